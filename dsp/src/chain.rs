@@ -44,7 +44,7 @@ pub struct MeasurementPlan<T: RealSample> {
 }
 
 /// Buffers of a [`MeasurementPlan`].
-pub struct MeasurementScratch<T> {
+pub struct MeasurementScratch<T: RealSample> {
     deconvolution: ResponseScratch<T>,
     raw: Vec<T>,
 }

@@ -9,6 +9,7 @@ use realfft::num_complex::Complex;
 use rustfft::{Fft, FftDirection};
 
 use crate::aligned::AlignedBuffer;
+use crate::complex_vector::ComplexVector;
 use crate::error::check_len;
 use crate::joint::{BinPower, SignalLevels};
 use crate::pruned::PrunedInverse;
@@ -97,12 +98,12 @@ pub struct DeconvolutionPlan<T: RealSample> {
 }
 
 /// Buffers of a [`DeconvolutionPlan`].
-pub struct DeconvolutionScratch<T> {
+pub struct DeconvolutionScratch<T: RealSample> {
     /// `[len + 1]`: the transform of both signals, and its first bin again as the mirror image of itself.
     joint: AlignedBuffer<Complex<T>>,
     /// Scratch of the transforms; between them, the quotient. One buffer, as the cache has no room for two.
     work: AlignedBuffer<Complex<T>>,
-    sums: Vec<Complex<T>>,
+    sums: Vec<ComplexVector<T>>,
 }
 
 impl<T: RealSample> DeconvolutionPlan<T> {
@@ -196,21 +197,29 @@ impl<T: RealSample> DeconvolutionPlan<T> {
         let DeconvolutionScratch { joint, work, sums } = scratch;
         let (joint, work) = (joint.values(), work.values());
         let levels = SignalLevels::of(recording, loopback)?;
-        self.transform(recording, loopback, T::of(levels.gain), joint, work);
+        self.transform(recording, loopback, levels.gains.map(T::of), joint, work);
         let (quotient, work) = work.split_at_mut(self.inverse.spectrum_len());
         self.divide(limits_hz, joint, levels.rounding, quotient)?;
         let kept = ir.len().min(self.len);
         let (ir, rest) = ir.split_at_mut(kept);
-        self.inverse.run(quotient, T::of(levels.gain / self.len as f64), ir, sums, work);
+        self.inverse.run(quotient, T::of(levels.gains[1] / levels.gains[0] / self.len as f64), ir, sums, work);
         rest.fill(T::default());
         // Finite samples can still be too large for a spectrum; that spoils every sample of the response.
         if ir.iter().all(|x| x.f64().is_finite()) { Ok(()) } else { Err(Error::NotFinite { what: "the response" }) }
     }
 
-    // Z of x + i gain s.
-    fn transform(&self, x: &[T], s: &[T], gain: T, joint: &mut [Complex<T>], work: &mut [Complex<T>]) {
-        for (z, (x, s)) in joint.iter_mut().zip(x.iter().zip(s)) {
-            *z = Complex::new(*x, *s * gain);
+    // Z of both signals times their gains, x + i s.
+    fn transform(&self, x: &[T], s: &[T], gains: [T; 2], joint: &mut [Complex<T>], work: &mut [Complex<T>]) {
+        let (whole, rest) = joint[..self.recording_len].as_chunks_mut();
+        let ((x, x_rest), (s, s_rest)) = (x.as_chunks(), s.as_chunks());
+        let [x_gain, s_gain] = gains.map(T::Vector::from);
+        for (z, (x, s)) in whole.iter_mut().zip(x.iter().zip(s)) {
+            let (re, im) = (T::Vector::from(*x) * x_gain, T::Vector::from(*s) * s_gain);
+            *z = ComplexVector::<T> { re, im }.values();
+        }
+        let [x_gain, s_gain] = gains;
+        for (z, (x, s)) in rest.iter_mut().zip(x_rest.iter().zip(s_rest)) {
+            *z = Complex::new(*x * x_gain, *s * s_gain);
         }
         joint[self.recording_len..].fill(Complex::default());
         self.forward.process_with_scratch(&mut joint[..self.len], work);
@@ -316,17 +325,17 @@ fn divide_lanes<T: RealSample>(
     gains: [T; VECTOR_LANES],
     floor: T,
 ) -> ([Complex<T>; VECTOR_LANES], [T; VECTOR_LANES]) {
-    let [z0, z1, z2, z3] = z;
-    let (z_re, z_im) = (T::Vector::from([z0.re, z1.re, z2.re, z3.re]), T::Vector::from([z0.im, z1.im, z2.im, z3.im]));
-    let (m_re, m_im) = (T::Vector::from([m0.re, m1.re, m2.re, m3.re]), T::Vector::from([m0.im, m1.im, m2.im, m3.im]));
+    let (z, m) = (ComplexVector::from_values(z), ComplexVector::from_values(&[*m0, *m1, *m2, *m3]));
     // With d = Z - b = 2i S and u = Z + b = 2 X, X / S = i u conj(d) / |d|^2.
-    let ((u_re, u_im), (d_re, d_im)) = ((z_re + m_re, z_im - m_im), (z_re - m_re, z_im + m_im));
-    let power = d_re * d_re + d_im * d_im;
+    let (u, d) = (
+        ComplexVector::<T> { re: z.re + m.re, im: z.im - m.im },
+        ComplexVector::<T> { re: z.re - m.re, im: z.im + m.im },
+    );
+    let power = d.re * d.re + d.im * d.im;
     let raised = T::Vector::from(gains) / power.greater(floor.into());
-    let [re0, re1, re2, re3]: [T; VECTOR_LANES] = ((u_re * d_im - u_im * d_re) * raised).into();
-    let [im0, im1, im2, im3]: [T; VECTOR_LANES] = ((u_re * d_re + u_im * d_im) * raised).into();
-    let quotient = [Complex::new(re0, im0), Complex::new(re1, im1), Complex::new(re2, im2), Complex::new(re3, im3)];
-    (quotient, power.into())
+    let quotient =
+        ComplexVector::<T> { re: (u.re * d.im - u.im * d.re) * raised, im: (u.re * d.re + u.im * d.im) * raised };
+    (quotient.values(), power.into())
 }
 
 /// The least even length without prime factors above 5 that holds `len` samples.

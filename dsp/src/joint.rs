@@ -7,9 +7,9 @@ const BLOCK: usize = 64;
 
 /// Levels of the two signals, from an eighth of their samples.
 pub(crate) struct SignalLevels {
-    /// Power of two that brings the loopback to the recording's level: in one transform, the rounding of the louder
-    /// signal is noise in the other.
-    pub(crate) gain: f64,
+    /// Powers of two that bring the recording and the loopback to 1: in one transform, the rounding of the louder signal
+    /// is noise in the other.
+    pub(crate) gains: [f64; 2],
     /// Power of a bin that rounding alone may leave.
     pub(crate) rounding: f64,
 }
@@ -25,10 +25,17 @@ impl SignalLevels {
         if loopback.iter().all(|s| *s == T::default()) {
             return Err(Error::NoLoopback);
         }
-        let exponent = ((x / s).log2() / 2.0).round();
-        let gain = if exponent.abs() <= 60.0 { exponent.exp2() } else { 1.0 };
-        Ok(Self { gain, rounding: (16.0 * T::epsilon()).powi(2) * (x + gain * gain * s) })
+        let recording_gain = root_power_of_two(1.0 / x);
+        let loopback_gain = recording_gain * root_power_of_two(x / s);
+        let energy = recording_gain.powi(2) * x + loopback_gain.powi(2) * s;
+        Ok(Self { gains: [recording_gain, loopback_gain], rounding: (16.0 * T::epsilon()).powi(2) * energy })
     }
+}
+
+// The power of two next to a ratio of energies as one of amplitudes; 1 for what is no level.
+fn root_power_of_two(energy: f64) -> f64 {
+    let exponent = (energy.log2() / 2.0).round();
+    if exponent.abs() <= 60.0 { exponent.exp2() } else { 1.0 }
 }
 
 // Blocks that are long enough to be read at full speed, close enough to each other to miss no sweep.

@@ -31,6 +31,7 @@ pub mod air;
 mod aligned;
 pub mod arrival;
 pub mod chain;
+mod complex_vector;
 pub mod components;
 pub mod correlation;
 pub mod decay;

@@ -117,26 +117,20 @@ impl RealSample for f64 {
     }
 }
 
-impl SampleVector for f32x4 {
-    #[inline]
-    fn lesser(self, other: Self) -> Self {
-        self.fast_min(other)
-    }
+macro_rules! sample_vectors {
+    ($($vector:ty),+) => {$(
+        impl SampleVector for $vector {
+            #[inline]
+            fn lesser(self, other: Self) -> Self {
+                self.fast_min(other)
+            }
 
-    #[inline]
-    fn greater(self, other: Self) -> Self {
-        self.fast_max(other)
-    }
+            #[inline]
+            fn greater(self, other: Self) -> Self {
+                self.fast_max(other)
+            }
+        }
+    )+};
 }
 
-impl SampleVector for f64x4 {
-    #[inline]
-    fn lesser(self, other: Self) -> Self {
-        self.fast_min(other)
-    }
-
-    #[inline]
-    fn greater(self, other: Self) -> Self {
-        self.fast_max(other)
-    }
-}
+sample_vectors!(f32x4, f64x4);

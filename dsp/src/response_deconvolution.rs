@@ -18,9 +18,9 @@ enum Precision<T: RealSample> {
 }
 
 /// Buffers of a [`ResponseDeconvolution`].
-pub struct ResponseScratch<T>(PrecisionScratch<T>);
+pub struct ResponseScratch<T: RealSample>(PrecisionScratch<T>);
 
-enum PrecisionScratch<T> {
+enum PrecisionScratch<T: RealSample> {
     Same(DeconvolutionScratch<T>),
     Double { scratch: DeconvolutionScratch<f64>, recording: Vec<f64>, loopback: Vec<f64>, ir: Vec<f64> },
 }
