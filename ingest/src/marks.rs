@@ -71,13 +71,29 @@ impl SuspectFile {
         &self.source
     }
 
-    /// Records the death of a process that ingested this file alone; `ending` describes it. A file that the process had
-    /// already moved to its place is a suspect under its new name from now on.
+    /// Returns the suspects among the files that are in no table yet.
     ///
     /// # Errors
-    /// [`Error::Read`] if the mark cannot be written.
-    pub fn add_death(&mut self, ending: &str) -> Result<()> {
+    /// As of [`files::pending`].
+    pub async fn pending(lake: &Lake) -> Result<Vec<Self>> {
+        Ok(files::pending(lake).await?.iter().filter_map(|source| Self::from_source(lake, source)).collect())
+    }
+
+    /// Records the death of a process that ingested this file alone; `ending` describes it. If the process had moved the
+    /// file to its place, it is the suspect that is not among those of `before` the process.
+    ///
+    /// # Errors
+    /// As of [`files::pending`]; [`Error::Read`] if the mark cannot be written.
+    pub async fn add_death(&mut self, lake: &Lake, ending: &str, before: &[Self]) -> Result<()> {
         self.endings.push(ending.to_owned());
+        let mut suspects = Self::pending(lake).await?;
+        if suspects.iter().all(|suspect| suspect.source != self.source) {
+            suspects.retain(|suspect| before.iter().all(|known| known.source != suspect.source));
+            if let Some(moved) = suspects.pop() {
+                let _ = fs::remove_file(&self.mark);
+                (self.source, self.mark) = (moved.source, moved.mark);
+            }
+        }
         // Writes all endings, because the process has recreated the mark.
         let mark = OpenOptions::new().write(true).truncate(true).open(&self.mark);
         match mark.and_then(|mut mark| writeln!(mark, "{}", self.endings.join("\n"))) {
@@ -142,17 +158,44 @@ mod tests {
         die();
         let mut suspect = SuspectFile::from_source(&lake, &source).expect("a suspect");
         assert!(suspect.refuse(&lake).await.expect("asked").is_none(), "nothing was seen of it yet");
-        suspect.add_death("signal: 6 (SIGABRT)").expect("written");
+        suspect.add_death(&lake, "signal: 6 (SIGABRT)", &[]).await.expect("written");
         assert!(suspect.refuse(&lake).await.expect("asked").is_none(), "its parent may have been killed with it");
         // The next process looked at the file, then began to read it.
         drop(ReadingMark::new(&lake, &source));
         die();
-        suspect.add_death("signal: 9 (SIGKILL)").expect("written");
+        suspect.add_death(&lake, "signal: 9 (SIGKILL)", &[]).await.expect("written");
         let report = suspect.refuse(&lake).await.expect("asked").expect("refused");
         let FileReport::Refused { moved: Some(moved), why, .. } = report else { panic!("{report:?}") };
         assert!(why.to_string().contains("signal: 6 (SIGABRT), signal: 9 (SIGKILL)"), "{why}");
         let reason = ObjectPath::from(format!("{moved}.reason.txt"));
         assert!(lake.store().head(&moved).await.is_ok() && lake.store().head(&reason).await.is_ok(), "{moved}");
         assert!(!is_suspect(), "who moves it back has it tried again");
+    }
+
+    #[tokio::test]
+    async fn a_suspect_is_followed_to_its_place() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let url = folder.path().join("lake").display().to_string();
+        let lake = Lake::open_or_create(&url, &Rig::paper(), &ReferenceSurfaces::default()).await.expect("a lake");
+        let [first, other, place] = ["inbox/a.mcap", "inbox/b.mcap", "runs/brick/a.mcap"].map(ObjectPath::from);
+        for path in [&first, &other] {
+            lake.store().put(path, "x".into()).await.expect("written");
+            drop(ReadingMark::new(&lake, &RunSource::Lake(path.clone())));
+            fs::write(mark_path(&lake, &RunSource::Lake(path.clone())).expect("in a folder"), "").expect("written");
+        }
+        let before = SuspectFile::pending(&lake).await.expect("listed");
+        assert_eq!(before.len(), 2);
+        let mut suspect = SuspectFile::from_source(&lake, &RunSource::Lake(first.clone())).expect("a suspect");
+        suspect.add_death(&lake, "once", &before).await.expect("written");
+        assert_eq!(*suspect.source(), RunSource::Lake(first.clone()), "it is where it was");
+        // The next process moves it, and ends before the old mark is removed.
+        lake.store().rename(&first, &place).await.expect("moved");
+        let place = RunSource::Lake(place);
+        fs::write(mark_path(&lake, &place).expect("in a folder"), "").expect("written");
+        suspect.add_death(&lake, "twice", &before).await.expect("written");
+        assert_eq!(*suspect.source(), place);
+        assert!(SuspectFile::from_source(&lake, &RunSource::Lake(first)).is_none(), "its old mark is gone");
+        let there = SuspectFile::from_source(&lake, &place).expect("a suspect");
+        assert_eq!(there.endings, ["once", "twice"], "both count");
     }
 }

@@ -246,9 +246,9 @@ async fn watch_suspect(
     summary: &mut IngestSummary,
     progress: &CommandProgress,
 ) -> anyhow::Result<()> {
-    let file = suspect.source().clone();
-    let RunSource::Lake(path) = &file else { return Ok(()) };
     loop {
+        let file = suspect.source().clone();
+        let RunSource::Lake(path) = &file else { return Ok(()) };
         if let Some(report) = suspect.refuse(lake).await? {
             summary.add(report, progress);
             return Ok(());
@@ -257,6 +257,7 @@ async fn watch_suspect(
             return Err(echolake_ingest::Error::Stopped.into());
         }
         progress.say(format!("{file}: an ingest died while it read this; a process of its own takes it in"));
+        let before = SuspectFile::pending(lake).await?;
         let mut command = Command::new(std::env::current_exe().context("this program has no path")?);
         command.args(["--lake", lake.location(), "ingest", "--suspect", path.as_ref()]);
         let (name, value) = child_variable();
@@ -278,7 +279,7 @@ async fn watch_suspect(
                 return Ok(());
             }
             _ if stop.load(Ordering::Relaxed) => return Err(echolake_ingest::Error::Stopped.into()),
-            None | Some(PANICKED) => suspect.add_death(&output.status.to_string())?,
+            None | Some(PANICKED) => suspect.add_death(lake, &output.status.to_string(), &before).await?,
             Some(code) => anyhow::bail!("the process that took in `{file}` failed with exit code {code}"),
         }
     }
