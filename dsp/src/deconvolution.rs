@@ -208,7 +208,8 @@ impl<T: RealSample> DeconvolutionPlan<T> {
         if ir.iter().all(|x| x.f64().is_finite()) { Ok(()) } else { Err(Error::NotFinite { what: "the response" }) }
     }
 
-    // Z of both signals times their gains, x + i s.
+    // Z of both signals times their gains, x + i s. The gain of the loopback alone would do, but numbers that are only moved
+    // are moved one by one where loops are compiled for size.
     fn transform(&self, x: &[T], s: &[T], gains: [T; 2], joint: &mut [Complex<T>], work: &mut [Complex<T>]) {
         let (whole, rest) = joint[..self.recording_len].as_chunks_mut();
         let ((x, x_rest), (s, s_rest)) = (x.as_chunks(), s.as_chunks());

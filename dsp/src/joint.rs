@@ -7,8 +7,8 @@ const BLOCK: usize = 64;
 
 /// Levels of the two signals, from an eighth of their samples.
 pub(crate) struct SignalLevels {
-    /// Powers of two that bring the recording and the loopback to 1: in one transform, the rounding of the louder signal
-    /// is noise in the other.
+    /// Powers of two that bring the recording and the loopback to an energy of 1: in one transform, the rounding of the
+    /// louder signal is noise in the other.
     pub(crate) gains: [f64; 2],
     /// Power of a bin that rounding alone may leave.
     pub(crate) rounding: f64,
