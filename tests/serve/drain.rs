@@ -16,7 +16,8 @@ const LONG: &str = "select value, repeat('x', 100) as text from generate_series(
 #[test]
 fn nothing_new_is_taken_and_what_runs_goes_on() {
     let place = lake();
-    let mut server = served(&place, &[]);
+    // The default of 30 s can be over, on a busy machine, before both answers are read.
+    let mut server = served(&place, &["--drain", "10m"]);
     wait_until("it is ready", || get(&server, "/ready").status == 200);
     assert_eq!(json(&get(&server, "/ready"))["status"], "ready");
     let mut idle = postgres::WireClient::connect(&server, None);
