@@ -77,25 +77,6 @@ fn campaigns_that_cannot_be_run_are_refused_before_there_is_a_lake() {
     }
 }
 
-// On a small rig: that they can be run, and have what they compare.
-#[test]
-fn the_papers_experiments_can_be_run() {
-    let place = TestFolder::new();
-    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/examples/campaigns");
-    let mut compared = BTreeSet::new();
-    for (name, tables) in [("mortar", 2), ("macrostructure", 1), ("stone_and_brick", 2)] {
-        let file = format!("{folder}/{name}.toml");
-        let json = place.ok(&["campaign", "run", &file, "--rig", "rig.toml", "--ir-only", "--json"]);
-        let report: Value = serde_json::from_str(&json).expect("JSON");
-        let found = report["tables"].as_array().expect("tables");
-        assert_eq!(found.len(), tables, "{name}: {report}");
-        let rows = found.iter().flat_map(|table| table["rows"].as_array().expect("rows"));
-        compared.extend(rows.map(|row| row["surface"].as_str().expect("text").to_owned()));
-    }
-    let compared: Vec<_> = compared.iter().map(String::as_str).collect();
-    assert_eq!(compared, ["0005_1", "0011_1", "0012_1", "0013_1", "0015_0", "0015_1", "0031_0", "flat"]);
-}
-
 #[test]
 fn panels_of_the_paper_are_made_by_name() {
     let place = TestFolder::new();
@@ -117,4 +98,27 @@ fn panels_of_the_paper_are_made_by_name() {
     let rows = place.sql("select typology, macro_reference from surfaces order by surface_id");
     assert_eq!((&rows[0]["typology"], &rows[0]["macro_reference"]), (&"flemish_bond_bricks".into(), &"0015_1".into()));
     assert_eq!(rows[1]["macro_reference"], "0015_1");
+}
+
+mod slow {
+    use super::*;
+
+    // On a small rig: that they can be run, and have what they compare.
+    #[test]
+    fn the_papers_experiments_can_be_run() {
+        let place = TestFolder::new();
+        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/examples/campaigns");
+        let mut compared = BTreeSet::new();
+        for (name, tables) in [("mortar", 2), ("macrostructure", 1), ("stone_and_brick", 2)] {
+            let file = format!("{folder}/{name}.toml");
+            let json = place.ok(&["campaign", "run", &file, "--rig", "rig.toml", "--ir-only", "--json"]);
+            let report: Value = serde_json::from_str(&json).expect("JSON");
+            let found = report["tables"].as_array().expect("tables");
+            assert_eq!(found.len(), tables, "{name}: {report}");
+            let rows = found.iter().flat_map(|table| table["rows"].as_array().expect("rows"));
+            compared.extend(rows.map(|row| row["surface"].as_str().expect("text").to_owned()));
+        }
+        let compared: Vec<_> = compared.iter().map(String::as_str).collect();
+        assert_eq!(compared, ["0005_1", "0011_1", "0012_1", "0013_1", "0015_0", "0015_1", "0031_0", "flat"]);
+    }
 }

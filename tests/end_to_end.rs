@@ -172,6 +172,7 @@ mod slow {
     use std::path::Path;
 
     use crate::ECHOLAKE;
+    use crate::acquire_kills::{AcquireKillCampaign, AcquireKillCounts, PAIRS};
     use crate::kills::KillCampaign;
 
     // The long form is the campaign `kills`.
@@ -186,25 +187,27 @@ mod slow {
     fn two_processes_ingest_half_of_the_runs_each() {
         KillCampaign::of(Path::new(ECHOLAKE), 1, 12).halves(2, &mut |_, _| {});
     }
-}
 
-#[test]
-fn acquires_that_are_killed_lose_nothing_acknowledged() {
-    let mut campaign = super::acquire_kills::AcquireKillCampaign::new(std::path::Path::new(super::ECHOLAKE), 7);
-    let outcome = campaign.kills(6, &mut |_| {});
-    check_acknowledged(&outcome);
-}
+    #[test]
+    fn acquires_whose_power_is_cut_lose_nothing_acknowledged() {
+        let echolake = Path::new(ECHOLAKE);
+        let Some(mut campaign) = AcquireKillCampaign::with_power_cuts(echolake, 7) else {
+            return;
+        };
+        let outcome = campaign.kills(6, &mut |_| {});
+        check_acknowledged(&outcome);
+    }
 
-#[test]
-fn acquires_whose_power_is_cut_lose_nothing_acknowledged() {
-    let echolake = std::path::Path::new(super::ECHOLAKE);
-    let Some(mut campaign) = super::acquire_kills::AcquireKillCampaign::with_power_cuts(echolake, 7) else { return };
-    let outcome = campaign.kills(6, &mut |_| {});
-    check_acknowledged(&outcome);
-}
+    #[test]
+    fn acquires_that_are_killed_lose_nothing_acknowledged() {
+        let mut campaign = AcquireKillCampaign::new(Path::new(ECHOLAKE), 7);
+        let outcome = campaign.kills(6, &mut |_| {});
+        check_acknowledged(&outcome);
+    }
 
-// A kill between a pair's checkpoint and its line keeps the pair and loses the line.
-fn check_acknowledged(outcome: &super::acquire_kills::AcquireKillCounts) {
-    assert_eq!(outcome.killed, 6);
-    assert!(outcome.acknowledged + outcome.killed >= super::acquire_kills::PAIRS, "{outcome:?}");
+    // A kill between a pair's checkpoint and its line keeps the pair and loses the line.
+    fn check_acknowledged(outcome: &AcquireKillCounts) {
+        assert_eq!(outcome.killed, 6);
+        assert!(outcome.acknowledged + outcome.killed >= PAIRS, "{outcome:?}");
+    }
 }

@@ -6,7 +6,7 @@
 //! because `vacuum` keeps replaced files for a while; so all logs are checked periodically.
 
 use std::collections::HashMap;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use std::time::{Duration, Instant};
 
 use arrow::datatypes::SchemaRef;
@@ -27,7 +27,7 @@ use crate::as_of::{self, PastTableName};
 use crate::mcap::{self, Contents};
 use crate::system;
 use crate::table::{FileReaders, LakeTable};
-use crate::views::{LakeView, LookupFunctions, PairJoin, SortedNulls, UnusedJoin};
+use crate::views::{LakeView, LazyView, LookupFunctions, PairJoin, SortedNulls, UnusedJoin};
 use crate::{Error, error};
 
 /// Time for which a new layout of the same rows may go undetected; vacuum keeps replaced files for an hour at least.
@@ -43,7 +43,8 @@ pub(crate) struct LakeCatalog {
     lake: Lake,
     source: FileReaders,
     lookups: LookupFunctions,
-    names: Vec<(&'static str, SchemaRef)>,
+    /// Tables and views, once somebody asks for their list.
+    names: OnceLock<Vec<(&'static str, SchemaRef)>>,
     current: Mutex<Option<Arc<CatalogSnapshot>>>,
     /// Held while one query takes a new snapshot; the others wait for it.
     taking: tokio::sync::Mutex<()>,
@@ -64,19 +65,15 @@ struct CatalogSnapshot {
 
 impl LakeCatalog {
     /// # Errors
-    /// [`Error::Lake`] if the rig cannot be laid out, [`Error::Execution`] if a view does not fit its tables.
+    /// [`Error::Lake`] if the rig cannot be laid out.
     pub(crate) fn new(lake: &Lake, source: FileReaders) -> Result<Self, Error> {
         let lookups = LookupFunctions::of(lake)?;
-        let mut names: Vec<_> = Table::ALL.into_iter().map(|t| (t.name(), t.schema(lake.rig()))).collect();
-        for view in LakeView::ALL {
-            names.push((view.name(), view.schema(lake, &lookups).map_err(failed)?));
-        }
         let small = source.small.clone();
         Ok(Self {
             lake: lake.clone(),
             source,
             lookups,
-            names,
+            names: OnceLock::new(),
             current: Mutex::default(),
             taking: tokio::sync::Mutex::default(),
             past: Cache::new(PAST_TABLES),
@@ -165,7 +162,9 @@ impl LakeCatalog {
 
     /// Returns the tables and views with their schemas.
     pub(crate) fn tables(&self) -> impl Iterator<Item = (&'static str, SchemaRef)> {
-        self.names.iter().cloned()
+        let tables = || Table::ALL.into_iter().map(|table| (table.name(), table.schema(self.lake.rig())));
+        let views = || LakeView::ALL.into_iter().map(|view| (view.name(), view.schema(&self.lake, &self.lookups)));
+        self.names.get_or_init(|| tables().chain(views()).collect()).iter().cloned()
     }
 
     async fn current(&self) -> Result<Arc<CatalogSnapshot>, Error> {
@@ -241,7 +240,7 @@ impl LakeCatalog {
         for view in LakeView::ALL {
             let of = |table: &Table| Some((*table, tables.get(table)?.clone() as Arc<dyn TableProvider>));
             let beneath = view.tables().iter().filter_map(of).collect();
-            let view_table = view.over(&self.lake, &self.lookups, &beneath).map_err(failed)?;
+            let view_table = LazyView::new(view, &self.lake, &self.lookups, beneath);
             providers.push((TableReference::bare(view.name()), Arc::new(view_table)));
         }
         if let Some(runs) = tables.get(&Table::Runs) {

@@ -20,6 +20,7 @@ use datafusion::sql::parser::{DFParserBuilder, Statement};
 use datafusion::sql::sqlparser::parser::ParserError;
 use datafusion::sql::sqlparser::tokenizer::Tokenizer;
 use echolake_lake::{Lake, LakeSnapshot, VisibleRun};
+use futures::future::BoxFuture;
 use futures::{FutureExt as _, StreamExt as _};
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
@@ -209,11 +210,14 @@ impl Session {
     /// # Errors
     /// [`Error::Query`] if it is invalid, [`Error::NotReading`] if it would change something, [`Error::Lake`] if the
     /// lake cannot be read, [`Error::Busy`] if the client has no permit left, and those of [`QueryAnswer::next`].
-    pub async fn query(&self, sql: &str) -> Result<QueryAnswer, Error> {
-        let sql = &*self.summarized(sql).await?;
-        let started = self.start()?;
-        let prepared = self.plan(sql, self.parse(sql)?, &started.ticket).await?;
-        self.run(&prepared, LogicalPlan::clone(&prepared.plan), started).await
+    pub fn query<'a>(&'a self, sql: &'a str) -> BoxFuture<'a, Result<QueryAnswer, Error>> {
+        let query = async move {
+            let sql = &*self.summarized(sql).await?;
+            let started = self.start()?;
+            let prepared = self.plan(sql, self.parse(sql)?, &started.ticket).await?;
+            self.run(&prepared, LogicalPlan::clone(&prepared.plan), started).await
+        };
+        query.boxed()
     }
 
     /// Plans a query.
@@ -235,9 +239,12 @@ impl Session {
     ///
     /// # Errors
     /// As [`Session::query`].
-    pub async fn prepare(&self, sql: &str) -> Result<PreparedQuery, Error> {
-        let sql = &*self.summarized(sql).await?;
-        self.prepare_statement(sql, self.parse(sql)?).await
+    pub fn prepare<'a>(&'a self, sql: &'a str) -> BoxFuture<'a, Result<PreparedQuery, Error>> {
+        let prepare = async move {
+            let sql = &*self.summarized(sql).await?;
+            self.prepare_statement(sql, self.parse(sql)?).await
+        };
+        prepare.boxed()
     }
 
     // `SUMMARIZE` becomes a query over the columns of what it names.
@@ -252,19 +259,32 @@ impl Session {
     ///
     /// # Errors
     /// As [`Session::query`].
-    pub async fn prepare_statement(&self, sql: &str, statement: Statement) -> Result<PreparedQuery, Error> {
-        let started = self.start()?;
-        self.plan(sql, statement, &started.ticket).await
+    pub fn prepare_statement<'a>(
+        &'a self,
+        sql: &'a str,
+        statement: Statement,
+    ) -> BoxFuture<'a, Result<PreparedQuery, Error>> {
+        let prepare = async move {
+            let started = self.start()?;
+            self.plan(sql, statement, &started.ticket).await
+        };
+        prepare.boxed()
     }
 
     /// Runs a planned query with values for its placeholders.
     ///
     /// # Errors
     /// [`Error::Query`] if values are missing or of the wrong type; else as [`Session::query`].
-    pub async fn execute(&self, prepared: &PreparedQuery, values: ParamValues) -> Result<QueryAnswer, Error> {
-        let plan =
-            LogicalPlan::clone(&prepared.plan).with_param_values(values).map_err(|e| Error::plan(&prepared.sql, &e))?;
-        self.run(prepared, plan, self.start()?).await
+    pub fn execute<'a>(
+        &'a self,
+        prepared: &'a PreparedQuery,
+        values: ParamValues,
+    ) -> BoxFuture<'a, Result<QueryAnswer, Error>> {
+        let execute = async move {
+            let plan = LogicalPlan::clone(&prepared.plan).with_param_values(values);
+            self.run(prepared, plan.map_err(|e| Error::plan(&prepared.sql, &e))?, self.start()?).await
+        };
+        execute.boxed()
     }
 
     /// Parses one statement.

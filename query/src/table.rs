@@ -6,7 +6,6 @@ use std::time::SystemTime;
 
 use arrow::datatypes::{DataType, SchemaRef};
 use arrow::record_batch::RecordBatch;
-use async_trait::async_trait;
 use datafusion::catalog::{Session, TableProvider};
 use datafusion::common::pruning::PrunableStatistics;
 use datafusion::common::stats::Precision;
@@ -31,6 +30,8 @@ use datafusion::physical_plan::filter::{FilterExec, FilterExecBuilder};
 use datafusion::physical_plan::union::UnionExec;
 use echolake_lake::{DataFile, Lake};
 use echolake_schema::tables::Table;
+use futures::FutureExt as _;
+use futures::future::BoxFuture;
 use object_store::ObjectMeta;
 use tokio::sync::OnceCell;
 
@@ -289,7 +290,6 @@ fn groups(files: &[&ScanFile], count: usize) -> Vec<FileGroup> {
     groups.into_iter().map(|(_, files)| FileGroup::new(files)).collect()
 }
 
-#[async_trait]
 impl TableProvider for LakeTable {
     fn schema(&self) -> SchemaRef {
         self.schema.clone()
@@ -315,17 +315,54 @@ impl TableProvider for LakeTable {
         Some(statistics)
     }
 
-    async fn scan(
+    // Written out for the compiler: in an `async fn` of this trait it proves anew that expressions are `Sync`, for seconds.
+    fn scan<'table, 'state, 'columns, 'filters, 'scan>(
+        &'table self,
+        state: &'state dyn Session,
+        projection: Option<&'columns Vec<usize>>,
+        filters: &'filters [Expr],
+        limit: Option<usize>,
+    ) -> BoxFuture<'scan, Result<Arc<dyn ExecutionPlan>>>
+    where
+        'table: 'scan,
+        'state: 'scan,
+        'columns: 'scan,
+        'filters: 'scan,
+        Self: 'scan,
+    {
+        self.rows(state, projection, filters, limit)
+    }
+}
+
+impl LakeTable {
+    fn rows<'a>(
+        &'a self,
+        state: &'a dyn Session,
+        projection: Option<&'a Vec<usize>>,
+        filters: &'a [Expr],
+        limit: Option<usize>,
+    ) -> BoxFuture<'a, Result<Arc<dyn ExecutionPlan>>> {
+        let rows = async move {
+            match self.cached(projection).await? {
+                Some((rows, wanted)) => {
+                    let schema = rows.schema();
+                    let rows = MemorySourceConfig::try_new_exec(&[vec![rows]], schema, Some(wanted))?;
+                    Ok(rows as Arc<dyn ExecutionPlan>)
+                }
+                None => self.files_rows(state, projection, filters, limit),
+            }
+        };
+        rows.boxed()
+    }
+
+    // The rows of its files.
+    fn files_rows(
         &self,
         state: &dyn Session,
         projection: Option<&Vec<usize>>,
         filters: &[Expr],
         limit: Option<usize>,
     ) -> Result<Arc<dyn ExecutionPlan>> {
-        if let Some((rows, wanted)) = self.cached(projection).await? {
-            let schema = rows.schema();
-            return Ok(MemorySourceConfig::try_new_exec(&[vec![rows]], schema, Some(wanted))?);
-        }
         let kept = self.kept(state, filters)?;
         let (whole, partial): (Vec<_>, Vec<_>) = kept.into_iter().partition(|f| f.file.hidden.is_empty());
         match (whole.is_empty(), partial.is_empty()) {

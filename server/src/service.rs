@@ -9,6 +9,8 @@ use arrow::datatypes::SchemaRef;
 use datafusion::common::ParamValues;
 use echolake_lake::Lake;
 use echolake_query::{EngineClient, PreparedQuery, QueryEngine, QueryQuota, QueryThreads, Session, SqlFunction};
+use futures::future::BoxFuture;
+use futures::{FutureExt as _, TryFutureExt as _};
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinSet;
 use tracing::Instrument as _;
@@ -236,19 +238,21 @@ impl QueryService {
         task
     }
 
-    /// Parses and plans for a client, away from the threads that answer connections.
-    pub(crate) async fn plan<T: Send + 'static>(
+    /// Parses and plans for a client, away from the threads that answer connections. Boxed for the same reason as
+    /// [`echolake_query::OpaqueValue`].
+    pub(crate) fn plan<T: Send + 'static>(
         &self,
         client: &EngineClient,
         work: impl Future<Output = Result<T, RequestFault>> + Send + 'static,
-    ) -> Result<T, RequestFault> {
-        let guard = self.0.activity.enter();
+    ) -> BoxFuture<'_, Result<T, RequestFault>> {
+        let (guard, time) = (self.0.activity.enter(), client.quota().time);
         let work = async move {
             let _guard = guard;
             work.await
         };
-        let planned = self.0.engine.supervise(client.quota().time, work.in_current_span()).await;
-        planned.inspect_err(|fault| self.record_failure(fault))
+        let work = work.in_current_span();
+        let planned = async move { self.0.engine.supervise(time, work).await };
+        planned.inspect_err(|fault| self.record_failure(fault)).boxed()
     }
 
     /// Computes something long, which waits for nothing.
@@ -266,45 +270,48 @@ impl QueryService {
         handle.await.map_err(RequestFault::defect("computing ended its task"))
     }
 
-    /// Begins a query; its columns are known when this returns.
+    /// Begins a query; its columns are known when this returns. Boxed as [`QueryService::plan`].
     ///
     /// # Errors
     /// What is wrong with the query, or ended it.
-    pub(crate) async fn begin<E: AnswerEncoder>(
+    pub(crate) fn begin<E: AnswerEncoder>(
         &self,
         job: QueryJob,
         encode: impl FnOnce(&SchemaRef) -> Result<E, RequestFault> + Send + 'static,
-    ) -> Result<RunningQuery<E::Item>, RequestFault> {
-        let (columns, known) = oneshot::channel();
-        let (to, items) = mpsc::channel(WAITING);
-        let (stop, limit) = (job.stop.clone(), job.limit);
-        let service = self.clone();
-        let span = tracing::error_span!("query", protocol = job.protocol.name(), client = self.0.identity.name);
-        let timer = span.in_scope(|| self.watch(job.protocol, job.work.statement(), &job.stop));
-        let (watch, stopped) = (timer.watch().clone(), stop.clone());
-        let work = async move {
-            let done = tokio::select! {
-                done = run(timer.watch(), job, encode, columns, to) => done,
-                // Also if nobody fetches rows at present; who does says so.
-                () = stopped.stopped() => return Err(RequestFault::Cancelled),
+    ) -> BoxFuture<'_, Result<RunningQuery<E::Item>, RequestFault>> {
+        let begun = async move {
+            let (columns, known) = oneshot::channel();
+            let (to, items) = mpsc::channel(WAITING);
+            let (stop, limit) = (job.stop.clone(), job.limit);
+            let service = self.clone();
+            let span = tracing::error_span!("query", protocol = job.protocol.name(), client = self.0.identity.name);
+            let timer = span.in_scope(|| self.watch(job.protocol, job.work.statement(), &job.stop));
+            let (watch, stopped) = (timer.watch().clone(), stop.clone());
+            let work = async move {
+                let done = tokio::select! {
+                    done = run(timer.watch(), job, encode, columns, to) => done,
+                    // Also if nobody fetches rows at present; who does says so.
+                    () = stopped.stopped() => return Err(RequestFault::Cancelled),
+                };
+                timer.watch().finish(done.as_ref().err());
+                done.inspect_err(|fault| service.record_failure(fault))
             };
-            timer.watch().finish(done.as_ref().err());
-            done.inspect_err(|fault| service.record_failure(fault))
+            let mut task = self.spawn(work.instrument(span.clone()));
+            tokio::select! {
+                biased;
+                fault = ended(&stop, limit) => {
+                    watch.finish(Some(&fault));
+                    span.in_scope(|| self.record_failure(&fault));
+                    Err(fault)
+                }
+                schema = known => match schema {
+                    Ok(schema) => Ok(RunningQuery { schema, items, task, stop, limit, service: self.clone(), watch, span }),
+                    // It ended without having any: it says why.
+                    Err(_) => finish(&mut task).await.and(Err(RequestFault::Internal)),
+                }
+            }
         };
-        let mut task = self.spawn(work.instrument(span.clone()));
-        tokio::select! {
-            biased;
-            fault = ended(&stop, limit) => {
-                watch.finish(Some(&fault));
-                span.in_scope(|| self.record_failure(&fault));
-                Err(fault)
-            }
-            schema = known => match schema {
-                Ok(schema) => Ok(RunningQuery { schema, items, task, stop, limit, service: self.clone(), watch, span }),
-                // It ended without having any: it says why.
-                Err(_) => finish(&mut task).await.and(Err(RequestFault::Internal)),
-            }
-        }
+        begun.boxed()
     }
 }
 

@@ -64,58 +64,6 @@ fn write_large_run(path: &Path) {
     writer.finish().expect("closed");
 }
 
-// At each cut the store takes one part more.
-#[test]
-fn a_large_upload_that_is_cut_off_ten_times_sends_no_part_twice_that_is_known_to_be_there() {
-    let place = TestFolder::new();
-    let store = S3Double::start(StoreBehaviour::Faultless);
-    let (file, journal) = (place.path("large.mcap"), place.path("large.mcap.upload"));
-    write_large_run(&file);
-    for cut in 1..=CUTS {
-        wait_until("the end of the killed one's connections", || store.connections() == 0);
-        store.limit_parts(store.parts() + 1);
-        let expected = store.parts() + 1;
-        let mut upload =
-            ChildProcess::start(&mut command(&place, &store, &["upload", "large.mcap"])).expect("it starts");
-        wait_until("a part more", || store.parts() >= expected);
-        // A kill between the two costs that part.
-        wait_until("its line in the journal", || {
-            std::fs::read_to_string(&journal).is_ok_and(|text| text.lines().count() > cut)
-        });
-        if cut % 2 == 0 {
-            upload.signal("INT");
-            let output = upload.wait();
-            let said = stderr(&output);
-            assert_eq!(output.status.code(), Some(1), "{said}");
-            assert!(said.contains("run the same command again to resume"), "{said}");
-        } else {
-            upload.kill();
-        }
-        assert!(!store.keys().contains(&key(&format!("inbox/{LARGE_RUN}.mcap"))), "cut {cut}");
-    }
-    wait_until("the end of its connections", || store.connections() == 0);
-    store.limit_parts(usize::MAX);
-    let paths = ok(&place, &store, &["upload", "large.mcap"]);
-    assert_eq!(paths, format!("inbox/{LARGE_RUN}.mcap\n"));
-    assert!(store.get(&key(paths.trim())) == std::fs::read(&file).expect("read"), "other bytes");
-    assert_eq!(store.parts(), LARGE_PARTS, "each part once");
-    assert!(!journal.exists(), "its end");
-    let record = String::from_utf8(store.get(&key(&format!("inbox/{LARGE_RUN}.mcap.sha256")))).expect("text");
-    let summed = Command::new("sha256sum").arg(&file).output().expect("sha256sum starts");
-    assert_eq!(record.split(' ').next(), String::from_utf8_lossy(&summed.stdout).split(' ').next());
-
-    // What the store has forgotten is sent anew.
-    let store = S3Double::start(StoreBehaviour::Faultless);
-    store.limit_parts(1);
-    let mut upload = ChildProcess::start(&mut command(&place, &store, &["upload", "large.mcap"])).expect("it starts");
-    wait_until("a part", || store.parts() >= 1 && journal.exists());
-    upload.kill();
-    store.abort_uploads();
-    store.limit_parts(usize::MAX);
-    ok(&place, &store, &["upload", "large.mcap"]);
-    assert!(store.get(&key(paths.trim())) == std::fs::read(&file).expect("read"), "other bytes");
-}
-
 #[test]
 fn uploaded_runs_are_ingested_by_their_digest_and_known_ever_after() {
     let place = TestFolder::new();
@@ -255,36 +203,93 @@ fn a_recording_is_uploaded_at_its_end_and_stays_if_that_fails() {
     ok(&place, &store, &["upload", &file]);
 }
 
-// Each run is read and committed by one of them alone.
-#[test]
-fn three_ingests_share_an_inbox_without_doing_anything_twice() {
-    let place = TestFolder::new();
-    let surfaces = ["flat", "foam", "wood", "prd", "brick", "wavy", "flat_2", "wood_2", "brick_2", "prd_2"];
-    let runs = recordings(&place, &surfaces);
-    let store = S3Double::start(StoreBehaviour::Faultless);
-    ok(&place, &store, &["upload", "lake/inbox"]);
-    let start = |_| ChildProcess::start(&mut command(&place, &store, &["ingest"])).expect("it starts");
-    let mut ingests = [0, 1, 2].map(start);
-    let said: String = ingests
-        .iter_mut()
-        .map(|ingest| {
-            let output = ingest.wait();
-            assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
-            stderr(&output)
-        })
-        .collect();
-    for run in &runs {
-        let name = run.rsplit('/').next().and_then(|name| name.strip_suffix(".mcap")).expect("a run");
-        let taken =
-            said.lines().filter(|line| line.starts_with(&format!("{name}: ")) && line.ends_with(" measurements"));
-        assert_eq!(taken.count(), 1, "{name}: {said}");
+mod slow {
+    use super::*;
+
+    // At each cut the store takes one part more.
+    #[test]
+    fn a_large_upload_that_is_cut_off_ten_times_sends_no_part_twice_that_is_known_to_be_there() {
+        let place = TestFolder::new();
+        let store = S3Double::start(StoreBehaviour::Faultless);
+        let (file, journal) = (place.path("large.mcap"), place.path("large.mcap.upload"));
+        write_large_run(&file);
+        for cut in 1..=CUTS {
+            wait_until("the end of the killed one's connections", || store.connections() == 0);
+            store.limit_parts(store.parts() + 1);
+            let expected = store.parts() + 1;
+            let mut upload =
+                ChildProcess::start(&mut command(&place, &store, &["upload", "large.mcap"])).expect("it starts");
+            wait_until("a part more", || store.parts() >= expected);
+            // A kill between the two costs that part.
+            wait_until("its line in the journal", || {
+                std::fs::read_to_string(&journal).is_ok_and(|text| text.lines().count() > cut)
+            });
+            if cut % 2 == 0 {
+                upload.signal("INT");
+                let output = upload.wait();
+                let said = stderr(&output);
+                assert_eq!(output.status.code(), Some(1), "{said}");
+                assert!(said.contains("run the same command again to resume"), "{said}");
+            } else {
+                upload.kill();
+            }
+            assert!(!store.keys().contains(&key(&format!("inbox/{LARGE_RUN}.mcap"))), "cut {cut}");
+        }
+        wait_until("the end of its connections", || store.connections() == 0);
+        store.limit_parts(usize::MAX);
+        let paths = ok(&place, &store, &["upload", "large.mcap"]);
+        assert_eq!(paths, format!("inbox/{LARGE_RUN}.mcap\n"));
+        assert!(store.get(&key(paths.trim())) == std::fs::read(&file).expect("read"), "other bytes");
+        assert_eq!(store.parts(), LARGE_PARTS, "each part once");
+        assert!(!journal.exists(), "its end");
+        let record = String::from_utf8(store.get(&key(&format!("inbox/{LARGE_RUN}.mcap.sha256")))).expect("text");
+        let summed = Command::new("sha256sum").arg(&file).output().expect("sha256sum starts");
+        assert_eq!(record.split(' ').next(), String::from_utf8_lossy(&summed.stdout).split(' ').next());
+
+        // What the store has forgotten is sent anew.
+        let store = S3Double::start(StoreBehaviour::Faultless);
+        store.limit_parts(1);
+        let mut upload =
+            ChildProcess::start(&mut command(&place, &store, &["upload", "large.mcap"])).expect("it starts");
+        wait_until("a part", || store.parts() >= 1 && journal.exists());
+        upload.kill();
+        store.abort_uploads();
+        store.limit_parts(usize::MAX);
+        ok(&place, &store, &["upload", "large.mcap"]);
+        assert!(store.get(&key(paths.trim())) == std::fs::read(&file).expect("read"), "other bytes");
     }
-    assert!(!said.contains("is in the lake already"), "{said}");
-    let count = ok(&place, &store, &["sql", "--format", "csv", "select count(*) as n from runs"]);
-    assert_eq!(count, format!("n\n{}\n", surfaces.len()));
-    assert!(
-        store.keys().iter().all(|key| !key.contains("/inbox/") && !key.contains("/_claims/")),
-        "{:?}",
-        store.keys()
-    );
+
+    // Each run is read and committed by one of them alone.
+    #[test]
+    fn three_ingests_share_an_inbox_without_doing_anything_twice() {
+        let place = TestFolder::new();
+        let surfaces = ["flat", "foam", "wood", "prd", "brick", "wavy", "flat_2", "wood_2", "brick_2", "prd_2"];
+        let runs = recordings(&place, &surfaces);
+        let store = S3Double::start(StoreBehaviour::Faultless);
+        ok(&place, &store, &["upload", "lake/inbox"]);
+        let start = |_| ChildProcess::start(&mut command(&place, &store, &["ingest"])).expect("it starts");
+        let mut ingests = [0, 1, 2].map(start);
+        let said: String = ingests
+            .iter_mut()
+            .map(|ingest| {
+                let output = ingest.wait();
+                assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
+                stderr(&output)
+            })
+            .collect();
+        for run in &runs {
+            let name = run.rsplit('/').next().and_then(|name| name.strip_suffix(".mcap")).expect("a run");
+            let taken =
+                said.lines().filter(|line| line.starts_with(&format!("{name}: ")) && line.ends_with(" measurements"));
+            assert_eq!(taken.count(), 1, "{name}: {said}");
+        }
+        assert!(!said.contains("is in the lake already"), "{said}");
+        let count = ok(&place, &store, &["sql", "--format", "csv", "select count(*) as n from runs"]);
+        assert_eq!(count, format!("n\n{}\n", surfaces.len()));
+        assert!(
+            store.keys().iter().all(|key| !key.contains("/inbox/") && !key.contains("/_claims/")),
+            "{:?}",
+            store.keys()
+        );
+    }
 }

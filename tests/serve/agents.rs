@@ -48,7 +48,7 @@ fn an_agent_asks_by_tools() {
     let greeted = json_of(&post(&server, &message(1, "initialize", json!({ "protocolVersion": "2025-06-18" }))));
     assert_eq!((&greeted["id"], &greeted["result"]["protocolVersion"]), (&json!(1), &json!("2025-06-18")));
     let notified = post(&server, r#"{"jsonrpc":"2.0","method":"notifications/initialized"}"#);
-    assert_eq!((notified.status, notified.body.len()), (202, 0));
+    assert_eq!((notified.status, notified.body.len()), (202, 0), "{}", notified.text());
     let tools = json_of(&post(&server, &message(2, "tools/list", json!({}))));
     let tools = tools["result"]["tools"].as_array().expect("a list");
     assert!(tools.iter().all(|tool| tool["annotations"]["readOnlyHint"] == true) && tools.len() == 7, "{tools:?}");

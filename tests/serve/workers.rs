@@ -104,34 +104,10 @@ fn workers_are_encrypted() {
     wait_until("the renewed certificate", || trusting("tls/certificate.pem").contains("spread over 2 of 2 workers"));
 }
 
-#[test]
-fn workers_tell_what_they_did() {
-    let place = lake();
-    let (_first, one) = worker(&place, &[]);
-    let (_second, two) = worker(&place, &[]);
-    let server = served(&place, &["--workers", &format!("{one},{two},http://127.0.0.1:1"), "--spread-from", "0"]);
-    let figures = || json(&sql(&server, "select * from system.workers order by state desc, address"));
-    assert_eq!(json(&sql(&server, HEAVY))[0]["surface_id"], "flat");
-    // Tasks are over when their engine says so, and workers are asked every five seconds at most.
-    wait_until("tasks that read", || {
-        let rows = figures();
-        (0..2).map(|n| rows[n]["read_bytes"].as_u64().unwrap_or(0)).sum::<u64>() > 0
-    });
-    let rows = figures();
-    assert_eq!(rows.as_array().map(Vec::len), Some(3), "{rows}");
-    assert_eq!((rows[0]["state"].as_str(), rows[2]["state"].as_str()), (Some("used"), Some("not used")), "{rows}");
-    assert!(rows[2]["problem"].as_str().is_some_and(|reason| reason.contains("refused")), "{rows}");
-    assert!(rows[2]["last_seen"].is_null() && rows[0]["build"].is_string(), "{rows}");
-    let metrics = get(&server, "/metrics").text();
-    let read = metrics.lines().filter(|line| line.starts_with("echolake_worker_read_bytes{")).count();
-    assert_eq!(read, 2, "{metrics}");
-    assert!(metrics.contains("echolake_worker_imbalance "), "{metrics}");
-}
-
 mod slow {
     use std::path::Path;
 
-    use super::WorkerProcesses;
+    use super::*;
     use crate::ECHOLAKE;
 
     #[test]
@@ -141,5 +117,29 @@ mod slow {
         let report = cluster.check(6, 1).expect("answers");
         assert!(report.is_goal_reached(), "{report:?}");
         assert!(report.right > 0, "{report:?}");
+    }
+
+    #[test]
+    fn workers_tell_what_they_did() {
+        let place = lake();
+        let (_first, one) = worker(&place, &[]);
+        let (_second, two) = worker(&place, &[]);
+        let server = served(&place, &["--workers", &format!("{one},{two},http://127.0.0.1:1"), "--spread-from", "0"]);
+        let figures = || json(&sql(&server, "select * from system.workers order by state desc, address"));
+        assert_eq!(json(&sql(&server, HEAVY))[0]["surface_id"], "flat");
+        // Tasks are over when their engine says so, and workers are asked every five seconds at most.
+        wait_until("tasks that read", || {
+            let rows = figures();
+            (0..2).map(|n| rows[n]["read_bytes"].as_u64().unwrap_or(0)).sum::<u64>() > 0
+        });
+        let rows = figures();
+        assert_eq!(rows.as_array().map(Vec::len), Some(3), "{rows}");
+        assert_eq!((rows[0]["state"].as_str(), rows[2]["state"].as_str()), (Some("used"), Some("not used")), "{rows}");
+        assert!(rows[2]["problem"].as_str().is_some_and(|reason| reason.contains("refused")), "{rows}");
+        assert!(rows[2]["last_seen"].is_null() && rows[0]["build"].is_string(), "{rows}");
+        let metrics = get(&server, "/metrics").text();
+        let read = metrics.lines().filter(|line| line.starts_with("echolake_worker_read_bytes{")).count();
+        assert_eq!(read, 2, "{metrics}");
+        assert!(metrics.contains("echolake_worker_imbalance "), "{metrics}");
     }
 }

@@ -7,13 +7,14 @@ use std::sync::Arc;
 use arrow::array::{AsArray as _, StringArray};
 use arrow::datatypes::{Field, Schema, SchemaRef};
 use arrow::record_batch::RecordBatch;
-use async_trait::async_trait;
 use datafusion::catalog::{Session, TableProvider};
 use datafusion::common::{DFSchema, ScalarValue};
 use datafusion::datasource::TableType;
 use datafusion::error::Result;
 use datafusion::logical_expr::{BinaryExpr, Expr, Operator, TableProviderFilterPushDown};
 use datafusion::physical_plan::ExecutionPlan;
+use futures::FutureExt as _;
+use futures::future::{BoxFuture, ready};
 use object_store::path::Path;
 
 use super::error::Fault;
@@ -269,7 +270,6 @@ impl Source {
     }
 }
 
-#[async_trait]
 impl TableProvider for McapTable {
     fn schema(&self) -> SchemaRef {
         self.schema.clone()
@@ -287,7 +287,27 @@ impl TableProvider for McapTable {
         Ok(filters.iter().map(one).collect())
     }
 
-    async fn scan(
+    // Written out for the compiler: in an `async fn` of this trait it proves anew that expressions are `Sync`, for seconds.
+    fn scan<'table, 'state, 'columns, 'filters, 'scan>(
+        &'table self,
+        state: &'state dyn Session,
+        projection: Option<&'columns Vec<usize>>,
+        filters: &'filters [Expr],
+        limit: Option<usize>,
+    ) -> BoxFuture<'scan, Result<Arc<dyn ExecutionPlan>>>
+    where
+        'table: 'scan,
+        'state: 'scan,
+        'columns: 'scan,
+        'filters: 'scan,
+        Self: 'scan,
+    {
+        ready(self.messages(state, projection, filters, limit)).boxed()
+    }
+}
+
+impl McapTable {
+    fn messages(
         &self,
         state: &dyn Session,
         projection: Option<&Vec<usize>>,
@@ -306,9 +326,7 @@ impl TableProvider for McapTable {
         let scan = Scan { parts: self.parts.clone(), schema, projection, times, limit };
         Ok(Arc::new(McapExec::new(scan, pieces, all, state.config().target_partitions())))
     }
-}
 
-impl McapTable {
     // Which files pass the filters of surface and run.
     fn runs<'a>(&self, filters: impl Iterator<Item = &'a Expr>, state: &dyn Session) -> Result<Vec<bool>> {
         let schema = Arc::new(Schema::new(vec![Head::Surface.field(), Head::Run.field()]));

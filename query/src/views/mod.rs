@@ -1,11 +1,12 @@
 //! Views with the joins that most queries need. Computed by each query, never stored.
 //!
-//! Each is SQL over the lake's tables, planned once per snapshot and merged into the queries that name it, so that
-//! their filters and columns reach the scans beneath.
+//! Each is SQL over the lake's tables, planned once per snapshot, by the first query that names it, and merged into the
+//! queries that name it, so that their filters and columns reach the scans beneath.
 
 mod augmented;
 mod catalogue;
 mod ir;
+mod lazy_view;
 mod lookup;
 mod pair_join;
 mod sorted_nulls;
@@ -17,6 +18,7 @@ use std::sync::Arc;
 
 use arrow::datatypes::{Field, SchemaRef};
 use datafusion::common::metadata::FieldMetadata;
+use datafusion::datasource::empty::EmptyTable;
 use datafusion::datasource::{TableProvider, ViewTable};
 use datafusion::error::{DataFusionError, Result};
 use datafusion::logical_expr::{LogicalPlan, LogicalPlanBuilder};
@@ -27,6 +29,7 @@ use futures::FutureExt as _;
 
 use crate::system::{self, SYSTEM_SCHEMA};
 
+pub(crate) use lazy_view::LazyView;
 pub(crate) use lookup::LookupFunctions;
 pub(crate) use pair_join::PairJoin;
 pub(crate) use sorted_nulls::SortedNulls;
@@ -147,17 +150,12 @@ impl LakeView {
         Ok(ViewTable::new(annotated(plan, &self.notes(lake))?, Some(sql)))
     }
 
-    /// Returns its schema.
-    ///
-    /// # Errors
-    /// As [`LakeView::over`].
-    pub(crate) fn schema(self, lake: &Lake, lookups: &LookupFunctions) -> Result<SchemaRef> {
-        let empty = |table: Table| -> Result<(Table, Arc<dyn TableProvider>)> {
-            let schema = table.schema(lake.rig());
-            Ok((table, Arc::new(datafusion::datasource::empty::EmptyTable::new(schema))))
+    /// Returns its schema, which is empty if the view does not fit the lake's tables.
+    pub(crate) fn schema(self, lake: &Lake, lookups: &LookupFunctions) -> SchemaRef {
+        let empty = |table: &Table| -> (Table, Arc<dyn TableProvider>) {
+            (*table, Arc::new(EmptyTable::new(table.schema(lake.rig()))))
         };
-        let tables = self.tables().iter().map(|t| empty(*t)).collect::<Result<_>>()?;
-        Ok(self.over(lake, lookups, &tables)?.schema())
+        LazyView::new(self, lake, lookups, self.tables().iter().map(empty).collect()).schema()
     }
 }
 

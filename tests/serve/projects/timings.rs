@@ -58,24 +58,28 @@ fn compare_times(statements: &[String; 2], count: &mut impl FnMut(bool, &str)) -
     Err([theirs, ours])
 }
 
-#[test]
-fn counts_of_others_rows_take_no_time() {
-    let [_, with] = with_and_without();
-    let scene = ProjectScene::serve(with);
-    let connect = |token: &str| {
-        let mut client = WireClient::connect(&scene.server, None);
-        assert_eq!(client.log_in(token), None);
-        client
-    };
-    let [mut theirs, mut ours] = [&scene.all, &scene.ours].map(|token| connect(token));
-    for table in COUNTED {
-        check_times(&format!("{table} over HTTP"), table, |may_see, sql| {
-            let answer = scene.sql(sql, if may_see { &scene.all } else { &scene.ours });
-            assert!(answer.starts_with("200"), "{sql}: {answer}");
-        });
-        check_times(&format!("{table} over Postgres' protocol"), table, |may_see, sql| {
-            let answer = if may_see { &mut theirs } else { &mut ours }.query(sql);
-            assert!(answer.is_ok(), "{sql}: {answer:?}");
-        });
+mod slow {
+    use super::*;
+
+    #[test]
+    fn counts_of_others_rows_take_no_time() {
+        let [_, with] = with_and_without();
+        let scene = ProjectScene::serve(with);
+        let connect = |token: &str| {
+            let mut client = WireClient::connect(&scene.server, None);
+            assert_eq!(client.log_in(token), None);
+            client
+        };
+        let [mut theirs, mut ours] = [&scene.all, &scene.ours].map(|token| connect(token));
+        for table in COUNTED {
+            check_times(&format!("{table} over HTTP"), table, |may_see, sql| {
+                let answer = scene.sql(sql, if may_see { &scene.all } else { &scene.ours });
+                assert!(answer.starts_with("200"), "{sql}: {answer}");
+            });
+            check_times(&format!("{table} over Postgres' protocol"), table, |may_see, sql| {
+                let answer = if may_see { &mut theirs } else { &mut ours }.query(sql);
+                assert!(answer.is_ok(), "{sql}: {answer:?}");
+            });
+        }
     }
 }

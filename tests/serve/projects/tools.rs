@@ -54,53 +54,58 @@ fn download(scene: &ProjectScene, file: &SharedFile) -> Vec<u8> {
     answer.body
 }
 
-#[test]
-fn others_runs_do_not_exist_for_agents() {
-    let [without, with] = with_and_without().map(ProjectScene::serve);
-    let (marks, hidden) = (with.marks(), with.hidden());
-    let query =
-        |ProjectAttempt { sql, .. }: &ProjectAttempt| (sql.clone(), "query", json!({ "sql": sql, "max_rows": 1000 }));
-    let asked = |tool: &'static str, arguments: Value| (arguments.to_string(), tool, arguments);
-    let tools = [
-        asked("surface_summary", json!({ "surface_id": hidden.surface })),
-        asked("run_summary", json!({ "run_id": hidden.run })),
-        asked("slice_url", json!({ "runs": [hidden.run] })),
-        asked("slice_url", json!({ "where": "pair_id < 3" })),
-        asked("slice_url", json!({ "where": format!("surface_id = '{}'", hidden.surface) })),
-        asked("slice_url", json!({ "runs": [hidden.run], "where": "pair_id < 3" })),
-    ];
-    for (asked, tool, arguments) in statements(&hidden, with.version()).iter().map(query).chain(tools) {
-        let [theirs, seen] = [&with.all, &with.ours].map(|token| call(&with, token, tool, &arguments));
-        assert_ne!(theirs, seen, "whoever may see it sees it: {asked}");
-        check_marks(&marks, &asked, &seen);
-        if is_repeatable(&asked) {
-            assert_eq!(seen, call(&without, &without.ours, tool, &arguments), "{asked}");
+mod slow {
+    use super::*;
+
+    #[test]
+    fn others_runs_do_not_exist_for_agents() {
+        let [without, with] = with_and_without().map(ProjectScene::serve);
+        let (marks, hidden) = (with.marks(), with.hidden());
+        let query = |ProjectAttempt { sql, .. }: &ProjectAttempt| {
+            (sql.clone(), "query", json!({ "sql": sql, "max_rows": 1000 }))
+        };
+        let asked = |tool: &'static str, arguments: Value| (arguments.to_string(), tool, arguments);
+        let tools = [
+            asked("surface_summary", json!({ "surface_id": hidden.surface })),
+            asked("run_summary", json!({ "run_id": hidden.run })),
+            asked("slice_url", json!({ "runs": [hidden.run] })),
+            asked("slice_url", json!({ "where": "pair_id < 3" })),
+            asked("slice_url", json!({ "where": format!("surface_id = '{}'", hidden.surface) })),
+            asked("slice_url", json!({ "runs": [hidden.run], "where": "pair_id < 3" })),
+        ];
+        for (asked, tool, arguments) in statements(&hidden, with.version()).iter().map(query).chain(tools) {
+            let [theirs, seen] = [&with.all, &with.ours].map(|token| call(&with, token, tool, &arguments));
+            assert_ne!(theirs, seen, "whoever may see it sees it: {asked}");
+            check_marks(&marks, &asked, &seen);
+            if is_repeatable(&asked) {
+                assert_eq!(seen, call(&without, &without.ours, tool, &arguments), "{asked}");
+            }
         }
     }
-}
 
-#[test]
-fn others_runs_do_not_exist_in_shared_tables() {
-    let [without, with] = with_and_without().map(ProjectScene::serve);
-    let marks = with.marks();
-    let about = |files: &[SharedFile]| files.iter().map(|file| file.about.clone()).collect::<Vec<_>>().join("\n");
-    for table in TABLES.into_iter().filter(|table| !NOT_SHARED.contains(table)) {
-        let [theirs, seen] = [&with.all, &with.ours].map(|token| list_shared(&with, token, table));
-        let alone = list_shared(&without, &without.ours, table);
-        assert_ne!(theirs.0, seen.0, "whoever may see it sees it: version of {table}");
-        assert_ne!(about(&theirs.1), about(&seen.1), "whoever may see it sees it: {table}");
-        check_marks(&marks, table, &about(&seen.1));
-        assert_eq!((&seen.0, about(&seen.1)), (&alone.0, about(&alone.1)), "{table}");
-        for (file, same) in seen.1.iter().zip(&alone.1) {
-            assert!(download(&with, file) == download(&without, same), "{}", file.about);
-        }
-        // A signature is of one client and one file.
-        let own = &seen.1.first().expect("a file").path;
-        for hidden in theirs.1.iter().filter(|file| !about(&seen.1).contains(&file.about)) {
-            assert!(!download(&with, hidden).is_empty());
-            let signed = own.strip_suffix(file_name(own)).expect("its end").to_owned() + file_name(&hidden.path);
-            let answer = with.send(HttpRequest::get(&signed), &with.ours);
-            assert_eq!(answer.status, 401, "{signed}: {}", answer.text());
+    #[test]
+    fn others_runs_do_not_exist_in_shared_tables() {
+        let [without, with] = with_and_without().map(ProjectScene::serve);
+        let marks = with.marks();
+        let about = |files: &[SharedFile]| files.iter().map(|file| file.about.clone()).collect::<Vec<_>>().join("\n");
+        for table in TABLES.into_iter().filter(|table| !NOT_SHARED.contains(table)) {
+            let [theirs, seen] = [&with.all, &with.ours].map(|token| list_shared(&with, token, table));
+            let alone = list_shared(&without, &without.ours, table);
+            assert_ne!(theirs.0, seen.0, "whoever may see it sees it: version of {table}");
+            assert_ne!(about(&theirs.1), about(&seen.1), "whoever may see it sees it: {table}");
+            check_marks(&marks, table, &about(&seen.1));
+            assert_eq!((&seen.0, about(&seen.1)), (&alone.0, about(&alone.1)), "{table}");
+            for (file, same) in seen.1.iter().zip(&alone.1) {
+                assert!(download(&with, file) == download(&without, same), "{}", file.about);
+            }
+            // A signature is of one client and one file.
+            let own = &seen.1.first().expect("a file").path;
+            for hidden in theirs.1.iter().filter(|file| !about(&seen.1).contains(&file.about)) {
+                assert!(!download(&with, hidden).is_empty());
+                let signed = own.strip_suffix(file_name(own)).expect("its end").to_owned() + file_name(&hidden.path);
+                let answer = with.send(HttpRequest::get(&signed), &with.ours);
+                assert_eq!(answer.status, 401, "{signed}: {}", answer.text());
+            }
         }
     }
 }
