@@ -180,41 +180,6 @@ fn cut_off(whole: &[u8]) -> &[u8] {
     &whole[..last as usize + 10]
 }
 
-#[test]
-fn run_files_that_are_none_or_damaged() {
-    let place = TestFolder::new();
-    let run = place.acquire("flat", &["--checkpoint-every", "5"]);
-    let whole = std::fs::read(&run).expect("the run");
-    std::fs::remove_file(&run).expect("removed");
-    let ingest = |name: &str, bytes: &[u8], code: i32, expected: &str| {
-        std::fs::write(place.path(name), bytes).expect("written");
-        place.fails(code, &["ingest", name], expected);
-    };
-    ingest("empty.mcap", b"", 1, "the file is empty");
-    ingest("text.mcap", b"this is no MCAP file at all", 1, "not an MCAP file");
-    let mut foreign = std::io::Cursor::new(Vec::new());
-    mcap::Writer::new(&mut foreign).expect("a writer").finish().expect("closed");
-    ingest("foreign.mcap", foreign.get_ref(), 1, "no run of echolake");
-    assert_eq!(place.number("select count(*) from runs"), 0.0);
-
-    // Cut off near its end: what was complete is taken in.
-    ingest("cut.mcap", cut_off(&whole), 3, "its recording was cut off");
-    let kept = place.number("select count(*) from measurements");
-    assert!(kept > 0.0 && kept < 45.0, "{kept}");
-    assert_eq!(place.sql("select state from runs")[0]["state"], "partial");
-    // The whole file has other content under the same name.
-    ingest("whole.mcap", &whole, 1, "already in the lake with other content");
-
-    let other = TestFolder::new();
-    other.acquire("wavy", &["--seed", "5"]);
-    let mut flipped = whole.clone();
-    let at = flipped.len() / 2;
-    flipped[at] ^= 0x10;
-    std::fs::write(other.path("flipped.mcap"), &flipped).expect("written");
-    other.fails(3, &["ingest", "flipped.mcap"], "warning: ");
-    other.fails(0, &["ingest"], "45 measurements");
-}
-
 // The system ends a process that writes larger files than it may: heights are as large, and flat ones are not.
 #[test]
 fn a_run_that_ends_ingest_is_passed_over_by_the_next_one() {
@@ -431,5 +396,40 @@ mod slow {
             height("two_1") > 1.0 && (height("two_1") - height("from_file")).abs() < 0.5,
             "the back is the wavy one"
         );
+    }
+
+    #[test]
+    fn run_files_that_are_none_or_damaged() {
+        let place = TestFolder::new();
+        let run = place.acquire("flat", &["--checkpoint-every", "5"]);
+        let whole = std::fs::read(&run).expect("the run");
+        std::fs::remove_file(&run).expect("removed");
+        let ingest = |name: &str, bytes: &[u8], code: i32, expected: &str| {
+            std::fs::write(place.path(name), bytes).expect("written");
+            place.fails(code, &["ingest", name], expected);
+        };
+        ingest("empty.mcap", b"", 1, "the file is empty");
+        ingest("text.mcap", b"this is no MCAP file at all", 1, "not an MCAP file");
+        let mut foreign = std::io::Cursor::new(Vec::new());
+        mcap::Writer::new(&mut foreign).expect("a writer").finish().expect("closed");
+        ingest("foreign.mcap", foreign.get_ref(), 1, "no run of echolake");
+        assert_eq!(place.number("select count(*) from runs"), 0.0);
+
+        // Cut off near its end: what was complete is taken in.
+        ingest("cut.mcap", cut_off(&whole), 3, "its recording was cut off");
+        let kept = place.number("select count(*) from measurements");
+        assert!(kept > 0.0 && kept < 45.0, "{kept}");
+        assert_eq!(place.sql("select state from runs")[0]["state"], "partial");
+        // The whole file has other content under the same name.
+        ingest("whole.mcap", &whole, 1, "already in the lake with other content");
+
+        let other = TestFolder::new();
+        other.acquire("wavy", &["--seed", "5"]);
+        let mut flipped = whole.clone();
+        let at = flipped.len() / 2;
+        flipped[at] ^= 0x10;
+        std::fs::write(other.path("flipped.mcap"), &flipped).expect("written");
+        other.fails(3, &["ingest", "flipped.mcap"], "warning: ");
+        other.fails(0, &["ingest"], "45 measurements");
     }
 }

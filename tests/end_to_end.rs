@@ -26,74 +26,6 @@ fn every_command_explains_itself() {
 }
 
 #[test]
-fn references_complete_what_waits_and_the_physics_holds() {
-    let place = TestFolder::new();
-    place.acquire("wood", &["--seed", "3"]);
-    place.fails(0, &["ingest"], "waits for reference flat, foam");
-    assert_eq!(place.number("select count(*) from measurements"), PAIRS);
-    assert_eq!(place.number("select count(*) from tnce"), 0.0);
-    assert_eq!(place.sql("select state, missing from runs")[0]["state"], "waiting");
-
-    place.acquire("flat", &["--seed", "1"]);
-    place.acquire("foam", &["--seed", "2"]);
-    // A second Foam run under a name of its own: what the first one does not explain is noise and drift.
-    place.acquire("foam_2", &["--seed", "4"]);
-    place.ok(&["ingest"]);
-    assert_eq!(place.number("select count(*) from runs where state = 'complete' and missing = ''"), 4.0);
-    assert_eq!(place.number("select count(*) from tnce"), 4.0 * PAIRS);
-    assert_eq!(place.number("select count(*) from tnce_d4"), 4.0 * PAIRS * 8.0);
-    assert_eq!(place.number("select count(*) from heightmaps"), 4.0 * 8.0);
-    assert_eq!(place.number("select count(*) from surfaces where origin = 'simulated'"), 4.0);
-
-    // Flat over itself is 1, and its bands sum to it.
-    let off =
-        "select max(abs(tnce_total - 1)) + max(abs(tnce_2500 + tnce_5000 + tnce_10000 + tnce_20000 + tnce_40000 - 1))
-               + max(abs(tnce_band_5000 - 1)) from tnce where surface_id = 'flat'";
-    assert!(place.number(off) < 1e-4);
-    // The second Foam run lies 25 dB under Flat at least, on the mean over the pairs.
-    let foam = place.number("select 10 * log10(avg(tnce_total)) from tnce where surface_id = 'foam_2'");
-    assert!(foam < -25.0, "{foam} dB");
-    // Flat reflects 29.3 % less energy than Wood (Rust et al. 2021); the grid, noise and drift leave less than 1 %.
-    let wood = place.number("select avg(tnce_total) from tnce where surface_id = 'wood'");
-    let expected = 1.0 / (1.0 - 0.293);
-    assert!((wood / expected - 1.0).abs() < 0.01, "{wood} {expected}");
-
-    // The same runs again add nothing, and say so.
-    let before = place.sql("select run_id, run_derivation, reference_derivation from runs order by run_id");
-    let name = before[0]["run_id"].as_str().expect("a name").to_owned();
-    place.fails(0, &["ingest", &name], "is in the lake already, nothing added");
-    assert_eq!(place.sql("select run_id, run_derivation, reference_derivation from runs order by run_id"), before);
-    let report: serde_json::Value = serde_json::from_str(&place.ok(&["doctor", "--json"])).expect("JSON");
-    let findings = report["findings"].as_array().expect("a list");
-    assert!(findings.iter().all(|f| f["severity"] == "note"), "{findings:?}");
-    assert_eq!(report["runs"], 4);
-}
-
-#[test]
-fn a_second_flat_run_rewrites_its_dependants_and_a_lost_table_is_made_anew() {
-    let place = TestFolder::new();
-    for (surface, seed) in [("flat", "1"), ("foam", "2"), ("wavy", "3")] {
-        place.acquire(surface, &["--seed", seed]);
-    }
-    place.ok(&["ingest"]);
-    let version = |place: &TestFolder| place.sql("select distinct flat_version from nce where surface_id = 'wavy'");
-    let first = version(&place);
-    place.acquire("flat", &["--seed", "9"]);
-    place.ok(&["ingest"]);
-    let second = version(&place);
-    assert_eq!(second.len(), 1, "only the new derivation is seen");
-    assert_ne!(first, second);
-    assert!(second[0]["flat_version"].as_str().expect("text").starts_with("flat:2:"), "{second:?}");
-    let sum = "select sum(tnce_total) from tnce where surface_id = 'wavy'";
-    let before = place.number(sum);
-    // Tables can be deleted: the runs are the truth.
-    std::fs::remove_dir_all(place.path("lake/tables")).expect("removed");
-    place.ok(&["ingest"]);
-    assert_eq!(place.number("select count(*) from measurements"), 4.0 * PAIRS);
-    assert_eq!(place.number(sum), before);
-}
-
-#[test]
 fn answers_come_in_every_format_or_are_refused_clearly() {
     let place = TestFolder::new();
     place.acquire("flat", &[]);
@@ -169,10 +101,11 @@ fn a_gir_folder_becomes_runs_with_references_of_their_own() {
 }
 
 mod slow {
+    use super::*;
     use std::path::Path;
 
     use crate::ECHOLAKE;
-    use crate::acquire_kills::{AcquireKillCampaign, AcquireKillCounts, PAIRS};
+    use crate::acquire_kills::{self, AcquireKillCampaign, AcquireKillCounts};
     use crate::kills::KillCampaign;
 
     // The long form is the campaign `kills`.
@@ -208,6 +141,74 @@ mod slow {
     // A kill between a pair's checkpoint and its line keeps the pair and loses the line.
     fn check_acknowledged(outcome: &AcquireKillCounts) {
         assert_eq!(outcome.killed, 6);
-        assert!(outcome.acknowledged + outcome.killed >= PAIRS, "{outcome:?}");
+        assert!(outcome.acknowledged + outcome.killed >= acquire_kills::PAIRS, "{outcome:?}");
+    }
+
+    #[test]
+    fn references_complete_what_waits_and_the_physics_holds() {
+        let place = TestFolder::new();
+        place.acquire("wood", &["--seed", "3"]);
+        place.fails(0, &["ingest"], "waits for reference flat, foam");
+        assert_eq!(place.number("select count(*) from measurements"), PAIRS);
+        assert_eq!(place.number("select count(*) from tnce"), 0.0);
+        assert_eq!(place.sql("select state, missing from runs")[0]["state"], "waiting");
+
+        place.acquire("flat", &["--seed", "1"]);
+        place.acquire("foam", &["--seed", "2"]);
+        // A second Foam run under a name of its own: what the first one does not explain is noise and drift.
+        place.acquire("foam_2", &["--seed", "4"]);
+        place.ok(&["ingest"]);
+        assert_eq!(place.number("select count(*) from runs where state = 'complete' and missing = ''"), 4.0);
+        assert_eq!(place.number("select count(*) from tnce"), 4.0 * PAIRS);
+        assert_eq!(place.number("select count(*) from tnce_d4"), 4.0 * PAIRS * 8.0);
+        assert_eq!(place.number("select count(*) from heightmaps"), 4.0 * 8.0);
+        assert_eq!(place.number("select count(*) from surfaces where origin = 'simulated'"), 4.0);
+
+        // Flat over itself is 1, and its bands sum to it.
+        let off =
+            "select max(abs(tnce_total - 1)) + max(abs(tnce_2500 + tnce_5000 + tnce_10000 + tnce_20000 + tnce_40000 - 1))
+                   + max(abs(tnce_band_5000 - 1)) from tnce where surface_id = 'flat'";
+        assert!(place.number(off) < 1e-4);
+        // The second Foam run lies 25 dB under Flat at least, on the mean over the pairs.
+        let foam = place.number("select 10 * log10(avg(tnce_total)) from tnce where surface_id = 'foam_2'");
+        assert!(foam < -25.0, "{foam} dB");
+        // Flat reflects 29.3 % less energy than Wood (Rust et al. 2021); the grid, noise and drift leave less than 1 %.
+        let wood = place.number("select avg(tnce_total) from tnce where surface_id = 'wood'");
+        let expected = 1.0 / (1.0 - 0.293);
+        assert!((wood / expected - 1.0).abs() < 0.01, "{wood} {expected}");
+
+        // The same runs again add nothing, and say so.
+        let before = place.sql("select run_id, run_derivation, reference_derivation from runs order by run_id");
+        let name = before[0]["run_id"].as_str().expect("a name").to_owned();
+        place.fails(0, &["ingest", &name], "is in the lake already, nothing added");
+        assert_eq!(place.sql("select run_id, run_derivation, reference_derivation from runs order by run_id"), before);
+        let report: serde_json::Value = serde_json::from_str(&place.ok(&["doctor", "--json"])).expect("JSON");
+        let findings = report["findings"].as_array().expect("a list");
+        assert!(findings.iter().all(|f| f["severity"] == "note"), "{findings:?}");
+        assert_eq!(report["runs"], 4);
+    }
+
+    #[test]
+    fn a_second_flat_run_rewrites_its_dependants_and_a_lost_table_is_made_anew() {
+        let place = TestFolder::new();
+        for (surface, seed) in [("flat", "1"), ("foam", "2"), ("wavy", "3")] {
+            place.acquire(surface, &["--seed", seed]);
+        }
+        place.ok(&["ingest"]);
+        let version = |place: &TestFolder| place.sql("select distinct flat_version from nce where surface_id = 'wavy'");
+        let first = version(&place);
+        place.acquire("flat", &["--seed", "9"]);
+        place.ok(&["ingest"]);
+        let second = version(&place);
+        assert_eq!(second.len(), 1, "only the new derivation is seen");
+        assert_ne!(first, second);
+        assert!(second[0]["flat_version"].as_str().expect("text").starts_with("flat:2:"), "{second:?}");
+        let sum = "select sum(tnce_total) from tnce where surface_id = 'wavy'";
+        let before = place.number(sum);
+        // Tables can be deleted: the runs are the truth.
+        std::fs::remove_dir_all(place.path("lake/tables")).expect("removed");
+        place.ok(&["ingest"]);
+        assert_eq!(place.number("select count(*) from measurements"), 4.0 * PAIRS);
+        assert_eq!(place.number(sum), before);
     }
 }

@@ -86,28 +86,6 @@ fn tables_have_the_numbers_of_the_lake() {
 }
 
 #[test]
-fn every_figure_is_a_file() {
-    let place = lake();
-    let names = ["filters", "coverage", "map"];
-    for args in [&names[..1], &names[1..2], &names[2..], &["steps", "wood", "--celsius", "30,15"], &["relief", "wood"]]
-    {
-        let name = args[0];
-        let files = ["svg", "pdf", "png"].map(|extension| format!("{name}.{extension}"));
-        let output: Vec<&str> = files.iter().flat_map(|file| ["-o", file]).collect();
-        place.ok(&[&["figure"], args, &output[..]].concat());
-        let [svg, pdf, png] = files.map(|file| std::fs::read(place.path(&file)).expect("read"));
-        assert!(svg.starts_with(b"<svg ") && svg.ends_with(b"</svg>\n"), "{name}");
-        assert!(pdf.starts_with(b"%PDF-") && pdf.windows(14).any(|w| w == b"(echolake 0.1."), "{name}");
-        assert!(png.starts_with(b"\x89PNG") && png.windows(8).any(|w| w == b"iTXtLake"), "{name}");
-    }
-    place.ok(&["figure", "grid", "--where", "surface_id <> 'foam'", "-o", "each/{surface}.svg"]);
-    let mut written: Vec<_> =
-        std::fs::read_dir(place.path("each")).expect("listed").map(|e| e.expect("an entry").file_name()).collect();
-    written.sort();
-    assert_eq!(written, ["flat.svg", "wood.svg"]);
-}
-
-#[test]
 fn refusals_say_what_is_there() {
     let place = lake();
     place.fails(1, &["figure", "grid", "brick"], "surface `brick` is not in the lake");
@@ -121,4 +99,31 @@ fn refusals_say_what_is_there() {
     place.fails(1, &["figure", "grid", "wood", "--band", "7"], "there is no band `7`");
     place.fails(1, &["figure", "steps", "wood", "--pair", "99999"], "has no pair 99999");
     place.fails(2, &["figure", "grid"], "required");
+}
+
+mod slow {
+    use super::*;
+
+    #[test]
+    fn every_figure_is_a_file() {
+        let place = lake();
+        let names = ["filters", "coverage", "map"];
+        for args in
+            [&names[..1], &names[1..2], &names[2..], &["steps", "wood", "--celsius", "30,15"], &["relief", "wood"]]
+        {
+            let name = args[0];
+            let files = ["svg", "pdf", "png"].map(|extension| format!("{name}.{extension}"));
+            let output: Vec<&str> = files.iter().flat_map(|file| ["-o", file]).collect();
+            place.ok(&[&["figure"], args, &output[..]].concat());
+            let [svg, pdf, png] = files.map(|file| std::fs::read(place.path(&file)).expect("read"));
+            assert!(svg.starts_with(b"<svg ") && svg.ends_with(b"</svg>\n"), "{name}");
+            assert!(pdf.starts_with(b"%PDF-") && pdf.windows(14).any(|w| w == b"(echolake 0.1."), "{name}");
+            assert!(png.starts_with(b"\x89PNG") && png.windows(8).any(|w| w == b"iTXtLake"), "{name}");
+        }
+        place.ok(&["figure", "grid", "--where", "surface_id <> 'foam'", "-o", "each/{surface}.svg"]);
+        let mut written: Vec<_> =
+            std::fs::read_dir(place.path("each")).expect("listed").map(|e| e.expect("an entry").file_name()).collect();
+        written.sort();
+        assert_eq!(written, ["flat.svg", "wood.svg"]);
+    }
 }

@@ -211,30 +211,6 @@ fn tokens_let_in_and_are_needed_beyond_this_machine() {
 }
 
 #[test]
-fn a_query_ends_with_its_client() {
-    let place = lake();
-    let server = served(&place, &[]);
-    let asked = HttpRequest::post("/api/v1/sql", ENDLESS).with("content-type", "text/plain").begin(&server);
-    wait_until("it runs", || running(&server) == 1.0);
-    drop(asked);
-    wait_until("it ends with its connection", || running(&server) == 0.0);
-    let mut client = postgres::WireClient::connect(&server, None);
-    client.begin(ENDLESS);
-    wait_until("it runs", || running(&server) == 1.0);
-    drop(client);
-    wait_until("it ends with its connection", || running(&server) == 0.0);
-    let mut client = postgres::WireClient::connect(&server, None);
-    client.begin(ENDLESS);
-    wait_until("it runs", || running(&server) == 1.0);
-    client.cancel(&server);
-    assert_eq!(client.rows(), Err("57014".to_owned()));
-    wait_until("it ends by a CancelRequest", || running(&server) == 0.0);
-    assert_eq!(client.query("select 2 as two"), Ok(vec![vec![Some("2".to_owned())]]));
-    client.query("set statement_timeout = '200ms'").expect("set");
-    assert_eq!(client.query(ENDLESS), Err("57014".to_owned()));
-}
-
-#[test]
 fn a_short_answer_does_not_look_whole() {
     let place = lake();
     let server = served(&place, &[]);
@@ -342,6 +318,7 @@ fn it_stops_when_told() {
 }
 
 mod slow {
+    use super::*;
     use std::path::Path;
 
     use crate::ECHOLAKE;
@@ -365,5 +342,29 @@ mod slow {
         let mut campaign = FuzzCampaign::new(Path::new(ECHOLAKE), 1, serve);
         let outcome = campaign.throw(target, &mut |so_far| so_far.rounds < 100);
         assert!(outcome.answered > 0, "{}: some are right all the same", target.name());
+    }
+
+    #[test]
+    fn a_query_ends_with_its_client() {
+        let place = lake();
+        let server = served(&place, &[]);
+        let asked = HttpRequest::post("/api/v1/sql", ENDLESS).with("content-type", "text/plain").begin(&server);
+        wait_until("it runs", || running(&server) == 1.0);
+        drop(asked);
+        wait_until("it ends with its connection", || running(&server) == 0.0);
+        let mut client = postgres::WireClient::connect(&server, None);
+        client.begin(ENDLESS);
+        wait_until("it runs", || running(&server) == 1.0);
+        drop(client);
+        wait_until("it ends with its connection", || running(&server) == 0.0);
+        let mut client = postgres::WireClient::connect(&server, None);
+        client.begin(ENDLESS);
+        wait_until("it runs", || running(&server) == 1.0);
+        client.cancel(&server);
+        assert_eq!(client.rows(), Err("57014".to_owned()));
+        wait_until("it ends by a CancelRequest", || running(&server) == 0.0);
+        assert_eq!(client.query("select 2 as two"), Ok(vec![vec![Some("2".to_owned())]]));
+        client.query("set statement_timeout = '200ms'").expect("set");
+        assert_eq!(client.query(ENDLESS), Err("57014".to_owned()));
     }
 }

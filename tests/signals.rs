@@ -31,23 +31,6 @@ fn check(place: &TestFolder, args: &[&str], line: &str, code: i32, expected: &st
 }
 
 #[test]
-fn whoever_announces_itself_can_be_stopped() {
-    let place = TestFolder::new();
-    place.acquire("flat", &["--ir-only"]);
-    place.ok(&["ingest"]);
-    let any = "127.0.0.1:0";
-    check(&place, &["replay", "flat", "--listen", any], "ws://", 0, "recordings");
-    let serve = ["serve", "--listen", any, "--flight-sql", any, "--postgres", any];
-    check(&place, &serve, "lake", 0, "answers may go on");
-    check(&place, &["ingest", "--watch"], "watching", 0, "clean place");
-    let acquire = ["acquire", "--surface", "foam", "--rig", "rig.toml", "--pace", "1", "--live", any];
-    check(&place, &acquire, "simulated rig", 0, "pairs left; nothing that was measured is lost");
-    // More surfaces than are measured before the signal comes, however late it is.
-    let demo = ["demo", "--surfaces", "2000", "--ir-only", "--rig", "rig.toml"];
-    check(&place, &demo, "simulated rig", 1, "run the same command again to resume");
-}
-
-#[test]
 fn the_demo_can_be_stopped_while_it_serves() {
     let place = TestFolder::new();
     check(&place, &["demo", "--surfaces", "2", "--ir-only", "--rig", "rig.toml"], "http://", 0, "clean place");
@@ -64,5 +47,26 @@ fn a_second_signal_ends_at_once() {
         child.wait_for_line("stopping after the current pair");
         child.signal(signal);
         assert_eq!(child.wait().status.code(), Some(code), "SIG{signal}");
+    }
+}
+
+mod slow {
+    use super::*;
+
+    #[test]
+    fn whoever_announces_itself_can_be_stopped() {
+        let place = TestFolder::new();
+        place.acquire("flat", &["--ir-only"]);
+        place.ok(&["ingest"]);
+        let any = "127.0.0.1:0";
+        check(&place, &["replay", "flat", "--listen", any], "ws://", 0, "recordings");
+        let serve = ["serve", "--listen", any, "--flight-sql", any, "--postgres", any];
+        check(&place, &serve, "lake", 0, "answers may go on");
+        check(&place, &["ingest", "--watch"], "watching", 0, "clean place");
+        let acquire = ["acquire", "--surface", "foam", "--rig", "rig.toml", "--pace", "1", "--live", any];
+        check(&place, &acquire, "simulated rig", 0, "pairs left; nothing that was measured is lost");
+        // More surfaces than are measured before the signal comes, however late it is.
+        let demo = ["demo", "--surfaces", "2000", "--ir-only", "--rig", "rig.toml"];
+        check(&place, &demo, "simulated rig", 1, "run the same command again to resume");
     }
 }

@@ -2,40 +2,6 @@
 
 use super::TestFolder;
 
-#[test]
-fn sofa_out_and_in_again() {
-    let (place, other) = (TestFolder::new(), TestFolder::new());
-    for (surface, panel, seed) in [("flat", "flat", "1"), ("foam", "foam", "2"), ("0015_0", "macrostructure", "3")] {
-        place.acquire(surface, &["--seed", seed, "--panel", panel, "--ir-only"]);
-    }
-    place.ok(&["ingest"]);
-    place.ok(&["export", "sofa", "-o", &other.path("out").to_string_lossy()]);
-    let runs = other.ok(&["import", "sofa", "--rig", "rig.toml", "out/flat.sofa", "out/foam.sofa", "out/0015_0.sofa"]);
-    assert_eq!(runs.lines().count(), 3);
-    other.ok(&["ingest"]);
-    let responses = "select surface_id, pair_id, ir from measurements order by surface_id, pair_id";
-    let original = place.sql(responses);
-    assert_eq!(original.len(), 3 * 45);
-    assert!(original == other.sql(responses), "responses are the same");
-    // And with them what is derived of them.
-    let derived = "select surface_id, pair_id, tnce_total, tnce_2500 from tnce order by surface_id, pair_id";
-    assert!(place.sql(derived) == other.sql(derived), "curves are the same");
-    // What the format does not hold: the measured temperature, and times below a second.
-    let air = other.sql("select distinct temperature_c, humidity_pct from measurements");
-    assert_eq!((air.len(), air[0]["temperature_c"].as_f64()), (1, Some(20.0)));
-    let late = "select max(abs(log_time_ns - floor(log_time_ns / 1e9) * 1e9)) from measurements";
-    assert!(other.number(late) < 1e6, "whole seconds, and a microsecond where two would be one");
-    assert_eq!(other.sql("select distinct origin from runs")[0]["origin"], "imported_sofa");
-
-    // Two files of a surface are refused before there is a lake.
-    let third = TestFolder::new();
-    for copy in ["a.sofa", "b.sofa"] {
-        std::fs::copy(other.path("out/flat.sofa"), third.path(copy)).expect("copied");
-    }
-    third.fails(1, &["import", "sofa", "--rig", "rig.toml", "a.sofa", "b.sofa"], "a second file of surface flat");
-    assert!(!third.path("lake").exists());
-}
-
 // A SOFA file of one pair is a set in HDF5, too.
 #[test]
 fn a_mapped_set_is_what_its_file_has() {
@@ -63,4 +29,44 @@ fn a_mapped_set_is_what_its_file_has() {
     assert_eq!(place.sql(responses).len(), 1);
     assert!(place.sql(responses) == other.sql(responses), "the response is the same");
     assert_eq!(other.sql("select origin from runs")[0]["origin"], "imported_hdf5");
+}
+
+mod slow {
+    use super::*;
+
+    #[test]
+    fn sofa_out_and_in_again() {
+        let (place, other) = (TestFolder::new(), TestFolder::new());
+        for (surface, panel, seed) in [("flat", "flat", "1"), ("foam", "foam", "2"), ("0015_0", "macrostructure", "3")]
+        {
+            place.acquire(surface, &["--seed", seed, "--panel", panel, "--ir-only"]);
+        }
+        place.ok(&["ingest"]);
+        place.ok(&["export", "sofa", "-o", &other.path("out").to_string_lossy()]);
+        let runs =
+            other.ok(&["import", "sofa", "--rig", "rig.toml", "out/flat.sofa", "out/foam.sofa", "out/0015_0.sofa"]);
+        assert_eq!(runs.lines().count(), 3);
+        other.ok(&["ingest"]);
+        let responses = "select surface_id, pair_id, ir from measurements order by surface_id, pair_id";
+        let original = place.sql(responses);
+        assert_eq!(original.len(), 3 * 45);
+        assert!(original == other.sql(responses), "responses are the same");
+        // And with them what is derived of them.
+        let derived = "select surface_id, pair_id, tnce_total, tnce_2500 from tnce order by surface_id, pair_id";
+        assert!(place.sql(derived) == other.sql(derived), "curves are the same");
+        // What the format does not hold: the measured temperature, and times below a second.
+        let air = other.sql("select distinct temperature_c, humidity_pct from measurements");
+        assert_eq!((air.len(), air[0]["temperature_c"].as_f64()), (1, Some(20.0)));
+        let late = "select max(abs(log_time_ns - floor(log_time_ns / 1e9) * 1e9)) from measurements";
+        assert!(other.number(late) < 1e6, "whole seconds, and a microsecond where two would be one");
+        assert_eq!(other.sql("select distinct origin from runs")[0]["origin"], "imported_sofa");
+
+        // Two files of a surface are refused before there is a lake.
+        let third = TestFolder::new();
+        for copy in ["a.sofa", "b.sofa"] {
+            std::fs::copy(other.path("out/flat.sofa"), third.path(copy)).expect("copied");
+        }
+        third.fails(1, &["import", "sofa", "--rig", "rig.toml", "a.sofa", "b.sofa"], "a second file of surface flat");
+        assert!(!third.path("lake").exists());
+    }
 }

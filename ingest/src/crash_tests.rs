@@ -147,81 +147,11 @@ async fn each_death<T, E: std::fmt::Debug>(
     deaths
 }
 
-#[tokio::test(flavor = "multi_thread")]
-async fn upkeep_beside_ingest_loses_nothing_and_doubles_nothing() {
-    let surfaces = ["flat", "foam", "wood", "prd", "brick", "wavy", "flat_2", "wood_2"];
-    let runs = runs(&surfaces);
-    let undisturbed = with_inbox(&runs).await;
-    ingest(undisturbed.clone()).await.expect("ingested");
-    let expected = rows(undisturbed).await;
-    let store = with_inbox(&runs[..2]).await;
-    ingest(store.clone()).await.expect("ingested");
-    let done = Arc::new(AtomicBool::new(false));
-    let upkeep = tokio::spawn({
-        let (store, done) = (store.clone(), done.clone());
-        async move {
-            let mut rounds = 0;
-            while !done.load(Ordering::SeqCst) {
-                tidy(store.clone()).await.expect("tidied");
-                rounds += 1;
-            }
-            rounds
-        }
-    });
-    for (name, bytes) in &runs[2..] {
-        store.put(&Path::from(format!("inbox/{name}")), bytes.clone().into()).await.expect("written");
-        // Nothing is kept for readers here, so that ingest may find a file gone that was merged meanwhile: it is run
-        // again.
-        let mut tries = 0;
-        while let Err(e) = ingest(store.clone()).await {
-            tries += 1;
-            assert!(tries < 20, "{name}: {e}");
-        }
-    }
-    done.store(true, Ordering::SeqCst);
-    assert!(upkeep.await.expect("no panic") > 0);
-    ingest(store.clone()).await.expect("ingested");
-    let seen = rows(store).await;
-    for (table, rows) in &expected {
-        assert_eq!(seen.get(table).map(Vec::len), Some(rows.len()), "{table}");
-    }
-    assert!(seen == expected, "other rows");
-}
-
 /// Ahead or behind.
 const SKEW: TimeDelta = TimeDelta::minutes(5);
 
 fn skewed(store: &Arc<InMemory>, skew: TimeDelta, interlude: Option<Interlude>) -> Arc<dyn ObjectStore> {
     SkewedStore::new(store.clone(), skew, interlude)
-}
-
-// The rows that replace others are in their logs, and another machine cleans up before `runs` names them.
-#[tokio::test(flavor = "multi_thread")]
-async fn a_clean_up_just_before_the_rows_are_named_takes_none_of_them_whatever_the_clocks_say() {
-    let runs = runs(&["flat", "foam", "wood", "flat"]);
-    let undisturbed = with_inbox(&runs[..3]).await;
-    ingest(undisturbed.clone()).await.expect("ingested");
-    let (name, bytes) = &runs[3];
-    let inbox = Path::from(format!("inbox/{name}"));
-    undisturbed.put(&inbox, bytes.clone().into()).await.expect("written");
-    ingest(undisturbed.clone()).await.expect("ingested");
-    let expected = tables(undisturbed).await;
-    for (first, second) in [(SKEW, -SKEW), (-SKEW, SKEW), (SKEW, TimeDelta::zero())] {
-        let store = with_inbox(&runs[..3]).await;
-        ingest(skewed(&store, first, None)).await.expect("ingested");
-        store.put(&inbox, bytes.clone().into()).await.expect("written");
-        let other = store.clone();
-        let clean_up: Interlude = Arc::new(move || {
-            let store = skewed(&other, first, None);
-            Box::pin(async move {
-                lake(store).await.expect("opened").remove_superseded().await.expect("cleaned up");
-            })
-        });
-        ingest(skewed(&store, second, Some(clean_up))).await.expect("ingested");
-        let (seen, logged) = tables(store).await;
-        assert_eq!(logged, expected.1, "clocks {first} and {second}");
-        assert!(seen == expected.0, "clocks {first} and {second}: other bytes");
-    }
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -418,85 +348,155 @@ mod slow {
             assert!(seen == expected.0, "other bytes");
         }
     }
+
+    // Of eight runs, a process that died had claimed one, and had brought it to its place; a live one gives its own back.
+    #[tokio::test(flavor = "multi_thread")]
+    async fn what_others_claimed_and_did_not_do_is_done_after_a_while_and_by_one_ingest_alone() {
+        let runs = runs(&["flat", "foam", "wood", "prd", "brick", "wavy", "flat_2", "wood_2"]);
+        let undisturbed = with_inbox(&runs).await;
+        ingest(undisturbed.clone()).await.expect("ingested");
+        let expected = rows(undisturbed).await;
+        let store = with_inbox(&runs).await;
+        let lake = lake(store.clone()).await.expect("a lake");
+        let never = ClaimTimes { renew_every: Duration::from_secs(3600), ..IMPATIENT };
+        let dead = WorkClaims::start(&lake, never);
+        assert_eq!(dead.claim(&runs[2].0).await, ClaimOutcome::Granted);
+        let (from, to) = (format!("inbox/{}", runs[2].0), format!("runs/wood/{}", runs[2].0));
+        store.rename(&Path::from(from), &Path::from(to)).await.expect("moved");
+        let alive = WorkClaims::start(&lake, IMPATIENT);
+        assert_eq!(alive.claim(&runs[3].0).await, ClaimOutcome::Granted);
+        let work = async || {
+            let (mut taken, mut claimed) = (Vec::new(), 0);
+            let sources = pending(&lake).await.expect("listed");
+            let ingest = LakeIngest::new(&lake, Arc::default()).sharing(IMPATIENT);
+            let report = &mut |report: FileReport| match report {
+                FileReport::Taken(run) => taken.push(run.run.to_string()),
+                FileReport::Claimed(_) => claimed += 1,
+                FileReport::Gone(_) => {}
+                FileReport::Refused { source, why, .. } => panic!("{source}: {why}"),
+            };
+            ingest.take_in(sources, report).await.expect("ingested");
+            ingest.close().await;
+            (taken, claimed)
+        };
+        let give_back = async {
+            tokio::time::sleep(Duration::from_secs(1)).await;
+            alive.close().await;
+        };
+        let ((mut taken, claimed), (more, more_claimed), ()) = tokio::join!(work(), work(), give_back);
+        assert!(claimed + more_claimed >= 3, "both waited: {claimed} {more_claimed}");
+        taken.extend(more);
+        taken.sort();
+        let mut names: Vec<_> = runs.iter().map(|(name, _)| name.trim_end_matches(".mcap").to_owned()).collect();
+        names.sort();
+        assert_eq!(taken, names, "each once");
+        LakeIngest::new(&lake, Arc::default()).complete(&mut |_, _| {}).await.expect("completed");
+        assert!(rows(store).await == expected, "other rows");
+    }
+
+    // Two complete what waited for references, and the references themselves; each run once.
+    #[tokio::test(flavor = "multi_thread")]
+    async fn completions_are_shared() {
+        let runs = runs(&["wood", "prd", "brick", "wavy", "flat", "foam"]);
+        let store = with_inbox(&runs[..4]).await;
+        ingest(store.clone()).await.expect("ingested");
+        for (name, bytes) in &runs[4..] {
+            store.put(&Path::from(format!("inbox/{name}")), bytes.clone().into()).await.expect("written");
+        }
+        let lake = lake(store.clone()).await.expect("a lake");
+        let sources = pending(&lake).await.expect("listed");
+        LakeIngest::new(&lake, Arc::default()).take_in(sources, &mut |_| {}).await.expect("ingested");
+        let work = async || {
+            let mut completed = Vec::new();
+            let ingest = LakeIngest::new(&lake, Arc::default()).sharing(ClaimTimes::default());
+            let done = &mut |run: &CompletedRun, _| completed.push(run.run.to_string());
+            let summary = ingest.complete(done).await.expect("completed");
+            ingest.close().await;
+            assert_eq!(summary.changed, completed.len());
+            completed
+        };
+        let (mut completed, more) = tokio::join!(work(), work());
+        completed.extend(more);
+        completed.sort();
+        let mut names: Vec<_> = runs.iter().map(|(name, _)| name.trim_end_matches(".mcap").to_owned()).collect();
+        names.sort();
+        assert_eq!(completed, names);
+    }
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn upkeep_beside_ingest_loses_nothing_and_doubles_nothing() {
+        let surfaces = ["flat", "foam", "wood", "prd", "brick", "wavy", "flat_2", "wood_2"];
+        let runs = runs(&surfaces);
+        let undisturbed = with_inbox(&runs).await;
+        ingest(undisturbed.clone()).await.expect("ingested");
+        let expected = rows(undisturbed).await;
+        let store = with_inbox(&runs[..2]).await;
+        ingest(store.clone()).await.expect("ingested");
+        let done = Arc::new(AtomicBool::new(false));
+        let upkeep = tokio::spawn({
+            let (store, done) = (store.clone(), done.clone());
+            async move {
+                let mut rounds = 0;
+                while !done.load(Ordering::SeqCst) {
+                    tidy(store.clone()).await.expect("tidied");
+                    rounds += 1;
+                }
+                rounds
+            }
+        });
+        for (name, bytes) in &runs[2..] {
+            store.put(&Path::from(format!("inbox/{name}")), bytes.clone().into()).await.expect("written");
+            // Nothing is kept for readers here, so that ingest may find a file gone that was merged meanwhile: it is run
+            // again.
+            let mut tries = 0;
+            while let Err(e) = ingest(store.clone()).await {
+                tries += 1;
+                assert!(tries < 20, "{name}: {e}");
+            }
+        }
+        done.store(true, Ordering::SeqCst);
+        assert!(upkeep.await.expect("no panic") > 0);
+        ingest(store.clone()).await.expect("ingested");
+        let seen = rows(store).await;
+        for (table, rows) in &expected {
+            assert_eq!(seen.get(table).map(Vec::len), Some(rows.len()), "{table}");
+        }
+        assert!(seen == expected, "other rows");
+    }
+
+    // The rows that replace others are in their logs, and another machine cleans up before `runs` names them.
+    #[tokio::test(flavor = "multi_thread")]
+    async fn a_clean_up_just_before_the_rows_are_named_takes_none_of_them_whatever_the_clocks_say() {
+        let runs = runs(&["flat", "foam", "wood", "flat"]);
+        let undisturbed = with_inbox(&runs[..3]).await;
+        ingest(undisturbed.clone()).await.expect("ingested");
+        let (name, bytes) = &runs[3];
+        let inbox = Path::from(format!("inbox/{name}"));
+        undisturbed.put(&inbox, bytes.clone().into()).await.expect("written");
+        ingest(undisturbed.clone()).await.expect("ingested");
+        let expected = tables(undisturbed).await;
+        for (first, second) in [(SKEW, -SKEW), (-SKEW, SKEW), (SKEW, TimeDelta::zero())] {
+            let store = with_inbox(&runs[..3]).await;
+            ingest(skewed(&store, first, None)).await.expect("ingested");
+            store.put(&inbox, bytes.clone().into()).await.expect("written");
+            let other = store.clone();
+            let clean_up: Interlude = Arc::new(move || {
+                let store = skewed(&other, first, None);
+                Box::pin(async move {
+                    lake(store).await.expect("opened").remove_superseded().await.expect("cleaned up");
+                })
+            });
+            ingest(skewed(&store, second, Some(clean_up))).await.expect("ingested");
+            let (seen, logged) = tables(store).await;
+            assert_eq!(logged, expected.1, "clocks {first} and {second}");
+            assert!(seen == expected.0, "clocks {first} and {second}: other bytes");
+        }
+    }
 }
 
 /// Claims of processes that died are dead soon.
 const IMPATIENT: ClaimTimes =
     ClaimTimes { renew_every: Duration::from_millis(100), dead_after: Duration::from_secs(3) };
-
-// Of eight runs, a process that died had claimed one, and had brought it to its place; a live one gives its own back.
-#[tokio::test(flavor = "multi_thread")]
-async fn what_others_claimed_and_did_not_do_is_done_after_a_while_and_by_one_ingest_alone() {
-    let runs = runs(&["flat", "foam", "wood", "prd", "brick", "wavy", "flat_2", "wood_2"]);
-    let undisturbed = with_inbox(&runs).await;
-    ingest(undisturbed.clone()).await.expect("ingested");
-    let expected = rows(undisturbed).await;
-    let store = with_inbox(&runs).await;
-    let lake = lake(store.clone()).await.expect("a lake");
-    let never = ClaimTimes { renew_every: Duration::from_secs(3600), ..IMPATIENT };
-    let dead = WorkClaims::start(&lake, never);
-    assert_eq!(dead.claim(&runs[2].0).await, ClaimOutcome::Granted);
-    let (from, to) = (format!("inbox/{}", runs[2].0), format!("runs/wood/{}", runs[2].0));
-    store.rename(&Path::from(from), &Path::from(to)).await.expect("moved");
-    let alive = WorkClaims::start(&lake, IMPATIENT);
-    assert_eq!(alive.claim(&runs[3].0).await, ClaimOutcome::Granted);
-    let work = async || {
-        let (mut taken, mut claimed) = (Vec::new(), 0);
-        let sources = pending(&lake).await.expect("listed");
-        let ingest = LakeIngest::new(&lake, Arc::default()).sharing(IMPATIENT);
-        let report = &mut |report: FileReport| match report {
-            FileReport::Taken(run) => taken.push(run.run.to_string()),
-            FileReport::Claimed(_) => claimed += 1,
-            FileReport::Gone(_) => {}
-            FileReport::Refused { source, why, .. } => panic!("{source}: {why}"),
-        };
-        ingest.take_in(sources, report).await.expect("ingested");
-        ingest.close().await;
-        (taken, claimed)
-    };
-    let give_back = async {
-        tokio::time::sleep(Duration::from_secs(1)).await;
-        alive.close().await;
-    };
-    let ((mut taken, claimed), (more, more_claimed), ()) = tokio::join!(work(), work(), give_back);
-    assert!(claimed + more_claimed >= 3, "both waited: {claimed} {more_claimed}");
-    taken.extend(more);
-    taken.sort();
-    let mut names: Vec<_> = runs.iter().map(|(name, _)| name.trim_end_matches(".mcap").to_owned()).collect();
-    names.sort();
-    assert_eq!(taken, names, "each once");
-    LakeIngest::new(&lake, Arc::default()).complete(&mut |_, _| {}).await.expect("completed");
-    assert!(rows(store).await == expected, "other rows");
-}
-
-// Two complete what waited for references, and the references themselves; each run once.
-#[tokio::test(flavor = "multi_thread")]
-async fn completions_are_shared() {
-    let runs = runs(&["wood", "prd", "brick", "wavy", "flat", "foam"]);
-    let store = with_inbox(&runs[..4]).await;
-    ingest(store.clone()).await.expect("ingested");
-    for (name, bytes) in &runs[4..] {
-        store.put(&Path::from(format!("inbox/{name}")), bytes.clone().into()).await.expect("written");
-    }
-    let lake = lake(store.clone()).await.expect("a lake");
-    let sources = pending(&lake).await.expect("listed");
-    LakeIngest::new(&lake, Arc::default()).take_in(sources, &mut |_| {}).await.expect("ingested");
-    let work = async || {
-        let mut completed = Vec::new();
-        let ingest = LakeIngest::new(&lake, Arc::default()).sharing(ClaimTimes::default());
-        let done = &mut |run: &CompletedRun, _| completed.push(run.run.to_string());
-        let summary = ingest.complete(done).await.expect("completed");
-        ingest.close().await;
-        assert_eq!(summary.changed, completed.len());
-        completed
-    };
-    let (mut completed, more) = tokio::join!(work(), work());
-    completed.extend(more);
-    completed.sort();
-    let mut names: Vec<_> = runs.iter().map(|(name, _)| name.trim_end_matches(".mcap").to_owned()).collect();
-    names.sort();
-    assert_eq!(completed, names);
-}
 
 #[tokio::test(flavor = "multi_thread")]
 async fn another_file_in_a_runs_place_is_not_taken_for_it_though_it_is_as_long() {

@@ -55,71 +55,78 @@ fn metric(server: &ServedLake, name: &str) -> u64 {
     line.trim().parse().expect("a number")
 }
 
-#[test]
-fn pages_and_queries_of_a_warm_server_stay_within_their_budgets() {
-    let (place, store) = lake();
-    let server = serve(&place, &store, &[]);
-    get(&server, "/api/v1/surfaces?limit=60");
-    open_surface_page(&server, "wood");
-    sql(&server, "select ir from ir where surface_id = 'wood' and pair_id = 0");
-    take_requests(&store);
-    open_surface_page(&server, "prd");
-    let page = take_requests(&store);
-    assert!(page.len() <= 8, "{page:?}");
-    sql(&server, "select ir from ir where surface_id = 'prd' and pair_id = 1");
-    let response = take_requests(&store);
-    assert!(response.len() <= 2 && !response.is_empty(), "{response:?}");
-    sql(&server, "select avg(tnce_total) from tnce");
-    let scan = take_requests(&store);
-    assert!(scan.len() <= SURFACES.len(), "{scan:?}");
-    open_surface_page(&server, "prd");
-    assert!(take_requests(&store).is_empty(), "answers are kept");
+mod slow {
+    use super::*;
 
-    // What never changes is not asked for its size: neither for SQL, nor for a file, nor for a slice.
-    let runs = sql(&server, "select run_id from runs where surface_id = 'wood'");
-    let run = runs[0]["run_id"].as_str().expect("a name");
-    sql(&server, "select count(*) from mcap_messages('*')");
-    get(&server, &format!("/api/v1/runs/{run}/file.mcap"));
-    get(&server, &format!("/api/v1/slices.mcap?where=run_id%20%3D%20%27{run}%27%20and%20pair_id%20%3D%200"));
-    let all = take_requests(&store);
-    assert!(all.iter().all(|request| request.starts_with("GET ")) && !all.is_empty(), "{all:?}");
-}
+    #[test]
+    fn pages_and_queries_of_a_warm_server_stay_within_their_budgets() {
+        let (place, store) = lake();
+        let server = serve(&place, &store, &[]);
+        get(&server, "/api/v1/surfaces?limit=60");
+        open_surface_page(&server, "wood");
+        sql(&server, "select ir from ir where surface_id = 'wood' and pair_id = 0");
+        take_requests(&store);
+        open_surface_page(&server, "prd");
+        let page = take_requests(&store);
+        assert!(page.len() <= 8, "{page:?}");
+        sql(&server, "select ir from ir where surface_id = 'prd' and pair_id = 1");
+        let response = take_requests(&store);
+        assert!(response.len() <= 2 && !response.is_empty(), "{response:?}");
+        sql(&server, "select avg(tnce_total) from tnce");
+        let scan = take_requests(&store);
+        assert!(scan.len() <= SURFACES.len(), "{scan:?}");
+        open_surface_page(&server, "prd");
+        assert!(take_requests(&store).is_empty(), "answers are kept");
 
-#[test]
-fn engines_and_commands_share_the_folder_of_a_cache() {
-    let (place, store) = lake();
-    let cache = place.path("cache").display().to_string();
-    let args = ["--cache", cache.as_str(), "--cache-size", "200MB"];
-    let scan = "select avg(tnce_total), count(*) from tnce";
-    let (expected, fetched) = {
+        // What never changes is not asked for its size: neither for SQL, nor for a file, nor for a slice.
+        let runs = sql(&server, "select run_id from runs where surface_id = 'wood'");
+        let run = runs[0]["run_id"].as_str().expect("a name");
+        sql(&server, "select count(*) from mcap_messages('*')");
+        get(&server, &format!("/api/v1/runs/{run}/file.mcap"));
+        get(&server, &format!("/api/v1/slices.mcap?where=run_id%20%3D%20%27{run}%27%20and%20pair_id%20%3D%200"));
+        let all = take_requests(&store);
+        assert!(all.iter().all(|request| request.starts_with("GET ")) && !all.is_empty(), "{all:?}");
+    }
+
+    #[test]
+    fn engines_and_commands_share_the_folder_of_a_cache() {
+        let (place, store) = lake();
+        let cache = place.path("cache").display().to_string();
+        let args = ["--cache", cache.as_str(), "--cache-size", "200MB"];
+        let scan = "select avg(tnce_total), count(*) from tnce";
+        let (expected, fetched) = {
+            let server = serve(&place, &store, &args);
+            let answer = sql(&server, scan);
+            // Engines tell what they have counted a moment later.
+            let blocks = || metric(&server, "echolake_cache_blocks_total{from=\"store\"}");
+            crate::serve::wait_until("the engine counts its blocks", || blocks() > 0);
+            assert!(metric(&server, "echolake_cache_fetched_bytes_total") > 0);
+            (answer, take_requests(&store).len())
+        };
+        assert!(fetched >= SURFACES.len(), "{fetched}");
         let server = serve(&place, &store, &args);
-        let answer = sql(&server, scan);
-        // Engines tell what they have counted a moment later.
-        let blocks = || metric(&server, "echolake_cache_blocks_total{from=\"store\"}");
-        crate::serve::wait_until("the engine counts its blocks", || blocks() > 0);
-        assert!(metric(&server, "echolake_cache_fetched_bytes_total") > 0);
-        (answer, take_requests(&store).len())
-    };
-    assert!(fetched >= SURFACES.len(), "{fetched}");
-    let server = serve(&place, &store, &args);
-    take_requests(&store);
-    assert_eq!(sql(&server, scan), expected);
-    let again = take_requests(&store);
-    let is_table = |request: &&String| request.ends_with(".parquet") && !request.contains("/rig.");
-    assert!(!again.iter().any(|request| is_table(&request)), "{again:?}");
-    crate::serve::wait_until("the engine counts what it found", || {
-        metric(&server, "echolake_cache_blocks_total{from=\"disk\"}") > 0
-    });
-    let with_cache = [&["sql", "--json", scan][..], &args].concat();
-    let answer: Value = serde_json::from_str(&ok(&place, &store, &with_cache)).expect("JSON");
-    assert_eq!(answer, expected);
-    assert!(!take_requests(&store).iter().any(|request| is_table(&request)));
+        take_requests(&store);
+        assert_eq!(sql(&server, scan), expected);
+        let again = take_requests(&store);
+        let is_table = |request: &&String| request.ends_with(".parquet") && !request.contains("/rig.");
+        assert!(!again.iter().any(|request| is_table(&request)), "{again:?}");
+        crate::serve::wait_until("the engine counts what it found", || {
+            metric(&server, "echolake_cache_blocks_total{from=\"disk\"}") > 0
+        });
+        let with_cache = [&["sql", "--json", scan][..], &args].concat();
+        let answer: Value = serde_json::from_str(&ok(&place, &store, &with_cache)).expect("JSON");
+        assert_eq!(answer, expected);
+        assert!(!take_requests(&store).iter().any(|request| is_table(&request)));
 
-    // A folder that cannot be used is said before anything is served.
-    std::fs::write(place.path("file"), "x").expect("written");
-    let output = run(&place, &store, &["sql", "select 1", "--cache", "file"]);
-    let said = stderr(&output);
-    assert!(output.status.code() == Some(1) && said.contains("cannot hold a cache") && said.contains("hint"), "{said}");
-    let output = run(&place, &store, &["sql", "select 1", "--cache", "cache", "--cache-size", "1MB"]);
-    assert!(output.status.code() == Some(2) && stderr(&output).contains("100MB"), "{}", stderr(&output));
+        // A folder that cannot be used is said before anything is served.
+        std::fs::write(place.path("file"), "x").expect("written");
+        let output = run(&place, &store, &["sql", "select 1", "--cache", "file"]);
+        let said = stderr(&output);
+        assert!(
+            output.status.code() == Some(1) && said.contains("cannot hold a cache") && said.contains("hint"),
+            "{said}"
+        );
+        let output = run(&place, &store, &["sql", "select 1", "--cache", "cache", "--cache-size", "1MB"]);
+        assert!(output.status.code() == Some(2) && stderr(&output).contains("100MB"), "{}", stderr(&output));
+    }
 }

@@ -257,29 +257,6 @@ fn a_shared_file_needs_its_address_and_no_token() {
 }
 
 #[test]
-fn rows_that_were_replaced_are_not_shared() {
-    let place = TestFolder::new();
-    place.acquire("flat", &["--seed", "1", "--ir-only"]);
-    place.acquire("flat_b", &["--seed", "2", "--ir-only"]);
-    // Its rows do not change when `flat` does, and stay in merged files of which the rest goes.
-    place.acquire("wavy", &["--seed", "3", "--ir-only", "--flat", "flat_b"]);
-    place.ok(&["ingest"]);
-    place.ok(&["optimize"]);
-    place.acquire("flat", &["--seed", "9", "--ir-only"]);
-    place.ok(&["ingest"]);
-    let server = served(&place, &[]);
-    for table in ["surfaces", "nce", "tnce"] {
-        let mut rows = 0;
-        for file in shared(&server, table, "{}") {
-            let answer = get(&server, path_of(&server, &file));
-            assert_eq!((answer.status, answer.body.len() as u64), (200, file["size"].as_u64().expect("a size")));
-            rows += number_of_rows(&answer.body);
-        }
-        assert_eq!(place.number(&format!("select count(*) from {table}")), rows as f64, "{table}");
-    }
-}
-
-#[test]
 fn a_slice_is_a_sofa_file() {
     let place = lake();
     let server = served(&place, &[]);
@@ -299,4 +276,31 @@ fn a_slice_is_a_sofa_file() {
     refused(&get(&server, &format!("/api/v1/slices.sofa?run={run}&topics=/ir")), 400, "request_invalid");
     let foreign = HttpRequest::get("/api/v1/slices.sofa?where=true").with("origin", "https://evil.example");
     refused(&foreign.send(&server), 403, "foreign_origin");
+}
+
+mod slow {
+    use super::*;
+
+    #[test]
+    fn rows_that_were_replaced_are_not_shared() {
+        let place = TestFolder::new();
+        place.acquire("flat", &["--seed", "1", "--ir-only"]);
+        place.acquire("flat_b", &["--seed", "2", "--ir-only"]);
+        // Its rows do not change when `flat` does, and stay in merged files of which the rest goes.
+        place.acquire("wavy", &["--seed", "3", "--ir-only", "--flat", "flat_b"]);
+        place.ok(&["ingest"]);
+        place.ok(&["optimize"]);
+        place.acquire("flat", &["--seed", "9", "--ir-only"]);
+        place.ok(&["ingest"]);
+        let server = served(&place, &[]);
+        for table in ["surfaces", "nce", "tnce"] {
+            let mut rows = 0;
+            for file in shared(&server, table, "{}") {
+                let answer = get(&server, path_of(&server, &file));
+                assert_eq!((answer.status, answer.body.len() as u64), (200, file["size"].as_u64().expect("a size")));
+                rows += number_of_rows(&answer.body);
+            }
+            assert_eq!(place.number(&format!("select count(*) from {table}")), rows as f64, "{table}");
+        }
+    }
 }

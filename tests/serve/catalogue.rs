@@ -38,49 +38,6 @@ fn filled(template: &str, surface: &str, run: &str, file: &str) -> String {
 }
 
 #[test]
-fn every_path_keeps_the_contract() {
-    let place = lake();
-    let server = served(&place, &[]);
-    let contract = ApiContract::read();
-    let run = run_of(&server, "brick");
-    let files = json(&get(&server, "/api/v1/tables/points"));
-    let file = files[0]["file"].as_str().expect("a file");
-    let check = |template: &str, path: &str, status: u16| {
-        let answer = get(&server, path);
-        let media_type = answer.header("content-type").unwrap_or_default();
-        let objections = contract.objections(template, answer.status, media_type, &answer.body);
-        assert!(objections.is_empty(), "{path}: {objections:?}");
-        assert_eq!(answer.status, status, "{path}: {}", String::from_utf8_lossy(&answer.body));
-        assert_eq!(answer.header("x-content-type-options"), Some("nosniff"));
-    };
-    for template in contract.gets() {
-        check(template, &filled(template, "brick", &run, file), 200);
-        for (surface, run, file) in [("none", "none", "none"), ("..%2F..%2Fetc", "%00", "..%2F..%2Flake.toml")] {
-            if template.contains("{surface_id}") || template.contains("{run_id}") || template.contains("{file}") {
-                check(template, &filled(template, surface, run, file), 404);
-            }
-        }
-    }
-    for sort in ["run_id", "state", "duration", "measurements", "repeats", "damaged", "temperature"] {
-        check("/api/v1/runs", &format!("/api/v1/runs?sort={sort}&order=asc"), 200);
-    }
-    for (template, path) in [
-        ("/api/v1/surfaces", "/api/v1/surfaces?level=nonsense:1..2"),
-        ("/api/v1/surfaces", "/api/v1/surfaces?level=2500:a..b"),
-        ("/api/v1/surfaces", "/api/v1/surfaces?limit=0"),
-        ("/api/v1/surfaces", "/api/v1/surfaces?limit=501"),
-        ("/api/v1/surfaces", "/api/v1/surfaces?sort=surface_id;drop"),
-        ("/api/v1/runs", "/api/v1/runs?order=up"),
-        ("/api/v1/surfaces/{surface_id}/grid", "/api/v1/surfaces/brick/grid?microphone=10"),
-        ("/api/v1/surfaces/{surface_id}/grid", "/api/v1/surfaces/brick/grid"),
-        ("/api/v1/surfaces/{surface_id}/pairs/{pair_id}", "/api/v1/surfaces/brick/pairs/-1"),
-        ("/api/v1/map", "/api/v1/map?neighbours=21"),
-    ] {
-        check(template, path, 400);
-    }
-}
-
-#[test]
 fn curves_and_responses_come_as_arrow_too() {
     let place = lake();
     let server = served(&place, &[]);
@@ -188,42 +145,6 @@ fn references_are_not_data() {
     }
     let facets = page["facets"].as_array().expect("facets");
     assert!(facets.iter().all(|facet| facet["distinguishes"] == false), "there is one design: {facets:?}");
-}
-
-#[test]
-fn against_flat_is_the_same_number_everywhere() {
-    let place = lake();
-    let server = served(&place, &[]);
-    let surface = &json(&get(&server, "/api/v1/surfaces/brick"))["surface"];
-    let row = &place.sql(
-        "select c.against_flat_2500_db, c.against_flat_total_db, b.p90_mean_db - f.p90_mean_db as difference
-         from catalogue c join surface_stats b using (surface_id) join surface_stats f on f.band = b.band
-         where c.surface_id = 'brick' and f.surface_id = 'flat' and b.band = '2500'",
-    )[0];
-    let (levels, number) = (&surface["against_flat_db"], |name: &str| row[name].as_f64().expect("a level"));
-    assert!((number("against_flat_2500_db") - levels[0].as_f64().expect("a level")).abs() < 1e-9, "{row:?} {levels}");
-    assert!((number("difference") - number("against_flat_2500_db")).abs() < 1e-9, "{row:?}");
-    assert!((number("against_flat_total_db") - levels[5].as_f64().expect("a level")).abs() < 1e-9, "{row:?} {levels}");
-    let grid = |over: &str| get(&server, &format!("/api/v1/surfaces/brick/grid?microphone=3{over}")).body;
-    assert_eq!(grid(""), grid("&over=flat-band"));
-}
-
-#[test]
-fn answers_are_kept_until_the_lake_changes() {
-    let place = lake();
-    let server = served(&place, &[]);
-    let before = get(&server, "/api/v1/surfaces");
-    let tag = before.header("etag").expect("a tag").to_owned();
-    let again = HttpRequest::get("/api/v1/surfaces").with("if-none-match", &tag).send(&server);
-    assert_eq!((again.status, again.body.len()), (304, 0));
-    let packed = HttpRequest::get("/api/v1/surfaces").with("accept-encoding", "gzip").send(&server);
-    assert_eq!(packed.header("content-encoding"), Some("gzip"));
-    assert!(packed.body.len() < before.body.len() / 2);
-    place.acquire("wavy", &["--ir-only"]);
-    place.ok(&["ingest"]);
-    let after = HttpRequest::get("/api/v1/surfaces").with("if-none-match", &tag).send(&server);
-    assert_eq!((after.status, json(&after)["total"].as_u64()), (200, Some(4)));
-    assert_ne!(after.header("etag"), Some(tag.as_str()));
 }
 
 #[test]
@@ -338,38 +259,6 @@ fn what_is_asked_stays_data() {
     assert!(wrong.header("allow").is_some_and(|methods| methods.contains("GET")), "{:?}", wrong.header("allow"));
 }
 
-#[test]
-fn a_session_stands_for_a_token() {
-    let place = lake();
-    let open = served(&place, &[]);
-    let shown = |server: &ServedLake, token: &str| {
-        let body = serde_json::json!({ "token": token }).to_string();
-        HttpRequest::post("/api/v1/session", &body).with("content-type", "application/json").send(server)
-    };
-    assert_eq!(shown(&open, "x").status, 404, "no tokens, no sessions");
-    let made = place.run(&["token", "reader"]);
-    let token = crate::stderr(&made).lines().next().expect("a token").to_owned();
-    std::fs::write(place.path("tokens.toml"), &made.stdout).expect("written");
-    let server = served(&place, &["--tokens", "tokens.toml"]);
-    assert_eq!(get(&server, "/api/v1/surfaces").status, 401);
-    assert_eq!(shown(&server, "wrong").status, 401);
-    let begun = shown(&server, &token);
-    assert_eq!(begun.status, 204);
-    let cookie = begun.header("set-cookie").expect("a cookie");
-    assert!(cookie.contains("; HttpOnly") && cookie.contains("; SameSite=Strict"), "{cookie}");
-    assert!(!cookie.contains(&token), "the token itself is kept nowhere");
-    let cookie = cookie.split(';').next().expect("name and value");
-    let with = |name: &str, value: &str| {
-        HttpRequest::get("/api/v1/surfaces").with("cookie", cookie).with(name, value).send(&server).status
-    };
-    assert_eq!(with("sec-fetch-site", "same-origin"), 200);
-    assert_eq!(with("sec-fetch-site", "same-site"), 403, "a page on another port of this machine");
-    assert_eq!(with("origin", "http://localhost:1"), 403);
-    assert_eq!(HttpRequest::get("/api/v1/surfaces").with("cookie", "echolake=00").send(&server).status, 401);
-    // A cached answer is not given to a client that is not authorised for it.
-    assert_eq!(get(&server, "/api/v1/surfaces").status, 401);
-}
-
 #[cfg(feature = "web")]
 #[test]
 fn pages_are_part_of_the_program() {
@@ -392,4 +281,125 @@ fn pages_are_part_of_the_program() {
     assert_eq!(HttpRequest::get(script).with("if-none-match", &tag).send(&server).status, 304);
     assert_eq!(get(&server, "/assets/none.js").status, 404);
     assert_eq!(get(&server, "/favicon.ico").status, 404);
+}
+
+mod slow {
+    use super::*;
+
+    #[test]
+    fn a_session_stands_for_a_token() {
+        let place = lake();
+        let open = served(&place, &[]);
+        let shown = |server: &ServedLake, token: &str| {
+            let body = serde_json::json!({ "token": token }).to_string();
+            HttpRequest::post("/api/v1/session", &body).with("content-type", "application/json").send(server)
+        };
+        assert_eq!(shown(&open, "x").status, 404, "no tokens, no sessions");
+        let made = place.run(&["token", "reader"]);
+        let token = crate::stderr(&made).lines().next().expect("a token").to_owned();
+        std::fs::write(place.path("tokens.toml"), &made.stdout).expect("written");
+        let server = served(&place, &["--tokens", "tokens.toml"]);
+        assert_eq!(get(&server, "/api/v1/surfaces").status, 401);
+        assert_eq!(shown(&server, "wrong").status, 401);
+        let begun = shown(&server, &token);
+        assert_eq!(begun.status, 204);
+        let cookie = begun.header("set-cookie").expect("a cookie");
+        assert!(cookie.contains("; HttpOnly") && cookie.contains("; SameSite=Strict"), "{cookie}");
+        assert!(!cookie.contains(&token), "the token itself is kept nowhere");
+        let cookie = cookie.split(';').next().expect("name and value");
+        let with = |name: &str, value: &str| {
+            HttpRequest::get("/api/v1/surfaces").with("cookie", cookie).with(name, value).send(&server).status
+        };
+        assert_eq!(with("sec-fetch-site", "same-origin"), 200);
+        assert_eq!(with("sec-fetch-site", "same-site"), 403, "a page on another port of this machine");
+        assert_eq!(with("origin", "http://localhost:1"), 403);
+        assert_eq!(HttpRequest::get("/api/v1/surfaces").with("cookie", "echolake=00").send(&server).status, 401);
+        // A cached answer is not given to a client that is not authorised for it.
+        assert_eq!(get(&server, "/api/v1/surfaces").status, 401);
+    }
+
+    #[test]
+    fn every_path_keeps_the_contract() {
+        let place = lake();
+        let server = served(&place, &[]);
+        let contract = ApiContract::read();
+        let run = run_of(&server, "brick");
+        let files = json(&get(&server, "/api/v1/tables/points"));
+        let file = files[0]["file"].as_str().expect("a file");
+        let check = |template: &str, path: &str, status: u16| {
+            let answer = get(&server, path);
+            let media_type = answer.header("content-type").unwrap_or_default();
+            let objections = contract.objections(template, answer.status, media_type, &answer.body);
+            assert!(objections.is_empty(), "{path}: {objections:?}");
+            assert_eq!(answer.status, status, "{path}: {}", String::from_utf8_lossy(&answer.body));
+            assert_eq!(answer.header("x-content-type-options"), Some("nosniff"));
+        };
+        for template in contract.gets() {
+            check(template, &filled(template, "brick", &run, file), 200);
+            for (surface, run, file) in [("none", "none", "none"), ("..%2F..%2Fetc", "%00", "..%2F..%2Flake.toml")] {
+                if template.contains("{surface_id}") || template.contains("{run_id}") || template.contains("{file}") {
+                    check(template, &filled(template, surface, run, file), 404);
+                }
+            }
+        }
+        for sort in ["run_id", "state", "duration", "measurements", "repeats", "damaged", "temperature"] {
+            check("/api/v1/runs", &format!("/api/v1/runs?sort={sort}&order=asc"), 200);
+        }
+        for (template, path) in [
+            ("/api/v1/surfaces", "/api/v1/surfaces?level=nonsense:1..2"),
+            ("/api/v1/surfaces", "/api/v1/surfaces?level=2500:a..b"),
+            ("/api/v1/surfaces", "/api/v1/surfaces?limit=0"),
+            ("/api/v1/surfaces", "/api/v1/surfaces?limit=501"),
+            ("/api/v1/surfaces", "/api/v1/surfaces?sort=surface_id;drop"),
+            ("/api/v1/runs", "/api/v1/runs?order=up"),
+            ("/api/v1/surfaces/{surface_id}/grid", "/api/v1/surfaces/brick/grid?microphone=10"),
+            ("/api/v1/surfaces/{surface_id}/grid", "/api/v1/surfaces/brick/grid"),
+            ("/api/v1/surfaces/{surface_id}/pairs/{pair_id}", "/api/v1/surfaces/brick/pairs/-1"),
+            ("/api/v1/map", "/api/v1/map?neighbours=21"),
+        ] {
+            check(template, path, 400);
+        }
+    }
+
+    #[test]
+    fn answers_are_kept_until_the_lake_changes() {
+        let place = lake();
+        let server = served(&place, &[]);
+        let before = get(&server, "/api/v1/surfaces");
+        let tag = before.header("etag").expect("a tag").to_owned();
+        let again = HttpRequest::get("/api/v1/surfaces").with("if-none-match", &tag).send(&server);
+        assert_eq!((again.status, again.body.len()), (304, 0));
+        let packed = HttpRequest::get("/api/v1/surfaces").with("accept-encoding", "gzip").send(&server);
+        assert_eq!(packed.header("content-encoding"), Some("gzip"));
+        assert!(packed.body.len() < before.body.len() / 2);
+        place.acquire("wavy", &["--ir-only"]);
+        place.ok(&["ingest"]);
+        let after = HttpRequest::get("/api/v1/surfaces").with("if-none-match", &tag).send(&server);
+        assert_eq!((after.status, json(&after)["total"].as_u64()), (200, Some(4)));
+        assert_ne!(after.header("etag"), Some(tag.as_str()));
+    }
+
+    #[test]
+    fn against_flat_is_the_same_number_everywhere() {
+        let place = lake();
+        let server = served(&place, &[]);
+        let surface = &json(&get(&server, "/api/v1/surfaces/brick"))["surface"];
+        let row = &place.sql(
+            "select c.against_flat_2500_db, c.against_flat_total_db, b.p90_mean_db - f.p90_mean_db as difference
+             from catalogue c join surface_stats b using (surface_id) join surface_stats f on f.band = b.band
+             where c.surface_id = 'brick' and f.surface_id = 'flat' and b.band = '2500'",
+        )[0];
+        let (levels, number) = (&surface["against_flat_db"], |name: &str| row[name].as_f64().expect("a level"));
+        assert!(
+            (number("against_flat_2500_db") - levels[0].as_f64().expect("a level")).abs() < 1e-9,
+            "{row:?} {levels}"
+        );
+        assert!((number("difference") - number("against_flat_2500_db")).abs() < 1e-9, "{row:?}");
+        assert!(
+            (number("against_flat_total_db") - levels[5].as_f64().expect("a level")).abs() < 1e-9,
+            "{row:?} {levels}"
+        );
+        let grid = |over: &str| get(&server, &format!("/api/v1/surfaces/brick/grid?microphone=3{over}")).body;
+        assert_eq!(grid(""), grid("&over=flat-band"));
+    }
 }

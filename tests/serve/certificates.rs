@@ -83,20 +83,6 @@ fn a_certificate_logs_its_client_in() {
 }
 
 #[test]
-fn who_is_taken_back_is_refused() {
-    let place = place_of_clients();
-    let server = serve_clients(&place);
-    let mut open = connect(&place, &server, Some("ann")).expect("a handshake");
-    assert!(get(&mut open, "/api/v1/tables", "").starts_with("HTTP/1.1 200"));
-    std::fs::write(place.path("tokens.toml"), "[[token]]\nname = 'bob'\n").expect("written");
-    wait_until("ann has no line", || get(&mut open, "/api/v1/tables", "").starts_with("HTTP/1.1 401"));
-    assert_eq!(status(&place, &server, Some("bob"), ""), "200");
-    std::fs::copy(place.path("ann/certificate.pem"), place.path("clients.pem")).expect("copied");
-    wait_until("bob's certificate is none", || is_refused(&place, &server, "bob"));
-    assert_eq!(status(&place, &server, Some("ann"), ""), "401");
-}
-
-#[test]
 fn what_lets_nobody_in_is_said() {
     let place = place_of_clients();
     let with = |more: &[&'static str]| [&["serve"][..], &FILES, more].concat();
@@ -176,4 +162,22 @@ async fn a_certificate_logs_in_over_flight_sql() {
     assert_eq!(code(Some("ann")).await.as_deref(), Some(UNIMPLEMENTED));
     assert_eq!(code(Some("bob")).await.as_deref(), Some(UNAUTHENTICATED));
     assert_eq!(code(None).await.as_deref(), Some(UNAUTHENTICATED));
+}
+
+mod slow {
+    use super::*;
+
+    #[test]
+    fn who_is_taken_back_is_refused() {
+        let place = place_of_clients();
+        let server = serve_clients(&place);
+        let mut open = connect(&place, &server, Some("ann")).expect("a handshake");
+        assert!(get(&mut open, "/api/v1/tables", "").starts_with("HTTP/1.1 200"));
+        std::fs::write(place.path("tokens.toml"), "[[token]]\nname = 'bob'\n").expect("written");
+        wait_until("ann has no line", || get(&mut open, "/api/v1/tables", "").starts_with("HTTP/1.1 401"));
+        assert_eq!(status(&place, &server, Some("bob"), ""), "200");
+        std::fs::copy(place.path("ann/certificate.pem"), place.path("clients.pem")).expect("copied");
+        wait_until("bob's certificate is none", || is_refused(&place, &server, "bob"));
+        assert_eq!(status(&place, &server, Some("ann"), ""), "401");
+    }
 }

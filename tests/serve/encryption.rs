@@ -125,23 +125,6 @@ fn all_protocols_are_encrypted() {
 }
 
 #[test]
-fn a_renewed_certificate_is_taken_without_a_lost_connection() {
-    let place = certified();
-    let server = served(&place, &FILES);
-    let (old, new) = (place.path("tls/certificate.pem"), place.path("renewed/certificate.pem"));
-    let kept = place.path("old.pem");
-    std::fs::copy(&old, &kept).expect("copied");
-    let mut before = shake(ServedLake::connect(&server.http), &kept, "http/1.1").expect("a handshake");
-    place.ok(&["certificate", "localhost", "-o", "renewed"]);
-    std::fs::copy(place.path("renewed/key.pem"), place.path("tls/key.pem")).expect("copied");
-    std::fs::copy(&new, &old).expect("copied");
-    let shakes = |certificate: &Path| shake(ServedLake::connect(&server.http), certificate, "http/1.1").is_ok();
-    wait_until("the new certificate is in use", || shakes(&new));
-    assert!(!shakes(&kept));
-    assert!(get(&mut before, "/health", "").starts_with("HTTP/1.1 200"), "the old connection goes on");
-}
-
-#[test]
 fn what_cannot_be_encrypted_is_refused() {
     let place = certified();
     let tokens = place.run(&["token", "analyst"]);
@@ -156,4 +139,25 @@ fn what_cannot_be_encrypted_is_refused() {
     let files = ["serve", "--certificate", "tls/certificate.pem", "--key", "other/key.pem"];
     place.fails(1, &files, "`other/key.pem`");
     place.fails(1, &["certificate", "localhost", "-o", "tls"], "cannot write `tls/key.pem`");
+}
+
+mod slow {
+    use super::*;
+
+    #[test]
+    fn a_renewed_certificate_is_taken_without_a_lost_connection() {
+        let place = certified();
+        let server = served(&place, &FILES);
+        let (old, new) = (place.path("tls/certificate.pem"), place.path("renewed/certificate.pem"));
+        let kept = place.path("old.pem");
+        std::fs::copy(&old, &kept).expect("copied");
+        let mut before = shake(ServedLake::connect(&server.http), &kept, "http/1.1").expect("a handshake");
+        place.ok(&["certificate", "localhost", "-o", "renewed"]);
+        std::fs::copy(place.path("renewed/key.pem"), place.path("tls/key.pem")).expect("copied");
+        std::fs::copy(&new, &old).expect("copied");
+        let shakes = |certificate: &Path| shake(ServedLake::connect(&server.http), certificate, "http/1.1").is_ok();
+        wait_until("the new certificate is in use", || shakes(&new));
+        assert!(!shakes(&kept));
+        assert!(get(&mut before, "/health", "").starts_with("HTTP/1.1 200"), "the old connection goes on");
+    }
 }

@@ -83,99 +83,6 @@ fn a_slice_streams_and_is_what_the_command_exports() {
     assert!(poses.body.len() * 10 < all.body.len(), "{} of {}", poses.body.len(), all.body.len());
 }
 
-// As Lichtblick does: a plain GET whose headers are read and which is then broken off, then ranges.
-#[test]
-fn a_viewer_of_elsewhere_reads_a_slice_by_ranges() {
-    let place = lake();
-    let server = served(&place, &[]);
-    let run = run_of(&place, "flat");
-    let path = slice("pair_id < 20", &format!("&run={run}"));
-    let foreign =
-        || HttpRequest::get(&path).with("origin", "https://viewer.example").with("sec-fetch-site", "cross-site");
-    let mut first = foreign().begin(&server);
-    let mut head = Vec::new();
-    while !head.ends_with(b"\r\n\r\n") {
-        let mut byte = [0];
-        first.read_exact(&mut byte).expect("headers");
-        head.push(byte[0]);
-    }
-    drop(first);
-    let head = String::from_utf8(head).expect("text").to_ascii_lowercase();
-    let value = |name: &str| {
-        let line = head.lines().find_map(|l| l.strip_prefix(&format!("{name}: ")));
-        line.unwrap_or_else(|| panic!("no {name} in {head}")).to_owned()
-    };
-    assert!(head.starts_with("http/1.1 200"), "{head}");
-    assert_eq!((value("accept-ranges").as_str(), value("access-control-allow-origin").as_str()), ("bytes", "*"));
-    assert_eq!(value("cross-origin-resource-policy"), "cross-origin");
-    for name in ["accept-ranges", "content-length", "content-range", "etag"] {
-        assert!(value("access-control-expose-headers").contains(name), "{name}");
-    }
-    let (length, tag) = (value("content-length").parse::<usize>().expect("a length"), value("etag"));
-    // It begins with the end, which holds the index.
-    let (mut file, block) = (vec![0; length], 100_000);
-    let mut starts: Vec<_> = (0..length).step_by(block).collect();
-    starts.reverse();
-    for start in starts {
-        let end = (start + block).min(length);
-        let part = foreign().with("range", &format!("bytes={start}-{}", end - 1)).send(&server);
-        assert_eq!((part.status, part.header("etag")), (206, Some(tag.as_str())));
-        assert_eq!(part.header("content-range"), Some(&*format!("bytes {start}-{}/{length}", end - 1)));
-        file[start..end].copy_from_slice(&part.body);
-    }
-    assert_eq!(count(&messages(&file), "/sweep"), 20);
-    let streamed = get(&server, &path);
-    assert!(streamed.body == file && streamed.header("etag") == Some(tag.as_str()), "the same, however it is read");
-    let headed = HttpRequest::head(&path).send(&server);
-    assert_eq!((headed.status, headed.header("content-length")), (200, Some(&*length.to_string())));
-    assert_eq!(foreign().with("if-none-match", &tag).send(&server).status, 304);
-    let ranged = |known: &str| foreign().with("range", "bytes=0-7").with("if-range", known).send(&server).status;
-    assert_eq!((ranged(&tag), ranged("\"other\"")), (206, 200));
-    refused(&foreign().with("range", &format!("bytes={length}-")).send(&server), 416, "range_not_satisfiable");
-    // What others add to the lake changes nothing of it.
-    place.acquire("wavy", &["--ir-only"]);
-    place.ok(&["ingest"]);
-    assert_eq!(foreign().with("if-none-match", &tag).send(&server).status, 304);
-    let asked = HttpRequest::options(&path)
-        .with("origin", "https://viewer.example")
-        .with("access-control-request-method", "GET")
-        .with("access-control-request-headers", "range,authorization")
-        .with("access-control-request-private-network", "true")
-        .send(&server);
-    assert_eq!((asked.status, asked.header("access-control-allow-private-network")), (200, Some("true")));
-}
-
-#[test]
-fn a_page_of_elsewhere_asks_of_runs_that_it_knows_alone() {
-    let place = lake();
-    let server = served(&place, &[]);
-    let run = run_of(&place, "brick");
-    let foreign = |path: &str| HttpRequest::get(path).with("origin", "https://evil.example").send(&server);
-    refused(&foreign(&slice("true", "")), 403, "foreign_origin");
-    refused(&foreign("/api/v1/foxglove/manifest?where=true"), 403, "foreign_origin");
-    refused(&HttpRequest::get(&slice("true", "")).host("evil.example").send(&server), 403, "foreign_origin");
-    refused(&foreign(&slice("cast(run_id as int) = 1", "&run=guessed")), 404, "not_found");
-    let of_the_run = format!("&run={run}");
-    for asking in [
-        "pair_id in (select pair_id from tnce)",
-        "exists (select * from runs)",
-        "abs(pair_id) = 1",
-        "pair_id + 1 = 2",
-        "cardinality(array_repeat(make_array(range(0, 30000000)), 3000000)) > pair_id",
-        &format!("{}!{}", "position(".repeat(22), " in 'x')".repeat(22)),
-        &format!("cast(null as int{}) is null", "[]".repeat(8_000)),
-        &format!("pair_id in ({}1)", "1,".repeat(1_500)),
-    ] {
-        refused(&foreign(&slice(asking, &of_the_run)), 400, "query_invalid");
-        let manifest = format!("/api/v1/foxglove/manifest?where={}{of_the_run}", encoded(asking));
-        refused(&foreign(&manifest), 400, "query_invalid");
-    }
-    let manifest = "/api/v1/foxglove/manifest?where=not%20pair_id%20between%205%20and%2099";
-    assert_eq!(foreign(&format!("{manifest}{of_the_run}")).status, 200);
-    let own = foreign(&slice("pair_id = 1 or surface_id = 'flat'", &of_the_run));
-    assert_eq!((own.status, count(&messages(&own.body), "/ir")), (200, 1), "none of a run that it does not name");
-}
-
 #[test]
 fn what_cannot_be_cut_has_a_code() {
     let place = lake();
@@ -233,47 +140,6 @@ fn a_run_file_that_was_changed_or_moved_is_said() {
     let whole = get(&server, &path);
     assert_eq!((whole.status, whole.is_whole), (200, true));
     assert_eq!(get(&server, &slice("surface_id = 'brick'", "")).status, 200);
-}
-
-#[test]
-fn a_slice_ends_with_its_reader() {
-    let place = TestFolder::new();
-    let rig = crate::SMALL_RIG.replace("duration_secs = 0.03", LONG_SWEEPS);
-    std::fs::write(place.path("rig.toml"), rig).expect("written");
-    let run = place.acquire("flat", &[]);
-    let bytes = std::fs::metadata(&run).expect("a run").len();
-    assert!(bytes > 20_000_000, "{bytes} bytes are more than sockets hold");
-    place.ok(&["ingest"]);
-    let made = place.run(&["token", "one"]);
-    let token = crate::stderr(&made).lines().next().expect("a token").to_owned();
-    let lines = String::from_utf8_lossy(&made.stdout).replace("concurrent = 4", "concurrent = 1");
-    let lines = lines.replace("\"files\"]", "\"files\", \"metrics\"]");
-    std::fs::write(place.path("tokens.toml"), lines).expect("written");
-    let server = served(&place, &["--tokens", "tokens.toml"]);
-    let bearer = format!("Bearer {token}");
-    let ask = |path: &str| HttpRequest::get(path).with("authorization", &bearer);
-    let running = || running_of(&ask("/metrics").send(&server));
-    let mut unread = ask(&slice("true", "")).begin(&server);
-    let mut start = [0; 12];
-    unread.read_exact(&mut start).expect("a status");
-    assert_eq!(&start, b"HTTP/1.1 200");
-    wait_until("it waits for its reader", || running() == 1.0);
-    let pause = std::time::Duration::from_millis(500);
-    std::thread::sleep(pause);
-    let before = server.resident_kib();
-    std::thread::sleep(pause);
-    assert!(running() == 1.0 && server.resident_kib() < before + 20_000, "what waits does not grow");
-    refused(&ask(&slice("pair_id = 1", "")).send(&server), 429, "too_many");
-    drop(unread);
-    wait_until("it ends with its reader", || running() == 0.0);
-    let mut predicate = ask(&slice(&format!("({ENDLESS}) = pair_id"), "")).begin(&server);
-    wait_until("the predicate's query runs", || running() == 1.0);
-    let _ = predicate.set_nonblocking(true);
-    assert!(predicate.read(&mut start).is_err(), "it is not answered yet");
-    drop(predicate);
-    wait_until("it ends too", || running() == 0.0);
-    // Its place is free when its operators are gone, which is after its end is counted.
-    wait_until("its place is free", || ask(&slice("pair_id = 1", "")).send(&server).status == 200);
 }
 
 #[test]
@@ -383,47 +249,185 @@ fn the_manifest_says_what_comes() {
     assert!(json(&layout)["configById"].is_object());
 }
 
-#[test]
-fn the_lakes_files_are_urls_that_outlive_what_replaces_them() {
-    let place = lake();
-    let server = served(&place, &[]);
-    let list = |query: &str| json(&get(&server, &format!("/api/v1/files{query}")));
-    let before = list("?table=measurements&table=environment");
-    let files = before["files"].as_array().expect("files").clone();
-    let tables: BTreeSet<_> = files.iter().filter_map(|f| f["table"].as_str()).collect();
-    assert_eq!(tables, BTreeSet::from(["environment", "measurements"]));
-    assert!(list("")["files"].as_array().expect("files").len() > files.len());
-    let base = format!("http://{}", server.http);
-    let path =
-        |file: &Value| file["url"].as_str().expect("a URL").strip_prefix(&base).expect("of this server").to_owned();
-    let mut rows = 0;
-    for file in &files {
-        let whole = get(&server, &path(file));
-        assert_eq!((whole.status, whole.body.len() as u64), (200, file["bytes"].as_u64().expect("bytes")));
-        let end = HttpRequest::get(&path(file)).with("range", "bytes=-4").send(&server);
-        assert_eq!((end.status, &end.body[..]), (206, &b"PAR1"[..]));
-        let headed = HttpRequest::head(&path(file)).send(&server);
-        assert_eq!(headed.header("content-length"), Some(&*whole.body.len().to_string()));
-        assert_eq!(file["superseded_rows"], 0);
-        rows += if file["table"] == "measurements" { file["rows"].as_u64().expect("rows") } else { 0 };
+mod slow {
+    use super::*;
+
+    #[test]
+    fn a_slice_ends_with_its_reader() {
+        let place = TestFolder::new();
+        let rig = crate::SMALL_RIG.replace("duration_secs = 0.03", LONG_SWEEPS);
+        std::fs::write(place.path("rig.toml"), rig).expect("written");
+        let run = place.acquire("flat", &[]);
+        let bytes = std::fs::metadata(&run).expect("a run").len();
+        assert!(bytes > 20_000_000, "{bytes} bytes are more than sockets hold");
+        place.ok(&["ingest"]);
+        let made = place.run(&["token", "one"]);
+        let token = crate::stderr(&made).lines().next().expect("a token").to_owned();
+        let lines = String::from_utf8_lossy(&made.stdout).replace("concurrent = 4", "concurrent = 1");
+        let lines = lines.replace("\"files\"]", "\"files\", \"metrics\"]");
+        std::fs::write(place.path("tokens.toml"), lines).expect("written");
+        let server = served(&place, &["--tokens", "tokens.toml"]);
+        let bearer = format!("Bearer {token}");
+        let ask = |path: &str| HttpRequest::get(path).with("authorization", &bearer);
+        let running = || running_of(&ask("/metrics").send(&server));
+        let mut unread = ask(&slice("true", "")).begin(&server);
+        let mut start = [0; 12];
+        unread.read_exact(&mut start).expect("a status");
+        assert_eq!(&start, b"HTTP/1.1 200");
+        wait_until("it waits for its reader", || running() == 1.0);
+        let pause = std::time::Duration::from_millis(500);
+        std::thread::sleep(pause);
+        let before = server.resident_kib();
+        std::thread::sleep(pause);
+        assert!(running() == 1.0 && server.resident_kib() < before + 20_000, "what waits does not grow");
+        refused(&ask(&slice("pair_id = 1", "")).send(&server), 429, "too_many");
+        drop(unread);
+        wait_until("it ends with its reader", || running() == 0.0);
+        let mut predicate = ask(&slice(&format!("({ENDLESS}) = pair_id"), "")).begin(&server);
+        wait_until("the predicate's query runs", || running() == 1.0);
+        let _ = predicate.set_nonblocking(true);
+        assert!(predicate.read(&mut start).is_err(), "it is not answered yet");
+        drop(predicate);
+        wait_until("it ends too", || running() == 0.0);
+        // Its place is free when its operators are gone, which is after its end is counted.
+        wait_until("its place is free", || ask(&slice("pair_id = 1", "")).send(&server).status == 200);
     }
-    assert_eq!(rows, 90);
-    place.ok(&["optimize"]);
-    place.acquire("wavy", &["--ir-only"]);
-    place.ok(&["ingest"]);
-    let after = list("?table=measurements");
-    assert_ne!(after["version"], before["version"]);
-    let replaced: Vec<_> = files.iter().filter(|f| f["table"] == "measurements").collect();
-    let urls: Vec<_> = after["files"].as_array().expect("files").iter().map(|f| &f["url"]).collect();
-    assert!(replaced.iter().all(|file| !urls.contains(&&file["url"])), "they were merged: {urls:?}");
-    for file in &replaced {
-        assert_eq!(get(&server, &path(file)).status, 200, "who reads by the old list goes on");
-        std::fs::remove_file(place.path(&format!("lake/{}", path(file).trim_start_matches("/api/v1/"))))
-            .expect("vacuumed");
-        refused(&get(&server, &path(file)), 410, "gone");
+
+    #[test]
+    fn a_page_of_elsewhere_asks_of_runs_that_it_knows_alone() {
+        let place = lake();
+        let server = served(&place, &[]);
+        let run = run_of(&place, "brick");
+        let foreign = |path: &str| HttpRequest::get(path).with("origin", "https://evil.example").send(&server);
+        refused(&foreign(&slice("true", "")), 403, "foreign_origin");
+        refused(&foreign("/api/v1/foxglove/manifest?where=true"), 403, "foreign_origin");
+        refused(&HttpRequest::get(&slice("true", "")).host("evil.example").send(&server), 403, "foreign_origin");
+        refused(&foreign(&slice("cast(run_id as int) = 1", "&run=guessed")), 404, "not_found");
+        let of_the_run = format!("&run={run}");
+        for asking in [
+            "pair_id in (select pair_id from tnce)",
+            "exists (select * from runs)",
+            "abs(pair_id) = 1",
+            "pair_id + 1 = 2",
+            "cardinality(array_repeat(make_array(range(0, 30000000)), 3000000)) > pair_id",
+            &format!("{}!{}", "position(".repeat(22), " in 'x')".repeat(22)),
+            &format!("cast(null as int{}) is null", "[]".repeat(8_000)),
+            &format!("pair_id in ({}1)", "1,".repeat(1_500)),
+        ] {
+            refused(&foreign(&slice(asking, &of_the_run)), 400, "query_invalid");
+            let manifest = format!("/api/v1/foxglove/manifest?where={}{of_the_run}", encoded(asking));
+            refused(&foreign(&manifest), 400, "query_invalid");
+        }
+        let manifest = "/api/v1/foxglove/manifest?where=not%20pair_id%20between%205%20and%2099";
+        assert_eq!(foreign(&format!("{manifest}{of_the_run}")).status, 200);
+        let own = foreign(&slice("pair_id = 1 or surface_id = 'flat'", &of_the_run));
+        assert_eq!((own.status, count(&messages(&own.body), "/ir")), (200, 1), "none of a run that it does not name");
     }
-    refused(&get(&server, "/api/v1/tables/measurements/none.parquet"), 404, "not_found");
-    let foreign = HttpRequest::get("/api/v1/files").with("origin", "https://evil.example").send(&server);
-    refused(&foreign, 403, "foreign_origin");
-    assert_eq!(running(&server), 0.0);
+
+    // As Lichtblick does: a plain GET whose headers are read and which is then broken off, then ranges.
+    #[test]
+    fn a_viewer_of_elsewhere_reads_a_slice_by_ranges() {
+        let place = lake();
+        let server = served(&place, &[]);
+        let run = run_of(&place, "flat");
+        let path = slice("pair_id < 20", &format!("&run={run}"));
+        let foreign =
+            || HttpRequest::get(&path).with("origin", "https://viewer.example").with("sec-fetch-site", "cross-site");
+        let mut first = foreign().begin(&server);
+        let mut head = Vec::new();
+        while !head.ends_with(b"\r\n\r\n") {
+            let mut byte = [0];
+            first.read_exact(&mut byte).expect("headers");
+            head.push(byte[0]);
+        }
+        drop(first);
+        let head = String::from_utf8(head).expect("text").to_ascii_lowercase();
+        let value = |name: &str| {
+            let line = head.lines().find_map(|l| l.strip_prefix(&format!("{name}: ")));
+            line.unwrap_or_else(|| panic!("no {name} in {head}")).to_owned()
+        };
+        assert!(head.starts_with("http/1.1 200"), "{head}");
+        assert_eq!((value("accept-ranges").as_str(), value("access-control-allow-origin").as_str()), ("bytes", "*"));
+        assert_eq!(value("cross-origin-resource-policy"), "cross-origin");
+        for name in ["accept-ranges", "content-length", "content-range", "etag"] {
+            assert!(value("access-control-expose-headers").contains(name), "{name}");
+        }
+        let (length, tag) = (value("content-length").parse::<usize>().expect("a length"), value("etag"));
+        // It begins with the end, which holds the index.
+        let (mut file, block) = (vec![0; length], 100_000);
+        let mut starts: Vec<_> = (0..length).step_by(block).collect();
+        starts.reverse();
+        for start in starts {
+            let end = (start + block).min(length);
+            let part = foreign().with("range", &format!("bytes={start}-{}", end - 1)).send(&server);
+            assert_eq!((part.status, part.header("etag")), (206, Some(tag.as_str())));
+            assert_eq!(part.header("content-range"), Some(&*format!("bytes {start}-{}/{length}", end - 1)));
+            file[start..end].copy_from_slice(&part.body);
+        }
+        assert_eq!(count(&messages(&file), "/sweep"), 20);
+        let streamed = get(&server, &path);
+        assert!(streamed.body == file && streamed.header("etag") == Some(tag.as_str()), "the same, however it is read");
+        let headed = HttpRequest::head(&path).send(&server);
+        assert_eq!((headed.status, headed.header("content-length")), (200, Some(&*length.to_string())));
+        assert_eq!(foreign().with("if-none-match", &tag).send(&server).status, 304);
+        let ranged = |known: &str| foreign().with("range", "bytes=0-7").with("if-range", known).send(&server).status;
+        assert_eq!((ranged(&tag), ranged("\"other\"")), (206, 200));
+        refused(&foreign().with("range", &format!("bytes={length}-")).send(&server), 416, "range_not_satisfiable");
+        // What others add to the lake changes nothing of it.
+        place.acquire("wavy", &["--ir-only"]);
+        place.ok(&["ingest"]);
+        assert_eq!(foreign().with("if-none-match", &tag).send(&server).status, 304);
+        let asked = HttpRequest::options(&path)
+            .with("origin", "https://viewer.example")
+            .with("access-control-request-method", "GET")
+            .with("access-control-request-headers", "range,authorization")
+            .with("access-control-request-private-network", "true")
+            .send(&server);
+        assert_eq!((asked.status, asked.header("access-control-allow-private-network")), (200, Some("true")));
+    }
+
+    #[test]
+    fn the_lakes_files_are_urls_that_outlive_what_replaces_them() {
+        let place = lake();
+        let server = served(&place, &[]);
+        let list = |query: &str| json(&get(&server, &format!("/api/v1/files{query}")));
+        let before = list("?table=measurements&table=environment");
+        let files = before["files"].as_array().expect("files").clone();
+        let tables: BTreeSet<_> = files.iter().filter_map(|f| f["table"].as_str()).collect();
+        assert_eq!(tables, BTreeSet::from(["environment", "measurements"]));
+        assert!(list("")["files"].as_array().expect("files").len() > files.len());
+        let base = format!("http://{}", server.http);
+        let path =
+            |file: &Value| file["url"].as_str().expect("a URL").strip_prefix(&base).expect("of this server").to_owned();
+        let mut rows = 0;
+        for file in &files {
+            let whole = get(&server, &path(file));
+            assert_eq!((whole.status, whole.body.len() as u64), (200, file["bytes"].as_u64().expect("bytes")));
+            let end = HttpRequest::get(&path(file)).with("range", "bytes=-4").send(&server);
+            assert_eq!((end.status, &end.body[..]), (206, &b"PAR1"[..]));
+            let headed = HttpRequest::head(&path(file)).send(&server);
+            assert_eq!(headed.header("content-length"), Some(&*whole.body.len().to_string()));
+            assert_eq!(file["superseded_rows"], 0);
+            rows += if file["table"] == "measurements" { file["rows"].as_u64().expect("rows") } else { 0 };
+        }
+        assert_eq!(rows, 90);
+        place.ok(&["optimize"]);
+        place.acquire("wavy", &["--ir-only"]);
+        place.ok(&["ingest"]);
+        let after = list("?table=measurements");
+        assert_ne!(after["version"], before["version"]);
+        let replaced: Vec<_> = files.iter().filter(|f| f["table"] == "measurements").collect();
+        let urls: Vec<_> = after["files"].as_array().expect("files").iter().map(|f| &f["url"]).collect();
+        assert!(replaced.iter().all(|file| !urls.contains(&&file["url"])), "they were merged: {urls:?}");
+        for file in &replaced {
+            assert_eq!(get(&server, &path(file)).status, 200, "who reads by the old list goes on");
+            std::fs::remove_file(place.path(&format!("lake/{}", path(file).trim_start_matches("/api/v1/"))))
+                .expect("vacuumed");
+            refused(&get(&server, &path(file)), 410, "gone");
+        }
+        refused(&get(&server, "/api/v1/tables/measurements/none.parquet"), 404, "not_found");
+        let foreign = HttpRequest::get("/api/v1/files").with("origin", "https://evil.example").send(&server);
+        refused(&foreign, 403, "foreign_origin");
+        assert_eq!(running(&server), 0.0);
+    }
 }

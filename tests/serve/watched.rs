@@ -51,33 +51,6 @@ fn queries_are_listed_while_they_run_and_after() {
 }
 
 #[test]
-fn queries_of_all_protocols_are_cancelled_by_their_number() {
-    let place = lake();
-    let server = served(&place, &[]);
-    let cancel = |id: u64| HttpRequest::post(&format!("/api/v1/queries/{id}/cancel"), "").send(&server);
-    let endless = "select id, client, statement from system.queries where outcome = 'running' \
-                   and (protocol = 'postgres' or statement like '%generate_series%' and statement not like '%system%')";
-    let asked = HttpRequest::post("/api/v1/sql", ENDLESS).with("content-type", "text/plain").begin(&server);
-    wait_until("it runs", || rows(&server, endless).len() == 1);
-    let id = rows(&server, endless)[0]["id"].as_u64().expect("a number");
-    assert_eq!(cancel(id).status, 202);
-    wait_until("it ends", || rows(&server, endless).is_empty());
-    drop(asked);
-    let outcome = format!("select outcome from system.queries where id = {id}");
-    assert_eq!(rows(&server, &outcome)[0]["outcome"], "cancelled");
-    refused(&cancel(id), 404, "not_found");
-    refused(&HttpRequest::post("/api/v1/queries/one/cancel", "").send(&server), 400, "request_invalid");
-    // On a server without tokens everybody sees all queries, and the texts of their own.
-    let mut client = postgres::WireClient::connect(&server, None);
-    client.begin(ENDLESS);
-    wait_until("it runs", || rows(&server, endless).len() == 1);
-    let query = &rows(&server, endless)[0];
-    assert_eq!((query["client"].as_str(), query["statement"].as_str()), (Some("user me"), None));
-    assert_eq!(cancel(query["id"].as_u64().expect("a number")).status, 202);
-    assert_eq!(client.rows(), Err("57014".to_owned()));
-}
-
-#[test]
 fn the_lake_and_connections_are_tables_over_postgres_too() {
     let place = lake();
     let server = served(&place, &[]);
@@ -103,55 +76,6 @@ fn the_lake_and_connections_are_tables_over_postgres_too() {
     assert_eq!(client.query(files), one("t"));
     let versions = "select sum(rows_added) - sum(rows_removed) from system.versions where \"table\" = 'measurements'";
     assert_eq!(client.query(versions), one("45"));
-}
-
-#[test]
-fn a_token_sees_its_own_queries() {
-    let place = lake();
-    let mut tokens = String::new();
-    let mut secret = |name: &str, scopes: &str| {
-        let made = place.run(&["token", name]);
-        tokens += &String::from_utf8_lossy(&made.stdout).replace("[\"sql\", \"files\"]", scopes);
-        super::super::stderr(&made).lines().next().expect("a token").to_owned()
-    };
-    let ann = secret("ann", "[\"sql\"]");
-    let bob = secret("bob", "[\"sql\"]");
-    let chief = secret("chief", "[\"sql\", \"metrics\"]");
-    std::fs::write(place.path("tokens.toml"), &tokens).expect("written");
-    let server = served(&place, &["--tokens", "tokens.toml", "--log-slow", "0ms"]);
-    let ask = |token: &str, method: &'static str, path: &str, body: &str| {
-        let request = if method == "GET" { HttpRequest::get(path) } else { HttpRequest::post(path, body) };
-        let request = request.with("content-type", "text/plain");
-        request.with("authorization", &format!("Bearer {token}")).send(&server)
-    };
-    let query = |token: &str, text: &str| json(&ask(token, "POST", "/api/v1/sql", text)).as_array().cloned();
-    assert!(query(&ann, "select 'of ann' as text").is_some());
-    let running = HttpRequest::post("/api/v1/sql", ENDLESS)
-        .with("content-type", "text/plain")
-        .with("authorization", &format!("Bearer {ann}"))
-        .begin(&server);
-    let all = "select id, client, statement, outcome from system.queries where client = 'ann'";
-    wait_until("both are listed", || query(&chief, all).is_some_and(|rows| rows.len() == 2));
-    let seen = query(&chief, all).expect("rows");
-    assert!(seen.iter().all(|query| query["statement"].is_null()), "texts are their client's: {seen:?}");
-    assert_eq!(query(&bob, all), Some(Vec::new()));
-    let id = seen.iter().find(|query| query["outcome"] == "running").expect("it runs")["id"].clone();
-    let cancel = format!("/api/v1/queries/{id}/cancel");
-    refused(&ask(&bob, "POST", &cancel, ""), 404, "not_found");
-    refused(&ask("nonsense", "POST", &cancel, ""), 401, "unauthenticated");
-    assert_eq!(ask(&ann, "POST", &cancel, "").status, 202);
-    wait_until("it ends", || query(&chief, all).is_some_and(|rows| rows.iter().all(|q| q["outcome"] != "running")));
-    drop(running);
-    assert_eq!(ask(&ann, "GET", "/api/v1/runs/none/file.mcap", "").status, 403);
-    wait_until("slow queries are logged", || server.said().iter().any(|line| line.contains("of ann")));
-    let said = server.said();
-    let line = |parts: &[&str]| said.iter().find(|line| parts.iter().all(|part| line.contains(part))).cloned();
-    assert!(line(&["a client has logged in", "client=\"ann\"", "protocol=\"http\"", "peer=127.0.0.1"]).is_some());
-    assert!(line(&["a client was refused", "unauthenticated"]).is_some(), "{said:?}");
-    assert!(line(&["a slow query", "client=\"ann\"", "outcome=\"cancelled\""]).is_some(), "{said:?}");
-    for token in [&ann, &bob, &chief] {
-        assert!(line(&[token]).is_none(), "a token is in the log");
-    }
 }
 
 #[test]
@@ -204,5 +128,85 @@ fn figures_are_as_prometheus_wants_them() {
     match checked.status.code() {
         Some(127) => eprintln!("skipped: there is no promtool"),
         code => assert_eq!(code, Some(0), "{}", String::from_utf8_lossy(&checked.stderr)),
+    }
+}
+
+mod slow {
+    use super::*;
+
+    #[test]
+    fn queries_of_all_protocols_are_cancelled_by_their_number() {
+        let place = lake();
+        let server = served(&place, &[]);
+        let cancel = |id: u64| HttpRequest::post(&format!("/api/v1/queries/{id}/cancel"), "").send(&server);
+        let endless = "select id, client, statement from system.queries where outcome = 'running' \
+                       and (protocol = 'postgres' or statement like '%generate_series%' and statement not like '%system%')";
+        let asked = HttpRequest::post("/api/v1/sql", ENDLESS).with("content-type", "text/plain").begin(&server);
+        wait_until("it runs", || rows(&server, endless).len() == 1);
+        let id = rows(&server, endless)[0]["id"].as_u64().expect("a number");
+        assert_eq!(cancel(id).status, 202);
+        wait_until("it ends", || rows(&server, endless).is_empty());
+        drop(asked);
+        let outcome = format!("select outcome from system.queries where id = {id}");
+        assert_eq!(rows(&server, &outcome)[0]["outcome"], "cancelled");
+        refused(&cancel(id), 404, "not_found");
+        refused(&HttpRequest::post("/api/v1/queries/one/cancel", "").send(&server), 400, "request_invalid");
+        // On a server without tokens everybody sees all queries, and the texts of their own.
+        let mut client = postgres::WireClient::connect(&server, None);
+        client.begin(ENDLESS);
+        wait_until("it runs", || rows(&server, endless).len() == 1);
+        let query = &rows(&server, endless)[0];
+        assert_eq!((query["client"].as_str(), query["statement"].as_str()), (Some("user me"), None));
+        assert_eq!(cancel(query["id"].as_u64().expect("a number")).status, 202);
+        assert_eq!(client.rows(), Err("57014".to_owned()));
+    }
+
+    #[test]
+    fn a_token_sees_its_own_queries() {
+        let place = lake();
+        let mut tokens = String::new();
+        let mut secret = |name: &str, scopes: &str| {
+            let made = place.run(&["token", name]);
+            tokens += &String::from_utf8_lossy(&made.stdout).replace("[\"sql\", \"files\"]", scopes);
+            crate::stderr(&made).lines().next().expect("a token").to_owned()
+        };
+        let ann = secret("ann", "[\"sql\"]");
+        let bob = secret("bob", "[\"sql\"]");
+        let chief = secret("chief", "[\"sql\", \"metrics\"]");
+        std::fs::write(place.path("tokens.toml"), &tokens).expect("written");
+        let server = served(&place, &["--tokens", "tokens.toml", "--log-slow", "0ms"]);
+        let ask = |token: &str, method: &'static str, path: &str, body: &str| {
+            let request = if method == "GET" { HttpRequest::get(path) } else { HttpRequest::post(path, body) };
+            let request = request.with("content-type", "text/plain");
+            request.with("authorization", &format!("Bearer {token}")).send(&server)
+        };
+        let query = |token: &str, text: &str| json(&ask(token, "POST", "/api/v1/sql", text)).as_array().cloned();
+        assert!(query(&ann, "select 'of ann' as text").is_some());
+        let running = HttpRequest::post("/api/v1/sql", ENDLESS)
+            .with("content-type", "text/plain")
+            .with("authorization", &format!("Bearer {ann}"))
+            .begin(&server);
+        let all = "select id, client, statement, outcome from system.queries where client = 'ann'";
+        wait_until("both are listed", || query(&chief, all).is_some_and(|rows| rows.len() == 2));
+        let seen = query(&chief, all).expect("rows");
+        assert!(seen.iter().all(|query| query["statement"].is_null()), "texts are their client's: {seen:?}");
+        assert_eq!(query(&bob, all), Some(Vec::new()));
+        let id = seen.iter().find(|query| query["outcome"] == "running").expect("it runs")["id"].clone();
+        let cancel = format!("/api/v1/queries/{id}/cancel");
+        refused(&ask(&bob, "POST", &cancel, ""), 404, "not_found");
+        refused(&ask("nonsense", "POST", &cancel, ""), 401, "unauthenticated");
+        assert_eq!(ask(&ann, "POST", &cancel, "").status, 202);
+        wait_until("it ends", || query(&chief, all).is_some_and(|rows| rows.iter().all(|q| q["outcome"] != "running")));
+        drop(running);
+        assert_eq!(ask(&ann, "GET", "/api/v1/runs/none/file.mcap", "").status, 403);
+        wait_until("slow queries are logged", || server.said().iter().any(|line| line.contains("of ann")));
+        let said = server.said();
+        let line = |parts: &[&str]| said.iter().find(|line| parts.iter().all(|part| line.contains(part))).cloned();
+        assert!(line(&["a client has logged in", "client=\"ann\"", "protocol=\"http\"", "peer=127.0.0.1"]).is_some());
+        assert!(line(&["a client was refused", "unauthenticated"]).is_some(), "{said:?}");
+        assert!(line(&["a slow query", "client=\"ann\"", "outcome=\"cancelled\""]).is_some(), "{said:?}");
+        for token in [&ann, &bob, &chief] {
+            assert!(line(&[token]).is_none(), "a token is in the log");
+        }
     }
 }

@@ -28,39 +28,6 @@ fn explained(place: &TestFolder, workers: &str, more: &[&str]) -> String {
     plan
 }
 
-#[test]
-fn a_worker_is_of_the_same_lake_and_token() {
-    let place = lake();
-    std::fs::write(place.path("worker.token"), TOKEN).expect("written");
-    std::fs::write(place.path("other.token"), TOKEN.replace('0', "x")).expect("written");
-    std::fs::write(place.path("short.token"), "short").expect("written");
-    place.fails(1, &["serve", "--worker", "0.0.0.0:0"], "workers have no token");
-    place.fails(1, &["serve", "--worker", "0.0.0.0:0", "--worker-token", "worker.token"], "is not encrypted");
-    place.fails(1, &["serve", "--worker", "127.0.0.1:0", "--worker-token", "short.token"], "32 letters and digits");
-    place.fails(1, &["serve", "--workers", "http://10.0.0.7:7070"], "workers have no token");
-    place.fails(1, &["serve", "--workers", "10.0.0.7:7070"], "is no address of a worker");
-    place.fails(2, &["serve", "--worker", "127.0.0.1:0", "--workers", "http://127.0.0.1:1"], "cannot be used with");
-
-    let (_own, url) = worker(&place, &["--worker-token", "worker.token"]);
-    let plan = explained(&place, &url, &["--worker-token", "worker.token"]);
-    assert!(plan.contains("spread over 1 of 1 workers") || plan.contains("no part of it can run apart"), "{plan}");
-    // A wrong token, none, and a worker of another lake: the server says why, and answers by itself.
-    for (more, reason) in
-        [(&["--worker-token", "other.token"][..], "the token is not this worker's"), (&[], "this worker needs a token")]
-    {
-        let mut server = served(&place, &[&["--workers", &url, "--spread-from", "0"], more].concat());
-        let query = "select count(*) as n from measurements where ir[1] <> 7";
-        assert!(json(&sql(&server, query))[0]["n"].as_u64() > Some(0));
-        server.wait_for_line(reason);
-    }
-    let elsewhere = TestFolder::new();
-    elsewhere.acquire("flat", &["--ir-only"]);
-    elsewhere.ok(&["ingest"]);
-    let (_other, url) = worker(&elsewhere, &[]);
-    let plan = explained(&place, &url, &[]);
-    assert!(plan.contains("not spread over workers: none of 1 answers"), "{plan}");
-}
-
 const CERTIFIED: [&str; 8] = [
     "--certificate",
     "tls/certificate.pem",
@@ -71,38 +38,6 @@ const CERTIFIED: [&str; 8] = [
     "--worker-token",
     "worker.token",
 ];
-
-#[test]
-fn workers_are_encrypted() {
-    let place = lake();
-    std::fs::write(place.path("worker.token"), TOKEN).expect("written");
-    for folder in ["tls", "next"] {
-        place.ok(&["certificate", "127.0.0.1", "localhost", "-o", folder]);
-    }
-    place.fails(1, &["serve", "--workers", "https://127.0.0.1:7070", "--worker-ca", "none.pem"], "none.pem");
-    let (_first, one) = worker(&place, &CERTIFIED);
-    let (_second, two) = worker(&place, &CERTIFIED);
-    assert!(one.starts_with("https://127.0.0.1:"), "{one}");
-    let urls = format!("{one},{two}");
-    let trusting =
-        |authority: &str| explained(&place, &urls, &["--worker-token", "worker.token", "--worker-ca", authority]);
-    let plan = trusting("tls/certificate.pem");
-    assert!(plan.contains("spread over 2 of 2 workers"), "{plan}");
-
-    // A certificate that is not known, and plain text.
-    let strange = ["--workers", &one, "--spread-from", "0", "--worker-token", "worker.token", "--worker-ca"];
-    let mut server = served(&place, &[&strange[..], &["next/certificate.pem"]].concat());
-    assert_eq!(json(&sql(&server, HEAVY))[0]["surface_id"], "flat");
-    server.wait_for_line("invalid peer certificate");
-    let plan = explained(&place, &one.replace("https", "http"), &["--worker-token", "worker.token"]);
-    assert!(plan.contains("not spread over workers: none of 1 answers"), "{plan}");
-
-    // Renewed files are taken while the workers run.
-    for file in ["certificate.pem", "key.pem"] {
-        std::fs::rename(place.path("next").join(file), place.path("tls").join(file)).expect("renamed");
-    }
-    wait_until("the renewed certificate", || trusting("tls/certificate.pem").contains("spread over 2 of 2 workers"));
-}
 
 mod slow {
     use std::path::Path;
@@ -141,5 +76,73 @@ mod slow {
         let read = metrics.lines().filter(|line| line.starts_with("echolake_worker_read_bytes{")).count();
         assert_eq!(read, 2, "{metrics}");
         assert!(metrics.contains("echolake_worker_imbalance "), "{metrics}");
+    }
+
+    #[test]
+    fn workers_are_encrypted() {
+        let place = lake();
+        std::fs::write(place.path("worker.token"), TOKEN).expect("written");
+        for folder in ["tls", "next"] {
+            place.ok(&["certificate", "127.0.0.1", "localhost", "-o", folder]);
+        }
+        place.fails(1, &["serve", "--workers", "https://127.0.0.1:7070", "--worker-ca", "none.pem"], "none.pem");
+        let (_first, one) = worker(&place, &CERTIFIED);
+        let (_second, two) = worker(&place, &CERTIFIED);
+        assert!(one.starts_with("https://127.0.0.1:"), "{one}");
+        let urls = format!("{one},{two}");
+        let trusting =
+            |authority: &str| explained(&place, &urls, &["--worker-token", "worker.token", "--worker-ca", authority]);
+        let plan = trusting("tls/certificate.pem");
+        assert!(plan.contains("spread over 2 of 2 workers"), "{plan}");
+
+        // A certificate that is not known, and plain text.
+        let strange = ["--workers", &one, "--spread-from", "0", "--worker-token", "worker.token", "--worker-ca"];
+        let mut server = served(&place, &[&strange[..], &["next/certificate.pem"]].concat());
+        assert_eq!(json(&sql(&server, HEAVY))[0]["surface_id"], "flat");
+        server.wait_for_line("invalid peer certificate");
+        let plan = explained(&place, &one.replace("https", "http"), &["--worker-token", "worker.token"]);
+        assert!(plan.contains("not spread over workers: none of 1 answers"), "{plan}");
+
+        // Renewed files are taken while the workers run.
+        for file in ["certificate.pem", "key.pem"] {
+            std::fs::rename(place.path("next").join(file), place.path("tls").join(file)).expect("renamed");
+        }
+        wait_until("the renewed certificate", || {
+            trusting("tls/certificate.pem").contains("spread over 2 of 2 workers")
+        });
+    }
+
+    #[test]
+    fn a_worker_is_of_the_same_lake_and_token() {
+        let place = lake();
+        std::fs::write(place.path("worker.token"), TOKEN).expect("written");
+        std::fs::write(place.path("other.token"), TOKEN.replace('0', "x")).expect("written");
+        std::fs::write(place.path("short.token"), "short").expect("written");
+        place.fails(1, &["serve", "--worker", "0.0.0.0:0"], "workers have no token");
+        place.fails(1, &["serve", "--worker", "0.0.0.0:0", "--worker-token", "worker.token"], "is not encrypted");
+        place.fails(1, &["serve", "--worker", "127.0.0.1:0", "--worker-token", "short.token"], "32 letters and digits");
+        place.fails(1, &["serve", "--workers", "http://10.0.0.7:7070"], "workers have no token");
+        place.fails(1, &["serve", "--workers", "10.0.0.7:7070"], "is no address of a worker");
+        place.fails(2, &["serve", "--worker", "127.0.0.1:0", "--workers", "http://127.0.0.1:1"], "cannot be used with");
+
+        let (_own, url) = worker(&place, &["--worker-token", "worker.token"]);
+        let plan = explained(&place, &url, &["--worker-token", "worker.token"]);
+        assert!(plan.contains("spread over 1 of 1 workers") || plan.contains("no part of it can run apart"), "{plan}");
+        // A wrong token, none, and a worker of another lake: the server says why, and answers by itself.
+        for (more, reason) in [
+            (&["--worker-token", "other.token"][..], "the token is not this worker's"),
+            (&[], "this worker needs a token"),
+        ] {
+            let mut server = served(&place, &[&["--workers", &url, "--spread-from", "0"], more].concat());
+            let query = "select count(*) as n from measurements where ir[1] <> 7";
+            assert!(json(&sql(&server, query))[0]["n"].as_u64() > Some(0));
+            server.wait_for_line(reason);
+        }
+        let elsewhere = TestFolder::new();
+        elsewhere.acquire("flat", &["--ir-only"]);
+        elsewhere.ok(&["ingest"]);
+        let (_other, url) = worker(&elsewhere, &[]);
+        let plan = explained(&place, &url, &[]);
+        assert!(plan.contains("not spread over workers: none of 1 answers"), "{plan}");
     }
 }

@@ -246,47 +246,6 @@ fn playback_is_paused_put_elsewhere_and_ended() {
 }
 
 #[test]
-fn who_sleeps_stops_nobody_and_loses_no_order() {
-    let home = tempfile::tempdir().expect("a folder");
-    let paths: Vec<_> = (0..12).map(|i| run(home.path(), &format!("s{i}"), f64::from(i))).collect();
-    let paths: Vec<&Path> = paths.iter().map(PathBuf::as_path).collect();
-    let expected: usize = paths.iter().map(|path| messages(path).len()).sum();
-    let server = replay(&paths, FAST);
-    let mut sleeper = ReplayClient::connect(&server);
-    let mut awake = ReplayClient::connect(&server);
-    // The sleeper waits for its first message, so that it is known to be served.
-    sleeper.subscribe(&[]);
-    sleeper.collect(1);
-    awake.subscribe(&[]);
-    let begun = Instant::now();
-    let mut last = 0;
-    loop {
-        match awake.hear() {
-            Heard::Message((_, time, _)) => {
-                assert!(time >= last);
-                last = time;
-            }
-            Heard::Time(time) if last > 0 && time >= server.range().1 => break,
-            _ => {}
-        }
-        assert!(begun.elapsed() < ANSWER_LIMIT, "it ends");
-    }
-    let mut heard = 0;
-    last = 0;
-    while let Ok(Message::Binary(bytes)) = sleeper.socket.read() {
-        if bytes[0] == 1 {
-            let time = u64::from_le_bytes(bytes[5..13].try_into().expect("eight"));
-            assert!(time >= last, "no order is lost");
-            (last, heard) = (time, heard + 1);
-        }
-        if bytes[0] == 2 && u64::from_le_bytes(bytes[1..9].try_into().expect("eight")) >= server.range().1 {
-            break;
-        }
-    }
-    assert!(heard <= expected, "{heard} of {expected}");
-}
-
-#[test]
 fn damage_is_named_and_left_out() {
     let home = tempfile::tempdir().expect("a folder");
     let path = run(home.path(), "a", 0.0);
@@ -355,4 +314,49 @@ fn what_cannot_be_shown_is_refused() {
     let open = vec![Recording::open(&path).expect("a recording")];
     let taken = ReplayServer::start(server.address(), ViewerAccess::default(), open, FAST);
     assert!(taken.map(drop).expect_err("taken").to_string().contains("taken?"));
+}
+
+mod slow {
+    use super::*;
+
+    #[test]
+    fn who_sleeps_stops_nobody_and_loses_no_order() {
+        let home = tempfile::tempdir().expect("a folder");
+        let paths: Vec<_> = (0..12).map(|i| run(home.path(), &format!("s{i}"), f64::from(i))).collect();
+        let paths: Vec<&Path> = paths.iter().map(PathBuf::as_path).collect();
+        let expected: usize = paths.iter().map(|path| messages(path).len()).sum();
+        let server = replay(&paths, FAST);
+        let mut sleeper = ReplayClient::connect(&server);
+        let mut awake = ReplayClient::connect(&server);
+        // The sleeper waits for its first message, so that it is known to be served.
+        sleeper.subscribe(&[]);
+        sleeper.collect(1);
+        awake.subscribe(&[]);
+        let begun = Instant::now();
+        let mut last = 0;
+        loop {
+            match awake.hear() {
+                Heard::Message((_, time, _)) => {
+                    assert!(time >= last);
+                    last = time;
+                }
+                Heard::Time(time) if last > 0 && time >= server.range().1 => break,
+                _ => {}
+            }
+            assert!(begun.elapsed() < ANSWER_LIMIT, "it ends");
+        }
+        let mut heard = 0;
+        last = 0;
+        while let Ok(Message::Binary(bytes)) = sleeper.socket.read() {
+            if bytes[0] == 1 {
+                let time = u64::from_le_bytes(bytes[5..13].try_into().expect("eight"));
+                assert!(time >= last, "no order is lost");
+                (last, heard) = (time, heard + 1);
+            }
+            if bytes[0] == 2 && u64::from_le_bytes(bytes[1..9].try_into().expect("eight")) >= server.range().1 {
+                break;
+            }
+        }
+        assert!(heard <= expected, "{heard} of {expected}");
+    }
 }

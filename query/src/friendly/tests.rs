@@ -67,35 +67,6 @@ async fn answer(lake: &SmallLake, sql: &str, is_sorted: bool) -> Result<Vec<Stri
     Ok(lines)
 }
 
-#[tokio::test]
-async fn friendly_statements_answer_as_plain_ones_or_are_refused() {
-    let lake = SmallLake::new().await;
-    let mut wrong = String::new();
-    for statement in statements() {
-        let sql = statement.sql;
-        let is_sorted = sql.contains("order by all") || sql.contains(" limit ");
-        let given = answer(&lake, sql, is_sorted).await;
-        let complaint = match (statement.expected, given) {
-            (Expected::Plain(plain), Ok(given)) => match answer(&lake, plain, is_sorted).await {
-                Ok(expected) if expected == given && given.len() > 1 => continue,
-                Ok(expected) => format!("{given:.3?}\nexpected {expected:.3?}"),
-                Err(error) => format!("the plain form fails: {error}"),
-            },
-            (Expected::Plain(_), Err(error)) => error.to_string(),
-            (Expected::Hint(hint), Err(error)) => {
-                let text = error.to_string();
-                match text.split_once("hint: ") {
-                    Some((_, given)) if given.contains(hint) => continue,
-                    _ => format!("the hint lacks `{hint}`: {text}"),
-                }
-            }
-            (Expected::Hint(_), Ok(given)) => format!("answered {given:.3?}"),
-        };
-        let _ = writeln!(wrong, "== {sql}\n{complaint}");
-    }
-    assert!(wrong.is_empty(), "{wrong}");
-}
-
 async fn page(lake: &SmallLake) -> String {
     let mut page = HEAD.to_owned();
     let mut chapter = "";
@@ -131,34 +102,68 @@ async fn friendly_page_is_fresh() {
     assert!(written == page, "docs/friendly_sql.md is stale; `{command}` renews it");
 }
 
-// Short statements that would become long ones, or would be planned again and again.
-#[tokio::test]
-async fn rewriting_is_bounded() {
-    let lake = SmallLake::new().await;
-    let doubled: String = (0..40).map(|i| format!(", a{i} + a{i} as a{}", i + 1)).collect();
-    let chained: String = (0..60).map(|i| format!(", a{i} + 1 as a{}", i + 1)).collect();
-    let literal = "x".repeat(50_000);
-    let pivots = " pivot (count(*) for layer in (0))".repeat(21);
-    let lookups = "select columns('.*') from points union all ".repeat(150);
-    let nested = |call: &str, depth: usize, end: &str| format!("select {}1{}", call.repeat(depth), end.repeat(depth));
-    for sql in [
-        format!("select point_id as a0{doubled} from points"),
-        format!("select point_id as a0{chained} from points"),
-        format!("select concat(columns('.*'), '{literal}') as \"\\0\" from measurements"),
-        format!("select columns('{}') from points", "(a{1,100}){1,100}".repeat(20)),
-        format!("select * from points{pivots}"),
-        format!("{lookups} select * from points"),
-        format!("select concat({} 1) from points", "columns('.*'), ".repeat(20_000)),
-        format!("select {} 1 from points", "* rename (x_mm as x), ".repeat(20_000)),
-        nested("max(", 60, ", 1)"),
-        nested("arg_max(1, ", 60, ")"),
-        format!(
-            "pivot points on concat(layer, '{literal}') in (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21) using count(*)"
-        ),
-    ] {
-        let started = std::time::Instant::now();
-        let error = lake.batches(&sql).await.map(drop).expect_err(&sql[..60]).to_string();
-        assert!(error.contains("hint: "), "{}: {error}", &sql[..60]);
-        assert!(started.elapsed().as_secs() < 60, "{}: {:?}", &sql[..60], started.elapsed());
+mod slow {
+    use super::*;
+
+    // Short statements that would become long ones, or would be planned again and again.
+    #[tokio::test]
+    async fn rewriting_is_bounded() {
+        let lake = SmallLake::new().await;
+        let doubled: String = (0..40).map(|i| format!(", a{i} + a{i} as a{}", i + 1)).collect();
+        let chained: String = (0..60).map(|i| format!(", a{i} + 1 as a{}", i + 1)).collect();
+        let literal = "x".repeat(50_000);
+        let pivots = " pivot (count(*) for layer in (0))".repeat(21);
+        let lookups = "select columns('.*') from points union all ".repeat(150);
+        let nested =
+            |call: &str, depth: usize, end: &str| format!("select {}1{}", call.repeat(depth), end.repeat(depth));
+        for sql in [
+            format!("select point_id as a0{doubled} from points"),
+            format!("select point_id as a0{chained} from points"),
+            format!("select concat(columns('.*'), '{literal}') as \"\\0\" from measurements"),
+            format!("select columns('{}') from points", "(a{1,100}){1,100}".repeat(20)),
+            format!("select * from points{pivots}"),
+            format!("{lookups} select * from points"),
+            format!("select concat({} 1) from points", "columns('.*'), ".repeat(20_000)),
+            format!("select {} 1 from points", "* rename (x_mm as x), ".repeat(20_000)),
+            nested("max(", 60, ", 1)"),
+            nested("arg_max(1, ", 60, ")"),
+            format!(
+                "pivot points on concat(layer, '{literal}') in (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21) using count(*)"
+            ),
+        ] {
+            let started = std::time::Instant::now();
+            let error = lake.batches(&sql).await.map(drop).expect_err(&sql[..60]).to_string();
+            assert!(error.contains("hint: "), "{}: {error}", &sql[..60]);
+            assert!(started.elapsed().as_secs() < 60, "{}: {:?}", &sql[..60], started.elapsed());
+        }
+    }
+
+    #[tokio::test]
+    async fn friendly_statements_answer_as_plain_ones_or_are_refused() {
+        let lake = SmallLake::new().await;
+        let mut wrong = String::new();
+        for statement in statements() {
+            let sql = statement.sql;
+            let is_sorted = sql.contains("order by all") || sql.contains(" limit ");
+            let given = answer(&lake, sql, is_sorted).await;
+            let complaint = match (statement.expected, given) {
+                (Expected::Plain(plain), Ok(given)) => match answer(&lake, plain, is_sorted).await {
+                    Ok(expected) if expected == given && given.len() > 1 => continue,
+                    Ok(expected) => format!("{given:.3?}\nexpected {expected:.3?}"),
+                    Err(error) => format!("the plain form fails: {error}"),
+                },
+                (Expected::Plain(_), Err(error)) => error.to_string(),
+                (Expected::Hint(hint), Err(error)) => {
+                    let text = error.to_string();
+                    match text.split_once("hint: ") {
+                        Some((_, given)) if given.contains(hint) => continue,
+                        _ => format!("the hint lacks `{hint}`: {text}"),
+                    }
+                }
+                (Expected::Hint(_), Ok(given)) => format!("answered {given:.3?}"),
+            };
+            let _ = writeln!(wrong, "== {sql}\n{complaint}");
+        }
+        assert!(wrong.is_empty(), "{wrong}");
     }
 }

@@ -400,15 +400,6 @@ async fn put_events(lake: &Lake, surface: &str, run: &str, derivation: &str, lin
     lake.commit(&staged).await.expect("committed");
 }
 
-// Between the commit of a run's new rows and the clean-up, a merged file still holds its old ones. A small table is in
-// memory, a larger one is scanned.
-#[tokio::test]
-async fn replaced_rows_of_a_merged_file_are_not_seen() {
-    for others in [1, 20_000] {
-        check_replaced_rows(others).await;
-    }
-}
-
 async fn check_replaced_rows(others: usize) {
     let (_folder, lake) = lake().await;
     for (surface, run, lines) in [("flat", "r1", 3), ("foam", "r2", 5), ("wood", "r3", 7), ("prd", "r4", others)] {
@@ -443,4 +434,17 @@ async fn check_replaced_rows(others: usize) {
     put_events(&lake, "foam", "r2", "old", 5).await;
     put_events(&lake, "wood", "r3", "empty", 0).await;
     assert_eq!(number("select count(*) from events").await, 8 + others);
+}
+
+mod slow {
+    use super::*;
+
+    // Between the commit of a run's new rows and the clean-up, a merged file still holds its old ones. A small table is in
+    // memory, a larger one is scanned.
+    #[tokio::test]
+    async fn replaced_rows_of_a_merged_file_are_not_seen() {
+        for others in [1, 20_000] {
+            check_replaced_rows(others).await;
+        }
+    }
 }

@@ -178,33 +178,37 @@ async fn hostile_plans_have_no_effect() {
     assert_eq!(rows.expect("it works as before"), 3);
 }
 
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn scans_of_run_files_are_checked() {
-    let small = SmallLake::new().await;
-    let file = mcap_tests::json_file(mcap_tests::options(None), 3);
-    small.lake.store().put(&Path::from("inbox/a.mcap"), file.into()).await.expect("written");
-    let worker = TestWorker::start(&small.lake);
-    let client = HostileClient::new(&worker);
-    let session = crate::Session::new(&small.lake).expect("a session");
-    let sql = "select x from mcap('inbox/a.mcap', '/point') order by x";
-    let (_, expected) = answer(&session, sql).await.expect("rows");
-    let plan = session.local_plan(sql).await;
-    assert_eq!(client.send(plan.clone()).await.expect("rows"), lines(&expected, false).len());
-    let encoded = MaybeEncoded::Decoded(plan).encode(&client.context.task_ctx()).expect("encoded");
-    // Each byte of the plan changed: rows or an error, and a worker that goes on.
-    for place in 0..encoded.len() {
-        let mut changed = encoded.clone();
-        changed[place] = changed[place].wrapping_add(1);
-        drop(client.send_encoded(MaybeEncoded::Encoded(changed)).await);
+mod slow {
+    use super::*;
+
+    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+    async fn scans_of_run_files_are_checked() {
+        let small = SmallLake::new().await;
+        let file = mcap_tests::json_file(mcap_tests::options(None), 3);
+        small.lake.store().put(&Path::from("inbox/a.mcap"), file.into()).await.expect("written");
+        let worker = TestWorker::start(&small.lake);
+        let client = HostileClient::new(&worker);
+        let session = crate::Session::new(&small.lake).expect("a session");
+        let sql = "select x from mcap('inbox/a.mcap', '/point') order by x";
+        let (_, expected) = answer(&session, sql).await.expect("rows");
+        let plan = session.local_plan(sql).await;
+        assert_eq!(client.send(plan.clone()).await.expect("rows"), lines(&expected, false).len());
+        let encoded = MaybeEncoded::Decoded(plan).encode(&client.context.task_ctx()).expect("encoded");
+        // Each byte of the plan changed: rows or an error, and a worker that goes on.
+        for place in 0..encoded.len() {
+            let mut changed = encoded.clone();
+            changed[place] = changed[place].wrapping_add(1);
+            drop(client.send_encoded(MaybeEncoded::Encoded(changed)).await);
+        }
+        let renamed = String::from_utf8_lossy(&encoded).contains("inbox/a.mcap");
+        assert!(renamed, "the plan names its file");
+        let name = encoded.windows(12).position(|bytes| bytes == b"inbox/a.mcap").expect("its place");
+        for other in [b"lake/lake.to", b"../../a.mcap", b"/etc/passwd."] {
+            let mut changed = encoded.clone();
+            changed[name..name + other.len()].copy_from_slice(other);
+            assert!(client.send_encoded(MaybeEncoded::Encoded(changed)).await.is_err());
+        }
+        let plan = MaybeEncoded::Encoded(encoded);
+        assert_eq!(client.send_encoded(plan).await.expect("rows"), lines(&expected, false).len());
     }
-    let renamed = String::from_utf8_lossy(&encoded).contains("inbox/a.mcap");
-    assert!(renamed, "the plan names its file");
-    let name = encoded.windows(12).position(|bytes| bytes == b"inbox/a.mcap").expect("its place");
-    for other in [b"lake/lake.to", b"../../a.mcap", b"/etc/passwd."] {
-        let mut changed = encoded.clone();
-        changed[name..name + other.len()].copy_from_slice(other);
-        assert!(client.send_encoded(MaybeEncoded::Encoded(changed)).await.is_err());
-    }
-    let plan = MaybeEncoded::Encoded(encoded);
-    assert_eq!(client.send_encoded(plan).await.expect("rows"), lines(&expected, false).len());
 }

@@ -165,17 +165,6 @@ async fn check_answers(lake: &Lake, workers: &[TestWorker], queries: &[String]) 
     count
 }
 
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn spread_answers_are_those_of_one_machine() {
-    let small = SmallLake::new().await;
-    let queries = QUERIES.map(str::to_owned);
-    for count in [1, 2, 4] {
-        let workers: Vec<_> = (0..count).map(|_| TestWorker::start(&small.lake)).collect();
-        let spread = check_answers(&small.lake, &workers, &queries).await;
-        assert!(count == 1 || spread == queries.len(), "{spread} of {} are spread over {count}", queries.len());
-    }
-}
-
 /// Every kind of function over rows that workers read: the examples of the manual have their own rows, mostly.
 const FUNCTIONS: [&str; 14] = [
     "db(abs(ir[5]))",
@@ -193,54 +182,6 @@ const FUNCTIONS: [&str; 14] = [
     "d4_point(0, 'rot180')",
     "speed_of_sound(20 + ir[1])",
 ];
-
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn functions_answer_over_workers_what_they_do_here() {
-    let small = SmallLake::new().await;
-    let workers = [TestWorker::start(&small.lake), TestWorker::start(&small.lake)];
-    let examples: Vec<_> = examples().into_iter().map(|(_, query, _)| query).collect();
-    let spread = check_answers(&small.lake, &workers, &examples).await;
-    assert!(spread > 0, "none of {} examples is spread", examples.len());
-    let from = "from measurements where pair_id < 10 order by surface_id, pair_id";
-    let mut queries: Vec<_> = FUNCTIONS.map(|call| format!("select {call} as x, ir[1] as y {from}")).into();
-    queries.push("select surface_id, p90_mean(ir[9]), avg_list(ir) from measurements group by 1 order by 1".to_owned());
-    let spread = check_answers(&small.lake, &workers, &queries).await;
-    assert_eq!(spread, queries.len());
-}
-
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn run_files_are_read_by_workers() {
-    let small = SmallLake::new().await;
-    for (name, seconds) in [("a", 30), ("b", 3), ("c", 11)] {
-        let file = mcap_tests::json_file(mcap_tests::options(None), seconds);
-        let path = Path::from(format!("inbox/{name}.mcap"));
-        small.lake.store().put(&path, file.into()).await.expect("written");
-    }
-    let files = "inbox/a.mcap,inbox/b.mcap,inbox/c.mcap";
-    let queries = [
-        format!(
-            "select run_id, log_time, x, name, tags, \"at\" from mcap('{files}', '/point') order by name, log_time"
-        ),
-        format!(
-            "select topic, count(*), sum(size), max(data) from mcap_messages('{files}') group by topic order by topic"
-        ),
-        format!(
-            "select p.name, m.pair_id from mcap('{files}', '/point') p join measurements m on p.sequence = m.pair_id \
-             order by p.name, m.surface_id"
-        ),
-        format!("select count(*) from mcap('{files}', '/point') where x > 3 and log_time_ns % 3 = 0"),
-        format!("select name from mcap('{files}', '/point') where log_time_ns < 1767657605000000000"),
-    ];
-    for count in [2, 3] {
-        let workers: Vec<_> = (0..count).map(|_| TestWorker::start(&small.lake)).collect();
-        assert_eq!(check_answers(&small.lake, &workers, &queries).await, queries.len());
-    }
-    // Few rows of a run file are few bytes.
-    let workers = [TestWorker::start(&small.lake), TestWorker::start(&small.lake)];
-    let usual = session(&small.lake, &workers, |settings| settings.least_bytes = 1);
-    let text = explained(&usual, &format!("select name from mcap('{files}', '/point') limit 3")).await;
-    assert!(text.contains("not spread over workers: it reads about 0 MiB"), "{text}");
-}
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn explain_says_what_is_spread_and_why_not() {
@@ -320,4 +261,69 @@ async fn limits_hold_and_own_errors_stay() {
     assert_eq!(errors[0], errors[1]);
     let text = DataFusionError::from(WorkerLoss::new("it is gone"));
     assert!(matches!(Error::execution(&text), Error::WorkerLost { message } if message == "it is gone"));
+}
+
+mod slow {
+    use super::*;
+
+    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+    async fn spread_answers_are_those_of_one_machine() {
+        let small = SmallLake::new().await;
+        let queries = QUERIES.map(str::to_owned);
+        for count in [1, 2, 4] {
+            let workers: Vec<_> = (0..count).map(|_| TestWorker::start(&small.lake)).collect();
+            let spread = check_answers(&small.lake, &workers, &queries).await;
+            assert!(count == 1 || spread == queries.len(), "{spread} of {} are spread over {count}", queries.len());
+        }
+    }
+
+    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+    async fn functions_answer_over_workers_what_they_do_here() {
+        let small = SmallLake::new().await;
+        let workers = [TestWorker::start(&small.lake), TestWorker::start(&small.lake)];
+        let examples: Vec<_> = examples().into_iter().map(|(_, query, _)| query).collect();
+        let spread = check_answers(&small.lake, &workers, &examples).await;
+        assert!(spread > 0, "none of {} examples is spread", examples.len());
+        let from = "from measurements where pair_id < 10 order by surface_id, pair_id";
+        let mut queries: Vec<_> = FUNCTIONS.map(|call| format!("select {call} as x, ir[1] as y {from}")).into();
+        queries.push(
+            "select surface_id, p90_mean(ir[9]), avg_list(ir) from measurements group by 1 order by 1".to_owned(),
+        );
+        let spread = check_answers(&small.lake, &workers, &queries).await;
+        assert_eq!(spread, queries.len());
+    }
+
+    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+    async fn run_files_are_read_by_workers() {
+        let small = SmallLake::new().await;
+        for (name, seconds) in [("a", 30), ("b", 3), ("c", 11)] {
+            let file = mcap_tests::json_file(mcap_tests::options(None), seconds);
+            let path = Path::from(format!("inbox/{name}.mcap"));
+            small.lake.store().put(&path, file.into()).await.expect("written");
+        }
+        let files = "inbox/a.mcap,inbox/b.mcap,inbox/c.mcap";
+        let queries = [
+            format!(
+                "select run_id, log_time, x, name, tags, \"at\" from mcap('{files}', '/point') order by name, log_time"
+            ),
+            format!(
+                "select topic, count(*), sum(size), max(data) from mcap_messages('{files}') group by topic order by topic"
+            ),
+            format!(
+                "select p.name, m.pair_id from mcap('{files}', '/point') p join measurements m on p.sequence = m.pair_id \
+                 order by p.name, m.surface_id"
+            ),
+            format!("select count(*) from mcap('{files}', '/point') where x > 3 and log_time_ns % 3 = 0"),
+            format!("select name from mcap('{files}', '/point') where log_time_ns < 1767657605000000000"),
+        ];
+        for count in [2, 3] {
+            let workers: Vec<_> = (0..count).map(|_| TestWorker::start(&small.lake)).collect();
+            assert_eq!(check_answers(&small.lake, &workers, &queries).await, queries.len());
+        }
+        // Few rows of a run file are few bytes.
+        let workers = [TestWorker::start(&small.lake), TestWorker::start(&small.lake)];
+        let usual = session(&small.lake, &workers, |settings| settings.least_bytes = 1);
+        let text = explained(&usual, &format!("select name from mcap('{files}', '/point') limit 3")).await;
+        assert!(text.contains("not spread over workers: it reads about 0 MiB"), "{text}");
+    }
 }

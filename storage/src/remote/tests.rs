@@ -171,32 +171,6 @@ async fn a_store_that_overwrites_is_refused_before_anything_is_written() {
     }
 }
 
-// Four processes' worth of writers. Every call succeeds, says that the rows are new, and they are there once.
-#[tokio::test(flavor = "multi_thread")]
-async fn commits_whose_answers_are_lost_are_made_once_and_known_to_be_made() {
-    for seed in 1..=3 {
-        let store = FaultyStore::new(StoreFault::Unreliable, seed);
-        let rows = lake(store.clone()).await.expect("made").pairs().expect("rows");
-        let write = |writer: usize| {
-            let (store, rows) = (store.clone(), rows.clone());
-            tokio::spawn(async move {
-                let lake = lake(store).await.expect("opened");
-                for number in 0..6 {
-                    let name = FileName::Rig { derivation: format!("{writer}x{number}") };
-                    let outcome = lake.append_rows(Table::Pairs, &name, std::slice::from_ref(&rows)).await;
-                    assert_eq!(outcome.expect("committed"), CommitOutcome::Now, "seed {seed}, {writer}x{number}");
-                }
-            })
-        };
-        for writer in [0, 1, 2, 3].map(write) {
-            writer.await.expect("no panic");
-        }
-        let files = lake(store.clone()).await.expect("opened").log().files(Table::Pairs).await.expect("files");
-        assert_eq!(files.len(), 25, "seed {seed}: the rig's own and 24");
-        assert!(store.faults.load(Ordering::SeqCst) > 20, "seed {seed}");
-    }
-}
-
 #[tokio::test]
 async fn what_is_cut_off_is_fetched_again_and_what_never_comes_says_how_often_it_was_tried() {
     let faulty = FaultyStore::new(StoreFault::Unreliable, 5);
@@ -257,4 +231,34 @@ async fn a_view_costs_a_request_a_table_and_a_commit_of_many_runs_a_few() {
     }
     lake.commit(&staged).await.expect("there before");
     assert_eq!(store.take_requests().len(), tables.len(), "a look at each");
+}
+
+mod slow {
+    use super::*;
+
+    // Four processes' worth of writers. Every call succeeds, says that the rows are new, and they are there once.
+    #[tokio::test(flavor = "multi_thread")]
+    async fn commits_whose_answers_are_lost_are_made_once_and_known_to_be_made() {
+        for seed in 1..=3 {
+            let store = FaultyStore::new(StoreFault::Unreliable, seed);
+            let rows = lake(store.clone()).await.expect("made").pairs().expect("rows");
+            let write = |writer: usize| {
+                let (store, rows) = (store.clone(), rows.clone());
+                tokio::spawn(async move {
+                    let lake = lake(store).await.expect("opened");
+                    for number in 0..6 {
+                        let name = FileName::Rig { derivation: format!("{writer}x{number}") };
+                        let outcome = lake.append_rows(Table::Pairs, &name, std::slice::from_ref(&rows)).await;
+                        assert_eq!(outcome.expect("committed"), CommitOutcome::Now, "seed {seed}, {writer}x{number}");
+                    }
+                })
+            };
+            for writer in [0, 1, 2, 3].map(write) {
+                writer.await.expect("no panic");
+            }
+            let files = lake(store.clone()).await.expect("opened").log().files(Table::Pairs).await.expect("files");
+            assert_eq!(files.len(), 25, "seed {seed}: the rig's own and 24");
+            assert!(store.faults.load(Ordering::SeqCst) > 20, "seed {seed}");
+        }
+    }
 }

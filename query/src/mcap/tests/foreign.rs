@@ -25,28 +25,6 @@ fn file_without(parts: usize, chunks: bool) -> Vec<u8> {
 }
 
 #[tokio::test]
-async fn a_summary_that_leaves_parts_out_hides_nothing() {
-    let lake = lake().await;
-    for (parts, chunks) in (0..1 << PARTS.len()).flat_map(|parts| [(parts, true), (parts, false)]) {
-        let path = format!("inbox/{parts}_{chunks}.mcap");
-        put(&lake, &path, file_without(parts, chunks)).await;
-        check(&lake, &format!("select count(*), sum(x) from mcap('{path}', '/point')"), &["30 | 108.75"]).await;
-        assert_eq!(number(&lake, &format!("select count(*) from mcap_messages('{path}')")).await, 33);
-        check(
-            &lake,
-            &format!(
-                "select topic, schema_name, messages, first_time, last_time from mcap_topics('{path}') order by 1"
-            ),
-            &[
-                "/note |  | 3 | 2026-01-06T00:00:00Z | 2026-01-06T00:00:02Z",
-                "/point | Point | 30 | 2026-01-06T00:00:00Z | 2026-01-06T00:00:02.900Z",
-            ],
-        )
-        .await;
-    }
-}
-
-#[tokio::test]
 async fn topics_say_how_their_file_was_read() {
     let lake = lake().await;
     for (part, expected) in [
@@ -358,5 +336,31 @@ async fn cbor_messages_are_columns_or_text() {
     {
         put(&lake, "inbox/c.mcap", file(schema, damaged)).await;
         refused(&lake, "select x from mcap('inbox/c.mcap', '/t')", &["it is no CBOR map"]).await;
+    }
+}
+
+mod slow {
+    use super::*;
+
+    #[tokio::test]
+    async fn a_summary_that_leaves_parts_out_hides_nothing() {
+        let lake = lake().await;
+        for (parts, chunks) in (0..1 << PARTS.len()).flat_map(|parts| [(parts, true), (parts, false)]) {
+            let path = format!("inbox/{parts}_{chunks}.mcap");
+            put(&lake, &path, file_without(parts, chunks)).await;
+            check(&lake, &format!("select count(*), sum(x) from mcap('{path}', '/point')"), &["30 | 108.75"]).await;
+            assert_eq!(number(&lake, &format!("select count(*) from mcap_messages('{path}')")).await, 33);
+            check(
+                &lake,
+                &format!(
+                    "select topic, schema_name, messages, first_time, last_time from mcap_topics('{path}') order by 1"
+                ),
+                &[
+                    "/note |  | 3 | 2026-01-06T00:00:00Z | 2026-01-06T00:00:02Z",
+                    "/point | Point | 30 | 2026-01-06T00:00:00Z | 2026-01-06T00:00:02.900Z",
+                ],
+            )
+            .await;
+        }
     }
 }
