@@ -180,42 +180,6 @@ fn cut_off(whole: &[u8]) -> &[u8] {
     &whole[..last as usize + 10]
 }
 
-// The system ends a process that writes larger files than it may: heights are as large, and flat ones are not.
-#[test]
-fn a_run_that_ends_ingest_is_passed_over_by_the_next_one() {
-    let place = TestFolder::new();
-    for (surface, seed) in [("flat", "1"), ("brick", "1"), ("flat", "2")] {
-        place.acquire(surface, &["--seed", seed, "--ir-only"]);
-    }
-    let ingest = || {
-        let mut command = Command::new("sh");
-        command.args(["-c", "ulimit -c 0; ulimit -f 250; exec \"$0\" --lake lake ingest", ECHOLAKE]);
-        run_command(command.current_dir(place.path("")).env_remove("ECHOLAKE_LAKE")).expect("the command starts")
-    };
-    let first = ingest();
-    assert_eq!(first.status.code(), None, "{}", stderr(&first));
-    let second = ingest();
-    let said = stderr(&second);
-    assert_eq!(second.status.code(), Some(3), "{said}");
-    assert_eq!(said.matches("a process of its own takes it in").count(), 2, "{said}");
-    assert!(said.contains(".mcap` is passed over") && said.contains("-brick-") && said.contains("SIGXFSZ"), "{said}");
-    assert_eq!(place.number("select count(*) from runs where surface_id = 'flat'"), 2.0);
-    match std::fs::read_dir(place.path("lake/quarantine")) {
-        // It had not come to its place yet.
-        Ok(quarantine) => {
-            let files = quarantine.map(|entry| entry.expect("listed").path());
-            let run = files.into_iter().find(|path| path.extension() == Some("mcap".as_ref())).expect("a run");
-            std::fs::rename(&run, place.path("lake/inbox").join(run.file_name().expect("a name"))).expect("moved");
-        }
-        Err(_) => {
-            place.fails(3, &["ingest"], "is passed over");
-            std::fs::remove_dir_all(place.path("lake/tables/_reading")).expect("removed");
-        }
-    }
-    place.ok(&["ingest"]);
-    assert_eq!(place.number("select count(*) from runs"), 3.0);
-}
-
 #[test]
 fn lakes_that_are_none_newer_or_someone_elses() {
     let place = TestFolder::new();
@@ -261,33 +225,6 @@ impl Drop for SmallDisk {
     fn drop(&mut self) {
         let _ = run_command(Command::new("umount").arg(&self.0));
     }
-}
-
-#[test]
-fn a_full_disk_stops_everything_cleanly_and_with_space_it_goes_on() {
-    let place = TestFolder::new();
-    let Some(disk) = SmallDisk::mounted(&place.path("lake"), 12 << 10) else { return };
-    for (surface, seed) in [("flat", "1"), ("foam", "2"), ("wood", "3")] {
-        place.acquire(surface, &["--seed", seed, "--ir-only"]);
-    }
-    // As much space as two of the runs' tables need, less than all.
-    let used = || {
-        let output = run_command(Command::new("du").arg("-sk").arg(&disk.0)).expect("du starts");
-        String::from_utf8(output.stdout).expect("text").split_whitespace().next().and_then(|n| n.parse::<u64>().ok())
-    };
-    let before = used().expect("a number");
-    disk.remount(&format!("size={}k", before + 700));
-    place.fails(1, &["ingest"], "full");
-    place.fails(1, &["acquire", "--surface", "prd", "--rig", "rig.toml"], "full");
-    // Readers are not disturbed.
-    place.ok(&["sql", "select count(*) from runs"]);
-    disk.remount("size=24m");
-    place.ok(&["ingest"]);
-    assert_eq!(place.number("select count(*) from tnce"), 3.0 * 45.0);
-    assert_eq!(place.number("select count(*) from runs where state = 'complete'"), 3.0);
-    let report: serde_json::Value = serde_json::from_str(&place.ok(&["doctor", "--json"])).expect("JSON");
-    let findings = report["findings"].as_array().expect("a list");
-    assert!(findings.iter().all(|f| f["severity"] == "note"), "{findings:?}");
 }
 
 #[test]
@@ -431,5 +368,75 @@ mod slow {
         std::fs::write(other.path("flipped.mcap"), &flipped).expect("written");
         other.fails(3, &["ingest", "flipped.mcap"], "warning: ");
         other.fails(0, &["ingest"], "45 measurements");
+    }
+
+    #[test]
+    fn a_full_disk_stops_everything_cleanly_and_with_space_it_goes_on() {
+        let place = TestFolder::new();
+        let Some(disk) = SmallDisk::mounted(&place.path("lake"), 12 << 10) else { return };
+        for (surface, seed) in [("flat", "1"), ("foam", "2"), ("wood", "3")] {
+            place.acquire(surface, &["--seed", seed, "--ir-only"]);
+        }
+        // As much space as two of the runs' tables need, less than all.
+        let used = || {
+            let output = run_command(Command::new("du").arg("-sk").arg(&disk.0)).expect("du starts");
+            String::from_utf8(output.stdout)
+                .expect("text")
+                .split_whitespace()
+                .next()
+                .and_then(|n| n.parse::<u64>().ok())
+        };
+        let before = used().expect("a number");
+        disk.remount(&format!("size={}k", before + 700));
+        place.fails(1, &["ingest"], "full");
+        place.fails(1, &["acquire", "--surface", "prd", "--rig", "rig.toml"], "full");
+        // Readers are not disturbed.
+        place.ok(&["sql", "select count(*) from runs"]);
+        disk.remount("size=24m");
+        place.ok(&["ingest"]);
+        assert_eq!(place.number("select count(*) from tnce"), 3.0 * 45.0);
+        assert_eq!(place.number("select count(*) from runs where state = 'complete'"), 3.0);
+        let report: serde_json::Value = serde_json::from_str(&place.ok(&["doctor", "--json"])).expect("JSON");
+        let findings = report["findings"].as_array().expect("a list");
+        assert!(findings.iter().all(|f| f["severity"] == "note"), "{findings:?}");
+    }
+
+    // The system ends a process that writes larger files than it may: heights are as large, and flat ones are not.
+    #[test]
+    fn a_run_that_ends_ingest_is_passed_over_by_the_next_one() {
+        let place = TestFolder::new();
+        for (surface, seed) in [("flat", "1"), ("brick", "1"), ("flat", "2")] {
+            place.acquire(surface, &["--seed", seed, "--ir-only"]);
+        }
+        let ingest = || {
+            let mut command = Command::new("sh");
+            command.args(["-c", "ulimit -c 0; ulimit -f 250; exec \"$0\" --lake lake ingest", ECHOLAKE]);
+            run_command(command.current_dir(place.path("")).env_remove("ECHOLAKE_LAKE")).expect("the command starts")
+        };
+        let first = ingest();
+        assert_eq!(first.status.code(), None, "{}", stderr(&first));
+        let second = ingest();
+        let said = stderr(&second);
+        assert_eq!(second.status.code(), Some(3), "{said}");
+        assert_eq!(said.matches("a process of its own takes it in").count(), 2, "{said}");
+        assert!(
+            said.contains(".mcap` is passed over") && said.contains("-brick-") && said.contains("SIGXFSZ"),
+            "{said}"
+        );
+        assert_eq!(place.number("select count(*) from runs where surface_id = 'flat'"), 2.0);
+        match std::fs::read_dir(place.path("lake/quarantine")) {
+            // It had not come to its place yet.
+            Ok(quarantine) => {
+                let files = quarantine.map(|entry| entry.expect("listed").path());
+                let run = files.into_iter().find(|path| path.extension() == Some("mcap".as_ref())).expect("a run");
+                std::fs::rename(&run, place.path("lake/inbox").join(run.file_name().expect("a name"))).expect("moved");
+            }
+            Err(_) => {
+                place.fails(3, &["ingest"], "is passed over");
+                std::fs::remove_dir_all(place.path("lake/tables/_reading")).expect("removed");
+            }
+        }
+        place.ok(&["ingest"]);
+        assert_eq!(place.number("select count(*) from runs"), 3.0);
     }
 }

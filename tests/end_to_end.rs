@@ -25,28 +25,6 @@ fn every_command_explains_itself() {
     }
 }
 
-#[test]
-fn answers_come_in_every_format_or_are_refused_clearly() {
-    let place = TestFolder::new();
-    place.acquire("flat", &[]);
-    place.ok(&["ingest"]);
-    for format in ["csv", "json", "parquet", "arrow", "table"] {
-        let query = "select pair_id, ir from measurements order by pair_id";
-        place.ok(&["sql", "--format", format, "-o", "answer", query]);
-        assert!(std::fs::metadata(place.path("answer")).expect("written").len() > 1_000, "{format}");
-    }
-    place.fails(1, &["sql", "-o", "missing/answer", "select 1"], "cannot write");
-    place.fails(1, &["sql", "selec 1"], "^");
-    place.fails(1, &["sql", "drop table runs"], "only reading");
-    place.fails(2, &["sql", "--format", "xml", "select 1"], "xml");
-    let columns = place.ok(&["sql", "\\d surface_stats"]);
-    let level = columns.lines().find(|line| line.starts_with("p90_mean_db ")).expect("a line per column");
-    assert!(level.contains("dB re Flat total"), "{level}");
-    place.fails(1, &["sql", "\\d nothing"], "no table `nothing`");
-    place.fails(1, &["sql", "\\timing"], "prompt");
-    place.fails(1, &["sql", "--json", "\\d"], "--json");
-}
-
 // A folder as the published data set has them, of the small rig's size.
 #[test]
 fn a_gir_folder_becomes_runs_with_references_of_their_own() {
@@ -210,5 +188,27 @@ mod slow {
         place.ok(&["ingest"]);
         assert_eq!(place.number("select count(*) from measurements"), 4.0 * PAIRS);
         assert_eq!(place.number(sum), before);
+    }
+
+    #[test]
+    fn answers_come_in_every_format_or_are_refused_clearly() {
+        let place = TestFolder::new();
+        place.acquire("flat", &[]);
+        place.ok(&["ingest"]);
+        for format in ["csv", "json", "parquet", "arrow", "table"] {
+            let query = "select pair_id, ir from measurements order by pair_id";
+            place.ok(&["sql", "--format", format, "-o", "answer", query]);
+            assert!(std::fs::metadata(place.path("answer")).expect("written").len() > 1_000, "{format}");
+        }
+        place.fails(1, &["sql", "-o", "missing/answer", "select 1"], "cannot write");
+        place.fails(1, &["sql", "selec 1"], "^");
+        place.fails(1, &["sql", "drop table runs"], "only reading");
+        place.fails(2, &["sql", "--format", "xml", "select 1"], "xml");
+        let columns = place.ok(&["sql", "\\d surface_stats"]);
+        let level = columns.lines().find(|line| line.starts_with("p90_mean_db ")).expect("a line per column");
+        assert!(level.contains("dB re Flat total"), "{level}");
+        place.fails(1, &["sql", "\\d nothing"], "no table `nothing`");
+        place.fails(1, &["sql", "\\timing"], "prompt");
+        place.fails(1, &["sql", "--json", "\\d"], "--json");
     }
 }

@@ -39,32 +39,6 @@ fn stop_a_run(place: &TestFolder) -> PathBuf {
 }
 
 #[test]
-fn a_run_that_was_stopped_becomes_a_run_of_what_it_holds_or_is_resumed() {
-    let place = TestFolder::new();
-    let partial = stop_a_run(&place);
-    let name = partial.to_str().expect("a name");
-    let before = std::fs::read(&partial).expect("read");
-    // Ingest does not take the recording away from `--resume`.
-    place.fails(1, &["ingest", name], "is an unfinished recording");
-    place.fails(0, &["ingest"], "nothing to ingest");
-    let output = place.run(&["recover", name]);
-    let said = stderr(&output);
-    assert_eq!(output.status.code(), Some(0), "{said}");
-    assert!(said.contains("of 45 pairs") && said.contains("lost: nothing"), "{said}");
-    let run = partial.with_extension("");
-    assert_eq!(String::from_utf8_lossy(&output.stdout).trim(), run.to_str().expect("a name"));
-    assert_eq!(std::fs::read(&partial).expect("read"), before, "the recording is only read");
-    // A whole run is left alone.
-    place.fails(0, &["recover", run.to_str().expect("a name")], "nothing to do");
-    // The copy stands in the way of the run's name, and both ways out are named.
-    place.fails(1, &["acquire", "--resume", name], "delete it if the recording is to be resumed");
-    std::fs::remove_file(&run).expect("deleted");
-    place.ok(&["acquire", "--resume", name]);
-    place.ok(&["ingest"]);
-    assert_eq!(place.number("select count(*) from measurements"), 45.0);
-}
-
-#[test]
 fn a_recovered_run_is_taken_in_as_partial() {
     let place = TestFolder::new();
     let partial = stop_a_run(&place);
@@ -114,4 +88,34 @@ fn the_rig_of_the_readme_can_be_simulated() {
     }
     place.ok(&["ingest"]);
     assert_eq!(place.number("select count(*) from measurements"), 2.0);
+}
+
+mod slow {
+    use super::*;
+
+    #[test]
+    fn a_run_that_was_stopped_becomes_a_run_of_what_it_holds_or_is_resumed() {
+        let place = TestFolder::new();
+        let partial = stop_a_run(&place);
+        let name = partial.to_str().expect("a name");
+        let before = std::fs::read(&partial).expect("read");
+        // Ingest does not take the recording away from `--resume`.
+        place.fails(1, &["ingest", name], "is an unfinished recording");
+        place.fails(0, &["ingest"], "nothing to ingest");
+        let output = place.run(&["recover", name]);
+        let said = stderr(&output);
+        assert_eq!(output.status.code(), Some(0), "{said}");
+        assert!(said.contains("of 45 pairs") && said.contains("lost: nothing"), "{said}");
+        let run = partial.with_extension("");
+        assert_eq!(String::from_utf8_lossy(&output.stdout).trim(), run.to_str().expect("a name"));
+        assert_eq!(std::fs::read(&partial).expect("read"), before, "the recording is only read");
+        // A whole run is left alone.
+        place.fails(0, &["recover", run.to_str().expect("a name")], "nothing to do");
+        // The copy stands in the way of the run's name, and both ways out are named.
+        place.fails(1, &["acquire", "--resume", name], "delete it if the recording is to be resumed");
+        std::fs::remove_file(&run).expect("deleted");
+        place.ok(&["acquire", "--resume", name]);
+        place.ok(&["ingest"]);
+        assert_eq!(place.number("select count(*) from measurements"), 45.0);
+    }
 }

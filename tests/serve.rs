@@ -166,51 +166,6 @@ fn what_is_wrong_has_a_code() {
 }
 
 #[test]
-fn tokens_let_in_and_are_needed_beyond_this_machine() {
-    let place = lake();
-    place.fails(1, &["serve", "--listen", "0.0.0.0:0"], "can be reached from other machines");
-    place.fails(2, &["serve", "--listen", "somewhere"], "127.0.0.1:8080");
-    place.fails(1, &["serve", "--listen", "off", "--flight-sql", "off", "--postgres", "off"], "nothing to listen on");
-    place.fails(1, &["serve", "--tokens", "none.toml"], "cannot read the tokens");
-    let made = place.run(&["token", "analyst"]);
-    let lines = String::from_utf8_lossy(&made.stdout).into_owned();
-    let token = super::stderr(&made).lines().next().expect("a token").to_owned();
-    assert!(!lines.contains(&token), "only its hash is printed to be kept");
-    std::fs::write(place.path("tokens.toml"), &lines).expect("written");
-    let server = served(&place, &["--tokens", "tokens.toml"]);
-    let ask = |header: Option<String>| {
-        let request = HttpRequest::post("/api/v1/sql", "select 1 as one").with("content-type", "text/plain");
-        header.into_iter().fold(request, |request, value| request.with("authorization", &value)).send(&server)
-    };
-    assert_eq!(ask(Some(format!("Bearer {token}"))).text().trim(), r#"[{"one":1}]"#);
-    for wrong in [None, Some("Bearer x".to_owned()), Some(format!("Bearer {}", &token[1..])), Some(token.clone())] {
-        let answer = ask(wrong);
-        assert_eq!((answer.status, answer.header("www-authenticate").is_some()), (401, true));
-    }
-    let metrics = HttpRequest::get("/metrics").with("authorization", &format!("Bearer {token}")).send(&server);
-    assert_eq!(metrics.status, 403, "{}", metrics.text());
-    let mut postgres = postgres::WireClient::connect(&server, None);
-    assert_eq!(postgres.log_in("nonsense").as_deref(), Some("28P01"));
-    let mut postgres = postgres::WireClient::connect(&server, None);
-    assert_eq!(postgres.log_in(&token), None);
-    assert_eq!(postgres.query("select 1 as one"), Ok(vec![vec![Some("1".to_owned())]]));
-    // By its own name it is not sent: SCRAM, and a proof that is none.
-    let (mut named, request) = postgres::WireClient::start(&server, "analyst", None);
-    assert_eq!(request, b"\0\0\0\x0aSCRAM-SHA-256\0\0");
-    assert_eq!(named.log_in(&token).as_deref(), Some("22023"));
-    // Taken back, it ends what runs and what waits.
-    let mut running = postgres::WireClient::connect(&server, None);
-    assert_eq!(running.log_in(&token), None);
-    running.begin(ENDLESS);
-    let other = place.run(&["token", "other", "--days", "1"]);
-    std::fs::write(place.path("tokens.toml"), &other.stdout).expect("written");
-    wait_until("a new request is refused", || ask(Some(format!("Bearer {token}"))).status == 401);
-    assert_eq!(running.rows(), Err("28P01".to_owned()), "what runs is ended");
-    let renewed = super::stderr(&other).lines().next().expect("a token").to_owned();
-    assert_eq!(ask(Some(format!("Bearer {renewed}"))).status, 200);
-}
-
-#[test]
 fn a_short_answer_does_not_look_whole() {
     let place = lake();
     let server = served(&place, &[]);
@@ -366,5 +321,54 @@ mod slow {
         assert_eq!(client.query("select 2 as two"), Ok(vec![vec![Some("2".to_owned())]]));
         client.query("set statement_timeout = '200ms'").expect("set");
         assert_eq!(client.query(ENDLESS), Err("57014".to_owned()));
+    }
+
+    #[test]
+    fn tokens_let_in_and_are_needed_beyond_this_machine() {
+        let place = lake();
+        place.fails(1, &["serve", "--listen", "0.0.0.0:0"], "can be reached from other machines");
+        place.fails(2, &["serve", "--listen", "somewhere"], "127.0.0.1:8080");
+        place.fails(
+            1,
+            &["serve", "--listen", "off", "--flight-sql", "off", "--postgres", "off"],
+            "nothing to listen on",
+        );
+        place.fails(1, &["serve", "--tokens", "none.toml"], "cannot read the tokens");
+        let made = place.run(&["token", "analyst"]);
+        let lines = String::from_utf8_lossy(&made.stdout).into_owned();
+        let token = super::super::stderr(&made).lines().next().expect("a token").to_owned();
+        assert!(!lines.contains(&token), "only its hash is printed to be kept");
+        std::fs::write(place.path("tokens.toml"), &lines).expect("written");
+        let server = served(&place, &["--tokens", "tokens.toml"]);
+        let ask = |header: Option<String>| {
+            let request = HttpRequest::post("/api/v1/sql", "select 1 as one").with("content-type", "text/plain");
+            header.into_iter().fold(request, |request, value| request.with("authorization", &value)).send(&server)
+        };
+        assert_eq!(ask(Some(format!("Bearer {token}"))).text().trim(), r#"[{"one":1}]"#);
+        for wrong in [None, Some("Bearer x".to_owned()), Some(format!("Bearer {}", &token[1..])), Some(token.clone())] {
+            let answer = ask(wrong);
+            assert_eq!((answer.status, answer.header("www-authenticate").is_some()), (401, true));
+        }
+        let metrics = HttpRequest::get("/metrics").with("authorization", &format!("Bearer {token}")).send(&server);
+        assert_eq!(metrics.status, 403, "{}", metrics.text());
+        let mut postgres = postgres::WireClient::connect(&server, None);
+        assert_eq!(postgres.log_in("nonsense").as_deref(), Some("28P01"));
+        let mut postgres = postgres::WireClient::connect(&server, None);
+        assert_eq!(postgres.log_in(&token), None);
+        assert_eq!(postgres.query("select 1 as one"), Ok(vec![vec![Some("1".to_owned())]]));
+        // By its own name it is not sent: SCRAM, and a proof that is none.
+        let (mut named, request) = postgres::WireClient::start(&server, "analyst", None);
+        assert_eq!(request, b"\0\0\0\x0aSCRAM-SHA-256\0\0");
+        assert_eq!(named.log_in(&token).as_deref(), Some("22023"));
+        // Taken back, it ends what runs and what waits.
+        let mut running = postgres::WireClient::connect(&server, None);
+        assert_eq!(running.log_in(&token), None);
+        running.begin(ENDLESS);
+        let other = place.run(&["token", "other", "--days", "1"]);
+        std::fs::write(place.path("tokens.toml"), &other.stdout).expect("written");
+        wait_until("a new request is refused", || ask(Some(format!("Bearer {token}"))).status == 401);
+        assert_eq!(running.rows(), Err("28P01".to_owned()), "what runs is ended");
+        let renewed = super::super::stderr(&other).lines().next().expect("a token").to_owned();
+        assert_eq!(ask(Some(format!("Bearer {renewed}"))).status, 200);
     }
 }

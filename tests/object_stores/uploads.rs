@@ -65,44 +65,6 @@ fn write_large_run(path: &Path) {
 }
 
 #[test]
-fn uploaded_runs_are_ingested_by_their_digest_and_known_ever_after() {
-    let place = TestFolder::new();
-    let store = S3Double::start(StoreBehaviour::Faultless);
-    let runs = recordings(&place, &["flat", "foam"]);
-    let names: Vec<_> = runs.iter().map(|run| run.rsplit('/').next().expect("a name").to_owned()).collect();
-    std::fs::write(place.path("lake/inbox/x.mcap.partial"), "x").expect("written");
-    let uploaded = |json: &str| -> Vec<(String, bool)> {
-        let summary: serde_json::Value = serde_json::from_str(json).expect("JSON");
-        assert_eq!(summary["refused"].as_array().map(Vec::len), Some(0), "{summary}");
-        let runs = summary["runs"].as_array().expect("runs").iter();
-        runs.map(|run| (run["path"].as_str().expect("a path").to_owned(), run["uploaded"] == true)).collect()
-    };
-    let inbox = |uploaded: bool| names.iter().map(|name| (format!("inbox/{name}"), uploaded)).collect::<Vec<_>>();
-    // The first run makes the lake.
-    let output = run(&place, &store, &["upload", "lake/inbox", "--json"]);
-    assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
-    assert!(stderr(&output).contains("x.mcap.partial` is unfinished"), "{}", stderr(&output));
-    assert_eq!(uploaded(&String::from_utf8_lossy(&output.stdout)), inbox(true));
-    assert_eq!(uploaded(&ok(&place, &store, &["upload", &runs[0], &runs[1], "--json"])), inbox(false));
-
-    ok(&place, &store, &["ingest"]);
-    assert!(
-        store.keys().iter().all(|key| !key.contains("/inbox/") && !key.contains("/_claims/")),
-        "{:?}",
-        store.keys()
-    );
-    let in_runs = [format!("runs/flat/{}", names[0]), format!("runs/foam/{}", names[1])];
-    for (path, run) in in_runs.iter().zip(&runs) {
-        assert!(store.get(&key(path)) == std::fs::read(run).expect("read"));
-        assert!(store.keys().contains(&key(&format!("{path}.sha256"))));
-    }
-    let known = in_runs.map(|path| (path, false)).to_vec();
-    assert_eq!(uploaded(&ok(&place, &store, &["upload", &runs[0], &runs[1], "--json"])), known);
-    let report = ok(&place, &store, &["doctor"]);
-    assert!(!report.contains("sha256"), "{report}");
-}
-
-#[test]
 fn what_is_not_closed_and_what_is_another_file_is_refused_and_the_rest_goes_up() {
     let place = TestFolder::new();
     let store = S3Double::start(StoreBehaviour::Faultless);
@@ -291,5 +253,43 @@ mod slow {
             "{:?}",
             store.keys()
         );
+    }
+
+    #[test]
+    fn uploaded_runs_are_ingested_by_their_digest_and_known_ever_after() {
+        let place = TestFolder::new();
+        let store = S3Double::start(StoreBehaviour::Faultless);
+        let runs = recordings(&place, &["flat", "foam"]);
+        let names: Vec<_> = runs.iter().map(|run| run.rsplit('/').next().expect("a name").to_owned()).collect();
+        std::fs::write(place.path("lake/inbox/x.mcap.partial"), "x").expect("written");
+        let uploaded = |json: &str| -> Vec<(String, bool)> {
+            let summary: serde_json::Value = serde_json::from_str(json).expect("JSON");
+            assert_eq!(summary["refused"].as_array().map(Vec::len), Some(0), "{summary}");
+            let runs = summary["runs"].as_array().expect("runs").iter();
+            runs.map(|run| (run["path"].as_str().expect("a path").to_owned(), run["uploaded"] == true)).collect()
+        };
+        let inbox = |uploaded: bool| names.iter().map(|name| (format!("inbox/{name}"), uploaded)).collect::<Vec<_>>();
+        // The first run makes the lake.
+        let output = run(&place, &store, &["upload", "lake/inbox", "--json"]);
+        assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
+        assert!(stderr(&output).contains("x.mcap.partial` is unfinished"), "{}", stderr(&output));
+        assert_eq!(uploaded(&String::from_utf8_lossy(&output.stdout)), inbox(true));
+        assert_eq!(uploaded(&ok(&place, &store, &["upload", &runs[0], &runs[1], "--json"])), inbox(false));
+
+        ok(&place, &store, &["ingest"]);
+        assert!(
+            store.keys().iter().all(|key| !key.contains("/inbox/") && !key.contains("/_claims/")),
+            "{:?}",
+            store.keys()
+        );
+        let in_runs = [format!("runs/flat/{}", names[0]), format!("runs/foam/{}", names[1])];
+        for (path, run) in in_runs.iter().zip(&runs) {
+            assert!(store.get(&key(path)) == std::fs::read(run).expect("read"));
+            assert!(store.keys().contains(&key(&format!("{path}.sha256"))));
+        }
+        let known = in_runs.map(|path| (path, false)).to_vec();
+        assert_eq!(uploaded(&ok(&place, &store, &["upload", &runs[0], &runs[1], "--json"])), known);
+        let report = ok(&place, &store, &["doctor"]);
+        assert!(!report.contains("sha256"), "{report}");
     }
 }

@@ -191,40 +191,6 @@ fn number_of_rows(bytes: &[u8]) -> usize {
 }
 
 #[test]
-fn tables_are_shared_as_files() {
-    let place = lake();
-    let server = served(&place, &[]);
-    let tables = json_of(&get(&server, "/delta-sharing/shares/echolake/all-tables"));
-    let names: Vec<_> = tables["items"].as_array().expect("a list").iter().map(|t| t["name"].clone()).collect();
-    assert!(names.contains(&json!("tnce_db")) && !names.contains(&json!("ir")) && names.len() == 14, "{names:?}");
-    let page = json_of(&get(&server, "/delta-sharing/shares/echolake/all-tables?maxResults=3&pageToken=12"));
-    assert_eq!((page["items"].as_array().map(Vec::len), &page["nextPageToken"]), (Some(2), &Value::Null));
-    shared(&server, "catalogue", "{}");
-    let protocol =
-        super::sql(&server, "select protocol from system.queries where statement like 'select * from catalogue%'");
-    assert_eq!(json_of(&protocol)[0]["protocol"], "sharing");
-    for table in ["measurements", "pairs", "runs", "catalogue", "tnce_db"] {
-        let rows = place.number(&format!("select count(*) from {table}"));
-        let files = shared(&server, table, "{}");
-        assert_eq!(files.len(), 1, "{table}");
-        let file = get(&server, path_of(&server, &files[0]));
-        assert_eq!((file.status, file.body.len() as u64), (200, files[0]["size"].as_u64().expect("a size")), "{table}");
-        assert_eq!(number_of_rows(&file.body) as f64, rows, "{table}");
-        let part = HttpRequest::get(path_of(&server, &files[0])).with("range", "bytes=0-3").send(&server);
-        assert_eq!((part.status, part.body.as_slice()), (206, &b"PAR1"[..]), "{table}");
-        let head = HttpRequest::head(path_of(&server, &files[0])).send(&server);
-        assert_eq!(head.header("content-length"), Some(file.body.len().to_string().as_str()), "{table}");
-    }
-    assert!(shared(&server, "measurements", r#"{"limitHint": 0}"#).is_empty());
-    let path = |rest: &str| format!("/delta-sharing/shares/echolake/schemas/lake/tables/{rest}");
-    refused(&get(&server, &path("ir/metadata")), 404, "not_found");
-    refused(&get(&server, &path("runs/changes?startingVersion=0")), 400, "request_invalid");
-    refused(&HttpRequest::post(&path("runs/query"), r#"{"version": 0}"#).send(&server), 400, "request_invalid");
-    let delta = HttpRequest::get(&path("runs/metadata")).with("delta-sharing-capabilities", "responseformat=delta");
-    refused(&delta.send(&server), 501, "unsupported");
-}
-
-#[test]
 fn a_shared_file_needs_its_address_and_no_token() {
     let place = lake();
     let made = place.run(&["token", "office"]);
@@ -302,5 +268,45 @@ mod slow {
             }
             assert_eq!(place.number(&format!("select count(*) from {table}")), rows as f64, "{table}");
         }
+    }
+
+    #[test]
+    fn tables_are_shared_as_files() {
+        let place = lake();
+        let server = served(&place, &[]);
+        let tables = json_of(&get(&server, "/delta-sharing/shares/echolake/all-tables"));
+        let names: Vec<_> = tables["items"].as_array().expect("a list").iter().map(|t| t["name"].clone()).collect();
+        assert!(names.contains(&json!("tnce_db")) && !names.contains(&json!("ir")) && names.len() == 14, "{names:?}");
+        let page = json_of(&get(&server, "/delta-sharing/shares/echolake/all-tables?maxResults=3&pageToken=12"));
+        assert_eq!((page["items"].as_array().map(Vec::len), &page["nextPageToken"]), (Some(2), &Value::Null));
+        shared(&server, "catalogue", "{}");
+        let protocol = super::super::sql(
+            &server,
+            "select protocol from system.queries where statement like 'select * from catalogue%'",
+        );
+        assert_eq!(json_of(&protocol)[0]["protocol"], "sharing");
+        for table in ["measurements", "pairs", "runs", "catalogue", "tnce_db"] {
+            let rows = place.number(&format!("select count(*) from {table}"));
+            let files = shared(&server, table, "{}");
+            assert_eq!(files.len(), 1, "{table}");
+            let file = get(&server, path_of(&server, &files[0]));
+            assert_eq!(
+                (file.status, file.body.len() as u64),
+                (200, files[0]["size"].as_u64().expect("a size")),
+                "{table}"
+            );
+            assert_eq!(number_of_rows(&file.body) as f64, rows, "{table}");
+            let part = HttpRequest::get(path_of(&server, &files[0])).with("range", "bytes=0-3").send(&server);
+            assert_eq!((part.status, part.body.as_slice()), (206, &b"PAR1"[..]), "{table}");
+            let head = HttpRequest::head(path_of(&server, &files[0])).send(&server);
+            assert_eq!(head.header("content-length"), Some(file.body.len().to_string().as_str()), "{table}");
+        }
+        assert!(shared(&server, "measurements", r#"{"limitHint": 0}"#).is_empty());
+        let path = |rest: &str| format!("/delta-sharing/shares/echolake/schemas/lake/tables/{rest}");
+        refused(&get(&server, &path("ir/metadata")), 404, "not_found");
+        refused(&get(&server, &path("runs/changes?startingVersion=0")), 400, "request_invalid");
+        refused(&HttpRequest::post(&path("runs/query"), r#"{"version": 0}"#).send(&server), 400, "request_invalid");
+        let delta = HttpRequest::get(&path("runs/metadata")).with("delta-sharing-capabilities", "responseformat=delta");
+        refused(&delta.send(&server), 501, "unsupported");
     }
 }

@@ -115,34 +115,6 @@ fn what_cannot_be_cut_has_a_code() {
 }
 
 #[test]
-fn a_run_file_that_was_changed_or_moved_is_said() {
-    let place = lake();
-    let server = served(&place, &[]);
-    let run = run_of(&place, "flat");
-    let file = place.path(&format!("lake/runs/flat/{run}.mcap"));
-    let original = std::fs::read(&file).expect("the run");
-    let path = slice("surface_id = 'flat'", "");
-    std::fs::write(&file, &original[..original.len() / 2]).expect("cut short");
-    refused(&get(&server, &path), 409, "file_changed");
-    refused(&get(&server, "/api/v1/foxglove/manifest?where=surface_id='flat'"), 409, "file_changed");
-    // Of the same size: what is read is checked by its CRCs, and a slice that began is broken off.
-    let mut flipped = original.clone();
-    let middle = flipped.len() / 2;
-    flipped[middle] ^= 0x55;
-    std::fs::write(&file, &flipped).expect("changed");
-    let answer = get(&server, &path);
-    assert!(answer.status >= 400 || !answer.is_whole, "{} bytes look whole", answer.body.len());
-    let ranged = HttpRequest::get(&path).with("range", "bytes=0-9").send(&server);
-    assert!([409, 503].contains(&ranged.status), "{}", ranged.status);
-    std::fs::remove_file(&file).expect("moved");
-    refused(&get(&server, &path), 409, "file_changed");
-    std::fs::write(&file, &original).expect("brought back");
-    let whole = get(&server, &path);
-    assert_eq!((whole.status, whole.is_whole), (200, true));
-    assert_eq!(get(&server, &slice("surface_id = 'brick'", "")).status, 200);
-}
-
-#[test]
 fn slices_need_a_token_for_sql_and_files() {
     let place = lake();
     let mut lines = String::new();
@@ -182,71 +154,6 @@ fn slices_need_a_token_for_sql_and_files() {
     for path in ["/api/v1/surfaces/brick/mesh.glb", &format!("/api/v1/runs/{run}/file.mcap")] {
         assert_eq!(signed_in(path).send(&server).status, 200, "{path}");
     }
-}
-
-#[test]
-fn the_manifest_says_what_comes() {
-    let place = lake();
-    let server = served(&place, &[]);
-    let (flat, brick) = (run_of(&place, "flat"), run_of(&place, "brick"));
-    let whole = json(&get(&server, &format!("/api/v1/foxglove/manifest?run={flat}&run={brick}")));
-    let sources = whole["sources"].as_array().expect("sources");
-    assert_eq!(sources.len(), 2);
-    for source in sources {
-        assert_eq!(source["supportsRangeRequests"], true);
-        assert_eq!(source.as_object().expect("a source").len(), 2, "no other kind's fields: {source}");
-        let file = get(&server, source["url"].as_str().expect("a path"));
-        assert!(file.status == 200 && file.body.starts_with(b"\x89MCAP0\r\n"));
-    }
-    let path =
-        "/api/v1/foxglove/manifest?where=pair_id%20%3c%207%20or%20attempt%20%3e%2099%20or%20surface_id=%27wavy%27";
-    let topics = "&topics=/ir,/environment,/log,/panel/scene";
-    let asked = || json(&get(&server, &format!("{path}{topics}")));
-    let manifest = asked();
-    let text = |value: &Value| value.as_str().unwrap_or_else(|| panic!("{value}")).to_owned();
-    let ids = |manifest: &Value| -> Vec<_> {
-        manifest["sources"].as_array().expect("sources").iter().map(|s| text(&s["id"])).collect()
-    };
-    assert_eq!(ids(&manifest).len(), 2, "a source a run");
-    let source = &manifest["sources"][0];
-    let data = get(&server, &text(&source["url"]));
-    assert_eq!((data.status, data.is_whole), (200, true), "{source}");
-    let found = messages(&data.body);
-    assert_eq!(count(&found, "/ir"), 7);
-    assert!(found.is_sorted_by_key(|(_, time)| *time), "the data ascend");
-    let summary = mcap::Summary::read(&data.body).expect("sound").expect("a summary");
-    let (topics, schemas) =
-        (source["topics"].as_array().expect("topics"), source["schemas"].as_array().expect("schemas"));
-    for channel in summary.channels.values() {
-        let topic = topics.iter().find(|t| t["name"] == channel.topic.as_str()).expect("every channel is in it");
-        assert_eq!(topic["messageEncoding"], channel.message_encoding.as_str());
-        let schema = channel.schema.as_ref().expect("a schema");
-        let told = schemas.iter().find(|s| s["id"] == topic["schemaId"]).expect("its schema is too");
-        assert_eq!((&told["name"], &told["encoding"]), (&Value::from(&*schema.name), &Value::from(&*schema.encoding)));
-        assert_eq!(text(&told["data"]).len(), schema.data.len().div_ceil(3) * 4);
-    }
-    let numbers: BTreeSet<_> = schemas.iter().map(|s| s["id"].as_u64().expect("a number")).collect();
-    assert!(numbers.len() == schemas.len() && !numbers.contains(&0), "{numbers:?}");
-    let names: BTreeSet<_> = topics.iter().map(|t| t["name"].to_string()).collect();
-    assert_eq!(names.len(), topics.len(), "each topic once");
-    let time =
-        |value: &Value| chrono::DateTime::parse_from_rfc3339(&text(value)).expect("a time").timestamp_nanos_opt();
-    let (start, end) = (time(&source["startTime"]).expect("in range"), time(&source["endTime"]).expect("in range"));
-    assert!(found.iter().all(|(_, t)| (start..=end).contains(&(*t as i64))), "{start} to {end}");
-    assert_eq!(ids(&asked()), ids(&manifest), "the same, the same keys");
-    // The lake grows: what was cut of other runs keeps its key, and no key is ever given other data.
-    place.acquire("wavy", &["--ir-only"]);
-    place.ok(&["ingest"]);
-    let after = ids(&asked());
-    assert!(after.len() == 3 && ids(&manifest).iter().all(|id| after.contains(id)), "{after:?}");
-    let data = text(&source["url"]);
-    assert_eq!(get(&server, &data).status, 200);
-    refused(&get(&server, &data.replace("7%20or", "8%20or")), 410, "gone");
-    // Of the lake, a layout has only the length and the rate of responses.
-    let layout =
-        HttpRequest::get("/api/v1/layouts/echolake.json").with("origin", "https://viewer.example").send(&server);
-    assert_eq!((layout.status, layout.header("access-control-allow-origin")), (200, Some("*")));
-    assert!(json(&layout)["configById"].is_object());
 }
 
 mod slow {
@@ -429,5 +336,101 @@ mod slow {
         let foreign = HttpRequest::get("/api/v1/files").with("origin", "https://evil.example").send(&server);
         refused(&foreign, 403, "foreign_origin");
         assert_eq!(running(&server), 0.0);
+    }
+
+    #[test]
+    fn the_manifest_says_what_comes() {
+        let place = lake();
+        let server = served(&place, &[]);
+        let (flat, brick) = (run_of(&place, "flat"), run_of(&place, "brick"));
+        let whole = json(&get(&server, &format!("/api/v1/foxglove/manifest?run={flat}&run={brick}")));
+        let sources = whole["sources"].as_array().expect("sources");
+        assert_eq!(sources.len(), 2);
+        for source in sources {
+            assert_eq!(source["supportsRangeRequests"], true);
+            assert_eq!(source.as_object().expect("a source").len(), 2, "no other kind's fields: {source}");
+            let file = get(&server, source["url"].as_str().expect("a path"));
+            assert!(file.status == 200 && file.body.starts_with(b"\x89MCAP0\r\n"));
+        }
+        let path =
+            "/api/v1/foxglove/manifest?where=pair_id%20%3c%207%20or%20attempt%20%3e%2099%20or%20surface_id=%27wavy%27";
+        let topics = "&topics=/ir,/environment,/log,/panel/scene";
+        let asked = || json(&get(&server, &format!("{path}{topics}")));
+        let manifest = asked();
+        let text = |value: &Value| value.as_str().unwrap_or_else(|| panic!("{value}")).to_owned();
+        let ids = |manifest: &Value| -> Vec<_> {
+            manifest["sources"].as_array().expect("sources").iter().map(|s| text(&s["id"])).collect()
+        };
+        assert_eq!(ids(&manifest).len(), 2, "a source a run");
+        let source = &manifest["sources"][0];
+        let data = get(&server, &text(&source["url"]));
+        assert_eq!((data.status, data.is_whole), (200, true), "{source}");
+        let found = messages(&data.body);
+        assert_eq!(count(&found, "/ir"), 7);
+        assert!(found.is_sorted_by_key(|(_, time)| *time), "the data ascend");
+        let summary = mcap::Summary::read(&data.body).expect("sound").expect("a summary");
+        let (topics, schemas) =
+            (source["topics"].as_array().expect("topics"), source["schemas"].as_array().expect("schemas"));
+        for channel in summary.channels.values() {
+            let topic = topics.iter().find(|t| t["name"] == channel.topic.as_str()).expect("every channel is in it");
+            assert_eq!(topic["messageEncoding"], channel.message_encoding.as_str());
+            let schema = channel.schema.as_ref().expect("a schema");
+            let told = schemas.iter().find(|s| s["id"] == topic["schemaId"]).expect("its schema is too");
+            assert_eq!(
+                (&told["name"], &told["encoding"]),
+                (&Value::from(&*schema.name), &Value::from(&*schema.encoding))
+            );
+            assert_eq!(text(&told["data"]).len(), schema.data.len().div_ceil(3) * 4);
+        }
+        let numbers: BTreeSet<_> = schemas.iter().map(|s| s["id"].as_u64().expect("a number")).collect();
+        assert!(numbers.len() == schemas.len() && !numbers.contains(&0), "{numbers:?}");
+        let names: BTreeSet<_> = topics.iter().map(|t| t["name"].to_string()).collect();
+        assert_eq!(names.len(), topics.len(), "each topic once");
+        let time =
+            |value: &Value| chrono::DateTime::parse_from_rfc3339(&text(value)).expect("a time").timestamp_nanos_opt();
+        let (start, end) = (time(&source["startTime"]).expect("in range"), time(&source["endTime"]).expect("in range"));
+        assert!(found.iter().all(|(_, t)| (start..=end).contains(&(*t as i64))), "{start} to {end}");
+        assert_eq!(ids(&asked()), ids(&manifest), "the same, the same keys");
+        // The lake grows: what was cut of other runs keeps its key, and no key is ever given other data.
+        place.acquire("wavy", &["--ir-only"]);
+        place.ok(&["ingest"]);
+        let after = ids(&asked());
+        assert!(after.len() == 3 && ids(&manifest).iter().all(|id| after.contains(id)), "{after:?}");
+        let data = text(&source["url"]);
+        assert_eq!(get(&server, &data).status, 200);
+        refused(&get(&server, &data.replace("7%20or", "8%20or")), 410, "gone");
+        // Of the lake, a layout has only the length and the rate of responses.
+        let layout =
+            HttpRequest::get("/api/v1/layouts/echolake.json").with("origin", "https://viewer.example").send(&server);
+        assert_eq!((layout.status, layout.header("access-control-allow-origin")), (200, Some("*")));
+        assert!(json(&layout)["configById"].is_object());
+    }
+
+    #[test]
+    fn a_run_file_that_was_changed_or_moved_is_said() {
+        let place = lake();
+        let server = served(&place, &[]);
+        let run = run_of(&place, "flat");
+        let file = place.path(&format!("lake/runs/flat/{run}.mcap"));
+        let original = std::fs::read(&file).expect("the run");
+        let path = slice("surface_id = 'flat'", "");
+        std::fs::write(&file, &original[..original.len() / 2]).expect("cut short");
+        refused(&get(&server, &path), 409, "file_changed");
+        refused(&get(&server, "/api/v1/foxglove/manifest?where=surface_id='flat'"), 409, "file_changed");
+        // Of the same size: what is read is checked by its CRCs, and a slice that began is broken off.
+        let mut flipped = original.clone();
+        let middle = flipped.len() / 2;
+        flipped[middle] ^= 0x55;
+        std::fs::write(&file, &flipped).expect("changed");
+        let answer = get(&server, &path);
+        assert!(answer.status >= 400 || !answer.is_whole, "{} bytes look whole", answer.body.len());
+        let ranged = HttpRequest::get(&path).with("range", "bytes=0-9").send(&server);
+        assert!([409, 503].contains(&ranged.status), "{}", ranged.status);
+        std::fs::remove_file(&file).expect("moved");
+        refused(&get(&server, &path), 409, "file_changed");
+        std::fs::write(&file, &original).expect("brought back");
+        let whole = get(&server, &path);
+        assert_eq!((whole.status, whole.is_whole), (200, true));
+        assert_eq!(get(&server, &slice("surface_id = 'brick'", "")).status, 200);
     }
 }

@@ -120,64 +120,6 @@ async fn contents(lake: &Lake) -> BTreeMap<Path, (u64, i64)> {
     listed.map(|object| (object.location, (object.size, object.last_modified.timestamp_micros()))).collect().await
 }
 
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn hostile_plans_have_no_effect() {
-    let small = SmallLake::new().await;
-    let worker = TestWorker::start(&small.lake);
-    let client = HostileClient::new(&worker);
-    let outside = tempfile::tempdir().expect("a folder");
-    let secret = outside.path().join("secret.parquet");
-    let write = format!("copy (select column1 as n from (values (1), (2))) to '{}'", secret.display());
-    client.context.sql(&write).await.expect("a plan").collect().await.expect("a file outside of the lake");
-    let listener = TcpListener::bind("127.0.0.1:0").expect("a port");
-    listener.set_nonblocking(true).expect("it does not wait");
-    let elsewhere = format!("http://{}/", listener.local_addr().expect("an address"));
-    let before = contents(&small.lake).await;
-
-    // The way is right: a plan without harm is answered.
-    assert_eq!(client.send(client.plan("select * from (values (1), (2), (3))").await).await.expect("rows"), 3);
-    let path = |path: &std::path::Path| path.display().to_string();
-    let new_file = path(&outside.path().join("new.parquet"));
-    let mut plans = vec![
-        scan("file:///", &path(&secret)),
-        scan(&elsewhere, "a.parquet"),
-        scan("s3://bucket/", "a.parquet"),
-        scan("echolake://other/", "a.parquet"),
-        // Not below the lake.
-        scan("echolake://lake/", "../secret.parquet"),
-    ];
-    for target in
-        ["echolake://lake/tables/nce/evil.parquet", "echolake://lake/lake.toml", "s3://bucket/a.parquet", &new_file]
-    {
-        for format in ["parquet", "csv", "json"] {
-            let sql = format!("copy (select column1 as n from (values (1), (2))) to '{target}' stored as {format}");
-            // Formats that this build does not have cannot be asked for.
-            if let Ok(query) = client.context.sql(&sql).await
-                && let Ok(plan) = query.create_physical_plan().await
-            {
-                plans.push(plan);
-            }
-        }
-    }
-    assert!(plans.len() >= 9, "{} plans: there are sinks among them", plans.len());
-    for plan in plans {
-        let text = datafusion::physical_plan::displayable(plan.as_ref()).one_line().to_string();
-        let answered = client.send(plan).await;
-        assert!(answered.is_err(), "{text}: {answered:?}");
-    }
-    // What is no plan.
-    for garbage in [Vec::new(), vec![0xff; 64], b"select 1".to_vec()] {
-        let answered = client.send_encoded(MaybeEncoded::Encoded(garbage.clone())).await;
-        assert!(answered.is_err(), "{garbage:?}: {answered:?}");
-    }
-    assert_eq!(contents(&small.lake).await, before, "the lake is as it was");
-    let files: Vec<_> = std::fs::read_dir(outside.path()).expect("a folder").flatten().collect();
-    assert_eq!(files.len(), 1, "{files:?}");
-    assert!(listener.accept().is_err(), "nobody connects elsewhere");
-    let rows = client.send(client.plan("select * from (values (1), (2), (3))").await).await;
-    assert_eq!(rows.expect("it works as before"), 3);
-}
-
 mod slow {
     use super::*;
 
@@ -210,5 +152,63 @@ mod slow {
         }
         let plan = MaybeEncoded::Encoded(encoded);
         assert_eq!(client.send_encoded(plan).await.expect("rows"), lines(&expected, false).len());
+    }
+
+    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+    async fn hostile_plans_have_no_effect() {
+        let small = SmallLake::new().await;
+        let worker = TestWorker::start(&small.lake);
+        let client = HostileClient::new(&worker);
+        let outside = tempfile::tempdir().expect("a folder");
+        let secret = outside.path().join("secret.parquet");
+        let write = format!("copy (select column1 as n from (values (1), (2))) to '{}'", secret.display());
+        client.context.sql(&write).await.expect("a plan").collect().await.expect("a file outside of the lake");
+        let listener = TcpListener::bind("127.0.0.1:0").expect("a port");
+        listener.set_nonblocking(true).expect("it does not wait");
+        let elsewhere = format!("http://{}/", listener.local_addr().expect("an address"));
+        let before = contents(&small.lake).await;
+
+        // The way is right: a plan without harm is answered.
+        assert_eq!(client.send(client.plan("select * from (values (1), (2), (3))").await).await.expect("rows"), 3);
+        let path = |path: &std::path::Path| path.display().to_string();
+        let new_file = path(&outside.path().join("new.parquet"));
+        let mut plans = vec![
+            scan("file:///", &path(&secret)),
+            scan(&elsewhere, "a.parquet"),
+            scan("s3://bucket/", "a.parquet"),
+            scan("echolake://other/", "a.parquet"),
+            // Not below the lake.
+            scan("echolake://lake/", "../secret.parquet"),
+        ];
+        for target in
+            ["echolake://lake/tables/nce/evil.parquet", "echolake://lake/lake.toml", "s3://bucket/a.parquet", &new_file]
+        {
+            for format in ["parquet", "csv", "json"] {
+                let sql = format!("copy (select column1 as n from (values (1), (2))) to '{target}' stored as {format}");
+                // Formats that this build does not have cannot be asked for.
+                if let Ok(query) = client.context.sql(&sql).await
+                    && let Ok(plan) = query.create_physical_plan().await
+                {
+                    plans.push(plan);
+                }
+            }
+        }
+        assert!(plans.len() >= 9, "{} plans: there are sinks among them", plans.len());
+        for plan in plans {
+            let text = datafusion::physical_plan::displayable(plan.as_ref()).one_line().to_string();
+            let answered = client.send(plan).await;
+            assert!(answered.is_err(), "{text}: {answered:?}");
+        }
+        // What is no plan.
+        for garbage in [Vec::new(), vec![0xff; 64], b"select 1".to_vec()] {
+            let answered = client.send_encoded(MaybeEncoded::Encoded(garbage.clone())).await;
+            assert!(answered.is_err(), "{garbage:?}: {answered:?}");
+        }
+        assert_eq!(contents(&small.lake).await, before, "the lake is as it was");
+        let files: Vec<_> = std::fs::read_dir(outside.path()).expect("a folder").flatten().collect();
+        assert_eq!(files.len(), 1, "{files:?}");
+        assert!(listener.accept().is_err(), "nobody connects elsewhere");
+        let rows = client.send(client.plan("select * from (values (1), (2), (3))").await).await;
+        assert_eq!(rows.expect("it works as before"), 3);
     }
 }

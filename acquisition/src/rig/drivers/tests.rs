@@ -155,36 +155,6 @@ fn a_run_over_all_drivers_holds_what_they_told() {
     assert!(ended.log().contains("take repeated: overrun"), "{}", ended.log());
 }
 
-#[test]
-fn a_run_that_lost_a_driver_is_gone_on_with() {
-    let mut room = FakeDevices::new();
-    let folder = tempfile::tempdir().expect("a folder");
-    let mut recorder = begun(&room, folder.path());
-    let devices = room.devices(since(Timestamp::now(), &[]));
-    let broken = measure(&mut room, devices, &mut recorder, &BTreeMap::new(), &mut |room, done| {
-        if done == 2 {
-            room.bridge.set_fault(BridgeFault::HangsUp);
-        }
-    });
-    assert!(broken.is_err_and(|e| e.to_string().contains("robots: lost `ws://")));
-    let partial = recorder.partial().to_owned();
-    drop(recorder);
-
-    let mut room = FakeDevices::new();
-    let (mut recorder, held) = Recorder::resume(&partial).expect("gone on with");
-    assert!((1..3).contains(&held.pairs.len()), "{:?}", held.pairs);
-    let devices = room.devices(since(Timestamp::now(), &[]));
-    let end = measure(&mut room, devices, &mut recorder, &held.pairs, &mut |_, _| ()).expect("a whole run");
-    assert_eq!((end.accepted, end.rejected, end.attempts), (3, 0, 3));
-    let path = recorder.finish(&end).expect("finished");
-    echolake_recording::prove_file(&path).expect("a sound file");
-    let verdicts = messages(&path).into_iter().filter(|(topic, _)| topic == topics::MEASUREMENT);
-    let mut pairs: Vec<_> =
-        verdicts.map(|(_, data)| Measurement::decode(data.as_slice()).expect("a verdict").pair_id).collect();
-    pairs.sort_unstable();
-    assert_eq!(pairs, [0, 1, 2], "every pair once");
-}
-
 mod slow {
     use super::*;
 
@@ -209,5 +179,35 @@ mod slow {
         check(|room| room.bridge.set_fault(BridgeFault::HangsUp), "robots: lost `ws://");
         check(|room| room.sensor.unplug(), "ambient sensor: lost `");
         check(|room| room.sensor.send("~~~\n"), "ambient sensor: nothing but nonsense");
+    }
+
+    #[test]
+    fn a_run_that_lost_a_driver_is_gone_on_with() {
+        let mut room = FakeDevices::new();
+        let folder = tempfile::tempdir().expect("a folder");
+        let mut recorder = begun(&room, folder.path());
+        let devices = room.devices(since(Timestamp::now(), &[]));
+        let broken = measure(&mut room, devices, &mut recorder, &BTreeMap::new(), &mut |room, done| {
+            if done == 2 {
+                room.bridge.set_fault(BridgeFault::HangsUp);
+            }
+        });
+        assert!(broken.is_err_and(|e| e.to_string().contains("robots: lost `ws://")));
+        let partial = recorder.partial().to_owned();
+        drop(recorder);
+
+        let mut room = FakeDevices::new();
+        let (mut recorder, held) = Recorder::resume(&partial).expect("gone on with");
+        assert!((1..3).contains(&held.pairs.len()), "{:?}", held.pairs);
+        let devices = room.devices(since(Timestamp::now(), &[]));
+        let end = measure(&mut room, devices, &mut recorder, &held.pairs, &mut |_, _| ()).expect("a whole run");
+        assert_eq!((end.accepted, end.rejected, end.attempts), (3, 0, 3));
+        let path = recorder.finish(&end).expect("finished");
+        echolake_recording::prove_file(&path).expect("a sound file");
+        let verdicts = messages(&path).into_iter().filter(|(topic, _)| topic == topics::MEASUREMENT);
+        let mut pairs: Vec<_> =
+            verdicts.map(|(_, data)| Measurement::decode(data.as_slice()).expect("a verdict").pair_id).collect();
+        pairs.sort_unstable();
+        assert_eq!(pairs, [0, 1, 2], "every pair once");
     }
 }

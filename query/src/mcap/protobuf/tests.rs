@@ -327,24 +327,6 @@ fn random_messages_are_decoded_as_reflection_does() {
 }
 
 #[test]
-fn damaged_messages_are_errors_or_rows() {
-    let descriptor = all();
-    let mut random = Random(5);
-    for _ in 0..3000 {
-        let mut bytes = random_message(&descriptor, &mut random, 0).encode_to_vec();
-        bytes.truncate(1 + random.below(bytes.len() as u64) as usize);
-        for _ in 0..random.below(4) {
-            let at = random.below(bytes.len() as u64) as usize;
-            bytes[at] = random.next() as u8;
-        }
-        let mut decoder = decoder(&descriptor);
-        if decoder.push(&bytes).is_ok() {
-            assert!(finish(&mut decoder).iter().all(|array| array.len() == 1));
-        }
-    }
-}
-
-#[test]
 fn some_columns_are_those_of_all() {
     let descriptor = all();
     let fields = fields(&descriptor).expect("columns");
@@ -528,5 +510,23 @@ mod slow {
         element.push(0);
         let bytes = element.repeat(30_000_000);
         assert_eq!(decoder(&descriptor).push(&bytes), Err(Malformed::Expands));
+    }
+
+    #[test]
+    fn damaged_messages_are_errors_or_rows() {
+        let descriptor = all();
+        let mut random = Random(5);
+        for _ in 0..3000 {
+            let mut bytes = random_message(&descriptor, &mut random, 0).encode_to_vec();
+            bytes.truncate(1 + random.below(bytes.len() as u64) as usize);
+            for _ in 0..random.below(4) {
+                let at = random.below(bytes.len() as u64) as usize;
+                bytes[at] = random.next() as u8;
+            }
+            let mut decoder = decoder(&descriptor);
+            if decoder.push(&bytes).is_ok() {
+                assert!(finish(&mut decoder).iter().all(|array| array.len() == 1));
+            }
+        }
     }
 }

@@ -58,16 +58,6 @@ fn motors_that_stay_off_are_named() {
 }
 
 #[test]
-fn nonsense_is_told_of() {
-    let bridge = bridge();
-    let mut robots = connected(&bridge);
-    bridge.set_fault(BridgeFault::Nonsense);
-    robots.params.timeout_secs = IMPATIENT_SECS;
-    let _ = robots.current();
-    assert!(robots.notices().iter().any(|n| n.contains("no JSON")));
-}
-
-#[test]
 fn a_bridge_that_is_not_there_is_named() {
     let params = RosbridgeParams { url: "ws://127.0.0.1:1".into(), ..RosbridgeParams::default() };
     let error = RosbridgeRobots::connect(&params, Cell::of(&Rig::paper())).err().expect("nobody").to_string();
@@ -99,5 +89,15 @@ mod slow {
         check(BridgeFault::Silent, "no joint states on `/microphone/joint_states`");
         check(BridgeFault::HangsUp, "is the controller still on");
         check(BridgeFault::Nonsense, "no joint states on");
+    }
+
+    #[test]
+    fn nonsense_is_told_of() {
+        let bridge = bridge();
+        let mut robots = connected(&bridge);
+        bridge.set_fault(BridgeFault::Nonsense);
+        robots.params.timeout_secs = IMPATIENT_SECS;
+        let _ = robots.current();
+        assert!(robots.notices().iter().any(|n| n.contains("no JSON")));
     }
 }

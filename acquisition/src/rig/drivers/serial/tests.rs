@@ -133,42 +133,46 @@ fn nonsense_between_good_lines_is_told_of() {
 }
 
 #[test]
-fn nothing_but_nonsense_is_an_error() {
-    let fake = FakeSensor::sending("\u{3}\u{7f}~~\n");
-    let mut sensor = SerialSensor::open(&fake.params(IMPATIENT_SECS)).expect("open");
-    fake.fill_line();
-    let error = message(&mut sensor);
-    assert!(error.contains("nothing but nonsense") && error.contains("is 115200 baud right?"), "{error}");
-}
-
-#[test]
-fn a_silent_sensor_is_named() {
-    let fake = FakeSensor::sending("");
-    let error = message(&mut SerialSensor::open(&fake.params(IMPATIENT_SECS)).expect("open"));
-    assert!(error.contains("ambient sensor: no line on") && error.contains("powered"), "{error}");
-}
-
-#[test]
 fn a_sensor_that_is_not_there_is_named() {
     let params = SerialParams { path: "/dev/no-such-line".into(), ..SerialParams::default() };
     let error = SerialSensor::open(&params).err().expect("no such line").to_string();
     assert!(error.contains("cannot open `/dev/no-such-line`") && error.contains("hint"), "{error}");
 }
 
-#[test]
-fn an_unplugged_sensor_is_named_and_found_again() {
-    let mut first = FakeSensor::sending(GOOD);
-    let mut sensor = SerialSensor::open(&first.params(PATIENT_SECS)).expect("open");
-    sensor.read().expect("a reading");
-    sensor.params.timeout_secs = IMPATIENT_SECS;
-    first.unplug();
-    // What the line still held may be read once more.
-    let error = (0..3).find_map(|_| sensor.read().err()).expect("unplugged").to_string();
-    assert!(error.contains("lost `") && error.contains("still plugged in"), "{error}");
-    let second = FakeSensor::sending(GOOD);
-    symlink(&second.link, &first.link).expect("linked");
-    sensor.params.timeout_secs = PATIENT_SECS;
-    sensor.read().expect("found again");
-    let notices = sensor.notices().join("\n");
-    assert!(notices.contains("lost `") && notices.contains("is open again"), "{notices}");
+mod slow {
+    use super::*;
+
+    #[test]
+    fn nothing_but_nonsense_is_an_error() {
+        let fake = FakeSensor::sending("\u{3}\u{7f}~~\n");
+        let mut sensor = SerialSensor::open(&fake.params(IMPATIENT_SECS)).expect("open");
+        fake.fill_line();
+        let error = message(&mut sensor);
+        assert!(error.contains("nothing but nonsense") && error.contains("is 115200 baud right?"), "{error}");
+    }
+
+    #[test]
+    fn an_unplugged_sensor_is_named_and_found_again() {
+        let mut first = FakeSensor::sending(GOOD);
+        let mut sensor = SerialSensor::open(&first.params(PATIENT_SECS)).expect("open");
+        sensor.read().expect("a reading");
+        sensor.params.timeout_secs = IMPATIENT_SECS;
+        first.unplug();
+        // What the line still held may be read once more.
+        let error = (0..3).find_map(|_| sensor.read().err()).expect("unplugged").to_string();
+        assert!(error.contains("lost `") && error.contains("still plugged in"), "{error}");
+        let second = FakeSensor::sending(GOOD);
+        symlink(&second.link, &first.link).expect("linked");
+        sensor.params.timeout_secs = PATIENT_SECS;
+        sensor.read().expect("found again");
+        let notices = sensor.notices().join("\n");
+        assert!(notices.contains("lost `") && notices.contains("is open again"), "{notices}");
+    }
+
+    #[test]
+    fn a_silent_sensor_is_named() {
+        let fake = FakeSensor::sending("");
+        let error = message(&mut SerialSensor::open(&fake.params(IMPATIENT_SECS)).expect("open"));
+        assert!(error.contains("ambient sensor: no line on") && error.contains("powered"), "{error}");
+    }
 }
