@@ -23,6 +23,7 @@
 //! ```
 
 mod as_of;
+mod boxed_scan;
 mod catalog;
 mod control;
 mod dialect;

@@ -35,6 +35,7 @@ use futures::future::BoxFuture;
 use object_store::ObjectMeta;
 use tokio::sync::OnceCell;
 
+use crate::boxed_scan::boxed_scan;
 use crate::part_rows::visible_rows_scan;
 use crate::small::SmallTables;
 
@@ -315,23 +316,7 @@ impl TableProvider for LakeTable {
         Some(statistics)
     }
 
-    // Written out for the compiler: in an `async fn` of this trait it proves anew that expressions are `Sync`, for seconds.
-    fn scan<'table, 'state, 'columns, 'filters, 'scan>(
-        &'table self,
-        state: &'state dyn Session,
-        projection: Option<&'columns Vec<usize>>,
-        filters: &'filters [Expr],
-        limit: Option<usize>,
-    ) -> BoxFuture<'scan, Result<Arc<dyn ExecutionPlan>>>
-    where
-        'table: 'scan,
-        'state: 'scan,
-        'columns: 'scan,
-        'filters: 'scan,
-        Self: 'scan,
-    {
-        self.rows(state, projection, filters, limit)
-    }
+    boxed_scan!(self, state, projection, filters, limit => self.rows(state, projection, filters, limit));
 }
 
 impl LakeTable {

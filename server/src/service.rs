@@ -296,7 +296,7 @@ impl QueryService {
                 timer.watch().finish(done.as_ref().err());
                 done.inspect_err(|fault| service.record_failure(fault))
             };
-            let mut task = self.spawn(work.instrument(span.clone()));
+            let (mut task, service) = (self.spawn(work.instrument(span.clone())), self.clone());
             tokio::select! {
                 biased;
                 fault = ended(&stop, limit) => {
@@ -305,7 +305,7 @@ impl QueryService {
                     Err(fault)
                 }
                 schema = known => match schema {
-                    Ok(schema) => Ok(RunningQuery { schema, items, task, stop, limit, service: self.clone(), watch, span }),
+                    Ok(schema) => Ok(RunningQuery { schema, items, task, stop, limit, service, watch, span }),
                     // It ended without having any: it says why.
                     Err(_) => finish(&mut task).await.and(Err(RequestFault::Internal)),
                 }

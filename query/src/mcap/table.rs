@@ -14,7 +14,7 @@ use datafusion::error::Result;
 use datafusion::logical_expr::{BinaryExpr, Expr, Operator, TableProviderFilterPushDown};
 use datafusion::physical_plan::ExecutionPlan;
 use futures::FutureExt as _;
-use futures::future::{BoxFuture, ready};
+use futures::future::ready;
 use object_store::path::Path;
 
 use super::error::Fault;
@@ -23,6 +23,7 @@ use super::rows::{Head, Mapping};
 use super::scan::{McapExec, Scan};
 use super::schema::{Layout, RawSchema};
 use super::target::Target;
+use crate::boxed_scan::boxed_scan;
 
 /// Topics that a hint lists.
 const LISTED: usize = 20;
@@ -287,23 +288,7 @@ impl TableProvider for McapTable {
         Ok(filters.iter().map(one).collect())
     }
 
-    // Written out for the compiler: in an `async fn` of this trait it proves anew that expressions are `Sync`, for seconds.
-    fn scan<'table, 'state, 'columns, 'filters, 'scan>(
-        &'table self,
-        state: &'state dyn Session,
-        projection: Option<&'columns Vec<usize>>,
-        filters: &'filters [Expr],
-        limit: Option<usize>,
-    ) -> BoxFuture<'scan, Result<Arc<dyn ExecutionPlan>>>
-    where
-        'table: 'scan,
-        'state: 'scan,
-        'columns: 'scan,
-        'filters: 'scan,
-        Self: 'scan,
-    {
-        ready(self.messages(state, projection, filters, limit)).boxed()
-    }
+    boxed_scan!(self, state, projection, filters, limit => ready(self.messages(state, projection, filters, limit)).boxed());
 }
 
 impl McapTable {

@@ -80,7 +80,7 @@ pub async fn run_engine(lake: &Lake, sockets: &Path, settings: EngineRun) -> Res
         false => engine,
     };
     let service = QueryService::new(lake, engine, identity, settings.slow)?;
-    // Lists of tables plan all views, which the watchdog would take for work that nobody waits for.
+    // If the engine is new, this plans all views, which the watchdog would take for work that nobody waits for.
     drop(service.tables());
     // Behind the start of its threads, whose stacks count.
     limit.map(confinement::limit_memory).transpose().map_err(Error::System)?;
@@ -137,6 +137,7 @@ async fn warm_up(engine: &QueryEngine) -> Result<(), Error> {
     // A defect of the lake is reported to each client that queries it.
     let answer = async { session.query(WARM_UP).await?.next().await };
     drop(answer.boxed().await);
+    // Plans all views.
     drop(session.tables());
     Ok(())
 }
