@@ -82,7 +82,8 @@ def main() -> None:
         for name, run in (bare | loaders).items():
             rates[name].append(rate(run))
     middle = {name: statistics.median(values) for name, values in rates.items()}
-    print(f"{len(dataset)} samples, workers: {given.workers}, rounds: {given.rounds}, load: {os.getloadavg()[0]:.1f}")
+    samples = sum(pq.read_metadata(file).num_rows for file in dataset.files)
+    print(f"{samples} samples, workers: {given.workers}, rounds: {given.rounds}, load: {os.getloadavg()[0]:.1f}")
     for name, values in rates.items():
         shares = "".join(f"  {middle[name] / middle[other]:5.0%}" for other in bare) if name in loaders else ""
         print(f"{name:32} {middle[name]:9.0f} samples/s ({min(values):.0f} to {max(values):.0f}){shares}")

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+pq = pytest.importorskip("pyarrow.parquet")
 torch = pytest.importorskip("torch")
 from torch.utils.data import DataLoader  # noqa: E402
 
@@ -26,13 +27,45 @@ def rows(dataset: Measurements, workers: int = 0) -> list[tuple[str, str, int]]:
 def test_every_row_comes_once(training_set: Path, workers: int) -> None:
     dataset = Measurements(training_set, columns=["pair_id"])
     found = rows(dataset, workers)
-    assert len(found) == len(set(found)) == len(dataset)
+    assert len(found) == len(set(found)) == rows_of(training_set)
 
 
-def test_ranks_share_the_rows(training_set: Path) -> None:
-    parts = [rows(Measurements(training_set, columns=["pair_id"], rank=rank, world_size=3)) for rank in range(3)]
-    assert all(parts)
-    assert sum(map(len, parts)) == len(set().union(*parts)) == len(Measurements(training_set))
+def rows_of(training_set: Path) -> int:
+    """Rows of split train."""
+    return sum(pq.read_metadata(file).num_rows for file in (training_set / "data").glob("train-*.parquet"))
+
+
+@pytest.mark.parametrize("shuffle", [True, False])
+@pytest.mark.parametrize("ranks", [1, 2, 3, 5, 40])
+def test_every_rank_has_as_many_batches_as_its_length_says(training_set: Path, ranks: int, shuffle: bool) -> None:
+    counts, seen, surfaces = set(), set(), set()
+    for rank in range(ranks):
+        dataset = Measurements(
+            training_set, columns=["pair_id"], batch_size=100, shuffle=shuffle, rank=rank, world_size=ranks
+        )
+        batches = list(dataset)
+        counts |= {len(batches), len(dataset), len(DataLoader(dataset, batch_size=None))}
+        for batch in batches:
+            assert len(batch["pair_id"]) > 0
+            places = [batch["surface_ids"][place] for place in batch["surface"].tolist()]
+            seen |= set(zip(places, batch["pair_id"].tolist(), strict=True))
+            surfaces |= set(places)
+    assert len(counts) == 1
+    assert len(seen) == rows_of(training_set)
+    # Surfaces of one size are dealt evenly, so no rank has more than its share and one surface.
+    most = -(-len(surfaces) // ranks) * -(-len(seen) // len(surfaces))
+    assert counts.pop() <= -(-most // 100) + -(-len(surfaces) // ranks // 4) + 1
+
+
+def test_workers_change_neither_the_number_of_batches_nor_what_is_in_them(training_set: Path) -> None:
+    def batches(workers: int) -> list[Any]:
+        dataset = Measurements(training_set, columns=["pair_id"], batch_size=128, rank=1, world_size=2)
+        loader = DataLoader(dataset, batch_size=None, num_workers=workers)
+        found = [(batch["surface_ids"], batch["surface"].tolist(), batch["pair_id"].tolist()) for batch in loader]
+        assert len(found) == len(loader) == len(dataset)
+        return sorted(found)
+
+    assert batches(0) == batches(1) == batches(3)
 
 
 def test_shuffling_mixes_surfaces_and_is_repeatable(training_set: Path) -> None:

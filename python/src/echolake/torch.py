@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import cycle, islice
 from pathlib import Path
 from typing import Any, Literal
 
@@ -37,6 +38,15 @@ class _Item:
     row_group: int
     rows: int
     symmetry: str
+
+
+@dataclass(frozen=True)
+class _PlannedBlock:
+    """Surfaces that a rank reads and shuffles together, and how many batches it makes of them."""
+
+    number: int
+    items: list[_Item]
+    batches: int
 
 
 @dataclass
@@ -71,8 +81,13 @@ class Measurements(IterableDataset[Batch]):
     - ``heights`` (with ``heights=True``): ``[len(surface_ids), cells, cells]`` in mm, so
       ``batch["heights"][batch["surface"]]`` has a map for each row.
 
-    Files are dealt to ranks and workers; where there are fewer files than workers, surfaces are. ``mix`` surfaces, of
-    as many files, are read at a time and shuffled together, while the next ones are being read.
+    Surfaces are dealt to ranks. ``mix`` of a rank's surfaces, of as many files, are read at a time and shuffled
+    together, while the next ones are being read; these blocks are dealt to its workers. A block's last batch may be
+    short.
+
+    ``len`` is the number of batches of an epoch of this rank. It is the same at every rank and with any number of
+    workers: a rank that has fewer than another repeats its first ones, with its rows in another order. So each row
+    comes once if there is one rank, and at least once if there are several; to evaluate, read with ``world_size=1``.
 
     ``symmetries``: ``"none"``; ``"random"``, each surface under one of the eight, another one every epoch; ``"all"``,
     each under every one. Positions and height maps turn together; microphone and speaker keep their roles, so that
@@ -122,62 +137,71 @@ class Measurements(IterableDataset[Batch]):
         self._memory: Memory | None = None
 
     def __len__(self) -> int:
-        """Rows of one epoch, of all ranks and workers."""
-        rows = sum(sum(counts) for _, counts in self._groups)
-        return rows * (len(NAMES) if self.symmetries == "all" else 1)
+        """Batches of one epoch of this rank, over all of its workers; every rank has as many."""
+        return sum(planned.batches for planned in self._plan())
 
     def set_epoch(self, epoch: int) -> None:
         """Shuffles and turns anew; the same epoch and seed give the same order."""
         self.epoch = epoch
 
     def __iter__(self) -> Iterator[Batch]:
-        random = np.random.default_rng([self.seed, self.epoch])
-        items = self._items(random)
-        blocks = [items[i : i + self.mix] for i in range(0, len(items), self.mix)]
-        if not blocks:
+        info = get_worker_info()
+        worker, workers = (info.id, info.num_workers) if info else (0, 1)
+        plan = self._plan()[worker::workers]
+        if not plan:
             return
-        own = np.random.default_rng([self.seed, self.epoch, *self._place()])
-        if self._memory is None or get_worker_info() is None:
+        if self._memory is None or info is None:
             self._memory = Memory()
         # One block is dealt out while the next one is read; both places are filled again and again.
         rooms: tuple[_Room, _Room] = {}, {}
         with ThreadPoolExecutor(max_workers=_READERS) as readers:
-            coming = self._submit(readers, blocks[0], rooms[0])
-            for number in range(len(blocks)):
+            coming = self._submit(readers, plan[0].items, rooms[0])
+            for number, planned in enumerate(plan):
                 block = coming.result()
-                if number + 1 < len(blocks):
-                    coming = self._submit(readers, blocks[number + 1], rooms[(number + 1) % 2])
-                yield from self._batches(block, own, self._memory)
+                if number + 1 < len(plan):
+                    coming = self._submit(readers, plan[number + 1].items, rooms[(number + 1) % 2])
+                random = np.random.default_rng([self.seed, self.epoch, self.rank, planned.number])
+                yield from islice(self._batches(block, random, self._memory), planned.batches)
 
-    def _place(self) -> tuple[int, int]:
-        info = get_worker_info()
-        worker, workers = (info.id, info.num_workers) if info else (0, 1)
-        return self.rank * workers + worker, self.world_size * workers
+    # The blocks of this rank. A rank with fewer batches than another repeats its first ones: no rank waits for another
+    # at the end of an epoch, and no row is left out.
+    def _plan(self) -> list[_PlannedBlock]:
+        order = self._order()
+        ranks = [self._blocks(order, rank) for rank in range(self.world_size)]
+        counts = [sum(block.batches for block in blocks) for blocks in ranks]
+        own = ranks[self.rank]
+        missing = max(counts) - counts[self.rank]
+        for block in cycle(list(own)):
+            if missing == 0:
+                break
+            own.append(_PlannedBlock(len(own), block.items, min(missing, block.batches)))
+            missing -= own[-1].batches
+        return own
 
-    # What this rank and worker reads, in its order: files side by side, so that a block is of several.
-    def _items(self, random: np.random.Generator) -> list[_Item]:
-        place, places = self._place()
-        groups = list(self._groups)
+    def _blocks(self, order: list[_Item], rank: int) -> list[_PlannedBlock]:
+        # With fewer surfaces than ranks, some ranks read what another one reads, too.
+        mine = order[rank :: self.world_size] or order[rank % max(1, len(order)) :][:1]
+        blocks = [mine[i : i + self.mix] for i in range(0, len(mine), self.mix)]
+        counts = [-(-sum(item.rows for item in block) // self.batch_size) for block in blocks]
+        return [_PlannedBlock(number, *planned) for number, planned in enumerate(zip(blocks, counts, strict=True))]
+
+    # All that is read in an epoch, in its order, the same at every rank: files side by side, so that a block is of several.
+    def _order(self) -> list[_Item]:
+        random = np.random.default_rng([self.seed, self.epoch])
+        groups = [(file, group, rows) for file, counts in self._groups for group, rows in enumerate(counts) if rows > 0]
         if self.shuffle:
-            groups = [groups[i] for i in random.permutation(len(groups))]
-        if len(groups) >= places:
-            groups = groups[place::places]
-            mine = [(file, group, rows) for file, counts in groups for group, rows in enumerate(counts)]
-        else:
-            mine = [(file, group, rows) for file, counts in groups for group, rows in enumerate(counts)][place::places]
-        if self.shuffle:
-            ranked = [(random.random(), random.random()) for _ in mine]
+            ranked = [(random.random(), random.random()) for _ in groups]
             taken: dict[Path, int] = {}
             order = []
-            for i in sorted(range(len(mine)), key=lambda i: ranked[i][0]):
-                turn = taken.setdefault(mine[i][0], 0)
-                taken[mine[i][0]] = turn + 1
+            for i in sorted(range(len(groups)), key=lambda i: ranked[i][0]):
+                turn = taken.setdefault(groups[i][0], 0)
+                taken[groups[i][0]] = turn + 1
                 order.append((turn, ranked[i][1], i))
-            mine = [mine[i] for _, _, i in sorted(order)]
+            groups = [groups[i] for _, _, i in sorted(order)]
         names = {"none": ["identity"], "all": list(NAMES)}.get(self.symmetries)
         items = [
             _Item(file, group, rows, symmetry)
-            for file, group, rows in mine
+            for file, group, rows in groups
             for symmetry in (names or [NAMES[int(random.integers(len(NAMES)))]])
         ]
         if self.shuffle and self.symmetries == "all":
