@@ -18,7 +18,10 @@ root=$(mktemp -d)
 trap 'rm -rf "$root"' EXIT
 chmod 755 "$root"
 install -D -m 755 "$binary" "$root/usr/bin/echolake"
-install -D -m 644 "$packaging/debian/echolake.service" "$root/usr/lib/systemd/system/echolake.service"
+for unit in "$packaging"/debian/*.{service,timer}; do
+    install -D -m 644 "$unit" "$root/usr/lib/systemd/system/$(basename "$unit")"
+done
+install -D -m 755 "$packaging/debian/backup" "$root/usr/lib/echolake/backup"
 install -D -m 644 "$packaging/debian/echolake.default" "$root/etc/default/echolake"
 for page in "$documents"/man/*.1; do
     install -D -m 644 "$page" "$root/usr/share/man/man1/$(basename "$page")"
@@ -30,6 +33,7 @@ doc=$root/usr/share/doc/echolake
 install -d "$doc"
 install -m 644 "$source"/{README,CHANGELOG}.md "$source/docs/"*.md "$source/python/THIRD-PARTY-LICENCES.txt" \
     "$documents/echolake.cdx.json" "$doc"
+install -D -m 644 -t "$doc/grafana" "$source"/docs/grafana/*
 date=$(date -R -u -d "@${SOURCE_DATE_EPOCH:-$(date +%s)}")
 printf 'echolake (%s) stable; urgency=medium\n\n  * See CHANGELOG.md.gz.\n\n -- %s  %s\n' \
     "$version" "$maintainer" "$date" > "$doc/changelog"

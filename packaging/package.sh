@@ -107,6 +107,10 @@ make_source
 find_targets
 install_tools
 python3 "$source/packaging/inventory.py" licences "$source" "${targets[@]}"
+say "advisories"
+# Only a release requires them.
+ECHOLAKE_ADVISORIES=${ECHOLAKE_ADVISORIES:-unchecked} \
+    "$source/packaging/advisories.sh" "$source" "$out/echolake-$version.advisories.txt"
 runnable=
 for target in "${targets[@]}"; do
     rm -f "$work/fresh" && touch "$work/fresh"

@@ -26,7 +26,7 @@ if [ "$(git rev-parse --quiet --verify "$reference^" || true)" != "$(git rev-par
     git worktree remove --force "$folder"
     trap - EXIT
 fi
-packaging/package.sh "$reference"
+ECHOLAKE_ADVISORIES=${ECHOLAKE_ADVISORIES:-required} packaging/package.sh "$reference"
 git merge --quiet --ff-only "$reference" || fail "the branch has changed meanwhile; hint: run this again"
 git tag --annotate "v$version" --message "echolake $version"
 git update-ref -d "$reference"

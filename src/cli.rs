@@ -6,6 +6,8 @@ use anyhow::Context as _;
 use clap::{CommandFactory as _, Parser, Subcommand};
 #[cfg(feature = "lake")]
 use echolake_schema::ProjectName;
+#[cfg(feature = "lake")]
+use echolake_server::tokens::TokenScope;
 
 use crate::CommandOutcome;
 use crate::commands::acquire::{self, AcquireArgs};
@@ -126,6 +128,9 @@ pub(crate) enum LakeCommand {
         /// Project that the token may see, and no other; repeatable. By default it sees all.
         #[arg(long, value_name = "NAME")]
         project: Vec<ProjectName>,
+        /// What it is for: sql (queries), files (run files, Parquet files, meshes), metrics (the server's own figures).
+        #[arg(long, value_name = "SCOPE,...", value_delimiter = ',', default_value = "sql,files")]
+        scopes: Vec<TokenScope>,
     },
     /// Merge the tables' small files into large ones; ingest and queries may continue meanwhile.
     Optimize(OptimizeArgs),
@@ -195,7 +200,7 @@ impl LakeCommand {
             Self::Mcp(args) => mcp::run(args, lake).await,
             Self::Engine(args) => serve::engine(args, lake).await,
             Self::Certificate(args) => serve::certificate(args),
-            Self::Token { name, days, project } => serve::token(name, *days, project),
+            Self::Token { name, days, project, scopes } => serve::token(name, *days, project, scopes),
             Self::Optimize(args) => optimize::run(args, lake).await,
             Self::Twin(args) => twin::run(args, lake).await,
             Self::Vacuum(args) => vacuum::run(args, lake).await,

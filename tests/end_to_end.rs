@@ -200,6 +200,13 @@ mod slow {
             place.ok(&["sql", "--format", format, "-o", "answer", query]);
             assert!(std::fs::metadata(place.path("answer")).expect("written").len() > 1_000, "{format}");
         }
+        let formulas = "select '=1+1' as \"@name\", '-x' as text, -1.5 as number, null as nothing";
+        let plain = place.ok(&["sql", "--format", "csv", formulas]);
+        assert_eq!(plain, "@name,text,number,nothing\n=1+1,-x,-1.5,\n");
+        let escaped = place.ok(&["sql", "--format", "csv", "--escape-formulas", formulas]);
+        assert_eq!(escaped, "'@name,text,number,nothing\n'=1+1,'-x,-1.5,\n");
+        place.fails(2, &["sql", "--escape-formulas", formulas], "--format");
+        place.fails(1, &["sql", "--format", "json", "--escape-formulas", formulas], "--format csv");
         place.fails(1, &["sql", "-o", "missing/answer", "select 1"], "cannot write");
         place.fails(1, &["sql", "selec 1"], "^");
         place.fails(1, &["sql", "drop table runs"], "only reading");

@@ -2,6 +2,8 @@
 
 use std::fs;
 use std::net::TcpListener;
+use std::os::unix::fs::PermissionsExt as _;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use serde::Deserialize;
@@ -125,4 +127,139 @@ fn packages_get_man_pages_and_completions() {
     for shell in ["bash", "zsh", "fish"] {
         assert!(place.ok(&["completions", shell]).contains("echolake"), "{shell}");
     }
+}
+
+/// Units of the Debian package that an administrator enables.
+const UNITS: [&str; 4] =
+    ["echolake.service", "echolake-ingest.service", "echolake-doctor.timer", "echolake-backup.timer"];
+
+fn packaging() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("packaging")
+}
+
+#[test]
+fn units_of_the_package_call_commands_that_exist() {
+    let debian = packaging().join("debian");
+    let scripts = ["postinst", "postrm", "prerm"].map(|name| fs::read_to_string(debian.join(name)).expect("a script"));
+    for unit in UNITS {
+        assert!(debian.join(unit).exists(), "{unit}");
+        assert!(scripts.iter().all(|script| script.contains(unit)), "{unit} is in all scripts of the package");
+        if let Some(timed) = unit.strip_suffix(".timer") {
+            assert!(debian.join(format!("{timed}.service")).exists(), "{unit} starts a service of its name");
+        }
+    }
+    let mut commands = Vec::new();
+    for entry in fs::read_dir(&debian).expect("a folder") {
+        let path = entry.expect("an entry").path();
+        let text = fs::read_to_string(&path).expect("text");
+        if path.extension().is_some_and(|ending| ending == "service") {
+            commands.extend(text.lines().filter_map(|line| line.strip_prefix("ExecStart=")).map(str::to_owned));
+            assert!(text.contains("User=echolake\n") && text.contains("NoNewPrivileges=yes\n"), "{}", path.display());
+        }
+    }
+    commands.sort();
+    assert_eq!(
+        commands,
+        [
+            "/usr/bin/echolake doctor",
+            "/usr/bin/echolake ingest --watch",
+            "/usr/bin/echolake serve $ECHOLAKE_SERVE_OPTIONS",
+            "/usr/lib/echolake/backup"
+        ]
+    );
+    for command in commands.iter().filter_map(|command| command.strip_prefix("/usr/bin/echolake ")) {
+        let mut words: Vec<_> = command.split(' ').filter(|word| !word.starts_with('$')).collect();
+        words.push("--help");
+        assert!(run_command(Command::new(ECHOLAKE).args(&words)).expect("it starts").status.success(), "{command}");
+    }
+}
+
+#[test]
+fn a_backup_copies_what_a_lake_is_made_from_or_says_why_not() {
+    let place = TestFolder::new();
+    let fake = place.path("bin");
+    fs::create_dir_all(&fake).expect("a folder");
+    // As much of rsync as shows what it is asked.
+    let shown = "#!/bin/sh\nprintf '%s\\n' \"$@\"\n";
+    fs::write(fake.join("rsync"), shown).expect("written");
+    fs::set_permissions(fake.join("rsync"), fs::Permissions::from_mode(0o755)).expect("executable");
+    let path = format!("{}:{}", fake.display(), std::env::var("PATH").unwrap_or_default());
+    let backup = |lake: Option<&Path>, to: Option<&str>| {
+        let mut command = Command::new(packaging().join("debian/backup"));
+        command.env("PATH", &path).env_remove("ECHOLAKE_LAKE").env_remove("ECHOLAKE_BACKUP");
+        command.envs(lake.map(|lake| ("ECHOLAKE_LAKE", lake.as_os_str())));
+        command.envs(to.map(|to| ("ECHOLAKE_BACKUP", to)));
+        let output = run_command(&mut command).expect("it starts");
+        (output.status.success(), [&output.stdout[..], &output.stderr].concat())
+    };
+    let lake = place.path("lake");
+    fs::create_dir_all(&lake).expect("a folder");
+    let fails = |lake, to, expected: &str| {
+        let (is_done, text) = backup(lake, to);
+        let text = String::from_utf8_lossy(&text).into_owned();
+        assert!(!is_done && text.contains(expected), "{text}");
+    };
+    fails(None, Some("/backup"), "ECHOLAKE_LAKE: is not set");
+    fails(Some(&lake), None, "ECHOLAKE_BACKUP: is not set");
+    fails(Some(&lake), Some(""), "ECHOLAKE_BACKUP: is not set");
+    fails(Some(&lake), Some("/backup"), "no lake.toml");
+    fs::write(lake.join("lake.toml"), "").expect("written");
+    let (is_done, asked) = backup(Some(&lake), Some("host:/backup of lakes"));
+    let asked = String::from_utf8(asked).expect("text");
+    let expected = format!(
+        "-a\n--exclude\n*.partial\n--exclude\n/tables\n--exclude\n/temp\n{}/\nhost:/backup of lakes/\n",
+        lake.display()
+    );
+    assert!(is_done && asked == expected, "{asked}");
+}
+
+#[test]
+fn a_release_keeps_what_the_advisories_said_or_fails() {
+    let place = TestFolder::new();
+    let database = place.path("cargo/advisory-dbs/advisory-db");
+    let source = place.path("source");
+    fs::create_dir_all(&database).expect("a folder");
+    fs::create_dir_all(&source).expect("a folder");
+    fs::copy(Path::new(env!("CARGO_MANIFEST_DIR")).join("deny.toml"), source.join("deny.toml")).expect("copied");
+    let git = |args: &[&str]| {
+        let names = ["-c", "user.name=a", "-c", "user.email=a@localhost"];
+        let output = run_command(Command::new("git").arg("-C").arg(&database).args(names).args(args));
+        let output = output.expect("git starts");
+        assert!(output.status.success(), "{}", stderr(&output));
+        String::from_utf8(output.stdout).expect("text").trim().to_owned()
+    };
+    git(&["init", "--quiet"]);
+    git(&["commit", "--quiet", "--allow-empty", "--message", "An advisory"]);
+    let commit = git(&["rev-parse", "HEAD"]);
+    // As much of cargo-deny as answers: whether the database can be fetched, and what it finds.
+    let fake = place.path("cargo-deny");
+    let check = |fetched: bool, findings: &str, advisories: Option<&str>| {
+        let found = i32::from(!findings.is_empty());
+        let text = format!(
+            "#!/bin/sh\ncase \"$*\" in *fetch*) exit {} ;; esac\necho '{findings}' >&2\nexit {found}\n",
+            i32::from(!fetched)
+        );
+        fs::write(&fake, text).expect("written");
+        fs::set_permissions(&fake, fs::Permissions::from_mode(0o755)).expect("executable");
+        let mut command = Command::new(packaging().join("advisories.sh"));
+        command.arg(&source).arg(place.path("advisories.txt")).env_remove("ECHOLAKE_ADVISORIES");
+        command.env("CARGO_HOME", place.path("cargo")).env("ECHOLAKE_CARGO_DENY", &fake);
+        command.envs(advisories.map(|advisories| ("ECHOLAKE_ADVISORIES", advisories)));
+        let output = run_command(&mut command).expect("it starts");
+        let written = fs::read_to_string(place.path("advisories.txt")).expect("a report");
+        (output.status.success(), written, stderr(&output))
+    };
+    let (is_done, written, said) = check(true, "", None);
+    assert!(is_done && written.contains(&format!("database: commit {commit} of 20")), "{written}{said}");
+    // Every advisory that deny.toml answers is in the report, with its reason.
+    let denied = fs::read_to_string(source.join("deny.toml")).expect("text");
+    let answered = denied.matches("id = \"RUSTSEC-").count();
+    assert!(answered > 0 && written.matches("\nRUSTSEC-").count() == answered, "{written}");
+    assert!(written.contains("\nRUSTSEC-2026-0194: quick-xml 0.39"), "{written}");
+    let (is_done, written, said) = check(true, "RUSTSEC-2026-9999", None);
+    assert!(!is_done && written.contains("RUSTSEC-2026-9999") && said.contains("hint: update"), "{written}{said}");
+    let (is_done, written, said) = check(false, "", None);
+    assert!(!is_done && !written.contains("database:") && said.contains("ECHOLAKE_ADVISORIES=unchecked"), "{said}");
+    let (is_done, written, said) = check(false, "", Some("unchecked"));
+    assert!(is_done && written.contains("NOT CHECKED") && said.contains("NOT CHECKED"), "{written}{said}");
 }

@@ -103,6 +103,16 @@ fn answers_in_every_format() {
     let body = serde_json::json!({ "query": query, "format": "csv" }).to_string();
     let wrapped = HttpRequest::post("/api/v1/sql", &body).with("content-type", "application/json").send(&server);
     assert_eq!(wrapped.text(), csv.text());
+    let formulas = "select '=1+1' as a, -1.5 as b";
+    let escaped = |path: &str| HttpRequest::post(path, formulas).with("content-type", "application/sql").send(&server);
+    let plain = escaped("/api/v1/sql?format=csv&escape_formulas=false");
+    assert_eq!((plain.header("content-type"), &*plain.text()), (Some("text/csv"), "a,b\n=1+1,-1.5\n"));
+    let plain = escaped("/api/v1/sql?format=csv&escape_formulas=true");
+    assert_eq!((plain.header("content-type"), &*plain.text()), (Some("text/csv"), "a,b\n'=1+1,-1.5\n"));
+    refused(&escaped("/api/v1/sql?format=json&escape_formulas=true"), 400, "request_invalid");
+    let body = serde_json::json!({ "query": formulas, "format": "csv", "escape_formulas": true }).to_string();
+    let wrapped = HttpRequest::post("/api/v1/sql", &body).with("content-type", "application/json").send(&server);
+    assert_eq!(wrapped.text(), "a,b\n'=1+1,-1.5\n");
     let arrow = HttpRequest::post("/api/v1/sql", query)
         .with("content-type", "text/plain")
         .with("accept", "application/vnd.apache.arrow.stream")
@@ -336,6 +346,12 @@ mod slow {
         place.fails(1, &["serve", "--tokens", "none.toml"], "cannot read the tokens");
         let made = place.run(&["token", "analyst"]);
         let lines = String::from_utf8_lossy(&made.stdout).into_owned();
+        assert!(lines.contains("\nscopes = [\"sql\", \"files\"]\n"), "{lines}");
+        let watcher = place.run(&["token", "prometheus", "--scopes", "metrics"]);
+        let watcher = String::from_utf8_lossy(&watcher.stdout).into_owned();
+        assert!(watcher.contains("\nscopes = [\"metrics\"]\n"), "{watcher}");
+        place.fails(2, &["token", "x", "--scopes", "sql,all"], "no scope `all`; hint: sql, files or metrics");
+        place.fails(1, &["token", "x", "--scopes", "metrics", "--project", "brick"], "of all projects");
         let token = super::super::stderr(&made).lines().next().expect("a token").to_owned();
         assert!(!lines.contains(&token), "only its hash is printed to be kept");
         std::fs::write(place.path("tokens.toml"), &lines).expect("written");

@@ -15,6 +15,7 @@ use super::{TestFolder, stderr};
 
 const NO_SKIP: &str = "ECHOLAKE_NO_SKIP";
 const SCHEMATHESIS: &str = "schemathesis==4.32.5";
+const CLIENTS: [&str; 3] = ["pyarrow==26.0.1", "duckdb-cli==1.5.6", "rerun-sdk==0.41.0"];
 
 fn web() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("web")
@@ -72,6 +73,17 @@ fn schemathesis() -> Result<PathBuf, String> {
     Ok(program)
 }
 
+/// A folder whose programs the pages' code for other programs needs.
+fn clients() -> Result<PathBuf, String> {
+    let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("page-clients");
+    if !folder.join("installed").exists() {
+        run(Command::new("python3").args(["-m", "venv", "--clear"]).arg(&folder))?;
+        run(Command::new(folder.join("bin/pip")).args(["install", "--quiet"]).args(CLIENTS))?;
+        fs::write(folder.join("installed"), "").map_err(|e| e.to_string())?;
+    }
+    Ok(folder)
+}
+
 /// A lake of the paper's rig: the demo's, without sweeps.
 fn demo() -> TestFolder {
     let place = TestFolder::new();
@@ -99,6 +111,18 @@ mod slow {
         }
         let pictures = fs::read_dir(shots).expect("pictures").count();
         assert!(pictures >= 7 * 2, "{pictures} pictures of seven pages in two themes");
+    }
+
+    #[test]
+    fn code_of_the_pages_runs_in_other_programs() {
+        let ready = browser().and_then(|_| clients());
+        let Some(clients) = or_skip("the pages' code in other programs", ready) else { return };
+        let place = lake();
+        let server = served(&place, &[]);
+        let base = format!("http://{}", server.http);
+        let mut command = Command::new("node");
+        command.args(["tests/snippets.mjs", &base]).arg(clients).current_dir(web()).env("TMPDIR", place.path(""));
+        eprintln!("{}", run(&mut command).unwrap_or_else(|why| panic!("{why}")));
     }
 
     #[test]

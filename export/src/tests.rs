@@ -245,6 +245,12 @@ mod slow {
         );
         assert!(card.contains("\nlicense: unknown\n") && card.contains("--columns reflected_ir,"), "{card}");
         assert!(card.contains("no rows of this set") && card.contains("size_categories:\n- "), "{card}");
+        let version = lake.snapshot().await.expect("a snapshot").lake_version().expect("a version");
+        assert!(version > 0 && card.contains(&format!("of the lake as `runs@{version}` has it")), "{card}");
+        let croissant: serde_json::Value = serde_json::from_slice(&files["croissant.json"]).expect("JSON");
+        assert_eq!(croissant["version"], format!("1.{version}.0"));
+        let description = croissant["description"].as_str().expect("a text");
+        assert!(description.contains(&format!("Lake: runs@{version}, echolake ")), "{description}");
         let asked = TrainingSet { references: true, license: Some("cc-by-4.0".into()), ..TrainingSet::default() };
         let folder = home.path().join("with");
         let all = write_training_set(&lake, &folder, &asked, &mut |_, _| {}).await.expect("written");

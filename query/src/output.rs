@@ -6,6 +6,7 @@ use std::io::Write;
 use std::sync::Arc;
 
 use arrow::array::{Array as _, ArrayRef, AsArray as _, RecordBatch, StringArray};
+use arrow::compute::cast;
 use arrow::datatypes::{DataType, Field, Schema, SchemaRef};
 use arrow::error::ArrowError;
 use arrow::util::display::{ArrayFormatter, FormatOptions};
@@ -32,6 +33,9 @@ pub enum AnswerFormat {
     Table,
     /// Comma-separated, lists as JSON.
     Csv,
+    /// CSV whose texts no spreadsheet takes for formulas: `'` stands before a text, or a column's name, that begins with
+    /// `=`, `+`, `-`, `@`, a tab or a carriage return. Numbers stay as they are.
+    SpreadsheetCsv,
     /// One array of objects.
     Json,
     /// Parquet, zstd.
@@ -42,13 +46,13 @@ pub enum AnswerFormat {
 
 impl AnswerFormat {
     /// All formats.
-    pub const ALL: [Self; 5] = [Self::Table, Self::Csv, Self::Json, Self::Parquet, Self::Arrow];
+    pub const ALL: [Self; 6] = [Self::Table, Self::Csv, Self::SpreadsheetCsv, Self::Json, Self::Parquet, Self::Arrow];
 
-    /// Returns its name.
+    /// Returns its name; both forms of CSV have the same.
     pub fn name(self) -> &'static str {
         match self {
             Self::Table => "table",
-            Self::Csv => "csv",
+            Self::Csv | Self::SpreadsheetCsv => "csv",
             Self::Json => "json",
             Self::Parquet => "parquet",
             Self::Arrow => "arrow",
@@ -86,6 +90,7 @@ pub struct AnswerWriter<W: Write + Send> {
 enum FormatWriter<W: Write + Send> {
     Table(W, Vec<RecordBatch>),
     Csv(W, Vec<u8>),
+    SpreadsheetCsv(W, Vec<u8>),
     Json(arrow::json::ArrayWriter<W>),
     Parquet(Box<ArrowWriter<W>>),
     Arrow(arrow::ipc::writer::StreamWriter<W>),
@@ -107,6 +112,12 @@ impl<W: Write + Send> AnswerWriter<W> {
                 // A header even if there are no rows.
                 write_csv(&mut to, &mut text, &RecordBatch::new_empty(flat_schema(schema)), true)?;
                 FormatWriter::Csv(to, text)
+            }
+            AnswerFormat::SpreadsheetCsv => {
+                let (mut to, mut text) = (to, Vec::new());
+                let header = escape_formulas(&RecordBatch::new_empty(flat_schema(schema)));
+                write_csv(&mut to, &mut text, &header.map_err(|e| arrow_error(format, e))?, true)?;
+                FormatWriter::SpreadsheetCsv(to, text)
             }
             AnswerFormat::Json => {
                 FormatWriter::Json(arrow::json::WriterBuilder::new().with_explicit_nulls(true).build(to))
@@ -142,6 +153,10 @@ impl<W: Write + Send> AnswerWriter<W> {
             }
             FormatWriter::Table(..) => {}
             FormatWriter::Csv(to, text) => write_csv(to, text, &flat(batch, json_list).map_err(failed)?, false)?,
+            FormatWriter::SpreadsheetCsv(to, text) => {
+                let escaped = flat(batch, json_list).and_then(|batch| escape_formulas(&batch));
+                write_csv(to, text, &escaped.map_err(failed)?, false)?;
+            }
             FormatWriter::Json(writer) => writer.write(batch).map_err(failed)?,
             FormatWriter::Parquet(writer) => writer.write(batch).map_err(parquet_error)?,
             FormatWriter::Arrow(writer) => writer.write(batch).map_err(failed)?,
@@ -162,7 +177,7 @@ impl<W: Write + Send> AnswerWriter<W> {
                 writeln!(to, "{}", pretty_format_batches(&batches).map_err(failed)?)?;
                 to.flush()?;
             }
-            FormatWriter::Csv(mut to, _) => to.flush()?,
+            FormatWriter::Csv(mut to, _) | FormatWriter::SpreadsheetCsv(mut to, _) => to.flush()?,
             FormatWriter::Json(mut writer) => {
                 writer.finish().map_err(failed)?;
                 let mut to = writer.into_inner();
@@ -186,6 +201,35 @@ fn write_csv(to: &mut impl Write, text: &mut Vec<u8>, batch: &RecordBatch, heade
         .write(batch)
         .map_err(|e| arrow_error(AnswerFormat::Csv, e))?;
     Ok(to.write_all(text)?)
+}
+
+// Texts and names as `AnswerFormat::SpreadsheetCsv` has them.
+fn escape_formulas(batch: &RecordBatch) -> Result<RecordBatch, ArrowError> {
+    let escaped = |text: &str| match text.starts_with(['=', '+', '-', '@', '\t', '\r']) {
+        true => format!("'{text}"),
+        false => text.to_owned(),
+    };
+    let schema = batch.schema();
+    let mut fields = Vec::with_capacity(batch.num_columns());
+    let mut columns = Vec::with_capacity(batch.num_columns());
+    for (field, column) in schema.fields().iter().zip(batch.columns()) {
+        let kind = match field.data_type() {
+            DataType::Dictionary(_, values) => values,
+            other => other,
+        };
+        let is_text = matches!(kind, DataType::Utf8 | DataType::LargeUtf8 | DataType::Utf8View);
+        let column = match is_text {
+            true => {
+                let texts = cast(column, &DataType::Utf8)?;
+                let texts: StringArray = texts.as_string::<i32>().iter().map(|text| text.map(escaped)).collect();
+                Arc::new(texts) as ArrayRef
+            }
+            false => column.clone(),
+        };
+        fields.push(Field::new(escaped(field.name()), column.data_type().clone(), true));
+        columns.push(column);
+    }
+    RecordBatch::try_new(Arc::new(Schema::new(fields)), columns)
 }
 
 // Readers of JSON objects and of Parquet find columns by name.
@@ -339,6 +383,31 @@ mod tests {
         expect![[r#"
             [{"id":1,"name":"a,\"b\"","ir":[0.5,-1.0,2.0,3.0],"at":"2026-01-05T08:00:00Z"},{"id":null,"name":null,"ir":[1.0e-9],"at":null}]
         "#]].assert_eq(&text(AnswerFormat::Json));
+    }
+
+    #[test]
+    fn texts_are_no_formulas_in_a_spreadsheet_and_numbers_stay() {
+        let texts = ["=1+1", "+1", "-1", "@sum(a1)", "\t=1", "\r=1", "a=1", "'=1", ""];
+        let levels = Float32Array::from_iter_values((0..texts.len()).map(|i| -0.5 * i as f32));
+        let plain: ArrayRef = Arc::new(StringArray::from_iter_values(texts));
+        let coded = cast(&plain, &DataType::Dictionary(Box::new(DataType::Int8), Box::new(DataType::Utf8)));
+        let batch = RecordBatch::try_from_iter([
+            ("-level_db", Arc::new(levels) as ArrayRef),
+            ("plain", plain.clone()),
+            ("coded", coded.expect("coded")),
+            ("viewed", cast(&plain, &DataType::Utf8View).expect("viewed")),
+        ]);
+        let batch = batch.expect("a batch");
+        let mut out = Vec::new();
+        let mut writer = AnswerWriter::new(AnswerFormat::SpreadsheetCsv, &batch.schema(), &mut out).expect("begun");
+        writer.write(&batch).expect("written");
+        assert_eq!(writer.finish().expect("finished"), texts.len());
+        let mut expected = "'-level_db,plain,coded,viewed\n".to_owned();
+        for (i, text) in ["'=1+1", "'+1", "'-1", "'@sum(a1)", "'\t=1", "\"'\r=1\"", "a=1", "'=1", ""].iter().enumerate()
+        {
+            let _ = writeln!(expected, "{:.1},{text},{text},{text}", -0.5 * i as f32);
+        }
+        assert_eq!(String::from_utf8(out).expect("text"), expected);
     }
 
     #[test]

@@ -77,6 +77,12 @@ pub(crate) enum RequestFault {
     /// The path exists for other methods.
     #[error("this path is not for this method; hint: the header `Allow` lists those it is for")]
     Method,
+    /// The header If-Match names none of the versions there are.
+    #[error("the ETag is {etag}, which `If-Match` does not name; hint: leave the header out for the present version")]
+    Precondition {
+        /// The tag of the present version.
+        etag: String,
+    },
     /// A part of a file that it does not have.
     #[error("the file has {bytes} bytes; hint: ask for a range within them")]
     Range {
@@ -173,6 +179,7 @@ pub(crate) enum FaultCode {
     Changed,
     NoData,
     Method,
+    Precondition,
     Range,
     TooLarge,
     Unauthenticated,
@@ -192,7 +199,7 @@ pub(crate) enum FaultCode {
 
 impl FaultCode {
     /// All of them.
-    pub(crate) const ALL: [Self; 27] = [
+    pub(crate) const ALL: [Self; 28] = [
         Self::Query,
         Self::ReadOnly,
         Self::Execution,
@@ -205,6 +212,7 @@ impl FaultCode {
         Self::Changed,
         Self::NoData,
         Self::Method,
+        Self::Precondition,
         Self::Range,
         Self::TooLarge,
         Self::Unauthenticated,
@@ -237,6 +245,7 @@ impl FaultCode {
             Self::Changed => "file_changed",
             Self::NoData => "no_data",
             Self::Method => "method_not_allowed",
+            Self::Precondition => "precondition_failed",
             Self::Range => "range_not_satisfiable",
             Self::TooLarge => "request_too_large",
             Self::Unauthenticated => "unauthenticated",
@@ -329,6 +338,7 @@ impl RequestFault {
             Self::NoData { .. } => FaultCode::NoData,
             Self::Unreadable => FaultCode::Lake,
             Self::Method => FaultCode::Method,
+            Self::Precondition { .. } => FaultCode::Precondition,
             Self::Range { .. } => FaultCode::Range,
             Self::TooLarge { .. } => FaultCode::TooLarge,
             Self::Unauthenticated => FaultCode::Unauthenticated,

@@ -276,7 +276,9 @@ mod tests {
     #[test]
     fn a_fresh_token_lets_in_and_no_other_does() {
         let project: ProjectName = "brick".parse().expect("a name");
-        let fresh = fresh("a \"quoted\" name", Some(1), std::slice::from_ref(&project)).expect("a token");
+        let fresh =
+            fresh("a \"quoted\" name", Some(1), std::slice::from_ref(&project), &[TokenScope::Sql, TokenScope::Files])
+                .expect("a token");
         assert!(!fresh.lines.contains(&fresh.token), "only hashes of it are kept");
         let access = access_by(&fresh.lines);
         let local = ClientIdentity::pages;
@@ -293,7 +295,7 @@ mod tests {
         let (by_name, _) = access.scram_client("a \"quoted\" name").expect("a verifier");
         assert_eq!(by_name, client);
         assert!(access.scram_client("b").is_none());
-        let other = crate::tokens::fresh("b", None, &[]).expect("a token").token;
+        let other = crate::tokens::fresh("b", None, &[], &[TokenScope::Sql]).expect("a token").token;
         let cut = &fresh.token[..fresh.token.len() - 1];
         for wrong in [None, Some(""), Some(other.as_str()), Some(cut)] {
             assert!(matches!(access.client(wrong, local), Err(RequestFault::Unauthenticated)), "{wrong:?}");

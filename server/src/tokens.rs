@@ -3,6 +3,7 @@
 use std::collections::BTreeSet;
 use std::fmt;
 use std::path::{Path, PathBuf};
+use std::str::FromStr;
 use std::sync::Arc;
 
 use base64::Engine as _;
@@ -38,6 +39,21 @@ pub enum TokenScope {
     Files,
     /// The server's own figures.
     Metrics,
+}
+
+impl TokenScope {
+    /// The scopes, by their names in the file of tokens.
+    pub const NAMED: [(&'static str, Self); 3] =
+        [("sql", Self::Sql), ("files", Self::Files), ("metrics", Self::Metrics)];
+}
+
+impl FromStr for TokenScope {
+    type Err = String;
+
+    fn from_str(name: &str) -> Result<Self, String> {
+        let found = Self::NAMED.into_iter().find(|(known, _)| *known == name);
+        found.map(|(_, scope)| scope).ok_or_else(|| format!("no scope `{name}`; hint: sql, files or metrics"))
+    }
 }
 
 impl fmt::Display for TokenScope {
@@ -296,19 +312,27 @@ pub struct FreshToken {
     pub lines: String,
 }
 
-/// Makes a token, which expires after so many days and sees these projects; without any it sees all.
+/// Makes a token for these scopes, which expires after so many days and sees these projects; without any it sees all.
 ///
 /// # Errors
 /// [`Error::Random`].
-pub fn fresh(name: &str, days: Option<u32>, projects: &[ProjectName]) -> Result<FreshToken, Error> {
+pub fn fresh(
+    name: &str,
+    days: Option<u32>,
+    projects: &[ProjectName],
+    scopes: &[TokenScope],
+) -> Result<FreshToken, Error> {
     let mut secret = [0; 32];
     getrandom::fill(&mut secret).map_err(|failed| Error::Random(failed.into()))?;
     let token = format!("{PREFIX}{}", hex::encode(secret));
     let hash = hex::encode(Sha256::digest(token.as_bytes()));
     let scram = ScramVerifier::new(&token).map_err(|failed| Error::Random(failed.into()))?;
     let name = toml::Value::from(name);
+    let scopes = TokenScope::NAMED.into_iter().filter(|(_, scope)| scopes.contains(scope));
+    let scopes: Vec<_> = scopes.map(|(name, _)| format!("\"{name}\"")).collect();
+    let scopes = scopes.join(", ");
     let lines = format!(
-        "[[token]]\nname = {name}\nsha256 = \"{hash}\"\nscram = \"{scram}\"\nscopes = [\"sql\", \"files\"]\n\
+        "[[token]]\nname = {name}\nsha256 = \"{hash}\"\nscram = \"{scram}\"\nscopes = [{scopes}]\n\
          seconds = 60\nmemory_mb = 2000\nrows = 10_000_000\nconcurrent = 4\n"
     );
     let expires = days.map(|days| {

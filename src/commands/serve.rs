@@ -14,7 +14,7 @@ use echolake_query::{WorkerLink, WorkerToken};
 use echolake_schema::ProjectName;
 use echolake_server::certificate::{CertificateUse, self_signed};
 use echolake_server::engine::{EngineRun, confinement, run_engine};
-use echolake_server::tokens::{self, TokenFile};
+use echolake_server::tokens::{self, TokenFile, TokenScope};
 use echolake_server::worker::{
     EngineWorkers, LakeWorker, WORKER_TOKEN_VARIABLE, WorkerSettings, program_build, read_worker_token,
     read_worker_trust, worker_trust_files,
@@ -440,8 +440,17 @@ pub(crate) fn certificate(args: &CertificateArgs) -> anyhow::Result<CommandOutco
 }
 
 /// Prints a new token to stderr, once, and its lines for the file of tokens to stdout.
-pub(crate) fn token(name: &str, days: Option<u32>, projects: &[ProjectName]) -> anyhow::Result<CommandOutcome> {
-    let fresh = tokens::fresh(name, days, projects)?;
+pub(crate) fn token(
+    name: &str,
+    days: Option<u32>,
+    projects: &[ProjectName],
+    scopes: &[TokenScope],
+) -> anyhow::Result<CommandOutcome> {
+    anyhow::ensure!(
+        projects.is_empty() || !scopes.contains(&TokenScope::Metrics),
+        "a token of projects cannot have the scope metrics, whose figures are of all projects; hint: make two tokens"
+    );
+    let fresh = tokens::fresh(name, days, projects, scopes)?;
     eprintln!("{}\nthis token is kept nowhere: only its hash is, in the lines for the file of --tokens", fresh.token);
     super::print(fresh.lines.trim_end())?;
     Ok(CommandOutcome::Whole)

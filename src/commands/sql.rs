@@ -25,6 +25,10 @@ pub(crate) struct SqlArgs {
     /// The same as --format json.
     #[arg(long, conflicts_with = "format")]
     json: bool,
+    /// Put `'` before texts that a spreadsheet would take for formulas: those that begin with =, +, -, @, a tab or a
+    /// carriage return; with --format csv.
+    #[arg(long, requires = "format")]
+    escape_formulas: bool,
     /// File for the answer.
     #[arg(short, long)]
     output: Option<PathBuf>,
@@ -67,7 +71,12 @@ pub(crate) async fn run(args: &SqlArgs, lake_url: &str) -> anyhow::Result<()> {
         anyhow::ensure!(is_plain, "`{query}` answers as text; hint: leave --format, --json and -o out");
         return Ok(super::print(&text?)?);
     }
-    let format = if args.json { AnswerFormat::Json } else { args.format.into() };
+    let format = match (args.json, args.format, args.escape_formulas) {
+        (true, ..) => AnswerFormat::Json,
+        (false, FormatArg::Csv, true) => AnswerFormat::SpreadsheetCsv,
+        (false, _, true) => anyhow::bail!("--escape-formulas is for CSV; hint: --format csv"),
+        (false, format, false) => format.into(),
+    };
     let answer = session.query(&query).await?;
     match &args.output {
         Some(path) => to_file(answer, format, path).await.map(drop),

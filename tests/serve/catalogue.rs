@@ -189,6 +189,29 @@ fn run_files_come_in_ranges_to_viewers_of_elsewhere() {
     assert_eq!(foreign().with("if-none-match", &tag).send(&server).status, 304);
     let ranged = |known: &str| foreign().with("range", "bytes=0-7").with("if-range", known).send(&server).status;
     assert_eq!((ranged(&tag), ranged("\"other\"")), (206, 200));
+    // If-Match comes before If-None-Match, and both before the range.
+    let matched = |wanted: &str| foreign().with("if-match", wanted);
+    for wanted in ["\"nope\"", "nope", &format!("W/{tag}"), ""] {
+        let failed = [
+            matched(wanted),
+            matched(wanted).with("range", "bytes=0-7"),
+            matched(wanted).with("if-none-match", &tag),
+            matched(wanted).with("if-range", &tag).with("range", "bytes=9999999999-"),
+        ];
+        for request in failed {
+            let answer = request.send(&server);
+            refused(&answer, 412, "precondition_failed");
+            assert_eq!(answer.header("etag"), Some(&*tag), "{wanted}");
+        }
+    }
+    for wanted in [&*tag, "*", &format!("\"nope\", {tag}")] {
+        assert_eq!(matched(wanted).send(&server).status, 200, "{wanted}");
+        assert_eq!(matched(wanted).with("range", "bytes=0-7").send(&server).status, 206, "{wanted}");
+        assert_eq!(matched(wanted).with("if-none-match", &tag).send(&server).status, 304, "{wanted}");
+    }
+    assert_eq!(HttpRequest::head(&path).with("if-match", "\"nope\"").send(&server).status, 412);
+    let missing = |name: &str| HttpRequest::get("/api/v1/runs/none/file.mcap").with(name, "*").send(&server).status;
+    assert_eq!((missing("if-match"), missing("if-none-match")), (404, 404));
     let asked = HttpRequest::options(&path)
         .with("origin", "https://viewer.example")
         .with("access-control-request-method", "GET")
@@ -317,6 +340,26 @@ mod slow {
         let packed = HttpRequest::get("/api/v1/surfaces").with("accept-encoding", "gzip").send(&server);
         assert_eq!(packed.header("content-encoding"), Some("gzip"));
         assert!(packed.body.len() < before.body.len() / 2);
+        // A tag is one resource's own: it is no other's, nor that of what does not exist.
+        let asked = |path: &str, name: &str, tags: &str| HttpRequest::get(path).with(name, tags).send(&server).status;
+        for (path, expected) in [
+            ("/api/v1/surfaces", 304),
+            ("/api/v1/surfaces?limit=1", 200),
+            ("/api/v1/runs", 200),
+            ("/api/v1/files", 200),
+            ("/api/v1/surfaces/none", 404),
+            ("/api/v1/surfaces/brick/pairs/99999", 404),
+        ] {
+            assert_eq!(asked(path, "if-none-match", &format!("\"x\", W/{tag}")), expected, "{path}");
+        }
+        for (path, expected) in [("/api/v1/surfaces/brick", [304, 200, 412]), ("/api/v1/surfaces/none", [404; 3])] {
+            let statuses = [("if-none-match", "*"), ("if-match", "*"), ("if-match", &tag)];
+            assert_eq!(statuses.map(|(name, tags)| asked(path, name, tags)), expected, "{path}");
+        }
+        let of_points = get(&server, "/api/v1/files?table=points").header("etag").expect("a tag").to_owned();
+        assert_eq!(asked("/api/v1/files?table=points", "if-none-match", &of_points), 304);
+        assert_eq!(asked("/api/v1/files?table=pairs", "if-none-match", &of_points), 200);
+        assert_eq!(asked("/api/v1/files?table=pairs", "if-match", &of_points), 412);
         place.acquire("wavy", &["--ir-only"]);
         place.ok(&["ingest"]);
         let after = HttpRequest::get("/api/v1/surfaces").with("if-none-match", &tag).send(&server);

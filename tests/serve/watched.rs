@@ -121,13 +121,30 @@ fn figures_are_as_prometheus_wants_them() {
     ] {
         assert!(has(&text, line), "{line} in {text}");
     }
+    let rules = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/grafana/alerts.yaml");
+    let expressions = std::fs::read_to_string(&rules).expect("the rules");
+    let expressions = expressions.lines().filter_map(|line| line.trim().strip_prefix("expr: "));
+    let mut named = 0;
+    for expression in expressions {
+        let names = expression.split(|c: char| !c.is_ascii_alphanumeric() && c != '_');
+        let names: Vec<_> = names.filter(|name| name.starts_with("echolake_")).collect();
+        assert!(!names.is_empty(), "an alert over no figure of a server: {expression}");
+        for name in names {
+            let found = text.lines().any(|line| line.split(['{', ' ']).next() == Some(name));
+            assert!(found, "there is no {name}, which an alert reads, in {text}");
+            named += 1;
+        }
+    }
+    assert_eq!(named, 8);
     // Debian's package prometheus has it.
     std::fs::write(place.path("metrics.txt"), &text).expect("written");
-    let check = format!("promtool check metrics < '{}'", place.path("metrics.txt").display());
-    let checked = run_command(Command::new("sh").args(["-c", &check])).expect("a shell");
-    match checked.status.code() {
-        Some(127) => eprintln!("skipped: there is no promtool"),
-        code => assert_eq!(code, Some(0), "{}", String::from_utf8_lossy(&checked.stderr)),
+    let metrics = format!("promtool check metrics < '{}'", place.path("metrics.txt").display());
+    for check in [metrics, format!("promtool check rules '{}'", rules.display())] {
+        let checked = run_command(Command::new("sh").args(["-c", &check])).expect("a shell");
+        match checked.status.code() {
+            Some(127) => eprintln!("skipped: there is no promtool"),
+            code => assert_eq!(code, Some(0), "{}", String::from_utf8_lossy(&checked.stderr)),
+        }
     }
 }
 

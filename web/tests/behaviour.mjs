@@ -558,6 +558,62 @@ await check('operations say what a token may not see', async () => {
   forget(/status of 403/)
 })
 
+await check('a malformed address says so, and the next one is shown', async () => {
+  const heading = () => page.getByRole('heading', { level: 1 }).innerText()
+  for (const address of ['/surfaces/%zz', '/surfaces/%', '/runs/%ff', '/surfaces/%e9/pairs/7']) {
+    await open(address)
+    assert.equal(await heading(), 'Nothing to show', address)
+    const text = await page.getByRole('alert').innerText()
+    assert.ok(text.includes(address) && text.includes('malformed'), text)
+    await page.getByRole('link', { name: 'all runs' }).click()
+    await eventually(async () => assert.match(await heading(), /runs/))
+  }
+  await open('/nothing/%zz')
+  assert.ok((await page.getByRole('alert').innerText()).includes('no page at /nothing/%zz'))
+  // A percent sign that is right is decoded once.
+  await open('/surfaces/50%2525')
+  await page.getByRole('alert').first().waitFor()
+  assert.ok((await page.getByRole('alert').first().innerText()).includes('surface `50%25`'))
+  forget(/404/)
+})
+
+await check('a pair without references shows what was measured', async () => {
+  await page.route(`**/api/v1/surfaces/${id}/pairs/7`, async (route) => {
+    const response = await route.fetch()
+    const detail = { ...(await response.json()), reflected: null, flat_reflected: null, curves: null }
+    await route.fulfill({ response, json: detail })
+  })
+  for (const search of ['', '?show=group-delay', '?signal=reflected', `?with=${id}:8`]) {
+    await open(`/surfaces/${id}/pairs/7${search}`)
+    await settled()
+    assert.ok(await page.getByText('the Foam or Flat reference is missing').first().isVisible())
+    assert.equal(await page.getByRole('button', { name: 'Measured', exact: true }).getAttribute('aria-pressed'), 'true')
+    for (const title of ['Spectrum', search.includes('delay') ? 'Group delay' : 'Phase', 'Spectrogram'])
+      await page.locator(`section[aria-label="${title}"] :is(svg, canvas)`).first().waitFor()
+    const wav = await page.getByRole('link', { name: 'WAV, full scale' }).getAttribute('href')
+    assert.ok(wav.includes('signal=measured'), wav)
+  }
+  // An overlay that has none is named.
+  await open(`/surfaces/${id}/pairs/8?with=${id}:7`)
+  await settled()
+  assert.ok((await page.locator('body').innerText()).includes(`${id} 7, as measured`))
+  await page.unroute(`**/api/v1/surfaces/${id}/pairs/7`)
+})
+
+await check('a page that cannot be drawn says so, and the next one is shown', async () => {
+  await page.route(`**/api/v1/surfaces/${id}/pairs/9`, async (route) => {
+    const response = await route.fetch()
+    await route.fulfill({ response, json: { ...(await response.json()), measured: null } })
+  })
+  await open(`/surfaces/${id}/pairs/9`)
+  await page.getByRole('alert').first().waitFor()
+  assert.ok((await page.getByRole('alert').first().innerText()).includes('a defect of echolake'))
+  await page.unroute(`**/api/v1/surfaces/${id}/pairs/9`)
+  await page.getByRole('link', { name: 'all runs' }).click()
+  await eventually(async () => assert.match(await page.getByRole('heading', { level: 1 }).innerText(), /runs/))
+  forget(/./)
+})
+
 await check('names from the lake stay text', async () => {
   await page.route('**/api/v1/surfaces?*', async (route) => {
     const answer = await (await route.fetch()).json()

@@ -15,9 +15,11 @@ use crate::error::{Error, Result};
 pub(super) const PAPER: &str = "Rust, R. et al. (2021). A data acquisition setup for data driven acoustic design. \
 Building Acoustics 28(4), 345-360. https://doi.org/10.1177/1351010X20986901";
 
-/// Contents of a card: the lake, the plan, and the export's counts.
+/// Contents of a card: the lake and its version, the plan, and the export's counts.
 pub(super) struct CardContents<'a> {
     pub(super) lake: &'a Lake,
+    /// The version of table `runs` that the rows are of, as `AS OF` takes it.
+    pub(super) lake_version: u64,
     pub(super) plan: &'a Plan,
     pub(super) exported: &'a ExportSummary,
 }
@@ -169,8 +171,9 @@ fn files(text: &mut String, about: &CardContents<'_>) {
     });
     let _ = writeln!(
         text,
-        "Made by echolake {}; the same lake, arguments and version give the same bytes.",
-        env!("CARGO_PKG_VERSION")
+        "Made by echolake {} of the lake as `runs@{}` has it; the same lake, arguments and version give the same bytes.",
+        env!("CARGO_PKG_VERSION"),
+        about.lake_version
     );
 }
 

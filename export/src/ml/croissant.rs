@@ -52,9 +52,16 @@ pub(super) fn write(about: &CardContents<'_>) -> Result<String> {
         "@context": context(),
         "@type": "sc:Dataset",
         "name": "relief-reflections",
-        "description": format!("{} Origin: {}.", about.summary(), about.origins().join(", ")),
+        "description": format!(
+            "{} Origin: {}. Lake: runs@{}, echolake {}.",
+            about.summary(),
+            about.origins().join(", "),
+            about.lake_version,
+            env!("CARGO_PKG_VERSION"),
+        ),
         "conformsTo": "http://mlcommons.org/croissant/1.1",
-        "version": "1.0.0",
+        // Readers expect three numbers; the second one counts the lake's versions.
+        "version": format!("1.{}.0", about.lake_version),
         "citeAs": PAPER,
         "isLiveDataset": false,
         "distribution": distribution,

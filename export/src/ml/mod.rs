@@ -190,7 +190,7 @@ pub async fn write_training_set(
     }
     let job = Arc::new(ExportJob { lake: lake.clone(), snapshot, plan, folder: pending });
     let written = shards_of(&job, progress).await?;
-    let ExportJob { plan, folder: pending, .. } = &*job;
+    let ExportJob { plan, folder: pending, snapshot, .. } = &*job;
     let mut sources = Vec::new();
     for (one, (file, rows)) in plan.shards.iter().zip(written) {
         if let Some(counts) = parts.iter_mut().find(|p| p.part == one.part) {
@@ -202,7 +202,8 @@ pub async fn write_training_set(
     files.push(pending.write("surfaces.csv", card::sources(&sources)?.as_bytes())?);
     let (left_out, references) = (plan.left_out.clone(), plan.references.clone());
     let mut exported = ExportSummary { parts, left_out, references, waiting: plan.waiting, files };
-    let about = card::CardContents { lake, plan, exported: &exported };
+    let lake_version = snapshot.lake_version().unwrap_or(0);
+    let about = card::CardContents { lake, lake_version, plan, exported: &exported };
     let (croissant, readme) = (croissant::write(&about)?, card::write(&about));
     exported.files.push(pending.write("croissant.json", croissant.as_bytes())?);
     exported.files.push(pending.write("README.md", readme.as_bytes())?);

@@ -69,6 +69,7 @@ pub(super) fn takes(headers: &HeaderMap, encoding: &str) -> bool {
 
 /// The media type of a format.
 pub(super) fn media_type(format: AnswerFormat) -> &'static str {
+    let format = if format == AnswerFormat::SpreadsheetCsv { AnswerFormat::Csv } else { format };
     FORMATS.iter().find(|(known, _)| *known == format).map_or("application/octet-stream", |(_, types)| types[0])
 }
 

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use axum::Router;
 use axum::extract::State;
-use axum::http::{HeaderMap, StatusCode, header};
+use axum::http::{HeaderMap, header};
 use axum::response::{IntoResponse as _, Response};
 use echolake_dsp::chain::raw_len;
 use echolake_schema::Rig;
@@ -13,7 +13,7 @@ use sha2::{Digest as _, Sha256};
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
-use super::catalogue::is_known;
+use super::conditions::ConditionOutcome;
 use super::ranges::{POLICY, cors};
 
 /// The panel with the arms, the response that was heard last, the air, verdicts, the log. Repeated fields come first in
@@ -70,10 +70,8 @@ async fn layout(State(layout): State<ViewerLayout>, headers: HeaderMap) -> Respo
         (header::ETAG, &layout.etag),
         (POLICY, "cross-origin"),
     ];
-    match is_known(&headers, &layout.etag) {
-        true => (StatusCode::NOT_MODIFIED, common).into_response(),
-        false => (common, layout.text.to_string()).into_response(),
-    }
+    let instead = ConditionOutcome::new(&headers, &layout.etag).response(&layout.etag, common.clone());
+    instead.unwrap_or_else(|| (common, layout.text.to_string()).into_response())
 }
 
 #[cfg(test)]

@@ -2,7 +2,7 @@
 //! and read by ranges, without a copy.
 
 use axum::extract::State;
-use axum::http::{HeaderMap, HeaderName, StatusCode, header};
+use axum::http::{HeaderMap, HeaderName, header};
 use axum::response::{IntoResponse as _, Response};
 use echolake_lake::{DataFile, LakeSnapshot};
 use echolake_schema::tables::Table;
@@ -11,7 +11,8 @@ use utoipa::{IntoParams, ToSchema};
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
-use super::catalogue::{self, LakeCatalogue, is_known};
+use super::catalogue::{self, LakeCatalogue};
+use super::conditions::ConditionOutcome;
 use super::extract::QueryParams;
 use super::guard::is_encrypted;
 use super::problem::ProblemResponse;
@@ -84,14 +85,15 @@ async fn files(
     let tables = tables.collect::<Result<Vec<_>, RequestFault>>()?;
     let view = catalogue.view().await?;
     let origin = origin(&headers);
-    let etag = format!("\"{}\"", view.version);
+    // The answer has the tables that were asked for, and the server's address as this client knows it.
+    let etag = view.etag(&format!("{origin} files {:?}", query.table));
     let validators = [
         (header::ETAG, etag.as_str()),
         (header::CACHE_CONTROL, "private, no-cache"),
         (header::VARY, "Host, X-Forwarded-Proto"),
     ];
-    if is_known(&headers, &etag) {
-        return Ok((StatusCode::NOT_MODIFIED, validators).into_response());
+    if let Some(instead) = ConditionOutcome::new(&headers, &etag).response(&etag, validators.clone()) {
+        return Ok(instead);
     }
     let all: Vec<_> = Table::ALL.into_iter().filter(|table| tables.is_empty() || tables.contains(table)).collect();
     let snapshot = &view.snapshot;

@@ -2,6 +2,7 @@
 //! rest ([`door_router`]): pages, sessions, health and figures.
 
 mod catalogue;
+mod conditions;
 mod extract;
 mod files;
 mod format;

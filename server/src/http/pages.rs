@@ -4,12 +4,12 @@ use std::io::Read as _;
 use std::sync::LazyLock;
 
 use axum::body::Bytes;
-use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, Uri, header};
+use axum::http::{HeaderMap, HeaderValue, Method, Uri, header};
 use axum::response::{IntoResponse as _, Response};
 use flate2::read::GzDecoder;
 use sha2::{Digest as _, Sha256};
 
-use super::catalogue::is_known;
+use super::conditions::ConditionOutcome;
 use super::format::takes;
 use super::problem::ProblemResponse;
 use crate::fault::RequestFault;
@@ -60,26 +60,20 @@ pub(super) async fn fallback(method: Method, uri: Uri, headers: HeaderMap) -> Re
         response.headers_mut().insert(header::ALLOW, HeaderValue::from_static("GET,HEAD"));
         return response;
     }
-    let known = is_known(&headers, tag);
-    let (body, encoding) = page.body(&headers);
-    let mut response = if known { StatusCode::NOT_MODIFIED.into_response() } else { body.into_response() };
     let caching = if page.path.starts_with(ASSETS) { "public, max-age=31536000, immutable" } else { "no-cache" };
-    let out = response.headers_mut();
-    for (name, value) in [
+    let common = [
         (header::CONTENT_TYPE, page.media_type),
         (header::CACHE_CONTROL, caching),
         (header::CONTENT_SECURITY_POLICY, POLICY),
         (header::VARY, "Accept-Encoding"),
         (header::ETAG, tag),
-    ] {
-        if let Ok(value) = HeaderValue::from_str(value) {
-            out.insert(name, value);
-        }
+    ];
+    if let Some(instead) = ConditionOutcome::new(&headers, tag).response(tag, common.clone()) {
+        return instead;
     }
-    if let (Some(encoding), false) = (encoding, known) {
-        out.insert(header::CONTENT_ENCODING, HeaderValue::from_static(encoding));
-    }
-    response
+    let (body, encoding) = page.body(&headers);
+    let encoding = encoding.map(|encoding| [(header::CONTENT_ENCODING, encoding)]);
+    (common, encoding, body).into_response()
 }
 
 fn page(path: &str) -> Option<&'static (&'static PageFile, String)> {

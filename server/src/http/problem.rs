@@ -118,6 +118,7 @@ fn status(code: FaultCode) -> (StatusCode, &'static str) {
         FaultCode::Changed => (StatusCode::CONFLICT, "A run's file has changed"),
         FaultCode::NoData => (StatusCode::NOT_FOUND, "There are no such data"),
         FaultCode::Method => (StatusCode::METHOD_NOT_ALLOWED, "Not for this method"),
+        FaultCode::Precondition => (StatusCode::PRECONDITION_FAILED, "Not this version"),
         FaultCode::Range => (StatusCode::RANGE_NOT_SATISFIABLE, "Not in the file"),
         FaultCode::TooLarge => (StatusCode::PAYLOAD_TOO_LARGE, "The request is too large"),
         FaultCode::Unauthenticated => (StatusCode::UNAUTHORIZED, "A token is needed"),

@@ -7,7 +7,7 @@ use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, StatusCode, header}
 use axum::response::{IntoResponse as _, Response};
 use tower_http::cors::{Any, CorsLayer};
 
-use super::catalogue::is_known;
+use super::conditions::ConditionOutcome;
 use super::problem::ProblemResponse;
 use crate::fault::RequestFault;
 
@@ -21,10 +21,11 @@ pub(super) fn cors() -> CorsLayer {
     CorsLayer::new()
         .allow_origin(Any)
         .allow_methods([Method::GET, Method::HEAD])
-        // Lichtblick sends the last two with every question.
+        // Lichtblick sends the last two with every request.
         .allow_headers([
             header::RANGE,
             header::IF_RANGE,
+            header::IF_MATCH,
             header::IF_NONE_MATCH,
             header::AUTHORIZATION,
             header::CONTENT_TYPE,
@@ -67,8 +68,8 @@ pub(super) struct FilePart {
 impl FileDescription {
     /// Determines the answer to a request, for a file of `bytes` bytes.
     pub(super) fn asked(&self, headers: &HeaderMap, bytes: u64) -> RangeAnswer {
-        if let Some(known) = self.known(headers) {
-            return RangeAnswer::Answer(known);
+        if let Some(instead) = self.condition_answer(headers) {
+            return RangeAnswer::Answer(instead);
         }
         match self.wanted(headers, bytes) {
             WantedRange::Whole => RangeAnswer::Part(FilePart { range: 0..bytes, of: None }),
@@ -77,9 +78,15 @@ impl FileDescription {
         }
     }
 
-    /// Returns the answer to a client that has this version already, which is 304.
-    pub(super) fn known(&self, headers: &HeaderMap) -> Option<Response> {
-        is_known(headers, &self.etag).then(|| self.with_headers(StatusCode::NOT_MODIFIED.into_response()))
+    /// Returns the answer to a client that has this version already, 304, or that wants another one, 412.
+    pub(super) fn condition_answer(&self, headers: &HeaderMap) -> Option<Response> {
+        let outcome = ConditionOutcome::new(headers, &self.etag);
+        let mut response = outcome.response(&self.etag, ())?;
+        if outcome == ConditionOutcome::NotModified {
+            return Some(self.with_headers(response));
+        }
+        insert(response.headers_mut(), POLICY, self.policy);
+        Some(response)
     }
 
     /// Bytes as they were asked for.

@@ -33,6 +33,8 @@ const LARGEST: usize = 2 << 20;
 pub(super) struct SqlParams {
     #[param(schema_with = format_schema)]
     format: Option<String>,
+    /// CSV alone: `'` before texts that a spreadsheet would take for formulas. False by default.
+    escape_formulas: Option<bool>,
 }
 
 /// A query.
@@ -43,6 +45,9 @@ struct SqlRequest {
     query: String,
     #[schema(schema_with = format_schema, required = false)]
     format: Option<String>,
+    /// As the parameter of this name.
+    #[schema(required = false, nullable = false)]
+    escape_formulas: Option<bool>,
 }
 
 fn format_schema() -> RefOr<Schema> {
@@ -85,6 +90,14 @@ async fn post(
         params.map_err(|_| RequestFault::request("the path's parameters are not right; hint: ?format=csv"))?;
     let request = parse_body(&headers, &whole(body)?)?;
     let format = format(&headers, params.format.or(request.format))?;
+    let format = match (params.escape_formulas.or(request.escape_formulas).unwrap_or(false), format) {
+        (false, format) => format,
+        (true, AnswerFormat::Csv) => AnswerFormat::SpreadsheetCsv,
+        (true, other) => {
+            let message = format!("`escape_formulas` is for CSV, and the answer is {}; hint: format=csv", other.name());
+            return Err(RequestFault::request(message).into());
+        }
+    };
     let job = QueryJob::of_http(Arc::new(service.session(&client)), QueryWork::Sql(request.query));
     let mut running = service.begin(job, move |schema| FormatEncoder::new(format, schema)).await?;
     // A query that fails at once still has a status to say so with.
@@ -125,7 +138,7 @@ fn parse_body(headers: &HeaderMap, body: &[u8]) -> Result<SqlRequest, RequestFau
             RequestFault::request(format!("the body is not as expected: {e}; hint: {{\"query\": \"select 1\"}}"))
         }),
         "text/plain" | "application/sql" => match std::str::from_utf8(body) {
-            Ok(query) => Ok(SqlRequest { query: query.to_owned(), format: None }),
+            Ok(query) => Ok(SqlRequest { query: query.to_owned(), format: None, escape_formulas: None }),
             Err(_) => Err(RequestFault::request("the query is not UTF-8")),
         },
         other => Err(RequestFault::request(format!(

@@ -38,7 +38,7 @@ fn state(fault: &RequestFault) -> &'static str {
             FaultCode::Execution => "22000",
             FaultCode::Format => "0A000",
             FaultCode::Lake | FaultCode::Changed | FaultCode::WorkerLost => "58030",
-            FaultCode::Request | FaultCode::Method | FaultCode::Range => "22023",
+            FaultCode::Request | FaultCode::Method | FaultCode::Range | FaultCode::Precondition => "22023",
             FaultCode::Unsupported => "0A000",
             FaultCode::NotFound | FaultCode::Gone | FaultCode::NoData => "42704",
             FaultCode::MemoryLimit => "53200",

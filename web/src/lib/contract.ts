@@ -941,7 +941,7 @@ export interface components {
         /** @description RFC 9457; `code` is stable and made for programs. */
         readonly Problem: {
             /** @enum {string} */
-            readonly code: "query_invalid" | "read_only" | "query_failed" | "format_impossible" | "lake_unreadable" | "request_invalid" | "unsupported" | "not_found" | "gone" | "file_changed" | "no_data" | "method_not_allowed" | "range_not_satisfiable" | "request_too_large" | "unauthenticated" | "forbidden" | "foreign_origin" | "cancelled" | "time_limit" | "memory_limit" | "row_limit" | "too_many" | "query_ended_engine" | "worker_lost" | "internal" | "server_stopping" | "not_ready";
+            readonly code: "query_invalid" | "read_only" | "query_failed" | "format_impossible" | "lake_unreadable" | "request_invalid" | "unsupported" | "not_found" | "gone" | "file_changed" | "no_data" | "method_not_allowed" | "precondition_failed" | "range_not_satisfiable" | "request_too_large" | "unauthenticated" | "forbidden" | "foreign_origin" | "cancelled" | "time_limit" | "memory_limit" | "row_limit" | "too_many" | "query_ended_engine" | "worker_lost" | "internal" | "server_stopping" | "not_ready";
             /** @description What is wrong, where, and what to do: the text that all protocols and the prompt have. */
             readonly detail?: string;
             /** @description What to do. */
@@ -969,6 +969,8 @@ export interface components {
         };
         /** @description A query. */
         readonly Query: {
+            /** @description As the parameter of this name. */
+            readonly escape_formulas?: boolean;
             /**
              * @description Instead of the Accept header.
              * @enum {string}
@@ -1672,6 +1674,8 @@ export interface operations {
         readonly parameters: {
             readonly query?: {
                 readonly format?: "json" | "arrow" | "csv" | "parquet";
+                /** @description CSV alone: `'` before texts that a spreadsheet would take for formulas. False by default. */
+                readonly escape_formulas?: boolean;
             };
             readonly header?: never;
             readonly path?: never;

@@ -1,12 +1,22 @@
 //! Where the reader is. All of a view's state is in the address, so that every view is a link.
 import { changeSearch, parseSearch, type SearchChanges } from './search'
 
-const read = () => ({ path: decodeURI(location.pathname), search: location.search })
+const read = () => ({ path: location.pathname, search: location.search })
 
 let here = $state(read())
 
+/** Decodes a part of a path; undefined if it is malformed, as `%zz` is. */
+export function decodePart(part: string): string | undefined {
+  try {
+    return decodeURIComponent(part)
+  } catch {
+    return undefined
+  }
+}
+
 /** The current address, reactive. */
 export const place = {
+  /** As it stands in the address, with its percent signs. */
   get path(): string {
     return here.path
   },

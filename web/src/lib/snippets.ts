@@ -43,23 +43,65 @@ export const EXAMPLES: readonly { title: string; query: (lake: Lake) => string }
   },
 ]
 
-const pythonText = (query: string) => `"""${query.replaceAll('\\', '\\\\').replaceAll('"""', '\\"\\"\\"')}"""`
-
 export const LANGUAGES = ['curl', 'Python', 'DuckDB', 'Rust'] as const
 export type Language = (typeof LANGUAGES)[number]
 
-export function snippet(language: Language, query: string, origin: string, tables: readonly string[]): string {
+const shellText = (text: string) => `'${text.replaceAll("'", "'\\''")}'`
+/** Three quotes in a row, and one at the end, would close the text. */
+const pythonText = (text: string) => `"""${text.replaceAll('\\', '\\\\').replace(/"(?="|$)/g, '\\"')}"""`
+/** The text in as many `#` as it needs. */
+function rustText(text: string): string {
+  const longest = Math.max(0, ...Array.from(text.matchAll(/"(#*)/g), (found) => found[1].length + 1))
+  const hashes = '#'.repeat(Math.max(2, longest))
+  return `r${hashes}"${text}"${hashes}`
+}
+
+const curl = (url: string, query: string, accept: string) =>
+  `curl --fail-with-body ${url} \\\n  -H 'content-type: application/json' -H 'accept: ${accept}' \\\n  -d ${shellText(JSON.stringify({ query }))}`
+
+/** A query as code that asks the server of this page; every one runs as it is if the server has no tokens. */
+export function snippet(language: Language, query: string, origin: string): string {
   const url = `${origin}/api/v1/sql`
-  // Those of the schema `system` are no Delta tables.
-  const named = tables.filter((name) => !name.includes('.') && new RegExp(`\\b${name}\\b`, 'i').test(query))
   switch (language) {
     case 'curl':
-      return `curl --fail-with-body ${url} \\\n  -H 'content-type: application/json' -H 'accept: text/csv' \\\n  -d '${JSON.stringify({ query }).replaceAll("'", "'\\''")}'`
+      return `# A server with tokens: -H 'authorization: Bearer TOKEN'\n${curl(url, query, 'text/csv')}`
     case 'Python':
-      return `# pip install adbc-driver-flightsql pyarrow; the server runs with --flight-sql 0.0.0.0:50051\nimport adbc_driver_flightsql.dbapi as flight_sql\n\nquery = ${pythonText(query)}\nwith flight_sql.connect("grpc://${new URL(origin).hostname}:50051") as connection:\n    with connection.cursor() as cursor:\n        cursor.execute(query)\n        table = cursor.fetch_arrow_table()\nprint(table)`
+      return `# pip install pyarrow; a server with tokens: "authorization": "Bearer TOKEN" among the headers
+import json
+import urllib.request
+
+import pyarrow.ipc
+
+query = ${pythonText(query)}
+request = urllib.request.Request(
+    "${url}",
+    data=json.dumps({"query": query, "format": "arrow"}).encode(),
+    headers={"content-type": "application/json"},
+)
+with urllib.request.urlopen(request) as answer:
+    table = pyarrow.ipc.open_stream(answer).read_all()
+print(table)`
     case 'DuckDB':
-      return `-- In the lake's folder\ninstall delta; load delta;\n${named.map((name) => `create view ${name} as select * from delta_scan('tables/${name}');`).join('\n')}\n${query};`
+      return `# The server answers in its own SQL, DuckDB reads the answer; a server with tokens: -H 'authorization: Bearer TOKEN'\n${curl(url, query, 'application/vnd.apache.parquet')} -o answer.parquet\nduckdb -c "from 'answer.parquet'"`
     case 'Rust':
-      return `// arrow = "59", reqwest = { version = "0.12", features = ["blocking", "json"] }, serde_json = "1"\nuse arrow::ipc::reader::StreamReader;\n\nfn main() -> Result<(), Box<dyn std::error::Error>> {\n    let query = r##"${query}"##;\n    let answer = reqwest::blocking::Client::new()\n        .post("${url}")\n        .json(&serde_json::json!({ "query": query }))\n        .send()?\n        .error_for_status()?;\n    for batch in StreamReader::try_new(answer, None)? {\n        println!("{} rows", batch?.num_rows());\n    }\n    Ok(())\n}`
+      return `// arrow = "59", reqwest = { version = "0.12", features = ["blocking", "json"] }, serde_json = "1"
+// A server with tokens: .bearer_auth("TOKEN")
+use arrow::ipc::reader::StreamReader;
+
+fn main() -> Result<(), Box<dyn std::error::Error>> {
+    let query = ${rustText(query)};
+    let answer = reqwest::blocking::Client::new()
+        .post("${url}")
+        .json(&serde_json::json!({ "query": query, "format": "arrow" }))
+        .send()?
+        .error_for_status()?;
+    for batch in StreamReader::try_new(answer, None)? {
+        println!("{} rows", batch?.num_rows());
+    }
+    Ok(())
+}`
   }
 }
+
+/** The command that opens a run's file in rerun on this machine. */
+export const rerunCommand = (url: string) => `rerun ${shellText(url)}`

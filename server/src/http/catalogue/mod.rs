@@ -28,9 +28,9 @@ mod wav;
 use std::sync::Arc;
 
 use axum::extract::{Request, State};
-use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, header};
+use axum::http::{HeaderValue, Method, header};
 use axum::middleware::{Next, from_fn_with_state};
-use axum::response::{IntoResponse as _, Response};
+use axum::response::Response;
 use axum::{Extension, Router};
 use echolake_lake::Lake;
 use echolake_schema::tables::Table;
@@ -38,6 +38,7 @@ use serde_json::Value;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
+use super::conditions::{ConditionOutcome, is_named};
 use super::extract::PathParams;
 use super::format;
 use super::problem::ProblemResponse;
@@ -152,16 +153,22 @@ async fn respond(
     let view = catalogue.view().await?;
     let headers = request.headers().clone();
     let as_arrow = format::prefers_arrow(&headers);
-    let etag = view.etag(as_arrow);
-    if is_known(&headers, &etag) {
-        return Ok((StatusCode::NOT_MODIFIED, [(header::ETAG, etag)]).into_response());
+    let address = request.uri().path_and_query().map_or_else(String::new, ToString::to_string);
+    let etag = view.etag(&format!("{address} {as_arrow}"));
+    let outcome = ConditionOutcome::new(&headers, &etag);
+    let instead = || outcome.response(&etag, [(header::ETAG, &etag)]);
+    // Only an answer has this tag: a client that names it had the answer, which need not be made again.
+    if is_named(&headers, &etag)
+        && let (ConditionOutcome::NotModified, Some(unchanged)) = (outcome, instead())
+    {
+        return Ok(unchanged);
     }
-    let key = (request.uri().path_and_query().map_or_else(String::new, ToString::to_string), as_arrow);
+    let key = (address, as_arrow);
     // One answer is for both methods: HEAD's body is left out behind this.
     *request.method_mut() = Method::GET;
     request.extensions_mut().insert(CatalogueRequest::new(&catalogue, &view, as_arrow));
     match view.answers.get_or_make(&key, next.run(request)).await {
-        Ok(answer) => Ok(with_validators(answer.respond(&headers), &etag)),
+        Ok(answer) => Ok(instead().unwrap_or_else(|| with_validators(answer.respond(&headers), &etag))),
         Err(failed) => {
             let code = failed.extensions().get::<FaultCode>().copied();
             catalogue.service().failed(code.unwrap_or(FaultCode::Internal));
@@ -179,10 +186,4 @@ fn with_validators(mut response: Response, etag: &str) -> Response {
         out.insert(header::ETAG, etag);
     }
     response
-}
-
-/// Returns whether the client has this version already.
-pub(super) fn is_known(headers: &HeaderMap, etag: &str) -> bool {
-    let tags = headers.get_all(header::IF_NONE_MATCH).iter().filter_map(|v| v.to_str().ok());
-    tags.flat_map(|v| v.split(',')).map(str::trim).any(|tag| tag == "*" || tag.trim_start_matches("W/") == etag)
 }

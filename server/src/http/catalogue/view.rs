@@ -54,9 +54,11 @@ impl SnapshotView {
         }
     }
 
-    /// The version as a header says it; an Arrow stream is another form of the same.
-    pub(super) fn etag(&self, as_arrow: bool) -> String {
-        format!("\"{}{}\"", self.version, if as_arrow { "-arrow" } else { "" })
+    /// Returns the tag of an answer of this snapshot: a digest of the version and of the answer's `name`, which no other
+    /// answer has.
+    pub(in super::super) fn etag(&self, name: &str) -> String {
+        let digest = Sha256::new().chain_update(&self.version).chain_update(name).finalize();
+        format!("\"{}\"", hex::encode(&digest[..VERSION_BYTES]))
     }
 
     pub(super) fn prepared(&self, sql: &str) -> Option<Arc<PreparedQuery>> {

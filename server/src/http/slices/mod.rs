@@ -197,8 +197,8 @@ impl SliceService {
             media_type: "application/octet-stream",
             policy: "cross-origin",
         };
-        if let Some(known) = described.known(headers) {
-            return Ok(known);
+        if let Some(instead) = described.condition_answer(headers) {
+            return Ok(instead);
         }
         if !needs_length(method, headers) {
             let mut cutting = self.cut(request, selection)?;

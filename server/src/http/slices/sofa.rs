@@ -73,8 +73,8 @@ pub(super) async fn sofa(
         media_type: "application/x-hdf5",
         policy: "cross-origin",
     };
-    if let Some(known) = described.known(&headers) {
-        return Ok(known);
+    if let Some(instead) = described.condition_answer(&headers) {
+        return Ok(instead);
     }
     let mut response = described.stream(made.into());
     let saved = format!("attachment; filename=\"{name}\"");
