@@ -175,6 +175,53 @@ fn units_of_the_package_call_commands_that_exist() {
 }
 
 #[test]
+fn the_debian_package_has_units_alerts_and_the_backup() {
+    let place = TestFolder::new();
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let (source, documents) = (place.path("source"), place.path("documents"));
+    for folder in ["source/docs/grafana", "source/python", "documents/man", "documents/completions", "out"] {
+        fs::create_dir_all(place.path(folder)).expect("a folder");
+    }
+    let texts = ["README.md", "CHANGELOG.md", "LICENSE-MIT", "docs/administration.md", "docs/grafana/alerts.yaml"];
+    for text in texts {
+        fs::copy(root.join(text), source.join(text)).expect("copied");
+    }
+    fs::write(source.join("python/THIRD-PARTY-LICENCES.txt"), "").expect("written");
+    for name in ["echolake.cdx.json", "man/echolake.1"] {
+        fs::write(documents.join(name), "").expect("written");
+    }
+    for shell in ["bash", "zsh", "fish"] {
+        fs::write(documents.join(format!("completions/echolake.{shell}")), "").expect("written");
+    }
+    // A small program that links libc alone stands for the command.
+    let script = packaging().join("deb.sh");
+    let mut command = Command::new("bash");
+    command.arg(&script).args(["/bin/true", "amd64", "0.2.0"]).arg(&documents).arg(&source).arg(place.path("out"));
+    let has_tools = run_command(Command::new("sh").args(["-c", "command -v dpkg-deb readelf gzip"]));
+    if !has_tools.expect("a shell").status.success() {
+        eprintln!("skipped: there is no dpkg-deb, readelf or gzip");
+        return;
+    }
+    let made = run_command(&mut command).expect("it starts");
+    assert!(made.status.success(), "{}", stderr(&made));
+    let listed =
+        run_command(Command::new("dpkg-deb").arg("--contents").arg(place.path("out/echolake_0.2.0_amd64.deb")));
+    let listed = String::from_utf8(listed.expect("it starts").stdout).expect("text");
+    let mode_of = |path: &str| listed.lines().find(|line| line.ends_with(path)).map(|line| &line[..10]);
+    for unit in UNITS {
+        assert_eq!(mode_of(&format!("./usr/lib/systemd/system/{unit}")), Some("-rw-r--r--"), "{unit} in {listed}");
+    }
+    for (path, mode) in [
+        ("./usr/lib/systemd/system/echolake-doctor.service", "-rw-r--r--"),
+        ("./usr/lib/systemd/system/echolake-backup.service", "-rw-r--r--"),
+        ("./usr/lib/echolake/backup", "-rwxr-xr-x"),
+        ("./usr/share/doc/echolake/grafana/alerts.yaml", "-rw-r--r--"),
+    ] {
+        assert_eq!(mode_of(path), Some(mode), "{path} in {listed}");
+    }
+}
+
+#[test]
 fn a_backup_copies_what_a_lake_is_made_from_or_says_why_not() {
     let place = TestFolder::new();
     let fake = place.path("bin");

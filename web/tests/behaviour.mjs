@@ -583,7 +583,7 @@ await check('a pair without references shows what was measured', async () => {
     const detail = { ...(await response.json()), reflected: null, flat_reflected: null, curves: null }
     await route.fulfill({ response, json: detail })
   })
-  for (const search of ['', '?show=group-delay', '?signal=reflected', `?with=${id}:8`]) {
+  for (const search of ['', '?show=group-delay', '?signal=reflected', `?with=${id}/8`]) {
     await open(`/surfaces/${id}/pairs/7${search}`)
     await settled()
     assert.ok(await page.getByText('the Foam or Flat reference is missing').first().isVisible())
@@ -594,9 +594,9 @@ await check('a pair without references shows what was measured', async () => {
     assert.ok(wav.includes('signal=measured'), wav)
   }
   // An overlay that has none is named.
-  await open(`/surfaces/${id}/pairs/8?with=${id}:7`)
+  await open(`/surfaces/${id}/pairs/8?with=${id}/7`)
   await settled()
-  assert.ok((await page.locator('body').innerText()).includes(`${id} 7, as measured`))
+  await page.getByText(`${id} 7, as measured`).first().waitFor({ timeout: 20_000 })
   await page.unroute(`**/api/v1/surfaces/${id}/pairs/7`)
 })
 

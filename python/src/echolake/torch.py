@@ -185,7 +185,7 @@ class Measurements(IterableDataset[Batch]):
         counts = [-(-sum(item.rows for item in block) // self.batch_size) for block in blocks]
         return [_PlannedBlock(number, *planned) for number, planned in enumerate(zip(blocks, counts, strict=True))]
 
-    # All that is read in an epoch, in its order, the same at every rank: files side by side, so that a block is of several.
+    # All that is read in an epoch, in its order, the same at every rank: files side by side, so a block is of several.
     def _order(self) -> list[_Item]:
         random = np.random.default_rng([self.seed, self.epoch])
         groups = [(file, group, rows) for file, counts in self._groups for group, rows in enumerate(counts) if rows > 0]
