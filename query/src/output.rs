@@ -33,8 +33,8 @@ pub enum AnswerFormat {
     Table,
     /// Comma-separated, lists as JSON.
     Csv,
-    /// CSV whose texts no spreadsheet takes for formulas: `'` stands before a text, or a column's name, that begins with
-    /// `=`, `+`, `-`, `@`, a tab or a carriage return. Numbers stay as they are.
+    /// CSV whose texts no spreadsheet takes for formulas: `'` stands before a text, or a column's name, that begins
+    /// with `=`, `+`, `-`, `@`, a tab or a carriage return. Numbers stay as they are.
     SpreadsheetCsv,
     /// One array of objects.
     Json,

@@ -171,7 +171,8 @@ fn files(text: &mut String, about: &CardContents<'_>) {
     });
     let _ = writeln!(
         text,
-        "Made by echolake {} of the lake as `runs@{}` has it; the same lake, arguments and version give the same bytes.",
+        "Made by echolake {} of the lake as `runs@{}` has it; the same lake, arguments and version give the same \
+         bytes.",
         env!("CARGO_PKG_VERSION"),
         about.lake_version
     );

@@ -23,3 +23,18 @@ pub(super) fn bands(rig: &Rig) -> Vec<BandDescription> {
     let described = keys.zip(centres).zip(band_labels(rig));
     described.map(|((key, centre_hz), label)| BandDescription { key, centre_hz, label }).collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_total_is_last_and_always_there() {
+        let keys = |rig: &Rig| bands(rig).into_iter().map(|band| band.key).collect::<Vec<_>>();
+        let mut rig = Rig::paper();
+        assert_eq!(keys(&rig), ["2500", "5000", "10000", "20000", "40000", "total"]);
+        // No lake has such a rig; facets sort by the last band.
+        rig.bands.centres_hz.clear();
+        assert_eq!(keys(&rig), ["total"]);
+    }
+}

@@ -54,8 +54,8 @@ impl SnapshotView {
         }
     }
 
-    /// Returns the tag of an answer of this snapshot: a digest of the version and of the answer's `name`, which no other
-    /// answer has.
+    /// Returns the tag of an answer of this snapshot: a digest of the version and of the answer's `name`, which no
+    /// other answer has.
     pub(in super::super) fn etag(&self, name: &str) -> String {
         let digest = Sha256::new().chain_update(&self.version).chain_update(name).finalize();
         format!("\"{}\"", hex::encode(&digest[..VERSION_BYTES]))
