@@ -30,6 +30,8 @@ use crate::commands::mcp::{self, McpArgs};
 use crate::commands::optimize::{self, OptimizeArgs};
 use crate::commands::panel::{self, PanelArgs};
 use crate::commands::recover::{self, RecoverArgs};
+#[cfg(feature = "lake")]
+use crate::commands::remove::{self, RemoveArgs};
 use crate::commands::replay::{self, ReplayArgs};
 #[cfg(feature = "lake")]
 use crate::commands::serve::{self, CertificateArgs, EngineArgs, ServeArgs};
@@ -101,6 +103,8 @@ pub(crate) enum LakeCommand {
     Import(ImportArgs),
     /// Turn runs into rows.
     Ingest(IngestArgs),
+    /// Take runs out of the lake: their rows, and rows that rest on them, and their files.
+    Remove(RemoveArgs),
     /// Query the lake in SQL; without a query, a prompt.
     Sql(SqlArgs),
     /// Export data: training sets, slices of runs, SOFA, WAV, npz.
@@ -193,6 +197,7 @@ impl LakeCommand {
             Self::Campaign(command) => campaign::run(command, lake).await,
             Self::Import(args) => import::run(args, lake).await,
             Self::Ingest(args) => ingest::run(args, lake).await,
+            Self::Remove(args) => remove::run(args, lake).await,
             Self::Sql(args) => sql::run(args, lake).await.map(|()| CommandOutcome::Whole),
             Self::Export(args) => export::run(args, lake).await,
             Self::Figure(args) => figure::run(args, lake).await,

@@ -15,6 +15,7 @@ use crate::ingest::{LOOK_EVERY, LakeIngest};
 use crate::pipeline::{self, Cores, ReadyJob};
 use crate::read_back;
 use crate::references::{ReferenceFinder, WantedReferences};
+use crate::rows::runs::RunReferences;
 use crate::rows::{self, RunKeys};
 
 /// Maximum number of retries with a new snapshot after another ingest committed first.
@@ -95,12 +96,13 @@ struct CompletionRound {
 }
 
 async fn do_round(ingest: &LakeIngest<'_>, cores: &Cores, done: &mut CompletionReport<'_>) -> Result<CompletionRound> {
-    let LakeIngest { lake, stop, claims } = ingest;
+    let LakeIngest { lake, stop, claims, .. } = ingest;
     let context = IngestContext::new(lake, cores, lake.snapshot().await?);
     let mut jobs = Vec::new();
     for run in context.snapshot.runs() {
         let wanted = context.finder.lock().await.wanted(&run.surface);
-        if wanted.derivation(&run.run_derivation).is_some_and(|d| run.reference_derivation.as_ref() != Some(&d)) {
+        // Without its references, a run has no rows that follow from them.
+        if wanted.derivation(&run.run_derivation) != run.reference_derivation {
             jobs.push((run.clone(), wanted));
         }
     }
@@ -168,13 +170,19 @@ async fn complete_run(
     wanted: &WantedReferences,
 ) -> Result<ReadyJob<CompletedRun>> {
     let (lake, keys) = (&context.lake, RunKeys { surface: run.surface.clone(), run: run.run.clone() });
-    let responses = read_back::responses(lake, &context.snapshot, &run.run).await?;
-    let report =
-        CompletedRun { run: run.run.clone(), surface: run.surface.clone(), measurements: responses.pairs.len() };
-    let Some(derivation) = ReferenceDerivation::new(context, &run.run_derivation, wanted).await? else {
-        return Ok(ReadyJob { staged: Vec::new(), report });
+    let mut report = CompletedRun { run: run.run.clone(), surface: run.surface.clone(), measurements: 0 };
+    let (files, references) = match ReferenceDerivation::new(context, &run.run_derivation, wanted).await? {
+        Some(derivation) => {
+            let responses = read_back::responses(lake, &context.snapshot, &run.run).await?;
+            report.measurements = responses.pairs.len();
+            derivation.derive(context, &keys, responses).await?
+        }
+        // A reference was removed.
+        None if wanted.derivation(&run.run_derivation).is_none() => {
+            (Vec::new(), RunReferences { missing: wanted.missing(), ..RunReferences::default() })
+        }
+        None => return Ok(ReadyJob { staged: Vec::new(), report }),
     };
-    let (files, references) = derivation.derive(context, &keys, responses).await?;
     let mut row = Vec::new();
     for file in context.snapshot.files_of(Table::Runs, &run.run) {
         let before = read_back::run_row(lake, file, &run.run).await?;

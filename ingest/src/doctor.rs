@@ -4,15 +4,14 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use arrow::record_batch::RecordBatch;
-use echolake_lake::{DataFile, FileName, Lake, LakeSnapshot};
+use echolake_lake::{DataFile, FileName, FolderListing, Lake, LakeSnapshot};
 use echolake_recording::{DecodedChunk, ResyncItem, ResyncReader};
 use echolake_schema::tables::Table;
-use futures::TryStreamExt as _;
-use object_store::ObjectStore as _;
 use object_store::path::Path;
 use serde::Serialize;
 
 use crate::error::{Error, Result};
+use crate::files::has_end;
 use crate::read_back;
 use crate::references::ReferenceFinder;
 use crate::rows::runs::text_of;
@@ -211,9 +210,17 @@ async fn find_strays(lake: &Lake, snapshot: &LakeSnapshot, report: &mut LakeRepo
         .map(|f| f.path.clone())
         .chain(snapshot.runs().map(|r| Lake::run_path(&r.surface, &r.run)))
         .collect();
-    let listed: Vec<_> = lake.store().list(None).try_collect().await.map_err(|e| Error::read(lake.location(), e))?;
+    let mut listing = FolderListing::default();
+    for folder in ["inbox", "quarantine", "runs", "tables"] {
+        let mut listed = lake.list_folder(folder).await?;
+        listing.files.append(&mut listed.files);
+        listing.unusable.append(&mut listed.unusable);
+    }
+    for entry in listing.unusable {
+        report.find(FindingSeverity::Missing, entry.path, format!("it is passed over: {}", entry.reason));
+    }
     let mut left_behind = (0, 0);
-    for meta in listed.into_iter().filter(|m| !named.contains(&m.location)) {
+    for meta in listing.files.into_iter().filter(|m| !named.contains(&m.location)) {
         let path = meta.location;
         let parts: Vec<_> = path.parts().map(|p| p.as_ref().to_owned()).collect();
         match parts.first().map(String::as_str) {
@@ -223,8 +230,19 @@ async fn find_strays(lake: &Lake, snapshot: &LakeSnapshot, report: &mut LakeRepo
                 let what = "part of a run that is being uploaded; hint: `echolake upload` of it resumes";
                 report.find(FindingSeverity::Note, &path, what);
             }
+            Some("inbox" | "runs") if path.extension() == Some("mcap") && !has_end(lake, &path).await.unwrap_or(true) => {
+                let what = format!(
+                    "it has no end after {} bytes: it is still being copied, or its recording was cut off; hint: copy it \
+                     again, or `echolake recover` makes a run of what it holds",
+                    meta.size
+                );
+                report.find(FindingSeverity::Missing, &path, what);
+            }
             Some("inbox") if path.extension() == Some("mcap") => {
-                report.find(FindingSeverity::Missing, &path, "not yet taken in; hint: `echolake ingest`");
+                report.find(FindingSeverity::Missing, &path, "not yet ingested; hint: `echolake ingest`");
+            }
+            Some("inbox") if !path.as_ref().ends_with(".mcap.partial") => {
+                report.find(FindingSeverity::Note, &path, "no run file; ingest leaves it alone");
             }
             Some("inbox") => report.find(
                 FindingSeverity::Note,
@@ -233,7 +251,11 @@ async fn find_strays(lake: &Lake, snapshot: &LakeSnapshot, report: &mut LakeRepo
                  `echolake recover` makes a run of what it holds",
             ),
             Some("runs") => report.find(FindingSeverity::Missing, &path, "in no table; hint: `echolake ingest`"),
-            Some("quarantine") => report.find(FindingSeverity::Note, &path, "was refused; the reason stands beside it"),
+            // It is named with its file.
+            Some("quarantine") if path.as_ref().ends_with(".reason.txt") => {}
+            Some("quarantine") => {
+                report.find(FindingSeverity::Note, &path, "was refused or removed; the reason stands beside it");
+            }
             Some("tables") if FileName::parse(&path).is_some() => {
                 left_behind = (left_behind.0 + 1, left_behind.1 + meta.size);
             }

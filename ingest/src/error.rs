@@ -1,7 +1,7 @@
 //! Errors between a run's file and the tables.
 
 use echolake_dsp::foam_reflection::LEAST_PAIRS;
-use echolake_recording::ResyncError;
+use echolake_recording::{FILE_END_BYTES, ResyncError};
 use echolake_schema::ErrorCause;
 use echolake_schema::manifest::ManifestError;
 
@@ -63,7 +63,7 @@ pub enum Error {
     },
     /// Another run of this name is in the lake.
     #[error(
-        "run `{run}` is already in the lake with other content: `{file}` has SHA-256 {given}, the lake's file {there}; hint: a run file never changes once closed, so record it under another name"
+        "run `{run}` is already in the lake with other content: `{file}` has SHA-256 {given}, the lake's file {there}; hint: a run file never changes once closed; if the given one is right, `echolake remove {run}` takes the lake's out"
     )]
     OtherContent {
         /// The run.
@@ -82,10 +82,61 @@ pub enum Error {
         given: String,
     },
     /// The file has disappeared since it was listed.
-    #[error("`{file}` is gone: another ingest has taken it")]
+    #[error("`{file}` is gone: another ingest has taken it, or somebody deleted it")]
     Gone {
         /// The file.
         file: String,
+    },
+    /// The file does not end as a closed file does: it is still being copied, or its recording was cut off.
+    #[error(
+        "`{file}` is not whole: it has {bytes} bytes, and its last {} are not the footer and the magic bytes that a \
+         closed file ends with; it stays where it is. hint: once its copy has ended, ingest it again; if its recording was \
+         cut off, `echolake recover` makes a run of what it holds",
+        FILE_END_BYTES
+    )]
+    Unfinished {
+        /// The file.
+        file: String,
+        /// Its size.
+        bytes: u64,
+    },
+    /// A recording whose recorder died, and which cannot be resumed.
+    #[error(
+        "`{file}` was cut off after {bytes} bytes: its recorder has ended; it stays where it is. hint: `echolake recover` \
+         makes a run of what it holds"
+    )]
+    CutOff {
+        /// The file.
+        file: String,
+        /// Its size.
+        bytes: u64,
+    },
+    /// The file changed while it was read.
+    #[error(
+        "`{file}` changed while it was read: {before}, now {after}; it stays where it is. hint: ingest it again once nothing \
+         writes it any more"
+    )]
+    Changed {
+        /// The file.
+        file: String,
+        /// Its state before.
+        before: String,
+        /// Its state now.
+        after: String,
+    },
+    /// An entry of a folder that is no plain file with a usable name.
+    #[error("`{path}` is passed over: {reason}")]
+    Unusable {
+        /// Its path, escaped.
+        path: String,
+        /// The reason.
+        reason: String,
+    },
+    /// A removed run is in the lake again.
+    #[error("run `{run}` was ingested again while it was removed; hint: remove it again once no ingest is at work")]
+    CameBack {
+        /// The run.
+        run: String,
     },
     /// Another ingest is at it.
     #[error("`{file}` is being taken in by another ingest")]
@@ -183,6 +234,7 @@ impl Error {
             Self::Read { .. } | Self::NotMcap { .. } | Self::Foreign { .. } | Self::Manifest { .. } => true,
             Self::Attachment { .. } | Self::OtherContent { .. } | Self::NoRun { .. } | Self::Gone { .. } => true,
             Self::Claimed { .. } | Self::OtherDigest { .. } => true,
+            Self::Unfinished { .. } | Self::CutOff { .. } | Self::Changed { .. } | Self::Unusable { .. } => true,
             Self::Deadly { .. }
             | Self::Doubtful { .. }
             | Self::Kernel { .. }
@@ -191,8 +243,21 @@ impl Error {
             | Self::DataFile { .. }
             | Self::Threads { .. }
             | Self::Stopped
+            | Self::CameBack { .. }
             | Self::Lake(_) => false,
         }
+    }
+
+    /// Returns whether the file stays in the inbox: it may be readable or whole later.
+    pub(crate) fn keeps_place(&self) -> bool {
+        matches!(
+            self,
+            Self::Read { .. }
+                | Self::Unfinished { .. }
+                | Self::CutOff { .. }
+                | Self::Changed { .. }
+                | Self::Gone { .. }
+        )
     }
 
     pub(crate) fn read(file: impl ToString, source: impl Into<ErrorCause>) -> Self {

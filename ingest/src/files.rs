@@ -1,15 +1,21 @@
 //! Places of run files: new ones in `inbox/`, ingested ones under `runs/`, refused ones under `quarantine/`.
 
+use std::collections::BTreeSet;
+use std::fs::{self, Metadata};
+use std::io::{self, ErrorKind};
+use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path as FsPath, PathBuf};
 use std::sync::Arc;
 
-use echolake_lake::{Lake, StoreError, digest_record, digest_record_path, object_sha256, read_digest_record};
-use echolake_recording::FileIntegrity;
+use chrono::{DateTime, Utc};
+use echolake_lake::{
+    Lake, LakeSnapshot, StoreError, UnusableEntry, digest_record, digest_record_path, object_sha256, read_digest_record,
+};
+use echolake_recording::{FILE_END_BYTES, FileIntegrity, MAGIC, has_file_end};
 use echolake_schema::{Rig, RunId};
-use futures::TryStreamExt as _;
 use object_store::local::LocalFileSystem;
 use object_store::path::Path;
-use object_store::{ObjectMeta, ObjectStore, ObjectStoreExt as _, WriteMultipart};
+use object_store::{ObjectMeta, ObjectStore, ObjectStoreExt as _, PutMode, PutOptions, WriteMultipart};
 
 use crate::error::{Error, Result};
 use crate::run_content::Head;
@@ -20,10 +26,14 @@ const INBOX: &str = "inbox";
 const RUNS: &str = "runs";
 /// Folder of refused files.
 const QUARANTINE: &str = "quarantine";
-/// Suffix of a recording's name until the file is complete.
-const PARTIAL: &str = ".partial";
-/// Maximum length of a refused file's name, bytes. File systems allow 255.
+/// End of a recording's name until the file is complete.
+const PARTIAL: &str = ".mcap.partial";
+/// End of the name of the reason beside a refused file.
+const REASON: &str = ".reason.txt";
+/// Maximum length of a refused file's name, bytes.
 const LONGEST_NAME: usize = 200;
+/// Maximum length of a file's name on most file systems, bytes.
+const LONGEST_FILE_NAME: usize = 255;
 /// Bytes per copied part.
 const PART: u64 = 8 << 20;
 /// Parts on their way at once.
@@ -90,35 +100,164 @@ impl RunSource {
     }
 }
 
-/// Lists the run files that are in no table yet: all of `inbox/`, and those of `runs/` that table `runs` does not name.
-///
-/// # Errors
-/// [`Error::Lake`] if the snapshot cannot be read, [`Error::Read`] if a folder cannot be listed.
-pub async fn pending(lake: &Lake) -> Result<Vec<RunSource>> {
-    let snapshot = lake.snapshot().await?;
-    let mut found = Vec::new();
-    for folder in [INBOX, RUNS] {
-        let listed: Vec<_> =
-            lake.store().list(Some(&Path::from(folder))).try_collect().await.map_err(|e| Error::read(folder, e))?;
-        found.extend(listed.into_iter().map(|meta| meta.location));
-    }
-    found.sort();
-    let known = |path: &Path| {
-        let run = path.filename().and_then(|n| n.strip_suffix(".mcap")).and_then(|n| n.parse::<RunId>().ok());
-        run.and_then(|r| snapshot.run(&r)).is_some_and(|r| Lake::run_path(&r.surface, &r.run) == *path)
-    };
-    found.retain(|p| p.extension() == Some("mcap") && !known(p));
-    Ok(found.into_iter().map(RunSource::Lake).collect())
+/// What is in no table yet.
+#[derive(Debug, Default)]
+pub struct PendingFiles {
+    /// Run files.
+    pub runs: Vec<ObjectMeta>,
+    /// Recordings in the inbox that have not been finished.
+    pub recordings: Vec<UnfinishedRecording>,
+    /// Entries that nothing opens.
+    pub unusable: Vec<UnusableEntry>,
 }
 
-/// Lists the run files of the inbox alone: one request to an object store, which has files as a whole or not at all.
+/// A recording in the inbox that has not been finished.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct UnfinishedRecording {
+    /// Its path in the lake.
+    pub path: Path,
+    /// Its size.
+    pub bytes: u64,
+    /// What can become of it.
+    pub state: RecordingState,
+}
+
+/// What can become of an unfinished recording.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum RecordingState {
+    /// Its recorder is at work.
+    Running,
+    /// `acquire --resume` resumes it.
+    Resumable,
+    /// The import that wrote it is to be repeated.
+    Import,
+    /// Its recorder died; `recover` makes a run of what it holds.
+    CutOff,
+}
+
+impl PendingFiles {
+    /// Returns the run files as sources of an ingest.
+    pub fn sources(&self) -> Vec<RunSource> {
+        self.runs.iter().map(|run| RunSource::Lake(run.location.clone())).collect()
+    }
+}
+
+/// Lists what is in no table yet: all of `inbox/`, and the run files of `runs/` that table `runs` does not name.
 ///
 /// # Errors
-/// [`Error::Read`] if the inbox cannot be listed.
-pub async fn arrivals(lake: &Lake) -> Result<Vec<ObjectMeta>> {
-    let listed: Vec<_> =
-        lake.store().list(Some(&Path::from(INBOX))).try_collect().await.map_err(|e| Error::read(INBOX, e))?;
-    Ok(listed.into_iter().filter(|meta| meta.location.extension() == Some("mcap")).collect())
+/// [`Error::Lake`] if the snapshot or a folder cannot be read.
+pub async fn list_pending(lake: &Lake) -> Result<PendingFiles> {
+    let snapshot = lake.snapshot().await?;
+    let mut pending = list_arrivals(lake).await?;
+    let mut runs = lake.list_folder(RUNS).await?;
+    runs.files.retain(|meta| is_run_file(meta) && !is_known(&snapshot, &meta.location));
+    pending.runs.append(&mut runs.files);
+    pending.unusable.append(&mut runs.unusable);
+    // What was made of it is in the lake.
+    pending
+        .recordings
+        .retain(|recording| run_named(&recording.path, PARTIAL).is_none_or(|r| snapshot.run(&r).is_none()));
+    Ok(pending)
+}
+
+/// Lists the run files that are in no table yet.
+///
+/// # Errors
+/// As of [`list_pending`].
+pub async fn pending(lake: &Lake) -> Result<Vec<RunSource>> {
+    Ok(list_pending(lake).await?.sources())
+}
+
+/// Lists what is in the inbox alone: one request to an object store, which has files as a whole or not at all.
+///
+/// # Errors
+/// [`Error::Lake`] if the inbox cannot be listed.
+pub async fn list_arrivals(lake: &Lake) -> Result<PendingFiles> {
+    let mut listing = lake.list_folder(INBOX).await?;
+    let mut pending = PendingFiles { unusable: std::mem::take(&mut listing.unusable), ..PendingFiles::default() };
+    let names: BTreeSet<Path> = listing.files.iter().map(|meta| meta.location.clone()).collect();
+    for meta in listing.files {
+        let finished = meta.location.as_ref().strip_suffix(PARTIAL).map(|stem| format!("{stem}.mcap"));
+        match finished {
+            // It is what a finished or recovered run was made of.
+            Some(run) if Path::parse(&run).is_ok_and(|run| names.contains(&run)) => {}
+            Some(_) => pending.recordings.push(UnfinishedRecording {
+                state: recording_state(lake, &meta.location).await,
+                path: meta.location,
+                bytes: meta.size,
+            }),
+            None if is_run_file(&meta) => pending.runs.push(meta),
+            None => {}
+        }
+    }
+    Ok(pending)
+}
+
+fn is_run_file(meta: &ObjectMeta) -> bool {
+    meta.location.extension() == Some("mcap")
+}
+
+fn run_named(path: &Path, end: &str) -> Option<RunId> {
+    path.filename()?.strip_suffix(end)?.parse().ok()
+}
+
+fn is_known(snapshot: &LakeSnapshot, path: &Path) -> bool {
+    let run = run_named(path, ".mcap");
+    run.and_then(|run| snapshot.run(&run)).is_some_and(|run| Lake::run_path(&run.surface, &run.run) == *path)
+}
+
+/// Finds run files in the lake by their names or paths, each None if there is none.
+///
+/// # Errors
+/// [`Error::Lake`] if a folder cannot be listed, [`Error::Read`] if the store does not answer.
+pub async fn find_runs(lake: &Lake, names: &[&str]) -> Result<Vec<Option<Path>>> {
+    let mut found = Vec::with_capacity(names.len());
+    let mut listed = None;
+    for name in names {
+        let file = if name.ends_with(".mcap") { (*name).to_owned() } else { format!("{name}.mcap") };
+        let in_folder = [INBOX, RUNS].iter().any(|folder| file.starts_with(&format!("{folder}/")));
+        let run = file.strip_suffix(".mcap").and_then(|run| run.parse::<RunId>().ok());
+        // A run's name has its surface: most are found without a listing.
+        let surface = run.as_ref().and_then(|run| run.untagged().split_once('-')?.1.parse().ok());
+        let places = [
+            in_folder.then(|| file.clone()),
+            Some(format!("{INBOX}/{file}")),
+            surface.zip(run).map(|(surface, run)| Lake::run_path(&surface, &run).to_string()),
+        ];
+        let mut place = None;
+        for candidate in places.into_iter().flatten().filter_map(|place| Path::parse(place).ok()) {
+            if place.is_none() && is_there(lake, &candidate).await? {
+                place = Some(candidate);
+            }
+        }
+        if place.is_none() {
+            if listed.is_none() {
+                let mut files = lake.list_folder(INBOX).await?.files;
+                files.append(&mut lake.list_folder(RUNS).await?.files);
+                listed = Some(files);
+            }
+            let mut files = listed.iter().flatten().map(|meta| &meta.location);
+            place = files.find(|path| path.filename() == Some(file.as_str()) || path.as_ref() == file).cloned();
+        }
+        found.push(place);
+    }
+    Ok(found)
+}
+
+async fn is_there(lake: &Lake, path: &Path) -> Result<bool> {
+    if let Some(file) = local_file(lake, path) {
+        return Ok(fs::symlink_metadata(file).is_ok_and(|meta| meta.is_file()));
+    }
+    match lake.store().head(path).await {
+        Ok(_) => Ok(true),
+        Err(object_store::Error::NotFound { .. }) => Ok(false),
+        Err(e) => Err(Error::read(path, e)),
+    }
+}
+
+/// Returns the path of a lake's file on this machine; None for a lake on an object store.
+fn local_file(lake: &Lake, path: &Path) -> Option<PathBuf> {
+    Some(lake.folder()?.join(path.as_ref()))
 }
 
 /// Reads the rig of a run file of this machine, for a lake that is made for it; None if the file does not begin as a run.
@@ -134,52 +273,119 @@ pub async fn rig_of_run(file: &FsPath) -> Result<Option<Rig>> {
     Ok(Head::read(&opened).await.and_then(|head| head.rig))
 }
 
-/// Renames the recordings in the inbox whose recorder died, so that ingest accepts their complete part; returns them.
-/// Recordings that are still being written, that can be resumed, or that come from imports (which are repeated from
-/// their files) are left alone.
-///
-/// # Errors
-/// [`Error::Read`] if the inbox cannot be changed.
-pub async fn adopt_cut_off(lake: &Lake) -> Result<Vec<Path>> {
-    let Some(inbox) = lake.folder().map(|folder| folder.join(INBOX)).filter(|inbox| inbox.is_dir()) else {
-        return Ok(Vec::new());
-    };
-    let mut adopted = Vec::new();
-    for entry in std::fs::read_dir(&inbox).map_err(|e| Error::read(inbox.display(), e))? {
-        let partial = entry.map_err(|e| Error::read(inbox.display(), e))?.path();
-        let Some(name) = partial.file_name().and_then(|n| n.to_str()).and_then(|n| n.strip_suffix(PARTIAL)) else {
-            continue;
-        };
-        let to = inbox.join(name);
-        if !name.ends_with(".mcap")
-            || to.exists()
-            || is_being_recorded(&partial)
-            || is_made_whole_otherwise(&partial).await
-        {
-            continue;
-        }
-        let failed = |e: std::io::Error| Error::read(partial.display(), e);
-        std::fs::rename(&partial, &to).map_err(failed)?;
-        std::fs::File::open(&inbox).and_then(|folder| folder.sync_all()).map_err(failed)?;
-        adopted.push(Path::from(format!("{INBOX}/{name}")));
+async fn recording_state(lake: &Lake, partial: &Path) -> RecordingState {
+    let Some(file) = local_file(lake, partial) else { return RecordingState::CutOff };
+    if is_being_recorded(&file) {
+        return RecordingState::Running;
     }
-    Ok(adopted)
+    let opened = Opened { store: lake.store(), path: partial.clone(), name: partial.to_string() };
+    match Head::read(&opened).await {
+        Some(head) if head.has_plan => RecordingState::Resumable,
+        Some(head) if head.origin.is_imported() => RecordingState::Import,
+        _ => RecordingState::CutOff,
+    }
 }
 
 // The recorder holds a lock as long as it lives. A file that cannot be opened counts as being recorded.
 fn is_being_recorded(partial: &FsPath) -> bool {
-    match std::fs::File::open(partial) {
+    match fs::File::open(partial) {
         Ok(file) => file.try_lock_shared().is_err(),
         Err(_) => true,
     }
 }
 
-// A resumed run is better than its first part; an import is repeated.
-async fn is_made_whole_otherwise(partial: &FsPath) -> bool {
-    let Ok(path) = absolute(partial) else { return false };
-    let opened = Opened { store: Arc::new(LocalFileSystem::new()), path, name: partial.display().to_string() };
-    let is = |head: Head| head.has_plan || head.origin.is_imported();
-    Head::read(&opened).await.is_some_and(is)
+/// Returns whether a run file of the lake ends as a closed file does.
+///
+/// # Errors
+/// What the store says.
+pub async fn has_end(lake: &Lake, path: &Path) -> object_store::Result<bool> {
+    has_end_at(lake.store().as_ref(), path, lake.store().head(path).await?.size).await
+}
+
+/// Returns whether the first `bytes` bytes of a file end as a closed file does.
+pub(crate) async fn has_end_at(store: &dyn ObjectStore, path: &Path, bytes: u64) -> object_store::Result<bool> {
+    if bytes < FILE_END_BYTES {
+        return Ok(false);
+    }
+    Ok(has_file_end(&store.get_range(path, bytes - FILE_END_BYTES..bytes).await?))
+}
+
+/// Checks that a file ends as a closed file does. What is no MCAP file at all is left to its reader.
+///
+/// # Errors
+/// [`Error::Unfinished`], [`Error::Gone`], [`Error::Read`].
+pub(crate) async fn check_end(opened: &Opened) -> Result<()> {
+    let failed = |e: object_store::Error| match e {
+        object_store::Error::NotFound { .. } => Error::Gone { file: opened.name.clone() },
+        e => Error::read(&opened.name, e),
+    };
+    let bytes = opened.store.head(&opened.path).await.map_err(failed)?.size;
+    if has_end_at(opened.store.as_ref(), &opened.path, bytes).await.map_err(failed)? {
+        return Ok(());
+    }
+    let first = match bytes.min(MAGIC.len() as u64) {
+        0 => bytes::Bytes::new(),
+        length => opened.store.get_range(&opened.path, 0..length).await.map_err(failed)?,
+    };
+    // A copy of which nothing is written yet may have its size already.
+    let is_begun = MAGIC.starts_with(&first) || first.iter().all(|byte| *byte == 0);
+    if is_begun { Err(Error::Unfinished { file: opened.name.clone(), bytes }) } else { Ok(()) }
+}
+
+/// A file of this machine at a moment: what changes if another program writes it or replaces it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct FileState {
+    inode: u64,
+    bytes: u64,
+    changed: DateTime<Utc>,
+}
+
+impl FileState {
+    /// Returns the state of a source on this machine; None on an object store.
+    ///
+    /// # Errors
+    /// [`Error::Gone`], or [`Error::Read`] if it is no plain file.
+    pub(crate) fn read(lake: &Lake, source: &RunSource) -> Result<Option<Self>> {
+        let found = match source {
+            // No link in the lake is followed, also if it has just taken a file's place.
+            RunSource::Lake(path) => match local_file(lake, path) {
+                Some(file) => fs::symlink_metadata(file),
+                None => return Ok(None),
+            },
+            RunSource::File(file) => fs::metadata(file),
+        };
+        let meta = found.map_err(|e| match e.kind() {
+            ErrorKind::NotFound => Error::Gone { file: source.to_string() },
+            _ => Error::read(source, e),
+        })?;
+        if !meta.is_file() {
+            return Err(Error::read(source, io::Error::new(ErrorKind::InvalidInput, "it is no plain file")));
+        }
+        Ok(Some(Self::from_metadata(&meta)))
+    }
+
+    fn from_metadata(meta: &Metadata) -> Self {
+        let changed = meta.modified().map(DateTime::<Utc>::from).unwrap_or_default();
+        Self { inode: meta.ino(), bytes: meta.len(), changed }
+    }
+
+    /// Checks that the file is as it was.
+    ///
+    /// # Errors
+    /// [`Error::Changed`], [`Error::Gone`].
+    fn check(before: Option<Self>, lake: &Lake, source: &RunSource) -> Result<()> {
+        let (Some(before), Some(after)) = (before, Self::read(lake, source)?) else { return Ok(()) };
+        if before == after {
+            return Ok(());
+        }
+        Err(Error::Changed { file: source.to_string(), before: before.to_string(), after: after.to_string() })
+    }
+}
+
+impl std::fmt::Display for FileState {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{} bytes of {} (inode {})", self.bytes, self.changed.format("%H:%M:%S%.6f"), self.inode)
+    }
 }
 
 /// A run's file as it was read.
@@ -187,6 +393,8 @@ pub(crate) struct ReadFile<'a> {
     pub(crate) integrity: &'a FileIntegrity,
     /// Tag of the object when its reading began, if its store has tags.
     pub(crate) e_tag: Option<String>,
+    /// Its state when its reading began, if it is on this machine.
+    pub(crate) state: Option<FileState>,
     /// SHA-256 that was recorded when it was uploaded.
     pub(crate) recorded: Option<String>,
 }
@@ -199,29 +407,53 @@ impl<'a> ReadFile<'a> {
     pub(crate) async fn check(
         lake: &Lake,
         source: &RunSource,
-        e_tag: Option<String>,
+        FileVersion { e_tag, state }: FileVersion,
         integrity: &'a FileIntegrity,
     ) -> Result<Self> {
-        let recorded = match source {
-            RunSource::Lake(path) if source.is_in_inbox() => read_digest_record(lake.store().as_ref(), path).await,
-            _ => Ok(None),
-        };
-        let recorded = recorded.map_err(|e| Error::read(source, e))?;
+        let recorded = recorded_digest(lake, source).await?;
         match recorded {
             Some(recorded) if recorded != integrity.sha256 => {
                 let actual = integrity.sha256.clone();
                 Err(Error::OtherDigest { file: source.to_string(), recorded, actual })
             }
-            recorded => Ok(Self { integrity, e_tag, recorded }),
+            recorded => Ok(Self { integrity, e_tag, state, recorded }),
         }
     }
 }
 
-/// Returns the tag of an object in the inbox of an object store, before it is read.
-pub(crate) async fn inbox_tag(lake: &Lake, source: &RunSource) -> Option<String> {
+async fn recorded_digest(lake: &Lake, source: &RunSource) -> Result<Option<String>> {
     match source {
-        RunSource::Lake(path) if lake.is_remote() && source.is_in_inbox() => lake.store().head(path).await.ok()?.e_tag,
-        _ => None,
+        RunSource::Lake(path) if source.is_in_inbox() && can_have_record(path) => {
+            read_digest_record(lake.store().as_ref(), path).await.map_err(|e| Error::read(source, e))
+        }
+        _ => Ok(None),
+    }
+}
+
+// No file has a name that is too long for a file.
+fn can_have_record(path: &Path) -> bool {
+    digest_record_path(path).filename().is_some_and(|name| name.len() <= LONGEST_FILE_NAME)
+}
+
+/// What tells whether a file changed since its reading began.
+pub(crate) struct FileVersion {
+    e_tag: Option<String>,
+    state: Option<FileState>,
+}
+
+impl FileVersion {
+    /// Reads the version of a source, before it is read itself.
+    ///
+    /// # Errors
+    /// As of [`FileState::read`].
+    pub(crate) async fn read(lake: &Lake, source: &RunSource) -> Result<Self> {
+        let e_tag = match source {
+            RunSource::Lake(path) if lake.is_remote() && source.is_in_inbox() => {
+                lake.store().head(path).await.ok().and_then(|meta| meta.e_tag)
+            }
+            _ => None,
+        };
+        Ok(Self { e_tag, state: FileState::read(lake, source)? })
     }
 }
 
@@ -238,8 +470,8 @@ enum PlaceContent {
 /// another one in its place is damage.
 ///
 /// # Errors
-/// [`Error::OtherContent`] if another file is there, [`Error::Read`] if the copy is not what was read, or an error of the
-/// lake.
+/// [`Error::OtherContent`] if another file is there, [`Error::Changed`] if the file is not what was read, [`Error::Gone`] if
+/// it is no more, [`Error::Read`] if the copy is not what was read, or an error of the lake.
 pub(crate) async fn keep(
     lake: &Lake,
     source: &RunSource,
@@ -247,8 +479,14 @@ pub(crate) async fn keep(
     file: &ReadFile<'_>,
     is_known: bool,
 ) -> Result<()> {
+    let checked = FileState::check(file.state, lake, source);
     if matches!(source, RunSource::Lake(from) if from == to) {
-        return Ok(());
+        return checked;
+    }
+    match checked {
+        // Another ingest may have moved it.
+        Err(Error::Gone { .. }) => {}
+        checked => checked?,
     }
     let there = look_at_place(lake, to, file.integrity, is_known).await?;
     if let PlaceContent::Other(there) = &there {
@@ -262,7 +500,7 @@ pub(crate) async fn keep(
     }
     match source {
         RunSource::File(_) if there == PlaceContent::Same => Ok(()),
-        RunSource::File(from) => copy_in(lake, from, to).await,
+        RunSource::File(from) => copy_in(lake, from, to, &mut || FileState::check(file.state, lake, source)).await,
         RunSource::Lake(from) => {
             move_record(lake, from, to, file).await.map_err(|e| written(to, e))?;
             if there == PlaceContent::Same {
@@ -271,12 +509,49 @@ pub(crate) async fn keep(
             match move_object(lake, from, to, file.integrity.bytes, Some(file)).await {
                 // Another ingest has moved it.
                 Err(StoreFault::Store(object_store::Error::NotFound { .. })) if lake.store().head(to).await.is_ok() => {
-                    Ok(())
+                    return Ok(());
                 }
-                moved => moved.map_err(|fault| fault.into_error(to)),
+                Err(StoreFault::Store(object_store::Error::NotFound { .. })) => {
+                    return Err(Error::Gone { file: source.to_string() });
+                }
+                moved => moved.map_err(|fault| fault.into_error(to))?,
             }
+            // Who has it open writes on, under whatever name.
+            if let Err(changed) = FileState::check(file.state, lake, &RunSource::Lake(to.clone())) {
+                lake.store().rename(to, from).await.map_err(|e| written(from, e))?;
+                return Err(changed);
+            }
+            Ok(())
         }
     }
+}
+
+/// Checks that a file is as it was when its reading began.
+///
+/// # Errors
+/// [`Error::Changed`], [`Error::Gone`].
+pub(crate) fn check_unchanged(lake: &Lake, source: &RunSource, file: &ReadFile<'_>) -> Result<()> {
+    FileState::check(file.state, lake, source)
+}
+
+/// Puts a file into the place of a shorter one that has its beginning, after the commit of its rows: if the process ends
+/// before, the next ingest finds the file and its rows, and does the same.
+///
+/// # Errors
+/// An error of the lake.
+pub(crate) async fn replace_partial(lake: &Lake, source: &RunSource, to: &Path) -> Result<()> {
+    let from = match source {
+        RunSource::Lake(from) if from == to => return Ok(()),
+        RunSource::Lake(from) => from,
+        RunSource::File(from) => return copy_in(lake, from, to, &mut || Ok(())).await,
+    };
+    if let Some(sha256) = recorded_digest(lake, source).await? {
+        let record = digest_record_path(to);
+        lake.store().put(&record, digest_record(&sha256, to).into()).await.map_err(|e| written(&record, e))?;
+        delete(lake, &digest_record_path(from)).await.map_err(|e| written(from, e))?;
+    }
+    let bytes = lake.store().head(from).await.map_err(|e| written(from, e))?.size;
+    move_object(lake, from, to, bytes, None).await.map_err(|fault| fault.into_error(to))
 }
 
 async fn look_at_place(lake: &Lake, to: &Path, file: &FileIntegrity, is_known: bool) -> Result<PlaceContent> {
@@ -388,56 +663,105 @@ async fn find_change(
 }
 
 /// Moves a refused file of the inbox to `quarantine/`, the reason first; returns its path. Files outside the inbox
-/// stay.
+/// stay, and those that may be read later.
 pub(crate) async fn quarantine(lake: &Lake, source: &RunSource, why: &Error) -> Result<Option<Path>> {
     let RunSource::Lake(from) = source else { return Ok(None) };
-    // A file that cannot be read now may be readable later.
-    if !source.is_in_inbox() || matches!(why, Error::Read { .. }) {
+    if !source.is_in_inbox() || why.keeps_place() {
         return Ok(None);
     }
+    set_aside(lake, from, &why.to_string()).await
+}
+
+/// Moves a file of the lake to `quarantine/`, the reason first; returns its path, or None if the file is gone.
+///
+/// # Errors
+/// An error of the lake.
+pub(crate) async fn set_aside(lake: &Lake, from: &Path, reason: &str) -> Result<Option<Path>> {
     let store = lake.store();
+    let bytes = match store.head(from).await {
+        Ok(meta) => meta.size,
+        Err(object_store::Error::NotFound { .. }) => return Ok(None),
+        Err(e) => return Err(written(from, e)),
+    };
     let name = from.filename().unwrap_or("run");
     // Only the end of a long name, because the name of the reason's file is longer.
     let start = (name.len().saturating_sub(LONGEST_NAME)..name.len()).find(|at| name.is_char_boundary(*at));
-    let to = free_name(lake, &name[start.unwrap_or(0)..]).await?;
-    let reason = Path::from(format!("{to}.reason.txt"));
-    store.put(&reason, format!("{why}\n").into()).await.map_err(|e| written(&reason, e))?;
+    let to = reserve_name(lake, &name[start.unwrap_or(0)..], reason).await?;
     // The name is free for another upload.
-    delete(lake, &digest_record_path(from)).await.map_err(|e| written(from, e))?;
-    let moved = async { move_object(lake, from, &to, store.head(from).await?.size, None).await };
-    match moved.await {
-        // Another ingest refused it, too.
-        Err(StoreFault::Store(object_store::Error::NotFound { .. })) => Ok(None),
+    if can_have_record(from) {
+        delete(lake, &digest_record_path(from)).await.map_err(|e| written(from, e))?;
+    }
+    match move_object(lake, from, &to, bytes, None).await {
+        // Another process moved it.
+        Err(StoreFault::Store(object_store::Error::NotFound { .. })) => {
+            delete(lake, &reason_path(&to)).await.map_err(|e| written(&to, e))?;
+            Ok(None)
+        }
         moved => moved.map(|()| Some(to)).map_err(|fault| fault.into_error(from)),
     }
 }
 
-async fn free_name(lake: &Lake, name: &str) -> Result<Path> {
-    let mut number = 1;
-    loop {
-        let path = match number {
-            1 => Path::from(format!("{QUARANTINE}/{name}")),
-            _ => Path::from(format!("{QUARANTINE}/{number}-{name}")),
-        };
-        match lake.store().head(&path).await {
-            Err(object_store::Error::NotFound { .. }) => return Ok(path),
-            Err(e) => return Err(written(&path, e)),
-            Ok(_) => number += 1,
-        }
+/// Deletes a run's file and the record of its digest, if they are there.
+///
+/// # Errors
+/// An error of the lake.
+pub(crate) async fn delete_run(lake: &Lake, path: &Path) -> Result<()> {
+    for path in [path, &digest_record_path(path)] {
+        delete(lake, path).await.map_err(|e| written(path, e))?;
     }
+    Ok(())
 }
 
-async fn copy_in(lake: &Lake, from: &FsPath, to: &Path) -> Result<()> {
+fn reason_path(refused: &Path) -> Path {
+    let text = format!("{refused}{REASON}");
+    // A path is encoded already.
+    Path::parse(&text).unwrap_or_else(|_| Path::from(text))
+}
+
+// Of several processes that create a reason's file, one succeeds: two refused files of one name get two names.
+async fn reserve_name(lake: &Lake, name: &str, reason: &str) -> Result<Path> {
+    let store = lake.store();
+    for number in 1.. {
+        let text = match number {
+            1 => format!("{QUARANTINE}/{name}"),
+            _ => format!("{QUARANTINE}/{number}-{name}"),
+        };
+        let path = Path::parse(&text).unwrap_or_else(|_| Path::from(text));
+        match store.head(&path).await {
+            Err(object_store::Error::NotFound { .. }) => {}
+            Err(e) => return Err(written(&path, e)),
+            Ok(_) => continue,
+        }
+        let reserved = PutOptions::from(PutMode::Create);
+        match store.put_opts(&reason_path(&path), format!("{reason}\n").into(), reserved).await {
+            Err(object_store::Error::AlreadyExists { .. }) => {}
+            put => return put.map(|_| path.clone()).map_err(|e| written(&path, e)),
+        }
+    }
+    unreachable!("there is a number without a file")
+}
+
+// `check` is called when everything is copied, before the copy has the run's name.
+async fn copy_in(lake: &Lake, from: &FsPath, to: &Path, check: &mut (dyn FnMut() -> Result<()> + Send)) -> Result<()> {
     let (store, source) = (lake.store(), LocalFileSystem::new());
     let failed = |e: object_store::Error| written(to, e);
     let path = absolute(from)?;
     let size = source.head(&path).await.map_err(|e| Error::read(from.display(), e))?.size;
     // An object appears as a whole; a file is under another name first, so that a run's own name never holds part of it.
     if lake.is_remote() {
-        return copy_parts(&source, &path, size, store.as_ref(), to).await.map_err(failed);
+        copy_parts(&source, &path, size, store.as_ref(), to).await.map_err(failed)?;
+        if let Err(changed) = check() {
+            delete(lake, to).await.map_err(failed)?;
+            return Err(changed);
+        }
+        return Ok(());
     }
     let staged = Path::from(format!("{INBOX}/{}.copying", to.filename().unwrap_or("run")));
     copy_parts(&source, &path, size, store.as_ref(), &staged).await.map_err(failed)?;
+    if let Err(changed) = check() {
+        delete(lake, &staged).await.map_err(failed)?;
+        return Err(changed);
+    }
     store.rename(&staged, to).await.map_err(failed)
 }
 

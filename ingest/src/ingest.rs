@@ -5,7 +5,9 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use echolake_lake::{ClaimOutcome, ClaimTimes, CommitOutcome, EncodedFile, Lake, VisibleRun, WorkClaims, encode};
+use echolake_lake::{
+    ClaimOutcome, ClaimTimes, CommitOutcome, EncodedFile, Lake, VisibleRun, WorkClaims, encode, object_sha256,
+};
 use echolake_schema::tables::Table;
 use echolake_schema::{RunId, SurfaceId};
 use object_store::path::Path;
@@ -17,7 +19,7 @@ use crate::context::IngestContext;
 use crate::derive::ReferenceDerivation;
 use crate::derived_values::RunResponses;
 use crate::error::{Error, Result};
-use crate::files::{self, ReadFile, RunSource};
+use crate::files::{self, FileVersion, Opened, ReadFile, RunSource};
 use crate::marks::ReadingMark;
 use crate::measure::Measurer;
 use crate::pipeline::{self, Cores, ReadyJob};
@@ -57,6 +59,9 @@ pub struct IngestedRun {
     pub whole: bool,
     /// True if the run was stopped before its end and nothing that was recorded is lost.
     pub stopped: bool,
+    /// True if the lake had a shorter file of the run, with the same beginning and without an end.
+    #[serde(default)]
+    pub replaced: bool,
 }
 
 /// Outcome of an ingest: the run is new, or was in the lake before.
@@ -108,11 +113,14 @@ pub struct LakeIngest<'a> {
     pub(crate) stop: Arc<AtomicBool>,
     /// Claims, if several ingests share the work.
     pub(crate) claims: Option<Arc<WorkClaims>>,
+    /// Rows of runs that are in the lake are written again, if the log lacks their files.
+    again: bool,
 }
 
 /// State shared by the workers.
 #[derive(Clone)]
 struct IngestWork {
+    again: bool,
     context: IngestContext,
     measurer: Arc<Measurer>,
     shared: Option<SharedWork>,
@@ -131,7 +139,13 @@ impl<'a> LakeIngest<'a> {
     /// store it shares the work with other ingests, for which it needs a Tokio runtime.
     pub fn new(lake: &'a Lake, stop: Arc<AtomicBool>) -> Self {
         let claims = lake.is_remote().then(|| Arc::new(WorkClaims::start(lake, ClaimTimes::default())));
-        Self { lake, stop, claims }
+        Self { lake, stop, claims, again: false }
+    }
+
+    /// Writes the rows of runs that are in the lake again, too, if the log lacks their files.
+    #[must_use]
+    pub(crate) fn writing_again(self) -> Self {
+        Self { again: true, ..self }
     }
 
     /// Shares the work with other ingests on whatever store the lake is.
@@ -170,7 +184,7 @@ impl<'a> LakeIngest<'a> {
                 let runs = || Arc::new(context.snapshot.runs().map(|run| run.run.clone()).collect());
                 let known = known.get_or_insert_with(runs).clone();
                 let shared = self.claims.clone().map(|claims| SharedWork { claims, known });
-                let work = IngestWork { context, measurer: measurer.clone(), shared };
+                let work = IngestWork { again: self.again, context, measurer: measurer.clone(), shared };
                 for source in self.take_in_group(work, free, report).await? {
                     if !claimed.contains(&source) {
                         report(FileReport::Claimed(source.clone()));
@@ -211,9 +225,12 @@ impl<'a> LakeIngest<'a> {
     ) -> Result<Vec<RunSource>> {
         let (cores, claims) = (work.context.cores.clone(), work.shared.as_ref().map(|shared| shared.claims.clone()));
         let release = |source: &RunSource| claims.iter().for_each(|claims| claims.release(source.work_name()));
-        let (mut refused, mut claimed) = (Vec::new(), Vec::new());
+        let (mut refused, mut claimed, mut replaced) = (Vec::new(), Vec::new(), Vec::new());
         let ended = &mut |(source, done): pipeline::JobOutcome<RunSource, IngestedRun>| match done {
             Ok((taken, outcome)) => {
+                if taken.replaced && outcome != Some(CommitOutcome::Outdated) {
+                    replaced.push((source.clone(), Lake::run_path(&taken.surface, &taken.run)));
+                }
                 let outcome = IngestOutcome::from(outcome == Some(CommitOutcome::Now));
                 release(&source);
                 report(FileReport::Taken(IngestedRun { outcome, ..taken }));
@@ -235,6 +252,9 @@ impl<'a> LakeIngest<'a> {
             async move { work.take_in(&source).await }.instrument(span)
         };
         let done = pipeline::run(self.lake, &cores, sources, &self.stop, do_one, ended).await;
+        for (source, place) in replaced {
+            files::replace_partial(self.lake, &source, &place).await?;
+        }
         for (source, why) in refused {
             let name = source.work_name().to_owned();
             report(match why {
@@ -274,7 +294,8 @@ impl IngestWork {
         self.claim(source).await?;
         let mark = ReadingMark::new(lake, source);
         let opened = source.open(lake)?;
-        let e_tag = files::inbox_tag(lake, source).await;
+        let version = FileVersion::read(lake, source).await?;
+        files::check_end(&opened).await?;
         let content = Arc::new(RunContent::read(lake, &self.measurer, cores, &opened).await?);
         let keys = RunKeys { surface: content.manifest.surface_id.clone(), run: content.manifest.run_id.clone() };
         let span = Span::current();
@@ -282,12 +303,18 @@ impl IngestWork {
         tracing::debug!(measurements = content.accepted.len(), damages = content.damaged.len(), "the file is read");
         let derivation = digest(&[content.integrity.sha256.as_str(), CODE_VERSION, RESPONSES_REVISION]);
         let known = snapshot.run(&keys.run);
-        if let Some(known) = known {
-            self.check_same(known, &content, &opened.name).await?;
-        }
+        let replaced = match known {
+            Some(known) => self.check_same(known, &content, &opened).await?,
+            None => false,
+        };
         let place = Lake::run_path(&keys.surface, &keys.run);
-        let file = ReadFile::check(lake, source, e_tag, &content.integrity).await?;
+        let file = ReadFile::check(lake, source, version, &content.integrity).await?;
         let kept = async {
+            // The shorter file keeps its place until the rows of the longer one are committed.
+            if replaced {
+                files::check_unchanged(lake, source, &file)?;
+                return Ok(mark);
+            }
             let there = RunSource::Lake(place.clone());
             // Both names are marked while it moves: what is computed meanwhile may end the process.
             let next_mark = if *source == there { None } else { ReadingMark::new(lake, &there) };
@@ -306,8 +333,9 @@ impl IngestWork {
             damaged: content.damaged.clone(),
             whole: content.is_whole(),
             stopped: content.is_stopped(),
+            replaced,
         };
-        if known.is_some_and(|k| k.run_derivation == derivation) {
+        if !self.again && known.is_some_and(|k| k.run_derivation == derivation) {
             kept.await?;
             return Ok(ReadyJob { staged: Vec::new(), report: taken });
         }
@@ -354,15 +382,26 @@ impl IngestWork {
         if rows.iter().any(|row| row.shown_runs().contains(&run)) { Err(Error::Gone { file }) } else { Ok(()) }
     }
 
-    async fn check_same(&self, known: &VisibleRun, content: &RunContent, file: &str) -> Result<()> {
-        let Some(row) = self.context.snapshot.files_of(Table::Runs, &known.run).next() else { return Ok(()) };
+    // Returns whether the lake has no more than the beginning of this file, as of a copy that was cut off.
+    async fn check_same(&self, known: &VisibleRun, content: &RunContent, opened: &Opened) -> Result<bool> {
+        let Some(row) = self.context.snapshot.files_of(Table::Runs, &known.run).next() else { return Ok(false) };
         let row = read_back::run_row(&self.context.lake, row, &known.run).await?;
         let there = rows::runs::text_of(&row, "file_sha256").unwrap_or_default();
         if there == content.integrity.sha256 {
-            return Ok(());
+            return Ok(false);
+        }
+        let shorter = rows::runs::number_of(&row, "file_bytes").and_then(|bytes| u64::try_from(bytes).ok());
+        if let Some(bytes) = shorter.filter(|bytes| (1..content.integrity.bytes).contains(bytes)) {
+            let (store, path) = (opened.store.as_ref(), &opened.path);
+            let failed = |e: object_store::Error| Error::read(&opened.name, e);
+            if !files::has_end_at(store, path, bytes).await.map_err(failed)?
+                && object_sha256(store, path, bytes, &mut |_| {}).await.map_err(failed)? == there
+            {
+                return Ok(true);
+            }
         }
         let given = content.integrity.sha256.clone();
-        Err(Error::OtherContent { run: known.run.to_string(), file: file.to_owned(), given, there })
+        Err(Error::OtherContent { run: known.run.to_string(), file: opened.name.clone(), given, there })
     }
 }
 

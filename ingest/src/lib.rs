@@ -45,6 +45,7 @@ mod mortal;
 mod pipeline;
 mod read_back;
 mod references;
+mod remove;
 mod rows;
 mod run_channels;
 mod run_content;
@@ -54,11 +55,15 @@ mod skewed;
 pub use complete::{CompletedRun, CompletionReport, CompletionSummary};
 pub use echolake_recording::FileIntegrity;
 pub use error::{Error, Result};
-pub use files::{RunSource, adopt_cut_off, arrivals, pending, rig_of_run};
+pub use files::{
+    PendingFiles, RecordingState, RunSource, UnfinishedRecording, find_runs, has_end, list_arrivals, list_pending,
+    pending, rig_of_run,
+};
 pub use ingest::{FileReport, IngestOutcome, IngestedRun, LakeIngest};
 #[doc(hidden)]
 pub use inspect::{InspectedMeasurement, RunInspection, inspect};
 pub use marks::SuspectFile;
+pub use remove::{RemovedFile, RunRemoval, find_removals, find_removed};
 
 /// Version of the code that derives rows; every row has it.
 pub const CODE_VERSION: &str = concat!("echolake ", env!("CARGO_PKG_VERSION"));

@@ -50,4 +50,4 @@ pub use record_splitter::{RecordSplitter, SplitRecord};
 pub use resync_reader::{
     FileIntegrity, LargeRecordPermit, RawChunk, ResyncError, ResyncItem, ResyncReader, list_damage,
 };
-pub use summary::{ChannelDefinitions, RunSummary, summary_range, tail_range};
+pub use summary::{ChannelDefinitions, FILE_END_BYTES, RunSummary, has_file_end, summary_range, tail_range};

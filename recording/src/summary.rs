@@ -44,9 +44,21 @@ pub struct RunSummary {
     pub metadata_indexes: Vec<MetadataIndex>,
 }
 
+/// Bytes of a closed file's end: the footer and the closing magic.
+pub const FILE_END_BYTES: u64 = (FOOTER_BYTES + MAGIC.len()) as u64;
+
 /// Returns the range of a file's end that has its footer, and most often its summary.
 pub fn tail_range(file_bytes: u64) -> Range<u64> {
     file_bytes.saturating_sub(TAIL_BYTES)..file_bytes
+}
+
+/// Returns whether a file's last bytes, [`FILE_END_BYTES`] or more, are those of a closed file: a footer, and the closing
+/// magic behind it. A file that was cut off, or that is still being copied, has none.
+pub fn has_file_end(tail: &[u8]) -> bool {
+    let footer = tail.strip_suffix(MAGIC).and_then(|footer| footer.get(footer.len().checked_sub(FOOTER_BYTES)?..));
+    footer.is_some_and(|footer| {
+        footer[0] == op::FOOTER && footer[1..FRAME_BYTES] == ((FOOTER_BYTES - FRAME_BYTES) as u64).to_le_bytes()
+    })
 }
 
 /// Returns the range of the summary up to the end of the file, as the footer in the file's `tail` tells it; None if the

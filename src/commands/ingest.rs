@@ -1,23 +1,22 @@
 //! `echolake ingest`: runs become rows.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::io::Read as _;
 use std::path::Path;
 use std::process::{Command, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
 use echolake_acquisition::recovery::is_partial;
+use echolake_ingest::Error as IngestError;
 use echolake_ingest::{
-    CompletedRun, FileReport, IngestOutcome, IngestedRun, LakeIngest, RunSource, SuspectFile, adopt_cut_off, arrivals,
-    pending, rig_of_run,
+    CompletedRun, FileReport, IngestOutcome, IngestedRun, LakeIngest, PendingFiles, RecordingState, RunSource,
+    SuspectFile, UnfinishedRecording, find_runs, has_end, list_arrivals, list_pending, pending, rig_of_run,
 };
 use echolake_lake::{Error as LakeError, Lake, ReferenceSurfaces, remote_access};
-use futures::TryStreamExt as _;
 use object_store::path::Path as ObjectPath;
-use object_store::{ObjectMeta, ObjectStoreExt as _};
 use serde::{Deserialize, Serialize};
 
 use crate::CommandOutcome;
@@ -44,6 +43,8 @@ pub(crate) struct IngestArgs {
 
 /// Time between two looks at the inbox.
 const LOOK_EVERY: Duration = Duration::from_secs(2);
+/// Time for which a file without its end is taken for a copy that is still being made.
+const COPY_STALLS_AFTER: Duration = Duration::from_secs(60);
 /// Time that a watch waits after an error.
 const RETRY_AFTER: Duration = Duration::from_secs(10);
 
@@ -74,6 +75,18 @@ impl IngestSummary {
         !self.refused.is_empty() || self.taken.iter().any(|t| !(t.whole || t.stopped) || !t.damaged.is_empty())
     }
 
+    fn refuse(&mut self, file: String, why: &IngestError, moved_to: Option<String>) {
+        self.refused.push(RefusedFile { file, reason: why.to_string(), moved_to });
+    }
+
+    // Names what is passed over.
+    fn pass_over(&mut self, pending: &PendingFiles, progress: &CommandProgress) {
+        for (path, why) in passed_over(pending) {
+            progress.say(format!("error: {why}"));
+            self.refuse(path, &why, None);
+        }
+    }
+
     fn add(&mut self, report: FileReport, progress: &CommandProgress) {
         match report {
             FileReport::Taken(taken) => {
@@ -83,11 +96,10 @@ impl IngestSummary {
             FileReport::Refused { source, why, moved } => {
                 let whereto = moved.as_ref().map(|m| format!(" (now at `{m}`)")).unwrap_or_default();
                 progress.say(format!("error: {why}{whereto}"));
-                let (file, reason, moved_to) = (source.to_string(), why.to_string(), moved.map(|m| m.to_string()));
-                self.refused.push(RefusedFile { file, reason, moved_to });
+                self.refuse(source.to_string(), &why, moved.map(|m| m.to_string()));
             }
             FileReport::Gone(source) => {
-                progress.say(format!("{source}: another ingest has taken it"));
+                progress.say(format!("{source}: another ingest has taken it, or somebody deleted it"));
                 self.gone += 1;
             }
             FileReport::Claimed(source) => {
@@ -109,20 +121,24 @@ pub(crate) async fn run(args: &IngestArgs, lake_url: &str) -> anyhow::Result<Com
         lake.ensure_tables().await?;
         return watch(&lake, &stop, &progress).await;
     }
-    let sources = match args.runs.as_slice() {
-        [] => all_pending(&lake).await?,
-        names => sources_of(&lake, names).await?,
-    };
+    let pending = if args.runs.is_empty() { list_pending(&lake).await? } else { PendingFiles::default() };
+    let sources = if args.runs.is_empty() { pending.sources() } else { sources_of(&lake, &args.runs).await? };
     let nothing = sources.is_empty();
     let mut summary = take_in(&lake, sources, stop.flag(), &progress).await?;
     if args.runs.is_empty() {
+        summary.pass_over(&pending, &progress);
+        pending.recordings.iter().for_each(|recording| note_recording(recording, &progress));
         finish_for_others(&lake, &mut summary, stop.flag(), &progress).await?;
     }
     if args.json {
         super::print(&serde_json::to_string_pretty(&summary)?)?;
     }
     if nothing && !args.json {
-        eprintln!("nothing to ingest: every run of the lake is in its tables");
+        let unfinished = match pending.recordings.len() {
+            0 => String::new(),
+            count => format!("; {count} recordings in the inbox are not finished"),
+        };
+        eprintln!("nothing to ingest: every closed run of the lake is in its tables{unfinished}");
     }
     // Files that were named are the whole job; if none of them could be taken in, it failed.
     if !args.runs.is_empty() && summary.taken.is_empty() && !summary.refused.is_empty() {
@@ -143,12 +159,30 @@ async fn open_or_make(lake_url: &str, runs: &[String]) -> anyhow::Result<Lake> {
     Ok(Lake::open_or_create(lake_url, &rig, &ReferenceSurfaces::default()).await?)
 }
 
-// All pending files, with the recordings that a crashed recorder left.
-async fn all_pending(lake: &Lake) -> anyhow::Result<Vec<RunSource>> {
-    for path in adopt_cut_off(lake).await? {
-        eprintln!("`{path}` was cut off; what was complete is taken in");
-    }
-    Ok(pending(lake).await?)
+// What is no run now and will not become one by itself, by its path, and why.
+fn passed_over(pending: &PendingFiles) -> Vec<(String, IngestError)> {
+    let unusable = pending.unusable.iter().map(|entry| {
+        let (path, reason) = (entry.path.clone(), entry.reason.clone());
+        (path.clone(), IngestError::Unusable { path, reason })
+    });
+    let cut_off = pending.recordings.iter().filter(|recording| recording.state == RecordingState::CutOff);
+    let cut_off = cut_off.map(|recording| {
+        let file = recording.path.to_string();
+        (file.clone(), IngestError::CutOff { file, bytes: recording.bytes })
+    });
+    unusable.chain(cut_off).collect()
+}
+
+fn note_recording(UnfinishedRecording { path, bytes, state }: &UnfinishedRecording, progress: &CommandProgress) {
+    let what = match state {
+        RecordingState::Running => "is being recorded",
+        RecordingState::Resumable => {
+            "is not finished; hint: `echolake acquire --resume` resumes it, `echolake recover` makes a run of what it holds"
+        }
+        RecordingState::Import => "is part of an import that was cut off; hint: repeat the import",
+        RecordingState::CutOff => return,
+    };
+    progress.say(format!("note: `{path}` ({}) {what}", super::size(*bytes)));
 }
 
 // What another ingest took on an object store and did not finish, because it died, is in `runs/` and in no table.
@@ -292,65 +326,112 @@ async fn take_in_suspect(
     stop: &Arc<AtomicBool>,
     progress: &CommandProgress,
 ) -> anyhow::Result<CommandOutcome> {
+    let (ended, parent) = tokio::sync::oneshot::channel();
     std::thread::spawn(|| {
         let _ = std::io::stdin().read(&mut [0]);
-        std::process::exit(1);
+        // Nobody listens once the work is done.
+        let _ = ended.send(());
     });
     let mut summary = IngestSummary::default();
     let source = RunSource::Lake(ObjectPath::parse(path)?);
     let ingest = LakeIngest::new(lake, stop.clone());
-    ingest.take_in(vec![source], &mut |report| summary.add(report, progress)).await?;
+    let mut report = |report| summary.add(report, progress);
+    tokio::select! {
+        taken = ingest.take_in(vec![source], &mut report) => taken?,
+        _ = parent => anyhow::bail!("the ingest that started this process has ended"),
+    }
     ingest.close().await;
     super::print(&serde_json::to_string(&summary)?)?;
     Ok(CommandOutcome::Whole)
 }
 
-// Takes in new files of the inbox, until Ctrl-C. A file that is being copied there grows between two looks; one that is
-// as it was at the last look is whole.
+/// Size and time of change of a file.
+type WatchedState = (u64, chrono::DateTime<chrono::Utc>);
+
+/// What a watch knows of the inbox.
+#[derive(Default)]
+struct WatchedInbox {
+    /// Files that are not ingested yet, and since when they are as they are.
+    seen: HashMap<ObjectPath, (WatchedState, Instant)>,
+    /// Refused files that are still where they were.
+    given_up: HashMap<String, WatchedState>,
+    /// Entries that were named as passed over.
+    named: HashSet<String>,
+}
+
+impl WatchedInbox {
+    // The files that can be ingested now. One that is being copied grows between two looks; one that does not end as a
+    // closed file is still being copied, until it has not grown for a while.
+    async fn settled(&mut self, lake: &Lake, pending: &PendingFiles) -> HashMap<String, WatchedState> {
+        let (mut settled, mut seen) = (HashMap::new(), HashMap::new());
+        for meta in &pending.runs {
+            let (path, state) = (&meta.location, (meta.size, meta.last_modified));
+            if self.given_up.get(path.as_ref()) == Some(&state) {
+                continue;
+            }
+            let since = self.seen.get(path).filter(|(before, _)| *before == state).map(|(_, since)| *since);
+            // Object stores show no file before it is whole.
+            let is_settled = lake.is_remote()
+                || match since {
+                    None => false,
+                    Some(since) if since.elapsed() >= COPY_STALLS_AFTER => true,
+                    // What cannot be read is reported.
+                    Some(_) => has_end(lake, path).await.unwrap_or(true),
+                };
+            if is_settled {
+                settled.insert(path.to_string(), state);
+            } else {
+                seen.insert(path.clone(), (state, since.unwrap_or_else(Instant::now)));
+            }
+        }
+        self.seen = seen;
+        settled
+    }
+
+    // Those that were not passed over before.
+    fn name_passed_over(&mut self, mut pending: PendingFiles, summary: &mut IngestSummary, progress: &CommandProgress) {
+        pending.unusable.retain(|entry| self.named.insert(entry.path.clone()));
+        pending.recordings.retain(|r| r.state == RecordingState::CutOff && self.named.insert(r.path.to_string()));
+        summary.pass_over(&pending, progress);
+    }
+}
+
+// Ingests new files of the inbox, until Ctrl-C.
 async fn watch(lake: &Lake, stop: &StopRequest, progress: &CommandProgress) -> anyhow::Result<CommandOutcome> {
     eprintln!("watching `{}/inbox`; Ctrl-C ends it", lake.location());
-    let mut before: HashMap<ObjectPath, (u64, chrono::DateTime<chrono::Utc>)> = HashMap::new();
-    // Refused files that are still where they were.
-    let mut given_up = HashMap::new();
+    let mut inbox = WatchedInbox::default();
     let mut lost = false;
     let mut is_first = true;
     while !stop.is_made() {
-        let mut settled = Vec::new();
-        let mut now = HashMap::new();
-        let mut states = HashMap::new();
-        let found = match look(lake, is_first).await {
+        // On an object store the inbox alone is listed, but for the first time.
+        let found = match lake.is_remote() && !is_first {
+            true => list_arrivals(lake).await,
+            false => list_pending(lake).await,
+        };
+        let found = match found {
             Err(e) if lake.is_remote() => {
-                wait_after(&e, stop).await;
+                wait_after(&e.into(), stop).await;
                 continue;
             }
             found => found?,
         };
-        for meta in found {
-            let (path, state) = (meta.location, (meta.size, meta.last_modified));
-            if given_up.get(path.as_ref()) == Some(&state) {
-                continue;
-            }
-            states.insert(path.to_string(), state);
-            // Object stores show no file before it is whole.
-            if lake.is_remote() || before.get(&path) == Some(&state) {
-                settled.push(RunSource::Lake(path));
-            } else {
-                now.insert(path, state);
-            }
-        }
         is_first = false;
-        before = now;
-        if settled.is_empty() {
+        let mut settled = inbox.settled(lake, &found).await;
+        let mut passed_over = IngestSummary::default();
+        let sources: Vec<_> = found.sources().into_iter().filter(|s| settled.contains_key(&s.to_string())).collect();
+        inbox.name_passed_over(found, &mut passed_over, progress);
+        lost |= passed_over.lost();
+        if sources.is_empty() {
             pause(LOOK_EVERY, stop).await;
             continue;
         }
-        match take_in(lake, settled, stop.flag(), progress).await {
+        match take_in(lake, sources, stop.flag(), progress).await {
             Ok(summary) => {
                 lost |= summary.lost();
                 // They are looked for in `runs/`, in case that ingest died.
                 is_first |= summary.gone > 0;
                 let stay = summary.refused.iter().filter(|refused| refused.moved_to.is_none());
-                given_up.extend(stay.filter_map(|refused| states.remove_entry(&refused.file)));
+                inbox.given_up.extend(stay.filter_map(|refused| settled.remove_entry(&refused.file)));
             }
             Err(e) if stop.is_made() => drop(e),
             // A full disk or an absent store passes; the files are still there.
@@ -358,20 +439,6 @@ async fn watch(lake: &Lake, stop: &StopRequest, progress: &CommandProgress) -> a
         }
     }
     Ok(if lost { CommandOutcome::WithLoss } else { CommandOutcome::Whole })
-}
-
-// The pending files. On an object store the inbox alone is listed, but for the first time.
-async fn look(lake: &Lake, is_first: bool) -> anyhow::Result<Vec<ObjectMeta>> {
-    if lake.is_remote() && !is_first {
-        return Ok(arrivals(lake).await?);
-    }
-    let mut found = Vec::new();
-    for source in all_pending(lake).await? {
-        let RunSource::Lake(path) = &source else { continue };
-        // It may be gone again. A folder's store tells the place of a file on the disk.
-        found.extend(lake.store().head(path).await.ok().map(|meta| ObjectMeta { location: path.clone(), ..meta }));
-    }
-    Ok(found)
 }
 
 async fn wait_after(error: &anyhow::Error, stop: &StopRequest) {
@@ -402,24 +469,25 @@ fn say(progress: &CommandProgress, taken: &IngestedRun) {
 
 // A name of an existing file is that file; any other is looked up in the lake.
 async fn sources_of(lake: &Lake, names: &[String]) -> anyhow::Result<Vec<RunSource>> {
-    let mut sources = Vec::new();
     for name in names {
         anyhow::ensure!(
             !is_partial(Path::new(name)),
             "`{name}` is an unfinished recording, expected a run (.mcap); hint: `echolake acquire --resume {name}` resumes \
              it, `echolake recover {name}` makes a run of what it holds"
         );
-        if Path::new(name).is_file() {
-            sources.push(in_lake(lake, Path::new(name)).unwrap_or_else(|| RunSource::File(name.into())));
-            continue;
-        }
-        let file = if name.ends_with(".mcap") { name.clone() } else { format!("{name}.mcap") };
-        let listed: Vec<_> = lake.store().list(None).try_collect().await.context("cannot list the lake")?;
-        let found = listed.into_iter().map(|m| m.location).find(|p| {
-            let folder = p.parts().next().is_some_and(|f| matches!(f.as_ref(), "inbox" | "runs"));
-            folder && (p.filename() == Some(file.as_str()) || p.as_ref() == file)
+    }
+    let named: Vec<_> = names.iter().map(String::as_str).filter(|name| !Path::new(name).is_file()).collect();
+    let mut found = find_runs(lake, &named).await?.into_iter();
+    let mut sources = Vec::with_capacity(names.len());
+    for name in names {
+        let file = Path::new(name);
+        sources.push(match named.contains(&name.as_str()) {
+            false => in_lake(lake, file).unwrap_or_else(|| RunSource::File(file.into())),
+            true => {
+                let found = found.next().flatten();
+                RunSource::Lake(found.ok_or_else(|| IngestError::NoRun { given: name.clone() })?)
+            }
         });
-        sources.push(RunSource::Lake(found.ok_or(echolake_ingest::Error::NoRun { given: name.clone() })?));
     }
     Ok(sources)
 }

@@ -22,6 +22,8 @@ pub(crate) mod mcp;
 pub(crate) mod optimize;
 pub(crate) mod panel;
 pub(crate) mod recover;
+#[cfg(feature = "lake")]
+pub(crate) mod remove;
 pub(crate) mod replay;
 #[cfg(feature = "lake")]
 pub(crate) mod serve;

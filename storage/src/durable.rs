@@ -34,6 +34,18 @@ impl DurableFileSystem {
         Self { inner: LocalFileSystem::new() }
     }
 
+    // Opening a named pipe waits for its other end.
+    fn refuse_special(&self, location: &Path) -> Result<()> {
+        let path = self.inner.path_to_filesystem(location)?;
+        match fs::metadata(&path) {
+            Ok(meta) if !meta.is_file() && !meta.is_dir() => {
+                let source = io::Error::new(ErrorKind::InvalidInput, format!("`{}` is no file", path.display()));
+                Err(Error::Generic { store: "DurableFileSystem", source: Box::new(source) })
+            }
+            _ => Ok(()),
+        }
+    }
+
     // One renamed or copied file is as durable as its folder's entry.
     async fn sync_entry(&self, location: &Path) -> Result<()> {
         let path = self.inner.path_to_filesystem(location)?;
@@ -64,12 +76,14 @@ impl ObjectStore for DurableFileSystem {
     }
 
     async fn get_opts(&self, location: &Path, options: GetOptions) -> Result<GetResult> {
+        self.refuse_special(location)?;
         self.inner.get_opts(location, options).await
     }
 
     // Reads all ranges with the file open once, and nothing between them; the trait's default would request each by
     // itself and read the bytes between near ones.
     async fn get_ranges(&self, location: &Path, ranges: &[Range<u64>]) -> Result<Vec<Bytes>> {
+        self.refuse_special(location)?;
         self.inner.get_ranges(location, ranges).await
     }
 

@@ -19,6 +19,7 @@
 mod config;
 mod durable;
 mod error;
+mod folder_listing;
 mod lake;
 mod location;
 #[cfg(feature = "remote")]
@@ -33,6 +34,7 @@ mod upload;
 
 pub use config::{DirectSound, LAKE_FORMAT, LakeConfig, ReferenceSurfaces};
 pub use error::{Error, StoreError};
+pub use folder_listing::{FolderListing, UnusableEntry};
 pub use lake::Lake;
 #[cfg(feature = "tables")]
 pub use remote::{CACHE_MEMORY_BYTES, CacheCounters, CacheCounts, CacheFolder, ObjectFolder};

@@ -101,3 +101,10 @@ pub(crate) fn text_of(row: &RecordBatch, column: &str) -> Option<String> {
     let array = row.column_by_name(column)?.as_string_opt::<i32>()?;
     (array.len() == 1 && array.is_valid(0)).then(|| array.value(0).to_owned())
 }
+
+/// Returns a whole number of the row.
+pub(crate) fn number_of(row: &RecordBatch, column: &str) -> Option<i64> {
+    use arrow::array::{Array as _, AsArray as _};
+    let array = row.column_by_name(column)?.as_primitive_opt::<arrow::datatypes::Int64Type>()?;
+    (array.len() == 1 && array.is_valid(0)).then(|| array.value(0))
+}

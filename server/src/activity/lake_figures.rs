@@ -2,8 +2,6 @@
 
 use echolake_lake::{Lake, LakeSnapshot};
 use echolake_schema::tables::Table;
-use futures::TryStreamExt as _;
-use object_store::path::Path;
 use serde::{Deserialize, Serialize};
 
 /// Figures of the lake.
@@ -32,7 +30,7 @@ impl LakeFigures {
     ///
     /// # Errors
     /// The store does not list a folder.
-    pub(crate) async fn read(lake: &Lake, snapshot: &LakeSnapshot) -> Result<Self, object_store::Error> {
+    pub(crate) async fn read(lake: &Lake, snapshot: &LakeSnapshot) -> echolake_lake::Result<Self> {
         let bytes = |table: Table| snapshot.files(table).iter().map(|file| file.bytes).sum::<u64>();
         Ok(Self {
             version: snapshot.version(Table::Runs).unwrap_or(0),
@@ -46,10 +44,9 @@ impl LakeFigures {
 }
 
 impl FolderFigures {
-    async fn read(lake: &Lake, folder: &str) -> Result<Self, object_store::Error> {
-        let store = lake.store();
-        let all: Vec<_> = store.list(Some(&Path::from(folder))).try_collect().await?;
-        let runs = all.iter().filter(|object| object.location.as_ref().ends_with(".mcap"));
+    async fn read(lake: &Lake, folder: &str) -> echolake_lake::Result<Self> {
+        let listing = lake.list_folder(folder).await?;
+        let runs = listing.files.iter().filter(|object| object.location.as_ref().ends_with(".mcap"));
         Ok(runs.fold(Self::default(), |sum, object| Self { files: sum.files + 1, bytes: sum.bytes + object.size }))
     }
 }

@@ -172,6 +172,8 @@ pub struct TableCommit {
     pub remove: Vec<LoggedFile>,
     /// Its effect on readers.
     pub effect: CommitEffect,
+    /// The runs whose rows somebody removes by it, for the log's readers.
+    pub removed_runs: Vec<RunId>,
 }
 
 /// The names of a table's files, as the log knows them.

@@ -14,8 +14,8 @@ use std::time::{Duration, Instant};
 use arrow::datatypes::{DataType as ArrowType, Field, SchemaRef};
 use async_trait::async_trait;
 use chrono::{DateTime, Utc};
-use echolake_schema::Rig;
 use echolake_schema::tables::Table;
+use echolake_schema::{Rig, RunId};
 use object_store::ObjectStore;
 use object_store::path::Path;
 use percent_encoding::percent_decode_str;
@@ -183,13 +183,15 @@ struct PendingChange<'a> {
     add: Vec<&'a NewFile>,
     remove: BTreeSet<String>,
     effect: CommitEffect,
+    removed_runs: &'a [RunId],
 }
 
 impl<'a> PendingChange<'a> {
     fn of(commit: &'a TableCommit, mut known: HashMap<String, KnownFile>) -> Self {
         let gone = commit.remove.iter().filter(|file| is_known(file, &known));
         let remove = gone.map(|file| file.name.clone()).collect();
-        let mut change = Self { outcomes: Vec::new(), add: Vec::new(), remove, effect: commit.effect };
+        let (effect, removed_runs) = (commit.effect, commit.removed_runs.as_slice());
+        let mut change = Self { outcomes: Vec::new(), add: Vec::new(), remove, effect, removed_runs };
         for file in &commit.add {
             let outcome = change.outcome(file, &known);
             if outcome == CommitOutcome::Now {
@@ -217,6 +219,7 @@ impl<'a> PendingChange<'a> {
         let data_change = self.effect == CommitEffect::Rows;
         let largest = self.add.iter().map(|f| f.bytes).max().unwrap_or(0);
         let (operation, parameters) = match self.effect {
+            CommitEffect::Rows if !self.removed_runs.is_empty() => ("DELETE", removal_parameters(self.removed_runs)),
             CommitEffect::Rows if self.remove.is_empty() => ("WRITE", json!({ "mode": "Append" })),
             CommitEffect::Rows => ("WRITE", json!({ "mode": "Overwrite" })),
             CommitEffect::Layout => ("OPTIMIZE", json!({ "targetSize": largest.to_string() })),
@@ -458,6 +461,14 @@ fn commit_info(operation: &str, parameters: Value, now_millis: i64) -> LogLine {
     LogLine { commit_info: Some(info), ..LogLine::default() }
 }
 
+// As Delta writes a deletion, with the one who asked for it.
+fn removal_parameters(runs: &[RunId]) -> Value {
+    let names: Vec<_> = runs.iter().map(|run| format!("'{run}'")).collect();
+    let predicate = json!([format!("run_id IN ({})", names.join(", "))]).to_string();
+    let user = ["USER", "LOGNAME"].iter().find_map(|name| std::env::var(name).ok());
+    json!({ "predicate": predicate, "by": user.unwrap_or_else(|| "unknown".to_owned()) })
+}
+
 // Names of ours have no character that Delta would percent-encode.
 fn add_file(file: &NewFile, log_version: u64, now_millis: i64, data_change: bool) -> AddFile {
     let parts = (!file.parts.is_empty()).then(|| (PARTS, encode_parts(&file.parts)));
@@ -542,7 +553,7 @@ mod tests {
         let commit = TableCommit {
             add: vec![file("a", None), file("b", None), file("b", None)],
             remove: vec![logged("c", 3), logged("d", 3), logged("e", 2)],
-            effect: CommitEffect::Rows,
+            ..TableCommit::default()
         };
         let change = PendingChange::of(&commit, names(&["a", "c", "e"]));
         assert_eq!(change.outcomes, [CommitOutcome::Before, CommitOutcome::Now, CommitOutcome::Before]);

@@ -9,6 +9,7 @@ mod lease;
 mod optimize;
 mod process_identity;
 mod project_log;
+mod removal;
 mod rig_tables;
 mod rows;
 mod snapshot;

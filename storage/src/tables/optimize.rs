@@ -8,8 +8,8 @@
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use echolake_schema::ProjectName;
 use echolake_schema::tables::{Source, Table};
+use echolake_schema::{ProjectName, RunId};
 use futures::TryStreamExt as _;
 use serde::Serialize;
 use sha2::{Digest as _, Sha256};
@@ -94,6 +94,7 @@ impl Lake {
             Table::ALL.into_iter().map(|table| (table, plan(&snapshot, &readers, table, target_bytes))).collect();
         let total = plans.iter().flat_map(|(_, groups)| groups).map(Vec::len).sum();
         let (mut report, mut done) = (OptimizeReport::default(), 0);
+        let layout = || TableCommit { effect: CommitEffect::Layout, ..TableCommit::default() };
         for (table, groups) in plans.into_iter().filter(|(_, groups)| !groups.is_empty()) {
             let name = table.name();
             let mut of =
@@ -104,7 +105,7 @@ impl Lake {
                     report.stopped = true;
                     break;
                 }
-                match self.merge(table, group, CommitEffect::Layout, Some(&mut *lease)).await? {
+                match self.merge(table, group, layout(), Some(&mut *lease)).await? {
                     (CommitOutcome::Outdated, _) => of.outdated += 1,
                     (_, bytes) => {
                         of.merged += group.len();
@@ -122,16 +123,27 @@ impl Lake {
 
     /// Rewrites a merged file without its superseded rows. If another writer did so meanwhile, nothing changes.
     pub(crate) async fn rewrite(&self, table: Table, file: &DataFile) -> Result<CommitOutcome> {
-        let (outcome, _) = self.merge(table, std::slice::from_ref(file), CommitEffect::Rows, None).await?;
+        self.rewrite_without(table, file, &[]).await
+    }
+
+    /// The same, for the rows of runs that somebody removes, which the file hides.
+    pub(crate) async fn rewrite_without(
+        &self,
+        table: Table,
+        file: &DataFile,
+        removed_runs: &[RunId],
+    ) -> Result<CommitOutcome> {
+        let change = TableCommit { removed_runs: removed_runs.to_vec(), ..TableCommit::default() };
+        let (outcome, _) = self.merge(table, std::slice::from_ref(file), change, None).await?;
         Ok(outcome)
     }
 
-    // One file in the place of several; returns its size, too.
+    // One file in the place of several, by a commit that adds nothing else; returns its size, too.
     async fn merge(
         &self,
         table: Table,
         files: &[DataFile],
-        effect: CommitEffect,
+        change: TableCommit,
         mut lease: Option<&mut MaintenanceLease>,
     ) -> Result<(CommitOutcome, u64)> {
         let mut slices: Vec<_> = files.iter().flat_map(slices).collect();
@@ -161,7 +173,7 @@ impl Lake {
             lease.keep().await?;
         }
         let bytes = staged.file.bytes;
-        let commit = TableCommit { add: vec![staged.file], effect, ..TableCommit::default() };
+        let commit = TableCommit { add: vec![staged.file], ..change };
         let outcome = self.log().commit(table, &commit).await?;
         Ok((outcome[0], bytes))
     }

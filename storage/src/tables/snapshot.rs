@@ -220,7 +220,7 @@ impl LakeSnapshot {
     }
 
     /// The project of a run; None if it was given none.
-    pub(crate) fn project(&self, run: &RunId) -> Option<&ProjectName> {
+    pub fn project(&self, run: &RunId) -> Option<&ProjectName> {
         self.runs.get(run)?.project.as_ref()
     }
 
@@ -358,7 +358,7 @@ struct SortedFiles {
     shown: HashSet<RunId>,
 }
 
-fn run_of(file: &DataFile) -> Option<RunId> {
+pub(crate) fn run_of(file: &DataFile) -> Option<RunId> {
     match FileName::parse(&file.path)? {
         FileName::Rows { run, .. } => Some(run),
         FileName::Pointer(pointer) => Some(pointer.run),

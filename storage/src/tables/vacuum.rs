@@ -132,12 +132,7 @@ impl Lake {
                 }
             }
         }
-        let inbox: Vec<_> = self
-            .store()
-            .list(Some(&Path::from(INBOX)))
-            .try_collect()
-            .await
-            .map_err(|e| Error::store("list", INBOX, e))?;
+        let inbox = self.list_folder(INBOX).await?.files;
         let is_unfinished = |path: &Path| matches!(path.extension(), Some("copying" | "uploading"));
         let unfinished = inbox.into_iter().filter(|m| is_unfinished(&m.location) && old(m.last_modified));
         // Claims of processes that died.

@@ -5,7 +5,7 @@ import { figures, sql } from './api'
 const MARK = '/* operations page */'
 
 export interface InboxFile {
-  readonly state: 'waiting' | 'recording' | 'refused'
+  readonly state: 'waiting' | 'recording' | 'incomplete' | 'refused' | 'unusable'
   readonly path: string
   readonly bytes: number
   readonly changed: string

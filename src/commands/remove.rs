@@ -1,0 +1,86 @@
+//! `echolake remove`: runs leave the lake, with their rows and their files.
+
+use clap::Args;
+use echolake_ingest::{LakeIngest, RemovedFile, RunRemoval, find_removals, find_removed};
+use echolake_lake::Lake;
+
+use crate::CommandOutcome;
+use crate::progress::CommandProgress;
+
+#[derive(Debug, Args)]
+pub(crate) struct RemoveArgs {
+    /// Names of the runs.
+    #[arg(required = true)]
+    pub(crate) runs: Vec<String>,
+    /// Delete the runs' files instead of moving them to `quarantine/`.
+    #[arg(long)]
+    pub(crate) delete: bool,
+    /// List what would be removed, and remove nothing.
+    #[arg(long)]
+    pub(crate) dry_run: bool,
+    /// Print what was done as JSON.
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+pub(crate) async fn run(args: &RemoveArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
+    let stop = super::stop_request()?;
+    let lake = Lake::open(lake_url).await?;
+    let progress = CommandProgress::new();
+    let mut names = Vec::new();
+    for name in &args.runs {
+        // A removal that is repeated has nothing to do.
+        match find_removals(&lake, std::slice::from_ref(name)).await {
+            Err(absent @ echolake_ingest::Error::NoRun { .. }) => match find_removed(&lake, name).await {
+                Some(path) => progress.say(format!("{name}: is not in the lake; its file is at `{path}`")),
+                None => return Err(absent.into()),
+            },
+            found => found.map(|_| names.push(name.clone()))?,
+        }
+    }
+    let mut removals = find_removals(&lake, &names).await?;
+    if !args.dry_run && !removals.is_empty() {
+        let ingest = LakeIngest::new(&lake, stop.flag().clone());
+        let removed = remove(&ingest, &mut removals, args, &progress).await;
+        ingest.close().await;
+        removed?;
+    }
+    if args.json {
+        super::print(&serde_json::to_string_pretty(&removals)?)?;
+        return Ok(CommandOutcome::Whole);
+    }
+    for removal in &removals {
+        super::print(&describe_removal(removal, args))?;
+    }
+    Ok(CommandOutcome::Whole)
+}
+
+async fn remove(
+    ingest: &LakeIngest<'_>,
+    removals: &mut [RunRemoval],
+    args: &RemoveArgs,
+    progress: &CommandProgress,
+) -> anyhow::Result<()> {
+    let file = if args.delete { RemovedFile::Deleted } else { RemovedFile::Kept };
+    let user = ["USER", "LOGNAME"].iter().find_map(|name| std::env::var(name).ok());
+    ingest.remove(removals, file, user.as_deref().unwrap_or("an unknown user")).await?;
+    // Rows that were derived with them.
+    let mut rows = 0;
+    let completion = ingest.complete(&mut |completed, _| rows += completed.measurements).await?;
+    if completion.changed > 0 {
+        progress.say(format!("{} runs have other references now, {rows} measurements derived", completion.changed));
+    }
+    Ok(())
+}
+
+fn describe_removal(removal: &RunRemoval, args: &RemoveArgs) -> String {
+    let RunRemoval { run, measurements, bytes, .. } = removal;
+    let would = if args.dry_run { "would be " } else { "" };
+    let file = match (&removal.file, &removal.moved_to) {
+        (None, _) => "its file was gone".to_owned(),
+        (Some(file), _) if args.delete => format!("`{file}` ({}) {would}deleted", super::size(*bytes)),
+        (Some(_), Some(to)) => format!("its file is at `{to}`"),
+        (Some(file), None) => format!("`{file}` ({}) {would}moved to quarantine/", super::size(*bytes)),
+    };
+    format!("{run}: {measurements} measurements {would}removed; {file}")
+}

@@ -1,0 +1,83 @@
+//! Takes runs out of the tables, on somebody's request.
+//!
+//! The rows of `runs` go first: from that commit on no reader sees the runs, and the other rows mean nothing. Earlier
+//! versions of the lake still show them until `vacuum` deletes their files.
+
+use std::collections::BTreeSet;
+
+use echolake_schema::RunId;
+use echolake_schema::tables::Table;
+
+use crate::tables::snapshot::run_of;
+use crate::{DataFile, Error, Lake, Result, TableCommit};
+
+/// Looks at one table, each after another writer changed a file at the same moment.
+const ROUNDS: usize = 20;
+
+impl Lake {
+    /// Removes all rows of some runs; repeating it resumes what was cut off. Returns the number of files that went or were
+    /// written without these rows.
+    ///
+    /// # Errors
+    /// What the store says. Tables that were changed before stay so.
+    pub async fn remove_runs(&self, runs: &BTreeSet<RunId>) -> Result<usize> {
+        let mut count = self.remove_rows(Table::Runs, runs).await?;
+        for table in Table::ALL.into_iter().filter(|table| *table != Table::Runs) {
+            count += self.remove_rows(table, runs).await?;
+        }
+        Ok(count)
+    }
+
+    /// Returns whether a table's log has a file with rows of a run, seen or not.
+    ///
+    /// # Errors
+    /// [`Error::Log`] if a log is damaged.
+    pub async fn has_rows_of(&self, run: &RunId) -> Result<bool> {
+        let runs = BTreeSet::from([run.clone()]);
+        for table in Table::ALL {
+            if self.log().files(table).await?.iter().any(|file| !parts_of(file, &runs).is_empty()) {
+                return Ok(true);
+            }
+        }
+        Ok(false)
+    }
+
+    async fn remove_rows(&self, table: Table, runs: &BTreeSet<RunId>) -> Result<usize> {
+        let mut count = 0;
+        for _ in 0..ROUNDS {
+            let files = self.log().files(table).await?;
+            let (mut whole, mut shared) = (Vec::new(), Vec::new());
+            for file in files {
+                match parts_of(&file, runs) {
+                    of if of.is_empty() => {}
+                    of if of.len() < file.parts.len() => shared.push(DataFile { hidden: of, ..file }),
+                    _ => whole.push(file.logged()),
+                }
+            }
+            if whole.is_empty() && shared.is_empty() {
+                return Ok(count);
+            }
+            count += whole.len() + shared.len();
+            let removed_runs: Vec<_> = runs.iter().cloned().collect();
+            if !whole.is_empty() {
+                let removed_runs = removed_runs.clone();
+                let commit = TableCommit { remove: whole, removed_runs, ..TableCommit::default() };
+                self.log().commit(table, &commit).await?;
+            }
+            for file in &shared {
+                self.rewrite_without(table, file, &removed_runs).await?;
+            }
+        }
+        let source = format!("other writers changed its files in {ROUNDS} tries; hint: run the command again").into();
+        Err(Error::Log { table: table.name(), action: "written", source })
+    }
+}
+
+// The runs among these whose rows a file has.
+fn parts_of(file: &DataFile, runs: &BTreeSet<RunId>) -> Vec<RunId> {
+    let of: Vec<_> = match file.parts.is_empty() {
+        true => run_of(file).into_iter().collect(),
+        false => file.parts.iter().map(|part| part.run.clone()).collect(),
+    };
+    of.into_iter().filter(|run| runs.contains(run)).collect()
+}
