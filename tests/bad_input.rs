@@ -345,15 +345,18 @@ mod slow {
             std::fs::write(place.path(name), bytes).expect("written");
             place.fails(code, &["ingest", name], expected);
         };
-        ingest("empty.mcap", b"", 1, "the file is empty");
+        ingest("empty.mcap", b"", 1, "is not whole: it has 0 bytes");
         ingest("text.mcap", b"this is no MCAP file at all", 1, "not an MCAP file");
         let mut foreign = std::io::Cursor::new(Vec::new());
         mcap::Writer::new(&mut foreign).expect("a writer").finish().expect("closed");
         ingest("foreign.mcap", foreign.get_ref(), 1, "no run of echolake");
         assert_eq!(place.number("select count(*) from runs"), 0.0);
 
-        // Cut off near its end: what was complete is taken in.
-        ingest("cut.mcap", cut_off(&whole), 3, "its recording was cut off");
+        // Cut off near its end: it stays, and `recover` makes a run of what was complete.
+        ingest("cut.mcap", cut_off(&whole), 1, "is not whole");
+        assert_eq!(place.number("select count(*) from runs"), 0.0);
+        place.fails(3, &["recover", "cut.mcap", "-o", "part.mcap"], "lost: ");
+        place.fails(3, &["ingest", "part.mcap"], "its recording was cut off");
         let kept = place.number("select count(*) from measurements");
         assert!(kept > 0.0 && kept < 45.0, "{kept}");
         assert_eq!(place.sql("select state from runs")[0]["state"], "partial");

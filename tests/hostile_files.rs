@@ -4,6 +4,7 @@
 use std::fs::{self, File};
 use std::io;
 use std::ops::Range;
+use std::os::unix::fs::FileExt as _;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::{Duration, Instant};
@@ -27,6 +28,9 @@ const LOOK_EVERY: Duration = Duration::from_millis(100);
 /// Starts of `ingest` in one round after which it is given up.
 const MOST_STARTS: usize = 20;
 const FRAME: usize = 9;
+/// A footer and the magic bytes.
+const FILE_END_BYTES: u64 = 37;
+const FOOTER_FRAME: [u8; FRAME] = [0x02, 20, 0, 0, 0, 0, 0, 0, 0];
 pub(crate) const MIB: u64 = 1 << 20;
 
 /// Sizes of the generated files, in bytes.
@@ -81,11 +85,13 @@ struct TemplateRun {
     verdict: u16,
 }
 
-/// A file's bytes, of which zeros at the end are not stored.
+/// A file's bytes, of which zeros between the two parts are not stored.
 struct HostileFile {
     name: String,
     bytes: Vec<u8>,
     size: u64,
+    /// The last bytes of `size`.
+    end: Vec<u8>,
 }
 
 impl HostileCampaign {
@@ -124,25 +130,29 @@ impl HostileCampaign {
         for file in crafted.into_iter().chain(mutated) {
             file.write(&inbox).expect("written");
         }
-        let mut outcome =
-            HostileOutcome { files: run_files(&inbox), good_expected: self.good.len(), ..HostileOutcome::default() };
+        let mut outcome = HostileOutcome {
+            files: run_files(&inbox).len(),
+            good_expected: self.good.len(),
+            ..HostileOutcome::default()
+        };
         let begun = Instant::now();
-        while run_files(&inbox) > 0 {
+        while waiting_files(&inbox) > 0 {
             assert!(outcome.deaths.len() < MOST_STARTS, "it ends again and again: {:?}", outcome.deaths);
             self.watch(&inbox, begun + limit, &mut outcome);
         }
         outcome.elapsed = begun.elapsed();
-        outcome.quarantined = run_files(&lake.join("quarantine"));
+        outcome.quarantined = run_files(&lake.join("quarantine")).len();
         outcome.good = self.good.iter().filter(|run| self.is_taken_in(run)).count();
         outcome
     }
 
-    // Until the inbox is empty or the process has ended.
+    // Until nothing but files without an end are in the inbox, or the process has ended.
     fn watch(&self, inbox: &Path, end: Instant, outcome: &mut HostileOutcome) {
         let mut command = command(&self.binary, self.folder.path(), "round");
         let mut watch = ChildProcess::start_group(command.args(["ingest", "--watch"])).expect("the command starts");
-        while run_files(inbox) > 0 {
-            assert!(Instant::now() < end, "{} files are left in the inbox:\n{}", run_files(inbox), watch.stderr());
+        while waiting_files(inbox) > 0 {
+            let left = waiting_files(inbox);
+            assert!(Instant::now() < end, "{left} files are left in the inbox:\n{}", watch.stderr());
             outcome.peak_mib = outcome.peak_mib.max(peak_mib(watch.id()).unwrap_or(0));
             if watch.ends_within(LOOK_EVERY) {
                 let output = watch.wait();
@@ -186,11 +196,16 @@ impl TemplateRun {
         self.renamed(number, bytes)
     }
 
-    // The same; the last record of `hostile` is nothing but zeros from there on, and nothing is behind it.
+    // The same; the last record of `hostile` is nothing but zeros from there on, and a file's end is behind it.
     fn sparse(&self, number: u64, hostile: &[u8], zeros: u64) -> HostileFile {
         let mut file = self.renamed(number, [&self.bytes[..self.described], hostile].concat());
-        file.size += zeros;
+        file.end = self.end().to_vec();
+        file.size += zeros + FILE_END_BYTES;
         file
+    }
+
+    fn end(&self) -> &[u8] {
+        &self.bytes[self.bytes.len() - FILE_END_BYTES as usize..]
     }
 
     // Names end in four hexadecimal digits.
@@ -198,7 +213,7 @@ impl TemplateRun {
         let name = format!("{}{number:04x}", &self.run[..self.run.len() - 4]);
         let places: Vec<_> = (0..bytes.len()).filter(|at| bytes[*at..].starts_with(self.run.as_bytes())).collect();
         places.iter().for_each(|at| bytes[*at..*at + name.len()].copy_from_slice(name.as_bytes()));
-        HostileFile { name: format!("{name}.mcap"), size: bytes.len() as u64, bytes }
+        HostileFile { name: format!("{name}.mcap"), size: bytes.len() as u64, bytes, end: Vec::new() }
     }
 
     fn crafted(&self, sizes: HostileSizes) -> Vec<HostileFile> {
@@ -279,7 +294,12 @@ impl TemplateRun {
             self.with(18, &tiny_chunks(sizes.false_records / 70)),
             self.with(19, &[0; 1000]),
         ];
-        let other = |name: String, bytes: &[u8]| HostileFile { name, bytes: bytes.to_vec(), size: bytes.len() as u64 };
+        let other = |name: String, bytes: &[u8]| HostileFile {
+            name,
+            bytes: bytes.to_vec(),
+            size: bytes.len() as u64,
+            end: Vec::new(),
+        };
         files.push(other("empty.mcap".to_owned(), b""));
         files.push(other("magic.mcap".to_owned(), b"\x89MCAP0\r\n"));
         files.push(other("text.mcap".to_owned(), b"this is no MCAP file"));
@@ -329,6 +349,10 @@ impl TemplateRun {
                 _ => {}
             }
         }
+        // A file without an end is not read: half of those that lost theirs have it again.
+        if number.is_multiple_of(2) && !has_file_end(&file.bytes) {
+            file.bytes.extend(self.end());
+        }
         file.size = file.bytes.len() as u64;
         file
     }
@@ -338,7 +362,9 @@ impl HostileFile {
     fn write(&self, inbox: &Path) -> io::Result<()> {
         let path = inbox.join(&self.name);
         fs::write(&path, &self.bytes)?;
-        File::options().write(true).open(path)?.set_len(self.size)
+        let file = File::options().write(true).open(path)?;
+        file.set_len(self.size)?;
+        file.write_all_at(&self.end, self.size - self.end.len() as u64)
     }
 }
 
@@ -348,9 +374,30 @@ fn command(binary: &Path, folder: &Path, lake: &str) -> Command {
     command
 }
 
-fn run_files(folder: &Path) -> usize {
-    let Ok(listed) = fs::read_dir(folder) else { return 0 };
-    listed.filter(|entry| entry.as_ref().is_ok_and(|e| e.path().extension().is_some_and(|e| e == "mcap"))).count()
+fn run_files(folder: &Path) -> Vec<PathBuf> {
+    let Ok(listed) = fs::read_dir(folder) else { return Vec::new() };
+    listed.flatten().map(|entry| entry.path()).filter(|path| path.extension().is_some_and(|e| e == "mcap")).collect()
+}
+
+fn has_file_end(bytes: &[u8]) -> bool {
+    let footer = bytes.len().checked_sub(FILE_END_BYTES as usize);
+    footer.is_some_and(|footer| bytes[footer..].starts_with(&FOOTER_FRAME)) && bytes.ends_with(mcap::MAGIC)
+}
+
+// Those that do not stay where they are for lack of an end.
+fn waiting_files(inbox: &Path) -> usize {
+    run_files(inbox).iter().filter(|path| !is_unfinished(path).unwrap_or(true)).count()
+}
+
+fn is_unfinished(path: &Path) -> io::Result<bool> {
+    let file = File::open(path)?;
+    let size = file.metadata()?.len();
+    let mut first = vec![0; size.min(mcap::MAGIC.len() as u64) as usize];
+    file.read_exact_at(&mut first, 0)?;
+    let mut tail = vec![0; size.min(FILE_END_BYTES) as usize];
+    file.read_exact_at(&mut tail, size - tail.len() as u64)?;
+    let is_begun = mcap::MAGIC.starts_with(&first) || first.iter().all(|byte| *byte == 0);
+    Ok(is_begun && !has_file_end(&tail))
 }
 
 fn peak_mib(pid: u32) -> Option<u64> {

@@ -10,6 +10,7 @@ mod figure;
 mod forgetful;
 mod fuzz;
 mod hostile_files;
+mod inbox;
 mod installation;
 mod kills;
 mod large_chunk;

@@ -24,7 +24,7 @@ use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 
 use crate::mortal::{DeathMoment, MortalStore};
 use crate::skewed::{Interlude, SkewedStore};
-use crate::{CompletedRun, FileReport, LakeIngest, RunSource, pending};
+use crate::{CompletedRun, Error, FileReport, LakeIngest, RemovedFile, RunSource, find_removals, find_runs, pending};
 
 /// Ten points, so that a run takes milliseconds.
 const SMALL_RIG: &str = include_str!("../../tests/fixtures/small_rig.toml");
@@ -190,7 +190,7 @@ async fn refused_files_go_to_quarantine_with_the_reason_and_the_rest_goes_on() {
     let store = with_inbox(&runs).await;
     let reports = ingest(store.clone()).await.expect("ingested");
     let refused: Vec<_> = reports.iter().filter(|r| matches!(r, FileReport::Refused { .. })).collect();
-    assert_eq!(refused.len(), 1, "{refused:?}");
+    assert_eq!(refused.len(), 2, "{refused:?}");
     let reason = store.get(&Path::from("quarantine/text.mcap.reason.txt")).await.expect("a reason");
     let reason = String::from_utf8(reason.bytes().await.expect("bytes").to_vec()).expect("text");
     assert!(reason.contains("is not an MCAP file"), "{reason}");
@@ -203,10 +203,55 @@ async fn refused_files_go_to_quarantine_with_the_reason_and_the_rest_goes_on() {
             _ => None,
         })
         .collect();
-    assert_eq!(taken.len(), 2, "{taken:?}");
-    let foam = taken.iter().find(|t| t.0 == "foam").expect("the cut run");
-    assert!(!foam.1 && foam.2 < 45, "{foam:?}");
-    assert!(ingest(store).await.expect("ingested").is_empty(), "nothing is left in the inbox");
+    assert_eq!(taken, [("flat", true, 45)]);
+    // What is not whole stays.
+    let again = ingest(store.clone()).await.expect("ingested");
+    let [FileReport::Refused { why: Error::Unfinished { bytes, .. }, moved: None, .. }] = again.as_slice() else {
+        panic!("{again:?}")
+    };
+    assert_eq!(*bytes, cut as u64);
+    store.head(&Path::from(format!("inbox/{}", runs[1].0))).await.expect("where it was");
+}
+
+// As somebody deletes it, or another program moves it.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_file_that_is_gone_when_it_is_read_does_not_end_the_batch() {
+    let runs = runs(&["flat", "foam", "wood"]);
+    let store = with_inbox(&runs).await;
+    let (lake, mut reports) = (lake(store.clone()).await.expect("a lake"), Vec::new());
+    let sources = pending(&lake).await.expect("listed");
+    store.delete(&Path::from(format!("inbox/{}", runs[1].0))).await.expect("deleted");
+    let ingest = LakeIngest::new(&lake, Arc::default());
+    ingest.take_in(sources, &mut |report| reports.push(report)).await.expect("the others are ingested");
+    let gone = reports.iter().filter(|r| matches!(r, FileReport::Gone(_))).count();
+    let taken = reports.iter().filter(|r| matches!(r, FileReport::Taken(_))).count();
+    assert_eq!((gone, taken), (1, 2), "{reports:?}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn runs_are_found_by_name_and_by_path() {
+    let runs = runs(&["flat", "foam"]);
+    let store = with_inbox(&runs).await;
+    store.put(&Path::from("inbox/sub/own name.mcap"), runs[1].1.clone().into()).await.expect("written");
+    let place = format!("runs/flat/{}", runs[0].0);
+    store.rename(&Path::from(format!("inbox/{}", runs[0].0)), &Path::from(place.clone())).await.expect("moved");
+    let lake = lake(store).await.expect("a lake");
+    let in_inbox = format!("inbox/{}", runs[1].0);
+    let cases = [
+        (runs[0].0.trim_end_matches(".mcap"), Some(place.as_str())),
+        (&runs[0].0, Some(&place)),
+        (&place, Some(&place)),
+        (&runs[1].0, Some(&in_inbox)),
+        (&in_inbox, Some(&in_inbox)),
+        ("own name", Some("inbox/sub/own name.mcap")),
+        ("inbox/own name.mcap", None),
+        ("lake.toml", None),
+        ("", None),
+    ];
+    let found = find_runs(&lake, &cases.map(|(name, _)| name)).await.expect("looked up");
+    for ((name, expected), found) in cases.into_iter().zip(found) {
+        assert_eq!(found.as_ref().map(Path::as_ref), expected, "{name}");
+    }
 }
 
 // A sparse file costs its maker nothing, whatever its records claim.
@@ -251,8 +296,102 @@ async fn a_chunk_whose_records_end_early_is_told() {
     assert!(taken.damaged.iter().any(|d| d.starts_with(&place)), "{:?}", taken.damaged);
 }
 
+// Removes a run and derives what rested on it.
+async fn remove(store: Arc<dyn ObjectStore>, file: &str, kept: RemovedFile) -> crate::Result<()> {
+    let lake = lake(store).await?;
+    let ingest = LakeIngest::new(&lake, Arc::default());
+    match find_removals(&lake, &[file.to_owned()]).await {
+        // The first time was enough.
+        Err(Error::NoRun { .. }) => {}
+        found => ingest.remove(&mut found?, kept, "a test").await?,
+    }
+    ingest.complete(&mut |_, _| {}).await?;
+    Ok(())
+}
+
 mod slow {
     use super::*;
+
+    // An earlier version took half of a copy for a run, and the whole file comes.
+    #[tokio::test(flavor = "multi_thread")]
+    async fn a_whole_file_replaces_its_beginning_whatever_dies_on_the_way() {
+        let runs = runs(&["flat", "foam", "wood"]);
+        let undisturbed = with_inbox(&runs).await;
+        ingest(undisturbed.clone()).await.expect("ingested");
+        let expected = tables(undisturbed).await;
+        let (name, whole) = &runs[2];
+        let in_inbox = Path::from(format!("inbox/{name}"));
+        let start = with_inbox(&runs[..2]).await;
+        ingest(start.clone()).await.expect("ingested");
+        let half = whole.slice(..whole.len() * 3 / 5);
+        start.put(&in_inbox, half.into()).await.expect("written");
+        let lake = lake(start.clone()).await.expect("a lake");
+        let partial = LakeIngest::new(&lake, Arc::default())
+            .take_in_without_end(&RunSource::Lake(in_inbox.clone()))
+            .await
+            .expect("ingested as it was once");
+        assert!(partial.measurements < 45 && !partial.whole, "{partial:?}");
+        start.put(&in_inbox, whole.clone().into()).await.expect("written");
+        let deaths = each_death(&start, ingest, async |inner, death| {
+            let reports = ingest(inner.clone()).await.unwrap_or_else(|e| panic!("{death}: {e}"));
+            assert!(reports.iter().all(|r| matches!(r, FileReport::Taken(_))), "{death}: {reports:?}");
+            assert!(tables(inner.clone()).await == expected, "{death}: other files");
+            let kept = inner.get(&Path::from(format!("runs/wood/{name}"))).await.expect("there");
+            assert!(kept.bytes().await.expect("bytes") == *whole, "{death}: another file");
+            assert!(inner.head(&in_inbox).await.is_err(), "{death}: it is still in the inbox");
+        })
+        .await;
+        assert!(deaths > 20, "{deaths} deaths");
+
+        // Two files in one are no longer file: what the lake has ends as a closed file does.
+        let both = [&runs[0].1[..], &runs[1].1[..]].concat();
+        start.put(&Path::from(format!("inbox/{}", runs[0].0)), both.into()).await.expect("written");
+        let reports = ingest(start.clone()).await.expect("ingested");
+        let refused = |r: &FileReport| matches!(r, FileReport::Refused { why: Error::OtherContent { .. }, .. });
+        assert!(reports.iter().any(refused), "{reports:?}");
+    }
+
+    // A death at each write of a removal: once it is repeated, the lake's rows are those of one that never had the run.
+    #[tokio::test(flavor = "multi_thread")]
+    async fn a_removed_run_leaves_nothing_whatever_dies_on_the_way() {
+        let runs = runs(&["flat", "foam", "wood", "flat"]);
+        for (removed, is_merged) in [(2, false), (3, true)] {
+            let mut others = runs.clone();
+            let (name, bytes) = others.remove(removed);
+            let without = with_inbox(&others).await;
+            ingest(without.clone()).await.expect("ingested");
+            let expected = rows(without).await;
+            let start = with_inbox(&runs).await;
+            ingest(start.clone()).await.expect("ingested");
+            if is_merged {
+                tidy(start.clone()).await.expect("merged");
+            }
+            let surface = if removed == 2 { "wood" } else { "flat" };
+            let work = async |store| remove(store, &name, RemovedFile::Kept).await;
+            let deaths = each_death(&start, work, async |inner, death| {
+                // What readers see meanwhile is the run as a whole, or nothing of it.
+                ingest(inner.clone()).await.unwrap_or_else(|e| panic!("{death}: {e}"));
+                let seen = rows(inner.clone()).await[Table::Runs.name()].len();
+                assert!(seen == 3 || seen == 4, "{death}: {seen} runs");
+                remove(inner.clone(), &name, RemovedFile::Kept).await.unwrap_or_else(|e| panic!("{death}: {e}"));
+                assert!(ingest(inner.clone()).await.expect("ingested").is_empty(), "{death}: it is back");
+                let actual = rows(inner.clone()).await;
+                for (table, rows) in &expected {
+                    assert!(actual[table] == *rows, "{death}: other rows of {table}");
+                }
+                assert!(inner.head(&Path::from(format!("runs/{surface}/{name}"))).await.is_err(), "{death}");
+                let kept = inner.get(&Path::from(format!("quarantine/{name}"))).await;
+                let kept = match kept {
+                    Ok(kept) => kept,
+                    // It died between the reason and the file.
+                    Err(_) => inner.get(&Path::from(format!("quarantine/2-{name}"))).await.expect("kept"),
+                };
+                assert!(kept.bytes().await.expect("bytes") == bytes, "{death}: another file is kept");
+            })
+            .await;
+            assert!(deaths > 20, "{deaths} deaths");
+        }
+    }
 
     // A death at each write, made or not: afterwards ingest is run once more, and the tables are those of an ingest
     // that nothing disturbed, byte for byte.

@@ -801,3 +801,72 @@ fn absolute(file: &FsPath) -> Result<Path> {
     let absolute = std::path::absolute(file).map_err(|e| Error::read(file.display(), e))?;
     Path::from_absolute_path(absolute).map_err(|e| Error::read(file.display(), e))
 }
+
+#[cfg(test)]
+mod tests {
+    use echolake_lake::ReferenceSurfaces;
+    use object_store::memory::InMemory;
+
+    use super::*;
+
+    async fn lake_in(store: Arc<dyn ObjectStore>) -> Lake {
+        let made = Lake::open_or_create_in(store, "a lake", &Rig::paper(), &ReferenceSurfaces::default()).await;
+        made.expect("a lake")
+    }
+
+    #[tokio::test]
+    async fn two_refused_files_of_one_name_get_two_names() {
+        let store = Arc::new(InMemory::new());
+        let lake = lake_in(store.clone()).await;
+        let paths = ["a", "b", "c"].map(|folder| Path::from(format!("inbox/{folder}/x.mcap")));
+        for path in &paths {
+            store.put(path, path.to_string().into()).await.expect("written");
+        }
+        let [a, b, c] = &paths;
+        let (a, b, c) =
+            tokio::join!(set_aside(&lake, a, "why a"), set_aside(&lake, b, "why b"), set_aside(&lake, c, "why c"));
+        let mut names = Vec::new();
+        for (moved, letter) in [(a, "a"), (b, "b"), (c, "c")] {
+            let moved = moved.expect("moved").expect("it was there");
+            let text = async |path: &Path| store.get(path).await.expect("there").bytes().await.expect("bytes");
+            assert_eq!(text(&moved).await, format!("inbox/{letter}/x.mcap"));
+            assert_eq!(text(&reason_path(&moved)).await, format!("why {letter}\n"));
+            names.push(moved.to_string());
+        }
+        names.sort();
+        assert_eq!(names, ["quarantine/2-x.mcap", "quarantine/3-x.mcap", "quarantine/x.mcap"]);
+        assert_eq!(set_aside(&lake, &paths[0], "again").await.expect("nothing to do"), None);
+    }
+
+    #[tokio::test]
+    async fn a_file_that_changed_or_went_since_it_was_read_is_not_moved() {
+        let place = tempfile::tempdir().expect("a folder");
+        let url = place.path().join("lake").display().to_string();
+        let lake = Lake::open_or_create(&url, &Rig::paper(), &ReferenceSurfaces::default()).await.expect("a lake");
+        fs::create_dir(place.path().join("lake/inbox")).expect("made");
+        let outside = place.path().join("outside.mcap");
+        let inside = place.path().join("lake/inbox/x.mcap");
+        let to = Path::from("runs/flat/x.mcap");
+        for (source, file) in
+            [(RunSource::Lake(Path::from("inbox/x.mcap")), &inside), (RunSource::File(outside.clone()), &outside)]
+        {
+            let sha256 = "7".repeat(64);
+            let integrity = FileIntegrity { bytes: 5, sha256, closed: true, damage: Vec::new() };
+            fs::write(file, "12345").expect("written");
+            let version = FileVersion::read(&lake, &source).await.expect("there");
+            let read = ReadFile::check(&lake, &source, version, &integrity).await.expect("read");
+            fs::write(file, "123456").expect("written");
+            let changed = keep(&lake, &source, &to, &read, false).await.expect_err("it is another file");
+            assert!(matches!(changed, Error::Changed { .. }) && changed.to_string().contains("6 bytes"), "{changed}");
+            assert!(file.exists() && lake.store().head(&to).await.is_err(), "{source}");
+            fs::remove_file(file).expect("removed");
+            let gone = keep(&lake, &source, &to, &read, false).await.expect_err("it is gone");
+            assert!(gone.is_refusal(), "{gone}");
+            // A link in its place is not followed.
+            std::os::unix::fs::symlink("/etc/passwd", file).expect("linked");
+            let followed = FileVersion::read(&lake, &source).await.is_ok();
+            assert_eq!(followed, matches!(source, RunSource::File(_)));
+            fs::remove_file(file).expect("removed");
+        }
+    }
+}

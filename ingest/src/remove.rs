@@ -5,7 +5,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use echolake_lake::{Lake, LakeSnapshot};
+use echolake_lake::{Lake, LakeSnapshot, RemovalRecord};
 use echolake_schema::tables::Table;
 use echolake_schema::{RunId, SurfaceId};
 use object_store::path::Path;
@@ -117,10 +117,9 @@ impl LakeIngest<'_> {
                 RemovedFile::Deleted => files::delete_run(lake, &path).await?,
             }
         }
-        lake.remove_runs(&runs).await?;
-        for removal in removals.iter() {
-            let (run, surface, measurements) = (&removal.run, &removal.surface, removal.measurements);
-            tracing::info!(%run, %surface, measurements, by, moved_to = removal.moved_to, "a run was removed");
+        lake.remove_runs(&RemovalRecord { runs: runs.clone(), by: by.to_owned() }).await?;
+        for RunRemoval { run, surface, measurements, moved_to, .. } in removals.iter() {
+            tracing::info!(%run, %surface, measurements, by, moved_to, "a run was removed");
         }
         let snapshot = lake.snapshot().await?;
         match runs.iter().find(|run| snapshot.run(run).is_some()) {

@@ -63,7 +63,8 @@ async fn remove(
 ) -> anyhow::Result<()> {
     let file = if args.delete { RemovedFile::Deleted } else { RemovedFile::Kept };
     let user = ["USER", "LOGNAME"].iter().find_map(|name| std::env::var(name).ok());
-    ingest.remove(removals, file, user.as_deref().unwrap_or("an unknown user")).await?;
+    let user = user.unwrap_or_else(|| format!("user {}", rustix::process::getuid().as_raw()));
+    ingest.remove(removals, file, &user).await?;
     // Rows that were derived with them.
     let mut rows = 0;
     let completion = ingest.complete(&mut |completed, _| rows += completed.measurements).await?;

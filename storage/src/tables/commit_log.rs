@@ -1,6 +1,6 @@
 //! Commit log of a lake's tables, as a trait. Delta implements it; see `delta.rs`.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::{BTreeSet, HashMap, HashSet};
 use std::ops::Range;
 
 use async_trait::async_trait;
@@ -172,8 +172,23 @@ pub struct TableCommit {
     pub remove: Vec<LoggedFile>,
     /// Its effect on readers.
     pub effect: CommitEffect,
-    /// The runs whose rows somebody removes by it, for the log's readers.
-    pub removed_runs: Vec<RunId>,
+    /// If it removes runs: which, and who asked for it.
+    pub removal: Option<RemovalRecord>,
+}
+
+impl From<CommitEffect> for TableCommit {
+    fn from(effect: CommitEffect) -> Self {
+        Self { effect, ..Self::default() }
+    }
+}
+
+/// What a log says of a removal of runs.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct RemovalRecord {
+    /// The runs.
+    pub runs: BTreeSet<RunId>,
+    /// The user who removed them.
+    pub by: String,
 }
 
 /// The names of a table's files, as the log knows them.

@@ -14,8 +14,8 @@ use std::time::{Duration, Instant};
 use arrow::datatypes::{DataType as ArrowType, Field, SchemaRef};
 use async_trait::async_trait;
 use chrono::{DateTime, Utc};
+use echolake_schema::Rig;
 use echolake_schema::tables::Table;
-use echolake_schema::{Rig, RunId};
 use object_store::ObjectStore;
 use object_store::path::Path;
 use percent_encoding::percent_decode_str;
@@ -31,7 +31,7 @@ use crate::remote::backoff;
 use crate::tables::snapshot::{decode_parts, encode_parts, is_merged};
 use crate::{
     CommitEffect, CommitLog, CommitOutcome, DataFile, Error, FileHistory, FileStats, LoggedFile, NewFile,
-    ReplacedFiles, Result, RunPart, TableChange, TableCommit, TableVersion, TableView,
+    RemovalRecord, ReplacedFiles, Result, RunPart, TableChange, TableCommit, TableVersion, TableView,
 };
 
 /// Tries of one commit against other writers; each loses to a commit that went through.
@@ -183,15 +183,15 @@ struct PendingChange<'a> {
     add: Vec<&'a NewFile>,
     remove: BTreeSet<String>,
     effect: CommitEffect,
-    removed_runs: &'a [RunId],
+    removal: Option<&'a RemovalRecord>,
 }
 
 impl<'a> PendingChange<'a> {
     fn of(commit: &'a TableCommit, mut known: HashMap<String, KnownFile>) -> Self {
         let gone = commit.remove.iter().filter(|file| is_known(file, &known));
         let remove = gone.map(|file| file.name.clone()).collect();
-        let (effect, removed_runs) = (commit.effect, commit.removed_runs.as_slice());
-        let mut change = Self { outcomes: Vec::new(), add: Vec::new(), remove, effect, removed_runs };
+        let (effect, removal) = (commit.effect, commit.removal.as_ref());
+        let mut change = Self { outcomes: Vec::new(), add: Vec::new(), remove, effect, removal };
         for file in &commit.add {
             let outcome = change.outcome(file, &known);
             if outcome == CommitOutcome::Now {
@@ -218,11 +218,11 @@ impl<'a> PendingChange<'a> {
     fn log_lines(&self, state: &TableState, now_millis: i64) -> Vec<LogLine> {
         let data_change = self.effect == CommitEffect::Rows;
         let largest = self.add.iter().map(|f| f.bytes).max().unwrap_or(0);
-        let (operation, parameters) = match self.effect {
-            CommitEffect::Rows if !self.removed_runs.is_empty() => ("DELETE", removal_parameters(self.removed_runs)),
-            CommitEffect::Rows if self.remove.is_empty() => ("WRITE", json!({ "mode": "Append" })),
-            CommitEffect::Rows => ("WRITE", json!({ "mode": "Overwrite" })),
-            CommitEffect::Layout => ("OPTIMIZE", json!({ "targetSize": largest.to_string() })),
+        let (operation, parameters) = match (self.removal, self.effect) {
+            (Some(removal), _) => ("DELETE", removal_parameters(removal)),
+            (None, CommitEffect::Rows) if self.remove.is_empty() => ("WRITE", json!({ "mode": "Append" })),
+            (None, CommitEffect::Rows) => ("WRITE", json!({ "mode": "Overwrite" })),
+            (None, CommitEffect::Layout) => ("OPTIMIZE", json!({ "targetSize": largest.to_string() })),
         };
         let removed = state.files.values().filter(|f| self.remove.contains(&file_name(&f.path)));
         let removed =
@@ -462,11 +462,10 @@ fn commit_info(operation: &str, parameters: Value, now_millis: i64) -> LogLine {
 }
 
 // As Delta writes a deletion, with the one who asked for it.
-fn removal_parameters(runs: &[RunId]) -> Value {
-    let names: Vec<_> = runs.iter().map(|run| format!("'{run}'")).collect();
+fn removal_parameters(removal: &RemovalRecord) -> Value {
+    let names: Vec<_> = removal.runs.iter().map(|run| format!("'{run}'")).collect();
     let predicate = json!([format!("run_id IN ({})", names.join(", "))]).to_string();
-    let user = ["USER", "LOGNAME"].iter().find_map(|name| std::env::var(name).ok());
-    json!({ "predicate": predicate, "by": user.unwrap_or_else(|| "unknown".to_owned()) })
+    json!({ "predicate": predicate, "by": removal.by })
 }
 
 // Names of ours have no character that Delta would percent-encode.

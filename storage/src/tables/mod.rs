@@ -19,8 +19,8 @@ mod versions;
 pub use batch_builder::BatchBuilder;
 pub use claims::{ClaimOutcome, ClaimTimes, WorkClaims};
 pub use commit_log::{
-    CommitEffect, CommitLog, CommitOutcome, DataFile, FileHistory, FileStats, LoggedFile, NewFile, ReplacedFiles,
-    RunPart, TableChange, TableCommit, TableVersion, TableView,
+    CommitEffect, CommitLog, CommitOutcome, DataFile, FileHistory, FileStats, LoggedFile, NewFile, RemovalRecord,
+    ReplacedFiles, RunPart, TableChange, TableCommit, TableVersion, TableView,
 };
 pub use data_file::{EncodedFile, FileEncoder, encode};
 pub use delta::delta_schema;

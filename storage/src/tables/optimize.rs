@@ -8,8 +8,8 @@
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use echolake_schema::ProjectName;
 use echolake_schema::tables::{Source, Table};
-use echolake_schema::{ProjectName, RunId};
 use futures::TryStreamExt as _;
 use serde::Serialize;
 use sha2::{Digest as _, Sha256};
@@ -17,7 +17,7 @@ use sha2::{Digest as _, Sha256};
 use crate::tables::lease::MaintenanceLease;
 use crate::{
     CommitEffect, CommitOutcome, DataFile, Error, FileEncoder, FileName, Lake, LakeSnapshot, ReferenceSurfaces,
-    ReplacedFiles, Result, RunPart, TableCommit,
+    RemovalRecord, ReplacedFiles, Result, RunPart, TableCommit,
 };
 
 /// Default size that files are merged to: few enough for a million responses, small enough to be held in memory.
@@ -94,7 +94,6 @@ impl Lake {
             Table::ALL.into_iter().map(|table| (table, plan(&snapshot, &readers, table, target_bytes))).collect();
         let total = plans.iter().flat_map(|(_, groups)| groups).map(Vec::len).sum();
         let (mut report, mut done) = (OptimizeReport::default(), 0);
-        let layout = || TableCommit { effect: CommitEffect::Layout, ..TableCommit::default() };
         for (table, groups) in plans.into_iter().filter(|(_, groups)| !groups.is_empty()) {
             let name = table.name();
             let mut of =
@@ -105,7 +104,7 @@ impl Lake {
                     report.stopped = true;
                     break;
                 }
-                match self.merge(table, group, layout(), Some(&mut *lease)).await? {
+                match self.merge(table, group, CommitEffect::Layout.into(), Some(&mut *lease)).await? {
                     (CommitOutcome::Outdated, _) => of.outdated += 1,
                     (_, bytes) => {
                         of.merged += group.len();
@@ -123,7 +122,7 @@ impl Lake {
 
     /// Rewrites a merged file without its superseded rows. If another writer did so meanwhile, nothing changes.
     pub(crate) async fn rewrite(&self, table: Table, file: &DataFile) -> Result<CommitOutcome> {
-        self.rewrite_without(table, file, &[]).await
+        self.rewrite_without(table, file, None).await
     }
 
     /// The same, for the rows of runs that somebody removes, which the file hides.
@@ -131,9 +130,9 @@ impl Lake {
         &self,
         table: Table,
         file: &DataFile,
-        removed_runs: &[RunId],
+        removal: Option<RemovalRecord>,
     ) -> Result<CommitOutcome> {
-        let change = TableCommit { removed_runs: removed_runs.to_vec(), ..TableCommit::default() };
+        let change = TableCommit { removal, ..TableCommit::default() };
         let (outcome, _) = self.merge(table, std::slice::from_ref(file), change, None).await?;
         Ok(outcome)
     }

@@ -9,7 +9,7 @@ use echolake_schema::RunId;
 use echolake_schema::tables::Table;
 
 use crate::tables::snapshot::run_of;
-use crate::{DataFile, Error, Lake, Result, TableCommit};
+use crate::{DataFile, Error, Lake, RemovalRecord, Result, TableCommit};
 
 /// Looks at one table, each after another writer changed a file at the same moment.
 const ROUNDS: usize = 20;
@@ -20,10 +20,10 @@ impl Lake {
     ///
     /// # Errors
     /// What the store says. Tables that were changed before stay so.
-    pub async fn remove_runs(&self, runs: &BTreeSet<RunId>) -> Result<usize> {
-        let mut count = self.remove_rows(Table::Runs, runs).await?;
+    pub async fn remove_runs(&self, removal: &RemovalRecord) -> Result<usize> {
+        let mut count = self.remove_rows(Table::Runs, removal).await?;
         for table in Table::ALL.into_iter().filter(|table| *table != Table::Runs) {
-            count += self.remove_rows(table, runs).await?;
+            count += self.remove_rows(table, removal).await?;
         }
         Ok(count)
     }
@@ -42,13 +42,13 @@ impl Lake {
         Ok(false)
     }
 
-    async fn remove_rows(&self, table: Table, runs: &BTreeSet<RunId>) -> Result<usize> {
+    async fn remove_rows(&self, table: Table, removal: &RemovalRecord) -> Result<usize> {
         let mut count = 0;
         for _ in 0..ROUNDS {
             let files = self.log().files(table).await?;
             let (mut whole, mut shared) = (Vec::new(), Vec::new());
             for file in files {
-                match parts_of(&file, runs) {
+                match parts_of(&file, &removal.runs) {
                     of if of.is_empty() => {}
                     of if of.len() < file.parts.len() => shared.push(DataFile { hidden: of, ..file }),
                     _ => whole.push(file.logged()),
@@ -58,14 +58,13 @@ impl Lake {
                 return Ok(count);
             }
             count += whole.len() + shared.len();
-            let removed_runs: Vec<_> = runs.iter().cloned().collect();
             if !whole.is_empty() {
-                let removed_runs = removed_runs.clone();
-                let commit = TableCommit { remove: whole, removed_runs, ..TableCommit::default() };
+                let removal = Some(removal.clone());
+                let commit = TableCommit { remove: whole, removal, ..TableCommit::default() };
                 self.log().commit(table, &commit).await?;
             }
             for file in &shared {
-                self.rewrite_without(table, file, &removed_runs).await?;
+                self.rewrite_without(table, file, Some(removal.clone())).await?;
             }
         }
         let source = format!("other writers changed its files in {ROUNDS} tries; hint: run the command again").into();

@@ -205,7 +205,7 @@ async fn a_merge_of_what_is_replaced_meanwhile_changes_nothing() {
     put(&lake, "flat", "r1", "d2", 77).await;
     lake.remove_superseded().await.expect("cleaned up");
     let (before, named) = (seen(&lake).await, files(&lake).await);
-    let (outcome, _) = lake.merge(TABLE, &planned, CommitEffect::Layout, None).await.expect("no error");
+    let (outcome, _) = lake.merge(TABLE, &planned, CommitEffect::Layout.into(), None).await.expect("no error");
     assert_eq!(outcome, CommitOutcome::Outdated);
     assert_eq!(files(&lake).await, named);
     assert!(seen(&lake).await == before, "other rows");
@@ -222,7 +222,7 @@ async fn of_two_merges_at_once_one_is_made() {
             let (store, planned) = (store.clone(), planned.clone());
             tokio::spawn(async move {
                 let lake = open(&store).await;
-                lake.merge(TABLE, &planned[range], CommitEffect::Layout, None).await.expect("no error").0
+                lake.merge(TABLE, &planned[range], CommitEffect::Layout.into(), None).await.expect("no error").0
             })
         };
         let (a, b) = tokio::join!(merge(0..4), merge(1..5));
@@ -339,7 +339,7 @@ async fn projects_are_not_merged_and_readers_see_parts_of_files_that_were() {
     };
     assert_eq!((seen_runs(&reader_of(&lake, &["a"])).await.len(), whole(&reader_of(&lake, &["a"])).await), (4, 2));
     // As a version without projects merged them.
-    lake.merge(TABLE, &merged, CommitEffect::Layout, None).await.expect("merged");
+    lake.merge(TABLE, &merged, CommitEffect::Layout.into(), None).await.expect("merged");
     assert_eq!(files(&lake).await.len(), 1);
     let reader = reader_of(&lake, &["a"]);
     assert_eq!(
