@@ -394,8 +394,9 @@ fn is_unfinished(path: &Path) -> io::Result<bool> {
     let size = file.metadata()?.len();
     let mut first = vec![0; size.min(mcap::MAGIC.len() as u64) as usize];
     file.read_exact_at(&mut first, 0)?;
-    let mut tail = vec![0; size.min(FILE_END_BYTES) as usize];
-    file.read_exact_at(&mut tail, size - tail.len() as u64)?;
+    let length = size.min(FILE_END_BYTES);
+    let mut tail = vec![0; length as usize];
+    file.read_exact_at(&mut tail, size - length)?;
     let is_begun = mcap::MAGIC.starts_with(&first) || first.iter().all(|byte| *byte == 0);
     Ok(is_begun && !has_file_end(&tail))
 }

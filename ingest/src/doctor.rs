@@ -14,6 +14,7 @@ use crate::error::{Error, Result};
 use crate::files::has_end;
 use crate::read_back;
 use crate::references::ReferenceFinder;
+use crate::remove::find_removed;
 use crate::rows::runs::text_of;
 
 /// Result of a check of a lake.
@@ -148,6 +149,11 @@ async fn check_run(
     let (run, path, state) = (text("run_id"), text("file"), text("state"));
     for finding in check_run_file(lake, &Path::from(path.as_str()), &text("file_sha256"), report).await? {
         report.find(FindingSeverity::Damaged, &path, finding);
+    }
+    let removed = find_removed(lake, &run).await;
+    if let Some(removed) = removed.filter(|_| report.findings.iter().any(|f| f.subject == path)) {
+        let what = format!("its file is at `{removed}`; hint: `echolake remove {run}` resumes its removal");
+        report.find(FindingSeverity::Damaged, &run, what);
     }
     if state == "partial" {
         report.find(

@@ -721,12 +721,14 @@ fn reason_path(refused: &Path) -> Path {
 // Of several processes that create a reason's file, one succeeds: two refused files of one name get two names.
 async fn reserve_name(lake: &Lake, name: &str, reason: &str) -> Result<Path> {
     let store = lake.store();
-    for number in 1.. {
+    let mut number = 1;
+    loop {
         let text = match number {
             1 => format!("{QUARANTINE}/{name}"),
             _ => format!("{QUARANTINE}/{number}-{name}"),
         };
         let path = Path::parse(&text).unwrap_or_else(|_| Path::from(text));
+        number += 1;
         match store.head(&path).await {
             Err(object_store::Error::NotFound { .. }) => {}
             Err(e) => return Err(written(&path, e)),
@@ -735,10 +737,10 @@ async fn reserve_name(lake: &Lake, name: &str, reason: &str) -> Result<Path> {
         let reserved = PutOptions::from(PutMode::Create);
         match store.put_opts(&reason_path(&path), format!("{reason}\n").into(), reserved).await {
             Err(object_store::Error::AlreadyExists { .. }) => {}
-            put => return put.map(|_| path.clone()).map_err(|e| written(&path, e)),
+            Err(e) => return Err(written(&path, e)),
+            Ok(_) => return Ok(path),
         }
     }
-    unreachable!("there is a number without a file")
 }
 
 // `check` is called when everything is copied, before the copy has the run's name.

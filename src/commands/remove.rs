@@ -1,5 +1,7 @@
 //! `echolake remove`: runs leave the lake, with their rows and their files.
 
+use std::os::unix::fs::MetadataExt as _;
+
 use clap::Args;
 use echolake_ingest::{LakeIngest, RemovedFile, RunRemoval, find_removals, find_removed};
 use echolake_lake::Lake;
@@ -62,9 +64,7 @@ async fn remove(
     progress: &CommandProgress,
 ) -> anyhow::Result<()> {
     let file = if args.delete { RemovedFile::Deleted } else { RemovedFile::Kept };
-    let user = ["USER", "LOGNAME"].iter().find_map(|name| std::env::var(name).ok());
-    let user = user.unwrap_or_else(|| format!("user {}", rustix::process::getuid().as_raw()));
-    ingest.remove(removals, file, &user).await?;
+    ingest.remove(removals, file, &user_name()).await?;
     // Rows that were derived with them.
     let mut rows = 0;
     let completion = ingest.complete(&mut |completed, _| rows += completed.measurements).await?;
@@ -72,6 +72,14 @@ async fn remove(
         progress.say(format!("{} runs have other references now, {rows} measurements derived", completion.changed));
     }
     Ok(())
+}
+
+// Services have no name of a user; the system's own files of this process belong to who runs it.
+fn user_name() -> String {
+    let name = ["USER", "LOGNAME"].iter().find_map(|name| std::env::var(name).ok());
+    let id =
+        || std::fs::metadata("/proc/self").map_or_else(|_| "of unknown id".to_owned(), |own| own.uid().to_string());
+    name.unwrap_or_else(|| format!("user {}", id()))
 }
 
 fn describe_removal(removal: &RunRemoval, args: &RemoveArgs) -> String {
