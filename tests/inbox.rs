@@ -207,6 +207,9 @@ mod slow {
     use super::*;
     use crate::kills::copy_folder;
 
+    /// Entries that are tried at once.
+    const AT_ONCE: usize = 6;
+
     // Each entry by each command that reads the inbox: the good run beside it is ingested, the entry is named, nothing
     // hangs (every command has a limit), and nothing outside of the lake is touched.
     #[test]
@@ -218,50 +221,60 @@ mod slow {
         std::fs::create_dir(&elsewhere).expect("made");
         std::fs::rename(&other, elsewhere.join("other.mcap")).expect("moved");
         let run = name(&good).trim_end_matches(".mcap").to_owned();
-        for InboxEntry { kind, make, named } in inbox_entries() {
-            let lake_with_entry = || {
-                let place = TestFolder::new();
-                copy_folder(&start.path("lake"), &place.path("lake"));
-                copy_folder(&elsewhere, &place.path("elsewhere"));
-                make(&place.path("lake/inbox"), &place.path("elsewhere"));
-                place
-            };
-            let check = |place: &TestFolder, said: &str| {
-                if let Some(named) = named {
-                    assert!(said.contains(named), "{kind}: expected `{named}` in: {said}");
+        // A watch waits for most of its time.
+        let entries = inbox_entries();
+        for entries in entries.chunks(AT_ONCE) {
+            std::thread::scope(|scope| {
+                for entry in entries {
+                    scope.spawn(|| check_entry(entry, &start, &run));
                 }
-                let runs = if named.is_some() { 1.0 } else { 2.0 };
-                assert_eq!(place.number("select count(*) from runs"), runs, "{kind}: {said}");
-                assert_eq!(place.number("select count(*) from measurements where surface_id = 'flat'"), 45.0, "{kind}");
-                assert!(place.path("elsewhere/other.mcap").is_file(), "{kind}: it is touched");
-                assert!(!said.contains('\u{1b}') && !said.contains("root:"), "{kind}: {said}");
-            };
-            let place = lake_with_entry();
-            let report = place.ok(&["doctor"]);
-            let listed = place.ok(&["sql", "--json", "select state, path, reason from system.inbox"]);
-            // Refused files are named once ingest has read them.
-            if let Some(named) = named.filter(|named| !named.contains("MCAP")) {
-                let reason = named.rsplit("passed over: ").next().expect("a text");
-                let reason = if reason.contains('`') { "control character" } else { reason };
-                assert!(report.contains(reason), "{kind}: {report}");
-                assert!(listed.contains("unusable") && listed.contains(reason), "{kind}: {listed}");
-            }
-            assert!(listed.contains(&run), "{kind}: {listed}");
-            let output = place.run(&["ingest"]);
-            assert_eq!(output.status.code(), Some(if named.is_some() { 3 } else { 0 }), "{kind}: {}", stderr(&output));
-            check(&place, &stderr(&output));
-            place.ok(&["doctor"]);
-
-            let place = lake_with_entry();
-            let mut watch = start_watch(&place);
-            watch.wait_for_line(&format!("{run}: 45 measurements"));
-            // The commit of its rows follows its line, and the others' lines may come before or behind.
-            watch.wait_for_line(named.unwrap_or("foam"));
-            watch.wait_for_line("ingest: ");
-            watch.signal("TERM");
-            let output = watch.wait();
-            assert_eq!(output.status.code(), Some(if named.is_some() { 3 } else { 0 }), "{kind}: {}", stderr(&output));
-            check(&place, &stderr(&output));
+            });
         }
+    }
+
+    fn check_entry(InboxEntry { kind, make, named }: &InboxEntry, start: &TestFolder, run: &str) {
+        let named = *named;
+        let lake_with_entry = || {
+            let place = TestFolder::new();
+            copy_folder(&start.path("lake"), &place.path("lake"));
+            copy_folder(&start.path("elsewhere"), &place.path("elsewhere"));
+            make(&place.path("lake/inbox"), &place.path("elsewhere"));
+            place
+        };
+        let check = |place: &TestFolder, said: &str| {
+            if let Some(named) = named {
+                assert!(said.contains(named), "{kind}: expected `{named}` in: {said}");
+            }
+            let runs = if named.is_some() { 1.0 } else { 2.0 };
+            assert_eq!(place.number("select count(*) from runs"), runs, "{kind}: {said}");
+            assert_eq!(place.number("select count(*) from measurements where surface_id = 'flat'"), 45.0, "{kind}");
+            assert!(place.path("elsewhere/other.mcap").is_file(), "{kind}: it is touched");
+            assert!(!said.contains('\u{1b}') && !said.contains("root:"), "{kind}: {said}");
+        };
+        let place = lake_with_entry();
+        let report = place.ok(&["doctor"]);
+        let listed = place.ok(&["sql", "--json", "select state, path, reason from system.inbox"]);
+        // Refused files are named once ingest has read them.
+        if let Some(named) = named.filter(|named| !named.contains("MCAP")) {
+            let reason = named.rsplit("passed over: ").next().expect("a text");
+            let reason = if reason.contains('`') { "control character" } else { reason };
+            assert!(report.contains(reason), "{kind}: {report}");
+            assert!(listed.contains("unusable") && listed.contains(reason), "{kind}: {listed}");
+        }
+        assert!(listed.contains(run), "{kind}: {listed}");
+        let output = place.run(&["ingest"]);
+        assert_eq!(output.status.code(), Some(if named.is_some() { 3 } else { 0 }), "{kind}: {}", stderr(&output));
+        check(&place, &stderr(&output));
+        place.ok(&["doctor"]);
+
+        let place = lake_with_entry();
+        let mut watch = start_watch(&place);
+        watch.wait_for_line(&format!("{run}: 45 measurements"));
+        watch.wait_for_line(named.unwrap_or("foam"));
+        watch.wait_for_line("ingest: ");
+        watch.signal("TERM");
+        let output = watch.wait();
+        assert_eq!(output.status.code(), Some(if named.is_some() { 3 } else { 0 }), "{kind}: {}", stderr(&output));
+        check(&place, &stderr(&output));
     }
 }

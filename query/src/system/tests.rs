@@ -79,9 +79,12 @@ async fn the_inbox_has_what_waits_and_why_files_were_refused() {
     ] {
         lake.store().put(&Path::from(path), content.to_owned().into()).await.expect("written");
     }
+    let closed = [&[2, 20, 0, 0, 0, 0, 0, 0, 0][..], &[0; 20], b"\x89MCAP0\r\n"].concat();
+    lake.store().put(&Path::from("inbox/closed.mcap"), closed.into()).await.expect("written");
     for (rows, condition) in [
-        (5, "changed > timestamp '2026-01-01T00:00:00Z'"),
-        (1, "state = 'waiting' and path = 'inbox/a.mcap' and bytes = 5 and reason is null"),
+        (6, "changed > timestamp '2026-01-01T00:00:00Z'"),
+        (1, "state = 'incomplete' and path = 'inbox/a.mcap' and bytes = 5 and reason is null"),
+        (1, "state = 'waiting' and path = 'inbox/closed.mcap' and bytes = 37"),
         (1, "state = 'recording' and path = 'inbox/b.mcap.partial'"),
         (1, "state = 'refused' and path = 'quarantine/c.mcap' and bytes = 3 and reason = 'no magic'"),
         (1, "path = 'quarantine/d.mcap' and reason is null"),
