@@ -31,11 +31,24 @@ enum CommandOutcome {
     WithLoss,
 }
 
+/// Arguments that a file contradicts, which clap cannot see.
+#[derive(Debug)]
+struct UsageError(String);
+
+impl std::fmt::Display for UsageError {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
+impl std::error::Error for UsageError {}
+
 /// More would not make a disk faster, and each keeps memory.
 const BLOCKING_THREADS: usize = 16;
 /// The library's 61 makes a client wait for a quarter of a second beside others that send without end.
 const TURNS_BETWEEN_EVENTS: u32 = 8;
 const FAILED: u8 = 1;
+const WRONG_USAGE: u8 = 2;
 const DONE_WITH_LOSS: u8 = 3;
 
 fn main() -> ExitCode {
@@ -57,7 +70,7 @@ fn main() -> ExitCode {
         Err(error) if is_broken_pipe(&error) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("error: {}", describe_error(&error));
-            ExitCode::from(FAILED)
+            ExitCode::from(if error.is::<UsageError>() { WRONG_USAGE } else { FAILED })
         }
     }
 }

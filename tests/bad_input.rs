@@ -166,9 +166,32 @@ fn rigs_whose_devices_are_unknown_or_absent() {
         ([audio, sensor, robots].concat(), "no_such_pcm"),
     ] {
         std::fs::write(place.path("rig.toml"), format!("{rig}\n{devices}")).expect("written");
-        place.fails(1, &["acquire", "--surface", "flat", "--rig", "rig.toml"], expected);
+        place.fails(1, &["acquire", "--surface", "flat", "--rig", "rig.toml", "--no-geometry"], expected);
         assert_eq!(files(&place.path("lake/inbox")), 0, "no run file: {expected}");
     }
+    // A real panel is not what its surface is called.
+    place.fails(2, &["acquire", "--surface", "flat", "--rig", "rig.toml"], "hint: --mesh FILE");
+    place.fails(2, &["acquire", "--surface", "flat", "--rig", "rig.toml", "--set", "a=b"], "or --no-geometry");
+    place.fails(1, &["acquire", "--surface", "flat", "--rig", "rig.toml", "--panel", "flat"], "no_such_pcm");
+    std::fs::write(
+        place.path("campaign.toml"),
+        "name = \"real\"\nrig = \"rig.toml\"\n[[surfaces]]\nname = \"0012_1\"\n",
+    )
+    .expect("written");
+    let campaign = ["campaign", "run", "campaign.toml"];
+    place.fails(2, &campaign, "looks like; hint: `mesh = \"FILE\"`");
+    assert!(!place.path("lake").exists());
+    let campaign = [&campaign[..], &["--no-geometry"]].concat();
+    place.fails(1, &campaign, "nobody confirmed that surface `flat` is in place");
+    let mut command = Command::new("sh");
+    command.args(["-c", "echo | exec \"$0\" --lake lake \"$@\"", ECHOLAKE]).args(&campaign);
+    let output = run_command(command.current_dir(place.path("")).env_remove("ECHOLAKE_LAKE")).expect("it starts");
+    let said = stderr(&output);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(said.contains("no_such_pcm") && !said.contains("simulated"), "{said}");
+    assert_eq!(files(&place.path("lake/inbox")), 0, "nothing is simulated in place of it");
+    std::fs::write(place.path("rig.toml"), rig).expect("written");
+    place.fails(2, &["acquire", "--surface", "flat", "--rig", "rig.toml", "--no-geometry"], "leave out --no-geometry");
 }
 
 // A run's file that ends within the chunk of its last verdicts.
@@ -402,6 +425,26 @@ mod slow {
         let report: serde_json::Value = serde_json::from_str(&place.ok(&["doctor", "--json"])).expect("JSON");
         let findings = report["findings"].as_array().expect("a list");
         assert!(findings.iter().all(|f| f["severity"] == "note"), "{findings:?}");
+    }
+
+    #[test]
+    fn a_run_ends_in_order_before_its_disk_is_full() {
+        let place = TestFolder::new();
+        let Some(_disk) = SmallDisk::mounted(&place.path("lake"), 60 << 10) else { return };
+        // The paper's rig, whose checkpoints are 50 MB apart.
+        let acquire = ["acquire", "--surface", "flat", "--skip-checks", "--acknowledge", "safe.txt"];
+        place.fails(1, &acquire, "is nearly full: ");
+        place.fails(1, &acquire[..3], "the run needs about");
+        let acknowledged = std::fs::read_to_string(place.path("safe.txt")).expect("a list").lines().count();
+        let mut inbox = std::fs::read_dir(place.path("lake/inbox")).expect("an inbox");
+        let partial = std::fs::read(inbox.next().expect("a recording").expect("listed").path()).expect("read");
+        assert!(inbox.next().is_none() && partial.len() > 55 << 20, "{} bytes", partial.len());
+        let cut_off = mcap::read::Options::IgnoreEndMagic.into();
+        let messages = mcap::MessageStream::new_with_options(&partial, cut_off).expect("an MCAP file");
+        let topics: Vec<_> = messages.map_while(Result::ok).map(|message| message.channel.topic.clone()).collect();
+        let count = |topic: &str| topics.iter().filter(|of| *of == topic).count();
+        assert_eq!(count("/measurement"), acknowledged, "all that was measured is safe");
+        assert!(acknowledged > 200 && count("/sweep") == acknowledged, "{acknowledged}");
     }
 
     // The system ends a process that writes larger files than it may: heights are as large, and flat ones are not.

@@ -51,6 +51,29 @@ fn a_recovered_run_is_taken_in_as_partial() {
     assert!(partial.exists());
 }
 
+#[test]
+fn a_second_run_waits_for_the_first_or_is_forced() {
+    let place = TestFolder::new();
+    let first = ["acquire", "--surface", "flat", "--rig", "rig.toml", "--ir-only", "--skip-checks", "--pace", "3600"];
+    let mut child = ChildProcess::start(&mut place.command(&first)).expect("it starts");
+    let begun = Instant::now();
+    let is_recording = || std::fs::read_dir(place.path("lake/inbox")).is_ok_and(|inbox| inbox.count() > 0);
+    while !is_recording() {
+        assert!(begun.elapsed() < Duration::from_secs(60), "no recording yet");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    let second = ["acquire", "--surface", "foam", "--rig", "rig.toml", "--ir-only"];
+    place.fails(1, &second, "the folder `lake/inbox` is in use: `");
+    place.fails(1, &second, "-flat-");
+    place.fails(1, &second, ".mcap.partial` is being recorded; hint: wait for the end of that run, or --force");
+    place.ok(&[&second[..], &["--force"]].concat());
+    // The simulated rig of another lake is another one.
+    place.ok(&[&["--lake", "other"], &second[..]].concat());
+    // The lock of a process that is gone counts for nothing.
+    child.kill();
+    place.ok(&second);
+}
+
 const ROOM: &str = "name = \"room\"\nbands.centres_hz = [1000]\ngrid.points_mm = [[0, 0, 1000], [500, 0, 1000]]\n\
     sweep = { rate_hz = 48000, high_hz = 20000 }\nimpulse_response.length = 48000\n";
 

@@ -69,6 +69,11 @@ impl ChunkWriter {
         messages.push((header, begin..bytes.len()));
     }
 
+    /// Returns the bytes of the messages whose chunks are not written yet.
+    pub fn pending_bytes(&self) -> usize {
+        self.pending.iter().map(|pending| pending.bytes.len()).sum()
+    }
+
     /// Ends a part's chunk where it is large enough, and before it the chunks of what it rests on.
     pub fn end_large(&mut self, part: ChunkLane) -> McapResult<()> {
         match self.pending[part as usize].bytes.len() >= CHUNK_BYTES {

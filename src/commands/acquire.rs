@@ -2,17 +2,17 @@
 
 mod acknowledge;
 mod specimen;
-mod watch;
+pub(super) mod watch;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::Context as _;
-use echolake_acquisition::panel::mesh::Mesh;
 use echolake_acquisition::run::controller::{RecordingMode, RunControl, RunEvent};
 use echolake_acquisition::run::live::{LiveClock, LiveServer};
 use echolake_acquisition::run::metrics::{MetricsServer, RunMetrics};
 use echolake_acquisition::run::recorder::{Held, partial_of, random_tag};
+use echolake_acquisition::run::recording_lock::RecordingLock;
 use echolake_acquisition::run::session::{MeasuredRun, PreflightMode, RunSession, TakePace};
 use echolake_acquisition::run::{self, PanelSpecimen, RunRequest};
 use echolake_lake::{Error as LakeError, Lake, ReferenceSurfaces};
@@ -28,7 +28,7 @@ use crate::signals::StopRequest;
 use acknowledge::AcknowledgementWriter;
 use clap::Args;
 use echolake_acquisition::panel::mesh::PanelSide;
-pub(super) use specimen::{relief_of_file, set_all};
+pub(super) use specimen::{check_mesh, relief_of_file, set_all};
 use watch::RunWatcher;
 
 #[derive(Debug, Args)]
@@ -37,9 +37,9 @@ pub(crate) struct AcquireArgs {
     #[arg(long, required_unless_present = "resume")]
     pub(crate) surface: Option<SurfaceId>,
     /// Resume a run that was stopped or cut off: its `.mcap.partial`. Measurements that are safe in it are not repeated.
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["surface", "panel", "parameters", "set", "mesh", "side", "rig", "flat", "foam", "macro_reference", "project", "seed", "ir_only"])]
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["surface", "panel", "parameters", "set", "mesh", "side", "no_geometry", "rig", "flat", "foam", "macro_reference", "project", "seed", "ir_only"])]
     pub(crate) resume: Option<PathBuf>,
-    /// Relief for the simulated rig, by a name of `echolake panel --list`; by default the one that the surface's name
+    /// Relief by a name of `echolake panel --list`; by default, on the simulated rig, the one that the surface's name
     /// begins with.
     #[arg(long, value_name = "NAME", conflicts_with = "mesh")]
     pub(crate) panel: Option<String>,
@@ -55,6 +55,9 @@ pub(crate) struct AcquireArgs {
     /// The side of the mesh that is measured: the back is seen when the panel is turned over about its y axis.
     #[arg(long, value_name = "front|back", value_parser = side, requires = "mesh")]
     pub(crate) side: Option<PanelSide>,
+    /// Record a real panel without its geometry.
+    #[arg(long, conflicts_with_all = ["mesh", "panel", "parameters", "set"])]
+    pub(crate) no_geometry: bool,
     /// Rig file; by default the lake's rig, or the paper's for a new lake.
     #[arg(long)]
     pub(crate) rig: Option<PathBuf>,
@@ -86,6 +89,9 @@ pub(crate) struct AcquireArgs {
     /// Start even if the disk, sensor, level or loopback check fails.
     #[arg(long)]
     pub(crate) skip_checks: bool,
+    /// Start even if another run is recorded into the lake, or with the same devices.
+    #[arg(long)]
+    pub(crate) force: bool,
     /// Append one line to this file for every attempt that is safe on the disk: pair, attempt, verdict, SNR in dB. `-` is
     /// stdout.
     #[arg(long, value_name = "FILE")]
@@ -167,6 +173,11 @@ async fn measure(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<CommandOu
         }
         None => fresh(args, lake_url, &progress).await?,
     };
+    // Until the run has ended.
+    let _lock = match RecordingLock::acquire(&job.folder(), job.rig()) {
+        Err(_) if args.force => None,
+        locked => Some(locked?),
+    };
     #[cfg(feature = "upload")]
     if let Some(location) = args.upload_location() {
         super::upload::check_location(location, job.rig(), &progress).await?;
@@ -184,7 +195,8 @@ async fn measure(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<CommandOu
         super::tell_access(&args.viewers, live.address(), &progress);
     }
     let served = args.metrics.map(|address| MetricsServer::start(address, metrics.clone()));
-    let served = served.transpose().with_context(|| format!("cannot serve metrics at {:?}", args.metrics))?;
+    let unserved = || format!("cannot serve metrics at {}", args.metrics.map_or_else(String::new, |a| a.to_string()));
+    let served = served.transpose().with_context(unserved)?;
     if let Some(served) = &served {
         progress.say(format!("metrics: http://{}/metrics", served.address()));
     }
@@ -294,11 +306,9 @@ fn tell_resume(partial: &Path, lake_url: &str) {
 }
 
 async fn fresh(args: &AcquireArgs, lake_url: &str, progress: &CommandProgress) -> anyhow::Result<AcquireJob> {
-    let specimen = specimen::of(args)?;
     let rig = super::rig_or(args.rig.as_deref(), lake_url, Rig::paper).await?;
-    if let PanelSpecimen::Mesh(path, side) = &specimen {
-        Mesh::read(path)?.seen_from(*side).check(rig.panel.size_mm, rig.panel.depth_mm, path)?;
-    }
+    let specimen = specimen::of(args, &rig)?;
+    check_mesh(&specimen, &rig)?;
     let lake = Lake::open_or_create(lake_url, &rig, &ReferenceSurfaces::default()).await?;
     let folder = super::inbox(&lake)?;
     let surface = args.surface.clone().context("no surface is named; hint: --surface NAME")?;
@@ -311,13 +321,13 @@ async fn fresh(args: &AcquireArgs, lake_url: &str, progress: &CommandProgress) -
         ));
     }
     Ok(AcquireJob::Fresh(Box::new(NewRun {
+        macro_reference: specimen::macro_reference(args, &rig)?,
         rig,
         surface,
         specimen,
         folder,
         flat: args.flat.clone(),
         foam: args.foam.clone(),
-        macro_reference: specimen::macro_reference(args)?,
         project: args.project.clone(),
         start: Timestamp::now(),
         seed: args.seed,
@@ -344,7 +354,7 @@ async fn warn_of_missing_references(
 }
 
 // Unfinished recordings of the surface: names of runs have the surface behind their time.
-fn unfinished(folder: &Path, surface: &str) -> Vec<PathBuf> {
+pub(super) fn unfinished(folder: &Path, surface: &str) -> Vec<PathBuf> {
     let Ok(entries) = std::fs::read_dir(folder) else { return Vec::new() };
     let is_of = |path: &PathBuf| {
         let name = path.file_name().and_then(|n| n.to_str()).and_then(|n| n.strip_suffix(".mcap.partial"));

@@ -1,7 +1,8 @@
-//! `echolake campaign`: measures the surfaces of a file on the simulated rig, as far as the lake lacks them, and prints the
-//! paper's tables with what was expected.
+//! `echolake campaign`: measures the surfaces of a file, as far as the lake lacks them, and prints the paper's tables with
+//! what was expected. On a rig with real devices somebody puts each panel in place.
 
 mod definition;
+mod real_runs;
 mod tables;
 
 use std::collections::{BTreeMap, HashSet};
@@ -11,16 +12,20 @@ use std::path::{Path, PathBuf};
 use anyhow::Context as _;
 use clap::{Args, Subcommand};
 use echolake_acquisition::run::controller::RecordingMode;
+use echolake_acquisition::run::recording_lock::RecordingLock;
 use echolake_ingest::pending;
 use echolake_lake::{Lake, ReferenceSurfaces};
 use echolake_query::Session;
 use echolake_schema::{Rig, RunId, SurfaceId};
 use serde::Deserialize;
 
+use super::acquire::check_mesh;
 use super::simulated_runs::{PlannedRun, SimulationPlan, start_time};
 use crate::CommandOutcome;
 use crate::progress::CommandProgress;
-use definition::{CampaignDefinition, CampaignSurface};
+use crate::signals::StopRequest;
+use definition::{CampaignDefinition, CampaignSurface, UnnamedGeometry};
+use real_runs::RealRuns;
 use tables::{LevelTable, LevelsBySurface, TableColours, make_tables};
 
 #[derive(Debug, Subcommand)]
@@ -39,6 +44,12 @@ pub(crate) struct CampaignRunArgs {
     /// Record no sweeps, only impulse responses: a tenth of the space.
     #[arg(long)]
     ir_only: bool,
+    /// Real panels whose mesh or relief the campaign does not name are recorded without geometry.
+    #[arg(long)]
+    no_geometry: bool,
+    /// Start even if another run is recorded into the lake, or with the same devices.
+    #[arg(long)]
+    force: bool,
     /// Print the tables as JSON.
     #[arg(long)]
     json: bool,
@@ -53,22 +64,27 @@ pub(crate) async fn run(command: &CampaignSubcommand, lake_url: &str) -> anyhow:
     let own_rig = campaign.rig_file(&args.file);
     let rig = super::rig_or(args.rig.as_deref().or(own_rig.as_deref()), lake_url, Rig::paper).await?;
     let bands: Vec<String> = rig.band_names().into_iter().chain(["total".to_owned()]).collect();
+    let unnamed = match (rig.devices.are_simulated(), args.no_geometry) {
+        (true, _) => UnnamedGeometry::Guessed,
+        (false, true) => UnnamedGeometry::Unknown,
+        (false, false) => UnnamedGeometry::Refused,
+    };
     let check = |references: &ReferenceSurfaces| {
-        let surfaces = campaign.make_surfaces(&campaign.references(references))?;
+        let surfaces = campaign.make_surfaces(&campaign.references(references), unnamed)?;
+        surfaces.iter().try_for_each(|surface| check_mesh(&surface.specimen, &rig))?;
         campaign.check_expected(&surfaces, &bands)?;
         anyhow::Ok(surfaces)
     };
     check(&ReferenceSurfaces::default()).with_context(|| format!("campaign `{file}`"))?;
     let lake = Lake::open_or_create(lake_url, &rig, &ReferenceSurfaces::default()).await?;
     let surfaces = check(&lake.config().references).with_context(|| format!("campaign `{file}`"))?;
-    measure(args, &campaign, &surfaces, &lake, rig, &stop).await?;
+    let outcome = measure(args, &campaign, &surfaces, &lake, &rig, &stop).await?;
     super::ensure_wanted(&stop)?;
     let levels = levels(&Session::new(&lake)?).await?;
-    let named: Vec<_> =
-        surfaces.iter().map(|surface| (&surface.member.surface, surface.member.macro_reference.as_ref())).collect();
+    let named: Vec<_> = surfaces.iter().map(|surface| (&surface.surface, surface.macro_reference.as_ref())).collect();
     let tables = make_tables(&named, &levels, &campaign.expected);
     print_tables(args, &campaign, &bands, &tables)?;
-    Ok(CommandOutcome::Whole)
+    Ok(outcome)
 }
 
 fn print_tables(
@@ -96,35 +112,47 @@ fn print_tables(
     Ok(())
 }
 
-// Simulates the runs that the lake lacks, and takes them in.
+// Measures the runs that the lake lacks, and ingests them.
 async fn measure(
     args: &CampaignRunArgs,
     campaign: &CampaignDefinition,
     surfaces: &[CampaignSurface],
     lake: &Lake,
-    rig: Rig,
-    stop: &crate::signals::StopRequest,
-) -> anyhow::Result<()> {
+    rig: &Rig,
+    stop: &StopRequest,
+) -> anyhow::Result<CommandOutcome> {
     let folder = super::inbox(lake)?;
     let snapshot = lake.snapshot().await?;
     let there: Vec<_> = snapshot.runs().map(|run| run.surface.to_string()).chain(surfaces_in(&folder)?).collect();
     let runs = missing_runs(campaign, surfaces, &there);
+    let keep = if args.ir_only { RecordingMode::ResponsesOnly } else { RecordingMode::Sweeps };
+    let mut outcome = CommandOutcome::Whole;
     if runs.is_empty() {
         eprintln!("the lake has all runs of the campaign");
-    } else {
+    } else if rig.devices.are_simulated() {
         let progress = CommandProgress::new();
         progress.say("simulated rig: nothing here is measured");
-        let keep = if args.ir_only { RecordingMode::ResponsesOnly } else { RecordingMode::Sweeps };
-        let simulation = SimulationPlan { rig, runs, keep, folder, known: HashSet::new() };
+        let simulation = SimulationPlan { rig: rig.clone(), runs, keep, folder, known: HashSet::new() };
         let measuring = stop.clone();
         tokio::task::spawn_blocking(move || simulation.measure(measuring.flag(), &progress)).await??;
+        super::ensure_wanted(stop)?;
+    } else {
+        let lock = match RecordingLock::acquire(&folder, rig) {
+            Err(_) if args.force => None,
+            locked => Some(locked?),
+        };
+        let real = RealRuns { rig: rig.clone(), runs, keep, folder };
+        let measuring = stop.clone();
+        outcome =
+            tokio::task::spawn_blocking(move || real.measure(measuring.flag(), &CommandProgress::new())).await??;
+        drop(lock);
         super::ensure_wanted(stop)?;
     }
     let sources = pending(lake).await?;
     if !sources.is_empty() {
         super::ingest::take_in(lake, sources, stop.flag(), &CommandProgress::new()).await?;
     }
-    Ok(())
+    Ok(outcome)
 }
 
 // A surface that has runs of any origin is not measured again.
@@ -132,12 +160,14 @@ fn missing_runs(campaign: &CampaignDefinition, surfaces: &[CampaignSurface], the
     let [flat, foam] = campaign.named_references();
     let mut planned = Vec::new();
     let mut number = 0;
-    for CampaignSurface { member, seed, runs } in surfaces {
-        let known = there.iter().filter(|surface| **surface == member.surface.as_str()).count();
+    for CampaignSurface { surface, specimen, macro_reference, seed, runs } in surfaces {
+        let known = there.iter().filter(|there| **there == surface.as_str()).count();
         for run in 0..*runs {
             if run >= known {
                 planned.push(PlannedRun {
-                    member: member.clone(),
+                    surface: surface.clone(),
+                    specimen: specimen.clone(),
+                    macro_reference: macro_reference.clone(),
                     flat: flat.clone(),
                     foam: foam.clone(),
                     project: campaign.project.clone(),

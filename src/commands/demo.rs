@@ -4,6 +4,7 @@ use std::path::Path;
 use std::time::Instant;
 
 use echolake_acquisition::panel::collection::{CollectionSurface, collection};
+use echolake_acquisition::run::PanelSpecimen;
 use echolake_acquisition::run::controller::RecordingMode;
 use echolake_ingest::pending;
 use echolake_lake::{Lake, ReferenceSurfaces};
@@ -59,8 +60,10 @@ pub(crate) async fn run(args: &DemoArgs, lake_url: &str) -> anyhow::Result<Comma
     let lake = Lake::open_or_create(lake_url, &rig, &ReferenceSurfaces::default()).await?;
     let progress = CommandProgress::new();
     progress.say("simulated rig: nothing here is measured");
-    let planned = |(number, member)| PlannedRun {
-        member,
+    let planned = |(number, member): (usize, CollectionSurface)| PlannedRun {
+        surface: member.surface,
+        specimen: PanelSpecimen::Relief(member.relief),
+        macro_reference: member.macro_reference,
         flat: None,
         foam: None,
         project: None,

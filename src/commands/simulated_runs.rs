@@ -7,7 +7,6 @@ use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
 use anyhow::Context as _;
-use echolake_acquisition::panel::collection::CollectionSurface;
 use echolake_acquisition::run::controller::RecordingMode;
 use echolake_acquisition::run::recorder::random_tag;
 use echolake_acquisition::run::simulate::simulate;
@@ -33,7 +32,10 @@ const TOLD_EACH: usize = 20;
 
 /// A run to simulate.
 pub(super) struct PlannedRun {
-    pub(super) member: CollectionSurface,
+    pub(super) surface: SurfaceId,
+    pub(super) specimen: PanelSpecimen,
+    /// The surface that has its large shape alone.
+    pub(super) macro_reference: Option<SurfaceId>,
     /// References, if they are not the lake's.
     pub(super) flat: Option<SurfaceId>,
     pub(super) foam: Option<SurfaceId>,
@@ -132,7 +134,7 @@ impl SimulationPlan {
 
 impl PlannedRun {
     fn run_id(&self, tag: u64) -> Result<RunId, echolake_schema::Error> {
-        RunId::compose(self.start, &self.member.surface, tag)
+        RunId::compose(self.start, &self.surface, tag)
     }
 }
 
@@ -173,8 +175,7 @@ impl SimulationState<'_> {
     // Returns how the run ended and its size; nothing if it was measured before.
     fn measure(&self, planned: &PlannedRun) -> anyhow::Result<Option<(RunEnd, u64)>> {
         let SimulationPlan { rig, keep, folder, known, .. } = self.plan;
-        let PlannedRun { member, flat, foam, project, start, seed } = planned;
-        let surface = &member.surface;
+        let PlannedRun { surface, specimen, macro_reference, flat, foam, project, start, seed } = planned;
         let tag = random_tag();
         if known.contains(planned.run_id(tag)?.untagged()) {
             if self.whole.is_none() {
@@ -185,10 +186,10 @@ impl SimulationState<'_> {
         let run = RunRequest {
             rig,
             surface: surface.clone(),
-            specimen: &PanelSpecimen::Relief(member.relief.clone()),
+            specimen,
             flat: flat.clone(),
             foam: foam.clone(),
-            macro_reference: member.macro_reference.clone(),
+            macro_reference: macro_reference.clone(),
             project: project.clone(),
             start: *start,
             seed: *seed,

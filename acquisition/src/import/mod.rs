@@ -11,6 +11,7 @@ mod response;
 mod sofa;
 mod wav;
 mod wav_file;
+mod wav_layout;
 mod wav_manifest;
 
 use std::path::{Path, PathBuf};

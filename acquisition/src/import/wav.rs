@@ -15,6 +15,7 @@ use echolake_schema::messages::{AmbientSample, ImpulseResponse, Measurement, Swe
 use echolake_schema::{Grid, Rig, SampleRate, SurfaceId, Timestamp};
 
 use super::batch::ImportBatch;
+use super::wav_file::WavChannel;
 use super::wav_manifest::{self, ManifestRow};
 use super::{Error, ImportOptions, ImportedRun};
 use crate::run::assessment::TakeAssessor;
@@ -29,7 +30,7 @@ const NAME: &str = "import wav";
 /// # Errors
 /// [`Error`], naming the manifest and the place.
 pub fn sampling_rate_of(manifest: &Path) -> Result<SampleRate, Error> {
-    Ok(SampleRate::new(f64::from(wav_manifest::first_recording(manifest)?.spec.sample_rate))?)
+    Ok(SampleRate::new(f64::from(wav_manifest::first_recording(manifest)?.layout.rate_hz))?)
 }
 
 /// Imports all rows of a manifest; `progress` gets the number of rows done and of all.
@@ -138,7 +139,11 @@ impl WavImport<'_> {
         if judged.snr_db.is_nan() {
             judged.snr_db = f64::INFINITY;
         }
-        let mut reasons = Vec::new();
+        let columns = [("recording", &row.recording), ("loopback", &row.loopback)];
+        let warned = |(column, wav): (&str, &WavChannel)| {
+            wav.layout.warning.as_ref().map(|warning| format!("{column}, {}: {warning}", wav.label()))
+        };
+        let mut reasons: Vec<_> = columns.into_iter().filter_map(warned).collect();
         for objection in judged.objections(&rig.validation, f64::NEG_INFINITY) {
             match objection {
                 // Where to lower the gain depends on which of both it is.

@@ -133,7 +133,7 @@ impl ManifestCells<'_> {
         let (recording, loopback) = (self.wav("recording")?, self.wav("loopback")?);
         let expected = rig.sweep.rate_hz.get();
         for (column, wav) in [("recording", &recording), ("loopback", &loopback)] {
-            let actual = wav.spec.sample_rate;
+            let actual = wav.layout.rate_hz;
             if f64::from(actual) != expected {
                 let what = format!(
                     "sampled at {actual} Hz, expected the rig's {expected} Hz; hint: sweep.rate_hz in the rig file"
@@ -141,12 +141,12 @@ impl ManifestCells<'_> {
                 return Err(self.wrong(column, what));
             }
         }
-        if recording.samples != loopback.samples {
-            let what = format!("{} samples, expected the recording's {}", loopback.samples, recording.samples);
+        let [actual, expected] = [&loopback, &recording].map(|wav| wav.layout.samples);
+        if actual != expected {
+            let what = format!("{actual} samples, expected the recording's {expected}");
             return Err(self.wrong("loopback", what));
         }
-        let formats = recording.format().zip(loopback.format());
-        let format = formats.and_then(|(a, b)| common_format(a, b)).ok_or_else(|| {
+        let format = common_format(recording.format(), loopback.format()).ok_or_else(|| {
             self.wrong("loopback", "one of recording and loopback is float and the other integer; expected one kind")
         })?;
         let celsius = self.number("temperature_c")?.ok_or_else(|| self.wrong("temperature_c", "it is empty"))?;

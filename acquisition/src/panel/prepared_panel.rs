@@ -14,11 +14,17 @@ use crate::run::recorder::OriginalFile;
 
 /// A specimen, ready to be measured and recorded.
 pub(crate) struct PreparedPanel {
+    /// None if nobody gave it.
+    pub(crate) geometry: Option<PanelGeometry>,
+    pub(crate) record: SurfaceRecord,
+    original: Option<(String, Format, Vec<u8>)>,
+}
+
+/// Shape and material of a panel.
+pub(crate) struct PanelGeometry {
     pub(crate) heights: HeightField,
     pub(crate) mesh: Mesh,
-    pub(crate) record: SurfaceRecord,
     pub(crate) material: SurfaceMaterial,
-    original: Option<(String, Format, Vec<u8>)>,
 }
 
 impl PreparedPanel {
@@ -30,6 +36,7 @@ impl PreparedPanel {
         match specimen {
             PanelSpecimen::Relief(relief) => Ok(generated(relief)),
             PanelSpecimen::Mesh(path, side) => from_file(path, *side, rig),
+            PanelSpecimen::NoGeometry => Ok(Self { geometry: None, record: unknown_surface(), original: None }),
         }
     }
 
@@ -38,6 +45,10 @@ impl PreparedPanel {
         let (name, format, bytes) = self.original.as_ref()?;
         Some(OriginalFile { name, media_type: format.media_type(), bytes })
     }
+}
+
+fn unknown_surface() -> SurfaceRecord {
+    SurfaceRecord { typology: "unknown".to_owned(), ..SurfaceRecord::default() }
 }
 
 fn generated(relief: &PanelRelief) -> PreparedPanel {
@@ -66,9 +77,7 @@ fn generated(relief: &PanelRelief) -> PreparedPanel {
             mesh: Some(facts),
             ..SurfaceRecord::default()
         },
-        heights,
-        mesh,
-        material,
+        geometry: Some(PanelGeometry { heights, mesh, material }),
         original: None,
     }
 }
@@ -97,9 +106,7 @@ fn from_file(path: &Path, side: PanelSide, rig: &Rig) -> Result<PreparedPanel, m
             mesh: Some(facts),
             ..SurfaceRecord::default()
         },
-        heights,
-        mesh,
-        material,
+        geometry: Some(PanelGeometry { heights, mesh, material }),
         original: Some((name, format, bytes)),
     })
 }

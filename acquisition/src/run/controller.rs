@@ -22,6 +22,7 @@ use echolake_schema::{Grid, Pair, Rig, Timestamp};
 
 use crate::rig::{AudioTake, DrivePower, RigDevices};
 use crate::run::assessment::TakeAssessor;
+use crate::run::preflight::attempt_bytes;
 use crate::run::recorder::{LogLevel, Recorder, Tried};
 pub(crate) use attempt::implausible;
 pub use error::Error;
@@ -283,6 +284,8 @@ impl<'a> RunController<'a> {
         let before = run.tried.get(&pair.id.0).map_or(0, |t| t.attempts);
         let mut objections = Vec::new();
         for attempt in 1..=self.rig.validation.attempts {
+            // What is not on the disk yet must fit, and the attempt that is made next.
+            run.watch.disk(run.recorder.bytes_to_end() + attempt_bytes(self.rig, run.options.keep))?;
             let is_last = attempt == self.rig.validation.attempts;
             let mut made = self.attempt(run, pair, before + attempt, is_last)?;
             run.watch.at(made.at)?;
@@ -327,8 +330,7 @@ impl RunProgress<'_> {
         if self.unsafe_pairs < self.options.checkpoint_every {
             return Ok(());
         }
-        self.checkpoint(observe)?;
-        self.watch.disk()
+        self.checkpoint(observe)
     }
 
     // A verdict is reported only after the disk has it.

@@ -8,6 +8,7 @@ pub mod objection;
 pub mod plan;
 pub mod preflight;
 pub mod recorder;
+pub mod recording_lock;
 pub mod session;
 pub mod simulate;
 
@@ -21,7 +22,7 @@ use tracing::Span;
 
 use crate::disk::folder_of;
 use crate::panel::mesh;
-use crate::panel::prepared_panel::PreparedPanel;
+use crate::panel::prepared_panel::{PanelGeometry, PreparedPanel};
 use crate::recovery;
 use crate::rig::RigDevices;
 use crate::rig::devices::simulated::TAKE_SECS;
@@ -78,6 +79,14 @@ pub enum Error {
     /// The run cannot be resumed.
     #[error(transparent)]
     Resume(#[from] recovery::Error),
+    /// Another program records into the folder, or uses a device.
+    #[error("{what} is in use: {holder}; hint: wait for the end of that run, or --force if both are meant")]
+    InUse {
+        /// The folder or device.
+        what: String,
+        /// The other program, as far as it is known.
+        holder: String,
+    },
     /// The preflight check found something, and nothing was begun.
     #[error("not fit to measure: {}", findings.iter().map(ToString::to_string).collect::<Vec<_>>().join("\n  and: "))]
     Unfit {
@@ -125,8 +134,11 @@ impl RunRequest<'_> {
         surface.foam_reference = self.foam.clone();
         surface.macro_reference = self.macro_reference.clone();
         surface.project = self.project.clone();
-        let relief = RecordedRelief { heights: &panel.heights, mesh: &panel.mesh, original: panel.original() };
-        let start = RunStart { manifest: &manifest, rig: self.rig, surface: &surface, relief: Some(relief), plan };
+        let relief = panel.geometry.as_ref().map(|PanelGeometry { heights, mesh, .. }| {
+            let original = panel.original();
+            RecordedRelief { heights, mesh, original }
+        });
+        let start = RunStart { manifest: &manifest, rig: self.rig, surface: &surface, relief, plan };
         let none = BTreeMap::new();
         let mut job = job(panel, self.rig, self.folder, self.keep, &none, self.start, arms);
         if start.plan.is_none() {
@@ -206,6 +218,6 @@ fn job<'a>(
     started: Timestamp,
     arms: Option<Arc<Choreography>>,
 ) -> RunJob<'a> {
-    let shape = Some(Shape { heights: &panel.heights, mesh: &panel.mesh });
+    let shape = panel.geometry.as_ref().map(|PanelGeometry { heights, mesh, .. }| Shape { heights, mesh });
     RunJob { rig, folder, shape, keep, before, started, arms, when_stopped: WhenStopped::Open }
 }

@@ -12,6 +12,8 @@ const SEED: &str = "seed";
 const RELIEF: &str = "relief";
 const MESH: &str = "mesh";
 const SIDE: &str = "side";
+const GEOMETRY: &str = "geometry";
+const NONE: &str = "none";
 const SWEEPS: &str = "sweeps";
 const RESPONSES: &str = "responses";
 
@@ -33,6 +35,8 @@ pub enum PanelSpecimen {
     Relief(PanelRelief),
     /// A side of the mesh in a file, as a coated print.
     Mesh(PathBuf, PanelSide),
+    /// A real panel whose geometry nobody gave.
+    NoGeometry,
 }
 
 impl RunPlan {
@@ -45,6 +49,7 @@ impl RunPlan {
             PanelSpecimen::Mesh(path, side) => {
                 record.extend([(MESH, path.to_string_lossy().into_owned()), (SIDE, side.name().to_owned())]);
             }
+            PanelSpecimen::NoGeometry => record.push((GEOMETRY, NONE.to_owned())),
         }
         record.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
     }
@@ -64,6 +69,7 @@ impl RunPlan {
         let seed = seed.parse().map_err(|_| format!("its plan has the seed `{seed}`, expected a whole number"))?;
         let specimen = match text(RELIEF) {
             Ok(json) => PanelSpecimen::Relief(PanelRelief::from_json(json).map_err(|e| e.to_string())?),
+            Err(_) if record.get(GEOMETRY).is_some_and(|geometry| geometry == NONE) => PanelSpecimen::NoGeometry,
             Err(_) => {
                 // Earlier plans have no side: there was only the front.
                 let side = record.get(SIDE).map_or(PanelSide::Front.name(), String::as_str);
@@ -86,6 +92,7 @@ mod tests {
         for (keep, specimen) in [
             (RecordingMode::Sweeps, PanelSpecimen::Relief(relief)),
             (RecordingMode::ResponsesOnly, PanelSpecimen::Mesh("panels/0015.glb".into(), PanelSide::Back)),
+            (RecordingMode::Sweeps, PanelSpecimen::NoGeometry),
         ] {
             let plan = RunPlan { keep, seed: u64::MAX, specimen };
             assert_eq!(RunPlan::from_metadata(&plan.to_metadata()), Ok(plan));

@@ -6,7 +6,6 @@ use echolake_schema::{Pair, Rig};
 
 use crate::disk::free_bytes;
 use crate::run::assessment::{quiet_range, response_len};
-use crate::run::controller::watch::KEPT_FREE;
 use crate::run::controller::{RecordingMode, RunController, implausible};
 
 /// Bytes per recorded sample of both channels and audio, compressed: 4.92 in a simulated run with sweeps of 0.5 s.
@@ -17,6 +16,8 @@ const RESPONSE_BYTES_A_SAMPLE: f64 = 4.0;
 const PAIR_BYTES: f64 = 600.0;
 /// Bytes per run of panel, heights, summary.
 const RUN_BYTES: f64 = 2.5e6;
+/// Bytes that are kept free at the end of a run, so that it can be ended whatever was not foreseen.
+const KEPT_FREE: u64 = 4 << 20;
 /// Attempts per pair: a rig that needs more needs maintenance.
 const REPEATS: f64 = 1.1;
 
@@ -52,11 +53,19 @@ pub fn expected_bytes(rig: &Rig, keep: RecordingMode, pairs: usize) -> u64 {
     (RUN_BYTES + (sweep + response + PAIR_BYTES) * REPEATS * pairs as f64) as u64
 }
 
+/// Returns the bytes that one attempt takes at most: two channels of three bytes and audio of two per sample of the
+/// sweep, the response, and messages of fixed size.
+pub(crate) fn attempt_bytes(rig: &Rig, keep: RecordingMode) -> u64 {
+    const MESSAGES: usize = 8192;
+    let sweep = if keep == RecordingMode::Sweeps { rig.recording_len() * 8 } else { 0 };
+    (sweep + response_len(rig) * 4 + MESSAGES) as u64
+}
+
 /// Checks that the disk has room for a run of so many pairs.
 pub fn disk(folder: &Path, rig: &Rig, keep: RecordingMode, pairs: usize) -> Option<PreflightFinding> {
     // A file system that does not report its free space is no reason to refuse.
     let free = free_bytes(folder).ok()?;
-    room(folder, free, expected_bytes(rig, keep, pairs) + KEPT_FREE)
+    room(folder, free, expected_bytes(rig, keep, pairs) + attempt_bytes(rig, keep) + KEPT_FREE)
 }
 
 fn room(folder: &Path, free: u64, needed: u64) -> Option<PreflightFinding> {

@@ -6,6 +6,9 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 /// Limit of pending messages for one client, bytes: two minutes of a real rig's sweeps.
 pub(super) const WAITING_BYTES: usize = 16 << 20;
 
+/// Bytes that an entry costs beside its content.
+const ENTRY_BYTES: usize = 64;
+
 /// A pending message.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct PendingMessage {
@@ -34,9 +37,9 @@ pub(crate) struct ClientQueue {
 #[derive(Default)]
 struct QueueState {
     entries: VecDeque<QueueEntry>,
-    /// Bytes of messages that may be dropped.
+    /// Bytes of all entries but those of the current state.
     bytes: usize,
-    /// Bytes of messages that may not.
+    /// Bytes of the current state of channels.
     kept: usize,
     wanted: BTreeMap<u16, ChannelSubscription>,
     /// The client controls playback, so it understands states.
@@ -55,23 +58,47 @@ enum QueueEntry {
     Message(PendingMessage),
     /// Current state of its channel, which is not dropped.
     Kept(PendingMessage),
+    /// May be dropped.
     Time(u64),
+    /// An answer; dropped if nothing else is left to drop.
     State(Vec<u8>),
 }
 
 impl QueueEntry {
     fn bytes(&self) -> usize {
         match self {
-            Self::Message(waiting) => waiting.data.len(),
-            _ => 0,
+            Self::Message(waiting) => ENTRY_BYTES + waiting.data.len(),
+            Self::Kept(_) => 0,
+            Self::Time(_) => ENTRY_BYTES,
+            Self::State(encoded) => ENTRY_BYTES + encoded.len(),
         }
     }
 
     fn kept(&self) -> usize {
         match self {
-            Self::Kept(waiting) => waiting.data.len(),
+            Self::Kept(waiting) => ENTRY_BYTES + waiting.data.len(),
             _ => 0,
         }
+    }
+}
+
+impl QueueState {
+    // Adds an entry, and drops the oldest ones that are too much; returns how many messages were among them.
+    fn add(&mut self, entry: QueueEntry) -> u64 {
+        self.bytes += entry.bytes();
+        self.entries.push_back(entry);
+        let mut lost = 0;
+        while self.bytes > WAITING_BYTES {
+            // The newest is sent, whatever its size.
+            let old = self.entries.len() - 1;
+            let first = |is_wanted: fn(&QueueEntry) -> bool| self.entries.iter().take(old).position(is_wanted);
+            let oldest = first(|entry| matches!(entry, QueueEntry::Message(_) | QueueEntry::Time(_)));
+            let oldest = oldest.or_else(|| first(|entry| matches!(entry, QueueEntry::State(_))));
+            let Some(dropped) = oldest.and_then(|at| self.entries.remove(at)) else { break };
+            self.bytes -= dropped.bytes();
+            lost += u64::from(matches!(dropped, QueueEntry::Message(_)));
+        }
+        lost
     }
 }
 
@@ -105,7 +132,7 @@ impl ClientQueue {
         inner.bytes + inner.kept >= WAITING_BYTES / 2
     }
 
-    /// Returns the bytes of pending messages.
+    /// Returns the bytes of pending entries but those of the current state.
     #[cfg(test)]
     pub(crate) fn bytes(&self) -> usize {
         self.inner().bytes
@@ -128,30 +155,20 @@ impl ClientQueue {
         let mut inner = self.inner();
         inner.wanted.iter_mut().filter(|(id, _)| channels.contains(id)).for_each(|(_, wanted)| wanted.primed = true);
         let known: Vec<_> = known.iter().filter(|waiting| channels.contains(&waiting.channel)).cloned().collect();
-        let new: usize = known.iter().map(|waiting| waiting.data.len()).sum();
+        let known: Vec<_> = known.into_iter().map(QueueEntry::Kept).collect();
+        let new: usize = known.iter().map(QueueEntry::kept).sum();
         if inner.kept + new > WAITING_BYTES {
             // A client that has not read the older state for so long does not need it any more.
             inner.entries.retain(|e| !matches!(e, QueueEntry::Kept(waiting) if channels.contains(&waiting.channel)));
             inner.kept = inner.entries.iter().map(QueueEntry::kept).sum();
         }
         inner.kept += new;
-        inner.entries.extend(known.into_iter().map(QueueEntry::Kept));
+        inner.entries.extend(known);
     }
 
     /// Queues a new message; returns how many old ones are dropped for it.
     pub(super) fn push(&self, message: PendingMessage) -> u64 {
-        let mut inner = self.inner();
-        inner.bytes += message.data.len();
-        inner.entries.push_back(QueueEntry::Message(message));
-        let mut lost = 0;
-        while inner.bytes > WAITING_BYTES {
-            let oldest = inner.entries.iter().position(|entry| matches!(entry, QueueEntry::Message(_)));
-            // The newest is sent, whatever its size.
-            let Some(oldest) = oldest.filter(|at| at + 1 < inner.entries.len()) else { break };
-            inner.bytes -= inner.entries.remove(oldest).map_or(0, |entry| entry.bytes());
-            lost += 1;
-        }
-        lost
+        self.inner().add(QueueEntry::Message(message))
     }
 
     /// Queues the time; of several pending times only the latest matters.
@@ -159,15 +176,16 @@ impl ClientQueue {
         let mut inner = self.inner();
         if let Some(QueueEntry::Time(_)) = inner.entries.back() {
             inner.entries.pop_back();
+            inner.bytes -= ENTRY_BYTES;
         }
-        inner.entries.push_back(QueueEntry::Time(nanos));
+        inner.add(QueueEntry::Time(nanos));
     }
 
     /// Queues the state of playback, if the client controls it.
     pub(crate) fn tell_state(&self, encoded: Vec<u8>) {
         let mut inner = self.inner();
         if inner.controls {
-            inner.entries.push_back(QueueEntry::State(encoded));
+            inner.add(QueueEntry::State(encoded));
         }
     }
 
@@ -176,7 +194,8 @@ impl ClientQueue {
     pub(crate) fn forget(&self) {
         let mut inner = self.inner();
         inner.entries.retain(|entry| matches!(entry, QueueEntry::State(_)));
-        (inner.bytes, inner.kept) = (0, 0);
+        inner.bytes = inner.entries.iter().map(QueueEntry::bytes).sum();
+        inner.kept = 0;
         inner.wanted.values_mut().for_each(|wanted| wanted.primed = false);
     }
 
@@ -226,7 +245,7 @@ mod tests {
         queue.subscribe(1, 10);
         queue.subscribe(2, 20);
         queue.prime(&[1, 2].into(), &[waiting(1, 5, WAITING_BYTES)]);
-        let lost: u64 = (10..15).map(|time| queue.push(waiting(2, time, WAITING_BYTES / 3))).sum();
+        let lost: u64 = (10..15).map(|time| queue.push(waiting(2, time, WAITING_BYTES / 3 - ENTRY_BYTES))).sum();
         assert_eq!(lost, 2);
         // One alone that is larger than all that may wait is still sent.
         assert_eq!(queue.push(waiting(2, 15, 2 * WAITING_BYTES)), 3);
@@ -258,5 +277,34 @@ mod tests {
             assert!(queue.is_busy());
         }
         assert_eq!(drained(&queue), [(1, 8)]);
+    }
+
+    #[test]
+    fn times_and_states_count_and_do_not_grow_without_bounds() {
+        let queue = ClientQueue::default();
+        queue.subscribe(1, 10);
+        queue.prime(&[1].into(), &[]);
+        queue.hear_of_playback();
+        queue.tell_state(vec![1; 100]);
+        let half = WAITING_BYTES / 2 / ENTRY_BYTES;
+        // Of 16 MB, with a time between any two messages, half are messages.
+        for time in 0..2 * half as u64 {
+            queue.push(waiting(1, time, 0));
+            queue.tell_time(time);
+            assert!(queue.bytes() <= WAITING_BYTES);
+        }
+        let left = drained(&queue);
+        assert_eq!((left[0], left.len()), ((0, 0), 1 + 2 * half - 3), "the answer stays, the oldest others are gone");
+        assert_eq!(left.last(), Some(&(0, 2 * half as u64 - 1)));
+        assert_eq!(queue.bytes(), 0);
+        for _ in 0..100 {
+            queue.tell_state(vec![1; WAITING_BYTES / 10]);
+            assert!(queue.bytes() <= WAITING_BYTES);
+        }
+        assert_eq!(drained(&queue).len(), 9);
+        queue.tell_state(vec![1; 100]);
+        queue.forget();
+        assert_eq!(queue.bytes(), ENTRY_BYTES + 100);
+        assert_eq!((drained(&queue).len(), queue.bytes()), (1, 0));
     }
 }

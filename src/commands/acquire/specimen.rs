@@ -3,16 +3,28 @@
 use std::path::Path;
 
 use anyhow::Context as _;
-use echolake_acquisition::panel::mesh::PanelSide;
+use echolake_acquisition::panel::mesh::{Mesh, PanelSide};
 use echolake_acquisition::panel::paper_panel::PaperPanel;
 use echolake_acquisition::panel::relief::PanelRelief;
 use echolake_acquisition::run::PanelSpecimen;
-use echolake_schema::SurfaceId;
+use echolake_schema::{Rig, SurfaceId};
 
 use super::AcquireArgs;
+use crate::UsageError;
 
-/// Returns the specimen that the arguments name.
-pub(super) fn of(args: &AcquireArgs) -> anyhow::Result<PanelSpecimen> {
+/// Returns the specimen that the arguments name. A real panel is what it is, whatever its surface is called.
+pub(super) fn of(args: &AcquireArgs, rig: &Rig) -> anyhow::Result<PanelSpecimen> {
+    let is_simulated = rig.devices.are_simulated();
+    if args.no_geometry {
+        let hint = "the simulated rig measures the panel's geometry; hint: leave out --no-geometry";
+        anyhow::ensure!(!is_simulated, UsageError(hint.to_owned()));
+        return Ok(PanelSpecimen::NoGeometry);
+    }
+    if !is_simulated && args.mesh.is_none() && args.parameters.is_none() && args.panel.is_none() {
+        let text = "the rig's devices are real, and nothing says what the panel looks like; hint: --mesh FILE (or the \
+                    --panel or --parameters that it was made from), or --no-geometry";
+        return Err(UsageError(text.to_owned()).into());
+    }
     let surface = args.surface.as_ref().context("no surface is named; hint: --surface NAME")?;
     Ok(match (&args.mesh, &args.parameters) {
         // Absolute, so that a run can be resumed from another folder.
@@ -29,12 +41,21 @@ pub(super) fn of(args: &AcquireArgs) -> anyhow::Result<PanelSpecimen> {
     })
 }
 
+/// Checks that a mesh can be measured with a rig.
+pub(in crate::commands) fn check_mesh(specimen: &PanelSpecimen, rig: &Rig) -> anyhow::Result<()> {
+    if let PanelSpecimen::Mesh(path, side) = specimen {
+        Mesh::read(path)?.seen_from(*side).check(rig.panel.size_mm, rig.panel.depth_mm, path)?;
+    }
+    Ok(())
+}
+
 /// The surface with the specimen's large shape alone: the one that is named, else that of the paper's panel.
-pub(super) fn macro_reference(args: &AcquireArgs) -> anyhow::Result<Option<SurfaceId>> {
+pub(super) fn macro_reference(args: &AcquireArgs, rig: &Rig) -> anyhow::Result<Option<SurfaceId>> {
     if args.macro_reference.is_some() || args.mesh.is_some() || args.parameters.is_some() {
         return Ok(args.macro_reference.clone());
     }
-    let name = args.panel.as_deref().or(args.surface.as_ref().map(SurfaceId::as_str));
+    let named = args.surface.as_ref().filter(|_| rig.devices.are_simulated()).map(SurfaceId::as_str);
+    let name = args.panel.as_deref().or(named);
     let reference = name.and_then(PaperPanel::by_name).and_then(|panel| panel.macro_reference);
     Ok(reference.map(str::parse).transpose()?)
 }

@@ -19,10 +19,13 @@ use crate::progress::{CommandProgress, TaskProgress};
 use crate::signals::StopRequest;
 
 /// The progress of one run.
-pub(super) struct RunWatcher {
+pub(in crate::commands) struct RunWatcher {
     task: TaskProgress,
     metrics: RunMetrics,
     folder: PathBuf,
+    /// Pairs with an accepted measurement, and those of them that are safe on the disk.
+    accepted: u64,
+    safe: u64,
     repeats: u64,
     given_up: u64,
     snr_db: f64,
@@ -33,7 +36,7 @@ pub(super) struct RunWatcher {
 
 impl RunWatcher {
     /// Of a run over `planned` pairs, `accepted` of which are measured already.
-    pub(super) fn new(
+    pub(in crate::commands) fn new(
         progress: &CommandProgress,
         surface: &str,
         planned: u64,
@@ -43,12 +46,23 @@ impl RunWatcher {
     ) -> Self {
         let mut task = progress.task(surface.to_owned(), planned, "pairs");
         task.begin_at(accepted);
-        let (begun, cost) = (Instant::now(), Cost::default());
-        Self { task, metrics, folder, repeats: 0, given_up: 0, snr_db: f64::NAN, pair: String::new(), begun, cost }
+        Self {
+            task,
+            metrics,
+            folder,
+            accepted,
+            safe: accepted,
+            repeats: 0,
+            given_up: 0,
+            snr_db: f64::NAN,
+            pair: String::new(),
+            begun: Instant::now(),
+            cost: Cost::default(),
+        }
     }
 
-    /// Records an event. Only measurements that are safe on the disk count as done.
-    pub(super) fn observe(&mut self, event: &RunEvent<'_>) {
+    /// Records an event. Measured pairs count as done; the line says how many of them are safe on the disk.
+    pub(in crate::commands) fn observe(&mut self, event: &RunEvent<'_>) {
         self.metrics.observe(event);
         match event {
             RunEvent::Pair(pair) => {
@@ -57,15 +71,19 @@ impl RunWatcher {
             }
             RunEvent::Attempt(m) => {
                 self.snr_db = m.snr_db;
+                self.accepted += u64::from(m.verdict() == Verdict::Accepted);
                 self.repeats += u64::from(m.verdict() == Verdict::Repeated);
                 self.given_up += u64::from(m.verdict() == Verdict::Rejected);
                 self.task.note(self.line());
+                self.task.at(self.accepted);
             }
             RunEvent::Safe { accepted, cost, .. } => {
                 self.cost = *cost;
                 if let Ok(bytes) = free_bytes(&self.folder) {
                     self.metrics.disk_free(bytes);
                 }
+                (self.accepted, self.safe) = (*accepted, *accepted);
+                self.task.note(self.line());
                 self.task.at(*accepted);
             }
             RunEvent::Paused => {
@@ -76,7 +94,7 @@ impl RunWatcher {
     }
 
     /// Reports the end of the run, or that it was aborted.
-    pub(super) fn done(self, end: Option<RunEnd>) {
+    pub(in crate::commands) fn done(self, end: Option<RunEnd>) {
         if self.cost.checkpoints > 0 {
             let (busy, whole) = (self.cost.busy.as_secs_f64(), self.begun.elapsed().as_secs_f64());
             self.task.say(&format!(
@@ -97,8 +115,8 @@ impl RunWatcher {
     }
 
     fn line(&self) -> String {
-        let Self { pair, snr_db, repeats, given_up, .. } = self;
-        format!("{pair}, SNR {snr_db:.1} dB, {repeats} repeated, {given_up} given up")
+        let Self { pair, snr_db, repeats, given_up, safe, .. } = self;
+        format!("{pair}, SNR {snr_db:.1} dB, {repeats} repeated, {given_up} given up, {safe} safe on the disk")
     }
 }
 
@@ -136,4 +154,25 @@ pub(super) fn obey(control: &Arc<RunControl>) -> anyhow::Result<StopRequest> {
 
 fn toggle(control: &RunControl) {
     control.pause.fetch_xor(true, Ordering::Relaxed);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use echolake_schema::messages::Measurement;
+
+    #[test]
+    fn measured_pairs_are_done_and_safe_ones_are_counted() {
+        let metrics = RunMetrics::new("flat", 45, 3);
+        let mut watcher = RunWatcher::new(&CommandProgress::new(), "flat", 45, 3, metrics, PathBuf::from("."));
+        let mut attempt = |verdict: Verdict| {
+            watcher.observe(&RunEvent::Attempt(&Measurement { verdict: verdict.into(), ..Measurement::default() }));
+            (watcher.accepted, watcher.line())
+        };
+        assert_eq!(attempt(Verdict::Repeated).0, 3);
+        let (accepted, line) = attempt(Verdict::Accepted);
+        assert!(accepted == 4 && line.ends_with("1 repeated, 0 given up, 3 safe on the disk"), "{accepted} {line}");
+        watcher.observe(&RunEvent::Safe { verdicts: &[], accepted: 4, cost: Cost::default() });
+        assert!(watcher.line().ends_with("4 safe on the disk"), "{}", watcher.line());
+    }
 }

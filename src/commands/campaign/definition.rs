@@ -5,10 +5,14 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, bail, ensure};
 use echolake_acquisition::panel::collection::CollectionSurface;
+use echolake_acquisition::panel::mesh::PanelSide;
 use echolake_acquisition::panel::relief::PanelRelief;
+use echolake_acquisition::run::PanelSpecimen;
 use echolake_lake::ReferenceSurfaces;
 use echolake_schema::{ProjectName, SurfaceId};
 use serde::Deserialize;
+
+use crate::UsageError;
 
 /// Runs of one surface at most.
 const MOST_RUNS: usize = 1_000;
@@ -52,6 +56,10 @@ struct NamedSurface {
     relief: Option<String>,
     #[serde(default)]
     parameters: BTreeMap<String, toml::Value>,
+    /// A mesh in place of a relief; a relative path begins at the campaign's folder.
+    mesh: Option<PathBuf>,
+    /// The side of the mesh that is measured: `front` or `back`.
+    side: Option<String>,
     macro_reference: Option<SurfaceId>,
     /// Seed of its first run.
     seed: Option<u64>,
@@ -73,10 +81,24 @@ pub(super) struct ExpectedLevels {
     pub(super) source: String,
 }
 
-/// A surface of a campaign, with its relief.
+/// What a surface is whose relief or mesh the file does not name.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum UnnamedGeometry {
+    /// The relief that its name begins with: on the simulated rig.
+    Guessed,
+    /// A panel without known geometry.
+    Unknown,
+    /// An error: a real panel is what it is, whatever its surface is called.
+    Refused,
+}
+
+/// A surface of a campaign, with its geometry.
 #[derive(Debug)]
 pub(super) struct CampaignSurface {
-    pub(super) member: CollectionSurface,
+    pub(super) surface: SurfaceId,
+    pub(super) specimen: PanelSpecimen,
+    /// The surface that has its large shape alone.
+    pub(super) macro_reference: Option<SurfaceId>,
     pub(super) seed: u64,
     pub(super) runs: usize,
 }
@@ -95,9 +117,14 @@ impl CampaignDefinition {
         let text =
             std::fs::read_to_string(path).with_context(|| format!("cannot read campaign `{}`", path.display()))?;
         let parsed: Result<Self, _> = toml::from_str(&text);
-        parsed.map_err(|e| {
+        let mut campaign = parsed.map_err(|e| {
             anyhow::anyhow!("campaign `{}`: {e}hint: examples/campaigns has some that are right", path.display())
-        })
+        })?;
+        // Absolute, so that a run can be resumed from another folder.
+        let path = std::path::absolute(path)?;
+        let meshes = campaign.surfaces.iter_mut().filter_map(|surface| surface.mesh.as_mut());
+        meshes.for_each(|mesh| *mesh = path.with_file_name(&*mesh));
+        Ok(campaign)
     }
 
     /// Returns the path of the rig's file, which is named relative to the campaign's.
@@ -118,7 +145,11 @@ impl CampaignDefinition {
     }
 
     /// Makes the surfaces in the order in which they are measured: references that the file does not list come first.
-    pub(super) fn make_surfaces(&self, references: &[SurfaceId]) -> anyhow::Result<Vec<CampaignSurface>> {
+    pub(super) fn make_surfaces(
+        &self,
+        references: &[SurfaceId],
+        unnamed: UnnamedGeometry,
+    ) -> anyhow::Result<Vec<CampaignSurface>> {
         ensure!(!self.surfaces.is_empty(), "`surfaces` is empty; hint: [[surfaces]] with name = \"0012_1\"");
         let listed: BTreeSet<_> = self.surfaces.iter().map(|surface| &surface.name).collect();
         ensure!(listed.len() == self.surfaces.len(), "`surfaces` name one surface twice; hint: runs = 2 repeats it");
@@ -135,14 +166,14 @@ impl CampaignDefinition {
         let missing: Vec<_> = missing.collect();
         let all = missing.iter().chain(&self.surfaces);
         let made = all.zip(0u64..).map(|(surface, number)| {
-            surface.make(self.seed.wrapping_mul(1_000).wrapping_add(number * MOST_RUNS as u64))
+            surface.make(self.seed.wrapping_mul(1_000).wrapping_add(number * MOST_RUNS as u64), unnamed)
         });
         made.collect()
     }
 
     /// Checks that all that is expected has the names of surfaces and of bands.
     pub(super) fn check_expected(&self, surfaces: &[CampaignSurface], bands: &[String]) -> anyhow::Result<()> {
-        let names: Vec<_> = surfaces.iter().map(|surface| surface.member.surface.as_str()).collect();
+        let names: Vec<_> = surfaces.iter().map(|surface| surface.surface.as_str()).collect();
         for (ExpectedLevels { surface, relative_to, levels_db, .. }, number) in self.expected.iter().zip(1..) {
             for (key, name) in [("surface", Some(surface)), ("relative_to", relative_to.as_ref())] {
                 if let Some(name) = name.filter(|name| !names.contains(&name.as_str())) {
@@ -172,21 +203,64 @@ impl CampaignDefinition {
 
 impl NamedSurface {
     fn reference(name: &SurfaceId) -> Self {
-        let parameters = BTreeMap::new();
-        Self { name: name.clone(), relief: None, parameters, macro_reference: None, seed: None, runs: default_runs() }
+        Self {
+            name: name.clone(),
+            relief: None,
+            parameters: BTreeMap::new(),
+            mesh: None,
+            side: None,
+            macro_reference: None,
+            seed: None,
+            runs: default_runs(),
+        }
     }
 
-    fn make(&self, seed: u64) -> anyhow::Result<CampaignSurface> {
+    fn make(&self, seed: u64, unnamed: UnnamedGeometry) -> anyhow::Result<CampaignSurface> {
         let name = &self.name;
         ensure!(
             (1..=MOST_RUNS).contains(&self.runs),
             "`runs` of surface `{name}` is {}, expected 1 to {MOST_RUNS}; hint: surfaces that are not needed are left out",
             self.runs
         );
-        let relief = self.relief.as_deref().or_else(|| PanelRelief::guess(name.as_str()));
-        let relief = relief.with_context(|| {
-            format!("surface `{name}` has no `relief`, and its name says none; hint: {}", PanelRelief::NAMES.join(", "))
-        })?;
+        let (specimen, macro_reference) = match &self.mesh {
+            Some(mesh) => (self.measured_mesh(mesh)?, None),
+            None => self.measured_relief(unnamed)?,
+        };
+        let macro_reference = self.macro_reference.clone().or(macro_reference);
+        let seed = self.seed.unwrap_or(seed);
+        Ok(CampaignSurface { surface: name.clone(), specimen, macro_reference, seed, runs: self.runs })
+    }
+
+    fn measured_mesh(&self, mesh: &Path) -> anyhow::Result<PanelSpecimen> {
+        let name = &self.name;
+        ensure!(
+            self.relief.is_none() && self.parameters.is_empty(),
+            "surface `{name}` has a `mesh` and a `relief`, expected one of both"
+        );
+        let side = self.side.as_deref().map_or(Some(PanelSide::Front), PanelSide::parse);
+        let side = side.with_context(|| format!("`side` of surface `{name}` is none, expected front or back"))?;
+        Ok(PanelSpecimen::Mesh(mesh.to_owned(), side))
+    }
+
+    // With the reference that the paper's panels have.
+    fn measured_relief(&self, unnamed: UnnamedGeometry) -> anyhow::Result<(PanelSpecimen, Option<SurfaceId>)> {
+        let name = &self.name;
+        let guessed = || PanelRelief::guess(name.as_str()).filter(|_| unnamed == UnnamedGeometry::Guessed);
+        let relief = match (self.relief.as_deref().or_else(guessed), unnamed) {
+            (Some(relief), _) => relief,
+            (None, UnnamedGeometry::Unknown) => return Ok((PanelSpecimen::NoGeometry, None)),
+            (None, UnnamedGeometry::Refused) => {
+                let text = format!(
+                    "the rig's devices are real, and nothing says what the panel of surface `{name}` looks like; hint: \
+                     `mesh = \"FILE\"` (or the `relief` that it was made from) in its [[surfaces]], or --no-geometry"
+                );
+                return Err(UsageError(text).into());
+            }
+            (None, UnnamedGeometry::Guessed) => bail!(
+                "surface `{name}` has no `relief`, and its name says none; hint: {}",
+                PanelRelief::NAMES.join(", ")
+            ),
+        };
         let mut member = CollectionSurface::by_relief_name(name.clone(), relief)
             .with_context(|| format!("`relief` of surface `{name}`"))?;
         let mut set = || {
@@ -196,10 +270,7 @@ impl NamedSurface {
             member.relief.check_depth()
         };
         set().with_context(|| format!("`parameters` of surface `{name}`"))?;
-        if self.macro_reference.is_some() {
-            member.macro_reference.clone_from(&self.macro_reference);
-        }
-        Ok(CampaignSurface { member, seed: self.seed.unwrap_or(seed), runs: self.runs })
+        Ok((PanelSpecimen::Relief(member.relief), member.macro_reference))
     }
 }
 
@@ -213,8 +284,12 @@ mod tests {
         [[expected]]\nsurface = \"0012_1\"\nrelative_to = \"0015_1\"\nlevels_db = { 2500 = -0.1, total = -0.6 }\n";
 
     fn surfaces(text: &str) -> anyhow::Result<Vec<CampaignSurface>> {
+        made_surfaces(text, UnnamedGeometry::Guessed)
+    }
+
+    fn made_surfaces(text: &str, unnamed: UnnamedGeometry) -> anyhow::Result<Vec<CampaignSurface>> {
         let campaign: CampaignDefinition = toml::from_str(text)?;
-        let surfaces = campaign.make_surfaces(&campaign.references(&ReferenceSurfaces::default()))?;
+        let surfaces = campaign.make_surfaces(&campaign.references(&ReferenceSurfaces::default()), unnamed)?;
         campaign.check_expected(&surfaces, &["2500", "total"].map(str::to_owned))?;
         Ok(surfaces)
     }
@@ -222,11 +297,12 @@ mod tests {
     #[test]
     fn surfaces_are_made_after_their_references() {
         let made = surfaces(TEXT).expect("a campaign");
-        let names: Vec<_> = made.iter().map(|s| s.member.surface.as_str()).collect();
+        let names: Vec<_> = made.iter().map(|s| s.surface.as_str()).collect();
         assert_eq!(names, ["flat", "foam", "0012_1", "0015_1", "mine"]);
-        let reference = |n: usize| made[n].member.macro_reference.as_ref().map(SurfaceId::as_str);
+        let reference = |n: usize| made[n].macro_reference.as_ref().map(SurfaceId::as_str);
         assert_eq!([reference(2), reference(3), reference(4)], [Some("0015_1"), None, Some("flat")]);
-        assert_eq!(made[4].member.relief.parameters()["joint_depth_mm"], 20.0);
+        let PanelSpecimen::Relief(relief) = &made[4].specimen else { panic!("{:?}", made[4]) };
+        assert_eq!(relief.parameters()["joint_depth_mm"], 20.0);
         assert_eq!((made[2].runs, made[3].runs), (1, 2));
         let seeds: BTreeSet<_> = made.iter().map(|s| s.seed).collect();
         assert_eq!(seeds.len(), 5, "{seeds:?}");
@@ -256,5 +332,20 @@ mod tests {
         );
         check("2500 =", "250 =", "`levels_db` of `expected` 1 (`0012_1`) has a band `250`");
         check("-0.6", "nan", "expected a number");
+    }
+
+    #[test]
+    fn a_real_panel_has_the_geometry_that_the_file_names() {
+        let text = TEXT.replace("name = \"0012_1\"", "name = \"0012_1\"\nmesh = \"a.glb\"\nside = \"back\"");
+        let error = made_surfaces(&text, UnnamedGeometry::Refused).expect_err("flat is not listed");
+        assert!(error.is::<UsageError>() && error.to_string().contains("panel of surface `flat`"), "{error}");
+        let made = made_surfaces(&text, UnnamedGeometry::Unknown).expect("surfaces");
+        assert_eq!(made[2].specimen, PanelSpecimen::Mesh("a.glb".into(), PanelSide::Back));
+        for unknown in [0, 1, 3] {
+            assert_eq!((&made[unknown].specimen, &made[unknown].macro_reference), (&PanelSpecimen::NoGeometry, &None));
+        }
+        assert!(matches!(made[4].specimen, PanelSpecimen::Relief(_)), "it is named: {:?}", made[4]);
+        let both = TEXT.replace("relief = ", "mesh = \"a.glb\"\nrelief = ");
+        assert!(surfaces(&both).expect_err("both").to_string().contains("`mesh` and a `relief`"));
     }
 }

@@ -41,12 +41,15 @@ pub(crate) fn open_devices(request: &DeviceRequest<'_>, pace: TakePace) -> Resul
 /// Makes simulated devices.
 ///
 /// # Errors
-/// [`Error::Device`] if the rig's grid has no points.
+/// [`Error::Device`] if the rig's grid has no points, or the panel's geometry is not known.
 pub(crate) fn simulated_devices(request: &DeviceRequest<'_>, pace: TakePace) -> Result<RigDevices, Error> {
+    let Some(geometry) = &request.panel.geometry else {
+        return Err(Error::Device { device: "simulated rig", reason: "it needs the panel's geometry".into() });
+    };
     let devices = devices(&RigSimulation {
         rig: request.rig,
-        relief: &request.panel.heights,
-        material: request.panel.material,
+        relief: &geometry.heights,
+        material: geometry.material,
         start: request.start,
         seed: request.seed,
         arms: request.arms.clone(),

@@ -56,7 +56,7 @@ pub enum Error {
         back_secs: f64,
     },
     /// The disk is nearly full: stopped while all that was measured could still be written.
-    #[error("the disk of `{}` is nearly full: {free_mb:.1} MB are left, {needed_mb:.1} are kept free to end the run; hint: make room", folder.display())]
+    #[error("the disk of `{}` is nearly full: {free_mb:.1} MB are left, {needed_mb:.1} are kept free to end the run; hint: make room, and resume", folder.display())]
     DiskNearlyFull {
         /// The folder of the recording.
         folder: std::path::PathBuf,

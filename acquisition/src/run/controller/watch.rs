@@ -10,8 +10,6 @@ use crate::run::objection::TakeObjection;
 
 /// Pairs given up in a row before the run is: one may be bad luck, three with all their attempts are not.
 const LASTING: usize = 3;
-/// Bytes kept free, so that the log and the summary still fit.
-pub(crate) const KEPT_FREE: u64 = 1 << 20;
 
 /// Monitoring state of a run.
 pub(super) struct RunMonitor {
@@ -59,18 +57,18 @@ impl RunMonitor {
         Ok(())
     }
 
-    /// Checks the free space of the disk.
+    /// Checks that the disk has room for these bytes.
     ///
     /// # Errors
     /// [`Error::DiskNearlyFull`].
-    pub(super) fn disk(&self) -> Result<(), Error> {
+    pub(super) fn disk(&self, needed: u64) -> Result<(), Error> {
         // A file system that does not report it will refuse to write in the end.
         let Ok(free) = (self.free)(&self.folder) else { return Ok(()) };
-        if free >= KEPT_FREE {
+        if free >= needed {
             return Ok(());
         }
         let megabytes = |bytes: u64| bytes as f64 / 1e6;
-        let (free_mb, needed_mb) = (megabytes(free), megabytes(KEPT_FREE));
+        let (free_mb, needed_mb) = (megabytes(free), megabytes(needed));
         Err(Error::DiskNearlyFull { folder: self.folder.clone(), free_mb, needed_mb })
     }
 }
@@ -96,11 +94,11 @@ mod tests {
     #[test]
     fn a_disk_that_fills_up_is_noticed_before_it_is_full() {
         let mut watch = RunMonitor::new(Path::new("run.mcap"), Timestamp(0));
-        watch.free = |_| Ok(KEPT_FREE);
-        assert!(watch.disk().is_ok());
-        watch.free = |_| Ok(KEPT_FREE - 1);
-        assert!(matches!(watch.disk(), Err(Error::DiskNearlyFull { .. })));
+        watch.free = |_| Ok(5_000_000);
+        assert!(watch.disk(5_000_000).is_ok());
+        let error = watch.disk(5_100_000).expect_err("too little").to_string();
+        assert!(error.contains("5.0 MB are left, 5.1 are kept free to end the run"), "{error}");
         watch.free = |_| Err(std::io::ErrorKind::Unsupported.into());
-        assert!(watch.disk().is_ok(), "what cannot be told is no reason to stop");
+        assert!(watch.disk(u64::MAX).is_ok(), "what cannot be told is no reason to stop");
     }
 }

@@ -38,6 +38,13 @@ const SLOWER: f64 = 10.0;
 /// A run with more of them has chunks of a pair each, which cost every reader a request each.
 const MANY_CHECKPOINTS: u64 = 64;
 
+/// Bytes of a chunk in the summary, at most: its index has an entry for each of its topics.
+const CHUNK_INDEX_BYTES: u64 = 256;
+/// Bytes at which the writer ends a chunk.
+const CHUNK_BYTES: u64 = 1 << 20;
+/// Bytes that the end of a recording takes beside chunks and their indexes: log, schemas, metadata.
+const END_BYTES: u64 = 1 << 20;
+
 /// A panel as viewers show it.
 #[derive(Clone, Copy)]
 pub(crate) struct Shape<'a> {
@@ -261,6 +268,13 @@ impl Recorder {
     /// What recording has cost so far.
     pub fn cost(&self) -> Cost {
         self.cost
+    }
+
+    /// Returns the bytes that it takes, at most, to end the recording with all that was recorded: open chunks and the
+    /// summary.
+    pub(crate) fn bytes_to_end(&self) -> u64 {
+        let chunks = 3 * self.cost.checkpoints + self.cost.bytes / CHUNK_BYTES;
+        self.writer.pending_bytes() as u64 + chunks * CHUNK_INDEX_BYTES + END_BYTES
     }
 
     /// Records where microphone and speaker stand, mm: `/tf` and both poses.

@@ -16,8 +16,15 @@ use crate::panel::mesh::{Error, Mesh};
 /// shared, so a small file can ask for any number; a panel with a vertex every 0.5 mm on both sides has 2.7 million
 /// vertices and 5.5 million triangles.
 const MOST: usize = 6_000_000;
+/// Most characters of a buffer's URI in a message: it may be all of the buffer's bytes.
+const MOST_SHOWN: usize = 60;
 /// As messages say it.
 const AT_MOST: &str = "up to 6 million vertices and as many triangles in all instances";
+
+/// Extensions that change how a mesh looks and not its shape; others may do that, and a file that requires one is refused.
+const APPEARANCE: [&str; 3] = ["KHR_materials_", "KHR_texture_", "EXT_texture_"];
+/// An extension that makes instances of a node, which files may have without requiring it.
+const INSTANCING: &str = "EXT_mesh_gpu_instancing";
 
 /// Reads positions and triangles of every mesh in the file's scene, each transformed by its nodes.
 pub(crate) fn parse(bytes: &[u8], path: &Path) -> Result<Mesh, Error> {
@@ -35,6 +42,7 @@ fn wrong(place: impl Into<String>, actual: impl Into<String>, expected: &'static
 
 fn read(bytes: &[u8]) -> Result<Mesh, SceneFault> {
     let file = open(bytes)?;
+    check_features(&file.document)?;
     let mut mesh = Mesh::default();
     for instance in instances(&file.document)? {
         let primitives = list(&file.document["meshes"][instance.mesh]["primitives"]);
@@ -64,6 +72,30 @@ fn open(bytes: &[u8]) -> Result<GlbFile<'_>, SceneFault> {
     let bin = chunk(20 + text.len(), BIN_CHUNK).unwrap_or(&[]);
     let document = serde_json::from_slice(text).map_err(|e| wrong("its JSON", e.to_string(), "valid JSON"))?;
     Ok(GlbFile { document, bin })
+}
+
+// Refuses what would be read as another shape than the file's.
+fn check_features(document: &Value) -> Result<(), SceneFault> {
+    for extension in list(&document["extensionsRequired"]) {
+        let name = extension.as_str().unwrap_or_default();
+        if !APPEARANCE.iter().any(|prefix| name.starts_with(prefix)) {
+            let expected = "meshes that need no extension; hint: export it without compression and instances";
+            return Err(wrong("`extensionsRequired`", extension.to_string(), expected));
+        }
+    }
+    let has_instances = |node: &Value| !node["extensions"][INSTANCING].is_null();
+    if let Some(node) = list(&document["nodes"]).iter().position(has_instances) {
+        let expected = "one mesh a node; hint: export instances as meshes of their own";
+        return Err(wrong(format!("node {node}"), format!("the extension {INSTANCING}"), expected));
+    }
+    match &document["buffers"][0]["uri"] {
+        Value::Null => Ok(()),
+        uri => {
+            let shown: String = uri.to_string().chars().take(MOST_SHOWN).collect();
+            let expected = "the file's own binary chunk; hint: export it as one GLB file";
+            Err(wrong("buffer 0", format!("the uri {shown}"), expected))
+        }
+    }
 }
 
 // Adds a primitive with its node's transform; an error has the actual and the expected content.

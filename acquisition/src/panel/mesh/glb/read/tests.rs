@@ -129,6 +129,27 @@ fn numbers_of_another_kind_are_refused() {
     refused(|d| d["meshes"][0]["primitives"][0]["mode"] = json!("lines"), "expected triangles");
 }
 
+#[test]
+fn features_that_would_change_the_shape_are_refused_by_name() {
+    let required = |name: &str| {
+        let names = json!(["KHR_materials_unlit", name]);
+        move |d: &mut Value| d["extensionsRequired"] = names
+    };
+    refused(required("KHR_draco_mesh_compression"), "`extensionsRequired` has \"KHR_draco_mesh_compression\"");
+    refused(required("EXT_mesh_gpu_instancing"), "has \"EXT_mesh_gpu_instancing\"");
+    refused(|d| d["extensionsRequired"] = json!([7]), "`extensionsRequired` has 7");
+    assert_eq!(parsed(required("KHR_texture_transform")), parsed(|_| {}), "it changes no shape");
+    let instances = json!({ "EXT_mesh_gpu_instancing": { "attributes": { "TRANSLATION": 0 } } });
+    refused(|d| d["nodes"][0]["extensions"] = instances, "node 0 has the extension EXT_mesh_gpu_instancing");
+    refused(
+        |d| d["buffers"][0]["uri"] = json!("other.bin"),
+        "buffer 0 has the uri \"other.bin\", expected the file's own",
+    );
+    let embedded = format!("data:application/octet-stream;base64,{}", "A".repeat(9_999));
+    let error = parse(&file(|d| d["buffers"][0]["uri"] = json!(embedded)), Path::new("a.glb")).expect_err("a uri");
+    assert!(error.to_string().len() < 250, "{error}");
+}
+
 mod slow {
     use super::*;
 
