@@ -63,7 +63,7 @@ fn a_second_run_waits_for_the_first_or_is_forced() {
         std::thread::sleep(Duration::from_millis(20));
     }
     let second = ["acquire", "--surface", "foam", "--rig", "rig.toml", "--ir-only"];
-    place.fails(1, &second, "the folder `lake/inbox` is in use: `");
+    place.fails(1, &second, "lake/inbox` is in use: `");
     place.fails(1, &second, "-flat-");
     place.fails(1, &second, ".mcap.partial` is being recorded; hint: wait for the end of that run, or --force");
     place.ok(&[&second[..], &["--force"]].concat());

@@ -26,7 +26,7 @@ const NAME: &str = "import hdf5";
 const RESPONSE_SECS: f64 = 1e-3;
 /// Numbers that are read at once: 32 MB of them.
 const BLOCK_NUMBERS: usize = 1 << 22;
-/// Most numbers that are read at once because the file's chunks are so large: 256 MB.
+/// Most numbers that are read at once because each row, or each sample of all responses, has as many: 256 MB.
 const MOST_BLOCK_NUMBERS: usize = 1 << 25;
 const KELVIN: f64 = 273.15;
 
@@ -159,7 +159,7 @@ impl<'g> ResponseSet<'g> {
         let mut recorder = batch.create(&path, &start)?;
         recorder.log(started, LogLevel::Info, NAME, "times are made up: the mapping has none")?;
         let shape = &self.responses.shape;
-        let block = self.block_shape()?;
+        let block = self.block_shape();
         let mut blocks: Vec<usize> = shape.iter().zip(&block).map(|(n, b)| n.div_ceil(*b)).collect();
         if let Some(axis) = self.axes.measurement {
             blocks[axis] = 1;
@@ -219,28 +219,22 @@ impl<'g> ResponseSet<'g> {
         Ok(responses)
     }
 
-    // Returns the shape of the blocks that are read at once: all samples of some responses, in whole chunks.
-    fn block_shape(&self) -> Result<Vec<usize>, Error> {
+    // Returns the shape of the blocks that are read at once: all samples of some responses, in whole rows if they fit.
+    fn block_shape(&self) -> Vec<usize> {
         let shape = &self.responses.shape;
-        let fixed = [Some(self.axes.sample), self.axes.measurement];
-        let mut block = self.responses.chunk_shape().unwrap_or_else(|| vec![1; shape.len()]);
-        block.iter_mut().zip(shape).for_each(|(b, n)| *b = (*b).min(*n));
+        let mut block = vec![1; shape.len()];
         block[self.axes.sample] = shape[self.axes.sample];
-        if let Some(axis) = self.axes.measurement {
-            block[axis] = 1;
-        }
-        let size = |block: &[usize]| block.iter().fold(1usize, |size, n| size.saturating_mul(*n));
-        if size(&block) > MOST_BLOCK_NUMBERS {
-            let place = &self.mapping.responses.dataset;
-            let actual = format!("chunks of which all samples are {} numbers", size(&block));
-            let expected = format!("{MOST_BLOCK_NUMBERS} at most; hint: `h5repack -l` makes chunks of other shapes");
-            return Err(wrong(&self.mapping.file, place, actual, expected));
-        }
+        let fixed = [Some(self.axes.sample), self.axes.measurement];
         for axis in (0..shape.len()).rev().filter(|axis| !fixed.contains(&Some(*axis))) {
-            let room = BLOCK_NUMBERS / size(&block);
-            block[axis] = block[axis].saturating_mul(room.max(1)).min(shape[axis]);
+            let most = if axis == 0 { BLOCK_NUMBERS } else { MOST_BLOCK_NUMBERS };
+            let size = block.iter().fold(1usize, |size, n| size.saturating_mul(*n));
+            block[axis] = (most / size).clamp(1, shape[axis]);
         }
-        Ok(block)
+        let chunk_rows = self.responses.chunk_rows;
+        if block[0] > chunk_rows && block[0] < shape[0] {
+            block[0] -= block[0] % chunk_rows;
+        }
+        block
     }
 }
 
