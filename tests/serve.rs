@@ -3,7 +3,6 @@
 mod agents;
 mod attacks;
 pub(crate) mod catalogue;
-mod certificates;
 mod contract;
 mod dialect;
 mod drain;

@@ -317,12 +317,13 @@ impl QueryEngine {
         self.0.running.add(&ticket);
         if let (Some(time), Some(threads)) = (time, self.0.watch.handle()) {
             let watched = Arc::downgrade(&ticket);
-            threads.spawn(async move {
+            let timer = threads.spawn(async move {
                 tokio::time::sleep(time).await;
                 if let Some(ticket) = watched.upgrade() {
                     ticket.stop(StopReason::Time(time));
                 }
             });
+            ticket.set_timer(timer.abort_handle());
         }
         ticket
     }

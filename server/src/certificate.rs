@@ -15,37 +15,21 @@ pub struct SelfSigned {
     pub key: String,
 }
 
-/// The side that shows a certificate.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum CertificateUse {
-    /// A server of the names and addresses.
-    Server,
-    /// A client of the first name.
-    Client,
-}
-
-/// Makes a certificate of these names and addresses, valid for 397 days.
+/// Makes a server's certificate of these names and addresses, valid for 397 days.
 ///
 /// # Errors
 /// [`Error::SelfSigned`] if a name cannot be one.
-pub fn self_signed(names: &[String], shown_by: CertificateUse) -> Result<SelfSigned, Error> {
+pub fn self_signed(names: &[String]) -> Result<SelfSigned, Error> {
     let make = || {
         let key = KeyPair::generate()?;
-        // A client's name need not be one of a machine.
-        let mut params = match shown_by {
-            CertificateUse::Server => CertificateParams::new(names)?,
-            CertificateUse::Client => CertificateParams::default(),
-        };
+        let mut params = CertificateParams::new(names)?;
         params.distinguished_name = DistinguishedName::new();
         let now = time::OffsetDateTime::now_utc();
         params.not_before = now - time::Duration::hours(1);
         params.not_after = now + time::Duration::days(DAYS);
         params.distinguished_name.push(DnType::CommonName, names.first().map_or("echolake", String::as_str));
         params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
-        params.extended_key_usages = vec![match shown_by {
-            CertificateUse::Server => ExtendedKeyUsagePurpose::ServerAuth,
-            CertificateUse::Client => ExtendedKeyUsagePurpose::ClientAuth,
-        }];
+        params.extended_key_usages = vec![ExtendedKeyUsagePurpose::ServerAuth];
         let certificate = params.self_signed(&key)?.pem();
         Ok(SelfSigned { certificate, key: key.serialize_pem() })
     };

@@ -9,6 +9,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::tokens::TokenScope;
 
+/// Seconds after which a client may ask again a server that stops or is not ready: a restart takes some.
+const RESTART_SECS: u64 = 5;
+
 /// The failure of a request.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum RequestFault {
@@ -135,7 +138,7 @@ pub(crate) enum RequestFault {
         limit: usize,
     },
     /// Too many failed logins of an address.
-    #[error("too many failed logins from this address; hint: log in with a valid token in {} s", wait.as_secs() + 1)]
+    #[error("too many failed logins from this address; hint: log in with a valid token in {} s", whole_secs(*wait))]
     FailedLogins {
         /// Time after which it may try again.
         wait: Duration,
@@ -146,6 +149,17 @@ pub(crate) enum RequestFault {
     /// The server is stopping, and ends an idle connection.
     #[error("the server is stopping and ends this connection; hint: connect again in a moment")]
     Disconnected,
+    /// The connection was idle, and another client needed its engine's place.
+    #[error("this connection was idle, and its place was needed; hint: connect again, or serve with more --engines")]
+    Displaced,
+    /// Engines of the client have ended one after the other.
+    #[error("queries of this client ended {ends} engines in a row; hint: ask again in {} s", whole_secs(*wait))]
+    Backoff {
+        /// Engines that ended.
+        ends: u32,
+        /// Time after which the client may ask again.
+        wait: Duration,
+    },
     /// Requests cannot be answered at present.
     #[error("the server is not ready: {reason}; hint: its log says more")]
     NotReady {
@@ -324,6 +338,14 @@ impl RequestFault {
         }
     }
 
+    /// Returns the seconds after which the client may ask again, if they are known.
+    pub(crate) fn retry_secs(&self) -> Option<u64> {
+        match self {
+            Self::FailedLogins { wait } | Self::Backoff { wait, .. } => Some(whole_secs(*wait)),
+            _ => matches!(self.code(), FaultCode::Stopping | FaultCode::NotReady).then_some(RESTART_SECS),
+        }
+    }
+
     /// Its code.
     pub(crate) fn code(&self) -> FaultCode {
         match self {
@@ -346,13 +368,19 @@ impl RequestFault {
             Self::Foreign { .. } => FaultCode::Foreign,
             Self::Cancelled => FaultCode::Cancelled,
             Self::Timeout { .. } => FaultCode::TimeLimit,
-            Self::TooMany { .. } | Self::FailedLogins { .. } => FaultCode::TooMany,
+            Self::TooMany { .. } | Self::FailedLogins { .. } | Self::Backoff { .. } | Self::Displaced => {
+                FaultCode::TooMany
+            }
             Self::EngineEnded { .. } => FaultCode::EngineEnded,
             Self::Internal => FaultCode::Internal,
             Self::Draining | Self::Disconnected => FaultCode::Stopping,
             Self::NotReady { .. } => FaultCode::NotReady,
         }
     }
+}
+
+fn whole_secs(wait: Duration) -> u64 {
+    wait.as_secs() + 1
 }
 
 fn slice_code(error: &SliceError) -> FaultCode {

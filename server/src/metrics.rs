@@ -268,11 +268,10 @@ mod tests {
         metrics.spread(&SpreadCounts { spread: 3, repeated: 1, returned: 0 });
         let url = "http://127.0.0.1:7070/".to_owned();
         let figures = Some(WorkerFigures { read_bytes: 7, ..WorkerFigures::default() });
-        let problem = Some("gone".to_owned());
-        metrics.set_workers(&[WorkerStatus { url, problem, build: None, last_seen: None, figures }]);
+        metrics.set_workers(&[WorkerStatus { url, problem: None, build: None, last_seen: None, figures }]);
         let text = metrics.text(&ServerGauges::default()).expect("a text");
         has(&text, "echolake_spread_queries_total{event=\"begun_again\"} 1");
-        has(&text, "echolake_worker_usable{worker=\"http://127.0.0.1:7070/\"} 0");
+        has(&text, "echolake_worker_usable{worker=\"http://127.0.0.1:7070/\"} 1");
         has(&text, "echolake_worker_read_bytes{worker=\"http://127.0.0.1:7070/\"} 7");
         metrics.begin(ServerProtocol::Http);
         metrics.lose(1);

@@ -1,7 +1,6 @@
 //! Spans of requests in the log. The door numbers requests and connections, and the engine's lines about one carry the
 //! same number. Spans are at the level of errors: no filter that lets a line through takes its spans away.
 
-use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use axum::extract::Request;
@@ -30,7 +29,7 @@ const LONGEST_ID: usize = 128;
 pub(crate) fn begin_request(headers: &mut HeaderMap, protocol: ServerProtocol) -> (Span, HeaderValue) {
     let number = next_number();
     headers.insert(HEADER, HeaderValue::from(number));
-    let id = headers.remove(REQUEST_ID).filter(is_sane).unwrap_or_else(|| own_id(number));
+    let id = headers.remove(REQUEST_ID).filter(is_sane).unwrap_or_else(random_id);
     headers.insert(REQUEST_ID, id.clone());
     let (request_id, protocol) = (id.to_str().unwrap_or_default(), protocol.name());
     let span =
@@ -49,11 +48,10 @@ fn is_sane(id: &HeaderValue) -> bool {
     (1..=LONGEST_ID).contains(&id.len()) && id.as_bytes().iter().all(is_plain)
 }
 
-// Numbers begin anew with the server, so that they alone would name two requests.
-fn own_id(number: u64) -> HeaderValue {
-    static START: OnceLock<u32> = OnceLock::new();
-    let start = START.get_or_init(|| getrandom::u32().unwrap_or(0));
-    HeaderValue::from_str(&format!("{start:08x}-{number}")).unwrap_or_else(|_| HeaderValue::from(number))
+// A client sees it: a number that is counted would tell how much others ask.
+fn random_id() -> HeaderValue {
+    let random = getrandom::u64().unwrap_or(0);
+    HeaderValue::from_str(&format!("{random:016x}")).unwrap_or_else(|_| HeaderValue::from(random))
 }
 
 // The trace of `00-TRACE-PARENT-FLAGS`.
@@ -153,8 +151,8 @@ mod tests {
         assert_eq!(id(b"01J9ZK-a_b.c:d/e+f=@"), "01J9ZK-a_b.c:d/e+f=@");
         for wrong in [&b""[..], b"two words", b"a\"b", b"{}", b"caf\xe9", &[b'x'; LONGEST_ID + 1]] {
             let named = id(wrong);
-            let (start, number) = named.split_once('-').expect("two parts");
-            assert!(start.len() == 8 && number.parse::<u64>().is_ok(), "{wrong:?} became {named}");
+            assert!(named.len() == 16 && u64::from_str_radix(&named, 16).is_ok(), "{wrong:?} became {named}");
+            assert_ne!(named.get(..8), id(wrong).get(..8), "the next one does not follow from it");
         }
     }
 

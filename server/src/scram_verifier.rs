@@ -41,6 +41,14 @@ impl ScramVerifier {
         Ok(Self::with_salt(token, salt, ITERATIONS))
     }
 
+    /// Makes a verifier that no token passes, for a name without one. Its salt is always the same for a name, as that of a
+    /// verifier is, and nobody computes it without the secret.
+    pub(crate) fn unpassable(name: &str, secret: &[u8]) -> Self {
+        let of = |purpose: &[u8]| sign(&sign(secret, purpose), name.as_bytes());
+        let (salt, stored_key) = (of(b"salt")[..SALT_BYTES].to_vec(), of(b"stored key"));
+        Self { iterations: ITERATIONS, salt, stored_key, server_key: of(b"server key") }
+    }
+
     fn with_salt(token: &str, salt: Vec<u8>, iterations: NonZeroU32) -> Self {
         let mut salted = [0; 32];
         pbkdf2::derive(pbkdf2::PBKDF2_HMAC_SHA256, iterations, &salt, token.as_bytes(), &mut salted);

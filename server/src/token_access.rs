@@ -1,4 +1,4 @@
-//! Access control: who a client is, by its token, certificate, browser session, or identity provider.
+//! Access control: who a client is, by its token, browser session, or identity provider.
 
 use std::sync::{Arc, PoisonError, RwLock, RwLockReadGuard};
 use std::time::SystemTime;
@@ -117,18 +117,17 @@ impl TokenAccess {
         }
     }
 
-    /// Returns the client of the name in a certificate; None on a server without tokens, or if the name has no line.
-    pub(crate) fn certified_client(&self, name: &str) -> Option<Arc<ClientIdentity>> {
-        let Self::Named(named) = self else { return None };
-        named.file().find_name(name).map(|entry| entry.client.clone())
-    }
-
-    /// Returns the client of a token's name, and what tells whether it has the token; None if its line has no such verifier.
-    pub(crate) fn scram_client(&self, name: &str) -> Option<(Arc<ClientIdentity>, Arc<ScramVerifier>)> {
-        let Self::Named(named) = self else { return None };
+    /// Returns the verifier of a token's name, and its client. A name without one has a verifier that nobody passes and looks
+    /// like others, and no client.
+    pub(crate) fn scram_client(&self, name: &str) -> (Option<Arc<ClientIdentity>>, Arc<ScramVerifier>) {
+        let Self::Named(named) = self else { return (None, Arc::new(ScramVerifier::unpassable(name, &[]))) };
         let file = named.file();
-        let entry = file.find_name(name)?;
-        Some((entry.client.clone(), entry.scram.clone()?))
+        // Computed for known names, too, so that the time is the same.
+        let unpassable = ScramVerifier::unpassable(name, &file.secret());
+        match file.find_name(name).and_then(|entry| Some((entry.client.clone(), entry.scram.clone()?))) {
+            Some((client, verifier)) => (Some(client), verifier),
+            None => (None, Arc::new(unpassable)),
+        }
     }
 
     /// Returns the client of a name; on a server without tokens, the one of this name that asks over HTTP.
@@ -292,9 +291,15 @@ mod tests {
         assert_eq!(access.client_of_session(&secret, local).expect("let in"), client);
         assert!(matches!(access.client_of_session(&fresh.token, local), Err(RequestFault::Unauthenticated)));
         assert!(matches!(access.begin_session(&secret), Err(RequestFault::Unauthenticated)));
-        let (by_name, _) = access.scram_client("a \"quoted\" name").expect("a verifier");
-        assert_eq!(by_name, client);
-        assert!(access.scram_client("b").is_none());
+        let (by_name, verifier) = access.scram_client("a \"quoted\" name");
+        assert_eq!(by_name, Some(client));
+        let (nobody, unpassable) = access.scram_client("b");
+        assert_eq!((nobody, unpassable.salt().len()), (None, verifier.salt().len()));
+        assert_eq!(unpassable.iterations(), verifier.iterations());
+        assert_eq!(access.scram_client("b").1, unpassable, "a name's salt is always the same");
+        assert_ne!(access.scram_client("c").1.salt(), unpassable.salt());
+        let other = access_by(&crate::tokens::fresh("x", None, &[], &[TokenScope::Sql]).expect("a token").lines);
+        assert_ne!(other.scram_client("b").1.salt(), unpassable.salt(), "nobody computes it");
         let other = crate::tokens::fresh("b", None, &[], &[TokenScope::Sql]).expect("a token").token;
         let cut = &fresh.token[..fresh.token.len() - 1];
         for wrong in [None, Some(""), Some(other.as_str()), Some(cut)] {
@@ -313,19 +318,5 @@ mod tests {
         assert_eq!(allowed(""), [true, true, false]);
         assert_eq!(allowed("scopes = ['sql']"), [true, false, false]);
         assert_eq!(allowed("scopes = ['metrics']"), [false, false, true]);
-    }
-
-    #[test]
-    fn a_certificate_stands_for_the_token_of_its_name() {
-        let hash = hex::encode(Sha256::digest("x"));
-        let access =
-            access_by(&format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\n[[token]]\nname = 'b'\nscopes = ['sql']"));
-        let by_token = access.client(Some("x"), ClientIdentity::pages).expect("let in");
-        assert_eq!(access.certified_client("a"), Some(by_token));
-        let certified = access.certified_client("b").expect("let in");
-        assert_eq!((certified.scopes.as_slice(), certified.token), (&[TokenScope::Sql][..], None));
-        assert!(access.check_current(&certified).is_ok());
-        assert_eq!(access.certified_client("c"), None);
-        assert_eq!(TokenAccess::new(None, None).certified_client("a"), None, "there all are local");
     }
 }

@@ -73,20 +73,10 @@ pub struct TokenFile {
     groups: Vec<ClientIdentity>,
 }
 
-/// The logins of a server beside tokens.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct OtherLogins {
-    /// True if clients may log in by a certificate.
-    pub by_certificate: bool,
-    /// True if users of an identity provider may log in.
-    pub by_oidc: bool,
-}
-
 /// A line of a token.
 pub(crate) struct TokenEntry {
     pub(crate) client: Arc<ClientIdentity>,
-    /// None if the client logs in by certificate alone.
-    hash: Option<[u8; 32]>,
+    hash: [u8; 32],
     /// For logins that do not send the token; a line from an older version has none.
     pub(crate) scram: Option<Arc<ScramVerifier>>,
     expires: Option<DateTime<Utc>>,
@@ -138,13 +128,15 @@ impl Line {
                 "`{name}` is no name of a token; hint: users of an identity provider have `[[group]]`"
             ));
         }
-        let hash = self.sha256.as_ref().map(|text| {
-            let mut hash = [0; 32];
-            let decoded = hex::decode_to_slice(text, &mut hash).map(|()| hash);
-            decoded.map_err(|_| format!("the sha256 of `{name}` is not 64 hexadecimal digits"))
-        });
-        let hash = hash.transpose()?;
-        let token = hash.as_ref().and_then(|hash| hash.first_chunk()).map(|head| u64::from_le_bytes(*head));
+        let Some(text) = &self.sha256 else {
+            return Err(format!(
+                "`{name}` has no sha256, by which alone its client can log in; hint: `echolake token NAME`"
+            ));
+        };
+        let mut hash = [0; 32];
+        hex::decode_to_slice(text, &mut hash)
+            .map_err(|_| format!("the sha256 of `{name}` is not 64 hexadecimal digits"))?;
+        let token = hash.first_chunk().map(|head| u64::from_le_bytes(*head));
         let expires = self.expires.map(|time| {
             let time = DateTime::parse_from_rfc3339(&time.to_string()).map(|time| time.to_utc());
             time.map_err(|_| format!("expires of `{name}` is no time with a zone, as 2027-01-31T12:00:00Z"))
@@ -236,9 +228,7 @@ impl TokenFile {
         let file: TokenList = toml::from_str(text).map_err(|e| e.to_string())?;
         let entries = file.token.iter().map(Line::entry).collect::<Result<Vec<_>, _>>()?;
         for (i, entry) in entries.iter().enumerate() {
-            let is_same = |e: &TokenEntry| {
-                e.client.name == entry.client.name || entry.hash.is_some_and(|hash| e.hash == Some(hash))
-            };
+            let is_same = |e: &TokenEntry| e.client.name == entry.client.name || e.hash == entry.hash;
             if entries[..i].iter().any(is_same) {
                 return Err(format!("`{}` is there twice", entry.client.name));
             }
@@ -250,19 +240,12 @@ impl TokenFile {
         Ok(Self { path: path.to_owned(), entries, groups })
     }
 
-    /// Checks that each line can let somebody in.
+    /// Checks that there are no groups if there is no identity provider, who alone has users in them.
     ///
     /// # Errors
     /// [`Error::Tokens`].
-    pub(crate) fn check_logins(&self, other: OtherLogins) -> Result<(), Error> {
-        let without = self.entries.iter().find(|entry| entry.hash.is_none()).filter(|_| !other.by_certificate);
-        if let Some(entry) = without {
-            let name = &entry.client.name;
-            return Err(self.wrong(format!(
-                "`{name}` has no sha256, and no certificate can log it in; hint: --client-ca FILE, or `echolake token NAME`"
-            )));
-        }
-        match self.groups.first().filter(|_| !other.by_oidc) {
+    pub(crate) fn check_groups(&self, has_provider: bool) -> Result<(), Error> {
+        match self.groups.first().filter(|_| !has_provider) {
             Some(group) => {
                 Err(self.wrong(format!("the group `{}` is nobody's; hint: --oidc ISSUER names its users", group.name)))
             }
@@ -284,12 +267,17 @@ impl TokenFile {
     pub(crate) fn find(&self, hash: &[u8; 32]) -> Option<&TokenEntry> {
         let mut found = None;
         for entry in &self.entries {
-            let same: Choice = entry.hash.map_or(Choice::from(0), |own| own.ct_eq(hash));
+            let same: Choice = entry.hash.ct_eq(hash);
             if same.into() {
                 found = Some(entry);
             }
         }
         found.filter(|entry| entry.is_valid())
+    }
+
+    /// A secret that is the same after a restart, and for as long as the first line stays.
+    pub(crate) fn secret(&self) -> [u8; 32] {
+        self.entries.first().map_or([0; 32], |entry| entry.hash)
     }
 
     /// Finds a line by its name.
@@ -368,6 +356,7 @@ mod tests {
         for (text, expected) in [
             (format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\nexpires = 2027-01-31"), "no time with a zone"),
             ("[[token]]\nname = 'a'\nsha256 = 'ab'".to_owned(), "64 hexadecimal"),
+            ("[[token]]\nname = 'a'".to_owned(), "`a` has no sha256"),
             (format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\nscram = 'md5'"), "the scram of `a` is wrong"),
             (format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\nrows = 0"), "rows of `a` is 0"),
             (format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\nscopes = ['all']"), "unknown variant"),
@@ -405,15 +394,11 @@ mod tests {
     }
 
     #[test]
-    fn lines_that_let_nobody_in_are_refused() {
-        let check = |text: &str, by_certificate, by_oidc| {
-            let file = TokenFile::parse(Path::new("tokens.toml"), text).expect("tokens");
-            file.check_logins(OtherLogins { by_certificate, by_oidc }).map_err(|e| e.to_string())
-        };
-        let (certified, group) = ("[[token]]\nname = 'ann'", "[[group]]\nname = 'lab'");
-        assert!(check(certified, false, true).expect_err("no certificates").contains("`ann` has no sha256"));
-        assert!(check(group, true, false).expect_err("no provider").contains("the group `lab` is nobody's"));
-        assert_eq!(check(&format!("{certified}\n{group}"), true, true), Ok(()));
+    fn groups_without_a_provider_are_refused() {
+        let file = TokenFile::parse(Path::new("tokens.toml"), "[[group]]\nname = 'lab'").expect("a group");
+        let refused = file.check_groups(false).expect_err("no provider").to_string();
+        assert!(refused.contains("the group `lab` is nobody's"), "{refused}");
+        assert!(file.check_groups(true).is_ok());
     }
 
     #[test]

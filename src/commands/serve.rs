@@ -12,7 +12,7 @@ use anyhow::Context as _;
 use echolake_lake::{Lake, remote_access};
 use echolake_query::{WorkerLink, WorkerToken};
 use echolake_schema::ProjectName;
-use echolake_server::certificate::{CertificateUse, self_signed};
+use echolake_server::certificate::self_signed;
 use echolake_server::engine::{EngineRun, confinement, run_engine};
 use echolake_server::tokens::{self, TokenFile, TokenScope};
 use echolake_server::worker::{
@@ -39,6 +39,8 @@ const SPREAD_MIB: u32 = 64;
 const CATALOGUE_DRAIN: Duration = Duration::from_secs(5);
 
 #[derive(Debug, clap::Args)]
+// An option of earlier versions, which is refused by name.
+#[command(arg = clap::Arg::new("client_ca").long("client-ca").hide(true).value_parser(refuse_client_ca))]
 pub(crate) struct ServeArgs {
     /// Address for HTTP, or `off`; port 0 picks a free one (also for the two below).
     #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:8080")]
@@ -58,9 +60,6 @@ pub(crate) struct ServeArgs {
     /// Private key of the certificate (PEM).
     #[arg(long, value_name = "FILE", requires = "certificate")]
     key: Option<PathBuf>,
-    /// Certificates of those who issue clients' certificates (PEM): a client's name is that of a line in the file of tokens.
-    #[arg(long, value_name = "FILE", requires = "certificate", requires = "tokens")]
-    client_ca: Option<PathBuf>,
     #[command(flatten)]
     oidc: OidcArgs,
     /// Listen without encryption beyond this machine, because a proxy encrypts.
@@ -225,6 +224,11 @@ impl FromStr for ListenAddress {
     }
 }
 
+fn refuse_client_ca(_: &str) -> Result<String, String> {
+    Err("clients no longer log in by certificate; hint: --tokens FILE, whose lines `echolake token NAME` makes"
+        .to_owned())
+}
+
 impl ListenAddress {
     fn address(self) -> Option<SocketAddr> {
         match self {
@@ -278,7 +282,7 @@ impl ServeArgs {
 
     fn certificate_files(&self) -> Option<CertificateFiles> {
         let (certificate, key) = self.certificate.clone().zip(self.key.clone())?;
-        Some(CertificateFiles { certificate, key, client_ca: self.client_ca.clone() })
+        Some(CertificateFiles { certificate, key })
     }
 
     fn workers(&self) -> anyhow::Result<Option<EngineWorkers>> {
@@ -404,9 +408,6 @@ pub(crate) struct CertificateArgs {
     /// Names and addresses under which clients reach the server.
     #[arg(value_name = "NAME", required = true)]
     names: Vec<String>,
-    /// Make the certificate of a client, whose one NAME is that of a line in the file of tokens.
-    #[arg(long)]
-    client: bool,
     /// Folder for certificate.pem and key.pem; files that are there are not overwritten.
     #[arg(short, long, value_name = "DIR", default_value = ".")]
     output: PathBuf,
@@ -414,11 +415,7 @@ pub(crate) struct CertificateArgs {
 
 /// Writes a self-signed certificate and its key.
 pub(crate) fn certificate(args: &CertificateArgs) -> anyhow::Result<CommandOutcome> {
-    let made = match (args.client, args.names.as_slice()) {
-        (false, names) => self_signed(names, CertificateUse::Server)?,
-        (true, [_]) => self_signed(&args.names, CertificateUse::Client)?,
-        (true, names) => anyhow::bail!("{} names, expected one; hint: a certificate for each client", names.len()),
-    };
+    let made = self_signed(&args.names)?;
     std::fs::create_dir_all(&args.output).with_context(|| format!("cannot make `{}`", args.output.display()))?;
     // The key first: nobody but its owner reads it, from its first byte on.
     for (name, text, mode) in [("key.pem", &made.key, 0o600), ("certificate.pem", &made.certificate, 0o644)] {
@@ -428,14 +425,7 @@ pub(crate) fn certificate(args: &CertificateArgs) -> anyhow::Result<CommandOutco
         file.write_all(text.as_bytes()).and_then(|()| file.sync_all()).with_context(failed)?;
         super::print(&path.display().to_string())?;
     }
-    eprintln!(
-        "{}",
-        match args.client {
-            false => "clients trust it by having certificate.pem; the key stays on the server",
-            true =>
-                "a server lets it in by having certificate.pem in the file of --client-ca; the key stays with the client",
-        }
-    );
+    eprintln!("clients trust it by having certificate.pem; the key stays on the server");
     Ok(CommandOutcome::Whole)
 }
 

@@ -1,32 +1,48 @@
 //! TLS of all three protocols, as clients see it that trust the server's certificate alone.
 
+use std::future::poll_fn;
 use std::io::{Read as _, Write as _};
 use std::net::TcpStream;
 use std::path::Path;
+use std::pin::Pin;
 use std::sync::Arc;
 
+use hyper::body::Body as _;
+use hyper::client::conn::http2::{self, SendRequest};
+use hyper::{Request, Response};
+use hyper_util::rt::{TokioExecutor, TokioIo};
+use tokio_rustls::TlsConnector;
 use tokio_rustls::rustls::crypto::ring;
 use tokio_rustls::rustls::pki_types::pem::PemObject as _;
 use tokio_rustls::rustls::pki_types::{CertificateDer, PrivateKeyDer, ServerName};
 use tokio_rustls::rustls::{ClientConfig, ClientConnection, RootCertStore, StreamOwned};
 
 use super::super::TestFolder;
-use super::server::ServedLake;
+use super::server::{ANSWER_LIMIT, ServedLake};
 use super::{lake, served, wait_until};
 
-pub(super) type TlsClient = StreamOwned<ClientConnection, TcpStream>;
+type TlsClient = StreamOwned<ClientConnection, TcpStream>;
 
 /// A lake with a certificate in the folder `tls`.
-pub(super) fn certified() -> TestFolder {
+fn certified() -> TestFolder {
     let place = lake();
     place.ok(&["certificate", "localhost", "127.0.0.1", "-o", "tls"]);
     place
 }
 
-pub(super) const FILES: [&str; 4] = ["--certificate", "tls/certificate.pem", "--key", "tls/key.pem"];
+/// The same with a token, which is returned.
+fn certified_with_token() -> (TestFolder, String) {
+    let place = certified();
+    let made = place.run(&["token", "ann"]);
+    std::fs::write(place.path("tokens.toml"), &made.stdout).expect("written");
+    let token = super::super::stderr(&made).lines().next().expect("a token").to_owned();
+    (place, token)
+}
+
+const FILES: [&str; 4] = ["--certificate", "tls/certificate.pem", "--key", "tls/key.pem"];
 
 /// A client of a protocol that trusts one certificate, and shows the one in the folder `own`.
-pub(super) fn client_config(certificate: &Path, own: Option<&Path>, protocol: &str) -> ClientConfig {
+fn client_config(certificate: &Path, own: Option<&Path>, protocol: &str) -> ClientConfig {
     let mut roots = RootCertStore::empty();
     roots.add(CertificateDer::from_pem_file(certificate).expect("PEM")).expect("a certificate");
     let config = ClientConfig::builder_with_provider(Arc::new(ring::default_provider()))
@@ -51,7 +67,7 @@ fn shake(stream: TcpStream, certificate: &Path, protocol: &str) -> std::io::Resu
 }
 
 /// Shakes hands on a connection.
-pub(super) fn shake_as(stream: TcpStream, config: ClientConfig, protocol: &str) -> std::io::Result<TlsClient> {
+fn shake_as(stream: TcpStream, config: ClientConfig, protocol: &str) -> std::io::Result<TlsClient> {
     let name = ServerName::try_from("localhost").expect("a name");
     let mut client = StreamOwned::new(ClientConnection::new(Arc::new(config), name).expect("a client"), stream);
     client.flush()?;
@@ -63,7 +79,7 @@ pub(super) fn shake_as(stream: TcpStream, config: ClientConfig, protocol: &str) 
 }
 
 /// Asks for a path; the connection stays.
-pub(super) fn get(client: &mut TlsClient, path: &str, more: &str) -> String {
+fn get(client: &mut TlsClient, path: &str, more: &str) -> String {
     write!(client, "GET {path} HTTP/1.1\r\nHost: localhost\r\n{more}\r\n").expect("sent");
     let mut text = String::new();
     while !text.contains("\r\n\r\n") {
@@ -79,7 +95,7 @@ pub(super) fn get(client: &mut TlsClient, path: &str, more: &str) -> String {
 }
 
 /// Begins a session of a user over Postgres' protocol.
-pub(super) fn begin_session(stream: &mut dyn std::io::Write, user: &str) {
+fn begin_session(stream: &mut dyn std::io::Write, user: &str) {
     let mut body = 196_608_i32.to_be_bytes().to_vec();
     body.extend(format!("user\0{user}\0database\0datafusion\0\0").as_bytes());
     let length = ((body.len() + 4) as i32).to_be_bytes();
@@ -87,7 +103,7 @@ pub(super) fn begin_session(stream: &mut dyn std::io::Write, user: &str) {
 }
 
 /// Connects over Postgres' protocol, up to the handshake.
-pub(super) fn ask_for_tls(server: &ServedLake) -> TcpStream {
+fn ask_for_tls(server: &ServedLake) -> TcpStream {
     let mut asked = ServedLake::connect(&server.postgres);
     let mut answer = [0; 1];
     asked.write_all(&[0, 0, 0, 8, 0x04, 0xd2, 0x16, 0x2f]).expect("sent");
@@ -126,9 +142,7 @@ fn all_protocols_are_encrypted() {
 
 #[test]
 fn what_cannot_be_encrypted_is_refused() {
-    let place = certified();
-    let tokens = place.run(&["token", "analyst"]);
-    std::fs::write(place.path("tokens.toml"), &tokens.stdout).expect("written");
+    let (place, _) = certified_with_token();
     let beyond = ["serve", "--listen", "0.0.0.0:0", "--tokens", "tokens.toml"];
     place.fails(1, &beyond, "nothing would be encrypted");
     place.fails(2, &["serve", "--certificate", "tls/certificate.pem"], "--key");
@@ -139,6 +153,79 @@ fn what_cannot_be_encrypted_is_refused() {
     let files = ["serve", "--certificate", "tls/certificate.pem", "--key", "other/key.pem"];
     place.fails(1, &files, "`other/key.pem`");
     place.fails(1, &["certificate", "localhost", "-o", "tls"], "cannot write `tls/key.pem`");
+    place.fails(2, &["serve", "--client-ca", "tls/certificate.pem"], "clients no longer log in by certificate");
+    std::fs::write(place.path("certified.toml"), "[[token]]\nname = 'ann'\n").expect("written");
+    place.fails(1, &["serve", "--tokens", "certified.toml"], "`ann` has no sha256");
+}
+
+#[test]
+fn a_certificate_logs_nobody_in() {
+    let (place, token) = certified_with_token();
+    let server = served(&place, &[&FILES[..], &["--tokens", "tokens.toml"]].concat());
+    place.ok(&["certificate", "ann", "-o", "own"]);
+    let config = client_config(&place.path("tls/certificate.pem"), Some(&place.path("own")), "http/1.1");
+    let mut client = shake_as(ServedLake::connect(&server.http), config.clone(), "http/1.1").expect("a handshake");
+    assert!(get(&mut client, "/api/v1/tables", "").starts_with("HTTP/1.1 401"));
+    let bearer = format!("Authorization: Bearer {token}\r\n");
+    assert!(get(&mut client, "/api/v1/tables", &bearer).starts_with("HTTP/1.1 200"));
+    let config = ClientConfig { alpn_protocols: vec![b"postgresql".to_vec()], ..config };
+    let mut session = shake_as(ask_for_tls(&server), config, "postgresql").expect("a handshake");
+    begin_session(&mut session, "ann");
+    let mut header = [0; 9];
+    session.read_exact(&mut header).expect("an answer");
+    assert_eq!(header[5..], [0, 0, 0, 10], "it has to prove that it has the token");
+}
+
+async fn connect_http2(place: &TestFolder, address: &str) -> SendRequest<String> {
+    let config = client_config(&place.path("tls/certificate.pem"), None, "h2");
+    let stream = tokio::net::TcpStream::connect(address).await.expect("connected");
+    let name = ServerName::try_from("localhost").expect("a name");
+    let stream = TlsConnector::from(Arc::new(config)).connect(name, stream).await.expect("a handshake");
+    assert_eq!(stream.get_ref().1.alpn_protocol(), Some(&b"h2"[..]));
+    let (sender, connection) =
+        http2::handshake(TokioExecutor::new(), TokioIo::new(stream)).await.expect("a connection of HTTP/2");
+    tokio::spawn(async move { drop(connection.await) });
+    sender
+}
+
+async fn ask(sender: &SendRequest<String>, request: Request<String>) -> Response<Vec<u8>> {
+    let answer = async {
+        let (parts, mut incoming) = sender.clone().send_request(request).await.expect("an answer").into_parts();
+        let mut body = Vec::new();
+        while let Some(frame) = poll_fn(|context| Pin::new(&mut incoming).poll_frame(context)).await {
+            body.extend_from_slice(frame.expect("whole").data_ref().map_or(&[][..], |data| data));
+        }
+        Response::from_parts(parts, body)
+    };
+    tokio::time::timeout(ANSWER_LIMIT, answer).await.expect("in time")
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn pages_and_queries_share_a_connection_of_http_2() {
+    let (place, token) = certified_with_token();
+    let server = served(&place, &[&FILES[..], &["--tokens", "tokens.toml"]].concat());
+    let ann = connect_http2(&place, &server.http).await;
+    let bearer = format!("Bearer {token}");
+    let request = |path: &str, body: &str| {
+        let method = if body.is_empty() { "GET" } else { "POST" };
+        let request = Request::builder().method(method).uri(format!("https://localhost{path}"));
+        let request = request.header("authorization", &bearer).header("content-type", "text/plain");
+        request.body(body.to_owned()).expect("a request")
+    };
+    let rows = "select value, repeat('x', 1000) as text from generate_series(1, 20000)";
+    let (tables, answer, files) = tokio::join!(
+        ask(&ann, request("/api/v1/tables", "")),
+        ask(&ann, request("/api/v1/sql?format=csv", rows)),
+        ask(&ann, request("/api/v1/files?table=runs", "")),
+    );
+    assert_eq!((tables.status(), answer.status()), (200.try_into().expect("a status"), tables.status()));
+    assert_eq!(answer.body().iter().filter(|byte| **byte == b'\n').count(), 20_001);
+    assert!(String::from_utf8_lossy(files.body()).contains("\"https://localhost/"), "its authority is its host");
+    let mut nobodys = request("/api/v1/tables", "");
+    nobodys.headers_mut().remove("authorization");
+    let refused = ask(&ann, nobodys).await;
+    assert_eq!(refused.status(), 401);
+    assert!(refused.headers().contains_key("x-request-id"));
 }
 
 mod slow {

@@ -14,6 +14,7 @@ use std::sync::{Arc, Mutex, OnceLock, PoisonError, Weak};
 use std::time::{Duration, Instant};
 
 use tokio::sync::Notify;
+use tokio::task::AbortHandle;
 
 use pool::HeldMemory;
 
@@ -34,6 +35,16 @@ pub(crate) struct QueryTicket {
     held: Arc<HeldMemory>,
     /// Number of live work guards.
     working: AtomicUsize,
+    /// The task that stops the query at its timeout; it ends with the ticket.
+    timer: OnceLock<AbortHandle>,
+}
+
+impl Drop for QueryTicket {
+    fn drop(&mut self) {
+        if let Some(timer) = self.timer.get() {
+            timer.abort();
+        }
+    }
 }
 
 /// A guard for work on a query, dropped on the thread that does the work.
@@ -47,7 +58,18 @@ impl Drop for WorkGuard {
 
 impl QueryTicket {
     pub(crate) fn new() -> Self {
-        Self { stop: OnceLock::new(), stopped: Notify::new(), held: Arc::default(), working: AtomicUsize::new(0) }
+        Self {
+            stop: OnceLock::new(),
+            stopped: Notify::new(),
+            held: Arc::default(),
+            working: AtomicUsize::new(0),
+            timer: OnceLock::new(),
+        }
+    }
+
+    /// Sets the task that stops the query at its timeout.
+    pub(crate) fn set_timer(&self, timer: AbortHandle) {
+        let _ = self.timer.set(timer);
     }
 
     /// Stops the query; the first reason counts.

@@ -46,10 +46,16 @@ pub(crate) enum ActivityRows {
     Connections(Vec<OpenConnection>),
 }
 
+/// Returns a random number of a query or connection: one that is counted would tell a client how much others ask. It has 53
+/// bits, so that a page's numbers hold it, and is not 0.
+pub(crate) fn random_id() -> u64 {
+    (getrandom::u64().unwrap_or(0) >> 11).max(1)
+}
+
 /// A row of `system.connections`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct OpenConnection {
-    /// Number, counted from the start of the server.
+    /// Random number.
     pub(crate) id: u64,
     /// Name of its client, once it is known.
     pub(crate) client: Option<String>,

@@ -5,7 +5,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use serde::{Deserialize, Serialize};
 
-use super::{QueryEnd, QueryStart};
+use super::{QueryEnd, QueryStart, random_id};
 use crate::fault::FaultCode;
 
 /// Queries that are remembered after their end, of all clients together.
@@ -17,7 +17,6 @@ pub(crate) struct QueryLog(Mutex<LoggedQueries>);
 
 #[derive(Default)]
 struct LoggedQueries {
-    last: u64,
     /// By engine, and number in it.
     running: HashMap<(u32, u64), LoggedQuery>,
     ended: VecDeque<LoggedQuery>,
@@ -26,7 +25,7 @@ struct LoggedQueries {
 /// A row of `system.queries`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct LoggedQuery {
-    /// Number, counted from the start of the server.
+    /// Random number.
     pub(crate) id: u64,
     pub(crate) client: String,
     pub(crate) protocol: String,
@@ -57,9 +56,8 @@ impl QueryLog {
     /// Takes note of a query that begins in an engine.
     pub(crate) fn begin(&self, client: &str, engine: u32, start: QueryStart) {
         let mut queries = self.lock();
-        queries.last += 1;
         let query = LoggedQuery {
-            id: queries.last,
+            id: random_id(),
             client: client.to_owned(),
             protocol: start.protocol.name().to_owned(),
             statement: Some(start.statement),
@@ -117,7 +115,7 @@ impl QueryLog {
         let known = queries.running.values().chain(&queries.ended);
         let mut rows: Vec<_> = known.filter(|query| all || query.client == client).cloned().collect();
         rows.iter_mut().filter(|query| query.client != client).for_each(|query| query.statement = None);
-        rows.sort_by_key(|query| std::cmp::Reverse(query.id));
+        rows.sort_by_key(|query| std::cmp::Reverse(query.started));
         rows
     }
 
@@ -142,7 +140,8 @@ mod tests {
 
     fn begin(log: &QueryLog, client: &str, engine: u32, number: u64) {
         let statement = format!("select {number}");
-        log.begin(client, engine, QueryStart { number, protocol: ServerProtocol::Http, statement, started: 0 });
+        let started = log.rows(client, true).len() as i64;
+        log.begin(client, engine, QueryStart { number, protocol: ServerProtocol::Http, statement, started });
     }
 
     fn end(number: u64, failure: Option<FaultCode>) -> QueryEnd {
@@ -160,7 +159,8 @@ mod tests {
         let all = log.rows("ann", true);
         let told: Vec<_> = all.iter().map(|q| (q.client.as_str(), q.statement.is_some())).collect();
         assert_eq!(told, [("bob", false), ("ann", true)], "texts are their client's alone");
-        assert_eq!(log.find(2), Some(RunningPlace { client: "bob".to_owned(), engine: 8, number: 0 }));
+        let bobs = RunningPlace { client: "bob".to_owned(), engine: 8, number: 0 };
+        assert_eq!(log.find(all[0].id), Some(bobs));
     }
 
     #[test]
@@ -173,9 +173,10 @@ mod tests {
         log.end(7, &end(1, Some(FaultCode::TimeLimit)));
         log.end(9, &end(2, None));
         assert_eq!(log.end_engine(7), 1);
-        let outcomes: Vec<_> = log.rows("ann", false).into_iter().map(|query| query.outcome).collect();
+        let rows = log.rows("ann", false);
+        let outcomes: Vec<_> = rows.iter().map(|query| query.outcome.as_str()).collect();
         assert_eq!(outcomes, ["query_ended_engine", "time_limit", "answered"]);
-        assert_eq!(log.find(3), None);
+        assert_eq!(log.find(rows[0].id), None);
     }
 
     #[test]
@@ -186,6 +187,16 @@ mod tests {
             log.end(7, &end(number, None));
         }
         let rows = log.rows("ann", false);
-        assert_eq!((rows.len(), rows.last().map(|query| query.id)), (REMEMBERED, Some(11)));
+        let oldest = rows.last().and_then(|query| query.statement.as_deref());
+        assert_eq!((rows.len(), oldest), (REMEMBERED, Some("select 10")));
+    }
+
+    #[test]
+    fn ids_do_not_tell_what_others_ask() {
+        let log = QueryLog::default();
+        (0..9).for_each(|number| begin(&log, "ann", 7, number));
+        let ids: Vec<_> = log.rows("ann", false).iter().map(|query| query.id).collect();
+        assert!(ids.windows(2).all(|pair| pair[0].abs_diff(pair[1]) > 1_000), "{ids:?}");
+        assert!(ids.iter().all(|id| *id < 1 << 53), "pages compute with them");
     }
 }

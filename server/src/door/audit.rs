@@ -4,7 +4,6 @@
 use std::net::SocketAddr;
 
 use axum::http::{Method, StatusCode};
-use tokio_rustls::rustls::CertificateError;
 
 use crate::fault::FaultCode;
 use crate::metrics::ServerProtocol;
@@ -18,11 +17,6 @@ pub(super) fn record_refusal(peer: SocketAddr, protocol: ServerProtocol, code: F
     if matches!(code, FaultCode::Unauthenticated | FaultCode::Forbidden | FaultCode::Foreign) {
         tracing::warn!(target: TARGET, %peer, protocol = protocol.name(), code = code.name(), "a client was refused");
     }
-}
-
-/// Writes a line about a client whose certificate was refused.
-pub(super) fn record_certificate(peer: SocketAddr, reason: &CertificateError) {
-    tracing::warn!(target: TARGET, %peer, %reason, "a client's certificate was refused");
 }
 
 /// Writes a line about a client that has shown its token on a connection.

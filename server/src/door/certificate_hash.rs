@@ -31,11 +31,11 @@ mod tests {
     use tokio_rustls::rustls::pki_types::pem::PemObject as _;
 
     use super::*;
-    use crate::certificate::{CertificateUse, self_signed};
+    use crate::certificate::self_signed;
 
     #[test]
     fn the_hash_is_that_of_the_signature() {
-        let made = self_signed(&["localhost".to_owned()], CertificateUse::Server).expect("a certificate");
+        let made = self_signed(&["localhost".to_owned()]).expect("a certificate");
         let der = CertificateDer::from_pem_slice(made.certificate.as_bytes()).expect("PEM");
         let expected = digest::digest(&digest::SHA256, &der);
         assert_eq!(certificate_hash(&der).as_deref(), Some(expected.as_ref()));

@@ -19,7 +19,7 @@ use tokio::sync::Notify;
 use tokio::task::JoinSet;
 use tokio::time::Sleep;
 
-use crate::activity::OpenConnection;
+use crate::activity::{OpenConnection, random_id};
 use crate::metrics::ServerProtocol;
 
 /// Time to wait if the system has no more sockets.
@@ -158,9 +158,8 @@ impl ConnectionPlaces {
     }
 
     fn place(&self, stream: TcpStream, peer: SocketAddr) -> PlacedStream {
-        static LAST: AtomicU64 = AtomicU64::new(0);
         let state = PlaceState {
-            id: LAST.fetch_add(1, Ordering::Relaxed) + 1,
+            id: random_id(),
             peer,
             address: peer.ip(),
             started: Utc::now().timestamp_micros(),
@@ -385,6 +384,7 @@ mod tests {
         clients.push(TcpStream::connect(address).await.expect("connected"));
         let next = tokio::time::timeout(Duration::from_secs(60), places.next()).await.expect("a free place");
         assert_eq!(Some(next.state.address), clients[4].local_addr().ok().map(|a| a.ip()));
+        assert!(next.state.id.abs_diff(third.state.id) > 1_000, "ids do not tell how many connect");
     }
 
     #[tokio::test]

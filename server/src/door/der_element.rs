@@ -2,8 +2,6 @@
 
 /// An element.
 pub(super) struct DerElement<'a> {
-    /// Its kind.
-    pub(super) kind: u8,
     /// Its content.
     pub(super) content: &'a [u8],
     /// The bytes that follow it.
@@ -13,7 +11,7 @@ pub(super) struct DerElement<'a> {
 impl<'a> DerElement<'a> {
     /// Reads the first element; None if there is no whole one.
     pub(super) fn first(der: &'a [u8]) -> Option<Self> {
-        let (&[kind, length], rest) = der.split_first_chunk()?;
+        let (&[_kind, length], rest) = der.split_first_chunk()?;
         let (bytes, rest) = match length {
             0..=0x7f => (usize::from(length), rest),
             0x81..=0x84 => {
@@ -23,17 +21,6 @@ impl<'a> DerElement<'a> {
             _ => return None,
         };
         let (content, rest) = rest.split_at_checked(bytes)?;
-        Some(Self { kind, content, rest })
-    }
-
-    /// Reads all elements; None if what follows one is none.
-    pub(super) fn all(mut der: &'a [u8]) -> Option<Vec<Self>> {
-        let mut elements = Vec::new();
-        while !der.is_empty() {
-            let element = Self::first(der)?;
-            der = element.rest;
-            elements.push(element);
-        }
-        Some(elements)
+        Some(Self { content, rest })
     }
 }

@@ -1,25 +1,20 @@
-//! TLS of all three protocols: the server's certificate and the authority of its clients', from files that are read again
-//! when they change.
+//! TLS of all three protocols: the server's certificate and key, from files that are read again when they change.
 
 use std::io;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::{Arc, PoisonError, RwLock};
 use std::time::{Duration, SystemTime};
 
 use tokio_rustls::TlsAcceptor;
 use tokio_rustls::rustls::crypto::ring;
-use tokio_rustls::rustls::pki_types::PrivateKeyDer;
 use tokio_rustls::rustls::pki_types::pem::PemObject as _;
-use tokio_rustls::rustls::server::WebPkiClientVerifier;
-use tokio_rustls::rustls::server::danger::ClientCertVerifier;
+use tokio_rustls::rustls::pki_types::{CertificateDer, PrivateKeyDer};
 use tokio_rustls::rustls::sign::{CertifiedKey, SingleCertAndKey};
 use tokio_rustls::rustls::{self, ServerConfig};
 use tokio_rustls::server::TlsStream;
 use tokio_util::either::Either;
 
-use super::audit;
 use super::certificate_hash::certificate_hash;
-use super::client_certificate::{client_name, client_verifier, read_certificates};
 use super::connection_places::PlacedStream;
 use crate::Error;
 
@@ -31,25 +26,17 @@ const LOOK_EVERY: Duration = Duration::from_secs(2);
 /// A connection, encrypted or not.
 pub(super) type DoorStream = Either<PlacedStream, Box<TlsStream<PlacedStream>>>;
 
-/// A server's certificate and key, and the authority of its clients' certificates, as PEM files.
+/// A server's certificate and key, as PEM files.
 #[derive(Debug, Clone)]
 pub struct CertificateFiles {
     /// The certificate, then those of its issuers.
     pub certificate: PathBuf,
     /// Its private key.
     pub key: PathBuf,
-    /// The certificates of those who issue clients' certificates, and lists of revoked ones; None if clients have none.
-    pub client_ca: Option<PathBuf>,
 }
 
 /// Times of change and lengths of the files.
 type FileStates = Vec<Option<(SystemTime, u64)>>;
-
-/// The content of the files.
-struct LoadedCertificates {
-    server: Arc<CertifiedKey>,
-    clients: Option<Arc<dyn ClientCertVerifier>>,
-}
 
 impl CertificateFiles {
     /// Returns the folders that a process reads to take renewed files: those of the files, and of what they link to.
@@ -69,17 +56,10 @@ impl CertificateFiles {
             let about = std::fs::metadata(path).ok()?;
             Some((about.modified().ok()?, about.len()))
         };
-        [&self.certificate, &self.key].into_iter().chain(&self.client_ca).map(state).collect()
+        [&self.certificate, &self.key].into_iter().map(state).collect()
     }
 
-    fn load(&self) -> Result<LoadedCertificates, Error> {
-        Ok(LoadedCertificates {
-            server: Arc::new(self.load_key()?),
-            clients: self.client_ca.as_deref().map(client_verifier).transpose()?,
-        })
-    }
-
-    fn load_key(&self) -> Result<CertifiedKey, Error> {
+    fn load(&self) -> Result<Arc<CertifiedKey>, Error> {
         let wrong = |source| Error::Certificate { path: self.key.clone(), source };
         let chain = read_certificates(&self.certificate)?;
         let key = PrivateKeyDer::from_pem_file(&self.key).map_err(|e| wrong(e.into()))?;
@@ -87,16 +67,27 @@ impl CertificateFiles {
         let certified = CertifiedKey::new(chain, key);
         match certified.keys_match() {
             // Some kinds of keys cannot be compared.
-            Ok(()) | Err(rustls::Error::InconsistentKeys(rustls::InconsistentKeys::Unknown)) => Ok(certified),
+            Ok(()) | Err(rustls::Error::InconsistentKeys(rustls::InconsistentKeys::Unknown)) => Ok(certified.into()),
             Err(e) => Err(wrong(e.into())),
         }
+    }
+}
+
+// Returns the certificates of a PEM file, at least one.
+fn read_certificates(path: &Path) -> Result<Vec<CertificateDer<'static>>, Error> {
+    let wrong = |source: Box<dyn std::error::Error + Send + Sync>| Error::Certificate { path: path.to_owned(), source };
+    let read = CertificateDer::pem_file_iter(path).and_then(Iterator::collect::<Result<Vec<_>, _>>);
+    let certificates = read.map_err(|e| wrong(e.into()))?;
+    match certificates.is_empty() {
+        true => Err(wrong("it has no `BEGIN CERTIFICATE`".into())),
+        false => Ok(certificates),
     }
 }
 
 /// Encryption of a server.
 pub(crate) struct ServerEncryption {
     files: CertificateFiles,
-    loaded: LoadedCertificates,
+    loaded: Arc<CertifiedKey>,
     protocols: Vec<Arc<RwLock<ProtocolTls>>>,
 }
 
@@ -138,8 +129,7 @@ impl ServerEncryption {
         }
     }
 
-    // Sessions that began with the old files are not resumed: a client's certificate may be revoked by now.
-    fn renew(&self, loaded: &LoadedCertificates) {
+    fn renew(&self, loaded: &Arc<CertifiedKey>) {
         for protocol in &self.protocols {
             let names = protocol.read().unwrap_or_else(PoisonError::into_inner).names;
             match ProtocolTls::new(names, loaded) {
@@ -159,12 +149,11 @@ struct ProtocolTls {
 }
 
 impl ProtocolTls {
-    fn new(names: &'static [&'static [u8]], loaded: &LoadedCertificates) -> Result<Self, rustls::Error> {
-        let clients = loaded.clients.clone().unwrap_or_else(WebPkiClientVerifier::no_client_auth);
-        let certificate = loaded.server.clone();
+    fn new(names: &'static [&'static [u8]], loaded: &Arc<CertifiedKey>) -> Result<Self, rustls::Error> {
+        let certificate = loaded.clone();
         let mut config = ServerConfig::builder_with_provider(Arc::new(ring::default_provider()))
             .with_protocol_versions(&[&rustls::version::TLS13, &rustls::version::TLS12])?
-            .with_client_cert_verifier(clients)
+            .with_no_client_auth()
             .with_cert_resolver(Arc::new(SingleCertAndKey::from(certificate.clone())));
         config.alpn_protocols = names.iter().map(|name| name.to_vec()).collect();
         Ok(Self { names, acceptor: TlsAcceptor::from(Arc::new(config)), certificate })
@@ -196,15 +185,12 @@ impl ProtocolEncryption {
     /// Shakes hands with a client, if connections are encrypted; None if that fails, or takes too long.
     pub(super) async fn accept(&self, stream: PlacedStream) -> Option<DoorStream> {
         let Some(acceptor) = self.acceptor() else { return Some(Either::Left(stream)) };
-        let (evicted, peer) = (stream.evicted(), stream.work().peer());
+        let evicted = stream.evicted();
         tokio::select! {
             shaken = tokio::time::timeout(HANDSHAKE, acceptor.accept(stream)) => match shaken {
                 Ok(Ok(encrypted)) => Some(Either::Right(Box::new(encrypted))),
                 Ok(Err(e)) => {
-                    match e.get_ref().and_then(|inner| inner.downcast_ref()) {
-                        Some(rustls::Error::InvalidCertificate(reason)) => audit::record_certificate(peer, reason),
-                        _ => tracing::debug!(error = &e as &dyn std::error::Error, "a handshake failed"),
-                    }
+                    tracing::debug!(error = &e as &dyn std::error::Error, "a handshake failed");
                     None
                 }
                 Err(_) => None,
@@ -219,13 +205,5 @@ pub(super) fn agreed_protocol(stream: &DoorStream) -> Option<&[u8]> {
     match stream {
         Either::Left(_) => None,
         Either::Right(encrypted) => encrypted.get_ref().1.alpn_protocol(),
-    }
-}
-
-/// Returns the name in the certificate that the client has shown, if it has.
-pub(super) fn certificate_name(stream: &DoorStream) -> Option<String> {
-    match stream {
-        Either::Left(_) => None,
-        Either::Right(encrypted) => client_name(encrypted.get_ref().1.peer_certificates()?.first()?),
     }
 }

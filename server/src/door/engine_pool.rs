@@ -31,9 +31,11 @@ const AFTERWORK: Duration = Duration::from_secs(2);
 const PLACE_WAIT: Duration = Duration::from_secs(10);
 /// Memory of an engine that is not of its queries: footers of files, small tables, what the allocator keeps.
 const CACHE_BYTES: usize = 96 << 20;
-/// Clients wait this long for a new engine after the second one that their queries ended, and twice as long each time.
+/// Clients get no engine for so long after the second one that their queries ended, and for twice as long each time.
 const FIRST_BACKOFF: Duration = Duration::from_millis(250);
 const LONGEST_BACKOFF: Duration = Duration::from_secs(30);
+/// Backoff for which a request waits; during a longer one it is refused.
+const BACKOFF_WAIT: Duration = Duration::from_secs(1);
 /// Time until a spare engine that did not start is started again.
 const START_AGAIN: Duration = Duration::from_secs(2);
 /// Time without an end after which a client's earlier ones are forgotten.
@@ -128,11 +130,11 @@ impl EnginePool {
     }
 
     /// Leases a client's engine for one request. It is started if there is none; a client whose engines end again and
-    /// again waits longer each time (backoff).
+    /// again gets none for longer each time (backoff), which no request prolongs.
     ///
     /// # Errors
     /// [`RequestFault::Unauthenticated`] if the client's token is no longer one; [`RequestFault::TooMany`] if other
-    /// clients' engines are all answering; [`RequestFault::EngineEnded`].
+    /// clients' engines are all answering; [`RequestFault::Backoff`]; [`RequestFault::EngineEnded`].
     pub(super) async fn lease(&self, client: &ClientIdentity) -> Result<EngineLease, RequestFault> {
         let lease = self.lease_engine(client).await?;
         self.0.memory_watcher.unpark();
@@ -152,7 +154,10 @@ impl EnginePool {
         }
         own.end_outdated(client);
         self.count_end(&own, &mut state).await;
-        tokio::time::sleep(state.backoff()).await;
+        match state.backoff() {
+            wait if wait > BACKOFF_WAIT => return Err(RequestFault::Backoff { ends: state.ends, wait }),
+            wait => tokio::time::sleep(wait).await,
+        }
         self.make_room(&own).await?;
         let engine = self.take_spare().map_err(RequestFault::defect("no engine can be started"))?;
         if let Err(EndReason::Failed(reason)) = engine.assign(client).await {
@@ -192,7 +197,8 @@ impl EnginePool {
         }
     }
 
-    // Waits until there is a place among the engines: the one that is idle for longest makes room.
+    // Waits until there is a place among the engines: the one that is idle for longest makes room, with the connections whose
+    // clients are silent.
     async fn make_room(&self, own: &Arc<ClientEngine>) -> Result<(), RequestFault> {
         let free = async {
             loop {
@@ -201,10 +207,10 @@ impl EnginePool {
                 if live.len() < self.0.settings.count {
                     return;
                 }
-                let idle = live.into_iter().filter(|e| e.requests() == 0).max_by_key(|e| e.idle_time());
+                let idle = live.into_iter().filter_map(|engine| Some((engine.idle_time()?, engine)));
                 // One that is asked something meanwhile stays.
-                match idle.filter(|engine| engine.retire_after(Duration::ZERO)) {
-                    Some(engine) => engine.wait_for_end().await,
+                match idle.max_by_key(|(time, _)| *time).filter(|(_, engine)| engine.retire_after(Duration::ZERO)) {
+                    Some((_, engine)) => engine.wait_for_end().await,
                     None => drop(tokio::time::timeout(LOOK, freed).await),
                 }
             }
@@ -301,11 +307,12 @@ impl EnginePool {
     pub(super) async fn retire_idle(self) {
         loop {
             tokio::time::sleep(IDLE / 10).await;
-            for engine in self.live() {
+            // One with connections stays until its place is needed.
+            for engine in self.live().into_iter().filter(|engine| !engine.has_requests()) {
                 engine.retire_after(IDLE);
             }
             // Clients may come under any number of names.
-            lock(&self.0.clients).retain(|_, client| client.has_engine() || Arc::strong_count(client) > 1);
+            lock(&self.0.clients).retain(|_, client| client.is_known() || Arc::strong_count(client) > 1);
         }
     }
 
@@ -367,17 +374,22 @@ impl ClientEngine {
         }
     }
 
-    fn has_engine(&self) -> bool {
-        lock(&self.current).as_ref().is_some_and(|engine| !engine.has_ended())
+    // Whether it has an engine, or had ones that ended and are not forgotten.
+    fn is_known(&self) -> bool {
+        let has_engine = lock(&self.current).as_ref().is_some_and(|engine| !engine.has_ended());
+        let last_end = self.state.try_lock().ok().and_then(|state| state.last_end);
+        has_engine || last_end.is_some_and(|at| at.elapsed() < FORGIVEN)
     }
 }
 
 impl ClientState {
+    // Time that is left of the backoff.
     fn backoff(&self) -> Duration {
-        match self.ends {
+        let whole = match self.ends {
             0 | 1 => Duration::ZERO,
             ends => LONGEST_BACKOFF.min(FIRST_BACKOFF * 2_u32.saturating_pow(ends - 2)),
-        }
+        };
+        whole.saturating_sub(self.last_end.map_or(Duration::ZERO, |at| at.elapsed()))
     }
 }
 
@@ -400,12 +412,13 @@ fn end_large_engines(clients: &ClientEngines, memory: usize, uncounted: usize) -
     if sizes.iter().map(|(bytes, _)| bytes).sum::<usize>() > memory
         && let Some((_, largest)) = sizes.iter().max_by_key(|(bytes, _)| *bytes)
         // One that only keeps what it once had has done nothing wrong.
-        && !largest.retire_after(Duration::ZERO)
+        && (largest.has_queries() || !largest.retire_after(Duration::ZERO))
     {
         let reason = format!("queries took more than {} MiB, and its client's the most", memory >> 20);
         largest.end(EndReason::Failed(reason));
     }
-    sizes.iter().any(|(_, engine)| engine.requests() > 0 || engine.idle_time() < AFTERWORK)
+    let is_working = |engine: &EngineProcess| engine.idle_time().is_none_or(|idle| idle < AFTERWORK);
+    sizes.iter().any(|(_, engine)| engine.has_queries() || is_working(engine))
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
@@ -417,9 +430,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn waits_grow_to_a_limit() {
+    fn waits_grow_to_a_limit_and_pass() {
         let waits = |ends| ClientState { ends, last_end: None }.backoff();
         assert_eq!([0, 1, 2, 3].map(waits), [0, 0, 250, 500].map(Duration::from_millis));
         assert_eq!(waits(u32::MAX), LONGEST_BACKOFF);
+        let ago = |secs| Instant::now().checked_sub(Duration::from_secs(secs));
+        let left = |secs| ClientState { ends: 9, last_end: ago(secs) }.backoff();
+        assert!(left(20) <= Duration::from_secs(10) && left(20) > Duration::from_secs(9));
+        assert_eq!(left(30), Duration::ZERO, "whoever asked meanwhile");
     }
 }

@@ -6,6 +6,7 @@ use std::io;
 use std::os::fd::OwnedFd;
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -26,6 +27,9 @@ use crate::engine_socket::EngineSocket;
 use crate::metrics::ServerProtocol;
 use crate::worker::{EngineWorkers, WORKER_TOKEN_VARIABLE};
 
+/// Time for which a client has to ask nothing on its open connections and read nothing of its answers until its engine
+/// counts as idle. It is shorter than others wait for a place.
+const SILENCE: Duration = Duration::from_secs(5);
 /// Time for which a request that lost its engine waits for the reason.
 const REASON_WAIT: Duration = Duration::from_secs(2);
 
@@ -66,6 +70,8 @@ pub(super) struct EngineProcess {
     folder: PathBuf,
     stdin: tokio::sync::Mutex<ChildStdin>,
     usage: Mutex<EngineUsage>,
+    /// Queries that run, or wait for their rows to be fetched.
+    queries: AtomicUsize,
     base_bytes: OnceLock<usize>,
     /// Memory limit of its client's queries.
     memory_limit: OnceLock<usize>,
@@ -79,9 +85,22 @@ pub(super) struct EngineProcess {
 }
 
 struct EngineUsage {
-    requests: usize,
+    /// Open requests by number: since when the engine has waited for the client, or None if the client waits for it.
+    requests: HashMap<u64, Option<Instant>>,
+    last_request: u64,
     last_used: Instant,
     is_ending: bool,
+}
+
+impl EngineUsage {
+    // Time for which no client has waited for the engine; None if one does, or was silent for a moment only.
+    fn idle_time(&self) -> Option<Duration> {
+        let mut since = self.last_used;
+        for waiting in self.requests.values() {
+            since = since.max((*waiting)?);
+        }
+        Some(since.elapsed()).filter(|time| self.requests.is_empty() || *time >= SILENCE)
+    }
 }
 
 /// Parameters with which an engine is started.
@@ -138,7 +157,13 @@ impl EngineProcess {
             pid,
             folder: start.sockets,
             stdin: tokio::sync::Mutex::new(stdin),
-            usage: Mutex::new(EngineUsage { requests: 0, last_used: Instant::now(), is_ending: false }),
+            usage: Mutex::new(EngineUsage {
+                requests: HashMap::new(),
+                last_request: 0,
+                last_used: Instant::now(),
+                is_ending: false,
+            }),
+            queries: AtomicUsize::new(0),
             base_bytes: OnceLock::new(),
             memory_limit: OnceLock::new(),
             client: OnceLock::new(),
@@ -212,8 +237,11 @@ impl EngineProcess {
         if usage.is_ending || self.has_ended() {
             return None;
         }
-        usage.requests += 1;
-        Some(EngineLease(self.clone()))
+        usage.last_request += 1;
+        let number = usage.last_request;
+        usage.requests.insert(number, None);
+        drop(usage);
+        Some(EngineLease { engine: self.clone(), number })
     }
 
     /// Kills it; the first reason counts.
@@ -224,10 +252,10 @@ impl EngineProcess {
         let _ = pidfd_send_signal(&self.process, Signal::KILL);
     }
 
-    /// Kills it if it has answered nothing for longer than `time`, and answers nothing now.
+    /// Kills it if nobody has waited for it for longer than `time`.
     pub(super) fn retire_after(&self, time: Duration) -> bool {
         let mut usage = self.usage();
-        if usage.requests > 0 || usage.last_used.elapsed() < time {
+        if usage.idle_time().is_none_or(|idle| idle < time) {
             return false;
         }
         usage.is_ending = true;
@@ -260,14 +288,19 @@ impl EngineProcess {
         self.ended.wait().await;
     }
 
-    /// Requests that it answers now.
-    pub(super) fn requests(&self) -> usize {
-        self.usage().requests
+    /// Returns whether requests are open, such as connections of Postgres' protocol.
+    pub(super) fn has_requests(&self) -> bool {
+        !self.usage().requests.is_empty()
     }
 
-    /// Time since the last request.
-    pub(super) fn idle_time(&self) -> Duration {
-        self.usage().last_used.elapsed()
+    /// Returns whether queries run, or wait for their rows to be fetched.
+    pub(super) fn has_queries(&self) -> bool {
+        self.queries.load(Ordering::Relaxed) > 0
+    }
+
+    /// Time for which no client has waited for it; None if one does, or was silent for a moment only.
+    pub(super) fn idle_time(&self) -> Option<Duration> {
+        self.usage().idle_time()
     }
 
     /// Bytes that its client's queries may occupy; None if they have no limit of their own.
@@ -291,18 +324,26 @@ fn private_bytes(pid: u32) -> Option<usize> {
 }
 
 /// A request's hold on its engine.
-pub(super) struct EngineLease(Arc<EngineProcess>);
+pub(super) struct EngineLease {
+    engine: Arc<EngineProcess>,
+    number: u64,
+}
 
 impl EngineLease {
     pub(super) fn engine(&self) -> &Arc<EngineProcess> {
-        &self.0
+        &self.engine
+    }
+
+    /// Records whether the engine waits, from now on, for the client to ask or to read; else the client waits for it.
+    pub(super) fn set_waiting(&self, is_waiting: bool) {
+        self.engine.usage().requests.insert(self.number, is_waiting.then(Instant::now));
     }
 }
 
 impl Drop for EngineLease {
     fn drop(&mut self) {
-        let mut usage = self.0.usage();
-        usage.requests -= 1;
+        let mut usage = self.engine.usage();
+        usage.requests.remove(&self.number);
         usage.last_used = Instant::now();
     }
 }
@@ -350,11 +391,13 @@ impl EngineReports {
             Ok(EngineReport::Started(start)) => {
                 activity.metrics.begin(start.protocol);
                 self.protocols.insert(start.number, start.protocol);
+                engine.queries.store(self.protocols.len(), Ordering::Relaxed);
                 let client = engine.client.get().map_or("", |client| client.name.as_str());
                 activity.queries.begin(client, engine.pid, start);
             }
             Ok(EngineReport::Ended(end)) => {
                 if let Some(protocol) = self.protocols.remove(&end.number) {
+                    engine.queries.store(self.protocols.len(), Ordering::Relaxed);
                     activity.metrics.end(protocol, &end);
                     activity.queries.end(engine.pid, &end);
                 }

@@ -13,12 +13,11 @@ use tracing::Instrument as _;
 use super::connection_places::{ConnectionPlaces, PlaceWork, PlacedStream};
 use super::encryption::ProtocolEncryption;
 use super::forward::EngineProtocol;
-use super::http_connection::{client_certificate, drive, http2_builder};
+use super::http_connection::{drive, http2_builder};
 use crate::client_identity::ClientIdentity;
 use crate::door::server_door::ServerDoor;
 use crate::fault::RequestFault;
 use crate::flight::{WINDOW_BYTES, status};
-use crate::http::CertificateName;
 use crate::metrics::ServerProtocol;
 use crate::request_span::{REQUEST_ID, begin_request};
 use crate::tokens::of_header;
@@ -38,14 +37,13 @@ async fn answer(stream: PlacedStream, encryption: ProtocolEncryption, door: Serv
     let evicted = stream.evicted();
     let work = stream.work();
     let Some(stream) = encryption.accept(stream).await else { return };
-    let certificate = client_certificate(&stream);
     let (drain, place) = (door.drain().clone(), work.clone());
     let service = service_fn(move |mut request: Request<Incoming>| {
         work.hear_request();
-        let (door, work, certificate) = (door.clone(), work.clone(), certificate.clone());
+        let (door, work) = (door.clone(), work.clone());
         let (span, id) = begin_request(request.headers_mut(), ServerProtocol::FlightSql);
         let answer = async move {
-            let mut response = door.answer_flight(request, &certificate, &work).await.unwrap_or_else(|fault| {
+            let mut response = door.answer_flight(request, &work).await.unwrap_or_else(|fault| {
                 door.metrics().record_failure(&fault);
                 status(&fault).into_http()
             });
@@ -63,7 +61,6 @@ impl ServerDoor {
     async fn answer_flight(
         &self,
         request: Request<Incoming>,
-        certificate: &CertificateName,
         work: &PlaceWork,
     ) -> Result<Response<Body>, RequestFault> {
         if self.drain().is_begun() {
@@ -72,11 +69,7 @@ impl ServerDoor {
         let token = request.headers().get(header::AUTHORIZATION).and_then(|v| v.to_str().ok()).and_then(of_header);
         self.failed_logins().check(work.peer())?;
         self.access().await_key(token.as_deref()).await;
-        let certified = certificate.0.as_deref().filter(|_| token.is_none());
-        let found = match certified.and_then(|name| self.access().certified_client(name)) {
-            Some(client) => Ok(client),
-            None => self.access().client(token.as_deref(), ClientIdentity::programs),
-        };
+        let found = self.access().client(token.as_deref(), ClientIdentity::programs);
         if let (Some(_), Err(RequestFault::Unauthenticated)) = (&token, &found) {
             self.failed_logins().count(work.peer());
         }

@@ -87,15 +87,22 @@ impl EnginePool {
             EngineProtocol::Grpc => read_body(body, &parts.headers, LARGEST_GRPC).await?,
         };
         let working = work.map(PlaceWork::begin);
+        let mut ended = None;
         loop {
-            let lease = self.lease(client).await?;
+            let lease = match self.lease(client).await {
+                // The cause is what ended the first engine.
+                Err(RequestFault::Backoff { ends, wait }) => {
+                    return Err(ended.unwrap_or(RequestFault::Backoff { ends, wait }));
+                }
+                leased => leased?,
+            };
             let (sent, fault, again) = body.send();
             let answer = EngineAnswer::fetch(lease.engine(), request_of(&parts, sent), wire).await;
             match (answer, again) {
                 (Ok(answer), _) => return Ok(answer.with(lease, working)),
-                (Err(_), Some(again)) => {
+                (Err(failed), Some(again)) => {
                     body = again;
-                    let _ = lease.engine().why_ended().await;
+                    ended = Some(why(&lease, &failed).await);
                 }
                 (Err(failed), None) => {
                     let fault = fault.lock().unwrap_or_else(PoisonError::into_inner).take();
@@ -252,6 +259,7 @@ impl EngineAnswer {
 
     fn with(self, lease: EngineLease, working: Option<WorkingPlace>) -> Response<EngineBody> {
         let Self { response, connection, wire } = self;
+        lease.set_waiting(true);
         response.map(|incoming| {
             let is_ended = false;
             EngineBody {
@@ -308,7 +316,8 @@ impl EngineBody {
     fn failure(&self) -> Option<Frame<Bytes>> {
         let reason = match self.lease.engine().end_reason() {
             Some(EndReason::Failed(reason)) => reason.clone(),
-            _ => "it stopped answering".to_owned(),
+            Some(EndReason::Retired) => "the server needed its place, and nobody read its answer".to_owned(),
+            None => "it stopped answering".to_owned(),
         };
         self.span.in_scope(|| tracing::info!(reason, "an answer broke off"));
         if self.wire == EngineProtocol::Http {
@@ -331,7 +340,9 @@ impl hyper::body::Body for EngineBody {
         if self.is_ended {
             return Poll::Ready(None);
         }
-        match Pin::new(&mut self.incoming).poll_frame(context) {
+        let polled = Pin::new(&mut self.incoming).poll_frame(context);
+        self.lease.set_waiting(polled.is_ready());
+        match polled {
             Poll::Ready(Some(Err(failed))) => {
                 self.is_ended = true;
                 Poll::Ready(Some(self.failure().ok_or(failed)))

@@ -22,13 +22,12 @@ use super::connection_places::{ConnectionPlaces, PlaceWork, PlacedStream};
 use super::drain::ServerDrain;
 use super::encryption::{ProtocolEncryption, agreed_protocol};
 use super::forward::EngineProtocol;
-use super::http_connection::{HTTP_2, client_certificate, drive, http2_builder, restate};
+use super::http_connection::{HTTP_2, drive, http2_builder, restate};
 use crate::client_identity::ClientIdentity;
 use crate::door::server_door::ServerDoor;
 use crate::fault::{FaultCode, RequestFault};
 use crate::http::{
-    CertificateName, FORWARDED_PROTO, ProblemResponse, RequestSite, SLICED_RUNS, authenticate, door_router,
-    request_site,
+    FORWARDED_PROTO, ProblemResponse, RequestSite, SLICED_RUNS, authenticate, door_router, request_site,
 };
 use crate::metrics::ServerProtocol;
 use crate::request_span::{REQUEST_ID, begin_request};
@@ -52,7 +51,7 @@ async fn answer(stream: PlacedStream, encryption: ProtocolEncryption, router: Ro
     let evicted = stream.evicted();
     let work = stream.work();
     let Some(stream) = encryption.accept(stream).await else { return };
-    let (certificate, is_http2) = (client_certificate(&stream), agreed_protocol(&stream) == Some(HTTP_2));
+    let is_http2 = agreed_protocol(&stream) == Some(HTTP_2);
     let place = work.clone();
     let answers = TowerToHyperService::new(router);
     let service = service_fn(move |mut request: hyper::Request<Incoming>| {
@@ -62,7 +61,6 @@ async fn answer(stream: PlacedStream, encryption: ProtocolEncryption, router: Ro
             request.headers_mut().insert(FORWARDED_PROTO, HeaderValue::from_static("https"));
         }
         request.extensions_mut().insert(work.clone());
-        request.extensions_mut().insert(certificate.clone());
         answers.call(request)
     });
     let stream = TokioIo::new(stream);
@@ -130,8 +128,7 @@ impl ServerDoor {
             RequestSite::Program => ClientIdentity::programs(),
         };
         // A refusal is noted with those of the other routes.
-        let certificate = request.extensions().get::<CertificateName>().cloned().unwrap_or_default();
-        let client = authenticate(self.access(), request.headers(), &certificate, local).await?;
+        let client = authenticate(self.access(), request.headers(), local).await?;
         let path = request.uri().path().to_owned();
         self.answer_client(client, request, &path, &work).await
     }

@@ -1,7 +1,6 @@
 //! Connections of HTTP, of both of its versions.
 
 use std::pin::{Pin, pin};
-use std::sync::Arc;
 use std::time::Duration;
 
 use axum::http::{HeaderValue, Request, Uri, Version, header};
@@ -10,8 +9,6 @@ use hyper_util::rt::{TokioExecutor, TokioTimer};
 
 use super::connection_places::PlaceWork;
 use super::drain::ServerDrain;
-use super::encryption::{DoorStream, certificate_name};
-use crate::http::CertificateName;
 
 /// The name of HTTP/2 in a handshake.
 pub(super) const HTTP_2: &[u8] = b"h2";
@@ -48,11 +45,6 @@ pub(super) async fn drive<C: Future>(
         _ = connection => {}
         () = place.quiet() => {}
     }
-}
-
-/// Returns the name in the certificate of a connection's client.
-pub(super) fn client_certificate(stream: &DoorStream) -> CertificateName {
-    CertificateName(certificate_name(stream).map(Arc::from))
 }
 
 /// Gives a request of HTTP/2 the form of HTTP/1.1, which routes, guards and engines read: its authority becomes its Host.

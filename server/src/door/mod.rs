@@ -4,7 +4,6 @@
 mod agent;
 mod audit;
 mod certificate_hash;
-mod client_certificate;
 pub(crate) mod connection_places;
 mod der_element;
 pub(crate) mod drain;
@@ -32,7 +31,7 @@ use tokio::task::JoinSet;
 use crate::Error;
 use crate::oidc::{IdentityProvider, OidcSettings};
 use crate::token_access::TokenAccess;
-use crate::tokens::{OtherLogins, TokenFile};
+use crate::tokens::TokenFile;
 pub use agent::AgentDoor;
 pub use encryption::CertificateFiles;
 pub(crate) use encryption::{ProtocolEncryption, ServerEncryption};
@@ -93,9 +92,7 @@ impl LakeServer {
                 return Err(Error::PlainText { address });
             }
         }
-        let by_certificate = settings.certificate.as_ref().is_some_and(|files| files.client_ca.is_some());
-        let other_logins = OtherLogins { by_certificate, by_oidc: settings.oidc.is_some() };
-        settings.tokens.as_ref().map_or(Ok(()), |tokens| tokens.check_logins(other_logins))?;
+        settings.tokens.as_ref().map_or(Ok(()), |tokens| tokens.check_groups(settings.oidc.is_some()))?;
         let provider = settings.oidc.map(IdentityProvider::new).transpose()?;
         let access = Arc::new(TokenAccess::new(settings.tokens, provider.clone()));
         Ok(Self {

@@ -2,7 +2,6 @@
 //! browser lets every page of the web send requests to loopback, and a name that its owner points there (DNS rebinding)
 //! lets it read the answers too; so without tokens `Host` and `Origin` must be this machine's.
 
-use std::convert::Infallible;
 use std::net::IpAddr;
 use std::sync::Arc;
 
@@ -34,27 +33,13 @@ pub(super) struct MayQuery(pub(super) Arc<EngineClient>);
 /// The cookie of a browser's session.
 pub(super) const COOKIE: &str = "echolake";
 
-/// The name in the certificate that the client of a connection has shown; None if it has shown none. An extension of its
-/// requests.
-#[derive(Debug, Clone, Default)]
-pub(crate) struct CertificateName(pub(crate) Option<Arc<str>>);
-
-impl<S: Send + Sync> FromRequestParts<S> for CertificateName {
-    type Rejection = Infallible;
-
-    async fn from_request_parts(parts: &mut Parts, _: &S) -> Result<Self, Infallible> {
-        Ok(parts.extensions.get::<Self>().cloned().unwrap_or_default())
-    }
-}
-
-/// Authenticates a client by token, by session or by certificate; `local` makes the client of a server that has no tokens.
+/// Authenticates a client by token or by session; `local` makes the client of a server that has no tokens.
 ///
 /// # Errors
 /// [`RequestFault::Unauthenticated`], [`RequestFault::Foreign`].
 pub(crate) async fn authenticate(
     access: &TokenAccess,
     headers: &HeaderMap,
-    certificate: &CertificateName,
     local: impl Fn() -> ClientIdentity,
 ) -> Result<Arc<ClientIdentity>, RequestFault> {
     let token = headers.get(header::AUTHORIZATION).and_then(|v| v.to_str().ok()).and_then(of_header);
@@ -62,10 +47,8 @@ pub(crate) async fn authenticate(
         access.await_key(token.as_deref()).await;
         return access.client(token.as_deref(), local);
     }
-    let session = cookie(headers).and_then(|secret| access.client_of_session(secret, &local).ok());
-    let certified = || certificate.0.as_deref().and_then(|name| access.certified_client(name));
-    let client = session.or_else(certified).ok_or(RequestFault::Unauthenticated)?;
-    // A browser sends cookies and certificates along whichever page asks.
+    let client = access.client_of_session(cookie(headers).ok_or(RequestFault::Unauthenticated)?, &local)?;
+    // A browser sends cookies along whichever page asks.
     is_same_origin(headers)?;
     Ok(client)
 }

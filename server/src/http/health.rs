@@ -8,7 +8,7 @@ use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 use utoipa::ToSchema;
 
-use super::guard::{CertificateName, authenticate};
+use super::guard::authenticate;
 use super::problem::ProblemResponse;
 use crate::client_identity::ClientIdentity;
 use crate::door::server_door::ServerDoor;
@@ -66,10 +66,9 @@ pub(super) async fn refuse_while_draining(State(door): State<ServerDoor>, reques
 )]
 pub(super) async fn metrics(
     State(door): State<ServerDoor>,
-    certificate: CertificateName,
     headers: HeaderMap,
 ) -> Result<impl IntoResponse, ProblemResponse> {
-    let client = authenticate(door.access(), &headers, &certificate, ClientIdentity::pages).await;
+    let client = authenticate(door.access(), &headers, ClientIdentity::pages).await;
     client.and_then(|client| client.require(TokenScope::Metrics)).inspect_err(|f| door.metrics().failed(f.code()))?;
     Ok(([(header::CONTENT_TYPE, "text/plain; version=0.0.4; charset=utf-8")], door.figures().await?))
 }

@@ -43,7 +43,7 @@ use crate::request_span::trace_request;
 use crate::service::QueryService;
 use crate::signed_address::SIGNED_ROUTE;
 use catalogue::LakeCatalogue;
-pub(crate) use guard::{CertificateName, FORWARDED_PROTO, RequestSite, authenticate, request_site};
+pub(crate) use guard::{FORWARDED_PROTO, RequestSite, authenticate, request_site};
 pub(crate) use layout::ViewerLayout;
 pub(crate) use mcp::MCP;
 pub(crate) use problem::ProblemResponse;

@@ -9,9 +9,6 @@ use utoipa::openapi::{ObjectBuilder, RefOr, Schema, Type};
 
 use crate::fault::{FaultCode, RequestFault};
 
-/// Seconds after which a client may ask again a server that stops or is not ready: a restart takes some.
-const RETRY_AFTER_SECS: &str = "5";
-
 /// A failure, to be answered.
 pub(crate) struct ProblemResponse(pub(crate) RequestFault);
 
@@ -85,8 +82,8 @@ impl ProblemResponse {
         response.extensions_mut().insert(code);
         let headers = response.headers_mut();
         headers.insert(header::CONTENT_TYPE, HeaderValue::from_static("application/problem+json"));
-        if matches!(code, FaultCode::Stopping | FaultCode::NotReady) {
-            headers.insert(header::RETRY_AFTER, HeaderValue::from_static(RETRY_AFTER_SECS));
+        if let Some(secs) = self.0.retry_secs() {
+            headers.insert(header::RETRY_AFTER, HeaderValue::from(secs));
         }
         if code == FaultCode::Stopping {
             headers.insert(header::CONNECTION, HeaderValue::from_static("close"));

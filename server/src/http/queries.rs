@@ -4,7 +4,7 @@ use axum::extract::rejection::PathRejection;
 use axum::extract::{Path, State};
 use axum::http::{HeaderMap, StatusCode};
 
-use super::guard::{CertificateName, authenticate};
+use super::guard::authenticate;
 use super::problem::ProblemResponse;
 use crate::client_identity::ClientIdentity;
 use crate::door::server_door::ServerDoor;
@@ -24,10 +24,9 @@ use crate::fault::RequestFault;
 pub(super) async fn cancel(
     State(door): State<ServerDoor>,
     id: Result<Path<u64>, PathRejection>,
-    certificate: CertificateName,
     headers: HeaderMap,
 ) -> Result<StatusCode, ProblemResponse> {
-    let done = cancel_query(&door, id, &certificate, &headers).await;
+    let done = cancel_query(&door, id, &headers).await;
     done.inspect_err(|fault| door.metrics().record_failure(fault))?;
     Ok(StatusCode::ACCEPTED)
 }
@@ -35,10 +34,9 @@ pub(super) async fn cancel(
 async fn cancel_query(
     door: &ServerDoor,
     id: Result<Path<u64>, PathRejection>,
-    certificate: &CertificateName,
     headers: &HeaderMap,
 ) -> Result<(), RequestFault> {
-    let client = authenticate(door.access(), headers, certificate, ClientIdentity::programs).await?;
+    let client = authenticate(door.access(), headers, ClientIdentity::programs).await?;
     let Path(id) =
         id.map_err(|_| RequestFault::request("a query has a number; hint: select id from system.queries"))?;
     door.cancel_query(&client, id).await

@@ -1,4 +1,4 @@
-//! Figures of workers, as they told them when they were asked last.
+//! Figures of the workers that answered when they were asked last.
 
 use echolake_query::{WorkerFigures, WorkerStatus};
 use prometheus::{Gauge, IntGaugeVec, Opts, Registry, Result};
@@ -46,10 +46,13 @@ impl WorkerGauges {
 
     /// Takes what an engine was told.
     pub(super) fn set(&self, workers: &[WorkerStatus]) {
+        // Those of a worker that cannot be reached are old.
+        self.usable.reset();
+        self.figures.iter().for_each(IntGaugeVec::reset);
         for worker in workers {
             self.usable.with_label_values(&[&worker.url]).set(i64::from(worker.problem.is_none()));
             for (gauge, (_, _, value)) in self.figures.iter().zip(FIGURES) {
-                if let Some(figures) = &worker.figures {
+                if let Some(figures) = worker.figures.as_ref().filter(|_| worker.problem.is_none()) {
                     gauge.with_label_values(&[&worker.url]).set(i64::try_from(value(figures)).unwrap_or(i64::MAX));
                 }
             }
@@ -79,6 +82,20 @@ mod tests {
             last_seen: None,
             figures: Some(WorkerFigures { read_bytes, ..WorkerFigures::default() }),
         }
+    }
+
+    #[test]
+    fn a_worker_that_left_has_no_figures() {
+        let registry = Registry::new();
+        let gauges = WorkerGauges::register(&registry).expect("distinct names");
+        let text = || prometheus::TextEncoder::new().encode_to_string(&registry.gather()).expect("a text");
+        gauges.set(&[worker("http://a/", 300, None), worker("http://b/", 100, None)]);
+        assert!(text().contains("echolake_worker_read_bytes{worker=\"http://b/\"} 100"), "{}", text());
+        gauges.set(&[worker("http://a/", 300, None)]);
+        assert!(!text().contains("http://b/"), "{}", text());
+        gauges.set(&[worker("http://a/", 300, Some("gone"))]);
+        assert!(text().contains("echolake_worker_usable{worker=\"http://a/\"} 0"), "{}", text());
+        assert!(!text().contains("read_bytes{worker=\"http://a/\"}"), "{}", text());
     }
 
     #[test]

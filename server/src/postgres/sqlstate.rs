@@ -31,7 +31,7 @@ fn state(fault: &RequestFault) -> &'static str {
         RequestFault::Query(QueryError::Query { message, .. }) if message.starts_with("no column ") => "42703",
         RequestFault::TooMany { what: "connections", .. } => "53300",
         RequestFault::NotFound { what, .. } if what.starts_with("cursor ") => "34000",
-        RequestFault::Disconnected => "57P01",
+        RequestFault::Disconnected | RequestFault::Displaced => "57P01",
         _ => match fault.code() {
             FaultCode::Query => "42601",
             FaultCode::ReadOnly => "25006",

@@ -9,7 +9,7 @@ use super::frames::cancel_message;
 use crate::door::engine_process::EngineProcess;
 use crate::engine_socket::EngineSocket;
 
-/// The engine that a connection uses now, and the key of its connection there.
+/// The engine of a connection, and the key of its connection there.
 #[derive(Clone)]
 pub(super) struct CancelTarget {
     pub(super) engine: Arc<EngineProcess>,
@@ -23,16 +23,9 @@ pub(super) struct CancelKey {
     pub(super) secret: Vec<u8>,
 }
 
-/// The target of a key, and whether it was used since the connection's last statement began: an engine that ends does not
-/// pass that on to the next.
-struct KnownKey {
-    target: CancelTarget,
-    is_used: bool,
-}
-
 /// The keys of all connections.
 #[derive(Default)]
-pub(super) struct CancelKeys(Mutex<HashMap<(i32, Vec<u8>), KnownKey>>);
+pub(super) struct CancelKeys(Mutex<HashMap<(i32, Vec<u8>), CancelTarget>>);
 
 impl CancelKeys {
     /// A number for a connection, random as well.
@@ -54,16 +47,7 @@ impl CancelKeys {
 
     /// Lets this key cancel queries of the target's connection from now on.
     pub(super) fn set(&self, key: &CancelKey, target: CancelTarget) {
-        let mut keys = self.lock();
-        let place = (key.pid, key.secret.clone());
-        let is_used = keys.get(&place).is_some_and(|known| known.is_used);
-        keys.insert(place, KnownKey { target, is_used });
-    }
-
-    /// Returns whether a key was used since this was asked last.
-    pub(super) fn take_use(&self, key: &CancelKey) -> bool {
-        let mut keys = self.lock();
-        keys.get_mut(&(key.pid, key.secret.clone())).is_some_and(|known| std::mem::take(&mut known.is_used))
+        self.lock().insert((key.pid, key.secret.clone()), target);
     }
 
     /// Removes a key.
@@ -73,10 +57,7 @@ impl CancelKeys {
 
     /// Cancels the query on the connection of a key; false if there is none.
     pub(super) async fn cancel(&self, pid: i32, secret: &[u8]) -> bool {
-        let found = self.lock().get_mut(&(pid, secret.to_vec())).map(|known| {
-            known.is_used = true;
-            known.target.clone()
-        });
+        let found = self.lock().get(&(pid, secret.to_vec())).cloned();
         let Some(target) = found else { return false };
         // An engine that is gone runs nothing.
         if let Ok(mut stream) = target.engine.connect(EngineSocket::Postgres).await
@@ -88,7 +69,7 @@ impl CancelKeys {
         true
     }
 
-    fn lock(&self) -> MutexGuard<'_, HashMap<(i32, Vec<u8>), KnownKey>> {
+    fn lock(&self) -> MutexGuard<'_, HashMap<(i32, Vec<u8>), CancelTarget>> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

@@ -1,7 +1,7 @@
 //! Messages of Postgres' protocol as the door sees them: a type, a length, bytes. What they say is the engine's to know.
 
 use bytes::{Buf as _, BufMut as _, BytesMut};
-use pgwire::error::{ErrorInfo, PgWireError};
+use pgwire::error::ErrorInfo;
 use pgwire::messages::PgWireBackendMessage;
 
 use crate::fault::RequestFault;
@@ -123,27 +123,14 @@ impl MessageParts<'_> {
     }
 }
 
-/// A failure that leaves the connection open.
-pub(super) fn error_message(fault: &RequestFault) -> BytesMut {
-    encode_error(sqlstate::error(fault))
-}
-
 /// A failure that ends the connection.
 pub(super) fn fatal_message(fault: &RequestFault) -> BytesMut {
-    encode_error(sqlstate::fatal(fault))
-}
-
-fn encode_error(error: PgWireError) -> BytesMut {
     let mut bytes = BytesMut::new();
     // It is a message of a few hundred bytes, which is no reason for the library to refuse it.
-    let _ = PgWireBackendMessage::ErrorResponse(ErrorInfo::from(error).into()).encode(&mut bytes);
+    let _ = PgWireBackendMessage::ErrorResponse(ErrorInfo::from(sqlstate::fatal(fault)).into()).encode(&mut bytes);
     bytes
 }
 
-/// Says that the next statement is awaited, outside of a transaction.
-pub(super) const READY: [u8; 6] = [b'Z', 0, 0, 0, 5, b'I'];
-/// Requests all answers so far.
-pub(super) const SYNC: [u8; 5] = [b'S', 0, 0, 0, 4];
 /// Requests a password.
 pub(super) const PASSWORD_WANTED: [u8; 9] = [b'R', 0, 0, 0, 8, 0, 0, 0, 3];
 

@@ -1,9 +1,9 @@
 //! Postgres connections of the door. It logs clients in, checks the lengths of messages, and passes them on; if an
-//! engine ends, it reports that on the connection, which continues with the next engine.
+//! engine ends, it reports that on the connection, which ends with it.
 
 mod cancel_keys;
-mod exchange;
 mod frames;
+mod pending_answers;
 mod relay;
 mod scram;
 
@@ -16,7 +16,7 @@ use tokio::net::TcpListener;
 use tracing::Instrument as _;
 
 use super::connection_places::{ConnectionPlaces, PlaceWork, PlacedStream};
-use super::encryption::{DoorStream, ProtocolEncryption, certificate_name};
+use super::encryption::{DoorStream, ProtocolEncryption};
 use crate::client_identity::ClientIdentity;
 use crate::door::server_door::ServerDoor;
 use crate::fault::RequestFault;
@@ -36,6 +36,8 @@ const MOST: usize = 128;
 const LOGIN: Duration = Duration::from_secs(10);
 /// Bytes of a startup packet, as in Postgres.
 const STARTUP: usize = 10_000;
+/// The user who sends a token as it is, as password: one of an identity provider, or of a line without a verifier.
+const TOKEN_USER: &str = "token";
 /// Delay of the answer to a wrong cancel key.
 const WRONG_KEY: Duration = Duration::from_secs(1);
 
@@ -83,9 +85,9 @@ async fn attend(stream: PlacedStream, place: LoginPlace) {
 /// A client that is logged in.
 struct PostgresLogin {
     client: Arc<ClientIdentity>,
-    /// The packet that it began with, which each of its engines is sent.
+    /// The packet that it began with, which its engine is sent.
     startup: BytesMut,
-    /// The number of its connection in each of them, and in its cancel key.
+    /// The number of its connection there, and in its cancel key.
     pid: i32,
 }
 
@@ -174,8 +176,8 @@ impl LoginPlace {
 }
 
 impl LoginPlace {
-    // A client whose certificate has the user's name is logged in. Else, if the user is a token's name, and its line has a
-    // verifier, the client proves that it has the token; all others send it.
+    // Users of one name alone send their token. All others prove that they have the one of their name, whether there is such
+    // a name or not: nobody learns by asking which names there are.
     async fn authenticate(
         &self,
         stream: &mut DoorStream,
@@ -183,21 +185,19 @@ impl LoginPlace {
         certificate: Option<&[u8]>,
     ) -> Result<Arc<ClientIdentity>, RequestFault> {
         let access = self.door.access();
-        let certified = certificate_name(stream).filter(|name| name == user);
-        if let Some(client) = certified.and_then(|name| access.certified_client(&name)) {
-            return Ok(client);
+        if access.is_open() {
+            return access.client(None, || ClientIdentity::user(user));
         }
-        if let Some((client, verifier)) = access.scram_client(user) {
+        if user != TOKEN_USER {
+            let (client, verifier) = access.scram_client(user);
             prove_token(stream, &verifier, certificate).await?;
+            let client = client.ok_or(RequestFault::Unauthenticated)?;
             access.check_current(&client)?;
             return Ok(client);
         }
-        let token = match access.is_open() {
-            true => None,
-            false => Some(read_password(stream).await?),
-        };
-        access.await_key(token.as_deref()).await;
-        access.client(token.as_deref(), || ClientIdentity::user(user))
+        let token = read_password(stream).await?;
+        access.await_key(Some(&token)).await;
+        access.client(Some(&token), || ClientIdentity::user(user))
     }
 }
 

@@ -93,8 +93,11 @@ impl<'a> ScramExchange<'a> {
             (METHOD, "n", _) | (METHOD, "y", None) => {}
             _ => return Err(malformed("method and binding to the certificate differ from what was offered")),
         }
-        let nonce = bare.split(',').find_map(|part| part.strip_prefix("r=")).filter(|nonce| !nonce.is_empty());
-        let nonce = format!("{}{own_nonce}", nonce.ok_or_else(|| malformed("no `r=`"))?);
+        check_extensions(bare)?;
+        let mut attributes = bare.split(',');
+        let _user = attributes.next().and_then(|part| part.strip_prefix("n=")).ok_or_else(|| malformed("no `n=`"))?;
+        let nonce = attributes.next().and_then(|part| part.strip_prefix("r=")).filter(|nonce| !nonce.is_empty());
+        let nonce = format!("{}{own_nonce}", nonce.ok_or_else(|| malformed("no `r=` behind `n=`"))?);
         let server_first = format!("r={nonce},s={},i={}", verifier.salt(), verifier.iterations());
         let messages = format!("{bare},{server_first}");
         Ok(Self { verifier, binding, nonce, messages, server_first })
@@ -112,6 +115,7 @@ impl<'a> ScramExchange<'a> {
     pub(super) fn finish(&self, message: &[u8]) -> Result<BytesMut, RequestFault> {
         let last = str::from_utf8(message).map_err(|_| malformed("its last message is no text"))?;
         let (unproved, proof) = last.rsplit_once(",p=").ok_or_else(|| malformed("no `p=`"))?;
+        check_extensions(unproved)?;
         let mut parts = unproved.split(',');
         let binding = parts.next().and_then(|part| BASE64.decode(part.strip_prefix("c=")?).ok());
         if binding.as_deref() != Some(&self.binding[..]) {
@@ -124,6 +128,14 @@ impl<'a> ScramExchange<'a> {
         let messages = format!("{},{unproved}", self.messages);
         let answer = self.verifier.check_proof(&messages, &proof).ok_or(RequestFault::Unauthenticated)?;
         Ok(sasl_message(SASL_FINAL, format!("v={}", BASE64.encode(answer)).as_bytes()))
+    }
+}
+
+// A client that sends `m=` must not be let in by a server that does not know what it wants (RFC 5802, section 5.1).
+fn check_extensions(message: &str) -> Result<(), RequestFault> {
+    match message.split(',').any(|attribute| attribute.starts_with("m=")) {
+        true => Err(malformed("it wants an extension (`m=`), and there is none")),
+        false => Ok(()),
     }
 }
 
@@ -172,6 +184,23 @@ mod tests {
         {
             assert!(matches!(exchange.finish(malformed.as_bytes()), Err(RequestFault::Request { .. })), "{malformed}");
         }
+    }
+
+    #[test]
+    fn extensions_are_refused() {
+        let verifier = VERIFIER.parse().expect("a verifier");
+        let begin = |bare: &str| {
+            ScramExchange::with_nonce(&initial(METHOD, &format!("n,,{bare}")), &verifier, None, OWN_NONCE).map(drop)
+        };
+        assert!(begin("n=user,r=abc").is_ok() && begin("n=,r=abc,x=unknown").is_ok());
+        for wrong in ["m=x,n=user,r=abc", "n=user,m=x,r=abc", "n=user,r=abc,m=x", "r=abc,n=user", "n=user", "n=user,r="]
+        {
+            assert!(matches!(begin(wrong), Err(RequestFault::Request { .. })), "{wrong}");
+        }
+        let first = initial(METHOD, "n,,n=user,r=rOprNGfwEbeRWgbNEkqO");
+        let exchange = ScramExchange::with_nonce(&first, &verifier, None, OWN_NONCE).expect("a first message");
+        let last = exchange.finish(format!("c=biws,r={NONCE},m=x,p={PROOF}").as_bytes());
+        assert!(matches!(last, Err(RequestFault::Request { .. })));
     }
 
     #[test]

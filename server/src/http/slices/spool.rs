@@ -1,5 +1,5 @@
 //! Slices that are read by ranges: cut once, cached in files without names up to a number of bytes, the oldest evicted
-//! first. Disks are waited for on threads of their own.
+//! first, and while other clients have room on the disk. Disks are waited for on threads of their own.
 //!
 //! It is none of the caches by `quick_cache`, which count an item once it is complete and until it is evicted: here bytes
 //! count from when they are written until the last reader closes the file.
@@ -21,6 +21,9 @@ use crate::running::RunningQuery;
 
 /// Bytes of all slices that are kept, and of one.
 const MOST_BYTES: u64 = 2 << 30;
+/// Part of the disk's space that a client's slices may take of what they and the free space have together: an engine has one
+/// client, and the others write to the same disk.
+const SHARE: u64 = 4;
 /// Bytes that are read at a time.
 const BLOCK: u64 = 256 << 10;
 
@@ -46,8 +49,25 @@ impl PieceSource for RunningQuery<Bytes> {
 }
 
 /// Cache of slices, by their digest.
-#[derive(Clone, Default)]
-pub(in crate::http) struct SliceSpool(Arc<Mutex<SpoolState>>);
+#[derive(Clone)]
+pub(in crate::http) struct SliceSpool(Arc<SharedSpool>);
+
+struct SharedSpool {
+    state: Mutex<SpoolState>,
+    /// Free bytes of the disk; None if the system does not tell.
+    free_bytes: fn() -> Option<u64>,
+}
+
+impl Default for SliceSpool {
+    fn default() -> Self {
+        Self::new(free_temp_bytes)
+    }
+}
+
+fn free_temp_bytes() -> Option<u64> {
+    let disk = rustix::fs::statvfs(&std::env::temp_dir()).ok()?;
+    Some(disk.f_bavail * disk.f_frsize)
+}
 
 #[derive(Default)]
 struct SpoolState {
@@ -90,6 +110,10 @@ impl Drop for SliceWaiter<'_> {
 }
 
 impl SliceSpool {
+    fn new(free_bytes: fn() -> Option<u64>) -> Self {
+        Self(Arc::new(SharedSpool { state: Mutex::default(), free_bytes }))
+    }
+
     /// Returns the slice of this name; it is cut if it is neither cached nor being cut by another request. If that
     /// request is dropped, the work is cancelled, and another waiting one starts it again.
     ///
@@ -109,34 +133,34 @@ impl SliceSpool {
     }
 
     async fn fill(&self, mut cutting: impl PieceSource) -> Result<SpooledSlice, RequestFault> {
-        let file = on_disk(tempfile::tempfile).await.map_err(no_room)?;
+        let file = on_disk(tempfile::tempfile).await.map_err(disk_fault)?;
         let mut slice = SpooledSlice { file, bytes: 0, spool: self.clone() };
         while let Some(piece) = cutting.next_piece().await? {
             self.make_room(piece.len() as u64)?;
             slice.bytes += piece.len() as u64;
             // It moves along: even if the request is dropped meanwhile, its bytes count as long as it is written to.
             let written = on_disk(move || slice.file.write_all(&piece).map(|()| slice)).await;
-            slice = written.map_err(no_room)?;
+            slice = written.map_err(disk_fault)?;
         }
         Ok(slice)
     }
 
     // Counts bytes that are about to be written, and evicts the oldest slices for them.
     fn make_room(&self, bytes: u64) -> Result<(), RequestFault> {
-        let mut gone = Vec::new();
-        let has_room = loop {
+        loop {
+            let free_bytes = (self.0.free_bytes)().unwrap_or(u64::MAX);
             let mut kept = self.kept();
-            if kept.bytes + bytes <= MOST_BYTES {
+            let limit = MOST_BYTES.min(kept.bytes.saturating_add(free_bytes) / SHARE);
+            if kept.bytes + bytes <= limit {
                 kept.bytes += bytes;
-                break true;
+                return Ok(());
             }
-            let Some(oldest) = kept.order.pop_front() else { break false };
-            gone.extend(kept.slices.remove(&oldest));
+            let Some(oldest) = kept.order.pop_front() else { return Err(RequestFault::NoRoom { limit }) };
+            let gone = kept.slices.remove(&oldest);
             drop(kept);
             // Its bytes are free once it is dropped, unless it is being read; dropping takes the lock.
-            gone.clear();
-        };
-        if has_room { Ok(()) } else { Err(RequestFault::NoRoom { limit: MOST_BYTES }) }
+            drop(gone);
+        }
     }
 
     fn touch(&self, key: &str, cell: &Arc<OnceCell<Arc<SpooledSlice>>>) {
@@ -149,7 +173,7 @@ impl SliceSpool {
     }
 
     fn kept(&self) -> std::sync::MutexGuard<'_, SpoolState> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        self.0.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -158,7 +182,7 @@ async fn on_disk<T: Send + 'static>(work: impl FnOnce() -> io::Result<T> + Send 
     tokio::task::spawn_blocking(work).await?
 }
 
-fn no_room(error: io::Error) -> RequestFault {
+fn disk_fault(error: io::Error) -> RequestFault {
     tracing::warn!(error = &error as &dyn std::error::Error, folder = %std::env::temp_dir().display(), "a slice cannot be kept");
     RequestFault::NoRoom { limit: MOST_BYTES }
 }
@@ -189,5 +213,47 @@ impl SpooledSlice {
                 Err(failed) => Err(RequestFault::defect("a kept slice cannot be read")(failed)),
             }
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::atomic::{AtomicU64, Ordering};
+
+    use super::*;
+
+    /// What is left of a slice.
+    struct ZeroSource(u64);
+
+    impl PieceSource for ZeroSource {
+        async fn next_piece(&mut self) -> Result<Option<Bytes>, RequestFault> {
+            let bytes = self.0.min(10_000);
+            self.0 -= bytes;
+            FREE.fetch_sub(bytes, Ordering::Relaxed);
+            Ok((bytes > 0).then(|| Bytes::from(vec![0; bytes as usize])))
+        }
+    }
+
+    /// Free bytes of the disk in this test.
+    static FREE: AtomicU64 = AtomicU64::new(1_000_000);
+
+    #[tokio::test]
+    async fn a_client_evicts_its_own_and_leaves_the_disk_to_others() {
+        let spool = SliceSpool::new(|| Some(FREE.load(Ordering::Relaxed)));
+        let keep = async |key, bytes| spool.once(key, async { Ok(ZeroSource(bytes)) }).await.map(drop);
+        for key in ["a", "b"] {
+            keep(key, 100_000).await.expect("room");
+        }
+        // The disk of this test is not freed: it is as if others took what was evicted.
+        keep("c", 100_000).await.expect("the oldest made room");
+        assert_eq!(spool.kept().order, ["b", "c"]);
+        let others: u64 = 500_000;
+        FREE.fetch_sub(others, Ordering::Relaxed);
+        keep("d", 10_000).await.expect("both made room");
+        let kept = spool.kept().bytes;
+        assert!(kept <= (kept + FREE.load(Ordering::Relaxed)) / SHARE + 10_000, "{kept}");
+        assert!(matches!(keep("e", 400_000).await, Err(RequestFault::NoRoom { limit }) if limit < 300_000));
+        assert!(FREE.load(Ordering::Relaxed) > 0, "others have room");
+        assert_eq!(spool.kept().bytes, 0, "what was begun is gone");
     }
 }
