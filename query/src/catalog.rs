@@ -93,7 +93,7 @@ impl LakeCatalog {
 
     /// Registers everything that `statement` may name, all of one snapshot of the lake, and the program's own tables in
     /// `system`. It is called before planning,
-    /// because the lookup of these names is asynchronous and planning is not.
+    /// because the lookup of these names is asynchronous and planning is not. Returns the snapshot.
     ///
     /// # Errors
     /// [`Error::Lake`] if the lake cannot be read, or not as of the moment that the statement names;
@@ -103,7 +103,7 @@ impl LakeCatalog {
         context: &SessionContext,
         system: Vec<(&'static str, Arc<dyn TableProvider>)>,
         statement: &mut Statement,
-    ) -> Result<(), Error> {
+    ) -> Result<Arc<LakeSnapshot>, Error> {
         let past = as_of::named(statement);
         let current = self.current().await?;
         for (name, provider) in &current.providers {
@@ -118,7 +118,8 @@ impl LakeCatalog {
             let provider = self.at(&past, &mut versions).await?;
             context.register_table(TableReference::bare(past.name), provider).map_err(failed)?;
         }
-        mcap::register(context, &current.snapshot, &self.runs, statement).await
+        mcap::register(context, &current.snapshot, &self.runs, statement).await?;
+        Ok(current.snapshot.clone())
     }
 
     /// Returns the current snapshot of the lake, which a query started now would see; cached until something changes.

@@ -25,7 +25,7 @@ use crate::catalog::LakeCatalog;
 use crate::control::pool::{HeldMemory, PartialPool};
 use crate::control::threads::{QueryThreadGroups, QueryThreads};
 use crate::control::{QueryTicket, RunningQueries, StopReason};
-use crate::functions::octet_length_of_bytes;
+use crate::functions::{octet_length_of_bytes, pattern_functions};
 use crate::scan_readers::LakeReaderFactory;
 use crate::small::SmallTables;
 use crate::spread::WorkerCluster;
@@ -443,6 +443,9 @@ fn template(
     let builder = SessionStateBuilder::new().with_config(config()).with_runtime_env(runtime).with_default_features();
     let mut state = rules.into_iter().fold(builder, SessionStateBuilder::with_optimizer_rule).build();
     let _ = state.register_udf(Arc::new(octet_length_of_bytes()));
+    for function in pattern_functions(state.config_options()) {
+        let _ = state.register_udf(Arc::new(function));
+    }
     // They replace functions with the same names and aliases; only a closed registry would refuse.
     for function in functions.scalar() {
         let _ = state.register_udf(function.clone());

@@ -34,6 +34,7 @@ mod friendly;
 mod functions;
 mod gate;
 mod ignored_clauses;
+mod integer_casts;
 mod mcap;
 mod opaque;
 pub mod output;

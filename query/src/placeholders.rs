@@ -1,4 +1,5 @@
-//! Types of placeholders that DataFusion leaves open: those of casts, of LIMIT and OFFSET, and of lists that are searched.
+//! Types of placeholders that DataFusion leaves open: those of casts, of LIMIT and OFFSET, of lists that are searched, of
+//! NOT, and of values that stand beside others.
 
 use std::sync::Arc;
 
@@ -12,6 +13,9 @@ use datafusion::logical_expr::{Expr, ExprSchemable as _, LogicalPlan};
 
 /// The function that `x = ANY(list)` becomes.
 const SEARCH: &str = "array_has";
+
+/// Functions whose arguments have one type.
+const ALIKE: [&str; 4] = ["coalesce", "greatest", "least", "nullif"];
 
 /// Gives a plan's placeholders the types that the query determines.
 pub(crate) fn infer_types(plan: LogicalPlan) -> Result<LogicalPlan> {
@@ -40,6 +44,12 @@ fn infer_of_expression(mut expr: Expr, counts_rows: bool, schema: &DFSchema) -> 
             }),
             _ => false,
         },
+        Expr::ScalarFunction(ScalarFunction { func, args }) if ALIKE.contains(&func.name()) => {
+            let known = |arg: &Expr| arg.get_type(schema).ok().filter(|kind| *kind != DataType::Null);
+            let kind = args.iter().find_map(known);
+            args.iter_mut().fold(false, |found, arg| settle_type(arg, || kind.clone()) || found)
+        }
+        Expr::Not(truth) => settle_type(truth, || Some(DataType::Boolean)),
         placeholder @ Expr::Placeholder(_) if counts_rows => settle_type(placeholder, || Some(DataType::Int64)),
         _ => false,
     };

@@ -34,7 +34,7 @@ use crate::spread::attempt::{QueryAttempt, QueryAttempts, SpreadQuery, explain_s
 use crate::spread::decision::SpreadDecision;
 use crate::statement_bounds::check_statement_bounds;
 use crate::system::SYSTEM_SCHEMA;
-use crate::{Error, OpaqueValue, as_of, friendly, gate, ignored_clauses, placeholders, summarize};
+use crate::{Error, OpaqueValue, as_of, friendly, gate, ignored_clauses, integer_casts, placeholders, summarize};
 
 /// Capacity of the queue of batches to a slow reader.
 const AHEAD: usize = 2;
@@ -51,10 +51,11 @@ pub struct Session {
 pub type ContextExtension = Arc<dyn Fn(&SessionContext) -> Result<(), DataFusionError> + Send + Sync>;
 
 /// A planned query that can be run repeatedly with other values. It keeps the snapshot of the lake on which it was
-/// planned.
+/// planned; [`Session::is_current`] finds out whether the lake has changed since.
 pub struct PreparedQuery {
     state: OpaqueValue<SessionState>,
     plan: OpaqueValue<LogicalPlan>,
+    snapshot: Arc<LakeSnapshot>,
     sql: String,
 }
 
@@ -215,7 +216,7 @@ impl Session {
             let sql = &*self.summarized(sql).await?;
             let started = self.start()?;
             let prepared = self.plan(sql, self.parse(sql)?, &started.ticket).await?;
-            self.run(&prepared, LogicalPlan::clone(&prepared.plan), started).await
+            self.run(prepared.state.clone(), &prepared.sql, LogicalPlan::clone(&prepared.plan), started).await
         };
         query.boxed()
     }
@@ -282,9 +283,21 @@ impl Session {
     ) -> BoxFuture<'a, Result<QueryAnswer, Error>> {
         let execute = async move {
             let plan = LogicalPlan::clone(&prepared.plan).with_param_values(values);
-            self.run(prepared, plan.map_err(|e| Error::plan(&prepared.sql, &e))?, self.start()?).await
+            let plan = plan.map_err(|e| Error::plan(&prepared.sql, &e))?;
+            // now() is the time of this run, not that of planning.
+            let mut state = SessionState::clone(&prepared.state);
+            state.mark_start_execution();
+            self.run(OpaqueValue::new(state), &prepared.sql, plan, self.start()?).await
         };
         execute.boxed()
+    }
+
+    /// Returns whether a query that started now would see the snapshot on which this one was planned.
+    ///
+    /// # Errors
+    /// [`Error::Lake`] if the lake cannot be read.
+    pub async fn is_current(&self, prepared: &PreparedQuery) -> Result<bool, Error> {
+        Ok(Arc::ptr_eq(&self.snapshot().await?, &prepared.snapshot))
     }
 
     /// Parses one statement.
@@ -330,7 +343,7 @@ impl Session {
             let wrong = |e: DataFusionError| Error::plan(&sql, &e);
             let context = session.engine.context();
             let system = session.engine.system_tables();
-            session.engine.catalog().register(&context, system, &mut statement).await?;
+            let snapshot = session.engine.catalog().register(&context, system, &mut statement).await?;
             if let Some(extend) = &session.extend {
                 extend(&context).map_err(|e| Error::execution(&e))?;
             }
@@ -342,18 +355,26 @@ impl Session {
                     && !state.aggregate_functions().contains_key(name)
                     && !state.window_functions().contains_key(name)
             })?;
-            let plan = state.statement_to_plan(statement).await.and_then(placeholders::infer_types).map_err(wrong)?;
+            let plan = state.statement_to_plan(statement).await.and_then(placeholders::infer_types);
+            let plan = plan.and_then(integer_casts::round_casts).map_err(wrong)?;
             // `SELECT INTO` reads by its first word and makes a table by its plan.
             let reading = SQLOptions::new().with_allow_ddl(false).with_allow_dml(false).with_allow_statements(false);
             reading.verify_plan(&plan).map_err(|_| Error::NotReading { statement: plan.display().to_string() })?;
-            Ok(PreparedQuery { state: OpaqueValue::new(context.state()), plan: OpaqueValue::new(plan), sql })
+            let (state, plan) = (OpaqueValue::new(context.state()), OpaqueValue::new(plan));
+            Ok(PreparedQuery { state, plan, snapshot, sql })
         };
         self.engine.on_threads(ticket, plan).await
     }
 
-    async fn run(&self, prepared: &PreparedQuery, plan: LogicalPlan, started: Started) -> Result<QueryAnswer, Error> {
+    async fn run(
+        &self,
+        state: OpaqueValue<SessionState>,
+        sql: &str,
+        plan: LogicalPlan,
+        started: Started,
+    ) -> Result<QueryAnswer, Error> {
         let Started { ticket, place } = started;
-        let planned = self.clone().physical_plan(prepared.state.clone(), prepared.sql.clone(), plan, ticket.clone());
+        let planned = self.clone().physical_plan(state, sql.to_owned(), plan, ticket.clone());
         let (schema, attempts) = self.engine.on_threads(&ticket, planned).await?;
         let (send, batches) = mpsc::channel(AHEAD);
         let query = drive(schema.clone(), attempts, send, ticket.clone(), place).boxed();

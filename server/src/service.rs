@@ -27,8 +27,6 @@ use crate::metrics::ServerProtocol;
 use crate::running::{AnswerEncoder, RunningQuery, SessionTimeLimit, StopSignal, WAITING, ended, finish, parts};
 use crate::tokens::TokenScope;
 
-/// Maximal age of a plan, which sees the lake as of its planning.
-pub(crate) const FRESH: Duration = Duration::from_secs(2);
 /// The catalogue and schema of the lake's tables, as DataFusion calls them.
 pub(crate) const CATALOG: &str = "datafusion";
 pub(crate) const SCHEMA: &str = "public";

@@ -26,6 +26,7 @@ mod spectrum;
 mod symmetry;
 #[cfg(test)]
 pub(crate) mod tests;
+mod time_patterns;
 mod value_counts;
 
 use std::sync::Arc;
@@ -37,6 +38,7 @@ use aggregate::udaf;
 pub(crate) use octet_length::octet_length_of_bytes;
 use rig::RigFacts;
 use scalar::udf;
+pub(crate) use time_patterns::pattern_functions;
 
 /// All functions of a lake, made once for all its sessions.
 ///

@@ -34,6 +34,13 @@ impl CurveShapeFunction {
     }
 }
 
+// An impulse response has a shape of this kind, too, which means nothing.
+fn require_rising<T: SampleElement>(arguments: &CallArguments<'_>, row: usize, curve: &[T]) -> Result<()> {
+    let Some(at) = curve.windows(2).position(|pair| pair[1].f64() < pair[0].f64()) else { return Ok(()) };
+    let falls = format_args!("less in sample {} than in the one before", at + 2);
+    Err(arguments.wrong(0, row, falls, "a cumulative curve does not fall; nce() makes one of a response"))
+}
+
 const CURVE: &[FunctionParameter] = &[FunctionParameter {
     name: "curve",
     kind: ArgumentKind::Samples,
@@ -106,6 +113,7 @@ impl ScalarKernel for CurveShapeFunction {
         let (curves, per_ms) = (arguments.samples::<T>(0)?, self.facts.rate_hz / 1e3);
         numbers(arguments, |row| {
             let curve = curves.at(row)?;
+            require_rising(arguments, row, curve)?;
             match curve_shape(curve) {
                 Some(shape) => Ok(Some((self.value)(&shape, per_ms))),
                 None => require_finite(arguments, row, curve).map(|()| None),

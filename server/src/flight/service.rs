@@ -2,7 +2,6 @@
 
 use std::pin::Pin;
 use std::sync::Arc;
-use std::time::Instant;
 
 use arrow::datatypes::Schema;
 use arrow_flight::error::FlightError;
@@ -36,7 +35,7 @@ use super::{info, values};
 use crate::fault::RequestFault;
 use crate::metrics::ServerProtocol;
 use crate::running::StopSignal;
-use crate::service::{CATALOG, FRESH, QueryJob, QueryService, QueryWork, SCHEMA};
+use crate::service::{CATALOG, QueryJob, QueryService, QueryWork, SCHEMA};
 use crate::tokens::{TokenScope, of_header};
 
 /// The action that ends a query by what GetFlightInfo gave.
@@ -67,8 +66,8 @@ impl LakeFlightService {
         let (session, sql): (_, Arc<str>) = (Arc::new(self.service.session(client)), sql.into());
         let prepared = self.prepare(&session, &sql).await?;
         let values = ParamValues::from(Vec::<ScalarValue>::new());
-        let (schema, planned) = (prepared.schema(), Instant::now());
-        Ok(HeldStatement { session, sql, prepared, planned, schema, values, stop: StopSignal::new() })
+        let schema = prepared.schema();
+        Ok(HeldStatement { session, sql, prepared, schema, values, stop: StopSignal::new() })
     }
 
     async fn prepare(&self, session: &Arc<Session>, sql: &Arc<str>) -> Result<Arc<PreparedQuery>, Status> {
@@ -89,15 +88,9 @@ impl LakeFlightService {
         Ok(statement)
     }
 
-    // A statement of a client's handle, for a run of its own on today's lake.
+    // A statement of a client's handle, for a run of its own.
     async fn prepared(&self, client: &Arc<EngineClient>, handle: &[u8]) -> Result<HeldStatement, Status> {
-        let found = self.find(client, handle).await?;
-        let mut statement = HeldStatement { stop: StopSignal::new(), ..found };
-        if statement.planned.elapsed() >= FRESH {
-            statement.prepared = self.prepare(&statement.session, &statement.sql).await?;
-            statement.planned = Instant::now();
-        }
-        Ok(statement)
+        Ok(HeldStatement { stop: StopSignal::new(), ..self.find(client, handle).await? })
     }
 
     // A ticket of its own for each run, so that binding other values meanwhile does not change it.
@@ -108,7 +101,12 @@ impl LakeFlightService {
         answer::info(is_settled(&schema).then_some(schema.as_ref()), &ticket, descriptor)
     }
 
-    async fn run(&self, statement: HeldStatement) -> Result<Response<FlightStream>, Status> {
+    // Plans the statement again if the lake has changed since it was planned.
+    async fn run(&self, mut statement: HeldStatement) -> Result<Response<FlightStream>, Status> {
+        let is_current = statement.session.is_current(&statement.prepared).await;
+        if !is_current.map_err(|error| status(&error.into()))? {
+            statement.prepared = self.prepare(&statement.session, &statement.sql).await?;
+        }
         let told = is_settled(&statement.schema).then(|| statement.schema.clone());
         let job = QueryJob {
             protocol: ServerProtocol::FlightSql,

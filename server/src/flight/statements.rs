@@ -30,8 +30,6 @@ pub(super) struct HeldStatement {
     pub(super) session: Arc<Session>,
     pub(super) sql: Arc<str>,
     pub(super) prepared: Arc<PreparedQuery>,
-    /// Time of planning: it sees the lake as of then.
-    pub(super) planned: Instant,
     /// Columns as they were announced to the client.
     pub(super) schema: SchemaRef,
     /// Values of its placeholders.

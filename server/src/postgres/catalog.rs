@@ -201,7 +201,8 @@ fn fixed_tables(
     let mut tables = Vec::new();
     for name in library.table_names() {
         let batches = match library.build_table_by_name(&name)? {
-            Some(PgCatalogTable::Static(table)) if table.data().is_empty() => {
+            // What its rows are about has no constraints here.
+            Some(PgCatalogTable::Static(table)) if table.data().is_empty() || name == "pg_constraint" => {
                 vec![RecordBatch::new_empty(table.schema())]
             }
             Some(PgCatalogTable::Static(table)) => table.data().to_vec(),

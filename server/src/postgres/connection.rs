@@ -10,7 +10,6 @@ use datafusion_pg_catalog::sql::PostgresCompatibilityParser;
 use echolake_query::{EngineClient, Session};
 use futures::FutureExt as _;
 use futures::future::BoxFuture;
-use pgwire::api::Type;
 use pgwire::messages::startup::SecretKey;
 use tokio::sync::SetOnce;
 
@@ -22,7 +21,7 @@ use crate::Error;
 use crate::fault::RequestFault;
 use crate::metrics::ServerProtocol;
 use crate::running::{AnswerEncoder, RunningQuery, SessionTimeLimit, StopSignal, ended};
-use crate::service::{FRESH, QueryJob, QueryService, QueryWork};
+use crate::service::{QueryJob, QueryService, QueryWork};
 
 /// Cursors of a connection at once.
 const CURSORS: usize = 16;
@@ -164,7 +163,6 @@ impl PostgresConnection {
     pub(super) fn statements<'a>(
         &'a self,
         sql: &'a str,
-        types: &'a [Option<Type>],
         run: &'a CommandRun,
     ) -> BoxFuture<'a, Result<Vec<ClientStatement>, RequestFault>> {
         let statements = async move {
@@ -172,10 +170,10 @@ impl PostgresConnection {
                 return Err(RequestFault::TooLarge { limit: LARGEST });
             }
             let (shared, session) = (self.shared.clone(), self.session()?.clone());
-            let (sql, types): (Arc<str>, _) = (sql.into(), types.to_vec());
+            let sql: Arc<str> = sql.into();
             let work = async move {
                 let mut statements = Vec::new();
-                for parsed in statement::parse(&shared.parser, &session, &sql, &types)? {
+                for parsed in statement::parse(&shared.parser, &session, &sql)? {
                     statements.push(statement::plan(&session, &sql, parsed).await?);
                 }
                 Ok(statements)
@@ -196,7 +194,7 @@ impl PostgresConnection {
         }
     }
 
-    /// Runs a planned statement; plans it again if the plan is old.
+    /// Runs a planned statement; plans it again if the lake has changed since.
     pub(super) async fn run<E: AnswerEncoder>(
         &self,
         run: &CommandRun,
@@ -205,17 +203,11 @@ impl PostgresConnection {
         encode: impl FnOnce(&arrow::datatypes::SchemaRef) -> Result<E, RequestFault> + Send + 'static,
     ) -> Result<RunningQuery<E::Item>, RequestFault> {
         let session = self.session()?.clone();
-        let prepared = match planned.at.elapsed() < FRESH {
-            true => planned.prepared.clone(),
-            false => {
-                let (planner, old) = (session.clone(), planned.clone());
-                let new = self.planned(run, async move { Ok(old.again(&planner).await?) }).await?;
-                if new.schema() != planned.prepared.schema() {
-                    return Err(RequestFault::unsupported("a prepared statement whose columns have changed since"));
-                }
-                Arc::new(new)
-            }
-        };
+        let (planner, known) = (session.clone(), planned.clone());
+        let prepared = self.planned(run, async move { Ok(known.current(&planner).await?) }).await?;
+        if prepared.schema() != planned.prepared.schema() {
+            return Err(RequestFault::unsupported("a prepared statement whose columns have changed since"));
+        }
         let job = QueryJob {
             protocol: ServerProtocol::Postgres,
             session,

@@ -1,6 +1,5 @@
 //! The extended query protocol: parse, bind, describe, execute, with values and in parts.
 
-use std::borrow::Cow;
 use std::fmt::Debug;
 use std::sync::Arc;
 
@@ -8,7 +7,7 @@ use arrow::datatypes::DataType;
 use arrow_pg::datatypes::df::deserialize_parameters;
 use arrow_pg::datatypes::into_pg_type;
 use async_trait::async_trait;
-use datafusion::common::ParamValues;
+use datafusion::common::{ParamValues, ScalarValue};
 use futures::{Sink, SinkExt as _};
 use pgwire::api::portal::{Format, Portal, PortalExecutionState};
 use pgwire::api::query::{ExtendedQueryHandler, send_describe_response, send_partial_query_response};
@@ -24,7 +23,7 @@ use pgwire::messages::extendedquery::{
 };
 use pgwire::messages::response::{EmptyQueryResponse, ReadyForQuery, TransactionStatus};
 
-use super::array_texts::without_spaces;
+use super::array_texts::array_elements;
 use super::catalog::OID;
 use super::command::{StatementReply, act, columns};
 use super::connection::{NamedObject, PostgresConnection};
@@ -53,12 +52,12 @@ pub(super) struct StatementPlanner(Arc<PostgresConnection>);
 impl QueryParser for StatementPlanner {
     type Statement = ClientStatement;
 
-    async fn parse_sql<C>(&self, _: &C, sql: &str, types: &[Option<Type>]) -> PgWireResult<Option<ClientStatement>>
+    async fn parse_sql<C>(&self, _: &C, sql: &str, _: &[Option<Type>]) -> PgWireResult<Option<ClientStatement>>
     where
         C: ClientInfo + Unpin + Send + Sync,
     {
         let run = self.0.command();
-        let mut statements = self.0.statements(sql, types, &run).await.map_err(|fault| error(&fault))?;
+        let mut statements = self.0.statements(sql, &run).await.map_err(|fault| error(&fault))?;
         match statements.len() {
             0 | 1 => Ok(statements.pop()),
             _ => Err(error(&RequestFault::request("cannot insert multiple commands into a prepared statement"))),
@@ -90,26 +89,28 @@ fn kinds(statement: &ClientStatement) -> Result<Vec<Option<DataType>>, RequestFa
     }
 }
 
-// Lists that are sent as texts.
-fn tidy_lists(message: &mut Bind, statement: &StoredStatement<ClientStatement>) {
-    let kinds = kinds(&statement.statement).unwrap_or_default();
-    for (i, value) in message.parameters.iter_mut().enumerate() {
-        let is_text = match message.parameter_format_codes.as_slice() {
-            [] => true,
-            [all] => *all == 0,
-            codes => codes.get(i) == Some(&0),
-        };
-        let is_list = match statement.parameter_types.get(i).and_then(Option::as_ref) {
-            // Postgres writes a type of arrays so.
-            Some(told) if *told != Type::UNKNOWN => told.name().starts_with('_'),
-            _ => matches!(kinds.get(i), Some(Some(DataType::List(_)))),
-        };
-        if let (true, true, Some(text)) = (is_text, is_list, value.as_deref().and_then(|v| str::from_utf8(v).ok()))
-            && let Cow::Owned(dense) = without_spaces(text)
-        {
-            *value = Some(dense.into());
+// The value of a placeholder for a list that is sent as a text. The library takes `""` and `"NULL"` in it for NULL.
+fn list_value(portal: &Portal<ClientStatement>, at: usize, kind: Option<&DataType>) -> Result<Option<ScalarValue>, RequestFault> {
+    let told = portal.statement.parameter_types.get(at).and_then(Option::as_ref);
+    let is_text = matches!(told, Some(told) if matches!(*told, Type::TEXT | Type::VARCHAR));
+    let list = match (kind, told) {
+        (Some(list @ DataType::List(_)), _) => list.clone(),
+        (None, Some(told)) if matches!(*told, Type::TEXT_ARRAY | Type::VARCHAR_ARRAY) => {
+            DataType::new_list(DataType::Utf8, true)
         }
+        _ => return Ok(None),
+    };
+    let Some(Some(bytes)) = portal.parameters.get(at) else { return Ok(None) };
+    // Bytes of a text are the same in both formats.
+    if portal.parameter_format.is_binary(at) && !is_text {
+        return Ok(None);
     }
+    let refused = || RequestFault::request(format!("the value of ${} is no array of one dimension", at + 1));
+    let elements = str::from_utf8(bytes).ok().and_then(array_elements).ok_or_else(refused)?;
+    let elements: Vec<_> = elements.into_iter().map(ScalarValue::Utf8).collect();
+    let texts = ScalarValue::List(ScalarValue::new_list_nullable(&elements, &DataType::Utf8));
+    let value = texts.cast_to(&list).map_err(|e| RequestFault::request(format!("the value of ${}: {e}", at + 1)))?;
+    Ok(Some(value))
 }
 
 fn values(portal: &Portal<ClientStatement>) -> Result<ParamValues, RequestFault> {
@@ -127,13 +128,27 @@ fn values(portal: &Portal<ClientStatement>) -> Result<ParamValues, RequestFault>
     let told = |i: usize| {
         portal.statement.parameter_types.get(i).is_some_and(|t| t.as_ref().is_some_and(|t| *t != Type::UNKNOWN))
     };
+    let lists = kinds.iter().enumerate().map(|(i, kind)| list_value(portal, i, kind.as_ref()));
+    let lists = lists.collect::<Result<Vec<_>, _>>()?;
     let settled = |(i, kind): (usize, Option<DataType>)| kind.or_else(|| (!told(i)).then_some(DataType::Utf8));
     let kinds: Vec<_> = kinds.into_iter().enumerate().map(settled).collect();
     let hints: Vec<_> = kinds.iter().map(Option::as_ref).collect();
-    deserialize_parameters(portal, &hints).map_err(|e| match e {
+    // The library reads the others.
+    let mut others = Portal::new_cursor(portal.name.clone(), portal.statement.clone());
+    others.parameter_format = portal.parameter_format.clone();
+    let unread = portal.parameters.iter().zip(&lists);
+    others.parameters = unread.map(|(value, list)| value.clone().filter(|_| list.is_none())).collect();
+    let values = deserialize_parameters(&others, &hints).map_err(|e| match e {
         PgWireError::UserError(info) => RequestFault::request(info.message.clone()),
         other => RequestFault::request(other.to_string()),
-    })
+    })?;
+    let ParamValues::List(mut values) = values else { return Ok(values) };
+    for (value, list) in values.iter_mut().zip(lists) {
+        if let Some(list) = list {
+            value.value = list;
+        }
+    }
+    Ok(ParamValues::List(values))
 }
 
 #[async_trait]
@@ -164,7 +179,7 @@ impl ExtendedQueryHandler for ExtendedQueries {
     }
 
     // As the library's own, but that portals are counted.
-    async fn on_bind<C>(&self, client: &mut C, mut message: Bind) -> PgWireResult<()>
+    async fn on_bind<C>(&self, client: &mut C, message: Bind) -> PgWireResult<()>
     where
         C: ClientInfo + ClientPortalStore + Sink<PgWireBackendMessage> + Unpin + Send + Sync,
         C::PortalStore: PortalStore<Statement = ClientStatement>,
@@ -176,7 +191,6 @@ impl ExtendedQueryHandler for ExtendedQueries {
         self.connection.remember(NamedObject::Portal, &portal).map_err(|fault| error(&fault))?;
         match client.portal_store().get_statement(&name) {
             Some(Entry::Value(statement)) => {
-                tidy_lists(&mut message, &statement);
                 client.portal_store().put_portal(Arc::new(Portal::try_new(&message, statement)?));
             }
             Some(Entry::Empty) => client.portal_store().put_empty_portal(&portal),

@@ -1,17 +1,27 @@
-//! Adaptations of clients' catalogue queries beyond those of `datafusion-pg-catalog`.
+//! Statements of Postgres' clients as DataFusion plans them.
+//!
+//! A statement that reads the lake reaches DataFusion as it was written; only what Postgres has that changes no value is
+//! added: names and types of its columns, and the syntax of arrays in texts. A statement all of whose tables are of
+//! `pg_catalog` or `information_schema`, or without any relation, is a client's question about the server: what DataFusion
+//! lacks for it is put in other words.
 
 use std::ops::ControlFlow;
 
 use datafusion::sql::sqlparser::ast::{
-    AccessExpr, BinaryOperator, Expr, Function, FunctionArg, FunctionArgExpr, FunctionArgumentList, FunctionArguments,
-    GroupByExpr, Ident, ObjectName, ObjectNamePart, Query, Select, SelectItem, SetExpr, Statement, TableAlias,
-    TableAliasColumnDef, TableFactor, UnaryOperator, Value, ValueWithSpan, VisitorMut,
+    AccessExpr, Array, BinaryOperator, DataType as SqlType, Expr, Function, FunctionArg, FunctionArgExpr,
+    FunctionArgumentClause, FunctionArgumentList, FunctionArguments, GroupByExpr, Ident, LimitClause, ObjectName,
+    ObjectNamePart, OrderByExpr, OrderByKind, Query, Select, SelectItem, SetExpr, Statement, TableAlias,
+    TableAliasColumnDef, TableFactor, Value, ValueWithSpan, VisitorMut,
 };
 use datafusion::sql::sqlparser::dialect::PostgreSqlDialect;
 use datafusion::sql::sqlparser::parser::Parser;
+use datafusion_pg_catalog::sql::rules::{
+    AliasDuplicatedProjectionRewrite, CurrentUserVariableToSessionUserFunctionCall, ResolveUnqualifiedIdentifier,
+    RewritePgCatalogOperator, SqlStatementRewriteRule, StripCallableQualifier, StripCollate,
+};
 use echolake_query::{walk_expr, walk_statement};
-use pgwire::api::Type;
 
+use super::array_texts::array_elements;
 use super::column_names::{name_columns, order_by_columns};
 
 /// Columns of `pg_type` that name a function by its number.
@@ -32,39 +42,22 @@ const FUNCTIONS_OF_NOTHING: [(&str, &str); 2] = [
     ),
     ("pg_options_to_table", "CAST('' AS TEXT) AS option_name, CAST('' AS TEXT) AS option_value"),
 ];
-/// Columns of lists that clients compare with texts.
+/// Columns of lists that clients compare with texts, and those of them whose tables have no rows.
 const LISTS: [&str; 4] = ["confkey", "conkey", "indkey", "polroles"];
-/// What `datafusion-pg-catalog` makes of a name that is cast to a number, before and after the name, and the function
-/// that does the same without a subquery, and for more names.
-const CASTS: [(&str, &str, &str); 4] = [
-    (
-        "SELECT c.oid FROM pg_catalog.pg_class c JOIN pg_catalog.pg_namespace n ON c.relnamespace = n.oid CROSS JOIN \
-         (SELECT parse_ident(",
-        "::TEXT) AS parts)",
-        "to_regclass",
-    ),
-    ("SELECT oid FROM pg_catalog.pg_namespace WHERE nspname = ", "", "to_regnamespace"),
-    ("SELECT oid FROM pg_catalog.pg_type WHERE typname = ", "", "to_regtype"),
-    ("SELECT oid FROM pg_catalog.pg_proc WHERE proname = ", "", "to_regproc"),
-];
-
-/// Tables of `pg_catalog` that are found without its name, beside those that `datafusion-pg-catalog` knows.
-const OWN_TABLES: [&str; 13] = [
-    "pg_group",
-    "pg_indexes",
-    "pg_locks",
-    "pg_policies",
-    "pg_sequences",
-    "pg_shadow",
-    "pg_stat_activity",
-    "pg_stat_ssl",
-    "pg_timezone_names",
-    "pg_ts_config_map",
-    "pg_user",
-    "pg_user_mappings",
-    "pg_views",
+const LISTS_OF_NOTHING: [&str; 3] = ["confkey", "conkey", "polroles"];
+/// The beginning of the names of functions that read the lake's files.
+const LAKE_FUNCTIONS: &str = "mcap";
+/// Rules of the library for names, operators and qualifiers; its others change what a statement answers.
+const RULES: [&dyn SqlStatementRewriteRule; 6] = [
+    &AliasDuplicatedProjectionRewrite,
+    &ResolveUnqualifiedIdentifier,
+    &StripCallableQualifier,
+    &CurrentUserVariableToSessionUserFunctionCall,
+    &StripCollate,
+    &RewritePgCatalogOperator,
 ];
 const PG_CATALOG: &str = "pg_catalog";
+const INFORMATION_SCHEMA: &str = "information_schema";
 
 /// The name by which asyncpg's query for types is known, and a query with the same answer for types that are no domains,
 /// ranges or rows: DataFusion does not end its recursion.
@@ -78,19 +71,174 @@ const TYPES: &str = "SELECT t.oid, n.nspname AS ns, t.typname AS name, t.typtype
      LEFT JOIN pg_catalog.pg_type e ON e.oid = t.typelem WHERE array_contains($1::oid[], t.oid) \
      OR t.oid IN (SELECT o.typelem FROM pg_catalog.pg_type o WHERE array_contains($1::oid[], o.oid)) ORDER BY depth DESC";
 
-/// Adapts a statement; `types` are those that its client gives its placeholders.
-pub(super) fn rewrite(mut statement: Statement, types: &[Option<Type>]) -> Statement {
-    if let Statement::Query(query) = &statement
-        && let Some(with) = &query.with
-        && with.cte_tables.first().is_some_and(|table| table.alias.name.value == TYPE_TREE)
+/// Adapts a statement.
+pub(super) fn rewrite(mut statement: Statement) -> Statement {
+    // Here and below, walks never break off.
+    let _ = walk_statement(&mut statement, &mut ColumnAdapter);
+    let Some(names) = catalogue_names(&mut statement) else { return statement };
+    if names.first().is_some_and(|name| name == TYPE_TREE)
         && let Some(known) = Parser::parse_sql(&PostgreSqlDialect {}, TYPES).ok().and_then(|mut all| all.pop())
     {
         return known;
     }
-    // It never breaks off.
-    let _ = walk_statement(&mut statement, &mut StatementAdapter(types));
+    // Before qualifiers are gone.
+    let _ = walk_statement(&mut statement, &mut NumberAdapter);
+    statement = RULES.iter().fold(statement, |statement, rule| rule.rewrite(statement));
+    let _ = walk_statement(&mut statement, &mut CatalogueAdapter { names });
     type_integers(&mut statement);
     statement
+}
+
+/// Returns the names of the common tables of a statement about the server; None for one that reads anything else.
+pub(super) fn catalogue_names(statement: &mut Statement) -> Option<Vec<String>> {
+    let mut found = StatementRelations::default();
+    let _ = walk_statement(statement, &mut found);
+    let is_of_catalogue = !found.reads_other && (found.reads_catalogue || !found.has_relation);
+    is_of_catalogue.then_some(found.names)
+}
+
+/// The relations of a statement.
+#[derive(Default)]
+struct StatementRelations {
+    /// Names of common tables, WITH.
+    names: Vec<String>,
+    reads_catalogue: bool,
+    reads_other: bool,
+    has_relation: bool,
+}
+
+impl VisitorMut for StatementRelations {
+    type Break = ();
+
+    fn pre_visit_query(&mut self, query: &mut Query) -> ControlFlow<()> {
+        let tables = query.with.iter().flat_map(|with| &with.cte_tables);
+        self.names.extend(tables.map(|table| table.alias.name.value.clone()));
+        self.reads_other |= matches!(query.body.as_ref(), SetExpr::Table(_));
+        ControlFlow::Continue(())
+    }
+
+    fn pre_visit_table_factor(&mut self, factor: &mut TableFactor) -> ControlFlow<()> {
+        self.has_relation = true;
+        match factor {
+            TableFactor::Table { name, args: Some(_), .. } => {
+                self.reads_other |= last_name(name).is_some_and(|name| name.starts_with(LAKE_FUNCTIONS));
+            }
+            TableFactor::Table { name, .. } => match &name.0[..] {
+                [ObjectNamePart::Identifier(name)] if self.names.contains(&name.value) => {}
+                _ if is_of_catalogue(name) => self.reads_catalogue = true,
+                _ => self.reads_other = true,
+            },
+            _ => {}
+        }
+        ControlFlow::Continue(())
+    }
+}
+
+// Without a schema those of `pg_catalog` are found by the beginning of their names, which no table of the lake has.
+fn is_of_catalogue(name: &ObjectName) -> bool {
+    let parts: Vec<_> = name.0.iter().filter_map(|part| part.as_ident()).map(|i| i.value.to_lowercase()).collect();
+    match &parts[..] {
+        [table] => table.starts_with("pg_"),
+        [.., schema, _] => schema == PG_CATALOG || schema == INFORMATION_SCHEMA,
+        [] => false,
+    }
+}
+
+fn last_name(name: &ObjectName) -> Option<String> {
+    Some(name.0.last()?.as_ident()?.value.to_lowercase())
+}
+
+/// Gives columns Postgres' names and types, and arrays their syntax.
+struct ColumnAdapter;
+
+impl VisitorMut for ColumnAdapter {
+    type Break = ();
+
+    fn pre_visit_query(&mut self, query: &mut Query) -> ControlFlow<()> {
+        if let SetExpr::Select(select) = query.body.as_mut() {
+            name_columns(select);
+        }
+        order_by_columns(query);
+        ControlFlow::Continue(())
+    }
+
+    fn pre_visit_select(&mut self, select: &mut Select) -> ControlFlow<()> {
+        name_columns(select);
+        ControlFlow::Continue(())
+    }
+
+    fn pre_visit_expr(&mut self, expr: &mut Expr) -> ControlFlow<()> {
+        if let Expr::Cast { expr: text, data_type: SqlType::Array(_), .. } = expr {
+            read_array(text);
+        }
+        ControlFlow::Continue(())
+    }
+
+    // The call stays within what replaces it.
+    fn post_visit_expr(&mut self, expr: &mut Expr) -> ControlFlow<()> {
+        if let Some(signed) = signed_rank(expr) {
+            *expr = signed;
+        }
+        ControlFlow::Continue(())
+    }
+}
+
+// '{a,"b c"}' as an array of texts.
+fn read_array(expr: &mut Expr) {
+    let Expr::Value(ValueWithSpan { value: Value::SingleQuotedString(text), .. }) = expr else { return };
+    let Some(elements) = array_elements(text) else { return };
+    let value = |element: Option<String>| Expr::value(element.map_or(Value::Null, Value::SingleQuotedString));
+    *expr = Expr::Array(Array { elem: elements.into_iter().map(value).collect(), named: true });
+}
+
+// Numbers of rows and ranks are unsigned in DataFusion, which no integer of Postgres is.
+fn signed_rank(expr: &Expr) -> Option<Expr> {
+    let Expr::Function(function) = expr else { return None };
+    let is_rank = RANKS.contains(&function.name.to_string().to_lowercase().as_str());
+    (is_rank && function.over.is_some()).then(|| parsed(&format!("CAST({function} AS BIGINT)"))).flatten()
+}
+
+/// Finds the numbers of names: 'name'::regclass and its like.
+struct NumberAdapter;
+
+impl VisitorMut for NumberAdapter {
+    type Break = ();
+
+    fn pre_visit_expr(&mut self, expr: &mut Expr) -> ControlFlow<()> {
+        if let Some(number) = number_of_text(expr) {
+            *expr = number;
+        }
+        ControlFlow::Continue(())
+    }
+}
+
+// Of a text, or of a placeholder for one.
+fn number_of_text(expr: &Expr) -> Option<Expr> {
+    let Expr::Cast { expr: inner, data_type, .. } = expr else { return None };
+    let kind = data_type.to_string().to_lowercase();
+    let function = match kind.strip_prefix("pg_catalog.").unwrap_or(&kind) {
+        "regclass" => "to_regclass",
+        "regnamespace" => "to_regnamespace",
+        "regtype" => "to_regtype",
+        "regproc" | "regprocedure" => "to_regproc",
+        _ => return None,
+    };
+    is_text(inner).then(|| parsed(&format!("{function}({inner})"))).flatten()
+}
+
+fn is_text(expr: &Expr) -> bool {
+    match expr {
+        Expr::Value(ValueWithSpan { value, .. }) => {
+            matches!(value, Value::SingleQuotedString(_) | Value::Placeholder(_))
+        }
+        Expr::Function(function) => {
+            last_name(&function.name).is_some_and(|name| ["format", "quote_ident", "concat"].contains(&name.as_str()))
+        }
+        Expr::BinaryOp { op: BinaryOperator::StringConcat, .. } => true,
+        Expr::Cast { expr, data_type: SqlType::Text, .. } => is_text(expr),
+        Expr::Nested(inner) => is_text(inner),
+        _ => false,
+    }
 }
 
 // An integer alone is of 32 bits in Postgres.
@@ -121,88 +269,37 @@ fn type_of_integer(expr: &mut Expr) {
     }
 }
 
-struct StatementAdapter<'a>(&'a [Option<Type>]);
-
-impl StatementAdapter<'_> {
-    // `x = ANY($1)` came here as array_contains($1, x). If a client tells that it is a text, it sends
-    // the array as one.
-    fn any_of_text(&self, expr: &mut Expr) -> Option<()> {
-        let Expr::Function(Function { name, args: FunctionArguments::List(args), .. }) = expr else { return None };
-        if name.to_string() != "array_contains" {
-            return None;
-        }
-        let FunctionArg::Unnamed(FunctionArgExpr::Expr(array)) = args.args.first_mut()? else { return None };
-        let Expr::Value(ValueWithSpan { value: Value::Placeholder(placeholder), .. }) = array else { return None };
-        let number: usize = placeholder.strip_prefix('$')?.parse().ok()?;
-        let told = self.0.get(number.checked_sub(1)?).and_then(Option::as_ref);
-        if told.is_some_and(|told| matches!(*told, Type::TEXT | Type::VARCHAR)) {
-            let unquoted = format!("replace(replace(btrim({placeholder}, '{{}}'), '\"', ''), ', ', ',')");
-            let sql = format!("string_to_array({unquoted}, ',')");
-            *array = parsed(&sql)?;
-        }
-        Some(())
-    }
+/// Puts in other words what DataFusion lacks.
+struct CatalogueAdapter {
+    /// Names of common tables, WITH.
+    names: Vec<String>,
 }
 
-impl VisitorMut for StatementAdapter<'_> {
+impl VisitorMut for CatalogueAdapter {
     type Break = ();
 
-    fn pre_visit_relation(&mut self, relation: &mut ObjectName) -> ControlFlow<()> {
-        if let [ObjectNamePart::Identifier(name)] = &relation.0[..]
-            && OWN_TABLES.contains(&name.value.as_str())
-        {
-            *relation = ObjectName::from(vec![Ident::new(PG_CATALOG), name.clone()]);
-        }
-        ControlFlow::Continue(())
-    }
-
     fn pre_visit_expr(&mut self, expr: &mut Expr) -> ControlFlow<()> {
-        if is_whole_table(expr) {
-            *expr = Expr::value(Value::Boolean(true));
-        }
-        if let Some(better) = array_of_query(expr)
-            .or_else(|| subscripts(expr))
-            .or_else(|| split_text(expr))
-            .or_else(|| expanded(expr))
-            .or_else(|| number_of_name(expr))
-            .or_else(|| case_of_truth(expr))
-            .or_else(|| time_of_text(expr))
-            .or_else(|| name_of_function(expr))
-            .or_else(|| number_of_text(expr))
-            .or_else(|| field_of_row(expr))
-            .or_else(|| compared_with_text(expr))
-        {
-            *expr = better;
+        if let Expr::AnyOp { right, .. } | Expr::AllOp { right, .. } = expr {
+            read_array(right);
         }
         if let Expr::Subquery(query) = expr
             && asks_for_nothing(query)
         {
             *expr = Expr::value(Value::Null);
         }
-        if let Expr::Subquery(query) = expr {
-            one_row(query);
+        if let Some(better) = array_of_query(expr)
+            .or_else(|| subscripts(expr))
+            .or_else(|| split_text(expr))
+            .or_else(|| expanded(expr))
+            .or_else(|| name_of_function(expr))
+            .or_else(|| field_of_row(expr))
+            .or_else(|| compared_with_text(expr))
+            .or_else(|| single_value(expr))
+        {
+            *expr = better;
         }
-        self.any_of_text(expr);
-        not_a_value(expr);
         escape_by_backslash(expr);
         type_of_integer(expr);
-        ControlFlow::Continue(())
-    }
-
-    // The call stays within what replaces it.
-    fn post_visit_expr(&mut self, expr: &mut Expr) -> ControlFlow<()> {
-        if let Some(signed) = signed_rank(expr) {
-            *expr = signed;
-        }
-        ControlFlow::Continue(())
-    }
-
-    // Names are those of the statement before it is adapted.
-    fn pre_visit_query(&mut self, query: &mut Query) -> ControlFlow<()> {
-        if let SetExpr::Select(select) = query.body.as_mut() {
-            name_columns(select);
-        }
-        order_by_columns(query);
         ControlFlow::Continue(())
     }
 
@@ -211,15 +308,19 @@ impl VisitorMut for StatementAdapter<'_> {
         if let Some(none) = table_without_rows(factor).or_else(|| keys_of_nothing(factor)) {
             *factor = none;
         }
+        if let TableFactor::Table { name, args: None, .. } = factor
+            && let [ObjectNamePart::Identifier(own)] = &name.0[..]
+            && !self.names.contains(&own.value)
+        {
+            *name = ObjectName::from(vec![Ident::new(PG_CATALOG), own.clone()]);
+        }
         ControlFlow::Continue(())
     }
 
     fn pre_visit_select(&mut self, select: &mut Select) -> ControlFlow<()> {
-        name_columns(select);
         series_rows(&mut select.projection);
         for item in &mut select.projection {
             if let SelectItem::UnnamedExpr(expr) | SelectItem::ExprWithAlias { expr, .. } = item {
-                // It never breaks off.
                 let _ = walk_expr(expr, &mut ExistsAdapter { depth: 0 });
             }
         }
@@ -295,46 +396,6 @@ fn expanded(expr: &Expr) -> Option<Expr> {
     })
 }
 
-// 'name'::regclass and its like.
-fn number_of_name(expr: &Expr) -> Option<Expr> {
-    let Expr::Subquery(query) = expr else { return None };
-    let text = query.to_string();
-    let text = text.strip_suffix(" LIMIT 1").unwrap_or(&text);
-    CASTS.iter().find_map(|(before, after, function)| {
-        let rest = text.strip_prefix(before)?;
-        let name = match after.is_empty() {
-            true => rest,
-            false => rest.split_once(after)?.0,
-        };
-        let is_value = name.starts_with(['\'', '$']);
-        is_value.then(|| parsed(&format!("{function}({name})"))).flatten()
-    })
-}
-
-// A text that is computed, or the name of a function with its arguments, as the number of what it names.
-fn number_of_text(expr: &Expr) -> Option<Expr> {
-    let Expr::Cast { expr: inner, data_type, .. } = expr else { return None };
-    let kind = data_type.to_string().to_lowercase();
-    let is_literal = matches!(inner.as_ref(), Expr::Value(ValueWithSpan { value: Value::SingleQuotedString(_), .. }));
-    let function = match kind.strip_prefix("pg_catalog.").unwrap_or(&kind) {
-        "regprocedure" if is_literal => "to_regproc",
-        "regclass" if is_text(inner) => "to_regclass",
-        _ => return None,
-    };
-    parsed(&format!("{function}({inner})"))
-}
-
-fn is_text(expr: &Expr) -> bool {
-    match expr {
-        Expr::Function(function) => {
-            ["format", "quote_ident", "concat"].contains(&function.name.to_string().to_lowercase().as_str())
-        }
-        Expr::BinaryOp { op: BinaryOperator::StringConcat, .. } => true,
-        Expr::Nested(inner) => is_text(inner),
-        _ => false,
-    }
-}
-
 // (row).field
 fn field_of_row(expr: &Expr) -> Option<Expr> {
     let Expr::CompoundFieldAccess { root, access_chain } = expr else { return None };
@@ -378,89 +439,85 @@ fn name_of_function(expr: &Expr) -> Option<Expr> {
     (is_text && names_function).then(|| parsed(&format!("function_name({inner})"))).flatten()
 }
 
-// Numbers of rows and ranks are unsigned in DataFusion, which no integer of Postgres is.
-fn signed_rank(expr: &Expr) -> Option<Expr> {
-    let Expr::Function(function) = expr else { return None };
-    let is_rank = RANKS.contains(&function.name.to_string().to_lowercase().as_str());
-    (is_rank && function.over.is_some()).then(|| parsed(&format!("CAST({function} AS BIGINT)"))).flatten()
-}
-
-// to_timestamp(text, 'YYYY-MM-DD'), whose letters are others in DataFusion.
-fn time_of_text(expr: &Expr) -> Option<Expr> {
-    let Expr::Function(Function { name, args: FunctionArguments::List(args), .. }) = expr else { return None };
-    let [text, FunctionArg::Unnamed(FunctionArgExpr::Expr(Expr::Value(format)))] = &args.args[..] else { return None };
-    let Value::SingleQuotedString(format) = &format.value else { return None };
-    if !name.to_string().eq_ignore_ascii_case("to_timestamp") || format.contains('%') {
-        return None;
-    }
-    let letters = [
-        (".US", "%.f"),
-        (".MS", "%.f"),
-        ("YYYY", "%Y"),
-        ("MM", "%m"),
-        ("DD", "%d"),
-        ("HH24", "%H"),
-        ("MI", "%M"),
-        ("SS", "%S"),
-    ];
-    let format = letters.iter().fold(format.clone(), |format, (from, to)| format.replace(from, to));
-    parsed(&format!("to_timestamp({text}, '{}')", format.replace('\'', "''")))
-}
-
-// CASE of a truth, WHEN 't'.
-fn case_of_truth(expr: &Expr) -> Option<Expr> {
-    let Expr::Case { operand: Some(operand), conditions, .. } = expr else { return None };
-    let is_letter = |expr: &Expr| {
-        matches!(expr, Expr::Value(ValueWithSpan { value: Value::SingleQuotedString(text), .. })
-            if text == "t" || text == "f")
-    };
-    let is_column = matches!(operand.as_ref(), Expr::Identifier(_) | Expr::CompoundIdentifier(_));
-    if !is_column || !conditions.iter().all(|when| is_letter(&when.condition)) {
-        return None;
-    }
-    let letter = parsed(&format!("replace(replace(CAST({operand} AS TEXT), 'true', 't'), 'false', 'f')"))?;
-    let mut adapted = expr.clone();
-    if let Expr::Case { operand, .. } = &mut adapted {
-        *operand = Some(Box::new(letter));
-    }
-    Some(adapted)
-}
-
-// DuckDB reads a table by ranges of `ctid`; if `pg_class` reports one page, there is one range, of all rows.
-fn is_whole_table(expr: &Expr) -> bool {
-    let is_place = |expr: &Expr, place: &str| {
-        matches!(expr, Expr::Cast { expr, data_type, .. }
-        if data_type.to_string().eq_ignore_ascii_case("tid") && expr.to_string() == place)
-    };
-    matches!(expr, Expr::Between { expr, negated: false, low, high }
-        if expr.to_string() == "ctid" && is_place(low, "'(0,0)'") && is_place(high, "'(4294967295,0)'"))
-}
-
-// ARRAY(SELECT x ...) is (SELECT array_agg(x) ...), but for the order.
+// The rows of a query as an array: ARRAY(SELECT x ... ORDER BY y) is array_agg(x ORDER BY y), but for no rows.
 fn array_of_query(expr: &Expr) -> Option<Expr> {
     let Expr::Function(function) = expr else { return None };
     let FunctionArguments::Subquery(query) = &function.args else { return None };
     if !function.name.to_string().eq_ignore_ascii_case("array") {
         return None;
     }
-    let SetExpr::Select(select) = query.body.as_ref() else { return None };
-    let [SelectItem::UnnamedExpr(item) | SelectItem::ExprWithAlias { expr: item, .. }] = &select.projection[..] else {
-        return None;
-    };
-    // What it unnests is a column of the query around it, which DataFusion cannot do; in what clients ask, such columns
-    // hold nothing here.
-    let unnests = |factor: &TableFactor| match factor {
-        TableFactor::UNNEST { .. } => true,
-        TableFactor::Table { name, args: Some(_), .. } => name.to_string().eq_ignore_ascii_case("unnest"),
-        _ => false,
-    };
-    if select.from.iter().any(|from| unnests(&from.relation)) || asks_for_nothing(query) {
-        return parsed("CAST(NULL AS TEXT[])");
+    let (select, _) = selected_value(query)?;
+    // What it unnests is a column of the query around it, which DataFusion cannot do.
+    let is_of_nothing = select.from.iter().any(|from| keys_of_nothing(&from.relation).is_some());
+    if is_of_nothing || asks_for_nothing(query) {
+        return parsed("CAST(ARRAY[] AS TEXT[])");
     }
+    if query.limit_clause.is_some() || query.fetch.is_some() {
+        return None;
+    }
+    let list = Expr::Subquery(Box::new(aggregated(query, "array_agg")?));
+    parsed(&format!("coalesce({list}, ARRAY[])"))
+}
+
+// DataFusion wants to be sure that a scalar subquery with a column of the query around it has one row.
+fn single_value(expr: &Expr) -> Option<Expr> {
+    let Expr::Subquery(query) = expr else { return None };
+    let (select, value) = selected_value(query)?;
+    let is_table = |factor: &TableFactor| matches!(factor, TableFactor::Table { args: None, .. });
+    let known = select.from.iter().all(|f| is_table(&f.relation) && f.joins.iter().all(|j| is_table(&j.relation)));
+    if select.from.is_empty() || !known || matches!(value, Expr::Function(function) if is_aggregate(function)) {
+        return None;
+    }
+    match &query.limit_clause {
+        None => parsed(&format!("single_value({})", Expr::Subquery(Box::new(aggregated(query, "array_agg")?)))),
+        Some(LimitClause::LimitOffset { limit: Some(limit), offset: None, limit_by })
+            if limit_by.is_empty() && limit.to_string() == "1" =>
+        {
+            Some(Expr::Subquery(Box::new(aggregated(query, "first_value")?)))
+        }
+        Some(_) => None,
+    }
+}
+
+// The selection of a query and the one value that each of its rows has.
+fn selected_value(query: &Query) -> Option<(&Select, &Expr)> {
+    let SetExpr::Select(select) = query.body.as_ref() else { return None };
+    let is_grouped = !matches!(&select.group_by, GroupByExpr::Expressions(by, _) if by.is_empty());
+    if is_grouped || select.distinct.is_some() || select.having.is_some() || query.fetch.is_some() {
+        return None;
+    }
+    match &select.projection[..] {
+        [SelectItem::UnnamedExpr(value) | SelectItem::ExprWithAlias { expr: value, .. }] => Some((select, value)),
+        _ => None,
+    }
+}
+
+// The query whose one row is an aggregate of its values, in its order.
+fn aggregated(query: &Query, aggregate: &str) -> Option<Query> {
+    let (select, value) = selected_value(query)?;
     let mut select = select.clone();
-    select.projection = vec![SelectItem::UnnamedExpr(call("array_agg", item.clone(), function))];
-    let body = Box::new(SetExpr::Select(select));
-    Some(Expr::Subquery(Box::new(Query { body, order_by: None, ..query.as_ref().clone() })))
+    let is_value = |order: &Expr| {
+        let is_name = matches!(&select.projection[0], SelectItem::ExprWithAlias { alias, .. }
+            if matches!(order, Expr::Identifier(name) if name.value == alias.value));
+        is_name || order.to_string() == "1"
+    };
+    let orders = match query.order_by.as_ref().map(|order| &order.kind) {
+        None => Vec::new(),
+        Some(OrderByKind::Expressions(orders)) => orders.clone(),
+        Some(OrderByKind::All(_)) => return None,
+    };
+    let by_value = |order: OrderByExpr| match is_value(&order.expr) {
+        true => OrderByExpr { expr: value.clone(), ..order },
+        false => order,
+    };
+    let orders: Vec<_> = orders.into_iter().map(by_value).collect();
+    let Expr::Function(mut call) = parsed(&format!("{aggregate}({value})"))? else { return None };
+    if let (FunctionArguments::List(arguments), false) = (&mut call.args, orders.is_empty()) {
+        arguments.clauses.push(FunctionArgumentClause::OrderBy(orders));
+    }
+    select.projection = vec![SelectItem::UnnamedExpr(Expr::Function(call))];
+    let body = Box::new(SetExpr::Select(Box::new(select)));
+    Some(Query { body, order_by: None, limit_clause: None, ..query.clone() })
 }
 
 // generate_subscripts(list, dimension): a row for each place of a list.
@@ -490,20 +547,6 @@ fn split_text(expr: &Expr) -> Option<Expr> {
     asked.then(|| parsed(&format!("unnest({parts})"))).flatten()
 }
 
-// NOT $1, whose value is a truth.
-fn not_a_value(expr: &mut Expr) {
-    let Expr::UnaryOp { op: UnaryOperator::Not, expr: inner } = expr else { return };
-    let value = match inner.as_ref() {
-        Expr::Nested(value) => value.as_ref(),
-        value => value,
-    };
-    if matches!(value, Expr::Value(ValueWithSpan { value: Value::Placeholder(_), .. }))
-        && let Some(truth) = parsed(&format!("CAST({value} AS BOOLEAN)"))
-    {
-        **inner = truth;
-    }
-}
-
 // The one column of a list's elements has the name of their table.
 fn name_elements(factor: &mut TableFactor) {
     if let TableFactor::UNNEST { alias: Some(alias), array_exprs, .. } = factor
@@ -521,7 +564,7 @@ fn keys_of_nothing(factor: &TableFactor) -> Option<TableFactor> {
         [Expr::CompoundIdentifier(parts)] => parts.last()?,
         _ => return None,
     };
-    LISTS.contains(&name.value.as_str()).then(|| without_rows("CAST(0 AS SMALLINT)", alias.as_ref())).flatten()
+    LISTS_OF_NOTHING.contains(&name.value.as_str()).then(|| without_rows("CAST(0 AS SMALLINT)", alias.as_ref())).flatten()
 }
 
 fn without_rows(columns: &str, alias: Option<&TableAlias>) -> Option<TableFactor> {
@@ -565,41 +608,6 @@ fn asks_for_nothing(query: &Query) -> bool {
 fn is_aggregate(function: &Function) -> bool {
     let name = function.name.to_string();
     AGGREGATES.iter().any(|a| name.eq_ignore_ascii_case(a))
-}
-
-// DataFusion wants to be sure that a scalar subquery has one row. Those that clients ask of the catalogue look one up
-// by its key: its greatest is the same.
-fn one_row(query: &mut Query) {
-    let SetExpr::Select(select) = query.body.as_mut() else { return };
-    let of_catalog = |factor: &TableFactor| {
-        matches!(factor, TableFactor::Table { name, args: None, .. }
-            if name.0.last().and_then(|n| n.as_ident()).is_some_and(|n| n.value.starts_with("pg_")))
-    };
-    let plain = select.distinct.is_none() && select.having.is_none() && !select.from.is_empty();
-    let grouped = !matches!(&select.group_by, GroupByExpr::Expressions(by, _) if by.is_empty());
-    let known = select.from.iter().all(|f| of_catalog(&f.relation) && f.joins.iter().all(|j| of_catalog(&j.relation)));
-    if !plain || grouped || !known {
-        return;
-    }
-    let [SelectItem::UnnamedExpr(item) | SelectItem::ExprWithAlias { expr: item, .. }] = &mut select.projection[..]
-    else {
-        return;
-    };
-    if matches!(item, Expr::Function(function) if is_aggregate(function)) {
-        return;
-    }
-    let plain_call = Function {
-        name: ObjectName::from(Vec::<Ident>::new()),
-        uses_odbc_syntax: false,
-        parameters: FunctionArguments::None,
-        args: FunctionArguments::None,
-        filter: None,
-        null_treatment: None,
-        over: None,
-        within_group: Vec::new(),
-    };
-    *item = call("max", item.clone(), &plain_call);
-    (query.limit_clause, query.order_by) = (None, None);
 }
 
 #[cfg(test)]

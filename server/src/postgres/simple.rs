@@ -44,7 +44,7 @@ impl SimpleQueryHandler for SimpleQueries {
         }
         client.set_state(PgWireConnectionState::QueryInProgress);
         let run = self.0.command();
-        let statements = self.0.statements(&query.query, &[], &run).await.map_err(|fault| error(&fault))?;
+        let statements = self.0.statements(&query.query, &run).await.map_err(|fault| error(&fault))?;
         if statements.is_empty() {
             client.feed(PgWireBackendMessage::EmptyQueryResponse(EmptyQueryResponse::new())).await?;
         }

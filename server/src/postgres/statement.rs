@@ -1,7 +1,6 @@
 //! Statements as Postgres' clients write them: queries are planned, what changes nothing is known, all else is refused.
 
 use std::sync::Arc;
-use std::time::Instant;
 
 use datafusion::sql::parser::Statement as Parsed;
 use datafusion::sql::sqlparser::ast::{
@@ -12,7 +11,6 @@ use datafusion::sql::sqlparser::dialect::PostgreSqlDialect;
 use datafusion::sql::sqlparser::parser::Parser;
 use datafusion_pg_catalog::sql::PostgresCompatibilityParser;
 use echolake_query::{Error as QueryError, OpaqueValue, PreparedQuery, Session, check_statement_bounds};
-use pgwire::api::Type;
 
 use super::copy::{self, CopyAs};
 use super::rewrite;
@@ -24,7 +22,6 @@ const TOGETHER: usize = 100;
 /// A planned query.
 pub(super) struct PlannedQuery {
     pub(super) prepared: Arc<PreparedQuery>,
-    pub(super) at: Instant,
     statement: OpaqueValue<Parsed>,
     sql: Arc<str>,
 }
@@ -32,12 +29,15 @@ pub(super) struct PlannedQuery {
 impl PlannedQuery {
     async fn new(session: &Session, sql: &Arc<str>, statement: Parsed) -> Result<Arc<Self>, RequestFault> {
         let prepared = Arc::new(session.prepare_statement(sql, statement.clone()).await?);
-        Ok(Arc::new(Self { prepared, at: Instant::now(), statement: OpaqueValue::new(statement), sql: sql.clone() }))
+        Ok(Arc::new(Self { prepared, statement: OpaqueValue::new(statement), sql: sql.clone() }))
     }
 
-    /// The same on today's lake.
-    pub(super) async fn again(&self, session: &Session) -> Result<PreparedQuery, QueryError> {
-        session.prepare_statement(&self.sql, Parsed::clone(&self.statement)).await
+    /// Its plan on the present lake: the first one, or another if the lake has changed since.
+    pub(super) async fn current(&self, session: &Session) -> Result<Arc<PreparedQuery>, QueryError> {
+        if session.is_current(&self.prepared).await? {
+            return Ok(self.prepared.clone());
+        }
+        Ok(Arc::new(session.prepare_statement(&self.sql, Parsed::clone(&self.statement)).await?))
     }
 }
 
@@ -72,26 +72,36 @@ pub(super) enum ClientStatement {
     Unlisten,
 }
 
-/// Parses the statements of a text, whose placeholders have these types if the client gives them.
+/// Parses the statements of a text.
 pub(super) fn parse(
     parser: &PostgresCompatibilityParser,
     session: &Session,
     sql: &str,
-    types: &[Option<Type>],
 ) -> Result<Vec<Parsed>, RequestFault> {
     check_statement_bounds(sql, &PostgreSqlDialect {})?;
-    let Ok(adapted) = parser.parse(sql) else {
-        // DataFusion's own parser knows more, such as DESCRIBE, and gives the position of an error.
-        return Ok(vec![session.parse(sql)?]);
+    let statements = match Parser::parse_sql(&PostgreSqlDialect {}, sql) {
+        Ok(mut written) => replaced_queries(parser, sql, &mut written).unwrap_or(written),
+        Err(_) => match parser.parse(sql) {
+            // ABORT, which it takes for ROLLBACK.
+            Ok(adapted) => adapted,
+            // DataFusion's own parser knows more, such as DESCRIBE, and gives the position of an error.
+            Err(_) => return Ok(vec![session.parse(sql)?]),
+        },
     };
-    if adapted.len() > TOGETHER {
+    if statements.len() > TOGETHER {
         return Err(RequestFault::TooMany { what: "statements in one text", limit: TOGETHER });
     }
-    // The adapted ones have lost their positions; if nothing but positions differs, these keep them.
-    let placed = Parser::parse_sql(&PostgreSqlDialect {}, sql).unwrap_or_default();
-    let placed: Vec<_> = placed.into_iter().map(|s| parser.rewrite(s)).collect();
-    let statements = if placed == adapted { placed } else { adapted };
-    Ok(statements.into_iter().map(|s| Parsed::Statement(Box::new(rewrite::rewrite(s, types)))).collect())
+    Ok(statements.into_iter().map(|s| Parsed::Statement(Box::new(rewrite::rewrite(s)))).collect())
+}
+
+// The statements of a text about the server, if it is one of the queries that the library replaces as a whole: what
+// comes of its text is something else than what its rules make of its statements.
+fn replaced_queries(parser: &PostgresCompatibilityParser, sql: &str, written: &mut [Sql]) -> Option<Vec<Sql>> {
+    if !written.iter_mut().all(|statement| rewrite::catalogue_names(statement).is_some()) {
+        return None;
+    }
+    let by_rules: Vec<_> = written.iter().cloned().map(|statement| parser.rewrite(statement)).collect();
+    parser.parse(sql).ok().filter(|adapted| *adapted != by_rules)
 }
 
 /// Makes of a statement what can be done.

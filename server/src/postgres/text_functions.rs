@@ -6,10 +6,11 @@ use std::hash::{Hash, Hasher};
 use std::sync::Arc;
 
 use arrow::array::{
-    Array, ArrayRef, AsArray as _, BooleanArray, Int32Array, ListArray, RecordBatch, StringArray, StructArray,
+    Array, ArrayRef, AsArray as _, BooleanArray, Int32Array, ListArray, RecordBatch, StringArray, StructArray, UInt32Array,
+    new_null_array,
 };
 use arrow::buffer::OffsetBuffer;
-use arrow::compute::cast;
+use arrow::compute::{cast, take};
 use arrow::datatypes::{DataType, Field, Fields, Int32Type, Int64Type};
 use arrow_pg::datatypes::into_pg_type;
 use datafusion::error::{DataFusionError, Result};
@@ -124,6 +125,7 @@ pub(super) fn all() -> Vec<ScalarUDF> {
             let one = |row| valid(patterns, row).zip(valid(escapes, row)).map(|(p, e)| escape_pattern(p, e));
             Ok(Arc::new((0..rows).map(one).collect::<StringArray>()))
         }),
+        AnyFunction::udf("single_value", element_type, |args, _| single_values(first(args)?)),
         AnyFunction::udf("_pg_expandarray", expanded_type, |args, _| expand_list(first(args)?)),
     ];
     let truth = |_: &[DataType]| DataType::Boolean;
@@ -213,7 +215,7 @@ fn type_name(kind: &DataType) -> String {
 // Rounds half up, and changes to a larger unit from 10240 of one.
 fn pretty_size(size: i64) -> String {
     const LIMIT: i64 = 10 * 1024;
-    if size.abs() < LIMIT {
+    if size.unsigned_abs() < LIMIT.unsigned_abs() {
         return format!("{size} bytes");
     }
     let mut halves = size / 512;
@@ -308,17 +310,32 @@ fn quote_name(name: &str) -> String {
     if is_plain { name.to_owned() } else { format!("\"{}\"", name.replace('"', "\"\"")) }
 }
 
+fn element_type(kinds: &[DataType]) -> DataType {
+    match kinds.first() {
+        Some(DataType::List(element)) => element.data_type().clone(),
+        _ => DataType::Null,
+    }
+}
+
+// The one element of each list, NULL of none: the value of a subquery whose rows these are.
+fn single_values(lists: &ArrayRef) -> Result<ArrayRef> {
+    let Some(lists) = lists.as_list_opt::<i32>() else { return Ok(new_null_array(&DataType::Null, lists.len())) };
+    let place = |row: usize| match lists.is_valid(row).then(|| lists.value_length(row)) {
+        None | Some(0) => Ok(None),
+        Some(1) => Ok(Some(lists.value_offsets()[row] as u32)),
+        Some(_) => Err(DataFusionError::Execution("more than one row of a subquery that is a value".to_owned())),
+    };
+    let places = (0..lists.len()).map(place).collect::<Result<UInt32Array>>()?;
+    Ok(take(lists.values(), &places, None)?)
+}
+
 // Of a list, the pairs of each element `x` and its place `n`.
 fn pairs_of(element: &DataType) -> Fields {
     vec![Field::new("x", element.clone(), true), Field::new("n", DataType::Int32, true)].into()
 }
 
 fn expanded_type(kinds: &[DataType]) -> DataType {
-    let element = match kinds.first() {
-        Some(DataType::List(element)) => element.data_type().clone(),
-        _ => DataType::Int32,
-    };
-    DataType::new_list(DataType::Struct(pairs_of(&element)), true)
+    DataType::new_list(DataType::Struct(pairs_of(&element_type(kinds))), true)
 }
 
 fn expand_list(lists: &ArrayRef) -> Result<ArrayRef> {
@@ -356,6 +373,7 @@ mod tests {
             (10_485_760, "10 MB"),
             (-20_480, "-20 kB"),
             (123_456_789_012, "115 GB"),
+            (i64::MIN, "-8192 PB"),
         ] {
             assert_eq!(pretty_size(size), expected);
         }

@@ -1,0 +1,38 @@
+//! Casts of fractions to integers: they round, as in PostgreSQL and DuckDB. DataFusion's cut the digits off.
+
+use arrow::datatypes::DataType;
+use datafusion::common::DFSchema;
+use datafusion::common::tree_node::{Transformed, TreeNode as _};
+use datafusion::error::Result;
+use datafusion::functions::math::expr_fn::round;
+use datafusion::logical_expr::expr::{Cast, TryCast};
+use datafusion::logical_expr::expr_rewriter::NamePreserver;
+use datafusion::logical_expr::utils::merge_schema;
+use datafusion::logical_expr::{Expr, ExprSchemable as _, LogicalPlan};
+
+/// Has the casts that a statement writes round to the nearest integer, ties away from zero. It is called before
+/// DataFusion adds casts of its own.
+pub(crate) fn round_casts(plan: LogicalPlan) -> Result<LogicalPlan> {
+    let round_node = |node: LogicalPlan| {
+        let schema = merge_schema(&node.inputs());
+        let names = NamePreserver::new(&node);
+        node.map_expressions(|expr| {
+            let name = names.save(&expr);
+            let rounded = expr.transform_up(|expr| Ok(round_cast(expr, &schema)))?;
+            Ok(rounded.update_data(|expr| name.restore(expr)))
+        })
+    };
+    Ok(plan.transform_up_with_subqueries(round_node)?.data)
+}
+
+fn round_cast(mut cast: Expr, schema: &DFSchema) -> Transformed<Expr> {
+    let (Expr::Cast(Cast { expr, field }) | Expr::TryCast(TryCast { expr, field })) = &mut cast else {
+        return Transformed::no(cast);
+    };
+    let has_fraction = |kind: DataType| kind.is_floating() || kind.is_decimal();
+    if !field.data_type().is_integer() || !expr.get_type(schema).is_ok_and(has_fraction) {
+        return Transformed::no(cast);
+    }
+    *expr = Box::new(round(vec![std::mem::take(expr.as_mut())]));
+    Transformed::yes(cast)
+}
