@@ -14,5 +14,5 @@ pub(crate) fn describe_error(error: &anyhow::Error) -> String {
         }
         text.push_str(": ");
     }
-    text
+    echolake_schema::escape_controls(&text)
 }

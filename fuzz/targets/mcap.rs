@@ -1,4 +1,4 @@
-//! Run files: the reader that searches for whole records after damage, the one that stops at it, and the summary's.
+//! Run files: the reader that searches for whole records after damage, in a store and on a disk, and the summary's.
 #![no_main]
 
 use std::sync::{Arc, LazyLock};
@@ -6,7 +6,7 @@ use std::sync::{Arc, LazyLock};
 use bytes::Bytes;
 use echolake_fuzz::ImportFolder;
 use echolake_recording::{
-    DecodedChunk, PrefixReader, ResyncItem, ResyncReader, RunSummary, prove_file, summary_range, tail_range,
+    DecodedChunk, RecordingReader, ResyncItem, ResyncReader, RunSummary, prove_file, summary_range, tail_range,
 };
 use futures::executor::block_on;
 use libfuzzer_sys::fuzz_target;
@@ -21,9 +21,9 @@ fuzz_target!(init: echolake_fuzz::write_seeds_on_request(), |bytes: &[u8]| {
     read_summary(bytes);
     let path = FOLDER.write("input.mcap", bytes);
     let _ = prove_file(&path);
-    if let Ok(mut reader) = PrefixReader::open(&path) {
+    if let Ok(mut reader) = RecordingReader::open(&path) {
         while let Ok(Some(_)) = reader.next_item() {}
-        assert!(reader.verified <= reader.size);
+        assert!(reader.offset() <= bytes.len() as u64);
     }
 });
 

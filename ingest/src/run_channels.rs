@@ -27,29 +27,55 @@ pub(crate) struct RunDefinitions {
 }
 
 impl RunDefinitions {
-    /// Learns a definition. The first of an id counts: a chunk's definitions have its CRC, those of the summary may be
-    /// damaged.
+    /// Learns a definition outside of chunks. The first of an id counts: a chunk's definitions have its CRC, those of the
+    /// summary may be damaged.
     pub(crate) fn learn(&mut self, record: &Record<'_>) {
         match record {
             Record::Schema { header, .. } => {
                 self.schemas.entry(header.id).or_insert_with(|| kept_name(&header.name));
             }
             Record::Channel(channel) if !self.channels.contains_key(&channel.id) => {
-                let schema = self.schemas.get(&channel.schema_id).cloned().unwrap_or_default();
-                let channels = Arc::make_mut(&mut self.channels);
-                channels.insert(channel.id, RunChannel { topic: kept_name(&channel.topic), schema });
+                let described = self.described(channel);
+                Arc::make_mut(&mut self.channels).insert(channel.id, described);
             }
             _ => {}
         }
     }
 
     /// Learns the schemas and channels that a chunk introduces.
-    pub(crate) fn learn_chunk(&mut self, chunk: &DecodedChunk) {
+    ///
+    /// # Errors
+    /// What is different, if an id is used again for something else: nobody could tell whose the messages are.
+    pub(crate) fn learn_chunk(&mut self, chunk: &DecodedChunk) -> Result<(), String> {
         for (code, body) in chunk.records().filter(|(code, _)| matches!(*code, opcode::SCHEMA | opcode::CHANNEL)) {
-            if let Ok(record) = parse_record(code, body) {
-                self.learn(&record);
+            let Ok(record) = parse_record(code, body) else { continue };
+            self.learn(&record);
+            match &record {
+                Record::Schema { header, .. } => {
+                    let (known, now) = (self.schemas.get(&header.id), kept_name(&header.name));
+                    if let Some(known) = known.filter(|known| **known != now) {
+                        return Err(format!("schema {} is used again: it is `{known}`, and now `{now}`", header.id));
+                    }
+                }
+                Record::Channel(channel) => {
+                    let (known, now) = (self.channels.get(&channel.id), self.described(channel));
+                    if let Some(known) = known.filter(|known| **known != now) {
+                        let (topics, schemas) = ([&known.topic, &now.topic], [&known.schema, &now.schema]);
+                        return Err(format!(
+                            "channel {} is used again: it is `{}` of `{}`, and now `{}` of `{}`",
+                            channel.id, topics[0], schemas[0], topics[1], schemas[1]
+                        ));
+                    }
+                }
+                _ => {}
             }
         }
+        Ok(())
+    }
+
+    fn described(&self, channel: &echolake_recording::ChannelRecord) -> RunChannel {
+        let schema = self.schemas.get(&channel.schema_id).cloned().unwrap_or_default();
+        RunChannel { topic: kept_name(&channel.topic), schema }
     }
 
     /// Returns whether the channels of all messages of a chunk are known.

@@ -77,7 +77,7 @@ impl Head {
         let mut envelope = Envelope::default();
         while let Ok(Some(item)) = reader.next_item().await {
             match item {
-                ResyncItem::Attachment { name, data } => envelope.keep_attachment(name, data),
+                ResyncItem::Attachment(found) => envelope.keep_attachment(found.name, found.data),
                 ResyncItem::Metadata(record) => envelope.keep_metadata(record),
                 ResyncItem::Definition(_) => {}
                 ResyncItem::Chunk(_) => break,
@@ -122,7 +122,8 @@ impl RunContent {
                             });
                         }
                         Ok((offset, chunk)) => {
-                            definitions.learn_chunk(&chunk);
+                            let learned = definitions.learn_chunk(&chunk);
+                            learned.map_err(|what| Error::read(name, format!("the chunk at byte {offset}: {what}")))?;
                             if !definitions.knows(&chunk) {
                                 waiting.push((offset, length));
                                 continue;
@@ -148,7 +149,7 @@ impl RunContent {
                         }
                     }
                 }
-                ResyncItem::Attachment { name, data } => envelope.keep_attachment(name, data),
+                ResyncItem::Attachment(found) => envelope.keep_attachment(found.name, found.data),
                 ResyncItem::Metadata(record) => envelope.keep_metadata(record),
                 ResyncItem::Definition(record) => definitions.learn(&record),
             }
@@ -168,7 +169,7 @@ impl RunContent {
             whole.append(cores.compute(move || measurer.process(offset, &chunk, &channels, &budget)).await);
         }
         let integrity = reader.finish().await?;
-        if !integrity.damage.is_empty() {
+        if !integrity.damage.is_empty() || !integrity.closed {
             vouch(&manifest, name)?;
         }
         Self::assemble(manifest, envelope, whole, integrity, name)
@@ -294,22 +295,16 @@ impl Yield {
     }
 }
 
-// A manifest has no CRC of its own. Where something outside of chunks is damaged, the run's name must be that of its
-// file and say the same surface and start, or its measurements could become those of another run.
+// Where something outside of chunks is damaged, the manifest may be, too.
 fn vouch(manifest: &RunManifest, name: &str) -> Result<()> {
-    let run = manifest.run_id.as_str();
-    let file = name.rsplit(['/', '\\']).next().unwrap_or_default();
-    let stem = file.strip_suffix(".partial").unwrap_or(file).trim_end_matches(".mcap");
-    let begins = format!("{}-{}-", manifest.started.compact(), manifest.surface_id);
-    // Files may have names of their own; one that is as long as the run's was meant to be it.
-    let renamed = stem.len() == run.len() && stem != run;
-    if run.starts_with(&begins) && !renamed {
+    if manifest.fits_file_name(name) {
         return Ok(());
     }
+    let file = name.rsplit(['/', '\\']).next().unwrap_or_default();
     let reason = format!(
-        "it is damaged, and its manifest may be: it says run `{run}` of `{}`, begun {}, in a file named `{file}`; \
+        "it is damaged, and its manifest may be: it says run `{}` of `{}`, begun {}, in a file named `{file}`; \
          hint: if it is right, name the file after the run",
-        manifest.surface_id, manifest.started
+        manifest.run_id, manifest.surface_id, manifest.started
     );
     Err(Error::Doubtful { file: name.to_owned(), reason })
 }

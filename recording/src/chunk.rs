@@ -5,7 +5,7 @@ use std::cell::RefCell;
 use std::io::{self, Read as _};
 
 use bytes::Bytes;
-use echolake_schema::ErrorCause;
+use echolake_schema::{ErrorCause, escape_controls};
 use mcap::McapError;
 use mcap::records::{ChunkHeader, MessageHeader, Record, op};
 use zstd::bulk::Decompressor;
@@ -244,15 +244,17 @@ fn has_attachment_head(body: &[u8]) -> bool {
 pub fn system_cause(error: McapError) -> ErrorCause {
     match error {
         McapError::Io(system) => system.into(),
-        other => other.into(),
+        other => describe(&other).into(),
     }
 }
 
-/// Returns an error of the MCAP library with its cause.
+/// Returns an error of the MCAP library with its cause. That of a parser is its innermost one: the others are a drawing of
+/// the parser's source, with colours and the paths of the machine that built it.
 pub fn describe(error: &McapError) -> String {
-    match std::error::Error::source(error) {
-        Some(cause) => format!("{error}: {cause}"),
-        None => error.to_string(),
+    match error {
+        McapError::Parse(cause) => format!("{error}: {}", escape_controls(&cause.root_cause().to_string())),
+        McapError::Io(cause) => format!("{error}: {cause}"),
+        other => escape_controls(&other.to_string()),
     }
 }
 

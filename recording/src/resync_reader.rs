@@ -5,20 +5,25 @@
 //! a file holds, the walk takes time in proportion to its size, and one large record is in memory at a time.
 
 use std::borrow::Cow;
-use std::collections::HashSet;
+use std::collections::{BTreeMap, HashSet};
+use std::fs::File;
+use std::ops::Range;
+#[cfg(feature = "store")]
 use std::sync::Arc;
 
 use bytes::Bytes;
 use crc32fast::Hasher as Crc32;
-use echolake_schema::ErrorCause;
+use echolake_schema::{ErrorCause, escape_controls, topics};
 use mcap::MAGIC;
 use mcap::records::{Metadata, Record, op};
-use object_store::path::Path;
-use object_store::{ObjectStore, ObjectStoreExt as _};
+#[cfg(feature = "store")]
+use object_store::{ObjectStore, ObjectStoreExt as _, path::Path};
 use sha2::{Digest as _, Sha256};
+#[cfg(feature = "store")]
 use tokio::sync::{Semaphore, SemaphorePermit};
 
 use crate::block_reader::BlockReader;
+use crate::chunk::describe;
 use crate::record_frame::{FRAME_BYTES, RecordFrame};
 use crate::record_shape::{PREFIX_BYTES, RecordShape, largest_record};
 
@@ -35,6 +40,7 @@ const MOST_DAMAGE: usize = 1000;
 /// Records of which one is in memory at a time, in all files together, are larger than this. A recorder's chunks have
 /// 1 MiB.
 pub(crate) const LARGE_RECORD: u64 = 8 << 20;
+#[cfg(feature = "store")]
 static LARGE_RECORDS: Semaphore = Semaphore::const_new(1);
 /// Bytes from the footer's frame to the end of the file.
 const FOOTER: u64 = FRAME + 20 + MAGIC.len() as u64;
@@ -78,16 +84,26 @@ pub enum ResyncItem {
     /// A chunk, still compressed.
     Chunk(RawChunk),
     /// An attachment whose CRC is right.
-    Attachment {
-        /// Its name.
-        name: String,
-        /// Its content.
-        data: Bytes,
-    },
+    Attachment(StoredAttachment),
     /// A metadata record.
     Metadata(Metadata),
     /// A schema or channel of the summary.
     Definition(Record<'static>),
+}
+
+/// An attachment as it is in the file.
+#[derive(Debug)]
+pub struct StoredAttachment {
+    /// Its name.
+    pub name: String,
+    /// Its media type.
+    pub media_type: String,
+    /// Time at which it was recorded, ns since 1970.
+    pub log_time: u64,
+    /// Time at which it was made, ns since 1970.
+    pub create_time: u64,
+    /// Its content.
+    pub data: Bytes,
 }
 
 /// A chunk's body and where its record begins.
@@ -102,7 +118,11 @@ pub struct RawChunk {
 }
 
 /// Permits one large record to be in memory.
+#[cfg(feature = "store")]
 pub type LargeRecordPermit = SemaphorePermit<'static>;
+/// Without stores one file is read at a time.
+#[cfg(not(feature = "store"))]
+pub type LargeRecordPermit = std::convert::Infallible;
 
 /// The state of a whole file.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -115,6 +135,11 @@ pub struct FileIntegrity {
     pub closed: bool,
     /// What is damaged outside of chunks, in the file's order.
     pub damage: Vec<String>,
+    /// Bytes that belong to no whole record, in the file's order. Those of a summary are not among them if all data before
+    /// it are right: it can be made again.
+    pub lost: Vec<Range<u64>>,
+    /// Nothing but the summary is damaged.
+    pub is_data_whole: bool,
 }
 
 /// Reads one file from its first byte to its last.
@@ -144,6 +169,18 @@ pub struct ResyncReader {
     summary: Crc32,
     end: Option<FileEnd>,
     damage: Vec<String>,
+    /// Where the last whole record ends.
+    whole_end: u64,
+    /// Bytes between whole records.
+    lost: Vec<Range<u64>>,
+    /// Behind the record that ends the data, if its CRC is right.
+    data_end: Option<u64>,
+    /// What is damaged behind that.
+    summary_damage: Vec<String>,
+    /// Where something begins that is none of this file.
+    foreign: Option<u64>,
+    /// What the file's first manifest says.
+    manifest: Option<BTreeMap<String, String>>,
 }
 
 /// The end of a walk.
@@ -155,14 +192,25 @@ enum FileEnd {
 
 impl ResyncReader {
     /// Opens a file and checks its first bytes.
+    #[cfg(feature = "store")]
     pub async fn open(store: Arc<dyn ObjectStore>, path: Path, name: String) -> Result<Self, ResyncError> {
         let size = match store.head(&path).await {
             Ok(meta) => meta.size,
             Err(object_store::Error::NotFound { .. }) => return Err(ResyncError::Gone { file: name }),
             Err(e) => return Err(ResyncError::read(&name, e)),
         };
+        Self::begin(BlockReader::open(store, path).await, size, name).await
+    }
+
+    /// Reads an open file of this machine; nothing in it waits for anything but the disk.
+    pub(crate) async fn from_file(file: File, name: String) -> Result<Self, ResyncError> {
+        let size = file.metadata().map_err(|e| ResyncError::read(&name, e))?.len();
+        Self::begin(BlockReader::from_file(file), size, name).await
+    }
+
+    async fn begin(file: BlockReader, size: u64, name: String) -> Result<Self, ResyncError> {
         let mut reader = Self {
-            file: BlockReader::open(store, path).await,
+            file,
             name,
             size,
             offset: 0,
@@ -179,6 +227,12 @@ impl ResyncReader {
             summary: Crc32::new(),
             end: None,
             damage: Vec::new(),
+            whole_end: MAGIC.len() as u64,
+            lost: Vec::new(),
+            data_end: None,
+            summary_damage: Vec::new(),
+            foreign: None,
+            manifest: None,
         };
         let length = (MAGIC.len() as u64).min(size);
         reader.fill(length).await?;
@@ -212,29 +266,49 @@ impl ResyncReader {
     /// Returns the state of the whole file, once [`Self::next_item`] returned None.
     pub async fn finish(mut self) -> Result<FileIntegrity, ResyncError> {
         self.pass(self.size - self.offset).await?;
+        self.lose(self.whole_end..self.size);
+        if let Some(data_end) = self.data_end {
+            self.lost.retain(|range| range.start < data_end || self.foreign.is_some_and(|from| range.start >= from));
+        }
+        let is_data_whole = self.lost.is_empty() && self.damage.is_empty();
+        self.damage.append(&mut self.summary_damage);
         Ok(FileIntegrity {
             bytes: self.size,
             sha256: hex::encode(self.digest.finalize()),
             closed: self.end == Some(FileEnd::Closed),
             damage: self.damage,
+            lost: self.lost,
+            is_data_whole,
         })
+    }
+
+    /// Returns the byte at which the next record begins.
+    pub fn offset(&self) -> u64 {
+        self.offset
     }
 
     /// The chunk that began at `offset` is damaged. Where bytes of it are missing it reached too far, so the walk
     /// goes on at the next whole record behind its first byte; no chunk comes twice.
     pub async fn look_into(&mut self, offset: u64) -> Result<(), ResyncError> {
         self.end = None;
+        let end = self.offset;
+        self.lost.retain(|range| range.start < offset);
+        self.whole_end = offset;
         match self.rewind(offset) {
             true => self.search().await,
-            false => Ok(()),
+            false => {
+                self.lose(offset..end);
+                self.whole_end = end;
+                Ok(())
+            }
         }
     }
 
     /// A chunk that the walk came by earlier, once more.
-    pub async fn again(&self, offset: u64, length: u64) -> Result<RawChunk, ResyncError> {
+    pub async fn again(&mut self, offset: u64, length: u64) -> Result<RawChunk, ResyncError> {
         let start = offset + FRAME;
         // What it becomes is known only once it is read.
-        let permit = large_record_permit(LARGE_RECORD + 1).await;
+        let permit = self.large_record_permit(LARGE_RECORD + 1).await;
         let body = self.file.range(start..start + length).await;
         Ok(RawChunk { offset, body: body.map_err(|e| ResyncError::read(&self.name, e))?, permit })
     }
@@ -245,7 +319,16 @@ impl ResyncReader {
             Ok(frame) => frame,
             Err(what) => {
                 let at = self.offset;
-                list_damage(&mut self.damage, || format!("the file {what} at byte {at}"));
+                // A search would go on in the other file, whose messages are none of this one's.
+                if self.is_other_file().await? {
+                    return Ok(None);
+                }
+                // A recording that was killed between two records ends as it should.
+                if at == self.size {
+                    self.end = Some(FileEnd::CutOff);
+                    return Ok(None);
+                }
+                self.note(|| format!("the file {what} at byte {at}"));
                 self.search().await?;
                 return Ok(None);
             }
@@ -256,7 +339,7 @@ impl ResyncReader {
         let most = largest_record(code).unwrap_or(u64::MAX);
         let is_one_too_many = code == op::CHUNK && self.chunks.len() == MOST_CHUNKS;
         if length > most || is_one_too_many {
-            list_damage(&mut self.damage, || match is_one_too_many {
+            self.note(|| match is_one_too_many {
                 true => format!("the chunk at byte {offset}: the file has more than {MOST_CHUNKS}"),
                 false => format!("record of kind {code:#04x} at byte {offset} has {length} bytes, more than {most}"),
             });
@@ -264,13 +347,16 @@ impl ResyncReader {
             self.doubtful = None;
             return self.pass(FRAME + length).await;
         }
+        self.lose(self.whole_end..offset);
+        self.whole_end = self.whole_end.max(offset + FRAME + length);
         match code {
             op::CHUNK | op::ATTACHMENT | op::METADATA | op::SCHEMA | op::CHANNEL => {
-                let permit = large_record_permit(self.memory(frame)).await;
+                let permit = self.large_record_permit(self.memory(frame)).await;
                 self.fill(FRAME + length).await?;
                 let mut record = self.skip(FRAME + length, true);
                 let body = record.split_off(FRAME as usize);
                 if code == op::CHUNK {
+                    self.data_end = None;
                     return Ok(self.chunks.insert(offset).then_some(ResyncItem::Chunk(RawChunk {
                         offset,
                         body,
@@ -278,14 +364,61 @@ impl ResyncReader {
                     })));
                 }
                 let item = self.item(code, offset, &body);
-                if item.is_none() {
-                    self.look_into(offset).await?;
+                match &item {
+                    None => self.look_into(offset).await?,
+                    Some(ResyncItem::Metadata(m)) if m.name == topics::RUN_METADATA => {
+                        if self.manifest.get_or_insert_with(|| m.metadata.clone()) != &m.metadata {
+                            self.end_at(offset, "another run", FileEnd::CutOff);
+                            return Ok(None);
+                        }
+                    }
+                    Some(_) => {}
                 }
                 Ok(item)
             }
             op::DATA_END => self.data_end().await,
             op::FOOTER => self.footer().await,
             _ => self.pass(FRAME + length).await,
+        }
+    }
+
+    // Whether this file ends here and another one follows, which is then left alone.
+    async fn is_other_file(&mut self) -> Result<bool, ResyncError> {
+        let left = self.size - self.offset;
+        self.fill(left.min(FOOTER)).await?;
+        if !is_inner_footer(self.ahead(), left) {
+            return Ok(false);
+        }
+        self.skip(FOOTER, false);
+        self.end_at(self.offset, "another file", FileEnd::Closed);
+        Ok(true)
+    }
+
+    // Ends the walk: what begins at the byte `from` is `what`, and none of this file.
+    fn end_at(&mut self, from: u64, what: &str, end: FileEnd) {
+        let bytes = self.size - from;
+        list_damage(&mut self.damage, || {
+            format!(
+                "{what} begins at byte {from}, of which {bytes} bytes are not read; hint: store it in a file of its own"
+            )
+        });
+        self.foreign = Some(from);
+        self.whole_end = from;
+        self.end = Some(end);
+    }
+
+    // Behind data that are right nothing is damaged but the summary.
+    fn note(&mut self, line: impl FnOnce() -> String) {
+        let lines = if self.data_end.is_some() { &mut self.summary_damage } else { &mut self.damage };
+        list_damage(lines, line);
+    }
+
+    fn lose(&mut self, range: Range<u64>) {
+        let is_full = self.lost.len() >= MOST_DAMAGE;
+        match self.lost.last_mut() {
+            _ if range.is_empty() => {}
+            Some(last) if last.end == range.start || is_full => last.end = range.end,
+            _ => self.lost.push(range),
         }
     }
 
@@ -297,6 +430,17 @@ impl ResyncReader {
         frame.length.max(claimed)
     }
 
+    // One reader of a file of this machine is alone; those of stores take turns.
+    async fn large_record_permit(&self, bytes: u64) -> Option<LargeRecordPermit> {
+        #[cfg(feature = "store")]
+        if bytes > LARGE_RECORD && self.file.is_shared() {
+            // Nobody closes the semaphore.
+            return LARGE_RECORDS.acquire().await.ok();
+        }
+        let _ = bytes;
+        None
+    }
+
     // The frame at `offset`, or in words why no record begins there.
     async fn frame(&mut self) -> Result<Result<RecordFrame, String>, ResyncError> {
         let left = self.size - self.offset;
@@ -306,7 +450,11 @@ impl ResyncReader {
         self.fill(FRAME).await?;
         let frame = RecordFrame::read(self.ahead());
         if frame.length > left - FRAME {
-            return Ok(Err(format!("ends within a record of kind {:#04x} and {} bytes", frame.code, frame.length)));
+            // A recorder writes a chunk's size when the chunk is full, and until then the largest number.
+            return Ok(Err(match frame.code == op::CHUNK && frame.length == u64::MAX {
+                true => "has a chunk that was never closed".to_owned(),
+                false => format!("ends within a record of kind {:#04x} and {} bytes", frame.code, frame.length),
+            }));
         }
         self.fill(left.min(FRAME + frame.length.min(PREFIX_BYTES as u64) + MAGIC.len() as u64)).await?;
         let sound = match look(self.ahead(), left) {
@@ -329,7 +477,11 @@ impl ResyncReader {
         } else {
             let start = self.offset + behind;
             let bytes = self.file.range(start..start + FRAME).await;
-            RecordFrame::read(&bytes.map_err(|e| ResyncError::read(&self.name, e))?)
+            let bytes = bytes.map_err(|e| ResyncError::read(&self.name, e))?;
+            if bytes.len() < FRAME_BYTES {
+                return Err(ResyncError::read(&self.name, "it became shorter while it was read"));
+            }
+            RecordFrame::read(&bytes)
         };
         Ok(frame.is_possible(left - FRAME))
     }
@@ -373,10 +525,7 @@ impl ResyncReader {
             let count = ahead.len() - behind + 1;
             let mut at = 0;
             // Most bytes are no record's code; a plain loop passes over them fast in every profile.
-            while at < count
-                && !(matches!(ahead[at], 1..=op::DATA_END)
-                    && look(&ahead[at..], left - at as u64) == RecordShape::Sound)
-            {
+            while at < count && !(matches!(ahead[at], 1..=op::DATA_END) && can_begin(&ahead[at..], left - at as u64)) {
                 at += 1;
             }
             self.skip(at as u64, true);
@@ -395,12 +544,18 @@ impl ResyncReader {
                     Cow::Borrowed(part) => body.slice_ref(part),
                     Cow::Owned(copy) => copy.into(),
                 };
-                Some(ResyncItem::Attachment { name: header.name, data })
+                Some(ResyncItem::Attachment(StoredAttachment {
+                    name: header.name,
+                    media_type: header.media_type,
+                    log_time: header.log_time,
+                    create_time: header.create_time,
+                    data,
+                }))
             }
             Ok(Record::Metadata(metadata)) => Some(ResyncItem::Metadata(metadata)),
             Ok(definition) => Some(ResyncItem::Definition(definition.into_owned())),
             Err(e) => {
-                list_damage(&mut self.damage, || format!("record at byte {offset}: {e}"));
+                self.note(|| format!("record at byte {offset}: {}", describe(&e)));
                 None
             }
         }
@@ -411,10 +566,10 @@ impl ResyncReader {
         let at = self.offset;
         let record = self.skip(FRAME + 4, true);
         let stored = u32_at(&record, FRAME as usize);
-        if stored != 0 && stored != sum {
-            list_damage(&mut self.damage, || {
-                format!("data section up to byte {at}: CRC is {sum:08x}, expected {stored:08x}")
-            });
+        if stored == sum {
+            self.data_end = Some(self.offset);
+        } else if stored != 0 {
+            self.note(|| format!("data section up to byte {at}: CRC is {sum:08x}, expected {stored:08x}"));
         }
         self.in_summary = true;
         Ok(None)
@@ -430,11 +585,10 @@ impl ResyncReader {
         let stored = u32_at(&record, 25);
         let has_summary = record[9..17] != [0; 8];
         if has_summary && stored != 0 && stored != sum {
-            list_damage(&mut self.damage, || {
-                format!("summary before byte {at}: CRC is {sum:08x}, expected {stored:08x}")
-            });
+            self.note(|| format!("summary before byte {at}: CRC is {sum:08x}, expected {stored:08x}"));
         }
         self.end = Some(FileEnd::Closed);
+        self.whole_end = self.size;
         Ok(None)
     }
 
@@ -501,6 +655,18 @@ impl ResyncReader {
     }
 }
 
+// Whether a search ends at these bytes, as for [`look`].
+fn can_begin(bytes: &[u8], left: u64) -> bool {
+    look(bytes, left) == RecordShape::Sound || is_inner_footer(bytes, left)
+}
+
+// Whether a whole file ends with the footer and the magic bytes that `bytes` begin with, and something follows.
+fn is_inner_footer(bytes: &[u8], left: u64) -> bool {
+    left > FOOTER
+        && RecordFrame::read(bytes) == RecordFrame { code: op::FOOTER, length: 20 }
+        && bytes.get(FRAME_BYTES + 20..FOOTER as usize) == Some(MAGIC)
+}
+
 // What can be said of the record that begins with `bytes`, which have its frame, the first [`PREFIX_BYTES`] bytes behind it and
 // the file's last ones, where it has them; `left` bytes of the file are left.
 fn look(bytes: &[u8], left: u64) -> RecordShape {
@@ -518,15 +684,10 @@ fn look(bytes: &[u8], left: u64) -> RecordShape {
     }
 }
 
-async fn large_record_permit(bytes: u64) -> Option<LargeRecordPermit> {
-    // Nobody closes the semaphore.
-    if bytes > LARGE_RECORD { LARGE_RECORDS.acquire().await.ok() } else { None }
-}
-
 /// Adds a line to what is said of a file's damage, up to a limit.
 pub fn list_damage(lines: &mut Vec<String>, line: impl FnOnce() -> String) {
     match lines.len() {
-        0..MOST_DAMAGE => lines.push(line()),
+        0..MOST_DAMAGE => lines.push(escape_controls(&line())),
         MOST_DAMAGE => lines.push("more damage is not listed".to_owned()),
         _ => {}
     }

@@ -93,6 +93,7 @@ impl RunSummary {
         let mut reader = LinearReader::new_with_options(options);
         let mut next = DATA_END.as_slice();
         let mut behind = Some(summary);
+        let mut read_bytes = 0;
         while let Some(event) = reader.next_event() {
             match event? {
                 LinearReadEvent::ReadRequest(_) => {
@@ -103,14 +104,21 @@ impl RunSummary {
                     reader.notify_read(next.len());
                     next = &[];
                 }
-                LinearReadEvent::Record { opcode, data } => match crate::chunk::parse_record(opcode, data)? {
-                    Record::Statistics(statistics) => found.statistics = Some(statistics),
-                    Record::ChunkIndex(index) => found.chunk_indexes.push(index),
-                    Record::AttachmentIndex(index) => found.attachment_indexes.push(index),
-                    Record::MetadataIndex(index) => found.metadata_indexes.push(index),
-                    other => definitions.learn(&other),
-                },
+                LinearReadEvent::Record { opcode, data } => {
+                    read_bytes += FRAME_BYTES + data.len();
+                    match crate::chunk::parse_record(opcode, data)? {
+                        Record::Statistics(statistics) => found.statistics = Some(statistics),
+                        Record::ChunkIndex(index) => found.chunk_indexes.push(index),
+                        Record::AttachmentIndex(index) => found.attachment_indexes.push(index),
+                        Record::MetadataIndex(index) => found.metadata_indexes.push(index),
+                        other => definitions.learn(&other).map_err(McapError::ConflictingChannels)?,
+                    }
+                }
             }
+        }
+        // A summary in front of another file's.
+        if read_bytes != DATA_END.len() + summary.len() - MAGIC.len() {
+            return Err(McapError::BytesAfterEndMagic);
         }
         found.schema_count = definitions.schemas.len();
         found.channel_without_schema = definitions.channel_without_schema();
@@ -195,6 +203,10 @@ fn indexed_messages(chunk: &ChunkIndex) -> Option<u64> {
     entries.is_multiple_of(INDEX_ENTRY).then_some(entries / INDEX_ENTRY)
 }
 
+fn is_same_channel(one: &mcap::records::Channel, other: &mcap::records::Channel) -> bool {
+    (&one.topic, one.schema_id, &one.message_encoding) == (&other.topic, other.schema_id, &other.message_encoding)
+}
+
 /// Schemas and channels in the order in which they come.
 #[derive(Debug, Default)]
 pub struct ChannelDefinitions {
@@ -203,24 +215,44 @@ pub struct ChannelDefinitions {
 }
 
 impl ChannelDefinitions {
-    /// Takes note of a schema or channel; the first one of an id counts, a second one repeats it.
-    pub fn learn(&mut self, record: &Record<'_>) {
+    /// Takes note of a schema or channel. One that comes again says the same.
+    ///
+    /// # Errors
+    /// What is different, if an id is used again for something else: nobody could tell whose the messages are.
+    pub fn learn(&mut self, record: &Record<'_>) -> Result<(), String> {
         match record {
-            Record::Schema { header, data } => {
-                self.schemas.entry(header.id).or_insert_with(|| {
-                    Arc::new(Schema {
+            Record::Schema { header, data } => match self.schemas.get(&header.id) {
+                Some(known)
+                    if known.encoding == header.encoding && known.data == *data && known.name == header.name => {}
+                Some(known) => {
+                    let (id, before, now) = (header.id, &known.name, &header.name);
+                    return Err(format!(
+                        "schema {id} is used again: it is `{before}` and, with other content, `{now}`"
+                    ));
+                }
+                None => {
+                    let schema = Schema {
                         id: header.id,
                         name: header.name.clone(),
                         encoding: header.encoding.clone(),
                         data: data.to_vec().into(),
-                    })
-                });
-            }
-            Record::Channel(channel) => {
-                self.channels.entry(channel.id).or_insert_with(|| channel.clone());
-            }
+                    };
+                    self.schemas.insert(header.id, Arc::new(schema));
+                }
+            },
+            Record::Channel(channel) => match self.channels.get(&channel.id) {
+                Some(known) if is_same_channel(known, channel) => {}
+                Some(known) => {
+                    let (id, before, now) = (channel.id, &known.topic, &channel.topic);
+                    return Err(format!(
+                        "channel {id} is used again: it is `{before}` and, with other content, `{now}`"
+                    ));
+                }
+                None => drop(self.channels.insert(channel.id, channel.clone())),
+            },
             _ => {}
         }
+        Ok(())
     }
 
     /// Returns a channel whose schema did not come.

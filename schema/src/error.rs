@@ -3,6 +3,24 @@
 /// The cause of another member's error: an error of a library or the system, or a text.
 pub type ErrorCause = Box<dyn std::error::Error + Send + Sync>;
 
+/// Returns a text without characters that control a terminal, but with its lines: names in files, and messages of
+/// libraries about them, may hold any.
+pub fn escape_controls(text: &str) -> String {
+    let mut safe = String::with_capacity(text.len());
+    for character in text.chars() {
+        match character {
+            '\n' | '\t' => safe.push(character),
+            // Those that turn the direction of writing hide as much.
+            '\u{200e}'..='\u{200f}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}' => {
+                safe.extend(character.escape_unicode());
+            }
+            _ if character.is_control() => safe.extend(character.escape_default()),
+            _ => safe.push(character),
+        }
+    }
+    safe
+}
+
 /// A value that is not what its type promises.
 #[derive(Debug, thiserror::Error, Clone, PartialEq)]
 pub enum Error {
@@ -85,4 +103,15 @@ pub enum Error {
         /// Its value.
         value: f32,
     },
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn texts_for_a_terminal_control_none() {
+        let text = "`/a\u{1b}]0;title\u{7}\r\u{9b}31m`\n\tgrün \u{202e}";
+        assert_eq!(escape_controls(text), "`/a\\u{1b}]0;title\\u{7}\\r\\u{9b}31m`\n\tgrün \\u{202e}");
+    }
 }

@@ -234,6 +234,18 @@ impl RunManifest {
         .into()
     }
 
+    /// Returns whether it may be the manifest of a damaged file of this name. It has no CRC of its own: the run's name must
+    /// say the same surface and start, and be the file's, or measurements could become those of another run.
+    pub fn fits_file_name(&self, name: &str) -> bool {
+        let run = self.run_id.as_str();
+        let file = name.rsplit(['/', '\\']).next().unwrap_or_default();
+        let stem = file.strip_suffix(".partial").unwrap_or(file).trim_end_matches(".mcap");
+        let begins = format!("{}-{}-", self.started.compact(), self.surface_id);
+        // Files may have names of their own; one that is as long as the run's was meant to be it.
+        let is_renamed = stem.len() == run.len() && stem != run;
+        run.starts_with(&begins) && !is_renamed
+    }
+
     /// Reads the metadata record.
     ///
     /// # Errors

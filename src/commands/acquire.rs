@@ -169,6 +169,9 @@ async fn measure(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<CommandOu
         Some(partial) => {
             let held = Box::new(Held::read(partial)?);
             check_not_ingested(partial, &held)?;
+            for line in &held.damage {
+                progress.say(format!("damage: {line}; what was lost with it is measured again"));
+            }
             AcquireJob::Resumed { partial: partial.clone(), held }
         }
         None => fresh(args, lake_url, &progress).await?,
@@ -200,6 +203,7 @@ async fn measure(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<CommandOu
     if let Some(served) = &served {
         progress.say(format!("metrics: http://{}/metrics", served.address()));
     }
+    let is_damaged = matches!(&job, AcquireJob::Resumed { held, .. } if held.is_damaged());
     let mut watcher = RunWatcher::new(&progress, &surface, planned, accepted, metrics.clone(), job.folder());
     let preflight = if args.skip_checks { PreflightMode::Skip } else { PreflightMode::Check };
     let (checkpoint_every, tap) = (args.checkpoint_every.map(|n| n as usize), live.as_ref().map(LiveServer::tap));
@@ -225,6 +229,7 @@ async fn measure(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<CommandOu
     match measured {
         Ok(measured) => {
             let outcome = tell(&measured, lake_url)?;
+            let outcome = if is_damaged { CommandOutcome::WithLoss } else { outcome };
             if measured.outcome.left > 0 {
                 return Ok(outcome);
             }

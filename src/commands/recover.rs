@@ -1,4 +1,4 @@
-//! `echolake recover`: a recording that was stopped, cut off or damaged, made a run as far as it is proven whole.
+//! `echolake recover`: a recording that was stopped, cut off or damaged, made a run of all that is proven whole.
 
 use anyhow::ensure;
 use echolake_acquisition::recovery::{Report, beside, is_partial, recover};
@@ -29,11 +29,7 @@ pub(crate) fn run(args: &RecoverArgs) -> anyhow::Result<CommandOutcome> {
         true => super::print(&serde_json::to_string_pretty(&report)?)?,
         false => tell(&report)?,
     }
-    Ok(if report.lost_bytes() > 0 || report.defect.is_some() {
-        CommandOutcome::WithLoss
-    } else {
-        CommandOutcome::Whole
-    })
+    Ok(if report.is_whole() { CommandOutcome::Whole } else { CommandOutcome::WithLoss })
 }
 
 fn tell(report: &Report) -> anyhow::Result<()> {
@@ -56,20 +52,28 @@ fn tell(report: &Report) -> anyhow::Result<()> {
         of("/ir"),
         of("/sweep")
     );
-    match &report.defect {
-        Some(defect) => eprintln!("lost: {} bytes, because {defect}", report.lost_bytes()),
-        None => eprintln!("lost: nothing"),
+    match report.is_whole() {
+        true => eprintln!("lost: nothing"),
+        false => eprintln!("lost: {} bytes{}", report.lost_bytes(), places(report)),
+    }
+    for line in &report.damage {
+        eprintln!("damage: {line}");
     }
     if !report.has_end {
         eprintln!("note: its run was not finished; ingest marks it as partial");
     }
-    if is_partial(&report.from) {
-        let to = to.display();
-        eprintln!(
-            "`{from}` is unchanged; delete it when you no longer need it, or delete `{to}` and resume the recording"
-        );
-    }
+    let or_resume = match is_partial(&report.from) {
+        true => format!(", or delete `{}` and resume the recording", to.display()),
+        false => String::new(),
+    };
+    eprintln!("`{from}` is unchanged; delete it when you no longer need it{or_resume}");
     Ok(())
+}
+
+// Where in the recording the lost bytes are.
+fn places(report: &Report) -> String {
+    let places: Vec<_> = report.lost.iter().map(|range| format!("{}..{}", range.start, range.end)).collect();
+    if places.is_empty() { String::new() } else { format!(", at {}", places.join(", ")) }
 }
 
 // Pairs with an accepted measurement, and all pairs of the rig.

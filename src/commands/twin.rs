@@ -15,7 +15,7 @@ use echolake_acquisition::run::{PanelSpecimen, RunRequest};
 use echolake_ingest::pending;
 use echolake_lake::Lake;
 use echolake_query::Session;
-use echolake_recording::{PrefixItem, PrefixReader};
+use echolake_recording::{RecordingItem, RecordingReader};
 use echolake_schema::manifest::Origin;
 use echolake_schema::{ProjectName, Rig, RunId, SurfaceId, SurfaceRecord, Timestamp, topics};
 use serde::{Deserialize, Serialize};
@@ -221,10 +221,10 @@ impl ComputedRun {
 
 // Writes the panel's mesh to a file; returns the surface's project. Both stand in the run's file before its measurements.
 fn take_mesh(run: &Path, to: &Path) -> anyhow::Result<Option<ProjectName>> {
-    let mut reader = PrefixReader::open(run)?;
+    let mut reader = RecordingReader::open(run)?;
     let (mut mesh, mut record) = (None, None);
     while let (false, Some(item)) = (mesh.is_some() && record.is_some(), reader.next_item()?) {
-        let PrefixItem::Attachment(attachment) = item else { continue };
+        let RecordingItem::Attachment(attachment) = item else { continue };
         match attachment.name.as_str() {
             topics::MESH_ATTACHMENT => mesh = Some(attachment.data),
             topics::SURFACE_ATTACHMENT => record = Some(attachment.data),

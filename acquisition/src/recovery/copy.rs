@@ -1,8 +1,11 @@
 //! Takes what is whole of one recording into another: messages, attachments and metadata as they are, chunks anew.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::BTreeMap;
+use std::sync::Arc;
 
-use echolake_recording::{ChunkLane, ChunkWriter, McapResult, MessageHeader, PrefixItem, Record};
+use echolake_recording::{
+    Attachment, Channel, ChunkLane, ChunkWriter, McapResult, MessageHeader, Record, RecordingItem,
+};
 use echolake_schema::topics;
 
 /// Messages of each topic.
@@ -11,7 +14,9 @@ pub(crate) type Counts = BTreeMap<String, u64>;
 /// A copy that is being made.
 pub(crate) struct Copy<'a> {
     out: &'a mut ChunkWriter,
-    channels: HashMap<u16, (String, ChunkLane)>,
+    channels: &'a BTreeMap<u16, Arc<Channel<'static>>>,
+    /// Whether they are described in `out`: its first chunk describes them all.
+    is_described: bool,
     /// What was copied so far.
     pub(crate) counts: Counts,
     /// The highest number of a message.
@@ -19,67 +24,77 @@ pub(crate) struct Copy<'a> {
 }
 
 impl<'a> Copy<'a> {
-    /// A copy into `out`.
-    pub(crate) fn new(out: &'a mut ChunkWriter) -> Self {
-        Self { out, channels: HashMap::new(), counts: Counts::new(), sequence: 0 }
+    /// A copy into `out` of messages of these channels.
+    pub(crate) fn new(out: &'a mut ChunkWriter, channels: &'a BTreeMap<u16, Arc<Channel<'static>>>) -> Self {
+        Self { out, channels, is_described: false, counts: Counts::new(), sequence: 0 }
     }
 
-    /// Copies one thing, of a chunk only the messages that `keep` wants.
+    /// Copies one item, of a chunk only the messages that `keep` wants.
     ///
     /// # Errors
     /// The writer's.
     pub(crate) fn take(
         &mut self,
-        item: PrefixItem,
+        item: RecordingItem,
         keep: &dyn Fn(ChunkLane, &MessageHeader) -> bool,
     ) -> McapResult<()> {
         match item {
-            PrefixItem::Chunk(records) => {
-                for record in records {
-                    self.record(record, keep)?;
+            RecordingItem::Chunk(chunk) => {
+                self.describe_channels()?;
+                for record in chunk.records {
+                    self.message(record, keep);
                 }
                 // In the order of their parts as soon as one is large: a verdict never gets ahead of its recording.
                 [ChunkLane::Sweeps, ChunkLane::Responses, ChunkLane::Light]
                     .into_iter()
                     .try_for_each(|p| self.out.end_large(p))
             }
-            PrefixItem::Attachment(attachment) => {
+            RecordingItem::Attachment(attachment) => {
                 self.out.end_all()?;
-                self.out.mcap.attach(&attachment)
+                self.out.mcap.attach(&Attachment {
+                    log_time: attachment.log_time,
+                    create_time: attachment.create_time,
+                    name: attachment.name,
+                    media_type: attachment.media_type,
+                    data: attachment.data[..].into(),
+                })
             }
-            PrefixItem::Metadata(metadata) => {
+            RecordingItem::Metadata(metadata) => {
                 self.out.end_all()?;
                 self.out.mcap.write_metadata(&metadata)
             }
+            RecordingItem::Definition(_) => Ok(()),
         }
     }
 
-    fn record(&mut self, record: Record<'_>, keep: &dyn Fn(ChunkLane, &MessageHeader) -> bool) -> McapResult<()> {
-        match record {
-            Record::Schema { header, data } => {
-                self.out.mcap.add_schema_with_id(header.id, &header.name, &header.encoding, &data)?;
-            }
-            Record::Channel(channel) => {
-                let (topic, encoding) = (&channel.topic, &channel.message_encoding);
-                let (id, schema) = (channel.id, channel.schema_id);
-                self.out.mcap.add_channel_with_id(id, schema, topic, encoding, &channel.metadata)?;
-                self.channels.insert(id, (topic.clone(), ChunkLane::from_topic(topic)));
-            }
-            Record::Message { header, data } => {
-                let Some((topic, part)) = self.channels.get(&header.channel_id) else { return Ok(()) };
-                if keep(*part, &header) {
-                    *self.counts.entry(topic.clone()).or_default() += 1;
-                    self.sequence = self.sequence.max(header.sequence);
-                    self.out.push(*part, header, &data);
-                }
-            }
-            _ => {}
+    fn describe_channels(&mut self) -> McapResult<()> {
+        if std::mem::replace(&mut self.is_described, true) {
+            return Ok(());
+        }
+        for channel in self.channels.values() {
+            let (topic, encoding) = (&channel.topic, &channel.message_encoding);
+            let schema = match &channel.schema {
+                Some(s) => self.out.mcap.add_schema_with_id(s.id, &s.name, &s.encoding, &s.data)?,
+                None => 0,
+            };
+            self.out.mcap.add_channel_with_id(channel.id, schema, topic, encoding, &channel.metadata)?;
         }
         Ok(())
     }
+
+    fn message(&mut self, record: Record<'_>, keep: &dyn Fn(ChunkLane, &MessageHeader) -> bool) {
+        let Record::Message { header, data } = record else { return };
+        let Some(channel) = self.channels.get(&header.channel_id) else { return };
+        let lane = ChunkLane::from_topic(&channel.topic);
+        if keep(lane, &header) {
+            *self.counts.entry(channel.topic.clone()).or_default() += 1;
+            self.sequence = self.sequence.max(header.sequence);
+            self.out.push(lane, header, &data);
+        }
+    }
 }
 
-/// Whether a metadata record says how the run ended.
-pub(crate) fn is_end(item: &PrefixItem) -> bool {
-    matches!(item, PrefixItem::Metadata(m) if m.name == topics::RUN_END_METADATA)
+/// Returns whether a metadata record says how the run ended.
+pub(crate) fn is_end(item: &RecordingItem) -> bool {
+    matches!(item, RecordingItem::Metadata(m) if m.name == topics::RUN_END_METADATA)
 }

@@ -1,12 +1,11 @@
-//! Why a recording cannot be recovered or gone on with.
+//! Why a recording cannot be recovered or resumed.
 
-use std::io;
 use std::path::PathBuf;
 
-use echolake_recording::PrefixError;
+use echolake_recording::ResyncError;
 use echolake_schema::ErrorCause;
 
-/// Why a recording cannot be recovered or gone on with. The recording itself is as it was.
+/// Why a recording cannot be recovered or resumed. The recording itself is as it was.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The system refused to read it.
@@ -15,7 +14,7 @@ pub enum Error {
         /// The file.
         path: PathBuf,
         /// The system's reason.
-        source: io::Error,
+        source: ErrorCause,
     },
     /// Somebody records it.
     #[error("`{}` is being recorded; hint: stop that `echolake acquire` first", path.display())]
@@ -23,12 +22,20 @@ pub enum Error {
         /// The file.
         path: PathBuf,
     },
-    /// It holds nothing that could be kept.
-    #[error("`{}` holds no run: {source}; hint: nothing was measured into it, measure anew", path.display())]
+    /// Nothing was measured into it, or nothing of that can be read.
+    #[error("`{}` holds no run: {source}; hint: no measurement in it can be read, measure again", path.display())]
     Headless {
         /// The file.
         path: PathBuf,
         /// What is missing, or the damage.
+        source: ErrorCause,
+    },
+    /// There are whole measurements in it, but no run can be made of them.
+    #[error("no run can be made of `{}`: {source}; hint: keep the file, and look for another copy of it", path.display())]
+    Unusable {
+        /// The file.
+        path: PathBuf,
+        /// What is missing or damaged, and what is whole.
         source: ErrorCause,
     },
     /// It does not say how to go on.
@@ -69,13 +76,15 @@ pub enum Error {
     },
 }
 
-impl From<PrefixError> for Error {
-    fn from(error: PrefixError) -> Self {
+impl From<ResyncError> for Error {
+    fn from(error: ResyncError) -> Self {
         match error {
-            PrefixError::Read { path, source } => Self::Read { path, source },
-            PrefixError::Headless { path, bytes } => {
-                Self::Headless { path, source: format!("it is no MCAP file, or only {bytes} bytes of one").into() }
-            }
+            ResyncError::Read { file, source } => Self::Read { path: file.into(), source },
+            ResyncError::Gone { file } => Self::Read { path: file.into(), source: "it is gone".into() },
+            ResyncError::NotMcap { file, actual } => Self::Headless {
+                path: file.into(),
+                source: format!("it is no MCAP file: it begins with {actual}").into(),
+            },
         }
     }
 }

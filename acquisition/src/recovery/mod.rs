@@ -1,23 +1,24 @@
-//! Rebuilds a recording that was cut off or damaged to its longest verified prefix. The original is only read.
+//! Rebuilds a recording that was cut off or damaged from all that is whole of it. The original is only read.
 
 mod copy;
 mod error;
+mod survey;
 #[cfg(test)]
 mod tests;
 
 use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions, TryLockError};
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 
-use echolake_recording::{
-    ChunkWriter, McapError, Metadata, PrefixItem, PrefixReader, Record, prove_file, system_cause,
-};
+use echolake_recording::{ChunkWriter, McapError, Metadata, RecordingReader, prove_file, system_cause};
 use echolake_schema::topics;
 use serde::Serialize;
 
 use crate::disk::{folder_of, sync};
 pub(crate) use copy::{Copy, Counts, is_end};
 pub use error::Error;
+pub(crate) use survey::RecordingSurvey;
 
 /// What became of a recording.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
@@ -28,20 +29,27 @@ pub struct Report {
     pub to: Option<PathBuf>,
     /// Size of the recording, bytes.
     pub bytes: u64,
-    /// Size of its verified prefix: all that was kept.
+    /// Bytes of it that are whole: all that was kept.
     pub verified_bytes: u64,
     /// Messages that were kept, by topic.
     pub messages: BTreeMap<String, u64>,
     /// Whether it says how its run ended.
     pub has_end: bool,
-    /// What stands behind the verified prefix, in words.
-    pub defect: Option<String>,
+    /// What is damaged, each with its place, in words.
+    pub damage: Vec<String>,
+    /// Bytes of the recording that were lost.
+    pub lost: Vec<Range<u64>>,
 }
 
 impl Report {
     /// Bytes that could not be kept.
     pub fn lost_bytes(&self) -> u64 {
         self.bytes - self.verified_bytes
+    }
+
+    /// Returns whether nothing was lost.
+    pub fn is_whole(&self) -> bool {
+        self.lost.is_empty() && self.damage.is_empty()
     }
 }
 
@@ -62,8 +70,10 @@ pub fn beside(from: &Path) -> PathBuf {
 pub fn recover(from: &Path, to: &Path) -> Result<Report, Error> {
     // What is being recorded goes on growing behind the copy.
     let _lock = lock(from)?;
-    let mut report = survey(from)?;
-    if !is_partial(from) && report.defect.is_none() && prove_file(from).is_ok() {
+    let survey = RecordingSurvey::read(from)?;
+    survey.manifest(from)?;
+    let mut report = survey.report(from);
+    if !is_partial(from) && report.is_whole() && prove_file(from).is_ok() {
         return Ok(report);
     }
     if to.exists() {
@@ -72,7 +82,7 @@ pub fn recover(from: &Path, to: &Path) -> Result<Report, Error> {
     let mut staged = to.as_os_str().to_owned();
     staged.push(".recovering");
     let staged = PathBuf::from(staged);
-    let made = rebuild(from, &staged, &report).and_then(|()| compare(&staged, &report));
+    let made = rebuild(from, &staged, &survey, &report).and_then(|()| compare(&staged, &report));
     let named = made.and_then(|()| publish(&staged, to));
     if let Err(error) = named {
         // Half a copy of what is whole elsewhere; the cause is told.
@@ -88,55 +98,13 @@ pub fn is_partial(path: &Path) -> bool {
     path.extension().is_some_and(|e| e == "partial")
 }
 
-// What there is to keep, without writing anything.
-fn survey(from: &Path) -> Result<Report, Error> {
-    let mut walk = PrefixReader::open(from)?;
-    let (mut messages, mut topics_by_id, mut has_manifest, mut has_end) =
-        (Counts::new(), BTreeMap::new(), false, false);
-    while let Some(item) = walk.next_item()? {
-        has_end |= is_end(&item);
-        match item {
-            PrefixItem::Metadata(m) => has_manifest |= m.name == topics::RUN_METADATA,
-            PrefixItem::Attachment(_) => {}
-            PrefixItem::Chunk(records) => {
-                for record in records {
-                    match record {
-                        Record::Channel(c) => drop(topics_by_id.insert(c.id, c.topic)),
-                        Record::Message { header, .. } => {
-                            if let Some(topic) = topics_by_id.get(&header.channel_id) {
-                                *messages.entry(topic.clone()).or_default() += 1;
-                            }
-                        }
-                        _ => {}
-                    }
-                }
-            }
-        }
-    }
-    // The first chunk has the topics, behind all that a run is described by.
-    if !has_manifest || topics_by_id.is_empty() {
-        let found = walk.defect.clone().unwrap_or_else(|| "it ends".to_owned());
-        let source = format!("{found}, before its first chunk is whole").into();
-        return Err(Error::Headless { path: from.to_owned(), source });
-    }
-    // What follows the data can be made anew from them.
-    let verified_bytes = if walk.ended { walk.size } else { walk.verified };
-    let (from, bytes, defect) = (from.to_owned(), walk.size, walk.defect);
-    Ok(Report { from, to: None, bytes, verified_bytes, messages, has_end, defect })
-}
-
-/// Messages of each topic in a file's verified prefix.
-pub(crate) fn messages(path: &Path) -> Result<Counts, Error> {
-    Ok(survey(path)?.messages)
-}
-
-fn rebuild(from: &Path, to: &Path, report: &Report) -> Result<(), Error> {
+fn rebuild(from: &Path, to: &Path, survey: &RecordingSurvey, report: &Report) -> Result<(), Error> {
     let failed = |e: McapError| Error::Write { path: to.to_owned(), source: system_cause(e) };
     let file = OpenOptions::new().write(true).create(true).truncate(true).open(to);
     let file = file.map_err(|e| failed(e.into()))?;
     let mut writer = ChunkWriter::new(file).map_err(failed)?;
-    let mut walk = PrefixReader::open(from)?;
-    let mut copy = Copy::new(&mut writer);
+    let mut walk = RecordingReader::open(from)?;
+    let mut copy = Copy::new(&mut writer, &survey.channels);
     while let Some(item) = walk.next_item()? {
         copy.take(item, &|_, _| true).map_err(failed)?;
     }
@@ -145,7 +113,7 @@ fn rebuild(from: &Path, to: &Path, report: &Report) -> Result<(), Error> {
         ("from", from.file_name().unwrap_or_default().to_string_lossy().into_owned()),
         ("bytes", report.bytes.to_string()),
         ("verified_bytes", report.verified_bytes.to_string()),
-        ("defect", report.defect.clone().unwrap_or_default()),
+        ("defect", report.damage.join("; ")),
     ];
     let metadata = record.map(|(key, value)| (key.to_owned(), value)).into();
     let noted = writer
@@ -159,9 +127,9 @@ fn rebuild(from: &Path, to: &Path, report: &Report) -> Result<(), Error> {
 fn compare(written: &Path, expected: &Report) -> Result<(), Error> {
     let unproven = |text: String| Error::Unproven { path: written.to_owned(), source: text.into() };
     prove_file(written).map_err(unproven)?;
-    let found = survey(written)?;
-    if found.messages != expected.messages || found.has_end != expected.has_end {
-        return Err(unproven(format!("it has {:?}, read were {:?}", found.messages, expected.messages)));
+    let found = RecordingSurvey::read(written)?;
+    if found.counts != expected.messages || found.has_end() != expected.has_end {
+        return Err(unproven(format!("it has {:?}, read were {:?}", found.counts, expected.messages)));
     }
     Ok(())
 }
@@ -180,7 +148,7 @@ fn publish(staged: &Path, to: &Path) -> Result<(), Error> {
 /// # Errors
 /// [`Error::Busy`] if somebody else holds the lock.
 pub(crate) fn lock(partial: &Path) -> Result<File, Error> {
-    let file = File::open(partial).map_err(|source| Error::Read { path: partial.to_owned(), source })?;
+    let file = File::open(partial).map_err(|e| Error::Read { path: partial.to_owned(), source: e.into() })?;
     match file.try_lock() {
         Err(TryLockError::WouldBlock) => Err(Error::Busy { path: partial.to_owned() }),
         // A file system without locks cannot tell.

@@ -1,4 +1,4 @@
-//! Files that are cut at any byte, or damaged, are rebuilt to what was whole before that, and nothing else.
+//! Files that are cut at any byte, or damaged, are rebuilt from what is whole of them, and nothing else.
 
 use std::path::Path;
 
@@ -9,7 +9,7 @@ use mcap::read::Options;
 use prost::Message as _;
 
 use super::*;
-use crate::run::recorder::{Held, Recorder, RunStart};
+use crate::run::recorder::{Held, Recorder, RunStart, SOFTWARE, Tried};
 
 /// Pairs of the run, one a checkpoint.
 const PAIRS: u32 = 20;
@@ -39,7 +39,7 @@ fn whole(path: &Path) -> Vec<u64> {
         run_id: RunId::compose(START, &surface, 1).expect("an id"),
         surface_id: surface,
         started: START,
-        software: "test".into(),
+        software: SOFTWARE.into(),
         rig: rig.name.clone(),
         origin: Origin::Simulated,
     };
@@ -111,12 +111,12 @@ fn a_whole_file_is_left_as_it_is() {
     whole(&path);
     let out = folder.path().join("out.mcap");
     let report = recover(&path, &out).expect("looked at");
-    assert!(report.to.is_none() && report.defect.is_none() && report.has_end && report.lost_bytes() == 0);
+    assert!(report.to.is_none() && report.is_whole() && report.has_end && report.lost_bytes() == 0);
     assert!(!out.exists());
 }
 
 #[test]
-fn damage_ends_what_is_kept_and_is_told() {
+fn damage_is_skipped_and_told() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("run.mcap");
     let checkpoints = whole(&path);
@@ -127,12 +127,156 @@ fn damage_ends_what_is_kept_and_is_told() {
     let out = beside(&path);
     assert_eq!(out, folder.path().join("run.recovered.mcap"));
     let report = recover(&path, &out).expect("rebuilt");
-    let defect = report.defect.clone().expect("a defect");
-    assert!(defect.contains(&format!("at byte {}", checkpoints[9])), "{defect}");
-    assert_eq!(report.lost_bytes(), bytes.len() as u64 - checkpoints[9]);
-    assert_eq!(pairs(&out)[0], (0..10).collect::<Vec<_>>());
+    assert!(report.damage.iter().any(|d| d.contains(&format!("at byte {}", checkpoints[9]))), "{:?}", report.damage);
+    let [lost] = &report.lost[..] else { panic!("{:?}", report.lost) };
+    assert_eq!((lost.start, lost.end < checkpoints[10]), (checkpoints[9], true));
+    let all: Vec<u32> = (0..PAIRS).collect();
+    let without: Vec<u32> = all.iter().copied().filter(|pair| *pair != 10).collect();
+    assert_eq!(pairs(&out), [all, without]);
+    // The pair whose response is lost is measured again.
+    let held = Held::read(&out).expect("a run with a plan");
+    assert_eq!((held.accepted(), held.pairs[&10]), (PAIRS as usize - 1, Tried { attempts: 1, accepted: false }));
     // Nothing is overwritten.
     assert!(matches!(recover(&path, &out), Err(Error::Exists { .. })));
+}
+
+/// The opcode and range of each record of a whole file.
+fn records(bytes: &[u8]) -> Vec<(u8, std::ops::Range<usize>)> {
+    let (mut found, mut at) = (Vec::new(), 8);
+    while at < bytes.len() - 8 {
+        let length = u64::from_le_bytes(bytes[at + 1..at + 9].try_into().expect("eight bytes")) as usize;
+        found.push((bytes[at], at..at + 9 + length));
+        at += 9 + length;
+    }
+    found
+}
+
+#[test]
+fn one_wrong_byte_costs_one_record_whether_the_file_was_closed_or_not() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("run.mcap");
+    let checkpoints = whole(&path);
+    let bytes = std::fs::read(&path).expect("read");
+    let (partial, out) = (folder.path().join("damaged.mcap.partial"), folder.path().join("damaged.mcap"));
+    let all: Vec<u32> = (0..PAIRS).collect();
+    let data = records(&bytes).into_iter().take_while(|(code, _)| *code != 0x0F);
+    let mut chunks = 0;
+    // Attachments, and chunks, the first of which describes the channels.
+    for (code, range) in data.filter(|(code, _)| matches!(code, 0x06 | 0x09)) {
+        chunks += usize::from(code == 0x06);
+        for at in [range.start + 2, range.start + 9 + 16, range.end - 20] {
+            for size in [bytes.len(), checkpoints[PAIRS as usize - 1] as usize] {
+                let mut damaged = bytes[..size].to_vec();
+                damaged[at] ^= 1;
+                std::fs::write(&partial, &damaged).expect("written");
+                let report = recover(&partial, &out).unwrap_or_else(|e| panic!("byte {at} of {code:#04x}: {e}"));
+                assert_eq!(report.lost, [range.start as u64..range.end as u64], "byte {at} of {code:#04x}: {report:?}");
+                assert!(!report.damage.is_empty(), "byte {at}");
+                assert_eq!(prove_file(&out), Ok(()), "byte {at}");
+                let [verdicts, responses] = pairs(&out);
+                let lost = 2 * PAIRS as usize - verdicts.len() - responses.len();
+                assert_eq!(lost, usize::from(code == 0x06 && chunks > 1), "byte {at}: {verdicts:?} {responses:?}");
+                assert!(verdicts.iter().chain(&responses).all(|pair| all.contains(pair)));
+                std::fs::remove_file(&out).expect("removed");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_chunk_that_was_never_closed_costs_itself() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("run.mcap");
+    let checkpoints = whole(&path);
+    let bytes = std::fs::read(&path).expect("read");
+    let partial = folder.path().join("open.mcap.partial");
+    for (begin, expected) in [(checkpoints[14] as usize, 15), (checkpoints[3] as usize, 4)] {
+        let mut open = bytes[..begin + 400].to_vec();
+        open[begin + 1..begin + 9].fill(0xFF);
+        open[begin + 9 + 16..begin + 9 + 24].fill(0xFF);
+        std::fs::write(&partial, &open).expect("written");
+        let (from, to) = (open.len() as u64, begin as u64);
+        let report = recover(&partial, &folder.path().join("out.mcap")).expect("rebuilt");
+        assert_eq!((report.lost, report.verified_bytes), (vec![to..from], to));
+        assert_eq!(report.damage, [format!("the file has a chunk that was never closed at byte {to}")]);
+        std::fs::remove_file(folder.path().join("out.mcap")).expect("removed");
+        let held = Held::read(&partial).expect("it can be resumed");
+        assert_eq!((held.accepted(), held.is_damaged()), (expected, false));
+    }
+}
+
+#[test]
+fn a_file_cut_within_its_summary_or_footer_loses_nothing() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("run.mcap");
+    whole(&path);
+    let bytes = std::fs::read(&path).expect("read");
+    let (_, end) = records(&bytes).into_iter().find(|(code, _)| *code == 0x0F).expect("the data end");
+    // A run without its end keeps its name; what becomes of it stands beside it.
+    let (cut_off, out) = (folder.path().join("cut.mcap"), folder.path().join("cut.recovered.mcap"));
+    for cut in (end.end..bytes.len()).step_by(97).chain([bytes.len() - 9, bytes.len() - 8, bytes.len() - 1]) {
+        std::fs::write(&cut_off, &bytes[..cut]).expect("written");
+        let report = recover(&cut_off, &beside(&cut_off)).unwrap_or_else(|e| panic!("cut at {cut}: {e}"));
+        assert!(report.is_whole() && report.lost_bytes() == 0, "cut at {cut}: {report:?}");
+        assert_eq!(pairs(&out)[0].len(), PAIRS as usize);
+        std::fs::remove_file(&out).expect("removed");
+    }
+}
+
+#[test]
+fn a_second_file_behind_the_first_is_named() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("run.mcap");
+    whole(&path);
+    let bytes = std::fs::read(&path).expect("read");
+    let size = bytes.len() as u64;
+    std::fs::write(&path, [&bytes[..], &bytes[..]].concat()).expect("written");
+    let report = recover(&path, &beside(&path)).expect("rebuilt");
+    assert_eq!(report.lost, [size..2 * size]);
+    assert!(report.damage[0].starts_with(&format!("another file begins at byte {size}")), "{:?}", report.damage);
+    assert_eq!(pairs(&beside(&path))[0].len(), PAIRS as usize);
+}
+
+#[test]
+fn a_manifest_that_is_lost_is_named_and_nothing_is_said_of_measurements() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("run.mcap.partial");
+    whole(&folder.path().join("whole.mcap"));
+    let mut bytes = std::fs::read(folder.path().join("whole.mcap")).expect("read");
+    let is_manifest = |range: &std::ops::Range<usize>| bytes[range.clone()].windows(12).any(|w| w == b"echolake.run");
+    let (_, manifest) =
+        records(&bytes).into_iter().find(|(code, r)| *code == 0x0C && is_manifest(r)).expect("it is there");
+    bytes[manifest.start + 9 + 5] ^= 1;
+    std::fs::write(&path, &bytes).expect("written");
+    let error = recover(&path, &beside(&path)).expect_err("no run").to_string();
+    assert!(error.contains("its manifest is missing or damaged, though"), "{error}");
+    assert!(!error.contains("no measurement"), "{error}");
+    let error = Recorder::resume(&path).map(|_| ()).expect_err("no run").to_string();
+    assert!(error.contains("its manifest is missing or damaged, though"), "{error}");
+}
+
+#[test]
+fn a_channel_that_is_used_again_for_something_else_is_refused() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("run.mcap");
+    whole(&path);
+    let bytes = std::fs::read(&path).expect("read");
+    let (_, last) = records(&bytes).into_iter().rfind(|(code, _)| *code == 0x06).expect("a chunk");
+    let mut other = std::io::Cursor::new(Vec::new());
+    let mut writer = mcap::Writer::new(&mut other).expect("a writer");
+    writer.add_schema_with_id(1, "other", "", b"").expect("added");
+    writer.add_channel_with_id(1, 1, "/other", "json", &BTreeMap::new()).expect("added");
+    writer.finish().expect("written");
+    drop(writer);
+    let other = other.into_inner();
+    let (_, chunk) = records(&other).into_iter().find(|(code, _)| *code == 0x06).expect("a chunk");
+    let spliced = [&bytes[..last.start], &other[chunk], &bytes[last.start..]].concat();
+    std::fs::write(&path, spliced).expect("written");
+    let error = recover(&path, &beside(&path)).expect_err("refused").to_string();
+    assert!(
+        error.contains(&format!("the chunk at byte {}: ", last.start)) && error.contains("is used again"),
+        "{error}"
+    );
 }
 
 #[test]
@@ -163,7 +307,7 @@ fn what_is_no_run_is_refused() {
 }
 
 #[test]
-fn a_run_is_gone_on_with_behind_what_is_safe() {
+fn a_run_is_resumed_behind_what_is_safe() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("run.mcap");
     let checkpoints = whole(&path);
@@ -194,4 +338,36 @@ fn a_run_is_gone_on_with_behind_what_is_safe() {
         assert_eq!((held.accepted(), held.attempts), (PAIRS as usize, u64::from(PAIRS)));
         std::fs::remove_file(&path).expect("removed");
     }
+}
+
+#[test]
+fn what_is_lost_in_the_middle_is_measured_again() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("run.mcap");
+    let checkpoints = whole(&path);
+    let mut bytes = std::fs::read(&path).expect("read")[..checkpoints[15] as usize].to_vec();
+    std::fs::remove_file(&path).expect("removed");
+    let chunks: Vec<_> =
+        records(&[&bytes[..], &[0; 8]].concat()).into_iter().filter(|(code, _)| *code == 0x06).collect();
+    // The channels; the responses of the first pair; the verdict of the fifth.
+    for chunk in [&chunks[0].1, &chunks[1].1, &chunks[10].1] {
+        bytes[chunk.end - 30] ^= 8;
+    }
+    let partial = folder.path().join("run.mcap.partial");
+    std::fs::write(&partial, &bytes).expect("written");
+    let (mut recorder, held) = Recorder::resume(&partial).expect("resumed");
+    assert_eq!((held.accepted(), held.is_damaged(), held.lost.len()), (14, true, 3));
+    let again: Vec<u32> = (0..PAIRS).filter(|pair| held.pairs.get(pair).is_none_or(|tried| !tried.accepted)).collect();
+    assert_eq!(again, [0, 4, 16, 17, 18, 19]);
+    for pair in again {
+        let number = held.pairs.get(&pair).map_or(1, |tried| tried.attempts + 1);
+        attempt(&mut recorder, pair, number);
+    }
+    recorder.finish(&end()).expect("finished");
+    assert_eq!(prove_file(&path), Ok(()));
+    let mut found = pairs(&path);
+    found.iter_mut().for_each(|pairs| pairs.sort_unstable());
+    // The first verdict is there, whose response was lost, and the second.
+    let expected: Vec<u32> = (0..PAIRS).collect();
+    assert_eq!(found, [[&[0], &expected[..]].concat(), expected]);
 }

@@ -9,8 +9,8 @@ use std::path::{Path, PathBuf};
 use bytes::Bytes;
 use echolake_recording::limits::LARGEST_CHUNK;
 use echolake_recording::{
-    Channel, ChannelDefinitions, ChunkIndex, DecodedChunk, FRAME_BYTES, PrefixError, PrefixItem, PrefixReader, Record,
-    RunSummary, summary_range, tail_range,
+    Channel, ChannelDefinitions, ChunkIndex, DecodedChunk, FRAME_BYTES, Record, RecordingItem, RecordingReader,
+    ResyncError, RunSummary, summary_range, tail_range,
 };
 
 use super::error::Error;
@@ -54,8 +54,8 @@ pub(super) struct Message {
 }
 
 impl Recording {
-    /// Opens a file and reads its index. One without, because it was cut off, is walked through, and what is whole of it
-    /// is replayed.
+    /// Opens a file and reads its index. One without, because it was cut off or is damaged, is walked through, and what is
+    /// whole of it is replayed.
     ///
     /// # Errors
     /// [`Error::Read`], or [`Error::Unplayable`] where there is not one whole message.
@@ -176,33 +176,50 @@ type Walked = (BTreeMap<u16, Topic>, Vec<Stretch>, Option<String>);
 
 // The index of a file that has none.
 fn walked(path: &Path) -> Result<Walked, Error> {
-    let unplayable = |e: PrefixError| match e {
-        PrefixError::Read { path, source } => Error::Read { path, source },
-        PrefixError::Headless { path, bytes } => {
-            Error::Unplayable { path, reason: format!("it is no MCAP file, or only {bytes} bytes of one") }
-        }
+    let unread = |e: ResyncError| {
+        let reason = match e {
+            ResyncError::Read { source, .. } => source.to_string(),
+            ResyncError::Gone { .. } => "it is gone".to_owned(),
+            ResyncError::NotMcap { actual, .. } => format!("it is no MCAP file: it begins with {actual}"),
+        };
+        Error::Unplayable { path: path.to_owned(), reason }
     };
-    let mut walk = PrefixReader::open(path).map_err(unplayable)?;
+    let mut walk = RecordingReader::open(path).map_err(unread)?;
     let mut definitions = ChannelDefinitions::default();
     let mut chunks = Vec::new();
-    while let Some(item) = walk.next_item().map_err(unplayable)? {
-        let PrefixItem::Chunk(records) = item else { continue };
+    while let Some(item) = walk.next_item().map_err(unread)? {
+        let chunk = match item {
+            RecordingItem::Chunk(chunk) => chunk,
+            // Those of a chunk have a CRC and count for more.
+            RecordingItem::Definition(record) => {
+                let _ = definitions.learn(&record);
+                continue;
+            }
+            _ => continue,
+        };
         let mut times = Vec::new();
         let mut channels = BTreeSet::new();
-        for record in records {
-            definitions.learn(&record);
+        for record in &chunk.records {
+            definitions.learn(record).map_err(|what| Error::Unplayable {
+                path: path.to_owned(),
+                reason: format!("the chunk at byte {}: {what}", chunk.offset),
+            })?;
             if let Record::Message { header, .. } = record {
                 times.push(header.log_time);
                 channels.insert(header.channel_id);
             }
         }
         if let (Some(start), Some(end)) = (times.iter().copied().min(), times.iter().copied().max()) {
-            let (offset, length) = (walk.item, walk.verified - walk.item);
+            let (offset, length) = (chunk.offset, chunk.length);
             chunks.push(Stretch { start, end, offset, length, channels: Some(channels) });
         }
     }
     // What was closed, yet has no chunks, is of another make, not damaged.
-    let defect = walk.defect.take().or_else(|| (!chunks.is_empty()).then(|| "it has no index".to_owned()));
+    let damage = walk.finish().map_err(unread)?.damage;
+    let defect = match damage.is_empty() {
+        true => (!chunks.is_empty()).then(|| "it has no index".to_owned()),
+        false => Some(damage.join("; ")),
+    };
     Ok((topics_of(definitions.into_channels().values().map(|c| c.as_ref())), chunks, defect))
 }
 

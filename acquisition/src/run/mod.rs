@@ -124,7 +124,7 @@ impl RunRequest<'_> {
             run_id: self.run_id()?,
             surface_id: self.surface.clone(),
             started: self.start,
-            software: concat!("echolake ", env!("CARGO_PKG_VERSION")).to_owned(),
+            software: recorder::SOFTWARE.to_owned(),
             rig: self.rig.name.clone(),
             origin: devices.origin,
         };

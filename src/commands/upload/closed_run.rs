@@ -6,7 +6,7 @@ use std::path::Path;
 
 use anyhow::{Context as _, bail, ensure};
 use echolake_acquisition::recovery::is_partial;
-use echolake_recording::{PrefixItem, PrefixReader, summary_range, tail_range};
+use echolake_recording::{RecordingItem, RecordingReader, summary_range, tail_range};
 use echolake_schema::manifest::RunManifest;
 use echolake_schema::{Rig, topics};
 
@@ -25,21 +25,21 @@ impl ClosedRun {
             "`{name}` is an unfinished recording, expected a closed run (.mcap); hint: `echolake acquire --resume {name}` \
              resumes it, `echolake recover {name}` makes a run of what it holds"
         );
-        let mut reader = PrefixReader::open(path)?;
+        let mut reader = RecordingReader::open(path)?;
         ensure!(
-            has_end(path, reader.size)?,
+            has_end(path)?,
             "`{name}` was not closed: it has no summary at its end; hint: `echolake recover {name}` makes a run of what it \
              holds"
         );
         let (mut manifest, mut rig) = (None, None);
         while manifest.is_none() || rig.is_none() {
             match reader.next_item()? {
-                Some(PrefixItem::Metadata(record)) if record.name == topics::RUN_METADATA => {
+                Some(RecordingItem::Metadata(record)) if record.name == topics::RUN_METADATA => {
                     let found = RunManifest::from_metadata(&record.metadata);
                     manifest = Some(found.with_context(|| format!("`{name}` is no run that this version knows"))?);
                 }
-                Some(PrefixItem::Attachment(attachment)) if attachment.name == topics::RIG_ATTACHMENT => {
-                    let text = String::from_utf8(attachment.data.into_owned());
+                Some(RecordingItem::Attachment(attachment)) if attachment.name == topics::RIG_ATTACHMENT => {
+                    let text = String::from_utf8(attachment.data.to_vec());
                     let found = text.map_err(anyhow::Error::from).and_then(|text| Ok(Rig::from_toml(&text)?));
                     rig = Some(found.with_context(|| format!("the rig in `{name}`"))?);
                 }
@@ -47,12 +47,13 @@ impl ClosedRun {
                 None => break,
             }
         }
-        match (manifest, rig) {
-            (Some(manifest), Some(rig)) => Ok(Self { manifest, rig }),
-            _ if reader.defect.is_some() => bail!(
-                "`{name}` is damaged: {}; hint: `echolake recover {name}` makes a run of what it holds",
-                reader.defect.unwrap_or_default()
-            ),
+        if let (Some(manifest), Some(rig)) = (manifest, rig) {
+            return Ok(Self { manifest, rig });
+        }
+        match reader.finish()?.damage.first() {
+            Some(damage) => {
+                bail!("`{name}` is damaged: {damage}; hint: `echolake recover {name}` makes a run of what it holds")
+            }
             _ => bail!(
                 "`{name}` is an MCAP file but no run of echolake: it has no metadata `{}` or no attachment `{}`; hint: only \
                  recordings of `echolake acquire` and `echolake import` are uploaded",
@@ -63,13 +64,14 @@ impl ClosedRun {
     }
 }
 
-fn has_end(path: &Path, bytes: u64) -> anyhow::Result<bool> {
+fn has_end(path: &Path) -> anyhow::Result<bool> {
     let read = || {
         let (mut file, mut tail) = (File::open(path)?, Vec::new());
+        let bytes = file.metadata()?.len();
         file.seek(SeekFrom::Start(tail_range(bytes).start))?;
         file.take(bytes).read_to_end(&mut tail)?;
-        Ok::<_, std::io::Error>(tail)
+        Ok::<_, std::io::Error>((tail, bytes))
     };
-    let tail = read().with_context(|| format!("cannot read `{}`", path.display()))?;
+    let (tail, bytes) = read().with_context(|| format!("cannot read `{}`", path.display()))?;
     Ok(summary_range(&tail, bytes).is_some())
 }

@@ -1,9 +1,10 @@
 //! The topics of a run's file and their schemas.
 
-use std::fs::File;
-use std::io::BufWriter;
+use std::collections::BTreeMap;
+use std::io::{Cursor, Seek, Write};
+use std::sync::Arc;
 
-use echolake_recording::{ChunkLane, McapResult, Writer};
+use echolake_recording::{Channel, ChunkLane, McapResult, RunSummary, Writer, summary_range};
 use echolake_schema::messages::{
     AmbientSample, FILE_DESCRIPTOR_SET, ImpulseResponse, Measurement, Message as RunMessage, SweepRecording,
 };
@@ -57,7 +58,7 @@ impl Channels {
     }
 
     /// Declares every topic, so that a reader knows all of them whatever the run holds.
-    pub(super) fn register(writer: &mut Writer<BufWriter<File>>) -> McapResult<Self> {
+    pub(super) fn register(writer: &mut Writer<impl Write + Seek>) -> McapResult<Self> {
         use foxglove::messages as fg;
         Ok(Self {
             tf: foxglove_channel::<fg::FrameTransforms>(writer, topics::TF)?,
@@ -75,7 +76,21 @@ impl Channels {
     }
 }
 
-pub(super) fn foxglove_channel<M: Encode>(writer: &mut Writer<BufWriter<File>>, topic: &str) -> McapResult<u16> {
+/// Returns the channels that every run of this version has, by the ids that they have in each.
+pub(crate) fn own_channels() -> BTreeMap<u16, Arc<Channel<'static>>> {
+    let mut file = Cursor::new(Vec::new());
+    let written = Writer::new(&mut file).and_then(|mut writer| {
+        Channels::register(&mut writer)?;
+        writer.finish()
+    });
+    // Memory is written without fail.
+    let file = written.map(|_| file.into_inner()).unwrap_or_default();
+    let range = summary_range(&file, file.len() as u64);
+    let summary = range.and_then(|range| RunSummary::parse(&file[range.start as usize..]).ok());
+    summary.unwrap_or_default().channels
+}
+
+pub(super) fn foxglove_channel<M: Encode>(writer: &mut Writer<impl Write + Seek>, topic: &str) -> McapResult<u16> {
     let schema = match M::get_schema() {
         Some(schema) => writer.add_schema(&schema.name, &schema.encoding, &schema.data)?,
         None => 0,
@@ -83,7 +98,7 @@ pub(super) fn foxglove_channel<M: Encode>(writer: &mut Writer<BufWriter<File>>, 
     writer.add_channel(schema, topic, &M::get_message_encoding(), &Default::default())
 }
 
-fn own_channel<M: RunMessage>(writer: &mut Writer<BufWriter<File>>, topic: &str) -> McapResult<u16> {
+fn own_channel<M: RunMessage>(writer: &mut Writer<impl Write + Seek>, topic: &str) -> McapResult<u16> {
     let schema = writer.add_schema(M::FULL_NAME, "protobuf", FILE_DESCRIPTOR_SET)?;
     writer.add_channel(schema, topic, "protobuf", &Default::default())
 }

@@ -28,9 +28,13 @@ use crate::disk::{folder_of, sync};
 use crate::panel::mesh::Mesh;
 use crate::panel::relief::HeightField;
 use channels::Channels;
+pub(crate) use channels::own_channels;
 pub use error::Error;
 pub use resume::{Held, Tried};
 pub use sealed::Sealed;
+
+/// The program that records, as manifests name it.
+pub(crate) const SOFTWARE: &str = concat!("echolake ", env!("CARGO_PKG_VERSION"));
 
 /// `/sweep/audio` is played this many times slower: at a scale of 1:10, 2-40 kHz become 200 Hz to 4 kHz.
 const SLOWER: f64 = 10.0;

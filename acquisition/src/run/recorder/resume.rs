@@ -1,10 +1,14 @@
-//! A recording that is gone on with: what is safe in it, and a recorder that writes behind that.
+//! A recording that is resumed: what is safe in it, and a recorder that writes behind that.
 
 use std::collections::{BTreeMap, HashSet};
 use std::fs::OpenOptions;
+use std::ops::Range;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
-use echolake_recording::{ChunkLane, ChunkWriter, MessageHeader, PrefixItem, PrefixReader, Record, system_cause};
+use echolake_recording::{
+    Channel, ChunkLane, ChunkWriter, MessageHeader, Record, RecordingItem, RecordingReader, system_cause,
+};
 use echolake_schema::manifest::RunManifest;
 use echolake_schema::messages::{Measurement, Verdict};
 use echolake_schema::{ErrorCause, Rig, Timestamp, topics};
@@ -13,12 +17,12 @@ use prost::Message as _;
 use super::Recorder;
 use super::channels::Channels;
 use crate::disk::{folder_of, sync};
-use crate::recovery::{Copy, Error, is_end, lock};
+use crate::recovery::{Copy, Error, RecordingSurvey, is_end, lock};
 
 /// What the name of a recording ends in until it is whole.
 const PARTIAL: &str = "partial";
 
-/// What a recording that was broken off holds: its verified prefix.
+/// What a recording that was broken off holds: all of it that is whole.
 #[derive(Debug, Clone)]
 pub struct Held {
     /// The run.
@@ -33,8 +37,13 @@ pub struct Held {
     pub attempts: u64,
     /// Time of the last message.
     pub last: Timestamp,
-    /// Size of the verified prefix, bytes, and of the file.
-    pub bytes: [u64; 2],
+    /// Size of the file, bytes.
+    pub bytes: u64,
+    /// What is damaged, each with its place, in words.
+    pub damage: Vec<String>,
+    /// Bytes that are lost.
+    pub lost: Vec<Range<u64>>,
+    channels: BTreeMap<u16, Arc<Channel<'static>>>,
     /// Times of the verdicts; sweeps and responses of other times are of attempts that nobody acknowledged.
     times: HashSet<u64>,
 }
@@ -52,40 +61,42 @@ impl Held {
     /// Reads what a recording holds; nothing is written.
     ///
     /// # Errors
-    /// [`Error::Headless`] where it was broken off before its first checkpoint, [`Error::NoPlan`] where it was not
-    /// begun as a run that can be gone on with.
+    /// [`Error::Headless`] if it was broken off before its first checkpoint, [`Error::Unusable`] if its manifest cannot be
+    /// read, [`Error::NoPlan`] if it was not begun as a run that can be resumed, or its plan or rig cannot be read.
     pub fn read(partial: &Path) -> Result<Self, Error> {
-        let mut walk = PrefixReader::open(partial)?;
+        let mut survey = RecordingSurvey::read(partial)?;
+        let manifest = survey.manifest(partial)?;
+        let no_plan = |source: ErrorCause| Error::NoPlan { path: partial.to_owned(), source };
+        let rig = survey.rig.take().ok_or_else(|| no_plan("its rig is missing or damaged".into()))?;
+        let rig = Rig::from_toml(&rig).map_err(|e| no_plan(e.into()))?;
+        let plan = survey.metadata.remove(topics::RUN_PLAN_METADATA);
+        let plan = plan.ok_or_else(|| no_plan("it does not say what was planned".into()))?;
         let mut seen = Seen::default();
+        let mut walk = RecordingReader::open(partial)?;
         while let Some(item) = walk.next_item()? {
-            match item {
-                PrefixItem::Chunk(records) => records.iter().for_each(|record| seen.learn(record)),
-                PrefixItem::Metadata(m) => drop(seen.metadata.insert(m.name, m.metadata)),
-                PrefixItem::Attachment(a) if a.name == topics::RIG_ATTACHMENT => seen.rig = Some(a.data.into_owned()),
-                PrefixItem::Attachment(_) => {}
+            if let RecordingItem::Chunk(chunk) = item {
+                chunk.records.iter().for_each(|record| seen.learn(record, &survey.channels));
             }
         }
-        let headless = |source: ErrorCause| Error::Headless { path: partial.to_owned(), source };
-        let begins = |what: &str| headless(format!("it has no {what}").into());
-        let record = seen.metadata.get(topics::RUN_METADATA).ok_or_else(|| begins("manifest"))?;
-        let manifest = RunManifest::from_metadata(record).map_err(|e| headless(e.into()))?;
-        let rig = seen.rig.and_then(|bytes| String::from_utf8(bytes).ok()).ok_or_else(|| begins("rig"))?;
-        let rig = Rig::from_toml(&rig).map_err(|e| headless(e.into()))?;
-        if !seen.channels.values().any(|topic| topic == topics::MEASUREMENT) {
-            return Err(begins("chunk that is whole"));
-        }
-        let no_plan = || Error::NoPlan { path: partial.to_owned(), source: "it does not say what was planned".into() };
+        let (lost, bytes) = survey.lost();
         Ok(Self {
-            plan: seen.metadata.remove(topics::RUN_PLAN_METADATA).ok_or_else(no_plan)?,
+            plan,
             last: Timestamp(seen.last.max(manifest.started.0)),
             manifest,
             rig,
-            pairs: seen.pairs,
-            attempts: seen.attempts,
-            // A recorder that ends in order writes a summary behind its data; it is made anew.
-            bytes: [if walk.ended { walk.size } else { walk.verified }, walk.size],
-            times: seen.times,
+            attempts: seen.verdicts.len() as u64,
+            times: seen.verdicts.iter().map(|(time, _)| *time).collect(),
+            pairs: seen.pairs(),
+            bytes,
+            damage: survey.damage().to_vec(),
+            lost: lost.to_vec(),
+            channels: survey.channels,
         })
+    }
+
+    /// Returns whether more than its end is damaged, which may be what was being written.
+    pub fn is_damaged(&self) -> bool {
+        self.lost.iter().any(|range| range.end < self.bytes)
     }
 
     /// Pairs with an accepted measurement: they are safe and are not measured again.
@@ -97,39 +108,42 @@ impl Held {
 /// What the walk has come by.
 #[derive(Default)]
 struct Seen {
-    metadata: BTreeMap<String, BTreeMap<String, String>>,
-    rig: Option<Vec<u8>>,
-    channels: BTreeMap<u16, String>,
-    pairs: BTreeMap<u32, Tried>,
-    attempts: u64,
-    times: HashSet<u64>,
+    /// Verdicts with their times.
+    verdicts: Vec<(u64, Measurement)>,
+    /// Times of sweeps and responses.
+    recorded: HashSet<u64>,
     last: i64,
 }
 
 impl Seen {
-    fn learn(&mut self, record: &Record<'_>) {
-        match record {
-            Record::Channel(channel) => drop(self.channels.insert(channel.id, channel.topic.clone())),
-            Record::Message { header, data } => {
-                self.last = self.last.max(i64::try_from(header.log_time).unwrap_or(i64::MAX));
-                let is_verdict = self.channels.get(&header.channel_id).is_some_and(|t| t == topics::MEASUREMENT);
-                if let (true, Ok(m)) = (is_verdict, Measurement::decode(&data[..])) {
-                    self.times.insert(header.log_time);
-                    self.attempts += 1;
-                    let tried = self.pairs.entry(m.pair_id).or_insert(Tried { attempts: 0, accepted: false });
-                    tried.attempts = tried.attempts.max(m.attempt);
-                    tried.accepted |= m.verdict() == Verdict::Accepted;
-                }
+    fn learn(&mut self, record: &Record<'_>, channels: &BTreeMap<u16, Arc<Channel<'static>>>) {
+        let Record::Message { header, data } = record else { return };
+        self.last = self.last.max(i64::try_from(header.log_time).unwrap_or(i64::MAX));
+        match channels.get(&header.channel_id).map(|channel| channel.topic.as_str()) {
+            Some(topics::SWEEP | topics::IR) => drop(self.recorded.insert(header.log_time)),
+            Some(topics::MEASUREMENT) => {
+                self.verdicts.extend(Measurement::decode(&data[..]).ok().map(|m| (header.log_time, m)));
             }
             _ => {}
         }
     }
+
+    // A verdict whose sweep and response are lost accepts nothing: the pair is measured again.
+    fn pairs(&self) -> BTreeMap<u32, Tried> {
+        let mut pairs = BTreeMap::new();
+        for (time, verdict) in &self.verdicts {
+            let tried = pairs.entry(verdict.pair_id).or_insert(Tried { attempts: 0, accepted: false });
+            tried.attempts = tried.attempts.max(verdict.attempt);
+            tried.accepted |= verdict.verdict() == Verdict::Accepted && self.recorded.contains(time);
+        }
+        pairs
+    }
 }
 
 impl Recorder {
-    /// Goes on with a recording, behind all that is safe in it. What follows its verified prefix, and what stands in
-    /// it of attempts without a verdict, is left behind. The file is replaced by a copy that is on the disk; until
-    /// then it is as it was, whatever happens.
+    /// Resumes a recording behind all that is safe in it. What is damaged, and what stands in it of attempts without a
+    /// verdict, is left behind. The file is replaced by a copy that is on the disk; until then it is as it was, whatever
+    /// happens.
     ///
     /// # Errors
     /// As [`Held::read`]; [`Error::Busy`] where somebody records it, [`Error::Finished`] where the run is whole already,
@@ -164,8 +178,8 @@ impl Recorder {
         // As in Recorder::create.
         let _ = file.try_lock();
         let mut writer = ChunkWriter::new(file).map_err(|e| failed(system_cause(e)))?;
-        let mut walk = PrefixReader::open(partial)?;
-        let mut taken = Copy::new(&mut writer);
+        let mut walk = RecordingReader::open(partial)?;
+        let mut taken = Copy::new(&mut writer, &held.channels);
         let acknowledged =
             |part: ChunkLane, header: &MessageHeader| part == ChunkLane::Light || held.times.contains(&header.log_time);
         while let Some(item) = walk.next_item()? {

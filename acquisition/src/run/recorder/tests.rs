@@ -15,7 +15,7 @@ use rs_opw_kinematics::glam;
 
 use super::*;
 use crate::rig::robots::Choreography;
-use echolake_recording::{PrefixItem, PrefixReader};
+use echolake_recording::{RecordingItem, RecordingReader};
 
 const START: Timestamp = Timestamp(1_767_600_000_123_456_789);
 const MICROPHONE_MM: [f64; 3] = [-187.5, 37.5, 124.0];
@@ -494,11 +494,11 @@ fn heavy_topics_have_chunks_of_their_own_before_their_verdicts() {
     let cut_off = folder.path().join("cut.mcap");
     for cut in (0..file.len()).step_by(file.len() / 41) {
         std::fs::write(&cut_off, &file[..cut]).expect("written");
-        let Ok(mut walk) = PrefixReader::open(&cut_off) else { continue };
+        let Ok(mut walk) = RecordingReader::open(&cut_off) else { continue };
         let (mut names, mut seen) = (BTreeMap::new(), std::collections::BTreeSet::new());
         while let Some(item) = walk.next_item().expect("readable") {
-            let PrefixItem::Chunk(records) = item else { continue };
-            for record in records {
+            let RecordingItem::Chunk(chunk) = item else { continue };
+            for record in chunk.records {
                 match record {
                     Record::Channel(channel) => drop(names.insert(channel.id, channel.topic)),
                     Record::Message { header, .. } => {

@@ -4,11 +4,11 @@
 use std::fs::OpenOptions;
 use std::path::Path;
 
-use echolake_recording::{ChunkWriter, PrefixReader, prove_file};
+use echolake_recording::{ChunkWriter, RecordingReader, prove_file};
 use echolake_schema::ErrorCause;
 
 use crate::disk::{folder_of, free_bytes, sync};
-use crate::recovery::Copy;
+use crate::recovery::{Copy, RecordingSurvey};
 
 /// Puts a whole recording's messages into larger chunks. Until the copy is proven and on the disk the recording is as
 /// it was; so it is where an error is returned.
@@ -23,23 +23,23 @@ pub(super) fn with_larger_chunks(partial: &Path, path: &Path) -> Result<(), Erro
 }
 
 fn copied(partial: &Path, copy: &Path) -> Result<(), ErrorCause> {
-    let mut walk = PrefixReader::open(partial)?;
-    if free_bytes(folder_of(copy)).is_ok_and(|free| free < walk.size) {
+    let survey = RecordingSurvey::read(partial)?;
+    if let Some(damage) = survey.damage().first() {
+        return Err(damage.clone().into());
+    }
+    if free_bytes(folder_of(copy)).is_ok_and(|free| free < survey.lost().1) {
         return Err("there is no room for a copy".into());
     }
     let file = OpenOptions::new().write(true).create(true).truncate(true).open(copy)?;
     let mut writer = ChunkWriter::new(file)?;
-    let mut taken = Copy::new(&mut writer);
+    let mut taken = Copy::new(&mut writer, &survey.channels);
+    let mut walk = RecordingReader::open(partial)?;
     while let Some(item) = walk.next_item()? {
         taken.take(item, &|_, _| true)?;
     }
-    let counts = taken.counts;
-    if let Some(defect) = walk.defect {
-        return Err(defect.into());
-    }
     writer.finish()?;
     prove_file(copy)?;
-    if crate::recovery::messages(copy)? != counts {
+    if RecordingSurvey::read(copy)?.counts != survey.counts {
         return Err("the copy has other messages".into());
     }
     std::fs::rename(copy, partial)?;
