@@ -44,6 +44,9 @@ pub use record_frame::{FRAME_BYTES, RecordFrame};
 pub use record_splitter::{RecordSplitter, SplitRecord};
 pub use recording_reader::{RecordingItem, RecordingReader, WholeChunk};
 pub use resync_reader::{
-    FileIntegrity, LargeRecordPermit, RawChunk, ResyncError, ResyncItem, ResyncReader, StoredAttachment, list_damage,
+    FileIntegrity, LargeRecordPermit, RawChunk, ResyncError, ResyncItem, ResyncReader, StoredAttachment, find_part,
+    list_damage,
 };
-pub use summary::{ChannelDefinitions, FILE_END_BYTES, RunSummary, has_file_end, summary_range, tail_range};
+pub use summary::{
+    ChannelDefinitions, FILE_END_BYTES, RunSummary, definition_digest, has_file_end, summary_range, tail_range,
+};

@@ -44,6 +44,12 @@ impl RecordSplitter {
         self.offset
     }
 
+    /// Returns the byte of the file at which the next record ends, if its frame is there.
+    pub fn claimed_end(&self) -> Option<u64> {
+        let frame = self.buffer.get(..FRAME_BYTES).map(RecordFrame::read)?;
+        Some(self.offset.saturating_add(frame.length).saturating_add(FRAME_BYTES as u64))
+    }
+
     /// Takes the file's next bytes.
     pub fn push(&mut self, block: &[u8]) {
         self.buffer.extend_from_slice(block);

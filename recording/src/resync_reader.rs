@@ -684,6 +684,22 @@ fn look(bytes: &[u8], left: u64) -> RecordShape {
     }
 }
 
+/// Searches bytes of a file, of which `left` are left from the first on, for a whole chunk, or for the magic bytes with
+/// something behind them: for what a reader that ends in front of them would leave out. Returns its position, or the
+/// number of positions at which there is none.
+///
+/// # Errors
+/// Nothing was found.
+pub fn find_part(bytes: &[u8], left: u64) -> Result<usize, usize> {
+    let behind = if bytes.len() as u64 >= left { FRAME_BYTES } else { FRAME_BYTES + PREFIX_BYTES };
+    let count = (bytes.len() + 1).saturating_sub(behind);
+    let is_part = |at: &usize| match bytes[*at] {
+        op::CHUNK => look(&bytes[*at..], left - *at as u64) == RecordShape::Sound,
+        _ => bytes[*at..].starts_with(MAGIC) && left - *at as u64 > MAGIC.len() as u64,
+    };
+    (0..count).find(is_part).ok_or(count)
+}
+
 /// Adds a line to what is said of a file's damage, up to a limit.
 pub fn list_damage(lines: &mut Vec<String>, line: impl FnOnce() -> String) {
     match lines.len() {

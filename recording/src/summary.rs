@@ -32,6 +32,8 @@ pub struct RunSummary {
     pub statistics: Option<Statistics>,
     /// Channels with their schemas, by id. The first definition of an id counts.
     pub channels: BTreeMap<u16, Arc<Channel<'static>>>,
+    /// The digest of each schema and channel, by its opcode and id.
+    pub digests: BTreeMap<(u8, u16), u32>,
     /// Number of schemas that it describes.
     pub schema_count: usize,
     /// A channel whose schema it does not describe.
@@ -111,7 +113,10 @@ impl RunSummary {
                         Record::ChunkIndex(index) => found.chunk_indexes.push(index),
                         Record::AttachmentIndex(index) => found.attachment_indexes.push(index),
                         Record::MetadataIndex(index) => found.metadata_indexes.push(index),
-                        other => definitions.learn(&other).map_err(McapError::ConflictingChannels)?,
+                        other => {
+                            definitions.learn(&other).map_err(McapError::ConflictingChannels)?;
+                            found.digests.extend(definition_digest(&other).map(|(code, id, crc)| ((code, id), crc)));
+                        }
                     }
                 }
             }
@@ -201,6 +206,30 @@ fn indexed_messages(chunk: &ChunkIndex) -> Option<u64> {
     let frames = INDEX_FRAME.checked_mul(chunk.message_index_offsets.len() as u64)?;
     let entries = chunk.message_index_length.checked_sub(frames)?;
     entries.is_multiple_of(INDEX_ENTRY).then_some(entries / INDEX_ENTRY)
+}
+
+/// Returns the opcode of a schema or channel, its id, and a digest of all that messages are read by.
+pub fn definition_digest(record: &Record<'_>) -> Option<(u8, u16, u32)> {
+    match record {
+        Record::Schema { header, data } => {
+            Some((op::SCHEMA, header.id, digest_of([header.name.as_bytes(), header.encoding.as_bytes(), data])))
+        }
+        Record::Channel(channel) => {
+            let parts =
+                [channel.topic.as_bytes(), channel.message_encoding.as_bytes(), &channel.schema_id.to_le_bytes()];
+            Some((op::CHANNEL, channel.id, digest_of(parts)))
+        }
+        _ => None,
+    }
+}
+
+fn digest_of(parts: [&[u8]; 3]) -> u32 {
+    let mut digest = crc32fast::Hasher::new();
+    for part in parts {
+        digest.update(&part.len().to_le_bytes());
+        digest.update(part);
+    }
+    digest.finalize()
 }
 
 fn is_same_channel(one: &mcap::records::Channel, other: &mcap::records::Channel) -> bool {

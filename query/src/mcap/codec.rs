@@ -108,6 +108,19 @@ struct SourceMessage {
     described: Vec<u32>,
     #[prost(message, repeated, tag = "4")]
     channels: Vec<ChannelMessage>,
+    #[prost(message, repeated, tag = "5")]
+    digests: Vec<DigestMessage>,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct DigestMessage {
+    /// The opcode of a schema or channel.
+    #[prost(uint32, tag = "1")]
+    code: u32,
+    #[prost(uint32, tag = "2")]
+    id: u32,
+    #[prost(uint32, tag = "3")]
+    digest: u32,
 }
 
 #[derive(Clone, PartialEq, Message)]
@@ -220,11 +233,17 @@ impl SourceMessage {
             topic: topic.clone(),
             mapping: *mapping as u64,
         };
+        let digest = |((code, id), digest): (&(u8, u16), &u32)| DigestMessage {
+            code: u32::from(*code),
+            id: u32::from(*id),
+            digest: *digest,
+        };
         Self {
             path: source.path.to_string(),
             run: source.run.iter().flat_map(|(surface, run)| [surface.clone(), run.clone()]).collect(),
             described: source.described.iter().map(|id| u32::from(*id)).collect(),
             channels: source.channels.iter().map(channel).collect(),
+            digests: source.digests.iter().map(digest).collect(),
         }
     }
 
@@ -248,7 +267,12 @@ impl SourceMessage {
             }
             channels.insert(number(channel.id)?, (channel.topic, channel.mapping as usize));
         }
-        Ok(Source { run, path, described, channels })
+        let mut digests = BTreeMap::new();
+        for DigestMessage { code, id, digest } in self.digests {
+            let code = u8::try_from(code).map_err(|_| wrong("opcodes have 8 bits"))?;
+            digests.insert((code, number(id)?), digest);
+        }
+        Ok(Source { run, path, described, digests, channels })
     }
 }
 

@@ -1,6 +1,7 @@
 //! Why messages of an MCAP file cannot be given as rows.
 
 use datafusion::error::DataFusionError;
+use echolake_schema::escape_controls;
 
 use crate::Error;
 
@@ -79,8 +80,10 @@ impl Fault {
 impl From<Fault> for Error {
     fn from(fault: Fault) -> Self {
         match fault {
-            Fault::Call { what, hint } => Self::Query { message: what, place: None, hint: Some(hint) },
-            other => Self::Execution { message: other.to_string() },
+            Fault::Call { what, hint } => {
+                Self::Query { message: escape_controls(&what), place: None, hint: Some(escape_controls(&hint)) }
+            }
+            other => Self::Execution { message: escape_controls(&other.to_string()) },
         }
     }
 }
@@ -88,8 +91,8 @@ impl From<Fault> for Error {
 impl From<Fault> for DataFusionError {
     fn from(fault: Fault) -> Self {
         match fault {
-            Fault::Call { what, hint } => Self::Plan(format!("{what}; hint: {hint}")),
-            other => Self::Execution(other.to_string()),
+            Fault::Call { what, hint } => Self::Plan(escape_controls(&format!("{what}; hint: {hint}"))),
+            other => Self::Execution(escape_controls(&other.to_string())),
         }
     }
 }

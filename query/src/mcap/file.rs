@@ -12,7 +12,7 @@ use bytes::Bytes;
 use echolake_lake::{Lake, LakeSnapshot};
 use echolake_recording::{
     ChannelDefinitions, FRAME_BYTES, MAGIC, Record, RecordFrame, RecordSplitter, RunSummary, SplitRecord, describe,
-    opcode, parse_record, summary_range, tail_range,
+    find_part, opcode, parse_record, summary_range, tail_range,
 };
 use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt as _};
@@ -42,6 +42,8 @@ pub(super) struct McapFile {
     /// The reason why it was walked; None if its summary told where what is.
     pub(super) walked: Option<String>,
     pub(super) channels: BTreeMap<u16, Channel>,
+    /// Digests of the schemas and channels in its summary, by opcode and id; a walk compares them all by itself.
+    pub(super) digests: BTreeMap<(u8, u16), u32>,
     /// In the file's order, without overlaps.
     pub(super) pieces: Vec<Piece>,
     pub(super) attachments: Vec<Attachment>,
@@ -266,11 +268,37 @@ impl Opening<'_> {
             Some(Attachment { name: index.name, media_type: index.media_type, bytes: index.data_size, range })
         });
         let attachments = attachments.collect();
-        Some(McapFile { path: self.path.clone(), bytes: self.bytes, walked: None, channels, pieces, attachments })
+        let (path, digests) = (self.path.clone(), summary.digests);
+        Some(McapFile { path, bytes: self.bytes, walked: None, channels, digests, pieces, attachments })
     }
 
     fn damaged(&self, offset: u64, what: impl Into<String>) -> Fault {
         Fault::Damaged { file: self.path.to_string(), offset, what: what.into() }
+    }
+
+    // Whether the record at `offset`, which claims more bytes than there are, is what a file that was cut off ends in.
+    async fn check_end(&self, offset: u64) -> Result<(), Fault> {
+        if self.is_closed().await? {
+            return Err(self.damaged(offset, "a record claims more bytes than there are"));
+        }
+        self.check_nothing_follows(offset + 1).await
+    }
+
+    // The walk ends here: what a second file behind this one holds, or a chunk behind damage, would be left out.
+    async fn check_nothing_follows(&self, mut offset: u64) -> Result<(), Fault> {
+        while offset + FRAME_BYTES as u64 <= self.bytes {
+            let bytes = self.read(offset..(offset + BLOCK).min(self.bytes)).await?;
+            match find_part(&bytes, self.bytes - offset) {
+                Ok(position) => {
+                    let what = "another file, or a part of this one, begins here behind what is read; hint: `echolake recover` \
+                                keeps what is whole";
+                    return Err(self.damaged(offset + position as u64, what));
+                }
+                Err(searched) => offset += searched.max(1) as u64,
+            }
+            tokio::task::yield_now().await;
+        }
+        Ok(())
     }
 
     // Goes through all records up to the end of the data or of what there is of them.
@@ -284,17 +312,21 @@ impl Opening<'_> {
         let mut read = splitter.offset();
         loop {
             let offset = splitter.offset();
-            match splitter.next_record().map_err(|what| self.damaged(offset, what))? {
-                Ok(SplitRecord { code: opcode::DATA_END | opcode::FOOTER, .. }) => break,
-                Ok(record) => walk.record(&record).map_err(|what| self.damaged(offset, what))?,
-                Err(_) if read == self.bytes && self.is_closed().await? => {
-                    return Err(self.damaged(offset, "a record claims more bytes than there are"));
-                }
+            let is_beyond = splitter.claimed_end().map_or(read == self.bytes, |end| end > self.bytes);
+            if is_beyond && offset < self.bytes {
+                self.check_end(offset).await?;
+            }
+            if is_beyond {
                 // A record that was cut off is none.
-                Err(_) if read == self.bytes => {
-                    reason = "it is cut off".to_owned();
+                reason = format!("it is cut off at byte {offset} of {}", self.bytes);
+                break;
+            }
+            match splitter.next_record().map_err(|what| self.damaged(offset, what))? {
+                Ok(SplitRecord { code: opcode::DATA_END | opcode::FOOTER, .. }) => {
+                    self.check_nothing_follows(splitter.offset()).await?;
                     break;
                 }
+                Ok(record) => walk.record(&record).map_err(|what| self.damaged(offset, what))?,
                 Err(missing) => {
                     let block = self.read(read..(read + BLOCK.max(missing)).min(self.bytes)).await?;
                     read += block.len() as u64;
@@ -305,8 +337,8 @@ impl Opening<'_> {
         }
         let attachments = std::mem::take(&mut walk.attachments);
         let (channels, pieces) = walk.finish().map_err(|(offset, what)| self.damaged(offset, what))?;
-        let walked = Some(reason);
-        Ok(McapFile { path: self.path.clone(), bytes: self.bytes, walked, channels, pieces, attachments })
+        let (path, walked, digests) = (self.path.clone(), Some(reason), BTreeMap::new());
+        Ok(McapFile { path, bytes: self.bytes, walked, channels, digests, pieces, attachments })
     }
 }
 
@@ -353,7 +385,7 @@ impl Walk {
             opcode::MESSAGE | opcode::SCHEMA | opcode::CHANNEL => {
                 let parsed = parse_record(record.code, &record.body).map_err(|e| describe(&e))?;
                 let mut seen = Seen::default();
-                self.see(&parsed, &mut seen);
+                self.see(&parsed, &mut seen)?;
                 if record.code == opcode::MESSAGE {
                     self.message(range, seen);
                 }
@@ -378,14 +410,10 @@ impl Walk {
     fn chunk(&mut self, range: Range<u64>, body: Bytes) -> Result<(), String> {
         self.open = false;
         let mut seen = Seen::default();
-        let mut sink = |record: Record<'_>| {
-            self.see(&record, &mut seen);
-            Ok::<_, std::convert::Infallible>(ReadStep::Continue)
-        };
+        let mut sink = |record: Record<'_>| self.see(&record, &mut seen).map(|()| ReadStep::Continue);
         match PieceRecords::from_chunk(body)?.read(&mut sink) {
             Ok(_) => {}
-            Err(ReadStop::Damage(what)) => return Err(what),
-            Err(ReadStop::Sink(never)) => match never {},
+            Err(ReadStop::Damage(what) | ReadStop::Sink(what)) => return Err(what),
         }
         if let Some(times) = seen.times {
             self.pieces.push(seen.piece(PieceKind::Chunk, range, times));
@@ -408,8 +436,8 @@ impl Walk {
         }
     }
 
-    fn see(&mut self, record: &Record<'_>, seen: &mut Seen) {
-        self.definitions.learn(record);
+    fn see(&mut self, record: &Record<'_>, seen: &mut Seen) -> Result<(), String> {
+        self.definitions.learn(record)?;
         if let Record::Message { header, .. } = record {
             let now = (header.log_time, header.log_time);
             let widen = |times: (u64, u64)| (times.0.min(now.0), times.1.max(now.1));
@@ -418,6 +446,7 @@ impl Walk {
             seen.times = Some(seen.times.map_or(now, widen));
             seen.channels.insert(header.channel_id);
         }
+        Ok(())
     }
 
     // An error has the place of a message whose channel nothing describes: nobody knows its topic.

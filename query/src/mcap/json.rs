@@ -22,7 +22,7 @@ const PARSED: usize = 16;
 const PARSED_CBOR: usize = 96;
 /// Integers are below this, 2^64.
 const MOST_INTEGER: f64 = 18_446_744_073_709_551_616.0;
-/// Numbers that JSON's grammar lacks and that many writers write all the same.
+/// Numbers that JSON's grammar lacks and that many writers write all the same. Others, as `1e400`, exceed 64 bits.
 const NO_NUMBERS: [&str; 3] = ["-Infinity", "Infinity", "NaN"];
 
 /// Where the columns come from.
@@ -178,22 +178,37 @@ impl Decoder {
     }
 }
 
-// The text with null in the place of NaN and infinities, and how many there were.
+// The text with null in the place of NaN, infinities and numbers that 64 bits do not have, and how many there were.
 fn without_no_numbers(data: &[u8]) -> (Vec<u8>, usize) {
     let mut text = Vec::with_capacity(data.len());
     let (mut replaced, mut at, mut in_string) = (0, 0, false);
     while at < data.len() {
         let rest = &data[at..];
-        let found = NO_NUMBERS.iter().find(|name| !in_string && rest.starts_with(name.as_bytes()));
-        let taken = match found {
-            Some(name) => {
+        let name = NO_NUMBERS.iter().find(|name| !in_string && rest.starts_with(name.as_bytes()));
+        let number = match name {
+            Some(name) => name.len(),
+            None => {
+                if in_string {
+                    0
+                } else {
+                    number_length(rest)
+                }
+            }
+        };
+        let is_none = name.is_some() || is_too_large(&rest[..number]);
+        let taken = match is_none {
+            true => {
                 text.extend_from_slice(b"null");
                 replaced += 1;
-                name.len()
+                number
             }
-            None => {
-                // What an escape is of does not end a string.
-                let taken = if in_string && rest[0] == b'\\' { rest.len().min(2) } else { 1 };
+            false => {
+                // What an escape is of does not end a string; a number is passed over as a whole.
+                let taken = match in_string {
+                    true if rest[0] == b'\\' => rest.len().min(2),
+                    true => 1,
+                    false => number.max(1),
+                };
                 in_string ^= rest[0] == b'"';
                 text.extend_from_slice(&rest[..taken]);
                 taken
@@ -202,6 +217,16 @@ fn without_no_numbers(data: &[u8]) -> (Vec<u8>, usize) {
         at += taken;
     }
     (text, replaced)
+}
+
+// Bytes of the number at the front of a text.
+fn number_length(text: &[u8]) -> usize {
+    text.iter().take_while(|byte| matches!(byte, b'0'..=b'9' | b'-' | b'+' | b'.' | b'e' | b'E')).count()
+}
+
+fn is_too_large(number: &[u8]) -> bool {
+    let number = std::str::from_utf8(number).ok().and_then(|text| text.parse::<f64>().ok());
+    number.is_some_and(f64::is_infinite)
 }
 
 fn push(

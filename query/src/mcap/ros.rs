@@ -332,8 +332,10 @@ impl Member {
             }
             return Ok(());
         }
-        // Every value takes a byte at least, so a count beyond the rest is a lie.
-        if count > cdr.rest() {
+        if self.kind.is_without_bytes() {
+            spent.add(count)?;
+        } else if count > cdr.rest() {
+            // Every value takes a byte at least, so a count beyond the rest is a lie.
             return Err(Malformed::Ends);
         }
         match column {
@@ -357,6 +359,16 @@ impl Member {
 }
 
 impl Kind {
+    // As messages without members are in ROS 1, and those that have no others.
+    fn is_without_bytes(&self) -> bool {
+        let Self::Message(definition) = self else { return false };
+        let mut members = definition.members.iter();
+        match definition.members.is_empty() {
+            true => definition.version == RosVersion::One,
+            false => members.all(|member| member.count != Count::Sequence && member.kind.is_without_bytes()),
+        }
+    }
+
     fn read(&self, cdr: &mut Cdr<'_>, column: Option<&mut Column>, spent: &mut Spent) -> Result<(), Malformed> {
         match self {
             Self::Bool => {

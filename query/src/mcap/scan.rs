@@ -359,7 +359,12 @@ impl Scanner {
         let (rows, left, times) = (&mut self.rows, &mut self.left, &self.scan.times);
         let offset = current.offset;
         let mut sink = |record: Record<'_>| {
-            let Record::Message { header, data } = &record else { return Ok(ReadStep::Continue) };
+            let Record::Message { header, data } = &record else {
+                return match source.contradiction(&record) {
+                    Some(what) => Err(Fault::Damaged { file: source.path.to_string(), offset, what }.into()),
+                    None => Ok(ReadStep::Continue),
+                };
+            };
             let Some((topic, mapping)) = source.channels.get(&header.channel_id) else {
                 if source.described.contains(&header.channel_id) {
                     return Ok(ReadStep::Continue);

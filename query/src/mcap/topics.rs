@@ -12,6 +12,7 @@ use bytes::Bytes;
 use datafusion::catalog::TableProvider;
 use datafusion::datasource::MemTable;
 use echolake_recording::{Record, RecordCursor};
+use echolake_schema::escape_controls;
 use futures::{StreamExt as _, TryStreamExt as _};
 use object_store::ObjectStoreExt as _;
 
@@ -87,7 +88,7 @@ fn batch(rows: &[Row<'_>]) -> Result<RecordBatch, arrow::error::ArrowError> {
     ]);
     let indexed: Vec<bool> = rows.iter().map(|r| r.target.file.walked.is_none()).collect();
     let read_by = |r: &Row<'_>| match &r.target.file.walked {
-        Some(reason) => format!("walk: {reason}"),
+        Some(reason) => escape_controls(&format!("walk: {reason}")),
         None => "summary".to_owned(),
     };
     let read_by: Vec<String> = rows.iter().map(read_by).collect();

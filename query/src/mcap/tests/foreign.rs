@@ -41,10 +41,116 @@ async fn topics_say_how_their_file_was_read() {
         check(&lake, "select distinct read_by from mcap_topics('inbox/p.mcap')", &[expected]).await;
     }
     let whole = file_without(0, true);
-    for (bytes, expected) in [(whole.len() - 20, "walk: it has no summary"), (whole.len() / 2, "walk: it is cut off")] {
-        put(&lake, "inbox/p.mcap", whole[..bytes].to_vec()).await;
-        check(&lake, "select distinct read_by from mcap_topics('inbox/p.mcap')", &[expected]).await;
+    let sql = "select distinct read_by from mcap_topics('inbox/p.mcap')";
+    put(&lake, "inbox/p.mcap", whole[..whole.len() - 20].to_vec()).await;
+    check(&lake, sql, &["walk: it has no summary"]).await;
+    put(&lake, "inbox/p.mcap", whole[..whole.len() / 2].to_vec()).await;
+    let begin = chunks_of(&whole).into_iter().map(|c| c.start).rfind(|at| *at < whole.len() / 2).expect("a chunk");
+    check(&lake, sql, &[&format!("walk: it is cut off at byte {begin} of {}", whole.len() / 2)]).await;
+}
+
+/// The ranges of a whole file's chunks.
+fn chunks_of(file: &[u8]) -> Vec<std::ops::Range<usize>> {
+    let (mut found, mut at) = (Vec::new(), MAGIC.len());
+    while at < file.len() - MAGIC.len() {
+        let length = u64::from_le_bytes(file[at + 1..at + 9].try_into().expect("eight bytes")) as usize;
+        found.extend((file[at] == opcode::CHUNK).then_some(at..at + 9 + length));
+        at += 9 + length;
     }
+    found
+}
+
+// A recorder that is killed leaves a chunk whose sizes it had not written yet.
+#[tokio::test]
+async fn a_last_chunk_that_was_never_closed_is_none() {
+    let lake = lake().await;
+    let whole = json_file(options(Some(Compression::Zstd)), 5);
+    let chunks = chunks_of(&whole);
+    let last = chunks.last().expect("chunks");
+    let mut open = whole[..last.end - 10].to_vec();
+    open[last.start + 1..last.start + 9].fill(0xFF);
+    open[last.start + 25..last.start + 33].fill(0xFF);
+    put(&lake, "inbox/open.mcap", open.clone()).await;
+    put(&lake, "inbox/cut.mcap", whole[..last.start].to_vec()).await;
+    let count = |file: &str| format!("select count(*) from mcap_messages('inbox/{file}.mcap')");
+    let expected = number(&lake, &count("cut")).await;
+    assert!((45..55).contains(&expected), "{expected}");
+    assert_eq!(number(&lake, &count("open")).await, expected);
+    let read_by = format!("walk: it is cut off at byte {} of {}", last.start, open.len());
+    check(&lake, "select distinct read_by from mcap_topics('inbox/open.mcap')", &[&read_by]).await;
+    // The same sizes in front of whole chunks are damage: these would be left out.
+    let second = &chunks[1];
+    let mut damaged = whole[..last.end].to_vec();
+    damaged[second.start + 1..second.start + 9].fill(0xFF);
+    put(&lake, "inbox/damaged.mcap", damaged).await;
+    refused(&lake, &count("damaged"), &[&format!("at byte {}", chunks[2].start), "begins here behind what is read"])
+        .await;
+}
+
+#[tokio::test]
+async fn a_second_file_behind_the_first_is_refused() {
+    let lake = lake().await;
+    let (one, other) = (json_file(options(None), 2), json_file(options(Some(Compression::Zstd)), 4));
+    for (first, second) in [(&one, &other), (&other, &one), (&one, &one)] {
+        put(&lake, "inbox/two.mcap", [&first[..], second].concat()).await;
+        for function in ["mcap_topics('inbox/two.mcap')", "mcap('inbox/two.mcap', '/point')"] {
+            refused(&lake, &format!("select * from {function}"), &["inbox/two.mcap", "another file"]).await;
+        }
+    }
+}
+
+// A chunk in front of the data end, which no summary names. With one, the chunk is listed in its place.
+#[tokio::test]
+async fn a_channel_or_schema_that_is_used_again_is_refused() {
+    let lake = lake().await;
+    let whole = json_file(options(None), 2);
+    let channel = |id: u16, schema: u16, topic: &str| {
+        let text = |text: &str| [&(text.len() as u32).to_le_bytes(), text.as_bytes()].concat();
+        let body = [&id.to_le_bytes()[..], &schema.to_le_bytes(), &text(topic), &text("json"), &[0; 4]].concat();
+        record(opcode::CHANNEL, &body)
+    };
+    let schema = |id: u16, name: &str| {
+        let text = |text: &str| [&(text.len() as u32).to_le_bytes(), text.as_bytes()].concat();
+        record(opcode::SCHEMA, &[&id.to_le_bytes()[..], &text(name), &text("jsonschema"), &text("{}")].concat())
+    };
+    let chunks = chunks_of(&whole);
+    let last = chunks.last().expect("chunks");
+    for (again, expected) in [
+        (channel(1, 1, "/other"), "channel 1"),
+        (channel(1, 0, "/point"), "channel 1"),
+        (schema(1, "Other"), "schema 1"),
+        (schema(1, "Point"), "schema 1"),
+    ] {
+        let loose = [&whole[..last.start], &again, &whole[last.start..]].concat();
+        put(&lake, "inbox/again.mcap", loose[..loose.len() - 60].to_vec()).await;
+        refused(&lake, "select * from mcap('inbox/again.mcap', '/point')", &[expected, "is used again"]).await;
+    }
+    // The definition of the first chunk is other than that of the summary.
+    for (part, other) in [("/point", "/joint"), ("\"name\":", "\"nome\":")] {
+        let mut file = json_file(options(None).calculate_chunk_crcs(false), 2);
+        let at = file.windows(part.len()).position(|w| w == part.as_bytes()).expect("it is there");
+        assert!(chunks_of(&file)[0].contains(&at));
+        file[at..at + part.len()].copy_from_slice(other.as_bytes());
+        put(&lake, "inbox/again.mcap", file).await;
+        refused(&lake, "select * from mcap('inbox/again.mcap', '/point')", &["again, with other content"]).await;
+    }
+}
+
+#[tokio::test]
+async fn names_in_files_and_errors_of_libraries_control_no_terminal() {
+    let lake = lake().await;
+    let channel =
+        TestChannel { topic: "/\u{1b}[31m", encoding: "json", schema: ("T", "jsonschema", b"{"), messages: &[b"1"] };
+    put(&lake, "inbox/e.mcap", file_of(&[channel])).await;
+    refused(&lake, "select * from mcap('inbox/e.mcap', '/x')", &["the topics are /\\u{1b}[31m"]).await;
+    // A channel whose topic is no text.
+    let broken = record(opcode::CHANNEL, &[&[1, 0, 0, 0][..], &4u32.to_le_bytes(), &[0xFF; 4], &[0; 8]].concat());
+    let file = [MAGIC, &record(opcode::HEADER, &[0; 8]), &broken, &record(opcode::DATA_END, &[0; 4])].concat();
+    put(&lake, "inbox/b.mcap", file).await;
+    let error = try_rows(&lake, "select * from mcap_topics('inbox/b.mcap')").await.map(|_| ()).expect_err("damaged");
+    let error = error.to_string();
+    assert!(error.contains("inbox/b.mcap") && error.contains("Record parse failed"), "{error}");
+    assert!(!error.contains(".rs") && !error.contains('\u{1b}') && error.lines().count() == 1, "{error}");
 }
 
 fn record(code: u8, body: &[u8]) -> Vec<u8> {
@@ -159,18 +265,19 @@ async fn fields_keep_apart_whatever_their_names() {
 #[tokio::test]
 async fn numbers_that_json_lacks_are_null_and_counted() {
     let lake = lake().await;
-    let messages: [&[u8]; 4] = [
+    let messages: [&[u8]; 5] = [
         br#"{"x":NaN,"n":1,"small":-Infinity}"#,
         br#"{"x":2.5,"n":Infinity,"small":3}"#,
         b"\xef\xbb\xbf{\"x\":\"\\\"NaN\\\\\",\"n\":NaN,\"small\":10}",
         br#"{"x":4,"n":"5","small":1.5}"#,
+        br#"{"x":1e400,"n":-2E999,"small":1e0}"#,
     ];
     let schema = format!("\u{feff}{NUMBERS}");
     put(&lake, "inbox/n.mcap", file_of(&[json_channel(&schema, &messages)])).await;
     let sql = "select x, n, small from mcap('inbox/n.mcap', '/t') order by sequence";
-    check(&lake, sql, &[" | 1 | ", "2.5 |  | 3", " |  | 10", "4.0 |  | "]).await;
-    // Two of the first message, one of the second, two of the third, two of the fourth.
-    assert_eq!(metric(&lake, sql, "values_unfit").await, 7);
+    check(&lake, sql, &[" | 1 | ", "2.5 |  | 3", " |  | 10", "4.0 |  | ", " |  | 1"]).await;
+    // Two of the first message, one of the second, two of each other.
+    assert_eq!(metric(&lake, sql, "values_unfit").await, 9);
     put(&lake, "inbox/n.mcap", file_of(&[json_channel(NUMBERS, &[br#"{"x":Nan}"#])])).await;
     refused(&lake, "select x from mcap('inbox/n.mcap', '/t')", &["it is no JSON object"]).await;
 }
@@ -314,6 +421,27 @@ async fn ros_1_messages_are_columns() {
     for length in 0..message.len() {
         put(&lake, "inbox/r.mcap", file(&message[..length])).await;
         refused(&lake, "select * from mcap('inbox/r.mcap', '/s')", &["ends within a value"]).await;
+    }
+}
+
+#[tokio::test]
+async fn arrays_of_messages_without_members_take_no_bytes_in_ros_1() {
+    let definition =
+        "std_msgs/Empty[3] nothing\nfloat64 x\n====\nMSG: std_msgs/Empty\n".replace("====", &"=".repeat(80));
+    let schema = ("test_msgs/State", "ros1msg", definition.as_bytes());
+    let message = 2.5f64.to_le_bytes();
+    let lake = lake().await;
+    let file = file_of(&[TestChannel { topic: "/s", encoding: "ros1", schema, messages: &[&message] }]);
+    put(&lake, "inbox/r.mcap", file).await;
+    check(&lake, "select nothing, x from mcap('inbox/r.mcap', '/s')", &["[true, true, true] | 2.5"]).await;
+    // As many as the message says that it has cost memory, so they have a bound, too.
+    let definition = definition.replace("[3]", "[]");
+    let schema = ("test_msgs/State", "ros1msg", definition.as_bytes());
+    let message = [&u32::MAX.to_le_bytes()[..], &message].concat();
+    let file = file_of(&[TestChannel { topic: "/s", encoding: "ros1", schema, messages: &[&message] }]);
+    put(&lake, "inbox/r.mcap", file).await;
+    for column in ["nothing", "x"] {
+        refused(&lake, &format!("select {column} from mcap('inbox/r.mcap', '/s')"), &["it expands to more than"]).await;
     }
 }
 
