@@ -48,5 +48,5 @@ pub use resync_reader::{
     list_damage,
 };
 pub use summary::{
-    ChannelDefinitions, FILE_END_BYTES, RunSummary, definition_digest, has_file_end, summary_range, tail_range,
+    ChannelDefinitions, DefinitionDigests, FILE_END_BYTES, RunSummary, has_file_end, summary_range, tail_range,
 };

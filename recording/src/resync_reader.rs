@@ -241,7 +241,12 @@ impl ResyncReader {
             let actual = start.iter().map(|b| format!("{b:02x}")).collect::<Vec<_>>().join(" ");
             let actual =
                 if actual.is_empty() { "nothing (the file is empty)".to_owned() } else { format!("`{actual}`") };
-            return Err(ResyncError::NotMcap { file: reader.name, actual });
+            // One wrong byte in front does not make it another file.
+            if !matches!(reader.frame().await?, Ok(frame) if frame.code == op::HEADER) {
+                return Err(ResyncError::NotMcap { file: reader.name, actual });
+            }
+            reader.note(|| format!("the file begins with {actual}, which are no magic bytes"));
+            reader.lose(0..length);
         }
         Ok(reader)
     }

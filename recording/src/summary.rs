@@ -32,8 +32,8 @@ pub struct RunSummary {
     pub statistics: Option<Statistics>,
     /// Channels with their schemas, by id. The first definition of an id counts.
     pub channels: BTreeMap<u16, Arc<Channel<'static>>>,
-    /// The digest of each schema and channel, by its opcode and id.
-    pub digests: BTreeMap<(u8, u16), u32>,
+    /// Digests of its schemas and channels.
+    pub digests: DefinitionDigests,
     /// Number of schemas that it describes.
     pub schema_count: usize,
     /// A channel whose schema it does not describe.
@@ -115,7 +115,7 @@ impl RunSummary {
                         Record::MetadataIndex(index) => found.metadata_indexes.push(index),
                         other => {
                             definitions.learn(&other).map_err(McapError::ConflictingChannels)?;
-                            found.digests.extend(definition_digest(&other).map(|(code, id, crc)| ((code, id), crc)));
+                            found.digests.learn(&other);
                         }
                     }
                 }
@@ -208,25 +208,52 @@ fn indexed_messages(chunk: &ChunkIndex) -> Option<u64> {
     entries.is_multiple_of(INDEX_ENTRY).then_some(entries / INDEX_ENTRY)
 }
 
-/// Returns the opcode of a schema or channel, its id, and a digest of all that messages are read by.
-pub fn definition_digest(record: &Record<'_>) -> Option<(u8, u16, u32)> {
+/// Digests of a summary's schemas and channels, of all that messages are read by.
+#[derive(Debug, Default, Clone, PartialEq, Eq)]
+pub struct DefinitionDigests {
+    /// By the opcode of a schema or channel, and its id.
+    pub by_id: BTreeMap<(u8, u16), u32>,
+}
+
+impl DefinitionDigests {
+    fn learn(&mut self, record: &Record<'_>) {
+        self.by_id.extend(digest_of(record));
+    }
+
+    /// Compares a record of a chunk with the summary.
+    ///
+    /// # Errors
+    /// What is different, if it is a schema or channel whose id stands for something else: nobody could tell whose the
+    /// messages are.
+    pub fn check(&self, record: &Record<'_>) -> Result<(), String> {
+        let Some((key, digest)) = digest_of(record) else { return Ok(()) };
+        match self.by_id.get(&key) {
+            Some(known) if *known != digest => {
+                let (kind, id) = (if key.0 == op::SCHEMA { "schema" } else { "channel" }, key.1);
+                Err(format!("{kind} {id} is used again: with other content than the summary has"))
+            }
+            _ => Ok(()),
+        }
+    }
+}
+
+fn digest_of(record: &Record<'_>) -> Option<((u8, u16), u32)> {
     match record {
         Record::Schema { header, data } => {
-            Some((op::SCHEMA, header.id, digest_of([header.name.as_bytes(), header.encoding.as_bytes(), data])))
+            Some(((op::SCHEMA, header.id), crc_of([header.name.as_bytes(), header.encoding.as_bytes(), data])))
         }
-        Record::Channel(channel) => {
-            let parts =
-                [channel.topic.as_bytes(), channel.message_encoding.as_bytes(), &channel.schema_id.to_le_bytes()];
-            Some((op::CHANNEL, channel.id, digest_of(parts)))
+        Record::Channel(c) => {
+            let parts = [c.topic.as_bytes(), c.message_encoding.as_bytes(), &c.schema_id.to_le_bytes()];
+            Some(((op::CHANNEL, c.id), crc_of(parts)))
         }
         _ => None,
     }
 }
 
-fn digest_of(parts: [&[u8]; 3]) -> u32 {
+fn crc_of(parts: [&[u8]; 3]) -> u32 {
     let mut digest = crc32fast::Hasher::new();
     for part in parts {
-        digest.update(&part.len().to_le_bytes());
+        digest.update(&(part.len() as u64).to_le_bytes());
         digest.update(part);
     }
     digest.finalize()

@@ -9,8 +9,8 @@ use std::path::{Path, PathBuf};
 use bytes::Bytes;
 use echolake_recording::limits::LARGEST_CHUNK;
 use echolake_recording::{
-    Channel, ChannelDefinitions, ChunkIndex, DecodedChunk, FRAME_BYTES, Record, RecordingItem, RecordingReader,
-    ResyncError, RunSummary, summary_range, tail_range,
+    Channel, ChannelDefinitions, ChunkIndex, DecodedChunk, DefinitionDigests, FRAME_BYTES, Record, RecordingItem,
+    RecordingReader, ResyncError, RunSummary, summary_range, tail_range,
 };
 
 use super::error::Error;
@@ -24,6 +24,8 @@ pub struct Recording {
     file: File,
     /// By channel of the file.
     pub(super) topics: BTreeMap<u16, Topic>,
+    /// Those of its summary; a walk compares all schemas and channels by itself.
+    digests: DefinitionDigests,
     /// Those with messages, by the time of their first.
     pub(super) chunks: Vec<Stretch>,
     /// First and last time, ns since 1970.
@@ -69,8 +71,10 @@ impl Recording {
             // The walk says what is wrong.
             Err(Unread::Damaged) => None,
         };
+        let mut digests = DefinitionDigests::default();
         let (topics, mut chunks, defect) = match summary {
             Some(summary) => {
+                digests = summary.digests;
                 let chunks = summary.chunk_indexes.iter().filter_map(Stretch::of_index).collect();
                 (topics_of(summary.channels.values().map(|c| c.as_ref())), chunks, None)
             }
@@ -85,7 +89,7 @@ impl Recording {
             };
             return Err(Error::Unplayable { path: path.to_owned(), reason });
         };
-        Ok(Self { path: path.to_owned(), file, topics, chunks, range, defect })
+        Ok(Self { path: path.to_owned(), file, topics, digests, chunks, range, defect })
     }
 
     /// Where it is.
@@ -110,6 +114,7 @@ impl Recording {
         let mut messages = Vec::new();
         let mut place = 0;
         while let Some(record) = records.next_record().map_err(|e| e.to_string())? {
+            self.digests.check(&record)?;
             if let Record::Message { header, data } = record
                 && channels.contains(&header.channel_id)
             {

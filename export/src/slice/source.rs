@@ -8,8 +8,8 @@ use arrow::datatypes::Int64Type;
 use bytes::Bytes;
 use echolake_lake::{Lake, LakeSnapshot};
 use echolake_recording::{
-    Attachment, Channel, ChunkIndex, DecodedChunk, McapError, Record, RecordCursor, RecordError, RunSummary,
-    chunk_body, describe, summary_range, tail_range,
+    Attachment, Channel, ChunkIndex, DecodedChunk, DefinitionDigests, McapError, Record, RecordCursor, RecordError,
+    RunSummary, chunk_body, describe, summary_range, tail_range,
 };
 use echolake_schema::tables::Table;
 use echolake_schema::{ErrorCause, RunId, SurfaceId, topics};
@@ -39,6 +39,7 @@ pub(super) struct Source {
     pub(super) file: RunFile,
     store: Arc<dyn ObjectStore>,
     pub(super) channels: BTreeMap<u16, Arc<Channel<'static>>>,
+    digests: DefinitionDigests,
     /// In the file's order.
     pub(super) chunks: Vec<ChunkIndex>,
     attachments: Vec<Range<u64>>,
@@ -88,6 +89,7 @@ impl Source {
             file,
             store,
             channels: BTreeMap::new(),
+            digests: DefinitionDigests::default(),
             chunks: Vec::new(),
             attachments: Vec::new(),
             manifest: BTreeMap::new(),
@@ -128,6 +130,7 @@ impl Source {
         };
         let summary = RunSummary::parse(&summary).map_err(|e| self.damaged(&e))?;
         self.channels = summary.channels;
+        self.digests = summary.digests;
         self.chunks = summary.chunk_indexes;
         self.chunks.sort_by_key(|chunk| chunk.chunk_start_offset);
         self.attachments =
@@ -180,6 +183,7 @@ impl Source {
         let mut records = decoded.into_cursor();
         let mut messages = Vec::new();
         while let Some(record) = records.next_record().map_err(|e| self.damaged_record(e))? {
+            self.digests.check(&record).map_err(chunk_damaged)?;
             let Record::Message { header, data } = record else { continue };
             let channel = self.channels.get(&header.channel_id).cloned();
             let channel =

@@ -12,6 +12,7 @@ use datafusion::error::{DataFusionError, Result};
 use datafusion::execution::TaskContext;
 use datafusion::physical_plan::ExecutionPlan;
 use datafusion_proto::physical_plan::{PhysicalExtensionCodec, PhysicalProtoConverterExtension};
+use echolake_recording::DefinitionDigests;
 use object_store::path::Path;
 use prost::Message;
 
@@ -243,7 +244,7 @@ impl SourceMessage {
             run: source.run.iter().flat_map(|(surface, run)| [surface.clone(), run.clone()]).collect(),
             described: source.described.iter().map(|id| u32::from(*id)).collect(),
             channels: source.channels.iter().map(channel).collect(),
-            digests: source.digests.iter().map(digest).collect(),
+            digests: source.digests.by_id.iter().map(digest).collect(),
         }
     }
 
@@ -267,10 +268,10 @@ impl SourceMessage {
             }
             channels.insert(number(channel.id)?, (channel.topic, channel.mapping as usize));
         }
-        let mut digests = BTreeMap::new();
+        let mut digests = DefinitionDigests::default();
         for DigestMessage { code, id, digest } in self.digests {
             let code = u8::try_from(code).map_err(|_| wrong("opcodes have 8 bits"))?;
-            digests.insert((code, number(id)?), digest);
+            digests.by_id.insert((code, number(id)?), digest);
         }
         Ok(Source { run, path, described, digests, channels })
     }

@@ -11,8 +11,8 @@ use std::sync::Arc;
 use bytes::Bytes;
 use echolake_lake::{Lake, LakeSnapshot};
 use echolake_recording::{
-    ChannelDefinitions, FRAME_BYTES, MAGIC, Record, RecordFrame, RecordSplitter, RunSummary, SplitRecord, describe,
-    find_part, opcode, parse_record, summary_range, tail_range,
+    ChannelDefinitions, DefinitionDigests, FRAME_BYTES, MAGIC, Record, RecordFrame, RecordSplitter, RunSummary,
+    SplitRecord, describe, find_part, opcode, parse_record, summary_range, tail_range,
 };
 use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt as _};
@@ -42,8 +42,8 @@ pub(super) struct McapFile {
     /// The reason why it was walked; None if its summary told where what is.
     pub(super) walked: Option<String>,
     pub(super) channels: BTreeMap<u16, Channel>,
-    /// Digests of the schemas and channels in its summary, by opcode and id; a walk compares them all by itself.
-    pub(super) digests: BTreeMap<(u8, u16), u32>,
+    /// Those of its summary; a walk compares all schemas and channels by itself.
+    pub(super) digests: DefinitionDigests,
     /// In the file's order, without overlaps.
     pub(super) pieces: Vec<Piece>,
     pub(super) attachments: Vec<Attachment>,
@@ -337,7 +337,7 @@ impl Opening<'_> {
         }
         let attachments = std::mem::take(&mut walk.attachments);
         let (channels, pieces) = walk.finish().map_err(|(offset, what)| self.damaged(offset, what))?;
-        let (path, walked, digests) = (self.path.clone(), Some(reason), BTreeMap::new());
+        let (path, walked, digests) = (self.path.clone(), Some(reason), DefinitionDigests::default());
         Ok(McapFile { path, bytes: self.bytes, walked, channels, digests, pieces, attachments })
     }
 }

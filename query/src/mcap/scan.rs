@@ -360,10 +360,8 @@ impl Scanner {
         let offset = current.offset;
         let mut sink = |record: Record<'_>| {
             let Record::Message { header, data } = &record else {
-                return match source.contradiction(&record) {
-                    Some(what) => Err(Fault::Damaged { file: source.path.to_string(), offset, what }.into()),
-                    None => Ok(ReadStep::Continue),
-                };
+                let checked = source.digests.check(&record).map(|()| ReadStep::Continue);
+                return checked.map_err(|what| Fault::Damaged { file: source.path.to_string(), offset, what }.into());
             };
             let Some((topic, mapping)) = source.channels.get(&header.channel_id) else {
                 if source.described.contains(&header.channel_id) {

@@ -13,7 +13,7 @@ use datafusion::datasource::TableType;
 use datafusion::error::Result;
 use datafusion::logical_expr::{BinaryExpr, Expr, Operator, TableProviderFilterPushDown};
 use datafusion::physical_plan::ExecutionPlan;
-use echolake_recording::{Record, definition_digest, opcode};
+use echolake_recording::DefinitionDigests;
 use futures::FutureExt as _;
 use futures::future::ready;
 use object_store::path::Path;
@@ -61,8 +61,8 @@ pub(super) struct Source {
     pub(super) path: Path,
     /// All channels that its file describes.
     pub(super) described: BTreeSet<u16>,
-    /// Digests of their schemas and of them, by opcode and id.
-    pub(super) digests: BTreeMap<(u8, u16), u32>,
+    /// Those of its summary.
+    pub(super) digests: DefinitionDigests,
     /// The channels that are meant: topic, and which mapping they have.
     pub(super) channels: BTreeMap<u16, (String, usize)>,
 }
@@ -258,14 +258,6 @@ impl Source {
         let described = target.file.channels.keys().copied().collect();
         let (run, path, digests) = (target.run.clone(), target.file.path.clone(), target.file.digests.clone());
         Self { run, path, described, digests, channels }
-    }
-
-    /// Returns, in words, how a record contradicts what the summary says of its schema or channel.
-    pub(super) fn contradiction(&self, record: &Record<'_>) -> Option<String> {
-        let (code, id, digest) = definition_digest(record)?;
-        let known = self.digests.get(&(code, id))?;
-        let kind = if code == opcode::SCHEMA { "schema" } else { "channel" };
-        (*known != digest).then(|| format!("it uses {kind} {id} again, with other content than the summary has"))
     }
 
     // The pieces of its file that may have messages of the channels in the time.

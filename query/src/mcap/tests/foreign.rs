@@ -132,7 +132,8 @@ async fn a_channel_or_schema_that_is_used_again_is_refused() {
         assert!(chunks_of(&file)[0].contains(&at));
         file[at..at + part.len()].copy_from_slice(other.as_bytes());
         put(&lake, "inbox/again.mcap", file).await;
-        refused(&lake, "select * from mcap('inbox/again.mcap', '/point')", &["again, with other content"]).await;
+        refused(&lake, "select * from mcap('inbox/again.mcap', '/point')", &["is used again: with other content"])
+            .await;
     }
 }
 
