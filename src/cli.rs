@@ -29,6 +29,8 @@ use crate::commands::mcp::{self, McpArgs};
 #[cfg(feature = "lake")]
 use crate::commands::optimize::{self, OptimizeArgs};
 use crate::commands::panel::{self, PanelArgs};
+#[cfg(feature = "lake")]
+use crate::commands::rebuild::{self, RebuildArgs};
 use crate::commands::recover::{self, RecoverArgs};
 #[cfg(feature = "lake")]
 use crate::commands::remove::{self, RemoveArgs};
@@ -105,6 +107,8 @@ pub(crate) enum LakeCommand {
     Ingest(IngestArgs),
     /// Take runs out of the lake: their rows, and rows that rest on them, and their files.
     Remove(RemoveArgs),
+    /// Empty a table that is damaged, or all, and derive the rows again from the run files.
+    Rebuild(RebuildArgs),
     /// Query the lake in SQL; without a query, a prompt.
     Sql(SqlArgs),
     /// Export data: training sets, slices of runs, SOFA, WAV, npz.
@@ -198,6 +202,7 @@ impl LakeCommand {
             Self::Import(args) => import::run(args, lake).await,
             Self::Ingest(args) => ingest::run(args, lake).await,
             Self::Remove(args) => remove::run(args, lake).await,
+            Self::Rebuild(args) => rebuild::run(args, lake).await,
             Self::Sql(args) => sql::run(args, lake).await.map(|()| CommandOutcome::Whole),
             Self::Export(args) => export::run(args, lake).await,
             Self::Figure(args) => figure::run(args, lake).await,

@@ -1,10 +1,11 @@
 //! Derives the rows that need references, for every run whose references exist and differ from those its rows used.
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
 use echolake_lake::{ClaimOutcome, CommitOutcome, DataFile, Lake, LakeSnapshot, VisibleRun, WorkClaims};
-use echolake_schema::tables::Table;
+use echolake_schema::tables::{Source, Table};
 use echolake_schema::{RunId, SurfaceId};
 use tracing::Instrument as _;
 
@@ -99,10 +100,14 @@ async fn do_round(ingest: &LakeIngest<'_>, cores: &Cores, done: &mut CompletionR
     let LakeIngest { lake, stop, claims, .. } = ingest;
     let context = IngestContext::new(lake, cores, lake.snapshot().await?);
     let mut jobs = Vec::new();
+    let derived = Table::ALL.into_iter().filter(|table| table.source() == Source::References);
+    let lacking: BTreeSet<_> =
+        derived.flat_map(|table| context.snapshot.lacking(table)).map(|lacking| lacking.run.clone()).collect();
     for run in context.snapshot.runs() {
         let wanted = context.finder.lock().await.wanted(&run.surface);
+        let derivation = wanted.derivation(&run.run_derivation);
         // Without its references, a run has no rows that follow from them.
-        if wanted.derivation(&run.run_derivation) != run.reference_derivation {
+        if derivation != run.reference_derivation || lacking.contains(&run.run) {
             jobs.push((run.clone(), wanted));
         }
     }
@@ -132,7 +137,7 @@ async fn do_round(ingest: &LakeIngest<'_>, cores: &Cores, done: &mut CompletionR
             Err(Error::Gone { .. }) if claims.is_some() => round.overtaken = true,
             Err(error) => return Err(error),
             Ok((completed, outcome)) => {
-                if outcome == Some(CommitOutcome::Now) {
+                if outcome == Some(CommitOutcome::Now) || lacking.contains(&run.run) {
                     round.changed += 1;
                     done(&completed, total);
                 }
@@ -189,5 +194,13 @@ async fn complete_run(
         row.push(rows::runs::with_references(lake.rig(), &keys, &before, &references)?);
     }
     let pointer = VisibleRun { reference_derivation: references.derivation.clone(), ..run.clone() };
-    Ok(ReadyJob { staged: context.stage_derived(pointer, &row, files).await?, report })
+    let mut staged = context.stage_derived(pointer, &row, files).await?;
+    // A row of an earlier version of the program does not count the others.
+    if let Some(counts) = context.snapshot.row_counts(&run.run).cloned()
+        && let Some(row) = staged.pop()
+    {
+        let row = row.counting(counts, &staged);
+        staged.push(row);
+    }
+    Ok(ReadyJob { staged, report })
 }

@@ -4,10 +4,11 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use arrow::record_batch::RecordBatch;
-use echolake_lake::{DataFile, FileName, FolderListing, Lake, LakeSnapshot};
+use echolake_lake::{DataFile, Error as LakeError, FileName, FolderListing, Lake, LakeSnapshot};
 use echolake_recording::{DecodedChunk, ResyncItem, ResyncReader};
 use echolake_schema::tables::Table;
 use object_store::path::Path;
+use object_store::{ObjectStore as _, ObjectStoreExt as _};
 use serde::Serialize;
 
 use crate::error::{Error, Result};
@@ -83,6 +84,10 @@ impl LakeReport {
         self.findings.iter().any(|f| f.severity == FindingSeverity::Damaged)
     }
 
+    fn find_in(&mut self, table: Table, what: impl ToString) {
+        self.find(FindingSeverity::Damaged, format!("tables/{}", table.name()), what.to_string());
+    }
+
     fn find(&mut self, severity: FindingSeverity, subject: impl ToString, what: impl Into<String>) {
         self.findings.push(LakeFinding { severity, subject: subject.to_string(), what: what.into() });
     }
@@ -93,8 +98,17 @@ impl LakeReport {
 /// # Errors
 /// [`Error`] if the lake itself cannot be read; damage in it is a finding.
 pub async fn examine(lake: &Lake, progress: &mut dyn FnMut(CheckStep<'_>)) -> Result<LakeReport> {
-    let snapshot = Arc::new(lake.snapshot().await?);
-    let mut report = LakeReport { runs: snapshot.runs().count(), ..LakeReport::default() };
+    let mut report = LakeReport::default();
+    let snapshot = match lake.snapshot().await {
+        // Without it, nothing says what the other tables must have.
+        Err(error @ LakeError::Log { .. }) => {
+            report.find(FindingSeverity::Damaged, "tables/runs", error.to_string());
+            return Ok(report);
+        }
+        snapshot => Arc::new(snapshot?),
+    };
+    report.runs = snapshot.runs().count();
+    find_faults(lake, &snapshot, &mut report).await?;
     let total = Table::ALL.iter().map(|t| snapshot.files(*t).len()).sum::<usize>() + report.runs;
     let mut done = 0;
     for table in Table::ALL {
@@ -129,14 +143,53 @@ pub async fn examine(lake: &Lake, progress: &mut dyn FnMut(CheckStep<'_>)) -> Re
     Ok(report)
 }
 
+// What the tables' logs have, against what `runs` names.
+async fn find_faults(lake: &Lake, snapshot: &LakeSnapshot, report: &mut LakeReport) -> Result<()> {
+    let is_named = snapshot.check(Table::Runs).map_err(|fault| report.find_in(Table::Runs, fault)).is_ok();
+    for table in Table::ALL {
+        for lacking in snapshot.lacking(table) {
+            report.find_in(table, format!("{lacking}; hint: `echolake ingest` derives them again from the run's file"));
+        }
+        for file in snapshot.foreign(table) {
+            let what = "another program put it into the table's log; hint: `echolake ingest` removes it, and derives again \
+                        what it replaced";
+            report.find(FindingSeverity::Damaged, &file.path, what);
+        }
+        if is_named
+            && snapshot.lacking(table).is_empty()
+            && snapshot.foreign(table).is_empty()
+            && let Err(fault) = snapshot.check(table)
+        {
+            report.find_in(table, fault);
+        }
+        if let Some(versions) = lake.overdue_checkpoint(table).await? {
+            let what = format!(
+                "{versions} versions since its last checkpoint; hint: can the folder be written? The log of ingest says \
+                 why a checkpoint failed"
+            );
+            report.find(FindingSeverity::Note, format!("tables/{}/_delta_log", table.name()), what);
+        }
+    }
+    Ok(())
+}
+
+// A batch at a time: a merged file has more rows than memory should hold.
 async fn check_table_file(lake: &Lake, table: Table, file: &DataFile) -> Result<()> {
-    let batches = read_back::batches(lake, table, file, &[]).await?;
-    let rows: usize = batches.iter().map(RecordBatch::num_rows).sum();
-    if rows as u64 == file.rows {
+    let size = lake.store().head(&file.path).await.map_err(|e| LakeError::unread_file(&file.path, e))?.size;
+    if size != file.bytes {
+        let reason = format!("it has {size} bytes, its log says {}", file.bytes);
+        return Err(LakeError::DataFile { file: file.path.to_string(), source: reason.into() }.into());
+    }
+    let mut batches = lake.rows(table, file, &[], 0..file.rows).await?;
+    let mut rows = 0;
+    while let Some(batch) = batches.try_next().await? {
+        rows += batch.num_rows() as u64;
+    }
+    if rows == file.rows {
         return Ok(());
     }
     let reason = format!("it has {rows} rows, its log says {}", file.rows);
-    Err(Error::DataFile { file: file.path.to_string(), reason })
+    Err(LakeError::DataFile { file: file.path.to_string(), source: reason.into() }.into())
 }
 
 async fn check_run(

@@ -191,9 +191,7 @@ pub enum Error {
         flat: String,
     },
     /// A data file of the lake cannot be read.
-    #[error(
-        "`{file}` in the lake is damaged: {reason}; hint: delete the folder `tables` and run `echolake ingest`, which makes it anew from the runs"
-    )]
+    #[error("`{file}` in the lake is damaged: {reason}; hint: `echolake rebuild` makes the tables again from the runs")]
     DataFile {
         /// The file.
         file: String,

@@ -12,6 +12,7 @@ use echolake_lake::{
     Lake, LakeSnapshot, StoreError, UnusableEntry, digest_record, digest_record_path, object_sha256, read_digest_record,
 };
 use echolake_recording::{FILE_END_BYTES, FileIntegrity, MAGIC, has_file_end};
+use echolake_schema::tables::{Source, Table};
 use echolake_schema::{Rig, RunId};
 use object_store::local::LocalFileSystem;
 use object_store::path::Path;
@@ -142,7 +143,8 @@ impl PendingFiles {
     }
 }
 
-/// Lists what is in no table yet: all of `inbox/`, and the run files of `runs/` that table `runs` does not name.
+/// Lists what is in no table yet: all of `inbox/`, and the run files of `runs/` that table `runs` does not name or whose
+/// rows are missing.
 ///
 /// # Errors
 /// [`Error::Lake`] if the snapshot or a folder cannot be read.
@@ -150,7 +152,10 @@ pub async fn list_pending(lake: &Lake) -> Result<PendingFiles> {
     let snapshot = lake.snapshot().await?;
     let mut pending = list_arrivals(lake).await?;
     let mut runs = lake.list_folder(RUNS).await?;
-    runs.files.retain(|meta| is_run_file(meta) && !is_known(&snapshot, &meta.location));
+    let of_run = Table::ALL.into_iter().filter(|table| table.source() == Source::Run);
+    let lacking: BTreeSet<_> = of_run.flat_map(|table| snapshot.lacking(table)).map(|of| &of.run).collect();
+    let is_whole = |path: &Path| known_run(&snapshot, path).is_some_and(|run| !lacking.contains(run));
+    runs.files.retain(|meta| is_run_file(meta) && !is_whole(&meta.location));
     pending.runs.append(&mut runs.files);
     pending.unusable.append(&mut runs.unusable);
     // What was made of it is in the lake.
@@ -201,9 +206,10 @@ fn run_named(path: &Path, end: &str) -> Option<RunId> {
     path.filename()?.strip_suffix(end)?.parse().ok()
 }
 
-fn is_known(snapshot: &LakeSnapshot, path: &Path) -> bool {
-    let run = run_named(path, ".mcap");
-    run.and_then(|run| snapshot.run(&run)).is_some_and(|run| Lake::run_path(&run.surface, &run.run) == *path)
+// The run whose rows are those of the file at this path.
+fn known_run<'a>(snapshot: &'a LakeSnapshot, path: &Path) -> Option<&'a RunId> {
+    let run = snapshot.run(&run_named(path, ".mcap")?)?;
+    (Lake::run_path(&run.surface, &run.run) == *path).then_some(&run.run)
 }
 
 /// Finds run files in the lake by their names or paths, each None if there is none.

@@ -6,9 +6,9 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use echolake_lake::{
-    ClaimOutcome, ClaimTimes, CommitOutcome, EncodedFile, Lake, VisibleRun, WorkClaims, encode, object_sha256,
+    ClaimOutcome, ClaimTimes, CommitOutcome, EncodedFile, Lake, RunRowCounts, VisibleRun, WorkClaims, encode, object_sha256,
 };
-use echolake_schema::tables::Table;
+use echolake_schema::tables::{Source, Table};
 use echolake_schema::{RunId, SurfaceId};
 use object_store::path::Path;
 use serde::{Deserialize, Serialize};
@@ -62,6 +62,9 @@ pub struct IngestedRun {
     /// True if the lake had a shorter file of the run, with the same beginning and without an end.
     #[serde(default)]
     pub replaced: bool,
+    /// True if it was in the lake before and rows of it were missing, which are derived again.
+    #[serde(default)]
+    pub mended: bool,
 }
 
 /// Outcome of an ingest: the run is new, or was in the lake before.
@@ -170,9 +173,13 @@ impl<'a> LakeIngest<'a> {
     pub async fn take_in(&self, sources: Vec<RunSource>, report: &mut (dyn FnMut(FileReport) + Send)) -> Result<()> {
         let mut first = Some(self.lake.ensure_tables().await?);
         let mut known: Option<Arc<BTreeSet<RunId>>> = None;
+        // Runs that are references, perhaps, and lack their own rows.
+        let is_lacking = |run: &RunId| first.as_ref().is_some_and(|before| before.lacks_rows(run, Source::Run));
+        let (lacking, sources): (Vec<_>, Vec<_>) =
+            sources.into_iter().partition(|source| source.run_in_place().is_some_and(|run| is_lacking(&run)));
         let (references, others) = self.in_order(sources).await?;
         let (cores, measurer) = (Cores::all()?, Arc::new(Measurer::new(self.lake)));
-        for sources in [references, others] {
+        for sources in [lacking, references, others] {
             let mut claimed: Vec<RunSource> = Vec::new();
             let mut free = sources;
             while !free.is_empty() {
@@ -349,8 +356,10 @@ impl IngestWork {
             whole: content.is_whole(),
             stopped: content.is_stopped(),
             replaced,
+            mended: false,
         };
-        if !self.again && known.is_some_and(|k| k.run_derivation == derivation) {
+        let is_current = known.is_some_and(|k| k.run_derivation == derivation);
+        if !self.again && is_current && !snapshot.lacks_rows(&keys.run, Source::Run) {
             kept.await?;
             return Ok(ReadyJob { staged: Vec::new(), report: taken });
         }
@@ -359,6 +368,12 @@ impl IngestWork {
             let files = cores.compute(move || encode_run(&its_lake, &for_rows, &its_content)).await?;
             self.context.stage_rows(&keys, &derivation, files).await
         };
+        if is_current {
+            // Its row of `runs` names the missing rows. Those that need references follow when all of these are there.
+            let (staged, _) = tokio::try_join!(of_the_run, kept)?;
+            taken.mended = true;
+            return Ok(ReadyJob { staged, report: taken });
+        }
         let of_references = async {
             let (files, references) = match ReferenceDerivation::new(&self.context, &derivation, &wanted).await? {
                 Some(derived) => derived.derive(&self.context, &keys, content.responses()).await?,
@@ -377,6 +392,10 @@ impl IngestWork {
         let (mut staged, (derived, references), mark) = tokio::try_join!(of_the_run, of_references, kept)?;
         // The row of `runs` is the last one.
         staged.extend(derived);
+        if let Some(row) = staged.pop() {
+            let row = row.counting(RunRowCounts::default(), &staged);
+            staged.push(row);
+        }
         taken.derived = references.derivation.is_some();
         taken.missing = references.missing;
         drop(mark);

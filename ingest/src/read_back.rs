@@ -17,6 +17,10 @@ use crate::error::{Error, Result};
 
 /// Reads a run's impulse responses from `measurements`.
 pub(crate) async fn responses(lake: &Lake, snapshot: &LakeSnapshot, run: &RunId) -> Result<RunResponses> {
+    // References without all of their measurements would be others.
+    if snapshot.lacking(Table::Measurements).iter().any(|lacking| lacking.run == *run) {
+        snapshot.check(Table::Measurements)?;
+    }
     let mut out = RunResponses::default();
     let files: Vec<_> = snapshot.files_of(Table::Measurements, run).cloned().collect();
     for file in files {

@@ -18,7 +18,7 @@ use datafusion::logical_expr::ScalarUDF;
 use datafusion::optimizer::OptimizerRule;
 use datafusion::prelude::SessionContext;
 use datafusion::sql::parser::Statement;
-use echolake_lake::{DataFile, Lake, LakeMoment, LakeSnapshot, VisibleRun};
+use echolake_lake::{DataFile, Error as LakeError, Lake, LakeMoment, LakeSnapshot, VisibleRun};
 use echolake_schema::tables::Table;
 use futures::future::try_join_all;
 use quick_cache::sync::Cache;
@@ -122,12 +122,15 @@ impl LakeCatalog {
         Ok(current.snapshot.clone())
     }
 
-    /// Returns the current snapshot of the lake, which a query started now would see; cached until something changes.
+    /// Returns the current snapshot of the lake, which a query started now would see; cached until something changes. Tables
+    /// other than `runs` may have faults, see [`LakeSnapshot::check`].
     ///
     /// # Errors
-    /// [`Error::Lake`] if the lake cannot be read.
+    /// [`Error::Lake`] if the lake cannot be read, or `runs` is not whole.
     pub(crate) async fn snapshot(&self) -> Result<Arc<LakeSnapshot>, Error> {
-        Ok(self.current().await?.snapshot.clone())
+        let snapshot = self.current().await?.snapshot.clone();
+        snapshot.check(Table::Runs)?;
+        Ok(snapshot)
     }
 
     /// Returns the contents of a run's file, from its summary and message indexes.
@@ -196,12 +199,26 @@ impl LakeCatalog {
     async fn is_fresh(&self, current: &CatalogSnapshot) -> Result<bool, Error> {
         let log = self.lake.log();
         let Some(version) = current.snapshot.version(Table::Runs) else { return Ok(false) };
+        // What mends another table changes no version of `runs`.
+        if !current.snapshot.is_whole() {
+            return Ok(false);
+        }
         let checked = *current.checked.lock().unwrap_or_else(PoisonError::into_inner);
         if self.lake.is_remote() && checked.elapsed() < REMOTE_CHECK_LASTS {
             return Ok(true);
         }
         if log.has_after(Table::Runs, version).await? {
             return Ok(false);
+        }
+        // In a folder, a look at whether all of it is still there costs nothing.
+        if !self.lake.is_remote() {
+            let is_there = match version.checked_sub(1) {
+                Some(before) => log.has_after(Table::Runs, before).await?,
+                None => self.lake.check_readable().await.is_ok(),
+            };
+            if !is_there {
+                return Ok(false);
+            }
         }
         *current.checked.lock().unwrap_or_else(PoisonError::into_inner) = Instant::now();
         let due = {
@@ -213,8 +230,12 @@ impl LakeCatalog {
             due
         };
         if due {
-            let versions = try_join_all(Table::ALL.into_iter().map(|table| log.version(table))).await?;
-            if Table::ALL.into_iter().zip(versions).any(|(table, now)| now != current.snapshot.version(table)) {
+            // The next snapshot tells which log cannot be read.
+            let versions = try_join_all(Table::ALL.into_iter().map(|table| log.version(table))).await;
+            let is_same = |versions: Vec<_>| {
+                Table::ALL.into_iter().zip(versions).all(|(table, now)| now == current.snapshot.version(table))
+            };
+            if !versions.is_ok_and(is_same) {
                 return Ok(false);
             }
         }
@@ -227,10 +248,11 @@ impl LakeCatalog {
         let mut tables = HashMap::new();
         for table in Table::ALL {
             let files = snapshot.files(table);
-            let kept = before.and_then(|b| b.tables.get(&table)).filter(|t| t.is_of(files)).cloned();
-            let provider = match kept {
-                Some(kept) => kept,
-                None => self.table(table, files)?,
+            let is_same = |before: &&Arc<LakeTable>| before.is_of(files) && !before.is_faulty();
+            let kept = before.and_then(|b| b.tables.get(&table)).filter(is_same);
+            let provider = match kept.filter(|_| snapshot.check(table).is_ok()) {
+                Some(kept) => kept.clone(),
+                None => Arc::new(self.table(table, files)?.of_snapshot(&snapshot)),
             };
             tables.insert(table, provider);
         }
@@ -254,9 +276,9 @@ impl LakeCatalog {
         Ok(CatalogSnapshot { snapshot, tables, providers, looked, checked })
     }
 
-    fn table(&self, table: Table, files: &[DataFile]) -> Result<Arc<LakeTable>, Error> {
+    fn table(&self, table: Table, files: &[DataFile]) -> Result<LakeTable, Error> {
         let schema = table.schema(self.lake.rig());
-        Ok(Arc::new(LakeTable::new(table, schema, files.to_vec(), self.source.clone()).map_err(failed)?))
+        LakeTable::new(table, schema, files.to_vec(), self.source.clone()).map_err(failed)
     }
 
     async fn at(
@@ -272,7 +294,7 @@ impl LakeCatalog {
         }
         let version = match versions.get(&moment) {
             Some(version) => *version,
-            None => self.lake.version_at(moment).await?,
+            None => self.lake.version_at(moment).await.map_err(moment_error)?,
         };
         versions.insert(moment, version);
         if let Some(table) = table {
@@ -289,9 +311,21 @@ impl LakeCatalog {
     async fn table_at(&self, version: u64, table: Table) -> Result<Arc<LakeTable>, Error> {
         let read = async {
             let snapshot = self.lake.snapshot_at(version, table).await?;
-            self.table(table, snapshot.files(table))
+            Ok(Arc::new(self.table(table, snapshot.files(table))?))
         };
         self.past.get_or_insert_async(&(version, table), read).await
+    }
+}
+
+// A moment that never was is the query's fault.
+fn moment_error(error: LakeError) -> Error {
+    match error {
+        LakeError::NoMoment { .. } => {
+            let text = error.to_string();
+            let (message, hint) = text.split_once("; hint: ").unwrap_or((&text, ""));
+            Error::Query { message: message.to_owned(), place: None, hint: Some(hint.to_owned()) }
+        }
+        error => error.into(),
     }
 }
 

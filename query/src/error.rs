@@ -11,6 +11,7 @@ use datafusion::common::{Column, SchemaError};
 use datafusion::error::DataFusionError;
 use datafusion::sql::sqlparser::parser::ParserError;
 use datafusion::sql::sqlparser::tokenizer::Location;
+use echolake_lake::Error as LakeError;
 use echolake_schema::ErrorCause;
 use echolake_schema::tables::Table;
 
@@ -175,14 +176,22 @@ impl Error {
         })
     }
 
-    // An error about a limit or a worker, not about the query.
+    // An error about a limit, a worker or the lake, not about the query.
     fn limit(error: &DataFusionError) -> Option<Self> {
         match error.find_root() {
             DataFusionError::ResourcesExhausted(text) => Some(Self::MemoryLimit { message: text.clone() }),
-            DataFusionError::External(cause) => {
-                let loss = cause.downcast_ref::<WorkerLoss>()?;
-                Some(Self::WorkerLost { message: loss.message().to_owned() })
-            }
+            DataFusionError::External(cause) => match cause.downcast_ref::<LakeError>() {
+                Some(LakeError::Incomplete { table, found }) => {
+                    Some(LakeError::Incomplete { table, found: found.clone() }.into())
+                }
+                Some(LakeError::Log { table, action, source }) => {
+                    Some(LakeError::Log { table, action, source: source.to_string().into() }.into())
+                }
+                _ => {
+                    let loss = cause.downcast_ref::<WorkerLoss>()?;
+                    Some(Self::WorkerLost { message: loss.message().to_owned() })
+                }
+            },
             _ => None,
         }
     }

@@ -439,7 +439,7 @@ impl Session {
     /// Returns the current snapshot of the lake, which a query started now would see; cached until something changes.
     ///
     /// # Errors
-    /// [`Error::Lake`] if the lake cannot be read.
+    /// [`Error::Lake`] if the lake cannot be read, or `runs` is not whole.
     pub async fn snapshot(&self) -> Result<Arc<LakeSnapshot>, Error> {
         self.engine.catalog().snapshot().await
     }

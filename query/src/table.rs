@@ -17,7 +17,7 @@ use datafusion::datasource::physical_plan::{
     FileGroup, FileScanConfigBuilder, ParquetFileReaderFactory, ParquetSource,
 };
 use datafusion::datasource::source::DataSourceExec;
-use datafusion::error::Result;
+use datafusion::error::{DataFusionError, Result};
 use datafusion::execution::object_store::ObjectStoreUrl;
 use datafusion::logical_expr::utils::conjunction;
 use datafusion::logical_expr::{Expr, TableProviderFilterPushDown};
@@ -28,7 +28,7 @@ use datafusion::physical_plan::ExecutionPlan;
 use datafusion::physical_plan::empty::EmptyExec;
 use datafusion::physical_plan::filter::{FilterExec, FilterExecBuilder};
 use datafusion::physical_plan::union::UnionExec;
-use echolake_lake::{DataFile, Lake};
+use echolake_lake::{DataFile, Lake, LakeSnapshot};
 use echolake_schema::tables::Table;
 use futures::FutureExt as _;
 use futures::future::BoxFuture;
@@ -60,6 +60,8 @@ pub(crate) struct LakeTable {
     source: FileReaders,
     /// The cached columns of all rows, if the table is small and was queried.
     rows: OnceCell<RecordBatch>,
+    /// The snapshot, if it has a fault in this table: it is refused.
+    faulty: Option<Arc<LakeSnapshot>>,
 }
 
 /// A file with its entry in a scan and its statistics.
@@ -94,7 +96,18 @@ impl LakeTable {
         let is_restricted = source.restricted.is_some();
         let files: Vec<_> = files.into_iter().map(|file| ScanFile::new(file, &schema, is_restricted)).collect();
         let all = Statistics::try_merge_iter(files.iter().map(|f| f.known.as_ref()), &schema)?;
-        Ok(Self { table, schema, columns, files, all, source, rows: OnceCell::new() })
+        Ok(Self { table, schema, columns, files, all, source, rows: OnceCell::new(), faulty: None })
+    }
+
+    /// The table of this snapshot, which is refused if the snapshot has a fault in it.
+    pub(crate) fn of_snapshot(self, snapshot: &Arc<LakeSnapshot>) -> Self {
+        let faulty = snapshot.check(self.table).is_err().then(|| snapshot.clone());
+        Self { faulty, ..self }
+    }
+
+    /// Returns whether queries of it are refused.
+    pub(crate) fn is_faulty(&self) -> bool {
+        self.faulty.is_some()
     }
 
     /// Returns whether the table consists of exactly these files.
@@ -307,6 +320,9 @@ impl TableProvider for LakeTable {
     }
 
     fn statistics(&self) -> Option<Statistics> {
+        if self.is_faulty() {
+            return None;
+        }
         let mut statistics = self.all.clone();
         if self.files.iter().any(|f| !f.file.hidden.is_empty()) {
             statistics = statistics.to_inexact();
@@ -328,6 +344,9 @@ impl LakeTable {
         limit: Option<usize>,
     ) -> BoxFuture<'a, Result<Arc<dyn ExecutionPlan>>> {
         let rows = async move {
+            if let Some(snapshot) = &self.faulty {
+                snapshot.check(self.table).map_err(|fault| DataFusionError::External(fault.into()))?;
+            }
             match self.cached(projection).await? {
                 Some((rows, wanted)) => {
                     let schema = rows.schema();

@@ -122,7 +122,7 @@ async fn measure(
     stop: &StopRequest,
 ) -> anyhow::Result<CommandOutcome> {
     let folder = super::inbox(lake)?;
-    let snapshot = lake.snapshot().await?;
+    let snapshot = lake.whole_snapshot().await?;
     let there: Vec<_> = snapshot.runs().map(|run| run.surface.to_string()).chain(surfaces_in(&folder)?).collect();
     let runs = missing_runs(campaign, surfaces, &there);
     let keep = if args.ir_only { RecordingMode::ResponsesOnly } else { RecordingMode::Sweeps };

@@ -75,7 +75,7 @@ pub(crate) async fn run(args: &DemoArgs, lake_url: &str) -> anyhow::Result<Comma
         runs: surfaces.into_iter().enumerate().map(planned).collect(),
         keep: if args.ir_only { RecordingMode::ResponsesOnly } else { RecordingMode::Sweeps },
         folder: super::inbox(&lake)?,
-        known: lake.snapshot().await?.runs().map(|r| r.run.untagged().to_owned()).collect(),
+        known: lake.whole_snapshot().await?.runs().map(|r| r.run.untagged().to_owned()).collect(),
     };
     let measuring = stop.clone();
     tokio::task::spawn_blocking(move || simulation.measure(measuring.flag(), &progress)).await??;

@@ -242,7 +242,7 @@ async fn mcap(lake: &Lake, args: &McapArgs) -> anyhow::Result<()> {
     };
     let count = taken.len();
     let params = SliceParams { taken, topics: args.topics.clone(), layout, check: check(&args.selection) };
-    let mut slice = Slice::open(lake, &lake.snapshot().await?, params).await?;
+    let mut slice = Slice::open(lake, &lake.whole_snapshot().await?, params).await?;
     let mut bytes = 0;
     while let Some(piece) = slice.next().await? {
         bytes += piece.len() as u64;

@@ -129,6 +129,7 @@ pub(crate) async fn run(args: &IngestArgs, lake_url: &str) -> anyhow::Result<Com
         summary.pass_over(&pending, &progress);
         pending.recordings.iter().for_each(|recording| note_recording(recording, &progress));
         finish_for_others(&lake, &mut summary, stop.flag(), &progress).await?;
+        finish_tables(&lake, &summary).await?;
     }
     if args.json {
         super::print(&serde_json::to_string_pretty(&summary)?)?;
@@ -204,6 +205,14 @@ async fn finish_for_others(
         summary.gone = more.gone;
     }
     Ok(())
+}
+
+// All run files are in the tables, or refused. One of `runs/` that is refused may have been in them before.
+async fn finish_tables(lake: &Lake, summary: &IngestSummary) -> anyhow::Result<()> {
+    if !summary.refused.iter().any(|refused| refused.moved_to.is_none()) {
+        lake.finish_rebuild().await?;
+    }
+    lake.whole_snapshot().await.map(drop).context("rows of the lake are still missing")
 }
 
 /// Ingests runs, then completes rows that waited for references.
@@ -402,6 +411,8 @@ async fn watch(lake: &Lake, stop: &StopRequest, progress: &CommandProgress) -> a
     let mut inbox = WatchedInbox::default();
     let mut lost = false;
     let mut is_first = true;
+    // No run file is left that tables may have lost.
+    let mut is_finished = false;
     while !stop.is_made() {
         // On an object store the inbox alone is listed, but for the first time.
         let found = match lake.is_remote() && !is_first {
@@ -421,6 +432,10 @@ async fn watch(lake: &Lake, stop: &StopRequest, progress: &CommandProgress) -> a
         let sources: Vec<_> = found.sources().into_iter().filter(|s| settled.contains_key(&s.to_string())).collect();
         inbox.name_passed_over(found, &mut passed_over, progress);
         lost |= passed_over.lost();
+        if sources.is_empty() && inbox.seen.is_empty() && inbox.given_up.is_empty() && !is_finished {
+            lake.finish_rebuild().await?;
+            is_finished = true;
+        }
         if sources.is_empty() {
             pause(LOOK_EVERY, stop).await;
             continue;
@@ -454,6 +469,7 @@ async fn pause(time: Duration, stop: &StopRequest) {
 fn say(progress: &CommandProgress, taken: &IngestedRun) {
     let IngestedRun { run, measurements, .. } = taken;
     match taken.outcome {
+        _ if taken.mended => progress.say(format!("{run}: rows were missing, and are derived again")),
         IngestOutcome::Known => progress.say(format!("{run}: is in the lake already, nothing added")),
         IngestOutcome::Added => progress.say(format!("{run}: {measurements} measurements")),
     }

@@ -21,6 +21,8 @@ pub(crate) mod mcp;
 #[cfg(feature = "lake")]
 pub(crate) mod optimize;
 pub(crate) mod panel;
+#[cfg(feature = "lake")]
+pub(crate) mod rebuild;
 pub(crate) mod recover;
 #[cfg(feature = "lake")]
 pub(crate) mod remove;

@@ -179,7 +179,7 @@ async fn paths(names: &[String], lake_url: &str) -> anyhow::Result<Vec<PathBuf>>
 pub(in crate::commands) async fn run_file(lake: &Lake, name: &str) -> anyhow::Result<PathBuf> {
     let folder =
         lake.folder().context("a replay needs a lake in a folder; hint: --lake FOLDER, or name .mcap files")?;
-    let snapshot = lake.snapshot().await?;
+    let snapshot = lake.whole_snapshot().await?;
     let (run, surface) = (name.parse::<RunId>().ok(), name.parse::<SurfaceId>().ok());
     let of_run = run.and_then(|run| snapshot.run(&run).cloned());
     let found = of_run.or_else(|| snapshot.runs().rfind(|r| Some(&r.surface) == surface.as_ref()).cloned());

@@ -161,7 +161,7 @@ impl TwinComputation {
             let specimen = PanelSpecimen::Mesh(file, PanelSide::Front);
             runs.push(ComputedRun { surface: twin, project, specimen, tag });
         }
-        let snapshot = lake.snapshot().await?;
+        let snapshot = lake.whole_snapshot().await?;
         let known: HashSet<RunId> = snapshot.runs().map(|run| run.run.clone()).collect();
         runs.retain(|run| run.id().is_ok_and(|id| !known.contains(&id)));
         let mut rig = lake.rig().clone();

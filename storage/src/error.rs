@@ -111,6 +111,14 @@ pub enum Error {
         /// The fault.
         source: ErrorCause,
     },
+    /// A table does not have the rows that `runs` names, or has others besides.
+    #[error("table `{table}` is not whole: {found}; hint: `echolake ingest` derives it again from the runs")]
+    Incomplete {
+        /// The table.
+        table: &'static str,
+        /// The run with its expected and actual rows, or what else is wrong.
+        found: String,
+    },
     /// The lake is as a reader of some projects sees it.
     #[error("table `{table}` cannot be {action} by a reader of some projects; hint: open the lake without projects")]
     Restricted {
@@ -128,7 +136,7 @@ pub enum Error {
         reason: String,
     },
     /// A file of a table cannot be read.
-    #[error("`{file}` is damaged: {source}; hint: delete the table's folder, `echolake ingest` makes it anew")]
+    #[error("`{file}` is damaged: {source}; hint: `echolake rebuild {}` makes it again from the runs", table_of(file))]
     DataFile {
         /// The file.
         file: String,
@@ -184,6 +192,19 @@ pub enum Error {
         missing: usize,
         /// Files that it had.
         files: usize,
+    },
+    /// The log has forgotten rows of that moment.
+    #[error(
+        "table `{table}` cannot be seen at {moment}: of the rows of then, its log does not have all: {lacking}; hint: ask \
+         for a newer version, `system.versions` lists them"
+    )]
+    Forgotten {
+        /// The moment.
+        moment: String,
+        /// The table.
+        table: &'static str,
+        /// The run with its expected and actual rows.
+        lacking: String,
     },
     /// The run file that is uploaded, or the journal of its upload beside it, cannot be used.
     #[error("cannot {action} `{}`: {source}{hint}", file.display())]
@@ -292,6 +313,11 @@ impl Error {
             source => Self::store("read", file, source),
         }
     }
+}
+
+// The table of a file in `tables/`.
+fn table_of(file: &str) -> &str {
+    file.strip_prefix("tables/").and_then(|within| within.split('/').next()).unwrap_or_default()
 }
 
 impl StoreError {

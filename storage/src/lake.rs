@@ -336,6 +336,12 @@ impl Lake {
         }
     }
 
+    /// The commit log, without regard to what may be seen.
+    #[cfg(feature = "tables")]
+    pub(crate) fn delta_log(&self) -> &DeltaLog {
+        &self.0.log
+    }
+
     /// Path of a run's file.
     ///
     /// ```

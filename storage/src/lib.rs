@@ -45,10 +45,10 @@ pub use run_digest::{digest_record, digest_record_path, file_sha256, object_sha2
 #[cfg(feature = "tables")]
 pub use tables::{
     BatchBuilder, ClaimOutcome, ClaimTimes, CommitEffect, CommitLog, CommitOutcome, DataFile, DeletedFile,
-    DeletionMode, EncodedFile, FileEncoder, FileHistory, FileName, FileStats, KEEP_HOURS, LakeMoment, LakeSnapshot,
-    LoggedFile, MergeProgress, NewFile, NoMoment, OptimizeReport, RemovalRecord, ReplacedFiles, RunPart, StagedFile,
-    TARGET_BYTES, TableChange, TableCommit, TableOptimizeReport, TableVersion, TableView, VacuumReport, VisibleRun,
-    WorkClaims, add_missing_columns, delta_schema, encode, reader_metadata, wanted_schema,
+    DeletionMode, EncodedFile, FileEncoder, FileHistory, FileName, FileStats, KEEP_HOURS, LackingRows, LakeMoment,
+    LakeSnapshot, LoggedFile, MergeProgress, NewFile, NoMoment, OptimizeReport, RemovalRecord, ReplacedFiles, RunPart,
+    RunRowCounts, StagedFile, TARGET_BYTES, TableChange, TableCommit, TableOptimizeReport, TableVersion, TableView,
+    VacuumReport, VisibleRun, WorkClaims, add_missing_columns, delta_schema, encode, reader_metadata, wanted_schema,
 };
 #[cfg(feature = "remote")]
 pub use upload::{RunUpload, UploadOutcome, UploadStep};

@@ -50,7 +50,7 @@ pub async fn write_responses(
     surfaces: &[SurfaceId],
     progress: &mut (dyn FnMut(usize, usize) + Send),
 ) -> Result<Vec<WrittenFile>> {
-    let snapshot = lake.snapshot().await?;
+    let snapshot = lake.whole_snapshot().await?;
     let runs = newest_runs(&snapshot, surfaces)?;
     let pending = PendingFolder::create(folder)?;
     let mut files = Vec::new();

@@ -177,7 +177,7 @@ pub async fn write_training_set(
     set: &TrainingSet,
     progress: &mut dyn FnMut(usize, usize),
 ) -> Result<ExportSummary> {
-    let snapshot = lake.snapshot().await?;
+    let snapshot = lake.whole_snapshot().await?;
     let plan = Plan::new(lake, &snapshot, set).await?;
     let pending = PendingFolder::create(folder)?;
     let (mut parts, mut files) = (Vec::new(), Vec::new());

@@ -162,7 +162,7 @@ impl OpenedRun {
 /// Opens the runs of measurements, each checked.
 pub(crate) async fn open_runs(lake: &Lake, taken: &[Taken], check: Check) -> Result<Vec<OpenedRun>> {
     let mut opened = Vec::new();
-    for (file, taken) in files(lake, &lake.snapshot().await?, taken.to_vec()).await? {
+    for (file, taken) in files(lake, &lake.whole_snapshot().await?, taken.to_vec()).await? {
         let source = Source::open(lake.store(), file, check).await?;
         opened.push(OpenedRun(Groups::new(source, &taken, &[])));
     }

@@ -42,6 +42,7 @@ use datafusion::sql::sqlparser::ast::{
     Expr as SqlExpr, FunctionArg, FunctionArgExpr, ObjectNamePart, TableFactor, VisitorMut,
 };
 use echolake_lake::LakeSnapshot;
+use echolake_schema::tables::Table;
 
 use crate::Error;
 use crate::syntax_walk::walk_mut;
@@ -85,7 +86,8 @@ type Call = (Function, Vec<String>);
 /// snapshot, where their messages are, which columns they have.
 ///
 /// # Errors
-/// [`Error::Query`] for a call that is not right, [`Error::Execution`] where a file cannot be read.
+/// [`Error::Query`] for a call that is not right, [`Error::Execution`] where a file cannot be read, [`Error::Lake`] if `runs`
+/// is not whole.
 pub(crate) async fn register(
     context: &SessionContext,
     snapshot: &LakeSnapshot,
@@ -94,6 +96,7 @@ pub(crate) async fn register(
 ) -> Result<(), Error> {
     let mut tables: HashMap<Function, HashMap<Vec<String>, Arc<dyn TableProvider>>> = HashMap::new();
     for (function, arguments) in calls(statement) {
+        snapshot.check(Table::Runs)?;
         let of = tables.entry(function).or_default();
         if let Entry::Vacant(place) = of.entry(arguments) {
             let table = table(function, place.key(), snapshot, files).await?;

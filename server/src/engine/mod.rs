@@ -15,6 +15,7 @@ use std::time::Duration;
 
 use echolake_lake::Lake;
 use echolake_query::{EngineClient, EngineLimits, QueryEngine, QueryQuota};
+use echolake_schema::tables::Table;
 use futures::FutureExt as _;
 use tokio::sync::mpsc;
 
@@ -123,7 +124,10 @@ async fn report_lake(lake: &Lake, engine: &QueryEngine) -> Infallible {
     let session = engine.session(&Arc::new(EngineClient::new("lake figures", QueryQuota::default())));
     loop {
         let figures = match session.snapshot().await {
-            Ok(snapshot) => LakeFigures::read(lake, &snapshot).await.map_err(|e| e.to_string()),
+            Ok(snapshot) => match Table::ALL.into_iter().try_for_each(|table| snapshot.check(table)) {
+                Ok(()) => LakeFigures::read(lake, &snapshot).await.map_err(|e| e.to_string()),
+                Err(fault) => Err(fault.to_string()),
+            },
             Err(e) => Err(e.to_string()),
         };
         let figures = figures.inspect_err(|error| tracing::warn!(error, "the lake cannot be read")).ok();

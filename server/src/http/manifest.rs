@@ -97,6 +97,9 @@ async fn files(
     }
     let all: Vec<_> = Table::ALL.into_iter().filter(|table| tables.is_empty() || tables.contains(table)).collect();
     let snapshot = &view.snapshot;
+    for table in &all {
+        snapshot.check(*table).map_err(|fault| RequestFault::Query(fault.into()))?;
+    }
     let files = all.iter().flat_map(|table| {
         let origin = &origin;
         snapshot.readable_files(*table).filter_map(move |file| ManifestFile::of(origin, *table, file))

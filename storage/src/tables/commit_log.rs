@@ -1,6 +1,6 @@
 //! Commit log of a lake's tables, as a trait. Delta implements it; see `delta.rs`.
 
-use std::collections::{BTreeSet, HashMap, HashSet};
+use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use std::ops::Range;
 
 use async_trait::async_trait;
@@ -8,6 +8,7 @@ use chrono::{DateTime, Utc};
 use echolake_schema::tables::Table;
 use echolake_schema::{RunId, SurfaceId};
 use object_store::path::Path;
+use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
 use crate::Result;
@@ -32,6 +33,25 @@ pub struct DataFile {
     pub parts: Vec<RunPart>,
     /// The runs of parts that a snapshot does not show; empty as the log gives it.
     pub hidden: Vec<RunId>,
+    /// Of a run's row in `runs`: the rows that its other tables have. None if an earlier version of the program wrote it.
+    pub row_counts: Option<RunRowCounts>,
+}
+
+/// Numbers of a run's rows, by table.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct RunRowCounts(BTreeMap<String, u64>);
+
+impl RunRowCounts {
+    /// Sets the number of rows in a table.
+    pub fn set_rows(&mut self, table: Table, rows: u64) {
+        self.0.insert(table.name().to_owned(), rows);
+    }
+
+    /// The number of rows in a table; None if it does not say.
+    pub fn rows(&self, table: Table) -> Option<u64> {
+        self.0.get(table.name()).copied()
+    }
 }
 
 /// The rows of one run in a file that was merged from several.
@@ -47,6 +67,8 @@ pub struct RunPart {
     pub rows: u64,
     /// Of a row of `runs`: the version of `runs` that added it, whichever file it was in then.
     pub row_version: Option<u64>,
+    /// Of a row of `runs`: as [`DataFile::row_counts`].
+    pub row_counts: Option<RunRowCounts>,
 }
 
 impl DataFile {
@@ -104,6 +126,8 @@ pub struct TableView {
     pub version: u64,
     /// Its files, by path.
     pub files: Vec<DataFile>,
+    /// Of `runs`: rows may be missing, because it is being made again or another program has changed it.
+    pub is_rebuilding: bool,
 }
 
 /// Least and greatest values of a file's columns, by name, as in Delta's log.
@@ -133,6 +157,8 @@ pub struct NewFile {
     /// The version of `runs` that added the row of its run which its author had seen; 0 if there was none. If the file is
     /// in the log already, but its author had not seen that row, it is added again.
     pub run_version: u64,
+    /// Of a run's row in `runs`: the rows that its other tables have.
+    pub row_counts: Option<RunRowCounts>,
 }
 
 /// The files that a new one replaces. If other files have taken their place, the new one is not added. A merged file in a
@@ -283,6 +309,7 @@ mod tests {
             derivation: "d".to_owned(),
             rows,
             row_version: None,
+            row_counts: None,
         };
         let mut file = DataFile {
             path: "tables/nce/merged.x.parquet".into(),
@@ -293,6 +320,7 @@ mod tests {
             stats: None,
             parts: vec![part("a", 1), part("b", 2), part("c", 4), part("d", 8)],
             hidden: Vec::new(),
+            row_counts: None,
         };
         let check = |file: &DataFile, expected: &[(u64, u64)]| {
             let ranges: Vec<_> = file.visible_ranges().iter().map(|range| (range.start, range.end)).collect();

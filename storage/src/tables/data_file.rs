@@ -54,6 +54,7 @@ pub struct FileEncoder {
 pub struct EncodedFile {
     pub(crate) bytes: Bytes,
     pub(crate) stats: String,
+    pub(crate) rows: u64,
 }
 
 impl FileEncoder {
@@ -84,7 +85,8 @@ impl FileEncoder {
             Some(writer) => writer.into_inner().map_err(|e| failed(table, e))?,
             None => Vec::new(),
         };
-        Ok(EncodedFile { bytes: bytes.into(), stats: self.stats.json().to_string() })
+        let rows = self.stats.rows as u64;
+        Ok(EncodedFile { bytes: bytes.into(), rows, stats: self.stats.json().to_string() })
     }
 
     fn writer(&mut self, first: &RecordBatch) -> Result<&mut ArrowWriter<Vec<u8>>> {

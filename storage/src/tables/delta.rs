@@ -16,6 +16,7 @@ use async_trait::async_trait;
 use chrono::{DateTime, Utc};
 use echolake_schema::Rig;
 use echolake_schema::tables::Table;
+use futures::TryStreamExt as _;
 use object_store::ObjectStore;
 use object_store::path::Path;
 use percent_encoding::percent_decode_str;
@@ -24,14 +25,14 @@ use tokio::sync::Mutex;
 use uuid::Uuid;
 
 use self::actions::{AddFile, FileFormat, LogLine, TableMetadata};
-use self::log_folder::{CommitAttempt, LogFolder, REBUILD_HINT, own_protocol};
-use self::table_state::TableState;
+use self::log_folder::{CommitAttempt, LogFolder, own_protocol, rebuild_hint};
+use self::table_state::{ENGINE, TableState, mark_rebuild};
 use crate::location::LakeLocation;
 use crate::remote::backoff;
 use crate::tables::snapshot::{decode_parts, encode_parts, is_merged};
 use crate::{
     CommitEffect, CommitLog, CommitOutcome, DataFile, Error, FileHistory, FileStats, LoggedFile, NewFile,
-    RemovalRecord, ReplacedFiles, Result, RunPart, TableChange, TableCommit, TableVersion, TableView,
+    RemovalRecord, ReplacedFiles, Result, RunPart, RunRowCounts, TableChange, TableCommit, TableVersion, TableView,
 };
 
 /// Tries of one commit against other writers; each loses to a commit that went through.
@@ -45,6 +46,10 @@ const PARTS: &str = "echolake.parts";
 const LOG_VERSION: &str = "echolake.version";
 /// The tag of an Add that holds the version of `runs` that its author had seen.
 const SEEN_RUNS: &str = "echolake.seenRuns";
+/// The tag of an Add of `runs` that holds the numbers of the run's rows by table, of a merged file those of each part.
+const ROWS: &str = "echolake.rows";
+/// Folder of closed runs.
+const RUNS: &str = "runs";
 
 /// The tables' Delta logs under `tables/`.
 #[derive(Debug)]
@@ -122,18 +127,19 @@ impl DeltaLog {
         self.load(table).await?.ok_or_else(|| Error::Log {
             table: table.name(),
             action: "read",
-            source: "it has no log; hint: `echolake ingest` makes it anew from the runs".into(),
+            source: "it has no log; hint: `echolake ingest` makes it again from the runs".into(),
         })
     }
 
     /// Adds the columns that a table of an earlier version of the program lacks; its files have nulls there.
     async fn add_columns(&self, table: Table, mut state: Arc<TableState>) -> Result<()> {
         for losses in 1..=COMMIT_TRIES {
-            let Some((metadata, added)) = grown_metadata(table, &state, &table.schema(&self.rig))? else {
+            let Some((mut metadata, added)) = grown_metadata(table, &state, &table.schema(&self.rig))? else {
                 return Ok(());
             };
             let log = self.log_folder(table);
             log.check_writable(&state)?;
+            mark_rebuild(&mut metadata, state.is_rebuilding());
             let info = commit_info("ADD COLUMNS", json!({ "columns": added }), Utc::now().timestamp_millis());
             let lines = [info, LogLine { meta_data: Some(metadata), ..LogLine::default() }];
             let attempt = log.write_commit(state.version + 1, &lines).await?;
@@ -144,6 +150,37 @@ impl DeltaLog {
             self.wait_after_loss(losses).await;
         }
         Err(lost_to_others(table))
+    }
+
+    /// Marks `runs` as being made again, or as whole.
+    pub(crate) async fn set_rebuilding(&self, is_rebuilding: bool) -> Result<()> {
+        let table = Table::Runs;
+        for losses in 1..=COMMIT_TRIES {
+            let Some(state) = self.load(table).await?.filter(|state| state.is_rebuilding() != is_rebuilding) else {
+                return Ok(());
+            };
+            let log = self.log_folder(table);
+            log.check_writable(&state)?;
+            let info = commit_info("REBUILD", json!({ "done": !is_rebuilding }), Utc::now().timestamp_millis());
+            let meta_data = state.metadata_marked(is_rebuilding);
+            let lines = [info, LogLine { meta_data, ..LogLine::default() }];
+            if log.write_commit(state.version + 1, &lines).await? == CommitAttempt::Written {
+                return Ok(());
+            }
+            self.wait_after_loss(losses).await;
+        }
+        Err(lost_to_others(table))
+    }
+
+    /// Deletes a table's log.
+    pub(crate) async fn delete_log(&self, table: Table) -> Result<()> {
+        self.log_folder(table).delete().await?;
+        self.loaded.lock().await.remove(&table);
+        Ok(())
+    }
+
+    pub(crate) async fn overdue_checkpoint(&self, table: Table) -> Result<Option<u64>> {
+        self.log_folder(table).overdue_checkpoint().await
     }
 
     // Written against one version, so that it takes effect only if that is still the newest.
@@ -160,9 +197,12 @@ impl DeltaLog {
         let attempt = log.write_commit(state.version + 1, &lines).await?;
         if attempt == CommitAttempt::Written {
             let mut state = TableState::clone(state);
-            state.apply(state.version + 1, lines);
+            state.apply_commit(state.version + 1, lines);
             // The commit is done; a checkpoint only spares readers some work, and the next one makes up for it.
-            let _ = log.maintain(&state, now).await;
+            if let Err(error) = log.maintain(&state, now).await {
+                let (table, error) = (table.name(), &error as &dyn std::error::Error);
+                tracing::warn!(table, error, "the log's checkpoint cannot be written, or old versions not be deleted");
+            }
             let written = LoadedTable { state: Arc::new(state), found: Instant::now() };
             self.loaded.lock().await.insert(table, written);
         }
@@ -254,6 +294,19 @@ fn is_known(file: &LoggedFile, known: &HashMap<String, KnownFile>) -> bool {
     known.get(&file.name).is_some_and(|known| known.log_version == file.log_version)
 }
 
+/// Returns whether the lake has closed runs.
+pub(crate) async fn has_run_files(store: &dyn ObjectStore) -> Result<bool> {
+    let folder = Path::from(RUNS);
+    let is_run = |path: &Path| path.extension() == Some("mcap");
+    let mut listed = store.list(Some(&folder));
+    while let Some(object) = listed.try_next().await.map_err(|e| Error::store("list", &folder, e))? {
+        if is_run(&object.location) {
+            return Ok(true);
+        }
+    }
+    Ok(false)
+}
+
 /// A table's folder in the lake.
 pub(crate) fn folder(table: Table) -> Path {
     Path::from(format!("tables/{}", table.name()))
@@ -270,7 +323,7 @@ impl CommitLog for DeltaLog {
             return self.add_columns(table, state).await;
         }
         let now_millis = Utc::now().timestamp_millis();
-        let metadata = TableMetadata {
+        let mut metadata = TableMetadata {
             id: Uuid::new_v4().to_string(),
             name: Some(table.name().to_owned()),
             description: None,
@@ -280,6 +333,8 @@ impl CommitLog for DeltaLog {
             configuration: actions::TextMap::new(),
             created_time: Some(now_millis),
         };
+        // The log is lost, unless this is the lake's first ingest: until its end, the table lacks runs.
+        mark_rebuild(&mut metadata, table == Table::Runs && has_run_files(self.store.as_ref()).await?);
         let lines = [
             commit_info("CREATE TABLE", json!({ "mode": "ErrorIfExists" }), now_millis),
             LogLine { protocol: Some(own_protocol()), ..LogLine::default() },
@@ -291,7 +346,8 @@ impl CommitLog for DeltaLog {
 
     async fn view(&self, table: Table) -> Result<Option<TableView>> {
         let Some(state) = self.load(table).await? else { return Ok(None) };
-        Ok(Some(TableView { version: state.version, files: data_files(table, &state)? }))
+        let is_rebuilding = table == Table::Runs && state.is_rebuilding();
+        Ok(Some(TableView { version: state.version, files: data_files(table, &state)?, is_rebuilding }))
     }
 
     async fn known_version(&self, table: Table) -> Option<u64> {
@@ -378,11 +434,12 @@ fn lost_to_others(table: Table) -> Error {
 // The table's metadata with the columns that it lacks behind its own, and these as JSON; None if it lacks none.
 fn grown_metadata(table: Table, state: &TableState, schema: &SchemaRef) -> Result<Option<(TableMetadata, String)>> {
     let damaged = |source: String| Error::Log { table: table.name(), action: "read", source: source.into() };
-    let mut metadata = state.metadata.clone().ok_or_else(|| damaged(format!("it has no metadata; {REBUILD_HINT}")))?;
+    let mut metadata =
+        state.metadata.clone().ok_or_else(|| damaged(format!("it has no metadata; {}", rebuild_hint(table))))?;
     let mut known: Value = serde_json::from_str(&metadata.schema_string)
-        .map_err(|e| damaged(format!("its schema is no JSON: {e}; {REBUILD_HINT}")))?;
+        .map_err(|e| damaged(format!("its schema is no JSON: {e}; {}", rebuild_hint(table))))?;
     let Some(fields) = known.get_mut("fields").and_then(Value::as_array_mut) else {
-        return Err(damaged(format!("its schema has no fields; {REBUILD_HINT}")));
+        return Err(damaged(format!("its schema has no fields; {}", rebuild_hint(table))));
     };
     let has = |field: &&Arc<Field>| fields.iter().any(|column| column["name"].as_str() == Some(field.name().as_str()));
     let lacking: Vec<_> = schema.fields().iter().filter(|field| !has(field)).map(|f| delta_column(f)).collect();
@@ -411,6 +468,7 @@ fn data_file(table: Table, add: &AddFile) -> Result<DataFile> {
         log_version: number_tag(add, LOG_VERSION),
         seen_runs: number_tag(add, SEEN_RUNS),
         stats: stats.map(file_stats),
+        row_counts: tag(add, ROWS).and_then(|text| serde_json::from_str(text).ok()),
         parts: if is_merged(&name) { parts(table, add)? } else { Vec::new() },
         hidden: Vec::new(),
         path: folder(table).join(name),
@@ -442,8 +500,12 @@ fn number_tag(add: &AddFile, name: &str) -> u64 {
 }
 
 fn parts(table: Table, add: &AddFile) -> Result<Vec<RunPart>> {
-    tag(add, PARTS).and_then(decode_parts).ok_or_else(|| {
-        let source = format!("`{}` has lost the list of its parts; {REBUILD_HINT}", add.path).into();
+    let counts = tag(add, ROWS).and_then(|text| serde_json::from_str::<Vec<Option<RunRowCounts>>>(text).ok());
+    let mut counts = counts.unwrap_or_default().into_iter();
+    let counted = |part| RunPart { row_counts: counts.next().flatten(), ..part };
+    let parts = tag(add, PARTS).and_then(decode_parts).map(|parts| parts.into_iter().map(counted).collect());
+    parts.ok_or_else(|| {
+        let source = format!("`{}` has lost the list of its parts; {}", add.path, rebuild_hint(table)).into();
         Error::Log { table: table.name(), action: "read", source }
     })
 }
@@ -454,7 +516,7 @@ fn commit_info(operation: &str, parameters: Value, now_millis: i64) -> LogLine {
         "timestamp": now_millis,
         "operation": operation,
         "operationParameters": parameters,
-        "engineInfo": concat!("echolake/", env!("CARGO_PKG_VERSION")),
+        "engineInfo": format!("{ENGINE}{}", env!("CARGO_PKG_VERSION")),
         // Makes each commit unlike all others: a store whose answer is lost is asked if it holds this one.
         "txnId": Uuid::new_v4().to_string(),
     });
@@ -472,7 +534,14 @@ fn removal_parameters(removal: &RemovalRecord) -> Value {
 fn add_file(file: &NewFile, log_version: u64, now_millis: i64, data_change: bool) -> AddFile {
     let parts = (!file.parts.is_empty()).then(|| (PARTS, encode_parts(&file.parts)));
     let seen_runs = (file.seen_runs > 0).then(|| (SEEN_RUNS, file.seen_runs.to_string()));
-    let tags = [Some((LOG_VERSION, log_version.to_string())), seen_runs, parts].into_iter().flatten();
+    let of_parts: Vec<_> = file.parts.iter().map(|part| &part.row_counts).collect();
+    let rows = match &file.row_counts {
+        Some(counts) => serde_json::to_string(counts).ok(),
+        None if of_parts.iter().any(|counts| counts.is_some()) => serde_json::to_string(&of_parts).ok(),
+        None => None,
+    };
+    let rows = rows.map(|text| (ROWS, text));
+    let tags = [Some((LOG_VERSION, log_version.to_string())), seen_runs, parts, rows].into_iter().flatten();
     AddFile {
         path: file.name.clone(),
         partition_values: actions::TextMap::new(),
@@ -534,8 +603,8 @@ mod tests {
             prefix: Some(prefix.to_owned()).filter(|p| !p.is_empty()),
             files: names.iter().map(|name| logged(name, 3)).collect(),
         });
-        let (stats, parts) = ("{}".into(), Vec::new());
-        NewFile { name: name.into(), bytes: 1, stats, replaces, parts, seen_runs: 0, run_version: 0 }
+        let (stats, parts, row_counts) = ("{}".into(), Vec::new(), None);
+        NewFile { name: name.into(), bytes: 1, stats, replaces, parts, seen_runs: 0, run_version: 0, row_counts }
     }
 
     fn logged(name: &str, log_version: u64) -> LoggedFile {

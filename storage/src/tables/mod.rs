@@ -9,10 +9,12 @@ mod lease;
 mod optimize;
 mod process_identity;
 mod project_log;
+mod rebuild;
 mod removal;
 mod rig_tables;
 mod rows;
 mod snapshot;
+mod table_fault;
 mod vacuum;
 mod versions;
 
@@ -20,7 +22,7 @@ pub use batch_builder::BatchBuilder;
 pub use claims::{ClaimOutcome, ClaimTimes, WorkClaims};
 pub use commit_log::{
     CommitEffect, CommitLog, CommitOutcome, DataFile, FileHistory, FileStats, LoggedFile, NewFile, RemovalRecord,
-    ReplacedFiles, RunPart, TableChange, TableCommit, TableVersion, TableView,
+    ReplacedFiles, RunPart, RunRowCounts, TableChange, TableCommit, TableVersion, TableView,
 };
 pub use data_file::{EncodedFile, FileEncoder, encode};
 pub use delta::delta_schema;
@@ -28,6 +30,7 @@ pub use optimize::{MergeProgress, OptimizeReport, TARGET_BYTES, TableOptimizeRep
 pub(crate) use project_log::ProjectLog;
 pub use rows::{add_missing_columns, reader_metadata, wanted_schema};
 pub use snapshot::{FileName, LakeSnapshot, VisibleRun};
+pub use table_fault::LackingRows;
 pub use vacuum::{DeletedFile, DeletionMode, KEEP_HOURS, VacuumReport};
 pub use versions::{LakeMoment, NoMoment};
 
@@ -36,7 +39,8 @@ use echolake_schema::tables::{Source, Table};
 use futures::future::{join, join_all, try_join_all};
 use object_store::ObjectStoreExt as _;
 
-use self::delta::folder;
+use self::delta::{folder, has_run_files};
+use self::table_fault::TableFault;
 use crate::{Error, LAKE_FORMAT, Lake, Result};
 
 /// A file in the store that no commit names yet.
@@ -44,6 +48,7 @@ use crate::{Error, LAKE_FORMAT, Lake, Result};
 pub struct StagedFile {
     pub(crate) table: Table,
     pub(crate) file: NewFile,
+    rows: u64,
 }
 
 impl StagedFile {
@@ -54,6 +59,20 @@ impl StagedFile {
         self.file.seen_runs = snapshot.version(Table::Runs).unwrap_or(0);
         self.file.run_version = snapshot.run_version(&self.file.name);
         self
+    }
+
+    /// Records the rows that the run's other tables have: those of `counts`, and of these files. Without them its row of
+    /// `runs` says no more than that there are some.
+    #[must_use]
+    pub fn counting<'a>(mut self, mut counts: RunRowCounts, files: impl IntoIterator<Item = &'a Self>) -> Self {
+        files.into_iter().for_each(|file| counts.set_rows(file.table, file.rows));
+        self.file.row_counts = Some(counts);
+        self
+    }
+
+    /// The table that it is for.
+    pub fn table(&self) -> Table {
+        self.table
     }
 
     /// Makes a run's row replace its present rows, which are these files or none. If there are others by the time of
@@ -112,10 +131,29 @@ impl Lake {
     /// # Ok::<(), Box<dyn std::error::Error>>(())
     /// ```
     ///
+    /// A table that lacks rows, or whose log cannot be read, is a fault of the snapshot: [`LakeSnapshot::check`].
+    ///
     /// # Errors
-    /// [`Error::Log`] if a table's log is damaged.
+    /// [`Error::Log`] if the log of `runs` is damaged, [`Error::NoLake`] if the lake is gone.
     pub async fn snapshot(&self) -> Result<LakeSnapshot> {
-        Ok(LakeSnapshot::take(self.log()).await?.restricted(self.is_restricted()))
+        let mut snapshot = LakeSnapshot::take(self.log()).await?.restricted(self.is_restricted());
+        if snapshot.version(Table::Runs).is_none() {
+            self.check_readable().await?;
+            if has_run_files(self.store().as_ref()).await? {
+                snapshot.set_fault(TableFault::without_log(Table::Runs));
+            }
+        }
+        Ok(snapshot)
+    }
+
+    /// The same of a lake all of whose tables are whole.
+    ///
+    /// # Errors
+    /// [`Error::Incomplete`] if one lacks rows; as [`Lake::snapshot`].
+    pub async fn whole_snapshot(&self) -> Result<LakeSnapshot> {
+        let snapshot = self.snapshot().await?;
+        Table::ALL.into_iter().try_for_each(|table| snapshot.check(table))?;
+        Ok(snapshot)
     }
 
     /// Puts a file's bytes into the store, for a commit to name. No reader sees them before that.
@@ -125,10 +163,11 @@ impl Lake {
     pub async fn stage(&self, table: Table, name: &FileName, file: EncodedFile) -> Result<StagedFile> {
         let name = name.compose();
         let path = folder(table).join(name.as_str());
-        let (bytes, stats) = (file.bytes.len() as u64, file.stats);
+        let (bytes, stats, rows) = (file.bytes.len() as u64, file.stats, file.rows);
         self.store().put(&path, file.bytes.into()).await.map_err(|e| Error::store("write", &path, e))?;
-        let file = NewFile { name, bytes, stats, replaces: None, parts: Vec::new(), seen_runs: 0, run_version: 0 };
-        Ok(StagedFile { table, file })
+        let (parts, replaces, row_counts) = (Vec::new(), None, None);
+        let file = NewFile { name, bytes, stats, replaces, parts, seen_runs: 0, run_version: 0, row_counts };
+        Ok(StagedFile { table, file, rows })
     }
 
     /// Returns whether a file of this name is in the table.
@@ -196,7 +235,7 @@ impl Lake {
         Ok(self.commit(&[staged]).await?[0])
     }
 
-    /// Removes from the logs all files that no run's row names any more; merged files are rewritten without such rows.
+    /// Removes from the logs all files that no run's row names any more, and those of other programs; merged files are rewritten without such rows.
     /// The files themselves stay for readers that hold older views.
     ///
     /// # Errors
@@ -212,7 +251,8 @@ impl Lake {
     pub async fn remove_superseded_in(&self, snapshot: &LakeSnapshot) -> Result<usize> {
         let mut count = 0;
         for table in Table::ALL {
-            let remove: Vec<_> = snapshot.superseded(table).iter().map(DataFile::logged).collect();
+            let gone = snapshot.superseded(table).iter().chain(snapshot.foreign(table));
+            let remove: Vec<_> = gone.map(DataFile::logged).collect();
             if !remove.is_empty() {
                 count += remove.len();
                 self.log().commit(table, &TableCommit { remove, ..TableCommit::default() }).await?;

@@ -50,7 +50,7 @@ impl ProjectLog {
         if project_of(file).is_some_and(|project| self.projects.contains(&project)) {
             return Vec::new();
         }
-        let runs = pointers(file).into_iter().map(|(run, _)| run);
+        let runs = pointers(file).into_iter().map(|row| row.run);
         runs.filter(|run| !self.common.contains(&run.surface)).map(|run| run.run).collect()
     }
 
@@ -94,7 +94,7 @@ impl CommitLog for ProjectLog {
 
     // Up to the one that added the newest row that is seen: how many came after it is a matter of other projects.
     async fn versions(&self, table: Table) -> Result<Vec<TableVersion>> {
-        let newest = self.files(Table::Runs).await?.iter().flat_map(pointers).map(|(_, version)| version).max();
+        let newest = self.files(Table::Runs).await?.iter().flat_map(pointers).map(|row| row.version).max();
         let mut versions = self.log.versions(table).await?;
         if table == Table::Runs {
             versions.retain(|version| newest.is_some_and(|newest| version.version <= newest));

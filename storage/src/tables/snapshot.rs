@@ -4,7 +4,6 @@
 //! row carries in its name the derivations that are current; files of other derivations are not seen.
 
 use std::collections::{BTreeMap, HashMap, HashSet};
-use std::ops::Bound;
 
 use echolake_schema::tables::{Source, Table};
 use echolake_schema::{ProjectName, RunId, SurfaceId};
@@ -14,7 +13,8 @@ use serde::Deserialize;
 use serde_json::{Value, json};
 
 use crate::tables::project_log::project_of;
-use crate::{CommitLog, DataFile, Result, RunPart, TableView};
+use crate::tables::table_fault::{LackingRows, TableFault};
+use crate::{CommitLog, DataFile, Error, Result, RunPart, RunRowCounts, TableView};
 
 /// Parsed name of a file in `tables/`.
 ///
@@ -81,8 +81,12 @@ impl VisibleRun {
 pub struct LakeSnapshot {
     files: HashMap<Table, Vec<DataFile>>,
     runs: BTreeMap<RunId, CurrentRun>,
+    newest: NewestRuns,
     hidden: HashMap<Table, Vec<DataFile>>,
     outgrown: HashMap<Table, Vec<DataFile>>,
+    foreign: HashMap<Table, Vec<DataFile>>,
+    lacking: HashMap<Table, Vec<LackingRows>>,
+    faults: HashMap<Table, TableFault>,
     versions: HashMap<Table, u64>,
     is_restricted: bool,
 }
@@ -93,11 +97,34 @@ struct CurrentRun {
     run: VisibleRun,
     log_version: u64,
     project: Option<ProjectName>,
+    row_counts: Option<RunRowCounts>,
+}
+
+/// The newest run of each surface: of all its runs, and of those of a project.
+#[derive(Debug, Clone, Default)]
+struct NewestRuns {
+    of_surface: HashMap<SurfaceId, RunId>,
+    of_project: HashMap<(SurfaceId, ProjectName), RunId>,
+}
+
+impl NewestRuns {
+    fn of(runs: &BTreeMap<RunId, CurrentRun>) -> Self {
+        let mut newest = Self::default();
+        for CurrentRun { run, project, .. } in runs.values() {
+            newest.of_surface.insert(run.surface.clone(), run.run.clone());
+            if let Some(project) = project {
+                newest.of_project.insert((run.surface.clone(), project.clone()), run.run.clone());
+            }
+        }
+        newest
+    }
 }
 
 const EXTENSION: &str = ".parquet";
 const WITHOUT: &str = "none";
 const MERGED: &str = "merged";
+/// Snapshots that are taken until one is not overtaken by a commit of `runs`.
+const TAKE_TRIES: usize = 10;
 
 impl FileName {
     /// The name.
@@ -132,40 +159,126 @@ impl FileName {
     }
 }
 
-async fn views_of_others(log: &dyn CommitLog) -> Result<Vec<(Table, Option<TableView>)>> {
+/// A table's view, or the fault of its log.
+type ReadView = std::result::Result<Option<TableView>, TableFault>;
+
+async fn views_of_others(log: &dyn CommitLog) -> Result<Vec<(Table, ReadView)>> {
     let others = Table::ALL.into_iter().filter(|table| *table != Table::Runs);
-    try_join_all(others.map(|table| async move { Ok((table, log.view(table).await?)) })).await
+    let read = others.map(|table| async move {
+        match log.view(table).await {
+            Err(Error::Log { source, .. }) => Ok((table, Err(TableFault::unreadable(table, source.to_string())))),
+            view => view.map(|view| (table, Ok(view))),
+        }
+    });
+    try_join_all(read).await
 }
 
 impl LakeSnapshot {
     /// Takes a view. The other tables are read after the version of `runs` was there, so that they hold whatever it names:
     /// all at once if it is still the version of the last look.
+    ///
+    /// If `runs` has a newer version than a view that lacks rows, ingest has replaced them meanwhile: the view is taken again.
     pub(crate) async fn take(log: &dyn CommitLog) -> Result<Self> {
+        for _ in 0..TAKE_TRIES {
+            let snapshot = Self::take_once(log).await?;
+            if snapshot.faults.is_empty() || log.version(Table::Runs).await? == snapshot.version(Table::Runs) {
+                return Ok(snapshot);
+            }
+        }
+        Self::take_once(log).await
+    }
+
+    async fn take_once(log: &dyn CommitLog) -> Result<Self> {
         let known = log.known_version(Table::Runs).await;
         let (pointers, mut views) = try_join(log.view(Table::Runs), views_of_others(log)).await?;
         if known.is_none() || pointers.as_ref().map(|view| view.version) != known {
             views = views_of_others(log).await?;
         }
-        let runs = pointers.as_ref().map(|view| current_runs(&view.files)).unwrap_or_default();
-        let mut snapshot = Self { runs, ..Self::default() };
-        for (table, view) in views.into_iter().chain([(Table::Runs, pointers)]) {
-            snapshot.versions.extend(view.as_ref().map(|view| (table, view.version)));
-            snapshot.sort_in(table, view.unwrap_or_default().files);
+        let mut snapshot = Self::naming(pointers.as_ref().map_or(&[], |view| view.files.as_slice()));
+        let is_rebuilding = pointers.as_ref().is_some_and(|view| view.is_rebuilding);
+        for (table, view) in views.into_iter().chain([(Table::Runs, Ok(pointers))]) {
+            match view {
+                Ok(view) => {
+                    snapshot.versions.extend(view.as_ref().map(|view| (table, view.version)));
+                    snapshot.sort_in(table, view.unwrap_or_default().files);
+                }
+                Err(fault) => {
+                    snapshot.sort_in(table, Vec::new());
+                    snapshot.set_fault(fault);
+                }
+            }
+        }
+        if is_rebuilding {
+            snapshot.set_fault(TableFault::unfinished());
         }
         Ok(snapshot)
     }
 
+    // Without the files of any table.
+    fn naming(pointers: &[DataFile]) -> Self {
+        let runs = current_runs(pointers);
+        Self { newest: NewestRuns::of(&runs), runs, ..Self::default() }
+    }
+
     /// The view of one table that a version of `runs` gives, its files as the log had them then.
     pub(crate) fn of(pointers: &[DataFile], table: Table, files: Vec<DataFile>) -> Self {
-        let mut snapshot = Self { runs: current_runs(pointers), ..Self::default() };
+        let mut snapshot = Self::naming(pointers);
         snapshot.sort_in(table, files);
         snapshot
     }
 
+    /// Checks that a table has all rows that `runs` names, and no others.
+    ///
+    /// # Errors
+    /// [`Error::Incomplete`], or [`Error::Log`] if its log is damaged.
+    pub fn check(&self, table: Table) -> Result<()> {
+        let of_runs = || self.faults.get(&Table::Runs).filter(|_| table.source() != Source::Rig);
+        match self.faults.get(&table).or_else(of_runs) {
+            Some(fault) => Err(fault.to_error()),
+            None => Ok(()),
+        }
+    }
+
+    /// Returns whether no table has a fault.
+    pub fn is_whole(&self) -> bool {
+        self.faults.is_empty()
+    }
+
+    pub(crate) fn set_fault(&mut self, fault: TableFault) {
+        self.faults.insert(fault.table, fault);
+    }
+
+    /// The runs that have other rows in a table than `runs` names.
+    pub fn lacking(&self, table: Table) -> &[LackingRows] {
+        self.lacking.get(&table).map_or(&[], Vec::as_slice)
+    }
+
+    /// Returns whether a run lacks rows in one of the tables of a source.
+    pub fn lacks_rows(&self, run: &RunId, source: Source) -> bool {
+        let of_source = Table::ALL.into_iter().filter(|table| table.source() == source);
+        of_source.flat_map(|table| self.lacking(table)).any(|lacking| lacking.run == *run)
+    }
+
+    /// The files of a table that another program put into its log; empty for readers of some projects.
+    pub fn foreign(&self, table: Table) -> &[DataFile] {
+        self.foreign.get(&table).map_or(&[], Vec::as_slice)
+    }
+
+    /// The rows of a run by table, as its row in `runs` names them.
+    pub fn row_counts(&self, run: &RunId) -> Option<&RunRowCounts> {
+        self.runs.get(run)?.row_counts.as_ref()
+    }
+
     /// The same view, of a reader of some projects.
     #[must_use]
-    pub(crate) fn restricted(self, is_restricted: bool) -> Self {
-        Self { is_restricted, ..self }
+    pub(crate) fn restricted(mut self, is_restricted: bool) -> Self {
+        self.is_restricted = is_restricted;
+        if is_restricted {
+            // They may be of other projects. Rows of this reader that are in them are missing besides.
+            self.foreign.clear();
+            self.faults.retain(|_, fault| !fault.is_of_foreign_files);
+        }
+        self
     }
 
     /// Returns whether this is a reader's of some projects: what it hides is none of the reader's business.
@@ -248,18 +361,54 @@ impl LakeSnapshot {
         for file in single {
             match self.file_place(table, &file) {
                 RowsPlace::Seen => {
+                    sorted.logged.extend(run_of(&file).map(|run| (run, file.rows)));
                     sorted.shown.extend(run_of(&file));
                     sorted.seen.push(file);
                 }
+                RowsPlace::OfProject => sorted.logged.extend(run_of(&file).map(|run| (run, file.rows))),
                 RowsPlace::Superseded if self.is_superseded(&file) => sorted.hidden.push(file),
+                RowsPlace::Foreign => sorted.foreign.push(file),
                 RowsPlace::Superseded | RowsPlace::Unseen => {}
             }
         }
         merged.into_iter().for_each(|file| self.sort_merged(table, file, &mut sorted));
         sorted.seen.sort_by(|a, b| a.path.cmp(&b.path));
+        let is_without_rig = table.source() == Source::Rig && sorted.seen.is_empty() && !self.runs.is_empty();
+        let lacking = self.compare_rows(table, &sorted.logged);
+        let fault = match (lacking.is_empty(), sorted.foreign.first()) {
+            (false, _) => Some(TableFault::lacking(table, &lacking)),
+            (true, Some(file)) => Some(TableFault::foreign(table, file)),
+            (true, None) => is_without_rig.then(|| TableFault::without_rig(table)),
+        };
+        fault.into_iter().for_each(|fault| self.set_fault(fault));
         self.files.insert(table, sorted.seen);
         self.hidden.insert(table, sorted.hidden);
         self.outgrown.insert(table, sorted.outgrown);
+        self.foreign.insert(table, sorted.foreign);
+        self.lacking.insert(table, lacking);
+    }
+
+    // What each run's row says that the table has of it, against what its log has.
+    fn compare_rows(&self, table: Table, logged: &HashMap<RunId, u64>) -> Vec<LackingRows> {
+        let named = self.runs.values().filter(|current| match table.source() {
+            Source::Rig | Source::Pointer => false,
+            Source::Run => true,
+            Source::References => current.run.reference_derivation.is_some(),
+        });
+        let needed = named.filter(|current| self.run_place(table, current) != RowsPlace::Superseded);
+        let compared = needed.filter_map(|current| {
+            let actual = logged.get(&current.run.run).copied();
+            let expected = current.row_counts.as_ref().and_then(|counts| counts.rows(table));
+            let is_whole = match (expected, &current.row_counts) {
+                (Some(expected), _) => actual.unwrap_or(0) == expected,
+                (None, Some(_)) => true,
+                // An earlier version of the program wrote the row: all tables but this one have a file of each run.
+                (None, None) => actual.is_some() || table == Table::Heightmaps,
+            };
+            let run = current.run.run.clone();
+            (!is_whole).then(|| LackingRows { run, expected, actual: actual.unwrap_or(0) })
+        });
+        compared.collect()
     }
 
     // What is merged was seen before. An ingest that did not know of the merge may have added the same rows again: its
@@ -268,10 +417,14 @@ impl LakeSnapshot {
         let mut superseded = Vec::new();
         file.hidden.clear();
         for part in &file.parts {
-            match self.rows_place(table, &part.surface, &part.run, &part.derivation) {
+            let place = self.rows_place(table, &part.run, &part.derivation);
+            if matches!(place, RowsPlace::Seen | RowsPlace::OfProject) {
+                sorted.logged.entry(part.run.clone()).or_insert(part.rows);
+            }
+            match place {
                 RowsPlace::Seen if sorted.shown.insert(part.run.clone()) => continue,
                 RowsPlace::Seen | RowsPlace::Superseded => superseded.push(part.run.clone()),
-                RowsPlace::Unseen => {}
+                RowsPlace::OfProject | RowsPlace::Unseen | RowsPlace::Foreign => {}
             }
             file.hidden.push(part.run.clone());
         }
@@ -292,32 +445,35 @@ impl LakeSnapshot {
             Some(FileName::Rig { .. }) if table.source() == Source::Rig => RowsPlace::Seen,
             Some(FileName::Pointer(pointer)) if self.run(&pointer.run) == Some(&pointer) => RowsPlace::Seen,
             Some(FileName::Pointer(_)) => RowsPlace::Superseded,
-            Some(FileName::Rows { surface, run, derivation }) => self.rows_place(table, &surface, &run, &derivation),
-            Some(FileName::Rig { .. } | FileName::Merged { .. }) | None => RowsPlace::Unseen,
+            Some(FileName::Rows { run, derivation, .. }) => self.rows_place(table, &run, &derivation),
+            Some(FileName::Rig { .. } | FileName::Merged { .. }) => RowsPlace::Unseen,
+            None => RowsPlace::Foreign,
         }
     }
 
-    fn rows_place(&self, table: Table, surface: &SurfaceId, run: &RunId, derivation: &str) -> RowsPlace {
+    fn rows_place(&self, table: Table, run: &RunId, derivation: &str) -> RowsPlace {
         let Some(current) = self.runs.get(run) else { return RowsPlace::Unseen };
         let is_named = match table.source() {
             Source::References => current.run.reference_derivation.as_deref() == Some(derivation),
             Source::Pointer => current.run.derivations() == derivation,
             _ => current.run.run_derivation == derivation,
         };
-        if !is_named {
-            return RowsPlace::Superseded;
+        match is_named {
+            true => self.run_place(table, current),
+            false => RowsPlace::Superseded,
         }
-        if !table.key().contains(&"surface_id") {
+    }
+
+    // A surface that was measured twice is still one surface: of the runs that a reader sees, the newest describes it.
+    fn run_place(&self, table: Table, current: &CurrentRun) -> RowsPlace {
+        let VisibleRun { surface, run, .. } = &current.run;
+        if !table.key().contains(&"surface_id") || self.newest.of_surface.get(surface) == Some(run) {
             return RowsPlace::Seen;
         }
-        // A surface that was measured twice is still one surface: of the runs that a reader sees, the newest describes it.
-        let newer = self.runs.range((Bound::Excluded(run), Bound::Unbounded)).map(|(_, newer)| newer);
-        let newer: Vec<_> = newer.filter(|newer| newer.run.surface == *surface).collect();
-        let is_seen_with = |newer: &&CurrentRun| current.project.is_none() || newer.project == current.project;
-        match newer.is_empty() {
-            true => RowsPlace::Seen,
-            false if newer.iter().any(is_seen_with) => RowsPlace::Superseded,
-            false => RowsPlace::Unseen,
+        let of_project = current.project.clone().map(|project| (surface.clone(), project));
+        match of_project.and_then(|key| self.newest.of_project.get(&key)) == Some(run) {
+            true => RowsPlace::OfProject,
+            false => RowsPlace::Superseded,
         }
     }
 
@@ -343,9 +499,12 @@ enum RowsPlace {
     Seen,
     /// No reader will see them again.
     Superseded,
-    /// They belong to a run that readers of this snapshot do not see, which another ingest may be about to name, or to one
-    /// that readers of another project see.
+    /// Readers see a newer run of the surface, but those of this run's project alone do not.
+    OfProject,
+    /// They belong to a run that readers of this snapshot do not see, which another ingest may be about to name.
     Unseen,
+    /// Another program put them into the log.
+    Foreign,
 }
 
 /// A table's files on their way into a snapshot.
@@ -354,8 +513,11 @@ struct SortedFiles {
     seen: Vec<DataFile>,
     hidden: Vec<DataFile>,
     outgrown: Vec<DataFile>,
+    foreign: Vec<DataFile>,
     /// The runs that a file shows already.
     shown: HashSet<RunId>,
+    /// The rows of each run that the table's log has, of the derivation that `runs` names.
+    logged: HashMap<RunId, u64>,
 }
 
 pub(crate) fn run_of(file: &DataFile) -> Option<RunId> {
@@ -366,18 +528,31 @@ pub(crate) fn run_of(file: &DataFile) -> Option<RunId> {
     }
 }
 
-/// The runs whose rows in `runs` a file of that table shows, each with the version that added its row.
-pub(crate) fn pointers(file: &DataFile) -> Vec<(VisibleRun, u64)> {
-    let pointer = |path: &Path, version| match FileName::parse(path)? {
-        FileName::Pointer(run) => Some((run, version)),
+/// A run's row in `runs`.
+pub(crate) struct RunPointer<'a> {
+    pub(crate) run: VisibleRun,
+    /// The version of `runs` that added it.
+    pub(crate) version: u64,
+    row_counts: Option<&'a RunRowCounts>,
+}
+
+/// The rows of `runs` that a file of that table shows.
+pub(crate) fn pointers(file: &DataFile) -> Vec<RunPointer<'_>> {
+    let run = |path: &Path| match FileName::parse(path)? {
+        FileName::Pointer(run) => Some(run),
         _ => None,
     };
     if file.parts.is_empty() {
-        let row = pointer(&file.path, file.log_version);
-        return row.into_iter().filter(|(run, _)| !file.hidden.contains(&run.run)).collect();
+        let shown = run(&file.path).filter(|run| !file.hidden.contains(&run.run));
+        let (version, row_counts) = (file.log_version, file.row_counts.as_ref());
+        return shown.map(|run| RunPointer { run, version, row_counts }).into_iter().collect();
     }
     let parts = file.visible_parts().map(|(part, _)| part);
-    parts.filter_map(|part| pointer(&part.file_name().into(), part.row_version?)).collect()
+    let pointers = parts.filter_map(|part| {
+        let (run, version) = (run(&part.file_name().into())?, part.row_version?);
+        Some(RunPointer { run, version, row_counts: part.row_counts.as_ref() })
+    });
+    pointers.collect()
 }
 
 impl DataFile {
@@ -425,18 +600,19 @@ pub(crate) fn decode_parts(text: &str) -> Option<Vec<RunPart>> {
 impl RunPart {
     /// The only part of a file of one run; None if the file has another name.
     pub(crate) fn of_file(file: &DataFile) -> Option<Self> {
-        Self::parse(&file.path, file.rows, Some(file.log_version))
+        let part = Self::parse(&file.path, file.rows, Some(file.log_version))?;
+        Some(Self { row_counts: file.row_counts.clone(), ..part })
     }
 
     fn parse(path: &Path, rows: u64, row_version: Option<u64>) -> Option<Self> {
         match FileName::parse(path)? {
             FileName::Rows { surface, run, derivation } => {
-                Some(Self { surface, run, derivation, rows, row_version: None })
+                Some(Self { surface, run, derivation, rows, row_version: None, row_counts: None })
             }
             FileName::Pointer(pointer) => {
                 let derivation = pointer.derivations();
-                let row_version = Some(row_version?);
-                Some(Self { surface: pointer.surface, run: pointer.run, derivation, rows, row_version })
+                let (row_version, row_counts) = (Some(row_version?), None);
+                Some(Self { surface: pointer.surface, run: pointer.run, derivation, rows, row_version, row_counts })
             }
             FileName::Rig { .. } | FileName::Merged { .. } => None,
         }
@@ -452,8 +628,13 @@ impl RunPart {
 fn current_runs(files: &[DataFile]) -> BTreeMap<RunId, CurrentRun> {
     let mut rows: Vec<_> =
         files.iter().flat_map(|file| pointers(file).into_iter().map(move |row| (row, file))).collect();
-    rows.sort_by_key(|((run, version), _)| (*version, run.derivations()));
-    let current = |((run, log_version), file)| CurrentRun { run, log_version, project: project_of(file) };
+    rows.sort_by_key(|(row, _)| (row.version, row.run.derivations()));
+    let current = |(row, file): (RunPointer<'_>, _)| CurrentRun {
+        log_version: row.version,
+        project: project_of(file),
+        row_counts: row.row_counts.cloned(),
+        run: row.run,
+    };
     rows.into_iter().map(current).map(|row| (row.run.run.clone(), row)).collect()
 }
 
@@ -466,12 +647,13 @@ mod tests {
         let path = crate::tables::delta::folder(table).join(name);
         let log_version = if table == Table::Runs { version } else { 0 };
         let seen_runs = version - log_version.min(1);
-        DataFile { path, bytes: 1, rows: 1, log_version, seen_runs, stats: None, parts: Vec::new(), hidden: Vec::new() }
+        let (stats, parts, hidden, row_counts) = (None, Vec::new(), Vec::new(), None);
+        DataFile { path, bytes: 1, rows: 1, log_version, seen_runs, stats, parts, hidden, row_counts }
     }
 
     fn view(files: &[(Table, &str, u64)]) -> LakeSnapshot {
         let of = |table| files.iter().filter(|f| f.0 == table).map(|f| file(f.0, f.1, f.2)).collect::<Vec<_>>();
-        let mut snapshot = LakeSnapshot { runs: current_runs(&of(Table::Runs)), ..LakeSnapshot::default() };
+        let mut snapshot = LakeSnapshot::naming(&of(Table::Runs));
         Table::ALL.into_iter().for_each(|table| snapshot.sort_in(table, of(table)));
         snapshot
     }
@@ -551,10 +733,7 @@ mod tests {
     fn parts_are_seen_and_superseded_as_files_were() {
         let runs = |wood: &str| {
             let pointers = ["flat.r1.ab.cd.parquet".to_owned(), format!("wood.r2.ab.{wood}.parquet")];
-            let mut snapshot = LakeSnapshot {
-                runs: current_runs(&pointers.map(|name| file(Table::Runs, &name, 5))),
-                ..LakeSnapshot::default()
-            };
+            let mut snapshot = LakeSnapshot::naming(&pointers.map(|name| file(Table::Runs, &name, 5)));
             let files = vec![
                 file(Table::Nce, "flat.r1.cd.parquet", 9),
                 merged(Table::Nce, &[("flat.r1.cd.parquet", 4), ("wood.r2.ef.parquet", 3)]),

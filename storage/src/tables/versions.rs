@@ -104,6 +104,10 @@ impl Lake {
         }
         let there = self.list_files(table).await?;
         let wanted = LakeSnapshot::of(&pointers, table, files.clone());
+        if let Some(lacking) = wanted.lacking(table).first() {
+            let moment = LakeMoment::Version(version).to_string();
+            return Err(Error::Forgotten { moment, table: table.name(), lacking: lacking.to_string() });
+        }
         files.retain(|file| there.contains(&file.path));
         let snapshot = LakeSnapshot::of(&pointers, table, files);
         let shown = snapshot.shown_runs(table);

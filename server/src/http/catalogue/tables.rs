@@ -92,7 +92,9 @@ pub(super) async fn table_files(
     Extension(request): Extension<CatalogueRequest>,
     PathParams(path): PathParams<TablePath>,
 ) -> EndpointAnswer {
-    let files = request.view.snapshot.readable_files(table(&path.table)?);
+    let table = table(&path.table)?;
+    request.view.snapshot.check(table).map_err(|fault| RequestFault::Query(fault.into()))?;
+    let files = request.view.snapshot.readable_files(table);
     let file = |file: &'_ echolake_lake::DataFile| {
         let rows = Some(file.visible_rows());
         file.path.filename().map(|name| (name.to_owned(), file.bytes, rows))

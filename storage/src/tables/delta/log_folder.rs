@@ -10,13 +10,13 @@ use echolake_schema::tables::Table;
 use futures::{StreamExt as _, TryStreamExt as _};
 use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt as _, PutMode};
-use serde_json::json;
+use serde_json::{Value, json};
 
 use super::actions::LogLine;
 use super::checkpoint::{decode_checkpoint, encode_checkpoint};
 use super::commit_files::{commit_name, commit_number, list_versions};
 use super::folder;
-use super::table_state::TableState;
+use super::table_state::{TableState, is_own_commit};
 use crate::{Error, Result, TableChange, TableVersion};
 
 /// The newest version of the protocol that this reads.
@@ -29,10 +29,15 @@ const CHECKPOINT_INTERVAL: u64 = 20;
 const LOG_RETENTION: TimeDelta = TimeDelta::days(30);
 /// Commits that are read at once.
 const CONCURRENT_READS: usize = 16;
-/// The way out of a log that cannot be read: all tables can be derived again.
-pub(super) const REBUILD_HINT: &str = "hint: delete the table's folder, `echolake ingest` makes it anew";
+/// The field of a commit's `commitInfo` that holds the number of its lines: a file that lost some at its end says so.
+const LINES: &str = "echolakeLines";
 /// The file that names the newest checkpoint for readers.
 const LAST_CHECKPOINT: &str = "_last_checkpoint";
+
+/// Returns the way out of a log that cannot be read: all tables can be derived again.
+pub(super) fn rebuild_hint(table: Table) -> String {
+    format!("hint: `echolake rebuild {}` makes it again from the runs", table.name())
+}
 
 /// One table's log folder.
 pub(super) struct LogFolder<'a> {
@@ -80,7 +85,7 @@ impl<'a> LogFolder<'a> {
             Some((version, checkpoint)) => self.apply_checkpoint(&mut state, version, checkpoint).await?,
             None => 0,
         };
-        self.apply_commits(&mut state, next..=last, TableState::apply).await?;
+        self.apply_commits(&mut state, next..=last, TableState::apply_commit).await?;
         self.check_readable(&state)?;
         Ok(Some(state))
     }
@@ -142,7 +147,7 @@ impl<'a> LogFolder<'a> {
         let from = state.version;
         while let Some(lines) = self.read_commit(state.version + 1).await? {
             let next = state.version + 1;
-            Arc::make_mut(&mut state).apply(next, lines);
+            Arc::make_mut(&mut state).apply_commit(next, lines);
         }
         if is_in_doubt && state.version == from && !self.has_version(from).await? {
             return Ok(None);
@@ -183,7 +188,11 @@ impl<'a> LogFolder<'a> {
     pub(super) async fn write_commit(&self, version: u64, lines: &[LogLine]) -> Result<CommitAttempt> {
         let mut text = Vec::new();
         for line in lines {
-            serde_json::to_writer(&mut text, line).map_err(|e| self.failed("written", e))?;
+            let mut line = line.clone();
+            if let Some(Value::Object(info)) = &mut line.commit_info {
+                info.insert(LINES.to_owned(), lines.len().into());
+            }
+            serde_json::to_writer(&mut text, &line).map_err(|e| self.failed("written", e))?;
             text.push(b'\n');
         }
         let path = self.path.clone().join(commit_name(version));
@@ -234,6 +243,23 @@ impl<'a> LogFolder<'a> {
         Ok(())
     }
 
+    /// Returns the versions since the newest checkpoint, if another one was due long ago.
+    pub(super) async fn overdue_checkpoint(&self) -> Result<Option<u64>> {
+        let listing = self.list().await?;
+        let since = listing.newest().unwrap_or(0) - listing.checkpoints.keys().next_back().copied().unwrap_or(0);
+        Ok((since >= 2 * CHECKPOINT_INTERVAL).then_some(since))
+    }
+
+    /// Deletes the log.
+    pub(super) async fn delete(&self) -> Result<()> {
+        let listed: Vec<_> =
+            self.store.list(Some(&self.path)).try_collect().await.map_err(|e| Error::store("list", &self.path, e))?;
+        for object in listed {
+            self.store.delete(&object.location).await.map_err(|e| Error::store("delete", object.location, e))?;
+        }
+        Ok(())
+    }
+
     async fn list(&self) -> Result<LogListing> {
         let there = self.store.list_with_delimiter(Some(&self.path)).await;
         let there = there.map_err(|e| Error::store("list", &self.path, e))?;
@@ -266,7 +292,22 @@ impl<'a> LogFolder<'a> {
             })?;
             lines.push(line);
         }
+        self.check_lines(version, &lines)?;
         Ok(Some(lines))
+    }
+
+    // A file that is cut at the end of a line, or emptied, has nothing else that is wrong.
+    fn check_lines(&self, version: u64, lines: &[LogLine]) -> Result<()> {
+        let written = lines.iter().find_map(|line| line.commit_info.as_ref()?.get(LINES)?.as_u64());
+        let expected = match written {
+            Some(count) if count == lines.len() as u64 => return Ok(()),
+            Some(count) => format!("{count} lines"),
+            // Others write commits that change nothing.
+            None if lines.is_empty() || lines.len() == 1 && is_own_commit(lines) => "actions".to_owned(),
+            None => return Ok(()),
+        };
+        let found = if lines.is_empty() { "none".to_owned() } else { lines.len().to_string() };
+        Err(self.damaged(&format!("`{}`: expected {expected}, found {found}", commit_name(version))))
     }
 
     async fn read_checkpoint(&self, path: &Path) -> Result<Vec<LogLine>> {
@@ -300,14 +341,14 @@ impl<'a> LogFolder<'a> {
             return Ok(());
         }
         let reason = format!(
-            "another program has raised it to Delta's {role} version {needed}, echolake {verb} version {supported}; \
-             {REBUILD_HINT}"
+            "another program has raised it to Delta's {role} version {needed}, echolake {verb} version {supported}; {}",
+            rebuild_hint(self.table)
         );
         Err(self.failed(action, reason))
     }
 
     fn damaged(&self, what: &str) -> Error {
-        self.failed("read", format!("{what}; {REBUILD_HINT}"))
+        self.failed("read", format!("{what}; {}", rebuild_hint(self.table)))
     }
 
     fn failed(&self, action: &'static str, source: impl Into<ErrorCause>) -> Error {
@@ -466,6 +507,33 @@ mod tests {
         assert!(store.head(&path(&checkpoint_name(100))).await.is_err());
         let loaded = log.load(None).await.expect("read").expect("a table");
         assert!(loaded.files.keys().eq(state.files.keys()));
+    }
+
+    #[tokio::test]
+    async fn a_commit_that_lost_lines_is_refused_and_older_ones_and_those_of_others_are_read() {
+        let store = InMemory::new();
+        put(&store, &commit_name(0), PROTOCOL).await;
+        let log = LogFolder::new(Table::Nce, &store);
+        let info = |by: &str| LogLine { commit_info: Some(json!({ "engineInfo": by })), ..LogLine::default() };
+        log.write_commit(1, &[info("echolake/1.0.0"), add("a"), add("b")]).await.expect("written");
+        let whole = store.get(&path(&commit_name(1))).await.expect("read").bytes().await.expect("bytes");
+        let whole = String::from_utf8(whole.to_vec()).expect("text");
+        let lines: Vec<_> = whole.lines().collect();
+        for (kept, said) in [(0, "expected actions, found none"), (1, "expected 3 lines, found 1"), (2, "found 2")] {
+            put(&store, &commit_name(1), lines[..kept].iter().map(|line| format!("{line}\n")).collect::<String>())
+                .await;
+            let error = load_error(&store).await;
+            assert!(error.contains(said) && error.contains("`echolake rebuild nce`"), "{kept}: {error}");
+        }
+        put(&store, &commit_name(1), whole).await;
+        assert_eq!(log.load(None).await.expect("read").expect("a table").files.len(), 2);
+        let text = |line: LogLine| serde_json::to_string(&line).expect("text");
+        for (number, readable) in [(text(info("echolake/0.9.0")), false), (text(info("delta-rs:1.5.0")), true)] {
+            put(&store, &commit_name(2), number.clone()).await;
+            assert_eq!(log.load(None).await.is_ok(), readable, "{number}");
+        }
+        put(&store, &commit_name(2), format!("{}\n{}", text(info("echolake/0.9.0")), text(add("c")))).await;
+        assert_eq!(log.load(None).await.expect("read").expect("a table").files.len(), 3);
     }
 
     #[tokio::test]

@@ -3,6 +3,8 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use serde_json::Value;
+
 use super::actions::{AddFile, ApplicationTransaction, LogLine, ProtocolVersions, RemoveFile, TableMetadata};
 
 /// Time for which a checkpoint keeps a removed file's tombstone: Delta's default, a week.
@@ -18,7 +20,14 @@ pub(super) struct TableState {
     pub(super) files: BTreeMap<String, Arc<AddFile>>,
     pub(super) removed: BTreeMap<String, Arc<RemoveFile>>,
     transactions: BTreeMap<String, ApplicationTransaction>,
+    /// Another program has added or removed files since this one last wrote the metadata.
+    is_changed_by_others: bool,
 }
+
+/// The setting of a table's metadata that says that it is being made again, or that another program changed its files.
+const REBUILD: &str = "echolake.rebuild";
+/// The beginning of `engineInfo` in commits of this program.
+pub(super) const ENGINE: &str = "echolake/";
 
 impl TableState {
     /// Applies the actions of a version, or of a checkpoint.
@@ -27,6 +36,31 @@ impl TableState {
         for line in lines {
             self.apply_line(line);
         }
+    }
+
+    /// Applies the actions of a version, and looks at whose they are.
+    pub(super) fn apply_commit(&mut self, version: u64, lines: Vec<LogLine>) {
+        match is_own_commit(&lines) {
+            true if lines.iter().any(|line| line.meta_data.is_some()) => self.is_changed_by_others = false,
+            false if lines.iter().any(|line| line.add.is_some() || line.remove.is_some()) => {
+                self.is_changed_by_others = true;
+            }
+            _ => {}
+        }
+        self.apply(version, lines);
+    }
+
+    /// Returns whether rows may be missing: the table is being made again, or another program has changed its files.
+    pub(super) fn is_rebuilding(&self) -> bool {
+        let is_marked = |metadata: &TableMetadata| metadata.configuration.contains_key(REBUILD);
+        self.is_changed_by_others || self.metadata.as_ref().is_some_and(is_marked)
+    }
+
+    /// The metadata with or without the mark of a rebuild.
+    pub(super) fn metadata_marked(&self, is_rebuilding: bool) -> Option<TableMetadata> {
+        let mut metadata = self.metadata.clone()?;
+        mark_rebuild(&mut metadata, is_rebuilding);
+        Some(metadata)
     }
 
     /// Applies the actions of a version but for removals.
@@ -55,7 +89,7 @@ impl TableState {
         let line = LogLine::default;
         let header = [
             LogLine { protocol: self.protocol.clone(), ..line() },
-            LogLine { meta_data: self.metadata.clone(), ..line() },
+            LogLine { meta_data: self.metadata_marked(self.is_rebuilding()), ..line() },
         ];
         let transactions = self.transactions.values().map(|txn| LogLine { txn: Some(txn.clone()), ..line() });
         let added = self.files.values().map(|add| {
@@ -74,12 +108,48 @@ impl TableState {
     }
 }
 
+/// Returns whether this program wrote the commit.
+pub(super) fn is_own_commit(lines: &[LogLine]) -> bool {
+    let engine = |info: &Value| info.get("engineInfo").and_then(Value::as_str).is_some_and(|by| by.starts_with(ENGINE));
+    lines.iter().any(|line| line.commit_info.as_ref().is_some_and(engine))
+}
+
+/// Marks a table as being made again, or takes the mark away.
+pub(super) fn mark_rebuild(metadata: &mut TableMetadata, is_rebuilding: bool) {
+    match is_rebuilding {
+        true => drop(metadata.configuration.insert(REBUILD.to_owned(), Some("true".to_owned()))),
+        false => drop(metadata.configuration.remove(REBUILD)),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
     fn line(json: &str) -> LogLine {
         serde_json::from_str(json).expect("a line")
+    }
+
+    #[test]
+    fn changes_by_others_are_remembered_until_the_metadata_say_that_they_are_mended() {
+        let own = r#"{"commitInfo":{"engineInfo":"echolake/1.0.0"}}"#;
+        let other = r#"{"commitInfo":{"engineInfo":"delta-rs:py-1.5.0","operation":"DELETE"}}"#;
+        let metadata = r#"{"metaData":{"id":"x","format":{"provider":"parquet","options":{}},"schemaString":"{}"}}"#;
+        let add = r#"{"add":{"path":"a","partitionValues":{},"size":1,"modificationTime":1,"dataChange":true}}"#;
+        let remove = r#"{"remove":{"path":"a","deletionTimestamp":1000,"dataChange":true}}"#;
+        let mut state = TableState::default();
+        let mut check = |lines: &[&str], expected: bool| {
+            state.apply_commit(state.version + 1, lines.iter().map(|json| line(json)).collect());
+            assert_eq!(state.is_rebuilding(), expected, "{lines:?}");
+            let mut from_checkpoint = TableState::default();
+            from_checkpoint.apply(state.version, state.checkpoint_lines(0));
+            assert_eq!(from_checkpoint.is_rebuilding(), expected, "{lines:?}, from a checkpoint");
+        };
+        check(&[own, metadata, add], false);
+        check(&[other], false);
+        check(&[other, remove], true);
+        check(&[own, add], true);
+        check(&[own, metadata], false);
     }
 
     #[test]

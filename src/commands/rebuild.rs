@@ -1,0 +1,53 @@
+//! `echolake rebuild`: rows of damaged tables are derived again.
+
+use std::collections::HashSet;
+
+use clap::Args;
+use clap::builder::PossibleValuesParser;
+use echolake_lake::{Error as LakeError, Lake};
+use echolake_schema::tables::{Source, Table};
+use futures::TryStreamExt as _;
+use object_store::ObjectStore as _;
+
+use super::ingest::{self, IngestArgs};
+use crate::CommandOutcome;
+
+#[derive(Debug, Args)]
+pub(crate) struct RebuildArgs {
+    /// The table; by default all. Until its rows are there again, queries of it are refused.
+    #[arg(value_parser = PossibleValuesParser::new(Table::ALL.map(Table::name)))]
+    pub(crate) table: Option<String>,
+}
+
+pub(crate) async fn run(args: &RebuildArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
+    let lake = Lake::open(lake_url).await?;
+    let named = args.table.as_deref().and_then(Table::by_name);
+    let tables = named.map_or_else(|| Table::ALL.to_vec(), |table| vec![table]);
+    if tables.iter().any(|table| matches!(table.source(), Source::Run | Source::Pointer)) {
+        ensure_run_files(&lake).await?;
+    }
+    lake.begin_rebuild(&tables).await?;
+    let args = IngestArgs { runs: Vec::new(), watch: false, json: false, suspect: None };
+    ingest::run(&args, lake_url).await
+}
+
+// What has no run file is in the tables alone.
+async fn ensure_run_files(lake: &Lake) -> anyhow::Result<()> {
+    let snapshot = match lake.snapshot().await {
+        // Nothing says which runs there were.
+        Err(LakeError::Log { .. }) => return Ok(()),
+        snapshot => snapshot?,
+    };
+    let listed: Vec<_> = lake.store().list(Some(&"runs".into())).try_collect().await?;
+    let there: HashSet<_> = listed.into_iter().map(|object| object.location).collect();
+    let missing: Vec<_> = snapshot.runs().map(|run| Lake::run_path(&run.surface, &run.run)).collect();
+    let missing: Vec<_> = missing.into_iter().filter(|path| !there.contains(path)).collect();
+    anyhow::ensure!(
+        missing.is_empty(),
+        "`{}` is not there, from which rows would be derived again, and {} run files more; hint: bring them back from a \
+         copy, or rebuild tables that need no run file: nce, tnce, tnce_d4, surface_stats",
+        missing[0],
+        missing.len() - 1
+    );
+    Ok(())
+}
