@@ -3,6 +3,7 @@
 
 mod acquire_kills;
 mod bad_input;
+mod broken_tables;
 mod campaign;
 mod child;
 mod end_to_end;

@@ -11,6 +11,7 @@ mod escapes;
 pub(crate) mod http;
 mod lichtblick;
 mod log;
+mod lost_tables;
 mod oidc;
 pub(crate) mod postgres;
 mod projects;

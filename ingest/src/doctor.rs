@@ -7,11 +7,12 @@ use arrow::record_batch::RecordBatch;
 use echolake_lake::{DataFile, Error as LakeError, FileName, FolderListing, Lake, LakeSnapshot};
 use echolake_recording::{DecodedChunk, ResyncItem, ResyncReader};
 use echolake_schema::tables::Table;
+use futures::TryStreamExt as _;
+use object_store::ObjectStoreExt as _;
 use object_store::path::Path;
-use object_store::{ObjectStore as _, ObjectStoreExt as _};
 use serde::Serialize;
 
-use crate::error::{Error, Result};
+use crate::error::Result;
 use crate::files::has_end;
 use crate::read_back;
 use crate::references::ReferenceFinder;

@@ -33,6 +33,6 @@ fn round_cast(mut cast: Expr, schema: &DFSchema) -> Transformed<Expr> {
     if !field.data_type().is_integer() || !expr.get_type(schema).is_ok_and(has_fraction) {
         return Transformed::no(cast);
     }
-    *expr = Box::new(round(vec![std::mem::take(expr.as_mut())]));
+    **expr = round(vec![std::mem::take(expr.as_mut())]);
     Transformed::yes(cast)
 }

@@ -202,10 +202,7 @@ impl LakeSnapshot {
                     snapshot.versions.extend(view.as_ref().map(|view| (table, view.version)));
                     snapshot.sort_in(table, view.unwrap_or_default().files);
                 }
-                Err(fault) => {
-                    snapshot.sort_in(table, Vec::new());
-                    snapshot.set_fault(fault);
-                }
+                Err(fault) => snapshot.set_fault(fault),
             }
         }
         if is_rebuilding {
@@ -720,6 +717,64 @@ mod tests {
         ]);
         assert_eq!(names(twice.files(Table::Surfaces)), ["flat.r2.cd.parquet"]);
         assert_eq!(twice.files(Table::Measurements).len(), 2);
+    }
+
+    fn counting(file: DataFile, counts: &[(Table, u64)]) -> DataFile {
+        let mut rows = RunRowCounts::default();
+        counts.iter().for_each(|(table, count)| rows.set_rows(*table, *count));
+        DataFile { row_counts: Some(rows), ..file }
+    }
+
+    fn lacking(snapshot: &LakeSnapshot, table: Table) -> Vec<(String, Option<u64>, u64)> {
+        let rows = snapshot.lacking(table).iter();
+        rows.map(|lacking| (lacking.run.to_string(), lacking.expected, lacking.actual)).collect()
+    }
+
+    #[test]
+    fn rows_of_each_run_are_compared_with_what_its_row_names() {
+        let row = counting(file(Table::Runs, "flat.r1.ab.cd.parquet", 5), &[(Table::Nce, 4), (Table::Events, 0)]);
+        let older = file(Table::Runs, "wood.r2.ab.none.parquet", 5);
+        let of = |table, files| LakeSnapshot::of(&[row.clone(), older.clone()], table, files);
+        let four = DataFile { rows: 4, ..file(Table::Nce, "flat.r1.cd.parquet", 5) };
+        assert!(of(Table::Nce, vec![four.clone()]).check(Table::Nce).is_ok(), "the older run waits for references");
+        let three = of(Table::Nce, vec![DataFile { rows: 3, ..four.clone() }]);
+        assert_eq!(lacking(&three, Table::Nce), [("r1".to_owned(), Some(4), 3)]);
+        let error = three.check(Table::Nce).expect_err("refused").to_string();
+        assert!(error.contains("`nce`") && error.contains("run `r1` has 3 rows, expected 4"), "{error}");
+        assert_eq!(lacking(&of(Table::Nce, Vec::new()), Table::Nce), [("r1".to_owned(), Some(4), 0)]);
+        let other = of(Table::Nce, vec![file(Table::Nce, "flat.r1.ef.parquet", 5)]);
+        assert_eq!(lacking(&other, Table::Nce), [("r1".to_owned(), Some(4), 0)]);
+        let merged = of(Table::Nce, vec![merged(Table::Nce, &[("flat.r1.cd.parquet", 4), ("x.r9.cd.parquet", 3)])]);
+        assert!(merged.check(Table::Nce).is_ok());
+        // A row that does not count the others still has some of each.
+        assert_eq!(lacking(&of(Table::Events, Vec::new()), Table::Events), [("r2".to_owned(), None, 0)]);
+        assert!(of(Table::Heightmaps, Vec::new()).check(Table::Heightmaps).is_ok());
+    }
+
+    #[test]
+    fn a_removed_run_and_an_older_one_of_a_surface_lack_nothing() {
+        let counts = [(Table::Surfaces, 1), (Table::Measurements, 2)];
+        let row = |name: &str| counting(file(Table::Runs, name, 5), &counts);
+        let rows = [row("flat.r1.ab.none.parquet"), row("flat.r2.ab.none.parquet")];
+        let newest = file(Table::Surfaces, "flat.r2.ab.parquet", 5);
+        assert!(LakeSnapshot::of(&rows, Table::Surfaces, vec![newest]).check(Table::Surfaces).is_ok());
+        let older = file(Table::Surfaces, "flat.r1.ab.parquet", 5);
+        let snapshot = LakeSnapshot::of(&rows, Table::Surfaces, vec![older]);
+        assert_eq!(lacking(&snapshot, Table::Surfaces), [("r2".to_owned(), Some(1), 0)]);
+        assert!(LakeSnapshot::of(&[], Table::Measurements, Vec::new()).is_whole());
+    }
+
+    #[test]
+    fn files_of_other_programs_are_a_fault_that_readers_of_some_projects_do_not_meet() {
+        let row = counting(file(Table::Runs, "flat.r1.ab.none.parquet", 5), &[(Table::Measurements, 1)]);
+        let rows = file(Table::Measurements, "flat.r1.ab.parquet", 5);
+        let foreign = file(Table::Measurements, "part-00000-c528.zstd.parquet", 0);
+        let snapshot = LakeSnapshot::of(&[row], Table::Measurements, vec![rows, foreign]);
+        let error = snapshot.check(Table::Measurements).expect_err("refused").to_string();
+        assert!(error.contains("another program put `tables/measurements/part-00000-c528.zstd.parquet`"), "{error}");
+        assert_eq!(names(snapshot.foreign(Table::Measurements)), ["part-00000-c528.zstd.parquet"]);
+        let seen = snapshot.restricted(true);
+        assert!(seen.check(Table::Measurements).is_ok() && seen.foreign(Table::Measurements).is_empty());
     }
 
     fn merged(table: Table, parts: &[(&str, u64)]) -> DataFile {

@@ -82,7 +82,13 @@ impl<'a> LogFolder<'a> {
         let last = at.unwrap_or(newest).min(newest);
         let mut state = TableState::default();
         let next = match listing.checkpoint_before(last) {
-            Some((version, checkpoint)) => self.apply_checkpoint(&mut state, version, checkpoint).await?,
+            Some((version, checkpoint)) => {
+                let next = self.apply_checkpoint(&mut state, version, checkpoint).await?;
+                if self.table == Table::Runs && !state.is_own_checkpoint(version) {
+                    self.look_at_authors(&mut state, &listing, version).await;
+                }
+                next
+            }
             None => 0,
         };
         self.apply_commits(&mut state, next..=last, TableState::apply_commit).await?;
@@ -104,6 +110,16 @@ impl<'a> LogFolder<'a> {
         self.apply_commits(&mut state, next..=newest, TableState::apply_additions).await?;
         self.check_readable(&state)?;
         Ok(Some(state))
+    }
+
+    // Another program's checkpoint does not say that it has removed files before. Commits that cannot be read are not needed.
+    async fn look_at_authors(&self, state: &mut TableState, listing: &LogListing, checkpoint: u64) {
+        let first = checkpoint.saturating_sub(2 * CHECKPOINT_INTERVAL);
+        for version in listing.commits.range(first..=checkpoint) {
+            if let Ok(Some(lines)) = self.read_commit(*version).await {
+                state.look_at_author(&lines);
+            }
+        }
     }
 
     // Returns the version behind the checkpoint.

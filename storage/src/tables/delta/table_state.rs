@@ -26,6 +26,8 @@ pub(super) struct TableState {
 
 /// The setting of a table's metadata that says that it is being made again, or that another program changed its files.
 const REBUILD: &str = "echolake.rebuild";
+/// The setting that this program's checkpoints have: their version. Those of others repeat an earlier one, or have none.
+const CHECKED: &str = "echolake.checkpoint";
 /// The beginning of `engineInfo` in commits of this program.
 pub(super) const ENGINE: &str = "echolake/";
 
@@ -40,14 +42,25 @@ impl TableState {
 
     /// Applies the actions of a version, and looks at whose they are.
     pub(super) fn apply_commit(&mut self, version: u64, lines: Vec<LogLine>) {
-        match is_own_commit(&lines) {
+        self.look_at_author(&lines);
+        self.apply(version, lines);
+    }
+
+    /// Looks at whose a commit is that may have been applied with a checkpoint.
+    pub(super) fn look_at_author(&mut self, lines: &[LogLine]) {
+        match is_own_commit(lines) {
             true if lines.iter().any(|line| line.meta_data.is_some()) => self.is_changed_by_others = false,
             false if lines.iter().any(|line| line.add.is_some() || line.remove.is_some()) => {
                 self.is_changed_by_others = true;
             }
             _ => {}
         }
-        self.apply(version, lines);
+    }
+
+    /// Returns whether this program wrote the checkpoint of this version, which is all that was applied.
+    pub(super) fn is_own_checkpoint(&self, version: u64) -> bool {
+        let checked = self.metadata.as_ref().and_then(|metadata| metadata.configuration.get(CHECKED)?.as_ref());
+        checked.is_some_and(|checked| *checked == version.to_string())
     }
 
     /// Returns whether rows may be missing: the table is being made again, or another program has changed its files.
@@ -87,10 +100,11 @@ impl TableState {
     /// The rows of a checkpoint of this version.
     pub(super) fn checkpoint_lines(&self, now_millis: i64) -> Vec<LogLine> {
         let line = LogLine::default;
-        let header = [
-            LogLine { protocol: self.protocol.clone(), ..line() },
-            LogLine { meta_data: self.metadata_marked(self.is_rebuilding()), ..line() },
-        ];
+        let mut meta_data = self.metadata_marked(self.is_rebuilding());
+        if let Some(metadata) = &mut meta_data {
+            metadata.configuration.insert(CHECKED.to_owned(), Some(self.version.to_string()));
+        }
+        let header = [LogLine { protocol: self.protocol.clone(), ..line() }, LogLine { meta_data, ..line() }];
         let transactions = self.transactions.values().map(|txn| LogLine { txn: Some(txn.clone()), ..line() });
         let added = self.files.values().map(|add| {
             let add = AddFile { data_change: false, ..add.as_ref().clone() };
