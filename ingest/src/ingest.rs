@@ -6,7 +6,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use echolake_lake::{
-    ClaimOutcome, ClaimTimes, CommitOutcome, EncodedFile, Lake, RunRowCounts, VisibleRun, WorkClaims, encode, object_sha256,
+    ClaimOutcome, ClaimTimes, CommitOutcome, EncodedFile, Lake, RunRowCounts, VisibleRun, WorkClaims, encode,
+    object_sha256,
 };
 use echolake_schema::tables::{Source, Table};
 use echolake_schema::{RunId, SurfaceId};

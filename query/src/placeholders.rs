@@ -47,7 +47,11 @@ fn infer_of_expression(mut expr: Expr, counts_rows: bool, schema: &DFSchema) -> 
         Expr::ScalarFunction(ScalarFunction { func, args }) if ALIKE.contains(&func.name()) => {
             let known = |arg: &Expr| arg.get_type(schema).ok().filter(|kind| *kind != DataType::Null);
             let kind = args.iter().find_map(known);
-            args.iter_mut().fold(false, |found, arg| settle_type(arg, || kind.clone()) || found)
+            let mut found = false;
+            for arg in args {
+                found |= settle_type(arg, || kind.clone());
+            }
+            found
         }
         Expr::Not(truth) => settle_type(truth, || Some(DataType::Boolean)),
         placeholder @ Expr::Placeholder(_) if counts_rows => settle_type(placeholder, || Some(DataType::Int64)),

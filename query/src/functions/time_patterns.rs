@@ -10,9 +10,7 @@ use datafusion::common::ScalarValue;
 use datafusion::config::ConfigOptions;
 use datafusion::error::{DataFusionError, Result};
 use datafusion::functions::datetime::{to_char, to_date, to_timestamp};
-use datafusion::logical_expr::{
-    ColumnarValue, Documentation, ScalarFunctionArgs, ScalarUDF, ScalarUDFImpl, Signature,
-};
+use datafusion::logical_expr::{ColumnarValue, Documentation, ScalarFunctionArgs, ScalarUDF, ScalarUDFImpl, Signature};
 
 /// Numbers, whose letters may be small, and what they are in DataFusion; of two that begin alike the longer comes first.
 const NUMBERS: [(&str, &str); 15] = [
@@ -64,7 +62,8 @@ impl PatternFunction {
             },
             ColumnarValue::Array(texts) => {
                 let texts = cast(texts, &DataType::Utf8)?;
-                let translated = texts.as_string::<i32>().iter().map(|text| text.map(|t| self.translate(t)).transpose());
+                let translated =
+                    texts.as_string::<i32>().iter().map(|text| text.map(|t| self.translate(t)).transpose());
                 ColumnarValue::Array(Arc::new(translated.collect::<Result<StringArray>>()?))
             }
         })
@@ -79,7 +78,9 @@ impl PatternFunction {
             ))
         })?;
         let reads = self.name() != "to_char";
-        Ok(READ_FRACTIONS.iter().fold(translated, |pattern, part| if reads { pattern.replace(part, "%.f") } else { pattern }))
+        Ok(READ_FRACTIONS
+            .iter()
+            .fold(translated, |pattern, part| if reads { pattern.replace(part, "%.f") } else { pattern }))
     }
 }
 
@@ -128,9 +129,8 @@ fn chrono_pattern(pattern: &str) -> std::result::Result<String, String> {
     let mut translated = String::with_capacity(pattern.len() + 8);
     let mut rest = pattern;
     while let Some(first) = rest.chars().next() {
-        let has_number = |(known, _): &&(&str, &str)| {
-            rest.get(..known.len()).is_some_and(|start| start.eq_ignore_ascii_case(known))
-        };
+        let has_number =
+            |(known, _): &&(&str, &str)| rest.get(..known.len()).is_some_and(|start| start.eq_ignore_ascii_case(known));
         let number = NUMBERS.iter().find(has_number);
         if let Some((known, own)) = number.or_else(|| NAMES.iter().find(|(known, _)| rest.starts_with(known))) {
             translated.push_str(own);

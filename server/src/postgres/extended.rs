@@ -90,7 +90,11 @@ fn kinds(statement: &ClientStatement) -> Result<Vec<Option<DataType>>, RequestFa
 }
 
 // The value of a placeholder for a list that is sent as a text. The library takes `""` and `"NULL"` in it for NULL.
-fn list_value(portal: &Portal<ClientStatement>, at: usize, kind: Option<&DataType>) -> Result<Option<ScalarValue>, RequestFault> {
+fn list_value(
+    portal: &Portal<ClientStatement>,
+    at: usize,
+    kind: Option<&DataType>,
+) -> Result<Option<ScalarValue>, RequestFault> {
     let told = portal.statement.parameter_types.get(at).and_then(Option::as_ref);
     let is_text = matches!(told, Some(told) if matches!(*told, Type::TEXT | Type::VARCHAR));
     let list = match (kind, told) {

@@ -564,7 +564,10 @@ fn keys_of_nothing(factor: &TableFactor) -> Option<TableFactor> {
         [Expr::CompoundIdentifier(parts)] => parts.last()?,
         _ => return None,
     };
-    LISTS_OF_NOTHING.contains(&name.value.as_str()).then(|| without_rows("CAST(0 AS SMALLINT)", alias.as_ref())).flatten()
+    LISTS_OF_NOTHING
+        .contains(&name.value.as_str())
+        .then(|| without_rows("CAST(0 AS SMALLINT)", alias.as_ref()))
+        .flatten()
 }
 
 fn without_rows(columns: &str, alias: Option<&TableAlias>) -> Option<TableFactor> {

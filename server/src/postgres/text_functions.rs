@@ -6,8 +6,8 @@ use std::hash::{Hash, Hasher};
 use std::sync::Arc;
 
 use arrow::array::{
-    Array, ArrayRef, AsArray as _, BooleanArray, Int32Array, ListArray, RecordBatch, StringArray, StructArray, UInt32Array,
-    new_null_array,
+    Array, ArrayRef, AsArray as _, BooleanArray, Int32Array, ListArray, RecordBatch, StringArray, StructArray,
+    UInt32Array, new_null_array,
 };
 use arrow::buffer::OffsetBuffer;
 use arrow::compute::{cast, take};
