@@ -43,6 +43,8 @@ pub struct CompletionSummary {
     pub changed: usize,
     /// The runs that wait for references, with the names of the missing references.
     pub waiting: Vec<(RunId, String)>,
+    /// True if no table lacked rows before superseded ones were removed.
+    pub is_whole: bool,
 }
 
 impl LakeIngest<'_> {
@@ -54,7 +56,8 @@ impl LakeIngest<'_> {
     pub async fn complete(&self, done: &mut CompletionReport<'_>) -> Result<CompletionSummary> {
         let (changed, snapshot) = self.complete_runs(done).await?;
         self.lake.remove_superseded_in(&snapshot).await?;
-        Ok(CompletionSummary { changed, waiting: waiting(self.lake, snapshot) })
+        let is_whole = snapshot.is_whole();
+        Ok(CompletionSummary { changed, waiting: waiting(self.lake, snapshot), is_whole })
     }
 
     // Returns the number of changed runs, and the lake's snapshot thereafter.

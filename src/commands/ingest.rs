@@ -59,6 +59,9 @@ pub(crate) struct IngestSummary {
     /// Number of files that other ingests took.
     #[serde(skip)]
     gone: usize,
+    /// Tables lack rows, or may.
+    #[serde(skip)]
+    lacks_rows: bool,
 }
 
 /// A file that cannot be taken in.
@@ -203,12 +206,16 @@ async fn finish_for_others(
         summary.taken.append(&mut more.taken);
         summary.refused.append(&mut more.refused);
         summary.gone = more.gone;
+        summary.lacks_rows = more.lacks_rows;
     }
     Ok(())
 }
 
 // All run files are in the tables, or refused. One of `runs/` that is refused may have been in them before.
 async fn finish_tables(lake: &Lake, summary: &IngestSummary) -> anyhow::Result<()> {
+    if !summary.lacks_rows {
+        return Ok(());
+    }
     if !summary.refused.iter().any(|refused| refused.moved_to.is_none()) {
         lake.finish_rebuild().await?;
     }
@@ -272,6 +279,7 @@ async fn take_in_and_complete(
     if let Some(task) = task {
         task.done(format!("{runs} runs, {rows} measurements derived"));
     }
+    summary.lacks_rows = !completion.is_whole;
     for (run, missing) in completion.waiting {
         if summary.taken.iter().any(|t| t.run == run) {
             progress.say(format!("{run}: waits for reference {missing}; ingest a run of it, and it is completed"));
@@ -411,7 +419,7 @@ async fn watch(lake: &Lake, stop: &StopRequest, progress: &CommandProgress) -> a
     let mut inbox = WatchedInbox::default();
     let mut lost = false;
     let mut is_first = true;
-    // No run file is left that tables may have lost.
+    // All that tables have lost is there again.
     let mut is_finished = false;
     while !stop.is_made() {
         // On an object store the inbox alone is listed, but for the first time.
@@ -433,8 +441,13 @@ async fn watch(lake: &Lake, stop: &StopRequest, progress: &CommandProgress) -> a
         inbox.name_passed_over(found, &mut passed_over, progress);
         lost |= passed_over.lost();
         if sources.is_empty() && inbox.seen.is_empty() && inbox.given_up.is_empty() && !is_finished {
-            lake.finish_rebuild().await?;
-            is_finished = true;
+            match take_in(lake, Vec::new(), stop.flag(), progress).await {
+                Ok(summary) => {
+                    finish_tables(lake, &summary).await?;
+                    is_finished = true;
+                }
+                Err(e) => wait_after(&e, stop).await,
+            }
         }
         if sources.is_empty() {
             pause(LOOK_EVERY, stop).await;
