@@ -65,7 +65,7 @@ impl Default for SliceSpool {
 }
 
 fn free_temp_bytes() -> Option<u64> {
-    let disk = rustix::fs::statvfs(&std::env::temp_dir()).ok()?;
+    let disk = rustix::fs::statvfs(std::env::temp_dir()).ok()?;
     Some(disk.f_bavail * disk.f_frsize)
 }
 
