@@ -1,5 +1,5 @@
-//! `echolake campaign`: measures the surfaces of a file, as far as the lake lacks them, and prints the paper's tables with
-//! what was expected. On a rig with real devices somebody puts each panel in place.
+//! `echolake campaign`: measures the surfaces of a file, as far as the lake lacks them, and prints the paper's tables
+//! with what was expected. On a rig with real devices somebody puts each panel in place.
 
 mod definition;
 mod real_runs;

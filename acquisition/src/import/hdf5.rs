@@ -1,5 +1,5 @@
-//! Import of an HDF5 file of another make, by a mapping of its datasets: one run per measurement, with a response of each
-//! microphone and each speaker. The file is read block by block, so that a set may be larger than the memory.
+//! Import of an HDF5 file of another make, by a mapping of its datasets: one run per measurement, with a response of
+//! each microphone and each speaker. The file is read block by block, so that a set may be larger than the memory.
 
 #[cfg(test)]
 mod tests;
@@ -26,7 +26,7 @@ const NAME: &str = "import hdf5";
 const RESPONSE_SECS: f64 = 1e-3;
 /// Numbers that are read at once: 32 MB of them.
 const BLOCK_NUMBERS: usize = 1 << 22;
-/// Most numbers that are read at once because each row, or each sample of all responses, has as many: 256 MB.
+/// Most numbers that are read at once because each row has as many, or the samples are the rows: 256 MB.
 const MOST_BLOCK_NUMBERS: usize = 1 << 25;
 const KELVIN: f64 = 273.15;
 

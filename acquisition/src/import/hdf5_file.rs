@@ -8,8 +8,8 @@ use hdf5_pure::{AttrValue, Dataset, Error as Hdf5Error, File, FormatError, Group
 const MOST: usize = 1 << 29;
 /// Numbers of a window of rows: 32 MB.
 const WINDOW_NUMBERS: usize = 1 << 22;
-/// Most numbers of one row, which is read as a whole: 256 MB.
-const MOST_ROW_NUMBERS: usize = 1 << 25;
+/// Most numbers of one row, which is read as a whole: 1 GB.
+const MOST_ROW_NUMBERS: usize = 1 << 27;
 /// Most bytes that one byte of a file may stand for, by deflate; a file that says more is damaged or a trap.
 const MOST_PACKED: u64 = 1100;
 /// Most names of variables, and levels of groups, that are listed: links may lead in circles.
@@ -211,7 +211,8 @@ mod tests {
         let packed = builder.create_dataset("packed").with_f64_data(&numbers).with_shape(&[5, 7]);
         packed.with_chunks(&[2, 3]).with_shuffle().with_deflate(5).with_fletcher32();
         let integers: Vec<i32> = numbers.iter().map(|x| *x as i32).collect();
-        builder.create_dataset("integers").with_i32_data(&integers).with_shape(&[5, 7]);
+        let packed = builder.create_dataset("integers").with_i32_data(&integers).with_shape(&[5, 7]);
+        packed.with_chunks(&[3, 7]).with_lzf();
         let path = folder.path().join("set.h5");
         builder.write(&path).expect("written");
         let file = Hdf5File::open(&path).expect("opened");
@@ -242,7 +243,8 @@ mod tests {
         assert!(read.as_ref().is_err_and(|e| e.contains("more than a file of")), "{read:?}");
     }
 
-    // Written by h5py, opened again, `RoomTemperature` renamed to `x`, `w1` deleted: both names are left in the group's heap.
+    // Written by h5py, then opened again, `RoomTemperature` renamed to `x`, and `w1` deleted: the group's heap has both
+    // names still.
     #[test]
     fn links_that_are_gone_are_not_read() {
         let folder = tempfile::tempdir().expect("a folder");

@@ -151,8 +151,8 @@ impl WavLayout {
         self.width * usize::from(self.channels)
     }
 
-    // Samples of fewer bits than their bytes have are in the upper bits by the format's definition, and in the lower ones
-    // of some writers. Which of both it is shows in all samples together.
+    // Samples of fewer bits than their bytes have are in the upper bits by the format's definition, and in the lower
+    // ones of some writers. Which of both it is shows in all samples together.
     fn find_unused_above(&self, path: &Path) -> Result<u32, String> {
         let (width_bits, bits) = (8 * self.width as u32, self.bits);
         let unused = width_bits - bits;
@@ -234,8 +234,8 @@ impl ChunkReader {
         match (is_name && left >= 8 && is_within, has_data) {
             (true, _) => Ok(Some(ChunkHead { name, start, bytes })),
             (false, true) => Err(format!(
-                "has {left} bytes behind its samples that are no chunk of a WAV file: its header says fewer samples than \
-                 there are, or it is damaged; hint: export it again"
+                "has {left} bytes behind its samples that are no chunk of a WAV file: its header says fewer samples \
+                 than there are, or it is damaged; hint: export it again"
             )),
             (false, false) => Err(format!("is no WAV file that can be read: byte {} begins no chunk", self.at)),
         }

@@ -1,8 +1,8 @@
-//! Lock of a folder and of a rig's devices while a run is recorded: two runs would move the same arms, and play into each
-//! other's takes.
+//! Lock of a folder and of a rig's devices while a run is recorded: two runs would move the same arms, and play into
+//! each other's takes.
 //!
-//! The system releases a lock when its process ends, however it ends. Simulated devices are computed by each process for
-//! itself and are not locked.
+//! The system releases a lock when its process ends, however it ends. Simulated devices are computed by each process
+//! for itself and are not locked.
 
 use std::fs::{File, OpenOptions, TryLockError};
 use std::io::{self, Read as _, Seek as _, Write as _};
@@ -62,17 +62,21 @@ impl RecordingLock {
 
 /// Names of what runs of two rig files must not use at once; none of simulated devices.
 fn device_names(devices: &DeviceParams) -> Vec<String> {
-    let mut names = Vec::new();
-    if let AudioParams::Alsa(params) = &devices.audio {
-        names.push(format!("audio {}", params.capture));
-    }
-    if let SensorParams::Serial(params) = &devices.sensor {
-        names.push(format!("sensor {}", params.path));
-    }
-    if let RobotsParams::Rosbridge(params) = &devices.robots {
-        names.push(format!("robots {}", params.url));
-    }
-    names
+    // Every kind is named, so that a new one is not forgotten.
+    let audio = match &devices.audio {
+        AudioParams::Simulated => Vec::new(),
+        AudioParams::Alsa(params) if params.capture == params.playback => vec![format!("audio {}", params.capture)],
+        AudioParams::Alsa(params) => [&params.capture, &params.playback].map(|pcm| format!("audio {pcm}")).into(),
+    };
+    let sensor = match &devices.sensor {
+        SensorParams::Simulated => None,
+        SensorParams::Serial(params) => Some(format!("sensor {}", params.path)),
+    };
+    let robots = match &devices.robots {
+        RobotsParams::Simulated => None,
+        RobotsParams::Rosbridge(params) => Some(format!("robots {}", params.url)),
+    };
+    audio.into_iter().chain(sensor).chain(robots).collect()
 }
 
 // The same for every user and folder of this machine.
@@ -134,7 +138,7 @@ mod tests {
 
     // Devices that no other test has.
     fn real_rig(name: &str, url: &str) -> Rig {
-        let pcm = format!("kind = \"alsa\"\ncapture = \"{name}\"");
+        let pcm = format!("kind = \"alsa\"\ncapture = \"{name}\"\nplayback = \"{name}-out\"");
         Rig::from_toml(&REAL.replace("kind = \"alsa\"", &pcm).replace("ws://NAME", url).replace("NAME", name))
             .expect("a rig")
     }

@@ -17,10 +17,14 @@ use super::rosbridge::fake::{BridgeFault, FakeBridge};
 use super::serial::SerialSensor;
 use super::serial::tests::{FakeSensor, GOOD, IMPATIENT_SECS, PATIENT_SECS};
 use super::*;
+use crate::panel::prepared_panel::PreparedPanel;
+use crate::rig::devices::{DeviceRequest, simulated_devices};
 use crate::run::controller::{
     Error as RunError, RecordingMode, RunControl, RunController, RunEvent, RunOptions, RunWorkload,
 };
 use crate::run::recorder::{Recorder, RunStart, Tried};
+use crate::run::session::{PreflightMode, RunSession, TakePace};
+use crate::run::{PanelSpecimen, RunRequest};
 
 // A cable is no air: its sound comes at the wrong time for any distance.
 const RIG: &str = "sweep.duration_secs = 0.1\nvalidation.attempts = 1\nvalidation.arrival_us = 1e6\n[grid]\nclearance_mm = 0\npoints_mm = \
@@ -153,6 +157,47 @@ fn a_run_over_all_drivers_holds_what_they_told() {
         assert_eq!(ended.count(topic), 3, "{topic}");
     }
     assert!(ended.log().contains("take repeated: overrun"), "{}", ended.log());
+}
+
+#[test]
+fn a_real_panel_is_recorded_without_a_geometry_that_nobody_gave() {
+    let room = FakeDevices::new();
+    let (folder, rig) = (tempfile::tempdir().expect("a folder"), &room.rig);
+    let request = RunRequest {
+        rig,
+        surface: "flat".parse().expect("an id"),
+        specimen: &PanelSpecimen::NoGeometry,
+        flat: None,
+        foam: None,
+        macro_reference: None,
+        project: None,
+        start: Timestamp::now(),
+        seed: 1,
+        tag: 1,
+        keep: RecordingMode::Sweeps,
+        folder: folder.path(),
+    };
+    let panel = PreparedPanel::new(request.specimen, rig).expect("a panel");
+    let simulated = DeviceRequest { rig, panel: &panel, start: request.start, seed: 1, arms: None };
+    let refused = simulated_devices(&simulated, TakePace::Fast).err().expect("no geometry").to_string();
+    assert!(refused.contains("needs the panel's geometry"), "{refused}");
+    let session = RunSession {
+        control: &RunControl::default(),
+        observe: &mut |_| {},
+        tap: None,
+        preflight: PreflightMode::Skip,
+        checkpoint_every: None,
+        pace: TakePace::Fast,
+    };
+    let devices = room.devices(since(request.start, &[]));
+    let measured = request.measure_with(devices, &panel, None, session, Some(BTreeMap::new())).expect("a run");
+    assert_eq!((measured.outcome.left, measured.outcome.end.accepted), (0, 3));
+    let file = std::fs::read(&measured.path).expect("the run");
+    let summary = mcap::Summary::read(&file).expect("sound").expect("a summary");
+    let attached: Vec<_> = summary.attachment_indexes.iter().map(|attachment| attachment.name.as_str()).collect();
+    assert_eq!(attached, [topics::RIG_ATTACHMENT, topics::SURFACE_ATTACHMENT]);
+    let shown = messages(&measured.path).into_iter().filter(|(topic, _)| topic.starts_with("/panel"));
+    assert_eq!(shown.count(), 0);
 }
 
 mod slow {

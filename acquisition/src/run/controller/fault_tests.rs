@@ -282,6 +282,32 @@ fn an_overrun_is_taken_again() {
 }
 
 #[test]
+fn room_is_kept_for_one_more_take_as_it_is_recorded() {
+    for keep in [RecordingMode::Sweeps, RecordingMode::ResponsesOnly] {
+        let (rig, folder) = (rig(), tempfile::tempdir().expect("a folder"));
+        let (devices, _) = simulated(&rig, NONE, start(), 3);
+        let mut controller = RunController::new(&rig, devices).expect("a controller");
+        let pairs = controller.grid.pairs()[..PAIRS].to_vec();
+        let mut recorder = begun(&folder.path().join("run.mcap"), &rig);
+        let options = RunOptions { keep, checkpoint_every: 1 };
+        let (mut attempts, mut recorded) = (0u64, Vec::new());
+        let mut observe = |event: RunEvent<'_>| match event {
+            RunEvent::Attempt(_) => attempts += 1,
+            RunEvent::Safe { cost, .. } => recorded.push((attempts, cost.bytes)),
+            _ => {}
+        };
+        let work = RunWorkload { pairs: &pairs, before: &BTreeMap::new(), options };
+        controller.run(&mut recorder, &work, &RunControl::default(), &mut observe).expect("a run");
+        assert!(recorder.bytes_to_end() > 1 << 20);
+        for two in recorded.windows(2).filter(|two| two[1].0 > two[0].0) {
+            let each = (two[1].1 - two[0].1) / (two[1].0 - two[0].0);
+            let most = attempt_bytes(&rig, keep);
+            assert!((most - 8192..=most).contains(&each), "{each} {most}");
+        }
+    }
+}
+
+#[test]
 fn what_is_not_fit_is_told_before_the_run() {
     let rig = rig();
     let told = |fault: DeviceFault| {

@@ -21,7 +21,7 @@ const MOST_SHOWN: usize = 60;
 /// As messages say it.
 const AT_MOST: &str = "up to 6 million vertices and as many triangles in all instances";
 
-/// Extensions that change how a mesh looks and not its shape; others may do that, and a file that requires one is refused.
+/// Extensions that change how a mesh looks and not its shape. A file that requires another is refused.
 const APPEARANCE: [&str; 3] = ["KHR_materials_", "KHR_texture_", "EXT_texture_"];
 /// An extension that makes instances of a node, which files may have without requiring it.
 const INSTANCING: &str = "EXT_mesh_gpu_instancing";
