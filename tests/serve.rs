@@ -376,6 +376,8 @@ mod slow {
         let (mut named, request) = postgres::WireClient::start(&server, "analyst", None);
         assert_eq!(request, b"\0\0\0\x0aSCRAM-SHA-256\0\0");
         assert_eq!(named.log_in(&token).as_deref(), Some("22023"));
+        let (_, others) = postgres::WireClient::start(&server, "nobody", None);
+        assert_eq!(others, request, "nobody learns which names there are");
         // Taken back, it ends what runs and what waits.
         let mut running = postgres::WireClient::connect(&server, None);
         assert_eq!(running.log_in(&token), None);
@@ -383,7 +385,7 @@ mod slow {
         let other = place.run(&["token", "other", "--days", "1"]);
         std::fs::write(place.path("tokens.toml"), &other.stdout).expect("written");
         wait_until("a new request is refused", || ask(Some(format!("Bearer {token}"))).status == 401);
-        assert_eq!(running.rows(), Err("28P01".to_owned()), "what runs is ended");
+        assert_eq!(running.end_state(), "28P01", "what runs is ended");
         let renewed = super::super::stderr(&other).lines().next().expect("a token").to_owned();
         assert_eq!(ask(Some(format!("Bearer {renewed}"))).status, 200);
     }

@@ -508,3 +508,30 @@ pub(crate) fn ended() -> Error {
 pub(crate) fn defect() -> Error {
     Error::Execution { message: "a defect ended it".to_owned() }
 }
+
+#[cfg(test)]
+mod tests {
+    use echolake_lake::ReferenceSurfaces;
+    use echolake_schema::Rig;
+
+    use super::*;
+
+    #[tokio::test]
+    async fn a_timer_ends_with_its_query() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let url = folder.path().join("lake").display().to_string();
+        let lake = Lake::open_or_create(&url, &Rig::paper(), &ReferenceSurfaces::default()).await.expect("a lake");
+        let engine = QueryEngine::new(&lake, EngineLimits::default()).expect("an engine");
+        let tasks = engine.0.watch.handle().expect("threads").metrics();
+        let before = tasks.num_alive_tasks();
+        let tickets: Vec<_> = (0..100).map(|_| engine.ticket(Some(Duration::from_secs(3600)))).collect();
+        assert_eq!(tasks.num_alive_tasks(), before + 100);
+        drop(tickets);
+        let ended = async {
+            while tasks.num_alive_tasks() > before {
+                tokio::task::yield_now().await;
+            }
+        };
+        tokio::time::timeout(Duration::from_secs(60), ended).await.expect("no task sleeps for an hour");
+    }
+}

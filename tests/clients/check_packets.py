@@ -101,14 +101,14 @@ def flight_session(server, is_encrypted):
 
 
 def postgres_session(server, is_encrypted):
-    """As a user without a verifier, who sends the token itself."""
+    """As the user who sends the token itself."""
     stream = socket.create_connection(("localhost", server.postgres), timeout=20)
     if is_encrypted:
         stream.sendall(struct.pack(">II", 8, 80877103))
         assert stream.recv(1) == b"S"
         stream = context(server).wrap_socket(stream, server_hostname="localhost")
     with stream, stream.makefile("rb") as answers:
-        startup = b"\0\x03\0\0user\0anybody\0database\0datafusion\0\0"
+        startup = b"\0\x03\0\0user\0token\0database\0datafusion\0\0"
         stream.sendall(struct.pack(">I", len(startup) + 4) + startup)
         send_postgres(stream, b"p", server.token)
         kinds_until_ready(answers)

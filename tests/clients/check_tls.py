@@ -153,7 +153,7 @@ async def postgres_message(reader):
 
 
 async def begin_postgres(reader, writer, token):
-    startup = b"\0\x03\0\0user\0anybody\0database\0datafusion\0\0"
+    startup = b"\0\x03\0\0user\0token\0database\0datafusion\0\0"
     writer.write((len(startup) + 4).to_bytes(4, "big") + startup)
     await postgres_message(reader)
     password = token.encode() + b"\0"

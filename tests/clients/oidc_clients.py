@@ -68,7 +68,7 @@ def over_http(port, token):
 def over_postgres(port, token):
     """Who asks, as the server calls it."""
     import psycopg
-    with psycopg.connect(host="localhost", port=port, user="anybody", password=token, dbname="datafusion") as lake:
+    with psycopg.connect(host="localhost", port=port, user="token", password=token, dbname="datafusion") as lake:
         return lake.execute("select distinct client from system.queries").fetchone()[0]
 
 

@@ -83,7 +83,7 @@ pub(super) fn http(random: &mut ChaCha8Rng, token: &str) -> Vec<u8> {
 /// A connection to Postgres' port, log-in and all, with changes.
 pub(super) fn postgres(random: &mut ChaCha8Rng, token: &str) -> Vec<u8> {
     let message = |kind: u8, body: &[u8]| [&[kind][..], &((body.len() + 4) as i32).to_be_bytes(), body].concat();
-    let start = b"\0\x03\0\0user\0me\0database\0datafusion\0\0";
+    let start = b"\0\x03\0\0user\0token\0database\0datafusion\0\0";
     let mut parts = vec![[&((start.len() + 4) as i32).to_be_bytes(), &start[..]].concat()];
     parts.push(message(b'p', &[token.as_bytes(), b"\0"].concat()));
     let query = b"select pair_id from pairs where pair_id = $1\0";

@@ -163,12 +163,12 @@ fn a_certificate_logs_nobody_in() {
     let (place, token) = certified_with_token();
     let server = served(&place, &[&FILES[..], &["--tokens", "tokens.toml"]].concat());
     place.ok(&["certificate", "ann", "-o", "own"]);
-    let config = client_config(&place.path("tls/certificate.pem"), Some(&place.path("own")), "http/1.1");
+    let mut config = client_config(&place.path("tls/certificate.pem"), Some(&place.path("own")), "http/1.1");
     let mut client = shake_as(ServedLake::connect(&server.http), config.clone(), "http/1.1").expect("a handshake");
     assert!(get(&mut client, "/api/v1/tables", "").starts_with("HTTP/1.1 401"));
     let bearer = format!("Authorization: Bearer {token}\r\n");
     assert!(get(&mut client, "/api/v1/tables", &bearer).starts_with("HTTP/1.1 200"));
-    let config = ClientConfig { alpn_protocols: vec![b"postgresql".to_vec()], ..config };
+    config.alpn_protocols = vec![b"postgresql".to_vec()];
     let mut session = shake_as(ask_for_tls(&server), config, "postgresql").expect("a handshake");
     begin_session(&mut session, "ann");
     let mut header = [0; 9];

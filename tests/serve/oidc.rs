@@ -93,7 +93,7 @@ fn groups_of_a_user_say_what_it_may() {
     let session = HttpRequest::post("/api/v1/session", &body).with("content-type", "application/json").send(&server);
     let cookie = session.header("set-cookie").and_then(|cookie| cookie.split(';').next()).expect("a cookie").to_owned();
     assert_eq!(HttpRequest::get("/api/v1/tables").with("cookie", &cookie).send(&server).status, 200);
-    let (mut client, _) = WireClient::start(&server, "anybody", None);
+    let (mut client, _) = WireClient::start(&server, "token", None);
     assert_eq!(client.log_in(&ann), None);
     assert_eq!(client.query("select 7"), Ok(vec![vec![Some("7".to_owned())]]));
     // A group that is taken back ends what its users were doing.

@@ -17,14 +17,14 @@ pub(crate) struct WireClient {
 pub(crate) type TextRows = Result<Vec<Vec<Option<String>>>, String>;
 
 impl WireClient {
-    /// Connects; if no token is required, the session has begun.
+    /// Connects as the user who sends a token; if none is required, the session has begun.
     pub(crate) fn connect(server: &ServedLake, options: Option<&str>) -> Self {
         Self::attempt(server, options).unwrap_or_else(|state| panic!("refused: {state}"))
     }
 
     /// The same; the error is the state of the refusal.
     pub(crate) fn attempt(server: &ServedLake, options: Option<&str>) -> Result<Self, String> {
-        let (mut client, request) = Self::begin_login(server, "me", options)?;
+        let (mut client, request) = Self::begin_login(server, "token", options)?;
         if request == [0; 4] {
             assert_eq!(client.ready(), None);
         }
@@ -120,6 +120,19 @@ impl WireClient {
         packet.extend(80_877_102_i32.to_be_bytes());
         packet.extend(&self.key);
         stream.write_all(&packet).expect("sent");
+    }
+
+    /// The state of the error with which a connection ends that sends no answer to its end.
+    pub(crate) fn end_state(&mut self) -> String {
+        let state = loop {
+            match self.message() {
+                (b'E', body) => break state(&body),
+                (b'Z', _) => panic!("the answer came to its end"),
+                _ => {}
+            }
+        };
+        assert_eq!(self.stream.read(&mut [0]).unwrap_or(0), 0, "nothing follows {state}");
+        state
     }
 
     pub(crate) fn send_raw(&mut self, bytes: &[u8]) {
@@ -231,4 +244,125 @@ fn the_catalogue_is_as_in_postgres() {
     assert!(copied.is_ok(), "{copied:?}");
     assert_eq!(client.query("unlisten *"), Ok(Vec::new()));
     assert_eq!(client.query("listen news"), Err("25006".to_owned()));
+}
+
+#[test]
+fn what_is_sent_after_an_error_is_not_kept() {
+    const MIB: usize = 1 << 20;
+    let place = super::lake();
+    let server = super::served(&place, &[]);
+    let mut client = WireClient::connect(&server, None);
+    client.send(b'P', b"\0selec\0\0\0");
+    let before = server.resident_kib();
+    let long = [&b"s\0select '"[..], &vec![b'x'; MIB], b"'\0\0\0"].concat();
+    let message = [&b"P"[..], &((long.len() + 4) as i32).to_be_bytes(), &long].concat();
+    // The engine ends a connection that keeps it busy without a query.
+    let _sent = (0..100).try_for_each(|_| client.stream.write_all(&message));
+    let grown = server.resident_kib().saturating_sub(before);
+    assert!(grown < 32 << 10, "the door grew by {grown} KiB");
+    let mut next = WireClient::connect(&server, None);
+    assert_eq!(next.query("select 7"), Ok(vec![vec![Some("7".to_owned())]]));
+}
+
+mod slow {
+    use rustix::process::{Pid, Signal, kill_process};
+
+    use super::super::http::HttpRequest;
+    use super::super::{ENDLESS, lake, refused, running, served, sql, wait_until};
+    use super::*;
+
+    // The server's engines, the spare one, too.
+    fn kill_engines(server: &ServedLake) {
+        let all = std::fs::read_dir(format!("/proc/{}/task", server.id())).expect("threads");
+        let lists = all.map(|thread| std::fs::read_to_string(thread.expect("a thread").path().join("children")));
+        let pids: Vec<i32> = lists
+            .filter_map(Result::ok)
+            .flat_map(|list| list.split_whitespace().map(|pid| pid.parse().expect("a number")).collect::<Vec<_>>())
+            .collect();
+        assert!(!pids.is_empty(), "it has engines");
+        for pid in pids {
+            // One may have ended by itself.
+            let _ = kill_process(Pid::from_raw(pid).expect("a process"), Signal::KILL);
+        }
+    }
+
+    #[test]
+    fn a_connection_ends_with_its_engine_and_nothing_is_run_again() {
+        let place = lake();
+        let server = served(&place, &[]);
+        let mut idle = WireClient::connect(&server, None);
+        idle.query("set application_name = 'x'").expect("set");
+        let mut busy = WireClient::connect(&server, None);
+        busy.begin(ENDLESS);
+        wait_until("it runs", || running(&server) == 1.0);
+        // An answer of which rows were sent.
+        let mut reading = WireClient::connect(&server, None);
+        reading.begin("select repeat('x', 1000) from generate_series(1, 1000000)");
+        while reading.message().0 != b'D' {}
+        kill_engines(&server);
+        for client in [&mut idle, &mut busy] {
+            assert_eq!(client.end_state(), "58000");
+        }
+        // It may have been broken off within a message, which nothing can follow.
+        let mut rest = Vec::new();
+        let _ = reading.stream.read_to_end(&mut rest);
+        assert!(!rest.ends_with(&[b'Z', 0, 0, 0, 5, b'I']), "a cut answer looks whole");
+        let mut next = WireClient::connect(&server, None);
+        assert_eq!(next.query("select 7"), Ok(vec![vec![Some("7".to_owned())]]));
+        assert_eq!(running(&server), 0.0, "nothing was begun again");
+    }
+
+    #[test]
+    fn silent_clients_hold_no_place() {
+        let place = lake();
+        let server = served(&place, &["--engines", "4"]);
+        let start = |user: &str| {
+            let (mut client, _) = WireClient::start(&server, user, None);
+            client.ready();
+            client
+        };
+        let mut in_transaction = start("a");
+        in_transaction.query("begin").expect("begun");
+        let mut with_cursor = start("b");
+        with_cursor.query("begin; declare c cursor for select * from generate_series(1, 1000000)").expect("begun");
+        let mut with_portal = start("c");
+        with_portal.send(b'P', b"\0select * from generate_series(1, 1000000)\0\0\0");
+        with_portal.send(b'B', b"p\0\0\0\0\0\0\0\0");
+        with_portal.send(b'E', b"p\0\0\0\0\x01");
+        with_portal.send(b'H', b"");
+        let mut unread = start("d");
+        unread.begin("select repeat('x', 1000) from generate_series(1, 1000000)");
+        // As many others, who stay.
+        let mut others = ["e", "f", "g", "h"].map(start);
+        for client in &mut others {
+            assert_eq!(client.query("select 7"), Ok(vec![vec![Some("7".to_owned())]]));
+        }
+        let ended = [in_transaction, with_cursor, with_portal].map(|mut client| client.end_state());
+        assert_eq!(ended, ["57P01"; 3]);
+        let mut rest = Vec::new();
+        let _ = unread.stream.read_to_end(&mut rest);
+        assert!(!rest.ends_with(&[b'Z', 0, 0, 0, 5, b'I']), "a cut answer looks whole");
+    }
+
+    #[test]
+    fn a_client_whose_engines_ended_is_answered_after_a_while_whatever_it_asks_meanwhile() {
+        let place = lake();
+        let server = served(&place, &[]);
+        let refusal = loop {
+            let answer = sql(&server, "select 7");
+            match answer.status {
+                200 => kill_engines(&server),
+                // It was killed while it answered, or started.
+                500 => {}
+                _ => break answer,
+            }
+        };
+        refused(&refusal, 429, "too_many");
+        let wait: u64 = refusal.header("retry-after").and_then(|secs| secs.parse().ok()).expect("seconds");
+        assert!((1..=3).contains(&wait), "{wait}");
+        let begun = std::time::Instant::now();
+        wait_until("it is answered", || sql(&server, "select 7").status == 200);
+        assert!(begun.elapsed().as_secs() <= wait + 1, "{:?}", begun.elapsed());
+        assert_eq!(HttpRequest::get("/health").send(&server).status, 200);
+    }
 }

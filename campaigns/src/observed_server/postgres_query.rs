@@ -32,7 +32,7 @@ impl io::Read for StreamReader {
 
 /// First message of a session.
 pub(crate) fn startup_message() -> Vec<u8> {
-    let body = [&PROTOCOL_VERSION.to_be_bytes()[..], b"user\0me\0database\0datafusion\0\0"].concat();
+    let body = [&PROTOCOL_VERSION.to_be_bytes()[..], b"user\0token\0database\0datafusion\0\0"].concat();
     [&message_length(&body)[..], &body].concat()
 }
 

@@ -133,3 +133,24 @@ fn status(code: FaultCode) -> (StatusCode, &'static str) {
         FaultCode::NotReady => (StatusCode::SERVICE_UNAVAILABLE, "The server is not ready"),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use super::*;
+
+    #[test]
+    fn a_refusal_for_a_while_says_for_how_long() {
+        let retry = |fault| {
+            let answer = ProblemResponse(fault).answer();
+            let secs = answer.headers().get(header::RETRY_AFTER).and_then(|secs| secs.to_str().ok()?.parse().ok());
+            (answer.status().as_u16(), secs)
+        };
+        let wait = Duration::from_millis(7_500);
+        assert_eq!(retry(RequestFault::Backoff { ends: 8, wait }), (429, Some(8)));
+        assert_eq!(retry(RequestFault::FailedLogins { wait }), (429, Some(8)));
+        assert_eq!(retry(RequestFault::Draining), (503, Some(5)));
+        assert_eq!(retry(RequestFault::Unauthenticated), (401, None));
+    }
+}

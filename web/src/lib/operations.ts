@@ -78,7 +78,7 @@ export const queriesQuery = (filter: QueryFilter, most: number) =>
   coalesce(seconds, date_part('epoch', now() - started)) as seconds, rows, memory_bytes
 from system.queries
 where ${QUERY_FILTERS[filter]} and coalesce(statement, '') not like '${MARK}%'
-order by outcome <> 'running', id desc
+order by outcome <> 'running', started desc
 limit ${most}`
 
 export const CONNECTIONS_QUERY = `select id, client, protocol, peer, started, requests, is_working
