@@ -21,6 +21,7 @@ mod object_stores;
 mod operator;
 mod prompt;
 mod real_data;
+mod recover;
 mod replay;
 mod serve;
 mod signals;
