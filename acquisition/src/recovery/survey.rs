@@ -109,7 +109,7 @@ impl RecordingSurvey {
             Some(Err(e)) => Err(Error::Unusable { path, source: format!("{e}, though {whole}").into() }),
             Some(Ok(manifest)) if !self.is_undamaged() && !manifest.fits_file_name(&path.to_string_lossy()) => Err(Error::Unusable {
                 source: format!(
-                    "it is damaged, and its manifest may be: it says run `{}`, which is not the file's name; hint: if it is \
+                    "it is damaged, and its manifest may be: it says run `{}`, which is not the file's name; if it is \
                      right, name the file after the run",
                     manifest.run_id
                 )
