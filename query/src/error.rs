@@ -12,8 +12,8 @@ use datafusion::error::DataFusionError;
 use datafusion::sql::sqlparser::parser::ParserError;
 use datafusion::sql::sqlparser::tokenizer::Location;
 use echolake_lake::Error as LakeError;
-use echolake_schema::ErrorCause;
 use echolake_schema::tables::Table;
+use echolake_schema::{ErrorCause, escape_controls};
 
 use crate::control::StopReason;
 use crate::friendly::hints;
@@ -140,7 +140,7 @@ impl Error {
                 (hints::short(&message), hint)
             }
         };
-        Self::Query { message, place, hint: Some(hint) }
+        Self::Query { message: escape_controls(&message), place, hint: Some(escape_controls(&hint)) }
     }
 
     /// Converts an error of the tokenizer.
@@ -172,7 +172,8 @@ impl Error {
     pub(crate) fn execution(error: &DataFusionError) -> Self {
         Self::limit(error).unwrap_or_else(|| {
             let message = explain(error).0;
-            Self::Execution { message: store_fault(&message).unwrap_or_else(|| hints::with_hint(message)) }
+            let message = store_fault(&message).unwrap_or_else(|| hints::with_hint(message));
+            Self::Execution { message: escape_controls(&message) }
         })
     }
 

@@ -144,6 +144,7 @@ async fn names_in_files_and_errors_of_libraries_control_no_terminal() {
         TestChannel { topic: "/\u{1b}[31m", encoding: "json", schema: ("T", "jsonschema", b"{"), messages: &[b"1"] };
     put(&lake, "inbox/e.mcap", file_of(&[channel])).await;
     refused(&lake, "select * from mcap('inbox/e.mcap', '/x')", &["the topics are /\\u{1b}[31m"]).await;
+    refused(&lake, "select cast(chr(27) as bigint)", &["\\u{1b}"]).await;
     // A channel whose topic is no text.
     let broken = record(opcode::CHANNEL, &[&[1, 0, 0, 0][..], &4u32.to_le_bytes(), &[0xFF; 4], &[0; 8]].concat());
     let file = [MAGIC, &record(opcode::HEADER, &[0; 8]), &broken, &record(opcode::DATA_END, &[0; 4])].concat();
