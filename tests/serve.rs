@@ -5,6 +5,7 @@ mod attacks;
 pub(crate) mod catalogue;
 mod contract;
 mod dialect;
+mod differences;
 mod drain;
 mod encryption;
 mod escapes;

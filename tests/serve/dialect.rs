@@ -187,7 +187,7 @@ async fn system_tables_are_listed_over_flight_sql() {
     assert_eq!(batches.iter().map(|batch| batch.num_rows()).sum::<usize>(), 7);
 }
 
-async fn connect(server: &ServedLake) -> FlightSqlServiceClient<Channel> {
+pub(super) async fn connect(server: &ServedLake) -> FlightSqlServiceClient<Channel> {
     let endpoint = Endpoint::from_shared(format!("http://{}", server.flight_sql)).expect("a URL");
     let channel = endpoint.connect_timeout(ANSWER_LIMIT).timeout(ANSWER_LIMIT).connect().await;
     FlightSqlServiceClient::new(channel.expect("connected"))

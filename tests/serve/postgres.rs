@@ -79,6 +79,31 @@ impl WireClient {
         self.rows()
     }
 
+    /// The same by the extended protocol, with values as texts whose types the server finds.
+    pub(crate) fn query_extended(&mut self, sql: &str, values: &[&str]) -> TextRows {
+        self.prepare("", sql);
+        self.execute("", values)
+    }
+
+    /// Prepares a statement of this name, without waiting for the answer.
+    pub(crate) fn prepare(&mut self, name: &str, sql: &str) {
+        self.send(b'P', &[name.as_bytes(), b"\0", sql.as_bytes(), b"\0", &[0; 2]].concat());
+    }
+
+    /// Runs a prepared statement.
+    pub(crate) fn execute(&mut self, name: &str, values: &[&str]) -> TextRows {
+        let mut bound = [b"\0", name.as_bytes(), b"\0", &[0; 2], &(values.len() as i16).to_be_bytes()[..]].concat();
+        for value in values {
+            bound.extend((value.len() as i32).to_be_bytes());
+            bound.extend(value.as_bytes());
+        }
+        bound.extend([0; 2]);
+        self.send(b'B', &bound);
+        self.send(b'E', &[0; 5]);
+        self.send(b'S', &[]);
+        self.rows()
+    }
+
     /// Asks and does not wait.
     pub(crate) fn begin(&mut self, sql: &str) {
         self.send(b'Q', &[sql.as_bytes(), b"\0"].concat());
@@ -244,6 +269,24 @@ fn the_catalogue_is_as_in_postgres() {
     assert!(copied.is_ok(), "{copied:?}");
     assert_eq!(client.query("unlisten *"), Ok(Vec::new()));
     assert_eq!(client.query("listen news"), Err("25006".to_owned()));
+}
+
+// Within two seconds, too, for which plans once were kept.
+#[test]
+fn a_prepared_statement_sees_the_lake_at_its_start() {
+    let place = super::lake();
+    let server = super::served(&place, &[]);
+    let mut client = WireClient::connect(&server, None);
+    let one = |text: &str| Ok(vec![vec![Some(text.to_owned())]]);
+    client.prepare("counted", "select count(*) from runs where $1::int = 1");
+    assert_eq!(client.execute("counted", &["1"]), one("1"));
+    place.acquire("foam", &["--ir-only"]);
+    place.ok(&["ingest"]);
+    // A plan of this moment.
+    client.prepare("new", "select now()");
+    let first = client.execute("new", &[]);
+    assert_eq!(client.execute("counted", &["1"]), one("2"));
+    assert_ne!(client.execute("new", &[]), first, "now() is the time of each run");
 }
 
 #[test]

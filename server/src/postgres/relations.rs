@@ -495,8 +495,6 @@ fn class_row(of: &CatalogRelation) -> RowValues {
         ("relnamespace", number(of.namespace.0)),
         ("relowner", number(OWNER)),
         ("relam", number(if of.is_view { 0 } else { 2 })),
-        // DuckDB reads tables in parts by their pages.
-        ("relpages", number(1)),
         ("reltuples", ScalarValue::Float32(Some(-1.0))),
         ("relpersistence", text("p")),
         ("relkind", text(if of.is_view { "v" } else { "r" })),

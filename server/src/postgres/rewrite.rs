@@ -11,7 +11,7 @@ use datafusion::sql::sqlparser::ast::{
     AccessExpr, Array, BinaryOperator, DataType as SqlType, Expr, Function, FunctionArg, FunctionArgExpr,
     FunctionArgumentClause, FunctionArgumentList, FunctionArguments, GroupByExpr, Ident, LimitClause, ObjectName,
     ObjectNamePart, OrderByExpr, OrderByKind, Query, Select, SelectItem, SetExpr, Statement, TableAlias,
-    TableAliasColumnDef, TableFactor, Value, ValueWithSpan, VisitorMut,
+    TableAliasColumnDef, TableFactor, TableFunctionArgs, Value, ValueWithSpan, VisitorMut,
 };
 use datafusion::sql::sqlparser::dialect::PostgreSqlDialect;
 use datafusion::sql::sqlparser::parser::Parser;
@@ -35,16 +35,17 @@ const RANKS: [&str; 4] = ["row_number", "rank", "dense_rank", "ntile"];
 /// Tables about what no table or column of the lake has.
 const NOTHING: [&str; 4] = ["pg_attrdef", "pg_collation", "pg_policy", "pg_sequence"];
 /// Functions that give rows about what the lake has not, and their columns.
-const FUNCTIONS_OF_NOTHING: [(&str, &str); 2] = [
+const FUNCTIONS_OF_NOTHING: [(&str, &str); 3] = [
     (
         "pg_partition_tree",
         "CAST(0 AS OID) AS relid, CAST(0 AS OID) AS parentrelid, false AS isleaf, CAST(0 AS INT) AS level",
     ),
     ("pg_options_to_table", "CAST('' AS TEXT) AS option_name, CAST('' AS TEXT) AS option_value"),
+    ("ts_token_type", "CAST(0 AS INT) AS tokid, CAST('' AS TEXT) AS alias, CAST('' AS TEXT) AS description"),
 ];
-/// Columns of lists that clients compare with texts, and those of them whose tables have no rows.
+/// Columns of lists that clients compare with texts, and lists that no row has.
 const LISTS: [&str; 4] = ["confkey", "conkey", "indkey", "polroles"];
-const LISTS_OF_NOTHING: [&str; 3] = ["confkey", "conkey", "polroles"];
+const LISTS_OF_NOTHING: [&str; 5] = ["confkey", "conkey", "evttags", "polroles", "reloptions"];
 /// The beginning of the names of functions that read the lake's files.
 const LAKE_FUNCTIONS: &str = "mcap";
 /// Rules of the library for names, operators and qualifiers; its others change what a statement answers.
@@ -56,6 +57,8 @@ const RULES: [&dyn SqlStatementRewriteRule; 6] = [
     &StripCollate,
     &RewritePgCatalogOperator,
 ];
+/// The beginning of the names of tables and functions of `pg_catalog`, which nothing of the lake has.
+const CATALOGUE_NAMES: &str = "pg_";
 const PG_CATALOG: &str = "pg_catalog";
 const INFORMATION_SCHEMA: &str = "information_schema";
 
@@ -121,7 +124,9 @@ impl VisitorMut for StatementRelations {
         self.has_relation = true;
         match factor {
             TableFactor::Table { name, args: Some(_), .. } => {
-                self.reads_other |= last_name(name).is_some_and(|name| name.starts_with(LAKE_FUNCTIONS));
+                let name = last_name(name).unwrap_or_default();
+                self.reads_other |= name.starts_with(LAKE_FUNCTIONS);
+                self.reads_catalogue |= name.starts_with(CATALOGUE_NAMES);
             }
             TableFactor::Table { name, .. } => match &name.0[..] {
                 [ObjectNamePart::Identifier(name)] if self.names.contains(&name.value) => {}
@@ -134,11 +139,10 @@ impl VisitorMut for StatementRelations {
     }
 }
 
-// Without a schema those of `pg_catalog` are found by the beginning of their names, which no table of the lake has.
 fn is_of_catalogue(name: &ObjectName) -> bool {
     let parts: Vec<_> = name.0.iter().filter_map(|part| part.as_ident()).map(|i| i.value.to_lowercase()).collect();
     match &parts[..] {
-        [table] => table.starts_with("pg_"),
+        [table] => table.starts_with(CATALOGUE_NAMES),
         [.., schema, _] => schema == PG_CATALOG || schema == INFORMATION_SCHEMA,
         [] => false,
     }
@@ -463,19 +467,33 @@ fn array_of_query(expr: &Expr) -> Option<Expr> {
 fn single_value(expr: &Expr) -> Option<Expr> {
     let Expr::Subquery(query) = expr else { return None };
     let (select, value) = selected_value(query)?;
-    let is_table = |factor: &TableFactor| matches!(factor, TableFactor::Table { args: None, .. });
-    let known = select.from.iter().all(|f| is_table(&f.relation) && f.joins.iter().all(|j| is_table(&j.relation)));
-    if select.from.is_empty() || !known || matches!(value, Expr::Function(function) if is_aggregate(function)) {
+    if select.from.is_empty() {
         return None;
     }
-    match &query.limit_clause {
-        None => parsed(&format!("single_value({})", Expr::Subquery(Box::new(aggregated(query, "array_agg")?)))),
+    let is_first = match &query.limit_clause {
+        None => false,
         Some(LimitClause::LimitOffset { limit: Some(limit), offset: None, limit_by })
             if limit_by.is_empty() && limit.to_string() == "1" =>
         {
-            Some(Expr::Subquery(Box::new(aggregated(query, "first_value")?)))
+            true
         }
-        Some(_) => None,
+        Some(_) => return None,
+    };
+    let one_row = match (is_first, has_aggregate(value)) {
+        (true, true) => Query { limit_clause: None, ..query.as_ref().clone() },
+        (true, false) => aggregated(query, "first_value")?,
+        (false, true) => return None,
+        (false, false) => return parsed(&format!("single_value(({}))", aggregated(query, "array_agg")?)),
+    };
+    Some(Expr::Subquery(Box::new(one_row)))
+}
+
+fn has_aggregate(expr: &Expr) -> bool {
+    match expr {
+        Expr::Function(function) => is_aggregate(function),
+        Expr::Cast { expr, .. } | Expr::Nested(expr) => has_aggregate(expr),
+        Expr::BinaryOp { left, right, .. } => has_aggregate(left) || has_aggregate(right),
+        _ => false,
     }
 }
 
@@ -558,10 +576,17 @@ fn name_elements(factor: &mut TableFactor) {
 
 // The elements of a key, of which no table has one. DataFusion cannot unnest a column of the query around.
 fn keys_of_nothing(factor: &TableFactor) -> Option<TableFactor> {
-    let TableFactor::UNNEST { alias, array_exprs, .. } = factor else { return None };
-    let name = match &array_exprs[..] {
-        [Expr::Identifier(name)] => name,
-        [Expr::CompoundIdentifier(parts)] => parts.last()?,
+    let (alias, list) = match factor {
+        TableFactor::UNNEST { alias, array_exprs, .. } => (alias, array_exprs.first()?),
+        TableFactor::Table { name, args: Some(TableFunctionArgs { args, .. }), alias, .. } => match &args[..] {
+            [FunctionArg::Unnamed(FunctionArgExpr::Expr(list))] if last_name(name)? == "unnest" => (alias, list),
+            _ => return None,
+        },
+        _ => return None,
+    };
+    let name = match list {
+        Expr::Identifier(name) => name,
+        Expr::CompoundIdentifier(parts) => parts.last()?,
         _ => return None,
     };
     LISTS_OF_NOTHING
