@@ -23,27 +23,46 @@ use object_store::{
 /// Distinguishes the temporary files of one process.
 static NEXT_TEMPORARY: AtomicU64 = AtomicU64::new(0);
 
+/// Folders of a lake that anybody may put files into.
+const OPEN_FOLDERS: [&str; 2] = ["inbox", "quarantine"];
+
 /// The whole local file system; paths are absolute.
 #[derive(Debug)]
 pub(crate) struct DurableFileSystem {
     inner: LocalFileSystem,
+    /// The lake that is read and written by it.
+    lake: PathBuf,
 }
 
 impl DurableFileSystem {
-    pub(crate) fn new() -> Self {
-        Self { inner: LocalFileSystem::new() }
+    pub(crate) fn new(lake: &FsPath) -> Self {
+        Self { inner: LocalFileSystem::new(), lake: lake.to_owned() }
     }
 
-    // Opening a named pipe waits for its other end.
+    // Opening a named pipe waits for its other end. A link in a folder that anybody may put files into is not followed: it
+    // would show files that are none of the lake's.
     fn refuse_special(&self, location: &Path) -> Result<()> {
         let path = self.inner.path_to_filesystem(location)?;
-        match fs::metadata(&path) {
-            Ok(meta) if !meta.is_file() && !meta.is_dir() => {
-                let source = io::Error::new(ErrorKind::InvalidInput, format!("`{}` is no file", path.display()));
-                Err(Error::Generic { store: "DurableFileSystem", source: Box::new(source) })
-            }
-            _ => Ok(()),
-        }
+        let what = match fs::metadata(&path) {
+            Ok(meta) if !meta.is_file() && !meta.is_dir() => "is no file",
+            Ok(_) if self.is_behind_link(&path) => "is a symbolic link, or below one, which is not followed",
+            _ => return Ok(()),
+        };
+        let source = io::Error::new(ErrorKind::InvalidInput, format!("`{}` {what}", path.display()));
+        Err(Error::Generic { store: "DurableFileSystem", source: Box::new(source) })
+    }
+
+    fn is_behind_link(&self, path: &FsPath) -> bool {
+        let Ok(within) = path.strip_prefix(&self.lake) else { return false };
+        let mut parts = within.components();
+        let Some(top) = parts.next().filter(|top| OPEN_FOLDERS.iter().any(|open| top.as_os_str() == *open)) else {
+            return false;
+        };
+        let mut at = self.lake.join(top);
+        parts.any(|part| {
+            at.push(part);
+            at.is_symlink()
+        })
     }
 
     // One renamed or copied file is as durable as its folder's entry.
@@ -185,7 +204,7 @@ mod tests {
     #[tokio::test]
     async fn create_refuses_a_taken_name_and_leaves_nothing_behind() {
         let folder = tempfile::tempdir().expect("a folder");
-        let store = DurableFileSystem::new();
+        let store = DurableFileSystem::new(folder.path());
         let path = at(&folder, "a/b/c");
         store.put_opts(&path, "first".into(), PutMode::Create.into()).await.expect("new");
         let again = store.put_opts(&path, "second".into(), PutMode::Create.into()).await;
@@ -197,9 +216,34 @@ mod tests {
     }
 
     #[tokio::test]
+    async fn links_in_the_inbox_are_not_followed_and_those_of_the_owner_are() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let store = DurableFileSystem::new(folder.path());
+        for name in ["elsewhere/secret", "moved/run", "inbox/plain"] {
+            store.put(&at(&folder, name), "x".into()).await.expect("written");
+        }
+        let link = |to: &str, name: &str| {
+            std::os::unix::fs::symlink(folder.path().join(to), folder.path().join(name)).expect("linked");
+        };
+        link("elsewhere/secret", "inbox/link");
+        link("elsewhere", "inbox/folder");
+        link("moved", "runs");
+        let read = async |name: &str| store.get(&at(&folder, name)).await.map(|_| ());
+        for name in ["inbox/link", "inbox/folder/secret"] {
+            let refused = read(name).await.expect_err(name).to_string();
+            assert!(refused.contains("which is not followed"), "{refused}");
+            let ranges = store.get_ranges(&at(&folder, name), &[0..1]).await;
+            assert!(ranges.is_err(), "{name}");
+        }
+        for name in ["inbox/plain", "runs/run"] {
+            read(name).await.expect(name);
+        }
+    }
+
+    #[tokio::test]
     async fn temporary_files_are_not_listed() {
         let folder = tempfile::tempdir().expect("a folder");
-        let store = DurableFileSystem::new();
+        let store = DurableFileSystem::new(folder.path());
         store.put(&at(&folder, "seen"), "x".into()).await.expect("written");
         fs::write(temporary_beside(&folder.path().join("lost")), "half").expect("written");
         let listed: Vec<_> = store.list(Some(&at(&folder, ""))).try_collect().await.expect("listed");

@@ -104,7 +104,7 @@ impl LakeLocation {
             return Err(wrong("it is a file".into()));
         }
         let prefix = ObjectPath::from_absolute_path(&absolute).map_err(|e| wrong(e.into()))?;
-        let store = Arc::new(PrefixStore::new(DurableFileSystem::new(), prefix));
+        let store = Arc::new(PrefixStore::new(DurableFileSystem::new(&absolute), prefix));
         Ok(Self { folder: Some(absolute), ..Self::store(text, store) })
     }
 }
