@@ -87,3 +87,45 @@ impl RunDefinitions {
 fn kept_name(name: &str) -> String {
     if name.len() <= LONGEST_NAME { name.to_owned() } else { String::new() }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::io::Cursor;
+
+    use bytes::Bytes;
+    use echolake_recording::{RecordSplitter, Writer};
+
+    use super::*;
+
+    /// A chunk that describes channel 1.
+    fn chunk(schema: &str, topic: &str) -> DecodedChunk {
+        let mut file = Cursor::new(Vec::new());
+        let mut writer = Writer::new(&mut file).expect("a writer");
+        writer.add_schema_with_id(1, schema, "protobuf", b"x").expect("added");
+        writer.add_channel_with_id(1, 1, topic, "protobuf", &Default::default()).expect("added");
+        writer.finish().expect("finished");
+        drop(writer);
+        let mut splitter = RecordSplitter::new(8);
+        splitter.push(&file.into_inner()[8..]);
+        loop {
+            let record = splitter.next_record().expect("sound").expect("a chunk");
+            if record.code == opcode::CHUNK {
+                return DecodedChunk::decode(&Bytes::copy_from_slice(&record.body)).expect("sound");
+            }
+        }
+    }
+
+    #[test]
+    fn a_channel_or_schema_that_is_used_again_for_something_else_is_refused() {
+        let mut definitions = RunDefinitions::default();
+        for _ in 0..2 {
+            assert_eq!(definitions.learn_chunk(&chunk("a.A", "/a")), Ok(()));
+        }
+        for (schema, topic, expected) in
+            [("a.A", "/b", "channel 1 is used again"), ("b.B", "/a", "schema 1 is used again")]
+        {
+            let refused = definitions.clone().learn_chunk(&chunk(schema, topic)).expect_err(expected);
+            assert!(refused.starts_with(expected) && refused.contains("/a") | refused.contains("a.A"), "{refused}");
+        }
+    }
+}
