@@ -115,6 +115,8 @@ impl LakeCatalog {
         // A time stands for one version in all of a statement, even if a version with an earlier time comes meanwhile.
         let mut versions = HashMap::new();
         for past in past {
+            // Without all of its log, a version may seem never to have been.
+            current.snapshot.check(Table::Runs)?;
             let provider = self.at(&past, &mut versions).await?;
             context.register_table(TableReference::bare(past.name), provider).map_err(failed)?;
         }

@@ -172,6 +172,9 @@ impl Error {
     pub(crate) fn execution(error: &DataFusionError) -> Self {
         Self::limit(error).unwrap_or_else(|| {
             let message = explain(error).0;
+            if let Some(damaged) = damaged_file(&message) {
+                return damaged.into();
+            }
             let message = store_fault(&message).unwrap_or_else(|| hints::with_hint(message));
             Self::Execution { message: escape_controls(&message) }
         })
@@ -231,6 +234,18 @@ fn explain(error: &DataFusionError) -> (String, Option<String>) {
         DataFusionError::Execution(text) => (text.clone(), None),
         other => (other.strip_backtrace(), None),
     }
+}
+
+// Returns the error of a table's file that is gone or damaged. The readers of files keep such faults as texts alone.
+fn damaged_file(message: &str) -> Option<LakeError> {
+    let (_, after) = message.split_once("Failed to fetch metadata for file ")?;
+    let (file, cause) = after.split_once(": ").filter(|(file, _)| file.starts_with("tables/"))?;
+    if store_fault(message).is_some() {
+        return None;
+    }
+    // The store's text names the place on the server's disk.
+    let cause = if cause.contains(" not found") { "it is not there" } else { cause };
+    Some(LakeError::DataFile { file: file.to_owned(), source: cause.to_owned().into() })
 }
 
 // Returns what is to be said of a store that did not answer. The readers of files keep such faults as texts alone.
@@ -375,6 +390,17 @@ mod tests {
                         run the query again when the store answers";
         assert_eq!(store_fault(fault).as_deref(), Some(expected));
         assert_eq!(store_fault("division by zero"), None);
+        assert!(damaged_file(&fault.replace(" x.parquet", " tables/nce/x.parquet")).is_none());
+    }
+
+    #[test]
+    fn a_file_that_is_gone_is_damage_with_a_way_out_and_without_the_servers_paths() {
+        let fault = "Parquet error: Failed to fetch metadata for file tables/nce/x.parquet: Object Store error: Object at \
+                     location /srv/lake/tables/nce/x.parquet not found: No such file or directory (os error 2)";
+        let expected = "`tables/nce/x.parquet` is damaged: it is not there; hint: `echolake rebuild nce` makes it again from \
+                        the runs";
+        assert_eq!(damaged_file(fault).map(|error| error.to_string()).as_deref(), Some(expected));
+        assert!(damaged_file("division by zero").is_none());
     }
 
     #[test]

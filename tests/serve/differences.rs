@@ -152,8 +152,11 @@ const BOUND: [(&str, &str, &str); 14] = [
     ("select $1::int as v from pairs limit 1", "3", "3"),
     ("select pair_id from pairs where direct_mm > $1 order by 1 limit 4", "200.5", "200.5"),
     ("select count(*) as v from measurements where surface_id = $1", "flat", "'flat'"),
-    ("select count(*) as v from measurements where log_time > $1::timestamptz", "2020-01-01 00:00:00+00", 
-     "'2020-01-01 00:00:00+00'"),
+    (
+        "select count(*) as v from measurements where log_time > $1::timestamptz",
+        "2020-01-01 00:00:00+00",
+        "'2020-01-01 00:00:00+00'",
+    ),
     ("select pair_id from pairs order by 1 limit $1", "3", "3"),
     ("select pair_id from pairs where not $1::boolean order by 1 limit 2", "f", "false"),
     ("select case when pair_id > $1 then 'more' else 'less' end as v from pairs order by pair_id limit 3", "1", "1"),
@@ -169,7 +172,14 @@ impl StatementGenerator {
 
     fn number(&mut self) -> String {
         let n = self.0.random_range(1..40);
-        let kinds = ["pair_id", "microphone + speaker", "direct_mm", "image_mm - direct_mm", "sqrt(direct_mm)", "-incidence_deg"];
+        let kinds = [
+            "pair_id",
+            "microphone + speaker",
+            "direct_mm",
+            "image_mm - direct_mm",
+            "sqrt(direct_mm)",
+            "-incidence_deg",
+        ];
         let number = self.pick(&kinds);
         match self.0.random_range(0..5) {
             0 => format!("{number} * {n}"),
@@ -212,7 +222,8 @@ impl StatementGenerator {
                 format!("select {key} as k, max({number}) as v, count(*) as n from pairs group by {key} order by 1")
             }
             3 => {
-                let kind = self.pick(&["int", "bigint", "smallint", "double", "real", "text", "numeric(14,3)", "boolean"]);
+                let kind =
+                    self.pick(&["int", "bigint", "smallint", "double", "real", "text", "numeric(14,3)", "boolean"]);
                 format!("select pair_id, cast({number} as {kind}) as v from pairs order by pair_id limit {limit}")
             }
             4 => format!(
@@ -232,11 +243,14 @@ impl StatementGenerator {
                     "regexp_replace(surface_id, '[a-f]', '*')",
                     "concat(surface_id, null, '-', pair_id)",
                 ]);
-                format!("select {text} as v from measurements where pair_id % {limit} = 0 order by pair_id limit {limit}")
+                format!(
+                    "select {text} as v from measurements where pair_id % {limit} = 0 order by pair_id limit {limit}"
+                )
             }
             6 => {
                 let part = self.pick(&["second", "minute", "hour", "day", "week", "month", "year"]);
-                let time = self.pick(&["log_time", "log_time + interval '36 hours'", "date '2026-02-28'", "log_time::date"]);
+                let time =
+                    self.pick(&["log_time", "log_time + interval '36 hours'", "date '2026-02-28'", "log_time::date"]);
                 let call = match self.0.random_range(0..4) {
                     0 => format!("date_trunc('{part}', {time})"),
                     1 => format!("extract({part} from {time})"),
@@ -428,7 +442,10 @@ async fn three_hundred_statements_have_one_answer() {
         };
         check("Flight SQL", (tables(&rows) != tables(&by_flight)).then(|| format!("{rows:?}\n{by_flight:?}")));
         check("Postgres, simple", difference(&rows, &client.query(&written)));
-        check("Postgres, extended", difference(&rows, &client.query_extended(&sql, &value.into_iter().collect::<Vec<_>>())));
+        check(
+            "Postgres, extended",
+            difference(&rows, &client.query_extended(&sql, &value.into_iter().collect::<Vec<_>>())),
+        );
     }
     assert!(wrong.is_empty(), "{} of them differ:\n{}", wrong.len(), wrong.join("\n\n"));
     assert!(answered >= ANSWERED, "{answered} are answered");

@@ -6,7 +6,6 @@ use arrow_flight::sql::client::FlightSqlServiceClient;
 use futures::TryStreamExt as _;
 use tonic::transport::Endpoint;
 
-use super::http::HttpRequest;
 use super::postgres::WireClient;
 use super::server::{ANSWER_LIMIT, ServedLake};
 use super::{get, json, refused, served, sql, wait_until};
