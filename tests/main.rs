@@ -19,6 +19,7 @@ mod load;
 mod maintenance;
 mod object_stores;
 mod operator;
+mod operators;
 mod prompt;
 mod real_data;
 mod recover;

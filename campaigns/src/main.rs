@@ -31,6 +31,9 @@ mod mcap_bench;
 mod memory;
 mod motion;
 mod observed_server;
+mod operator_rounds;
+#[path = "../../tests/operators/mod.rs"]
+mod operators;
 mod overhead;
 mod percentile;
 mod query_bench;
@@ -75,6 +78,8 @@ enum CampaignCommand {
     HostileFiles(hostile_ingest::HostileFilesArgs),
     /// Kill `acquire`, with or without the power, recover and resume; nothing acknowledged may be lost.
     AcquireKills(kill_acquire::KillAcquireArgs),
+    /// Do what people do to a lake, in random sequences; an answer is whole, or an exit code says that it is not.
+    Operators(operator_rounds::OperatorArgs),
     /// Throw changed SQL, bytes of each protocol or run files at `serve`.
     Fuzz(fuzz_server::FuzzArgs),
     /// Attack `serve` by statements and by bytes; other clients must not notice it.
@@ -111,6 +116,7 @@ fn main() -> Result<()> {
         CampaignCommand::Kills(args) => kill_ingest::run(&args),
         CampaignCommand::HostileFiles(args) => hostile_ingest::run(&args),
         CampaignCommand::AcquireKills(args) => kill_acquire::run(&args),
+        CampaignCommand::Operators(args) => operator_rounds::run(&args),
         CampaignCommand::Fuzz(args) => fuzz_server::run(&args),
         CampaignCommand::Attacks(args) => attacks::run(&args),
         CampaignCommand::HostileClients(args) => hostile_clients::run(&args),
