@@ -85,6 +85,7 @@ mod slow {
     use crate::ECHOLAKE;
     use crate::acquire_kills::{self, AcquireKillCampaign, AcquireKillCounts};
     use crate::kills::KillCampaign;
+    use crate::operators::OperatorCampaign;
 
     // The long form is the campaign `kills`.
     #[test]
@@ -97,6 +98,14 @@ mod slow {
     #[test]
     fn two_processes_ingest_half_of_the_runs_each() {
         KillCampaign::of(Path::new(ECHOLAKE), 1, 12).halves(2, &mut |_, _| {});
+    }
+
+    // The long form is the campaign `operators`.
+    #[test]
+    fn answers_after_what_people_do_to_a_lake_are_whole_or_errors() {
+        let failures = OperatorCampaign::new(Path::new(ECHOLAKE), 1, None).rounds(5, &mut |_, _| {});
+        let told: Vec<_> = failures.iter().map(ToString::to_string).collect();
+        assert!(told.is_empty(), "{}", told.join("\n"));
     }
 
     #[test]

@@ -2,10 +2,16 @@
 
 use std::io::Write as _;
 use std::path::PathBuf;
+use std::process::Command;
 
-use anyhow::{Result, ensure};
+use anyhow::{Context as _, Result, ensure};
 
+use super::child::run_long_command;
 use super::operators::{OperatorCampaign, RoundFailure};
+
+const DELTALAKE: &str = "deltalake==1.6.6";
+/// With this variable a missing package is a failure.
+const NO_SKIP: &str = "ECHOLAKE_NO_SKIP";
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct OperatorArgs {
@@ -15,9 +21,9 @@ pub(crate) struct OperatorArgs {
     /// Seed of the first round; each further one has the next.
     #[arg(default_value_t = 1)]
     seed: u64,
-    /// Python that has the package deltalake.
-    #[arg(long, default_value = "python3")]
-    python: PathBuf,
+    /// Python that has the package deltalake; by default it is installed beside this program.
+    #[arg(long)]
+    python: Option<PathBuf>,
     /// The command; by default the one that is built beside this program.
     #[arg(long)]
     binary: Option<PathBuf>,
@@ -25,7 +31,14 @@ pub(crate) struct OperatorArgs {
 
 pub(crate) fn run(args: &OperatorArgs) -> Result<()> {
     let binary = args.binary.clone().map_or_else(super::echolake_path, |path| Ok(path.canonicalize()?))?;
-    let campaign = OperatorCampaign::new(&binary, args.seed, Some(args.python.clone()));
+    let python = match args.python.clone().map_or_else(install_deltalake, Ok) {
+        Err(why) if std::env::var_os(NO_SKIP).is_none() => {
+            writeln!(std::io::stderr(), "SKIPPED deltalake's maintenance: {why:#}")?;
+            None
+        }
+        python => Some(python?),
+    };
+    let campaign = OperatorCampaign::new(&binary, args.seed, python);
     let mut number = 0;
     let failures = campaign.rounds(args.rounds, &mut |seed, failure: Option<&RoundFailure>| {
         number += 1;
@@ -43,5 +56,24 @@ pub(crate) fn run(args: &OperatorArgs) -> Result<()> {
         args.rounds,
         args.seed
     )?;
+    Ok(())
+}
+
+// Returns a Python that has the package, in a folder beside this program.
+fn install_deltalake() -> Result<PathBuf> {
+    let folder = super::echolake_path()?.with_file_name("operators-python");
+    let python = folder.join("bin/python");
+    let has_package = || run_program(Command::new(&python).args(["-c", "import deltalake"]));
+    if has_package().is_err() {
+        run_program(Command::new("python3").args(["-m", "venv"]).arg(&folder))?;
+        run_program(Command::new(folder.join("bin/pip")).args(["install", "--quiet", DELTALAKE]))?;
+        has_package()?;
+    }
+    Ok(python)
+}
+
+fn run_program(command: &mut Command) -> Result<()> {
+    let output = run_long_command(command).with_context(|| format!("cannot start {command:?}"))?;
+    ensure!(output.status.success(), "{command:?}: {}", String::from_utf8_lossy(&output.stderr));
     Ok(())
 }
