@@ -17,8 +17,8 @@ use super::{OperatorRound, SourceRun, finish, mount_disk, run_to_end};
 const KILL_WITHIN: Duration = Duration::from_millis(300);
 /// Two looks of `ingest --watch` at the inbox, and a half.
 const WATCH_LOOKS: Duration = Duration::from_millis(5000);
-/// Bytes that a full disk has left.
-const SPARE_BYTES: u64 = 1 << 20;
+/// The most that a full disk has left beside the run, in bytes: an ingest writes about half of it.
+const SPARE_BYTES: u64 = 512 << 10;
 const HOUR: Duration = Duration::from_secs(3600);
 
 /// What an action needs of the command or of the machine.
@@ -252,7 +252,6 @@ fn fill_disk(round: &mut OperatorRound<'_>) -> Result<(), String> {
     assert!(mount_disk(&disk, &(used + file + spare).to_string()), "it was mounted before");
     copy_folder(&lake, &disk.join("lake"));
     std::fs::copy(&source.file, disk.join("lake/inbox").join(source.file_name())).expect("copied");
-    // An entry that is no regular file stays where it is.
     round.note(format!("  {}: {spare} bytes are left", source.run));
     round.lake = "full/lake";
     let checked = round.ingest().and_then(|_| round.check_answers());
