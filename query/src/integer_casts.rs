@@ -36,3 +36,37 @@ fn round_cast(mut cast: Expr, schema: &DFSchema) -> Transformed<Expr> {
     **expr = round(vec![std::mem::take(expr.as_mut())]);
     Transformed::yes(cast)
 }
+
+#[cfg(test)]
+mod tests {
+    use arrow::util::display::array_value_to_string;
+
+    use echolake_lake::{Lake, ReferenceSurfaces};
+    use echolake_schema::Rig;
+
+    use crate::Session;
+
+    #[tokio::test]
+    async fn fractions_are_rounded_and_columns_keep_their_names() {
+        let lake =
+            Lake::open_or_create("memory://", &Rig::paper(), &ReferenceSurfaces::default()).await.expect("a lake");
+        let session = Session::new(&lake).expect("a session");
+        for (sql, expected) in [
+            ("select 2.7::int", "3"),
+            ("select cast(-2.5 as bigint)", "-3"),
+            ("select try_cast(1.49::real as smallint)", "1"),
+            ("select cast(cast(2.5 as decimal(4, 1)) as int)", "3"),
+            ("select cast(0.5 + x as int) from (values (2.2)) as t(x)", "3"),
+            (
+                "select cast(x as int) from (values (1.6), (2.4)) as t(x) group by cast(x as int) order by cast(x as int)",
+                "2",
+            ),
+            ("select (select max(cast(x as int)) from (values (1.6)) as t(x))", "2"),
+            ("select 7 / 2", "3"),
+        ] {
+            let mut answer = session.query(sql).await.unwrap_or_else(|e| panic!("{sql}: {e}"));
+            let batch = answer.next().await.expect(sql).expect(sql);
+            assert_eq!(array_value_to_string(batch.column(0), 0).expect(sql), expected, "{sql}");
+        }
+    }
+}

@@ -33,7 +33,7 @@ struct ProtocolDifference {
     over_postgres: Result<&'static str, &'static str>,
 }
 
-const DIFFERENCES: [ProtocolDifference; 5] = [
+const DIFFERENCES: [ProtocolDifference; 6] = [
     ProtocolDifference {
         sql: r#"select '{a,"b,c"}'::text[] as v from pairs limit 1"#,
         reason: "Postgres writes arrays as texts; elsewhere a text is one element",
@@ -59,10 +59,16 @@ const DIFFERENCES: [ProtocolDifference; 5] = [
         over_postgres: Ok("{2,4}"),
     },
     ProtocolDifference {
+        sql: "select distinct lower(surface_id) as v from measurements order by lower(surface_id)",
+        reason: "over Postgres distinct rows may be ordered by the expression of a column, elsewhere by its name",
+        over_http: Err("ORDER BY expressions"),
+        over_postgres: Ok("flat"),
+    },
+    ProtocolDifference {
         sql: "select 1e20::numeric as v from pairs limit 1",
         reason: "the library writes decimals of 96 bits",
         over_http: Ok("100000000000000001988.4624838656"),
-        over_postgres: Err("22"),
+        over_postgres: Err("0A000"),
     },
 ];
 
@@ -122,7 +128,7 @@ const WRITTEN: &[&str] = &[
     "select generate_series(1, 4) as v from pairs limit 1",
     "select value from generate_series(1, 4) order by 1",
     "select sum(value) as v from generate_series(1, 1000)",
-    "select distinct lower(surface_id) as v from measurements order by lower(surface_id)",
+    "select distinct lower(surface_id) as v from measurements order by v",
     "select surface_id, count(*) from measurements group by surface_id having count(*) > 1 order by count(*)",
     "select pair_id::text as v from pairs where pair_id::text like '1%' order by pair_id::int",
     "select 'a_b' like 'a\\_b' as v, 'axb' like 'a\\_b' as w, 'A' ilike 'a' as x, 'abc' ~ '^a' as y from pairs limit 1",

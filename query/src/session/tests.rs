@@ -43,6 +43,8 @@ async fn placeholders_have_the_types_that_the_query_determines() {
         ("select 1 from pairs where array_has($1, pair_id)", vec![Some(int_list())]),
         ("select 1 from pairs where array_has($1::int[], pair_id)", vec![Some(int_list())]),
         ("select 1 from pairs where pair_id = $1", vec![Some(DataType::Int32)]),
+        ("select coalesce($1, 5), nullif('x', $2)", vec![Some(DataType::Int64), Some(DataType::Utf8)]),
+        ("select not $1", vec![Some(DataType::Boolean)]),
         ("select $1", vec![None]),
     ] {
         let prepared = session.prepare(sql).await.unwrap_or_else(|e| panic!("{sql}: {e}"));
