@@ -7,7 +7,7 @@ use arrow::buffer::OffsetBuffer;
 use arrow::compute::{cast, concat_batches};
 use arrow::datatypes::{DataType, Field, Float32Type, Float64Type, Int32Type, Int64Type};
 use arrow::record_batch::RecordBatch;
-use echolake_lake::{FileName, Lake, ReferenceSurfaces, VisibleRun, encode};
+use echolake_lake::{FileName, Lake, ReferenceSurfaces, RunRowCounts, VisibleRun, encode};
 use echolake_schema::tables::{COMMENT, Table, UNIT};
 use echolake_schema::{Rig, Symmetry};
 
@@ -71,7 +71,10 @@ async fn put(lake: &Lake, surface: &str, run: &str) {
         let columns = schema.fields().iter().map(|f| column(table, f, surface, run)).collect();
         let file = encode(table, &schema, &[RecordBatch::try_new(schema.clone(), columns).expect("rows")]);
         let name = if table == Table::Runs { FileName::Pointer(pointer.clone()) } else { rows.clone() };
-        staged.push(lake.stage(table, &name, file.expect("encoded")).await.expect("staged"));
+        let file = lake.stage(table, &name, file.expect("encoded")).await.expect("staged");
+        // The run has no rows in tables that are not here.
+        let counted = if table == Table::Runs { file.counting(RunRowCounts::default(), &staged) } else { file };
+        staged.push(counted);
     }
     lake.commit(&staged).await.expect("committed");
 }
@@ -222,7 +225,8 @@ async fn the_past_is_seen_until_it_is_vacuumed() {
         assert!(error.to_string().contains(expected), "{of}: {error}");
         error
     };
-    refused("nce version as of 99", "the lake has no version 99").await;
+    let error = refused("nce version as of 99", "the lake has no version 99").await;
+    assert!(matches!(error, Error::Query { .. }));
     refused("nce timestamp as of '2001-01-01'", "the lake has no 2001-01-01").await;
     let error = refused("nce timestamp as of 'yesterday'", "neither a version nor a time").await;
     assert!(matches!(error, Error::Query { .. }));
