@@ -9,7 +9,6 @@ use std::time::{Duration, SystemTime};
 use rand::Rng as _;
 
 use super::super::child::{ChildProcess, run_command};
-use super::super::kills::copy_folder;
 use super::reader::read_measurements;
 use super::{OperatorRound, SourceRun, finish, mount_disk, run_to_end};
 
@@ -250,7 +249,7 @@ fn fill_disk(round: &mut OperatorRound<'_>) -> Result<(), String> {
     let file = std::fs::metadata(&source.file).expect("there").len();
     let spare = round.random.random_range(0..SPARE_BYTES);
     assert!(mount_disk(&disk, &(used + file + spare).to_string()), "it was mounted before");
-    copy_folder(&lake, &disk.join("lake"));
+    copy_entries(&lake, &disk.join("lake"));
     std::fs::copy(&source.file, disk.join("lake/inbox").join(source.file_name())).expect("copied");
     round.note(format!("  {}: {spare} bytes are left", source.run));
     round.lake = "full/lake";
@@ -258,7 +257,7 @@ fn fill_disk(round: &mut OperatorRound<'_>) -> Result<(), String> {
     round.lake = "lake";
     checked?;
     std::fs::remove_dir_all(&lake).expect("removed");
-    copy_folder(&disk.join("lake"), &lake);
+    copy_entries(&disk.join("lake"), &lake);
     assert!(super::succeeds(Command::new("umount").arg(&disk)), "unmounted");
     Ok(())
 }
@@ -575,6 +574,11 @@ impl<'a> OperatorRound<'a> {
 fn any_entry(round: &mut OperatorRound<'_>, folder: &str) -> Option<PathBuf> {
     let entries = entries(&round.path(folder));
     round.any(entries)
+}
+
+// Copies a folder with its pipes and links as they are.
+fn copy_entries(from: &Path, to: &Path) {
+    assert!(super::succeeds(Command::new("cp").arg("-a").args([from, to])), "copied");
 }
 
 // In an order that a seed repeats.
