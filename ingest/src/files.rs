@@ -859,7 +859,8 @@ mod tests {
             [(RunSource::Lake(Path::from("inbox/x.mcap")), &inside), (RunSource::File(outside.clone()), &outside)]
         {
             let sha256 = "7".repeat(64);
-            let integrity = FileIntegrity { bytes: 5, sha256, closed: true, damage: Vec::new() };
+            let (damage, lost, is_data_whole) = (Vec::new(), Vec::new(), true);
+            let integrity = FileIntegrity { bytes: 5, sha256, closed: true, damage, lost, is_data_whole };
             fs::write(file, "12345").expect("written");
             let version = FileVersion::read(&lake, &source).await.expect("there");
             let read = ReadFile::check(&lake, &source, version, &integrity).await.expect("read");
