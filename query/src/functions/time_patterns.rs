@@ -165,7 +165,7 @@ mod tests {
         ] {
             assert_eq!(known(pattern), expected);
         }
-        for (pattern, part) in [("YYYY-Q", "Q"), ("Month", "Month"), ("at YYYY", "at"), ("999", "999"), ("\"", "")] {
+        for (pattern, part) in [("YYYY-Q", "Q"), ("Month", "th"), ("at YYYY", "at"), ("999", "999"), ("\"", "")] {
             assert_eq!(chrono_pattern(pattern), Err(part.to_owned()), "{pattern}");
         }
     }

@@ -656,7 +656,7 @@ mod tests {
             "SELECT ARRAY(SELECT y FROM pg_catalog.pg_policy) AS n FROM runs",
             "SELECT (SELECT relname FROM pg_class ORDER BY 1 LIMIT 1) AS n FROM public.pg_own",
             "SELECT x FROM runs WHERE x = ANY($1) AND y <> ALL('{a,b}')",
-            "SELECT to_timestamp(x, 'YYYY') AS t, EXISTS (SELECT 1) AS e, indisprimary = 't' AS p FROM runs",
+            "SELECT to_timestamp(x, 'YYYY') AS t, EXISTS (SELECT 1 AS n) AS e, indisprimary = 't' AS p FROM runs",
             "SELECT generate_series(1, 2) AS i, 1 AS n FROM runs",
             "SELECT k FROM UNNEST(ARRAY[3, 1]) AS k",
             "SELECT ARRAY(SELECT x FROM UNNEST(ARRAY[3, 1]) AS t (x)) AS n",
