@@ -206,14 +206,23 @@ impl MessageRelay {
         Ok(())
     }
 
-    // Begins a session on the client's engine.
+    // Begins a session on the client's engine, or, if that ended before the session began, on the next one.
     async fn connect(&mut self) -> Result<EngineLink, Option<RequestFault>> {
-        let lease = self.door.engines().lease(&self.login.client).await.map_err(Some)?;
-        let engine = lease.engine().clone();
-        match self.start_session(lease).await {
-            Ok(Some(link)) => Ok(link),
-            Ok(None) => Err(None),
-            Err(_) => Err(Some(self.find_fault(&engine).await)),
+        let mut ended = None;
+        loop {
+            let lease = match self.door.engines().lease(&self.login.client).await {
+                Ok(lease) => lease,
+                Err(fault) => return Err(ended.or(Some(fault))),
+            };
+            let engine = lease.engine().clone();
+            match self.start_session(lease).await {
+                Ok(link) => return link.ok_or(None),
+                Err(_) if ended.is_some() => return Err(ended),
+                Err(_) => {
+                    self.outgoing.clear();
+                    ended = Some(self.find_fault(&engine).await);
+                }
+            }
         }
     }
 
