@@ -232,7 +232,7 @@ mod tests {
         for name in ["inbox/link", "inbox/folder/secret"] {
             let refused = read(name).await.expect_err(name).to_string();
             assert!(refused.contains("which is not followed"), "{refused}");
-            let ranges = store.get_ranges(&at(&folder, name), &[0..1]).await;
+            let ranges = store.get_ranges(&at(&folder, name), std::slice::from_ref(&(0..1))).await;
             assert!(ranges.is_err(), "{name}");
         }
         for name in ["inbox/plain", "runs/run"] {
