@@ -8,6 +8,7 @@ use std::env;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::sync::OnceLock;
 
 use super::child::{ChildProcess, run_long_command};
 use super::serve::{catalogue::lake, served};
@@ -40,9 +41,15 @@ pub(crate) fn or_skip<T>(test: &str, ready: Result<T, String>) -> Option<T> {
     }
 }
 
-/// The browser; the packages that drive it are installed then.
+/// The browser; the packages that drive it are installed then, once for all tests.
 fn browser() -> Result<PathBuf, String> {
-    if !web().join("node_modules/playwright-core").exists() {
+    static BROWSER: OnceLock<Result<PathBuf, String>> = OnceLock::new();
+    BROWSER.get_or_init(install_browser).clone()
+}
+
+fn install_browser() -> Result<PathBuf, String> {
+    // npm writes this file last.
+    if !web().join("node_modules/.package-lock.json").exists() {
         run(Command::new("npm").args(["ci", "--no-audit", "--no-fund"]).current_dir(web()))?;
     }
     let known = || {

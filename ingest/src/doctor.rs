@@ -310,7 +310,11 @@ async fn find_strays(lake: &Lake, snapshot: &LakeSnapshot, report: &mut LakeRepo
                 "unfinished recording (still running, stopped or cut off); hint: `echolake acquire --resume` resumes it, \
                  `echolake recover` makes a run of what it holds",
             ),
-            Some("runs") => report.find(FindingSeverity::Missing, &path, "in no table; hint: `echolake ingest`"),
+            Some("runs") => {
+                let what = "in no table: an ingest reads it now or was cut off, or the log of `runs` lost its newest \
+                            commits; hint: `echolake ingest`";
+                report.find(FindingSeverity::Damaged, &path, what);
+            }
             // It is named with its file.
             Some("quarantine") if path.as_ref().ends_with(".reason.txt") => {}
             Some("quarantine") => {

@@ -88,7 +88,7 @@ fn what_is_not_closed_and_what_is_another_file_is_refused_and_the_rest_goes_up()
         "`cut.mcap` was not closed",
         "echolake recover cut.mcap",
         "`going.mcap.partial` is an unfinished recording",
-        "`text.mcap` is no MCAP file",
+        "`text.mcap` is not an MCAP file: it begins with `6e 6f 20 72 75 6e`",
         "is another file than the given one",
         "cannot read `absent.mcap`",
         "5 of 5 files were not uploaded",
