@@ -97,7 +97,7 @@ impl LakeReport {
 /// Checks a lake: every file of every table is decoded, and every run file read to its last CRC.
 ///
 /// # Errors
-/// [`Error`] if the lake itself cannot be read; damage in it is a finding.
+/// [`crate::Error`] if the lake itself cannot be read; damage in it is a finding.
 pub async fn examine(lake: &Lake, progress: &mut dyn FnMut(CheckStep<'_>)) -> Result<LakeReport> {
     let mut report = LakeReport::default();
     let snapshot = match lake.snapshot().await {
