@@ -524,6 +524,8 @@ async fn whoever_looks_while_runs_come_sees_all_rows_of_each() {
     let writing = tokio::spawn(async move {
         for number in 0..RUNS {
             put(&lake, "wood", &format!("r{number}"), "d1", number).await;
+            // A look at a lake whose other tables lack rows is repeated while runs come.
+            tokio::time::sleep(Duration::from_millis(20)).await;
         }
     });
     let mut looks = BTreeSet::new();
