@@ -63,7 +63,9 @@ pub enum Error {
     },
     /// Another run of this name is in the lake.
     #[error(
-        "run `{run}` is already in the lake with other content: `{file}` has SHA-256 {given}, the lake's file {there}; hint: a run file never changes once closed; if the given one is right, `echolake remove {run}` takes the lake's out"
+        "run `{run}` is already in the lake with other content: `{file}` has SHA-256 {given}, the lake's file \
+         {there}; hint: a run file never changes once closed; if the given one is right, `echolake remove {run}` takes the \
+         lake's out"
     )]
     OtherContent {
         /// The run.

@@ -98,26 +98,25 @@ impl RecordingSurvey {
         let found = self.integrity.damage.first().cloned().unwrap_or_else(|| "it ends".to_owned());
         let whole = format!("{} chunks of it are whole", self.chunks);
         let manifest = self.metadata.get(topics::RUN_METADATA).map(RunManifest::from_metadata);
-        match manifest {
+        let fault = match manifest {
             _ if self.chunks == 0 => {
-                Err(Error::Headless { path, source: format!("{found}, and no chunk of it is whole").into() })
+                return Err(Error::Headless { path, source: format!("{found}, and no chunk of it is whole").into() });
             }
             Some(_) if self.counts.is_empty() && self.channels.is_empty() => {
-                Err(Error::Unusable { path, source: format!("nothing describes its channels, though {whole}").into() })
+                format!("nothing describes its channels, though {whole}")
             }
-            None => Err(Error::Unusable { path, source: format!("its manifest is missing or damaged, though {whole}").into() }),
-            Some(Err(e)) => Err(Error::Unusable { path, source: format!("{e}, though {whole}").into() }),
-            Some(Ok(manifest)) if !self.is_undamaged() && !manifest.fits_file_name(&path.to_string_lossy()) => Err(Error::Unusable {
-                source: format!(
-                    "it is damaged, and its manifest may be: it says run `{}`, which is not the file's name; if it is \
-                     right, name the file after the run",
-                    manifest.run_id
-                )
-                .into(),
-                path,
-            }),
-            Some(Ok(manifest)) => Ok(manifest),
-        }
+            None => format!("its manifest is missing or damaged, though {whole}"),
+            Some(Err(e)) => format!("{e}, though {whole}"),
+            Some(Ok(manifest)) if self.is_undamaged() || manifest.fits_file_name(&path.to_string_lossy()) => {
+                return Ok(manifest);
+            }
+            Some(Ok(manifest)) => format!(
+                "it is damaged, and its manifest may be: it says run `{}`, which is not the file's name; if it is right, \
+                 name the file after the run",
+                manifest.run_id
+            ),
+        };
+        Err(Error::Unusable { path, source: fault.into() })
     }
 
     /// Returns whether it says how its run ended.

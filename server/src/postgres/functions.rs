@@ -49,7 +49,6 @@ pub(super) fn fixed() -> Vec<Arc<ScalarUDF>> {
     let texts = [
         ("user", Some(ROLE.to_owned())),
         ("current_user", Some(ROLE.to_owned())),
-        ("current_role", Some(ROLE.to_owned())),
         ("version", Some(format!("PostgreSQL {VERSION}"))),
         ("pg_client_encoding", Some("UTF8".to_owned())),
         ("getdatabaseencoding", Some("UTF8".to_owned())),

@@ -235,7 +235,8 @@ impl Lake {
         Ok(self.commit(&[staged]).await?[0])
     }
 
-    /// Removes from the logs all files that no run's row names any more, and those of other programs; merged files are rewritten without such rows.
+    /// Removes from the logs all files that no run's row names any more, and those of other programs; merged files are
+    /// rewritten without such rows.
     /// The files themselves stay for readers that hold older views.
     ///
     /// # Errors
