@@ -5,17 +5,17 @@ _list:
 
 # All tests, as in the README.
 test:
-    cargo test --release --workspace --locked
+    cargo test --profile quick --workspace --locked
 
 # Rust's format and lints, and all tests but the slow ones: what to run between two edits.
 quick:
     cargo fmt --all --check
-    cargo clippy --release --workspace --all-targets --locked -- -D warnings
-    cargo test --release --workspace --tests --locked -- --skip slow
+    cargo clippy --profile quick --workspace --all-targets --locked -- -D warnings
+    cargo test --profile quick --workspace --tests --locked -- --skip slow
 
 # Tests of one member's library, as `just member query views`: nothing but the member is compiled.
 member MEMBER *NAMES:
-    cargo test --release -p echolake -p echolake-{{ MEMBER }} --lib --locked -- {{ NAMES }}
+    cargo test --profile quick -p echolake -p echolake-{{ MEMBER }} --lib --locked -- {{ NAMES }}
 
 # How long that takes after a change of one line, for all members.
 inner-loop *FOLDERS:
@@ -28,12 +28,12 @@ fmt:
 
 # Lints of all three, formatting and types of the pages and the Python package.
 lint:
-    cargo clippy --release --workspace --all-targets --locked -- -D warnings
+    cargo clippy --profile quick --workspace --all-targets --locked -- -D warnings
     .ci/lint
 
 # Writes docs/functions.md from what the functions say of themselves.
 docs:
-    ECHOLAKE_RENEW=1 cargo test --release --workspace --locked manual
+    ECHOLAKE_RENEW=1 cargo test --profile quick --workspace --locked manual
 
 # Writes the types of the API for the pages, from web/openapi.json.
 api:
@@ -45,7 +45,7 @@ paper *LAKE:
 
 # A long form of what tests try in short: README lists them.
 campaign NAME *OPTIONS:
-    cargo run --release --locked -p echolake-campaigns -- {{ NAME }} {{ OPTIONS }}
+    cargo run --profile quick --locked -p echolake-campaigns -- {{ NAME }} {{ OPTIONS }}
 
 # Fuzzes a reader of foreign bytes with coverage, as `just fuzz sofa 3600`; targets are in fuzz/targets/ and fuzz/wires/targets/.
 fuzz TARGET *OPTIONS:

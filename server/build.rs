@@ -1,5 +1,5 @@
-//! Embeds the catalogue's pages: lists their files for `src/http/pages.rs`. Pages that come with the sources, as in the
-//! archive of a release, are taken as they are. Else npm builds them in a copy below the target folder, which keeps the
+//! Embeds the catalogue's pages and the manual: lists their files for `src/http/pages.rs`. Pages that come with the sources,
+//! as in the archive of a release, are taken as they are. Else npm builds them in a copy below the target folder, which keeps the
 //! checkout clean. Without Node the program is built without pages, and says so.
 #![allow(clippy::print_stdout, reason = "that is how a build script speaks to cargo")]
 
@@ -32,11 +32,14 @@ const STRICT: [&str; 2] = ["ECHOLAKE_NO_SKIP", "CI"];
 const LOCK: &str = "package-lock.json";
 const INSTALLED: &str = "installed.json";
 const NPM: &str = if cfg!(windows) { "npm.cmd" } else { "npm" };
-const TYPES: [(&str, &str); 8] = [
+/// The folder of the built manual, a full path; `docs/build.sh` builds it. A source archive has it in `docs/`.
+const MANUAL: &str = "ECHOLAKE_MANUAL";
+const TYPES: [(&str, &str); 9] = [
     ("html", "text/html; charset=utf-8"),
     ("js", "text/javascript; charset=utf-8"),
     ("css", "text/css; charset=utf-8"),
     ("svg", "image/svg+xml"),
+    ("jpg", "image/jpeg"),
     ("png", "image/png"),
     ("json", "application/json"),
     ("txt", "text/plain; charset=utf-8"),
@@ -49,11 +52,11 @@ fn main() -> ExitCode {
     if env::var_os("CARGO_FEATURE_WEB").is_none() {
         return ExitCode::SUCCESS;
     }
-    match embed_pages() {
+    match embed_pages().and_then(|()| embed_manual()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(why) => {
-            println!("cargo::error=the catalogue's pages cannot be built: {why}");
-            println!("cargo::error=hint: they need {NODE}; --no-default-features leaves them out");
+            println!("cargo::error=the catalogue's pages or the manual cannot be built: {why}");
+            println!("cargo::error=hint: pages need {NODE}; --no-default-features leaves them out");
             ExitCode::FAILURE
         }
     }
@@ -65,20 +68,33 @@ fn embed_pages() -> Result<(), String> {
     let prebuilt = web.join(PREBUILT);
     if prebuilt.is_dir() {
         println!("cargo::rerun-if-changed={}", prebuilt.display());
-        return write_list(&prebuilt, &out);
+        return write_list(&prebuilt, &out.join("pages.rs"));
     }
     for source in SOURCES {
         println!("cargo::rerun-if-changed={}", web.join(source).display());
     }
     match find_node() {
-        Ok(()) => write_list(&build_pages(&web, &out)?, &out),
+        Ok(()) => write_list(&build_pages(&web, &out)?, &out.join("pages.rs")),
         Err(why) => leave_out_pages(&why),
     }
 }
 
-fn write_list(pages: &Path, out: &Path) -> Result<(), String> {
-    let list = list(pages).map_err(|e| format!("the pages in {} cannot be listed: {e}", pages.display()))?;
-    fs::write(out.join("pages.rs"), list).map_err(|e| e.to_string())
+fn embed_manual() -> Result<(), String> {
+    println!("cargo::rerun-if-env-changed={MANUAL}");
+    let prebuilt = variable("CARGO_MANIFEST_DIR")?.join("../docs").join(PREBUILT);
+    let list = variable("OUT_DIR")?.join("manual.rs");
+    let built = env::var_os(MANUAL).map(PathBuf::from).or_else(|| prebuilt.is_dir().then_some(prebuilt));
+    let Some(manual) = built else { return fs::write(list, "&[]").map_err(|e| e.to_string()) };
+    println!("cargo::rerun-if-changed={}", manual.display());
+    if !manual.join("index.html").is_file() {
+        return Err(format!("{} has no index.html; hint: docs/build.sh {0}", manual.display()));
+    }
+    write_list(&manual, &list)
+}
+
+fn write_list(pages: &Path, to: &Path) -> Result<(), String> {
+    let list = list(pages).map_err(|e| format!("the files in {} cannot be listed: {e}", pages.display()))?;
+    fs::write(to, list).map_err(|e| e.to_string())
 }
 
 /// Returns the folder of the built pages.

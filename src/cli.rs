@@ -217,3 +217,25 @@ impl LakeCommand {
         }
     }
 }
+
+#[cfg(all(test, feature = "lake"))]
+mod tests {
+    use super::*;
+
+    /// The manual's page of commands, which is generated from their help.
+    const PAGE: &str = "docs/commands.md";
+    /// Set to write the page.
+    const RENEW: &str = "ECHOLAKE_RENEW";
+
+    #[test]
+    fn page_of_commands_is_fresh() {
+        let options = clap_markdown::MarkdownOptions::new().title("Commands".to_owned()).show_footer(false);
+        let page = clap_markdown::help_markdown_custom::<CliArguments>(&options);
+        if std::env::var_os(RENEW).is_some() {
+            std::fs::write(PAGE, &page).expect("the page is written");
+        }
+        let written = std::fs::read_to_string(PAGE).unwrap_or_default();
+        let command = format!("{RENEW}=1 cargo test --profile quick --locked page_of_commands");
+        assert!(written == page, "{PAGE} is stale; `{command}` renews it");
+    }
+}

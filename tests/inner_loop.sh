@@ -24,7 +24,7 @@ tests() {
     local package
     package=$(sed -n 's/^name = "\(.*\)"/\1/p' "$1/Cargo.toml" | head -n 1)
     shift
-    cargo test --release -p echolake -p "$package" --lib --locked "$@" >"$logs/cargo.log" 2>&1 ||
+    cargo test --profile quick -p echolake -p "$package" --lib --locked "$@" >"$logs/cargo.log" 2>&1 ||
         { cat "$logs/cargo.log" >&3 && false; }
 }
 

@@ -36,8 +36,11 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::OnceLock;
 
-/// The command under test.
-const ECHOLAKE: &str = env!("CARGO_BIN_EXE_echolake");
+/// The command under test: `packaging/package.sh` names the one that ships.
+const ECHOLAKE: &str = match option_env!("ECHOLAKE_SHIPPED") {
+    Some(shipped) => shipped,
+    None => env!("CARGO_BIN_EXE_echolake"),
+};
 /// A rig that measures in milliseconds.
 const SMALL_RIG: &str = include_str!("fixtures/small_rig.toml");
 

@@ -24,7 +24,7 @@ for run in $(seq "$runs"); do
         done
     fi
     log="$logs/$run.log"
-    command="$before; exec cargo test --release --workspace --locked"
+    command="$before; exec cargo test --profile quick --workspace --locked"
     if { time timeout --kill-after=60 "$limit" bash -c "$command" >"$log" 2>&1; } 2>"$logs/time"; then
         outcome=passed
         rm "$log"

@@ -2,7 +2,7 @@
 //! address and ends when its input is closed.
 //!
 //! ```text
-//! cargo run --release -p echolake-acquisition --example fake-rosbridge -- 127.0.0.1:0
+//! cargo run --profile quick -p echolake-acquisition --example fake-rosbridge -- 127.0.0.1:0
 //! ```
 
 use std::io::{Read as _, Write as _};

@@ -141,6 +141,6 @@ fn block_on<T>(work: impl Future<Output = Result<T>>) -> Result<T> {
 /// Returns the path of the `echolake` command, which is built beside this program.
 fn echolake_path() -> Result<PathBuf> {
     let path = std::env::current_exe().context("this program has no path")?.with_file_name("echolake");
-    anyhow::ensure!(path.exists(), "`{}` is missing; hint: cargo build --release", path.display());
+    anyhow::ensure!(path.exists(), "`{}` is missing; hint: build `echolake` with the same profile", path.display());
     Ok(path)
 }

@@ -7,7 +7,7 @@
 set -euo pipefail
 lake=$(realpath -m "${1:-$(dirname "$0")/paper-lake}")
 cd "$(dirname "$0")"
-program=${ECHOLAKE:-cargo run --release --locked --quiet --manifest-path ../../Cargo.toml --}
+program=${ECHOLAKE:-cargo run --profile quick --locked --quiet --manifest-path ../../Cargo.toml --}
 
 echolake() { $program --lake "$lake" "$@"; }
 

@@ -21,7 +21,7 @@ LIMIT_SECS = 1800
 def echolake() -> str:
     found = os.environ.get("ECHOLAKE") or shutil.which("echolake")
     if not found:
-        pytest.skip("no echolake binary; hint: ECHOLAKE=target/release/echolake")
+        pytest.skip("no echolake binary; hint: ECHOLAKE=target/quick/echolake")
     return found
 
 

@@ -117,7 +117,7 @@ async fn rig(file: Option<&Path>, lake_url: &str) -> anyhow::Result<Rig> {
 
 // The command line of this program for hints; cargo sets the variable for programs that it runs.
 fn program() -> &'static str {
-    if std::env::var_os("CARGO_MANIFEST_DIR").is_some() { "cargo run --release --" } else { "echolake" }
+    if std::env::var_os("CARGO_MANIFEST_DIR").is_some() { "cargo run --profile quick --" } else { "echolake" }
 }
 
 fn lake_flag(lake_url: &str) -> String {

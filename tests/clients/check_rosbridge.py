@@ -1,6 +1,6 @@
 """Talks to the fake rosbridge with roslibpy, so that the fake is one to others too: `check_rosbridge.py FAKE`.
 
-FAKE is the program: `cargo build --release -p echolake-acquisition --example fake-rosbridge`. Needs the PyPI package
+FAKE is the program: `cargo build --profile quick -p echolake-acquisition --example fake-rosbridge`. Needs the PyPI package
 roslibpy. Exits with 1 and says what is wrong.
 """
 import subprocess

@@ -22,7 +22,7 @@ What `echolake sql`, HTTP and Flight SQL take beside plain SQL, most of it as Du
 the plain one beside it, or is refused with the hint beside it; none answers something else. Postgres' protocol reads
 statements as Postgres does, and only what Postgres' grammar does not know as here.
 
-This page is generated from the statements that a test tries; `ECHOLAKE_RENEW=1 cargo test --release --workspace friendly`
+This page is generated from the statements that a test tries; `ECHOLAKE_RENEW=1 cargo test --profile quick --workspace friendly`
 writes it.
 ";
 
@@ -97,7 +97,7 @@ async fn friendly_page_is_fresh() {
     if std::env::var_os(RENEW).is_some() {
         std::fs::write(PAGE, &page).expect("the page is written");
     }
-    let command = format!("{RENEW}=1 cargo test --release --workspace friendly");
+    let command = format!("{RENEW}=1 cargo test --profile quick --workspace friendly");
     let written = std::fs::read_to_string(PAGE).unwrap_or_default();
     assert!(written == page, "docs/friendly_sql.md is stale; `{command}` renews it");
 }

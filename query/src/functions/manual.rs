@@ -23,7 +23,7 @@ right. The sampling rate, the bands and the grid are those of the lake's rig; th
 For sums, differences and multiples of lists DataFusion has `list_add`, `list_subtract`, `list_scale`, `list_sum`,
 `list_avg`, `list_min`, `list_max` and `dot_product`.
 
-This page is generated; `ECHOLAKE_RENEW=1 cargo test --release --workspace manual` writes it.
+This page is generated; `ECHOLAKE_RENEW=1 cargo test --profile quick --workspace manual` writes it.
 ";
 
 fn page() -> String {
@@ -62,7 +62,7 @@ fn manual_is_fresh() {
         std::fs::write(PAGE, &page).expect("the page is written");
     }
     let written = std::fs::read_to_string(PAGE).unwrap_or_default();
-    let command = format!("{RENEW}=1 cargo test --release --workspace manual");
+    let command = format!("{RENEW}=1 cargo test --profile quick --workspace manual");
     assert!(written == page, "docs/functions.md is stale; `{command}` renews it");
 }
 

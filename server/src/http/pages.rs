@@ -1,11 +1,14 @@
-//! The catalogue's pages, which are part of the program. They hold no data, so they need no token.
+//! The catalogue's pages and the manual, which are part of the program. They hold no data, so they need no token.
 
+use std::collections::BTreeSet;
 use std::io::Read as _;
 use std::sync::LazyLock;
 
 use axum::body::Bytes;
 use axum::http::{HeaderMap, HeaderValue, Method, Uri, header};
-use axum::response::{IntoResponse as _, Response};
+use axum::response::{IntoResponse as _, Redirect, Response};
+use base64::Engine as _;
+use base64::prelude::BASE64_STANDARD;
 use flate2::read::GzDecoder;
 use sha2::{Digest as _, Sha256};
 
@@ -22,6 +25,9 @@ const INDEX: &str = "/index.html";
 const ASSETS: &str = "/assets/";
 /// Paths that are no page's.
 const OTHERS: [&str; 6] = ["/api", "/assets", "/delta-sharing", "/health", "/mcp", "/metrics"];
+/// The manual's path and its first page.
+const MANUAL_PATH: &str = "/docs";
+const MANUAL_INDEX: &str = "/docs/index.html";
 
 /// A file of the pages; `build.rs` lists them.
 struct PageFile {
@@ -45,16 +51,50 @@ static PAGES: &[PageFile] = &[PageFile {
     brotli: None,
 }];
 
-/// A page, each with its digest.
-static TAGGED: LazyLock<Vec<(&PageFile, String)>> = LazyLock::new(|| {
-    let tag = |page: &PageFile| format!("\"{}\"", hex::encode(&Sha256::digest(page.bytes)[..8]));
-    PAGES.iter().map(|page| (page, tag(page))).collect()
+/// The files of the manual; none if the program was built without it.
+static MANUAL: &[PageFile] = include!(concat!(env!("OUT_DIR"), "/manual.rs"));
+
+/// The pages, each with its digest.
+static TAGGED_PAGES: LazyLock<Vec<(&PageFile, String)>> = LazyLock::new(|| tag_files(PAGES));
+/// The manual's files, each with its digest.
+static TAGGED_MANUAL: LazyLock<Vec<(&PageFile, String)>> = LazyLock::new(|| tag_files(MANUAL));
+/// The manual's own inline scripts, and nothing from elsewhere: its generator writes three into each page.
+static MANUAL_POLICY: LazyLock<String> = LazyLock::new(|| {
+    let texts: Vec<String> = MANUAL
+        .iter()
+        .filter(|file| file.path.ends_with(".html"))
+        .map(|file| String::from_utf8_lossy(file.bytes).into_owned())
+        .collect();
+    let scripts: BTreeSet<&str> = texts.iter().flat_map(|text| inline_scripts(text)).collect();
+    let hashes: String = scripts
+        .iter()
+        .map(|script| format!(" 'sha256-{}'", BASE64_STANDARD.encode(Sha256::digest(script.as_bytes()))))
+        .collect();
+    format!(
+        "default-src 'none'; script-src 'self'{hashes}; style-src 'self'; img-src 'self' data:; connect-src 'self'; \
+         worker-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    )
 });
+
+fn tag_files(files: &'static [PageFile]) -> Vec<(&'static PageFile, String)> {
+    files.iter().map(|file| (file, format!("\"{}\"", hex::encode(&Sha256::digest(file.bytes)[..8])))).collect()
+}
+
+// The texts between `<script>` and `</script>`.
+fn inline_scripts(page: &str) -> impl Iterator<Item = &str> {
+    page.split("<script>").skip(1).filter_map(|rest| rest.split_once("</script>")).map(|(script, _)| script)
+}
 
 /// Answers all other paths. The pages decide themselves what an address shows, so every one of them has the same
 /// file.
 pub(super) async fn fallback(method: Method, uri: Uri, headers: HeaderMap) -> Response {
-    let Some((page, tag)) = page(uri.path()) else { return super::nothing().await.into_response() };
+    let manual_path = uri.path().strip_prefix(MANUAL_PATH).filter(|rest| rest.is_empty() || rest.starts_with('/'));
+    let (found, policy) = match manual_path {
+        Some("" | "/") if !MANUAL.is_empty() => return Redirect::permanent(MANUAL_INDEX).into_response(),
+        Some(path) => (find_manual_file(path), MANUAL_POLICY.as_str()),
+        None => (find_page(uri.path()), POLICY),
+    };
+    let Some((page, tag)) = found else { return missing(manual_path.is_some()).await };
     if method != Method::GET && method != Method::HEAD {
         let mut response = ProblemResponse(RequestFault::Method).into_response();
         response.headers_mut().insert(header::ALLOW, HeaderValue::from_static("GET,HEAD"));
@@ -64,7 +104,7 @@ pub(super) async fn fallback(method: Method, uri: Uri, headers: HeaderMap) -> Re
     let common = [
         (header::CONTENT_TYPE, page.media_type),
         (header::CACHE_CONTROL, caching),
-        (header::CONTENT_SECURITY_POLICY, POLICY),
+        (header::CONTENT_SECURITY_POLICY, policy),
         (header::VARY, "Accept-Encoding"),
         (header::ETAG, tag),
     ];
@@ -76,13 +116,28 @@ pub(super) async fn fallback(method: Method, uri: Uri, headers: HeaderMap) -> Re
     (common, encoding, body).into_response()
 }
 
-fn page(path: &str) -> Option<&'static (&'static PageFile, String)> {
-    let of = |path: &str| TAGGED.iter().find(|(page, _)| page.path == path);
+async fn missing(is_of_manual: bool) -> Response {
+    if !is_of_manual {
+        return super::nothing().await.into_response();
+    }
+    let hint = match MANUAL {
+        [] => "this program was built without its manual; docs/build.sh makes it for the next build",
+        _ => "/docs/index.html lists the manual's pages",
+    };
+    ProblemResponse(RequestFault::NotFound { what: "this page of the manual".to_owned(), hint }).into_response()
+}
+
+fn find_manual_file(path: &str) -> Option<&'static (&'static PageFile, String)> {
+    TAGGED_MANUAL.iter().find(|(file, _)| file.path == path)
+}
+
+fn find_page(path: &str) -> Option<&'static (&'static PageFile, String)> {
+    let of_path = |path: &str| TAGGED_PAGES.iter().find(|(page, _)| page.path == path);
     let is_other =
         OTHERS.iter().any(|other| path.strip_prefix(other).is_some_and(|r| r.is_empty() || r.starts_with('/')));
     // A file that is not there is not there; names of surfaces and runs have no dots.
     let is_file = path.rsplit('/').next().is_some_and(|last| last.contains('.'));
-    of(path).or_else(|| if is_other || is_file { None } else { of(INDEX) })
+    of_path(path).or_else(|| if is_other || is_file { None } else { of_path(INDEX) })
 }
 
 impl PageFile {
@@ -105,11 +160,13 @@ impl PageFile {
 
 #[cfg(test)]
 mod tests {
+    use axum::http::StatusCode;
+
     use super::*;
 
     #[test]
     fn addresses_are_pages_and_files_are_themselves() {
-        let path = |asked: &str| page(asked).map(|(page, _)| page.path);
+        let path = |asked: &str| find_page(asked).map(|(page, _)| page.path);
         for address in ["/", "/surfaces/flat/pairs/7", "/sql", "/map", "/apis"] {
             assert_eq!(path(address), Some(INDEX), "{address}");
         }
@@ -118,10 +175,43 @@ mod tests {
         }
     }
 
+    #[tokio::test]
+    async fn the_manual_is_shown_with_its_own_scripts_alone() {
+        let ask = async |path: &'static str| fallback(Method::GET, Uri::from_static(path), HeaderMap::new()).await;
+        if MANUAL.is_empty() {
+            assert!(std::env::var_os("ECHOLAKE_NO_SKIP").is_none(), "the manual is not built; hint: docs/build.sh");
+            let response = ask("/docs").await;
+            assert_eq!(response.status(), StatusCode::NOT_FOUND);
+            return;
+        }
+        assert_eq!(ask("/docs").await.headers()[header::LOCATION], MANUAL_INDEX);
+        assert_eq!(ask("/docs/none.html").await.status(), StatusCode::NOT_FOUND);
+        let response = ask(MANUAL_INDEX).await;
+        assert_eq!(response.status(), StatusCode::OK);
+        assert_eq!(response.headers()[header::CONTENT_TYPE], "text/html; charset=utf-8");
+        let policy = response.headers()[header::CONTENT_SECURITY_POLICY].to_str().expect("text").to_owned();
+        let (page, _) = find_manual_file("/index.html").expect("a page");
+        let scripts: Vec<&str> = inline_scripts(std::str::from_utf8(page.bytes).expect("text")).collect();
+        assert!(!scripts.is_empty());
+        for script in scripts {
+            let hash = BASE64_STANDARD.encode(Sha256::digest(script.as_bytes()));
+            assert!(policy.contains(&format!("'sha256-{hash}'")), "{policy}");
+        }
+        assert!(!policy.contains("unsafe"), "{policy}");
+        for file in MANUAL {
+            assert_eq!(ask_path(file.path).await, StatusCode::OK, "{}", file.path);
+        }
+    }
+
+    async fn ask_path(path: &str) -> StatusCode {
+        let uri = format!("{MANUAL_PATH}{path}").parse().expect("a path");
+        fallback(Method::GET, uri, HeaderMap::new()).await.status()
+    }
+
     #[cfg(not(pages_not_built))]
     #[test]
     fn scripts_are_there_and_packed() {
-        let path = |asked: &str| page(asked).map(|(page, _)| page.path);
+        let path = |asked: &str| find_page(asked).map(|(page, _)| page.path);
         assert_eq!(path("/theme.js"), Some("/theme.js"));
         let script = PAGES.iter().find(|p| p.path.starts_with("/assets/index-") && p.path.ends_with(".js"));
         let script = script.expect("a script");
