@@ -45,8 +45,6 @@ pub(super) enum Malformed {
     Expands,
     #[error("it is no JSON object")]
     Json,
-    #[error("it is no CBOR map")]
-    Cbor,
     #[error("its encapsulation is none of CDR's that are known here")]
     Encapsulation,
 }

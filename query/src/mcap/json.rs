@@ -1,25 +1,20 @@
-//! JSON messages into columns: by their schema's properties, else as one column `json` with the text. CBOR is the same
-//! in binary.
+//! JSON messages into columns: by their schema's properties, else as one column `json` with the text.
 //!
 //! A value that does not fit its column's type is null and counted: nothing in a JSON channel binds its writer to the
 //! schema.
 
-use std::borrow::Cow;
 use std::sync::Arc;
 
 use arrow::datatypes::{DataType, Field, Fields};
 use echolake_schema::tables::LIST_CHILD;
 use serde_json::{Map, Number, Value};
 
-use super::cbor;
 use super::column::{Column, DEEPEST, MOST_LEAVES, Record, integer_type, width};
 use super::error::{Malformed, Spent};
 use super::schema::BYTE_ORDER_MARK;
 
 /// A parsed value takes about this many bytes for each byte of its text, at worst.
 const PARSED: usize = 16;
-/// The same of CBOR, in which a value may have one byte.
-const PARSED_CBOR: usize = 96;
 /// Integers are below this, 2^64.
 const MOST_INTEGER: f64 = 18_446_744_073_709_551_616.0;
 /// Numbers that JSON's grammar lacks and that many writers write all the same. Others, as `1e400`, exceed 64 bits.
@@ -32,13 +27,6 @@ pub(super) enum Shape {
     Properties,
     /// There is one, the text.
     Text,
-}
-
-/// The encoding of messages.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum JsonEncoding {
-    Text,
-    Cbor,
 }
 
 /// The columns that a JSON schema describes.
@@ -113,7 +101,6 @@ fn integer(schema: &Value) -> DataType {
 /// Decodes messages.
 pub(super) struct Decoder {
     shape: Shape,
-    encoding: JsonEncoding,
     fields: Fields,
     record: Record,
     width: usize,
@@ -123,10 +110,10 @@ pub(super) struct Decoder {
 }
 
 impl Decoder {
-    pub(super) fn new(shape: Shape, encoding: JsonEncoding, all: &Fields, wanted: &[usize]) -> Self {
+    pub(super) fn new(shape: Shape, all: &Fields, wanted: &[usize]) -> Self {
         let fields: Fields = wanted.iter().map(|i| all[*i].clone()).collect();
         let width = fields.iter().map(|f| width(f.data_type())).sum();
-        Self { shape, encoding, record: Record::new(&fields), fields, width, spent: Spent::default(), unfit: 0 }
+        Self { shape, record: Record::new(&fields), fields, width, spent: Spent::default(), unfit: 0 }
     }
 
     pub(super) fn push(&mut self, data: &[u8]) -> Result<(), Malformed> {
@@ -136,14 +123,10 @@ impl Decoder {
             return Ok(());
         }
         if self.shape == Shape::Text {
-            let text = match self.encoding {
-                JsonEncoding::Text => Cow::Borrowed(data),
-                JsonEncoding::Cbor => Cow::Owned(self.parse(data)?.to_string().into_bytes()),
-            };
-            self.spent.add(text.len())?;
+            self.spent.add(data.len())?;
             for column in &mut self.record.columns {
                 if let Column::Text(c) = column {
-                    c.push_text(&text);
+                    c.push_text(data);
                 }
             }
             return Ok(());
@@ -157,11 +140,7 @@ impl Decoder {
     }
 
     fn parse(&mut self, data: &[u8]) -> Result<Value, Malformed> {
-        let factor = if self.encoding == JsonEncoding::Cbor { PARSED_CBOR } else { PARSED };
-        Spent::default().add(data.len().saturating_mul(factor))?;
-        if self.encoding == JsonEncoding::Cbor {
-            return cbor::parse(data);
-        }
+        Spent::default().add(data.len().saturating_mul(PARSED))?;
         let data = data.strip_prefix(BYTE_ORDER_MARK).unwrap_or(data);
         if let Ok(message) = serde_json::from_slice(data) {
             return Ok(message);

@@ -3,7 +3,6 @@
 //! Planning cannot wait for a store, so what a statement asks for is looked up before it is planned; the functions that
 //! the planner then calls only hand it over.
 
-mod cbor;
 mod chunk;
 mod codec;
 mod column;

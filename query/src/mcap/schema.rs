@@ -8,7 +8,6 @@ use arrow::error::ArrowError;
 use prost_reflect::MessageDescriptor;
 
 use super::error::Malformed;
-use super::json::JsonEncoding;
 use super::ros::RosVersion;
 use super::{flatbuffer, json, protobuf, ros, ros_idl};
 
@@ -36,7 +35,7 @@ pub(super) struct Layout {
 enum Kind {
     Protobuf(MessageDescriptor),
     /// By its properties, or one column with the text.
-    Json(json::Shape, JsonEncoding),
+    Json(json::Shape),
     Ros(ros::Definition),
     Flatbuffer(flatbuffer::FlatbufferDefinition),
     /// Messages of an encoding that is not known, which have no columns.
@@ -48,7 +47,7 @@ pub(super) const BYTE_ORDER_MARK: &[u8] = b"\xef\xbb\xbf";
 
 /// The encodings that have columns, in words.
 const KNOWN: &str =
-    "protobuf, flatbuffer, json and cbor with jsonschema or none, cdr with ros2msg or ros2idl, and ros1 with ros1msg";
+    "protobuf, flatbuffer, json with jsonschema or none, cdr with ros2msg or ros2idl, and ros1 with ros1msg";
 
 impl Layout {
     /// Understands a schema; the text of an error says what is wrong with it.
@@ -59,9 +58,9 @@ impl Layout {
                 let message = protobuf::message_type(&schema.name, &schema.data)?;
                 (protobuf::fields(&message)?, Kind::Protobuf(message))
             }
-            Some(Encoding::Json(encoding)) => {
+            Some(Encoding::Json) => {
                 let (fields, shape) = json::columns(text)?;
-                (fields, Kind::Json(shape, encoding))
+                (fields, Kind::Json(shape))
             }
             Some(Encoding::Ros(version, notation)) => {
                 let text = std::str::from_utf8(text).map_err(|e| format!("its schema is no text: {e}"))?;
@@ -102,7 +101,7 @@ impl Layout {
     pub(super) fn decoder(&self, wanted: &[usize]) -> Decoder {
         match &self.kind {
             Kind::Protobuf(message) => Decoder::Protobuf(protobuf::Decoder::new(message, &self.fields, wanted)),
-            Kind::Json(shape, encoding) => Decoder::Json(json::Decoder::new(*shape, *encoding, &self.fields, wanted)),
+            Kind::Json(shape) => Decoder::Json(json::Decoder::new(*shape, &self.fields, wanted)),
             Kind::Ros(definition) => Decoder::Ros(ros::Decoder::new(definition, &self.fields, wanted)),
             Kind::Flatbuffer(definition) => {
                 Decoder::Flatbuffer(flatbuffer::FlatbufferDecoder::new(definition, &self.fields, wanted))
@@ -116,7 +115,7 @@ impl Layout {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Encoding {
     Protobuf,
-    Json(JsonEncoding),
+    Json,
     Ros(RosVersion, RosNotation),
     Flatbuffer,
 }
@@ -132,8 +131,7 @@ impl Encoding {
     fn of(schema: &RawSchema) -> Option<Self> {
         Some(match (schema.messages.as_str(), schema.encoding.as_str()) {
             ("protobuf", "protobuf") => Self::Protobuf,
-            ("json", "jsonschema" | "") => Self::Json(JsonEncoding::Text),
-            ("cbor", "jsonschema" | "") => Self::Json(JsonEncoding::Cbor),
+            ("json", "jsonschema" | "") => Self::Json,
             ("flatbuffer", "flatbuffer") => Self::Flatbuffer,
             ("cdr", "ros2msg") => Self::Ros(RosVersion::Two, RosNotation::Message),
             ("cdr", "ros2idl") => Self::Ros(RosVersion::Two, RosNotation::Idl),

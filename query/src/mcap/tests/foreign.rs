@@ -447,28 +447,6 @@ async fn arrays_of_messages_without_members_take_no_bytes_in_ros_1() {
     }
 }
 
-#[tokio::test]
-async fn cbor_messages_are_columns_or_text() {
-    // {"x": 1.5 in 16 bits, "n": 2^64-1, "small": -1, "z": h'0102', 3: [undefined, 1(0)]}
-    let message = b"\xa5\x61x\xf9\x3e\x00\x61n\x1b\xff\xff\xff\xff\xff\xff\xff\xff\x65small\x20\x61z\x42\x01\x02\
-                    \x03\x82\xf7\xc1\x00";
-    let lake = lake().await;
-    let file = |schema, message: &[u8]| {
-        file_of(&[TestChannel { topic: "/t", encoding: "cbor", schema, messages: &[message] }])
-    };
-    let schema = ("T", "jsonschema", NUMBERS.as_bytes());
-    put(&lake, "inbox/c.mcap", file(schema, message)).await;
-    check(&lake, "select x, n, small from mcap('inbox/c.mcap', '/t')", &["1.5 | 18446744073709551615 | -1"]).await;
-    put(&lake, "inbox/c.mcap", file(("", "", b"".as_slice()), message)).await;
-    let expected = [r#"{"3":[null,0],"n":18446744073709551615,"small":-1,"x":1.5,"z":"0102"}"#];
-    check(&lake, "select json from mcap('inbox/c.mcap', '/t')", &expected).await;
-    for damaged in [&message[..message.len() - 1], &[message.as_slice(), b"\x00"].concat(), b"\x9b\xff\xff\xff\xff\xff"]
-    {
-        put(&lake, "inbox/c.mcap", file(schema, damaged)).await;
-        refused(&lake, "select x from mcap('inbox/c.mcap', '/t')", &["it is no CBOR map"]).await;
-    }
-}
-
 mod slow {
     use super::*;
 
