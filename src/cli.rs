@@ -154,8 +154,6 @@ impl CliArguments {
         match &self.command {
             #[cfg(feature = "lake")]
             CliCommand::Lake(LakeCommand::Engine(args)) => args.confine(&self.lake),
-            #[cfg(feature = "lake")]
-            CliCommand::Lake(LakeCommand::Serve(args)) => args.confine(&self.lake),
             _ => Ok(()),
         }
     }
@@ -163,7 +161,7 @@ impl CliArguments {
     /// Returns whether the command has clients of its own, whose requests are spans.
     #[cfg(feature = "otlp")]
     pub(crate) fn answers_clients(&self) -> bool {
-        matches!(&self.command, CliCommand::Lake(LakeCommand::Serve(args)) if !args.is_worker())
+        matches!(&self.command, CliCommand::Lake(LakeCommand::Serve(_)))
     }
 
     /// Runs the command.

@@ -46,7 +46,6 @@ mod serve {
     pub(crate) mod tunnel;
 }
 mod slices;
-mod workers;
 
 use std::path::PathBuf;
 
@@ -88,8 +87,6 @@ enum CampaignCommand {
     HostileClients(hostile_clients::HostileClientsArgs),
     /// Kill engines of `serve` while they answer; no short answer may look whole.
     EngineKills(engine_kills::EngineKillsArgs),
-    /// Kill workers of heavy queries; no answer may be wrong or short, and what they read is counted.
-    Workers(workers::WorkersArgs),
     /// Measure how soon the server is idle after a query is ended.
     Cancels(cancels::CancelArgs),
     /// Measure ingest beside bare transforms, the reference pipeline and the parquet crate alone.
@@ -121,7 +118,6 @@ fn main() -> Result<()> {
         CampaignCommand::Attacks(args) => attacks::run(&args),
         CampaignCommand::HostileClients(args) => hostile_clients::run(&args),
         CampaignCommand::EngineKills(args) => engine_kills::run(&args),
-        CampaignCommand::Workers(args) => workers::run(&args),
         CampaignCommand::Cancels(args) => cancels::run(&args),
         CampaignCommand::IngestBench(args) => ingest_bench::run(&args),
         CampaignCommand::QueryBench(args) => block_on(query_bench::run(&args)),

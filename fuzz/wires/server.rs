@@ -119,7 +119,6 @@ fn engine_settings(program: PathBuf, sockets: &str) -> EngineSettings {
         temp: None,
         slow: None,
         cache: None,
-        workers: None,
     }
 }
 

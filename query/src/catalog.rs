@@ -14,7 +14,6 @@ use bytes::Bytes;
 use datafusion::common::TableReference;
 use datafusion::datasource::TableProvider;
 use datafusion::error::DataFusionError;
-use datafusion::logical_expr::ScalarUDF;
 use datafusion::optimizer::OptimizerRule;
 use datafusion::prelude::SessionContext;
 use datafusion::sql::parser::Statement;
@@ -81,11 +80,6 @@ impl LakeCatalog {
         })
     }
 
-    /// Returns the functions that views look values up with.
-    pub(crate) fn lookups(&self) -> &[Arc<ScalarUDF>] {
-        self.lookups.functions()
-    }
-
     /// Returns the optimizer rules for plans over these tables and views, the same for every snapshot.
     pub(crate) fn rules(&self) -> [Arc<dyn OptimizerRule + Send + Sync>; 3] {
         [Arc::new(UnusedJoin), Arc::new(PairJoin::new(&self.lookups)), Arc::new(SortedNulls)]
@@ -149,11 +143,6 @@ impl LakeCatalog {
     /// As [`LakeCatalog::contents`].
     pub(crate) async fn attachment(&self, run: &VisibleRun, ending: &str) -> Result<Option<Bytes>, Error> {
         mcap::attachment(run, &self.current().await?.snapshot, ending, &self.runs).await
-    }
-
-    /// Returns the run files, as `mcap` reads them.
-    pub(crate) fn run_files(&self) -> &Arc<mcap::Files> {
-        &self.runs
     }
 
     /// Returns the views with their definitions.

@@ -28,8 +28,6 @@ use crate::control::{QueryTicket, RunningQueries, StopReason};
 use crate::functions::{octet_length_of_bytes, pattern_functions};
 use crate::scan_readers::LakeReaderFactory;
 use crate::small::SmallTables;
-use crate::spread::WorkerCluster;
-use crate::spread::read_only::ReadOnlyStore;
 use crate::system::{self, SystemSource};
 use crate::table::FileReaders;
 use crate::{Error, FunctionSet, OpaqueValue, Session};
@@ -82,7 +80,6 @@ struct EngineState {
     // A thread for timeouts, which busy query threads cannot delay.
     watch: QueryThreads,
     system: OnceLock<Arc<dyn SystemSource>>,
-    cluster: OnceLock<Arc<WorkerCluster>>,
 }
 
 /// Limits on all queries of a process together.
@@ -235,7 +232,6 @@ impl QueryEngine {
             own: functions.names().map(str::to_owned).collect(),
             watch: QueryThreads::new("query-watch", 1).map_err(threads)?,
             system: OnceLock::new(),
-            cluster: OnceLock::new(),
         };
         Ok(Self(OpaqueValue::new(inner)))
     }
@@ -245,19 +241,9 @@ impl QueryEngine {
         let _ = self.0.system.set(source);
     }
 
-    /// Has heavy queries spread over workers from now on; to be called once.
-    pub fn spread_over(&self, cluster: Arc<WorkerCluster>) {
-        let _ = self.0.cluster.set(cluster);
-    }
-
-    /// Returns the workers over which heavy queries are spread.
-    pub fn cluster(&self) -> Option<&Arc<WorkerCluster>> {
-        self.0.cluster.get()
-    }
-
     /// Returns the tables of the schema `system` that are not the lake's; none without a program around that has some.
     pub(crate) fn system_tables(&self) -> Vec<(&'static str, Arc<dyn TableProvider>)> {
-        self.0.system.get().map_or_else(Vec::new, |source| system::engine_tables(source, self.cluster()))
+        self.0.system.get().map_or_else(Vec::new, |source| system::engine_tables(source))
     }
 
     /// Creates a session of a client, one per connection.
@@ -378,45 +364,6 @@ impl QueryEngine {
         &self.0.template
     }
 
-    /// Returns whether a query's settings are those of every query here, which workers have, too.
-    pub(crate) fn has_own_settings(&self, state: &SessionState) -> bool {
-        let (own, its) = (&self.0.template.config_options().execution, &state.config_options().execution);
-        own.time_zone == its.time_zone && own.batch_size == its.batch_size
-    }
-
-    /// Builds the state of a task that runs here for an engine elsewhere: functions, settings and store of this engine's
-    /// queries; its operators may hold `memory` bytes.
-    ///
-    /// # Errors
-    /// If a function cannot be registered.
-    pub(crate) fn task_state(
-        &self,
-        mut builder: SessionStateBuilder,
-        memory: Option<usize>,
-    ) -> Result<SessionState, DataFusionError> {
-        let template = &self.0.template;
-        let mut runtime = template.runtime_env().as_ref().clone();
-        if let Some(limit) = memory {
-            let pool = PartialPool::new(runtime.memory_pool, "the task holds", limit, Arc::default());
-            runtime.memory_pool = Arc::new(pool);
-        }
-        if let Some(config) = builder.config() {
-            config.options_mut().execution = template.config_options().execution.clone();
-        }
-        let mut state = builder
-            .with_runtime_env(Arc::new(runtime))
-            .with_scalar_functions(template.scalar_functions().values().cloned().collect())
-            .with_aggregate_functions(template.aggregate_functions().values().cloned().collect())
-            .with_window_functions(template.window_functions().values().cloned().collect())
-            .build();
-        // Last: they replace functions with the same names and aliases.
-        let own = self.0.own.iter().filter_map(|name| template.scalar_functions().get(name));
-        for function in own.chain(self.0.catalog.lookups()) {
-            state.register_udf(function.clone())?;
-        }
-        Ok(state)
-    }
-
     // One new context per query: its tables are of one snapshot, and nothing a query does outlives it. Functions and
     // optimizer rules are those of the template.
     pub(crate) fn context(&self) -> SessionContext {
@@ -469,7 +416,7 @@ fn config() -> SessionConfig {
 fn runtime(lake: &Lake, url: &ObjectStoreUrl, limits: &EngineLimits) -> Result<Arc<RuntimeEnv>, DataFusionError> {
     let stores = DefaultObjectStoreRegistry::new();
     stores.deregister_store(ObjectStoreUrl::parse(MACHINE)?.as_ref())?;
-    stores.register_store(url.as_ref(), Arc::new(ReadOnlyStore::new(lake.store())));
+    stores.register_store(url.as_ref(), lake.store());
     let mut builder = RuntimeEnvBuilder::new();
     if let Some(memory) = limits.memory {
         builder = builder.with_memory_pool(Arc::new(GreedyMemoryPool::new(memory)));

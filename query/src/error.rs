@@ -17,7 +17,6 @@ use echolake_schema::{ErrorCause, escape_controls};
 
 use crate::control::StopReason;
 use crate::friendly::hints;
-use crate::spread::WorkerLoss;
 
 /// Minimum similarity of a suggested name: half of the letters, as in DataFusion's own suggestions.
 const ALIKE: f64 = 0.5;
@@ -78,12 +77,6 @@ pub enum Error {
     TimeLimit {
         /// The client's time for a query.
         limit: Duration,
-    },
-    /// A worker that ran a part of it was lost after rows had been sent.
-    #[error("a worker was lost while the query ran: {message}; hint: ask again, the others go on")]
-    WorkerLost {
-        /// What is known of it.
-        message: String,
     },
     /// It needed more memory than there is for it.
     #[error("the query needs more memory than it may have: {message}; hint: ask for less, or for fewer columns")]
@@ -180,7 +173,7 @@ impl Error {
         })
     }
 
-    // An error about a limit, a worker or the lake, not about the query.
+    // An error about a limit or the lake, not about the query.
     fn limit(error: &DataFusionError) -> Option<Self> {
         match error.find_root() {
             DataFusionError::ResourcesExhausted(text) => Some(Self::MemoryLimit { message: text.clone() }),
@@ -191,10 +184,7 @@ impl Error {
                 Some(LakeError::Log { table, action, source }) => {
                     Some(LakeError::Log { table, action, source: source.to_string().into() }.into())
                 }
-                _ => {
-                    let loss = cause.downcast_ref::<WorkerLoss>()?;
-                    Some(Self::WorkerLost { message: loss.message().to_owned() })
-                }
+                _ => None,
             },
             _ => None,
         }

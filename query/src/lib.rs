@@ -46,7 +46,6 @@ mod request_tests;
 mod scan_readers;
 mod session;
 mod small;
-mod spread;
 mod statement_bounds;
 mod summarize;
 mod syntax_walk;
@@ -64,10 +63,6 @@ pub use mcap::{Attachment, Contents, Topic};
 pub use opaque::OpaqueValue;
 pub use predicate::PredicateForm;
 pub use session::{CancelHandle, ContextExtension, PreparedQuery, QueryAnswer, Session};
-pub use spread::{
-    ClusterSettings, SpreadCounts, SpreadTasks, SpreadWorker, TASK_HEADER, TaskLease, WORKER_FIGURES_PATH,
-    WorkerCluster, WorkerFigures, WorkerIdentity, WorkerLink, WorkerStatus, WorkerToken, WorkerTrust, is_loopback_url,
-};
 pub use statement_bounds::check_statement_bounds;
 pub use syntax_walk::{walk_expr, walk_statement};
 pub use system::{SYSTEM_SCHEMA, SystemSource};

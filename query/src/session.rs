@@ -4,7 +4,7 @@ use std::borrow::Cow;
 use std::sync::Arc;
 
 use arrow::datatypes::{DataType, SchemaRef};
-use arrow::record_batch::{RecordBatch, RecordBatchOptions};
+use arrow::record_batch::RecordBatch;
 use bytes::Bytes;
 use datafusion::common::ParamValues;
 use datafusion::error::DataFusionError;
@@ -12,9 +12,7 @@ use datafusion::execution::TaskContext;
 use datafusion::execution::context::SQLOptions;
 use datafusion::execution::session_state::SessionState;
 use datafusion::logical_expr::LogicalPlan;
-#[cfg(test)]
-use datafusion::physical_plan::ExecutionPlan;
-use datafusion::physical_plan::execute_stream;
+use datafusion::physical_plan::{ExecutionPlan, execute_stream};
 use datafusion::prelude::SessionContext;
 use datafusion::sql::parser::{DFParserBuilder, Statement};
 use datafusion::sql::sqlparser::parser::ParserError;
@@ -30,8 +28,6 @@ use crate::control::{QueryTicket, StopReason};
 use crate::dialect::LakeDialect;
 use crate::engine::{self, EngineClient, EngineLimits, QueryEngine, QueryPermit, QueryQuota, SqlFunction};
 use crate::mcap::Contents;
-use crate::spread::attempt::{QueryAttempt, QueryAttempts, SpreadQuery, explain_spread};
-use crate::spread::decision::SpreadDecision;
 use crate::statement_bounds::check_statement_bounds;
 use crate::system::SYSTEM_SCHEMA;
 use crate::{Error, OpaqueValue, as_of, friendly, gate, ignored_clauses, integer_casts, placeholders, summarize};
@@ -374,10 +370,14 @@ impl Session {
         started: Started,
     ) -> Result<QueryAnswer, Error> {
         let Started { ticket, place } = started;
-        let planned = self.clone().physical_plan(state, sql.to_owned(), plan, ticket.clone());
-        let (schema, attempts) = self.engine.on_threads(&ticket, planned).await?;
+        let context = self.task_context(&state, &ticket);
+        let text = sql.to_owned();
+        let planned =
+            async move { state.create_physical_plan(&plan).await.map_err(|error| Error::plan(&text, &error)) };
+        let plan = self.engine.on_threads(&ticket, planned).await?;
+        let schema = plan.schema();
         let (send, batches) = mpsc::channel(AHEAD);
-        let query = drive(schema.clone(), attempts, send, ticket.clone(), place).boxed();
+        let query = drive(plan, context, send, ticket.clone(), place).boxed();
         // Dropped, it stops the query, which may have begun.
         let mut answer = QueryAnswer {
             schema,
@@ -393,38 +393,6 @@ impl Session {
             why = answer.ticket.stopped() => return Err(Error::stopped(&why)),
         }
         Ok(answer)
-    }
-
-    // The plan for this process, and what plans it for workers if it is for them.
-    async fn physical_plan(
-        self,
-        state: OpaqueValue<SessionState>,
-        sql: String,
-        query: LogicalPlan,
-        ticket: Arc<QueryTicket>,
-    ) -> Result<(SchemaRef, QueryAttempts), Error> {
-        let wrong = |e: DataFusionError| Error::plan(&sql, &e);
-        let mut plan = state.create_physical_plan(&query).await.map_err(wrong)?;
-        let context = self.task_context(&state, &ticket);
-        let mut spread = None;
-        if let Some(cluster) = self.engine.cluster().filter(|_| self.engine.has_own_settings(&state)) {
-            if let LogicalPlan::Explain(explain) = &query {
-                plan = explain_spread(cluster, &state, explain, plan).await.map_err(wrong)?;
-            } else if let SpreadDecision::Spread { .. } =
-                SpreadDecision::of_plan(&plan, cluster.least_bytes()).map_err(wrong)?
-            {
-                let memory = self.engine.memory(self.client.quota());
-                spread = Some(SpreadQuery {
-                    cluster: cluster.clone(),
-                    state: SessionState::clone(&state),
-                    query,
-                    memory,
-                    contexts: Box::new(move |state| self.task_context(state, &ticket)),
-                });
-            }
-        }
-        let schema = plan.schema();
-        Ok((schema, QueryAttempts::new(plan, context, spread)))
     }
 
     // As DataFusion builds it, except for the memory pool.
@@ -490,15 +458,6 @@ impl Session {
     }
 }
 
-#[cfg(test)]
-impl Session {
-    /// Plans a query for this process.
-    pub(crate) async fn local_plan(&self, sql: &str) -> Arc<dyn ExecutionPlan> {
-        let prepared = self.prepare(sql).await.unwrap_or_else(|e| panic!("{sql}: {e}"));
-        prepared.state.create_physical_plan(&prepared.plan).await.unwrap_or_else(|e| panic!("{sql}: {e}"))
-    }
-}
-
 /// A started query with its permit, before it is planned.
 struct Started {
     ticket: Arc<QueryTicket>,
@@ -507,76 +466,36 @@ struct Started {
 
 // Runs a query. It holds its permit until its operators are dropped, even if the reader is gone.
 async fn drive(
-    schema: SchemaRef,
-    mut attempts: QueryAttempts,
+    plan: Arc<dyn ExecutionPlan>,
+    context: Arc<TaskContext>,
     send: mpsc::Sender<Result<RecordBatch, DataFusionError>>,
     ticket: Arc<QueryTicket>,
     _place: QueryPermit,
 ) {
     let _work = ticket.begin_work();
-    let run = async {
-        let mut attempt = attempts.first().await;
-        while let Some(current) = attempt {
-            attempt = match run_attempt(&schema, &current, &send).await {
-                AttemptEnd::Done => None,
-                AttemptEnd::Failed { error, has_sent } => {
-                    let next = if has_sent { None } else { attempts.after(&current, &error).await };
-                    if next.is_none() {
-                        // An error of `send` means that the answer was dropped.
-                        let _ = send.send(Err(current.final_error(error))).await;
-                    }
-                    next
-                }
-            };
-        }
-    };
     tokio::select! {
         biased;
         _ = ticket.stopped() => {}
-        () = run => {}
+        () = send_batches(plan, context, &send) => {}
     }
 }
 
-/// The end of an attempt to run a query.
-enum AttemptEnd {
-    /// All rows were sent, or nobody reads them.
-    Done,
-    Failed {
-        error: DataFusionError,
-        /// True if batches were sent before.
-        has_sent: bool,
-    },
-}
-
-async fn run_attempt(
-    schema: &SchemaRef,
-    attempt: &QueryAttempt,
+// An error of `send` means that the answer was dropped.
+async fn send_batches(
+    plan: Arc<dyn ExecutionPlan>,
+    context: Arc<TaskContext>,
     send: &mpsc::Sender<Result<RecordBatch, DataFusionError>>,
-) -> AttemptEnd {
-    let mut has_sent = false;
-    let mut batches = match execute_stream(attempt.plan.clone(), attempt.context.clone()) {
+) {
+    let mut batches = match execute_stream(plan, context) {
         Ok(batches) => batches,
-        Err(error) => return AttemptEnd::Failed { error, has_sent },
+        Err(error) => return drop(send.send(Err(error)).await),
     };
     while let Some(batch) = batches.next().await {
-        let batch = batch.and_then(|batch| if attempt.is_spread() { with_schema(batch, schema) } else { Ok(batch) });
-        match batch {
-            Ok(batch) => {
-                has_sent = true;
-                if send.send(Ok(batch)).await.is_err() {
-                    return AttemptEnd::Done;
-                }
-            }
-            Err(error) => return AttemptEnd::Failed { error, has_sent },
+        let has_failed = batch.is_err();
+        if send.send(batch).await.is_err() || has_failed {
+            return;
         }
     }
-    AttemptEnd::Done
-}
-
-// What a function returns loses its unit between machines.
-fn with_schema(batch: RecordBatch, schema: &SchemaRef) -> Result<RecordBatch, DataFusionError> {
-    let options = RecordBatchOptions::new().with_row_count(Some(batch.num_rows()));
-    Ok(RecordBatch::try_new_with_options(schema.clone(), batch.columns().to_vec(), &options)?)
 }
 
 #[cfg(test)]

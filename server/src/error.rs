@@ -33,48 +33,6 @@ pub enum Error {
         /// The requested address.
         address: SocketAddr,
     },
-    /// Others could reach a worker, and it would run whatever they send.
-    #[error(
-        "{address} is beyond this machine, and workers have no token; hint: --worker-token FILE here and there, with a line \
-         that `openssl rand -hex 32` makes"
-    )]
-    OpenWorker {
-        /// The worker's address.
-        address: String,
-    },
-    /// Rows and the token would go over the network as they are.
-    #[error(
-        "{address} is beyond this machine, and what goes to workers is not encrypted; hint: --certificate and --key with \
-         --worker, and https:// in --workers; or --plain-text-to-workers if the network between them is private, such as \
-         WireGuard's"
-    )]
-    PlainTextWorker {
-        /// The worker's address.
-        address: String,
-    },
-    /// A worker's token cannot be read.
-    #[error("the token in `{}` cannot be used: {message}; hint: `openssl rand -hex 32` makes one", path.display())]
-    WorkerToken {
-        /// The file.
-        path: PathBuf,
-        /// The cause.
-        message: String,
-    },
-    /// Nobody vouches for workers' certificates.
-    #[error("this system trusts no authority of certificates; hint: --worker-ca FILE with the workers' certificates")]
-    NoAuthorities,
-    /// A worker's address is none.
-    #[error("`{given}` is no address of a worker; hint: as https://10.0.0.7:7070, which `serve --worker` prints")]
-    WorkerAddress {
-        /// The given text.
-        given: String,
-    },
-    /// The lake has nothing to query yet.
-    #[error("the lake `{location}` has no tables; hint: `echolake ingest` makes them")]
-    NoTables {
-        /// The lake.
-        location: String,
-    },
     /// The lake cannot be read.
     #[error(transparent)]
     Lake(#[from] echolake_lake::Error),

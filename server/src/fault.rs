@@ -205,7 +205,6 @@ pub(crate) enum FaultCode {
     RowLimit,
     TooMany,
     EngineEnded,
-    WorkerLost,
     Internal,
     Stopping,
     NotReady,
@@ -213,7 +212,7 @@ pub(crate) enum FaultCode {
 
 impl FaultCode {
     /// All of them.
-    pub(crate) const ALL: [Self; 28] = [
+    pub(crate) const ALL: [Self; 27] = [
         Self::Query,
         Self::ReadOnly,
         Self::Execution,
@@ -238,7 +237,6 @@ impl FaultCode {
         Self::RowLimit,
         Self::TooMany,
         Self::EngineEnded,
-        Self::WorkerLost,
         Self::Internal,
         Self::Stopping,
         Self::NotReady,
@@ -271,7 +269,6 @@ impl FaultCode {
             Self::RowLimit => "row_limit",
             Self::TooMany => "too_many",
             Self::EngineEnded => "query_ended_engine",
-            Self::WorkerLost => "worker_lost",
             Self::Internal => "internal",
             Self::Stopping => "server_stopping",
             Self::NotReady => "not_ready",
@@ -327,11 +324,7 @@ impl RequestFault {
     pub(crate) fn log(&self) {
         let (code, text) = (self.code(), self.to_string());
         match code {
-            FaultCode::Internal
-            | FaultCode::Lake
-            | FaultCode::Changed
-            | FaultCode::EngineEnded
-            | FaultCode::WorkerLost => {
+            FaultCode::Internal | FaultCode::Lake | FaultCode::Changed | FaultCode::EngineEnded => {
                 tracing::warn!(code = code.name(), text, "a request failed");
             }
             _ => tracing::debug!(code = code.name(), text, "a request failed"),
@@ -403,7 +396,6 @@ fn query_code(error: &QueryError) -> FaultCode {
         QueryError::MemoryLimit { .. } => FaultCode::MemoryLimit,
         QueryError::RowLimit { .. } => FaultCode::RowLimit,
         QueryError::Busy { .. } => FaultCode::TooMany,
-        QueryError::WorkerLost { .. } => FaultCode::WorkerLost,
         QueryError::Format { .. } => FaultCode::Format,
         QueryError::Write(_) | QueryError::Lake(_) => FaultCode::Lake,
     }

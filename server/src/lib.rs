@@ -39,7 +39,6 @@ mod sessions;
 mod signed_address;
 mod token_access;
 pub mod tokens;
-pub mod worker;
 
 pub use catalogue_pages::CataloguePages;
 pub use door::{AgentDoor, CertificateFiles, EngineSettings, LakeServer, ServerSettings};

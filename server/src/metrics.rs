@@ -2,10 +2,8 @@
 //! their part to the door, which alone has figures.
 
 mod gauges;
-mod workers;
 
 use echolake_lake::CacheCounts;
-use echolake_query::{SpreadCounts, WorkerStatus};
 use prometheus::{
     HistogramOpts, HistogramVec, IntCounter, IntCounterVec, IntGauge, Opts, Registry, Result, TextEncoder,
 };
@@ -14,7 +12,6 @@ use serde::{Deserialize, Serialize};
 use crate::activity::QueryEnd;
 use crate::fault::{FaultCode, RequestFault};
 pub(crate) use gauges::{DiskSpace, PoolGauges, ServerGauges};
-use workers::WorkerGauges;
 
 /// The protocol of a query.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -62,8 +59,6 @@ pub(crate) struct ServerMetrics {
     cache_blocks: IntCounterVec,
     cache_requests: IntCounter,
     cache_bytes: IntCounter,
-    spread: IntCounterVec,
-    workers: WorkerGauges,
 }
 
 impl ServerMetrics {
@@ -77,7 +72,6 @@ impl ServerMetrics {
         let request_time = histogram("echolake_http_request_seconds", "Time of a request, to the head of its answer.");
         let registry = Registry::new();
         let metrics = Self {
-            workers: WorkerGauges::register(&registry)?,
             registry,
             queries: IntCounterVec::new(
                 Opts::new("echolake_queries_total", "Queries that were begun."),
@@ -101,13 +95,6 @@ impl ServerMetrics {
                 "Requests to the object store for blocks that were not cached.",
             )?,
             cache_bytes: IntCounter::new("echolake_cache_fetched_bytes_total", "Bytes of these blocks.")?,
-            spread: IntCounterVec::new(
-                Opts::new(
-                    "echolake_spread_queries_total",
-                    "Queries that were begun on workers, begun again, or returned.",
-                ),
-                &["event"],
-            )?,
         };
         metrics.register()?;
         Ok(metrics)
@@ -125,7 +112,6 @@ impl ServerMetrics {
         registry.register(Box::new(self.cache_blocks.clone()))?;
         registry.register(Box::new(self.cache_requests.clone()))?;
         registry.register(Box::new(self.cache_bytes.clone()))?;
-        registry.register(Box::new(self.spread.clone()))?;
         // What did not happen yet is zero, and not unknown.
         for protocol in ServerProtocol::ALL {
             queries.with_label_values(&[protocol.name()]);
@@ -135,7 +121,6 @@ impl ServerMetrics {
             failures.with_label_values(&[code.name()]);
         }
         self.cached(&CacheCounts::default());
-        self.spread(&SpreadCounts::default());
         Ok(())
     }
 
@@ -176,19 +161,6 @@ impl ServerMetrics {
         self.cache_bytes.inc_by(fetched_bytes);
     }
 
-    /// Counts what an engine had workers do.
-    pub(crate) fn spread(&self, counts: &SpreadCounts) {
-        let SpreadCounts { spread, repeated, returned } = *counts;
-        for (event, queries) in [("begun", spread), ("begun_again", repeated), ("returned", returned)] {
-            self.spread.with_label_values(&[event]).inc_by(queries);
-        }
-    }
-
-    /// Takes what an engine was told by workers.
-    pub(crate) fn set_workers(&self, workers: &[WorkerStatus]) {
-        self.workers.set(workers);
-    }
-
     /// Counts a failed request.
     pub(crate) fn failed(&self, code: FaultCode) {
         self.failures.with_label_values(&[code.name()]).inc();
@@ -215,8 +187,6 @@ impl ServerMetrics {
 
 #[cfg(test)]
 mod tests {
-    use echolake_query::WorkerFigures;
-
     use super::*;
 
     #[test]
@@ -264,15 +234,6 @@ mod tests {
         let text = metrics.text(&ServerGauges::default()).expect("a text");
         has(&text, "echolake_cache_blocks_total{from=\"disk\"} 2");
         has(&text, "echolake_cache_fetched_bytes_total 4096");
-        has(&text, "echolake_spread_queries_total{event=\"begun\"} 0");
-        metrics.spread(&SpreadCounts { spread: 3, repeated: 1, returned: 0 });
-        let url = "http://127.0.0.1:7070/".to_owned();
-        let figures = Some(WorkerFigures { read_bytes: 7, ..WorkerFigures::default() });
-        metrics.set_workers(&[WorkerStatus { url, problem: None, build: None, last_seen: None, figures }]);
-        let text = metrics.text(&ServerGauges::default()).expect("a text");
-        has(&text, "echolake_spread_queries_total{event=\"begun_again\"} 1");
-        has(&text, "echolake_worker_usable{worker=\"http://127.0.0.1:7070/\"} 1");
-        has(&text, "echolake_worker_read_bytes{worker=\"http://127.0.0.1:7070/\"} 7");
         metrics.begin(ServerProtocol::Http);
         metrics.lose(1);
         has(&metrics.text(&ServerGauges::default()).expect("a text"), "echolake_running_queries 0");

@@ -4,21 +4,16 @@ use std::fs::OpenOptions;
 use std::io::Write as _;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::os::unix::fs::OpenOptionsExt as _;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::str::FromStr;
 use std::time::Duration;
 
 use anyhow::Context as _;
 use echolake_lake::{Lake, remote_access};
-use echolake_query::{WorkerLink, WorkerToken};
 use echolake_schema::ProjectName;
 use echolake_server::certificate::self_signed;
 use echolake_server::engine::{EngineRun, confinement, run_engine};
 use echolake_server::tokens::{self, TokenFile, TokenScope};
-use echolake_server::worker::{
-    EngineWorkers, LakeWorker, WORKER_TOKEN_VARIABLE, WorkerSettings, program_build, read_worker_token,
-    read_worker_trust, worker_trust_files,
-};
 use echolake_server::{
     CataloguePages, CertificateFiles, EngineSettings, Error, LakeServer, OidcSettings, ServerSettings,
 };
@@ -33,8 +28,6 @@ use crate::signals::StopRequest;
 /// Memory for queries, and engines at once, by default.
 pub(super) const MEMORY_MIB: u32 = 4096;
 const ENGINES: u32 = 16;
-/// Least MiB that a query reads to be spread, by default: a second of one core's work.
-const SPREAD_MIB: u32 = 64;
 /// Time for which the demo's answers may go on after Ctrl-C.
 const CATALOGUE_DRAIN: Duration = Duration::from_secs(5);
 
@@ -54,7 +47,7 @@ pub(crate) struct ServeArgs {
     /// File of tokens; without it only this machine has access. `echolake token` makes its lines.
     #[arg(long, value_name = "FILE")]
     tokens: Option<PathBuf>,
-    /// Certificate of the server or worker (PEM), with which all connections to it are encrypted; renewed files are taken while it runs.
+    /// Certificate of the server (PEM), with which all connections to it are encrypted; renewed files are taken while it runs.
     #[arg(long, value_name = "FILE", requires = "key")]
     certificate: Option<PathBuf>,
     /// Private key of the certificate (PEM).
@@ -80,24 +73,6 @@ pub(crate) struct ServeArgs {
     /// Folder for temporary files, such as sorts that do not fit into memory; by default `temp` in the lake.
     #[arg(long, value_name = "DIR")]
     temp: Option<PathBuf>,
-    /// Workers for heavy queries, as https://10.0.0.7:7070; light queries run here.
-    #[arg(long, value_name = "URL,...", value_delimiter = ',')]
-    workers: Vec<String>,
-    /// MiB that a query must read to be spread over workers.
-    #[arg(long, value_name = "MIB", default_value_t = SPREAD_MIB, requires = "workers")]
-    spread_from: u32,
-    /// Be a worker of other servers of this lake, at this address; nothing else is served.
-    #[arg(long, value_name = "ADDRESS", conflicts_with_all = ["listen", "flight_sql", "postgres", "tokens", "workers"])]
-    worker: Option<SocketAddr>,
-    /// File of the token that servers and workers share; without it, workers are on this machine.
-    #[arg(long, value_name = "FILE")]
-    worker_token: Option<PathBuf>,
-    /// Certificates of the workers, or of their issuers (PEM); without it, those of authorities that the system trusts.
-    #[arg(long, value_name = "FILE")]
-    worker_ca: Option<PathBuf>,
-    /// Send rows and the token to workers beyond this machine without encryption, because that network is private.
-    #[arg(long)]
-    plain_text_to_workers: bool,
     #[command(flatten)]
     cache: CacheArgs,
 }
@@ -145,16 +120,6 @@ pub(crate) struct EngineArgs {
     /// Milliseconds from which a query is logged.
     #[arg(long)]
     log_slow_ms: Option<u64>,
-    /// Workers for heavy queries, the bytes that make one heavy, and the build that workers must have.
-    #[arg(long, value_delimiter = ',')]
-    workers: Vec<String>,
-    #[arg(long, default_value_t = 0)]
-    spread_bytes: u64,
-    #[arg(long, default_value = "")]
-    build: String,
-    /// The file of authorities of workers' certificates.
-    #[arg(long)]
-    worker_ca: Option<PathBuf>,
     #[command(flatten)]
     cache: CacheArgs,
 }
@@ -168,30 +133,12 @@ impl EngineArgs {
             .into_iter()
             .chain(cache.as_ref().map(|cache| cache.path.as_path()))
             .collect();
-        let workers = self.workers()?;
-        let ports: Vec<_> = workers.iter().flat_map(EngineWorkers::ports).collect();
-        let trusted: Vec<_> = workers.iter().flat_map(EngineWorkers::files).collect();
         let confined = match (&self.confine_to, remote_access(lake_url)) {
-            (Some(lake), _) => confinement::confine_files(lake, &trusted, &own, &ports),
-            (None, Some(mut store)) => {
-                store.files.extend(trusted);
-                confinement::confine_to_store(&store, &own, &ports)
-            }
+            (Some(lake), _) => confinement::confine_files(lake, &own),
+            (None, Some(store)) => confinement::confine_to_store(&store, &own),
             (None, None) => Ok(()),
         };
         confined.context("the engine cannot be confined")
-    }
-
-    fn workers(&self) -> anyhow::Result<Option<EngineWorkers>> {
-        if self.workers.is_empty() {
-            return Ok(None);
-        }
-        let secret = std::env::var(WORKER_TOKEN_VARIABLE).ok();
-        // The door has checked that the network may be used.
-        let token = secret.as_deref().and_then(WorkerToken::parse);
-        let link = WorkerLink { token, trust: None, is_private: true };
-        let (authorities, build) = (self.worker_ca.as_deref(), self.build.clone());
-        Ok(Some(EngineWorkers::new(&self.workers, link, authorities, self.spread_bytes, build)?))
     }
 }
 
@@ -201,7 +148,7 @@ pub(crate) async fn engine(args: &EngineArgs, lake_url: &str) -> anyhow::Result<
     let _ignored = signal(SignalKind::terminate()).context("cannot listen to SIGTERM")?;
     let lake = args.cache.open_lake(lake_url).await?;
     let slow = args.log_slow_ms.map(Duration::from_millis);
-    let run = EngineRun { memory: Some(args.memory_bytes), slow, workers: args.workers()? };
+    let run = EngineRun { memory: Some(args.memory_bytes), slow };
     run_engine(&lake, &args.sockets, run).await?;
     Ok(CommandOutcome::Whole)
 }
@@ -241,90 +188,7 @@ impl ListenAddress {
 /// The default address of HTTP.
 const HTTP: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 8080);
 
-impl ServeArgs {
-    /// Gives up what a worker does not need; a server's engines do so themselves. To be called before there are threads.
-    pub(crate) fn confine(&self, lake_url: &str) -> anyhow::Result<()> {
-        if self.worker.is_none() {
-            return Ok(());
-        }
-        let temp = self.worker_temp();
-        let cache = self.cache.folder();
-        let own: Vec<_> =
-            [temp.as_path()].into_iter().chain(cache.as_ref().map(|cache| cache.path.as_path())).collect();
-        let mut readable = match remote_access(lake_url) {
-            Some(store) => store.files,
-            None => confinement::lake_folders(Path::new(lake_url.strip_prefix("file://").unwrap_or(lake_url))),
-        };
-        readable.extend(self.worker_token.clone());
-        if let Some(certificate) = self.certificate_files() {
-            readable.extend(certificate.folders());
-        }
-        if self.certificate.is_some() || self.worker_ca.is_some() {
-            readable.extend(worker_trust_files(self.worker_ca.as_deref()));
-        }
-        confinement::confine_worker(readable, &own).context("the worker cannot be confined")
-    }
-
-    /// Returns whether it has no clients but servers.
-    #[cfg(feature = "otlp")]
-    pub(crate) fn is_worker(&self) -> bool {
-        self.worker.is_some()
-    }
-
-    fn worker_temp(&self) -> PathBuf {
-        self.temp.clone().unwrap_or_else(std::env::temp_dir)
-    }
-
-    fn link(&self) -> anyhow::Result<WorkerLink> {
-        let token = self.worker_token.as_deref().map(read_worker_token).transpose()?;
-        Ok(WorkerLink { token, trust: None, is_private: self.plain_text_to_workers })
-    }
-
-    fn certificate_files(&self) -> Option<CertificateFiles> {
-        let (certificate, key) = self.certificate.clone().zip(self.key.clone())?;
-        Some(CertificateFiles { certificate, key })
-    }
-
-    fn workers(&self) -> anyhow::Result<Option<EngineWorkers>> {
-        if self.workers.is_empty() {
-            return Ok(None);
-        }
-        let build = program_build().context("cannot read this program")?;
-        let least_bytes = u64::from(self.spread_from) << 20;
-        Ok(Some(EngineWorkers::new(&self.workers, self.link()?, self.worker_ca.as_deref(), least_bytes, build)?))
-    }
-}
-
-// A worker of other servers. What panics in one of its tasks would end the rows of that task, as if there were no more:
-// the process ends instead, and engines run their queries elsewhere.
-async fn work(args: &ServeArgs, address: SocketAddr, lake_url: &str) -> anyhow::Result<CommandOutcome> {
-    let stop = StopRequest::listen("stopping: engines run their queries elsewhere".to_owned())?;
-    let lake = args.cache.open_lake(lake_url).await?;
-    let (mut link, certificate) = (args.link()?, args.certificate_files());
-    // A stage may read from other workers, which have certificates as this one has.
-    if certificate.is_some() || args.worker_ca.is_some() {
-        link.trust = Some(read_worker_trust(args.worker_ca.as_deref())?);
-    }
-    let (memory, temp) = ((args.memory as usize) << 20, args.worker_temp());
-    let worker = LakeWorker::bind(&lake, WorkerSettings { address, link, certificate, memory, temp }).await?;
-    let default = std::panic::take_hook();
-    std::panic::set_hook(Box::new(move |panic| {
-        default(panic);
-        std::process::abort();
-    }));
-    eprintln!("lake {}", lake.location());
-    if let Some(missing) = confinement::missing() {
-        eprintln!("note: {missing}");
-    }
-    eprintln!("  worker {}", worker.address()?);
-    worker.run(stop.wait()).await?;
-    Ok(CommandOutcome::Whole)
-}
-
 pub(crate) async fn run(args: &ServeArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
-    if let Some(address) = args.worker {
-        return work(args, address, lake_url).await;
-    }
     let reply = format!("stopping: answers may go on for {:?}; Ctrl-C again stops at once", args.drain);
     let stop = StopRequest::listen(reply)?;
     let lake = args.cache.open_lake(lake_url).await?;
@@ -333,14 +197,17 @@ pub(crate) async fn run(args: &ServeArgs, lake_url: &str) -> anyhow::Result<Comm
         flight_sql: args.flight_sql.address(),
         postgres: args.postgres.address(),
         tokens: args.tokens.as_deref().map(TokenFile::read).transpose()?,
-        certificate: args.certificate_files(),
+        certificate: args
+            .certificate
+            .clone()
+            .zip(args.key.clone())
+            .map(|(certificate, key)| CertificateFiles { certificate, key }),
         oidc: args.oidc.settings(),
         is_behind_proxy: args.plain_text_behind_a_proxy,
         drain: args.drain,
         engines: EngineSettings {
             cache: args.cache.folder().filter(|_| lake.is_remote()),
             slow: args.log_slow,
-            workers: args.workers()?,
             ..engines(args.memory, args.engines, args.temp.clone())?
         },
     };
@@ -387,7 +254,6 @@ pub(super) fn engines(memory_mib: u32, count: u32, temp: Option<PathBuf>) -> any
         temp,
         slow: None,
         cache: None,
-        workers: None,
     })
 }
 

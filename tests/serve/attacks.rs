@@ -1,4 +1,4 @@
-//! Short forms of the campaigns `attacks`, `hostile-clients`, `engine-kills` and `cancels`; `workers.rs` has that of its own. How soon others are answered
+//! Short forms of the campaigns `attacks`, `hostile-clients`, `engine-kills` and `cancels`. How soon others are answered
 //! depends on what else the machine does, so that it is measured there and not here.
 
 #![allow(clippy::module_inception, reason = "the campaign has the name of its tests")]
@@ -20,9 +20,6 @@ mod hostile_clients;
 mod observed_server;
 #[path = "../../campaigns/src/percentile.rs"]
 mod percentile;
-#[allow(dead_code, reason = "the campaign, of which this wants a part")]
-#[path = "../../campaigns/src/workers.rs"]
-pub(super) mod workers;
 
 use std::path::PathBuf;
 

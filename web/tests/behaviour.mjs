@@ -376,7 +376,7 @@ await check('the console shows rows of every table, integers of 64 bits to the l
   assert.ok(tables.length > 10, `${tables.length} tables`)
   for (const { name } of tables) {
     await open(`/sql?q=${encodeURIComponent(`select * from ${name} limit 3`)}`)
-    // No file waits in the inbox of this lake, and it has no workers: the page says so.
+    // No file waits in the inbox of this lake: the page says so.
     const empty = name.startsWith('system.') && (await sql(`select * from ${name} limit 1`)).length === 0
     await page
       .locator(empty ? '.none' : '.rows tbody tr')

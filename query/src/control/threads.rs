@@ -104,7 +104,7 @@ impl QueryThreadGroups {
 }
 
 impl ThreadGroup {
-    // Tasks are also connections to stores and workers, and what is left of ended work.
+    // Tasks are also connections to stores, and what is left of ended work.
     fn load(&self) -> (usize, usize) {
         let tasks = self.threads.handle().map_or(0, |threads| threads.metrics().num_alive_tasks());
         (Arc::strong_count(&self.work) - 1, tasks)

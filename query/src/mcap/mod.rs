@@ -4,7 +4,6 @@
 //! the planner then calls only hand it over.
 
 mod chunk;
-mod codec;
 mod column;
 mod contents;
 mod error;
@@ -23,7 +22,7 @@ mod schema;
 mod table;
 mod target;
 #[cfg(test)]
-pub(crate) mod tests;
+mod tests;
 mod topics;
 
 use std::collections::HashMap;
@@ -45,13 +44,11 @@ use echolake_schema::tables::Table;
 
 use crate::Error;
 use crate::syntax_walk::walk_mut;
-pub(crate) use codec::McapCodec;
 pub use contents::{Contents, Topic};
 pub(crate) use contents::{attachment, contents};
 use error::Fault;
 pub use file::Attachment;
 pub(crate) use file::Files;
-pub(crate) use scan::{McapExec, RunPiece};
 use target::Target;
 
 /// What one of the functions may be called with, for whoever calls it otherwise.

@@ -24,7 +24,6 @@ use echolake_recording::Record;
 use futures::stream::{self, BoxStream};
 use futures::{StreamExt as _, TryStreamExt as _};
 use object_store::ObjectStoreExt as _;
-use object_store::path::Path;
 
 use super::chunk::{PieceRecords, ReadProgress, ReadStep, ReadStop};
 use super::error::Fault;
@@ -54,40 +53,21 @@ pub(super) struct Scan {
 
 /// The plan of a scan.
 #[derive(Debug)]
-pub(crate) struct McapExec {
+pub(super) struct McapExec {
     scan: Arc<Scan>,
     partitions: Vec<Vec<FileRead>>,
-    /// Pieces that need not be read.
-    pruned: usize,
+    /// Pieces of all its files, also those that are not read.
+    all: usize,
     properties: Arc<PlanProperties>,
     metrics: ExecutionPlanMetricsSet,
 }
 
 /// Bytes of one file that are fetched at once, and the pieces in them.
 #[derive(Debug, Clone)]
-pub(super) struct FileRead {
-    pub(super) source: usize,
-    pub(super) range: Range<u64>,
-    pub(super) pieces: Vec<Piece>,
-}
-
-/// A part of a scan that can be read on its own.
-#[derive(Debug, Clone)]
-pub(crate) struct RunPiece {
-    path: Path,
-    read: FileRead,
-}
-
-impl RunPiece {
-    /// Returns the path of its file.
-    pub(crate) fn path(&self) -> &str {
-        self.path.as_ref()
-    }
-
-    /// Returns where it is in its file.
-    pub(crate) fn range(&self) -> &Range<u64> {
-        &self.read.range
-    }
+struct FileRead {
+    source: usize,
+    range: Range<u64>,
+    pieces: Vec<Piece>,
 }
 
 impl McapExec {
@@ -108,11 +88,6 @@ impl McapExec {
                 add(reads, source, piece);
             }
         }
-        Self::of_partitions(Arc::new(scan), partitions, all - count)
-    }
-
-    /// A plan of these partitions, which leave out so many pieces.
-    pub(super) fn of_partitions(scan: Arc<Scan>, partitions: Vec<Vec<FileRead>>, pruned: usize) -> Self {
         let properties = PlanProperties::new(
             EquivalenceProperties::new(scan.schema.clone()),
             Partitioning::UnknownPartitioning(partitions.len()),
@@ -121,39 +96,8 @@ impl McapExec {
         );
         let properties = Arc::new(properties.with_scheduling_type(SchedulingType::Cooperative));
         let metrics = ExecutionPlanMetricsSet::new();
-        MetricBuilder::new(&metrics).global_counter("chunks_pruned").add(pruned);
-        Self { scan, partitions, pruned, properties, metrics }
-    }
-
-    pub(super) fn scan(&self) -> &Scan {
-        &self.scan
-    }
-
-    pub(super) fn partitions(&self) -> &[Vec<FileRead>] {
-        &self.partitions
-    }
-
-    /// Returns the bytes that it fetches.
-    pub(crate) fn fetched_bytes(&self) -> u64 {
-        self.partitions.iter().flatten().map(|r| r.range.end - r.range.start).sum()
-    }
-
-    /// Returns true if it ends once it has enough rows.
-    pub(crate) fn is_limited(&self) -> bool {
-        self.scan.limit.is_some()
-    }
-
-    /// Returns the parts that it reads.
-    pub(crate) fn pieces(&self) -> Vec<RunPiece> {
-        let piece =
-            |read: &FileRead| RunPiece { path: self.scan.parts.sources[read.source].path.clone(), read: read.clone() };
-        self.partitions.iter().flatten().map(piece).collect()
-    }
-
-    /// Returns a plan that reads these parts of this one, in these partitions.
-    pub(crate) fn with_partitions(&self, partitions: Vec<Vec<RunPiece>>) -> Self {
-        let reads = |pieces: Vec<RunPiece>| pieces.into_iter().map(|piece| piece.read).collect();
-        Self::of_partitions(self.scan.clone(), partitions.into_iter().map(reads).collect(), self.pruned)
+        MetricBuilder::new(&metrics).global_counter("chunks_pruned").add(all - count);
+        Self { scan: Arc::new(scan), partitions, all, properties, metrics }
     }
 }
 
@@ -175,10 +119,10 @@ fn add(reads: &mut Vec<FileRead>, source: usize, piece: Piece) {
 impl DisplayAs for McapExec {
     fn fmt_as(&self, _: DisplayFormatType, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let chosen: usize = self.partitions.iter().flatten().map(|read| read.pieces.len()).sum();
-        let (all, bytes) = (chosen + self.pruned, self.fetched_bytes());
+        let bytes: u64 = self.partitions.iter().flatten().map(|read| read.range.end - read.range.start).sum();
         let (parts, fields) = (&self.scan.parts, self.scan.schema.fields());
         let columns: Vec<_> = fields.iter().map(|f| f.name().as_str()).collect();
-        write!(f, "McapExec: {}, files={}, chunks={chosen} of {all}", parts.name, parts.sources.len())?;
+        write!(f, "McapExec: {}, files={}, chunks={chosen} of {}", parts.name, parts.sources.len(), self.all)?;
         write!(f, ", bytes={bytes}, columns=[{}]", columns.join(", "))?;
         match self.scan.limit {
             Some(limit) => write!(f, ", limit={limit}"),

@@ -1,13 +1,12 @@
 //! Tables of the schema `system`: versions and files of the lake and how its runs came into it, all as the query's
-//! snapshot has them; run files that are not in it yet; those that the program around the engine has of itself
-//! ([`SystemSource`]), and its workers.
+//! snapshot has them; run files that are not in it yet; and those that the program around the engine has of
+//! itself ([`SystemSource`]).
 
 mod files;
 mod inbox;
 mod ingests;
 mod source;
 mod versions;
-mod workers;
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -31,9 +30,6 @@ use ingests::LakeIngests;
 use source::SourceRows;
 pub use source::SystemSource;
 use versions::LakeVersions;
-use workers::ClusterWorkers;
-
-use crate::WorkerCluster;
 
 /// The schema of the system tables.
 pub const SYSTEM_SCHEMA: &str = "system";
@@ -110,23 +106,18 @@ pub(crate) fn meaning(name: &str) -> Option<&'static str> {
         }
         "queries" => "One row per query of the server that runs, or ran lately: client, statement, times, outcome.",
         "connections" => "One row per open connection to the server: client, protocol, address.",
-        "workers" => "One row per worker over which heavy queries are spread: address, state, figures.",
         _ => return None,
     })
 }
 
-/// The tables of an engine's program: those of its source, and the workers of its cluster.
-pub(crate) fn engine_tables(
-    source: &Arc<dyn SystemSource>,
-    cluster: Option<&Arc<WorkerCluster>>,
-) -> Vec<(&'static str, Arc<dyn TableProvider>)> {
-    let table = |rows: Box<dyn SystemRows>| Arc::new(SystemTable(rows)) as Arc<dyn TableProvider>;
-    let of_source = source.tables().into_iter().map(|(name, schema)| {
+/// Returns the tables that the program around the engine has of itself.
+pub(crate) fn engine_tables(source: &Arc<dyn SystemSource>) -> Vec<(&'static str, Arc<dyn TableProvider>)> {
+    let mut tables = Vec::new();
+    for (name, schema) in source.tables() {
         let rows = SourceRows { source: source.clone(), name, schema };
-        (name, table(Box::new(rows)))
-    });
-    let workers = ClusterWorkers { cluster: cluster.cloned() };
-    of_source.chain([("workers", table(Box::new(workers)))]).collect()
+        tables.push((name, Arc::new(SystemTable(Box::new(rows))) as Arc<dyn TableProvider>));
+    }
+    tables
 }
 
 /// A column with its unit, empty if it has none, and its meaning.

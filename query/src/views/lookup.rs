@@ -52,11 +52,6 @@ impl LookupFunctions {
         self.0.iter().find(|function| function.name().strip_prefix(OF_PAIR) == Some(column))
     }
 
-    /// Returns all of them.
-    pub(crate) fn functions(&self) -> &[Arc<ScalarUDF>] {
-        &self.0
-    }
-
     pub(super) fn register(&self, context: &SessionContext) {
         for function in &self.0 {
             context.register_udf(function.as_ref().clone());

@@ -39,18 +39,6 @@ pub struct CertificateFiles {
 type FileStates = Vec<Option<(SystemTime, u64)>>;
 
 impl CertificateFiles {
-    /// Returns the folders that a process reads to take renewed files: those of the files, and of what they link to.
-    pub fn folders(&self) -> Vec<PathBuf> {
-        let files = [&self.certificate, &self.key];
-        let targets = files.into_iter().filter_map(|path| path.canonicalize().ok());
-        let all = files.into_iter().cloned().chain(targets);
-        let folder = |path: PathBuf| match path.parent() {
-            Some(parent) if !parent.as_os_str().is_empty() => parent.to_owned(),
-            _ => PathBuf::from("."),
-        };
-        all.map(folder).collect()
-    }
-
     fn states(&self) -> FileStates {
         let state = |path: &PathBuf| {
             let about = std::fs::metadata(path).ok()?;
@@ -85,7 +73,7 @@ fn read_certificates(path: &Path) -> Result<Vec<CertificateDer<'static>>, Error>
 }
 
 /// Encryption of a server.
-pub(crate) struct ServerEncryption {
+pub(super) struct ServerEncryption {
     files: CertificateFiles,
     loaded: Arc<CertifiedKey>,
     protocols: Vec<Arc<RwLock<ProtocolTls>>>,
@@ -96,7 +84,7 @@ impl ServerEncryption {
     ///
     /// # Errors
     /// [`Error::Certificate`].
-    pub(crate) fn new(files: CertificateFiles) -> Result<Self, Error> {
+    pub(super) fn new(files: CertificateFiles) -> Result<Self, Error> {
         Ok(Self { loaded: files.load()?, files, protocols: Vec::new() })
     }
 
@@ -104,7 +92,7 @@ impl ServerEncryption {
     ///
     /// # Errors
     /// [`Error::System`].
-    pub(crate) fn of_protocol(&mut self, names: &'static [&'static [u8]]) -> Result<ProtocolEncryption, Error> {
+    pub(super) fn of_protocol(&mut self, names: &'static [&'static [u8]]) -> Result<ProtocolEncryption, Error> {
         let tls = ProtocolTls::new(names, &self.loaded).map_err(|e| Error::System(io::Error::other(e)))?;
         let tls = Arc::new(RwLock::new(tls));
         self.protocols.push(tls.clone());
@@ -112,7 +100,7 @@ impl ServerEncryption {
     }
 
     /// Takes changed files for new connections; open ones keep what they began with. Never ends.
-    pub(crate) async fn keep_up(self) {
+    pub(super) async fn keep_up(self) {
         let mut known = self.files.states();
         loop {
             tokio::time::sleep(LOOK_EVERY).await;
@@ -162,7 +150,7 @@ impl ProtocolTls {
 
 /// Encryption of one protocol's connections, or none.
 #[derive(Clone, Default)]
-pub(crate) struct ProtocolEncryption(Option<Arc<RwLock<ProtocolTls>>>);
+pub(super) struct ProtocolEncryption(Option<Arc<RwLock<ProtocolTls>>>);
 
 impl ProtocolEncryption {
     /// Returns whether connections are encrypted.
@@ -170,8 +158,8 @@ impl ProtocolEncryption {
         self.0.is_some()
     }
 
-    /// Returns what shakes hands with the next client; None if connections are not encrypted.
-    pub(crate) fn acceptor(&self) -> Option<TlsAcceptor> {
+    // What shakes hands with the next client; None if connections are not encrypted.
+    fn acceptor(&self) -> Option<TlsAcceptor> {
         let tls = self.0.as_ref()?.read().unwrap_or_else(PoisonError::into_inner);
         Some(tls.acceptor.clone())
     }

@@ -25,7 +25,6 @@ use crate::engine::door_message::DoorMessage;
 use crate::engine::report::EngineReport;
 use crate::engine_socket::EngineSocket;
 use crate::metrics::ServerProtocol;
-use crate::worker::{EngineWorkers, WORKER_TOKEN_VARIABLE};
 
 /// Time for which a client has to ask nothing on its open connections and read nothing of its answers until its engine
 /// counts as idle. It is shorter than others wait for a place.
@@ -51,8 +50,6 @@ pub struct EngineSettings {
     pub slow: Option<Duration>,
     /// The folder in which they cache what they read of an object store.
     pub cache: Option<CacheFolder>,
-    /// Workers for heavy queries.
-    pub workers: Option<EngineWorkers>,
 }
 
 /// The reason for which an engine ended.
@@ -136,8 +133,6 @@ impl EngineProcess {
                 start.settings.slow.iter().flat_map(|slow| ["--log-slow-ms".to_owned(), slow.as_millis().to_string()]),
             )
             .args(start.settings.cache.iter().flat_map(cache_arguments))
-            .args(start.settings.workers.iter().flat_map(EngineWorkers::engine_arguments))
-            .envs(start.settings.workers.iter().filter_map(|w| Some((WORKER_TOKEN_VARIABLE, w.secret()?))))
             .envs(start.settings.environment.iter().map(|(name, value)| (name, value)))
             .env("TMPDIR", &start.spills)
             // Memory that is reserved and not used would count against the limit.
@@ -405,8 +400,6 @@ impl EngineReports {
             Ok(EngineReport::Failure(code)) => activity.metrics.failed(code),
             Ok(EngineReport::Lake(figures)) => activity.set_lake(figures),
             Ok(EngineReport::Cache(counts)) => activity.metrics.cached(&counts),
-            Ok(EngineReport::Spread(counts)) => activity.metrics.spread(&counts),
-            Ok(EngineReport::Workers(workers)) => activity.metrics.set_workers(&workers),
             Ok(EngineReport::Ask { number, table }) => {
                 let Some(client) = engine.client.get() else { return };
                 let message = DoorMessage::Rows { number, rows: activity.rows(table, client) };

@@ -34,7 +34,7 @@ use crate::token_access::TokenAccess;
 use crate::tokens::TokenFile;
 pub use agent::AgentDoor;
 pub use encryption::CertificateFiles;
-pub(crate) use encryption::{ProtocolEncryption, ServerEncryption};
+use encryption::{ProtocolEncryption, ServerEncryption};
 pub use engine_process::EngineSettings;
 use http_connection::HTTP_2;
 use server_door::ServerDoor;

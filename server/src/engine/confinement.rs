@@ -15,9 +15,6 @@ use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 const LANDLOCK: ABI = ABI::V5;
 /// The process's own figures, those of the processors, and random bytes.
 const SYSTEM: [&str; 4] = ["/proc", "/sys/fs/cgroup", "/sys/devices/system/cpu", "/dev/urandom"];
-/// Files with which names of other machines are looked up.
-const NAMES: [&str; 5] =
-    ["/etc/resolv.conf", "/etc/hosts", "/etc/nsswitch.conf", "/etc/host.conf", "/run/systemd/resolve"];
 /// Address space over what queries may hold, for a process that is running: stacks of threads that are still to come,
 /// caches, what the allocator keeps. The door looks at what is really used; this limit ends one huge allocation at once.
 const OVERHEAD_BYTES: u64 = 1 << 30;
@@ -36,56 +33,35 @@ pub fn missing() -> Option<&'static str> {
     )
 }
 
-/// Lets the process read `lake`, the files `trusted` and its own program, read and write `own` folders, and nothing else; connect over TCP
-/// to the ports of `workers` alone. To be called before there are threads. A kernel without Landlock leaves the process as it is.
+/// Lets the process read `lake` and its own program, read and write `own` folders, and nothing else, and connect to no other
+/// machine. To be called before there are threads. A kernel without Landlock leaves the process as it is.
 ///
 /// # Errors
 /// The system refuses.
-pub fn confine_files(lake: &Path, trusted: &[PathBuf], own: &[&Path], workers: &[u16]) -> io::Result<()> {
-    let mut readable = lake_folders(lake);
-    readable.extend_from_slice(trusted);
-    if !workers.is_empty() {
-        readable.extend(NAMES.map(PathBuf::from));
-    }
-    confine(&readable, own, Some(workers))
-}
-
-/// Confines a worker to files as an engine; it listens, and connects to other workers, wherever they are.
-///
-/// # Errors
-/// The system refuses.
-pub fn confine_worker(mut readable: Vec<PathBuf>, own: &[&Path]) -> io::Result<()> {
-    readable.extend(NAMES.map(PathBuf::from));
-    confine(&readable, own, None)
-}
-
-/// Returns the folders that a lake in a folder is in.
-pub fn lake_folders(lake: &Path) -> Vec<PathBuf> {
-    [lake.to_owned()].into_iter().chain(linked_folders(lake)).collect()
+pub fn confine_files(lake: &Path, own: &[&Path]) -> io::Result<()> {
+    let mut readable = linked_folders(lake);
+    readable.push(lake.to_owned());
+    confine(&readable, own, &[])
 }
 
 /// Lets the process read what it needs to reach the lake's object store, read and write `own` folders, and nothing else;
-/// connect over TCP to the ports of the store and of `workers` alone. Otherwise as [`confine_files`].
+/// connect over TCP to the store's ports alone. Otherwise as [`confine_files`].
 ///
 /// # Errors
 /// The system refuses.
-pub fn confine_to_store(store: &RemoteAccess, own: &[&Path], workers: &[u16]) -> io::Result<()> {
-    confine(&store.files, own, Some(&[&store.ports, workers].concat()))
+pub fn confine_to_store(store: &RemoteAccess, own: &[&Path]) -> io::Result<()> {
+    confine(&store.files, own, &store.ports)
 }
 
-// Without ports, the network is left as it is.
-fn confine(readable: &[PathBuf], own: &[&Path], ports: Option<&[u16]>) -> io::Result<()> {
-    let connections = ports.unwrap_or(&[]).iter();
-    let connections = connections.map(|port| Ok::<_, RulesetError>(NetPort::new(*port, AccessNet::ConnectTcp)));
-    // A worker takes its checksum, and the place of a panic in the log has the names of its functions.
+fn confine(readable: &[PathBuf], own: &[&Path], ports: &[u16]) -> io::Result<()> {
+    let connections = ports.iter().map(|port| Ok::<_, RulesetError>(NetPort::new(*port, AccessNet::ConnectTcp)));
+    // The place of a panic in the log has the names of its functions.
     let program = std::env::current_exe();
     let ruleset = || -> Result<RulesetCreated, RulesetError> {
         let read = AccessFs::from_read(LANDLOCK) & !AccessFs::Execute;
-        let mut handled = Ruleset::default().handle_access(AccessFs::from_all(LANDLOCK))?;
-        if ports.is_some() {
-            handled = handled.handle_access(AccessNet::from_all(LANDLOCK))?;
-        }
-        handled
+        Ruleset::default()
+            .handle_access(AccessFs::from_all(LANDLOCK))?
+            .handle_access(AccessNet::from_all(LANDLOCK))?
             .create()?
             .add_rules(path_beneath_rules(readable, read))?
             .add_rules(path_beneath_rules(SYSTEM, read))?

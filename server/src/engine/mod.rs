@@ -23,7 +23,6 @@ use crate::activity::LakeFigures;
 use crate::client_identity::ClientIdentity;
 use crate::engine_socket::EngineSocket;
 use crate::service::QueryService;
-use crate::worker::EngineWorkers;
 use crate::{Error, flight, http, postgres};
 use door_message::DoorMessage;
 use report::EngineReport;
@@ -41,8 +40,6 @@ pub struct EngineRun {
     pub memory: Option<usize>,
     /// Time from which a query is logged as slow; None for never.
     pub slow: Option<Duration>,
-    /// Workers for heavy queries.
-    pub workers: Option<EngineWorkers>,
 }
 
 /// Answers one client's requests until standard input ends, which the door holds.
@@ -59,12 +56,6 @@ pub async fn run_engine(lake: &Lake, sockets: &Path, settings: EngineRun) -> Res
     let flight_sql = EngineSocket::FlightSql.listen(sockets)?;
     let postgres = EngineSocket::Postgres.listen(sockets)?;
     let engine = QueryEngine::new(lake, EngineLimits { memory, temp: None })?;
-    if let Some(workers) = settings.workers {
-        match workers.cluster(lake).await {
-            Ok(cluster) => engine.spread_over(Arc::new(cluster)),
-            Err(e) => tracing::warn!(error = &e as &dyn std::error::Error, "queries run without workers"),
-        }
-    }
     warm_up(&engine).await?;
     EngineReport::Ready.send();
     let identity = tokio::select! {

@@ -4,7 +4,6 @@ use std::io::Write as _;
 use std::sync::{Mutex, PoisonError};
 
 use echolake_lake::CacheCounts;
-use echolake_query::{SpreadCounts, WorkerStatus};
 use serde::{Deserialize, Serialize};
 
 use crate::activity::{ActivityTable, LakeFigures, QueryEnd, QueryStart};
@@ -28,10 +27,6 @@ pub(crate) enum EngineReport {
     Lake(Option<LakeFigures>),
     /// Counts of its cache of an object store since the last such line.
     Cache(CacheCounts),
-    /// Queries over workers since the last such line.
-    Spread(SpreadCounts),
-    /// The workers, as they were when it asked them.
-    Workers(Vec<WorkerStatus>),
     /// It asks for its client's rows of a table of the server's activity.
     Ask {
         /// Number of the answer.

@@ -4,7 +4,6 @@
 use std::time::{Duration, Instant};
 
 use echolake_lake::CacheCounts;
-use echolake_query::{SpreadCounts, WorkerCluster, WorkerStatus};
 use rustix::time::{ClockId, clock_gettime};
 
 use super::report::EngineReport;
@@ -30,7 +29,6 @@ pub(super) fn start(service: &QueryService) -> std::io::Result<()> {
 fn watch(service: &QueryService) {
     let mut idle = IdleWork::default();
     let mut cached = CacheCounts::default();
-    let mut spread = ReportedCluster::default();
     loop {
         std::thread::sleep(INTERVAL);
         EngineReport::send_queued();
@@ -45,30 +43,6 @@ fn watch(service: &QueryService) {
         {
             EngineReport::Cache(counts.since(&cached)).send();
             cached = counts;
-        }
-        if let Some(cluster) = service.engine().cluster() {
-            spread.report(cluster);
-        }
-    }
-}
-
-/// The door's knowledge of workers.
-#[derive(Default)]
-struct ReportedCluster {
-    counts: SpreadCounts,
-    workers: Vec<WorkerStatus>,
-}
-
-impl ReportedCluster {
-    fn report(&mut self, cluster: &WorkerCluster) {
-        let (counts, workers) = (cluster.counts(), cluster.workers());
-        if counts != self.counts {
-            EngineReport::Spread(counts.since(&self.counts)).send();
-            self.counts = counts;
-        }
-        if workers != self.workers {
-            EngineReport::Workers(workers.clone()).send();
-            self.workers = workers;
         }
     }
 }

@@ -30,7 +30,7 @@ fn grpc(code: FaultCode) -> Grpc {
         FaultCode::Query | FaultCode::Request | FaultCode::Format | FaultCode::Method => Grpc::InvalidArgument,
         FaultCode::ReadOnly | FaultCode::Forbidden | FaultCode::Foreign => Grpc::PermissionDenied,
         FaultCode::Execution | FaultCode::Changed | FaultCode::Precondition => Grpc::FailedPrecondition,
-        FaultCode::Lake | FaultCode::Stopping | FaultCode::NotReady | FaultCode::WorkerLost => Grpc::Unavailable,
+        FaultCode::Lake | FaultCode::Stopping | FaultCode::NotReady => Grpc::Unavailable,
         FaultCode::Unsupported => Grpc::Unimplemented,
         FaultCode::NotFound | FaultCode::Gone | FaultCode::NoData => Grpc::NotFound,
         FaultCode::Range => Grpc::OutOfRange,

@@ -9,8 +9,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use chrono::Utc;
-use echolake_query::is_loopback_url;
-use url::Url;
+use url::{Host, Url};
 
 use crate::Error;
 use provider_keys::ProviderKeys;
@@ -155,6 +154,16 @@ fn check_address(address: &str) -> Result<Url, String> {
         "https" => Ok(url),
         "http" if is_loopback_url(&url) => Ok(url),
         other => Err(format!("it is {other}, expected https")),
+    }
+}
+
+// Whether it is of this machine, whatever a resolver says.
+fn is_loopback_url(url: &Url) -> bool {
+    match url.host() {
+        Some(Host::Ipv4(address)) => address.is_loopback(),
+        Some(Host::Ipv6(address)) => address.is_loopback(),
+        Some(Host::Domain(name)) => name == "localhost",
+        None => false,
     }
 }
 

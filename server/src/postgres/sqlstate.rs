@@ -37,7 +37,7 @@ fn state(fault: &RequestFault) -> &'static str {
             FaultCode::ReadOnly => "25006",
             FaultCode::Execution => "22000",
             FaultCode::Format => "0A000",
-            FaultCode::Lake | FaultCode::Changed | FaultCode::WorkerLost => "58030",
+            FaultCode::Lake | FaultCode::Changed => "58030",
             FaultCode::Request | FaultCode::Method | FaultCode::Range | FaultCode::Precondition => "22023",
             FaultCode::Unsupported => "0A000",
             FaultCode::NotFound | FaultCode::Gone | FaultCode::NoData => "42704",
