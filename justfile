@@ -55,10 +55,6 @@ fuzz TARGET *OPTIONS:
 bench NAME *OPTIONS:
     {{ if NAME == "kernels" { "cargo bench --manifest-path campaigns/kernels/Cargo.toml --locked --" } else { "cargo run --profile dist --locked -p echolake-campaigns -- " + NAME } }} {{ OPTIONS }}
 
-# A server with so many workers on this machine, on the lake of $ECHOLAKE_LAKE or ./lake; all end with Ctrl-C.
-cluster WORKERS="4" *OPTIONS:
-    packaging/cluster.sh {{ WORKERS }} {{ OPTIONS }}
-
 # What a change must pass.
 ci:
     .ci/run
