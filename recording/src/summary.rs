@@ -212,7 +212,7 @@ fn indexed_messages(chunk: &ChunkIndex) -> Option<u64> {
 #[derive(Debug, Default, Clone, PartialEq, Eq)]
 pub struct DefinitionDigests {
     /// By the opcode of a schema or channel, and its id.
-    pub by_id: BTreeMap<(u8, u16), u32>,
+    by_id: BTreeMap<(u8, u16), u32>,
 }
 
 impl DefinitionDigests {

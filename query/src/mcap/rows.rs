@@ -11,7 +11,7 @@ use echolake_recording::MessageHeader;
 
 use super::column::{Column, time_type};
 use super::error::Malformed;
-use super::schema::{Decoder, Layout, RawSchema};
+use super::schema::{Decoder, Layout};
 
 /// Bytes that the rows of a batch take, roughly; a batch of whole sweeps has a few rows.
 const BATCH_BYTES: usize = 8 << 20;
@@ -73,8 +73,6 @@ pub(super) struct Message<'a> {
 /// A schema of some files, and where the table's own columns are in it.
 #[derive(Debug, Clone)]
 pub(super) struct Mapping {
-    /// The schema as it stands in the files.
-    pub(super) schema: Arc<RawSchema>,
     pub(super) layout: Arc<Layout>,
     /// For each column of the messages in the table, its place in the layout.
     pub(super) columns: Vec<Option<usize>>,

@@ -200,7 +200,7 @@ fn fetch(
     let one = move |read: FileRead| {
         let (parts, bytes_read) = (parts.clone(), bytes_read.clone());
         async move {
-            let path = &parts.sources[read.source].path;
+            let path = &parts.sources[read.source].file.path;
             let failed = |source| Fault::Read { file: path.to_string(), source };
             let bytes = parts.files.store.get_range(path, read.range.clone()).await.map_err(failed)?;
             bytes_read.add(bytes.len());
@@ -304,14 +304,15 @@ impl Scanner {
         let offset = current.offset;
         let mut sink = |record: Record<'_>| {
             let Record::Message { header, data } = &record else {
-                let checked = source.digests.check(&record).map(|()| ReadStep::Continue);
-                return checked.map_err(|what| Fault::Damaged { file: source.path.to_string(), offset, what }.into());
+                let checked = source.file.digests.check(&record).map(|()| ReadStep::Continue);
+                return checked
+                    .map_err(|what| Fault::Damaged { file: source.file.path.to_string(), offset, what }.into());
             };
             let Some((topic, mapping)) = source.channels.get(&header.channel_id) else {
-                if source.described.contains(&header.channel_id) {
+                if source.file.channels.contains_key(&header.channel_id) {
                     return Ok(ReadStep::Continue);
                 }
-                let (file, what) = (source.path.to_string(), undescribed(header.channel_id));
+                let (file, what) = (source.file.path.to_string(), undescribed(header.channel_id));
                 return Err(Fault::Damaged { file, offset, what }.into());
             };
             let within =
@@ -322,7 +323,7 @@ impl Scanner {
             let message = Message { run: source.run.as_ref(), topic, header, data };
             let mapping = parts.mappings.as_ref().map(|all| (*mapping, &all[*mapping]));
             let ready = rows.push(&message, mapping)?.map_err(|what| Fault::Message {
-                file: source.path.to_string(),
+                file: source.file.path.to_string(),
                 topic: topic.clone(),
                 sequence: header.sequence,
                 offset,
@@ -348,6 +349,6 @@ impl Scanner {
     }
 
     fn damaged(&self, source: usize, offset: u64, what: String) -> Fault {
-        Fault::Damaged { file: self.scan.parts.sources[source].path.to_string(), offset, what }
+        Fault::Damaged { file: self.scan.parts.sources[source].file.path.to_string(), offset, what }
     }
 }

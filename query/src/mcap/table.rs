@@ -13,10 +13,8 @@ use datafusion::datasource::TableType;
 use datafusion::error::Result;
 use datafusion::logical_expr::{BinaryExpr, Expr, Operator, TableProviderFilterPushDown};
 use datafusion::physical_plan::ExecutionPlan;
-use echolake_recording::DefinitionDigests;
 use futures::FutureExt as _;
 use futures::future::ready;
-use object_store::path::Path;
 
 use super::error::Fault;
 use super::file::{Channel, Files, McapFile, Piece};
@@ -29,7 +27,7 @@ use crate::boxed_scan::boxed_scan;
 /// Topics that a hint lists.
 const LISTED: usize = 20;
 /// Largest schema that is looked into, in bytes; the descriptors of all messages of a large robot are a tenth of it.
-pub(super) const LARGEST_SCHEMA: usize = 4 << 20;
+const LARGEST_SCHEMA: usize = 4 << 20;
 /// What a column of a message is called where one in front of it has its name already.
 const PREFIX: &str = "message_";
 
@@ -38,8 +36,6 @@ const PREFIX: &str = "message_";
 pub(super) struct McapTable {
     schema: SchemaRef,
     parts: Arc<Parts>,
-    /// The files of its sources, in their order.
-    files: Vec<Arc<McapFile>>,
 }
 
 /// What all partitions of all scans of a table share.
@@ -58,11 +54,7 @@ pub(super) struct Parts {
 #[derive(Debug)]
 pub(super) struct Source {
     pub(super) run: Option<(String, String)>,
-    pub(super) path: Path,
-    /// All channels that its file describes.
-    pub(super) described: BTreeSet<u16>,
-    /// Those of its summary.
-    pub(super) digests: DefinitionDigests,
+    pub(super) file: Arc<McapFile>,
     /// The channels that are meant: topic, and which mapping they have.
     pub(super) channels: BTreeMap<u16, (String, usize)>,
 }
@@ -80,17 +72,15 @@ pub(super) fn columns(targets: Vec<Target>, topic: &str, files: &Arc<Files>) -> 
     let source = |target: &Target| {
         let mapped =
             |(id, channel): (u16, Channel)| Some((id, (topic.to_owned(), *layouts.known.get(&channel.schema)?)));
-        Source::new(target, channels_of(target).into_iter().filter_map(mapped).collect())
+        let channels = channels_of(target).into_iter().filter_map(mapped).collect();
+        Source { run: target.run.clone(), file: target.file.clone(), channels }
     };
     let sources = targets.iter().map(source).collect();
     let heads = Head::OF_COLUMNS.to_vec();
     let (schema, mappings) = layouts.table(&heads, topic)?;
     let name = format!("topic={topic}");
-    Ok(McapTable {
-        schema,
-        parts: Arc::new(Parts { name, files: files.clone(), heads, sources, mappings: Some(mappings) }),
-        files: targets.into_iter().map(|target| target.file).collect(),
-    })
+    let parts = Parts { name, files: files.clone(), heads, sources, mappings: Some(mappings) };
+    Ok(McapTable { schema, parts: Arc::new(parts) })
 }
 
 /// The table of messages as they are, of one topic or of all.
@@ -99,19 +89,17 @@ pub(super) fn messages(targets: Vec<Target>, topic: Option<&str>, files: &Arc<Fi
     if let Some(topic) = topic.filter(|_| !targets.iter().any(known)) {
         return Err(no_topic(&targets, topic));
     }
-    let source = |target: &Target| {
+    let source = |target: Target| {
         let meant = target.file.channels.iter().filter(|(_, c)| topic.is_none_or(|topic| c.topic == topic));
-        Source::new(target, meant.map(|(id, c)| (*id, (c.topic.clone(), 0))).collect())
+        let channels = meant.map(|(id, c)| (*id, (c.topic.clone(), 0))).collect();
+        Source { run: target.run, file: target.file, channels }
     };
     let heads = Head::OF_MESSAGES.to_vec();
     let schema = Arc::new(Schema::new(heads.iter().map(|h| h.field()).collect::<Vec<_>>()));
     let name = topic.map_or_else(|| "all topics".to_owned(), |topic| format!("topic={topic}"));
-    let sources = targets.iter().map(source).collect();
-    Ok(McapTable {
-        schema,
-        parts: Arc::new(Parts { name, files: files.clone(), heads, sources, mappings: None }),
-        files: targets.into_iter().map(|target| target.file).collect(),
-    })
+    let sources = targets.into_iter().map(source).collect();
+    let parts = Parts { name, files: files.clone(), heads, sources, mappings: None };
+    Ok(McapTable { schema, parts: Arc::new(parts) })
 }
 
 fn no_topic(targets: &[Target], topic: &str) -> Fault {
@@ -132,10 +120,9 @@ struct Layouts {
     all: Vec<SchemaLayout>,
 }
 
-/// A schema with its first file.
+/// The layout of a schema, and the first file that has it.
 struct SchemaLayout {
     file: String,
-    schema: Arc<RawSchema>,
     layout: Arc<Layout>,
 }
 
@@ -187,7 +174,7 @@ impl Layouts {
 
     fn add(&mut self, file: &McapFile, schema: &Arc<RawSchema>, layout: Layout) {
         self.known.insert(schema.clone(), self.all.len());
-        self.all.push(SchemaLayout { file: file.path.to_string(), schema: schema.clone(), layout: Arc::new(layout) });
+        self.all.push(SchemaLayout { file: file.path.to_string(), layout: Arc::new(layout) });
     }
 
     // Whether no column has another type than one of its name in the others.
@@ -206,7 +193,7 @@ impl Layouts {
         let own_names: BTreeSet<String> =
             self.all.iter().flat_map(|one| one.layout.fields.iter().map(|f| f.name().clone())).collect();
         let mut places: Vec<HashMap<usize, usize>> = Vec::new();
-        for SchemaLayout { file, layout, .. } in &self.all {
+        for SchemaLayout { file, layout } in &self.all {
             let mut of = HashMap::new();
             for (i, field) in layout.fields.iter().enumerate() {
                 let mut name = field.name().clone();
@@ -237,7 +224,6 @@ impl Layouts {
         }
         let own = fields.len() - heads.len();
         let mapping = |(one, of): (SchemaLayout, HashMap<usize, usize>)| Mapping {
-            schema: one.schema,
             layout: one.layout,
             columns: (0..own).map(|i| of.get(&i).copied()).collect(),
         };
@@ -254,24 +240,14 @@ fn layout_of(file: &McapFile, topic: &str, schema: &RawSchema) -> Result<Layout,
 }
 
 impl Source {
-    fn new(target: &Target, channels: BTreeMap<u16, (String, usize)>) -> Self {
-        let described = target.file.channels.keys().copied().collect();
-        let (run, path, digests) = (target.run.clone(), target.file.path.clone(), target.file.digests.clone());
-        Self { run, path, described, digests, channels }
-    }
-
-    // The pieces of its file that may have messages of the channels in the time.
-    fn pieces<'a>(
-        &'a self,
-        file: &'a McapFile,
-        times: Option<&'a RangeInclusive<i64>>,
-    ) -> impl Iterator<Item = &'a Piece> {
+    // The pieces that may have messages of the channels in the time.
+    fn pieces<'a>(&'a self, times: Option<&'a RangeInclusive<i64>>) -> impl Iterator<Item = &'a Piece> {
         let nanos = |time: u64| i64::try_from(time).unwrap_or(i64::MAX);
         let within = move |p: &&Piece| {
             times.is_none_or(|times| nanos(p.times.1) >= *times.start() && nanos(p.times.0) <= *times.end())
         };
         let meant = |p: &&Piece| self.channels.keys().any(|channel| p.has(*channel));
-        file.pieces.iter().filter(within).filter(meant)
+        self.file.pieces.iter().filter(within).filter(meant)
     }
 }
 
@@ -305,11 +281,11 @@ impl McapTable {
     ) -> Result<Arc<dyn ExecutionPlan>> {
         let times = filters.iter().filter_map(times_of).reduce(both);
         let shown = self.runs(filters.iter().filter(|f| is_of_runs(f)), state)?;
-        let all = self.files.iter().map(|file| file.pieces.len()).sum();
-        let files = self.parts.sources.iter().zip(&self.files).enumerate().filter(|(i, _)| shown[*i]);
-        let pieces = files
-            .flat_map(|(i, (source, file))| source.pieces(file, times.as_ref()).map(move |piece| (i, piece.clone())))
-            .collect();
+        let sources = &self.parts.sources;
+        let all = sources.iter().map(|source| source.file.pieces.len()).sum();
+        let pieces = sources.iter().enumerate().filter(|(i, _)| shown[*i]);
+        let pieces =
+            pieces.flat_map(|(i, source)| source.pieces(times.as_ref()).map(move |piece| (i, piece.clone()))).collect();
         let projection = projection.cloned().unwrap_or_else(|| (0..self.schema.fields().len()).collect());
         let schema = Arc::new(self.schema.project(&projection)?);
         let scan = Scan { parts: self.parts.clone(), schema, projection, times, limit };

@@ -13,7 +13,7 @@ use super::file::{Files, McapFile};
 /// Files that are opened at once.
 const OPENED_AT_ONCE: usize = 16;
 /// The end of a run file's name.
-pub(super) const EXTENSION: &str = ".mcap";
+const EXTENSION: &str = ".mcap";
 const FORMS: &str = "a surface (`0015_0`), a run, either with * and ?, or a file in the lake (`inbox/x.mcap`); \
                      several with commas between them";
 
