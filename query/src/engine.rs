@@ -1,7 +1,6 @@
 //! The engine: the lake, cached file footers, memory and limits that all sessions of a process share.
 
 use std::collections::BTreeSet;
-use std::path::PathBuf;
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
@@ -9,7 +8,7 @@ use datafusion::catalog::{CatalogProvider as _, CatalogProviderList as _, TableP
 use datafusion::catalog::{MemoryCatalogProvider, MemoryCatalogProviderList, MemorySchemaProvider};
 use datafusion::error::DataFusionError;
 use datafusion::execution::FunctionRegistry as _;
-use datafusion::execution::disk_manager::{DiskManagerBuilder, DiskManagerMode};
+use datafusion::execution::disk_manager::DiskManagerBuilder;
 use datafusion::execution::memory_pool::{GreedyMemoryPool, MemoryPool};
 use datafusion::execution::object_store::{DefaultObjectStoreRegistry, ObjectStoreRegistry as _, ObjectStoreUrl};
 use datafusion::execution::runtime_env::{RuntimeEnv, RuntimeEnvBuilder};
@@ -53,12 +52,12 @@ const SPILL_BYTES: u64 = 16 << 30;
 /// use std::sync::Arc;
 ///
 /// use echolake_lake::{Lake, ReferenceSurfaces};
-/// use echolake_query::{EngineClient, EngineLimits, Error, QueryEngine, QueryQuota};
+/// use echolake_query::{EngineClient, Error, QueryEngine, QueryQuota};
 /// use echolake_schema::Rig;
 ///
 /// # tokio::runtime::Runtime::new()?.block_on(async {
 /// let lake = Lake::open_or_create("memory://", &Rig::paper(), &ReferenceSurfaces::default()).await?;
-/// let engine = QueryEngine::new(&lake, EngineLimits::default())?;
+/// let engine = QueryEngine::new(&lake, None)?;
 /// let client = EngineClient::new("guest", QueryQuota { rows: Some(1), ..QueryQuota::default() });
 /// let mut answer = engine.session(&Arc::new(client)).query("select * from points").await?;
 /// assert!(matches!(answer.next().await, Err(Error::RowLimit { limit: 1 })));
@@ -74,21 +73,13 @@ struct EngineState {
     catalog: LakeCatalog,
     threads: QueryThreadGroups,
     running: RunningQueries,
-    limits: EngineLimits,
+    /// Bytes that queries may hold; None for no limit.
+    memory: Option<usize>,
     /// Names of echolake's own functions.
     own: BTreeSet<String>,
     // A thread for timeouts, which busy query threads cannot delay.
     watch: QueryThreads,
     system: OnceLock<Arc<dyn SystemSource>>,
-}
-
-/// Limits on all queries of a process together.
-#[derive(Debug, Clone, Default)]
-pub struct EngineLimits {
-    /// Bytes that queries may hold; None for no limit.
-    pub memory: Option<usize>,
-    /// The folder for sorts that do not fit; None for the system's.
-    pub temp: Option<PathBuf>,
 }
 
 /// A function that queries may call.
@@ -207,14 +198,14 @@ pub struct QueryQuota {
 }
 
 impl QueryEngine {
-    /// Creates an engine on a lake.
+    /// Creates an engine on a lake, all of whose queries together may hold `memory` bytes; None for no limit.
     ///
     /// # Errors
     /// [`Error::Execution`] if DataFusion cannot be set up.
-    pub fn new(lake: &Lake, limits: EngineLimits) -> Result<Self, Error> {
+    pub fn new(lake: &Lake, memory: Option<usize>) -> Result<Self, Error> {
         let failed = |e: DataFusionError| Error::execution(&e);
         let url = ObjectStoreUrl::parse(STORE).map_err(failed)?;
-        let runtime = runtime(lake, &url, &limits).map_err(failed)?;
+        let runtime = runtime(lake, &url, memory).map_err(failed)?;
         let metadata = runtime.cache_manager.get_file_metadata_cache();
         let reader = Arc::new(LakeReaderFactory::new(lake, metadata));
         let functions = FunctionSet::all(lake.rig()).map_err(|e| Error::Execution { message: e.to_string() })?;
@@ -228,7 +219,7 @@ impl QueryEngine {
             catalog,
             threads: QueryThreadGroups::per_core("query").map_err(threads)?,
             running: RunningQueries::default(),
-            limits,
+            memory,
             own: functions.names().map(str::to_owned).collect(),
             watch: QueryThreads::new("query-watch", 1).map_err(threads)?,
             system: OnceLock::new(),
@@ -356,7 +347,7 @@ impl QueryEngine {
 
     /// Returns the memory limit of one query, bytes; `usize::MAX` if there is none.
     pub(crate) fn memory(&self, quota: &QueryQuota) -> usize {
-        self.0.limits.memory.into_iter().chain(quota.memory).min().unwrap_or(usize::MAX)
+        self.0.memory.into_iter().chain(quota.memory).min().unwrap_or(usize::MAX)
     }
 
     /// Returns the state from which all contexts are built: without tables, with the same parser options.
@@ -413,20 +404,16 @@ fn config() -> SessionConfig {
     config
 }
 
-fn runtime(lake: &Lake, url: &ObjectStoreUrl, limits: &EngineLimits) -> Result<Arc<RuntimeEnv>, DataFusionError> {
+fn runtime(lake: &Lake, url: &ObjectStoreUrl, memory: Option<usize>) -> Result<Arc<RuntimeEnv>, DataFusionError> {
     let stores = DefaultObjectStoreRegistry::new();
     stores.deregister_store(ObjectStoreUrl::parse(MACHINE)?.as_ref())?;
     stores.register_store(url.as_ref(), lake.store());
     let mut builder = RuntimeEnvBuilder::new();
-    if let Some(memory) = limits.memory {
+    if let Some(memory) = memory {
         builder = builder.with_memory_pool(Arc::new(GreedyMemoryPool::new(memory)));
     }
-    let mut disk = DiskManagerBuilder::default().with_max_temp_directory_size(SPILL_BYTES);
-    if let Some(folder) = &limits.temp {
-        disk.set_mode(DiskManagerMode::Directories(vec![folder.clone()]));
-    }
     builder
-        .with_disk_manager_builder(disk)
+        .with_disk_manager_builder(DiskManagerBuilder::default().with_max_temp_directory_size(SPILL_BYTES))
         .with_object_store_registry(Arc::new(stores))
         .with_metadata_cache_limit(METADATA_BYTES)
         .build_arc()
@@ -468,7 +455,7 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         let url = folder.path().join("lake").display().to_string();
         let lake = Lake::open_or_create(&url, &Rig::paper(), &ReferenceSurfaces::default()).await.expect("a lake");
-        let engine = QueryEngine::new(&lake, EngineLimits::default()).expect("an engine");
+        let engine = QueryEngine::new(&lake, None).expect("an engine");
         let tasks = engine.0.watch.handle().expect("threads").metrics();
         let before = tasks.num_alive_tasks();
         let tickets: Vec<_> = (0..100).map(|_| engine.ticket(Some(Duration::from_secs(3600)))).collect();

@@ -54,7 +54,7 @@ mod table;
 mod views;
 
 pub use control::threads::QueryThreads;
-pub use engine::{EngineClient, EngineLimits, QueryEngine, QueryPermit, QueryQuota, SqlFunction};
+pub use engine::{EngineClient, QueryEngine, QueryPermit, QueryQuota, SqlFunction};
 pub use error::{Error, QueryPlace};
 pub use functions::FunctionSet;
 #[cfg(fuzzing)]

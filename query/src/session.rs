@@ -26,7 +26,7 @@ use tokio::task::JoinHandle;
 use crate::control::pool::PartialPool;
 use crate::control::{QueryTicket, StopReason};
 use crate::dialect::LakeDialect;
-use crate::engine::{self, EngineClient, EngineLimits, QueryEngine, QueryPermit, QueryQuota, SqlFunction};
+use crate::engine::{self, EngineClient, QueryEngine, QueryPermit, QueryQuota, SqlFunction};
 use crate::mcap::Contents;
 use crate::statement_bounds::check_statement_bounds;
 use crate::system::SYSTEM_SCHEMA;
@@ -167,7 +167,7 @@ impl Session {
     /// [`Error::Execution`] if DataFusion cannot be set up.
     pub fn new(lake: &Lake) -> Result<Self, Error> {
         let client = EngineClient::new("local", QueryQuota::default());
-        Ok(QueryEngine::new(lake, EngineLimits::default())?.session(&Arc::new(client)))
+        Ok(QueryEngine::new(lake, None)?.session(&Arc::new(client)))
     }
 
     pub(crate) fn of(engine: QueryEngine, client: Arc<EngineClient>) -> Self {

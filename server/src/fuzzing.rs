@@ -4,7 +4,7 @@
 use std::path::Path;
 
 use echolake_lake::Lake;
-use echolake_query::{EngineLimits, QueryEngine};
+use echolake_query::QueryEngine;
 
 use crate::client_identity::ClientIdentity;
 use crate::engine_socket::EngineSocket;
@@ -20,7 +20,7 @@ const QUERY_ROWS: u64 = 10_000;
 /// # Errors
 /// [`Error::System`], [`Error::Query`], [`Error::Transport`].
 pub async fn serve_engine(lake: &Lake, sockets: &Path, memory: usize) -> Result<(), Error> {
-    let engine = QueryEngine::new(lake, EngineLimits { memory: Some(memory), temp: None })?;
+    let engine = QueryEngine::new(lake, Some(memory))?;
     let mut identity = ClientIdentity::programs();
     identity.seconds = Some(QUERY_SECONDS);
     identity.rows = Some(QUERY_ROWS);

@@ -12,7 +12,7 @@ use anyhow::Context as _;
 use echolake_lake::{Lake, remote_access};
 use echolake_schema::ProjectName;
 use echolake_server::certificate::self_signed;
-use echolake_server::engine::{EngineRun, confinement, run_engine};
+use echolake_server::engine::{confinement, run_engine};
 use echolake_server::tokens::{self, TokenFile, TokenScope};
 use echolake_server::{
     CataloguePages, CertificateFiles, EngineSettings, Error, LakeServer, OidcSettings, ServerSettings,
@@ -148,8 +148,7 @@ pub(crate) async fn engine(args: &EngineArgs, lake_url: &str) -> anyhow::Result<
     let _ignored = signal(SignalKind::terminate()).context("cannot listen to SIGTERM")?;
     let lake = args.cache.open_lake(lake_url).await?;
     let slow = args.log_slow_ms.map(Duration::from_millis);
-    let run = EngineRun { memory: Some(args.memory_bytes), slow };
-    run_engine(&lake, &args.sockets, run).await?;
+    run_engine(&lake, &args.sockets, args.memory_bytes, slow).await?;
     Ok(CommandOutcome::Whole)
 }
 

@@ -225,7 +225,7 @@ impl Lake {
             let failed = |source| Error::CacheFolder { folder: folder.path.clone(), source };
             folder.create().map_err(failed)?;
             // A lake without tables has nothing to cache yet.
-            let id = self.id().await?;
+            let id = self.0.log.table_id(Table::Runs).await?;
             blocks = id.map(|id| BlockFolder::open(folder, &id)).transpose().map_err(failed)?;
         }
         let cached = CachedStore::new(self.store(), Arc::new(BlockCache::new(blocks)));
@@ -273,15 +273,6 @@ impl Lake {
     #[cfg(feature = "tables")]
     pub fn is_restricted(&self) -> bool {
         self.0.projects.is_some()
-    }
-
-    /// Returns what tells this lake from all others: the random id of its table of runs; None if it has no tables yet.
-    ///
-    /// # Errors
-    /// What the store says.
-    #[cfg(feature = "tables")]
-    pub async fn id(&self) -> Result<Option<String>> {
-        self.0.log.table_id(Table::Runs).await
     }
 
     /// Returns what the cache has counted since it was made; None if there is no cache.

@@ -170,12 +170,11 @@ class Bucket:
 class Proxy:
     """The proxy that harms requests, as a process."""
 
-    def __init__(self, upstream, port, seed, faults=(), latency=None, rate=None):
+    def __init__(self, upstream, port, seed, faults=(), latency=None):
         self.port, self.url = port, f"http://127.0.0.1:{port}"
         command = [sys.executable, str(HERE / "s3_fault_proxy.py"), "--listen", str(port), "--upstream", upstream]
         command += ["--seed", str(seed)] + [part for fault in faults for part in ("--fault", fault)]
         command += ["--latency", latency] if latency else []
-        command += ["--rate", str(rate)] if rate else []
         self.process = subprocess.Popen(command, stdout=subprocess.PIPE)
         require(self.process.stdout.readline(), f"the proxy does not listen on port {port}")
 

@@ -18,11 +18,11 @@ const ENDLESS: &str = "with recursive r as (select 1 n union all select n + 1 fr
 const BARREN: &str = "select count(*) from generate_series(1, 1000000) a(x) join generate_series(1, 1000000) b(y) \
                       on a.x > b.y + 2000000";
 
-async fn engine(limits: EngineLimits) -> (tempfile::TempDir, QueryEngine) {
+async fn engine(memory: Option<usize>) -> (tempfile::TempDir, QueryEngine) {
     let folder = tempfile::tempdir().expect("a folder");
     let url = folder.path().join("lake").display().to_string();
     let lake = Lake::open_or_create(&url, &Rig::paper(), &ReferenceSurfaces::default()).await.expect("a lake");
-    (folder, QueryEngine::new(&lake, limits).expect("an engine"))
+    (folder, QueryEngine::new(&lake, memory).expect("an engine"))
 }
 
 fn session(engine: &QueryEngine, quota: QueryQuota) -> Session {
@@ -43,7 +43,7 @@ async fn outcome(session: &Session, sql: &str) -> Result<u64, Error> {
 
 #[tokio::test]
 async fn a_query_ends_when_it_is_cancelled() {
-    let (_folder, engine) = engine(EngineLimits::default()).await;
+    let (_folder, engine) = engine(None).await;
     for sql in [ENDLESS, BARREN] {
         let mut answer = session(&engine, QueryQuota::default()).query(sql).await.expect("it begins");
         let handle = answer.cancel_handle();
@@ -58,7 +58,7 @@ async fn a_query_ends_when_it_is_cancelled() {
 
 #[tokio::test]
 async fn time_rows_and_places_are_limited() {
-    let (_folder, engine) = engine(EngineLimits::default()).await;
+    let (_folder, engine) = engine(None).await;
     let brief = session(&engine, QueryQuota { time: Some(Duration::from_millis(100)), ..QueryQuota::default() });
     assert!(matches!(outcome(&brief, ENDLESS).await, Err(Error::TimeLimit { .. })));
     let few = session(&engine, QueryQuota { rows: Some(10), ..QueryQuota::default() });
@@ -77,7 +77,7 @@ async fn time_rows_and_places_are_limited() {
 
 #[tokio::test]
 async fn memory_is_limited() {
-    let (_folder, engine) = engine(EngineLimits { memory: Some(32 << 20), temp: None }).await;
+    let (_folder, engine) = engine(Some(32 << 20)).await;
     let session = session(&engine, QueryQuota::default());
     // One list of all values, which cannot be spilled to disk.
     let sql = "select array_agg(x || 'abcdefghijklmnopqrstuvwxyz') from generate_series(1, 10000000) t(x)";
@@ -87,7 +87,7 @@ async fn memory_is_limited() {
 
 #[tokio::test]
 async fn work_that_holds_its_threads_delays_no_query() {
-    let (_folder, engine) = engine(EngineLimits::default()).await;
+    let (_folder, engine) = engine(None).await;
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     let (release, released) = std::sync::mpsc::channel::<()>();
     let released = Arc::new(Mutex::new(released));
@@ -132,7 +132,7 @@ async fn work_that_holds_its_threads_delays_no_query() {
 
 #[tokio::test]
 async fn an_answer_outlives_its_session() {
-    let (_folder, engine) = engine(EngineLimits::default()).await;
+    let (_folder, engine) = engine(None).await;
     let mut answer = session(&engine, QueryQuota::default()).query("select * from pairs").await.expect("it begins");
     drop(engine);
     let mut rows = 0;
@@ -148,7 +148,7 @@ mod slow {
     // A stack that is too small ends the whole process, and this test with it.
     #[tokio::test]
     async fn the_longest_chains_that_pass_fit_the_stacks() {
-        let (_folder, engine) = engine(EngineLimits::default()).await;
+        let (_folder, engine) = engine(None).await;
         let session = session(&engine, QueryQuota::default());
         for (again, end) in [
             ("1 + ", "1"),
@@ -178,7 +178,7 @@ mod slow {
 
     #[tokio::test]
     async fn what_does_not_end_is_found() {
-        let (_folder, engine) = engine(EngineLimits::default()).await;
+        let (_folder, engine) = engine(None).await;
         let session = session(&engine, QueryQuota { time: Some(Duration::from_millis(250)), ..QueryQuota::default() });
         assert_eq!(engine.overdue(), None);
         // One call of a function, computed while the query is planned, for a second or more.

@@ -12,7 +12,7 @@ use object_store::ObjectStoreExt as _;
 use object_store::path::Path;
 
 use super::SystemSource;
-use crate::{EngineClient, EngineLimits, Error, QueryEngine, QueryQuota, Session};
+use crate::{EngineClient, Error, QueryEngine, QueryQuota, Session};
 
 #[derive(Debug)]
 struct Numbers;
@@ -39,7 +39,7 @@ async fn session(source: Option<Arc<dyn SystemSource>>) -> Session {
 }
 
 fn session_of(lake: &Lake, source: Option<Arc<dyn SystemSource>>) -> Session {
-    let engine = QueryEngine::new(lake, EngineLimits::default()).expect("an engine");
+    let engine = QueryEngine::new(lake, None).expect("an engine");
     if let Some(source) = source {
         engine.add_system_tables(source);
     }

@@ -14,7 +14,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use echolake_lake::Lake;
-use echolake_query::{EngineClient, EngineLimits, QueryEngine, QueryQuota};
+use echolake_query::{EngineClient, QueryEngine, QueryQuota};
 use echolake_schema::tables::Table;
 use futures::FutureExt as _;
 use tokio::sync::mpsc;
@@ -33,29 +33,20 @@ const WARM_UP: &str = "select count(*) from runs";
 const LAKE_LOOK: Duration = Duration::from_secs(15);
 const REMOTE_LAKE_LOOK: Duration = Duration::from_secs(60);
 
-/// Settings of an engine.
-#[derive(Debug, Clone, Default)]
-pub struct EngineRun {
-    /// Bytes that its queries may hold; None for no limit.
-    pub memory: Option<usize>,
-    /// Time from which a query is logged as slow; None for never.
-    pub slow: Option<Duration>,
-}
-
-/// Answers one client's requests until standard input ends, which the door holds.
+/// Answers one client's requests until standard input ends, which the door holds. Its queries may hold `memory` bytes; those
+/// that take as long as `slow` are logged.
 ///
 /// It is a spare at first: it reads the lake, reports that it is ready, and learns whose engine it is by the first line
 /// of standard input.
 ///
 /// # Errors
 /// [`Error::System`], [`Error::Query`], [`Error::Transport`].
-pub async fn run_engine(lake: &Lake, sockets: &Path, settings: EngineRun) -> Result<(), Error> {
-    let memory = settings.memory;
+pub async fn run_engine(lake: &Lake, sockets: &Path, memory: usize, slow: Option<Duration>) -> Result<(), Error> {
     let mut messages = read_messages();
     let http = EngineSocket::Http.listen(sockets)?;
     let flight_sql = EngineSocket::FlightSql.listen(sockets)?;
     let postgres = EngineSocket::Postgres.listen(sockets)?;
-    let engine = QueryEngine::new(lake, EngineLimits { memory, temp: None })?;
+    let engine = QueryEngine::new(lake, Some(memory))?;
     warm_up(&engine).await?;
     EngineReport::Ready.send();
     let identity = tokio::select! {
@@ -64,18 +55,18 @@ pub async fn run_engine(lake: &Lake, sockets: &Path, settings: EngineRun) -> Res
     };
     // The door went away before it had a use for this engine.
     let Some(identity) = identity else { return Ok(()) };
-    let limit = identity.memory_bytes.into_iter().chain(memory).min();
+    let limit = identity.memory_bytes.map_or(memory, |own| own.min(memory));
     let lake = &identity.visible_lake(lake);
     // Whatever the spare engine has read of the lake, it read as a reader of all projects.
     let engine = match lake.is_restricted() {
-        true => QueryEngine::new(lake, EngineLimits { memory, temp: None })?,
+        true => QueryEngine::new(lake, Some(memory))?,
         false => engine,
     };
-    let service = QueryService::new(lake, engine, identity, settings.slow)?;
+    let service = QueryService::new(lake, engine, identity, slow)?;
     // If the engine is new, this plans all views, which the watchdog would take for work that nobody waits for.
     drop(service.tables());
     // Behind the start of its threads, whose stacks count.
-    limit.map(confinement::limit_memory).transpose().map_err(Error::System)?;
+    confinement::limit_memory(limit).map_err(Error::System)?;
     watchdog::start(&service).map_err(Error::System)?;
     let obeying = service.clone();
     tokio::select! {
