@@ -234,7 +234,7 @@ impl QueryEngine {
 
     /// Returns the tables of the schema `system` that are not the lake's; none without a program around that has some.
     pub(crate) fn system_tables(&self) -> Vec<(&'static str, Arc<dyn TableProvider>)> {
-        self.0.system.get().map_or_else(Vec::new, |source| system::engine_tables(source))
+        self.0.system.get().map_or_else(Vec::new, system::engine_tables)
     }
 
     /// Creates a session of a client, one per connection.

@@ -26,7 +26,7 @@ use crate::logging::child_variable;
 use crate::signals::StopRequest;
 
 /// Memory for queries, and engines at once, by default.
-pub(super) const MEMORY_MIB: u32 = 4096;
+const MEMORY_MIB: u32 = 4096;
 const ENGINES: u32 = 16;
 /// Time for which the demo's answers may go on after Ctrl-C.
 const CATALOGUE_DRAIN: Duration = Duration::from_secs(5);
@@ -58,15 +58,22 @@ pub(crate) struct ServeArgs {
     /// Listen without encryption beyond this machine, because a proxy encrypts.
     #[arg(long, conflicts_with = "certificate")]
     plain_text_behind_a_proxy: bool,
-    /// Memory limit of all queries together, MiB; if it is exceeded, the engine of the largest client is ended.
-    #[arg(long, value_name = "MIB", default_value_t = MEMORY_MIB, value_parser = clap::value_parser!(u32).range(64..))]
-    memory: u32,
     /// Limit of concurrent clients. Each client's queries run in an engine, a process of its own; idle engines make room.
     #[arg(long, value_name = "N", default_value_t = ENGINES, value_parser = clap::value_parser!(u32).range(1..=256))]
     engines: u32,
     /// Time for which answers may go on after SIGTERM or Ctrl-C, as 30s or 5m; nothing new is taken meanwhile.
     #[arg(long, value_name = "TIME", default_value = "30s", value_parser = parse_duration)]
     drain: Duration,
+    #[command(flatten)]
+    queries: QueryArgs,
+}
+
+/// Options of commands that start engines.
+#[derive(Debug, clap::Args)]
+pub(super) struct QueryArgs {
+    /// Memory limit of all queries together, MiB; if it is exceeded, the queries of the largest client are ended.
+    #[arg(long, value_name = "MIB", default_value_t = MEMORY_MIB, value_parser = clap::value_parser!(u32).range(64..))]
+    memory: u32,
     /// Log queries that take this long or longer, with their statements, as 1s or 500ms.
     #[arg(long, value_name = "TIME", value_parser = parse_duration)]
     log_slow: Option<Duration>,
@@ -75,6 +82,23 @@ pub(crate) struct ServeArgs {
     temp: Option<PathBuf>,
     #[command(flatten)]
     cache: CacheArgs,
+}
+
+impl QueryArgs {
+    /// Opens a lake with the cache.
+    pub(super) async fn open_lake(&self, url: &str) -> anyhow::Result<Lake> {
+        self.cache.open_lake(url).await
+    }
+
+    /// Returns the settings of `count` engines of a lake.
+    pub(super) fn engine_settings(&self, lake: &Lake, count: u32) -> anyhow::Result<EngineSettings> {
+        Ok(EngineSettings {
+            temp: self.temp.clone(),
+            slow: self.log_slow,
+            cache: self.cache.folder().filter(|_| lake.is_remote()),
+            ..default_engine_settings(self.memory, count)?
+        })
+    }
 }
 
 /// The identity provider of `serve`.
@@ -190,7 +214,7 @@ const HTTP: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 8080);
 pub(crate) async fn run(args: &ServeArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let reply = format!("stopping: answers may go on for {:?}; Ctrl-C again stops at once", args.drain);
     let stop = StopRequest::listen(reply)?;
-    let lake = args.cache.open_lake(lake_url).await?;
+    let lake = args.queries.open_lake(lake_url).await?;
     let settings = ServerSettings {
         http: args.listen.address(),
         flight_sql: args.flight_sql.address(),
@@ -204,11 +228,7 @@ pub(crate) async fn run(args: &ServeArgs, lake_url: &str) -> anyhow::Result<Comm
         oidc: args.oidc.settings(),
         is_behind_proxy: args.plain_text_behind_a_proxy,
         drain: args.drain,
-        engines: EngineSettings {
-            cache: args.cache.folder().filter(|_| lake.is_remote()),
-            slow: args.log_slow,
-            ..engines(args.memory, args.engines, args.temp.clone())?
-        },
+        engines: args.queries.engine_settings(&lake, args.engines)?,
     };
     let server = LakeServer::bind(&lake, settings)?;
     anyhow::ensure!(!server.addresses().is_empty(), "nothing to listen on; hint: all three are off");
@@ -221,7 +241,7 @@ pub(crate) async fn run(args: &ServeArgs, lake_url: &str) -> anyhow::Result<Comm
 
 /// Serves the catalogue alone, at the default address or, if that is taken, on any free port.
 pub(crate) async fn catalogue(lake: &Lake, stop: &StopRequest) -> anyhow::Result<CommandOutcome> {
-    let engines = engines(MEMORY_MIB, ENGINES, None)?;
+    let engines = default_engine_settings(MEMORY_MIB, ENGINES)?;
     let settings = |http| ServerSettings {
         http: Some(http),
         flight_sql: None,
@@ -241,8 +261,7 @@ pub(crate) async fn catalogue(lake: &Lake, stop: &StopRequest) -> anyhow::Result
     answer(server, stop).await
 }
 
-/// Settings of engines, without cache and log.
-pub(super) fn engines(memory_mib: u32, count: u32, temp: Option<PathBuf>) -> anyhow::Result<EngineSettings> {
+fn default_engine_settings(memory_mib: u32, count: u32) -> anyhow::Result<EngineSettings> {
     let program = std::env::current_exe().context("this program does not know its own path")?;
     let (name, value) = child_variable();
     Ok(EngineSettings {
@@ -250,7 +269,7 @@ pub(super) fn engines(memory_mib: u32, count: u32, temp: Option<PathBuf>) -> any
         environment: vec![(name.to_owned(), value.to_owned())],
         memory: (memory_mib as usize) << 20,
         count: count as usize,
-        temp,
+        temp: None,
         slow: None,
         cache: None,
     })
