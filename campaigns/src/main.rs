@@ -11,7 +11,6 @@ mod catalogue_client;
 #[path = "../../tests/child.rs"]
 mod child;
 mod engine_kills;
-mod flips;
 #[path = "../../tests/forgetful.rs"]
 mod forgetful;
 mod functions_bench;
@@ -69,8 +68,6 @@ struct CampaignCli {
 
 #[derive(Debug, clap::Subcommand)]
 enum CampaignCommand {
-    /// Damage run files; ingest must keep what is whole and report the rest.
-    Flips(flips::FlipsArgs),
     /// Kill ingests, or let two processes ingest at once; the tables must be those of an undisturbed ingest.
     Kills(kill_ingest::KillIngestArgs),
     /// Put hostile and mutated run files into the inbox of `ingest --watch`; all others must be taken in.
@@ -109,7 +106,6 @@ enum CampaignCommand {
 
 fn main() -> Result<()> {
     match CampaignCli::parse().campaign {
-        CampaignCommand::Flips(args) => block_on(flips::run(&args)),
         CampaignCommand::Kills(args) => kill_ingest::run(&args),
         CampaignCommand::HostileFiles(args) => hostile_ingest::run(&args),
         CampaignCommand::AcquireKills(args) => kill_acquire::run(&args),

@@ -11,7 +11,7 @@ use echolake_lake::{Lake, ReferenceSurfaces};
 use echolake_query::Session;
 use tokio::runtime::Runtime;
 
-pub use message_input::{ENCODINGS, MessageInput};
+pub use message_input::MessageInput;
 pub use seeds::write_seeds_on_request;
 pub use server::{FuzzedServer, ServerWire};
 

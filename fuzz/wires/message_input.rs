@@ -1,24 +1,10 @@
-//! A message with its schema as one input: encoding, length of the type's name, name, length of the schema, schema, message.
+//! A message with its schema as one input: length of the type's name, name, length of the schema, schema, message.
 
 use echolake_query::EncodedMessage;
-
-/// Encodings of messages and of their schemas, by an input's first byte.
-pub const ENCODINGS: [(&str, &str); 8] = [
-    ("protobuf", "protobuf"),
-    ("json", "jsonschema"),
-    ("cbor", "jsonschema"),
-    ("json", ""),
-    ("cdr", "ros2msg"),
-    ("cdr", "ros2idl"),
-    ("ros1", "ros1msg"),
-    ("flatbuffer", "flatbuffer"),
-];
 
 /// The parts of an input.
 #[derive(Debug, Clone, Copy)]
 pub struct MessageInput<'a> {
-    /// Place of the encoding in [`ENCODINGS`].
-    pub encoding: usize,
     /// The message type's name.
     pub type_name: &'a str,
     /// The schema.
@@ -30,12 +16,11 @@ pub struct MessageInput<'a> {
 impl<'a> MessageInput<'a> {
     /// Takes the parts; None if the input is too short, or the name no text.
     pub fn parse(bytes: &'a [u8]) -> Option<Self> {
-        let ([encoding, name_bytes], bytes) = bytes.split_first_chunk()?;
+        let ([name_bytes], bytes) = bytes.split_first_chunk()?;
         let (name, bytes) = bytes.split_at_checked(usize::from(*name_bytes))?;
         let (schema_bytes, bytes) = bytes.split_first_chunk()?;
         let (schema, data) = bytes.split_at_checked(usize::from(u16::from_le_bytes(*schema_bytes)))?;
-        let encoding = usize::from(*encoding) % ENCODINGS.len();
-        Some(Self { encoding, type_name: std::str::from_utf8(name).ok()?, schema, data })
+        Some(Self { type_name: std::str::from_utf8(name).ok()?, schema, data })
     }
 
     /// The input of the parts.
@@ -43,17 +28,16 @@ impl<'a> MessageInput<'a> {
     /// # Panics
     /// The name or the schema is too long.
     pub fn to_bytes(&self) -> Vec<u8> {
-        let mut bytes = vec![self.encoding as u8, u8::try_from(self.type_name.len()).expect("a short name")];
+        let mut bytes = vec![u8::try_from(self.type_name.len()).expect("a short name")];
         bytes.extend(self.type_name.bytes());
         bytes.extend(u16::try_from(self.schema.len()).expect("a short schema").to_le_bytes());
         bytes.extend([self.schema, self.data].concat());
         bytes
     }
 
-    /// The message.
-    pub fn message(&self) -> EncodedMessage<'a> {
-        let (message_encoding, schema_encoding) = ENCODINGS[self.encoding];
-        let Self { type_name, schema, data, .. } = *self;
+    /// Returns the message, with its encoding and that of its schema.
+    pub fn with_encodings(&self, message_encoding: &'a str, schema_encoding: &'a str) -> EncodedMessage<'a> {
+        let Self { type_name, schema, data } = *self;
         EncodedMessage { type_name, schema_encoding, message_encoding, schema, data }
     }
 }

@@ -1,28 +1,18 @@
-//! The inputs that fuzzing begins with: requests as clients write them, and messages in each encoding.
+//! The inputs that fuzzing begins with: requests as clients write them, and a message in each encoding.
 
 use std::path::PathBuf;
 
 use echolake_schema::messages::FILE_DESCRIPTOR_SET;
 
-use crate::{ENCODINGS, MessageInput};
+use crate::MessageInput;
 
 const QUERY: &str = "select pair_id, direct_mm from pairs where pair_id < 2";
-const READING: [&[u8]; 2] = [
-    include_bytes!("../../query/src/mcap/flatbuffer/fixtures/reading.bfbs"),
-    include_bytes!("../../query/src/mcap/flatbuffer/fixtures/reading.bin"),
-];
 const JSON_SCHEMA: &str = r#"{"type":"object","properties":{"a":{"type":"integer"},"b":{"type":"array","items":{"type":
     "number"}},"c":{"type":"object","properties":{"d":{"type":"string","contentEncoding":"base64"}}}}}"#;
-const ROS_DEFINITION: &str = "# a reading\nstd_msgs/Header header\nuint8 FAST=2\nfloat32 speed 1.5\nPoint[] points\nstring name\n\
-                              uint8[] data\nfloat64[3] low\nduration took\n\
+const ROS_DEFINITION: &str = "# a reading\nstd_msgs/Header header\nuint8 FAST=2\nfloat32 speed 1.5\nPoint[] points\n\
+                              string name\nuint8[] data\nfloat64[3] low\nbuiltin_interfaces/Duration took\n\
                               ===\nMSG: a/Point\nfloat64 x\n\
-                              ===\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n";
-const IDL_DEFINITION: &str = "#include \"a.idl\"\nmodule a { module msg { typedef double double__3[3]; enum Layer { near, far };\n\
-                              struct Point { double x; }; @verbatim (language=\"comment\", text=\"one\")\n\
-                              struct B { builtin_interfaces::msg::Time stamp; sequence<Point, 5> points; string<10> name, other;\n\
-                              sequence<octet> data; double__3 low; Layer layer; /* rows */ long long count; }; }; };\n\
-                              ===\nIDL: builtin_interfaces/msg/Time\nmodule builtin_interfaces { module msg { struct Time \
-                              { int32 sec; uint32 nanosec; }; }; };\n";
+                              ===\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n";
 
 /// Fills the folder that `ECHOLAKE_SEEDS` names with a folder of files per target, and ends the process; without that
 /// variable it does nothing.
@@ -47,7 +37,7 @@ fn seeds() -> Vec<Seed> {
     let named = |target, seeds: Vec<Vec<u8>>| {
         seeds.into_iter().enumerate().map(move |(number, bytes)| (target, number.to_string(), bytes))
     };
-    named("messages", message_seeds())
+    message_seeds()
         .chain(named("mcap_sql", vec![echolake_fuzz::run_of_wav()]))
         .chain(named("postgres", postgres_seeds()))
         .chain(named("http", http_seeds()))
@@ -55,31 +45,23 @@ fn seeds() -> Vec<Seed> {
         .collect()
 }
 
-fn message_seeds() -> Vec<Vec<u8>> {
+fn message_seeds() -> impl Iterator<Item = Seed> {
     // Each first member is a number or an empty list, and zeros are good values of all the others.
     let cdr = [&[0, 1, 0, 0][..], &[0; 96]].concat();
     let measurement = [&[0x08, 7, 0x10, 1, 0x31][..], &12.5f64.to_le_bytes(), &[0x72, 1, b'a', 0x72, 0]].concat();
-    let json = br#"{"a": 1e3, "b": [0.5, null, -1], "c": {"d": "AAEC"}, "e": "a"}"#;
-    let cbor = b"\xa3\x61a\x19\x03\xe8\x61b\x82\xfb\x3f\xe0\0\0\0\0\0\0\xf6\x61c\xa1\x61d\x43\0\x01\x02";
-    // What ROS 1 has as words are messages in ROS 2.
-    let ros_2 = ROS_DEFINITION.replace("time stamp", "builtin_interfaces/Time stamp");
-    let ros_2 = ros_2.replace("duration took", "builtin_interfaces/Duration took");
-    let kinds: [(&str, &[u8], &[u8]); ENCODINGS.len()] = [
-        ("echolake.v1.Measurement", FILE_DESCRIPTOR_SET, &measurement),
-        ("a", JSON_SCHEMA.as_bytes(), json),
-        ("a", JSON_SCHEMA.as_bytes(), cbor),
-        ("", b"", json),
-        ("a/msg/B", ros_2.as_bytes(), &cdr),
-        ("a/msg/B", IDL_DEFINITION.as_bytes(), &cdr),
-        ("a/B", ROS_DEFINITION.as_bytes(), &cdr[4..]),
-        ("lab.Reading", READING[0], READING[1]),
+    let json = br#"{"a": 1e3, "b": [0.5, null, -1], "c": {"d": "AAEC"}, "e": "a"}"#.to_vec();
+    let inputs: [(&str, [&str; 2], &str, &[u8], Vec<u8>); 4] = [
+        ("protobuf", ["protobuf"; 2], "echolake.v1.Measurement", FILE_DESCRIPTOR_SET, measurement),
+        ("json", ["json", "jsonschema"], "a", JSON_SCHEMA.as_bytes(), json.clone()),
+        ("json", ["json", "jsonschema"], "", b"", json),
+        ("ros2", ["cdr", "ros2msg"], "a/msg/B", ROS_DEFINITION.as_bytes(), cdr),
     ];
-    let input = |(encoding, (type_name, schema, data))| {
-        let input = MessageInput { encoding, type_name, schema, data };
-        assert!(input.message().decode().is_some(), "{input:?} is refused");
-        input.to_bytes()
-    };
-    kinds.into_iter().enumerate().map(input).collect()
+    inputs.into_iter().map(|(target, [message_encoding, schema_encoding], type_name, schema, data)| {
+        let input = MessageInput { type_name, schema, data: &data };
+        let decoded = input.with_encodings(message_encoding, schema_encoding).decode();
+        assert!(decoded.is_some(), "{input:?} is refused");
+        (target, format!("{type_name}_").replace('/', "_"), input.to_bytes())
+    })
 }
 
 fn http_seeds() -> Vec<Vec<u8>> {

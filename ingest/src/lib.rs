@@ -21,10 +21,6 @@
 //! # }
 //! ```
 
-// The campaign of `flips_tests` refers to this crate by its external name.
-#[cfg(test)]
-extern crate self as echolake_ingest;
-
 mod complete;
 mod context;
 #[cfg(test)]
@@ -34,10 +30,7 @@ mod derived_values;
 pub mod doctor;
 mod error;
 mod files;
-#[cfg(test)]
-mod flips_tests;
 mod ingest;
-mod inspect;
 mod marks;
 mod measure;
 #[cfg(test)]
@@ -61,7 +54,6 @@ pub use files::{
 };
 pub use ingest::{FileReport, IngestOutcome, IngestedRun, LakeIngest};
 #[doc(hidden)]
-pub use inspect::{InspectedMeasurement, RunInspection, inspect};
 pub use marks::SuspectFile;
 pub use remove::{RemovedFile, RunRemoval, find_removals, find_removed};
 

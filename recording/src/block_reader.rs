@@ -12,7 +12,7 @@ use echolake_schema::ErrorCause;
 #[cfg(feature = "store")]
 use object_store::{GetOptions, GetResultPayload, ObjectStore, ObjectStoreExt as _, path::Path};
 
-use crate::resync_reader::LARGE_RECORD;
+use crate::limits::LARGE_RECORD;
 
 /// How much is fetched of a store at a time: a few chunks, as a request takes long.
 #[cfg(feature = "store")]

@@ -248,8 +248,8 @@ pub fn system_cause(error: McapError) -> ErrorCause {
     }
 }
 
-/// Returns an error of the MCAP library with its cause. That of a parser is its innermost one: the others are a drawing of
-/// the parser's source, with colours and the paths of the machine that built it.
+/// Returns an error of the MCAP library with its cause. That of a parser is its innermost one: the others are a drawing
+/// of the parser's source, with colours and the paths of the machine that built it.
 pub fn describe(error: &McapError) -> String {
     match error {
         McapError::Parse(cause) => format!("{error}: {}", escape_controls(&cause.root_cause().to_string())),
@@ -271,9 +271,9 @@ fn chunk_parts(body: &[u8]) -> Result<(ChunkHeader, &[u8]), ChunkError> {
 
 fn split_record(records: &[u8]) -> Option<(u8, &[u8], &[u8])> {
     let (frame, behind) = records.split_at_checked(FRAME_BYTES)?;
-    let length = usize::try_from(u64::from_le_bytes(frame[1..].try_into().ok()?)).ok()?;
-    let (body, behind) = behind.split_at_checked(length)?;
-    Some((frame[0], body, behind))
+    let frame = RecordFrame::read(frame);
+    let (body, behind) = behind.split_at_checked(usize::try_from(frame.length).ok()?)?;
+    Some((frame.code, body, behind))
 }
 
 // Most records are messages, which are read without the library's general parser.

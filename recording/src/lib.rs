@@ -1,9 +1,9 @@
 //! Run files: everything the workspace knows about the MCAP container. No other member reads or writes it by itself.
 //!
-//! Two readers differ in what they do about damage. `ResyncReader` (feature `store`), and [`RecordingReader`] over it for
-//! files of this machine, search for the next whole record: ingest, recovery and replay lose only what the damage touches,
-//! and list it. Queries are strict: [`RecordCursor`] fails, since an answer that silently lacks rows is wrong. All of them
-//! decode chunks by [`DecodedChunk`], within the same [`limits`].
+//! Two readers differ in what they do about damage. `ResyncReader` (feature `store`), and [`RecordingReader`] over it
+//! for files of this machine, search for the next whole record: ingest, recovery and replay lose only what the damage
+//! touches, and list it. Queries are strict: [`RecordCursor`] fails, since an answer that silently lacks rows is wrong.
+//! All of them decode chunks by [`DecodedChunk`], within the same [`limits`].
 //!
 //! ```
 //! use echolake_recording::{RecordingItem, RecordingReader};
@@ -26,7 +26,6 @@ mod chunk_writer;
 mod file_proof;
 pub mod limits;
 mod record_frame;
-mod record_shape;
 mod record_splitter;
 mod recording_reader;
 mod resync_reader;

@@ -24,22 +24,19 @@ use tokio::sync::{Semaphore, SemaphorePermit};
 
 use crate::block_reader::BlockReader;
 use crate::chunk::describe;
-use crate::record_frame::{FRAME_BYTES, RecordFrame};
-use crate::record_shape::{PREFIX_BYTES, RecordShape, largest_record};
+use crate::limits::LARGE_RECORD;
+use crate::record_frame::{FRAME_BYTES, PREFIX_BYTES, RecordFrame, RecordShape, largest_record};
 
 const FRAME: u64 = FRAME_BYTES as u64;
 /// Most that is passed over at a time, and what a search fetches at a time.
 const PASS: u64 = 1 << 20;
-/// How often the walk may go back over the file, all of its ways back together: false records that reach over each other
-/// would have it read the same bytes without end.
+/// How often the walk may go back over the file, all of its ways back together: false records that reach over each
+/// other would have it read the same bytes without end.
 const REWINDS: u64 = 4;
 /// Most chunks of one file: their places are kept.
 const MOST_CHUNKS: usize = 1 << 20;
 /// Most lines about one file's damage: a hostile file has millions.
 const MOST_DAMAGE: usize = 1000;
-/// Records of which one is in memory at a time, in all files together, are larger than this. A recorder's chunks have
-/// 1 MiB.
-pub(crate) const LARGE_RECORD: u64 = 8 << 20;
 #[cfg(feature = "store")]
 static LARGE_RECORDS: Semaphore = Semaphore::const_new(1);
 /// Bytes from the footer's frame to the end of the file.
@@ -135,8 +132,8 @@ pub struct FileIntegrity {
     pub closed: bool,
     /// What is damaged outside of chunks, in the file's order.
     pub damage: Vec<String>,
-    /// Bytes that belong to no whole record, in the file's order. Those of a summary are not among them if all data before
-    /// it are right: it can be made again.
+    /// Bytes that belong to no whole record, in the file's order. Those of a summary are not among them if all data
+    /// before it are right: it can be made again.
     pub lost: Vec<Range<u64>>,
     /// Nothing but the summary is damaged.
     pub is_data_whole: bool,
@@ -608,8 +605,8 @@ impl ResyncReader {
         self.fetch(count, self.file.ahead()).await
     }
 
-    // The same; where it must read, it reads `at_least` so much. What was left is fetched once more: that is less than to
-    // copy all behind it.
+    // The same; where it must read, it reads `at_least` so much. What was left is fetched once more: that is less than
+    // to copy all behind it.
     async fn fetch(&mut self, count: u64, at_least: u64) -> Result<(), ResyncError> {
         if (self.ahead().len() as u64) < count {
             // Let go, so that its memory serves again.
@@ -672,8 +669,8 @@ fn is_inner_footer(bytes: &[u8], left: u64) -> bool {
         && bytes.get(FRAME_BYTES + 20..FOOTER as usize) == Some(MAGIC)
 }
 
-// What can be said of the record that begins with `bytes`, which have its frame, the first [`PREFIX_BYTES`] bytes behind it and
-// the file's last ones, where it has them; `left` bytes of the file are left.
+// What can be said of the record that begins with `bytes`, which have its frame, the first [`PREFIX_BYTES`] bytes
+// behind it and the file's last ones, where it has them; `left` bytes of the file are left.
 fn look(bytes: &[u8], left: u64) -> RecordShape {
     let frame = RecordFrame::read(bytes);
     if !frame.is_possible(left - FRAME) {

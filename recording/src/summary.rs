@@ -54,8 +54,8 @@ pub fn tail_range(file_bytes: u64) -> Range<u64> {
     file_bytes.saturating_sub(TAIL_BYTES)..file_bytes
 }
 
-/// Returns whether a file's last bytes, [`FILE_END_BYTES`] or more, are those of a closed file: a footer, and the closing
-/// magic behind it. A file that was cut off, or that is still being copied, has none.
+/// Returns whether a file's last bytes, [`FILE_END_BYTES`] or more, are those of a closed file: a footer, and the
+/// closing magic behind it. A file that was cut off, or that is still being copied, has none.
 pub fn has_file_end(tail: &[u8]) -> bool {
     let footer = tail.strip_suffix(MAGIC).and_then(|footer| footer.get(footer.len().checked_sub(FOOTER_BYTES)?..));
     footer.is_some_and(|footer| {

@@ -2,12 +2,12 @@
 
 use std::sync::Arc;
 
-use arrow::array::builder::{BooleanBufferBuilder, NullBufferBuilder};
+use arrow::array::builder::{ArrayBuilder as _, BinaryBuilder, BooleanBuilder, NullBufferBuilder, NullBuilder};
 use arrow::array::{
-    Array as _, ArrayRef, ArrowPrimitiveType, BinaryArray, BooleanArray, ListArray, MapArray, NullArray,
-    PrimitiveArray, StringArray, StructArray,
+    Array as _, ArrayRef, ArrowPrimitiveType, BinaryArray, ListArray, MapArray, PrimitiveArray, StringArray,
+    StructArray,
 };
-use arrow::buffer::{NullBuffer, OffsetBuffer, ScalarBuffer};
+use arrow::buffer::{OffsetBuffer, ScalarBuffer};
 use arrow::datatypes::{
     DataType, Decimal128Type, DurationNanosecondType, FieldRef, Fields, Float32Type, Float64Type, Int8Type, Int16Type,
     Int32Type, Int64Type, TimeUnit, TimestampNanosecondType, UInt8Type, UInt16Type, UInt32Type, UInt64Type,
@@ -42,7 +42,7 @@ pub(super) fn integer_type() -> DataType {
 
 /// A column, of one of the types that messages have.
 pub(super) enum Column {
-    Bool(Bits),
+    Bool(BooleanBuilder),
     I8(Numbers<Int8Type>),
     I16(Numbers<Int16Type>),
     I32(Numbers<Int32Type>),
@@ -57,32 +57,46 @@ pub(super) enum Column {
     Decimal(Numbers<Decimal128Type>),
     Time(Numbers<TimestampNanosecondType>),
     Duration(Numbers<DurationNanosecondType>),
-    Text(Strings),
-    Binary(Strings),
+    /// The bytes of texts in UTF-8.
+    Text(BinaryBuilder),
+    Binary(BinaryBuilder),
     Struct(Record),
     List(List),
     /// Its child is the record of key and value.
     Map(List),
     /// A type that no message has.
-    Nothing(usize),
+    Nothing(NullBuilder),
 }
 
-/// Truth values.
-pub(super) struct Bits {
-    values: BooleanBufferBuilder,
-    nulls: NullBufferBuilder,
+/// Evaluates an expression with a column's builder, whatever its type.
+macro_rules! with_builder {
+    ($column:expr, $builder:ident => $value:expr) => {
+        match $column {
+            Self::Bool($builder) => $value,
+            Self::I8($builder) => $value,
+            Self::I16($builder) => $value,
+            Self::I32($builder) => $value,
+            Self::I64($builder) => $value,
+            Self::U8($builder) => $value,
+            Self::U16($builder) => $value,
+            Self::U32($builder) => $value,
+            Self::U64($builder) => $value,
+            Self::F32($builder) => $value,
+            Self::F64($builder) => $value,
+            Self::Decimal($builder) => $value,
+            Self::Time($builder) => $value,
+            Self::Duration($builder) => $value,
+            Self::Text($builder) | Self::Binary($builder) => $value,
+            Self::Struct($builder) => $value,
+            Self::List($builder) | Self::Map($builder) => $value,
+            Self::Nothing($builder) => $value,
+        }
+    };
 }
 
-/// Numbers of one type.
+/// Numbers of one type. Arrow's own builder has no safe way to add many that are not in memory as they are.
 pub(super) struct Numbers<T: ArrowPrimitiveType> {
-    pub(super) values: Vec<T::Native>,
-    nulls: NullBufferBuilder,
-}
-
-/// Texts, or bytes.
-pub(super) struct Strings {
-    offsets: Vec<i32>,
-    bytes: Vec<u8>,
+    values: Vec<T::Native>,
     nulls: NullBufferBuilder,
 }
 
@@ -101,47 +115,36 @@ pub(super) struct List {
     nulls: NullBufferBuilder,
 }
 
-impl Bits {
-    fn new() -> Self {
-        Self { values: BooleanBufferBuilder::new(0), nulls: NullBufferBuilder::new(0) }
-    }
-
-    pub(super) fn push(&mut self, value: bool) {
-        self.values.append(value);
-        self.nulls.append_non_null();
-    }
-
-    fn push_null(&mut self) {
-        self.values.append(false);
-        self.nulls.append_null();
-    }
-}
-
 impl<T: ArrowPrimitiveType> Numbers<T> {
     fn new() -> Self {
         Self { values: Vec::new(), nulls: NullBufferBuilder::new(0) }
     }
 
-    pub(super) fn push(&mut self, value: T::Native) {
+    fn len(&self) -> usize {
+        self.values.len()
+    }
+
+    /// Adds a value.
+    pub(super) fn append_value(&mut self, value: T::Native) {
         self.values.push(value);
         self.nulls.append_non_null();
     }
 
-    /// Several at once; this is what a packed list of floats is decoded with.
+    /// Adds several values at once, as those of a packed list of floats.
     pub(super) fn extend(&mut self, values: impl ExactSizeIterator<Item = T::Native>) {
         self.nulls.append_n_non_nulls(values.len());
         self.values.extend(values);
     }
 
-    /// A value, or a missing one.
-    pub(super) fn push_option(&mut self, value: Option<T::Native>) {
+    /// Adds a value, or a missing one.
+    pub(super) fn append_option(&mut self, value: Option<T::Native>) {
         match value {
-            Some(value) => self.push(value),
-            None => self.push_null(),
+            Some(value) => self.append_value(value),
+            None => self.append_null(),
         }
     }
 
-    pub(super) fn push_null(&mut self) {
+    fn append_null(&mut self) {
         self.values.push(T::Native::default());
         self.nulls.append_null();
     }
@@ -151,46 +154,24 @@ impl<T: ArrowPrimitiveType> Numbers<T> {
     }
 }
 
-impl Strings {
-    fn new() -> Self {
-        Self { offsets: vec![0], bytes: Vec::new(), nulls: NullBufferBuilder::new(0) }
-    }
-
-    pub(super) fn push(&mut self, value: &[u8]) {
-        self.bytes.extend_from_slice(value);
-        self.offsets.push(offset(self.bytes.len()));
-        self.nulls.append_non_null();
-    }
-
-    /// A text; what is no UTF-8 in it is replaced, as a text is shown, so that one of them does not end a scan.
-    pub(super) fn push_text(&mut self, value: &[u8]) {
-        self.push(String::from_utf8_lossy(value).as_bytes());
-    }
-
-    fn push_null(&mut self) {
-        self.offsets.push(offset(self.bytes.len()));
-        self.nulls.append_null();
-    }
-
-    fn take(&mut self) -> (OffsetBuffer<i32>, Vec<u8>, Option<NullBuffer>) {
-        (offsets(&mut self.offsets), take(&mut self.bytes), self.nulls.finish())
-    }
-}
-
 impl Record {
-    /// Columns of these fields.
+    /// Makes columns of these fields.
     pub(super) fn new(fields: &Fields) -> Self {
         let columns = fields.iter().map(|f| Column::new(f.data_type())).collect();
         Self { fields: fields.clone(), columns, nulls: NullBufferBuilder::new(0) }
     }
 
-    /// All columns have got one more value, which together are one that is there.
+    fn len(&self) -> usize {
+        self.nulls.len()
+    }
+
+    /// Ends a record that is there, for which each column has got a value.
     pub(super) fn end_row(&mut self) {
         self.nulls.append_non_null();
     }
 
-    fn push_null(&mut self) {
-        self.columns.iter_mut().for_each(Column::push_null);
+    fn append_null(&mut self) {
+        self.columns.iter_mut().for_each(Column::append_null);
         self.nulls.append_null();
     }
 
@@ -207,23 +188,38 @@ impl List {
         Self { field: field.clone(), offsets: vec![0], values, nulls: NullBufferBuilder::new(0) }
     }
 
-    /// What came to the values since the last list is one.
+    fn len(&self) -> usize {
+        self.nulls.len()
+    }
+
+    /// Ends a list, of the values that were added since the last one.
     pub(super) fn end_row(&mut self) {
-        self.offsets.push(offset(self.values.len()));
+        self.push_offset();
         self.nulls.append_non_null();
     }
 
-    fn push_null(&mut self) {
-        self.offsets.push(offset(self.values.len()));
+    fn append_null(&mut self) {
+        self.push_offset();
         self.nulls.append_null();
+    }
+
+    // Batches end long before this many values, and a message that expands to more is refused.
+    fn push_offset(&mut self) {
+        self.offsets.push(i32::try_from(self.values.len()).unwrap_or(i32::MAX));
+    }
+
+    fn finish_offsets(&mut self) -> OffsetBuffer<i32> {
+        let ends = take(&mut self.offsets);
+        self.offsets.push(0);
+        OffsetBuffer::new(ScalarBuffer::from(ends))
     }
 }
 
 impl Column {
-    /// An empty column of a type.
+    /// Makes an empty column of a type.
     pub(super) fn new(kind: &DataType) -> Self {
         match kind {
-            DataType::Boolean => Self::Bool(Bits::new()),
+            DataType::Boolean => Self::Bool(BooleanBuilder::new()),
             DataType::Int8 => Self::I8(Numbers::new()),
             DataType::Int16 => Self::I16(Numbers::new()),
             DataType::Int32 => Self::I32(Numbers::new()),
@@ -237,67 +233,28 @@ impl Column {
             DataType::Decimal128(_, _) => Self::Decimal(Numbers::new()),
             DataType::Timestamp(_, _) => Self::Time(Numbers::new()),
             DataType::Duration(_) => Self::Duration(Numbers::new()),
-            DataType::Utf8 => Self::Text(Strings::new()),
-            DataType::Binary => Self::Binary(Strings::new()),
+            DataType::Utf8 => Self::Text(BinaryBuilder::new()),
+            DataType::Binary => Self::Binary(BinaryBuilder::new()),
             DataType::Struct(fields) => Self::Struct(Record::new(fields)),
             DataType::List(field) => Self::List(List::new(field)),
             DataType::Map(entry, _) => Self::Map(List::new(entry)),
-            _ => Self::Nothing(0),
+            _ => Self::Nothing(NullBuilder::new()),
         }
     }
 
-    /// Values so far.
-    pub(super) fn len(&self) -> usize {
-        match self {
-            Self::Bool(c) => c.values.len(),
-            Self::I8(c) => c.values.len(),
-            Self::I16(c) => c.values.len(),
-            Self::I32(c) => c.values.len(),
-            Self::I64(c) => c.values.len(),
-            Self::U8(c) => c.values.len(),
-            Self::U16(c) => c.values.len(),
-            Self::U32(c) => c.values.len(),
-            Self::U64(c) => c.values.len(),
-            Self::F32(c) => c.values.len(),
-            Self::F64(c) => c.values.len(),
-            Self::Decimal(c) => c.values.len(),
-            Self::Time(c) => c.values.len(),
-            Self::Duration(c) => c.values.len(),
-            Self::Text(c) | Self::Binary(c) => c.offsets.len() - 1,
-            Self::Struct(c) => c.nulls.len(),
-            Self::List(c) | Self::Map(c) => c.offsets.len() - 1,
-            Self::Nothing(count) => *count,
-        }
+    fn len(&self) -> usize {
+        with_builder!(self, builder => builder.len())
     }
 
-    /// One value that is missing.
-    pub(super) fn push_null(&mut self) {
-        match self {
-            Self::Bool(c) => c.push_null(),
-            Self::I8(c) => c.push_null(),
-            Self::I16(c) => c.push_null(),
-            Self::I32(c) => c.push_null(),
-            Self::I64(c) => c.push_null(),
-            Self::U8(c) => c.push_null(),
-            Self::U16(c) => c.push_null(),
-            Self::U32(c) => c.push_null(),
-            Self::U64(c) => c.push_null(),
-            Self::F32(c) => c.push_null(),
-            Self::F64(c) => c.push_null(),
-            Self::Decimal(c) => c.push_null(),
-            Self::Time(c) => c.push_null(),
-            Self::Duration(c) => c.push_null(),
-            Self::Text(c) | Self::Binary(c) => c.push_null(),
-            Self::Struct(c) => c.push_null(),
-            Self::List(c) | Self::Map(c) => c.push_null(),
-            Self::Nothing(count) => *count += 1,
-        }
+    /// Adds a value that is missing.
+    pub(super) fn append_null(&mut self) {
+        with_builder!(self, builder => builder.append_null());
     }
 
-    /// The array of all values; the column is empty afterwards.
+    /// Returns the array of all values, and empties the column.
     pub(super) fn finish(&mut self) -> Result<ArrayRef, ArrowError> {
         Ok(match self {
-            Self::Bool(c) => Arc::new(BooleanArray::new(c.values.finish(), c.nulls.finish())),
+            Self::Bool(c) => Arc::new(c.finish()),
             Self::I8(c) => Arc::new(c.finish()),
             Self::I16(c) => Arc::new(c.finish()),
             Self::I32(c) => Arc::new(c.finish()),
@@ -311,29 +268,29 @@ impl Column {
             Self::Decimal(c) => Arc::new(c.finish().with_precision_and_scale(INTEGER_DIGITS, 0)?),
             Self::Time(c) => Arc::new(c.finish().with_timezone(UTC)),
             Self::Duration(c) => Arc::new(c.finish()),
-            Self::Text(c) => {
-                let (offsets, bytes, nulls) = c.take();
-                Arc::new(StringArray::try_new(offsets, bytes.into(), nulls)?)
-            }
-            Self::Binary(c) => {
-                let (offsets, bytes, nulls) = c.take();
-                Arc::new(BinaryArray::try_new(offsets, bytes.into(), nulls)?)
-            }
+            Self::Text(c) => Arc::new(StringArray::try_from_binary(finish_bytes(c))?),
+            Self::Binary(c) => Arc::new(finish_bytes(c)),
             Self::Struct(c) => Arc::new(c.finish()?),
             Self::List(c) => {
-                let (ends, values) = (offsets(&mut c.offsets), c.values.finish()?);
-                Arc::new(ListArray::try_new(c.field.clone(), ends, values, c.nulls.finish())?)
+                let values = c.values.finish()?;
+                Arc::new(ListArray::try_new(c.field.clone(), c.finish_offsets(), values, c.nulls.finish())?)
             }
             Self::Map(c) => {
-                let (ends, values) = (offsets(&mut c.offsets), c.values.finish()?);
+                let values = c.values.finish()?;
                 let Some(entries) = values.as_any().downcast_ref::<StructArray>() else {
                     return Err(ArrowError::SchemaError("a map's child is no record of key and value".to_owned()));
                 };
-                Arc::new(MapArray::try_new(c.field.clone(), ends, entries.clone(), c.nulls.finish(), false)?)
+                let offsets = c.finish_offsets();
+                Arc::new(MapArray::try_new(c.field.clone(), offsets, entries.clone(), c.nulls.finish(), false)?)
             }
-            Self::Nothing(count) => Arc::new(NullArray::new(std::mem::take(count))),
+            Self::Nothing(c) => Arc::new(c.finish()),
         })
     }
+}
+
+/// Adds a text. What is no UTF-8 in it is replaced, as a text is shown, so that one of them does not end a scan.
+pub(super) fn append_text(column: &mut BinaryBuilder, text: &[u8]) {
+    column.append_value(String::from_utf8_lossy(text).as_bytes());
 }
 
 /// Bytes that one value of a type takes, what is in its lists and texts aside: they are what a message of few bytes can
@@ -345,18 +302,13 @@ pub(super) fn width(kind: &DataType) -> usize {
     }
 }
 
-// Batches end long before this many bytes, and a message that expands to more is refused.
-fn offset(length: usize) -> i32 {
-    i32::try_from(length).unwrap_or(i32::MAX)
-}
-
-fn offsets(taken: &mut Vec<i32>) -> OffsetBuffer<i32> {
-    let ends = take(taken);
-    taken.push(0);
-    OffsetBuffer::new(ScalarBuffer::from(ends))
-}
-
 // The next batch is about as large, and does not have to grow to it.
+fn finish_bytes(column: &mut BinaryBuilder) -> BinaryArray {
+    let next = BinaryBuilder::with_capacity(column.len(), column.values_slice().len());
+    std::mem::replace(column, next).finish()
+}
+
+// As for bytes.
 fn take<T>(values: &mut Vec<T>) -> Vec<T> {
     let next = Vec::with_capacity(values.len());
     std::mem::replace(values, next)

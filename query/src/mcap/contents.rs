@@ -8,10 +8,10 @@ use echolake_lake::{Lake, LakeSnapshot, VisibleRun};
 use echolake_recording::limits::LARGEST_CHUNK;
 use echolake_recording::{FRAME_BYTES, Record, RecordCursor, opcode, parse_record};
 use futures::{StreamExt as _, TryStreamExt as _};
-use object_store::ObjectStoreExt as _;
 
 use super::error::Fault;
-use super::file::{Attachment, Files, McapFile, Piece};
+use super::file::{Attachment, Files, McapFile};
+use super::piece::Piece;
 use crate::Error;
 
 /// Message indexes that are read at once.
@@ -69,17 +69,18 @@ pub(crate) async fn attachment(
     let file = open(run, snapshot, files).await?;
     let Some(found) = file.attachments.iter().find(|a| a.name.ends_with(ending)) else { return Ok(None) };
     let range = found.range.clone();
-    let damaged = |what: &str| Fault::Damaged { file: file.path.to_string(), offset: range.start, what: what.into() };
     if range.end - range.start > LARGEST_CHUNK {
-        return Err(damaged("its attachment is larger than is read").into());
+        return Err(Fault::damaged(&file.path, range.start, "its attachment is larger than is read").into());
     }
-    let read = files.store.get_range(&file.path, range.clone()).await;
-    let record = read.map_err(|source| Fault::Read { file: file.path.to_string(), source })?;
+    let record = files.read_range(&file.path, range.clone()).await?;
     match record.get(FRAME_BYTES..).map(|body| parse_record(opcode::ATTACHMENT, body)) {
         Some(Ok(Record::Attachment { data, .. })) if record[0] == opcode::ATTACHMENT => {
             Ok(Some(data.into_owned().into()))
         }
-        _ => Err(damaged("there is no sound attachment where its index says").into()),
+        _ => {
+            let what = "there is no sound attachment where its index says";
+            Err(Fault::damaged(&file.path, range.start, what).into())
+        }
     }
 }
 
@@ -96,11 +97,7 @@ async fn sizes(file: &McapFile, files: &Files) -> Result<Option<HashMap<u16, u64
     }
     let read = |piece: &Piece| {
         let (range, plain) = (piece.range.end..piece.range.end + piece.index, piece.plain);
-        async move {
-            let bytes = files.store.get_range(&file.path, range).await;
-            let bytes = bytes.map_err(|source| Fault::Read { file: file.path.to_string(), source })?;
-            Ok::<_, Fault>((bytes, plain))
-        }
+        async move { Ok::<_, Fault>((files.read_range(&file.path, range).await?, plain)) }
     };
     let reads: Vec<_> = file.pieces.iter().map(read).collect();
     let mut reads = futures::stream::iter(reads).buffer_unordered(AT_ONCE);

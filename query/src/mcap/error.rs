@@ -2,7 +2,9 @@
 
 use datafusion::error::DataFusionError;
 use echolake_schema::escape_controls;
+use object_store::path::Path;
 
+use super::encodings::Malformed;
 use crate::Error;
 
 /// What is wrong, with the file and the place in it.
@@ -30,46 +32,13 @@ pub(super) enum Fault {
     Message { file: String, topic: String, sequence: u32, offset: u64, what: Malformed },
 }
 
-/// Why bytes are no message of their schema.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-pub(super) enum Malformed {
-    #[error("it ends within a value")]
-    Ends,
-    #[error("there is no field number 0 and no wire type above 5")]
-    Tag,
-    #[error("a variable-length integer has more than ten bytes")]
-    Varint,
-    #[error("a group ends that did not begin")]
-    Group,
-    #[error("it expands to more than {} MiB", Spent::MOST >> 20)]
-    Expands,
-    #[error("it is no JSON object")]
-    Json,
-    #[error("its encapsulation is none of CDR's that are known here")]
-    Encapsulation,
-}
-
-/// What the rows under construction take, roughly, in bytes: messages are small beside what some of them expand to.
-#[derive(Debug, Default)]
-pub(super) struct Spent(usize);
-
-impl Spent {
-    /// No batch of rows may take more, so that offsets fit 32 bits and a hostile message does not fill the memory.
-    pub(super) const MOST: usize = 512 << 20;
-
-    /// Counts some more.
-    pub(super) fn add(&mut self, bytes: usize) -> Result<(), Malformed> {
-        self.0 = self.0.saturating_add(bytes);
-        if self.0 <= Self::MOST { Ok(()) } else { Err(Malformed::Expands) }
-    }
-
-    /// So far.
-    pub(super) fn bytes(&self) -> usize {
-        self.0
-    }
-}
-
 impl Fault {
+    /// Makes the error of a file's damage.
+    pub(super) fn damaged(file: &Path, offset: u64, what: impl Into<String>) -> Self {
+        Self::Damaged { file: file.to_string(), offset, what: what.into() }
+    }
+
+    /// Makes the error of a call.
     pub(super) fn call(what: impl Into<String>, hint: impl Into<String>) -> Self {
         Self::Call { what: what.into(), hint: hint.into() }
     }

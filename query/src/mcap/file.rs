@@ -19,10 +19,10 @@ use object_store::{ObjectStore, ObjectStoreExt as _};
 use quick_cache::Weighter;
 use quick_cache::sync::Cache;
 
-use super::chunk::{PieceKind, PieceRecords, ReadStep, ReadStop};
+use super::encodings::RawSchema;
 use super::error::Fault;
+use super::piece::{Piece, PieceKind, PieceRecords};
 use super::run_sizes::RunSizes;
-use super::schema::RawSchema;
 use crate::small::SmallTables;
 
 /// What is read at a time of a file that is walked.
@@ -73,32 +73,10 @@ pub(super) struct Channel {
     pub(super) times: Option<(u64, u64)>,
 }
 
-/// A chunk, or a run of messages in none.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Piece {
-    pub(super) kind: PieceKind,
-    pub(super) range: Range<u64>,
-    /// Times of its earliest and latest message, ns.
-    pub(super) times: (u64, u64),
-    /// Channels of its messages; None where the index does not say.
-    pub(super) channels: Option<Box<[u16]>>,
-    /// Bytes of message indexes behind it.
-    pub(super) index: u64,
-    /// Bytes of its records before compression, where its index tells.
-    pub(super) plain: u64,
-}
-
-impl Piece {
-    /// Whether it may have messages of a channel.
-    pub(super) fn has(&self, channel: u16) -> bool {
-        self.channels.as_ref().is_none_or(|channels| channels.contains(&channel))
-    }
-}
-
 /// Opens files, and caches their summaries.
 #[derive(Debug)]
 pub(crate) struct Files {
-    pub(super) store: Arc<dyn ObjectStore>,
+    store: Arc<dyn ObjectStore>,
     /// None for a lake in a folder, where a look at a file costs nothing and shows if somebody changed it.
     sizes: Option<RunSizes>,
     cache: Cache<FileVersion, Arc<McapFile>, SummaryWeighter>,
@@ -143,9 +121,19 @@ impl Files {
                 (meta.size, meta.last_modified.timestamp_micros())
             }
         };
-        let opening = Opening { store: self.store.as_ref(), path, bytes };
+        let opening = Opening { files: self, path, bytes };
         let version = (path.clone(), bytes, modified);
         self.cache.get_or_insert_async(&version, async { opening.file().await.map(Arc::new) }).await
+    }
+
+    /// Reads a range of a file.
+    pub(super) async fn read_range(&self, path: &Path, range: Range<u64>) -> Result<Bytes, Fault> {
+        let bytes = self.store.get_range(path, range.clone()).await;
+        let bytes = bytes.map_err(|source| Fault::Read { file: path.to_string(), source })?;
+        match bytes.len() as u64 == range.end - range.start {
+            true => Ok(bytes),
+            false => Err(Fault::damaged(path, range.start, "it became shorter while it was read")),
+        }
     }
 }
 
@@ -159,7 +147,7 @@ impl McapFile {
 
 /// A file that is being opened.
 struct Opening<'a> {
-    store: &'a dyn ObjectStore,
+    files: &'a Files,
     path: &'a Path,
     bytes: u64,
 }
@@ -232,8 +220,7 @@ impl Opening<'_> {
         if range.is_empty() {
             return Ok(Bytes::new());
         }
-        let read = self.store.get_range(self.path, range).await;
-        read.map_err(|source| Fault::Read { file: self.path.to_string(), source })
+        self.files.read_range(self.path, range).await
     }
 
     // The summary accounts for all messages; None if it has them where they cannot be.
@@ -273,7 +260,7 @@ impl Opening<'_> {
     }
 
     fn damaged(&self, offset: u64, what: impl Into<String>) -> Fault {
-        Fault::Damaged { file: self.path.to_string(), offset, what: what.into() }
+        Fault::damaged(self.path, offset, what)
     }
 
     // Whether the record at `offset`, which claims more bytes than there are, is what a file that was cut off ends in.
@@ -290,8 +277,8 @@ impl Opening<'_> {
             let bytes = self.read(offset..(offset + BLOCK).min(self.bytes)).await?;
             match find_part(&bytes, self.bytes - offset) {
                 Ok(position) => {
-                    let what = "another file, or a part of this one, begins here behind what is read; hint: `echolake recover` \
-                                keeps what is whole";
+                    let what = "another file, or a part of this one, begins here behind what is read; \
+                                hint: `echolake recover` keeps what is whole";
                     return Err(self.damaged(offset + position as u64, what));
                 }
                 Err(searched) => offset += searched.max(1) as u64,
@@ -410,10 +397,9 @@ impl Walk {
     fn chunk(&mut self, range: Range<u64>, body: Bytes) -> Result<(), String> {
         self.open = false;
         let mut seen = Seen::default();
-        let mut sink = |record: Record<'_>| self.see(&record, &mut seen).map(|()| ReadStep::Continue);
-        match PieceRecords::from_chunk(body)?.read(&mut sink) {
-            Ok(_) => {}
-            Err(ReadStop::Damage(what) | ReadStop::Sink(what)) => return Err(what),
+        let mut records = PieceRecords::from_chunk(body)?;
+        while let Some(record) = records.next_record()? {
+            self.see(&record, &mut seen)?;
         }
         if let Some(times) = seen.times {
             self.pieces.push(seen.piece(PieceKind::Chunk, range, times));

@@ -1,13 +1,13 @@
 //! Decoders of messages for fuzz targets, which give them schemas and messages without a file around them.
 
-use super::schema::{Layout, RawSchema};
+use super::encodings::{MessageLayout, RawSchema};
 
 /// A message with its channel's schema.
 #[derive(Debug, Clone, Copy)]
 pub struct EncodedMessage<'a> {
     /// The message type's name.
     pub type_name: &'a str,
-    /// The encoding of the schema, such as `ros2idl`.
+    /// The encoding of the schema, such as `ros2msg`.
     pub schema_encoding: &'a str,
     /// The encoding of the message, such as `cdr`.
     pub message_encoding: &'a str,
@@ -18,8 +18,8 @@ pub struct EncodedMessage<'a> {
 }
 
 impl EncodedMessage<'_> {
-    /// Decodes the message twice, once with all columns and once with every other one, and returns the number of columns; None
-    /// if the schema or the message is refused.
+    /// Decodes the message twice, once with all columns and once with every other one, and returns the number of
+    /// columns; None if the schema or the message is refused.
     ///
     /// # Panics
     /// A column has not one row per message.
@@ -30,7 +30,7 @@ impl EncodedMessage<'_> {
             messages: self.message_encoding.to_owned(),
             data: self.schema.to_vec(),
         };
-        let layout = Layout::new(&schema).ok()?;
+        let layout = MessageLayout::from_schema(&schema).ok()?;
         for step in [1, 2] {
             let wanted: Vec<usize> = (0..layout.fields.len()).step_by(step).collect();
             let mut decoder = layout.decoder(&wanted);

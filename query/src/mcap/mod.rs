@@ -3,22 +3,17 @@
 //! Planning cannot wait for a store, so what a statement asks for is looked up before it is planned; the functions that
 //! the planner then calls only hand it over.
 
-mod chunk;
 mod column;
 mod contents;
+mod encodings;
 mod error;
 mod file;
-mod flatbuffer;
 #[cfg(fuzzing)]
 pub(crate) mod fuzzing;
-mod json;
-mod protobuf;
-mod ros;
-mod ros_idl;
+mod piece;
 mod rows;
 mod run_sizes;
 mod scan;
-mod schema;
 mod table;
 mod target;
 #[cfg(test)]
@@ -82,8 +77,8 @@ type Call = (Function, Vec<String>);
 /// snapshot, where their messages are, which columns they have.
 ///
 /// # Errors
-/// [`Error::Query`] for a call that is not right, [`Error::Execution`] where a file cannot be read, [`Error::Lake`] if `runs`
-/// is not whole.
+/// [`Error::Query`] for a call that is not right, [`Error::Execution`] where a file cannot be read, [`Error::Lake`] if
+/// `runs` is not whole.
 pub(crate) async fn register(
     context: &SessionContext,
     snapshot: &LakeSnapshot,

@@ -10,8 +10,7 @@ use arrow::record_batch::{RecordBatch, RecordBatchOptions};
 use echolake_recording::MessageHeader;
 
 use super::column::{Column, time_type};
-use super::error::Malformed;
-use super::schema::{Decoder, Layout};
+use super::encodings::{Malformed, MessageLayout, RowDecoder};
 
 /// Bytes that the rows of a batch take, roughly; a batch of whole sweeps has a few rows.
 const BATCH_BYTES: usize = 8 << 20;
@@ -73,7 +72,7 @@ pub(super) struct Message<'a> {
 /// A schema of some files, and where the table's own columns are in it.
 #[derive(Debug, Clone)]
 pub(super) struct Mapping {
-    pub(super) layout: Arc<Layout>,
+    pub(super) layout: Arc<MessageLayout>,
     /// For each column of the messages in the table, its place in the layout.
     pub(super) columns: Vec<Option<usize>>,
 }
@@ -96,7 +95,7 @@ pub(super) struct Rows {
 
 struct Current {
     mapping: usize,
-    decoder: Decoder,
+    decoder: RowDecoder,
     /// Which columns of the output it has.
     has: Vec<bool>,
 }
@@ -199,23 +198,23 @@ impl Head {
         // A time that 64 bits with a sign do not hold, from the year 2262 on, is null.
         let nanos = |time: u64| i64::try_from(time).ok();
         match (self, column) {
-            (Self::Time, Column::Time(c)) => c.push_option(nanos(message.header.log_time)),
-            (Self::TimeNanos, Column::I64(c)) => c.push_option(nanos(message.header.log_time)),
-            (Self::Published, Column::Time(c)) => c.push_option(nanos(message.header.publish_time)),
-            (Self::Sequence, Column::I64(c)) => c.push(i64::from(message.header.sequence)),
-            (Self::Size, Column::I64(c)) => c.push(message.data.len() as i64),
+            (Self::Time, Column::Time(c)) => c.append_option(nanos(message.header.log_time)),
+            (Self::TimeNanos, Column::I64(c)) => c.append_option(nanos(message.header.log_time)),
+            (Self::Published, Column::Time(c)) => c.append_option(nanos(message.header.publish_time)),
+            (Self::Sequence, Column::I64(c)) => c.append_value(i64::from(message.header.sequence)),
+            (Self::Size, Column::I64(c)) => c.append_value(message.data.len() as i64),
             (Self::Data, Column::Binary(c)) => {
-                c.push(message.data);
+                c.append_value(message.data);
                 return message.data.len();
             }
-            (Self::Topic, Column::Text(c)) => c.push(message.topic.as_bytes()),
+            (Self::Topic, Column::Text(c)) => c.append_value(message.topic.as_bytes()),
             (Self::Surface, Column::Text(c)) if message.run.is_some() => {
-                c.push(message.run.map_or(&[], |(surface, _)| surface.as_bytes()));
+                c.append_value(message.run.map_or("", |(surface, _)| surface.as_str()));
             }
             (Self::Run, Column::Text(c)) if message.run.is_some() => {
-                c.push(message.run.map_or(&[], |(_, run)| run.as_bytes()));
+                c.append_value(message.run.map_or("", |(_, run)| run.as_str()));
             }
-            (_, column) => column.push_null(),
+            (_, column) => column.append_null(),
         }
         8
     }

@@ -1,6 +1,6 @@
 //! The scan of a topic: reads the pieces that have it, side by side, and decodes what is asked for.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeMap, VecDeque};
 use std::fmt;
 use std::ops::{Range, RangeInclusive};
 use std::sync::Arc;
@@ -9,7 +9,7 @@ use arrow::datatypes::SchemaRef;
 use arrow::record_batch::RecordBatch;
 use bytes::Bytes;
 use datafusion::common::tree_node::TreeNodeRecursion;
-use datafusion::error::{DataFusionError, Result};
+use datafusion::error::Result;
 use datafusion::execution::memory_pool::{MemoryConsumer, MemoryReservation};
 use datafusion::execution::{SendableRecordBatchStream, TaskContext};
 use datafusion::physical_expr::{EquivalenceProperties, PhysicalExpr};
@@ -23,13 +23,11 @@ use datafusion::physical_plan::{
 use echolake_recording::Record;
 use futures::stream::{self, BoxStream};
 use futures::{StreamExt as _, TryStreamExt as _};
-use object_store::ObjectStoreExt as _;
 
-use super::chunk::{PieceRecords, ReadProgress, ReadStep, ReadStop};
 use super::error::Fault;
-use super::file::{Piece, undescribed};
-use super::rows::{Message, Rows};
-use super::table::Parts;
+use super::file::{Files, McapFile, undescribed};
+use super::piece::{Piece, PieceRecords};
+use super::rows::{Head, Mapping, Message, Rows};
 
 /// Neighbouring pieces are fetched together up to this size.
 const READ: u64 = 4 << 20;
@@ -37,6 +35,39 @@ const READ: u64 = 4 << 20;
 const GAP: u64 = 128 << 10;
 /// Reads under way while another one is decoded.
 const AHEAD: usize = 2;
+
+/// What all partitions of all scans of a table share.
+#[derive(Debug)]
+pub(super) struct Parts {
+    /// What it is called in plans.
+    pub(super) name: String,
+    pub(super) files: Arc<Files>,
+    pub(super) heads: Vec<Head>,
+    pub(super) sources: Vec<Source>,
+    /// None in a table of messages as they are.
+    pub(super) mappings: Option<Vec<Mapping>>,
+}
+
+/// One file.
+#[derive(Debug)]
+pub(super) struct Source {
+    pub(super) run: Option<(String, String)>,
+    pub(super) file: Arc<McapFile>,
+    /// The channels that are meant: topic, and which mapping they have.
+    pub(super) channels: BTreeMap<u16, (String, usize)>,
+}
+
+impl Source {
+    /// Returns the pieces that may have messages of the channels in the time.
+    pub(super) fn pieces<'a>(&'a self, times: Option<&'a RangeInclusive<i64>>) -> impl Iterator<Item = &'a Piece> {
+        let nanos = |time: u64| i64::try_from(time).unwrap_or(i64::MAX);
+        let within = move |p: &&Piece| {
+            times.is_none_or(|times| nanos(p.times.1) >= *times.start() && nanos(p.times.0) <= *times.end())
+        };
+        let meant = |p: &&Piece| self.channels.keys().any(|channel| p.has(*channel));
+        self.file.pieces.iter().filter(within).filter(meant)
+    }
+}
 
 /// What a scan is asked for.
 #[derive(Debug)]
@@ -200,14 +231,8 @@ fn fetch(
     let one = move |read: FileRead| {
         let (parts, bytes_read) = (parts.clone(), bytes_read.clone());
         async move {
-            let path = &parts.sources[read.source].file.path;
-            let failed = |source| Fault::Read { file: path.to_string(), source };
-            let bytes = parts.files.store.get_range(path, read.range.clone()).await.map_err(failed)?;
+            let bytes = parts.files.read_range(&parts.sources[read.source].file.path, read.range.clone()).await?;
             bytes_read.add(bytes.len());
-            if bytes.len() as u64 != read.range.end - read.range.start {
-                let what = "it became shorter while it was read".to_owned();
-                return Err(Fault::Damaged { file: path.to_string(), offset: read.range.start, what });
-            }
             Ok((read, bytes))
         }
     };
@@ -262,6 +287,7 @@ impl Scanner {
             let elapsed = self.baseline.elapsed_compute().clone();
             let _timer = elapsed.timer();
             self.decode()?;
+            self.unfit.add(self.rows.take_unfit());
         }
     }
 
@@ -286,7 +312,8 @@ impl Scanner {
             let (source, offset) = (fetched.source, piece.range.start);
             let bytes =
                 fetched.bytes.slice((offset - fetched.start) as usize..(piece.range.end - fetched.start) as usize);
-            let records = PieceRecords::new(bytes, piece.kind).map_err(|what| self.damaged(source, offset, what))?;
+            let path = &self.scan.parts.sources[source].file.path;
+            let records = PieceRecords::new(bytes, piece.kind).map_err(|what| Fault::damaged(path, offset, what))?;
             self.memory.try_resize(records.memory)?;
             self.chunks.add(1);
             self.current = Some(Current { source, offset, records });
@@ -295,60 +322,43 @@ impl Scanner {
         Ok(true)
     }
 
-    // Goes on with the piece at hand until a batch is ready.
+    // Continues with the piece at hand until a batch is ready.
     fn decode(&mut self) -> Result<()> {
-        let Some(current) = &mut self.current else { return Ok(()) };
+        let Some(Current { source, offset, records }) = &mut self.current else { return Ok(()) };
         let parts = &self.scan.parts;
-        let source = &parts.sources[current.source];
-        let (rows, left, times) = (&mut self.rows, &mut self.left, &self.scan.times);
-        let offset = current.offset;
-        let mut sink = |record: Record<'_>| {
+        let source = &parts.sources[*source];
+        let path = &source.file.path;
+        while let Some(record) = records.next_record().map_err(|what| Fault::damaged(path, *offset, what))? {
             let Record::Message { header, data } = &record else {
-                let checked = source.file.digests.check(&record).map(|()| ReadStep::Continue);
-                return checked
-                    .map_err(|what| Fault::Damaged { file: source.file.path.to_string(), offset, what }.into());
+                source.file.digests.check(&record).map_err(|what| Fault::damaged(path, *offset, what))?;
+                continue;
             };
             let Some((topic, mapping)) = source.channels.get(&header.channel_id) else {
                 if source.file.channels.contains_key(&header.channel_id) {
-                    return Ok(ReadStep::Continue);
+                    continue;
                 }
-                let (file, what) = (source.file.path.to_string(), undescribed(header.channel_id));
-                return Err(Fault::Damaged { file, offset, what }.into());
+                return Err(Fault::damaged(path, *offset, undescribed(header.channel_id)).into());
             };
-            let within =
-                |times: &RangeInclusive<i64>| i64::try_from(header.log_time).is_ok_and(|nanos| times.contains(&nanos));
-            if !times.as_ref().is_none_or(within) {
-                return Ok(ReadStep::Continue);
+            if let Some(times) = &self.scan.times
+                && !i64::try_from(header.log_time).is_ok_and(|nanos| times.contains(&nanos))
+            {
+                continue;
             }
             let message = Message { run: source.run.as_ref(), topic, header, data };
             let mapping = parts.mappings.as_ref().map(|all| (*mapping, &all[*mapping]));
-            let ready = rows.push(&message, mapping)?.map_err(|what| Fault::Message {
-                file: source.file.path.to_string(),
+            let is_ready = self.rows.push(&message, mapping)?.map_err(|what| Fault::Message {
+                file: path.to_string(),
                 topic: topic.clone(),
                 sequence: header.sequence,
-                offset,
+                offset: *offset,
                 what,
             })?;
-            *left -= 1;
-            Ok::<_, DataFusionError>(if ready || *left == 0 { ReadStep::Pause } else { ReadStep::Continue })
-        };
-        let progress = current.records.read(&mut sink);
-        self.unfit.add(self.rows.take_unfit());
-        match progress {
-            Ok(ReadProgress::Paused) => Ok(()),
-            Ok(ReadProgress::Done) => {
-                self.current = None;
-                Ok(())
+            self.left -= 1;
+            if is_ready || self.left == 0 {
+                return Ok(());
             }
-            Err(ReadStop::Damage(what)) => {
-                let source = current.source;
-                Err(self.damaged(source, offset, what).into())
-            }
-            Err(ReadStop::Sink(e)) => Err(e),
         }
-    }
-
-    fn damaged(&self, source: usize, offset: u64, what: String) -> Fault {
-        Fault::Damaged { file: self.scan.parts.sources[source].file.path.to_string(), offset, what }
+        self.current = None;
+        Ok(())
     }
 }

@@ -1,6 +1,6 @@
 //! The messages of one topic as a table, whose rows come from many files.
 
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::collections::{BTreeSet, HashMap};
 use std::ops::RangeInclusive;
 use std::sync::Arc;
 
@@ -16,11 +16,11 @@ use datafusion::physical_plan::ExecutionPlan;
 use futures::FutureExt as _;
 use futures::future::ready;
 
+use super::encodings::{MessageLayout, RawSchema, is_supported};
 use super::error::Fault;
-use super::file::{Channel, Files, McapFile, Piece};
+use super::file::{Channel, Files, McapFile};
 use super::rows::{Head, Mapping};
-use super::scan::{McapExec, Scan};
-use super::schema::{Layout, RawSchema};
+use super::scan::{McapExec, Parts, Scan, Source};
 use super::target::Target;
 use crate::boxed_scan::boxed_scan;
 
@@ -36,27 +36,6 @@ const PREFIX: &str = "message_";
 pub(super) struct McapTable {
     schema: SchemaRef,
     parts: Arc<Parts>,
-}
-
-/// What all partitions of all scans of a table share.
-#[derive(Debug)]
-pub(super) struct Parts {
-    /// What it is called in plans.
-    pub(super) name: String,
-    pub(super) files: Arc<Files>,
-    pub(super) heads: Vec<Head>,
-    pub(super) sources: Vec<Source>,
-    /// None in a table of messages as they are.
-    pub(super) mappings: Option<Vec<Mapping>>,
-}
-
-/// One file.
-#[derive(Debug)]
-pub(super) struct Source {
-    pub(super) run: Option<(String, String)>,
-    pub(super) file: Arc<McapFile>,
-    /// The channels that are meant: topic, and which mapping they have.
-    pub(super) channels: BTreeMap<u16, (String, usize)>,
 }
 
 /// The table of a topic's messages, a column a field.
@@ -123,7 +102,7 @@ struct Layouts {
 /// The layout of a schema, and the first file that has it.
 struct SchemaLayout {
     file: String,
-    layout: Arc<Layout>,
+    layout: Arc<MessageLayout>,
 }
 
 impl Layouts {
@@ -161,10 +140,10 @@ impl Layouts {
             }
         }
         for (target, schema, refusal) in refusals {
-            if layouts.all.is_empty() || Layout::is_known(&schema) {
+            if layouts.all.is_empty() || is_supported(&schema) {
                 return Err(refusal);
             }
-            layouts.add(&target.file, &schema, Layout::without_columns());
+            layouts.add(&target.file, &schema, MessageLayout::without_columns());
         }
         match refusal_of_empty {
             Some(refusal) if layouts.all.is_empty() => Err(refusal),
@@ -172,13 +151,13 @@ impl Layouts {
         }
     }
 
-    fn add(&mut self, file: &McapFile, schema: &Arc<RawSchema>, layout: Layout) {
+    fn add(&mut self, file: &McapFile, schema: &Arc<RawSchema>, layout: MessageLayout) {
         self.known.insert(schema.clone(), self.all.len());
         self.all.push(SchemaLayout { file: file.path.to_string(), layout: Arc::new(layout) });
     }
 
     // Whether no column has another type than one of its name in the others.
-    fn fits(&self, layout: &Layout) -> bool {
+    fn fits(&self, layout: &MessageLayout) -> bool {
         let clashes = |field: &Arc<Field>| {
             let mut others = self.all.iter().filter_map(|other| other.layout.fields.find(field.name()));
             others.any(|(_, other)| other != field)
@@ -231,24 +210,12 @@ impl Layouts {
     }
 }
 
-fn layout_of(file: &McapFile, topic: &str, schema: &RawSchema) -> Result<Layout, Fault> {
+fn layout_of(file: &McapFile, topic: &str, schema: &RawSchema) -> Result<MessageLayout, Fault> {
     let layout = match schema.data.len() {
-        ..=LARGEST_SCHEMA => Layout::new(schema),
+        ..=LARGEST_SCHEMA => MessageLayout::from_schema(schema),
         bytes => Err(format!("its schema has {bytes} bytes, more than {LARGEST_SCHEMA}")),
     };
     layout.map_err(|what| Fault::Schema { file: file.path.to_string(), topic: topic.to_owned(), what })
-}
-
-impl Source {
-    // The pieces that may have messages of the channels in the time.
-    fn pieces<'a>(&'a self, times: Option<&'a RangeInclusive<i64>>) -> impl Iterator<Item = &'a Piece> {
-        let nanos = |time: u64| i64::try_from(time).unwrap_or(i64::MAX);
-        let within = move |p: &&Piece| {
-            times.is_none_or(|times| nanos(p.times.1) >= *times.start() && nanos(p.times.0) <= *times.end())
-        };
-        let meant = |p: &&Piece| self.channels.keys().any(|channel| p.has(*channel));
-        self.file.pieces.iter().filter(within).filter(meant)
-    }
 }
 
 impl TableProvider for McapTable {
@@ -268,7 +235,9 @@ impl TableProvider for McapTable {
         Ok(filters.iter().map(one).collect())
     }
 
-    boxed_scan!(self, state, projection, filters, limit => ready(self.messages(state, projection, filters, limit)).boxed());
+    boxed_scan!(self, state, projection, filters, limit => {
+        ready(self.messages(state, projection, filters, limit)).boxed()
+    });
 }
 
 impl McapTable {

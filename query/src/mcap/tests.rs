@@ -9,7 +9,7 @@ use echolake_lake::{FileName, Lake, ReferenceSurfaces, VisibleRun, encode};
 use echolake_schema::Rig;
 use echolake_schema::tables::Table;
 use mcap::records::MessageHeader;
-use mcap::{Compression, WriteOptions, Writer};
+use mcap::{Compression, WriteOptions};
 use object_store::ObjectStoreExt as _;
 use object_store::path::Path;
 
@@ -17,21 +17,21 @@ use crate::{Error, Session};
 
 const SECOND: u64 = 1_000_000_000;
 /// 2026-01-06, 00:00.
-const START: u64 = 1_767_657_600 * SECOND;
+pub(in crate::mcap) const START: u64 = 1_767_657_600 * SECOND;
 
 /// A lake in memory, and one session for all that is asked of it: to make one takes longer than most queries.
-struct TestLake {
+pub(in crate::mcap) struct TestLake {
     lake: Lake,
     session: Session,
 }
 
-async fn lake() -> TestLake {
+pub(in crate::mcap) async fn lake() -> TestLake {
     let lake = Lake::open_or_create("memory://", &Rig::paper(), &ReferenceSurfaces::default()).await.expect("a lake");
     let session = Session::new(&lake).expect("a session");
     TestLake { lake, session }
 }
 
-async fn put(lake: &TestLake, path: &str, file: Vec<u8>) {
+pub(in crate::mcap) async fn put(lake: &TestLake, path: &str, file: Vec<u8>) {
     lake.lake.store().put(&Path::from(path), file.into()).await.expect("written");
 }
 
@@ -48,12 +48,12 @@ async fn rows(lake: &TestLake, sql: &str) -> Vec<RecordBatch> {
     try_rows(lake, sql).await.unwrap_or_else(|e| panic!("{sql}: {e}"))
 }
 
-async fn number(lake: &TestLake, sql: &str) -> i64 {
+pub(in crate::mcap) async fn number(lake: &TestLake, sql: &str) -> i64 {
     rows(lake, sql).await[0].column(0).as_primitive::<Int64Type>().value(0)
 }
 
 /// Checks an answer as it is printed, the frame aside.
-async fn check(lake: &TestLake, sql: &str, expected: &[&str]) {
+pub(in crate::mcap) async fn check(lake: &TestLake, sql: &str, expected: &[&str]) {
     let printed = pretty_format_batches(&rows(lake, sql).await).expect("printed").to_string();
     let lines: Vec<_> = printed.lines().filter(|l| l.starts_with('|')).skip(1).collect();
     let lines: Vec<String> =
@@ -61,7 +61,7 @@ async fn check(lake: &TestLake, sql: &str, expected: &[&str]) {
     assert_eq!(lines, expected, "{sql}\n{printed}");
 }
 
-async fn refused(lake: &TestLake, sql: &str, expected: &[&str]) {
+pub(in crate::mcap) async fn refused(lake: &TestLake, sql: &str, expected: &[&str]) {
     let error = try_rows(lake, sql).await.map(|b| b.len()).expect_err(sql).to_string();
     for text in expected {
         assert!(error.contains(text), "{sql}: {error}");
@@ -129,30 +129,38 @@ async fn put_run(lake: &TestLake, surface: &str, run: &str, file: Vec<u8>) {
     lake.lake.commit(&[staged]).await.expect("committed");
 }
 
-#[tokio::test]
-async fn json_channels_are_columns_by_their_schema_or_text() {
-    let lake = lake().await;
-    put(&lake, "inbox/j.mcap", json_file(options(Some(Compression::Zstd)), 3)).await;
-    check(
-        &lake,
-        "select run_id, log_time, sequence, x, name, tags, \"at\", message_sequence \
-         from mcap('inbox/j.mcap', '/point') where sequence in (0, 17) order by log_time_ns",
-        &[
-            " | 2026-01-06T00:00:00Z | 0 | 0.0 | p0 | [0, 1] | {z: -0.0} | 0",
-            " | 2026-01-06T00:00:01.700Z | 17 | 4.25 | p17 | [17, 1] | {z: -4.25} | 17",
-        ],
-    )
-    .await;
-    check(&lake, "select json from mcap('inbox/j.mcap', '/note') limit 1", &[r#"{"free":"form"}"#]).await;
-    check(
-        &lake,
-        "select topic, size, arrow_cast(data, 'Utf8') from mcap_messages('inbox/j.mcap', '/note') limit 1",
-        &[r#"/note | 15 | {"free":"form"}"#],
-    )
-    .await;
-    assert_eq!(number(&lake, "select count(*) from MCAP_MESSAGES('inbox/j.mcap')").await, 33);
-    assert_eq!(number(&lake, "select count(*) from mcap('inbox/j.mcap', '/point') a join mcap('inbox/j.mcap', '/note') b on a.log_time_ns = b.log_time_ns").await, 3);
+/// A channel of a file: its topic, encoding and schema, and its messages.
+pub(in crate::mcap) struct TestChannel<'a> {
+    pub(in crate::mcap) topic: &'a str,
+    pub(in crate::mcap) encoding: &'a str,
+    /// Name, encoding and data.
+    pub(in crate::mcap) schema: (&'a str, &'a str, &'a [u8]),
+    pub(in crate::mcap) messages: &'a [&'a [u8]],
 }
+
+pub(in crate::mcap) fn file_of(channels: &[TestChannel<'_>]) -> Vec<u8> {
+    let mut file = Cursor::new(Vec::new());
+    let mut writer = options(None).create(&mut file).expect("a writer");
+    for channel in channels {
+        let (name, encoding, data) = channel.schema;
+        let schema = if name.is_empty() { 0 } else { writer.add_schema(name, encoding, data).expect("added") };
+        let id = writer.add_channel(schema, channel.topic, channel.encoding, &Default::default()).expect("added");
+        for (i, data) in channel.messages.iter().enumerate() {
+            let header = MessageHeader { channel_id: id, sequence: i as u32, log_time: START, publish_time: START };
+            writer.write_to_known_channel(&header, data).expect("written");
+        }
+    }
+    writer.finish().expect("finished");
+    drop(writer);
+    file.into_inner()
+}
+
+pub(in crate::mcap) fn json_channel<'a>(schema: &'a str, messages: &'a [&'a [u8]]) -> TestChannel<'a> {
+    TestChannel { topic: "/t", encoding: "json", schema: ("T", "jsonschema", schema.as_bytes()), messages }
+}
+
+pub(in crate::mcap) const NUMBERS: &str = r#"{"properties":{"x":{"type":"number"},"n":{"type":"integer"},
+    "small":{"type":"integer","minimum":0,"maximum":9}}}"#;
 
 #[tokio::test]
 async fn topics_are_listed_with_their_times() {
@@ -195,7 +203,7 @@ async fn runs_are_asked_by_surface_run_and_pattern() {
 }
 
 /// A metric of EXPLAIN ANALYZE.
-async fn metric(lake: &TestLake, sql: &str, name: &str) -> u64 {
+pub(in crate::mcap) async fn metric(lake: &TestLake, sql: &str, name: &str) -> u64 {
     let plan =
         pretty_format_batches(&rows(lake, &format!("explain analyze {sql}")).await).expect("printed").to_string();
     let (_, behind) = plan.split_once(&format!("{name}=")).unwrap_or_else(|| panic!("no {name} in {plan}"));
@@ -274,107 +282,6 @@ async fn files_that_are_cut_off_give_what_they_have() {
             Err(e) => assert!(length < 8, "{length}: {e}"),
         }
     }
-}
-
-/// Encodes a ROS 2 message: values aligned to their size behind a header of four bytes.
-#[derive(Default)]
-struct Cdr(Vec<u8>);
-
-impl Cdr {
-    fn put<const N: usize>(mut self, bytes: [u8; N]) -> Self {
-        self.0.resize(self.0.len().next_multiple_of(N), 0);
-        self.0.extend_from_slice(&bytes);
-        self
-    }
-
-    fn text(self, text: &str) -> Self {
-        let mut cdr = self.put((text.len() as u32 + 1).to_le_bytes());
-        cdr.0.extend_from_slice(text.as_bytes());
-        cdr.0.push(0);
-        cdr
-    }
-
-    fn message(self) -> Vec<u8> {
-        [&[0, 1, 0, 0], self.0.as_slice()].concat()
-    }
-}
-
-const STATE: &str = "
-# A state.
-int8 KIND=3
-std_msgs/Header header
-float64[] position
-geometry_msgs/Point[2] corners
-uint8[] image
-string<=10 name \"none\"
-bool ok
-Extra extra
-================================================================================
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-================================================================================
-MSG: geometry_msgs/Point
-float32 x
-float32 y
-================================================================================
-MSG: test_msgs/Extra
-int16 a
-uint64 b
-";
-
-fn state(n: u32) -> Vec<u8> {
-    let cdr = Cdr::default().put(n.to_le_bytes()).put(5u32.to_le_bytes()).text("panel");
-    let cdr = cdr.put(3u32.to_le_bytes()).put(1.5f64.to_le_bytes()).put(2.5f64.to_le_bytes());
-    let cdr = cdr.put(f64::from(n).to_le_bytes());
-    let cdr = [1f32, 2.0, 3.0, 4.0].into_iter().fold(cdr, |cdr, v| cdr.put(v.to_le_bytes()));
-    let cdr = cdr.put(3u32.to_le_bytes()).put([7]).put([8]).put([9]).text("x").put([1]);
-    cdr.put((-2i16).to_le_bytes()).put(99u64.to_le_bytes()).message()
-}
-
-fn ros_file(messages: &[Vec<u8>]) -> Vec<u8> {
-    let mut file = Cursor::new(Vec::new());
-    let mut writer = Writer::new(&mut file).expect("a writer");
-    let schema = writer.add_schema("test_msgs/msg/State", "ros2msg", STATE.as_bytes()).expect("added");
-    let channel = writer.add_channel(schema, "/state", "cdr", &Default::default()).expect("added");
-    for (i, data) in messages.iter().enumerate() {
-        let header = MessageHeader { channel_id: channel, sequence: i as u32, log_time: START, publish_time: START };
-        writer.write_to_known_channel(&header, data).expect("written");
-    }
-    writer.finish().expect("finished");
-    drop(writer);
-    file.into_inner()
-}
-
-#[tokio::test]
-async fn ros_messages_are_columns() {
-    let lake = lake().await;
-    put(&lake, "inbox/r.mcap", ros_file(&[state(1), state(2)])).await;
-    check(
-        &lake,
-        "select header, position, corners, encode(image, 'hex'), name, ok, extra from mcap('inbox/r.mcap', '/state') order by sequence",
-        &[
-            "{stamp: 1970-01-01T00:00:01.000000005Z, frame_id: panel} | [1.5, 2.5, 1.0] | [{x: 1.0, y: 2.0}, {x: 3.0, y: 4.0}] | 070809 | x | true | {a: -2, b: 99}",
-            "{stamp: 1970-01-01T00:00:02.000000005Z, frame_id: panel} | [1.5, 2.5, 2.0] | [{x: 1.0, y: 2.0}, {x: 3.0, y: 4.0}] | 070809 | x | true | {a: -2, b: 99}",
-        ],
-    )
-    .await;
-    check(&lake, "select name from mcap('inbox/r.mcap', '/state') where sequence = 1", &["x"]).await;
-}
-
-#[tokio::test]
-async fn messages_that_do_not_fit_their_schema_are_named() {
-    let lake = lake().await;
-    let whole = state(1);
-    for length in 0..whole.len() {
-        put(&lake, "inbox/r.mcap", ros_file(&[state(0), whole[..length].to_vec()])).await;
-        refused(&lake, "select * from mcap('inbox/r.mcap', '/state')", &["message 1 of topic `/state`"]).await;
-    }
-    let mut lies = state(1);
-    // The count of `position`, behind the header.
-    lies[24..28].copy_from_slice(&u32::MAX.to_le_bytes());
-    put(&lake, "inbox/r.mcap", ros_file(&[lies])).await;
-    refused(&lake, "select * from mcap('inbox/r.mcap', '/state')", &["ends within a value"]).await;
 }
 
 mod foreign;

@@ -1,8 +1,6 @@
 //! The topics of files as a table: what there is, before anything is scanned.
 
 use std::collections::HashMap;
-use std::convert::Infallible;
-use std::ops::Range;
 use std::sync::Arc;
 
 use arrow::array::{ArrayRef, BooleanArray, Int64Array, StringArray, TimestampNanosecondArray};
@@ -14,12 +12,11 @@ use datafusion::datasource::MemTable;
 use echolake_recording::{Record, RecordCursor};
 use echolake_schema::escape_controls;
 use futures::{StreamExt as _, TryStreamExt as _};
-use object_store::ObjectStoreExt as _;
 
-use super::chunk::{PieceKind, PieceRecords, ReadStep, ReadStop};
 use super::column::{UTC, time_type};
 use super::error::Fault;
-use super::file::{Files, McapFile, Piece};
+use super::file::{Files, McapFile};
+use super::piece::{Piece, PieceKind, PieceRecords};
 use super::rows::Head;
 use super::target::Target;
 
@@ -120,9 +117,9 @@ async fn times(file: &McapFile, files: &Files) -> Result<HashMap<u16, (u64, u64)
         if let Some(times) = channel.times {
             found.insert(*id, times);
         } else if channel.messages != Some(0)
-            && let (Some(first), Some(last)) = (indexes.first(*id).await?, indexes.last(*id).await?)
+            && let Some(times) = indexes.times(*id).await?
         {
-            found.insert(*id, (first, last));
+            found.insert(*id, times);
         }
     }
     Ok(found)
@@ -136,72 +133,55 @@ struct Indexes<'a> {
 }
 
 impl Indexes<'_> {
-    async fn first(&mut self, channel: u16) -> Result<Option<u64>, Fault> {
+    // Times of a channel's first and last message. Once the piece that begins first and the one that ends last are
+    // read, most others lie between them.
+    async fn times(&mut self, channel: u16) -> Result<Times, Fault> {
         let mut pieces: Vec<_> = self.file.pieces.iter().filter(|p| p.has(channel)).collect();
         pieces.sort_by_key(|p| p.times.0);
-        let mut best: Option<u64> = None;
-        for piece in pieces {
-            if best.is_some_and(|best| piece.times.0 >= best) {
-                break;
-            }
-            let Some((first, _)) = self.of(piece, channel).await? else { continue };
-            best = Some(best.map_or(first, |best| best.min(first)));
+        if let Some(latest) = (1..pieces.len()).max_by_key(|i| pieces[*i].times.1) {
+            pieces[1..=latest].rotate_right(1);
         }
-        Ok(best)
-    }
-
-    async fn last(&mut self, channel: u16) -> Result<Option<u64>, Fault> {
-        let mut pieces: Vec<_> = self.file.pieces.iter().filter(|p| p.has(channel)).collect();
-        pieces.sort_by_key(|p| std::cmp::Reverse(p.times.1));
-        let mut best: Option<u64> = None;
+        let mut times: Times = None;
         for piece in pieces {
-            if best.is_some_and(|best| piece.times.1 <= best) {
-                break;
+            if times.is_some_and(|(first, last)| first <= piece.times.0 && piece.times.1 <= last) {
+                continue;
             }
-            let Some((_, last)) = self.of(piece, channel).await? else { continue };
-            best = Some(best.map_or(last, |best| best.max(last)));
+            if let Some((first, last)) = self.of(piece, channel).await? {
+                times = Some(times.map_or((first, last), |times| (times.0.min(first), times.1.max(last))));
+            }
         }
-        Ok(best)
+        Ok(times)
     }
 
     // None if the channel has no messages in the piece.
     async fn of(&mut self, piece: &Piece, channel: u16) -> Result<Times, Fault> {
         let place = piece.range.start;
         if !self.read.contains_key(&place) {
-            let times = match (1..=LARGEST_INDEX).contains(&piece.index) {
-                true => index_times(self.bytes(piece.range.end..piece.range.end + piece.index).await?),
-                false => {
-                    let damaged = |what| Fault::Damaged { file: self.file.path.to_string(), offset: place, what };
-                    chunk_times(self.bytes(piece.range.clone()).await?).map_err(damaged)?
-                }
+            let path = &self.file.path;
+            let times = if (1..=LARGEST_INDEX).contains(&piece.index) {
+                let index = piece.range.end..piece.range.end + piece.index;
+                index_times(self.files.read_range(path, index).await?)
+            } else {
+                let chunk = self.files.read_range(path, piece.range.clone()).await?;
+                chunk_times(chunk).map_err(|what| Fault::damaged(path, place, what))?
             };
             self.read.insert(place, times);
         }
         Ok(self.read.get(&place).and_then(|times| times.get(&channel).copied()))
     }
-
-    async fn bytes(&self, range: Range<u64>) -> Result<Bytes, Fault> {
-        let path = &self.file.path;
-        let bytes = self.files.store.get_range(path, range).await;
-        bytes.map_err(|source| Fault::Read { file: path.to_string(), source })
-    }
 }
 
 fn chunk_times(chunk: Bytes) -> Result<HashMap<u16, (u64, u64)>, String> {
     let mut times = HashMap::new();
-    let mut sink = |record: Record<'_>| {
+    let mut records = PieceRecords::new(chunk, PieceKind::Chunk)?;
+    while let Some(record) = records.next_record()? {
         if let Record::Message { header, .. } = record {
-            let time = header.log_time;
-            let widen = |(first, last): &mut (u64, u64)| (*first, *last) = (time.min(*first), time.max(*last));
-            times.entry(header.channel_id).and_modify(widen).or_insert((time, time));
+            let (first, last) = times.entry(header.channel_id).or_insert((header.log_time, header.log_time));
+            *first = header.log_time.min(*first);
+            *last = header.log_time.max(*last);
         }
-        Ok::<_, Infallible>(ReadStep::Continue)
-    };
-    match PieceRecords::new(chunk, PieceKind::Chunk)?.read(&mut sink) {
-        Ok(_) => Ok(times),
-        Err(ReadStop::Damage(what)) => Err(what),
-        Err(ReadStop::Sink(never)) => match never {},
     }
+    Ok(times)
 }
 
 fn index_times(bytes: Bytes) -> HashMap<u16, (u64, u64)> {

@@ -9,9 +9,8 @@ use arrow::datatypes::{DataType, Field, Fields};
 use echolake_schema::tables::LIST_CHILD;
 use serde_json::{Map, Number, Value};
 
-use super::column::{Column, DEEPEST, MOST_LEAVES, Record, integer_type, width};
-use super::error::{Malformed, Spent};
-use super::schema::BYTE_ORDER_MARK;
+use super::{Malformed, MessageDecoder, MessageEncoding, MessageType, RawSchema, RowTally, strip_byte_order_mark};
+use crate::mcap::column::{Column, DEEPEST, MOST_LEAVES, append_text, integer_type, width};
 
 /// A parsed value takes about this many bytes for each byte of its text, at worst.
 const PARSED: usize = 16;
@@ -19,27 +18,40 @@ const PARSED: usize = 16;
 const MOST_INTEGER: f64 = 18_446_744_073_709_551_616.0;
 /// Numbers that JSON's grammar lacks and that many writers write all the same. Others, as `1e400`, exceed 64 bits.
 const NO_NUMBERS: [&str; 3] = ["-Infinity", "Infinity", "NaN"];
+const NO_OBJECT: Malformed = Malformed::Invalid("it is no JSON object");
 
-/// Where the columns come from.
+/// JSON, with a JSON schema or without.
+pub(super) struct JsonEncoding;
+
+impl MessageEncoding for JsonEncoding {
+    fn names(&self) -> &'static [(&'static str, &'static str)] {
+        &[("json", "jsonschema"), ("json", "")]
+    }
+
+    fn parse_schema(&self, channel: &RawSchema) -> Result<(Fields, Box<dyn MessageType>), String> {
+        let schema = strip_byte_order_mark(&channel.data);
+        if !schema.iter().all(u8::is_ascii_whitespace) {
+            let schema: Value = serde_json::from_slice(schema).map_err(|e| format!("its schema is no JSON: {e}"))?;
+            if let Some(properties) = properties(&schema) {
+                return Ok((fields(properties, 1, &mut 0)?, Box::new(JsonType::Properties)));
+            }
+        }
+        Ok((Fields::from(vec![Field::new("json", DataType::Utf8, true)]), Box::new(JsonType::Text)))
+    }
+}
+
+/// The source of the columns.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Shape {
+enum JsonType {
     /// Each is a property.
     Properties,
     /// There is one, the text.
     Text,
 }
 
-/// The columns that a JSON schema describes.
-pub(super) fn columns(schema: &[u8]) -> Result<(Fields, Shape), String> {
-    let whole = || (Fields::from(vec![Field::new("json", DataType::Utf8, true)]), Shape::Text);
-    if schema.iter().all(u8::is_ascii_whitespace) {
-        return Ok(whole());
-    }
-    let schema: Value = serde_json::from_slice(schema).map_err(|e| format!("its schema is no JSON: {e}"))?;
-    let mut leaves = 0;
-    match properties(&schema) {
-        Some(properties) => Ok((fields(properties, 1, &mut leaves)?, Shape::Properties)),
-        None => Ok(whole()),
+impl MessageType for JsonType {
+    fn decoder(&self, _: &[usize], fields: &Fields) -> Box<dyn MessageDecoder> {
+        Box::new(JsonDecoder { json_type: *self, fields: fields.clone() })
     }
 }
 
@@ -99,62 +111,40 @@ fn integer(schema: &Value) -> DataType {
 }
 
 /// Decodes messages.
-pub(super) struct Decoder {
-    shape: Shape,
+struct JsonDecoder {
+    json_type: JsonType,
     fields: Fields,
-    record: Record,
-    width: usize,
-    pub(super) spent: Spent,
-    /// Values that are null because they are not of their column's type, or no numbers.
-    pub(super) unfit: usize,
 }
 
-impl Decoder {
-    pub(super) fn new(shape: Shape, all: &Fields, wanted: &[usize]) -> Self {
-        let fields: Fields = wanted.iter().map(|i| all[*i].clone()).collect();
-        let width = fields.iter().map(|f| width(f.data_type())).sum();
-        Self { shape, record: Record::new(&fields), fields, width, spent: Spent::default(), unfit: 0 }
-    }
-
-    pub(super) fn push(&mut self, data: &[u8]) -> Result<(), Malformed> {
-        self.spent.add(self.width)?;
-        // Nothing is asked of the message: it is not parsed.
-        if self.record.columns.is_empty() {
-            return Ok(());
-        }
-        if self.shape == Shape::Text {
-            self.spent.add(data.len())?;
-            for column in &mut self.record.columns {
-                if let Column::Text(c) = column {
-                    c.push_text(data);
-                }
+impl MessageDecoder for JsonDecoder {
+    fn decode(&mut self, message: &[u8], columns: &mut [Column], tally: &mut RowTally) -> Result<(), Malformed> {
+        match (self.json_type, columns) {
+            // Nothing is asked of the message: it is not parsed.
+            (_, []) => Ok(()),
+            (JsonType::Text, [Column::Text(text), ..]) => {
+                tally.add_bytes(message.len())?;
+                append_text(text, message);
+                Ok(())
             }
-            return Ok(());
+            (_, columns) => {
+                let message = parse(message, tally)?;
+                let message = message.as_object().ok_or(NO_OBJECT)?;
+                push_members(columns, &self.fields, message, tally)
+            }
         }
-        let message = self.parse(data)?;
-        let message = message.as_object().ok_or(Malformed::Json)?;
-        for (field, column) in self.fields.iter().zip(&mut self.record.columns) {
-            push(column, field.data_type(), message.get(field.name()), &mut self.spent, &mut self.unfit)?;
-        }
-        Ok(())
     }
+}
 
-    fn parse(&mut self, data: &[u8]) -> Result<Value, Malformed> {
-        Spent::default().add(data.len().saturating_mul(PARSED))?;
-        let data = data.strip_prefix(BYTE_ORDER_MARK).unwrap_or(data);
-        if let Ok(message) = serde_json::from_slice(data) {
-            return Ok(message);
-        }
-        let (text, replaced) = without_no_numbers(data);
-        let message = serde_json::from_slice(&text).map_err(|_| Malformed::Json)?;
-        self.unfit += replaced;
-        Ok(message)
+fn parse(message: &[u8], tally: &mut RowTally) -> Result<Value, Malformed> {
+    RowTally::default().add_bytes(message.len().saturating_mul(PARSED))?;
+    let message = strip_byte_order_mark(message);
+    if let Ok(message) = serde_json::from_slice(message) {
+        return Ok(message);
     }
-
-    pub(super) fn columns(&mut self) -> &mut [Column] {
-        self.spent = Spent::default();
-        &mut self.record.columns
-    }
+    let (text, replaced) = without_no_numbers(message);
+    let message = serde_json::from_slice(&text).map_err(|_| NO_OBJECT)?;
+    tally.unfit += replaced;
+    Ok(message)
 }
 
 // The text with null in the place of NaN, infinities and numbers that 64 bits do not have, and how many there were.
@@ -166,13 +156,8 @@ fn without_no_numbers(data: &[u8]) -> (Vec<u8>, usize) {
         let name = NO_NUMBERS.iter().find(|name| !in_string && rest.starts_with(name.as_bytes()));
         let number = match name {
             Some(name) => name.len(),
-            None => {
-                if in_string {
-                    0
-                } else {
-                    number_length(rest)
-                }
-            }
+            None if in_string => 0,
+            None => number_length(rest),
         };
         let is_none = name.is_some() || is_too_large(&rest[..number]);
         let taken = match is_none {
@@ -208,56 +193,60 @@ fn is_too_large(number: &[u8]) -> bool {
     number.is_some_and(f64::is_infinite)
 }
 
-fn push(
-    column: &mut Column,
-    kind: &DataType,
-    value: Option<&Value>,
-    spent: &mut Spent,
-    unfit: &mut usize,
+fn push_members(
+    columns: &mut [Column],
+    fields: &Fields,
+    members: &Map<String, Value>,
+    tally: &mut RowTally,
 ) -> Result<(), Malformed> {
+    for (field, column) in fields.iter().zip(columns) {
+        push(column, field.data_type(), members.get(field.name()), tally)?;
+    }
+    Ok(())
+}
+
+fn push(column: &mut Column, kind: &DataType, value: Option<&Value>, tally: &mut RowTally) -> Result<(), Malformed> {
     let Some(value) = value.filter(|v| !v.is_null()) else {
-        column.push_null();
+        column.append_null();
         return Ok(());
     };
     match (column, kind, value) {
-        (Column::F64(c), _, Value::Number(n)) if n.as_f64().is_some() => c.push(n.as_f64().unwrap_or(f64::NAN)),
+        (Column::F64(c), _, Value::Number(n)) if n.as_f64().is_some() => c.append_option(n.as_f64()),
         (Column::I64(c), _, Value::Number(n)) => {
             let value = integer_of(n).and_then(|value| i64::try_from(value).ok());
-            *unfit += usize::from(value.is_none());
-            c.push_option(value);
+            tally.unfit += usize::from(value.is_none());
+            c.append_option(value);
         }
         (Column::Decimal(c), _, Value::Number(n)) => {
             let value = integer_of(n);
-            *unfit += usize::from(value.is_none());
-            c.push_option(value);
+            tally.unfit += usize::from(value.is_none());
+            c.append_option(value);
         }
-        (Column::Bool(c), _, Value::Bool(b)) => c.push(*b),
+        (Column::Bool(c), _, Value::Bool(b)) => c.append_value(*b),
         (Column::Text(c), _, Value::String(text)) => {
-            spent.add(text.len())?;
-            c.push(text.as_bytes());
+            tally.add_bytes(text.len())?;
+            c.append_value(text.as_bytes());
         }
         (Column::Text(c), _, other) => {
             let text = other.to_string();
-            spent.add(text.len())?;
-            c.push(text.as_bytes());
+            tally.add_bytes(text.len())?;
+            c.append_value(text.as_bytes());
         }
         (Column::List(list), DataType::List(child), Value::Array(values)) => {
             let each = width(child.data_type());
             for value in values {
-                spent.add(each)?;
-                push(&mut list.values, child.data_type(), Some(value), spent, unfit)?;
+                tally.add_bytes(each)?;
+                push(&mut list.values, child.data_type(), Some(value), tally)?;
             }
             list.end_row();
         }
         (Column::Struct(record), DataType::Struct(fields), Value::Object(members)) => {
-            for (field, column) in fields.iter().zip(&mut record.columns) {
-                push(column, field.data_type(), members.get(field.name()), spent, unfit)?;
-            }
+            push_members(&mut record.columns, fields, members, tally)?;
             record.end_row();
         }
         (other, _, _) => {
-            *unfit += 1;
-            other.push_null();
+            tally.unfit += 1;
+            other.append_null();
         }
     }
     Ok(())
@@ -271,3 +260,6 @@ fn integer_of(number: &Number) -> Option<i128> {
         (value.fract() == 0.0 && value.abs() < MOST_INTEGER).then_some(value as i128)
     })
 }
+
+#[cfg(test)]
+mod tests;

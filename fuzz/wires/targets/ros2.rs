@@ -1,9 +1,9 @@
-//! Messages of MCAP files with their schemas, in every encoding that has columns.
+//! Messages of MCAP files in ROS 2, with their schemas.
 #![no_main]
 
 use echolake_fuzz_wires::MessageInput;
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(init: echolake_fuzz_wires::write_seeds_on_request(), |bytes: &[u8]| {
-    let _ = MessageInput::parse(bytes).and_then(|input| input.message().decode());
+    let _ = MessageInput::parse(bytes).and_then(|input| input.with_encodings("cdr", "ros2msg").decode());
 });

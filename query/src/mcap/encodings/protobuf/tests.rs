@@ -13,8 +13,8 @@ use prost_reflect::prost_types::{
 };
 use prost_reflect::{DynamicMessage, MapKey, ReflectMessage as _, Value};
 
-use super::super::schema::{Layout, RawSchema};
 use super::*;
+use crate::mcap::encodings::{Malformed, MessageLayout, RowDecoder};
 
 /// A linear congruential generator: Knuth, MMIX.
 struct Random(u64);
@@ -287,14 +287,19 @@ fn same_message(name: &str, message: &DynamicMessage, array: &ArrayRef, row: usi
     }
 }
 
-fn decoder(descriptor: &MessageDescriptor) -> Decoder {
+fn layout(descriptor: &MessageDescriptor) -> MessageLayout {
     let fields = fields(descriptor).expect("columns");
-    let all: Vec<_> = (0..fields.len()).collect();
-    Decoder::new(descriptor, &fields, &all)
+    MessageLayout { fields, message_type: Some(Box::new(descriptor.clone())) }
 }
 
-fn finish(decoder: &mut Decoder) -> Vec<ArrayRef> {
-    decoder.columns().iter_mut().map(|c| c.finish().expect("an array")).collect()
+fn decoder(descriptor: &MessageDescriptor) -> RowDecoder {
+    let layout = layout(descriptor);
+    let all: Vec<_> = (0..layout.fields.len()).collect();
+    layout.decoder(&all)
+}
+
+fn finish(decoder: &mut RowDecoder) -> Vec<ArrayRef> {
+    decoder.finish().expect("arrays")
 }
 
 #[test]
@@ -329,18 +334,18 @@ fn random_messages_are_decoded_as_reflection_does() {
 #[test]
 fn some_columns_are_those_of_all() {
     let descriptor = all();
-    let fields = fields(&descriptor).expect("columns");
+    let layout = layout(&descriptor);
     let mut random = Random(3);
     let messages: Vec<_> = (0..40).map(|_| random_message(&descriptor, &mut random, 0).encode_to_vec()).collect();
     let mut whole = decoder(&descriptor);
     messages.iter().for_each(|m| whole.push(m).expect("decoded"));
     let whole = finish(&mut whole);
     for wanted in [vec![], vec![3], vec![70, 2, 61]] {
-        let mut some = Decoder::new(&descriptor, &fields, &wanted);
+        let mut some = layout.decoder(&wanted);
         messages.iter().for_each(|m| some.push(m).expect("decoded"));
         let some = finish(&mut some);
         assert_eq!(some.len(), wanted.len());
-        wanted.iter().zip(&some).for_each(|(i, array)| assert_eq!(array, &whole[*i], "{}", fields[*i].name()));
+        wanted.iter().zip(&some).for_each(|(i, array)| assert_eq!(array, &whole[*i], "{}", layout.fields[*i].name()));
     }
 }
 
@@ -493,7 +498,7 @@ fn a_type_of_too_many_columns_is_refused() {
         messages: "protobuf".into(),
         data: FileDescriptorSet { file: vec![file] }.encode_to_vec(),
     };
-    let error = Layout::new(&schema).map(drop).expect_err("too many");
+    let error = MessageLayout::from_schema(&schema).map(drop).expect_err("too many");
     assert!(error.contains("more than 4096 columns"), "{error}");
 }
 
