@@ -13,7 +13,6 @@ pub(crate) mod http;
 mod lichtblick;
 mod log;
 mod lost_tables;
-mod oidc;
 pub(crate) mod postgres;
 mod projects;
 pub(crate) mod server;

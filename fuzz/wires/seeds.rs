@@ -88,7 +88,6 @@ fn http_seeds() -> Vec<Vec<u8>> {
         format!("HEAD /api/v1/slices.mcap?where=pair_id%3C2&topics=/ir&layout=by-topic HTTP/1.1\r\n{head}\r\n"),
         post("/mcp", json, call),
         post("/api/v1/session", json, r#"{"token": "a"}"#),
-        post("/delta-sharing/shares/echolake/schemas/lake/tables/pairs/query", json, r#"{"limitHint": 1}"#),
     ]
     .map(String::into_bytes)
     .into()

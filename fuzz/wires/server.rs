@@ -66,7 +66,6 @@ impl FuzzedServer {
             postgres: any,
             tokens: None,
             certificate: None,
-            oidc: None,
             is_behind_proxy: false,
             drain: Duration::ZERO,
             engines: engine_settings(program, sockets.to_str().expect("a path in UTF-8")),

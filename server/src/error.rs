@@ -68,16 +68,6 @@ pub enum Error {
         /// The defect in the file.
         message: String,
     },
-    /// An identity provider cannot be asked.
-    #[error(
-        "`{issuer}` cannot be the identity provider: {message}; hint: its issuer, as https://id.example.org/realms/lab"
-    )]
-    Oidc {
-        /// The given issuer.
-        issuer: String,
-        /// The defect.
-        message: String,
-    },
     /// The system gives no random bytes.
     #[error("the system gives no random bytes")]
     Random(#[source] io::Error),

@@ -27,7 +27,6 @@ mod flight;
 pub mod fuzzing;
 mod http;
 mod metrics;
-mod oidc;
 mod postgres;
 mod request_span;
 #[cfg(feature = "otlp")]
@@ -36,11 +35,9 @@ mod running;
 mod scram_verifier;
 mod service;
 mod sessions;
-mod signed_address;
 mod token_access;
 pub mod tokens;
 
 pub use catalogue_pages::CataloguePages;
 pub use door::{AgentDoor, CertificateFiles, EngineSettings, LakeServer, ServerSettings};
 pub use error::Error;
-pub use oidc::OidcSettings;

@@ -22,12 +22,10 @@ pub(crate) enum ServerProtocol {
     Postgres,
     /// The Model Context Protocol.
     Mcp,
-    /// Delta Sharing.
-    Sharing,
 }
 
 impl ServerProtocol {
-    pub(crate) const ALL: [Self; 5] = [Self::Http, Self::FlightSql, Self::Postgres, Self::Mcp, Self::Sharing];
+    pub(crate) const ALL: [Self; 4] = [Self::Http, Self::FlightSql, Self::Postgres, Self::Mcp];
 
     /// As metrics and the log have it.
     pub(crate) fn name(self) -> &'static str {
@@ -36,7 +34,6 @@ impl ServerProtocol {
             Self::FlightSql => "flight_sql",
             Self::Postgres => "postgres",
             Self::Mcp => "mcp",
-            Self::Sharing => "sharing",
         }
     }
 }

@@ -1,4 +1,4 @@
-//! Access control: who a client is, by its token, browser session, or identity provider.
+//! Access control: who a client is, by its token or browser session.
 
 use std::sync::{Arc, PoisonError, RwLock, RwLockReadGuard};
 use std::time::SystemTime;
@@ -7,10 +7,9 @@ use sha2::{Digest as _, Sha256};
 
 use crate::client_identity::ClientIdentity;
 use crate::fault::RequestFault;
-use crate::oidc::IdentityProvider;
 use crate::scram_verifier::ScramVerifier;
 use crate::sessions::BrowserSessions;
-use crate::tokens::{OIDC_PREFIX, TokenFile};
+use crate::tokens::TokenFile;
 
 /// The access rule of a server.
 pub(crate) enum TokenAccess {
@@ -24,7 +23,6 @@ pub(crate) enum TokenAccess {
 pub(crate) struct NamedAccess {
     file: RwLock<TokenFile>,
     sessions: BrowserSessions,
-    provider: Option<Arc<IdentityProvider>>,
 }
 
 impl NamedAccess {
@@ -32,56 +30,25 @@ impl NamedAccess {
         self.file.read().unwrap_or_else(PoisonError::into_inner)
     }
 
-    // The client of a token that was shown before, or is in the file.
+    // The client of a token.
     fn holder(&self, hash: &[u8; 32]) -> Result<Arc<ClientIdentity>, RequestFault> {
-        let file = self.file();
-        if let Some(entry) = file.find(hash) {
-            return Ok(entry.client.clone());
-        }
-        let login = self.provider.as_ref().and_then(|provider| provider.known_login(hash));
-        let user = login.and_then(|login| file.user(&login.name, &login.groups));
-        user.map(Arc::new).ok_or(RequestFault::Unauthenticated)
-    }
-
-    // The clients of a name that may ask now: one of the file, and a user by each token that was shown.
-    fn clients_of(&self, name: &str) -> Vec<Arc<ClientIdentity>> {
-        let file = self.file();
-        let entry = file.find_name(name).map(|entry| entry.client.clone());
-        let user = name.strip_prefix(OIDC_PREFIX).zip(self.provider.as_ref());
-        let logins = user.into_iter().flat_map(|(user, provider)| provider.known_logins(|login| login.name == user));
-        let users = logins.filter_map(|login| file.user(&login.name, &login.groups)).map(Arc::new);
-        entry.into_iter().chain(users).collect()
+        self.file().find(hash).map(|entry| entry.client.clone()).ok_or(RequestFault::Unauthenticated)
     }
 
     // All clients that may ask now.
     fn current(&self) -> Vec<Arc<ClientIdentity>> {
         let file = self.file();
-        let entries = file.entries.iter().filter(|entry| entry.is_valid()).map(|entry| entry.client.clone());
-        let logins = self.provider.iter().flat_map(|provider| provider.known_logins(|_| true));
-        let users = logins.filter_map(|login| file.user(&login.name, &login.groups)).map(Arc::new);
-        entries.chain(users).collect()
-    }
-
-    fn client(&self, token: &str) -> Result<Arc<ClientIdentity>, RequestFault> {
-        let hash = hash_of(token);
-        if let Ok(holder) = self.holder(&hash) {
-            return Ok(holder);
-        }
-        let login = self.provider.as_ref().and_then(|provider| provider.log_in(token, hash));
-        let Some(login) = login else { return Err(RequestFault::Unauthenticated) };
-        self.holder(&hash).inspect_err(|_| {
-            tracing::info!(user = login.name, groups = ?login.groups, "a user is in no group of the file of tokens");
-        })
+        file.entries.iter().filter(|entry| entry.is_valid()).map(|entry| entry.client.clone()).collect()
     }
 }
 
 impl TokenAccess {
-    /// Access by `tokens`, and by a provider whose users' groups they name; open access without them.
-    pub(crate) fn new(tokens: Option<TokenFile>, provider: Option<Arc<IdentityProvider>>) -> Self {
+    /// Access by `tokens`; open access without them.
+    pub(crate) fn new(tokens: Option<TokenFile>) -> Self {
         match tokens {
             Some(file) => {
-                let (file, sessions) = (RwLock::new(file), BrowserSessions::default());
-                Self::Named(Box::new(NamedAccess { file, sessions, provider }))
+                let named = NamedAccess { file: RwLock::new(file), sessions: BrowserSessions::default() };
+                Self::Named(Box::new(named))
             }
             None => Self::Open,
         }
@@ -90,16 +57,6 @@ impl TokenAccess {
     /// Returns whether no token is required.
     pub(crate) fn is_open(&self) -> bool {
         matches!(self, Self::Open)
-    }
-
-    /// Waits, for a few seconds at most, for the key of a token of the identity provider that is signed with a new one.
-    pub(crate) async fn await_key(&self, token: Option<&str>) {
-        if let (Self::Named(named), Some(token)) = (self, token)
-            && let Some(provider) = &named.provider
-            && named.holder(&hash_of(token)).is_err()
-        {
-            provider.await_key(token).await;
-        }
     }
 
     /// Returns the client of a token; on a server without tokens, the client that `local` makes.
@@ -113,7 +70,7 @@ impl TokenAccess {
     ) -> Result<Arc<ClientIdentity>, RequestFault> {
         match self {
             Self::Open => Ok(Arc::new(local())),
-            Self::Named(named) => named.client(token.unwrap_or_default()),
+            Self::Named(named) => named.holder(&hash_of(token.unwrap_or_default())),
         }
     }
 
@@ -130,28 +87,14 @@ impl TokenAccess {
         }
     }
 
-    /// Returns the client of a name; on a server without tokens, the one of this name that asks over HTTP.
-    ///
-    /// # Errors
-    /// [`RequestFault::Unauthenticated`].
-    pub(crate) fn client_of_name(&self, name: &str) -> Result<Arc<ClientIdentity>, RequestFault> {
-        let found = match self {
-            Self::Open => {
-                let known = [ClientIdentity::pages(), ClientIdentity::programs()];
-                known.into_iter().find(|client| client.name == name).map(Arc::new)
-            }
-            Self::Named(named) => named.clients_of(name).pop(),
-        };
-        found.ok_or(RequestFault::Unauthenticated)
-    }
-
     /// Checks that what a client may do has not changed, and that it may still ask.
     ///
     /// # Errors
     /// [`RequestFault::Unauthenticated`].
     pub(crate) fn check_current(&self, client: &ClientIdentity) -> Result<(), RequestFault> {
         let Self::Named(named) = self else { return Ok(()) };
-        let is_current = named.clients_of(&client.name).iter().any(|current| **current == *client);
+        let file = named.file();
+        let is_current = file.find_name(&client.name).is_some_and(|entry| *entry.client == *client);
         is_current.then_some(()).ok_or(RequestFault::Unauthenticated)
     }
 
@@ -160,8 +103,6 @@ impl TokenAccess {
     pub(crate) fn renew(&self, known: &mut TokenFileState) -> Vec<String> {
         let Self::Named(named) = self else { return Vec::new() };
         let path = named.file().path().to_owned();
-        // Some of them logged in since the last look.
-        let mut before = named.current();
         let changed = std::fs::metadata(&path).ok().and_then(|about| Some((about.modified().ok()?, about.len())));
         if known.file.replace(changed).is_some_and(|before| before != changed) {
             match TokenFile::read_any(&path) {
@@ -172,8 +113,7 @@ impl TokenAccess {
                 Err(e) => tracing::warn!(error = &e as &dyn std::error::Error, "the tokens stay as they were"),
             }
         }
-        before.retain(|client| !known.clients.contains(client));
-        before.extend(std::mem::replace(&mut known.clients, named.current()));
+        let before = std::mem::replace(&mut known.clients, named.current());
         let gone = before.into_iter().filter(|client| !known.clients.contains(client));
         gone.map(|client| client.name.clone()).collect()
     }
@@ -187,8 +127,9 @@ impl TokenAccess {
             let hint = "this server has no tokens, ask right away";
             return Err(RequestFault::NotFound { what: "a session".to_owned(), hint });
         };
-        named.client(token)?;
-        named.sessions.begin(hash_of(token)).map_err(RequestFault::defect("no session can begin"))
+        let hash = hash_of(token);
+        named.holder(&hash)?;
+        named.sessions.begin(hash).map_err(RequestFault::defect("no session can begin"))
     }
 
     /// Returns the client of the session with this secret; as [`TokenAccess::client`].
@@ -229,7 +170,7 @@ mod tests {
 
     fn access_by(lines: &str) -> TokenAccess {
         let file = TokenFile::parse(Path::new("no-such-file.toml"), lines).expect("tokens");
-        TokenAccess::new(Some(file), None)
+        TokenAccess::new(Some(file))
     }
 
     #[test]
@@ -239,7 +180,7 @@ mod tests {
         let hash = hex::encode(Sha256::digest("x"));
         let line = |rest: &str| format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\n{rest}\n");
         std::fs::write(&path, line("expires = 2126-01-01T00:00:00Z")).expect("written");
-        let access = TokenAccess::new(Some(TokenFile::read(&path).expect("tokens")), None);
+        let access = TokenAccess::new(Some(TokenFile::read(&path).expect("tokens")));
         let mut known = TokenFileState::default();
         assert!(access.renew(&mut known).is_empty());
         let client = access.client(Some("x"), ClientIdentity::pages).expect("let in");

@@ -1,4 +1,4 @@
-//! The file of tokens, stored as hashes, each with scopes and quotas; and the groups of an identity provider's users.
+//! The file of tokens, stored as hashes, each with scopes and quotas.
 
 use std::collections::BTreeSet;
 use std::fmt;
@@ -25,9 +25,6 @@ const BASE64: GeneralPurpose = GeneralPurpose::new(&STANDARD, NO_PAD.with_decode
 
 /// Prefix of all tokens, so that leaked ones can be found by searching.
 const PREFIX: &str = "echolake_";
-
-/// Prefix of the names of an identity provider's users, which no line of a token has.
-pub(crate) const OIDC_PREFIX: &str = "oidc:";
 
 /// A permission of a token.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -66,11 +63,10 @@ impl fmt::Display for TokenScope {
     }
 }
 
-/// The tokens of a file, and the groups of an identity provider's users.
+/// The tokens of a file.
 pub struct TokenFile {
     path: PathBuf,
     pub(crate) entries: Vec<TokenEntry>,
-    groups: Vec<ClientIdentity>,
 }
 
 /// A line of a token.
@@ -94,15 +90,13 @@ impl TokenEntry {
 struct TokenList {
     #[serde(default)]
     token: Vec<Line>,
-    #[serde(default)]
-    group: Vec<Line>,
 }
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Line {
     name: String,
-    sha256: Option<String>,
+    sha256: String,
     scram: Option<String>,
     #[serde(default = "reading")]
     scopes: Vec<TokenScope>,
@@ -123,18 +117,8 @@ fn reading() -> Vec<TokenScope> {
 impl Line {
     fn entry(&self) -> Result<TokenEntry, String> {
         let name = &self.name;
-        if name.starts_with(OIDC_PREFIX) {
-            return Err(format!(
-                "`{name}` is no name of a token; hint: users of an identity provider have `[[group]]`"
-            ));
-        }
-        let Some(text) = &self.sha256 else {
-            return Err(format!(
-                "`{name}` has no sha256, by which alone its client can log in; hint: `echolake token NAME`"
-            ));
-        };
         let mut hash = [0; 32];
-        hex::decode_to_slice(text, &mut hash)
+        hex::decode_to_slice(&self.sha256, &mut hash)
             .map_err(|_| format!("the sha256 of `{name}` is not 64 hexadecimal digits"))?;
         let token = hash.first_chunk().map(|head| u64::from_le_bytes(*head));
         let expires = self.expires.map(|time| {
@@ -146,15 +130,6 @@ impl Line {
         });
         let client = Arc::new(self.identity(token)?);
         Ok(TokenEntry { client, hash, scram: scram.transpose()?, expires: expires.transpose()? })
-    }
-
-    // What its users may; their names are their own.
-    fn group(&self) -> Result<ClientIdentity, String> {
-        if self.sha256.is_some() || self.scram.is_some() || self.expires.is_some() {
-            let name = &self.name;
-            return Err(format!("the group `{name}` has sha256, scram or expires; hint: these are of `[[token]]`"));
-        }
-        self.identity(None)
     }
 
     fn identity(&self, token: Option<u64>) -> Result<ClientIdentity, String> {
@@ -204,8 +179,9 @@ impl TokenFile {
     /// [`Error::ReadTokens`], [`Error::Tokens`].
     pub fn read(path: &Path) -> Result<Self, Error> {
         let file = Self::read_any(path)?;
-        if file.entries.is_empty() && file.groups.is_empty() {
-            return Err(file.wrong("there is none; hint: `echolake token NAME` makes one".to_owned()));
+        if file.entries.is_empty() {
+            let message = "there is none; hint: `echolake token NAME` makes one".to_owned();
+            return Err(Error::Tokens { path: path.to_owned(), message });
         }
         Ok(file)
     }
@@ -233,28 +209,7 @@ impl TokenFile {
                 return Err(format!("`{}` is there twice", entry.client.name));
             }
         }
-        let groups = file.group.iter().map(Line::group).collect::<Result<Vec<_>, _>>()?;
-        if let Some(twice) = (1..groups.len()).find(|i| groups[..*i].iter().any(|g| g.name == groups[*i].name)) {
-            return Err(format!("the group `{}` is there twice", groups[twice].name));
-        }
-        Ok(Self { path: path.to_owned(), entries, groups })
-    }
-
-    /// Checks that there are no groups if there is no identity provider, who alone has users in them.
-    ///
-    /// # Errors
-    /// [`Error::Tokens`].
-    pub(crate) fn check_groups(&self, has_provider: bool) -> Result<(), Error> {
-        match self.groups.first().filter(|_| !has_provider) {
-            Some(group) => {
-                Err(self.wrong(format!("the group `{}` is nobody's; hint: --oidc ISSUER names its users", group.name)))
-            }
-            None => Ok(()),
-        }
-    }
-
-    fn wrong(&self, message: String) -> Error {
-        Error::Tokens { path: self.path.clone(), message }
+        Ok(Self { path: path.to_owned(), entries })
     }
 
     /// The file's path.
@@ -283,12 +238,6 @@ impl TokenFile {
     /// Finds a line by its name.
     pub(crate) fn find_name(&self, name: &str) -> Option<&TokenEntry> {
         self.entries.iter().find(|entry| entry.client.name == name && entry.is_valid())
-    }
-
-    /// Returns the identity of a user in these groups: the first group of the file that is among them decides.
-    pub(crate) fn user(&self, name: &str, groups: &[String]) -> Option<ClientIdentity> {
-        let group = self.groups.iter().find(|group| groups.contains(&group.name))?;
-        Some(ClientIdentity { name: format!("{OIDC_PREFIX}{name}"), ..group.clone() })
     }
 }
 
@@ -356,7 +305,7 @@ mod tests {
         for (text, expected) in [
             (format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\nexpires = 2027-01-31"), "no time with a zone"),
             ("[[token]]\nname = 'a'\nsha256 = 'ab'".to_owned(), "64 hexadecimal"),
-            ("[[token]]\nname = 'a'".to_owned(), "`a` has no sha256"),
+            ("[[token]]\nname = 'a'".to_owned(), "missing field `sha256`"),
             (format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\nscram = 'md5'"), "the scram of `a` is wrong"),
             (format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\nrows = 0"), "rows of `a` is 0"),
             (format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\nscopes = ['all']"), "unknown variant"),
@@ -367,10 +316,7 @@ mod tests {
                 "has projects and the scope metrics",
             ),
             (format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\n").repeat(2), "twice"),
-            ("[[token]]\nname = 'oidc:a'".to_owned(), "is no name of a token"),
-            (format!("[[group]]\nname = 'a'\nsha256 = '{hash}'"), "the group `a` has sha256"),
-            ("[[group]]\nname = 'a'\nrows = 0".to_owned(), "rows of `a` is 0"),
-            ("[[group]]\nname = 'a'\n".repeat(2), "the group `a` is there twice"),
+            ("[[group]]\nname = 'a'".to_owned(), "unknown field `group`"),
         ] {
             let error = TokenFile::parse(Path::new("tokens.toml"), &text).map(|_| ()).expect_err(&text);
             assert!(error.contains(expected), "{text}: {error}");
@@ -391,24 +337,5 @@ mod tests {
         ] {
             assert_eq!(of_header(value).as_deref(), expected, "{value}");
         }
-    }
-
-    #[test]
-    fn groups_without_a_provider_are_refused() {
-        let file = TokenFile::parse(Path::new("tokens.toml"), "[[group]]\nname = 'lab'").expect("a group");
-        let refused = file.check_groups(false).expect_err("no provider").to_string();
-        assert!(refused.contains("the group `lab` is nobody's"), "{refused}");
-        assert!(file.check_groups(true).is_ok());
-    }
-
-    #[test]
-    fn the_first_group_decides() {
-        let text = "[[group]]\nname = 'brick'\nprojects = ['brick']\n[[group]]\nname = 'lab'\nscopes = ['sql']";
-        let file = TokenFile::parse(Path::new("tokens.toml"), text).expect("groups");
-        let user = |groups: &[&str]| file.user("ann", &groups.iter().map(|g| g.to_string()).collect::<Vec<_>>());
-        let both = user(&["lab", "brick"]).expect("a user");
-        assert_eq!((both.name.as_str(), both.projects.is_some()), ("oidc:ann", true));
-        assert_eq!(user(&["lab"]).expect("a user").scopes, [TokenScope::Sql]);
-        assert_eq!(user(&["Lab", ""]), None);
     }
 }

@@ -14,9 +14,7 @@ use echolake_schema::ProjectName;
 use echolake_server::certificate::self_signed;
 use echolake_server::engine::{confinement, run_engine};
 use echolake_server::tokens::{self, TokenFile, TokenScope};
-use echolake_server::{
-    CataloguePages, CertificateFiles, EngineSettings, Error, LakeServer, OidcSettings, ServerSettings,
-};
+use echolake_server::{CataloguePages, CertificateFiles, EngineSettings, Error, LakeServer, ServerSettings};
 use tokio::signal::unix::{SignalKind, signal};
 
 use super::cache::CacheArgs;
@@ -32,8 +30,6 @@ const ENGINES: u32 = 16;
 const CATALOGUE_DRAIN: Duration = Duration::from_secs(5);
 
 #[derive(Debug, clap::Args)]
-// An option of earlier versions, which is refused by name.
-#[command(arg = clap::Arg::new("client_ca").long("client-ca").hide(true).value_parser(refuse_client_ca))]
 pub(crate) struct ServeArgs {
     /// Address for HTTP, or `off`; port 0 picks a free one (also for the two below).
     #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:8080")]
@@ -53,8 +49,6 @@ pub(crate) struct ServeArgs {
     /// Private key of the certificate (PEM).
     #[arg(long, value_name = "FILE", requires = "certificate")]
     key: Option<PathBuf>,
-    #[command(flatten)]
-    oidc: OidcArgs,
     /// Listen without encryption beyond this machine, because a proxy encrypts.
     #[arg(long, conflicts_with = "certificate")]
     plain_text_behind_a_proxy: bool,
@@ -97,34 +91,6 @@ impl QueryArgs {
             slow: self.log_slow,
             cache: self.cache.folder().filter(|_| lake.is_remote()),
             ..default_engine_settings(self.memory, count)?
-        })
-    }
-}
-
-/// The identity provider of `serve`.
-#[derive(Debug, clap::Args)]
-struct OidcArgs {
-    /// Identity provider (OpenID Connect) whose tokens are accepted; `[[group]]` in the file of tokens says who may what.
-    #[arg(long, value_name = "ISSUER", requires = "tokens", requires = "oidc_audience")]
-    oidc: Option<String>,
-    /// Audience of its tokens: what the provider calls this server.
-    #[arg(long, value_name = "AUDIENCE", requires = "oidc")]
-    oidc_audience: Option<String>,
-    /// Claim with a user's name; users must not be able to choose it.
-    #[arg(long, value_name = "CLAIM", default_value = "sub")]
-    oidc_name: String,
-    /// Claim with a user's groups.
-    #[arg(long, value_name = "CLAIM", default_value = "groups")]
-    oidc_groups: String,
-}
-
-impl OidcArgs {
-    fn settings(&self) -> Option<OidcSettings> {
-        Some(OidcSettings {
-            issuer: self.oidc.clone()?,
-            audience: self.oidc_audience.clone()?,
-            name_claim: self.oidc_name.clone(),
-            groups_claim: self.oidc_groups.clone(),
         })
     }
 }
@@ -194,11 +160,6 @@ impl FromStr for ListenAddress {
     }
 }
 
-fn refuse_client_ca(_: &str) -> Result<String, String> {
-    Err("clients no longer log in by certificate; hint: --tokens FILE, whose lines `echolake token NAME` makes"
-        .to_owned())
-}
-
 impl ListenAddress {
     fn address(self) -> Option<SocketAddr> {
         match self {
@@ -225,7 +186,6 @@ pub(crate) async fn run(args: &ServeArgs, lake_url: &str) -> anyhow::Result<Comm
             .clone()
             .zip(args.key.clone())
             .map(|(certificate, key)| CertificateFiles { certificate, key }),
-        oidc: args.oidc.settings(),
         is_behind_proxy: args.plain_text_behind_a_proxy,
         drain: args.drain,
         engines: args.queries.engine_settings(&lake, args.engines)?,
@@ -248,7 +208,6 @@ pub(crate) async fn catalogue(lake: &Lake, stop: &StopRequest) -> anyhow::Result
         postgres: None,
         tokens: None,
         certificate: None,
-        oidc: None,
         is_behind_proxy: false,
         drain: CATALOGUE_DRAIN,
         engines: engines.clone(),

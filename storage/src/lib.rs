@@ -48,7 +48,7 @@ pub use tables::{
     DeletionMode, EncodedFile, FileEncoder, FileHistory, FileName, FileStats, KEEP_HOURS, LackingRows, LakeMoment,
     LakeSnapshot, LoggedFile, MergeProgress, NewFile, NoMoment, OptimizeReport, RemovalRecord, ReplacedFiles, RunPart,
     RunRowCounts, StagedFile, TARGET_BYTES, TableChange, TableCommit, TableOptimizeReport, TableVersion, TableView,
-    VacuumReport, VisibleRun, WorkClaims, add_missing_columns, delta_schema, encode, reader_metadata, wanted_schema,
+    VacuumReport, VisibleRun, WorkClaims, add_missing_columns, encode, reader_metadata, wanted_schema,
 };
 #[cfg(feature = "remote")]
 pub use upload::{RunUpload, UploadOutcome, UploadStep};

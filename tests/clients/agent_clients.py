@@ -1,9 +1,8 @@
-"""Checks agents and spreadsheets: `agent_clients.py ECHOLAKE LAKE [--write docs/clients.md]`.
+"""Checks agents: `agent_clients.py ECHOLAKE LAKE [--write docs/clients.md]`.
 
 It serves the lake with tokens and asks it with the official Python client of the Model Context Protocol, in the protocol's
-revision of 2026-07-28, in those with a handshake, and over `echolake mcp`; then with delta-sharing and pandas, whose values
-must be those that SQL answers. `--write` replaces the table in that page. Needs the PyPI packages mcp, delta-sharing, pandas
-and pyarrow.
+revision of 2026-07-28, in those with a handshake, and over `echolake mcp`. `--write` replaces the table in that page. Needs
+the PyPI package mcp.
 """
 import argparse
 import asyncio
@@ -208,86 +207,6 @@ def foreign_pages(checks, server):
     checks.holds("no token", server.status("/mcp", data=message) == 401)
 
 
-def shared_tables(checks, server, folder):
-    """Every shared table as pandas reads it, against SQL."""
-    import delta_sharing
-    import pandas
-
-    profile = os.path.join(folder, "lake.share")
-    with open(profile, "wb") as file:
-        file.write(server.read("/delta-sharing/profile.share", server.token))
-    client = delta_sharing.SharingClient(profile)
-    tables = client.list_all_tables()
-    names = {table.name for table in tables}
-    checks.holds("tables", {"surfaces", "tnce", "tnce_db", "catalogue", "measurements"} <= names, names)
-    checks.holds("views with lists are not shared", not {"ir", "augmented"} & names, names)
-    for table in tables:
-        url = f"{profile}#{table.share}.{table.schema}.{table.name}"
-        columns = [row["column_name"] for row in server.rows(
-            f"select column_name from information_schema.columns where table_name = '{table.name}' order by ordinal_position")]
-        count = server.rows(f"select count(*) as n from {table.name}")[0]["n"]
-
-        def is_same(url=url, count=count, columns=columns, table=table):
-            found = delta_sharing.load_as_pandas(url)
-            if (len(found), list(found.columns)) != (count, columns):
-                return f"{len(found)} rows, expected {count}; {set(columns) ^ set(found.columns)}"
-            numbers = [c for c in columns if found[c].dtype.kind in "if"][:8]
-            sums = ", ".join(f'sum(cast("{c}" as double)) as "{c}"' for c in numbers)
-            expected = server.rows(f"select {sums} from {table.name}")[0] if numbers else {}
-            for name, value in expected.items():
-                total = found[name].astype("float64").sum()
-                if value is not None and abs(total - value) > 1e-6 * max(1.0, abs(value)):
-                    return f"sum of {name} is {total}, expected {value}"
-            return None
-
-        if count > 200_000:
-            checks.run(f"{table.name}, 10 rows", lambda url=url: len(delta_sharing.load_as_pandas(url, limit=10)) == 10)
-        else:
-            checks.run(table.name, is_same)
-    url = f"{profile}#echolake.lake."
-    checks.run("version", lambda: delta_sharing.get_table_version(url + "tnce") >= 0)
-    checks.run("limit", lambda: len(delta_sharing.load_as_pandas(url + "pairs", limit=7)) == 7)
-    checks.run("lists", lambda: len(delta_sharing.load_as_pandas(url + "measurements", limit=2)["ir"][1]) > 100)
-    metadata = delta_sharing.get_table_metadata(url + "tnce_db")
-    checks.holds("metadata", "incidence_deg" in metadata.schema_string, metadata)
-    checks.holds("empty", isinstance(delta_sharing.load_as_pandas(url + "runs", limit=0), pandas.DataFrame))
-    addresses(checks, server, folder, profile)
-
-
-def addresses(checks, server, folder, profile):
-    """Files are read by their addresses, which are for these files alone."""
-    import delta_sharing
-
-    base = "/delta-sharing/shares/echolake/schemas/lake/tables/"
-    lines = server.read(base + "runs/query", server.token, data=b"{}").decode().splitlines()
-    file = json.loads(lines[2])["file"]
-    whole = server.read(file["url"])
-    checks.holds("an address needs no token", len(whole) == file["size"] and whole[:4] == b"PAR1", len(whole))
-    part = urllib.request.Request(file["url"], headers={"range": "bytes=0-3"})
-    with urllib.request.urlopen(part, timeout=60) as answer:
-        checks.holds("by ranges", (answer.status, answer.read()) == (206, b"PAR1"))
-    head = urllib.request.Request(file["url"], method="HEAD")
-    with urllib.request.urlopen(head, timeout=60) as answer:
-        checks.holds("its length", int(answer.headers["content-length"]) == file["size"])
-    parts = file["url"].split("/")
-    for at, changed in [(-1, "x.parquet"), (-2, "surfaces"), (-3, "00" * 32), (-4, "99999999999"), (-5, "61")]:
-        other = "/".join([*parts[:at], changed, *parts[at + 1 or len(parts):]])
-        checks.holds(f"another address: {changed}", server.status(other) in (401, 404), other)
-    for path, method in [("no_table/query", b"{}"), ("ir/query", b"{}"), ("runs/query", b"[")]:
-        checks.holds(path, server.status(base + path, server.token, data=method) in (400, 404))
-    checks.holds("the past", server.status(base + "runs/query", server.token, data=b'{"version": 0}') == 400)
-    checks.holds("changes", server.status(base + "runs/changes?startingVersion=0", server.token) == 400)
-    checks.holds("without a token", server.status(base + "runs/query", data=b"{}") == 401)
-    wrong = os.path.join(folder, "wrong.share")
-    with open(profile, encoding="utf-8") as file, open(wrong, "w", encoding="utf-8") as other:
-        json.dump(json.load(file) | {"bearerToken": "echolake_" + "0" * 64}, other)
-    try:
-        delta_sharing.load_as_pandas(wrong + "#echolake.lake.runs")
-        checks.holds("a wrong token", False, "let in")
-    except Exception:  # whatever the client throws is a refusal
-        checks.holds("a wrong token", True)
-
-
 def version_of(package):
     """A package's version."""
     from importlib.metadata import version
@@ -308,7 +227,6 @@ def main():
         ClientChecks(f"{agents}, `POST /mcp`, revision 2026-07-28"),
         ClientChecks(f"{agents}, `POST /mcp`, with a handshake"),
         ClientChecks(f"{agents}, `echolake mcp`"),
-        ClientChecks(f"{version_of('delta-sharing')}, {version_of('pandas')}"),
     ]
     with tempfile.TemporaryDirectory() as folder:
         server = TokenServer(program, lake, folder, given.port)
@@ -317,7 +235,6 @@ def main():
                 lambda checks: asyncio.run(agent_over_http(checks, server, "auto")),
                 lambda checks: asyncio.run(agent_over_http(checks, server, "legacy")),
                 lambda checks: asyncio.run(agent_over_pipes(checks, server, program, lake)),
-                lambda checks: shared_tables(checks, server, folder),
             ]
             for checks, step in zip(all_checks, steps):
                 try:

@@ -1,9 +1,8 @@
-//! Programs that know nothing of echolake: agents by the Model Context Protocol, spreadsheets by Delta Sharing.
+//! Programs that know nothing of echolake: agents by the Model Context Protocol, and readers of SOFA files.
 
 use std::io::Write as _;
 use std::process::Command;
 
-use parquet::file::reader::{FileReader as _, SerializedFileReader};
 use serde_json::{Value, json};
 
 use super::http::{HttpRequest, HttpResponse};
@@ -165,63 +164,6 @@ fn an_agent_of_this_machine_asks_over_pipes() {
     place.fails(1, &["mcp", "--pages", "localhost"], "hint: scheme, host and port alone");
 }
 
-// The lines of a shared table's files, after protocol and metadata.
-fn shared(server: &ServedLake, table: &str, body: &str) -> Vec<Value> {
-    let path = format!("/delta-sharing/shares/echolake/schemas/lake/tables/{table}/query");
-    let answer = HttpRequest::post(&path, body).with("content-type", "application/json").send(server);
-    assert_eq!(answer.status, 200, "{}", answer.text());
-    assert!(answer.header("delta-table-version").is_some());
-    let lines: Vec<Value> = answer.text().lines().map(|line| serde_json::from_str(line).expect("JSON")).collect();
-    assert_eq!(lines[0], json!({ "protocol": { "minReaderVersion": 1 } }));
-    let schema = lines[1]["metaData"]["schemaString"].as_str().expect("a schema");
-    assert_eq!(serde_json::from_str::<Value>(schema).expect("JSON")["type"], "struct");
-    lines[2..].iter().map(|line| line["file"].clone()).collect()
-}
-
-// The path of a file's address.
-fn path_of<'a>(server: &ServedLake, file: &'a Value) -> &'a str {
-    file["url"].as_str().expect("a URL").split_once(&server.http).expect("this server's").1
-}
-
-fn number_of_rows(bytes: &[u8]) -> usize {
-    let mut file = tempfile::tempfile().expect("a file");
-    file.write_all(bytes).expect("written");
-    let reader = SerializedFileReader::new(file).expect("a Parquet file");
-    usize::try_from(reader.metadata().file_metadata().num_rows()).expect("a number")
-}
-
-#[test]
-fn a_shared_file_needs_its_address_and_no_token() {
-    let place = lake();
-    let made = place.run(&["token", "office"]);
-    let token = crate::stderr(&made).lines().next().expect("a token").to_owned();
-    std::fs::write(place.path("tokens.toml"), &made.stdout).expect("written");
-    let server = served(&place, &["--tokens", "tokens.toml"]);
-    let bearer = format!("Bearer {token}");
-    let ask = |path: &str| HttpRequest::get(path).with("authorization", &bearer).send(&server);
-    refused(&get(&server, "/delta-sharing/profile.share"), 401, "unauthenticated");
-    let profile = json_of(&ask("/delta-sharing/profile.share"));
-    assert_eq!((&profile["bearerToken"], &profile["shareCredentialsVersion"]), (&json!(token), &json!(1)));
-    assert_eq!(profile["endpoint"], format!("http://{}/delta-sharing", server.http));
-    let path = "/delta-sharing/shares/echolake/schemas/lake/tables/runs/query";
-    refused(&HttpRequest::post(path, "{}").send(&server), 401, "unauthenticated");
-    let listed = HttpRequest::post(path, "{}").with("authorization", &bearer).send(&server);
-    let line: Value = serde_json::from_str(listed.text().lines().nth(2).expect("a file")).expect("JSON");
-    let address = path_of(&server, &line["file"]).to_owned();
-    assert_eq!(get(&server, &address).status, 200);
-    let parts: Vec<_> = address.split('/').collect();
-    for (at, other) in [(3, "61"), (4, "99999999999"), (5, "00"), (6, "surfaces"), (7, "x.parquet")] {
-        let mut changed = parts.clone();
-        changed[at] = other;
-        refused(&get(&server, &changed.join("/")), 401, "unauthenticated");
-        refused(&ask(&changed.join("/")), 401, "unauthenticated");
-    }
-    assert!(!server.said().join("\n").contains(parts[5]), "no signature is in the log");
-    // The token is taken back, and its addresses with it.
-    std::fs::write(place.path("tokens.toml"), "").expect("written");
-    super::wait_until("the address ends", || get(&server, &address).status == 401);
-}
-
 #[test]
 fn a_slice_is_a_sofa_file() {
     let place = lake();
@@ -242,71 +184,4 @@ fn a_slice_is_a_sofa_file() {
     refused(&get(&server, &format!("/api/v1/slices.sofa?run={run}&topics=/ir")), 400, "request_invalid");
     let foreign = HttpRequest::get("/api/v1/slices.sofa?where=true").with("origin", "https://evil.example");
     refused(&foreign.send(&server), 403, "foreign_origin");
-}
-
-mod slow {
-    use super::*;
-
-    #[test]
-    fn rows_that_were_replaced_are_not_shared() {
-        let place = TestFolder::new();
-        place.acquire("flat", &["--seed", "1", "--ir-only"]);
-        place.acquire("flat_b", &["--seed", "2", "--ir-only"]);
-        // Its rows do not change when `flat` does, and stay in merged files of which the rest goes.
-        place.acquire("wavy", &["--seed", "3", "--ir-only", "--flat", "flat_b"]);
-        place.ok(&["ingest"]);
-        place.ok(&["optimize"]);
-        place.acquire("flat", &["--seed", "9", "--ir-only"]);
-        place.ok(&["ingest"]);
-        let server = served(&place, &[]);
-        for table in ["surfaces", "nce", "tnce"] {
-            let mut rows = 0;
-            for file in shared(&server, table, "{}") {
-                let answer = get(&server, path_of(&server, &file));
-                assert_eq!((answer.status, answer.body.len() as u64), (200, file["size"].as_u64().expect("a size")));
-                rows += number_of_rows(&answer.body);
-            }
-            assert_eq!(place.number(&format!("select count(*) from {table}")), rows as f64, "{table}");
-        }
-    }
-
-    #[test]
-    fn tables_are_shared_as_files() {
-        let place = lake();
-        let server = served(&place, &[]);
-        let tables = json_of(&get(&server, "/delta-sharing/shares/echolake/all-tables"));
-        let names: Vec<_> = tables["items"].as_array().expect("a list").iter().map(|t| t["name"].clone()).collect();
-        assert!(names.contains(&json!("tnce_db")) && !names.contains(&json!("ir")) && names.len() == 14, "{names:?}");
-        let page = json_of(&get(&server, "/delta-sharing/shares/echolake/all-tables?maxResults=3&pageToken=12"));
-        assert_eq!((page["items"].as_array().map(Vec::len), &page["nextPageToken"]), (Some(2), &Value::Null));
-        shared(&server, "catalogue", "{}");
-        let protocol = super::super::sql(
-            &server,
-            "select protocol from system.queries where statement like 'select * from catalogue%'",
-        );
-        assert_eq!(json_of(&protocol)[0]["protocol"], "sharing");
-        for table in ["measurements", "pairs", "runs", "catalogue", "tnce_db"] {
-            let rows = place.number(&format!("select count(*) from {table}"));
-            let files = shared(&server, table, "{}");
-            assert_eq!(files.len(), 1, "{table}");
-            let file = get(&server, path_of(&server, &files[0]));
-            assert_eq!(
-                (file.status, file.body.len() as u64),
-                (200, files[0]["size"].as_u64().expect("a size")),
-                "{table}"
-            );
-            assert_eq!(number_of_rows(&file.body) as f64, rows, "{table}");
-            let part = HttpRequest::get(path_of(&server, &files[0])).with("range", "bytes=0-3").send(&server);
-            assert_eq!((part.status, part.body.as_slice()), (206, &b"PAR1"[..]), "{table}");
-            let head = HttpRequest::head(path_of(&server, &files[0])).send(&server);
-            assert_eq!(head.header("content-length"), Some(file.body.len().to_string().as_str()), "{table}");
-        }
-        assert!(shared(&server, "measurements", r#"{"limitHint": 0}"#).is_empty());
-        let path = |rest: &str| format!("/delta-sharing/shares/echolake/schemas/lake/tables/{rest}");
-        refused(&get(&server, &path("ir/metadata")), 404, "not_found");
-        refused(&get(&server, &path("runs/changes?startingVersion=0")), 400, "request_invalid");
-        refused(&HttpRequest::post(&path("runs/query"), r#"{"version": 0}"#).send(&server), 400, "request_invalid");
-        let delta = HttpRequest::get(&path("runs/metadata")).with("delta-sharing-capabilities", "responseformat=delta");
-        refused(&delta.send(&server), 501, "unsupported");
-    }
 }

@@ -7,7 +7,6 @@ use axum::http::{Method, StatusCode};
 
 use crate::fault::FaultCode;
 use crate::metrics::ServerProtocol;
-use crate::signed_address::SIGNED_FILES;
 
 /// The target of its lines, by which a log's levels leave them out.
 const TARGET: &str = "echolake_server::audit";
@@ -44,7 +43,7 @@ pub(super) fn record_file(peer: SocketAddr, method: &Method, status: StatusCode,
 
 fn is_file(path: &str) -> bool {
     const ENDINGS: [&str; 5] = [".mcap", ".parquet", ".wav", ".glb", ".sofa"];
-    (path.starts_with("/api/") || path.starts_with(SIGNED_FILES)) && ENDINGS.iter().any(|ending| path.ends_with(ending))
+    path.starts_with("/api/") && ENDINGS.iter().any(|ending| path.ends_with(ending))
 }
 
 #[cfg(test)]
@@ -53,12 +52,7 @@ mod tests {
 
     #[test]
     fn files_are_told_by_their_paths() {
-        for path in [
-            "/api/v1/slices.mcap",
-            "/api/v1/runs/r/file.mcap",
-            "/api/v1/tables/tnce/x.parquet",
-            "/delta-sharing/files/tnce/x.parquet",
-        ] {
+        for path in ["/api/v1/slices.mcap", "/api/v1/runs/r/file.mcap", "/api/v1/tables/tnce/x.parquet"] {
             assert!(is_file(path), "{path}");
         }
         for path in ["/api/v1/sql", "/api/v1/files", "/assets/x.glb", "/api/v1/runs"] {

@@ -68,7 +68,6 @@ impl ServerDoor {
         }
         let token = request.headers().get(header::AUTHORIZATION).and_then(|v| v.to_str().ok()).and_then(of_header);
         self.failed_logins().check(work.peer())?;
-        self.access().await_key(token.as_deref()).await;
         let found = self.access().client(token.as_deref(), ClientIdentity::programs);
         if let (Some(_), Err(RequestFault::Unauthenticated)) = (&token, &found) {
             self.failed_logins().count(work.peer());

@@ -1,6 +1,5 @@
 //! HTTP connections of the door: so many at once, each of which must say what it wants in time.
 
-use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use axum::Router;
@@ -31,7 +30,6 @@ use crate::http::{
 };
 use crate::metrics::ServerProtocol;
 use crate::request_span::{REQUEST_ID, begin_request};
-use crate::signed_address::{SIGNED_FILES, SignedAddress};
 
 /// Path to which a browser shows a token.
 const SESSION_PATH: &str = "/api/v1/session";
@@ -87,14 +85,6 @@ impl ServerDoor {
         })
     }
 
-    /// Forwards a request for a file whose address is signed to the engine of the client that it was signed for.
-    pub(crate) async fn forward_signed(State(door): State<Self>, request: Request) -> Response {
-        door.answer_signed(request).await.unwrap_or_else(|fault| {
-            door.metrics().record_failure(&fault);
-            ProblemResponse(fault).into_response()
-        })
-    }
-
     /// Answers a request within its span, and names it in the answer; the layer of all routes.
     pub(crate) async fn name_request(State(door): State<Self>, mut request: Request, next: Next) -> Response {
         let begun = Instant::now();
@@ -128,42 +118,15 @@ impl ServerDoor {
             RequestSite::Program => ClientIdentity::programs(),
         };
         // A refusal is noted with those of the other routes.
-        let client = authenticate(self.access(), request.headers(), local).await?;
+        let client = authenticate(self.access(), request.headers(), local)?;
+        let client = self.note_client(&work, ServerProtocol::Http, Ok(client))?;
         let path = request.uri().path().to_owned();
-        self.answer_client(client, request, &path, &work).await
-    }
-
-    // The address is the client's own right: it comes without a token.
-    async fn answer_signed(&self, request: Request) -> Result<Response, RequestFault> {
-        let work = request.extensions().get::<PlaceWork>().cloned().ok_or(RequestFault::Internal)?;
-        let address = SignedAddress::parse(request.uri().path()).ok_or(RequestFault::Unauthenticated)?;
-        let client = self.access().client_of_name(&address.client)?;
-        if !self.signing().key_of(&client).verify(&address) {
-            return Err(RequestFault::Unauthenticated);
-        }
-        if address.has_expired() {
-            return Err(RequestFault::Gone { what: "this address", hint: "ask for the table again" });
-        }
-        // The log has no address that others could use.
-        let path = format!("{SIGNED_FILES}{}", address.file);
-        self.answer_client(client, request, &path, &work).await
-    }
-
-    async fn answer_client(
-        &self,
-        client: Arc<ClientIdentity>,
-        mut request: Request,
-        path: &str,
-        work: &PlaceWork,
-    ) -> Result<Response, RequestFault> {
-        let client = self.note_client(work, ServerProtocol::Http, Ok(client))?;
-        self.signing().key_of(&client).send(request.headers_mut());
         let method = request.method().clone();
-        let mut response = self.engines().forward(&client, request, EngineProtocol::Http, Some(work)).await?;
+        let mut response = self.engines().forward(&client, request, EngineProtocol::Http, Some(&work)).await?;
         let runs = response.headers_mut().remove(SLICED_RUNS);
         if !self.access().is_open() {
             let runs = runs.as_ref().and_then(|runs| runs.to_str().ok());
-            let file = HandedFile { client: &client.name, path, runs };
+            let file = HandedFile { client: &client.name, path: &path, runs };
             audit::record_file(work.peer(), &method, response.status(), &file);
         }
         Ok(response.map(Body::new))

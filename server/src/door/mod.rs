@@ -29,7 +29,6 @@ use tokio::net::{TcpListener, TcpSocket};
 use tokio::task::JoinSet;
 
 use crate::Error;
-use crate::oidc::{IdentityProvider, OidcSettings};
 use crate::token_access::TokenAccess;
 use crate::tokens::TokenFile;
 pub use agent::AgentDoor;
@@ -53,8 +52,6 @@ pub struct ServerSettings {
     pub postgres: Option<SocketAddr>,
     /// The accepted tokens; None for open access, on loopback only.
     pub tokens: Option<TokenFile>,
-    /// The identity provider whose users may log in; their groups are in the file of tokens.
-    pub oidc: Option<OidcSettings>,
     /// The certificate with which connections are encrypted; None for plain text.
     pub certificate: Option<CertificateFiles>,
     /// True if plain text may leave this machine, because a proxy encrypts it.
@@ -72,7 +69,6 @@ pub struct LakeServer {
     flight_sql: Option<TcpListener>,
     postgres: Option<TcpListener>,
     encryption: Option<ServerEncryption>,
-    provider: Option<Arc<IdentityProvider>>,
     drain_limit: Duration,
 }
 
@@ -80,8 +76,7 @@ impl LakeServer {
     /// Listens.
     ///
     /// # Errors
-    /// [`Error::Open`], [`Error::PlainText`], [`Error::Tokens`], [`Error::Oidc`], [`Error::Certificate`], [`Error::Bind`],
-    /// [`Error::Temp`].
+    /// [`Error::Open`], [`Error::PlainText`], [`Error::Certificate`], [`Error::Bind`], [`Error::Temp`].
     pub fn bind(lake: &Lake, settings: ServerSettings) -> Result<Self, Error> {
         let addresses = [settings.http, settings.flight_sql, settings.postgres];
         if let Some(address) = addresses.into_iter().flatten().find(|a| !a.ip().is_loopback()) {
@@ -92,13 +87,10 @@ impl LakeServer {
                 return Err(Error::PlainText { address });
             }
         }
-        settings.tokens.as_ref().map_or(Ok(()), |tokens| tokens.check_groups(settings.oidc.is_some()))?;
-        let provider = settings.oidc.map(IdentityProvider::new).transpose()?;
-        let access = Arc::new(TokenAccess::new(settings.tokens, provider.clone()));
+        let access = Arc::new(TokenAccess::new(settings.tokens));
         Ok(Self {
             encryption: settings.certificate.map(ServerEncryption::new).transpose()?,
             door: ServerDoor::new(lake, access, settings.is_behind_proxy, settings.engines)?,
-            provider,
             http: listen(settings.http)?,
             flight_sql: listen(settings.flight_sql)?,
             postgres: listen(settings.postgres)?,
@@ -131,9 +123,6 @@ impl LakeServer {
         let mut upkeep = JoinSet::new();
         upkeep.spawn(self.door.engines().clone().keep_up());
         upkeep.spawn(self.door.clone().watch_tokens());
-        if let Some(provider) = self.provider {
-            upkeep.spawn(provider.keep_up());
-        }
         let mut encryption = self.encryption;
         let mut encrypted = |names| match &mut encryption {
             Some(encryption) => encryption.of_protocol(names),

@@ -18,7 +18,6 @@ use crate::client_identity::ClientIdentity;
 use crate::fault::RequestFault;
 use crate::http::ViewerLayout;
 use crate::metrics::{ServerGauges, ServerMetrics, ServerProtocol};
-use crate::signed_address::SigningSecret;
 use crate::token_access::{TokenAccess, TokenFileState};
 use crate::tokens::TokenScope;
 
@@ -37,14 +36,13 @@ struct DoorState {
     drain: ServerDrain,
     layout: ViewerLayout,
     failed_logins: FailedLogins,
-    signing: SigningSecret,
 }
 
 impl ServerDoor {
     /// The door of a lake.
     ///
     /// # Errors
-    /// [`Error::Temp`], [`Error::Random`].
+    /// [`Error::Temp`].
     pub(super) fn new(
         lake: &Lake,
         access: Arc<TokenAccess>,
@@ -56,13 +54,7 @@ impl ServerDoor {
         let engines = EnginePool::new(lake, settings, activity.clone(), access.clone())?;
         let layout = ViewerLayout::new(lake.rig());
         let (readiness, drain) = (ReadinessCheck::new(lake), ServerDrain::default());
-        let signing = SigningSecret::new()?;
-        Ok(Self(Arc::new(DoorState { access, activity, engines, readiness, drain, layout, failed_logins, signing })))
-    }
-
-    /// The secret of signed addresses.
-    pub(super) fn signing(&self) -> &SigningSecret {
-        &self.0.signing
+        Ok(Self(Arc::new(DoorState { access, activity, engines, readiness, drain, layout, failed_logins })))
     }
 
     /// Failed logins of the last minute.

@@ -83,7 +83,7 @@ fn schema(table: ActivityTable) -> SchemaRef {
         ActivityTable::Queries => vec![
             ("id", count(), false, "", "Number since the start of the server, by which it is cancelled"),
             ("client", text(), false, "", "Name of the token, or of the client of a server without tokens"),
-            ("protocol", text(), false, "", "http, flight_sql, postgres, mcp or sharing"),
+            ("protocol", text(), false, "", "http, flight_sql, postgres or mcp"),
             ("statement", text(), true, "", "Text, its first 2000 characters; null for queries of other clients"),
             ("outcome", text(), false, "", "running, answered, or the code of the failure"),
             ("started", time(), false, "", "Start, UTC"),

@@ -101,19 +101,8 @@ async fn table_file(
     headers: HeaderMap,
 ) -> Result<Response, ProblemResponse> {
     catalogue.service().client(TokenScope::Files)?;
-    Ok(table_file_answer(&catalogue, catalogue::table(&path.table)?, &path.file, &headers).await?)
-}
-
-/// Answers a request for a table's file.
-///
-/// # Errors
-/// [`RequestFault::NotFound`] if no snapshot has shown it; [`RequestFault::Gone`], [`RequestFault::Unreadable`].
-pub(super) async fn table_file_answer(
-    catalogue: &LakeCatalogue,
-    table: Table,
-    name: &str,
-    headers: &HeaderMap,
-) -> Result<Response, RequestFault> {
+    let table = catalogue::table(&path.table)?;
+    let name = &path.file;
     let view = catalogue.view().await?;
     let hint = "GET /api/v1/tables/{table} lists what there is";
     let file = catalogue.shown(&view, table, name);
@@ -125,7 +114,8 @@ pub(super) async fn table_file_answer(
         media_type: "application/vnd.apache.parquet",
         policy: "same-origin",
     };
-    RangedFile { path: file.path.clone(), bytes: file.bytes, described }.answer(catalogue.lake(), headers).await
+    let stored = RangedFile { path: file.path.clone(), bytes: file.bytes, described };
+    Ok(stored.answer(catalogue.lake(), &headers).await?)
 }
 
 #[derive(Deserialize)]

@@ -37,14 +37,13 @@ pub(super) const COOKIE: &str = "echolake";
 ///
 /// # Errors
 /// [`RequestFault::Unauthenticated`], [`RequestFault::Foreign`].
-pub(crate) async fn authenticate(
+pub(crate) fn authenticate(
     access: &TokenAccess,
     headers: &HeaderMap,
     local: impl Fn() -> ClientIdentity,
 ) -> Result<Arc<ClientIdentity>, RequestFault> {
     let token = headers.get(header::AUTHORIZATION).and_then(|v| v.to_str().ok()).and_then(of_header);
     if token.is_some() || access.is_open() {
-        access.await_key(token.as_deref()).await;
         return access.client(token.as_deref(), local);
     }
     let client = access.client_of_session(cookie(headers).ok_or(RequestFault::Unauthenticated)?, &local)?;

@@ -68,7 +68,7 @@ pub(super) async fn metrics(
     State(door): State<ServerDoor>,
     headers: HeaderMap,
 ) -> Result<impl IntoResponse, ProblemResponse> {
-    let client = authenticate(door.access(), &headers, ClientIdentity::pages).await;
+    let client = authenticate(door.access(), &headers, ClientIdentity::pages);
     client.and_then(|client| client.require(TokenScope::Metrics)).inspect_err(|f| door.metrics().failed(f.code()))?;
     Ok(([(header::CONTENT_TYPE, "text/plain; version=0.0.4; charset=utf-8")], door.figures().await?))
 }

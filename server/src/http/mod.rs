@@ -19,7 +19,6 @@ mod queries;
 mod ranges;
 mod request_protocol;
 mod session;
-mod sharing;
 mod slices;
 mod sql;
 
@@ -41,14 +40,12 @@ use crate::fault::RequestFault;
 use crate::metrics::ServerProtocol;
 use crate::request_span::trace_request;
 use crate::service::QueryService;
-use crate::signed_address::SIGNED_ROUTE;
 use catalogue::LakeCatalogue;
 pub(crate) use guard::{FORWARDED_PROTO, RequestSite, authenticate, request_site};
 pub(crate) use layout::ViewerLayout;
 pub(crate) use mcp::MCP;
 pub(crate) use problem::ProblemResponse;
 pub(crate) use request_protocol::request_protocol;
-use sharing::SHARING;
 pub(crate) use slices::SLICED_RUNS;
 use slices::SliceService;
 
@@ -76,7 +73,6 @@ fn engine_router(service: &QueryService) -> Router {
         .merge(catalogue.router())
         .merge(Router::from(files).with_state(catalogue.clone()))
         .merge(of_protocol(ServerProtocol::Mcp, mcp::routes(&catalogue, &slices)))
-        .merge(of_protocol(ServerProtocol::Sharing, sharing::routes(&catalogue, &slices)))
         .layer(from_fn_with_state(service.is_open(), guard::own_pages_only));
     let viewers = Router::from(files::viewer_routes()).with_state(catalogue.clone());
     let all = own.merge(viewers).merge(slices::for_viewers(slices)).fallback(nothing);
@@ -94,10 +90,10 @@ pub(crate) fn door_router(door: &ServerDoor) -> Router {
     // Here and not for all routes: a preflight must come to the layer.
     let viewers =
         viewers.into_iter().fold(Router::new(), |router, path| router.route(path, any(ServerDoor::forward_http)));
-    let forwarded = ["/api/{*path}", MCP, SHARING]
+    let forwarded = ["/api/{*path}", MCP]
         .into_iter()
         .fold(Router::new(), |router, path| router.route(path, any(ServerDoor::forward_http)));
-    let forwarded = forwarded.route(SIGNED_ROUTE, any(ServerDoor::forward_signed)).merge(viewers.layer(ranges::cors()));
+    let forwarded = forwarded.merge(viewers.layer(ranges::cors()));
     #[cfg(feature = "web")]
     let rest = pages::fallback;
     #[cfg(not(feature = "web"))]

@@ -24,7 +24,7 @@ const INDEX: &str = "/index.html";
 /// Path of files that have a digest in their name.
 const ASSETS: &str = "/assets/";
 /// Paths that are no page's.
-const OTHERS: [&str; 6] = ["/api", "/assets", "/delta-sharing", "/health", "/mcp", "/metrics"];
+const OTHERS: [&str; 5] = ["/api", "/assets", "/health", "/mcp", "/metrics"];
 /// The manual's path and its first page.
 const MANUAL_PATH: &str = "/docs";
 const MANUAL_INDEX: &str = "/docs/index.html";

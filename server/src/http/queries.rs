@@ -36,7 +36,7 @@ async fn cancel_query(
     id: Result<Path<u64>, PathRejection>,
     headers: &HeaderMap,
 ) -> Result<(), RequestFault> {
-    let client = authenticate(door.access(), headers, ClientIdentity::programs).await?;
+    let client = authenticate(door.access(), headers, ClientIdentity::programs)?;
     let Path(id) =
         id.map_err(|_| RequestFault::request("a query has a number; hint: select id from system.queries"))?;
     door.cancel_query(&client, id).await

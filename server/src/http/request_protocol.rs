@@ -1,5 +1,5 @@
-//! The protocol of a request over HTTP, by its path: those of agents and of Delta Sharing are protocols of their own in
-//! `system.queries`, in figures and in the log.
+//! The protocol of a request over HTTP, by its path: that of agents is a protocol of its own in `system.queries`, in
+//! figures and in the log.
 
 use axum::extract::{Request, State};
 use axum::middleware::Next;

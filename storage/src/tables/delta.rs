@@ -562,7 +562,7 @@ fn file_stats(mut stats: Map<String, Value>) -> FileStats {
 }
 
 /// Returns a schema as Delta's log has it.
-pub fn delta_schema(schema: &SchemaRef) -> Value {
+fn delta_schema(schema: &SchemaRef) -> Value {
     let fields: Vec<_> = schema.fields().iter().map(|f| delta_column(f)).collect();
     json!({ "type": "struct", "fields": fields })
 }

@@ -25,7 +25,6 @@ pub use commit_log::{
     ReplacedFiles, RunPart, RunRowCounts, TableChange, TableCommit, TableVersion, TableView,
 };
 pub use data_file::{EncodedFile, FileEncoder, encode};
-pub use delta::delta_schema;
 pub use optimize::{MergeProgress, OptimizeReport, TARGET_BYTES, TableOptimizeReport};
 pub(crate) use project_log::ProjectLog;
 pub use rows::{add_missing_columns, reader_metadata, wanted_schema};

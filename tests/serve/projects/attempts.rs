@@ -14,7 +14,7 @@ pub(super) struct ProjectAttempt {
 }
 
 /// Tables and views that have rows of runs.
-pub(super) const TABLES: [&str; 14] = [
+const TABLES: [&str; 14] = [
     "surfaces",
     "runs",
     "measurements",

@@ -15,7 +15,7 @@ const TEXT: usize = (2 << 20) + (1 << 10);
 const VALUES: usize = 4 << 20;
 /// Bytes of what only names a statement or a portal.
 const NAMES: usize = 4 << 10;
-/// Of a password, which may be a token of an identity provider.
+/// Of a password.
 const PASSWORD: usize = 18 << 10;
 
 /// The first bytes of a message.

@@ -36,7 +36,7 @@ const MOST: usize = 128;
 const LOGIN: Duration = Duration::from_secs(10);
 /// Bytes of a startup packet, as in Postgres.
 const STARTUP: usize = 10_000;
-/// The user who sends a token as it is, as password: one of an identity provider, or of a line without a verifier.
+/// The user who sends a token as it is, as password: one of a line without a verifier.
 const TOKEN_USER: &str = "token";
 /// Delay of the answer to a wrong cancel key.
 const WRONG_KEY: Duration = Duration::from_secs(1);
@@ -196,7 +196,6 @@ impl LoginPlace {
             return Ok(client);
         }
         let token = read_password(stream).await?;
-        access.await_key(Some(&token)).await;
         access.client(Some(&token), || ClientIdentity::user(user))
     }
 }

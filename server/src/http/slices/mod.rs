@@ -41,7 +41,6 @@ use query::SliceQuery;
 use selection::{SelectionCache, SliceSelection};
 pub(in crate::http) use sofa::SOFA;
 use spool::SliceSpool;
-pub(super) use spool::SpooledSlice;
 
 /// Foxglove's manifest of slices.
 pub(in crate::http) use foxglove::MANIFEST as FOXGLOVE_MANIFEST;
@@ -108,11 +107,6 @@ impl SliceService {
             places: Arc::new(Semaphore::new(MOST)),
             turns: Arc::new(Semaphore::new(TURNS)),
         }))
-    }
-
-    /// The cache of what is read by ranges.
-    pub(super) fn spool(&self) -> &SliceSpool {
-        &self.0.spool
     }
 
     /// The addresses of a slice. Who asks is this server's page or a program.

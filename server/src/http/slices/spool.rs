@@ -17,7 +17,6 @@ use tokio::sync::OnceCell;
 
 use super::SliceTask;
 use crate::fault::RequestFault;
-use crate::running::RunningQuery;
 
 /// Bytes of all slices that are kept, and of one.
 const MOST_BYTES: u64 = 2 << 30;
@@ -28,7 +27,7 @@ const SHARE: u64 = 4;
 const BLOCK: u64 = 256 << 10;
 
 /// Something that comes in pieces, of which a file is kept.
-pub(in crate::http) trait PieceSource: Send {
+pub(super) trait PieceSource: Send {
     /// The next bytes; None after the last.
     ///
     /// # Errors
@@ -42,15 +41,9 @@ impl PieceSource for SliceTask {
     }
 }
 
-impl PieceSource for RunningQuery<Bytes> {
-    fn next_piece(&mut self) -> impl Future<Output = Result<Option<Bytes>, RequestFault>> + Send {
-        self.next()
-    }
-}
-
 /// Cache of slices, by their digest.
 #[derive(Clone)]
-pub(in crate::http) struct SliceSpool(Arc<SharedSpool>);
+pub(super) struct SliceSpool(Arc<SharedSpool>);
 
 struct SharedSpool {
     state: Mutex<SpoolState>,
@@ -79,7 +72,7 @@ struct SpoolState {
 }
 
 /// A slice in a file without a name: the system deletes it when it is closed, even by a crash.
-pub(in crate::http) struct SpooledSlice {
+pub(super) struct SpooledSlice {
     file: File,
     /// Those that are counted in its spool.
     bytes: u64,
@@ -119,7 +112,7 @@ impl SliceSpool {
     ///
     /// # Errors
     /// Those of cutting, and [`RequestFault::NoRoom`].
-    pub(in crate::http) async fn once<S: PieceSource>(
+    pub(super) async fn once<S: PieceSource>(
         &self,
         key: &str,
         cut: impl Future<Output = Result<S, RequestFault>> + Send,
@@ -189,12 +182,12 @@ fn disk_fault(error: io::Error) -> RequestFault {
 
 impl SpooledSlice {
     /// Its length.
-    pub(in crate::http) fn bytes(&self) -> u64 {
+    pub(super) fn bytes(&self) -> u64 {
         self.bytes
     }
 
     /// Bytes of it, a block at a time.
-    pub(in crate::http) fn read(
+    pub(super) fn read(
         self: &Arc<Self>,
         range: Range<u64>,
     ) -> impl Stream<Item = Result<Bytes, RequestFault>> + Send + use<> {
