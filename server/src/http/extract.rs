@@ -1,22 +1,22 @@
 //! Typed parts of paths and typed parameters. Each defect is answered as a [`ProblemResponse`] that says what is allowed.
 
-use std::fmt;
 use std::ops::RangeInclusive;
-use std::vec;
 
-use axum::extract::{FromRequestParts, Path, Query};
+use axum::extract::{FromRequestParts, Path};
 use axum::http::Uri;
 use axum::http::request::Parts;
-use serde::de::value::{MapAccessDeserializer, SeqDeserializer, StrDeserializer};
-use serde::de::{
-    DeserializeOwned, DeserializeSeed, Deserializer, Error as _, IntoDeserializer as _, MapAccess, Visitor,
-};
-use serde::{Deserialize, forward_to_deserialize_any};
+use serde::Deserialize;
+use serde::de::{DeserializeOwned, Deserializer, Error as _};
+use serde_html_form::Deserializer as FormDeserializer;
+use serde_path_to_error::Segment;
 use utoipa::openapi::{KnownFormat, ObjectBuilder, RefOr, Schema, SchemaFormat, Type};
 use utoipa::{PartialSchema, ToSchema};
 
 use super::problem::ProblemResponse;
 use crate::fault::RequestFault;
+
+/// What serde_html_form says of several values if its field is no list.
+const LIST_FOUND: &str = "unsupported value";
 
 /// The named parts of a path.
 pub(super) struct PathParams<T>(pub(super) T);
@@ -32,7 +32,7 @@ impl<S: Send + Sync, T: DeserializeOwned + Send> FromRequestParts<S> for PathPar
 }
 
 /// The parameters after the path's `?`. A field that is a list has all values of its name; another name may be there
-/// once.
+/// once. An optional parameter without a value counts as left out.
 pub(super) struct QueryParams<T>(pub(super) T);
 
 impl<S: Send + Sync, T: DeserializeOwned> FromRequestParts<S> for QueryParams<T> {
@@ -48,103 +48,17 @@ impl<S: Send + Sync, T: DeserializeOwned> FromRequestParts<S> for QueryParams<T>
 /// # Errors
 /// [`RequestFault::Request`] if a name or a value is not allowed.
 pub(super) fn parse_query<T: DeserializeOwned>(uri: &Uri) -> Result<T, RequestFault> {
-    let Query(pairs) = Query::<Vec<(String, String)>>::try_from_uri(uri)
-        .map_err(|_| RequestFault::request("the parameters are not UTF-8"))?;
-    let mut names: Vec<(&str, Vec<&str>)> = Vec::new();
-    for (name, value) in &pairs {
-        match names.iter_mut().find(|(known, _)| known == name) {
-            Some((_, values)) => values.push(value),
-            None => names.push((name, vec![value])),
+    let params = FormDeserializer::from_bytes(uri.query().unwrap_or_default().as_bytes());
+    serde_path_to_error::deserialize(params).map_err(|error| {
+        let mut defect = error.inner().to_string();
+        if defect == LIST_FOUND {
+            defect = "it is there twice".to_owned();
         }
-    }
-    let access = ParamAccess { rest: names.into_iter(), values: None };
-    T::deserialize(MapAccessDeserializer::new(access)).map_err(|e| RequestFault::request(e.0))
-}
-
-/// The defect of a parameter, without its name or with it.
-#[derive(Debug, thiserror::Error)]
-#[error("{0}")]
-struct ParamError(String);
-
-impl serde::de::Error for ParamError {
-    fn custom<M: fmt::Display>(message: M) -> Self {
-        Self(message.to_string())
-    }
-
-    fn unknown_variant(found: &str, known: &'static [&'static str]) -> Self {
-        Self(format!("is `{found}`; hint: {}", known.join(", ")))
-    }
-
-    fn unknown_field(found: &str, known: &'static [&'static str]) -> Self {
-        Self(format!("there is no parameter `{found}`; hint: {}", known.join(", ")))
-    }
-}
-
-/// Parameters by name.
-struct ParamAccess<'a> {
-    rest: vec::IntoIter<(&'a str, Vec<&'a str>)>,
-    values: Option<(&'a str, Vec<&'a str>)>,
-}
-
-impl<'de> MapAccess<'de> for ParamAccess<'de> {
-    type Error = ParamError;
-
-    fn next_key_seed<K: DeserializeSeed<'de>>(&mut self, seed: K) -> Result<Option<K::Value>, ParamError> {
-        self.values = self.rest.next();
-        let name = self.values.as_ref().map(|(name, _)| StrDeserializer::new(name));
-        name.map(|name| seed.deserialize(name)).transpose()
-    }
-
-    fn next_value_seed<V: DeserializeSeed<'de>>(&mut self, seed: V) -> Result<V::Value, ParamError> {
-        let (name, values) = self.values.take().unwrap_or_default();
-        seed.deserialize(ParamValues(values)).map_err(|e| ParamError(format!("`{name}` {e}")))
-    }
-}
-
-/// The values of one name.
-struct ParamValues<'a>(Vec<&'a str>);
-
-impl<'de> ParamValues<'de> {
-    fn one(&self) -> Result<StrDeserializer<'de, ParamError>, ParamError> {
-        match self.0[..] {
-            [value] => Ok(value.into_deserializer()),
-            _ => Err(ParamError::custom("is there twice")),
-        }
-    }
-}
-
-impl<'de> Deserializer<'de> for ParamValues<'de> {
-    type Error = ParamError;
-
-    fn deserialize_any<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, ParamError> {
-        self.one()?.deserialize_any(visitor)
-    }
-
-    fn deserialize_option<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, ParamError> {
-        visitor.visit_some(self)
-    }
-
-    fn deserialize_seq<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, ParamError> {
-        visitor.visit_seq(SeqDeserializer::new(self.0.into_iter()))
-    }
-
-    fn deserialize_enum<V: Visitor<'de>>(
-        self,
-        name: &'static str,
-        variants: &'static [&'static str],
-        visitor: V,
-    ) -> Result<V::Value, ParamError> {
-        self.one()?.deserialize_enum(name, variants, visitor)
-    }
-
-    fn deserialize_ignored_any<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, ParamError> {
-        visitor.visit_unit()
-    }
-
-    forward_to_deserialize_any! {
-        bool i8 i16 i32 i64 i128 u8 u16 u32 u64 u128 f32 f64 char str string bytes byte_buf unit unit_struct
-        newtype_struct tuple tuple_struct map struct identifier
-    }
+        RequestFault::request(match error.path().iter().next() {
+            Some(Segment::Map { key: name }) => format!("`{name}`: {defect}"),
+            _ => format!("the parameters are not right: {defect}"),
+        })
+    })
 }
 
 /// A parameter that is a whole number within bounds, and that has a default.
@@ -186,11 +100,11 @@ impl<const LOW: usize, const HIGH: usize, const DEFAULT: usize> ToSchema for Who
 /// Reads a whole number. It has no sign and no spaces, so that one number makes one address.
 ///
 /// # Errors
-/// What the text is and what is allowed, to be put after the parameter's name.
+/// The text, and what is allowed.
 pub(super) fn parse_whole(text: &str, bounds: RangeInclusive<usize>) -> Result<usize, String> {
     let digits = text.bytes().all(|b| b.is_ascii_digit());
     let value = text.parse().ok().filter(|n| digits && bounds.contains(n));
-    value.ok_or_else(|| format!("is `{text}`; hint: a whole number from {} to {}", bounds.start(), bounds.end()))
+    value.ok_or_else(|| format!("`{text}` is no whole number from {} to {}", bounds.start(), bounds.end()))
 }
 
 /// A range of numbers, written `lo..hi`.
@@ -201,12 +115,12 @@ impl NumberRange {
     /// Reads `lo..hi`.
     ///
     /// # Errors
-    /// What the text is and what is allowed, to be put after the parameter's name.
+    /// The text, and what is allowed.
     pub(super) fn parse(text: &str) -> Result<Self, String> {
         let number = |text: &str| text.parse::<f64>().ok().filter(|n| n.is_finite());
         let bounds = text.split_once("..").and_then(|(low, high)| Some(number(low)?..=number(high)?));
         let bounds = bounds.filter(|b| b.start() <= b.end());
-        bounds.map(Self).ok_or_else(|| format!("is `{text}`; hint: two numbers, the lower first, as -6..0.5"))
+        bounds.map(Self).ok_or_else(|| format!("`{text}` is no range; hint: two numbers, the lower first, as -6..0.5"))
     }
 }
 
@@ -252,7 +166,7 @@ mod tests {
     }
 
     #[derive(Debug, Default, PartialEq, Deserialize)]
-    #[serde(default)]
+    #[serde(default, deny_unknown_fields)]
     struct TestQuery {
         a: Option<String>,
         b: Vec<String>,
@@ -275,24 +189,26 @@ mod tests {
             order: RowOrder::Desc,
             level: vec![NumberRange(-6.0..=0.5)],
         };
-        assert_eq!(query("a=1&b=x%20y&b=%3C&limit=007&order=desc&level=-6..0.5&other=1&other=2"), Ok(expected));
+        assert_eq!(query("a=1&b=x%20y&b=%3C&limit=007&order=desc&level=-6..0.5"), Ok(expected));
         assert!(query("a=%ff").is_ok());
     }
 
     #[test]
     fn defects_say_what_is_allowed() {
         for wrong in ["0", "501", "+7", "7.0", "", "x", "99999999999999999999"] {
-            let expected = format!("`limit` is `{wrong}`; hint: a whole number from 1 to 500");
+            let expected = format!("`limit`: `{wrong}` is no whole number from 1 to 500");
             assert_eq!(query(&format!("limit={}", wrong.replace('+', "%2B"))), Err(expected));
         }
         for wrong in ["", "1", "1..", "..1", "a..b", "1..inf", "NaN..1", "1...2", "2..1"] {
-            let expected = format!("`level` is `{wrong}`; hint: two numbers, the lower first, as -6..0.5");
+            let expected = format!("`level`: `{wrong}` is no range; hint: two numbers, the lower first, as -6..0.5");
             assert_eq!(query(&format!("level=1..2&level={wrong}")), Err(expected));
         }
-        assert_eq!(query("order=up"), Err("`order` is `up`; hint: asc, desc".into()));
+        assert_eq!(query("order=up"), Err("`order`: unknown variant `up`, expected `asc` or `desc`".into()));
+        let unknown = "the parameters are not right: unknown field `other`, expected one of `a`, `b`, `limit`, `order`, `level`";
+        assert_eq!(query("a=1&other=2"), Err(unknown.into()));
         for twice in ["a=1&a=1", "limit=1&b=2&limit=1", "order=asc&order=asc"] {
             let name = twice.split('=').next().expect("a name");
-            assert_eq!(query(twice), Err(format!("`{name}` is there twice")));
+            assert_eq!(query(twice), Err(format!("`{name}`: it is there twice")));
         }
     }
 }

@@ -21,7 +21,7 @@ use crate::tokens::TokenScope;
 
 /// The tables that files are listed of.
 #[derive(Default, Deserialize, IntoParams)]
-#[serde(default)]
+#[serde(default, deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
 pub(super) struct FilesQuery {
     /// Only of these tables.

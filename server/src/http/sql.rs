@@ -3,8 +3,8 @@
 use std::sync::Arc;
 
 use axum::body::Body;
-use axum::extract::rejection::{BytesRejection, QueryRejection};
-use axum::extract::{Query, State};
+use axum::extract::State;
+use axum::extract::rejection::BytesRejection;
 use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse as _, Response};
 use bytes::Bytes;
@@ -16,7 +16,7 @@ use utoipa::{IntoParams, ToSchema};
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
-use super::extract::BinaryContent;
+use super::extract::{BinaryContent, QueryParams};
 use super::format::{FormatEncoder, accepted, format_names, media_type, named};
 use super::guard::MayQuery;
 use super::problem::ProblemResponse;
@@ -29,6 +29,7 @@ const LARGEST: usize = 2 << 20;
 
 /// The parameters after the path's `?`.
 #[derive(Deserialize, IntoParams)]
+#[serde(deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
 pub(super) struct SqlParams {
     #[param(schema_with = format_schema)]
@@ -82,12 +83,10 @@ pub(super) fn routes() -> OpenApiRouter<QueryService> {
 async fn post(
     State(service): State<QueryService>,
     MayQuery(client): MayQuery,
-    params: Result<Query<SqlParams>, QueryRejection>,
+    QueryParams(params): QueryParams<SqlParams>,
     headers: HeaderMap,
     body: Result<Bytes, BytesRejection>,
 ) -> Result<Response, ProblemResponse> {
-    let Query(params) =
-        params.map_err(|_| RequestFault::request("the path's parameters are not right; hint: ?format=csv"))?;
     let request = parse_body(&headers, &whole(body)?)?;
     let format = format(&headers, params.format.or(request.format))?;
     let format = match (params.escape_formulas.or(request.escape_formulas).unwrap_or(false), format) {

@@ -42,7 +42,7 @@ struct BandCorrelation {
 
 /// The surfaces that correlations are of.
 #[derive(Default, Deserialize, IntoParams)]
-#[serde(default)]
+#[serde(default, deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
 pub(super) struct CorrelationsQuery {
     typology: Vec<String>,

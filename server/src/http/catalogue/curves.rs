@@ -133,7 +133,7 @@ fn times_ms(rig: &Rig, kept: &[usize]) -> Vec<f64> {
 
 /// The pairs and the points of curves.
 #[derive(Default, Deserialize, IntoParams)]
-#[serde(default)]
+#[serde(default, deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
 pub(super) struct CurvesQuery {
     /// A grid point.

@@ -64,7 +64,7 @@ const MEANS: &str = "select min(log_time_ns) as ns, avg(temperature_c) as temper
 
 /// The number of means.
 #[derive(Default, Deserialize, IntoParams)]
-#[serde(default)]
+#[serde(default, deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
 pub(super) struct EnvironmentQuery {
     #[param(inline)]

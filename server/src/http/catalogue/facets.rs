@@ -59,7 +59,7 @@ const FACETS: [SurfaceFacet; 6] = [
 
 /// Filters, order and part of a page of surfaces.
 #[derive(Default, Deserialize, IntoParams)]
-#[serde(default)]
+#[serde(default, deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
 pub(super) struct SurfacesQuery {
     /// Text in id, typology, structures, material, parameters.
@@ -122,7 +122,7 @@ struct LevelRange {
 impl<'de> Deserialize<'de> for LevelRange {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         let text = String::deserialize(deserializer)?;
-        let incomplete = || D::Error::custom(format!("is `{text}`; hint: a band and two numbers, as 2500:-6..0.5"));
+        let incomplete = || D::Error::custom(format!("`{text}` is no range of a band; hint: a band and two numbers, as 2500:-6..0.5"));
         let (band, range) = text.split_once(':').ok_or_else(incomplete)?;
         Ok(Self { band: band.to_owned(), range: NumberRange::parse(range).map_err(D::Error::custom)? })
     }

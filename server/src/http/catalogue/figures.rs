@@ -44,6 +44,7 @@ enum FigurePalette {
 
 /// The contents of a grid plot.
 #[derive(Deserialize, IntoParams)]
+#[serde(deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
 pub(super) struct GridFigureQuery {
     /// A grid point.
@@ -145,7 +146,7 @@ pub(super) async fn grid_figure(
 
 /// The contents of a plot of NCE curves.
 #[derive(Default, Deserialize, IntoParams)]
-#[serde(default)]
+#[serde(default, deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
 pub(super) struct CurvesFigureQuery {
     /// A grid point.

@@ -58,7 +58,7 @@ struct MapPoint<'a> {
 
 /// The number of neighbours.
 #[derive(Default, Deserialize, IntoParams)]
-#[serde(default)]
+#[serde(default, deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
 pub(super) struct MapQuery {
     #[param(inline)]

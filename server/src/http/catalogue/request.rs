@@ -92,7 +92,7 @@ impl CatalogueRequest {
     /// Reads the parameter `microphone`, a grid point of the lake.
     pub(super) fn microphone(&self, text: &str) -> Result<usize, RequestFault> {
         let last = self.catalogue.lake().grid().points().len().saturating_sub(1);
-        parse_whole(text, 0..=last).map_err(|e| RequestFault::request(format!("`microphone` {e}")))
+        parse_whole(text, 0..=last).map_err(|e| RequestFault::request(format!("`microphone`: {e}")))
     }
 
     /// The rows of a query. `sql` is a text of the program's own; what came with the request is among `values`.

@@ -65,7 +65,7 @@ const CHOSEN: &str = "($1 = '' or strpos(lower(concat(run_id, ' ', surface_id, '
 
 /// Filters, order and part of a page of runs.
 #[derive(Default, Deserialize, IntoParams)]
-#[serde(default)]
+#[serde(default, deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
 pub(super) struct RunsQuery {
     /// Text in id, surface and state.

@@ -156,6 +156,7 @@ struct SurfaceGrid<'a> {
 
 /// The point and the levels of a grid.
 #[derive(Deserialize, IntoParams)]
+#[serde(deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
 pub(super) struct GridQuery {
     /// A grid point.

@@ -20,7 +20,7 @@ const HEAD: usize = 58;
 
 /// The signal and the pitch of a response that is heard.
 #[derive(Default, Deserialize, IntoParams)]
-#[serde(default)]
+#[serde(default, deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
 pub(super) struct WavQuery {
     #[param(inline)]
