@@ -1,6 +1,9 @@
 //! `GET /api/v1/surfaces/{surface_id}/pairs/{pair_id}/ir.wav`: an audible response, slowed down to full scale.
 
+use std::io::Cursor;
+
 use axum::Extension;
+use hound::{SampleFormat, WavSpec, WavWriter};
 use serde::Deserialize;
 use utoipa::{IntoParams, ToSchema};
 
@@ -12,11 +15,6 @@ use crate::fault::RequestFault;
 
 /// The panels are models of walls at a tenth of their size: the wavelengths are a tenth, too.
 const SCALE: usize = 10;
-/// IEEE floats, in WAVE's words.
-const FLOATS: u16 = 3;
-const SAMPLE_BYTES: u16 = 4;
-/// From the file's beginning to its samples: RIFF, `fmt ` with an empty extension, `fact`, `data`.
-const HEAD: usize = 58;
 
 /// The signal and the pitch of a response that is heard.
 #[derive(Default, Deserialize, IntoParams)]
@@ -78,31 +76,20 @@ pub(super) async fn wav(
     let what = || format!("pair {pair} of surface `{id}`");
     let samples = samples.ok_or_else(|| RequestFault::NoData { what: what(), data: "reflected response", hint })?;
     let rate_hz = request.catalogue.lake().rig().sweep.rate_hz.get() / query.slowdown.get() as f64;
-    Ok(AnswerContent::new("audio/wav", file(&samples, rate_hz.round() as u32))
-        .named(format!("{id}-{pair}-{}.wav", query.signal.name())))
+    let file = write_wav(&samples, rate_hz.round() as u32);
+    let file = file.map_err(RequestFault::defect("a response makes no WAV file"))?;
+    Ok(AnswerContent::new("audio/wav", file).named(format!("{id}-{pair}-{}.wav", query.signal.name())))
 }
 
-fn file(samples: &[f32], rate_hz: u32) -> Vec<u8> {
-    let data = samples.len() as u32 * u32::from(SAMPLE_BYTES);
-    let mut file = Vec::with_capacity(HEAD + data as usize);
-    file.extend(b"RIFF");
-    file.extend((HEAD as u32 - 8 + data).to_le_bytes());
-    file.extend(b"WAVEfmt ");
-    file.extend(18_u32.to_le_bytes());
-    file.extend(FLOATS.to_le_bytes());
-    file.extend(1_u16.to_le_bytes());
-    file.extend(rate_hz.to_le_bytes());
-    file.extend((rate_hz * u32::from(SAMPLE_BYTES)).to_le_bytes());
-    file.extend(SAMPLE_BYTES.to_le_bytes());
-    file.extend((8 * SAMPLE_BYTES).to_le_bytes());
-    file.extend(0_u16.to_le_bytes());
-    file.extend(b"fact");
-    file.extend(4_u32.to_le_bytes());
-    file.extend((samples.len() as u32).to_le_bytes());
-    file.extend(b"data");
-    file.extend(data.to_le_bytes());
-    samples.iter().for_each(|sample| file.extend(sample.to_le_bytes()));
-    file
+fn write_wav(samples: &[f32], rate_hz: u32) -> hound::Result<Vec<u8>> {
+    let spec = WavSpec { channels: 1, sample_rate: rate_hz, bits_per_sample: 32, sample_format: SampleFormat::Float };
+    let mut file = Cursor::new(Vec::new());
+    let mut writer = WavWriter::new(&mut file, spec)?;
+    for sample in samples {
+        writer.write_sample(*sample)?;
+    }
+    writer.finalize()?;
+    Ok(file.into_inner())
 }
 
 #[cfg(test)]
@@ -110,12 +97,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_file_says_what_is_in_it() {
-        let file = file(&[0.5, -0.25], 9600);
-        assert_eq!(file.len(), HEAD + 8);
-        let number = |at: usize| u32::from_le_bytes(file[at..at + 4].try_into().expect("four bytes"));
-        assert_eq!((number(4) as usize, number(24), number(28)), (file.len() - 8, 9600, 38_400));
-        assert_eq!((&file[50..54], number(54)), (b"data".as_slice(), 8));
-        assert_eq!(file[HEAD..HEAD + 4], 0.5_f32.to_le_bytes());
+    fn a_file_has_the_samples_and_their_rate() {
+        let file = write_wav(&[0.5, -0.25], 9600).expect("a file");
+        let mut reader = hound::WavReader::new(&file[..]).expect("a WAV file");
+        assert_eq!((reader.spec().sample_rate, reader.spec().sample_format), (9600, SampleFormat::Float));
+        let samples: Vec<f32> = reader.samples().collect::<Result<_, _>>().expect("samples");
+        assert_eq!(samples, [0.5, -0.25]);
     }
 }
