@@ -9,7 +9,7 @@ use echolake_schema::ProjectName;
 use serde::{Deserialize, Serialize};
 
 use crate::fault::RequestFault;
-use crate::tokens::TokenScope;
+use crate::token_scope::TokenScope;
 
 /// Name of the client for requests of the server's own pages, if there are no tokens.
 const PAGES: &str = "pages";

@@ -7,7 +7,7 @@ use echolake_export::Error as SliceError;
 use echolake_query::{Error as QueryError, QueryPlace};
 use serde::{Deserialize, Serialize};
 
-use crate::tokens::TokenScope;
+use crate::token_scope::TokenScope;
 
 /// Seconds after which a client may ask again a server that stops or is not ready: a restart takes some.
 const RESTART_SECS: u64 = 5;

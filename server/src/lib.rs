@@ -36,6 +36,7 @@ mod scram_verifier;
 mod service;
 mod sessions;
 mod token_access;
+mod token_scope;
 pub mod tokens;
 
 pub use catalogue_pages::CataloguePages;

@@ -1,9 +1,7 @@
 //! The file of tokens, stored as hashes, each with scopes and quotas.
 
 use std::collections::BTreeSet;
-use std::fmt;
 use std::path::{Path, PathBuf};
-use std::str::FromStr;
 use std::sync::Arc;
 
 use base64::Engine as _;
@@ -12,56 +10,20 @@ use base64::engine::GeneralPurpose;
 use base64::engine::general_purpose::NO_PAD;
 use chrono::{DateTime, Utc};
 use echolake_schema::ProjectName;
-use serde::{Deserialize, Serialize};
+use serde::Deserialize;
 use sha2::{Digest as _, Sha256};
 use subtle::{Choice, ConstantTimeEq as _};
 
 use crate::Error;
 use crate::client_identity::ClientIdentity;
 use crate::scram_verifier::ScramVerifier;
+pub use crate::token_scope::TokenScope;
 
 /// Of basic credentials; padding is cut off before, since gRPC's clients leave it out.
 const BASE64: GeneralPurpose = GeneralPurpose::new(&STANDARD, NO_PAD.with_decode_allow_trailing_bits(true));
 
 /// Prefix of all tokens, so that leaked ones can be found by searching.
 const PREFIX: &str = "echolake_";
-
-/// A permission of a token.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum TokenScope {
-    /// Queries, and what the tables are.
-    Sql,
-    /// The runs' and tables' files.
-    Files,
-    /// The server's own figures.
-    Metrics,
-}
-
-impl TokenScope {
-    /// The scopes, by their names in the file of tokens.
-    pub const NAMED: [(&'static str, Self); 3] =
-        [("sql", Self::Sql), ("files", Self::Files), ("metrics", Self::Metrics)];
-}
-
-impl FromStr for TokenScope {
-    type Err = String;
-
-    fn from_str(name: &str) -> Result<Self, String> {
-        let found = Self::NAMED.into_iter().find(|(known, _)| *known == name);
-        found.map(|(_, scope)| scope).ok_or_else(|| format!("no scope `{name}`; hint: sql, files or metrics"))
-    }
-}
-
-impl fmt::Display for TokenScope {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Self::Sql => "SQL",
-            Self::Files => "files",
-            Self::Metrics => "metrics",
-        })
-    }
-}
 
 /// The tokens of a file.
 pub struct TokenFile {

@@ -53,7 +53,7 @@ pub(super) fn routes() -> OpenApiRouter<ViewerLayout> {
 
 /// The layout for viewers on pages of any origin.
 pub(super) fn for_viewers(layout: ViewerLayout) -> Router {
-    Router::from(routes()).method_not_allowed_fallback(super::wrong_method).layer(cors()).with_state(layout)
+    Router::from(routes()).method_not_allowed_fallback(super::problem::refuse_method).layer(cors()).with_state(layout)
 }
 
 /// A layout for Foxglove and Lichtblick: panel and arms, response, air, measurement, log.

@@ -129,7 +129,7 @@ fn contract_parts() -> [OpenApi; 2] {
 
 fn with_refusals(router: Router) -> Router {
     router
-        .method_not_allowed_fallback(wrong_method)
+        .method_not_allowed_fallback(problem::refuse_method)
         .layer(CatchPanicLayer::custom(|_| ProblemResponse(RequestFault::Internal).answer()))
         .layer(map_response(guard::security_headers))
 }
@@ -139,8 +139,4 @@ async fn nothing() -> ProblemResponse {
         what: "this path".to_owned(),
         hint: "GET /api/v1/openapi.json lists what there is",
     })
-}
-
-async fn wrong_method() -> ProblemResponse {
-    ProblemResponse(RequestFault::Method)
 }

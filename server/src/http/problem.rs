@@ -101,6 +101,11 @@ impl IntoResponse for ProblemResponse {
     }
 }
 
+/// Refuses a method that a path does not have.
+pub(super) async fn refuse_method() -> ProblemResponse {
+    ProblemResponse(RequestFault::Method)
+}
+
 fn status(code: FaultCode) -> (StatusCode, &'static str) {
     match code {
         FaultCode::Query => (StatusCode::BAD_REQUEST, "The query is not right"),

@@ -122,7 +122,9 @@ struct LevelRange {
 impl<'de> Deserialize<'de> for LevelRange {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         let text = String::deserialize(deserializer)?;
-        let incomplete = || D::Error::custom(format!("`{text}` is no range of a band; hint: a band and two numbers, as 2500:-6..0.5"));
+        let incomplete = || {
+            D::Error::custom(format!("`{text}` is no range of a band; hint: a band and two numbers, as 2500:-6..0.5"))
+        };
         let (band, range) = text.split_once(':').ok_or_else(incomplete)?;
         Ok(Self { band: band.to_owned(), range: NumberRange::parse(range).map_err(D::Error::custom)? })
     }

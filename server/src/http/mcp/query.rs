@@ -9,16 +9,11 @@ use echolake_query::output::{AnswerFormat, AnswerWriter};
 use echolake_schema::tables::UNIT;
 use serde_json::{Map, Value, json};
 
-use super::tools::ToolCall;
+use super::tools::{MOST_BYTES, MOST_ROWS, ToolCall, USUAL_ROWS};
 use crate::fault::RequestFault;
 use crate::running::AnswerEncoder;
 use crate::service::{QueryJob, QueryWork};
 
-/// Rows of an answer if the call does not say, and at most.
-pub(super) const USUAL_ROWS: u64 = 100;
-pub(super) const MOST_ROWS: u64 = 1000;
-/// Bytes of an answer's rows as JSON: some 25,000 words.
-pub(super) const MOST_BYTES: usize = 100_000;
 /// Rows that are encoded at once, because one may be long.
 const PART_ROWS: usize = 16;
 

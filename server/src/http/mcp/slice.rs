@@ -1,23 +1,10 @@
 //! `slice_url`: the address of an MCAP file of chosen measurements.
 
-use serde::Deserialize;
 use serde_json::{Value, json};
 
 use super::super::slices::SliceParameters;
-use super::tools::ToolCall;
+use super::tools::{SliceArguments, ToolCall};
 use crate::fault::RequestFault;
-
-/// The slice that is wanted.
-#[derive(Deserialize)]
-#[serde(deny_unknown_fields)]
-pub(super) struct SliceArguments {
-    #[serde(default)]
-    runs: Vec<String>,
-    #[serde(rename = "where")]
-    predicate: Option<String>,
-    #[serde(default)]
-    topics: Vec<String>,
-}
 
 impl ToolCall<'_> {
     /// The addresses of a slice, and what is in it.

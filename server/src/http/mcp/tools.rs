@@ -5,11 +5,14 @@ use serde::de::DeserializeOwned;
 use serde_json::{Map, Value, json};
 
 use super::AgentService;
-use super::query::{MOST_BYTES, MOST_ROWS, USUAL_ROWS};
-use super::slice::SliceArguments;
 use crate::fault::RequestFault;
 use crate::tokens::TokenScope;
 
+/// Rows of an answer if the call does not say, and at most.
+pub(super) const USUAL_ROWS: u64 = 100;
+pub(super) const MOST_ROWS: u64 = 1000;
+/// Bytes of an answer's rows as JSON: some 25,000 words.
+pub(super) const MOST_BYTES: usize = 100_000;
 /// A tool.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum AgentTool {
@@ -62,6 +65,18 @@ struct SurfaceArguments {
 #[serde(deny_unknown_fields)]
 struct RunArguments {
     run_id: String,
+}
+
+/// The slice that is wanted.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct SliceArguments {
+    #[serde(default)]
+    pub(super) runs: Vec<String>,
+    #[serde(rename = "where")]
+    pub(super) predicate: Option<String>,
+    #[serde(default)]
+    pub(super) topics: Vec<String>,
 }
 
 impl AgentTool {

@@ -79,7 +79,7 @@ pub(super) fn routes() -> OpenApiRouter<SliceService> {
 /// Slices and their manifest for viewers on pages of any origin.
 pub(super) fn for_viewers(slices: SliceService) -> Router {
     let routes = Router::from(routes()).route(LICHTBLICK_SESSION, get(lichtblick::session));
-    routes.method_not_allowed_fallback(super::wrong_method).with_state(slices)
+    routes.method_not_allowed_fallback(super::problem::refuse_method).with_state(slices)
 }
 
 /// An authorised request for a slice.
