@@ -1,19 +1,19 @@
-//! Slices that are read by ranges: cut once, cached in files without names up to a number of bytes, the oldest evicted
-//! first, and while other clients have room on the disk. Disks are waited for on threads of their own.
+//! Slices that are read by ranges: cut once, cached in files without names up to a number of bytes, and while other
+//! clients have room on the disk. Disks are waited for on threads of their own.
 //!
-//! It is none of the caches by `quick_cache`, which count an item once it is complete and until it is evicted: here bytes
-//! count from when they are written until the last reader closes the file.
+//! The cache weighs a slice once it is complete and until it is evicted. On the disk its bytes count from when they are
+//! written until the last reader closes the file, so that these are counted beside it.
 
-use std::collections::{HashMap, VecDeque};
 use std::fs::File;
 use std::io::{self, Write as _};
 use std::ops::Range;
 use std::os::unix::fs::FileExt as _;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use bytes::Bytes;
 use futures::stream::{self, Stream};
-use tokio::sync::OnceCell;
+use quick_cache::Weighter;
+use quick_cache::sync::Cache;
 
 use super::SliceTask;
 use crate::fault::RequestFault;
@@ -46,7 +46,9 @@ impl PieceSource for SliceTask {
 pub(super) struct SliceSpool(Arc<SharedSpool>);
 
 struct SharedSpool {
-    state: Mutex<SpoolState>,
+    slices: Cache<String, Arc<SpooledSlice>, SliceWeighter>,
+    /// Bytes of all open files, cached or not.
+    open_bytes: Mutex<u64>,
     /// Free bytes of the disk; None if the system does not tell.
     free_bytes: fn() -> Option<u64>,
 }
@@ -62,13 +64,14 @@ fn free_temp_bytes() -> Option<u64> {
     Some(disk.f_bavail * disk.f_frsize)
 }
 
-#[derive(Default)]
-struct SpoolState {
-    slices: HashMap<String, Arc<OnceCell<Arc<SpooledSlice>>>>,
-    /// Keys of complete slices, the most recently used last.
-    order: VecDeque<String>,
-    /// Bytes of all open files, cached or not.
-    bytes: u64,
+/// Weighs slices by their bytes.
+#[derive(Clone)]
+struct SliceWeighter;
+
+impl Weighter<String, Arc<SpooledSlice>> for SliceWeighter {
+    fn weight(&self, _: &String, slice: &Arc<SpooledSlice>) -> u64 {
+        slice.bytes.max(1)
+    }
 }
 
 /// A slice in a file without a name: the system deletes it when it is closed, even by a crash.
@@ -81,30 +84,15 @@ pub(super) struct SpooledSlice {
 
 impl Drop for SpooledSlice {
     fn drop(&mut self) {
-        self.spool.kept().bytes -= self.bytes;
-    }
-}
-
-/// A request that waits for a slice. The last one that is dropped without a slice removes the empty entry.
-struct SliceWaiter<'a> {
-    spool: &'a SliceSpool,
-    cell: Arc<OnceCell<Arc<SpooledSlice>>>,
-    key: &'a str,
-}
-
-impl Drop for SliceWaiter<'_> {
-    fn drop(&mut self) {
-        let mut kept = self.spool.kept();
-        // Two: the map's and this one.
-        if !self.cell.initialized() && Arc::strong_count(&self.cell) <= 2 {
-            kept.slices.remove(self.key);
-        }
+        *self.spool.open_bytes() -= self.bytes;
     }
 }
 
 impl SliceSpool {
     fn new(free_bytes: fn() -> Option<u64>) -> Self {
-        Self(Arc::new(SharedSpool { state: Mutex::default(), free_bytes }))
+        // So few items are one shard, in which a slice may take all the room.
+        let slices = Cache::with_weighter(32, MOST_BYTES, SliceWeighter);
+        Self(Arc::new(SharedSpool { slices, open_bytes: Mutex::default(), free_bytes }))
     }
 
     /// Returns the slice of this name; it is cut if it is neither cached nor being cut by another request. If that
@@ -117,12 +105,8 @@ impl SliceSpool {
         key: &str,
         cut: impl Future<Output = Result<S, RequestFault>> + Send,
     ) -> Result<Arc<SpooledSlice>, RequestFault> {
-        let cell = self.kept().slices.entry(key.to_owned()).or_default().clone();
-        let waiting = SliceWaiter { spool: self, cell, key };
-        let spooled =
-            waiting.cell.get_or_try_init(|| async { self.fill(cut.await?).await.map(Arc::new) }).await?.clone();
-        self.touch(key, &waiting.cell);
-        Ok(spooled)
+        let fill = async { self.fill(cut.await?).await.map(Arc::new) };
+        self.0.slices.get_or_insert_async(key, fill).await
     }
 
     async fn fill(&self, mut cutting: impl PieceSource) -> Result<SpooledSlice, RequestFault> {
@@ -138,35 +122,31 @@ impl SliceSpool {
         Ok(slice)
     }
 
-    // Counts bytes that are about to be written, and evicts the oldest slices for them.
+    // Counts bytes that are about to be written, and evicts slices for them.
     fn make_room(&self, bytes: u64) -> Result<(), RequestFault> {
+        let slices = &self.0.slices;
         loop {
             let free_bytes = (self.0.free_bytes)().unwrap_or(u64::MAX);
-            let mut kept = self.kept();
-            let limit = MOST_BYTES.min(kept.bytes.saturating_add(free_bytes) / SHARE);
-            if kept.bytes + bytes <= limit {
-                kept.bytes += bytes;
+            let mut open_bytes = self.open_bytes();
+            let limit = MOST_BYTES.min(open_bytes.saturating_add(free_bytes) / SHARE);
+            let lacking = (*open_bytes + bytes).saturating_sub(limit);
+            if lacking == 0 {
+                *open_bytes += bytes;
                 return Ok(());
             }
-            let Some(oldest) = kept.order.pop_front() else { return Err(RequestFault::NoRoom { limit }) };
-            let gone = kept.slices.remove(&oldest);
-            drop(kept);
-            // Its bytes are free once it is dropped, unless it is being read; dropping takes the lock.
-            drop(gone);
+            // An evicted slice is dropped, unless it is being read, which takes this lock.
+            drop(open_bytes);
+            let cached = slices.weight();
+            if cached == 0 {
+                return Err(RequestFault::NoRoom { limit });
+            }
+            slices.set_capacity(cached.saturating_sub(lacking));
+            slices.set_capacity(MOST_BYTES);
         }
     }
 
-    fn touch(&self, key: &str, cell: &Arc<OnceCell<Arc<SpooledSlice>>>) {
-        let mut kept = self.kept();
-        // It may have had to go meanwhile.
-        if kept.slices.get(key).is_some_and(|known| Arc::ptr_eq(known, cell)) {
-            kept.order.retain(|known| known != key);
-            kept.order.push_back(key.to_owned());
-        }
-    }
-
-    fn kept(&self) -> std::sync::MutexGuard<'_, SpoolState> {
-        self.0.state.lock().unwrap_or_else(PoisonError::into_inner)
+    fn open_bytes(&self) -> MutexGuard<'_, u64> {
+        self.0.open_bytes.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -239,14 +219,14 @@ mod tests {
         }
         // The disk of this test is not freed: it is as if others took what was evicted.
         keep("c", 100_000).await.expect("the oldest made room");
-        assert_eq!(spool.kept().order, ["b", "c"]);
+        assert_eq!(["a", "b", "c"].map(|key| spool.0.slices.contains_key(key)), [false, true, true]);
         let others: u64 = 500_000;
         FREE.fetch_sub(others, Ordering::Relaxed);
         keep("d", 10_000).await.expect("both made room");
-        let kept = spool.kept().bytes;
+        let kept = *spool.open_bytes();
         assert!(kept <= (kept + FREE.load(Ordering::Relaxed)) / SHARE + 10_000, "{kept}");
         assert!(matches!(keep("e", 400_000).await, Err(RequestFault::NoRoom { limit }) if limit < 300_000));
         assert!(FREE.load(Ordering::Relaxed) > 0, "others have room");
-        assert_eq!(spool.kept().bytes, 0, "what was begun is gone");
+        assert_eq!(*spool.open_bytes(), 0, "what was begun is gone");
     }
 }
