@@ -8,7 +8,7 @@ use std::time::Duration;
 use arrow::datatypes::SchemaRef;
 use datafusion::common::ParamValues;
 use echolake_lake::Lake;
-use echolake_query::{EngineClient, PreparedQuery, QueryEngine, QueryQuota, QueryThreads, Session, SqlFunction};
+use echolake_query::{EngineClient, PreparedQuery, QueryEngine, QueryThreads, Session, SqlFunction};
 use futures::future::BoxFuture;
 use futures::{FutureExt as _, TryFutureExt as _};
 use tokio::sync::{mpsc, oneshot};
@@ -189,14 +189,12 @@ impl QueryService {
 
     /// The tables and their schemas.
     pub(crate) fn tables(&self) -> Vec<(&'static str, SchemaRef)> {
-        let nobody = Arc::new(EngineClient::new("tables", QueryQuota::default()));
-        self.session(&nobody).tables().collect()
+        self.session(&self.0.client).tables().collect()
     }
 
     /// The tables of the schema `system`, and their schemas.
     pub(crate) fn system_tables(&self) -> Vec<(&'static str, SchemaRef)> {
-        let nobody = Arc::new(EngineClient::new("tables", QueryQuota::default()));
-        self.session(&nobody).system_tables()
+        self.session(&self.0.client).system_tables()
     }
 
     /// All tables by the names that SQL has for them, and their schemas: those of the lake, then those of the schema
@@ -207,14 +205,12 @@ impl QueryService {
 
     /// The views' definitions by their names.
     pub(crate) fn view_definitions(&self) -> HashMap<&'static str, String> {
-        let nobody = Arc::new(EngineClient::new("views", QueryQuota::default()));
-        self.session(&nobody).view_definitions().collect()
+        self.session(&self.0.client).view_definitions().collect()
     }
 
     /// The field's functions.
     pub(crate) fn functions(&self) -> Vec<SqlFunction> {
-        let nobody = Arc::new(EngineClient::new("functions", QueryQuota::default()));
-        self.session(&nobody).functions().into_iter().filter(|f| f.is_own).collect()
+        self.all_functions().into_iter().filter(|f| f.is_own).collect()
     }
 
     /// All functions, the field's and DataFusion's.

@@ -3,6 +3,7 @@
 use echolake_export::{Layout, Taken};
 use echolake_query::PredicateForm;
 use echolake_schema::RunId;
+use percent_encoding::{AsciiSet, NON_ALPHANUMERIC, utf8_percent_encode};
 use serde::Deserialize;
 use utoipa::{IntoParams, ToSchema};
 
@@ -10,6 +11,8 @@ use crate::fault::RequestFault;
 
 /// Runs that may be named, and sources of a manifest.
 pub(super) const MOST_RUNS: usize = 100;
+/// Characters that are encoded in a URL: all that RFC 3986 does not call unreserved.
+const RESERVED: &AsciiSet = &NON_ALPHANUMERIC.remove(b'-').remove(b'.').remove(b'_').remove(b'~');
 
 /// The parameters after the path's `?`.
 #[derive(Default, Deserialize, IntoParams)]
@@ -123,7 +126,8 @@ impl SliceQuery {
         pairs.extend(self.predicate.as_deref().map(|predicate| ("where", predicate)));
         pairs.extend(runs.into_iter().map(|run| ("run", run.as_str())));
         pairs.extend(self.topics.iter().map(|topic| ("topics", topic.as_str())));
-        pairs.iter().map(|(name, value)| format!("{name}={}", encoded(value))).collect::<Vec<_>>().join("&")
+        let params = pairs.iter().map(|(name, value)| format!("{name}={}", utf8_percent_encode(value, RESERVED)));
+        params.collect::<Vec<_>>().join("&")
     }
 
     /// The name of its layout.
@@ -133,17 +137,6 @@ impl SliceQuery {
             Layout::InTime => "in-time",
         }
     }
-}
-
-// RFC 3986: what is not unreserved is encoded.
-fn encoded(text: &str) -> String {
-    text.bytes().fold(String::new(), |mut encoded, byte| {
-        match byte {
-            b'A'..=b'Z' | b'a'..=b'z' | b'0'..=b'9' | b'-' | b'.' | b'_' | b'~' => encoded.push(byte as char),
-            other => encoded.push_str(&format!("%{other:02X}")),
-        }
-        encoded
-    })
 }
 
 #[cfg(test)]
