@@ -28,13 +28,16 @@ pub mod fuzzing;
 mod http;
 mod metrics;
 mod postgres;
+mod random_id;
 mod request_span;
 #[cfg(feature = "otlp")]
 mod request_trace;
 mod running;
 mod scram_verifier;
+mod server_protocol;
 mod service;
 mod sessions;
+mod stop_signal;
 mod token_access;
 mod token_scope;
 pub mod tokens;

@@ -7,36 +7,11 @@ use echolake_lake::CacheCounts;
 use prometheus::{
     HistogramOpts, HistogramVec, IntCounter, IntCounterVec, IntGauge, Opts, Registry, Result, TextEncoder,
 };
-use serde::{Deserialize, Serialize};
 
 use crate::activity::QueryEnd;
 use crate::fault::{FaultCode, RequestFault};
+pub(crate) use crate::server_protocol::ServerProtocol;
 pub(crate) use gauges::{DiskSpace, PoolGauges, ServerGauges};
-
-/// The protocol of a query.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub(crate) enum ServerProtocol {
-    Http,
-    FlightSql,
-    Postgres,
-    /// The Model Context Protocol.
-    Mcp,
-}
-
-impl ServerProtocol {
-    pub(crate) const ALL: [Self; 4] = [Self::Http, Self::FlightSql, Self::Postgres, Self::Mcp];
-
-    /// As metrics and the log have it.
-    pub(crate) fn name(self) -> &'static str {
-        match self {
-            Self::Http => "http",
-            Self::FlightSql => "flight_sql",
-            Self::Postgres => "postgres",
-            Self::Mcp => "mcp",
-        }
-    }
-}
 
 /// Upper bounds of the buckets of a query's time, in seconds.
 const BUCKETS: [f64; 7] = [0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 10.0];

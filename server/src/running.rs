@@ -6,14 +6,15 @@ use std::time::Duration;
 
 use arrow::datatypes::SchemaRef;
 use arrow::record_batch::RecordBatch;
-use tokio::sync::{mpsc, watch};
+use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 use tokio::time::Instant;
 use tracing::Span;
 
 use crate::activity::QueryWatch;
+use crate::engine::report::EngineReport;
 use crate::fault::RequestFault;
-use crate::service::QueryService;
+pub(crate) use crate::stop_signal::StopSignal;
 
 /// Bytes of rows that are encoded at once: what an answer holds in memory is a few of these.
 const PART_BYTES: usize = 4 << 20;
@@ -47,27 +48,6 @@ impl AnswerEncoder for BatchEncoder {
     }
 }
 
-/// A signal that stops a query from another task.
-#[derive(Debug, Clone)]
-pub(crate) struct StopSignal(watch::Sender<bool>);
-
-impl StopSignal {
-    pub(crate) fn new() -> Self {
-        Self(watch::Sender::new(false))
-    }
-
-    /// Ends it.
-    pub(crate) fn stop(&self) {
-        self.0.send_replace(true);
-    }
-
-    /// Waits until the query is stopped.
-    pub(crate) async fn stopped(&self) {
-        // The sender lives in `self`, so there is no error to come.
-        let _ = self.0.subscribe().wait_for(|stopped| *stopped).await;
-    }
-}
-
 /// A query that runs. Dropping it ends it.
 pub(crate) struct RunningQuery<T> {
     /// The columns.
@@ -76,7 +56,6 @@ pub(crate) struct RunningQuery<T> {
     pub(crate) task: JoinSet<Result<(), RequestFault>>,
     pub(crate) stop: StopSignal,
     pub(crate) limit: Option<SessionTimeLimit>,
-    pub(crate) service: QueryService,
     pub(crate) watch: Arc<QueryWatch>,
     pub(crate) span: Span,
 }
@@ -113,7 +92,7 @@ impl<T: Send + 'static> RunningQuery<T> {
             fault = ended(&self.stop, limit) => {
                 self.watch.finish(Some(&fault));
                 self.task.abort_all();
-                self.span.in_scope(|| self.service.record_failure(&fault));
+                self.span.in_scope(|| EngineReport::record_failure(&fault));
                 return Err(fault);
             }
             item = self.items.recv() => if let Some(item) = item {

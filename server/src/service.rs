@@ -145,7 +145,7 @@ impl QueryService {
     /// # Errors
     /// [`RequestFault::Forbidden`].
     pub(crate) fn client(&self, scope: TokenScope) -> Result<Arc<EngineClient>, RequestFault> {
-        self.0.identity.require(scope).inspect_err(|fault| self.record_failure(fault))?;
+        self.0.identity.require(scope).inspect_err(EngineReport::record_failure)?;
         Ok(self.0.client.clone())
     }
 
@@ -157,12 +157,6 @@ impl QueryService {
     /// Reports a failed request to the door, which counts them.
     pub(crate) fn failed(&self, code: FaultCode) {
         EngineReport::Failure(code).queue();
-    }
-
-    /// Reports a failed request and writes it to the log.
-    pub(crate) fn record_failure(&self, fault: &RequestFault) {
-        self.failed(fault.code());
-        fault.log();
     }
 
     /// Watches a query, or other work that is listed among queries, until the timer is dropped.
@@ -246,7 +240,7 @@ impl QueryService {
         };
         let work = work.in_current_span();
         let planned = async move { self.0.engine.supervise(time, work).await };
-        planned.inspect_err(|fault| self.record_failure(fault)).boxed()
+        planned.inspect_err(EngineReport::record_failure).boxed()
     }
 
     /// Computes something long, which waits for nothing.
@@ -277,7 +271,6 @@ impl QueryService {
             let (columns, known) = oneshot::channel();
             let (to, items) = mpsc::channel(WAITING);
             let (stop, limit) = (job.stop.clone(), job.limit);
-            let service = self.clone();
             let span = tracing::error_span!("query", protocol = job.protocol.name(), client = self.0.identity.name);
             let timer = span.in_scope(|| self.watch(job.protocol, job.work.statement(), &job.stop));
             let (watch, stopped) = (timer.watch().clone(), stop.clone());
@@ -288,18 +281,18 @@ impl QueryService {
                     () = stopped.stopped() => return Err(RequestFault::Cancelled),
                 };
                 timer.watch().finish(done.as_ref().err());
-                done.inspect_err(|fault| service.record_failure(fault))
+                done.inspect_err(EngineReport::record_failure)
             };
-            let (mut task, service) = (self.spawn(work.instrument(span.clone())), self.clone());
+            let mut task = self.spawn(work.instrument(span.clone()));
             tokio::select! {
                 biased;
                 fault = ended(&stop, limit) => {
                     watch.finish(Some(&fault));
-                    span.in_scope(|| self.record_failure(&fault));
+                    span.in_scope(|| EngineReport::record_failure(&fault));
                     Err(fault)
                 }
                 schema = known => match schema {
-                    Ok(schema) => Ok(RunningQuery { schema, items, task, stop, limit, service, watch, span }),
+                    Ok(schema) => Ok(RunningQuery { schema, items, task, stop, limit, watch, span }),
                     // It ended without having any: it says why.
                     Err(_) => finish(&mut task).await.and(Err(RequestFault::Internal)),
                 }

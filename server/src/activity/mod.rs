@@ -1,7 +1,9 @@
 //! The server's activity: its queries, its connections, and what engines report of the lake. The door keeps it for
 //! `/metrics`, for `system.queries` and `system.connections`; engines report to it and ask for their client's rows.
 
+mod activity_rows;
 mod lake_figures;
+mod query_events;
 mod query_log;
 mod query_watch;
 
@@ -9,11 +11,12 @@ use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
 use chrono::{DateTime, Utc};
-use serde::{Deserialize, Serialize};
 
+pub(crate) use activity_rows::{ActivityRows, ActivityTable, OpenConnection};
 pub(crate) use lake_figures::LakeFigures;
+pub(crate) use query_events::{QueryEnd, QueryStart};
 pub(crate) use query_log::{LoggedQuery, QueryLog};
-pub(crate) use query_watch::{QueryEnd, QueryStart, QueryTimer, QueryWatch, RunningWatches};
+pub(crate) use query_watch::{QueryTimer, QueryWatch, RunningWatches};
 
 use crate::Error;
 use crate::client_identity::ClientIdentity;
@@ -28,47 +31,6 @@ pub(crate) struct ServerActivity {
     pub(crate) connections: OpenConnections,
     lake: Mutex<Option<(Instant, Option<LakeFigures>)>>,
     started: DateTime<Utc>,
-}
-
-/// A table of the server's activity.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub(crate) enum ActivityTable {
-    Queries,
-    Connections,
-}
-
-/// Rows of such a table.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub(crate) enum ActivityRows {
-    Queries(Vec<LoggedQuery>),
-    Connections(Vec<OpenConnection>),
-}
-
-/// Returns a random number of a query or connection: one that is counted would tell a client how much others ask. It has 53
-/// bits, so that a page's numbers hold it, and is not 0.
-pub(crate) fn random_id() -> u64 {
-    (getrandom::u64().unwrap_or(0) >> 11).max(1)
-}
-
-/// A row of `system.connections`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub(crate) struct OpenConnection {
-    /// Random number.
-    pub(crate) id: u64,
-    /// Name of its client, once it is known.
-    pub(crate) client: Option<String>,
-    /// Protocol.
-    pub(crate) protocol: String,
-    /// Address of the other side.
-    pub(crate) peer: String,
-    /// Microseconds since 1970.
-    pub(crate) started: i64,
-    /// Requests so far; over Postgres' protocol the session is one.
-    pub(crate) requests: u64,
-    /// True while a request is answered.
-    pub(crate) is_working: bool,
 }
 
 impl ServerActivity {

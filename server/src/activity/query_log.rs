@@ -5,8 +5,9 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use serde::{Deserialize, Serialize};
 
-use super::{QueryEnd, QueryStart, random_id};
+use super::query_events::{QueryEnd, QueryStart};
 use crate::fault::FaultCode;
+use crate::random_id::random_id;
 
 /// Queries that are remembered after their end, of all clients together.
 const REMEMBERED: usize = 1_000;

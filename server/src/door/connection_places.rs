@@ -19,8 +19,9 @@ use tokio::sync::Notify;
 use tokio::task::JoinSet;
 use tokio::time::Sleep;
 
-use crate::activity::{OpenConnection, random_id};
-use crate::metrics::ServerProtocol;
+use crate::activity::OpenConnection;
+use crate::random_id::random_id;
+use crate::server_protocol::ServerProtocol;
 
 /// Time to wait if the system has no more sockets.
 const PAUSE: Duration = Duration::from_millis(100);

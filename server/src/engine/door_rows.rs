@@ -5,17 +5,16 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use arrow::array::{ArrayRef, BooleanArray, Float64Array, StringArray, TimestampMicrosecondArray, UInt64Array};
 use arrow::datatypes::{DataType, Field, Schema, SchemaRef, TimeUnit};
-use arrow::error::ArrowError;
 use arrow::record_batch::RecordBatch;
 use async_trait::async_trait;
 use echolake_query::SystemSource;
 use echolake_schema::tables::{COMMENT, UNIT};
+use serde::Serialize;
 use tokio::sync::oneshot;
 
 use super::report::EngineReport;
-use crate::activity::{ActivityRows, ActivityTable, LoggedQuery, OpenConnection};
+use crate::activity::{ActivityRows, ActivityTable};
 
 /// Time for which an engine waits for rows.
 const ANSWER_LIMIT: Duration = Duration::from_secs(10);
@@ -64,11 +63,10 @@ impl SystemSource for DoorRows {
         let Some((_, table)) = TABLES.into_iter().find(|(name, _)| *name == table) else {
             return Err(format!("there is no table system.{table}"));
         };
-        let batch = match self.ask(table).await? {
-            ActivityRows::Queries(queries) => query_batch(&queries),
-            ActivityRows::Connections(connections) => connection_batch(&connections),
-        };
-        batch.map_err(|e| e.to_string())
+        match self.ask(table).await? {
+            ActivityRows::Queries(queries) => row_batch(table, &queries),
+            ActivityRows::Connections(connections) => row_batch(table, &connections),
+        }
     }
 }
 
@@ -107,56 +105,10 @@ fn schema(table: ActivityTable) -> SchemaRef {
     Arc::new(Schema::new(columns.into_iter().map(column).collect::<Vec<_>>()))
 }
 
-fn query_batch(queries: &[LoggedQuery]) -> Result<RecordBatch, ArrowError> {
-    let text = |value: fn(&LoggedQuery) -> &str| -> ArrayRef {
-        Arc::new(StringArray::from_iter_values(queries.iter().map(value)))
-    };
-    let count = |value: fn(&LoggedQuery) -> Option<u64>| -> ArrayRef {
-        Arc::new(queries.iter().map(value).collect::<UInt64Array>())
-    };
-    let seconds = |value: fn(&LoggedQuery) -> Option<f64>| -> ArrayRef {
-        Arc::new(queries.iter().map(value).collect::<Float64Array>())
-    };
-    let statement: StringArray = queries.iter().map(|query| query.statement.as_deref()).collect();
-    let columns = vec![
-        count(|query| Some(query.id)),
-        text(|query| &query.client),
-        text(|query| &query.protocol),
-        Arc::new(statement),
-        text(|query| &query.outcome),
-        times(queries.iter().map(|query| query.started)),
-        seconds(|query| query.plan_seconds),
-        seconds(|query| query.first_row_seconds),
-        seconds(|query| query.seconds),
-        count(|query| query.rows),
-        count(|query| query.bytes),
-        count(|query| query.memory_bytes),
-    ];
-    RecordBatch::try_new(schema(ActivityTable::Queries), columns)
-}
-
-fn connection_batch(connections: &[OpenConnection]) -> Result<RecordBatch, ArrowError> {
-    let text = |value: fn(&OpenConnection) -> Option<&str>| -> ArrayRef {
-        Arc::new(connections.iter().map(value).collect::<StringArray>())
-    };
-    let count = |value: fn(&OpenConnection) -> u64| -> ArrayRef {
-        Arc::new(UInt64Array::from_iter_values(connections.iter().map(value)))
-    };
-    let working: BooleanArray = connections.iter().map(|connection| Some(connection.is_working)).collect();
-    let columns = vec![
-        count(|connection| connection.id),
-        text(|connection| connection.client.as_deref()),
-        text(|connection| Some(&connection.protocol)),
-        text(|connection| Some(&connection.peer)),
-        times(connections.iter().map(|connection| connection.started)),
-        count(|connection| connection.requests),
-        Arc::new(working),
-    ];
-    RecordBatch::try_new(schema(ActivityTable::Connections), columns)
-}
-
-fn times(micros: impl Iterator<Item = i64>) -> ArrayRef {
-    Arc::new(TimestampMicrosecondArray::from_iter_values(micros).with_timezone("UTC"))
+fn row_batch<T: Serialize>(table: ActivityTable, rows: &[T]) -> Result<RecordBatch, String> {
+    let schema = schema(table);
+    let batch = serde_arrow::to_record_batch(schema.fields(), &rows).map_err(|e| e.to_string())?;
+    RecordBatch::try_new(schema, batch.columns().to_vec()).map_err(|e| e.to_string())
 }
 
 #[cfg(test)]
@@ -179,8 +131,8 @@ mod tests {
             bytes: None,
             memory_bytes: None,
         };
-        assert_eq!(query_batch(&[query.clone(), query]).map(|batch| batch.num_rows()).ok(), Some(2));
-        assert_eq!(query_batch(&[]).map(|batch| batch.num_rows()).ok(), Some(0));
+        assert_eq!(row_batch(ActivityTable::Queries, &[query.clone(), query]).map(|batch| batch.num_rows()), Ok(2));
+        assert_eq!(row_batch::<LoggedQuery>(ActivityTable::Queries, &[]).map(|batch| batch.num_rows()), Ok(0));
         let connection = OpenConnection {
             id: 1,
             client: None,
@@ -190,6 +142,6 @@ mod tests {
             requests: 1,
             is_working: true,
         };
-        assert_eq!(connection_batch(&[connection]).map(|batch| batch.num_rows()).ok(), Some(1));
+        assert_eq!(row_batch(ActivityTable::Connections, &[connection]).map(|batch| batch.num_rows()), Ok(1));
     }
 }

@@ -7,7 +7,7 @@ use echolake_lake::CacheCounts;
 use serde::{Deserialize, Serialize};
 
 use crate::activity::{ActivityTable, LakeFigures, QueryEnd, QueryStart};
-use crate::fault::FaultCode;
+use crate::fault::{FaultCode, RequestFault};
 
 /// A line.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -55,6 +55,12 @@ impl EngineReport {
             Ok(()) => queued.push(b'\n'),
             Err(_) => queued.truncate(whole),
         }
+    }
+
+    /// Reports a failed request, and writes it to the log.
+    pub(crate) fn record_failure(fault: &RequestFault) {
+        Self::Failure(fault.code()).queue();
+        fault.log();
     }
 
     /// Writes the lines that wait.
