@@ -1,6 +1,5 @@
 //! Programs that know nothing of echolake: agents by the Model Context Protocol, and readers of SOFA files.
 
-use std::io::Write as _;
 use std::process::Command;
 
 use serde_json::{Value, json};
@@ -8,7 +7,6 @@ use serde_json::{Value, json};
 use super::http::{HttpRequest, HttpResponse};
 use super::server::ServedLake;
 use super::{get, lake, refused, served};
-use crate::TestFolder;
 use crate::child::run_command;
 
 const STATELESS: &str = "2026-07-28";

@@ -4,7 +4,7 @@
 mod activity_rows;
 mod lake_figures;
 mod query_events;
-mod query_log;
+pub(crate) mod query_log;
 mod query_watch;
 
 use std::sync::{Mutex, PoisonError};
@@ -15,7 +15,7 @@ use chrono::{DateTime, Utc};
 pub(crate) use activity_rows::{ActivityRows, ActivityTable, OpenConnection};
 pub(crate) use lake_figures::LakeFigures;
 pub(crate) use query_events::{QueryEnd, QueryStart};
-pub(crate) use query_log::{LoggedQuery, QueryLog};
+pub(crate) use query_log::QueryLog;
 pub(crate) use query_watch::{QueryTimer, QueryWatch, RunningWatches};
 
 use crate::Error;

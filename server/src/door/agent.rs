@@ -67,7 +67,7 @@ impl AgentDoor {
     pub fn new(lake: &Lake, engines: EngineSettings, pages: &str) -> Result<Self, Error> {
         let (scheme, host) = origin_headers(pages).ok_or_else(|| Error::Pages { found: pages.to_owned() })?;
         let activity = Arc::new(ServerActivity::new()?);
-        let engines = EnginePool::new(lake, engines, activity, Arc::new(TokenAccess::new(None, None)))?;
+        let engines = EnginePool::new(lake, engines, activity, Arc::new(TokenAccess::new(None)))?;
         // No page of elsewhere reaches standard input.
         let client = ClientIdentity { is_open: false, ..ClientIdentity::local(AGENT) };
         Ok(Self { route: Arc::new(AgentRoute { engines, client, host, scheme }) })

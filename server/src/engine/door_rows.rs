@@ -114,6 +114,8 @@ fn row_batch<T: Serialize>(table: ActivityTable, rows: &[T]) -> Result<RecordBat
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::activity::OpenConnection;
+    use crate::activity::query_log::LoggedQuery;
 
     #[test]
     fn rows_fit_their_schemas() {
