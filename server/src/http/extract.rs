@@ -204,8 +204,7 @@ mod tests {
             assert_eq!(query(&format!("level=1..2&level={wrong}")), Err(expected));
         }
         assert_eq!(query("order=up"), Err("`order`: unknown variant `up`, expected `asc` or `desc`".into()));
-        let unknown =
-            "the parameters are not right: unknown field `other`, expected one of `a`, `b`, `limit`, `order`, `level`";
+        let unknown = "`other`: unknown field `other`, expected one of `a`, `b`, `limit`, `order`, `level`";
         assert_eq!(query("a=1&other=2"), Err(unknown.into()));
         for twice in ["a=1&a=1", "limit=1&b=2&limit=1", "order=asc&order=asc"] {
             let name = twice.split('=').next().expect("a name");

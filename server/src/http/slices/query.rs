@@ -171,10 +171,7 @@ mod tests {
             assert!(question(wrong).is_err(), "{wrong}");
         }
         let unknown = question("topic=/tf&where=a").err().expect("a fault").to_string();
-        assert_eq!(
-            unknown,
-            "the parameters are not right: unknown field `topic`, expected one of `where`, `run`, `topics`, `layout`, `id`"
-        );
+        assert_eq!(unknown, "`topic`: unknown field `topic`, expected one of `where`, `run`, `topics`, `layout`, `id`");
         let many: String = (0..=MOST_RUNS).map(|i| format!("&run=r{i}")).collect();
         assert!(question(&many).is_err());
     }
