@@ -55,6 +55,17 @@ fn the_server_draws_the_same() {
         let written = place.ok(&[&["figure"], args].concat());
         assert_eq!(drawn(&answer.text()), drawn(&written), "{path}");
     }
+    let answer = HttpRequest::get("/api/v1/map.svg").send(&server);
+    assert_eq!(drawn(&answer.text()), drawn(&place.ok(&["figure", "map"])));
+    for (format, media_type, opening) in
+        [("svg", "image/svg+xml", &b"<svg"[..]), ("pdf", "application/pdf", b"%PDF"), ("png", "image/png", b"\x89PNG")]
+    {
+        for path in ["surfaces/wood/grid.svg?microphone=3", "surfaces/wood/curves.svg?width=420", "map.svg?axes=23"] {
+            let answer = HttpRequest::get(&format!("/api/v1/{path}&format={format}")).send(&server);
+            assert_eq!((answer.status, answer.header("content-type")), (200, Some(media_type)), "{path}");
+            assert!(answer.body.starts_with(opening), "{path} as {format}");
+        }
+    }
 }
 
 #[test]

@@ -16,7 +16,7 @@ pub struct MapPosition {
     pub name: String,
     /// Its kind, which has a colour.
     pub kind: String,
-    /// Coordinates along the first two components, dB.
+    /// Coordinates along the two components, dB.
     pub position_db: [f64; 2],
 }
 
@@ -25,6 +25,8 @@ pub struct MapPosition {
 pub struct MapFigure {
     /// The surfaces.
     pub positions: Vec<MapPosition>,
+    /// The components to the right and upwards, 0 the first.
+    pub components: [usize; 2],
     /// Shares of the variance of both components.
     pub explained: [f64; 2],
     /// Width, px.
@@ -32,6 +34,11 @@ pub struct MapFigure {
 }
 
 impl MapFigure {
+    /// Returns the title that a map has if it is given no other.
+    pub fn default_title(surfaces: usize, unit: &str) -> String {
+        format!("{surfaces} surfaces by their TNCE, {unit}")
+    }
+
     /// Lays out the figure.
     pub fn draw(&self, notes: &FigureNotes) -> FigureDrawing {
         let mut kinds: Vec<&str> = self.positions.iter().map(|p| p.kind.as_str()).collect();
@@ -64,8 +71,11 @@ impl MapFigure {
             }
         }
         frame.draw_axes(&mut drawing);
-        let title = |i: usize| format!("Component {}, dB ({:.0} % of the variance)", i + 1, 100.0 * self.explained[i]);
-        frame.draw_titles(&mut drawing, &title(0), &title(1));
+        let [x_title, y_title] = [0, 1].map(|axis| {
+            let number = self.components[axis] + 1;
+            format!("Component {number}, dB ({:.0} % of the variance)", 100.0 * self.explained[axis])
+        });
+        frame.draw_titles(&mut drawing, &x_title, &y_title);
         drawing.add_origin();
         drawing
     }
@@ -131,7 +141,9 @@ mod tests {
     fn names_at_one_place_are_below_each_other() {
         let position = |name: &str| MapPosition { name: name.into(), kind: "brick".into(), position_db: [1.0, 2.0] };
         let positions = ["0011_1", "0012_1", "0013_1"].map(position).to_vec();
-        let drawing = MapFigure { positions, explained: [0.7, 0.2], width_px: 400.0 }.draw(&FigureNotes::default());
+        let figure = MapFigure { positions, components: [0, 2], explained: [0.7, 0.2], width_px: 400.0 };
+        let drawing = figure.draw(&FigureNotes::default());
+        assert!(drawing.to_svg().contains("Component 3, dB (20 % of the variance)"));
         let baselines: Vec<f32> = drawing
             .shapes
             .iter()

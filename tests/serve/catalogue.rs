@@ -101,6 +101,50 @@ fn numbers_are_those_of_sql() {
 }
 
 #[test]
+fn responses_are_analysed() {
+    let place = lake();
+    let server = served(&place, &[]);
+    let numbers = |value: &Value| -> Vec<f64> {
+        value.as_array().expect("numbers").iter().map(|x| x.as_f64().expect("a number")).collect()
+    };
+    let pair = json(&get(&server, "/api/v1/surfaces/brick/pairs/7"));
+    let path = "/api/v1/surfaces/brick/pairs/7/analysis";
+    let found = json(&get(&server, path));
+    for signal in ["measured", "reflected", "flat_reflected"] {
+        let samples = numbers(&pair[signal]);
+        let levels = numbers(&found[signal]["sample_db"]);
+        let envelope = numbers(&found[signal]["envelope_db"]);
+        for ((sample, level), over) in samples.iter().zip(&levels).zip(&envelope) {
+            assert!((20.0 * sample.abs().max(1e-10).log10() - level).abs() < 1e-4, "{signal}: {sample} {level}");
+            assert!(*over > level - 1e-4, "{signal}: {level} is over its envelope, {over}");
+        }
+        let bins = found["frequency_hz"].as_array().map(Vec::len);
+        for name in ["level_db", "phase_deg", "group_delay_ms"] {
+            assert_eq!(found[signal][name].as_array().map(Vec::len), bins, "{signal} {name}");
+        }
+    }
+    // The direct sound is there after its path at the speed of sound at the reference temperature.
+    let direct_s = found["direct_s"].as_f64().expect("a time");
+    let direct_mm = pair["pair"]["direct_mm"].as_f64().expect("a length");
+    assert!((direct_s * 343.2 - direct_mm / 1000.0).abs() < 1e-3, "{direct_s} {direct_mm}");
+    let highest = numbers(&found["measured"]["envelope_db"]).into_iter().fold(f64::MIN, f64::max);
+    assert!((found["direct_db"].as_f64().expect("a level") - highest).abs() < 3.0, "{found}");
+    let other = json(&get(&server, &format!("{path}?octave=3&delay=none")));
+    assert_eq!(other["removed_s"], 0.0);
+    assert_ne!(other["measured"]["level_db"], found["measured"]["level_db"]);
+    for wrong in ["?octave=49", "?delay=all"] {
+        refused(&get(&server, &format!("{path}{wrong}")), 400, "request_invalid");
+    }
+    let picture = json(&get(&server, "/api/v1/surfaces/brick/pairs/7/spectrogram"));
+    let levels = numbers(&picture["level_db"]);
+    let cells = picture["times"].as_u64().zip(picture["bins"].as_u64()).map(|(times, bins)| (times * bins) as usize);
+    assert_eq!(cells, Some(levels.len()));
+    assert_eq!(levels.iter().copied().fold(f64::MIN, f64::max), 0.0);
+    let foam = json(&get(&server, "/api/v1/surfaces/foam/pairs/7/analysis"));
+    assert_eq!(foam["surface_id"], "foam");
+}
+
+#[test]
 fn facets_leave_their_own_filter_out() {
     let place = lake();
     let server = served(&place, &[]);

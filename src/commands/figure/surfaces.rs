@@ -240,11 +240,11 @@ pub(super) async fn write_map(source: &FigureSource, args: &MapArgs) -> anyhow::
     let share = |axis: usize| explained.get(axis).copied().unwrap_or(0.0);
     let figure = MapFigure {
         positions: surfaces.iter().enumerate().map(position).collect(),
+        components: [0, 1],
         explained: [share(0), share(1)],
         width_px: 720.0,
     };
-    let title =
-        args.output.title(|| format!("{} surfaces by their TNCE, {}", surfaces.len(), LevelReference::FlatBand.unit()));
+    let title = args.output.title(|| MapFigure::default_title(surfaces.len(), LevelReference::FlatBand.unit()));
     args.output.write_drawing(&figure.draw(&source.notes(title, query, &surfaces)), &[])
 }
 

@@ -162,6 +162,8 @@ pub(super) fn addresses(HiddenRun { surface, run }: &HiddenRun, file: &str) -> V
     let mut all = vec![
         "/api/v1/lake".to_owned(),
         "/api/v1/map".to_owned(),
+        "/api/v1/map.svg".to_owned(),
+        "/api/v1/map.svg?format=pdf".to_owned(),
         "/api/v1/correlations".to_owned(),
         "/api/v1/files".to_owned(),
         "/api/v1/files?table=runs&table=nce".to_owned(),
@@ -187,6 +189,8 @@ pub(super) fn addresses(HiddenRun { surface, run }: &HiddenRun, file: &str) -> V
         "/mesh.glb",
         "/thumbnail.png",
         "/pairs/7",
+        "/pairs/7/analysis",
+        "/pairs/7/spectrogram?signal=measured",
         "/pairs/7/ir.wav",
     ];
     all.extend(of_surface.map(|path| format!("/api/v1/surfaces/{surface}{path}")));

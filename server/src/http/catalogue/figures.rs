@@ -1,24 +1,58 @@
-//! Figures of surfaces as SVG: what `echolake figure` writes, for the pages, which show them.
+//! Figures of surfaces: what `echolake figure` writes, for the pages, which show them and offer them as files.
 
 use axum::Extension;
-use echolake_figures::{FigureNotes, GridFigure, GridLayer, GridPanel, LevelPalette, NceFigure, NcePanel};
-use echolake_query::figure_rows::{LevelReference, band_labels, curves_query, grid_query, lake_version, quoted};
+use echolake_figures::{
+    FigureDrawing, FigureNotes, GridFigure, GridLayer, GridPanel, LevelPalette, MapFigure, MapPosition, NceFigure,
+    NcePanel,
+};
+use echolake_query::figure_rows::{
+    LevelReference, band_labels, curves_query, grid_query, lake_version, level_vectors_query, quoted,
+};
 use serde::Deserialize;
 use utoipa::{IntoParams, ToSchema};
 
 use super::super::extract::{BinaryContent, PathParams, QueryParams, WholeNumber};
 use super::content::{AnswerContent, EndpointAnswer};
 use super::curves::{CurveSet, PairSelection};
+use super::map::positions;
 use super::request::{CatalogueRequest, SurfacePath};
 use super::summary::SurfaceEntry;
 use super::surface::{GridNormalisation, read_grid, required_microphone};
 use crate::fault::RequestFault;
 
-const SVG: &str = "image/svg+xml";
 /// Surfaces of one figure.
 const MOST_SURFACES: usize = 8;
 /// Surfaces in a row.
 const COLUMNS: usize = 4;
+
+/// Width of the map, px.
+const MAP_PX: f32 = 720.0;
+
+/// The file format of a figure.
+#[derive(Clone, Copy, Default, Deserialize, ToSchema)]
+#[serde(rename_all = "lowercase")]
+#[schema(default = "svg")]
+enum FigureFormat {
+    #[default]
+    Svg,
+    Pdf,
+    Png,
+}
+
+impl FigureFormat {
+    /// Writes a drawing.
+    ///
+    /// # Errors
+    /// Those of computing beside the requests.
+    async fn write(self, request: &CatalogueRequest, drawing: FigureDrawing) -> EndpointAnswer {
+        let write = move || match self {
+            Self::Svg => AnswerContent::new("image/svg+xml", drawing.to_svg()),
+            Self::Pdf => AnswerContent::new("application/pdf", drawing.to_pdf()),
+            Self::Png => AnswerContent::new("image/png", drawing.to_png()),
+        };
+        Ok(request.catalogue.service().crunch(write).await?)
+    }
+}
 
 /// The surroundings of a figure.
 #[derive(Clone, Copy, Default, PartialEq, Eq, Deserialize, ToSchema)]
@@ -71,6 +105,9 @@ pub(super) struct GridFigureQuery {
     #[serde(default)]
     #[param(inline)]
     width: WholeNumber<160, 1200, 560>,
+    #[serde(default)]
+    #[param(inline)]
+    format: FigureFormat,
 }
 
 /// TNCE over the grid for one microphone point, drawn.
@@ -81,7 +118,11 @@ pub(super) struct GridFigureQuery {
     path = "/api/v1/surfaces/{surface_id}/grid.svg",
     tag = "catalogue",
     params(SurfacePath, GridFigureQuery),
-    responses((status = 200, description = "OK", body = inline(BinaryContent), content_type = "image/svg+xml")),
+    responses((status = 200, description = "OK", content(
+        (inline(BinaryContent) = "image/svg+xml"),
+        (inline(BinaryContent) = "application/pdf"),
+        (inline(BinaryContent) = "image/png")
+    ))),
     extensions(("x-sql" = json!(["as of grid"])))
 )]
 pub(super) async fn grid_figure(
@@ -141,7 +182,7 @@ pub(super) async fn grid_figure(
         query: grid_query(lake.rig(), over, &quoted(&path.surface_id), &microphone.to_string()),
         ..notes(&request, &used)
     };
-    Ok(AnswerContent::new(SVG, figure.draw(&notes).to_svg()))
+    query.format.write(&request, figure.draw(&notes)).await
 }
 
 /// The contents of a plot of NCE curves.
@@ -161,6 +202,8 @@ pub(super) struct CurvesFigureQuery {
     /// Width of a surface's plot, px.
     #[param(inline)]
     width: WholeNumber<160, 1200, 560>,
+    #[param(inline)]
+    format: FigureFormat,
 }
 
 /// NCE by band, a mean over pairs, stacked, beside Flat's total; drawn.
@@ -169,7 +212,11 @@ pub(super) struct CurvesFigureQuery {
     path = "/api/v1/surfaces/{surface_id}/curves.svg",
     tag = "catalogue",
     params(SurfacePath, CurvesFigureQuery),
-    responses((status = 200, description = "OK", body = inline(BinaryContent), content_type = "image/svg+xml")),
+    responses((status = 200, description = "OK", content(
+        (inline(BinaryContent) = "image/svg+xml"),
+        (inline(BinaryContent) = "application/pdf"),
+        (inline(BinaryContent) = "image/png")
+    ))),
     extensions(("x-sql" = json!(["as of curves"])))
 )]
 pub(super) async fn curves_figure(
@@ -204,7 +251,87 @@ pub(super) async fn curves_figure(
         query: curves_query(rig, &quoted(&path.surface_id), &filter),
         ..notes(&request, &entries)
     };
-    Ok(AnswerContent::new(SVG, figure.draw(&notes).to_svg()))
+    query.format.write(&request, figure.draw(&notes)).await
+}
+
+/// Two principal components of the map.
+#[derive(Clone, Copy, Default, Deserialize, ToSchema)]
+#[schema(default = "12")]
+enum MapAxes {
+    #[default]
+    #[serde(rename = "12")]
+    FirstSecond,
+    #[serde(rename = "13")]
+    FirstThird,
+    #[serde(rename = "23")]
+    SecondThird,
+}
+
+impl MapAxes {
+    fn components(self) -> [usize; 2] {
+        match self {
+            Self::FirstSecond => [0, 1],
+            Self::FirstThird => [0, 2],
+            Self::SecondThird => [1, 2],
+        }
+    }
+}
+
+/// The contents of a map.
+#[derive(Default, Deserialize, IntoParams)]
+#[serde(default)]
+#[into_params(parameter_in = Query)]
+pub(super) struct MapFigureQuery {
+    /// Components to the right and upwards.
+    #[param(inline)]
+    axes: MapAxes,
+    #[param(inline)]
+    format: FigureFormat,
+}
+
+/// Surfaces as points, close together if they reflect alike; drawn.
+#[utoipa::path(
+    get,
+    path = "/api/v1/map.svg",
+    tag = "catalogue",
+    params(MapFigureQuery),
+    responses((status = 200, description = "OK", content(
+        (inline(BinaryContent) = "image/svg+xml"),
+        (inline(BinaryContent) = "application/pdf"),
+        (inline(BinaryContent) = "image/png")
+    ))),
+    extensions(("x-sql" = json!(["as of map"])))
+)]
+pub(super) async fn map_figure(
+    Extension(request): Extension<CatalogueRequest>,
+    QueryParams(query): QueryParams<MapFigureQuery>,
+) -> EndpointAnswer {
+    let summary = request.summary().await?;
+    let places = positions(&request).await?;
+    let components = query.axes.components();
+    let entries: Vec<_> = places.names.iter().filter_map(|name| summary.entry(name)).collect();
+    let position = |(i, entry): (usize, &&SurfaceEntry)| {
+        let place = places.components.position(i);
+        MapPosition {
+            name: entry.surface.surface_id.clone(),
+            kind: entry.surface.typology.clone(),
+            position_db: components.map(|component| place.get(component).copied().unwrap_or(0.0)),
+        }
+    };
+    let explained = places.components.explained();
+    let figure = MapFigure {
+        positions: entries.iter().enumerate().map(position).collect(),
+        components,
+        explained: components.map(|component| explained.get(component).copied().unwrap_or(0.0)),
+        width_px: MAP_PX,
+    };
+    let notes = FigureNotes {
+        title: MapFigure::default_title(entries.len(), LevelReference::FlatBand.unit()),
+        command: if components == [0, 1] { "echolake figure map".into() } else { String::new() },
+        query: level_vectors_query(request.catalogue.lake().rig(), "1"),
+        ..notes(&request, &entries)
+    };
+    query.format.write(&request, figure.draw(&notes)).await
 }
 
 async fn surfaces<'a>(

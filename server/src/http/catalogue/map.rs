@@ -85,7 +85,7 @@ pub(super) async fn map(
     QueryParams(query): QueryParams<MapQuery>,
 ) -> EndpointAnswer {
     let summary = request.summary().await?;
-    let places = request.view.places.get_or_try_init(|| find_positions(&request)).await?;
+    let places = positions(&request).await?;
     let typology = |name: &str| summary.entry(name).map_or("", |entry| entry.surface.typology.as_str());
     let point = |(i, name)| MapPoint {
         surface_id: name,
@@ -107,6 +107,14 @@ pub(super) async fn map(
         points: places.names.iter().map(String::as_str).enumerate().map(point).collect(),
         left_out: all.filter(|name| !names.contains(name)).collect(),
     })?)
+}
+
+/// Returns the surfaces' positions, which are found once per snapshot.
+///
+/// # Errors
+/// Those of its query.
+pub(super) async fn positions(request: &CatalogueRequest) -> Result<&SurfacePositions, RequestFault> {
+    request.view.places.get_or_try_init(|| find_positions(request)).await
 }
 
 /// Finds the surfaces' positions by their TNCE.

@@ -3,6 +3,7 @@
 //! [`table_routes`] and [`file_routes`] list the endpoints. [`respond`] stands before all of them: whether the client may
 //! ask, whether it has the answer already, and whether the cache does.
 
+mod analysis;
 mod answer_cache;
 mod bands;
 mod content;
@@ -64,8 +65,11 @@ pub(super) fn table_routes() -> OpenApiRouter {
         .routes(routes!(relief::heightmap))
         .routes(routes!(relief::thumbnail))
         .routes(routes!(pair::pair))
+        .routes(routes!(analysis::analysis))
+        .routes(routes!(analysis::spectrogram))
         .routes(routes!(wav::wav))
         .routes(routes!(map::map))
+        .routes(routes!(figures::map_figure))
         .routes(routes!(correlations::correlations))
         .routes(routes!(runs::runs))
         .routes(routes!(runs::run))

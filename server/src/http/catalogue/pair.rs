@@ -68,14 +68,14 @@ struct FresnelEllipse {
 /// The geometry of a pair.
 #[derive(Deserialize, Serialize, ToSchema)]
 #[schema(as = Pair)]
-struct PairGeometry {
+pub(super) struct PairGeometry {
     pair_id: i32,
     microphone: i32,
     speaker: i32,
     microphone_mm: [f64; 3],
     speaker_mm: [f64; 3],
-    direct_mm: f64,
-    image_mm: f64,
+    pub(super) direct_mm: f64,
+    pub(super) image_mm: f64,
     incidence_deg: f64,
     /// x, y in the panel's plane.
     specular_mm: [f64; 2],
@@ -187,6 +187,15 @@ impl CatalogueRequest {
     }
 }
 
+/// Reads the geometry of a pair.
+///
+/// # Errors
+/// Those of its query.
+pub(super) async fn geometry(request: &CatalogueRequest, pair: usize) -> Result<PairGeometry, RequestFault> {
+    let found = request.rows::<PairGeometry>(GEOMETRY, vec![number(pair)]).await?.into_iter().next();
+    found.map(PairGeometry::with_fresnel).ok_or_else(|| missing(format!("pair {pair}"), "ask for another one"))
+}
+
 /// The newest measurement of a pair.
 ///
 /// # Errors
@@ -212,6 +221,51 @@ pub(super) async fn reflected(
     let rows: Vec<ReflectedResponse> = request.rows(REFLECTED, vec![text(id), text(flat), number(pair)]).await?;
     let of = |surface: &str| rows.iter().find(|row| row.surface_id == surface).and_then(|row| row.reflected.clone());
     Ok([of(id), of(flat)])
+}
+
+/// A pair's response.
+#[derive(Clone, Copy, Default, Deserialize, ToSchema)]
+#[serde(rename_all = "lowercase")]
+#[schema(default = "reflected")]
+pub(super) enum ResponseSignal {
+    /// After Foam's was subtracted.
+    #[default]
+    Reflected,
+    Measured,
+}
+
+impl ResponseSignal {
+    pub(super) fn name(self) -> &'static str {
+        match self {
+            Self::Reflected => "reflected",
+            Self::Measured => "measured",
+        }
+    }
+
+    /// Reads the samples.
+    ///
+    /// # Errors
+    /// [`RequestFault::NoData`] if Foam is missing, [`RequestFault::NotFound`] if the pair was not measured.
+    pub(super) async fn read(
+        self,
+        request: &CatalogueRequest,
+        entry: &SurfaceEntry,
+        pair: usize,
+    ) -> Result<Vec<f32>, RequestFault> {
+        let measurement = measurement(request, entry, pair).await?;
+        let samples = match self {
+            Self::Measured => Some(measurement.ir),
+            Self::Reflected => {
+                let [own, _] = reflected(request, entry, pair).await?;
+                own
+            }
+        };
+        samples.ok_or_else(|| RequestFault::NoData {
+            what: format!("pair {pair} of surface `{}`", entry.surface.surface_id),
+            data: "reflected response",
+            hint: "its Foam is missing; ask for signal=measured",
+        })
+    }
 }
 
 /// Everything about one impulse response.
@@ -249,7 +303,7 @@ pub(super) async fn pair(
         return Ok(samples(&request, &measurement.ir, own.as_deref(), flat.as_deref())?);
     }
     let (geometry, energies, moved, curves, attempts, air) = tokio::try_join!(
-        request.rows::<PairGeometry>(GEOMETRY, vec![number(pair)]),
+        geometry(&request, pair),
         energies(&request, entry, pair, &measurement.run_id),
         symmetries(&request, entry, pair, &measurement.run_id),
         CurveSet::read(&request, entry, PairSelection::Pair(pair), usize::MAX),
@@ -264,10 +318,9 @@ pub(super) async fn pair(
             ],
         ),
     )?;
-    let geometry = geometry.into_iter().next().ok_or_else(|| missing(format!("pair {pair}"), "ask for another one"))?;
     Ok(AnswerContent::json(&PairDetail {
         surface_id: &entry.surface.surface_id,
-        pair: geometry.with_fresnel(),
+        pair: geometry,
         environment: AirSeries::new(air, measurement.log_time_ns, &measurement.log_time),
         measured: &measurement.ir,
         measurement: &measurement,

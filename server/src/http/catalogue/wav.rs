@@ -5,13 +5,12 @@ use std::io::Cursor;
 use axum::Extension;
 use hound::{SampleFormat, WavSpec, WavWriter};
 use serde::Deserialize;
-use utoipa::{IntoParams, ToSchema};
+use utoipa::IntoParams;
 
 use super::super::extract::{BinaryContent, PathParams, QueryParams, WholeNumber};
 use super::content::{AnswerContent, EndpointAnswer};
-use super::pair::{PairPath, measurement, reflected};
+use super::pair::{PairPath, ResponseSignal};
 use super::request::CatalogueRequest;
-use crate::fault::RequestFault;
 
 /// The panels are models of walls at a tenth of their size: the wavelengths are a tenth, too.
 const SCALE: usize = 10;
@@ -22,27 +21,9 @@ const SCALE: usize = 10;
 #[into_params(parameter_in = Query)]
 pub(super) struct WavQuery {
     #[param(inline)]
-    signal: WavSignal,
+    signal: ResponseSignal,
     #[param(inline)]
     slowdown: WholeNumber<1, 100, { SCALE }>,
-}
-
-#[derive(Clone, Copy, Default, Deserialize, ToSchema)]
-#[serde(rename_all = "lowercase")]
-#[schema(default = "reflected")]
-enum WavSignal {
-    #[default]
-    Reflected,
-    Measured,
-}
-
-impl WavSignal {
-    fn name(self) -> &'static str {
-        match self {
-            Self::Reflected => "reflected",
-            Self::Measured => "measured",
-        }
-    }
 }
 
 /// The response as 32-bit float WAV.
@@ -63,22 +44,12 @@ pub(super) async fn wav(
 ) -> EndpointAnswer {
     let entry = request.surface(&path.surface_id).await?;
     let pair = request.pair(&path.pair_id)?;
-    let measurement = measurement(&request, entry, pair).await?;
-    let id = &entry.surface.surface_id;
-    let samples = match query.signal {
-        WavSignal::Measured => Some(measurement.ir),
-        WavSignal::Reflected => {
-            let [own, _] = reflected(&request, entry, pair).await?;
-            own
-        }
-    };
-    let hint = "its Foam is missing; ask for signal=measured";
-    let what = || format!("pair {pair} of surface `{id}`");
-    let samples = samples.ok_or_else(|| RequestFault::NoData { what: what(), data: "reflected response", hint })?;
+    let samples = query.signal.read(&request, entry, pair).await?;
     let rate_hz = request.catalogue.lake().rig().sweep.rate_hz.get() / query.slowdown.get() as f64;
     let file = write_wav(&samples, rate_hz.round() as u32);
     let file = file.map_err(RequestFault::defect("a response makes no WAV file"))?;
-    Ok(AnswerContent::new("audio/wav", file).named(format!("{id}-{pair}-{}.wav", query.signal.name())))
+    let name = format!("{}-{pair}-{}.wav", entry.surface.surface_id, query.signal.name());
+    Ok(AnswerContent::new("audio/wav", file).named(name))
 }
 
 fn write_wav(samples: &[f32], rate_hz: u32) -> hound::Result<Vec<u8>> {
