@@ -1,7 +1,7 @@
 //! What the pages must do, tried in a browser: `node tests/behaviour.mjs http://127.0.0.1:8420 [part of a check's name]`.
 import assert from 'node:assert/strict'
 import { contextOf, eventually, launch, LIMIT } from './browser.mjs'
-import './mathematics.mjs'
+import './answers.mjs'
 
 const [base, only = ''] = process.argv.slice(2)
 const get = async (path) => (await fetch(base + path)).json()
@@ -202,10 +202,10 @@ async function tabTo(holds, most = 80) {
 }
 
 /** What a download holds. */
-async function textOf(file) {
-  let text = ''
-  for await (const part of await file.createReadStream()) text += part
-  return text
+async function bytesOf(file) {
+  const parts = []
+  for await (const part of await file.createReadStream()) parts.push(part)
+  return Buffer.concat(parts)
 }
 
 await check('the keyboard alone finds surfaces in three stops, compares them and exports their curves', async () => {
@@ -236,10 +236,10 @@ await check('the keyboard alone finds surfaces in three stops, compares them and
   await page.locator('.uplot canvas').waitFor()
   await tabTo(() => document.activeElement.textContent === 'Export NCE, mean over all pairs')
   await page.keyboard.press('Enter')
-  await tabTo(() => document.activeElement.textContent === 'Picture, SVG')
+  await tabTo(() => document.activeElement.textContent === 'Picture, PNG')
   const [file] = await Promise.all([page.waitForEvent('download'), page.keyboard.press('Enter')])
-  const svg = await textOf(file)
-  assert.ok(svg.includes(`>${id}<`) && svg.includes('>simulated<'), svg.slice(-300))
+  const picture = await bytesOf(file)
+  assert.ok(picture.subarray(1, 4).toString() === 'PNG' && picture.length > 5000, `${picture.length} bytes`)
 })
 
 await check('levels against Flat are one number on wall, surface, compare and in SQL', async () => {
@@ -312,7 +312,6 @@ await check('a WAV, a picture and numbers can be saved', async () => {
   assert.match(wav.suggestedFilename(), /\.wav$/)
   for (const [item, ending] of [
     ['Picture, PNG', 'png'],
-    ['Picture, SVG', 'svg'],
     ['Numbers, CSV', 'csv'],
     ['Numbers, Parquet', 'parquet'],
     ['Numbers, Arrow', 'arrow'],
@@ -323,10 +322,50 @@ await check('a WAV, a picture and numbers can be saved', async () => {
       page.locator('details[open] .menu button', { hasText: item }).click(),
     ])
     assert.ok(file.suggestedFilename().endsWith(`.${ending}`), file.suggestedFilename())
-    const stream = await file.createReadStream()
-    let bytes = 0
-    for await (const part of stream) bytes += part.length
+    const bytes = (await bytesOf(file)).length
     assert.ok(bytes > 500, `${ending}: ${bytes} bytes`)
+  }
+})
+
+await check('figures that the server draws are saved in three formats, what the browser draws as one', async () => {
+  const menu = (title) => page.locator(`section[aria-label="${title}"] details`)
+  for (const [path, title] of [
+    [`/surfaces/${id}?microphone=14`, 'TNCE over the grid'],
+    [`/surfaces/${id}?microphone=14`, 'NCE, stacked by band'],
+    ['/map?axes=13', 'Surfaces by what they reflect'],
+  ]) {
+    await open(path)
+    await menu(title).locator('summary').click()
+    for (const [format, opening] of [
+      ['SVG', '<svg'],
+      ['PDF', '%PDF'],
+      ['PNG', '\x89PNG'],
+    ]) {
+      const [file] = await Promise.all([
+        page.waitForEvent('download'),
+        menu(title)
+          .getByRole('link', { name: `Picture, ${format}` })
+          .click(),
+      ])
+      assert.ok(file.suggestedFilename().endsWith(`.${format.toLowerCase()}`), file.suggestedFilename())
+      assert.ok((await bytesOf(file)).toString('latin1').startsWith(opening), `${title} as ${format}`)
+    }
+  }
+  for (const [path, title] of [
+    [`/surfaces/${id}?microphone=14`, 'Relief'],
+    [`/surfaces/${id}/pairs/159`, 'Spectrogram'],
+    [`/sql?q=${encodeURIComponent('select surface_id, count(*) as n from tnce group by 1')}&as=bars`, 'Chart'],
+  ]) {
+    await open(path)
+    await page.locator(`section[aria-label="${title}"] :is(canvas, .drawing svg)`).first().waitFor()
+    await settled()
+    await menu(title).locator('summary').click()
+    const [file] = await Promise.all([
+      page.waitForEvent('download'),
+      menu(title).getByRole('button', { name: 'Picture, PNG' }).click(),
+    ])
+    const picture = await bytesOf(file)
+    assert.ok(picture.subarray(1, 4).toString() === 'PNG' && picture.length > 2000, `${title}: ${picture.length} bytes`)
   }
 })
 
@@ -560,7 +599,7 @@ await check('operations say what a token may not see', async () => {
 
 await check('a malformed address says so, and the next one is shown', async () => {
   const heading = () => page.getByRole('heading', { level: 1 }).innerText()
-  for (const address of ['/surfaces/%zz', '/surfaces/%', '/runs/%ff', '/surfaces/%e9/pairs/7']) {
+  for (const address of ['/surfaces/%zz', '/surfaces/%', '/surfaces/%E0%A4', '/runs/%ff', '/surfaces/%e9/pairs/7']) {
     await open(address)
     assert.equal(await heading(), 'Nothing to show', address)
     const text = await page.getByRole('alert').innerText()
@@ -603,7 +642,7 @@ await check('a pair without references shows what was measured', async () => {
 await check('a page that cannot be drawn says so, and the next one is shown', async () => {
   await page.route(`**/api/v1/surfaces/${id}/pairs/9`, async (route) => {
     const response = await route.fetch()
-    await route.fulfill({ response, json: { ...(await response.json()), measured: null } })
+    await route.fulfill({ response, json: { ...(await response.json()), pair: null } })
   })
   await open(`/surfaces/${id}/pairs/9`)
   await page.getByRole('alert').first().waitFor()

@@ -44,6 +44,18 @@ export const curvesHref = (id: string, microphone: number | null = null) =>
 
 export const pairPath = (id: string, pair: number | string) => `${surfacePath(id)}/pairs/${pair}`
 export const pairDetailHref = (id: string, pair: number | string) => apiHref(pairPath(id, pair))
+/** Fractions of an octave that levels and group delays are smoothed over. */
+export const SMOOTHINGS = ['12', '6', '3', '1'] as const
+/** What phase and group delay are less. */
+export const DELAYS = { direct: 'direct sound', reflected: 'reflected path', none: 'nothing' } as const
+export const smoothingOf = (params: URLSearchParams) => SMOOTHINGS.find((one) => one === params.get('octave')) ?? null
+export const delayOf = (params: URLSearchParams) =>
+  (Object.keys(DELAYS) as (keyof typeof DELAYS)[]).find((one) => one === params.get('delay')) ?? 'direct'
+/** A pair's analysis as the page's parameters ask for it. */
+export const analysisHref = (id: string, pair: number | string, params: URLSearchParams) =>
+  apiHref(`${pairPath(id, pair)}/analysis`, { octave: smoothingOf(params), delay: delayOf(params) })
+export const spectrogramHref = (id: string, pair: number | string, signal: string) =>
+  apiHref(`${pairPath(id, pair)}/spectrogram`, { signal })
 
 export const runPath = (id: string) => `/runs/${encodeURIComponent(id)}`
 export const runDetailHref = (id: string) => apiHref(runPath(id))

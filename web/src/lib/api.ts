@@ -9,6 +9,12 @@ export type SurfaceDetail = Schemas['SurfaceDetail']
 export type Grid = Schemas['Grid']
 export type CurveSet = Schemas['CurveSet']
 export type PairDetail = Schemas['PairDetail']
+export type PairAnalysis = Schemas['PairAnalysis']
+/** A pair, and what the server reads off its responses. */
+export interface PairResponse {
+  readonly detail: PairDetail
+  readonly analysis: PairAnalysis
+}
 export type Run = Schemas['Run']
 export type RunDetail = Schemas['RunDetail']
 export type SurfaceMap = Schemas['SurfaceMap']
@@ -79,7 +85,10 @@ function remember<T>(href: string, make: () => Promise<T>): Promise<T> {
   const answer = make()
   kept.delete(href)
   kept.set(href, { since: performance.now(), answer })
-  answer.catch(() => kept.delete(href))
+  answer.catch(() => {
+    // A later answer of the same address stays.
+    if (kept.get(href)?.answer === answer) kept.delete(href)
+  })
   if (kept.size > KEPT) kept.delete(kept.keys().next().value as string)
   return answer
 }

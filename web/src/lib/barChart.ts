@@ -1,8 +1,8 @@
-//! Bars over names, as a picture: the same on the screen and for export.
+//! Bars over names, as a picture.
 import { token } from './colour'
 import { plain } from './format'
 import { ticks, type TableData } from './plot'
-import { label, picture } from './svg'
+import { label, picture, shortened } from './svg'
 
 export interface BarSpec {
   readonly names: { readonly label: string; readonly values: readonly string[] }
@@ -14,13 +14,11 @@ const LETTER = 6.8
 const PAD = { right: 70, bottom: 42 } as const
 const LONGEST_NAME = 28
 
-const shortened = (text: string) => (text.length > LONGEST_NAME ? `${text.slice(0, LONGEST_NAME - 1)}…` : text)
-
 /** Draws one bar a name, from zero. */
-export function barsSvg(spec: BarSpec, title: string, width = 720): string {
-  const names = spec.names.values.map(shortened)
+export function barsSvg(spec: BarSpec, width: number): string {
+  const names = spec.names.values.map((name) => shortened(name, LONGEST_NAME))
   const left = 12 + LETTER * Math.max(...names.map((name) => name.length), 4)
-  const top = title ? 32 : 8
+  const top = 8
   const values = spec.bars.values.map((value) => (value !== null && Number.isFinite(value) ? value : null))
   const numbers = values.filter((value) => value !== null)
   const [low, high] = [Math.min(0, ...numbers), Math.max(0, ...numbers)]
@@ -29,7 +27,7 @@ export function barsSvg(spec: BarSpec, title: string, width = 720): string {
   const [first, last] = [low < 0 ? left + PAD.right : left, width - PAD.right]
   const px = (value: number) => first + ((value - low) / reach) * Math.max(10, last - first)
   const bottom = top + ROW * names.length
-  let body = title ? label(12, 20, title, 'start', 'font-weight="600"') : ''
+  let body = ''
   for (const tick of ticks(low, low + reach, Math.max(2, (last - first) / 90)))
     body +=
       `<path d="M${px(tick)} ${top}V${bottom}" stroke="${token('--rule')}"/>` +

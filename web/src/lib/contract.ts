@@ -1157,6 +1157,32 @@ export interface components {
             readonly schema: string;
             readonly topic: string;
         };
+        readonly ResponseAnalysis: {
+            readonly sample_db: readonly number[];
+            readonly envelope_db: readonly number[];
+            readonly level_db: readonly number[];
+            readonly phase_deg: readonly number[];
+            readonly group_delay_ms: readonly number[];
+        };
+        readonly PairAnalysis: {
+            readonly surface_id: string;
+            readonly pair_id: number;
+            readonly direct_s: number;
+            readonly reflected_s: number;
+            readonly removed_s: number;
+            readonly direct_db: number;
+            readonly frequency_hz: readonly number[];
+            readonly measured: components["schemas"]["ResponseAnalysis"];
+            readonly reflected: null | components["schemas"]["ResponseAnalysis"];
+            readonly flat_reflected: null | components["schemas"]["ResponseAnalysis"];
+        };
+        readonly Spectrogram: {
+            readonly times: number;
+            readonly step_s: number;
+            readonly bins: number;
+            readonly bin_hz: number;
+            readonly level_db: readonly number[];
+        };
     };
     responses: {
         /** @description What went wrong and what to do */

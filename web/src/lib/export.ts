@@ -21,66 +21,58 @@ export const csvOf = (table: TableData) =>
     type: 'text/csv',
   })
 
-const LABEL_HEIGHT = 22
-const LABEL_FONT = "12px 'IBM Plex Sans', 'Helvetica Neue', Arial, sans-serif"
+const LINE_PX = 22
+const MARGIN_PX = 8
 
-/** Adds the origin at the foot of a drawing, unless it says it already, as those of the server do. */
-export function withOrigin(svg: string, word: string): string {
-  const drawing = new DOMParser().parseFromString(svg, 'image/svg+xml')
-  const root = drawing.documentElement
-  const texts = Array.from(root.querySelectorAll('text'), (text) => text.textContent ?? '')
-  if (!word || texts.some((text) => /^(partly )?(simulated|computed)\b/.test(text.trim()))) return svg
-  const [width, height] = ['width', 'height'].map((name) => Number(root.getAttribute(name)))
-  root.setAttribute('height', String(height + LABEL_HEIGHT))
-  root.setAttribute('viewBox', `0 0 ${width} ${height + LABEL_HEIGHT}`)
-  const label = drawing.createElementNS('http://www.w3.org/2000/svg', 'text')
-  label.setAttribute('x', '8')
-  label.setAttribute('y', String(height + LABEL_HEIGHT - 7))
-  label.setAttribute('fill', token('--mark'))
-  label.textContent = word
-  root.append(label)
-  return new XMLSerializer().serializeToString(root)
+/** The first drawing of a figure, as something that a canvas takes. */
+async function drawingOf(figure: Element): Promise<HTMLCanvasElement | HTMLImageElement> {
+  const drawn = figure.querySelector('canvas, .drawing svg')
+  if (drawn instanceof HTMLCanvasElement) return drawn
+  if (!drawn) throw new Error('the picture is not drawn yet')
+  const image = new Image()
+  image.src = URL.createObjectURL(new Blob([new XMLSerializer().serializeToString(drawn)], { type: 'image/svg+xml' }))
+  await image.decode()
+  URL.revokeObjectURL(image.src)
+  return image
 }
 
-/** Adds the origin at the foot of a picture of pixels. */
-export async function pngWithOrigin(png: Blob, word: string): Promise<Blob> {
-  if (!word) return png
-  const image = await createImageBitmap(png)
+/** The first drawing of a figure as it is on the screen, with its title, its plot's legend, and the data's origin. */
+export async function pictureOf(figure: Element, title: string, origin: string): Promise<Blob> {
+  const drawing = await drawingOf(figure)
+  const scale = drawing instanceof HTMLCanvasElement ? devicePixelRatio || 1 : 1
   const canvas = document.createElement('canvas')
-  canvas.width = image.width
-  canvas.height = image.height + LABEL_HEIGHT
   const context = canvas.getContext('2d')
   if (!context) throw new Error('the picture could not be made')
+  const legend = Array.from(figure.querySelectorAll('.legend .entry'), (entry) => ({
+    name: entry.querySelector('.name')?.textContent ?? '',
+    colour: getComputedStyle(entry.querySelector('line') ?? entry).stroke,
+  }))
+  const lines = legend.length ? 2 : 1
+  canvas.width = drawing.width
+  canvas.height = drawing.height + scale * LINE_PX * (lines + (origin ? 1 : 0))
   context.fillStyle = token('--paper')
   context.fillRect(0, 0, canvas.width, canvas.height)
-  context.drawImage(image, 0, 0)
-  context.fillStyle = token('--mark')
-  context.font = LABEL_FONT
-  context.fillText(word, 8, canvas.height - 7)
-  return blobOf(canvas)
-}
-
-/** An SVG drawn at twice its size. */
-export async function pngOf(svg: string): Promise<Blob> {
-  const image = new Image()
-  const url = URL.createObjectURL(new Blob([svg], { type: 'image/svg+xml' }))
-  try {
-    image.src = url
-    await image.decode()
-    const canvas = document.createElement('canvas')
-    canvas.width = image.naturalWidth * 2
-    canvas.height = image.naturalHeight * 2
-    canvas.getContext('2d')?.drawImage(image, 0, 0, canvas.width, canvas.height)
-    return await blobOf(canvas)
-  } finally {
-    URL.revokeObjectURL(url)
+  context.drawImage(drawing, 0, scale * LINE_PX * lines)
+  context.scale(scale, scale)
+  const font = getComputedStyle(document.body).fontFamily
+  context.fillStyle = token('--ink')
+  context.font = `600 12px ${font}`
+  context.fillText(title, MARGIN_PX, 15)
+  context.font = `12px ${font}`
+  let x = MARGIN_PX
+  for (const { name, colour } of legend) {
+    context.fillStyle = colour
+    context.fillRect(x, LINE_PX + 9, 16, 3)
+    context.fillStyle = token('--ink')
+    context.fillText(name, x + 20, LINE_PX + 15)
+    x += 36 + context.measureText(name).width
   }
-}
-
-export const blobOf = (canvas: HTMLCanvasElement) =>
-  new Promise<Blob>((resolve, reject) =>
+  context.fillStyle = token('--mark')
+  if (origin) context.fillText(origin, MARGIN_PX, canvas.height / scale - 7)
+  return new Promise((resolve, reject) =>
     canvas.toBlob((blob) => (blob ? resolve(blob) : reject(new Error('the picture could not be made'))), 'image/png'),
   )
+}
 
 export const FORMATS = {
   csv: 'text/csv',

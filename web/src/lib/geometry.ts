@@ -1,4 +1,15 @@
-//! Paths of a pair over the panel's plane.
+//! Points of the grid, and paths of a pair over the panel's plane.
+import type { Lake } from './api'
+
+/** The point of this number; null if there is none. */
+export const pointNamed = (lake: Lake, name: string | null): number | null =>
+  name !== null && /^\d+$/.test(name) && Number(name) < lake.points.length ? Number(name) : null
+
+/** The point in the middle of the lowest layer. */
+export const middlePoint = (lake: Lake): number =>
+  lake.points
+    .filter((p) => p.layer === 0)
+    .reduce((best, p) => (Math.hypot(p.x_mm, p.y_mm) < Math.hypot(best.x_mm, best.y_mm) - 1e-6 ? p : best)).point_id
 
 export type Vec3 = readonly [number, number, number]
 

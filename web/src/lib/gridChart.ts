@@ -1,9 +1,9 @@
-//! A column's mean over two others, as a grid of colours: the same on the screen and for export.
+//! A column's mean over two others, as a grid of colours.
 import { cellText, type Answer } from './answer'
 import { css, inkOn, viridis } from './colour'
 import { plain } from './format'
 import type { TableData } from './plot'
-import { escape, label, picture } from './svg'
+import { escape, label, picture, shortened as shortenedTo } from './svg'
 
 /** More names than that across or up are no picture. */
 export const MOST_NAMES = 120
@@ -20,7 +20,7 @@ export interface GridSpec {
 
 const LETTER = 6.8
 const LONGEST_NAME = 18
-const shortened = (text: string) => (text.length > LONGEST_NAME ? `${text.slice(0, LONGEST_NAME - 1)}…` : text)
+const shortened = (text: string) => shortenedTo(text, LONGEST_NAME)
 
 /** The names of a column in their order, and for each row the index of its own; undefined if there are too many. */
 function namesOf(column: Column, rows: number) {
@@ -61,10 +61,10 @@ export function gridOf(rows: number, across: Column, up: Column, value: Column):
 }
 
 /** Draws the cells, the first row at the bottom, and the numbers where there is room. */
-export function gridSvg(spec: GridSpec, title: string, width = 720): string {
+export function gridSvg(spec: GridSpec, width: number): string {
   const [columns, rows] = [spec.across.names.length, spec.up.names.length]
   const left = 30 + LETTER * Math.max(4, ...spec.up.names.map((name) => shortened(name).length))
-  const top = title ? 32 : 8
+  const top = 8
   const cellWidth = Math.max(2, (width - left - 12) / columns)
   const cellHeight = Math.max(4, Math.min(28, 480 / rows))
   const bottom = top + cellHeight * rows
@@ -72,7 +72,7 @@ export function gridSvg(spec: GridSpec, title: string, width = 720): string {
   const low = numbers.reduce((least, mean) => Math.min(least, mean), Infinity)
   const high = numbers.reduce((most, mean) => Math.max(most, mean), -Infinity)
   const every = (room: number, size: number) => Math.max(1, Math.ceil(room / size))
-  let body = title ? label(12, 20, title, 'start', 'font-weight="600"') : ''
+  let body = ''
   spec.means.forEach((mean, cell) => {
     if (mean === null) return
     const [x, y] = [left + (cell % columns) * cellWidth, bottom - (Math.floor(cell / columns) + 1) * cellHeight]

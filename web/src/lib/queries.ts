@@ -6,8 +6,8 @@ import type { LevelReference } from './reference'
 export const quoted = (text: string) => `'${text.replaceAll("'", "''")}'`
 const centres = (lake: Lake) => lake.bands.filter((band) => band.centre_hz !== null).map((band) => band.key)
 
-export const gridQuery = (lake: Lake, id: string, microphone: number, over: string) =>
-  `select pair_id, microphone, speaker,\n${lake.bands
+export const gridQuery = (lake: Lake, ids: readonly string[], microphone: number, over: string) =>
+  `select surface_id, pair_id, microphone, speaker,\n${lake.bands
     .map((band) => {
       const column =
         band.key === 'total' ? 'tnce_total' : over === 'flat-band' ? `tnce_band_${band.key}` : `tnce_${band.key}`
@@ -15,7 +15,7 @@ export const gridQuery = (lake: Lake, id: string, microphone: number, over: stri
     })
     .join(
       ',\n',
-    )}\nfrom tnce\nwhere surface_id = ${quoted(id)} and (microphone = ${microphone} or speaker = ${microphone})`
+    )}\nfrom tnce\nwhere surface_id in (${ids.map(quoted).join(', ')}) and (microphone = ${microphone} or speaker = ${microphone})`
 
 export const meanQuery = (lake: Lake, ids: readonly string[]) =>
   `select surface_id, count(*) as pairs,\n${lake.bands.map((band) => `  avg(tnce_${band.key}) as tnce_${band.key}`).join(',\n')}\nfrom tnce\nwhere surface_id in (${ids.map(quoted).join(', ')})\ngroup by surface_id order by surface_id`

@@ -20,6 +20,10 @@ export const unitOf = (over: LevelReference) => REFERENCES.find(({ key }) => key
 export const difference = (level: number | null | undefined, less: number | null | undefined) =>
   level === null || level === undefined || less === null || less === undefined ? null : level - less
 
+/** The class of a difference that is over or under nothing. */
+export const tone = (value: number | null) =>
+  value === null || Math.abs(value) < 0.05 ? undefined : value > 0 ? 'over' : 'under'
+
 /** Converts a level over Flat's total of a band. */
 export function levelOver(over: LevelReference, surface: Surface, band: number, total_db: number | null | undefined) {
   if (total_db === null || total_db === undefined) return null

@@ -40,7 +40,6 @@ export interface Relief {
   turn(dx: number, dy: number): void
   zoom(factor: number): void
   resize(width: number, height: number): void
-  picture(): HTMLCanvasElement
   dispose(): void
 }
 
@@ -206,10 +205,6 @@ export function relief(
       camera.fov = width / height < 1 ? 42 : 32
       camera.updateProjectionMatrix()
       later()
-    },
-    picture() {
-      draw()
-      return canvas
     },
     dispose() {
       if (frame) cancelAnimationFrame(frame)

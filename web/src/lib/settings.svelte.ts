@@ -24,8 +24,13 @@ const dark = matchMedia('(prefers-color-scheme: dark)')
 let theme = $state<Theme>(stored('theme', ['system', 'light', 'dark'], 'system'))
 let palette = $state<Palette>(stored('palette', ['paper', 'safe'], 'paper'))
 let systemDark = $state(dark.matches)
+const isDark = () => theme === 'dark' || (theme === 'system' && systemDark)
+function showTheme(): void {
+  document.documentElement.dataset.theme = isDark() ? 'dark' : 'light'
+}
 dark.addEventListener('change', () => {
   systemDark = dark.matches
+  showTheme()
 })
 document.documentElement.dataset.palette = stored('palette', ['paper', 'safe'], 'paper')
 
@@ -36,8 +41,7 @@ export const settings = {
   set theme(value: Theme) {
     theme = value
     store('theme', value)
-    if (value === 'system') delete document.documentElement.dataset.theme
-    else document.documentElement.dataset.theme = value
+    showTheme()
   },
   /** Red and green as in the paper, or colours that a colour-blind reader tells apart. */
   get palette() {
@@ -49,6 +53,6 @@ export const settings = {
     document.documentElement.dataset.palette = value
   },
   get isDark() {
-    return theme === 'dark' || (theme === 'system' && systemDark)
+    return isDark()
   },
 }

@@ -1,15 +1,16 @@
-//! A spectrogram as a picture: on the screen, and with a caption for export.
+//! A spectrogram as a picture.
+import type { Schemas } from './api'
 import { css, token, viridis } from './colour'
 import { plain } from './format'
-import type { Spectrogram } from './fourier'
 import { logTicks, ticks } from './plot'
 
 /** What the colours show below the highest level. */
-export const SPECTROGRAM_RANGE_DB = 50
+const SPECTROGRAM_RANGE_DB = 50
 /** Rows of the picture, lowest frequency first: each has one frequency. */
 export const SPECTROGRAM_ROWS = 129
 export const SPECTROGRAM_PAD = { left: 52, right: 64, top: 10, bottom: 40 } as const
-const CAPTION_HEIGHT = 22
+
+type Spectrogram = Schemas['Spectrogram']
 
 /** The axes of a spectrogram. */
 export interface SpectrogramAxes {
@@ -31,7 +32,7 @@ const shareOf = (axes: SpectrogramAxes, frequency_hz: number) =>
     ? Math.log(frequency_hz / axes.low_hz) / Math.log(axes.high_hz / axes.low_hz)
     : (frequency_hz - axes.low_hz) / (axes.high_hz - axes.low_hz)
 
-/** The level at a step of time, between its bins linear. */
+/** The level below the highest at a step of time, between its bins linear. */
 export function levelAt(data: Spectrogram, time: number, frequency_hz: number): number {
   const bin = Math.min(data.bins - 1, frequency_hz / data.bin_hz)
   const below = Math.min(data.bins - 2, Math.floor(bin))
@@ -40,45 +41,30 @@ export function levelAt(data: Spectrogram, time: number, frequency_hz: number): 
   return low + (high - low) * (bin - below)
 }
 
-/** Draws levels below the highest as colours, axes and colour key; with a caption the picture is higher by its line. */
+/** Draws levels as colours, axes and colour key. */
 export function drawSpectrogram(
   canvas: HTMLCanvasElement,
   width: number,
   height: number,
   data: Spectrogram,
-  peak_db: number,
   axes: SpectrogramAxes,
-  caption = '',
 ): void {
   const context = canvas.getContext('2d')
   if (!context) return
-  const ratio = caption ? 2 : devicePixelRatio || 1
-  const above = caption ? CAPTION_HEIGHT : 0
+  const ratio = devicePixelRatio || 1
   canvas.width = Math.round(width * ratio)
-  canvas.height = Math.round((height + above) * ratio)
+  canvas.height = Math.round(height * ratio)
   context.setTransform(ratio, 0, 0, ratio, 0, 0)
   context.fillStyle = token('--paper')
-  context.fillRect(0, 0, width, height + above)
+  context.fillRect(0, 0, width, height)
   const ink = token('--ink')
-  context.fillStyle = ink
-  if (caption) {
-    context.font = '600 12px Plex, sans-serif'
-    context.fillText(caption, SPECTROGRAM_PAD.left, 17)
-  }
-  context.translate(0, above)
   const inner = {
     width: Math.max(10, width - SPECTROGRAM_PAD.left - SPECTROGRAM_PAD.right),
     height: height - SPECTROGRAM_PAD.top - SPECTROGRAM_PAD.bottom,
   }
   const x = (time_s: number) => SPECTROGRAM_PAD.left + (inner.width * time_s) / axes.length_s
   const y = (frequency_hz: number) => SPECTROGRAM_PAD.top + inner.height * (1 - shareOf(axes, frequency_hz))
-  context.drawImage(
-    colourImage(data, peak_db, axes),
-    SPECTROGRAM_PAD.left,
-    SPECTROGRAM_PAD.top,
-    inner.width,
-    inner.height,
-  )
+  context.drawImage(colourImage(data, axes), SPECTROGRAM_PAD.left, SPECTROGRAM_PAD.top, inner.width, inner.height)
   context.strokeStyle = '#ffffffb0'
   context.setLineDash([4, 4])
   for (const limit of axes.valid_hz) {
@@ -126,7 +112,7 @@ const shades = Array.from({ length: SHADES }, (_, i) => [...viridis(i / (SHADES 
 const palette = new Uint32Array(Uint8ClampedArray.from(shades.flat()).buffer)
 
 /** One pixel a step of time and row. */
-function colourImage(data: Spectrogram, peak_db: number, axes: SpectrogramAxes): HTMLCanvasElement {
+function colourImage(data: Spectrogram, axes: SpectrogramAxes): HTMLCanvasElement {
   const small = document.createElement('canvas')
   small.width = data.times
   small.height = SPECTROGRAM_ROWS
@@ -138,7 +124,7 @@ function colourImage(data: Spectrogram, peak_db: number, axes: SpectrogramAxes):
     const frequency_hz = frequencyAt(axes, row / (SPECTROGRAM_ROWS - 1))
     const first = (SPECTROGRAM_ROWS - 1 - row) * data.times
     for (let time = 0; time < data.times; time += 1) {
-      const share = 1 + (levelAt(data, time, frequency_hz) - peak_db) / SPECTROGRAM_RANGE_DB
+      const share = 1 + levelAt(data, time, frequency_hz) / SPECTROGRAM_RANGE_DB
       pixels[first + time] = palette[Math.round(Math.max(0, Math.min(1, share)) * (SHADES - 1))]
     }
   }
