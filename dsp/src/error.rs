@@ -37,3 +37,7 @@ pub enum Error {
 pub(crate) fn check_len(what: &'static str, actual: usize, expected: usize) -> Result<(), Error> {
     if actual == expected { Ok(()) } else { Err(Error::Length { what, actual, expected }) }
 }
+
+pub(crate) fn check_finite(what: &'static str, samples: &[f64]) -> Result<(), Error> {
+    if samples.iter().all(|x| x.is_finite()) { Ok(()) } else { Err(Error::NotFinite { what }) }
+}

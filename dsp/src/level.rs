@@ -2,10 +2,17 @@
 
 /// Reference of sound pressure levels in air, Pa (ISO 1683:2015).
 const REFERENCE_PRESSURE_PA: f64 = 20e-6;
+/// -200 dB: levels for plots end there, so that silence has one.
+const LEAST_PLOTTED_POWER: f64 = 1e-20;
 
 /// 10 log10 x: the level of a power ratio, dB. No power is minus infinity.
 pub fn power_to_db(power: f64) -> f64 {
     10.0 * power.log10()
+}
+
+/// The level of a power ratio for a plot: as [`power_to_db`], but -200 dB at least.
+pub fn plotted_power_to_db(power: f64) -> f64 {
+    power_to_db(power.max(LEAST_PLOTTED_POWER))
 }
 
 /// 20 log10 |x|: the level of an amplitude ratio, dB. No amplitude is minus infinity.
@@ -82,6 +89,7 @@ mod tests {
         assert_eq!(power_to_db(100.0), 20.0);
         assert!((db_to_power(power_to_db(0.37)) - 0.37).abs() < 1e-15);
         assert_eq!(power_to_db(0.0), f64::NEG_INFINITY);
+        assert_eq!((plotted_power_to_db(0.0), plotted_power_to_db(100.0)), (-200.0, 20.0));
         assert_eq!((amplitude_to_db(-10.0), amplitude_to_db(0.0)), (20.0, f64::NEG_INFINITY));
         assert!((sound_pressure_level_db(1.0) - 93.979).abs() < 1e-3, "the calibrator's 94 dB");
     }
