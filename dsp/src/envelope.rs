@@ -15,7 +15,8 @@ use crate::{Error, RealSample};
 ///
 /// ```
 /// let plan = echolake_dsp::envelope::EnvelopePlan::new(64)?;
-/// let burst: Vec<f64> = (0..64).map(|n| (f64::from(n) * 0.8).cos() * (-f64::from(n - 32).powi(2) / 64.0).exp()).collect();
+/// let burst = |n: i32| (f64::from(n) * 0.8).cos() * (-f64::from(n - 32).powi(2) / 64.0).exp();
+/// let burst: Vec<f64> = (0..64).map(burst).collect();
 /// let mut envelope = [0.0; 64];
 /// plan.run(&burst, &mut envelope, &mut plan.scratch())?;
 /// assert!((envelope[32] - 1.0).abs() < 1e-3 && (envelope[40] - (-1f64).exp()).abs() < 1e-3);

@@ -1,6 +1,6 @@
 //! The two parts of Flat that levels are over. "Against Flat" is over the same band, on every page; the other one is always
 //! named in full.
-import type { Surface } from './api'
+import type { Surface, SurfaceDetail } from './api'
 import { place } from './router.svelte'
 
 export type LevelReference = 'flat-band' | 'flat-total'
@@ -19,6 +19,12 @@ export const unitOf = (over: LevelReference) => REFERENCES.find(({ key }) => key
 /** A level less another; null if one is not known. */
 export const difference = (level: number | null | undefined, less: number | null | undefined) =>
   level === null || level === undefined || less === null || less === undefined ? null : level - less
+
+/** The difference of a surface's mean energy in a band from Flat's, %. */
+export function energyChange(d: SurfaceDetail, band: number): number | null {
+  const [own, flat] = [d.mean[band], d.flat_mean[band]]
+  return own !== null && flat ? 100 * (own / flat - 1) : null
+}
 
 /** The class of a difference that is over or under nothing. */
 export const tone = (value: number | null) =>

@@ -1,5 +1,5 @@
-//! What is read off a pair's responses: levels, phase, group delay and spectrogram, by the kernels that the lake's numbers
-//! come from.
+//! What is read off a pair's responses: levels, phase, group delay and spectrogram, by the kernels of the lake's own
+//! numbers.
 
 use axum::Extension;
 use echolake_dsp::envelope::EnvelopePlan;
