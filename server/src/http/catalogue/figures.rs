@@ -309,18 +309,20 @@ pub(super) async fn map_figure(
     let summary = request.summary().await?;
     let places = positions(&request).await?;
     let components = query.axes.components();
-    let entries: Vec<_> = places.names.iter().filter_map(|name| summary.entry(name)).collect();
-    let position = |(i, entry): (usize, &&SurfaceEntry)| {
-        let place = places.components.position(i);
+    let placed: Vec<_> =
+        places.names.iter().enumerate().filter_map(|(i, name)| Some((i, summary.entry(name)?))).collect();
+    let positions = placed.iter().map(|(i, entry)| {
+        let place = places.components.position(*i);
         MapPosition {
             name: entry.surface.surface_id.clone(),
             kind: entry.surface.typology.clone(),
             position_db: components.map(|component| place.get(component).copied().unwrap_or(0.0)),
         }
-    };
+    });
+    let entries: Vec<_> = placed.iter().map(|(_, entry)| *entry).collect();
     let explained = places.components.explained();
     let figure = MapFigure {
-        positions: entries.iter().enumerate().map(position).collect(),
+        positions: positions.collect(),
         components,
         explained: components.map(|component| explained.get(component).copied().unwrap_or(0.0)),
         width_px: MAP_PX,
