@@ -114,7 +114,7 @@ mod tests {
     #[test]
     fn a_tone_is_highest_at_its_time_and_frequency() {
         let tone = |i: usize| (std::f64::consts::TAU * 15e3 * i as f64 / RATE_HZ).sin();
-        let response: Vec<f64> = (0..384).map(|i| if i.abs_diff(200) < 60 { tone(i) } else { 0.0 }).collect();
+        let response: Vec<f64> = (0..384).map(|i: usize| if i.abs_diff(200) < 60 { tone(i) } else { 0.0 }).collect();
         let plan = SpectrogramPlan::new(384, 48, 2).expect("a plan");
         let levels = levels(&plan, &response);
         let highest = (0..levels.len()).max_by(|a, b| levels[*a].total_cmp(&levels[*b])).expect("levels");
