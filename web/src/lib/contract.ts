@@ -116,6 +116,23 @@ export interface paths {
         readonly patch?: never;
         readonly trace?: never;
     };
+    readonly "/api/v1/map.svg": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        /** Surfaces as points, close together if they reflect alike; drawn. */
+        readonly get: operations["map_figure"];
+        readonly put?: never;
+        readonly post?: never;
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
     readonly "/api/v1/openapi.json": {
         readonly parameters: {
             readonly query?: never;
@@ -479,6 +496,23 @@ export interface paths {
         readonly patch?: never;
         readonly trace?: never;
     };
+    readonly "/api/v1/surfaces/{surface_id}/pairs/{pair_id}/analysis": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        /** The responses of a pair over time and over frequency. */
+        readonly get: operations["analysis"];
+        readonly put?: never;
+        readonly post?: never;
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
     readonly "/api/v1/surfaces/{surface_id}/pairs/{pair_id}/ir.wav": {
         readonly parameters: {
             readonly query?: never;
@@ -491,6 +525,23 @@ export interface paths {
          * @description The rate in its header is the rig's divided by `slowdown`: 10 gives full scale.
          */
         readonly get: operations["wav"];
+        readonly put?: never;
+        readonly post?: never;
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
+    readonly "/api/v1/surfaces/{surface_id}/pairs/{pair_id}/spectrogram": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        /** A response's levels over time and frequency. */
+        readonly get: operations["spectrogram"];
         readonly put?: never;
         readonly post?: never;
         readonly delete?: never;
@@ -903,6 +954,24 @@ export interface components {
             /** @description x, y in the panel's plane. */
             readonly specular_mm: readonly number[];
         };
+        /** @description A pair's responses over time and frequency. Levels are re 1, and -200 dB at least. */
+        readonly PairAnalysis: {
+            /** @description Highest level of the measured response's envelope around the direct sound. */
+            readonly direct_db: number;
+            /** @description Travel time of the direct sound at the reference temperature. */
+            readonly direct_s: number;
+            readonly flat_reflected: components["schemas"]["ResponseAnalysis"] | null;
+            /** @description Within the range of the sweep. */
+            readonly frequency_hz: readonly number[];
+            readonly measured: components["schemas"]["ResponseAnalysis"];
+            readonly pair_id: number;
+            readonly reflected: components["schemas"]["ResponseAnalysis"] | null;
+            /** @description Travel time of the sound that the panel reflects. */
+            readonly reflected_s: number;
+            /** @description The delay that phase and group delay are less. */
+            readonly removed_s: number;
+            readonly surface_id: string;
+        };
         /** @description Everything about one impulse response. */
         readonly PairDetail: {
             /** @description What the controller logged about this pair. */
@@ -978,6 +1047,17 @@ export interface components {
             readonly format?: "json" | "arrow" | "csv" | "parquet";
             readonly query: string;
         };
+        /** @description A response by sample and by frequency. */
+        readonly ResponseAnalysis: {
+            /** @description Of the envelope, by sample: the energy-time curve. */
+            readonly envelope_db: readonly number[];
+            readonly group_delay_ms: readonly number[];
+            readonly level_db: readonly number[];
+            /** @description Unwrapped upwards from the lowest frequency; not smoothed. */
+            readonly phase_deg: readonly number[];
+            /** @description By sample. */
+            readonly sample_db: readonly number[];
+        };
         /** @description Rows of a table that are in no file of the manifest. */
         readonly RowsElsewhere: {
             readonly rows: number;
@@ -1043,6 +1123,17 @@ export interface components {
         /** @description A token. */
         readonly Session: {
             readonly token: string;
+        };
+        /** @description A response's levels over time and frequency, by Hann windows of half a millisecond. */
+        readonly Spectrogram: {
+            readonly bin_hz: number;
+            /** @description Frequencies, from 0 Hz to half the rate. */
+            readonly bins: number;
+            /** @description Below the highest, to a tenth; by time, then by frequency. */
+            readonly level_db: readonly number[];
+            readonly step_s: number;
+            /** @description Windows; the first one's centre is the first sample. */
+            readonly times: number;
         };
         /** @description A surface as the pages know it. */
         readonly Surface: {
@@ -1156,32 +1247,6 @@ export interface components {
             readonly messages: number;
             readonly schema: string;
             readonly topic: string;
-        };
-        readonly ResponseAnalysis: {
-            readonly sample_db: readonly number[];
-            readonly envelope_db: readonly number[];
-            readonly level_db: readonly number[];
-            readonly phase_deg: readonly number[];
-            readonly group_delay_ms: readonly number[];
-        };
-        readonly PairAnalysis: {
-            readonly surface_id: string;
-            readonly pair_id: number;
-            readonly direct_s: number;
-            readonly reflected_s: number;
-            readonly removed_s: number;
-            readonly direct_db: number;
-            readonly frequency_hz: readonly number[];
-            readonly measured: components["schemas"]["ResponseAnalysis"];
-            readonly reflected: null | components["schemas"]["ResponseAnalysis"];
-            readonly flat_reflected: null | components["schemas"]["ResponseAnalysis"];
-        };
-        readonly Spectrogram: {
-            readonly times: number;
-            readonly step_s: number;
-            readonly bins: number;
-            readonly bin_hz: number;
-            readonly level_db: readonly number[];
         };
     };
     responses: {
@@ -1379,6 +1444,41 @@ export interface operations {
                 };
                 content: {
                     readonly "application/json": components["schemas"]["SurfaceMap"];
+                };
+            };
+            /** @description Not changed since the ETag of If-None-Match */
+            readonly 304: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content?: never;
+            };
+            readonly default: components["responses"]["Problem"];
+        };
+    };
+    readonly map_figure: {
+        readonly parameters: {
+            readonly query?: {
+                /** @description Components to the right and upwards. */
+                readonly axes?: "12" | "13" | "23";
+                readonly format?: "svg" | "pdf" | "png";
+            };
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        readonly requestBody?: never;
+        readonly responses: {
+            /** @description OK */
+            readonly 200: {
+                headers: {
+                    readonly ETag?: string;
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/pdf": string;
+                    readonly "image/png": string;
+                    readonly "image/svg+xml": string;
                 };
             };
             /** @description Not changed since the ETag of If-None-Match */
@@ -1860,6 +1960,7 @@ export interface operations {
                 readonly frame?: "caption" | "bare";
                 /** @description Width of a surface's plot, px. */
                 readonly width?: number;
+                readonly format?: "svg" | "pdf" | "png";
             };
             readonly header?: never;
             readonly path: {
@@ -1876,6 +1977,8 @@ export interface operations {
                     readonly [name: string]: unknown;
                 };
                 content: {
+                    readonly "application/pdf": string;
+                    readonly "image/png": string;
                     readonly "image/svg+xml": string;
                 };
             };
@@ -1942,6 +2045,7 @@ export interface operations {
                 readonly frame?: "caption" | "bare";
                 /** @description Width of a surface's plot, px. */
                 readonly width?: number;
+                readonly format?: "svg" | "pdf" | "png";
             };
             readonly header?: never;
             readonly path: {
@@ -1958,6 +2062,8 @@ export interface operations {
                     readonly [name: string]: unknown;
                 };
                 content: {
+                    readonly "application/pdf": string;
+                    readonly "image/png": string;
                     readonly "image/svg+xml": string;
                 };
             };
@@ -2066,6 +2172,42 @@ export interface operations {
             readonly default: components["responses"]["Problem"];
         };
     };
+    readonly analysis: {
+        readonly parameters: {
+            readonly query?: {
+                /** @description Level and group delay are means over the n-th part of an octave, by power; 0: they are not smoothed. */
+                readonly octave?: number;
+                readonly delay?: "direct" | "reflected" | "none";
+            };
+            readonly header?: never;
+            readonly path: {
+                readonly surface_id: string;
+                readonly pair_id: number;
+            };
+            readonly cookie?: never;
+        };
+        readonly requestBody?: never;
+        readonly responses: {
+            /** @description OK */
+            readonly 200: {
+                headers: {
+                    readonly ETag?: string;
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/json": components["schemas"]["PairAnalysis"];
+                };
+            };
+            /** @description Not changed since the ETag of If-None-Match */
+            readonly 304: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content?: never;
+            };
+            readonly default: components["responses"]["Problem"];
+        };
+    };
     readonly wav: {
         readonly parameters: {
             readonly query?: {
@@ -2089,6 +2231,40 @@ export interface operations {
                 };
                 content: {
                     readonly "audio/wav": string;
+                };
+            };
+            /** @description Not changed since the ETag of If-None-Match */
+            readonly 304: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content?: never;
+            };
+            readonly default: components["responses"]["Problem"];
+        };
+    };
+    readonly spectrogram: {
+        readonly parameters: {
+            readonly query?: {
+                readonly signal?: "reflected" | "measured";
+            };
+            readonly header?: never;
+            readonly path: {
+                readonly surface_id: string;
+                readonly pair_id: number;
+            };
+            readonly cookie?: never;
+        };
+        readonly requestBody?: never;
+        readonly responses: {
+            /** @description OK */
+            readonly 200: {
+                headers: {
+                    readonly ETag?: string;
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/json": components["schemas"]["Spectrogram"];
                 };
             };
             /** @description Not changed since the ETag of If-None-Match */
