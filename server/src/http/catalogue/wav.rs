@@ -11,6 +11,7 @@ use super::super::extract::{BinaryContent, PathParams, QueryParams, WholeNumber}
 use super::content::{AnswerContent, EndpointAnswer};
 use super::pair::{PairPath, ResponseSignal};
 use super::request::CatalogueRequest;
+use crate::fault::RequestFault;
 
 /// The panels are models of walls at a tenth of their size: the wavelengths are a tenth, too.
 const SCALE: usize = 10;
