@@ -32,7 +32,7 @@ impl<S: Send + Sync, T: DeserializeOwned + Send> FromRequestParts<S> for PathPar
 }
 
 /// The parameters after the path's `?`. A field that is a list has all values of its name; another name may be there
-/// once. An optional parameter without a value counts as left out.
+/// once.
 pub(super) struct QueryParams<T>(pub(super) T);
 
 impl<S: Send + Sync, T: DeserializeOwned> FromRequestParts<S> for QueryParams<T> {
@@ -59,6 +59,17 @@ pub(super) fn parse_query<T: DeserializeOwned>(uri: &Uri) -> Result<T, RequestFa
             _ => format!("the parameters are not right: {defect}"),
         })
     })
+}
+
+/// Reads an optional parameter that is there. Without a value it is an empty text, as other texts, and not left out:
+/// serde_html_form takes `where=` for no predicate, which is another question.
+///
+/// # Errors
+/// What the parameter's type says.
+pub(super) fn read_present<'de, D: Deserializer<'de>, T: Deserialize<'de>>(
+    deserializer: D,
+) -> Result<Option<T>, D::Error> {
+    T::deserialize(deserializer).map(Some)
 }
 
 /// A parameter that is a whole number within bounds, and that has a default.
@@ -168,6 +179,7 @@ mod tests {
     #[derive(Debug, Default, PartialEq, Deserialize)]
     #[serde(default, deny_unknown_fields)]
     struct TestQuery {
+        #[serde(deserialize_with = "read_present")]
         a: Option<String>,
         b: Vec<String>,
         limit: WholeNumber<1, 500, 60>,
@@ -191,6 +203,7 @@ mod tests {
         };
         assert_eq!(query("a=1&b=x%20y&b=%3C&limit=007&order=desc&level=-6..0.5"), Ok(expected));
         assert!(query("a=%ff").is_ok());
+        assert_eq!(query("a=").map(|query| query.a), Ok(Some(String::new())));
     }
 
     #[test]

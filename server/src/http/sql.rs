@@ -33,8 +33,10 @@ const LARGEST: usize = 2 << 20;
 #[into_params(parameter_in = Query)]
 pub(super) struct SqlParams {
     #[param(schema_with = format_schema)]
+    #[serde(default, deserialize_with = "crate::http::extract::read_present")]
     format: Option<String>,
     /// CSV alone: `'` before texts that a spreadsheet would take for formulas. False by default.
+    #[serde(default, deserialize_with = "crate::http::extract::read_present")]
     escape_formulas: Option<bool>,
 }
 

@@ -138,6 +138,7 @@ fn times_ms(rig: &Rig, kept: &[usize]) -> Vec<f64> {
 pub(super) struct CurvesQuery {
     /// A grid point.
     #[param(value_type = usize, required = false)]
+    #[serde(default, deserialize_with = "crate::http::extract::read_present")]
     microphone: Option<String>,
     #[param(inline)]
     points: WholeNumber<16, 4096, 192>,

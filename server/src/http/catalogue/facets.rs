@@ -63,6 +63,7 @@ const FACETS: [SurfaceFacet; 6] = [
 #[into_params(parameter_in = Query)]
 pub(super) struct SurfacesQuery {
     /// Text in id, typology, structures, material, parameters.
+    #[serde(default, deserialize_with = "crate::http::extract::read_present")]
     q: Option<String>,
     typology: Vec<String>,
     macrostructure: Vec<String>,
@@ -72,9 +73,11 @@ pub(super) struct SurfacesQuery {
     origin: Vec<String>,
     /// `lo..hi` in days since 1970, as the histogram's bins.
     #[param(inline)]
+    #[serde(default, deserialize_with = "crate::http::extract::read_present")]
     started: Option<NumberRange>,
     /// `lo..hi` mm, root mean square. References have none.
     #[param(inline)]
+    #[serde(default, deserialize_with = "crate::http::extract::read_present")]
     relief: Option<NumberRange>,
     /// `band:lo..hi`, dB against Flat of the same band. References have none.
     #[param(inline)]
@@ -83,6 +86,7 @@ pub(super) struct SurfacesQuery {
     sort: SurfaceSort,
     /// A band's key, as in `lake.bands`.
     #[param(default = "total")]
+    #[serde(default, deserialize_with = "crate::http::extract::read_present")]
     sort_band: Option<String>,
     #[param(inline)]
     order: SurfaceDirection,

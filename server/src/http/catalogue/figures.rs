@@ -83,6 +83,7 @@ enum FigurePalette {
 pub(super) struct GridFigureQuery {
     /// A grid point.
     #[param(value_type = usize, required = true)]
+    #[serde(default, deserialize_with = "crate::http::extract::read_present")]
     microphone: Option<String>,
     /// As of grid.
     #[serde(default)]
@@ -92,8 +93,10 @@ pub(super) struct GridFigureQuery {
     #[serde(default)]
     beside: Vec<String>,
     /// A surface whose levels are subtracted from those of the others.
+    #[serde(default, deserialize_with = "crate::http::extract::read_present")]
     less: Option<String>,
     /// Key of the only band, as in `lake.bands`; all if there is none.
+    #[serde(default, deserialize_with = "crate::http::extract::read_present")]
     band: Option<String>,
     #[serde(default)]
     #[param(inline)]
@@ -192,6 +195,7 @@ pub(super) async fn grid_figure(
 pub(super) struct CurvesFigureQuery {
     /// A grid point.
     #[param(value_type = usize, required = false)]
+    #[serde(default, deserialize_with = "crate::http::extract::read_present")]
     microphone: Option<String>,
     #[param(inline)]
     points: WholeNumber<16, 4096, 192>,

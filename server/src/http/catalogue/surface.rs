@@ -161,6 +161,7 @@ struct SurfaceGrid<'a> {
 pub(super) struct GridQuery {
     /// A grid point.
     #[param(value_type = usize, required = true)]
+    #[serde(default, deserialize_with = "crate::http::extract::read_present")]
     microphone: Option<String>,
     /// flat-total: as in the paper's tables. flat-band: as in its grid plots; the total is then over Flat's total.
     #[serde(default)]

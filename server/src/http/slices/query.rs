@@ -22,6 +22,7 @@ pub(in super::super) struct SliceParameters {
     /// An SQL predicate over the columns of table measurements; all measurements of the runs if there is none.
     #[serde(rename = "where")]
     #[param(example = "pair_id < 5")]
+    #[serde(default, deserialize_with = "crate::http::extract::read_present")]
     predicate: Option<String>,
     /// The runs that the measurements are of; a page of elsewhere has to name them.
     #[param(style = Form, explode)]
@@ -33,6 +34,7 @@ pub(in super::super) struct SliceParameters {
     #[param(inline)]
     layout: SliceLayout,
     /// The slice's ETag without quotes; if it is another by now, 410.
+    #[serde(default, deserialize_with = "crate::http::extract::read_present")]
     id: Option<String>,
 }
 

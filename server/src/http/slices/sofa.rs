@@ -30,10 +30,12 @@ pub(in crate::http) const SOFA: &str = "/api/v1/slices.sofa";
 #[into_params(parameter_in = Query)]
 pub(super) struct SofaParameters {
     /// The run; the only one of the measurements if there is none.
+    #[serde(default, deserialize_with = "crate::http::extract::read_present")]
     run: Option<String>,
     /// An SQL predicate over the columns of table measurements; all measurements of the run if there is none.
     #[serde(rename = "where")]
     #[param(example = "surface_id = 'flat' and pair_id < 5")]
+    #[serde(default, deserialize_with = "crate::http::extract::read_present")]
     predicate: Option<String>,
 }
 
