@@ -43,7 +43,7 @@ api:
 paper *LAKE:
     docs/paper/make.sh {{ LAKE }}
 
-# A long form of what tests try in short: README lists them.
+# A long form of what tests try in short: docs/testing.md lists them.
 campaign NAME *OPTIONS:
     cargo run --profile quick --locked -p echolake-campaigns -- {{ NAME }} {{ OPTIONS }}
 

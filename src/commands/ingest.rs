@@ -30,7 +30,7 @@ use clap::Args;
 pub(crate) struct IngestArgs {
     /// Run files, or names of runs in the lake; by default all that are not in the tables yet.
     pub(crate) runs: Vec<String>,
-    /// Keep running and take in new files of the lake's inbox, until Ctrl-C.
+    /// Keep running and ingest new files of the lake's inbox, until Ctrl-C.
     #[arg(long, conflicts_with_all = ["runs", "json"])]
     pub(crate) watch: bool,
     /// Print what was done as JSON.
