@@ -38,9 +38,9 @@ pub(crate) struct PanelArgs {
     /// Set a parameter of the other side; repeatable.
     #[arg(long, value_name = "KEY=VALUE", requires = "back")]
     back_set: Vec<String>,
-    /// Output file; repeatable. The extension selects the content: glb, stl, obj or ply for the panel's mesh, png for a
-    /// picture, npy for 512 x 512 heights in mm, json for the parameters. The png, npy and json of a panel with two
-    /// sides are written as FILE_0 and FILE_1. With --group, the output folder; with --next, the file of the next ranges.
+    /// Output file; repeatable. The extension selects the content: glb or stl for the panel's mesh, png for a picture,
+    /// npy for 512 x 512 heights in mm, json for the parameters. The png, npy and json of a panel with two sides are
+    /// written as FILE_0 and FILE_1. With --group, the output folder; with --next, the file of the next ranges.
     #[arg(short, long, required_unless_present = "list", value_name = "FILE")]
     output: Vec<PathBuf>,
     /// Cells along each side of the mesh; by default 585 (1 mm each) for walls with joints, and 274 for flat, foam, wood

@@ -15,18 +15,11 @@ pub enum Error {
         source: io::Error,
     },
     /// The extension names no known format.
-    #[error("`{}` is no mesh file that is known; hint: .glb, .stl, .obj or .ply", path.display())]
-    Format {
-        /// The file.
-        path: PathBuf,
-    },
-    /// The format is written and not read.
     #[error(
-        "mesh `{}` is of a format that is only written; hint: meshes are read from .glb and .stl, which Blender, MeshLab \
-         and trimesh export",
+        "`{}` is no mesh file that is known; hint: .glb or .stl, which Blender, MeshLab and trimesh export",
         path.display()
     )]
-    WrittenOnly {
+    Format {
         /// The file.
         path: PathBuf,
     },
@@ -49,7 +42,11 @@ pub enum Error {
         path: PathBuf,
     },
     /// The mesh has edges with one triangle only.
-    #[error("mesh `{}` is open: {edges} edges have no second triangle, the first at {place:?} mm; hint: export a closed solid", path.display())]
+    #[error(
+        "mesh `{}` is open: {edges} edges have no second triangle, the first at {place:?} mm; hint: export a closed \
+         solid",
+        path.display()
+    )]
     Open {
         /// The file.
         path: PathBuf,
@@ -59,7 +56,10 @@ pub enum Error {
         place: [f32; 3],
     },
     /// The mesh is larger than the rig's panel.
-    #[error("mesh `{}` is {actual}, larger than the panel: expected {expected}; hint: lengths are in mm (GLB: metres)", path.display())]
+    #[error(
+        "mesh `{}` is {actual}, larger than the panel: expected {expected}; hint: lengths are in mm (GLB: metres)",
+        path.display()
+    )]
     TooLarge {
         /// The file.
         path: PathBuf,

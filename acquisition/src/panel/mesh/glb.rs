@@ -1,22 +1,16 @@
 //! GLB: glTF 2.0 in one binary file, metres, Y up.
 
-mod accessor;
 mod read;
-mod scene;
 
 pub(super) use read::parse;
 
+use gltf::Glb;
+use gltf::binary::Header;
 use serde_json::json;
 
 use super::Mesh;
 
-const MAGIC: &[u8; 4] = b"glTF";
-const JSON_CHUNK: u32 = 0x4E4F_534A;
-const BIN_CHUNK: u32 = 0x004E_4942;
-
 /// Component types and targets of glTF 2.0.
-const UNSIGNED_BYTE: u64 = 5121;
-const UNSIGNED_SHORT: u64 = 5123;
 const UNSIGNED_INT: u64 = 5125;
 const FLOAT: u64 = 5126;
 const ARRAY_BUFFER: u64 = 34962;
@@ -53,17 +47,15 @@ pub(super) fn write(mesh: &Mesh) -> Vec<u8> {
         ],
         "buffers": [{ "byteLength": bin.len() }],
     });
-    let mut text = document.to_string().into_bytes();
-    text.resize(text.len().next_multiple_of(4), b' ');
-    let mut file = Vec::with_capacity(text.len() + bin.len() + 28);
-    file.extend_from_slice(MAGIC);
-    file.extend(2u32.to_le_bytes());
-    file.extend(((12 + 8 + text.len() + 8 + bin.len()) as u32).to_le_bytes());
-    for (kind, body) in [(JSON_CHUNK, &text), (BIN_CHUNK, &bin)] {
-        file.extend((body.len() as u32).to_le_bytes());
-        file.extend(kind.to_le_bytes());
-        file.extend_from_slice(body);
-    }
+    pack(document.to_string().into_bytes(), bin)
+}
+
+// The crate writes the header's version and length itself.
+fn pack(json: Vec<u8>, bin: Vec<u8>) -> Vec<u8> {
+    let header = Header { magic: *b"glTF", version: 2, length: 0 };
+    let mut file = Vec::with_capacity(json.len() + bin.len() + 32);
+    // A vector takes all bytes.
+    let _ = Glb { header, json: json.into(), bin: Some(bin.into()) }.to_writer(&mut file);
     file
 }
 

@@ -1,9 +1,7 @@
-//! Meshes of panels: made from height fields, read from GLB and STL, written to these, OBJ and PLY.
+//! Meshes of panels: made from height fields, read from and written to GLB and STL.
 
 mod error;
 mod glb;
-mod obj;
-mod ply;
 mod solid;
 mod stl;
 
@@ -59,10 +57,6 @@ pub enum Format {
     Glb,
     /// Stereolithography, binary or text.
     Stl,
-    /// Wavefront, written only.
-    Obj,
-    /// Stanford polygons, binary little-endian, written only.
-    Ply,
 }
 
 impl Format {
@@ -75,8 +69,6 @@ impl Format {
         match extension.as_deref() {
             Some("glb") => Ok(Self::Glb),
             Some("stl") => Ok(Self::Stl),
-            Some("obj") => Ok(Self::Obj),
-            Some("ply") => Ok(Self::Ply),
             _ => Err(Error::Format { path: path.to_owned() }),
         }
     }
@@ -86,7 +78,6 @@ impl Format {
         match self {
             Self::Glb => "model/gltf-binary",
             Self::Stl => "model/stl",
-            Self::Obj | Self::Ply => "application/octet-stream",
         }
     }
 }
@@ -115,7 +106,6 @@ impl Mesh {
         let mesh = match format {
             Format::Glb => glb::parse(bytes, path),
             Format::Stl => stl::parse(bytes, path),
-            Format::Obj | Format::Ply => Err(Error::WrittenOnly { path: path.to_owned() }),
         }?;
         let count = mesh.vertices_mm.len();
         match mesh.triangles.iter().flatten().find(|i| **i as usize >= count) {
@@ -134,8 +124,6 @@ impl Mesh {
         match format {
             Format::Glb => glb::write(self),
             Format::Stl => stl::write(self),
-            Format::Obj => obj::write(self),
-            Format::Ply => ply::write(self),
         }
     }
 }

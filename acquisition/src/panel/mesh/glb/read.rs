@@ -3,32 +3,45 @@
 #[cfg(test)]
 mod tests;
 
+use std::collections::HashSet;
 use std::path::Path;
 
-use serde_json::Value;
+use gltf::accessor::{DataType, Dimensions};
+use gltf::json::{Root, deserialize};
+use gltf::mesh::Mode;
+use gltf::{Accessor, Document, Glb, Node, Primitive, Semantic};
 
-use super::accessor::{GlbFile, list};
-use super::scene::{MeshInstance, SceneFault, instances};
-use super::{BIN_CHUNK, JSON_CHUNK, MAGIC, from_gltf};
+use super::from_gltf;
 use crate::panel::mesh::{Error, Mesh};
 
 /// Most vertices, and most triangles, that a scene may have once its instances are made. Accessors and meshes are
 /// shared, so a small file can ask for any number; a panel with a vertex every 0.5 mm on both sides has 2.7 million
 /// vertices and 5.5 million triangles.
 const MOST: usize = 6_000_000;
+/// [`MOST`] in messages.
+const AT_MOST: &str = "up to 6 million vertices and as many triangles in all instances";
 /// Most characters of a buffer's URI in a message: it may be all of the buffer's bytes.
 const MOST_SHOWN: usize = 60;
-/// As messages say it.
-const AT_MOST: &str = "up to 6 million vertices and as many triangles in all instances";
+/// Accessors that are read.
+const PLAIN: &str = "plain f32 positions and whole-numbered triangle indices";
+/// Types of indices.
+const WHOLE_NUMBERS: [DataType; 3] = [DataType::U8, DataType::U16, DataType::U32];
 
 /// Extensions that change how a mesh looks and not its shape. A file that requires another is refused.
 const APPEARANCE: [&str; 3] = ["KHR_materials_", "KHR_texture_", "EXT_texture_"];
 /// An extension that makes instances of a node, which files may have without requiring it.
 const INSTANCING: &str = "EXT_mesh_gpu_instancing";
 
+/// A transform, column by column.
+type Matrix = [[f64; 4]; 4];
+const IDENTITY: Matrix = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]];
+
+/// The place, the actual and the expected content of [`Error::Syntax`].
+type GlbFault = (String, String, &'static str);
+
 /// Reads positions and triangles of every mesh in the file's scene, each transformed by its nodes.
 pub(crate) fn parse(bytes: &[u8], path: &Path) -> Result<Mesh, Error> {
-    read(bytes).map_err(|SceneFault { place, actual, expected }| Error::Syntax {
+    read_scene(bytes).map_err(|(place, actual, expected)| Error::Syntax {
         path: path.to_owned(),
         place,
         actual,
@@ -36,105 +49,162 @@ pub(crate) fn parse(bytes: &[u8], path: &Path) -> Result<Mesh, Error> {
     })
 }
 
-fn wrong(place: impl Into<String>, actual: impl Into<String>, expected: &'static str) -> SceneFault {
-    SceneFault { place: place.into(), actual: actual.into(), expected }
-}
-
-fn read(bytes: &[u8]) -> Result<Mesh, SceneFault> {
-    let file = open(bytes)?;
-    check_features(&file.document)?;
+fn read_scene(bytes: &[u8]) -> Result<Mesh, GlbFault> {
+    // The crate takes longer files, and subtracts the header's bytes from a length that may be less.
+    let length = bytes.get(8..12).and_then(|b| b.try_into().ok()).map(u32::from_le_bytes);
+    if bytes.starts_with(b"glTF") && length.map(|n| n as usize) != Some(bytes.len()) {
+        let actual = format!("a length that is not the file's {} bytes", bytes.len());
+        return Err(("byte 8".into(), actual, "the file's length"));
+    }
+    let glb = Glb::from_slice(bytes).map_err(|e| describe_error(&e))?;
+    let root = deserialize::from_slice(&glb.json).map_err(|e| describe_error(&gltf::Error::Deserialize(e)))?;
+    let document = Document::from_json(check_features(root)?).map_err(|e| describe_error(&e))?;
+    let bin = glb.bin.as_deref().unwrap_or_default();
     let mut mesh = Mesh::default();
-    for instance in instances(&file.document)? {
-        let primitives = list(&file.document["meshes"][instance.mesh]["primitives"]);
-        for (number, primitive) in primitives.iter().enumerate() {
-            append(&mut mesh, &file, &instance, primitive).map_err(|(actual, expected)| {
-                wrong(format!("mesh {}, primitive {number}", instance.mesh), actual, expected)
-            })?;
+    // A file without nodes is a library of meshes: each keeps its place.
+    if document.nodes().len() == 0 {
+        document.meshes().try_for_each(|shape| append_mesh(&mut mesh, &shape, &IDENTITY, bin))?;
+    }
+    let mut seen = HashSet::new();
+    let mut waiting: Vec<_> = root_nodes(&document).into_iter().map(|node| (node, IDENTITY)).collect();
+    // A tree has each node once, which ends this whatever the file says, at any depth.
+    while let Some((node, parent)) = waiting.pop() {
+        if !seen.insert(node.index()) {
+            let actual = "a second parent, or itself above it".to_owned();
+            return Err((format!("node {}", node.index()), actual, "a tree of nodes"));
         }
+        let transform = multiply(&parent, &node.transform().matrix().map(|column| column.map(f64::from)));
+        if let Some(shape) = node.mesh() {
+            append_mesh(&mut mesh, &shape, &transform, bin)?;
+        }
+        waiting.extend(node.children().map(|child| (child, transform)));
     }
     Ok(mesh)
 }
 
-// The chunks of the file: its JSON, and its numbers, if any.
-fn open(bytes: &[u8]) -> Result<GlbFile<'_>, SceneFault> {
-    let word = |at: usize| Some(u32::from_le_bytes(bytes.get(at..at + 4)?.try_into().ok()?) as usize);
-    if bytes.get(..4) != Some(MAGIC) || word(4) != Some(2) {
-        return Err(wrong("byte 0", "no glTF 2.0 header", "`glTF` and version 2"));
-    }
-    if word(8) != Some(bytes.len()) {
-        let actual = format!("a length that is not the file's {} bytes", bytes.len());
-        return Err(wrong("byte 8", actual, "the file's length"));
-    }
-    let chunk = |at: usize, kind: u32| -> Option<&[u8]> {
-        (word(at + 4)? == kind as usize).then(|| bytes.get(at + 8..at + 8 + word(at)?)).flatten()
+fn describe_error(error: &gltf::Error) -> GlbFault {
+    let (place, actual) = match error {
+        gltf::Error::Binary(e) => ("its header or chunks".to_owned(), e.to_string()),
+        gltf::Error::Validation(faults) if let Some((place, fault)) = faults.first() => {
+            (format!("its JSON at `{place}`"), fault.to_string())
+        }
+        other => ("its JSON".to_owned(), other.to_string()),
     };
-    let text = chunk(12, JSON_CHUNK).ok_or_else(|| wrong("byte 12", "no JSON chunk", "a JSON chunk"))?;
-    let bin = chunk(20 + text.len(), BIN_CHUNK).unwrap_or(&[]);
-    let document = serde_json::from_slice(text).map_err(|e| wrong("its JSON", e.to_string(), "valid JSON"))?;
-    Ok(GlbFile { document, bin })
+    (place, format!("\"{actual}\""), "glTF 2.0 in one binary file")
 }
 
-// Refuses what would be read as another shape than the file's.
-fn check_features(document: &Value) -> Result<(), SceneFault> {
-    for extension in list(&document["extensionsRequired"]) {
-        let name = extension.as_str().unwrap_or_default();
-        if !APPEARANCE.iter().any(|prefix| name.starts_with(prefix)) {
-            let expected = "meshes that need no extension; hint: export it without compression and instances";
-            return Err(wrong("`extensionsRequired`", extension.to_string(), expected));
-        }
+// Refuses what would be read as another shape than the file's, and what the crate's validation does not survive.
+fn check_features(mut root: Root) -> Result<Root, GlbFault> {
+    root.extensions_required.retain(|name| !APPEARANCE.iter().any(|prefix| name.starts_with(prefix)));
+    if let Some(name) = root.extensions_required.first() {
+        let expected = "meshes that need no extension; hint: export it without compression and instances";
+        return Err(("`extensionsRequired`".into(), format!("{name:?}"), expected));
     }
-    let has_instances = |node: &Value| !node["extensions"][INSTANCING].is_null();
-    if let Some(node) = list(&document["nodes"]).iter().position(has_instances) {
+    let is_instanced = |e: &gltf::json::extensions::scene::Node| e.others.contains_key(INSTANCING);
+    if let Some(node) = root.nodes.iter().position(|node| node.extensions.as_ref().is_some_and(is_instanced)) {
         let expected = "one mesh a node; hint: export instances as meshes of their own";
-        return Err(wrong(format!("node {node}"), format!("the extension {INSTANCING}"), expected));
+        return Err((format!("node {node}"), format!("the extension {INSTANCING}"), expected));
     }
-    match &document["buffers"][0]["uri"] {
-        Value::Null => Ok(()),
-        uri => {
-            let shown: String = uri.to_string().chars().take(MOST_SHOWN).collect();
-            let expected = "the file's own binary chunk; hint: export it as one GLB file";
-            Err(wrong("buffer 0", format!("the uri {shown}"), expected))
+    if let Some(uri) = root.buffers.first().and_then(|buffer| buffer.uri.as_ref()) {
+        let shown: String = uri.chars().take(MOST_SHOWN).collect();
+        let expected = "the file's own binary chunk; hint: export it as one GLB file";
+        return Err(("buffer 0".into(), format!("the uri {shown:?}"), expected));
+    }
+    for (number, mesh) in root.meshes.iter().enumerate() {
+        let accessors = mesh.primitives.iter().flat_map(|primitive| primitive.attributes.values());
+        if let Some(lacking) = accessors.map(|a| a.value()).find(|a| *a >= root.accessors.len()) {
+            return Err((format!("mesh {number}"), format!("accessor {lacking}"), "one of the file's accessors"));
         }
     }
+    Ok(root)
 }
 
-// Adds a primitive with its node's transform; an error has the actual and the expected content.
-fn append(
-    mesh: &mut Mesh,
-    file: &GlbFile<'_>,
-    instance: &MeshInstance,
-    primitive: &Value,
-) -> Result<(), (String, &'static str)> {
-    const PLAIN: &str = "plain f32 positions and whole-numbered triangle indices";
-    let mode = &primitive["mode"];
-    if !mode.is_null() && mode.as_u64() != Some(4) {
-        return Err((format!("mode {mode}"), "triangles"));
+// The nodes of the default scene; without scenes, all that have no parent.
+fn root_nodes(document: &Document) -> Vec<Node<'_>> {
+    if let Some(scene) = document.default_scene().or_else(|| document.scenes().next()) {
+        return scene.nodes().collect();
     }
-    let (positions, indices) = (&primitive["attributes"]["POSITION"], &primitive["indices"]);
+    let children: HashSet<usize> = document.nodes().flat_map(|node| node.children()).map(|node| node.index()).collect();
+    document.nodes().filter(|node| !children.contains(&node.index())).collect()
+}
+
+fn multiply(left: &Matrix, right: &Matrix) -> Matrix {
+    right.map(|column| [0, 1, 2, 3].map(|row| (0..4).map(|k| left[k][row] * column[k]).sum()))
+}
+
+fn apply(transform: &Matrix, point: [f32; 3]) -> [f32; 3] {
+    let [x, y, z] = point.map(f64::from);
+    let [a, b, c, d] = transform;
+    [0, 1, 2].map(|row| (a[row] * x + b[row] * y + c[row] * z + d[row]) as f32)
+}
+
+// Returns whether a transform turns the inside of a solid out.
+fn mirrors(transform: &Matrix) -> bool {
+    let [[a, b, c, _], [d, e, f, _], [g, h, i, _], _] = transform;
+    a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) < 0.0
+}
+
+fn append_mesh(mesh: &mut Mesh, shape: &gltf::Mesh<'_>, transform: &Matrix, bin: &[u8]) -> Result<(), GlbFault> {
+    shape.primitives().try_for_each(|primitive| {
+        append_primitive(mesh, &primitive, transform, bin).map_err(|(actual, expected)| {
+            (format!("mesh {}, primitive {}", shape.index(), primitive.index()), actual, expected)
+        })
+    })
+}
+
+// An error has the actual and the expected content.
+fn append_primitive(
+    mesh: &mut Mesh,
+    primitive: &Primitive<'_>,
+    transform: &Matrix,
+    bin: &[u8],
+) -> Result<(), (String, &'static str)> {
+    if primitive.mode() != Mode::Triangles {
+        return Err((format!("mode {:?}", primitive.mode()), "triangles"));
+    }
+    let positions = primitive
+        .get(&Semantic::Positions)
+        .filter(|positions| is_readable(positions, Dimensions::Vec3, &[DataType::F32], bin))
+        .ok_or_else(|| ("no readable positions".to_owned(), PLAIN))?;
+    let indices = primitive.indices();
+    if indices.as_ref().is_some_and(|indices| !is_readable(indices, Dimensions::Scalar, &WHOLE_NUMBERS, bin)) {
+        return Err(("no readable indices".to_owned(), PLAIN));
+    }
     // Counted before anything is made of it.
-    let count = file.count(positions).ok_or_else(|| ("no readable positions".to_owned(), PLAIN))?;
-    let corners = if indices.is_null() { Some(count) } else { file.count(indices) };
-    let corners = corners.ok_or_else(|| ("no readable indices".to_owned(), PLAIN))?;
-    let vertices = mesh.vertices_mm.len().saturating_add(count);
+    let corners = indices.as_ref().unwrap_or(&positions).count();
+    let vertices = mesh.vertices_mm.len().saturating_add(positions.count());
     let triangles = mesh.triangles.len().saturating_add(corners / 3);
     if vertices.max(triangles) > MOST {
         return Err((format!("with all before it {vertices} vertices and {triangles} triangles"), AT_MOST));
     }
-    let positions = file.positions(positions).ok_or_else(|| ("no readable positions".to_owned(), PLAIN))?;
-    let indices = match indices {
-        Value::Null => (0..count as u32).collect(),
-        accessor => file.indices(accessor).ok_or_else(|| ("no readable indices".to_owned(), PLAIN))?,
-    };
-    if !indices.len().is_multiple_of(3) {
-        return Err((format!("{} corners", indices.len()), "three for each triangle"));
+    if !corners.is_multiple_of(3) {
+        return Err((format!("{corners} corners"), "three for each triangle"));
     }
-    if let Some(index) = indices.iter().find(|i| **i as usize >= count) {
+    let reader = primitive.reader(|_| Some(bin));
+    let own_positions = reader.read_positions().ok_or_else(|| ("no readable positions".to_owned(), PLAIN))?;
+    let own_indices: Vec<u32> = match reader.read_indices() {
+        Some(read) => read.into_u32().collect(),
+        None if indices.is_none() => (0..corners as u32).collect(),
+        None => return Err(("no readable indices".to_owned(), PLAIN)),
+    };
+    if let Some(index) = own_indices.iter().find(|i| **i as usize >= positions.count()) {
         return Err((format!("vertex {index}"), "one of its own vertices"));
     }
     let first = mesh.vertices_mm.len() as u32;
-    mesh.vertices_mm.extend(positions.into_iter().map(|p| from_gltf(instance.transform.apply(p))));
-    let mirrors = instance.transform.mirrors();
-    let triangles = indices.chunks_exact(3).map(|t| if mirrors { [t[0], t[2], t[1]] } else { [t[0], t[1], t[2]] });
-    mesh.triangles.extend(triangles.map(|t| t.map(|i| first + i)));
+    mesh.vertices_mm.extend(own_positions.map(|p| from_gltf(apply(transform, p))));
+    let order = if mirrors(transform) { [0, 2, 1] } else { [0, 1, 2] };
+    mesh.triangles.extend(own_indices.chunks_exact(3).map(|corners| order.map(|i| first + corners[i])));
     Ok(())
+}
+
+// The crate asserts shape, type and stride, adds offsets as they come, and trusts that a count is not 0.
+fn is_readable(accessor: &Accessor<'_>, shape: Dimensions, types: &[DataType], bin: &[u8]) -> bool {
+    accessor.view().is_some_and(|view| {
+        [accessor.offset(), view.offset(), view.length()].iter().all(|n| *n <= bin.len())
+            && view.stride().is_none_or(|stride| stride >= accessor.size())
+            && view.buffer().index() == 0
+    }) && accessor.dimensions() == shape
+        && types.contains(&accessor.data_type())
+        && accessor.sparse().is_none()
+        && accessor.count() > 0
 }

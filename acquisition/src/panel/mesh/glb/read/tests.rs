@@ -1,6 +1,6 @@
 //! Files whose JSON is changed: nodes that move and mirror, sharing, and what is refused.
 
-use serde_json::json;
+use serde_json::{Value, json};
 
 use super::*;
 use crate::panel::relief::HeightField;
@@ -13,22 +13,18 @@ fn plate() -> Mesh {
 /// The plate's file, its JSON changed.
 fn file(change: impl FnOnce(&mut Value)) -> Vec<u8> {
     let bytes = super::super::write(&plate());
-    let opened = open(&bytes).unwrap_or_else(|e| panic!("its own file: {e:?}"));
-    let (mut document, bin) = (opened.document, opened.bin.to_vec());
+    let glb = Glb::from_slice(&bytes).expect("its own file");
+    let mut document = serde_json::from_slice(&glb.json).expect("its own JSON");
     change(&mut document);
-    packed(&document, &bin)
+    packed(&document, &glb.bin.unwrap_or_default())
 }
 
 fn packed(document: &Value, bin: &[u8]) -> Vec<u8> {
-    let mut text = document.to_string().into_bytes();
-    text.resize(text.len().next_multiple_of(4), b' ');
-    let mut bytes = MAGIC.to_vec();
-    bytes.extend([2, (28 + text.len() + bin.len()) as u32].map(u32::to_le_bytes).as_flattened());
-    for (kind, body) in [(JSON_CHUNK, &text[..]), (BIN_CHUNK, bin)] {
-        bytes.extend([body.len() as u32, kind].map(u32::to_le_bytes).as_flattened());
-        bytes.extend_from_slice(body);
-    }
-    bytes
+    super::super::pack(document.to_string().into_bytes(), bin.to_vec())
+}
+
+fn remove(document: &mut Value, key: &str) {
+    assert!(document.as_object_mut().and_then(|object| object.remove(key)).is_some(), "no {key}");
 }
 
 fn parsed(change: impl FnOnce(&mut Value)) -> Mesh {
@@ -95,9 +91,12 @@ fn every_instance_stands_and_what_is_not_in_the_scene_does_not() {
     let second = json!([{ "nodes": [0] }, { "nodes": [2] }]);
     let shown = parsed(|d| (d["nodes"], d["scenes"], d["scene"]) = (nodes.clone(), second, json!(1)));
     assert_bounds(&shown, [[-50.0, -50.0, 8980.0], [50.0, 50.0, 9000.0]]);
-    let without_scenes = parsed(|d| (d["nodes"], d["scenes"]) = (nodes, Value::Null));
+    let without_scenes = parsed(|d| {
+        d["nodes"] = nodes;
+        ["scenes", "scene"].iter().for_each(|key| remove(d, key));
+    });
     assert_eq!(without_scenes.triangles.len(), 3 * plate().triangles.len());
-    let without_nodes = parsed(|d| (d["nodes"], d["scenes"]) = (Value::Null, Value::Null));
+    let without_nodes = parsed(|d| ["nodes", "scenes", "scene"].iter().for_each(|key| remove(d, key)));
     assert_eq!(without_nodes.triangles.len(), plate().triangles.len());
 }
 
@@ -107,11 +106,14 @@ fn graphs_that_are_no_trees_are_refused() {
     refused(nodes(json!([{ "children": [0] }])), "node 0 has a second parent, or itself above it");
     refused(nodes(json!([{ "children": [1] }, { "children": [0] }])), "expected a tree of nodes");
     refused(nodes(json!([{ "children": [1, 1] }, { "mesh": 0 }])), "node 1 has a second parent");
-    refused(nodes(json!([{ "children": [7] }])), "node 0 has node 7");
-    refused(nodes(json!([{ "mesh": 1 }])), "node 0 has mesh 1");
-    refused(nodes(json!([{ "mesh": 0, "scale": [1, "a", 1] }])), "node 0 has a transform that is none");
-    refused(nodes(json!([{ "mesh": 0, "matrix": [1, 0, 0] }])), "node 0 has a transform that is none");
-    refused(|d| d["scene"] = json!(3), "scene 3");
+    refused(nodes(json!([{ "children": [7] }])), "its JSON at `nodes[0].children[0]` has \"Index out of bounds\"");
+    refused(nodes(json!([{ "mesh": 1 }])), "its JSON at `nodes[0].mesh` has");
+    refused(
+        nodes(json!([{ "mesh": 0, "scale": [1, "a", 1] }])),
+        "its JSON has \"invalid type: string \"a\", expected f32",
+    );
+    refused(nodes(json!([{ "mesh": 0, "matrix": [1, 0, 0] }])), "its JSON has \"invalid length 3");
+    refused(|d| d["scene"] = json!(3), "its JSON at `scene` has");
     // A chain as long as any file's: depth costs no stack.
     let mut chain: Vec<Value> = (1..100_000).map(|next| json!({ "children": [next] })).collect();
     chain.push(json!({ "mesh": 0 }));
@@ -122,11 +124,28 @@ fn graphs_that_are_no_trees_are_refused() {
 fn numbers_of_another_kind_are_refused() {
     refused(|d| d["accessors"][2]["componentType"] = json!(5126), "no readable indices");
     refused(|d| d["accessors"][0]["componentType"] = json!(5125), "no readable positions");
-    refused(|d| d["accessors"][0]["sparse"] = json!({ "count": 1 }), "no readable positions");
-    refused(|d| d["bufferViews"][0]["byteOffset"] = json!(-4), "no readable positions");
+    let sparse = json!({
+        "count": 1,
+        "indices": { "bufferView": 2, "componentType": 5125 },
+        "values": { "bufferView": 1 },
+    });
+    refused(|d| d["accessors"][0]["sparse"] = sparse, "no readable positions");
+    refused(|d| d["accessors"][0]["type"] = json!("VEC4"), "no readable positions");
+    refused(|d| d["accessors"][0]["count"] = json!(0), "no readable positions");
+    refused(|d| d["bufferViews"][0]["byteStride"] = json!(8), "no readable positions");
+    refused(
+        |d| d["bufferViews"][0]["byteStride"] = json!(1 << 40),
+        "`bufferViews[0].byteStride` has \"Invalid value\"",
+    );
+    refused(|d| d["bufferViews"][0]["byteOffset"] = json!(u64::MAX - 4), "no readable positions");
+    refused(|d| d["bufferViews"][2]["byteOffset"] = json!(1 << 20), "no readable indices");
+    refused(|d| d["accessors"][2]["type"] = json!("VEC3"), "no readable indices");
+    refused(|d| d["meshes"][0]["primitives"][0]["attributes"]["POSITION"] = json!(9), "mesh 0 has accessor 9");
+    refused(|d| d["meshes"][0]["primitives"][0]["indices"] = json!(9), "primitives[0].indices` has \"Index out");
+    refused(|d| d["bufferViews"][0]["byteOffset"] = json!(-4), "its JSON has \"invalid value: integer `-4`");
     refused(|d| d["accessors"][2]["count"] = json!(10), "10 corners, expected three for each triangle");
     refused(|d| d["accessors"][0]["count"] = json!(4), "one of its own vertices");
-    refused(|d| d["meshes"][0]["primitives"][0]["mode"] = json!("lines"), "expected triangles");
+    refused(|d| d["meshes"][0]["primitives"][0]["mode"] = json!(1), "mode Lines, expected triangles");
 }
 
 #[test]
@@ -137,8 +156,14 @@ fn features_that_would_change_the_shape_are_refused_by_name() {
     };
     refused(required("KHR_draco_mesh_compression"), "`extensionsRequired` has \"KHR_draco_mesh_compression\"");
     refused(required("EXT_mesh_gpu_instancing"), "has \"EXT_mesh_gpu_instancing\"");
-    refused(|d| d["extensionsRequired"] = json!([7]), "`extensionsRequired` has 7");
+    refused(|d| d["extensionsRequired"] = json!([7]), "invalid type: integer `7`, expected a string");
     assert_eq!(parsed(required("KHR_texture_transform")), parsed(|_| {}), "it changes no shape");
+    let with_picture = parsed(|d| {
+        d["textures"] = json!([{ "extensions": { "EXT_texture_webp": { "source": 0 } } }]);
+        d["images"] = json!([{ "uri": "a.webp" }]);
+        d["meshes"][0]["primitives"][0]["attributes"]["_OWN"] = json!(0);
+    });
+    assert_eq!(with_picture, parsed(|_| {}), "pictures and attributes of applications change no shape");
     let instances = json!({ "EXT_mesh_gpu_instancing": { "attributes": { "TRANSLATION": 0 } } });
     refused(|d| d["nodes"][0]["extensions"] = instances, "node 0 has the extension EXT_mesh_gpu_instancing");
     refused(
@@ -162,7 +187,8 @@ mod slow {
                 "asset": { "version": "2.0" },
                 "nodes": vec![json!({ "mesh": 0 }); nodes],
                 "meshes": [{ "primitives": vec![json!({ "attributes": { "POSITION": 0 } }); primitives] }],
-                "accessors": [{ "bufferView": 0, "componentType": 5126, "count": 9_000, "type": "VEC3" }],
+                "accessors": [{ "bufferView": 0, "componentType": 5126, "count": 9_000, "type": "VEC3",
+                                 "min": [0, 0, 0], "max": [0, 0, 0] }],
                 "bufferViews": [{ "buffer": 0, "byteLength": bin.len() }],
                 "buffers": [{ "byteLength": bin.len() }],
             })
