@@ -27,44 +27,26 @@
 //! # Ok::<(), echolake_dsp::Error>(())
 //! ```
 
-pub mod air;
-mod aligned;
-pub mod arrival;
 pub mod chain;
-mod complex_vector;
-pub mod components;
-pub mod correlation;
-pub mod decay;
 pub mod deconvolution;
-pub mod diffusion;
-pub mod energy;
-pub mod envelope;
 mod error;
-pub mod filter_bank;
-pub mod foam;
-pub mod foam_reflection;
-pub mod frequency_response;
-pub mod fresnel;
-pub mod geometry;
 #[cfg(test)]
 mod golden;
-pub mod height_field;
-pub mod heights;
-mod joint;
-pub mod kirchhoff;
-pub mod level;
-pub mod mean;
-pub mod png;
-mod pruned;
+mod levels;
 mod real;
-pub mod response_deconvolution;
-pub mod rise;
-pub mod self_organising_map;
-pub mod spectrogram;
-pub mod spectrum;
+mod reflection;
+mod relief;
+mod similarity;
 pub mod sweep;
 pub mod temperature;
-pub mod uncertainty;
 
+pub use deconvolution::response_deconvolution;
 pub use error::Error;
+pub use levels::{
+    decay, diffusion, energy, envelope, filter_bank, frequency_response, level, mean, rise, spectrogram, spectrum,
+    uncertainty,
+};
 pub use real::{RealSample, SampleVector, VECTOR_LANES};
+pub use reflection::{air, arrival, foam, foam_reflection, fresnel, geometry, kirchhoff};
+pub use relief::{height_field, heights};
+pub use similarity::{components, correlation, self_organising_map};

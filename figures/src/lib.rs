@@ -7,8 +7,8 @@
 //! ```
 //! use echolake_figures::{FigureNotes, FilterFigure};
 //!
-//! let figure = FilterFigure { centres_hz: vec![2500.0, 5000.0, 10000.0], low_hz: 2000.0, high_hz: 40000.0, width_px: 480.0 };
-//! let svg = figure.draw(&FigureNotes { title: "Filter bank".into(), ..FigureNotes::default() }).to_svg();
+//! let figure = FilterFigure { centres_hz: vec![2500.0, 5000.0, 10000.0], low_hz: 2000.0, high_hz: 40000.0, width_px:
+//! 480.0 }; let svg = figure.draw(&FigureNotes { title: "Filter bank".into(), ..FigureNotes::default() }).to_svg();
 //! assert!(svg.contains("5 kHz"));
 //! ```
 
@@ -23,6 +23,7 @@ mod map;
 mod nce;
 mod notes;
 mod output;
+mod picture;
 mod relief;
 mod steps;
 mod table;
@@ -35,6 +36,7 @@ pub use grid::{BandLevels, GridFigure, GridLayer, GridPanel, GridPosition, GridS
 pub use map::{MapFigure, MapPosition};
 pub use nce::{NceFigure, NcePanel};
 pub use notes::FigureNotes;
+pub use picture::encode_grey_png;
 pub use relief::{ReliefFigure, ReliefPanel};
 pub use steps::{ResponseTrace, StepsFigure, StepsRow};
 pub use table::{FigureTable, TableRow};

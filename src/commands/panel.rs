@@ -9,6 +9,7 @@ use anyhow::{Context as _, bail};
 use clap::Args;
 use echolake_acquisition::panel::mesh::{BACK_MM, Format, Mesh};
 use echolake_acquisition::panel::relief::{HeightField, PanelRelief};
+use echolake_figures::encode_grey_png;
 
 use crate::CommandOutcome;
 
@@ -121,7 +122,10 @@ impl OutputKind {
 
     fn bytes(self, relief: &PanelRelief) -> anyhow::Result<Vec<u8>> {
         Ok(match self {
-            Self::Picture => relief.height_field(PICTURE_CELLS).to_png(),
+            Self::Picture => {
+                let pixels = relief.height_field(PICTURE_CELLS).to_pixels();
+                encode_grey_png(&pixels, pixels.len().isqrt())?
+            }
             Self::Heights => relief.height_field(FIELD_CELLS).to_npy(),
             Self::Parameters => serde_json::to_vec_pretty(&relief.to_json())?,
             Self::Mesh(_) => bail!("a mesh is of a whole panel"),

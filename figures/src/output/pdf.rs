@@ -1,6 +1,9 @@
 //! A drawing as PDF: one page, with the font inside, so that its texts can be searched and copied.
 
-use miniz_oxide::deflate::compress_to_vec_zlib;
+use std::io::{self, Write as _};
+
+use flate2::Compression;
+use flate2::write::ZlibEncoder;
 use pdf_writer::types::{CidFontType, FontFlags, LineJoinStyle, SystemInfo, UnicodeCmap};
 use pdf_writer::{Content, Filter, Finish as _, Name, Pdf, Rect, Ref, Str, TextStr};
 
@@ -10,7 +13,6 @@ use crate::font::{FONT, advance, face, glyphs};
 
 /// Points (1/72 inch) per px.
 const POINTS: f32 = 0.75;
-const COMPRESSION: u8 = 6;
 const FONT_NAME: Name<'static> = Name(b"F");
 const BASE_FONT: Name<'static> = Name(b"EFGRSB+EcholakeFigures");
 const CMAP_NAME: Name<'static> = Name(b"EcholakeFigures");
@@ -34,7 +36,10 @@ const FIRST_PICTURE: i32 = 200;
 
 impl FigureDrawing {
     /// Returns the drawing as a PDF file; its notes are in the document's information.
-    pub fn to_pdf(&self) -> Vec<u8> {
+    ///
+    /// # Errors
+    /// Its parts cannot be compressed.
+    pub fn to_pdf(&self) -> io::Result<Vec<u8>> {
         let mut page = PdfPage { content: Content::new(), pictures: Vec::new(), opacities: Vec::new() };
         page.content.transform([POINTS, 0.0, 0.0, -POINTS, 0.0, self.height_px * POINTS]);
         self.shapes.iter().for_each(|shape| page.draw(shape));
@@ -63,21 +68,27 @@ impl FigureDrawing {
             pdf.ext_graphics(state_ref(opacity)).non_stroking_alpha(f32::from(opacity) / f32::from(OPACITIES));
         }
         for (place, (pixels, columns)) in pictures.iter().enumerate() {
-            let packed = compress_to_vec_zlib(pixels, COMPRESSION);
+            let packed = compress(pixels)?;
             let mut image = pdf.image_xobject(picture_ref(place), &packed);
             image.filter(Filter::FlateDecode);
             image.width(*columns as i32).height((pixels.len() / columns) as i32).bits_per_component(8);
             image.color_space().device_gray();
         }
-        pdf.stream(CONTENTS, &compress_to_vec_zlib(&content.finish(), COMPRESSION)).filter(Filter::FlateDecode);
-        write_font(&mut pdf);
+        pdf.stream(CONTENTS, &compress(&content.finish())?).filter(Filter::FlateDecode);
+        write_font(&mut pdf)?;
         let notes = &self.notes;
         let mut info = pdf.document_info(INFO);
         info.title(TextStr(&notes.title)).subject(TextStr(&notes.query)).keywords(TextStr(&notes.to_json()));
         info.creator(TextStr(&notes.command)).producer(TextStr(&notes.program));
         info.finish();
-        pdf.finish()
+        Ok(pdf.finish())
     }
+}
+
+fn compress(bytes: &[u8]) -> io::Result<Vec<u8>> {
+    let mut encoder = ZlibEncoder::new(Vec::new(), Compression::default());
+    encoder.write_all(bytes)?;
+    encoder.finish()
 }
 
 fn state_name(opacity: u8) -> Vec<u8> {
@@ -166,9 +177,10 @@ impl<'a> PdfPage<'a> {
                 let offset = text_offset(text, *size_px, *anchor);
                 let codes: Vec<u8> = glyphs(text).flat_map(|glyph| glyph.0.to_be_bytes()).collect();
                 // y is downwards on the page, so letters are turned over again.
-                let matrix = match upwards {
-                    false => [1.0, 0.0, 0.0, -1.0, at[0] + offset, at[1]],
-                    true => [0.0, -1.0, -1.0, 0.0, at[0], at[1] - offset],
+                let matrix = if *upwards {
+                    [0.0, -1.0, -1.0, 0.0, at[0], at[1] - offset]
+                } else {
+                    [1.0, 0.0, 0.0, -1.0, at[0] + offset, at[1]]
                 };
                 content.begin_text().set_font(FONT_NAME, *size_px).set_text_matrix(matrix).show(Str(&codes)).end_text();
             }
@@ -181,8 +193,8 @@ impl<'a> PdfPage<'a> {
     }
 }
 
-fn write_font(pdf: &mut Pdf) {
-    let Some(face) = face() else { return };
+fn write_font(pdf: &mut Pdf) -> io::Result<()> {
+    let Some(face) = face() else { return Ok(()) };
     let mut font = pdf.type0_font(FONT_REF);
     font.base_font(BASE_FONT).encoding_predefined(Name(b"Identity-H")).descendant_font(CID_FONT).to_unicode(TO_UNICODE);
     font.finish();
@@ -202,7 +214,7 @@ fn write_font(pdf: &mut Pdf) {
     descriptor.ascent(f32::from(face.ascender()) * milli).descent(f32::from(face.descender()) * milli);
     descriptor.cap_height(f32::from(face.capital_height().unwrap_or(0)) * milli);
     descriptor.finish();
-    let packed = compress_to_vec_zlib(FONT, COMPRESSION);
+    let packed = compress(FONT)?;
     let mut file = pdf.stream(FONT_FILE, &packed);
     file.filter(Filter::FlateDecode).pair(Name(b"Length1"), FONT.len() as i32);
     file.finish();
@@ -214,4 +226,5 @@ fn write_font(pdf: &mut Pdf) {
         }
     }
     pdf.cmap(TO_UNICODE, &cmap.finish());
+    Ok(())
 }

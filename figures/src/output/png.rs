@@ -1,12 +1,15 @@
 //! A drawing as PNG, at twice its size unless that is very large.
 
-use echolake_dsp::png;
+use std::io;
+
+use png::ColorType;
 use ttf_parser::OutlineBuilder;
 use zeno::{Cap, Command, Join, Mask, Stroke, Style, Transform, Vector};
 
 use super::{ellipse_curves, text_offset};
 use crate::drawing::{DrawnShape, FigureColour, FigureDrawing, ShapeGeometry, StrokeStyle};
 use crate::font::{advance, face, glyphs, outline, text_width};
+use crate::picture::encode_png;
 
 /// Pixels per px of a drawing: 192 dots per inch.
 const SCALE: f32 = 2.0;
@@ -19,7 +22,10 @@ const MOST_STROKE_PX: f32 = 4.0;
 
 impl FigureDrawing {
     /// Returns the drawing as a PNG file; its notes are texts of the file.
-    pub fn to_png(&self) -> Vec<u8> {
+    ///
+    /// # Errors
+    /// The drawing has no area, or is larger than such a file can be.
+    pub fn to_png(&self) -> io::Result<Vec<u8>> {
         let is_large = self.width_px * self.height_px * SCALE * SCALE > MOST_PIXELS;
         let scale = if is_large { 1.0 } else { SCALE };
         let [width, height] = [self.width_px, self.height_px].map(|length| (length * scale).ceil().max(1.0) as usize);
@@ -34,7 +40,7 @@ impl FigureDrawing {
             shown.for_each(|(shape, _)| canvas.draw(shape));
             canvas.pixels.iter().map(|part| part.round() as u8).collect::<Vec<u8>>()
         });
-        png::coloured(strips, [width, height], &self.notes.named())
+        encode_png(strips, [width, height], ColorType::Rgb, &self.notes.named())
     }
 }
 
@@ -173,9 +179,10 @@ fn path_of(geometry: &ShapeGeometry) -> (Vec<Command>, Transform) {
                 pen.x += advance(glyph) * size_px;
             }
             path = pen.path;
-            placed = match upwards {
-                true => Transform::new(0.0, -1.0, 1.0, 0.0, at[0], at[1]),
-                false => Transform::translation(at[0], at[1]),
+            placed = if *upwards {
+                Transform::new(0.0, -1.0, 1.0, 0.0, at[0], at[1])
+            } else {
+                Transform::translation(at[0], at[1])
             };
         }
         ShapeGeometry::Picture { .. } => {}
@@ -231,25 +238,9 @@ impl OutlineBuilder for GlyphPen {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::drawing::TextAnchor;
-    use crate::drawing::{filled_rect, label};
+    use crate::drawing::{TextAnchor, filled_rect, label};
     use crate::notes::FigureNotes;
-
-    fn size(png: &[u8]) -> [u32; 2] {
-        [16, 20].map(|at| u32::from_be_bytes(png[at..at + 4].try_into().expect("four bytes")))
-    }
-
-    fn pixels(png: &[u8], width: usize) -> Vec<u8> {
-        let at = png.windows(4).position(|w| w == b"IDAT").expect("data");
-        let rows = miniz_oxide::inflate::decompress_to_vec_zlib(&png[at + 4..png.len() - 16]).expect("zlib");
-        let mut above = vec![0u8; 3 * width];
-        let mut pixels = Vec::new();
-        for row in rows.chunks_exact(1 + 3 * width) {
-            above.iter_mut().zip(&row[1..]).for_each(|(above, now)| *above = above.wrapping_add(*now));
-            pixels.extend_from_slice(&above);
-        }
-        pixels
-    }
+    use crate::picture::tests::decode_png;
 
     // Three strips: what is across their limits is whole.
     #[test]
@@ -260,9 +251,8 @@ mod tests {
         for row in 0..100 {
             tall.add(label([40.0, 15.0 * row as f32], "M", TextAnchor::Start));
         }
-        let png = tall.to_png();
-        assert_eq!(size(&png), [3000, 3000]);
-        let pixels = pixels(&png, 3000);
+        let (size, pixels) = decode_png(&tall.to_png().expect("a file"));
+        assert_eq!(size, [3000, 3000]);
         let at = |x: usize, y: usize| &pixels[3 * (3000 * y + x)..][..3];
         assert!((20..2980).all(|y| at(40, y) == accent.rgb()), "the bar");
         assert_eq!((at(40, 19), at(40, 2980), at(2000, 1500)), (&[255; 3][..], &[255; 3][..], &[255; 3][..]));
@@ -277,6 +267,7 @@ mod tests {
 
     #[test]
     fn large_drawings_have_a_pixel_per_px() {
-        assert_eq!(size(&FigureDrawing::new(10.0, 3e6, &FigureNotes::default()).to_png()), [10, 3_000_000]);
+        let file = FigureDrawing::new(10.0, 3e6, &FigureNotes::default()).to_png().expect("a file");
+        assert_eq!(decode_png(&file).0, [10, 3_000_000]);
     }
 }

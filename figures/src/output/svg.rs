@@ -4,9 +4,9 @@ use std::fmt::{self, Write as _};
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
-use echolake_dsp::png;
 
 use crate::drawing::{DrawnShape, FigureColour, FigureDrawing, ShapeGeometry, StrokeStyle, TEXT_PX, TextAnchor};
+use crate::picture::encode_grey_png;
 
 const FONTS: &str = "IBM Plex Sans,Helvetica Neue,Arial,sans-serif";
 
@@ -16,8 +16,9 @@ impl FigureDrawing {
         let (width, height) = (Number(self.width_px), Number(self.height_px));
         let notes = &self.notes;
         let mut svg = format!(
-            "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{width}\" height=\"{height}\" viewBox=\"0 0 {width} {height}\" \
-             font-family=\"{FONTS}\" font-size=\"{}\" role=\"img\">\n<title>{}</title>\n<metadata>{}</metadata>\n",
+            "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{width}\" height=\"{height}\" viewBox=\"0 0 {width} \
+             {height}\" font-family=\"{FONTS}\" font-size=\"{}\" \
+             role=\"img\">\n<title>{}</title>\n<metadata>{}</metadata>\n",
             Number(TEXT_PX),
             Escaped(&notes.title),
             Escaped(&notes.to_json()),
@@ -127,9 +128,10 @@ impl fmt::Display for Element<'_> {
             }
             ShapeGeometry::Text { at: [x, y], text, size_px, anchor, upwards } => {
                 let [x, y] = [x, y].map(|v| Number(*v));
-                match upwards {
-                    true => write!(f, "<text transform=\"translate({x} {y}) rotate(-90)\"")?,
-                    false => write!(f, "<text x=\"{x}\" y=\"{y}\"")?,
+                if *upwards {
+                    write!(f, "<text transform=\"translate({x} {y}) rotate(-90)\"")?;
+                } else {
+                    write!(f, "<text x=\"{x}\" y=\"{y}\"")?;
                 }
                 match anchor {
                     TextAnchor::Start => {}
@@ -143,7 +145,9 @@ impl fmt::Display for Element<'_> {
             }
             ShapeGeometry::Picture { x, y, side, pixels, columns } => {
                 let [x, y, side] = [x, y, side].map(|v| Number(*v));
-                let data = STANDARD.encode(png::grey(pixels, *columns));
+                // A picture without pixels is no file, and shows nothing.
+                let Ok(file) = encode_grey_png(pixels, *columns) else { return Ok(()) };
+                let data = STANDARD.encode(file);
                 let place = format!("x=\"{x}\" y=\"{y}\" width=\"{side}\" height=\"{side}\"");
                 return write!(f, "<image {place} href=\"data:image/png;base64,{data}\"/>");
             }

@@ -52,8 +52,8 @@ impl OutputArgs {
         for path in self.paths(surfaces)? {
             match extension(&path) {
                 "svg" => write_file(&path, drawing.to_svg().as_bytes())?,
-                "pdf" => write_file(&path, &drawing.to_pdf())?,
-                "png" => write_file(&path, &drawing.to_png())?,
+                "pdf" => write_file(&path, &drawing.to_pdf()?)?,
+                "png" => write_file(&path, &drawing.to_png()?)?,
                 _ => bail!("`{}` has another extension; hint: svg, pdf or png", path.display()),
             }
         }

@@ -1,7 +1,8 @@
 //! A surface's relief: heights, a picture, and the mesh of its run's file.
 
 use axum::Extension;
-use echolake_dsp::{heights, png};
+use echolake_dsp::heights;
+use echolake_figures::encode_grey_png;
 use serde::Deserialize;
 
 use super::super::extract::{BinaryContent, PathParams};
@@ -67,7 +68,8 @@ pub(super) async fn thumbnail(
     let row = read(&request, &path).await?;
     let pixels = heights::shaded(&row.heights_mm, row.size_mm / row.cells as f32)
         .map_err(RequestFault::defect("a height map makes no picture"))?;
-    Ok(AnswerContent::new("image/png", png::grey(&pixels, row.cells)))
+    let file = encode_grey_png(&pixels, row.cells).map_err(RequestFault::defect("a height map makes no picture"))?;
+    Ok(AnswerContent::new("image/png", file))
 }
 
 /// The panel's mesh as the run file holds it.

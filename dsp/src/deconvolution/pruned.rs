@@ -5,7 +5,7 @@ use std::sync::Arc;
 use realfft::num_complex::Complex;
 use rustfft::{Fft, FftDirection};
 
-use crate::complex_vector::ComplexVector;
+use super::complex_vector::ComplexVector;
 use crate::{RealSample, VECTOR_LANES};
 
 /// Room behind each strand: rows of whole KiB would all fall into the same few lines of the cache.

@@ -1,5 +1,11 @@
 //! Division of the recording by the loopback in the Fourier domain, within the sweep's range.
 
+mod aligned;
+mod complex_vector;
+mod joint;
+mod pruned;
+pub mod response_deconvolution;
+
 use std::f64::consts::FRAC_PI_2;
 use std::ops::{Range, RangeInclusive};
 use std::sync::Arc;
@@ -8,11 +14,11 @@ pub use echolake_schema::SpectralDivision;
 use realfft::num_complex::Complex;
 use rustfft::{Fft, FftDirection};
 
-use crate::aligned::AlignedBuffer;
-use crate::complex_vector::ComplexVector;
+use self::aligned::AlignedBuffer;
+use self::complex_vector::ComplexVector;
+use self::joint::{BinPower, SignalLevels};
+use self::pruned::PrunedInverse;
 use crate::error::check_len;
-use crate::joint::{BinPower, SignalLevels};
-use crate::pruned::PrunedInverse;
 use crate::{Error, RealSample, SampleVector as _, VECTOR_LANES};
 
 /// Settings of a deconvolution.

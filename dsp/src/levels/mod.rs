@@ -1,0 +1,14 @@
+//! Energies and levels: of bands, along time, over frequency, of several measurements.
+
+pub mod decay;
+pub mod diffusion;
+pub mod energy;
+pub mod envelope;
+pub mod filter_bank;
+pub mod frequency_response;
+pub mod level;
+pub mod mean;
+pub mod rise;
+pub mod spectrogram;
+pub mod spectrum;
+pub mod uncertainty;

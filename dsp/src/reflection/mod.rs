@@ -1,0 +1,9 @@
+//! What travels from a speaker to a microphone: direct sound, reflections at a relief and at Foam.
+
+pub mod air;
+pub mod arrival;
+pub mod foam;
+pub mod foam_reflection;
+pub mod fresnel;
+pub mod geometry;
+pub mod kirchhoff;

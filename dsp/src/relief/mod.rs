@@ -1,0 +1,4 @@
+//! Heights of reliefs.
+
+pub mod height_field;
+pub mod heights;
