@@ -6,10 +6,10 @@ use std::path::{Path, PathBuf};
 use echolake_acquisition::import::import_wav;
 use echolake_acquisition::panel::mesh::{Format, Mesh};
 use echolake_acquisition::panel::relief::HeightField;
+use hdf5_pure::{AttrValue, FileBuilder};
 use hound::{SampleFormat, WavSpec, WavWriter};
 use ndarray::Array2;
 use ndarray_npy::NpzWriter;
-use rust_hdf5::{H5File, VarLenUnicode};
 
 use crate::{ImportFolder, LENGTH, POINTS_MM, WAV_MANIFEST, gir_surface, three_points};
 
@@ -115,35 +115,34 @@ fn gir_heights() -> Vec<u8> {
     bytes.into_inner()
 }
 
-fn write_variable(file: &H5File, name: &str, shape: &[usize], value: &[f64], attributes: &[(&str, &str)]) {
-    let dataset = file.new_dataset::<f64>().shape(shape).create(name).expect("a variable");
-    dataset.write_raw(value).expect("written");
+fn write_variable(file: &mut FileBuilder, name: &str, shape: &[u64], value: &[f64], attributes: &[(&str, &str)]) {
+    let dataset = file.create_dataset(name).with_f64_data(value).with_shape(shape);
     for (key, value) in attributes {
-        let attribute = dataset.new_attr::<VarLenUnicode>().shape(()).create(key).expect("an attribute");
-        attribute.write_string(value).expect("written");
+        dataset.set_attr(key, AttrValue::VarLenString((*value).to_owned()));
     }
 }
 
 fn write_sofa(path: &Path, convention: &str, data_type: &str) {
-    let file = H5File::create(path).expect("a file");
+    const BINS: u64 = LENGTH as u64 / 2 + 1;
+    let mut file = FileBuilder::new();
     let texts =
         [("Conventions", "SOFA"), ("SOFAConventions", convention), ("DataType", data_type), ("APIName", "seeds")];
     for (name, value) in texts {
-        file.set_attr_string(name, value).expect("written");
+        file.set_attr(name, AttrValue::VarLenString(value.to_owned()));
     }
-    let put = |name: &str, shape: &[usize], attributes: &[(&str, &str)], value: &dyn Fn(usize) -> f64| {
-        let values: Vec<f64> = (0..shape.iter().product()).map(value).collect();
-        write_variable(&file, name, shape, &values, attributes);
+    let mut put = |name: &str, shape: &[u64], attributes: &[(&str, &str)], value: &dyn Fn(usize) -> f64| {
+        let values: Vec<f64> = (0..shape.iter().product::<u64>() as usize).map(value).collect();
+        write_variable(&mut file, name, shape, &values, attributes);
     };
     let metres: &[(&str, &str)] = &[("Type", "cartesian"), ("Units", "metre")];
     match data_type {
         "TF" => {
-            put("N", &[LENGTH / 2 + 1], &[("Units", "hertz")], &|k| 96e3 * k as f64 / LENGTH as f64);
-            put("Data.Real", &[1, 1, LENGTH / 2 + 1], &[], &|_| 1.0);
-            put("Data.Imag", &[1, 1, LENGTH / 2 + 1], &[], &|_| 0.0);
+            put("N", &[BINS], &[("Units", "hertz")], &|k| 96e3 * k as f64 / LENGTH as f64);
+            put("Data.Real", &[1, 1, BINS], &[], &|_| 1.0);
+            put("Data.Imag", &[1, 1, BINS], &[], &|_| 0.0);
         }
-        "FIR-E" => put("Data.IR", &[1, 1, LENGTH, 1], &[], &|n| n as f64 / 1e3),
-        _ => put("Data.IR", &[1, 1, LENGTH], &[], &|n| n as f64 / 1e3),
+        "FIR-E" => put("Data.IR", &[1, 1, LENGTH as u64, 1], &[], &|n| n as f64 / 1e3),
+        _ => put("Data.IR", &[1, 1, LENGTH as u64], &[], &|n| n as f64 / 1e3),
     }
     put("Data.SamplingRate", &[1], &[("Units", "hertz")], &|_| 96e3);
     put("Data.Delay", &[1, 1], &[], &|_| 0.0);
@@ -155,17 +154,15 @@ fn write_sofa(path: &Path, convention: &str, data_type: &str) {
     put("EmitterPosition", &[1, 3, 1], &[("Type", "spherical"), ("Units", "degree, degree, metre")], &|_| 0.0);
     put("RoomTemperature", &[1], &[("Units", "kelvin")], &|_| 293.15);
     put("MeasurementDate", &[1], &[], &|_| 1.7e9);
-    file.close().expect("closed");
+    file.write(path).expect("written");
 }
 
 fn write_set(path: &Path) {
-    let file = H5File::create(path).expect("a file");
-    let responses =
-        file.new_dataset::<f32>().shape([1, 2, LENGTH]).chunk(&[1, 1, 100]).create("ir").expect("a dataset");
-    responses.write_slice(&[0, 0, 0], &[1, 2, LENGTH], &vec![0.25f32; 2 * LENGTH]).expect("written");
-    responses.new_attr::<f64>().shape(()).create("fs").expect("an attribute").write_numeric(&96e3f64).expect("written");
+    let mut file = FileBuilder::new();
+    let responses = file.create_dataset("ir").with_f32_data(&[0.25; 2 * LENGTH]).with_shape(&[1, 2, LENGTH as u64]);
+    responses.with_chunks(&[1, 1, 100]).set_attr("fs", AttrValue::F64(96e3));
     let metres: Vec<f64> = POINTS_MM[..2].concat().iter().map(|mm| mm / 1e3).collect();
-    write_variable(&file, "microphones", &[2, 3], &metres, &[]);
-    write_variable(&file, "speakers", &[3, 1], &POINTS_MM[2], &[]);
-    file.close().expect("closed");
+    write_variable(&mut file, "microphones", &[2, 3], &metres, &[]);
+    write_variable(&mut file, "speakers", &[3, 1], &POINTS_MM[2], &[]);
+    file.write(path).expect("written");
 }

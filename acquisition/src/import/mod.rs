@@ -75,7 +75,10 @@ pub enum Error {
         source: ErrorCause,
     },
     /// The manifest has a wrong header.
-    #[error("manifest `{}`: {what}; hint: the columns are {}", path.display(), echolake_schema::interchange::WAV_MANIFEST.join(", "))]
+    #[error(
+        "manifest `{}`: {what}; hint: the columns are {}",
+        path.display(), echolake_schema::interchange::WAV_MANIFEST.join(", ")
+    )]
     Header {
         /// The manifest.
         path: PathBuf,

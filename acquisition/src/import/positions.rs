@@ -43,9 +43,10 @@ impl CoordinateFrame {
         let names = units.to_lowercase();
         let names: Vec<&str> =
             names.split(|c: char| c == ',' || c == ';' || c.is_whitespace()).filter(|name| !name.is_empty()).collect();
-        let expected = match is_spherical {
-            false => "metre, centimetre or millimetre, of all coordinates or of each of the three",
-            true => "degree or radian, the same again, and metre, centimetre or millimetre",
+        let expected = if is_spherical {
+            "degree or radian, the same again, and metre, centimetre or millimetre"
+        } else {
+            "metre, centimetre or millimetre, of all coordinates or of each of the three"
         };
         let fault = || FrameFault { actual: format!("units `{units}`"), expected };
         let names = match (names.as_slice(), is_spherical) {

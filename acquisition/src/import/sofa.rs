@@ -310,10 +310,7 @@ impl SofaReader<'_> {
     }
 
     fn expect_any(&self, name: &str, found: &Hdf5Variable) -> Result<(), Error> {
-        match found.values.is_empty() {
-            false => Ok(()),
-            true => Err(wrong(self.path, name, "no measurement", "one at least")),
-        }
+        if found.values.is_empty() { Err(wrong(self.path, name, "no measurement", "one at least")) } else { Ok(()) }
     }
 
     fn expect_finite(&self, name: &str, found: &Hdf5Variable) -> Result<(), Error> {
@@ -376,9 +373,12 @@ impl SofaReader<'_> {
         };
         let rows = self.rows(name, &found, count, 1)?;
         let checked: Result<Vec<_>, _> = rows.into_iter().map(|row| Celsius::new(to_nano(row[0] - zero))).collect();
-        checked.map_err(|e| match found.values.iter().all(|x| *x == 0.0) {
-            true => refused("0 kelvin, with which tools fill what nobody measured".into(), "a temperature"),
-            false => refused(e.to_string(), "a temperature"),
+        checked.map_err(|e| {
+            if found.values.iter().all(|x| *x == 0.0) {
+                refused("0 kelvin, with which tools fill what nobody measured".into(), "a temperature")
+            } else {
+                refused(e.to_string(), "a temperature")
+            }
         })
     }
 
@@ -432,10 +432,7 @@ impl SofaReader<'_> {
         let name = format!("{object}Position");
         let origins = self.positions(&name, count)?;
         let offsets = self.offsets(&format!("{element}Position"), elements, count)?;
-        let turns = match offsets.is_zero() {
-            true => None,
-            false => Some(self.axes(object, count)?),
-        };
+        let turns = if offsets.is_zero() { None } else { Some(self.axes(object, count)?) };
         let mut points = Vec::with_capacity(count);
         for (row, origin) in origins.iter().enumerate() {
             let of_element = |(number, offset): (usize, &[f64; 3])| {

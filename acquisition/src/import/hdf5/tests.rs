@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use echolake_schema::messages::ImpulseResponse;
 use echolake_schema::{Timestamp, topics};
+use hdf5_pure::FileBuilder;
 use prost::Message as _;
 
 use super::*;
@@ -24,10 +25,9 @@ struct Hdf5Folder(tempfile::TempDir);
 
 impl Hdf5Folder {
     /// A file with responses of these dimensions; the rest of the mapping can be changed.
-    fn new(dimensions: &[&str], chunk: Option<&[usize]>) -> Self {
+    fn new(dimensions: &[&str], chunk: Option<&[u64]>) -> Self {
         let place = Self(tempfile::tempdir().expect("a folder"));
         std::fs::create_dir(place.inbox()).expect("a folder");
-        let file = rust_hdf5::H5File::create(place.0.path().join("set.h5")).expect("a file");
         let sizes = [("microphone", 2), ("speaker", 2), ("sample", LENGTH), ("measurement", 2)];
         let size = |name: &str| sizes.iter().find(|(of, _)| *of == name).expect("a dimension").1;
         let shape: Vec<usize> = dimensions.iter().map(|d| size(d)).collect();
@@ -36,17 +36,15 @@ impl Hdf5Folder {
             value(index("measurement"), index("microphone"), index("speaker"), index("sample"))
         };
         let numbers: Vec<f64> = (0..shape.iter().product()).map(|i| number(super::place(i, &shape))).collect();
-        let group = file.create_group("data").expect("a group");
-        let responses = group.new_dataset::<f64>().shape(&shape);
-        let responses = if let Some(chunk) = chunk { responses.chunk(chunk) } else { responses };
-        responses
-            .create("responses")
-            .expect("a dataset")
-            .write_slice(&vec![0; shape.len()], &shape, &numbers)
-            .expect("written");
-        let put = |name: &str, shape: &[usize], numbers: &[f64]| {
-            let dataset = group.new_dataset::<f64>().shape(shape).create(name).expect("a dataset");
-            dataset.write_raw(numbers).expect("written");
+        let mut file = FileBuilder::new();
+        let mut group = file.create_group("data");
+        let stored_shape: Vec<u64> = shape.iter().map(|n| *n as u64).collect();
+        let responses = group.create_dataset("responses").with_f64_data(&numbers).with_shape(&stored_shape);
+        if let Some(chunk) = chunk {
+            responses.with_chunks(chunk);
+        }
+        let mut put = |name: &str, shape: &[u64], numbers: &[f64]| {
+            group.create_dataset(name).with_f64_data(numbers).with_shape(shape);
         };
         put("microphones", &[2, 3], &POINTS_MM[..2].concat().iter().map(|mm| mm / 1e3).collect::<Vec<_>>());
         // The speakers' coordinates are rows.
@@ -54,9 +52,13 @@ impl Hdf5Folder {
         put("speakers", &[3, 2], &rows);
         put("rate", &[1], &[96e3]);
         put("kelvin", &[2], &[294.15, 295.15]);
-        drop(group);
-        file.close().expect("closed");
+        file.add_group(group.finish());
+        file.write(place.file()).expect("written");
         place
+    }
+
+    fn file(&self) -> PathBuf {
+        self.0.path().join("set.h5")
     }
 
     fn inbox(&self) -> PathBuf {
@@ -95,7 +97,7 @@ fn irs(run: &ImportedRun) -> Vec<ImpulseResponse> {
 
 #[test]
 fn every_order_of_dimensions_is_the_same_set() {
-    let orders: [(&[&str], Option<&[usize]>); 5] = [
+    let orders: [(&[&str], Option<&[u64]>); 5] = [
         (&["microphone", "speaker", "sample"], None),
         (&["speaker", "microphone", "sample"], Some(&[1, 2, 100])),
         (&["sample", "speaker", "microphone"], Some(&[64, 2, 1])),
@@ -166,12 +168,11 @@ fn what_is_wrong_is_named_and_nothing_is_left() {
 fn a_sample_that_is_no_number_leaves_nothing() {
     let dimensions = ["speaker", "microphone", "sample"];
     let place = Hdf5Folder::new(&dimensions, None);
-    let path = place.0.path().join("set.h5");
-    let file = rust_hdf5::H5File::open_rw(&path).expect("the file");
-    let responses = file.dataset_writer("data/responses").expect("the dataset");
-    responses.write_slice(&[1, 0, 7], &[1, 1, 1], &[f64::INFINITY]).expect("written");
-    drop(responses);
-    file.close().expect("closed");
+    let mut bytes = std::fs::read(place.file()).expect("the file");
+    let sample = value(0, 0, 1, 7).to_le_bytes();
+    let at = bytes.windows(8).position(|eight| eight == sample).expect("the only such number");
+    bytes[at..at + 8].copy_from_slice(&f64::INFINITY.to_le_bytes());
+    std::fs::write(place.file(), bytes).expect("written");
     let error = place.import(&place.mapping(&dimensions, ("", "")), None).expect_err("infinite").to_string();
     assert!(error.contains("data/responses[1, 0, 7]: inf, expected a finite f32"), "{error}");
     assert_eq!(std::fs::read_dir(place.inbox()).expect("a folder").count(), 0);

@@ -2,8 +2,8 @@
 
 use echolake_schema::messages::ImpulseResponse;
 use echolake_schema::topics;
+use hdf5_pure::{AttrValue, FileBuilder};
 use prost::Message as _;
-use rust_hdf5::VarLenUnicode;
 
 use super::*;
 
@@ -81,19 +81,18 @@ impl SofaContent {
     }
 
     fn write(&self, path: &Path) {
-        let file = rust_hdf5::H5File::create(path).expect("a file");
+        let mut file = FileBuilder::new();
         for (name, value) in &self.texts {
-            file.set_attr_string(name, value).expect("written");
+            file.set_attr(name, AttrValue::VarLenString(value.clone()));
         }
         for (name, shape, values, attributes) in &self.variables {
-            let dataset = file.new_dataset::<f64>().shape(shape).create(name).expect("a variable");
-            dataset.write_raw(values).expect("written");
+            let shape: Vec<u64> = shape.iter().map(|n| *n as u64).collect();
+            let dataset = file.create_dataset(name).with_f64_data(values).with_shape(&shape);
             for (key, value) in attributes {
-                let attribute = dataset.new_attr::<VarLenUnicode>().shape(()).create(key).expect("an attribute");
-                attribute.write_string(value).expect("written");
+                dataset.set_attr(key, AttrValue::VarLenString((*value).to_owned()));
             }
         }
-        file.close().expect("closed");
+        file.write(path).expect("written");
     }
 }
 
