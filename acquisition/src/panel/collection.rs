@@ -1,5 +1,5 @@
-//! A simulated collection of panels of any size: the references, then both sides of panel after panel. Those that have a
-//! name of the paper's are the paper's.
+//! A simulated collection of panels of any size: the references, then both sides of panel after panel. Those that have
+//! a name of the paper's are the paper's.
 
 use echolake_schema::{Error, SurfaceId};
 
@@ -37,7 +37,7 @@ impl CollectionSurface {
     // A panel of the paper if it has the name of one.
     fn new(name: &str, relief: PanelRelief) -> Result<Self, Error> {
         let paper = PaperPanel::by_name(name);
-        let relief = paper.and_then(|panel| panel.to_relief().ok()).unwrap_or(relief);
+        let relief = paper.and_then(|panel| PanelRelief::from_paper(&panel).ok()).unwrap_or(relief);
         let macro_reference = paper.and_then(|panel| panel.macro_reference).map(str::parse).transpose()?;
         Ok(Self { surface: name.parse()?, relief, macro_reference })
     }

@@ -4,8 +4,6 @@
 //! The paper prints bonds, joints and stones of its walls, and which of them share a large shape, but not the shapes'
 //! dimensions. What it does not print is an assumption here, and named as one.
 
-use super::relief::{Error, PanelRelief};
-
 /// A panel of the paper.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PaperPanel {
@@ -27,14 +25,14 @@ pub struct PaperPanel {
 const SHAPE: [(&str, &str); 3] =
     [("macrostructure", "wavy_xy"), ("macro_depth_mm", "120"), ("macro_wavelength_mm", "2500")];
 const SHAPE_ASSUMED: &str = "the large shape, waves 120 mm high and 2500 mm long in both directions";
-const BRICKS_ASSUMED: &str = "bricks 215 x 65 mm as those of 0013_1, none standing out; the large shape of 0015_1, waves \
-    120 mm high and 2500 mm long in both directions";
+const BRICKS_ASSUMED: &str = "bricks 215 x 65 mm as those of 0013_1, none standing out; the large shape of 0015_1, \
+    waves 120 mm high and 2500 mm long in both directions";
 
 impl PaperPanel {
     /// All that the paper describes, by name.
     pub const ALL: [Self; 8] = [
-        // Section "Stone vs. brick walls". Nine stones a square metre are 292 mm apart when they are 1.3 times as long as
-        // high.
+        // Section "Stone vs. brick walls". Nine stones a square metre are 292 mm apart when they are 1.3 times as long
+        // as high.
         Self {
             name: "0005_1",
             relief: "polygonal_rubble",
@@ -50,10 +48,10 @@ impl PaperPanel {
                 ("roughness_mm", "60"),
             ],
             macro_reference: Some("0015_1"),
-            printed: "polygonal rubble, nine stones a square metre, joints 20 to 30 mm wide and 50 to 80 mm deep, roughness \
-                +-30 mm, the large shape of 0015_1",
-            assumed: "the stones' shape, projection and grain; the large shape, waves 120 mm high and 2500 mm long in both \
-                directions",
+            printed: "polygonal rubble, nine stones a square metre, joints 20 to 30 mm wide and 50 to 80 mm deep, \
+                roughness +-30 mm, the large shape of 0015_1",
+            assumed: "the stones' shape, projection and grain; the large shape, waves 120 mm high and 2500 mm long in \
+                both directions",
         },
         // Section "Brick wall joints", table "Mortar on brick walls".
         Self {
@@ -110,9 +108,10 @@ impl PaperPanel {
                 ("joint_depth_jitter_mm", "1"),
             ],
             macro_reference: Some("0015_1"),
-            printed: "stretcher bond, bricks 215 x 65 x 102.5 mm, raked joints 15 +- 1 mm wide and 10 +- 1 mm deep, the \
-                large shape of 0015_1",
-            assumed: "bricks that do not stand out; the large shape, waves 120 mm high and 2500 mm long in both directions",
+            printed: "stretcher bond, bricks 215 x 65 x 102.5 mm, raked joints 15 +- 1 mm wide and 10 +- 1 mm deep, \
+                the large shape of 0015_1",
+            assumed: "bricks that do not stand out; the large shape, waves 120 mm high and 2500 mm long in both \
+                directions",
         },
         // Section "Macrostructure"; 0015_0 is one of the reference panels.
         Self {
@@ -146,7 +145,8 @@ impl PaperPanel {
             printed: "a large shape without stones and joints, whose concave parts focus",
             assumed: "the shape, waves 200 mm high and 2500 mm long in both directions around a trough",
         },
-        // Table 2 alone, which prints energies: 47 and 35 % more than Flat in the lower two bands, half in the upper two.
+        // Table 2 alone, which prints energies: 47 and 35 % more than Flat in the lower two bands, half in the upper
+        // two.
         Self {
             name: "0072_0",
             relief: "flemish_bond",
@@ -170,28 +170,18 @@ impl PaperPanel {
     pub fn by_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|panel| panel.name == name)
     }
-
-    /// Makes its relief.
-    ///
-    /// # Errors
-    /// None for those of [`PaperPanel::ALL`].
-    pub fn to_relief(&self) -> Result<PanelRelief, Error> {
-        let mut relief = PanelRelief::by_name(self.relief)?;
-        self.settings.iter().try_for_each(|(key, value)| relief.set(key, value))?;
-        relief.check_depth()?;
-        Ok(relief)
-    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::panel::relief::PanelRelief;
 
     #[test]
     fn every_panel_of_the_paper_is_made_by_its_name() {
         for panel in PaperPanel::ALL {
             let relief = PanelRelief::by_name(panel.name).expect(panel.name);
-            assert_eq!(Ok(&relief), panel.to_relief().as_ref());
+            assert_eq!(Ok(&relief), PanelRelief::from_paper(&panel).as_ref());
             assert_eq!((relief.name(), PanelRelief::guess(panel.name)), (panel.relief, Some(panel.name)));
             for (key, value) in panel.settings {
                 let set = &relief.parameters()[*key];

@@ -22,9 +22,8 @@ use echolake_schema::{Grid, Pair, Rig, Timestamp};
 
 use crate::rig::{AudioTake, DrivePower, RigDevices};
 use crate::run::assessment::TakeAssessor;
-use crate::run::preflight::attempt_bytes;
 use crate::run::recorder::{LogLevel, Recorder, Tried};
-pub(crate) use attempt::implausible;
+pub use crate::run::recording_mode::RecordingMode;
 pub use error::Error;
 use watch::RunMonitor;
 
@@ -32,15 +31,6 @@ use watch::RunMonitor;
 const NAME: &str = "controller";
 /// Interval at which a paused run checks whether to continue.
 const PAUSE_LOOKS: Duration = Duration::from_millis(50);
-
-/// Choice of the messages that a run records.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum RecordingMode {
-    /// Sweeps and impulse responses.
-    Sweeps,
-    /// Impulse responses alone.
-    ResponsesOnly,
-}
 
 /// Recording settings of a run.
 #[derive(Debug, Clone, Copy)]
@@ -214,9 +204,10 @@ impl<'a> RunController<'a> {
             RunProgress { recorder, options, tried, attempts, ended: begun.at, watch, unsafe_verdicts, unsafe_pairs };
         let todo: Vec<Pair> = work.pairs.iter().filter(|p| !run.is_accepted(p.id.0)).copied().collect();
         let (left_out, of) = (work.pairs.len() - todo.len(), work.pairs.len());
-        let what = match work.before.is_empty() {
-            true => format!("{of} pairs with rig {}, {}", self.rig.name, self.devices.origin.label()),
-            false => format!("resumed: {left_out} of {of} pairs are measured already"),
+        let what = if work.before.is_empty() {
+            format!("{of} pairs with rig {}, {}", self.rig.name, self.devices.origin.label())
+        } else {
+            format!("resumed: {left_out} of {of} pairs are measured already")
         };
         run.say(LogLevel::Info, &what)?;
         for (done, pair) in todo.iter().enumerate() {
@@ -285,7 +276,7 @@ impl<'a> RunController<'a> {
         let mut objections = Vec::new();
         for attempt in 1..=self.rig.validation.attempts {
             // What is not on the disk yet must fit, and the attempt that is made next.
-            run.watch.disk(run.recorder.bytes_to_end() + attempt_bytes(self.rig, run.options.keep))?;
+            run.watch.disk(run.recorder.bytes_to_end() + run.options.keep.attempt_bytes(self.rig))?;
             let is_last = attempt == self.rig.validation.attempts;
             let mut made = self.attempt(run, pair, before + attempt, is_last)?;
             run.watch.at(made.at)?;

@@ -9,6 +9,7 @@ pub mod plan;
 pub mod preflight;
 pub mod recorder;
 pub mod recording_lock;
+mod recording_mode;
 pub mod session;
 pub mod simulate;
 
@@ -95,8 +96,33 @@ pub enum Error {
     },
 }
 
-impl RunRequest<'_> {
-    /// Measures all pairs with the devices that the rig file names. A run that is stopped or interrupted can be resumed.
+impl<'a> RunRequest<'a> {
+    /// Makes a request that keeps sweeps, with seed and tag 1, without references of its own and without a project.
+    pub fn new(
+        rig: &'a Rig,
+        surface: SurfaceId,
+        specimen: &'a PanelSpecimen,
+        start: Timestamp,
+        folder: &'a Path,
+    ) -> Self {
+        Self {
+            rig,
+            surface,
+            specimen,
+            flat: None,
+            foam: None,
+            macro_reference: None,
+            project: None,
+            start,
+            seed: 1,
+            tag: 1,
+            keep: RecordingMode::Sweeps,
+            folder,
+        }
+    }
+
+    /// Measures all pairs with the devices that the rig file names. A run that is stopped or interrupted can be
+    /// resumed.
     ///
     /// # Errors
     /// [`Error`]; a run that was begun leaves its `.partial` file.

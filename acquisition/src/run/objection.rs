@@ -1,9 +1,17 @@
 //! Reasons to reject a take, with advice for the rig's operator.
 
+use crate::rig::AmbientReading;
+
 /// The ratio of signal to noise, as an unknown quantity.
 pub(crate) const SIGNAL_TO_NOISE: &str = "signal-to-noise ratio";
 /// The arrival of the direct sound, as an unknown quantity.
 pub(crate) const ARRIVAL: &str = "arrival of the direct sound";
+
+/// Plausible range of readings in rooms; a value outside is the fault of the sensor or its line.
+const TEMPERATURE_C: [f64; 2] = [-20.0, 60.0];
+const HUMIDITY_PCT: [f64; 2] = [0.0, 100.0];
+const PRESSURE_HPA: [f64; 2] = [300.0, 1_100.0];
+const LEVEL_DB: [f64; 2] = [0.0, 150.0];
 
 /// A reason to reject a take. Its text is recorded in the verdict.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -98,4 +106,20 @@ impl TakeObjection {
             Self::Refused { .. } => "look at the robots' own messages; are they referenced, and is the grid the rig's?",
         }
     }
+}
+
+/// Returns objections to values that no room has; values that the reading leaves unknown are not among them.
+pub(crate) fn implausible(reading: &AmbientReading) -> Vec<TakeObjection> {
+    let values = [
+        ("a temperature", reading.temperature_c, "C", TEMPERATURE_C),
+        ("a humidity", reading.humidity_pct, "%", HUMIDITY_PCT),
+        ("a pressure", reading.pressure_hpa, "hPa", PRESSURE_HPA),
+        ("a level outside", reading.outside_level_db, "dB", LEVEL_DB),
+    ];
+    let wrong = |(_, value, _, [least, most]): &(_, f64, _, [f64; 2])| value < least || value > most;
+    values
+        .into_iter()
+        .filter(wrong)
+        .map(|(what, value, unit, [least, most])| TakeObjection::Implausible { what, value, unit, least, most })
+        .collect()
 }

@@ -6,7 +6,9 @@ use echolake_schema::{Pair, Rig};
 
 use crate::disk::free_bytes;
 use crate::run::assessment::{quiet_range, response_len};
-use crate::run::controller::{RecordingMode, RunController, implausible};
+use crate::run::controller::RunController;
+use crate::run::objection::implausible;
+use crate::run::recording_mode::RecordingMode;
 
 /// Bytes per recorded sample of both channels and audio, compressed: 4.92 in a simulated run with sweeps of 0.5 s.
 const SWEEP_BYTES_A_SAMPLE: f64 = 5.0;
@@ -53,19 +55,11 @@ pub fn expected_bytes(rig: &Rig, keep: RecordingMode, pairs: usize) -> u64 {
     (RUN_BYTES + (sweep + response + PAIR_BYTES) * REPEATS * pairs as f64) as u64
 }
 
-/// Returns the bytes that one attempt takes at most: two channels of three bytes and audio of two per sample of the
-/// sweep, the response, and messages of fixed size.
-pub(crate) fn attempt_bytes(rig: &Rig, keep: RecordingMode) -> u64 {
-    const MESSAGES: usize = 8192;
-    let sweep = if keep == RecordingMode::Sweeps { rig.recording_len() * 8 } else { 0 };
-    (sweep + response_len(rig) * 4 + MESSAGES) as u64
-}
-
 /// Checks that the disk has room for a run of so many pairs.
 pub fn disk(folder: &Path, rig: &Rig, keep: RecordingMode, pairs: usize) -> Option<PreflightFinding> {
     // A file system that does not report its free space is no reason to refuse.
     let free = free_bytes(folder).ok()?;
-    room(folder, free, expected_bytes(rig, keep, pairs) + attempt_bytes(rig, keep) + KEPT_FREE)
+    room(folder, free, expected_bytes(rig, keep, pairs) + keep.attempt_bytes(rig) + KEPT_FREE)
 }
 
 fn room(folder: &Path, free: u64, needed: u64) -> Option<PreflightFinding> {
@@ -90,8 +84,8 @@ pub fn quiet_part(rig: &Rig) -> Option<PreflightFinding> {
     let secs = |samples: usize| samples as f64 / rig.sweep.rate_hz.get();
     let needed = (response + 1).div_ceil(3) * 4;
     let what = format!(
-        "rig `{}`: a recording of {:.2} s is too short to tell the noise behind a response of {:.2} s, expected at least \
-         {:.2} s",
+        "rig `{}`: a recording of {:.2} s is too short to tell the noise behind a response of {:.2} s, expected at \
+         least {:.2} s",
         rig.name,
         secs(recorded),
         secs(response),

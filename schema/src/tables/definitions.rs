@@ -1,49 +1,7 @@
-//! The definition of every table: its name, source, key and columns, in order.
+//! The columns of every table, in order; functions of bands get the names of the lake's.
 
 use super::column::Column;
-use super::{Source, Table};
 use crate::manifest::ORIGINS;
-
-/// A table's definition. [`Table`] describes each part.
-pub(super) struct TableDefinition {
-    pub(super) name: &'static str,
-    pub(super) source: Source,
-    pub(super) key: &'static [&'static str],
-    /// Its columns in a lake whose bands have these names.
-    pub(super) columns: fn(&[String]) -> Vec<Column>,
-}
-
-impl TableDefinition {
-    pub(super) fn of(table: Table) -> Self {
-        match table {
-            Table::Surfaces => Self::new("surfaces", Source::Run, &["surface_id"], surfaces),
-            Table::Runs => Self::new("runs", Source::Pointer, &["run_id"], |_| runs()),
-            Table::Points => Self::new("points", Source::Rig, &["point_id"], |_| points()),
-            Table::Pairs => Self::new("pairs", Source::Rig, &["pair_id"], |_| pairs()),
-            Table::Measurements => Self::new("measurements", Source::Run, &PAIR_KEY, |_| measurements()),
-            Table::Nce => Self::new("nce", Source::References, &PAIR_KEY, nce),
-            Table::Tnce => Self::new("tnce", Source::References, &PAIR_KEY, tnce),
-            Table::TnceD4 => Self::new("tnce_d4", Source::References, &["run_id", "pair_id", "symmetry"], tnce_d4),
-            Table::Heightmaps => Self::new("heightmaps", Source::Run, &["surface_id", "symmetry"], |_| heightmaps()),
-            Table::Environment => Self::new("environment", Source::Run, &[], |_| environment()),
-            Table::Events => Self::new("events", Source::Run, &[], |_| events()),
-            Table::SurfaceStats => {
-                Self::new("surface_stats", Source::References, &["run_id", "band"], |_| surface_stats())
-            }
-        }
-    }
-
-    fn new(
-        name: &'static str,
-        source: Source,
-        key: &'static [&'static str],
-        columns: fn(&[String]) -> Vec<Column>,
-    ) -> Self {
-        Self { name, source, key, columns }
-    }
-}
-
-const PAIR_KEY: [&str; 2] = ["run_id", "pair_id"];
 
 fn run_keys() -> Vec<Column> {
     vec![
@@ -88,7 +46,7 @@ fn references() -> Vec<Column> {
     ]
 }
 
-fn surfaces(bands: &[String]) -> Vec<Column> {
+pub(super) fn surfaces(bands: &[String]) -> Vec<Column> {
     let mut columns = run_keys();
     columns.extend([
         Column::text("panel", "Physical panel that the surface is a side of"),
@@ -120,7 +78,7 @@ fn surfaces(bands: &[String]) -> Vec<Column> {
     columns
 }
 
-fn runs() -> Vec<Column> {
+pub(super) fn runs() -> Vec<Column> {
     let mut columns = run_keys();
     columns.extend([
         Column::text("state", "complete; waiting: references are missing; partial: the file was cut off"),
@@ -156,7 +114,7 @@ fn runs() -> Vec<Column> {
     columns
 }
 
-fn points() -> Vec<Column> {
+pub(super) fn points() -> Vec<Column> {
     vec![
         Column::int("point_id", "", "Grid point, 0-based in (layer, gridx, gridy) order"),
         Column::int("layer", "", "Layer, 0 the lowest"),
@@ -168,7 +126,7 @@ fn points() -> Vec<Column> {
     ]
 }
 
-fn pairs() -> Vec<Column> {
+pub(super) fn pairs() -> Vec<Column> {
     let mut columns = vec![
         Column::int("pair_id", "", "Pair, 0-based in (microphone, speaker) order"),
         Column::int("microphone", "", "Grid point of the microphone"),
@@ -208,7 +166,7 @@ fn positions() -> [Column; 6] {
     ]
 }
 
-fn measurements() -> Vec<Column> {
+pub(super) fn measurements() -> Vec<Column> {
     let mut columns = pair_keys();
     columns.extend(log_time());
     columns.extend([
@@ -224,15 +182,23 @@ fn measurements() -> Vec<Column> {
         Column::float("arrival_error_us", "us", "Direct sound's arrival minus the one geometry gives").or_null(),
         Column::float("microphone_residual_mm", "mm", "Measured minus wanted position of the microphone").or_null(),
         Column::float("speaker_residual_mm", "mm", "Measured minus wanted position of the speaker").or_null(),
-        Column::text("source", "sweep: deconvolved from the recording; ir: taken as recorded; corrected: given at the reference temperature"),
+        Column::text(
+            "source",
+            "sweep: deconvolved from the recording; ir: taken as recorded; corrected: given at the \
+            reference temperature",
+        ),
         Column::long("chunk_offset", "B", "Where in the run's file the chunk begins that holds it"),
-        Column::floats("ir", "1", "Impulse response over the loopback, at the reference temperature, cropped; direct sound still in it"),
+        Column::floats(
+            "ir",
+            "1",
+            "Impulse response over the loopback, at the reference temperature, cropped; direct sound still in it",
+        ),
         code_version(),
     ]);
     columns
 }
 
-fn nce(bands: &[String]) -> Vec<Column> {
+pub(super) fn nce(bands: &[String]) -> Vec<Column> {
     let mut columns = pair_keys();
     columns.push(Column::floats("reflected_ir", "1", "Impulse response with Foam's subtracted"));
     columns.extend(bands.iter().map(|band| {
@@ -257,7 +223,7 @@ fn energies(bands: &[String]) -> Vec<Column> {
     columns
 }
 
-fn tnce(bands: &[String]) -> Vec<Column> {
+pub(super) fn tnce(bands: &[String]) -> Vec<Column> {
     let mut columns = pair_keys();
     columns.extend(energies(bands));
     columns.extend(curve_shapes(bands));
@@ -292,7 +258,7 @@ fn level_uncertainties(bands: &[String]) -> Vec<Column> {
     over_total.chain(bands.iter().map(|band| format!("tnce_band_{band}"))).map(column).collect()
 }
 
-fn tnce_d4(bands: &[String]) -> Vec<Column> {
+pub(super) fn tnce_d4(bands: &[String]) -> Vec<Column> {
     let mut columns = pair_keys();
     columns.extend([
         Column::text("symmetry", "identity, rot90, rot180, rot270, mirror_x, mirror_y, mirror_diag or mirror_anti"),
@@ -308,7 +274,7 @@ fn tnce_d4(bands: &[String]) -> Vec<Column> {
     columns
 }
 
-fn heightmaps() -> Vec<Column> {
+pub(super) fn heightmaps() -> Vec<Column> {
     let mut columns = run_keys();
     columns.extend([
         Column::text("symmetry", "identity, rot90, rot180, rot270, mirror_x, mirror_y, mirror_diag or mirror_anti"),
@@ -320,7 +286,7 @@ fn heightmaps() -> Vec<Column> {
     columns
 }
 
-fn environment() -> Vec<Column> {
+pub(super) fn environment() -> Vec<Column> {
     let mut columns = run_keys();
     columns.extend(log_time());
     columns.extend([
@@ -333,7 +299,7 @@ fn environment() -> Vec<Column> {
     columns
 }
 
-fn events() -> Vec<Column> {
+pub(super) fn events() -> Vec<Column> {
     let mut columns = run_keys();
     columns.extend(log_time());
     columns.extend([
@@ -345,7 +311,7 @@ fn events() -> Vec<Column> {
     columns
 }
 
-fn surface_stats() -> Vec<Column> {
+pub(super) fn surface_stats() -> Vec<Column> {
     let mut columns = run_keys();
     columns.extend([
         Column::text("band", "Centre of the band in Hz, or total"),

@@ -15,7 +15,6 @@ pub use column::{COMMENT, LIST_CHILD, UNIT};
 pub use rows::BandStatistics;
 
 use self::column::Column;
-use self::definitions::TableDefinition;
 use crate::Rig;
 
 /// A table of the lake.
@@ -76,7 +75,7 @@ impl Table {
 
     /// Its name in SQL and its folder.
     pub fn name(self) -> &'static str {
-        TableDefinition::of(self).name
+        self.definition().name
     }
 
     /// Meaning of a row of it.
@@ -104,23 +103,66 @@ impl Table {
 
     /// Source of its rows.
     pub fn source(self) -> Source {
-        TableDefinition::of(self).source
+        self.definition().source
     }
 
     /// Columns of which no two visible rows have the same values; none if rows may repeat. If `surface_id` is one of
     /// them, only the newest run of a surface has visible rows.
     pub fn key(self) -> &'static [&'static str] {
-        TableDefinition::of(self).key
+        self.definition().key
     }
 
     /// Its schema in a lake of this rig.
     pub fn schema(self, rig: &Rig) -> SchemaRef {
-        let columns = (TableDefinition::of(self).columns)(&rig.band_names());
+        let columns = (self.definition().columns)(&rig.band_names());
         Arc::new(Schema::new(columns.into_iter().map(Column::field).collect::<Vec<_>>()))
     }
 
     /// Cells along each side of a stored height map.
     pub const HEIGHTMAP_CELLS: usize = 128;
+
+    fn definition(self) -> TableDefinition {
+        match self {
+            Self::Surfaces => define("surfaces", Source::Run, &["surface_id"], definitions::surfaces),
+            Self::Runs => define("runs", Source::Pointer, &["run_id"], |_| definitions::runs()),
+            Self::Points => define("points", Source::Rig, &["point_id"], |_| definitions::points()),
+            Self::Pairs => define("pairs", Source::Rig, &["pair_id"], |_| definitions::pairs()),
+            Self::Measurements => define("measurements", Source::Run, &PAIR_KEY, |_| definitions::measurements()),
+            Self::Nce => define("nce", Source::References, &PAIR_KEY, definitions::nce),
+            Self::Tnce => define("tnce", Source::References, &PAIR_KEY, definitions::tnce),
+            Self::TnceD4 => {
+                define("tnce_d4", Source::References, &["run_id", "pair_id", "symmetry"], definitions::tnce_d4)
+            }
+            Self::Heightmaps => {
+                define("heightmaps", Source::Run, &["surface_id", "symmetry"], |_| definitions::heightmaps())
+            }
+            Self::Environment => define("environment", Source::Run, &[], |_| definitions::environment()),
+            Self::Events => define("events", Source::Run, &[], |_| definitions::events()),
+            Self::SurfaceStats => {
+                define("surface_stats", Source::References, &["run_id", "band"], |_| definitions::surface_stats())
+            }
+        }
+    }
+}
+
+const PAIR_KEY: [&str; 2] = ["run_id", "pair_id"];
+
+/// A table's definition. [`Table`] describes each part.
+struct TableDefinition {
+    name: &'static str,
+    source: Source,
+    key: &'static [&'static str],
+    /// Its columns in a lake whose bands have these names.
+    columns: fn(&[String]) -> Vec<Column>,
+}
+
+fn define(
+    name: &'static str,
+    source: Source,
+    key: &'static [&'static str],
+    columns: fn(&[String]) -> Vec<Column>,
+) -> TableDefinition {
+    TableDefinition { name, source, key, columns }
 }
 
 /// Source of a table's rows, which decides when they change.

@@ -30,7 +30,7 @@ fn json_of(relief: &PanelRelief) -> serde_json::Value {
 
 fn json_of_panel(panel: &PaperPanel) -> Result<serde_json::Value, Error> {
     let PaperPanel { name, macro_reference, printed, assumed, .. } = panel;
-    let mut json = panel.to_relief()?.to_json();
+    let mut json = PanelRelief::from_paper(panel)?.to_json();
     json["panel"] = serde_json::json!({
         "name": name, "macro_reference": macro_reference, "printed": printed, "assumed": assumed,
     });

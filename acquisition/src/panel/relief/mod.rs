@@ -54,7 +54,10 @@ pub enum PanelRelief {
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum Error {
     /// No such relief.
-    #[error("`{given}` is no relief; hint: {}, or one of the paper's panels: {}", PanelRelief::NAMES.join(", "), paper_names())]
+    #[error(
+        "`{given}` is no relief; hint: {}, or one of the paper's panels: {}",
+        PanelRelief::NAMES.join(", "), paper_names()
+    )]
     Name {
         /// The given name.
         given: String,
@@ -121,8 +124,8 @@ pub enum Error {
 const RENAMED: [(&str, &str); 3] =
     [("brick", "stretcher_bond"), ("flemish", "flemish_bond"), ("wavy", "macrostructure")];
 
-/// Walls of each kind among [`DECK_SIZE`]. The paper had measured about 150 surfaces when it counted 92 brick and 46 stone
-/// walls (Rust et al. 2021); how these and the others divide into kinds is an assumption: evenly.
+/// Walls of each kind among [`DECK_SIZE`]. The paper had measured about 150 surfaces when it counted 92 brick and 46
+/// stone walls (Rust et al. 2021); how these and the others divide into kinds is an assumption: evenly.
 const SHARES: [(StoneArrangement, usize); 9] = [
     (StoneArrangement::StretcherBond, 46),
     (StoneArrangement::FlemishBond, 46),
@@ -178,7 +181,7 @@ impl PanelRelief {
     /// [`Error::Name`], which lists the names, or [`Error::Renamed`].
     pub fn by_name(name: &str) -> Result<Self, Error> {
         if let Some(panel) = PaperPanel::by_name(name) {
-            return panel.to_relief();
+            return Self::from_paper(&panel);
         }
         Ok(match name {
             "flat" => Self::Flat,
@@ -198,8 +201,19 @@ impl PanelRelief {
         })
     }
 
-    /// Returns the panel of the paper that has a surface's name, or the relief that the name begins with: the longest name
-    /// that matches.
+    /// Makes the relief of a panel of the paper.
+    ///
+    /// # Errors
+    /// None for those of [`PaperPanel::ALL`].
+    pub fn from_paper(panel: &PaperPanel) -> Result<Self, Error> {
+        let mut relief = Self::by_name(panel.relief)?;
+        panel.settings.iter().try_for_each(|(key, value)| relief.set(key, value))?;
+        relief.check_depth()?;
+        Ok(relief)
+    }
+
+    /// Returns the panel of the paper that has a surface's name, or the relief that the name begins with: the longest
+    /// name that matches.
     pub fn guess(surface: &str) -> Option<&'static str> {
         if let Some(panel) = PaperPanel::by_name(surface) {
             return Some(panel.name);
@@ -210,8 +224,8 @@ impl PanelRelief {
     }
 
     /// Relief `number` of the collection that `seed` names; it does not depend on how many there are. Every 150 from a
-    /// multiple of it are 92 walls of brick, 46 of stone and 12 others, in any order, but the first nine are one of each
-    /// kind; their parameters are from all of their ranges.
+    /// multiple of it are 92 walls of brick, 46 of stone and 12 others, in any order, but the first nine are one of
+    /// each kind; their parameters are from all of their ranges.
     pub fn drawn(seed: u64, number: u64) -> Self {
         let chance = SeededRandom::new(seed, 0xDECC);
         let deck = deck(chance.at((number / DECK_SIZE) as i64, 1));

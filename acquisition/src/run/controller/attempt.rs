@@ -6,23 +6,18 @@ use echolake_schema::messages::{AmbientSample, ImpulseResponse, Measurement, Sam
 use echolake_schema::samples::split_24;
 use echolake_schema::{Celsius, Pair, Timestamp};
 
-use super::{Error, NAME, RecordingMode, RunController, RunProgress};
+use super::{Error, NAME, RunController, RunProgress};
 use crate::rig::{AmbientReading, ArmPositions, DrivePower, Error as RigError};
 use crate::run::assessment::TakeAssessment;
-use crate::run::objection::{ARRIVAL, SIGNAL_TO_NOISE, TakeObjection};
+use crate::run::objection::{ARRIVAL, SIGNAL_TO_NOISE, TakeObjection, implausible};
 use crate::run::recorder::LogLevel;
+use crate::run::recording_mode::RecordingMode;
 
 /// Full scale of a take's samples.
 const FULL_SCALE: f32 = 8_388_608.0;
 /// Number of tries of a device that fails before the run ends: an overrun, or a line of a sensor that was cut short, is
 /// over at once.
 const TRIES: usize = 3;
-/// Plausible range of readings in rooms; a value outside is the fault of the sensor or its line.
-const TEMPERATURE_C: [f64; 2] = [-20.0, 60.0];
-const HUMIDITY_PCT: [f64; 2] = [0.0, 100.0];
-const PRESSURE_HPA: [f64; 2] = [300.0, 1_100.0];
-const LEVEL_DB: [f64; 2] = [0.0, 150.0];
-
 /// One attempt with its measurement.
 pub(super) struct AttemptResult {
     pub(super) at: Timestamp,
@@ -273,22 +268,6 @@ fn unknowns(found: &TakeAssessment, reading: &AmbientReading) -> Vec<TakeObjecti
         ("level outside", reading.outside_level_db),
     ];
     values.into_iter().filter(|(_, x)| x.is_nan()).map(|(what, _)| TakeObjection::Unknown { what }).collect()
-}
-
-/// Returns objections to values that no room has; values that the reading leaves unknown are not among them.
-pub(crate) fn implausible(reading: &AmbientReading) -> Vec<TakeObjection> {
-    let values = [
-        ("a temperature", reading.temperature_c, "C", TEMPERATURE_C),
-        ("a humidity", reading.humidity_pct, "%", HUMIDITY_PCT),
-        ("a pressure", reading.pressure_hpa, "hPa", PRESSURE_HPA),
-        ("a level outside", reading.outside_level_db, "dB", LEVEL_DB),
-    ];
-    let wrong = |(_, value, _, [least, most]): &(_, f64, _, [f64; 2])| value < least || value > most;
-    values
-        .into_iter()
-        .filter(wrong)
-        .map(|(what, value, unit, [least, most])| TakeObjection::Implausible { what, value, unit, least, most })
-        .collect()
 }
 
 // Samples as fractions of full scale; returns how many are at it.
