@@ -29,7 +29,8 @@ pub struct MeasurementParams {
     pub low_hz: f64,
     /// Highest frequency of the sweep, Hz.
     pub high_hz: f64,
-    /// Treatment of frequencies at the limits of that range and beyond them; a taper is as wide as the response resolves.
+    /// Treatment of frequencies at the limits of that range and beyond them; a taper is as wide as the response
+    /// resolves.
     pub division: SpectralDivision,
     /// Temperature that responses are corrected to, C.
     pub reference_celsius: f64,
@@ -84,8 +85,8 @@ impl<T: RealSample> MeasurementPlan<T> {
     /// The response of one measurement at the reference temperature.
     ///
     /// # Errors
-    /// As [`ResponseDeconvolution::run_within`], and [`Error::Setting`] for a temperature outside of -60 to 80 C: the plan
-    /// has deconvolved too little for it.
+    /// As [`ResponseDeconvolution::run_within`], and [`Error::Setting`] for a temperature outside of -60 to 80 C: the
+    /// plan has deconvolved too little for it.
     pub fn ir(
         &self,
         recording: &[T],
@@ -106,9 +107,9 @@ impl<T: RealSample> MeasurementPlan<T> {
 
 /// Correction of responses to the reference temperature.
 ///
-/// The paper's chain resamples a response and keeps its height: a stretched one has more energy, 0.007 dB a kelvin. With
-/// [`SpectralDivision::Tapered`] its spectrum keeps its height instead, so that a reflection's energy does not depend on the
-/// air; the other divisions stay what they are elsewhere.
+/// The paper's chain resamples a response and keeps its height: a stretched one has more energy, 0.007 dB a kelvin.
+/// With [`SpectralDivision::Tapered`] its spectrum keeps its height instead, so that a reflection's energy does not
+/// depend on the air; the other divisions stay what they are elsewhere.
 ///
 /// ```
 /// use echolake_dsp::chain::ResponseCorrection;
@@ -313,8 +314,8 @@ impl<T: RealSample> DerivationPlan<T> {
         self.bank.energies(reflected, energies, &mut scratch.bank)
     }
 
-    /// Computes what errors of the direct sound, and warmer air by its relative change of each bin, do to the energies of a
-    /// reflected response: `sensitivities[band]`.
+    /// Computes what errors of the direct sound, and warmer air by its relative change of each bin, do to the energies
+    /// of a reflected response: `sensitivities[band]`.
     ///
     /// # Errors
     /// [`Error::Length`] or [`Error::NotFinite`].

@@ -46,7 +46,7 @@ pub use levels::{
     decay, diffusion, energy, envelope, filter_bank, frequency_response, level, mean, rise, spectrogram, spectrum,
     uncertainty,
 };
-pub use real::{RealSample, SampleVector, VECTOR_LANES};
+pub use real::RealSample;
 pub use reflection::{air, arrival, foam, foam_reflection, fresnel, geometry, kirchhoff};
 pub use relief::{height_field, heights};
 pub use similarity::{components, correlation, self_organising_map};

@@ -1,32 +1,15 @@
 //! The two kinds of sample: f32 for the product, f64 for its oracle.
 
-use std::ops::{Add, Div, Mul, Sub};
 use std::sync::Arc;
 
 use realfft::{ComplexToReal, FftNum, RealFftPlanner, RealToComplex};
 use rustfft::{Fft, FftDirection, FftPlanner};
-use wide::{f32x4, f64x4};
-
-/// Samples of a [`RealSample::Vector`].
-pub const VECTOR_LANES: usize = 4;
-
-/// Samples that are computed with at once: written so, loops are vectors at each level of link-time optimisation.
-pub trait SampleVector:
-    Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Output = Self> + Div<Output = Self>
-{
-    /// The lesser of each lane.
-    fn lesser(self, other: Self) -> Self;
-    /// The greater of each lane.
-    fn greater(self, other: Self) -> Self;
-}
 
 /// A sample.
 ///
-/// Transforms are planned here and nowhere else: rustfft's planner is generic, and each crate that calls it compiles all
-/// of rustfft's kernels once more (20 s of a first build).
+/// Transforms are planned here and nowhere else: rustfft's planner is generic, and each crate that calls it compiles
+/// all of rustfft's kernels once more (20 s of a first build).
 pub trait RealSample: FftNum + PartialOrd + Default {
-    /// Samples side by side.
-    type Vector: SampleVector + From<Self> + From<[Self; VECTOR_LANES]> + Into<[Self; VECTOR_LANES]>;
     /// Nearest to an f64.
     fn of(value: f64) -> Self;
     /// As f64, exactly.
@@ -45,92 +28,42 @@ pub trait RealSample: FftNum + PartialOrd + Default {
     fn plan_real_inverse(len: usize) -> Arc<dyn ComplexToReal<Self>>;
 }
 
-impl RealSample for f32 {
-    type Vector = f32x4;
-
-    fn of(value: f64) -> Self {
-        value as Self
-    }
-
-    fn f64(self) -> f64 {
-        f64::from(self)
-    }
-
-    fn epsilon() -> f64 {
-        f64::from(Self::EPSILON)
-    }
-
-    fn max_value() -> Self {
-        Self::MAX
-    }
-
-    fn add_to(signal: &[Self], sums: &mut [f64]) {
-        sums.iter_mut().zip(signal).for_each(|(sum, x)| *sum += x.f64());
-    }
-
-    fn plan_fft(len: usize, direction: FftDirection) -> Arc<dyn Fft<Self>> {
-        FftPlanner::new().plan_fft(len, direction)
-    }
-
-    fn plan_real_forward(len: usize) -> Arc<dyn RealToComplex<Self>> {
-        RealFftPlanner::new().plan_fft_forward(len)
-    }
-
-    fn plan_real_inverse(len: usize) -> Arc<dyn ComplexToReal<Self>> {
-        RealFftPlanner::new().plan_fft_inverse(len)
-    }
-}
-
-impl RealSample for f64 {
-    type Vector = f64x4;
-
-    fn of(value: f64) -> Self {
-        value
-    }
-
-    fn f64(self) -> f64 {
-        self
-    }
-
-    fn epsilon() -> f64 {
-        Self::EPSILON
-    }
-
-    fn max_value() -> Self {
-        Self::MAX
-    }
-
-    fn add_to(signal: &[Self], sums: &mut [f64]) {
-        sums.iter_mut().zip(signal).for_each(|(sum, x)| *sum += x.f64());
-    }
-
-    fn plan_fft(len: usize, direction: FftDirection) -> Arc<dyn Fft<Self>> {
-        FftPlanner::new().plan_fft(len, direction)
-    }
-
-    fn plan_real_forward(len: usize) -> Arc<dyn RealToComplex<Self>> {
-        RealFftPlanner::new().plan_fft_forward(len)
-    }
-
-    fn plan_real_inverse(len: usize) -> Arc<dyn ComplexToReal<Self>> {
-        RealFftPlanner::new().plan_fft_inverse(len)
-    }
-}
-
-macro_rules! sample_vectors {
-    ($($vector:ty),+) => {$(
-        impl SampleVector for $vector {
-            #[inline]
-            fn lesser(self, other: Self) -> Self {
-                self.fast_min(other)
+macro_rules! real_samples {
+    ($($sample:ty),+) => {$(
+        impl RealSample for $sample {
+            fn of(value: f64) -> Self {
+                value as Self
             }
 
-            #[inline]
-            fn greater(self, other: Self) -> Self {
-                self.fast_max(other)
+            fn f64(self) -> f64 {
+                self.into()
+            }
+
+            fn epsilon() -> f64 {
+                Self::EPSILON.into()
+            }
+
+            fn max_value() -> Self {
+                Self::MAX
+            }
+
+            fn add_to(signal: &[Self], sums: &mut [f64]) {
+                sums.iter_mut().zip(signal).for_each(|(sum, x)| *sum += x.f64());
+            }
+
+            fn plan_fft(len: usize, direction: FftDirection) -> Arc<dyn Fft<Self>> {
+                FftPlanner::new().plan_fft(len, direction)
+            }
+
+            fn plan_real_forward(len: usize) -> Arc<dyn RealToComplex<Self>> {
+                RealFftPlanner::new().plan_fft_forward(len)
+            }
+
+            fn plan_real_inverse(len: usize) -> Arc<dyn ComplexToReal<Self>> {
+                RealFftPlanner::new().plan_fft_inverse(len)
             }
         }
     )+};
 }
 
-sample_vectors!(f32x4, f64x4);
+real_samples!(f32, f64);

@@ -3,7 +3,7 @@
 use std::f64::consts::PI;
 use std::sync::{Arc, LazyLock};
 
-use crate::{RealSample, VECTOR_LANES};
+use crate::RealSample;
 
 /// Speed of sound at 0 C, m/s (Rust et al. 2021, appendix, step 2).
 const C0: f64 = 331.3;
@@ -35,7 +35,8 @@ pub fn resampling_ratio(celsius: f64, reference_celsius: f64) -> f64 {
 /// is about 9 K colder or warmer than the reference.
 const RANGE_MARGIN: f64 = 0.015;
 
-/// Limits, before the correction by a ratio, of the range that responses have after it: 1.5 % inside of the sweep's, Hz.
+/// Limits, before the correction by a ratio, of the range that responses have after it: 1.5 % inside of the sweep's,
+/// Hz.
 ///
 /// The correction moves frequencies, too. Limits at the sweep's own would leave a warmer response less of its highest
 /// band than a colder one, 0.03 dB a kelvin. Beyond 9 K the sweep's own range is the limit.
@@ -80,10 +81,10 @@ pub struct TemperatureCorrection<T: RealSample> {
     table: Arc<[KernelPiece<T>]>,
 }
 
-/// A value for each tap.
-type TapVectors<T> = [<T as RealSample>::Vector; TAPS / VECTOR_LANES];
+/// Sums side by side, so that an addition need not wait for the one before.
+const LANES: usize = 4;
 /// Coefficients of 1, t, t^2 and t^3 of each tap, t from 0 to 1 along a piece.
-type KernelPiece<T> = [TapVectors<T>; 4];
+type KernelPiece<T> = [[T; TAPS]; 4];
 
 // Tap j is k(fraction + CENTRE - j), piece i for fractions from i / PIECES to (i + 1) / PIECES.
 static TABLE: LazyLock<Vec<[[f64; TAPS]; 4]>> = LazyLock::new(|| {
@@ -108,10 +109,7 @@ impl<T: RealSample> Default for TemperatureCorrection<T> {
 impl<T: RealSample> TemperatureCorrection<T> {
     /// The plan; it serves every ratio.
     pub fn new() -> Self {
-        let vectors = |taps: [f64; TAPS]| -> TapVectors<T> {
-            std::array::from_fn(|i| std::array::from_fn(|lane| T::of(taps[VECTOR_LANES * i + lane])).into())
-        };
-        Self { table: TABLE.iter().map(|piece| piece.map(vectors)).collect() }
+        Self { table: TABLE.iter().map(|piece| piece.map(|taps| taps.map(T::of))).collect() }
     }
 
     /// Samples of input that `output_len` samples of output depend on.
@@ -160,40 +158,34 @@ impl<T: RealSample> TemperatureCorrection<T> {
             if let Some(out) =
                 at.checked_sub(CENTRE).and_then(|first| ir_out.get_mut(first..)?.first_chunk_mut::<TAPS>())
             {
-                let x = T::Vector::from(x);
-                for (out, taps) in out.as_chunks_mut().0.iter_mut().zip(taps) {
-                    *out = (T::Vector::from(*out) + x * taps).into();
-                }
+                out.iter_mut().zip(taps).for_each(|(out, tap)| *out = *out + x * tap);
             } else {
                 let skipped = CENTRE.saturating_sub(at);
                 let out = ir_out[(at + skipped).saturating_sub(CENTRE)..].iter_mut();
-                let taps = taps.into_iter().flat_map(|taps| -> [T; VECTOR_LANES] { taps.into() });
-                out.zip(taps.skip(skipped)).for_each(|(out, tap)| *out = *out + x * tap);
+                out.zip(taps.into_iter().skip(skipped)).for_each(|(out, tap)| *out = *out + x * tap);
             }
         }
     }
 
     /// The sample at or before a position, which tap `CENTRE` belongs to, and the kernel around it.
-    fn taps(&self, position: f64) -> (usize, TapVectors<T>) {
+    fn taps(&self, position: f64) -> (usize, [T; TAPS]) {
         let at = position as usize;
         let along = (position - at as f64) * PIECES as f64;
         let index = (along as usize).min(PIECES - 1);
-        let t = T::Vector::from(T::of(along - index as f64));
+        let t = T::of(along - index as f64);
         let [c0, c1, c2, c3] = &self.table[index];
-        let mut taps = *c3;
-        for (i, taps) in taps.iter_mut().enumerate() {
-            *taps = c0[i] + t * (c1[i] + t * (c2[i] + t * *taps));
-        }
-        (at, taps)
+        (at, std::array::from_fn(|i| c0[i] + t * (c1[i] + t * (c2[i] + t * c3[i]))))
     }
 }
 
-fn dot<T: RealSample>(x: &[T; TAPS], taps: &TapVectors<T>) -> T {
-    let mut sums = T::Vector::from(T::default());
-    for (x, taps) in x.as_chunks().0.iter().zip(taps) {
-        sums = sums + T::Vector::from(*x) * *taps;
+fn dot<T: RealSample>(x: &[T; TAPS], taps: &[T; TAPS]) -> T {
+    let mut sums = [T::default(); LANES];
+    for (x, taps) in x.as_chunks::<LANES>().0.iter().zip(taps.as_chunks::<LANES>().0) {
+        for lane in 0..LANES {
+            sums[lane] = sums[lane] + x[lane] * taps[lane];
+        }
     }
-    let [a, b, c, d] = sums.into();
+    let [a, b, c, d] = sums;
     (a + b) + (c + d)
 }
 
@@ -236,8 +228,7 @@ mod tests {
             let position = f64::from(i) / 1_234.5;
             let (at, taps) = plan.taps(position);
             assert_eq!(at, position.floor() as usize);
-            let taps = taps.into_iter().flat_map(<[f64; VECTOR_LANES]>::from);
-            for (j, tap) in taps.enumerate() {
+            for (j, tap) in taps.into_iter().enumerate() {
                 let u = position - (at + j) as f64 + CENTRE as f64;
                 assert!((tap - kernel(u)).abs() < 5e-8, "{u}: {tap} {}", kernel(u));
             }

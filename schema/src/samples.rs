@@ -11,8 +11,6 @@
 //! # Ok::<(), echolake_schema::Error>(())
 //! ```
 
-use wide::{f32x4, i16x8, i32x4, i32x8, u8x16};
-
 use crate::Error;
 use crate::messages::SampleFormat;
 
@@ -58,13 +56,7 @@ pub fn decode(format: SampleFormat, bytes: &[u8], out: &mut [f32]) -> Result<(),
         }
         SampleFormat::S24Split => {
             let (low, upper) = bytes.split_at(out.len());
-            let (whole, rest) = out.as_chunks_mut();
-            let (low, low_rest) = low.as_chunks();
-            let (upper, upper_rest) = upper.as_chunks().0.as_chunks();
-            for ((y, l), u) in whole.iter_mut().zip(low).zip(upper) {
-                *y = fractions_24(l, u);
-            }
-            for ((y, l), u) in rest.iter_mut().zip(low_rest).zip(upper_rest) {
+            for ((y, l), u) in out.iter_mut().zip(low).zip(upper.as_chunks().0) {
                 *y = fraction_24(i32::from(i16::from_le_bytes(*u)) << 8 | i32::from(*l));
             }
         }
@@ -75,21 +67,6 @@ pub fn decode(format: SampleFormat, bytes: &[u8], out: &mut [f32]) -> Result<(),
 
 fn each<const N: usize>(bytes: &[u8], out: &mut [f32], decode: impl Fn([u8; N]) -> f32) {
     out.iter_mut().zip(bytes.as_chunks().0).for_each(|(y, b)| *y = decode(*b));
-}
-
-// Eight samples as vectors, which they stay at each level of link-time optimisation.
-#[inline]
-fn fractions_24(low: &[u8; 8], upper: &[[u8; 2]; 8]) -> [f32; 8] {
-    let [l0, l1, l2, l3, l4, l5, l6, l7] = *low;
-    let low = i16x8::from_u8x16_low(u8x16::new([l0, l1, l2, l3, l4, l5, l6, l7, 0, 0, 0, 0, 0, 0, 0, 0]));
-    let of = i16::from_le_bytes;
-    let [u0, u1, u2, u3, u4, u5, u6, u7] = *upper;
-    let upper = i16x8::new([of(u0), of(u1), of(u2), of(u3), of(u4), of(u5), of(u6), of(u7)]);
-    let [a, b, c, d, e, f, g, h] = ((i32x8::from(upper) << 8_i32) | i32x8::from(low)).to_array();
-    let scale = f32x4::splat(FRACTION_24);
-    let first = (f32x4::from_i32x4(i32x4::new([a, b, c, d])) * scale).to_array();
-    let second = (f32x4::from_i32x4(i32x4::new([e, f, g, h])) * scale).to_array();
-    [first[0], first[1], first[2], first[3], second[0], second[1], second[2], second[3]]
 }
 
 fn fraction_24(x: i32) -> f32 {

@@ -1,9 +1,11 @@
 //! Levels of two signals that share a transform, and the power of one of them over its bins.
 
-use crate::{Error, RealSample, SampleVector as _, VECTOR_LANES};
+use crate::{Error, RealSample};
 
 /// Samples that levels are taken from, of each eight times as many.
 const BLOCK: usize = 64;
+/// Sums side by side, so that an addition need not wait for the one before.
+const LANES: usize = 8;
 
 /// Levels of the two signals, from an eighth of their samples.
 pub(crate) struct SignalLevels {
@@ -40,71 +42,45 @@ fn root_power_of_two(energy: f64) -> f64 {
 
 // Blocks that are long enough to be read at full speed, close enough to each other to miss no sweep.
 fn sampled_energy<T: RealSample>(signal: &[T]) -> f64 {
-    let mut sums = VectorPair::<T>::splat(T::default());
+    let mut sums = [T::default(); LANES];
     for block in signal.chunks(8 * BLOCK) {
-        for pair in block[..block.len().min(BLOCK)].as_chunks().0 {
-            let VectorPair(a, b) = VectorPair::<T>::from_samples(pair);
-            sums = VectorPair(sums.0 + a * a, sums.1 + b * b);
+        for lanes in block[..block.len().min(BLOCK)].as_chunks::<LANES>().0 {
+            sums.iter_mut().zip(lanes).for_each(|(sum, x)| *sum = *sum + *x * *x);
         }
     }
-    8.0 * sums.samples().map(|x| x.f64()).sum::<f64>()
+    8.0 * sums.into_iter().map(T::f64).sum::<f64>()
 }
 
 /// Power of the divisor over some bins.
 pub(crate) struct BinPower<T: RealSample> {
-    sums: VectorPair<T>,
-    least: VectorPair<T>,
+    sums: [T; LANES],
+    least: [T; LANES],
 }
 
 impl<T: RealSample> BinPower<T> {
     pub(crate) fn none() -> Self {
-        Self { sums: VectorPair::splat(T::default()), least: VectorPair::splat(T::max_value()) }
+        Self { sums: [T::default(); LANES], least: [T::max_value(); LANES] }
     }
 
     pub(crate) fn add(&mut self, powers: &[T]) {
-        let (whole, rest) = powers.as_chunks();
-        for pair in whole {
-            let powers = VectorPair::from_samples(pair);
-            self.add_pair(powers, powers);
-        }
-        // The first lane alone.
-        for power in rest {
-            let (mut sum, mut least) = ([T::default(); 2 * VECTOR_LANES], [T::max_value(); 2 * VECTOR_LANES]);
-            (sum[0], least[0]) = (*power, *power);
-            self.add_pair(VectorPair::from_samples(&sum), VectorPair::from_samples(&least));
-        }
-    }
-
-    fn add_pair(&mut self, powers: VectorPair<T>, least: VectorPair<T>) {
-        self.sums = VectorPair(self.sums.0 + powers.0, self.sums.1 + powers.1);
-        self.least = VectorPair(least.0.lesser(self.least.0), least.1.lesser(self.least.1));
-    }
-
-    pub(crate) fn sum(&self) -> f64 {
-        self.sums.samples().map(|x| x.f64()).sum()
-    }
-
-    pub(crate) fn least(&self) -> f64 {
-        self.least.samples().map(|x| x.f64()).fold(f64::INFINITY, f64::min)
-    }
-}
-
-/// Eight lanes, so that an addition need not wait for the one before.
-#[derive(Clone, Copy)]
-struct VectorPair<T: RealSample>(T::Vector, T::Vector);
-
-impl<T: RealSample> VectorPair<T> {
-    fn splat(value: T) -> Self {
-        Self(value.into(), value.into())
+        let (whole, rest) = powers.as_chunks::<LANES>();
+        whole.iter().for_each(|lanes| self.add_lanes(lanes));
+        self.add_lanes(rest);
     }
 
     #[inline]
-    fn from_samples([a, b, c, d, e, f, g, h]: &[T; 2 * VECTOR_LANES]) -> Self {
-        Self([*a, *b, *c, *d].into(), [*e, *f, *g, *h].into())
+    fn add_lanes(&mut self, powers: &[T]) {
+        for ((sum, least), power) in self.sums.iter_mut().zip(&mut self.least).zip(powers) {
+            *sum = *sum + *power;
+            *least = if *power < *least { *power } else { *least };
+        }
     }
 
-    fn samples(&self) -> impl Iterator<Item = T> {
-        let (first, second): ([T; VECTOR_LANES], [T; VECTOR_LANES]) = (self.0.into(), self.1.into());
-        first.into_iter().chain(second)
+    pub(crate) fn sum(&self) -> f64 {
+        self.sums.into_iter().map(T::f64).sum()
+    }
+
+    pub(crate) fn least(&self) -> f64 {
+        self.least.into_iter().map(T::f64).fold(f64::INFINITY, f64::min)
     }
 }

@@ -1,7 +1,6 @@
 //! Division of the recording by the loopback in the Fourier domain, within the sweep's range.
 
 mod aligned;
-mod complex_vector;
 mod joint;
 mod pruned;
 pub mod response_deconvolution;
@@ -15,11 +14,10 @@ use realfft::num_complex::Complex;
 use rustfft::{Fft, FftDirection};
 
 use self::aligned::AlignedBuffer;
-use self::complex_vector::ComplexVector;
 use self::joint::{BinPower, SignalLevels};
 use self::pruned::PrunedInverse;
 use crate::error::check_len;
-use crate::{Error, RealSample, SampleVector as _, VECTOR_LANES};
+use crate::{Error, RealSample};
 
 /// Settings of a deconvolution.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -109,7 +107,7 @@ pub struct DeconvolutionScratch<T: RealSample> {
     joint: AlignedBuffer<Complex<T>>,
     /// Scratch of the transforms; between them, the quotient. One buffer, as the cache has no room for two.
     work: AlignedBuffer<Complex<T>>,
-    sums: Vec<ComplexVector<T>>,
+    sums: Vec<Complex<T>>,
 }
 
 impl<T: RealSample> DeconvolutionPlan<T> {
@@ -214,18 +212,10 @@ impl<T: RealSample> DeconvolutionPlan<T> {
         if ir.iter().all(|x| x.f64().is_finite()) { Ok(()) } else { Err(Error::NotFinite { what: "the response" }) }
     }
 
-    // Z of both signals times their gains, x + i s. The gain of the loopback alone would do, but numbers that are only moved
-    // are moved one by one where loops are compiled for size.
+    // Z of both signals times their gains, x + i s.
     fn transform(&self, x: &[T], s: &[T], gains: [T; 2], joint: &mut [Complex<T>], work: &mut [Complex<T>]) {
-        let (whole, rest) = joint[..self.recording_len].as_chunks_mut();
-        let ((x, x_rest), (s, s_rest)) = (x.as_chunks(), s.as_chunks());
-        let [x_gain, s_gain] = gains.map(T::Vector::from);
-        for (z, (x, s)) in whole.iter_mut().zip(x.iter().zip(s)) {
-            let (re, im) = (T::Vector::from(*x) * x_gain, T::Vector::from(*s) * s_gain);
-            *z = ComplexVector::<T> { re, im }.values();
-        }
         let [x_gain, s_gain] = gains;
-        for (z, (x, s)) in rest.iter_mut().zip(x_rest.iter().zip(s_rest)) {
+        for (z, (x, s)) in joint.iter_mut().zip(x.iter().zip(s)) {
             *z = Complex::new(*x * x_gain, *s * s_gain);
         }
         joint[self.recording_len..].fill(Complex::default());
@@ -289,8 +279,8 @@ impl<T: RealSample> DeconvolutionPlan<T> {
         }
     }
 
-    // Divides with the divisor's power raised to `floor`, times `gain` of the bin; returns the power before it is raised,
-    // times 4.
+    // Divides with the divisor's power raised to `floor`, times `gain` of the bin; returns the power before it is
+    // raised, times 4.
     fn divide_bins(
         &self,
         bins: Range<usize>,
@@ -303,18 +293,11 @@ impl<T: RealSample> DeconvolutionPlan<T> {
         let mut total = BinPower::none();
         for first in bins.clone().step_by(PIECE) {
             let count = PIECE.min(bins.end - first);
-            let (whole, rest) = joint[first..first + count].as_chunks();
-            let (mirrored_rest, mirrored) = joint[self.len + 1 - first - count..=self.len - first].as_rchunks();
-            // What is left is filled up to a vector.
-            let (mut last, mut mirrored_last) =
-                ([Complex::default(); VECTOR_LANES], [Complex::default(); VECTOR_LANES]);
-            last[..rest.len()].copy_from_slice(rest);
-            mirrored_last[VECTOR_LANES - rest.len()..].copy_from_slice(mirrored_rest);
-            let pairs = whole.iter().zip(mirrored.iter().rev()).chain([(&last, &mirrored_last)]);
-            let outputs = piece.as_chunks_mut().0.iter_mut().zip(powers.as_chunks_mut().0);
-            for (bin, ((z, mirrored), (to, power))) in (first..).step_by(VECTOR_LANES).zip(pairs.zip(outputs)) {
-                let gains = [gain(bin), gain(bin + 1), gain(bin + 2), gain(bin + 3)];
-                (*to, *power) = divide_lanes::<T>(z, mirrored, gains, floor);
+            // Mirror images are in the opposite order.
+            let mirrored = joint[self.len + 1 - first - count..=self.len - first].iter().rev();
+            let bins = joint[first..first + count].iter().zip(mirrored);
+            for (i, ((z, mirrored), (to, power))) in bins.zip(piece.iter_mut().zip(&mut powers)).enumerate() {
+                (*to, *power) = divide_bin(*z, *mirrored, gain(first + i), floor);
             }
             self.inverse.lay(first, &piece[..count], quotient);
             total.add(&powers[..count]);
@@ -323,26 +306,16 @@ impl<T: RealSample> DeconvolutionPlan<T> {
     }
 }
 
-// Gain X / S of neighbouring bins, and the power of 2 S before it is raised to `floor`. Mirror images are in their own
-// order, so the last belongs to the first bin.
+// Gain X / S of a bin and the bin of its mirror image, and the power of 2 S before it is raised to `floor`.
 #[inline]
-fn divide_lanes<T: RealSample>(
-    z: &[Complex<T>; VECTOR_LANES],
-    [m3, m2, m1, m0]: &[Complex<T>; VECTOR_LANES],
-    gains: [T; VECTOR_LANES],
-    floor: T,
-) -> ([Complex<T>; VECTOR_LANES], [T; VECTOR_LANES]) {
-    let (z, m) = (ComplexVector::from_values(z), ComplexVector::from_values(&[*m0, *m1, *m2, *m3]));
+fn divide_bin<T: RealSample>(z: Complex<T>, mirrored: Complex<T>, gain: T, floor: T) -> (Complex<T>, T) {
+    let b = mirrored.conj();
     // With d = Z - b = 2i S and u = Z + b = 2 X, X / S = i u conj(d) / |d|^2.
-    let (u, d) = (
-        ComplexVector::<T> { re: z.re + m.re, im: z.im - m.im },
-        ComplexVector::<T> { re: z.re - m.re, im: z.im + m.im },
-    );
-    let power = d.re * d.re + d.im * d.im;
-    let raised = T::Vector::from(gains) / power.greater(floor.into());
-    let quotient =
-        ComplexVector::<T> { re: (u.re * d.im - u.im * d.re) * raised, im: (u.re * d.re + u.im * d.im) * raised };
-    (quotient.values(), power.into())
+    let u = z + b;
+    let d = z - b;
+    let power = d.norm_sqr();
+    let raised = gain / if power > floor { power } else { floor };
+    (Complex::new((u.re * d.im - u.im * d.re) * raised, (u.re * d.re + u.im * d.im) * raised), power)
 }
 
 /// The least even length without prime factors above 5 that holds `len` samples.

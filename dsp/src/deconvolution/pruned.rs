@@ -5,8 +5,7 @@ use std::sync::Arc;
 use realfft::num_complex::Complex;
 use rustfft::{Fft, FftDirection};
 
-use super::complex_vector::ComplexVector;
-use crate::{RealSample, VECTOR_LANES};
+use crate::RealSample;
 
 /// Room behind each strand: rows of whole KiB would all fall into the same few lines of the cache.
 const GAP: usize = 8;
@@ -21,8 +20,8 @@ pub(crate) struct PrunedInverse<T: RealSample> {
     strands: usize,
     strand_len: usize,
     inverse: Arc<dyn Fft<T>>,
-    /// `[samples wanted / lanes]`: w of each sample.
-    turns: Vec<ComplexVector<T>>,
+    /// `[samples wanted]`: w of each sample.
+    turns: Vec<Complex<T>>,
 }
 
 impl<T: RealSample> PrunedInverse<T> {
@@ -32,12 +31,11 @@ impl<T: RealSample> PrunedInverse<T> {
             let (im, re) = (std::f64::consts::TAU * m as f64 / n as f64).sin_cos();
             Complex::new(T::of(re), T::of(im))
         };
-        let turns: Vec<_> = (0..output_len.min(n)).map(turn).collect();
         Self {
             strands: n / strand_len,
             strand_len,
             inverse: T::plan_fft(strand_len, FftDirection::Inverse),
-            turns: turns.chunks(VECTOR_LANES).map(ComplexVector::from_first).collect(),
+            turns: (0..output_len.min(n)).map(turn).collect(),
         }
     }
 
@@ -51,8 +49,8 @@ impl<T: RealSample> PrunedInverse<T> {
     }
 
     /// Room for sums between strands.
-    pub(crate) fn sums(&self) -> Vec<ComplexVector<T>> {
-        vec![ComplexVector::splat(Complex::default()); self.turns.len()]
+    pub(crate) fn sums(&self) -> Vec<Complex<T>> {
+        vec![Complex::default(); self.turns.len()]
     }
 
     /// Lays bins from `first` on, none of them past n / 2, into their strands; all from 0 to n / 2 must be laid.
@@ -88,31 +86,25 @@ impl<T: RealSample> PrunedInverse<T> {
         spectrum: &mut [Complex<T>],
         scale: T,
         out: &mut [T],
-        sums: &mut [ComplexVector<T>],
+        sums: &mut [Complex<T>],
         work: &mut [Complex<T>],
     ) {
-        sums.fill(ComplexVector::splat(Complex::default()));
-        let two = T::Vector::from(T::of(2.0));
+        sums.fill(Complex::default());
         let rows = spectrum.chunks_exact_mut(self.strand_len + GAP).enumerate();
         for (r, row) in rows.rev() {
             let strand = &mut row[..self.strand_len];
             self.inverse.process_with_scratch(strand, work);
-            let (whole, rest) = strand.as_chunks();
-            let rest = ComplexVector::from_first(rest);
-            let values = whole.iter().map(ComplexVector::from_values).chain([rest]);
-            let outputs = sums.iter_mut().zip(values);
+            let outputs = sums.iter_mut().zip(&*strand);
             if r == 0 {
-                for (out, (sum, x)) in out.chunks_mut(VECTOR_LANES).zip(outputs) {
-                    let samples: [T; VECTOR_LANES] = ((two * sum.re + x.re) * scale.into()).into();
-                    out.copy_from_slice(&samples[..out.len()]);
+                for (out, (sum, x)) in out.iter_mut().zip(outputs) {
+                    *out = (T::of(2.0) * sum.re + x.re) * scale;
                 }
                 return;
             }
             // A strand that is its own mirror image counts once.
-            let weight = T::Vector::from(if 2 * r == self.strands { T::of(0.5) } else { T::of(1.0) });
+            let weight = T::of(if 2 * r == self.strands { 0.5 } else { 1.0 });
             for ((sum, x), w) in outputs.zip(&self.turns) {
-                let (re, im) = (sum.re + x.re * weight, sum.im + x.im * weight);
-                *sum = ComplexVector { re: re * w.re - im * w.im, im: re * w.im + im * w.re };
+                *sum = (*sum + x * weight) * w;
             }
         }
     }

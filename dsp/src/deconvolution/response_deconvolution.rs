@@ -117,7 +117,8 @@ mod tests {
         }
     }
 
-    // The greatest difference between single precision and the definition in double precision, over the greatest sample.
+    // The greatest difference between single precision and the definition in double precision, over the greatest
+    // sample.
     fn difference(division: SpectralDivision) -> f64 {
         let sweep = LinearSweep { rate_hz: 96e3, duration_secs: 0.04, low_hz: 2e3, high_hz: 40e3, fade_secs: 0.001 };
         let mut loopback = sweep.samples();

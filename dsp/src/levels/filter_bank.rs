@@ -172,8 +172,8 @@ impl<T: RealSample> FilterBankPlan<T> {
         Ok(())
     }
 
-    /// Energy of a reflected response in each band, and what errors of the direct sound beneath it do to that energy, and
-    /// warmer air by its relative change in each bin.
+    /// Energy of a reflected response in each band, and what errors of the direct sound beneath it do to that energy,
+    /// and warmer air by its relative change in each bin.
     ///
     /// # Errors
     /// [`Error::Length`] or [`Error::NotFinite`].

@@ -1,4 +1,5 @@
-//! Times and slope of a cumulative energy curve: the paper's measure of how diffuse a reflection is is the curve's slope.
+//! Times and slope of a cumulative energy curve: the paper's measure of how diffuse a reflection is is the curve's
+//! slope.
 
 use crate::RealSample;
 
@@ -16,8 +17,8 @@ pub struct CurveShape {
     pub slope: f64,
 }
 
-/// Computes the shape of a curve that does not fall, from a sample before its first, where it is 0. None without energy,
-/// or if a value is not finite.
+/// Computes the shape of a curve that does not fall, from a sample before its first, where it is 0. None without
+/// energy, or if a value is not finite.
 ///
 /// ```
 /// use echolake_dsp::rise::curve_shape;

@@ -1,8 +1,8 @@
 //! Standard uncertainty of levels, from what the subtraction of the direct sound leaves.
 //!
-//! Speaker and microphone are never at the same place twice, the air is never the same, and the direct sound of two runs
-//! differs by a delay and a gain. Their size is measured in each run, before the reflection arrives. What they do to a
-//! level is linear in them for most measurements; squares are kept for those whose reflection is weak.
+//! Speaker and microphone are never at the same place twice, the air is never the same, and the direct sound of two
+//! runs differs by a delay and a gain. Their size is measured in each run, before the reflection arrives. What they do
+//! to a level is linear in them for most measurements; squares are kept for those whose reflection is weak.
 
 use std::f64::consts::LN_10;
 use std::sync::Arc;
@@ -16,8 +16,8 @@ use crate::{Error, RealSample};
 
 /// Least time between both arrivals of a pair that residuals are measured in, s.
 const LEAST_SEPARATION_SECS: f64 = 0.35e-3;
-/// Times before the reflection's arrival between which the measured part falls to nothing, s: the first parts of a relief
-/// reflect before the plane does, by 0.17 ms if they stand 30 mm over it.
+/// Times before the reflection's arrival between which the measured part falls to nothing, s: the first parts of a
+/// relief reflect before the plane does, by 0.17 ms if they stand 30 mm over it.
 const GATE_SECS: [f64; 2] = [0.3e-3, 0.2e-3];
 /// Time before the direct sound's arrival up to which there is noise alone, s.
 const NOISE_SECS: f64 = 0.4e-3;
@@ -69,8 +69,8 @@ pub struct ResidualFit<T: RealSample> {
     len: usize,
     forward: Arc<dyn RealToComplex<T>>,
     inverse: Arc<dyn ComplexToReal<T>>,
-    /// Gain of each bin, over the number of samples: falls smoothly to nothing at the limits of the sweep's range, so that
-    /// nothing rings from one arrival to the other.
+    /// Gain of each bin, over the number of samples: falls smoothly to nothing at the limits of the sweep's range, so
+    /// that nothing rings from one arrival to the other.
     bin_gains: Vec<f64>,
     /// Power of what is left of noise, over its density.
     noise_share: f64,
@@ -132,7 +132,8 @@ impl<T: RealSample> ResidualFit<T> {
     /// Begins with responses of `len` samples to sweeps of this range, Hz.
     ///
     /// # Errors
-    /// [`Error::Setting`] for no samples, a rate that is not finite and above 0, or a range that is not below half of it.
+    /// [`Error::Setting`] for no samples, a rate that is not finite and above 0, or a range that is not below half of
+    /// it.
     pub fn new(len: usize, rate_hz: f64, range_hz: [f64; 2]) -> Result<Self, Error> {
         if len == 0 || !(rate_hz.is_finite() && rate_hz > 0.0) {
             let actual = format!("{len} samples at {rate_hz} Hz");
@@ -312,8 +313,8 @@ impl TemperatureResponse {
 }
 
 impl LevelUncertainty {
-    /// Computes the relative error that a run's measurements have in common, and the variance of the rest, of the energy
-    /// of a measurement over Flat's; the run's air was so many kelvin warmer than Flat's.
+    /// Computes the relative error that a run's measurements have in common, and the variance of the rest, of the
+    /// energy of a measurement over Flat's; the run's air was so many kelvin warmer than Flat's.
     pub fn relative_error(&self, of: &EnergySensitivity, flat: &EnergySensitivity, warmer: f64) -> ErrorMoments {
         let per = |s: &EnergySensitivity, change: f64| change / s.energy;
         let both = |value: fn(&EnergySensitivity) -> f64| [of, flat].map(|s| per(s, value(s)));

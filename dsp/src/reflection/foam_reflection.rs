@@ -4,10 +4,10 @@
 //! same away from every surface: in phase from Flat, which it weakens, and out of phase from a relief whose reflection
 //! arrives at other times, to which it adds energy.
 //!
-//! Flat and Foam lie in the same plane, so both reflect the same waves: for each pair, Foam's reflection is that of Flat
-//! less Foam through a short filter k, which is the same for all pairs. It is fitted where the reflection arrives well
-//! after the direct sound. The direct sound is then Foam's response less k applied to the difference, also for pairs
-//! whose arrivals overlap.
+//! Flat and Foam lie in the same plane, so both reflect the same waves: for each pair, Foam's reflection is that of
+//! Flat less Foam through a short filter k, which is the same for all pairs. It is fitted where the reflection arrives
+//! well after the direct sound. The direct sound is then Foam's response less k applied to the difference, also for
+//! pairs whose arrivals overlap.
 
 use std::sync::Arc;
 

@@ -2,10 +2,10 @@
 //!
 //! With source at r1 and receiver at r2 from a facet dS,
 //! h(t) = 1/(4 pi) sum dS/(r1 r2) [ (cos1 + cos2)/c d'(t - tau) + (cos1/r1 + cos2/r2) d(t - tau) ],
-//! tau = (r1 + r2)/c: the tangent-plane approximation. [`FacetScattering`] tells which facets count, and what else is mixed
-//! in for slopes and details of the size of the wavelength. No multiple reflection, no diffraction of the diffracted, no
-//! shadows; worse at grazing angles. `tests/simulation/compare_bem.py` compares it with a boundary-element method.
-//! With facets of 2.14 mm a flat plate is within 0.04 dB of its image source, 2.5 to 40 kHz.
+//! tau = (r1 + r2)/c: the tangent-plane approximation. [`FacetScattering`] tells which facets count, and what else is
+//! mixed in for slopes and details of the size of the wavelength. No multiple reflection, no diffraction of the
+//! diffracted, no shadows; worse at grazing angles. `tests/simulation/compare_bem.py` compares it with a
+//! boundary-element method. With facets of 2.14 mm a flat plate is within 0.04 dB of its image source, 2.5 to 40 kHz.
 //!
 //! Directivity and the air's absorption, which depend on a facet's direction or distance and on the frequency, are
 //! gathered at a few frequencies at once and interpolated between them.
@@ -80,14 +80,14 @@ pub struct KirchhoffPlan {
 /// Scattering of facets that are not level.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FacetScattering {
-    /// Each facet scatters as a part of its tangent plane, and only if it faces microphone and speaker: what falls on steep
-    /// walls is lost.
+    /// Each facet scatters as a part of its tangent plane, and only if it faces microphone and speaker: what falls on
+    /// steep walls is lost.
     FacingTangent,
-    /// All facets count, those that face away with their negative cosines, so that the sum over a wall and its foot loses
-    /// nothing. Half of it is by tangent planes, half by the small-slope approximation of first order, whose weight
-    /// 4 (1 + t1 t2)/(z1 + z2), with t and z the parts of the unit vectors to both ends along the panel and over it, is
-    /// (cos1 + cos2) where a level facet mirrors and more beside it: details below the wavelength scatter sideways. The
-    /// half is what agrees best with the boundary-element method over all reliefs that were tried.
+    /// All facets count, those that face away with their negative cosines, so that the sum over a wall and its foot
+    /// loses nothing. Half of it is by tangent planes, half by the small-slope approximation of first order, whose
+    /// weight 4 (1 + t1 t2)/(z1 + z2), with t and z the parts of the unit vectors to both ends along the panel and over
+    /// it, is (cos1 + cos2) where a level facet mirrors and more beside it: details below the wavelength scatter
+    /// sideways. The half is what agrees best with the boundary-element method over all reliefs that were tried.
     ///
     /// Source: Voronovich 1994, Wave Scattering from Rough Surfaces, for a hard surface.
     Blended,
@@ -125,7 +125,8 @@ struct ReliefFacets {
     groups: Vec<FacetGroup>,
 }
 
-/// Neighbours of one row, which are weighed at once. The last group of a row is filled up with facets that weigh nothing.
+/// Neighbours of one row, which are weighed at once. The last group of a row is filled up with facets that weigh
+/// nothing.
 struct FacetGroup {
     place: [f32x8; 3],
     slope: [f32x8; 2],
@@ -167,8 +168,8 @@ struct FacetWeights {
 
 /// Buffers of a [`KirchhoffPlan`].
 pub struct KirchhoffScratch {
-    /// Weights of d' at each node, and of d, by time. Of d alone there is one: it matters at low frequencies only, where
-    /// directivity and absorption do not.
+    /// Weights of d' at each node, and of d, by time. Of d alone there is one: it matters at low frequencies only,
+    /// where directivity and absorption do not.
     derivative: Vec<f32x4>,
     plain: Vec<f32>,
     wide: Vec<f32>,
@@ -580,8 +581,8 @@ mod tests {
     }
 
     // Over the middle of a flat plate the first edge is 2.2 times as far as the image: gated before it, only the
-    // image source is left. By tangent planes 0.04 dB is the accuracy that this facet size has been measured to have; the
-    // small-slope approximation neglects the near field of slanting sound.
+    // image source is left. By tangent planes 0.04 dB is the accuracy that this facet size has been measured to have;
+    // the small-slope approximation neglects the near field of slanting sound.
     #[test]
     fn a_flat_plate_is_its_image_source() {
         let plate = HeightField::from_fn(PANEL_SIZE_MM, 274, |_, _| 0.0);
@@ -689,9 +690,9 @@ mod tests {
         }
     }
 
-    // Gains by direction and frequency reach reflection and direct sound alike. The reflection's spreads over facets, so
-    // its gain is that of the specular direction only to the accuracy of the plate's diffraction; a gain that depends on
-    // the frequency alone has to come out as it is.
+    // Gains by direction and frequency reach reflection and direct sound alike. The reflection's spreads over facets,
+    // so its gain is that of the specular direction only to the accuracy of the plate's diffraction; a gain that
+    // depends on the frequency alone has to come out as it is.
     #[test]
     fn directivity_and_air_act_on_the_reflection() {
         let plate = HeightField::from_fn(PANEL_SIZE_MM, 274, |_, _| 0.0);

@@ -90,8 +90,8 @@ impl HeightField {
         lower * (1.0 - v) + upper * v
     }
 
-    /// Root mean square of the heights beside their mean over squares of this width around them, mm: of what is narrower.
-    /// Squares end at the field's edges.
+    /// Root mean square of the heights beside their mean over squares of this width around them, mm: of what is
+    /// narrower. Squares end at the field's edges.
     pub fn detail_rms_mm(&self, width_mm: f64) -> f64 {
         let cells = self.cells;
         let reach = ((width_mm / self.pitch_mm() - 1.0) / 2.0).round().clamp(0.0, cells as f64) as usize;

@@ -21,8 +21,8 @@ const LONGEST: f64 = 2.0;
 /// use echolake_dsp::components::PrincipalComponents;
 /// use echolake_dsp::self_organising_map::SelfOrganisingMap;
 ///
-/// let mut rows: Vec<Vec<f32>> = (0..40).map(|i| vec![i as f32, 0.5 * i as f32, if i < 20 { 0.0 } else { 30.0 }]).collect();
-/// let map = SelfOrganisingMap::of(&PrincipalComponents::of(&mut rows, 2)?);
+/// let mut rows: Vec<Vec<f32>> = (0..40).map(|i| vec![i as f32, 0.5 * i as f32, if i < 20 { 0.0 } else { 30.0
+/// }]).collect(); let map = SelfOrganisingMap::of(&PrincipalComponents::of(&mut rows, 2)?);
 /// // Neighbours share a unit or are beside one another; the ends are far apart.
 /// let distance = |a: [usize; 2], b: [usize; 2]| a[0].abs_diff(b[0]).max(a[1].abs_diff(b[1]));
 /// assert!(distance(map.units[3], map.units[4]) <= 1);
