@@ -16,7 +16,10 @@ pub enum Error {
         hint: &'static str,
     },
     /// The system refused to write.
-    #[error("cannot write `{}`: {source}; hint: is its folder there and writable, and its disk not full?", path.display())]
+    #[error(
+        "cannot write `{}`: {source}; hint: is its folder there and writable, and its disk not full?",
+        path.display()
+    )]
     Write {
         /// The file or folder.
         path: PathBuf,
@@ -57,7 +60,8 @@ pub enum Error {
     },
     /// A run's file is not the one that was ingested.
     #[error(
-        "`{file}` is not the file that run {run} was ingested from: {source}; hint: bring the original back, `echolake doctor` lists all"
+        "`{file}` is not the file that run {run} was ingested from: {source}; hint: bring the original back, `echolake \
+         doctor` lists all"
     )]
     Changed {
         /// The run.

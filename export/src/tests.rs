@@ -36,20 +36,10 @@ async fn lake(home: &TempDir, keep: RecordingMode) -> Lake {
     for (number, surface) in SURFACES.into_iter().enumerate() {
         let name = if number < 2 { surface } else { "macrostructure" };
         let specimen = PanelSpecimen::Relief(PanelRelief::by_name(name).expect("a relief"));
-        let run = RunRequest {
-            rig: &rig,
-            surface: surface.parse().expect("an id"),
-            specimen: &specimen,
-            flat: None,
-            foam: None,
-            macro_reference: None,
-            project: None,
-            start: Timestamp(1_767_600_000_000_000_000).plus_secs(number as f64 * 3_600.0),
-            seed: number as u64 + 1,
-            tag: number as u64 + 1,
-            keep,
-            folder: &inbox,
-        };
+        let start = Timestamp(1_767_600_000_000_000_000).plus_secs(number as f64 * 3_600.0);
+        let seed = number as u64 + 1;
+        let run = RunRequest::new(&rig, surface.parse().expect("an id"), &specimen, start, &inbox);
+        let run = RunRequest { seed, tag: seed, keep, ..run };
         simulate(&run, Origin::Simulated, &AtomicBool::new(false), &mut |_| {}).expect("a run");
     }
     let ingest = LakeIngest::new(&lake, Arc::default());
@@ -138,7 +128,8 @@ mod slow {
         let once = [topics::PANEL_SCENE, topics::PANEL_POINTS, topics::ROBOT_DESCRIPTION];
         for run in &runs {
             for (topic, time, data) in messages(&std::fs::read(run_file(&lake, run)).expect("the run")) {
-                // Air is read a moment later than its measurement begins, and the log's lines are few: both by count below.
+                // Air is read a moment later than its measurement begins, and the log's lines are few: both by count
+                // below.
                 if topic != topics::LOG
                     && topic != topics::ENVIRONMENT
                     && (times.contains(&time) || once.contains(&topic.as_str()))

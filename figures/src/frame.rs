@@ -26,9 +26,10 @@ impl PlotAxis {
 
     /// Returns where a value is, 0 at the low end, 1 at the high end; values beyond are at the ends.
     fn share(self, value: f64) -> f64 {
-        let share = match self.is_log {
-            true => (value / self.low).ln() / (self.high / self.low).ln(),
-            false => (value - self.low) / (self.high - self.low),
+        let share = if self.is_log {
+            (value / self.low).ln() / (self.high / self.low).ln()
+        } else {
+            (value - self.low) / (self.high - self.low)
         };
         share.clamp(0.0, 1.0)
     }

@@ -81,8 +81,8 @@ pub struct GridPanel {
 }
 
 impl GridPanel {
-    /// Returns the panel of a surface: some bands of its levels. If there is a base, a surface and its levels, these are
-    /// subtracted from those of every other surface.
+    /// Returns the panel of a surface: some bands of its levels. If there is a base, a surface and its levels, these
+    /// are subtracted from those of every other surface.
     pub fn new(name: &str, levels_db: &[BandLevels], shown: &[usize], base: Option<(&str, &[BandLevels])>) -> Self {
         let own = shown.iter().filter_map(|band| levels_db.get(*band));
         let Some((base_name, base)) = base.filter(|(base_name, _)| *base_name != name) else {

@@ -15,7 +15,8 @@ pub struct FigureNotes {
     pub lake: String,
     /// Name and version of the program.
     pub program: String,
-    /// Origins of the data: `simulated`, `computed`, `measured`, `imported`; none if it is calculated from the rig alone.
+    /// Origins of the data: `simulated`, `computed`, `measured`, `imported`; none if it is calculated from the rig
+    /// alone.
     pub origins: Vec<String>,
 }
 

@@ -39,20 +39,10 @@ fn runs(surfaces: &[&str]) -> Vec<(String, Bytes)> {
     let one = |(number, surface): (usize, &&str)| {
         let relief = PanelRelief::guess(surface).expect("a name");
         let specimen = PanelSpecimen::Relief(PanelRelief::by_name(relief).expect("a relief"));
-        let run = RunRequest {
-            rig: &rig,
-            surface: surface.parse().expect("an id"),
-            specimen: &specimen,
-            flat: None,
-            foam: None,
-            macro_reference: None,
-            project: None,
-            start: Timestamp(1_767_600_000_000_000_000).plus_secs(number as f64 * 3_600.0),
-            seed: number as u64 + 1,
-            tag: number as u64 + 1,
-            keep: RecordingMode::ResponsesOnly,
-            folder: folder.path(),
-        };
+        let start = Timestamp(1_767_600_000_000_000_000).plus_secs(number as f64 * 3_600.0);
+        let seed = number as u64 + 1;
+        let run = RunRequest::new(&rig, surface.parse().expect("an id"), &specimen, start, folder.path());
+        let run = RunRequest { seed, tag: seed, keep: RecordingMode::ResponsesOnly, ..run };
         let (path, _) = simulate(&run, Origin::Simulated, &AtomicBool::new(false), &mut |_| {}).expect("a run");
         let name = path.file_name().expect("a name").to_string_lossy().into_owned();
         (name, Bytes::from(std::fs::read(path).expect("read")))

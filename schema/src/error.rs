@@ -61,7 +61,10 @@ pub enum Error {
         message: String,
     },
     /// A point that the rig's grid does not have.
-    #[error("{given} is not a point of the rig's grid ({expected}){}", nearest.as_deref().map(|n| format!("; the nearest is {n}")).unwrap_or_default())]
+    #[error(
+        "{given} is not a point of the rig's grid ({expected}){}",
+        nearest.as_deref().map(|n| format!("; the nearest is {n}")).unwrap_or_default()
+    )]
     Point {
         /// The given point.
         given: String,

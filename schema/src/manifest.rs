@@ -234,8 +234,8 @@ impl RunManifest {
         .into()
     }
 
-    /// Returns whether it may be the manifest of a damaged file of this name. It has no CRC of its own: the run's name must
-    /// say the same surface and start, and be the file's, or measurements could become those of another run.
+    /// Returns whether it may be the manifest of a damaged file of this name. It has no CRC of its own: the run's name
+    /// must say the same surface and start, and be the file's, or measurements could become those of another run.
     pub fn fits_file_name(&self, name: &str) -> bool {
         let run = self.run_id.as_str();
         let file = name.rsplit(['/', '\\']).next().unwrap_or_default();

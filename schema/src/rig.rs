@@ -83,8 +83,8 @@ pub struct ImpulseResponse {
     pub division: SpectralDivision,
 }
 
-/// Division of the recording's spectrum by the loopback's at the limits of the sweep's range and beyond them; in between
-/// it is exact.
+/// Division of the recording's spectrum by the loopback's at the limits of the sweep's range and beyond them; in
+/// between it is exact.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum SpectralDivision {
     /// Nothing is left beyond the limits, and the quotient rises from there over a half cosine as wide as the response

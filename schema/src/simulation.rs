@@ -14,8 +14,8 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct SimulationParams {
-    /// Steep facets scatter as the boundary-element method says, as far as that goes without second reflections; if off,
-    /// what falls on facets that face away is lost.
+    /// Steep facets scatter as the boundary-element method says, as far as that goes without second reflections; if
+    /// off, what falls on facets that face away is lost.
     pub steep_facets: bool,
     /// Materials reflect each frequency as they do; if off, all frequencies alike.
     pub material_spectra: bool,

@@ -11,8 +11,8 @@ const PRINT_ABSORPTION: f64 = 0.048;
 const PRINT_SHELF_HZ: [f64; 2] = [20_000.0, 31_200.0];
 /// Pressure reflection factor of the board.
 const BOARD_FACTOR: f64 = 0.99;
-/// Thickness of the foam (Rust et al. 2021), m, and its resistance to flow, Pa s/m^2: an assumption amid the 8 to 20 kPa
-/// s/m^2 that is usual for melamine foam.
+/// Thickness of the foam (Rust et al. 2021), m, and its resistance to flow, Pa s/m^2: an assumption amid the 8 to 20
+/// kPa s/m^2 that is usual for melamine foam.
 const FOAM_M: f64 = 0.05;
 const FOAM_RESISTIVITY: f64 = 10e3;
 /// Speed of sound at 20 C, m/s.

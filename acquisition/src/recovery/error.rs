@@ -31,7 +31,10 @@ pub enum Error {
         source: ErrorCause,
     },
     /// There are whole measurements in it, but no run can be made of them.
-    #[error("no run can be made of `{}`: {source}; hint: keep the file, and look for another copy of it", path.display())]
+    #[error(
+        "no run can be made of `{}`: {source}; hint: keep the file, and look for another copy of it",
+        path.display()
+    )]
     Unusable {
         /// The file.
         path: PathBuf,
@@ -47,7 +50,10 @@ pub enum Error {
         source: ErrorCause,
     },
     /// The run was finished or recovered before.
-    #[error("`{}` is there already, made of this recording; hint: delete it if the recording is to be resumed", path.display())]
+    #[error(
+        "`{}` is there already, made of this recording; hint: delete it if the recording is to be resumed",
+        path.display()
+    )]
     Finished {
         /// The run's file.
         path: PathBuf,

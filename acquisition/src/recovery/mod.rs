@@ -56,10 +56,7 @@ impl Report {
 /// Where a recording is rebuilt to, if nobody says otherwise: beside it, under the name that it would have had, or
 /// with `.recovered` in it where it has that name.
 pub fn beside(from: &Path) -> PathBuf {
-    match is_partial(from) {
-        true => from.with_extension(""),
-        false => from.with_extension("recovered.mcap"),
-    }
+    if is_partial(from) { from.with_extension("") } else { from.with_extension("recovered.mcap") }
 }
 
 /// Rebuilds `from` as `to`, reads it back, and only then gives it its name. A whole file is left alone, unless it is a

@@ -67,8 +67,8 @@ impl RecordingSurvey {
         Ok(survey)
     }
 
-    // The chunk that describes the channels may be damaged, and a recording that was cut off has no summary. Its channels
-    // are then those that this version's recorder gives every run.
+    // The chunk that describes the channels may be damaged, and a recording that was cut off has no summary. Its
+    // channels are then those that this version's recorder gives every run.
     fn name_channels(&mut self, by_channel: &BTreeMap<u16, u64>) {
         let is_unknown = |survey: &Self, id: &u16| !survey.channels.contains_key(id);
         let is_ours =
@@ -111,8 +111,8 @@ impl RecordingSurvey {
                 return Ok(manifest);
             }
             Some(Ok(manifest)) => format!(
-                "it is damaged, and its manifest may be: it says run `{}`, which is not the file's name; if it is right, \
-                 name the file after the run",
+                "it is damaged, and its manifest may be: it says run `{}`, which is not the file's name; if it is \
+                 right, name the file after the run",
                 manifest.run_id
             ),
         };

@@ -3,14 +3,15 @@
 use std::path::Path;
 use std::slice::from_ref;
 
-use echolake_schema::manifest::{Origin, RunEnd, RunManifest};
+use echolake_schema::manifest::RunEnd;
 use echolake_schema::messages::{AmbientSample, ImpulseResponse, Measurement, Verdict};
-use echolake_schema::{Rig, RunId, SurfaceRecord, Timestamp, topics};
+use echolake_schema::{Rig, Timestamp, topics};
 use mcap::read::Options;
 use prost::Message as _;
 
 use super::*;
-use crate::run::recorder::{Held, Recorder, RunStart, SOFTWARE, Tried};
+use crate::run::recorder::tests::create_flat;
+use crate::run::recorder::{Held, Recorder, Tried};
 
 /// Pairs of the run, one a checkpoint.
 const PAIRS: u32 = 20;
@@ -35,18 +36,7 @@ fn end() -> RunEnd {
 /// A run of [`PAIRS`], and how long its file was after each checkpoint.
 fn whole(path: &Path) -> Vec<u64> {
     let rig = Rig::paper();
-    let surface = "flat".parse().expect("an id");
-    let manifest = RunManifest {
-        run_id: RunId::compose(START, &surface, 1).expect("an id"),
-        surface_id: surface,
-        started: START,
-        software: SOFTWARE.into(),
-        rig: rig.name.clone(),
-        origin: Origin::Simulated,
-    };
-    let (surface, plan) = (SurfaceRecord::default(), Some(BTreeMap::new()));
-    let start = RunStart { manifest: &manifest, rig: &rig, surface: &surface, relief: None, plan };
-    let mut recorder = Recorder::create(path, &start).expect("a recorder");
+    let mut recorder = create_flat(path, &rig, START, Some(BTreeMap::new()));
     let lengths = (0..PAIRS).map(|pair| {
         attempt(&mut recorder, pair, 1);
         recorder.checkpoint().expect("on the disk");

@@ -56,8 +56,8 @@ pub(super) struct Message {
 }
 
 impl Recording {
-    /// Opens a file and reads its index. One without, because it was cut off or is damaged, is walked through, and what is
-    /// whole of it is replayed.
+    /// Opens a file and reads its index. One without, because it was cut off or is damaged, is walked through, and what
+    /// is whole of it is replayed.
     ///
     /// # Errors
     /// [`Error::Read`], or [`Error::Unplayable`] where there is not one whole message.
@@ -221,9 +221,10 @@ fn walked(path: &Path) -> Result<Walked, Error> {
     }
     // What was closed, yet has no chunks, is of another make, not damaged.
     let damage = walk.finish().map_err(unread)?.damage;
-    let defect = match damage.is_empty() {
-        true => (!chunks.is_empty()).then(|| "it has no index".to_owned()),
-        false => Some(damage.join("; ")),
+    let defect = if damage.is_empty() {
+        (!chunks.is_empty()).then(|| "it has no index".to_owned())
+    } else {
+        Some(damage.join("; "))
     };
     Ok((topics_of(definitions.into_channels().values().map(|c| c.as_ref())), chunks, defect))
 }

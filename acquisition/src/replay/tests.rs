@@ -13,7 +13,6 @@ use tungstenite::client::IntoClientRequest as _;
 
 use super::*;
 use crate::panel::relief::PanelRelief;
-use crate::run::controller::RecordingMode;
 use crate::run::simulate::simulate;
 use crate::run::{PanelSpecimen, RunRequest};
 
@@ -29,20 +28,8 @@ const ONCE: [&str; 3] = [topics::PANEL_SCENE, topics::PANEL_POINTS, topics::ROBO
 fn run(folder: &Path, surface: &str, hours: f64) -> PathBuf {
     let rig = Rig::from_toml(SMALL_RIG).expect("a rig");
     let specimen = PanelSpecimen::Relief(PanelRelief::by_name("flat").expect("a relief"));
-    let run = RunRequest {
-        rig: &rig,
-        surface: surface.parse().expect("an id"),
-        specimen: &specimen,
-        flat: None,
-        foam: None,
-        macro_reference: None,
-        project: None,
-        start: Timestamp(START).plus_secs(hours * 3_600.0),
-        seed: 1,
-        tag: 1,
-        keep: RecordingMode::Sweeps,
-        folder,
-    };
+    let start = Timestamp(START).plus_secs(hours * 3_600.0);
+    let run = RunRequest::new(&rig, surface.parse().expect("an id"), &specimen, start, folder);
     simulate(&run, Origin::Simulated, &AtomicBool::new(false), &mut |_| {}).expect("a run").0
 }
 

@@ -43,16 +43,13 @@ pub fn audio(audio: &mut dyn AudioInterface) {
         last = started;
         let power = |x: &[i32]| x.iter().map(|x| (f64::from(*x) / 8_388_608.0).powi(2)).sum::<f64>() / x.len() as f64;
         let sent = output.iter().map(|x| f64::from(*x).powi(2)).sum::<f64>() / output.len() as f64;
-        match sent > 0.0 {
-            true => {
-                assert!((0.01..4.0).contains(&(power(&take.loopback) / sent)), "the loopback has the output's level");
-                let likeness = likeness(output, &take.loopback);
-                assert!(likeness > 0.8, "the loopback carries the output: correlation {likeness}");
-            }
-            false => {
-                assert!(power(&take.loopback) < 1e-6, "silence stays silent");
-                assert!(take.microphone.iter().all(|x| x.abs() < (1 << 23) - 1), "silence does not reach full scale");
-            }
+        if sent > 0.0 {
+            assert!((0.01..4.0).contains(&(power(&take.loopback) / sent)), "the loopback has the output's level");
+            let likeness = likeness(output, &take.loopback);
+            assert!(likeness > 0.8, "the loopback carries the output: correlation {likeness}");
+        } else {
+            assert!(power(&take.loopback) < 1e-6, "silence stays silent");
+            assert!(take.microphone.iter().all(|x| x.abs() < (1 << 23) - 1), "silence does not reach full scale");
         }
     }
 }

@@ -1,5 +1,5 @@
-//! Whole runs of the simulated rig, whatever devices a rig file names: for demos, twins of measured panels, benchmarks and
-//! tests.
+//! Whole runs of the simulated rig, whatever devices a rig file names: for demos, twins of measured panels, benchmarks
+//! and tests.
 
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};

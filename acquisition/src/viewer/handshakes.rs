@@ -23,9 +23,10 @@ impl PendingHandshakes {
         let address = stream.peer_addr()?.ip();
         let mut pending = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let is_full = pending.iter().filter(|(of, _)| *of == address).count() >= MOST_OF_ADDRESS;
-        let oldest = match is_full {
-            true => pending.iter().position(|(of, _)| *of == address),
-            false => (pending.len() >= MOST_OF_ALL).then_some(0),
+        let oldest = if is_full {
+            pending.iter().position(|(of, _)| *of == address)
+        } else {
+            (pending.len() >= MOST_OF_ALL).then_some(0)
         };
         if let Some(oldest) = oldest {
             let (_, ended) = pending.remove(oldest);

@@ -98,19 +98,14 @@ impl SimulationOrder<'_> {
     }
 
     fn run(&self, number: usize, member: &CollectionSurface) -> Result<(PathBuf, RunEnd)> {
+        let rig = Rig::paper();
+        let specimen = PanelSpecimen::Relief(member.relief.clone());
+        let start = FIRST_START.plus_secs(number as f64 * RUN_EVERY_SECS);
         let run = RunRequest {
-            rig: &Rig::paper(),
-            surface: member.surface.clone(),
-            specimen: &PanelSpecimen::Relief(member.relief.clone()),
-            flat: None,
-            foam: None,
-            macro_reference: None,
-            project: None,
-            start: FIRST_START.plus_secs(number as f64 * RUN_EVERY_SECS),
             seed: self.seed.wrapping_mul(1_000).wrapping_add(number as u64),
             tag: number as u64,
             keep: self.keep,
-            folder: self.folder,
+            ..RunRequest::new(&rig, member.surface.clone(), &specimen, start, self.folder)
         };
         let stop = AtomicBool::new(false);
         let made =

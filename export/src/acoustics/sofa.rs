@@ -41,7 +41,8 @@ fn fill(file: &H5File, lake: &Lake, responses: &SurfaceResponses) -> std::result
     let first = Timestamp(responses.log_time_ns.iter().copied().min().unwrap_or(0)).to_string();
     let date = first.replace('T', " ").chars().take(19).collect::<String>();
     let comment = format!(
-        "Surface {}, run {}. Responses over the loopback, on the time axis of {reference} C, direct sound still in them.",
+        "Surface {}, run {}. Responses over the loopback, on the time axis of {reference} C, direct sound still in \
+         them.",
         responses.run.surface, responses.run.run
     );
     for (name, value) in [

@@ -31,7 +31,9 @@ impl CardContents<'_> {
         let surfaces: usize = self.exported.parts.iter().map(|p| p.surfaces).sum();
         let rate = self.lake.rig().sweep.rate_hz.get();
         format!(
-            "{rows} acoustic reflections of {surfaces} relief surfaces: impulse responses at {rate} Hz between a microphone and a speaker over each surface, their energies by band over those of a flat plate, and the surfaces' height maps."
+            "{rows} acoustic reflections of {surfaces} relief surfaces: impulse responses at {rate} Hz between a \
+             microphone and a speaker over each surface, their energies by band over those of a flat plate, and the \
+             surfaces' height maps."
         )
     }
 
@@ -65,12 +67,15 @@ pub(super) fn write(about: &CardContents<'_>) -> String {
     }
     let _ = writeln!(text, "\n## Splits\n\n{} (`{}`, seed {})", about.split_words(), split.by.name(), split.seed);
     text.push_str(
-        "No physical panel (column `group`) is in two splits: neither a side of it, nor a repeated run, nor a symmetry.\n",
+        "No physical panel (column `group`) is in two splits: neither a side of it, nor a repeated run, nor a \
+         symmetry.\n",
     );
     text.push_str(if about.plan.set.references {
-        "References are among the rows, for training only, because they are in every number anyway: leave out rows whose `typology` is `reference` to learn reliefs. Foam has no energy, Flat is 1 by definition.\n\n"
+        "References are among the rows, for training only, because they are in every number anyway: leave out rows \
+         whose `typology` is `reference` to learn reliefs. Foam has no energy, Flat is 1 by definition.\n\n"
     } else {
-        "References (Flat, Foam and other plain plates) are no rows of this set, because Foam has no energy, Flat is 1 by definition, and the height maps of all are zero; `--references` puts them into split train.\n\n"
+        "References (Flat, Foam and other plain plates) are no rows of this set, because Foam has no energy, Flat is 1 \
+         by definition, and the height maps of all are zero; `--references` puts them into split train.\n\n"
     });
     text.push_str(
         "| split | files | panels | surfaces | rows | height maps |\n| --- | ---: | ---: | ---: | ---: | ---: |\n",
@@ -118,7 +123,8 @@ pub(super) fn write(about: &CardContents<'_>) -> String {
 
 fn front_matter(about: &CardContents<'_>) -> String {
     let mut text = format!(
-        "---\npretty_name: Reflections of relief surfaces\nlicense: {}\nsize_categories:\n- {}\ntags:\n- acoustics\n- impulse-response\nconfigs:\n",
+        "---\npretty_name: Reflections of relief surfaces\nlicense: {}\nsize_categories:\n- {}\ntags:\n- acoustics\n- \
+         impulse-response\nconfigs:\n",
         about.plan.set.license.as_deref().unwrap_or("unknown"),
         size_category(about.exported.parts.iter().map(|p| p.rows).sum()),
     );
@@ -163,11 +169,24 @@ fn size_category(rows: u64) -> &'static str {
 
 fn files(text: &mut String, about: &CardContents<'_>) {
     text.push_str(
-        "\n## Files\n\n- `data/<split>-*.parquet`: measurements. Whole surfaces in a file, one row group a surface, in a drawn order.\n- `heightmaps/<split>.parquet`: the surfaces' heights, joined by `surface_id` and `symmetry`.\n- `surfaces.csv`: every surface and run, its file, rows, and the digests of what its rows were derived from.\n- `croissant.json`: the same as Croissant metadata. `SHA256SUMS`: `sha256sum -c SHA256SUMS` checks all files.\n\n",
+        "\n## Files\n\n- `data/<split>-*.parquet`: measurements. Whole surfaces in a file, one row group a surface, in \
+         a drawn order.\n- `heightmaps/<split>.parquet`: the surfaces' heights, joined by `surface_id` and \
+         `symmetry`.\n- `surfaces.csv`: every surface and run, its file, rows, and the digests of what its rows were \
+         derived from.\n- `croissant.json`: the same as Croissant metadata. `SHA256SUMS`: `sha256sum -c SHA256SUMS` \
+         checks all files.\n\n",
     );
     text.push_str(match about.plan.set.symmetries {
-        RowSymmetries::None => "Rows are as they were measured. The grid and the panel have the eight symmetries of a square; `echolake.torch.Measurements(symmetries=\"all\")` turns positions and height maps together while it loads.\n",
-        RowSymmetries::All => "Every measurement stands there under each of the square's eight symmetries: its positions are turned, its numbers are the same, and the height map of the same `symmetry` is turned with it. Where `swapped` is true, microphone and speaker changed places as well, which relies on reciprocity; leave these rows out where that is not wanted.\n",
+        RowSymmetries::None => {
+            "Rows are as they were measured. The grid and the panel have the eight symmetries of a \
+            square; `echolake.torch.Measurements(symmetries=\"all\")` turns positions and height maps together while \
+            it loads.\n"
+        }
+        RowSymmetries::All => {
+            "Every measurement stands there under each of the square's eight symmetries: its \
+            positions are turned, its numbers are the same, and the height map of the same `symmetry` is turned with \
+            it. Where `swapped` is true, microphone and speaker changed places as well, which relies on reciprocity; \
+            leave these rows out where that is not wanted.\n"
+        }
     });
     let _ = writeln!(
         text,

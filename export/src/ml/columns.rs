@@ -117,7 +117,8 @@ fn keys() -> Vec<FieldRef> {
             "symmetry",
             DataType::Utf8,
             "",
-            "What the row is turned by: identity, rot90, rot180, rot270, mirror_x, mirror_y, mirror_diag or mirror_anti",
+            "What the row is turned by: identity, rot90, rot180, rot270, mirror_x, mirror_y, mirror_diag or \
+             mirror_anti",
         ),
         field("split", DataType::Utf8, "", "train, validation or test"),
         field("group", DataType::Utf8, "", "Physical panel: all of its sides, runs and symmetries are in one split"),

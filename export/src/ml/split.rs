@@ -96,10 +96,8 @@ pub(super) fn assign(surfaces: &[TrainingSurface], split: SplitParams) -> Result
         }
     }
     let part = |surface: &TrainingSurface| {
-        let of_panel = match fixed.contains_key(surface.id.panel()) {
-            true => SplitPart::Train,
-            false => *rarest.get(surface.id.panel())?,
-        };
+        let of_panel =
+            if fixed.contains_key(surface.id.panel()) { SplitPart::Train } else { *rarest.get(surface.id.panel())? };
         (own(surface) == of_panel || fixed.contains_key(surface.id.panel())).then_some(of_panel)
     };
     Ok(surfaces.iter().map(part).collect())

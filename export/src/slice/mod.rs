@@ -35,8 +35,8 @@ const SLICE_METADATA: &str = "echolake.slice";
 /// Metadata record of each of its runs: the run's own manifest. Under another name than in a run's file, so that no
 /// slice is ever taken for a run.
 const SLICE_RUN_METADATA: &str = "echolake.slice.run";
-/// Key in it, before an attachment's name in the run's file: the slice's attachment with these bytes, if that has another
-/// run's name.
+/// Key in it, before an attachment's name in the run's file: the slice's attachment with these bytes, if that has
+/// another run's name.
 const SAME_ATTACHMENT: &str = "attachment.";
 
 /// A measurement that a slice is to have, as table `measurements` has it.

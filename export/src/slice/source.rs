@@ -107,9 +107,10 @@ impl Source {
             sha.update(self.read(start..(start + BLOCK).min(self.file.bytes)).await?);
         }
         let actual = hex::encode(sha.finalize());
-        match actual == self.file.sha256 {
-            true => Ok(()),
-            false => Err(self.file.changed(format!("its SHA-256 is {actual}, expected {}", self.file.sha256))),
+        if actual == self.file.sha256 {
+            Ok(())
+        } else {
+            Err(self.file.changed(format!("its SHA-256 is {actual}, expected {}", self.file.sha256)))
         }
     }
 
@@ -211,8 +212,9 @@ async fn read_tail(store: &dyn ObjectStore, file: &RunFile) -> Result<Bytes> {
             _ => return Err(file.unread(error)),
         },
     };
-    match size == file.bytes {
-        true => Ok(tail),
-        false => Err(file.changed(format!("it has {size} bytes, expected {}", file.bytes))),
+    if size == file.bytes {
+        Ok(tail)
+    } else {
+        Err(file.changed(format!("it has {size} bytes, expected {}", file.bytes)))
     }
 }

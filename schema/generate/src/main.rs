@@ -1,4 +1,5 @@
-//! Compiles the messages of `schema/proto` into `schema/src/messages`; with `--check` it only says whether they are those.
+//! Compiles the messages of `schema/proto` into `schema/src/messages`; with `--check` it only says whether they are
+//! those.
 //!
 //! Their result is kept beside the sources, so that building echolake needs no compiler of protobuf: protox and
 //! prost-build were a tenth of the build of the program for the rig.

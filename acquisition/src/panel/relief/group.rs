@@ -181,7 +181,8 @@ impl GroupRanges {
         let known = PanelRelief::by_name(&self.relief)?.describe();
         let (judgement, change) = if factor > 1.0 { ("too alike", "wider") } else { ("far apart", "narrower") };
         let mut reasons = vec![format!(
-            "The last group's results lie {spread_db:.2} dB apart, {:.2} dB are wanted: {judgement}, so ranges become {factor:.2} times as wide ({change}).",
+            "The last group's results lie {spread_db:.2} dB apart, {:.2} dB are wanted: {judgement}, so ranges become \
+             {factor:.2} times as wide ({change}).",
             self.target_spread_db
         )];
         let mut next = Self { seed: self.seed.wrapping_add(1), ..self.clone() };

@@ -1,7 +1,7 @@
 //! Walls in three layers, as the paper makes its panels: any large shape, with any stones, with any joints and skin.
 //!
-//! Parameters are full-scale: the panel is a tenth of the wall. Not all of them at their greatest fit the relief's 40 mm
-//! together: [`LayeredWall::check_depth`] refuses what does not.
+//! Parameters are full-scale: the panel is a tenth of the wall. Not all of them at their greatest fit the relief's 40
+//! mm together: [`LayeredWall::check_depth`] refuses what does not.
 
 use super::chance::SeededRandom;
 use super::macrostructure::{self, MacrostructureModel};

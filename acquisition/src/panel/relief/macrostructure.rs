@@ -18,8 +18,9 @@ pub(super) const PARAMETERS: [ReliefParameter; 4] = [
         "macro_depth_mm",
         LAYER,
         [0.0, 400.0, 120.0],
-        "height of the large shape from its lowest to its highest point; nothing where it is flat. Waves 200 mm high and 2500 \
-         mm long focus by 10 dB at some pairs in their troughs, a bowl over the whole panel is too shallow for that",
+        "height of the large shape from its lowest to its highest point; nothing where it is flat. Waves 200 mm high \
+         and 2500 mm long focus by 10 dB at some pairs in their troughs, a bowl over the whole panel is too shallow \
+         for that",
     ),
     ReliefParameter::mm("macro_wavelength_mm", LAYER, [600.0, 6000.0, 2500.0], "from crest to crest"),
     ReliefParameter::number(

@@ -53,7 +53,8 @@ const SPOILED_LEVEL_DB: f64 = 78.0;
 const SPOILED_NOISE: f64 = 3e-3;
 /// Full scale of 24 bits.
 const FULL_SCALE: f64 = 8_388_608.0;
-/// Seed of the arms' calibration: it is the rig's, not the run's, so that Foam and Flat are measured at the same places.
+/// Seed of the arms' calibration: it is the rig's, not the run's, so that Foam and Flat are measured at the same
+/// places.
 const CALIBRATION_SEED: u64 = 0xCA11;
 /// Told from the seed of noise and air by this.
 const PLACES_SEED: u64 = 0x91AC;
@@ -265,8 +266,8 @@ impl RobotArms for SimulatedRobots {
 }
 
 impl SimulatedRobots {
-    // Axes of microphone and speaker: as the arms hold them, or, without a model of the arms, the microphone straight down
-    // and the speaker at the point that mirrors to it.
+    // Axes of microphone and speaker: as the arms hold them, or, without a model of the arms, the microphone straight
+    // down and the speaker at the point that mirrors to it.
     fn axes(&self, joints: Option<&[Joints; 2]>, microphone_mm: [f64; 3], speaker_mm: [f64; 3]) -> [[f64; 3]; 2] {
         if let (Some(arms), Some([microphone, speaker])) = (&self.arms, joints) {
             let cell = arms.cell();

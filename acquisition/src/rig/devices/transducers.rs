@@ -10,8 +10,8 @@ const MEMBRANE_M: f64 = 0.01;
 const SPEED_M_S: f64 = 343.2;
 /// Nodes of the quadrature over the membrane: exact to 1e-9 up to 60 kHz.
 const MEMBRANE_NODES: usize = 16;
-/// The tweeter's response is not published. These resonances, Hz, dB and quality, make Flat's shares of the bands those of
-/// the paper's table 2.
+/// The tweeter's response is not published. These resonances, Hz, dB and quality, make Flat's shares of the bands those
+/// of the paper's table 2.
 const RESONANCES: [(f64, f64, f64); 2] = [(3_530.0, 7.1, 1.3), (30_400.0, 5.5, 1.6)];
 /// Level of the tweeter beside its resonances: with it the direct sound keeps its distance from full scale.
 const TWEETER_FACTOR: f64 = 0.5;

@@ -51,7 +51,10 @@ impl AlsaDuplex {
         let rate_hz = self.rate_hz;
         self.set(&pcm, channels).map_err(|e| {
             let format = self.params.format;
-            format!("`{name}` does not do {channels} channels of {format:?} at {rate_hz} Hz: {e}; hint: a `hw:` name, and its own format")
+            format!(
+                "`{name}` does not do {channels} channels of {format:?} at {rate_hz} Hz: {e}; hint: a `hw:` name, \
+                and its own format"
+            )
         })?;
         Ok(pcm)
     }
@@ -75,7 +78,8 @@ impl AlsaDuplex {
 
     fn run(&self, played: &[u8], captured: &mut [u8]) -> Result<Timestamp, TransferError> {
         let [player, recorder] = [self.pcm(Direction::Playback), self.pcm(Direction::Capture)];
-        let (player, recorder) = (player.map_err(TransferError::Gone)?, recorder.map_err(TransferError::Gone)?);
+        let (player, recorder) =
+            (player.map_err(TransferError::Permanent)?, recorder.map_err(TransferError::Permanent)?);
         // PCMs that cannot be linked are started one after the other; the loopback shows the difference.
         let linked = recorder.link(&player).is_ok();
         let [out_frame, in_frame] = [self.params.outputs, self.params.inputs].map(|n| n as usize * self.sample_bytes());
@@ -150,9 +154,10 @@ fn write(player: &PCM, bytes: &[u8], most: usize) -> Result<usize, TransferError
 }
 
 fn trouble(e: alsa::Error) -> TransferError {
-    match LATE.contains(&e.errno().abs()) {
-        true => TransferError::Late(format!("overrun or underrun ({e})")),
-        false => TransferError::Gone(format!("{e}; hint: is the interface still plugged in?")),
+    if LATE.contains(&e.errno().abs()) {
+        TransferError::Transient(format!("overrun or underrun ({e})"))
+    } else {
+        TransferError::Permanent(format!("{e}; hint: is the interface still plugged in?"))
     }
 }
 

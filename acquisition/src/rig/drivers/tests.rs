@@ -5,9 +5,9 @@ use std::path::Path;
 use std::sync::Arc;
 
 use echolake_schema::devices::RosbridgeParams;
-use echolake_schema::manifest::{RunEnd, RunManifest};
+use echolake_schema::manifest::RunEnd;
 use echolake_schema::messages::Measurement;
-use echolake_schema::{Rig, RunId, SurfaceRecord, Timestamp, topics};
+use echolake_schema::{Rig, Timestamp, topics};
 use prost::Message as _;
 
 use super::audio::AlignedAudio;
@@ -22,13 +22,14 @@ use crate::rig::devices::{DeviceRequest, simulated_devices};
 use crate::run::controller::{
     Error as RunError, RecordingMode, RunControl, RunController, RunEvent, RunOptions, RunWorkload,
 };
-use crate::run::recorder::{Recorder, RunStart, Tried};
+use crate::run::recorder::tests::create_flat;
+use crate::run::recorder::{Recorder, Tried};
 use crate::run::session::{PreflightMode, RunSession, TakePace};
 use crate::run::{PanelSpecimen, RunRequest};
 
 // A cable is no air: its sound comes at the wrong time for any distance.
-const RIG: &str = "sweep.duration_secs = 0.1\nvalidation.attempts = 1\nvalidation.arrival_us = 1e6\n[grid]\nclearance_mm = 0\npoints_mm = \
-    [[-62.5, 62.5, 124.0], [62.5, -62.5, 214.0], [0.0, 0.0, 304.0]]";
+const RIG: &str = "sweep.duration_secs = 0.1\nvalidation.attempts = 1\nvalidation.arrival_us = 1e6\n\
+    [grid]\nclearance_mm = 0\npoints_mm = [[-62.5, 62.5, 124.0], [62.5, -62.5, 214.0], [0.0, 0.0, 304.0]]";
 
 /// The far ends of the three devices.
 struct FakeDevices {
@@ -92,18 +93,7 @@ impl FinishedRun {
 
 fn begun(room: &FakeDevices, folder: &Path) -> Recorder {
     let (rig, start) = (&room.rig, Timestamp::now());
-    let surface = "flat".parse().expect("an id");
-    let manifest = RunManifest {
-        run_id: RunId::compose(start, &surface, 1).expect("an id"),
-        surface_id: surface,
-        started: start,
-        software: "test".into(),
-        rig: rig.name.clone(),
-        origin: Origin::Measured,
-    };
-    let (surface, plan) = (SurfaceRecord::default(), Some(BTreeMap::new()));
-    let begin = RunStart { manifest: &manifest, rig, surface: &surface, relief: None, plan };
-    let mut recorder = Recorder::create(&folder.join("run.mcap"), &begin).expect("a recorder");
+    let mut recorder = create_flat(&folder.join("run.mcap"), rig, start, Some(BTreeMap::new()));
     recorder.arms(start, Arc::new(Cell::of(rig)), "rig").expect("recorded");
     recorder
 }
@@ -163,20 +153,8 @@ fn a_run_over_all_drivers_holds_what_they_told() {
 fn a_real_panel_is_recorded_without_a_geometry_that_nobody_gave() {
     let room = FakeDevices::new();
     let (folder, rig) = (tempfile::tempdir().expect("a folder"), &room.rig);
-    let request = RunRequest {
-        rig,
-        surface: "flat".parse().expect("an id"),
-        specimen: &PanelSpecimen::NoGeometry,
-        flat: None,
-        foam: None,
-        macro_reference: None,
-        project: None,
-        start: Timestamp::now(),
-        seed: 1,
-        tag: 1,
-        keep: RecordingMode::Sweeps,
-        folder: folder.path(),
-    };
+    let surface = "flat".parse().expect("an id");
+    let request = RunRequest::new(rig, surface, &PanelSpecimen::NoGeometry, Timestamp::now(), folder.path());
     let panel = PreparedPanel::new(request.specimen, rig).expect("a panel");
     let simulated = DeviceRequest { rig, panel: &panel, start: request.start, seed: 1, arms: None };
     let refused = simulated_devices(&simulated, TakePace::Fast).err().expect("no geometry").to_string();

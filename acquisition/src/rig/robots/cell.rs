@@ -230,10 +230,7 @@ impl Cell {
     fn speaker_solutions(&self, microphone_mm: [f64; 3], speaker_mm: [f64; 3], aim: SpeakerAim) -> Vec<Joints> {
         let [microphone, speaker] = [microphone_mm, speaker_mm].map(|mm| DVec3::from_array(mm) / 1e3);
         // From below the panel's plane no mirror is seen; straight down will do, and is refused as what it is.
-        let axis = match speaker.z > 0.0 && microphone.z > 0.0 {
-            true => aim.axis(microphone, speaker),
-            false => -DVec3::Z,
-        };
+        let axis = if speaker.z > 0.0 && microphone.z > 0.0 { aim.axis(microphone, speaker) } else { -DVec3::Z };
         let aimed = DQuat::from_rotation_arc(DVec3::Z, axis);
         let roll = |i: usize| aimed * DQuat::from_rotation_z(i as f64 * TAU / ROLLS as f64);
         solutions(&self.speaker, (0..ROLLS).map(|i| Pose::from_parts(speaker, roll(i))))
@@ -241,9 +238,10 @@ impl Cell {
 
     // The first ways, nearest to home, in which an arm touches neither itself nor its surroundings.
     fn clear_ways(&self, arm: &RobotArm, solved: &[Joints], most: usize) -> ArmSolutions {
-        let mut failure = match solved.is_empty() {
-            true => UnreachableReason::OutOfReach(arm.tool()),
-            false => UnreachableReason::Joints(arm.tool()),
+        let mut failure = if solved.is_empty() {
+            UnreachableReason::OutOfReach(arm.tool())
+        } else {
+            UnreachableReason::Joints(arm.tool())
         };
         let mut ways = Vec::new();
         for joints in solved.iter().filter(|joints| in_range(joints)) {

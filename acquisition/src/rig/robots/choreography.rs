@@ -57,12 +57,11 @@ impl Choreography {
         }
         let mut arms = Self::new(rig)?;
         // The paper's whole grid is within reach: a test checks it, and runs need not wait for it.
-        let found = match key == self::key(&Rig::paper()) || arms.missing().is_empty() {
-            true => {
-                arms.turns = (rig.robots.order == VisitOrder::Planned).then(|| arms.planned());
-                Some(Arc::new(arms))
-            }
-            false => None,
+        let found = if key == self::key(&Rig::paper()) || arms.missing().is_empty() {
+            arms.turns = (rig.robots.order == VisitOrder::Planned).then(|| arms.planned());
+            Some(Arc::new(arms))
+        } else {
+            None
         };
         *last = Some((key, found.clone()));
         Ok(found)

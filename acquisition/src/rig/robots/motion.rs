@@ -6,8 +6,8 @@ use super::cell::{ArmPose, Cell};
 
 /// Largest turn of a joint between two collision checks, degrees: 850 mm of arm move 15 mm.
 const STEP_DEG: f64 = 1.0;
-/// Shoulder and elbow of an arm that is drawn back, degrees: low over its foot, high, half-way out and others; if one is
-/// blocked, another need not be.
+/// Shoulder and elbow of an arm that is drawn back, degrees: low over its foot, high, half-way out and others; if one
+/// is blocked, another need not be.
 const BACKS_DEG: [[f64; 2]; 8] = [
     [-70.0, 130.0],
     [-30.0, 70.0],

@@ -23,7 +23,8 @@ pub enum Error {
     Schema(#[from] echolake_schema::Error),
     /// The interface runs at another rate than the rig's sweep is made for.
     #[error(
-        "rig `{rig}` samples at {expected_hz} Hz, the audio interface at {actual_hz} Hz; hint: set the interface, or `sweep.rate_hz`"
+        "rig `{rig}` samples at {expected_hz} Hz, the audio interface at {actual_hz} Hz; hint: set the interface, or \
+         `sweep.rate_hz`"
     )]
     Rate {
         /// The rig.
@@ -45,7 +46,8 @@ pub enum Error {
     },
     /// The clock went backwards.
     #[error(
-        "the clock went back by {back_secs:.1} s, to {now}; hint: set it right (is NTP on?), and resume when it is past {before}"
+        "the clock went back by {back_secs:.1} s, to {now}; hint: set it right (is NTP on?), and resume when it is \
+         past {before}"
     )]
     Clock {
         /// Last time before the jump.
@@ -56,7 +58,11 @@ pub enum Error {
         back_secs: f64,
     },
     /// The disk is nearly full: stopped while all that was measured could still be written.
-    #[error("the disk of `{}` is nearly full: {free_mb:.1} MB are left, {needed_mb:.1} are kept free to end the run; hint: make room, and resume", folder.display())]
+    #[error(
+        "the disk of `{}` is nearly full: {free_mb:.1} MB are left, {needed_mb:.1} are kept free to end the run; hint: \
+         make room, and resume",
+        folder.display()
+    )]
     DiskNearlyFull {
         /// The folder of the recording.
         folder: std::path::PathBuf,

@@ -5,9 +5,9 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 
-use echolake_schema::manifest::{Origin, RunManifest};
+use echolake_schema::manifest::Origin;
 use echolake_schema::messages::{Measurement, Verdict};
-use echolake_schema::{Rig, RunId, Timestamp, topics};
+use echolake_schema::{Rig, Timestamp, topics};
 use prost::Message as _;
 
 use super::*;
@@ -18,7 +18,8 @@ use crate::rig::{
     AmbientReading, AmbientSensor, ArmPositions, AudioInterface, AudioTake, Error as RigError, RigDevices, RobotArms,
 };
 use crate::run::preflight;
-use crate::run::recorder::{Held, Recorder, RunStart};
+use crate::run::recorder::tests::create_flat;
+use crate::run::recorder::{Held, Recorder};
 
 /// Pairs of a run, and the one at which its fault begins.
 const PAIRS: usize = 12;
@@ -109,19 +110,7 @@ fn start() -> Timestamp {
 }
 
 fn begun(path: &std::path::Path, rig: &Rig) -> Recorder {
-    let surface = "flat".parse().expect("an id");
-    let manifest = RunManifest {
-        run_id: RunId::compose(start(), &surface, 1).expect("an id"),
-        surface_id: surface,
-        started: start(),
-        software: "test".into(),
-        rig: rig.name.clone(),
-        origin: Origin::Simulated,
-    };
-    let surface = echolake_schema::SurfaceRecord::default();
-    let plan = Some(BTreeMap::new());
-    Recorder::create(path, &RunStart { manifest: &manifest, rig, surface: &surface, relief: None, plan })
-        .expect("a recorder")
+    create_flat(path, rig, start(), Some(BTreeMap::new()))
 }
 
 /// Runs into a fault, checks what is said of it, mends it, goes on, and checks the whole file. Returns its verdicts and
@@ -259,9 +248,10 @@ fn an_overrun_is_taken_again() {
         fn play_and_record(&mut self, output: &[f32], take: &mut AudioTake) -> Result<(), RigError> {
             self.0.play_and_record(output, take)?;
             self.1 += 1;
-            match self.1.is_multiple_of(4) {
-                true => Err(RigError::Device { device: "audio interface", reason: "overrun".into() }),
-                false => Ok(()),
+            if self.1.is_multiple_of(4) {
+                Err(RigError::Device { device: "audio interface", reason: "overrun".into() })
+            } else {
+                Ok(())
             }
         }
     }

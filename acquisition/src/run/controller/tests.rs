@@ -3,16 +3,15 @@
 use std::sync::Arc;
 use std::sync::atomic::AtomicU32;
 
-use echolake_schema::manifest::{Origin, RunManifest};
 use echolake_schema::messages::{ImpulseResponse, Message as RunMessage, SweepRecording};
-use echolake_schema::{RunId, topics};
+use echolake_schema::topics;
 
 use super::*;
 use crate::panel::material::SurfaceMaterial;
 use crate::panel::relief::PanelRelief;
 use crate::rig::devices::simulated::{RigSimulation, devices};
 use crate::rig::{AmbientReading, AmbientSensor, ArmPositions, AudioInterface, Error as RigError, RobotArms};
-use crate::run::recorder::RunStart;
+use crate::run::recorder::tests::create_flat;
 
 /// An interface with something wrong on its first takes.
 struct Faulty {
@@ -136,19 +135,8 @@ impl RecordedRun {
 
 fn record(rig: &Rig, devices: RigDevices, pairs: usize, keep: RecordingMode, stop_after: usize) -> RecordedRun {
     let folder = tempfile::tempdir().expect("a folder");
-    let surface = "flat".parse().expect("an id");
-    let manifest = RunManifest {
-        run_id: RunId::compose(start(), &surface, 1).expect("an id"),
-        surface_id: surface,
-        started: start(),
-        software: "test".into(),
-        rig: rig.name.clone(),
-        origin: Origin::Simulated,
-    };
-    let surface = echolake_schema::SurfaceRecord::default();
-    let run = RunStart { manifest: &manifest, rig, surface: &surface, relief: None, plan: None };
     let path = folder.path().join("run.mcap");
-    let mut recorder = Recorder::create(&path, &run).expect("a recorder");
+    let mut recorder = create_flat(&path, rig, start(), None);
     let mut controller = RunController::new(rig, devices).expect("a controller");
     let pairs: Vec<_> = controller.grid.pairs().iter().step_by(2951 / pairs).copied().take(pairs).collect();
     let (control, nothing) = (RunControl::default(), BTreeMap::new());

@@ -73,8 +73,8 @@ impl Recorder {
         Ok(())
     }
 
-    /// Records `/tf` of both arms' links alone, at the beginning of a run: without it viewers have no place for anything
-    /// until the first pair is measured. A run that is gone on with has it already.
+    /// Records `/tf` of both arms' links alone, at the beginning of a run: without it viewers have no place for
+    /// anything until the first pair is measured. A run that is gone on with has it already.
     ///
     /// # Errors
     /// [`Error::Write`].

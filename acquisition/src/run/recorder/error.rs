@@ -14,7 +14,10 @@ pub enum Error {
         path: PathBuf,
     },
     /// The recording cannot be begun.
-    #[error("cannot create `{}`: {source}; hint: is the folder there, writable, and its disk not full?", path.display())]
+    #[error(
+        "cannot create `{}`: {source}; hint: is the folder there, writable, and its disk not full?",
+        path.display()
+    )]
     Create {
         /// The file.
         path: PathBuf,
@@ -22,7 +25,10 @@ pub enum Error {
         source: ErrorCause,
     },
     /// The system refused while the run was recorded.
-    #[error("cannot write `{}`: {source}; hint: is the disk full or read-only? What was recorded so far is in `{}`", path.display(), partial.display())]
+    #[error(
+        "cannot write `{}`: {source}; hint: is the disk full or read-only? What was recorded so far is in `{}`",
+        path.display(), partial.display()
+    )]
     Write {
         /// The file.
         path: PathBuf,

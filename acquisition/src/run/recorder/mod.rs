@@ -8,7 +8,7 @@ mod resume;
 mod scene;
 mod sealed;
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 mod tidy;
 
 use std::collections::BTreeMap;

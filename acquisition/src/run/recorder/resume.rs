@@ -61,8 +61,8 @@ impl Held {
     /// Reads what a recording holds; nothing is written.
     ///
     /// # Errors
-    /// [`Error::Headless`] if it was broken off before its first checkpoint, [`Error::Unusable`] if its manifest cannot be
-    /// read, [`Error::NoPlan`] if it was not begun as a run that can be resumed, or its plan or rig cannot be read.
+    /// [`Error::Headless`] if it was broken off before its first checkpoint, [`Error::Unusable`] if its manifest cannot
+    /// be read, [`Error::NoPlan`] if it was not begun as a run that can be resumed, or its plan or rig cannot be read.
     pub fn read(partial: &Path) -> Result<Self, Error> {
         let mut survey = RecordingSurvey::read(partial)?;
         let manifest = survey.manifest(partial)?;
@@ -142,12 +142,12 @@ impl Seen {
 
 impl Recorder {
     /// Resumes a recording behind all that is safe in it. What is damaged, and what stands in it of attempts without a
-    /// verdict, is left behind. The file is replaced by a copy that is on the disk; until then it is as it was, whatever
-    /// happens.
+    /// verdict, is left behind. The file is replaced by a copy that is on the disk; until then it is as it was,
+    /// whatever happens.
     ///
     /// # Errors
-    /// As [`Held::read`]; [`Error::Busy`] where somebody records it, [`Error::Finished`] where the run is whole already,
-    /// [`Error::Write`] where there is no room for the copy.
+    /// As [`Held::read`]; [`Error::Busy`] where somebody records it, [`Error::Finished`] where the run is whole
+    /// already, [`Error::Write`] where there is no room for the copy.
     pub fn resume(partial: &Path) -> Result<(Self, Held), Error> {
         let path = partial.with_extension("");
         if partial.extension().is_none_or(|e| e != PARTIAL) {

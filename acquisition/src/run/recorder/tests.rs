@@ -2,9 +2,9 @@
 
 use std::collections::BTreeMap;
 
-use echolake_schema::PairId;
 use echolake_schema::manifest::Origin;
 use echolake_schema::messages::Verdict;
+use echolake_schema::{PairId, RunId};
 use foxglove::Decode;
 use foxglove::messages as fg;
 use mcap::read::{LinearReader, MessageStream, Options};
@@ -49,6 +49,22 @@ fn measurement() -> Measurement {
 
 fn ambient() -> AmbientSample {
     AmbientSample { temperature_c: 21.25, humidity_pct: 40.0, pressure_hpa: 960.0, outside_level_db: 31.0 }
+}
+
+/// Begins a run of Flat without its shape.
+pub(crate) fn create_flat(
+    path: &Path,
+    rig: &Rig,
+    started: Timestamp,
+    plan: Option<BTreeMap<String, String>>,
+) -> Recorder {
+    let surface_id = "flat".parse().expect("an id");
+    let run_id = RunId::compose(started, &surface_id, 1).expect("an id");
+    let (software, rig_name) = (SOFTWARE.to_owned(), rig.name.clone());
+    let manifest = RunManifest { run_id, surface_id, started, software, rig: rig_name, origin: Origin::Simulated };
+    let surface = SurfaceRecord::default();
+    Recorder::create(path, &RunStart { manifest: &manifest, rig, surface: &surface, relief: None, plan })
+        .expect("a recorder")
 }
 
 /// Begins a run in `path` with a relief, and hands it to `record`.

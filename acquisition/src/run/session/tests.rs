@@ -13,20 +13,8 @@ const SMALL_RIG: &str = include_str!("../../../../tests/fixtures/small_rig.toml"
 const PAIRS: u64 = 45;
 
 fn run<'a>(rig: &'a Rig, specimen: &'a PanelSpecimen, folder: &'a Path) -> RunRequest<'a> {
-    RunRequest {
-        rig,
-        surface: "flat".parse().expect("an id"),
-        specimen,
-        flat: None,
-        foam: None,
-        macro_reference: None,
-        project: None,
-        start: Timestamp(1_767_600_000_000_000_000),
-        seed: 1,
-        tag: 1,
-        keep: RecordingMode::Sweeps,
-        folder,
-    }
+    let start = Timestamp(1_767_600_000_000_000_000);
+    RunRequest::new(rig, "flat".parse().expect("an id"), specimen, start, folder)
 }
 
 fn flat() -> PanelSpecimen {

@@ -49,9 +49,9 @@ pub struct DuplexRecording {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum TransferError {
     /// The computer was too late to fetch or to bring samples; a retry may succeed.
-    Late(String),
-    /// The device is gone or refuses.
-    Gone(String),
+    Transient(String),
+    /// The device is gone or refuses, or its loopback does not carry the output.
+    Permanent(String),
 }
 
 /// An audio interface whose takes begin with the output.
@@ -74,29 +74,26 @@ impl<D: AudioDuplex> AlignedAudio<D> {
     }
 
     // One try: the delay, and when the first sample of the take was taken.
-    fn attempt(&mut self, output: &[f32]) -> Result<(usize, Timestamp), Failure> {
+    fn attempt(&mut self, output: &[f32]) -> Result<(usize, Timestamp), TransferError> {
         let rate_hz = self.duplex.rate_hz();
         let latency = (self.latency_secs * rate_hz).ceil() as usize;
         let frames = output.len() + latency;
-        let began = self.duplex.transfer(output, frames, &mut self.recorded).map_err(|trouble| match trouble {
-            TransferError::Late(why) => Failure::Again(why),
-            TransferError::Gone(why) => Failure::Final(why),
-        })?;
+        let began = self.duplex.transfer(output, frames, &mut self.recorded)?;
         let counts = [self.recorded.microphone.len(), self.recorded.loopback.len()];
         if counts != [frames; 2] {
-            return Err(Failure::Again(format!("{counts:?} frames came, expected {frames}")));
+            return Err(TransferError::Transient(format!("{counts:?} frames came, expected {frames}")));
         }
         let delay = self.delay_of(output)?;
         Ok((delay, began.plus_secs(delay as f64 / rate_hz)))
     }
 
-    fn delay_of(&self, output: &[f32]) -> Result<usize, Failure> {
+    fn delay_of(&self, output: &[f32]) -> Result<usize, TransferError> {
         if rms(output) < SILENCE {
             return Ok(self.delay);
         }
         let found = locate(output, &self.recorded.loopback);
         if found.likeness < LIKENESS {
-            return Err(Failure::Final(self.no_loopback(&found)));
+            return Err(TransferError::Permanent(self.no_loopback(&found)));
         }
         // A gap moves the samples behind it, and the system's counters may miss it.
         let part = output.len() / 3;
@@ -107,7 +104,7 @@ impl<D: AudioDuplex> AlignedAudio<D> {
             });
             if ends[0] != ends[1] {
                 let why = format!("{} samples went missing or came twice", ends[1].abs_diff(ends[0]));
-                return Err(Failure::Again(why));
+                return Err(TransferError::Transient(why));
             }
         }
         Ok(found.at)
@@ -117,16 +114,10 @@ impl<D: AudioDuplex> AlignedAudio<D> {
         let level = 20.0 * rms_24(&self.recorded.loopback).max(1e-9).log10();
         let likeness = found.likeness;
         format!(
-            "the loopback does not carry the output (level {level:.0} dBFS, likeness {likeness:.2}); hint: is its cable \
-             plugged in, from the output that the rig file names to the input that it names?"
+            "the loopback does not carry the output (level {level:.0} dBFS, likeness {likeness:.2}); hint: is its \
+             cable plugged in, from the output that the rig file names to the input that it names?"
         )
     }
-}
-
-/// A failed attempt: `Again` may be retried, `Final` not.
-enum Failure {
-    Again(String),
-    Final(String),
 }
 
 impl<D: AudioDuplex> AudioInterface for AlignedAudio<D> {
@@ -150,15 +141,15 @@ impl<D: AudioDuplex> AudioInterface for AlignedAudio<D> {
                     cut(&self.recorded.loopback, &mut take.loopback);
                     return Ok(());
                 }
-                Err(Failure::Again(why)) if attempt < self.repeats => {
+                Err(TransferError::Transient(why)) if attempt < self.repeats => {
                     self.notices.push(format!("take repeated: {why}"));
                 }
-                Err(Failure::Again(why)) => {
+                Err(TransferError::Transient(why)) => {
                     let tries = self.repeats + 1;
                     let hint = "a larger `period_frames`, fewer other programs, another USB port";
                     return failed(format!("{tries} takes in a row have gaps, the last: {why}; hint: {hint}"));
                 }
-                Err(Failure::Final(why)) => return failed(why),
+                Err(TransferError::Permanent(why)) => return failed(why),
             }
         }
         failed("no take was tried".into())

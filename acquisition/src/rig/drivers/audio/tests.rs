@@ -42,8 +42,8 @@ impl AudioDuplex for LoopbackCable {
         recorded.loopback = loopback.map(|x| (f64::from(x) * self.gain * 8_388_608.0) as i32).collect();
         recorded.microphone = recorded.loopback.iter().map(|x| x / 4).collect();
         match fault {
-            CableFault::Overrun => Err(TransferError::Late("overrun".into())),
-            CableFault::Unplugged => Err(TransferError::Gone("no such device".into())),
+            CableFault::Overrun => Err(TransferError::Transient("overrun".into())),
+            CableFault::Unplugged => Err(TransferError::Permanent("no such device".into())),
             CableFault::Short => {
                 recorded.loopback.pop();
                 Ok(self.now)
