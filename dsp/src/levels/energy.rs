@@ -20,18 +20,6 @@ pub fn cumulate_whole<T: RealSample>(ir: &[T], scale: f64, curve: &mut [T]) {
     accumulate(ir, scale.recip(), curve);
 }
 
-/// Running sum of squares of each band over `scale`, summed up in f64.
-///
-/// bands  `[bands x len]`
-/// curves `[bands x len]`  cumulative energy (scale 1), or NCE (scale: Flat's total energy)
-/// last   `[bands]`        each curve's last value, in f64
-pub fn cumulate<T: RealSample>(bands: &[T], len: usize, scale: f64, curves: &mut [T], last: &mut [f64]) {
-    let len = len.max(1);
-    for ((band, curve), last) in bands.chunks_exact(len).zip(curves.chunks_exact_mut(len)).zip(last) {
-        *last = accumulate(band, scale.recip(), curve) * scale.recip();
-    }
-}
-
 /// Running sum of squares of each band, summed up in f64.
 ///
 /// bands, curves  `[bands x len]`
@@ -126,9 +114,6 @@ mod tests {
         let mut last = [f64::NAN; 2];
         assert!((tnce(&curves, 3, &mut last) - 0.95).abs() < 1e-15);
         assert_eq!(last, [0.45, 0.5]);
-        let (mut at_once, mut last_at_once) = ([f64::NAN; 6], [f64::NAN; 2]);
-        cumulate(&BANDS, 3, 20.0, &mut at_once, &mut last_at_once);
-        assert_eq!((at_once, last_at_once), (curves, last));
     }
 
     #[test]
@@ -151,6 +136,5 @@ mod tests {
     fn nothing_is_no_energy() {
         assert_eq!((energy::<f32>(&[]), rms::<f32>(&[]), rms(&[3.0, -3.0])), (0.0, 0.0, 3.0));
         assert_eq!(tnce::<f32>(&[], 0, &mut []), 0.0);
-        cumulate::<f32>(&[], 0, 1.0, &mut [], &mut []);
     }
 }

@@ -85,9 +85,9 @@ fn read_scene(bytes: &[u8]) -> Result<Mesh, GlbFault> {
 fn describe_error(error: &gltf::Error) -> GlbFault {
     let (place, actual) = match error {
         gltf::Error::Binary(e) => ("its header or chunks".to_owned(), e.to_string()),
-        gltf::Error::Validation(faults) if let Some((place, fault)) = faults.first() => {
-            (format!("its JSON at `{place}`"), fault.to_string())
-        }
+        gltf::Error::Validation(faults) => faults.first().map_or_else(Default::default, |(place, fault)| {
+            (format!("its JSON at `{}`", place.as_str()), fault.to_string())
+        }),
         other => ("its JSON".to_owned(), other.to_string()),
     };
     (place, format!("\"{actual}\""), "glTF 2.0 in one binary file")
