@@ -4,7 +4,7 @@ use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
 use echolake_acquisition::import::import_wav;
-use echolake_acquisition::panel::mesh::{Format, Mesh};
+use echolake_acquisition::panel::mesh::{Mesh, MeshFormat};
 use echolake_acquisition::panel::relief::HeightField;
 use hdf5_pure::{AttrValue, FileBuilder};
 use hound::{SampleFormat, WavSpec, WavWriter};
@@ -43,9 +43,9 @@ fn write_seeds(folder: PathBuf) {
     }
     let heights = HeightField::from_fn(585.0, 3, |x, y| (x + y) / 100.0);
     let mesh = Mesh::from_height_field(&heights, -20.0);
-    put("stl", "binary", &mesh.to_bytes(Format::Stl));
+    put("stl", "binary", &mesh.to_bytes(MeshFormat::Stl));
     put("stl", "text", TEXT_STL.as_bytes());
-    put("glb", "panel", &mesh.to_bytes(Format::Glb));
+    put("glb", "panel", &mesh.to_bytes(MeshFormat::Glb));
     let first = |which: u8, bytes: &[u8]| [&[which], bytes].concat();
     put("gir", "surface", &first(0, &gir_surface()));
     put("gir", "heights", &first(1, &gir_heights()));

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, bail};
 use clap::Args;
-use echolake_acquisition::panel::mesh::{BACK_MM, Format, Mesh};
+use echolake_acquisition::panel::mesh::{BACK_MM, Mesh, MeshFormat};
 use echolake_acquisition::panel::relief::{HeightField, PanelRelief};
 use echolake_figures::encode_grey_png;
 
@@ -99,7 +99,7 @@ pub(crate) fn run(args: &PanelArgs) -> anyhow::Result<CommandOutcome> {
 /// The content of an output file.
 #[derive(Debug, Clone, Copy)]
 enum OutputKind {
-    Mesh(Format),
+    Mesh(MeshFormat),
     Picture,
     Heights,
     Parameters,
@@ -111,7 +111,7 @@ impl OutputKind {
             Some("png") => Self::Picture,
             Some("npy") => Self::Heights,
             Some("json") => Self::Parameters,
-            _ => Self::Mesh(Format::of(path).with_context(|| {
+            _ => Self::Mesh(MeshFormat::from_path(path).with_context(|| {
                 format!(
                     "cannot tell what `{}` is to hold; or a picture .png, heights .npy, parameters .json",
                     path.display()

@@ -6,7 +6,7 @@ use echolake_schema::manifest::MeshFacts;
 use echolake_schema::{Rig, SurfaceRecord};
 
 use crate::panel::material::SurfaceMaterial;
-use crate::panel::mesh::{self, BACK_MM, Format, MESH_CELLS, Mesh, PanelSide};
+use crate::panel::mesh::{self, BACK_MM, MESH_CELLS, Mesh, MeshFormat, PanelSide};
 use crate::panel::relief::{HeightField, PanelRelief};
 use crate::rig::devices::simulated::FACETS;
 use crate::run::plan::PanelSpecimen;
@@ -17,7 +17,7 @@ pub(crate) struct PreparedPanel {
     /// None if nobody gave it.
     pub(crate) geometry: Option<PanelGeometry>,
     pub(crate) record: SurfaceRecord,
-    original: Option<(String, Format, Vec<u8>)>,
+    original: Option<(String, MeshFormat, Vec<u8>)>,
 }
 
 /// Shape and material of a panel.
@@ -83,7 +83,7 @@ fn generated(relief: &PanelRelief) -> PreparedPanel {
 }
 
 fn from_file(path: &Path, side: PanelSide, rig: &Rig) -> Result<PreparedPanel, mesh::Error> {
-    let format = Format::of(path)?;
+    let format = MeshFormat::from_path(path)?;
     let mesh = Mesh::read(path)?.seen_from(side).check(rig.panel.size_mm, rig.panel.depth_mm, path)?;
     let heights = mesh.to_height_field(FACETS, rig.panel.size_mm, rig.panel.depth_mm, path)?;
     let bytes = std::fs::read(path).map_err(|source| mesh::Error::Read { path: path.to_owned(), source })?;

@@ -9,24 +9,24 @@ use echolake_recording::{
 use echolake_schema::topics;
 
 /// Messages of each topic.
-pub(crate) type Counts = BTreeMap<String, u64>;
+pub(crate) type MessageCounts = BTreeMap<String, u64>;
 
 /// A copy that is being made.
-pub(crate) struct Copy<'a> {
+pub(crate) struct RecordingCopy<'a> {
     out: &'a mut ChunkWriter,
     channels: &'a BTreeMap<u16, Arc<Channel<'static>>>,
     /// Whether they are described in `out`: its first chunk describes them all.
     is_described: bool,
     /// What was copied so far.
-    pub(crate) counts: Counts,
+    pub(crate) counts: MessageCounts,
     /// The highest number of a message.
     pub(crate) sequence: u32,
 }
 
-impl<'a> Copy<'a> {
+impl<'a> RecordingCopy<'a> {
     /// A copy into `out` of messages of these channels.
     pub(crate) fn new(out: &'a mut ChunkWriter, channels: &'a BTreeMap<u16, Arc<Channel<'static>>>) -> Self {
-        Self { out, channels, is_described: false, counts: Counts::new(), sequence: 0 }
+        Self { out, channels, is_described: false, counts: MessageCounts::new(), sequence: 0 }
     }
 
     /// Copies one item, of a chunk only the messages that `keep` wants.

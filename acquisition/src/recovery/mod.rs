@@ -16,7 +16,7 @@ use echolake_schema::topics;
 use serde::Serialize;
 
 use crate::disk::{folder_of, sync};
-pub(crate) use copy::{Copy, Counts, is_end};
+pub(crate) use copy::{MessageCounts, RecordingCopy, is_end};
 pub use error::Error;
 pub(crate) use survey::RecordingSurvey;
 
@@ -101,7 +101,7 @@ fn rebuild(from: &Path, to: &Path, survey: &RecordingSurvey, report: &Report) ->
     let file = file.map_err(|e| failed(e.into()))?;
     let mut writer = ChunkWriter::new(file).map_err(failed)?;
     let mut walk = RecordingReader::open(from)?;
-    let mut copy = Copy::new(&mut writer, &survey.channels);
+    let mut copy = RecordingCopy::new(&mut writer, &survey.channels);
     while let Some(item) = walk.next_item()? {
         copy.take(item, &|_, _| true).map_err(failed)?;
     }

@@ -9,7 +9,7 @@ use echolake_recording::{Channel, ChannelDefinitions, FileIntegrity, Record, Rec
 use echolake_schema::manifest::RunManifest;
 use echolake_schema::topics;
 
-use super::{Counts, Error, Report};
+use super::{Error, MessageCounts, Report};
 use crate::run::recorder::{SOFTWARE, own_channels};
 
 /// What is whole of a recording.
@@ -21,7 +21,7 @@ pub(crate) struct RecordingSurvey {
     /// The rig's attachment.
     pub(crate) rig: Option<String>,
     /// Messages by topic.
-    pub(crate) counts: Counts,
+    pub(crate) counts: MessageCounts,
     chunks: u64,
     integrity: FileIntegrity,
 }
@@ -60,7 +60,7 @@ impl RecordingSurvey {
             }
         }
         let integrity = walk.finish()?;
-        let counts = Counts::new();
+        let counts = MessageCounts::new();
         let channels = definitions.into_channels();
         let mut survey = Self { channels, metadata, rig, counts, chunks, integrity };
         survey.name_channels(&by_channel);

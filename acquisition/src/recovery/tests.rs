@@ -11,7 +11,7 @@ use prost::Message as _;
 
 use super::*;
 use crate::run::recorder::tests::create_flat;
-use crate::run::recorder::{Held, Recorder, Tried};
+use crate::run::recorder::{Held, PairAttempts, Recorder};
 
 /// Pairs of the run, one a checkpoint.
 const PAIRS: u32 = 20;
@@ -126,7 +126,7 @@ fn damage_is_skipped_and_told() {
     assert_eq!(pairs(&out), [all, without]);
     // The pair whose response is lost is measured again.
     let held = Held::read(&out).expect("a run with a plan");
-    assert_eq!((held.accepted(), held.pairs[&10]), (PAIRS as usize - 1, Tried { attempts: 1, accepted: false }));
+    assert_eq!((held.accepted(), held.pairs[&10]), (PAIRS as usize - 1, PairAttempts { attempts: 1, accepted: false }));
     // Nothing is overwritten.
     assert!(matches!(recover(&path, &out), Err(Error::Exists { .. })));
 }

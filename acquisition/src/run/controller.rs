@@ -22,7 +22,7 @@ use echolake_schema::{Grid, Pair, Rig, Timestamp};
 
 use crate::rig::{AudioTake, DrivePower, RigDevices};
 use crate::run::assessment::TakeAssessor;
-use crate::run::recorder::{LogLevel, Recorder, Tried};
+use crate::run::recorder::{LogLevel, PairAttempts, Recorder};
 pub use crate::run::recording_mode::RecordingMode;
 pub use error::Error;
 use watch::RunMonitor;
@@ -47,7 +47,7 @@ pub struct RunWorkload<'a> {
     /// The pairs, in their order.
     pub pairs: &'a [Pair],
     /// Earlier attempts by pair id, if the run is resumed: accepted pairs are skipped.
-    pub before: &'a BTreeMap<u32, Tried>,
+    pub before: &'a BTreeMap<u32, PairAttempts>,
     /// Recording settings.
     pub options: RunOptions,
 }
@@ -112,7 +112,7 @@ pub struct RunController<'a> {
 struct RunProgress<'r> {
     recorder: &'r mut Recorder,
     options: RunOptions,
-    tried: BTreeMap<u32, Tried>,
+    tried: BTreeMap<u32, PairAttempts>,
     attempts: u64,
     ended: Timestamp,
     watch: RunMonitor,
@@ -287,7 +287,7 @@ impl<'a> RunController<'a> {
             let verdict = made.measurement.verdict();
             objections = std::mem::take(&mut made.objections);
             let accepted = verdict == Verdict::Accepted;
-            run.tried.insert(pair.id.0, Tried { attempts: before + attempt, accepted });
+            run.tried.insert(pair.id.0, PairAttempts { attempts: before + attempt, accepted });
             run.unsafe_verdicts.push(made.measurement);
             if accepted {
                 run.watch.accepted();

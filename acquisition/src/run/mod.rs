@@ -33,7 +33,7 @@ use crate::run::controller::{RecordingMode, RunController};
 pub use crate::run::plan::PanelSpecimen;
 use crate::run::plan::RunPlan;
 use crate::run::preflight::PreflightFinding;
-use crate::run::recorder::{Held, Recorder, Relief as RecordedRelief, RunStart, Shape, Tried};
+use crate::run::recorder::{Held, PairAttempts, Recorder, Relief as RecordedRelief, RunStart, Shape};
 use crate::run::session::{MeasuredRun, PreflightMode, RunJob, RunSession, WhenStopped};
 
 /// A run that is to be measured.
@@ -240,7 +240,7 @@ fn job<'a>(
     rig: &'a Rig,
     folder: &'a Path,
     keep: RecordingMode,
-    before: &'a BTreeMap<u32, Tried>,
+    before: &'a BTreeMap<u32, PairAttempts>,
     started: Timestamp,
     arms: Option<Arc<Choreography>>,
 ) -> RunJob<'a> {

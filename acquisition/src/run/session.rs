@@ -15,7 +15,7 @@ use crate::run::controller::{
     self, RecordingMode, RunControl, RunController, RunEvent, RunOptions, RunOutcome, RunWorkload,
 };
 use crate::run::preflight::{self, PreflightFinding};
-use crate::run::recorder::{Recorder, Shape, Tap, Tried};
+use crate::run::recorder::{PairAttempts, Recorder, Shape, Tap};
 
 /// Pairs between two checkpoints of a simulated run; one that is lost is made again.
 const SIMULATED_CHECKPOINT_EVERY: usize = 200;
@@ -70,7 +70,7 @@ pub(crate) struct RunJob<'a> {
     pub(crate) folder: &'a Path,
     pub(crate) shape: Option<Shape<'a>>,
     pub(crate) keep: RecordingMode,
-    pub(crate) before: &'a BTreeMap<u32, Tried>,
+    pub(crate) before: &'a BTreeMap<u32, PairAttempts>,
     pub(crate) started: Timestamp,
     /// Joints of the arms at each pair, if the arms are known.
     pub(crate) arms: Option<Arc<Choreography>>,

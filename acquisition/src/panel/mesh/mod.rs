@@ -52,19 +52,19 @@ impl PanelSide {
 
 /// A file format, chosen by the file's extension.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Format {
+pub enum MeshFormat {
     /// glTF 2.0, binary.
     Glb,
     /// Stereolithography, binary or text.
     Stl,
 }
 
-impl Format {
+impl MeshFormat {
     /// Returns the format of a path's extension.
     ///
     /// # Errors
     /// [`Error::Format`], which lists the formats.
-    pub fn of(path: &Path) -> Result<Self, Error> {
+    pub fn from_path(path: &Path) -> Result<Self, Error> {
         let extension = path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase);
         match extension.as_deref() {
             Some("glb") => Ok(Self::Glb),
@@ -88,7 +88,7 @@ impl Mesh {
     /// # Errors
     /// [`Error`], naming the file and the place in it.
     pub fn read(path: &Path) -> Result<Self, Error> {
-        let format = Format::of(path)?;
+        let format = MeshFormat::from_path(path)?;
         let failed = |source| Error::Read { path: path.to_owned(), source };
         let size = std::fs::metadata(path).map_err(failed)?.len();
         if size > LARGEST_FILE {
@@ -102,28 +102,18 @@ impl Mesh {
     ///
     /// # Errors
     /// As [`Mesh::read`].
-    pub fn from_bytes(format: Format, bytes: &[u8], path: &Path) -> Result<Self, Error> {
-        let mesh = match format {
-            Format::Glb => glb::parse(bytes, path),
-            Format::Stl => stl::parse(bytes, path),
-        }?;
-        let count = mesh.vertices_mm.len();
-        match mesh.triangles.iter().flatten().find(|i| **i as usize >= count) {
-            None => Ok(mesh),
-            Some(index) => Err(Error::Syntax {
-                path: path.to_owned(),
-                place: "a face".to_owned(),
-                actual: format!("vertex {index}"),
-                expected: "one of the file's vertices",
-            }),
+    pub fn from_bytes(format: MeshFormat, bytes: &[u8], path: &Path) -> Result<Self, Error> {
+        match format {
+            MeshFormat::Glb => glb::parse(bytes, path),
+            MeshFormat::Stl => stl::parse(bytes, path),
         }
     }
 
     /// The bytes of a file.
-    pub fn to_bytes(&self, format: Format) -> Vec<u8> {
+    pub fn to_bytes(&self, format: MeshFormat) -> Vec<u8> {
         match format {
-            Format::Glb => glb::write(self),
-            Format::Stl => stl::write(self),
+            MeshFormat::Glb => glb::write(self),
+            MeshFormat::Stl => stl::write(self),
         }
     }
 }
@@ -133,13 +123,13 @@ mod tests {
     use super::*;
     use crate::panel::relief::PanelRelief;
 
-    const READ: [Format; 2] = [Format::Glb, Format::Stl];
+    const READ: [MeshFormat; 2] = [MeshFormat::Glb, MeshFormat::Stl];
 
     fn small() -> Mesh {
         Mesh::from_height_field(&PanelRelief::by_name("macrostructure").expect("a relief").height_field(4), -20.0)
     }
 
-    fn parse(format: Format, bytes: &[u8]) -> Result<Mesh, Error> {
+    fn parse(format: MeshFormat, bytes: &[u8]) -> Result<Mesh, Error> {
         Mesh::from_bytes(format, bytes, Path::new("panel"))
     }
 

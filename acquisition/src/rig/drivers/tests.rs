@@ -23,7 +23,7 @@ use crate::run::controller::{
     Error as RunError, RecordingMode, RunControl, RunController, RunEvent, RunOptions, RunWorkload,
 };
 use crate::run::recorder::tests::create_flat;
-use crate::run::recorder::{Recorder, Tried};
+use crate::run::recorder::{PairAttempts, Recorder};
 use crate::run::session::{PreflightMode, RunSession, TakePace};
 use crate::run::{PanelSpecimen, RunRequest};
 
@@ -103,7 +103,7 @@ fn measure(
     room: &mut FakeDevices,
     devices: RigDevices,
     recorder: &mut Recorder,
-    before: &BTreeMap<u32, Tried>,
+    before: &BTreeMap<u32, PairAttempts>,
     progress: &mut dyn FnMut(&mut FakeDevices, usize),
 ) -> Result<RunEnd, RunError> {
     let rig = room.rig.clone();

@@ -30,7 +30,7 @@ use crate::panel::relief::HeightField;
 use channels::Channels;
 pub(crate) use channels::own_channels;
 pub use error::Error;
-pub use resume::{Held, Tried};
+pub use resume::{Held, PairAttempts};
 pub use sealed::Sealed;
 
 /// The program that records, as manifests name it.
@@ -230,7 +230,7 @@ impl Recorder {
         let surface = serde_json::to_vec_pretty(start.surface).map_err(|source| Error::Surface { source })?;
         self.attach(at, topics::RIG_ATTACHMENT, "application/toml", start.rig.to_toml().as_bytes())?;
         self.attach(at, topics::SURFACE_ATTACHMENT, "application/json", &surface)?;
-        let glb = start.relief.as_ref().map(|r| r.mesh.to_bytes(crate::panel::mesh::Format::Glb));
+        let glb = start.relief.as_ref().map(|r| r.mesh.to_bytes(crate::panel::mesh::MeshFormat::Glb));
         if let (Some(relief), Some(glb)) = (&start.relief, &glb) {
             let heights: Vec<u8> = relief.heights.heights_mm().iter().flat_map(|h| h.to_le_bytes()).collect();
             self.attach(at, topics::MESH_ATTACHMENT, "model/gltf-binary", glb)?;
@@ -260,7 +260,7 @@ impl Recorder {
             let time = u64::try_from(at.0).unwrap_or(0);
             let mut encoded = Vec::new();
             // A Vec grows, so encoding into it cannot fail.
-            let _ = scene::panel(at, mesh.to_bytes(crate::panel::mesh::Format::Glb)).encode(&mut encoded);
+            let _ = scene::panel(at, mesh.to_bytes(crate::panel::mesh::MeshFormat::Glb)).encode(&mut encoded);
             tap.message(self.channels.scene, time, &encoded);
             encoded.clear();
             let _ = scene::points(at, heights).encode(&mut encoded);

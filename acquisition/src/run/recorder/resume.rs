@@ -17,7 +17,7 @@ use prost::Message as _;
 use super::Recorder;
 use super::channels::Channels;
 use crate::disk::{folder_of, sync};
-use crate::recovery::{Copy, Error, RecordingSurvey, is_end, lock};
+use crate::recovery::{Error, RecordingCopy, RecordingSurvey, is_end, lock};
 
 /// What the name of a recording ends in until it is whole.
 const PARTIAL: &str = "partial";
@@ -32,7 +32,7 @@ pub struct Held {
     /// What it takes to go on.
     pub plan: BTreeMap<String, String>,
     /// The pairs that have a verdict.
-    pub pairs: BTreeMap<u32, Tried>,
+    pub pairs: BTreeMap<u32, PairAttempts>,
     /// Attempts with a verdict.
     pub attempts: u64,
     /// Time of the last message.
@@ -50,7 +50,7 @@ pub struct Held {
 
 /// What is known of a pair.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Tried {
+pub struct PairAttempts {
     /// The highest number of an attempt; where it goes on, numbers do, too.
     pub attempts: u32,
     /// Whether one was accepted.
@@ -129,10 +129,10 @@ impl Seen {
     }
 
     // A verdict whose sweep and response are lost accepts nothing: the pair is measured again.
-    fn pairs(&self) -> BTreeMap<u32, Tried> {
+    fn pairs(&self) -> BTreeMap<u32, PairAttempts> {
         let mut pairs = BTreeMap::new();
         for (time, verdict) in &self.verdicts {
-            let tried = pairs.entry(verdict.pair_id).or_insert(Tried { attempts: 0, accepted: false });
+            let tried = pairs.entry(verdict.pair_id).or_insert(PairAttempts { attempts: 0, accepted: false });
             tried.attempts = tried.attempts.max(verdict.attempt);
             tried.accepted |= verdict.verdict() == Verdict::Accepted && self.recorded.contains(time);
         }
@@ -179,7 +179,7 @@ impl Recorder {
         let _ = file.try_lock();
         let mut writer = ChunkWriter::new(file).map_err(|e| failed(system_cause(e)))?;
         let mut walk = RecordingReader::open(partial)?;
-        let mut taken = Copy::new(&mut writer, &held.channels);
+        let mut taken = RecordingCopy::new(&mut writer, &held.channels);
         let acknowledged =
             |part: ChunkLane, header: &MessageHeader| part == ChunkLane::Light || held.times.contains(&header.log_time);
         while let Some(item) = walk.next_item()? {

@@ -8,7 +8,7 @@ use echolake_recording::{ChunkWriter, RecordingReader, prove_file};
 use echolake_schema::ErrorCause;
 
 use crate::disk::{folder_of, free_bytes, sync};
-use crate::recovery::{Copy, RecordingSurvey};
+use crate::recovery::{RecordingCopy, RecordingSurvey};
 
 /// Puts a whole recording's messages into larger chunks. Until the copy is proven and on the disk the recording is as
 /// it was; so it is where an error is returned.
@@ -32,7 +32,7 @@ fn copied(partial: &Path, copy: &Path) -> Result<(), ErrorCause> {
     }
     let file = OpenOptions::new().write(true).create(true).truncate(true).open(copy)?;
     let mut writer = ChunkWriter::new(file)?;
-    let mut taken = Copy::new(&mut writer, &survey.channels);
+    let mut taken = RecordingCopy::new(&mut writer, &survey.channels);
     let mut walk = RecordingReader::open(partial)?;
     while let Some(item) = walk.next_item()? {
         taken.take(item, &|_, _| true)?;
