@@ -100,8 +100,11 @@ fn check_features(mut root: Root) -> Result<Root, GlbFault> {
         let expected = "meshes that need no extension; hint: export it without compression and instances";
         return Err(("`extensionsRequired`".into(), format!("{name:?}"), expected));
     }
-    let is_instanced = |e: &gltf::json::extensions::scene::Node| e.others.contains_key(INSTANCING);
-    if let Some(node) = root.nodes.iter().position(|node| node.extensions.as_ref().is_some_and(is_instanced)) {
+    let instanced = root
+        .nodes
+        .iter()
+        .position(|node| node.extensions.as_ref().is_some_and(|extensions| extensions.others.contains_key(INSTANCING)));
+    if let Some(node) = instanced {
         let expected = "one mesh a node; hint: export instances as meshes of their own";
         return Err((format!("node {node}"), format!("the extension {INSTANCING}"), expected));
     }
