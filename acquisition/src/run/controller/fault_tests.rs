@@ -291,7 +291,7 @@ fn room_is_kept_for_one_more_take_as_it_is_recorded() {
         assert!(recorder.bytes_to_end() > 1 << 20);
         for two in recorded.windows(2).filter(|two| two[1].0 > two[0].0) {
             let each = (two[1].1 - two[0].1) / (two[1].0 - two[0].0);
-            let most = attempt_bytes(&rig, keep);
+            let most = keep.attempt_bytes(&rig);
             assert!((most - 8192..=most).contains(&each), "{each} {most}");
         }
     }
