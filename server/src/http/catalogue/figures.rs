@@ -1,5 +1,7 @@
 //! Figures of surfaces: what `echolake figure` writes, for the pages, which show them and offer them as files.
 
+use std::io;
+
 use axum::Extension;
 use echolake_figures::{
     FigureDrawing, FigureNotes, GridFigure, GridLayer, GridPanel, LevelPalette, MapFigure, MapPosition, NceFigure,
@@ -43,14 +45,17 @@ impl FigureFormat {
     /// Writes a drawing.
     ///
     /// # Errors
-    /// Those of computing beside the requests.
+    /// Those of computing beside the requests, and a drawing that the format cannot hold.
     async fn write(self, request: &CatalogueRequest, drawing: FigureDrawing) -> EndpointAnswer {
-        let write = move || match self {
-            Self::Svg => AnswerContent::new("image/svg+xml", drawing.to_svg()),
-            Self::Pdf => AnswerContent::new("application/pdf", drawing.to_pdf()),
-            Self::Png => AnswerContent::new("image/png", drawing.to_png()),
+        let write = move || -> io::Result<AnswerContent> {
+            Ok(match self {
+                Self::Svg => AnswerContent::new("image/svg+xml", drawing.to_svg()),
+                Self::Pdf => AnswerContent::new("application/pdf", drawing.to_pdf()?),
+                Self::Png => AnswerContent::new("image/png", drawing.to_png()?),
+            })
         };
-        Ok(request.catalogue.service().crunch(write).await?)
+        let written = request.catalogue.service().crunch(write).await?;
+        Ok(written.map_err(RequestFault::defect("a figure cannot be written"))?)
     }
 }
 
