@@ -1,7 +1,6 @@
 //! Adapter from an aggregate function to DataFusion, over one group or many at once.
 
 use std::fmt::{self, Debug};
-use std::hash::{Hash, Hasher};
 
 use arrow::array::{ArrayRef, BooleanArray};
 use arrow::datatypes::{DataType, Field, FieldRef};
@@ -15,6 +14,7 @@ use datafusion::logical_expr::{
 
 use super::arguments::{CallArguments, check, coerced};
 use super::description::FunctionDescription;
+use super::scalar::identify_by_name;
 
 /// A function of the values of many rows. Null rows do not count.
 pub(super) trait AggregateKernel: Send + Sync + Clone + 'static {
@@ -256,23 +256,4 @@ impl<A: AggregateKernel> Debug for Accumulated<A> {
     }
 }
 
-impl<A: AggregateKernel> Debug for AggregateAdapter<A> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.name())
-    }
-}
-
-// Compared by name, like scalar functions.
-impl<A: AggregateKernel> PartialEq for AggregateAdapter<A> {
-    fn eq(&self, other: &Self) -> bool {
-        self.name() == other.name()
-    }
-}
-
-impl<A: AggregateKernel> Eq for AggregateAdapter<A> {}
-
-impl<A: AggregateKernel> Hash for AggregateAdapter<A> {
-    fn hash<H: Hasher>(&self, state: &mut H) {
-        self.name().hash(state);
-    }
-}
+identify_by_name!(AggregateAdapter, AggregateKernel);

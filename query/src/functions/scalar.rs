@@ -1,8 +1,5 @@
 //! Adapter from a scalar function to DataFusion: shared planning, documentation and constants, one kernel call each.
 
-use std::fmt::{self, Debug};
-use std::hash::{Hash, Hasher};
-
 use arrow::array::ArrayRef;
 use arrow::datatypes::DataType;
 use datafusion::common::ScalarValue;
@@ -87,23 +84,31 @@ impl<F: ScalarKernel> ScalarUDFImpl for ScalarAdapter<F> {
     }
 }
 
-impl<F: ScalarKernel> Debug for ScalarAdapter<F> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.name())
-    }
+/// Compares an adapter by its name: names are unique in an engine, and its plans never contain functions of another one.
+macro_rules! identify_by_name {
+    ($adapter:ident, $kernel:ident) => {
+        impl<F: $kernel> ::std::fmt::Debug for $adapter<F> {
+            fn fmt(&self, f: &mut ::std::fmt::Formatter<'_>) -> ::std::fmt::Result {
+                f.write_str(self.name())
+            }
+        }
+
+        impl<F: $kernel> PartialEq for $adapter<F> {
+            fn eq(&self, other: &Self) -> bool {
+                self.name() == other.name()
+            }
+        }
+
+        impl<F: $kernel> Eq for $adapter<F> {}
+
+        impl<F: $kernel> ::std::hash::Hash for $adapter<F> {
+            fn hash<H: ::std::hash::Hasher>(&self, state: &mut H) {
+                self.name().hash(state);
+            }
+        }
+    };
 }
 
-// Compared by name: names are unique in an engine, and its plans never contain functions of another engine.
-impl<F: ScalarKernel> PartialEq for ScalarAdapter<F> {
-    fn eq(&self, other: &Self) -> bool {
-        self.name() == other.name()
-    }
-}
+pub(super) use identify_by_name;
 
-impl<F: ScalarKernel> Eq for ScalarAdapter<F> {}
-
-impl<F: ScalarKernel> Hash for ScalarAdapter<F> {
-    fn hash<H: Hasher>(&self, state: &mut H) {
-        self.name().hash(state);
-    }
-}
+identify_by_name!(ScalarAdapter, ScalarKernel);
