@@ -22,10 +22,10 @@ use echolake_schema::tables::Table;
 use futures::future::try_join_all;
 use quick_cache::sync::Cache;
 
-use crate::as_of::{self, PastTableName};
 use crate::mcap::{self, Contents};
+use crate::scan::table::{FileReaders, LakeTable};
+use crate::statement::{PastTableName, find_past_tables};
 use crate::system;
-use crate::table::{FileReaders, LakeTable};
 use crate::views::{LakeView, LazyView, LookupFunctions, PairJoin, SortedNulls, UnusedJoin};
 use crate::{Error, error};
 
@@ -98,7 +98,7 @@ impl LakeCatalog {
         system: Vec<(&'static str, Arc<dyn TableProvider>)>,
         statement: &mut Statement,
     ) -> Result<Arc<LakeSnapshot>, Error> {
-        let past = as_of::named(statement);
+        let past = find_past_tables(statement)?;
         let current = self.current().await?;
         for (name, provider) in &current.providers {
             context.register_table(name.clone(), provider.clone()).map_err(failed)?;
@@ -118,8 +118,8 @@ impl LakeCatalog {
         Ok(current.snapshot.clone())
     }
 
-    /// Returns the current snapshot of the lake, which a query started now would see; cached until something changes. Tables
-    /// other than `runs` may have faults, see [`LakeSnapshot::check`].
+    /// Returns the current snapshot of the lake, which a query started now would see; cached until something changes.
+    /// Tables other than `runs` may have faults, see [`LakeSnapshot::check`].
     ///
     /// # Errors
     /// [`Error::Lake`] if the lake cannot be read, or `runs` is not whole.

@@ -9,7 +9,7 @@ use datafusion::catalog::{MemoryCatalogProvider, MemoryCatalogProviderList, Memo
 use datafusion::error::DataFusionError;
 use datafusion::execution::FunctionRegistry as _;
 use datafusion::execution::disk_manager::DiskManagerBuilder;
-use datafusion::execution::memory_pool::{GreedyMemoryPool, MemoryPool};
+use datafusion::execution::memory_pool::GreedyMemoryPool;
 use datafusion::execution::object_store::{DefaultObjectStoreRegistry, ObjectStoreRegistry as _, ObjectStoreUrl};
 use datafusion::execution::runtime_env::{RuntimeEnv, RuntimeEnvBuilder};
 use datafusion::execution::session_state::{SessionState, SessionStateBuilder};
@@ -18,18 +18,17 @@ use datafusion::optimizer::OptimizerRule;
 use datafusion::prelude::{SessionConfig, SessionContext};
 use echolake_lake::Lake;
 use futures::FutureExt as _;
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 use crate::catalog::LakeCatalog;
-use crate::control::pool::{HeldMemory, PartialPool};
+use crate::client::QueryQuota;
 use crate::control::threads::{QueryThreadGroups, QueryThreads};
 use crate::control::{QueryTicket, RunningQueries, StopReason};
 use crate::functions::{octet_length_of_bytes, pattern_functions};
-use crate::scan_readers::LakeReaderFactory;
-use crate::small::SmallTables;
+use crate::scan::readers::LakeReaderFactory;
+use crate::scan::small_tables::SmallTables;
+use crate::scan::table::FileReaders;
 use crate::system::{self, SystemSource};
-use crate::table::FileReaders;
-use crate::{Error, FunctionSet, OpaqueValue, Session};
+use crate::{Error, FunctionSet, OpaqueValue};
 
 /// URL of the lake's store. No other store is registered, so no query can reach a file outside of the lake.
 const STORE: &str = "echolake://lake/";
@@ -105,98 +104,6 @@ impl SqlFunction {
     }
 }
 
-/// A client with its quota. All sessions of a token share one.
-///
-/// ```
-/// use echolake_query::{EngineClient, QueryQuota};
-///
-/// let client = EngineClient::new("guest", QueryQuota { concurrent: Some(1), ..QueryQuota::default() });
-/// let permit = client.place()?;
-/// assert!(client.place().is_err());
-/// drop(permit);
-/// assert!(client.place().is_ok());
-/// # Ok::<(), echolake_query::Error>(())
-/// ```
-#[derive(Debug)]
-pub struct EngineClient {
-    name: String,
-    quota: QueryQuota,
-    places: Option<Arc<Semaphore>>,
-    /// Bytes that operators of its queries have reserved.
-    held: Arc<HeldMemory>,
-}
-
-impl EngineClient {
-    /// Creates a client.
-    pub fn new(name: impl Into<String>, quota: QueryQuota) -> Self {
-        let places = quota.concurrent.map(|places| Arc::new(Semaphore::new(places)));
-        Self { name: name.into(), quota, places, held: Arc::default() }
-    }
-
-    /// Returns the name for logs and error messages.
-    pub fn name(&self) -> &str {
-        &self.name
-    }
-
-    /// Returns the limits on the client's queries.
-    pub fn quota(&self) -> &QueryQuota {
-        &self.quota
-    }
-
-    /// Returns the client's share of the memory pool of all queries.
-    pub(crate) fn memory_pool(&self, all: Arc<dyn MemoryPool>) -> Arc<dyn MemoryPool> {
-        match self.quota.memory {
-            Some(limit) => Arc::new(PartialPool::new(all, "the client's queries hold", limit, self.held.clone())),
-            None => all,
-        }
-    }
-
-    /// Acquires one of the client's concurrency permits, for a query or for other work that its requests cause.
-    ///
-    /// # Errors
-    /// [`Error::Busy`] if all are taken.
-    pub fn place(&self) -> Result<QueryPermit, Error> {
-        let Some(places) = &self.places else { return Ok(QueryPermit(None)) };
-        let place = places.clone().try_acquire_owned().map_err(|_| self.busy())?;
-        Ok(QueryPermit(Some(place)))
-    }
-
-    /// Acquires a permit like [`EngineClient::place`], but waits up to `wait` if all are taken; first come, first
-    /// served.
-    ///
-    /// # Errors
-    /// [`Error::Busy`] if none becomes free within `wait`.
-    pub async fn place_within(&self, wait: Duration) -> Result<QueryPermit, Error> {
-        let Some(places) = &self.places else { return Ok(QueryPermit(None)) };
-        match tokio::time::timeout(wait, places.clone().acquire_owned()).await {
-            Ok(Ok(place)) => Ok(QueryPermit(Some(place))),
-            // The semaphore is never closed, so this is the timeout.
-            _ => Err(self.busy()),
-        }
-    }
-
-    fn busy(&self) -> Error {
-        Error::Busy { client: self.name.clone(), limit: self.quota.concurrent.unwrap_or(0) }
-    }
-}
-
-/// A permit for one of the queries that a client may run at once; released on drop.
-#[derive(Debug)]
-pub struct QueryPermit(#[expect(dead_code, reason = "it is held")] Option<OwnedSemaphorePermit>);
-
-/// Limits on the queries of one client; None means no limit.
-#[derive(Debug, Clone, Default)]
-pub struct QueryQuota {
-    /// Maximum time from a query's start to its last row.
-    pub time: Option<Duration>,
-    /// Maximum memory of all its queries, bytes.
-    pub memory: Option<usize>,
-    /// Maximum rows of one answer; a longer one ends with an error, it is not silently truncated.
-    pub rows: Option<u64>,
-    /// Maximum number of concurrent queries; more are refused.
-    pub concurrent: Option<usize>,
-}
-
 impl QueryEngine {
     /// Creates an engine on a lake, all of whose queries together may hold `memory` bytes; None for no limit.
     ///
@@ -235,11 +142,6 @@ impl QueryEngine {
     /// Returns the tables of the schema `system` that are not the lake's; none without a program around that has some.
     pub(crate) fn system_tables(&self) -> Vec<(&'static str, Arc<dyn TableProvider>)> {
         self.0.system.get().map_or_else(Vec::new, system::engine_tables)
-    }
-
-    /// Creates a session of a client, one per connection.
-    pub fn session(&self, client: &Arc<EngineClient>) -> Session {
-        Session::of(self.clone(), client.clone())
     }
 
     /// Returns the number of queries that run or wait now.

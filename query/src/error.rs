@@ -16,7 +16,7 @@ use echolake_schema::tables::Table;
 use echolake_schema::{ErrorCause, escape_controls};
 
 use crate::control::StopReason;
-use crate::friendly::hints;
+use crate::statement::hints;
 
 /// Minimum similarity of a suggested name: half of the letters, as in DataFusion's own suggestions.
 const ALIKE: f64 = 0.5;
@@ -120,7 +120,12 @@ impl Error {
         if let Some(limit) = Self::limit(error) {
             return limit;
         }
-        let (message, hint) = explain(error);
+        let (message, mut hint) = explain(error);
+        if let DataFusionError::SchemaError(schema, _) = error.find_root()
+            && let SchemaError::FieldNotFound { field, .. } = schema.as_ref()
+        {
+            hint = hints::of_alias(sql, &field.name).or(hint);
+        }
         let span = error.diagnostic().and_then(|d| d.span).map(|s| (s.start.line, s.start.column));
         let (message, parsed) = without_place(sql, &message);
         let place = span.or(parsed).and_then(|(line, column)| mark(sql, line, column));

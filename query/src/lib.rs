@@ -22,48 +22,32 @@
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 
-mod as_of;
-mod boxed_scan;
 mod catalog;
+mod client;
 mod control;
-mod dialect;
 mod engine;
 mod error;
 pub mod figure_rows;
-mod friendly;
 mod functions;
-mod gate;
-mod ignored_clauses;
-mod integer_casts;
 mod mcap;
 mod opaque;
 pub mod output;
-mod part_rows;
-mod placeholders;
-mod predicate;
-#[cfg(test)]
-mod request_tests;
-mod scan_readers;
+mod scan;
 mod session;
-mod small;
-mod statement_bounds;
-mod summarize;
-mod syntax_walk;
+mod statement;
 mod system;
-mod table;
 mod views;
 
+pub use client::{EngineClient, QueryPermit, QueryQuota};
 pub use control::threads::QueryThreads;
-pub use engine::{EngineClient, QueryEngine, QueryPermit, QueryQuota, SqlFunction};
+pub use engine::{QueryEngine, SqlFunction};
 pub use error::{Error, QueryPlace};
 pub use functions::FunctionSet;
 #[cfg(fuzzing)]
 pub use mcap::fuzzing::EncodedMessage;
 pub use mcap::{Attachment, Contents, Topic};
 pub use opaque::OpaqueValue;
-pub use predicate::PredicateForm;
 pub use session::{CancelHandle, ContextExtension, PreparedQuery, QueryAnswer, Session};
-pub use statement_bounds::check_statement_bounds;
-pub use syntax_walk::{walk_expr, walk_statement};
+pub use statement::{PredicateForm, check_statement_bounds, walk_expr, walk_statement};
 pub use system::{SYSTEM_SCHEMA, SystemSource};
 pub use views::table_meaning;

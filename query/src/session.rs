@@ -1,6 +1,5 @@
 //! A session: every query sees one snapshot of the lake and may only read.
 
-use std::borrow::Cow;
 use std::sync::Arc;
 
 use arrow::datatypes::{DataType, SchemaRef};
@@ -9,28 +8,25 @@ use bytes::Bytes;
 use datafusion::common::ParamValues;
 use datafusion::error::DataFusionError;
 use datafusion::execution::TaskContext;
-use datafusion::execution::context::SQLOptions;
 use datafusion::execution::session_state::SessionState;
 use datafusion::logical_expr::LogicalPlan;
 use datafusion::physical_plan::{ExecutionPlan, execute_stream};
 use datafusion::prelude::SessionContext;
-use datafusion::sql::parser::{DFParserBuilder, Statement};
-use datafusion::sql::sqlparser::parser::ParserError;
-use datafusion::sql::sqlparser::tokenizer::Tokenizer;
+use datafusion::sql::parser::Statement;
 use echolake_lake::{Lake, LakeSnapshot, VisibleRun};
 use futures::future::BoxFuture;
 use futures::{FutureExt as _, StreamExt as _};
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 
+use crate::client::{EngineClient, QueryPermit, QueryQuota};
 use crate::control::pool::PartialPool;
 use crate::control::{QueryTicket, StopReason};
-use crate::dialect::LakeDialect;
-use crate::engine::{self, EngineClient, QueryEngine, QueryPermit, QueryQuota, SqlFunction};
+use crate::engine::{self, QueryEngine, SqlFunction};
 use crate::mcap::Contents;
-use crate::statement_bounds::check_statement_bounds;
+use crate::statement::{PredicateForm, append_predicate, parse_statement, prepare_statement};
 use crate::system::SYSTEM_SCHEMA;
-use crate::{Error, OpaqueValue, as_of, friendly, gate, ignored_clauses, integer_casts, placeholders, summarize};
+use crate::{Error, OpaqueValue};
 
 /// Capacity of the queue of batches to a slow reader.
 const AHEAD: usize = 2;
@@ -112,6 +108,13 @@ impl CancelHandle {
     }
 }
 
+impl QueryEngine {
+    /// Creates a session of a client, one per connection.
+    pub fn session(&self, client: &Arc<EngineClient>) -> Session {
+        Session { engine: self.clone(), client: client.clone(), extend: None }
+    }
+}
+
 impl QueryAnswer {
     /// Returns the next rows; None after the last.
     ///
@@ -170,10 +173,6 @@ impl Session {
         Ok(QueryEngine::new(lake, None)?.session(&Arc::new(client)))
     }
 
-    pub(crate) fn of(engine: QueryEngine, client: Arc<EngineClient>) -> Self {
-        Self { engine, client, extend: None }
-    }
-
     /// Adds a protocol's own tables and functions to the session.
     #[must_use]
     pub fn extended(mut self, extend: ContextExtension) -> Self {
@@ -209,7 +208,6 @@ impl Session {
     /// lake cannot be read, [`Error::Busy`] if the client has no permit left, and those of [`QueryAnswer::next`].
     pub fn query<'a>(&'a self, sql: &'a str) -> BoxFuture<'a, Result<QueryAnswer, Error>> {
         let query = async move {
-            let sql = &*self.summarized(sql).await?;
             let started = self.start()?;
             let prepared = self.plan(sql, self.parse(sql)?, &started.ticket).await?;
             self.run(prepared.state.clone(), &prepared.sql, LogicalPlan::clone(&prepared.plan), started).await
@@ -237,19 +235,7 @@ impl Session {
     /// # Errors
     /// As [`Session::query`].
     pub fn prepare<'a>(&'a self, sql: &'a str) -> BoxFuture<'a, Result<PreparedQuery, Error>> {
-        let prepare = async move {
-            let sql = &*self.summarized(sql).await?;
-            self.prepare_statement(sql, self.parse(sql)?).await
-        };
-        prepare.boxed()
-    }
-
-    // `SUMMARIZE` becomes a query over the columns of what it names.
-    async fn summarized<'a>(&self, sql: &'a str) -> Result<Cow<'a, str>, Error> {
-        let Some(source) = summarize::source(sql) else { return Ok(Cow::Borrowed(sql)) };
-        let all = format!("select * from {source}");
-        let schema = self.prepare_statement(&all, self.parse(&all)?).await?.schema();
-        Ok(Cow::Owned(summarize::query(&source, &schema)))
+        async move { self.prepare_statement(sql, self.parse(sql)?).await }.boxed()
     }
 
     /// Plans a statement that a protocol has parsed, and perhaps rewritten, from `sql`.
@@ -301,25 +287,34 @@ impl Session {
     /// # Errors
     /// [`Error::Query`] if it is not a statement.
     pub fn parse(&self, sql: &str) -> Result<Statement, Error> {
-        check_statement_bounds(sql, &LakeDialect)?;
-        let sql = &*as_of::respelled(sql);
-        let limit = self.engine.template().config().options().sql_parser.recursion_limit.get();
-        let tokens = Tokenizer::new(&LakeDialect, sql).tokenize_with_location().map_err(ParserError::from);
-        let tokens = tokens.map(friendly::tokens::rewritten).map_err(|e| Error::syntax(sql, e))?;
-        let parser = DFParserBuilder::new(tokens).with_dialect(&LakeDialect).with_recursion_limit(limit).build();
-        let statements = parser.and_then(|mut parser| parser.parse_statements()).map_err(|e| Error::plan(sql, &e))?;
-        let wrong = |message: &str, hint: &str| Error::Query {
-            message: message.to_owned(),
-            place: None,
-            hint: Some(hint.to_owned()),
-        };
-        match <[Statement; 1]>::try_from(Vec::from(statements)) {
-            Ok([statement]) => Ok(statement),
-            Err(none) if none.is_empty() => Err(wrong("no statement", "select * from surfaces")),
-            Err(_) => Err(wrong("one statement at a time", "the prompt takes several, each ended by ;")),
-        }
+        parse_statement(sql, self.engine.template().config().options().sql_parser.recursion_limit.get())
     }
 
+    /// Returns the query `select` with a predicate appended: `select` ends in `where`, or in `and` after it. The query
+    /// is not run, and its permissions are left to the gate; this only checks that `predicate` is one expression.
+    ///
+    /// ```
+    /// use echolake_lake::{Lake, ReferenceSurfaces};
+    /// use echolake_query::{PredicateForm, Session};
+    /// use echolake_schema::Rig;
+    ///
+    /// # tokio::runtime::Runtime::new()?.block_on(async {
+    /// let lake = Lake::open_or_create("memory://", &Rig::paper(), &ReferenceSurfaces::default()).await?;
+    /// let session = Session::new(&lake)?;
+    /// let select = "select 1 from pairs where";
+    /// let selecting = |predicate| session.selecting(select, predicate, PredicateForm::Comparisons);
+    /// assert_eq!(selecting("pair_id < 9")?, "select 1 from pairs where (\npair_id < 9\n)");
+    /// assert!(selecting("true) or (true").is_err());
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// # })?;
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
+    ///
+    /// # Errors
+    /// [`Error::Query`] if the predicate is none, or is not of the form.
+    pub fn selecting(&self, select: &str, predicate: &str, form: PredicateForm) -> Result<String, Error> {
+        append_predicate(select, predicate, form, |sql| self.parse(sql))
+    }
     // The query's timeout starts here and includes waiting.
     fn start(&self) -> Result<Started, Error> {
         let place = self.client.place()?;
@@ -332,32 +327,17 @@ impl Session {
         mut statement: Statement,
         ticket: &Arc<QueryTicket>,
     ) -> Result<PreparedQuery, Error> {
-        gate::check(&statement)?;
-        let (session, text) = (self.clone(), sql.to_owned());
+        let (session, sql) = (self.clone(), sql.to_owned());
         let plan = async move {
-            let sql = text;
-            let wrong = |e: DataFusionError| Error::plan(&sql, &e);
             let context = session.engine.context();
             let system = session.engine.system_tables();
             let snapshot = session.engine.catalog().register(&context, system, &mut statement).await?;
             if let Some(extend) = &session.extend {
                 extend(&context).map_err(|e| Error::execution(&e))?;
             }
-            friendly::rewrite(&mut statement)?;
             let state = context.state();
-            friendly::expand(&mut statement, &state, &sql).await?;
-            ignored_clauses::check(&statement, &sql, &|name| {
-                state.scalar_functions().contains_key(name)
-                    && !state.aggregate_functions().contains_key(name)
-                    && !state.window_functions().contains_key(name)
-            })?;
-            let plan = state.statement_to_plan(statement).await.and_then(placeholders::infer_types);
-            let plan = plan.and_then(integer_casts::round_casts).map_err(wrong)?;
-            // `SELECT INTO` reads by its first word and makes a table by its plan.
-            let reading = SQLOptions::new().with_allow_ddl(false).with_allow_dml(false).with_allow_statements(false);
-            reading.verify_plan(&plan).map_err(|_| Error::NotReading { statement: plan.display().to_string() })?;
-            let (state, plan) = (OpaqueValue::new(context.state()), OpaqueValue::new(plan));
-            Ok(PreparedQuery { state, plan, snapshot, sql })
+            let plan = OpaqueValue::new(prepare_statement(&sql, statement, &state).await?);
+            Ok(PreparedQuery { state: OpaqueValue::new(state), plan, snapshot, sql })
         };
         self.engine.on_threads(ticket, plan).await
     }
@@ -444,8 +424,8 @@ impl Session {
         self.engine.catalog().system_tables().into_iter().chain(of_engine).collect()
     }
 
-    /// Returns all tables and views by the names that SQL has for them, and their schemas: those of the lake, then those
-    /// of the schema `system`.
+    /// Returns all tables and views by the names that SQL has for them, and their schemas: those of the lake, then
+    /// those of the schema `system`.
     pub fn all_tables(&self) -> Vec<(String, SchemaRef)> {
         let own = self.tables().map(|(name, schema)| (name.to_owned(), schema));
         let system = self.system_tables().into_iter();

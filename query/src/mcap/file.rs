@@ -23,7 +23,7 @@ use super::encodings::RawSchema;
 use super::error::Fault;
 use super::piece::{Piece, PieceKind, PieceRecords};
 use super::run_sizes::RunSizes;
-use crate::small::SmallTables;
+use crate::scan::small_tables::SmallTables;
 
 /// What is read at a time of a file that is walked.
 const BLOCK: u64 = 4 << 20;

@@ -38,7 +38,7 @@ use echolake_lake::LakeSnapshot;
 use echolake_schema::tables::Table;
 
 use crate::Error;
-use crate::syntax_walk::walk_mut;
+use crate::statement::walk_mut;
 pub use contents::{Contents, Topic};
 pub(crate) use contents::{attachment, contents};
 use error::Fault;

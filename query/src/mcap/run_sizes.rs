@@ -10,7 +10,7 @@ use echolake_lake::{Lake, LakeSnapshot};
 use echolake_schema::tables::Table;
 use object_store::path::Path;
 
-use crate::small::SmallTables;
+use crate::scan::small_tables::SmallTables;
 
 /// The rows of `runs`, in memory.
 #[derive(Debug)]

@@ -22,7 +22,7 @@ use super::file::{Channel, Files, McapFile};
 use super::rows::{Head, Mapping};
 use super::scan::{McapExec, Parts, Scan, Source};
 use super::target::Target;
-use crate::boxed_scan::boxed_scan;
+use crate::scan::boxed_scan::boxed_scan;
 
 /// Topics that a hint lists.
 const LISTED: usize = 20;

@@ -8,7 +8,7 @@ use echolake_lake::{Lake, ReferenceSurfaces};
 use echolake_schema::Rig;
 
 use super::*;
-use crate::statement_bounds::check_statement_bounds;
+use crate::check_statement_bounds;
 
 /// Timeout for a stopped query to end; a busy machine needs some of it.
 const END_LIMIT: Duration = Duration::from_secs(120);

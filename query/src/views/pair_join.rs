@@ -14,7 +14,7 @@ use datafusion::optimizer::{OptimizerConfig, OptimizerRule};
 use echolake_schema::tables::Table;
 
 use super::LookupFunctions;
-use crate::table::LakeTable;
+use crate::scan::table::LakeTable;
 
 const KEY: &str = "pair_id";
 

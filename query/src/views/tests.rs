@@ -208,7 +208,7 @@ async fn the_past_is_seen_until_it_is_vacuumed() {
     let (number, then) = (first.version, first.committed.to_rfc3339());
     for of in [
         format!("nce version as of {number}"),
-        format!("ir for version as of {number}"),
+        format!("ir version as of {number}"),
         format!("ir timestamp as of '{then}'"),
     ] {
         assert_eq!(count(&of).await, PAIRS as i64, "{of}");

@@ -58,7 +58,8 @@ mod tests {
             ("select cast(cast(2.5 as decimal(4, 1)) as int)", "3"),
             ("select cast(0.5 + x as int) from (values (2.2)) as t(x)", "3"),
             (
-                "select cast(x as int) from (values (1.6), (2.4)) as t(x) group by cast(x as int) order by cast(x as int)",
+                "select cast(x as int) from (values (1.6), (2.4)) as t(x) \
+                 group by cast(x as int) order by cast(x as int)",
                 "2",
             ),
             ("select (select max(cast(x as int)) from (values (1.6)) as t(x))", "2"),

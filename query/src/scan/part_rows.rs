@@ -1,4 +1,4 @@
-//! Rows of merged files whose other rows are none of the reader's business: read by their places in the files, so that no
+//! Visible rows of merged files, for a reader who may not see the others: read by their places in the files, so that no
 //! plan names or counts what is left out.
 
 use std::sync::Arc;

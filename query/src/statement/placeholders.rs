@@ -1,5 +1,5 @@
-//! Types of placeholders that DataFusion leaves open: those of casts, of LIMIT and OFFSET, of lists that are searched, of
-//! NOT, and of values that stand beside others.
+//! Types of placeholders that DataFusion leaves open: those of casts, of LIMIT and OFFSET, of lists that are searched,
+//! of NOT, and of values that stand beside others.
 
 use std::sync::Arc;
 

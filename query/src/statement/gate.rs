@@ -9,10 +9,10 @@ use crate::Error;
 ///
 /// # Errors
 /// [`Error::NotReading`] for all others.
-pub(crate) fn check(statement: &Statement) -> Result<(), Error> {
+pub(super) fn check_reading(statement: &Statement) -> Result<(), Error> {
     let reads = match statement {
         Statement::Statement(sql) => reads(sql),
-        Statement::Explain(explain) => return check(&explain.statement),
+        Statement::Explain(explain) => return check_reading(&explain.statement),
         Statement::CreateExternalTable(_) | Statement::CopyTo(_) | Statement::Reset(_) => false,
     };
     if reads { Ok(()) } else { Err(Error::NotReading { statement: name(&statement.to_string()) }) }

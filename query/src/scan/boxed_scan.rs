@@ -2,7 +2,8 @@
 
 /// The method `scan` of a `TableProvider`, whose future is an expression of its arguments.
 ///
-/// Written out for the compiler: in an `async fn` of that trait it proves anew that expressions are `Sync`, for seconds.
+/// Written out for the compiler: in an `async fn` of that trait it proves again that expressions are `Sync`, which
+/// takes seconds.
 macro_rules! boxed_scan {
     ($table:ident, $state:ident, $projection:ident, $filters:ident, $limit:ident => $rows:expr) => {
         fn scan<'table, 'state, 'columns, 'filters, 'scan>(

@@ -3,7 +3,7 @@
 use datafusion::sql::parser::Statement;
 use datafusion::sql::sqlparser::ast::{BinaryOperator, Expr, Ident, SetExpr, Statement as Sql, UnaryOperator, Value};
 
-use crate::{Error, Session};
+use crate::Error;
 
 /// Maximum length of a predicate of comparisons, bytes.
 const MOST_COMPARISON_BYTES: usize = 2048;
@@ -17,49 +17,36 @@ pub enum PredicateForm {
     Comparisons,
 }
 
-impl Session {
-    /// Returns the query `select` with a predicate appended: `select` ends in `where`, or in `and` after it. The query
-    /// is not run, and its permissions are left to the gate; this only checks that `predicate` is one expression.
-    ///
-    /// ```
-    /// use echolake_lake::{Lake, ReferenceSurfaces};
-    /// use echolake_query::{PredicateForm, Session};
-    /// use echolake_schema::Rig;
-    ///
-    /// # tokio::runtime::Runtime::new()?.block_on(async {
-    /// let lake = Lake::open_or_create("memory://", &Rig::paper(), &ReferenceSurfaces::default()).await?;
-    /// let session = Session::new(&lake)?;
-    /// let selecting = |predicate| session.selecting("select 1 from pairs where", predicate, PredicateForm::Comparisons);
-    /// assert_eq!(selecting("pair_id < 9")?, "select 1 from pairs where (\npair_id < 9\n)");
-    /// assert!(selecting("true) or (true").is_err());
-    /// # Ok::<(), Box<dyn std::error::Error>>(())
-    /// # })?;
-    /// # Ok::<(), Box<dyn std::error::Error>>(())
-    /// ```
-    ///
-    /// # Errors
-    /// [`Error::Query`] if the predicate is none, or is not of the form.
-    pub fn selecting(&self, select: &str, predicate: &str, form: PredicateForm) -> Result<String, Error> {
-        if form == PredicateForm::Comparisons && predicate.len() > MOST_COMPARISON_BYTES {
-            let message = format!("the predicate has {} bytes, {MOST_COMPARISON_BYTES} may be here", predicate.len());
-            return Err(refused(message, "BETWEEN and IN are shorter than many comparisons"));
-        }
-        // The line breaks keep a comment in the predicate from reaching further.
-        let query = |predicate: &str| format!("{select} (\n{predicate}\n)");
-        let given = query(predicate);
-        let (mut asked, mut ours) = (self.parse(&given)?, self.parse(&query("true"))?);
-        match (emptied(&mut asked), emptied(&mut ours)) {
-            (Some(inner), Some(_)) if asked == ours => {
-                if form == PredicateForm::Comparisons {
-                    check_comparisons(&inner)?;
-                }
-                Ok(given)
+/// Appends a predicate to the query `select` for [`Session::selecting`](crate::Session::selecting). `parse` parses a
+/// query.
+///
+/// # Errors
+/// [`Error::Query`] if the predicate is none, or is not of the form.
+pub(crate) fn append_predicate(
+    select: &str,
+    predicate: &str,
+    form: PredicateForm,
+    parse: impl Fn(&str) -> Result<Statement, Error>,
+) -> Result<String, Error> {
+    if form == PredicateForm::Comparisons && predicate.len() > MOST_COMPARISON_BYTES {
+        let message = format!("the predicate has {} bytes, {MOST_COMPARISON_BYTES} may be here", predicate.len());
+        return Err(refused(message, "BETWEEN and IN are shorter than many comparisons"));
+    }
+    // The line breaks keep a comment in the predicate from reaching further.
+    let query = |predicate: &str| format!("{select} (\n{predicate}\n)");
+    let given = query(predicate);
+    let (mut asked, mut ours) = (parse(&given)?, parse(&query("true"))?);
+    match (emptied(&mut asked), emptied(&mut ours)) {
+        (Some(inner), Some(_)) if asked == ours => {
+            if form == PredicateForm::Comparisons {
+                check_comparisons(&inner)?;
             }
-            _ => Err(refused(
-                "the predicate is not one expression".to_owned(),
-                "what may stand behind WHERE, as `snr_db < 35 and pair_id < 100`",
-            )),
+            Ok(given)
         }
+        _ => Err(refused(
+            "the predicate is not one expression".to_owned(),
+            "what may stand behind WHERE, as `snr_db < 35 and pair_id < 100`",
+        )),
     }
 }
 

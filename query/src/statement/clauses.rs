@@ -3,14 +3,16 @@
 
 use std::ops::ControlFlow;
 
+use datafusion::execution::session_state::SessionState;
 use datafusion::sql::parser::Statement;
 use datafusion::sql::sqlparser::ast::{
-    Expr, Function, FunctionArgumentClause, FunctionArguments, Join, JoinConstraint, JoinOperator, ObjectName,
-    ObjectNamePart, Query, Select, TableFactor, TableWithJoins, Visitor,
+    BinaryOperator, Expr, Function, FunctionArgumentClause, FunctionArguments, Join, JoinConstraint, JoinOperator,
+    ObjectName, ObjectNamePart, Query, Select, TableFactor, TableWithJoins, Visitor,
 };
 
+use super::syntax_walk::walk;
+use super::{hints, tree};
 use crate::Error;
-use crate::syntax_walk::walk;
 
 /// Aliases that are the first word of a kind of join which the parser does not know.
 const JOIN_WORDS: [&str; 2] = ["POSITIONAL", "ASOF"];
@@ -18,18 +20,17 @@ const JOIN_WORDS: [&str; 2] = ["POSITIONAL", "ASOF"];
 /// Replacement of an ASOF JOIN.
 const NEAREST: &str = "JOIN ... ON a.t >= b.t QUALIFY row_number() over (partition by a.id order by b.t desc) = 1";
 
-/// Accepts statements all of whose clauses are planned. `is_scalar` tells whether a function is a scalar one and nothing
-/// else.
+/// Accepts statements all of whose clauses are planned.
 ///
 /// # Errors
 /// [`Error::Query`] with the clause and what to write instead.
-pub(crate) fn check(statement: &Statement, sql: &str, is_scalar: &dyn Fn(&str) -> bool) -> Result<(), Error> {
+pub(super) fn check_clauses(statement: &Statement, sql: &str, state: &SessionState) -> Result<(), Error> {
     match statement {
-        Statement::Statement(parsed) => match walk(parsed.as_ref(), &mut ClauseVisitor { is_scalar }) {
+        Statement::Statement(parsed) => match walk(parsed.as_ref(), &mut ClauseVisitor { state }) {
             ControlFlow::Break(ignored) => Err(Error::clause(sql, &ignored.clause, ignored.hint)),
             ControlFlow::Continue(()) => Ok(()),
         },
-        Statement::Explain(explain) => check(&explain.statement, sql, is_scalar),
+        Statement::Explain(explain) => check_clauses(&explain.statement, sql, state),
         Statement::CreateExternalTable(_) | Statement::CopyTo(_) | Statement::Reset(_) => Ok(()),
     }
 }
@@ -41,7 +42,7 @@ struct IgnoredClause {
 }
 
 struct ClauseVisitor<'a> {
-    is_scalar: &'a dyn Fn(&str) -> bool,
+    state: &'a SessionState,
 }
 
 type Outcome = ControlFlow<IgnoredClause>;
@@ -85,20 +86,23 @@ impl Visitor for ClauseVisitor<'_> {
                 refuse_if(*with_ordinality, "ORDINALITY", "row_number() over ()")
             }
             TableFactor::NestedJoin { table_with_joins, .. } => check_joins(table_with_joins),
-            TableFactor::Pivot { .. } => refuse_if(true, "PIVOT here", "PIVOT in a subquery of FROM, or in WITH"),
-            TableFactor::Unpivot { .. } => refuse_if(true, "UNPIVOT here", "UNPIVOT in a subquery of FROM, or in WITH"),
+            TableFactor::Pivot { .. } => refuse_if(true, "PIVOT", hints::PIVOT),
+            TableFactor::Unpivot { .. } => refuse_if(true, "UNPIVOT", hints::UNPIVOT),
             _ => ControlFlow::Continue(()),
         }
     }
 
     fn pre_visit_expr(&mut self, expr: &Expr) -> Outcome {
+        let is_caret = matches!(expr, Expr::BinaryOp { op: BinaryOperator::BitwiseXor, .. });
+        refuse_if(is_caret, "`^`, which means power or XOR", "power(a, b) or bit_xor over rows")?;
+        refuse_if(matches!(expr, Expr::JsonAccess { .. }), "a name before a colon", hints::NAMED)?;
         let Expr::Function(function) = expr else { return ControlFlow::Continue(()) };
         let name = function.name.to_string();
         let is_columns = name.eq_ignore_ascii_case("columns");
-        refuse_if(is_columns, "COLUMNS here", "COLUMNS in a select list, in WHERE, HAVING or QUALIFY, or in UNPIVOT")?;
+        refuse_if(is_columns, "COLUMNS here", "COLUMNS in a select list, in WHERE, HAVING or QUALIFY")?;
         let has_parameters = function.parameters != FunctionArguments::None;
         refuse_if(has_parameters, &format!("parameters of {name} before its arguments"), "write them as arguments")?;
-        if !is_plain(&function.name, self.is_scalar) {
+        if !self.is_scalar(&function.name) {
             return ControlFlow::Continue(());
         }
         let refuse = |is_there, clause: &str| {
@@ -132,8 +136,6 @@ fn check_joins(tables: &TableWithJoins) -> Outcome {
         );
         let is_as_of = matches!(join_operator, JoinOperator::AsOf { .. });
         refuse_if(is_as_of, "ASOF JOIN", NEAREST)?;
-        let is_semi = matches!(join_operator, JoinOperator::Semi(_) | JoinOperator::Anti(_));
-        refuse_if(is_semi, "SEMI and ANTI JOIN without LEFT or RIGHT", "LEFT SEMI JOIN, or WHERE x IN (SELECT ...)")?;
         refuse_if(is_bare, "JOIN without ON or USING", "CROSS JOIN if every pair of rows is meant")?;
         left = relation;
     }
@@ -151,11 +153,14 @@ fn join_word(factor: &TableFactor) -> Option<&'static str> {
     JOIN_WORDS.into_iter().find(|word| alias.name.value.eq_ignore_ascii_case(word))
 }
 
-fn is_plain(name: &ObjectName, is_scalar: &dyn Fn(&str) -> bool) -> bool {
-    match name.0.as_slice() {
-        [ObjectNamePart::Identifier(name)] if name.quote_style.is_none() => is_scalar(&name.value.to_lowercase()),
-        [ObjectNamePart::Identifier(name)] => is_scalar(&name.value),
-        _ => false,
+impl ClauseVisitor<'_> {
+    // A scalar function and nothing else.
+    fn is_scalar(&self, name: &ObjectName) -> bool {
+        let [ObjectNamePart::Identifier(name)] = name.0.as_slice() else { return false };
+        let name = tree::normalized(name);
+        self.state.scalar_functions().contains_key(&name)
+            && !self.state.aggregate_functions().contains_key(&name)
+            && !self.state.window_functions().contains_key(&name)
     }
 }
 

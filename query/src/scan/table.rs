@@ -35,9 +35,9 @@ use futures::future::BoxFuture;
 use object_store::ObjectMeta;
 use tokio::sync::OnceCell;
 
-use crate::boxed_scan::boxed_scan;
-use crate::part_rows::visible_rows_scan;
-use crate::small::SmallTables;
+use super::boxed_scan::boxed_scan;
+use super::part_rows::visible_rows_scan;
+use super::small_tables::SmallTables;
 
 /// Delta writers truncate texts in statistics to 32 characters; a shorter text is complete.
 const WHOLE_TEXT: usize = 32;
@@ -237,7 +237,7 @@ impl ScanFile {
             e_tag: None,
             version: None,
         };
-        // Where hidden rows are none of the reader's business, a scan does not meet them; elsewhere it filters them out.
+        // A restricted lake's scan does not read hidden rows; other scans filter them out.
         let only_visible = is_restricted && !file.hidden.is_empty();
         let known = Arc::new(if only_visible { known_of_parts(&file, schema) } else { known(&file, schema) });
         let part = PartitionedFile::new_from_meta(meta).with_statistics(known.clone());

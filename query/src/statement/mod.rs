@@ -1,0 +1,80 @@
+//! From the text of a statement to the plan that DataFusion runs.
+//!
+//! [`parse_statement`] checks the bounds of a text ([`bounds`]) and parses it in the [`dialect`] of HTTP, Flight SQL
+//! and the prompt; Postgres' protocol checks the same bounds and has a parser of its own. [`prepare_statement`] then
+//! takes the steps that are the same for all protocols, in this order: the one [`rewrite`] of the tree, the [`gate`]
+//! and the check of [`clauses`], the planner, and two passes over its plan. The text itself is never rewritten.
+
+mod as_of;
+mod bounds;
+mod clauses;
+mod columns;
+mod dialect;
+mod gate;
+pub(crate) mod hints;
+mod integer_casts;
+mod placeholders;
+mod predicate;
+mod rewrite;
+mod summarize;
+mod syntax_walk;
+#[cfg(test)]
+mod tests;
+mod tree;
+
+use datafusion::execution::context::SQLOptions;
+use datafusion::execution::session_state::SessionState;
+use datafusion::logical_expr::LogicalPlan;
+use datafusion::sql::parser::{DFParserBuilder, Statement};
+use datafusion::sql::sqlparser::tokenizer::Tokenizer;
+
+pub(crate) use as_of::{PastTableName, find_past_tables};
+pub use bounds::check_statement_bounds;
+pub use predicate::PredicateForm;
+pub(crate) use predicate::append_predicate;
+pub(crate) use syntax_walk::walk_mut;
+pub use syntax_walk::{walk_expr, walk_statement};
+
+use crate::Error;
+use dialect::LakeDialect;
+
+/// Parses a text that is one statement.
+///
+/// # Errors
+/// [`Error::Query`] if it is none, or exceeds a bound.
+pub(crate) fn parse_statement(sql: &str, recursion_limit: usize) -> Result<Statement, Error> {
+    check_statement_bounds(sql, &LakeDialect)?;
+    let tokens = Tokenizer::new(&LakeDialect, sql).tokenize_with_location();
+    let tokens = summarize::read_summarize(tokens.map_err(|e| Error::syntax(sql, e.into()))?);
+    let builder = DFParserBuilder::new(tokens).with_dialect(&LakeDialect).with_recursion_limit(recursion_limit);
+    let statements = builder.build().and_then(|mut parser| parser.parse_statements());
+    match <[Statement; 1]>::try_from(Vec::from(statements.map_err(|e| Error::plan(sql, &e))?)) {
+        Ok([statement]) => Ok(statement),
+        Err(none) if none.is_empty() => Err(columns::refused("no statement".into(), "select * from surfaces".into())),
+        Err(_) => {
+            let hint = "the prompt takes several, each ended by ;";
+            Err(columns::refused("one statement at a time".into(), hint.into()))
+        }
+    }
+}
+
+/// Plans a parsed statement, whose tables `state` knows. `sql` is its text, for places of errors.
+///
+/// # Errors
+/// [`Error::Query`] if it cannot be planned as a whole, [`Error::NotReading`] if it would change something.
+pub(crate) async fn prepare_statement(
+    sql: &str,
+    mut statement: Statement,
+    state: &SessionState,
+) -> Result<LogicalPlan, Error> {
+    rewrite::rewrite_statement(&mut statement, state, sql)?;
+    gate::check_reading(&statement)?;
+    clauses::check_clauses(&statement, sql, state)?;
+    let plan = state.statement_to_plan(statement).await;
+    let plan = plan.and_then(placeholders::infer_types).and_then(integer_casts::round_casts);
+    let plan = plan.map_err(|e| Error::plan(sql, &e))?;
+    // `SELECT INTO` reads by its first word and makes a table by its plan.
+    let reading = SQLOptions::new().with_allow_ddl(false).with_allow_dml(false).with_allow_statements(false);
+    reading.verify_plan(&plan).map_err(|_| Error::NotReading { statement: plan.display().to_string() })?;
+    Ok(plan)
+}
