@@ -1,4 +1,4 @@
-//! Messages of Postgres' protocol as the door sees them: a type, a length, bytes. What they say is the engine's to know.
+//! Messages of Postgres' protocol as the door sees them: a type, a length, bytes. Their contents are the engine's.
 
 use bytes::{Buf as _, BufMut as _, BytesMut};
 use pgwire::error::ErrorInfo;
@@ -57,8 +57,8 @@ impl FrameHeader {
         }
     }
 
-    /// Checks that the parts of a client's message, all of which is there, are within it: the library that decodes it panics if
-    /// they are not.
+    /// Checks that the parts of a client's message, all of which is there, are within it: the library that decodes it
+    /// panics if they are not.
     ///
     /// # Errors
     /// [`RequestFault::Request`].

@@ -3,7 +3,6 @@
 
 mod cancel_keys;
 mod frames;
-mod pending_answers;
 mod relay;
 mod scram;
 

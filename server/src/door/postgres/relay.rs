@@ -11,7 +11,6 @@ use tokio::net::unix::{OwnedReadHalf, OwnedWriteHalf};
 use super::PostgresLogin;
 use super::cancel_keys::{CancelKey, CancelKeys, CancelTarget};
 use super::frames::{FrameHeader, HEADER, fatal_message, key_message};
-use super::pending_answers::PendingAnswers;
 use crate::door::encryption::DoorStream;
 use crate::door::engine_process::{EndReason, EngineLease, EngineProcess};
 use crate::door::server_door::ServerDoor;
@@ -22,8 +21,6 @@ use crate::fault::RequestFault;
 const READ_BYTES: usize = 256 << 10;
 /// Bytes of a client's message from which it is passed on before it is whole, and that wait for an engine.
 const ASK_BYTES: usize = 64 << 10;
-/// Messages without an answer from which a client is not read.
-const MOST_PENDING: usize = 10_000;
 
 /// A connection of a client that is logged in.
 pub(super) struct MessageRelay {
@@ -37,7 +34,37 @@ pub(super) struct MessageRelay {
     outgoing: BytesMut,
     /// Bytes of a long message that are still to come.
     rest: usize,
-    pending: PendingAnswers,
+    /// Answers that the engine owes.
+    awaited: AwaitedAnswers,
+}
+
+/// What a client waits for, by the types of messages alone: each Query and Sync ends with a ReadyForQuery. A Flush
+/// requests answers, too; its client waits until it has sent a Sync, whose answer is the last.
+#[derive(Default)]
+struct AwaitedAnswers {
+    ends: usize,
+    is_flushed: bool,
+}
+
+impl AwaitedAnswers {
+    fn ask(&mut self, kind: u8) {
+        match kind {
+            b'Q' | b'S' => self.ends += 1,
+            b'H' => self.is_flushed = true,
+            _ => {}
+        }
+    }
+
+    fn answer(&mut self, kind: u8) {
+        if kind == b'Z' {
+            self.ends = self.ends.saturating_sub(1);
+            self.is_flushed = false;
+        }
+    }
+
+    fn is_any(&self) -> bool {
+        self.ends > 0 || self.is_flushed
+    }
 }
 
 /// A connection to an engine.
@@ -83,7 +110,7 @@ impl MessageRelay {
             incoming: BytesMut::new(),
             outgoing: BytesMut::new(),
             rest: 0,
-            pending: PendingAnswers::default(),
+            awaited: AwaitedAnswers::default(),
         }
     }
 
@@ -118,9 +145,9 @@ impl MessageRelay {
                 return end;
             }
             let is_unread = !self.outgoing.is_empty();
-            link.lease.set_waiting(is_unread || !self.pending.is_requested());
+            link.lease.set_waiting(is_unread || !self.awaited.is_any());
             tokio::select! {
-                () = drain.begun(), if !is_unread && !self.pending.is_requested() => {
+                () = drain.begun(), if !is_unread && !self.awaited.is_any() => {
                     self.outgoing = fatal_message(&RequestFault::Disconnected);
                     return RelayEnd::Client;
                 }
@@ -136,7 +163,7 @@ impl MessageRelay {
                     }
                 }
                 read = self.read.read_buf(&mut self.incoming),
-                    if link.outgoing.len() < ASK_BYTES && self.pending.len() < MOST_PENDING =>
+                    if link.outgoing.len() < ASK_BYTES =>
                 {
                     if read.unwrap_or(0) == 0 {
                         return RelayEnd::Client;
@@ -173,7 +200,7 @@ impl MessageRelay {
             if there == header.bytes {
                 header.check_parts(&self.incoming[..there]).map_err(broken)?;
             }
-            self.pending.ask(header.kind);
+            self.awaited.ask(header.kind);
             self.rest = header.bytes - there;
             link.outgoing.extend_from_slice(&self.incoming.split_to(there));
         }
@@ -197,7 +224,7 @@ impl MessageRelay {
             if there.len() < header.bytes && header.bytes <= READ_BYTES {
                 break;
             }
-            self.pending.answer(header.kind);
+            self.awaited.answer(header.kind);
             let bytes = header.bytes.min(there.len());
             (passed, link.rest) = (passed + bytes, header.bytes - bytes);
         }
