@@ -246,7 +246,7 @@ fn the_catalogue_is_as_in_postgres() {
         ),
         (
             "select col_description('pairs'::regclass, 1) is not null, obj_description('pairs'::regclass)",
-            "t,One row per pair",
+            "t,One row per pair of grid points: distances and angles.",
         ),
         ("select has_table_privilege('pairs', 'SELECT'), has_table_privilege('pairs', 'INSERT')", "t,f"),
         ("select count(*) from information_schema.table_constraints", "0"),

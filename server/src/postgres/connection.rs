@@ -1,6 +1,6 @@
 //! A connection: its session, settings and cursors, and what runs on it.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::HashMap;
 use std::sync::atomic::{AtomicI32, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 
@@ -14,7 +14,7 @@ use pgwire::messages::startup::SecretKey;
 use tokio::sync::SetOnce;
 
 use super::catalog::PgCatalog;
-use super::cursor::QueryCursor;
+use super::cursor::{CommandRun, QueryCursor};
 use super::settings::SessionSettings;
 use super::statement::{self, ClientStatement, PlannedQuery};
 use crate::Error;
@@ -27,8 +27,6 @@ use crate::service::{QueryJob, QueryService, QueryWork};
 const CURSORS: usize = 16;
 /// Bytes of a query, as over HTTP.
 const LARGEST: usize = 2 << 20;
-/// Prepared statements of a connection at once, and portals.
-const NAMED: usize = 500;
 
 /// The key by which a client cancels: the process's number and the secret that it was given.
 type BackendKey = (i32, Bytes);
@@ -65,7 +63,6 @@ pub(super) struct PostgresConnection {
     key: OnceLock<BackendKey>,
     current: Arc<Mutex<StopSignal>>,
     cursors: Mutex<HashMap<String, Arc<QueryCursor>>>,
-    kept: Mutex<HashSet<(NamedObject, String)>>,
     pub(super) settings: Arc<SessionSettings>,
 }
 
@@ -77,29 +74,6 @@ impl Drop for PostgresConnection {
     }
 }
 
-/// Kinds of named objects that clients keep.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub(super) enum NamedObject {
-    Statement,
-    Portal,
-}
-
-impl NamedObject {
-    fn name(self) -> &'static str {
-        match self {
-            Self::Statement => "prepared statements",
-            Self::Portal => "portals",
-        }
-    }
-}
-
-/// Stop signal and time limit of a command.
-#[derive(Clone)]
-pub(super) struct CommandRun {
-    pub(super) stop: StopSignal,
-    pub(super) limit: Option<SessionTimeLimit>,
-}
-
 impl PostgresConnection {
     /// A connection without a login.
     pub(super) fn new(shared: Arc<PostgresState>) -> Self {
@@ -109,7 +83,6 @@ impl PostgresConnection {
             key: OnceLock::new(),
             current: Arc::new(Mutex::new(StopSignal::new())),
             cursors: Mutex::default(),
-            kept: Mutex::default(),
             settings: Arc::default(),
         }
     }
@@ -173,7 +146,7 @@ impl PostgresConnection {
             let sql: Arc<str> = sql.into();
             let work = async move {
                 let mut statements = Vec::new();
-                for parsed in statement::parse(&shared.parser, &session, &sql)? {
+                for parsed in statement::parse(&shared.parser, shared.catalog.empty_relations(), &session, &sql)? {
                     statements.push(statement::plan(&session, &sql, parsed).await?);
                 }
                 Ok(statements)
@@ -216,27 +189,6 @@ impl PostgresConnection {
             stop: run.stop.clone(),
         };
         self.shared.service.begin(job, encode).await
-    }
-
-    /// Counts an object that a client keeps by name.
-    pub(super) fn remember(&self, kind: NamedObject, name: &str) -> Result<(), RequestFault> {
-        let mut all = lock(&self.kept);
-        let new = (kind, name.to_owned());
-        if !all.contains(&new) && all.iter().filter(|(known, _)| *known == kind).count() >= NAMED {
-            return Err(RequestFault::TooMany { what: kind.name(), limit: NAMED });
-        }
-        all.insert(new);
-        Ok(())
-    }
-
-    /// Stops counting it.
-    pub(super) fn forget(&self, kind: NamedObject, name: &str) {
-        lock(&self.kept).remove(&(kind, name.to_owned()));
-    }
-
-    /// All portals are gone.
-    pub(super) fn forget_portals(&self) {
-        lock(&self.kept).retain(|(kind, _)| *kind != NamedObject::Portal);
     }
 
     /// Keeps a cursor.

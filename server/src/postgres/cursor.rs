@@ -7,15 +7,20 @@ use arrow::record_batch::RecordBatch;
 use futures::stream;
 use pgwire::api::portal::Format;
 use pgwire::api::results::QueryResponse;
-use pgwire::error::PgWireResult;
+use pgwire::error::PgWireError;
 use pgwire::messages::data::DataRow;
 use tokio::sync::Mutex;
 
-use super::connection::CommandRun;
 use super::rows::{RowEncoder, fields, flat};
-use super::sqlstate::error;
 use crate::fault::RequestFault;
-use crate::running::RunningQuery;
+use crate::running::{RunningQuery, SessionTimeLimit, StopSignal};
+
+/// Stop signal and time limit of a command.
+#[derive(Clone)]
+pub(super) struct CommandRun {
+    pub(super) stop: StopSignal,
+    pub(super) limit: Option<SessionTimeLimit>,
+}
 
 /// A cursor.
 pub(super) struct QueryCursor {
@@ -33,8 +38,11 @@ struct RemainingRows {
 }
 
 impl RemainingRows {
-    // The next rows, at most this many.
-    async fn take(&mut self, most: usize) -> Result<Option<RecordBatch>, RequestFault> {
+    // Encodes the next rows, at most this many.
+    async fn next_rows(&mut self, most: usize, encoder: &RowEncoder) -> Result<Option<Vec<DataRow>>, RequestFault> {
+        if most == 0 {
+            return Ok(None);
+        }
         let batch = match self.begun.take() {
             Some(batch) => batch,
             None => match self.running.next().await? {
@@ -46,7 +54,7 @@ impl RemainingRows {
         if count < batch.num_rows() {
             self.begun = Some(batch.slice(count, batch.num_rows() - count));
         }
-        Ok(Some(batch.slice(0, count)))
+        encoder.encode(batch.slice(0, count)).map(Some)
     }
 }
 
@@ -71,29 +79,17 @@ impl QueryCursor {
             left.running.stop = run.stop.clone();
         }
         let encoder = Arc::new(RowEncoder::new(&self.schema, format)?);
-        let parts = stream::try_unfold((rows, count), move |(rows, wanted)| {
+        let most = count.map_or(usize::MAX, |count| usize::try_from(count).unwrap_or(usize::MAX));
+        let parts = stream::try_unfold((rows, most), move |(rows, most)| {
             let encoder = encoder.clone();
             async move {
-                let part: PgWireResult<_> = next(&rows, wanted, &encoder).await.map_err(|fault| error(&fault));
-                Ok(part?.map(|(part, wanted)| (part, (rows, wanted))))
+                let Some(part) = rows.lock().await.next_rows(most, &encoder).await? else { return Ok(None) };
+                let left = most - part.len();
+                Ok::<_, PgWireError>(Some((part, (rows, left))))
             }
         });
         let mut response = QueryResponse::new(fields(&self.schema, format)?, flat(parts));
         response.set_command_tag("FETCH");
         Ok(response)
     }
-}
-
-async fn next(
-    rows: &Mutex<RemainingRows>,
-    wanted: Option<u64>,
-    encoder: &RowEncoder,
-) -> Result<Option<(Vec<DataRow>, Option<u64>)>, RequestFault> {
-    let most = wanted.map_or(usize::MAX, |n| usize::try_from(n).unwrap_or(usize::MAX));
-    if most == 0 {
-        return Ok(None);
-    }
-    let Some(batch) = rows.lock().await.take(most).await? else { return Ok(None) };
-    let left = wanted.map(|n| n - batch.num_rows() as u64);
-    Ok(Some((encoder.encode(batch)?, left)))
 }

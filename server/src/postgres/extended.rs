@@ -12,24 +12,19 @@ use futures::{Sink, SinkExt as _};
 use pgwire::api::portal::{Format, Portal, PortalExecutionState};
 use pgwire::api::query::{ExtendedQueryHandler, send_describe_response, send_partial_query_response};
 use pgwire::api::results::{DescribePortalResponse, FieldInfo, Response, Tag};
-use pgwire::api::stmt::{QueryParser, StoredStatement};
+use pgwire::api::stmt::QueryParser;
 use pgwire::api::store::{Entry, PortalStore};
 use pgwire::api::{ClientInfo, ClientPortalStore, DEFAULT_NAME, PgWireConnectionState, Type};
 use pgwire::error::{PgWireError, PgWireResult};
 use pgwire::messages::PgWireBackendMessage;
-use pgwire::messages::extendedquery::{
-    Bind, BindComplete, Close, CloseComplete, Describe, Execute, Parse, ParseComplete, Sync as PgSync,
-    TARGET_TYPE_BYTE_PORTAL, TARGET_TYPE_BYTE_STATEMENT,
-};
+use pgwire::messages::extendedquery::{Describe, Execute, Sync as PgSync, TARGET_TYPE_BYTE_PORTAL};
 use pgwire::messages::response::{EmptyQueryResponse, ReadyForQuery, TransactionStatus};
 
-use super::array_texts::array_elements;
-use super::catalog::OID;
-use super::command::{StatementReply, act, columns};
-use super::connection::{NamedObject, PostgresConnection};
-use super::copy;
+use super::columns::array_elements;
+use super::command::{execute_statement, find_columns};
+use super::connection::PostgresConnection;
+use super::names::OID;
 use super::rows::fields;
-use super::sqlstate::error;
 use super::statement::ClientStatement;
 use crate::fault::RequestFault;
 
@@ -57,15 +52,15 @@ impl QueryParser for StatementPlanner {
         C: ClientInfo + Unpin + Send + Sync,
     {
         let run = self.0.command();
-        let mut statements = self.0.statements(sql, &run).await.map_err(|fault| error(&fault))?;
+        let mut statements = self.0.statements(sql, &run).await?;
         match statements.len() {
             0 | 1 => Ok(statements.pop()),
-            _ => Err(error(&RequestFault::request("cannot insert multiple commands into a prepared statement"))),
+            _ => Err(RequestFault::request("cannot insert multiple commands into a prepared statement").into()),
         }
     }
 
     fn get_parameter_types(&self, statement: &ClientStatement) -> PgWireResult<Vec<Type>> {
-        let kinds = kinds(statement).map_err(|fault| error(&fault))?;
+        let kinds = kinds(statement)?;
         // If the query does not determine the type, Postgres takes a text.
         let one = |kind: Option<DataType>| match kind {
             Some(DataType::List(element)) if element.name() == OID => Ok(Type::OID_ARRAY),
@@ -76,7 +71,7 @@ impl QueryParser for StatementPlanner {
 
     fn get_result_schema(&self, statement: &ClientStatement, format: Option<&Format>) -> PgWireResult<Vec<FieldInfo>> {
         let format = format.unwrap_or(&Format::UnifiedText);
-        columns(&self.0, statement, format).map_err(|fault| error(&fault))
+        Ok(find_columns(&self.0, statement, format)?)
     }
 }
 
@@ -117,7 +112,7 @@ fn list_value(
     Ok(Some(value))
 }
 
-fn values(portal: &Portal<ClientStatement>) -> Result<ParamValues, RequestFault> {
+fn read_values(portal: &Portal<ClientStatement>) -> Result<ParamValues, RequestFault> {
     let kinds = kinds(&portal.statement.statement)?;
     let given = portal.parameter_len();
     if given != kinds.len() {
@@ -164,46 +159,6 @@ impl ExtendedQueryHandler for ExtendedQueries {
         self.parser.clone()
     }
 
-    async fn on_parse<C>(&self, client: &mut C, message: Parse) -> PgWireResult<()>
-    where
-        C: ClientInfo + ClientPortalStore + Sink<PgWireBackendMessage> + Unpin + Send + Sync,
-        C::PortalStore: PortalStore<Statement = ClientStatement>,
-        C::Error: Debug,
-        PgWireError: From<<C as Sink<PgWireBackendMessage>>::Error>,
-    {
-        let name = message.name.clone().unwrap_or_else(|| DEFAULT_NAME.to_owned());
-        let parsed = StoredStatement::parse(client, &message, self.parser.clone()).await?;
-        self.connection.remember(NamedObject::Statement, &name).map_err(|fault| error(&fault))?;
-        match parsed {
-            Some(statement) => client.portal_store().put_statement(Arc::new(statement)),
-            None => client.portal_store().put_empty_statement(&name),
-        }
-        client.feed(PgWireBackendMessage::ParseComplete(ParseComplete::new())).await?;
-        Ok(())
-    }
-
-    // As the library's own, but that portals are counted.
-    async fn on_bind<C>(&self, client: &mut C, message: Bind) -> PgWireResult<()>
-    where
-        C: ClientInfo + ClientPortalStore + Sink<PgWireBackendMessage> + Unpin + Send + Sync,
-        C::PortalStore: PortalStore<Statement = ClientStatement>,
-        C::Error: Debug,
-        PgWireError: From<<C as Sink<PgWireBackendMessage>>::Error>,
-    {
-        let name = message.statement_name.clone().unwrap_or_else(|| DEFAULT_NAME.to_owned());
-        let portal = message.portal_name.clone().unwrap_or_else(|| DEFAULT_NAME.to_owned());
-        self.connection.remember(NamedObject::Portal, &portal).map_err(|fault| error(&fault))?;
-        match client.portal_store().get_statement(&name) {
-            Some(Entry::Value(statement)) => {
-                client.portal_store().put_portal(Arc::new(Portal::try_new(&message, statement)?));
-            }
-            Some(Entry::Empty) => client.portal_store().put_empty_portal(&portal),
-            None => return Err(PgWireError::StatementNotFound(name)),
-        }
-        client.feed(PgWireBackendMessage::BindComplete(BindComplete::new())).await?;
-        Ok(())
-    }
-
     // The library's own gathers a whole answer before it sends the first row.
     async fn on_execute<C>(&self, client: &mut C, message: Execute) -> PgWireResult<()>
     where
@@ -218,10 +173,7 @@ impl ExtendedQueryHandler for ExtendedQueries {
         client.set_state(PgWireConnectionState::QueryInProgress);
         let name = message.name.as_deref().unwrap_or(DEFAULT_NAME);
         match client.portal_store().get_portal(name) {
-            Some(Entry::Value(portal)) => {
-                let most = usize::try_from(message.max_rows).unwrap_or(0);
-                self.execute(client, &portal, most).await?;
-            }
+            Some(Entry::Value(portal)) => self.execute_portal(client, &portal, message.max_rows).await?,
             Some(Entry::Empty) => {
                 client.feed(PgWireBackendMessage::EmptyQueryResponse(EmptyQueryResponse::new())).await?;
             }
@@ -243,7 +195,7 @@ impl ExtendedQueryHandler for ExtendedQueries {
             && client.portal_store().get_portal(name).is_none()
             && let Ok(cursor) = self.connection.cursor(name)
         {
-            let columns = fields(&cursor.schema, &Format::UnifiedText).map_err(|fault| error(&fault))?;
+            let columns = fields(&cursor.schema, &Format::UnifiedText)?;
             return send_describe_response(client, &DescribePortalResponse::new(columns.to_vec())).await;
         }
         self._on_describe(client, message).await
@@ -259,35 +211,10 @@ impl ExtendedQueryHandler for ExtendedQueries {
     {
         let status = client.transaction_status();
         match status {
-            TransactionStatus::Idle => {
-                client.portal_store().clear_portals();
-                self.connection.forget_portals();
-            }
+            TransactionStatus::Idle => client.portal_store().clear_portals(),
             _ => client.portal_store().rm_portal(DEFAULT_NAME),
         }
         client.send(PgWireBackendMessage::ReadyForQuery(ReadyForQuery::new(status))).await?;
-        Ok(())
-    }
-
-    async fn on_close<C>(&self, client: &mut C, message: Close) -> PgWireResult<()>
-    where
-        C: ClientInfo + ClientPortalStore + Sink<PgWireBackendMessage> + Unpin + Send + Sync,
-        C::PortalStore: PortalStore<Statement = ClientStatement>,
-        C::Error: Debug,
-        PgWireError: From<<C as Sink<PgWireBackendMessage>>::Error>,
-    {
-        let name = message.name.as_deref().unwrap_or(DEFAULT_NAME);
-        match message.target_type {
-            TARGET_TYPE_BYTE_STATEMENT => {
-                client.portal_store().rm_statement(name);
-                self.connection.forget(NamedObject::Statement, name);
-            }
-            _ => {
-                client.portal_store().rm_portal(name);
-                self.connection.forget(NamedObject::Portal, name);
-            }
-        }
-        client.feed(PgWireBackendMessage::CloseComplete(CloseComplete::new())).await?;
         Ok(())
     }
 
@@ -304,7 +231,7 @@ impl ExtendedQueryHandler for ExtendedQueries {
 }
 
 impl ExtendedQueries {
-    async fn execute<C>(&self, client: &mut C, portal: &Portal<ClientStatement>, most: usize) -> PgWireResult<()>
+    async fn execute_portal<C>(&self, client: &mut C, portal: &Portal<ClientStatement>, most: i32) -> PgWireResult<()>
     where
         C: ClientInfo + ClientPortalStore + Sink<PgWireBackendMessage> + Unpin + Send + Sync,
         C::PortalStore: PortalStore<Statement = ClientStatement>,
@@ -314,28 +241,22 @@ impl ExtendedQueries {
         let state = portal.state();
         let mut state = state.lock().await;
         if matches!(*state, PortalExecutionState::Initial) {
-            let values = values(portal).map_err(|fault| error(&fault))?;
+            let values = read_values(portal)?;
             let run = self.connection.command();
             let statement = &portal.statement.statement;
-            match act(&self.connection, client, &run, statement, values, &portal.result_column_format).await? {
-                StatementReply::Rows(rows) => *state = PortalExecutionState::Suspended(rows),
-                StatementReply::Copy(form, running) => return copy::send(client, &form, running).await,
-                StatementReply::Done(tag) => {
-                    client.feed(PgWireBackendMessage::CommandComplete(tag.into())).await?;
-                    return Ok(());
-                }
+            let format = &portal.result_column_format;
+            match execute_statement(&self.connection, client, &run, statement, values, format).await? {
+                Some(rows) => *state = PortalExecutionState::Suspended(rows),
+                None => return Ok(()),
             }
         }
-        match &mut *state {
-            PortalExecutionState::Suspended(rows) => {
-                if !send_partial_query_response(client, rows, most).await? {
-                    *state = PortalExecutionState::Finished;
-                }
+        if let PortalExecutionState::Suspended(rows) = &mut *state {
+            if !send_partial_query_response(client, rows, usize::try_from(most).unwrap_or(0)).await? {
+                *state = PortalExecutionState::Finished;
             }
-            _ => {
-                let tag = Tag::new("SELECT").with_rows(0);
-                client.feed(PgWireBackendMessage::CommandComplete(tag.into())).await?;
-            }
+        } else {
+            let tag = Tag::new("SELECT").with_rows(0);
+            client.feed(PgWireBackendMessage::CommandComplete(tag.into())).await?;
         }
         Ok(())
     }

@@ -1,8 +1,9 @@
 //! Postgres' wire protocol, for psql, drivers and tools that speak it: reading only, one session per connection.
 
-mod array_texts;
 mod catalog;
-mod column_names;
+mod catalog_statement;
+mod catalog_tables;
+mod columns;
 mod command;
 mod connection;
 mod copy;
@@ -10,17 +11,13 @@ mod cursor;
 mod extended;
 mod fixed_tables;
 mod functions;
-mod information;
-mod json_columns;
-mod relations;
-mod rewrite;
+mod names;
 mod rows;
 mod settings;
 mod simple;
 pub(crate) mod sqlstate;
 mod startup;
 mod statement;
-mod text_functions;
 
 use std::io;
 use std::sync::Arc;

@@ -2,10 +2,11 @@
 
 use std::sync::Arc;
 
-use arrow::array::{Array as _, ArrayRef, AsArray as _, StringArray};
+use arrow::array::{Array as _, ArrayRef, AsArray as _, StringArray, StringBuilder};
 use arrow::compute::cast;
 use arrow::datatypes::{DataType, Field, FieldRef, Int32Type, Schema, SchemaRef};
 use arrow::error::ArrowError;
+use arrow::json::writer::{EncoderOptions, make_encoder};
 use arrow::record_batch::{RecordBatch, RecordBatchOptions};
 use arrow_pg::datatypes::{PG_OID_ALIAS_KEY, arrow_schema_to_pg_fields};
 use arrow_pg::encode_recordbatch;
@@ -17,10 +18,8 @@ use pgwire::api::results::{DataRowEncoder, FieldFormat, FieldInfo, QueryResponse
 use pgwire::error::{PgWireError, PgWireResult};
 use pgwire::messages::data::DataRow;
 
-use super::column_names::REPEATED;
+use super::columns::REPEATED;
 use super::fixed_tables::{VECTOR_KEY, function_name};
-use super::json_columns::{is_json, json_texts};
-use super::sqlstate::error;
 use crate::fault::RequestFault;
 use crate::running::{AnswerEncoder, RunningQuery};
 
@@ -92,8 +91,8 @@ impl RowEncoder {
     }
 }
 
-/// Columns as Postgres has them: in texts a function's number is its name, and some lists have no brackets; what Postgres
-/// has no type for is JSON.
+/// Columns as Postgres has them: in texts a function's number is its name, and some lists have no brackets; what
+/// Postgres has no type for is JSON.
 ///
 /// # Errors
 /// If a value has no JSON.
@@ -144,8 +143,8 @@ impl AnswerEncoder for RowEncoder {
 pub(super) fn response(running: RunningQuery<Vec<DataRow>>, format: &Format) -> Result<QueryResponse, RequestFault> {
     let fields = fields(&running.schema, format)?;
     let parts = stream::try_unfold(running, |mut running| async move {
-        let part = running.next().await.map_err(|fault| error(&fault))?;
-        Ok(part.map(|part| (part, running)))
+        let part = running.next().await?;
+        Ok::<_, PgWireError>(part.map(|part| (part, running)))
     });
     Ok(QueryResponse::new(fields, flat(parts)))
 }
@@ -175,4 +174,57 @@ pub(super) fn texts(names: &[&str], rows: &[Vec<String>]) -> Result<QueryRespons
         encoded.push(Ok(encoder.take_row()));
     }
     Ok(QueryResponse::new(fields, stream::iter(encoded)))
+}
+
+// A type that Postgres has not: lists of lists and of rows, and maps.
+fn is_json(kind: &DataType) -> bool {
+    match kind {
+        DataType::List(element) | DataType::LargeList(element) | DataType::FixedSizeList(element, _) => {
+            element.data_type().is_nested()
+        }
+        DataType::Map(..) => true,
+        _ => false,
+    }
+}
+
+// The values as texts of JSON; numbers that are not finite are null there.
+fn json_texts(column: &ArrayRef) -> Result<ArrayRef, ArrowError> {
+    let field = Arc::new(Field::new("", column.data_type().clone(), true));
+    let options = EncoderOptions::default().with_explicit_nulls(true);
+    let mut encoder = make_encoder(&field, column, &options)?;
+    let mut texts = StringBuilder::new();
+    let mut json = Vec::new();
+    for row in 0..column.len() {
+        if encoder.is_null(row) {
+            texts.append_null();
+            continue;
+        }
+        json.clear();
+        encoder.encode(row, &mut json);
+        texts.append_value(std::str::from_utf8(&json).map_err(|e| ArrowError::JsonError(e.to_string()))?);
+    }
+    Ok(Arc::new(texts.finish()))
+}
+
+#[cfg(test)]
+mod tests {
+    use arrow::array::ListArray;
+    use arrow::buffer::OffsetBuffer;
+    use arrow::datatypes::Float32Type;
+
+    use super::*;
+
+    #[test]
+    fn lists_of_lists_are_json() {
+        let inner = [Some(vec![Some(1.0), None]), Some(vec![]), Some(vec![Some(f32::NAN)])];
+        let inner = ListArray::from_iter_primitive::<Float32Type, _, _>(inner);
+        let field = Arc::new(Field::new("item", inner.data_type().clone(), true));
+        let offsets = OffsetBuffer::from_lengths([2, 0, 1]);
+        let nulls = Some(vec![true, false, true].into());
+        let outer: ArrayRef = Arc::new(ListArray::new(field, offsets, Arc::new(inner.clone()), nulls));
+        assert!(is_json(outer.data_type()) && !is_json(inner.data_type()));
+        let texts = json_texts(&outer).expect("JSON");
+        let texts: Vec<_> = texts.as_string::<i32>().iter().collect();
+        assert_eq!(texts, [Some("[[1.0,null],[]]"), None, Some("[[null]]")]);
+    }
 }

@@ -16,18 +16,11 @@ use pgwire::messages::PgWireBackendMessage;
 use pgwire::messages::response::EmptyQueryResponse;
 use pgwire::messages::simplequery::Query;
 
-use super::command::{StatementReply, act};
+use super::command::execute_statement;
 use super::connection::PostgresConnection;
-use super::copy;
-use super::sqlstate::error;
 
 /// Answers simple queries.
 pub(super) struct SimpleQueries(pub(super) Arc<PostgresConnection>);
-
-/// No values.
-pub(super) fn none() -> ParamValues {
-    ParamValues::from(Vec::<ScalarValue>::new())
-}
 
 #[async_trait]
 impl SimpleQueryHandler for SimpleQueries {
@@ -44,15 +37,16 @@ impl SimpleQueryHandler for SimpleQueries {
         }
         client.set_state(PgWireConnectionState::QueryInProgress);
         let run = self.0.command();
-        let statements = self.0.statements(&query.query, &run).await.map_err(|fault| error(&fault))?;
+        let statements = self.0.statements(&query.query, &run).await?;
         if statements.is_empty() {
             client.feed(PgWireBackendMessage::EmptyQueryResponse(EmptyQueryResponse::new())).await?;
         }
         for statement in &statements {
-            match act(&self.0, client, &run, statement, none(), &Format::UnifiedText).await? {
-                StatementReply::Rows(rows) => send_query_response(client, rows, true).await?,
-                StatementReply::Copy(form, running) => copy::send(client, &form, running).await?,
-                StatementReply::Done(tag) => client.feed(PgWireBackendMessage::CommandComplete(tag.into())).await?,
+            let values = ParamValues::from(Vec::<ScalarValue>::new());
+            if let Some(rows) =
+                execute_statement(&self.0, client, &run, statement, values, &Format::UnifiedText).await?
+            {
+                send_query_response(client, rows, true).await?;
             }
         }
         client.set_state(PgWireConnectionState::ReadyForQuery);

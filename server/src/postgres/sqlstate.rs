@@ -5,9 +5,11 @@ use pgwire::error::{ErrorInfo, PgWireError};
 
 use crate::fault::{FaultCode, FaultParts, RequestFault};
 
-/// A failure that leaves the connection open.
-pub(crate) fn error(fault: &RequestFault) -> PgWireError {
-    info("ERROR", fault)
+// A failure that leaves the connection open.
+impl From<RequestFault> for PgWireError {
+    fn from(fault: RequestFault) -> Self {
+        info("ERROR", &fault)
+    }
 }
 
 /// A failure that ends the connection.

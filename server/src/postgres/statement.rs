@@ -12,12 +12,16 @@ use datafusion::sql::sqlparser::parser::Parser;
 use datafusion_pg_catalog::sql::PostgresCompatibilityParser;
 use echolake_query::{Error as QueryError, OpaqueValue, PreparedQuery, Session, check_statement_bounds};
 
-use super::copy::{self, CopyAs};
-use super::rewrite;
+use super::catalog_statement::{EmptyRelations, adapt, find_catalog_names};
+use super::columns::adapt_columns;
+use super::copy::{CopyForm, read_copy};
 use crate::fault::RequestFault;
 
 /// Statements of one text at most.
 const TOGETHER: usize = 100;
+/// A statement that the parser does not know, and the same in other words.
+const ABORT: &str = "abort";
+const ROLLBACK: &str = "rollback";
 
 /// A planned query.
 pub(super) struct PlannedQuery {
@@ -45,7 +49,7 @@ impl PlannedQuery {
 #[derive(Clone)]
 pub(super) enum ClientStatement {
     Query(Arc<PlannedQuery>),
-    Copy(Arc<PlannedQuery>, CopyAs),
+    Copy(Arc<PlannedQuery>, CopyForm),
     Declare {
         name: String,
         planned: Arc<PlannedQuery>,
@@ -72,36 +76,45 @@ pub(super) enum ClientStatement {
     Unlisten,
 }
 
-/// Parses the statements of a text.
+/// Parses the statements of a text. Those about the server alone are adapted, all others stay as they are written, but
+/// for what [`adapt_columns`] adds.
 pub(super) fn parse(
     parser: &PostgresCompatibilityParser,
+    empty: &EmptyRelations,
     session: &Session,
     sql: &str,
 ) -> Result<Vec<Parsed>, RequestFault> {
     check_statement_bounds(sql, &PostgreSqlDialect {})?;
-    let statements = match Parser::parse_sql(&PostgreSqlDialect {}, sql) {
-        Ok(mut written) => replaced_queries(parser, sql, &mut written).unwrap_or(written),
-        Err(_) => match parser.parse(sql) {
-            // ABORT, which it takes for ROLLBACK.
-            Ok(adapted) => adapted,
-            // DataFusion's own parser knows more, such as DESCRIBE, and gives the position of an error.
-            Err(_) => return Ok(vec![session.parse(sql)?]),
-        },
+    let sql = if sql.trim_end_matches([' ', ';']).eq_ignore_ascii_case(ABORT) { ROLLBACK } else { sql };
+    // DataFusion's own parser knows more, such as DESCRIBE, and gives the position of an error.
+    let Ok(mut statements) = Parser::parse_sql(&PostgreSqlDialect {}, sql) else {
+        return Ok(vec![session.parse(sql)?]);
     };
     if statements.len() > TOGETHER {
         return Err(RequestFault::TooMany { what: "statements in one text", limit: TOGETHER });
     }
-    Ok(statements.into_iter().map(|s| Parsed::Statement(Box::new(rewrite::rewrite(s)))).collect())
+    if let Some(replaced) = replace_queries(parser, sql, &mut statements) {
+        statements = replaced;
+    }
+    Ok(statements.into_iter().map(|statement| adapt_statement(statement, empty)).collect())
+}
+
+fn adapt_statement(mut statement: Sql, empty: &EmptyRelations) -> Parsed {
+    adapt_columns(&mut statement);
+    if let Some(names) = find_catalog_names(&mut statement) {
+        statement = adapt(statement, names, empty);
+    }
+    Parsed::Statement(Box::new(statement))
 }
 
 // The statements of a text about the server, if it is one of the queries that the library replaces as a whole: what
 // comes of its text is something else than what its rules make of its statements.
-fn replaced_queries(parser: &PostgresCompatibilityParser, sql: &str, written: &mut [Sql]) -> Option<Vec<Sql>> {
-    if !written.iter_mut().all(|statement| rewrite::catalogue_names(statement).is_some()) {
+fn replace_queries(parser: &PostgresCompatibilityParser, sql: &str, written: &mut [Sql]) -> Option<Vec<Sql>> {
+    if !written.iter_mut().all(|statement| find_catalog_names(statement).is_some()) {
         return None;
     }
     let by_rules: Vec<_> = written.iter().cloned().map(|statement| parser.rewrite(statement)).collect();
-    parser.parse(sql).ok().filter(|adapted| *adapted != by_rules)
+    parser.parse(sql).ok().filter(|replaced| *replaced != by_rules)
 }
 
 /// Makes of a statement what can be done.
@@ -135,7 +148,7 @@ pub(super) async fn plan(session: &Session, sql: &Arc<str>, parsed: Parsed) -> R
         Sql::Close { cursor: CloseCursor::All } => ClientStatement::Close(None),
         Sql::Close { cursor: CloseCursor::Specific { name } } => ClientStatement::Close(Some(name.value)),
         Sql::Copy { source, to: true, target, options, legacy_options, .. } => {
-            let (asked, form) = copy::read(source, &target, options, legacy_options)?;
+            let (asked, form) = read_copy(source, &target, options, legacy_options)?;
             ClientStatement::Copy(query(Parsed::Statement(Box::new(asked))).await?, form)
         }
         other => ClientStatement::Query(query(Parsed::Statement(Box::new(other))).await?),
