@@ -1,14 +1,13 @@
 """Checks a served lake over Postgres' protocol: `serve_postgres.py postgresql://me@127.0.0.1:5433/datafusion`.
 
-Needs psql and the PyPI packages psycopg[binary], sqlalchemy, pandas, polars, connectorx, adbc-driver-postgresql,
-asyncpg, duckdb and duckdb-extension-postgres-scanner of duckdb's version. What Grafana and DBeaver ask when they start
-is asked in their place. Prints a line a check, exits with 1 where one fails.
+Needs the PyPI packages psycopg[binary], sqlalchemy, pandas, polars, connectorx, adbc-driver-postgresql, asyncpg, duckdb and
+duckdb-extension-postgres-scanner of duckdb's version. psql and the catalogue queries of tools are checked by
+`postgres_clients.py`. Prints a line a check, exits with 1 where one fails.
 """
 import asyncio
 import datetime
 import glob
 import os
-import subprocess
 import sys
 import threading
 import time
@@ -28,77 +27,6 @@ from checks import Checks
 ENDLESS = """select count(*) from generate_series(1, 1000000) a cross join generate_series(1, 1000000) b
              where a.value + b.value = 7"""
 
-PSQL = [r"\d", r"\dt", r"\d pairs", r"\d+ pairs", r"\df", r"\du", r"\l", r"\dn", r"\dv", r"\di", r"\dT", r"\conninfo"]
-
-# Whether a table's schema is in the search path, as Grafana puts it.
-IN_PATH = """quote_ident(table_schema) IN (
-  SELECT CASE WHEN trim(s[i]) = '"$user"' THEN user ELSE trim(s[i]) END
-  FROM generate_series(array_lower(string_to_array(current_setting('search_path'),','),1),
-    array_upper(string_to_array(current_setting('search_path'),','),1)) as i,
-    string_to_array(current_setting('search_path'),',') s)"""
-
-GRAFANA = [
-    "SELECT current_setting('server_version_num')::int / 100 AS version",
-    "SELECT extversion FROM pg_extension WHERE extname = 'timescaledb'",
-    """SELECT quote_ident(table_name) AS "table" FROM information_schema.tables
-       WHERE quote_ident(table_schema) NOT IN ('information_schema', 'pg_catalog') ORDER BY 1""",
-    f"""SELECT CASE WHEN {IN_PATH} THEN quote_ident(table_name)
-       ELSE quote_ident(table_schema) || '.' || quote_ident(table_name) END AS "table"
-       FROM information_schema.tables WHERE quote_ident(table_schema) NOT IN ('information_schema', 'pg_catalog')
-       ORDER BY CASE WHEN {IN_PATH} THEN 0 ELSE 1 END, 1""",
-    f"""SELECT quote_ident(column_name) AS "column", data_type AS "type" FROM information_schema.columns
-       WHERE CASE WHEN array_length(parse_ident('public.pairs'),1) = 2
-       THEN quote_ident(table_schema) = (parse_ident('public.pairs'))[1]
-         AND quote_ident(table_name) = (parse_ident('public.pairs'))[2]
-       ELSE quote_ident(table_name) = 'public.pairs' AND {IN_PATH} END""",
-    "SELECT started AS time, measurements AS value FROM runs WHERE started BETWEEN '2020-01-01T00:00:00Z' AND "
-    "'2100-01-01T00:00:00Z' ORDER BY 1",
-]
-
-DBEAVER = [
-    "SET extra_float_digits = 3",
-    "SET application_name = 'DBeaver - Main'",
-    "SELECT current_schema(), session_user",
-    "SELECT version()",
-    "SHOW search_path",
-    "SHOW TRANSACTION ISOLATION LEVEL",
-    "SELECT * FROM pg_catalog.pg_settings WHERE name = 'standard_conforming_strings'",
-    "SELECT string_agg(word, ',') FROM pg_catalog.pg_get_keywords() WHERE word <> ALL ('{a,abs,select}'::text[])",
-    "SELECT db.oid, db.* FROM pg_catalog.pg_database db WHERE datname = 'datafusion'",
-    """SELECT n.oid, n.*, d.description FROM pg_catalog.pg_namespace n
-       LEFT OUTER JOIN pg_catalog.pg_description d
-       ON d.objoid = n.oid AND d.objsubid = 0 AND d.classoid = 'pg_namespace'::regclass ORDER BY nspname""",
-    """SELECT c.oid, c.*, d.description, pg_catalog.pg_get_expr(c.relpartbound, c.oid) AS partition_expr,
-       pg_catalog.pg_get_partkeydef(c.oid) AS partition_key FROM pg_catalog.pg_class c
-       LEFT OUTER JOIN pg_catalog.pg_description d
-       ON d.objoid = c.oid AND d.objsubid = 0 AND d.classoid = 'pg_class'::regclass
-       WHERE c.relnamespace = {schema} AND c.relkind NOT IN ('i', 'I', 'c')""",
-    """SELECT c.relname, a.*, pg_catalog.pg_get_expr(ad.adbin, ad.adrelid, true) AS def_value, dsc.description, dep.objid
-       FROM pg_catalog.pg_attribute a INNER JOIN pg_catalog.pg_class c ON (a.attrelid = c.oid)
-       LEFT OUTER JOIN pg_catalog.pg_attrdef ad ON (a.attrelid = ad.adrelid AND a.attnum = ad.adnum)
-       LEFT OUTER JOIN pg_catalog.pg_description dsc ON (c.oid = dsc.objoid AND a.attnum = dsc.objsubid)
-       LEFT OUTER JOIN pg_depend dep ON dep.refobjid = a.attrelid AND dep.deptype = 'i'
-       AND dep.refobjsubid = a.attnum AND dep.classid = dep.refclassid
-       WHERE NOT a.attisdropped AND c.relkind NOT IN ('i', 'I', 'c') AND c.oid = {table} ORDER BY a.attnum""",
-    """SELECT t.oid, t.*, c.relkind, format_type(nullif(t.typbasetype, 0), t.typtypmod) AS base_type_name, d.description
-       FROM pg_catalog.pg_type t LEFT OUTER JOIN pg_catalog.pg_type et ON et.oid = t.typelem
-       LEFT OUTER JOIN pg_catalog.pg_class c ON c.oid = t.typrelid
-       LEFT OUTER JOIN pg_catalog.pg_description d ON t.oid = d.objoid
-       WHERE t.typname IS NOT NULL AND (c.relkind IS NULL OR c.relkind = 'c')
-       AND (et.typcategory IS NULL OR et.typcategory <> 'C')""",
-    """SELECT c.oid, c.*, t.relname AS tabrelname, d.description FROM pg_catalog.pg_constraint c
-       INNER JOIN pg_catalog.pg_class t ON t.oid = c.conrelid LEFT OUTER JOIN pg_catalog.pg_description d
-       ON d.objoid = c.oid AND d.objsubid = 0 AND d.classoid = 'pg_constraint'::regclass WHERE c.conrelid = {table}""",
-    """SELECT i.*, i.indkey AS keys, c.relname, pg_catalog.pg_get_expr(i.indpred, i.indrelid) AS pred_expr
-       FROM pg_catalog.pg_index i INNER JOIN pg_catalog.pg_class c ON c.oid = i.indexrelid WHERE i.indrelid = {table}""",
-    """SELECT c.oid, pg_catalog.pg_total_relation_size(c.oid) AS total_rel_size FROM pg_catalog.pg_class c
-       WHERE c.relnamespace = {schema}""",
-    "SELECT * FROM pairs LIMIT 200",
-]
-
-# What is right to have no rows: no TimescaleDB, no constraints, no indexes, nothing that SET answers.
-EMPTY = ("SET ", "SELECT extversion", "SELECT c.oid, c.*, t.relname", "SELECT i.*")
-
 
 def main(url):
     checks = Checks()
@@ -106,23 +34,6 @@ def main(url):
     connection = connect()
     one = lambda query, *values: connection.execute(query, *values).fetchone()[0]
     state = lambda query: refused(connection, query)
-
-    for command in PSQL:
-        ran = lambda: subprocess.run(["psql", "-X", url, "-c", command], capture_output=True, text=True)
-        checks.holds(f"psql {command}", lambda: (r := ran()).stdout + r.stderr, lambda text: "ERROR" not in text)
-
-    def row_count(query):
-        """How many; 0 of a statement that has none."""
-        answer = connection.execute(query)
-        return len(answer.fetchall()) if answer.description else 0
-
-    # Clients look up the numbers of what they show.
-    schema = str(one("select oid from pg_catalog.pg_namespace where nspname = 'public'"))
-    table = str(one("select oid from pg_catalog.pg_class where relname = 'pairs'"))
-    for name, queries in ("Grafana", GRAFANA), ("DBeaver", DBEAVER):
-        for query in queries:
-            asked = query.replace("{schema}", schema).replace("{table}", table)
-            checks.holds(f"{name}: {query[:60]}", lambda: row_count(asked), lambda n: (n == 0) == query.startswith(EMPTY))
 
     kinds = lambda table: dict(connection.execute("select column_name, data_type from information_schema.columns where table_name = %s", (table,)).fetchall())
     some = {"surface_id": "text", "log_time": "timestamp with time zone", "pair_id": "integer", "snr_db": "real", "ir": "ARRAY"}

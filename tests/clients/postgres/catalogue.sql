@@ -63,6 +63,29 @@ SELECT CASE WHEN quote_ident(table_schema) IN (
       ) THEN quote_ident(table_name) ELSE quote_ident(table_schema) || '.' || quote_ident(table_name) END AS "table" FROM information_schema.tables WHERE quote_ident(table_schema) NOT IN ('information_schema', 'pg_catalog', '_timescaledb_cache', '_timescaledb_catalog') ORDER BY 1
 -- Grafana: columns +
 select quote_ident(column_name) as "column", data_type as "type" from information_schema.columns where quote_ident(table_name) = 'pairs'
+-- Grafana: tables in order +
+SELECT CASE WHEN quote_ident(table_schema) IN (
+  SELECT CASE WHEN trim(s[i]) = '"$user"' THEN user ELSE trim(s[i]) END
+  FROM generate_series(array_lower(string_to_array(current_setting('search_path'),','),1),
+    array_upper(string_to_array(current_setting('search_path'),','),1)) as i,
+    string_to_array(current_setting('search_path'),',') s) THEN quote_ident(table_name)
+  ELSE quote_ident(table_schema) || '.' || quote_ident(table_name) END AS "table"
+  FROM information_schema.tables WHERE quote_ident(table_schema) NOT IN ('information_schema', 'pg_catalog')
+  ORDER BY CASE WHEN quote_ident(table_schema) IN (
+  SELECT CASE WHEN trim(s[i]) = '"$user"' THEN user ELSE trim(s[i]) END
+  FROM generate_series(array_lower(string_to_array(current_setting('search_path'),','),1),
+    array_upper(string_to_array(current_setting('search_path'),','),1)) as i,
+    string_to_array(current_setting('search_path'),',') s) THEN 0 ELSE 1 END, 1
+-- Grafana: columns by parts of a name +
+SELECT quote_ident(column_name) AS "column", data_type AS "type" FROM information_schema.columns
+  WHERE CASE WHEN array_length(parse_ident('public.pairs'),1) = 2
+  THEN quote_ident(table_schema) = (parse_ident('public.pairs'))[1]
+    AND quote_ident(table_name) = (parse_ident('public.pairs'))[2]
+  ELSE quote_ident(table_name) = 'public.pairs' AND quote_ident(table_schema) IN (
+  SELECT CASE WHEN trim(s[i]) = '"$user"' THEN user ELSE trim(s[i]) END
+  FROM generate_series(array_lower(string_to_array(current_setting('search_path'),','),1),
+    array_upper(string_to_array(current_setting('search_path'),','),1)) as i,
+    string_to_array(current_setting('search_path'),',') s) END
 -- Grafana: a time series
 select floor(extract(epoch from log_time) / 60) * 60 as "time", avg(snr_db) as "snr_db" from measurements where log_time between '2020-01-01T00:00:00Z' and '2100-01-01T00:00:00Z' group by 1 order by 1
 -- Grafana: a logarithm of bounds
