@@ -19,7 +19,7 @@ use super::catalog_tables::find_fixed_number;
 const FUNCTION: &str = "regproc";
 const NO_FUNCTION: &str = "-";
 /// Tables whose rows in the library are about what is not here.
-const WITHOUT_ROWS: [&str; 3] = ["pg_collation", "pg_constraint", "pg_index"];
+const WITHOUT_ROWS: [&str; 2] = ["pg_collation", "pg_constraint"];
 /// Columns of lists, by the types of their elements.
 static LISTS: [(DataType, &str); 3] = [
     (

@@ -38,32 +38,50 @@ pub(super) struct MessageRelay {
     awaited: AwaitedAnswers,
 }
 
-/// What a client waits for, by the types of messages alone: each Query and Sync ends with a ReadyForQuery. A Flush
-/// requests answers, too; its client waits until it has sent a Sync, whose answer is the last.
+/// What a client waits for, by the types of messages alone. A Query and a Sync end with a ReadyForQuery each; another
+/// message has one last answer, which the client waits for if it has sent a Flush.
 #[derive(Default)]
 struct AwaitedAnswers {
     ends: usize,
-    is_flushed: bool,
+    /// Other messages that are not answered, and those of them that were sent before a Flush.
+    others: usize,
+    flushed: usize,
+    /// True after an error, until the next Sync: the engine answers nothing before.
+    is_skipping: bool,
 }
 
 impl AwaitedAnswers {
     fn ask(&mut self, kind: u8) {
         match kind {
-            b'Q' | b'S' => self.ends += 1,
-            b'H' => self.is_flushed = true,
+            b'Q' => self.ends += 1,
+            b'S' => {
+                self.ends += 1;
+                self.is_skipping = false;
+            }
+            b'P' | b'B' | b'D' | b'E' | b'C' if !self.is_skipping => self.others += 1,
+            b'H' => self.flushed = self.others,
             _ => {}
         }
     }
 
     fn answer(&mut self, kind: u8) {
-        if kind == b'Z' {
-            self.ends = self.ends.saturating_sub(1);
-            self.is_flushed = false;
+        match kind {
+            b'Z' => self.ends = self.ends.saturating_sub(1),
+            b'1' | b'2' | b'3' | b'T' | b'n' | b'C' | b'I' | b's' => {
+                self.others = self.others.saturating_sub(1);
+                self.flushed = self.flushed.saturating_sub(1);
+            }
+            b'E' => {
+                self.others = 0;
+                self.flushed = 0;
+                self.is_skipping = self.ends == 0;
+            }
+            _ => {}
         }
     }
 
     fn is_any(&self) -> bool {
-        self.ends > 0 || self.is_flushed
+        self.ends > 0 || self.flushed > 0
     }
 }
 
@@ -309,6 +327,36 @@ impl EngineLink {
             if self.read.read_buf(&mut self.incoming).await? == 0 {
                 return Err(io::ErrorKind::UnexpectedEof.into());
             }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    // Of a conversation: types behind `>` are the client's, those behind `<` the engine's.
+    fn waits(conversation: &str) -> bool {
+        let mut awaited = AwaitedAnswers::default();
+        for part in conversation.split(' ') {
+            for kind in part[1..].bytes() {
+                if part.starts_with('>') { awaited.ask(kind) } else { awaited.answer(kind) }
+            }
+        }
+        awaited.is_any()
+    }
+
+    #[test]
+    fn a_client_waits_for_what_it_requested() {
+        for waiting in
+            [">Q", ">Q <TDDC", ">QQ <TDCZ", ">PBDES <12T", ">PBEHP <12", ">PBESPBES <1EZ", ">P <E >PPBS", ">EH <NSA"]
+        {
+            assert!(waits(waiting), "{waiting}");
+        }
+        for idle in
+            [">Q <TDDCZ", ">Q <EZ", ">PDS <1tTZ", ">PB", ">PBEH <12Ds", ">P <E >PPBE", ">P <E >PPBS <EZ >P", ">PH <1"]
+        {
+            assert!(!waits(idle), "{idle}");
         }
     }
 }
