@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use echolake_schema::ErrorCause;
 
-use crate::location::object_text;
+use crate::location_text::object_text;
 
 /// The commands of this build that make a missing lake, as words of a hint.
 #[cfg(feature = "tables")]

@@ -11,13 +11,14 @@ use echolake_schema::{ProjectName, tables::Table};
 use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt as _, PutMode};
 
-use crate::location::{LakeLocation, object_text};
+use crate::location::LakeLocation;
+use crate::location_text::object_text;
 #[cfg(feature = "remote")]
 use crate::remote::PartStore;
 #[cfg(feature = "tables")]
 use crate::remote::{BlockCache, BlockFolder, CacheCounters, CacheCounts, CacheFolder, CachedStore};
 #[cfg(feature = "tables")]
-use crate::tables::{ProjectLog, delta::DeltaLog};
+use crate::tables::{DeltaLog, ProjectLog};
 use crate::unused;
 use crate::{Error, LAKE_FORMAT, LakeConfig, ReferenceSurfaces, Result};
 
@@ -25,7 +26,7 @@ use crate::{Error, LAKE_FORMAT, LakeConfig, ReferenceSurfaces, Result};
 #[derive(Debug, Clone)]
 pub struct Lake(Arc<OpenLake>);
 
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 struct OpenLake {
     location: LakeLocation,
     config: LakeConfig,
@@ -230,13 +231,8 @@ impl Lake {
         }
         let cached = CachedStore::new(self.store(), Arc::new(BlockCache::new(blocks)));
         let store = Arc::new(cached.clone());
-        Ok(Self(Arc::new(OpenLake {
-            location: LakeLocation { store, cached: Some(cached), ..self.0.location.clone() },
-            config: self.0.config.clone(),
-            grid: self.0.grid.clone(),
-            log: self.0.log.clone(),
-            projects: self.0.projects.clone(),
-        })))
+        let location = LakeLocation { store, cached: Some(cached), ..self.0.location.clone() };
+        Ok(Self(Arc::new(OpenLake { location, ..self.0.as_ref().clone() })))
     }
 
     /// Returns the lake as a reader of these projects sees it: with their runs, and those of the surfaces that `lake.toml`
@@ -260,13 +256,8 @@ impl Lake {
     pub fn restricted_to(&self, projects: BTreeSet<ProjectName>) -> Self {
         let references = &self.config().references;
         let common = [references.flat.clone(), references.foam.clone()];
-        Self(Arc::new(OpenLake {
-            location: self.0.location.clone(),
-            config: self.0.config.clone(),
-            grid: self.0.grid.clone(),
-            log: self.0.log.clone(),
-            projects: Some(ProjectLog::new(self.0.log.clone(), projects, common)),
-        }))
+        let projects = Some(ProjectLog::new(self.0.log.clone(), projects, common));
+        Self(Arc::new(OpenLake { projects, ..self.0.as_ref().clone() }))
     }
 
     /// Returns whether this is the lake as a reader of some projects sees it.

@@ -22,6 +22,9 @@ mod error;
 mod folder_listing;
 mod lake;
 mod location;
+mod location_text;
+#[cfg(feature = "tables")]
+mod locks;
 #[cfg(feature = "remote")]
 mod remote;
 #[cfg(feature = "remote")]
@@ -37,6 +40,8 @@ pub use error::{Error, StoreError};
 pub use folder_listing::{FolderListing, UnusableEntry};
 pub use lake::Lake;
 #[cfg(feature = "tables")]
+pub use locks::{ClaimOutcome, ClaimTimes, WorkClaims};
+#[cfg(feature = "tables")]
 pub use remote::{CACHE_MEMORY_BYTES, CacheCounters, CacheCounts, CacheFolder, ObjectFolder};
 #[cfg(feature = "remote")]
 pub use remote::{RemoteAccess, remote_access};
@@ -44,11 +49,11 @@ pub use remote::{RemoteAccess, remote_access};
 pub use run_digest::{digest_record, digest_record_path, file_sha256, object_sha256, read_digest_record};
 #[cfg(feature = "tables")]
 pub use tables::{
-    BatchBuilder, ClaimOutcome, ClaimTimes, CommitEffect, CommitLog, CommitOutcome, DataFile, DeletedFile,
-    DeletionMode, EncodedFile, FileEncoder, FileHistory, FileName, FileStats, KEEP_HOURS, LackingRows, LakeMoment,
-    LakeSnapshot, LoggedFile, MergeProgress, NewFile, NoMoment, OptimizeReport, RemovalRecord, ReplacedFiles, RunPart,
-    RunRowCounts, StagedFile, TARGET_BYTES, TableChange, TableCommit, TableOptimizeReport, TableVersion, TableView,
-    VacuumReport, VisibleRun, WorkClaims, add_missing_columns, encode, reader_metadata, wanted_schema,
+    BatchBuilder, CommitEffect, CommitLog, CommitOutcome, DataFile, DeletedFile, DeletionMode, EncodedFile,
+    FileEncoder, FileHistory, FileName, FileStats, KEEP_HOURS, LackingRows, LakeMoment, LakeSnapshot, LoggedFile,
+    MergeProgress, NewFile, NoMoment, OptimizeReport, RemovalRecord, ReplacedFiles, RunPart, RunRowCounts, StagedFile,
+    TARGET_BYTES, TableChange, TableCommit, TableOptimizeReport, TableVersion, TableView, VacuumReport, VisibleRun,
+    add_missing_columns, encode, reader_metadata, wanted_schema,
 };
 #[cfg(feature = "remote")]
 pub use upload::{RunUpload, UploadOutcome, UploadStep};

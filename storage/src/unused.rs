@@ -6,7 +6,7 @@ use futures::TryStreamExt as _;
 use object_store::path::Path;
 use object_store::{ObjectMeta, ObjectStoreExt as _};
 
-use crate::location::object_text;
+use crate::location_text::object_text;
 use crate::{Error, Lake, Result};
 
 /// Folder of the tables.

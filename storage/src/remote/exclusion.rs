@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use futures::future::{join, join_all};
 use object_store::path::Path;
-use object_store::{Error as StoreError, ObjectStore, ObjectStoreExt as _, PutMode, Result as StoreResult};
+use object_store::{Error as StoreError, ObjectStore, ObjectStoreExt as _, PutMode, PutPayload, Result as StoreResult};
 use uuid::Uuid;
 
 /// Folder of the probe's objects, which are deleted at once.
@@ -37,7 +37,8 @@ pub(crate) async fn probe_exclusion(store: &Arc<dyn ObjectStore>) -> Result<(), 
 }
 
 async fn create_twice(store: &dyn ObjectStore, path: &Path) -> Result<(), ExclusionFault> {
-    let created = (create(store, path, "first").await?, create(store, path, "second").await?);
+    let created =
+        (create_object(store, path, "first".into()).await?, create_object(store, path, "second".into()).await?);
     match created {
         (true, false) => Ok(()),
         _ => Err(ExclusionFault::Overwrites("an object that was there was created again".to_owned())),
@@ -46,7 +47,7 @@ async fn create_twice(store: &dyn ObjectStore, path: &Path) -> Result<(), Exclus
 
 async fn race_for(store: &dyn ObjectStore, path: &Path) -> Result<(), ExclusionFault> {
     let texts: Vec<_> = (0..RACERS).map(|racer| format!("racer {racer}")).collect();
-    let racers = join_all(texts.iter().map(|text| create(store, path, text))).await;
+    let racers = join_all(texts.iter().map(|text| create_object(store, path, text.clone().into()))).await;
     let created = racers.into_iter().collect::<StoreResult<Vec<_>>>()?;
     let winners: Vec<_> = (0..RACERS).filter(|racer| created[*racer]).collect();
     let there = store.get(path).await?.bytes().await?;
@@ -64,9 +65,12 @@ async fn race_for(store: &dyn ObjectStore, path: &Path) -> Result<(), ExclusionF
     }
 }
 
-// Returns whether it was created; false if it was there.
-async fn create(store: &dyn ObjectStore, path: &Path, text: &str) -> StoreResult<bool> {
-    match store.put_opts(path, text.to_owned().into(), PutMode::Create.into()).await {
+/// Creates an object; returns false if it is there already.
+///
+/// # Errors
+/// What the store says.
+pub(crate) async fn create_object(store: &dyn ObjectStore, path: &Path, content: PutPayload) -> StoreResult<bool> {
+    match store.put_opts(path, content, PutMode::Create.into()).await {
         Ok(_) => Ok(true),
         Err(StoreError::AlreadyExists { .. }) => Ok(false),
         Err(error) => Err(error),

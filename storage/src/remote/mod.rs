@@ -27,7 +27,7 @@ use url::Url;
 pub(crate) use cache::{BlockCache, BlockFolder, CachedStore};
 #[cfg(feature = "tables")]
 pub use cache::{CACHE_MEMORY_BYTES, CacheCounters, CacheCounts, CacheFolder};
-pub(crate) use exclusion::{ExclusionFault, probe_exclusion};
+pub(crate) use exclusion::{ExclusionFault, create_object, probe_exclusion};
 #[cfg(feature = "tables")]
 pub use object_folder::ObjectFolder;
 pub(crate) use part_store::PartStore;

@@ -9,7 +9,7 @@ use object_store::{Error as StoreError, ObjectStore, ObjectStoreExt as _, PutMod
 use url::Url;
 
 use super::{PartStore, open_store};
-use crate::location::{object_text, without_secrets};
+use crate::location_text::{object_text, without_secrets};
 use crate::upload::{PARTS_AT_ONCE, part_bytes, read_part};
 use crate::{Error, Result};
 

@@ -11,7 +11,7 @@ use object_store::multipart::MultipartStore;
 use object_store::{ClientConfigKey, ObjectStore, RetryConfig};
 use url::Url;
 
-use crate::location::without_secrets;
+use crate::location_text::without_secrets;
 
 /// Time for one request with its body: a part of an upload over a slow line takes long.
 const REQUEST_TIMEOUT: &str = "120 seconds";

@@ -1,36 +1,32 @@
 //! A lake's tables: rows in, and a view of them.
 
 mod batch_builder;
-mod claims;
-mod commit_log;
 mod data_file;
-pub(crate) mod delta;
-mod lease;
-mod optimize;
-mod process_identity;
-mod project_log;
-mod rebuild;
-mod removal;
+mod file_name;
+mod log;
+mod maintenance;
 mod rig_tables;
 mod rows;
+mod run_parts;
 mod snapshot;
 mod table_fault;
-mod vacuum;
 mod versions;
 
 pub use batch_builder::BatchBuilder;
-pub use claims::{ClaimOutcome, ClaimTimes, WorkClaims};
-pub use commit_log::{
+pub use data_file::{EncodedFile, FileEncoder, encode};
+pub use file_name::{FileName, VisibleRun};
+pub use log::{
     CommitEffect, CommitLog, CommitOutcome, DataFile, FileHistory, FileStats, LoggedFile, NewFile, RemovalRecord,
     ReplacedFiles, RunPart, RunRowCounts, TableChange, TableCommit, TableVersion, TableView,
 };
-pub use data_file::{EncodedFile, FileEncoder, encode};
-pub use optimize::{MergeProgress, OptimizeReport, TARGET_BYTES, TableOptimizeReport};
-pub(crate) use project_log::ProjectLog;
+pub(crate) use log::{DeltaLog, ProjectLog};
+pub use maintenance::{
+    DeletedFile, DeletionMode, KEEP_HOURS, MergeProgress, OptimizeReport, TARGET_BYTES, TableOptimizeReport,
+    VacuumReport,
+};
 pub use rows::{add_missing_columns, reader_metadata, wanted_schema};
-pub use snapshot::{FileName, LakeSnapshot, VisibleRun};
+pub use snapshot::LakeSnapshot;
 pub use table_fault::LackingRows;
-pub use vacuum::{DeletedFile, DeletionMode, KEEP_HOURS, VacuumReport};
 pub use versions::{LakeMoment, NoMoment};
 
 use arrow::record_batch::RecordBatch;
@@ -38,7 +34,8 @@ use echolake_schema::tables::{Source, Table};
 use futures::future::{join, join_all, try_join_all};
 use object_store::ObjectStoreExt as _;
 
-use self::delta::{folder, has_run_files};
+use self::file_name::table_folder;
+use self::log::has_run_files;
 use self::table_fault::TableFault;
 use crate::{Error, LAKE_FORMAT, Lake, Result};
 
@@ -161,7 +158,7 @@ impl Lake {
     /// What the store says.
     pub async fn stage(&self, table: Table, name: &FileName, file: EncodedFile) -> Result<StagedFile> {
         let name = name.compose();
-        let path = folder(table).join(name.as_str());
+        let path = table_folder(table).join(name.as_str());
         let (bytes, stats, rows) = (file.bytes.len() as u64, file.stats, file.rows);
         self.store().put(&path, file.bytes.into()).await.map_err(|e| Error::store("write", &path, e))?;
         let (parts, replaces, row_counts) = (Vec::new(), None, None);

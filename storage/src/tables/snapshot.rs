@@ -9,72 +9,11 @@ use echolake_schema::tables::{Source, Table};
 use echolake_schema::{ProjectName, RunId, SurfaceId};
 use futures::future::{try_join, try_join_all};
 use object_store::path::Path;
-use serde::Deserialize;
-use serde_json::{Value, json};
 
-use crate::tables::project_log::project_of;
+use crate::tables::file_name::{FileName, VisibleRun};
+use crate::tables::run_parts::{RunPointer, list_pointers, run_of_file};
 use crate::tables::table_fault::{LackingRows, TableFault};
-use crate::{CommitLog, DataFile, Error, Result, RunPart, RunRowCounts, TableView};
-
-/// Parsed name of a file in `tables/`.
-///
-/// ```
-/// use echolake_lake::FileName;
-///
-/// let name = FileName::Rows { surface: "flat".parse()?, run: "r1".parse()?, derivation: "ab".into() };
-/// assert_eq!(name.compose(), "flat.r1.ab.parquet");
-/// assert_eq!(FileName::parse(&"tables/nce/flat.r1.ab.parquet".into()), Some(name));
-/// # Ok::<(), echolake_schema::Error>(())
-/// ```
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum FileName {
-    /// Rows that come from the rig alone.
-    Rig {
-        /// Digest of what they were made from.
-        derivation: String,
-    },
-    /// Rows of one run.
-    Rows {
-        /// The run's surface.
-        surface: SurfaceId,
-        /// The run.
-        run: RunId,
-        /// Digest of what they were made from.
-        derivation: String,
-    },
-    /// A run's row in `runs`.
-    Pointer(VisibleRun),
-    /// Rows of several runs, which the log lists.
-    Merged {
-        /// Digest of the list.
-        digest: String,
-    },
-}
-
-/// A run that readers see, and which derivations of its rows.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct VisibleRun {
-    /// The run's surface.
-    pub surface: SurfaceId,
-    /// The run.
-    pub run: RunId,
-    /// Derivation of the rows that come from the run alone.
-    pub run_derivation: String,
-    /// Derivation of the rows that need references; None while they are missing.
-    pub reference_derivation: Option<String>,
-}
-
-impl VisibleRun {
-    /// Common beginning of the names of all of the run's rows in `runs`.
-    pub(crate) fn prefix(&self) -> String {
-        format!("{}.{}.", self.surface, self.run)
-    }
-
-    /// Both derivations, as the name of the run's row has them.
-    fn derivations(&self) -> String {
-        format!("{}.{}", self.run_derivation, self.reference_derivation.as_deref().unwrap_or(WITHOUT))
-    }
-}
+use crate::{CommitLog, DataFile, Error, Result, RunRowCounts, TableView};
 
 /// A frozen view of all tables.
 #[derive(Debug, Clone, Default)]
@@ -120,44 +59,8 @@ impl NewestRuns {
     }
 }
 
-const EXTENSION: &str = ".parquet";
-const WITHOUT: &str = "none";
-const MERGED: &str = "merged";
 /// Snapshots that are taken until one is not overtaken by a commit of `runs`.
 const TAKE_TRIES: usize = 10;
-
-impl FileName {
-    /// The name.
-    pub fn compose(&self) -> String {
-        match self {
-            Self::Rig { derivation } => format!("rig.{derivation}{EXTENSION}"),
-            Self::Merged { digest } => format!("{MERGED}.{digest}{EXTENSION}"),
-            Self::Rows { surface, run, derivation } => format!("{surface}.{run}.{derivation}{EXTENSION}"),
-            Self::Pointer(run) => format!("{}{}{EXTENSION}", run.prefix(), run.derivations()),
-        }
-    }
-
-    /// Parses a name; None if it is not one of ours.
-    pub fn parse(path: &Path) -> Option<Self> {
-        let parts: Vec<_> = path.filename()?.strip_suffix(EXTENSION)?.split('.').collect();
-        match parts[..] {
-            ["rig", derivation] => Some(Self::Rig { derivation: derivation.into() }),
-            [MERGED, digest] => Some(Self::Merged { digest: digest.into() }),
-            [surface, run, derivation] => Some(Self::Rows {
-                surface: surface.parse().ok()?,
-                run: run.parse().ok()?,
-                derivation: derivation.into(),
-            }),
-            [surface, run, run_derivation, references] => Some(Self::Pointer(VisibleRun {
-                surface: surface.parse().ok()?,
-                run: run.parse().ok()?,
-                run_derivation: run_derivation.into(),
-                reference_derivation: (references != WITHOUT).then(|| references.into()),
-            })),
-            _ => None,
-        }
-    }
-}
 
 /// A table's view, or the fault of its log.
 type ReadView = std::result::Result<Option<TableView>, TableFault>;
@@ -342,7 +245,7 @@ impl LakeSnapshot {
     /// The files of one run in a table, and the merged ones that show its rows.
     pub fn files_of<'a>(&'a self, table: Table, run: &'a RunId) -> impl Iterator<Item = &'a DataFile> {
         self.files(table).iter().filter(move |file| match file.parts.is_empty() {
-            true => run_of(file).as_ref() == Some(run),
+            true => run_of_file(file).as_ref() == Some(run),
             false => file.visible_parts().any(|(part, _)| part.run == *run),
         })
     }
@@ -358,11 +261,11 @@ impl LakeSnapshot {
         for file in single {
             match self.file_place(table, &file) {
                 RowsPlace::Seen => {
-                    sorted.logged.extend(run_of(&file).map(|run| (run, file.rows)));
-                    sorted.shown.extend(run_of(&file));
+                    sorted.logged.extend(run_of_file(&file).map(|run| (run, file.rows)));
+                    sorted.shown.extend(run_of_file(&file));
                     sorted.seen.push(file);
                 }
-                RowsPlace::OfProject => sorted.logged.extend(run_of(&file).map(|run| (run, file.rows))),
+                RowsPlace::OfProject => sorted.logged.extend(run_of_file(&file).map(|run| (run, file.rows))),
                 RowsPlace::Superseded if self.is_superseded(&file) => sorted.hidden.push(file),
                 RowsPlace::Foreign => sorted.foreign.push(file),
                 RowsPlace::Superseded | RowsPlace::Unseen => {}
@@ -477,7 +380,9 @@ impl LakeSnapshot {
     // An author that had not seen the run's present row cannot replace it, so that no row will ever name its file as
     // the log has it now. No clock is asked.
     fn is_superseded(&self, file: &DataFile) -> bool {
-        run_of(file).and_then(|run| self.runs.get(&run)).is_some_and(|current| file.seen_runs < current.log_version)
+        run_of_file(file)
+            .and_then(|run| self.runs.get(&run))
+            .is_some_and(|current| file.seen_runs < current.log_version)
     }
 
     /// The version of `runs` that added the row of a file's run; 0 if the name is no run's rows, or the run is not seen.
@@ -517,118 +422,14 @@ struct SortedFiles {
     logged: HashMap<RunId, u64>,
 }
 
-pub(crate) fn run_of(file: &DataFile) -> Option<RunId> {
-    match FileName::parse(&file.path)? {
-        FileName::Rows { run, .. } => Some(run),
-        FileName::Pointer(pointer) => Some(pointer.run),
-        FileName::Rig { .. } | FileName::Merged { .. } => None,
-    }
-}
-
-/// A run's row in `runs`.
-pub(crate) struct RunPointer<'a> {
-    pub(crate) run: VisibleRun,
-    /// The version of `runs` that added it.
-    pub(crate) version: u64,
-    row_counts: Option<&'a RunRowCounts>,
-}
-
-/// The rows of `runs` that a file of that table shows.
-pub(crate) fn pointers(file: &DataFile) -> Vec<RunPointer<'_>> {
-    let run = |path: &Path| match FileName::parse(path)? {
-        FileName::Pointer(run) => Some(run),
-        _ => None,
-    };
-    if file.parts.is_empty() {
-        let shown = run(&file.path).filter(|run| !file.hidden.contains(&run.run));
-        let (version, row_counts) = (file.log_version, file.row_counts.as_ref());
-        return shown.map(|run| RunPointer { run, version, row_counts }).into_iter().collect();
-    }
-    let parts = file.visible_parts().map(|(part, _)| part);
-    let pointers = parts.filter_map(|part| {
-        let (run, version) = (run(&part.file_name().into())?, part.row_version?);
-        Some(RunPointer { run, version, row_counts: part.row_counts.as_ref() })
-    });
-    pointers.collect()
-}
-
-impl DataFile {
-    /// The runs whose rows the file shows; none for rows that come from the rig.
-    pub fn shown_runs(&self) -> Vec<RunId> {
-        match self.parts.is_empty() {
-            true => run_of(self).into_iter().collect(),
-            false => self.visible_parts().map(|(part, _)| part.run.clone()).collect(),
-        }
-    }
-}
-
-/// Returns whether a file of this name was merged from several.
-pub(crate) fn is_merged(name: &str) -> bool {
-    matches!(FileName::parse(&Path::from(name)), Some(FileName::Merged { .. }))
-}
-
-/// A part in the log: the name that it had as a file of its own, and its rows; in `runs` also the version that added it.
-#[derive(Deserialize)]
-#[serde(untagged)]
-enum LoggedPart {
-    Rows(String, u64),
-    Pointer(String, u64, u64),
-}
-
-/// Parts as text.
-pub(crate) fn encode_parts(parts: &[RunPart]) -> String {
-    let one = |part: &RunPart| match part.row_version {
-        Some(version) => json!([part.file_name(), part.rows, version]),
-        None => json!([part.file_name(), part.rows]),
-    };
-    Value::Array(parts.iter().map(one).collect()).to_string()
-}
-
-/// Decodes the parts from such a text; None if it is none.
-pub(crate) fn decode_parts(text: &str) -> Option<Vec<RunPart>> {
-    let parts: Vec<LoggedPart> = serde_json::from_str(text).ok()?;
-    let one = |part: LoggedPart| match part {
-        LoggedPart::Rows(name, rows) => RunPart::parse(&name.into(), rows, None),
-        LoggedPart::Pointer(name, rows, version) => RunPart::parse(&name.into(), rows, Some(version)),
-    };
-    parts.into_iter().map(one).collect::<Option<Vec<_>>>().filter(|parts| !parts.is_empty())
-}
-
-impl RunPart {
-    /// The only part of a file of one run; None if the file has another name.
-    pub(crate) fn of_file(file: &DataFile) -> Option<Self> {
-        let part = Self::parse(&file.path, file.rows, Some(file.log_version))?;
-        Some(Self { row_counts: file.row_counts.clone(), ..part })
-    }
-
-    fn parse(path: &Path, rows: u64, row_version: Option<u64>) -> Option<Self> {
-        match FileName::parse(path)? {
-            FileName::Rows { surface, run, derivation } => {
-                Some(Self { surface, run, derivation, rows, row_version: None, row_counts: None })
-            }
-            FileName::Pointer(pointer) => {
-                let derivation = pointer.derivations();
-                let (row_version, row_counts) = (Some(row_version?), None);
-                Some(Self { surface: pointer.surface, run: pointer.run, derivation, rows, row_version, row_counts })
-            }
-            FileName::Rig { .. } | FileName::Merged { .. } => None,
-        }
-    }
-
-    /// The name of a file with these rows alone.
-    pub(crate) fn file_name(&self) -> String {
-        format!("{}.{}.{}{EXTENSION}", self.surface, self.run, self.derivation)
-    }
-}
-
 // A row replaces its predecessor, in the same commit unless that one is in a merged file; of two the newer one counts.
 fn current_runs(files: &[DataFile]) -> BTreeMap<RunId, CurrentRun> {
     let mut rows: Vec<_> =
-        files.iter().flat_map(|file| pointers(file).into_iter().map(move |row| (row, file))).collect();
+        files.iter().flat_map(|file| list_pointers(file).into_iter().map(move |row| (row, file))).collect();
     rows.sort_by_key(|(row, _)| (row.version, row.run.derivations()));
-    let current = |(row, file): (RunPointer<'_>, _)| CurrentRun {
+    let current = |(row, file): (RunPointer<'_>, &DataFile)| CurrentRun {
         log_version: row.version,
-        project: project_of(file),
+        project: file.project(),
         row_counts: row.row_counts.cloned(),
         run: row.run,
     };
@@ -638,10 +439,12 @@ fn current_runs(files: &[DataFile]) -> BTreeMap<RunId, CurrentRun> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::tables::file_name::table_folder;
+    use crate::tables::run_parts::{decode_parts, encode_parts};
 
     /// A file whose number is the version of `runs` that its author had seen; of a run's row, that added it.
     fn file(table: Table, name: &str, version: u64) -> DataFile {
-        let path = crate::tables::delta::folder(table).join(name);
+        let path = table_folder(table).join(name);
         let log_version = if table == Table::Runs { version } else { 0 };
         let seen_runs = version - log_version.min(1);
         let (stats, parts, hidden, row_counts) = (None, Vec::new(), Vec::new(), None);
@@ -657,23 +460,6 @@ mod tests {
 
     fn names(files: &[DataFile]) -> Vec<&str> {
         files.iter().filter_map(|f| f.path.filename()).collect()
-    }
-
-    #[test]
-    fn names_round_trip() {
-        for name in [
-            "rig.ab.parquet",
-            "0015_0.20260105T080000Z-0015_0-7c1e.ab.parquet",
-            "flat.r.ab.none.parquet",
-            "flat.r.ab.cd.parquet",
-            "merged.ab.parquet",
-        ] {
-            let parsed = FileName::parse(&Path::from(name)).expect(name);
-            assert_eq!(parsed.compose(), name);
-        }
-        for foreign in ["part-00000.parquet", "a.b.c.d.e.parquet", "a.b.c", "..parquet"] {
-            assert_eq!(FileName::parse(&Path::from(foreign)), None, "{foreign}");
-        }
     }
 
     #[test]

@@ -12,7 +12,7 @@ use chrono::{DateTime, NaiveDate, NaiveDateTime, SecondsFormat, Utc};
 use echolake_schema::tables::{Source, Table};
 use object_store::path::Path;
 
-use crate::tables::delta::folder;
+use crate::tables::file_name::table_folder;
 use crate::{DataFile, Error, Lake, LakeSnapshot, Result, TableVersion};
 
 /// Formats of times beside RFC 3339.
@@ -125,7 +125,7 @@ impl Lake {
     }
 
     async fn list_files(&self, table: Table) -> Result<HashSet<Path>> {
-        let folder = folder(table);
+        let folder = table_folder(table);
         let there = self.store().list_with_delimiter(Some(&folder)).await;
         let there = there.map_err(|e| Error::store("list", &folder, e))?;
         Ok(there.objects.into_iter().map(|o| o.location).collect())

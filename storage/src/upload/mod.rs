@@ -15,8 +15,9 @@ use std::path::PathBuf;
 
 use echolake_schema::{RunId, SurfaceId};
 use object_store::path::Path;
-use object_store::{Error as StoreError, ObjectStoreExt as _, PutMode};
+use object_store::{Error as StoreError, ObjectStoreExt as _};
 
+use crate::remote::create_object;
 use crate::run_digest::{digest_record, digest_record_path, object_sha256, read_digest_record};
 use crate::{Error, Lake, Result};
 use journal::UploadJournal;
@@ -132,10 +133,9 @@ impl Lake {
     async fn reserve_name(&self, run: &RunUpload, inbox: &Path) -> Result<()> {
         let (store, record) = (self.store(), digest_record_path(inbox));
         let text = digest_record(&run.sha256, inbox);
-        match store.put_opts(&record, text.into(), PutMode::Create.into()).await {
-            Ok(_) => return Ok(()),
-            Err(StoreError::AlreadyExists { .. }) => {}
-            Err(e) => return Err(Error::store("write", record, e)),
+        let created = create_object(store.as_ref(), &record, text.into()).await;
+        if created.map_err(|e| Error::store("write", &record, e))? {
+            return Ok(());
         }
         match read_digest_record(store.as_ref(), inbox).await.map_err(|e| Error::store("read", &record, e))? {
             Some(other) if other != run.sha256 => {

@@ -6,13 +6,13 @@ use std::ops::Range;
 use std::sync::Arc;
 
 use bytes::Bytes;
-use chrono::{DateTime, Utc};
 use futures::{FutureExt as _, StreamExt as _, stream};
 use object_store::path::Path;
 use object_store::{Error as StoreError, GetOptions, GetRange, ObjectStore, Result as StoreResult};
 use quick_cache::sync::{Cache, DefaultLifecycle, PlaceholderGuard};
 use quick_cache::{DefaultHashBuilder, Weighter};
 
+use super::block_folder::CachedBlock;
 use super::{BlockFolder, CacheCounters, CacheCounts};
 
 /// Bytes of a block. At 100 MB/s it takes 10 ms to fetch, less than a request to a store takes to begin.
@@ -23,14 +23,6 @@ pub const CACHE_MEMORY_BYTES: u64 = 64 << 20;
 const BLOCKS_PER_REQUEST: usize = 16;
 /// Requests of one read at once.
 const CONCURRENT_REQUESTS: usize = 8;
-
-/// A block, and what the store says of its object.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct CachedBlock {
-    pub(super) bytes: Bytes,
-    pub(super) object_bytes: u64,
-    pub(super) modified: DateTime<Utc>,
-}
 
 /// An object and the number of a block in it.
 type BlockKey = (Path, u64);

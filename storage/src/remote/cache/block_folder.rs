@@ -12,11 +12,17 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, SystemTime};
 
 use bytes::Bytes;
-use chrono::DateTime;
+use chrono::{DateTime, Utc};
 use object_store::path::Path;
 use sha2::{Digest as _, Sha256};
 
-use super::block_cache::CachedBlock;
+/// A block, and what the store says of its object.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct CachedBlock {
+    pub(super) bytes: Bytes,
+    pub(super) object_bytes: u64,
+    pub(super) modified: DateTime<Utc>,
+}
 
 /// The folder for a cache, and the bytes that it may hold.
 #[derive(Debug, Clone, PartialEq, Eq)]

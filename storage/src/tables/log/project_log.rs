@@ -10,17 +10,13 @@ use std::sync::Arc;
 use async_trait::async_trait;
 use echolake_schema::tables::Table;
 use echolake_schema::{ProjectName, RunId, SurfaceId};
-use serde_json::Value;
 
-use crate::tables::delta::DeltaLog;
-use crate::tables::snapshot::pointers;
+use super::delta::DeltaLog;
+use crate::tables::run_parts::list_pointers;
 use crate::{
     CommitLog, CommitOutcome, DataFile, Error, FileHistory, LakeSnapshot, Result, TableChange, TableCommit,
     TableVersion, TableView,
 };
-
-/// The column of `runs` that holds a run's project.
-const PROJECT: &str = "project";
 
 /// A log without the runs of other projects.
 #[derive(Debug, Clone)]
@@ -41,29 +37,22 @@ impl ProjectLog {
         if table == Table::Runs {
             files.retain_mut(|file| {
                 file.hidden = self.hidden_runs(file);
-                !pointers(file).is_empty()
+                !list_pointers(file).is_empty()
             });
         }
     }
 
     fn hidden_runs(&self, file: &DataFile) -> Vec<RunId> {
-        if project_of(file).is_some_and(|project| self.projects.contains(&project)) {
+        if file.project().is_some_and(|project| self.projects.contains(&project)) {
             return Vec::new();
         }
-        let runs = pointers(file).into_iter().map(|row| row.run);
+        let runs = list_pointers(file).into_iter().map(|row| row.run);
         runs.filter(|run| !self.common.contains(&run.surface)).map(|run| run.run).collect()
     }
 
     fn refuse<T>(table: Table, action: &'static str) -> Result<T> {
         Err(Error::Restricted { table: table.name(), action })
     }
-}
-
-/// The project of the runs of a file of `runs`, which is the same for all of them; None if they were given none.
-pub(crate) fn project_of(pointer: &DataFile) -> Option<ProjectName> {
-    let stats = pointer.stats.as_ref()?;
-    let [least, greatest] = [&stats.min, &stats.max].map(|values| values.get(PROJECT).and_then(Value::as_str));
-    least.filter(|_| least == greatest)?.parse().ok()
 }
 
 #[async_trait]
@@ -94,7 +83,7 @@ impl CommitLog for ProjectLog {
 
     // Up to the one that added the newest row that is seen: how many came after it is a matter of other projects.
     async fn versions(&self, table: Table) -> Result<Vec<TableVersion>> {
-        let newest = self.files(Table::Runs).await?.iter().flat_map(pointers).map(|row| row.version).max();
+        let newest = self.files(Table::Runs).await?.iter().flat_map(list_pointers).map(|row| row.version).max();
         let mut versions = self.log.versions(table).await?;
         if table == Table::Runs {
             versions.retain(|version| newest.is_some_and(|newest| version.version <= newest));

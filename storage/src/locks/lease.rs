@@ -12,10 +12,11 @@ use std::time::{Duration, Instant};
 use chrono::{DateTime, TimeDelta, Utc};
 use futures::TryStreamExt as _;
 use object_store::path::Path;
-use object_store::{ObjectStore, ObjectStoreExt as _, PutMode};
+use object_store::{ObjectStore, ObjectStoreExt as _};
 use serde::{Deserialize, Serialize};
 
-use super::process_identity::ProcessIdentity;
+use super::process_identity::{ProcessIdentity, host_name};
+use crate::remote::create_object;
 use crate::{Error, Lake, Result};
 
 /// Folder of the lease's objects.
@@ -54,7 +55,7 @@ struct LeaseRecord {
 
 impl LeaseRecord {
     fn new() -> Self {
-        let (host, pid, now) = (host(), std::process::id(), Utc::now());
+        let (host, pid, now) = (host_name(), std::process::id(), Utc::now());
         let holder = format!("{host}.{pid}.{}", now.timestamp_nanos_opt().unwrap_or_default());
         Self { holder, host, pid, process: ProcessIdentity::current(), expires: now + HOLDS }
     }
@@ -74,7 +75,7 @@ impl MaintenanceLease {
     ///
     /// # Errors
     /// [`Error::Maintained`] if another process holds it, or what the store says.
-    pub(crate) async fn take(lake: &Lake) -> Result<Self> {
+    pub(crate) async fn acquire(lake: &Lake) -> Result<Self> {
         lake.ensure_exclusive().await?;
         let (store, location, record) = (lake.store(), lake.location().to_owned(), LeaseRecord::new());
         let last = last_number(store.as_ref()).await?;
@@ -98,7 +99,7 @@ impl MaintenanceLease {
     ///
     /// # Errors
     /// [`Error::LeaseLost`] if another process has taken it over, or what the store says.
-    pub(crate) async fn keep(&mut self) -> Result<()> {
+    pub(crate) async fn ensure_held(&mut self) -> Result<()> {
         let lost = || Error::LeaseLost { location: self.location.clone() };
         if self.renewed.elapsed() >= RENEW_EVERY {
             self.record.expires = Utc::now() + HOLDS;
@@ -156,11 +157,8 @@ async fn last_number(store: &dyn ObjectStore) -> Result<u64> {
 
 // Returns whether it was created; false if another process took the number.
 async fn create(store: &dyn ObjectStore, number: u64, record: &LeaseRecord) -> Result<bool> {
-    match store.put_opts(&object(number), record.bytes().into(), PutMode::Create.into()).await {
-        Ok(_) => Ok(true),
-        Err(object_store::Error::AlreadyExists { .. }) => Ok(false),
-        Err(e) => Err(Error::store("write", object(number), e)),
-    }
+    let created = create_object(store, &object(number), record.bytes().into()).await;
+    created.map_err(|e| Error::store("write", object(number), e))
 }
 
 // Lower numbers say nothing any more; those that stay are deleted by the next holder.
@@ -189,12 +187,6 @@ async fn read(store: &dyn ObjectStore, number: u64) -> Result<Option<LeaseRecord
     Ok(Some(serde_json::from_slice(&bytes).unwrap_or_else(|_| unreadable())))
 }
 
-/// Name of this machine, for people.
-pub(super) fn host() -> String {
-    let named = std::fs::read_to_string("/proc/sys/kernel/hostname").ok().or_else(|| std::env::var("HOSTNAME").ok());
-    named.map_or_else(|| "this machine".to_owned(), |name| name.trim().to_owned())
-}
-
 #[cfg(test)]
 mod tests {
     use echolake_schema::Rig;
@@ -209,38 +201,38 @@ mod tests {
     #[tokio::test]
     async fn one_holds_it_and_the_second_is_told_who() {
         let lake = lake().await;
-        let mut first = MaintenanceLease::take(&lake).await.expect("free");
-        first.keep().await.expect("held");
-        let error = MaintenanceLease::take(&lake).await.expect_err("held").to_string();
-        assert!(error.contains(&format!("process {}", std::process::id())) && error.contains(&host()), "{error}");
+        let mut first = MaintenanceLease::acquire(&lake).await.expect("free");
+        first.ensure_held().await.expect("held");
+        let error = MaintenanceLease::acquire(&lake).await.expect_err("held").to_string();
+        assert!(error.contains(&format!("process {}", std::process::id())) && error.contains(&host_name()), "{error}");
         first.release().await.expect("given back");
-        MaintenanceLease::take(&lake).await.expect("free again");
+        MaintenanceLease::acquire(&lake).await.expect("free again");
     }
 
     #[tokio::test]
     async fn a_holder_that_was_killed_on_this_machine_blocks_nobody() {
         let lake = lake().await;
-        let mut first = MaintenanceLease::take(&lake).await.expect("free");
+        let mut first = MaintenanceLease::acquire(&lake).await.expect("free");
         let mut child = std::process::Command::new("sleep").arg("600").spawn().expect("it starts");
         let running = ProcessIdentity::find(child.id()).expect("it runs");
         first.record.process = Some(running);
         lake.store().put(&object(first.number), first.record.bytes().into()).await.expect("written");
-        assert!(matches!(MaintenanceLease::take(&lake).await, Err(Error::Maintained { .. })));
+        assert!(matches!(MaintenanceLease::acquire(&lake).await, Err(Error::Maintained { .. })));
         child.kill().expect("killed");
         child.wait().expect("ended");
-        MaintenanceLease::take(&lake).await.expect("at once");
+        MaintenanceLease::acquire(&lake).await.expect("at once");
     }
 
     #[tokio::test]
     async fn a_dead_holder_is_followed_and_notices_where_it_was_not_dead() {
         let lake = lake().await;
-        let mut first = MaintenanceLease::take(&lake).await.expect("free");
+        let mut first = MaintenanceLease::acquire(&lake).await.expect("free");
         first.record.expires = Utc::now() - TimeDelta::seconds(1);
         lake.store().put(&object(first.number), first.record.bytes().into()).await.expect("written");
-        let mut second = MaintenanceLease::take(&lake).await.expect("run out");
-        assert!(matches!(first.keep().await, Err(Error::LeaseLost { .. })));
+        let mut second = MaintenanceLease::acquire(&lake).await.expect("run out");
+        assert!(matches!(first.ensure_held().await, Err(Error::LeaseLost { .. })));
         first.release().await.expect("not ours, left alone");
-        second.keep().await.expect("held");
+        second.ensure_held().await.expect("held");
         second.release().await.expect("given back");
         let there = numbers(lake.store().as_ref()).await.expect("listed");
         assert_eq!(there, [3], "taken twice and given back, and no number is used again");

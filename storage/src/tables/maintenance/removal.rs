@@ -8,7 +8,7 @@ use std::collections::BTreeSet;
 use echolake_schema::RunId;
 use echolake_schema::tables::Table;
 
-use crate::tables::snapshot::run_of;
+use crate::tables::run_parts::run_of_file;
 use crate::{DataFile, Error, Lake, RemovalRecord, Result, TableCommit};
 
 /// Looks at one table, each after another writer changed a file at the same moment.
@@ -75,7 +75,7 @@ impl Lake {
 // The runs among these whose rows a file has.
 fn parts_of(file: &DataFile, runs: &BTreeSet<RunId>) -> Vec<RunId> {
     let of: Vec<_> = match file.parts.is_empty() {
-        true => run_of(file).into_iter().collect(),
+        true => run_of_file(file).into_iter().collect(),
         false => file.parts.iter().map(|part| part.run.clone()).collect(),
     };
     of.into_iter().filter(|run| runs.contains(run)).collect()

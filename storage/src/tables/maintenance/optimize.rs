@@ -14,7 +14,7 @@ use futures::TryStreamExt as _;
 use serde::Serialize;
 use sha2::{Digest as _, Sha256};
 
-use crate::tables::lease::MaintenanceLease;
+use crate::locks::MaintenanceLease;
 use crate::{
     CommitEffect, CommitOutcome, DataFile, Error, FileEncoder, FileName, Lake, LakeSnapshot, ReferenceSurfaces,
     RemovalRecord, ReplacedFiles, Result, RunPart, TableCommit,
@@ -74,7 +74,7 @@ impl Lake {
         stop: &AtomicBool,
         progress: &mut (dyn FnMut(MergeProgress) + Send),
     ) -> Result<OptimizeReport> {
-        let mut lease = MaintenanceLease::take(self).await?;
+        let mut lease = MaintenanceLease::acquire(self).await?;
         let done = self.merge_all(target_bytes, stop, progress, &mut lease).await;
         let released = lease.release().await;
         done.and_then(|report| released.map(|()| report))
@@ -150,7 +150,7 @@ impl Lake {
         let mut encoder = FileEncoder::new(table, table.schema(self.rig()));
         for slice in &slices {
             if let Some(lease) = lease.as_deref_mut() {
-                lease.keep().await?;
+                lease.ensure_held().await?;
             }
             let mut batches = self.rows(table, slice.file, &[], slice.rows.clone()).await?;
             let mut rows = 0;
@@ -169,7 +169,7 @@ impl Lake {
         staged.file.replaces = Some(ReplacedFiles { prefix: None, files: replaced });
         staged.file.parts = parts;
         if let Some(lease) = lease {
-            lease.keep().await?;
+            lease.ensure_held().await?;
         }
         let bytes = staged.file.bytes;
         let commit = TableCommit { add: vec![staged.file], ..change };

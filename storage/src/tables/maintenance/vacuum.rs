@@ -10,9 +10,8 @@ use object_store::ObjectStore as _;
 use object_store::path::Path;
 use serde::Serialize;
 
-use crate::tables::claims;
-use crate::tables::delta::folder;
-use crate::tables::lease::MaintenanceLease;
+use crate::locks::{CLAIMS_FOLDER, MaintenanceLease};
+use crate::tables::file_name::table_folder;
 use crate::{Error, FileHistory, Lake, Result};
 
 /// Hours for which a file is kept after it left its table, by default and at most: Delta's log forgets the time of
@@ -78,7 +77,7 @@ impl Lake {
         if deletion == DeletionMode::Pretended {
             return self.left_over(keep).await;
         }
-        let mut lease = MaintenanceLease::take(self).await?;
+        let mut lease = MaintenanceLease::acquire(self).await?;
         let done = self.delete_left_over(keep, deleted, &mut lease).await;
         let released = lease.release().await;
         done.and_then(|report| released.map(|()| report))
@@ -93,7 +92,7 @@ impl Lake {
         let report = self.left_over(keep).await?;
         let mut done = 0;
         for files in report.files.chunks(if self.is_remote() { DELETED_AT_ONCE } else { 1 }) {
-            lease.keep().await?;
+            lease.ensure_held().await?;
             let mut stored = Vec::new();
             for file in files {
                 match &file.place {
@@ -122,8 +121,8 @@ impl Lake {
         let (now, mut files) = (Utc::now(), Vec::new());
         let old = |modified| is_over(modified, None, now, keep);
         for table in Table::ALL {
-            let there = self.store().list_with_delimiter(Some(&folder(table))).await;
-            let there = there.map_err(|e| Error::store("list", folder(table), e))?;
+            let there = self.store().list_with_delimiter(Some(&table_folder(table))).await;
+            let there = there.map_err(|e| Error::store("list", table_folder(table), e))?;
             // Without a log, nothing says what the files are.
             let Some(history) = self.log().history(table).await? else { continue };
             for meta in there.objects {
@@ -136,7 +135,7 @@ impl Lake {
         let is_unfinished = |path: &Path| matches!(path.extension(), Some("copying" | "uploading"));
         let unfinished = inbox.into_iter().filter(|m| is_unfinished(&m.location) && old(m.last_modified));
         // Claims of processes that died.
-        let claims = Path::from(claims::FOLDER);
+        let claims = Path::from(CLAIMS_FOLDER);
         let claims: Vec<_> =
             self.store().list(Some(&claims)).try_collect().await.map_err(|e| Error::store("list", claims, e))?;
         let claims = claims.into_iter().filter(|meta| old(meta.last_modified));

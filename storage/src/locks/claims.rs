@@ -16,18 +16,18 @@ use bytes::Bytes;
 use futures::TryStreamExt as _;
 use futures::future::join_all;
 use object_store::path::Path;
-use object_store::{Error as StoreError, ObjectStore, ObjectStoreExt as _, PutMode, Result as StoreResult};
+use object_store::{ObjectStore, ObjectStoreExt as _, Result as StoreResult};
 use sha2::{Digest as _, Sha256};
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 use uuid::Uuid;
 
-use super::lease::host;
-use super::process_identity::ProcessIdentity;
+use super::process_identity::{ProcessIdentity, host_name};
 use crate::Lake;
+use crate::remote::create_object;
 
 /// Folder of the claims' objects.
-pub(super) const FOLDER: &str = "tables/_claims";
+pub(crate) const FOLDER: &str = "tables/_claims";
 /// Hexadecimal digits of the digest that names the work.
 const KEY_DIGITS: usize = 24;
 
@@ -102,7 +102,7 @@ impl SeenClaim {
 impl WorkClaims {
     /// Starts to hold claims on a lake's work; needs a Tokio runtime.
     pub fn start(lake: &Lake, times: ClaimTimes) -> Self {
-        let holder = format!("{} {} {}", host(), std::process::id(), Uuid::new_v4().simple());
+        let holder = format!("{} {} {}", host_name(), std::process::id(), Uuid::new_v4().simple());
         // A struct of texts and numbers always has a JSON form.
         let process = serde_json::to_string(&ProcessIdentity::current()).unwrap_or_default();
         let state = Arc::new(ClaimState { store: lake.store(), holder, process, times, board: Mutex::default() });
@@ -209,11 +209,7 @@ impl ClaimState {
     // Returns whether it was created; false if another process has the number.
     async fn create(&self, key: &str, number: u64) -> StoreResult<bool> {
         let text = format!("{} {number}\n{}\n", self.holder, self.process);
-        match self.store.put_opts(&object(key, number), text.into(), PutMode::Create.into()).await {
-            Ok(_) => Ok(true),
-            Err(StoreError::AlreadyExists { .. }) => Ok(false),
-            Err(e) => Err(e),
-        }
+        create_object(self.store.as_ref(), &object(key, number), text.into()).await
     }
 
     async fn numbers(&self) -> StoreResult<Vec<(String, u64)>> {

@@ -67,6 +67,12 @@ fn state(pid: u32) -> ProcessState {
     }
 }
 
+/// Returns the name of this machine, for people.
+pub(super) fn host_name() -> String {
+    let named = std::fs::read_to_string("/proc/sys/kernel/hostname").ok().or_else(|| std::env::var("HOSTNAME").ok());
+    named.map_or_else(|| "this machine".to_owned(), |name| name.trim().to_owned())
+}
+
 #[cfg(test)]
 mod tests {
     use std::process::Command;

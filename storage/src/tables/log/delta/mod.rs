@@ -29,7 +29,8 @@ use self::log_folder::{CommitAttempt, LogFolder, own_protocol, rebuild_hint};
 use self::table_state::{ENGINE, TableState, mark_rebuild};
 use crate::location::LakeLocation;
 use crate::remote::backoff;
-use crate::tables::snapshot::{decode_parts, encode_parts, is_merged};
+use crate::tables::file_name::{is_merged, table_folder};
+use crate::tables::run_parts::{decode_parts, encode_parts};
 use crate::{
     CommitEffect, CommitLog, CommitOutcome, DataFile, Error, FileHistory, FileStats, LoggedFile, NewFile,
     RemovalRecord, ReplacedFiles, Result, RunPart, RunRowCounts, TableChange, TableCommit, TableVersion, TableView,
@@ -307,11 +308,6 @@ pub(crate) async fn has_run_files(store: &dyn ObjectStore) -> Result<bool> {
     Ok(false)
 }
 
-/// A table's folder in the lake.
-pub(crate) fn folder(table: Table) -> Path {
-    Path::from(format!("tables/{}", table.name()))
-}
-
 #[async_trait]
 impl CommitLog for DeltaLog {
     async fn ensure(&self, table: Table) -> Result<()> {
@@ -471,7 +467,7 @@ fn data_file(table: Table, add: &AddFile) -> Result<DataFile> {
         row_counts: tag(add, ROWS).and_then(|text| serde_json::from_str(text).ok()),
         parts: if is_merged(&name) { parts(table, add)? } else { Vec::new() },
         hidden: Vec::new(),
-        path: folder(table).join(name),
+        path: table_folder(table).join(name),
     })
 }
 

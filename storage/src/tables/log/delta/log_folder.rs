@@ -15,8 +15,8 @@ use serde_json::{Value, json};
 use super::actions::LogLine;
 use super::checkpoint::{decode_checkpoint, encode_checkpoint};
 use super::commit_files::{commit_name, commit_number, list_versions};
-use super::folder;
 use super::table_state::{TableState, is_own_commit};
+use crate::tables::file_name::table_folder;
 use crate::{Error, Result, TableChange, TableVersion};
 
 /// The newest version of the protocol that this reads.
@@ -72,7 +72,7 @@ struct CheckpointFiles {
 
 impl<'a> LogFolder<'a> {
     pub(super) fn new(table: Table, store: &'a dyn ObjectStore) -> Self {
-        Self { table, path: folder(table).join("_delta_log"), store }
+        Self { table, path: table_folder(table).join("_delta_log"), store }
     }
 
     /// The table at its newest version, or at the given one; None if it has no log.
@@ -448,7 +448,7 @@ mod tests {
     }
 
     fn path(name: &str) -> Path {
-        folder(Table::Nce).join("_delta_log").join(name)
+        table_folder(Table::Nce).join("_delta_log").join(name)
     }
 
     async fn put(store: &InMemory, name: &str, text: impl Into<Vec<u8>>) {

@@ -1,0 +1,119 @@
+//! The runs whose rows a file has: of one run by its name, of several by the list of its parts in the log.
+
+use echolake_schema::{ProjectName, RunId};
+use object_store::path::Path;
+use serde::Deserialize;
+use serde_json::{Value, json};
+
+use super::file_name::{EXTENSION, FileName, VisibleRun};
+use crate::{DataFile, RunPart, RunRowCounts};
+
+/// The column of `runs` that holds a run's project.
+const PROJECT: &str = "project";
+
+/// Returns the run of a file of one run; None for other files.
+pub(crate) fn run_of_file(file: &DataFile) -> Option<RunId> {
+    match FileName::parse(&file.path)? {
+        FileName::Rows { run, .. } => Some(run),
+        FileName::Pointer(pointer) => Some(pointer.run),
+        FileName::Rig { .. } | FileName::Merged { .. } => None,
+    }
+}
+
+/// A run's row in `runs`.
+pub(crate) struct RunPointer<'a> {
+    pub(crate) run: VisibleRun,
+    /// The version of `runs` that added it.
+    pub(crate) version: u64,
+    pub(crate) row_counts: Option<&'a RunRowCounts>,
+}
+
+/// Lists the rows of `runs` that a file of that table shows.
+pub(crate) fn list_pointers(file: &DataFile) -> Vec<RunPointer<'_>> {
+    let run = |path: &Path| match FileName::parse(path)? {
+        FileName::Pointer(run) => Some(run),
+        _ => None,
+    };
+    if file.parts.is_empty() {
+        let shown = run(&file.path).filter(|run| !file.hidden.contains(&run.run));
+        let (version, row_counts) = (file.log_version, file.row_counts.as_ref());
+        return shown.map(|run| RunPointer { run, version, row_counts }).into_iter().collect();
+    }
+    let parts = file.visible_parts().map(|(part, _)| part);
+    let pointers = parts.filter_map(|part| {
+        let (run, version) = (run(&part.file_name().into())?, part.row_version?);
+        Some(RunPointer { run, version, row_counts: part.row_counts.as_ref() })
+    });
+    pointers.collect()
+}
+
+impl DataFile {
+    /// The runs whose rows the file shows; none for rows that come from the rig.
+    pub fn shown_runs(&self) -> Vec<RunId> {
+        match self.parts.is_empty() {
+            true => run_of_file(self).into_iter().collect(),
+            false => self.visible_parts().map(|(part, _)| part.run.clone()).collect(),
+        }
+    }
+
+    /// Returns the project of the runs of a file of `runs`, which is the same for all of them; None if they have none.
+    pub(crate) fn project(&self) -> Option<ProjectName> {
+        let stats = self.stats.as_ref()?;
+        let [least, greatest] = [&stats.min, &stats.max].map(|values| values.get(PROJECT).and_then(Value::as_str));
+        least.filter(|_| least == greatest)?.parse().ok()
+    }
+}
+
+/// A part in the log: the name that it had as a file of its own, and its rows; in `runs` also the version that added it.
+#[derive(Deserialize)]
+#[serde(untagged)]
+enum LoggedPart {
+    Rows(String, u64),
+    Pointer(String, u64, u64),
+}
+
+/// Parts as text.
+pub(crate) fn encode_parts(parts: &[RunPart]) -> String {
+    let one = |part: &RunPart| match part.row_version {
+        Some(version) => json!([part.file_name(), part.rows, version]),
+        None => json!([part.file_name(), part.rows]),
+    };
+    Value::Array(parts.iter().map(one).collect()).to_string()
+}
+
+/// Decodes the parts from such a text; None if it is none.
+pub(crate) fn decode_parts(text: &str) -> Option<Vec<RunPart>> {
+    let parts: Vec<LoggedPart> = serde_json::from_str(text).ok()?;
+    let one = |part: LoggedPart| match part {
+        LoggedPart::Rows(name, rows) => RunPart::parse(&name.into(), rows, None),
+        LoggedPart::Pointer(name, rows, version) => RunPart::parse(&name.into(), rows, Some(version)),
+    };
+    parts.into_iter().map(one).collect::<Option<Vec<_>>>().filter(|parts| !parts.is_empty())
+}
+
+impl RunPart {
+    /// The only part of a file of one run; None if the file has another name.
+    pub(crate) fn of_file(file: &DataFile) -> Option<Self> {
+        let part = Self::parse(&file.path, file.rows, Some(file.log_version))?;
+        Some(Self { row_counts: file.row_counts.clone(), ..part })
+    }
+
+    fn parse(path: &Path, rows: u64, row_version: Option<u64>) -> Option<Self> {
+        match FileName::parse(path)? {
+            FileName::Rows { surface, run, derivation } => {
+                Some(Self { surface, run, derivation, rows, row_version: None, row_counts: None })
+            }
+            FileName::Pointer(pointer) => {
+                let derivation = pointer.derivations();
+                let (row_version, row_counts) = (Some(row_version?), None);
+                Some(Self { surface: pointer.surface, run: pointer.run, derivation, rows, row_version, row_counts })
+            }
+            FileName::Rig { .. } | FileName::Merged { .. } => None,
+        }
+    }
+
+    /// The name of a file with these rows alone.
+    pub(crate) fn file_name(&self) -> String {
+        format!("{}.{}.{}{EXTENSION}", self.surface, self.run, self.derivation)
+    }
+}
