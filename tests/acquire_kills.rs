@@ -7,12 +7,11 @@ use std::process::{Command, Output};
 use std::time::{Duration, Instant};
 
 use echolake_schema::messages::{Measurement, Verdict};
+use echolake_testing::{ChildProcess, SMALL_RIG, run_command};
 use prost::Message as _;
 use rand::{Rng as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 
-use super::SMALL_RIG;
-use super::child::{ChildProcess, run_command};
 use super::forgetful::{DiskMount, ForgetfulDisk};
 
 /// Pairs of the small rig.

@@ -4,7 +4,8 @@ use std::path::Path;
 use std::process::Command;
 use std::time::Duration;
 
-use super::child::run_command;
+use echolake_testing::run_command;
+
 use super::{ECHOLAKE, TestFolder, stderr};
 
 fn files(folder: &Path) -> usize {

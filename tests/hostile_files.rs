@@ -11,12 +11,11 @@ use std::time::{Duration, Instant};
 
 use echolake_schema::messages::{ImpulseResponse, Measurement, Message as _};
 use echolake_schema::topics;
+use echolake_testing::{ChildProcess, SMALL_RIG, run_command};
 use prost::Message as _;
 use rand::{Rng as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 
-use super::SMALL_RIG;
-use super::child::{ChildProcess, run_command};
 use super::kills::copy_folder;
 
 /// Surfaces whose runs must be taken in.

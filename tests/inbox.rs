@@ -8,7 +8,8 @@ use std::os::unix::net::UnixListener;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use super::child::{ChildProcess, run_command};
+use echolake_testing::{ChildProcess, run_command};
+
 use super::{TestFolder, stderr};
 
 fn start_watch(place: &TestFolder) -> ChildProcess {

@@ -6,9 +6,9 @@ use std::os::unix::fs::PermissionsExt as _;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use echolake_testing::run_command;
 use serde::Deserialize;
 
-use super::child::run_command;
 use super::{ECHOLAKE, TestFolder, stderr};
 
 #[derive(Debug, Deserialize)]

@@ -6,12 +6,10 @@ use std::process::Command;
 use std::time::{Duration, Instant};
 
 use echolake_schema::{Rig, Table};
+use echolake_testing::{ChildProcess, SMALL_RIG, run_command};
 use rand::seq::SliceRandom as _;
 use rand::{Rng as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
-
-use super::SMALL_RIG;
-use super::child::{ChildProcess, run_command};
 
 /// Surfaces of the lake: references and what waits for them, in an order that a run must not depend on.
 const SURFACES: [&str; 6] = ["wood", "flat", "prd", "foam", "brick", "wavy"];

@@ -5,7 +5,6 @@ mod acquire_kills;
 mod bad_input;
 mod broken_tables;
 mod campaign;
-mod child;
 mod end_to_end;
 mod figure;
 mod forgetful;
@@ -36,13 +35,13 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::OnceLock;
 
+use echolake_testing::{SMALL_RIG, run_command};
+
 /// The command under test: `packaging/package.sh` names the one that ships.
 const ECHOLAKE: &str = match option_env!("ECHOLAKE_SHIPPED") {
     Some(shipped) => shipped,
     None => env!("CARGO_BIN_EXE_echolake"),
 };
-/// A rig that measures in milliseconds.
-const SMALL_RIG: &str = include_str!("fixtures/small_rig.toml");
 
 /// A folder with a lake and a small rig.
 struct TestFolder {
@@ -67,7 +66,7 @@ impl TestFolder {
     }
 
     fn run(&self, args: &[&str]) -> Output {
-        child::run_command(&mut self.command(args)).expect("the command starts")
+        run_command(&mut self.command(args)).expect("the command starts")
     }
 
     /// Runs what must succeed; returns stdout.

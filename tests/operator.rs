@@ -3,7 +3,8 @@
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-use super::child::ChildProcess;
+use echolake_testing::ChildProcess;
+
 use super::{TestFolder, stderr};
 
 /// A run that was stopped by Ctrl-C after its first pairs; returns its recording.

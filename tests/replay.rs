@@ -1,6 +1,7 @@
 //! Start and end of a replay by its users; the content that a viewer sees is tested beside the player.
 
-use super::child::ChildProcess;
+use echolake_testing::ChildProcess;
+
 use super::{TestFolder, stderr};
 
 /// Replays until it listens, then ends it by Ctrl-C; its exit code, and what it said.

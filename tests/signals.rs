@@ -3,7 +3,8 @@
 
 use std::process::Command;
 
-use super::child::ChildProcess;
+use echolake_testing::ChildProcess;
+
 use super::{ECHOLAKE, TestFolder, stderr};
 
 const SIGNALS: [&str; 2] = ["INT", "TERM"];

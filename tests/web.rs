@@ -10,7 +10,8 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::OnceLock;
 
-use super::child::{ChildProcess, run_long_command};
+use echolake_testing::{ChildProcess, run_long_command};
+
 use super::serve::{catalogue::lake, served};
 use super::{TestFolder, stderr};
 

@@ -4,10 +4,6 @@
 //! libasound finds its configuration by the environment, so the program starts itself once more with that set.
 #![allow(clippy::print_stderr, reason = "it has no harness that would say what was tried")]
 
-#[allow(dead_code, unused_imports, reason = "the tests' helper, of which this wants a part")]
-#[path = "../../tests/child.rs"]
-mod child;
-
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
@@ -16,6 +12,7 @@ use echolake_acquisition::rig::drivers::audio_interface;
 use echolake_acquisition::rig::{AudioInterface, AudioTake, Error};
 use echolake_schema::Timestamp;
 use echolake_schema::devices::{AlsaParams, AudioFormat};
+use echolake_testing::run_command;
 
 const FOLDER: &str = "ECHOLAKE_ALSA_TEST";
 const RATE_HZ: f64 = 96_000.0;
@@ -30,7 +27,7 @@ fn main() {
             std::fs::write(folder.path().join("asound.conf"), configuration(folder.path())).expect("written");
             let mut command = Command::new(std::env::current_exe().expect("this program"));
             command.env(FOLDER, folder.path()).env("ALSA_CONFIG_PATH", folder.path().join("asound.conf"));
-            let output = child::run_command(&mut command).expect("started");
+            let output = run_command(&mut command).expect("started");
             let said = String::from_utf8_lossy(&output.stderr);
             assert!(output.status.success(), "the checks failed: {said}");
             eprint!("{said}");

@@ -7,9 +7,6 @@ mod acquire_kills;
 mod attacks;
 mod cancels;
 mod catalogue_client;
-#[allow(dead_code, reason = "the tests' helper, of which this wants a part")]
-#[path = "../../tests/child.rs"]
-mod child;
 mod engine_kills;
 #[path = "../../tests/forgetful.rs"]
 mod forgetful;
@@ -54,9 +51,6 @@ use clap::Parser as _;
 // As in the `echolake` command, so that it is measured as it is used.
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
-
-/// A rig that measures in milliseconds.
-const SMALL_RIG: &str = include_str!("../../tests/fixtures/small_rig.toml");
 
 /// Campaigns and benchmarks of echolake.
 #[derive(Debug, clap::Parser)]

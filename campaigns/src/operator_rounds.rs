@@ -5,8 +5,8 @@ use std::path::PathBuf;
 use std::process::Command;
 
 use anyhow::{Context as _, Result, ensure};
+use echolake_testing::run_long_command;
 
-use super::child::run_long_command;
 use super::operators::{OperatorCampaign, RoundFailure};
 
 const DELTALAKE: &str = "deltalake==1.6.6";

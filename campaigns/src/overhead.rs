@@ -8,9 +8,9 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Context as _, Result, ensure};
+use echolake_testing::run_command;
 
 use super::catalogue_client::CatalogueServer;
-use super::child::run_command;
 use super::observed_server::ProcessTree;
 use super::percentile::{millis, percentile};
 use super::readers::{CatalogueContents, QuestionKind, ReaderLoad};

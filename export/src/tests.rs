@@ -3,28 +3,22 @@
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use std::path::Path;
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 
 use arrow::array::AsArray as _;
 use arrow::datatypes::{Int32Type, Int64Type};
 use arrow::record_batch::RecordBatch;
 use echolake_acquisition::import::{ImportOptions, import_gir, import_wav};
-use echolake_acquisition::panel::relief::PanelRelief;
 use echolake_acquisition::run::controller::RecordingMode;
-use echolake_acquisition::run::simulate::simulate;
-use echolake_acquisition::run::{PanelSpecimen, RunRequest};
 use echolake_ingest::{LakeIngest, pending};
 use echolake_lake::{Lake, ReferenceSurfaces};
-use echolake_schema::manifest::Origin;
 use echolake_schema::{Rig, RunId, Table, Timestamp, topics};
+use echolake_testing::{SMALL_RIG, simulate_run};
 use futures::TryStreamExt as _;
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 use tempfile::TempDir;
 
 use crate::*;
 
-/// Ten points, so that a run takes milliseconds.
-const SMALL_RIG: &str = include_str!("../../tests/fixtures/small_rig.toml");
 const SURFACES: [&str; 6] = ["flat", "foam", "0001_0", "0001_1", "0002_0", "0003_0"];
 
 async fn lake(home: &TempDir, keep: RecordingMode) -> Lake {
@@ -35,16 +29,11 @@ async fn lake(home: &TempDir, keep: RecordingMode) -> Lake {
     std::fs::create_dir_all(&inbox).expect("a folder");
     for (number, surface) in SURFACES.into_iter().enumerate() {
         let name = if number < 2 { surface } else { "macrostructure" };
-        let specimen = PanelSpecimen::Relief(PanelRelief::by_name(name).expect("a relief"));
-        let start = Timestamp(1_767_600_000_000_000_000).plus_secs(number as f64 * 3_600.0);
-        let seed = number as u64 + 1;
-        let run = RunRequest::new(&rig, surface.parse().expect("an id"), &specimen, start, &inbox);
-        let run = RunRequest { seed, tag: seed, keep, ..run };
-        simulate(&run, Origin::Simulated, &AtomicBool::new(false), &mut |_| {}).expect("a run");
+        simulate_run(&inbox, number, surface, name, keep);
     }
     let ingest = LakeIngest::new(&lake, Arc::default());
-    ingest.take_in(pending(&lake).await.expect("runs"), &mut |_| {}).await.expect("ingested");
-    ingest.complete(&mut |_, _| {}).await.expect("derived");
+    ingest.ingest_runs(pending(&lake).await.expect("runs"), &mut |_| {}).await.expect("ingested");
+    ingest.complete_runs(&mut |_, _| {}).await.expect("derived");
     lake
 }
 

@@ -53,15 +53,15 @@ impl LakeIngest<'_> {
     ///
     /// # Errors
     /// [`crate::Error`]; runs completed before stay so, and the same call resumes with the rest.
-    pub async fn complete(&self, done: &mut CompletionReport<'_>) -> Result<CompletionSummary> {
-        let (changed, snapshot) = self.complete_runs(done).await?;
+    pub async fn complete_runs(&self, done: &mut CompletionReport<'_>) -> Result<CompletionSummary> {
+        let (changed, snapshot) = self.complete_in_rounds(done).await?;
         self.lake.remove_superseded_in(&snapshot).await?;
         let is_whole = snapshot.is_whole();
         Ok(CompletionSummary { changed, waiting: waiting(self.lake, snapshot), is_whole })
     }
 
     // Returns the number of changed runs, and the lake's snapshot thereafter.
-    async fn complete_runs(&self, done: &mut CompletionReport<'_>) -> Result<(usize, Arc<LakeSnapshot>)> {
+    async fn complete_in_rounds(&self, done: &mut CompletionReport<'_>) -> Result<(usize, Arc<LakeSnapshot>)> {
         let (cores, mut count, mut rounds) = (Cores::all()?, 0, 0);
         while rounds < ROUNDS {
             let round = do_round(self, &cores, done).await?;

@@ -13,7 +13,7 @@ use object_store::path::Path;
 use serde::Serialize;
 
 use crate::error::Result;
-use crate::files::has_end;
+use crate::inbox::has_end;
 use crate::read_back;
 use crate::references::ReferenceFinder;
 use crate::remove::find_removed;
@@ -282,49 +282,46 @@ async fn find_strays(lake: &Lake, snapshot: &LakeSnapshot, report: &mut LakeRepo
     let mut left_behind = (0, 0);
     for meta in listing.files.into_iter().filter(|m| !named.contains(&m.location)) {
         let path = meta.location;
-        let parts: Vec<_> = path.parts().map(|p| p.as_ref().to_owned()).collect();
-        match parts.first().map(String::as_str) {
+        let folder = path.parts().next().map(|part| part.as_ref().to_owned()).unwrap_or_default();
+        let (severity, what) = match (folder.as_str(), path.extension().unwrap_or_default()) {
             // The digest of the run beside it.
-            Some("inbox" | "runs") if path.extension() == Some("sha256") => {}
-            Some("inbox") if path.extension() == Some("uploading") => {
-                let what = "part of a run that is being uploaded; hint: `echolake upload` of it resumes";
-                report.find(FindingSeverity::Note, &path, what);
+            ("inbox" | "runs", "sha256") => continue,
+            ("inbox", "uploading") => {
+                (FindingSeverity::Note, "part of a run that is being uploaded; hint: `echolake upload` of it resumes")
             }
-            Some("inbox" | "runs") if path.extension() == Some("mcap") && !has_end(lake, &path).await.unwrap_or(true) => {
+            ("inbox" | "runs", "mcap") if !has_end(lake, &path).await.unwrap_or(true) => {
                 let what = format!(
                     "it has no end after {} bytes: it is still being copied, or its recording was cut off; hint: copy it \
                      again, or `echolake recover` makes a run of what it holds",
                     meta.size
                 );
                 report.find(FindingSeverity::Missing, &path, what);
+                continue;
             }
-            Some("inbox") if path.extension() == Some("mcap") => {
-                report.find(FindingSeverity::Missing, &path, "not yet ingested; hint: `echolake ingest`");
+            ("inbox", "mcap") => (FindingSeverity::Missing, "not yet ingested; hint: `echolake ingest`"),
+            ("inbox", _) if !path.as_ref().ends_with(".mcap.partial") => {
+                (FindingSeverity::Note, "no run file; ingest leaves it alone")
             }
-            Some("inbox") if !path.as_ref().ends_with(".mcap.partial") => {
-                report.find(FindingSeverity::Note, &path, "no run file; ingest leaves it alone");
-            }
-            Some("inbox") => report.find(
+            ("inbox", _) => (
                 FindingSeverity::Note,
-                &path,
                 "unfinished recording (still running, stopped or cut off); hint: `echolake acquire --resume` resumes it, \
                  `echolake recover` makes a run of what it holds",
             ),
-            Some("runs") => {
-                let what = "in no table: an ingest reads it now or was cut off, or the log of `runs` lost its newest \
-                            commits; hint: `echolake ingest`";
-                report.find(FindingSeverity::Damaged, &path, what);
-            }
+            ("runs", _) => (
+                FindingSeverity::Damaged,
+                "in no table: an ingest reads it now or was cut off, or the log of `runs` lost its newest commits; hint: \
+                 `echolake ingest`",
+            ),
             // It is named with its file.
-            Some("quarantine") if path.as_ref().ends_with(".reason.txt") => {}
-            Some("quarantine") => {
-                report.find(FindingSeverity::Note, &path, "was refused or removed; the reason stands beside it");
-            }
-            Some("tables") if FileName::parse(&path).is_some() => {
+            ("quarantine", _) if path.as_ref().ends_with(".reason.txt") => continue,
+            ("quarantine", _) => (FindingSeverity::Note, "was refused or removed; the reason stands beside it"),
+            ("tables", _) if FileName::parse(&path).is_some() => {
                 left_behind = (left_behind.0 + 1, left_behind.1 + meta.size);
+                continue;
             }
-            _ => {}
-        }
+            _ => continue,
+        };
+        report.find(severity, &path, what);
     }
     if left_behind.0 > 0 {
         let what = format!(

@@ -9,10 +9,8 @@ use echolake_lake::{
     ClaimOutcome, ClaimTimes, CommitOutcome, EncodedFile, Lake, RunRowCounts, VisibleRun, WorkClaims, encode,
     object_sha256,
 };
+use echolake_schema::RunId;
 use echolake_schema::tables::{Source, Table};
-use echolake_schema::{RunId, SurfaceId};
-use object_store::path::Path;
-use serde::{Deserialize, Serialize};
 use tracing::{Instrument as _, Span, field};
 
 use crate::CODE_VERSION;
@@ -20,95 +18,20 @@ use crate::context::IngestContext;
 use crate::derive::ReferenceDerivation;
 use crate::derived_values::RunResponses;
 use crate::error::{Error, Result};
-use crate::files::{self, FileVersion, Opened, ReadFile, RunSource};
-use crate::marks::ReadingMark;
-use crate::measure::Measurer;
+use crate::inbox::{self, FileVersion, OpenedRun, ReadFile, ReadingMark, RunSource};
 use crate::pipeline::{self, Cores, ReadyJob};
 use crate::read_back;
+use crate::reading::{Measurer, RunContent, RunHead};
 use crate::references::{ReferenceNames, digest};
+use crate::report::{FileReport, IngestOutcome, IngestedRun};
 use crate::rows::runs::RunReferences;
 use crate::rows::{self, RunKeys};
-use crate::run_content::{Head, RunContent};
 
 /// Revision of the responses that follow from recordings: those of another one are derived anew.
 const RESPONSES_REVISION: &str = "2";
 
 /// Time between two looks at other ingests' claims.
 pub(crate) const LOOK_EVERY: Duration = Duration::from_secs(2);
-
-/// Result of the ingest of one run.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct IngestedRun {
-    /// The run.
-    #[serde(rename = "run_id")]
-    pub run: RunId,
-    /// Its surface.
-    #[serde(rename = "surface_id")]
-    pub surface: SurfaceId,
-    /// Measurements in the table.
-    pub measurements: usize,
-    /// True if its derived rows are in the lake, too.
-    pub derived: bool,
-    /// Missing references, separated by commas; empty if none is missing.
-    pub missing: String,
-    /// Its outcome; in JSON the boolean `added`.
-    #[serde(rename = "added")]
-    pub outcome: IngestOutcome,
-    /// Descriptions of what could not be read.
-    pub damaged: Vec<String>,
-    /// True if the file was closed and records how the run ended.
-    pub whole: bool,
-    /// True if the run was stopped before its end and nothing that was recorded is lost.
-    pub stopped: bool,
-    /// True if the lake had a shorter file of the run, with the same beginning and without an end.
-    #[serde(default)]
-    pub replaced: bool,
-    /// True if it was in the lake before and rows of it were missing, which are derived again.
-    #[serde(default)]
-    pub mended: bool,
-}
-
-/// Outcome of an ingest: the run is new, or was in the lake before.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(from = "bool", into = "bool")]
-pub enum IngestOutcome {
-    /// It is in the lake now.
-    Added,
-    /// It was in the lake before; nothing was added.
-    Known,
-}
-
-impl From<bool> for IngestOutcome {
-    fn from(is_added: bool) -> Self {
-        if is_added { Self::Added } else { Self::Known }
-    }
-}
-
-impl From<IngestOutcome> for bool {
-    fn from(outcome: IngestOutcome) -> Self {
-        outcome == IngestOutcome::Added
-    }
-}
-
-/// Report on one file.
-#[derive(Debug)]
-pub enum FileReport {
-    /// It is in the tables.
-    Taken(IngestedRun),
-    /// It cannot be ingested, now or later.
-    Refused {
-        /// The file.
-        source: RunSource,
-        /// The cause.
-        why: Error,
-        /// Its new path, if it was moved.
-        moved: Option<Path>,
-    },
-    /// Another ingest has moved it meanwhile.
-    Gone(RunSource),
-    /// Another ingest is at it; this one waits for its end. Another report follows.
-    Claimed(RunSource),
-}
 
 /// Ingests runs into a lake.
 #[derive(Debug, Clone)]
@@ -134,7 +57,7 @@ struct IngestWork {
 #[derive(Clone)]
 struct SharedWork {
     claims: Arc<WorkClaims>,
-    /// Runs that were in the tables before the first file was taken in: whoever wants them ingested wants them again.
+    /// Runs that were in the tables before the first file was ingested: whoever wants them ingested wants them again.
     known: Arc<BTreeSet<RunId>>,
 }
 
@@ -171,14 +94,18 @@ impl<'a> LakeIngest<'a> {
     /// # Errors
     /// [`Error::Stopped`], or an error of the lake. Readers do not see files that are not reported yet; the same call
     /// resumes with them.
-    pub async fn take_in(&self, sources: Vec<RunSource>, report: &mut (dyn FnMut(FileReport) + Send)) -> Result<()> {
+    pub async fn ingest_runs(
+        &self,
+        sources: Vec<RunSource>,
+        report: &mut (dyn FnMut(FileReport) + Send),
+    ) -> Result<()> {
         let mut first = Some(self.lake.ensure_tables().await?);
         let mut known: Option<Arc<BTreeSet<RunId>>> = None;
         // Runs that are references, perhaps, and lack their own rows.
         let is_lacking = |run: &RunId| first.as_ref().is_some_and(|before| before.lacks_rows(run, Source::Run));
         let (lacking, sources): (Vec<_>, Vec<_>) =
             sources.into_iter().partition(|source| source.run_in_place().is_some_and(|run| is_lacking(&run)));
-        let (references, others) = self.in_order(sources).await?;
+        let (references, others) = self.order_sources(sources).await?;
         let (cores, measurer) = (Cores::all()?, Arc::new(Measurer::new(self.lake)));
         for sources in [lacking, references, others] {
             let mut claimed: Vec<RunSource> = Vec::new();
@@ -193,7 +120,7 @@ impl<'a> LakeIngest<'a> {
                 let known = known.get_or_insert_with(runs).clone();
                 let shared = self.claims.clone().map(|claims| SharedWork { claims, known });
                 let work = IngestWork { again: self.again, context, measurer: measurer.clone(), shared };
-                for source in self.take_in_group(work, free, report).await? {
+                for source in self.ingest_group(work, free, report).await? {
                     if !claimed.contains(&source) {
                         report(FileReport::Claimed(source.clone()));
                         claimed.push(source);
@@ -207,7 +134,7 @@ impl<'a> LakeIngest<'a> {
 
     /// Ingests a file as versions before this one did, whether it has an end or not.
     #[cfg(test)]
-    pub(crate) async fn take_in_without_end(&self, source: &RunSource) -> Result<IngestedRun> {
+    pub(crate) async fn ingest_without_end(&self, source: &RunSource) -> Result<IngestedRun> {
         let context = IngestContext::new(self.lake, &Cores::all()?, self.lake.ensure_tables().await?);
         let measurer = Arc::new(Measurer::new(self.lake));
         let work = IngestWork { again: false, context, measurer, shared: None };
@@ -236,7 +163,7 @@ impl<'a> LakeIngest<'a> {
     }
 
     // Returns the files that other ingests have claimed.
-    async fn take_in_group(
+    async fn ingest_group(
         &self,
         work: IngestWork,
         sources: Vec<RunSource>,
@@ -252,7 +179,7 @@ impl<'a> LakeIngest<'a> {
                 }
                 let outcome = IngestOutcome::from(outcome == Some(CommitOutcome::Now));
                 release(&source);
-                report(FileReport::Taken(IngestedRun { outcome, ..taken }));
+                report(FileReport::Ingested(IngestedRun { outcome, ..taken }));
                 Ok(())
             }
             Err(Error::Claimed { .. }) => {
@@ -268,17 +195,19 @@ impl<'a> LakeIngest<'a> {
         let do_one = move |source| {
             let work = work.clone();
             let span = tracing::error_span!("ingest", file = %source, run = field::Empty, surface = field::Empty);
-            async move { work.take_in(&source).await }.instrument(span)
+            async move { work.ingest_run(&source).await }.instrument(span)
         };
         let done = pipeline::run(self.lake, &cores, sources, &self.stop, do_one, ended).await;
         for (source, place) in replaced {
-            files::replace_partial(self.lake, &source, &place).await?;
+            inbox::replace_partial(self.lake, &source, &place).await?;
         }
         for (source, why) in refused {
             let name = source.work_name().to_owned();
             report(match why {
                 Error::Gone { .. } => FileReport::Gone(source),
-                why => FileReport::Refused { moved: files::quarantine(self.lake, &source, &why).await?, source, why },
+                why => {
+                    FileReport::Refused { moved: inbox::quarantine_file(self.lake, &source, &why).await?, source, why }
+                }
             });
             claims.iter().for_each(|claims| claims.release(&name));
         }
@@ -287,20 +216,20 @@ impl<'a> LakeIngest<'a> {
 
     // Runs of surfaces that others name as references, and the rest. The order only saves time: rows are derived again
     // if their references change.
-    async fn in_order(&self, sources: Vec<RunSource>) -> Result<(Vec<RunSource>, Vec<RunSource>)> {
+    async fn order_sources(&self, sources: Vec<RunSource>) -> Result<(Vec<RunSource>, Vec<RunSource>)> {
         let defaults = &self.lake.config().references;
         let mut names = BTreeSet::from([defaults.flat.clone(), defaults.foam.clone()]);
         let mut heads = Vec::with_capacity(sources.len());
         for source in sources {
             let _mark = ReadingMark::new(self.lake, &source);
             let head = match source.open(self.lake) {
-                Ok(opened) => Head::read(&opened).await,
+                Ok(opened) => RunHead::read(&opened).await,
                 Err(_) => None,
             };
             names.extend(head.iter().flat_map(|h| h.references.clone()));
             heads.push((source, head));
         }
-        let is_reference = |head: &Option<Head>| head.as_ref().is_some_and(|h| names.contains(&h.surface));
+        let is_reference = |head: &Option<RunHead>| head.as_ref().is_some_and(|h| names.contains(&h.surface));
         let (references, others): (Vec<_>, Vec<_>) = heads.into_iter().partition(|(_, head)| is_reference(head));
         let sources = |of: Vec<(RunSource, _)>| of.into_iter().map(|(source, _)| source).collect();
         Ok((sources(references), sources(others)))
@@ -308,9 +237,9 @@ impl<'a> LakeIngest<'a> {
 }
 
 impl IngestWork {
-    async fn take_in(&self, source: &RunSource) -> Result<ReadyJob<IngestedRun>> {
+    async fn ingest_run(&self, source: &RunSource) -> Result<ReadyJob<IngestedRun>> {
         self.claim(source).await?;
-        files::check_end(&source.open(&self.context.lake)?).await?;
+        inbox::check_end(&source.open(&self.context.lake)?).await?;
         self.read_and_stage(source).await
     }
 
@@ -327,7 +256,7 @@ impl IngestWork {
         let derivation = digest(&[content.integrity.sha256.as_str(), CODE_VERSION, RESPONSES_REVISION]);
         let known = snapshot.run(&keys.run);
         let replaced = match known {
-            Some(known) => self.check_same(known, &content, &opened).await?,
+            Some(known) => self.has_beginning_only(known, &content, &opened).await?,
             None => false,
         };
         let place = Lake::run_path(&keys.surface, &keys.run);
@@ -335,13 +264,13 @@ impl IngestWork {
         let kept = async {
             // The shorter file keeps its place until the rows of the longer one are committed.
             if replaced {
-                files::check_unchanged(lake, source, &file)?;
+                inbox::check_unchanged(lake, source, &file)?;
                 return Ok(mark);
             }
             let there = RunSource::Lake(place.clone());
             // Both names are marked while it moves: what is computed meanwhile may end the process.
             let next_mark = if *source == there { None } else { ReadingMark::new(lake, &there) };
-            files::keep(lake, source, &place, &file, known.is_some()).await?;
+            inbox::move_to_place(lake, source, &place, &file, known.is_some()).await?;
             Ok(next_mark.or(mark))
         };
         let names = ReferenceNames::of(&content.surface, &lake.config().references);
@@ -418,7 +347,7 @@ impl IngestWork {
     }
 
     // Returns whether the lake has no more than the beginning of this file, as of a copy that was cut off.
-    async fn check_same(&self, known: &VisibleRun, content: &RunContent, opened: &Opened) -> Result<bool> {
+    async fn has_beginning_only(&self, known: &VisibleRun, content: &RunContent, opened: &OpenedRun) -> Result<bool> {
         let Some(row) = self.context.snapshot.files_of(Table::Runs, &known.run).next() else { return Ok(false) };
         let row = read_back::run_row(&self.context.lake, row, &known.run).await?;
         let there = rows::runs::text_of(&row, "file_sha256").unwrap_or_default();
@@ -429,7 +358,7 @@ impl IngestWork {
         if let Some(bytes) = shorter.filter(|bytes| (1..content.integrity.bytes).contains(bytes)) {
             let (store, path) = (opened.store.as_ref(), &opened.path);
             let failed = |e: object_store::Error| Error::read(&opened.name, e);
-            if !files::has_end_at(store, path, bytes).await.map_err(failed)?
+            if !inbox::has_end_at(store, path, bytes).await.map_err(failed)?
                 && object_sha256(store, path, bytes, &mut |_| {}).await.map_err(failed)? == there
             {
                 return Ok(true);

@@ -38,8 +38,8 @@ pub(crate) struct Cores {
 /// A guard that counts a core as busy until it is dropped.
 pub(crate) struct BusyCore(Arc<AtomicUsize>);
 
-/// Handle of a computation on a core.
-pub(crate) struct Begun<T>(oneshot::Receiver<std::thread::Result<T>>);
+/// A computation on a core that has not ended.
+pub(crate) struct PendingComputation<T>(oneshot::Receiver<std::thread::Result<T>>);
 
 impl Drop for BusyCore {
     fn drop(&mut self) {
@@ -80,7 +80,7 @@ impl Cores {
     }
 
     /// Starts a computation on a core of its own once one is free, in the order of the calls.
-    pub(crate) fn begin<T: Send + 'static>(&self, work: impl FnOnce() -> T + Send + 'static) -> Begun<T> {
+    pub(crate) fn begin<T: Send + 'static>(&self, work: impl FnOnce() -> T + Send + 'static) -> PendingComputation<T> {
         let (sender, done) = oneshot::channel();
         let (busy, span) = (self.busy(), Span::current());
         self.pool.spawn_fifo(move || {
@@ -89,7 +89,7 @@ impl Cores {
             // The receiver is gone if the whole ingest was cancelled.
             let _ = sender.send(done);
         });
-        Begun(done)
+        PendingComputation(done)
     }
 
     /// Computes on a core of its own, as [`Self::begin`] does, and waits for the result.
@@ -98,7 +98,7 @@ impl Cores {
     }
 }
 
-impl<T> Begun<T> {
+impl<T> PendingComputation<T> {
     /// Waits for the result; a panic of the computation is resumed here.
     pub(crate) async fn done(self) -> T {
         match self.0.await {

@@ -13,8 +13,9 @@ use object_store::{Error as StoreError, ObjectStoreExt as _};
 use serde::Serialize;
 
 use crate::error::{Error, Result};
-use crate::files::{self, RunSource};
-use crate::ingest::{FileReport, LakeIngest};
+use crate::inbox::{self, RunSource};
+use crate::ingest::LakeIngest;
+use crate::report::FileReport;
 
 /// What becomes of a removed run's file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -92,7 +93,7 @@ async fn find_removal(lake: &Lake, snapshot: &LakeSnapshot, name: &str) -> Resul
 }
 
 impl LakeIngest<'_> {
-    /// Removes runs from the lake. Rows that were derived with them as references follow by [`LakeIngest::complete`]. The
+    /// Removes runs from the lake. Rows that were derived with them as references follow by [`LakeIngest::complete_runs`]. The
     /// same call resumes a removal that was cut off.
     ///
     /// # Errors
@@ -112,9 +113,9 @@ impl LakeIngest<'_> {
                          `inbox/`",
                         removal.run
                     );
-                    removal.moved_to = files::set_aside(lake, &path, &reason).await?.map(|path| path.to_string());
+                    removal.moved_to = inbox::set_file_aside(lake, &path, &reason).await?.map(|path| path.to_string());
                 }
-                RemovedFile::Deleted => files::delete_run(lake, &path).await?,
+                RemovedFile::Deleted => inbox::delete_run(lake, &path).await?,
             }
         }
         lake.remove_runs(&RemovalRecord { runs: runs.clone(), by: by.to_owned() }).await?;
@@ -151,7 +152,7 @@ impl LakeIngest<'_> {
                 refused = Some(why);
             }
         };
-        self.clone().writing_again().take_in(sources, &mut report).await?;
+        self.clone().writing_again().ingest_runs(sources, &mut report).await?;
         refused.map_or(Ok(()), Err)
     }
 }

@@ -150,7 +150,7 @@ async fn measure(
     }
     let sources = pending(lake).await?;
     if !sources.is_empty() {
-        super::ingest::take_in(lake, sources, stop.flag(), &CommandProgress::new()).await?;
+        super::ingest::ingest_runs(lake, sources, stop.flag(), &CommandProgress::new()).await?;
     }
     Ok(outcome)
 }

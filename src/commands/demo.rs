@@ -85,7 +85,7 @@ pub(crate) async fn run(args: &DemoArgs, lake_url: &str) -> anyhow::Result<Comma
         return Ok(CommandOutcome::Whole);
     }
     let sources = pending(&lake).await?;
-    super::ingest::take_in(&lake, sources, stop.flag(), &CommandProgress::new()).await?;
+    super::ingest::ingest_runs(&lake, sources, stop.flag(), &CommandProgress::new()).await?;
     super::ensure_wanted(&stop)?;
     let example = match args.surfaces {
         Some(_) => print_typologies(&lake).await?,

@@ -92,9 +92,9 @@ impl IngestSummary {
 
     fn add(&mut self, report: FileReport, progress: &CommandProgress) {
         match report {
-            FileReport::Taken(taken) => {
-                say(progress, &taken);
-                self.taken.push(taken);
+            FileReport::Ingested(run) => {
+                print_ingested(progress, &run);
+                self.taken.push(run);
             }
             FileReport::Refused { source, why, moved } => {
                 let whereto = moved.as_ref().map(|m| format!(" (now at `{m}`)")).unwrap_or_default();
@@ -117,7 +117,7 @@ pub(crate) async fn run(args: &IngestArgs, lake_url: &str) -> anyhow::Result<Com
     let lake = open_or_make(lake_url, &args.runs).await?;
     let progress = CommandProgress::new();
     if let Some(path) = &args.suspect {
-        return take_in_suspect(&lake, path, stop.flag(), &progress).await;
+        return ingest_suspect(&lake, path, stop.flag(), &progress).await;
     }
     if args.watch {
         // Later errors are waited out; this one is the store's nature.
@@ -127,7 +127,7 @@ pub(crate) async fn run(args: &IngestArgs, lake_url: &str) -> anyhow::Result<Com
     let pending = if args.runs.is_empty() { list_pending(&lake).await? } else { PendingFiles::default() };
     let sources = if args.runs.is_empty() { pending.sources() } else { sources_of(&lake, &args.runs).await? };
     let nothing = sources.is_empty();
-    let mut summary = take_in(&lake, sources, stop.flag(), &progress).await?;
+    let mut summary = ingest_runs(&lake, sources, stop.flag(), &progress).await?;
     if args.runs.is_empty() {
         summary.pass_over(&pending, &progress);
         pending.recordings.iter().for_each(|recording| note_recording(recording, &progress));
@@ -202,7 +202,7 @@ async fn finish_for_others(
         if left.is_empty() {
             break;
         }
-        let mut more = take_in(lake, left, stop, progress).await?;
+        let mut more = ingest_runs(lake, left, stop, progress).await?;
         summary.taken.append(&mut more.taken);
         summary.refused.append(&mut more.refused);
         summary.gone = more.gone;
@@ -223,19 +223,19 @@ async fn finish_tables(lake: &Lake, summary: &IngestSummary) -> anyhow::Result<(
 }
 
 /// Ingests runs, then completes rows that waited for references.
-pub(crate) async fn take_in(
+pub(crate) async fn ingest_runs(
     lake: &Lake,
     sources: Vec<RunSource>,
     stop: &Arc<AtomicBool>,
     progress: &CommandProgress,
 ) -> anyhow::Result<IngestSummary> {
     let ingest = LakeIngest::new(lake, stop.clone());
-    let taken = take_in_and_complete(&ingest, lake, sources, stop, progress).await;
+    let taken = ingest_and_complete(&ingest, lake, sources, stop, progress).await;
     ingest.close().await;
     taken
 }
 
-async fn take_in_and_complete(
+async fn ingest_and_complete(
     ingest: &LakeIngest<'_>,
     lake: &Lake,
     sources: Vec<RunSource>,
@@ -253,7 +253,7 @@ async fn take_in_and_complete(
         summary.add(report, progress);
         task.at(ended);
     };
-    let mut outcome = ingest.take_in(sources, &mut report).await.map_err(anyhow::Error::from);
+    let mut outcome = ingest.ingest_runs(sources, &mut report).await.map_err(anyhow::Error::from);
     // All others first: these may end the process of which this one is a part.
     for mut suspect in suspects.iter().filter_map(|source| SuspectFile::from_source(lake, source)) {
         if outcome.is_ok() {
@@ -275,7 +275,7 @@ async fn take_in_and_complete(
         runs += 1;
         task.get_or_insert_with(|| progress.task("complete", total as u64, "runs")).at(runs);
     };
-    let completion = ingest.complete(completed).await?;
+    let completion = ingest.complete_runs(completed).await?;
     if let Some(task) = task {
         task.done(format!("{runs} runs, {rows} measurements derived"));
     }
@@ -337,7 +337,7 @@ async fn watch_suspect(
 }
 
 // Takes in one file for the ingest that started this process, and ends with it.
-async fn take_in_suspect(
+async fn ingest_suspect(
     lake: &Lake,
     path: &str,
     stop: &Arc<AtomicBool>,
@@ -354,7 +354,7 @@ async fn take_in_suspect(
     let ingest = LakeIngest::new(lake, stop.clone());
     let mut report = |report| summary.add(report, progress);
     tokio::select! {
-        taken = ingest.take_in(vec![source], &mut report) => taken?,
+        taken = ingest.ingest_runs(vec![source], &mut report) => taken?,
         _ = parent => anyhow::bail!("the ingest that started this process has ended"),
     }
     ingest.close().await;
@@ -379,7 +379,7 @@ struct WatchedInbox {
 impl WatchedInbox {
     // The files that can be ingested now. One that is being copied grows between two looks; one that does not end as a
     // closed file is still being copied, until it has not grown for a while.
-    async fn settled(&mut self, lake: &Lake, pending: &PendingFiles) -> HashMap<String, WatchedState> {
+    async fn list_settled(&mut self, lake: &Lake, pending: &PendingFiles) -> HashMap<String, WatchedState> {
         let (mut settled, mut seen) = (HashMap::new(), HashMap::new());
         for meta in &pending.runs {
             let (path, state) = (&meta.location, (meta.size, meta.last_modified));
@@ -435,13 +435,13 @@ async fn watch(lake: &Lake, stop: &StopRequest, progress: &CommandProgress) -> a
             found => found?,
         };
         is_first = false;
-        let mut settled = inbox.settled(lake, &found).await;
+        let mut settled = inbox.list_settled(lake, &found).await;
         let mut passed_over = IngestSummary::default();
         let sources: Vec<_> = found.sources().into_iter().filter(|s| settled.contains_key(&s.to_string())).collect();
         inbox.name_passed_over(found, &mut passed_over, progress);
         lost |= passed_over.lost();
         if sources.is_empty() && inbox.seen.is_empty() && inbox.given_up.is_empty() && !is_finished {
-            match take_in(lake, Vec::new(), stop.flag(), progress).await {
+            match ingest_runs(lake, Vec::new(), stop.flag(), progress).await {
                 Ok(summary) => {
                     finish_tables(lake, &summary).await?;
                     is_finished = true;
@@ -453,7 +453,7 @@ async fn watch(lake: &Lake, stop: &StopRequest, progress: &CommandProgress) -> a
             pause(LOOK_EVERY, stop).await;
             continue;
         }
-        match take_in(lake, sources, stop.flag(), progress).await {
+        match ingest_runs(lake, sources, stop.flag(), progress).await {
             Ok(summary) => {
                 lost |= summary.lost();
                 // They are looked for in `runs/`, in case that ingest died.
@@ -479,7 +479,7 @@ async fn pause(time: Duration, stop: &StopRequest) {
     let _ = tokio::time::timeout(time, stop.wait()).await;
 }
 
-fn say(progress: &CommandProgress, taken: &IngestedRun) {
+fn print_ingested(progress: &CommandProgress, taken: &IngestedRun) {
     let IngestedRun { run, measurements, .. } = taken;
     match taken.outcome {
         _ if taken.mended => progress.say(format!("{run}: rows were missing, and are derived again")),

@@ -67,7 +67,7 @@ async fn remove(
     ingest.remove(removals, file, &user_name()).await?;
     // Rows that were derived with them.
     let mut rows = 0;
-    let completion = ingest.complete(&mut |completed, _| rows += completed.measurements).await?;
+    let completion = ingest.complete_runs(&mut |completed, _| rows += completed.measurements).await?;
     if completion.changed > 0 {
         progress.say(format!("{} runs have other references now, {rows} measurements derived", completion.changed));
     }

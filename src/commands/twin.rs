@@ -106,7 +106,7 @@ pub(crate) async fn run(args: &TwinArgs, lake_url: &str) -> anyhow::Result<Comma
     let flag = stop.clone();
     tokio::task::spawn_blocking(move || computing.compute_missing(flag.flag(), &progress)).await??;
     anyhow::ensure!(!stop.is_made(), "stopped; hint: run the same command again to resume");
-    super::ingest::take_in(&lake, pending(&lake).await?, stop.flag(), &CommandProgress::new()).await?;
+    super::ingest::ingest_runs(&lake, pending(&lake).await?, stop.flag(), &CommandProgress::new()).await?;
     anyhow::ensure!(!stop.is_made(), "stopped; hint: run the same command again to resume");
     let differences = TwinDifferences::read(&lake, surface, args.pairs).await?;
     match args.json {

@@ -5,11 +5,10 @@
 use std::path::Path;
 use std::time::Duration;
 
+use echolake_testing::{SMALL_RIG, run_command};
 use rand::{Rng as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 
-use super::SMALL_RIG;
-use super::child::run_command;
 use super::serve::http::HttpRequest;
 use super::serve::server::ServedLake;
 

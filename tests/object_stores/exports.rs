@@ -1,8 +1,9 @@
 //! `export` to a bucket: all data first, then the checksums that say that they are there.
 
+use echolake_testing::run_command;
+
 use super::super::TestFolder;
 use super::{S3Double, StoreBehaviour, command, ok, recordings, stderr};
-use crate::child::run_command;
 
 const CHECKSUMS: &str = "SHA256SUMS";
 

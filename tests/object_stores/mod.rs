@@ -10,9 +10,9 @@ mod uploads;
 use std::collections::BTreeMap;
 use std::process::{Command, Output};
 
+use echolake_testing::run_command;
 use s3_double::{S3Double, StoreBehaviour};
 
-use super::child::run_command;
 use super::kills::table_queries;
 use super::{ECHOLAKE, TestFolder, stderr};
 
@@ -85,7 +85,7 @@ fn a_location_without_a_lake_or_with_plain_http_is_refused_in_words() {
 
 mod slow {
     use super::*;
-    use crate::child::ChildProcess;
+    use echolake_testing::ChildProcess;
 
     // Two machines take in the same runs, one by copying them, the other from the bucket's inbox.
     #[test]

@@ -6,10 +6,10 @@ use std::time::{Duration, Instant};
 
 use echolake_schema::manifest::{Origin, RunManifest};
 use echolake_schema::{Rig, Timestamp, topics};
+use echolake_testing::{COMMAND_LIMIT, ChildProcess};
 use rand::{RngCore as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 
-use super::super::child::{COMMAND_LIMIT, ChildProcess};
 use super::{ECHOLAKE, S3Double, StoreBehaviour, TestFolder, command, ok, recordings, run, stderr};
 
 /// Run of the large file.

@@ -6,9 +6,9 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::{Duration, SystemTime};
 
+use echolake_testing::{ChildProcess, run_command};
 use rand::Rng as _;
 
-use super::super::child::{ChildProcess, run_command};
 use super::reader::read_measurements;
 use super::{OperatorRound, SourceRun, finish, mount_disk, run_to_end};
 

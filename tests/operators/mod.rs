@@ -11,13 +11,12 @@ use std::process::Command;
 use std::time::Duration;
 
 use echolake_schema::{Rig, Table};
+use echolake_testing::{ChildProcess, SMALL_RIG, run_command};
 use rand::{Rng as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 
 use self::actions::{ActionNeed, OPERATOR_ACTIONS};
 use self::reader::{MEASUREMENTS_QUERY, RowsByRun, read_measurements, rows_by_run};
-use super::SMALL_RIG;
-use super::child::{ChildProcess, run_command};
 use super::kills::{copy_folder, table_queries};
 use super::serve::http::HttpRequest;
 use super::serve::server::ServedLake;

@@ -2,12 +2,12 @@
 
 use std::process::Command;
 
+use echolake_testing::run_command;
 use serde_json::{Value, json};
 
 use super::http::{HttpRequest, HttpResponse};
 use super::server::ServedLake;
 use super::{get, lake, refused, served};
-use crate::child::run_command;
 
 const STATELESS: &str = "2026-07-28";
 

@@ -2,9 +2,9 @@
 
 use std::io::{Read as _, Write as _};
 
+use echolake_testing::ChildProcess;
 use serde_json::Value;
 
-use super::super::child::ChildProcess;
 use super::http::HttpRequest;
 use super::lake;
 use super::server::ServedLake;

@@ -5,7 +5,8 @@ use std::path::Path;
 use std::process::Command;
 use std::time::Duration;
 
-use super::super::child::{ChildProcess, run_command};
+use echolake_testing::{ChildProcess, run_command};
+
 use super::tunnel::{CERTIFIED_NAME, ServerTunnels, TunnelOpening};
 
 /// Time for which a client waits for the next bytes of an answer, or until it may send more of a request.

@@ -2,9 +2,9 @@
 
 use std::process::Command;
 
+use echolake_testing::run_command;
 use serde_json::Value;
 
-use super::super::child::run_command;
 use super::http::HttpRequest;
 use super::server::ServedLake;
 use super::{ENDLESS, get, json, lake, postgres, refused, served, sql, wait_until};

@@ -134,8 +134,8 @@ impl SimulatedRuns {
         for (files, cost) in [references, panels].into_iter().zip(&mut costs) {
             put_into_inbox(files, folder)?;
             let meter = CostMeter::start()?;
-            ingest.take_in(pending(&lake).await?, &mut report).await?;
-            ingest.complete(&mut |_, _| {}).await?;
+            ingest.ingest_runs(pending(&lake).await?, &mut report).await?;
+            ingest.complete_runs(&mut |_, _| {}).await?;
             *cost = meter.stop()?;
         }
         ensure!(refused.is_empty(), "refused: {}", refused.join("; "));

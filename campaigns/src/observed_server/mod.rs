@@ -6,9 +6,8 @@ use std::process::{Command, Output};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, ensure};
+use echolake_testing::{SMALL_RIG, run_command};
 
-use crate::SMALL_RIG;
-use crate::child::run_command;
 use crate::serve::server::ServedLake;
 
 mod client_connections;

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::process::Command;
 use std::time::{Duration, Instant};
 
-use crate::child::run_command;
+use echolake_testing::run_command;
 
 /// One clock tick of `/proc/PID/stat`; Linux reports a hundred per second to programs on every machine.
 const CLOCK_TICK: Duration = Duration::from_millis(10);

@@ -7,7 +7,7 @@ use echolake_schema::tables::Table;
 
 use super::RunKeys;
 use crate::error::Result;
-use crate::measure::Event;
+use crate::reading::Event;
 
 /// Builds one row per reading.
 pub(crate) fn environment(rig: &Rig, keys: &RunKeys, readings: &[(i64, AmbientSample)]) -> Result<RecordBatch> {

@@ -8,7 +8,7 @@ use echolake_schema::{Grid, PairId, Rig};
 
 use super::{RunKeys, finite};
 use crate::error::Result;
-use crate::measure::Response;
+use crate::reading::Response;
 
 /// Number of list values per batch; each batch is encoded before the next one is built.
 const LIST_VALUES: usize = 1 << 18;

@@ -8,7 +8,7 @@ use echolake_schema::{ProjectName, Rig};
 
 use super::RunKeys;
 use crate::error::Result;
-use crate::run_content::RunContent;
+use crate::reading::RunContent;
 
 /// The columns of a run's row about its references.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]

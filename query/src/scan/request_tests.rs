@@ -1,24 +1,19 @@
 //! Requests that queries send to an object store, on files as large as those of the paper's rig.
 
-use std::fmt;
-use std::sync::{Arc, Mutex};
+use std::sync::Arc;
 
 use arrow::array::{ArrayRef, AsArray as _, Float32Array, Int64Array, ListArray, StringArray};
 use arrow::buffer::OffsetBuffer;
 use arrow::compute::cast;
 use arrow::datatypes::{DataType, Field};
 use arrow::record_batch::RecordBatch;
-use async_trait::async_trait;
 use echolake_lake::{FileName, Lake, ReferenceSurfaces, VisibleRun, encode};
 use echolake_schema::Rig;
 use echolake_schema::tables::Table;
-use futures::stream::BoxStream;
+use echolake_testing::StoreDouble;
+use object_store::ObjectStoreExt as _;
 use object_store::memory::InMemory;
 use object_store::path::Path;
-use object_store::{
-    CopyOptions, GetOptions, GetResult, ListResult, MultipartUpload, ObjectMeta, ObjectStore, ObjectStoreExt as _,
-    PutMultipartOptions, PutOptions, PutPayload, PutResult, Result as StoreResult,
-};
 
 use crate::Session;
 
@@ -27,73 +22,6 @@ const RUNS: usize = 7;
 /// Pairs of the paper's rig, and samples of its responses.
 const PAIRS: usize = 2951;
 const SAMPLES: usize = 384;
-
-/// A store in memory that lists what is asked of it.
-#[derive(Debug, Default)]
-struct CountingStore {
-    inner: InMemory,
-    requests: Mutex<Vec<String>>,
-}
-
-impl CountingStore {
-    fn count(&self, kind: &str, path: Option<&Path>) {
-        let path = path.map(Path::as_ref).unwrap_or_default();
-        self.requests.lock().expect("no panic").push(format!("{kind} {path}"));
-    }
-
-    /// The requests since the last call, but for the look at what is new, which all queries of a second share.
-    fn take_requests(&self) -> Vec<String> {
-        let mut requests = std::mem::take(&mut *self.requests.lock().expect("no panic"));
-        requests.retain(|request| !request.contains("/_delta_log/"));
-        requests
-    }
-}
-
-impl fmt::Display for CountingStore {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str("CountingStore")
-    }
-}
-
-#[async_trait]
-impl ObjectStore for CountingStore {
-    async fn put_opts(&self, location: &Path, payload: PutPayload, opts: PutOptions) -> StoreResult<PutResult> {
-        self.inner.put_opts(location, payload, opts).await
-    }
-
-    async fn put_multipart_opts(
-        &self,
-        location: &Path,
-        opts: PutMultipartOptions,
-    ) -> StoreResult<Box<dyn MultipartUpload>> {
-        self.inner.put_multipart_opts(location, opts).await
-    }
-
-    async fn get_opts(&self, location: &Path, options: GetOptions) -> StoreResult<GetResult> {
-        self.count(if options.head { "HEAD" } else { "GET" }, Some(location));
-        // A real store's answer comes later, and others ask meanwhile.
-        tokio::task::yield_now().await;
-        self.inner.get_opts(location, options).await
-    }
-
-    fn delete_stream(&self, locations: BoxStream<'static, StoreResult<Path>>) -> BoxStream<'static, StoreResult<Path>> {
-        self.inner.delete_stream(locations)
-    }
-
-    fn list(&self, prefix: Option<&Path>) -> BoxStream<'static, StoreResult<ObjectMeta>> {
-        self.count("LIST", prefix);
-        self.inner.list(prefix)
-    }
-
-    async fn list_with_delimiter(&self, prefix: Option<&Path>) -> StoreResult<ListResult> {
-        self.count("LIST", prefix);
-        self.inner.list_with_delimiter(prefix).await
-    }
-
-    async fn copy_opts(&self, from: &Path, to: &Path, options: CopyOptions) -> StoreResult<()> {
-        self.inner.copy_opts(from, to, options).await
-    }
-}
 
 // Numbers that do not compress.
 fn noise(count: usize) -> Float32Array {
@@ -161,8 +89,8 @@ async fn put_run(lake: &Lake, number: usize) {
     lake.commit(&staged).await.expect("committed");
 }
 
-async fn lake() -> (Arc<CountingStore>, Lake) {
-    let store = Arc::new(CountingStore::default());
+async fn lake() -> (Arc<StoreDouble<()>>, Lake) {
+    let store = StoreDouble::new(Arc::new(InMemory::new()), ());
     let (rig, references) = (Rig::paper(), ReferenceSurfaces::default());
     let lake = Lake::open_or_create_in(store.clone(), "s3://bucket/lake", &rig, &references).await.expect("a lake");
     for number in 0..RUNS {
@@ -180,12 +108,14 @@ async fn rows(session: &Session, sql: &str) -> Vec<RecordBatch> {
     batches
 }
 
-// The requests of a query that returns so many rows.
-async fn requests(session: &Session, store: &CountingStore, sql: &str, expected: usize) -> Vec<String> {
+// The requests of a query that returns so many rows, but for the look at what is new, which all queries of a second share.
+async fn requests(session: &Session, store: &StoreDouble<()>, sql: &str, expected: usize) -> Vec<String> {
     store.take_requests();
     let count = rows(session, sql).await.iter().map(RecordBatch::num_rows).sum::<usize>();
     assert_eq!(count, expected, "{sql}");
-    store.take_requests()
+    let mut requests = store.take_requests();
+    requests.retain(|request| !request.contains("/_delta_log/"));
+    requests
 }
 
 fn response(surface: usize, pair: usize) -> String {

@@ -1,27 +1,24 @@
 //! Stores whose answers are lost, cut off or refused, and stores that overwrite.
 
-use std::fmt;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex};
 
 use async_trait::async_trait;
 use echolake_schema::Rig;
 use echolake_schema::tables::Table;
-use futures::stream::{self, BoxStream};
+use echolake_testing::{RequestFate, RequestKind, StoreBehaviour, StoreDouble};
+use futures::stream;
 use futures::{StreamExt as _, TryStreamExt as _};
 use object_store::memory::InMemory;
 use object_store::path::Path;
-use object_store::{
-    CopyOptions, Error as StoreError, GetOptions, GetResult, ListResult, MultipartUpload, ObjectMeta, ObjectStore,
-    ObjectStoreExt as _, PutMode, PutMultipartOptions, PutOptions, PutPayload, PutResult, Result as StoreResult,
-};
+use object_store::{Error as StoreError, ObjectStore, ObjectStoreExt as _, PutMode, PutOptions, PutPayload};
 
 use super::{ExclusionFault, RetryingStore, probe_exclusion};
 use crate::{CommitOutcome, Error, FileName, Lake, ReferenceSurfaces, encode};
 
 /// Faults of a store.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum StoreFault {
+enum StoreFault {
     /// Creating overwrites.
     Overwrites,
     /// Creating an object that exists is refused, unless both meet.
@@ -32,31 +29,21 @@ pub(super) enum StoreFault {
     None,
 }
 
-/// A store in memory with faults. Chance follows from a seed.
+/// Faults by chance, which follows from a seed.
 #[derive(Debug)]
-pub(super) struct FaultyStore {
-    inner: InMemory,
+struct StoreFaults {
     fault: StoreFault,
     random: AtomicU64,
-    faults: AtomicUsize,
-    /// Requests, with their paths.
-    requests: Mutex<Vec<String>>,
+    count: AtomicUsize,
 }
 
-impl FaultyStore {
-    pub(super) fn new(fault: StoreFault, seed: u64) -> Arc<Self> {
-        let (random, faults) = (AtomicU64::new(seed), AtomicUsize::new(0));
-        Arc::new(Self { inner: InMemory::new(), fault, random, faults, requests: Mutex::default() })
-    }
+/// A store in memory with faults.
+type FaultyStore = StoreDouble<StoreFaults>;
 
-    fn count(&self, kind: &str, location: Option<&Path>) {
-        let location = location.map(|path| path.as_ref()).unwrap_or_default();
-        self.requests.lock().expect("no panic").push(format!("{kind} {location}"));
-    }
-
-    /// The requests since the last call.
-    pub(super) fn take_requests(&self) -> Vec<String> {
-        std::mem::take(&mut *self.requests.lock().expect("no panic"))
+impl StoreFaults {
+    fn in_memory(fault: StoreFault, seed: u64) -> Arc<FaultyStore> {
+        let faults = Self { fault, random: AtomicU64::new(seed), count: AtomicUsize::new(0) };
+        StoreDouble::new(Arc::new(InMemory::new()), faults)
     }
 
     // SplitMix64: Steele, Lea, Flood 2014, Fast splittable pseudorandom number generators.
@@ -68,80 +55,44 @@ impl FaultyStore {
     }
 
     fn lost(&self) -> StoreError {
-        self.faults.fetch_add(1, Ordering::SeqCst);
+        self.count.fetch_add(1, Ordering::SeqCst);
         StoreError::Generic { store: "faulty", source: "connection reset by peer".into() }
     }
 }
 
-impl fmt::Display for FaultyStore {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str("FaultyStore")
-    }
-}
-
 #[async_trait]
-impl ObjectStore for FaultyStore {
-    async fn put_opts(&self, location: &Path, payload: PutPayload, mut opts: PutOptions) -> StoreResult<PutResult> {
-        self.count("PUT", Some(location));
-        if opts.mode == PutMode::Create {
-            match (self.fault, self.draw(10)) {
-                (StoreFault::Overwrites, _) => opts.mode = PutMode::Overwrite,
-                (StoreFault::OverwritesInRaces, _) if location.as_ref().ends_with(".race") => {
-                    opts.mode = PutMode::Overwrite;
+impl StoreBehaviour for StoreFaults {
+    fn decide_fate(&self, kind: RequestKind, path: Option<&Path>) -> RequestFate {
+        if self.fault != StoreFault::Unreliable {
+            return RequestFate::Done;
+        }
+        let one_in = |count| self.draw(count) == 0;
+        match kind {
+            RequestKind::Create => match self.draw(10) {
+                0 | 1 => RequestFate::AnswerLost(self.lost()),
+                2 => RequestFate::Refused(self.lost()),
+                3 => {
+                    let (path, source) = (path.map(ToString::to_string).unwrap_or_default(), "409 Conflict".into());
+                    RequestFate::Refused(StoreError::AlreadyExists { path, source })
                 }
-                (StoreFault::Unreliable, 0 | 1) => {
-                    self.inner.put_opts(location, payload, opts).await?;
-                    return Err(self.lost());
-                }
-                (StoreFault::Unreliable, 2) => return Err(self.lost()),
-                (StoreFault::Unreliable, 3) => {
-                    let source = "409 Conflict".into();
-                    return Err(StoreError::AlreadyExists { path: location.to_string(), source });
-                }
-                _ => {}
-            }
+                _ => RequestFate::Done,
+            },
+            RequestKind::Get if one_in(20) => RequestFate::Refused(self.lost()),
+            RequestKind::List if one_in(5) => RequestFate::AnswerLost(self.lost()),
+            _ => RequestFate::Done,
         }
-        self.inner.put_opts(location, payload, opts).await
     }
 
-    async fn put_multipart_opts(
-        &self,
-        location: &Path,
-        opts: PutMultipartOptions,
-    ) -> StoreResult<Box<dyn MultipartUpload>> {
-        self.inner.put_multipart_opts(location, opts).await
-    }
-
-    async fn get_opts(&self, location: &Path, options: GetOptions) -> StoreResult<GetResult> {
-        self.count("GET", Some(location));
-        if self.fault == StoreFault::Unreliable && self.draw(20) == 0 {
-            return Err(self.lost());
+    async fn change_put(&self, path: &Path, payload: PutPayload, options: &mut PutOptions) -> PutPayload {
+        let overwrites = match self.fault {
+            StoreFault::Overwrites => true,
+            StoreFault::OverwritesInRaces => path.as_ref().ends_with(".race"),
+            StoreFault::Unreliable | StoreFault::None => false,
+        };
+        if overwrites {
+            options.mode = PutMode::Overwrite;
         }
-        self.inner.get_opts(location, options).await
-    }
-
-    fn delete_stream(&self, locations: BoxStream<'static, StoreResult<Path>>) -> BoxStream<'static, StoreResult<Path>> {
-        self.inner.delete_stream(locations)
-    }
-
-    fn list(&self, prefix: Option<&Path>) -> BoxStream<'static, StoreResult<ObjectMeta>> {
-        self.count("LIST", prefix);
-        if self.fault == StoreFault::Unreliable && self.draw(5) == 0 {
-            return self.inner.list(prefix).take(1).chain(stream::iter([Err(self.lost())])).boxed();
-        }
-        self.inner.list(prefix)
-    }
-
-    async fn list_with_delimiter(&self, prefix: Option<&Path>) -> StoreResult<ListResult> {
-        self.count("LIST", prefix);
-        if self.fault == StoreFault::Unreliable && self.draw(5) == 0 {
-            return Err(self.lost());
-        }
-        self.inner.list_with_delimiter(prefix).await
-    }
-
-    async fn copy_opts(&self, from: &Path, to: &Path, options: CopyOptions) -> StoreResult<()> {
-        self.inner.copy_opts(from, to, options).await
+        payload
     }
 }
 
@@ -160,7 +111,7 @@ async fn a_store_that_overwrites_is_refused_before_anything_is_written() {
         (StoreFault::Overwrites, "an object that was there was created again"),
         (StoreFault::OverwritesInRaces, "8 of 8 that created the same object at once succeeded"),
     ] {
-        let store = FaultyStore::new(fault, 1);
+        let store = StoreFaults::in_memory(fault, 1);
         let probed = probe_exclusion(&(store.clone() as Arc<dyn ObjectStore>)).await;
         assert!(matches!(&probed, Err(ExclusionFault::Overwrites(_))), "{probed:?}");
         let error = lake(store.clone()).await.expect_err("refused");
@@ -173,7 +124,7 @@ async fn a_store_that_overwrites_is_refused_before_anything_is_written() {
 
 #[tokio::test]
 async fn what_is_cut_off_is_fetched_again_and_what_never_comes_says_how_often_it_was_tried() {
-    let faulty = FaultyStore::new(StoreFault::Unreliable, 5);
+    let faulty = StoreFaults::in_memory(StoreFault::Unreliable, 5);
     let store = RetryingStore::new(faulty.clone());
     let paths: Vec<_> = (0..10).map(|number| Path::from(format!("{number}"))).collect();
     for path in &paths {
@@ -188,13 +139,13 @@ async fn what_is_cut_off_is_fetched_again_and_what_never_comes_says_how_often_it
         .try_collect::<Vec<_>>()
         .await
         .expect("deleted");
-    assert!(faulty.faults.load(Ordering::SeqCst) > 0);
+    assert!(faulty.behaviour.count.load(Ordering::SeqCst) > 0);
     let gone = Error::store(
         "read",
         "x",
         StoreError::Generic {
             store: "remote",
-            source: Box::new(super::RetriedError { tries: 8, source: faulty.lost() }),
+            source: Box::new(super::RetriedError { tries: 8, source: faulty.behaviour.lost() }),
         },
     );
     let expected = "cannot read `x`: connection reset by peer (tried 8 times); hint: run the same command again when the \
@@ -204,7 +155,7 @@ async fn what_is_cut_off_is_fetched_again_and_what_never_comes_says_how_often_it
 
 #[tokio::test]
 async fn a_view_costs_a_request_a_table_and_a_commit_of_many_runs_a_few() {
-    let store = FaultyStore::new(StoreFault::None, 1);
+    let store = StoreFaults::in_memory(StoreFault::None, 1);
     let lake = lake(store.clone()).await.expect("made");
     lake.snapshot().await.expect("a view");
     store.take_requests();
@@ -240,7 +191,7 @@ mod slow {
     #[tokio::test(flavor = "multi_thread")]
     async fn commits_whose_answers_are_lost_are_made_once_and_known_to_be_made() {
         for seed in 1..=3 {
-            let store = FaultyStore::new(StoreFault::Unreliable, seed);
+            let store = StoreFaults::in_memory(StoreFault::Unreliable, seed);
             let rows = lake(store.clone()).await.expect("made").pairs().expect("rows");
             let write = |writer: usize| {
                 let (store, rows) = (store.clone(), rows.clone());
@@ -258,7 +209,7 @@ mod slow {
             }
             let files = lake(store.clone()).await.expect("opened").log().files(Table::Pairs).await.expect("files");
             assert_eq!(files.len(), 25, "seed {seed}: the rig's own and 24");
-            assert!(store.faults.load(Ordering::SeqCst) > 20, "seed {seed}");
+            assert!(store.behaviour.count.load(Ordering::SeqCst) > 20, "seed {seed}");
         }
     }
 }

@@ -4,13 +4,14 @@ use std::path::Path as FsPath;
 use std::sync::Arc;
 
 use bytes::Bytes;
+use echolake_testing::StoreDouble;
 use futures::future::join_all;
+use object_store::memory::InMemory;
 use object_store::path::Path;
 use object_store::{GetOptions, ObjectStore, ObjectStoreExt as _};
 
 use super::block_cache::BLOCK_BYTES;
 use super::{BlockCache, BlockFolder, CacheCounters, CacheCounts, CacheFolder, CachedStore};
-use crate::remote::tests::{FaultyStore, StoreFault};
 
 const FILE: &str = "tables/nce/flat.r1.ab.parquet";
 /// Not a whole number of blocks.
@@ -20,14 +21,14 @@ fn content() -> Bytes {
     (0..FILE_BYTES).map(|at| (at.wrapping_mul(2_654_435_761) >> 13) as u8).collect()
 }
 
-async fn store() -> Arc<FaultyStore> {
-    let store = FaultyStore::new(StoreFault::None, 1);
+async fn store() -> Arc<StoreDouble<()>> {
+    let store = StoreDouble::new(Arc::new(InMemory::new()), ());
     store.put(&Path::from(FILE), content().into()).await.expect("written");
     store.take_requests();
     store
 }
 
-fn cached(store: &Arc<FaultyStore>, folder: Option<BlockFolder>) -> CachedStore {
+fn cached(store: &Arc<StoreDouble<()>>, folder: Option<BlockFolder>) -> CachedStore {
     CachedStore::new(store.clone(), Arc::new(BlockCache::new(folder)))
 }
 

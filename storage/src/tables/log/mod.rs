@@ -8,6 +8,5 @@ pub use commit_log::{
     CommitEffect, CommitLog, CommitOutcome, DataFile, FileHistory, FileStats, LoggedFile, NewFile, RemovalRecord,
     ReplacedFiles, RunPart, RunRowCounts, TableChange, TableCommit, TableVersion, TableView,
 };
-pub use delta::delta_schema;
 pub(crate) use delta::{DeltaLog, has_run_files};
 pub(crate) use project_log::ProjectLog;

@@ -14,7 +14,7 @@ use echolake_schema::messages::{
 use echolake_schema::{Celsius, Rig, samples, topics};
 use prost::Message as _;
 
-use crate::run_channels::RunChannels;
+use super::run_channels::RunChannels;
 
 /// Memory for a run's messages beyond those that its rig implies, bytes: five readings a second for a day, or 100,000
 /// lines of log.
@@ -87,7 +87,7 @@ impl RecordingPlan {
 
 /// Results of one chunk.
 #[derive(Debug, Default)]
-pub(crate) struct Yield {
+pub(crate) struct ChunkResults {
     pub(crate) responses: Vec<Response>,
     pub(crate) verdicts: Vec<(i64, Measurement)>,
     pub(crate) readings: Vec<(i64, AmbientSample)>,
@@ -176,8 +176,8 @@ impl Measurer {
         chunk: &DecodedChunk,
         channels: &RunChannels,
         budget: &RunBudget,
-    ) -> Yield {
-        let mut out = Yield { last_time_ns: i64::MIN, ..Yield::default() };
+    ) -> ChunkResults {
+        let mut out = ChunkResults { last_time_ns: i64::MIN, ..ChunkResults::default() };
         if let Err(reason) = chunk.check_records() {
             out.damaged.push(format!("the chunk at byte {offset}: {reason}; what is before it is read"));
         }

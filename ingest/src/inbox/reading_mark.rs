@@ -11,10 +11,12 @@ use std::path::{Path, PathBuf};
 
 use echolake_lake::Lake;
 
+use super::pending_files::pending;
+use super::quarantine::quarantine_file;
+use super::run_source::RunSource;
 use crate::error::{Error, Result};
-use crate::files::{self, RunSource};
-use crate::ingest::FileReport;
 use crate::references::digest;
+use crate::report::FileReport;
 
 /// Folder of the marks. Deleting `tables/` deletes them, too.
 const FOLDER: &str = "tables/_reading";
@@ -74,16 +76,16 @@ impl SuspectFile {
     /// Returns the suspects among the files that are in no table yet.
     ///
     /// # Errors
-    /// As of [`files::pending`].
+    /// As of [`pending`].
     pub async fn pending(lake: &Lake) -> Result<Vec<Self>> {
-        Ok(files::pending(lake).await?.iter().filter_map(|source| Self::from_source(lake, source)).collect())
+        Ok(pending(lake).await?.iter().filter_map(|source| Self::from_source(lake, source)).collect())
     }
 
     /// Records the death of a process that ingested this file alone; `ending` describes it. If the process had moved the
     /// file to its place, it is the suspect that is not among those of `before` the process.
     ///
     /// # Errors
-    /// As of [`files::pending`]; [`Error::Read`] if the mark cannot be written.
+    /// As of [`pending`]; [`Error::Read`] if the mark cannot be written.
     pub async fn add_death(&mut self, lake: &Lake, ending: &str, before: &[Self]) -> Result<()> {
         self.endings.push(ending.to_owned());
         let mut suspects = Self::pending(lake).await?;
@@ -112,7 +114,7 @@ impl SuspectFile {
         }
         let (file, mark) = (self.source.to_string(), self.mark.display().to_string());
         let why = Error::Deadly { file, endings: self.endings.join(", "), mark };
-        let moved = files::quarantine(lake, &self.source, &why).await?;
+        let moved = quarantine_file(lake, &self.source, &why).await?;
         // The file of an ingested run is not moved, and its mark stays.
         if moved.is_some() {
             let _ = fs::remove_file(&self.mark);

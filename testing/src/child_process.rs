@@ -8,9 +8,9 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 /// For commands on small lakes. They take a second; a busy machine may need a hundred times that.
-pub(crate) const COMMAND_LIMIT: Duration = Duration::from_secs(300);
+pub const COMMAND_LIMIT: Duration = Duration::from_secs(300);
 /// For programs that install packages, drive a browser, or measure the paper's whole rig.
-pub(crate) const LONG_LIMIT: Duration = Duration::from_secs(1800);
+pub const LONG_LIMIT: Duration = Duration::from_secs(1800);
 /// Time limit for a killed process to be gone. One that waits for a broken disk may never be.
 const KILL_LIMIT: Duration = Duration::from_secs(10);
 /// Between two looks at a process that has no pipe to hear its end from.
@@ -19,7 +19,7 @@ const POLL_EVERY: Duration = Duration::from_millis(2);
 const REPEATED_BYTES: usize = 8 << 10;
 
 /// A started program. Dropped, it is killed.
-pub(crate) struct ChildProcess {
+pub struct ChildProcess {
     child: Child,
     name: String,
     limit: Duration,
@@ -49,7 +49,7 @@ const STDERR: usize = 1;
 ///
 /// # Errors
 /// The program cannot be started.
-pub(crate) fn run_command(command: &mut Command) -> io::Result<Output> {
+pub fn run_command(command: &mut Command) -> io::Result<Output> {
     Ok(ChildProcess::start(command)?.wait())
 }
 
@@ -57,7 +57,7 @@ pub(crate) fn run_command(command: &mut Command) -> io::Result<Output> {
 ///
 /// # Errors
 /// The program cannot be started.
-pub(crate) fn run_long_command(command: &mut Command) -> io::Result<Output> {
+pub fn run_long_command(command: &mut Command) -> io::Result<Output> {
     Ok(ChildProcess::start_group(command)?.wait())
 }
 
@@ -66,7 +66,7 @@ impl ChildProcess {
     ///
     /// # Errors
     /// The program cannot be started.
-    pub(crate) fn start(command: &mut Command) -> io::Result<Self> {
+    pub fn start(command: &mut Command) -> io::Result<Self> {
         Self::spawn(command, COMMAND_LIMIT, false)
     }
 
@@ -74,7 +74,7 @@ impl ChildProcess {
     ///
     /// # Errors
     /// The program cannot be started.
-    pub(crate) fn start_group(command: &mut Command) -> io::Result<Self> {
+    pub fn start_group(command: &mut Command) -> io::Result<Self> {
         Self::spawn(command.process_group(0), LONG_LIMIT, true)
     }
 
@@ -90,17 +90,17 @@ impl ChildProcess {
     }
 
     /// Returns its process id.
-    pub(crate) fn id(&self) -> u32 {
+    pub fn id(&self) -> u32 {
         self.child.id()
     }
 
     /// Returns whether it has not ended yet.
-    pub(crate) fn is_running(&mut self) -> bool {
+    pub fn is_running(&mut self) -> bool {
         self.exit_status().is_none()
     }
 
     /// Returns what it wrote to stderr so far.
-    pub(crate) fn stderr(&self) -> String {
+    pub fn stderr(&self) -> String {
         text(&self.transcript.lock()[STDERR].bytes)
     }
 
@@ -108,7 +108,7 @@ impl ChildProcess {
     ///
     /// # Panics
     /// The limit is reached, or the program ends without it.
-    pub(crate) fn wait_for_line(&mut self, part: &str) -> String {
+    pub fn wait_for_line(&mut self, part: &str) -> String {
         let end = Instant::now() + self.limit;
         self.wait_for(end, &format!("line with `{part}`"), |pipes| {
             let whole = text(&pipes[STDERR].bytes);
@@ -124,7 +124,7 @@ impl ChildProcess {
     ///
     /// # Panics
     /// The limit is reached.
-    pub(crate) fn wait(&mut self) -> Output {
+    pub fn wait(&mut self) -> Output {
         let end = Instant::now() + self.limit;
         self.wait_for(end, "end", |pipes| pipes.iter().all(|pipe| !pipe.is_open).then_some(()));
         let status = loop {
@@ -140,7 +140,7 @@ impl ChildProcess {
     }
 
     /// Waits for its end, but not longer than `time`; returns whether it ended.
-    pub(crate) fn ends_within(&mut self, time: Duration) -> bool {
+    pub fn ends_within(&mut self, time: Duration) -> bool {
         let end = Instant::now() + time;
         loop {
             if !self.is_running() {
@@ -155,7 +155,7 @@ impl ChildProcess {
     }
 
     /// Sends it a signal, as `INT`.
-    pub(crate) fn signal(&self, name: &str) {
+    pub fn signal(&self, name: &str) {
         let sent = run_command(Command::new("kill").args([format!("-{name}"), self.id().to_string()]));
         let sent = sent.expect("kill starts");
         assert!(sent.status.success(), "{}: {}", self.name, text(&sent.stderr));
@@ -165,7 +165,7 @@ impl ChildProcess {
     ///
     /// # Panics
     /// It is not gone after a while.
-    pub(crate) fn kill(&mut self) {
+    pub fn kill(&mut self) {
         self.send_kill();
         assert!(self.ends_within(KILL_LIMIT), "{} cannot be killed", self.name);
     }

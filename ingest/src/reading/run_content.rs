@@ -3,18 +3,18 @@
 use std::collections::{BTreeMap, HashSet};
 use std::sync::Arc;
 
-use bytes::Bytes;
 use echolake_lake::Lake;
-use echolake_recording::{DecodedChunk, FileIntegrity, Metadata, RawChunk, ResyncItem, ResyncReader, list_damage};
-use echolake_schema::manifest::{Origin, RunEnd, RunManifest};
+use echolake_recording::{DecodedChunk, FileIntegrity, RawChunk, ResyncItem, ResyncReader, list_damage};
+use echolake_schema::manifest::{RunEnd, RunManifest};
 use echolake_schema::messages::{AmbientSample, Measurement, Verdict};
-use echolake_schema::{ErrorCause, Rig, SurfaceId, SurfaceRecord, topics};
+use echolake_schema::{SurfaceRecord, topics};
 
+use super::measure::{ChunkResults, Event, Measurer, Response};
+use super::run_channels::RunDefinitions;
+use super::run_envelope::RunEnvelope;
 use crate::error::{Error, Result};
-use crate::files::Opened;
-use crate::measure::{Event, Measurer, Response, Yield};
-use crate::pipeline::{Begun, Cores};
-use crate::run_channels::RunDefinitions;
+use crate::inbox::OpenedRun;
+use crate::pipeline::{Cores, PendingComputation};
 
 /// A run, read.
 pub(crate) struct RunContent {
@@ -38,72 +38,23 @@ pub(crate) struct RunContent {
 }
 
 /// What became of a chunk, or will.
-enum Measured {
-    Here(Yield),
-    Elsewhere(Begun<Yield>),
-}
-
-/// What stands outside of chunks, as far as ingest needs it: a file may have any number of others.
-#[derive(Default)]
-struct Envelope {
-    metadata: BTreeMap<String, BTreeMap<String, String>>,
-    attachments: BTreeMap<String, Bytes>,
-}
-
-const NEEDED_METADATA: [&str; 4] =
-    [topics::RUN_METADATA, topics::RUN_PLAN_METADATA, topics::RUN_END_METADATA, topics::RECOVERY_METADATA];
-const NEEDED_ATTACHMENTS: [&str; 3] = [topics::RIG_ATTACHMENT, topics::SURFACE_ATTACHMENT, topics::HEIGHTS_ATTACHMENT];
-/// Largest heights that are kept: those of 2048 by 2048 points.
-const LARGEST_HEIGHTS: usize = 16 << 20;
-/// Largest text that is kept; what it is parsed to is a multiple of it.
-const LARGEST_TEXT: usize = 1 << 20;
-
-/// What a run says of itself before its first measurement.
-#[derive(Debug)]
-pub(crate) struct Head {
-    pub(crate) surface: SurfaceId,
-    pub(crate) references: Vec<SurfaceId>,
-    pub(crate) origin: Origin,
-    /// It says how the run is gone on with.
-    pub(crate) has_plan: bool,
-    pub(crate) rig: Option<Rig>,
-}
-
-impl Head {
-    /// None where the file does not begin as a run of ours does.
-    pub(crate) async fn read(opened: &Opened) -> Option<Self> {
-        let (store, path) = (opened.store.clone(), opened.path.clone());
-        let mut reader = ResyncReader::open(store, path, opened.name.clone()).await.ok()?.without_digest();
-        let mut envelope = Envelope::default();
-        while let Ok(Some(item)) = reader.next_item().await {
-            match item {
-                ResyncItem::Attachment(found) => envelope.keep_attachment(found.name, found.data),
-                ResyncItem::Metadata(record) => envelope.keep_metadata(record),
-                ResyncItem::Definition(_) => {}
-                ResyncItem::Chunk(_) => break,
-            }
-        }
-        let manifest = RunManifest::from_metadata(envelope.metadata.get(topics::RUN_METADATA)?).ok()?;
-        let surface = envelope.surface(&opened.name).ok()?;
-        let references = [surface.flat_reference, surface.foam_reference].into_iter().flatten().collect();
-        let has_plan = envelope.metadata.contains_key(topics::RUN_PLAN_METADATA);
-        let rig = envelope.rig(&opened.name).ok();
-        Some(Self { surface: manifest.surface_id, references, origin: manifest.origin, has_plan, rig })
-    }
+enum ChunkMeasurement {
+    Here(ChunkResults),
+    Elsewhere(PendingComputation<ChunkResults>),
 }
 
 impl RunContent {
     /// Reads a run; its chunks are measured on all cores while the next ones are fetched.
-    pub(crate) async fn read(lake: &Lake, measurer: &Arc<Measurer>, cores: &Cores, opened: &Opened) -> Result<Self> {
+    pub(crate) async fn read(lake: &Lake, measurer: &Arc<Measurer>, cores: &Cores, opened: &OpenedRun) -> Result<Self> {
         let name = opened.name.as_str();
         let mut reader = ResyncReader::open(opened.store.clone(), opened.path.clone(), name.to_owned()).await?;
-        let mut envelope = Envelope::default();
+        let mut envelope = RunEnvelope::default();
         let mut definitions = RunDefinitions::default();
-        let mut whole = Yield { last_time_ns: i64::MIN, ..Yield::default() };
+        let mut whole = ChunkResults { last_time_ns: i64::MIN, ..ChunkResults::default() };
         let mut checked = false;
         let busy = cores.busy();
         let budget = Arc::new(measurer.run_budget());
-        let mut measured: Vec<Measured> = Vec::new();
+        let mut measured: Vec<ChunkMeasurement> = Vec::new();
         let mut seen = HashSet::new();
         // Chunks whose channels are not known yet: the chunk that introduces them is damaged, the summary has them too.
         let mut waiting = Vec::new();
@@ -115,7 +66,7 @@ impl RunContent {
                         checked = true;
                     }
                     let (begin, length) = (raw.offset, raw.body.len() as u64);
-                    match budget.take_chunk().and_then(|()| decode(&raw)) {
+                    match budget.take_chunk().and_then(|()| decode_chunk(&raw)) {
                         Ok((offset, chunk)) if !seen.insert(chunk.identity()) => {
                             list_damage(&mut whole.damaged, || {
                                 format!("the chunk at byte {offset}: a copy of one before it")
@@ -138,8 +89,8 @@ impl RunContent {
                             // Another core would have to fetch what this one has in its cache, so it gets a chunk only
                             // where it has nothing else to do. That also bounds how many are in memory.
                             measured.push(match cores.is_one_idle() {
-                                true => Measured::Elsewhere(cores.begin(work)),
-                                false => Measured::Here(work()),
+                                true => ChunkMeasurement::Elsewhere(cores.begin(work)),
+                                false => ChunkMeasurement::Here(work()),
                             });
                             tokio::task::yield_now().await;
                         }
@@ -158,27 +109,27 @@ impl RunContent {
         drop(busy);
         for part in measured {
             whole.append(match part {
-                Measured::Here(part) => part,
-                Measured::Elsewhere(part) => part.done().await,
+                ChunkMeasurement::Here(part) => part,
+                ChunkMeasurement::Elsewhere(part) => part.done().await,
             });
         }
         for (offset, length) in waiting {
             let raw = reader.again(offset, length).await?;
-            let (offset, chunk) = decode(&raw).map_err(|e| Error::read(name, e))?;
+            let (offset, chunk) = decode_chunk(&raw).map_err(|e| Error::read(name, e))?;
             let (measurer, channels, budget) = (measurer.clone(), definitions.channels.clone(), budget.clone());
             whole.append(cores.compute(move || measurer.process(offset, &chunk, &channels, &budget)).await);
         }
         let integrity = reader.finish().await?;
         if !integrity.damage.is_empty() || !integrity.closed {
-            vouch(&manifest, name)?;
+            check_manifest(&manifest, name)?;
         }
         Self::assemble(manifest, envelope, whole, integrity, name)
     }
 
     fn assemble(
         manifest: RunManifest,
-        envelope: Envelope,
-        whole: Yield,
+        envelope: RunEnvelope,
+        whole: ChunkResults,
         integrity: FileIntegrity,
         name: &str,
     ) -> Result<Self> {
@@ -191,10 +142,10 @@ impl RunContent {
         let end = end.and_then(|end| end.map_err(|cause| damaged.push(cause.to_string())).ok());
         let recovery = envelope.metadata.get(topics::RECOVERY_METADATA);
         let recovered_whole = recovery.is_some_and(|record| record.get("defect").is_some_and(String::is_empty));
-        let responses = best_responses(whole.responses);
-        let rejected = given_up(&whole.verdicts);
+        let responses = select_responses(whole.responses);
+        let rejected = count_given_up(&whole.verdicts);
         let attempts = whole.verdicts.len() as u64;
-        let accepted = join(whole.verdicts, responses, &mut damaged);
+        let accepted = join_verdicts(whole.verdicts, responses, &mut damaged);
         Ok(Self {
             surface: envelope.surface(name)?,
             heights_mm: envelope.heights(),
@@ -223,66 +174,7 @@ impl RunContent {
     }
 }
 
-impl Envelope {
-    // The first of a name counts.
-    fn keep_attachment(&mut self, name: String, data: Bytes) {
-        let most = if name == topics::HEIGHTS_ATTACHMENT { LARGEST_HEIGHTS } else { LARGEST_TEXT };
-        if NEEDED_ATTACHMENTS.contains(&name.as_str()) && data.len() <= most {
-            // A copy: the bytes are part of whatever was fetched with them.
-            self.attachments.entry(name).or_insert_with(|| Bytes::copy_from_slice(&data));
-        }
-    }
-
-    fn keep_metadata(&mut self, record: Metadata) {
-        if NEEDED_METADATA.contains(&record.name.as_str()) {
-            self.metadata.entry(record.name).or_insert(record.metadata);
-        }
-    }
-
-    // Other writers may put what the run is behind its first chunks.
-    fn is_complete(&self) -> bool {
-        self.metadata.contains_key(topics::RUN_METADATA) && self.attachments.contains_key(topics::RIG_ATTACHMENT)
-    }
-
-    // Checked before chunks are measured where that can be, so that a wrong file costs nothing.
-    fn check(&self, lake: &Lake, name: &str) -> Result<RunManifest> {
-        let Some(record) = self.metadata.get(topics::RUN_METADATA) else {
-            return Err(Error::Foreign { file: name.to_owned() });
-        };
-        let manifest =
-            RunManifest::from_metadata(record).map_err(|cause| Error::Manifest { file: name.to_owned(), cause })?;
-        lake.fits(&self.rig(name)?)?;
-        Ok(manifest)
-    }
-
-    fn rig(&self, name: &str) -> Result<Rig> {
-        let wrong = |source: ErrorCause| Error::Attachment {
-            file: name.to_owned(),
-            attachment: topics::RIG_ATTACHMENT,
-            source,
-        };
-        let bytes = self.attachments.get(topics::RIG_ATTACHMENT).ok_or_else(|| wrong("is missing".into()))?;
-        let text = std::str::from_utf8(bytes).map_err(|e| wrong(format!("is no text: {e}").into()))?;
-        Rig::from_toml(text).map_err(|e| wrong(e.into()))
-    }
-
-    fn surface(&self, name: &str) -> Result<SurfaceRecord> {
-        let wrong = |source: ErrorCause| Error::Attachment {
-            file: name.to_owned(),
-            attachment: topics::SURFACE_ATTACHMENT,
-            source,
-        };
-        let bytes = self.attachments.get(topics::SURFACE_ATTACHMENT).ok_or_else(|| wrong("is missing".into()))?;
-        serde_json::from_slice(bytes).map_err(|e| wrong(e.into()))
-    }
-
-    fn heights(&self) -> Vec<f32> {
-        let bytes = self.attachments.get(topics::HEIGHTS_ATTACHMENT).map_or(&[][..], |b| &b[..]);
-        bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect()
-    }
-}
-
-impl Yield {
+impl ChunkResults {
     fn append(&mut self, mut other: Self) {
         self.responses.append(&mut other.responses);
         self.verdicts.append(&mut other.verdicts);
@@ -296,7 +188,7 @@ impl Yield {
 }
 
 // Where something outside of chunks is damaged, the manifest may be, too.
-fn vouch(manifest: &RunManifest, name: &str) -> Result<()> {
+fn check_manifest(manifest: &RunManifest, name: &str) -> Result<()> {
     if manifest.fits_file_name(name) {
         return Ok(());
     }
@@ -310,14 +202,14 @@ fn vouch(manifest: &RunManifest, name: &str) -> Result<()> {
 }
 
 // Where the walk is: it takes less than the digest of the same bytes, and to hand it to another thread as much again.
-fn decode(raw: &RawChunk) -> std::result::Result<(u64, DecodedChunk), String> {
+fn decode_chunk(raw: &RawChunk) -> std::result::Result<(u64, DecodedChunk), String> {
     let chunk = DecodedChunk::decode(&raw.body);
     let chunk = chunk.map_err(|reason| format!("the chunk at byte {}: {reason}", raw.offset))?;
     Ok((raw.offset, chunk))
 }
 
 // A recording that is there twice, as sweep and as response, counts as sweep.
-fn best_responses(responses: Vec<Response>) -> BTreeMap<(u32, u32), Response> {
+fn select_responses(responses: Vec<Response>) -> BTreeMap<(u32, u32), Response> {
     let mut best: BTreeMap<(u32, u32), Response> = BTreeMap::new();
     for response in responses {
         let key = (response.pair, response.attempt);
@@ -329,7 +221,7 @@ fn best_responses(responses: Vec<Response>) -> BTreeMap<(u32, u32), Response> {
 }
 
 // Pairs without an accepted attempt. A run that is gone on with tries those again that it gave up before.
-fn given_up(verdicts: &[(i64, Measurement)]) -> u64 {
+fn count_given_up(verdicts: &[(i64, Measurement)]) -> u64 {
     let of = |verdict: Verdict| -> HashSet<u32> {
         verdicts.iter().filter(|v| v.1.verdict() == verdict).map(|v| v.1.pair_id).collect()
     };
@@ -337,7 +229,7 @@ fn given_up(verdicts: &[(i64, Measurement)]) -> u64 {
 }
 
 // The last accepted attempt at a pair is its measurement.
-fn join(
+fn join_verdicts(
     verdicts: Vec<(i64, Measurement)>,
     mut responses: BTreeMap<(u32, u32), Response>,
     damaged: &mut Vec<String>,

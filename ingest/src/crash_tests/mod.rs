@@ -1,5 +1,8 @@
 //! Ingest that dies at any step of its writing, and ingests side by side: the tables end as if nothing had happened.
 
+mod mortal;
+mod skewed;
+
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -10,24 +13,19 @@ use bytes::Bytes;
 use chrono::TimeDelta;
 use echolake_acquisition::panel::relief::PanelRelief;
 use echolake_acquisition::run::controller::RecordingMode;
-use echolake_acquisition::run::simulate::simulate;
-use echolake_acquisition::run::{PanelSpecimen, RunRequest};
 use echolake_lake::{ClaimOutcome, ClaimTimes, DeletionMode, Lake, ReferenceSurfaces, WorkClaims};
-use echolake_schema::manifest::Origin;
+use echolake_schema::Rig;
 use echolake_schema::tables::Table;
-use echolake_schema::{Rig, Timestamp};
+use echolake_testing::{SMALL_RIG, StoreDouble, simulate_run};
 use futures::TryStreamExt as _;
 use object_store::memory::InMemory;
 use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt as _};
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 
-use crate::mortal::{DeathMoment, MortalStore};
-use crate::skewed::{Interlude, SkewedStore};
+use self::mortal::{DeathMoment, MortalStore};
+use self::skewed::{Interlude, SkewedStore};
 use crate::{CompletedRun, Error, FileReport, LakeIngest, RemovedFile, RunSource, find_removals, find_runs, pending};
-
-/// Ten points, so that a run takes milliseconds.
-const SMALL_RIG: &str = include_str!("../../tests/fixtures/small_rig.toml");
 
 fn rig() -> Rig {
     Rig::from_toml(SMALL_RIG).expect("a rig")
@@ -35,15 +33,10 @@ fn rig() -> Rig {
 
 /// Run files of these surfaces, by name. A surface is made of the relief that its name begins with.
 fn runs(surfaces: &[&str]) -> Vec<(String, Bytes)> {
-    let (folder, rig) = (tempfile::tempdir().expect("a folder"), rig());
+    let folder = tempfile::tempdir().expect("a folder");
     let one = |(number, surface): (usize, &&str)| {
         let relief = PanelRelief::guess(surface).expect("a name");
-        let specimen = PanelSpecimen::Relief(PanelRelief::by_name(relief).expect("a relief"));
-        let start = Timestamp(1_767_600_000_000_000_000).plus_secs(number as f64 * 3_600.0);
-        let seed = number as u64 + 1;
-        let run = RunRequest::new(&rig, surface.parse().expect("an id"), &specimen, start, folder.path());
-        let run = RunRequest { seed, tag: seed, keep: RecordingMode::ResponsesOnly, ..run };
-        let (path, _) = simulate(&run, Origin::Simulated, &AtomicBool::new(false), &mut |_| {}).expect("a run");
+        let path = simulate_run(folder.path(), number, surface, relief, RecordingMode::ResponsesOnly);
         let name = path.file_name().expect("a name").to_string_lossy().into_owned();
         (name, Bytes::from(std::fs::read(path).expect("read")))
     };
@@ -67,8 +60,8 @@ async fn with_inbox(runs: &[(String, Bytes)]) -> Arc<InMemory> {
 async fn ingest(store: Arc<dyn ObjectStore>) -> crate::Result<Vec<FileReport>> {
     let (lake, mut reports) = (lake(store).await?, Vec::new());
     let ingest = LakeIngest::new(&lake, Arc::default());
-    ingest.take_in(pending(&lake).await?, &mut |report| reports.push(report)).await?;
-    ingest.complete(&mut |_, _| {}).await?;
+    ingest.ingest_runs(pending(&lake).await?, &mut |report| reports.push(report)).await?;
+    ingest.complete_runs(&mut |_, _| {}).await?;
     Ok(reports)
 }
 
@@ -124,9 +117,9 @@ async fn each_death<T, E: std::fmt::Debug>(
     for death in [DeathMoment::Before, DeathMoment::After] {
         for last in 0.. {
             let inner = Arc::new(start.fork());
-            let mortal = MortalStore::new(inner.clone(), last, death);
+            let mortal = StoreDouble::new(inner.clone(), MortalStore::new(last, death));
             let first = work(mortal.clone()).await;
-            if !mortal.died() {
+            if !mortal.behaviour.has_died() {
                 first.expect("it lived");
                 break;
             }
@@ -141,7 +134,7 @@ async fn each_death<T, E: std::fmt::Debug>(
 const SKEW: TimeDelta = TimeDelta::minutes(5);
 
 fn skewed(store: &Arc<InMemory>, skew: TimeDelta, interlude: Option<Interlude>) -> Arc<dyn ObjectStore> {
-    SkewedStore::new(store.clone(), skew, interlude)
+    StoreDouble::new(store.clone(), SkewedStore { skew, interlude })
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -189,7 +182,7 @@ async fn refused_files_go_to_quarantine_with_the_reason_and_the_rest_goes_on() {
     let taken: Vec<_> = reports
         .iter()
         .filter_map(|r| match r {
-            FileReport::Taken(taken) => Some((taken.surface.as_str(), taken.whole, taken.measurements)),
+            FileReport::Ingested(taken) => Some((taken.surface.as_str(), taken.whole, taken.measurements)),
             _ => None,
         })
         .collect();
@@ -212,9 +205,9 @@ async fn a_file_that_is_gone_when_it_is_read_does_not_end_the_batch() {
     let sources = pending(&lake).await.expect("listed");
     store.delete(&Path::from(format!("inbox/{}", runs[1].0))).await.expect("deleted");
     let ingest = LakeIngest::new(&lake, Arc::default());
-    ingest.take_in(sources, &mut |report| reports.push(report)).await.expect("the others are ingested");
+    ingest.ingest_runs(sources, &mut |report| reports.push(report)).await.expect("the others are ingested");
     let gone = reports.iter().filter(|r| matches!(r, FileReport::Gone(_))).count();
-    let taken = reports.iter().filter(|r| matches!(r, FileReport::Taken(_))).count();
+    let taken = reports.iter().filter(|r| matches!(r, FileReport::Ingested(_))).count();
     assert_eq!((gone, taken), (1, 2), "{reports:?}");
 }
 
@@ -261,7 +254,7 @@ async fn a_record_that_is_too_large_is_passed_over_and_told() {
     file.extend(&whole[header..]);
     runs[0].1 = file.into();
     let reports = ingest(with_inbox(&runs).await).await.expect("ingested");
-    let [FileReport::Taken(taken)] = reports.as_slice() else { panic!("{reports:?}") };
+    let [FileReport::Ingested(taken)] = reports.as_slice() else { panic!("{reports:?}") };
     assert_eq!(taken.measurements, 45);
     let place = format!("record of kind 0x09 at byte {header} has ");
     assert!(taken.damaged.iter().any(|d| d.starts_with(&place) && d.contains("more than")), "{:?}", taken.damaged);
@@ -280,7 +273,7 @@ async fn a_chunk_whose_records_end_early_is_told() {
     let chunk = [&[0x06][..], &(body.len() as u64).to_le_bytes(), &body].concat();
     runs[0].1 = [&whole[..header], &chunk, &whole[header..]].concat().into();
     let reports = ingest(with_inbox(&runs).await).await.expect("ingested");
-    let [FileReport::Taken(taken)] = reports.as_slice() else { panic!("{reports:?}") };
+    let [FileReport::Ingested(taken)] = reports.as_slice() else { panic!("{reports:?}") };
     assert_eq!(taken.measurements, 45);
     let place = format!("the chunk at byte {header}: a record ends early");
     assert!(taken.damaged.iter().any(|d| d.starts_with(&place)), "{:?}", taken.damaged);
@@ -295,7 +288,7 @@ async fn remove(store: Arc<dyn ObjectStore>, file: &str, kept: RemovedFile) -> c
         Err(Error::NoRun { .. }) => {}
         found => ingest.remove(&mut found?, kept, "a test").await?,
     }
-    ingest.complete(&mut |_, _| {}).await?;
+    ingest.complete_runs(&mut |_, _| {}).await?;
     Ok(())
 }
 
@@ -317,14 +310,14 @@ mod slow {
         start.put(&in_inbox, half.into()).await.expect("written");
         let lake = lake(start.clone()).await.expect("a lake");
         let partial = LakeIngest::new(&lake, Arc::default())
-            .take_in_without_end(&RunSource::Lake(in_inbox.clone()))
+            .ingest_without_end(&RunSource::Lake(in_inbox.clone()))
             .await
             .expect("ingested as it was once");
         assert!(partial.measurements < 45 && !partial.whole, "{partial:?}");
         start.put(&in_inbox, whole.clone().into()).await.expect("written");
         let deaths = each_death(&start, ingest, async |inner, death| {
             let reports = ingest(inner.clone()).await.unwrap_or_else(|e| panic!("{death}: {e}"));
-            assert!(reports.iter().all(|r| matches!(r, FileReport::Taken(_))), "{death}: {reports:?}");
+            assert!(reports.iter().all(|r| matches!(r, FileReport::Ingested(_))), "{death}: {reports:?}");
             assert!(tables(inner.clone()).await == expected, "{death}: other files");
             let kept = inner.get(&Path::from(format!("runs/wood/{name}"))).await.expect("there");
             assert!(kept.bytes().await.expect("bytes") == *whole, "{death}: another file");
@@ -499,12 +492,12 @@ mod slow {
             let sources = pending(&lake).await.expect("listed");
             let ingest = LakeIngest::new(&lake, Arc::default()).sharing(IMPATIENT);
             let report = &mut |report: FileReport| match report {
-                FileReport::Taken(run) => taken.push(run.run.to_string()),
+                FileReport::Ingested(run) => taken.push(run.run.to_string()),
                 FileReport::Claimed(_) => claimed += 1,
                 FileReport::Gone(_) => {}
                 FileReport::Refused { source, why, .. } => panic!("{source}: {why}"),
             };
-            ingest.take_in(sources, report).await.expect("ingested");
+            ingest.ingest_runs(sources, report).await.expect("ingested");
             ingest.close().await;
             (taken, claimed)
         };
@@ -519,7 +512,7 @@ mod slow {
         let mut names: Vec<_> = runs.iter().map(|(name, _)| name.trim_end_matches(".mcap").to_owned()).collect();
         names.sort();
         assert_eq!(taken, names, "each once");
-        LakeIngest::new(&lake, Arc::default()).complete(&mut |_, _| {}).await.expect("completed");
+        LakeIngest::new(&lake, Arc::default()).complete_runs(&mut |_, _| {}).await.expect("completed");
         assert!(rows(store).await == expected, "other rows");
     }
 
@@ -534,12 +527,12 @@ mod slow {
         }
         let lake = lake(store.clone()).await.expect("a lake");
         let sources = pending(&lake).await.expect("listed");
-        LakeIngest::new(&lake, Arc::default()).take_in(sources, &mut |_| {}).await.expect("ingested");
+        LakeIngest::new(&lake, Arc::default()).ingest_runs(sources, &mut |_| {}).await.expect("ingested");
         let work = async || {
             let mut completed = Vec::new();
             let ingest = LakeIngest::new(&lake, Arc::default()).sharing(ClaimTimes::default());
             let done = &mut |run: &CompletedRun, _| completed.push(run.run.to_string());
-            let summary = ingest.complete(done).await.expect("completed");
+            let summary = ingest.complete_runs(done).await.expect("completed");
             ingest.close().await;
             assert_eq!(summary.changed, completed.len());
             completed
@@ -639,7 +632,7 @@ async fn another_file_in_a_runs_place_is_not_taken_for_it_though_it_is_as_long()
     store.put(&place, other.clone().into()).await.expect("written");
     let (lake, mut reports) = (lake(store.clone()).await.expect("a lake"), Vec::new());
     let source = RunSource::Lake(Path::from(format!("inbox/{name}")));
-    LakeIngest::new(&lake, Arc::default()).take_in(vec![source], &mut |r| reports.push(r)).await.expect("ingested");
+    LakeIngest::new(&lake, Arc::default()).ingest_runs(vec![source], &mut |r| reports.push(r)).await.expect("ingested");
     let [FileReport::Refused { why, moved: Some(moved), .. }] = reports.as_slice() else { panic!("{reports:?}") };
     assert!(why.to_string().contains("already in the lake with other content"), "{why}");
     assert_eq!(store.get(moved).await.expect("there").bytes().await.expect("bytes"), bytes);

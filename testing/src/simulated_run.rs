@@ -1,0 +1,38 @@
+//! Runs of a small simulated rig.
+
+use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
+
+use echolake_acquisition::panel::relief::PanelRelief;
+use echolake_acquisition::run::controller::RecordingMode;
+use echolake_acquisition::run::simulate::simulate;
+use echolake_acquisition::run::{PanelSpecimen, RunRequest};
+use echolake_schema::manifest::Origin;
+use echolake_schema::{Rig, Timestamp};
+
+/// A rig of ten points, so that a run takes milliseconds.
+pub const SMALL_RIG: &str = include_str!("../../tests/fixtures/small_rig.toml");
+
+/// Measures a surface of the small rig into a folder, `number` hours after the first; returns the run's file.
+///
+/// # Panics
+/// There is no such relief, or the folder cannot be written.
+pub fn simulate_run(folder: &Path, number: usize, surface: &str, relief: &str, keep: RecordingMode) -> PathBuf {
+    let rig = Rig::from_toml(SMALL_RIG).expect("a rig");
+    let specimen = PanelSpecimen::Relief(PanelRelief::by_name(relief).expect("a relief"));
+    let run = RunRequest {
+        rig: &rig,
+        surface: surface.parse().expect("an id"),
+        specimen: &specimen,
+        flat: None,
+        foam: None,
+        macro_reference: None,
+        project: None,
+        start: Timestamp(1_767_600_000_000_000_000).plus_secs(number as f64 * 3_600.0),
+        seed: number as u64 + 1,
+        tag: number as u64 + 1,
+        keep,
+        folder,
+    };
+    simulate(&run, Origin::Simulated, &AtomicBool::new(false), &mut |_| {}).expect("a run").0
+}
