@@ -41,14 +41,9 @@ impl CatalogueServer {
         Self { address: address.to_owned(), headers, encryption: None }
     }
 
-    /// Shows it a token.
-    pub(crate) fn with_token(self, token: &str) -> Self {
-        self.with_header("authorization", &format!("Bearer {token}"))
-    }
-
-    /// Sends it a header with each request.
-    pub(crate) fn with_header(mut self, name: &str, value: &str) -> Self {
-        self.headers += &format!("{name}: {value}\r\n");
+    /// Sends it a token with each request.
+    pub(crate) fn with_token(mut self, token: &str) -> Self {
+        self.headers += &format!("authorization: Bearer {token}\r\n");
         self
     }
 

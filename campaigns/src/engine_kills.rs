@@ -2,7 +2,6 @@
 //! answer must be whole, or an error with its code, or be seen to be broken off.
 #![allow(clippy::print_stdout, reason = "figures are what it is for")]
 
-use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, PoisonError};
@@ -14,7 +13,7 @@ use rand::{Rng as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 
 use super::observed_server::{
-    ClientGroup, ObservedServer, QueryOutcome, QueryProtocol, RightAnswers, kill_process, take_right_answers,
+    AnswerTally, ClientGroup, ObservedServer, RightAnswers, kill_process, take_right_answers,
 };
 
 /// Clients at once.
@@ -44,34 +43,14 @@ pub(crate) struct EngineKillsArgs {
     seed: u64,
 }
 
-/// Answers and errors that the readers got.
-#[derive(Debug, Default)]
-pub(crate) struct KillReport {
-    kills: usize,
-    pub(crate) whole: usize,
-    /// Answers that look whole and are not the right ones.
-    pub(crate) wrong: usize,
-    /// Errors by protocol and code.
-    errors: BTreeMap<(QueryProtocol, String), usize>,
-    /// Answers over HTTP that were broken off, which is how it shows an error after the first byte.
-    broken_off: usize,
-    /// Connections that ended without a code.
-    pub(crate) lost: BTreeMap<QueryProtocol, usize>,
-}
-
 pub(crate) fn run(args: &EngineKillsArgs) -> Result<()> {
-    let report = run_kills(&super::echolake_path()?, args.kills, args.seed)?;
-    println!(
-        "{} kills: {} answers whole, {} wrong, {} broken off",
-        report.kills, report.whole, report.wrong, report.broken_off
-    );
-    for ((protocol, code), count) in &report.errors {
-        println!("  {:17} {code}: {count}", protocol.name());
+    let tally = run_kills(&super::echolake_path()?, args.kills, args.seed)?;
+    let (whole, wrong) = (tally.times.len(), tally.wrong);
+    println!("{} kills: {whole} answers whole, {wrong} wrong, {} broken off", args.kills, tally.broken_off);
+    for (error, count) in tally.refused.iter().chain(&tally.lost) {
+        println!("  {error}: {count}");
     }
-    for (protocol, count) in &report.lost {
-        println!("  {:17} ended without a code: {count}", protocol.name());
-    }
-    ensure!(report.is_goal_reached(), "goals are missed: no wrong answer, and a code for each that is not whole");
+    ensure!(tally.is_honest(), "goals are missed: no wrong answer, and a code for each that is not whole");
     Ok(())
 }
 
@@ -79,40 +58,23 @@ pub(crate) fn run(args: &EngineKillsArgs) -> Result<()> {
 ///
 /// # Errors
 /// The lake cannot be made, the undisturbed server fails, or it has no engines.
-pub(crate) fn run_kills(binary: &Path, kills: usize, seed: u64) -> Result<KillReport> {
+pub(crate) fn run_kills(binary: &Path, kills: usize, seed: u64) -> Result<AnswerTally> {
     let mut server = ObservedServer::start(binary, &[CLIENTS])?;
     let right = take_right_answers(&server.client(CLIENTS.name, 0), &QUERIES)?;
-    let report = Mutex::new(KillReport::default());
+    let tally = Mutex::<AnswerTally>::default();
     let is_stopped = AtomicBool::new(false);
     let killed = std::thread::scope(|scope| {
         for reader in 0..READERS {
-            let (server, right, report, is_stopped) = (&server, &right, &report, &is_stopped);
-            scope.spawn(move || read_answers(server, reader, right, seed, report, is_stopped));
+            let (server, right, tally, is_stopped) = (&server, &right, &tally, &is_stopped);
+            scope.spawn(move || read_answers(server, reader, right, seed, tally, is_stopped));
         }
         let killed = kill_engines(&server, kills, seed);
         is_stopped.store(true, Ordering::Relaxed);
         killed
     });
-    let mut report = report.into_inner().unwrap_or_else(PoisonError::into_inner);
-    report.kills = killed?;
+    killed?;
     ensure!(server.is_alive(), "the server died: {}", server.last_words());
-    Ok(report)
-}
-
-impl KillReport {
-    pub(crate) fn is_goal_reached(&self) -> bool {
-        self.wrong == 0 && self.lost.is_empty()
-    }
-
-    fn add(&mut self, protocol: QueryProtocol, outcome: QueryOutcome, expected: &QueryOutcome) {
-        match outcome {
-            right if right == *expected => self.whole += 1,
-            QueryOutcome::Answer(_) => self.wrong += 1,
-            QueryOutcome::Refused(code) => *self.errors.entry((protocol, code)).or_default() += 1,
-            QueryOutcome::Truncated if protocol == QueryProtocol::Http => self.broken_off += 1,
-            _ => *self.lost.entry(protocol).or_default() += 1,
-        }
-    }
+    Ok(tally.into_inner().unwrap_or_else(PoisonError::into_inner))
 }
 
 fn read_answers(
@@ -120,7 +82,7 @@ fn read_answers(
     reader: usize,
     right: &RightAnswers,
     seed: u64,
-    report: &Mutex<KillReport>,
+    tally: &Mutex<AnswerTally>,
     is_stopped: &AtomicBool,
 ) {
     let mut random = ChaCha8Rng::seed_from_u64(seed + 1 + reader as u64);
@@ -129,18 +91,19 @@ fn read_answers(
     while !is_stopped.load(Ordering::Relaxed) {
         let Some(client) = clients.choose(&mut random) else { return };
         let Some(((protocol, sql), expected)) = questions.choose(&mut random) else { return };
+        let begun = Instant::now();
         let outcome = client.query(*protocol, sql);
-        report.lock().unwrap_or_else(PoisonError::into_inner).add(*protocol, outcome, expected);
+        tally.lock().unwrap_or_else(PoisonError::into_inner).add(*protocol, outcome, expected, begun.elapsed());
     }
 }
 
-fn kill_engines(server: &ObservedServer, kills: usize, seed: u64) -> Result<usize> {
+fn kill_engines(server: &ObservedServer, kills: usize, seed: u64) -> Result<()> {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     for _ in 0..kills {
         std::thread::sleep(LONGEST_PAUSE.mul_f64(random.random()));
         kill_process(find_engine(server, &mut random)?);
     }
-    Ok(kills)
+    Ok(())
 }
 
 fn find_engine(server: &ObservedServer, random: &mut ChaCha8Rng) -> Result<u32> {

@@ -16,8 +16,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::attacks::{AttackCase, all_cases};
 use super::observed_server::{
-    ClientGroup, MemoryWatch, ObservedServer, QueryClient, QueryOutcome, QueryProtocol, RightAnswers,
-    take_right_answers,
+    AnswerTally, ClientGroup, MemoryWatch, ObservedServer, QueryClient, RightAnswers, take_right_answers,
 };
 use super::percentile::{millis, percentile};
 
@@ -63,21 +62,11 @@ pub(crate) struct HostileClientsArgs {
     seed: u64,
 }
 
-/// Answers and errors that the workers got.
-#[derive(Debug, Default)]
-pub(crate) struct WorkerReport {
-    /// Times of right answers.
-    pub(crate) times: Vec<Duration>,
-    pub(crate) wrong_answers: usize,
-    /// Number of errors that came in place of an answer, by protocol and kind.
-    pub(crate) errors: BTreeMap<String, usize>,
-}
-
 /// The server quiet and under attack.
 #[derive(Debug)]
 pub(crate) struct HostileReport {
-    pub(crate) quiet: WorkerReport,
-    pub(crate) attacked: WorkerReport,
+    pub(crate) quiet: AnswerTally,
+    pub(crate) attacked: AnswerTally,
     attacks: BTreeMap<String, usize>,
     restarts: usize,
 }
@@ -109,7 +98,7 @@ impl HostileReport {
 
     /// Returns whether every answer was right and the server lives.
     pub(crate) fn is_right(&self) -> bool {
-        self.attacked.wrong_answers == 0 && self.attacked.errors.is_empty() && self.restarts == 0
+        self.attacked.is_right() && self.restarts == 0
     }
 
     fn slowdown(&self) -> f64 {
@@ -121,12 +110,14 @@ impl HostileReport {
 fn print_report(report: &HostileReport) {
     for (name, phase) in [("quiet", &report.quiet), ("attacked", &report.attacked)] {
         println!(
-            "{name:8} {} answers, {} wrong, p50 {:.1} ms, p99 {:.1} ms, errors {:?}",
+            "{name:8} {} answers, {} wrong, {} broken off, p50 {:.1} ms, p99 {:.1} ms, errors {:?} {:?}",
             phase.times.len(),
-            phase.wrong_answers,
+            phase.wrong,
+            phase.broken_off,
             millis(percentile(&phase.times, 0.5)),
             millis(percentile(&phase.times, 0.99)),
-            phase.errors,
+            phase.refused,
+            phase.lost,
         );
     }
     println!("p99 under attack is {:.1} x quiet; the server died {} times", report.slowdown(), report.restarts);
@@ -140,7 +131,7 @@ fn run_phase(
     time: Duration,
     seed: u64,
     attacks: &[AttackCase],
-) -> (WorkerReport, BTreeMap<String, usize>) {
+) -> (AnswerTally, BTreeMap<String, usize>) {
     let phase = ClientPhase {
         right,
         attacks,
@@ -162,7 +153,7 @@ struct ClientPhase<'a> {
     attacks: &'a [AttackCase],
     end: Instant,
     server_died: AtomicBool,
-    report: Mutex<WorkerReport>,
+    report: Mutex<AnswerTally>,
     outcomes: Mutex<BTreeMap<String, usize>>,
 }
 
@@ -204,17 +195,10 @@ impl ClientPhase<'_> {
             let one = client.clone().with_source(client.connections.source());
             let begun = Instant::now();
             let answer = one.connections.close_after(QUERY_LIMIT, || one.query(*protocol, sql));
-            self.count_answer(*protocol, answer, expected, begun.elapsed());
+            let mut tally = self.report.lock().unwrap_or_else(PoisonError::into_inner);
+            tally.add(*protocol, answer, expected, begun.elapsed());
+            drop(tally);
             std::thread::sleep(LONGEST_PAUSE.mul_f64(random.random()));
-        }
-    }
-
-    fn count_answer(&self, protocol: QueryProtocol, answer: QueryOutcome, expected: &QueryOutcome, took: Duration) {
-        let mut report = self.report.lock().unwrap_or_else(PoisonError::into_inner);
-        match answer {
-            right if right == *expected => report.times.push(took),
-            QueryOutcome::Answer(_) => report.wrong_answers += 1,
-            other => *report.errors.entry(format!("{}: {other}", protocol.name())).or_default() += 1,
         }
     }
 

@@ -10,7 +10,6 @@ mod catalogue_client;
 mod engine_kills;
 #[path = "../../tests/forgetful.rs"]
 mod forgetful;
-mod functions_bench;
 #[path = "../../tests/fuzz/mod.rs"]
 mod fuzz;
 mod fuzz_server;
@@ -30,7 +29,6 @@ mod observed_server;
 mod operator_rounds;
 #[path = "../../tests/operators/mod.rs"]
 mod operators;
-mod overhead;
 mod percentile;
 mod query_bench;
 mod readers;
@@ -88,12 +86,8 @@ enum CampaignCommand {
     McapBench(mcap_bench::McapBenchArgs),
     /// Measure many readers of a served catalogue at once.
     Readers(readers::ReadersArgs),
-    /// Measure what encryption, tokens, audit and traces cost: readers and one response, with all of it and without.
-    Overhead(overhead::OverheadArgs),
     /// Measure slices of a served run, for one reader and for many.
     Slices(slices::SlicesArgs),
-    /// Measure SQL's list functions beside plain loops.
-    FunctionsBench,
     /// Compare orders in which the arms visit the grid, and show what they cannot reach.
     Motion(motion::MotionArgs),
 }
@@ -113,9 +107,7 @@ fn main() -> Result<()> {
         CampaignCommand::QueryBench(args) => block_on(query_bench::run(&args)),
         CampaignCommand::McapBench(args) => block_on(mcap_bench::run(&args)),
         CampaignCommand::Readers(args) => readers::run(&args),
-        CampaignCommand::Overhead(args) => overhead::run(&args),
         CampaignCommand::Slices(args) => slices::run(&args),
-        CampaignCommand::FunctionsBench => functions_bench::run(),
         CampaignCommand::Motion(args) => motion::run(&args),
     }
 }

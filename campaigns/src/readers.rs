@@ -9,10 +9,13 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use anyhow::{Result, anyhow};
+use rand::{Rng as _, SeedableRng as _};
+use rand_chacha::ChaCha8Rng;
 use serde_json::Value;
 
 use super::catalogue_client::CatalogueServer;
 use super::memory::resident_mib;
+use super::observed_server::percent_encoded;
 use super::percentile::{millis, percentile};
 
 /// Kind of requests that a reader sends.
@@ -51,7 +54,7 @@ pub(crate) struct ReadersArgs {
 }
 
 /// Surfaces, facets, runs and pairs that requests name.
-pub(crate) struct CatalogueContents {
+struct CatalogueContents {
     surfaces: Vec<String>,
     facets: Vec<(String, String)>,
     runs: Vec<String>,
@@ -63,7 +66,7 @@ impl CatalogueContents {
     ///
     /// # Errors
     /// The server does not answer.
-    pub(crate) fn read(server: &CatalogueServer) -> Result<Self> {
+    fn read(server: &CatalogueServer) -> Result<Self> {
         let mut connection = server.connect()?;
         let mut json = |path: &str| -> Result<Value> { Ok(serde_json::from_slice(&connection.get(path)?.1)?) };
         let text = |value: &Value| value.as_str().unwrap_or_default().to_owned();
@@ -71,7 +74,9 @@ impl CatalogueContents {
         let list = |value: &Value| value.as_array().cloned().unwrap_or_default();
         let mut facets = Vec::new();
         for facet in list(&page["facets"]) {
-            facets.extend(list(&facet["values"]).iter().map(|v| (text(&facet["name"]), encoded(&text(&v["value"])))));
+            facets.extend(
+                list(&facet["values"]).iter().map(|v| (text(&facet["name"]), percent_encoded(&text(&v["value"])))),
+            );
         }
         for histogram in list(&page["histograms"]) {
             let (name, prefix) = match text(&histogram["name"]).split_once(':') {
@@ -90,63 +95,49 @@ impl CatalogueContents {
         })
     }
 
-    fn path(&self, kind: QuestionKind, chance: &mut RequestRandom) -> String {
-        let surface = &self.surfaces[chance.below(self.surfaces.len() as u64) as usize];
-        let pair = chance.below(self.pairs);
-        match (kind, chance.below(10)) {
+    fn path(&self, kind: QuestionKind, random: &mut ChaCha8Rng) -> String {
+        let surface = &self.surfaces[random.random_range(0..self.surfaces.len())];
+        let pair = random.random_range(0..self.pairs.max(1));
+        match (kind, random.random_range(0..10)) {
             (QuestionKind::Facets, _) => {
-                let (name, value) = &self.facets[chance.below(self.facets.len() as u64) as usize];
+                let (name, value) = &self.facets[random.random_range(0..self.facets.len())];
                 // A different offset makes an address that was not requested before.
-                format!("/api/v1/surfaces?{name}={value}&sort=level&offset={}", chance.below(100_000))
+                format!("/api/v1/surfaces?{name}={value}&sort=level&offset={}", random.random_range(0..100_000))
             }
             (QuestionKind::Ir, _) => format!("/api/v1/surfaces/{surface}/pairs/{pair}/ir.wav?signal=measured"),
             (QuestionKind::All, 0) => "/".to_owned(),
             (QuestionKind::All, 1) => "/api/v1/surfaces".to_owned(),
             (QuestionKind::All, 2) => format!("/api/v1/surfaces/{surface}"),
-            (QuestionKind::All, 3) => format!("/api/v1/surfaces/{surface}/grid?microphone={}", chance.below(10)),
-            (QuestionKind::All, 4) => format!("/api/v1/surfaces/{surface}/curves?microphone={}", chance.below(10)),
+            (QuestionKind::All, 3) => {
+                format!("/api/v1/surfaces/{surface}/grid?microphone={}", random.random_range(0..10))
+            }
+            (QuestionKind::All, 4) => {
+                format!("/api/v1/surfaces/{surface}/curves?microphone={}", random.random_range(0..10))
+            }
             (QuestionKind::All, 5 | 6) => format!("/api/v1/surfaces/{surface}/thumbnail.png"),
             (QuestionKind::All, 7) => format!("/api/v1/surfaces/{surface}/pairs/{pair}"),
             (QuestionKind::All, 8) => {
-                format!("/api/v1/runs/{}", self.runs[chance.below(self.runs.len() as u64) as usize])
+                format!("/api/v1/runs/{}", self.runs[random.random_range(0..self.runs.len())])
             }
             (QuestionKind::All, _) => "/api/v1/map".to_owned(),
         }
     }
 }
 
-fn encoded(text: &str) -> String {
-    text.bytes()
-        .map(|b| if b.is_ascii_alphanumeric() { (b as char).to_string() } else { format!("%{b:02x}") })
-        .collect()
-}
-
-/// Numbers that are the same each time (Marsaglia 2003, xorshift).
-struct RequestRandom(u64);
-
-impl RequestRandom {
-    fn below(&mut self, bound: u64) -> u64 {
-        self.0 ^= self.0 << 13;
-        self.0 ^= self.0 >> 7;
-        self.0 ^= self.0 << 17;
-        self.0 % bound.max(1)
-    }
-}
-
 /// Readers that ask for a while.
 #[derive(Clone)]
-pub(crate) struct ReaderLoad {
-    pub(crate) server: CatalogueServer,
-    pub(crate) contents: Arc<CatalogueContents>,
-    pub(crate) kind: QuestionKind,
-    pub(crate) readers: u64,
-    pub(crate) time: Duration,
+struct ReaderLoad {
+    server: CatalogueServer,
+    contents: Arc<CatalogueContents>,
+    kind: QuestionKind,
+    readers: u64,
+    time: Duration,
 }
 
 /// Times of all answers, and the number of requests that failed.
-pub(crate) struct ReaderTimes {
-    pub(crate) answers: Vec<Duration>,
-    pub(crate) errors: u64,
+struct ReaderTimes {
+    answers: Vec<Duration>,
+    errors: u64,
 }
 
 impl ReaderLoad {
@@ -154,7 +145,7 @@ impl ReaderLoad {
     ///
     /// # Errors
     /// A reader panicked.
-    pub(crate) fn measure(&self, mut watch: impl FnMut()) -> Result<ReaderTimes> {
+    fn measure(&self, mut watch: impl FnMut()) -> Result<ReaderTimes> {
         let errors = Arc::new(AtomicU64::new(0));
         let end = Instant::now() + self.time;
         let reader = |number| {
@@ -174,14 +165,11 @@ impl ReaderLoad {
     }
 
     fn read(&self, number: u64, end: Instant, errors: &AtomicU64) -> Vec<Duration> {
-        let mut chance = RequestRandom(number.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1);
-        (0..10).for_each(|_| {
-            let _ = chance.below(1);
-        });
+        let mut random = ChaCha8Rng::seed_from_u64(number);
         let mut own = Vec::new();
         let mut connection = None;
         while Instant::now() < end {
-            let path = self.contents.path(self.kind, &mut chance);
+            let path = self.contents.path(self.kind, &mut random);
             let begun = Instant::now();
             let asked = match connection.take() {
                 Some(open) => Ok(open),

@@ -2,7 +2,7 @@
 
 use super::super::observed_server::{QueryClient, QueryProtocol};
 use super::sql::{SQL_FAMILIES, SqlAttack};
-use super::wire::{UPLOADS, UploadAttack, WIRE_FAMILIES, WireAttack};
+use super::wire::{UPLOADS, UploadAttack, WIRE_FAMILIES, WireAttack, WirePort};
 
 /// Connections that send a hostile statement at once; more than processors here, as many as a client may open.
 const SQL_CONNECTIONS: usize = 4;
@@ -19,7 +19,7 @@ pub(crate) struct AttackCase {
 #[derive(Debug, Clone, Copy)]
 enum AttackKind {
     Sql(&'static SqlAttack, QueryProtocol),
-    Wire(&'static WireAttack),
+    Wire(WirePort, &'static WireAttack),
     Upload(&'static UploadAttack),
 }
 
@@ -28,14 +28,10 @@ impl AttackCase {
         Self { family, kind }
     }
 
-    pub(crate) fn family(&self) -> &'static str {
-        self.family
-    }
-
     pub(crate) fn name(&self) -> &'static str {
         match self.kind {
             AttackKind::Sql(attack, _) => attack.name,
-            AttackKind::Wire(attack) => attack.name,
+            AttackKind::Wire(_, attack) => attack.name,
             AttackKind::Upload(attack) => attack.name,
         }
     }
@@ -43,7 +39,7 @@ impl AttackCase {
     pub(crate) fn protocol(&self) -> &'static str {
         match self.kind {
             AttackKind::Sql(_, protocol) => protocol.name(),
-            AttackKind::Wire(attack) => attack.port.name(),
+            AttackKind::Wire(port, _) => port.name(),
             AttackKind::Upload(_) => "flight-sql",
         }
     }
@@ -57,7 +53,7 @@ impl AttackCase {
     pub(crate) fn run(&self, client: &QueryClient) -> Vec<String> {
         match self.kind {
             AttackKind::Sql(attack, protocol) => ask_at_once(client, protocol, &(attack.text)()),
-            AttackKind::Wire(attack) => attack.run(client),
+            AttackKind::Wire(port, attack) => attack.run(port, client),
             AttackKind::Upload(attack) => attack.run(client),
         }
     }
@@ -85,11 +81,11 @@ pub(crate) fn all_cases() -> Vec<AttackCase> {
 }
 
 /// Returns the first attacks of each family, over one protocol each.
-pub(crate) fn quick_cases(seed: u64) -> Vec<AttackCase> {
+pub(crate) fn quick_cases() -> Vec<AttackCase> {
     let mut cases = Vec::new();
     for (number, (family, attacks)) in SQL_FAMILIES.into_iter().enumerate() {
         for (place, attack) in attacks.iter().take(QUICK_ATTACKS).enumerate() {
-            let turn = seed as usize + number * QUICK_ATTACKS + place;
+            let turn = number * QUICK_ATTACKS + place;
             let protocol = QueryProtocol::ALL[turn % QueryProtocol::ALL.len()];
             cases.push(AttackCase::new(family, AttackKind::Sql(attack, protocol)));
         }
@@ -105,8 +101,10 @@ pub(crate) fn quick_cases(seed: u64) -> Vec<AttackCase> {
 }
 
 fn wire_cases() -> Vec<AttackCase> {
-    let bytes = WIRE_FAMILIES.into_iter().flatten();
-    let mut cases: Vec<_> = bytes.map(|attack| AttackCase::new(attack.port.name(), AttackKind::Wire(attack))).collect();
+    let mut cases = Vec::new();
+    for (port, attacks) in WIRE_FAMILIES {
+        cases.extend(attacks.iter().map(|attack| AttackCase::new(port.name(), AttackKind::Wire(port, attack))));
+    }
     cases.extend(UPLOADS.iter().map(|attack| AttackCase::new("uploads", AttackKind::Upload(attack))));
     cases
 }

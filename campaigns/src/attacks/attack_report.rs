@@ -1,11 +1,8 @@
-//! Results of the attacks, as a table or JSON, and the goals that they miss.
+//! Results of the attacks as a table, and the goals that they miss.
 #![allow(clippy::print_stdout, reason = "figures are what it is for")]
 
 use std::collections::BTreeMap;
 use std::time::Duration;
-
-use anyhow::Result;
-use serde_json::{Value, json};
 
 use super::super::observed_server::{LightReport, MemoryPeak};
 use super::super::percentile::{millis, percentile};
@@ -34,7 +31,6 @@ pub(crate) enum ServerFate {
 /// An attack over one protocol and what it did.
 #[derive(Debug, Clone)]
 pub(crate) struct AttackRow {
-    pub(super) family: &'static str,
     pub(super) name: &'static str,
     pub(super) protocol: &'static str,
     /// Outcome of each of the attacker's connections.
@@ -86,66 +82,38 @@ impl AttackRow {
             ServerFate::Busy => "BUSY",
         }
     }
-
-    fn to_json(&self) -> Value {
-        json!({
-            "family": self.family,
-            "name": self.name,
-            "protocol": self.protocol,
-            "outcome": self.outcome(),
-            "seconds": self.took.as_secs_f64(),
-            "light_queries": self.light.queries.len(),
-            "light_failures": self.light.failures,
-            "light_p50_ms": millis(percentile(&self.light.queries, 0.5)),
-            "light_max_ms": millis(longest(&self.light.queries)),
-            "health_max_ms": millis(longest(&self.light.health)),
-            "door_max_mib": self.peak.door_mib,
-            "all_max_mib": self.peak.total_mib,
-            "all_before_mib": self.idle_mib,
-            "idle_after_ms": millis(self.idle_time),
-            "server": self.fate_name(),
-            "missed": self.missed_goals(),
-        })
-    }
 }
 
 fn longest(times: &[Duration]) -> Duration {
     times.iter().max().copied().unwrap_or_default()
 }
 
-/// Prints rows of the table.
-pub(super) fn print_rows(rows: &[AttackRow]) {
-    for row in rows {
-        println!(
-            "{:42} {:17} light p50 {:6.0} max {:6.0} wrong {:2}, health {:6.0} ms, door {:5} all {:5} MiB, idle {:5.0} \
-             ms, {:5} {:4.1} s: {}",
-            row.name,
-            row.protocol,
-            millis(percentile(&row.light.queries, 0.5)),
-            millis(longest(&row.light.queries)),
-            row.light.failures.len(),
-            millis(longest(&row.light.health)),
-            row.peak.door_mib,
-            row.peak.total_mib,
-            millis(row.idle_time),
-            row.fate_name(),
-            row.took.as_secs_f64(),
-            row.outcome(),
-        );
-        row.missed_goals().iter().for_each(|goal| println!("  missed: {goal}"));
-        row.light.failures.iter().for_each(|failure| println!("  light query {failure}"));
-    }
+/// Prints a row of the table.
+pub(super) fn print_row(row: &AttackRow) {
+    println!(
+        "{:42} {:17} light p50 {:6.0} max {:6.0} wrong {:2}, health {:6.0} ms, door {:5} all {:5} MiB, idle {:5.0} \
+         ms, {:5} {:4.1} s: {}",
+        row.name,
+        row.protocol,
+        millis(percentile(&row.light.queries, 0.5)),
+        millis(longest(&row.light.queries)),
+        row.light.failures.len(),
+        millis(longest(&row.light.health)),
+        row.peak.door_mib,
+        row.peak.total_mib,
+        millis(row.idle_time),
+        row.fate_name(),
+        row.took.as_secs_f64(),
+        row.outcome(),
+    );
+    row.missed_goals().iter().for_each(|goal| println!("  missed: {goal}"));
+    row.light.failures.iter().for_each(|failure| println!("  light query {failure}"));
 }
 
 /// Prints how many rows miss which goal; returns whether none does.
-pub(super) fn print_summary(rows: &[AttackRow], is_json: bool) -> Result<bool> {
+pub(super) fn print_summary(rows: &[AttackRow]) -> bool {
     let mut missed = BTreeMap::<&str, usize>::new();
     rows.iter().flat_map(AttackRow::missed_goals).for_each(|goal| *missed.entry(goal).or_default() += 1);
-    if is_json {
-        let rows: Vec<_> = rows.iter().map(AttackRow::to_json).collect();
-        println!("{}", serde_json::to_string_pretty(&rows)?);
-        return Ok(missed.is_empty());
-    }
     let count = |fate: &str| rows.iter().filter(|row| row.fate_name() == fate).count();
     println!("{} attacks: {} died, {} capped, {} busy", rows.len(), count("DIED"), count("CAP"), count("BUSY"));
     let light: Vec<_> = rows.iter().flat_map(|row| row.light.queries.iter().copied()).collect();
@@ -157,5 +125,5 @@ pub(super) fn print_summary(rows: &[AttackRow], is_json: bool) -> Result<bool> {
     for (goal, rows) in &missed {
         println!("missed: {goal}: {rows} rows");
     }
-    Ok(missed.is_empty())
+    missed.is_empty()
 }

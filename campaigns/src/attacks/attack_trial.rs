@@ -1,6 +1,5 @@
 //! One attack: other clients query meanwhile, memory is sampled, and afterwards the server must be idle.
 
-use std::sync::mpsc::channel;
 use std::time::{Duration, Instant};
 
 use super::super::observed_server::{LightLoad, MemoryWatch, ObservedServer, QueryClient};
@@ -34,21 +33,22 @@ impl<'a> AttackTrial<'a> {
         let watch = MemoryWatch::start(self.server.process_tree());
         let light = LightLoad::start(self.server);
         let begun = Instant::now();
-        let outcomes = self.attack(case, Duration::from_secs_f64(seconds));
+        let connections = &self.attacker.connections;
+        let outcomes = connections.close_after(Duration::from_secs_f64(seconds), || case.run(&self.attacker));
+        connections.close_all();
         let took = begun.elapsed();
         std::thread::sleep(SHORTEST_TRIAL.saturating_sub(took));
         light.pause();
         std::thread::sleep(SETTLE_TIME);
         let idle_time = self.server.process_tree().processor_time_over(IDLE_TIME);
         let light = light.stop();
-        let fate = self.settle(&watch);
+        let fate = self.find_fate(&watch);
         let peak = watch.peak();
         drop(watch);
         if fate != ServerFate::Alive {
             self.server.restart();
         }
         AttackRow {
-            family: case.family(),
             name: case.name(),
             protocol: case.protocol(),
             outcomes,
@@ -62,24 +62,8 @@ impl<'a> AttackTrial<'a> {
         }
     }
 
-    // Closes the attacker's connections at the limit.
-    fn attack(&self, case: &AttackCase, limit: Duration) -> Vec<String> {
-        let case = *case;
-        let attacker = self.attacker.clone();
-        let (done, outcome) = channel();
-        let attack = std::thread::spawn(move || {
-            // After the limit there is no receiver any more; the outcome is returned, too.
-            let outcomes = case.run(&attacker);
-            let _ = done.send(());
-            outcomes
-        });
-        let _ = outcome.recv_timeout(limit);
-        self.attacker.connections.close_all();
-        attack.join().unwrap_or_else(|_| vec!["panicked".to_owned()])
-    }
-
     // An attack may have effects after its end, and kill the server then: it is watched until it is idle.
-    fn settle(&mut self, watch: &MemoryWatch) -> ServerFate {
+    fn find_fate(&mut self, watch: &MemoryWatch) -> ServerFate {
         let is_idle = self.server.wait_until_idle(IDLE_LIMIT);
         match self.server.is_alive() {
             _ if watch.peak().is_capped => ServerFate::Capped,

@@ -16,7 +16,7 @@ use anyhow::{Result, ensure};
 use super::observed_server::{ClientGroup, ObservedServer};
 pub(crate) use attack_case::{AttackCase, all_cases, quick_cases};
 pub(crate) use attack_report::AttackRow;
-use attack_report::{print_rows, print_summary};
+use attack_report::{print_row, print_summary};
 use attack_trial::AttackTrial;
 
 /// Megabytes that a hostile client's queries may hold; those of its limits below.
@@ -39,29 +39,17 @@ pub(crate) struct AttackArgs {
     /// Duration of an attack, in seconds.
     #[arg(long, value_name = "SECS", default_value_t = 15.0)]
     seconds: f64,
-    /// Seed of which protocol a short selection takes for which attack.
-    #[arg(long, default_value_t = 1)]
-    seed: u64,
     /// A short selection: two attacks of each family, over one protocol each.
     #[arg(long)]
     quick: bool,
-    /// Print the rows as JSON.
-    #[arg(long)]
-    json: bool,
 }
 
 pub(crate) fn run(args: &AttackArgs) -> Result<()> {
-    let mut cases = if args.quick { quick_cases(args.seed) } else { all_cases() };
+    let mut cases = if args.quick { quick_cases() } else { all_cases() };
     cases.retain(|case| args.only.as_ref().is_none_or(|part| case.title().contains(part.as_str())));
     ensure!(!cases.is_empty(), "no attack has this in `NAME PROTOCOL`");
-    let mut progress = |row: &AttackRow| {
-        if !args.json {
-            print_rows(std::slice::from_ref(row));
-        }
-    };
-    let rows = run_cases(&super::echolake_path()?, &cases, args.seconds, &mut progress)?;
-    let is_reached = print_summary(&rows, args.json)?;
-    ensure!(is_reached, "goals are missed");
+    let rows = run_cases(&super::echolake_path()?, &cases, args.seconds, &mut print_row)?;
+    ensure!(print_summary(&rows), "goals are missed");
     Ok(())
 }
 

@@ -20,11 +20,23 @@ pub(crate) type FlightClient = FlightSqlServiceClient<Channel>;
 /// Runs a query; rows are compared as CSV, which does not depend on how they are cut into batches.
 pub(super) fn query(client: &QueryClient, sql: &str) -> QueryOutcome {
     let mut digest = AnswerDigest::default();
-    let answer = client.connections.run(fetch_rows(client, sql, &mut digest));
-    match answer {
-        None => QueryOutcome::Abandoned,
+    match client.connections.run(fetch_rows(client, sql, &mut digest)) {
         Some(Ok(())) => QueryOutcome::Answer(digest),
-        Some(Err(error)) => error_outcome(&error),
+        failed => failure_outcome(failed.and_then(Result::err)),
+    }
+}
+
+/// Returns the outcome of a call that failed by this error, or whose connections were closed.
+pub(crate) fn failure_outcome(error: Option<FlightError>) -> QueryOutcome {
+    // The server's own errors have a code; others come from a connection that ended.
+    match error {
+        None => QueryOutcome::Abandoned,
+        Some(FlightError::Tonic(status)) => match status.metadata().get("echolake-code").map(|code| code.to_str()) {
+            Some(Ok(code)) => QueryOutcome::Refused(code.to_owned()),
+            _ if is_transport(&status) => QueryOutcome::Disconnected,
+            _ => QueryOutcome::Refused(format!("grpc {:?}", status.code())),
+        },
+        Some(_) => QueryOutcome::Disconnected,
     }
 }
 
@@ -32,9 +44,10 @@ pub(super) fn query(client: &QueryClient, sql: &str) -> QueryOutcome {
 ///
 /// # Errors
 /// The connection is not accepted.
-pub(crate) async fn flight_client(client: &QueryClient) -> Result<FlightClient, tonic::transport::Error> {
-    let endpoint = Endpoint::from_shared(format!("http://{}", client.addresses.flight_sql))?;
-    let channel = endpoint.local_address(Some(client.connections.source().into())).connect().await?;
+pub(crate) async fn flight_client(client: &QueryClient) -> Result<FlightClient, FlightError> {
+    let failed = |error| FlightError::ExternalError(Box::new(error));
+    let endpoint = Endpoint::from_shared(format!("http://{}", client.addresses.flight_sql)).map_err(failed)?;
+    let channel = endpoint.local_address(Some(client.connections.source().into())).connect().await.map_err(failed)?;
     let inner = arrow_flight::flight_service_client::FlightServiceClient::new(channel);
     let mut flight = FlightClient::new_from_inner(inner.max_decoding_message_size(LARGEST_MESSAGE));
     flight.set_token(client.token.clone());
@@ -42,8 +55,7 @@ pub(crate) async fn flight_client(client: &QueryClient) -> Result<FlightClient, 
 }
 
 async fn fetch_rows(client: &QueryClient, sql: &str, digest: &mut AnswerDigest) -> Result<(), FlightError> {
-    let connected = flight_client(client).await;
-    let mut flight = connected.map_err(|error| FlightError::ExternalError(Box::new(error)))?;
+    let mut flight = flight_client(client).await?;
     let info = flight.execute(sql.to_owned(), None).await?;
     for ticket in info.endpoint.into_iter().filter_map(|endpoint| endpoint.ticket) {
         let mut rows = flight.do_get(ticket).await?;
@@ -62,16 +74,6 @@ fn write_rows(batch: &RecordBatch, digest: &mut AnswerDigest) -> Result<(), Arro
         return Ok(());
     }
     written
-}
-
-// The server's own errors have a code; others come from a connection that ended.
-fn error_outcome(error: &FlightError) -> QueryOutcome {
-    let FlightError::Tonic(status) = error else { return QueryOutcome::Disconnected };
-    match status.metadata().get("echolake-code").and_then(|code| code.to_str().ok()) {
-        Some(code) => QueryOutcome::Refused(code.to_owned()),
-        None if is_transport(status) => QueryOutcome::Disconnected,
-        None => QueryOutcome::Refused(format!("grpc {:?}", status.code())),
-    }
 }
 
 fn is_transport(status: &tonic::Status) -> bool {

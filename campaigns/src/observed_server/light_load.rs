@@ -2,12 +2,11 @@
 
 use std::io;
 use std::net::Ipv4Addr;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
-use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use super::query_client::AnswerDigest;
+use super::repeated_work::RepeatedWork;
 use super::{ObservedServer, QueryClient, QueryOutcome, QueryProtocol, http_query};
 use crate::serve::http::HttpRequest;
 
@@ -41,61 +40,44 @@ pub(crate) struct LightReport {
 /// Threads that probe until they are stopped.
 pub(crate) struct LightLoad {
     report: Arc<Mutex<LightReport>>,
-    is_stopped: Arc<AtomicBool>,
-    probes: Vec<JoinHandle<()>>,
+    probes: [RepeatedWork; 3],
 }
 
 impl LightLoad {
     pub(crate) fn start(server: &ObservedServer) -> Self {
         let report = Arc::<Mutex<LightReport>>::default();
-        let is_stopped = Arc::<AtomicBool>::default();
         let kinds = [(LightProbe::HttpQuery, 0), (LightProbe::PostgresQuery, 1), (LightProbe::Health, 2)];
         let probes = kinds.map(|(probe, number)| {
             let client = server.client("light", number);
             let runs = server.run_count();
             let found = report.clone();
-            let stop = is_stopped.clone();
-            std::thread::spawn(move || run_probes(probe, &client, runs, &found, &stop))
+            RepeatedWork::start(PROBE_EVERY, move || run_probe(probe, &client, runs, &found))
         });
-        Self { report, is_stopped, probes: probes.into() }
+        Self { report, probes }
     }
 
     /// Begins no more probes.
     pub(crate) fn pause(&self) {
-        self.is_stopped.store(true, Ordering::Relaxed);
+        self.probes.iter().for_each(RepeatedWork::stop);
     }
 
     /// Waits for the probes that run, and returns what all of them found.
     pub(crate) fn stop(self) -> LightReport {
-        self.pause();
-        for probe in self.probes {
-            // A probe that panicked has its results in the report all the same.
-            let _ = probe.join();
-        }
+        drop(self.probes);
         self.report.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 }
 
-fn run_probes(
-    probe: LightProbe,
-    client: &QueryClient,
-    runs: usize,
-    report: &Mutex<LightReport>,
-    is_stopped: &AtomicBool,
-) {
-    while !is_stopped.load(Ordering::Relaxed) {
-        let begun = Instant::now();
-        let outcome = send_probe(probe, client);
-        let took = begun.elapsed();
-        let mut report = report.lock().unwrap_or_else(PoisonError::into_inner);
-        if !is_right(probe, &outcome, runs) {
-            report.failures.push(format!("{probe:?}: {outcome}"));
-        }
-        let times = if probe == LightProbe::Health { &mut report.health } else { &mut report.queries };
-        times.push(took);
-        drop(report);
-        std::thread::sleep(PROBE_EVERY.saturating_sub(took));
+fn run_probe(probe: LightProbe, client: &QueryClient, runs: usize, report: &Mutex<LightReport>) {
+    let begun = Instant::now();
+    let outcome = send_probe(probe, client);
+    let took = begun.elapsed();
+    let mut report = report.lock().unwrap_or_else(PoisonError::into_inner);
+    if !is_right(probe, &outcome, runs) {
+        report.failures.push(format!("{probe:?}: {outcome}"));
     }
+    let times = if probe == LightProbe::Health { &mut report.health } else { &mut report.queries };
+    times.push(took);
 }
 
 fn send_probe(probe: LightProbe, client: &QueryClient) -> QueryOutcome {

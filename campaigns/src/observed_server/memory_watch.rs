@@ -1,11 +1,10 @@
 //! Samples the memory of a server's processes, and kills them before they take what others on the machine need.
 
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
-use std::thread::JoinHandle;
 use std::time::Duration;
 
 use super::ProcessTree;
+use super::repeated_work::RepeatedWork;
 
 /// Between two samples.
 const SAMPLE_EVERY: Duration = Duration::from_millis(50);
@@ -21,39 +20,23 @@ pub(crate) struct MemoryPeak {
     pub(crate) is_capped: bool,
 }
 
-/// A thread that samples until it is stopped.
+/// Samples until it is dropped.
 pub(crate) struct MemoryWatch {
     peak: Arc<Mutex<MemoryPeak>>,
-    is_stopped: Arc<AtomicBool>,
-    sampler: Option<JoinHandle<()>>,
+    _sampler: RepeatedWork,
 }
 
 impl MemoryWatch {
     pub(crate) fn start(tree: ProcessTree) -> Self {
-        let peak = Arc::new(Mutex::new(MemoryPeak::default()));
-        let is_stopped = Arc::new(AtomicBool::new(false));
+        let peak = Arc::<Mutex<MemoryPeak>>::default();
         let sampled = peak.clone();
-        let stop = is_stopped.clone();
-        let sampler = std::thread::spawn(move || {
-            while !stop.load(Ordering::Relaxed) {
-                take_sample(tree, &sampled);
-                std::thread::sleep(SAMPLE_EVERY);
-            }
-        });
-        Self { peak, is_stopped, sampler: Some(sampler) }
+        let _sampler = RepeatedWork::start(SAMPLE_EVERY, move || take_sample(tree, &sampled));
+        Self { peak, _sampler }
     }
 
     /// Returns the peak so far.
     pub(crate) fn peak(&self) -> MemoryPeak {
         *self.peak.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-}
-
-impl Drop for MemoryWatch {
-    fn drop(&mut self) {
-        self.is_stopped.store(true, Ordering::Relaxed);
-        // A sampler that panicked has nothing more to say.
-        let _ = self.sampler.take().map(JoinHandle::join);
     }
 }
 

@@ -19,16 +19,17 @@ mod postgres_query;
 mod process_tree;
 mod protocol_query;
 mod query_client;
+mod repeated_work;
 mod right_answers;
 
 pub(crate) use client_connections::ClientConnections;
-pub(crate) use flight_query::{FlightClient, flight_client};
+pub(crate) use flight_query::{FlightClient, failure_outcome, flight_client};
 pub(crate) use light_load::{LightLoad, LightReport};
 pub(crate) use memory_watch::{MemoryPeak, MemoryWatch};
 pub(crate) use postgres_query::{PostgresClient, startup_message, tagged_message};
 pub(crate) use process_tree::{ProcessTree, kill_process};
 pub(crate) use query_client::{QueryClient, QueryOutcome, QueryProtocol, percent_encoded};
-pub(crate) use right_answers::{RightAnswers, take_right_answers};
+pub(crate) use right_answers::{AnswerTally, RightAnswers, take_right_answers};
 
 /// Memory of all queries together, MiB: `--memory`.
 const QUERY_MEMORY_MIB: &str = "2048";

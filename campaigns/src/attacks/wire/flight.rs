@@ -1,16 +1,7 @@
 //! Attacks on gRPC and the HTTP/2 below it. The frames are built here, because client libraries send no invalid ones.
 
 use super::super::super::observed_server::QueryClient;
-use super::{WireAttack, WireFlow, WirePort};
-
-const fn attack(
-    name: &'static str,
-    connections: usize,
-    opening: fn(&QueryClient) -> Vec<u8>,
-    flow: WireFlow,
-) -> WireAttack {
-    super::attack(name, WirePort::FlightSql, connections, opening, flow)
-}
+use super::{WireAttack, WireFlow, attack};
 
 pub(super) const ATTACKS: &[WireAttack] = &[
     attack("connections that say nothing", 300, |_| Vec::new(), WireFlow::Hold),

@@ -1,16 +1,7 @@
 //! Attacks on HTTP: what comes slowly, what never ends, and what says of itself that it is larger or other than it is.
 
 use super::super::super::observed_server::{QueryClient, percent_encoded};
-use super::{WireAttack, WireFlow, WirePort};
-
-const fn attack(
-    name: &'static str,
-    connections: usize,
-    opening: fn(&QueryClient) -> Vec<u8>,
-    flow: WireFlow,
-) -> WireAttack {
-    super::attack(name, WirePort::Http, connections, opening, flow)
-}
+use super::{WireAttack, WireFlow, attack};
 
 pub(super) const ATTACKS: &[WireAttack] = &[
     attack("slow heads", 600, |_| b"GET /health HTTP/1.1\r\nhost: ".to_vec(), WireFlow::Drip(blanks)),

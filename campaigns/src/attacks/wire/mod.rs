@@ -52,7 +52,6 @@ pub(crate) enum WireFlow {
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct WireAttack {
     pub(crate) name: &'static str,
-    pub(crate) port: WirePort,
     /// Connections at once.
     connections: usize,
     /// The first bytes of each.
@@ -61,7 +60,8 @@ pub(crate) struct WireAttack {
 }
 
 /// The attacks by bytes, by protocol.
-pub(crate) const WIRE_FAMILIES: [&[WireAttack]; 3] = [postgres::ATTACKS, http::ATTACKS, flight::ATTACKS];
+pub(crate) const WIRE_FAMILIES: [(WirePort, &[WireAttack]); 3] =
+    [(WirePort::Postgres, postgres::ATTACKS), (WirePort::Http, http::ATTACKS), (WirePort::FlightSql, flight::ATTACKS)];
 /// The attacks by what Flight SQL's DoPut carries.
 pub(crate) const UPLOADS: &[UploadAttack] = uploads::ATTACKS;
 
@@ -81,70 +81,64 @@ impl WirePort {
             Self::FlightSql => &client.addresses.flight_sql,
         }
     }
+
+    // Postgres' server answers all before it sees the end; those of HTTP take an end for a client that is gone.
+    fn flood(self, client: &QueryClient, stream: &TcpStream, block: BlockMaker, count: usize) -> io::Result<()> {
+        (0..count).try_for_each(|number| send(stream, &block(client, number)))?;
+        self.end_writing(stream)
+    }
+
+    fn end_writing(self, stream: &TcpStream) -> io::Result<()> {
+        if self == Self::Postgres { stream.shutdown(Shutdown::Write) } else { Ok(()) }
+    }
 }
 
-const fn attack(
-    name: &'static str,
-    port: WirePort,
-    connections: usize,
-    opening: BytesMaker,
-    flow: WireFlow,
-) -> WireAttack {
-    WireAttack { name, port, connections, opening, flow }
+const fn attack(name: &'static str, connections: usize, opening: BytesMaker, flow: WireFlow) -> WireAttack {
+    WireAttack { name, connections, opening, flow }
 }
 
 impl WireAttack {
     /// Runs it until it ends or the client's connections are closed; returns how each connection ended.
-    pub(crate) fn run(&self, client: &QueryClient) -> Vec<String> {
+    pub(crate) fn run(&self, port: WirePort, client: &QueryClient) -> Vec<String> {
         let opening = (self.opening)(client);
         std::thread::scope(|scope| {
-            let run = || self.run_connection(client, &opening);
+            let run = || self.run_connection(port, client, &opening);
             let connections: Vec<_> = (0..self.connections).map(|_| scope.spawn(run)).collect();
             connections.into_iter().map(|c| c.join().unwrap_or_else(|_| "panicked".to_owned())).collect()
         })
     }
 
-    fn run_connection(&self, client: &QueryClient, opening: &[u8]) -> String {
+    fn run_connection(&self, port: WirePort, client: &QueryClient, opening: &[u8]) -> String {
         let rounds = if let WireFlow::Reconnect(times) = self.flow { times } else { 1 };
         let mut heard = Vec::new();
         for _ in 0..rounds {
-            match client.connections.connect(self.port.address(client)) {
-                Ok(stream) => heard = self.talk(client, &stream, opening),
+            match client.connections.connect(port.address(client)) {
+                Ok(stream) => heard = self.talk(port, client, &stream, opening),
                 Err(_) => break,
             }
         }
         match heard.as_slice() {
             [] if client.connections.is_closed() => "time limit".to_owned(),
             [] => "connection closed".to_owned(),
-            bytes => answer_name(self.port, bytes),
+            bytes => answer_name(port, bytes),
         }
     }
 
     // Sends all; returns the beginning of what came back.
-    fn talk(&self, client: &QueryClient, stream: &TcpStream, opening: &[u8]) -> Vec<u8> {
+    fn talk(&self, port: WirePort, client: &QueryClient, stream: &TcpStream, opening: &[u8]) -> Vec<u8> {
         // A server may close as soon as it has seen enough, so that no failure to send is one of the attack's.
         let _ = send(stream, opening);
         match self.flow {
-            WireFlow::ReadAnswer => read_meanwhile(stream, || self.end_writing(stream)),
+            WireFlow::ReadAnswer => read_meanwhile(stream, || port.end_writing(stream)),
             WireFlow::Hold => wait_for_close(client),
             WireFlow::Reconnect(_) => Vec::new(),
             WireFlow::FloodUnread(block, count) => {
-                let _ = self.flood(client, stream, block, count);
+                let _ = port.flood(client, stream, block, count);
                 wait_for_close(client)
             }
-            WireFlow::Flood(block, count) => read_meanwhile(stream, || self.flood(client, stream, block, count)),
+            WireFlow::Flood(block, count) => read_meanwhile(stream, || port.flood(client, stream, block, count)),
             WireFlow::Drip(block) => read_meanwhile(stream, || drip(stream, &block(client))),
         }
-    }
-
-    // Postgres' server answers all before it sees the end; those of HTTP take an end for a client that is gone.
-    fn flood(&self, client: &QueryClient, stream: &TcpStream, block: BlockMaker, count: usize) -> io::Result<()> {
-        (0..count).try_for_each(|number| send(stream, &block(client, number)))?;
-        self.end_writing(stream)
-    }
-
-    fn end_writing(&self, stream: &TcpStream) -> io::Result<()> {
-        if self.port == WirePort::Postgres { stream.shutdown(Shutdown::Write) } else { Ok(()) }
     }
 }
 

@@ -1,16 +1,7 @@
 //! Attacks on Postgres' protocol: lengths that lie, messages that never end, and more of everything than is sensible.
 
 use super::super::super::observed_server::{QueryClient, startup_message, tagged_message};
-use super::{WireAttack, WireFlow, WirePort};
-
-const fn attack(
-    name: &'static str,
-    connections: usize,
-    opening: fn(&QueryClient) -> Vec<u8>,
-    flow: WireFlow,
-) -> WireAttack {
-    super::attack(name, WirePort::Postgres, connections, opening, flow)
-}
+use super::{WireAttack, WireFlow, attack};
 
 pub(super) const ATTACKS: &[WireAttack] = &[
     attack("query of 1 GiB before log-in", 8, |_| begun(&startup_message(), b'Q'), WireFlow::Flood(megabyte, 1023)),

@@ -16,7 +16,7 @@ use arrow_flight::{Action, FlightData, FlightDescriptor};
 use futures::{StreamExt as _, TryStreamExt as _, stream};
 use prost::Message as _;
 
-use super::super::super::observed_server::{FlightClient, QueryClient, flight_client};
+use super::super::super::observed_server::{FlightClient, QueryClient, failure_outcome, flight_client};
 
 /// A length that nothing in memory has.
 const LYING_LENGTH: i64 = 1 << 62;
@@ -64,20 +64,14 @@ impl UploadAttack {
 
     fn put(&self, client: &QueryClient, upload: Vec<FlightData>) -> String {
         match client.connections.run(put_parameters(client, upload, self.repeats)) {
-            None => "time limit".to_owned(),
             Some(Ok(())) => "answer".to_owned(),
-            Some(Err(FlightError::Tonic(status))) => {
-                let code = status.metadata().get("echolake-code").and_then(|code| code.to_str().ok());
-                code.map_or_else(|| format!("grpc {:?}", status.code()), str::to_owned)
-            }
-            Some(Err(_)) => "connection closed".to_owned(),
+            failed => failure_outcome(failed.and_then(Result::err)).to_string(),
         }
     }
 }
 
 async fn put_parameters(client: &QueryClient, mut upload: Vec<FlightData>, repeats: usize) -> Result<(), FlightError> {
-    let connected = flight_client(client).await;
-    let mut flight = connected.map_err(|error| FlightError::ExternalError(Box::new(error)))?;
+    let mut flight = flight_client(client).await?;
     let command = CommandPreparedStatementQuery { prepared_statement_handle: prepare(&mut flight).await?.into() };
     if let Some(first) = upload.first_mut() {
         first.flight_descriptor = Some(FlightDescriptor::new_cmd(command.as_any().encode_to_vec()));
