@@ -44,8 +44,8 @@ paper *LAKE:
     docs/paper/make.sh {{ LAKE }}
 
 # A long form of what tests try in short: docs/testing.md lists them.
-campaign NAME *OPTIONS:
-    cargo run --profile quick --locked -p echolake-campaigns -- {{ NAME }} {{ OPTIONS }}
+stress NAME *OPTIONS:
+    cargo run --profile quick --locked -p echolake-stress -- {{ NAME }} {{ OPTIONS }}
 
 # Fuzzes a reader of foreign bytes with coverage, as `just fuzz sofa 3600`; targets are in fuzz/targets/ and fuzz/wires/targets/.
 fuzz TARGET *OPTIONS:
@@ -53,7 +53,7 @@ fuzz TARGET *OPTIONS:
 
 # A benchmark, built as packages are; `kernels` are criterion's.
 bench NAME *OPTIONS:
-    {{ if NAME == "kernels" { "cargo bench --manifest-path campaigns/kernels/Cargo.toml --locked --" } else { "cargo run --profile dist --locked -p echolake-campaigns -- " + NAME } }} {{ OPTIONS }}
+    {{ if NAME == "kernels" { "cargo bench --manifest-path stress/kernels/Cargo.toml --locked --" } else { "cargo run --profile dist --locked -p echolake-stress -- " + NAME } }} {{ OPTIONS }}
 
 # What a change must pass.
 ci:

@@ -22,7 +22,7 @@ import urllib.request
 from collections.abc import Callable
 from pathlib import Path
 
-QUERIES = Path(__file__).resolve().parent.parent / "campaigns/src/query_bench/queries.sql"
+QUERIES = Path(__file__).resolve().parent.parent / "stress/src/query_bench/queries.sql"
 # A query is asked this often in a round; its time is the least, because a busy machine only ever adds to it.
 ASKED = 5
 LONGEST_SECONDS = 1800

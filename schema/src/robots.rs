@@ -44,7 +44,7 @@ pub enum Rod {
 
 impl Default for RobotCell {
     /// An arrangement in which the paper's whole grid is within reach. The paper prints no positions; these were
-    /// found by trial (`campaigns/src/motion.rs` prints the reach): the arms face each other over the
+    /// found by trial (`stress/src/motion.rs` prints the reach): the arms face each other over the
     /// panel, the microphone's at lower x, because in a layer the microphone's point has the lower x. The relief's
     /// top is 29 mm over the mean plane (the paper's heights against those of the published data).
     fn default() -> Self {

@@ -4,21 +4,21 @@
 #![allow(clippy::module_inception, reason = "the campaign has the name of its tests")]
 
 #[allow(dead_code, reason = "the campaign, of which this wants a part")]
-#[path = "../../campaigns/src/attacks/mod.rs"]
+#[path = "../../stress/src/attacks/mod.rs"]
 mod attacks;
 #[allow(dead_code, reason = "the campaign, of which this wants a part")]
-#[path = "../../campaigns/src/cancels.rs"]
+#[path = "../../stress/src/cancels.rs"]
 mod cancels;
 #[allow(dead_code, reason = "the campaign, of which this wants a part")]
-#[path = "../../campaigns/src/engine_kills.rs"]
+#[path = "../../stress/src/engine_kills.rs"]
 mod engine_kills;
 #[allow(dead_code, reason = "the campaign, of which this wants a part")]
-#[path = "../../campaigns/src/hostile_clients.rs"]
+#[path = "../../stress/src/hostile_clients.rs"]
 mod hostile_clients;
 #[allow(dead_code, reason = "the campaigns' helper, of which this wants a part")]
-#[path = "../../campaigns/src/observed_server/mod.rs"]
+#[path = "../../stress/src/observed_server/mod.rs"]
 mod observed_server;
-#[path = "../../campaigns/src/percentile.rs"]
+#[path = "../../stress/src/percentile.rs"]
 mod percentile;
 
 use std::path::PathBuf;

@@ -52,8 +52,8 @@ static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
 /// Campaigns and benchmarks of echolake.
 #[derive(Debug, clap::Parser)]
-#[command(name = "campaign", max_term_width = 100)]
-struct CampaignCli {
+#[command(name = "stress", max_term_width = 100)]
+struct StressCli {
     #[command(subcommand)]
     campaign: CampaignCommand,
 }
@@ -93,7 +93,7 @@ enum CampaignCommand {
 }
 
 fn main() -> Result<()> {
-    match CampaignCli::parse().campaign {
+    match StressCli::parse().campaign {
         CampaignCommand::Kills(args) => kill_ingest::run(&args),
         CampaignCommand::HostileFiles(args) => hostile_ingest::run(&args),
         CampaignCommand::AcquireKills(args) => kill_acquire::run(&args),
