@@ -25,7 +25,7 @@ use super::columns::{parse_expr, parse_statement, read_array};
 /// Columns of `pg_type` that name a function by its number.
 const FUNCTIONS: [&str; 6] = ["typinput", "typoutput", "typreceive", "typsend", "typmodin", "typmodout"];
 /// The beginnings of the names of truths that clients compare with `t` and `f`.
-const TRUTHS: [&str; 2] = ["indis", "condefer"];
+const TRUTHS: [&str; 3] = ["attnotnull", "condefer", "indis"];
 /// Aggregates that a subquery may have already.
 const AGGREGATES: [&str; 8] = ["array_agg", "avg", "bool_or", "count", "max", "min", "string_agg", "sum"];
 /// Functions that give a row for each element of a list, and the same in other words; `{}` is for their arguments.
@@ -108,6 +108,15 @@ impl VisitorMut for StatementRelations {
                 _ => self.reads_other = true,
             },
             _ => {}
+        }
+        ControlFlow::Continue(())
+    }
+
+    // Nothing of the lake is named so, either.
+    fn pre_visit_expr(&mut self, expr: &mut Expr) -> ControlFlow<()> {
+        if let Expr::Function(function) = expr {
+            self.reads_catalog |= matches!(&function.name.0[..], [schema, _]
+                if schema.as_ident().is_some_and(|schema| schema.value.eq_ignore_ascii_case(PG_CATALOG)));
         }
         ControlFlow::Continue(())
     }
@@ -259,6 +268,9 @@ impl VisitorMut for CatalogAdapter<'_> {
         }
         match expr {
             Expr::AnyOp { right, .. } | Expr::AllOp { right, .. } => read_array(right),
+            Expr::Case { operand: Some(operand), conditions, .. } if is_truth(operand) => {
+                conditions.iter_mut().for_each(|when| read_truth(&mut when.condition));
+            }
             Expr::Like { pattern, escape_char, .. } | Expr::ILike { pattern, escape_char, .. } => {
                 escape_by_backslash(pattern, escape_char);
             }
@@ -358,8 +370,9 @@ impl CatalogAdapter<'_> {
             let list = quote_text(text.trim_matches(['{', '}']));
             return parse_expr(&format!("array_to_string({left}, ',') {op} {list}"));
         }
-        let is_truth = ["t", "f"].contains(&text.as_str()) && TRUTHS.iter().any(|begin| name.starts_with(begin));
-        is_truth.then(|| parse_expr(&format!("{left} {op} {}", text == "t"))).flatten()
+        let mut truth = right.clone();
+        read_truth(&mut truth);
+        (is_truth(left) && truth != *right).then(|| parse_expr(&format!("{left} {op} {truth}"))).flatten()
     }
 
     // The rows of a query as an array: ARRAY(SELECT x ... ORDER BY y) is array_agg(x ORDER BY y), but for no rows.
@@ -375,6 +388,18 @@ impl CatalogAdapter<'_> {
         }
         let list = Expr::Subquery(Box::new(aggregated(query, "array_agg")?));
         parse_expr(&format!("coalesce({list}, ARRAY[])"))
+    }
+}
+
+fn is_truth(expr: &Expr) -> bool {
+    column_name(expr).is_some_and(|name| TRUTHS.iter().any(|begin| name.starts_with(begin)))
+}
+
+fn read_truth(expr: &mut Expr) {
+    if let Expr::Value(ValueWithSpan { value: Value::SingleQuotedString(text), .. }) = expr
+        && ["t", "f"].contains(&text.as_str())
+    {
+        *expr = Expr::value(Value::Boolean(text == "t"));
     }
 }
 
@@ -540,6 +565,7 @@ mod tests {
             "SELECT k FROM UNNEST(ARRAY[3, 1]) AS k",
             "SELECT ARRAY(SELECT x FROM UNNEST(ARRAY[3, 1]) AS t (x)) AS n",
             "SELECT x FROM (VALUES (1)) AS t (x) WHERE 1 = 1",
+            "SELECT pg_catalog.upper(surface_id) AS n FROM runs",
             "SELECT value AS regclass FROM mcap('a', '/b')",
             "WITH pg AS (SELECT 1 AS x) SELECT x FROM pg, runs",
         ] {
@@ -615,6 +641,14 @@ mod tests {
             (
                 "SELECT relname FROM pg_class WHERE relkind = ANY('{r,\"v\"}')",
                 "SELECT relname FROM pg_catalog.pg_class WHERE relkind = ANY(ARRAY['r', 'v'])",
+            ),
+            (
+                "SELECT CASE a.attnotnull WHEN 't' THEN 0 END AS n FROM pg_attribute a",
+                "SELECT CASE a.attnotnull WHEN true THEN 0 END AS n FROM pg_catalog.pg_attribute a",
+            ),
+            (
+                "SELECT pg_catalog.format_type(tp, 1) AS n FROM (VALUES (23)) AS s (tp)",
+                "SELECT format_type(tp, 1) AS n FROM (VALUES (23)) AS s (tp)",
             ),
             ("SELECT (keys).n FROM pg_index", "SELECT get_field((keys), 'n') AS \"n\" FROM pg_catalog.pg_index"),
             (
