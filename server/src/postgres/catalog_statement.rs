@@ -1,6 +1,6 @@
 //! Statements about the server alone: those all of whose relations are of `pg_catalog` or `information_schema`, and
-//! those without any. [`find_catalog_names`] decides; such a statement is then adapted here, by rules on its syntax tree
-//! that put what DataFusion lacks in other words. A statement that names anything of the lake never comes here.
+//! those without any. [`find_catalog_names`] decides; such a statement is then adapted here, by rules on its syntax
+//! tree that put what DataFusion lacks in other words. A statement that names anything of the lake never comes here.
 
 use std::collections::HashSet;
 use std::ops::ControlFlow;
@@ -56,8 +56,8 @@ const RULES: [&dyn SqlStatementRewriteRule; 6] = [
 /// domains, ranges or rows: DataFusion does not end its recursion.
 const TYPE_TREE: &str = "typeinfo_tree";
 const TYPES: &str = "SELECT t.oid, n.nspname AS ns, t.typname AS name, t.typtype AS kind, \
-     CAST(NULL AS oid) AS basetype, t.typelem AS elemtype, e.typdelim AS elemdelim, CAST(NULL AS oid) AS range_subtype, \
-     CAST(NULL AS TEXT) AS attrtypoids, CAST(NULL AS TEXT) AS attrnames, \
+     CAST(NULL AS oid) AS basetype, t.typelem AS elemtype, e.typdelim AS elemdelim, \
+     CAST(NULL AS oid) AS range_subtype, CAST(NULL AS TEXT) AS attrtypoids, CAST(NULL AS TEXT) AS attrnames, \
      CASE WHEN array_contains($1::oid[], t.oid) THEN 0 ELSE 1 END AS depth, CAST(NULL AS TEXT) AS basetype_name, \
      e.typname AS elemtype_name, CAST(NULL AS TEXT) AS range_subtype_name \
      FROM pg_catalog.pg_type t JOIN pg_catalog.pg_namespace n ON n.oid = t.typnamespace \
