@@ -9,7 +9,7 @@ use echolake_acquisition::panel::collection::{CollectionSurface, collection};
 use echolake_acquisition::run::controller::RecordingMode;
 use echolake_acquisition::run::simulate::simulate;
 use echolake_acquisition::run::{PanelSpecimen, RunRequest};
-use echolake_ingest::{FileReport as Told, LakeIngest, pending};
+use echolake_ingest::{FileReport, LakeIngest, pending};
 use echolake_lake::{Lake, ReferenceSurfaces};
 use echolake_schema::manifest::{Origin, RunEnd};
 use echolake_schema::{Rig, Timestamp};
@@ -124,8 +124,8 @@ impl SimulatedRuns {
             Lake::open_or_create(&folder.display().to_string(), &Rig::paper(), &ReferenceSurfaces::default()).await?;
         let ingest = LakeIngest::new(&lake, Arc::default());
         let (mut accepted, mut refused) = (0, Vec::new());
-        let mut report = |told| match told {
-            Told::Taken(taken) => accepted += taken.measurements as u64,
+        let mut report = |report| match report {
+            FileReport::Ingested(run) => accepted += run.measurements as u64,
             other => refused.push(format!("{other:?}")),
         };
         forget_peak();
