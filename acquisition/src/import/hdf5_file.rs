@@ -237,12 +237,12 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("hollow.h5");
         let mut builder = FileBuilder::new();
-        // Equal numbers are packed to none.
+        // Equal numbers are packed to a bit each, and equal bits by a thousand.
         let hollow = builder.create_dataset("hollow").with_i32_data(&vec![7; 1 << 22]).with_chunks(&[1 << 20]);
-        hollow.with_scale_offset(ScaleOffset::Integer(0));
+        hollow.with_scale_offset(ScaleOffset::Integer(0)).with_deflate(9);
         builder.write(&path).expect("written");
-        let read = Hdf5File::open(&path).and_then(|file| file.variable("hollow"));
-        assert!(read.as_ref().is_err_and(|e| e.contains("more than a file of")), "{read:?}");
+        let fault = Hdf5File::open(&path).and_then(|file| file.variable("hollow")).err().unwrap_or_default();
+        assert!(fault.contains("more than a file of"), "{fault:?}");
     }
 
     // Written by h5py, then opened again, `RoomTemperature` renamed to `x`, and `w1` deleted: the group's heap has both
