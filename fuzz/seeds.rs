@@ -4,8 +4,8 @@ use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
 use echolake_acquisition::import::import_wav;
-use echolake_acquisition::panel::mesh::{Mesh, MeshFormat};
-use echolake_acquisition::panel::relief::HeightField;
+use echolake_panel::mesh::{Mesh, MeshFormat};
+use echolake_panel::relief::HeightField;
 use hdf5_pure::{AttrValue, FileBuilder};
 use hound::{SampleFormat, WavSpec, WavWriter};
 use ndarray::Array2;

@@ -8,6 +8,8 @@ use std::collections::{HashMap, HashSet};
 use std::fs::File;
 use std::path::{Path, PathBuf};
 
+use echolake_panel::mesh::{BACK_MM, MESH_CELLS, Mesh};
+use echolake_panel::relief::HeightField;
 use echolake_schema::interchange::{GIR_COMBINATIONS, GIR_PANEL_INFO};
 use echolake_schema::manifest::{MeshFacts, Origin, RunEnd};
 use echolake_schema::{Celsius, Grid, Pair, PairId, Rig, SurfaceId, SurfaceRecord};
@@ -17,8 +19,6 @@ use ndarray_npy::{NpzReader, ReadableElement};
 use super::batch::ImportBatch;
 use super::response::ImportedResponse;
 use super::{Error, ImportOptions, ImportedRun, RUN_SECS, wrong};
-use crate::panel::mesh::{BACK_MM, MESH_CELLS, Mesh};
-use crate::panel::relief::HeightField;
 use crate::rig::devices::simulated::TAKE_SECS;
 use crate::run::recorder::{LogLevel, Relief, RunStart};
 

@@ -25,8 +25,8 @@ pub use settings::FULL_SCALE;
 
 pub use echolake_dsp::height_field::HeightField;
 
-use crate::panel::material::SurfaceMaterial;
-use crate::panel::paper_panel::PaperPanel;
+use crate::material::SurfaceMaterial;
+use crate::paper_panel::PaperPanel;
 use chance::SeededRandom;
 
 /// Edge of a panel, mm (Rust et al. 2021).

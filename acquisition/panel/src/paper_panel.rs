@@ -175,7 +175,7 @@ impl PaperPanel {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::panel::relief::PanelRelief;
+    use crate::relief::PanelRelief;
 
     #[test]
     fn every_panel_of_the_paper_is_made_by_its_name() {

@@ -12,7 +12,7 @@ use gltf::mesh::Mode;
 use gltf::{Accessor, Document, Glb, Node, Primitive, Semantic};
 
 use super::from_gltf;
-use crate::panel::mesh::{Error, Mesh};
+use crate::mesh::{Error, Mesh};
 
 /// Most vertices, and most triangles, that a scene may have once its instances are made. Accessors and meshes are
 /// shared, so a small file can ask for any number; a panel with a vertex every 0.5 mm on both sides has 2.7 million

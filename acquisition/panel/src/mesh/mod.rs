@@ -12,8 +12,10 @@ use std::path::Path;
 /// Largest mesh file that is read: ten times the published panels'.
 const LARGEST_FILE: u64 = 1 << 30;
 
+/// Facets along each side of heights: 2.14 mm, a quarter of the wavelength at 40 kHz.
+pub(crate) const FACETS: usize = 274;
 /// Cells along each side of a mesh that is recorded beside a height field.
-pub(crate) const MESH_CELLS: usize = 117;
+pub const MESH_CELLS: usize = 117;
 /// The back of a panel with one side, mm.
 pub const BACK_MM: f32 = -30.0;
 
@@ -121,7 +123,7 @@ impl Mesh {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::panel::relief::PanelRelief;
+    use crate::relief::PanelRelief;
 
     const READ: [MeshFormat; 2] = [MeshFormat::Glb, MeshFormat::Stl];
 

@@ -3,9 +3,8 @@
 use std::collections::HashMap;
 use std::path::Path;
 
-use super::{Error, Mesh, PanelSide};
-use crate::panel::relief::{HeightField, RELIEF_MM};
-use crate::rig::devices::simulated::FACETS;
+use super::{Error, FACETS, Mesh, PanelSide};
+use crate::relief::{HeightField, RELIEF_MM};
 
 /// From the plane of a panel's front to that of its back, mm: 100 less twice the relief's greatest height.
 const CORE_MM: f64 = 42.0;
@@ -246,7 +245,7 @@ fn rasterise(corners: [[f64; 3]; 3], cells: usize, tops: &mut [f32]) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::panel::relief::{PANEL_SIZE_MM, PanelRelief};
+    use crate::relief::{PANEL_SIZE_MM, PanelRelief};
 
     #[test]
     fn a_box_has_its_volume_and_is_closed() {

@@ -1,30 +1,52 @@
 //! A specimen as a run needs it: heights for its devices, a mesh and facts for its file.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use echolake_schema::manifest::MeshFacts;
 use echolake_schema::{Rig, SurfaceRecord};
 
-use crate::panel::material::SurfaceMaterial;
-use crate::panel::mesh::{self, BACK_MM, MESH_CELLS, Mesh, MeshFormat, PanelSide};
-use crate::panel::relief::{HeightField, PanelRelief};
-use crate::rig::devices::simulated::FACETS;
-use crate::run::plan::PanelSpecimen;
-use crate::run::recorder::OriginalFile;
+use crate::material::SurfaceMaterial;
+use crate::mesh::{self, BACK_MM, FACETS, MESH_CELLS, Mesh, MeshFormat, PanelSide};
+use crate::relief::{HeightField, PanelRelief};
+
+/// A panel to be measured.
+#[derive(Debug, Clone, PartialEq)]
+pub enum PanelSpecimen {
+    /// A generated relief.
+    Relief(PanelRelief),
+    /// A side of the mesh in a file, as a coated print.
+    Mesh(PathBuf, PanelSide),
+    /// A real panel whose geometry nobody gave.
+    NoGeometry,
+}
 
 /// A specimen, ready to be measured and recorded.
-pub(crate) struct PreparedPanel {
+pub struct PreparedPanel {
     /// None if nobody gave it.
-    pub(crate) geometry: Option<PanelGeometry>,
-    pub(crate) record: SurfaceRecord,
+    pub geometry: Option<PanelGeometry>,
+    /// The surface as its table has it, without references.
+    pub record: SurfaceRecord,
     original: Option<(String, MeshFormat, Vec<u8>)>,
 }
 
 /// Shape and material of a panel.
-pub(crate) struct PanelGeometry {
-    pub(crate) heights: HeightField,
-    pub(crate) mesh: Mesh,
-    pub(crate) material: SurfaceMaterial,
+pub struct PanelGeometry {
+    /// Heights of the relief, as simulations take them.
+    pub heights: HeightField,
+    /// The panel as a solid.
+    pub mesh: Mesh,
+    /// What its surface is of.
+    pub material: SurfaceMaterial,
+}
+
+/// A file that is kept as it is.
+pub struct OriginalFile<'a> {
+    /// Its name.
+    pub name: &'a str,
+    /// Its media type.
+    pub media_type: &'a str,
+    /// Its content.
+    pub bytes: &'a [u8],
 }
 
 impl PreparedPanel {
@@ -32,7 +54,7 @@ impl PreparedPanel {
     ///
     /// # Errors
     /// The mesh cannot be used.
-    pub(crate) fn new(specimen: &PanelSpecimen, rig: &Rig) -> Result<Self, mesh::Error> {
+    pub fn new(specimen: &PanelSpecimen, rig: &Rig) -> Result<Self, mesh::Error> {
         match specimen {
             PanelSpecimen::Relief(relief) => Ok(generated(relief)),
             PanelSpecimen::Mesh(path, side) => from_file(path, *side, rig),
@@ -41,7 +63,7 @@ impl PreparedPanel {
     }
 
     /// The file that the mesh was read from.
-    pub(crate) fn original(&self) -> Option<OriginalFile<'_>> {
+    pub fn original(&self) -> Option<OriginalFile<'_>> {
         let (name, format, bytes) = self.original.as_ref()?;
         Some(OriginalFile { name, media_type: format.media_type(), bytes })
     }

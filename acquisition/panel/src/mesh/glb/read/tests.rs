@@ -3,7 +3,7 @@
 use serde_json::{Value, json};
 
 use super::*;
-use crate::panel::relief::HeightField;
+use crate::relief::HeightField;
 
 /// A plate of 100 x 100 x 20 mm, its top at 0.
 fn plate() -> Mesh {

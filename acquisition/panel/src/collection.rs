@@ -3,8 +3,8 @@
 
 use echolake_schema::{Error, SurfaceId};
 
-use crate::panel::paper_panel::PaperPanel;
-use crate::panel::relief::{self, PanelRelief};
+use crate::paper_panel::PaperPanel;
+use crate::relief::{self, PanelRelief};
 
 /// The references, which are measured first.
 const REFERENCES: [(&str, PanelRelief); 3] =
