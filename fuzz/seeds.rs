@@ -3,7 +3,7 @@
 use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
-use echolake_acquisition::import::import_wav;
+use echolake_import::import_wav;
 use echolake_panel::mesh::{Mesh, MeshFormat};
 use echolake_panel::relief::HeightField;
 use hdf5_pure::{AttrValue, FileBuilder};

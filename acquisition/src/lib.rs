@@ -1,8 +1,6 @@
-//! Acquisition: from a rig, or from files of another origin, to a run's MCAP file.
+//! Acquisition: from a rig to a run's MCAP file.
 
 pub mod disk;
-#[cfg(feature = "import")]
-pub mod import;
 pub mod recovery;
 pub mod replay;
 pub mod rig;

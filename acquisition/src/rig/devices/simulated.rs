@@ -35,7 +35,7 @@ use crate::rig::{
 /// Samples of a response beyond its farthest echo: the band limit rings.
 const RINGING: f64 = 32.0;
 /// Time of one measurement (Rust et al. 2021): moving, settling, sweep.
-pub(crate) const TAKE_SECS: f64 = 12.3;
+pub const TAKE_SECS: f64 = 12.3;
 /// Gain from pressure at 1 m to full scale: the direct sound at 75 mm stays 9 dB under it.
 const MICROPHONE_GAIN: f64 = 0.037;
 /// Noise of the channels, rms re full scale: -102 and -108 dB.

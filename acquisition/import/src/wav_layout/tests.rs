@@ -2,7 +2,7 @@
 
 use echolake_schema::messages::SampleFormat;
 
-use crate::import::wav_file::WavChannel;
+use crate::wav_file::WavChannel;
 
 /// Numbers of 24 bits, the loudest of them at full scale.
 const NUMBERS: [i32; 6] = [0, 1, -1, 0x12_3456, -0x12_3457, 0x7F_FFFF];

@@ -11,7 +11,7 @@ const RADIANS: &[&str] = &["radian", "radians", "rad"];
 
 /// Type and units of three coordinates.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct CoordinateFrame {
+pub(crate) struct CoordinateFrame {
     is_spherical: bool,
     /// Millimetres, or radians, of one unit of each coordinate.
     scales: [Scale; 3],
@@ -27,14 +27,14 @@ enum Scale {
 
 /// A type or unit that is not known.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct FrameFault {
-    pub(super) actual: String,
-    pub(super) expected: &'static str,
+pub(crate) struct FrameFault {
+    pub(crate) actual: String,
+    pub(crate) expected: &'static str,
 }
 
 impl CoordinateFrame {
     /// Reads a type (cartesian if empty) and units: one of all coordinates, or a list; metres and degrees if empty.
-    pub(super) fn parse(kind: &str, units: &str) -> Result<Self, FrameFault> {
+    pub(crate) fn parse(kind: &str, units: &str) -> Result<Self, FrameFault> {
         let is_spherical = match kind.trim().to_lowercase().as_str() {
             "cartesian" | "" => false,
             "spherical" => true,
@@ -65,7 +65,7 @@ impl CoordinateFrame {
     }
 
     /// Returns a position as cartesian coordinates, mm.
-    pub(super) fn millimetres(&self, position: [f64; 3]) -> [f64; 3] {
+    pub(crate) fn millimetres(&self, position: [f64; 3]) -> [f64; 3] {
         let [a, b, c] = [0, 1, 2].map(|i| self.scales[i].apply(position[i]));
         if !self.is_spherical {
             return [a, b, c].map(to_nano);
@@ -96,7 +96,7 @@ impl Scale {
 }
 
 /// Rounds to the ninth place: what metres or kelvin have behind it is their conversion's.
-pub(super) fn to_nano(x: f64) -> f64 {
+pub(crate) fn to_nano(x: f64) -> f64 {
     (x * 1e9).round() / 1e9
 }
 

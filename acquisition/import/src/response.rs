@@ -1,24 +1,23 @@
 //! One imported response as a run records it: its pair, time and temperature; everything else is unknown.
 
+use echolake_acquisition::run::recorder::{Error, Recorder};
 use echolake_dsp::temperature::{TemperatureCorrection, resampling_ratio};
 use echolake_schema::messages::{AmbientSample, ImpulseResponse, Measurement, Verdict};
 use echolake_schema::{Celsius, Grid, Pair, Rig, Timestamp};
 
-use crate::run::recorder::{Error, Recorder};
-
 /// A response, recorded as the file has it.
-pub(super) struct ImportedResponse {
-    pub(super) pair: Pair,
-    pub(super) at: Timestamp,
-    pub(super) celsius: Celsius,
-    pub(super) samples: Vec<f32>,
+pub(crate) struct ImportedResponse {
+    pub(crate) pair: Pair,
+    pub(crate) at: Timestamp,
+    pub(crate) celsius: Celsius,
+    pub(crate) samples: Vec<f32>,
     /// True if it is on the time axis of the rig's reference temperature.
-    pub(super) is_corrected: bool,
+    pub(crate) is_corrected: bool,
 }
 
 impl ImportedResponse {
     /// Records it as the pair's first attempt, accepted.
-    pub(super) fn record(self, recorder: &mut Recorder, rig: &Rig, grid: &Grid) -> Result<(), Error> {
+    pub(crate) fn record(self, recorder: &mut Recorder, rig: &Rig, grid: &Grid) -> Result<(), Error> {
         let Self { pair, at, celsius, samples, is_corrected } = self;
         let (unknown, celsius) = (f64::NAN, celsius.get());
         let [m, s] = [pair.microphone, pair.speaker].map(|id| grid.points()[id.index()].position_mm);
@@ -67,7 +66,7 @@ impl ImportedResponse {
 }
 
 /// Returns the samples that it takes to bring a response to the reference temperature.
-pub(super) fn least_length(rig: &Rig, celsius: Celsius, is_corrected: bool) -> usize {
+pub(crate) fn least_length(rig: &Rig, celsius: Celsius, is_corrected: bool) -> usize {
     let ratio = resampling_ratio(celsius.get(), rig.impulse_response.reference_temperature_c.get());
     match rig.impulse_response.length {
         length if is_corrected || ratio == 1.0 => length,

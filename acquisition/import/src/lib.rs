@@ -16,10 +16,9 @@ mod wav_manifest;
 
 use std::path::{Path, PathBuf};
 
+use echolake_acquisition::run::recorder::random_tag;
 use echolake_schema::manifest::{Origin, RunManifest};
 use echolake_schema::{ErrorCause, ProjectName, Rig, RunId, SurfaceId, SurfaceRecord, Timestamp};
-
-use crate::run::recorder::random_tag;
 
 pub use gir::{GIR_IR_LEN, import_gir};
 pub use hdf5::{check_hdf5, import_hdf5};
@@ -111,7 +110,7 @@ pub enum Error {
     },
     /// The run cannot be recorded.
     #[error(transparent)]
-    Record(#[from] crate::run::recorder::Error),
+    Record(#[from] echolake_acquisition::run::recorder::Error),
     /// The rig's settings make no plan.
     #[error("rig `{rig}` does not fit: {cause}")]
     Plan {

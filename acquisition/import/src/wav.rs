@@ -5,6 +5,9 @@ mod tests;
 
 use std::path::Path;
 
+use echolake_acquisition::run::assessment::TakeAssessor;
+use echolake_acquisition::run::objection::TakeObjection;
+use echolake_acquisition::run::recorder::{LogLevel, Recorder, RunStart};
 use echolake_dsp::chain::raw_len;
 use echolake_dsp::deconvolution::{DeconvolutionParams, TransformLength};
 use echolake_dsp::geometry::direct_mm;
@@ -14,13 +17,10 @@ use echolake_schema::manifest::{Origin, RunEnd};
 use echolake_schema::messages::{AmbientSample, ImpulseResponse, Measurement, SweepRecording, Verdict};
 use echolake_schema::{Grid, Rig, SampleRate, SurfaceId, Timestamp};
 
-use super::batch::ImportBatch;
-use super::wav_file::WavChannel;
-use super::wav_manifest::{self, ManifestRow};
-use super::{Error, ImportOptions, ImportedRun};
-use crate::run::assessment::TakeAssessor;
-use crate::run::objection::TakeObjection;
-use crate::run::recorder::{LogLevel, Recorder, RunStart};
+use crate::batch::ImportBatch;
+use crate::wav_file::WavChannel;
+use crate::wav_manifest::{self, ManifestRow};
+use crate::{Error, ImportOptions, ImportedRun};
 
 /// Source name of the import's log entries.
 const NAME: &str = "import wav";
@@ -79,7 +79,7 @@ impl WavImport<'_> {
         let mut timed: Vec<_> = (0u32..).zip(rows).map(|(i, row)| (self.time(row, i), row)).collect();
         timed.sort_by_key(|(time, _)| *time);
         let started = timed.first().map_or(self.options.started, |(time, _)| *time);
-        let manifest = super::manifest(Origin::ImportedWav, &surface, self.rig, started)?;
+        let manifest = crate::manifest(Origin::ImportedWav, &surface, self.rig, started)?;
         let record = self.options.surface_record("imported");
         let path = self.options.folder.join(format!("{}.mcap", manifest.run_id));
         let start = RunStart { manifest: &manifest, rig: self.rig, surface: &record, relief: None, plan: None };

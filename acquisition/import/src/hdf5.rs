@@ -7,18 +7,18 @@ mod tests;
 use std::collections::HashMap;
 use std::path::Path;
 
+use echolake_acquisition::run::recorder::{LogLevel, RunStart};
 use echolake_schema::manifest::{Origin, RunEnd};
 use echolake_schema::{Celsius, ErrorCause, Grid, Pair, PairId, Point, Rig, SurfaceId};
 
-use super::batch::ImportBatch;
-use super::hdf5_file::{Hdf5Dataset, Hdf5File, Hdf5Variable, place};
-use super::hdf5_mapping::{
+use crate::batch::ImportBatch;
+use crate::hdf5_file::{Hdf5Dataset, Hdf5File, Hdf5Variable, place};
+use crate::hdf5_mapping::{
     DatasetDimension, Hdf5Mapping, PositionMapping, RateMapping, TemperatureMapping, TemperatureUnit,
 };
-use super::positions::{CoordinateFrame, to_nano};
-use super::response::{ImportedResponse, least_length};
-use super::{Error, ImportOptions, ImportedRun, RUN_SECS, wrong};
-use crate::run::recorder::{LogLevel, RunStart};
+use crate::positions::{CoordinateFrame, to_nano};
+use crate::response::{ImportedResponse, least_length};
+use crate::{Error, ImportOptions, ImportedRun, RUN_SECS, wrong};
 
 /// Source name of the import's log entries.
 const NAME: &str = "import hdf5";
@@ -152,7 +152,7 @@ impl<'g> ResponseSet<'g> {
         done: &mut dyn FnMut(usize),
     ) -> Result<ImportedRun, Error> {
         let started = import.options.started.plus_secs(number as f64 * RUN_SECS);
-        let manifest = super::manifest(Origin::ImportedHdf5, &self.surfaces[number], import.rig, started)?;
+        let manifest = crate::manifest(Origin::ImportedHdf5, &self.surfaces[number], import.rig, started)?;
         let record = import.options.surface_record("imported");
         let path = import.options.folder.join(format!("{}.mcap", manifest.run_id));
         let start = RunStart { manifest: &manifest, rig: import.rig, surface: &record, relief: None, plan: None };

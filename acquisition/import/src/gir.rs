@@ -8,6 +8,8 @@ use std::collections::{HashMap, HashSet};
 use std::fs::File;
 use std::path::{Path, PathBuf};
 
+use echolake_acquisition::rig::devices::simulated::TAKE_SECS;
+use echolake_acquisition::run::recorder::{LogLevel, Relief, RunStart};
 use echolake_panel::mesh::{BACK_MM, MESH_CELLS, Mesh};
 use echolake_panel::relief::HeightField;
 use echolake_schema::interchange::{GIR_COMBINATIONS, GIR_PANEL_INFO};
@@ -16,11 +18,9 @@ use echolake_schema::{Celsius, Grid, Pair, PairId, Rig, SurfaceId, SurfaceRecord
 use ndarray::{Array1, Array2, Ix1, Ix2};
 use ndarray_npy::{NpzReader, ReadableElement};
 
-use super::batch::ImportBatch;
-use super::response::ImportedResponse;
-use super::{Error, ImportOptions, ImportedRun, RUN_SECS, wrong};
-use crate::rig::devices::simulated::TAKE_SECS;
-use crate::run::recorder::{LogLevel, Relief, RunStart};
+use crate::batch::ImportBatch;
+use crate::response::ImportedResponse;
+use crate::{Error, ImportOptions, ImportedRun, RUN_SECS, wrong};
 
 /// Samples of the published responses.
 pub const GIR_IR_LEN: usize = 400;
@@ -82,7 +82,7 @@ impl GirImport<'_> {
             relief_mm: h.extent_mm().map(f64::from),
         });
         let started = self.options.started.plus_secs(f64::from(self.number) * RUN_SECS);
-        let manifest = super::manifest(Origin::ImportedGir, &surface, self.rig, started)?;
+        let manifest = crate::manifest(Origin::ImportedGir, &surface, self.rig, started)?;
         let path = self.options.folder.join(format!("{}.mcap", manifest.run_id));
         let relief =
             heights.as_ref().zip(mesh.as_ref()).map(|(heights, mesh)| Relief { heights, mesh, original: None });

@@ -5,26 +5,26 @@ use std::path::{Path, PathBuf};
 use echolake_schema::messages::SampleFormat;
 use echolake_schema::samples::split_24;
 
-use super::wav_layout::{SampleCoding, WavLayout};
+use crate::wav_layout::{SampleCoding, WavLayout};
 
 /// A channel of a file.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct WavChannel {
+pub(crate) struct WavChannel {
     path: PathBuf,
     channel: u16,
-    pub(super) layout: WavLayout,
+    pub(crate) layout: WavLayout,
 }
 
 /// The samples of a channel.
-pub(super) struct ChannelSamples {
-    pub(super) bytes: Vec<u8>,
-    pub(super) fractions: Vec<f32>,
-    pub(super) clipped: u32,
+pub(crate) struct ChannelSamples {
+    pub(crate) bytes: Vec<u8>,
+    pub(crate) fractions: Vec<f32>,
+    pub(crate) clipped: u32,
 }
 
 impl WavChannel {
     /// Opens `file.wav`, or `file.wav#2` for its second channel. The text of an error names the fault.
-    pub(super) fn open(folder: &Path, reference: &str) -> Result<Self, String> {
+    pub(crate) fn open(folder: &Path, reference: &str) -> Result<Self, String> {
         let (name, channel) = match reference.rsplit_once('#') {
             Some((name, number)) => {
                 let number: u16 = number.parse().map_err(|_| format!("`#{number}` is no channel number"))?;
@@ -49,12 +49,12 @@ impl WavChannel {
     }
 
     /// Returns its file and channel, for messages.
-    pub(super) fn label(&self) -> String {
+    pub(crate) fn label(&self) -> String {
         format!("`{}`, channel {}", self.path.display(), self.channel + 1)
     }
 
     /// Returns the format that stores its samples without loss.
-    pub(super) fn format(&self) -> SampleFormat {
+    pub(crate) fn format(&self) -> SampleFormat {
         match (self.layout.coding, self.layout.bits) {
             (SampleCoding::Float, _) => SampleFormat::F32le,
             (SampleCoding::Integer, ..=16) => SampleFormat::S16le,
@@ -64,7 +64,7 @@ impl WavChannel {
     }
 
     /// Reads its samples, as bytes of `format`, which is its own or a wider one.
-    pub(super) fn read(&self, format: SampleFormat) -> Result<ChannelSamples, String> {
+    pub(crate) fn read(&self, format: SampleFormat) -> Result<ChannelSamples, String> {
         let failed = |fault: String| format!("`{}` {fault}", self.path.display());
         let mut out = ChannelSamples { bytes: Vec::new(), fractions: Vec::new(), clipped: 0 };
         if self.layout.coding == SampleCoding::Float {
@@ -97,7 +97,7 @@ impl WavChannel {
 }
 
 /// Returns the wider of two formats, if one holds the other's samples exactly.
-pub(super) fn common_format(a: SampleFormat, b: SampleFormat) -> Option<SampleFormat> {
+pub(crate) fn common_format(a: SampleFormat, b: SampleFormat) -> Option<SampleFormat> {
     match (a == b, a == SampleFormat::F32le || b == SampleFormat::F32le) {
         (true, _) => Some(a),
         (false, true) => None,

@@ -17,47 +17,47 @@ const MOST_NAMES: usize = 1000;
 const MOST_LEVELS: usize = 16;
 
 /// A file that is read.
-pub(super) struct Hdf5File {
+pub(crate) struct Hdf5File {
     file: File,
     size_bytes: u64,
 }
 
 /// A variable that is in memory.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Hdf5Variable {
-    pub(super) shape: Vec<usize>,
-    pub(super) values: Vec<f64>,
+pub(crate) struct Hdf5Variable {
+    pub(crate) shape: Vec<usize>,
+    pub(crate) values: Vec<f64>,
 }
 
 /// A variable of a file, of which parts are read.
-pub(super) struct Hdf5Dataset {
+pub(crate) struct Hdf5Dataset {
     dataset: Dataset,
-    pub(super) shape: Vec<usize>,
+    pub(crate) shape: Vec<usize>,
     /// Rows that are stored together.
-    pub(super) chunk_rows: usize,
+    pub(crate) chunk_rows: usize,
 }
 
 impl Hdf5File {
-    pub(super) fn open(path: &Path) -> Result<Self, String> {
+    pub(crate) fn open(path: &Path) -> Result<Self, String> {
         let size_bytes = std::fs::metadata(path).map_err(|e| e.to_string())?.len();
         let file = File::open_streaming(path).map_err(describe)?;
         Ok(Self { file, size_bytes })
     }
 
     /// Returns an attribute of the file; empty if it is missing.
-    pub(super) fn text(&self, name: &str) -> String {
+    pub(crate) fn text(&self, name: &str) -> String {
         let found = self.file.root().attrs().ok().and_then(|mut attributes| attributes.remove(name));
         found.as_ref().and_then(AttrValue::as_str).unwrap_or_default().to_owned()
     }
 
     /// Returns an attribute of a variable; empty if it is missing.
-    pub(super) fn text_of(&self, variable: &str, name: &str) -> String {
+    pub(crate) fn text_of(&self, variable: &str, name: &str) -> String {
         let found = self.attribute(variable, name).ok().flatten();
         found.as_ref().and_then(AttrValue::as_str).unwrap_or_default().to_owned()
     }
 
     /// Returns a number that is an attribute of a variable.
-    pub(super) fn number_of(&self, variable: &str, name: &str) -> Result<f64, String> {
+    pub(crate) fn number_of(&self, variable: &str, name: &str) -> Result<f64, String> {
         let found = self.attribute(variable, name).map_err(describe)?.ok_or("it is missing")?;
         let number = found.as_f64().or_else(|| found.as_i64().map(|integer| integer as f64));
         number.ok_or_else(|| format!("{} and not one number", found.type_name()))
@@ -68,7 +68,7 @@ impl Hdf5File {
     }
 
     /// Returns the paths of variables, of a file with very many only the first.
-    pub(super) fn names(&self) -> Vec<String> {
+    pub(crate) fn names(&self) -> Vec<String> {
         let mut names = Vec::new();
         let mut groups: Vec<(Group, String, usize)> = vec![(self.file.root(), String::new(), 0)];
         let mut seen = 0;
@@ -84,7 +84,7 @@ impl Hdf5File {
     }
 
     /// Opens a variable; None if it is missing.
-    pub(super) fn dataset(&self, name: &str) -> Result<Option<Hdf5Dataset>, String> {
+    pub(crate) fn dataset(&self, name: &str) -> Result<Option<Hdf5Dataset>, String> {
         let dataset = match self.file.dataset(name) {
             Err(Hdf5Error::Format(FormatError::PathNotFound(_)) | Hdf5Error::NotAGroup(_)) => return Ok(None),
             opened => opened.map_err(describe)?,
@@ -113,7 +113,7 @@ impl Hdf5File {
     }
 
     /// Reads a variable; None if it is missing.
-    pub(super) fn variable(&self, name: &str) -> Result<Option<Hdf5Variable>, String> {
+    pub(crate) fn variable(&self, name: &str) -> Result<Option<Hdf5Variable>, String> {
         let Some(dataset) = self.dataset(name)? else { return Ok(None) };
         let values = dataset.read(&vec![0; dataset.shape.len()], &dataset.shape)?;
         Ok(Some(Hdf5Variable { shape: dataset.shape, values }))
@@ -122,7 +122,7 @@ impl Hdf5File {
 
 impl Hdf5Dataset {
     /// Reads the block of `counts` numbers that begins at `starts`, row by row. Rows are read with all that is in them.
-    pub(super) fn read(&self, starts: &[usize], counts: &[usize]) -> Result<Vec<f64>, String> {
+    pub(crate) fn read(&self, starts: &[usize], counts: &[usize]) -> Result<Vec<f64>, String> {
         let count = counts.iter().try_fold(1usize, |count, n| count.checked_mul(*n)).filter(|n| *n <= MOST);
         let count = count.ok_or_else(|| format!("{counts:?} numbers, more than {MOST}"))?;
         let (&[start, ref starts @ ..], &[rows, ref counts @ ..], [_, within @ ..]) = (starts, counts, &self.shape[..])
@@ -171,7 +171,7 @@ fn cut(values: &[f64], shape: &[usize], starts: &[usize], counts: &[usize], out:
 }
 
 // The place of a number in a grid, row by row.
-pub(super) fn place(number: usize, grid: &[usize]) -> Vec<usize> {
+pub(crate) fn place(number: usize, grid: &[usize]) -> Vec<usize> {
     let (mut left, mut at) = (number, vec![0; grid.len()]);
     for (i, n) in grid.iter().enumerate().rev() {
         at[i] = left % n;

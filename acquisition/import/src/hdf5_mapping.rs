@@ -5,35 +5,35 @@ use std::path::{Path, PathBuf};
 use echolake_schema::SurfaceId;
 use serde::Deserialize;
 
-use super::{Error, wrong};
+use crate::{Error, wrong};
 
 /// A mapping file, as TOML has it.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct Hdf5Mapping {
+pub(crate) struct Hdf5Mapping {
     /// The HDF5 file; a relative path begins at the mapping's folder.
-    pub(super) file: PathBuf,
+    pub(crate) file: PathBuf,
     /// One per measurement, or a single one.
-    pub(super) surfaces: Vec<String>,
-    pub(super) responses: ResponseMapping,
-    pub(super) sampling_rate: RateMapping,
-    pub(super) microphones: PositionMapping,
-    pub(super) speakers: PositionMapping,
-    pub(super) temperature: Option<TemperatureMapping>,
+    pub(crate) surfaces: Vec<String>,
+    pub(crate) responses: ResponseMapping,
+    pub(crate) sampling_rate: RateMapping,
+    pub(crate) microphones: PositionMapping,
+    pub(crate) speakers: PositionMapping,
+    pub(crate) temperature: Option<TemperatureMapping>,
 }
 
 /// The dataset of the responses.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct ResponseMapping {
-    pub(super) dataset: String,
-    pub(super) dimensions: Vec<DatasetDimension>,
+pub(crate) struct ResponseMapping {
+    pub(crate) dataset: String,
+    pub(crate) dimensions: Vec<DatasetDimension>,
 }
 
 /// A dimension of a dataset.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub(super) enum DatasetDimension {
+pub(crate) enum DatasetDimension {
     Microphone,
     Speaker,
     Sample,
@@ -44,7 +44,7 @@ pub(super) enum DatasetDimension {
 /// The sampling rate: a number, or the place where the file has it.
 #[derive(Debug, Deserialize)]
 #[serde(untagged)]
-pub(super) enum RateMapping {
+pub(crate) enum RateMapping {
     Hertz(f64),
     Stored(StoredRate),
 }
@@ -52,27 +52,27 @@ pub(super) enum RateMapping {
 /// A dataset with the sampling rate, or one of its attributes.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct StoredRate {
-    pub(super) dataset: String,
-    pub(super) attribute: Option<String>,
+pub(crate) struct StoredRate {
+    pub(crate) dataset: String,
+    pub(crate) attribute: Option<String>,
 }
 
 /// A dataset of positions, three numbers each.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct PositionMapping {
-    pub(super) dataset: String,
+pub(crate) struct PositionMapping {
+    pub(crate) dataset: String,
     /// By default those of the dataset's attribute `Units`.
-    pub(super) units: Option<String>,
+    pub(crate) units: Option<String>,
     /// Cartesian or spherical; by default that of the dataset's attribute `Type`, or cartesian.
     #[serde(rename = "type")]
-    pub(super) kind: Option<String>,
+    pub(crate) kind: Option<String>,
 }
 
 /// The temperature of the air: a number, or the dataset that has it.
 #[derive(Debug, Deserialize)]
 #[serde(untagged)]
-pub(super) enum TemperatureMapping {
+pub(crate) enum TemperatureMapping {
     Celsius(f64),
     Stored(StoredTemperatures),
 }
@@ -80,25 +80,25 @@ pub(super) enum TemperatureMapping {
 /// A dataset of temperatures.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct StoredTemperatures {
-    pub(super) dataset: String,
-    pub(super) units: TemperatureUnit,
+pub(crate) struct StoredTemperatures {
+    pub(crate) dataset: String,
+    pub(crate) units: TemperatureUnit,
     /// Empty for one temperature of all.
     #[serde(default)]
-    pub(super) dimensions: Vec<DatasetDimension>,
+    pub(crate) dimensions: Vec<DatasetDimension>,
 }
 
 /// A unit of temperatures.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub(super) enum TemperatureUnit {
+pub(crate) enum TemperatureUnit {
     Celsius,
     Kelvin,
 }
 
 impl Hdf5Mapping {
     /// Reads a mapping file.
-    pub(super) fn read(path: &Path) -> Result<Self, Error> {
+    pub(crate) fn read(path: &Path) -> Result<Self, Error> {
         let unread = |e: std::io::Error| Error::Read { path: path.to_owned(), source: e.into() };
         let text = std::fs::read_to_string(path).map_err(unread)?;
         let mut mapping: Self = toml::from_str(&text).map_err(|e| {
@@ -110,7 +110,7 @@ impl Hdf5Mapping {
     }
 
     /// Returns the surfaces' names, checked: one per measurement.
-    pub(super) fn surfaces(&self, path: &Path, measurements: usize) -> Result<Vec<SurfaceId>, Error> {
+    pub(crate) fn surfaces(&self, path: &Path, measurements: usize) -> Result<Vec<SurfaceId>, Error> {
         let place = "surfaces";
         if self.surfaces.len() != measurements {
             let expected = format!("{measurements}, one per measurement of `{}`", self.responses.dataset);
@@ -127,7 +127,7 @@ impl Hdf5Mapping {
 
 impl DatasetDimension {
     /// Its name in mapping files.
-    pub(super) fn label(self) -> &'static str {
+    pub(crate) fn label(self) -> &'static str {
         match self {
             Self::Microphone => "microphone",
             Self::Speaker => "speaker",

@@ -10,16 +10,16 @@ mod tests;
 use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 
+use echolake_acquisition::rig::devices::simulated::TAKE_SECS;
+use echolake_acquisition::run::recorder::{LogLevel, RunStart};
 use echolake_schema::manifest::{Origin, RunEnd};
 use echolake_schema::{Celsius, ErrorCause, Grid, Pair, PairId, Point, Rig, SurfaceId, Timestamp};
 
-use super::batch::ImportBatch;
-use super::hdf5_file::{Hdf5File, Hdf5Variable, place};
-use super::positions::{CoordinateFrame, to_nano};
-use super::response::{ImportedResponse, least_length};
-use super::{Error, ImportOptions, ImportedRun, RUN_SECS, wrong};
-use crate::rig::devices::simulated::TAKE_SECS;
-use crate::run::recorder::{LogLevel, RunStart};
+use crate::batch::ImportBatch;
+use crate::hdf5_file::{Hdf5File, Hdf5Variable, place};
+use crate::positions::{CoordinateFrame, to_nano};
+use crate::response::{ImportedResponse, least_length};
+use crate::{Error, ImportOptions, ImportedRun, RUN_SECS, wrong};
 
 /// Source name of the import's log entries.
 const NAME: &str = "import sofa";
@@ -169,7 +169,7 @@ impl Sofa {
     fn record(&self, import: &SofaImport<'_>, batch: &mut ImportBatch) -> Result<ImportedRun, Error> {
         let times = self.times(import.options.started.plus_secs(f64::from(import.number) * RUN_SECS));
         let (started, ended) = (times[0], times[times.len() - 1]);
-        let manifest = super::manifest(Origin::ImportedSofa, &self.surface, import.rig, started)?;
+        let manifest = crate::manifest(Origin::ImportedSofa, &self.surface, import.rig, started)?;
         let record = import.options.surface_record("imported");
         let path = import.options.folder.join(format!("{}.mcap", manifest.run_id));
         let start = RunStart { manifest: &manifest, rig: import.rig, surface: &record, relief: None, plan: None };

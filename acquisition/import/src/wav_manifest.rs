@@ -8,29 +8,29 @@ use echolake_schema::interchange::WAV_MANIFEST;
 use echolake_schema::messages::SampleFormat;
 use echolake_schema::{Celsius, Grid, Pair, PairId, Rig, SurfaceId, Timestamp};
 
-use super::Error;
-use super::wav_file::{WavChannel, common_format};
+use crate::Error;
+use crate::wav_file::{WavChannel, common_format};
 
 /// Number of required columns, which come first.
 const NEEDED: usize = 6;
 
 /// A row of the manifest, checked.
 #[derive(Debug, Clone)]
-pub(super) struct ManifestRow {
-    pub(super) line: u64,
-    pub(super) recording: WavChannel,
-    pub(super) loopback: WavChannel,
-    pub(super) format: SampleFormat,
-    pub(super) pair: Pair,
-    pub(super) celsius: Celsius,
-    pub(super) humidity_pct: f64,
-    pub(super) pressure_hpa: f64,
-    pub(super) recorded_at: Option<Timestamp>,
-    pub(super) attempt: u32,
+pub(crate) struct ManifestRow {
+    pub(crate) line: u64,
+    pub(crate) recording: WavChannel,
+    pub(crate) loopback: WavChannel,
+    pub(crate) format: SampleFormat,
+    pub(crate) pair: Pair,
+    pub(crate) celsius: Celsius,
+    pub(crate) humidity_pct: f64,
+    pub(crate) pressure_hpa: f64,
+    pub(crate) recorded_at: Option<Timestamp>,
+    pub(crate) attempt: u32,
 }
 
 /// A manifest's rows by surface.
-pub(super) type WavManifest = BTreeMap<SurfaceId, Vec<ManifestRow>>;
+pub(crate) type WavManifest = BTreeMap<SurfaceId, Vec<ManifestRow>>;
 
 /// Opens a manifest and checks its header; returns the place of each column.
 fn open(path: &Path) -> Result<(csv::Reader<std::fs::File>, Vec<Option<usize>>), Error> {
@@ -52,7 +52,7 @@ fn open(path: &Path) -> Result<(csv::Reader<std::fs::File>, Vec<Option<usize>>),
 }
 
 /// The first recording of a manifest.
-pub(super) fn first_recording(path: &Path) -> Result<WavChannel, Error> {
+pub(crate) fn first_recording(path: &Path) -> Result<WavChannel, Error> {
     let (mut reader, places) = open(path)?;
     let record = next(path, &mut reader)?.ok_or_else(|| no_rows(path))?;
     let cells = ManifestCells { path, places: &places, record: &record };
@@ -60,7 +60,7 @@ pub(super) fn first_recording(path: &Path) -> Result<WavChannel, Error> {
 }
 
 /// Reads and checks all rows.
-pub(super) fn read(path: &Path, rig: &Rig, grid: &Grid) -> Result<WavManifest, Error> {
+pub(crate) fn read(path: &Path, rig: &Rig, grid: &Grid) -> Result<WavManifest, Error> {
     let (mut reader, places) = open(path)?;
     let mut manifest = WavManifest::new();
     while let Some(record) = next(path, &mut reader)? {
