@@ -134,7 +134,7 @@ fn numbers_of_another_kind_are_refused() {
     refused(|d| d["accessors"][0]["count"] = json!(0), "no readable positions");
     refused(|d| d["bufferViews"][0]["byteStride"] = json!(8), "no readable positions");
     refused(
-        |d| d["bufferViews"][0]["byteStride"] = json!(1 << 40),
+        |d| d["bufferViews"][0]["byteStride"] = json!(1_u64 << 40),
         "`bufferViews[0].byteStride` has \"Invalid value\"",
     );
     refused(|d| d["bufferViews"][0]["byteOffset"] = json!(u64::MAX - 4), "no readable positions");
