@@ -5,7 +5,7 @@ mod seeds;
 use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
-use echolake_acquisition::import::ImportOptions;
+use echolake_import::ImportOptions;
 use echolake_schema::{Rig, Timestamp};
 use ndarray::{Array1, Array2};
 use ndarray_npy::NpzWriter;

@@ -3,9 +3,9 @@
 use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
-use echolake_acquisition::import::import_wav;
-use echolake_acquisition::panel::mesh::{Mesh, MeshFormat};
-use echolake_acquisition::panel::relief::HeightField;
+use echolake_import::import_wav;
+use echolake_panel::mesh::{Mesh, MeshFormat};
+use echolake_panel::relief::HeightField;
 use hdf5_pure::{AttrValue, FileBuilder};
 use hound::{SampleFormat, WavSpec, WavWriter};
 use ndarray::Array2;

@@ -4,8 +4,8 @@
 
 use std::sync::LazyLock;
 
-use echolake_acquisition::import::import_gir;
 use echolake_fuzz::{ImportFolder, three_points};
+use echolake_import::import_gir;
 use echolake_schema::Rig;
 use libfuzzer_sys::fuzz_target;
 

@@ -3,7 +3,7 @@
 
 use std::path::Path;
 
-use echolake_acquisition::panel::mesh::{Mesh, MeshFormat};
+use echolake_panel::mesh::{Mesh, MeshFormat};
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(init: echolake_fuzz::write_seeds_on_request(), |bytes: &[u8]| {

@@ -4,8 +4,8 @@
 use std::path::PathBuf;
 use std::sync::LazyLock;
 
-use echolake_acquisition::import::import_hdf5;
 use echolake_fuzz::{ImportFolder, MAPPING, three_points};
+use echolake_import::import_hdf5;
 use echolake_schema::Rig;
 use libfuzzer_sys::fuzz_target;
 

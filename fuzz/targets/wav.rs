@@ -4,8 +4,8 @@
 use std::path::PathBuf;
 use std::sync::LazyLock;
 
-use echolake_acquisition::import::{import_wav, sampling_rate_of};
 use echolake_fuzz::{ImportFolder, WAV_MANIFEST, three_points};
+use echolake_import::{import_wav, sampling_rate_of};
 use echolake_schema::Rig;
 use libfuzzer_sys::fuzz_target;
 

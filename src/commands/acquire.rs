@@ -14,8 +14,9 @@ use echolake_acquisition::run::metrics::{MetricsServer, RunMetrics};
 use echolake_acquisition::run::recorder::{Held, partial_of, random_tag};
 use echolake_acquisition::run::recording_lock::RecordingLock;
 use echolake_acquisition::run::session::{MeasuredRun, PreflightMode, RunSession, TakePace};
-use echolake_acquisition::run::{self, PanelSpecimen, RunRequest};
+use echolake_acquisition::run::{self, RunRequest};
 use echolake_lake::{Error as LakeError, Lake, ReferenceSurfaces};
+use echolake_panel::PanelSpecimen;
 use echolake_schema::{ProjectName, Rig, SurfaceId, Timestamp};
 
 use crate::CommandOutcome;
@@ -27,7 +28,7 @@ use crate::progress::CommandProgress;
 use crate::signals::StopRequest;
 use acknowledge::AcknowledgementWriter;
 use clap::Args;
-use echolake_acquisition::panel::mesh::PanelSide;
+use echolake_panel::mesh::PanelSide;
 pub(super) use specimen::{check_mesh, relief_of_file, set_all};
 use watch::RunWatcher;
 

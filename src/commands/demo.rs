@@ -3,11 +3,11 @@
 use std::path::Path;
 use std::time::Instant;
 
-use echolake_acquisition::panel::collection::{CollectionSurface, collection};
-use echolake_acquisition::run::PanelSpecimen;
 use echolake_acquisition::run::controller::RecordingMode;
 use echolake_ingest::pending;
 use echolake_lake::{Lake, ReferenceSurfaces};
+use echolake_panel::PanelSpecimen;
+use echolake_panel::collection::{CollectionSurface, collection};
 use echolake_query::Session;
 use echolake_schema::Rig;
 
@@ -15,7 +15,7 @@ use super::simulated_runs::{PlannedRun, SimulationPlan, start_time};
 use crate::CommandOutcome;
 use crate::progress::CommandProgress;
 use clap::Args;
-use echolake_acquisition::panel::collection::LARGEST;
+use echolake_panel::collection::LARGEST;
 use std::path::PathBuf;
 
 #[derive(Debug, Args)]

@@ -1,6 +1,6 @@
 //! `echolake import`: existing measurements become runs.
 
-use echolake_acquisition::import::{
+use echolake_import::{
     Error, GIR_IR_LEN, ImportOptions, ImportedRun, check_hdf5, check_sofa, check_wav, import_gir, import_hdf5,
     import_sofa, import_wav, sampling_rate_of,
 };

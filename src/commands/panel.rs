@@ -7,9 +7,9 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, bail};
 use clap::Args;
-use echolake_acquisition::panel::mesh::{BACK_MM, Mesh, MeshFormat};
-use echolake_acquisition::panel::relief::{HeightField, PanelRelief};
 use echolake_figures::encode_grey_png;
+use echolake_panel::mesh::{BACK_MM, Mesh, MeshFormat};
+use echolake_panel::relief::{HeightField, PanelRelief};
 
 use crate::CommandOutcome;
 

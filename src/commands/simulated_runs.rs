@@ -7,10 +7,11 @@ use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
 use anyhow::Context as _;
+use echolake_acquisition::run::RunRequest;
 use echolake_acquisition::run::controller::RecordingMode;
 use echolake_acquisition::run::recorder::random_tag;
 use echolake_acquisition::run::simulate::simulate;
-use echolake_acquisition::run::{PanelSpecimen, RunRequest};
+use echolake_panel::PanelSpecimen;
 use echolake_schema::manifest::{Origin, RunEnd};
 use echolake_schema::{ProjectName, Rig, RunId, SurfaceId, Timestamp};
 

@@ -3,10 +3,11 @@
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
-use echolake_acquisition::panel::relief::PanelRelief;
+use echolake_acquisition::run::RunRequest;
 use echolake_acquisition::run::controller::RecordingMode;
 use echolake_acquisition::run::simulate::simulate;
-use echolake_acquisition::run::{PanelSpecimen, RunRequest};
+use echolake_panel::PanelSpecimen;
+use echolake_panel::relief::PanelRelief;
 use echolake_schema::manifest::Origin;
 use echolake_schema::{Rig, Timestamp};
 

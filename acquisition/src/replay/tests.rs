@@ -5,6 +5,8 @@ use std::path::Path;
 use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
+use echolake_panel::PanelSpecimen;
+use echolake_panel::relief::PanelRelief;
 use echolake_schema::manifest::Origin;
 use echolake_schema::{Rig, Timestamp, topics};
 use serde_json::{Value, json};
@@ -12,9 +14,8 @@ use tungstenite::Message;
 use tungstenite::client::IntoClientRequest as _;
 
 use super::*;
-use crate::panel::relief::PanelRelief;
+use crate::run::RunRequest;
 use crate::run::simulate::simulate;
-use crate::run::{PanelSpecimen, RunRequest};
 
 const SMALL_RIG: &str = include_str!("../../../tests/fixtures/small_rig.toml");
 const START: i64 = 1_767_600_000_000_000_000;

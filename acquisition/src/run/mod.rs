@@ -17,20 +17,18 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use echolake_panel::{PanelGeometry, PanelSpecimen, PreparedPanel, mesh};
 use echolake_schema::manifest::{Origin, RunManifest};
 use echolake_schema::{ProjectName, Rig, RunId, SurfaceId, Timestamp};
 use tracing::Span;
 
 use crate::disk::folder_of;
-use crate::panel::mesh;
-use crate::panel::prepared_panel::{PanelGeometry, PreparedPanel};
 use crate::recovery;
 use crate::rig::RigDevices;
 use crate::rig::devices::simulated::TAKE_SECS;
 use crate::rig::devices::{DeviceRequest, open_devices};
 use crate::rig::robots::Choreography;
 use crate::run::controller::{RecordingMode, RunController};
-pub use crate::run::plan::PanelSpecimen;
 use crate::run::plan::RunPlan;
 use crate::run::preflight::PreflightFinding;
 use crate::run::recorder::{Held, PairAttempts, Recorder, Relief as RecordedRelief, RunStart, Shape};

@@ -1,10 +1,11 @@
 //! The plan that is needed to resume a run: metadata `echolake.run.plan` of its file.
 
 use std::collections::BTreeMap;
-use std::path::PathBuf;
 
-use crate::panel::mesh::PanelSide;
-use crate::panel::relief::PanelRelief;
+use echolake_panel::PanelSpecimen;
+use echolake_panel::mesh::PanelSide;
+use echolake_panel::relief::PanelRelief;
+
 use crate::run::controller::RecordingMode;
 
 const KEEP: &str = "keep";
@@ -26,17 +27,6 @@ pub struct RunPlan {
     pub seed: u64,
     /// The measured panel.
     pub specimen: PanelSpecimen,
-}
-
-/// A panel to be measured.
-#[derive(Debug, Clone, PartialEq)]
-pub enum PanelSpecimen {
-    /// A generated relief.
-    Relief(PanelRelief),
-    /// A side of the mesh in a file, as a coated print.
-    Mesh(PathBuf, PanelSide),
-    /// A real panel whose geometry nobody gave.
-    NoGeometry,
 }
 
 impl RunPlan {

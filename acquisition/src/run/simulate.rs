@@ -4,10 +4,10 @@
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use echolake_panel::PreparedPanel;
 use echolake_schema::manifest::{Origin, RunEnd};
 use echolake_schema::messages::Verdict;
 
-use crate::panel::prepared_panel::PreparedPanel;
 use crate::rig::devices::{DeviceRequest, simulated_devices};
 use crate::rig::robots::Choreography;
 use crate::run::controller::{self, RunControl, RunEvent};

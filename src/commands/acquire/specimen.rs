@@ -3,10 +3,10 @@
 use std::path::Path;
 
 use anyhow::Context as _;
-use echolake_acquisition::panel::mesh::{Mesh, PanelSide};
-use echolake_acquisition::panel::paper_panel::PaperPanel;
-use echolake_acquisition::panel::relief::PanelRelief;
-use echolake_acquisition::run::PanelSpecimen;
+use echolake_panel::PanelSpecimen;
+use echolake_panel::mesh::{Mesh, PanelSide};
+use echolake_panel::paper_panel::PaperPanel;
+use echolake_panel::relief::PanelRelief;
 use echolake_schema::{Rig, SurfaceId};
 
 use super::AcquireArgs;

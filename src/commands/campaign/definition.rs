@@ -4,11 +4,11 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, bail, ensure};
-use echolake_acquisition::panel::collection::CollectionSurface;
-use echolake_acquisition::panel::mesh::PanelSide;
-use echolake_acquisition::panel::relief::PanelRelief;
-use echolake_acquisition::run::PanelSpecimen;
 use echolake_lake::ReferenceSurfaces;
+use echolake_panel::PanelSpecimen;
+use echolake_panel::collection::CollectionSurface;
+use echolake_panel::mesh::PanelSide;
+use echolake_panel::relief::PanelRelief;
 use echolake_schema::{ProjectName, SurfaceId};
 use serde::Deserialize;
 

@@ -3,8 +3,8 @@
 use std::path::Path;
 
 use anyhow::Context as _;
-use echolake_acquisition::panel::relief::PanelRelief;
-use echolake_acquisition::panel::relief::group::{BandLevel, GroupRanges};
+use echolake_panel::relief::PanelRelief;
+use echolake_panel::relief::group::{BandLevel, GroupRanges};
 
 use crate::CommandOutcome;
 

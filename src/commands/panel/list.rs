@@ -1,7 +1,7 @@
 //! `echolake panel --list`: the reliefs and their parameters.
 
-use echolake_acquisition::panel::paper_panel::PaperPanel;
-use echolake_acquisition::panel::relief::{Error, PanelRelief, ParameterDomain, ReliefParameter};
+use echolake_panel::paper_panel::PaperPanel;
+use echolake_panel::relief::{Error, PanelRelief, ParameterDomain, ReliefParameter};
 
 use crate::CommandOutcome;
 

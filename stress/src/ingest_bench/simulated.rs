@@ -5,12 +5,13 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 use anyhow::{Context as _, Result, ensure};
-use echolake_acquisition::panel::collection::{CollectionSurface, collection};
+use echolake_acquisition::run::RunRequest;
 use echolake_acquisition::run::controller::RecordingMode;
 use echolake_acquisition::run::simulate::simulate;
-use echolake_acquisition::run::{PanelSpecimen, RunRequest};
 use echolake_ingest::{FileReport, LakeIngest, pending};
 use echolake_lake::{Lake, ReferenceSurfaces};
+use echolake_panel::PanelSpecimen;
+use echolake_panel::collection::{CollectionSurface, collection};
 use echolake_schema::manifest::{Origin, RunEnd};
 use echolake_schema::{Rig, Timestamp};
 

@@ -6,9 +6,9 @@ mod transducers;
 
 use std::sync::Arc;
 
+use echolake_panel::PreparedPanel;
 use echolake_schema::{Rig, Timestamp};
 
-use crate::panel::prepared_panel::PreparedPanel;
 use crate::rig::drivers;
 use crate::rig::robots::Choreography;
 use crate::rig::{Error, RigDevices};

@@ -14,6 +14,8 @@ use echolake_dsp::deconvolution::fast_length;
 use echolake_dsp::geometry::specular_point;
 use echolake_dsp::kirchhoff::{FacetScattering, KirchhoffPlan, KirchhoffScratch, SoundPath, TransducerPose};
 use echolake_dsp::temperature::speed_of_sound;
+use echolake_panel::material::SurfaceMaterial;
+use echolake_panel::relief::HeightField;
 use echolake_schema::manifest::Origin;
 use echolake_schema::simulation::SimulationParams;
 use echolake_schema::{Grid, Rig, Timestamp};
@@ -24,20 +26,16 @@ use realfft::num_complex::Complex;
 use realfft::{ComplexToReal, RealToComplex};
 
 use super::transducers;
-use crate::panel::material::SurfaceMaterial;
-use crate::panel::relief::HeightField;
 use crate::rig::robots::{Choreography, Joints, Tool};
 use crate::rig::{
     AmbientReading, AmbientSensor, ArmPositions, AudioInterface, AudioTake, DeviceFault, DrivePower, Error, RigDevices,
     RobotArms,
 };
 
-/// Facets along each side: 2.14 mm, a quarter of the wavelength at 40 kHz.
-pub const FACETS: usize = 274;
 /// Samples of a response beyond its farthest echo: the band limit rings.
 const RINGING: f64 = 32.0;
 /// Time of one measurement (Rust et al. 2021): moving, settling, sweep.
-pub(crate) const TAKE_SECS: f64 = 12.3;
+pub const TAKE_SECS: f64 = 12.3;
 /// Gain from pressure at 1 m to full scale: the direct sound at 75 mm stays 9 dB under it.
 const MICROPHONE_GAIN: f64 = 0.037;
 /// Noise of the channels, rms re full scale: -102 and -108 dB.
@@ -422,8 +420,9 @@ fn quantise(signal: &[f32], gain: f64, noise: f64, world: &mut SimulatedWorld, o
 
 #[cfg(test)]
 mod tests {
+    use echolake_panel::relief::PanelRelief;
+
     use super::*;
-    use crate::panel::relief::PanelRelief;
     use crate::rig::conformance;
 
     fn simulated(seed: u64) -> RigDevices {

@@ -4,6 +4,8 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 
+use echolake_panel::PanelSpecimen;
+use echolake_panel::PreparedPanel;
 use echolake_schema::devices::RosbridgeParams;
 use echolake_schema::manifest::RunEnd;
 use echolake_schema::messages::Measurement;
@@ -17,15 +19,14 @@ use super::rosbridge::fake::{BridgeFault, FakeBridge};
 use super::serial::SerialSensor;
 use super::serial::tests::{FakeSensor, GOOD, IMPATIENT_SECS, PATIENT_SECS};
 use super::*;
-use crate::panel::prepared_panel::PreparedPanel;
 use crate::rig::devices::{DeviceRequest, simulated_devices};
+use crate::run::RunRequest;
 use crate::run::controller::{
     Error as RunError, RecordingMode, RunControl, RunController, RunEvent, RunOptions, RunWorkload,
 };
 use crate::run::recorder::tests::create_flat;
 use crate::run::recorder::{PairAttempts, Recorder};
 use crate::run::session::{PreflightMode, RunSession, TakePace};
-use crate::run::{PanelSpecimen, RunRequest};
 
 // A cable is no air: its sound comes at the wrong time for any distance.
 const RIG: &str = "sweep.duration_secs = 0.1\nvalidation.attempts = 1\nvalidation.arrival_us = 1e6\n\

@@ -5,14 +5,14 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 
+use echolake_panel::material::SurfaceMaterial;
+use echolake_panel::relief::PanelRelief;
 use echolake_schema::manifest::Origin;
 use echolake_schema::messages::{Measurement, Verdict};
 use echolake_schema::{Rig, Timestamp, topics};
 use prost::Message as _;
 
 use super::*;
-use crate::panel::material::SurfaceMaterial;
-use crate::panel::relief::PanelRelief;
 use crate::rig::devices::simulated::{RigSimulation, devices};
 use crate::rig::{
     AmbientReading, AmbientSensor, ArmPositions, AudioInterface, AudioTake, Error as RigError, RigDevices, RobotArms,

@@ -3,12 +3,12 @@
 use std::sync::Arc;
 use std::sync::atomic::AtomicU32;
 
+use echolake_panel::material::SurfaceMaterial;
+use echolake_panel::relief::PanelRelief;
 use echolake_schema::messages::{ImpulseResponse, Message as RunMessage, SweepRecording};
 use echolake_schema::topics;
 
 use super::*;
-use crate::panel::material::SurfaceMaterial;
-use crate::panel::relief::PanelRelief;
 use crate::rig::devices::simulated::{RigSimulation, devices};
 use crate::rig::{AmbientReading, AmbientSensor, ArmPositions, AudioInterface, Error as RigError, RobotArms};
 use crate::run::recorder::tests::create_flat;

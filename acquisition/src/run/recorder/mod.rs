@@ -16,6 +16,9 @@ use std::fs::{File, OpenOptions};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
+use echolake_panel::OriginalFile;
+use echolake_panel::mesh::{Mesh, MeshFormat};
+use echolake_panel::relief::HeightField;
 use echolake_recording::{Attachment, ChunkLane, ChunkWriter, MessageHeader, Metadata, system_cause};
 use echolake_schema::manifest::{RunEnd, RunManifest};
 use echolake_schema::messages::{
@@ -25,8 +28,6 @@ use echolake_schema::{ErrorCause, Rig, SurfaceRecord, Timestamp, samples, topics
 use foxglove::Encode;
 
 use crate::disk::{folder_of, sync};
-use crate::panel::mesh::Mesh;
-use crate::panel::relief::HeightField;
 use channels::Channels;
 pub(crate) use channels::own_channels;
 pub use error::Error;
@@ -78,16 +79,6 @@ pub struct Relief<'a> {
     pub mesh: &'a Mesh,
     /// The producer's own file.
     pub original: Option<OriginalFile<'a>>,
-}
-
-/// A file that is kept as it is.
-pub struct OriginalFile<'a> {
-    /// Its name.
-    pub name: &'a str,
-    /// Its media type.
-    pub media_type: &'a str,
-    /// Its content.
-    pub bytes: &'a [u8],
 }
 
 /// How much a line of the log matters.
@@ -230,7 +221,7 @@ impl Recorder {
         let surface = serde_json::to_vec_pretty(start.surface).map_err(|source| Error::Surface { source })?;
         self.attach(at, topics::RIG_ATTACHMENT, "application/toml", start.rig.to_toml().as_bytes())?;
         self.attach(at, topics::SURFACE_ATTACHMENT, "application/json", &surface)?;
-        let glb = start.relief.as_ref().map(|r| r.mesh.to_bytes(crate::panel::mesh::MeshFormat::Glb));
+        let glb = start.relief.as_ref().map(|r| r.mesh.to_bytes(MeshFormat::Glb));
         if let (Some(relief), Some(glb)) = (&start.relief, &glb) {
             let heights: Vec<u8> = relief.heights.heights_mm().iter().flat_map(|h| h.to_le_bytes()).collect();
             self.attach(at, topics::MESH_ATTACHMENT, "model/gltf-binary", glb)?;
@@ -260,7 +251,7 @@ impl Recorder {
             let time = u64::try_from(at.0).unwrap_or(0);
             let mut encoded = Vec::new();
             // A Vec grows, so encoding into it cannot fail.
-            let _ = scene::panel(at, mesh.to_bytes(crate::panel::mesh::MeshFormat::Glb)).encode(&mut encoded);
+            let _ = scene::panel(at, mesh.to_bytes(MeshFormat::Glb)).encode(&mut encoded);
             tap.message(self.channels.scene, time, &encoded);
             encoded.clear();
             let _ = scene::points(at, heights).encode(&mut encoded);

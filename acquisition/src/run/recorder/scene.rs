@@ -1,5 +1,6 @@
 //! The messages that viewers show: frames, poses, the panel, its points, audio and log. Metres and quaternions.
 
+use echolake_panel::relief::HeightField;
 use echolake_schema::Timestamp;
 use foxglove::messages::{
     Color, FrameTransform, FrameTransforms, JointState, JointStates, Log, ModelPrimitive, PackedElementField,
@@ -8,7 +9,6 @@ use foxglove::messages::{
 };
 
 use super::LogLevel;
-use crate::panel::relief::HeightField;
 use crate::rig::robots::{Cell, Joints, PANEL_M, Tool, frame_names, joint_names};
 
 /// Length of the holders between flange and microphone or speaker, m.

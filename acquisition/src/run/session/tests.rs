@@ -2,11 +2,13 @@
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use echolake_panel::PanelSpecimen;
+use echolake_panel::relief::PanelRelief;
+
 use super::*;
-use crate::panel::relief::PanelRelief;
 use crate::run::recorder::Held;
 use crate::run::simulate::simulate;
-use crate::run::{PanelSpecimen, RunRequest, resume};
+use crate::run::{RunRequest, resume};
 use echolake_recording::prove_file;
 
 const SMALL_RIG: &str = include_str!("../../../../tests/fixtures/small_rig.toml");

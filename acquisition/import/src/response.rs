@@ -1,0 +1,75 @@
+//! One imported response as a run records it: its pair, time and temperature; everything else is unknown.
+
+use echolake_acquisition::run::recorder::{Error, Recorder};
+use echolake_dsp::temperature::{TemperatureCorrection, resampling_ratio};
+use echolake_schema::messages::{AmbientSample, ImpulseResponse, Measurement, Verdict};
+use echolake_schema::{Celsius, Grid, Pair, Rig, Timestamp};
+
+/// A response, recorded as the file has it.
+pub(crate) struct ImportedResponse {
+    pub(crate) pair: Pair,
+    pub(crate) at: Timestamp,
+    pub(crate) celsius: Celsius,
+    pub(crate) samples: Vec<f32>,
+    /// True if it is on the time axis of the rig's reference temperature.
+    pub(crate) is_corrected: bool,
+}
+
+impl ImportedResponse {
+    /// Records it as the pair's first attempt, accepted.
+    pub(crate) fn record(self, recorder: &mut Recorder, rig: &Rig, grid: &Grid) -> Result<(), Error> {
+        let Self { pair, at, celsius, samples, is_corrected } = self;
+        let (unknown, celsius) = (f64::NAN, celsius.get());
+        let [m, s] = [pair.microphone, pair.speaker].map(|id| grid.points()[id.index()].position_mm);
+        recorder.poses(at, m, s)?;
+        recorder.environment(
+            at,
+            &AmbientSample {
+                temperature_c: celsius,
+                humidity_pct: unknown,
+                pressure_hpa: unknown,
+                outside_level_db: unknown,
+            },
+        )?;
+        recorder.ir(
+            at,
+            &ImpulseResponse {
+                pair_id: pair.id.0,
+                attempt: 1,
+                sample_rate_hz: rig.sweep.rate_hz.get(),
+                samples,
+                temperature_c: celsius,
+                temperature_corrected: is_corrected,
+            },
+        )?;
+        recorder.measurement(
+            at,
+            &Measurement {
+                pair_id: pair.id.0,
+                attempt: 1,
+                microphone: pair.microphone.0,
+                speaker: pair.speaker.0,
+                verdict: Verdict::Accepted.into(),
+                snr_db: unknown,
+                loopback_level_dbfs: unknown,
+                arrival_error_us: unknown,
+                outside_level_db: unknown,
+                temperature_c: celsius,
+                humidity_pct: unknown,
+                pressure_hpa: unknown,
+                microphone_residual_mm: unknown,
+                speaker_residual_mm: unknown,
+                ..Measurement::default()
+            },
+        )
+    }
+}
+
+/// Returns the samples that it takes to bring a response to the reference temperature.
+pub(crate) fn least_length(rig: &Rig, celsius: Celsius, is_corrected: bool) -> usize {
+    let ratio = resampling_ratio(celsius.get(), rig.impulse_response.reference_temperature_c.get());
+    match rig.impulse_response.length {
+        length if is_corrected || ratio == 1.0 => length,
+        length => TemperatureCorrection::<f64>::input_len_for(length, ratio),
+    }
+}

@@ -1,0 +1,234 @@
+//! Import of WAV files, one run per surface. One row at a time is in memory.
+
+#[cfg(test)]
+mod tests;
+
+use std::path::Path;
+
+use echolake_acquisition::run::assessment::TakeAssessor;
+use echolake_acquisition::run::objection::TakeObjection;
+use echolake_acquisition::run::recorder::{LogLevel, Recorder, RunStart};
+use echolake_dsp::chain::raw_len;
+use echolake_dsp::deconvolution::{DeconvolutionParams, TransformLength};
+use echolake_dsp::geometry::direct_mm;
+use echolake_dsp::response_deconvolution::ResponseDeconvolution;
+use echolake_dsp::temperature::{resampling_ratio, response_limits_hz, speed_of_sound};
+use echolake_schema::manifest::{Origin, RunEnd};
+use echolake_schema::messages::{AmbientSample, ImpulseResponse, Measurement, SweepRecording, Verdict};
+use echolake_schema::{Grid, Rig, SampleRate, SurfaceId, Timestamp};
+
+use crate::batch::ImportBatch;
+use crate::wav_file::WavChannel;
+use crate::wav_manifest::{self, ManifestRow};
+use crate::{Error, ImportOptions, ImportedRun};
+
+/// Source name of the import's log entries.
+const NAME: &str = "import wav";
+
+/// Returns the sampling rate of a manifest's first recording.
+///
+/// # Errors
+/// [`Error`], naming the manifest and the place.
+pub fn sampling_rate_of(manifest: &Path) -> Result<SampleRate, Error> {
+    Ok(SampleRate::new(f64::from(wav_manifest::first_recording(manifest)?.layout.rate_hz))?)
+}
+
+/// Imports all rows of a manifest; `progress` gets the number of rows done and of all.
+///
+/// # Errors
+/// [`Error`], naming the place; every row is checked before the first is imported, and a refused import leaves nothing
+/// behind.
+pub fn import_wav(
+    manifest: &Path,
+    rig: &Rig,
+    options: ImportOptions<'_>,
+    progress: &mut dyn FnMut(usize, usize),
+) -> Result<Vec<ImportedRun>, Error> {
+    let grid = rig.grid()?;
+    let surfaces = wav_manifest::read(manifest, rig, &grid)?;
+    let total = surfaces.values().map(Vec::len).sum();
+    let (mut runs, mut batch, mut done) = (Vec::new(), ImportBatch::default(), 0);
+    for (surface, rows) in surfaces {
+        let import = WavImport { manifest, rig, grid: &grid, options };
+        let run = import.surface(surface, &rows, &mut batch, &mut || {
+            done += 1;
+            progress(done, total);
+        })?;
+        runs.push(run);
+    }
+    batch.publish()?;
+    Ok(runs)
+}
+
+struct WavImport<'a> {
+    manifest: &'a Path,
+    rig: &'a Rig,
+    grid: &'a Grid,
+    options: ImportOptions<'a>,
+}
+
+impl WavImport<'_> {
+    fn surface(
+        &self,
+        surface: SurfaceId,
+        rows: &[ManifestRow],
+        batch: &mut ImportBatch,
+        done: &mut dyn FnMut(),
+    ) -> Result<ImportedRun, Error> {
+        // A run's file is in the order of time, however the manifest's rows are.
+        let mut timed: Vec<_> = (0u32..).zip(rows).map(|(i, row)| (self.time(row, i), row)).collect();
+        timed.sort_by_key(|(time, _)| *time);
+        let started = timed.first().map_or(self.options.started, |(time, _)| *time);
+        let manifest = crate::manifest(Origin::ImportedWav, &surface, self.rig, started)?;
+        let record = self.options.surface_record("imported");
+        let path = self.options.folder.join(format!("{}.mcap", manifest.run_id));
+        let start = RunStart { manifest: &manifest, rig: self.rig, surface: &record, relief: None, plan: None };
+        let mut recorder = batch.create(&path, &start)?;
+        recorder.log(started, LogLevel::Info, NAME, &format!("{} recordings", rows.len()))?;
+        let mut warnings = Vec::new();
+        for (at, row) in &timed {
+            warnings.extend(self.row(&mut recorder, row, *at)?);
+            done();
+        }
+        let count = rows.len() as u64;
+        let ended = timed.last().map_or(started, |(time, _)| *time);
+        batch.seal(recorder, &RunEnd { ended, accepted: count, rejected: 0, attempts: count })?;
+        Ok(ImportedRun { path, run_id: manifest.run_id, surface, measurements: rows.len(), warnings })
+    }
+
+    fn time(&self, row: &ManifestRow, index: u32) -> Timestamp {
+        row.recorded_at.unwrap_or_else(|| self.options.started.plus_secs(f64::from(index)))
+    }
+
+    // Import keeps all it is given: objections of the rig become warnings, not refusals.
+    fn row(&self, recorder: &mut Recorder, row: &ManifestRow, at: Timestamp) -> Result<Option<String>, Error> {
+        let unread = |column, what| Error::Row { path: self.manifest.to_owned(), line: row.line, column, what };
+        let microphone = row.recording.read(row.format).map_err(|e| unread("recording", e))?;
+        let loopback = row.loopback.read(row.format).map_err(|e| unread("loopback", e))?;
+        let (rig, celsius) = (self.rig, row.celsius.get());
+        let planned = |cause| Error::Plan { rig: rig.name.clone(), cause };
+        let len = microphone.fractions.len();
+        let plan = ResponseDeconvolution::<f32>::new(DeconvolutionParams {
+            recording_len: len,
+            output_len: raw_len(rig.impulse_response.length, rig.impulse_response.reference_temperature_c.get())
+                .min(len),
+            rate_hz: rig.sweep.rate_hz.get(),
+            low_hz: rig.sweep.low_hz,
+            high_hz: rig.sweep.high_hz,
+            division: rig.impulse_response.division,
+            taper_hz: rig.taper_hz(),
+            length: TransformLength::Fast,
+        })
+        .map_err(planned)?;
+        let mut samples = vec![0.0; plan.output_len()];
+        let rho = resampling_ratio(celsius, rig.impulse_response.reference_temperature_c.get());
+        let limits_hz = response_limits_hz([rig.sweep.low_hz, rig.sweep.high_hz], rho);
+        plan.run_within(limits_hz, &microphone.fractions, &loopback.fractions, &mut samples, &mut plan.scratch())
+            .map_err(|e| unread("loopback", e.to_string()))?;
+        let [m, s] = [row.pair.microphone, row.pair.speaker].map(|id| self.grid.points()[id.index()].position_mm);
+        let arrival = direct_mm(m, s) / 1e3 / speed_of_sound(celsius);
+        let clipped = microphone.clipped + loopback.clipped;
+        let assessment = TakeAssessor::new(rig, len)
+            .and_then(|mut a| a.assess(&microphone.fractions, &loopback.fractions, arrival, clipped))
+            .map_err(planned)?;
+        // The geometry of a foreign rig is known less well than its files say, and the level outside was not recorded:
+        // the arrival is recorded, not judged, and so is a signal-to-noise ratio that a long response leaves no room
+        // for.
+        let mut judged = assessment;
+        judged.arrival_error_us = 0.0;
+        if judged.snr_db.is_nan() {
+            judged.snr_db = f64::INFINITY;
+        }
+        let columns = [("recording", &row.recording), ("loopback", &row.loopback)];
+        let warned = |(column, wav): (&str, &WavChannel)| {
+            wav.layout.warning.as_ref().map(|warning| format!("{column}, {}: {warning}", wav.label()))
+        };
+        let mut reasons: Vec<_> = columns.into_iter().filter_map(warned).collect();
+        for objection in judged.objections(&rig.validation, f64::NEG_INFINITY) {
+            match objection {
+                // Where to lower the gain depends on which of both it is.
+                TakeObjection::Clipped { .. } => {
+                    let of = [
+                        ("recording", &row.recording, microphone.clipped),
+                        ("loopback", &row.loopback, loopback.clipped),
+                    ];
+                    let clipped = of.iter().filter(|(.., samples)| *samples > 0);
+                    reasons.extend(clipped.map(|(column, wav, samples)| {
+                        format!("{samples} samples clipped in the {column}, {}", wav.label())
+                    }));
+                }
+                other => reasons.push(other.to_string()),
+            }
+        }
+        let sample_rate_hz = rig.sweep.rate_hz.get();
+        recorder.poses(at, m, s)?;
+        recorder.environment(
+            at,
+            &AmbientSample {
+                temperature_c: celsius,
+                humidity_pct: row.humidity_pct,
+                pressure_hpa: row.pressure_hpa,
+                outside_level_db: f64::NAN,
+            },
+        )?;
+        recorder.sweep(
+            at,
+            &SweepRecording {
+                pair_id: row.pair.id.0,
+                attempt: row.attempt,
+                sample_rate_hz,
+                sample_count: len as u32,
+                format: row.format.into(),
+                microphone: microphone.bytes.into(),
+                loopback: loopback.bytes.into(),
+                temperature_c: celsius,
+            },
+        )?;
+        recorder.ir(
+            at,
+            &ImpulseResponse {
+                pair_id: row.pair.id.0,
+                attempt: row.attempt,
+                sample_rate_hz,
+                samples,
+                temperature_c: celsius,
+                temperature_corrected: false,
+            },
+        )?;
+        let warning = (!reasons.is_empty()).then(|| format!("line {}: {}", row.line, reasons.join("; ")));
+        recorder.measurement(
+            at,
+            &Measurement {
+                pair_id: row.pair.id.0,
+                attempt: row.attempt,
+                microphone: row.pair.microphone.0,
+                speaker: row.pair.speaker.0,
+                verdict: Verdict::Accepted.into(),
+                snr_db: assessment.snr_db,
+                clipped_samples: clipped,
+                loopback_level_dbfs: assessment.loopback_dbfs,
+                arrival_error_us: assessment.arrival_error_us,
+                outside_level_db: f64::NAN,
+                temperature_c: celsius,
+                humidity_pct: row.humidity_pct,
+                pressure_hpa: row.pressure_hpa,
+                reasons,
+                microphone_residual_mm: f64::NAN,
+                speaker_residual_mm: f64::NAN,
+            },
+        )?;
+        if let Some(warning) = &warning {
+            recorder.log(at, LogLevel::Warning, NAME, warning)?;
+        }
+        recorder.checkpoint()?;
+        Ok(warning)
+    }
+}
+
+/// Checks all rows of a manifest and the files that they name, without importing them.
+///
+/// # Errors
+/// As [`import_wav`].
+pub fn check_wav(manifest: &Path, rig: &Rig) -> Result<(), Error> {
+    wav_manifest::read(manifest, rig, &rig.grid()?).map(drop)
+}

@@ -1,0 +1,150 @@
+//! One channel of a WAV file, checked before it is believed.
+
+use std::path::{Path, PathBuf};
+
+use echolake_schema::messages::SampleFormat;
+use echolake_schema::samples::split_24;
+
+use crate::wav_layout::{SampleCoding, WavLayout};
+
+/// A channel of a file.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct WavChannel {
+    path: PathBuf,
+    channel: u16,
+    pub(crate) layout: WavLayout,
+}
+
+/// The samples of a channel.
+pub(crate) struct ChannelSamples {
+    pub(crate) bytes: Vec<u8>,
+    pub(crate) fractions: Vec<f32>,
+    pub(crate) clipped: u32,
+}
+
+impl WavChannel {
+    /// Opens `file.wav`, or `file.wav#2` for its second channel. The text of an error names the fault.
+    pub(crate) fn open(folder: &Path, reference: &str) -> Result<Self, String> {
+        let (name, channel) = match reference.rsplit_once('#') {
+            Some((name, number)) => {
+                let number: u16 = number.parse().map_err(|_| format!("`#{number}` is no channel number"))?;
+                (name, number)
+            }
+            None => (reference, 1),
+        };
+        let path = folder.join(name);
+        let shown = path.display();
+        let size = std::fs::metadata(&path).map_err(|e| format!("cannot read `{shown}`: {e}"))?.len();
+        if size == 0 {
+            return Err(format!("`{shown}` is empty"));
+        }
+        let layout = WavLayout::read(&path).map_err(|fault| format!("`{shown}` {fault}"))?;
+        if layout.samples == 0 {
+            return Err(format!("`{shown}` has no samples"));
+        }
+        if !(1..=layout.channels).contains(&channel) {
+            return Err(format!("`{shown}` has {} channels, expected one with number {channel}", layout.channels));
+        }
+        Ok(Self { path, channel: channel - 1, layout })
+    }
+
+    /// Returns its file and channel, for messages.
+    pub(crate) fn label(&self) -> String {
+        format!("`{}`, channel {}", self.path.display(), self.channel + 1)
+    }
+
+    /// Returns the format that stores its samples without loss.
+    pub(crate) fn format(&self) -> SampleFormat {
+        match (self.layout.coding, self.layout.bits) {
+            (SampleCoding::Float, _) => SampleFormat::F32le,
+            (SampleCoding::Integer, ..=16) => SampleFormat::S16le,
+            (SampleCoding::Integer, ..=24) => SampleFormat::S24Split,
+            (SampleCoding::Integer, _) => SampleFormat::S32le,
+        }
+    }
+
+    /// Reads its samples, as bytes of `format`, which is its own or a wider one.
+    pub(crate) fn read(&self, format: SampleFormat) -> Result<ChannelSamples, String> {
+        let failed = |fault: String| format!("`{}` {fault}", self.path.display());
+        let mut out = ChannelSamples { bytes: Vec::new(), fractions: Vec::new(), clipped: 0 };
+        if self.layout.coding == SampleCoding::Float {
+            let visit = |x: f32| {
+                out.bytes.extend(x.to_le_bytes());
+                out.fractions.push(x);
+                out.clipped += u32::from(x.abs() >= 1.0);
+            };
+            self.layout.visit_floats(&self.path, self.channel, visit).map_err(failed)?;
+            return match out.fractions.iter().find(|x| !x.is_finite()) {
+                Some(x) => Err(failed(format!("has a sample that is {x}"))),
+                None => Ok(out),
+            };
+        }
+        let width = format.bytes().unwrap_or(4);
+        let highest = i32::MAX - ((1u32 << (32 - self.layout.bits)) - 1) as i32;
+        let mut wide = Vec::with_capacity(self.layout.samples as usize);
+        let visit = |x: i32| {
+            wide.push(x >> (32 - 8 * width));
+            out.fractions.push((f64::from(x) / 2f64.powi(31)) as f32);
+            out.clipped += u32::from(x == i32::MIN || x >= highest);
+        };
+        self.layout.visit_integers(&self.path, self.channel, visit).map_err(failed)?;
+        out.bytes = match format {
+            SampleFormat::S24Split => split_24(&wide),
+            _ => wide.iter().flat_map(|x| x.to_le_bytes().into_iter().take(width)).collect(),
+        };
+        Ok(out)
+    }
+}
+
+/// Returns the wider of two formats, if one holds the other's samples exactly.
+pub(crate) fn common_format(a: SampleFormat, b: SampleFormat) -> Option<SampleFormat> {
+    match (a == b, a == SampleFormat::F32le || b == SampleFormat::F32le) {
+        (true, _) => Some(a),
+        (false, true) => None,
+        (false, false) => {
+            if a.bytes() > b.bytes() {
+                Some(a)
+            } else {
+                Some(b)
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use echolake_schema::samples::decode;
+    use hound::{SampleFormat as WavFormat, WavSpec};
+
+    use super::*;
+
+    fn written(folder: &Path, bits_per_sample: u16, samples: &[i32]) -> WavChannel {
+        let spec = WavSpec { channels: 1, sample_rate: 96_000, bits_per_sample, sample_format: WavFormat::Int };
+        let name = format!("{bits_per_sample}.wav");
+        let mut writer = hound::WavWriter::create(folder.join(&name), spec).expect("a file");
+        samples.iter().for_each(|x| writer.write_sample(*x).expect("a sample"));
+        writer.finalize().expect("a whole file");
+        WavChannel::open(folder, &name).expect("a channel")
+    }
+
+    // What is stored is read back as the fractions that import itself computed with.
+    #[test]
+    fn every_width_keeps_its_samples() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let widths = [(16, SampleFormat::S16le), (24, SampleFormat::S24Split), (32, SampleFormat::S32le)];
+        for (bits, format) in widths {
+            let full = 1i64 << (bits - 1);
+            let samples = [0, 1, -1, 0x1234, -0x1235, full - 1, -full].map(|x| x as i32);
+            let channel = written(folder.path(), bits, &samples);
+            assert_eq!(channel.format(), format);
+            for wider in widths.into_iter().filter(|(w, _)| *w >= bits).map(|(_, f)| f) {
+                let read = channel.read(wider).expect("samples");
+                let mut decoded = [f32::NAN; 7];
+                decode(wider, &read.bytes, &mut decoded).expect("bytes of this format");
+                assert_eq!(decoded.as_slice(), read.fractions, "{bits} bits as {wider:?}");
+                assert_eq!(decoded.map(|y| (f64::from(y) * full as f64) as i32), samples.map(|x| (x as f32) as i32));
+                assert_eq!(read.clipped, 2);
+            }
+        }
+    }
+}

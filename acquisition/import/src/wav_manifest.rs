@@ -1,0 +1,181 @@
+//! The manifest of an import: a CSV file, checked row by row before anything is written.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use csv::StringRecord;
+use echolake_schema::interchange::WAV_MANIFEST;
+use echolake_schema::messages::SampleFormat;
+use echolake_schema::{Celsius, Grid, Pair, PairId, Rig, SurfaceId, Timestamp};
+
+use crate::Error;
+use crate::wav_file::{WavChannel, common_format};
+
+/// Number of required columns, which come first.
+const NEEDED: usize = 6;
+
+/// A row of the manifest, checked.
+#[derive(Debug, Clone)]
+pub(crate) struct ManifestRow {
+    pub(crate) line: u64,
+    pub(crate) recording: WavChannel,
+    pub(crate) loopback: WavChannel,
+    pub(crate) format: SampleFormat,
+    pub(crate) pair: Pair,
+    pub(crate) celsius: Celsius,
+    pub(crate) humidity_pct: f64,
+    pub(crate) pressure_hpa: f64,
+    pub(crate) recorded_at: Option<Timestamp>,
+    pub(crate) attempt: u32,
+}
+
+/// A manifest's rows by surface.
+pub(crate) type WavManifest = BTreeMap<SurfaceId, Vec<ManifestRow>>;
+
+/// Opens a manifest and checks its header; returns the place of each column.
+fn open(path: &Path) -> Result<(csv::Reader<std::fs::File>, Vec<Option<usize>>), Error> {
+    let unreadable = |e: csv::Error| Error::Read { path: path.to_owned(), source: e.into() };
+    let mut reader = csv::ReaderBuilder::new().trim(csv::Trim::All).from_path(path).map_err(unreadable)?;
+    let header = reader.headers().map_err(unreadable)?.clone();
+    let wrong = |what| Error::Header { path: path.to_owned(), what };
+    if header.is_empty() {
+        return Err(wrong("it is empty".into()));
+    }
+    if let Some(unknown) = header.iter().find(|h| !WAV_MANIFEST.contains(h)) {
+        return Err(wrong(format!("unknown column `{unknown}`")));
+    }
+    let places: Vec<_> = WAV_MANIFEST.iter().map(|c| header.iter().position(|h| h == *c)).collect();
+    match places[..NEEDED].iter().position(Option::is_none) {
+        Some(missing) => Err(wrong(format!("column `{}` is missing", WAV_MANIFEST[missing]))),
+        None => Ok((reader, places)),
+    }
+}
+
+/// The first recording of a manifest.
+pub(crate) fn first_recording(path: &Path) -> Result<WavChannel, Error> {
+    let (mut reader, places) = open(path)?;
+    let record = next(path, &mut reader)?.ok_or_else(|| no_rows(path))?;
+    let cells = ManifestCells { path, places: &places, record: &record };
+    cells.wav("recording")
+}
+
+/// Reads and checks all rows.
+pub(crate) fn read(path: &Path, rig: &Rig, grid: &Grid) -> Result<WavManifest, Error> {
+    let (mut reader, places) = open(path)?;
+    let mut manifest = WavManifest::new();
+    while let Some(record) = next(path, &mut reader)? {
+        let cells = ManifestCells { path, places: &places, record: &record };
+        let surface: SurfaceId = cells.parse("surface")?;
+        let row = cells.row(rig, grid)?;
+        let rows = manifest.entry(surface).or_default();
+        if let Some(twin) = rows.iter().find(|r| r.pair == row.pair && r.attempt == row.attempt) {
+            let what = format!(
+                "attempt {} at this pair is in line {} already; hint: number the attempts",
+                row.attempt, twin.line
+            );
+            return Err(cells.wrong("attempt", what));
+        }
+        rows.push(row);
+    }
+    if manifest.is_empty() { Err(no_rows(path)) } else { Ok(manifest) }
+}
+
+fn next(path: &Path, reader: &mut csv::Reader<std::fs::File>) -> Result<Option<StringRecord>, Error> {
+    let mut record = StringRecord::new();
+    match reader.read_record(&mut record) {
+        Ok(true) => Ok(Some(record)),
+        Ok(false) => Ok(None),
+        Err(e) => Err(Error::Read { path: path.to_owned(), source: e.into() }),
+    }
+}
+
+fn no_rows(path: &Path) -> Error {
+    Error::Header { path: path.to_owned(), what: "it has no rows".into() }
+}
+
+struct ManifestCells<'a> {
+    path: &'a Path,
+    places: &'a [Option<usize>],
+    record: &'a StringRecord,
+}
+
+impl ManifestCells<'_> {
+    fn get(&self, column: &'static str) -> Option<&str> {
+        let index = WAV_MANIFEST.iter().position(|c| *c == column)?;
+        self.record.get(self.places[index]?).filter(|text| !text.is_empty())
+    }
+
+    fn wrong(&self, column: &'static str, what: impl Into<String>) -> Error {
+        let line = self.record.position().map_or(0, csv::Position::line);
+        Error::Row { path: self.path.to_owned(), line, column, what: what.into() }
+    }
+
+    fn needed(&self, column: &'static str) -> Result<&str, Error> {
+        self.get(column).ok_or_else(|| self.wrong(column, "it is empty"))
+    }
+
+    fn parse<T: std::str::FromStr<Err = echolake_schema::Error>>(&self, column: &'static str) -> Result<T, Error> {
+        self.needed(column)?.parse().map_err(|e: T::Err| self.wrong(column, e.to_string()))
+    }
+
+    fn number(&self, column: &'static str) -> Result<Option<f64>, Error> {
+        let Some(text) = self.get(column) else { return Ok(None) };
+        let number = text.parse().ok().filter(|x: &f64| x.is_finite());
+        number.map(Some).ok_or_else(|| self.wrong(column, format!("`{text}` is no number")))
+    }
+
+    fn wav(&self, column: &'static str) -> Result<WavChannel, Error> {
+        let folder = self.path.parent().unwrap_or(Path::new("."));
+        WavChannel::open(folder, self.needed(column)?).map_err(|what| self.wrong(column, what))
+    }
+
+    fn row(&self, rig: &Rig, grid: &Grid) -> Result<ManifestRow, Error> {
+        let (recording, loopback) = (self.wav("recording")?, self.wav("loopback")?);
+        let expected = rig.sweep.rate_hz.get();
+        for (column, wav) in [("recording", &recording), ("loopback", &loopback)] {
+            let actual = wav.layout.rate_hz;
+            if f64::from(actual) != expected {
+                let what = format!(
+                    "sampled at {actual} Hz, expected the rig's {expected} Hz; hint: sweep.rate_hz in the rig file"
+                );
+                return Err(self.wrong(column, what));
+            }
+        }
+        let [actual, expected] = [&loopback, &recording].map(|wav| wav.layout.samples);
+        if actual != expected {
+            let what = format!("{actual} samples, expected the recording's {expected}");
+            return Err(self.wrong("loopback", what));
+        }
+        let format = common_format(recording.format(), loopback.format()).ok_or_else(|| {
+            self.wrong("loopback", "one of recording and loopback is float and the other integer; expected one kind")
+        })?;
+        let celsius = self.number("temperature_c")?.ok_or_else(|| self.wrong("temperature_c", "it is empty"))?;
+        let attempt = self.get("attempt").map_or(Ok(1), str::parse).ok().filter(|a| (1..=1000).contains(a));
+        Ok(ManifestRow {
+            line: self.record.position().map_or(0, csv::Position::line),
+            format,
+            pair: self.pair(grid)?,
+            celsius: Celsius::new(celsius).map_err(|e| self.wrong("temperature_c", e.to_string()))?,
+            humidity_pct: self.number("humidity_pct")?.unwrap_or(f64::NAN),
+            pressure_hpa: self.number("pressure_hpa")?.unwrap_or(f64::NAN),
+            recorded_at: self
+                .get("recorded_at")
+                .map(Timestamp::parse)
+                .transpose()
+                .map_err(|e| self.wrong("recorded_at", e.to_string()))?,
+            attempt: attempt.ok_or_else(|| self.wrong("attempt", "expected a whole number from 1 to 1000"))?,
+            recording,
+            loopback,
+        })
+    }
+
+    fn pair(&self, grid: &Grid) -> Result<Pair, Error> {
+        let point = |column| {
+            let found = grid.parse_point(self.needed(column)?);
+            found.map_err(|e| self.wrong(column, e.to_string()))
+        };
+        let (microphone, speaker) = (point("microphone")?, point("speaker")?);
+        let PairId(id) = grid.parse_pair(microphone, speaker).map_err(|e| self.wrong("speaker", e.to_string()))?;
+        Ok(grid.pairs()[id as usize])
+    }
+}
