@@ -1,9 +1,9 @@
 //! The frame of a plot: axes with round numbers, and places of values in it.
 
-use crate::drawing::{
+use crate::canvas::drawing::{
     FigureColour, FigureDrawing, SMALL_PX, StrokeStyle, TextAnchor, filled_rect, label, line, sized_label, upward_label,
 };
-use crate::font::text_width;
+use crate::canvas::font::text_width;
 
 /// An axis: the range that it shows.
 #[derive(Debug, Clone, Copy)]

@@ -2,14 +2,14 @@
 
 use echolake_schema::{Grid, Point};
 
-use crate::colours::{DIFFERENCE_DB, HIGH_DB, LOW_DB, LevelPalette, difference_colour, ink_on, level_colour};
-use crate::drawing::{
+use crate::canvas::colours::{DIFFERENCE_DB, HIGH_DB, LOW_DB, LevelPalette, difference_colour, ink_on, level_colour};
+use crate::canvas::drawing::{
     FigureColour, FigureDrawing, SMALL_PX, StrokeStyle, TEXT_PX, TextAnchor, filled_rect, framed_rect, label,
     sized_label,
 };
-use crate::font::{fitted_text, text_width};
-use crate::frame::number_text;
-use crate::notes::FigureNotes;
+use crate::canvas::font::{fitted_text, text_width};
+use crate::canvas::frame::number_text;
+use crate::canvas::notes::FigureNotes;
 
 const GAP: f32 = 10.0;
 const LABELS: f32 = 54.0;

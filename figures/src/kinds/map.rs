@@ -1,10 +1,10 @@
 //! Surfaces as points, close together if they reflect alike.
 
-use crate::colours::kind_colour;
-use crate::drawing::{FigureColour, FigureDrawing, SMALL_PX, TextAnchor, ellipse, sized_label};
-use crate::font::{fitted_text, text_width};
-use crate::frame::{PlotAxis, PlotFrame, draw_legend, legend_width};
-use crate::notes::FigureNotes;
+use crate::canvas::colours::kind_colour;
+use crate::canvas::drawing::{FigureColour, FigureDrawing, SMALL_PX, TextAnchor, ellipse, sized_label};
+use crate::canvas::font::{fitted_text, text_width};
+use crate::canvas::frame::{PlotAxis, PlotFrame, draw_legend, legend_width};
+use crate::canvas::notes::FigureNotes;
 
 /// More points than these have no names.
 const MOST_NAMES: usize = 60;
@@ -135,7 +135,7 @@ fn legend_rows(entries: &[(FigureColour, String)], width: f32) -> Vec<Vec<(Figur
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::drawing::ShapeGeometry;
+    use crate::canvas::drawing::ShapeGeometry;
 
     #[test]
     fn names_at_one_place_are_below_each_other() {

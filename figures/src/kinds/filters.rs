@@ -2,10 +2,10 @@
 
 use echolake_dsp::filter_bank::gain;
 
-use crate::colours::band_colour;
-use crate::drawing::{FigureColour, FigureDrawing, StrokeStyle, line};
-use crate::frame::{PlotAxis, PlotFrame, draw_legend};
-use crate::notes::FigureNotes;
+use crate::canvas::colours::band_colour;
+use crate::canvas::drawing::{FigureColour, FigureDrawing, StrokeStyle, line};
+use crate::canvas::frame::{PlotAxis, PlotFrame, draw_legend};
+use crate::canvas::notes::FigureNotes;
 
 const POINTS: usize = 400;
 const HEIGHT: f32 = 220.0;

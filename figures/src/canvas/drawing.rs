@@ -1,7 +1,7 @@
 //! A drawing: shapes on a page, before they become SVG, PDF or PNG.
 
-use crate::font::{fitted_text, text_width};
-use crate::notes::FigureNotes;
+use crate::canvas::font::{fitted_text, text_width};
+use crate::canvas::notes::FigureNotes;
 
 /// Size of ordinary text, px.
 pub(crate) const TEXT_PX: f32 = 12.0;

@@ -8,8 +8,8 @@ use pdf_writer::types::{CidFontType, FontFlags, LineJoinStyle, SystemInfo, Unico
 use pdf_writer::{Content, Filter, Finish as _, Name, Pdf, Rect, Ref, Str, TextStr};
 
 use super::{ellipse_curves, text_offset};
-use crate::drawing::{DrawnShape, FigureDrawing, ShapeGeometry};
-use crate::font::{FONT, advance, face, glyphs};
+use crate::canvas::drawing::{DrawnShape, FigureDrawing, ShapeGeometry};
+use crate::canvas::font::{FONT, advance, face, glyphs};
 
 /// Points (1/72 inch) per px.
 const POINTS: f32 = 0.75;

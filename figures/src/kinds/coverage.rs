@@ -1,8 +1,8 @@
 //! The surface that a layer's pairs see: first Fresnel zones on the panel, seen from above.
 
-use crate::drawing::{FigureColour, FigureDrawing, StrokeStyle, TextAnchor, ellipse, framed_rect, label};
-use crate::frame::number_text;
-use crate::notes::FigureNotes;
+use crate::canvas::drawing::{FigureColour, FigureDrawing, StrokeStyle, TextAnchor, ellipse, framed_rect, label};
+use crate::canvas::frame::number_text;
+use crate::canvas::notes::FigureNotes;
 
 /// The zones reach beyond the panel by this share of it at most.
 const MARGIN: f32 = 0.12;

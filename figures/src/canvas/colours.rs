@@ -1,6 +1,6 @@
 //! Colours that carry numbers.
 
-use crate::drawing::FigureColour;
+use crate::canvas::drawing::FigureColour;
 
 /// The paper's scale: white at -20 dB, black at 0 dB (equal to Flat), red at +6 dB.
 pub(crate) const LOW_DB: f64 = -20.0;

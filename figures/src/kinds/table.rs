@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use crate::notes::FigureNotes;
+use crate::canvas::notes::FigureNotes;
 
 /// The paper's colours: the loudest value of a column red, the quietest green.
 const LOUDEST: &str = "[rgb]{0.918,0.6,0.6}";

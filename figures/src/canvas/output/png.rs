@@ -7,9 +7,9 @@ use ttf_parser::OutlineBuilder;
 use zeno::{Cap, Command, Join, Mask, Stroke, Style, Transform, Vector};
 
 use super::{ellipse_curves, text_offset};
-use crate::drawing::{DrawnShape, FigureColour, FigureDrawing, ShapeGeometry, StrokeStyle};
-use crate::font::{advance, face, glyphs, outline, text_width};
-use crate::picture::encode_png;
+use crate::canvas::drawing::{DrawnShape, FigureColour, FigureDrawing, ShapeGeometry, StrokeStyle};
+use crate::canvas::font::{advance, face, glyphs, outline, text_width};
+use crate::canvas::picture::encode_png;
 
 /// Pixels per px of a drawing: 192 dots per inch.
 const SCALE: f32 = 2.0;
@@ -238,9 +238,9 @@ impl OutlineBuilder for GlyphPen {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::drawing::{TextAnchor, filled_rect, label};
-    use crate::notes::FigureNotes;
-    use crate::picture::tests::decode_png;
+    use crate::canvas::drawing::{TextAnchor, filled_rect, label};
+    use crate::canvas::notes::FigureNotes;
+    use crate::canvas::picture::tests::decode_png;
 
     // Three strips: what is across their limits is whole.
     #[test]

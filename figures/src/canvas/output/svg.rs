@@ -5,8 +5,10 @@ use std::fmt::{self, Write as _};
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 
-use crate::drawing::{DrawnShape, FigureColour, FigureDrawing, ShapeGeometry, StrokeStyle, TEXT_PX, TextAnchor};
-use crate::picture::encode_grey_png;
+use crate::canvas::drawing::{
+    DrawnShape, FigureColour, FigureDrawing, ShapeGeometry, StrokeStyle, TEXT_PX, TextAnchor,
+};
+use crate::canvas::picture::encode_grey_png;
 
 const FONTS: &str = "IBM Plex Sans,Helvetica Neue,Arial,sans-serif";
 

@@ -1,10 +1,10 @@
 //! Cumulative energy of the bands over time, stacked.
 
-use crate::colours::band_colour;
-use crate::drawing::{FigureColour, FigureDrawing, StrokeStyle, TEXT_PX, TextAnchor, filled_area, label, line};
-use crate::font::fitted_text;
-use crate::frame::{PlotAxis, PlotFrame, draw_legend};
-use crate::notes::FigureNotes;
+use crate::canvas::colours::band_colour;
+use crate::canvas::drawing::{FigureColour, FigureDrawing, StrokeStyle, TEXT_PX, TextAnchor, filled_area, label, line};
+use crate::canvas::font::fitted_text;
+use crate::canvas::frame::{PlotAxis, PlotFrame, draw_legend};
+use crate::canvas::notes::FigureNotes;
 
 const LEFT: f32 = 62.0;
 const BETWEEN: f32 = 26.0;

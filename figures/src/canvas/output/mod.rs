@@ -4,8 +4,8 @@ mod pdf;
 mod png;
 mod svg;
 
-use crate::drawing::TextAnchor;
-use crate::font::text_width;
+use crate::canvas::drawing::TextAnchor;
+use crate::canvas::font::text_width;
 
 /// Returns where a text begins, left of its point.
 fn text_offset(text: &str, size_px: f32, anchor: TextAnchor) -> f32 {

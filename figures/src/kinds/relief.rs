@@ -1,11 +1,11 @@
 //! Reliefs in oblique light, side by side, to one scale.
 
-use crate::drawing::{
+use crate::canvas::drawing::{
     FigureColour, FigureDrawing, SMALL_PX, StrokeStyle, TEXT_PX, TextAnchor, framed_rect, label, line, picture,
     sized_label,
 };
-use crate::font::fitted_text;
-use crate::notes::FigureNotes;
+use crate::canvas::font::fitted_text;
+use crate::canvas::notes::FigureNotes;
 
 /// The relief of a surface.
 #[derive(Debug, Clone, PartialEq)]

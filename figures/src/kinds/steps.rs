@@ -1,10 +1,10 @@
 //! Steps of the processing, one below the other: the paper's figure of measured response, temperature correction and
 //! removal of direct sound.
 
-use crate::colours::kind_colour;
-use crate::drawing::{FigureDrawing, StrokeStyle, TextAnchor, label, line};
-use crate::frame::{PlotAxis, PlotFrame, draw_legend, legend_width};
-use crate::notes::FigureNotes;
+use crate::canvas::colours::kind_colour;
+use crate::canvas::drawing::{FigureDrawing, StrokeStyle, TextAnchor, label, line};
+use crate::canvas::frame::{PlotAxis, PlotFrame, draw_legend, legend_width};
+use crate::canvas::notes::FigureNotes;
 
 const ROW: f32 = 150.0;
 const BETWEEN: f32 = 58.0;
