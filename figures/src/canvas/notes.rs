@@ -21,6 +21,14 @@ pub struct FigureNotes {
 }
 
 impl FigureNotes {
+    /// Returns the notes of a figure of this version of a lake, whose data have these origins, each named once.
+    pub fn of_lake(lake: String, origins: impl Iterator<Item = String>) -> Self {
+        let mut origins: Vec<_> = origins.collect();
+        origins.sort();
+        origins.dedup();
+        Self { lake, program: concat!("echolake ", env!("CARGO_PKG_VERSION")).into(), origins, ..Self::default() }
+    }
+
     /// Name and text of each note that is not empty.
     pub(crate) fn named(&self) -> Vec<(&'static str, String)> {
         let all = [

@@ -1,5 +1,7 @@
 //! Surfaces as points, close together if they reflect alike.
 
+use echolake_dsp::components::PrincipalComponents;
+
 use crate::canvas::colours::kind_colour;
 use crate::canvas::drawing::{FigureColour, FigureDrawing, SMALL_PX, TextAnchor, ellipse, sized_label};
 use crate::canvas::font::{fitted_text, text_width};
@@ -8,6 +10,8 @@ use crate::canvas::notes::FigureNotes;
 
 /// More points than these have no names.
 const MOST_NAMES: usize = 60;
+/// Width of a map, px.
+const WIDTH_PX: f32 = 720.0;
 
 /// A surface on the map.
 #[derive(Debug, Clone, PartialEq)]
@@ -34,6 +38,22 @@ pub struct MapFigure {
 }
 
 impl MapFigure {
+    /// Places surfaces by two of the components that were found. Each is given by its row there, its name and its kind.
+    pub fn of_components<'a>(
+        found: &PrincipalComponents,
+        components: [usize; 2],
+        surfaces: impl Iterator<Item = (usize, &'a str, &'a str)>,
+    ) -> Self {
+        let of = |values: &[f64]| components.map(|component| values.get(component).copied().unwrap_or(0.0));
+        let position = |(row, name, kind): (usize, &str, &str)| MapPosition {
+            name: name.to_owned(),
+            kind: kind.to_owned(),
+            position_db: of(&found.position(row)),
+        };
+        let positions = surfaces.map(position).collect();
+        Self { positions, components, explained: of(&found.explained()), width_px: WIDTH_PX }
+    }
+
     /// Returns the title that a map has if it is given no other.
     pub fn default_title(surfaces: usize, unit: &str) -> String {
         format!("{surfaces} surfaces by their TNCE, {unit}")
