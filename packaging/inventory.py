@@ -150,7 +150,7 @@ def toolchain_components(targets: list[str]) -> list[Component]:
 
 def figure_font(source: Path) -> Component:
     """The font inside figures: a Latin part of IBM Plex Sans under another name."""
-    text = (source / "figures/src/font/OFL.txt").read_text(encoding="utf-8").strip()
+    text = (source / "figures/src/canvas/font/OFL.txt").read_text(encoding="utf-8").strip()
     return Component("IBM Plex Sans, Latin, without hints", "3.201", "OFL-1.1", "https://github.com/IBM/plex", [text])
 
 

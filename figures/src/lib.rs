@@ -7,36 +7,24 @@
 //! ```
 //! use echolake_figures::{FigureNotes, FilterFigure};
 //!
-//! let figure = FilterFigure { centres_hz: vec![2500.0, 5000.0, 10000.0], low_hz: 2000.0, high_hz: 40000.0, width_px:
-//! 480.0 }; let svg = figure.draw(&FigureNotes { title: "Filter bank".into(), ..FigureNotes::default() }).to_svg();
+//! let centres_hz = vec![2500.0, 5000.0, 10000.0];
+//! let figure = FilterFigure { centres_hz, low_hz: 2000.0, high_hz: 40000.0, width_px: 480.0 };
+//! let svg = figure.draw(&FigureNotes { title: "Filter bank".into(), ..FigureNotes::default() }).to_svg();
 //! assert!(svg.contains("5 kHz"));
 //! ```
 
-mod colours;
-mod coverage;
-mod drawing;
-mod filters;
-mod font;
-mod frame;
-mod grid;
-mod map;
-mod nce;
-mod notes;
-mod output;
-mod picture;
-mod relief;
-mod steps;
-mod table;
+mod canvas;
+mod kinds;
 
-pub use colours::LevelPalette;
-pub use coverage::{CoverageFigure, CoverageZone};
-pub use drawing::FigureDrawing;
-pub use filters::FilterFigure;
-pub use grid::{BandLevels, GridFigure, GridLayer, GridPanel, GridPosition, GridScale};
-pub use map::{MapFigure, MapPosition};
-pub use nce::{NceFigure, NcePanel};
-pub use notes::FigureNotes;
-pub use picture::encode_grey_png;
-pub use relief::{ReliefFigure, ReliefPanel};
-pub use steps::{ResponseTrace, StepsFigure, StepsRow};
-pub use table::{FigureTable, TableRow};
+pub use canvas::colours::LevelPalette;
+pub use canvas::drawing::FigureDrawing;
+pub use canvas::notes::FigureNotes;
+pub use canvas::picture::encode_grey_png;
+pub use kinds::coverage::{CoverageFigure, CoverageZone};
+pub use kinds::filters::FilterFigure;
+pub use kinds::grid::{BandLevels, GridFigure, GridLayer, GridPanel, GridPosition, GridScale};
+pub use kinds::map::{MapFigure, MapPosition};
+pub use kinds::nce::{NceFigure, NcePanel};
+pub use kinds::relief::{ReliefFigure, ReliefPanel};
+pub use kinds::steps::{ResponseTrace, StepsFigure, StepsRow};
+pub use kinds::table::{FigureTable, TableRow};

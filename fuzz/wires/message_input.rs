@@ -1,6 +1,6 @@
 //! A message with its schema as one input: length of the type's name, name, length of the schema, schema, message.
 
-use echolake_query::EncodedMessage;
+use echolake_mcap_tables::EncodedMessage;
 
 /// The parts of an input.
 #[derive(Debug, Clone, Copy)]

@@ -18,13 +18,13 @@ use datafusion::optimizer::OptimizerRule;
 use datafusion::prelude::SessionContext;
 use datafusion::sql::parser::Statement;
 use echolake_lake::{DataFile, Error as LakeError, Lake, LakeMoment, LakeSnapshot, VisibleRun};
+use echolake_lake_tables::{FileReaders, LakeTable};
+use echolake_mcap_tables::{self as mcap_tables, Contents, McapCalls, McapFiles};
 use echolake_schema::tables::Table;
 use futures::future::try_join_all;
 use quick_cache::sync::Cache;
 
-use crate::mcap::{self, Contents};
-use crate::scan::table::{FileReaders, LakeTable};
-use crate::statement::{PastTableName, find_past_tables};
+use crate::statement::{PastTableName, find_past_tables, walk_statement};
 use crate::system;
 use crate::views::{LakeView, LazyView, LookupFunctions, PairJoin, SortedNulls, UnusedJoin};
 use crate::{Error, error};
@@ -49,7 +49,7 @@ pub(crate) struct LakeCatalog {
     taking: tokio::sync::Mutex<()>,
     /// Cache of tables as of versions of the lake, which do not change.
     past: Cache<(u64, Table), Arc<LakeTable>>,
-    runs: Arc<mcap::Files>,
+    runs: Arc<McapFiles>,
 }
 
 /// One snapshot of the lake with its tables and views.
@@ -76,7 +76,7 @@ impl LakeCatalog {
             current: Mutex::default(),
             taking: tokio::sync::Mutex::default(),
             past: Cache::new(PAST_TABLES),
-            runs: Arc::new(mcap::Files::new(lake, &small)),
+            runs: Arc::new(McapFiles::new(lake, &small)),
         })
     }
 
@@ -114,7 +114,10 @@ impl LakeCatalog {
             let provider = self.at(&past, &mut versions).await?;
             context.register_table(TableReference::bare(past.name), provider).map_err(failed)?;
         }
-        mcap::register(context, &current.snapshot, &self.runs, statement).await?;
+        let mut calls = McapCalls::default();
+        find_mcap_calls(statement, &mut calls);
+        let read = mcap_tables::register(context, &current.snapshot, &self.runs, calls).await;
+        read.map_err(mcap_failed)?;
         Ok(current.snapshot.clone())
     }
 
@@ -134,7 +137,7 @@ impl LakeCatalog {
     /// # Errors
     /// [`Error::Execution`] if the file cannot be read.
     pub(crate) async fn contents(&self, run: &VisibleRun) -> Result<Contents, Error> {
-        mcap::contents(run, &self.current().await?.snapshot, &self.runs).await
+        mcap_tables::contents(run, &self.current().await?.snapshot, &self.runs).await.map_err(mcap_failed)
     }
 
     /// Returns the bytes of the first attachment of a run's file whose name has this ending; None if there is none.
@@ -142,7 +145,8 @@ impl LakeCatalog {
     /// # Errors
     /// As [`LakeCatalog::contents`].
     pub(crate) async fn attachment(&self, run: &VisibleRun, ending: &str) -> Result<Option<Bytes>, Error> {
-        mcap::attachment(run, &self.current().await?.snapshot, ending, &self.runs).await
+        let snapshot = &self.current().await?.snapshot;
+        mcap_tables::attachment(run, snapshot, ending, &self.runs).await.map_err(mcap_failed)
     }
 
     /// Returns the views with their definitions.
@@ -317,6 +321,25 @@ fn moment_error(error: LakeError) -> Error {
             Error::Query { message: message.to_owned(), place: None, hint: Some(hint.to_owned()) }
         }
         error => error.into(),
+    }
+}
+
+fn find_mcap_calls(statement: &mut Statement, calls: &mut McapCalls) {
+    match statement {
+        Statement::Statement(sql) => {
+            let _ = walk_statement(sql.as_mut(), calls);
+        }
+        Statement::Explain(explain) => find_mcap_calls(&mut explain.statement, calls),
+        _ => {}
+    }
+}
+
+// A call that is not right is the query's fault. What is wrong with a file is said as it is, without the store's hints.
+fn mcap_failed(error: DataFusionError) -> Error {
+    match error {
+        DataFusionError::Plan(_) => Error::plan("", &error),
+        DataFusionError::Execution(message) => Error::Execution { message },
+        other => failed(other),
     }
 }
 

@@ -16,19 +16,17 @@ use datafusion::execution::session_state::{SessionState, SessionStateBuilder};
 use datafusion::logical_expr::Documentation;
 use datafusion::optimizer::OptimizerRule;
 use datafusion::prelude::{SessionConfig, SessionContext};
+use echolake_functions::{FunctionSet, octet_length_of_bytes, pattern_functions};
 use echolake_lake::Lake;
+use echolake_lake_tables::{FileReaders, LakeReaderFactory, SmallTables};
 use futures::FutureExt as _;
 
 use crate::catalog::LakeCatalog;
 use crate::client::QueryQuota;
 use crate::control::threads::{QueryThreadGroups, QueryThreads};
 use crate::control::{QueryTicket, RunningQueries, StopReason};
-use crate::functions::{octet_length_of_bytes, pattern_functions};
-use crate::scan::readers::LakeReaderFactory;
-use crate::scan::small_tables::SmallTables;
-use crate::scan::table::FileReaders;
 use crate::system::{self, SystemSource};
-use crate::{Error, FunctionSet, OpaqueValue};
+use crate::{Error, OpaqueValue};
 
 /// URL of the lake's store. No other store is registered, so no query can reach a file outside of the lake.
 const STORE: &str = "echolake://lake/";

@@ -40,6 +40,11 @@ pub fn quoted(text: &str) -> String {
     format!("'{}'", text.replace('\'', "''"))
 }
 
+/// Returns the rig's bands as columns and options name them, the total last.
+pub fn band_keys(rig: &Rig) -> Vec<String> {
+    rig.band_names().into_iter().chain([TOTAL_BAND.to_owned()]).collect()
+}
+
 /// Returns names of the rig's bands as pictures have them, the total last.
 pub fn band_labels(rig: &Rig) -> Vec<String> {
     let label = |hz: &f64| if *hz >= 1000.0 { format!("{} kHz", hz / 1000.0) } else { format!("{hz} Hz") };
@@ -50,9 +55,7 @@ pub fn band_labels(rig: &Rig) -> Vec<String> {
 ///
 /// Names of bands come from `lake.toml`, and are digits.
 pub fn band_list(rig: &Rig, column: impl Fn(&str) -> String) -> String {
-    let names = rig.band_names();
-    let names = names.iter().map(String::as_str).chain([TOTAL_BAND]);
-    let columns: Vec<_> = names.map(|band| format!("cast({} as double)", column(band))).collect();
+    let columns: Vec<_> = band_keys(rig).iter().map(|band| format!("cast({} as double)", column(band))).collect();
     format!("make_array({})", columns.join(", "))
 }
 
@@ -66,16 +69,21 @@ pub fn lake_version(snapshot: &LakeSnapshot) -> String {
     format!("runs@{}", snapshot.lake_version().unwrap_or(0))
 }
 
+/// Returns the condition, with `and` before it, that a pair has this grid point.
+pub fn point_filter(point: &str) -> String {
+    format!(" and (microphone = {point} or speaker = {point})")
+}
+
 /// Returns the query of [`GridCell`] for a surface and a grid point.
 pub fn grid_query(rig: &Rig, over: LevelReference, surface: &str, microphone: &str) -> String {
     let energies = band_list(rig, |band| match band == TOTAL_BAND || over == LevelReference::FlatTotal {
         true => format!("avg(tnce_{band})"),
         false => format!("avg(tnce_band_{band})"),
     });
+    let filter = point_filter(microphone);
     format!(
         "select pair_id, microphone, speaker, {energies} as energies from tnce \
-         where surface_id = {surface} and (microphone = {microphone} or speaker = {microphone}) \
-         group by pair_id, microphone, speaker"
+         where surface_id = {surface}{filter} group by pair_id, microphone, speaker"
     )
 }
 
@@ -179,6 +187,17 @@ pub fn thinned_samples(length: usize, points: usize) -> Vec<usize> {
     }
     let step = (length - 1) as f64 / (points - 1) as f64;
     (0..points).map(|i| (i as f64 * step).round() as usize).collect()
+}
+
+/// Returns the times of these samples, ms.
+pub fn times_ms(rig: &Rig, kept: &[usize]) -> Vec<f64> {
+    kept.iter().map(|i| 1000.0 * *i as f64 / rig.sweep.rate_hz.get()).collect()
+}
+
+/// Returns the sum of curves over their bands; none if there are no bands.
+pub fn total_curve(bands: &[Vec<f32>]) -> Vec<f32> {
+    let length = bands.first().map_or(0, Vec::len);
+    (0..length).map(|i| bands.iter().filter_map(|band| band.get(i)).sum()).collect()
 }
 
 /// Returns the query of levels for [`LevelVectors`]: surface, pair and a level for each band, of the pairs that

@@ -28,11 +28,8 @@ mod control;
 mod engine;
 mod error;
 pub mod figure_rows;
-mod functions;
-mod mcap;
 mod opaque;
 pub mod output;
-mod scan;
 mod session;
 mod statement;
 mod system;
@@ -40,12 +37,9 @@ mod views;
 
 pub use client::{EngineClient, QueryPermit, QueryQuota};
 pub use control::threads::QueryThreads;
+pub use echolake_mcap_tables::{Attachment, Contents, Topic};
 pub use engine::{QueryEngine, SqlFunction};
 pub use error::{Error, QueryPlace};
-pub use functions::FunctionSet;
-#[cfg(fuzzing)]
-pub use mcap::fuzzing::EncodedMessage;
-pub use mcap::{Attachment, Contents, Topic};
 pub use opaque::OpaqueValue;
 pub use session::{CancelHandle, ContextExtension, PreparedQuery, QueryAnswer, Session};
 pub use statement::{PredicateForm, check_statement_bounds, walk_expr, walk_statement};

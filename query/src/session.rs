@@ -14,6 +14,7 @@ use datafusion::physical_plan::{ExecutionPlan, execute_stream};
 use datafusion::prelude::SessionContext;
 use datafusion::sql::parser::Statement;
 use echolake_lake::{Lake, LakeSnapshot, VisibleRun};
+use echolake_mcap_tables::Contents;
 use futures::future::BoxFuture;
 use futures::{FutureExt as _, StreamExt as _};
 use tokio::sync::mpsc;
@@ -23,7 +24,6 @@ use crate::client::{EngineClient, QueryPermit, QueryQuota};
 use crate::control::pool::PartialPool;
 use crate::control::{QueryTicket, StopReason};
 use crate::engine::{self, QueryEngine, SqlFunction};
-use crate::mcap::Contents;
 use crate::statement::{PredicateForm, append_predicate, parse_statement, prepare_statement};
 use crate::system::SYSTEM_SCHEMA;
 use crate::{Error, OpaqueValue};
@@ -489,3 +489,9 @@ mod attempts;
 
 #[cfg(test)]
 mod escape_tests;
+
+#[cfg(test)]
+pub(crate) mod function_tests;
+
+#[cfg(test)]
+mod request_tests;

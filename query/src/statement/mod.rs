@@ -32,7 +32,6 @@ pub(crate) use as_of::{PastTableName, find_past_tables};
 pub use bounds::check_statement_bounds;
 pub use predicate::PredicateForm;
 pub(crate) use predicate::append_predicate;
-pub(crate) use syntax_walk::walk_mut;
 pub use syntax_walk::{walk_expr, walk_statement};
 
 use crate::Error;

@@ -19,7 +19,7 @@ pub(crate) fn walk<B>(node: &impl Visit, visitor: &mut dyn Visitor<Break = B>) -
 }
 
 /// Walks over a part of a syntax tree that the visitor may change; returns what the visitor broke off with.
-pub(crate) fn walk_mut<B>(node: &mut impl VisitMut, visitor: &mut dyn VisitorMut<Break = B>) -> ControlFlow<B> {
+pub(super) fn walk_mut<B>(node: &mut impl VisitMut, visitor: &mut dyn VisitorMut<Break = B>) -> ControlFlow<B> {
     let mut kept = KeptBreakMut { visitor, broken: None };
     match node.visit(&mut SharedVisitorMut(&mut kept)) {
         ControlFlow::Break(()) => kept.broken.map_or(ControlFlow::Continue(()), ControlFlow::Break),

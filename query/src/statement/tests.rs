@@ -6,7 +6,7 @@ use std::fmt::Write as _;
 use arrow::util::pretty::pretty_format_batches;
 
 use crate::Error;
-use crate::functions::tests::SmallLake;
+use crate::session::function_tests::SmallLake;
 
 const STATEMENTS: &str = include_str!("statements.txt");
 /// Path of the page; tests run in their package's folder.

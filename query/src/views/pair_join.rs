@@ -11,10 +11,10 @@ use datafusion::logical_expr::logical_plan::{Join, Projection};
 use datafusion::logical_expr::{Expr, LogicalPlan};
 use datafusion::optimizer::optimizer::ApplyOrder;
 use datafusion::optimizer::{OptimizerConfig, OptimizerRule};
+use echolake_lake_tables::LakeTable;
 use echolake_schema::tables::Table;
 
 use super::LookupFunctions;
-use crate::scan::table::LakeTable;
 
 const KEY: &str = "pair_id";
 

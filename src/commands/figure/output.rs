@@ -11,8 +11,6 @@ use super::source::SelectedSurface;
 
 /// The part of a file's name that stands for a surface.
 const PLACEHOLDER: &str = "{surface}";
-/// Options whose values are of the machine, and not of the figure.
-const LOCAL_OPTIONS: [&str; 4] = ["--lake", "-o", "--output", "--log-format"];
 
 #[derive(Debug, Args)]
 pub(crate) struct OutputArgs {
@@ -110,24 +108,4 @@ fn write_file(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     std::fs::rename(&partial, path).with_context(failed)?;
     eprintln!("{}: {}", path.display(), super::super::size(bytes.len() as u64));
     Ok(())
-}
-
-/// Returns the command as it was typed, without the lake and the files.
-pub(super) fn typed_command() -> String {
-    let typed: Vec<String> = std::env::args_os().skip(1).map(|word| word.to_string_lossy().into_owned()).collect();
-    plain_command(&typed)
-}
-
-fn plain_command(typed: &[String]) -> String {
-    let mut words = vec!["echolake".to_owned()];
-    let mut typed = typed.iter();
-    while let Some(word) = typed.next() {
-        if LOCAL_OPTIONS.contains(&word.as_str()) {
-            typed.next();
-        } else if !LOCAL_OPTIONS.iter().any(|o| word.starts_with(&format!("{o}="))) && !word.starts_with("-o") {
-            let is_plain = word.chars().all(|c| c.is_ascii_alphanumeric() || "-_./,=".contains(c));
-            words.push(if is_plain { word.clone() } else { format!("'{}'", word.replace('\'', "'\\''")) });
-        }
-    }
-    words.join(" ")
 }

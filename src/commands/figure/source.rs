@@ -10,7 +10,9 @@ use serde::Deserialize;
 use serde::de::DeserializeOwned;
 
 use super::SelectionArgs;
-use super::output::typed_command;
+
+/// Options whose values are of the machine, and not of the figure.
+const LOCAL_OPTIONS: [&str; 4] = ["--lake", "-o", "--output", "--log-format"];
 
 /// A surface of a figure.
 #[derive(Debug, Clone, Deserialize)]
@@ -126,16 +128,27 @@ impl FigureSource {
         query: String,
         surfaces: impl IntoIterator<Item = &'a SelectedSurface>,
     ) -> FigureNotes {
-        let mut origins: Vec<_> = surfaces.into_iter().map(|surface| surface.origin.clone()).collect();
-        origins.sort();
-        origins.dedup();
-        FigureNotes {
-            title,
-            command: typed_command(),
-            query,
-            lake: self.version.clone(),
-            program: concat!("echolake ", env!("CARGO_PKG_VERSION")).into(),
-            origins,
+        let origins = surfaces.into_iter().map(|surface| surface.origin.clone());
+        FigureNotes { title, command: typed_command(), query, ..FigureNotes::of_lake(self.version.clone(), origins) }
+    }
+}
+
+// The command as it was typed, without the lake and the files.
+fn typed_command() -> String {
+    let typed: Vec<String> = std::env::args_os().skip(1).map(|word| word.to_string_lossy().into_owned()).collect();
+    plain_command(&typed)
+}
+
+fn plain_command(typed: &[String]) -> String {
+    let mut words = vec!["echolake".to_owned()];
+    let mut typed = typed.iter();
+    while let Some(word) = typed.next() {
+        if LOCAL_OPTIONS.contains(&word.as_str()) {
+            typed.next();
+        } else if !LOCAL_OPTIONS.iter().any(|o| word.starts_with(&format!("{o}="))) && !word.starts_with("-o") {
+            let is_plain = word.chars().all(|c| c.is_ascii_alphanumeric() || "-_./,=".contains(c));
+            words.push(if is_plain { word.clone() } else { format!("'{}'", word.replace('\'', "'\\''")) });
         }
     }
+    words.join(" ")
 }

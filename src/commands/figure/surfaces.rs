@@ -7,12 +7,12 @@ use echolake_dsp::chain::ResponseCorrection;
 use echolake_dsp::components::PrincipalComponents;
 use echolake_dsp::heights;
 use echolake_figures::{
-    GridFigure, GridLayer, GridPanel, LevelPalette, MapFigure, MapPosition, NceFigure, NcePanel, ReliefFigure,
-    ReliefPanel, ResponseTrace, StepsFigure, StepsRow,
+    GridFigure, GridLayer, GridPanel, LevelPalette, MapFigure, NceFigure, NcePanel, ReliefFigure, ReliefPanel,
+    ResponseTrace, StepsFigure, StepsRow,
 };
 use echolake_query::figure_rows::{
-    CurveRow, GridCell, GridLevels, LevelReference, LevelVectors, band_labels, curves_query, grid_query,
-    level_vectors_query, quoted, thinned_samples,
+    CurveRow, GridCell, GridLevels, LevelReference, LevelVectors, band_keys, band_labels, curves_query, grid_query,
+    level_vectors_query, point_filter, quoted, thinned_samples, times_ms, total_curve,
 };
 use serde::Deserialize;
 
@@ -29,8 +29,7 @@ pub(super) async fn write_grid(source: &FigureSource, args: &GridArgs) -> anyhow
     let microphone = source.microphone(args.microphone.as_deref())?;
     let over = LevelReference::from(args.over);
     let rig = source.lake.rig();
-    let (labels, mut keys) = (band_labels(rig), rig.band_names());
-    keys.push(echolake_query::figure_rows::TOTAL_BAND.to_owned());
+    let (labels, keys) = (band_labels(rig), band_keys(rig));
     let shown: Vec<usize> = match &args.band {
         None => (0..keys.len()).collect(),
         Some(key) => {
@@ -93,9 +92,7 @@ pub(super) async fn write_nce(source: &FigureSource, args: &NceArgs) -> anyhow::
     let surfaces = source.surfaces(&args.selection).await?;
     let rig = source.lake.rig();
     let point = args.microphone.as_ref().map(|named| source.microphone(Some(named))).transpose()?;
-    let filter = point.map_or_else(String::new, |point| {
-        format!(" and (microphone = {number} or speaker = {number})", number = point.id.index())
-    });
+    let filter = point.map_or_else(String::new, |point| point_filter(&point.id.index().to_string()));
     let kept = thinned_samples(rig.impulse_response.length, CURVE_POINTS);
     let mut bands = band_labels(rig);
     bands.pop();
@@ -109,12 +106,11 @@ pub(super) async fn write_nce(source: &FigureSource, args: &NceArgs) -> anyhow::
                 .with_context(|| format!("surface `{id}` has no curves; hint: energies need Flat and Foam"))?;
             if !flat_totals.contains_key(flat) {
                 let curves = read_curves(source, flat, &filter, &kept).await?.unwrap_or_default();
-                let total = |i: usize| curves.iter().filter_map(|band| band.get(i)).sum();
-                flat_totals.insert(flat, (0..kept.len()).map(total).collect());
+                flat_totals.insert(flat, total_curve(&curves));
             }
             panels.push(NcePanel { title: id.to_owned(), bands, flat_total: flat_totals[flat].clone() });
         }
-        let time_ms = kept.iter().map(|i| 1000.0 * *i as f64 / rig.sweep.rate_hz.get()).collect();
+        let time_ms = times_ms(rig, &kept);
         let figure = NceFigure {
             bands: bands.clone(),
             time_ms,
@@ -231,19 +227,9 @@ pub(super) async fn write_map(source: &FigureSource, args: &MapArgs) -> anyhow::
         surfaces.into_iter().zip(has_levels).filter(|(_, has)| *has).map(|(surface, _)| surface).collect();
     anyhow::ensure!(surfaces.len() > 1, "a map needs two surfaces with energies");
     let found = PrincipalComponents::of(&mut vectors.rows, COMPONENTS)?;
-    let position = |(i, surface): (usize, &SelectedSurface)| {
-        let place = found.position(i);
-        let at = |axis: usize| place.get(axis).copied().unwrap_or(0.0);
-        MapPosition { name: surface.surface_id.clone(), kind: surface.typology.clone(), position_db: [at(0), at(1)] }
-    };
-    let explained = found.explained();
-    let share = |axis: usize| explained.get(axis).copied().unwrap_or(0.0);
-    let figure = MapFigure {
-        positions: surfaces.iter().enumerate().map(position).collect(),
-        components: [0, 1],
-        explained: [share(0), share(1)],
-        width_px: 720.0,
-    };
+    let rows = surfaces.iter().enumerate();
+    let rows = rows.map(|(i, surface)| (i, surface.surface_id.as_str(), surface.typology.as_str()));
+    let figure = MapFigure::of_components(&found, [0, 1], rows);
     let title = args.output.title(|| MapFigure::default_title(surfaces.len(), LevelReference::FlatBand.unit()));
     args.output.write_drawing(&figure.draw(&source.notes(title, query, &surfaces)), &[])
 }

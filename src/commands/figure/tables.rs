@@ -4,7 +4,7 @@ use std::collections::HashMap;
 
 use anyhow::Context as _;
 use echolake_figures::{FigureTable, TableRow};
-use echolake_query::figure_rows::{LevelReference, TOTAL_BAND, band_labels, band_list, quoted};
+use echolake_query::figure_rows::{LevelReference, band_keys, band_labels, band_list, quoted};
 use serde::Deserialize;
 
 use super::source::{FigureSource, SelectedSurface};
@@ -86,8 +86,7 @@ async fn level_table(
     // Of several runs of a surface, the newest counts.
     let levels: HashMap<_, _> =
         rows.iter().map(|row| ((row.surface_id.as_str(), row.band.as_str()), row.level_db)).collect();
-    let keys = source.lake.rig().band_names();
-    let keys: Vec<_> = keys.iter().map(String::as_str).chain([TOTAL_BAND]).collect();
+    let keys = band_keys(source.lake.rig());
     let level = |surface: &str, band: &str| levels.get(&(surface, band)).copied().flatten();
     let value = |surface: &str, band: &str| match base {
         Some(base) if base != surface => Some(level(surface, band)? - level(base, band)?),

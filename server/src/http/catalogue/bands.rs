@@ -1,6 +1,6 @@
 //! The bands of the lake as answers name them.
 
-use echolake_query::figure_rows::{TOTAL_BAND, band_labels};
+use echolake_query::figure_rows::{band_keys, band_labels};
 use echolake_schema::Rig;
 use serde::Serialize;
 use utoipa::ToSchema;
@@ -18,7 +18,7 @@ pub(super) struct BandDescription {
 
 /// The rig's bands, the total last.
 pub(super) fn bands(rig: &Rig) -> Vec<BandDescription> {
-    let keys = rig.band_names().into_iter().chain([TOTAL_BAND.to_owned()]);
+    let keys = band_keys(rig).into_iter();
     let centres = rig.bands.centres_hz.iter().copied().map(Some).chain([None]);
     let described = keys.zip(centres).zip(band_labels(rig));
     described.map(|((key, centre_hz), label)| BandDescription { key, centre_hz, label }).collect()

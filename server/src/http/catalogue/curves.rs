@@ -6,7 +6,7 @@ use arrow::array::{ArrayRef, Float64Array};
 use arrow::record_batch::RecordBatch;
 use axum::Extension;
 use datafusion::common::ScalarValue;
-use echolake_query::figure_rows::{CurveRow, curves_query, kept_curves_query, thinned_samples};
+use echolake_query::figure_rows::{CurveRow, curves_query, kept_curves_query, point_filter, thinned_samples, times_ms};
 use echolake_schema::Rig;
 use serde::{Deserialize, Serialize};
 use utoipa::{IntoParams, ToSchema};
@@ -44,11 +44,11 @@ pub(super) enum PairSelection {
 }
 
 impl PairSelection {
-    fn filter(&self) -> (&'static str, Option<ScalarValue>) {
+    fn filter(&self) -> (String, Option<ScalarValue>) {
         match self {
-            Self::All => ("", None),
-            Self::Point(point) => (" and (microphone = $2 or speaker = $2)", Some(number(*point))),
-            Self::Pair(pair) => (" and pair_id = $2", Some(number(*pair))),
+            Self::All => (String::new(), None),
+            Self::Point(point) => (point_filter("$2"), Some(number(*point))),
+            Self::Pair(pair) => (" and pair_id = $2".to_owned(), Some(number(*pair))),
         }
     }
 }
@@ -64,7 +64,7 @@ impl CurveSet {
     ) -> Result<Self, RequestFault> {
         let rig = request.catalogue.lake().rig();
         let (filter, value) = over.filter();
-        let sql = curves_query(rig, "$1", filter);
+        let sql = curves_query(rig, "$1", &filter);
         let kept_sql = matches!(over, PairSelection::All).then(|| kept_curves_query(rig, "$1"));
         let first = async |sql: &str, values| -> Result<Option<CurveRow>, RequestFault> {
             Ok(request.rows(sql, values).await?.into_iter().next())
@@ -114,21 +114,9 @@ impl CurveSet {
     }
 }
 
-impl SurfaceCurves {
-    /// Returns the sum over the bands.
-    pub(super) fn total(&self) -> Vec<f32> {
-        let length = self.bands.first().map_or(0, Vec::len);
-        (0..length).map(|i| self.bands.iter().filter_map(|band| band.get(i)).sum()).collect()
-    }
-}
-
 fn thinned_curves(surface: &str, row: Option<&CurveRow>, rig: &Rig, kept: &[usize]) -> SurfaceCurves {
     let bands = row.map_or_else(|| vec![Vec::new(); rig.band_names().len()], |row| row.thinned(kept));
     SurfaceCurves { surface_id: surface.to_owned(), pairs: row.map_or(0, |row| row.pairs), bands }
-}
-
-fn times_ms(rig: &Rig, kept: &[usize]) -> Vec<f64> {
-    kept.iter().map(|i| 1000.0 * *i as f64 / rig.sweep.rate_hz.get()).collect()
 }
 
 /// The pairs and the points of curves.

@@ -4,11 +4,11 @@ use std::io;
 
 use axum::Extension;
 use echolake_figures::{
-    FigureDrawing, FigureNotes, GridFigure, GridLayer, GridPanel, LevelPalette, MapFigure, MapPosition, NceFigure,
-    NcePanel,
+    FigureDrawing, FigureNotes, GridFigure, GridLayer, GridPanel, LevelPalette, MapFigure, NceFigure, NcePanel,
 };
 use echolake_query::figure_rows::{
-    LevelReference, band_labels, curves_query, grid_query, lake_version, level_vectors_query, quoted,
+    LevelReference, band_labels, curves_query, grid_query, lake_version, level_vectors_query, point_filter, quoted,
+    total_curve,
 };
 use serde::Deserialize;
 use utoipa::{IntoParams, ToSchema};
@@ -26,9 +26,6 @@ use crate::fault::RequestFault;
 const MOST_SURFACES: usize = 8;
 /// Surfaces in a row.
 const COLUMNS: usize = 4;
-
-/// Width of the map, px.
-const MAP_PX: f32 = 720.0;
 
 /// The file format of a figure.
 #[derive(Clone, Copy, Default, Deserialize, ToSchema)]
@@ -241,7 +238,7 @@ pub(super) async fn curves_figure(
     for entry in &entries {
         let over = microphone.map_or(PairSelection::All, PairSelection::Point);
         let set = CurveSet::read(&request, entry, over, query.points.get()).await?;
-        let flat_total = set.flat.total();
+        let flat_total = total_curve(&set.flat.bands);
         panels.push(NcePanel { title: entry.surface.surface_id.clone(), bands: set.surface.bands, flat_total });
         time_ms = set.time_ms;
     }
@@ -251,8 +248,7 @@ pub(super) async fn curves_figure(
     let panel_px = query.width.get() as f32;
     let figure = NceFigure { bands, time_ms, panels, panel_px, columns: COLUMNS, with_caption };
     let point = microphone.and_then(|point| request.catalogue.lake().grid().points().get(point));
-    let filter =
-        microphone.map_or_else(String::new, |point| format!(" and (microphone = {point} or speaker = {point})"));
+    let filter = microphone.map_or_else(String::new, |point| point_filter(&point.to_string()));
     let options: Vec<_> = microphone.iter().map(|point| format!("--microphone {point}")).collect();
     let notes = FigureNotes {
         title: NceFigure::default_title(point.map(|point| point.label()).as_deref()),
@@ -320,22 +316,10 @@ pub(super) async fn map_figure(
     let components = query.axes.components();
     let placed: Vec<_> =
         places.names.iter().enumerate().filter_map(|(i, name)| Some((i, summary.entry(name)?))).collect();
-    let positions = placed.iter().map(|(i, entry)| {
-        let place = places.components.position(*i);
-        MapPosition {
-            name: entry.surface.surface_id.clone(),
-            kind: entry.surface.typology.clone(),
-            position_db: components.map(|component| place.get(component).copied().unwrap_or(0.0)),
-        }
-    });
+    let surfaces =
+        placed.iter().map(|(i, entry)| (*i, entry.surface.surface_id.as_str(), entry.surface.typology.as_str()));
     let entries: Vec<_> = placed.iter().map(|(_, entry)| *entry).collect();
-    let explained = places.components.explained();
-    let figure = MapFigure {
-        positions: positions.collect(),
-        components,
-        explained: components.map(|component| explained.get(component).copied().unwrap_or(0.0)),
-        width_px: MAP_PX,
-    };
+    let figure = MapFigure::of_components(&places.components, components, surfaces);
     let notes = FigureNotes {
         title: MapFigure::default_title(entries.len(), LevelReference::FlatBand.unit()),
         command: if components == [0, 1] { "echolake figure map".into() } else { String::new() },
@@ -370,13 +354,6 @@ fn command(kind: &str, entries: &[&SurfaceEntry], options: &[String]) -> String 
 }
 
 fn notes(request: &CatalogueRequest, entries: &[&SurfaceEntry]) -> FigureNotes {
-    let mut origins: Vec<_> = entries.iter().map(|entry| entry.surface.origin.clone()).collect();
-    origins.sort();
-    origins.dedup();
-    FigureNotes {
-        lake: lake_version(&request.view.snapshot),
-        program: concat!("echolake ", env!("CARGO_PKG_VERSION")).into(),
-        origins,
-        ..FigureNotes::default()
-    }
+    let origins = entries.iter().map(|entry| entry.surface.origin.clone());
+    FigureNotes::of_lake(lake_version(&request.view.snapshot), origins)
 }

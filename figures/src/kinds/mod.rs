@@ -1,0 +1,10 @@
+//! The kinds of figures, each laid out as a drawing of plain data, and the table.
+
+pub(crate) mod coverage;
+pub(crate) mod filters;
+pub(crate) mod grid;
+pub(crate) mod map;
+pub(crate) mod nce;
+pub(crate) mod relief;
+pub(crate) mod steps;
+pub(crate) mod table;

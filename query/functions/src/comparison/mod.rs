@@ -1,0 +1,4 @@
+//! Functions that compare lists, and the diffusion of levels.
+
+pub(crate) mod alike;
+pub(crate) mod diffusion;

@@ -1,0 +1,5 @@
+//! Functions of geometry, sound and symmetry.
+
+pub(crate) mod fresnel;
+pub(crate) mod sound;
+pub(crate) mod symmetry;

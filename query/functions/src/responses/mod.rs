@@ -1,0 +1,7 @@
+//! Functions of impulse responses.
+
+pub(crate) mod band_energy;
+pub(crate) mod decay;
+pub(crate) mod nce;
+pub(crate) mod rise;
+pub(crate) mod spectrum;

@@ -1,0 +1,89 @@
+//! `nce`: the normalised cumulative energy curve of a response.
+
+use std::sync::Arc;
+
+use arrow::array::ArrayRef;
+use arrow::datatypes::DataType;
+use datafusion::error::Result;
+use echolake_dsp::energy::cumulate_whole;
+use echolake_dsp::filter_bank::FilterBankPlan;
+
+use crate::adapters::answers::{grow, lists};
+use crate::adapters::arguments::{CallArguments, SampleElement, like};
+use crate::adapters::description::{ArgumentKind, FunctionDescription, FunctionFamily, FunctionParameter};
+use crate::adapters::per_length::PerLength;
+use crate::adapters::rig::RigFacts;
+use crate::adapters::scalar::ScalarKernel;
+
+/// `nce`.
+pub(crate) struct NceFunction(pub(crate) Arc<RigFacts>);
+
+static DESCRIPTION: FunctionDescription = FunctionDescription {
+    name: "nce",
+    family: FunctionFamily::Responses,
+    about: "Normalised cumulative energy (NCE): the energy of a response up to each of its samples over Flat's total \
+            energy for the same pair; the last value is TNCE. Of the whole response, or of one band where its centre is \
+            given, as the columns `nce_2500` and so on of table nce. Null where Flat has no energy.",
+    parameters: &[
+        FunctionParameter {
+            name: "ir",
+            kind: ArgumentKind::Samples,
+            about: "the response with Foam's subtracted, as reflected_ir",
+        },
+        FunctionParameter {
+            name: "flat_energy",
+            kind: ArgumentKind::Number,
+            about: "Flat's energy of the pair, sum of squares, all bands",
+        },
+        FunctionParameter { name: "centre_hz", kind: ArgumentKind::Number, about: "centre of one band, Hz" },
+    ],
+    optional: 1,
+    example: "select nce([1, 2, 0, 1], 8) as curve",
+    answer: "\
++-----------------------------+
+| curve                       |
++-----------------------------+
+| [0.125, 0.625, 0.625, 0.75] |
++-----------------------------+",
+    related: &["band_energy", "list_db", "edc"],
+};
+
+impl ScalarKernel for NceFunction {
+    fn description(&self) -> &'static FunctionDescription {
+        &DESCRIPTION
+    }
+
+    fn returns(&self, arguments: &[DataType]) -> DataType {
+        like(&arguments[0])
+    }
+
+    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
+        let (ir, flat) = (arguments.samples::<T>(0)?, arguments.numbers(1)?);
+        let room = ir.room(arguments.rows());
+        if arguments.given() == 2 {
+            return lists::<T>(arguments, room, |row, out| {
+                let (ir, flat) = (ir.at(row)?, flat.at(row));
+                cumulate_whole(ir, flat, grow(out, ir.len()));
+                Ok(flat > 0.0)
+            });
+        }
+        let centre = arguments.numbers(2)?;
+        let mut plans = PerLength::new(DESCRIPTION.name);
+        lists::<T>(arguments, room, |row, out| {
+            let (ir, flat, centre) = (ir.at(row)?, flat.at(row), centre.at(row));
+            let band = self.0.band(centre);
+            let band = band.ok_or_else(|| arguments.wrong(2, row, centre, &self.0.bands_hint()))?;
+            if ir.is_empty() {
+                return Ok(flat > 0.0);
+            }
+            let (plan, scratch, bands) = plans.get(ir.len(), |len| {
+                let plan = FilterBankPlan::<T>::new(len, self.0.rate_hz, &self.0.centres_hz)?;
+                let (scratch, bands) = (plan.scratch(), vec![T::default(); plan.bands() * len]);
+                Ok((plan, scratch, bands))
+            })?;
+            plan.run(ir, bands, scratch).map_err(|e| arguments.refused(row, &e))?;
+            cumulate_whole(&bands[band * ir.len()..][..ir.len()], flat, grow(out, ir.len()));
+            Ok(flat > 0.0)
+        })
+    }
+}

@@ -1,0 +1,4 @@
+//! DataFusion's own functions, for more kinds of arguments.
+
+pub(crate) mod octet_length;
+pub(crate) mod time_patterns;

@@ -1,0 +1,45 @@
+//! Sizes of runs' files as `runs` has them, so that an object store is not asked for each.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+
+use arrow::array::AsArray as _;
+use arrow::datatypes::{Int64Type, SchemaRef};
+use arrow::record_batch::RecordBatch;
+use echolake_lake::{Lake, LakeSnapshot};
+use echolake_lake_tables::SmallTables;
+use echolake_schema::tables::Table;
+use object_store::path::Path;
+
+/// The rows of `runs`, in memory.
+#[derive(Debug)]
+pub(super) struct RunSizes {
+    small: Arc<SmallTables>,
+    schema: SchemaRef,
+}
+
+impl RunSizes {
+    pub(super) fn new(lake: &Lake, small: &Arc<SmallTables>) -> Self {
+        Self { small: small.clone(), schema: Table::Runs.schema(lake.rig()) }
+    }
+
+    /// Returns the sizes that are known. A file that is missing here is asked for its size.
+    pub(super) async fn read(&self, snapshot: &LakeSnapshot) -> HashMap<Path, u64> {
+        let files: Vec<_> = snapshot.files(Table::Runs).iter().collect();
+        if SmallTables::cached_columns(Table::Runs, &self.schema, files.iter().copied()).is_none() {
+            return HashMap::new();
+        }
+        let rows = self.small.rows(Table::Runs, &self.schema, &files).await;
+        rows.ok().and_then(|rows| sizes(&rows)).unwrap_or_default()
+    }
+}
+
+fn sizes(rows: &RecordBatch) -> Option<HashMap<Path, u64>> {
+    let files = rows.column_by_name("file")?.as_string_opt::<i32>()?;
+    let bytes = rows.column_by_name("file_bytes")?.as_primitive_opt::<Int64Type>()?;
+    let known = files.iter().zip(bytes).filter_map(|(file, bytes)| {
+        let bytes = u64::try_from(bytes?).ok().filter(|bytes| *bytes > 0)?;
+        Some((Path::from(file?), bytes))
+    });
+    Some(known.collect())
+}

@@ -1,0 +1,364 @@
+//! The scan of a topic: reads the pieces that have it, side by side, and decodes what is asked for.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::fmt;
+use std::ops::{Range, RangeInclusive};
+use std::sync::Arc;
+
+use arrow::datatypes::SchemaRef;
+use arrow::record_batch::RecordBatch;
+use bytes::Bytes;
+use datafusion::common::tree_node::TreeNodeRecursion;
+use datafusion::error::Result;
+use datafusion::execution::memory_pool::{MemoryConsumer, MemoryReservation};
+use datafusion::execution::{SendableRecordBatchStream, TaskContext};
+use datafusion::physical_expr::{EquivalenceProperties, PhysicalExpr};
+use datafusion::physical_plan::coop::make_cooperative;
+use datafusion::physical_plan::execution_plan::{Boundedness, EmissionType, SchedulingType};
+use datafusion::physical_plan::metrics::{BaselineMetrics, Count, ExecutionPlanMetricsSet, MetricBuilder, MetricsSet};
+use datafusion::physical_plan::stream::RecordBatchStreamAdapter;
+use datafusion::physical_plan::{
+    DisplayAs, DisplayFormatType, ExecutionPlan, Partitioning, PlanProperties, ReplaceChildrenOptions,
+};
+use echolake_recording::Record;
+use futures::stream::{self, BoxStream};
+use futures::{StreamExt as _, TryStreamExt as _};
+
+use super::error::Fault;
+use super::file::{McapFile, McapFiles, undescribed};
+use super::piece::{Piece, PieceRecords};
+use super::rows::{Head, Mapping, Message, Rows};
+
+/// Neighbouring pieces are fetched together up to this size.
+const READ: u64 = 4 << 20;
+/// What stands between two pieces is fetched with them where it is less: a request costs more.
+const GAP: u64 = 128 << 10;
+/// Reads under way while another one is decoded.
+const AHEAD: usize = 2;
+
+/// What all partitions of all scans of a table share.
+#[derive(Debug)]
+pub(super) struct Parts {
+    /// What it is called in plans.
+    pub(super) name: String,
+    pub(super) files: Arc<McapFiles>,
+    pub(super) heads: Vec<Head>,
+    pub(super) sources: Vec<Source>,
+    /// None in a table of messages as they are.
+    pub(super) mappings: Option<Vec<Mapping>>,
+}
+
+/// One file.
+#[derive(Debug)]
+pub(super) struct Source {
+    pub(super) run: Option<(String, String)>,
+    pub(super) file: Arc<McapFile>,
+    /// The channels that are meant: topic, and which mapping they have.
+    pub(super) channels: BTreeMap<u16, (String, usize)>,
+}
+
+impl Source {
+    /// Returns the pieces that may have messages of the channels in the time.
+    pub(super) fn pieces<'a>(&'a self, times: Option<&'a RangeInclusive<i64>>) -> impl Iterator<Item = &'a Piece> {
+        let nanos = |time: u64| i64::try_from(time).unwrap_or(i64::MAX);
+        let within = move |p: &&Piece| {
+            times.is_none_or(|times| nanos(p.times.1) >= *times.start() && nanos(p.times.0) <= *times.end())
+        };
+        let meant = |p: &&Piece| self.channels.keys().any(|channel| p.has(*channel));
+        self.file.pieces.iter().filter(within).filter(meant)
+    }
+}
+
+/// What a scan is asked for.
+#[derive(Debug)]
+pub(super) struct Scan {
+    pub(super) parts: Arc<Parts>,
+    /// Columns that are asked for, by their place in the table.
+    pub(super) projection: Vec<usize>,
+    /// The same as fields.
+    pub(super) schema: SchemaRef,
+    /// Times of messages, ns; None if all are asked for, also those that have no such time.
+    pub(super) times: Option<RangeInclusive<i64>>,
+    pub(super) limit: Option<usize>,
+}
+
+/// The plan of a scan.
+#[derive(Debug)]
+pub(super) struct McapExec {
+    scan: Arc<Scan>,
+    partitions: Vec<Vec<FileRead>>,
+    /// Pieces of all its files, also those that are not read.
+    all: usize,
+    properties: Arc<PlanProperties>,
+    metrics: ExecutionPlanMetricsSet,
+}
+
+/// Bytes of one file that are fetched at once, and the pieces in them.
+#[derive(Debug, Clone)]
+struct FileRead {
+    source: usize,
+    range: Range<u64>,
+    pieces: Vec<Piece>,
+}
+
+impl McapExec {
+    /// A plan that reads `pieces`, each with its source, in up to `most` partitions of about the same size.
+    pub(super) fn new(scan: Scan, pieces: Vec<(usize, Piece)>, all: usize, most: usize) -> Self {
+        let count = pieces.len();
+        let bytes: u64 = pieces.iter().map(|(_, p)| p.range.end - p.range.start).sum();
+        let share = bytes.div_ceil(most.max(1) as u64).max(1);
+        let mut partitions: Vec<Vec<FileRead>> = vec![Vec::new()];
+        let mut taken = 0;
+        for (source, piece) in pieces {
+            if taken >= share {
+                partitions.push(Vec::new());
+                taken = 0;
+            }
+            taken += piece.range.end - piece.range.start;
+            if let Some(reads) = partitions.last_mut() {
+                add(reads, source, piece);
+            }
+        }
+        let properties = PlanProperties::new(
+            EquivalenceProperties::new(scan.schema.clone()),
+            Partitioning::UnknownPartitioning(partitions.len()),
+            EmissionType::Incremental,
+            Boundedness::Bounded,
+        );
+        let properties = Arc::new(properties.with_scheduling_type(SchedulingType::Cooperative));
+        let metrics = ExecutionPlanMetricsSet::new();
+        MetricBuilder::new(&metrics).global_counter("chunks_pruned").add(all - count);
+        Self { scan: Arc::new(scan), partitions, all, properties, metrics }
+    }
+}
+
+// To the last read, where the piece is near enough, or as another one.
+fn add(reads: &mut Vec<FileRead>, source: usize, piece: Piece) {
+    let near = |r: &&mut FileRead| {
+        let gap = piece.range.start.checked_sub(r.range.end);
+        r.source == source && gap.is_some_and(|gap| gap <= GAP) && piece.range.end - r.range.start <= READ
+    };
+    match reads.last_mut().filter(near) {
+        Some(read) => {
+            read.range.end = piece.range.end;
+            read.pieces.push(piece);
+        }
+        None => reads.push(FileRead { source, range: piece.range.clone(), pieces: vec![piece] }),
+    }
+}
+
+impl DisplayAs for McapExec {
+    fn fmt_as(&self, _: DisplayFormatType, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let chosen: usize = self.partitions.iter().flatten().map(|read| read.pieces.len()).sum();
+        let bytes: u64 = self.partitions.iter().flatten().map(|read| read.range.end - read.range.start).sum();
+        let (parts, fields) = (&self.scan.parts, self.scan.schema.fields());
+        let columns: Vec<_> = fields.iter().map(|f| f.name().as_str()).collect();
+        write!(f, "McapExec: {}, files={}, chunks={chosen} of {}", parts.name, parts.sources.len(), self.all)?;
+        write!(f, ", bytes={bytes}, columns=[{}]", columns.join(", "))?;
+        match self.scan.limit {
+            Some(limit) => write!(f, ", limit={limit}"),
+            None => Ok(()),
+        }
+    }
+}
+
+impl ExecutionPlan for McapExec {
+    fn name(&self) -> &'static str {
+        "McapExec"
+    }
+
+    fn properties(&self) -> &Arc<PlanProperties> {
+        &self.properties
+    }
+
+    fn children(&self) -> Vec<&Arc<dyn ExecutionPlan>> {
+        Vec::new()
+    }
+
+    fn apply_expressions(
+        &self,
+        _: &mut dyn FnMut(&Arc<dyn PhysicalExpr>) -> Result<TreeNodeRecursion>,
+    ) -> Result<TreeNodeRecursion> {
+        Ok(TreeNodeRecursion::Continue)
+    }
+
+    fn replace_children(
+        self: Arc<Self>,
+        _: Vec<Arc<dyn ExecutionPlan>>,
+        _: ReplaceChildrenOptions,
+    ) -> Result<Arc<dyn ExecutionPlan>> {
+        Ok(self)
+    }
+
+    fn with_new_children(self: Arc<Self>, _: Vec<Arc<dyn ExecutionPlan>>) -> Result<Arc<dyn ExecutionPlan>> {
+        Ok(self)
+    }
+
+    fn metrics(&self) -> Option<MetricsSet> {
+        Some(self.metrics.clone_inner())
+    }
+
+    fn execute(&self, partition: usize, context: Arc<TaskContext>) -> Result<SendableRecordBatchStream> {
+        let reads = self.partitions.get(partition).cloned().unwrap_or_default();
+        let count = |name: &'static str| MetricBuilder::new(&self.metrics).counter(name, partition);
+        let scan = &self.scan;
+        let most = context.session_config().batch_size();
+        let scanner = Scanner {
+            scan: scan.clone(),
+            reads: fetch(scan.parts.clone(), reads, count("bytes_read")),
+            fetched: None,
+            current: None,
+            rows: Rows::new(scan.schema.clone(), &scan.parts.heads, &scan.projection, most),
+            left: scan.limit.unwrap_or(usize::MAX),
+            memory: MemoryConsumer::new("McapExec").register(context.memory_pool()),
+            chunks: count("chunks_read"),
+            unfit: count("values_unfit"),
+            baseline: BaselineMetrics::new(&self.metrics, partition),
+        };
+        let batches = stream::try_unfold(scanner, |mut scanner| async move {
+            Ok(scanner.next().await?.map(|batch| (batch, scanner)))
+        });
+        Ok(make_cooperative(Box::pin(RecordBatchStreamAdapter::new(scan.schema.clone(), batches))))
+    }
+}
+
+// The next ones are on their way while one is decoded.
+fn fetch(
+    parts: Arc<Parts>,
+    reads: Vec<FileRead>,
+    bytes_read: Count,
+) -> BoxStream<'static, Result<(FileRead, Bytes), Fault>> {
+    let one = move |read: FileRead| {
+        let (parts, bytes_read) = (parts.clone(), bytes_read.clone());
+        async move {
+            let bytes = parts.files.read_range(&parts.sources[read.source].file.path, read.range.clone()).await?;
+            bytes_read.add(bytes.len());
+            Ok((read, bytes))
+        }
+    };
+    stream::iter(reads).map(one).buffered(AHEAD).boxed()
+}
+
+/// One partition on its way.
+struct Scanner {
+    scan: Arc<Scan>,
+    reads: BoxStream<'static, Result<(FileRead, Bytes), Fault>>,
+    fetched: Option<Fetched>,
+    current: Option<Current>,
+    rows: Rows,
+    /// Rows until the limit.
+    left: usize,
+    memory: MemoryReservation,
+    chunks: Count,
+    /// Values that are null because they are not of their column's type.
+    unfit: Count,
+    baseline: BaselineMetrics,
+}
+
+/// What was fetched at once, and what of it is still to be read.
+struct Fetched {
+    source: usize,
+    start: u64,
+    bytes: Bytes,
+    pieces: VecDeque<Piece>,
+}
+
+/// The piece at hand.
+struct Current {
+    source: usize,
+    offset: u64,
+    records: PieceRecords,
+}
+
+impl Scanner {
+    async fn next(&mut self) -> Result<Option<RecordBatch>> {
+        loop {
+            if let Some(batch) = self.rows.take() {
+                self.baseline.record_output(batch.num_rows());
+                return Ok(Some(batch));
+            }
+            if self.left == 0 || !self.open().await? {
+                self.rows.finish()?;
+                self.left = 0;
+                let Some(batch) = self.rows.take() else { return Ok(None) };
+                self.baseline.record_output(batch.num_rows());
+                return Ok(Some(batch));
+            }
+            let elapsed = self.baseline.elapsed_compute().clone();
+            let _timer = elapsed.timer();
+            self.decode()?;
+            self.unfit.add(self.rows.take_unfit());
+        }
+    }
+
+    // Whether there is a piece at hand, or another one.
+    async fn open(&mut self) -> Result<bool> {
+        while self.current.is_none() {
+            let Some(fetched) = &mut self.fetched else {
+                match self.reads.try_next().await? {
+                    Some((read, bytes)) => {
+                        let (source, start) = (read.source, read.range.start);
+                        self.fetched = Some(Fetched { source, start, bytes, pieces: read.pieces.into() });
+                    }
+                    None => return Ok(false),
+                }
+                continue;
+            };
+            let Some(piece) = fetched.pieces.pop_front() else {
+                self.fetched = None;
+                continue;
+            };
+            // Between chunks others have their turn, and a query that is dropped ends.
+            let (source, offset) = (fetched.source, piece.range.start);
+            let bytes =
+                fetched.bytes.slice((offset - fetched.start) as usize..(piece.range.end - fetched.start) as usize);
+            let path = &self.scan.parts.sources[source].file.path;
+            let records = PieceRecords::new(bytes, piece.kind).map_err(|what| Fault::damaged(path, offset, what))?;
+            self.memory.try_resize(records.memory)?;
+            self.chunks.add(1);
+            self.current = Some(Current { source, offset, records });
+            tokio::task::yield_now().await;
+        }
+        Ok(true)
+    }
+
+    // Continues with the piece at hand until a batch is ready.
+    fn decode(&mut self) -> Result<()> {
+        let Some(Current { source, offset, records }) = &mut self.current else { return Ok(()) };
+        let parts = &self.scan.parts;
+        let source = &parts.sources[*source];
+        let path = &source.file.path;
+        while let Some(record) = records.next_record().map_err(|what| Fault::damaged(path, *offset, what))? {
+            let Record::Message { header, data } = &record else {
+                source.file.digests.check(&record).map_err(|what| Fault::damaged(path, *offset, what))?;
+                continue;
+            };
+            let Some((topic, mapping)) = source.channels.get(&header.channel_id) else {
+                if source.file.channels.contains_key(&header.channel_id) {
+                    continue;
+                }
+                return Err(Fault::damaged(path, *offset, undescribed(header.channel_id)).into());
+            };
+            if let Some(times) = &self.scan.times
+                && !i64::try_from(header.log_time).is_ok_and(|nanos| times.contains(&nanos))
+            {
+                continue;
+            }
+            let message = Message { run: source.run.as_ref(), topic, header, data };
+            let mapping = parts.mappings.as_ref().map(|all| (*mapping, &all[*mapping]));
+            let is_ready = self.rows.push(&message, mapping)?.map_err(|what| Fault::Message {
+                file: path.to_string(),
+                topic: topic.clone(),
+                sequence: header.sequence,
+                offset: *offset,
+                what,
+            })?;
+            self.left -= 1;
+            if is_ready || self.left == 0 {
+                return Ok(());
+            }
+        }
+        self.current = None;
+        Ok(())
+    }
+}

@@ -1,0 +1,162 @@
+//! Which files a call means: runs of one view of the lake, or a file by its place in the lake.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use echolake_lake::{Lake, LakeSnapshot, VisibleRun};
+use futures::{StreamExt as _, TryStreamExt as _};
+use object_store::path::Path;
+
+use super::error::Fault;
+use super::file::{McapFile, McapFiles};
+
+/// Files that are opened at once.
+const OPENED_AT_ONCE: usize = 16;
+/// The end of a run file's name.
+const EXTENSION: &str = ".mcap";
+const FORMS: &str = "a surface (`0015_0`), a run, either with * and ?, or a file in the lake (`inbox/x.mcap`); \
+                     several with commas between them";
+
+const RUNS_ALONE: &str = "tokens of projects read files of their runs alone; select file from runs";
+
+/// A file that a call means.
+#[derive(Debug, Clone)]
+pub(super) struct Target {
+    /// Surface and run; None for a file that is no run of the lake.
+    pub(super) run: Option<(String, String)>,
+    pub(super) file: Arc<McapFile>,
+}
+
+impl Target {
+    /// Opens the files that `pattern` means, each once.
+    pub(super) async fn open(pattern: &str, snapshot: &LakeSnapshot, files: &McapFiles) -> Result<Vec<Self>, Fault> {
+        let mut meant = BTreeMap::new();
+        for part in pattern.split(',').map(str::trim) {
+            if part.contains('/') || part.ends_with(EXTENSION) {
+                let path = path(part)?;
+                let run = snapshot.runs().find(|r| Lake::run_path(&r.surface, &r.run) == path);
+                if run.is_none() && snapshot.is_restricted() {
+                    return Err(Fault::call(format!("`{part}` is the file of no run that you may see"), RUNS_ALONE));
+                }
+                meant.insert(path, run.map(names));
+            } else {
+                meant.extend(runs(part, snapshot)?);
+            }
+        }
+        let sizes = &files.known_sizes(snapshot).await;
+        let open = |(path, run)| async move {
+            let file = files.open(&path, sizes.get(&path).copied()).await?;
+            Ok(Self { run, file })
+        };
+        futures::stream::iter(meant).map(open).buffered(OPENED_AT_ONCE).try_collect().await
+    }
+}
+
+/// A file, and the surface and run that it is; None of a foreign one.
+type Meant = (Path, Option<(String, String)>);
+
+fn names(run: &VisibleRun) -> (String, String) {
+    (run.surface.to_string(), run.run.to_string())
+}
+
+fn runs(pattern: &str, snapshot: &LakeSnapshot) -> Result<Vec<Meant>, Fault> {
+    let meant = |r: &&VisibleRun| matches(pattern, r.surface.as_str()) || matches(pattern, r.run.as_str());
+    let found = snapshot.runs().filter(meant).map(|r| (Lake::run_path(&r.surface, &r.run), Some(names(r))));
+    let found: Vec<_> = found.collect();
+    match found.is_empty() {
+        true => Err(Fault::call(format!("no surface and no run is called `{pattern}`"), format!("it may be {FORMS}"))),
+        false => Ok(found),
+    }
+}
+
+// Only files that are named as recordings are, by the very place that they have in the lake's store.
+fn path(text: &str) -> Result<Path, Fault> {
+    let wrong =
+        |why: &str| Fault::call(format!("`{text}` is no file in the lake: {why}"), format!("it may be {FORMS}"));
+    if text.contains(['*', '?']) {
+        return Err(wrong("patterns are for surfaces and runs"));
+    }
+    if !text.ends_with(EXTENSION) {
+        return Err(wrong("its name does not end with .mcap"));
+    }
+    let odd = |c: char| c.is_control() || matches!(c, '\\' | '%' | ':');
+    let climbs = text.split('/').any(|part| matches!(part, "" | "." | ".."));
+    if climbs || text.contains(odd) {
+        return Err(wrong("it is not written as a place below the lake's own"));
+    }
+    Path::parse(text).map_err(|e| wrong(&e.to_string()))
+}
+
+/// Whether a text is of a pattern in which `*` stands for anything and `?` for one character.
+fn matches(pattern: &str, text: &str) -> bool {
+    let (pattern, text): (Vec<_>, Vec<_>) = (pattern.chars().collect(), text.chars().collect());
+    let (mut p, mut t) = (0, 0);
+    // The last star, and where what it stands for ends: one character more each time the rest does not fit.
+    let mut star: Option<(usize, usize)> = None;
+    while t < text.len() {
+        match pattern.get(p) {
+            Some('*') => {
+                star = Some((p, t));
+                p += 1;
+            }
+            Some(c) if *c == '?' || *c == text[t] => {
+                p += 1;
+                t += 1;
+            }
+            _ => match &mut star {
+                Some((at, end)) => {
+                    *end += 1;
+                    (p, t) = (*at + 1, *end);
+                }
+                None => return false,
+            },
+        }
+    }
+    pattern[p..].iter().all(|c| *c == '*')
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn patterns_match_whole_names() {
+        for (pattern, text, expected) in [
+            ("flat", "flat", true),
+            ("flat", "flat_2", false),
+            ("fl*", "flat", true),
+            ("*", "", true),
+            ("?", "", false),
+            ("00?5_*", "0015_0", true),
+            ("00?5_*", "0115_0", false),
+            ("*a*b*", "xaxxbx", true),
+            ("*a*b", "xaxxbx", false),
+            ("", "flat", false),
+        ] {
+            assert_eq!(matches(pattern, text), expected, "{pattern} {text}");
+        }
+    }
+
+    #[test]
+    fn a_path_stays_in_the_lake() {
+        assert_eq!(path("inbox/a b.mcap").expect("a path").as_ref(), "inbox/a b.mcap");
+        for outside in [
+            "../x.mcap",
+            "inbox/../../x.mcap",
+            "/etc/x.mcap",
+            "inbox//x.mcap",
+            "./x.mcap",
+            "file:///x.mcap",
+            "inbox\\..\\x.mcap",
+            "%2e%2e/x.mcap",
+            "inbox/..%2fx.mcap",
+            "lake.toml/",
+            "tables/runs/a.parquet",
+            "inbox/*.mcap",
+            "inbox/x\0.mcap",
+            "/",
+        ] {
+            assert!(path(outside).is_err(), "{outside}");
+        }
+    }
+}
