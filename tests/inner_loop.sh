@@ -6,7 +6,9 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 members=("$@")
-[ $# -gt 0 ] || members=(schema dsp recording storage acquisition ingest query export server)
+[ $# -gt 0 ] || members=(
+    schema dsp recording storage acquisition ingest query export server/service server/http server/postgres server
+)
 logs=$(mktemp -d)
 file=
 restore() {

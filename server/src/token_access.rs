@@ -3,10 +3,9 @@
 use std::sync::{Arc, PoisonError, RwLock, RwLockReadGuard};
 use std::time::SystemTime;
 
+use echolake_service::{ClientIdentity, RequestFault};
 use sha2::{Digest as _, Sha256};
 
-use crate::client_identity::ClientIdentity;
-use crate::fault::RequestFault;
 use crate::scram_verifier::ScramVerifier;
 use crate::sessions::BrowserSessions;
 use crate::tokens::TokenFile;
@@ -166,7 +165,8 @@ mod tests {
     use echolake_schema::ProjectName;
 
     use super::*;
-    use crate::tokens::{TokenScope, fresh};
+    use crate::tokens::fresh;
+    use echolake_service::TokenScope;
 
     fn access_by(lines: &str) -> TokenAccess {
         let file = TokenFile::parse(Path::new("no-such-file.toml"), lines).expect("tokens");

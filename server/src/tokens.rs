@@ -4,23 +4,15 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use base64::Engine as _;
-use base64::alphabet::STANDARD;
-use base64::engine::GeneralPurpose;
-use base64::engine::general_purpose::NO_PAD;
 use chrono::{DateTime, Utc};
 use echolake_schema::ProjectName;
+use echolake_service::{ClientIdentity, Error};
 use serde::Deserialize;
 use sha2::{Digest as _, Sha256};
 use subtle::{Choice, ConstantTimeEq as _};
 
-use crate::Error;
-use crate::client_identity::ClientIdentity;
 use crate::scram_verifier::ScramVerifier;
-pub use crate::token_scope::TokenScope;
-
-/// Of basic credentials; padding is cut off before, since gRPC's clients leave it out.
-const BASE64: GeneralPurpose = GeneralPurpose::new(&STANDARD, NO_PAD.with_decode_allow_trailing_bits(true));
+pub use echolake_service::TokenScope;
 
 /// Prefix of all tokens, so that leaked ones can be found by searching.
 const PREFIX: &str = "echolake_";
@@ -244,19 +236,6 @@ pub fn fresh(
     Ok(FreshToken { token, lines })
 }
 
-/// The token of an `Authorization` header: a bearer's, or the password of a basic one.
-pub(crate) fn of_header(value: &str) -> Option<String> {
-    let (scheme, rest) = value.split_once(' ')?;
-    if scheme.eq_ignore_ascii_case("bearer") {
-        return Some(rest.trim().to_owned());
-    }
-    if !scheme.eq_ignore_ascii_case("basic") {
-        return None;
-    }
-    let pair = String::from_utf8(BASE64.decode(rest.trim().trim_end_matches('=')).ok()?).ok()?;
-    Some(pair.split_once(':')?.1.to_owned())
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -282,22 +261,6 @@ mod tests {
         ] {
             let error = TokenFile::parse(Path::new("tokens.toml"), &text).map(|_| ()).expect_err(&text);
             assert!(error.contains(expected), "{text}: {error}");
-        }
-    }
-
-    #[test]
-    fn tokens_of_headers() {
-        for (value, expected) in [
-            ("Bearer x", Some("x")),
-            ("bearer  x ", Some("x")),
-            ("Basic dXNlcjpwYXNzOndvcmQ=", Some("pass:word")),
-            ("Basic dXNlcjpwYXNzOndvcmQ", Some("pass:word")),
-            ("Basic !!", None),
-            ("Basic dXNlcg==", None),
-            ("Digest x", None),
-            ("x", None),
-        ] {
-            assert_eq!(of_header(value).as_deref(), expected, "{value}");
         }
     }
 }

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, PoisonError, RwLock};
 use std::time::{Duration, SystemTime};
 
+use echolake_service::Error;
 use tokio_rustls::TlsAcceptor;
 use tokio_rustls::rustls::crypto::ring;
 use tokio_rustls::rustls::pki_types::pem::PemObject as _;
@@ -16,7 +17,6 @@ use tokio_util::either::Either;
 
 use super::certificate_hash::certificate_hash;
 use super::connection_places::PlacedStream;
-use crate::Error;
 
 /// Time limit for a handshake.
 const HANDSHAKE: Duration = Duration::from_secs(10);

@@ -1,6 +1,7 @@
 //! The door: the process that clients reach. It holds connections, finds out who asks, and forwards requests to the engine
 //! of that client. It parses no SQL and decodes no file, so that no request can end it.
 
+pub(crate) mod activity;
 mod agent;
 mod audit;
 mod certificate_hash;
@@ -16,6 +17,7 @@ mod forward;
 mod http;
 mod http_connection;
 mod postgres;
+mod query_log;
 mod readiness;
 pub(crate) mod server_door;
 mod temp_folder;
@@ -25,10 +27,10 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use echolake_lake::Lake;
+use echolake_service::Error;
 use tokio::net::{TcpListener, TcpSocket};
 use tokio::task::JoinSet;
 
-use crate::Error;
 use crate::token_access::TokenAccess;
 use crate::tokens::TokenFile;
 pub use agent::AgentDoor;

@@ -2,9 +2,6 @@
 //! folder that only its user may enter; the door, which started it, is its only peer and has authenticated the client.
 
 pub mod confinement;
-pub(crate) mod door_message;
-pub(crate) mod door_rows;
-pub(crate) mod report;
 mod watchdog;
 
 use std::convert::Infallible;
@@ -16,16 +13,9 @@ use std::time::Duration;
 use echolake_lake::Lake;
 use echolake_query::{EngineClient, QueryEngine, QueryQuota};
 use echolake_schema::tables::Table;
+use echolake_service::{ClientIdentity, DoorMessage, EngineReport, EngineSocket, Error, LakeFigures, QueryService};
 use futures::FutureExt as _;
 use tokio::sync::mpsc;
-
-use crate::activity::LakeFigures;
-use crate::client_identity::ClientIdentity;
-use crate::engine_socket::EngineSocket;
-use crate::service::QueryService;
-use crate::{Error, flight, http, postgres};
-use door_message::DoorMessage;
-use report::EngineReport;
 
 /// A query that has a new engine read what every query reads.
 const WARM_UP: &str = "select count(*) from runs";
@@ -71,9 +61,9 @@ pub async fn run_engine(lake: &Lake, sockets: &Path, memory: usize, slow: Option
     let obeying = service.clone();
     tokio::select! {
         () = obeying.obey(messages) => Ok(()),
-        failed = http::serve(service.clone(), http) => failed,
-        failed = flight::serve(service.clone(), flight_sql) => failed,
-        failed = postgres::serve(service, postgres) => failed,
+        failed = echolake_http::serve(service.clone(), http) => failed,
+        failed = echolake_flight::serve(service.clone(), flight_sql) => failed,
+        failed = echolake_postgres::serve(service, postgres) => failed,
     }
 }
 

@@ -4,8 +4,8 @@
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD as BASE64;
 use bytes::{BufMut as _, BytesMut};
+use echolake_service::RequestFault;
 
-use crate::fault::RequestFault;
 use crate::scram_verifier::{METHOD, ScramVerifier};
 
 /// The method that binds a login to the certificate.
