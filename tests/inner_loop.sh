@@ -7,7 +7,8 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 members=("$@")
 [ $# -gt 0 ] || members=(
-    schema dsp recording storage acquisition ingest query export server/service server/http server/postgres server
+    schema dsp recording storage acquisition ingest query export server/service server/access server/http server/flight
+    server/postgres server
 )
 logs=$(mktemp -d)
 file=

@@ -17,15 +17,12 @@ mod catalogue_pages;
 pub mod certificate;
 mod door;
 pub mod engine;
-#[cfg(fuzzing)]
+#[cfg(all(fuzzing, feature = "postgres"))]
 pub mod fuzzing;
 mod metrics;
 mod random_id;
-mod scram_verifier;
-mod sessions;
-mod token_access;
-pub mod tokens;
 
 pub use catalogue_pages::CataloguePages;
 pub use door::{AgentDoor, CertificateFiles, EngineSettings, LakeServer, ServerSettings};
+pub use echolake_access::tokens;
 pub use echolake_service::Error;

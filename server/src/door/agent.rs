@@ -8,6 +8,7 @@ use std::sync::Arc;
 use axum::body::{Body, to_bytes};
 use axum::http::{HeaderValue, Request, StatusCode, Uri, header};
 use bytes::Bytes;
+use echolake_access::TokenAccess;
 use echolake_http::{FORWARDED_PROTO, MCP};
 use echolake_lake::Lake;
 use echolake_service::request_span::begin_request;
@@ -21,7 +22,6 @@ use super::engine_pool::EnginePool;
 use super::engine_process::EngineSettings;
 use super::forward::EngineProtocol;
 use crate::door::activity::ServerActivity;
-use crate::token_access::TokenAccess;
 
 /// Name of the client.
 const AGENT: &str = "agent";

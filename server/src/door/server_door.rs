@@ -3,6 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use echolake_access::{TokenAccess, TokenFileState};
 use echolake_http::layout::ViewerLayout;
 use echolake_lake::Lake;
 use echolake_service::{ClientIdentity, Error, RequestFault, ServerProtocol, TokenScope};
@@ -16,7 +17,6 @@ use super::failed_logins::FailedLogins;
 use super::readiness::ReadinessCheck;
 use crate::door::activity::ServerActivity;
 use crate::metrics::{ServerGauges, ServerMetrics};
-use crate::token_access::{TokenAccess, TokenFileState};
 
 /// Time between two looks at the file of tokens.
 const LOOK_EVERY: Duration = Duration::from_secs(1);

@@ -35,6 +35,7 @@ pub async fn run_engine(lake: &Lake, sockets: &Path, memory: usize, slow: Option
     let mut messages = read_messages();
     let http = EngineSocket::Http.listen(sockets)?;
     let flight_sql = EngineSocket::FlightSql.listen(sockets)?;
+    #[cfg(feature = "postgres")]
     let postgres = EngineSocket::Postgres.listen(sockets)?;
     let engine = QueryEngine::new(lake, Some(memory))?;
     warm_up(&engine).await?;
@@ -59,11 +60,15 @@ pub async fn run_engine(lake: &Lake, sockets: &Path, memory: usize, slow: Option
     confinement::limit_memory(limit).map_err(Error::System)?;
     watchdog::start(&service).map_err(Error::System)?;
     let obeying = service.clone();
+    #[cfg(feature = "postgres")]
+    let postgres = echolake_postgres::serve(service.clone(), postgres);
+    #[cfg(not(feature = "postgres"))]
+    let postgres = std::future::pending();
     tokio::select! {
         () = obeying.obey(messages) => Ok(()),
         failed = echolake_http::serve(service.clone(), http) => failed,
         failed = echolake_flight::serve(service.clone(), flight_sql) => failed,
-        failed = echolake_postgres::serve(service, postgres) => failed,
+        failed = postgres => failed,
     }
 }
 

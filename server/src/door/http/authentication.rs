@@ -3,11 +3,10 @@
 use std::sync::Arc;
 
 use axum::http::{HeaderMap, header};
+use echolake_access::TokenAccess;
 use echolake_http::is_same_origin;
 use echolake_service::authorization::of_header;
 use echolake_service::{ClientIdentity, RequestFault};
-
-use crate::token_access::TokenAccess;
 
 /// The cookie of a browser's session.
 pub(super) const COOKIE: &str = "echolake";

@@ -5,6 +5,7 @@ use axum::extract::rejection::BytesRejection;
 use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::IntoResponse;
 use bytes::Bytes;
+use echolake_access::LIFETIME;
 use echolake_http::{ProblemResponse, is_encrypted};
 use echolake_service::RequestFault;
 use serde::Deserialize;
@@ -12,7 +13,6 @@ use utoipa::ToSchema;
 
 use super::authentication::COOKIE;
 use crate::door::server_door::ServerDoor;
-use crate::sessions::LIFETIME;
 
 /// Bytes of a request.
 const LARGEST: usize = 4 << 10;

@@ -10,6 +10,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::{Buf as _, BytesMut};
+use echolake_access::ScramVerifier;
 use echolake_postgres::{PID_PARAMETER, fatal_message};
 use echolake_service::request_span::{begin_connection, mark_startup};
 use echolake_service::{ClientIdentity, RequestFault, ServerProtocol, TokenScope};
@@ -20,7 +21,6 @@ use tracing::Instrument as _;
 use super::connection_places::{ConnectionPlaces, PlaceWork, PlacedStream};
 use super::encryption::{DoorStream, ProtocolEncryption};
 use crate::door::server_door::ServerDoor;
-use crate::scram_verifier::ScramVerifier;
 use cancel_keys::CancelKeys;
 use frames::{FrameHeader, HEADER, PASSWORD_WANTED, StartupPacket};
 use relay::MessageRelay;

@@ -11,7 +11,7 @@ use crate::sessions::BrowserSessions;
 use crate::tokens::TokenFile;
 
 /// The access rule of a server.
-pub(crate) enum TokenAccess {
+pub enum TokenAccess {
     /// All clients on this machine.
     Open,
     /// Those whom the file of tokens names.
@@ -19,7 +19,7 @@ pub(crate) enum TokenAccess {
 }
 
 /// Access of those whom a file names.
-pub(crate) struct NamedAccess {
+pub struct NamedAccess {
     file: RwLock<TokenFile>,
     sessions: BrowserSessions,
 }
@@ -43,7 +43,7 @@ impl NamedAccess {
 
 impl TokenAccess {
     /// Access by `tokens`; open access without them.
-    pub(crate) fn new(tokens: Option<TokenFile>) -> Self {
+    pub fn new(tokens: Option<TokenFile>) -> Self {
         match tokens {
             Some(file) => {
                 let named = NamedAccess { file: RwLock::new(file), sessions: BrowserSessions::default() };
@@ -54,7 +54,7 @@ impl TokenAccess {
     }
 
     /// Returns whether no token is required.
-    pub(crate) fn is_open(&self) -> bool {
+    pub fn is_open(&self) -> bool {
         matches!(self, Self::Open)
     }
 
@@ -62,7 +62,7 @@ impl TokenAccess {
     ///
     /// # Errors
     /// [`RequestFault::Unauthenticated`].
-    pub(crate) fn client(
+    pub fn client(
         &self,
         token: Option<&str>,
         local: impl FnOnce() -> ClientIdentity,
@@ -75,7 +75,7 @@ impl TokenAccess {
 
     /// Returns the verifier of a token's name, and its client. A name without one has a verifier that nobody passes and looks
     /// like others, and no client.
-    pub(crate) fn scram_client(&self, name: &str) -> (Option<Arc<ClientIdentity>>, Arc<ScramVerifier>) {
+    pub fn scram_client(&self, name: &str) -> (Option<Arc<ClientIdentity>>, Arc<ScramVerifier>) {
         let Self::Named(named) = self else { return (None, Arc::new(ScramVerifier::unpassable(name, &[]))) };
         let file = named.file();
         // Computed for known names, too, so that the time is the same.
@@ -90,7 +90,7 @@ impl TokenAccess {
     ///
     /// # Errors
     /// [`RequestFault::Unauthenticated`].
-    pub(crate) fn check_current(&self, client: &ClientIdentity) -> Result<(), RequestFault> {
+    pub fn check_current(&self, client: &ClientIdentity) -> Result<(), RequestFault> {
         let Self::Named(named) = self else { return Ok(()) };
         let file = named.file();
         let is_current = file.find_name(&client.name).is_some_and(|entry| *entry.client == *client);
@@ -99,7 +99,7 @@ impl TokenAccess {
 
     /// Reads the file again if it changed; returns the names of clients that may no longer ask, or may do other things now. A
     /// file that cannot be read changes nothing.
-    pub(crate) fn renew(&self, known: &mut TokenFileState) -> Vec<String> {
+    pub fn renew(&self, known: &mut TokenFileState) -> Vec<String> {
         let Self::Named(named) = self else { return Vec::new() };
         let path = named.file().path().to_owned();
         let changed = std::fs::metadata(&path).ok().and_then(|about| Some((about.modified().ok()?, about.len())));
@@ -121,7 +121,7 @@ impl TokenAccess {
     ///
     /// # Errors
     /// [`RequestFault::Unauthenticated`]; [`RequestFault::NotFound`] if there are no tokens.
-    pub(crate) fn begin_session(&self, token: &str) -> Result<String, RequestFault> {
+    pub fn begin_session(&self, token: &str) -> Result<String, RequestFault> {
         let Self::Named(named) = self else {
             let hint = "this server has no tokens, ask right away";
             return Err(RequestFault::NotFound { what: "a session".to_owned(), hint });
@@ -135,7 +135,7 @@ impl TokenAccess {
     ///
     /// # Errors
     /// As [`TokenAccess::client`].
-    pub(crate) fn client_of_session(
+    pub fn client_of_session(
         &self,
         secret: &str,
         local: impl FnOnce() -> ClientIdentity,
@@ -149,7 +149,7 @@ impl TokenAccess {
 
 /// State of the file of tokens, and the clients that might ask, when it was last looked at.
 #[derive(Default)]
-pub(crate) struct TokenFileState {
+pub struct TokenFileState {
     file: Option<Option<(SystemTime, u64)>>,
     clients: Vec<Arc<ClientIdentity>>,
 }

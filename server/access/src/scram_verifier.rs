@@ -11,7 +11,7 @@ use ring::{digest, hmac, pbkdf2};
 use subtle::ConstantTimeEq as _;
 
 /// The method's name, which begins a verifier.
-pub(crate) const METHOD: &str = "SCRAM-SHA-256";
+pub const METHOD: &str = "SCRAM-SHA-256";
 /// Iterations of the hash, as in PostgreSQL. A token is random, so that more of them would protect nothing.
 const ITERATIONS: NonZeroU32 = match NonZeroU32::new(4096) {
     Some(iterations) => iterations,
@@ -23,7 +23,7 @@ const MOST_ITERATIONS: u32 = 1_000_000;
 
 /// Verifier of a token.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct ScramVerifier {
+pub struct ScramVerifier {
     iterations: NonZeroU32,
     salt: Vec<u8>,
     stored_key: [u8; 32],
@@ -35,7 +35,7 @@ impl ScramVerifier {
     ///
     /// # Errors
     /// If the system gives no random bytes.
-    pub(crate) fn new(token: &str) -> Result<Self, getrandom::Error> {
+    pub fn new(token: &str) -> Result<Self, getrandom::Error> {
         let mut salt = vec![0; SALT_BYTES];
         getrandom::fill(&mut salt)?;
         Ok(Self::with_salt(token, salt, ITERATIONS))
@@ -58,17 +58,17 @@ impl ScramVerifier {
     }
 
     /// Returns the salt in base 64, which the client needs.
-    pub(crate) fn salt(&self) -> String {
+    pub fn salt(&self) -> String {
         BASE64.encode(&self.salt)
     }
 
     /// Returns the number of iterations, which the client needs.
-    pub(crate) fn iterations(&self) -> NonZeroU32 {
+    pub fn iterations(&self) -> NonZeroU32 {
         self.iterations
     }
 
     /// Checks a client's proof of the messages of a login; returns the server's, if it is right.
-    pub(crate) fn check_proof(&self, messages: &str, proof: &[u8]) -> Option<[u8; 32]> {
+    pub fn check_proof(&self, messages: &str, proof: &[u8]) -> Option<[u8; 32]> {
         let signature = sign(&self.stored_key, messages.as_bytes());
         let proof: &[u8; 32] = proof.try_into().ok()?;
         let mut client_key = [0; 32];

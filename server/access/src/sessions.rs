@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use sha2::{Digest as _, Sha256};
 
 /// Lifetime of a session.
-pub(crate) const LIFETIME: Duration = Duration::from_secs(12 * 3600);
+pub const LIFETIME: Duration = Duration::from_secs(12 * 3600);
 /// Sessions that are kept; the oldest is evicted first.
 const MOST: usize = 1000;
 
