@@ -11,7 +11,7 @@ use utoipa::{IntoParams, ToSchema};
 use super::super::extract::QueryParams;
 use super::content::{AnswerContent, EndpointAnswer};
 use super::request::CatalogueRequest;
-use super::summary::SurfaceEntry;
+use super::snapshot::summary::SurfaceEntry;
 
 /// Fewer surfaces have no meaningful correlation: two are always on a line.
 const LEAST: usize = 3;

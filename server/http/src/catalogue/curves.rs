@@ -15,7 +15,7 @@ use utoipa::{IntoParams, ToSchema};
 use super::super::extract::{BinaryContent, PathParams, QueryParams, WholeNumber};
 use super::content::{AnswerContent, EndpointAnswer};
 use super::request::{CatalogueRequest, SurfacePath, number, text};
-use super::summary::SurfaceEntry;
+use super::snapshot::summary::SurfaceEntry;
 
 /// Curves of a surface beside those of its Flat.
 #[derive(Serialize, ToSchema)]

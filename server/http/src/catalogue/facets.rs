@@ -15,7 +15,7 @@ use utoipa::{IntoParams, PartialSchema, ToSchema};
 use super::super::extract::{NumberRange, QueryParams, RANGE_PATTERN, WholeNumber};
 use super::content::{AnswerContent, EndpointAnswer};
 use super::request::CatalogueRequest;
-use super::summary::{CatalogueSummary, SurfaceEntry, SurfaceSummary};
+use super::snapshot::summary::{CatalogueSummary, SurfaceEntry, SurfaceSummary};
 
 /// Values of a facet that are answered, the most frequent ones.
 const MOST_VALUES: usize = 200;

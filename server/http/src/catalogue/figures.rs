@@ -19,7 +19,7 @@ use super::content::{AnswerContent, EndpointAnswer};
 use super::curves::{CurveSet, PairSelection};
 use super::map::positions;
 use super::request::{CatalogueRequest, SurfacePath};
-use super::summary::SurfaceEntry;
+use super::snapshot::summary::SurfaceEntry;
 use super::surface::{GridNormalisation, read_grid, required_microphone};
 
 /// Surfaces of one figure.

@@ -4,9 +4,9 @@ use axum::Extension;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-use super::bands::{BandDescription, bands};
 use super::content::{AnswerContent, EndpointAnswer};
 use super::request::CatalogueRequest;
+use super::snapshot::bands::{BandDescription, bands};
 
 /// The lake.
 #[derive(Serialize, ToSchema)]

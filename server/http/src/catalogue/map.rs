@@ -11,8 +11,8 @@ use utoipa::{IntoParams, ToSchema};
 
 use super::super::extract::{QueryParams, WholeNumber};
 use super::content::{AnswerContent, EndpointAnswer};
-use super::positions::{SurfaceNeighbour, SurfacePositions};
 use super::request::CatalogueRequest;
+use super::snapshot::positions::{SurfaceNeighbour, SurfacePositions};
 
 /// Components that are answered.
 const COMPONENTS: usize = 3;

@@ -4,8 +4,6 @@
 //! ask, whether it has the answer already, and whether the cache does.
 
 mod analysis;
-mod answer_cache;
-mod bands;
 mod content;
 mod correlations;
 mod curves;
@@ -15,15 +13,13 @@ mod figures;
 mod lake;
 mod map;
 mod pair;
-mod positions;
 mod relief;
 mod request;
 mod rows;
 mod runs;
-mod summary;
+mod snapshot;
 mod surface;
 mod tables;
-mod view;
 mod wav;
 
 use std::sync::Arc;
@@ -46,9 +42,9 @@ use super::format;
 use super::problem::ProblemResponse;
 use request::SurfacePath;
 pub(super) use request::{CatalogueRequest, RunPath, run, text};
+use snapshot::view::SnapshotViews;
+pub(super) use snapshot::view::{SnapshotView, VisibleFile};
 pub(super) use tables::{ColumnDescription, table};
-use view::SnapshotViews;
-pub(super) use view::{SnapshotView, VisibleFile};
 
 /// The endpoints that are answered from tables.
 pub(super) fn table_routes() -> OpenApiRouter {

@@ -16,7 +16,7 @@ use super::curves::{CurveSet, PairSelection};
 use super::environment::{AirReading, AirSeries};
 use super::request::{CatalogueRequest, long, missing, number, text};
 use super::runs::RunLogEntry;
-use super::summary::SurfaceEntry;
+use super::snapshot::summary::SurfaceEntry;
 
 /// Length of the air's history that is shown before and after a measurement.
 const AROUND_NS: i64 = 900_000_000_000;

@@ -14,10 +14,10 @@ use utoipa::IntoParams;
 
 use super::super::extract::parse_whole;
 use super::LakeCatalogue;
-use super::bands::bands;
 use super::rows::RowDecoder;
-use super::summary::{BAND_STATISTICS, CatalogueSummary, SURFACES, SurfaceEntry};
-use super::view::SnapshotView;
+use super::snapshot::bands::bands;
+use super::snapshot::summary::{BAND_STATISTICS, CatalogueSummary, SURFACES, SurfaceEntry};
+use super::snapshot::view::SnapshotView;
 use crate::request_protocol::http_job;
 
 /// A request to an endpoint.

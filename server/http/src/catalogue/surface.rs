@@ -12,7 +12,7 @@ use utoipa::{IntoParams, ToSchema};
 use super::super::extract::{PathParams, QueryParams};
 use super::content::{AnswerContent, EndpointAnswer};
 use super::request::{CatalogueRequest, SurfacePath, number, text};
-use super::summary::{SurfaceEntry, SurfaceSummary};
+use super::snapshot::summary::{SurfaceEntry, SurfaceSummary};
 
 /// One surface.
 #[derive(Serialize, ToSchema)]

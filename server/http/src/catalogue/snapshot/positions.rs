@@ -6,15 +6,15 @@ use serde::Serialize;
 use utoipa::ToSchema;
 
 /// Surfaces on the map.
-pub(super) struct SurfacePositions {
-    pub(super) names: Vec<String>,
-    pub(super) components: PrincipalComponents,
-    pub(super) units: SelfOrganisingMap,
+pub(in super::super) struct SurfacePositions {
+    pub(in super::super) names: Vec<String>,
+    pub(in super::super) components: PrincipalComponents,
+    pub(in super::super) units: SelfOrganisingMap,
 }
 
 impl SurfacePositions {
     /// The `count` surfaces nearest to one.
-    pub(super) fn neighbours(&self, of: usize, count: usize) -> Vec<SurfaceNeighbour<'_>> {
+    pub(in super::super) fn neighbours(&self, of: usize, count: usize) -> Vec<SurfaceNeighbour<'_>> {
         let others = self.names.iter().enumerate().filter(|(i, _)| *i != of);
         let mut near: Vec<_> = others.map(|(i, name)| (self.components.distance(of, i), name)).collect();
         near.sort_by(|a, b| a.0.total_cmp(&b.0));
@@ -27,7 +27,7 @@ impl SurfacePositions {
 
 /// A surface that is near another one.
 #[derive(Serialize, ToSchema)]
-pub(super) struct SurfaceNeighbour<'a> {
+pub(in super::super) struct SurfaceNeighbour<'a> {
     surface_id: &'a str,
     /// Root mean square over the features.
     distance_db: f64,

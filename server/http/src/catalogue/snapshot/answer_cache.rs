@@ -14,9 +14,9 @@ use flate2::read::GzEncoder;
 use quick_cache::Weighter;
 use quick_cache::sync::Cache;
 
-use super::super::format::takes;
-use super::super::problem::ProblemResponse;
-use super::content::ARROW;
+use crate::catalogue::content::ARROW;
+use crate::format::takes;
+use crate::problem::ProblemResponse;
 
 /// Maximum size of the cached answers of one snapshot, bytes.
 const CACHED_BYTES: u64 = 96 << 20;
@@ -26,10 +26,10 @@ const WORTH_PACKING: usize = 2000;
 const LEVEL: Compression = Compression::new(3);
 
 /// An address with its parameters, and whether the answer is an Arrow stream.
-pub(super) type AnswerKey = (String, bool);
+pub(in super::super) type AnswerKey = (String, bool);
 
 /// Cache of answers of one snapshot.
-pub(super) struct AnswerCache(Cache<AnswerKey, Arc<CachedAnswer>, AnswerWeighter>);
+pub(in super::super) struct AnswerCache(Cache<AnswerKey, Arc<CachedAnswer>, AnswerWeighter>);
 
 /// Weighs answers by their bytes, with those that they will have once they are packed, too.
 #[derive(Clone)]
@@ -53,7 +53,7 @@ impl AnswerCache {
     ///
     /// # Errors
     /// What `make` answers instead of 200, which is not cached.
-    pub(super) async fn get_or_make(
+    pub(in super::super) async fn get_or_make(
         &self,
         key: &AnswerKey,
         make: impl Future<Output = Response>,
@@ -64,7 +64,7 @@ impl AnswerCache {
 }
 
 /// An answer, without the headers that depend on the request.
-pub(super) struct CachedAnswer {
+pub(in super::super) struct CachedAnswer {
     headers: HeaderMap,
     bytes: Bytes,
     /// None if it cannot be packed.
@@ -85,7 +85,7 @@ impl CachedAnswer {
     }
 
     /// Returns the response to a request with these headers.
-    pub(super) fn respond(&self, request: &HeaderMap) -> Response {
+    pub(in super::super) fn respond(&self, request: &HeaderMap) -> Response {
         let packs = self.headers.get(header::CONTENT_TYPE).is_some_and(is_packable);
         let is_worth = packs && self.bytes.len() >= WORTH_PACKING && takes(request, "gzip");
         let packed = is_worth.then(|| self.packed.get_or_init(|| pack(&self.bytes).ok()).clone());
@@ -113,8 +113,8 @@ mod tests {
 
     use flate2::read::GzDecoder;
 
-    use super::super::content::AnswerContent;
     use super::*;
+    use crate::catalogue::content::AnswerContent;
 
     fn key(name: &str) -> AnswerKey {
         (name.to_owned(), false)

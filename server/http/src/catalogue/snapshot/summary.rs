@@ -16,76 +16,76 @@ const DAY_NS: f64 = 86_400e9;
 /// A surface as the pages know it.
 #[derive(Debug, Serialize, ToSchema)]
 #[schema(as = Surface)]
-pub(super) struct SurfaceSummary {
-    pub(super) surface_id: String,
-    pub(super) run_id: Option<String>,
+pub(in super::super) struct SurfaceSummary {
+    pub(in super::super) surface_id: String,
+    pub(in super::super) run_id: Option<String>,
     panel: String,
     side: Option<i32>,
-    pub(super) typology: String,
-    pub(super) macrostructure: Option<String>,
-    pub(super) mesostructure: Option<String>,
+    pub(in super::super) typology: String,
+    pub(in super::super) macrostructure: Option<String>,
+    pub(in super::super) mesostructure: Option<String>,
     microstructure: Option<String>,
-    pub(super) material: String,
-    pub(super) flat_reference: String,
-    pub(super) foam_reference: String,
-    pub(super) origin: String,
+    pub(in super::super) material: String,
+    pub(in super::super) flat_reference: String,
+    pub(in super::super) foam_reference: String,
+    pub(in super::super) origin: String,
     #[schema(format = DateTime)]
     started: Option<String>,
     relief_min_mm: Option<f64>,
     relief_max_mm: Option<f64>,
-    pub(super) relief_rms_mm: Option<f64>,
+    pub(in super::super) relief_rms_mm: Option<f64>,
     /// Mean TNCE of the values up to the 90th percentile, dB re Flat total. One value per band in the order of
     /// `lake.bands`, the total last; null if there is no value.
     level_db: Vec<Option<f64>>,
     /// `level_db` less that of the surface's Flat.
-    pub(super) against_flat_db: Vec<Option<f64>>,
+    pub(in super::super) against_flat_db: Vec<Option<f64>>,
     /// Standard deviation of the pairs' TNCE in dB, by band as `level_db`.
-    pub(super) spread_db: Vec<Option<f64>>,
+    pub(in super::super) spread_db: Vec<Option<f64>>,
 }
 
 impl SurfaceSummary {
     /// Returns whether it is a reference, which is no design.
-    pub(super) fn is_reference(&self) -> bool {
+    pub(in super::super) fn is_reference(&self) -> bool {
         self.typology == REFERENCE
     }
 
     /// Returns whether it is the Foam that is subtracted from it, which leaves nothing.
-    pub(super) fn is_foam(&self) -> bool {
+    pub(in super::super) fn is_foam(&self) -> bool {
         self.surface_id == self.foam_reference
     }
 }
 
 /// A surface, and what it is found and compared by.
-pub(super) struct SurfaceEntry {
-    pub(super) surface: SurfaceSummary,
+pub(in super::super) struct SurfaceEntry {
+    pub(in super::super) surface: SurfaceSummary,
     /// Parameters of its relief's generator.
-    pub(super) parameters: Map<String, Value>,
-    pub(super) mesh_triangles: Option<i64>,
-    pub(super) mesh_watertight: Option<bool>,
-    pub(super) reflection_factor: Option<f64>,
+    pub(in super::super) parameters: Map<String, Value>,
+    pub(in super::super) mesh_triangles: Option<i64>,
+    pub(in super::super) mesh_watertight: Option<bool>,
+    pub(in super::super) reflection_factor: Option<f64>,
     /// Start of its run, days since 1970.
-    pub(super) day: Option<f64>,
+    pub(in super::super) day: Option<f64>,
     /// The searched text, in lower case.
-    pub(super) words: String,
+    pub(in super::super) words: String,
 }
 
 impl SurfaceEntry {
     /// From the lowest to the highest point.
-    pub(super) fn relief_range_mm(&self) -> Option<f64> {
+    pub(in super::super) fn relief_range_mm(&self) -> Option<f64> {
         Some(self.surface.relief_max_mm? - self.surface.relief_min_mm?)
     }
 }
 
 /// All surfaces, by name.
-pub(super) struct CatalogueSummary {
-    pub(super) bands: Vec<BandDescription>,
-    pub(super) entries: Vec<SurfaceEntry>,
+pub(in super::super) struct CatalogueSummary {
+    pub(in super::super) bands: Vec<BandDescription>,
+    pub(in super::super) entries: Vec<SurfaceEntry>,
     places: HashMap<String, usize>,
 }
 
 /// A surface and the start of its run.
 #[derive(Deserialize)]
-pub(super) struct SurfaceRow {
+pub(in super::super) struct SurfaceRow {
     surface_id: String,
     run_id: Option<String>,
     panel: String,
@@ -120,7 +120,7 @@ fn decimal<'de, D: Deserializer<'de>>(column: D) -> Result<Option<f64>, D::Error
 
 /// Level and spread of a surface in a band.
 #[derive(Deserialize)]
-pub(super) struct BandStatistic {
+pub(in super::super) struct BandStatistic {
     surface_id: String,
     band: String,
     p90_mean_db: Option<f64>,
@@ -131,17 +131,21 @@ pub(super) struct BandStatistic {
 type SurfaceLevels = HashMap<String, HashMap<String, (Option<f64>, Option<f64>)>>;
 
 /// The query of [`SurfaceRow`].
-pub(super) const SURFACES: &str = "select s.surface_id, s.run_id, s.panel, s.side, s.typology, s.macrostructure, s.mesostructure, \
+pub(in super::super) const SURFACES: &str = "select s.surface_id, s.run_id, s.panel, s.side, s.typology, s.macrostructure, s.mesostructure, \
     s.microstructure, s.material, s.flat_reference, s.foam_reference, s.parameters, s.mesh_triangles, s.mesh_watertight, \
     s.reflection_factor, s.relief_min_mm, s.relief_max_mm, s.relief_rms_mm, s.origin, r.started, r.started_ns \
     from surfaces s left join runs r on r.run_id = s.run_id order by s.surface_id, s.run_id";
 /// The query of [`BandStatistic`].
-pub(super) const BAND_STATISTICS: &str =
+pub(in super::super) const BAND_STATISTICS: &str =
     "select surface_id, band, p90_mean_db, spread_db from surface_stats order by surface_id, run_id";
 
 impl CatalogueSummary {
     /// The surfaces of the rows of [`SURFACES`] with the statistics of [`BAND_STATISTICS`].
-    pub(super) fn new(rows: Vec<SurfaceRow>, statistics: Vec<BandStatistic>, bands: Vec<BandDescription>) -> Self {
+    pub(in super::super) fn new(
+        rows: Vec<SurfaceRow>,
+        statistics: Vec<BandStatistic>,
+        bands: Vec<BandDescription>,
+    ) -> Self {
         let mut levels = SurfaceLevels::new();
         for stat in statistics {
             levels.entry(stat.surface_id).or_default().insert(stat.band, (stat.p90_mean_db, stat.spread_db));
@@ -155,7 +159,7 @@ impl CatalogueSummary {
     }
 
     /// The surface of a name.
-    pub(super) fn entry(&self, surface: &str) -> Option<&SurfaceEntry> {
+    pub(in super::super) fn entry(&self, surface: &str) -> Option<&SurfaceEntry> {
         self.places.get(surface).map(|place| &self.entries[*place])
     }
 }

@@ -8,16 +8,16 @@ use utoipa::ToSchema;
 /// A band, or the total, which has no centre.
 #[derive(Debug, Serialize, ToSchema)]
 #[schema(as = Band)]
-pub(super) struct BandDescription {
+pub(in super::super) struct BandDescription {
     /// As in column names: `2500`, ..., `total`.
-    pub(super) key: String,
+    pub(in super::super) key: String,
     centre_hz: Option<f64>,
     /// As in pictures: `2.5 kHz`.
-    pub(super) label: String,
+    pub(in super::super) label: String,
 }
 
 /// The rig's bands, the total last.
-pub(super) fn bands(rig: &Rig) -> Vec<BandDescription> {
+pub(in super::super) fn bands(rig: &Rig) -> Vec<BandDescription> {
     let keys = rig.band_names().into_iter().chain([TOTAL_BAND.to_owned()]);
     let centres = rig.bands.centres_hz.iter().copied().map(Some).chain([None]);
     let described = keys.zip(centres).zip(band_labels(rig));

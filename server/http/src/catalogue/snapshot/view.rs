@@ -25,14 +25,14 @@ const EARLIER: usize = 20_000;
 const VERSION_BYTES: usize = 8;
 
 /// One snapshot.
-pub(in super::super) struct SnapshotView {
+pub(crate) struct SnapshotView {
     /// Changes with every snapshot, and with the program.
-    pub(in super::super) version: String,
-    pub(in super::super) snapshot: Arc<LakeSnapshot>,
-    pub(super) session: Arc<Session>,
-    pub(super) answers: AnswerCache,
-    pub(super) summary: OnceCell<CatalogueSummary>,
-    pub(super) places: OnceCell<SurfacePositions>,
+    pub(crate) version: String,
+    pub(crate) snapshot: Arc<LakeSnapshot>,
+    pub(in super::super) session: Arc<Session>,
+    pub(in super::super) answers: AnswerCache,
+    pub(in super::super) summary: OnceCell<CatalogueSummary>,
+    pub(in super::super) places: OnceCell<SurfacePositions>,
     /// Mean curves over all pairs of the references that surfaces are beside, by name; there are few.
     flat_curves: Mutex<HashMap<String, Arc<OnceCell<Option<CurveRow>>>>>,
     /// Prepared queries by their text; there are few texts, because values are bound.
@@ -55,22 +55,22 @@ impl SnapshotView {
 
     /// Returns the tag of an answer of this snapshot: a digest of the version and of the answer's `name`, which no
     /// other answer has.
-    pub(in super::super) fn etag(&self, name: &str) -> String {
+    pub(crate) fn etag(&self, name: &str) -> String {
         let digest = Sha256::new().chain_update(&self.version).chain_update(name).finalize();
         format!("\"{}\"", hex::encode(&digest[..VERSION_BYTES]))
     }
 
-    pub(super) fn prepared(&self, sql: &str) -> Option<Arc<PreparedQuery>> {
+    pub(in super::super) fn prepared(&self, sql: &str) -> Option<Arc<PreparedQuery>> {
         self.prepared.lock().unwrap_or_else(PoisonError::into_inner).get(sql).cloned()
     }
 
     /// The place of a reference's mean curves over all pairs.
-    pub(super) fn flat_curves(&self, flat: &str) -> Arc<OnceCell<Option<CurveRow>>> {
+    pub(in super::super) fn flat_curves(&self, flat: &str) -> Arc<OnceCell<Option<CurveRow>>> {
         let mut known = self.flat_curves.lock().unwrap_or_else(PoisonError::into_inner);
         known.entry(flat.to_owned()).or_default().clone()
     }
 
-    pub(super) fn keep_prepared(&self, sql: &str, prepared: Arc<PreparedQuery>) {
+    pub(in super::super) fn keep_prepared(&self, sql: &str, prepared: Arc<PreparedQuery>) {
         self.prepared.lock().unwrap_or_else(PoisonError::into_inner).insert(sql.to_owned(), prepared);
     }
 }
@@ -90,10 +90,10 @@ fn version(snapshot: &LakeSnapshot) -> String {
 
 /// A file of a table.
 #[derive(Debug, Clone)]
-pub(in super::super) struct VisibleFile {
+pub(crate) struct VisibleFile {
     table: Table,
-    pub(in super::super) path: StorePath,
-    pub(in super::super) bytes: u64,
+    pub(crate) path: StorePath,
+    pub(crate) bytes: u64,
 }
 
 impl VisibleFile {
@@ -108,7 +108,7 @@ impl VisibleFile {
 
 /// The newest snapshot that was seen.
 #[derive(Default)]
-pub(super) struct SnapshotViews(Mutex<ViewHistory>);
+pub(in super::super) struct SnapshotViews(Mutex<ViewHistory>);
 
 #[derive(Default)]
 struct ViewHistory {
@@ -123,7 +123,7 @@ impl SnapshotViews {
     ///
     /// # Errors
     /// The snapshot cannot be read.
-    pub(super) async fn current(&self, service: &QueryService) -> Result<Arc<SnapshotView>, RequestFault> {
+    pub(in super::super) async fn current(&self, service: &QueryService) -> Result<Arc<SnapshotView>, RequestFault> {
         let known = self.seen().view.clone();
         let session = match &known {
             Some(view) => view.session.clone(),
@@ -147,7 +147,7 @@ impl SnapshotViews {
     }
 
     /// A file that a view shows, or that an earlier one did. A file with rows of other projects is none for a client of some.
-    pub(super) fn shown(&self, view: &SnapshotView, table: Table, name: &str) -> Option<VisibleFile> {
+    pub(in super::super) fn shown(&self, view: &SnapshotView, table: Table, name: &str) -> Option<VisibleFile> {
         let now = view.snapshot.readable_files(table).find(|file| file.path.filename() == Some(name));
         let earlier = || self.seen().earlier.iter().find(|file| file.is(table, name)).cloned();
         now.map(|file| VisibleFile::of(table, file)).or_else(earlier)
