@@ -6,7 +6,10 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 members=("$@")
-[ $# -gt 0 ] || members=(schema dsp recording storage acquisition acquisition/{import,panel} ingest query query/{functions,mcap} export server)
+[ $# -gt 0 ] || members=(
+    schema dsp recording storage acquisition acquisition/{import,panel} ingest query query/{functions,mcap} export
+    server server/{access,flight,http,postgres,service}
+)
 logs=$(mktemp -d)
 file=
 restore() {

@@ -1,8 +1,7 @@
 //! Self-signed certificates, for a lab without a certificate authority.
 
+use echolake_service::Error;
 use rcgen::{CertificateParams, DistinguishedName, DnType, ExtendedKeyUsagePurpose, KeyPair, KeyUsagePurpose};
-
-use crate::Error;
 
 /// Days for which a certificate is valid.
 const DAYS: i64 = 397;

@@ -5,11 +5,7 @@ use std::path::Path;
 
 use echolake_lake::Lake;
 use echolake_query::QueryEngine;
-
-use crate::client_identity::ClientIdentity;
-use crate::engine_socket::EngineSocket;
-use crate::service::QueryService;
-use crate::{Error, flight, http, postgres};
+use echolake_service::{ClientIdentity, EngineSocket, Error, QueryService};
 
 /// Limits of a query: seconds, and rows of the answer.
 const QUERY_SECONDS: u64 = 2;
@@ -26,8 +22,8 @@ pub async fn serve_engine(lake: &Lake, sockets: &Path, memory: usize) -> Result<
     identity.rows = Some(QUERY_ROWS);
     let service = QueryService::new(lake, engine, identity, None)?;
     tokio::select! {
-        failed = http::serve(service.clone(), EngineSocket::Http.listen(sockets)?) => failed,
-        failed = flight::serve(service.clone(), EngineSocket::FlightSql.listen(sockets)?) => failed,
-        failed = postgres::serve(service, EngineSocket::Postgres.listen(sockets)?) => failed,
+        failed = echolake_http::serve(service.clone(), EngineSocket::Http.listen(sockets)?) => failed,
+        failed = echolake_flight::serve(service.clone(), EngineSocket::FlightSql.listen(sockets)?) => failed,
+        failed = echolake_postgres::serve(service, EngineSocket::Postgres.listen(sockets)?) => failed,
     }
 }

@@ -13,35 +13,16 @@
 //! # }
 //! ```
 
-mod activity;
 mod catalogue_pages;
 pub mod certificate;
-mod client_identity;
 mod door;
 pub mod engine;
-mod engine_socket;
-mod error;
-mod fault;
-mod flight;
-#[cfg(fuzzing)]
+#[cfg(all(fuzzing, feature = "postgres"))]
 pub mod fuzzing;
-mod http;
 mod metrics;
-mod postgres;
 mod random_id;
-mod request_span;
-#[cfg(feature = "otlp")]
-mod request_trace;
-mod running;
-mod scram_verifier;
-mod server_protocol;
-mod service;
-mod sessions;
-mod stop_signal;
-mod token_access;
-mod token_scope;
-pub mod tokens;
 
 pub use catalogue_pages::CataloguePages;
 pub use door::{AgentDoor, CertificateFiles, EngineSettings, LakeServer, ServerSettings};
-pub use error::Error;
+pub use echolake_access::tokens;
+pub use echolake_service::Error;

@@ -4,13 +4,11 @@
 mod gauges;
 
 use echolake_lake::CacheCounts;
+use echolake_service::{FaultCode, QueryEnd, RequestFault, ServerProtocol};
 use prometheus::{
     HistogramOpts, HistogramVec, IntCounter, IntCounterVec, IntGauge, Opts, Registry, Result, TextEncoder,
 };
 
-use crate::activity::QueryEnd;
-use crate::fault::{FaultCode, RequestFault};
-pub(crate) use crate::server_protocol::ServerProtocol;
 pub(crate) use gauges::{DiskSpace, PoolGauges, ServerGauges};
 
 /// Upper bounds of the buckets of a query's time, in seconds.

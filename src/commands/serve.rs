@@ -38,6 +38,7 @@ pub(crate) struct ServeArgs {
     #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:8081")]
     flight_sql: ListenAddress,
     /// Address for Postgres' protocol.
+    #[cfg(feature = "postgres")]
     #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:5433")]
     postgres: ListenAddress,
     /// File of tokens; without it only this machine has access. `echolake token` makes its lines.
@@ -179,6 +180,7 @@ pub(crate) async fn run(args: &ServeArgs, lake_url: &str) -> anyhow::Result<Comm
     let settings = ServerSettings {
         http: args.listen.address(),
         flight_sql: args.flight_sql.address(),
+        #[cfg(feature = "postgres")]
         postgres: args.postgres.address(),
         tokens: args.tokens.as_deref().map(TokenFile::read).transpose()?,
         certificate: args
@@ -205,6 +207,7 @@ pub(crate) async fn catalogue(lake: &Lake, stop: &StopRequest) -> anyhow::Result
     let settings = |http| ServerSettings {
         http: Some(http),
         flight_sql: None,
+        #[cfg(feature = "postgres")]
         postgres: None,
         tokens: None,
         certificate: None,

@@ -8,7 +8,11 @@ use std::sync::Arc;
 use axum::body::{Body, to_bytes};
 use axum::http::{HeaderValue, Request, StatusCode, Uri, header};
 use bytes::Bytes;
+use echolake_access::TokenAccess;
+use echolake_http::{FORWARDED_PROTO, MCP};
 use echolake_lake::Lake;
+use echolake_service::request_span::begin_request;
+use echolake_service::{ClientIdentity, Error, RequestFault, ServerProtocol};
 use serde_json::{Value, json};
 use tokio::sync::{Semaphore, mpsc};
 use tokio::task::{AbortHandle, JoinSet};
@@ -17,14 +21,7 @@ use tracing::Instrument as _;
 use super::engine_pool::EnginePool;
 use super::engine_process::EngineSettings;
 use super::forward::EngineProtocol;
-use crate::Error;
-use crate::activity::ServerActivity;
-use crate::client_identity::ClientIdentity;
-use crate::fault::RequestFault;
-use crate::http::{FORWARDED_PROTO, MCP};
-use crate::metrics::ServerProtocol;
-use crate::request_span::begin_request;
-use crate::token_access::TokenAccess;
+use crate::door::activity::ServerActivity;
 
 /// Name of the client.
 const AGENT: &str = "agent";

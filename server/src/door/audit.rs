@@ -4,9 +4,7 @@
 use std::net::SocketAddr;
 
 use axum::http::{Method, StatusCode};
-
-use crate::fault::FaultCode;
-use crate::metrics::ServerProtocol;
+use echolake_service::{FaultCode, ServerProtocol};
 
 /// The target of its lines, by which a log's levels leave them out.
 const TARGET: &str = "echolake_server::audit";

@@ -13,15 +13,14 @@ use std::task::{Context, Poll};
 use std::time::Duration;
 
 use chrono::Utc;
+use echolake_service::{OpenConnection, ServerProtocol};
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Notify;
 use tokio::task::JoinSet;
 use tokio::time::Sleep;
 
-use crate::activity::OpenConnection;
 use crate::random_id::random_id;
-use crate::server_protocol::ServerProtocol;
 
 /// Time to wait if the system has no more sockets.
 const PAUSE: Duration = Duration::from_millis(100);

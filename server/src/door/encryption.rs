@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, PoisonError, RwLock};
 use std::time::{Duration, SystemTime};
 
+use echolake_service::Error;
 use tokio_rustls::TlsAcceptor;
 use tokio_rustls::rustls::crypto::ring;
 use tokio_rustls::rustls::pki_types::pem::PemObject as _;
@@ -14,9 +15,9 @@ use tokio_rustls::rustls::{self, ServerConfig};
 use tokio_rustls::server::TlsStream;
 use tokio_util::either::Either;
 
+#[cfg(feature = "postgres")]
 use super::certificate_hash::certificate_hash;
 use super::connection_places::PlacedStream;
-use crate::Error;
 
 /// Time limit for a handshake.
 const HANDSHAKE: Duration = Duration::from_secs(10);
@@ -133,18 +134,23 @@ impl ServerEncryption {
 struct ProtocolTls {
     names: &'static [&'static [u8]],
     acceptor: TlsAcceptor,
+    #[cfg(feature = "postgres")]
     certificate: Arc<CertifiedKey>,
 }
 
 impl ProtocolTls {
     fn new(names: &'static [&'static [u8]], loaded: &Arc<CertifiedKey>) -> Result<Self, rustls::Error> {
-        let certificate = loaded.clone();
         let mut config = ServerConfig::builder_with_provider(Arc::new(ring::default_provider()))
             .with_protocol_versions(&[&rustls::version::TLS13, &rustls::version::TLS12])?
             .with_no_client_auth()
-            .with_cert_resolver(Arc::new(SingleCertAndKey::from(certificate.clone())));
+            .with_cert_resolver(Arc::new(SingleCertAndKey::from(loaded.clone())));
         config.alpn_protocols = names.iter().map(|name| name.to_vec()).collect();
-        Ok(Self { names, acceptor: TlsAcceptor::from(Arc::new(config)), certificate })
+        Ok(Self {
+            names,
+            acceptor: TlsAcceptor::from(Arc::new(config)),
+            #[cfg(feature = "postgres")]
+            certificate: loaded.clone(),
+        })
     }
 }
 
@@ -165,6 +171,7 @@ impl ProtocolEncryption {
     }
 
     /// Returns the hash of the certificate by which logins are bound to it.
+    #[cfg(feature = "postgres")]
     pub(super) fn certificate_hash(&self) -> Option<Vec<u8>> {
         let tls = self.0.as_ref()?.read().unwrap_or_else(PoisonError::into_inner);
         certificate_hash(tls.certificate.cert.first()?)

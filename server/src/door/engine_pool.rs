@@ -7,18 +7,15 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::Thread;
 use std::time::{Duration, Instant};
 
+use echolake_access::TokenAccess;
 use echolake_lake::{CACHE_MEMORY_BYTES, Lake};
+use echolake_service::{ClientIdentity, DoorMessage, Error, RequestFault};
 use tokio::sync::Notify;
 
 use super::engine_process::{EndReason, EngineLease, EngineProcess, EngineSettings, EngineStart};
 use super::temp_folder::{ServerFolders, disk_space};
-use crate::Error;
-use crate::activity::ServerActivity;
-use crate::client_identity::ClientIdentity;
-use crate::engine::door_message::DoorMessage;
-use crate::fault::RequestFault;
+use crate::door::activity::ServerActivity;
 use crate::metrics::{DiskSpace, PoolGauges};
-use crate::token_access::TokenAccess;
 
 /// Time without a request after which an engine ends.
 const IDLE: Duration = Duration::from_secs(300);

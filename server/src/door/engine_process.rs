@@ -12,6 +12,7 @@ use std::time::{Duration, Instant};
 
 use axum::body::Body;
 use echolake_lake::CacheFolder;
+use echolake_service::{ClientIdentity, DoorMessage, EngineReport, EngineSocket, ServerProtocol, counted_bytes};
 use hyper::client::conn::http2;
 use rustix::process::{Pid, PidfdFlags, Signal, pidfd_open, pidfd_send_signal};
 use tokio::io::{AsyncBufReadExt as _, AsyncWriteExt as _, BufReader};
@@ -19,12 +20,7 @@ use tokio::net::UnixStream;
 use tokio::process::{Child, ChildStdin, ChildStdout, Command};
 use tokio::sync::SetOnce;
 
-use crate::activity::ServerActivity;
-use crate::client_identity::{ClientIdentity, counted_bytes};
-use crate::engine::door_message::DoorMessage;
-use crate::engine::report::EngineReport;
-use crate::engine_socket::EngineSocket;
-use crate::metrics::ServerProtocol;
+use crate::door::activity::ServerActivity;
 
 /// Time for which a client has to ask nothing on its open connections and read nothing of its answers until its engine
 /// counts as idle. It is shorter than others wait for a place.

@@ -6,7 +6,7 @@ use std::net::{IpAddr, Ipv6Addr, SocketAddr};
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use crate::fault::RequestFault;
+use echolake_service::RequestFault;
 
 /// Time from an address' first failure until it counts anew.
 const WINDOW: Duration = Duration::from_secs(60);

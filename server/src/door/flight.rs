@@ -4,6 +4,10 @@ use std::convert::Infallible;
 
 use axum::body::Body;
 use axum::http::{Request, Response, header};
+use echolake_flight::{WINDOW_BYTES, status};
+use echolake_service::authorization::of_header;
+use echolake_service::request_span::{REQUEST_ID, begin_request};
+use echolake_service::{ClientIdentity, RequestFault, ServerProtocol};
 use hyper::body::Incoming;
 use hyper::service::service_fn;
 use hyper_util::rt::TokioIo;
@@ -14,13 +18,7 @@ use super::connection_places::{ConnectionPlaces, PlaceWork, PlacedStream};
 use super::encryption::ProtocolEncryption;
 use super::forward::EngineProtocol;
 use super::http_connection::{drive, http2_builder};
-use crate::client_identity::ClientIdentity;
 use crate::door::server_door::ServerDoor;
-use crate::fault::RequestFault;
-use crate::flight::{WINDOW_BYTES, status};
-use crate::metrics::ServerProtocol;
-use crate::request_span::{REQUEST_ID, begin_request};
-use crate::tokens::of_header;
 
 /// Connections at once. With those of the other protocols they are within the 1024 files that systems often allow.
 const MOST: usize = 128;

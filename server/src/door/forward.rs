@@ -10,6 +10,8 @@ use axum::body::{Body, BodyDataStream};
 use axum::http::request::Parts;
 use axum::http::{HeaderMap, HeaderName, Request, Response, header};
 use bytes::{Bytes, BytesMut};
+use echolake_flight::WINDOW_BYTES;
+use echolake_service::{ClientIdentity, EngineSocket, RequestFault};
 use futures::{TryStreamExt as _, stream};
 use hyper::body::{Frame, Incoming, SizeHint};
 use hyper::client::conn::{http1, http2};
@@ -21,10 +23,6 @@ use tracing::Span;
 use super::connection_places::{PlaceWork, WorkingPlace};
 use super::engine_pool::EnginePool;
 use super::engine_process::{EndReason, EngineLease, EngineProcess};
-use crate::client_identity::ClientIdentity;
-use crate::engine_socket::EngineSocket;
-use crate::fault::RequestFault;
-use crate::flight::WINDOW_BYTES;
 
 /// Bytes of a request up to which it is kept, so that it can be sent again to a new engine.
 const KEPT_BYTES: usize = 64 << 10;
@@ -324,7 +322,7 @@ impl EngineBody {
             return None;
         }
         let mut trailers = HeaderMap::new();
-        crate::flight::status(&RequestFault::EngineEnded { reason }).add_header(&mut trailers).ok()?;
+        echolake_flight::status(&RequestFault::EngineEnded { reason }).add_header(&mut trailers).ok()?;
         Some(Frame::trailers(trailers))
     }
 }

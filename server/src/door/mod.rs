@@ -1,10 +1,13 @@
 //! The door: the process that clients reach. It holds connections, finds out who asks, and forwards requests to the engine
 //! of that client. It parses no SQL and decodes no file, so that no request can end it.
 
+pub(crate) mod activity;
 mod agent;
 mod audit;
+#[cfg(feature = "postgres")]
 mod certificate_hash;
 pub(crate) mod connection_places;
+#[cfg(feature = "postgres")]
 mod der_element;
 pub(crate) mod drain;
 mod encryption;
@@ -15,7 +18,9 @@ mod flight;
 mod forward;
 mod http;
 mod http_connection;
+#[cfg(feature = "postgres")]
 mod postgres;
+mod query_log;
 mod readiness;
 pub(crate) mod server_door;
 mod temp_folder;
@@ -24,13 +29,13 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
+use echolake_access::TokenAccess;
+use echolake_access::tokens::TokenFile;
 use echolake_lake::Lake;
+use echolake_service::Error;
 use tokio::net::{TcpListener, TcpSocket};
 use tokio::task::JoinSet;
 
-use crate::Error;
-use crate::token_access::TokenAccess;
-use crate::tokens::TokenFile;
 pub use agent::AgentDoor;
 pub use encryption::CertificateFiles;
 use encryption::{ProtocolEncryption, ServerEncryption};
@@ -49,6 +54,7 @@ pub struct ServerSettings {
     /// Arrow Flight SQL.
     pub flight_sql: Option<SocketAddr>,
     /// Postgres' protocol.
+    #[cfg(feature = "postgres")]
     pub postgres: Option<SocketAddr>,
     /// The accepted tokens; None for open access, on loopback only.
     pub tokens: Option<TokenFile>,
@@ -67,6 +73,7 @@ pub struct LakeServer {
     door: ServerDoor,
     http: Option<TcpListener>,
     flight_sql: Option<TcpListener>,
+    #[cfg(feature = "postgres")]
     postgres: Option<TcpListener>,
     encryption: Option<ServerEncryption>,
     drain_limit: Duration,
@@ -78,7 +85,12 @@ impl LakeServer {
     /// # Errors
     /// [`Error::Open`], [`Error::PlainText`], [`Error::Certificate`], [`Error::Bind`], [`Error::Temp`].
     pub fn bind(lake: &Lake, settings: ServerSettings) -> Result<Self, Error> {
-        let addresses = [settings.http, settings.flight_sql, settings.postgres];
+        let addresses = [
+            settings.http,
+            settings.flight_sql,
+            #[cfg(feature = "postgres")]
+            settings.postgres,
+        ];
         if let Some(address) = addresses.into_iter().flatten().find(|a| !a.ip().is_loopback()) {
             if settings.tokens.is_none() {
                 return Err(Error::Open { address });
@@ -93,6 +105,7 @@ impl LakeServer {
             door: ServerDoor::new(lake, access, settings.is_behind_proxy, settings.engines)?,
             http: listen(settings.http)?,
             flight_sql: listen(settings.flight_sql)?,
+            #[cfg(feature = "postgres")]
             postgres: listen(settings.postgres)?,
             drain_limit: settings.drain,
         })
@@ -105,10 +118,12 @@ impl LakeServer {
             let address = listener.as_ref()?.local_addr().ok()?;
             Some(format!("{}://{address}{path}", schemes[usize::from(is_encrypted)]))
         };
+        #[cfg(feature = "postgres")]
         let database = if is_encrypted { "/datafusion?sslmode=verify-full" } else { "/datafusion" };
         let all = [
             url(["http", "https"], &self.http, ""),
             url(["grpc", "grpc+tls"], &self.flight_sql, ""),
+            #[cfg(feature = "postgres")]
             url(["postgresql"; 2], &self.postgres, database),
         ];
         all.into_iter().flatten().collect()
@@ -130,6 +145,7 @@ impl LakeServer {
         };
         let http_tls = encrypted(&[HTTP_2, b"http/1.1"])?;
         let flight_tls = encrypted(&[HTTP_2])?;
+        #[cfg(feature = "postgres")]
         let postgres_tls = encrypted(&[b"postgresql"])?;
         if let Some(encryption) = encryption {
             upkeep.spawn(encryption.keep_up());
@@ -140,6 +156,7 @@ impl LakeServer {
         if let Some(listener) = self.flight_sql {
             tasks.spawn(flight::serve(self.door.clone(), listener, flight_tls));
         }
+        #[cfg(feature = "postgres")]
         if let Some(listener) = self.postgres {
             tasks.spawn(postgres::serve(self.door.clone(), listener, postgres_tls));
         }

@@ -3,10 +3,10 @@
 use std::time::{Duration, Instant};
 
 use echolake_lake::Lake;
+use echolake_service::RequestFault;
 use tokio::sync::Mutex;
 
-use crate::activity::ServerActivity;
-use crate::fault::RequestFault;
+use crate::door::activity::ServerActivity;
 
 /// Time for which a look is good.
 const LOOK_LASTS: Duration = Duration::from_secs(2);

@@ -3,7 +3,10 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use echolake_access::{TokenAccess, TokenFileState};
+use echolake_http::layout::ViewerLayout;
 use echolake_lake::Lake;
+use echolake_service::{ClientIdentity, Error, RequestFault, ServerProtocol, TokenScope};
 
 use super::audit;
 use super::connection_places::PlaceWork;
@@ -12,14 +15,8 @@ use super::engine_pool::EnginePool;
 use super::engine_process::EngineSettings;
 use super::failed_logins::FailedLogins;
 use super::readiness::ReadinessCheck;
-use crate::Error;
-use crate::activity::ServerActivity;
-use crate::client_identity::ClientIdentity;
-use crate::fault::RequestFault;
-use crate::http::ViewerLayout;
-use crate::metrics::{ServerGauges, ServerMetrics, ServerProtocol};
-use crate::token_access::{TokenAccess, TokenFileState};
-use crate::tokens::TokenScope;
+use crate::door::activity::ServerActivity;
+use crate::metrics::{ServerGauges, ServerMetrics};
 
 /// Time between two looks at the file of tokens.
 const LOOK_EVERY: Duration = Duration::from_secs(1);

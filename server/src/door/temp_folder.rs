@@ -6,11 +6,11 @@ use std::os::unix::fs::{MetadataExt as _, PermissionsExt as _};
 use std::path::Path;
 
 use echolake_lake::Lake;
+use echolake_service::Error;
 use rustix::fs::{statfs, statvfs};
 use rustix::process::geteuid;
 use tempfile::{Builder, TempDir};
 
-use crate::Error;
 use crate::metrics::DiskSpace;
 
 /// The folder in the lake for temporary files, if no other is given.

@@ -2,9 +2,6 @@
 //! folder that only its user may enter; the door, which started it, is its only peer and has authenticated the client.
 
 pub mod confinement;
-pub(crate) mod door_message;
-pub(crate) mod door_rows;
-pub(crate) mod report;
 mod watchdog;
 
 use std::convert::Infallible;
@@ -16,16 +13,9 @@ use std::time::Duration;
 use echolake_lake::Lake;
 use echolake_query::{EngineClient, QueryEngine, QueryQuota};
 use echolake_schema::tables::Table;
+use echolake_service::{ClientIdentity, DoorMessage, EngineReport, EngineSocket, Error, LakeFigures, QueryService};
 use futures::FutureExt as _;
 use tokio::sync::mpsc;
-
-use crate::activity::LakeFigures;
-use crate::client_identity::ClientIdentity;
-use crate::engine_socket::EngineSocket;
-use crate::service::QueryService;
-use crate::{Error, flight, http, postgres};
-use door_message::DoorMessage;
-use report::EngineReport;
 
 /// A query that has a new engine read what every query reads.
 const WARM_UP: &str = "select count(*) from runs";
@@ -45,6 +35,7 @@ pub async fn run_engine(lake: &Lake, sockets: &Path, memory: usize, slow: Option
     let mut messages = read_messages();
     let http = EngineSocket::Http.listen(sockets)?;
     let flight_sql = EngineSocket::FlightSql.listen(sockets)?;
+    #[cfg(feature = "postgres")]
     let postgres = EngineSocket::Postgres.listen(sockets)?;
     let engine = QueryEngine::new(lake, Some(memory))?;
     warm_up(&engine).await?;
@@ -69,11 +60,15 @@ pub async fn run_engine(lake: &Lake, sockets: &Path, memory: usize, slow: Option
     confinement::limit_memory(limit).map_err(Error::System)?;
     watchdog::start(&service).map_err(Error::System)?;
     let obeying = service.clone();
+    #[cfg(feature = "postgres")]
+    let postgres = echolake_postgres::serve(service.clone(), postgres);
+    #[cfg(not(feature = "postgres"))]
+    let postgres = std::future::pending();
     tokio::select! {
         () = obeying.obey(messages) => Ok(()),
-        failed = http::serve(service.clone(), http) => failed,
-        failed = flight::serve(service.clone(), flight_sql) => failed,
-        failed = postgres::serve(service, postgres) => failed,
+        failed = echolake_http::serve(service.clone(), http) => failed,
+        failed = echolake_flight::serve(service.clone(), flight_sql) => failed,
+        failed = postgres => failed,
     }
 }
 

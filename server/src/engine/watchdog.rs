@@ -4,10 +4,8 @@
 use std::time::{Duration, Instant};
 
 use echolake_lake::CacheCounts;
+use echolake_service::{EngineReport, QueryService};
 use rustix::time::{ClockId, clock_gettime};
-
-use super::report::EngineReport;
-use crate::service::QueryService;
 
 /// Time between two looks; what was reported meanwhile is sent as often.
 const INTERVAL: Duration = Duration::from_millis(50);

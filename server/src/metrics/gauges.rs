@@ -2,13 +2,11 @@
 
 use std::time::Duration;
 
+use echolake_service::{LakeFigures, ServerProtocol};
 use prometheus::core::Collector;
 use prometheus::{Counter, Gauge, Opts, Registry, Result};
 use rustix::process::{Resource, getrlimit};
 use rustix::time::{ClockId, clock_gettime};
-
-use super::ServerProtocol;
-use crate::activity::LakeFigures;
 
 /// Gauges of one moment.
 #[derive(Default)]

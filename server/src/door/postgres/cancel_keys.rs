@@ -3,11 +3,11 @@
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
+use echolake_service::EngineSocket;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 
 use super::frames::cancel_message;
 use crate::door::engine_process::EngineProcess;
-use crate::engine_socket::EngineSocket;
 
 /// The engine of a connection, and the key of its connection there.
 #[derive(Clone)]

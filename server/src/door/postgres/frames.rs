@@ -1,11 +1,7 @@
 //! Messages of Postgres' protocol as the door sees them: a type, a length, bytes. Their contents are the engine's.
 
 use bytes::{Buf as _, BufMut as _, BytesMut};
-use pgwire::error::ErrorInfo;
-use pgwire::messages::PgWireBackendMessage;
-
-use crate::fault::RequestFault;
-use crate::postgres::sqlstate;
+use echolake_service::RequestFault;
 
 /// Bytes of a message's type and length.
 pub(super) const HEADER: usize = 5;
@@ -121,14 +117,6 @@ impl MessageParts<'_> {
         self.0 = self.0.get(bytes..)?;
         Some(())
     }
-}
-
-/// A failure that ends the connection.
-pub(super) fn fatal_message(fault: &RequestFault) -> BytesMut {
-    let mut bytes = BytesMut::new();
-    // It is a message of a few hundred bytes, which is no reason for the library to refuse it.
-    let _ = PgWireBackendMessage::ErrorResponse(ErrorInfo::from(sqlstate::fatal(fault)).into()).encode(&mut bytes);
-    bytes
 }
 
 /// Requests a password.

@@ -10,22 +10,19 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::{Buf as _, BytesMut};
+use echolake_access::ScramVerifier;
+use echolake_postgres::{PID_PARAMETER, fatal_message};
+use echolake_service::request_span::{begin_connection, mark_startup};
+use echolake_service::{ClientIdentity, RequestFault, ServerProtocol, TokenScope};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpListener;
 use tracing::Instrument as _;
 
 use super::connection_places::{ConnectionPlaces, PlaceWork, PlacedStream};
 use super::encryption::{DoorStream, ProtocolEncryption};
-use crate::client_identity::ClientIdentity;
 use crate::door::server_door::ServerDoor;
-use crate::fault::RequestFault;
-use crate::metrics::ServerProtocol;
-use crate::postgres::PID_PARAMETER;
-use crate::request_span::{begin_connection, mark_startup};
-use crate::scram_verifier::ScramVerifier;
-use crate::tokens::TokenScope;
 use cancel_keys::CancelKeys;
-use frames::{FrameHeader, HEADER, PASSWORD_WANTED, StartupPacket, fatal_message};
+use frames::{FrameHeader, HEADER, PASSWORD_WANTED, StartupPacket};
 use relay::MessageRelay;
 use scram::{ScramExchange, methods_message};
 

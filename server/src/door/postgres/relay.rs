@@ -5,17 +5,17 @@ use std::io;
 use std::sync::Arc;
 
 use bytes::{Buf as _, BytesMut};
+use echolake_postgres::fatal_message;
+use echolake_service::{EngineSocket, RequestFault};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _, ReadHalf, WriteHalf};
 use tokio::net::unix::{OwnedReadHalf, OwnedWriteHalf};
 
 use super::PostgresLogin;
 use super::cancel_keys::{CancelKey, CancelKeys, CancelTarget};
-use super::frames::{FrameHeader, HEADER, fatal_message, key_message};
+use super::frames::{FrameHeader, HEADER, key_message};
 use crate::door::encryption::DoorStream;
 use crate::door::engine_process::{EndReason, EngineLease, EngineProcess};
 use crate::door::server_door::ServerDoor;
-use crate::engine_socket::EngineSocket;
-use crate::fault::RequestFault;
 
 /// Bytes that are read at once, and of an engine's message from which it is passed on before it is whole.
 const READ_BYTES: usize = 256 << 10;

@@ -4,9 +4,8 @@
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD as BASE64;
 use bytes::{BufMut as _, BytesMut};
-
-use crate::fault::RequestFault;
-use crate::scram_verifier::{METHOD, ScramVerifier};
+use echolake_access::{METHOD, ScramVerifier};
+use echolake_service::RequestFault;
 
 /// The method that binds a login to the certificate.
 const METHOD_PLUS: &str = "SCRAM-SHA-256-PLUS";

@@ -1,0 +1,126 @@
+//! Statements that clients hold handles of. A handle begins with a random number, under which the statement is kept
+//! until it is not used any more, and continues with its text, so that another engine of the same client can plan it
+//! again.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use arrow::datatypes::SchemaRef;
+use bytes::Bytes;
+use datafusion::common::ParamValues;
+use echolake_query::{PreparedQuery, Session};
+use echolake_service::{RequestFault, StopSignal};
+
+/// Bytes of a text up to which handles carry it.
+const CARRIED_BYTES: usize = 32 << 10;
+/// Time after which an unused handle expires.
+const KEPT: Duration = Duration::from_secs(600);
+/// Handles of one client; the least recently used is evicted.
+const HELD: usize = 256;
+
+type StatementHandle = [u8; 16];
+
+/// The statement of a handle.
+#[derive(Clone)]
+pub(super) struct HeldStatement {
+    /// The session it was planned in; its client owns the handle.
+    pub(super) session: Arc<Session>,
+    pub(super) sql: Arc<str>,
+    pub(super) prepared: Arc<PreparedQuery>,
+    /// Columns as they were announced to the client.
+    pub(super) schema: SchemaRef,
+    /// Values of its placeholders.
+    pub(super) values: ParamValues,
+    /// Ends its run.
+    pub(super) stop: StopSignal,
+}
+
+/// The statements of all clients.
+#[derive(Default)]
+pub(super) struct HeldStatements(Mutex<HashMap<StatementHandle, StatementEntry>>);
+
+struct StatementEntry {
+    statement: HeldStatement,
+    used: Instant,
+}
+
+impl HeldStatements {
+    /// Keeps a statement.
+    pub(super) fn keep(&self, statement: HeldStatement) -> Result<Bytes, RequestFault> {
+        let mut handle = StatementHandle::default();
+        getrandom::fill(&mut handle).map_err(RequestFault::defect("no random bytes"))?;
+        let sql = Some(statement.sql.clone()).filter(|sql| sql.len() <= CARRIED_BYTES);
+        let whole = [&handle, sql.as_deref().unwrap_or_default().as_bytes()].concat();
+        self.insert(handle, statement);
+        Ok(whole.into())
+    }
+
+    /// Keeps a statement under a handle that another engine made.
+    pub(super) fn keep_as(&self, handle: &[u8], statement: HeldStatement) -> Result<(), RequestFault> {
+        let (handle, _) = handle.split_first_chunk().ok_or_else(gone)?;
+        self.insert(*handle, statement);
+        Ok(())
+    }
+
+    /// The text that a handle carries.
+    pub(super) fn text(handle: &[u8]) -> Option<String> {
+        let (_, sql) = handle.split_first_chunk::<{ size_of::<StatementHandle>() }>()?;
+        String::from_utf8(sql.to_vec()).ok().filter(|sql| !sql.is_empty())
+    }
+
+    fn insert(&self, handle: StatementHandle, statement: HeldStatement) {
+        let mut all = self.lock();
+        all.retain(|_, kept| kept.used.elapsed() < KEPT);
+        let owner = statement.session.client().name();
+        let mut own: Vec<_> = all
+            .iter()
+            .filter(|(_, kept)| kept.statement.session.client().name() == owner)
+            .map(|(handle, kept)| (kept.used, *handle))
+            .collect();
+        own.sort_unstable();
+        for (_, oldest) in own.iter().take((own.len() + 1).saturating_sub(HELD)) {
+            all.remove(oldest);
+        }
+        all.insert(handle, StatementEntry { statement, used: Instant::now() });
+    }
+
+    /// The statement of a client's handle.
+    pub(super) fn find(&self, client: &str, handle: &[u8]) -> Result<HeldStatement, RequestFault> {
+        self.with(client, handle, |kept| kept.statement.clone())
+    }
+
+    /// Sets the values of its placeholders.
+    pub(super) fn bind(&self, client: &str, handle: &[u8], values: ParamValues) -> Result<(), RequestFault> {
+        self.with(client, handle, |kept| kept.statement.values = values)
+    }
+
+    /// Forgets it; a running query continues.
+    pub(super) fn forget(&self, client: &str, handle: &[u8]) {
+        if self.find(client, handle).is_ok() {
+            self.lock().retain(|known, _| !handle.starts_with(known));
+        }
+    }
+
+    fn with<T>(
+        &self,
+        client: &str,
+        handle: &[u8],
+        act: impl FnOnce(&mut StatementEntry) -> T,
+    ) -> Result<T, RequestFault> {
+        let (handle, _) = handle.split_first_chunk().ok_or_else(gone)?;
+        let mut all = self.lock();
+        let kept = all.get_mut(handle).filter(|kept| kept.statement.session.client().name() == client);
+        let kept = kept.filter(|kept| kept.used.elapsed() < KEPT).ok_or_else(gone)?;
+        kept.used = Instant::now();
+        Ok(act(kept))
+    }
+
+    fn lock(&self) -> MutexGuard<'_, HashMap<StatementHandle, StatementEntry>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+fn gone() -> RequestFault {
+    RequestFault::NotFound { what: "this statement".to_owned(), hint: "ask again: it may have expired" }
+}

@@ -1,0 +1,119 @@
+//! `GET /api/v1/lake`: what the lake holds, its rig, bands and grid.
+
+use axum::Extension;
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+
+use super::content::{AnswerContent, EndpointAnswer};
+use super::request::CatalogueRequest;
+use super::snapshot::bands::{BandDescription, bands};
+
+/// The lake.
+#[derive(Serialize, ToSchema)]
+#[schema(as = Lake)]
+struct LakeDescription<'a> {
+    name: &'a str,
+    /// Changes with every snapshot; also the ETag of what is computed from it.
+    version: &'a str,
+    software: &'static str,
+    bands: Vec<BandDescription>,
+    rate_hz: f64,
+    low_hz: f64,
+    high_hz: f64,
+    ir_length: usize,
+    reference_temperature_c: f64,
+    /// Division of the spectra at the limits of `low_hz` and `high_hz`: `tapered`, `floored` or `literal`.
+    division: &'static str,
+    /// Direct sound that is subtracted: `foam`, or `estimated` without Foam's own reflection.
+    direct_sound: &'static str,
+    panel_size_mm: f64,
+    panel_depth_mm: f64,
+    layers: i32,
+    points: Vec<GridPoint>,
+    counts: LakeCounts,
+    /// Every surface comes from the simulated rig, or is computed for the mesh of one.
+    simulated: bool,
+}
+
+/// A point of the grid.
+#[derive(Deserialize, Serialize, ToSchema)]
+#[schema(as = Point)]
+struct GridPoint {
+    point_id: i32,
+    layer: i32,
+    gridx: i32,
+    gridy: i32,
+    x_mm: f64,
+    y_mm: f64,
+    z_mm: f64,
+}
+
+/// Numbers of what the lake holds.
+#[derive(Serialize, ToSchema)]
+struct LakeCounts {
+    surfaces: usize,
+    runs: i64,
+    measurements: i64,
+    pairs: usize,
+}
+
+#[derive(Deserialize)]
+struct RunTotals {
+    runs: i64,
+    measurements: Option<i64>,
+}
+
+/// The contents of the lake, its rig, bands and grid.
+#[utoipa::path(
+    get,
+    path = "/api/v1/lake",
+    tag = "catalogue",
+    responses((status = 200, description = "OK", body = LakeDescription)),
+    extensions(("x-sql" = json!([
+        "select * from points order by point_id",
+        "select count(*) from surfaces",
+        "select count(*), sum(measurements) from runs",
+        "lake.toml for the rig",
+    ])))
+)]
+pub(super) async fn lake(Extension(request): Extension<CatalogueRequest>) -> EndpointAnswer {
+    let lake = request.catalogue.lake();
+    let rig = lake.rig();
+    let points: Vec<GridPoint> = request
+        .rows("select point_id, layer, gridx, gridy, x_mm, y_mm, z_mm from points order by point_id", Vec::new())
+        .await?;
+    let runs: Vec<RunTotals> =
+        request.rows("select count(*) as runs, sum(measurements) as measurements from runs", Vec::new()).await?;
+    let summary = request.summary().await?;
+    let counts = LakeCounts {
+        surfaces: summary.entries.len(),
+        runs: runs.first().map_or(0, |r| r.runs),
+        measurements: runs.first().and_then(|r| r.measurements).unwrap_or(0),
+        pairs: lake.grid().pairs().len(),
+    };
+    Ok(AnswerContent::json(&LakeDescription {
+        name: name(lake.location()),
+        version: &request.view.version,
+        software: concat!("echolake ", env!("CARGO_PKG_VERSION")),
+        bands: bands(rig),
+        rate_hz: rig.sweep.rate_hz.get(),
+        low_hz: rig.sweep.low_hz,
+        high_hz: rig.sweep.high_hz,
+        ir_length: rig.impulse_response.length,
+        reference_temperature_c: rig.impulse_response.reference_temperature_c.get(),
+        division: rig.impulse_response.division.name(),
+        direct_sound: lake.config().references.direct_sound.name(),
+        panel_size_mm: rig.panel.size_mm,
+        panel_depth_mm: rig.panel.depth_mm,
+        layers: points.iter().map(|p| p.layer + 1).max().unwrap_or(0),
+        points,
+        counts,
+        simulated: !summary.entries.is_empty()
+            && summary.entries.iter().all(|e| matches!(e.surface.origin.as_str(), "simulated" | "computed")),
+    })?)
+}
+
+// The lake's path on the server's disk is not disclosed.
+fn name(location: &str) -> &str {
+    location.split(['/', '\\']).rfind(|part| !part.is_empty()).unwrap_or("lake")
+}

@@ -1,0 +1,187 @@
+//! The catalogue: the data of the pages, each a query of the lake, answered once per snapshot and cached.
+//!
+//! [`table_routes`] and [`file_routes`] list the endpoints. [`respond`] stands before all of them: whether the client may
+//! ask, whether it has the answer already, and whether the cache does.
+
+mod analysis;
+mod content;
+mod correlations;
+mod curves;
+mod environment;
+mod facets;
+mod figures;
+mod lake;
+mod map;
+mod pair;
+mod relief;
+mod request;
+mod rows;
+mod runs;
+mod snapshot;
+mod surface;
+mod tables;
+mod wav;
+
+use std::sync::Arc;
+
+use axum::extract::{Request, State};
+use axum::http::{HeaderValue, Method, header};
+use axum::middleware::{Next, from_fn_with_state};
+use axum::response::Response;
+use axum::{Extension, Router};
+use echolake_lake::Lake;
+use echolake_schema::tables::Table;
+use echolake_service::{FaultCode, QueryService, RequestFault, TokenScope};
+use serde_json::Value;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use super::conditions::{ConditionOutcome, is_named};
+use super::extract::PathParams;
+use super::format;
+use super::problem::ProblemResponse;
+use request::SurfacePath;
+pub(super) use request::{CatalogueRequest, RunPath, run, text};
+use snapshot::view::SnapshotViews;
+pub(super) use snapshot::view::{SnapshotView, VisibleFile};
+pub(super) use tables::{ColumnDescription, table};
+
+/// The endpoints that are answered from tables.
+pub(super) fn table_routes() -> OpenApiRouter {
+    OpenApiRouter::new()
+        .routes(routes!(lake::lake))
+        .routes(routes!(facets::surfaces))
+        .routes(routes!(surface::surface))
+        .routes(routes!(surface::grid))
+        .routes(routes!(curves::curves))
+        .routes(routes!(figures::grid_figure))
+        .routes(routes!(figures::curves_figure))
+        .routes(routes!(relief::heightmap))
+        .routes(routes!(relief::thumbnail))
+        .routes(routes!(pair::pair))
+        .routes(routes!(analysis::analysis))
+        .routes(routes!(analysis::spectrogram))
+        .routes(routes!(wav::wav))
+        .routes(routes!(map::map))
+        .routes(routes!(figures::map_figure))
+        .routes(routes!(correlations::correlations))
+        .routes(routes!(runs::runs))
+        .routes(routes!(runs::run))
+        .routes(routes!(environment::environment))
+        .routes(routes!(tables::tables))
+        .routes(routes!(tables::table_files))
+}
+
+/// The endpoints that are answered from run files.
+pub(super) fn file_routes() -> OpenApiRouter {
+    OpenApiRouter::new().routes(routes!(relief::mesh))
+}
+
+/// State shared by the endpoints.
+#[derive(Clone)]
+pub(super) struct LakeCatalogue(Arc<CatalogueState>);
+
+struct CatalogueState {
+    service: QueryService,
+    views: SnapshotViews,
+}
+
+impl LakeCatalogue {
+    pub(super) fn new(service: QueryService) -> Self {
+        Self(Arc::new(CatalogueState { service, views: SnapshotViews::default() }))
+    }
+
+    /// Routes of the endpoints.
+    pub(super) fn router(&self) -> Router {
+        let cached = |routes: OpenApiRouter, scope| {
+            Router::from(routes).route_layer(from_fn_with_state((self.clone(), scope), respond))
+        };
+        cached(table_routes(), TokenScope::Sql).merge(cached(file_routes(), TokenScope::Files))
+    }
+
+    /// Returns the answer of a surface's endpoint.
+    ///
+    /// # Errors
+    /// [`RequestFault::NotFound`], or those of its queries.
+    pub(super) async fn surface_value(&self, surface: &str) -> Result<Value, RequestFault> {
+        let request = CatalogueRequest::new(self, &self.view().await?, false);
+        let path = PathParams(SurfacePath { surface_id: surface.to_owned() });
+        Box::pin(surface::surface(Extension(request), path)).await.map_err(|problem| problem.0)?.value()
+    }
+
+    /// Returns the answer of a run's endpoint.
+    ///
+    /// # Errors
+    /// As [`LakeCatalogue::surface_value`].
+    pub(super) async fn run_value(&self, run: &str) -> Result<Value, RequestFault> {
+        let request = CatalogueRequest::new(self, &self.view().await?, false);
+        let path = PathParams(RunPath { run_id: run.to_owned() });
+        Box::pin(runs::run(Extension(request), path)).await.map_err(|problem| problem.0)?.value()
+    }
+
+    pub(super) fn service(&self) -> &QueryService {
+        &self.0.service
+    }
+
+    pub(super) fn lake(&self) -> &Lake {
+        self.0.service.lake()
+    }
+
+    /// The lake as it is now, with what was computed of it already.
+    pub(super) async fn view(&self) -> Result<Arc<SnapshotView>, RequestFault> {
+        self.0.views.current(&self.0.service).await
+    }
+
+    /// A table's file of this name, of the lake as it is or as it was while the server ran.
+    pub(super) fn shown(&self, view: &SnapshotView, table: Table, name: &str) -> Option<VisibleFile> {
+        self.0.views.shown(view, table, name)
+    }
+}
+
+/// Answers a request from the cache, or by its endpoint.
+async fn respond(
+    State((catalogue, scope)): State<(LakeCatalogue, TokenScope)>,
+    mut request: Request,
+    next: Next,
+) -> Result<Response, ProblemResponse> {
+    if !matches!(*request.method(), Method::GET | Method::HEAD) {
+        return Ok(next.run(request).await);
+    }
+    catalogue.service().client(scope)?;
+    let view = catalogue.view().await?;
+    let headers = request.headers().clone();
+    let as_arrow = format::prefers_arrow(&headers);
+    let address = request.uri().path_and_query().map_or_else(String::new, ToString::to_string);
+    let etag = view.etag(&format!("{address} {as_arrow}"));
+    let outcome = ConditionOutcome::new(&headers, &etag);
+    let instead = || outcome.response(&etag, [(header::ETAG, &etag)]);
+    // Only an answer has this tag: a client that names it had the answer, which need not be made again.
+    if is_named(&headers, &etag)
+        && let (ConditionOutcome::NotModified, Some(unchanged)) = (outcome, instead())
+    {
+        return Ok(unchanged);
+    }
+    let key = (address, as_arrow);
+    // One answer is for both methods: HEAD's body is left out behind this.
+    *request.method_mut() = Method::GET;
+    request.extensions_mut().insert(CatalogueRequest::new(&catalogue, &view, as_arrow));
+    match view.answers.get_or_make(&key, next.run(request)).await {
+        Ok(answer) => Ok(instead().unwrap_or_else(|| with_validators(answer.respond(&headers), &etag))),
+        Err(failed) => {
+            let code = failed.extensions().get::<FaultCode>().copied();
+            catalogue.service().failed(code.unwrap_or(FaultCode::Internal));
+            Ok(failed)
+        }
+    }
+}
+
+fn with_validators(mut response: Response, etag: &str) -> Response {
+    let out = response.headers_mut();
+    out.insert(header::VARY, HeaderValue::from_static("Accept, Accept-Encoding"));
+    // Revalidated each time, by 304 for as long as nothing changes; no cache in between keeps what needed a token.
+    out.insert(header::CACHE_CONTROL, HeaderValue::from_static("private, no-cache"));
+    if let Ok(etag) = HeaderValue::from_str(etag) {
+        out.insert(header::ETAG, etag);
+    }
+    response
+}

@@ -1,0 +1,422 @@
+//! `GET /api/v1/surfaces/{surface_id}/pairs/{pair_id}`: everything about one impulse response.
+
+use std::sync::Arc;
+
+use arrow::array::{ArrayRef, Float64Array};
+use arrow::record_batch::RecordBatch;
+use axum::Extension;
+use echolake_query::figure_rows::{TOTAL_BAND, band_list, levels_db};
+use echolake_service::RequestFault;
+use serde::{Deserialize, Serialize};
+use utoipa::{IntoParams, ToSchema};
+
+use super::super::extract::{BinaryContent, PathParams};
+use super::content::{AnswerContent, EndpointAnswer};
+use super::curves::{CurveSet, PairSelection};
+use super::environment::{AirReading, AirSeries};
+use super::request::{CatalogueRequest, long, missing, number, text};
+use super::runs::RunLogEntry;
+use super::snapshot::summary::SurfaceEntry;
+
+/// Length of the air's history that is shown before and after a measurement.
+const AROUND_NS: i64 = 900_000_000_000;
+
+/// The path of a pair of a surface.
+#[derive(Deserialize, IntoParams)]
+#[into_params(parameter_in = Path)]
+pub(super) struct PairPath {
+    pub(super) surface_id: String,
+    #[param(value_type = usize)]
+    pub(super) pair_id: String,
+}
+
+/// Everything about one impulse response.
+#[derive(Serialize, ToSchema)]
+struct PairDetail<'a> {
+    surface_id: &'a str,
+    pair: PairGeometry,
+    measurement: &'a PairMeasurement,
+    rate_hz: f64,
+    /// Temperature-corrected, cropped, direct sound still in it; Pa per unit of the sweep's amplitude.
+    measured: &'a [f32],
+    /// After Foam's response was subtracted; null if Foam is missing.
+    reflected: Option<&'a [f32]>,
+    flat_reflected: Option<&'a [f32]>,
+    /// Over Flat's total. One value per band in the order of `lake.bands`, the total last; null if there is no value.
+    tnce_db: Vec<Option<f64>>,
+    /// Over Flat's same band, by band as `tnce_db`.
+    tnce_band_db: Vec<Option<f64>>,
+    /// Standard uncertainties of `tnce_db`; null if they are not known.
+    tnce_u_db: Vec<Option<f64>>,
+    /// Standard uncertainties of `tnce_band_db`; null if they are not known.
+    tnce_band_u_db: Vec<Option<f64>>,
+    curves: Option<CurveSet>,
+    symmetries: Vec<SymmetricPair>,
+    /// What the controller logged about this pair.
+    attempts: Vec<RunLogEntry>,
+    environment: AirSeries,
+}
+
+/// A first Fresnel zone, by its full diameters.
+#[derive(Deserialize, Serialize, ToSchema)]
+struct FresnelEllipse {
+    frequency_hz: f64,
+    major_mm: f64,
+    minor_mm: f64,
+}
+
+/// The geometry of a pair.
+#[derive(Deserialize, Serialize, ToSchema)]
+#[schema(as = Pair)]
+pub(super) struct PairGeometry {
+    pair_id: i32,
+    microphone: i32,
+    speaker: i32,
+    microphone_mm: [f64; 3],
+    speaker_mm: [f64; 3],
+    pub(super) direct_mm: f64,
+    pub(super) image_mm: f64,
+    incidence_deg: f64,
+    /// x, y in the panel's plane.
+    specular_mm: [f64; 2],
+    /// Those at 2 and 40 kHz. They are no column of the table.
+    #[serde(default)]
+    #[schema(required = true)]
+    fresnel: Vec<FresnelEllipse>,
+    #[serde(skip_serializing)]
+    #[schema(ignore)]
+    low_mm: [Option<f64>; 2],
+    #[serde(skip_serializing)]
+    #[schema(ignore)]
+    high_mm: [Option<f64>; 2],
+}
+
+/// A measurement of a pair.
+#[derive(Deserialize, Serialize, ToSchema)]
+#[schema(as = Measurement)]
+pub(super) struct PairMeasurement {
+    #[serde(skip_serializing)]
+    #[schema(ignore)]
+    pub(super) ir: Vec<f32>,
+    #[serde(skip_serializing)]
+    #[schema(ignore)]
+    log_time_ns: i64,
+    run_id: String,
+    #[schema(format = DateTime)]
+    log_time: String,
+    attempt: i64,
+    verdict: String,
+    reasons: String,
+    temperature_c: Option<f64>,
+    humidity_pct: Option<f64>,
+    pressure_hpa: Option<f64>,
+    outside_level_db: Option<f32>,
+    snr_db: Option<f32>,
+    clipped_samples: Option<i64>,
+    arrival_error_us: Option<f32>,
+    microphone_residual_mm: Option<f32>,
+    speaker_residual_mm: Option<f32>,
+    source: String,
+    chunk_offset: i64,
+}
+
+#[derive(Deserialize)]
+pub(super) struct ReflectedResponse {
+    surface_id: String,
+    pub(super) reflected: Option<Vec<f32>>,
+}
+
+#[derive(Deserialize)]
+struct PairEnergies {
+    total: Vec<Option<f64>>,
+    band: Vec<Option<f64>>,
+    total_u_db: Vec<Option<f64>>,
+    band_u_db: Vec<Option<f64>>,
+}
+
+/// A pair that a symmetry of the grid makes of another.
+#[derive(Serialize, ToSchema)]
+struct SymmetricPair {
+    symmetry: String,
+    pair_id: i64,
+    microphone: i64,
+    speaker: i64,
+    /// Relies on reciprocity.
+    swapped: bool,
+    /// Of that pair on the same surface, over Flat's total, by band as in `PairDetail`.
+    tnce_db: Vec<Option<f64>>,
+}
+
+#[derive(Deserialize)]
+struct SymmetryRow {
+    symmetry: String,
+    pair_id: i64,
+    microphone: i64,
+    speaker: i64,
+    swapped: bool,
+    energies: Vec<Option<f64>>,
+}
+
+const MEASUREMENT: &str = "select ir, log_time_ns, run_id, log_time, attempt, verdict, reasons, temperature_c, \
+    humidity_pct, pressure_hpa, outside_level_db, snr_db, clipped_samples, arrival_error_us, microphone_residual_mm, \
+    speaker_residual_mm, source, chunk_offset from measurements \
+    where surface_id = $1 and pair_id = $2 order by run_id desc limit 1";
+const GEOMETRY: &str = "select pair_id, microphone, speaker, \
+    make_array(microphone_x_mm, microphone_y_mm, microphone_z_mm) as microphone_mm, \
+    make_array(speaker_x_mm, speaker_y_mm, speaker_z_mm) as speaker_mm, direct_mm, image_mm, incidence_deg, \
+    make_array(specular_x_mm, specular_y_mm) as specular_mm, \
+    make_array(fresnel_major_2000_mm, fresnel_minor_2000_mm) as low_mm, \
+    make_array(fresnel_major_40000_mm, fresnel_minor_40000_mm) as high_mm from pairs where pair_id = $1";
+const REFLECTED: &str = "select surface_id, avg_list(reflected_ir) as reflected from nce \
+    where surface_id in ($1, $2) and pair_id = $3 group by surface_id";
+const ATTEMPTS: &str = "select log_time, level, name, message from events \
+    where run_id = $1 and message like $2 order by log_time_ns limit 200";
+const AIR: &str = "select log_time_ns as ns, temperature_c, humidity_pct, pressure_hpa, outside_level_db \
+    from environment where run_id = $1 and log_time_ns between $2 and $3 order by log_time_ns limit 2000";
+
+impl CatalogueRequest {
+    /// The pair of this number.
+    pub(super) fn pair(&self, text: &str) -> Result<usize, RequestFault> {
+        let pairs = self.catalogue.lake().grid().pairs().len();
+        let digits = !text.is_empty() && text.bytes().all(|b| b.is_ascii_digit());
+        match (digits, text.parse::<usize>()) {
+            (true, Ok(pair)) if pair < pairs => Ok(pair),
+            (true, _) => Err(missing(format!("pair `{text}`"), "table `pairs` lists what there is")),
+            _ => Err(RequestFault::request(format!("the pair is `{text}`; hint: a whole number below {pairs}"))),
+        }
+    }
+}
+
+/// Reads the geometry of a pair.
+///
+/// # Errors
+/// Those of its query.
+pub(super) async fn geometry(request: &CatalogueRequest, pair: usize) -> Result<PairGeometry, RequestFault> {
+    let found = request.rows::<PairGeometry>(GEOMETRY, vec![number(pair)]).await?.into_iter().next();
+    found.map(PairGeometry::with_fresnel).ok_or_else(|| missing(format!("pair {pair}"), "ask for another one"))
+}
+
+/// The newest measurement of a pair.
+///
+/// # Errors
+/// [`RequestFault::NotFound`] if there is none.
+pub(super) async fn measurement(
+    request: &CatalogueRequest,
+    entry: &SurfaceEntry,
+    pair: usize,
+) -> Result<PairMeasurement, RequestFault> {
+    let id = &entry.surface.surface_id;
+    let found = request.rows(MEASUREMENT, vec![text(id), number(pair)]).await?.into_iter().next();
+    let what = || format!("a measurement of pair {pair} on surface `{id}`");
+    found.ok_or_else(|| missing(what(), "its run may be partial; another pair may be there"))
+}
+
+/// The responses of a surface and of its Flat after Foam's were subtracted, if they are known.
+pub(super) async fn reflected(
+    request: &CatalogueRequest,
+    entry: &SurfaceEntry,
+    pair: usize,
+) -> Result<[Option<Vec<f32>>; 2], RequestFault> {
+    let (id, flat) = (&entry.surface.surface_id, &entry.surface.flat_reference);
+    let rows: Vec<ReflectedResponse> = request.rows(REFLECTED, vec![text(id), text(flat), number(pair)]).await?;
+    let of = |surface: &str| rows.iter().find(|row| row.surface_id == surface).and_then(|row| row.reflected.clone());
+    Ok([of(id), of(flat)])
+}
+
+/// A pair's response.
+#[derive(Clone, Copy, Default, Deserialize, ToSchema)]
+#[serde(rename_all = "lowercase")]
+#[schema(default = "reflected")]
+pub(super) enum ResponseSignal {
+    /// After Foam's was subtracted.
+    #[default]
+    Reflected,
+    Measured,
+}
+
+impl ResponseSignal {
+    pub(super) fn name(self) -> &'static str {
+        match self {
+            Self::Reflected => "reflected",
+            Self::Measured => "measured",
+        }
+    }
+
+    /// Reads the samples.
+    ///
+    /// # Errors
+    /// [`RequestFault::NoData`] if Foam is missing, [`RequestFault::NotFound`] if the pair was not measured.
+    pub(super) async fn read(
+        self,
+        request: &CatalogueRequest,
+        entry: &SurfaceEntry,
+        pair: usize,
+    ) -> Result<Vec<f32>, RequestFault> {
+        let measurement = measurement(request, entry, pair).await?;
+        let samples = match self {
+            Self::Measured => Some(measurement.ir),
+            Self::Reflected => {
+                let [own, _] = reflected(request, entry, pair).await?;
+                own
+            }
+        };
+        samples.ok_or_else(|| RequestFault::NoData {
+            what: format!("pair {pair} of surface `{}`", entry.surface.surface_id),
+            data: "reflected response",
+            hint: "its Foam is missing; ask for signal=measured",
+        })
+    }
+}
+
+/// Everything about one impulse response.
+///
+/// As an Arrow stream its samples: `time_ms`, `measured`, `reflected`, `flat_reflected`.
+#[utoipa::path(
+    get,
+    path = "/api/v1/surfaces/{surface_id}/pairs/{pair_id}",
+    tag = "catalogue",
+    params(PairPath),
+    responses((status = 200, description = "OK", content(
+        (PairDetail = "application/json"),
+        (inline(BinaryContent) = "application/vnd.apache.arrow.stream")
+    ))),
+    extensions(("x-sql" = json!([
+        "select * from measurements where surface_id = $1 and pair_id = $2",
+        "select reflected_ir, nce_* from nce where surface_id in ($1, $flat) and pair_id = $2",
+        "select * from tnce where surface_id = $1 and pair_id = $2",
+        "select * from pairs where pair_id = $2",
+        "select d.symmetry, d.d4_pair_id, d.d4_microphone, d.d4_speaker, d.swapped, t.* from tnce_d4 d join tnce t \
+         on t.surface_id = d.surface_id and t.pair_id = d.d4_pair_id where d.surface_id = $1 and d.pair_id = $2",
+        "select * from events where run_id = $run and message like 'pair ' || $2 || ',%'",
+        "select * from environment where run_id = $run and log_time_ns between $t - 900e9 and $t + 900e9",
+    ])))
+)]
+pub(super) async fn pair(
+    Extension(request): Extension<CatalogueRequest>,
+    PathParams(path): PathParams<PairPath>,
+) -> EndpointAnswer {
+    let entry = request.surface(&path.surface_id).await?;
+    let pair = request.pair(&path.pair_id)?;
+    let responses = tokio::try_join!(measurement(&request, entry, pair), reflected(&request, entry, pair));
+    let (measurement, [own, flat]) = responses?;
+    if request.as_arrow {
+        return Ok(samples(&request, &measurement.ir, own.as_deref(), flat.as_deref())?);
+    }
+    let (geometry, energies, moved, curves, attempts, air) = tokio::try_join!(
+        geometry(&request, pair),
+        energies(&request, entry, pair, &measurement.run_id),
+        symmetries(&request, entry, pair, &measurement.run_id),
+        CurveSet::read(&request, entry, PairSelection::Pair(pair), usize::MAX),
+        // The controller's messages about a pair begin so.
+        request.rows::<RunLogEntry>(ATTEMPTS, vec![text(&measurement.run_id), text(&format!("pair {pair},%"))]),
+        request.rows::<AirReading>(
+            AIR,
+            vec![
+                text(&measurement.run_id),
+                long(measurement.log_time_ns.saturating_sub(AROUND_NS)),
+                long(measurement.log_time_ns.saturating_add(AROUND_NS)),
+            ],
+        ),
+    )?;
+    Ok(AnswerContent::json(&PairDetail {
+        surface_id: &entry.surface.surface_id,
+        pair: geometry,
+        environment: AirSeries::new(air, measurement.log_time_ns, &measurement.log_time),
+        measured: &measurement.ir,
+        measurement: &measurement,
+        rate_hz: request.catalogue.lake().rig().sweep.rate_hz.get(),
+        reflected: own.as_deref(),
+        flat_reflected: flat.as_deref(),
+        tnce_db: levels_db(&energies.total),
+        tnce_band_db: levels_db(&energies.band),
+        tnce_u_db: energies.total_u_db,
+        tnce_band_u_db: energies.band_u_db,
+        curves: Some(curves).filter(CurveSet::is_there),
+        symmetries: moved,
+        attempts,
+    })?)
+}
+
+impl PairGeometry {
+    fn with_fresnel(mut self) -> Self {
+        let zone = |frequency_hz: f64, [major, minor]: [Option<f64>; 2]| {
+            Some(FresnelEllipse { frequency_hz, major_mm: major?, minor_mm: minor? })
+        };
+        self.fresnel = [zone(2000.0, self.low_mm), zone(40_000.0, self.high_mm)].into_iter().flatten().collect();
+        self
+    }
+}
+
+async fn energies(
+    request: &CatalogueRequest,
+    entry: &SurfaceEntry,
+    pair: usize,
+    run: &str,
+) -> Result<PairEnergies, RequestFault> {
+    let rig = request.catalogue.lake().rig();
+    let over_total = |band: &str| format!("tnce_{band}");
+    let over_band = |band: &str| if band == TOTAL_BAND { over_total(band) } else { format!("tnce_band_{band}") };
+    let (total, band) = (band_list(rig, over_total), band_list(rig, over_band));
+    let total_u = band_list(rig, |band| format!("{}_u_db", over_total(band)));
+    let band_u = band_list(rig, |band| format!("{}_u_db", over_band(band)));
+    let sql = format!(
+        "select {total} as total, {band} as band, {total_u} as total_u_db, {band_u} as band_u_db from tnce \
+         where surface_id = $1 and pair_id = $2 and run_id = $3"
+    );
+    let values = vec![text(&entry.surface.surface_id), number(pair), text(run)];
+    let nothing = vec![None; rig.band_names().len() + 1];
+    let found = request.rows(&sql, values).await?.into_iter().next();
+    Ok(found.unwrap_or_else(|| PairEnergies {
+        total: nothing.clone(),
+        band: nothing.clone(),
+        total_u_db: nothing.clone(),
+        band_u_db: nothing,
+    }))
+}
+
+async fn symmetries(
+    request: &CatalogueRequest,
+    entry: &SurfaceEntry,
+    pair: usize,
+    run: &str,
+) -> Result<Vec<SymmetricPair>, RequestFault> {
+    let energies = band_list(request.catalogue.lake().rig(), |band| format!("t.tnce_{band}"));
+    let sql = format!(
+        "select d.symmetry, d.d4_pair_id as pair_id, d.d4_microphone as microphone, d.d4_speaker as speaker, d.swapped, \
+         {energies} as energies from tnce_d4 d join tnce t on t.surface_id = d.surface_id and t.run_id = d.run_id \
+         and t.pair_id = d.d4_pair_id where d.surface_id = $1 and d.pair_id = $2 and d.run_id = $3 \
+         and t.surface_id = $1 and t.run_id = $3 order by d.symmetry"
+    );
+    let rows = request.rows(&sql, vec![text(&entry.surface.surface_id), number(pair), text(run)]).await?;
+    let levels = |row: SymmetryRow| SymmetricPair {
+        symmetry: row.symmetry,
+        pair_id: row.pair_id,
+        microphone: row.microphone,
+        speaker: row.speaker,
+        swapped: row.swapped,
+        tnce_db: levels_db(&row.energies),
+    };
+    Ok(rows.into_iter().map(levels).collect())
+}
+
+fn samples(
+    request: &CatalogueRequest,
+    measured: &[f32],
+    own: Option<&[f32]>,
+    flat: Option<&[f32]>,
+) -> Result<AnswerContent, RequestFault> {
+    let rate_hz = request.catalogue.lake().rig().sweep.rate_hz.get();
+    let times = (0..measured.len()).map(|i| Some(1000.0 * i as f64 / rate_hz));
+    let column = |values: Option<&[f32]>| -> ArrayRef {
+        let values = values.unwrap_or_default();
+        Arc::new((0..measured.len()).map(|i| values.get(i).copied().map(f64::from)).collect::<Float64Array>())
+    };
+    let columns: [(&str, ArrayRef); 4] = [
+        ("time_ms", Arc::new(times.collect::<Float64Array>())),
+        ("measured", column(Some(measured))),
+        ("reflected", column(own)),
+        ("flat_reflected", column(flat)),
+    ];
+    let batch = RecordBatch::try_from_iter_with_nullable(columns.map(|(name, values)| (name, values, true)));
+    AnswerContent::arrow(&batch.map_err(RequestFault::defect("samples make no batch"))?)
+}

@@ -1,0 +1,154 @@
+//! A request to an endpoint, and its queries of the lake: values are bound or validated, never part of a text.
+
+use std::sync::Arc;
+
+use arrow::record_batch::RecordBatch;
+use datafusion::common::{ParamValues, ScalarValue};
+use echolake_lake::VisibleRun;
+use echolake_schema::{RunId, SurfaceId};
+use echolake_service::running::{AnswerEncoder, BatchEncoder, RunningQuery};
+use echolake_service::{QueryWork, RequestFault};
+use serde::Deserialize;
+use serde::de::DeserializeOwned;
+use utoipa::IntoParams;
+
+use super::super::extract::parse_whole;
+use super::LakeCatalogue;
+use super::rows::RowDecoder;
+use super::snapshot::bands::bands;
+use super::snapshot::summary::{BAND_STATISTICS, CatalogueSummary, SURFACES, SurfaceEntry};
+use super::snapshot::view::SnapshotView;
+use crate::request_protocol::http_job;
+
+/// A request to an endpoint.
+#[derive(Clone)]
+pub(in super::super) struct CatalogueRequest {
+    pub(super) catalogue: LakeCatalogue,
+    pub(super) view: Arc<SnapshotView>,
+    /// True if an Arrow stream is preferred to JSON.
+    pub(super) as_arrow: bool,
+}
+
+/// The path of a surface.
+#[derive(Deserialize, IntoParams)]
+#[into_params(parameter_in = Path)]
+pub(super) struct SurfacePath {
+    pub(super) surface_id: String,
+}
+
+/// The path of a run.
+#[derive(Deserialize, IntoParams)]
+#[into_params(parameter_in = Path)]
+pub(in super::super) struct RunPath {
+    pub(in super::super) run_id: String,
+}
+
+/// A text, to be bound.
+pub(in super::super) fn text(value: &str) -> ScalarValue {
+    ScalarValue::Utf8(Some(value.to_owned()))
+}
+
+/// A number of a point or a pair, to be bound.
+pub(super) fn number(value: usize) -> ScalarValue {
+    ScalarValue::Int32(i32::try_from(value).ok())
+}
+
+/// A time or a duration in nanoseconds, to be bound.
+pub(super) fn long(value: i64) -> ScalarValue {
+    ScalarValue::Int64(Some(value))
+}
+
+impl CatalogueRequest {
+    /// A request for what a snapshot shows.
+    pub(in super::super) fn new(catalogue: &LakeCatalogue, view: &Arc<SnapshotView>, as_arrow: bool) -> Self {
+        Self { catalogue: catalogue.clone(), view: view.clone(), as_arrow }
+    }
+
+    /// All surfaces in short.
+    pub(super) async fn summary(&self) -> Result<&CatalogueSummary, RequestFault> {
+        let read = || async {
+            let (surfaces, statistics) =
+                tokio::try_join!(self.rows(SURFACES, Vec::new()), self.rows(BAND_STATISTICS, Vec::new()))?;
+            Ok(CatalogueSummary::new(surfaces, statistics, bands(self.catalogue.lake().rig())))
+        };
+        self.view.summary.get_or_try_init(read).await
+    }
+
+    /// The surface of this name.
+    pub(super) async fn surface(&self, name: &str) -> Result<&SurfaceEntry, RequestFault> {
+        let known = name.parse::<SurfaceId>().ok();
+        let found = match known {
+            Some(id) => self.summary().await?.entry(id.as_str()),
+            None => None,
+        };
+        found.ok_or_else(|| missing(format!("surface `{name}`"), "GET /api/v1/surfaces lists what there is"))
+    }
+
+    /// The run of this name, as the snapshot shows it.
+    pub(super) fn run(&self, name: &str) -> Result<&VisibleRun, RequestFault> {
+        run(&self.view, name)
+    }
+
+    /// Reads the parameter `microphone`, a grid point of the lake.
+    pub(super) fn microphone(&self, text: &str) -> Result<usize, RequestFault> {
+        let last = self.catalogue.lake().grid().points().len().saturating_sub(1);
+        parse_whole(text, 0..=last).map_err(|e| RequestFault::request(format!("`microphone`: {e}")))
+    }
+
+    /// The rows of a query. `sql` is a text of the program's own; what came with the request is among `values`.
+    pub(in super::super) async fn rows<T: DeserializeOwned + Send + 'static>(
+        &self,
+        sql: &str,
+        values: Vec<ScalarValue>,
+    ) -> Result<Vec<T>, RequestFault> {
+        let decoder = RowDecoder::new(sql.to_owned());
+        let mut running = self.begin(sql, values, |_| Ok(decoder)).await?;
+        let mut rows = Vec::new();
+        while let Some(part) = running.next().await? {
+            rows.extend(part);
+        }
+        Ok(rows)
+    }
+
+    /// The batches of a query, as they come.
+    pub(super) async fn batches(
+        &self,
+        sql: &str,
+        values: Vec<ScalarValue>,
+    ) -> Result<RunningQuery<RecordBatch>, RequestFault> {
+        self.begin(sql, values, |_| Ok(BatchEncoder)).await
+    }
+
+    async fn begin<E: AnswerEncoder>(
+        &self,
+        sql: &str,
+        values: Vec<ScalarValue>,
+        encode: impl FnOnce(&arrow::datatypes::SchemaRef) -> Result<E, RequestFault> + Send + 'static,
+    ) -> Result<RunningQuery<E::Item>, RequestFault> {
+        let service = self.catalogue.service();
+        let prepared = match self.view.prepared(sql) {
+            Some(prepared) => prepared,
+            None => {
+                let (session, text) = (self.view.session.clone(), sql.to_owned());
+                let planned =
+                    service.plan(self.view.session.client(), async move { Ok(session.prepare(&text).await?) }).await?;
+                let planned = Arc::new(planned);
+                self.view.keep_prepared(sql, planned.clone());
+                planned
+            }
+        };
+        let job = http_job(self.view.session.clone(), QueryWork::Prepared(prepared, ParamValues::from(values)));
+        service.begin(job, encode).await
+    }
+}
+
+/// The run of this name.
+pub(in super::super) fn run<'a>(view: &'a SnapshotView, name: &str) -> Result<&'a VisibleRun, RequestFault> {
+    let found = name.parse::<RunId>().ok().and_then(|id| view.snapshot.run(&id));
+    found.ok_or_else(|| missing(format!("run `{name}`"), "GET /api/v1/runs lists what there is"))
+}
+
+/// The fault for a missing item.
+pub(super) fn missing(what: String, hint: &'static str) -> RequestFault {
+    RequestFault::NotFound { what, hint }
+}

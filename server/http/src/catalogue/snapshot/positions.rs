@@ -1,0 +1,34 @@
+//! Positions of surfaces among each other, by their TNCE.
+
+use echolake_dsp::components::PrincipalComponents;
+use echolake_dsp::self_organising_map::SelfOrganisingMap;
+use serde::Serialize;
+use utoipa::ToSchema;
+
+/// Surfaces on the map.
+pub(in super::super) struct SurfacePositions {
+    pub(in super::super) names: Vec<String>,
+    pub(in super::super) components: PrincipalComponents,
+    pub(in super::super) units: SelfOrganisingMap,
+}
+
+impl SurfacePositions {
+    /// The `count` surfaces nearest to one.
+    pub(in super::super) fn neighbours(&self, of: usize, count: usize) -> Vec<SurfaceNeighbour<'_>> {
+        let others = self.names.iter().enumerate().filter(|(i, _)| *i != of);
+        let mut near: Vec<_> = others.map(|(i, name)| (self.components.distance(of, i), name)).collect();
+        near.sort_by(|a, b| a.0.total_cmp(&b.0));
+        near.into_iter()
+            .take(count)
+            .map(|(distance_db, surface_id)| SurfaceNeighbour { surface_id, distance_db })
+            .collect()
+    }
+}
+
+/// A surface that is near another one.
+#[derive(Serialize, ToSchema)]
+pub(in super::super) struct SurfaceNeighbour<'a> {
+    surface_id: &'a str,
+    /// Root mean square over the features.
+    distance_db: f64,
+}

@@ -1,0 +1,176 @@
+//! The lake as one snapshot shows it, with cached results: a new snapshot begins with an empty cache.
+
+use std::collections::{HashMap, HashSet, VecDeque};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use echolake_lake::{DataFile, LakeSnapshot};
+use echolake_query::figure_rows::CurveRow;
+use echolake_query::{EngineClient, PreparedQuery, QueryQuota, Session};
+use echolake_schema::tables::Table;
+use echolake_service::{QueryService, RequestFault};
+use object_store::path::Path as StorePath;
+use sha2::{Digest as _, Sha256};
+use tokio::sync::OnceCell;
+
+use super::answer_cache::AnswerCache;
+use super::positions::SurfacePositions;
+use super::summary::CatalogueSummary;
+
+/// Time limit of the catalogue's own queries: they read a surface at most, and all surfaces once per snapshot.
+const LONGEST: Duration = Duration::from_secs(60);
+/// Files of earlier snapshots that are remembered.
+const EARLIER: usize = 20_000;
+/// Bytes of a version that tell it from all others.
+const VERSION_BYTES: usize = 8;
+
+/// One snapshot.
+pub(crate) struct SnapshotView {
+    /// Changes with every snapshot, and with the program.
+    pub(crate) version: String,
+    pub(crate) snapshot: Arc<LakeSnapshot>,
+    pub(in super::super) session: Arc<Session>,
+    pub(in super::super) answers: AnswerCache,
+    pub(in super::super) summary: OnceCell<CatalogueSummary>,
+    pub(in super::super) places: OnceCell<SurfacePositions>,
+    /// Mean curves over all pairs of the references that surfaces are beside, by name; there are few.
+    flat_curves: Mutex<HashMap<String, Arc<OnceCell<Option<CurveRow>>>>>,
+    /// Prepared queries by their text; there are few texts, because values are bound.
+    prepared: Mutex<HashMap<String, Arc<PreparedQuery>>>,
+}
+
+impl SnapshotView {
+    fn new(snapshot: Arc<LakeSnapshot>, session: Arc<Session>) -> Self {
+        Self {
+            version: version(&snapshot),
+            snapshot,
+            session,
+            answers: AnswerCache::default(),
+            summary: OnceCell::new(),
+            places: OnceCell::new(),
+            flat_curves: Mutex::default(),
+            prepared: Mutex::default(),
+        }
+    }
+
+    /// Returns the tag of an answer of this snapshot: a digest of the version and of the answer's `name`, which no
+    /// other answer has.
+    pub(crate) fn etag(&self, name: &str) -> String {
+        let digest = Sha256::new().chain_update(&self.version).chain_update(name).finalize();
+        format!("\"{}\"", hex::encode(&digest[..VERSION_BYTES]))
+    }
+
+    pub(in super::super) fn prepared(&self, sql: &str) -> Option<Arc<PreparedQuery>> {
+        self.prepared.lock().unwrap_or_else(PoisonError::into_inner).get(sql).cloned()
+    }
+
+    /// The place of a reference's mean curves over all pairs.
+    pub(in super::super) fn flat_curves(&self, flat: &str) -> Arc<OnceCell<Option<CurveRow>>> {
+        let mut known = self.flat_curves.lock().unwrap_or_else(PoisonError::into_inner);
+        known.entry(flat.to_owned()).or_default().clone()
+    }
+
+    pub(in super::super) fn keep_prepared(&self, sql: &str, prepared: Arc<PreparedQuery>) {
+        self.prepared.lock().unwrap_or_else(PoisonError::into_inner).insert(sql.to_owned(), prepared);
+    }
+}
+
+// The version of a snapshot: a digest of its files' names and visible rows.
+fn version(snapshot: &LakeSnapshot) -> String {
+    let mut digest = Sha256::new();
+    digest.update(env!("CARGO_PKG_VERSION"));
+    for table in Table::ALL {
+        for file in snapshot.files(table) {
+            digest.update(file.path.as_ref());
+            digest.update(file.visible_rows().to_le_bytes());
+        }
+    }
+    hex::encode(&digest.finalize()[..VERSION_BYTES])
+}
+
+/// A file of a table.
+#[derive(Debug, Clone)]
+pub(crate) struct VisibleFile {
+    table: Table,
+    pub(crate) path: StorePath,
+    pub(crate) bytes: u64,
+}
+
+impl VisibleFile {
+    fn of(table: Table, file: &DataFile) -> Self {
+        Self { table, path: file.path.clone(), bytes: file.bytes }
+    }
+
+    fn is(&self, table: Table, name: &str) -> bool {
+        self.table == table && self.path.filename() == Some(name)
+    }
+}
+
+/// The newest snapshot that was seen.
+#[derive(Default)]
+pub(in super::super) struct SnapshotViews(Mutex<ViewHistory>);
+
+#[derive(Default)]
+struct ViewHistory {
+    view: Option<Arc<SnapshotView>>,
+    /// Files that earlier snapshots showed: they stay until `vacuum` removes them, and clients that read by a manifest
+    /// of that time can continue.
+    earlier: VecDeque<VisibleFile>,
+}
+
+impl SnapshotViews {
+    /// The lake as it is now.
+    ///
+    /// # Errors
+    /// The snapshot cannot be read.
+    pub(in super::super) async fn current(&self, service: &QueryService) -> Result<Arc<SnapshotView>, RequestFault> {
+        let known = self.seen().view.clone();
+        let session = match &known {
+            Some(view) => view.session.clone(),
+            None => session(service),
+        };
+        let asking = session.clone();
+        let snapshot = service.plan(session.client(), async move { Ok(asking.snapshot().await?) }).await?;
+        let mut seen = self.seen();
+        match seen.view.as_ref().filter(|view| Arc::ptr_eq(&view.snapshot, &snapshot)) {
+            Some(view) => Ok(view.clone()),
+            None => {
+                let view = Arc::new(SnapshotView::new(snapshot, session));
+                let before = seen.view.replace(view.clone());
+                let gone = before.map(|before| gone(&before.snapshot, &view.snapshot)).unwrap_or_default();
+                seen.earlier.extend(gone);
+                let too_many = seen.earlier.len().saturating_sub(EARLIER);
+                seen.earlier.drain(..too_many);
+                Ok(view)
+            }
+        }
+    }
+
+    /// A file that a view shows, or that an earlier one did. A file with rows of other projects is none for a client of some.
+    pub(in super::super) fn shown(&self, view: &SnapshotView, table: Table, name: &str) -> Option<VisibleFile> {
+        let now = view.snapshot.readable_files(table).find(|file| file.path.filename() == Some(name));
+        let earlier = || self.seen().earlier.iter().find(|file| file.is(table, name)).cloned();
+        now.map(|file| VisibleFile::of(table, file)).or_else(earlier)
+    }
+
+    fn seen(&self) -> std::sync::MutexGuard<'_, ViewHistory> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+// The files that a snapshot shows and the next does not.
+fn gone(before: &LakeSnapshot, after: &LakeSnapshot) -> Vec<VisibleFile> {
+    let mut gone = Vec::new();
+    for table in Table::ALL {
+        let stay: HashSet<_> = after.files(table).iter().map(|file| &file.path).collect();
+        let left = before.readable_files(table).filter(|file| !stay.contains(&file.path));
+        gone.extend(left.map(|file| VisibleFile::of(table, file)));
+    }
+    gone
+}
+
+// The client was authorised before; the quota of its own queries does not apply to these.
+fn session(service: &QueryService) -> Arc<Session> {
+    let quota = QueryQuota { time: Some(LONGEST), ..QueryQuota::default() };
+    Arc::new(service.session(&Arc::new(EngineClient::new("catalogue", quota))))
+}

@@ -1,0 +1,79 @@
+//! `GET /api/v1/surfaces/{surface_id}/pairs/{pair_id}/ir.wav`: an audible response, slowed down to full scale.
+
+use std::io::Cursor;
+
+use axum::Extension;
+use echolake_service::RequestFault;
+use hound::{SampleFormat, WavSpec, WavWriter};
+use serde::Deserialize;
+use utoipa::IntoParams;
+
+use super::super::extract::{BinaryContent, PathParams, QueryParams, WholeNumber};
+use super::content::{AnswerContent, EndpointAnswer};
+use super::pair::{PairPath, ResponseSignal};
+use super::request::CatalogueRequest;
+
+/// The panels are models of walls at a tenth of their size: the wavelengths are a tenth, too.
+const SCALE: usize = 10;
+
+/// The signal and the pitch of a response that is heard.
+#[derive(Default, Deserialize, IntoParams)]
+#[serde(default, deny_unknown_fields)]
+#[into_params(parameter_in = Query)]
+pub(super) struct WavQuery {
+    #[param(inline)]
+    signal: ResponseSignal,
+    #[param(inline)]
+    slowdown: WholeNumber<1, 100, { SCALE }>,
+}
+
+/// The response as 32-bit float WAV.
+///
+/// The rate in its header is the rig's divided by `slowdown`: 10 gives full scale.
+#[utoipa::path(
+    get,
+    path = "/api/v1/surfaces/{surface_id}/pairs/{pair_id}/ir.wav",
+    tag = "catalogue",
+    params(PairPath, WavQuery),
+    responses((status = 200, description = "OK", body = inline(BinaryContent), content_type = "audio/wav")),
+    extensions(("x-sql" = json!(["as of pair"])))
+)]
+pub(super) async fn wav(
+    Extension(request): Extension<CatalogueRequest>,
+    PathParams(path): PathParams<PairPath>,
+    QueryParams(query): QueryParams<WavQuery>,
+) -> EndpointAnswer {
+    let entry = request.surface(&path.surface_id).await?;
+    let pair = request.pair(&path.pair_id)?;
+    let samples = query.signal.read(&request, entry, pair).await?;
+    let rate_hz = request.catalogue.lake().rig().sweep.rate_hz.get() / query.slowdown.get() as f64;
+    let file = write_wav(&samples, rate_hz.round() as u32);
+    let file = file.map_err(RequestFault::defect("a response makes no WAV file"))?;
+    let name = format!("{}-{pair}-{}.wav", entry.surface.surface_id, query.signal.name());
+    Ok(AnswerContent::new("audio/wav", file).named(name))
+}
+
+fn write_wav(samples: &[f32], rate_hz: u32) -> hound::Result<Vec<u8>> {
+    let spec = WavSpec { channels: 1, sample_rate: rate_hz, bits_per_sample: 32, sample_format: SampleFormat::Float };
+    let mut file = Cursor::new(Vec::new());
+    let mut writer = WavWriter::new(&mut file, spec)?;
+    for sample in samples {
+        writer.write_sample(*sample)?;
+    }
+    writer.finalize()?;
+    Ok(file.into_inner())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_file_has_the_samples_and_their_rate() {
+        let file = write_wav(&[0.5, -0.25], 9600).expect("a file");
+        let mut reader = hound::WavReader::new(&file[..]).expect("a WAV file");
+        assert_eq!((reader.spec().sample_rate, reader.spec().sample_format), (9600, SampleFormat::Float));
+        let samples: Vec<f32> = reader.samples().collect::<Result<_, _>>().expect("samples");
+        assert_eq!(samples, [0.5, -0.25]);
+    }
+}

@@ -1,0 +1,102 @@
+//! HTTP of an engine, which reads the lake: queries, the catalogue, files and slices. Of what it has for the door, a server
+//! builds the rest.
+
+mod catalogue;
+mod conditions;
+mod extract;
+mod files;
+mod format;
+mod guard;
+pub mod layout;
+mod manifest;
+mod mcp;
+mod problem;
+mod ranges;
+mod request_protocol;
+mod slices;
+mod sql;
+
+use axum::Router;
+use axum::middleware::{from_fn, from_fn_with_state, map_response};
+use echolake_service::request_span::trace_request;
+use echolake_service::{Error, QueryService, RequestFault, ServerProtocol};
+use hyper::server::conn::http1;
+use hyper_util::rt::TokioIo;
+use hyper_util::service::TowerToHyperService;
+use tokio::net::UnixListener;
+use tower_http::catch_panic::CatchPanicLayer;
+use utoipa::openapi::OpenApi;
+
+use catalogue::LakeCatalogue;
+pub use conditions::ConditionOutcome;
+pub use format::takes;
+pub use guard::{FORWARDED_PROTO, RequestSite, is_encrypted, is_same_origin, own_pages_only, request_site};
+pub use mcp::MCP;
+pub use problem::{ProblemBody, ProblemResponse};
+pub use ranges::cors;
+pub use slices::SLICED_RUNS;
+use slices::{FOXGLOVE_MANIFEST, LICHTBLICK_SESSION, SLICE, SOFA, SliceService};
+
+/// Paths that viewers on pages of any origin use.
+pub const VIEWER_PATHS: [&str; 5] = [files::RUN, SLICE, SOFA, FOXGLOVE_MANIFEST, LICHTBLICK_SESSION];
+
+/// Answers HTTP on an engine's socket; a connection is one request.
+pub async fn serve(service: QueryService, listener: UnixListener) -> Result<(), Error> {
+    let router = engine_router(&service);
+    loop {
+        let (stream, _) = listener.accept().await.map_err(Error::System)?;
+        let answers = TowerToHyperService::new(router.clone());
+        let guard = service.activity().enter();
+        tokio::spawn(async move {
+            let _guard = guard;
+            // A connection that breaks off is the door's matter.
+            let _ = http1::Builder::new().serve_connection(TokioIo::new(stream), answers).await;
+        });
+    }
+}
+
+fn engine_router(service: &QueryService) -> Router {
+    let catalogue = LakeCatalogue::new(service.clone());
+    let slices = SliceService::new(&catalogue);
+    let files = files::own_routes().merge(manifest::routes());
+    let own = Router::from(sql::routes())
+        .with_state(service.clone())
+        .merge(catalogue.router())
+        .merge(Router::from(files).with_state(catalogue.clone()))
+        .merge(of_protocol(ServerProtocol::Mcp, mcp::routes(&catalogue, &slices)))
+        .layer(from_fn_with_state(service.is_open(), guard::own_pages_only));
+    let viewers = Router::from(files::viewer_routes()).with_state(catalogue.clone());
+    let all = own.merge(viewers).merge(slices::for_viewers(slices)).fallback(nothing);
+    with_refusals(all).layer(from_fn(trace_request))
+}
+
+fn of_protocol(protocol: ServerProtocol, routes: Router) -> Router {
+    routes.layer(from_fn_with_state(protocol, request_protocol::set_protocol))
+}
+
+/// The contract of an engine's routes and of the layout's: of those whose answers to GET have an ETag, and of the others.
+pub fn contract_parts() -> [OpenApi; 2] {
+    let files = files::viewer_routes().merge(files::own_routes()).merge(manifest::routes());
+    let mut validated = catalogue::table_routes().merge(catalogue::file_routes()).into_openapi();
+    validated.merge(layout::routes().into_openapi());
+    validated.merge(files.into_openapi());
+    let mut others = sql::routes().into_openapi();
+    others.merge(slices::routes().into_openapi());
+    [validated, others]
+}
+
+/// Refuses other methods, turns panics into failures, and adds the headers that every answer has.
+pub fn with_refusals(router: Router) -> Router {
+    router
+        .method_not_allowed_fallback(problem::refuse_method)
+        .layer(CatchPanicLayer::custom(|_| ProblemResponse(RequestFault::Internal).answer()))
+        .layer(map_response(guard::security_headers))
+}
+
+/// Answers a path that does not exist.
+pub async fn nothing() -> ProblemResponse {
+    ProblemResponse(RequestFault::NotFound {
+        what: "this path".to_owned(),
+        hint: "GET /api/v1/openapi.json lists what there is",
+    })
+}

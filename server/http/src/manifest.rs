@@ -1,0 +1,137 @@
+//! `GET /api/v1/files`: the Parquet files of the lake's snapshot as URLs, so that loaders of training sets take a list
+//! and read by ranges, without a copy.
+
+use axum::extract::State;
+use axum::http::{HeaderMap, HeaderName, header};
+use axum::response::{IntoResponse as _, Response};
+use echolake_lake::{DataFile, LakeSnapshot};
+use echolake_schema::tables::Table;
+use echolake_service::{RequestFault, TokenScope};
+use serde::{Deserialize, Serialize};
+use utoipa::{IntoParams, ToSchema};
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use super::catalogue::{self, LakeCatalogue};
+use super::conditions::ConditionOutcome;
+use super::extract::QueryParams;
+use super::guard::is_encrypted;
+use super::problem::ProblemResponse;
+
+/// The tables that files are listed of.
+#[derive(Default, Deserialize, IntoParams)]
+#[serde(default, deny_unknown_fields)]
+#[into_params(parameter_in = Query)]
+pub(super) struct FilesQuery {
+    /// Only of these tables.
+    #[param(style = Form, explode)]
+    table: Vec<String>,
+}
+
+/// The Parquet files of a snapshot.
+#[derive(Serialize, ToSchema)]
+struct FileManifest<'a> {
+    /// Of the snapshot; another one, another version.
+    version: &'a str,
+    files: Vec<ManifestFile>,
+    /// Rows that only queries give, because their files hold rows of projects that the client may not see.
+    rows_elsewhere: Vec<RowsElsewhere>,
+}
+
+/// Rows of a table that are in no file of the manifest.
+#[derive(Serialize, ToSchema)]
+struct RowsElsewhere {
+    table: &'static str,
+    rows: u64,
+}
+
+/// A Parquet file with its address.
+#[derive(Serialize, ToSchema)]
+struct ManifestFile {
+    table: &'static str,
+    #[schema(format = "uri")]
+    url: String,
+    bytes: u64,
+    /// Rows that the snapshot shows.
+    rows: u64,
+    /// Rows that are in the file, too, but were replaced by newer rows of the same runs.
+    superseded_rows: u64,
+}
+
+/// The route of the list.
+pub(super) fn routes() -> OpenApiRouter<LakeCatalogue> {
+    OpenApiRouter::new().routes(routes!(files))
+}
+
+/// The Parquet files of the lake's snapshot as URLs, for loaders that take a list of them.
+///
+/// Needs the scope files.
+#[utoipa::path(
+    get,
+    path = "/api/v1/files",
+    tag = "files",
+    params(FilesQuery),
+    responses((status = 200, description = "OK", body = FileManifest)),
+    extensions(("x-sql" = json!(["the commit log"])))
+)]
+async fn files(
+    State(catalogue): State<LakeCatalogue>,
+    QueryParams(query): QueryParams<FilesQuery>,
+    headers: HeaderMap,
+) -> Result<Response, ProblemResponse> {
+    catalogue.service().client(TokenScope::Files)?;
+    let tables = query.table.iter().map(|name| catalogue::table(name));
+    let tables = tables.collect::<Result<Vec<_>, RequestFault>>()?;
+    let view = catalogue.view().await?;
+    let origin = origin(&headers);
+    // The answer has the tables that were asked for, and the server's address as this client knows it.
+    let etag = view.etag(&format!("{origin} files {:?}", query.table));
+    let validators = [
+        (header::ETAG, etag.as_str()),
+        (header::CACHE_CONTROL, "private, no-cache"),
+        (header::VARY, "Host, X-Forwarded-Proto"),
+    ];
+    if let Some(instead) = ConditionOutcome::new(&headers, &etag).response(&etag, validators.clone()) {
+        return Ok(instead);
+    }
+    let all: Vec<_> = Table::ALL.into_iter().filter(|table| tables.is_empty() || tables.contains(table)).collect();
+    let snapshot = &view.snapshot;
+    for table in &all {
+        snapshot.check(*table).map_err(|fault| RequestFault::Query(fault.into()))?;
+    }
+    let files = all.iter().flat_map(|table| {
+        let origin = &origin;
+        snapshot.readable_files(*table).filter_map(move |file| ManifestFile::of(origin, *table, file))
+    });
+    let rows_elsewhere = all.iter().filter_map(|table| RowsElsewhere::of(snapshot, *table)).collect();
+    let manifest = FileManifest { version: &view.version, files: files.collect(), rows_elsewhere };
+    Ok((validators, axum::Json(manifest)).into_response())
+}
+
+/// The origin of this server's URLs as the client sees it: behind a proxy with TLS, `https`.
+pub(super) fn origin(headers: &HeaderMap) -> String {
+    let text = |name: HeaderName| headers.get(name).and_then(|v| v.to_str().ok());
+    let scheme = if is_encrypted(headers) { "https" } else { "http" };
+    format!("{scheme}://{}", text(header::HOST).unwrap_or_default())
+}
+
+impl RowsElsewhere {
+    fn of(snapshot: &LakeSnapshot, table: Table) -> Option<Self> {
+        let all: u64 = snapshot.files(table).iter().map(DataFile::visible_rows).sum();
+        let readable: u64 = snapshot.readable_files(table).map(DataFile::visible_rows).sum();
+        (all > readable).then(|| Self { table: table.name(), rows: all - readable })
+    }
+}
+
+impl ManifestFile {
+    fn of(origin: &str, table: Table, file: &DataFile) -> Option<Self> {
+        let (name, rows) = (file.path.filename()?, file.visible_rows());
+        Some(Self {
+            table: table.name(),
+            url: format!("{origin}/api/v1/tables/{}/{name}", table.name()),
+            bytes: file.bytes,
+            rows,
+            superseded_rows: file.rows - rows,
+        })
+    }
+}

@@ -1,0 +1,230 @@
+//! A connection: its session, settings and cursors, and what runs on it.
+
+use std::collections::HashMap;
+use std::sync::atomic::{AtomicI32, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+
+use bytes::Bytes;
+use datafusion::common::ParamValues;
+use datafusion_pg_catalog::sql::PostgresCompatibilityParser;
+use echolake_query::{EngineClient, Session};
+use echolake_service::running::{AnswerEncoder, RunningQuery, SessionTimeLimit, ended};
+use echolake_service::{Error, QueryJob, QueryService, QueryWork, RequestFault, ServerProtocol, StopSignal};
+use futures::FutureExt as _;
+use futures::future::BoxFuture;
+use pgwire::messages::startup::SecretKey;
+use tokio::sync::SetOnce;
+
+use super::catalog::PgCatalog;
+use super::cursor::{CommandRun, QueryCursor};
+use super::settings::SessionSettings;
+use super::statement::{self, ClientStatement, PlannedQuery};
+
+/// Cursors of a connection at once.
+const CURSORS: usize = 16;
+/// Bytes of a query, as over HTTP.
+const LARGEST: usize = 2 << 20;
+
+/// The key by which a client cancels: the process's number and the secret that it was given.
+type BackendKey = (i32, Bytes);
+
+/// State shared by all connections.
+pub(super) struct PostgresState {
+    pub(super) service: QueryService,
+    pub(super) parser: PostgresCompatibilityParser,
+    pub(super) catalog: PgCatalog,
+    next_pid: AtomicI32,
+    running: Mutex<HashMap<BackendKey, Arc<Mutex<StopSignal>>>>,
+}
+
+impl PostgresState {
+    pub(super) fn new(service: QueryService) -> Result<Self, Error> {
+        let catalog = PgCatalog::new(&service)?;
+        let parser = PostgresCompatibilityParser::new();
+        Ok(Self { service, parser, catalog, next_pid: AtomicI32::new(1), running: Mutex::default() })
+    }
+
+    /// Cancels the query on the connection of this key.
+    pub(super) fn cancel(&self, pid: i32, key: &SecretKey) {
+        let found = lock(&self.running).get(&(pid, key.to_bytes())).cloned();
+        if let Some(current) = found {
+            lock(&current).stop();
+        }
+    }
+}
+
+/// A connection.
+pub(super) struct PostgresConnection {
+    shared: Arc<PostgresState>,
+    session: SetOnce<Arc<Session>>,
+    key: OnceLock<BackendKey>,
+    current: Arc<Mutex<StopSignal>>,
+    cursors: Mutex<HashMap<String, Arc<QueryCursor>>>,
+    pub(super) settings: Arc<SessionSettings>,
+}
+
+impl Drop for PostgresConnection {
+    fn drop(&mut self) {
+        if let Some(key) = self.key.get() {
+            lock(&self.shared.running).remove(key);
+        }
+    }
+}
+
+impl PostgresConnection {
+    /// A connection without a login.
+    pub(super) fn new(shared: Arc<PostgresState>) -> Self {
+        Self {
+            shared,
+            session: SetOnce::new(),
+            key: OnceLock::new(),
+            current: Arc::new(Mutex::new(StopSignal::new())),
+            cursors: Mutex::default(),
+            settings: Arc::default(),
+        }
+    }
+
+    pub(super) fn shared(&self) -> &PostgresState {
+        &self.shared
+    }
+
+    /// Logs a client in, whose connection has a number if the door gave one; returns what a CancelRequest must show.
+    /// `wide` keys are of protocol 3.2.
+    pub(super) fn log_in(
+        &self,
+        client: &Arc<EngineClient>,
+        pid: Option<i32>,
+        wide: bool,
+    ) -> Result<(i32, SecretKey), RequestFault> {
+        let mut secret = [0; 32];
+        getrandom::fill(&mut secret).map_err(RequestFault::defect("no random bytes"))?;
+        let pid = pid.unwrap_or_else(|| self.shared.next_pid.fetch_add(1, Ordering::Relaxed));
+        let key = match wide {
+            true => SecretKey::Bytes(Bytes::copy_from_slice(&secret)),
+            false => SecretKey::I32(i32::from_be_bytes([secret[0], secret[1], secret[2], secret[3]])),
+        };
+        let session = self.shared.service.session(client).extended(self.shared.catalog.extend(pid, &self.settings));
+        let known = (pid, key.to_bytes());
+        if self.session.set(Arc::new(session)).is_err() || self.key.set(known.clone()).is_err() {
+            return Err(RequestFault::request("this connection is logged in already"));
+        }
+        lock(&self.shared.running).insert(known, self.current.clone());
+        Ok((pid, key))
+    }
+
+    /// Its session.
+    pub(super) fn session(&self) -> Result<&Arc<Session>, RequestFault> {
+        self.session.get().ok_or(RequestFault::Unauthenticated)
+    }
+
+    /// Waits for the login.
+    pub(super) async fn logged_in(&self) {
+        self.session.wait().await;
+    }
+
+    /// Begins a command: a CancelRequest ends this one from now on.
+    pub(super) fn command(&self) -> CommandRun {
+        let stop = StopSignal::new();
+        *lock(&self.current) = stop.clone();
+        CommandRun { stop, limit: self.settings.statement_timeout().map(SessionTimeLimit::of) }
+    }
+
+    /// Parses and plans. Boxed for the same reason as [`echolake_query::OpaqueValue`].
+    pub(super) fn statements<'a>(
+        &'a self,
+        sql: &'a str,
+        run: &'a CommandRun,
+    ) -> BoxFuture<'a, Result<Vec<ClientStatement>, RequestFault>> {
+        let statements = async move {
+            if sql.len() > LARGEST {
+                return Err(RequestFault::TooLarge { limit: LARGEST });
+            }
+            let (shared, session) = (self.shared.clone(), self.session()?.clone());
+            let sql: Arc<str> = sql.into();
+            let work = async move {
+                let mut statements = Vec::new();
+                for parsed in statement::parse(&shared.parser, shared.catalog.empty_relations(), &session, &sql)? {
+                    statements.push(statement::plan(&session, &sql, parsed).await?);
+                }
+                Ok(statements)
+            };
+            self.planned(run, work).await
+        };
+        statements.boxed()
+    }
+
+    async fn planned<T: Send + 'static>(
+        &self,
+        run: &CommandRun,
+        work: impl Future<Output = Result<T, RequestFault>> + Send + 'static,
+    ) -> Result<T, RequestFault> {
+        tokio::select! {
+            fault = ended(&run.stop, run.limit) => Err(fault),
+            planned = self.shared.service.plan(self.session()?.client(), work) => planned,
+        }
+    }
+
+    /// Runs a planned statement; plans it again if the lake has changed since.
+    pub(super) async fn run<E: AnswerEncoder>(
+        &self,
+        run: &CommandRun,
+        planned: &Arc<PlannedQuery>,
+        values: ParamValues,
+        encode: impl FnOnce(&arrow::datatypes::SchemaRef) -> Result<E, RequestFault> + Send + 'static,
+    ) -> Result<RunningQuery<E::Item>, RequestFault> {
+        let session = self.session()?.clone();
+        let (planner, known) = (session.clone(), planned.clone());
+        let prepared = self.planned(run, async move { Ok(known.current(&planner).await?) }).await?;
+        if prepared.schema() != planned.prepared.schema() {
+            return Err(RequestFault::unsupported("a prepared statement whose columns have changed since"));
+        }
+        let job = QueryJob {
+            protocol: ServerProtocol::Postgres,
+            session,
+            work: QueryWork::Prepared(prepared, values),
+            limit: run.limit,
+            stop: run.stop.clone(),
+        };
+        self.shared.service.begin(job, encode).await
+    }
+
+    /// Keeps a cursor.
+    pub(super) fn declare(&self, name: &str, cursor: QueryCursor) -> Result<(), RequestFault> {
+        let mut cursors = lock(&self.cursors);
+        if cursors.contains_key(name) {
+            return Err(RequestFault::request(format!("cursor \"{name}\" already exists")));
+        }
+        if cursors.len() >= CURSORS {
+            return Err(RequestFault::TooMany { what: "cursors", limit: CURSORS });
+        }
+        cursors.insert(name.to_owned(), Arc::new(cursor));
+        Ok(())
+    }
+
+    /// A cursor.
+    pub(super) fn cursor(&self, name: &str) -> Result<Arc<QueryCursor>, RequestFault> {
+        let missing = || RequestFault::NotFound { what: format!("cursor \"{name}\""), hint: "DECLARE it first" };
+        lock(&self.cursors).get(name).cloned().ok_or_else(missing)
+    }
+
+    /// Closes a cursor, or all of them.
+    pub(super) fn close(&self, name: Option<&str>) -> Result<(), RequestFault> {
+        match name {
+            Some(name) => {
+                self.cursor(name)?;
+                lock(&self.cursors).remove(name);
+            }
+            None => lock(&self.cursors).clear(),
+        }
+        Ok(())
+    }
+
+    /// Ends a transaction: the cursors go that are not held.
+    pub(super) fn end_transaction(&self) {
+        lock(&self.cursors).retain(|_, cursor| cursor.held);
+    }
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}

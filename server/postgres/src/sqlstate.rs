@@ -1,0 +1,64 @@
+//! Failures as Postgres says them, with its five-letter states.
+
+use bytes::BytesMut;
+use echolake_query::Error as QueryError;
+use echolake_service::{FaultCode, FaultParts, RequestFault};
+use pgwire::error::{ErrorInfo, PgWireError};
+use pgwire::messages::PgWireBackendMessage;
+
+/// A failure that leaves the connection open.
+pub(super) fn failure(fault: RequestFault) -> PgWireError {
+    info("ERROR", &fault)
+}
+
+/// A failure that ends the connection, as a message.
+pub fn fatal_message(fault: &RequestFault) -> BytesMut {
+    let mut bytes = BytesMut::new();
+    // It is a message of a few hundred bytes, which is no reason for the library to refuse it.
+    let _ = PgWireBackendMessage::ErrorResponse(ErrorInfo::from(fatal(fault)).into()).encode(&mut bytes);
+    bytes
+}
+
+/// A failure that ends the connection.
+pub(super) fn fatal(fault: &RequestFault) -> PgWireError {
+    info("FATAL", fault)
+}
+
+// Clients mark the place in their own copy of the text.
+fn info(severity: &str, fault: &RequestFault) -> PgWireError {
+    let FaultParts { message, place, hint } = fault.parts();
+    let mut info = ErrorInfo::new(severity.to_owned(), state(fault).to_owned(), message);
+    info.position = place.map(|place| place.position.to_string());
+    info.hint = hint;
+    PgWireError::UserError(Box::new(info))
+}
+
+// Appendix A of Postgres' manual.
+fn state(fault: &RequestFault) -> &'static str {
+    match fault {
+        RequestFault::Query(QueryError::Query { message, .. }) if message.starts_with("no table ") => "42P01",
+        RequestFault::Query(QueryError::Query { message, .. }) if message.starts_with("no column ") => "42703",
+        RequestFault::TooMany { what: "connections", .. } => "53300",
+        RequestFault::NotFound { what, .. } if what.starts_with("cursor ") => "34000",
+        RequestFault::Disconnected | RequestFault::Displaced => "57P01",
+        _ => match fault.code() {
+            FaultCode::Query => "42601",
+            FaultCode::ReadOnly => "25006",
+            FaultCode::Execution => "22000",
+            FaultCode::Format => "0A000",
+            FaultCode::Lake | FaultCode::Changed => "58030",
+            FaultCode::Request | FaultCode::Method | FaultCode::Range | FaultCode::Precondition => "22023",
+            FaultCode::Unsupported => "0A000",
+            FaultCode::NotFound | FaultCode::Gone | FaultCode::NoData => "42704",
+            FaultCode::MemoryLimit => "53200",
+            FaultCode::TooLarge | FaultCode::RowLimit => "54000",
+            FaultCode::TooMany => "53300",
+            FaultCode::Unauthenticated => "28P01",
+            FaultCode::Forbidden | FaultCode::Foreign => "42501",
+            FaultCode::Cancelled | FaultCode::TimeLimit => "57014",
+            FaultCode::EngineEnded => "58000",
+            FaultCode::Internal => "XX000",
+            FaultCode::Stopping | FaultCode::NotReady => "57P03",
+        },
+    }
+}

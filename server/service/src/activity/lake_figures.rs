@@ -1,0 +1,57 @@
+//! Figures of the lake, for `/metrics`. An engine that waits for a client reads them: the door decodes no log.
+
+use echolake_lake::{Lake, LakeSnapshot};
+use echolake_schema::tables::Table;
+use serde::{Deserialize, Serialize};
+
+/// Figures of the lake.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct LakeFigures {
+    /// Version of the lake, which is that of `runs`.
+    pub version: u64,
+    /// Surfaces.
+    pub surfaces: u64,
+    /// Runs.
+    pub runs: u64,
+    /// Bytes of the tables' files.
+    pub table_bytes: u64,
+    /// Run files that wait for ingest.
+    pub inbox: FolderFigures,
+    /// Run files that were refused.
+    pub quarantine: FolderFigures,
+}
+
+/// Run files of a folder.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct FolderFigures {
+    /// Number of files.
+    pub files: u64,
+    /// Bytes of these files.
+    pub bytes: u64,
+}
+
+impl LakeFigures {
+    /// Counts what a snapshot and the two folders hold.
+    ///
+    /// # Errors
+    /// The store does not list a folder.
+    pub async fn read(lake: &Lake, snapshot: &LakeSnapshot) -> echolake_lake::Result<Self> {
+        let bytes = |table: Table| snapshot.files(table).iter().map(|file| file.bytes).sum::<u64>();
+        Ok(Self {
+            version: snapshot.version(Table::Runs).unwrap_or(0),
+            surfaces: snapshot.files(Table::Surfaces).iter().map(echolake_lake::DataFile::visible_rows).sum(),
+            runs: snapshot.runs().count() as u64,
+            table_bytes: Table::ALL.into_iter().map(bytes).sum(),
+            inbox: FolderFigures::read(lake, "inbox").await?,
+            quarantine: FolderFigures::read(lake, "quarantine").await?,
+        })
+    }
+}
+
+impl FolderFigures {
+    async fn read(lake: &Lake, folder: &str) -> echolake_lake::Result<Self> {
+        let listing = lake.list_folder(folder).await?;
+        let runs = listing.files.iter().filter(|object| object.location.as_ref().ends_with(".mcap"));
+        Ok(runs.fold(Self::default(), |sum, object| Self { files: sum.files + 1, bytes: sum.bytes + object.size }))
+    }
+}

@@ -1,0 +1,34 @@
+//! The sockets between the door and an engine.
+
+use std::path::{Path, PathBuf};
+
+use tokio::net::UnixListener;
+
+use crate::Error;
+
+/// A protocol, as an engine's sockets are named.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum EngineSocket {
+    /// HTTP.
+    Http,
+    /// Arrow Flight SQL.
+    FlightSql,
+    /// Postgres' wire protocol.
+    Postgres,
+}
+
+impl EngineSocket {
+    /// The path of this socket in an engine's folder.
+    pub fn path(self, folder: &Path) -> PathBuf {
+        folder.join(match self {
+            Self::Http => "http",
+            Self::FlightSql => "flight",
+            Self::Postgres => "postgres",
+        })
+    }
+
+    /// Listens on it.
+    pub fn listen(self, folder: &Path) -> Result<UnixListener, Error> {
+        UnixListener::bind(self.path(folder)).map_err(Error::System)
+    }
+}

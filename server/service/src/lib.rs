@@ -1,0 +1,36 @@
+//! What the protocols of a server share: the query engine and its client, queries that run, failures with their codes, spans
+//! of requests, and what an engine and its door tell each other.
+
+mod activity;
+pub mod authorization;
+mod client_identity;
+mod door_message;
+mod door_rows;
+mod engine_report;
+mod engine_socket;
+mod error;
+mod fault;
+mod query_watch;
+pub mod request_span;
+#[cfg(feature = "otlp")]
+mod request_trace;
+pub mod running;
+mod server_protocol;
+mod service;
+mod stop_signal;
+mod token_scope;
+
+pub use activity::{
+    ActivityRows, ActivityTable, FolderFigures, LakeFigures, LoggedQuery, OpenConnection, QueryEnd, QueryStart,
+};
+pub use client_identity::{ClientIdentity, counted_bytes};
+pub use door_message::DoorMessage;
+pub use engine_report::EngineReport;
+pub use engine_socket::EngineSocket;
+pub use error::Error;
+pub use fault::{FaultCode, FaultParts, RequestFault};
+pub use query_watch::{QueryTimer, QueryWatch};
+pub use server_protocol::ServerProtocol;
+pub use service::{ActivityCounter, ActivityGuard, CATALOG, QueryJob, QueryService, QueryWork, SCHEMA};
+pub use stop_signal::StopSignal;
+pub use token_scope::TokenScope;

@@ -1,0 +1,345 @@
+//! State shared by the three protocols: the query engine, its client, encoder threads, and metrics.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::Duration;
+
+use arrow::datatypes::SchemaRef;
+use datafusion::common::ParamValues;
+use echolake_lake::Lake;
+use echolake_query::{EngineClient, PreparedQuery, QueryEngine, QueryThreads, Session, SqlFunction};
+use futures::future::BoxFuture;
+use futures::{FutureExt as _, TryFutureExt as _};
+use tokio::sync::{mpsc, oneshot};
+use tokio::task::JoinSet;
+use tracing::Instrument as _;
+
+use crate::Error;
+use crate::client_identity::ClientIdentity;
+use crate::door_message::DoorMessage;
+use crate::door_rows::DoorRows;
+use crate::engine_report::EngineReport;
+use crate::fault::{FaultCode, RequestFault};
+use crate::query_watch::{QueryTimer, QueryWatch, RunningWatches};
+use crate::running::{AnswerEncoder, RunningQuery, SessionTimeLimit, WAITING, ended, finish, parts};
+use crate::server_protocol::ServerProtocol;
+use crate::stop_signal::StopSignal;
+use crate::token_scope::TokenScope;
+
+/// The catalogue of the lake's tables, as DataFusion calls it.
+pub const CATALOG: &str = "datafusion";
+/// Their schema, as DataFusion calls it.
+pub const SCHEMA: &str = "public";
+
+/// State shared by the three protocols.
+#[derive(Clone)]
+pub struct QueryService(Arc<ServiceState>);
+
+struct ServiceState {
+    lake: Lake,
+    engine: QueryEngine,
+    identity: ClientIdentity,
+    client: Arc<EngineClient>,
+    activity: ActivityCounter,
+    watches: Arc<RunningWatches>,
+    door_rows: Arc<DoorRows>,
+    // Answers are encoded on threads of their own: connections are answered, and queries cancelled, while all are busy.
+    encoders: QueryThreads,
+}
+
+/// The query text or plan to run.
+pub enum QueryWork {
+    /// A text.
+    Sql(String),
+    /// A prepared plan, with values for its placeholders.
+    Prepared(Arc<PreparedQuery>, ParamValues),
+}
+
+impl QueryWork {
+    fn statement(&self) -> &str {
+        match self {
+            Self::Sql(sql) => sql,
+            Self::Prepared(prepared, _) => prepared.sql(),
+        }
+    }
+}
+
+/// A query to run.
+pub struct QueryJob {
+    /// Its protocol.
+    pub protocol: ServerProtocol,
+    /// Its session.
+    pub session: Arc<Session>,
+    /// The text or plan.
+    pub work: QueryWork,
+    /// The session's own limit of time, beside its client's quota.
+    pub limit: Option<SessionTimeLimit>,
+    /// Stops it from another task.
+    pub stop: StopSignal,
+}
+
+/// Counts requests, and work for them.
+#[derive(Clone, Default)]
+pub struct ActivityCounter(Arc<AtomicUsize>);
+
+/// One that is counted, until this is dropped.
+pub struct ActivityGuard(ActivityCounter);
+
+impl Drop for ActivityGuard {
+    fn drop(&mut self) {
+        self.0.0.fetch_sub(1, Ordering::Relaxed);
+    }
+}
+
+impl ActivityCounter {
+    /// Counts one more, until the guard is dropped.
+    pub fn enter(&self) -> ActivityGuard {
+        self.0.fetch_add(1, Ordering::Relaxed);
+        ActivityGuard(self.clone())
+    }
+
+    /// How many there are.
+    pub fn count(&self) -> usize {
+        self.0.load(Ordering::Relaxed)
+    }
+}
+
+impl QueryService {
+    /// The state of an engine of this client; queries that take as long as `slow` are logged.
+    ///
+    /// # Errors
+    /// [`Error::System`].
+    pub fn new(
+        lake: &Lake,
+        engine: QueryEngine,
+        identity: ClientIdentity,
+        slow: Option<Duration>,
+    ) -> Result<Self, Error> {
+        let door_rows = Arc::new(DoorRows::default());
+        engine.add_system_tables(door_rows.clone());
+        Ok(Self(Arc::new(ServiceState {
+            lake: lake.clone(),
+            engine,
+            client: Arc::new(EngineClient::new(identity.name.clone(), identity.quota())),
+            identity,
+            activity: ActivityCounter::default(),
+            watches: Arc::new(RunningWatches::new(slow)),
+            door_rows,
+            encoders: QueryThreads::per_core("encode").map_err(Error::System)?,
+        })))
+    }
+
+    /// The lake, as the client sees it.
+    pub fn lake(&self) -> &Lake {
+        &self.0.lake
+    }
+
+    /// The query engine.
+    pub fn engine(&self) -> &QueryEngine {
+        &self.0.engine
+    }
+
+    /// Returns whether the server has no tokens.
+    pub fn is_open(&self) -> bool {
+        self.0.identity.is_open
+    }
+
+    /// The client whose requests these are, if they may do this.
+    ///
+    /// # Errors
+    /// [`RequestFault::Forbidden`].
+    pub fn client(&self, scope: TokenScope) -> Result<Arc<EngineClient>, RequestFault> {
+        self.0.identity.require(scope).inspect_err(EngineReport::record_failure)?;
+        Ok(self.0.client.clone())
+    }
+
+    /// Requests that are being answered.
+    pub fn activity(&self) -> &ActivityCounter {
+        &self.0.activity
+    }
+
+    /// Reports a failed request to the door, which counts them.
+    pub fn failed(&self, code: FaultCode) {
+        EngineReport::Failure(code).queue();
+    }
+
+    /// Watches a query, or other work that is listed among queries, until the timer is dropped.
+    pub fn watch(&self, protocol: ServerProtocol, statement: &str, stop: &StopSignal) -> QueryTimer {
+        self.0.watches.begin(protocol, statement, stop)
+    }
+
+    /// Does what the door says; ends with the door.
+    pub async fn obey(&self, mut messages: mpsc::UnboundedReceiver<DoorMessage>) {
+        while let Some(message) = messages.recv().await {
+            match message {
+                DoorMessage::Cancel(number) => self.0.watches.cancel(number),
+                DoorMessage::Rows { number, rows } => self.0.door_rows.answer(number, rows),
+                // An engine has one client.
+                DoorMessage::Client(_) => {}
+            }
+        }
+    }
+
+    /// Begins a session: one per connection, or one per request if the protocol has no connections.
+    pub fn session(&self, client: &Arc<EngineClient>) -> Session {
+        self.0.engine.session(client)
+    }
+
+    /// The tables and their schemas.
+    pub fn tables(&self) -> Vec<(&'static str, SchemaRef)> {
+        self.session(&self.0.client).tables().collect()
+    }
+
+    /// The tables of the schema `system`, and their schemas.
+    pub fn system_tables(&self) -> Vec<(&'static str, SchemaRef)> {
+        self.session(&self.0.client).system_tables()
+    }
+
+    /// All tables by the names that SQL has for them, and their schemas: those of the lake, then those of the schema
+    /// `system`.
+    pub fn all_tables(&self) -> Vec<(String, SchemaRef)> {
+        self.session(&self.0.client).all_tables()
+    }
+
+    /// The views' definitions by their names.
+    pub fn view_definitions(&self) -> HashMap<&'static str, String> {
+        self.session(&self.0.client).view_definitions().collect()
+    }
+
+    /// The field's functions.
+    pub fn functions(&self) -> Vec<SqlFunction> {
+        self.all_functions().into_iter().filter(|f| f.is_own).collect()
+    }
+
+    /// All functions, the field's and DataFusion's.
+    pub fn all_functions(&self) -> Vec<SqlFunction> {
+        self.session(&self.0.client).functions()
+    }
+
+    /// Spawns work on the encoder threads; dropping the returned task aborts it.
+    pub fn spawn<T: Send + 'static>(&self, work: impl Future<Output = T> + Send + 'static) -> JoinSet<T> {
+        let mut task = JoinSet::new();
+        let guard = self.0.activity.enter();
+        if let Some(threads) = self.0.encoders.handle() {
+            let work = async move {
+                let _guard = guard;
+                work.await
+            };
+            task.spawn_on(work, threads);
+        }
+        task
+    }
+
+    /// Parses and plans for a client, away from the threads that answer connections. Boxed for the same reason as
+    /// [`echolake_query::OpaqueValue`].
+    pub fn plan<T: Send + 'static>(
+        &self,
+        client: &EngineClient,
+        work: impl Future<Output = Result<T, RequestFault>> + Send + 'static,
+    ) -> BoxFuture<'_, Result<T, RequestFault>> {
+        let (guard, time) = (self.0.activity.enter(), client.quota().time);
+        let work = async move {
+            let _guard = guard;
+            work.await
+        };
+        let work = work.in_current_span();
+        let planned = async move { self.0.engine.supervise(time, work).await };
+        planned.inspect_err(EngineReport::record_failure).boxed()
+    }
+
+    /// Computes something long, which waits for nothing.
+    pub async fn crunch<T: Send + 'static>(
+        &self,
+        work: impl FnOnce() -> T + Send + 'static,
+    ) -> Result<T, RequestFault> {
+        let guard = self.0.activity.enter();
+        let work = move || {
+            let _guard = guard;
+            work()
+        };
+        let handle = self.0.encoders.handle().map(|threads| threads.spawn_blocking(work));
+        let Some(handle) = handle else { return Err(RequestFault::Internal) };
+        handle.await.map_err(RequestFault::defect("computing ended its task"))
+    }
+
+    /// Begins a query; its columns are known when this returns. Boxed as [`QueryService::plan`].
+    ///
+    /// # Errors
+    /// What is wrong with the query, or ended it.
+    pub fn begin<E: AnswerEncoder>(
+        &self,
+        job: QueryJob,
+        encode: impl FnOnce(&SchemaRef) -> Result<E, RequestFault> + Send + 'static,
+    ) -> BoxFuture<'_, Result<RunningQuery<E::Item>, RequestFault>> {
+        let begun = async move {
+            let (columns, known) = oneshot::channel();
+            let (to, items) = mpsc::channel(WAITING);
+            let (stop, limit) = (job.stop.clone(), job.limit);
+            let span = tracing::error_span!("query", protocol = job.protocol.name(), client = self.0.identity.name);
+            let timer = span.in_scope(|| self.watch(job.protocol, job.work.statement(), &job.stop));
+            let (watch, stopped) = (timer.watch().clone(), stop.clone());
+            let work = async move {
+                let done = tokio::select! {
+                    done = run(timer.watch(), job, encode, columns, to) => done,
+                    // Also if nobody fetches rows at present; who does says so.
+                    () = stopped.stopped() => return Err(RequestFault::Cancelled),
+                };
+                timer.watch().finish(done.as_ref().err());
+                done.inspect_err(EngineReport::record_failure)
+            };
+            let mut task = self.spawn(work.instrument(span.clone()));
+            tokio::select! {
+                biased;
+                fault = ended(&stop, limit) => {
+                    watch.finish(Some(&fault));
+                    span.in_scope(|| EngineReport::record_failure(&fault));
+                    Err(fault)
+                }
+                schema = known => match schema {
+                    Ok(schema) => Ok(RunningQuery { schema, items, task, stop, limit, watch, span }),
+                    // It ended without having any: it says why.
+                    Err(_) => finish(&mut task).await.and(Err(RequestFault::Internal)),
+                }
+            }
+        };
+        begun.boxed()
+    }
+}
+
+async fn run<E: AnswerEncoder>(
+    watch: &QueryWatch,
+    job: QueryJob,
+    encode: impl FnOnce(&SchemaRef) -> Result<E, RequestFault>,
+    columns: oneshot::Sender<SchemaRef>,
+    to: mpsc::Sender<E::Item>,
+) -> Result<(), RequestFault> {
+    let mut answer = match job.work {
+        QueryWork::Sql(sql) => job.session.query(&sql).await?,
+        QueryWork::Prepared(prepared, values) => job.session.execute(&prepared, values).await?,
+    };
+    watch.planned();
+    let mut encoder = encode(&answer.schema)?;
+    // If sending fails, here and below, the receiver is gone: the query ends by being dropped.
+    if columns.send(answer.schema.clone()).is_err() {
+        return Ok(());
+    }
+    while let Some(batch) = answer.next().await? {
+        watch.answered(&batch);
+        watch.held(answer.peak_memory());
+        for part in parts(&batch) {
+            for item in encoder.batch(part)? {
+                if to.send(item).await.is_err() {
+                    return Ok(());
+                }
+            }
+        }
+    }
+    watch.held(answer.peak_memory());
+    for item in encoder.end()? {
+        if to.send(item).await.is_err() {
+            return Ok(());
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,142 @@
+//! HTTP connections of the door: so many at once, each of which must say what it wants in time. An engine answers what reads
+//! the lake; the door answers the rest: pages, sessions, health and figures.
+
+mod authentication;
+mod health;
+mod openapi;
+#[cfg(feature = "web")]
+mod pages;
+mod queries;
+mod router;
+mod session;
+
+use std::time::{Duration, Instant};
+
+use axum::Router;
+use axum::body::Body;
+use axum::extract::{Request, State};
+use axum::http::{HeaderValue, header};
+use axum::middleware::Next;
+use axum::response::{IntoResponse as _, Response};
+use echolake_http::{FORWARDED_PROTO, ProblemResponse, RequestSite, SLICED_RUNS, request_site};
+use echolake_service::request_span::{REQUEST_ID, begin_request};
+use echolake_service::{ClientIdentity, FaultCode, RequestFault, ServerProtocol};
+use hyper::body::Incoming;
+use hyper::server::conn::http1;
+use hyper::service::{Service as _, service_fn};
+use hyper_util::rt::{TokioIo, TokioTimer};
+use hyper_util::service::TowerToHyperService;
+use tokio::net::TcpListener;
+use tracing::Instrument as _;
+
+use super::audit::{self, HandedFile};
+use super::connection_places::{ConnectionPlaces, PlaceWork, PlacedStream};
+use super::drain::ServerDrain;
+use super::encryption::{ProtocolEncryption, agreed_protocol};
+use super::forward::EngineProtocol;
+use super::http_connection::{HTTP_2, drive, http2_builder, restate};
+use crate::door::server_door::ServerDoor;
+use authentication::authenticate;
+use router::door_router;
+
+/// Path to which a browser shows a token.
+const SESSION_PATH: &str = "/api/v1/session";
+/// Connections at once. Systems often allow a process 1024 open files.
+const MOST: usize = 512;
+/// Time limit for a request's head, and for an idle connection between two requests.
+const HEAD: Duration = Duration::from_secs(30);
+
+/// Answers connections; never ends.
+pub(super) async fn serve(door: ServerDoor, listener: TcpListener, encryption: ProtocolEncryption) {
+    let router = door_router(&door);
+    let places = ConnectionPlaces::new(listener, MOST).listed(&door.activity().connections, ServerProtocol::Http);
+    places.attend(|stream| answer(stream, encryption.clone(), router.clone(), door.drain().clone())).await;
+}
+
+async fn answer(stream: PlacedStream, encryption: ProtocolEncryption, router: Router, drain: ServerDrain) {
+    let evicted = stream.evicted();
+    let work = stream.work();
+    let Some(stream) = encryption.accept(stream).await else { return };
+    let is_http2 = agreed_protocol(&stream) == Some(HTTP_2);
+    let place = work.clone();
+    let answers = TowerToHyperService::new(router);
+    let service = service_fn(move |mut request: hyper::Request<Incoming>| {
+        work.hear_request();
+        restate(&mut request);
+        if encryption.is_on() {
+            request.headers_mut().insert(FORWARDED_PROTO, HeaderValue::from_static("https"));
+        }
+        request.extensions_mut().insert(work.clone());
+        answers.call(request)
+    });
+    let stream = TokioIo::new(stream);
+    if is_http2 {
+        let connection = http2_builder().serve_connection(stream, service);
+        drive(connection, |connection| connection.graceful_shutdown(), evicted, &drain, &place).await;
+    } else {
+        let mut builder = http1::Builder::new();
+        let connection = builder.timer(TokioTimer::new()).header_read_timeout(HEAD).serve_connection(stream, service);
+        drive(connection, |connection| connection.graceful_shutdown(), evicted, &drain, &place).await;
+    }
+}
+
+fn shows_token(request: &Request) -> bool {
+    request.headers().contains_key(header::AUTHORIZATION) || request.uri().path() == SESSION_PATH
+}
+
+impl ServerDoor {
+    /// Forwards a request to the client's engine.
+    pub(crate) async fn forward_http(State(door): State<Self>, request: Request) -> Response {
+        door.answer_http(request).await.unwrap_or_else(|fault| {
+            door.metrics().record_failure(&fault);
+            ProblemResponse(fault).into_response()
+        })
+    }
+
+    /// Answers a request within its span, and names it in the answer; the layer of all routes.
+    pub(crate) async fn name_request(State(door): State<Self>, mut request: Request, next: Next) -> Response {
+        let begun = Instant::now();
+        let (span, id) = begin_request(request.headers_mut(), ServerProtocol::Http);
+        let peer = request.extensions().get::<PlaceWork>().map(PlaceWork::peer);
+        // A page that nobody has logged in to shows no token.
+        let login = peer.filter(|_| shows_token(&request));
+        let mut response = match login.map_or(Ok(()), |peer| door.failed_logins().check(peer)) {
+            Ok(()) => next.run(request).instrument(span.clone()).await,
+            Err(fault) => ProblemResponse(fault).into_response(),
+        };
+        if let (Some(peer), Some(code)) = (peer, response.extensions().get::<FaultCode>())
+            && !door.access().is_open()
+        {
+            if let (Some(peer), FaultCode::Unauthenticated) = (login, code) {
+                door.failed_logins().count(peer);
+            }
+            span.in_scope(|| audit::record_refusal(peer, ServerProtocol::Http, *code));
+        }
+        response.headers_mut().insert(REQUEST_ID, id);
+        door.metrics().answered(response.status().as_u16(), begun.elapsed().as_secs_f64());
+        response
+    }
+
+    async fn answer_http(&self, request: Request) -> Result<Response, RequestFault> {
+        let work = request.extensions().get::<PlaceWork>().cloned().ok_or(RequestFault::Internal)?;
+        let site = request_site(request.uri(), request.headers());
+        let local = || match site {
+            RequestSite::Foreign => ClientIdentity::foreign(),
+            RequestSite::OwnPage => ClientIdentity::pages(),
+            RequestSite::Program => ClientIdentity::programs(),
+        };
+        // A refusal is noted with those of the other routes.
+        let client = authenticate(self.access(), request.headers(), local)?;
+        let client = self.note_client(&work, ServerProtocol::Http, Ok(client))?;
+        let path = request.uri().path().to_owned();
+        let method = request.method().clone();
+        let mut response = self.engines().forward(&client, request, EngineProtocol::Http, Some(&work)).await?;
+        let runs = response.headers_mut().remove(SLICED_RUNS);
+        if !self.access().is_open() {
+            let runs = runs.as_ref().and_then(|runs| runs.to_str().ok());
+            let file = HandedFile { client: &client.name, path: &path, runs };
+            audit::record_file(work.peer(), &method, response.status(), &file);
+        }
+        Ok(response.map(Body::new))
+    }
+}

@@ -1,0 +1,225 @@
+//! The catalogue's pages and the manual, which are part of the program. They hold no data, so they need no token.
+
+use std::collections::BTreeSet;
+use std::io::Read as _;
+use std::sync::LazyLock;
+
+use axum::body::Bytes;
+use axum::http::{HeaderMap, HeaderValue, Method, Uri, header};
+use axum::response::{IntoResponse as _, Redirect, Response};
+use base64::Engine as _;
+use base64::prelude::BASE64_STANDARD;
+use echolake_http::{ConditionOutcome, ProblemResponse, nothing, takes};
+use echolake_service::RequestFault;
+use flate2::read::GzDecoder;
+use sha2::{Digest as _, Sha256};
+
+/// Nothing inline, nothing from elsewhere.
+const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; font-src 'self'; \
+     media-src 'self' blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
+const INDEX: &str = "/index.html";
+/// Path of files that have a digest in their name.
+const ASSETS: &str = "/assets/";
+/// Paths that are no page's.
+const OTHERS: [&str; 5] = ["/api", "/assets", "/health", "/mcp", "/metrics"];
+/// The manual's path and its first page.
+const MANUAL_PATH: &str = "/docs";
+const MANUAL_INDEX: &str = "/docs/index.html";
+
+/// A file of the pages; `build.rs` lists them.
+struct PageFile {
+    path: &'static str,
+    media_type: &'static str,
+    /// As it is, or packed by gzip: few clients want it unpacked, and it is a megabyte less of the program.
+    bytes: &'static [u8],
+    is_gzip: bool,
+    brotli: Option<&'static [u8]>,
+}
+
+#[cfg(not(pages_not_built))]
+static PAGES: &[PageFile] = include!(concat!(env!("OUT_DIR"), "/pages.rs"));
+/// The only page of a program that was built without Node.
+#[cfg(pages_not_built)]
+static PAGES: &[PageFile] = &[PageFile {
+    path: INDEX,
+    media_type: "text/html; charset=utf-8",
+    bytes: include_bytes!("pages_not_built.html"),
+    is_gzip: false,
+    brotli: None,
+}];
+
+/// The files of the manual; none if the program was built without it.
+static MANUAL: &[PageFile] = include!(concat!(env!("OUT_DIR"), "/manual.rs"));
+
+/// The pages, each with its digest.
+static TAGGED_PAGES: LazyLock<Vec<(&PageFile, String)>> = LazyLock::new(|| tag_files(PAGES));
+/// The manual's files, each with its digest.
+static TAGGED_MANUAL: LazyLock<Vec<(&PageFile, String)>> = LazyLock::new(|| tag_files(MANUAL));
+/// The manual's own inline scripts, and nothing from elsewhere: its generator writes three into each page.
+static MANUAL_POLICY: LazyLock<String> = LazyLock::new(|| {
+    let texts: Vec<String> = MANUAL
+        .iter()
+        .filter(|file| file.path.ends_with(".html"))
+        .map(|file| String::from_utf8_lossy(file.bytes).into_owned())
+        .collect();
+    let scripts: BTreeSet<&str> = texts.iter().flat_map(|text| inline_scripts(text)).collect();
+    let hashes: String = scripts
+        .iter()
+        .map(|script| format!(" 'sha256-{}'", BASE64_STANDARD.encode(Sha256::digest(script.as_bytes()))))
+        .collect();
+    format!(
+        "default-src 'none'; script-src 'self'{hashes}; style-src 'self'; img-src 'self' data:; connect-src 'self'; \
+         worker-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    )
+});
+
+fn tag_files(files: &'static [PageFile]) -> Vec<(&'static PageFile, String)> {
+    files.iter().map(|file| (file, format!("\"{}\"", hex::encode(&Sha256::digest(file.bytes)[..8])))).collect()
+}
+
+// The texts between `<script>` and `</script>`.
+fn inline_scripts(page: &str) -> impl Iterator<Item = &str> {
+    page.split("<script>").skip(1).filter_map(|rest| rest.split_once("</script>")).map(|(script, _)| script)
+}
+
+/// Answers all other paths. The pages decide themselves what an address shows, so every one of them has the same
+/// file.
+pub(super) async fn fallback(method: Method, uri: Uri, headers: HeaderMap) -> Response {
+    let manual_path = uri.path().strip_prefix(MANUAL_PATH).filter(|rest| rest.is_empty() || rest.starts_with('/'));
+    let (found, policy) = match manual_path {
+        Some("" | "/") if !MANUAL.is_empty() => return Redirect::permanent(MANUAL_INDEX).into_response(),
+        Some(path) => (find_manual_file(path), MANUAL_POLICY.as_str()),
+        None => (find_page(uri.path()), POLICY),
+    };
+    let Some((page, tag)) = found else { return missing(manual_path.is_some()).await };
+    if method != Method::GET && method != Method::HEAD {
+        let mut response = ProblemResponse(RequestFault::Method).into_response();
+        response.headers_mut().insert(header::ALLOW, HeaderValue::from_static("GET,HEAD"));
+        return response;
+    }
+    let caching = if page.path.starts_with(ASSETS) { "public, max-age=31536000, immutable" } else { "no-cache" };
+    let common = [
+        (header::CONTENT_TYPE, page.media_type),
+        (header::CACHE_CONTROL, caching),
+        (header::CONTENT_SECURITY_POLICY, policy),
+        (header::VARY, "Accept-Encoding"),
+        (header::ETAG, tag),
+    ];
+    if let Some(instead) = ConditionOutcome::new(&headers, tag).response(tag, common.clone()) {
+        return instead;
+    }
+    let (body, encoding) = page.body(&headers);
+    let encoding = encoding.map(|encoding| [(header::CONTENT_ENCODING, encoding)]);
+    (common, encoding, body).into_response()
+}
+
+async fn missing(is_of_manual: bool) -> Response {
+    if !is_of_manual {
+        return nothing().await.into_response();
+    }
+    let hint = match MANUAL {
+        [] => "this program was built without its manual; docs/build.sh makes it for the next build",
+        _ => "/docs/index.html lists the manual's pages",
+    };
+    ProblemResponse(RequestFault::NotFound { what: "this page of the manual".to_owned(), hint }).into_response()
+}
+
+fn find_manual_file(path: &str) -> Option<&'static (&'static PageFile, String)> {
+    TAGGED_MANUAL.iter().find(|(file, _)| file.path == path)
+}
+
+fn find_page(path: &str) -> Option<&'static (&'static PageFile, String)> {
+    let of_path = |path: &str| TAGGED_PAGES.iter().find(|(page, _)| page.path == path);
+    let is_other =
+        OTHERS.iter().any(|other| path.strip_prefix(other).is_some_and(|r| r.is_empty() || r.starts_with('/')));
+    // A file that is not there is not there; names of surfaces and runs have no dots.
+    let is_file = path.rsplit('/').next().is_some_and(|last| last.contains('.'));
+    of_path(path).or_else(|| if is_other || is_file { None } else { of_path(INDEX) })
+}
+
+impl PageFile {
+    fn body(&self, headers: &HeaderMap) -> (Bytes, Option<&'static str>) {
+        match self.brotli.filter(|_| takes(headers, "br")) {
+            Some(packed) => (Bytes::from_static(packed), Some("br")),
+            None if self.is_gzip && takes(headers, "gzip") => (Bytes::from_static(self.bytes), Some("gzip")),
+            None if self.is_gzip => (self.unpack().into(), None),
+            None => (Bytes::from_static(self.bytes), None),
+        }
+    }
+
+    fn unpack(&self) -> Vec<u8> {
+        let mut bytes = Vec::new();
+        // It was packed by the build, and what cannot be read of it is not there.
+        let _ = GzDecoder::new(self.bytes).read_to_end(&mut bytes);
+        bytes
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use axum::http::StatusCode;
+
+    use super::*;
+
+    #[test]
+    fn addresses_are_pages_and_files_are_themselves() {
+        let path = |asked: &str| find_page(asked).map(|(page, _)| page.path);
+        for address in ["/", "/surfaces/flat/pairs/7", "/sql", "/map", "/apis"] {
+            assert_eq!(path(address), Some(INDEX), "{address}");
+        }
+        for missing in ["/api", "/api/v1/nothing", "/assets/none.js", "/assets", "/favicon.ico", "/a/../b.js"] {
+            assert_eq!(path(missing), None, "{missing}");
+        }
+    }
+
+    #[tokio::test]
+    async fn the_manual_is_shown_with_its_own_scripts_alone() {
+        let ask = async |path: &'static str| fallback(Method::GET, Uri::from_static(path), HeaderMap::new()).await;
+        if MANUAL.is_empty() {
+            assert!(std::env::var_os("ECHOLAKE_NO_SKIP").is_none(), "the manual is not built; hint: docs/build.sh");
+            let response = ask("/docs").await;
+            assert_eq!(response.status(), StatusCode::NOT_FOUND);
+            return;
+        }
+        assert_eq!(ask("/docs").await.headers()[header::LOCATION], MANUAL_INDEX);
+        assert_eq!(ask("/docs/none.html").await.status(), StatusCode::NOT_FOUND);
+        let response = ask(MANUAL_INDEX).await;
+        assert_eq!(response.status(), StatusCode::OK);
+        assert_eq!(response.headers()[header::CONTENT_TYPE], "text/html; charset=utf-8");
+        let policy = response.headers()[header::CONTENT_SECURITY_POLICY].to_str().expect("text").to_owned();
+        let (page, _) = find_manual_file("/index.html").expect("a page");
+        let scripts: Vec<&str> = inline_scripts(std::str::from_utf8(page.bytes).expect("text")).collect();
+        assert!(!scripts.is_empty());
+        for script in scripts {
+            let hash = BASE64_STANDARD.encode(Sha256::digest(script.as_bytes()));
+            assert!(policy.contains(&format!("'sha256-{hash}'")), "{policy}");
+        }
+        assert!(!policy.contains("unsafe"), "{policy}");
+        for file in MANUAL {
+            assert_eq!(ask_path(file.path).await, StatusCode::OK, "{}", file.path);
+        }
+    }
+
+    async fn ask_path(path: &str) -> StatusCode {
+        let uri = format!("{MANUAL_PATH}{path}").parse().expect("a path");
+        fallback(Method::GET, uri, HeaderMap::new()).await.status()
+    }
+
+    #[cfg(not(pages_not_built))]
+    #[test]
+    fn scripts_are_there_and_packed() {
+        let path = |asked: &str| find_page(asked).map(|(page, _)| page.path);
+        assert_eq!(path("/theme.js"), Some("/theme.js"));
+        let script = PAGES.iter().find(|p| p.path.starts_with("/assets/index-") && p.path.ends_with(".js"));
+        let script = script.expect("a script");
+        let packed = HeaderMap::from_iter([(header::ACCEPT_ENCODING, HeaderValue::from_static("gzip"))]);
+        let (gzip, named) = script.body(&packed);
+        assert_eq!(named, Some("gzip"));
+        let (plain, named) = script.body(&HeaderMap::new());
+        assert_eq!(named, None);
+        // gzip ends with the length of what it packed.
+        let length = gzip.last_chunk().map(|length| u32::from_le_bytes(*length));
+        assert_eq!(length, u32::try_from(plain.len()).ok());
+        assert!(gzip.len() < plain.len());
+    }
+}
