@@ -46,7 +46,7 @@ pub(crate) struct ClientIdentity {
 
 impl ClientIdentity {
     /// A client of a server without tokens.
-    pub(crate) fn local(name: impl Into<String>) -> Self {
+    pub(crate) fn local_client(name: impl Into<String>) -> Self {
         let scopes = vec![TokenScope::Sql, TokenScope::Files, TokenScope::Metrics];
         Self {
             name: name.into(),
@@ -62,23 +62,23 @@ impl ClientIdentity {
     }
 
     /// The server's own pages.
-    pub(crate) fn pages() -> Self {
-        Self::local(PAGES)
+    pub(crate) fn own_pages() -> Self {
+        Self::local_client(PAGES)
     }
 
     /// Programs of this machine, over HTTP or Flight SQL.
-    pub(crate) fn programs() -> Self {
-        Self::local(PROGRAMS)
+    pub(crate) fn local_programs() -> Self {
+        Self::local_client(PROGRAMS)
     }
 
     /// A user of this machine, by their own word, over Postgres' protocol.
-    pub(crate) fn user(name: &str) -> Self {
-        Self::local(format!("user {name}"))
+    pub(crate) fn local_user(name: &str) -> Self {
+        Self::local_client(format!("user {name}"))
     }
 
     /// Pages of other origins.
-    pub(crate) fn foreign() -> Self {
-        Self::local(FOREIGN)
+    pub(crate) fn foreign_pages() -> Self {
+        Self::local_client(FOREIGN)
     }
 
     /// Limits of its queries.
@@ -103,7 +103,7 @@ impl ClientIdentity {
     ///
     /// # Errors
     /// [`RequestFault::Forbidden`].
-    pub(crate) fn require(&self, scope: TokenScope) -> Result<(), RequestFault> {
+    pub(crate) fn require_scope(&self, scope: TokenScope) -> Result<(), RequestFault> {
         match self.scopes.contains(&scope) {
             true => Ok(()),
             false => Err(RequestFault::Forbidden { name: self.name.clone(), scope }),

@@ -16,7 +16,7 @@ pub(crate) enum EngineSocket {
 
 impl EngineSocket {
     /// The path of this socket in an engine's folder.
-    pub(crate) fn path(self, folder: &Path) -> PathBuf {
+    pub(crate) fn path_in(self, folder: &Path) -> PathBuf {
         folder.join(match self {
             Self::Http => "http",
             Self::FlightSql => "flight",
@@ -25,7 +25,7 @@ impl EngineSocket {
     }
 
     /// Listens on it.
-    pub(crate) fn listen(self, folder: &Path) -> Result<UnixListener, Error> {
-        UnixListener::bind(self.path(folder)).map_err(Error::System)
+    pub(crate) fn listen_in(self, folder: &Path) -> Result<UnixListener, Error> {
+        UnixListener::bind(self.path_in(folder)).map_err(Error::System)
     }
 }

@@ -288,7 +288,7 @@ pub(crate) struct FaultParts {
 
 impl RequestFault {
     /// Returns the parts of its text.
-    pub(crate) fn parts(&self) -> FaultParts {
+    pub(crate) fn text_parts(&self) -> FaultParts {
         if let Self::Query(QueryError::Query { message, place, hint }) = self {
             return FaultParts { message: message.clone(), place: place.clone(), hint: hint.clone() };
         }
@@ -302,7 +302,7 @@ impl RequestFault {
     }
 
     /// A request that is not understood.
-    pub(crate) fn request(message: impl Into<String>) -> Self {
+    pub(crate) fn bad_request(message: impl Into<String>) -> Self {
         Self::Request { message: message.into() }
     }
 
@@ -321,7 +321,7 @@ impl RequestFault {
 
     /// Writes it to the log: as a warning if the client is not to blame for it, else for debugging, because its text may
     /// quote a statement.
-    pub(crate) fn log(&self) {
+    pub(crate) fn log_failure(&self) {
         let (code, text) = (self.code(), self.to_string());
         match code {
             FaultCode::Internal | FaultCode::Lake | FaultCode::Changed | FaultCode::EngineEnded => {

@@ -5,7 +5,7 @@ use std::sync::atomic::AtomicBool;
 
 use echolake_acquisition::panel::relief::PanelRelief;
 use echolake_acquisition::run::controller::RecordingMode;
-use echolake_acquisition::run::simulate::simulate;
+use echolake_acquisition::run::simulate::run_simulation;
 use echolake_acquisition::run::{PanelSpecimen, RunRequest};
 use echolake_schema::manifest::Origin;
 use echolake_schema::{Rig, Timestamp};
@@ -34,5 +34,5 @@ pub fn simulate_run(folder: &Path, number: usize, surface: &str, relief: &str, k
         keep,
         folder,
     };
-    simulate(&run, Origin::Simulated, &AtomicBool::new(false), &mut |_| {}).expect("a run").0
+    run_simulation(&run, Origin::Simulated, &AtomicBool::new(false), &mut |_| {}).expect("a run").0
 }

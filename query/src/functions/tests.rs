@@ -8,7 +8,7 @@ use arrow::datatypes::{DataType, Field, Float32Type, Float64Type, Int64Type};
 use arrow::record_batch::RecordBatch;
 use arrow::util::pretty::pretty_format_batches;
 use bytes::Bytes;
-use echolake_lake::{FileName, Lake, ReferenceSurfaces, VisibleRun, encode};
+use echolake_lake::{FileName, Lake, ReferenceSurfaces, VisibleRun, encode_batches};
 use echolake_schema::tables::Table;
 use echolake_schema::{Rig, Symmetry};
 use expect_test::expect;
@@ -142,12 +142,12 @@ async fn put(lake: &Lake, surface: &str, golden: &[RecordBatch], ir: &str, refle
             }
         };
         let batch = RecordBatch::try_new(schema.clone(), schema.fields().iter().map(column).collect()).expect("rows");
-        let file = encode(table, &schema, &[batch]).expect("encoded");
-        staged.push(lake.stage(table, &name, file).await.expect("staged"));
+        let file = encode_batches(table, &schema, &[batch]).expect("encoded");
+        staged.push(lake.stage_file(table, &name, file).await.expect("staged"));
     }
-    let row = staged.pop().expect("the run's row").replacing(&pointer, &[]);
+    let row = staged.pop().expect("the run's row").with_replaced_rows(&pointer, &[]);
     staged.push(row);
-    lake.commit(&staged).await.expect("committed");
+    lake.commit_staged(&staged).await.expect("committed");
 }
 
 /// Energy of each case in a band, from the golden bands of the panel; for Flat, which has none, the total energy.
@@ -303,7 +303,8 @@ async fn aggregates_are_the_same_however_rows_are_divided() {
     let expected = echolake_dsp::level::p90_mean(&one, &mut Vec::new()).expect("some");
     let sql = format!("select p from (select g, p90_mean(x) as p from {values} group by g) where g = 3");
     assert!(close(small.number(&sql).await, expected));
-    let expected = echolake_dsp::diffusion::diffusion(&one.iter().map(|x| x / 50.0).collect::<Vec<_>>()).expect("some");
+    let expected =
+        echolake_dsp::diffusion::diffusion_of_levels(&one.iter().map(|x| x / 50.0).collect::<Vec<_>>()).expect("some");
     let sql =
         format!("select d from (select g, diffusion_coefficient(x / 50) as d from {values} group by g) where g = 3");
     assert!(close(small.number(&sql).await, expected));
@@ -358,10 +359,13 @@ fn slices_of_arrays_are_read_where_they_begin() {
     let (field, offsets, ..) = lists.into_parts();
     let lists = arrow::array::ListArray::new(field, offsets, Arc::new(values), None).slice(1, 2);
     let arguments = CallArguments::new(&DESCRIPTION, &[ColumnarValue::Array(Arc::new(lists))], 2).expect("arguments");
-    let samples = arguments.samples::<f32>(0).expect("f32");
-    assert_eq!((samples.at(0).expect("whole"), samples.at(1).expect("whole")), (&[3.0][..], &[4.0, 5.0][..]));
-    assert_eq!(samples.room(2), 3);
-    assert!(arguments.samples::<f64>(0).is_err());
+    let samples = arguments.sample_lists::<f32>(0).expect("f32");
+    assert_eq!(
+        (samples.samples_at(0).expect("whole"), samples.samples_at(1).expect("whole")),
+        (&[3.0][..], &[4.0, 5.0][..])
+    );
+    assert_eq!(samples.sample_capacity(2), 3);
+    assert!(arguments.sample_lists::<f64>(0).is_err());
 }
 
 #[tokio::test]

@@ -44,9 +44,13 @@ pub struct Contents {
 }
 
 /// What the file of a run holds.
-pub(crate) async fn contents(run: &VisibleRun, snapshot: &LakeSnapshot, files: &Arc<Files>) -> Result<Contents, Error> {
-    let file = open(run, snapshot, files).await?;
-    let bytes = sizes(&file, files).await?;
+pub(crate) async fn read_contents(
+    run: &VisibleRun,
+    snapshot: &LakeSnapshot,
+    files: &Arc<Files>,
+) -> Result<Contents, Error> {
+    let file = open_run(run, snapshot, files).await?;
+    let bytes = channel_sizes(&file, files).await?;
     let topic = |(id, channel): (&u16, &super::file::Channel)| Topic {
         topic: channel.topic.clone(),
         schema: channel.schema.name.clone(),
@@ -60,13 +64,13 @@ pub(crate) async fn contents(run: &VisibleRun, snapshot: &LakeSnapshot, files: &
 }
 
 /// The bytes of the first attachment whose name ends so.
-pub(crate) async fn attachment(
+pub(crate) async fn read_attachment(
     run: &VisibleRun,
     snapshot: &LakeSnapshot,
     ending: &str,
     files: &Arc<Files>,
 ) -> Result<Option<Bytes>, Error> {
-    let file = open(run, snapshot, files).await?;
+    let file = open_run(run, snapshot, files).await?;
     let Some(found) = file.attachments.iter().find(|a| a.name.ends_with(ending)) else { return Ok(None) };
     let range = found.range.clone();
     if range.end - range.start > LARGEST_CHUNK {
@@ -84,13 +88,13 @@ pub(crate) async fn attachment(
     }
 }
 
-async fn open(run: &VisibleRun, snapshot: &LakeSnapshot, files: &Files) -> Result<Arc<McapFile>, Fault> {
+async fn open_run(run: &VisibleRun, snapshot: &LakeSnapshot, files: &Files) -> Result<Arc<McapFile>, Fault> {
     let path = Lake::run_path(&run.surface, &run.run);
-    files.open(&path, files.known_sizes(snapshot).await.get(&path).copied()).await
+    files.open_file(&path, files.known_sizes(snapshot).await.get(&path).copied()).await
 }
 
 // Bytes by channel; None where the file does not tell.
-async fn sizes(file: &McapFile, files: &Files) -> Result<Option<HashMap<u16, u64>>, Fault> {
+async fn channel_sizes(file: &McapFile, files: &Files) -> Result<Option<HashMap<u16, u64>>, Fault> {
     let told = file.walked.is_none() && file.pieces.iter().all(|p| p.index > 0);
     if !told || file.pieces.iter().map(|p| p.index).sum::<u64>() > MOST_INDEXES {
         return Ok(None);

@@ -40,7 +40,7 @@ use echolake_schema::tables::Table;
 use crate::Error;
 use crate::statement::walk_mut;
 pub use contents::{Contents, Topic};
-pub(crate) use contents::{attachment, contents};
+pub(crate) use contents::{read_attachment, read_contents};
 use error::Fault;
 pub use file::Attachment;
 pub(crate) use file::Files;
@@ -87,7 +87,7 @@ pub(crate) async fn register(
 ) -> Result<(), Error> {
     let mut tables: HashMap<Function, HashMap<Vec<String>, Arc<dyn TableProvider>>> = HashMap::new();
     for (function, arguments) in calls(statement) {
-        snapshot.check(Table::Runs)?;
+        snapshot.check_table(Table::Runs)?;
         let of = tables.entry(function).or_default();
         if let Entry::Vacant(place) = of.entry(arguments) {
             let table = table(function, place.key(), snapshot, files).await?;
@@ -107,14 +107,14 @@ async fn table(
     snapshot: &LakeSnapshot,
     files: &Arc<Files>,
 ) -> Result<Arc<dyn TableProvider>, Fault> {
-    let usage = || Fault::call(format!("{} is called with {} texts", function.name(), arguments.len()), USAGE);
+    let usage = || Fault::invalid_call(format!("{} is called with {} texts", function.name(), arguments.len()), USAGE);
     let pattern = arguments.first().ok_or_else(usage)?;
-    let open = || Target::open(pattern, snapshot, files);
+    let open = || Target::open_all(pattern, snapshot, files);
     Ok(match (function, arguments) {
-        (Function::Columns, [_, topic]) => Arc::new(table::columns(open().await?, topic, files)?),
-        (Function::Messages, [_]) => Arc::new(table::messages(open().await?, None, files)?),
-        (Function::Messages, [_, topic]) => Arc::new(table::messages(open().await?, Some(topic), files)?),
-        (Function::Topics, [_]) => topics::table(open().await?, files).await?,
+        (Function::Columns, [_, topic]) => Arc::new(table::decoded_table(open().await?, topic, files)?),
+        (Function::Messages, [_]) => Arc::new(table::message_table(open().await?, None, files)?),
+        (Function::Messages, [_, topic]) => Arc::new(table::message_table(open().await?, Some(topic), files)?),
+        (Function::Topics, [_]) => topics::channel_table(open().await?, files).await?,
         _ => return Err(usage()),
     })
 }

@@ -5,7 +5,7 @@ use std::io::Cursor;
 use arrow::array::{AsArray as _, RecordBatch};
 use arrow::datatypes::Int64Type;
 use arrow::util::pretty::pretty_format_batches;
-use echolake_lake::{FileName, Lake, ReferenceSurfaces, VisibleRun, encode};
+use echolake_lake::{FileName, Lake, ReferenceSurfaces, VisibleRun, encode_batches};
 use echolake_schema::Rig;
 use echolake_schema::tables::Table;
 use mcap::records::MessageHeader;
@@ -124,9 +124,9 @@ async fn put_run(lake: &TestLake, surface: &str, run: &str, file: Vec<u8>) {
         }
     };
     let batch = RecordBatch::try_new(schema.clone(), schema.fields().iter().map(column).collect()).expect("a row");
-    let file = encode(Table::Runs, &schema, &[batch]).expect("encoded");
-    let staged = lake.lake.stage(Table::Runs, &FileName::Pointer(pointer.clone()), file).await.expect("staged");
-    lake.lake.commit(&[staged]).await.expect("committed");
+    let file = encode_batches(Table::Runs, &schema, &[batch]).expect("encoded");
+    let staged = lake.lake.stage_file(Table::Runs, &FileName::Pointer(pointer.clone()), file).await.expect("staged");
+    lake.lake.commit_staged(&[staged]).await.expect("committed");
 }
 
 /// A channel of a file: its topic, encoding and schema, and its messages.

@@ -37,16 +37,16 @@ pub(super) const COOKIE: &str = "echolake";
 ///
 /// # Errors
 /// [`RequestFault::Unauthenticated`], [`RequestFault::Foreign`].
-pub(crate) fn authenticate(
+pub(crate) fn authenticate_client(
     access: &TokenAccess,
     headers: &HeaderMap,
     local: impl Fn() -> ClientIdentity,
 ) -> Result<Arc<ClientIdentity>, RequestFault> {
     let token = headers.get(header::AUTHORIZATION).and_then(|v| v.to_str().ok()).and_then(of_header);
     if token.is_some() || access.is_open() {
-        return access.client(token.as_deref(), local);
+        return access.client_of_token(token.as_deref(), local);
     }
-    let client = access.client_of_session(cookie(headers).ok_or(RequestFault::Unauthenticated)?, &local)?;
+    let client = access.client_of_session(session_cookie(headers).ok_or(RequestFault::Unauthenticated)?, &local)?;
     // A browser sends cookies along whichever page asks.
     is_same_origin(headers)?;
     Ok(client)
@@ -77,7 +77,7 @@ pub(super) fn is_encrypted(headers: &HeaderMap) -> bool {
     headers.get(FORWARDED_PROTO).is_some_and(|scheme| scheme == "https")
 }
 
-fn cookie(headers: &HeaderMap) -> Option<&str> {
+fn session_cookie(headers: &HeaderMap) -> Option<&str> {
     let all = headers.get_all(header::COOKIE).iter().filter_map(|v| v.to_str().ok());
     all.flat_map(|v| v.split(';')).find_map(|pair| pair.trim().strip_prefix(COOKIE)?.strip_prefix('='))
 }
@@ -86,7 +86,7 @@ impl FromRequestParts<QueryService> for MayQuery {
     type Rejection = ProblemResponse;
 
     async fn from_request_parts(_: &mut Parts, service: &QueryService) -> Result<Self, ProblemResponse> {
-        Ok(Self(service.client(TokenScope::Sql)?))
+        Ok(Self(service.authorised_client(TokenScope::Sql)?))
     }
 }
 
@@ -105,7 +105,7 @@ pub(super) async fn own_pages_only(State(is_open): State<bool>, request: Request
 /// [`RequestFault::Foreign`] if it does not.
 pub(super) fn is_own(uri: &Uri, headers: &HeaderMap) -> Result<(), RequestFault> {
     // HTTP/1.1 wants one Host; with two, the check and the routing may use different ones.
-    let host = match (headers.get_all(header::HOST).iter().count(), text(headers, &header::HOST)) {
+    let host = match (headers.get_all(header::HOST).iter().count(), header_text(headers, &header::HOST)) {
         (1, Some(host)) => host,
         (_, host) => return Err(RequestFault::Foreign { what: "host", found: host.unwrap_or_default() }),
     };
@@ -121,13 +121,13 @@ pub(super) fn is_own(uri: &Uri, headers: &HeaderMap) -> Result<(), RequestFault>
 
 // Checks by the headers of browsers that a request is not made by a page of another origin.
 fn is_same_origin(headers: &HeaderMap) -> Result<(), RequestFault> {
-    let host = text(headers, &header::HOST).unwrap_or_default();
-    if let Some(origin) = text(headers, &header::ORIGIN)
+    let host = header_text(headers, &header::HOST).unwrap_or_default();
+    if let Some(origin) = header_text(headers, &header::ORIGIN)
         && !ORIGIN_SCHEMES.iter().any(|scheme| origin.strip_prefix(scheme) == Some(&host))
     {
         return Err(RequestFault::Foreign { what: "origin", found: origin });
     }
-    match text(headers, &FETCH_SITE) {
+    match header_text(headers, &FETCH_SITE) {
         Some(site) if site != "same-origin" && site != "none" => {
             Err(RequestFault::Foreign { what: "site", found: site })
         }
@@ -135,7 +135,7 @@ fn is_same_origin(headers: &HeaderMap) -> Result<(), RequestFault> {
     }
 }
 
-fn text(headers: &HeaderMap, name: &HeaderName) -> Option<String> {
+fn header_text(headers: &HeaderMap, name: &HeaderName) -> Option<String> {
     headers.get(name).map(|v| String::from_utf8_lossy(v.as_bytes()).into_owned())
 }
 

@@ -8,7 +8,7 @@ use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 use utoipa::ToSchema;
 
-use super::guard::authenticate;
+use super::guard::authenticate_client;
 use super::problem::ProblemResponse;
 use crate::client_identity::ClientIdentity;
 use crate::door::server_door::ServerDoor;
@@ -51,7 +51,7 @@ pub(super) async fn ready(State(door): State<ServerDoor>) -> Result<Json<ServerH
 pub(super) async fn refuse_while_draining(State(door): State<ServerDoor>, request: Request, next: Next) -> Response {
     let is_operators = matches!(request.uri().path(), "/health" | "/ready" | "/metrics");
     if door.drain().is_begun() && !is_operators {
-        door.metrics().failed(FaultCode::Stopping);
+        door.metrics().count_failure(FaultCode::Stopping);
         return ProblemResponse(RequestFault::Draining).into_response();
     }
     next.run(request).await
@@ -68,7 +68,9 @@ pub(super) async fn metrics(
     State(door): State<ServerDoor>,
     headers: HeaderMap,
 ) -> Result<impl IntoResponse, ProblemResponse> {
-    let client = authenticate(door.access(), &headers, ClientIdentity::pages);
-    client.and_then(|client| client.require(TokenScope::Metrics)).inspect_err(|f| door.metrics().failed(f.code()))?;
-    Ok(([(header::CONTENT_TYPE, "text/plain; version=0.0.4; charset=utf-8")], door.figures().await?))
+    let client = authenticate_client(door.access(), &headers, ClientIdentity::own_pages);
+    client
+        .and_then(|client| client.require_scope(TokenScope::Metrics))
+        .inspect_err(|f| door.metrics().count_failure(f.code()))?;
+    Ok(([(header::CONTENT_TYPE, "text/plain; version=0.0.4; charset=utf-8")], door.gather_figures().await?))
 }

@@ -1,4 +1,4 @@
-//! HTTP. An engine answers what reads the lake ([`serve`]): queries, the catalogue, files and slices. The door answers the
+//! HTTP. An engine answers what reads the lake ([`serve_http_socket`]): queries, the catalogue, files and slices. The door answers the
 //! rest ([`door_router`]): pages, sessions, health and figures.
 
 mod catalogue;
@@ -41,7 +41,7 @@ use crate::metrics::ServerProtocol;
 use crate::request_span::trace_request;
 use crate::service::QueryService;
 use catalogue::LakeCatalogue;
-pub(crate) use guard::{FORWARDED_PROTO, RequestSite, authenticate, request_site};
+pub(crate) use guard::{FORWARDED_PROTO, RequestSite, authenticate_client, request_site};
 pub(crate) use layout::ViewerLayout;
 pub(crate) use mcp::MCP;
 pub(crate) use problem::ProblemResponse;
@@ -50,12 +50,12 @@ pub(crate) use slices::SLICED_RUNS;
 use slices::SliceService;
 
 /// Answers HTTP on an engine's socket; a connection is one request.
-pub(crate) async fn serve(service: QueryService, listener: UnixListener) -> Result<(), Error> {
+pub(crate) async fn serve_http_socket(service: QueryService, listener: UnixListener) -> Result<(), Error> {
     let router = engine_router(&service);
     loop {
         let (stream, _) = listener.accept().await.map_err(Error::System)?;
         let answers = TowerToHyperService::new(router.clone());
-        let guard = service.activity().enter();
+        let guard = service.activity().begin_work();
         tokio::spawn(async move {
             let _guard = guard;
             // A connection that breaks off is the door's matter.
@@ -67,15 +67,15 @@ pub(crate) async fn serve(service: QueryService, listener: UnixListener) -> Resu
 fn engine_router(service: &QueryService) -> Router {
     let catalogue = LakeCatalogue::new(service.clone());
     let slices = SliceService::new(&catalogue);
-    let files = files::own_routes().merge(manifest::routes());
-    let own = Router::from(sql::routes())
+    let files = files::own_routes().merge(manifest::manifest_routes());
+    let own = Router::from(sql::sql_routes())
         .with_state(service.clone())
-        .merge(catalogue.router())
+        .merge(catalogue.endpoint_router())
         .merge(Router::from(files).with_state(catalogue.clone()))
-        .merge(of_protocol(ServerProtocol::Mcp, mcp::routes(&catalogue, &slices)))
+        .merge(of_protocol(ServerProtocol::Mcp, mcp::agent_routes(&catalogue, &slices)))
         .layer(from_fn_with_state(service.is_open(), guard::own_pages_only));
     let viewers = Router::from(files::viewer_routes()).with_state(catalogue.clone());
-    let all = own.merge(viewers).merge(slices::for_viewers(slices)).fallback(nothing);
+    let all = own.merge(viewers).merge(slices::for_viewers(slices)).fallback(refuse_unknown_path);
     with_refusals(all).layer(from_fn(trace_request))
 }
 
@@ -93,11 +93,11 @@ pub(crate) fn door_router(door: &ServerDoor) -> Router {
     let forwarded = ["/api/{*path}", MCP]
         .into_iter()
         .fold(Router::new(), |router, path| router.route(path, any(ServerDoor::forward_http)));
-    let forwarded = forwarded.merge(viewers.layer(ranges::cors()));
+    let forwarded = forwarded.merge(viewers.layer(ranges::cors_layer()));
     #[cfg(feature = "web")]
-    let rest = pages::fallback;
+    let rest = pages::serve_page;
     #[cfg(not(feature = "web"))]
-    let rest = nothing;
+    let rest = refuse_unknown_path;
     let all =
         own.merge(forwarded).with_state(door.clone()).merge(layout::for_viewers(door.layout().clone())).fallback(rest);
     let all = with_refusals(all.layer(from_fn_with_state(door.clone(), health::refuse_while_draining)));
@@ -107,9 +107,9 @@ pub(crate) fn door_router(door: &ServerDoor) -> Router {
 // What the door answers itself, but for pages and the layout.
 fn door_routes() -> OpenApiRouter<ServerDoor> {
     OpenApiRouter::new()
-        .routes(routes!(session::post))
-        .routes(routes!(queries::cancel))
-        .routes(routes!(openapi::get))
+        .routes(routes!(session::post_session))
+        .routes(routes!(queries::post_cancellation))
+        .routes(routes!(openapi::get_openapi))
         .routes(routes!(health::metrics))
         .routes(routes!(health::health))
         .routes(routes!(health::ready))
@@ -117,12 +117,12 @@ fn door_routes() -> OpenApiRouter<ServerDoor> {
 
 // The contract of all routes: of those whose answers to GET have an ETag, and of the others.
 fn contract_parts() -> [OpenApi; 2] {
-    let files = files::viewer_routes().merge(files::own_routes()).merge(manifest::routes());
+    let files = files::viewer_routes().merge(files::own_routes()).merge(manifest::manifest_routes());
     let mut validated = catalogue::table_routes().merge(catalogue::file_routes()).into_openapi();
-    validated.merge(layout::routes().into_openapi());
+    validated.merge(layout::layout_routes().into_openapi());
     validated.merge(files.into_openapi());
-    let mut others = sql::routes().into_openapi();
-    others.merge(slices::routes().into_openapi());
+    let mut others = sql::sql_routes().into_openapi();
+    others.merge(slices::slice_routes().into_openapi());
     others.merge(door_routes().into_openapi());
     [validated, others]
 }
@@ -130,11 +130,11 @@ fn contract_parts() -> [OpenApi; 2] {
 fn with_refusals(router: Router) -> Router {
     router
         .method_not_allowed_fallback(problem::refuse_method)
-        .layer(CatchPanicLayer::custom(|_| ProblemResponse(RequestFault::Internal).answer()))
+        .layer(CatchPanicLayer::custom(|_| ProblemResponse(RequestFault::Internal).to_response()))
         .layer(map_response(guard::security_headers))
 }
 
-async fn nothing() -> ProblemResponse {
+async fn refuse_unknown_path() -> ProblemResponse {
     ProblemResponse(RequestFault::NotFound {
         what: "this path".to_owned(),
         hint: "GET /api/v1/openapi.json lists what there is",

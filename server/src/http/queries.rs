@@ -4,7 +4,7 @@ use axum::extract::rejection::PathRejection;
 use axum::extract::{Path, State};
 use axum::http::{HeaderMap, StatusCode};
 
-use super::guard::authenticate;
+use super::guard::authenticate_client;
 use super::problem::ProblemResponse;
 use crate::client_identity::ClientIdentity;
 use crate::door::server_door::ServerDoor;
@@ -21,7 +21,7 @@ use crate::fault::RequestFault;
     params(("id" = u64, Path, description = "Number of the query")),
     responses((status = 202, description = "It is being ended"))
 )]
-pub(super) async fn cancel(
+pub(super) async fn post_cancellation(
     State(door): State<ServerDoor>,
     id: Result<Path<u64>, PathRejection>,
     headers: HeaderMap,
@@ -36,8 +36,8 @@ async fn cancel_query(
     id: Result<Path<u64>, PathRejection>,
     headers: &HeaderMap,
 ) -> Result<(), RequestFault> {
-    let client = authenticate(door.access(), headers, ClientIdentity::programs)?;
+    let client = authenticate_client(door.access(), headers, ClientIdentity::local_programs)?;
     let Path(id) =
-        id.map_err(|_| RequestFault::request("a query has a number; hint: select id from system.queries"))?;
+        id.map_err(|_| RequestFault::bad_request("a query has a number; hint: select id from system.queries"))?;
     door.cancel_query(&client, id).await
 }
