@@ -63,8 +63,8 @@ fn main() -> ExitCode {
 }
 
 fn embed_pages() -> Result<(), String> {
-    let web = variable("CARGO_MANIFEST_DIR")?.join("../web");
-    let out = variable("OUT_DIR")?;
+    let web = cargo_variable("CARGO_MANIFEST_DIR")?.join("../web");
+    let out = cargo_variable("OUT_DIR")?;
     let prebuilt = web.join(PREBUILT);
     if prebuilt.is_dir() {
         println!("cargo::rerun-if-changed={}", prebuilt.display());
@@ -81,8 +81,8 @@ fn embed_pages() -> Result<(), String> {
 
 fn embed_manual() -> Result<(), String> {
     println!("cargo::rerun-if-env-changed={MANUAL}");
-    let prebuilt = variable("CARGO_MANIFEST_DIR")?.join("../docs").join(PREBUILT);
-    let list = variable("OUT_DIR")?.join("manual.rs");
+    let prebuilt = cargo_variable("CARGO_MANIFEST_DIR")?.join("../docs").join(PREBUILT);
+    let list = cargo_variable("OUT_DIR")?.join("manual.rs");
     let built = env::var_os(MANUAL).map(PathBuf::from).or_else(|| prebuilt.is_dir().then_some(prebuilt));
     let Some(manual) = built else { return fs::write(list, "&[]").map_err(|e| e.to_string()) };
     println!("cargo::rerun-if-changed={}", manual.display());
@@ -93,7 +93,8 @@ fn embed_manual() -> Result<(), String> {
 }
 
 fn write_list(pages: &Path, to: &Path) -> Result<(), String> {
-    let list = list(pages).map_err(|e| format!("the files in {} cannot be listed: {e}", pages.display()))?;
+    let list =
+        render_file_list(pages).map_err(|e| format!("the files in {} cannot be listed: {e}", pages.display()))?;
     fs::write(to, list).map_err(|e| e.to_string())
 }
 
@@ -103,10 +104,10 @@ fn build_pages(web: &Path, out: &Path) -> Result<PathBuf, String> {
     copy_sources(web, &copy).map_err(|e| format!("their sources cannot be copied to {}: {e}", copy.display()))?;
     let lock = fs::read(copy.join(LOCK)).map_err(|e| format!("there is no {LOCK}: {e}"))?;
     if fs::read(copy.join(INSTALLED)).ok().as_ref() != Some(&lock) {
-        npm(&copy, &["ci", "--no-audit", "--no-fund"])?;
+        run_npm(&copy, &["ci", "--no-audit", "--no-fund"])?;
         fs::write(copy.join(INSTALLED), &lock).map_err(|e| e.to_string())?;
     }
-    npm(&copy, &["run", "build"])?;
+    run_npm(&copy, &["run", "build"])?;
     Ok(copy.join("dist"))
 }
 
@@ -149,7 +150,7 @@ fn leave_out_pages(why: &str) -> Result<(), String> {
     Ok(())
 }
 
-fn variable(name: &str) -> Result<PathBuf, String> {
+fn cargo_variable(name: &str) -> Result<PathBuf, String> {
     env::var_os(name).map(PathBuf::from).ok_or_else(|| format!("cargo sets no {name}"))
 }
 
@@ -178,7 +179,7 @@ fn copy_all(from: &Path, to: &Path) -> io::Result<()> {
     Ok(())
 }
 
-fn npm(folder: &Path, args: &[&str]) -> Result<(), String> {
+fn run_npm(folder: &Path, args: &[&str]) -> Result<(), String> {
     let output = Command::new(NPM).args(args).current_dir(folder).output().map_err(|e| format!("npm: {e}"))?;
     if output.status.success() {
         return Ok(());
@@ -188,9 +189,9 @@ fn npm(folder: &Path, args: &[&str]) -> Result<(), String> {
 }
 
 // An array of what is built; what was packed beside it is named with it.
-fn list(dist: &Path) -> io::Result<String> {
+fn render_file_list(dist: &Path) -> io::Result<String> {
     let mut files = Vec::new();
-    find(dist, &mut files)?;
+    collect_files(dist, &mut files)?;
     files.sort();
     let mut list = String::from("&[\n");
     for file in &files {
@@ -213,10 +214,10 @@ fn list(dist: &Path) -> io::Result<String> {
     Ok(list)
 }
 
-fn find(folder: &Path, files: &mut Vec<PathBuf>) -> io::Result<()> {
+fn collect_files(folder: &Path, files: &mut Vec<PathBuf>) -> io::Result<()> {
     for entry in fs::read_dir(folder)? {
         let path = entry?.path();
-        if path.is_dir() { find(&path, files)? } else { files.push(path) }
+        if path.is_dir() { collect_files(&path, files)? } else { files.push(path) }
     }
     Ok(())
 }

@@ -150,10 +150,10 @@ pub(crate) enum LakeCommand {
 
 impl CliArguments {
     /// Gives up what the command does not need. To be called before there are threads.
-    pub(crate) fn confine(&self) -> anyhow::Result<()> {
+    pub(crate) fn confine_process(&self) -> anyhow::Result<()> {
         match &self.command {
             #[cfg(feature = "lake")]
-            CliCommand::Lake(LakeCommand::Engine(args)) => args.confine(&self.lake),
+            CliCommand::Lake(LakeCommand::Engine(args)) => args.confine_process(&self.lake),
             _ => Ok(()),
         }
     }
@@ -165,18 +165,18 @@ impl CliArguments {
     }
 
     /// Runs the command.
-    pub(crate) async fn run(self) -> anyhow::Result<CommandOutcome> {
+    pub(crate) async fn run_command(self) -> anyhow::Result<CommandOutcome> {
         let lake = &self.lake;
         match &self.command {
             #[cfg(feature = "lake")]
-            CliCommand::Lake(command) => command.run(lake).await,
-            CliCommand::Acquire(args) => acquire::run(args, lake).await,
-            CliCommand::Panel(args) => panel::run(args),
-            CliCommand::Replay(args) => replay::run(args, lake).await,
-            CliCommand::Recover(args) => recover::run(args),
+            CliCommand::Lake(command) => command.run_command(lake).await,
+            CliCommand::Acquire(args) => acquire::run_acquire(args, lake).await,
+            CliCommand::Panel(args) => panel::run_panel(args),
+            CliCommand::Replay(args) => replay::run_replay(args, lake).await,
+            CliCommand::Recover(args) => recover::run_recover(args),
             #[cfg(feature = "upload")]
-            CliCommand::Upload(args) => upload::run(args, lake).await,
-            CliCommand::Doctor(args) => doctor::run(args, lake).await,
+            CliCommand::Upload(args) => upload::run_upload(args, lake).await,
+            CliCommand::Doctor(args) => doctor::run_doctor(args, lake).await,
             CliCommand::Completions { shell } => {
                 clap_complete::generate(*shell, &mut Self::command(), "echolake", &mut std::io::stdout());
                 Ok(CommandOutcome::Whole)
@@ -193,25 +193,25 @@ impl CliArguments {
 
 #[cfg(feature = "lake")]
 impl LakeCommand {
-    async fn run(&self, lake: &str) -> anyhow::Result<CommandOutcome> {
+    async fn run_command(&self, lake: &str) -> anyhow::Result<CommandOutcome> {
         match self {
-            Self::Demo(args) => demo::run(args, lake).await,
-            Self::Campaign(command) => campaign::run(command, lake).await,
-            Self::Import(args) => import::run(args, lake).await,
-            Self::Ingest(args) => ingest::run(args, lake).await,
-            Self::Remove(args) => remove::run(args, lake).await,
-            Self::Rebuild(args) => rebuild::run(args, lake).await,
-            Self::Sql(args) => sql::run(args, lake).await.map(|()| CommandOutcome::Whole),
-            Self::Export(args) => export::run(args, lake).await,
-            Self::Figure(args) => figure::run(args, lake).await,
-            Self::Serve(args) => serve::run(args, lake).await,
-            Self::Mcp(args) => mcp::run(args, lake).await,
-            Self::Engine(args) => serve::engine(args, lake).await,
-            Self::Certificate(args) => serve::certificate(args),
-            Self::Token { name, days, project, scopes } => serve::token(name, *days, project, scopes),
-            Self::Optimize(args) => optimize::run(args, lake).await,
-            Self::Twin(args) => twin::run(args, lake).await,
-            Self::Vacuum(args) => vacuum::run(args, lake).await,
+            Self::Demo(args) => demo::run_demo(args, lake).await,
+            Self::Campaign(command) => campaign::run_campaign(command, lake).await,
+            Self::Import(args) => import::run_import(args, lake).await,
+            Self::Ingest(args) => ingest::run_ingest(args, lake).await,
+            Self::Remove(args) => remove::run_remove(args, lake).await,
+            Self::Rebuild(args) => rebuild::run_rebuild(args, lake).await,
+            Self::Sql(args) => sql::run_sql(args, lake).await.map(|()| CommandOutcome::Whole),
+            Self::Export(args) => export::run_export(args, lake).await,
+            Self::Figure(args) => figure::run_figure(args, lake).await,
+            Self::Serve(args) => serve::run_serve(args, lake).await,
+            Self::Mcp(args) => mcp::run_mcp(args, lake).await,
+            Self::Engine(args) => serve::serve_engine(args, lake).await,
+            Self::Certificate(args) => serve::write_certificate(args),
+            Self::Token { name, days, project, scopes } => serve::print_token(name, *days, project, scopes),
+            Self::Optimize(args) => optimize::run_optimize(args, lake).await,
+            Self::Twin(args) => twin::run_twin(args, lake).await,
+            Self::Vacuum(args) => vacuum::run_vacuum(args, lake).await,
         }
     }
 }

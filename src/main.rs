@@ -63,7 +63,8 @@ fn main() -> ExitCode {
             .max_blocking_threads(BLOCKING_THREADS)
             .build()
     };
-    let outcome = cli.confine().and_then(|()| Ok(runtime()?)).and_then(|runtime| runtime.block_on(run(cli)));
+    let outcome =
+        cli.confine_process().and_then(|()| Ok(runtime()?)).and_then(|runtime| runtime.block_on(run_cli(cli)));
     match outcome {
         Ok(CommandOutcome::Whole) => ExitCode::SUCCESS,
         Ok(CommandOutcome::WithLoss) => ExitCode::from(DONE_WITH_LOSS),
@@ -75,7 +76,7 @@ fn main() -> ExitCode {
     }
 }
 
-async fn run(cli: cli::CliArguments) -> anyhow::Result<CommandOutcome> {
+async fn run_cli(cli: cli::CliArguments) -> anyhow::Result<CommandOutcome> {
     #[cfg(feature = "otlp")]
     let export = if cli.answers_clients() { span_export::SpanExport::start()? } else { None };
     #[cfg(feature = "otlp")]
@@ -83,7 +84,7 @@ async fn run(cli: cli::CliArguments) -> anyhow::Result<CommandOutcome> {
     #[cfg(not(feature = "otlp"))]
     let spans = None;
     logging::start_log(cli.log_format, spans);
-    cli.run().await
+    cli.run_command().await
 }
 
 // The reader that closed the pipe wants no more.

@@ -40,7 +40,7 @@ impl CommandProgress {
     }
 
     /// A task of `total` units.
-    pub(crate) fn task(&self, name: impl Into<String>, total: u64, unit: &'static str) -> TaskProgress {
+    pub(crate) fn start_task(&self, name: impl Into<String>, total: u64, unit: &'static str) -> TaskProgress {
         let name = name.into();
         let pace = Arc::<Mutex<String>>::default();
         let bar = self.bars.as_ref().map(|bars| {
@@ -53,7 +53,7 @@ impl CommandProgress {
     }
 
     /// Prints a line among the bars.
-    pub(crate) fn say(&self, line: impl AsRef<str>) {
+    pub(crate) fn print_message(&self, line: impl AsRef<str>) {
         match &self.bars {
             Some(bars) => bars.suspend(|| eprintln!("{}", line.as_ref())),
             None => eprintln!("{}", line.as_ref()),
@@ -68,7 +68,7 @@ impl TaskProgress {
     }
 
     /// Sets the number of units that are done.
-    pub(crate) fn at(&mut self, done: u64) {
+    pub(crate) fn set_done(&mut self, done: u64) {
         match &self.bar {
             Some(bar) => {
                 let bar = bar.clone();
@@ -96,7 +96,7 @@ impl TaskProgress {
     }
 
     /// Prints a line that stays.
-    pub(crate) fn say(&self, line: &str) {
+    pub(crate) fn print_message(&self, line: &str) {
         match &self.bar {
             Some(bar) => bar.suspend(|| eprintln!("{line}")),
             None => eprintln!("{}: {line}", self.name),
@@ -104,7 +104,7 @@ impl TaskProgress {
     }
 
     /// Shows a remark below the bar, or in the line.
-    pub(crate) fn note(&mut self, note: String) {
+    pub(crate) fn set_note(&mut self, note: String) {
         if let Some(bar) = &self.bar {
             if self.note.is_empty() {
                 bar.set_style(bar_style(self.unit, BarLines::Two, &self.pace));
@@ -130,7 +130,7 @@ impl TaskProgress {
     }
 
     /// Ends the task, with `what` as its result.
-    pub(crate) fn done(self, what: impl AsRef<str>) {
+    pub(crate) fn finish_with(self, what: impl AsRef<str>) {
         if let Some(bar) = &self.bar {
             bar.finish_and_clear();
         }
@@ -276,13 +276,13 @@ mod tests {
             let text: Vec<char> = terminal.text().chars().filter(|c| *c != '\n').collect();
             text.chunks(80).map(|line| line.iter().collect::<String>().trim_end().to_owned()).collect::<Vec<_>>()
         };
-        let mut task = progress.task("0015_0", 2951, "pairs");
+        let mut task = progress.start_task("0015_0", 2951, "pairs");
         task.begin_at(413);
-        task.note("pair 2102 (microphone 41, speaker 29), SNR 66.0 dB, 1 repeated, 0 given up".to_owned());
+        task.set_note("pair 2102 (microphone 41, speaker 29), SNR 66.0 dB, 1 repeated, 0 given up".to_owned());
         let shown = drawing(&task);
         assert!(shown[0].ends_with("413/2951 pairs"), "{shown:?}");
         task.first = Some((Instant::now() - Duration::from_secs(100), 413));
-        task.at(1413);
+        task.set_done(1413);
         let shown = drawing(&task);
         assert_eq!(shown.len(), 2, "{shown:?}");
         assert!(shown[0].contains("████") && shown[0].contains("48 % 1413/2951 pairs, 10/s, ends "), "{shown:?}");

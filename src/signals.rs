@@ -34,7 +34,7 @@ impl StopRequest {
     /// # Errors
     /// The system refused a handler.
     pub(crate) fn listen(reply: impl Display + Send + 'static) -> anyhow::Result<Self> {
-        let mut signals = StopSignals::register()?;
+        let mut signals = StopSignals::register_handlers()?;
         let request = Self { flag: Arc::new(AtomicBool::new(false)), made: Arc::new(Notify::new()) };
         let listener = request.clone();
         tokio::spawn(async move {
@@ -60,7 +60,7 @@ impl StopRequest {
     }
 
     /// Waits until the request is made.
-    pub(crate) async fn wait(&self) {
+    pub(crate) async fn wait_until_made(&self) {
         // Hears of a request from here on, so that none falls between the look and the wait.
         let made = self.made.notified();
         if !self.is_made() {
@@ -70,7 +70,7 @@ impl StopRequest {
 }
 
 impl StopSignals {
-    fn register() -> anyhow::Result<Self> {
+    fn register_handlers() -> anyhow::Result<Self> {
         let terminations = signal(SignalKind::terminate()).context("cannot listen to SIGTERM")?;
         Ok(Self { interrupts: interrupt_signal()?, terminations })
     }

@@ -43,7 +43,7 @@ fn a_room_s_impulse_response_is_asked_for_in_sql() {
 #[test]
 fn the_published_combinations_are_the_built_in_pairs() {
     let Some(path) = shared_data("gir/combinations.csv") else { return };
-    let grid = echolake_schema::Rig::paper().grid().expect("the built-in rig is valid");
+    let grid = echolake_schema::Rig::paper().build_grid().expect("the built-in rig is valid");
     let text = std::fs::read_to_string(path).expect("read");
     let mut seen = std::collections::BTreeSet::new();
     for line in text.lines().skip(1) {

@@ -14,7 +14,7 @@ pub fn free_bytes(path: &Path) -> io::Result<u64> {
 }
 
 /// Waits until a file's content, or a folder's entries, are on the disk.
-pub(crate) fn sync(path: &Path) -> io::Result<()> {
+pub(crate) fn sync_to_disk(path: &Path) -> io::Result<()> {
     File::open(path)?.sync_all()
 }
 

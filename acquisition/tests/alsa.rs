@@ -91,8 +91,8 @@ impl AudioInterface for Rewired {
         self.inner.play_and_record(output, take)
     }
 
-    fn notices(&mut self) -> Vec<String> {
-        self.inner.notices()
+    fn take_notices(&mut self) -> Vec<String> {
+        self.inner.take_notices()
     }
 }
 
@@ -118,7 +118,7 @@ fn sweep() -> Vec<f32> {
 
 fn checks(folder: &Path) {
     for format in [AudioFormat::S32, AudioFormat::S24, AudioFormat::S24Packed] {
-        conformance::audio(&mut Rewired::new(folder, format, CableState::Plugged));
+        conformance::check_audio(&mut Rewired::new(folder, format, CableState::Plugged));
         takes_are_exact_to_the_sample(folder, format);
     }
     faults_are_named(folder);
@@ -139,7 +139,7 @@ fn takes_are_exact_to_the_sample(folder: &Path, format: AudioFormat) {
     let played = std::fs::read(folder.join("out.raw")).expect("what was played");
     assert_eq!(&played[..expected.len()], expected, "{format:?}");
     assert!(played[expected.len()..].iter().all(|byte| *byte == 0));
-    assert!(audio.notices().is_empty());
+    assert!(audio.take_notices().is_empty());
 }
 
 fn faults_are_named(folder: &Path) {
@@ -150,7 +150,7 @@ fn faults_are_named(folder: &Path) {
     check(&mut Rewired::new(folder, AudioFormat::S32, CableState::Missing), "is its cable plugged in");
     let mut leaking = Rewired::new(folder, AudioFormat::S32, CableState::Leaking);
     check(&mut leaking, "2 takes in a row have gaps, the last: 1 samples went missing or came twice");
-    assert_eq!(leaking.notices().len(), 1);
+    assert_eq!(leaking.take_notices().len(), 1);
 
     let refused = |params: AlsaParams, rate_hz: f64, expected: &str| {
         let error = audio_interface(&params, rate_hz).err().expect(expected).to_string();

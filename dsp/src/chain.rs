@@ -3,10 +3,10 @@
 use echolake_schema::SpectralDivision;
 
 use crate::deconvolution::{DeconvolutionParams, TransformLength};
-use crate::energy::{accumulate, energy, tnce_over_band};
+use crate::energy::{accumulate_energy, energy, tnce_over_band};
 use crate::error::check_len;
 use crate::filter_bank::{FilterBankPlan, FilterBankScratch};
-use crate::foam::subtract;
+use crate::foam::subtract_foam;
 use crate::response_deconvolution::{ResponseDeconvolution, ResponseScratch};
 use crate::rise::{CurveShape, curve_shape};
 use crate::temperature::{TemperatureCorrection, resampling_ratio, response_limits_hz};
@@ -76,10 +76,10 @@ impl<T: RealSample> MeasurementPlan<T> {
         })
     }
 
-    /// Buffers for [`Self::ir`]; one per thread.
-    pub fn scratch(&self) -> MeasurementScratch<T> {
+    /// Buffers for [`Self::compute_ir`]; one per thread.
+    pub fn make_scratch(&self) -> MeasurementScratch<T> {
         let raw = vec![T::default(); self.deconvolution.output_len()];
-        MeasurementScratch { deconvolution: self.deconvolution.scratch(), raw }
+        MeasurementScratch { deconvolution: self.deconvolution.make_scratch(), raw }
     }
 
     /// The response of one measurement at the reference temperature.
@@ -87,7 +87,7 @@ impl<T: RealSample> MeasurementPlan<T> {
     /// # Errors
     /// As [`ResponseDeconvolution::run_within`], and [`Error::Setting`] for a temperature outside of -60 to 80 C: the
     /// plan has deconvolved too little for it.
-    pub fn ir(
+    pub fn compute_ir(
         &self,
         recording: &[T],
         loopback: &[T],
@@ -97,10 +97,10 @@ impl<T: RealSample> MeasurementPlan<T> {
     ) -> Result<(), Error> {
         check_len("the response", ir.len(), self.ir_len)?;
         check_celsius("the temperature (C)", celsius)?;
-        let limits_hz = response_limits_hz(self.range_hz, self.correction.ratio(celsius));
+        let limits_hz = response_limits_hz(self.range_hz, self.correction.time_ratio(celsius));
         let (raw, deconvolution) = (&mut scratch.raw, &mut scratch.deconvolution);
         self.deconvolution.run_within(limits_hz, recording, loopback, raw, deconvolution)?;
-        self.correction.run(raw, celsius, ir);
+        self.correction.correct_response(raw, celsius, ir);
         Ok(())
     }
 }
@@ -117,7 +117,7 @@ impl<T: RealSample> MeasurementPlan<T> {
 ///
 /// let correction = ResponseCorrection::<f64>::new(20.0, SpectralDivision::Tapered);
 /// let (raw, mut corrected) = ([0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.0, 0.0], [0.0; 8]);
-/// correction.run(&raw, 26.0, &mut corrected);
+/// correction.correct_response(&raw, 26.0, &mut corrected);
 /// assert!((corrected.iter().sum::<f64>() - 3.0).abs() < 0.01);
 /// ```
 pub struct ResponseCorrection<T: RealSample> {
@@ -134,16 +134,16 @@ impl<T: RealSample> ResponseCorrection<T> {
     }
 
     /// Returns the ratio by which times grow, of a response in air of a temperature in C.
-    pub fn ratio(&self, celsius: f64) -> f64 {
+    pub fn time_ratio(&self, celsius: f64) -> f64 {
         resampling_ratio(celsius, self.reference_celsius)
     }
 
     /// Corrects one response.
     ///
     /// raw `[any]`, corrected `[wanted]`  from the same instant
-    pub fn run(&self, raw: &[T], celsius: f64, corrected: &mut [T]) {
-        let rho = self.ratio(celsius);
-        self.correction.run(raw, rho, corrected);
+    pub fn correct_response(&self, raw: &[T], celsius: f64, corrected: &mut [T]) {
+        let rho = self.time_ratio(celsius);
+        self.correction.correct_response(raw, rho, corrected);
         if self.keeps_spectrum {
             let factor = T::of(rho.recip());
             corrected.iter_mut().for_each(|sample| *sample = *sample * factor);
@@ -201,8 +201,8 @@ pub struct FlatEnergies {
 /// let mut flat = vec![0.0; 384];
 /// flat[100] = 1.0;
 /// let (foam, ir) = (vec![0.0; 384], flat.iter().map(|x| 0.5 * x).collect::<Vec<f64>>());
-/// let mut derived = plan.derived();
-/// plan.run(&ir, &foam, &flat, &mut derived, &mut plan.scratch())?;
+/// let mut derived = plan.make_derived();
+/// plan.derive_response(&ir, &foam, &flat, &mut derived, &mut plan.make_scratch())?;
 /// assert!((derived.total - 0.25).abs() < 1e-9);
 /// # Ok::<(), echolake_dsp::Error>(())
 /// ```
@@ -226,19 +226,19 @@ impl<T: RealSample> DerivationPlan<T> {
         Ok(Self { bank: FilterBankPlan::new(len, rate_hz, centres_hz)? })
     }
 
-    /// Buffers for [`Self::run`]; one per thread.
-    pub fn scratch(&self) -> DerivationScratch<T> {
-        let (bands, len) = (self.bank.bands(), self.bank.len());
+    /// Buffers for [`Self::derive_response`]; one per thread.
+    pub fn make_scratch(&self) -> DerivationScratch<T> {
+        let (bands, len) = (self.bank.band_count(), self.bank.len());
         DerivationScratch {
-            bank: self.bank.scratch(),
+            bank: self.bank.make_scratch(),
             bands: vec![T::default(); bands * len],
             flat: FlatEnergies { total: 0.0, bands: vec![0.0; bands] },
         }
     }
 
     /// A place for results, which runs fill again and again.
-    pub fn derived(&self) -> DerivedResponse<T> {
-        let (bands, len) = (self.bank.bands(), self.bank.len());
+    pub fn make_derived(&self) -> DerivedResponse<T> {
+        let (bands, len) = (self.bank.band_count(), self.bank.len());
         DerivedResponse {
             reflected: vec![T::default(); len],
             curves: vec![T::default(); bands * len],
@@ -264,7 +264,7 @@ impl<T: RealSample> DerivationPlan<T> {
     ///
     /// # Errors
     /// [`Error::Length`] or [`Error::NotFinite`].
-    pub fn run(
+    pub fn derive_response(
         &self,
         ir: &[T],
         foam: &[T],
@@ -273,12 +273,12 @@ impl<T: RealSample> DerivationPlan<T> {
         scratch: &mut DerivationScratch<T>,
     ) -> Result<(), Error> {
         self.measure_flat(flat, scratch)?;
-        self.filter(ir, foam, derived, scratch)?;
+        self.filter_reflected(ir, foam, derived, scratch)?;
         put_over(&scratch.flat, &scratch.bands, derived);
         Ok(())
     }
 
-    /// Derives as [`Self::run`] does, over energies of Flat that are known already.
+    /// Derives as [`Self::derive_response`] does, over energies of Flat that are known already.
     ///
     /// # Errors
     /// [`Error::Length`] or [`Error::NotFinite`].
@@ -290,8 +290,8 @@ impl<T: RealSample> DerivationPlan<T> {
         derived: &mut DerivedResponse<T>,
         scratch: &mut DerivationScratch<T>,
     ) -> Result<(), Error> {
-        check_len("Flat's energies", flat.bands.len(), self.bank.bands())?;
-        self.filter(ir, foam, derived, scratch)?;
+        check_len("Flat's energies", flat.bands.len(), self.bank.band_count())?;
+        self.filter_reflected(ir, foam, derived, scratch)?;
         put_over(flat, &scratch.bands, derived);
         Ok(())
     }
@@ -310,8 +310,8 @@ impl<T: RealSample> DerivationPlan<T> {
         check_len("the response", ir.len(), self.bank.len())?;
         check_len("the direct sound", direct.len(), self.bank.len())?;
         let reflected = &mut scratch.bands[..ir.len()];
-        subtract(ir, direct, reflected);
-        self.bank.energies(reflected, energies, &mut scratch.bank)
+        subtract_foam(ir, direct, reflected);
+        self.bank.compute_energies(reflected, energies, &mut scratch.bank)
     }
 
     /// Computes what errors of the direct sound, and warmer air by its relative change of each bin, do to the energies
@@ -319,7 +319,7 @@ impl<T: RealSample> DerivationPlan<T> {
     ///
     /// # Errors
     /// [`Error::Length`] or [`Error::NotFinite`].
-    pub fn sensitivities(
+    pub fn compute_sensitivities(
         &self,
         reflected: &[T],
         direct: &[T],
@@ -327,7 +327,7 @@ impl<T: RealSample> DerivationPlan<T> {
         sensitivities: &mut [EnergySensitivity],
         scratch: &mut DerivationScratch<T>,
     ) -> Result<(), Error> {
-        self.bank.sensitivities(reflected, direct, per_kelvin, sensitivities, &mut scratch.bank)
+        self.bank.compute_sensitivities(reflected, direct, per_kelvin, sensitivities, &mut scratch.bank)
     }
 
     /// Computes the power spectrum of a response, `[len / 2 + 1]`, and adds it to one.
@@ -346,10 +346,10 @@ impl<T: RealSample> DerivationPlan<T> {
     fn measure_flat(&self, flat: &[T], scratch: &mut DerivationScratch<T>) -> Result<(), Error> {
         check_len("Flat's response", flat.len(), self.bank.len())?;
         scratch.flat.total = energy(flat);
-        self.bank.energies(flat, &mut scratch.flat.bands, &mut scratch.bank)
+        self.bank.compute_energies(flat, &mut scratch.flat.bands, &mut scratch.bank)
     }
 
-    fn filter(
+    fn filter_reflected(
         &self,
         ir: &[T],
         foam: &[T],
@@ -358,8 +358,8 @@ impl<T: RealSample> DerivationPlan<T> {
     ) -> Result<(), Error> {
         check_len("the response", ir.len(), self.bank.len())?;
         check_len("Foam's response", foam.len(), self.bank.len())?;
-        subtract(ir, foam, &mut derived.reflected);
-        self.bank.run(&derived.reflected, &mut scratch.bands, &mut scratch.bank)
+        subtract_foam(ir, foam, &mut derived.reflected);
+        self.bank.split_bands(&derived.reflected, &mut scratch.bands, &mut scratch.bank)
     }
 }
 
@@ -367,7 +367,7 @@ fn put_over<T: RealSample>(flat: &FlatEnergies, bands: &[T], derived: &mut Deriv
     let (len, factor) = (derived.reflected.len(), flat.total.recip());
     let curves = bands.chunks_exact(len).zip(derived.curves.chunks_exact_mut(len));
     for ((band, curve), energy) in curves.zip(&mut derived.energies) {
-        *energy = accumulate(band, factor, curve);
+        *energy = accumulate_energy(band, factor, curve);
     }
     derived.tnce.iter_mut().zip(&derived.energies).for_each(|(tnce, energy)| *tnce = energy * factor);
     derived.total = derived.tnce.iter().sum();
@@ -405,14 +405,14 @@ mod tests {
     #[test]
     fn temperatures_that_the_plan_is_not_for_are_refused() {
         let plan = MeasurementPlan::<f64>::new(&params()).expect("a plan");
-        let (mut ir, mut scratch) = (vec![0.0; 384], plan.scratch());
+        let (mut ir, mut scratch) = (vec![0.0; 384], plan.make_scratch());
         for bad in [-61.0, 81.0, -273.15, -300.0, 400.0, f64::NAN, f64::INFINITY] {
-            let result = plan.ir(&noise(), &noise(), bad, &mut ir, &mut scratch);
+            let result = plan.compute_ir(&noise(), &noise(), bad, &mut ir, &mut scratch);
             assert!(matches!(result, Err(Error::Setting { .. })), "{bad}: {result:?}");
             assert!(MeasurementPlan::<f64>::new(&MeasurementParams { reference_celsius: bad, ..params() }).is_err());
         }
         for good in [-60.0, 80.0] {
-            plan.ir(&noise(), &noise(), good, &mut ir, &mut scratch).expect("a response");
+            plan.compute_ir(&noise(), &noise(), good, &mut ir, &mut scratch).expect("a response");
             assert!(ir.iter().all(|x| x.is_finite()), "{good}");
         }
     }
@@ -432,13 +432,14 @@ mod tests {
         let (plan, bands) = (MeasurementPlan::<f64>::new(&params).expect("a plan"), [2_500.0, 5e3, 10e3, 20e3, 40e3]);
         let response = |reflections: &[(usize, f64)]| {
             let mut ir = vec![0.0; 384];
-            plan.ir(&heard(reflections), &loopback, 21.3, &mut ir, &mut plan.scratch()).expect("a response");
+            plan.compute_ir(&heard(reflections), &loopback, 21.3, &mut ir, &mut plan.make_scratch())
+                .expect("a response");
             ir
         };
         let (flat, relief) = (response(&[(90, 1.0)]), response(&[(84, 0.4), (93, -0.3), (101, 0.5), (160, 0.1)]));
         let plan = DerivationPlan::new(384, 96e3, &bands).expect("a plan");
-        let mut derived = plan.derived();
-        plan.run(&relief, &[0.0; 384], &flat, &mut derived, &mut plan.scratch()).expect("derived");
+        let mut derived = plan.make_derived();
+        plan.derive_response(&relief, &[0.0; 384], &flat, &mut derived, &mut plan.make_scratch()).expect("derived");
         derived.tnce.iter().chain([&derived.total]).map(|tnce| 10.0 * tnce.log10()).collect()
     }
 
@@ -489,13 +490,13 @@ mod tests {
             let response = |reflections: &[(f64, f64)], celsius: f64| {
                 let (mut ir, rho) = (vec![0.0; 384], resampling_ratio(celsius, 20.0));
                 let recording = heard(reflections, rho);
-                plan.ir(&recording, &loopback, celsius, &mut ir, &mut plan.scratch()).expect("a response");
+                plan.compute_ir(&recording, &loopback, celsius, &mut ir, &mut plan.make_scratch()).expect("a response");
                 ir
             };
             let plan = DerivationPlan::new(384, 96e3, &[2_500.0, 5e3, 10e3, 20e3, 40e3]).expect("a plan");
-            let mut derived = plan.derived();
+            let mut derived = plan.make_derived();
             let (relief, flat) = (response(&relief, celsius), response(&flat, 20.0));
-            plan.run(&relief, &[0.0; 384], &flat, &mut derived, &mut plan.scratch()).expect("derived");
+            plan.derive_response(&relief, &[0.0; 384], &flat, &mut derived, &mut plan.make_scratch()).expect("derived");
             derived.tnce.iter().map(|tnce| 10.0 * tnce.log10()).collect::<Vec<_>>()
         };
         let apart = |division| {
@@ -514,8 +515,8 @@ mod tests {
         for len in [383, 384, 400, 401] {
             let plan = DerivationPlan::<f32>::new(len, 96e3, &[2_500.0, 5e3, 10e3, 20e3, 40e3]).expect("a plan");
             let flat: Vec<f32> = noise()[..len].iter().map(|x| *x as f32).collect();
-            let (mut derived, silence) = (plan.derived(), vec![0.0; len]);
-            plan.run(&flat, &silence, &flat, &mut derived, &mut plan.scratch()).expect("derived");
+            let (mut derived, silence) = (plan.make_derived(), vec![0.0; len]);
+            plan.derive_response(&flat, &silence, &flat, &mut derived, &mut plan.make_scratch()).expect("derived");
             // f32 transforms of some 400 samples.
             assert!((derived.total - 1.0).abs() < 1e-5, "{len}: {}", derived.total);
             assert!(derived.tnce_over_band.iter().all(|x| (x - 1.0).abs() < 1e-5), "{:?}", derived.tnce_over_band);
@@ -526,11 +527,11 @@ mod tests {
     fn energies_of_flat_serve_every_response_of_a_pair() {
         let plan = DerivationPlan::<f32>::new(384, 96e3, &[2_500.0, 5e3, 10e3, 20e3, 40e3]).expect("a plan");
         let noise: Vec<f32> = noise().iter().map(|x| *x as f32).collect();
-        let (mut scratch, foam, flat) = (plan.scratch(), &noise[..384], &noise[384..768]);
+        let (mut scratch, foam, flat) = (plan.make_scratch(), &noise[..384], &noise[384..768]);
         let energies = plan.flat_energies(flat, &mut scratch).expect("energies");
         for ir in [&noise[100..484], &noise[500..884]] {
-            let (mut once, mut again) = (plan.derived(), plan.derived());
-            plan.run(ir, foam, flat, &mut once, &mut plan.scratch()).expect("derived");
+            let (mut once, mut again) = (plan.make_derived(), plan.make_derived());
+            plan.derive_response(ir, foam, flat, &mut once, &mut plan.make_scratch()).expect("derived");
             plan.run_over(ir, foam, &energies, &mut again, &mut scratch).expect("derived");
             assert_eq!(once, again);
             let mut energies = [f64::NAN; 5];
@@ -540,21 +541,21 @@ mod tests {
             assert!(energies.iter().zip(&once.energies).all(alike), "{energies:?} {:?}", once.energies);
         }
         let short = FlatEnergies { bands: vec![1.0; 4], ..energies };
-        let result = plan.run_over(flat, foam, &short, &mut plan.derived(), &mut scratch);
+        let result = plan.run_over(flat, foam, &short, &mut plan.make_derived(), &mut scratch);
         assert!(matches!(result, Err(Error::Length { .. })), "{result:?}");
     }
 
     #[test]
     fn nan_and_wrong_lengths_are_refused() {
         let plan = DerivationPlan::<f64>::new(16, 96e3, &[1e3]).expect("a plan");
-        let (mut derived, mut scratch) = (plan.derived(), plan.scratch());
+        let (mut derived, mut scratch) = (plan.make_derived(), plan.make_scratch());
         let (one, mut broken) = ([1.0; 16], [1.0; 16]);
         broken[3] = f64::NAN;
         for [ir, foam, flat] in [[&broken, &one, &one], [&one, &broken, &one], [&one, &one, &broken]] {
-            let result = plan.run(ir, foam, flat, &mut derived, &mut scratch);
+            let result = plan.derive_response(ir, foam, flat, &mut derived, &mut scratch);
             assert!(matches!(result, Err(Error::NotFinite { .. })), "{result:?}");
         }
-        let result = plan.run(&one[1..], &one, &one, &mut derived, &mut scratch);
+        let result = plan.derive_response(&one[1..], &one, &one, &mut derived, &mut scratch);
         assert!(matches!(result, Err(Error::Length { .. })), "{result:?}");
     }
 }

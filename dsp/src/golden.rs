@@ -13,8 +13,8 @@ use crate::RealSample;
 use crate::chain::{DerivationPlan, MeasurementParams, MeasurementPlan};
 use crate::deconvolution::{DeconvolutionParams, DeconvolutionPlan, TransformLength};
 use crate::energy::{cumulative_energy, energy, nce, tnce};
-use crate::filter_bank::{FilterBankPlan, gain};
-use crate::foam::subtract;
+use crate::filter_bank::{FilterBankPlan, band_gain};
+use crate::foam::subtract_foam;
 use crate::fresnel::{FresnelZone, first_fresnel_zone};
 use crate::level::{p90_mean, power_to_db};
 use crate::temperature::{TemperatureCorrection, resampling_ratio};
@@ -30,7 +30,7 @@ struct GoldenCases {
     metadata: HashMap<String, Value>,
 }
 
-fn golden() -> GoldenCases {
+fn read_golden() -> GoldenCases {
     // Tests run in their package's folder. A path fixed at compile time would be that of another checkout if both
     // share a target folder.
     let path = "../tests/fixtures/golden.parquet";
@@ -58,18 +58,18 @@ fn golden() -> GoldenCases {
     GoldenCases { cases, metadata }
 }
 
-fn of<T: RealSample>(x: &[f64]) -> Vec<T> {
+fn cast_samples<T: RealSample>(x: &[f64]) -> Vec<T> {
     x.iter().map(|x| T::of(*x)).collect()
 }
 
 /// Relative L2 error.
-fn error<T: RealSample>(actual: &[T], expected: &[f64]) -> f64 {
+fn relative_error<T: RealSample>(actual: &[T], expected: &[f64]) -> f64 {
     assert_eq!(actual.len(), expected.len());
     let off: f64 = actual.iter().zip(expected).map(|(a, e)| (a.f64() - e).powi(2)).sum();
     (off / energy(expected)).sqrt()
 }
 
-fn params(recording_len: usize) -> MeasurementParams {
+fn measurement_params(recording_len: usize) -> MeasurementParams {
     MeasurementParams {
         recording_len,
         ir_len: LEN,
@@ -82,12 +82,12 @@ fn params(recording_len: usize) -> MeasurementParams {
 }
 
 fn check_deconvolution<T: RealSample>(length: TransformLength, output_len: impl Fn(usize) -> usize, tolerance: f64) {
-    for case in golden().cases {
+    for case in read_golden().cases {
         for kind in ["foam", "flat", "panel"] {
             let (x, s) = (&case[&format!("{kind}_recording")], &case[&format!("{kind}_loopback")]);
             let output_len = output_len(x.len());
             let wanted = &case[&format!("{kind}_deconvolved")][..output_len];
-            let MeasurementParams { rate_hz, low_hz, high_hz, division, .. } = params(x.len());
+            let MeasurementParams { rate_hz, low_hz, high_hz, division, .. } = measurement_params(x.len());
             let recording_len = x.len();
             let settings = DeconvolutionParams {
                 recording_len,
@@ -101,8 +101,9 @@ fn check_deconvolution<T: RealSample>(length: TransformLength, output_len: impl 
             };
             let plan = DeconvolutionPlan::<T>::new(settings).expect("a plan");
             let mut ir = vec![T::default(); output_len];
-            plan.run(&of(x), &of(s), &mut ir, &mut plan.scratch()).expect("a response");
-            let off = error(&ir, wanted);
+            plan.deconvolve_recording(&cast_samples(x), &cast_samples(s), &mut ir, &mut plan.make_scratch())
+                .expect("a response");
+            let off = relative_error(&ir, wanted);
             assert!(off <= tolerance, "{kind}: {off}");
         }
     }
@@ -119,15 +120,16 @@ fn deconvolution() {
 
 // Both are padded to a fast length, which is what keeps f64 from coming closer; see `responses_in_f64_without_padding`.
 fn check_responses<T: RealSample>(tolerance: f64) {
-    for case in golden().cases {
-        let plan = MeasurementPlan::<T>::new(&params(case["foam_recording"].len())).expect("a plan");
-        let mut scratch = plan.scratch();
+    for case in read_golden().cases {
+        let plan = MeasurementPlan::<T>::new(&measurement_params(case["foam_recording"].len())).expect("a plan");
+        let mut scratch = plan.make_scratch();
         for kind in ["foam", "flat", "panel"] {
-            let signal = |what: &str| of::<T>(&case[&format!("{kind}_{what}")]);
+            let signal = |what: &str| cast_samples::<T>(&case[&format!("{kind}_{what}")]);
             let mut ir = vec![T::default(); LEN];
             let celsius = case[&format!("{kind}_celsius")][0];
-            plan.ir(&signal("recording"), &signal("loopback"), celsius, &mut ir, &mut scratch).expect("a response");
-            let off = error(&ir, &case[&format!("{kind}_ir")]);
+            plan.compute_ir(&signal("recording"), &signal("loopback"), celsius, &mut ir, &mut scratch)
+                .expect("a response");
+            let off = relative_error(&ir, &case[&format!("{kind}_ir")]);
             assert!(off <= tolerance, "{kind} at {celsius}: {off}");
         }
     }
@@ -144,15 +146,15 @@ fn responses() {
 #[test]
 fn responses_in_f64_without_padding() {
     let (mut worst_exact, mut worst_fraction) = (0.0f64, 0.0f64);
-    for case in golden().cases {
+    for case in read_golden().cases {
         for kind in ["foam", "flat", "panel"] {
             let celsius = case[&format!("{kind}_celsius")][0];
             let exact = resampling_ratio(celsius, 20.0);
             let (up, down) = nearest_fraction(exact, 10_000);
             let off = |rho| {
                 let mut ir = vec![0.0; LEN];
-                TemperatureCorrection::new().run(&case[&format!("{kind}_deconvolved")], rho, &mut ir);
-                error(&ir, &case[&format!("{kind}_ir")])
+                TemperatureCorrection::new().correct_response(&case[&format!("{kind}_deconvolved")], rho, &mut ir);
+                relative_error(&ir, &case[&format!("{kind}_ir")])
             };
             worst_exact = worst_exact.max(off(exact));
             worst_fraction = worst_fraction.max(off(up as f64 / down as f64));
@@ -183,15 +185,15 @@ fn nearest_fraction(x: f64, largest: u64) -> (u64, u64) {
 
 fn check_derivation<T: RealSample>(tolerance: f64) {
     let plan = DerivationPlan::<T>::new(LEN, 96e3, &CENTRES).expect("a plan");
-    let (mut derived, mut scratch) = (plan.derived(), plan.scratch());
-    for case in golden().cases {
-        let (ir, foam) = (of::<T>(&case["panel_ir"]), of::<T>(&case["foam_ir"]));
-        let flat = of::<T>(&case["flat_reflected_ir"]);
-        plan.run(&ir, &foam, &flat, &mut derived, &mut scratch).expect("derived");
-        assert!(error(&derived.reflected, &case["reflected_ir"]) <= tolerance);
+    let (mut derived, mut scratch) = (plan.make_derived(), plan.make_scratch());
+    for case in read_golden().cases {
+        let (ir, foam) = (cast_samples::<T>(&case["panel_ir"]), cast_samples::<T>(&case["foam_ir"]));
+        let flat = cast_samples::<T>(&case["flat_reflected_ir"]);
+        plan.derive_response(&ir, &foam, &flat, &mut derived, &mut scratch).expect("derived");
+        assert!(relative_error(&derived.reflected, &case["reflected_ir"]) <= tolerance);
         // Curve by curve, as the quiet bands would drown in the norm of all; and the product's last value of each.
         for (curve, expected) in derived.curves.chunks_exact(LEN).zip(case["nce"].chunks_exact(LEN)) {
-            assert!(error(curve, expected) <= tolerance);
+            assert!(relative_error(curve, expected) <= tolerance);
         }
         assert!((derived.total / case["tnce_total"][0] - 1.0).abs() <= tolerance);
         for (band, tnce) in derived.tnce.iter().enumerate() {
@@ -212,32 +214,32 @@ fn derivation() {
 // What a scratch was used for before leaves no trace, to the last bit.
 #[test]
 fn dirty_scratch_changes_nothing() {
-    let cases = golden().cases;
-    let plan = MeasurementPlan::<f32>::new(&params(cases[0]["panel_recording"].len())).expect("a plan");
+    let cases = read_golden().cases;
+    let plan = MeasurementPlan::<f32>::new(&measurement_params(cases[0]["panel_recording"].len())).expect("a plan");
     let run = |case: &GoldenCase, scratch: &mut _| {
         let mut ir = vec![f32::NAN; LEN];
-        let (x, s) = (of(&case["panel_recording"]), of(&case["panel_loopback"]));
-        plan.ir(&x, &s, case["panel_celsius"][0], &mut ir, scratch).expect("a response");
+        let (x, s) = (cast_samples(&case["panel_recording"]), cast_samples(&case["panel_loopback"]));
+        plan.compute_ir(&x, &s, case["panel_celsius"][0], &mut ir, scratch).expect("a response");
         ir
     };
-    let mut used = plan.scratch();
+    let mut used = plan.make_scratch();
     for case in &cases {
-        assert_eq!(run(case, &mut used), run(case, &mut plan.scratch()));
+        assert_eq!(run(case, &mut used), run(case, &mut plan.make_scratch()));
     }
 }
 
 #[test]
 fn dirty_derivation_scratch_changes_nothing() {
-    let cases = golden().cases;
+    let cases = read_golden().cases;
     let plan = DerivationPlan::<f32>::new(LEN, 96e3, &CENTRES).expect("a plan");
     let run = |case: &GoldenCase, (derived, scratch): &mut (_, _)| {
-        let [ir, foam, flat] = ["panel_ir", "foam_ir", "flat_reflected_ir"].map(|name| of(&case[name]));
-        plan.run(&ir, &foam, &flat, derived, scratch).expect("derived");
+        let [ir, foam, flat] = ["panel_ir", "foam_ir", "flat_reflected_ir"].map(|name| cast_samples(&case[name]));
+        plan.derive_response(&ir, &foam, &flat, derived, scratch).expect("derived");
         derived.clone()
     };
-    let mut used = (plan.derived(), plan.scratch());
+    let mut used = (plan.make_derived(), plan.make_scratch());
     for case in &cases {
-        assert_eq!(run(case, &mut used), run(case, &mut (plan.derived(), plan.scratch())));
+        assert_eq!(run(case, &mut used), run(case, &mut (plan.make_derived(), plan.make_scratch())));
     }
 }
 
@@ -246,19 +248,22 @@ fn dirty_derivation_scratch_changes_nothing() {
 #[test]
 fn recordings_to_levels_in_f32() {
     let (mut worst, mut worst_db) = (0.0f64, 0.0f64);
-    for case in golden().cases {
-        let plan = MeasurementPlan::<f32>::new(&params(case["foam_recording"].len())).expect("a plan");
+    for case in read_golden().cases {
+        let plan = MeasurementPlan::<f32>::new(&measurement_params(case["foam_recording"].len())).expect("a plan");
         let derivation = DerivationPlan::<f32>::new(LEN, 96e3, &CENTRES).expect("a plan");
         let [foam, flat, panel] = ["foam", "flat", "panel"].map(|kind| {
-            let signal = |what: &str| of::<f32>(&case[&format!("{kind}_{what}")]);
+            let signal = |what: &str| cast_samples::<f32>(&case[&format!("{kind}_{what}")]);
             let (mut ir, celsius) = (vec![0.0; LEN], case[&format!("{kind}_celsius")][0]);
-            plan.ir(&signal("recording"), &signal("loopback"), celsius, &mut ir, &mut plan.scratch()).expect("one");
+            plan.compute_ir(&signal("recording"), &signal("loopback"), celsius, &mut ir, &mut plan.make_scratch())
+                .expect("one");
             ir
         });
         let mut flat_reflected = vec![0.0; LEN];
-        subtract(&flat, &foam, &mut flat_reflected);
-        let mut derived = derivation.derived();
-        derivation.run(&panel, &foam, &flat_reflected, &mut derived, &mut derivation.scratch()).expect("derived");
+        subtract_foam(&flat, &foam, &mut flat_reflected);
+        let mut derived = derivation.make_derived();
+        derivation
+            .derive_response(&panel, &foam, &flat_reflected, &mut derived, &mut derivation.make_scratch())
+            .expect("derived");
         worst = worst.max((derived.total / case["tnce_total"][0] - 1.0).abs());
         for (band, tnce) in derived.tnce.iter().enumerate() {
             worst = worst.max((tnce / case["tnce"][band] - 1.0).abs());
@@ -271,57 +276,57 @@ fn recordings_to_levels_in_f32() {
 #[test]
 fn bands_and_single_steps() {
     let plan = FilterBankPlan::<f64>::new(LEN, 96e3, &CENTRES).expect("a plan");
-    let (mut bands, mut scratch) = (vec![0.0; 5 * LEN], plan.scratch());
-    for case in golden().cases {
-        plan.run(&case["reflected_ir"], &mut bands, &mut scratch).expect("split");
-        assert!(error(&bands, &case["bands"]) <= 1e-9);
+    let (mut bands, mut scratch) = (vec![0.0; 5 * LEN], plan.make_scratch());
+    for case in read_golden().cases {
+        plan.split_bands(&case["reflected_ir"], &mut bands, &mut scratch).expect("split");
+        assert!(relative_error(&bands, &case["bands"]) <= 1e-9);
         let (mut curves, mut last) = (vec![0.0; 5 * LEN], [0.0; 5]);
         cumulative_energy(&bands, &mut curves, LEN);
         nce(&mut curves, energy(&case["flat_reflected_ir"]));
-        assert!(error(&curves, &case["nce"]) <= 1e-9);
+        assert!(relative_error(&curves, &case["nce"]) <= 1e-9);
         assert!((tnce(&curves, LEN, &mut last) / case["tnce_total"][0] - 1.0).abs() <= 1e-9);
-        assert!(error(&last, &case["tnce"]) <= 1e-9);
+        assert!(relative_error(&last, &case["tnce"]) <= 1e-9);
         let mut reflected = vec![0.0; LEN];
-        subtract(&case["panel_ir"], &case["foam_ir"], &mut reflected);
-        assert!(error(&reflected, &case["reflected_ir"]) <= 1e-12);
+        subtract_foam(&case["panel_ir"], &case["foam_ir"], &mut reflected);
+        assert!(relative_error(&reflected, &case["reflected_ir"]) <= 1e-12);
     }
 }
 
-fn numbers(value: &Value) -> Vec<f64> {
+fn number_list(value: &Value) -> Vec<f64> {
     value.as_array().expect("a list").iter().map(|x| x.as_f64().expect("a number")).collect()
 }
 
 #[test]
 fn gains_ratios_and_means() {
-    let golden = golden();
-    let frequencies = numbers(&golden.metadata["frequencies_hz"]);
+    let golden = read_golden();
+    let frequencies = number_list(&golden.metadata["frequencies_hz"]);
     for (band, gains) in golden.metadata["gains"].as_array().expect("bands").iter().enumerate() {
-        for (hz, expected) in frequencies.iter().zip(numbers(gains)) {
-            assert!((gain(&CENTRES, band, *hz) - expected).abs() <= 1e-6, "band {band} at {hz}");
+        for (hz, expected) in frequencies.iter().zip(number_list(gains)) {
+            assert!((band_gain(&CENTRES, band, *hz) - expected).abs() <= 1e-6, "band {band} at {hz}");
         }
     }
     for (celsius, fraction) in golden.metadata["resampling"].as_object().expect("ratios") {
         let exact = resampling_ratio(celsius.parse().expect("a temperature"), 20.0);
         let (up, down) = nearest_fraction(exact, 10_000);
-        assert_eq!(vec![up as f64, down as f64], numbers(fraction), "{celsius}");
+        assert_eq!(vec![up as f64, down as f64], number_list(fraction), "{celsius}");
     }
     let p90 = &golden.metadata["p90"];
-    let mean = p90_mean(&numbers(&p90["values"]), &mut Vec::new()).expect("a mean");
+    let mean = p90_mean(&number_list(&p90["values"]), &mut Vec::new()).expect("a mean");
     assert!((mean / p90["p90_mean"].as_f64().expect("a number") - 1.0).abs() <= 1e-12);
 }
 
 #[test]
 fn grid_pairs_and_symmetries_are_identical() {
-    let golden = golden();
-    let grid = Rig::paper().grid().expect("the built-in rig is valid");
-    let points: Vec<_> = golden.metadata["points_mm"].as_array().expect("points").iter().map(numbers).collect();
+    let golden = read_golden();
+    let grid = Rig::paper().build_grid().expect("the built-in rig is valid");
+    let points: Vec<_> = golden.metadata["points_mm"].as_array().expect("points").iter().map(number_list).collect();
     assert_eq!(grid.points().iter().map(|p| p.position_mm.to_vec()).collect::<Vec<_>>(), points);
-    let pairs: Vec<_> = golden.metadata["pairs"].as_array().expect("pairs").iter().map(numbers).collect();
+    let pairs: Vec<_> = golden.metadata["pairs"].as_array().expect("pairs").iter().map(number_list).collect();
     let ours = grid.pairs().iter().map(|p| vec![f64::from(p.microphone.0), f64::from(p.speaker.0)]);
     assert_eq!(ours.collect::<Vec<_>>(), pairs);
     for symmetry in Symmetry::ALL {
-        let expected = numbers(&golden.metadata["d4"][symmetry.name()]);
-        let ours = grid.permutation(symmetry).expect("the grid is square");
+        let expected = number_list(&golden.metadata["d4"][symmetry.name()]);
+        let ours = grid.point_permutation(symmetry).expect("the grid is square");
         assert_eq!(ours.iter().map(|p| f64::from(p.0)).collect::<Vec<_>>(), expected, "{}", symmetry.name());
     }
 }
@@ -329,7 +334,7 @@ fn grid_pairs_and_symmetries_are_identical() {
 // The four diameters of DESIGN's definition, to the tenth of a millimetre that it prints.
 #[test]
 fn fresnel_zones_of_the_measured_pairs() {
-    let grid = Rig::paper().grid().expect("the built-in rig is valid");
+    let grid = Rig::paper().build_grid().expect("the built-in rig is valid");
     let at = |id: echolake_schema::PointId| grid.point(id).expect("a point").position_mm;
     let extremes = |hz: f64| {
         let zones = grid.pairs().iter().map(|p| first_fresnel_zone(at(p.microphone), at(p.speaker), hz, 343.0));

@@ -72,7 +72,7 @@ pub fn response_limits_hz([low, high]: [f64; 2], rho: f64) -> [f64; 2] {
 /// assert!((speed_of_sound(30.0) / speed_of_sound(20.0) - rho).abs() < 1e-12);
 /// let (mut warm, mut corrected) = ([0.0; 120], [0.0; 120]);
 /// warm[100] = 1.0;
-/// TemperatureCorrection::<f64>::new().run(&warm, rho, &mut corrected);
+/// TemperatureCorrection::<f64>::new().correct_response(&warm, rho, &mut corrected);
 /// // In air of 20 C, what arrived after 100 samples arrives after 101.7.
 /// assert_eq!((0..120).max_by(|a, b| corrected[*a].total_cmp(&corrected[*b])), Some(102));
 /// ```
@@ -89,7 +89,7 @@ type KernelPiece<T> = [[T; TAPS]; 4];
 // Tap j is k(fraction + CENTRE - j), piece i for fractions from i / PIECES to (i + 1) / PIECES.
 static TABLE: LazyLock<Vec<[[f64; TAPS]; 4]>> = LazyLock::new(|| {
     let cubic = |i: usize, j: usize| {
-        let at = |t: f64| kernel((i as f64 + t) / PIECES as f64 + CENTRE as f64 - j as f64);
+        let at = |t: f64| windowed_sinc((i as f64 + t) / PIECES as f64 + CENTRE as f64 - j as f64);
         let [a, b, c, d] = [-1.0, 0.0, 1.0, 2.0].map(at);
         [b, c - a / 3.0 - b / 2.0 - d / 6.0, (a + c) / 2.0 - b, (d - a) / 6.0 + (b - c) / 2.0]
     };
@@ -122,20 +122,20 @@ impl<T: RealSample> TemperatureCorrection<T> {
     ///
     /// ir_in `[n]`  at the measured temperature
     /// ir_out `[m]` at the reference temperature
-    pub fn run(&self, ir_in: &[T], rho: f64, ir_out: &mut [T]) {
+    pub fn correct_response(&self, ir_in: &[T], rho: f64, ir_out: &mut [T]) {
         if rho == 1.0 {
             crop(ir_in, ir_out);
         } else if rho > 1.0 {
-            self.gather(ir_in, rho.recip(), ir_out);
+            self.gather_samples(ir_in, rho.recip(), ir_out);
         } else {
-            self.scatter(ir_in, rho, ir_out);
+            self.scatter_samples(ir_in, rho, ir_out);
         }
     }
 
-    fn gather(&self, ir_in: &[T], step: f64, ir_out: &mut [T]) {
+    fn gather_samples(&self, ir_in: &[T], step: f64, ir_out: &mut [T]) {
         let gain = T::of(GAIN);
         for (m, out) in ir_out.iter_mut().enumerate() {
-            let (at, taps) = self.taps(m as f64 * step);
+            let (at, taps) = self.taps_at(m as f64 * step);
             let inside = at.checked_sub(CENTRE).and_then(|first| ir_in.get(first..)?.first_chunk());
             let x: [T; TAPS] = inside.copied().unwrap_or_else(|| {
                 std::array::from_fn(|j| {
@@ -146,11 +146,11 @@ impl<T: RealSample> TemperatureCorrection<T> {
         }
     }
 
-    fn scatter(&self, ir_in: &[T], rho: f64, ir_out: &mut [T]) {
+    fn scatter_samples(&self, ir_in: &[T], rho: f64, ir_out: &mut [T]) {
         ir_out.fill(T::default());
         let gain = T::of(GAIN * rho);
         for (n, x) in ir_in.iter().enumerate() {
-            let (at, taps) = self.taps(n as f64 * rho);
+            let (at, taps) = self.taps_at(n as f64 * rho);
             if at >= ir_out.len() + CENTRE {
                 return;
             }
@@ -168,7 +168,7 @@ impl<T: RealSample> TemperatureCorrection<T> {
     }
 
     /// The sample at or before a position, which tap `CENTRE` belongs to, and the kernel around it.
-    fn taps(&self, position: f64) -> (usize, [T; TAPS]) {
+    fn taps_at(&self, position: f64) -> (usize, [T; TAPS]) {
         let at = position as usize;
         let along = (position - at as f64) * PIECES as f64;
         let index = (along as usize).min(PIECES - 1);
@@ -196,7 +196,7 @@ pub fn crop<T: RealSample>(from: &[T], to: &mut [T]) {
     to[kept..].fill(T::default());
 }
 
-fn kernel(u: f64) -> f64 {
+fn windowed_sinc(u: f64) -> f64 {
     // Just past the edge the window continues smoothly, which the interpolation of the last lobe needs.
     let window = 1.0 - (u / LOBES).powi(2);
     let sinc = if u == 0.0 { 1.0 } else { (PI * u).sin() / (PI * u) };
@@ -226,11 +226,11 @@ mod tests {
         let plan = TemperatureCorrection::<f64>::new();
         for i in 0..10_000 {
             let position = f64::from(i) / 1_234.5;
-            let (at, taps) = plan.taps(position);
+            let (at, taps) = plan.taps_at(position);
             assert_eq!(at, position.floor() as usize);
             for (j, tap) in taps.into_iter().enumerate() {
                 let u = position - (at + j) as f64 + CENTRE as f64;
-                assert!((tap - kernel(u)).abs() < 5e-8, "{u}: {tap} {}", kernel(u));
+                assert!((tap - windowed_sinc(u)).abs() < 5e-8, "{u}: {tap} {}", windowed_sinc(u));
             }
         }
     }
@@ -243,11 +243,11 @@ mod tests {
             for rho in [0.8f64, 0.97, 0.999_9, 1.000_1, 1.03, 1.2] {
                 let fc = rho.min(1.0);
                 let mut out = vec![f64::NAN; output];
-                TemperatureCorrection::new().run(&x[..input], rho, &mut out);
+                TemperatureCorrection::new().correct_response(&x[..input], rho, &mut out);
                 for (m, out) in out.iter().enumerate() {
                     let term = |(n, x): (usize, &f64)| {
                         let u = fc * (m as f64 / rho - n as f64);
-                        if u.abs() <= LOBES { x * kernel(u) } else { 0.0 }
+                        if u.abs() <= LOBES { x * windowed_sinc(u) } else { 0.0 }
                     };
                     let expected = GAIN * fc * x[..input].iter().enumerate().map(term).sum::<f64>();
                     assert!((out - expected).abs() < 1e-5, "{rho}, {input} to {output}, {m}: {out} {expected}");
@@ -271,7 +271,7 @@ mod tests {
             let (from, to) = (0.7 / speed_of_sound(celsius) * rate, 0.7 / speed_of_sound(20.0) * rate);
             let rho = resampling_ratio(celsius, 20.0);
             let mut out = vec![0.0; 384];
-            TemperatureCorrection::<f64>::new().run(&pulse(from, 440), rho, &mut out);
+            TemperatureCorrection::<f64>::new().correct_response(&pulse(from, 440), rho, &mut out);
             let energy: f64 = out.iter().map(|x| x * x).sum();
             let centre = out.iter().enumerate().map(|(i, x)| i as f64 * x * x).sum::<f64>() / energy;
             assert!((centre - to).abs() < 1e-3, "{celsius}: {centre} {to}");
@@ -284,8 +284,8 @@ mod tests {
         for rho in [0.93, 0.99, 1.01, 1.05] {
             let needed = TemperatureCorrection::<f64>::input_len_for(384, rho);
             let (mut all, mut some) = (vec![0.0; 384], vec![0.0; 384]);
-            TemperatureCorrection::new().run(&x, rho, &mut all);
-            TemperatureCorrection::new().run(&x[..needed], rho, &mut some);
+            TemperatureCorrection::new().correct_response(&x, rho, &mut all);
+            TemperatureCorrection::new().correct_response(&x[..needed], rho, &mut some);
             assert_eq!(all, some, "{rho}");
         }
     }
@@ -294,7 +294,7 @@ mod tests {
     fn the_reference_temperature_changes_nothing() {
         let x: Vec<f32> = (0..100).map(|i| i as f32).collect();
         let mut out = vec![1.0; 120];
-        TemperatureCorrection::new().run(&x, resampling_ratio(20.0, 20.0), &mut out);
+        TemperatureCorrection::new().correct_response(&x, resampling_ratio(20.0, 20.0), &mut out);
         assert_eq!(&out[..100], &x[..]);
         assert_eq!(&out[100..], &[0.0; 20]);
     }

@@ -26,4 +26,4 @@ pub use ml::{
     ExportSummary, PartCounts, RowSymmetries, SHARDS, SplitBy, SplitParams, SplitPart, TrainingSet, write_training_set,
 };
 pub use output::{PendingFile, WrittenFile};
-pub use slice::{Check, Layout, Outline, OutlineSchema, OutlineTopic, Slice, SliceParams, Taken, outline};
+pub use slice::{Check, Layout, Outline, OutlineSchema, OutlineTopic, Slice, SliceParams, Taken, outline_slice};

@@ -36,7 +36,7 @@ impl PendingFolder {
     }
 
     /// Creates a file in the folder; `name` may contain folders.
-    pub(crate) fn file(&self, name: &str) -> Result<HashedFile> {
+    pub(crate) fn create_file(&self, name: &str) -> Result<HashedFile> {
         let path = self.partial.join(name);
         if let Some(folder) = path.parent() {
             fs::create_dir_all(folder).map_err(|e| Error::write(&self.path.join(name), e))?;
@@ -45,19 +45,19 @@ impl PendingFolder {
     }
 
     /// Writes a small file.
-    pub(crate) fn write(&self, name: &str, content: &[u8]) -> Result<WrittenFile> {
-        let mut file = self.file(name)?;
+    pub(crate) fn write_file(&self, name: &str, content: &[u8]) -> Result<WrittenFile> {
+        let mut file = self.create_file(name)?;
         file.write_all(content).map_err(|e| Error::write(&self.path.join(name), e))?;
         file.finish()
     }
 
     /// Returns the final path of a file, for messages.
-    pub(crate) fn named(&self, name: &str) -> PathBuf {
+    pub(crate) fn final_path(&self, name: &str) -> PathBuf {
         self.path.join(name)
     }
 
     /// Returns the path of a file while the folder is being written.
-    pub(crate) fn meanwhile(&self, name: &str) -> PathBuf {
+    pub(crate) fn partial_path(&self, name: &str) -> PathBuf {
         self.partial.join(name)
     }
 
@@ -157,7 +157,7 @@ impl PendingFile {
     }
 
     /// Returns the path while the file is being written, for libraries that open files themselves.
-    pub fn meanwhile(&self) -> &Path {
+    pub fn partial_path(&self) -> &Path {
         &self.partial
     }
 
@@ -224,7 +224,7 @@ mod tests {
         let home = tempfile::tempdir().expect("a folder");
         let path = home.path().join("set");
         let folder = PendingFolder::create(&path).expect("begun");
-        folder.write("a/b.txt", b"x").expect("written");
+        folder.write_file("a/b.txt", b"x").expect("written");
         assert!(matches!(PendingFolder::create(&path), Err(Error::Exists { .. })), "two at once");
         drop(folder);
         let mut file = PendingFile::create(&home.path().join("one.mcap")).expect("begun");
@@ -239,7 +239,7 @@ mod tests {
         let path = home.path().join("set");
         fs::create_dir(&path).expect("an empty folder");
         let folder = PendingFolder::create(&path).expect("an empty folder will do");
-        let written = folder.write("a.txt", b"abc").expect("written");
+        let written = folder.write_file("a.txt", b"abc").expect("written");
         assert_eq!(written.sha256, "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad");
         folder.publish().expect("named");
         assert_eq!(fs::read(path.join("a.txt")).expect("there"), b"abc");

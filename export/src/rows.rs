@@ -23,21 +23,21 @@ pub(crate) async fn of_run(
     let mut batches = Vec::new();
     for file in snapshot.files_of(table, run) {
         let rows = file.visible_parts().find(|(part, _)| part.run == *run).map_or(0..file.rows, |(_, rows)| rows);
-        batches.extend(lake.rows(table, file, columns, rows).await?.try_collect::<Vec<_>>().await?);
+        batches.extend(lake.read_rows(table, file, columns, rows).await?.try_collect::<Vec<_>>().await?);
     }
-    together(lake, table, columns, &batches).map_err(|e| Error::damaged(format!("{}, run {run}", table.name()), e))
+    concat_rows(lake, table, columns, &batches).map_err(|e| Error::damaged(format!("{}, run {run}", table.name()), e))
 }
 
 /// Reads the named columns of all rows of a file that readers see.
 pub(crate) async fn of_file(lake: &Lake, table: Table, file: &DataFile, columns: &[&str]) -> Result<RecordBatch> {
     let mut batches = Vec::new();
     for range in file.visible_ranges() {
-        batches.extend(lake.rows(table, file, columns, range).await?.try_collect::<Vec<_>>().await?);
+        batches.extend(lake.read_rows(table, file, columns, range).await?.try_collect::<Vec<_>>().await?);
     }
-    together(lake, table, columns, &batches).map_err(|e| Error::damaged(&file.path, e))
+    concat_rows(lake, table, columns, &batches).map_err(|e| Error::damaged(&file.path, e))
 }
 
-fn together(
+fn concat_rows(
     lake: &Lake,
     table: Table,
     columns: &[&str],
@@ -49,7 +49,7 @@ fn together(
 }
 
 /// Returns the texts of a column without nulls; empty if the column is missing.
-pub(crate) fn texts<'a>(batch: &'a RecordBatch, column: &str) -> Vec<&'a str> {
+pub(crate) fn text_column<'a>(batch: &'a RecordBatch, column: &str) -> Vec<&'a str> {
     optional_texts(batch, column).into_iter().map(Option::unwrap_or_default).collect()
 }
 
@@ -60,7 +60,10 @@ pub(crate) fn optional_texts<'a>(batch: &'a RecordBatch, column: &str) -> Vec<Op
 }
 
 /// Returns the numbers of a column.
-pub(crate) fn numbers<'a, T: ArrowPrimitiveType>(batch: &'a RecordBatch, column: &str) -> Result<&'a [T::Native]> {
+pub(crate) fn number_column<'a, T: ArrowPrimitiveType>(
+    batch: &'a RecordBatch,
+    column: &str,
+) -> Result<&'a [T::Native]> {
     let found = batch.column_by_name(column).and_then(|c| c.as_primitive_opt::<T>());
     let found = found.filter(|array| array.null_count() == 0);
     found

@@ -9,7 +9,7 @@ use arrow::datatypes::{Int32Type, Int64Type};
 use arrow::record_batch::RecordBatch;
 use echolake_acquisition::run::controller::RecordingMode;
 use echolake_import::{ImportOptions, import_gir, import_wav};
-use echolake_ingest::{LakeIngest, pending};
+use echolake_ingest::{LakeIngest, pending_runs};
 use echolake_lake::{Lake, ReferenceSurfaces};
 use echolake_schema::{Rig, RunId, Table, Timestamp, topics};
 use echolake_testing::{SMALL_RIG, simulate_run};
@@ -32,7 +32,7 @@ async fn lake(home: &TempDir, keep: RecordingMode) -> Lake {
         simulate_run(&inbox, number, surface, name, keep);
     }
     let ingest = LakeIngest::new(&lake, Arc::default());
-    ingest.ingest_runs(pending(&lake).await.expect("runs"), &mut |_| {}).await.expect("ingested");
+    ingest.ingest_runs(pending_runs(&lake).await.expect("runs"), &mut |_| {}).await.expect("ingested");
     ingest.complete_runs(&mut |_, _| {}).await.expect("derived");
     lake
 }
@@ -44,7 +44,7 @@ async fn measurements(lake: &Lake, surfaces: &[&str]) -> Vec<Taken> {
     for run in snapshot.runs().filter(|r| surfaces.contains(&r.surface.as_str())) {
         for file in snapshot.files_of(Table::Measurements, &run.run) {
             let columns = ["pair_id", "log_time_ns", "attempt"];
-            let rows = lake.rows(Table::Measurements, file, &columns, 0..file.rows).await.expect("rows");
+            let rows = lake.read_rows(Table::Measurements, file, &columns, 0..file.rows).await.expect("rows");
             for batch in rows.try_collect::<Vec<RecordBatch>>().await.expect("rows") {
                 let number = |column: usize, row| batch.column(column).as_primitive::<Int32Type>().value(row) as u32;
                 taken.extend((0..batch.num_rows()).map(|row| Taken {
@@ -130,7 +130,7 @@ mod slow {
         }
         let snapshot = lake.snapshot().await.expect("a view");
         let params = SliceParams { taken: some.clone(), ..SliceParams::default() };
-        let looked_over = outline(&lake, &snapshot, params).await.expect("an outline");
+        let looked_over = outline_slice(&lake, &snapshot, params).await.expect("an outline");
         for layout in [Layout::InTime, Layout::ByTopic] {
             let file = cut(&lake, SliceParams { taken: some.clone(), layout, ..SliceParams::default() })
                 .await
@@ -291,8 +291,10 @@ mod slow {
                     let sweep = SweepRecording::decode(data.as_slice()).expect("a sweep");
                     let mut samples = vec![0.0; 2 * sweep.sample_count as usize];
                     let (microphone, loopback) = samples.split_at_mut(sweep.sample_count as usize);
-                    echolake_schema::samples::decode(sweep.format(), &sweep.microphone, microphone).expect("samples");
-                    echolake_schema::samples::decode(sweep.format(), &sweep.loopback, loopback).expect("samples");
+                    echolake_schema::samples::decode_samples(sweep.format(), &sweep.microphone, microphone)
+                        .expect("samples");
+                    echolake_schema::samples::decode_samples(sweep.format(), &sweep.loopback, loopback)
+                        .expect("samples");
                     (time, sweep.temperature_c, samples)
                 });
             decoded.collect()

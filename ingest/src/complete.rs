@@ -57,7 +57,7 @@ impl LakeIngest<'_> {
         let (changed, snapshot) = self.complete_in_rounds(done).await?;
         self.lake.remove_superseded_in(&snapshot).await?;
         let is_whole = snapshot.is_whole();
-        Ok(CompletionSummary { changed, waiting: waiting(self.lake, snapshot), is_whole })
+        Ok(CompletionSummary { changed, waiting: waiting_runs(self.lake, snapshot), is_whole })
     }
 
     // Returns the number of changed runs, and the lake's snapshot thereafter.
@@ -80,9 +80,9 @@ impl LakeIngest<'_> {
     }
 }
 
-fn waiting(lake: &Lake, snapshot: Arc<LakeSnapshot>) -> Vec<(RunId, String)> {
+fn waiting_runs(lake: &Lake, snapshot: Arc<LakeSnapshot>) -> Vec<(RunId, String)> {
     let finder = ReferenceFinder::new(lake, snapshot.clone());
-    let missing = |run: &VisibleRun| (run.run.clone(), finder.wanted(&run.surface).missing());
+    let missing = |run: &VisibleRun| (run.run.clone(), finder.wanted_references(&run.surface).missing_names());
     snapshot.runs().map(missing).filter(|(_, missing)| !missing.is_empty()).collect()
 }
 
@@ -105,10 +105,10 @@ async fn do_round(ingest: &LakeIngest<'_>, cores: &Cores, done: &mut CompletionR
     let mut jobs = Vec::new();
     let derived = Table::ALL.into_iter().filter(|table| table.source() == Source::References);
     let lacking: BTreeSet<_> =
-        derived.flat_map(|table| context.snapshot.lacking(table)).map(|lacking| lacking.run.clone()).collect();
+        derived.flat_map(|table| context.snapshot.lacking_rows(table)).map(|lacking| lacking.run.clone()).collect();
     for run in context.snapshot.runs() {
-        let wanted = context.finder.lock().await.wanted(&run.surface);
-        let derivation = wanted.derivation(&run.run_derivation);
+        let wanted = context.finder.lock().await.wanted_references(&run.surface);
+        let derivation = wanted.derivation_name(&run.run_derivation);
         // Without its references, a run has no rows that follow from them.
         if derivation != run.reference_derivation || lacking.contains(&run.run) {
             jobs.push((run.clone(), wanted));
@@ -125,7 +125,7 @@ async fn do_round(ingest: &LakeIngest<'_>, cores: &Cores, done: &mut CompletionR
         let span = tracing::error_span!("complete", run = %run.run, surface = %run.surface);
         let work = async move {
             if let Some(claims) = &claims {
-                claim(&context, claims, &run).await?;
+                claim_run(&context, claims, &run).await?;
             }
             complete_run(&context, &run, &wanted).await
         };
@@ -147,10 +147,10 @@ async fn do_round(ingest: &LakeIngest<'_>, cores: &Cores, done: &mut CompletionR
                 round.overtaken |= outcome == Some(CommitOutcome::Outdated);
             }
         }
-        claims.iter().for_each(|claims| claims.release(&work_name(&run)));
+        claims.iter().for_each(|claims| claims.release_work(&work_name(&run)));
         Ok(())
     };
-    pipeline::run(lake, cores, jobs, stop, do_one, ended).await?;
+    pipeline::run_jobs(lake, cores, jobs, stop, do_one, ended).await?;
     Ok(round)
 }
 
@@ -159,13 +159,13 @@ fn work_name(run: &VisibleRun) -> String {
 }
 
 // Claims a run; another ingest may have completed it since the snapshot.
-async fn claim(context: &IngestContext, claims: &WorkClaims, run: &VisibleRun) -> Result<()> {
+async fn claim_run(context: &IngestContext, claims: &WorkClaims, run: &VisibleRun) -> Result<()> {
     let file = run.run.to_string();
-    if claims.claim(&work_name(run)).await == ClaimOutcome::Denied {
+    if claims.claim_work(&work_name(run)).await == ClaimOutcome::Denied {
         return Err(Error::Claimed { file });
     }
-    let rows = context.lake.log().files(Table::Runs).await?;
-    let is_there = |row: &DataFile| rows.iter().any(|there| there.logged() == row.logged());
+    let rows = context.lake.commit_log().list_files(Table::Runs).await?;
+    let is_there = |row: &DataFile| rows.iter().any(|there| there.logged_file() == row.logged_file());
     match context.snapshot.files_of(Table::Runs, &run.run).all(is_there) {
         true => Ok(()),
         false => Err(Error::Gone { file }),
@@ -181,13 +181,13 @@ async fn complete_run(
     let mut report = CompletedRun { run: run.run.clone(), surface: run.surface.clone(), measurements: 0 };
     let (files, references) = match ReferenceDerivation::new(context, &run.run_derivation, wanted).await? {
         Some(derivation) => {
-            let responses = read_back::responses(lake, &context.snapshot, &run.run).await?;
+            let responses = read_back::read_responses(lake, &context.snapshot, &run.run).await?;
             report.measurements = responses.pairs.len();
-            derivation.derive(context, &keys, responses).await?
+            derivation.derive_run(context, &keys, responses).await?
         }
         // A reference was removed.
-        None if wanted.derivation(&run.run_derivation).is_none() => {
-            (Vec::new(), RunReferences { missing: wanted.missing(), ..RunReferences::default() })
+        None if wanted.derivation_name(&run.run_derivation).is_none() => {
+            (Vec::new(), RunReferences { missing: wanted.missing_names(), ..RunReferences::default() })
         }
         None => return Ok(ReadyJob { staged: Vec::new(), report }),
     };
@@ -202,7 +202,7 @@ async fn complete_run(
     if let Some(counts) = context.snapshot.row_counts(&run.run).cloned()
         && let Some(row) = staged.pop()
     {
-        let row = row.counting(counts, &staged);
+        let row = row.with_row_counts(counts, &staged);
         staged.push(row);
     }
     Ok(ReadyJob { staged, report })

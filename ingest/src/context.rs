@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use arrow::record_batch::RecordBatch;
-use echolake_lake::{EncodedFile, FileName, Lake, LakeSnapshot, StagedFile, VisibleRun, encode};
+use echolake_lake::{EncodedFile, FileName, Lake, LakeSnapshot, StagedFile, VisibleRun, encode_batches};
 use echolake_schema::tables::Table;
 use futures::future::{join_all, try_join};
 
@@ -24,7 +24,7 @@ pub(crate) struct IngestContext {
 impl IngestContext {
     pub(crate) fn new(lake: &Lake, cores: &Cores, snapshot: LakeSnapshot) -> Self {
         let snapshot = Arc::new(snapshot);
-        let finder = ReferenceFinder::shared(lake, snapshot.clone());
+        let finder = ReferenceFinder::new_shared(lake, snapshot.clone());
         Self { lake: lake.clone(), cores: cores.clone(), snapshot, finder }
     }
 
@@ -38,7 +38,7 @@ impl IngestContext {
         let RunKeys { surface, run } = keys.clone();
         let name = FileName::Rows { surface, run, derivation: derivation.to_owned() };
         // In parallel, because each file waits for the disk by itself.
-        let staged = join_all(files.into_iter().map(|(table, file)| self.lake.stage(table, &name, file))).await;
+        let staged = join_all(files.into_iter().map(|(table, file)| self.lake.stage_file(table, &name, file))).await;
         let staged = staged.into_iter().map(|file| Ok(file?.made_from(&self.snapshot)));
         staged.collect()
     }
@@ -61,8 +61,8 @@ impl IngestContext {
     }
 
     async fn stage_pointer(&self, run: VisibleRun, row: &[RecordBatch]) -> Result<StagedFile> {
-        let file = encode(Table::Runs, &Table::Runs.schema(self.lake.rig()), row)?;
-        let staged = self.lake.stage(Table::Runs, &FileName::Pointer(run.clone()), file).await?;
-        Ok(staged.made_from(&self.snapshot).replacing(&run, self.snapshot.files_of(Table::Runs, &run.run)))
+        let file = encode_batches(Table::Runs, &Table::Runs.schema(self.lake.rig()), row)?;
+        let staged = self.lake.stage_file(Table::Runs, &FileName::Pointer(run.clone()), file).await?;
+        Ok(staged.made_from(&self.snapshot).with_replaced_rows(&run, self.snapshot.files_of(Table::Runs, &run.run)))
     }
 }

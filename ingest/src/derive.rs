@@ -2,17 +2,17 @@
 
 use std::sync::Arc;
 
-use echolake_dsp::foam::subtract;
+use echolake_dsp::foam::subtract_foam;
 use echolake_dsp::mean::SignalMean;
 use echolake_dsp::temperature::speed_of_sound;
 use echolake_dsp::uncertainty::{EnergySensitivity, LevelUncertainty};
-use echolake_lake::{EncodedFile, FileEncoder, Lake, encode};
+use echolake_lake::{EncodedFile, FileEncoder, Lake, encode_batches};
 use echolake_schema::tables::Table;
 
 use crate::context::IngestContext;
 use crate::derived_values::{DerivedRows, RunResponses, derivation_plan, residual_fit};
 use crate::error::{Error, Result};
-use crate::references::{LoadedReferences, WantedReferences, arrivals};
+use crate::references::{LoadedReferences, WantedReferences, arrival_times};
 use crate::rows::derived::ReferenceVersions;
 use crate::rows::runs::RunReferences;
 use crate::rows::stats::SurfaceLevels;
@@ -36,16 +36,19 @@ impl ReferenceDerivation {
         run_derivation: &str,
         wanted: &WantedReferences,
     ) -> Result<Option<Self>> {
-        let (Some((flat_version, foam_version)), Some(name)) = (wanted.versions(), wanted.derivation(run_derivation))
+        let (Some((flat_version, foam_version)), Some(name)) =
+            (wanted.version_pair(), wanted.derivation_name(run_derivation))
         else {
             return Ok(None);
         };
-        let Some(references) = context.finder.lock().await.load(wanted, &context.cores).await? else { return Ok(None) };
+        let Some(references) = context.finder.lock().await.load_references(wanted, &context.cores).await? else {
+            return Ok(None);
+        };
         Ok(Some(Self { name, flat_version, foam_version, references }))
     }
 
     /// Derives every pair that both references have. Returns the files, and the run row's references.
-    pub(crate) async fn derive(
+    pub(crate) async fn derive_run(
         self,
         context: &IngestContext,
         keys: &RunKeys,
@@ -53,7 +56,8 @@ impl ReferenceDerivation {
     ) -> Result<(Vec<(Table, EncodedFile)>, RunReferences)> {
         let (this, for_rows, lake) = (Arc::new(self), keys.clone(), context.lake.clone());
         let derivation = this.clone();
-        let (files, unpaired) = context.cores.compute(move || derivation.encode(&lake, &for_rows, &responses)).await?;
+        let (files, unpaired) =
+            context.cores.compute_on_core(move || derivation.encode_tables(&lake, &for_rows, &responses)).await?;
         let references = RunReferences {
             missing: if unpaired == 0 { String::new() } else { format!("references of {unpaired} pairs") },
             derivation: Some(this.name.clone()),
@@ -64,7 +68,7 @@ impl ReferenceDerivation {
     }
 
     // Returns the files, and the number of pairs that a reference lacks.
-    fn encode(
+    fn encode_tables(
         &self,
         lake: &Lake,
         keys: &RunKeys,
@@ -72,7 +76,7 @@ impl ReferenceDerivation {
     ) -> Result<(Vec<(Table, EncodedFile)>, usize)> {
         let (rig, grid) = (lake.rig(), lake.grid());
         let failed = |cause| Error::Kernel { file: keys.run.to_string(), cause };
-        let moved = rows::derived::SymmetryPairs::of(grid);
+        let moved = rows::derived::SymmetryPairs::from_grid(grid);
         let of = ReferenceVersions { flat: &self.flat_version, foam: &self.foam_version };
         let mut encoders =
             [Table::Nce, Table::Tnce, Table::TnceD4].map(|table| (table, FileEncoder::new(table, table.schema(rig))));
@@ -81,7 +85,7 @@ impl ReferenceDerivation {
         let mut errors = vec![Vec::new(); totals.len()];
         let mut curves = vec![SignalMean::default(); rig.bands.centres_hz.len()];
         let mut paired = 0;
-        self.slices(lake, keys, responses, &mut |slice| {
+        self.derive_slices(lake, keys, responses, &mut |slice| {
             paired += slice.pairs.len();
             totals.iter_mut().zip(slice.tnce_columns()).for_each(|(all, some)| all.extend(some));
             unbiased.iter_mut().zip(slice.unbiased_columns()).for_each(|(all, some)| all.extend(some));
@@ -91,10 +95,10 @@ impl ReferenceDerivation {
             lists.add_curves(rig.impulse_response.length, &mut curves).map_err(failed)?;
             // Lists take most of the time; an idle core can encode the rest meanwhile.
             let (first, second) = rayon::join(
-                || Ok(nce.1.write(&rows::derived::nce(rig, grid, keys, lists, of)?)?),
+                || Ok(nce.1.write_batch(&rows::derived::nce_rows(rig, grid, keys, lists, of)?)?),
                 || {
-                    tnce.1.write(&rows::derived::tnce(rig, grid, keys, slice, of)?)?;
-                    Ok(tnce_d4.1.write(&rows::derived::tnce_d4(rig, grid, &moved, keys, slice, of)?)?)
+                    tnce.1.write_batch(&rows::derived::tnce_rows(rig, grid, keys, slice, of)?)?;
+                    Ok(tnce_d4.1.write_batch(&rows::derived::tnce_d4(rig, grid, &moved, keys, slice, of)?)?)
                 },
             );
             first.and(second)
@@ -103,12 +107,15 @@ impl ReferenceDerivation {
         for (table, encoder) in encoders {
             files.push((table, encoder.finish()?));
         }
-        let stats = rows::stats::rows(rig, keys, &SurfaceLevels { tnce: totals, unbiased, errors, curves }, of)?;
-        files.push((Table::SurfaceStats, encode(Table::SurfaceStats, &Table::SurfaceStats.schema(rig), &[stats])?));
+        let stats = rows::stats::stats_rows(rig, keys, &SurfaceLevels { tnce: totals, unbiased, errors, curves }, of)?;
+        files.push((
+            Table::SurfaceStats,
+            encode_batches(Table::SurfaceStats, &Table::SurfaceStats.schema(rig), &[stats])?,
+        ));
         Ok((files, responses.pairs.len() - paired))
     }
 
-    fn slices(
+    fn derive_slices(
         &self,
         lake: &Lake,
         keys: &RunKeys,
@@ -121,7 +128,7 @@ impl ReferenceDerivation {
         let plan = derivation_plan(rig).map_err(failed)?;
         let levels = self.level_uncertainty(lake, keys, responses)?;
         let sound_m_s = speed_of_sound(rig.impulse_response.reference_temperature_c.get());
-        let (mut scratch, mut derived, mut energies) = (plan.scratch(), plan.derived(), vec![0.0; bands]);
+        let (mut scratch, mut derived, mut energies) = (plan.make_scratch(), plan.make_derived(), vec![0.0; bands]);
         let mut sensitivities = vec![EnergySensitivity::default(); bands];
         let slices = responses.pairs.chunks(SLICE).zip(responses.irs.chunks(SLICE * length));
         for ((pairs, irs), temperatures) in slices.zip(responses.celsius.chunks(SLICE)) {
@@ -132,10 +139,16 @@ impl ReferenceDerivation {
                 slice.push(*pair, &derived);
                 if let Some(levels) = &levels {
                     let air = &self.references.chosen.air;
-                    let metres = arrivals(lake, *pair).map_or(0.0, |[_, reflected]| reflected * sound_m_s);
+                    let metres = arrival_times(lake, *pair).map_or(0.0, |[_, reflected]| reflected * sound_m_s);
                     let per_kelvin = |bin| air.per_kelvin(bin, metres);
-                    plan.sensitivities(&derived.reflected, direct, per_kelvin, &mut sensitivities, &mut scratch)
-                        .map_err(failed)?;
+                    plan.compute_sensitivities(
+                        &derived.reflected,
+                        direct,
+                        per_kelvin,
+                        &mut sensitivities,
+                        &mut scratch,
+                    )
+                    .map_err(failed)?;
                     slice.push_errors(levels, &sensitivities, flat, *celsius);
                 }
                 if let Some((direct, flat)) = self.references.estimated.as_ref().and_then(|e| e.of_pair(*pair)) {
@@ -161,12 +174,13 @@ impl ReferenceDerivation {
         let mut fit = residual_fit(lake.rig()).map_err(failed)?;
         let mut reflected = vec![0.0; length];
         for (pair, ir) in responses.pairs.iter().zip(responses.irs.chunks_exact(length)) {
-            let (Some((direct, _)), Some(arrivals)) = (self.references.chosen.of_pair(*pair), arrivals(lake, *pair))
+            let (Some((direct, _)), Some(arrivals)) =
+                (self.references.chosen.of_pair(*pair), arrival_times(lake, *pair))
             else {
                 continue;
             };
-            subtract(ir, direct, &mut reflected);
-            fit.add(&reflected, direct, arrivals[0], arrivals[1]).map_err(failed)?;
+            subtract_foam(ir, direct, &mut reflected);
+            fit.add_pair(&reflected, direct, arrivals[0], arrivals[1]).map_err(failed)?;
         }
         let is_flat = self.references.only_flat.as_ref() == Some(&keys.surface);
         Ok(fit.finish().map(|run| LevelUncertainty { run, flat, is_flat }))

@@ -102,7 +102,7 @@ impl DerivedLists {
     /// Adds the curves, `length` samples each, to the means of their bands.
     pub(crate) fn add_curves(&self, length: usize, means: &mut [SignalMean]) -> Result<(), echolake_dsp::Error> {
         for (mean, curves) in means.iter_mut().zip(&self.curves) {
-            curves.chunks_exact(length).try_for_each(|curve| mean.add(curve))?;
+            curves.chunks_exact(length).try_for_each(|curve| mean.add_signal(curve))?;
         }
         Ok(())
     }
@@ -142,7 +142,8 @@ impl DerivedRows {
         celsius: f64,
     ) {
         let warmer = celsius - flat.celsius;
-        let (total, flat_total) = (EnergySensitivity::total(of), EnergySensitivity::total(&flat.sensitivities));
+        let (total, flat_total) =
+            (EnergySensitivity::sum_of_bands(of), EnergySensitivity::sum_of_bands(&flat.sensitivities));
         let over_total = || of.iter().chain([&total]);
         self.errors.extend(over_total().map(|of| levels.relative_error(of, &flat_total, warmer)));
         self.uncertainties.extend(over_total().map(|of| levels.level_db(of, &flat_total, warmer)));
@@ -161,12 +162,14 @@ impl DerivedRows {
 
     /// Returns the values of every column from `tnce_*` to `energy_total`, by its name.
     pub(crate) fn energy_columns(&self, bands: &[String]) -> Vec<(String, Vec<f64>)> {
-        let mut columns =
-            vec![("tnce_total".into(), self.totals(&self.tnce)), ("energy_total".into(), self.totals(&self.energies))];
+        let mut columns = vec![
+            ("tnce_total".into(), self.sum_bands(&self.tnce)),
+            ("energy_total".into(), self.sum_bands(&self.energies)),
+        ];
         for (b, band) in bands.iter().enumerate() {
-            columns.push((format!("tnce_{band}"), self.column(&self.tnce, b)));
-            columns.push((format!("tnce_band_{band}"), self.column(&self.tnce_over_band, b)));
-            columns.push((format!("energy_{band}"), self.column(&self.energies, b)));
+            columns.push((format!("tnce_{band}"), self.band_values(&self.tnce, b)));
+            columns.push((format!("tnce_band_{band}"), self.band_values(&self.tnce_over_band, b)));
+            columns.push((format!("energy_{band}"), self.band_values(&self.energies, b)));
         }
         columns
     }
@@ -217,15 +220,15 @@ impl DerivedRows {
     }
 
     fn band_columns(&self, values: &[f64]) -> Vec<Vec<f64>> {
-        let bands = (0..self.bands).map(|band| self.column(values, band));
-        bands.chain([self.totals(values)]).collect()
+        let bands = (0..self.bands).map(|band| self.band_values(values, band));
+        bands.chain([self.sum_bands(values)]).collect()
     }
 
-    fn column(&self, values: &[f64], band: usize) -> Vec<f64> {
+    fn band_values(&self, values: &[f64], band: usize) -> Vec<f64> {
         values.iter().skip(band).step_by(self.bands).copied().collect()
     }
 
-    fn totals(&self, values: &[f64]) -> Vec<f64> {
+    fn sum_bands(&self, values: &[f64]) -> Vec<f64> {
         values.chunks_exact(self.bands).map(|row| row.iter().sum()).collect()
     }
 }

@@ -86,10 +86,10 @@ impl LakeReport {
     }
 
     fn find_in(&mut self, table: Table, what: impl ToString) {
-        self.find(FindingSeverity::Damaged, format!("tables/{}", table.name()), what.to_string());
+        self.add_finding(FindingSeverity::Damaged, format!("tables/{}", table.name()), what.to_string());
     }
 
-    fn find(&mut self, severity: FindingSeverity, subject: impl ToString, what: impl Into<String>) {
+    fn add_finding(&mut self, severity: FindingSeverity, subject: impl ToString, what: impl Into<String>) {
         self.findings.push(LakeFinding { severity, subject: subject.to_string(), what: what.into() });
     }
 }
@@ -98,12 +98,12 @@ impl LakeReport {
 ///
 /// # Errors
 /// [`crate::Error`] if the lake itself cannot be read; damage in it is a finding.
-pub async fn examine(lake: &Lake, progress: &mut dyn FnMut(CheckStep<'_>)) -> Result<LakeReport> {
+pub async fn examine_lake(lake: &Lake, progress: &mut dyn FnMut(CheckStep<'_>)) -> Result<LakeReport> {
     let mut report = LakeReport::default();
     let snapshot = match lake.snapshot().await {
         // Without it, nothing says what the other tables must have.
         Err(error @ LakeError::Log { .. }) => {
-            report.find(FindingSeverity::Damaged, "tables/runs", error.to_string());
+            report.add_finding(FindingSeverity::Damaged, "tables/runs", error.to_string());
             return Ok(report);
         }
         snapshot => Arc::new(snapshot?),
@@ -118,7 +118,7 @@ pub async fn examine(lake: &Lake, progress: &mut dyn FnMut(CheckStep<'_>)) -> Re
             progress(CheckStep { subject: file.path.as_ref(), done, total });
             done += 1;
             if let Err(error) = check_table_file(lake, table, file).await {
-                report.find(FindingSeverity::Damaged, &file.path, error.to_string());
+                report.add_finding(FindingSeverity::Damaged, &file.path, error.to_string());
             }
         }
         report.tables.push(TableReport {
@@ -146,20 +146,20 @@ pub async fn examine(lake: &Lake, progress: &mut dyn FnMut(CheckStep<'_>)) -> Re
 
 // What the tables' logs have, against what `runs` names.
 async fn find_faults(lake: &Lake, snapshot: &LakeSnapshot, report: &mut LakeReport) -> Result<()> {
-    let is_named = snapshot.check(Table::Runs).map_err(|fault| report.find_in(Table::Runs, fault)).is_ok();
+    let is_named = snapshot.check_table(Table::Runs).map_err(|fault| report.find_in(Table::Runs, fault)).is_ok();
     for table in Table::ALL {
-        for lacking in snapshot.lacking(table) {
+        for lacking in snapshot.lacking_rows(table) {
             report.find_in(table, format!("{lacking}; hint: `echolake ingest` derives them again from the run's file"));
         }
-        for file in snapshot.foreign(table) {
+        for file in snapshot.foreign_files(table) {
             let what = "another program put it into the table's log; hint: `echolake ingest` removes it, and derives again \
                         what it replaced";
-            report.find(FindingSeverity::Damaged, &file.path, what);
+            report.add_finding(FindingSeverity::Damaged, &file.path, what);
         }
         if is_named
-            && snapshot.lacking(table).is_empty()
-            && snapshot.foreign(table).is_empty()
-            && let Err(fault) = snapshot.check(table)
+            && snapshot.lacking_rows(table).is_empty()
+            && snapshot.foreign_files(table).is_empty()
+            && let Err(fault) = snapshot.check_table(table)
         {
             report.find_in(table, fault);
         }
@@ -168,7 +168,7 @@ async fn find_faults(lake: &Lake, snapshot: &LakeSnapshot, report: &mut LakeRepo
                 "{versions} versions since its last checkpoint; hint: can the folder be written? The log of ingest says \
                  why a checkpoint failed"
             );
-            report.find(FindingSeverity::Note, format!("tables/{}/_delta_log", table.name()), what);
+            report.add_finding(FindingSeverity::Note, format!("tables/{}/_delta_log", table.name()), what);
         }
     }
     Ok(())
@@ -181,7 +181,7 @@ async fn check_table_file(lake: &Lake, table: Table, file: &DataFile) -> Result<
         let reason = format!("it has {size} bytes, its log says {}", file.bytes);
         return Err(LakeError::DataFile { file: file.path.to_string(), source: reason.into() }.into());
     }
-    let mut batches = lake.rows(table, file, &[], 0..file.rows).await?;
+    let mut batches = lake.read_rows(table, file, &[], 0..file.rows).await?;
     let mut rows = 0;
     while let Some(batch) = batches.try_next().await? {
         rows += batch.num_rows() as u64;
@@ -202,28 +202,28 @@ async fn check_run(
     let text = |column| text_of(row, column).unwrap_or_default();
     let (run, path, state) = (text("run_id"), text("file"), text("state"));
     for finding in check_run_file(lake, &Path::from(path.as_str()), &text("file_sha256"), report).await? {
-        report.find(FindingSeverity::Damaged, &path, finding);
+        report.add_finding(FindingSeverity::Damaged, &path, finding);
     }
     let removed = find_removed(lake, &run).await;
     if let Some(removed) = removed.filter(|_| report.findings.iter().any(|f| f.subject == path)) {
         let what = format!("its file is at `{removed}`; hint: `echolake remove {run}` resumes its removal");
-        report.find(FindingSeverity::Damaged, &run, what);
+        report.add_finding(FindingSeverity::Damaged, &run, what);
     }
     if state == "partial" {
-        report.find(
+        report.add_finding(
             FindingSeverity::Note,
             &run,
             "the recording was stopped, cut off or damaged; what it holds is in the tables",
         );
     }
     if let Ok(surface) = text("surface_id").parse() {
-        let missing = ReferenceFinder::new(lake, snapshot.clone()).wanted(&surface).missing();
+        let missing = ReferenceFinder::new(lake, snapshot.clone()).wanted_references(&surface).missing_names();
         if !missing.is_empty() {
             let what =
                 format!("waits for reference {missing}; hint: ingest a run of that surface, and it is completed");
-            report.find(FindingSeverity::Missing, &run, what);
+            report.add_finding(FindingSeverity::Missing, &run, what);
         } else if text("reference_derivation").is_empty() {
-            report.find(
+            report.add_finding(
                 FindingSeverity::Missing,
                 &run,
                 "its references are there, its derived rows are not; hint: `echolake ingest`",
@@ -266,7 +266,7 @@ async fn check_run_file(lake: &Lake, path: &Path, sha256: &str, report: &mut Lak
 async fn find_strays(lake: &Lake, snapshot: &LakeSnapshot, report: &mut LakeReport) -> Result<()> {
     let named: BTreeSet<Path> = Table::ALL
         .iter()
-        .flat_map(|t| snapshot.files(*t).iter().chain(snapshot.superseded(*t)))
+        .flat_map(|t| snapshot.files(*t).iter().chain(snapshot.superseded_files(*t)))
         .map(|f| f.path.clone())
         .chain(snapshot.runs().map(|r| Lake::run_path(&r.surface, &r.run)))
         .collect();
@@ -277,7 +277,7 @@ async fn find_strays(lake: &Lake, snapshot: &LakeSnapshot, report: &mut LakeRepo
         listing.unusable.append(&mut listed.unusable);
     }
     for entry in listing.unusable {
-        report.find(FindingSeverity::Missing, entry.path, format!("it is passed over: {}", entry.reason));
+        report.add_finding(FindingSeverity::Missing, entry.path, format!("it is passed over: {}", entry.reason));
     }
     let mut left_behind = (0, 0);
     for meta in listing.files.into_iter().filter(|m| !named.contains(&m.location)) {
@@ -295,7 +295,7 @@ async fn find_strays(lake: &Lake, snapshot: &LakeSnapshot, report: &mut LakeRepo
                      again, or `echolake recover` makes a run of what it holds",
                     meta.size
                 );
-                report.find(FindingSeverity::Missing, &path, what);
+                report.add_finding(FindingSeverity::Missing, &path, what);
                 continue;
             }
             ("inbox", "mcap") => (FindingSeverity::Missing, "not yet ingested; hint: `echolake ingest`"),
@@ -321,14 +321,14 @@ async fn find_strays(lake: &Lake, snapshot: &LakeSnapshot, report: &mut LakeRepo
             }
             _ => continue,
         };
-        report.find(severity, &path, what);
+        report.add_finding(severity, &path, what);
     }
     if left_behind.0 > 0 {
         let what = format!(
             "{} files ({} bytes) of older derivations or of an ingest that was cut off; hint: `echolake vacuum`",
             left_behind.0, left_behind.1
         );
-        report.find(FindingSeverity::Note, "tables", what);
+        report.add_finding(FindingSeverity::Note, "tables", what);
     }
     Ok(())
 }

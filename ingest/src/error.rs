@@ -260,7 +260,7 @@ impl Error {
         )
     }
 
-    pub(crate) fn read(file: impl ToString, source: impl Into<ErrorCause>) -> Self {
+    pub(crate) fn read_failure(file: impl ToString, source: impl Into<ErrorCause>) -> Self {
         Self::Read { file: file.to_string(), source: source.into() }
     }
 }

@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use echolake_lake::{
-    ClaimOutcome, ClaimTimes, CommitOutcome, EncodedFile, Lake, RunRowCounts, VisibleRun, WorkClaims, encode,
+    ClaimOutcome, ClaimTimes, CommitOutcome, EncodedFile, Lake, RunRowCounts, VisibleRun, WorkClaims, encode_batches,
     object_sha256,
 };
 use echolake_schema::RunId;
@@ -22,7 +22,7 @@ use crate::inbox::{self, FileVersion, OpenedRun, ReadFile, ReadingMark, RunSourc
 use crate::pipeline::{self, Cores, ReadyJob};
 use crate::read_back;
 use crate::reading::{Measurer, RunContent, RunHead};
-use crate::references::{ReferenceNames, digest};
+use crate::references::{ReferenceNames, digest_parts};
 use crate::report::{FileReport, IngestOutcome, IngestedRun};
 use crate::rows::runs::RunReferences;
 use crate::rows::{self, RunKeys};
@@ -77,14 +77,14 @@ impl<'a> LakeIngest<'a> {
 
     /// Shares the work with other ingests on whatever store the lake is.
     #[cfg(test)]
-    pub(crate) fn sharing(self, times: ClaimTimes) -> Self {
+    pub(crate) fn with_claims(self, times: ClaimTimes) -> Self {
         Self { claims: Some(Arc::new(WorkClaims::start(self.lake, times))), ..self }
     }
 
     /// Waits until all claims are given back: whoever waits for them need not wait until they are dead.
-    pub async fn close(self) {
+    pub async fn release_claims(self) {
         if let Some(claims) = self.claims.and_then(Arc::into_inner) {
-            claims.close().await;
+            claims.release_all().await;
         }
     }
 
@@ -139,7 +139,7 @@ impl<'a> LakeIngest<'a> {
         let measurer = Arc::new(Measurer::new(self.lake));
         let work = IngestWork { again: false, context, measurer, shared: None };
         let job = work.read_and_stage(source).await?;
-        self.lake.commit(&job.staged).await?;
+        self.lake.commit_staged(&job.staged).await?;
         Ok(job.report)
     }
 
@@ -150,7 +150,7 @@ impl<'a> LakeIngest<'a> {
             if self.stop.load(Ordering::Relaxed) {
                 return Err(Error::Stopped);
             }
-            claims.look().await;
+            claims.refresh_claims().await;
             let all = std::mem::take(claimed).into_iter();
             let (free, held): (Vec<_>, Vec<_>) = all.partition(|source| claims.is_free(source.work_name()));
             *claimed = held;
@@ -170,7 +170,7 @@ impl<'a> LakeIngest<'a> {
         report: &mut (dyn FnMut(FileReport) + Send),
     ) -> Result<Vec<RunSource>> {
         let (cores, claims) = (work.context.cores.clone(), work.shared.as_ref().map(|shared| shared.claims.clone()));
-        let release = |source: &RunSource| claims.iter().for_each(|claims| claims.release(source.work_name()));
+        let release = |source: &RunSource| claims.iter().for_each(|claims| claims.release_work(source.work_name()));
         let (mut refused, mut claimed, mut replaced) = (Vec::new(), Vec::new(), Vec::new());
         let ended = &mut |(source, done): pipeline::JobOutcome<RunSource, IngestedRun>| match done {
             Ok((taken, outcome)) => {
@@ -197,7 +197,7 @@ impl<'a> LakeIngest<'a> {
             let span = tracing::error_span!("ingest", file = %source, run = field::Empty, surface = field::Empty);
             async move { work.ingest_run(&source).await }.instrument(span)
         };
-        let done = pipeline::run(self.lake, &cores, sources, &self.stop, do_one, ended).await;
+        let done = pipeline::run_jobs(self.lake, &cores, sources, &self.stop, do_one, ended).await;
         for (source, place) in replaced {
             inbox::replace_partial(self.lake, &source, &place).await?;
         }
@@ -209,7 +209,7 @@ impl<'a> LakeIngest<'a> {
                     FileReport::Refused { moved: inbox::quarantine_file(self.lake, &source, &why).await?, source, why }
                 }
             });
-            claims.iter().for_each(|claims| claims.release(&name));
+            claims.iter().for_each(|claims| claims.release_work(&name));
         }
         done.map(|()| claimed)
     }
@@ -222,8 +222,8 @@ impl<'a> LakeIngest<'a> {
         let mut heads = Vec::with_capacity(sources.len());
         for source in sources {
             let _mark = ReadingMark::new(self.lake, &source);
-            let head = match source.open(self.lake) {
-                Ok(opened) => RunHead::read(&opened).await,
+            let head = match source.open_run(self.lake) {
+                Ok(opened) => RunHead::read_from(&opened).await,
                 Err(_) => None,
             };
             names.extend(head.iter().flat_map(|h| h.references.clone()));
@@ -238,29 +238,29 @@ impl<'a> LakeIngest<'a> {
 
 impl IngestWork {
     async fn ingest_run(&self, source: &RunSource) -> Result<ReadyJob<IngestedRun>> {
-        self.claim(source).await?;
-        inbox::check_end(&source.open(&self.context.lake)?).await?;
+        self.claim_source(source).await?;
+        inbox::check_end(&source.open_run(&self.context.lake)?).await?;
         self.read_and_stage(source).await
     }
 
     async fn read_and_stage(&self, source: &RunSource) -> Result<ReadyJob<IngestedRun>> {
         let IngestContext { lake, cores, snapshot, finder } = &self.context;
         let mark = ReadingMark::new(lake, source);
-        let opened = source.open(lake)?;
-        let version = FileVersion::read(lake, source).await?;
-        let content = Arc::new(RunContent::read(lake, &self.measurer, cores, &opened).await?);
+        let opened = source.open_run(lake)?;
+        let version = FileVersion::from_source(lake, source).await?;
+        let content = Arc::new(RunContent::read_from(lake, &self.measurer, cores, &opened).await?);
         let keys = RunKeys { surface: content.manifest.surface_id.clone(), run: content.manifest.run_id.clone() };
         let span = Span::current();
         span.record("run", field::display(&keys.run)).record("surface", field::display(&keys.surface));
         tracing::debug!(measurements = content.accepted.len(), damages = content.damaged.len(), "the file is read");
-        let derivation = digest(&[content.integrity.sha256.as_str(), CODE_VERSION, RESPONSES_REVISION]);
+        let derivation = digest_parts(&[content.integrity.sha256.as_str(), CODE_VERSION, RESPONSES_REVISION]);
         let known = snapshot.run(&keys.run);
         let replaced = match known {
             Some(known) => self.has_beginning_only(known, &content, &opened).await?,
             None => false,
         };
         let place = Lake::run_path(&keys.surface, &keys.run);
-        let file = ReadFile::check(lake, source, version, &content.integrity).await?;
+        let file = ReadFile::check_digest(lake, source, version, &content.integrity).await?;
         let kept = async {
             // The shorter file keeps its place until the rows of the longer one are committed.
             if replaced {
@@ -273,14 +273,14 @@ impl IngestWork {
             inbox::move_to_place(lake, source, &place, &file, known.is_some()).await?;
             Ok(next_mark.or(mark))
         };
-        let names = ReferenceNames::of(&content.surface, &lake.config().references);
+        let names = ReferenceNames::from_surface(&content.surface, &lake.config().references);
         let wanted = finder.lock().await.wanted_by(names);
         let mut taken = IngestedRun {
             run: keys.run.clone(),
             surface: keys.surface.clone(),
             measurements: content.accepted.len(),
             derived: false,
-            missing: wanted.missing(),
+            missing: wanted.missing_names(),
             outcome: IngestOutcome::Added,
             damaged: content.damaged.clone(),
             whole: content.is_whole(),
@@ -295,7 +295,7 @@ impl IngestWork {
         }
         let (its_lake, for_rows, its_content) = (lake.clone(), keys.clone(), content.clone());
         let of_the_run = async {
-            let files = cores.compute(move || encode_run(&its_lake, &for_rows, &its_content)).await?;
+            let files = cores.compute_on_core(move || encode_run(&its_lake, &for_rows, &its_content)).await?;
             self.context.stage_rows(&keys, &derivation, files).await
         };
         if is_current {
@@ -306,8 +306,8 @@ impl IngestWork {
         }
         let of_references = async {
             let (files, references) = match ReferenceDerivation::new(&self.context, &derivation, &wanted).await? {
-                Some(derived) => derived.derive(&self.context, &keys, content.responses()).await?,
-                None => (Vec::new(), RunReferences { missing: wanted.missing(), ..RunReferences::default() }),
+                Some(derived) => derived.derive_run(&self.context, &keys, content.run_responses()).await?,
+                None => (Vec::new(), RunReferences { missing: wanted.missing_names(), ..RunReferences::default() }),
             };
             let run = VisibleRun {
                 surface: keys.surface.clone(),
@@ -315,7 +315,7 @@ impl IngestWork {
                 run_derivation: derivation.clone(),
                 reference_derivation: references.derivation.clone(),
             };
-            let row = rows::runs::row(lake, &keys, &content, &derivation, &references)?;
+            let row = rows::runs::new_run_row(lake, &keys, &content, &derivation, &references)?;
             Ok((self.context.stage_derived(run, &[row], files).await?, references))
         };
         // The file comes to its place meanwhile.
@@ -323,7 +323,7 @@ impl IngestWork {
         // The row of `runs` is the last one.
         staged.extend(derived);
         if let Some(row) = staged.pop() {
-            let row = row.counting(RunRowCounts::default(), &staged);
+            let row = row.with_row_counts(RunRowCounts::default(), &staged);
             staged.push(row);
         }
         taken.derived = references.derivation.is_some();
@@ -334,15 +334,15 @@ impl IngestWork {
     }
 
     // Claims a file, if several ingests share the work.
-    async fn claim(&self, source: &RunSource) -> Result<()> {
+    async fn claim_source(&self, source: &RunSource) -> Result<()> {
         let Some(SharedWork { claims, known }) = &self.shared else { return Ok(()) };
         let file = source.to_string();
-        if claims.claim(source.work_name()).await == ClaimOutcome::Denied {
+        if claims.claim_work(source.work_name()).await == ClaimOutcome::Denied {
             return Err(Error::Claimed { file });
         }
         // Another ingest may have finished it meanwhile. In the inbox it would be gone.
         let Some(run) = source.run_in_place().filter(|run| !known.contains(run)) else { return Ok(()) };
-        let rows = self.context.lake.log().files(Table::Runs).await?;
+        let rows = self.context.lake.commit_log().list_files(Table::Runs).await?;
         if rows.iter().any(|row| row.shown_runs().contains(&run)) { Err(Error::Gone { file }) } else { Ok(()) }
     }
 
@@ -357,7 +357,7 @@ impl IngestWork {
         let shorter = rows::runs::number_of(&row, "file_bytes").and_then(|bytes| u64::try_from(bytes).ok());
         if let Some(bytes) = shorter.filter(|bytes| (1..content.integrity.bytes).contains(bytes)) {
             let (store, path) = (opened.store.as_ref(), &opened.path);
-            let failed = |e: object_store::Error| Error::read(&opened.name, e);
+            let failed = |e: object_store::Error| Error::read_failure(&opened.name, e);
             if !inbox::has_end_at(store, path, bytes).await.map_err(failed)?
                 && object_sha256(store, path, bytes, &mut |_| {}).await.map_err(failed)? == there
             {
@@ -374,25 +374,28 @@ fn encode_run(lake: &Lake, keys: &RunKeys, content: &RunContent) -> Result<Vec<(
     let rig = lake.rig();
     let origin = content.manifest.origin.label();
     let references = &lake.config().references;
-    let surface = rows::surfaces::row(rig, keys, &content.surface, references, origin, &content.heights_mm)?;
-    let heights = rows::heightmaps::rows(rig, keys, &content.heights_mm)?;
+    let surface = rows::surfaces::surface_row(rig, keys, &content.surface, references, origin, &content.heights_mm)?;
+    let heights = rows::heightmaps::heightmap_rows(rig, keys, &content.heights_mm)?;
     let mut tables = vec![
         (Table::Surfaces, vec![surface]),
-        (Table::Environment, vec![rows::logs::environment(rig, keys, &content.readings)?]),
-        (Table::Events, vec![rows::logs::events(rig, keys, &content.events)?]),
+        (Table::Environment, vec![rows::logs::environment_rows(rig, keys, &content.readings)?]),
+        (Table::Events, vec![rows::logs::event_rows(rig, keys, &content.events)?]),
     ];
     tables.extend(heights.map(|batch| (Table::Heightmaps, vec![batch])));
     let mut encoded = Vec::with_capacity(tables.len() + 1);
     for (table, batches) in tables {
-        encoded.push((table, encode(table, &table.schema(rig), &batches)?));
+        encoded.push((table, encode_batches(table, &table.schema(rig), &batches)?));
     }
-    encoded.push((Table::Measurements, rows::measurements::encode(rig, lake.grid(), keys, &content.accepted)?));
+    encoded.push((
+        Table::Measurements,
+        rows::measurements::encode_measurements(rig, lake.grid(), keys, &content.accepted)?,
+    ));
     Ok(encoded)
 }
 
 impl RunContent {
     /// Returns the responses alone, sorted by pair.
-    fn responses(&self) -> RunResponses {
+    fn run_responses(&self) -> RunResponses {
         RunResponses {
             pairs: self.accepted.iter().map(|(m, _)| m.pair_id).collect(),
             irs: self.accepted.iter().flat_map(|(_, r)| r.ir.iter().copied()).collect(),

@@ -4,12 +4,12 @@
 //! [`LakeIngest::complete_runs`] derives again the rows that used outdated references, and nothing else.
 //!
 //! ```no_run,standalone_crate
-//! use echolake_ingest::{FileReport, LakeIngest, pending};
+//! use echolake_ingest::{FileReport, LakeIngest, pending_runs};
 //! # async fn example() -> Result<(), Box<dyn std::error::Error>> {
 //! let lake = echolake_lake::Lake::open("lake").await?;
 //! let ingest = LakeIngest::new(&lake, std::sync::Arc::default());
 //! ingest
-//!     .ingest_runs(pending(&lake).await?, &mut |report| {
+//!     .ingest_runs(pending_runs(&lake).await?, &mut |report| {
 //!         if let FileReport::Ingested(run) = report {
 //!             println!("{} measurements of {}", run.measurements, run.surface);
 //!         }
@@ -44,7 +44,7 @@ pub use echolake_recording::FileIntegrity;
 pub use error::{Error, Result};
 pub use inbox::{
     PendingFiles, RecordingState, RunSource, SuspectFile, UnfinishedRecording, find_runs, has_end, list_arrivals,
-    list_pending, pending, rig_of_run,
+    list_pending, pending_runs, rig_of_run,
 };
 pub use ingest::LakeIngest;
 pub use remove::{RemovedFile, RunRemoval, find_removals, find_removed};

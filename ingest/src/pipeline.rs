@@ -69,7 +69,7 @@ impl Cores {
     }
 
     /// Counts the caller as a busy core.
-    pub(crate) fn busy(&self) -> BusyCore {
+    pub(crate) fn mark_busy(&self) -> BusyCore {
         self.busy.fetch_add(1, Ordering::Relaxed);
         BusyCore(self.busy.clone())
     }
@@ -80,9 +80,12 @@ impl Cores {
     }
 
     /// Starts a computation on a core of its own once one is free, in the order of the calls.
-    pub(crate) fn begin<T: Send + 'static>(&self, work: impl FnOnce() -> T + Send + 'static) -> PendingComputation<T> {
+    pub(crate) fn begin_on_core<T: Send + 'static>(
+        &self,
+        work: impl FnOnce() -> T + Send + 'static,
+    ) -> PendingComputation<T> {
         let (sender, done) = oneshot::channel();
-        let (busy, span) = (self.busy(), Span::current());
+        let (busy, span) = (self.mark_busy(), Span::current());
         self.pool.spawn_fifo(move || {
             let done = catch_unwind(AssertUnwindSafe(|| span.in_scope(work)));
             drop(busy);
@@ -92,15 +95,15 @@ impl Cores {
         PendingComputation(done)
     }
 
-    /// Computes on a core of its own, as [`Self::begin`] does, and waits for the result.
-    pub(crate) async fn compute<T: Send + 'static>(&self, work: impl FnOnce() -> T + Send + 'static) -> T {
-        self.begin(work).done().await
+    /// Computes on a core of its own, as [`Self::begin_on_core`] does, and waits for the result.
+    pub(crate) async fn compute_on_core<T: Send + 'static>(&self, work: impl FnOnce() -> T + Send + 'static) -> T {
+        self.begin_on_core(work).wait_for_result().await
     }
 }
 
 impl<T> PendingComputation<T> {
     /// Waits for the result; a panic of the computation is resumed here.
-    pub(crate) async fn done(self) -> T {
+    pub(crate) async fn wait_for_result(self) -> T {
         match self.0.await {
             Ok(Ok(done)) => done,
             Ok(Err(panic)) => resume_unwind(panic),
@@ -116,7 +119,7 @@ impl<T> PendingComputation<T> {
 ///
 /// # Errors
 /// [`Error::Stopped`] if jobs are left, an error that `ended` returned, or the lake's error in a commit.
-pub(crate) async fn run<J, R, W, F>(
+pub(crate) async fn run_jobs<J, R, W, F>(
     lake: &Lake,
     cores: &Cores,
     jobs: Vec<J>,
@@ -149,8 +152,8 @@ where
         });
     }
     drop(sender);
-    while let Some(group) = gather(&mut ready).await {
-        commit(lake, group, ended).await?;
+    while let Some(group) = gather_group(&mut ready).await {
+        commit_group(lake, group, ended).await?;
         halt.store(stop.load(Ordering::Relaxed), Ordering::Relaxed);
     }
     // A worker that panicked has not finished its job.
@@ -165,7 +168,7 @@ where
 }
 
 // Collects ready jobs until there are enough for a commit or the timeout is over; None once no more will come.
-async fn gather<T>(ready: &mut mpsc::Receiver<T>) -> Option<Vec<T>> {
+async fn gather_group<T>(ready: &mut mpsc::Receiver<T>) -> Option<Vec<T>> {
     let mut group = vec![ready.recv().await?];
     let deadline = Instant::now() + GATHER;
     while group.len() < GROUP
@@ -176,14 +179,14 @@ async fn gather<T>(ready: &mut mpsc::Receiver<T>) -> Option<Vec<T>> {
     Some(group)
 }
 
-async fn commit<J, R>(
+async fn commit_group<J, R>(
     lake: &Lake,
     group: Vec<(J, Result<ReadyJob<R>>)>,
     ended: &mut (dyn FnMut(JobOutcome<J, R>) -> Result<()> + Send),
 ) -> Result<()> {
     let staged: Vec<_> =
         group.iter().flat_map(|(_, done)| done.iter().flat_map(|r| r.staged.iter().cloned())).collect();
-    let mut outcomes = lake.commit(&staged).await?.into_iter();
+    let mut outcomes = lake.commit_staged(&staged).await?.into_iter();
     for (job, done) in group {
         let done = done.map(|ready| {
             let last = outcomes.by_ref().take(ready.staged.len()).last();

@@ -16,10 +16,10 @@ use crate::derived_values::RunResponses;
 use crate::error::{Error, Result};
 
 /// Reads a run's impulse responses from `measurements`.
-pub(crate) async fn responses(lake: &Lake, snapshot: &LakeSnapshot, run: &RunId) -> Result<RunResponses> {
+pub(crate) async fn read_responses(lake: &Lake, snapshot: &LakeSnapshot, run: &RunId) -> Result<RunResponses> {
     // References without all of their measurements would be others.
-    if snapshot.lacking(Table::Measurements).iter().any(|lacking| lacking.run == *run) {
-        snapshot.check(Table::Measurements)?;
+    if snapshot.lacking_rows(Table::Measurements).iter().any(|lacking| lacking.run == *run) {
+        snapshot.check_table(Table::Measurements)?;
     }
     let mut out = RunResponses::default();
     let files: Vec<_> = snapshot.files_of(Table::Measurements, run).cloned().collect();
@@ -52,8 +52,8 @@ async fn rows_of_run(
 ) -> Result<Vec<RecordBatch>> {
     let place = file.visible_parts().find(|(part, _)| part.run == *run).map(|(_, rows)| rows);
     match place {
-        Some(rows) => Ok(lake.rows(table, file, columns, rows).await?.try_collect().await?),
-        None => batches(lake, table, file, columns).await,
+        Some(rows) => Ok(lake.read_rows(table, file, columns, rows).await?.try_collect().await?),
+        None => read_batches(lake, table, file, columns).await,
     }
 }
 
@@ -65,7 +65,12 @@ pub(crate) async fn run_row(lake: &Lake, file: &DataFile, run: &RunId) -> Result
 }
 
 /// Reads the named columns of a file; all if `columns` is empty.
-pub(crate) async fn batches(lake: &Lake, table: Table, file: &DataFile, columns: &[&str]) -> Result<Vec<RecordBatch>> {
+pub(crate) async fn read_batches(
+    lake: &Lake,
+    table: Table,
+    file: &DataFile,
+    columns: &[&str],
+) -> Result<Vec<RecordBatch>> {
     let damaged = |reason: String| Error::DataFile { file: file.path.to_string(), reason };
     let bytes = async { lake.store().get(&file.path).await?.bytes().await };
     let bytes = bytes.await.map_err(|e| echolake_lake::Error::unread_file(&file.path, e))?;

@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 
-use echolake_dsp::foam::subtract;
+use echolake_dsp::foam::subtract_foam;
 use echolake_dsp::foam_reflection::FoamReflectionFit;
 use echolake_dsp::geometry::{direct_mm, image_mm};
 use echolake_dsp::temperature::speed_of_sound;
@@ -74,7 +74,7 @@ pub(crate) struct ReferenceNames {
 
 impl ReferenceNames {
     /// Returns the names that a run's surface gives, else the lake's.
-    pub(crate) fn of(surface: &SurfaceRecord, references: &ReferenceSurfaces) -> Self {
+    pub(crate) fn from_surface(surface: &SurfaceRecord, references: &ReferenceSurfaces) -> Self {
         Self {
             flat: surface.flat_reference.clone().unwrap_or_else(|| references.flat.clone()),
             foam: surface.foam_reference.clone().unwrap_or_else(|| references.foam.clone()),
@@ -102,7 +102,7 @@ pub(crate) struct ReferenceVersion {
 
 impl ReferenceVersion {
     // Means are known by it.
-    fn key(&self) -> &str {
+    fn version_key(&self) -> &str {
         self.version.as_deref().unwrap_or_default()
     }
 }
@@ -115,30 +115,31 @@ impl ReferenceFinder {
         }
         // `flat:2:1f00ab...`: the surface, the number of runs, and a digest of their derivations.
         let version = |(surface, runs): (SurfaceId, Vec<String>)| {
-            let version = format!("{surface}:{}:{}", runs.len(), digest(&runs));
+            let version = format!("{surface}:{}:{}", runs.len(), digest_parts(&runs));
             (surface, version)
         };
         let versions = runs.into_iter().map(version).collect();
-        let names = snapshot.files(Table::Surfaces).iter().flat_map(|f| names(f, &lake.config().references)).collect();
+        let names =
+            snapshot.files(Table::Surfaces).iter().flat_map(|f| names_of_file(f, &lake.config().references)).collect();
         Self { lake: lake.clone(), snapshot, names, versions, means: HashMap::new(), loaded: HashMap::new() }
     }
 
-    pub(crate) fn shared(lake: &Lake, snapshot: Arc<LakeSnapshot>) -> SharedFinder {
+    pub(crate) fn new_shared(lake: &Lake, snapshot: Arc<LakeSnapshot>) -> SharedFinder {
         Arc::new(Mutex::new(Self::new(lake, snapshot)))
     }
 
     /// Returns the references with which the surface's rows must be derived.
-    pub(crate) fn wanted(&self, surface: &SurfaceId) -> WantedReferences {
-        self.wanted_by(self.names(surface))
+    pub(crate) fn wanted_references(&self, surface: &SurfaceId) -> WantedReferences {
+        self.wanted_by(self.reference_names(surface))
     }
 
     /// The same for a surface with these names.
     pub(crate) fn wanted_by(&self, ReferenceNames { flat, foam }: ReferenceNames) -> WantedReferences {
-        let flat_foam = self.names(&flat).foam;
+        let flat_foam = self.reference_names(&flat).foam;
         WantedReferences {
-            flat: self.found(flat),
-            foam: self.found(foam),
-            flat_foam: self.found(flat_foam),
+            flat: self.find_version(flat),
+            foam: self.find_version(foam),
+            flat_foam: self.find_version(flat_foam),
             direct_sound: self.lake.config().references.direct_sound,
         }
     }
@@ -147,21 +148,28 @@ impl ReferenceFinder {
     ///
     /// # Errors
     /// [`Error::FoamReflection`] if the lake wants it estimated and it cannot be.
-    pub(crate) async fn load(&mut self, wanted: &WantedReferences, cores: &Cores) -> Result<Option<LoadedReferences>> {
-        let Some(versions) = wanted.versions() else { return Ok(None) };
+    pub(crate) async fn load_references(
+        &mut self,
+        wanted: &WantedReferences,
+        cores: &Cores,
+    ) -> Result<Option<LoadedReferences>> {
+        let Some(versions) = wanted.version_pair() else { return Ok(None) };
         if let Some(known) = self.loaded.get(&versions) {
             return Ok(Some(known.clone()));
         }
         // One after the other, each would wait for its store.
         let named = [&wanted.foam, &wanted.flat_foam, &wanted.flat];
         self.read_means(named).await?;
-        let [foam, flat_foam, flat] = named.map(|of| self.means[of.key()].clone());
+        let [foam, flat_foam, flat] = named.map(|of| self.means[of.version_key()].clone());
         let (lake, is_foam_chosen) = (self.lake.clone(), wanted.direct_sound == DirectSound::Foam);
         let derive = move || {
             let of_foam = || ReferenceResponses::new(&lake, foam.clone(), &flat, &flat_foam);
-            rayon::join(|| is_foam_chosen.then(of_foam).transpose(), || estimated(&lake, &flat, &flat_foam, &foam))
+            rayon::join(
+                || is_foam_chosen.then(of_foam).transpose(),
+                || estimate_references(&lake, &flat, &flat_foam, &foam),
+            )
         };
-        let (of_foam, estimated) = cores.compute(derive).await;
+        let (of_foam, estimated) = cores.compute_on_core(derive).await;
         let (of_foam, estimated) = (of_foam?, estimated?);
         let chosen = of_foam.or_else(|| estimated.clone()).ok_or_else(|| Error::FoamReflection {
             foam: wanted.foam.surface.to_string(),
@@ -177,10 +185,10 @@ impl ReferenceFinder {
     // Reads the means that are not known yet side by side.
     async fn read_means(&mut self, named: [&ReferenceVersion; 3]) -> Result<()> {
         // Foam is most often that of Flat, too.
-        let named = named.into_iter().map(|of| (of.key(), of));
+        let named = named.into_iter().map(|of| (of.version_key(), of));
         let unknown: BTreeMap<_, _> = named.filter(|(key, _)| !self.means.contains_key(*key)).collect();
         let read = unknown.into_iter().map(|(key, of)| {
-            let means = self.mean(of);
+            let means = self.compute_mean(of);
             async move { Ok::<_, Error>((key.to_owned(), Arc::new(means.await?))) }
         });
         let read = try_join_all(read).await?;
@@ -188,11 +196,11 @@ impl ReferenceFinder {
         Ok(())
     }
 
-    async fn mean(&self, of: &ReferenceVersion) -> Result<MeanResponses> {
+    async fn compute_mean(&self, of: &ReferenceVersion) -> Result<MeanResponses> {
         // Number of responses, the sum of their temperatures, and that of their samples.
         let mut sums: HashMap<u32, (u32, f64, Vec<f64>)> = HashMap::new();
         for run in self.snapshot.runs().filter(|r| r.surface == of.surface) {
-            let responses = read_back::responses(&self.lake, &self.snapshot, &run.run).await?;
+            let responses = read_back::read_responses(&self.lake, &self.snapshot, &run.run).await?;
             let length = self.lake.rig().impulse_response.length;
             let measured = responses.pairs.iter().zip(&responses.celsius).zip(responses.irs.chunks_exact(length));
             for ((pair, celsius), ir) in measured {
@@ -209,12 +217,12 @@ impl ReferenceFinder {
         Ok(sums.into_iter().map(mean).collect())
     }
 
-    fn found(&self, surface: SurfaceId) -> ReferenceVersion {
+    fn find_version(&self, surface: SurfaceId) -> ReferenceVersion {
         ReferenceVersion { version: self.versions.get(&surface).cloned(), surface }
     }
 
     // The lake's defaults for an unknown surface.
-    fn names(&self, surface: &SurfaceId) -> ReferenceNames {
+    fn reference_names(&self, surface: &SurfaceId) -> ReferenceNames {
         let references = &self.lake.config().references;
         let defaults = || ReferenceNames { flat: references.flat.clone(), foam: references.foam.clone() };
         self.names.get(surface).cloned().unwrap_or_else(defaults)
@@ -222,7 +230,7 @@ impl ReferenceFinder {
 }
 
 // The names in the rows of a file's surfaces, which are the same in all of them, taken from the file's statistics.
-fn names(file: &DataFile, references: &ReferenceSurfaces) -> Vec<(SurfaceId, ReferenceNames)> {
+fn names_of_file(file: &DataFile, references: &ReferenceSurfaces) -> Vec<(SurfaceId, ReferenceNames)> {
     let surfaces = match FileName::parse(&file.path) {
         Some(FileName::Rows { surface, .. }) => vec![surface],
         _ => file.visible_parts().map(|(part, _)| part.surface.clone()).collect(),
@@ -239,32 +247,33 @@ impl ReferenceResponses {
     // `direct` is subtracted from a surface's responses, `flat_direct` from Flat's.
     fn new(lake: &Lake, direct: Arc<MeanResponses>, flat: &MeanResponses, flat_direct: &MeanResponses) -> Result<Self> {
         let rig = lake.rig();
-        let plan = derivation_plan(rig).map_err(failed)?;
-        let mut scratch = plan.scratch();
+        let plan = derivation_plan(rig).map_err(kernel_error)?;
+        let mut scratch = plan.make_scratch();
         let length = rig.impulse_response.length;
         let mut power = vec![0.0; length / 2 + 1];
-        let reflected: Vec<_> = sorted(flat)
+        let reflected: Vec<_> = sorted_means(flat)
             .into_iter()
             .filter_map(|(pair, flat)| {
                 let direct = flat_direct.get(&pair)?;
                 let mut reflected = vec![0.0; length];
-                subtract(&flat.ir, &direct.ir, &mut reflected);
+                subtract_foam(&flat.ir, &direct.ir, &mut reflected);
                 Some((pair, reflected, direct, flat.celsius))
             })
             .collect();
         for (_, reflected, ..) in &reflected {
-            plan.add_power(reflected, &mut power, &mut scratch).map_err(failed)?;
+            plan.add_power(reflected, &mut power, &mut scratch).map_err(kernel_error)?;
         }
-        let air = temperature_response(rig, &power).map_err(failed)?;
-        let mut residual = residual_fit(rig).map_err(failed)?;
+        let air = temperature_response(rig, &power).map_err(kernel_error)?;
+        let mut residual = residual_fit(rig).map_err(kernel_error)?;
         let mut pairs = FlatPairs::with_capacity(flat.len());
         for (pair, reflected, direct, celsius) in reflected {
-            let energies = plan.flat_energies(&reflected, &mut scratch).map_err(failed)?;
+            let energies = plan.flat_energies(&reflected, &mut scratch).map_err(kernel_error)?;
             let mut sensitivities = vec![EnergySensitivity::default(); energies.bands.len()];
             // Flat's air is what temperatures are told from.
-            plan.sensitivities(&reflected, &direct.ir, |_| 0.0, &mut sensitivities, &mut scratch).map_err(failed)?;
-            if let Some([direct_secs, reflected_secs]) = arrivals(lake, pair) {
-                residual.add(&reflected, &direct.ir, direct_secs, reflected_secs).map_err(failed)?;
+            plan.compute_sensitivities(&reflected, &direct.ir, |_| 0.0, &mut sensitivities, &mut scratch)
+                .map_err(kernel_error)?;
+            if let Some([direct_secs, reflected_secs]) = arrival_times(lake, pair) {
+                residual.add_pair(&reflected, &direct.ir, direct_secs, reflected_secs).map_err(kernel_error)?;
             }
             pairs.insert(pair, FlatPair { energies, sensitivities, celsius });
         }
@@ -278,7 +287,7 @@ impl ReferenceResponses {
 }
 
 /// Returns the arrivals of a pair's direct sound and of its reflection in the panel's plane, s.
-pub(crate) fn arrivals(lake: &Lake, pair: u32) -> Option<[f64; 2]> {
+pub(crate) fn arrival_times(lake: &Lake, pair: u32) -> Option<[f64; 2]> {
     let points = lake.grid().pair(PairId(pair))?;
     let position = |point| lake.grid().point(point).map(|point| point.position_mm);
     let (microphone, speaker) = (position(points.microphone)?, position(points.speaker)?);
@@ -290,30 +299,31 @@ pub(crate) fn arrivals(lake: &Lake, pair: u32) -> Option<[f64; 2]> {
 }
 
 // In one order, so that sums are the same in every process.
-fn sorted(means: &MeanResponses) -> Vec<(u32, &MeanResponse)> {
+fn sorted_means(means: &MeanResponses) -> Vec<(u32, &MeanResponse)> {
     let mut pairs: Vec<_> = means.iter().map(|(pair, mean)| (*pair, mean)).collect();
     pairs.sort_unstable_by_key(|(pair, _)| *pair);
     pairs
 }
 
-fn failed(cause: echolake_dsp::Error) -> Error {
+fn kernel_error(cause: echolake_dsp::Error) -> Error {
     Error::Kernel { file: "the reference".to_owned(), cause }
 }
 
 // References without Foam's reflection. Flat's Foam may be another one than the surface's: both are of the same material.
-fn estimated(
+fn estimate_references(
     lake: &Lake,
     flat: &MeanResponses,
     flat_foam: &MeanResponses,
     foam: &MeanResponses,
 ) -> Result<Option<ReferenceResponses>> {
     let rig = lake.rig();
-    let mut fit = FoamReflectionFit::new(rig.impulse_response.length, rig.sweep.rate_hz.get()).map_err(failed)?;
-    for (pair, flat) in sorted(flat) {
-        let (Some(foam), Some([direct_secs, reflected_secs])) = (flat_foam.get(&pair), arrivals(lake, pair)) else {
+    let mut fit = FoamReflectionFit::new(rig.impulse_response.length, rig.sweep.rate_hz.get()).map_err(kernel_error)?;
+    for (pair, flat) in sorted_means(flat) {
+        let (Some(foam), Some([direct_secs, reflected_secs])) = (flat_foam.get(&pair), arrival_times(lake, pair))
+        else {
             continue;
         };
-        fit.add(&foam.ir, &flat.ir, direct_secs, reflected_secs).map_err(failed)?;
+        fit.add_pair(&foam.ir, &flat.ir, direct_secs, reflected_secs).map_err(kernel_error)?;
     }
     let Some(reflection) = fit.finish() else { return Ok(None) };
     let direct_sound = |foam: &MeanResponses| -> Result<MeanResponses> {
@@ -321,7 +331,7 @@ fn estimated(
         for (pair, foam) in foam {
             let Some(flat) = flat.get(pair) else { continue };
             let mut ir = vec![0.0; foam.ir.len()];
-            reflection.direct_sound(&foam.ir, &flat.ir, &mut ir).map_err(failed)?;
+            reflection.direct_sound(&foam.ir, &flat.ir, &mut ir).map_err(kernel_error)?;
             direct.insert(*pair, MeanResponse { ir, celsius: foam.celsius });
         }
         Ok(direct)
@@ -331,19 +341,19 @@ fn estimated(
 
 impl WantedReferences {
     /// Returns Flat's version and Foam's; None if one is missing. Flat's version includes that of its own Foam.
-    pub(crate) fn versions(&self) -> Option<(String, String)> {
+    pub(crate) fn version_pair(&self) -> Option<(String, String)> {
         let (flat, flat_foam) = (self.flat.version.as_ref()?, self.flat_foam.version.as_ref()?);
-        Some((format!("{flat}-{}", digest(&[flat_foam])), self.foam.version.clone()?))
+        Some((format!("{flat}-{}", digest_parts(&[flat_foam])), self.foam.version.clone()?))
     }
 
     /// Returns the derivation's name for a run with these references.
-    pub(crate) fn derivation(&self, run_derivation: &str) -> Option<String> {
-        let (flat, foam) = self.versions()?;
-        Some(digest(&[run_derivation, &flat, &foam, CODE_VERSION, ROWS_REVISION, self.direct_sound.name()]))
+    pub(crate) fn derivation_name(&self, run_derivation: &str) -> Option<String> {
+        let (flat, foam) = self.version_pair()?;
+        Some(digest_parts(&[run_derivation, &flat, &foam, CODE_VERSION, ROWS_REVISION, self.direct_sound.name()]))
     }
 
     /// Returns the names of the missing references, for messages.
-    pub(crate) fn missing(&self) -> String {
+    pub(crate) fn missing_names(&self) -> String {
         let absent = [&self.flat, &self.foam, &self.flat_foam].into_iter().filter(|f| f.version.is_none());
         let names: BTreeSet<_> = absent.map(|f| f.surface.as_str()).collect();
         names.into_iter().collect::<Vec<_>>().join(", ")
@@ -351,7 +361,7 @@ impl WantedReferences {
 }
 
 /// Returns a short digest of parts, none of which contains a line break.
-pub(crate) fn digest(parts: &[impl AsRef<str>]) -> String {
+pub(crate) fn digest_parts(parts: &[impl AsRef<str>]) -> String {
     let mut sha = Sha256::new();
     for part in parts {
         sha.update(part.as_ref());

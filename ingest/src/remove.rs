@@ -67,13 +67,13 @@ async fn find_removal(lake: &Lake, snapshot: &LakeSnapshot, name: &str) -> Resul
     let run: RunId = stem.strip_suffix(".mcap").unwrap_or(stem).parse().map_err(|_| absent())?;
     let surface = match snapshot.run(&run) {
         Some(visible) => visible.surface.clone(),
-        None => run.untagged().split_once('-').and_then(|(_, surface)| surface.parse().ok()).ok_or_else(absent)?,
+        None => run.untagged_name().split_once('-').and_then(|(_, surface)| surface.parse().ok()).ok_or_else(absent)?,
     };
     let path = Lake::run_path(&surface, &run);
     let bytes = match lake.store().head(&path).await {
         Ok(meta) => Some(meta.size),
         Err(StoreError::NotFound { .. }) => None,
-        Err(e) => return Err(Error::read(&path, e)),
+        Err(e) => return Err(Error::read_failure(&path, e)),
     };
     if bytes.is_none() && snapshot.run(&run).is_none() && !lake.has_rows_of(&run).await? {
         return Err(absent());
@@ -99,7 +99,7 @@ impl LakeIngest<'_> {
     /// # Errors
     /// [`Error::CameBack`] if another ingest has ingested one of them meanwhile; a refusal of an older run whose surface
     /// would lose its row, before anything is removed; or an error of the lake.
-    pub async fn remove(&self, removals: &mut [RunRemoval], file: RemovedFile, by: &str) -> Result<()> {
+    pub async fn remove_runs(&self, removals: &mut [RunRemoval], file: RemovedFile, by: &str) -> Result<()> {
         let lake = self.lake;
         let runs: BTreeSet<RunId> = removals.iter().map(|removal| removal.run.clone()).collect();
         self.restore_surfaces(&runs).await?;
@@ -137,7 +137,7 @@ impl LakeIngest<'_> {
         for run in snapshot.runs().filter(|run| !removed.contains(&run.run)) {
             let is_older = |of: &&RunId| **of > run.run && snapshot.run(of).is_some_and(|of| of.surface == run.surface);
             if removed.iter().any(|of| is_older(&of)) {
-                let project = snapshot.project(&run.run).map(ToString::to_string);
+                let project = snapshot.project_of(&run.run).map(ToString::to_string);
                 newest.insert((run.surface.clone(), project), run.run.clone());
             }
         }

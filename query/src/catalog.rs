@@ -66,7 +66,7 @@ impl LakeCatalog {
     /// # Errors
     /// [`Error::Lake`] if the rig cannot be laid out.
     pub(crate) fn new(lake: &Lake, source: FileReaders) -> Result<Self, Error> {
-        let lookups = LookupFunctions::of(lake)?;
+        let lookups = LookupFunctions::from_lake(lake)?;
         let small = source.small.clone();
         Ok(Self {
             lake: lake.clone(),
@@ -81,7 +81,7 @@ impl LakeCatalog {
     }
 
     /// Returns the optimizer rules for plans over these tables and views, the same for every snapshot.
-    pub(crate) fn rules(&self) -> [Arc<dyn OptimizerRule + Send + Sync>; 3] {
+    pub(crate) fn optimizer_rules(&self) -> [Arc<dyn OptimizerRule + Send + Sync>; 3] {
         [Arc::new(UnusedJoin), Arc::new(PairJoin::new(&self.lookups)), Arc::new(SortedNulls)]
     }
 
@@ -92,27 +92,29 @@ impl LakeCatalog {
     /// # Errors
     /// [`Error::Lake`] if the lake cannot be read, or not as of the moment that the statement names;
     /// [`Error::Query`] if that is no moment.
-    pub(crate) async fn register(
+    pub(crate) async fn register_tables(
         &self,
         context: &SessionContext,
         system: Vec<(&'static str, Arc<dyn TableProvider>)>,
         statement: &mut Statement,
     ) -> Result<Arc<LakeSnapshot>, Error> {
         let past = find_past_tables(statement)?;
-        let current = self.current().await?;
+        let current = self.fresh_snapshot().await?;
         for (name, provider) in &current.providers {
-            context.register_table(name.clone(), provider.clone()).map_err(failed)?;
+            context.register_table(name.clone(), provider.clone()).map_err(execution_error)?;
         }
         for (name, provider) in system {
-            context.register_table(TableReference::partial(system::SYSTEM_SCHEMA, name), provider).map_err(failed)?;
+            context
+                .register_table(TableReference::partial(system::SYSTEM_SCHEMA, name), provider)
+                .map_err(execution_error)?;
         }
         // A time stands for one version in all of a statement, even if a version with an earlier time comes meanwhile.
         let mut versions = HashMap::new();
         for past in past {
             // Without all of its log, a version may seem never to have been.
-            current.snapshot.check(Table::Runs)?;
-            let provider = self.at(&past, &mut versions).await?;
-            context.register_table(TableReference::bare(past.name), provider).map_err(failed)?;
+            current.snapshot.check_table(Table::Runs)?;
+            let provider = self.past_provider(&past, &mut versions).await?;
+            context.register_table(TableReference::bare(past.name), provider).map_err(execution_error)?;
         }
         let mut calls = McapCalls::default();
         find_mcap_calls(statement, &mut calls);
@@ -122,13 +124,13 @@ impl LakeCatalog {
     }
 
     /// Returns the current snapshot of the lake, which a query started now would see; cached until something changes.
-    /// Tables other than `runs` may have faults, see [`LakeSnapshot::check`].
+    /// Tables other than `runs` may have faults, see [`LakeSnapshot::check_table`].
     ///
     /// # Errors
     /// [`Error::Lake`] if the lake cannot be read, or `runs` is not whole.
-    pub(crate) async fn snapshot(&self) -> Result<Arc<LakeSnapshot>, Error> {
-        let snapshot = self.current().await?.snapshot.clone();
-        snapshot.check(Table::Runs)?;
+    pub(crate) async fn current_snapshot(&self) -> Result<Arc<LakeSnapshot>, Error> {
+        let snapshot = self.fresh_snapshot().await?.snapshot.clone();
+        snapshot.check_table(Table::Runs)?;
         Ok(snapshot)
     }
 
@@ -136,22 +138,22 @@ impl LakeCatalog {
     ///
     /// # Errors
     /// [`Error::Execution`] if the file cannot be read.
-    pub(crate) async fn contents(&self, run: &VisibleRun) -> Result<Contents, Error> {
-        mcap_tables::contents(run, &self.current().await?.snapshot, &self.runs).await.map_err(mcap_failed)
+    pub(crate) async fn read_contents(&self, run: &VisibleRun) -> Result<Contents, Error> {
+        mcap_tables::read_contents(run, &self.fresh_snapshot().await?.snapshot, &self.runs).await.map_err(mcap_failed)
     }
 
     /// Returns the bytes of the first attachment of a run's file whose name has this ending; None if there is none.
     ///
     /// # Errors
-    /// As [`LakeCatalog::contents`].
-    pub(crate) async fn attachment(&self, run: &VisibleRun, ending: &str) -> Result<Option<Bytes>, Error> {
-        let snapshot = &self.current().await?.snapshot;
+    /// As [`LakeCatalog::read_contents`].
+    pub(crate) async fn read_attachment(&self, run: &VisibleRun, ending: &str) -> Result<Option<Bytes>, Error> {
+        let snapshot = &self.fresh_snapshot().await?.snapshot;
         mcap_tables::attachment(run, snapshot, ending, &self.runs).await.map_err(mcap_failed)
     }
 
     /// Returns the views with their definitions.
     pub(crate) fn view_definitions(&self) -> impl Iterator<Item = (&'static str, String)> {
-        LakeView::ALL.into_iter().map(|view| (view.name(), view.sql(&self.lake)))
+        LakeView::ALL.into_iter().map(|view| (view.name(), view.definition_sql(&self.lake)))
     }
 
     /// Returns the system tables that every lake has, with their schemas.
@@ -160,14 +162,14 @@ impl LakeCatalog {
     }
 
     /// Returns the tables and views with their schemas.
-    pub(crate) fn tables(&self) -> impl Iterator<Item = (&'static str, SchemaRef)> {
+    pub(crate) fn table_schemas(&self) -> impl Iterator<Item = (&'static str, SchemaRef)> {
         let tables = || Table::ALL.into_iter().map(|table| (table.name(), table.schema(self.lake.rig())));
         let views = || LakeView::ALL.into_iter().map(|view| (view.name(), view.schema(&self.lake, &self.lookups)));
         self.names.get_or_init(|| tables().chain(views()).collect()).iter().cloned()
     }
 
-    async fn current(&self) -> Result<Arc<CatalogSnapshot>, Error> {
-        let known = self.known();
+    async fn fresh_snapshot(&self) -> Result<Arc<CatalogSnapshot>, Error> {
+        let known = self.known_snapshot();
         if let Some(current) = &known
             && self.is_fresh(current).await?
         {
@@ -175,25 +177,25 @@ impl LakeCatalog {
         }
         let _taking = self.taking.lock().await;
         // Another query may have taken a snapshot meanwhile; it is used only if it is still fresh.
-        let newer = self.known();
+        let newer = self.known_snapshot();
         if let Some(newer) = &newer
             && known.as_ref().is_none_or(|known| !Arc::ptr_eq(known, newer))
             && self.is_fresh(newer).await?
         {
             return Ok(newer.clone());
         }
-        let taken = Arc::new(self.take(newer.as_deref()).await?);
+        let taken = Arc::new(self.take_snapshot(newer.as_deref()).await?);
         *self.current.lock().unwrap_or_else(PoisonError::into_inner) = Some(taken.clone());
         Ok(taken)
     }
 
-    fn known(&self) -> Option<Arc<CatalogSnapshot>> {
+    fn known_snapshot(&self) -> Option<Arc<CatalogSnapshot>> {
         self.current.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
     async fn is_fresh(&self, current: &CatalogSnapshot) -> Result<bool, Error> {
-        let log = self.lake.log();
-        let Some(version) = current.snapshot.version(Table::Runs) else { return Ok(false) };
+        let log = self.lake.commit_log();
+        let Some(version) = current.snapshot.log_version(Table::Runs) else { return Ok(false) };
         // What mends another table changes no version of `runs`.
         if !current.snapshot.is_whole() {
             return Ok(false);
@@ -226,9 +228,9 @@ impl LakeCatalog {
         };
         if due {
             // The next snapshot tells which log cannot be read.
-            let versions = try_join_all(Table::ALL.into_iter().map(|table| log.version(table))).await;
+            let versions = try_join_all(Table::ALL.into_iter().map(|table| log.newest_version(table))).await;
             let is_same = |versions: Vec<_>| {
-                Table::ALL.into_iter().zip(versions).all(|(table, now)| now == current.snapshot.version(table))
+                Table::ALL.into_iter().zip(versions).all(|(table, now)| now == current.snapshot.log_version(table))
             };
             if !versions.is_ok_and(is_same) {
                 return Ok(false);
@@ -237,7 +239,7 @@ impl LakeCatalog {
         Ok(true)
     }
 
-    async fn take(&self, before: Option<&CatalogSnapshot>) -> Result<CatalogSnapshot, Error> {
+    async fn take_snapshot(&self, before: Option<&CatalogSnapshot>) -> Result<CatalogSnapshot, Error> {
         let taken = Instant::now();
         let snapshot = Arc::new(self.lake.snapshot().await?);
         let mut tables = HashMap::new();
@@ -245,9 +247,9 @@ impl LakeCatalog {
             let files = snapshot.files(table);
             let is_same = |before: &&Arc<LakeTable>| before.is_of(files) && !before.is_faulty();
             let kept = before.and_then(|b| b.tables.get(&table)).filter(is_same);
-            let provider = match kept.filter(|_| snapshot.check(table).is_ok()) {
+            let provider = match kept.filter(|_| snapshot.check_table(table).is_ok()) {
                 Some(kept) => kept.clone(),
-                None => Arc::new(self.table(table, files)?.of_snapshot(&snapshot)),
+                None => Arc::new(self.open_table(table, files)?.of_snapshot(&snapshot)),
             };
             tables.insert(table, provider);
         }
@@ -257,7 +259,7 @@ impl LakeCatalog {
             .collect();
         for view in LakeView::ALL {
             let of = |table: &Table| Some((*table, tables.get(table)?.clone() as Arc<dyn TableProvider>));
-            let beneath = view.tables().iter().filter_map(of).collect();
+            let beneath = view.source_tables().iter().filter_map(of).collect();
             let view_table = LazyView::new(view, &self.lake, &self.lookups, beneath);
             providers.push((TableReference::bare(view.name()), Arc::new(view_table)));
         }
@@ -271,21 +273,21 @@ impl LakeCatalog {
         Ok(CatalogSnapshot { snapshot, tables, providers, looked, checked })
     }
 
-    fn table(&self, table: Table, files: &[DataFile]) -> Result<LakeTable, Error> {
+    fn open_table(&self, table: Table, files: &[DataFile]) -> Result<LakeTable, Error> {
         let schema = table.schema(self.lake.rig());
-        LakeTable::new(table, schema, files.to_vec(), self.source.clone()).map_err(failed)
+        LakeTable::new(table, schema, files.to_vec(), self.source.clone()).map_err(execution_error)
     }
 
-    async fn at(
+    async fn past_provider(
         &self,
         past: &PastTableName,
         versions: &mut HashMap<LakeMoment, u64>,
     ) -> Result<Arc<dyn TableProvider>, Error> {
-        let moment = past.moment()?;
+        let moment = past.parse_moment()?;
         let table = Table::by_name(&past.table);
         let view = LakeView::by_name(&past.table);
         if table.is_none() && view.is_none() {
-            return Err(error::missing(&past.table));
+            return Err(error::unknown_table(&past.table));
         }
         let version = match versions.get(&moment) {
             Some(version) => *version,
@@ -295,18 +297,18 @@ impl LakeCatalog {
         if let Some(table) = table {
             return Ok(self.table_at(version, table).await?);
         }
-        let Some(view) = view else { return Err(error::missing(&past.table)) };
+        let Some(view) = view else { return Err(error::unknown_table(&past.table)) };
         let mut beneath = HashMap::new();
-        for table in view.tables() {
+        for table in view.source_tables() {
             beneath.insert(*table, self.table_at(version, *table).await? as Arc<dyn TableProvider>);
         }
-        Ok(Arc::new(view.over(&self.lake, &self.lookups, &beneath).map_err(failed)?))
+        Ok(Arc::new(view.plan_over(&self.lake, &self.lookups, &beneath).map_err(execution_error)?))
     }
 
     async fn table_at(&self, version: u64, table: Table) -> Result<Arc<LakeTable>, Error> {
         let read = async {
             let snapshot = self.lake.snapshot_at(version, table).await?;
-            Ok(Arc::new(self.table(table, snapshot.files(table))?))
+            Ok(Arc::new(self.open_table(table, snapshot.files(table))?))
         };
         self.past.get_or_insert_async(&(version, table), read).await
     }
@@ -343,6 +345,6 @@ fn mcap_failed(error: DataFusionError) -> Error {
     }
 }
 
-fn failed(error: DataFusionError) -> Error {
-    Error::execution(&error)
+fn execution_error(error: DataFusionError) -> Error {
+    Error::from_execution(&error)
 }

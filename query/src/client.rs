@@ -59,13 +59,13 @@ impl EngineClient {
     ///
     /// # Errors
     /// [`Error::Busy`] if all are taken.
-    pub fn place(&self) -> Result<QueryPermit, Error> {
+    pub fn acquire_place(&self) -> Result<QueryPermit, Error> {
         let Some(places) = &self.places else { return Ok(QueryPermit(None)) };
-        let place = places.clone().try_acquire_owned().map_err(|_| self.busy())?;
+        let place = places.clone().try_acquire_owned().map_err(|_| self.busy_error())?;
         Ok(QueryPermit(Some(place)))
     }
 
-    /// Acquires a permit like [`EngineClient::place`], but waits up to `wait` if all are taken; first come, first
+    /// Acquires a permit like [`EngineClient::acquire_place`], but waits up to `wait` if all are taken; first come, first
     /// served.
     ///
     /// # Errors
@@ -75,11 +75,11 @@ impl EngineClient {
         match tokio::time::timeout(wait, places.clone().acquire_owned()).await {
             Ok(Ok(place)) => Ok(QueryPermit(Some(place))),
             // The semaphore is never closed, so this is the timeout.
-            _ => Err(self.busy()),
+            _ => Err(self.busy_error()),
         }
     }
 
-    fn busy(&self) -> Error {
+    fn busy_error(&self) -> Error {
         Error::Busy { client: self.name.clone(), limit: self.quota.concurrent.unwrap_or(0) }
     }
 }

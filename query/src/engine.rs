@@ -96,7 +96,7 @@ pub struct SqlFunction {
 
 impl SqlFunction {
     /// Returns the arguments in the call syntax, without the parentheses.
-    pub fn arguments(&self) -> &str {
+    pub fn argument_list(&self) -> &str {
         let inner = self.syntax.split_once('(').map_or("", |(_, rest)| rest);
         inner.rsplit_once(')').map_or(inner, |(inner, _)| inner)
     }
@@ -108,9 +108,9 @@ impl QueryEngine {
     /// # Errors
     /// [`Error::Execution`] if DataFusion cannot be set up.
     pub fn new(lake: &Lake, memory: Option<usize>) -> Result<Self, Error> {
-        let failed = |e: DataFusionError| Error::execution(&e);
+        let failed = |e: DataFusionError| Error::from_execution(&e);
         let url = ObjectStoreUrl::parse(STORE).map_err(failed)?;
-        let runtime = runtime(lake, &url, memory).map_err(failed)?;
+        let runtime = build_runtime(lake, &url, memory).map_err(failed)?;
         let metadata = runtime.cache_manager.get_file_metadata_cache();
         let reader = Arc::new(LakeReaderFactory::new(lake, metadata));
         let functions = FunctionSet::all(lake.rig()).map_err(|e| Error::Execution { message: e.to_string() })?;
@@ -120,7 +120,7 @@ impl QueryEngine {
         let restricted = lake.is_restricted().then(|| lake.clone());
         let catalog = LakeCatalog::new(lake, FileReaders { url, reader, footer_bytes, small, restricted })?;
         let inner = EngineState {
-            template: template(runtime, &functions, catalog.rules()),
+            template: build_template(runtime, &functions, catalog.optimizer_rules()),
             catalog,
             threads: QueryThreadGroups::per_core("query").map_err(threads)?,
             running: RunningQueries::default(),
@@ -143,29 +143,29 @@ impl QueryEngine {
     }
 
     /// Returns the number of queries that run or wait now.
-    pub fn running(&self) -> usize {
-        self.0.running.count()
+    pub fn count_running(&self) -> usize {
+        self.0.running.count_running()
     }
 
     /// Returns the longest time for which work has continued after its query was ended; None if there is none.
-    pub fn overdue(&self) -> Option<Duration> {
-        self.0.running.overdue()
+    pub fn longest_overdue(&self) -> Option<Duration> {
+        self.0.running.longest_overdue()
     }
 
     /// Returns the functions, sorted by name.
-    pub(crate) fn functions(&self) -> Vec<SqlFunction> {
+    pub(crate) fn sql_functions(&self) -> Vec<SqlFunction> {
         let state = &self.0.template;
         let scalar = state.scalar_functions().iter().map(|(name, f)| (name, f.documentation()));
         let aggregate = state.aggregate_functions().iter().map(|(name, f)| (name, f.documentation()));
         let window = state.window_functions().iter().map(|(name, f)| (name, f.documentation()));
         let mut functions: Vec<_> =
-            scalar.chain(aggregate).chain(window).map(|(name, doc)| self.function(name, doc)).collect();
+            scalar.chain(aggregate).chain(window).map(|(name, doc)| self.describe_function(name, doc)).collect();
         functions.sort_by(|a, b| a.name.cmp(&b.name));
         functions.dedup_by(|a, b| a.name == b.name);
         functions
     }
 
-    fn function(&self, name: &str, doc: Option<&Documentation>) -> SqlFunction {
+    fn describe_function(&self, name: &str, doc: Option<&Documentation>) -> SqlFunction {
         SqlFunction {
             name: name.to_owned(),
             syntax: doc.map_or_else(|| format!("{name}(...)"), |d| d.syntax_example.clone()),
@@ -176,22 +176,22 @@ impl QueryEngine {
     }
 
     /// Runs other work of a client's request, such as parsing, in the same way as queries: on the same threads and with
-    /// a timeout of `time`. If the caller drops it, the work is ended or reported by [`QueryEngine::overdue`].
+    /// a timeout of `time`. If the caller drops it, the work is ended or reported by [`QueryEngine::longest_overdue`].
     ///
     /// # Errors
     /// Those of `work`; [`Error::TimeLimit`].
-    pub async fn supervise<T: Send + 'static, E: From<Error> + Send + 'static>(
+    pub async fn supervise_work<T: Send + 'static, E: From<Error> + Send + 'static>(
         &self,
         time: Option<Duration>,
         work: impl Future<Output = Result<T, E>> + Send + 'static,
     ) -> Result<T, E> {
-        self.on_threads(&self.ticket(time), work).await
+        self.on_threads(&self.create_ticket(time), work).await
     }
 
     /// Creates a ticket with a timeout of `time`.
-    pub(crate) fn ticket(&self, time: Option<Duration>) -> Arc<QueryTicket> {
+    pub(crate) fn create_ticket(&self, time: Option<Duration>) -> Arc<QueryTicket> {
         let ticket = Arc::new(QueryTicket::new());
-        self.0.running.add(&ticket);
+        self.0.running.add_ticket(&ticket);
         if let (Some(time), Some(threads)) = (time, self.0.watch.handle()) {
             let watched = Arc::downgrade(&ticket);
             let timer = threads.spawn(async move {
@@ -217,19 +217,19 @@ impl QueryEngine {
             let _guard = begun.begin_work();
             tokio::select! {
                 biased;
-                why = begun.stopped() => Err(Error::stopped(&why).into()),
+                why = begun.wait_for_stop() => Err(Error::from_stop(&why).into()),
                 done = work => done,
             }
         };
         let guarded = guarded.boxed();
         let work = async {
-            let Some(task) = self.0.threads.begin(guarded).await else { return Err(ended().into()) };
-            let done = task.await.unwrap_or_else(|_| Some(Err(defect().into())));
-            done.unwrap_or_else(|| Err(ended().into()))
+            let Some(task) = self.0.threads.begin_work(guarded).await else { return Err(ended_error().into()) };
+            let done = task.await.unwrap_or_else(|_| Some(Err(defect_error().into())));
+            done.unwrap_or_else(|| Err(ended_error().into()))
         };
         let done = tokio::select! {
             done = work => done,
-            why = ticket.stopped() => Err(Error::stopped(&why).into()),
+            why = ticket.wait_for_stop() => Err(Error::from_stop(&why).into()),
         };
         stop.is_done = true;
         done
@@ -246,18 +246,18 @@ impl QueryEngine {
     }
 
     /// Returns the memory limit of one query, bytes; `usize::MAX` if there is none.
-    pub(crate) fn memory(&self, quota: &QueryQuota) -> usize {
+    pub(crate) fn memory_limit(&self, quota: &QueryQuota) -> usize {
         self.0.memory.into_iter().chain(quota.memory).min().unwrap_or(usize::MAX)
     }
 
     /// Returns the state from which all contexts are built: without tables, with the same parser options.
-    pub(crate) fn template(&self) -> &SessionState {
+    pub(crate) fn template_state(&self) -> &SessionState {
         &self.0.template
     }
 
     // One new context per query: its tables are of one snapshot, and nothing a query does outlives it. Functions and
     // optimizer rules are those of the template.
-    pub(crate) fn context(&self) -> SessionContext {
+    pub(crate) fn create_context(&self) -> SessionContext {
         let names = &self.0.template.config_options().catalog;
         let catalog = MemoryCatalogProvider::new();
         // A new catalogue accepts any name.
@@ -273,12 +273,13 @@ impl QueryEngine {
     }
 }
 
-fn template(
+fn build_template(
     runtime: Arc<RuntimeEnv>,
     functions: &FunctionSet,
     rules: impl IntoIterator<Item = Arc<dyn OptimizerRule + Send + Sync>>,
 ) -> SessionState {
-    let builder = SessionStateBuilder::new().with_config(config()).with_runtime_env(runtime).with_default_features();
+    let builder =
+        SessionStateBuilder::new().with_config(session_config()).with_runtime_env(runtime).with_default_features();
     let mut state = rules.into_iter().fold(builder, SessionStateBuilder::with_optimizer_rule).build();
     let _ = state.register_udf(Arc::new(octet_length_of_bytes()));
     for function in pattern_functions(state.config_options()) {
@@ -295,7 +296,7 @@ fn template(
 }
 
 // DataFusion's defaults already use all cores and prune by row group and page.
-fn config() -> SessionConfig {
+fn session_config() -> SessionConfig {
     let mut config = SessionConfig::new().with_information_schema(true).with_batch_size(BATCH_ROWS);
     let options = config.options_mut();
     options.sql_parser.collect_spans = true;
@@ -304,7 +305,7 @@ fn config() -> SessionConfig {
     config
 }
 
-fn runtime(lake: &Lake, url: &ObjectStoreUrl, memory: Option<usize>) -> Result<Arc<RuntimeEnv>, DataFusionError> {
+fn build_runtime(lake: &Lake, url: &ObjectStoreUrl, memory: Option<usize>) -> Result<Arc<RuntimeEnv>, DataFusionError> {
     let stores = DefaultObjectStoreRegistry::new();
     stores.deregister_store(ObjectStoreUrl::parse(MACHINE)?.as_ref())?;
     stores.register_store(url.as_ref(), lake.store());
@@ -334,12 +335,12 @@ impl Drop for StopOnDrop {
 }
 
 /// Returns the error for an engine that has ended.
-pub(crate) fn ended() -> Error {
+pub(crate) fn ended_error() -> Error {
     Error::Execution { message: "the query service has ended".to_owned() }
 }
 
 /// Returns the error for a panic.
-pub(crate) fn defect() -> Error {
+pub(crate) fn defect_error() -> Error {
     Error::Execution { message: "a defect ended it".to_owned() }
 }
 
@@ -358,7 +359,7 @@ mod tests {
         let engine = QueryEngine::new(&lake, None).expect("an engine");
         let tasks = engine.0.watch.handle().expect("threads").metrics();
         let before = tasks.num_alive_tasks();
-        let tickets: Vec<_> = (0..100).map(|_| engine.ticket(Some(Duration::from_secs(3600)))).collect();
+        let tickets: Vec<_> = (0..100).map(|_| engine.create_ticket(Some(Duration::from_secs(3600)))).collect();
         assert_eq!(tasks.num_alive_tasks(), before + 100);
         drop(tickets);
         let ended = async {

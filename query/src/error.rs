@@ -116,11 +116,11 @@ pub enum Error {
 
 impl Error {
     /// Converts an error of parsing or planning `sql`.
-    pub(crate) fn plan(sql: &str, error: &DataFusionError) -> Self {
-        if let Some(limit) = Self::limit(error) {
+    pub(crate) fn from_planning(sql: &str, error: &DataFusionError) -> Self {
+        if let Some(limit) = Self::from_root_cause(error) {
             return limit;
         }
-        let (message, mut hint) = explain(error);
+        let (message, mut hint) = explain_error(error);
         if let DataFusionError::SchemaError(schema, _) = error.find_root()
             && let SchemaError::FieldNotFound { field, .. } = schema.as_ref()
         {
@@ -128,48 +128,48 @@ impl Error {
         }
         let span = error.diagnostic().and_then(|d| d.span).map(|s| (s.start.line, s.start.column));
         let (message, parsed) = without_place(sql, &message);
-        let place = span.or(parsed).and_then(|(line, column)| mark(sql, line, column));
+        let place = span.or(parsed).and_then(|(line, column)| query_place(sql, line, column));
         let (message, hint) = match message.split_once("; hint: ") {
             Some((message, own)) => (message.to_owned(), own.to_owned()),
             None => {
                 let is_syntax = matches!(error.find_root(), DataFusionError::SQL(..));
                 let hint =
                     hint.unwrap_or_else(|| if is_syntax { hints::of_syntax(sql) } else { hints::of_plan(&message) });
-                (hints::short(&message), hint)
+                (hints::shorten_message(&message), hint)
             }
         };
         Self::Query { message: escape_controls(&message), place, hint: Some(escape_controls(&hint)) }
     }
 
     /// Converts an error of the tokenizer.
-    pub(crate) fn syntax(sql: &str, error: ParserError) -> Self {
-        Self::plan(sql, &DataFusionError::from(error))
+    pub(crate) fn from_tokenizer(sql: &str, error: ParserError) -> Self {
+        Self::from_planning(sql, &DataFusionError::from(error))
     }
 
     /// Sets the place of an error that has none, if the query has one.
-    pub(crate) fn at(mut self, sql: &str, start: Location) -> Self {
+    pub(crate) fn with_place(mut self, sql: &str, start: Location) -> Self {
         if let Self::Query { place: place @ None, .. } = &mut self {
-            *place = mark(sql, start.line, start.column);
+            *place = query_place(sql, start.line, start.column);
         }
         self
     }
 
     /// Returns the error for a clause that is not planned; the query is marked at the clause's first word in capitals.
-    pub(crate) fn clause(sql: &str, clause: &str, hint: String) -> Self {
+    pub(crate) fn unsupported_clause(sql: &str, clause: &str, hint: String) -> Self {
         let word = clause.split(' ').find(|word| !word.is_empty() && word.chars().all(|c| c.is_ascii_uppercase()));
         let place = word.and_then(|word| {
             let at = sql.to_ascii_uppercase().find(word)?;
             let line_start = sql[..at].rfind('\n').map_or(0, |newline| newline + 1);
             let line = sql[..at].matches('\n').count() + 1;
-            mark(sql, line as u64, sql[line_start..at].chars().count() as u64 + 1)
+            query_place(sql, line as u64, sql[line_start..at].chars().count() as u64 + 1)
         });
         Self::Query { message: format!("not supported: {clause}"), place, hint: Some(hint) }
     }
 
     /// Converts an error of running a query.
-    pub(crate) fn execution(error: &DataFusionError) -> Self {
-        Self::limit(error).unwrap_or_else(|| {
-            let message = explain(error).0;
+    pub(crate) fn from_execution(error: &DataFusionError) -> Self {
+        Self::from_root_cause(error).unwrap_or_else(|| {
+            let message = explain_error(error).0;
             if let Some(damaged) = damaged_file(&message) {
                 return damaged.into();
             }
@@ -179,7 +179,7 @@ impl Error {
     }
 
     // An error about a limit or the lake, not about the query.
-    fn limit(error: &DataFusionError) -> Option<Self> {
+    fn from_root_cause(error: &DataFusionError) -> Option<Self> {
         match error.find_root() {
             DataFusionError::ResourcesExhausted(text) => Some(Self::MemoryLimit { message: text.clone() }),
             DataFusionError::External(cause) => match cause.downcast_ref::<LakeError>() {
@@ -196,7 +196,7 @@ impl Error {
     }
 
     /// Returns the error for a query that was stopped.
-    pub(crate) fn stopped(why: &StopReason) -> Self {
+    pub(crate) fn from_stop(why: &StopReason) -> Self {
         match why {
             StopReason::Cancelled => Self::Cancelled,
             StopReason::Time(limit) => Self::TimeLimit { limit: *limit },
@@ -209,7 +209,7 @@ fn hint_line(hint: Option<&str>) -> String {
 }
 
 // Returns the message without the name of the layer that raised it, and a hint.
-fn explain(error: &DataFusionError) -> (String, Option<String>) {
+fn explain_error(error: &DataFusionError) -> (String, Option<String>) {
     match error.find_root() {
         DataFusionError::SchemaError(schema, _) => match schema.as_ref() {
             SchemaError::FieldNotFound { field, valid_fields } => {
@@ -261,7 +261,7 @@ fn arrow_message(error: &ArrowError) -> String {
             text.clone()
         }
         ArrowError::ExternalError(source) => match source.downcast_ref::<DataFusionError>() {
-            Some(inner) => explain(inner).0,
+            Some(inner) => explain_error(inner).0,
             None => source.to_string(),
         },
         other => other.to_string(),
@@ -269,7 +269,7 @@ fn arrow_message(error: &ArrowError) -> String {
 }
 
 /// Returns the error of a query that names an unknown table.
-pub(crate) fn missing(name: &str) -> Error {
+pub(crate) fn unknown_table(name: &str) -> Error {
     let (message, hint) = missing_table(name);
     Error::Query { message, place: None, hint }
 }
@@ -330,7 +330,7 @@ fn end_of(sql: &str) -> Option<(u64, u64)> {
 /// Characters of a line shown before and after a marked place.
 const MARKED_CHARS: usize = 60;
 
-fn mark(sql: &str, line: u64, column: u64) -> Option<QueryPlace> {
+fn query_place(sql: &str, line: u64, column: u64) -> Option<QueryPlace> {
     let before = usize::try_from(line.checked_sub(1)?).ok()?;
     let text = sql.lines().nth(before)?;
     let length = text.chars().count();
@@ -340,12 +340,12 @@ fn mark(sql: &str, line: u64, column: u64) -> Option<QueryPlace> {
         line,
         column: column as u64 + 1,
         position: (above + column) as u64 + 1,
-        mark: marked(text, length, column),
+        mark: marked_line(text, length, column),
     })
 }
 
 // Shows only the surroundings of the place in a long line, such as programs generate.
-fn marked(text: &str, length: usize, column: usize) -> String {
+fn marked_line(text: &str, length: usize, column: usize) -> String {
     let begin = column.saturating_sub(MARKED_CHARS);
     let around: String = text.chars().skip(begin).take(2 * MARKED_CHARS).collect();
     let (cut, column) = if begin > 0 { ("...", column - begin + 3) } else { ("", column) };
@@ -366,14 +366,14 @@ mod tests {
         assert_eq!(without_place("", "meet me at Line: nowhere"), ("meet me at Line: nowhere".to_owned(), None));
         let (message, place) = without_place("select\n  1 +\n", "Expected: an expression, found: EOF");
         assert_eq!((message.as_str(), place), ("Expected: an expression, found the end of the query", Some((2, 6))));
-        let place = mark("sélect\nfrom x", 2, 6).expect("a place");
+        let place = query_place("sélect\nfrom x", 2, 6).expect("a place");
         assert_eq!((place.line, place.column, place.position), (2, 6, 13));
         assert_eq!(place.to_string(), " (line 2, column 6)\n  from x\n       ^");
-        assert_eq!(mark("\tx", 1, 2).expect("a place").mark, "  \tx\n  \t^");
-        assert_eq!(mark("select", 9, 1), None);
+        assert_eq!(query_place("\tx", 1, 2).expect("a place").mark, "  \tx\n  \t^");
+        assert_eq!(query_place("select", 9, 1), None);
         let long = format!("{}x{}", "a".repeat(100), "b".repeat(100));
         let around = format!("  ...{}x{}...\n  {}^", "a".repeat(60), "b".repeat(59), " ".repeat(63));
-        assert_eq!(mark(&long, 1, 101).expect("a place").mark, around);
+        assert_eq!(query_place(&long, 1, 101).expect("a place").mark, around);
     }
 
     #[test]

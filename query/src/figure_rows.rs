@@ -1,5 +1,5 @@
 //! The queries behind figures, and their rows: the same for the catalogue's endpoints and for the command that writes
-//! figures to files. Values are in the queries as placeholders, or as the literals of [`quoted`].
+//! figures to files. Values are in the queries as placeholders, or as the literals of [`quote_literal`].
 
 use std::collections::HashMap;
 
@@ -36,7 +36,7 @@ impl LevelReference {
 }
 
 /// Returns a text as an SQL literal.
-pub fn quoted(text: &str) -> String {
+pub fn quote_literal(text: &str) -> String {
     format!("'{}'", text.replace('\'', "''"))
 }
 
@@ -171,7 +171,7 @@ pub struct CurveRow {
 
 impl CurveRow {
     /// Returns its curves at these samples.
-    pub fn thinned(&self, kept: &[usize]) -> Vec<Vec<f32>> {
+    pub fn curves_at(&self, kept: &[usize]) -> Vec<Vec<f32>> {
         let thin = |curve: &Option<Vec<f32>>| {
             let curve = curve.as_deref().unwrap_or_default();
             kept.iter().filter_map(|i| curve.get(*i).copied()).collect()
@@ -229,7 +229,7 @@ impl LevelVectors {
     ///
     /// # Errors
     /// [`ArrowError::SchemaError`] if the rows are of another query.
-    pub fn add(&mut self, batch: &RecordBatch) -> Result<(), ArrowError> {
+    pub fn add_batch(&mut self, batch: &RecordBatch) -> Result<(), ArrowError> {
         let unexpected =
             || ArrowError::SchemaError(format!("levels of surfaces are not as expected: {}", batch.schema()));
         let columns = batch.columns();

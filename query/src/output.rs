@@ -149,12 +149,14 @@ impl<W: Write + Send> AnswerWriter<W> {
         let failed = |e| arrow_error(self.format, e);
         match &mut self.inner {
             FormatWriter::Table(_, batches) if room > 0 => {
-                batches.push(flat(&batch.slice(0, room), short_list).map_err(failed)?);
+                batches.push(flatten_columns(&batch.slice(0, room), short_list).map_err(failed)?);
             }
             FormatWriter::Table(..) => {}
-            FormatWriter::Csv(to, text) => write_csv(to, text, &flat(batch, json_list).map_err(failed)?, false)?,
+            FormatWriter::Csv(to, text) => {
+                write_csv(to, text, &flatten_columns(batch, json_list).map_err(failed)?, false)?
+            }
             FormatWriter::SpreadsheetCsv(to, text) => {
-                let escaped = flat(batch, json_list).and_then(|batch| escape_formulas(&batch));
+                let escaped = flatten_columns(batch, json_list).and_then(|batch| escape_formulas(&batch));
                 write_csv(to, text, &escaped.map_err(failed)?, false)?;
             }
             FormatWriter::Json(writer) => writer.write(batch).map_err(failed)?,
@@ -271,7 +273,7 @@ fn flat_schema(schema: &SchemaRef) -> SchemaRef {
 }
 
 // Returns the batch with each nested column as text.
-fn flat(
+fn flatten_columns(
     batch: &RecordBatch,
     text: fn(&ArrayRef) -> Result<Vec<String>, ArrowError>,
 ) -> Result<RecordBatch, ArrowError> {
@@ -284,8 +286,8 @@ fn flat(
             let value = match column.is_null(row) {
                 true => None,
                 false => Some(match column.as_list_opt::<i32>() {
-                    Some(list) => join(&text(&list.value(row))?, list.value(row).len()),
-                    None => display(column, row)?,
+                    Some(list) => join_values(&text(&list.value(row))?, list.value(row).len()),
+                    None => display_value(column, row)?,
                 }),
             };
             texts.push(value);
@@ -295,7 +297,7 @@ fn flat(
     RecordBatch::try_new(flat_schema(&batch.schema()), columns.collect::<Result<_, ArrowError>>()?)
 }
 
-fn join(shown: &[String], count: usize) -> String {
+fn join_values(shown: &[String], count: usize) -> String {
     let mut text = format!("[{}", shown.join(","));
     if shown.len() < count {
         let _ = write!(text, ", ... {count} values");
@@ -305,20 +307,20 @@ fn join(shown: &[String], count: usize) -> String {
 }
 
 fn short_list(values: &ArrayRef) -> Result<Vec<String>, ArrowError> {
-    (0..values.len().min(SHOWN)).map(|i| display(values, i)).collect()
+    (0..values.len().min(SHOWN)).map(|i| display_value(values, i)).collect()
 }
 
 fn json_list(values: &ArrayRef) -> Result<Vec<String>, ArrowError> {
     let is_text = matches!(values.data_type(), DataType::Utf8 | DataType::LargeUtf8 | DataType::Utf8View);
     let one = |i| match (values.is_null(i), is_text) {
         (true, _) => Ok("null".to_owned()),
-        (false, true) => Ok(serde_json::Value::from(display(values, i)?).to_string()),
-        (false, false) => display(values, i),
+        (false, true) => Ok(serde_json::Value::from(display_value(values, i)?).to_string()),
+        (false, false) => display_value(values, i),
     };
     (0..values.len()).map(one).collect()
 }
 
-fn display(array: &ArrayRef, row: usize) -> Result<String, ArrowError> {
+fn display_value(array: &ArrayRef, row: usize) -> Result<String, ArrowError> {
     Ok(ArrayFormatter::try_new(array, &FormatOptions::default())?.value(row).to_string())
 }
 
@@ -486,7 +488,7 @@ mod tests {
         list.append(true);
         let column: ArrayRef = Arc::new(list.finish());
         let batch = RecordBatch::try_from_iter([("texts", column)]).expect("a batch");
-        let flat = flat(&batch, json_list).expect("flat");
+        let flat = flatten_columns(&batch, json_list).expect("flat");
         assert_eq!(flat.column(0).as_string::<i32>().value(0), r#"["tab\t\"quote\"\u0001"]"#);
     }
 

@@ -66,8 +66,8 @@ impl PreparedQuery {
     ///
     /// # Errors
     /// [`Error::Query`] if a placeholder is not a number.
-    pub fn parameters(&self) -> Result<Vec<Option<DataType>>, Error> {
-        let types = self.plan.get_parameter_types().map_err(|e| Error::plan(&self.sql, &e))?;
+    pub fn parameter_types(&self) -> Result<Vec<Option<DataType>>, Error> {
+        let types = self.plan.get_parameter_types().map_err(|e| Error::from_planning(&self.sql, &e))?;
         let number = |name: &str| name.strip_prefix('$').and_then(|n| n.parse::<usize>().ok()).filter(|n| *n > 0);
         let mut found = Vec::new();
         for (name, kind) in types {
@@ -110,7 +110,7 @@ impl CancelHandle {
 
 impl QueryEngine {
     /// Creates a session of a client, one per connection.
-    pub fn session(&self, client: &Arc<EngineClient>) -> Session {
+    pub fn open_session(&self, client: &Arc<EngineClient>) -> Session {
         Session { engine: self.clone(), client: client.clone(), extend: None }
     }
 }
@@ -125,10 +125,10 @@ impl QueryAnswer {
         let batch = tokio::select! {
             biased;
             batch = self.batches.recv() => batch,
-            why = self.ticket.stopped() => return Err(Error::stopped(&why)),
+            why = self.ticket.wait_for_stop() => return Err(Error::from_stop(&why)),
         };
-        let Some(batch) = batch else { return self.end().await };
-        let batch = batch.map_err(|e| Error::execution(&e))?;
+        let Some(batch) = batch else { return self.end_query().await };
+        let batch = batch.map_err(|e| Error::from_execution(&e))?;
         self.rows += batch.num_rows() as u64;
         if let Some(limit) = self.limit.filter(|limit| self.rows > *limit) {
             self.ticket.stop(StopReason::Cancelled);
@@ -139,7 +139,7 @@ impl QueryAnswer {
 
     /// Returns the most memory that its operators have held, bytes.
     pub fn peak_memory(&self) -> usize {
-        self.ticket.held().peak()
+        self.ticket.held_memory().peak_bytes()
     }
 
     /// Returns a handle that cancels this answer's query.
@@ -148,11 +148,11 @@ impl QueryAnswer {
     }
 
     // Without this, an answer whose query panicked would look complete.
-    async fn end(&mut self) -> Result<Option<RecordBatch>, Error> {
+    async fn end_query(&mut self) -> Result<Option<RecordBatch>, Error> {
         let Some(query) = self.query.take() else { return Ok(None) };
         match query.await {
-            Ok(_) => self.ticket.why().map_or(Ok(None), |why| Err(Error::stopped(why))),
-            Err(_) => Err(engine::defect()),
+            Ok(_) => self.ticket.stop_reason().map_or(Ok(None), |why| Err(Error::from_stop(why))),
+            Err(_) => Err(engine::defect_error()),
         }
     }
 }
@@ -170,12 +170,12 @@ impl Session {
     /// [`Error::Execution`] if DataFusion cannot be set up.
     pub fn new(lake: &Lake) -> Result<Self, Error> {
         let client = EngineClient::new("local", QueryQuota::default());
-        Ok(QueryEngine::new(lake, None)?.session(&Arc::new(client)))
+        Ok(QueryEngine::new(lake, None)?.open_session(&Arc::new(client)))
     }
 
     /// Adds a protocol's own tables and functions to the session.
     #[must_use]
-    pub fn extended(mut self, extend: ContextExtension) -> Self {
+    pub fn with_extension(mut self, extend: ContextExtension) -> Self {
         self.extend = Some(extend);
         self
     }
@@ -208,9 +208,9 @@ impl Session {
     /// lake cannot be read, [`Error::Busy`] if the client has no permit left, and those of [`QueryAnswer::next`].
     pub fn query<'a>(&'a self, sql: &'a str) -> BoxFuture<'a, Result<QueryAnswer, Error>> {
         let query = async move {
-            let started = self.start()?;
-            let prepared = self.plan(sql, self.parse(sql)?, &started.ticket).await?;
-            self.run(prepared.state.clone(), &prepared.sql, LogicalPlan::clone(&prepared.plan), started).await
+            let started = self.start_query()?;
+            let prepared = self.plan_statement(sql, self.parse_sql(sql)?, &started.ticket).await?;
+            self.run_plan(prepared.state.clone(), &prepared.sql, LogicalPlan::clone(&prepared.plan), started).await
         };
         query.boxed()
     }
@@ -235,7 +235,7 @@ impl Session {
     /// # Errors
     /// As [`Session::query`].
     pub fn prepare<'a>(&'a self, sql: &'a str) -> BoxFuture<'a, Result<PreparedQuery, Error>> {
-        async move { self.prepare_statement(sql, self.parse(sql)?).await }.boxed()
+        async move { self.prepare_statement(sql, self.parse_sql(sql)?).await }.boxed()
     }
 
     /// Plans a statement that a protocol has parsed, and perhaps rewritten, from `sql`.
@@ -248,8 +248,8 @@ impl Session {
         statement: Statement,
     ) -> BoxFuture<'a, Result<PreparedQuery, Error>> {
         let prepare = async move {
-            let started = self.start()?;
-            self.plan(sql, statement, &started.ticket).await
+            let started = self.start_query()?;
+            self.plan_statement(sql, statement, &started.ticket).await
         };
         prepare.boxed()
     }
@@ -265,11 +265,11 @@ impl Session {
     ) -> BoxFuture<'a, Result<QueryAnswer, Error>> {
         let execute = async move {
             let plan = LogicalPlan::clone(&prepared.plan).with_param_values(values);
-            let plan = plan.map_err(|e| Error::plan(&prepared.sql, &e))?;
+            let plan = plan.map_err(|e| Error::from_planning(&prepared.sql, &e))?;
             // now() is the time of this run, not that of planning.
             let mut state = SessionState::clone(&prepared.state);
             state.mark_start_execution();
-            self.run(OpaqueValue::new(state), &prepared.sql, plan, self.start()?).await
+            self.run_plan(OpaqueValue::new(state), &prepared.sql, plan, self.start_query()?).await
         };
         execute.boxed()
     }
@@ -279,15 +279,15 @@ impl Session {
     /// # Errors
     /// [`Error::Lake`] if the lake cannot be read.
     pub async fn is_current(&self, prepared: &PreparedQuery) -> Result<bool, Error> {
-        Ok(Arc::ptr_eq(&self.snapshot().await?, &prepared.snapshot))
+        Ok(Arc::ptr_eq(&self.current_snapshot().await?, &prepared.snapshot))
     }
 
     /// Parses one statement.
     ///
     /// # Errors
     /// [`Error::Query`] if it is not a statement.
-    pub fn parse(&self, sql: &str) -> Result<Statement, Error> {
-        parse_statement(sql, self.engine.template().config().options().sql_parser.recursion_limit.get())
+    pub fn parse_sql(&self, sql: &str) -> Result<Statement, Error> {
+        parse_statement(sql, self.engine.template_state().config().options().sql_parser.recursion_limit.get())
     }
 
     /// Returns the query `select` with a predicate appended: `select` ends in `where`, or in `and` after it. The query
@@ -312,16 +312,16 @@ impl Session {
     ///
     /// # Errors
     /// [`Error::Query`] if the predicate is none, or is not of the form.
-    pub fn selecting(&self, select: &str, predicate: &str, form: PredicateForm) -> Result<String, Error> {
-        append_predicate(select, predicate, form, |sql| self.parse(sql))
+    pub fn append_predicate(&self, select: &str, predicate: &str, form: PredicateForm) -> Result<String, Error> {
+        append_predicate(select, predicate, form, |sql| self.parse_sql(sql))
     }
     // The query's timeout starts here and includes waiting.
-    fn start(&self) -> Result<Started, Error> {
-        let place = self.client.place()?;
-        Ok(Started { ticket: self.engine.ticket(self.client.quota().time), place })
+    fn start_query(&self) -> Result<Started, Error> {
+        let place = self.client.acquire_place()?;
+        Ok(Started { ticket: self.engine.create_ticket(self.client.quota().time), place })
     }
 
-    async fn plan(
+    async fn plan_statement(
         &self,
         sql: &str,
         mut statement: Statement,
@@ -329,11 +329,11 @@ impl Session {
     ) -> Result<PreparedQuery, Error> {
         let (session, sql) = (self.clone(), sql.to_owned());
         let plan = async move {
-            let context = session.engine.context();
+            let context = session.engine.create_context();
             let system = session.engine.system_tables();
-            let snapshot = session.engine.catalog().register(&context, system, &mut statement).await?;
+            let snapshot = session.engine.catalog().register_tables(&context, system, &mut statement).await?;
             if let Some(extend) = &session.extend {
-                extend(&context).map_err(|e| Error::execution(&e))?;
+                extend(&context).map_err(|e| Error::from_execution(&e))?;
             }
             let state = context.state();
             let plan = OpaqueValue::new(prepare_statement(&sql, statement, &state).await?);
@@ -342,7 +342,7 @@ impl Session {
         self.engine.on_threads(ticket, plan).await
     }
 
-    async fn run(
+    async fn run_plan(
         &self,
         state: OpaqueValue<SessionState>,
         sql: &str,
@@ -353,11 +353,11 @@ impl Session {
         let context = self.task_context(&state, &ticket);
         let text = sql.to_owned();
         let planned =
-            async move { state.create_physical_plan(&plan).await.map_err(|error| Error::plan(&text, &error)) };
+            async move { state.create_physical_plan(&plan).await.map_err(|error| Error::from_planning(&text, &error)) };
         let plan = self.engine.on_threads(&ticket, planned).await?;
         let schema = plan.schema();
         let (send, batches) = mpsc::channel(AHEAD);
-        let query = drive(plan, context, send, ticket.clone(), place).boxed();
+        let query = drive_query(plan, context, send, ticket.clone(), place).boxed();
         // Dropped, it stops the query, which may have begun.
         let mut answer = QueryAnswer {
             schema,
@@ -369,8 +369,8 @@ impl Session {
             _engine: self.engine.clone(),
         };
         tokio::select! {
-            begun = self.engine.threads().begin(query) => answer.query = Some(begun.ok_or_else(engine::ended)?),
-            why = answer.ticket.stopped() => return Err(Error::stopped(&why)),
+            begun = self.engine.threads().begin_work(query) => answer.query = Some(begun.ok_or_else(engine::ended_error)?),
+            why = answer.ticket.wait_for_stop() => return Err(Error::from_stop(&why)),
         }
         Ok(answer)
     }
@@ -378,9 +378,9 @@ impl Session {
     // As DataFusion builds it, except for the memory pool.
     fn task_context(&self, state: &SessionState, ticket: &Arc<QueryTicket>) -> Arc<TaskContext> {
         let mut runtime = state.runtime_env().as_ref().clone();
-        let limit = self.engine.memory(self.client.quota());
+        let limit = self.engine.memory_limit(self.client.quota());
         let pool = self.client.memory_pool(runtime.memory_pool);
-        runtime.memory_pool = Arc::new(PartialPool::new(pool, "the query holds", limit, ticket.held().clone()));
+        runtime.memory_pool = Arc::new(PartialPool::new(pool, "the query holds", limit, ticket.held_memory().clone()));
         Arc::new(TaskContext::from(state).with_runtime(Arc::new(runtime)))
     }
 
@@ -388,34 +388,34 @@ impl Session {
     ///
     /// # Errors
     /// [`Error::Lake`] if the lake cannot be read, or `runs` is not whole.
-    pub async fn snapshot(&self) -> Result<Arc<LakeSnapshot>, Error> {
-        self.engine.catalog().snapshot().await
+    pub async fn current_snapshot(&self) -> Result<Arc<LakeSnapshot>, Error> {
+        self.engine.catalog().current_snapshot().await
     }
 
     /// Returns the contents of a run's file, from its summary and message indexes.
     ///
     /// # Errors
     /// [`Error::Execution`] if the file cannot be read.
-    pub async fn contents(&self, run: &VisibleRun) -> Result<Contents, Error> {
-        self.engine.catalog().contents(run).await
+    pub async fn read_contents(&self, run: &VisibleRun) -> Result<Contents, Error> {
+        self.engine.catalog().read_contents(run).await
     }
 
     /// Returns the bytes of the first attachment of a run's file whose name has this ending; None if there is none.
     ///
     /// # Errors
-    /// As [`Session::contents`].
-    pub async fn attachment(&self, run: &VisibleRun, ending: &str) -> Result<Option<Bytes>, Error> {
-        self.engine.catalog().attachment(run, ending).await
+    /// As [`Session::read_contents`].
+    pub async fn read_attachment(&self, run: &VisibleRun, ending: &str) -> Result<Option<Bytes>, Error> {
+        self.engine.catalog().read_attachment(run, ending).await
     }
 
     /// Returns the functions, sorted by name.
-    pub fn functions(&self) -> Vec<SqlFunction> {
-        self.engine.functions()
+    pub fn sql_functions(&self) -> Vec<SqlFunction> {
+        self.engine.sql_functions()
     }
 
     /// Returns the tables and views with their schemas.
-    pub fn tables(&self) -> impl Iterator<Item = (&'static str, SchemaRef)> {
-        self.engine.catalog().tables()
+    pub fn table_schemas(&self) -> impl Iterator<Item = (&'static str, SchemaRef)> {
+        self.engine.catalog().table_schemas()
     }
 
     /// Returns the tables of the schema `system` with their schemas.
@@ -427,7 +427,7 @@ impl Session {
     /// Returns all tables and views by the names that SQL has for them, and their schemas: those of the lake, then
     /// those of the schema `system`.
     pub fn all_tables(&self) -> Vec<(String, SchemaRef)> {
-        let own = self.tables().map(|(name, schema)| (name.to_owned(), schema));
+        let own = self.table_schemas().map(|(name, schema)| (name.to_owned(), schema));
         let system = self.system_tables().into_iter();
         own.chain(system.map(|(name, schema)| (format!("{SYSTEM_SCHEMA}.{name}"), schema))).collect()
     }
@@ -445,7 +445,7 @@ struct Started {
 }
 
 // Runs a query. It holds its permit until its operators are dropped, even if the reader is gone.
-async fn drive(
+async fn drive_query(
     plan: Arc<dyn ExecutionPlan>,
     context: Arc<TaskContext>,
     send: mpsc::Sender<Result<RecordBatch, DataFusionError>>,
@@ -455,7 +455,7 @@ async fn drive(
     let _work = ticket.begin_work();
     tokio::select! {
         biased;
-        _ = ticket.stopped() => {}
+        _ = ticket.wait_for_stop() => {}
         () = send_batches(plan, context, &send) => {}
     }
 }

@@ -62,7 +62,7 @@ impl BlockReader {
     }
 
     /// Bytes that are fetched at least, where the file has them.
-    pub(crate) fn ahead(&self) -> u64 {
+    pub(crate) fn readahead_bytes(&self) -> u64 {
         #[cfg(feature = "store")]
         if self.file.is_none() {
             return FROM_STORE;
@@ -71,9 +71,9 @@ impl BlockReader {
     }
 
     /// Some of the file's bytes. Their memory serves the next block, where nothing holds this one any more.
-    pub(crate) async fn block(&mut self, range: Range<u64>) -> Result<Bytes, ErrorCause> {
+    pub(crate) async fn read_block(&mut self, range: Range<u64>) -> Result<Bytes, ErrorCause> {
         if self.file.is_none() {
-            return self.range(range).await;
+            return self.read_range(range).await;
         }
         let count = (range.end - range.start) as usize;
         let mut room = std::mem::take(&mut self.last).try_into_mut().unwrap_or_default();
@@ -90,7 +90,7 @@ impl BlockReader {
     }
 
     /// Some of the file's bytes, elsewhere than where the walk is.
-    pub(crate) async fn range(&mut self, range: Range<u64>) -> Result<Bytes, ErrorCause> {
+    pub(crate) async fn read_range(&mut self, range: Range<u64>) -> Result<Bytes, ErrorCause> {
         #[cfg(feature = "store")]
         if let Some((store, path)) = &self.stored {
             return Ok(store.get_range(path, range).await?);

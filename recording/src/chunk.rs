@@ -152,7 +152,7 @@ impl DecodedChunk {
     }
 
     /// Shares some of its bytes.
-    pub fn share(&self, part: &[u8]) -> Bytes {
+    pub fn share_bytes(&self, part: &[u8]) -> Bytes {
         self.records.slice_ref(part)
     }
 
@@ -169,7 +169,7 @@ pub enum RecordError {
     #[error("a record ends early")]
     Early,
     /// A record's content makes no sense.
-    #[error("{}", describe(.0))]
+    #[error("{}", describe_mcap_error(.0))]
     Content(McapError),
 }
 
@@ -209,7 +209,7 @@ pub fn chunk_body(record: &Bytes) -> Result<Bytes, String> {
     if record.len() < FRAME_BYTES {
         return Err("its chunk ends within its frame".to_owned());
     }
-    let frame = RecordFrame::read(record);
+    let frame = RecordFrame::from_bytes(record);
     if frame.code != op::CHUNK {
         return Err(format!("there is a record of kind {:#04x} where its index says that a chunk is", frame.code));
     }
@@ -244,13 +244,13 @@ fn has_attachment_head(body: &[u8]) -> bool {
 pub fn system_cause(error: McapError) -> ErrorCause {
     match error {
         McapError::Io(system) => system.into(),
-        other => describe(&other).into(),
+        other => describe_mcap_error(&other).into(),
     }
 }
 
 /// Returns an error of the MCAP library with its cause. That of a parser is its innermost one: the others are a drawing
 /// of the parser's source, with colours and the paths of the machine that built it.
-pub fn describe(error: &McapError) -> String {
+pub fn describe_mcap_error(error: &McapError) -> String {
     match error {
         McapError::Parse(cause) => format!("{error}: {}", escape_controls(&cause.root_cause().to_string())),
         McapError::Io(cause) => format!("{error}: {cause}"),
@@ -271,7 +271,7 @@ fn chunk_parts(body: &[u8]) -> Result<(ChunkHeader, &[u8]), ChunkError> {
 
 fn split_record(records: &[u8]) -> Option<(u8, &[u8], &[u8])> {
     let (frame, behind) = records.split_at_checked(FRAME_BYTES)?;
-    let frame = RecordFrame::read(frame);
+    let frame = RecordFrame::from_bytes(frame);
     let (body, behind) = behind.split_at_checked(usize::try_from(frame.length).ok()?)?;
     Some((frame.code, body, behind))
 }

@@ -62,7 +62,7 @@ impl ChunkWriter {
     }
 
     /// Takes a message; it is written with its chunk.
-    pub fn push(&mut self, part: ChunkLane, header: MessageHeader, data: &[u8]) {
+    pub fn push_message(&mut self, part: ChunkLane, header: MessageHeader, data: &[u8]) {
         let PendingMessages { messages, bytes } = &mut self.pending[part as usize];
         let begin = bytes.len();
         bytes.extend_from_slice(data);
@@ -78,7 +78,7 @@ impl ChunkWriter {
     pub fn end_large(&mut self, part: ChunkLane) -> McapResult<()> {
         match self.pending[part as usize].bytes.len() >= CHUNK_BYTES {
             true if part == ChunkLane::Light => self.end_all(),
-            true => self.end(part),
+            true => self.end_chunk(part),
             false => Ok(()),
         }
     }
@@ -86,13 +86,13 @@ impl ChunkWriter {
     /// Ends all chunks and hands them to the system.
     pub fn end_all(&mut self) -> McapResult<()> {
         for part in ChunkLane::ALL {
-            self.end(part)?;
+            self.end_chunk(part)?;
         }
         self.mcap.flush()
     }
 
     /// Ends all chunks and waits until they are on the disk.
-    pub fn sync(&mut self) -> McapResult<()> {
+    pub fn sync_chunks(&mut self) -> McapResult<()> {
         self.end_all()?;
         Ok(self.file.sync_data()?)
     }
@@ -104,7 +104,7 @@ impl ChunkWriter {
         Ok(self.file.sync_all()?)
     }
 
-    fn end(&mut self, part: ChunkLane) -> McapResult<()> {
+    fn end_chunk(&mut self, part: ChunkLane) -> McapResult<()> {
         // Taken out, so that what could not be written is not written behind its own half.
         let mut pending = std::mem::take(&mut self.pending[part as usize]);
         for (header, range) in &pending.messages {

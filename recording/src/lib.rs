@@ -32,7 +32,7 @@ mod resync_reader;
 mod summary;
 
 pub use chunk::{
-    ChunkError, ChunkIdentity, ChunkMessage, DecodedChunk, RecordCursor, RecordError, chunk_body, describe,
+    ChunkError, ChunkIdentity, ChunkMessage, DecodedChunk, RecordCursor, RecordError, chunk_body, describe_mcap_error,
     parse_record, system_cause,
 };
 pub use chunk_writer::{ChunkLane, ChunkWriter, StreamWriter, stream_writer};

@@ -21,7 +21,7 @@ pub struct RecordFrame {
 
 impl RecordFrame {
     /// Returns the frame at the start of `bytes`, which are at least [`FRAME_BYTES`].
-    pub fn read(bytes: &[u8]) -> Self {
+    pub fn from_bytes(bytes: &[u8]) -> Self {
         let mut length = [0; 8];
         length.copy_from_slice(&bytes[1..FRAME_BYTES]);
         Self { code: bytes[0], length: u64::from_le_bytes(length) }
@@ -70,16 +70,16 @@ impl RecordFrame {
     /// Returns whether the specification has such records, or leaves them to others, with `left` bytes of the file
     /// behind the frame.
     pub(crate) fn is_possible(self, left: u64) -> bool {
-        let is_known = !parts(self.code).is_empty() || matches!(self.code, op::MESSAGE | PRIVATE..);
+        let is_known = !record_parts(self.code).is_empty() || matches!(self.code, op::MESSAGE | PRIVATE..);
         self.length <= left && is_known
     }
 
     /// Judges the record by the first bytes behind the frame, at most [`PREFIX_BYTES`].
-    pub(crate) fn shape(self, prefix: &[u8]) -> RecordShape {
+    pub(crate) fn judge_shape(self, prefix: &[u8]) -> RecordShape {
         if self.code == op::MESSAGE || self.code >= PRIVATE {
             return RecordShape::Unknown;
         }
-        let parts = parts(self.code);
+        let parts = record_parts(self.code);
         if parts.is_empty() {
             return RecordShape::Broken;
         }
@@ -87,8 +87,8 @@ impl RecordFrame {
         for part in parts {
             let length = match part {
                 RecordPart::Fixed(bytes) => Some(*bytes),
-                RecordPart::Short => number(prefix, at, 4).map(|n| n + 4),
-                RecordPart::Long => number(prefix, at, 8).and_then(|n| n.checked_add(8)),
+                RecordPart::Short => number_at(prefix, at, 4).map(|n| n + 4),
+                RecordPart::Long => number_at(prefix, at, 8).and_then(|n| n.checked_add(8)),
             };
             match length.and_then(|l| at.checked_add(l)).filter(|end| *end <= self.length) {
                 Some(end) => at = end,
@@ -100,7 +100,7 @@ impl RecordFrame {
 }
 
 /// A record's parts in their order, from the specification; none where its length says nothing of it.
-fn parts(code: u8) -> &'static [RecordPart] {
+fn record_parts(code: u8) -> &'static [RecordPart] {
     use RecordPart::{Fixed, Long, Short};
     match code {
         // Header: profile, library.
@@ -135,7 +135,7 @@ fn parts(code: u8) -> &'static [RecordPart] {
     }
 }
 
-fn number(bytes: &[u8], at: u64, width: usize) -> Option<u64> {
+fn number_at(bytes: &[u8], at: u64, width: usize) -> Option<u64> {
     let at = usize::try_from(at).ok()?;
     let mut number = [0; 8];
     number[..width].copy_from_slice(bytes.get(at..at.checked_add(width)?)?);
@@ -166,12 +166,12 @@ mod tests {
         let mut rest = &file[8..file.len() - 8];
         let mut seen = std::collections::BTreeSet::new();
         while !rest.is_empty() {
-            let frame = RecordFrame::read(rest);
+            let frame = RecordFrame::from_bytes(rest);
             let body = &rest[FRAME_BYTES..FRAME_BYTES + frame.length as usize];
-            assert_eq!(frame.shape(body), RecordShape::Sound, "{frame:?}");
+            assert_eq!(frame.judge_shape(body), RecordShape::Sound, "{frame:?}");
             for length in [frame.length - 1, frame.length + 1, frame.length ^ 0x100, u64::MAX] {
                 let other = RecordFrame { length, ..frame };
-                assert_eq!(other.shape(&rest[FRAME_BYTES..]), RecordShape::Broken, "{other:?}");
+                assert_eq!(other.judge_shape(&rest[FRAME_BYTES..]), RecordShape::Broken, "{other:?}");
             }
             seen.insert(frame.code);
             rest = &rest[FRAME_BYTES + frame.length as usize..];
@@ -182,7 +182,7 @@ mod tests {
 
     #[test]
     fn records_that_do_not_exist_are_broken_and_private_ones_unknown() {
-        let shape = |code| RecordFrame { code, length: 0 }.shape(&[]);
+        let shape = |code| RecordFrame { code, length: 0 }.judge_shape(&[]);
         assert_eq!([shape(0), shape(0x10), shape(0x7F)], [RecordShape::Broken; 3]);
         assert_eq!([shape(op::MESSAGE), shape(0x80)], [RecordShape::Unknown; 2]);
     }

@@ -21,7 +21,7 @@ pub struct SplitRecord {
 
 impl SplitRecord {
     /// Returns the byte of the file behind it.
-    pub fn end(&self) -> u64 {
+    pub fn end_offset(&self) -> u64 {
         self.offset + (FRAME_BYTES + self.body.len()) as u64
     }
 }
@@ -46,12 +46,12 @@ impl RecordSplitter {
 
     /// Returns the byte of the file at which the next record ends, if its frame is there.
     pub fn claimed_end(&self) -> Option<u64> {
-        let frame = self.buffer.get(..FRAME_BYTES).map(RecordFrame::read)?;
+        let frame = self.buffer.get(..FRAME_BYTES).map(RecordFrame::from_bytes)?;
         Some(self.offset.saturating_add(frame.length).saturating_add(FRAME_BYTES as u64))
     }
 
     /// Takes the file's next bytes.
-    pub fn push(&mut self, block: &[u8]) {
+    pub fn push_bytes(&mut self, block: &[u8]) {
         self.buffer.extend_from_slice(block);
     }
 
@@ -64,7 +64,7 @@ impl RecordSplitter {
         if there < FRAME_BYTES as u64 {
             return Ok(Err(FRAME_BYTES as u64 - there));
         }
-        let RecordFrame { code, length } = RecordFrame::read(&self.buffer);
+        let RecordFrame { code, length } = RecordFrame::from_bytes(&self.buffer);
         if length > LARGEST {
             return Err(format!("a record of kind {code:#04x} has {length} bytes, more than {LARGEST}"));
         }
@@ -91,9 +91,9 @@ mod tests {
             let mut splitter = RecordSplitter::new(8);
             let mut found = Vec::new();
             for part in file.chunks(block) {
-                splitter.push(part);
+                splitter.push_bytes(part);
                 while let Ok(record) = splitter.next_record().expect("sound") {
-                    found.push((record.offset, record.code, record.body.len(), record.end()));
+                    found.push((record.offset, record.code, record.body.len(), record.end_offset()));
                 }
             }
             assert_eq!(found, [(8, 3, 6, 23), (23, 5, 0, 32), (32, 6, 300, 341)], "blocks of {block}");
@@ -103,9 +103,9 @@ mod tests {
     #[test]
     fn a_record_that_is_too_large_is_refused_by_its_frame() {
         let mut splitter = RecordSplitter::new(0);
-        splitter.push(&[6, 0, 0, 0, 0, 1]);
+        splitter.push_bytes(&[6, 0, 0, 0, 0, 1]);
         assert_eq!(splitter.next_record(), Ok(Err(3)));
-        splitter.push(&[0, 0, 0]);
+        splitter.push_bytes(&[0, 0, 0]);
         assert!(splitter.next_record().is_err());
     }
 }

@@ -50,7 +50,7 @@ impl RecordingReader {
     pub fn open(path: &Path) -> Result<Self, ResyncError> {
         let name = path.display().to_string();
         let file = File::open(path).map_err(|e| ResyncError::Read { file: name.clone(), source: e.into() })?;
-        let walk = wait(ResyncReader::from_file(file, name))?;
+        let walk = block_on(ResyncReader::from_file(file, name))?;
         Ok(Self { walk, seen: HashSet::new(), damage: Vec::new() })
     }
 
@@ -60,7 +60,7 @@ impl RecordingReader {
     /// [`ResyncError::Read`] if the system refuses; damage is no error but listed by [`Self::finish`].
     pub fn next_item(&mut self) -> Result<Option<RecordingItem>, ResyncError> {
         loop {
-            let Some(item) = wait(self.walk.next_item())? else { return Ok(None) };
+            let Some(item) = block_on(self.walk.next_item())? else { return Ok(None) };
             return Ok(Some(match item {
                 ResyncItem::Attachment(attachment) => RecordingItem::Attachment(attachment),
                 ResyncItem::Metadata(metadata) => RecordingItem::Metadata(metadata),
@@ -79,7 +79,7 @@ impl RecordingReader {
                     }
                     Err(reason) => {
                         list_damage(&mut self.damage, || format!("the chunk at byte {}: {reason}", raw.offset));
-                        wait(self.walk.look_into(raw.offset))?;
+                        block_on(self.walk.look_into(raw.offset))?;
                         continue;
                     }
                 },
@@ -92,7 +92,7 @@ impl RecordingReader {
     /// # Errors
     /// [`ResyncError::Read`].
     pub fn finish(self) -> Result<FileIntegrity, ResyncError> {
-        let mut integrity = wait(self.walk.finish())?;
+        let mut integrity = block_on(self.walk.finish())?;
         integrity.is_data_whole &= self.damage.is_empty();
         integrity.damage.extend(self.damage);
         Ok(integrity)
@@ -111,7 +111,7 @@ fn whole_records(body: &Bytes) -> Result<(crate::ChunkIdentity, Vec<Record<'stat
 }
 
 // A walk over a file of this machine never waits.
-fn wait<T>(walk: impl Future<Output = T>) -> T {
+fn block_on<T>(walk: impl Future<Output = T>) -> T {
     let mut walk = pin!(walk);
     loop {
         if let Poll::Ready(done) = walk.as_mut().poll(&mut Context::from_waker(Waker::noop())) {

@@ -23,7 +23,7 @@ use sha2::{Digest as _, Sha256};
 use tokio::sync::{Semaphore, SemaphorePermit};
 
 use crate::block_reader::BlockReader;
-use crate::chunk::describe;
+use crate::chunk::describe_mcap_error;
 use crate::limits::LARGE_RECORD;
 use crate::record_frame::{FRAME_BYTES, PREFIX_BYTES, RecordFrame, RecordShape, largest_record};
 
@@ -70,7 +70,7 @@ pub enum ResyncError {
 }
 
 impl ResyncError {
-    fn read(file: &str, source: impl Into<ErrorCause>) -> Self {
+    fn read_failure(file: &str, source: impl Into<ErrorCause>) -> Self {
         Self::Read { file: file.to_owned(), source: source.into() }
     }
 }
@@ -194,18 +194,18 @@ impl ResyncReader {
         let size = match store.head(&path).await {
             Ok(meta) => meta.size,
             Err(object_store::Error::NotFound { .. }) => return Err(ResyncError::Gone { file: name }),
-            Err(e) => return Err(ResyncError::read(&name, e)),
+            Err(e) => return Err(ResyncError::read_failure(&name, e)),
         };
-        Self::begin(BlockReader::open(store, path).await, size, name).await
+        Self::from_block_reader(BlockReader::open(store, path).await, size, name).await
     }
 
     /// Reads an open file of this machine; nothing in it waits for anything but the disk.
     pub(crate) async fn from_file(file: File, name: String) -> Result<Self, ResyncError> {
-        let size = file.metadata().map_err(|e| ResyncError::read(&name, e))?.len();
-        Self::begin(BlockReader::from_file(file), size, name).await
+        let size = file.metadata().map_err(|e| ResyncError::read_failure(&name, e))?.len();
+        Self::from_block_reader(BlockReader::from_file(file), size, name).await
     }
 
-    async fn begin(file: BlockReader, size: u64, name: String) -> Result<Self, ResyncError> {
+    async fn from_block_reader(file: BlockReader, size: u64, name: String) -> Result<Self, ResyncError> {
         let mut reader = Self {
             file,
             name,
@@ -232,18 +232,18 @@ impl ResyncReader {
             manifest: None,
         };
         let length = (MAGIC.len() as u64).min(size);
-        reader.fill(length).await?;
-        let start = reader.skip(length, true);
+        reader.fill_window(length).await?;
+        let start = reader.take_bytes(length, true);
         if start[..] != MAGIC[..] {
             let actual = start.iter().map(|b| format!("{b:02x}")).collect::<Vec<_>>().join(" ");
             let actual =
                 if actual.is_empty() { "nothing (the file is empty)".to_owned() } else { format!("`{actual}`") };
             // One wrong byte in front does not make it another file.
-            if !matches!(reader.frame().await?, Ok(frame) if frame.code == op::HEADER) {
+            if !matches!(reader.read_frame().await?, Ok(frame) if frame.code == op::HEADER) {
                 return Err(ResyncError::NotMcap { file: reader.name, actual });
             }
-            reader.note(|| format!("the file begins with {actual}, which are no magic bytes"));
-            reader.lose(0..length);
+            reader.note_damage(|| format!("the file begins with {actual}, which are no magic bytes"));
+            reader.mark_lost(0..length);
         }
         Ok(reader)
     }
@@ -259,7 +259,7 @@ impl ResyncReader {
             if self.end.is_some() {
                 return Ok(None);
             }
-            if let Some(item) = self.record().await? {
+            if let Some(item) = self.read_record().await? {
                 return Ok(Some(item));
             }
         }
@@ -267,8 +267,8 @@ impl ResyncReader {
 
     /// Returns the state of the whole file, once [`Self::next_item`] returned None.
     pub async fn finish(mut self) -> Result<FileIntegrity, ResyncError> {
-        self.pass(self.size - self.offset).await?;
-        self.lose(self.whole_end..self.size);
+        self.pass_bytes(self.size - self.offset).await?;
+        self.mark_lost(self.whole_end..self.size);
         if let Some(data_end) = self.data_end {
             self.lost.retain(|range| range.start < data_end || self.foreign.is_some_and(|from| range.start >= from));
         }
@@ -296,10 +296,10 @@ impl ResyncReader {
         let end = self.offset;
         self.lost.retain(|range| range.start < offset);
         self.whole_end = offset;
-        match self.rewind(offset) {
-            true => self.search().await,
+        match self.rewind_to(offset) {
+            true => self.search_record().await,
             false => {
-                self.lose(offset..end);
+                self.mark_lost(offset..end);
                 self.whole_end = end;
                 Ok(())
             }
@@ -307,17 +307,17 @@ impl ResyncReader {
     }
 
     /// A chunk that the walk came by earlier, once more.
-    pub async fn again(&mut self, offset: u64, length: u64) -> Result<RawChunk, ResyncError> {
+    pub async fn reread_chunk(&mut self, offset: u64, length: u64) -> Result<RawChunk, ResyncError> {
         let start = offset + FRAME;
         // What it becomes is known only once it is read.
         let permit = self.large_record_permit(LARGE_RECORD + 1).await;
-        let body = self.file.range(start..start + length).await;
-        Ok(RawChunk { offset, body: body.map_err(|e| ResyncError::read(&self.name, e))?, permit })
+        let body = self.file.read_range(start..start + length).await;
+        Ok(RawChunk { offset, body: body.map_err(|e| ResyncError::read_failure(&self.name, e))?, permit })
     }
 
     // One record; None where it is of no interest.
-    async fn record(&mut self) -> Result<Option<ResyncItem>, ResyncError> {
-        let frame = match self.frame().await? {
+    async fn read_record(&mut self) -> Result<Option<ResyncItem>, ResyncError> {
+        let frame = match self.read_frame().await? {
             Ok(frame) => frame,
             Err(what) => {
                 let at = self.offset;
@@ -330,8 +330,8 @@ impl ResyncReader {
                     self.end = Some(FileEnd::CutOff);
                     return Ok(None);
                 }
-                self.note(|| format!("the file {what} at byte {at}"));
-                self.search().await?;
+                self.note_damage(|| format!("the file {what} at byte {at}"));
+                self.search_record().await?;
                 return Ok(None);
             }
         };
@@ -341,21 +341,21 @@ impl ResyncReader {
         let most = largest_record(code).unwrap_or(u64::MAX);
         let is_one_too_many = code == op::CHUNK && self.chunks.len() == MOST_CHUNKS;
         if length > most || is_one_too_many {
-            self.note(|| match is_one_too_many {
+            self.note_damage(|| match is_one_too_many {
                 true => format!("the chunk at byte {offset}: the file has more than {MOST_CHUNKS}"),
                 false => format!("record of kind {code:#04x} at byte {offset} has {length} bytes, more than {most}"),
             });
             // The lengths inside of it agree with its own: nothing is looked for in it.
             self.doubtful = None;
-            return self.pass(FRAME + length).await;
+            return self.pass_bytes(FRAME + length).await;
         }
-        self.lose(self.whole_end..offset);
+        self.mark_lost(self.whole_end..offset);
         self.whole_end = self.whole_end.max(offset + FRAME + length);
         match code {
             op::CHUNK | op::ATTACHMENT | op::METADATA | op::SCHEMA | op::CHANNEL => {
-                let permit = self.large_record_permit(self.memory(frame)).await;
-                self.fill(FRAME + length).await?;
-                let mut record = self.skip(FRAME + length, true);
+                let permit = self.large_record_permit(self.record_memory(frame)).await;
+                self.fill_window(FRAME + length).await?;
+                let mut record = self.take_bytes(FRAME + length, true);
                 let body = record.split_off(FRAME as usize);
                 if code == op::CHUNK {
                     self.data_end = None;
@@ -365,7 +365,7 @@ impl ResyncReader {
                         permit,
                     })));
                 }
-                let item = self.item(code, offset, &body);
+                let item = self.parse_item(code, offset, &body);
                 match &item {
                     None => self.look_into(offset).await?,
                     Some(ResyncItem::Metadata(m)) if m.name == topics::RUN_METADATA => {
@@ -379,19 +379,19 @@ impl ResyncReader {
                 Ok(item)
             }
             op::DATA_END => self.data_end().await,
-            op::FOOTER => self.footer().await,
-            _ => self.pass(FRAME + length).await,
+            op::FOOTER => self.check_footer().await,
+            _ => self.pass_bytes(FRAME + length).await,
         }
     }
 
     // Whether this file ends here and another one follows, which is then left alone.
     async fn is_other_file(&mut self) -> Result<bool, ResyncError> {
         let left = self.size - self.offset;
-        self.fill(left.min(FOOTER)).await?;
-        if !is_inner_footer(self.ahead(), left) {
+        self.fill_window(left.min(FOOTER)).await?;
+        if !is_inner_footer(self.bytes_ahead(), left) {
             return Ok(false);
         }
-        self.skip(FOOTER, false);
+        self.take_bytes(FOOTER, false);
         self.end_at(self.offset, "another file", FileEnd::Closed);
         Ok(true)
     }
@@ -410,12 +410,12 @@ impl ResyncReader {
     }
 
     // Behind data that are right nothing is damaged but the summary.
-    fn note(&mut self, line: impl FnOnce() -> String) {
+    fn note_damage(&mut self, line: impl FnOnce() -> String) {
         let lines = if self.data_end.is_some() { &mut self.summary_damage } else { &mut self.damage };
         list_damage(lines, line);
     }
 
-    fn lose(&mut self, range: Range<u64>) {
+    fn mark_lost(&mut self, range: Range<u64>) {
         let is_full = self.lost.len() >= MOST_DAMAGE;
         match self.lost.last_mut() {
             _ if range.is_empty() => {}
@@ -425,9 +425,9 @@ impl ResyncReader {
     }
 
     // Bytes that a record takes: a chunk's also decompressed, which is its third number.
-    fn memory(&self, frame: RecordFrame) -> u64 {
+    fn record_memory(&self, frame: RecordFrame) -> u64 {
         let at = FRAME as usize + 16;
-        let claimed = self.ahead().get(at..at + 8).filter(|_| frame.code == op::CHUNK);
+        let claimed = self.bytes_ahead().get(at..at + 8).filter(|_| frame.code == op::CHUNK);
         let claimed = claimed.map_or(0, |bytes| u64::from_le_bytes(bytes.try_into().unwrap_or_default()));
         frame.length.max(claimed)
     }
@@ -444,13 +444,13 @@ impl ResyncReader {
     }
 
     // The frame at `offset`, or in words why no record begins there.
-    async fn frame(&mut self) -> Result<Result<RecordFrame, String>, ResyncError> {
+    async fn read_frame(&mut self) -> Result<Result<RecordFrame, String>, ResyncError> {
         let left = self.size - self.offset;
         if left < FRAME {
             return Ok(Err("ends within a record's frame".to_owned()));
         }
-        self.fill(FRAME).await?;
-        let frame = RecordFrame::read(self.ahead());
+        self.fill_window(FRAME).await?;
+        let frame = RecordFrame::from_bytes(self.bytes_ahead());
         if frame.length > left - FRAME {
             // A recorder writes a chunk's size when the chunk is full, and until then the largest number.
             return Ok(Err(match frame.code == op::CHUNK && frame.length == u64::MAX {
@@ -458,8 +458,8 @@ impl ResyncReader {
                 false => format!("ends within a record of kind {:#04x} and {} bytes", frame.code, frame.length),
             }));
         }
-        self.fill(left.min(FRAME + frame.length.min(PREFIX_BYTES as u64) + MAGIC.len() as u64)).await?;
-        let sound = match look(self.ahead(), left) {
+        self.fill_window(left.min(FRAME + frame.length.min(PREFIX_BYTES as u64) + MAGIC.len() as u64)).await?;
+        let sound = match judge_record(self.bytes_ahead(), left) {
             RecordShape::Sound => true,
             RecordShape::Unknown => self.goes_on(FRAME + frame.length).await?,
             RecordShape::Broken => false,
@@ -474,22 +474,22 @@ impl ResyncReader {
             return Ok(false);
         }
         let frame = if behind <= PREFIX_BYTES as u64 {
-            self.fill(behind + FRAME).await?;
-            RecordFrame::read(&self.ahead()[behind as usize..])
+            self.fill_window(behind + FRAME).await?;
+            RecordFrame::from_bytes(&self.bytes_ahead()[behind as usize..])
         } else {
             let start = self.offset + behind;
-            let bytes = self.file.range(start..start + FRAME).await;
-            let bytes = bytes.map_err(|e| ResyncError::read(&self.name, e))?;
+            let bytes = self.file.read_range(start..start + FRAME).await;
+            let bytes = bytes.map_err(|e| ResyncError::read_failure(&self.name, e))?;
             if bytes.len() < FRAME_BYTES {
-                return Err(ResyncError::read(&self.name, "it became shorter while it was read"));
+                return Err(ResyncError::read_failure(&self.name, "it became shorter while it was read"));
             }
-            RecordFrame::read(&bytes)
+            RecordFrame::from_bytes(&bytes)
         };
         Ok(frame.is_possible(left - FRAME))
     }
 
     // Goes back to where a doubtful record began; false where the walk went back too much already.
-    fn rewind(&mut self, to: u64) -> bool {
+    fn rewind_to(&mut self, to: u64) -> bool {
         self.doubtful = None;
         let back = self.offset - to;
         let may = self.rewound + back <= self.size.saturating_mul(REWINDS);
@@ -502,17 +502,17 @@ impl ResyncReader {
 
     // Goes on to the next bytes that can be a record. The record before may have swallowed it, where its length or
     // what is missing in it made it reach too far.
-    async fn search(&mut self) -> Result<(), ResyncError> {
+    async fn search_record(&mut self) -> Result<(), ResyncError> {
         if let Some(doubtful) = self.doubtful {
-            self.rewind(doubtful);
+            self.rewind_to(doubtful);
         }
         // It is another file's turn to have a large record in memory.
         if self.window.len() as u64 > LARGE_RECORD {
             self.window = Bytes::new();
         }
         if self.offset < self.size {
-            self.fill(1).await?;
-            self.skip(1, true);
+            self.fill_window(1).await?;
+            self.take_bytes(1, true);
         }
         loop {
             let left = self.size - self.offset;
@@ -520,8 +520,8 @@ impl ResyncReader {
                 self.end = Some(FileEnd::CutOff);
                 return Ok(());
             }
-            self.fetch(left.min(FRAME + PREFIX_BYTES as u64), PASS).await?;
-            let ahead = self.ahead();
+            self.fetch_window(left.min(FRAME + PREFIX_BYTES as u64), PASS).await?;
+            let ahead = self.bytes_ahead();
             // All frames that can be judged by what is fetched.
             let behind = if ahead.len() as u64 == left { FRAME as usize } else { FRAME as usize + PREFIX_BYTES };
             let count = ahead.len() - behind + 1;
@@ -530,14 +530,14 @@ impl ResyncReader {
             while at < count && !(matches!(ahead[at], 1..=op::DATA_END) && can_begin(&ahead[at..], left - at as u64)) {
                 at += 1;
             }
-            self.skip(at as u64, true);
+            self.take_bytes(at as u64, true);
             if at < count {
                 return Ok(());
             }
         }
     }
 
-    fn item(&mut self, code: u8, offset: u64, body: &Bytes) -> Option<ResyncItem> {
+    fn parse_item(&mut self, code: u8, offset: u64, body: &Bytes) -> Option<ResyncItem> {
         match crate::chunk::parse_record(code, body) {
             Ok(Record::Attachment { header, data, crc }) => {
                 // Its CRC was checked, but 0 stands for none: it may be what now stands at its end.
@@ -557,7 +557,7 @@ impl ResyncReader {
             Ok(Record::Metadata(metadata)) => Some(ResyncItem::Metadata(metadata)),
             Ok(definition) => Some(ResyncItem::Definition(definition.into_owned())),
             Err(e) => {
-                self.note(|| format!("record at byte {offset}: {}", describe(&e)));
+                self.note_damage(|| format!("record at byte {offset}: {}", describe_mcap_error(&e)));
                 None
             }
         }
@@ -566,20 +566,20 @@ impl ResyncReader {
     async fn data_end(&mut self) -> Result<Option<ResyncItem>, ResyncError> {
         let sum = self.crc.clone().finalize();
         let at = self.offset;
-        let record = self.skip(FRAME + 4, true);
+        let record = self.take_bytes(FRAME + 4, true);
         let stored = u32_at(&record, FRAME as usize);
         if stored == sum {
             self.data_end = Some(self.offset);
         } else if stored != 0 {
-            self.note(|| format!("data section up to byte {at}: CRC is {sum:08x}, expected {stored:08x}"));
+            self.note_damage(|| format!("data section up to byte {at}: CRC is {sum:08x}, expected {stored:08x}"));
         }
         self.in_summary = true;
         Ok(None)
     }
 
-    async fn footer(&mut self) -> Result<Option<ResyncItem>, ResyncError> {
+    async fn check_footer(&mut self) -> Result<Option<ResyncItem>, ResyncError> {
         let at = self.offset;
-        let record = self.skip(FOOTER, false);
+        let record = self.take_bytes(FOOTER, false);
         // The summary's CRC covers all of it up to the CRC itself, the footer's frame and offsets included.
         let mut sum = self.summary.clone();
         sum.update(&record[..25]);
@@ -587,7 +587,7 @@ impl ResyncReader {
         let stored = u32_at(&record, 25);
         let has_summary = record[9..17] != [0; 8];
         if has_summary && stored != 0 && stored != sum {
-            self.note(|| format!("summary before byte {at}: CRC is {sum:08x}, expected {stored:08x}"));
+            self.note_damage(|| format!("summary before byte {at}: CRC is {sum:08x}, expected {stored:08x}"));
         }
         self.end = Some(FileEnd::Closed);
         self.whole_end = self.size;
@@ -595,35 +595,35 @@ impl ResyncReader {
     }
 
     // What is fetched of the file from `offset` on.
-    fn ahead(&self) -> &[u8] {
+    fn bytes_ahead(&self) -> &[u8] {
         let from = self.offset.checked_sub(self.window_start).and_then(|from| usize::try_from(from).ok());
         from.and_then(|from| self.window.get(from..)).unwrap_or_default()
     }
 
     // Fetches, so that the next `count` bytes are there; the file has them.
-    async fn fill(&mut self, count: u64) -> Result<(), ResyncError> {
-        self.fetch(count, self.file.ahead()).await
+    async fn fill_window(&mut self, count: u64) -> Result<(), ResyncError> {
+        self.fetch_window(count, self.file.readahead_bytes()).await
     }
 
     // The same; where it must read, it reads `at_least` so much. What was left is fetched once more: that is less than
     // to copy all behind it.
-    async fn fetch(&mut self, count: u64, at_least: u64) -> Result<(), ResyncError> {
-        if (self.ahead().len() as u64) < count {
+    async fn fetch_window(&mut self, count: u64, at_least: u64) -> Result<(), ResyncError> {
+        if (self.bytes_ahead().len() as u64) < count {
             // Let go, so that its memory serves again.
             self.window = Bytes::new();
             let to = (self.offset + count.max(at_least)).min(self.size);
-            let fetched = self.file.block(self.offset..to).await;
-            self.window = fetched.map_err(|e| ResyncError::read(&self.name, e))?;
+            let fetched = self.file.read_block(self.offset..to).await;
+            self.window = fetched.map_err(|e| ResyncError::read_failure(&self.name, e))?;
             self.window_start = self.offset;
         }
-        if (self.ahead().len() as u64) < count {
-            return Err(ResyncError::read(&self.name, "it became shorter while it was read"));
+        if (self.bytes_ahead().len() as u64) < count {
+            return Err(ResyncError::read_failure(&self.name, "it became shorter while it was read"));
         }
         Ok(())
     }
 
     /// Takes the next `count` bytes, which are fetched.
-    fn skip(&mut self, count: u64, counts_in_crc: bool) -> Bytes {
+    fn take_bytes(&mut self, count: u64, counts_in_crc: bool) -> Bytes {
         let from = (self.offset - self.window_start) as usize;
         let passed = self.window.slice(from..from + count as usize);
         self.offset += count;
@@ -641,7 +641,7 @@ impl ResyncReader {
     }
 
     // Passes over what may be larger than the window should become.
-    async fn pass(&mut self, count: u64) -> Result<Option<ResyncItem>, ResyncError> {
+    async fn pass_bytes(&mut self, count: u64) -> Result<Option<ResyncItem>, ResyncError> {
         if !self.has_digest {
             self.offset += count;
             return Ok(None);
@@ -649,35 +649,35 @@ impl ResyncReader {
         let mut left = count;
         while left > 0 {
             let some = left.min(PASS);
-            self.fill(some).await?;
-            self.skip(some, true);
+            self.fill_window(some).await?;
+            self.take_bytes(some, true);
             left -= some;
         }
         Ok(None)
     }
 }
 
-// Whether a search ends at these bytes, as for [`look`].
+// Whether a search ends at these bytes, as for [`judge_record`].
 fn can_begin(bytes: &[u8], left: u64) -> bool {
-    look(bytes, left) == RecordShape::Sound || is_inner_footer(bytes, left)
+    judge_record(bytes, left) == RecordShape::Sound || is_inner_footer(bytes, left)
 }
 
 // Whether a whole file ends with the footer and the magic bytes that `bytes` begin with, and something follows.
 fn is_inner_footer(bytes: &[u8], left: u64) -> bool {
     left > FOOTER
-        && RecordFrame::read(bytes) == RecordFrame { code: op::FOOTER, length: 20 }
+        && RecordFrame::from_bytes(bytes) == RecordFrame { code: op::FOOTER, length: 20 }
         && bytes.get(FRAME_BYTES + 20..FOOTER as usize) == Some(MAGIC)
 }
 
 // What can be said of the record that begins with `bytes`, which have its frame, the first [`PREFIX_BYTES`] bytes
 // behind it and the file's last ones, where it has them; `left` bytes of the file are left.
-fn look(bytes: &[u8], left: u64) -> RecordShape {
-    let frame = RecordFrame::read(bytes);
+fn judge_record(bytes: &[u8], left: u64) -> RecordShape {
+    let frame = RecordFrame::from_bytes(bytes);
     if !frame.is_possible(left - FRAME) {
         return RecordShape::Broken;
     }
     let end = FRAME as usize + frame.length.min(PREFIX_BYTES as u64) as usize;
-    match frame.shape(&bytes[FRAME as usize..end]) {
+    match frame.judge_shape(&bytes[FRAME as usize..end]) {
         // The magic bytes and nothing else are behind a footer.
         RecordShape::Sound if frame.code == op::FOOTER && (left != FOOTER || !bytes.ends_with(MAGIC)) => {
             RecordShape::Broken
@@ -696,7 +696,7 @@ pub fn find_part(bytes: &[u8], left: u64) -> Result<usize, usize> {
     let behind = if bytes.len() as u64 >= left { FRAME_BYTES } else { FRAME_BYTES + PREFIX_BYTES };
     let count = (bytes.len() + 1).saturating_sub(behind);
     let is_part = |at: &usize| match bytes[*at] {
-        op::CHUNK => look(&bytes[*at..], left - *at as u64) == RecordShape::Sound,
+        op::CHUNK => judge_record(&bytes[*at..], left - *at as u64) == RecordShape::Sound,
         _ => bytes[*at..].starts_with(MAGIC) && left - *at as u64 > MAGIC.len() as u64,
     };
     (0..count).find(is_part).ok_or(count)

@@ -114,8 +114,8 @@ impl RunSummary {
                         Record::AttachmentIndex(index) => found.attachment_indexes.push(index),
                         Record::MetadataIndex(index) => found.metadata_indexes.push(index),
                         other => {
-                            definitions.learn(&other).map_err(McapError::ConflictingChannels)?;
-                            found.digests.learn(&other);
+                            definitions.learn_definition(&other).map_err(McapError::ConflictingChannels)?;
+                            found.digests.learn_definition(&other);
                         }
                     }
                 }
@@ -134,7 +134,7 @@ impl RunSummary {
     /// Returns what of the file it does not account for, in words that follow "its summary"; None if it describes and
     /// lists all that its statistics count. Writers may leave out any part of a summary, and a reader that takes the
     /// rest for the whole loses messages without a word.
-    pub fn unaccounted(&self) -> Option<String> {
+    pub fn describe_unaccounted(&self) -> Option<String> {
         let Some(statistics) = &self.statistics else { return Some("has no statistics".to_owned()) };
         let parts = [
             ("describes", "schemas", self.schema_count, usize::from(statistics.schema_count)),
@@ -216,7 +216,7 @@ pub struct DefinitionDigests {
 }
 
 impl DefinitionDigests {
-    fn learn(&mut self, record: &Record<'_>) {
+    fn learn_definition(&mut self, record: &Record<'_>) {
         self.by_id.extend(digest_of(record));
     }
 
@@ -225,7 +225,7 @@ impl DefinitionDigests {
     /// # Errors
     /// What is different, if it is a schema or channel whose id stands for something else: nobody could tell whose the
     /// messages are.
-    pub fn check(&self, record: &Record<'_>) -> Result<(), String> {
+    pub fn check_definition(&self, record: &Record<'_>) -> Result<(), String> {
         let Some((key, digest)) = digest_of(record) else { return Ok(()) };
         match self.by_id.get(&key) {
             Some(known) if *known != digest => {
@@ -275,7 +275,7 @@ impl ChannelDefinitions {
     ///
     /// # Errors
     /// What is different, if an id is used again for something else: nobody could tell whose the messages are.
-    pub fn learn(&mut self, record: &Record<'_>) -> Result<(), String> {
+    pub fn learn_definition(&mut self, record: &Record<'_>) -> Result<(), String> {
         match record {
             Record::Schema { header, data } => match self.schemas.get(&header.id) {
                 Some(known)
@@ -371,7 +371,7 @@ mod tests {
         let bytes = file.len() as u64;
         let range = summary_range(&file[tail_range(bytes).start as usize..], bytes).expect("a summary");
         let parse = || RunSummary::parse(&file[range.start as usize..]).expect("sound");
-        assert_eq!(parse().unaccounted(), None);
+        assert_eq!(parse().describe_unaccounted(), None);
         type Change = fn(&mut RunSummary, &mut Statistics);
         let changes: [(&str, Change); 10] = [
             ("describes 0 of 1 schemas", |summary, _| summary.schema_count = 0),
@@ -399,11 +399,11 @@ mod tests {
             let mut statistics = summary.statistics.take().expect("statistics");
             change(&mut summary, &mut statistics);
             summary.statistics = Some(statistics);
-            assert_eq!(summary.unaccounted().as_deref(), Some(expected));
+            assert_eq!(summary.describe_unaccounted().as_deref(), Some(expected));
         }
         let mut summary = parse();
         summary.statistics = None;
-        assert_eq!(summary.unaccounted().as_deref(), Some("has no statistics"));
+        assert_eq!(summary.describe_unaccounted().as_deref(), Some("has no statistics"));
     }
 
     #[test]

@@ -69,7 +69,7 @@ fn read_whole(path: &std::path::Path) -> (Vec<(Range<u64>, Messages)>, Vec<Strin
 /// Reads up to the first damage.
 fn read_strictly(bytes: &[u8]) -> Messages {
     let mut splitter = RecordSplitter::new(8);
-    splitter.push(bytes.get(8..).unwrap_or_default());
+    splitter.push_bytes(bytes.get(8..).unwrap_or_default());
     let mut messages = BTreeSet::new();
     while let Ok(Ok(record)) = splitter.next_record() {
         if let (opcode::CHUNK, Ok(chunk)) = (record.code, DecodedChunk::decode(&record.body)) {
@@ -114,7 +114,7 @@ fn damage_costs_what_it_touches_and_invents_nothing() {
         let tail = &bytes[tail_range(bytes.len() as u64).start as usize..];
         let summary =
             summary_range(tail, bytes.len() as u64).map(|range| RunSummary::parse(&bytes[range.start as usize..]));
-        let _ = summary.and_then(|summary| summary.ok()?.unaccounted());
+        let _ = summary.and_then(|summary| summary.ok()?.describe_unaccounted());
     }
     assert!(partly > 300, "only {partly} files were read in part");
 }

@@ -174,7 +174,7 @@ impl DeviceParams {
     }
 
     /// Describes the first contradiction among the settings.
-    pub(crate) fn contradiction(&self) -> Option<String> {
+    pub(crate) fn find_contradiction(&self) -> Option<String> {
         let simulated = [
             self.audio == AudioParams::Simulated,
             self.sensor == SensorParams::Simulated,

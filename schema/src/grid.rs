@@ -42,7 +42,7 @@ pub struct Pair {
 ///
 /// let layers = vec![Layer { points_per_side: 2, pitch_mm: 75.0, height_mm: 124.0 }];
 /// let params = GridParams { pairs: PairRule::Ordered, clearance_mm: 40.0, layers, points_mm: Vec::new() };
-/// assert_eq!(params.build()?.pairs().len(), 4 * 3);
+/// assert_eq!(params.build_grid()?.pairs().len(), 4 * 3);
 /// # Ok::<(), echolake_schema::Error>(())
 /// ```
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -121,7 +121,7 @@ impl PairRule {
 /// ```
 /// use echolake_schema::Rig;
 ///
-/// let grid = Rig::paper().grid()?;
+/// let grid = Rig::paper().build_grid()?;
 /// let microphone = grid.parse_point("0/0/0")?;
 /// let speaker = grid.parse_point("0 0 474")?;
 /// let pair = grid.parse_pair(microphone, speaker)?;
@@ -157,14 +157,14 @@ impl GridParams {
     ///
     /// # Errors
     /// [`Error::Quantity`] if there are fewer than 2 points, more than [`Self::MAX_POINTS`], or one is not within 1 km.
-    pub fn build(&self) -> Result<Grid, Error> {
+    pub fn build_grid(&self) -> Result<Grid, Error> {
         let count = self.layers.iter().map(|l| (l.points_per_side as usize).saturating_pow(2)).sum::<usize>();
         let count = count.saturating_add(self.points_mm.len());
         if !(2..=Self::MAX_POINTS).contains(&count) {
             let actual = count.to_string();
             return Err(Error::Quantity { quantity: "number of grid points", actual, expected: "2 to 2000" });
         }
-        let points = self.points();
+        let points = self.lay_out_points();
         if let Some(bad) = points.iter().find(|p| p.position_mm.iter().any(|x| !(x.abs() <= 1e6))) {
             let actual = format!("{:?}", bad.position_mm);
             return Err(Error::Quantity { quantity: "grid point (mm)", actual, expected: "finite, within 1 km" });
@@ -172,7 +172,7 @@ impl GridParams {
         Ok(Grid::new(points.clone(), self.pairs_of(&points)))
     }
 
-    fn points(&self) -> Vec<Point> {
+    fn lay_out_points(&self) -> Vec<Point> {
         let mut points = Vec::new();
         let mut push = |layer, gridx, gridy, position_mm| {
             points.push(Point { id: PointId(points.len() as u32), layer, gridx, gridy, position_mm });
@@ -202,7 +202,7 @@ impl GridParams {
                     PairRule::Unordered => a.id < b.id,
                     PairRule::Ordered => a.id != b.id,
                 };
-                if wanted && !self.collide(a, b, top) {
+                if wanted && !self.is_collision(a, b, top) {
                     pairs.push(Pair { id: PairId(pairs.len() as u32), microphone: a.id, speaker: b.id });
                 }
             }
@@ -211,7 +211,7 @@ impl GridParams {
     }
 
     // The end-effector at one point would be above that at the other; the topmost layer is high enough.
-    fn collide(&self, a: &Point, b: &Point, top: f64) -> bool {
+    fn is_collision(&self, a: &Point, b: &Point, top: f64) -> bool {
         let [dx, dy, dz] = [0, 1, 2].map(|i| a.position_mm[i] - b.position_mm[i]);
         dz != 0.0 && a.position_mm[2].max(b.position_mm[2]) < top && dx.hypot(dy) < self.clearance_mm
     }
@@ -250,7 +250,7 @@ impl Grid {
 
     /// The point at a position, mm, within half a millimetre.
     pub fn point_at(&self, position_mm: [f64; 3]) -> Option<&Point> {
-        self.nearest(position_mm).filter(|p| distance(p.position_mm, position_mm) < SAME_POINT_MM)
+        self.nearest_point(position_mm).filter(|p| distance_between(p.position_mm, position_mm) < SAME_POINT_MM)
     }
 
     /// Reads `layer/x/y` or millimetres `x y z`.
@@ -289,8 +289,8 @@ impl Grid {
         })
     }
 
-    fn nearest(&self, position_mm: [f64; 3]) -> Option<&Point> {
-        let to = |p: &Point| distance(p.position_mm, position_mm);
+    fn nearest_point(&self, position_mm: [f64; 3]) -> Option<&Point> {
+        let to = |p: &Point| distance_between(p.position_mm, position_mm);
         self.points.iter().min_by(|a, b| to(a).total_cmp(&to(b)))
     }
 
@@ -299,7 +299,7 @@ impl Grid {
         Error::Point {
             given: format!("`{text}`"),
             expected: format!("{} points; `layer/x/y` or millimetres `x y z`", self.points.len()),
-            nearest: position.and_then(|p| self.nearest(p)).map(|p| {
+            nearest: position.and_then(|p| self.nearest_point(p)).map(|p| {
                 let [x, y, z] = p.position_mm;
                 format!("{} at `{x} {y} {z}`", p.label())
             }),
@@ -314,7 +314,7 @@ impl Point {
     }
 }
 
-fn distance(a: [f64; 3], b: [f64; 3]) -> f64 {
+fn distance_between(a: [f64; 3], b: [f64; 3]) -> f64 {
     a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt()
 }
 
@@ -323,7 +323,7 @@ mod tests {
     use super::*;
 
     fn paper() -> Grid {
-        GridParams::default().build().expect("the built-in grid is valid")
+        GridParams::default().build_grid().expect("the built-in grid is valid")
     }
 
     #[test]
@@ -355,7 +355,7 @@ mod tests {
 
     #[test]
     fn a_description_of_single_points_has_no_layers() {
-        let grid = |text: &str| crate::Rig::from_toml(text).and_then(|r| r.grid()).expect(text);
+        let grid = |text: &str| crate::Rig::from_toml(text).and_then(|r| r.build_grid()).expect(text);
         assert_eq!(grid("grid.points_mm = [[0, 0, 0], [1000, 0, 0]]").points().len(), 2);
         assert_eq!(grid("grid.clearance_mm = 40.0").points().len(), 78);
         let room = crate::Rig::from_toml("grid.points_mm = [[0, 0, 0], [1000, 0, 0]]").expect("a rig");
@@ -370,7 +370,7 @@ mod tests {
             layers: Vec::new(),
             points_mm: vec![[0.0; 3], [1000.0, 0.0, 0.0], [0.0, 1500.0, 0.0]],
         };
-        let grid = params.build().expect("three points");
+        let grid = params.build_grid().expect("three points");
         assert_eq!(grid.pairs().len(), 6);
         assert_eq!(grid.parse_point("0/2/0").expect("a point").position_mm, [0.0, 1500.0, 0.0]);
     }

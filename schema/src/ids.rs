@@ -37,7 +37,7 @@ pub struct SurfaceId(String);
 ///
 /// let run = RunId::compose(Timestamp::parse("2026-01-05T08:00:00Z")?, &"flat".parse()?, 0x7c1e)?;
 /// assert_eq!(run.as_str(), "20260105T080000Z-flat-0000000000007c1e");
-/// assert_eq!(run.untagged(), "20260105T080000Z-flat");
+/// assert_eq!(run.untagged_name(), "20260105T080000Z-flat");
 /// # Ok::<(), echolake_schema::Error>(())
 /// ```
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
@@ -70,12 +70,12 @@ pub struct PointId(pub u32);
 impl SurfaceId {
     /// The physical panel that the surface is a side of: `0016` for `panel_0016_r180_0`, else the whole name.
     pub fn panel(&self) -> &str {
-        self.split().map_or(&self.0, |(panel, _)| panel)
+        self.split_name().map_or(&self.0, |(panel, _)| panel)
     }
 
     /// The side, 0 or 1, if the name follows the panels' pattern.
     pub fn side(&self) -> Option<u8> {
-        self.split().map(|(_, side)| side)
+        self.split_name().map(|(_, side)| side)
     }
 
     /// The name as text.
@@ -84,7 +84,7 @@ impl SurfaceId {
     }
 
     // `[panel_]NNNN[_rDDD]_S`: only four digits make a panel, so that `mean_flat_rfl_1` stays whole.
-    fn split(&self) -> Option<(&str, u8)> {
+    fn split_name(&self) -> Option<(&str, u8)> {
         let mut parts = self.0.strip_prefix("panel_").unwrap_or(&self.0).split('_');
         let panel = parts.next().filter(|p| p.len() == 4 && p.bytes().all(|b| b.is_ascii_digit()))?;
         let mut side = parts.next()?;
@@ -106,11 +106,11 @@ impl RunId {
     /// # Errors
     /// [`Error::Id`] if the parts make no valid name.
     pub fn compose(start: crate::Timestamp, surface: &SurfaceId, tag: u64) -> Result<Self, Error> {
-        format!("{}-{surface}-{tag:016x}", start.compact()).parse()
+        format!("{}-{surface}-{tag:016x}", start.compact_text()).parse()
     }
 
     /// The name without its tag, which runs of the same surface and second share.
-    pub fn untagged(&self) -> &str {
+    pub fn untagged_name(&self) -> &str {
         self.0.rsplit_once('-').map_or(&self.0, |(untagged, _)| untagged)
     }
 
@@ -141,7 +141,7 @@ impl PointId {
     }
 }
 
-fn check(kind: &'static str, value: &str, max: usize) -> Result<(), Error> {
+fn check_id(kind: &'static str, value: &str, max: usize) -> Result<(), Error> {
     let reason = if value.is_empty() {
         "it is empty"
     } else if value.len() > max {
@@ -161,7 +161,7 @@ macro_rules! checked_name {
         impl FromStr for $name {
             type Err = Error;
             fn from_str(value: &str) -> Result<Self, Error> {
-                check($kind, value, $max)?;
+                check_id($kind, value, $max)?;
                 Ok(Self(value.to_owned()))
             }
         }
@@ -240,6 +240,6 @@ mod tests {
         assert_eq!(early.as_str(), "20260105T080000Z-flat-0000000000007c1e");
         assert!(early < late);
         let shorter: RunId = "20260105T080000Z-flat-7c1e".parse().expect("a name of older versions");
-        assert_eq!(shorter.untagged(), early.untagged());
+        assert_eq!(shorter.untagged_name(), early.untagged_name());
     }
 }

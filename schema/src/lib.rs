@@ -4,7 +4,7 @@
 //! use echolake_schema::{Rig, SurfaceId};
 //!
 //! let rig = Rig::paper();
-//! let grid = rig.grid()?;
+//! let grid = rig.build_grid()?;
 //! assert_eq!((grid.points().len(), grid.pairs().len()), (78, 2951));
 //! let surface: SurfaceId = "panel_0016_r180_0".parse()?;
 //! assert_eq!(surface.panel(), "0016");

@@ -202,13 +202,13 @@ struct Record<'a> {
 }
 
 impl Record<'_> {
-    fn text(&self, key: &'static str) -> Result<&str, ManifestError> {
+    fn text_value(&self, key: &'static str) -> Result<&str, ManifestError> {
         let value = self.values.get(key).map(String::as_str);
         value.ok_or(ManifestError::Missing { record: self.name, key })
     }
 
-    fn number<T: std::str::FromStr>(&self, key: &'static str) -> Result<T, ManifestError> {
-        let text = self.text(key)?;
+    fn number_value<T: std::str::FromStr>(&self, key: &'static str) -> Result<T, ManifestError> {
+        let text = self.text_value(key)?;
         text.parse().map_err(|_| ManifestError::Value {
             record: self.name,
             key,
@@ -240,7 +240,7 @@ impl RunManifest {
         let run = self.run_id.as_str();
         let file = name.rsplit(['/', '\\']).next().unwrap_or_default();
         let stem = file.strip_suffix(".partial").unwrap_or(file).trim_end_matches(".mcap");
-        let begins = format!("{}-{}-", self.started.compact(), self.surface_id);
+        let begins = format!("{}-{}-", self.started.compact_text(), self.surface_id);
         // Files may have names of their own; one that is as long as the run's was meant to be it.
         let is_renamed = stem.len() == run.len() && stem != run;
         run.starts_with(&begins) && !is_renamed
@@ -252,17 +252,17 @@ impl RunManifest {
     /// [`ManifestError`], naming the key.
     pub fn from_metadata(values: &BTreeMap<String, String>) -> Result<Self, ManifestError> {
         let record = Record { name: crate::topics::RUN_METADATA, values };
-        let format = record.number("format")?;
+        let format = record.number_value("format")?;
         if format > RUN_FORMAT {
             return Err(ManifestError::Newer { actual: format, newest: RUN_FORMAT });
         }
-        let origin = record.text("origin")?;
+        let origin = record.text_value("origin")?;
         Ok(Self {
-            run_id: record.text("run_id")?.parse()?,
-            surface_id: record.text("surface_id")?.parse()?,
-            started: Timestamp::parse(record.text("started")?)?,
-            software: record.text("software")?.to_owned(),
-            rig: record.text("rig")?.to_owned(),
+            run_id: record.text_value("run_id")?.parse()?,
+            surface_id: record.text_value("surface_id")?.parse()?,
+            started: Timestamp::parse(record.text_value("started")?)?,
+            software: record.text_value("software")?.to_owned(),
+            rig: record.text_value("rig")?.to_owned(),
             origin: Origin::parse(origin).ok_or_else(|| ManifestError::Value {
                 record: record.name,
                 key: "origin",
@@ -293,10 +293,10 @@ impl RunEnd {
     pub fn from_metadata(values: &BTreeMap<String, String>) -> Result<Self, ManifestError> {
         let record = Record { name: crate::topics::RUN_END_METADATA, values };
         Ok(Self {
-            ended: Timestamp::parse(record.text("ended")?)?,
-            accepted: record.number("accepted")?,
-            rejected: record.number("rejected")?,
-            attempts: record.number("attempts")?,
+            ended: Timestamp::parse(record.text_value("ended")?)?,
+            accepted: record.number_value("accepted")?,
+            rejected: record.number_value("rejected")?,
+            attempts: record.number_value("attempts")?,
         })
     }
 }

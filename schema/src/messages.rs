@@ -52,7 +52,7 @@ impl Verdict {
 
 impl SampleFormat {
     /// Bytes of one sample; None if the format is unknown.
-    pub fn bytes(self) -> Option<usize> {
+    pub fn sample_bytes(self) -> Option<usize> {
         match self {
             Self::Unspecified => None,
             Self::S16le => Some(2),

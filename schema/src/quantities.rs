@@ -39,7 +39,7 @@ pub struct SampleRate(f64);
 /// use echolake_schema::Timestamp;
 ///
 /// let start = Timestamp::parse("2026-01-05T09:00:00+01:00")?;
-/// assert_eq!((start.compact().as_str(), start.micros()), ("20260105T080000Z", 1_767_600_000_000_000));
+/// assert_eq!((start.compact_text().as_str(), start.micros()), ("20260105T080000Z", 1_767_600_000_000_000));
 /// assert_eq!(start.plus_secs(0.5).to_string(), "2026-01-05T08:00:00.500Z");
 /// # Ok::<(), echolake_schema::Error>(())
 /// ```
@@ -58,7 +58,7 @@ impl Celsius {
         Err(Error::Quantity { quantity: "temperature (C)", actual: value.to_string(), expected: "-60 to 80" })
     }
 
-    pub(crate) const fn known(value: f64) -> Self {
+    pub(crate) const fn from_known(value: f64) -> Self {
         Self(value)
     }
 
@@ -80,7 +80,7 @@ impl SampleRate {
         Err(Error::Quantity { quantity: "sampling rate (Hz)", actual: value.to_string(), expected: "1 to 10 000 000" })
     }
 
-    pub(crate) const fn known(value: f64) -> Self {
+    pub(crate) const fn from_known(value: f64) -> Self {
         Self(value)
     }
 
@@ -147,18 +147,18 @@ impl Timestamp {
     }
 
     /// `20260105T080000Z`, for names.
-    pub fn compact(self) -> String {
-        self.utc().format("%Y%m%dT%H%M%SZ").to_string()
+    pub fn compact_text(self) -> String {
+        self.utc_time().format("%Y%m%dT%H%M%SZ").to_string()
     }
 
-    fn utc(self) -> DateTime<Utc> {
+    fn utc_time(self) -> DateTime<Utc> {
         DateTime::from_timestamp_nanos(self.0)
     }
 }
 
 impl fmt::Display for Timestamp {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.pad(&self.utc().to_rfc3339_opts(SecondsFormat::AutoSi, true))
+        f.pad(&self.utc_time().to_rfc3339_opts(SecondsFormat::AutoSi, true))
     }
 }
 

@@ -19,7 +19,7 @@ const SHOWN_POINTS: usize = 4;
 ///
 /// let rig = Rig::from_toml("name = \"hall\"\n[sweep]\nduration_secs = 1.0")?;
 /// assert_eq!((rig.recording_len(), rig.band_names().len()), (96_960, 5));
-/// assert!(Rig::paper().differences(&rig).is_empty(), "the tables' numbers mean the same");
+/// assert!(Rig::paper().differences_from(&rig).is_empty(), "the tables' numbers mean the same");
 /// assert!(Rig::from_toml("[sweep]\nlow_hz = 50e3").is_err());
 /// # Ok::<(), echolake_schema::Error>(())
 /// ```
@@ -302,7 +302,7 @@ impl Rig {
     /// [`Error::RigSyntax`] if it is no such TOML, [`Error::Rig`] or [`Error::Quantity`] if it contradicts itself.
     pub fn from_toml(text: &str) -> Result<Self, Error> {
         let rig: Self = toml::from_str(text).map_err(|e| Error::RigSyntax { message: e.to_string() })?;
-        rig.check()?;
+        rig.check_consistency()?;
         Ok(rig)
     }
 
@@ -315,8 +315,8 @@ impl Rig {
     ///
     /// # Errors
     /// [`Error::Quantity`] if there are too few points or too many.
-    pub fn grid(&self) -> Result<Grid, Error> {
-        self.grid.build()
+    pub fn build_grid(&self) -> Result<Grid, Error> {
+        self.grid.build_grid()
     }
 
     /// Samples of the whole recording: sweep and tail.
@@ -337,8 +337,8 @@ impl Rig {
 
     /// The settings that decide what the tables' numbers mean and that differ from `other`'s, as
     /// (field, here, there). A lake holds only runs for which there are none.
-    pub fn differences(&self, other: &Self) -> Vec<(&'static str, String, String)> {
-        fn entry<T: PartialEq>(
+    pub fn differences_from(&self, other: &Self) -> Vec<(&'static str, String, String)> {
+        fn compare_field<T: PartialEq>(
             field: &'static str,
             [a, b]: [&T; 2],
             describe: impl Fn(&T) -> String,
@@ -350,23 +350,25 @@ impl Rig {
         let is_tapered = self.impulse_response.division == SpectralDivision::Tapered;
         let durations = (!is_tapered).then(|| rigs.map(|r| &r.sweep.duration_secs));
         [
-            entry("sweep.rate_hz", rigs.map(|r| &r.sweep.rate_hz), |rate| rate.get().to_string()),
-            entry("sweep.low_hz", rigs.map(|r| &r.sweep.low_hz), f64::to_string),
-            entry("sweep.high_hz", rigs.map(|r| &r.sweep.high_hz), f64::to_string),
-            entry("impulse_response.length", responses.map(|r| &r.length), usize::to_string),
-            entry("impulse_response.reference_temperature_c", responses.map(|r| &r.reference_temperature_c), |t| {
-                t.get().to_string()
-            }),
-            entry("impulse_response.division", responses.map(|r| &r.division), describe_division),
+            compare_field("sweep.rate_hz", rigs.map(|r| &r.sweep.rate_hz), |rate| rate.get().to_string()),
+            compare_field("sweep.low_hz", rigs.map(|r| &r.sweep.low_hz), f64::to_string),
+            compare_field("sweep.high_hz", rigs.map(|r| &r.sweep.high_hz), f64::to_string),
+            compare_field("impulse_response.length", responses.map(|r| &r.length), usize::to_string),
+            compare_field(
+                "impulse_response.reference_temperature_c",
+                responses.map(|r| &r.reference_temperature_c),
+                |t| t.get().to_string(),
+            ),
+            compare_field("impulse_response.division", responses.map(|r| &r.division), describe_division),
             // Without a taper the numbers depend on the sweep's length.
-            durations.and_then(|durations| entry("sweep.duration_secs", durations, f64::to_string)),
-            entry("bands.centres_hz", rigs.map(|r| &r.bands.centres_hz), |centres| join_numbers(centres)),
-            entry("panel.size_mm", rigs.map(|r| &r.panel.size_mm), f64::to_string),
-            entry("panel.depth_mm", rigs.map(|r| &r.panel.depth_mm), f64::to_string),
-            entry("grid.pairs", rigs.map(|r| &r.grid.pairs), |rule| rule.name().to_owned()),
-            entry("grid.clearance_mm", rigs.map(|r| &r.grid.clearance_mm), f64::to_string),
-            entry("grid.layers", rigs.map(|r| &r.grid.layers), |layers| describe_layers(layers)),
-            entry("grid.points_mm", rigs.map(|r| &r.grid.points_mm), |points| describe_points(points)),
+            durations.and_then(|durations| compare_field("sweep.duration_secs", durations, f64::to_string)),
+            compare_field("bands.centres_hz", rigs.map(|r| &r.bands.centres_hz), |centres| join_numbers(centres)),
+            compare_field("panel.size_mm", rigs.map(|r| &r.panel.size_mm), f64::to_string),
+            compare_field("panel.depth_mm", rigs.map(|r| &r.panel.depth_mm), f64::to_string),
+            compare_field("grid.pairs", rigs.map(|r| &r.grid.pairs), |rule| rule.name().to_owned()),
+            compare_field("grid.clearance_mm", rigs.map(|r| &r.grid.clearance_mm), f64::to_string),
+            compare_field("grid.layers", rigs.map(|r| &r.grid.layers), |layers| describe_layers(layers)),
+            compare_field("grid.points_mm", rigs.map(|r| &r.grid.points_mm), |points| describe_points(points)),
         ]
         .into_iter()
         .flatten()
@@ -377,7 +379,7 @@ impl Rig {
     ///
     /// # Errors
     /// [`Error::Rig`] or [`Error::Quantity`], naming the field.
-    pub fn check(&self) -> Result<(), Error> {
+    pub fn check_consistency(&self) -> Result<(), Error> {
         let (sweep, nyquist) = (&self.sweep, self.sweep.rate_hz.get() / 2.0);
         let positive = |x: f64, max: f64| x > 0.0 && x <= max;
         let rules = [
@@ -423,7 +425,7 @@ impl Rig {
                 format!("is {:?}, expected -200 to 0", self.impulse_response.division),
             ),
             (
-                octaves(&self.bands.centres_hz),
+                are_octaves(&self.bands.centres_hz),
                 "bands.centres_hz",
                 format!(
                     "is {:?}, expected 1 to 12 whole numbers of Hz, each twice the one before",
@@ -440,23 +442,31 @@ impl Rig {
                 "validation.attempts",
                 format!("is {}, expected 1 to 100", self.validation.attempts),
             ),
-            (self.robots.contradiction().is_none(), "robots", self.robots.contradiction().unwrap_or_default()),
-            (self.devices.contradiction().is_none(), "devices", self.devices.contradiction().unwrap_or_default()),
             (
-                self.simulation.contradiction().is_none(),
+                self.robots.find_contradiction().is_none(),
+                "robots",
+                self.robots.find_contradiction().unwrap_or_default(),
+            ),
+            (
+                self.devices.find_contradiction().is_none(),
+                "devices",
+                self.devices.find_contradiction().unwrap_or_default(),
+            ),
+            (
+                self.simulation.find_contradiction().is_none(),
                 "simulation",
-                self.simulation.contradiction().unwrap_or_default(),
+                self.simulation.find_contradiction().unwrap_or_default(),
             ),
         ];
         match rules.into_iter().find(|(holds, ..)| !holds) {
             Some((_, field, reason)) => Err(Error::Rig { rig: self.name.clone(), field, reason }),
-            None => self.grid().map(drop),
+            None => self.build_grid().map(drop),
         }
     }
 }
 
 // Column names carry the centre in whole Hz.
-fn octaves(centres: &[f64]) -> bool {
+fn are_octaves(centres: &[f64]) -> bool {
     let whole = centres.iter().all(|c| (1.0..=1e6).contains(c) && c.fract() == 0.0);
     let doubled = centres.windows(2).all(|w| (w[1] / w[0] - 2.0).abs() < 1e-6);
     (1..=12).contains(&centres.len()) && whole && doubled
@@ -464,12 +474,12 @@ fn octaves(centres: &[f64]) -> bool {
 
 impl SampleRate {
     /// 96 kHz (Rust et al. 2021, appendix, step 2).
-    pub const PAPER: Self = Self::known(96_000.0);
+    pub const PAPER: Self = Self::from_known(96_000.0);
 }
 
 impl Celsius {
     /// 20 C (Rust et al. 2021, appendix, step 2).
-    pub const PAPER: Self = Self::known(20.0);
+    pub const PAPER: Self = Self::from_known(20.0);
 }
 
 #[cfg(test)]
@@ -481,7 +491,7 @@ mod tests {
     #[test]
     fn the_paper_s_rig_is_valid_and_round_trips() {
         let rig = Rig::paper();
-        assert_eq!(rig.check(), Ok(()));
+        assert_eq!(rig.check_consistency(), Ok(()));
         assert_eq!(Rig::from_toml(&rig.to_toml()), Ok(rig.clone()));
         assert_eq!(Rig::from_toml(""), Ok(rig.clone()));
         assert_eq!(rig.band_names(), ["2500", "5000", "10000", "20000", "40000"]);
@@ -500,16 +510,16 @@ mod tests {
         for toml in ["impulse_response.division = \"literal\"", "impulse_response.floor_db = -40"] {
             let rig = Rig::from_toml(toml).expect("a rig");
             assert_eq!(Rig::from_toml(&rig.to_toml()), Ok(rig.clone()));
-            let fields: Vec<_> = rig.differences(&Rig::paper()).into_iter().map(|(field, ..)| field).collect();
+            let fields: Vec<_> = rig.differences_from(&Rig::paper()).into_iter().map(|(field, ..)| field).collect();
             assert_eq!(fields, ["impulse_response.division"]);
             // The sweep's length matters where there is no taper.
             let mut longer = rig.clone();
             longer.sweep.duration_secs *= 2.0;
-            assert_eq!(rig.differences(&longer).len(), 1);
+            assert_eq!(rig.differences_from(&longer).len(), 1);
         }
         let mut longer = Rig::paper();
         longer.sweep.duration_secs *= 2.0;
-        assert_eq!(Rig::paper().differences(&longer), []);
+        assert_eq!(Rig::paper().differences_from(&longer), []);
     }
 
     const REAL: &str = "[devices]\naudio.kind = \"alsa\"\nsensor.kind = \"serial\"\nrobots.kind = \"rosbridge\"\n";
@@ -519,7 +529,7 @@ mod tests {
         let rig = Rig::from_toml(REAL).expect("a rig");
         assert!(!rig.devices.are_simulated() && Rig::paper().devices.are_simulated());
         assert_eq!(Rig::from_toml(&rig.to_toml()), Ok(rig.clone()));
-        assert_eq!(rig.differences(&Rig::paper()), [], "devices do not change what numbers mean");
+        assert_eq!(rig.differences_from(&Rig::paper()), [], "devices do not change what numbers mean");
         assert!(!Rig::paper().to_toml().contains("devices") && !Rig::paper().to_toml().contains("robots"));
     }
 
@@ -634,9 +644,9 @@ mod tests {
         other.sweep.duration_secs = 0.05;
         other.validation.attempts = 9;
         other.simulation.directivity = false;
-        assert_eq!(paper.differences(&other), []);
+        assert_eq!(paper.differences_from(&other), []);
         other.impulse_response.length = 400;
-        assert_eq!(paper.differences(&other), [("impulse_response.length", "384".into(), "400".into())]);
+        assert_eq!(paper.differences_from(&other), [("impulse_response.length", "384".into(), "400".into())]);
     }
 
     #[test]
@@ -646,7 +656,7 @@ mod tests {
             grid = { pairs = \"ordered\", points_mm = [[0, 0, 1000], [2000, 0, 1000.5]] }";
         let room = Rig::from_toml(room).expect("a rig");
         let said: String =
-            room.differences(&Rig::paper()).iter().map(|(field, a, b)| format!("{field}: {a} | {b}\n")).collect();
+            room.differences_from(&Rig::paper()).iter().map(|(field, a, b)| format!("{field}: {a} | {b}\n")).collect();
         expect_test::expect![[r#"
             sweep.rate_hz: 48000 | 96000
             sweep.high_hz: 20000 | 40000

@@ -67,7 +67,7 @@ impl RobotCell {
     }
 
     /// Describes the first contradiction among the settings.
-    pub(crate) fn contradiction(&self) -> Option<String> {
+    pub(crate) fn find_contradiction(&self) -> Option<String> {
         let lengths = [self.relief_mm, self.table_mm, self.margin_mm];
         let finite =
             self.microphone_foot_mm.iter().chain(&self.speaker_foot_mm).chain(&lengths).all(|x| x.abs() <= 1e4);

@@ -39,17 +39,17 @@ pub fn upper_16(split: &[u8]) -> &[u8] {
 /// # Errors
 /// [`Error::SampleFormat`] if the format is unknown, [`Error::SampleBytes`] if the number of bytes is not the one that
 /// `out` takes, [`Error::Sample`] if a sample is not a finite number; `out` is unspecified after an error.
-pub fn decode(format: SampleFormat, bytes: &[u8], out: &mut [f32]) -> Result<(), Error> {
-    let width = format.bytes().ok_or(Error::SampleFormat)?;
+pub fn decode_samples(format: SampleFormat, bytes: &[u8], out: &mut [f32]) -> Result<(), Error> {
+    let width = format.sample_bytes().ok_or(Error::SampleFormat)?;
     if out.len().checked_mul(width) != Some(bytes.len()) {
         return Err(Error::SampleBytes { actual: bytes.len(), samples: out.len(), width });
     }
     match format {
-        SampleFormat::S16le => each(bytes, out, |b| f32::from(i16::from_le_bytes(b)) * (1.0 / 32_768.0)),
-        SampleFormat::S24le => each(bytes, out, |[l, m, h]| fraction_24(i32::from_le_bytes([0, l, m, h]) >> 8)),
-        SampleFormat::S32le => each(bytes, out, |b| i32::from_le_bytes(b) as f32 * (1.0 / 2_147_483_648.0)),
+        SampleFormat::S16le => decode_each(bytes, out, |b| f32::from(i16::from_le_bytes(b)) * (1.0 / 32_768.0)),
+        SampleFormat::S24le => decode_each(bytes, out, |[l, m, h]| fraction_24(i32::from_le_bytes([0, l, m, h]) >> 8)),
+        SampleFormat::S32le => decode_each(bytes, out, |b| i32::from_le_bytes(b) as f32 * (1.0 / 2_147_483_648.0)),
         SampleFormat::F32le => {
-            each(bytes, out, f32::from_le_bytes);
+            decode_each(bytes, out, f32::from_le_bytes);
             if let Some(index) = out.iter().position(|x| !x.is_finite()) {
                 return Err(Error::Sample { index, value: out[index] });
             }
@@ -65,7 +65,7 @@ pub fn decode(format: SampleFormat, bytes: &[u8], out: &mut [f32]) -> Result<(),
     Ok(())
 }
 
-fn each<const N: usize>(bytes: &[u8], out: &mut [f32], decode: impl Fn([u8; N]) -> f32) {
+fn decode_each<const N: usize>(bytes: &[u8], out: &mut [f32], decode: impl Fn([u8; N]) -> f32) {
     out.iter_mut().zip(bytes.as_chunks().0).for_each(|(y, b)| *y = decode(*b));
 }
 
@@ -82,7 +82,7 @@ mod tests {
 
     fn decoded(format: SampleFormat, bytes: &[u8], count: usize) -> Result<Vec<f32>, Error> {
         let mut out = vec![f32::NAN; count];
-        decode(format, bytes, &mut out).map(|()| out)
+        decode_samples(format, bytes, &mut out).map(|()| out)
     }
 
     #[test]
@@ -132,7 +132,7 @@ mod tests {
             SampleFormat::F32le,
         ];
         for format in formats {
-            let width = format.bytes().expect("a width");
+            let width = format.sample_bytes().expect("a width");
             for actual in [0, width, 2 * width - 1, 2 * width + 1, 3 * width] {
                 let expected = Error::SampleBytes { actual, samples: 2, width };
                 assert_eq!(decoded(format, &vec![0; actual], 2), Err(expected), "{format:?}");

@@ -59,7 +59,7 @@ impl SimulationParams {
     }
 
     /// Describes the first contradiction among the settings.
-    pub(crate) fn contradiction(&self) -> Option<String> {
+    pub(crate) fn find_contradiction(&self) -> Option<String> {
         let is_plausible = |mm: f64| (0.0..=10.0).contains(&mm);
         let plausible = is_plausible(self.repeatability_mm) && is_plausible(self.calibration_mm);
         (!plausible).then(|| "expected repeatability_mm and calibration_mm from 0 to 10".to_owned())

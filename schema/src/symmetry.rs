@@ -11,7 +11,7 @@ use crate::{PairId, PointId};
 /// use echolake_schema::{Rig, Symmetry};
 ///
 /// assert_eq!(Symmetry::Rot90.apply([1.0, 2.0, 3.0]), [-2.0, 1.0, 3.0]);
-/// let moved = Rig::paper().grid()?.moved_pairs(Symmetry::Rot180);
+/// let moved = Rig::paper().build_grid()?.moved_pairs(Symmetry::Rot180);
 /// assert_eq!(moved.map(|pairs| pairs.len()), Some(2951));
 /// # Ok::<(), echolake_schema::Error>(())
 /// ```
@@ -87,7 +87,7 @@ impl Symmetry {
     }
 
     /// Moves a position; z stays.
-    pub fn apply(self, [x, y, z]: [f64; 3]) -> [f64; 3] {
+    pub fn move_position(self, [x, y, z]: [f64; 3]) -> [f64; 3] {
         let [[a, b], [c, d]] = self.matrix().map(|row| row.map(f64::from));
         [a * x + b * y, c * x + d * y, z]
     }
@@ -95,17 +95,17 @@ impl Symmetry {
 
 impl Grid {
     /// Maps points: point i moves to point `[i]`. None if the grid lacks the symmetry.
-    pub fn permutation(&self, symmetry: Symmetry) -> Option<Vec<PointId>> {
-        self.points().iter().map(|p| self.point_at(symmetry.apply(p.position_mm)).map(|q| q.id)).collect()
+    pub fn point_permutation(&self, symmetry: Symmetry) -> Option<Vec<PointId>> {
+        self.points().iter().map(|p| self.point_at(symmetry.move_position(p.position_mm)).map(|q| q.id)).collect()
     }
 
     /// Maps pairs: pair i moves to `[i]`. None if the grid or its set of pairs lacks the symmetry.
     pub fn moved_pairs(&self, symmetry: Symmetry) -> Option<Vec<MovedPair>> {
-        let to = self.permutation(symmetry)?;
-        self.pairs().iter().map(|pair| self.moved(*pair, &to)).collect()
+        let to = self.point_permutation(symmetry)?;
+        self.pairs().iter().map(|pair| self.move_pair(*pair, &to)).collect()
     }
 
-    fn moved(&self, pair: Pair, to: &[PointId]) -> Option<MovedPair> {
+    fn move_pair(&self, pair: Pair, to: &[PointId]) -> Option<MovedPair> {
         let (microphone, speaker) = (to[pair.microphone.index()], to[pair.speaker.index()]);
         let (id, swapped) = match self.pair_id(microphone, speaker) {
             Some(id) => (id, false),
@@ -123,7 +123,7 @@ mod tests {
 
     #[test]
     fn pairs_map_onto_themselves_with_swaps() {
-        let grid = Rig::paper().grid().expect("the built-in rig is valid");
+        let grid = Rig::paper().build_grid().expect("the built-in rig is valid");
         for symmetry in Symmetry::ALL {
             let moved = grid.moved_pairs(symmetry).expect("the grid is square");
             let mut seen: Vec<_> = moved.iter().map(|m| m.pair.id).collect();

@@ -22,7 +22,7 @@ impl CataloguePages {
     };
 
     /// Returns why there are no pages and how to get them; `None` if they are there.
-    pub fn problem(self) -> Option<&'static str> {
+    pub fn missing_reason(self) -> Option<&'static str> {
         match self {
             Self::Embedded => None,
             Self::NotBuilt => Some(

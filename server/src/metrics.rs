@@ -66,11 +66,11 @@ impl ServerMetrics {
             )?,
             cache_bytes: IntCounter::new("echolake_cache_fetched_bytes_total", "Bytes of these blocks.")?,
         };
-        metrics.register()?;
+        metrics.register_all()?;
         Ok(metrics)
     }
 
-    fn register(&self) -> Result<()> {
+    fn register_all(&self) -> Result<()> {
         let Self { registry, queries, failures, rows, bytes, running, seconds, requests, .. } = self;
         registry.register(Box::new(queries.clone()))?;
         registry.register(Box::new(failures.clone()))?;
@@ -90,18 +90,18 @@ impl ServerMetrics {
         for code in FaultCode::ALL {
             failures.with_label_values(&[code.name()]);
         }
-        self.cached(&CacheCounts::default());
+        self.count_cached(&CacheCounts::default());
         Ok(())
     }
 
     /// Counts a query that begins.
-    pub(crate) fn begin(&self, protocol: ServerProtocol) {
+    pub(crate) fn count_begin(&self, protocol: ServerProtocol) {
         self.queries.with_label_values(&[protocol.name()]).inc();
         self.running.inc();
     }
 
     /// Counts a query that has ended.
-    pub(crate) fn end(&self, protocol: ServerProtocol, end: &QueryEnd) {
+    pub(crate) fn count_end(&self, protocol: ServerProtocol, end: &QueryEnd) {
         let outcome = end.failure.map_or(ANSWERED, FaultCode::name);
         self.seconds.with_label_values(&[protocol.name(), outcome]).observe(end.seconds);
         self.rows.inc_by(end.rows);
@@ -110,19 +110,19 @@ impl ServerMetrics {
     }
 
     /// Counts queries that ended with their engine.
-    pub(crate) fn lose(&self, queries: usize) {
+    pub(crate) fn count_lost(&self, queries: usize) {
         self.running.sub(i64::try_from(queries).unwrap_or(i64::MAX));
     }
 
     /// Counts an answer over HTTP by the first digit of its status.
-    pub(crate) fn answered(&self, status: u16, seconds: f64) {
+    pub(crate) fn count_answer(&self, status: u16, seconds: f64) {
         let class = ["1xx", "2xx", "3xx", "4xx", "5xx"];
         let class = class.get(usize::from(status / 100).wrapping_sub(1)).copied().unwrap_or("other");
         self.requests.with_label_values(&[class]).observe(seconds);
     }
 
     /// Counts what an engine read of an object store.
-    pub(crate) fn cached(&self, counts: &CacheCounts) {
+    pub(crate) fn count_cached(&self, counts: &CacheCounts) {
         let CacheCounts { memory_hits, disk_hits, misses, requests, fetched_bytes } = *counts;
         for (from, blocks) in [("memory", memory_hits), ("disk", disk_hits), ("store", misses)] {
             self.cache_blocks.with_label_values(&[from]).inc_by(blocks);
@@ -132,23 +132,23 @@ impl ServerMetrics {
     }
 
     /// Counts a failed request.
-    pub(crate) fn failed(&self, code: FaultCode) {
+    pub(crate) fn count_failure(&self, code: FaultCode) {
         self.failures.with_label_values(&[code.name()]).inc();
     }
 
     /// Counts a failed request and writes it to the log.
     pub(crate) fn record_failure(&self, fault: &RequestFault) {
-        self.failed(fault.code());
-        fault.log();
+        self.count_failure(fault.code());
+        fault.log_failure();
     }
 
     /// Returns all figures in Prometheus' text format.
     ///
     /// # Errors
     /// A defect: two metrics of one name, or values that are not as their metric.
-    pub(crate) fn text(&self, gauges: &ServerGauges) -> Result<String> {
+    pub(crate) fn prometheus_text(&self, gauges: &ServerGauges) -> Result<String> {
         let moment = Registry::new();
-        gauges.register(&moment)?;
+        gauges.register_all(&moment)?;
         let mut families = self.registry.gather();
         families.extend(moment.gather());
         TextEncoder::new().encode_to_string(&families)
@@ -162,10 +162,10 @@ mod tests {
     #[test]
     fn what_happened_is_counted() {
         let metrics = ServerMetrics::new().expect("distinct names");
-        metrics.begin(ServerProtocol::Postgres);
-        metrics.failed(FaultCode::ReadOnly);
-        metrics.answered(404, 0.5);
-        let text = metrics.text(&ServerGauges::default()).expect("a text");
+        metrics.count_begin(ServerProtocol::Postgres);
+        metrics.count_failure(FaultCode::ReadOnly);
+        metrics.count_answer(404, 0.5);
+        let text = metrics.prometheus_text(&ServerGauges::default()).expect("a text");
         let has = |text: &str, line: &str| assert!(text.lines().any(|l| l == line), "{line} in {text}");
         for line in [
             "echolake_queries_total{protocol=\"postgres\"} 1",
@@ -188,8 +188,8 @@ mod tests {
             bytes: 9,
             memory: 0,
         };
-        metrics.end(ServerProtocol::Postgres, &end);
-        let text = metrics.text(&ServerGauges::default()).expect("a text");
+        metrics.count_end(ServerProtocol::Postgres, &end);
+        let text = metrics.prometheus_text(&ServerGauges::default()).expect("a text");
         for line in [
             "echolake_rows_total 3",
             "echolake_answer_bytes_total 9",
@@ -200,12 +200,18 @@ mod tests {
         ] {
             has(&text, line);
         }
-        metrics.cached(&CacheCounts { memory_hits: 3, disk_hits: 2, misses: 5, requests: 1, fetched_bytes: 4096 });
-        let text = metrics.text(&ServerGauges::default()).expect("a text");
+        metrics.count_cached(&CacheCounts {
+            memory_hits: 3,
+            disk_hits: 2,
+            misses: 5,
+            requests: 1,
+            fetched_bytes: 4096,
+        });
+        let text = metrics.prometheus_text(&ServerGauges::default()).expect("a text");
         has(&text, "echolake_cache_blocks_total{from=\"disk\"} 2");
         has(&text, "echolake_cache_fetched_bytes_total 4096");
-        metrics.begin(ServerProtocol::Http);
-        metrics.lose(1);
-        has(&metrics.text(&ServerGauges::default()).expect("a text"), "echolake_running_queries 0");
+        metrics.count_begin(ServerProtocol::Http);
+        metrics.count_lost(1);
+        has(&metrics.prometheus_text(&ServerGauges::default()).expect("a text"), "echolake_running_queries 0");
     }
 }

@@ -54,7 +54,7 @@ pub(crate) struct AcquireArgs {
     #[arg(long)]
     pub(crate) mesh: Option<PathBuf>,
     /// The side of the mesh that is measured: the back is seen when the panel is turned over about its y axis.
-    #[arg(long, value_name = "front|back", value_parser = side, requires = "mesh")]
+    #[arg(long, value_name = "front|back", value_parser = parse_side, requires = "mesh")]
     pub(crate) side: Option<PanelSide>,
     /// Record a real panel without its geometry.
     #[arg(long, conflicts_with_all = ["mesh", "panel", "parameters", "set"])]
@@ -123,7 +123,7 @@ impl AcquireArgs {
     }
 }
 
-fn side(text: &str) -> Result<PanelSide, String> {
+fn parse_side(text: &str) -> Result<PanelSide, String> {
     PanelSide::parse(text).ok_or_else(|| "expected front or back".to_owned())
 }
 
@@ -149,10 +149,10 @@ struct NewRun {
     keep: RecordingMode,
 }
 
-pub(crate) async fn run(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
+pub(crate) async fn run_acquire(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let is_new = args.resume.is_none() && matches!(Lake::open(lake_url).await, Err(LakeError::NoLake { .. }));
     let has_folder = Path::new(lake_url).exists();
-    let outcome = measure(args, lake_url).await;
+    let outcome = acquire_run(args, lake_url).await;
     if outcome.is_err() && is_new {
         // The refusal matters more than what is left of an empty lake.
         let _ = remove_new_lake(lake_url, has_folder).await;
@@ -160,22 +160,22 @@ pub(crate) async fn run(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<Co
     outcome
 }
 
-async fn measure(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
+async fn acquire_run(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let pace = if args.pace > 0.0 { TakePace::Secs(args.pace) } else { TakePace::Fast };
     let control = Arc::new(RunControl::default());
     #[cfg_attr(not(feature = "upload"), expect(unused_variables, reason = "it ends uploads"))]
-    let stop = watch::obey(&control)?;
+    let stop = watch::obey_signals(&control)?;
     let progress = CommandProgress::new();
     let job = match &args.resume {
         Some(partial) => {
-            let held = Box::new(Held::read(partial)?);
+            let held = Box::new(Held::from_file(partial)?);
             check_not_ingested(partial, &held)?;
             for line in &held.damage {
-                progress.say(format!("damage: {line}; what was lost with it is measured again"));
+                progress.print_message(format!("damage: {line}; what was lost with it is measured again"));
             }
             AcquireJob::Resumed { partial: partial.clone(), held }
         }
-        None => fresh(args, lake_url, &progress).await?,
+        None => prepare_new_run(args, lake_url, &progress).await?,
     };
     // Until the run has ended.
     let _lock = match RecordingLock::acquire(&job.folder(), job.rig()) {
@@ -188,40 +188,40 @@ async fn measure(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<CommandOu
     }
     let clock = if job.rig().devices.are_simulated() { LiveClock::Simulated } else { LiveClock::Wall };
     if clock == LiveClock::Simulated {
-        progress.say("simulated rig: nothing here is measured");
+        progress.print_message("simulated rig: nothing here is measured");
     }
-    let (surface, planned, accepted) = job.size()?;
+    let (surface, planned, accepted) = job.surface_and_pairs()?;
     let mut acknowledgements = args.acknowledge.as_deref().map(AcknowledgementWriter::open).transpose()?;
     let metrics = RunMetrics::new(&surface, planned, accepted);
-    let live = args.live.map(|address| LiveServer::start(address, args.viewers.access(), clock)).transpose()?;
+    let live = args.live.map(|address| LiveServer::start(address, args.viewers.viewer_access(), clock)).transpose()?;
     if let Some(live) = &live {
-        progress.say(format!("live: open {} in Foxglove or Lichtblick", live.url()));
+        progress.print_message(format!("live: open {} in Foxglove or Lichtblick", live.url()));
         super::tell_access(&args.viewers, live.address(), &progress);
     }
     let served = args.metrics.map(|address| MetricsServer::start(address, metrics.clone()));
     let unserved = || format!("cannot serve metrics at {}", args.metrics.map_or_else(String::new, |a| a.to_string()));
     let served = served.transpose().with_context(unserved)?;
     if let Some(served) = &served {
-        progress.say(format!("metrics: http://{}/metrics", served.address()));
+        progress.print_message(format!("metrics: http://{}/metrics", served.address()));
     }
     let is_damaged = matches!(&job, AcquireJob::Resumed { held, .. } if held.is_damaged());
     let mut watcher = RunWatcher::new(&progress, &surface, planned, accepted, metrics.clone(), job.folder());
     let preflight = if args.skip_checks { PreflightMode::Skip } else { PreflightMode::Check };
     let (checkpoint_every, tap) = (args.checkpoint_every.map(|n| n as usize), live.as_ref().map(LiveServer::tap));
-    let partial = job.partial()?;
+    let partial = job.partial_path()?;
     let measured = tokio::task::spawn_blocking(move || {
         let mut observe = |event: RunEvent<'_>| {
             if let Some(acknowledgements) = &mut acknowledgements {
-                acknowledgements.observe(&event);
+                acknowledgements.observe_event(&event);
             }
-            watcher.observe(&event);
+            watcher.observe_event(&event);
         };
         let session = RunSession { control: &control, observe: &mut observe, tap, preflight, checkpoint_every, pace };
-        let measured = job.measure(session);
+        let measured = job.measure_run(session);
         if measured.is_err() {
             metrics.broke_off();
         }
-        watcher.done(measured.as_ref().ok().map(|m| m.outcome.end));
+        watcher.report_end(measured.as_ref().ok().map(|m| m.outcome.end));
         measured
     });
     let measured = measured.await?;
@@ -229,7 +229,7 @@ async fn measure(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<CommandOu
     drop((served, live));
     match measured {
         Ok(measured) => {
-            let outcome = tell(&measured, lake_url)?;
+            let outcome = tell_outcome(&measured, lake_url)?;
             let outcome = if is_damaged { CommandOutcome::WithLoss } else { outcome };
             if measured.outcome.left > 0 {
                 return Ok(outcome);
@@ -255,7 +255,7 @@ async fn measure(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<CommandOu
 async fn upload_run(path: &Path, location: &str, stop: &StopRequest, progress: &CommandProgress) -> anyhow::Result<()> {
     let uploaded = tokio::select! {
         uploaded = super::upload::upload_one(path, location, progress) => uploaded,
-        () = stop.wait() => Err(anyhow::anyhow!("stopped")),
+        () = stop.wait_until_made() => Err(anyhow::anyhow!("stopped")),
     };
     uploaded.map_err(|cause| {
         let (path, cause) = (path.display(), describe_error(&cause));
@@ -267,14 +267,14 @@ async fn upload_run(path: &Path, location: &str, stop: &StopRequest, progress: &
 }
 
 // Reports the path of the run's file, or how to resume it.
-fn tell(measured: &MeasuredRun, lake_url: &str) -> anyhow::Result<CommandOutcome> {
+fn tell_outcome(measured: &MeasuredRun, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let MeasuredRun { path, outcome } = measured;
     if outcome.left > 0 {
         eprintln!("stopped with {} pairs left; nothing that was measured is lost", outcome.left);
         tell_resume(path, lake_url);
         return Ok(CommandOutcome::Whole);
     }
-    super::print(&path.display().to_string())?;
+    super::print_line(&path.display().to_string())?;
     Ok(if outcome.end.rejected > 0 { CommandOutcome::WithLoss } else { CommandOutcome::Whole })
 }
 
@@ -311,17 +311,17 @@ fn tell_resume(partial: &Path, lake_url: &str) {
     eprintln!("to resume: echolake --lake {lake_url} acquire --resume {}", partial.display());
 }
 
-async fn fresh(args: &AcquireArgs, lake_url: &str, progress: &CommandProgress) -> anyhow::Result<AcquireJob> {
+async fn prepare_new_run(args: &AcquireArgs, lake_url: &str, progress: &CommandProgress) -> anyhow::Result<AcquireJob> {
     let rig = super::rig_or(args.rig.as_deref(), lake_url, Rig::paper).await?;
-    let specimen = specimen::of(args, &rig)?;
+    let specimen = specimen::choose_specimen(args, &rig)?;
     check_mesh(&specimen, &rig)?;
     let lake = Lake::open_or_create(lake_url, &rig, &ReferenceSurfaces::default()).await?;
-    let folder = super::inbox(&lake)?;
+    let folder = super::prepare_inbox(&lake)?;
     let surface = args.surface.clone().context("no surface is named; hint: --surface NAME")?;
     #[cfg(feature = "lake")]
     warn_of_missing_references(args, &lake, &surface, progress).await?;
-    for unfinished in unfinished(&folder, surface.as_str()) {
-        progress.say(format!(
+    for unfinished in unfinished_recordings(&folder, surface.as_str()) {
+        progress.print_message(format!(
             "note: `{}` is unfinished; hint: `echolake acquire --resume` resumes it",
             unfinished.display()
         ));
@@ -353,14 +353,16 @@ async fn warn_of_missing_references(
     let snapshot = lake.snapshot().await?;
     for named in [&args.flat, &args.foam].into_iter().flatten() {
         if named != surface && !snapshot.runs().any(|run| run.surface == *named) {
-            progress.say(format!("warning: reference `{named}` is not measured yet; rows of `{surface}` wait for it"));
+            progress.print_message(format!(
+                "warning: reference `{named}` is not measured yet; rows of `{surface}` wait for it"
+            ));
         }
     }
     Ok(())
 }
 
 // Unfinished recordings of the surface: names of runs have the surface behind their time.
-pub(super) fn unfinished(folder: &Path, surface: &str) -> Vec<PathBuf> {
+pub(super) fn unfinished_recordings(folder: &Path, surface: &str) -> Vec<PathBuf> {
     let Ok(entries) = std::fs::read_dir(folder) else { return Vec::new() };
     let is_of = |path: &PathBuf| {
         let name = path.file_name().and_then(|n| n.to_str()).and_then(|n| n.strip_suffix(".mcap.partial"));
@@ -388,32 +390,32 @@ impl AcquireJob {
     }
 
     // The surface, its pairs, and how many of them are measured already.
-    fn size(&self) -> anyhow::Result<(String, u64, u64)> {
+    fn surface_and_pairs(&self) -> anyhow::Result<(String, u64, u64)> {
         let (surface, accepted) = match self {
             Self::Fresh(fresh) => (&fresh.surface, 0),
-            Self::Resumed { held, .. } => (&held.manifest.surface_id, held.accepted() as u64),
+            Self::Resumed { held, .. } => (&held.manifest.surface_id, held.accepted_count() as u64),
         };
-        Ok((surface.to_string(), self.rig().grid()?.pairs().len() as u64, accepted))
+        Ok((surface.to_string(), self.rig().build_grid()?.pairs().len() as u64, accepted))
     }
 
     // The path of the recording until it is complete.
-    fn partial(&self) -> anyhow::Result<PathBuf> {
+    fn partial_path(&self) -> anyhow::Result<PathBuf> {
         match self {
-            Self::Fresh(fresh) => Ok(partial_of(&fresh.request().path()?)),
+            Self::Fresh(fresh) => Ok(partial_of(&fresh.run_request().path()?)),
             Self::Resumed { partial, .. } => Ok(partial.clone()),
         }
     }
 
-    fn measure(&self, session: RunSession<'_>) -> Result<MeasuredRun, run::Error> {
+    fn measure_run(&self, session: RunSession<'_>) -> Result<MeasuredRun, run::Error> {
         match self {
-            Self::Fresh(fresh) => fresh.request().measure(session),
-            Self::Resumed { partial, .. } => run::resume(partial, session),
+            Self::Fresh(fresh) => fresh.run_request().measure_run(session),
+            Self::Resumed { partial, .. } => run::resume_run(partial, session),
         }
     }
 }
 
 impl NewRun {
-    fn request(&self) -> RunRequest<'_> {
+    fn run_request(&self) -> RunRequest<'_> {
         RunRequest {
             rig: &self.rig,
             surface: self.surface.clone(),

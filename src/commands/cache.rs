@@ -51,7 +51,7 @@ impl FromStr for CacheSize {
 
 impl CacheArgs {
     /// The folder, if there is one.
-    pub(crate) fn folder(&self) -> Option<CacheFolder> {
+    pub(crate) fn cache_folder(&self) -> Option<CacheFolder> {
         Some(CacheFolder { path: self.cache.clone()?, bytes: self.cache_size.0 })
     }
 
@@ -61,7 +61,7 @@ impl CacheArgs {
         if self.cache.is_some() && !lake.is_remote() {
             eprintln!("note: --cache is for lakes on object stores; `{}` is read without", lake.location());
         }
-        Ok(lake.with_cache(self.folder().as_ref()).await?)
+        Ok(lake.with_cache(self.cache_folder().as_ref()).await?)
     }
 }
 

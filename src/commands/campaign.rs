@@ -13,7 +13,7 @@ use anyhow::Context as _;
 use clap::{Args, Subcommand};
 use echolake_acquisition::run::controller::RecordingMode;
 use echolake_acquisition::run::recording_lock::RecordingLock;
-use echolake_ingest::pending;
+use echolake_ingest::pending_runs;
 use echolake_lake::{Lake, ReferenceSurfaces};
 use echolake_query::Session;
 use echolake_schema::{Rig, RunId, SurfaceId};
@@ -55,11 +55,11 @@ pub(crate) struct CampaignRunArgs {
     json: bool,
 }
 
-pub(crate) async fn run(command: &CampaignSubcommand, lake_url: &str) -> anyhow::Result<CommandOutcome> {
+pub(crate) async fn run_campaign(command: &CampaignSubcommand, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let CampaignSubcommand::Run(args) = command;
     let file = args.file.display();
     let stop = super::stop_request()?;
-    let campaign = CampaignDefinition::read(&args.file)?;
+    let campaign = CampaignDefinition::from_file(&args.file)?;
     // All of the file is checked before there is a lake.
     let own_rig = campaign.rig_file(&args.file);
     let rig = super::rig_or(args.rig.as_deref().or(own_rig.as_deref()), lake_url, Rig::paper).await?;
@@ -70,7 +70,7 @@ pub(crate) async fn run(command: &CampaignSubcommand, lake_url: &str) -> anyhow:
         (false, false) => UnnamedGeometry::Refused,
     };
     let check = |references: &ReferenceSurfaces| {
-        let surfaces = campaign.make_surfaces(&campaign.references(references), unnamed)?;
+        let surfaces = campaign.make_surfaces(&campaign.reference_surfaces(references), unnamed)?;
         surfaces.iter().try_for_each(|surface| check_mesh(&surface.specimen, &rig))?;
         campaign.check_expected(&surfaces, &bands)?;
         anyhow::Ok(surfaces)
@@ -78,9 +78,9 @@ pub(crate) async fn run(command: &CampaignSubcommand, lake_url: &str) -> anyhow:
     check(&ReferenceSurfaces::default()).with_context(|| format!("campaign `{file}`"))?;
     let lake = Lake::open_or_create(lake_url, &rig, &ReferenceSurfaces::default()).await?;
     let surfaces = check(&lake.config().references).with_context(|| format!("campaign `{file}`"))?;
-    let outcome = measure(args, &campaign, &surfaces, &lake, &rig, &stop).await?;
+    let outcome = measure_missing_runs(args, &campaign, &surfaces, &lake, &rig, &stop).await?;
     super::ensure_wanted(&stop)?;
-    let levels = levels(&Session::new(&lake)?).await?;
+    let levels = read_levels(&Session::new(&lake)?).await?;
     let named: Vec<_> = surfaces.iter().map(|surface| (&surface.surface, surface.macro_reference.as_ref())).collect();
     let tables = make_tables(&named, &levels, &campaign.expected);
     print_tables(args, &campaign, &bands, &tables)?;
@@ -97,23 +97,23 @@ fn print_tables(
         let report = serde_json::json!({
             "campaign": campaign.name, "about": campaign.about, "bands": bands, "tables": tables,
         });
-        super::print(&serde_json::to_string_pretty(&report)?)?;
+        super::print_line(&serde_json::to_string_pretty(&report)?)?;
         return Ok(());
     }
     let colours = std::io::stdout().is_terminal() && std::env::var_os("NO_COLOR").is_none();
     let colours = if colours { TableColours::Extremes } else { TableColours::None };
-    super::print(&campaign.name)?;
+    super::print_line(&campaign.name)?;
     if !campaign.about.is_empty() {
-        super::print(campaign.about.trim_end())?;
+        super::print_line(campaign.about.trim_end())?;
     }
     for table in tables {
-        super::print(&format!("\n{}", table.to_text(bands, colours)))?;
+        super::print_line(&format!("\n{}", table.to_text(bands, colours)))?;
     }
     Ok(())
 }
 
 // Measures the runs that the lake lacks, and ingests them.
-async fn measure(
+async fn measure_missing_runs(
     args: &CampaignRunArgs,
     campaign: &CampaignDefinition,
     surfaces: &[CampaignSurface],
@@ -121,7 +121,7 @@ async fn measure(
     rig: &Rig,
     stop: &StopRequest,
 ) -> anyhow::Result<CommandOutcome> {
-    let folder = super::inbox(lake)?;
+    let folder = super::prepare_inbox(lake)?;
     let snapshot = lake.whole_snapshot().await?;
     let there: Vec<_> = snapshot.runs().map(|run| run.surface.to_string()).chain(surfaces_in(&folder)?).collect();
     let runs = missing_runs(campaign, surfaces, &there);
@@ -131,10 +131,10 @@ async fn measure(
         eprintln!("the lake has all runs of the campaign");
     } else if rig.devices.are_simulated() {
         let progress = CommandProgress::new();
-        progress.say("simulated rig: nothing here is measured");
+        progress.print_message("simulated rig: nothing here is measured");
         let simulation = SimulationPlan { rig: rig.clone(), runs, keep, folder, known: HashSet::new() };
         let measuring = stop.clone();
-        tokio::task::spawn_blocking(move || simulation.measure(measuring.flag(), &progress)).await??;
+        tokio::task::spawn_blocking(move || simulation.measure_missing(measuring.flag(), &progress)).await??;
         super::ensure_wanted(stop)?;
     } else {
         let lock = match RecordingLock::acquire(&folder, rig) {
@@ -144,11 +144,11 @@ async fn measure(
         let real = RealRuns { rig: rig.clone(), runs, keep, folder };
         let measuring = stop.clone();
         outcome =
-            tokio::task::spawn_blocking(move || real.measure(measuring.flag(), &CommandProgress::new())).await??;
+            tokio::task::spawn_blocking(move || real.measure_all(measuring.flag(), &CommandProgress::new())).await??;
         drop(lock);
         super::ensure_wanted(stop)?;
     }
-    let sources = pending(lake).await?;
+    let sources = pending_runs(lake).await?;
     if !sources.is_empty() {
         super::ingest::ingest_runs(lake, sources, stop.flag(), &CommandProgress::new()).await?;
     }
@@ -187,7 +187,7 @@ fn surfaces_in(folder: &Path) -> anyhow::Result<Vec<String>> {
     let named = entries.flatten().filter_map(|entry| {
         let name = entry.file_name();
         let run: RunId = name.to_str()?.strip_suffix(".mcap")?.parse().ok()?;
-        run.untagged().split_once('-').map(|(_, surface)| surface.to_owned())
+        run.untagged_name().split_once('-').map(|(_, surface)| surface.to_owned())
     });
     Ok(named.collect())
 }
@@ -201,9 +201,9 @@ struct BandLevelRow {
 }
 
 // The levels of all surfaces, means over their runs.
-async fn levels(session: &Session) -> anyhow::Result<LevelsBySurface> {
+async fn read_levels(session: &Session) -> anyhow::Result<LevelsBySurface> {
     let sql = "select surface_id, band, avg(p90_mean_db) as level_db from surface_stats group by surface_id, band";
-    let rows: Vec<BandLevelRow> = super::sql::rows(session, sql).await?;
+    let rows: Vec<BandLevelRow> = super::sql::query_rows(session, sql).await?;
     let mut levels = BTreeMap::<String, BTreeMap<String, f64>>::new();
     for BandLevelRow { surface_id, band, level_db } in rows {
         if let Some(level_db) = level_db {

@@ -4,7 +4,7 @@ use std::path::Path;
 use std::time::Instant;
 
 use echolake_acquisition::run::controller::RecordingMode;
-use echolake_ingest::pending;
+use echolake_ingest::pending_runs;
 use echolake_lake::{Lake, ReferenceSurfaces};
 use echolake_panel::PanelSpecimen;
 use echolake_panel::collection::{CollectionSurface, collection};
@@ -49,17 +49,17 @@ const COMPARED: &str = "river_rock";
 /// Sweeps of 0.05 s instead of the paper's rig's 0.5 s: they fit a laptop's disk.
 const SWEEP_SECS: f64 = 0.05;
 
-pub(crate) async fn run(args: &DemoArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
+pub(crate) async fn run_demo(args: &DemoArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let begun = Instant::now();
     let stop = super::stop_request()?;
     let surfaces = match args.surfaces {
-        Some(count) => collection(args.seed, count as usize)?,
+        Some(count) => collection_surfaces(args.seed, count as usize)?,
         None => few_surfaces()?,
     };
-    let rig = rig(args.rig.as_deref(), lake_url).await?;
+    let rig = demo_rig(args.rig.as_deref(), lake_url).await?;
     let lake = Lake::open_or_create(lake_url, &rig, &ReferenceSurfaces::default()).await?;
     let progress = CommandProgress::new();
-    progress.say("simulated rig: nothing here is measured");
+    progress.print_message("simulated rig: nothing here is measured");
     let planned = |(number, member): (usize, CollectionSurface)| PlannedRun {
         surface: member.surface,
         specimen: PanelSpecimen::Relief(member.relief),
@@ -74,17 +74,17 @@ pub(crate) async fn run(args: &DemoArgs, lake_url: &str) -> anyhow::Result<Comma
         rig,
         runs: surfaces.into_iter().enumerate().map(planned).collect(),
         keep: if args.ir_only { RecordingMode::ResponsesOnly } else { RecordingMode::Sweeps },
-        folder: super::inbox(&lake)?,
-        known: lake.whole_snapshot().await?.runs().map(|r| r.run.untagged().to_owned()).collect(),
+        folder: super::prepare_inbox(&lake)?,
+        known: lake.whole_snapshot().await?.runs().map(|r| r.run.untagged_name().to_owned()).collect(),
     };
     let measuring = stop.clone();
-    tokio::task::spawn_blocking(move || simulation.measure(measuring.flag(), &progress)).await??;
+    tokio::task::spawn_blocking(move || simulation.measure_missing(measuring.flag(), &progress)).await??;
     super::ensure_wanted(&stop)?;
     if args.no_ingest {
-        eprintln!("the runs are in inbox/. Next:\n  {} {}ingest", program(), lake_flag(lake_url));
+        eprintln!("the runs are in inbox/. Next:\n  {} {}ingest", program_command(), lake_flag(lake_url));
         return Ok(CommandOutcome::Whole);
     }
-    let sources = pending(&lake).await?;
+    let sources = pending_runs(&lake).await?;
     super::ingest::ingest_runs(&lake, sources, stop.flag(), &CommandProgress::new()).await?;
     super::ensure_wanted(&stop)?;
     let example = match args.surfaces {
@@ -97,7 +97,7 @@ pub(crate) async fn run(args: &DemoArgs, lake_url: &str) -> anyhow::Result<Comma
         return Ok(CommandOutcome::Whole);
     }
     eprintln!();
-    super::serve::catalogue(&lake, &stop).await
+    super::serve::serve_catalogue(&lake, &stop).await
 }
 
 fn few_surfaces() -> anyhow::Result<Vec<CollectionSurface>> {
@@ -106,7 +106,7 @@ fn few_surfaces() -> anyhow::Result<Vec<CollectionSurface>> {
 }
 
 // Without a file the demo's rig, whatever the lake's is: a lake of another rig refuses it.
-async fn rig(file: Option<&Path>, lake_url: &str) -> anyhow::Result<Rig> {
+async fn demo_rig(file: Option<&Path>, lake_url: &str) -> anyhow::Result<Rig> {
     if file.is_some() {
         return super::rig_or(file, lake_url, Rig::paper).await;
     }
@@ -116,7 +116,7 @@ async fn rig(file: Option<&Path>, lake_url: &str) -> anyhow::Result<Rig> {
 }
 
 // The command line of this program for hints; cargo sets the variable for programs that it runs.
-fn program() -> &'static str {
+fn program_command() -> &'static str {
     if std::env::var_os("CARGO_MANIFEST_DIR").is_some() { "cargo run --profile quick --" } else { "echolake" }
 }
 
@@ -136,7 +136,7 @@ fn print_next(lake_url: &str, example: &str) {
         "ingest",
         "doctor",
     ] {
-        eprintln!("  {} {flag}{next}", program());
+        eprintln!("  {} {flag}{next}", program_command());
     }
 }
 
@@ -157,7 +157,7 @@ fn level_columns(lake: &Lake, aggregate: &str) -> String {
 async fn print_typologies(lake: &Lake) -> anyhow::Result<&'static str> {
     let session = Session::new(lake)?;
     let columns = level_columns(lake, "avg");
-    super::print(&format!("\n{LEVELS_TITLE}, mean over surfaces"))?;
+    super::print_line(&format!("\n{LEVELS_TITLE}, mean over surfaces"))?;
     let sql = format!(
         "select case typology when 'reference' then surface_id else typology end as kind, \
          count(*) as surfaces, {columns} \
@@ -171,10 +171,10 @@ async fn print_typologies(lake: &Lake) -> anyhow::Result<&'static str> {
 async fn print_tables(lake: &Lake) -> anyhow::Result<&'static str> {
     let session = Session::new(lake)?;
     let columns = level_columns(lake, "");
-    super::print(&format!("\nMean {LEVELS_TITLE}"))?;
+    super::print_line(&format!("\nMean {LEVELS_TITLE}"))?;
     let sql = format!("select surface_id as surface, {columns} from catalogue order by surface_id");
     super::sql::print_table(&session, &sql).await?;
-    super::print(&format!("\nMean energy of {COMPARED} and Flat, over Flat's total (simulated)"))?;
+    super::print_line(&format!("\nMean energy of {COMPARED} and Flat, over Flat's total (simulated)"))?;
     let row = |band: &str| {
         format!(
             "select '{band}' as band, avg(tnce_{band}) filter (where surface_id = 'flat') as flat, \

@@ -17,12 +17,12 @@ pub(crate) struct DoctorArgs {
     pub(crate) json: bool,
 }
 
-pub(crate) async fn run(args: &DoctorArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
+pub(crate) async fn run_doctor(args: &DoctorArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     if args.installation {
-        return installation::run(args.json, lake_url).await;
+        return installation::report_installation(args.json, lake_url).await;
     }
     #[cfg(feature = "lake")]
-    return lake::run(args.json, lake_url).await;
+    return lake::report_lake(args.json, lake_url).await;
     #[cfg(not(feature = "lake"))]
     anyhow::bail!("this program has no tables to look into; hint: `echolake doctor --self` looks at the program itself")
 }

@@ -59,14 +59,14 @@ pub(crate) struct MlArgs {
     #[arg(long)]
     references: bool,
     /// Licence of the data for the card and the metadata, as hubs name it.
-    #[arg(long, value_name = "NAME", value_parser = license)]
+    #[arg(long, value_name = "NAME", value_parser = parse_license)]
     license: Option<String>,
     /// Print what was written as JSON.
     #[arg(long)]
     json: bool,
 }
 
-fn license(text: &str) -> Result<String, String> {
+fn parse_license(text: &str) -> Result<String, String> {
     match !text.is_empty() && text.chars().all(|c| c.is_ascii_alphanumeric() || ".-+".contains(c)) {
         true => Ok(text.to_ascii_lowercase()),
         false => Err("letters, digits, `.`, `-` and `+` only; hint: a name such as cc-by-4.0 or other".into()),
@@ -145,19 +145,19 @@ pub(crate) struct WavArgs {
     output: ExportTarget,
 }
 
-pub(crate) async fn run(command: &ExportCommand, lake_url: &str) -> anyhow::Result<CommandOutcome> {
+pub(crate) async fn run_export(command: &ExportCommand, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let lake = Lake::open(lake_url).await?;
     match command {
-        ExportCommand::Ml(args) => ml(&lake, args).await?,
-        ExportCommand::Mcap(args) => mcap(&lake, args).await?,
-        ExportCommand::Sofa(args) => responses(&lake, args, ResponseFormat::Sofa).await?,
-        ExportCommand::Npz(args) => responses(&lake, args, ResponseFormat::Npz).await?,
-        ExportCommand::Wav(args) => wav(&lake, args).await?,
+        ExportCommand::Ml(args) => export_ml(&lake, args).await?,
+        ExportCommand::Mcap(args) => export_mcap(&lake, args).await?,
+        ExportCommand::Sofa(args) => export_responses(&lake, args, ResponseFormat::Sofa).await?,
+        ExportCommand::Npz(args) => export_responses(&lake, args, ResponseFormat::Npz).await?,
+        ExportCommand::Wav(args) => export_wav(&lake, args).await?,
     }
     Ok(CommandOutcome::Whole)
 }
 
-async fn ml(lake: &Lake, args: &MlArgs) -> anyhow::Result<()> {
+async fn export_ml(lake: &Lake, args: &MlArgs) -> anyhow::Result<()> {
     let by = match args.split {
         SplitArg::ByPanel => SplitBy::Panel,
         SplitArg::ByTypology => SplitBy::Typology,
@@ -177,15 +177,15 @@ async fn ml(lake: &Lake, args: &MlArgs) -> anyhow::Result<()> {
         license: args.license.clone(),
     };
     let (progress, mut task) = (CommandProgress::new(), None);
-    let pending = PendingExport::folder(&args.output).await?;
+    let pending = PendingExport::prepare_folder(&args.output).await?;
     let exported = write_training_set(lake, pending.path(), &set, &mut |done, total| {
-        step(&progress, &mut task, "surfaces", done, total);
+        show_progress(&progress, &mut task, "surfaces", done, total);
     })
     .await?;
     let bytes: u64 = exported.files.iter().map(|f| f.bytes).sum();
-    finish(task, format!("{} files, {}", exported.files.len(), super::size(bytes)));
+    finish_task(task, format!("{} files, {}", exported.files.len(), super::format_size(bytes)));
     pending.publish().await?;
-    super::print(&if args.json { in_json(&exported)? } else { in_words(&exported) })?;
+    super::print_line(&if args.json { in_json(&exported)? } else { in_words(&exported) })?;
     Ok(())
 }
 
@@ -232,16 +232,16 @@ fn in_json(exported: &ExportSummary) -> serde_json::Result<String> {
     }))
 }
 
-async fn mcap(lake: &Lake, args: &McapArgs) -> anyhow::Result<()> {
-    let pending = PendingExport::file(&args.output).await?;
+async fn export_mcap(lake: &Lake, args: &McapArgs) -> anyhow::Result<()> {
+    let pending = PendingExport::prepare_file(&args.output).await?;
     let mut file = PendingFile::create(pending.path())?;
-    let taken = taken(lake, &args.selection).await?;
+    let taken = select_measurements(lake, &args.selection).await?;
     let layout = match args.layout {
         LayoutArg::ByTopic => Layout::ByTopic,
         LayoutArg::InTime => Layout::InTime,
     };
     let count = taken.len();
-    let params = SliceParams { taken, topics: args.topics.clone(), layout, check: check(&args.selection) };
+    let params = SliceParams { taken, topics: args.topics.clone(), layout, check: wanted_check(&args.selection) };
     let mut slice = Slice::open(lake, &lake.whole_snapshot().await?, params).await?;
     let mut bytes = 0;
     while let Some(piece) = slice.next().await? {
@@ -250,31 +250,31 @@ async fn mcap(lake: &Lake, args: &McapArgs) -> anyhow::Result<()> {
     }
     file.publish()?;
     pending.publish().await?;
-    eprintln!("{}: {count} measurements, {}", args.output, super::size(bytes));
+    eprintln!("{}: {count} measurements, {}", args.output, super::format_size(bytes));
     Ok(())
 }
 
-async fn responses(lake: &Lake, args: &ResponseArgs, format: ResponseFormat) -> anyhow::Result<()> {
+async fn export_responses(lake: &Lake, args: &ResponseArgs, format: ResponseFormat) -> anyhow::Result<()> {
     let (progress, mut task) = (CommandProgress::new(), None);
-    let pending = PendingExport::folder(&args.output).await?;
+    let pending = PendingExport::prepare_folder(&args.output).await?;
     let files = write_responses(lake, pending.path(), format, &args.surfaces, &mut |done, total| {
-        step(&progress, &mut task, "surfaces", done, total);
+        show_progress(&progress, &mut task, "surfaces", done, total);
     })
     .await?;
     let bytes: u64 = files.iter().map(|f| f.bytes).sum();
-    finish(task, format!("{} files, {}", files.len(), super::size(bytes)));
+    finish_task(task, format!("{} files, {}", files.len(), super::format_size(bytes)));
     pending.publish().await
 }
 
-async fn wav(lake: &Lake, args: &WavArgs) -> anyhow::Result<()> {
-    let taken = taken(lake, &args.selection).await?;
+async fn export_wav(lake: &Lake, args: &WavArgs) -> anyhow::Result<()> {
+    let taken = select_measurements(lake, &args.selection).await?;
     let (progress, mut task) = (CommandProgress::new(), None);
-    let pending = PendingExport::folder(&args.output).await?;
-    let count = write_wav(lake, pending.path(), &taken, check(&args.selection), &mut |done, total| {
-        step(&progress, &mut task, "recordings", done, total);
+    let pending = PendingExport::prepare_folder(&args.output).await?;
+    let count = write_wav(lake, pending.path(), &taken, wanted_check(&args.selection), &mut |done, total| {
+        show_progress(&progress, &mut task, "recordings", done, total);
     })
     .await?;
-    finish(task, format!("{count} recordings"));
+    finish_task(task, format!("{count} recordings"));
     pending.publish().await?;
     if let ExportTarget::Local(folder) = &args.output {
         eprintln!("next: echolake --lake NEW import wav {}", folder.join("manifest.csv").display());
@@ -282,24 +282,31 @@ async fn wav(lake: &Lake, args: &WavArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn step(progress: &CommandProgress, task: &mut Option<TaskProgress>, unit: &'static str, done: usize, total: usize) {
-    task.get_or_insert_with(|| progress.task("export", total as u64, unit)).at(done as u64);
+fn show_progress(
+    progress: &CommandProgress,
+    task: &mut Option<TaskProgress>,
+    unit: &'static str,
+    done: usize,
+    total: usize,
+) {
+    task.get_or_insert_with(|| progress.start_task("export", total as u64, unit)).set_done(done as u64);
 }
 
-fn finish(task: Option<TaskProgress>, what: String) {
+fn finish_task(task: Option<TaskProgress>, what: String) {
     if let Some(task) = task {
-        task.done(what);
+        task.finish_with(what);
     }
 }
 
-fn check(selection: &SelectionArgs) -> Check {
+fn wanted_check(selection: &SelectionArgs) -> Check {
     if selection.quick { Check::Ends } else { Check::Whole }
 }
 
-async fn taken(lake: &Lake, selection: &SelectionArgs) -> anyhow::Result<Vec<Taken>> {
+async fn select_measurements(lake: &Lake, selection: &SelectionArgs) -> anyhow::Result<Vec<Taken>> {
     let session = Session::new(lake)?;
     let select = format!("select {} from measurements where", Taken::COLUMNS.join(", "));
-    let sql = session.selecting(&select, &selection.predicate, PredicateForm::AnyExpression).context("--where")?;
+    let sql =
+        session.append_predicate(&select, &selection.predicate, PredicateForm::AnyExpression).context("--where")?;
     let mut answer = session.query(&sql).await.context("--where")?;
     let mut taken = Vec::new();
     while let Some(batch) = answer.next().await? {

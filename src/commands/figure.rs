@@ -181,7 +181,7 @@ pub(crate) struct ReliefArgs {
     columns: u32,
 }
 
-pub(crate) async fn run(command: &FigureCommand, lake_url: &str) -> anyhow::Result<CommandOutcome> {
+pub(crate) async fn run_figure(command: &FigureCommand, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let source = FigureSource::open(Lake::open(lake_url).await?).await?;
     match command {
         FigureCommand::Grid(args) => surfaces::write_grid(&source, args).await?,

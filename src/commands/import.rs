@@ -67,7 +67,7 @@ enum ImportCommand {
     },
 }
 
-pub(crate) async fn run(args: &ImportArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
+pub(crate) async fn run_import(args: &ImportArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let ImportArgs { project, format: args } = args;
     let rig = match args {
         ImportCommand::Wav { manifest, rig } => {
@@ -78,7 +78,7 @@ pub(crate) async fn run(args: &ImportArgs, lake_url: &str) -> anyhow::Result<Com
             let silent = rig.as_deref().is_some_and(|f| !std::fs::read_to_string(f).is_ok_and(says_rate));
             if silent {
                 given.sweep.rate_hz = rate;
-                given.check()?;
+                given.check_consistency()?;
             }
             given
         }
@@ -90,7 +90,7 @@ pub(crate) async fn run(args: &ImportArgs, lake_url: &str) -> anyhow::Result<Com
     // All is checked and written beside the lake's tables before a lake is made for it.
     let existing = match Lake::open(lake_url).await {
         Ok(lake) => {
-            lake.fits(&rig)?;
+            lake.check_rig(&rig)?;
             Some(lake)
         }
         Err(echolake_lake::Error::NoLake { .. }) => None,
@@ -111,12 +111,12 @@ pub(crate) async fn run(args: &ImportArgs, lake_url: &str) -> anyhow::Result<Com
         }
     }
     let lake = Lake::open_or_create(lake_url, &rig, &ReferenceSurfaces::default()).await?;
-    let folder = super::inbox(&lake)?;
+    let folder = super::prepare_inbox(&lake)?;
     let progress = CommandProgress::new();
     let mut task = None;
     let options = ImportOptions { started: Timestamp::now(), folder: &folder, project: project.as_ref() };
     let mut step = |unit: &'static str, done: usize, total: usize| {
-        task.get_or_insert_with(|| progress.task("import", total as u64, unit)).at(done as u64);
+        task.get_or_insert_with(|| progress.start_task("import", total as u64, unit)).set_done(done as u64);
     };
     let runs: Result<Vec<ImportedRun>, Error> = tokio::task::block_in_place(|| match args {
         ImportCommand::Wav { manifest, .. } => {
@@ -131,21 +131,21 @@ pub(crate) async fn run(args: &ImportArgs, lake_url: &str) -> anyhow::Result<Com
         }
     });
     let runs = runs?;
-    finish(task, &runs);
+    finish_task(task, &runs);
     for run in &runs {
         for warning in &run.warnings {
-            progress.say(format!("{}: warning: {warning}", run.run_id));
+            progress.print_message(format!("{}: warning: {warning}", run.run_id));
         }
-        super::print(&run.path.display().to_string())?;
+        super::print_line(&run.path.display().to_string())?;
     }
     eprintln!("next: echolake --lake {lake_url} ingest");
     Ok(CommandOutcome::Whole)
 }
 
-fn finish(task: Option<TaskProgress>, runs: &[ImportedRun]) {
+fn finish_task(task: Option<TaskProgress>, runs: &[ImportedRun]) {
     let measurements: usize = runs.iter().map(|r| r.measurements).sum();
     if let Some(task) = task {
-        task.done(format!("{} runs, {measurements} measurements", runs.len()));
+        task.finish_with(format!("{} runs, {measurements} measurements", runs.len()));
     }
 }
 

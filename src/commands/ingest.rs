@@ -13,7 +13,7 @@ use echolake_acquisition::recovery::is_partial;
 use echolake_ingest::Error as IngestError;
 use echolake_ingest::{
     CompletedRun, FileReport, IngestOutcome, IngestedRun, LakeIngest, PendingFiles, RecordingState, RunSource,
-    SuspectFile, UnfinishedRecording, find_runs, has_end, list_arrivals, list_pending, pending, rig_of_run,
+    SuspectFile, UnfinishedRecording, find_runs, has_end, list_arrivals, list_pending, pending_runs, rig_of_run,
 };
 use echolake_lake::{Error as LakeError, Lake, ReferenceSurfaces, remote_access};
 use object_store::path::Path as ObjectPath;
@@ -74,23 +74,23 @@ struct RefusedFile {
 }
 
 impl IngestSummary {
-    fn lost(&self) -> bool {
+    fn has_loss(&self) -> bool {
         !self.refused.is_empty() || self.taken.iter().any(|t| !(t.whole || t.stopped) || !t.damaged.is_empty())
     }
 
-    fn refuse(&mut self, file: String, why: &IngestError, moved_to: Option<String>) {
+    fn add_refused(&mut self, file: String, why: &IngestError, moved_to: Option<String>) {
         self.refused.push(RefusedFile { file, reason: why.to_string(), moved_to });
     }
 
     // Names what is passed over.
     fn pass_over(&mut self, pending: &PendingFiles, progress: &CommandProgress) {
         for (path, why) in passed_over(pending) {
-            progress.say(format!("error: {why}"));
-            self.refuse(path, &why, None);
+            progress.print_message(format!("error: {why}"));
+            self.add_refused(path, &why, None);
         }
     }
 
-    fn add(&mut self, report: FileReport, progress: &CommandProgress) {
+    fn add_report(&mut self, report: FileReport, progress: &CommandProgress) {
         match report {
             FileReport::Ingested(run) => {
                 print_ingested(progress, &run);
@@ -98,21 +98,21 @@ impl IngestSummary {
             }
             FileReport::Refused { source, why, moved } => {
                 let whereto = moved.as_ref().map(|m| format!(" (now at `{m}`)")).unwrap_or_default();
-                progress.say(format!("error: {why}{whereto}"));
-                self.refuse(source.to_string(), &why, moved.map(|m| m.to_string()));
+                progress.print_message(format!("error: {why}{whereto}"));
+                self.add_refused(source.to_string(), &why, moved.map(|m| m.to_string()));
             }
             FileReport::Gone(source) => {
-                progress.say(format!("{source}: another ingest has taken it, or somebody deleted it"));
+                progress.print_message(format!("{source}: another ingest has taken it, or somebody deleted it"));
                 self.gone += 1;
             }
             FileReport::Claimed(source) => {
-                progress.say(format!("{source}: another ingest is at it; waiting for its end"))
+                progress.print_message(format!("{source}: another ingest is at it; waiting for its end"))
             }
         }
     }
 }
 
-pub(crate) async fn run(args: &IngestArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
+pub(crate) async fn run_ingest(args: &IngestArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let stop = super::stop_request()?;
     let lake = open_or_make(lake_url, &args.runs).await?;
     let progress = CommandProgress::new();
@@ -122,10 +122,10 @@ pub(crate) async fn run(args: &IngestArgs, lake_url: &str) -> anyhow::Result<Com
     if args.watch {
         // Later errors are waited out; this one is the store's nature.
         lake.ensure_tables().await?;
-        return watch(&lake, &stop, &progress).await;
+        return watch_inbox(&lake, &stop, &progress).await;
     }
     let pending = if args.runs.is_empty() { list_pending(&lake).await? } else { PendingFiles::default() };
-    let sources = if args.runs.is_empty() { pending.sources() } else { sources_of(&lake, &args.runs).await? };
+    let sources = if args.runs.is_empty() { pending.run_sources() } else { sources_of(&lake, &args.runs).await? };
     let nothing = sources.is_empty();
     let mut summary = ingest_runs(&lake, sources, stop.flag(), &progress).await?;
     if args.runs.is_empty() {
@@ -135,7 +135,7 @@ pub(crate) async fn run(args: &IngestArgs, lake_url: &str) -> anyhow::Result<Com
         finish_tables(&lake, &summary).await?;
     }
     if args.json {
-        super::print(&serde_json::to_string_pretty(&summary)?)?;
+        super::print_line(&serde_json::to_string_pretty(&summary)?)?;
     }
     if nothing && !args.json {
         let unfinished = match pending.recordings.len() {
@@ -148,7 +148,7 @@ pub(crate) async fn run(args: &IngestArgs, lake_url: &str) -> anyhow::Result<Com
     if !args.runs.is_empty() && summary.taken.is_empty() && !summary.refused.is_empty() {
         anyhow::bail!("nothing was taken in");
     }
-    Ok(if summary.lost() { CommandOutcome::WithLoss } else { CommandOutcome::Whole })
+    Ok(if summary.has_loss() { CommandOutcome::WithLoss } else { CommandOutcome::Whole })
 }
 
 // What makes a lake in a folder also records into it. On an object store, the first run that is taken in makes it.
@@ -186,7 +186,7 @@ fn note_recording(UnfinishedRecording { path, bytes, state }: &UnfinishedRecordi
         RecordingState::Import => "is part of an import that was cut off; hint: repeat the import",
         RecordingState::CutOff => return,
     };
-    progress.say(format!("note: `{path}` ({}) {what}", super::size(*bytes)));
+    progress.print_message(format!("note: `{path}` ({}) {what}", super::format_size(*bytes)));
 }
 
 // What another ingest took on an object store and did not finish, because it died, is in `runs/` and in no table.
@@ -197,7 +197,7 @@ async fn finish_for_others(
     progress: &CommandProgress,
 ) -> anyhow::Result<()> {
     while lake.is_remote() && std::mem::take(&mut summary.gone) > 0 {
-        let mut left = pending(lake).await?;
+        let mut left = pending_runs(lake).await?;
         left.retain(|source| summary.refused.iter().all(|refused| refused.file != source.to_string()));
         if left.is_empty() {
             break;
@@ -231,7 +231,7 @@ pub(crate) async fn ingest_runs(
 ) -> anyhow::Result<IngestSummary> {
     let ingest = LakeIngest::new(lake, stop.clone());
     let taken = ingest_and_complete(&ingest, lake, sources, stop, progress).await;
-    ingest.close().await;
+    ingest.release_claims().await;
     taken
 }
 
@@ -244,14 +244,14 @@ async fn ingest_and_complete(
 ) -> anyhow::Result<IngestSummary> {
     let mut summary = IngestSummary::default();
     let count = sources.len();
-    let mut task = progress.task("ingest", count as u64, "runs");
+    let mut task = progress.start_task("ingest", count as u64, "runs");
     let mut ended = 0;
     let (suspects, sources): (Vec<_>, Vec<_>) =
         sources.into_iter().partition(|source| SuspectFile::from_source(lake, source).is_some());
     let mut report = |report: FileReport| {
         ended += u64::from(!matches!(report, FileReport::Claimed(_)));
-        summary.add(report, progress);
-        task.at(ended);
+        summary.add_report(report, progress);
+        task.set_done(ended);
     };
     let mut outcome = ingest.ingest_runs(sources, &mut report).await.map_err(anyhow::Error::from);
     // All others first: these may end the process of which this one is a part.
@@ -265,24 +265,28 @@ async fn ingest_and_complete(
     let derived: usize = added().filter(|t| t.derived).map(|t| t.measurements).sum();
     match count {
         0 => task.dismiss(),
-        _ => task
-            .done(format!("{} runs, {measurements} new measurements, {derived} of them derived", summary.taken.len())),
+        _ => task.finish_with(format!(
+            "{} runs, {measurements} new measurements, {derived} of them derived",
+            summary.taken.len()
+        )),
     }
     outcome?;
     let (mut task, mut rows, mut runs) = (None, 0, 0);
     let completed = &mut |completed: &CompletedRun, total: usize| {
         rows += completed.measurements;
         runs += 1;
-        task.get_or_insert_with(|| progress.task("complete", total as u64, "runs")).at(runs);
+        task.get_or_insert_with(|| progress.start_task("complete", total as u64, "runs")).set_done(runs);
     };
     let completion = ingest.complete_runs(completed).await?;
     if let Some(task) = task {
-        task.done(format!("{runs} runs, {rows} measurements derived"));
+        task.finish_with(format!("{runs} runs, {rows} measurements derived"));
     }
     summary.lacks_rows = !completion.is_whole;
     for (run, missing) in completion.waiting {
         if summary.taken.iter().any(|t| t.run == run) {
-            progress.say(format!("{run}: waits for reference {missing}; ingest a run of it, and it is completed"));
+            progress.print_message(format!(
+                "{run}: waits for reference {missing}; ingest a run of it, and it is completed"
+            ));
         }
     }
     Ok(summary)
@@ -300,15 +304,15 @@ async fn watch_suspect(
     loop {
         let file = suspect.source().clone();
         let RunSource::Lake(path) = &file else { return Ok(()) };
-        if let Some(report) = suspect.refuse(lake).await? {
-            summary.add(report, progress);
+        if let Some(report) = suspect.refuse_if_deadly(lake).await? {
+            summary.add_report(report, progress);
             return Ok(());
         }
         if stop.load(Ordering::Relaxed) {
             return Err(echolake_ingest::Error::Stopped.into());
         }
-        progress.say(format!("{file}: an ingest died while it read this; a process of its own takes it in"));
-        let before = SuspectFile::pending(lake).await?;
+        progress.print_message(format!("{file}: an ingest died while it read this; a process of its own takes it in"));
+        let before = SuspectFile::find_pending(lake).await?;
         let mut command = Command::new(std::env::current_exe().context("this program has no path")?);
         command.args(["--lake", lake.location(), "ingest", "--suspect", path.as_ref()]);
         let (name, value) = child_variable();
@@ -352,13 +356,13 @@ async fn ingest_suspect(
     let mut summary = IngestSummary::default();
     let source = RunSource::Lake(ObjectPath::parse(path)?);
     let ingest = LakeIngest::new(lake, stop.clone());
-    let mut report = |report| summary.add(report, progress);
+    let mut report = |report| summary.add_report(report, progress);
     tokio::select! {
         taken = ingest.ingest_runs(vec![source], &mut report) => taken?,
         _ = parent => anyhow::bail!("the ingest that started this process has ended"),
     }
-    ingest.close().await;
-    super::print(&serde_json::to_string(&summary)?)?;
+    ingest.release_claims().await;
+    super::print_line(&serde_json::to_string(&summary)?)?;
     Ok(CommandOutcome::Whole)
 }
 
@@ -414,7 +418,7 @@ impl WatchedInbox {
 }
 
 // Ingests new files of the inbox, until Ctrl-C.
-async fn watch(lake: &Lake, stop: &StopRequest, progress: &CommandProgress) -> anyhow::Result<CommandOutcome> {
+async fn watch_inbox(lake: &Lake, stop: &StopRequest, progress: &CommandProgress) -> anyhow::Result<CommandOutcome> {
     eprintln!("watching `{}/inbox`; Ctrl-C ends it", lake.location());
     let mut inbox = WatchedInbox::default();
     let mut lost = false;
@@ -437,9 +441,10 @@ async fn watch(lake: &Lake, stop: &StopRequest, progress: &CommandProgress) -> a
         is_first = false;
         let mut settled = inbox.list_settled(lake, &found).await;
         let mut passed_over = IngestSummary::default();
-        let sources: Vec<_> = found.sources().into_iter().filter(|s| settled.contains_key(&s.to_string())).collect();
+        let sources: Vec<_> =
+            found.run_sources().into_iter().filter(|s| settled.contains_key(&s.to_string())).collect();
         inbox.name_passed_over(found, &mut passed_over, progress);
-        lost |= passed_over.lost();
+        lost |= passed_over.has_loss();
         if sources.is_empty() && inbox.seen.is_empty() && inbox.given_up.is_empty() && !is_finished {
             match ingest_runs(lake, Vec::new(), stop.flag(), progress).await {
                 Ok(summary) => {
@@ -450,12 +455,12 @@ async fn watch(lake: &Lake, stop: &StopRequest, progress: &CommandProgress) -> a
             }
         }
         if sources.is_empty() {
-            pause(LOOK_EVERY, stop).await;
+            sleep_or_stop(LOOK_EVERY, stop).await;
             continue;
         }
         match ingest_runs(lake, sources, stop.flag(), progress).await {
             Ok(summary) => {
-                lost |= summary.lost();
+                lost |= summary.has_loss();
                 // They are looked for in `runs/`, in case that ingest died.
                 is_first |= summary.gone > 0;
                 let stay = summary.refused.iter().filter(|refused| refused.moved_to.is_none());
@@ -471,28 +476,30 @@ async fn watch(lake: &Lake, stop: &StopRequest, progress: &CommandProgress) -> a
 
 async fn wait_after(error: &anyhow::Error, stop: &StopRequest) {
     eprintln!("error: {}; trying again in {} s", describe_error(error), RETRY_AFTER.as_secs());
-    pause(RETRY_AFTER, stop).await;
+    sleep_or_stop(RETRY_AFTER, stop).await;
 }
 
 // Ends early if a stop is requested.
-async fn pause(time: Duration, stop: &StopRequest) {
-    let _ = tokio::time::timeout(time, stop.wait()).await;
+async fn sleep_or_stop(time: Duration, stop: &StopRequest) {
+    let _ = tokio::time::timeout(time, stop.wait_until_made()).await;
 }
 
 fn print_ingested(progress: &CommandProgress, taken: &IngestedRun) {
     let IngestedRun { run, measurements, .. } = taken;
     match taken.outcome {
-        _ if taken.mended => progress.say(format!("{run}: rows were missing, and are derived again")),
-        IngestOutcome::Known => progress.say(format!("{run}: is in the lake already, nothing added")),
-        IngestOutcome::Added => progress.say(format!("{run}: {measurements} measurements")),
+        _ if taken.mended => progress.print_message(format!("{run}: rows were missing, and are derived again")),
+        IngestOutcome::Known => progress.print_message(format!("{run}: is in the lake already, nothing added")),
+        IngestOutcome::Added => progress.print_message(format!("{run}: {measurements} measurements")),
     }
     if taken.stopped {
-        progress.say(format!("{run}: its recording was stopped before its end; all that it holds is in the tables"));
+        progress.print_message(format!(
+            "{run}: its recording was stopped before its end; all that it holds is in the tables"
+        ));
     } else if !taken.whole {
-        progress.say(format!("{run}: warning: its recording was cut off; what it holds is in the tables"));
+        progress.print_message(format!("{run}: warning: its recording was cut off; what it holds is in the tables"));
     }
     for damage in &taken.damaged {
-        progress.say(format!("{run}: warning: {damage}"));
+        progress.print_message(format!("{run}: warning: {damage}"));
     }
 }
 

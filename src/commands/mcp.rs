@@ -16,10 +16,10 @@ pub(crate) struct McpArgs {
 }
 
 /// Answers until standard input ends.
-pub(crate) async fn run(args: &McpArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
+pub(crate) async fn run_mcp(args: &McpArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let stop = StopRequest::listen("stopping")?;
     let lake = args.queries.open_lake(lake_url).await?;
     let settings = args.queries.engine_settings(&lake, 1)?;
-    AgentDoor::new(&lake, settings, &args.pages)?.run(stop.wait()).await?;
+    AgentDoor::new(&lake, settings, &args.pages)?.answer_until(stop.wait_until_made()).await?;
     Ok(CommandOutcome::Whole)
 }

@@ -52,13 +52,13 @@ use crate::signals::StopRequest;
 use replay::ViewerArgs;
 
 /// Writes text and a line break to stdout; a closed pipe is an error that `main` takes for success.
-fn print(text: &str) -> std::io::Result<()> {
+fn print_line(text: &str) -> std::io::Result<()> {
     use std::io::Write as _;
     writeln!(std::io::stdout().lock(), "{text}")
 }
 
 /// A size for people.
-fn size(bytes: u64) -> String {
+fn format_size(bytes: u64) -> String {
     match bytes {
         0..1_000_000 => format!("{:.1} kB", bytes as f64 / 1e3),
         1_000_000..1_000_000_000 => format!("{:.1} MB", bytes as f64 / 1e6),
@@ -81,7 +81,7 @@ async fn rig_or(file: Option<&Path>, lake_url: &str, otherwise: impl FnOnce() ->
 }
 
 /// The folder of the lake that new recordings go to.
-fn inbox(lake: &Lake) -> anyhow::Result<std::path::PathBuf> {
+fn prepare_inbox(lake: &Lake) -> anyhow::Result<std::path::PathBuf> {
     let missing =
         "recordings need a lake in a folder; hint: --lake FOLDER, and `echolake upload` for one on an object store";
     let folder = lake.folder().context(missing)?.join("inbox");
@@ -98,10 +98,10 @@ fn inbox(lake: &Lake) -> anyhow::Result<std::path::PathBuf> {
 /// Prints which viewers have access at an address, and how to let in others.
 fn tell_access(viewers: &ViewerArgs, address: SocketAddr, progress: &CommandProgress) {
     if viewers.allowed_origins.is_empty() {
-        progress.say("hint: a viewer on the web must be allowed: --allow-origin https://app.foxglove.dev");
+        progress.print_message("hint: a viewer on the web must be allowed: --allow-origin https://app.foxglove.dev");
     }
     if viewers.open && !address.ip().is_loopback() {
-        progress.say("warning: anyone who reaches this address can view");
+        progress.print_message("warning: anyone who reaches this address can view");
     }
 }
 

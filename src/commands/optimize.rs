@@ -17,26 +17,27 @@ pub(crate) struct OptimizeArgs {
     pub(crate) json: bool,
 }
 
-pub(crate) async fn run(args: &OptimizeArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
+pub(crate) async fn run_optimize(args: &OptimizeArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let stop = super::stop_request()?;
     let lake = Lake::open(lake_url).await?;
     let progress = CommandProgress::new();
     let mut task = None;
     let done = lake
         .optimize(args.target_mb << 20, stop.flag(), &mut |at| {
-            task.get_or_insert_with(|| progress.task("optimize", at.total as u64, "files")).at(at.done as u64);
+            task.get_or_insert_with(|| progress.start_task("optimize", at.total as u64, "files"))
+                .set_done(at.done as u64);
         })
         .await;
     let report = done?;
     let merged: usize = report.tables.iter().map(|t| t.merged).sum();
     let files: usize = report.tables.iter().map(|t| t.files).sum();
     if let Some(task) = task {
-        task.done(format!("{merged} files became {files}"));
+        task.finish_with(format!("{merged} files became {files}"));
     }
     match args.json {
-        true => super::print(&serde_json::to_string_pretty(&report)?)?,
+        true => super::print_line(&serde_json::to_string_pretty(&report)?)?,
         false if report.tables.is_empty() => eprintln!("nothing to merge: no table has two small files"),
-        false => super::print(&text(&report.tables))?,
+        false => super::print_line(&report_text(&report.tables))?,
     }
     if report.stopped {
         anyhow::bail!("stopped; what was merged stays merged; hint: run the same command again to resume");
@@ -44,10 +45,10 @@ pub(crate) async fn run(args: &OptimizeArgs, lake_url: &str) -> anyhow::Result<C
     Ok(CommandOutcome::Whole)
 }
 
-fn text(tables: &[TableOptimizeReport]) -> String {
+fn report_text(tables: &[TableOptimizeReport]) -> String {
     let head = format!("{:<14} {:>7} {:>10} {:>7} {:>10}", "table", "merged", "size", "into", "size");
     let line = |t: &TableOptimizeReport| {
-        let (before, after) = (super::size(t.bytes_before), super::size(t.bytes_after));
+        let (before, after) = (super::format_size(t.bytes_before), super::format_size(t.bytes_after));
         let outdated = match t.outdated {
             0 => String::new(),
             count => format!("  {count} merges dropped, ingest was faster"),

@@ -69,15 +69,15 @@ pub(crate) struct PanelArgs {
     results: Option<PathBuf>,
 }
 
-pub(crate) fn run(args: &PanelArgs) -> anyhow::Result<CommandOutcome> {
+pub(crate) fn run_panel(args: &PanelArgs) -> anyhow::Result<CommandOutcome> {
     if args.list {
-        return list::run(args.name.as_deref(), args.json);
+        return list::list_panels(args.name.as_deref(), args.json);
     }
     if let Some(ranges) = &args.group {
-        return group::make(ranges, args.count as usize, one(&args.output)?);
+        return group::make_group(ranges, args.count as usize, single_output(&args.output)?);
     }
     if let (Some(ranges), Some(results)) = (&args.next, &args.results) {
-        return group::next(ranges, results, one(&args.output)?);
+        return group::write_next_ranges(ranges, results, single_output(&args.output)?);
     }
     let mut front = match &args.parameters {
         Some(path) => super::acquire::relief_of_file(path)?,
@@ -89,7 +89,7 @@ pub(crate) fn run(args: &PanelArgs) -> anyhow::Result<CommandOutcome> {
         super::acquire::set_all(back, &args.back_set)?;
     }
     // Wrong arguments are refused before anything is written.
-    let kinds = args.output.iter().map(|path| OutputKind::of(path)).collect::<anyhow::Result<Vec<_>>>()?;
+    let kinds = args.output.iter().map(|path| OutputKind::from_path(path)).collect::<anyhow::Result<Vec<_>>>()?;
     for (path, kind) in args.output.iter().zip(kinds) {
         write_one(path, kind, &front, back.as_ref(), args.cells.map(|n| n as usize))?;
     }
@@ -106,7 +106,7 @@ enum OutputKind {
 }
 
 impl OutputKind {
-    fn of(path: &Path) -> anyhow::Result<Self> {
+    fn from_path(path: &Path) -> anyhow::Result<Self> {
         Ok(match path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase).as_deref() {
             Some("png") => Self::Picture,
             Some("npy") => Self::Heights,
@@ -120,7 +120,7 @@ impl OutputKind {
         })
     }
 
-    fn bytes(self, relief: &PanelRelief) -> anyhow::Result<Vec<u8>> {
+    fn encode_relief(self, relief: &PanelRelief) -> anyhow::Result<Vec<u8>> {
         Ok(match self {
             Self::Picture => {
                 let pixels = relief.height_field(PICTURE_CELLS).to_pixels();
@@ -148,13 +148,13 @@ fn write_one(
                 Some(back) => Mesh::double_sided(&field(front), &field(back)),
                 None => Mesh::from_height_field(&field(front), BACK_MM),
             };
-            write(path, &mesh.to_bytes(format))?;
+            write_output(path, &mesh.to_bytes(format))?;
             eprintln!("{}: {} triangles", path.display(), mesh.triangles.len());
         }
-        (_, None) => write(path, &kind.bytes(front)?)?,
+        (_, None) => write_output(path, &kind.encode_relief(front)?)?,
         (_, Some(back)) => {
             for (side, relief) in [front, back].into_iter().enumerate() {
-                write(&of_side(path, side), &kind.bytes(relief)?)?;
+                write_output(&of_side(path, side), &kind.encode_relief(relief)?)?;
             }
         }
     }
@@ -171,13 +171,13 @@ fn of_side(path: &Path, side: usize) -> PathBuf {
     path.with_file_name(format!("{stem}_{side}.{extension}"))
 }
 
-fn one(outputs: &[PathBuf]) -> anyhow::Result<&Path> {
+fn single_output(outputs: &[PathBuf]) -> anyhow::Result<&Path> {
     match outputs {
         [path] => Ok(path),
         _ => bail!("{} outputs for a group; hint: one -o", outputs.len()),
     }
 }
 
-fn write(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
+fn write_output(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     std::fs::write(path, bytes).with_context(|| format!("cannot write `{}`", path.display()))
 }

@@ -19,7 +19,7 @@ pub(crate) struct RebuildArgs {
     pub(crate) table: Option<String>,
 }
 
-pub(crate) async fn run(args: &RebuildArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
+pub(crate) async fn run_rebuild(args: &RebuildArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let lake = Lake::open(lake_url).await?;
     let named = args.table.as_deref().and_then(Table::by_name);
     let tables = named.map_or_else(|| Table::ALL.to_vec(), |table| vec![table]);
@@ -28,7 +28,7 @@ pub(crate) async fn run(args: &RebuildArgs, lake_url: &str) -> anyhow::Result<Co
     }
     lake.begin_rebuild(&tables).await?;
     let args = IngestArgs { runs: Vec::new(), watch: false, json: false, suspect: None };
-    ingest::run(&args, lake_url).await
+    ingest::run_ingest(&args, lake_url).await
 }
 
 // What has no run file is in the tables alone.

@@ -20,27 +20,27 @@ pub(crate) struct RecoverArgs {
     pub(crate) json: bool,
 }
 
-pub(crate) fn run(args: &RecoverArgs) -> anyhow::Result<CommandOutcome> {
+pub(crate) fn run_recover(args: &RecoverArgs) -> anyhow::Result<CommandOutcome> {
     let to = args.output.clone().unwrap_or_else(|| beside(&args.file));
     let is_same = || matches!((args.file.canonicalize(), to.canonicalize()), (Ok(a), Ok(b)) if a == b);
     ensure!(!is_same(), "`{}` would be overwritten; hint: give another name with -o", args.file.display());
     let report = recover(&args.file, &to)?;
     match args.json {
-        true => super::print(&serde_json::to_string_pretty(&report)?)?,
-        false => tell(&report)?,
+        true => super::print_line(&serde_json::to_string_pretty(&report)?)?,
+        false => tell_report(&report)?,
     }
     Ok(if report.is_whole() { CommandOutcome::Whole } else { CommandOutcome::WithLoss })
 }
 
-fn tell(report: &Report) -> anyhow::Result<()> {
+fn tell_report(report: &Report) -> anyhow::Result<()> {
     let from = report.from.display();
     let Some(to) = &report.to else {
         eprintln!("`{from}` is whole: every checksum is right, nothing to do");
         return Ok(());
     };
-    super::print(&to.display().to_string())?;
+    super::print_line(&to.display().to_string())?;
     // Recordings that are none of a rig's, as imports, have no plan of pairs.
-    if let Some((measured, planned)) = Held::read(to).ok().and_then(|held| count_pairs(&held)) {
+    if let Some((measured, planned)) = Held::from_file(to).ok().and_then(|held| count_pairs(&held)) {
         eprintln!("made a run of {measured} of {planned} pairs");
     }
     let of = |topic: &str| report.messages.get(topic).copied().unwrap_or(0);
@@ -54,7 +54,7 @@ fn tell(report: &Report) -> anyhow::Result<()> {
     );
     match report.is_whole() {
         true => eprintln!("lost: nothing"),
-        false => eprintln!("lost: {} bytes{}", report.lost_bytes(), places(report)),
+        false => eprintln!("lost: {} bytes{}", report.lost_bytes(), lost_places(report)),
     }
     for line in &report.damage {
         eprintln!("damage: {line}");
@@ -71,12 +71,12 @@ fn tell(report: &Report) -> anyhow::Result<()> {
 }
 
 // Where in the recording the lost bytes are.
-fn places(report: &Report) -> String {
+fn lost_places(report: &Report) -> String {
     let places: Vec<_> = report.lost.iter().map(|range| format!("{}..{}", range.start, range.end)).collect();
     if places.is_empty() { String::new() } else { format!(", at {}", places.join(", ")) }
 }
 
 // Pairs with an accepted measurement, and all pairs of the rig.
 fn count_pairs(held: &Held) -> Option<(usize, usize)> {
-    Some((held.accepted(), held.rig.grid().ok()?.pairs().len()))
+    Some((held.accepted_count(), held.rig.build_grid().ok()?.pairs().len()))
 }

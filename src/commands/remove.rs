@@ -25,7 +25,7 @@ pub(crate) struct RemoveArgs {
     pub(crate) json: bool,
 }
 
-pub(crate) async fn run(args: &RemoveArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
+pub(crate) async fn run_remove(args: &RemoveArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let stop = super::stop_request()?;
     let lake = Lake::open(lake_url).await?;
     let progress = CommandProgress::new();
@@ -34,7 +34,7 @@ pub(crate) async fn run(args: &RemoveArgs, lake_url: &str) -> anyhow::Result<Com
         // A removal that is repeated has nothing to do.
         match find_removals(&lake, std::slice::from_ref(name)).await {
             Err(absent @ echolake_ingest::Error::NoRun { .. }) => match find_removed(&lake, name).await {
-                Some(path) => progress.say(format!("{name}: is not in the lake; its file is at `{path}`")),
+                Some(path) => progress.print_message(format!("{name}: is not in the lake; its file is at `{path}`")),
                 None => return Err(absent.into()),
             },
             found => found.map(|_| names.push(name.clone()))?,
@@ -43,33 +43,36 @@ pub(crate) async fn run(args: &RemoveArgs, lake_url: &str) -> anyhow::Result<Com
     let mut removals = find_removals(&lake, &names).await?;
     if !args.dry_run && !removals.is_empty() {
         let ingest = LakeIngest::new(&lake, stop.flag().clone());
-        let removed = remove(&ingest, &mut removals, args, &progress).await;
-        ingest.close().await;
+        let removed = remove_runs(&ingest, &mut removals, args, &progress).await;
+        ingest.release_claims().await;
         removed?;
     }
     if args.json {
-        super::print(&serde_json::to_string_pretty(&removals)?)?;
+        super::print_line(&serde_json::to_string_pretty(&removals)?)?;
         return Ok(CommandOutcome::Whole);
     }
     for removal in &removals {
-        super::print(&describe_removal(removal, args))?;
+        super::print_line(&describe_removal(removal, args))?;
     }
     Ok(CommandOutcome::Whole)
 }
 
-async fn remove(
+async fn remove_runs(
     ingest: &LakeIngest<'_>,
     removals: &mut [RunRemoval],
     args: &RemoveArgs,
     progress: &CommandProgress,
 ) -> anyhow::Result<()> {
     let file = if args.delete { RemovedFile::Deleted } else { RemovedFile::Kept };
-    ingest.remove(removals, file, &user_name()).await?;
+    ingest.remove_runs(removals, file, &user_name()).await?;
     // Rows that were derived with them.
     let mut rows = 0;
     let completion = ingest.complete_runs(&mut |completed, _| rows += completed.measurements).await?;
     if completion.changed > 0 {
-        progress.say(format!("{} runs have other references now, {rows} measurements derived", completion.changed));
+        progress.print_message(format!(
+            "{} runs have other references now, {rows} measurements derived",
+            completion.changed
+        ));
     }
     Ok(())
 }
@@ -87,9 +90,9 @@ fn describe_removal(removal: &RunRemoval, args: &RemoveArgs) -> String {
     let would = if args.dry_run { "would be " } else { "" };
     let file = match (&removal.file, &removal.moved_to) {
         (None, _) => "its file was gone".to_owned(),
-        (Some(file), _) if args.delete => format!("`{file}` ({}) {would}deleted", super::size(*bytes)),
+        (Some(file), _) if args.delete => format!("`{file}` ({}) {would}deleted", super::format_size(*bytes)),
         (Some(_), Some(to)) => format!("its file is at `{to}`"),
-        (Some(file), None) => format!("`{file}` ({}) {would}moved to quarantine/", super::size(*bytes)),
+        (Some(file), None) => format!("`{file}` ({}) {would}moved to quarantine/", super::format_size(*bytes)),
     };
     format!("{run}: {measurements} measurements {would}removed; {file}")
 }

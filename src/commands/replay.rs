@@ -27,7 +27,7 @@ pub(crate) struct ReplayArgs {
     #[command(flatten)]
     pub(crate) viewers: ViewerArgs,
     /// Initial speed, as a factor of real time.
-    #[arg(long, value_name = "X", default_value_t = 1.0, value_parser = speed)]
+    #[arg(long, value_name = "X", default_value_t = 1.0, value_parser = parse_speed)]
     pub(crate) speed: f32,
     /// Start paused, until a viewer presses play; by default playback begins with the first viewer.
     #[arg(long)]
@@ -38,7 +38,7 @@ pub(crate) struct ReplayArgs {
 #[derive(Debug, Args)]
 pub(crate) struct ViewerArgs {
     /// Allow a viewer that is a web page of another origin, such as `https://app.foxglove.dev`; repeatable.
-    #[arg(long = "allow-origin", value_name = "URL", value_parser = origin)]
+    #[arg(long = "allow-origin", value_name = "URL", value_parser = parse_origin)]
     pub(crate) allowed_origins: Vec<String>,
     /// Allow other machines without the token that is part of the printed address.
     #[arg(long)]
@@ -46,13 +46,13 @@ pub(crate) struct ViewerArgs {
 }
 
 impl ViewerArgs {
-    pub(crate) fn access(&self) -> ViewerAccess {
+    pub(crate) fn viewer_access(&self) -> ViewerAccess {
         ViewerAccess { allowed_origins: self.allowed_origins.clone(), is_open: self.open }
     }
 }
 
 // As browsers spell it.
-fn origin(text: &str) -> Result<String, String> {
+fn parse_origin(text: &str) -> Result<String, String> {
     let origin = text.trim_end_matches('/').to_ascii_lowercase();
     let is_origin = origin.split_once("://").is_some_and(|(scheme, host)| {
         !scheme.is_empty() && !host.is_empty() && !host.contains(['/', '?', '#', '@', ' '])
@@ -60,7 +60,7 @@ fn origin(text: &str) -> Result<String, String> {
     if is_origin { Ok(origin) } else { Err("expected scheme and host, as https://viewer.example:8080".to_owned()) }
 }
 
-fn speed(text: &str) -> Result<f32, String> {
+fn parse_speed(text: &str) -> Result<f32, String> {
     let speed = text.parse().ok().filter(|x| SPEEDS.contains(x));
     speed.ok_or_else(|| format!("expected a number from {} to {}", SPEEDS.start(), SPEEDS.end()))
 }
@@ -71,34 +71,34 @@ const LOOK_EVERY: Duration = Duration::from_millis(200);
 #[cfg(feature = "lake")]
 const LISTED: usize = 20;
 
-pub(crate) async fn run(args: &ReplayArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
+pub(crate) async fn run_replay(args: &ReplayArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let stop = super::stop_request()?;
-    let paths = paths(&args.runs, lake_url).await?;
+    let paths = find_recordings(&args.runs, lake_url).await?;
     let progress = CommandProgress::new();
-    let (recordings, lost) = tokio::task::block_in_place(|| open(&paths, &progress));
+    let (recordings, lost) = tokio::task::block_in_place(|| open_recordings(&paths, &progress));
     anyhow::ensure!(!recordings.is_empty(), "none of the recordings can be replayed");
     let count = recordings.len();
     let options = ReplayOptions { speed: args.speed, paused: args.paused };
-    let server = ReplayServer::start(args.listen, args.viewers.access(), recordings, options)?;
-    progress.say(format!("replay: open {} in Foxglove or Lichtblick; Ctrl-C ends it", server.url()));
+    let server = ReplayServer::start(args.listen, args.viewers.viewer_access(), recordings, options)?;
+    progress.print_message(format!("replay: open {} in Foxglove or Lichtblick; Ctrl-C ends it", server.url()));
     super::tell_access(&args.viewers, server.address(), &progress);
-    let mut task = progress.task("replay", server.length_secs().ceil() as u64, "s");
+    let mut task = progress.start_task("replay", server.length_secs().ceil() as u64, "s");
     let mut shown = ShownState::default();
     while !stop.is_made() {
         // The time that runs out is the usual end of this wait.
-        let _ = tokio::time::timeout(LOOK_EVERY, stop.wait()).await;
+        let _ = tokio::time::timeout(LOOK_EVERY, stop.wait_until_made()).await;
         let standing = server.standing();
-        shown.update(&mut task, &standing);
+        shown.show_state(&mut task, &standing);
     }
     let standing = server.standing();
-    shown.update(&mut task, &standing);
+    shown.show_state(&mut task, &standing);
     tokio::task::block_in_place(|| drop(server));
-    task.done(format!("{count} recordings, {:.0} s shown last", standing.shown_secs));
+    task.finish_with(format!("{count} recordings, {:.0} s shown last", standing.shown_secs));
     Ok(if lost || !standing.damages.is_empty() { CommandOutcome::WithLoss } else { CommandOutcome::Whole })
 }
 
 // Opens recordings, sorted by time; returns also whether one is damaged.
-fn open(paths: &[PathBuf], progress: &CommandProgress) -> (Vec<Recording>, bool) {
+fn open_recordings(paths: &[PathBuf], progress: &CommandProgress) -> (Vec<Recording>, bool) {
     let (mut recordings, mut lost) = (Vec::new(), false);
     for opened in paths.iter().map(|path| Recording::open(path)) {
         match opened {
@@ -106,20 +106,23 @@ fn open(paths: &[PathBuf], progress: &CommandProgress) -> (Vec<Recording>, bool)
                 if let Some(defect) = recording.defect() {
                     lost = true;
                     let path = recording.path().display();
-                    progress.say(format!("warning: `{path}` is not whole: {defect}; what is whole of it is shown"));
+                    progress.print_message(format!(
+                        "warning: `{path}` is not whole: {defect}; what is whole of it is shown"
+                    ));
                 }
                 recordings.push(recording);
             }
             Err(error) => {
                 lost = true;
-                progress.say(format!("error: {:#}", anyhow::Error::from(error)));
+                progress.print_message(format!("error: {:#}", anyhow::Error::from(error)));
             }
         }
     }
-    recordings.sort_by_key(|recording| recording.range().0);
-    for pair in recordings.windows(2).filter(|pair| pair[1].range().0 <= pair[0].range().1) {
+    recordings.sort_by_key(|recording| recording.time_range().0);
+    for pair in recordings.windows(2).filter(|pair| pair[1].time_range().0 <= pair[0].time_range().1) {
         let [earlier, later] = [&pair[0], &pair[1]].map(|recording| recording.path().display());
-        progress.say(format!("warning: `{later}` begins before `{earlier}` ends; time goes back between them"));
+        progress
+            .print_message(format!("warning: `{later}` begins before `{earlier}` ends; time goes back between them"));
     }
     (recordings, lost)
 }
@@ -134,21 +137,21 @@ struct ShownState {
 
 impl ShownState {
     // A journal gets no lines while nobody looks on.
-    fn update(&mut self, task: &mut TaskProgress, standing: &ReplayState) {
+    fn show_state(&mut self, task: &mut TaskProgress, standing: &ReplayState) {
         for damage in &standing.damages[self.damages..] {
-            task.say(&format!("warning: {damage}"));
+            task.print_message(&format!("warning: {damage}"));
         }
         self.damages = standing.damages.len();
-        let now = (standing.shown_secs as u64, describe(standing));
+        let now = (standing.shown_secs as u64, describe_state(standing));
         if task.is_due() && self.progress.as_ref() != Some(&now) {
-            task.note(now.1.clone());
-            task.at(now.0);
+            task.set_note(now.1.clone());
+            task.set_done(now.0);
             self.progress = Some(now);
         }
     }
 }
 
-fn describe(standing: &ReplayState) -> String {
+fn describe_state(standing: &ReplayState) -> String {
     let state = if standing.is_playing { "" } else { ", stands" };
     let lost = if standing.lost == 0 { String::new() } else { format!(", {} lost", standing.lost) };
     let name = standing.recording.file_stem().unwrap_or_default().to_string_lossy();
@@ -156,7 +159,7 @@ fn describe(standing: &ReplayState) -> String {
 }
 
 // Files by their paths, runs and surfaces by the lake's tables.
-async fn paths(names: &[String], lake_url: &str) -> anyhow::Result<Vec<PathBuf>> {
+async fn find_recordings(names: &[String], lake_url: &str) -> anyhow::Result<Vec<PathBuf>> {
     let (mut paths, mut lake) = (Vec::new(), None);
     for name in names {
         let path = Path::new(name);

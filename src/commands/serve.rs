@@ -90,7 +90,7 @@ impl QueryArgs {
         Ok(EngineSettings {
             temp: self.temp.clone(),
             slow: self.log_slow,
-            cache: self.cache.folder().filter(|_| lake.is_remote()),
+            cache: self.cache.cache_folder().filter(|_| lake.is_remote()),
             ..default_engine_settings(self.memory, count)?
         })
     }
@@ -117,9 +117,9 @@ pub(crate) struct EngineArgs {
 
 impl EngineArgs {
     /// Gives up what an engine does not need. To be called before there are threads.
-    pub(crate) fn confine(&self, lake_url: &str) -> anyhow::Result<()> {
+    pub(crate) fn confine_process(&self, lake_url: &str) -> anyhow::Result<()> {
         let temp = std::env::temp_dir();
-        let cache = self.cache.folder();
+        let cache = self.cache.cache_folder();
         let own: Vec<_> = [self.sockets.as_path(), &temp]
             .into_iter()
             .chain(cache.as_ref().map(|cache| cache.path.as_path()))
@@ -134,7 +134,7 @@ impl EngineArgs {
 }
 
 /// Answers one client's queries, until the door that started it ends.
-pub(crate) async fn engine(args: &EngineArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
+pub(crate) async fn serve_engine(args: &EngineArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     // A service manager may signal all processes of a service: an engine ends with its door.
     let _ignored = signal(SignalKind::terminate()).context("cannot listen to SIGTERM")?;
     let lake = args.cache.open_lake(lake_url).await?;
@@ -162,7 +162,7 @@ impl FromStr for ListenAddress {
 }
 
 impl ListenAddress {
-    fn address(self) -> Option<SocketAddr> {
+    fn socket_address(self) -> Option<SocketAddr> {
         match self {
             Self::Off => None,
             Self::On(address) => Some(address),
@@ -173,16 +173,16 @@ impl ListenAddress {
 /// The default address of HTTP.
 const HTTP: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 8080);
 
-pub(crate) async fn run(args: &ServeArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
+pub(crate) async fn run_serve(args: &ServeArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let reply = format!("stopping: answers may go on for {:?}; Ctrl-C again stops at once", args.drain);
     let stop = StopRequest::listen(reply)?;
     let lake = args.queries.open_lake(lake_url).await?;
     let settings = ServerSettings {
-        http: args.listen.address(),
-        flight_sql: args.flight_sql.address(),
+        http: args.listen.socket_address(),
+        flight_sql: args.flight_sql.socket_address(),
         #[cfg(feature = "postgres")]
-        postgres: args.postgres.address(),
-        tokens: args.tokens.as_deref().map(TokenFile::read).transpose()?,
+        postgres: args.postgres.socket_address(),
+        tokens: args.tokens.as_deref().map(TokenFile::read_from).transpose()?,
         certificate: args
             .certificate
             .clone()
@@ -193,16 +193,16 @@ pub(crate) async fn run(args: &ServeArgs, lake_url: &str) -> anyhow::Result<Comm
         engines: args.queries.engine_settings(&lake, args.engines)?,
     };
     let server = LakeServer::bind(&lake, settings)?;
-    anyhow::ensure!(!server.addresses().is_empty(), "nothing to listen on; hint: all three are off");
+    anyhow::ensure!(!server.listening_urls().is_empty(), "nothing to listen on; hint: all three are off");
     eprintln!("lake {}", lake.location());
-    if let Some(missing) = confinement::missing() {
+    if let Some(missing) = confinement::missing_support() {
         eprintln!("note: {missing}");
     }
-    answer(server, &stop).await
+    run_server(server, &stop).await
 }
 
 /// Serves the catalogue alone, at the default address or, if that is taken, on any free port.
-pub(crate) async fn catalogue(lake: &Lake, stop: &StopRequest) -> anyhow::Result<CommandOutcome> {
+pub(crate) async fn serve_catalogue(lake: &Lake, stop: &StopRequest) -> anyhow::Result<CommandOutcome> {
     let engines = default_engine_settings(MEMORY_MIB, ENGINES)?;
     let settings = |http| ServerSettings {
         http: Some(http),
@@ -220,7 +220,7 @@ pub(crate) async fn catalogue(lake: &Lake, stop: &StopRequest) -> anyhow::Result
         bound => bound?,
     };
     eprintln!("the catalogue, until Ctrl-C:");
-    answer(server, stop).await
+    run_server(server, stop).await
 }
 
 fn default_engine_settings(memory_mib: u32, count: u32) -> anyhow::Result<EngineSettings> {
@@ -237,14 +237,14 @@ fn default_engine_settings(memory_mib: u32, count: u32) -> anyhow::Result<Engine
     })
 }
 
-async fn answer(server: LakeServer, stop: &StopRequest) -> anyhow::Result<CommandOutcome> {
-    if let Some(problem) = CataloguePages::THIS_BUILD.problem() {
+async fn run_server(server: LakeServer, stop: &StopRequest) -> anyhow::Result<CommandOutcome> {
+    if let Some(problem) = CataloguePages::THIS_BUILD.missing_reason() {
         eprintln!("note: this program was {problem}");
     }
-    for address in server.addresses() {
+    for address in server.listening_urls() {
         eprintln!("  {address}");
     }
-    server.run(stop.wait()).await?;
+    server.serve_until(stop.wait_until_made()).await?;
     Ok(CommandOutcome::Whole)
 }
 
@@ -260,7 +260,7 @@ pub(crate) struct CertificateArgs {
 }
 
 /// Writes a self-signed certificate and its key.
-pub(crate) fn certificate(args: &CertificateArgs) -> anyhow::Result<CommandOutcome> {
+pub(crate) fn write_certificate(args: &CertificateArgs) -> anyhow::Result<CommandOutcome> {
     let made = self_signed(&args.names)?;
     std::fs::create_dir_all(&args.output).with_context(|| format!("cannot make `{}`", args.output.display()))?;
     // The key first: nobody but its owner reads it, from its first byte on.
@@ -269,14 +269,14 @@ pub(crate) fn certificate(args: &CertificateArgs) -> anyhow::Result<CommandOutco
         let failed = || format!("cannot write `{}`; hint: another folder, -o DIR", path.display());
         let mut file = OpenOptions::new().write(true).create_new(true).mode(mode).open(&path).with_context(failed)?;
         file.write_all(text.as_bytes()).and_then(|()| file.sync_all()).with_context(failed)?;
-        super::print(&path.display().to_string())?;
+        super::print_line(&path.display().to_string())?;
     }
     eprintln!("clients trust it by having certificate.pem; the key stays on the server");
     Ok(CommandOutcome::Whole)
 }
 
 /// Prints a new token to stderr, once, and its lines for the file of tokens to stdout.
-pub(crate) fn token(
+pub(crate) fn print_token(
     name: &str,
     days: Option<u32>,
     projects: &[ProjectName],
@@ -286,8 +286,8 @@ pub(crate) fn token(
         projects.is_empty() || !scopes.contains(&TokenScope::Metrics),
         "a token of projects cannot have the scope metrics, whose figures are of all projects; hint: make two tokens"
     );
-    let fresh = tokens::fresh(name, days, projects, scopes)?;
+    let fresh = tokens::generate_token(name, days, projects, scopes)?;
     eprintln!("{}\nthis token is kept nowhere: only its hash is, in the lines for the file of --tokens", fresh.token);
-    super::print(fresh.lines.trim_end())?;
+    super::print_line(fresh.lines.trim_end())?;
     Ok(CommandOutcome::Whole)
 }

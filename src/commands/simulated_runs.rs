@@ -10,7 +10,7 @@ use anyhow::Context as _;
 use echolake_acquisition::run::RunRequest;
 use echolake_acquisition::run::controller::RecordingMode;
 use echolake_acquisition::run::recorder::random_tag;
-use echolake_acquisition::run::simulate::simulate;
+use echolake_acquisition::run::simulate::run_simulation;
 use echolake_panel::PanelSpecimen;
 use echolake_schema::manifest::{Origin, RunEnd};
 use echolake_schema::{ProjectName, Rig, RunId, SurfaceId, Timestamp};
@@ -81,17 +81,18 @@ struct SimulationTotals {
 
 impl SimulationPlan {
     /// Measures the surfaces that are missing. When `stop` becomes true, it ends after those that are being measured.
-    pub(super) fn measure(mut self, stop: &AtomicBool, progress: &CommandProgress) -> anyhow::Result<()> {
+    pub(super) fn measure_missing(mut self, stop: &AtomicBool, progress: &CommandProgress) -> anyhow::Result<()> {
         self.look_for_runs()?;
         let plan = &self;
         let cores = std::thread::available_parallelism().map_or(1, usize::from);
         let begun = Instant::now();
         let count = plan.runs.len();
-        let whole = (count > TOLD_EACH).then(|| Mutex::new((progress.task("measure", count as u64, "surfaces"), 0)));
+        let whole =
+            (count > TOLD_EACH).then(|| Mutex::new((progress.start_task("measure", count as u64, "surfaces"), 0)));
         let shared = SimulationState { plan, progress, stop, next: AtomicUsize::new(0), whole, made: Mutex::default() };
         std::thread::scope(|scope| {
             for _ in 0..cores.min(count) {
-                scope.spawn(|| shared.work());
+                scope.spawn(|| shared.measure_next_runs());
             }
         });
         let SimulationState { whole, made, .. } = shared;
@@ -103,7 +104,7 @@ impl SimulationPlan {
         if let Some(whole) = whole {
             let (task, _) = whole.into_inner().unwrap_or_else(PoisonError::into_inner);
             let rate = accepted as f64 / begun.elapsed().as_secs_f64();
-            task.done(format!(
+            task.finish_with(format!(
                 "{runs} of {count} surfaces made, {accepted} pairs in {attempts} attempts, {rate:.0} pairs a second, {:.0} MB",
                 bytes as f64 / 1e6
             ));
@@ -113,14 +114,14 @@ impl SimulationPlan {
 
     // Adds the runs in the folder to those that are known, and removes what a simulation that was killed left behind.
     fn look_for_runs(&mut self) -> anyhow::Result<()> {
-        let ours = self.runs.iter().map(|run| Ok(run.run_id(0)?.untagged().to_owned()));
+        let ours = self.runs.iter().map(|run| Ok(run.run_id(0)?.untagged_name().to_owned()));
         let ours: HashSet<String> = ours.collect::<anyhow::Result<_>>()?;
         let unread = || format!("cannot read `{}`", self.folder.display());
         for entry in std::fs::read_dir(&self.folder).with_context(unread)? {
             let path = entry.with_context(unread)?.path();
             let name = path.file_name().unwrap_or_default().to_string_lossy();
             let Some((name, ending)) = name.split_once('.') else { continue };
-            let Some(untagged) = name.parse::<RunId>().ok().map(|run| run.untagged().to_owned()) else { continue };
+            let Some(untagged) = name.parse::<RunId>().ok().map(|run| run.untagged_name().to_owned()) else { continue };
             match ending {
                 "mcap" => _ = self.known.insert(untagged),
                 "mcap.partial" if ours.contains(&untagged) => {
@@ -140,11 +141,11 @@ impl PlannedRun {
 }
 
 impl SimulationState<'_> {
-    fn work(&self) {
+    fn measure_next_runs(&self) {
         while !self.stop.load(Ordering::Relaxed) {
             let number = self.next.fetch_add(1, Ordering::Relaxed);
             let Some(planned) = self.plan.runs.get(number) else { return };
-            let outcome = self.measure(planned);
+            let outcome = self.measure_planned(planned);
             let mut made = self.made.lock().unwrap_or_else(PoisonError::into_inner);
             match outcome {
                 Ok(None) => {}
@@ -160,27 +161,27 @@ impl SimulationState<'_> {
                 }
             }
             drop(made);
-            self.tell();
+            self.show_progress();
         }
     }
 
-    fn tell(&self) {
+    fn show_progress(&self) {
         if let Some(whole) = &self.whole {
             let mut whole = whole.lock().unwrap_or_else(PoisonError::into_inner);
             let (task, done) = &mut *whole;
             *done += 1;
-            task.at(*done);
+            task.set_done(*done);
         }
     }
 
     // Returns how the run ended and its size; nothing if it was measured before.
-    fn measure(&self, planned: &PlannedRun) -> anyhow::Result<Option<(RunEnd, u64)>> {
+    fn measure_planned(&self, planned: &PlannedRun) -> anyhow::Result<Option<(RunEnd, u64)>> {
         let SimulationPlan { rig, keep, folder, known, .. } = self.plan;
         let PlannedRun { surface, specimen, macro_reference, flat, foam, project, start, seed } = planned;
         let tag = random_tag();
-        if known.contains(planned.run_id(tag)?.untagged()) {
+        if known.contains(planned.run_id(tag)?.untagged_name()) {
             if self.whole.is_none() {
-                self.progress.say(format!("{surface}: measured before"));
+                self.progress.print_message(format!("{surface}: measured before"));
             }
             return Ok(None);
         }
@@ -198,19 +199,20 @@ impl SimulationState<'_> {
             keep: *keep,
             folder,
         };
-        let pairs = rig.grid()?.pairs().len();
-        let mut task = self.whole.is_none().then(|| self.progress.task(surface.to_string(), pairs as u64, "pairs"));
+        let pairs = rig.build_grid()?.pairs().len();
+        let mut task =
+            self.whole.is_none().then(|| self.progress.start_task(surface.to_string(), pairs as u64, "pairs"));
         let begun = Instant::now();
         // A simulated run takes seconds and is always completed: a stop only keeps the next one from beginning.
-        let measured = simulate(&run, Origin::Simulated, &AtomicBool::new(false), &mut |done| {
+        let measured = run_simulation(&run, Origin::Simulated, &AtomicBool::new(false), &mut |done| {
             if let Some(task) = &mut task {
-                task.at(done as u64);
+                task.set_done(done as u64);
             }
         });
         let (path, end) = measured.with_context(|| format!("surface {surface}"))?;
         if let Some(task) = task {
             let rate = end.attempts as f64 / begun.elapsed().as_secs_f64();
-            task.done(format!("{} pairs in {} attempts, {rate:.0} a second", end.accepted, end.attempts));
+            task.finish_with(format!("{} pairs in {} attempts, {rate:.0} a second", end.accepted, end.attempts));
         }
         let bytes = path.metadata().with_context(|| format!("cannot read `{}`", path.display()))?.len();
         Ok(Some((end, bytes)))

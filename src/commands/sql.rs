@@ -57,19 +57,19 @@ impl From<FormatArg> for AnswerFormat {
     }
 }
 
-pub(crate) async fn run(args: &SqlArgs, lake_url: &str) -> anyhow::Result<()> {
+pub(crate) async fn run_sql(args: &SqlArgs, lake_url: &str) -> anyhow::Result<()> {
     let lake = args.cache.open_lake(lake_url).await?;
     let session = Session::new(&lake)?;
     let query = match args.query.as_deref() {
         Some("-") => from_stdin()?,
         Some(query) => query.to_owned(),
-        None if std::io::stdin().is_terminal() => return prompt::run(&session, &lake).await,
+        None if std::io::stdin().is_terminal() => return prompt::run_prompt(&session, &lake).await,
         None => from_stdin()?,
     };
     if let Some(text) = prompt::command_answer(&session, &query) {
         let is_plain = args.output.is_none() && !args.json && args.format == FormatArg::Table;
         anyhow::ensure!(is_plain, "`{query}` answers as text; hint: leave --format, --json and -o out");
-        return Ok(super::print(&text?)?);
+        return Ok(super::print_line(&text?)?);
     }
     let format = match (args.json, args.format, args.escape_formulas) {
         (true, ..) => AnswerFormat::Json,
@@ -86,7 +86,7 @@ pub(crate) async fn run(args: &SqlArgs, lake_url: &str) -> anyhow::Result<()> {
                 "{} is not for a terminal; hint: -o FILE",
                 format.name()
             );
-            write(answer, format, BufWriter::new(std::io::stdout())).await.map(drop)
+            write_answer(answer, format, BufWriter::new(std::io::stdout())).await.map(drop)
         }
     }
 }
@@ -99,11 +99,11 @@ fn from_stdin() -> anyhow::Result<String> {
 
 /// Prints an answer for people.
 pub(super) async fn print_table(session: &Session, sql: &str) -> anyhow::Result<()> {
-    write(session.query(sql).await?, AnswerFormat::Table, std::io::stdout()).await.map(drop)
+    write_answer(session.query(sql).await?, AnswerFormat::Table, std::io::stdout()).await.map(drop)
 }
 
 /// Returns the rows of a query.
-pub(super) async fn rows<T: DeserializeOwned>(session: &Session, sql: &str) -> anyhow::Result<Vec<T>> {
+pub(super) async fn query_rows<T: DeserializeOwned>(session: &Session, sql: &str) -> anyhow::Result<Vec<T>> {
     let mut answer = session.query(sql).await?;
     let mut rows = Vec::new();
     while let Some(batch) = answer.next().await? {
@@ -113,7 +113,7 @@ pub(super) async fn rows<T: DeserializeOwned>(session: &Session, sql: &str) -> a
     Ok(rows)
 }
 
-async fn write(mut answer: QueryAnswer, format: AnswerFormat, to: impl Write + Send) -> anyhow::Result<usize> {
+async fn write_answer(mut answer: QueryAnswer, format: AnswerFormat, to: impl Write + Send) -> anyhow::Result<usize> {
     let mut writer = AnswerWriter::new(format, &answer.schema, to)?;
     while let Some(batch) = answer.next().await? {
         writer.write(&batch)?;
@@ -130,13 +130,13 @@ async fn to_file(answer: QueryAnswer, format: AnswerFormat, path: &Path) -> anyh
     let failed = || format!("cannot write `{}`", path.display());
     if path.metadata().is_ok_and(|m| !m.is_file()) {
         let special = OpenOptions::new().write(true).open(path).with_context(failed)?;
-        return write(answer, format, BufWriter::new(special)).await;
+        return write_answer(answer, format, BufWriter::new(special)).await;
     }
     let mut partial = path.as_os_str().to_owned();
     partial.push(".partial");
     let partial = PathBuf::from(partial);
     let file = File::create(&partial).with_context(failed)?;
-    let written = write(answer, format, BufWriter::new(file)).await;
+    let written = write_answer(answer, format, BufWriter::new(file)).await;
     let named = written.and_then(|rows| {
         std::fs::rename(&partial, path).with_context(failed)?;
         eprintln!("{}: {rows} rows", path.display());

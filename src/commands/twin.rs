@@ -8,8 +8,8 @@ use anyhow::Context as _;
 use clap::Args;
 use echolake_acquisition::run::RunRequest;
 use echolake_acquisition::run::controller::RecordingMode;
-use echolake_acquisition::run::simulate::simulate;
-use echolake_ingest::pending;
+use echolake_acquisition::run::simulate::run_simulation;
+use echolake_ingest::pending_runs;
 use echolake_lake::Lake;
 use echolake_panel::PanelSpecimen;
 use echolake_panel::material::SurfaceMaterial;
@@ -91,7 +91,7 @@ struct TwinDifferences {
     pairs: Vec<PairDifference>,
 }
 
-pub(crate) async fn run(args: &TwinArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
+pub(crate) async fn run_twin(args: &TwinArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let surface = &args.surface;
     anyhow::ensure!(
         !surface.as_str().starts_with(TWIN),
@@ -101,18 +101,18 @@ pub(crate) async fn run(args: &TwinArgs, lake_url: &str) -> anyhow::Result<Comma
     let lake = Lake::open(lake_url).await?;
     lake.ensure_tables().await?;
     let progress = CommandProgress::new();
-    progress.say("simulated rig: the twin is computed, not measured");
+    progress.print_message("simulated rig: the twin is computed, not measured");
     let path = super::replay::run_file(&lake, surface.as_str()).await?;
     let computing = TwinComputation::new(&lake, surface, &path).await?;
     let flag = stop.clone();
     tokio::task::spawn_blocking(move || computing.compute_missing(flag.flag(), &progress)).await??;
     anyhow::ensure!(!stop.is_made(), "stopped; hint: run the same command again to resume");
-    super::ingest::ingest_runs(&lake, pending(&lake).await?, stop.flag(), &CommandProgress::new()).await?;
+    super::ingest::ingest_runs(&lake, pending_runs(&lake).await?, stop.flag(), &CommandProgress::new()).await?;
     anyhow::ensure!(!stop.is_made(), "stopped; hint: run the same command again to resume");
-    let differences = TwinDifferences::read(&lake, surface, args.pairs).await?;
+    let differences = TwinDifferences::read_from_lake(&lake, surface, args.pairs).await?;
     match args.json {
-        true => super::print(&serde_json::to_string_pretty(&differences)?)?,
-        false => differences.print()?,
+        true => super::print_line(&serde_json::to_string_pretty(&differences)?)?,
+        false => differences.print_differences()?,
     }
     Ok(CommandOutcome::Whole)
 }
@@ -170,20 +170,20 @@ impl TwinComputation {
         rig.simulation.noise_and_drift = false;
         rig.simulation.repeatability_mm = 0.0;
         rig.simulation.calibration_mm = 0.0;
-        Ok(Self { rig, folder: super::inbox(lake)?, _mesh: mesh, runs })
+        Ok(Self { rig, folder: super::prepare_inbox(lake)?, _mesh: mesh, runs })
     }
 
     fn compute_missing(&self, stop: &AtomicBool, progress: &CommandProgress) -> anyhow::Result<()> {
         std::thread::scope(|scope| {
             let computing: Vec<_> =
-                self.runs.iter().map(|run| scope.spawn(|| self.compute(run, stop, progress))).collect();
+                self.runs.iter().map(|run| scope.spawn(|| self.compute_run(run, stop, progress))).collect();
             computing
                 .into_iter()
                 .try_for_each(|thread| thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
         })
     }
 
-    fn compute(&self, run: &ComputedRun, stop: &AtomicBool, progress: &CommandProgress) -> anyhow::Result<()> {
+    fn compute_run(&self, run: &ComputedRun, stop: &AtomicBool, progress: &CommandProgress) -> anyhow::Result<()> {
         let request = RunRequest {
             rig: &self.rig,
             surface: run.surface.clone(),
@@ -206,10 +206,11 @@ impl TwinComputation {
         if self.folder.join(format!("{}.mcap", run.id()?)).exists() {
             return Ok(());
         }
-        let mut task = progress.task(run.surface.to_string(), self.rig.grid()?.pairs().len() as u64, "pairs");
-        let made = simulate(&request, Origin::Computed, stop, &mut |done| task.at(done as u64));
+        let mut task =
+            progress.start_task(run.surface.to_string(), self.rig.build_grid()?.pairs().len() as u64, "pairs");
+        let made = run_simulation(&request, Origin::Computed, stop, &mut |done| task.set_done(done as u64));
         let (_, end) = made.with_context(|| format!("surface {}", run.surface))?;
-        task.done(format!("{} pairs computed", end.accepted));
+        task.finish_with(format!("{} pairs computed", end.accepted));
         Ok(())
     }
 }
@@ -247,12 +248,12 @@ fn take_mesh(run: &Path, to: &Path) -> anyhow::Result<Option<ProjectName>> {
 }
 
 impl TwinDifferences {
-    async fn read(lake: &Lake, surface: &SurfaceId, pairs: usize) -> anyhow::Result<Self> {
+    async fn read_from_lake(lake: &Lake, surface: &SurfaceId, pairs: usize) -> anyhow::Result<Self> {
         let session = Session::new(lake)?;
         let twin = format!("{TWIN}{surface}");
         let bands = lake.rig().band_names();
         let sql = format!("select max(origin) as origin from surfaces where surface_id = '{surface}'");
-        let origin = super::sql::rows::<SurfaceOrigin>(&session, &sql).await?.pop().and_then(|row| row.origin);
+        let origin = super::sql::query_rows::<SurfaceOrigin>(&session, &sql).await?.pop().and_then(|row| row.origin);
         let mut found = Self {
             surface_id: surface.clone(),
             origin: origin.unwrap_or_default(),
@@ -287,14 +288,14 @@ impl TwinDifferences {
                  cast((select max({phase}) from surfaces where surface_id = '{twin}') as double) as detail_phase \
                  from ({joined})"
             );
-            found.bands.extend(super::sql::rows::<BandDifference>(&session, &summary).await?);
+            found.bands.extend(super::sql::query_rows::<BandDifference>(&session, &summary).await?);
             every.push(joined);
         }
         let farthest = format!(
             "select * from ({}) order by abs(difference_db) desc, pair_id, band limit {pairs}",
             every.join(" union all ")
         );
-        found.pairs = super::sql::rows(&session, &farthest).await?;
+        found.pairs = super::sql::query_rows(&session, &farthest).await?;
         anyhow::ensure!(
             found.bands.iter().any(|band| band.pairs > 0),
             "surface `{surface}` has no levels to compare; hint: `echolake doctor` says which references are missing"
@@ -302,16 +303,16 @@ impl TwinDifferences {
         Ok(found)
     }
 
-    fn print(&self) -> anyhow::Result<()> {
+    fn print_differences(&self) -> anyhow::Result<()> {
         let level = |value: Option<f64>| value.map_or_else(String::new, |value| format!("{value:.2}"));
-        super::print(&format!(
+        super::print_line(&format!(
             "{} ({}) less {} (computed), dB re Flat, same band; the total: dB re Flat total\n\n\
              {:>6} {:>6} {:>9} {:>9} {:>6} {:>6} {:>6} {:>6}",
             self.surface_id, self.origin, self.twin_id, "band", "pairs", "surface", "twin", "mean", "rms", "P5", "P95",
         ))?;
         for band in &self.bands {
             let doubted = band.detail_phase.is_some_and(|phase| phase > GREATEST_DETAIL_PHASE);
-            super::print(&format!(
+            super::print_line(&format!(
                 "{:>6} {:>6} {:>9} {:>9} {:>6} {:>6} {:>6} {:>6}{}",
                 band.band,
                 band.pairs,
@@ -324,12 +325,12 @@ impl TwinDifferences {
                 if doubted { "  single pairs of the simulation are off by 1 dB here" } else { "" },
             ))?;
         }
-        super::print(&format!(
+        super::print_line(&format!(
             "\n{:>6} {:>5} {:>5} {:>6} {:>9} {:>9} {:>10}",
             "pair", "mic", "spk", "band", "surface", "twin", "difference"
         ))?;
         for pair in &self.pairs {
-            super::print(&format!(
+            super::print_line(&format!(
                 "{:>6} {:>5} {:>5} {:>6} {:>9.2} {:>9.2} {:>10.2}",
                 pair.pair_id,
                 pair.microphone,

@@ -86,7 +86,7 @@ impl LakeConfig {
             return Err(Error::Newer { location: location.to_owned(), actual: format, newest: LAKE_FORMAT });
         }
         let config: Self = toml::from_str(text).map_err(|e| damaged(e.into()))?;
-        config.rig.check().map_err(|e| damaged(e.into()))?;
+        config.rig.check_consistency().map_err(|e| damaged(e.into()))?;
         Ok(config)
     }
 }

@@ -68,7 +68,7 @@ impl DurableFileSystem {
     // One renamed or copied file is as durable as its folder's entry.
     async fn sync_entry(&self, location: &Path) -> Result<()> {
         let path = self.inner.path_to_filesystem(location)?;
-        blocking(move || File::open(&path)?.sync_all().and_then(|()| sync_folder(&path)), location).await
+        run_blocking(move || File::open(&path)?.sync_all().and_then(|()| sync_folder(&path)), location).await
     }
 }
 
@@ -83,8 +83,8 @@ impl ObjectStore for DurableFileSystem {
     async fn put_opts(&self, location: &Path, payload: PutPayload, opts: PutOptions) -> Result<PutResult> {
         let path = self.inner.path_to_filesystem(location)?;
         match opts.mode {
-            PutMode::Overwrite => blocking(move || write(&path, &payload, fs::rename), location).await?,
-            PutMode::Create => blocking(move || write(&path, &payload, link), location).await?,
+            PutMode::Overwrite => run_blocking(move || write_synced(&path, &payload, fs::rename), location).await?,
+            PutMode::Create => run_blocking(move || write_synced(&path, &payload, link_into_place), location).await?,
             PutMode::Update(_) => return self.inner.put_opts(location, payload, opts).await,
         }
         Ok(PutResult { e_tag: None, version: None })
@@ -129,7 +129,7 @@ impl ObjectStore for DurableFileSystem {
     }
 }
 
-async fn blocking(work: impl FnOnce() -> io::Result<()> + Send + 'static, location: &Path) -> Result<()> {
+async fn run_blocking(work: impl FnOnce() -> io::Result<()> + Send + 'static, location: &Path) -> Result<()> {
     let done = tokio::task::spawn_blocking(work).await.map_err(|source| Error::JoinError { source })?;
     done.map_err(|source| {
         let path = location.to_string();
@@ -142,7 +142,11 @@ async fn blocking(work: impl FnOnce() -> io::Result<()> + Send + 'static, locati
 }
 
 // Data, then name, then folder: at no moment does the name refer to less than the whole file.
-fn write(path: &FsPath, payload: &PutPayload, publish: fn(PathBuf, PathBuf) -> io::Result<()>) -> io::Result<()> {
+fn write_synced(
+    path: &FsPath,
+    payload: &PutPayload,
+    publish: fn(PathBuf, PathBuf) -> io::Result<()>,
+) -> io::Result<()> {
     let folder = path.parent().ok_or(ErrorKind::InvalidInput)?;
     create_folders(folder)?;
     let temporary = temporary_beside(path);
@@ -160,7 +164,7 @@ fn write(path: &FsPath, payload: &PutPayload, publish: fn(PathBuf, PathBuf) -> i
 }
 
 // A hard link fails if the name is taken, a rename does not.
-fn link(from: PathBuf, to: PathBuf) -> io::Result<()> {
+fn link_into_place(from: PathBuf, to: PathBuf) -> io::Result<()> {
     fs::hard_link(&from, to)?;
     fs::remove_file(from)
 }

@@ -92,7 +92,7 @@ pub enum Error {
         path: String,
     },
     /// The store refused.
-    #[error("cannot {action} `{path}`: {source}{}", source.hint())]
+    #[error("cannot {action} `{path}`: {source}{}", source.hint_text())]
     Store {
         /// The attempted operation.
         action: &'static str,
@@ -288,7 +288,7 @@ impl std::error::Error for StoreError {
 }
 
 impl Error {
-    pub(crate) fn store(action: &'static str, path: impl ToString, source: object_store::Error) -> Self {
+    pub(crate) fn store_failure(action: &'static str, path: impl ToString, source: object_store::Error) -> Self {
         Self::Store { action, path: path.to_string(), source: StoreError(source) }
     }
 
@@ -297,11 +297,11 @@ impl Error {
     /// # Errors
     /// The given fault.
     #[cfg(feature = "tables")]
-    pub fn unanswered(
+    pub fn from_unanswered(
         path: &object_store::path::Path,
         source: object_store::Error,
     ) -> std::result::Result<Self, object_store::Error> {
-        if is_unanswered(&source) { Ok(Self::store("read", path, source)) } else { Err(source) }
+        if is_unanswered(&source) { Ok(Self::store_failure("read", path, source)) } else { Err(source) }
     }
 
     /// Returns the error for a table's file that a store did not give: an absent one is damage to the lake, any other
@@ -310,7 +310,7 @@ impl Error {
     pub fn unread_file(file: &object_store::path::Path, source: object_store::Error) -> Self {
         match source {
             object_store::Error::NotFound { .. } => Self::DataFile { file: file.to_string(), source: source.into() },
-            source => Self::store("read", file, source),
+            source => Self::store_failure("read", file, source),
         }
     }
 }
@@ -321,7 +321,7 @@ fn table_of(file: &str) -> &str {
 }
 
 impl StoreError {
-    fn hint(&self) -> &'static str {
+    fn hint_text(&self) -> &'static str {
         let mut source: Option<&dyn std::error::Error> = Some(&self.0);
         while let Some(error) = source {
             if let Some(io) = error.downcast_ref::<std::io::Error>() {
@@ -431,7 +431,8 @@ mod tests {
             "404 Not Found, NoSuchBucket",
         );
         let absent = "404 Not Found: <?xml?><Error><Code>NoSuchBucket</Code></Error>".to_owned();
-        let error = Error::store("list", "s3://x", object_store::Error::Generic { store: "S3", source: absent.into() });
+        let error =
+            Error::store_failure("list", "s3://x", object_store::Error::Generic { store: "S3", source: absent.into() });
         assert!(error.to_string().contains("NoSuchBucket; hint: is the bucket's name right"), "{error}");
     }
 }

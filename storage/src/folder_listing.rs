@@ -64,7 +64,7 @@ impl Lake {
     /// # Errors
     /// [`Error::Store`] if the folder itself cannot be listed.
     pub async fn list_folder(&self, folder: &str) -> Result<FolderListing> {
-        let failed = |e| Error::store("list", folder, e);
+        let failed = |e| Error::store_failure("list", folder, e);
         let mut listing = match self.folder() {
             Some(lake) => {
                 let (lake, folder) = (lake.to_owned(), folder.to_owned());

@@ -57,7 +57,7 @@ impl Lake {
     pub async fn open(url: &str) -> Result<Self> {
         let location = LakeLocation::parse(url)?;
         match read_config(&location).await? {
-            Some(config) => Self::assemble(location, config),
+            Some(config) => Self::from_config(location, config),
             None => Err(Error::NoLake { location: location.text }),
         }
     }
@@ -84,7 +84,7 @@ impl Lake {
     /// let lake = Lake::open_or_create("memory://", &Rig::paper(), &ReferenceSurfaces::default()).await?;
     /// assert_eq!((lake.rig().name.as_str(), lake.grid().pairs().len()), ("paper", 2951));
     /// let other = Rig::from_toml("[impulse_response]\nlength = 400")?;
-    /// assert!(matches!(lake.fits(&other), Err(Error::OtherRig { .. })));
+    /// assert!(matches!(lake.check_rig(&other), Err(Error::OtherRig { .. })));
     /// # Ok::<(), Box<dyn std::error::Error>>(())
     /// # })?;
     /// # Ok::<(), Box<dyn std::error::Error>>(())
@@ -112,13 +112,13 @@ impl Lake {
     }
 
     async fn open_or_create_at(location: LakeLocation, rig: &Rig, references: &ReferenceSurfaces) -> Result<Self> {
-        rig.check()?;
+        rig.check_consistency()?;
         let config = match read_config(&location).await? {
             Some(config) => config,
             None => create_config(&location, rig, references).await?,
         };
-        let mut lake = Self::assemble(location, config)?;
-        if let Err(misfit) = lake.fits(rig) {
+        let mut lake = Self::from_config(location, config)?;
+        if let Err(misfit) = lake.check_rig(rig) {
             if !unused::is_unused(&lake).await? {
                 return Err(misfit);
             }
@@ -135,9 +135,9 @@ impl Lake {
         unused::delete_tables(self).await?;
         let references = self.config().references.clone();
         let config = LakeConfig { format: LAKE_FORMAT, references, rig: rig.clone() };
-        let failed = |e| Error::store("write", object_text(self.location(), CONFIG), e);
+        let failed = |e| Error::store_failure("write", object_text(self.location(), CONFIG), e);
         self.store().put(&Path::from(CONFIG), config.to_toml()?.into()).await.map_err(failed)?;
-        Self::assemble(self.0.location.clone(), config)
+        Self::from_config(self.0.location.clone(), config)
     }
 
     /// Removes a lake that holds no runs and no recordings; its folder stays, and other files in it. Returns whether it
@@ -151,14 +151,14 @@ impl Lake {
             return Ok(false);
         }
         unused::delete_tables(&self).await?;
-        let failed = |e| Error::store("delete", object_text(self.location(), CONFIG), e);
+        let failed = |e| Error::store_failure("delete", object_text(self.location(), CONFIG), e);
         self.store().delete(&Path::from(CONFIG)).await.map_err(failed)?;
         unused::remove_empty_folders(folder);
         Ok(true)
     }
 
-    fn assemble(location: LakeLocation, config: LakeConfig) -> Result<Self> {
-        let grid = config.rig.grid()?;
+    fn from_config(location: LakeLocation, config: LakeConfig) -> Result<Self> {
+        let grid = config.rig.build_grid()?;
         #[cfg(feature = "tables")]
         let log = Arc::new(DeltaLog::new(&location, config.rig.clone()));
         Ok(Self(Arc::new(OpenLake {
@@ -176,8 +176,8 @@ impl Lake {
     ///
     /// # Errors
     /// [`Error::OtherRig`] if they do not, with the differences.
-    pub fn fits(&self, rig: &Rig) -> Result<()> {
-        let differences = self.rig().differences(rig);
+    pub fn check_rig(&self, rig: &Rig) -> Result<()> {
+        let differences = self.rig().differences_from(rig);
         if differences.is_empty() {
             return Ok(());
         }
@@ -269,7 +269,7 @@ impl Lake {
     /// Returns what the cache has counted since it was made; None if there is no cache.
     #[cfg(feature = "tables")]
     pub fn cache_counts(&self) -> Option<CacheCounts> {
-        Some(self.0.location.cached.as_ref()?.cache().counts())
+        Some(self.0.location.cached.as_ref()?.block_cache().read_counts())
     }
 
     /// Returns the store for one scan, with counters of its own; None if there is no cache.
@@ -290,7 +290,7 @@ impl Lake {
 
     /// Uploads in parts, if the lake is on an object store.
     #[cfg(feature = "remote")]
-    pub(crate) fn parts(&self) -> Option<&PartStore> {
+    pub(crate) fn part_store(&self) -> Option<&PartStore> {
         self.0.location.remote.as_ref()?.parts.as_ref()
     }
 
@@ -311,7 +311,7 @@ impl Lake {
 
     /// The commit log, as far as it may be seen.
     #[cfg(feature = "tables")]
-    pub fn log(&self) -> &dyn crate::CommitLog {
+    pub fn commit_log(&self) -> &dyn crate::CommitLog {
         match &self.0.projects {
             Some(projects) => projects,
             None => self.0.log.as_ref(),
@@ -338,7 +338,7 @@ impl Lake {
 
 async fn read_config(location: &LakeLocation) -> Result<Option<LakeConfig>> {
     let path = Path::from(CONFIG);
-    let failed = |e| Error::store("read", object_text(&location.text, CONFIG), e);
+    let failed = |e| Error::store_failure("read", object_text(&location.text, CONFIG), e);
     let bytes = match location.store.get(&path).await {
         Ok(found) => found.bytes().await.map_err(failed)?,
         Err(object_store::Error::NotFound { .. }) => return Ok(None),
@@ -350,7 +350,7 @@ async fn read_config(location: &LakeLocation) -> Result<Option<LakeConfig>> {
 }
 
 async fn create_config(location: &LakeLocation, rig: &Rig, references: &ReferenceSurfaces) -> Result<LakeConfig> {
-    let failed = |e| Error::store("write", object_text(&location.text, CONFIG), e);
+    let failed = |e| Error::store_failure("write", object_text(&location.text, CONFIG), e);
     let there = location.store.list_with_delimiter(None).await.map_err(failed)?;
     let ours = |p: &Path| p.filename().is_some_and(|n| matches!(n, "runs" | "inbox" | "quarantine" | "tables"));
     if !there.objects.is_empty() || !there.common_prefixes.iter().all(ours) {

@@ -53,7 +53,7 @@ pub use tables::{
     FileEncoder, FileHistory, FileName, FileStats, KEEP_HOURS, LackingRows, LakeMoment, LakeSnapshot, LoggedFile,
     MergeProgress, NewFile, NoMoment, OptimizeReport, RemovalRecord, ReplacedFiles, RunPart, RunRowCounts, StagedFile,
     TARGET_BYTES, TableChange, TableCommit, TableOptimizeReport, TableVersion, TableView, VacuumReport, VisibleRun,
-    add_missing_columns, encode, reader_metadata, wanted_schema,
+    add_missing_columns, encode_batches, reader_metadata, wanted_schema,
 };
 #[cfg(feature = "remote")]
 pub use upload::{RunUpload, UploadOutcome, UploadStep};

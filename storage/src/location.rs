@@ -42,17 +42,19 @@ impl LakeLocation {
             return Err(wrong("it is empty".into()));
         }
         if !text.contains("://") {
-            return Self::folder(text, Path::new(text));
+            return Self::from_folder(text, Path::new(text));
         }
         let url = Url::parse(text).map_err(|e| wrong(e.into()))?;
         match url.scheme() {
-            "file" => Self::folder(text, &url.to_file_path().map_err(|()| wrong("it names no local folder".into()))?),
-            "memory" => Ok(Self::store(text, Arc::new(InMemory::new()))),
+            "file" => {
+                Self::from_folder(text, &url.to_file_path().map_err(|()| wrong("it names no local folder".into()))?)
+            }
+            "memory" => Ok(Self::from_store(text, Arc::new(InMemory::new()))),
             #[cfg(feature = "remote")]
             _ => {
                 let (store, parts) = crate::remote::open_store(&url).map_err(wrong)?;
                 let remote = RemoteStore { parts: Some(parts), ..RemoteStore::default() };
-                Ok(Self { remote: Some(Arc::new(remote)), ..Self::store(text.trim_end_matches('/'), store) })
+                Ok(Self { remote: Some(Arc::new(remote)), ..Self::from_store(text.trim_end_matches('/'), store) })
             }
             #[cfg(not(feature = "remote"))]
             scheme => Err(wrong(format!("this build does not reach `{scheme}://`").into())),
@@ -69,14 +71,14 @@ impl LakeLocation {
         let probe = async {
             probe_exclusion(&self.store).await.map_err(|fault| match fault {
                 ExclusionFault::Overwrites(observed) => Error::NotExclusive { location: self.text.clone(), observed },
-                ExclusionFault::Store(cause) => Error::store("write", &self.text, cause),
+                ExclusionFault::Store(cause) => Error::store_failure("write", &self.text, cause),
             })
         };
         remote.probed.get_or_try_init(|| probe).await.copied()
     }
 
     /// A store that holds nothing but the lake.
-    pub(crate) fn store(text: &str, store: Arc<dyn ObjectStore>) -> Self {
+    pub(crate) fn from_store(text: &str, store: Arc<dyn ObjectStore>) -> Self {
         Self {
             text: text.to_owned(),
             folder: None,
@@ -93,11 +95,11 @@ impl LakeLocation {
         Self {
             #[cfg(feature = "remote")]
             remote: crate::remote_access(name).map(|_| Arc::default()),
-            ..Self::store(name, store)
+            ..Self::from_store(name, store)
         }
     }
 
-    fn folder(text: &str, path: &Path) -> Result<Self> {
+    fn from_folder(text: &str, path: &Path) -> Result<Self> {
         let wrong = |source: ErrorCause| Error::Location { location: without_secrets(text), source };
         let absolute = resolved_path(path).map_err(|e| wrong(e.into()))?;
         if absolute.exists() && !absolute.is_dir() {
@@ -105,7 +107,7 @@ impl LakeLocation {
         }
         let prefix = ObjectPath::from_absolute_path(&absolute).map_err(|e| wrong(e.into()))?;
         let store = Arc::new(PrefixStore::new(DurableFileSystem::new(&absolute), prefix));
-        Ok(Self { folder: Some(absolute), ..Self::store(text, store) })
+        Ok(Self { folder: Some(absolute), ..Self::from_store(text, store) })
     }
 }
 

@@ -27,7 +27,7 @@ pub(crate) async fn is_unused(lake: &Lake) -> Result<bool> {
             _ => false,
         }
     };
-    Ok(!list(lake, None).await?.iter().any(used))
+    Ok(!list_objects(lake, None).await?.iter().any(used))
 }
 
 /// Deletes all tables.
@@ -35,8 +35,8 @@ pub(crate) async fn is_unused(lake: &Lake) -> Result<bool> {
 /// # Errors
 /// [`Error::Store`].
 pub(crate) async fn delete_tables(lake: &Lake) -> Result<()> {
-    for meta in list(lake, Some(&Path::from(TABLES))).await? {
-        let failed = |e| Error::store("delete", object_text(lake.location(), &meta.location), e);
+    for meta in list_objects(lake, Some(&Path::from(TABLES))).await? {
+        let failed = |e| Error::store_failure("delete", object_text(lake.location(), &meta.location), e);
         lake.store().delete(&meta.location).await.map_err(failed)?;
     }
     Ok(())
@@ -52,7 +52,7 @@ pub(crate) fn remove_empty_folders(folder: &FsPath) {
     }
 }
 
-async fn list(lake: &Lake, below: Option<&Path>) -> Result<Vec<ObjectMeta>> {
-    let failed = |e| Error::store("list", lake.location(), e);
+async fn list_objects(lake: &Lake, below: Option<&Path>) -> Result<Vec<ObjectMeta>> {
+    let failed = |e| Error::store_failure("list", lake.location(), e);
     lake.store().list(below).try_collect().await.map_err(failed)
 }

@@ -120,9 +120,9 @@ fn deconvolution(criterion: &mut Criterion) {
         ("exact", TransformLength::Exact, SpectralDivision::Tapered),
     ] {
         let plan = DeconvolutionPlan::<f32>::new(params(length, division)).expect("settings of the paper");
-        let (mut scratch, mut ir) = (plan.scratch(), vec![0.0; plan.output_len()]);
+        let (mut scratch, mut ir) = (plan.make_scratch(), vec![0.0; plan.output_len()]);
         group.bench_function(BenchmarkId::new(name, n), |bencher| {
-            bencher.iter(|| plan.run(black_box(&recording), &loopback, &mut ir, &mut scratch));
+            bencher.iter(|| plan.deconvolve_recording(black_box(&recording), &loopback, &mut ir, &mut scratch));
         });
     }
 }
@@ -138,7 +138,7 @@ fn temperature(criterion: &mut Criterion) {
         let rho = resampling_ratio(celsius, REFERENCE_CELSIUS);
         let raw = &loopback[..raw_len(IR_LEN, REFERENCE_CELSIUS)];
         group.bench_function(BenchmarkId::new(name, IR_LEN), |bencher| {
-            bencher.iter(|| correction.run(black_box(raw), rho, &mut corrected));
+            bencher.iter(|| correction.correct_response(black_box(raw), rho, &mut corrected));
         });
     }
 }
@@ -156,26 +156,26 @@ fn measurement(criterion: &mut Criterion) {
         reference_celsius: REFERENCE_CELSIUS,
     })
     .expect("settings of the paper");
-    let (mut scratch, mut ir) = (plan.scratch(), vec![0.0; IR_LEN]);
+    let (mut scratch, mut ir) = (plan.make_scratch(), vec![0.0; IR_LEN]);
     let mut group = criterion.benchmark_group("measurement");
     group.throughput(Throughput::Elements(n as u64));
     group.bench_function(BenchmarkId::new("recording_to_response", n), |bencher| {
-        bencher.iter(|| plan.ir(black_box(&recording), &loopback, 23.7, &mut ir, &mut scratch));
+        bencher.iter(|| plan.compute_ir(black_box(&recording), &loopback, 23.7, &mut ir, &mut scratch));
     });
 }
 
 fn filter_bank(criterion: &mut Criterion) {
     let ir = response();
     let plan = FilterBankPlan::<f32>::new(IR_LEN, RATE_HZ, &CENTRES_HZ).expect("bands of the paper");
-    let (mut scratch, mut bands) = (plan.scratch(), vec![0.0; plan.bands() * IR_LEN]);
-    let mut energies = vec![0.0; plan.bands()];
+    let (mut scratch, mut bands) = (plan.make_scratch(), vec![0.0; plan.band_count() * IR_LEN]);
+    let mut energies = vec![0.0; plan.band_count()];
     let mut group = criterion.benchmark_group("filter_bank");
     group.throughput(Throughput::Elements(IR_LEN as u64));
     group.bench_function(BenchmarkId::new("bands", IR_LEN), |bencher| {
-        bencher.iter(|| plan.run(black_box(&ir), &mut bands, &mut scratch));
+        bencher.iter(|| plan.split_bands(black_box(&ir), &mut bands, &mut scratch));
     });
     group.bench_function(BenchmarkId::new("energies", IR_LEN), |bencher| {
-        bencher.iter(|| plan.energies(black_box(&ir), &mut energies, &mut scratch));
+        bencher.iter(|| plan.compute_energies(black_box(&ir), &mut energies, &mut scratch));
     });
 }
 
@@ -196,12 +196,12 @@ fn energy(criterion: &mut Criterion) {
 fn derivation(criterion: &mut Criterion) {
     let (ir, foam) = (response(), vec![0.0; IR_LEN]);
     let plan = DerivationPlan::<f32>::new(IR_LEN, RATE_HZ, &CENTRES_HZ).expect("bands of the paper");
-    let (mut scratch, mut derived) = (plan.scratch(), plan.derived());
+    let (mut scratch, mut derived) = (plan.make_scratch(), plan.make_derived());
     let energies = plan.flat_energies(&ir, &mut scratch).expect("a response");
     let mut group = criterion.benchmark_group("derivation");
     group.throughput(Throughput::Elements(IR_LEN as u64));
     group.bench_function(BenchmarkId::new("response_to_curves", IR_LEN), |bencher| {
-        bencher.iter(|| -> Result<(), Error> { plan.run(black_box(&ir), &foam, &ir, &mut derived, &mut scratch) });
+        bencher.iter(|| -> Result<(), Error> { plan.derive_response(black_box(&ir), &foam, &ir, &mut derived, &mut scratch) });
     });
     group.bench_function(BenchmarkId::new("with_known_flat", IR_LEN), |bencher| {
         bencher.iter(|| plan.run_over(black_box(&ir), &foam, &energies, &mut derived, &mut scratch));
@@ -214,7 +214,7 @@ fn reflection(criterion: &mut Criterion) {
     let relief = HeightField::from_fn(585.0, CELLS, |x, y| 5.0 * (x / 60.0).sin() + 3.0 * (y / 45.0).cos());
     let plan = KirchhoffPlan::new(&relief, RATE_HZ, IR_LEN).with_directivity(|cosine, _| cosine, |cosine, _| cosine);
     let pose = |x| TransducerPose { position_mm: [x, 37.5, 124.0], axis: [0.0, 0.0, -1.0] };
-    let one = plan.filter(|_| 1.0.into());
+    let one = plan.spectrum_at_bins(|_| 1.0.into());
     let path = SoundPath {
         microphone: pose(-187.5),
         speaker: pose(112.5),
@@ -223,10 +223,10 @@ fn reflection(criterion: &mut Criterion) {
         direct: &one,
         reflection: &one,
     };
-    let (mut scratch, mut ir) = (plan.scratch(), vec![0.0; IR_LEN]);
+    let (mut scratch, mut ir) = (plan.make_scratch(), vec![0.0; IR_LEN]);
     let mut group = criterion.benchmark_group("kirchhoff");
     group.throughput(Throughput::Elements((CELLS * CELLS) as u64));
     group.bench_function(BenchmarkId::new("response", CELLS), |bencher| {
-        bencher.iter(|| plan.response(black_box(&path), &mut scratch, &mut ir));
+        bencher.iter(|| plan.compute_response(black_box(&path), &mut scratch, &mut ir));
     });
 }

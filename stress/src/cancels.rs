@@ -153,7 +153,7 @@ impl QueryEnd {
     }
 }
 
-pub(crate) fn run(args: &CancelArgs) -> Result<()> {
+pub(crate) fn run_cancel_campaign(args: &CancelArgs) -> Result<()> {
     let binary = super::echolake_path()?;
     let rows = run_cancels(&binary, &QUERY_ENDS, args.rounds, args.only.as_deref(), &mut print_row)?;
     let missed = rows.iter().filter(|row| !row.is_goal_reached()).count();

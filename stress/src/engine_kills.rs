@@ -43,7 +43,7 @@ pub(crate) struct EngineKillsArgs {
     seed: u64,
 }
 
-pub(crate) fn run(args: &EngineKillsArgs) -> Result<()> {
+pub(crate) fn run_engine_kills(args: &EngineKillsArgs) -> Result<()> {
     let tally = run_kills(&super::echolake_path()?, args.kills, args.seed)?;
     let (whole, wrong) = (tally.times.len(), tally.wrong);
     println!("{} kills: {whole} answers whole, {wrong} wrong, {} broken off", args.kills, tally.broken_off);

@@ -30,7 +30,7 @@ fn parse_target(name: &str) -> Result<FuzzTarget, String> {
     known.ok_or_else(|| "hint: sql, wire or mcap".to_owned())
 }
 
-pub(crate) fn run(args: &FuzzArgs) -> Result<()> {
+pub(crate) fn run_fuzz_server(args: &FuzzArgs) -> Result<()> {
     let FuzzArgs { target, seconds, seed } = *args;
     let binary = super::echolake_path()?;
     let (begun, mut told) = (Instant::now(), Instant::now());

@@ -71,7 +71,7 @@ pub(crate) struct HostileReport {
     restarts: usize,
 }
 
-pub(crate) fn run(args: &HostileClientsArgs) -> Result<()> {
+pub(crate) fn run_hostile_clients(args: &HostileClientsArgs) -> Result<()> {
     let quiet = Duration::from_secs(args.quiet_seconds);
     let report = run_clients(&super::echolake_path()?, quiet, Duration::from_secs(args.seconds), args.seed)?;
     print_report(&report);

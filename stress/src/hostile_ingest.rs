@@ -27,7 +27,7 @@ pub(crate) struct HostileFilesArgs {
     limit_secs: u64,
 }
 
-pub(crate) fn run(args: &HostileFilesArgs) -> Result<()> {
+pub(crate) fn run_hostile_ingest(args: &HostileFilesArgs) -> Result<()> {
     let HostileFilesArgs { count, seed, limit_secs } = *args;
     let campaign = HostileCampaign::new(&super::echolake_path()?, seed);
     let mut out = std::io::stdout().lock();

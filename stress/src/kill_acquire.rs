@@ -28,7 +28,7 @@ enum KilledPart {
     Power,
 }
 
-pub(crate) fn run(args: &KillAcquireArgs) -> Result<()> {
+pub(crate) fn run_kill_acquire(args: &KillAcquireArgs) -> Result<()> {
     let KillAcquireArgs { kills, seed, part } = *args;
     let binary = super::echolake_path()?;
     let campaign = match part {

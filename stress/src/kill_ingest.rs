@@ -30,7 +30,7 @@ enum IngestDisturbance {
     Halves,
 }
 
-pub(crate) fn run(args: &KillIngestArgs) -> Result<()> {
+pub(crate) fn run_kill_ingest(args: &KillIngestArgs) -> Result<()> {
     let KillIngestArgs { rounds, seed, disturbance } = *args;
     let binary = super::echolake_path()?;
     let mut tell = |round: usize, so_far: &KillCounts| {

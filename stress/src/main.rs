@@ -94,21 +94,21 @@ enum CampaignCommand {
 
 fn main() -> Result<()> {
     match StressCli::parse().campaign {
-        CampaignCommand::Kills(args) => kill_ingest::run(&args),
-        CampaignCommand::HostileFiles(args) => hostile_ingest::run(&args),
-        CampaignCommand::AcquireKills(args) => kill_acquire::run(&args),
-        CampaignCommand::Operators(args) => operator_rounds::run(&args),
-        CampaignCommand::Fuzz(args) => fuzz_server::run(&args),
-        CampaignCommand::Attacks(args) => attacks::run(&args),
-        CampaignCommand::HostileClients(args) => hostile_clients::run(&args),
-        CampaignCommand::EngineKills(args) => engine_kills::run(&args),
-        CampaignCommand::Cancels(args) => cancels::run(&args),
-        CampaignCommand::IngestBench(args) => ingest_bench::run(&args),
-        CampaignCommand::QueryBench(args) => block_on(query_bench::run(&args)),
-        CampaignCommand::McapBench(args) => block_on(mcap_bench::run(&args)),
-        CampaignCommand::Readers(args) => readers::run(&args),
-        CampaignCommand::Slices(args) => slices::run(&args),
-        CampaignCommand::Motion(args) => motion::run(&args),
+        CampaignCommand::Kills(args) => kill_ingest::run_kill_ingest(&args),
+        CampaignCommand::HostileFiles(args) => hostile_ingest::run_hostile_ingest(&args),
+        CampaignCommand::AcquireKills(args) => kill_acquire::run_kill_acquire(&args),
+        CampaignCommand::Operators(args) => operator_rounds::run_operator_rounds(&args),
+        CampaignCommand::Fuzz(args) => fuzz_server::run_fuzz_server(&args),
+        CampaignCommand::Attacks(args) => attacks::run_attacks(&args),
+        CampaignCommand::HostileClients(args) => hostile_clients::run_hostile_clients(&args),
+        CampaignCommand::EngineKills(args) => engine_kills::run_engine_kills(&args),
+        CampaignCommand::Cancels(args) => cancels::run_cancel_campaign(&args),
+        CampaignCommand::IngestBench(args) => ingest_bench::run_ingest_bench(&args),
+        CampaignCommand::QueryBench(args) => block_on(query_bench::run_query_bench(&args)),
+        CampaignCommand::McapBench(args) => block_on(mcap_bench::run_mcap_bench(&args)),
+        CampaignCommand::Readers(args) => readers::run_readers(&args),
+        CampaignCommand::Slices(args) => slices::run_slices(&args),
+        CampaignCommand::Motion(args) => motion::run_motion(&args),
     }
 }
 

@@ -42,26 +42,26 @@ pub(crate) struct McapBenchArgs {
     python: Option<String>,
 }
 
-pub(crate) async fn run(args: &McapBenchArgs) -> Result<()> {
+pub(crate) async fn run_mcap_bench(args: &McapBenchArgs) -> Result<()> {
     let McapBenchArgs { lake, pattern, python } = args;
     let lake = Lake::open(lake).await?;
     let session = Session::new(&lake)?;
-    let (files, bytes) = files(&session, &lake, pattern).await?;
+    let (files, bytes) = find_files(&session, &lake, pattern).await?;
     let mut out = std::io::stdout();
     writeln!(out, "{} files, {bytes} bytes", files.len())?;
     writeln!(out, "| topic | messages | bytes read | MB/s | mcap() ms | Python ms | ratio |")?;
     writeln!(out, "| --- | --- | --- | --- | --- | --- | --- |")?;
     for topic in TOPICS {
         let sql = format!("select * from mcap('{pattern}', '{topic}')");
-        let Ok((_, rows)) = scan(&session, &sql).await else { continue };
+        let Ok((_, rows)) = time_scan(&session, &sql).await else { continue };
         let mut seconds = Vec::new();
         for _ in 0..ROUNDS {
-            seconds.push(scan(&session, &sql).await?.0);
+            seconds.push(time_scan(&session, &sql).await?.0);
         }
         seconds.sort_by(f64::total_cmp);
         let ours = seconds[ROUNDS / 2];
         let read = bytes_read(&session, &sql).await?;
-        let theirs = python.as_deref().map(|python| peer(python, topic, &files, rows)).transpose()?;
+        let theirs = python.as_deref().map(|python| time_peer(python, topic, &files, rows)).transpose()?;
         let compared = theirs.map_or_else(|| "- | -".to_owned(), |t| format!("{:.0} | {:.1}", t * 1e3, t / ours));
         let speed = read as f64 / ours / 1e6;
         writeln!(out, "| `{topic}` | {rows} | {read} | {speed:.0} | {:.2} | {compared} |", ours * 1e3)?;
@@ -70,7 +70,7 @@ pub(crate) async fn run(args: &McapBenchArgs) -> Result<()> {
 }
 
 /// Seconds of one scan, from the query's text to its last row, and its rows.
-async fn scan(session: &Session, sql: &str) -> Result<(f64, usize)> {
+async fn time_scan(session: &Session, sql: &str) -> Result<(f64, usize)> {
     let start = Instant::now();
     let mut answer = session.query(sql).await?;
     let mut rows = 0;
@@ -80,7 +80,7 @@ async fn scan(session: &Session, sql: &str) -> Result<(f64, usize)> {
     Ok((start.elapsed().as_secs_f64(), rows))
 }
 
-async fn text(session: &Session, sql: &str) -> Result<String> {
+async fn query_text(session: &Session, sql: &str) -> Result<String> {
     let mut answer = session.query(sql).await?;
     let mut batches = Vec::new();
     while let Some(batch) = answer.next().await? {
@@ -91,15 +91,15 @@ async fn text(session: &Session, sql: &str) -> Result<String> {
 
 /// The plan's own sum of what all partitions fetched.
 async fn bytes_read(session: &Session, sql: &str) -> Result<u64> {
-    let plan = text(session, &format!("explain {sql}")).await?;
+    let plan = query_text(session, &format!("explain {sql}")).await?;
     let (_, behind) = plan.split_once("bytes=").context("the plan tells no bytes")?;
     Ok(behind.chars().take_while(char::is_ascii_digit).collect::<String>().parse()?)
 }
 
-async fn files(session: &Session, lake: &Lake, pattern: &str) -> Result<(Vec<String>, u64)> {
+async fn find_files(session: &Session, lake: &Lake, pattern: &str) -> Result<(Vec<String>, u64)> {
     let folder = lake.folder().context("the lake is no folder")?;
     let sql = format!("select distinct file from mcap_topics('{pattern}') order by 1");
-    let printed = text(session, &sql).await?;
+    let printed = query_text(session, &sql).await?;
     let names = printed.lines().filter_map(|l| l.strip_prefix('|')).map(|l| l.trim_matches(['|', ' ']));
     let files: Vec<_> = names.filter(|n| n.ends_with(".mcap")).map(|n| folder.join(n)).collect();
     let mut bytes = 0;
@@ -110,7 +110,7 @@ async fn files(session: &Session, lake: &Lake, pattern: &str) -> Result<(Vec<Str
 }
 
 /// Seconds that Python takes for the same messages.
-fn peer(python: &str, topic: &str, files: &[String], rows: usize) -> Result<f64> {
+fn time_peer(python: &str, topic: &str, files: &[String], rows: usize) -> Result<f64> {
     let done = Command::new(python).args(["-c", SCRIPT, topic]).args(files).output()?;
     if !done.status.success() {
         bail!("{}", String::from_utf8_lossy(&done.stderr));

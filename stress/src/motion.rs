@@ -8,7 +8,7 @@ use std::time::Instant;
 
 use anyhow::Result;
 use echolake_acquisition::rig::robots::{
-    ArmPose, Cell, MotionCourse, PlanParams, UnreachableReason, course, length_secs, plan,
+    ArmPose, Cell, MotionCourse, PlanParams, UnreachableReason, length_secs, plan_motion, plan_visit_order,
 };
 use echolake_schema::robots::{RobotCell, Rod};
 use echolake_schema::{Grid, Rig};
@@ -19,27 +19,27 @@ pub(crate) struct MotionArgs {
     published: Option<PathBuf>,
 }
 
-pub(crate) fn run(args: &MotionArgs) -> Result<()> {
+pub(crate) fn run_motion(args: &MotionArgs) -> Result<()> {
     let mut out = io::stdout();
     let rig = Rig::paper();
-    let grid = rig.grid()?;
+    let grid = rig.build_grid()?;
     for rod in [Rod::Leaning, Rod::Upright] {
         writeln!(out, "microphone's rod {rod:?}:")?;
         who_reaches_what(&mut out, &grid, &Cell::new(&RobotCell { rod, ..rig.robots.clone() }, rig.panel.size_mm))?;
     }
     who_shades_whom(&mut out, &grid)?;
-    let cell = Cell::of(&rig);
-    let standings = standings(&grid, &cell)?;
+    let cell = Cell::from_rig(&rig);
+    let standings = pair_poses(&grid, &cell)?;
     let own: Vec<usize> = (0..standings.len()).collect();
     if let Some(path) = &args.published {
-        report(&mut out, "published", &cell, &standings, &published(&grid, path)?)?;
+        report_order(&mut out, "published", &cell, &standings, &published_order(&grid, path)?)?;
     }
-    report(&mut out, "by number", &cell, &standings, &own)?;
+    report_order(&mut out, "by number", &cell, &standings, &own)?;
     for seed in 1..=3 {
         let began = Instant::now();
-        let order = plan(&standings, PlanParams { seed, ..PlanParams::default() });
+        let order = plan_visit_order(&standings, PlanParams { seed, ..PlanParams::default() });
         let took = began.elapsed().as_secs_f64();
-        report(&mut out, &format!("planned, seed {seed} ({took:.1} s)"), &cell, &standings, &order)?;
+        report_order(&mut out, &format!("planned, seed {seed} ({took:.1} s)"), &cell, &standings, &order)?;
     }
     Ok(())
 }
@@ -53,7 +53,7 @@ fn who_reaches_what(out: &mut dyn Write, grid: &Grid, cell: &Cell) -> io::Result
         for b in grid.points().iter().filter(|b| b.id > a.id) {
             let paired = grid.pair_id(a.id, b.id).is_some();
             let found = cell.reach_with(&ways, a.position_mm, b.position_mm);
-            let what = found.map_or_else(named, |s| format!("reached, speaker aims: {:?}", s.aim));
+            let what = found.map_or_else(describe_unreached, |s| format!("reached, speaker aims: {:?}", s.aim));
             tally.entry(what).or_default()[usize::from(!paired)] += 1;
         }
     }
@@ -89,17 +89,17 @@ fn off_axis_mm(microphone: [f64; 3], speaker: [f64; 3]) -> f64 {
     (dot(to, to) - dot(to, axis).powi(2) / dot(axis, axis)).max(0.0).sqrt()
 }
 
-fn named(why: UnreachableReason) -> String {
+fn describe_unreached(why: UnreachableReason) -> String {
     format!("NOT reached: {why}")
 }
 
-fn standings(grid: &Grid, cell: &Cell) -> Result<Vec<ArmPose>, UnreachableReason> {
+fn pair_poses(grid: &Grid, cell: &Cell) -> Result<Vec<ArmPose>, UnreachableReason> {
     let at = |id: echolake_schema::PointId| grid.points()[id.index()].position_mm;
-    grid.pairs().iter().map(|p| cell.reach(at(p.microphone), at(p.speaker))).collect()
+    grid.pairs().iter().map(|p| cell.reach_positions(at(p.microphone), at(p.speaker))).collect()
 }
 
 // The order of the published data set's file.
-fn published(grid: &Grid, path: &Path) -> Result<Vec<usize>> {
+fn published_order(grid: &Grid, path: &Path) -> Result<Vec<usize>> {
     let mut order = Vec::new();
     for row in csv::Reader::from_path(path)?.records() {
         let row = row?;
@@ -109,11 +109,17 @@ fn published(grid: &Grid, path: &Path) -> Result<Vec<usize>> {
     Ok(order)
 }
 
-fn report(out: &mut dyn Write, name: &str, cell: &Cell, standings: &[ArmPose], order: &[usize]) -> io::Result<()> {
+fn report_order(
+    out: &mut dyn Write,
+    name: &str,
+    cell: &Cell,
+    standings: &[ArmPose],
+    order: &[usize],
+) -> io::Result<()> {
     let mut courses: BTreeMap<String, usize> = BTreeMap::new();
-    let (mut secs, mut turned, mut last) = (0.0, 0.0, ArmPose::home());
+    let (mut secs, mut turned, mut last) = (0.0, 0.0, ArmPose::at_home());
     for next in order.iter().map(|i| standings[*i]) {
-        match course(cell, &last, &next) {
+        match plan_motion(cell, &last, &next) {
             Some(motion) => {
                 secs += motion.secs;
                 let mut from = [last.microphone, last.speaker];

@@ -29,7 +29,7 @@ pub(crate) struct OperatorArgs {
     binary: Option<PathBuf>,
 }
 
-pub(crate) fn run(args: &OperatorArgs) -> Result<()> {
+pub(crate) fn run_operator_rounds(args: &OperatorArgs) -> Result<()> {
     let binary = args.binary.clone().map_or_else(super::echolake_path, |path| Ok(path.canonicalize()?))?;
     let python = match args.python.clone().map_or_else(install_deltalake, Ok) {
         Err(why) if std::env::var_os(NO_SKIP).is_none() => {

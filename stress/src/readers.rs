@@ -195,7 +195,7 @@ impl ReaderLoad {
     }
 }
 
-pub(crate) fn run(args: &ReadersArgs) -> Result<()> {
+pub(crate) fn run_readers(args: &ReadersArgs) -> Result<()> {
     let mut server = CatalogueServer::new(&args.address);
     if let Some(token) = &args.token {
         server = server.with_token(token);

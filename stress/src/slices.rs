@@ -41,7 +41,7 @@ struct SliceTimes {
 }
 
 /// Reads a slice to its end; it is an error if the end does not come.
-fn read(address: &str, path: &str) -> Result<SliceTimes> {
+fn read_slice(address: &str, path: &str) -> Result<SliceTimes> {
     let begun = Instant::now();
     let mut stream = TcpStream::connect(address)?;
     stream.write_all(format!("GET {path} HTTP/1.1\r\nhost: {address}\r\nconnection: close\r\n\r\n").as_bytes())?;
@@ -72,11 +72,11 @@ fn read(address: &str, path: &str) -> Result<SliceTimes> {
     Ok(SliceTimes { bytes, first: first.unwrap_or_default(), all: begun.elapsed() })
 }
 
-fn path(run: &str, pairs: std::ops::Range<u64>, more: &str) -> String {
+fn slice_path(run: &str, pairs: std::ops::Range<u64>, more: &str) -> String {
     format!("/api/v1/slices.mcap?run={run}&where=pair_id%20between%20{}%20and%20{}{more}", pairs.start, pairs.end - 1)
 }
 
-pub(crate) fn run(args: &SlicesArgs) -> Result<()> {
+pub(crate) fn run_slices(args: &SlicesArgs) -> Result<()> {
     let args = Arc::new(args.clone());
     let milliseconds = |time: Duration| time.as_secs_f64() * 1e3;
     for (name, share, more) in [
@@ -86,8 +86,8 @@ pub(crate) fn run(args: &SlicesArgs) -> Result<()> {
         ("poses of 1 %", 100, POSES),
         ("poses of 100 %", 1, POSES),
     ] {
-        let path = path(&args.run, 0..(args.pairs / share).max(1), more);
-        let mut tries = (0..5).map(|_| read(&args.address, &path)).collect::<Result<Vec<_>>>()?;
+        let path = slice_path(&args.run, 0..(args.pairs / share).max(1), more);
+        let mut tries = (0..5).map(|_| read_slice(&args.address, &path)).collect::<Result<Vec<_>>>()?;
         tries.sort_by_key(|took| took.first);
         let (median, slowest) = (&tries[2], &tries[4]);
         println!(
@@ -105,7 +105,7 @@ pub(crate) fn run(args: &SlicesArgs) -> Result<()> {
         std::thread::spawn(move || {
             // Each another tenth of the run, so that none is like another.
             let from = number * 7 % (args.pairs * 9 / 10).max(1);
-            read(&args.address, &path(&args.run, from..from + (args.pairs / 10).max(1), ""))
+            read_slice(&args.address, &slice_path(&args.run, from..from + (args.pairs / 10).max(1), ""))
         })
     };
     let readers: Vec<_> = (0..args.readers).map(reader).collect();

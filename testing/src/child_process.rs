@@ -101,7 +101,7 @@ impl ChildProcess {
 
     /// Returns what it wrote to stderr so far.
     pub fn stderr(&self) -> String {
-        text(&self.transcript.lock()[STDERR].bytes)
+        lossy_text(&self.transcript.lock()[STDERR].bytes)
     }
 
     /// Waits for a line on stderr with this text in it, and returns the line.
@@ -111,7 +111,7 @@ impl ChildProcess {
     pub fn wait_for_line(&mut self, part: &str) -> String {
         let end = Instant::now() + self.limit;
         self.wait_for(end, &format!("line with `{part}`"), |pipes| {
-            let whole = text(&pipes[STDERR].bytes);
+            let whole = lossy_text(&pipes[STDERR].bytes);
             let mut lines = whole.split_inclusive('\n').filter(|line| line.ends_with('\n'));
             let found = lines.find(|line| line.contains(part)).map(|line| line.trim_end().to_owned());
             // What does not come before its end never comes.
@@ -158,7 +158,7 @@ impl ChildProcess {
     pub fn signal(&self, name: &str) {
         let sent = run_command(Command::new("kill").args([format!("-{name}"), self.id().to_string()]));
         let sent = sent.expect("kill starts");
-        assert!(sent.status.success(), "{}: {}", self.name, text(&sent.stderr));
+        assert!(sent.status.success(), "{}: {}", self.name, lossy_text(&sent.stderr));
     }
 
     /// Kills it by SIGKILL, after which nothing of it runs.
@@ -207,7 +207,7 @@ impl ChildProcess {
 
     fn repeated(&self) -> String {
         let pipes = self.transcript.lock();
-        let end = |bytes: &[u8]| text(&bytes[bytes.len().saturating_sub(REPEATED_BYTES)..]);
+        let end = |bytes: &[u8]| lossy_text(&bytes[bytes.len().saturating_sub(REPEATED_BYTES)..]);
         format!("stderr: {}\nstdout: {}", end(&pipes[STDERR].bytes), end(&pipes[STDOUT].bytes))
     }
 }
@@ -244,7 +244,7 @@ fn spawn_reader(mut pipe: impl Read + Send + 'static, number: usize, transcript:
     });
 }
 
-fn text(bytes: &[u8]) -> String {
+fn lossy_text(bytes: &[u8]) -> String {
     String::from_utf8_lossy(bytes).into_owned()
 }
 
@@ -299,7 +299,7 @@ mod tests {
     #[test]
     fn output_and_exit_code_are_those_of_the_program() {
         let output = run_command(Command::new("sh").args(["-c", "echo out; echo err >&2; exit 3"])).expect("a shell");
-        let said = [&output.stdout, &output.stderr].map(|bytes| text(bytes));
+        let said = [&output.stdout, &output.stderr].map(|bytes| lossy_text(bytes));
         assert_eq!((output.status.code(), said), (Some(3), ["out\n".to_owned(), "err\n".to_owned()]));
     }
 }

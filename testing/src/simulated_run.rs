@@ -5,7 +5,7 @@ use std::sync::atomic::AtomicBool;
 
 use echolake_acquisition::run::RunRequest;
 use echolake_acquisition::run::controller::RecordingMode;
-use echolake_acquisition::run::simulate::simulate;
+use echolake_acquisition::run::simulate::run_simulation;
 use echolake_panel::PanelSpecimen;
 use echolake_panel::relief::PanelRelief;
 use echolake_schema::manifest::Origin;
@@ -35,5 +35,5 @@ pub fn simulate_run(folder: &Path, number: usize, surface: &str, relief: &str, k
         keep,
         folder,
     };
-    simulate(&run, Origin::Simulated, &AtomicBool::new(false), &mut |_| {}).expect("a run").0
+    run_simulation(&run, Origin::Simulated, &AtomicBool::new(false), &mut |_| {}).expect("a run").0
 }

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use echolake_acquisition::run::recorder::{Error, Recorder, RunStart, Sealed};
 use echolake_schema::manifest::RunEnd;
 
-/// Runs that are written and not yet named. Dropped before [`ImportBatch::publish`] has named all, it removes its
+/// Runs that are written and not yet named. Dropped before [`ImportBatch::publish_all`] has named all, it removes its
 /// files, and only its own.
 #[derive(Default)]
 pub(crate) struct ImportBatch {
@@ -15,20 +15,20 @@ pub(crate) struct ImportBatch {
 
 impl ImportBatch {
     /// Begins one of the runs.
-    pub(crate) fn create(&mut self, path: &Path, start: &RunStart<'_>) -> Result<Recorder, Error> {
+    pub(crate) fn create_run(&mut self, path: &Path, start: &RunStart<'_>) -> Result<Recorder, Error> {
         let recorder = Recorder::create(path, start)?;
         self.ours.push(recorder.partial().to_owned());
         Ok(recorder)
     }
 
     /// Ends one of the runs: it is whole and on the disk.
-    pub(crate) fn seal(&mut self, recorder: Recorder, end: &RunEnd) -> Result<(), Error> {
+    pub(crate) fn seal_run(&mut self, recorder: Recorder, end: &RunEnd) -> Result<(), Error> {
         self.sealed.push(recorder.seal(end)?);
         Ok(())
     }
 
     /// Gives all runs their names.
-    pub(crate) fn publish(mut self) -> Result<(), Error> {
+    pub(crate) fn publish_all(mut self) -> Result<(), Error> {
         // Conflicts that can be known are found before the first run has its name.
         if let Some(taken) = self.sealed.iter().find(|run| run.path().exists()) {
             return Err(Error::Exists { path: taken.path().to_owned() });

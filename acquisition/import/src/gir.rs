@@ -20,7 +20,7 @@ use ndarray_npy::{NpzReader, ReadableElement};
 
 use crate::batch::ImportBatch;
 use crate::response::ImportedResponse;
-use crate::{Error, ImportOptions, ImportedRun, RUN_SECS, wrong};
+use crate::{Error, ImportOptions, ImportedRun, RUN_SECS, content_error};
 
 /// Samples of the published responses.
 pub const GIR_IR_LEN: usize = 400;
@@ -37,7 +37,7 @@ pub fn import_gir(
     options: ImportOptions<'_>,
     progress: &mut dyn FnMut(usize, usize),
 ) -> Result<Vec<ImportedRun>, Error> {
-    let grid = rig.grid()?;
+    let grid = rig.build_grid()?;
     let order = visiting_order(&folder.join("combinations.csv"), &grid)?;
     let info = panel_info(&folder.join("panel_info.csv"))?;
     let files = surfaces(folder)?;
@@ -48,7 +48,7 @@ pub fn import_gir(
         runs.push(import.surface(file, surface.clone(), info.get(&surface), &mut batch)?);
         progress(runs.len(), files.len());
     }
-    batch.publish()?;
+    batch.publish_all()?;
     Ok(runs)
 }
 
@@ -82,12 +82,12 @@ impl GirImport<'_> {
             relief_mm: h.extent_mm().map(f64::from),
         });
         let started = self.options.started.plus_secs(f64::from(self.number) * RUN_SECS);
-        let manifest = crate::manifest(Origin::ImportedGir, &surface, self.rig, started)?;
+        let manifest = crate::make_manifest(Origin::ImportedGir, &surface, self.rig, started)?;
         let path = self.options.folder.join(format!("{}.mcap", manifest.run_id));
         let relief =
             heights.as_ref().zip(mesh.as_ref()).map(|(heights, mesh)| Relief { heights, mesh, original: None });
         let start = RunStart { manifest: &manifest, rig: self.rig, surface: &record, relief, plan: None };
-        let mut recorder = batch.create(&path, &start)?;
+        let mut recorder = batch.create_run(&path, &start)?;
         if self.order.is_none() {
             let what = "no combinations.csv: rows are taken in the order of the rig's pairs";
             recorder.log(started, LogLevel::Warning, NAME, what)?;
@@ -99,10 +99,10 @@ impl GirImport<'_> {
             at = at.plus_secs(TAKE_SECS);
             let samples = matrix.row(row).iter().map(|x| *x as f32).collect();
             let response = ImportedResponse { pair: *pair, at, celsius: *celsius, samples, is_corrected: true };
-            response.record(&mut recorder, self.rig, self.grid)?;
+            response.record_response(&mut recorder, self.rig, self.grid)?;
         }
         let count = pairs.len() as u64;
-        batch.seal(recorder, &RunEnd { ended: at, accepted: count, rejected: 0, attempts: count })?;
+        batch.seal_run(recorder, &RunEnd { ended: at, accepted: count, rejected: 0, attempts: count })?;
         Ok(ImportedRun { path, run_id: manifest.run_id, surface, measurements: pairs.len(), warnings: Vec::new() })
     }
 
@@ -111,11 +111,11 @@ impl GirImport<'_> {
         let (actual, least) = (matrix.dim(), self.rig.impulse_response.length);
         if actual.0 != rows || actual.1 < least {
             let expected = format!("{rows} rows of at least {least} samples, the lake's response length");
-            return Err(wrong(file, "matrix", format!("{} x {}", actual.0, actual.1), expected));
+            return Err(content_error(file, "matrix", format!("{} x {}", actual.0, actual.1), expected));
         }
         // Responses are recorded in single precision.
         if let Some(((row, column), x)) = matrix.indexed_iter().find(|(_, x)| !(**x as f32).is_finite()) {
-            return Err(wrong(file, format!("matrix[{row}, {column}]"), format!("{x:e}"), "a finite f32"));
+            return Err(content_error(file, format!("matrix[{row}, {column}]"), format!("{x:e}"), "a finite f32"));
         }
         Ok(matrix)
     }
@@ -130,7 +130,7 @@ impl GirImport<'_> {
         let (rows, columns) = heights.dim();
         if rows != columns || rows < 2 || heights.iter().any(|h| !h.is_finite()) {
             let actual = format!("{rows} x {columns}, or numbers that are not finite");
-            return Err(wrong(&file, "surface", actual, "a square of finite heights"));
+            return Err(content_error(&file, "surface", actual, "a square of finite heights"));
         }
         let mean = heights.mean().unwrap_or(0.0);
         let span = heights.iter().fold(0.0f64, |m, h| m.max((h - mean).abs()));
@@ -148,11 +148,11 @@ fn smaller(heights: &HeightField) -> HeightField {
 fn temperatures(file: &Path, rows: usize) -> Result<Vec<Celsius>, Error> {
     let values: Array1<f64> = array::<Ix1>(file, "temperatures")?;
     if values.len() != rows {
-        return Err(wrong(file, "temperatures", format!("{} values", values.len()), rows.to_string()));
+        return Err(content_error(file, "temperatures", format!("{} values", values.len()), rows.to_string()));
     }
     let checked = values.iter().enumerate().map(|(row, celsius)| {
         let place = format!("temperatures[{row}]");
-        Celsius::new(*celsius).map_err(|e| wrong(file, place, e.to_string(), "a temperature"))
+        Celsius::new(*celsius).map_err(|e| content_error(file, place, e.to_string(), "a temperature"))
     });
     checked.collect()
 }
@@ -169,7 +169,11 @@ fn surfaces(folder: &Path) -> Result<Vec<PathBuf>, Error> {
         }
     }
     files.sort();
-    if files.is_empty() { Err(wrong(folder, "the folder", "no .npz file", "<surface>.npz files")) } else { Ok(files) }
+    if files.is_empty() {
+        Err(content_error(folder, "the folder", "no .npz file", "<surface>.npz files"))
+    } else {
+        Ok(files)
+    }
 }
 
 // An array of floats of either width, by its name.
@@ -178,7 +182,7 @@ fn array<D: ndarray::Dimension>(path: &Path, name: &str) -> Result<ndarray::Arra
         Ok(array) => Ok(array),
         Err(first) => match typed::<f32, D>(path, name) {
             Ok(array) => Ok(array.mapv(f64::from)),
-            Err(_) => Err(wrong(path, format!("array `{name}`"), first, "an array of f32 or f64")),
+            Err(_) => Err(content_error(path, format!("array `{name}`"), first, "an array of f32 or f64")),
         },
     }
 }
@@ -198,20 +202,22 @@ fn visiting_order(path: &Path, grid: &Grid) -> Result<Option<Vec<Pair>>, Error> 
     for (line, cells) in table(path, &GIR_COMBINATIONS)? {
         let place = format!("line {line}");
         let numbers: Option<Vec<usize>> = cells.iter().map(|c| c.parse().ok()).collect();
-        let n = numbers.ok_or_else(|| wrong(path, place.clone(), cells.join(","), "whole numbers"))?;
+        let n = numbers.ok_or_else(|| content_error(path, place.clone(), cells.join(","), "whole numbers"))?;
         let point = |l: usize, x: usize, y: usize| grid.parse_point(&format!("{l}/{x}/{y}"));
         let PairId(id) = point(n[1], n[2], n[3])
             .and_then(|m| Ok((m, point(n[4], n[5], n[6])?)))
             .and_then(|(m, s)| grid.parse_pair(m, s))
-            .map_err(|e| wrong(path, place.clone(), e.to_string(), "a pair of the rig"))?;
+            .map_err(|e| content_error(path, place.clone(), e.to_string(), "a pair of the rig"))?;
         let slot = n[0].checked_sub(1).and_then(|i| pairs.get_mut(i));
-        *slot.ok_or_else(|| wrong(path, place, n[0].to_string(), format!("1 to {}", grid.pairs().len())))? =
+        *slot.ok_or_else(|| content_error(path, place, n[0].to_string(), format!("1 to {}", grid.pairs().len())))? =
             Some(grid.pairs()[id as usize]);
     }
     let count = pairs.iter().flatten().count();
     let whole: Option<Vec<Pair>> = pairs.into_iter().collect();
     let expected = grid.pairs().len();
-    whole.map(Some).ok_or_else(|| wrong(path, "its rows", format!("{count} combinations"), expected.to_string()))
+    whole
+        .map(Some)
+        .ok_or_else(|| content_error(path, "its rows", format!("{count} combinations"), expected.to_string()))
 }
 
 // Reads the facts of each surface.
@@ -222,7 +228,8 @@ fn panel_info(path: &Path) -> Result<HashMap<SurfaceId, SurfaceRecord>, Error> {
     let mut info = HashMap::new();
     for (line, c) in table(path, &GIR_PANEL_INFO)? {
         let id = |text: &str| {
-            text.parse::<SurfaceId>().map_err(|e| wrong(path, format!("line {line}"), e.to_string(), "a surface id"))
+            text.parse::<SurfaceId>()
+                .map_err(|e| content_error(path, format!("line {line}"), e.to_string(), "a surface id"))
         };
         let some = |text: &str| (!text.is_empty()).then(|| text.to_owned());
         let record = SurfaceRecord {
@@ -252,7 +259,7 @@ fn table(path: &Path, names: &[&str]) -> Result<Vec<(u64, Vec<String>)>, Error> 
     let header = reader.headers().map_err(unreadable)?.clone();
     let place = |name: &&str| {
         let found = header.iter().position(|h| h == *name);
-        found.ok_or_else(|| wrong(path, "its header", format!("no column `{name}`"), names.join(", ")))
+        found.ok_or_else(|| content_error(path, "its header", format!("no column `{name}`"), names.join(", ")))
     };
     let places: Vec<usize> = names.iter().map(place).collect::<Result<_, _>>()?;
     let mut rows = Vec::new();

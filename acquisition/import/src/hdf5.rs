@@ -12,13 +12,13 @@ use echolake_schema::manifest::{Origin, RunEnd};
 use echolake_schema::{Celsius, ErrorCause, Grid, Pair, PairId, Point, Rig, SurfaceId};
 
 use crate::batch::ImportBatch;
-use crate::hdf5_file::{Hdf5Dataset, Hdf5File, Hdf5Variable, place};
+use crate::hdf5_file::{Hdf5Dataset, Hdf5File, Hdf5Variable, place_in_grid};
 use crate::hdf5_mapping::{
     DatasetDimension, Hdf5Mapping, PositionMapping, RateMapping, TemperatureMapping, TemperatureUnit,
 };
 use crate::positions::{CoordinateFrame, to_nano};
 use crate::response::{ImportedResponse, least_length};
-use crate::{Error, ImportOptions, ImportedRun, RUN_SECS, wrong};
+use crate::{Error, ImportOptions, ImportedRun, RUN_SECS, content_error};
 
 /// Source name of the import's log entries.
 const NAME: &str = "import hdf5";
@@ -42,7 +42,7 @@ pub fn import_hdf5(
     options: ImportOptions<'_>,
     progress: &mut dyn FnMut(usize, usize),
 ) -> Result<Vec<ImportedRun>, Error> {
-    let grid = rig.grid()?;
+    let grid = rig.build_grid()?;
     let set = ResponseSet::open(mapping, rig, &grid, celsius)?;
     let (mut runs, mut batch) = (Vec::new(), ImportBatch::default());
     let of_each = set.microphones.len() * set.speakers.len();
@@ -51,7 +51,7 @@ pub fn import_hdf5(
         let mut step = |done: usize| progress(number * of_each + done, total);
         runs.push(set.record(number, &Hdf5Import { rig, grid: &grid, options }, &mut batch, &mut step)?);
     }
-    batch.publish()?;
+    batch.publish_all()?;
     Ok(runs)
 }
 
@@ -60,7 +60,7 @@ pub fn import_hdf5(
 /// # Errors
 /// As [`import_hdf5`].
 pub fn check_hdf5(mapping: &Path, rig: &Rig, celsius: Option<Celsius>) -> Result<(), Error> {
-    ResponseSet::open(mapping, rig, &rig.grid()?, celsius).map(drop)
+    ResponseSet::open(mapping, rig, &rig.build_grid()?, celsius).map(drop)
 }
 
 struct Hdf5Import<'a> {
@@ -103,7 +103,7 @@ struct MappedFile<'a> {
 
 impl<'g> ResponseSet<'g> {
     fn open(path: &Path, rig: &Rig, grid: &'g Grid, celsius: Option<Celsius>) -> Result<Self, Error> {
-        let mapping = Hdf5Mapping::read(path)?;
+        let mapping = Hdf5Mapping::from_file(path)?;
         let unread = |source: ErrorCause| Error::Read { path: mapping.file.clone(), source };
         std::fs::File::open(&mapping.file).map_err(|e| unread(e.into()))?;
         let opened = Hdf5File::open(&mapping.file);
@@ -115,7 +115,7 @@ impl<'g> ResponseSet<'g> {
         if responses.shape.len() != mapping.responses.dimensions.len() || responses.shape.contains(&0) {
             let names: Vec<_> = mapping.responses.dimensions.iter().map(|d| d.label()).collect();
             let expected = format!("one number each of [{}]; hint: responses.dimensions", names.join(", "));
-            return Err(wrong(mapped.path, name, format!("shape {:?}", responses.shape), expected));
+            return Err(content_error(mapped.path, name, format!("shape {:?}", responses.shape), expected));
         }
         let count = |axis: usize| responses.shape[axis];
         mapped.expect_rate(&mapping.sampling_rate, rig)?;
@@ -124,11 +124,11 @@ impl<'g> ResponseSet<'g> {
         for microphone in &microphones {
             for speaker in &speakers {
                 grid.parse_pair(microphone, speaker)
-                    .map_err(|e| wrong(mapped.path, name, e.to_string(), "pairs of the rig"))?;
+                    .map_err(|e| content_error(mapped.path, name, e.to_string(), "pairs of the rig"))?;
             }
         }
         let measurements = axes.measurement.map_or(1, count);
-        let surfaces = mapping.surfaces(path, measurements)?;
+        let surfaces = mapping.parse_surfaces(path, measurements)?;
         let counts = [microphones.len(), speakers.len(), measurements];
         let temperatures = match celsius {
             Some(given) => AirTemperatures { celsius: vec![given], steps: [0; 3] },
@@ -138,7 +138,7 @@ impl<'g> ResponseSet<'g> {
         let least = temperatures.celsius.iter().map(|c| least_length(rig, *c, false)).max().unwrap_or(0);
         if length < least {
             let expected = format!("{least} at least, for the lake's responses of {}", rig.impulse_response.length);
-            return Err(wrong(mapped.path, name, format!("{length} samples"), expected));
+            return Err(content_error(mapped.path, name, format!("{length} samples"), expected));
         }
         Ok(Self { responses, axes, surfaces, microphones, speakers, temperatures, mapping })
     }
@@ -152,11 +152,11 @@ impl<'g> ResponseSet<'g> {
         done: &mut dyn FnMut(usize),
     ) -> Result<ImportedRun, Error> {
         let started = import.options.started.plus_secs(number as f64 * RUN_SECS);
-        let manifest = crate::manifest(Origin::ImportedHdf5, &self.surfaces[number], import.rig, started)?;
+        let manifest = crate::make_manifest(Origin::ImportedHdf5, &self.surfaces[number], import.rig, started)?;
         let record = import.options.surface_record("imported");
         let path = import.options.folder.join(format!("{}.mcap", manifest.run_id));
         let start = RunStart { manifest: &manifest, rig: import.rig, surface: &record, relief: None, plan: None };
-        let mut recorder = batch.create(&path, &start)?;
+        let mut recorder = batch.create_run(&path, &start)?;
         recorder.log(started, LogLevel::Info, NAME, "times are made up: the mapping has none")?;
         let shape = &self.responses.shape;
         let block = self.block_shape();
@@ -166,7 +166,7 @@ impl<'g> ResponseSet<'g> {
         }
         let (mut at, mut measured) = (started, 0usize);
         for index in 0..blocks.iter().product() {
-            let mut starts: Vec<usize> = place(index, &blocks).iter().zip(&block).map(|(i, b)| i * b).collect();
+            let mut starts: Vec<usize> = place_in_grid(index, &blocks).iter().zip(&block).map(|(i, b)| i * b).collect();
             if let Some(axis) = self.axes.measurement {
                 starts[axis] = number;
             }
@@ -175,13 +175,13 @@ impl<'g> ResponseSet<'g> {
             for (pair, celsius, samples) in self.read_block(&starts, &counts, number, import.grid)? {
                 at = started.plus_secs(measured as f64 * RESPONSE_SECS);
                 let response = ImportedResponse { pair, at, celsius, samples, is_corrected: false };
-                response.record(&mut recorder, import.rig, import.grid)?;
+                response.record_response(&mut recorder, import.rig, import.grid)?;
                 measured += 1;
             }
             done(measured);
         }
         let count = measured as u64;
-        batch.seal(recorder, &RunEnd { ended: at, accepted: count, rejected: 0, attempts: count })?;
+        batch.seal_run(recorder, &RunEnd { ended: at, accepted: count, rejected: 0, attempts: count })?;
         let (run_id, surface) = (manifest.run_id, manifest.surface_id);
         Ok(ImportedRun { path, run_id, surface, measurements: measured, warnings: Vec::new() })
     }
@@ -195,12 +195,17 @@ impl<'g> ResponseSet<'g> {
         grid: &Grid,
     ) -> Result<Vec<(Pair, Celsius, Vec<f32>)>, Error> {
         let (file, name) = (&self.mapping.file, &self.mapping.responses.dataset);
-        let values = self.responses.read(starts, counts).map_err(|what| {
-            wrong(file, format!("{name}, {counts:?} numbers from {starts:?} on"), what, "numbers that can be read")
+        let values = self.responses.read_block(starts, counts).map_err(|what| {
+            content_error(
+                file,
+                format!("{name}, {counts:?} numbers from {starts:?} on"),
+                what,
+                "numbers that can be read",
+            )
         })?;
         if let Some(at) = values.iter().position(|x| !(*x as f32).is_finite()) {
-            let place: Vec<usize> = place(at, counts).iter().zip(starts).map(|(i, start)| i + start).collect();
-            return Err(wrong(file, format!("{name}{place:?}"), format!("{:e}", values[at]), "a finite f32"));
+            let place: Vec<usize> = place_in_grid(at, counts).iter().zip(starts).map(|(i, start)| i + start).collect();
+            return Err(content_error(file, format!("{name}{place:?}"), format!("{:e}", values[at]), "a finite f32"));
         }
         let step = |axis: usize| counts[axis + 1..].iter().product::<usize>();
         let ResponseAxes { microphone, speaker, sample, .. } = self.axes;
@@ -251,7 +256,7 @@ impl ResponseAxes {
             _ => {
                 let names: Vec<_> = dimensions.iter().map(|d| d.label()).collect();
                 let expected = "microphone, speaker and sample once each, and measurement if the dataset has it";
-                Err(wrong(path, "responses.dimensions", format!("[{}]", names.join(", ")), expected))
+                Err(content_error(path, "responses.dimensions", format!("[{}]", names.join(", ")), expected))
             }
         }
     }
@@ -265,20 +270,25 @@ impl AirTemperatures {
 
 impl MappedFile<'_> {
     fn dataset(&self, name: &str) -> Result<Hdf5Dataset, Error> {
-        let found = self.file.dataset(name).map_err(|actual| wrong(self.path, name, actual, "a dataset of numbers"))?;
-        found.ok_or_else(|| wrong(self.path, name, "it is missing", self.datasets()))
+        let found = self
+            .file
+            .open_dataset(name)
+            .map_err(|actual| content_error(self.path, name, actual, "a dataset of numbers"))?;
+        found.ok_or_else(|| content_error(self.path, name, "it is missing", self.datasets()))
     }
 
     fn variable(&self, name: &str) -> Result<Hdf5Variable, Error> {
-        let found =
-            self.file.variable(name).map_err(|actual| wrong(self.path, name, actual, "a dataset of numbers"))?;
-        found.ok_or_else(|| wrong(self.path, name, "it is missing", self.datasets()))
+        let found = self
+            .file
+            .read_variable(name)
+            .map_err(|actual| content_error(self.path, name, actual, "a dataset of numbers"))?;
+        found.ok_or_else(|| content_error(self.path, name, "it is missing", self.datasets()))
     }
 
     // Names those that there are.
     fn datasets(&self) -> String {
         const SHOWN: usize = 20;
-        let names = self.file.names();
+        let names = self.file.variable_names();
         let more = if names.len() > SHOWN { ", ..." } else { "" };
         format!("one of {}{more}", names[..names.len().min(SHOWN)].join(", "))
     }
@@ -291,7 +301,7 @@ impl MappedFile<'_> {
                 Some(attribute) => {
                     let place = format!("attribute `{attribute}` of {}", stored.dataset);
                     let found = self.file.number_of(&stored.dataset, attribute);
-                    (place.clone(), vec![found.map_err(|actual| wrong(self.path, place, actual, "a number"))?])
+                    (place.clone(), vec![found.map_err(|actual| content_error(self.path, place, actual, "a number"))?])
                 }
             },
         };
@@ -301,9 +311,9 @@ impl MappedFile<'_> {
             Some(rate) => {
                 let actual = rates.iter().find(|other| **other != expected).unwrap_or(rate);
                 let expected = format!("the rig's {expected} Hz; hint: sweep.rate_hz in the rig file");
-                Err(wrong(self.path, place, format!("{actual} Hz"), expected))
+                Err(content_error(self.path, place, format!("{actual} Hz"), expected))
             }
-            None => Err(wrong(self.path, place, "no number", "a sampling rate")),
+            None => Err(content_error(self.path, place, "no number", "a sampling rate")),
         }
     }
 
@@ -327,9 +337,10 @@ impl MappedFile<'_> {
         let kind = mapping.kind.clone().unwrap_or_else(|| self.file.text_of(name, "Type"));
         if units.trim().is_empty() {
             let expected = format!("units; hint: `units = \"metre\"` under [{what}] in the mapping");
-            return Err(wrong(self.path, name, "no attribute `Units`", expected));
+            return Err(content_error(self.path, name, "no attribute `Units`", expected));
         }
-        let frame = CoordinateFrame::parse(&kind, &units).map_err(|f| wrong(self.path, name, f.actual, f.expected))?;
+        let frame =
+            CoordinateFrame::parse(&kind, &units).map_err(|f| content_error(self.path, name, f.actual, f.expected))?;
         let (mut points, mut seen) = (Vec::with_capacity(count), HashMap::new());
         for i in 0..count {
             let [Some(a), Some(b), Some(c)] = [0, 1, 2].map(|axis| at(i, axis)) else {
@@ -337,15 +348,15 @@ impl MappedFile<'_> {
                     "[{count}, 3], because `{responses}` has {count} {what}; hint: the order in \
                                         responses.dimensions"
                 );
-                return Err(wrong(self.path, name, format!("shape {:?}", found.shape), expected));
+                return Err(content_error(self.path, name, format!("shape {:?}", found.shape), expected));
             };
-            let [x, y, z] = frame.millimetres([a, b, c]);
+            let [x, y, z] = frame.position_mm([a, b, c]);
             let point = grid
                 .parse_point(&format!("{x} {y} {z}"))
-                .map_err(|e| wrong(self.path, format!("{name}[{i}]"), e.to_string(), "a point of the rig"))?;
+                .map_err(|e| content_error(self.path, format!("{name}[{i}]"), e.to_string(), "a point of the rig"))?;
             if let Some(twin) = seen.insert(point.id.0, i) {
                 let place = format!("{name}[{i}]");
-                return Err(wrong(self.path, place, format!("the point of {name}[{twin}]"), "one of its own"));
+                return Err(content_error(self.path, place, format!("the point of {name}[{twin}]"), "one of its own"));
             }
             points.push(point);
         }
@@ -360,9 +371,10 @@ impl MappedFile<'_> {
     ) -> Result<AirTemperatures, Error> {
         let hint = "a temperature; hint: --temperature-c says what it was";
         let stored = match mapping {
-            None => return Err(wrong(path, "temperature", "it is missing", hint)),
+            None => return Err(content_error(path, "temperature", "it is missing", hint)),
             Some(TemperatureMapping::Celsius(celsius)) => {
-                let celsius = Celsius::new(*celsius).map_err(|e| wrong(path, "temperature", e.to_string(), hint))?;
+                let celsius =
+                    Celsius::new(*celsius).map_err(|e| content_error(path, "temperature", e.to_string(), hint))?;
                 return Ok(AirTemperatures { celsius: vec![celsius], steps: [0; 3] });
             }
             Some(TemperatureMapping::Stored(stored)) => stored,
@@ -377,7 +389,7 @@ impl MappedFile<'_> {
                 DatasetDimension::Measurement => (2, measurements),
                 DatasetDimension::Sample => {
                     let expected = "microphone, speaker or measurement";
-                    return Err(wrong(path, "temperature.dimensions", "sample", expected));
+                    return Err(content_error(path, "temperature.dimensions", "sample", expected));
                 }
             };
             steps[index] = step;
@@ -387,14 +399,14 @@ impl MappedFile<'_> {
         let shape: Vec<usize> = found.shape.iter().copied().filter(|n| *n != 1).collect();
         if shape != expected.iter().copied().filter(|n| *n != 1).collect::<Vec<_>>() || found.values.len() != step {
             let expected = format!("{expected:?}; hint: temperature.dimensions");
-            return Err(wrong(self.path, &stored.dataset, format!("shape {:?}", found.shape), expected));
+            return Err(content_error(self.path, &stored.dataset, format!("shape {:?}", found.shape), expected));
         }
         let zero = match stored.units {
             TemperatureUnit::Celsius => 0.0,
             TemperatureUnit::Kelvin => KELVIN,
         };
         let celsius: Result<Vec<_>, _> = found.values.iter().map(|x| Celsius::new(to_nano(x - zero))).collect();
-        let celsius = celsius.map_err(|e| wrong(self.path, &stored.dataset, e.to_string(), hint))?;
+        let celsius = celsius.map_err(|e| content_error(self.path, &stored.dataset, e.to_string(), hint))?;
         Ok(AirTemperatures { celsius, steps })
     }
 }

@@ -40,35 +40,35 @@ pub(crate) struct Hdf5Dataset {
 impl Hdf5File {
     pub(crate) fn open(path: &Path) -> Result<Self, String> {
         let size_bytes = std::fs::metadata(path).map_err(|e| e.to_string())?.len();
-        let file = File::open_streaming(path).map_err(describe)?;
+        let file = File::open_streaming(path).map_err(describe_error)?;
         Ok(Self { file, size_bytes })
     }
 
     /// Returns an attribute of the file; empty if it is missing.
-    pub(crate) fn text(&self, name: &str) -> String {
+    pub(crate) fn root_text(&self, name: &str) -> String {
         let found = self.file.root().attrs().ok().and_then(|mut attributes| attributes.remove(name));
         found.as_ref().and_then(AttrValue::as_str).unwrap_or_default().to_owned()
     }
 
     /// Returns an attribute of a variable; empty if it is missing.
     pub(crate) fn text_of(&self, variable: &str, name: &str) -> String {
-        let found = self.attribute(variable, name).ok().flatten();
+        let found = self.read_attribute(variable, name).ok().flatten();
         found.as_ref().and_then(AttrValue::as_str).unwrap_or_default().to_owned()
     }
 
     /// Returns a number that is an attribute of a variable.
     pub(crate) fn number_of(&self, variable: &str, name: &str) -> Result<f64, String> {
-        let found = self.attribute(variable, name).map_err(describe)?.ok_or("it is missing")?;
+        let found = self.read_attribute(variable, name).map_err(describe_error)?.ok_or("it is missing")?;
         let number = found.as_f64().or_else(|| found.as_i64().map(|integer| integer as f64));
         number.ok_or_else(|| format!("{} and not one number", found.type_name()))
     }
 
-    fn attribute(&self, variable: &str, name: &str) -> Result<Option<AttrValue>, Hdf5Error> {
+    fn read_attribute(&self, variable: &str, name: &str) -> Result<Option<AttrValue>, Hdf5Error> {
         Ok(self.file.dataset(variable)?.attrs()?.remove(name))
     }
 
     /// Returns the paths of variables, of a file with very many only the first.
-    pub(crate) fn names(&self) -> Vec<String> {
+    pub(crate) fn variable_names(&self) -> Vec<String> {
         let mut names = Vec::new();
         let mut groups: Vec<(Group, String, usize)> = vec![(self.file.root(), String::new(), 0)];
         let mut seen = 0;
@@ -84,14 +84,14 @@ impl Hdf5File {
     }
 
     /// Opens a variable; None if it is missing.
-    pub(crate) fn dataset(&self, name: &str) -> Result<Option<Hdf5Dataset>, String> {
+    pub(crate) fn open_dataset(&self, name: &str) -> Result<Option<Hdf5Dataset>, String> {
         let dataset = match self.file.dataset(name) {
             Err(Hdf5Error::Format(FormatError::PathNotFound(_)) | Hdf5Error::NotAGroup(_)) => return Ok(None),
-            opened => opened.map_err(describe)?,
+            opened => opened.map_err(describe_error)?,
         };
         let sizes = |sizes: Vec<u64>| sizes.into_iter().map(|n| usize::try_from(n).unwrap_or(usize::MAX)).collect();
-        let shape: Vec<usize> = sizes(dataset.shape().map_err(describe)?);
-        let width = dataset.element_size().map_err(describe)?;
+        let shape: Vec<usize> = sizes(dataset.shape().map_err(describe_error)?);
+        let width = dataset.element_size().map_err(describe_error)?;
         let has_room = |shape: &[usize]| {
             let size = shape.iter().try_fold(width, |size, n| size.checked_mul(*n as u64));
             size.is_some_and(|size| size <= self.size_bytes.saturating_mul(MOST_PACKED))
@@ -100,9 +100,9 @@ impl Hdf5File {
             return Err(format!("{shape:?} numbers, more than a file of {} bytes can hold", self.size_bytes));
         }
         let mut chunk_rows = 1;
-        if matches!(dataset.layout().map_err(describe)?, Layout::Chunked { .. }) {
-            let chunk: Vec<usize> = sizes(dataset.chunk_shape().map_err(describe)?.unwrap_or_default());
-            let chunks = dataset.chunks().map_err(describe)?;
+        if matches!(dataset.layout().map_err(describe_error)?, Layout::Chunked { .. }) {
+            let chunk: Vec<usize> = sizes(dataset.chunk_shape().map_err(describe_error)?.unwrap_or_default());
+            let chunks = dataset.chunks().map_err(describe_error)?;
             let ends = chunks.iter().map(|chunk| chunk.address.saturating_add(chunk.storage_size));
             if !has_room(&chunk) || ends.max().is_some_and(|end| end > self.size_bytes) {
                 return Err(format!("chunks of {chunk:?} numbers that are not in the file; it is damaged or cut off"));
@@ -113,21 +113,21 @@ impl Hdf5File {
     }
 
     /// Reads a variable; None if it is missing.
-    pub(crate) fn variable(&self, name: &str) -> Result<Option<Hdf5Variable>, String> {
-        let Some(dataset) = self.dataset(name)? else { return Ok(None) };
-        let values = dataset.read(&vec![0; dataset.shape.len()], &dataset.shape)?;
+    pub(crate) fn read_variable(&self, name: &str) -> Result<Option<Hdf5Variable>, String> {
+        let Some(dataset) = self.open_dataset(name)? else { return Ok(None) };
+        let values = dataset.read_block(&vec![0; dataset.shape.len()], &dataset.shape)?;
         Ok(Some(Hdf5Variable { shape: dataset.shape, values }))
     }
 }
 
 impl Hdf5Dataset {
     /// Reads the block of `counts` numbers that begins at `starts`, row by row. Rows are read with all that is in them.
-    pub(crate) fn read(&self, starts: &[usize], counts: &[usize]) -> Result<Vec<f64>, String> {
+    pub(crate) fn read_block(&self, starts: &[usize], counts: &[usize]) -> Result<Vec<f64>, String> {
         let count = counts.iter().try_fold(1usize, |count, n| count.checked_mul(*n)).filter(|n| *n <= MOST);
         let count = count.ok_or_else(|| format!("{counts:?} numbers, more than {MOST}"))?;
         let (&[start, ref starts @ ..], &[rows, ref counts @ ..], [_, within @ ..]) = (starts, counts, &self.shape[..])
         else {
-            return self.dataset.read_f64().map_err(describe);
+            return self.dataset.read_f64().map_err(describe_error);
         };
         let row: usize = within.iter().product();
         if row > MOST_ROW_NUMBERS {
@@ -146,11 +146,11 @@ impl Hdf5Dataset {
         let (mut at, end) = (start, start + rows);
         while at < end {
             let next = end.min((at / step + 1) * step);
-            let window = self.dataset.read_f64_rows(at as u64, (next - at) as u64).map_err(describe)?;
+            let window = self.dataset.read_f64_rows(at as u64, (next - at) as u64).map_err(describe_error)?;
             if window.len() != (next - at) * row {
                 return Err(format!("{} numbers in {} rows, expected {row} in each", window.len(), next - at));
             }
-            window.chunks_exact(row).for_each(|row| cut(row, within, starts, counts, &mut values));
+            window.chunks_exact(row).for_each(|row| append_block(row, within, starts, counts, &mut values));
             at = next;
         }
         Ok(values)
@@ -158,20 +158,20 @@ impl Hdf5Dataset {
 }
 
 // Appends the block of `counts` numbers that begins at `starts`.
-fn cut(values: &[f64], shape: &[usize], starts: &[usize], counts: &[usize], out: &mut Vec<f64>) {
+fn append_block(values: &[f64], shape: &[usize], starts: &[usize], counts: &[usize], out: &mut Vec<f64>) {
     match shape {
         [] => out.extend(values),
         [_] => out.extend(&values[starts[0]..starts[0] + counts[0]]),
         [_, within @ ..] => {
             let step: usize = within.iter().product();
             let rows = values.chunks_exact(step).skip(starts[0]).take(counts[0]);
-            rows.for_each(|row| cut(row, within, &starts[1..], &counts[1..], out));
+            rows.for_each(|row| append_block(row, within, &starts[1..], &counts[1..], out));
         }
     }
 }
 
 // The place of a number in a grid, row by row.
-pub(crate) fn place(number: usize, grid: &[usize]) -> Vec<usize> {
+pub(crate) fn place_in_grid(number: usize, grid: &[usize]) -> Vec<usize> {
     let (mut left, mut at) = (number, vec![0; grid.len()]);
     for (i, n) in grid.iter().enumerate().rev() {
         at[i] = left % n;
@@ -181,7 +181,7 @@ pub(crate) fn place(number: usize, grid: &[usize]) -> Vec<usize> {
 }
 
 // What of the format is not read can be written in another way.
-fn describe(error: Hdf5Error) -> String {
+fn describe_error(error: Hdf5Error) -> String {
     let hint = match &error {
         Hdf5Error::Format(FormatError::UnsupportedExternalStorage | FormatError::UnsupportedVirtualLayout) => {
             return "its numbers are in other files; hint: `h5repack` brings them into one".to_owned();
@@ -217,19 +217,25 @@ mod tests {
         builder.write(&path).expect("written");
         let file = Hdf5File::open(&path).expect("opened");
         for name in ["plain", "/packed", "integers"] {
-            let dataset = file.dataset(name).expect("opened").expect("there");
+            let dataset = file.open_dataset(name).expect("opened").expect("there");
             assert_eq!(dataset.shape, shape);
-            for start in (0..35).map(|i| place(i, &shape)) {
-                for end in (0..35).map(|i| place(i, &shape)).filter(|end| end[0] >= start[0] && end[1] >= start[1]) {
+            for start in (0..35).map(|i| place_in_grid(i, &shape)) {
+                for end in
+                    (0..35).map(|i| place_in_grid(i, &shape)).filter(|end| end[0] >= start[0] && end[1] >= start[1])
+                {
                     let counts: Vec<usize> = end.iter().zip(&start).map(|(end, start)| end - start + 1).collect();
-                    let cells = (0..counts[0] * counts[1]).map(|i| place(i, &counts));
+                    let cells = (0..counts[0] * counts[1]).map(|i| place_in_grid(i, &counts));
                     let expected: Vec<f64> = cells.map(|c| ((start[0] + c[0]) * 10 + start[1] + c[1]) as f64).collect();
-                    assert_eq!(dataset.read(&start, &counts).as_ref(), Ok(&expected), "{name}: {start:?} to {end:?}");
+                    assert_eq!(
+                        dataset.read_block(&start, &counts).as_ref(),
+                        Ok(&expected),
+                        "{name}: {start:?} to {end:?}"
+                    );
                 }
             }
         }
-        assert!(file.dataset("missing").expect("no fault").is_none());
-        assert_eq!(file.names(), ["integers", "packed", "plain"]);
+        assert!(file.open_dataset("missing").expect("no fault").is_none());
+        assert_eq!(file.variable_names(), ["integers", "packed", "plain"]);
     }
 
     #[test]
@@ -241,7 +247,7 @@ mod tests {
         let hollow = builder.create_dataset("hollow").with_i32_data(&vec![7; 1 << 22]).with_chunks(&[1 << 20]);
         hollow.with_scale_offset(ScaleOffset::Integer(0)).with_deflate(9);
         builder.write(&path).expect("written");
-        let fault = Hdf5File::open(&path).and_then(|file| file.variable("hollow")).err().unwrap_or_default();
+        let fault = Hdf5File::open(&path).and_then(|file| file.read_variable("hollow")).err().unwrap_or_default();
         assert!(fault.contains("more than a file of"), "{fault:?}");
     }
 
@@ -253,14 +259,14 @@ mod tests {
         let path = folder.path().join("renamed_links.h5");
         std::fs::write(&path, include_bytes!("../../../tests/fixtures/renamed_links.h5")).expect("written");
         let file = Hdf5File::open(&path).expect("opened");
-        let value = |name: &str| file.variable(name).expect("no fault").map(|found| found.values);
+        let value = |name: &str| file.read_variable(name).expect("no fault").map(|found| found.values);
         assert_eq!([value("RoomTemperature"), value("w1")], [None, None]);
         assert_eq!([value("x"), value("/w2"), value("v7")], [Some(vec![293.15]), Some(vec![2.0]), Some(vec![7.0])]);
-        assert_eq!(file.names(), ["v0", "v1", "v2", "v3", "v4", "v5", "v6", "v7", "w0", "w2", "x"]);
+        assert_eq!(file.variable_names(), ["v0", "v1", "v2", "v3", "v4", "v5", "v6", "v7", "w0", "w2", "x"]);
     }
 
     #[test]
     fn places_count_row_by_row() {
-        assert_eq!((0..6).map(|n| place(n, &[2, 3])).collect::<Vec<_>>()[3..5], [vec![1, 0], vec![1, 1]]);
+        assert_eq!((0..6).map(|n| place_in_grid(n, &[2, 3])).collect::<Vec<_>>()[3..5], [vec![1, 0], vec![1, 1]]);
     }
 }

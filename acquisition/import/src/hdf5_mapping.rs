@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use echolake_schema::SurfaceId;
 use serde::Deserialize;
 
-use crate::{Error, wrong};
+use crate::{Error, content_error};
 
 /// A mapping file, as TOML has it.
 #[derive(Debug, Deserialize)]
@@ -98,27 +98,27 @@ pub(crate) enum TemperatureUnit {
 
 impl Hdf5Mapping {
     /// Reads a mapping file.
-    pub(crate) fn read(path: &Path) -> Result<Self, Error> {
+    pub(crate) fn from_file(path: &Path) -> Result<Self, Error> {
         let unread = |e: std::io::Error| Error::Read { path: path.to_owned(), source: e.into() };
         let text = std::fs::read_to_string(path).map_err(unread)?;
         let mut mapping: Self = toml::from_str(&text).map_err(|e| {
             let line = e.span().map_or(0, |span| text[..span.start].lines().count().max(1));
-            wrong(path, format!("line {line}"), e.message(), "a mapping; hint: docs/export.md has an example")
+            content_error(path, format!("line {line}"), e.message(), "a mapping; hint: docs/export.md has an example")
         })?;
         mapping.file = path.parent().unwrap_or(Path::new(".")).join(&mapping.file);
         Ok(mapping)
     }
 
     /// Returns the surfaces' names, checked: one per measurement.
-    pub(crate) fn surfaces(&self, path: &Path, measurements: usize) -> Result<Vec<SurfaceId>, Error> {
+    pub(crate) fn parse_surfaces(&self, path: &Path, measurements: usize) -> Result<Vec<SurfaceId>, Error> {
         let place = "surfaces";
         if self.surfaces.len() != measurements {
             let expected = format!("{measurements}, one per measurement of `{}`", self.responses.dataset);
-            return Err(wrong(path, place, format!("{} names", self.surfaces.len()), expected));
+            return Err(content_error(path, place, format!("{} names", self.surfaces.len()), expected));
         }
         let twin = self.surfaces.iter().enumerate().find(|(i, name)| self.surfaces[..*i].contains(name));
         if let Some((_, twin)) = twin {
-            return Err(wrong(path, place, format!("`{twin}` twice"), "one run per surface"));
+            return Err(content_error(path, place, format!("`{twin}` twice"), "one run per surface"));
         }
         let parsed: Result<_, _> = self.surfaces.iter().map(|name| name.parse()).collect();
         Ok(parsed?)

@@ -125,12 +125,17 @@ pub enum Error {
     Schema(#[from] echolake_schema::Error),
 }
 
-fn wrong(path: &Path, place: impl Into<String>, actual: impl Into<String>, expected: impl Into<String>) -> Error {
+fn content_error(
+    path: &Path,
+    place: impl Into<String>,
+    actual: impl Into<String>,
+    expected: impl Into<String>,
+) -> Error {
     Error::Content { path: path.to_owned(), place: place.into(), actual: actual.into(), expected: expected.into() }
 }
 
 /// Makes the manifest of an imported run.
-fn manifest(origin: Origin, surface: &SurfaceId, rig: &Rig, started: Timestamp) -> Result<RunManifest, Error> {
+fn make_manifest(origin: Origin, surface: &SurfaceId, rig: &Rig, started: Timestamp) -> Result<RunManifest, Error> {
     Ok(RunManifest {
         run_id: RunId::compose(started, surface, random_tag())?,
         surface_id: surface.clone(),

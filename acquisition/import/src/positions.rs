@@ -65,8 +65,8 @@ impl CoordinateFrame {
     }
 
     /// Returns a position as cartesian coordinates, mm.
-    pub(crate) fn millimetres(&self, position: [f64; 3]) -> [f64; 3] {
-        let [a, b, c] = [0, 1, 2].map(|i| self.scales[i].apply(position[i]));
+    pub(crate) fn position_mm(&self, position: [f64; 3]) -> [f64; 3] {
+        let [a, b, c] = [0, 1, 2].map(|i| self.scales[i].scale_value(position[i]));
         if !self.is_spherical {
             return [a, b, c].map(to_nano);
         }
@@ -86,7 +86,7 @@ impl Scale {
         }
     }
 
-    fn apply(self, x: f64) -> f64 {
+    fn scale_value(self, x: f64) -> f64 {
         match self {
             Self::Millimetres(scale) => x * scale,
             Self::Degrees => x.to_radians(),
@@ -108,7 +108,7 @@ mod tests {
     fn units_of_all_spellings_are_millimetres() {
         let check = |kind: &str, units: &str, position: [f64; 3], expected: [f64; 3]| {
             let frame = CoordinateFrame::parse(kind, units).unwrap_or_else(|e| panic!("{kind} {units}: {e:?}"));
-            assert_eq!(frame.millimetres(position), expected, "{kind} {units}");
+            assert_eq!(frame.position_mm(position), expected, "{kind} {units}");
         };
         for units in ["", "metre", "meter", "m", "metres", "Meters", "METRE", "metre, metre, metre", "m m m", "m,m,m"] {
             check("cartesian", units, [0.15, -0.2, 1.0], [150.0, -200.0, 1000.0]);

@@ -17,7 +17,7 @@ pub(crate) struct ImportedResponse {
 
 impl ImportedResponse {
     /// Records it as the pair's first attempt, accepted.
-    pub(crate) fn record(self, recorder: &mut Recorder, rig: &Rig, grid: &Grid) -> Result<(), Error> {
+    pub(crate) fn record_response(self, recorder: &mut Recorder, rig: &Rig, grid: &Grid) -> Result<(), Error> {
         let Self { pair, at, celsius, samples, is_corrected } = self;
         let (unknown, celsius) = (f64::NAN, celsius.get());
         let [m, s] = [pair.microphone, pair.speaker].map(|id| grid.points()[id.index()].position_mm);

@@ -16,10 +16,10 @@ use echolake_schema::manifest::{Origin, RunEnd};
 use echolake_schema::{Celsius, ErrorCause, Grid, Pair, PairId, Point, Rig, SurfaceId, Timestamp};
 
 use crate::batch::ImportBatch;
-use crate::hdf5_file::{Hdf5File, Hdf5Variable, place};
+use crate::hdf5_file::{Hdf5File, Hdf5Variable, place_in_grid};
 use crate::positions::{CoordinateFrame, to_nano};
 use crate::response::{ImportedResponse, least_length};
-use crate::{Error, ImportOptions, ImportedRun, RUN_SECS, wrong};
+use crate::{Error, ImportOptions, ImportedRun, RUN_SECS, content_error};
 
 /// Source name of the import's log entries.
 const NAME: &str = "import sofa";
@@ -52,14 +52,14 @@ pub fn import_sofa(
     options: ImportOptions<'_>,
     progress: &mut dyn FnMut(usize, usize),
 ) -> Result<Vec<ImportedRun>, Error> {
-    let grid = rig.grid()?;
+    let grid = rig.build_grid()?;
     let (mut runs, mut batch) = (Vec::new(), ImportBatch::default());
     each(files, rig, &grid, celsius, |sofa, number| {
         runs.push(sofa.record(&SofaImport { rig, grid: &grid, options, number }, &mut batch)?);
         progress(runs.len(), files.len());
         Ok(())
     })?;
-    batch.publish()?;
+    batch.publish_all()?;
     Ok(runs)
 }
 
@@ -68,7 +68,7 @@ pub fn import_sofa(
 /// # Errors
 /// As [`import_sofa`].
 pub fn check_sofa(files: &[PathBuf], rig: &Rig, celsius: Option<Celsius>) -> Result<(), Error> {
-    each(files, rig, &rig.grid()?, celsius, |_, _| Ok(()))
+    each(files, rig, &rig.build_grid()?, celsius, |_, _| Ok(()))
 }
 
 // Reads the files, one in memory at a time.
@@ -84,7 +84,7 @@ fn each(
         let sofa = Sofa::read(path, rig, grid, celsius)?;
         if !surfaces.insert(sofa.surface.clone()) {
             let what = format!("a second file of surface {}", sofa.surface);
-            return Err(wrong(path, "Title", what, "one file a surface"));
+            return Err(content_error(path, "Title", what, "one file a surface"));
         }
         then(&sofa, number)?;
     }
@@ -131,8 +131,8 @@ impl Sofa {
         let unread = |source: ErrorCause| Error::Read { path: path.to_owned(), source };
         std::fs::File::open(path).map_err(|e| unread(e.into()))?;
         let file = Hdf5File::open(path).map_err(|reason| unread(format!("it is no HDF5 file: {reason}").into()))?;
-        let mut reader = SofaReader { path, convention: file.text("SOFAConventions"), file, warnings: Vec::new() };
-        let is_ours = reader.file.text("APIName") == OURS;
+        let mut reader = SofaReader { path, convention: file.root_text("SOFAConventions"), file, warnings: Vec::new() };
+        let is_ours = reader.file.root_text("APIName") == OURS;
         let data_type = reader.expect_convention()?;
         let responses = match data_type {
             "TF" => reader.read_spectra(rig)?,
@@ -144,12 +144,12 @@ impl Sofa {
         let least = celsius.iter().map(|c| least_length(rig, *c, is_ours)).max().unwrap_or(0);
         if length < least {
             let expected = format!("{least} at least, for the lake's responses of {}", rig.impulse_response.length);
-            return Err(wrong(path, reader.data_name(), format!("{length} samples"), expected));
+            return Err(content_error(path, reader.data_name(), format!("{length} samples"), expected));
         }
         let off = celsius.iter().find(|c| is_ours && (c.get() - reference).abs() > 1e-6);
         if let Some(off) = off {
             let actual = format!("responses at {} C", off.get());
-            return Err(wrong(path, "RoomTemperature", actual, format!("those at the rig's {reference} C")));
+            return Err(content_error(path, "RoomTemperature", actual, format!("those at the rig's {reference} C")));
         }
         let pairs = reader.pairs(&responses, grid)?;
         let times = reader.times(count)?;
@@ -169,11 +169,11 @@ impl Sofa {
     fn record(&self, import: &SofaImport<'_>, batch: &mut ImportBatch) -> Result<ImportedRun, Error> {
         let times = self.times(import.options.started.plus_secs(f64::from(import.number) * RUN_SECS));
         let (started, ended) = (times[0], times[times.len() - 1]);
-        let manifest = crate::manifest(Origin::ImportedSofa, &self.surface, import.rig, started)?;
+        let manifest = crate::make_manifest(Origin::ImportedSofa, &self.surface, import.rig, started)?;
         let record = import.options.surface_record("imported");
         let path = import.options.folder.join(format!("{}.mcap", manifest.run_id));
         let start = RunStart { manifest: &manifest, rig: import.rig, surface: &record, relief: None, plan: None };
-        let mut recorder = batch.create(&path, &start)?;
+        let mut recorder = batch.create_run(&path, &start)?;
         if self.measurements.iter().all(|m| m.time.is_none()) {
             recorder.log(started, LogLevel::Info, NAME, "times are made up: the file has none")?;
         }
@@ -185,11 +185,11 @@ impl Sofa {
             let samples = samples[measured.row * length..][..*length].to_vec();
             let SofaMeasurement { pair, celsius, .. } = *measured;
             let response = ImportedResponse { pair, at, celsius, samples, is_corrected: self.is_corrected };
-            response.record(&mut recorder, import.rig, import.grid)?;
+            response.record_response(&mut recorder, import.rig, import.grid)?;
         }
         let count = self.measurements.len();
         let end = RunEnd { ended, accepted: count as u64, rejected: 0, attempts: count as u64 };
-        batch.seal(recorder, &end)?;
+        batch.seal_run(recorder, &end)?;
         let (run_id, surface) = (manifest.run_id, manifest.surface_id);
         Ok(ImportedRun { path, run_id, surface, measurements: count, warnings: self.warnings.clone() })
     }
@@ -222,12 +222,12 @@ struct ElementOffsets {
 
 impl SofaReader<'_> {
     fn variable(&self, name: &str) -> Result<Option<Hdf5Variable>, Error> {
-        self.file.variable(name).map_err(|actual| wrong(self.path, name, actual, "numbers"))
+        self.file.read_variable(name).map_err(|actual| content_error(self.path, name, actual, "numbers"))
     }
 
     fn needed(&self, name: &str) -> Result<Hdf5Variable, Error> {
         let expected = || format!("what {} asks for", self.convention);
-        self.variable(name)?.ok_or_else(|| wrong(self.path, name, "it is missing", expected()))
+        self.variable(name)?.ok_or_else(|| content_error(self.path, name, "it is missing", expected()))
     }
 
     // Returns the data type.
@@ -235,11 +235,11 @@ impl SofaReader<'_> {
         let Some((_, data_type)) = CONVENTIONS.iter().find(|(name, _)| *name == self.convention) else {
             let names = CONVENTIONS.map(|(name, _)| name).join(", ");
             let actual = format!("`{}`", self.convention);
-            return Err(wrong(self.path, "SOFAConventions", actual, format!("one of {names}")));
+            return Err(content_error(self.path, "SOFAConventions", actual, format!("one of {names}")));
         };
-        match self.file.text("DataType") {
+        match self.file.root_text("DataType") {
             actual if actual == *data_type => Ok(data_type),
-            actual => Err(wrong(self.path, "DataType", format!("`{actual}`"), format!("`{data_type}`"))),
+            actual => Err(content_error(self.path, "DataType", format!("`{actual}`"), format!("`{data_type}`"))),
         }
     }
 
@@ -256,7 +256,7 @@ impl SofaReader<'_> {
             _ => {
                 let emitters = if has_emitters { " x emitters" } else { "" };
                 let expected = format!("measurements x receivers x samples{emitters}");
-                return Err(wrong(self.path, name, format!("{:?}", found.shape), expected));
+                return Err(content_error(self.path, name, format!("{:?}", found.shape), expected));
             }
         };
         self.expect_any(name, &found)?;
@@ -283,11 +283,11 @@ impl SofaReader<'_> {
         let (real, imaginary) = (real?, imaginary?);
         let &[count, receivers, bins] = real.shape.as_slice() else {
             let expected = "measurements x receivers x frequencies";
-            return Err(wrong(self.path, "Data.Real", format!("{:?}", real.shape), expected));
+            return Err(content_error(self.path, "Data.Real", format!("{:?}", real.shape), expected));
         };
         if imaginary.shape != real.shape {
             let expected = format!("{:?}, as Data.Real", real.shape);
-            return Err(wrong(self.path, "Data.Imag", format!("{:?}", imaginary.shape), expected));
+            return Err(content_error(self.path, "Data.Imag", format!("{:?}", imaginary.shape), expected));
         }
         self.expect_any("Data.Real", &real)?;
         self.expect_finite("Data.Real", &real)?;
@@ -297,26 +297,30 @@ impl SofaReader<'_> {
         frequencies.values.iter_mut().for_each(|f| *f *= scale);
         if frequencies.values.len() != bins {
             let actual = format!("{} frequencies", frequencies.values.len());
-            return Err(wrong(self.path, "N", actual, format!("{bins}, as Data.Real has")));
+            return Err(content_error(self.path, "N", actual, format!("{bins}, as Data.Real has")));
         }
         let length = spectra::response_length(&frequencies.values, rig.sweep.rate_hz.get())
-            .map_err(|(actual, expected)| wrong(self.path, "N", actual, expected))?;
+            .map_err(|(actual, expected)| content_error(self.path, "N", actual, expected))?;
         let samples = spectra::invert_spectra(&real.values, &imaginary.values, length).map_err(|at| {
-            let place = format!("Data.Imag{:?}", place(at, &imaginary.shape));
+            let place = format!("Data.Imag{:?}", place_in_grid(at, &imaginary.shape));
             let expected = "0: of a response, the lowest and the highest bin are real";
-            wrong(self.path, place, format!("{:e}", imaginary.values[at]), expected)
+            content_error(self.path, place, format!("{:e}", imaginary.values[at]), expected)
         })?;
         Ok(SofaResponses { count, receivers, emitters: 1, length, samples })
     }
 
     fn expect_any(&self, name: &str, found: &Hdf5Variable) -> Result<(), Error> {
-        if found.values.is_empty() { Err(wrong(self.path, name, "no measurement", "one at least")) } else { Ok(()) }
+        if found.values.is_empty() {
+            Err(content_error(self.path, name, "no measurement", "one at least"))
+        } else {
+            Ok(())
+        }
     }
 
     fn expect_finite(&self, name: &str, found: &Hdf5Variable) -> Result<(), Error> {
         let Some(at) = found.values.iter().position(|x| !(*x as f32).is_finite()) else { return Ok(()) };
-        let place = format!("{name}{:?}", place(at, &found.shape));
-        Err(wrong(self.path, place, format!("{:e}", found.values[at]), "a finite f32"))
+        let place = format!("{name}{:?}", place_in_grid(at, &found.shape));
+        Err(content_error(self.path, place, format!("{:e}", found.values[at]), "a finite f32"))
     }
 
     fn expect_rate(&self, rig: &Rig) -> Result<(), Error> {
@@ -326,7 +330,7 @@ impl SofaReader<'_> {
             None => Ok(()),
             Some(actual) => {
                 let expected = format!("the rig's {expected} Hz; hint: sweep.rate_hz in the rig file");
-                Err(wrong(self.path, "Data.SamplingRate", format!("{actual} Hz"), expected))
+                Err(content_error(self.path, "Data.SamplingRate", format!("{actual} Hz"), expected))
             }
         }
     }
@@ -336,7 +340,7 @@ impl SofaReader<'_> {
         match self.file.text_of(name, "Units").trim().to_ascii_lowercase().as_str() {
             "hertz" | "hz" | "" => Ok(1.0),
             "kilohertz" | "khz" => Ok(1e3),
-            other => Err(wrong(self.path, name, format!("units `{other}`"), "hertz or kilohertz")),
+            other => Err(content_error(self.path, name, format!("units `{other}`"), "hertz or kilohertz")),
         }
     }
 
@@ -345,7 +349,7 @@ impl SofaReader<'_> {
         let Some(found) = self.variable(name)? else { return Ok(()) };
         match found.values.iter().find(|x| x.is_nan() || x.abs() > NO_DELAY) {
             None => Ok(()),
-            Some(actual) => Err(wrong(self.path, name, actual.to_string(), "zeros")),
+            Some(actual) => Err(content_error(self.path, name, actual.to_string(), "zeros")),
         }
     }
 
@@ -363,7 +367,7 @@ impl SofaReader<'_> {
     fn temperatures_of_file(&self, count: usize) -> Result<Vec<Celsius>, Error> {
         let name = "RoomTemperature";
         let refused = |actual: String, expected: &str| {
-            wrong(self.path, name, actual, format!("{expected}; hint: --temperature-c says what it was"))
+            content_error(self.path, name, actual, format!("{expected}; hint: --temperature-c says what it was"))
         };
         let found = self.variable(name)?.ok_or_else(|| refused("it is missing".into(), "temperatures"))?;
         let zero = match self.file.text_of(name, "Units").trim().to_ascii_lowercase().as_str() {
@@ -387,7 +391,7 @@ impl SofaReader<'_> {
         let name = "MeasurementDate";
         let Some(found) = self.variable(name)?.filter(|v| v.values.len() == count) else { return Ok(None) };
         if let Some(bad) = found.values.iter().find(|s| !(0.0..4e9).contains(*s)) {
-            return Err(wrong(self.path, name, bad.to_string(), "seconds since 1970"));
+            return Err(content_error(self.path, name, bad.to_string(), "seconds since 1970"));
         }
         // Zeros are how tools say that they know nothing.
         let known = found.values.iter().any(|s| *s > 0.0);
@@ -410,9 +414,9 @@ impl SofaReader<'_> {
                     };
                     let PairId(id) = grid
                         .parse_pair(microphone, speaker)
-                        .map_err(|e| wrong(self.path, place(), e.to_string(), "a pair of the rig"))?;
+                        .map_err(|e| content_error(self.path, place(), e.to_string(), "a pair of the rig"))?;
                     if !seen.insert(id) {
-                        return Err(wrong(self.path, place(), "a second response of its pair", "one of each"));
+                        return Err(content_error(self.path, place(), "a second response of its pair", "one of each"));
                     }
                     pairs.push(grid.pairs()[id as usize]);
                 }
@@ -448,7 +452,7 @@ impl SofaReader<'_> {
                     Some(_) => format!("{name}[{row}] and {element}Position[{number}]"),
                 };
                 let found = grid.parse_point(&format!("{x} {y} {z}"));
-                found.map_err(|e| wrong(self.path, place(), e.to_string(), "a point of the rig"))
+                found.map_err(|e| content_error(self.path, place(), e.to_string(), "a point of the rig"))
             };
             let of_row = offsets.of_row(row).iter().enumerate().map(of_element);
             points.push(of_row.collect::<Result<_, _>>()?);
@@ -460,7 +464,7 @@ impl SofaReader<'_> {
     fn frame(&mut self, name: &str, of: &str) -> Result<CoordinateFrame, Error> {
         let [kind, units] = ["Type", "Units"].map(|attribute| self.file.text_of(of, attribute));
         let frame = CoordinateFrame::parse(&kind, &units)
-            .map_err(|fault| wrong(self.path, format!("{of}, its attributes"), fault.actual, fault.expected))?;
+            .map_err(|fault| content_error(self.path, format!("{of}, its attributes"), fault.actual, fault.expected))?;
         if units.trim().is_empty() && name.ends_with("Position") {
             self.warnings.push(format!("{name} has no attribute Units: taken as metres"));
         }
@@ -472,7 +476,7 @@ impl SofaReader<'_> {
         let found = self.needed(name)?;
         let frame = self.frame(name, name)?;
         let rows = self.rows(name, &found, count, 3)?;
-        Ok(rows.into_iter().map(|row| frame.millimetres([row[0], row[1], row[2]])).collect())
+        Ok(rows.into_iter().map(|row| frame.position_mm([row[0], row[1], row[2]])).collect())
     }
 
     // Of the elements of each measurement, mm.
@@ -480,7 +484,7 @@ impl SofaReader<'_> {
         let Some(found) = self.variable(name)?.filter(|v| !v.values.is_empty()) else {
             return match elements {
                 1 => Ok(ElementOffsets { rows: vec![vec![[0.0; 3]]] }),
-                _ => Err(wrong(self.path, name, "it is missing", format!("positions of all {elements}"))),
+                _ => Err(content_error(self.path, name, "it is missing", format!("positions of all {elements}"))),
             };
         };
         // Zeros need neither units nor a shape.
@@ -492,13 +496,13 @@ impl SofaReader<'_> {
             [given, 3, rows] if (given == 1 || given == elements) && (rows == 1 || rows == count) => (given, rows),
             _ => {
                 let expected = format!("[{elements}, 3, {count}] or [{elements}, 3, 1]");
-                return Err(wrong(self.path, name, format!("{:?}", found.shape), expected));
+                return Err(content_error(self.path, name, format!("{:?}", found.shape), expected));
             }
         };
         let frame = self.frame(name, name)?;
         let offset = |row: usize, element: usize| {
             let first = element % given * 3;
-            frame.millimetres([0, 1, 2].map(|i| found.values[(first + i) * rows + row]))
+            frame.position_mm([0, 1, 2].map(|i| found.values[(first + i) * rows + row]))
         };
         let of_row = |row: usize| (0..elements).map(|element| offset(row, element)).collect();
         Ok(ElementOffsets { rows: (0..rows).map(of_row).collect() })
@@ -516,7 +520,9 @@ impl SofaReader<'_> {
             let up = front.and_then(|x| unit_vector([0, 1, 2].map(|i| up[i] - along(&x) * x[i])));
             let axes = front.zip(up).map(|(x, z)| [x, cross_product(z, x), z]);
             let place = format!("{view}[{row}]");
-            axes.ok_or_else(|| wrong(self.path, place, format!("no direction, or that of {up_name}"), "a direction"))
+            axes.ok_or_else(|| {
+                content_error(self.path, place, format!("no direction, or that of {up_name}"), "a direction")
+            })
         };
         fronts.iter().zip(&ups).enumerate().map(axes).collect()
     }
@@ -525,7 +531,7 @@ impl SofaReader<'_> {
         let Some(found) = self.variable(name)? else { return Ok(vec![otherwise; count]) };
         let frame = self.frame(name, of)?;
         let rows = self.rows(name, &found, count, 3)?;
-        Ok(rows.into_iter().map(|row| frame.millimetres([row[0], row[1], row[2]])).collect())
+        Ok(rows.into_iter().map(|row| frame.position_mm([row[0], row[1], row[2]])).collect())
     }
 
     // One row a measurement, or the same for all.
@@ -534,14 +540,19 @@ impl SofaReader<'_> {
         match rows.len() {
             n if n == count && v.values.len() == count * width => Ok(rows),
             1 if v.values.len() == width => Ok(vec![rows[0]; count]),
-            _ => Err(wrong(self.path, name, format!("{:?}", v.shape), format!("[{count}, {width}] or [1, {width}]"))),
+            _ => Err(content_error(
+                self.path,
+                name,
+                format!("{:?}", v.shape),
+                format!("[{count}, {width}] or [1, {width}]"),
+            )),
         }
     }
 
     // Others' titles are for people; their files' names must do.
     fn surface(&self, is_ours: bool) -> Result<SurfaceId, Error> {
         let stem = self.path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-        Ok(if is_ours { self.file.text("Title") } else { stem }.parse()?)
+        Ok(if is_ours { self.file.root_text("Title") } else { stem }.parse()?)
     }
 }
 

@@ -44,8 +44,8 @@ pub fn import_wav(
     options: ImportOptions<'_>,
     progress: &mut dyn FnMut(usize, usize),
 ) -> Result<Vec<ImportedRun>, Error> {
-    let grid = rig.grid()?;
-    let surfaces = wav_manifest::read(manifest, rig, &grid)?;
+    let grid = rig.build_grid()?;
+    let surfaces = wav_manifest::read_manifest(manifest, rig, &grid)?;
     let total = surfaces.values().map(Vec::len).sum();
     let (mut runs, mut batch, mut done) = (Vec::new(), ImportBatch::default(), 0);
     for (surface, rows) in surfaces {
@@ -56,7 +56,7 @@ pub fn import_wav(
         })?;
         runs.push(run);
     }
-    batch.publish()?;
+    batch.publish_all()?;
     Ok(runs)
 }
 
@@ -79,11 +79,11 @@ impl WavImport<'_> {
         let mut timed: Vec<_> = (0u32..).zip(rows).map(|(i, row)| (self.time(row, i), row)).collect();
         timed.sort_by_key(|(time, _)| *time);
         let started = timed.first().map_or(self.options.started, |(time, _)| *time);
-        let manifest = crate::manifest(Origin::ImportedWav, &surface, self.rig, started)?;
+        let manifest = crate::make_manifest(Origin::ImportedWav, &surface, self.rig, started)?;
         let record = self.options.surface_record("imported");
         let path = self.options.folder.join(format!("{}.mcap", manifest.run_id));
         let start = RunStart { manifest: &manifest, rig: self.rig, surface: &record, relief: None, plan: None };
-        let mut recorder = batch.create(&path, &start)?;
+        let mut recorder = batch.create_run(&path, &start)?;
         recorder.log(started, LogLevel::Info, NAME, &format!("{} recordings", rows.len()))?;
         let mut warnings = Vec::new();
         for (at, row) in &timed {
@@ -92,7 +92,7 @@ impl WavImport<'_> {
         }
         let count = rows.len() as u64;
         let ended = timed.last().map_or(started, |(time, _)| *time);
-        batch.seal(recorder, &RunEnd { ended, accepted: count, rejected: 0, attempts: count })?;
+        batch.seal_run(recorder, &RunEnd { ended, accepted: count, rejected: 0, attempts: count })?;
         Ok(ImportedRun { path, run_id: manifest.run_id, surface, measurements: rows.len(), warnings })
     }
 
@@ -103,8 +103,8 @@ impl WavImport<'_> {
     // Import keeps all it is given: objections of the rig become warnings, not refusals.
     fn row(&self, recorder: &mut Recorder, row: &ManifestRow, at: Timestamp) -> Result<Option<String>, Error> {
         let unread = |column, what| Error::Row { path: self.manifest.to_owned(), line: row.line, column, what };
-        let microphone = row.recording.read(row.format).map_err(|e| unread("recording", e))?;
-        let loopback = row.loopback.read(row.format).map_err(|e| unread("loopback", e))?;
+        let microphone = row.recording.read_samples(row.format).map_err(|e| unread("recording", e))?;
+        let loopback = row.loopback.read_samples(row.format).map_err(|e| unread("loopback", e))?;
         let (rig, celsius) = (self.rig, row.celsius.get());
         let planned = |cause| Error::Plan { rig: rig.name.clone(), cause };
         let len = microphone.fractions.len();
@@ -123,13 +123,13 @@ impl WavImport<'_> {
         let mut samples = vec![0.0; plan.output_len()];
         let rho = resampling_ratio(celsius, rig.impulse_response.reference_temperature_c.get());
         let limits_hz = response_limits_hz([rig.sweep.low_hz, rig.sweep.high_hz], rho);
-        plan.run_within(limits_hz, &microphone.fractions, &loopback.fractions, &mut samples, &mut plan.scratch())
+        plan.run_within(limits_hz, &microphone.fractions, &loopback.fractions, &mut samples, &mut plan.make_scratch())
             .map_err(|e| unread("loopback", e.to_string()))?;
         let [m, s] = [row.pair.microphone, row.pair.speaker].map(|id| self.grid.points()[id.index()].position_mm);
         let arrival = direct_mm(m, s) / 1e3 / speed_of_sound(celsius);
         let clipped = microphone.clipped + loopback.clipped;
         let assessment = TakeAssessor::new(rig, len)
-            .and_then(|mut a| a.assess(&microphone.fractions, &loopback.fractions, arrival, clipped))
+            .and_then(|mut a| a.assess_take(&microphone.fractions, &loopback.fractions, arrival, clipped))
             .map_err(planned)?;
         // The geometry of a foreign rig is known less well than its files say, and the level outside was not recorded:
         // the arrival is recorded, not judged, and so is a signal-to-noise ratio that a long response leaves no room
@@ -144,7 +144,7 @@ impl WavImport<'_> {
             wav.layout.warning.as_ref().map(|warning| format!("{column}, {}: {warning}", wav.label()))
         };
         let mut reasons: Vec<_> = columns.into_iter().filter_map(warned).collect();
-        for objection in judged.objections(&rig.validation, f64::NEG_INFINITY) {
+        for objection in judged.find_objections(&rig.validation, f64::NEG_INFINITY) {
             match objection {
                 // Where to lower the gain depends on which of both it is.
                 TakeObjection::Clipped { .. } => {
@@ -230,5 +230,5 @@ impl WavImport<'_> {
 /// # Errors
 /// As [`import_wav`].
 pub fn check_wav(manifest: &Path, rig: &Rig) -> Result<(), Error> {
-    wav_manifest::read(manifest, rig, &rig.grid()?).map(drop)
+    wav_manifest::read_manifest(manifest, rig, &rig.build_grid()?).map(drop)
 }

@@ -54,7 +54,7 @@ impl WavChannel {
     }
 
     /// Returns the format that stores its samples without loss.
-    pub(crate) fn format(&self) -> SampleFormat {
+    pub(crate) fn sample_format(&self) -> SampleFormat {
         match (self.layout.coding, self.layout.bits) {
             (SampleCoding::Float, _) => SampleFormat::F32le,
             (SampleCoding::Integer, ..=16) => SampleFormat::S16le,
@@ -64,7 +64,7 @@ impl WavChannel {
     }
 
     /// Reads its samples, as bytes of `format`, which is its own or a wider one.
-    pub(crate) fn read(&self, format: SampleFormat) -> Result<ChannelSamples, String> {
+    pub(crate) fn read_samples(&self, format: SampleFormat) -> Result<ChannelSamples, String> {
         let failed = |fault: String| format!("`{}` {fault}", self.path.display());
         let mut out = ChannelSamples { bytes: Vec::new(), fractions: Vec::new(), clipped: 0 };
         if self.layout.coding == SampleCoding::Float {
@@ -79,7 +79,7 @@ impl WavChannel {
                 None => Ok(out),
             };
         }
-        let width = format.bytes().unwrap_or(4);
+        let width = format.sample_bytes().unwrap_or(4);
         let highest = i32::MAX - ((1u32 << (32 - self.layout.bits)) - 1) as i32;
         let mut wide = Vec::with_capacity(self.layout.samples as usize);
         let visit = |x: i32| {
@@ -102,7 +102,7 @@ pub(crate) fn common_format(a: SampleFormat, b: SampleFormat) -> Option<SampleFo
         (true, _) => Some(a),
         (false, true) => None,
         (false, false) => {
-            if a.bytes() > b.bytes() {
+            if a.sample_bytes() > b.sample_bytes() {
                 Some(a)
             } else {
                 Some(b)
@@ -113,7 +113,7 @@ pub(crate) fn common_format(a: SampleFormat, b: SampleFormat) -> Option<SampleFo
 
 #[cfg(test)]
 mod tests {
-    use echolake_schema::samples::decode;
+    use echolake_schema::samples::decode_samples;
     use hound::{SampleFormat as WavFormat, WavSpec};
 
     use super::*;
@@ -136,11 +136,11 @@ mod tests {
             let full = 1i64 << (bits - 1);
             let samples = [0, 1, -1, 0x1234, -0x1235, full - 1, -full].map(|x| x as i32);
             let channel = written(folder.path(), bits, &samples);
-            assert_eq!(channel.format(), format);
+            assert_eq!(channel.sample_format(), format);
             for wider in widths.into_iter().filter(|(w, _)| *w >= bits).map(|(_, f)| f) {
-                let read = channel.read(wider).expect("samples");
+                let read = channel.read_samples(wider).expect("samples");
                 let mut decoded = [f32::NAN; 7];
-                decode(wider, &read.bytes, &mut decoded).expect("bytes of this format");
+                decode_samples(wider, &read.bytes, &mut decoded).expect("bytes of this format");
                 assert_eq!(decoded.as_slice(), read.fractions, "{bits} bits as {wider:?}");
                 assert_eq!(decoded.map(|y| (f64::from(y) * full as f64) as i32), samples.map(|x| (x as f32) as i32));
                 assert_eq!(read.clipped, 2);

@@ -33,7 +33,7 @@ pub(crate) struct ManifestRow {
 pub(crate) type WavManifest = BTreeMap<SurfaceId, Vec<ManifestRow>>;
 
 /// Opens a manifest and checks its header; returns the place of each column.
-fn open(path: &Path) -> Result<(csv::Reader<std::fs::File>, Vec<Option<usize>>), Error> {
+fn open_manifest(path: &Path) -> Result<(csv::Reader<std::fs::File>, Vec<Option<usize>>), Error> {
     let unreadable = |e: csv::Error| Error::Read { path: path.to_owned(), source: e.into() };
     let mut reader = csv::ReaderBuilder::new().trim(csv::Trim::All).from_path(path).map_err(unreadable)?;
     let header = reader.headers().map_err(unreadable)?.clone();
@@ -53,34 +53,34 @@ fn open(path: &Path) -> Result<(csv::Reader<std::fs::File>, Vec<Option<usize>>),
 
 /// The first recording of a manifest.
 pub(crate) fn first_recording(path: &Path) -> Result<WavChannel, Error> {
-    let (mut reader, places) = open(path)?;
-    let record = next(path, &mut reader)?.ok_or_else(|| no_rows(path))?;
+    let (mut reader, places) = open_manifest(path)?;
+    let record = next_record(path, &mut reader)?.ok_or_else(|| no_rows(path))?;
     let cells = ManifestCells { path, places: &places, record: &record };
-    cells.wav("recording")
+    cells.open_wav("recording")
 }
 
 /// Reads and checks all rows.
-pub(crate) fn read(path: &Path, rig: &Rig, grid: &Grid) -> Result<WavManifest, Error> {
-    let (mut reader, places) = open(path)?;
+pub(crate) fn read_manifest(path: &Path, rig: &Rig, grid: &Grid) -> Result<WavManifest, Error> {
+    let (mut reader, places) = open_manifest(path)?;
     let mut manifest = WavManifest::new();
-    while let Some(record) = next(path, &mut reader)? {
+    while let Some(record) = next_record(path, &mut reader)? {
         let cells = ManifestCells { path, places: &places, record: &record };
-        let surface: SurfaceId = cells.parse("surface")?;
-        let row = cells.row(rig, grid)?;
+        let surface: SurfaceId = cells.parse_cell("surface")?;
+        let row = cells.parse_row(rig, grid)?;
         let rows = manifest.entry(surface).or_default();
         if let Some(twin) = rows.iter().find(|r| r.pair == row.pair && r.attempt == row.attempt) {
             let what = format!(
                 "attempt {} at this pair is in line {} already; hint: number the attempts",
                 row.attempt, twin.line
             );
-            return Err(cells.wrong("attempt", what));
+            return Err(cells.cell_error("attempt", what));
         }
         rows.push(row);
     }
     if manifest.is_empty() { Err(no_rows(path)) } else { Ok(manifest) }
 }
 
-fn next(path: &Path, reader: &mut csv::Reader<std::fs::File>) -> Result<Option<StringRecord>, Error> {
+fn next_record(path: &Path, reader: &mut csv::Reader<std::fs::File>) -> Result<Option<StringRecord>, Error> {
     let mut record = StringRecord::new();
     match reader.read_record(&mut record) {
         Ok(true) => Ok(Some(record)),
@@ -105,32 +105,32 @@ impl ManifestCells<'_> {
         self.record.get(self.places[index]?).filter(|text| !text.is_empty())
     }
 
-    fn wrong(&self, column: &'static str, what: impl Into<String>) -> Error {
+    fn cell_error(&self, column: &'static str, what: impl Into<String>) -> Error {
         let line = self.record.position().map_or(0, csv::Position::line);
         Error::Row { path: self.path.to_owned(), line, column, what: what.into() }
     }
 
-    fn needed(&self, column: &'static str) -> Result<&str, Error> {
-        self.get(column).ok_or_else(|| self.wrong(column, "it is empty"))
+    fn needed_text(&self, column: &'static str) -> Result<&str, Error> {
+        self.get(column).ok_or_else(|| self.cell_error(column, "it is empty"))
     }
 
-    fn parse<T: std::str::FromStr<Err = echolake_schema::Error>>(&self, column: &'static str) -> Result<T, Error> {
-        self.needed(column)?.parse().map_err(|e: T::Err| self.wrong(column, e.to_string()))
+    fn parse_cell<T: std::str::FromStr<Err = echolake_schema::Error>>(&self, column: &'static str) -> Result<T, Error> {
+        self.needed_text(column)?.parse().map_err(|e: T::Err| self.cell_error(column, e.to_string()))
     }
 
-    fn number(&self, column: &'static str) -> Result<Option<f64>, Error> {
+    fn parse_number(&self, column: &'static str) -> Result<Option<f64>, Error> {
         let Some(text) = self.get(column) else { return Ok(None) };
         let number = text.parse().ok().filter(|x: &f64| x.is_finite());
-        number.map(Some).ok_or_else(|| self.wrong(column, format!("`{text}` is no number")))
+        number.map(Some).ok_or_else(|| self.cell_error(column, format!("`{text}` is no number")))
     }
 
-    fn wav(&self, column: &'static str) -> Result<WavChannel, Error> {
+    fn open_wav(&self, column: &'static str) -> Result<WavChannel, Error> {
         let folder = self.path.parent().unwrap_or(Path::new("."));
-        WavChannel::open(folder, self.needed(column)?).map_err(|what| self.wrong(column, what))
+        WavChannel::open(folder, self.needed_text(column)?).map_err(|what| self.cell_error(column, what))
     }
 
-    fn row(&self, rig: &Rig, grid: &Grid) -> Result<ManifestRow, Error> {
-        let (recording, loopback) = (self.wav("recording")?, self.wav("loopback")?);
+    fn parse_row(&self, rig: &Rig, grid: &Grid) -> Result<ManifestRow, Error> {
+        let (recording, loopback) = (self.open_wav("recording")?, self.open_wav("loopback")?);
         let expected = rig.sweep.rate_hz.get();
         for (column, wav) in [("recording", &recording), ("loopback", &loopback)] {
             let actual = wav.layout.rate_hz;
@@ -138,44 +138,48 @@ impl ManifestCells<'_> {
                 let what = format!(
                     "sampled at {actual} Hz, expected the rig's {expected} Hz; hint: sweep.rate_hz in the rig file"
                 );
-                return Err(self.wrong(column, what));
+                return Err(self.cell_error(column, what));
             }
         }
         let [actual, expected] = [&loopback, &recording].map(|wav| wav.layout.samples);
         if actual != expected {
             let what = format!("{actual} samples, expected the recording's {expected}");
-            return Err(self.wrong("loopback", what));
+            return Err(self.cell_error("loopback", what));
         }
-        let format = common_format(recording.format(), loopback.format()).ok_or_else(|| {
-            self.wrong("loopback", "one of recording and loopback is float and the other integer; expected one kind")
+        let format = common_format(recording.sample_format(), loopback.sample_format()).ok_or_else(|| {
+            self.cell_error(
+                "loopback",
+                "one of recording and loopback is float and the other integer; expected one kind",
+            )
         })?;
-        let celsius = self.number("temperature_c")?.ok_or_else(|| self.wrong("temperature_c", "it is empty"))?;
+        let celsius =
+            self.parse_number("temperature_c")?.ok_or_else(|| self.cell_error("temperature_c", "it is empty"))?;
         let attempt = self.get("attempt").map_or(Ok(1), str::parse).ok().filter(|a| (1..=1000).contains(a));
         Ok(ManifestRow {
             line: self.record.position().map_or(0, csv::Position::line),
             format,
-            pair: self.pair(grid)?,
-            celsius: Celsius::new(celsius).map_err(|e| self.wrong("temperature_c", e.to_string()))?,
-            humidity_pct: self.number("humidity_pct")?.unwrap_or(f64::NAN),
-            pressure_hpa: self.number("pressure_hpa")?.unwrap_or(f64::NAN),
+            pair: self.parse_pair(grid)?,
+            celsius: Celsius::new(celsius).map_err(|e| self.cell_error("temperature_c", e.to_string()))?,
+            humidity_pct: self.parse_number("humidity_pct")?.unwrap_or(f64::NAN),
+            pressure_hpa: self.parse_number("pressure_hpa")?.unwrap_or(f64::NAN),
             recorded_at: self
                 .get("recorded_at")
                 .map(Timestamp::parse)
                 .transpose()
-                .map_err(|e| self.wrong("recorded_at", e.to_string()))?,
-            attempt: attempt.ok_or_else(|| self.wrong("attempt", "expected a whole number from 1 to 1000"))?,
+                .map_err(|e| self.cell_error("recorded_at", e.to_string()))?,
+            attempt: attempt.ok_or_else(|| self.cell_error("attempt", "expected a whole number from 1 to 1000"))?,
             recording,
             loopback,
         })
     }
 
-    fn pair(&self, grid: &Grid) -> Result<Pair, Error> {
+    fn parse_pair(&self, grid: &Grid) -> Result<Pair, Error> {
         let point = |column| {
-            let found = grid.parse_point(self.needed(column)?);
-            found.map_err(|e| self.wrong(column, e.to_string()))
+            let found = grid.parse_point(self.needed_text(column)?);
+            found.map_err(|e| self.cell_error(column, e.to_string()))
         };
         let (microphone, speaker) = (point("microphone")?, point("speaker")?);
-        let PairId(id) = grid.parse_pair(microphone, speaker).map_err(|e| self.wrong("speaker", e.to_string()))?;
+        let PairId(id) = grid.parse_pair(microphone, speaker).map_err(|e| self.cell_error("speaker", e.to_string()))?;
         Ok(grid.pairs()[id as usize])
     }
 }

@@ -47,13 +47,13 @@ impl CollectionSurface {
 ///
 /// # Errors
 /// [`Error::Quantity`] if there are more than [`LARGEST`].
-pub fn collection(seed: u64, count: usize) -> Result<Vec<CollectionSurface>, Error> {
+pub fn collection_surfaces(seed: u64, count: usize) -> Result<Vec<CollectionSurface>, Error> {
     if count > LARGEST {
         let (quantity, expected) = ("number of surfaces", "20001 at most, as panels have four digits");
         return Err(Error::Quantity { quantity, actual: count.to_string(), expected });
     }
     let references = REFERENCES.map(|(name, relief)| (name.to_owned(), relief));
-    let sides = (0u64..).map(|n| (format!("{:04}_{}", n / 2 + 1, n % 2), PanelRelief::drawn(seed, n)));
+    let sides = (0u64..).map(|n| (format!("{:04}_{}", n / 2 + 1, n % 2), PanelRelief::from_seed(seed, n)));
     let surfaces = references.into_iter().chain(sides).take(count);
     surfaces.map(|(name, relief)| CollectionSurface::new(&name, relief)).collect()
 }
@@ -64,7 +64,7 @@ mod tests {
 
     #[test]
     fn references_come_first_and_sides_of_a_panel_together() {
-        let ten = collection(1, 10).expect("a collection");
+        let ten = collection_surfaces(1, 10).expect("a collection");
         let names: Vec<_> = ten.iter().map(|m| m.surface.as_str()).collect();
         assert_eq!(
             names,
@@ -72,13 +72,13 @@ mod tests {
         );
         let (panel, side) = (ten[8].surface.panel(), ten[8].surface.side());
         assert_eq!((panel, side), ("0003", Some(1)));
-        assert_eq!(collection(1, 4).expect("a collection"), ten[..4]);
-        assert_ne!(collection(2, 10).expect("a collection"), ten);
+        assert_eq!(collection_surfaces(1, 4).expect("a collection"), ten[..4]);
+        assert_ne!(collection_surfaces(2, 10).expect("a collection"), ten);
     }
 
     #[test]
     fn panels_of_the_paper_are_the_papers() {
-        let all = collection(3, 40).expect("a collection");
+        let all = collection_surfaces(3, 40).expect("a collection");
         let of = |name: &str| all.iter().find(|m| m.surface.as_str() == name).expect(name);
         assert_eq!(Ok(&of("0012_1").relief), PanelRelief::by_name("0012_1").as_ref());
         assert_eq!(of("0012_1").macro_reference.as_ref().map(SurfaceId::as_str), Some("0015_1"));
@@ -87,9 +87,9 @@ mod tests {
 
     #[test]
     fn the_largest_is_the_largest() {
-        let all = collection(1, LARGEST).expect("a collection");
+        let all = collection_surfaces(1, LARGEST).expect("a collection");
         assert_eq!(all[LARGEST - 1].surface.as_str(), "9999_1");
-        let refused = collection(1, LARGEST + 1).expect_err("too many").to_string();
+        let refused = collection_surfaces(1, LARGEST + 1).expect_err("too many").to_string();
         assert!(refused.contains(&format!("is {}, expected {LARGEST} at most", LARGEST + 1)), "{refused}");
     }
 }

@@ -51,21 +51,21 @@ impl SurfaceMaterial {
     }
 
     /// Pressure reflection factor at normal incidence and one frequency.
-    pub fn reflection(self, frequency_hz: f64) -> Complex<f64> {
+    pub fn reflection_at(self, frequency_hz: f64) -> Complex<f64> {
         match self {
             Self::CoatedPrint => {
                 let [falls, ends] = PRINT_SHELF_HZ.map(|corner| Complex::new(1.0, frequency_hz / corner));
                 ends / falls * (1.0 - PRINT_ABSORPTION).sqrt()
             }
             Self::FibreBoard => BOARD_FACTOR.into(),
-            Self::MelamineFoam => foam(frequency_hz.max(FOAM_LOWEST_HZ)),
+            Self::MelamineFoam => foam_reflection(frequency_hz.max(FOAM_LOWEST_HZ)),
         }
     }
 }
 
 // Impedance and wave number of a fibrous layer by its resistance to flow: Miki 1990, J. Acoust. Soc. Jpn. (E) 11(1),
 // 19-24, who mended Delany's and Bazley's; time goes as e^(i omega t).
-fn foam(frequency_hz: f64) -> Complex<f64> {
+fn foam_reflection(frequency_hz: f64) -> Complex<f64> {
     let x = 1e3 * frequency_hz / FOAM_RESISTIVITY;
     let impedance = Complex::new(1.0 + 5.50 * x.powf(-0.632), -8.43 * x.powf(-0.632));
     let wave_number =
@@ -80,14 +80,14 @@ mod tests {
 
     #[test]
     fn reflection_is_as_published() {
-        let absorption = |material: SurfaceMaterial, hz| 1.0 - material.reflection(hz).norm_sqr();
+        let absorption = |material: SurfaceMaterial, hz| 1.0 - material.reflection_at(hz).norm_sqr();
         for hz in [2e3, 4e3, 6e3] {
             let print = absorption(SurfaceMaterial::CoatedPrint, hz);
             assert!((0.04..0.1).contains(&print), "{hz}: {print}");
         }
         // Less of the higher frequencies comes back. The foam's back is heard at the lowest alone.
         let octaves = |material: SurfaceMaterial| {
-            [0, 1, 2, 3, 4].map(|n| material.reflection(2_500.0 * f64::from(1 << n)).norm())
+            [0, 1, 2, 3, 4].map(|n| material.reflection_at(2_500.0 * f64::from(1 << n)).norm())
         };
         let print = octaves(SurfaceMaterial::CoatedPrint);
         assert!(print.windows(2).all(|pair| pair[1] < pair[0]) && print[4] > 0.6, "{print:?}");

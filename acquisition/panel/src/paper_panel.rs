@@ -182,7 +182,7 @@ mod tests {
         for panel in PaperPanel::ALL {
             let relief = PanelRelief::by_name(panel.name).expect(panel.name);
             assert_eq!(Ok(&relief), PanelRelief::from_paper(&panel).as_ref());
-            assert_eq!((relief.name(), PanelRelief::guess(panel.name)), (panel.relief, Some(panel.name)));
+            assert_eq!((relief.name(), PanelRelief::guess_name(panel.name)), (panel.relief, Some(panel.name)));
             for (key, value) in panel.settings {
                 let set = &relief.parameters()[*key];
                 let same = set.as_str().map_or_else(|| set.as_f64() == value.parse().ok(), |word| word == *value);
@@ -196,6 +196,6 @@ mod tests {
                 assert_eq!(relief.parameters()[key], reference.parameters()[key], "{}: {key}", panel.name);
             }
         }
-        assert_eq!(PanelRelief::guess("0012_10"), None);
+        assert_eq!(PanelRelief::guess_name("0012_10"), None);
     }
 }

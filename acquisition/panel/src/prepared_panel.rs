@@ -56,14 +56,14 @@ impl PreparedPanel {
     /// The mesh cannot be used.
     pub fn new(specimen: &PanelSpecimen, rig: &Rig) -> Result<Self, mesh::Error> {
         match specimen {
-            PanelSpecimen::Relief(relief) => Ok(generated(relief)),
+            PanelSpecimen::Relief(relief) => Ok(from_relief(relief)),
             PanelSpecimen::Mesh(path, side) => from_file(path, *side, rig),
             PanelSpecimen::NoGeometry => Ok(Self { geometry: None, record: unknown_surface(), original: None }),
         }
     }
 
     /// The file that the mesh was read from.
-    pub fn original(&self) -> Option<OriginalFile<'_>> {
+    pub fn original_file(&self) -> Option<OriginalFile<'_>> {
         let (name, format, bytes) = self.original.as_ref()?;
         Some(OriginalFile { name, media_type: format.media_type(), bytes })
     }
@@ -73,7 +73,7 @@ fn unknown_surface() -> SurfaceRecord {
     SurfaceRecord { typology: "unknown".to_owned(), ..SurfaceRecord::default() }
 }
 
-fn generated(relief: &PanelRelief) -> PreparedPanel {
+fn from_relief(relief: &PanelRelief) -> PreparedPanel {
     let material = relief.material();
     let mesh = Mesh::from_height_field(&relief.height_field(MESH_CELLS), BACK_MM);
     let heights = relief.height_field(FACETS);
@@ -84,7 +84,7 @@ fn generated(relief: &PanelRelief) -> PreparedPanel {
         relief_mm: heights.extent_mm().map(f64::from),
     };
     let (macrostructure, microstructure) = match relief {
-        PanelRelief::Layered(wall) => (Some(wall.macrostructure()), Some(wall.microstructure())),
+        PanelRelief::Layered(wall) => (Some(wall.macrostructure_name()), Some(wall.microstructure_text())),
         _ => (None, None),
     };
     PreparedPanel {
@@ -106,7 +106,7 @@ fn generated(relief: &PanelRelief) -> PreparedPanel {
 
 fn from_file(path: &Path, side: PanelSide, rig: &Rig) -> Result<PreparedPanel, mesh::Error> {
     let format = MeshFormat::from_path(path)?;
-    let mesh = Mesh::read(path)?.seen_from(side).check(rig.panel.size_mm, rig.panel.depth_mm, path)?;
+    let mesh = Mesh::from_file(path)?.seen_from(side).check_solid(rig.panel.size_mm, rig.panel.depth_mm, path)?;
     let heights = mesh.to_height_field(FACETS, rig.panel.size_mm, rig.panel.depth_mm, path)?;
     let bytes = std::fs::read(path).map_err(|source| mesh::Error::Read { path: path.to_owned(), source })?;
     let name = path.file_name().map_or_else(|| "panel".to_owned(), |n| n.to_string_lossy().into_owned());

@@ -33,7 +33,7 @@ impl<'a> RecordingCopy<'a> {
     ///
     /// # Errors
     /// The writer's.
-    pub(crate) fn take(
+    pub(crate) fn copy_item(
         &mut self,
         item: RecordingItem,
         keep: &dyn Fn(ChunkLane, &MessageHeader) -> bool,
@@ -42,7 +42,7 @@ impl<'a> RecordingCopy<'a> {
             RecordingItem::Chunk(chunk) => {
                 self.describe_channels()?;
                 for record in chunk.records {
-                    self.message(record, keep);
+                    self.copy_message(record, keep);
                 }
                 // In the order of their parts as soon as one is large: a verdict never gets ahead of its recording.
                 [ChunkLane::Sweeps, ChunkLane::Responses, ChunkLane::Light]
@@ -82,14 +82,14 @@ impl<'a> RecordingCopy<'a> {
         Ok(())
     }
 
-    fn message(&mut self, record: Record<'_>, keep: &dyn Fn(ChunkLane, &MessageHeader) -> bool) {
+    fn copy_message(&mut self, record: Record<'_>, keep: &dyn Fn(ChunkLane, &MessageHeader) -> bool) {
         let Record::Message { header, data } = record else { return };
         let Some(channel) = self.channels.get(&header.channel_id) else { return };
         let lane = ChunkLane::from_topic(&channel.topic);
         if keep(lane, &header) {
             *self.counts.entry(channel.topic.clone()).or_default() += 1;
             self.sequence = self.sequence.max(header.sequence);
-            self.out.push(lane, header, &data);
+            self.out.push_message(lane, header, &data);
         }
     }
 }

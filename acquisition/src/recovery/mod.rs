@@ -15,7 +15,7 @@ use echolake_recording::{ChunkWriter, McapError, Metadata, RecordingReader, prov
 use echolake_schema::topics;
 use serde::Serialize;
 
-use crate::disk::{folder_of, sync};
+use crate::disk::{folder_of, sync_to_disk};
 pub(crate) use copy::{MessageCounts, RecordingCopy, is_end};
 pub use error::Error;
 pub(crate) use survey::RecordingSurvey;
@@ -67,9 +67,9 @@ pub fn beside(from: &Path) -> PathBuf {
 pub fn recover(from: &Path, to: &Path) -> Result<Report, Error> {
     // What is being recorded goes on growing behind the copy.
     let _lock = lock(from)?;
-    let survey = RecordingSurvey::read(from)?;
-    survey.manifest(from)?;
-    let mut report = survey.report(from);
+    let survey = RecordingSurvey::from_file(from)?;
+    survey.run_manifest(from)?;
+    let mut report = survey.survey_report(from);
     if !is_partial(from) && report.is_whole() && prove_file(from).is_ok() {
         return Ok(report);
     }
@@ -103,7 +103,7 @@ fn rebuild(from: &Path, to: &Path, survey: &RecordingSurvey, report: &Report) ->
     let mut walk = RecordingReader::open(from)?;
     let mut copy = RecordingCopy::new(&mut writer, &survey.channels);
     while let Some(item) = walk.next_item()? {
-        copy.take(item, &|_, _| true).map_err(failed)?;
+        copy.copy_item(item, &|_, _| true).map_err(failed)?;
     }
     let record = [
         ("software", concat!("echolake ", env!("CARGO_PKG_VERSION")).to_owned()),
@@ -124,7 +124,7 @@ fn rebuild(from: &Path, to: &Path, survey: &RecordingSurvey, report: &Report) ->
 fn compare(written: &Path, expected: &Report) -> Result<(), Error> {
     let unproven = |text: String| Error::Unproven { path: written.to_owned(), source: text.into() };
     prove_file(written).map_err(unproven)?;
-    let found = RecordingSurvey::read(written)?;
+    let found = RecordingSurvey::from_file(written)?;
     if found.counts != expected.messages || found.has_end() != expected.has_end {
         return Err(unproven(format!("it has {:?}, read were {:?}", found.counts, expected.messages)));
     }
@@ -137,7 +137,7 @@ fn publish(staged: &Path, to: &Path) -> Result<(), Error> {
         return Err(Error::Exists { path: to.to_owned() });
     }
     std::fs::rename(staged, to).map_err(failed)?;
-    sync(folder_of(to)).map_err(failed)
+    sync_to_disk(folder_of(to)).map_err(failed)
 }
 
 /// Locks a recording until the file is dropped; its recorder holds a lock as long as it lives.

@@ -32,7 +32,7 @@ impl RecordingSurvey {
     /// # Errors
     /// [`Error::Read`], [`Error::Headless`] if it is no MCAP file, [`Error::Unusable`] if its channels contradict each
     /// other.
-    pub(crate) fn read(path: &Path) -> Result<Self, Error> {
+    pub(crate) fn from_file(path: &Path) -> Result<Self, Error> {
         let mut walk = RecordingReader::open(path)?;
         let mut definitions = ChannelDefinitions::default();
         let (mut metadata, mut rig, mut by_channel, mut chunks) = (BTreeMap::new(), None, BTreeMap::new(), 0);
@@ -44,11 +44,11 @@ impl RecordingSurvey {
                 }
                 RecordingItem::Attachment(_) => {}
                 // Those of a chunk have a CRC and count for more.
-                RecordingItem::Definition(record) => drop(definitions.learn(&record)),
+                RecordingItem::Definition(record) => drop(definitions.learn_definition(&record)),
                 RecordingItem::Chunk(chunk) => {
                     chunks += 1;
                     for record in &chunk.records {
-                        definitions.learn(record).map_err(|what| Error::Unusable {
+                        definitions.learn_definition(record).map_err(|what| Error::Unusable {
                             path: path.to_owned(),
                             source: format!("the chunk at byte {}: {what}", chunk.offset).into(),
                         })?;
@@ -93,7 +93,7 @@ impl RecordingSurvey {
     ///
     /// # Errors
     /// [`Error::Headless`] if nothing was measured, [`Error::Unusable`] if something was and no run can be made of it.
-    pub(crate) fn manifest(&self, path: &Path) -> Result<RunManifest, Error> {
+    pub(crate) fn run_manifest(&self, path: &Path) -> Result<RunManifest, Error> {
         let path = path.to_owned();
         let found = self.integrity.damage.first().cloned().unwrap_or_else(|| "it ends".to_owned());
         let whole = format!("{} chunks of it are whole", self.chunks);
@@ -135,12 +135,12 @@ impl RecordingSurvey {
     }
 
     /// Returns the bytes that are lost, and the file's size.
-    pub(crate) fn lost(&self) -> (&[Range<u64>], u64) {
+    pub(crate) fn loss_and_size(&self) -> (&[Range<u64>], u64) {
         (&self.integrity.lost, self.integrity.bytes)
     }
 
     /// Returns the report of a recording that was only read.
-    pub(crate) fn report(&self, from: &Path) -> Report {
+    pub(crate) fn survey_report(&self, from: &Path) -> Report {
         let FileIntegrity { bytes, lost, .. } = &self.integrity;
         let lost_bytes: u64 = lost.iter().map(|range| range.end - range.start).sum();
         Report {

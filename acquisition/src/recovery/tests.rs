@@ -125,8 +125,11 @@ fn damage_is_skipped_and_told() {
     let without: Vec<u32> = all.iter().copied().filter(|pair| *pair != 10).collect();
     assert_eq!(pairs(&out), [all, without]);
     // The pair whose response is lost is measured again.
-    let held = Held::read(&out).expect("a run with a plan");
-    assert_eq!((held.accepted(), held.pairs[&10]), (PAIRS as usize - 1, PairAttempts { attempts: 1, accepted: false }));
+    let held = Held::from_file(&out).expect("a run with a plan");
+    assert_eq!(
+        (held.accepted_count(), held.pairs[&10]),
+        (PAIRS as usize - 1, PairAttempts { attempts: 1, accepted: false })
+    );
     // Nothing is overwritten.
     assert!(matches!(recover(&path, &out), Err(Error::Exists { .. })));
 }
@@ -195,8 +198,8 @@ fn a_chunk_that_was_never_closed_costs_itself() {
         assert_eq!((report.lost.as_slice(), report.verified_bytes), (from_ref(&(to..from)), to));
         assert_eq!(report.damage, [format!("the file has a chunk that was never closed at byte {to}")]);
         std::fs::remove_file(folder.path().join("out.mcap")).expect("removed");
-        let held = Held::read(&partial).expect("it can be resumed");
-        assert_eq!((held.accepted(), held.is_damaged()), (expected, false));
+        let held = Held::from_file(&partial).expect("it can be resumed");
+        assert_eq!((held.accepted_count(), held.is_damaged()), (expected, false));
     }
 }
 
@@ -246,7 +249,7 @@ fn a_manifest_that_is_lost_is_named_and_nothing_is_said_of_measurements() {
     let error = recover(&path, &beside(&path)).expect_err("no run").to_string();
     assert!(error.contains("its manifest is missing or damaged, though"), "{error}");
     assert!(!error.contains("no measurement"), "{error}");
-    let error = Recorder::resume(&path).map(|_| ()).expect_err("no run").to_string();
+    let error = Recorder::resume_recording(&path).map(|_| ()).expect_err("no run").to_string();
     assert!(error.contains("its manifest is missing or damaged, though"), "{error}");
 }
 
@@ -297,7 +300,7 @@ fn what_is_no_run_is_refused() {
         std::fs::write(&path, bytes).expect("written");
         let error = recover(&path, &beside(&path)).expect_err("no run").to_string();
         assert!(error.contains("holds no run"), "{error}");
-        assert!(matches!(Recorder::resume(&path), Err(Error::Headless { .. })));
+        assert!(matches!(Recorder::resume_recording(&path), Err(Error::Headless { .. })));
     }
 }
 
@@ -311,12 +314,12 @@ fn a_run_is_resumed_behind_what_is_safe() {
     let partial = folder.path().join("run.mcap.partial");
     for cut in [checkpoints[6], checkpoints[6] + 1_500, checkpoints[7] - 1, bytes.len() as u64] {
         std::fs::write(&partial, &bytes[..cut as usize]).expect("written");
-        let (mut recorder, held) = Recorder::resume(&partial).expect("gone on with");
-        let safe = held.accepted();
+        let (mut recorder, held) = Recorder::resume_recording(&partial).expect("gone on with");
+        let safe = held.accepted_count();
         let acknowledged = checkpoints.iter().filter(|c| **c <= cut).count();
         assert!(held.pairs.len() == safe && (safe == acknowledged || safe == acknowledged + 1), "{cut}");
         // Whoever else comes finds it in use.
-        assert!(matches!(Recorder::resume(&partial), Err(Error::Busy { .. })));
+        assert!(matches!(Recorder::resume_recording(&partial), Err(Error::Busy { .. })));
         for pair in safe as u32..PAIRS {
             attempt(&mut recorder, pair, 1);
         }
@@ -329,8 +332,8 @@ fn a_run_is_resumed_behind_what_is_safe() {
         let names: Vec<_> =
             std::fs::read_dir(folder.path()).expect("listed").flatten().map(|e| e.file_name()).collect();
         assert_eq!(names, ["run.mcap"], "nothing else is left");
-        let held = Held::read(&path).expect("the finished run");
-        assert_eq!((held.accepted(), held.attempts), (PAIRS as usize, u64::from(PAIRS)));
+        let held = Held::from_file(&path).expect("the finished run");
+        assert_eq!((held.accepted_count(), held.attempts), (PAIRS as usize, u64::from(PAIRS)));
         std::fs::remove_file(&path).expect("removed");
     }
 }
@@ -350,8 +353,8 @@ fn what_is_lost_in_the_middle_is_measured_again() {
     }
     let partial = folder.path().join("run.mcap.partial");
     std::fs::write(&partial, &bytes).expect("written");
-    let (mut recorder, held) = Recorder::resume(&partial).expect("resumed");
-    assert_eq!((held.accepted(), held.is_damaged(), held.lost.len()), (14, true, 2));
+    let (mut recorder, held) = Recorder::resume_recording(&partial).expect("resumed");
+    assert_eq!((held.accepted_count(), held.is_damaged(), held.lost.len()), (14, true, 2));
     let again: Vec<u32> = (0..PAIRS).filter(|pair| held.pairs.get(pair).is_none_or(|tried| !tried.accepted)).collect();
     assert_eq!(again, [0, 4, 16, 17, 18, 19]);
     for pair in again {

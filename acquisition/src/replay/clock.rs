@@ -32,7 +32,7 @@ impl ReplayClock {
     }
 
     /// Sets its time; a running clock goes on running.
-    pub(super) fn set(&mut self, at: u64) {
+    pub(super) fn set_time(&mut self, at: u64) {
         self.shown = at;
         self.since = self.since.map(|_| Instant::now());
     }
@@ -40,13 +40,13 @@ impl ReplayClock {
     /// Changes its speed; values that are no speed change nothing.
     pub(super) fn set_speed(&mut self, speed: f32) {
         if speed.is_finite() && speed > 0.0 {
-            self.set(self.now());
+            self.set_time(self.now());
             self.speed = speed.clamp(*SPEEDS.start(), *SPEEDS.end());
         }
     }
 
     /// Starts or stops it.
-    pub(super) fn go(&mut self, goes: bool) {
+    pub(super) fn set_running(&mut self, goes: bool) {
         if goes != self.since.is_some() {
             self.shown = self.now();
             self.since = goes.then(Instant::now);
@@ -54,7 +54,7 @@ impl ReplayClock {
     }
 
     /// Returns the wait until it shows a time.
-    pub(super) fn until(&self, at: u64) -> Duration {
+    pub(super) fn time_until(&self, at: u64) -> Duration {
         Duration::from_secs_f64(at.saturating_sub(self.now()) as f64 / 1e9 / f64::from(self.speed))
     }
 }
@@ -68,19 +68,19 @@ mod tests {
         let mut clock = ReplayClock::new(1_000, 1e9);
         assert_eq!(clock.speed(), *SPEEDS.end());
         assert_eq!(clock.now(), 1_000);
-        clock.go(true);
+        clock.set_running(true);
         std::thread::sleep(Duration::from_millis(2));
         assert!(clock.now() >= 1_000 + 2_000_000 * 1_000_000);
-        clock.go(false);
+        clock.set_running(false);
         let stood = clock.now();
         assert_eq!(clock.now(), stood);
-        clock.set(5);
+        clock.set_time(5);
         for speed in [f32::NAN, f32::INFINITY, 0.0, -1.0] {
             clock.set_speed(speed);
             assert_eq!(clock.speed(), *SPEEDS.end(), "{speed} is no speed");
         }
         clock.set_speed(2.0);
-        assert_eq!((clock.now(), clock.until(2_000_000_005)), (5, Duration::from_secs(1)));
-        assert_eq!(clock.until(0), Duration::ZERO);
+        assert_eq!((clock.now(), clock.time_until(2_000_000_005)), (5, Duration::from_secs(1)));
+        assert_eq!(clock.time_until(0), Duration::ZERO);
     }
 }

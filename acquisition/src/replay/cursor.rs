@@ -24,29 +24,29 @@ pub(super) struct MessageCursor {
 
 impl MessageCursor {
     /// Starts right behind `passed`, with these of the file's channels.
-    pub(super) fn behind(passed: Key, wanted: BTreeSet<u16>) -> Self {
+    pub(super) fn starting_behind(passed: Key, wanted: BTreeSet<u16>) -> Self {
         Self { wanted, passed, ..Self::default() }
     }
 
     /// Returns the key of the last message that was given out or skipped.
-    pub(super) fn passed(&self) -> Key {
+    pub(super) fn last_passed(&self) -> Key {
         self.passed
     }
 
     /// Skips all messages up to this key.
-    pub(super) fn pass(&mut self, upto: Key) {
+    pub(super) fn skip_to(&mut self, upto: Key) {
         self.passed = self.passed.max(upto);
     }
 
     /// Returns the time of the next message; None behind the last.
-    pub(super) fn peek(&mut self, recording: &Recording, damages: &mut Vec<ChunkDamage>) -> Option<u64> {
-        self.fill(recording, damages);
-        self.first().map(|(_, key)| key.0)
+    pub(super) fn peek_time(&mut self, recording: &Recording, damages: &mut Vec<ChunkDamage>) -> Option<u64> {
+        self.open_chunks(recording, damages);
+        self.earliest_head().map(|(_, key)| key.0)
     }
 
-    /// Returns the next message, if [`Self::peek`] saw one.
-    pub(super) fn pop(&mut self) -> Option<Message> {
-        let (at, key) = self.first()?;
+    /// Returns the next message, if [`Self::peek_time`] saw one.
+    pub(super) fn pop_message(&mut self) -> Option<Message> {
+        let (at, key) = self.earliest_head()?;
         let message = self.open[at].pop_front()?;
         if self.open[at].is_empty() {
             self.open.swap_remove(at);
@@ -56,22 +56,22 @@ impl MessageCursor {
         Some(message)
     }
 
-    fn first(&self) -> Option<(usize, Key)> {
+    fn earliest_head(&self) -> Option<(usize, Key)> {
         let heads = self.open.iter().enumerate().filter_map(|(at, chunk)| Some((at, chunk.front()?.key)));
         heads.min_by_key(|(_, key)| *key)
     }
 
     // Opens chunks until none that is closed can have an earlier message than the next.
-    fn fill(&mut self, recording: &Recording, damages: &mut Vec<ChunkDamage>) {
+    fn open_chunks(&mut self, recording: &Recording, damages: &mut Vec<ChunkDamage>) {
         while let Some(chunk) = recording.chunks.get(self.next_chunk) {
-            if self.first().is_some_and(|(_, key)| key.0 < chunk.start) {
+            if self.earliest_head().is_some_and(|(_, key)| key.0 < chunk.start) {
                 return;
             }
             self.next_chunk += 1;
             if chunk.end < self.passed.0 || !chunk.has_any(&self.wanted) {
                 continue;
             }
-            match recording.messages(chunk, &self.wanted) {
+            match recording.read_messages(chunk, &self.wanted) {
                 Ok(messages) => {
                     let ahead: VecDeque<_> = messages.into_iter().filter(|m| m.key > self.passed).collect();
                     let bytes: usize = ahead.iter().map(|m| m.data.len()).sum();
@@ -90,7 +90,7 @@ impl MessageCursor {
 }
 
 /// Returns the state at a place: of each channel the messages of its latest time up to there, by time.
-pub(super) fn standing(
+pub(super) fn latest_messages(
     recording: &Recording,
     upto: Key,
     channels: &BTreeSet<u16>,
@@ -112,7 +112,7 @@ pub(super) fn standing(
         if !chunk.has_any(&open) {
             continue;
         }
-        let messages = recording.messages(chunk, &open).unwrap_or_else(|what| {
+        let messages = recording.read_messages(chunk, &open).unwrap_or_else(|what| {
             damages.push((chunk.offset, what));
             Vec::new()
         });

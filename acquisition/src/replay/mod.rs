@@ -77,15 +77,15 @@ impl ReplayServer {
         mut recordings: Vec<Recording>,
         options: ReplayOptions,
     ) -> Result<Self, Error> {
-        recordings.sort_by_key(|r| r.range().0);
+        recordings.sort_by_key(|r| r.time_range().0);
         let (commands, obeyed) = mpsc::sync_channel(COMMANDS);
         let nothing = |reason| Error::Nothing { reason };
         let first = recordings.first().ok_or_else(|| nothing("there is no recording"))?;
-        let range = recordings.iter().fold(first.range(), |all, r| (all.0, all.1.max(r.range().1)));
+        let range = recordings.iter().fold(first.time_range(), |all, r| (all.0, all.1.max(r.time_range().1)));
         let playback = PlaybackControl { range, commands };
-        let length_secs = recordings.iter().map(player::secs).sum();
-        let topics =
-            player::ReplayTopics::of(&recordings).ok_or_else(|| nothing("there are more topics than channels"))?;
+        let length_secs = recordings.iter().map(player::recording_secs).sum();
+        let topics = player::ReplayTopics::from_recordings(&recordings)
+            .ok_or_else(|| nothing("there are more topics than channels"))?;
         let server = ViewerServer::start(address, access, topics.all.clone(), ViewerClock::Playback(playback))
             .map_err(|source| Error::Listen { address, source })?;
         let standing = Arc::new(Mutex::new(ReplayState {
@@ -97,8 +97,8 @@ impl ReplayServer {
             lost: 0,
             damages: Vec::new(),
         }));
-        let player = ReplayPlayer::new(recordings, topics, options, server.shared().clone(), standing.clone());
-        let thread = PlayerThread(Some(std::thread::spawn(move || player.run(&obeyed))));
+        let player = ReplayPlayer::new(recordings, topics, options, server.shared_state().clone(), standing.clone());
+        let thread = PlayerThread(Some(std::thread::spawn(move || player.run_player(&obeyed))));
         Ok(Self { server, _thread: thread, standing, length_secs, range })
     }
 

@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use super::clock::ReplayClock;
-use super::cursor::{ChunkDamage, MessageCursor, standing};
+use super::cursor::{ChunkDamage, MessageCursor, latest_messages};
 use super::recording::{Key, Recording};
 use super::{ReplayOptions, ReplayState};
 use crate::run::recorder::Topic;
@@ -22,8 +22,8 @@ const BREATH: Duration = Duration::from_millis(3);
 const STRIDE: usize = 256;
 
 /// Length of a recording, s.
-pub(super) fn secs(recording: &Recording) -> f64 {
-    (recording.range().1 - recording.range().0) as f64 / 1e9
+pub(super) fn recording_secs(recording: &Recording) -> f64 {
+    (recording.time_range().1 - recording.time_range().0) as f64 / 1e9
 }
 
 /// The topics of all recordings, each once.
@@ -36,7 +36,7 @@ pub(super) struct ReplayTopics {
 
 impl ReplayTopics {
     /// None if there are more topics than channels.
-    pub(super) fn of(recordings: &[Recording]) -> Option<Self> {
+    pub(super) fn from_recordings(recordings: &[Recording]) -> Option<Self> {
         let (mut all, mut of) = (Vec::<Topic>::new(), Vec::new());
         for recording in recordings {
             let mut channels = BTreeMap::new();
@@ -83,7 +83,7 @@ impl ReplayPlayer {
         shared: Arc<ViewerState>,
         told: Arc<Mutex<ReplayState>>,
     ) -> Self {
-        let start = recordings.first().map_or(0, |r| r.range().0);
+        let start = recordings.first().map_or(0, |r| r.time_range().0);
         let status = if options.paused { PlaybackStatus::Paused } else { PlaybackStatus::Playing };
         Self {
             recordings,
@@ -93,19 +93,19 @@ impl ReplayPlayer {
             clock: ReplayClock::new(start, options.speed),
             status,
             number: 0,
-            cursor: MessageCursor::behind(at_all_of(start), BTreeSet::new()),
+            cursor: MessageCursor::starting_behind(at_all_of(start), BTreeSet::new()),
             wishes: 0,
             damaged: BTreeSet::new(),
         }
     }
 
     /// Plays until the server has ended.
-    pub(super) fn run(mut self, commands: &Receiver<PlayerCommand>) {
+    pub(super) fn run_player(mut self, commands: &Receiver<PlayerCommand>) {
         while !self.shared.has_ended() {
-            let wait = self.step();
-            self.tell();
+            let wait = self.play_step();
+            self.tell_interface();
             match commands.recv_timeout(wait) {
-                Ok(first) => self.obey([first].into_iter().chain(commands.try_iter()).collect()),
+                Ok(first) => self.obey_commands([first].into_iter().chain(commands.try_iter()).collect()),
                 Err(RecvTimeoutError::Timeout) => {}
                 Err(RecvTimeoutError::Disconnected) => return,
             }
@@ -113,55 +113,55 @@ impl ReplayPlayer {
     }
 
     // Sends the messages that are due; returns the wait until the next one.
-    fn step(&mut self) -> Duration {
+    fn play_step(&mut self) -> Duration {
         self.keep_to_wishes();
-        let is_watched = !self.shared.wanted().is_empty();
-        self.clock.go(self.status == PlaybackStatus::Playing && is_watched);
+        let is_watched = !self.shared.wanted_channels().is_empty();
+        self.clock.set_running(self.status == PlaybackStatus::Playing && is_watched);
         if self.status != PlaybackStatus::Playing || !is_watched {
             return TICK;
         }
         for _ in 0..STRIDE {
-            let Some(next) = self.peek() else { return self.end_recording() };
+            let Some(next) = self.peek_time() else { return self.end_recording() };
             if next > self.clock.now() {
                 return self.wait_for(next);
             }
             if self.shared.all_are_busy() {
                 // A late message stays late; clients are not flooded to catch up.
-                self.clock.set(next);
+                self.clock.set_time(next);
                 return BREATH;
             }
-            if let Some(message) = self.cursor.pop()
+            if let Some(message) = self.cursor.pop_message()
                 && let Some(channel) = self.topics.of[self.number].get(&message.channel)
             {
-                self.shared.send(*channel, message.key.0, &message.data, false);
+                self.shared.send_message(*channel, message.key.0, &message.data, false);
             }
         }
         self.tell_time();
         Duration::ZERO
     }
 
-    fn peek(&mut self) -> Option<u64> {
+    fn peek_time(&mut self) -> Option<u64> {
         let mut damages = Vec::new();
-        let next = self.cursor.peek(&self.recordings[self.number], &mut damages);
-        self.note(damages);
+        let next = self.cursor.peek_time(&self.recordings[self.number], &mut damages);
+        self.note_damages(damages);
         next
     }
 
     // On to the next recording, or to the end; what is wanted of this one is over before it is.
     fn end_recording(&mut self) -> Duration {
-        let end = self.recordings[self.number].range().1;
+        let end = self.recordings[self.number].time_range().1;
         if self.clock.now() < end {
             return self.wait_for(end);
         }
         if self.number + 1 < self.recordings.len() {
             self.number += 1;
-            let start = self.recordings[self.number].range().0;
-            self.put(start);
+            let start = self.recordings[self.number].time_range().0;
+            self.move_to_time(start);
             self.tell_state(true, String::new());
             self.show_to(&self.shared.clients());
         } else {
-            self.clock.set(end);
-            self.clock.go(false);
+            self.clock.set_time(end);
+            self.clock.set_running(false);
             self.status = PlaybackStatus::Ended;
             self.tell_state(false, String::new());
         }
@@ -172,32 +172,32 @@ impl ReplayPlayer {
     fn wait_for(&mut self, next: u64) -> Duration {
         // New subscribers get the state at the current time.
         let now = self.clock.now().min(next.saturating_sub(1));
-        self.cursor.pass(at_all_of(now));
+        self.cursor.skip_to(at_all_of(now));
         self.tell_time();
-        self.clock.until(next).min(TICK)
+        self.clock.time_until(next).min(TICK)
     }
 
-    fn put(&mut self, time: u64) {
-        self.clock.set(time);
-        self.wishes = self.shared.wishes();
-        self.cursor = MessageCursor::behind(at_all_of(time), self.wanted());
+    fn move_to_time(&mut self, time: u64) {
+        self.clock.set_time(time);
+        self.wishes = self.shared.wish_counter();
+        self.cursor = MessageCursor::starting_behind(at_all_of(time), self.wanted_channels());
     }
 
     // Channels of the file with a subscription.
-    fn wanted(&self) -> BTreeSet<u16> {
-        let wanted = self.shared.wanted();
+    fn wanted_channels(&self) -> BTreeSet<u16> {
+        let wanted = self.shared.wanted_channels();
         self.topics.of[self.number].iter().filter(|(_, to)| wanted.contains(to)).map(|(from, _)| *from).collect()
     }
 
     fn keep_to_wishes(&mut self) {
-        let wishes = self.shared.wishes();
+        let wishes = self.shared.wish_counter();
         if wishes != self.wishes {
             self.wishes = wishes;
-            self.cursor = MessageCursor::behind(self.cursor.passed(), self.wanted());
+            self.cursor = MessageCursor::starting_behind(self.cursor.last_passed(), self.wanted_channels());
         }
     }
 
-    fn obey(&mut self, commands: Vec<PlayerCommand>) {
+    fn obey_commands(&mut self, commands: Vec<PlayerCommand>) {
         let mut new: Vec<(Arc<ClientQueue>, BTreeSet<u16>)> = Vec::new();
         let seeks = |c: &PlayerCommand| matches!(c, PlayerCommand::Playback(request) if request.seek.is_some());
         // Who drags a slider seeks faster than anything can be shown.
@@ -211,20 +211,20 @@ impl ReplayPlayer {
                         None => new.push((queue, wanted)),
                     }
                 }
-                PlayerCommand::Playback(request) => self.control(request, seeks_left == 0),
+                PlayerCommand::Playback(request) => self.control_playback(request, seeks_left == 0),
             }
         }
         for (queue, mut channels) in new {
-            channels.retain(|channel| !queue.receives(*channel));
-            self.show(&[(queue, channels)]);
+            channels.retain(|channel| !queue.receives_channel(*channel));
+            self.show_state(&[(queue, channels)]);
         }
     }
 
-    fn control(&mut self, request: PlaybackRequest, is_shown: bool) {
+    fn control_playback(&mut self, request: PlaybackRequest, is_shown: bool) {
         // The next step lets it go again; the answer is of now.
-        self.clock.go(false);
+        self.clock.set_running(false);
         if let Some(time) = request.seek {
-            self.seek(time);
+            self.seek_to(time);
         }
         self.clock.set_speed(request.speed);
         // Behind the end there is only seeking.
@@ -234,7 +234,7 @@ impl ReplayPlayer {
         let did_seek = request.seek.is_some();
         let clients = self.shared.clients();
         if did_seek {
-            clients.iter().for_each(|client| client.forget());
+            clients.iter().for_each(|client| client.forget_pending());
         }
         self.tell_state(did_seek, request.id);
         if did_seek && is_shown {
@@ -244,14 +244,14 @@ impl ReplayPlayer {
     }
 
     // To a time in this recording, or in the first that ends behind it; if none has that time, to its beginning.
-    fn seek(&mut self, time: u64) {
-        let here = self.recordings[self.number].range();
+    fn seek_to(&mut self, time: u64) {
+        let here = self.recordings[self.number].time_range();
         if !(here.0..=here.1).contains(&time) {
-            let found = self.recordings.iter().position(|r| time <= r.range().1);
+            let found = self.recordings.iter().position(|r| time <= r.time_range().1);
             self.number = found.unwrap_or(self.recordings.len() - 1);
         }
-        let (start, end) = self.recordings[self.number].range();
-        self.put(time.clamp(start, end));
+        let (start, end) = self.recordings[self.number].time_range();
+        self.move_to_time(time.clamp(start, end));
         if self.status == PlaybackStatus::Ended {
             self.status = PlaybackStatus::Paused;
         }
@@ -259,16 +259,17 @@ impl ReplayPlayer {
 
     // Sends clients the current state of their channels.
     fn show_to(&mut self, clients: &[Arc<ClientQueue>]) {
-        let all: Vec<_> = clients.iter().map(|c| (c.clone(), c.wanted().into_iter().collect())).collect();
-        self.show(&all);
+        let all: Vec<_> = clients.iter().map(|c| (c.clone(), c.wanted_channels().into_iter().collect())).collect();
+        self.show_state(&all);
     }
 
-    fn show(&mut self, to: &[(Arc<ClientQueue>, BTreeSet<u16>)]) {
+    fn show_state(&mut self, to: &[(Arc<ClientQueue>, BTreeSet<u16>)]) {
         let channels = &self.topics.of[self.number];
         let asked = |to_channel: &u16| to.iter().any(|(_, wanted)| wanted.contains(to_channel));
         let of_file = channels.iter().filter(|(_, to)| asked(to)).map(|(from, _)| *from).collect();
         let mut damages = Vec::new();
-        let messages = standing(&self.recordings[self.number], self.cursor.passed(), &of_file, &mut damages);
+        let messages =
+            latest_messages(&self.recordings[self.number], self.cursor.last_passed(), &of_file, &mut damages);
         let known: Vec<PendingMessage> = messages
             .into_iter()
             .filter_map(|m| {
@@ -277,13 +278,13 @@ impl ReplayPlayer {
             })
             .collect();
         for (queue, wanted) in to {
-            self.shared.prime(queue, wanted, &known);
+            self.shared.prime_client(queue, wanted, &known);
         }
-        self.note(damages);
+        self.note_damages(damages);
     }
 
     fn current_time(&self) -> u64 {
-        let (start, end) = self.recordings[self.number].range();
+        let (start, end) = self.recordings[self.number].time_range();
         self.clock.now().clamp(start, end)
     }
 
@@ -304,11 +305,11 @@ impl ReplayPlayer {
     }
 
     // What is behind the replay's own interface.
-    fn tell(&self) {
+    fn tell_interface(&self) {
         let recording = &self.recordings[self.number];
-        let before: f64 = self.recordings[..self.number].iter().map(secs).sum();
-        let within = (self.current_time() - recording.range().0) as f64 / 1e9;
-        let (viewers, lost) = (self.shared.clients().len(), self.shared.lost());
+        let before: f64 = self.recordings[..self.number].iter().map(recording_secs).sum();
+        let within = (self.current_time() - recording.time_range().0) as f64 / 1e9;
+        let (viewers, lost) = (self.shared.clients().len(), self.shared.lost_messages());
         let mut told = self.told.lock().unwrap_or_else(PoisonError::into_inner);
         if told.recording != recording.path() {
             told.recording = recording.path().to_owned();
@@ -319,7 +320,7 @@ impl ReplayPlayer {
         (told.viewers, told.lost) = (viewers, lost);
     }
 
-    fn note(&mut self, damages: Vec<ChunkDamage>) {
+    fn note_damages(&mut self, damages: Vec<ChunkDamage>) {
         for (offset, what) in damages {
             if self.damaged.insert((self.number, offset)) {
                 let path = self.recordings[self.number].path().display();

@@ -64,9 +64,9 @@ impl Recording {
     pub fn open(path: &Path) -> Result<Self, Error> {
         let unread = |source| Error::Read { path: path.to_owned(), source };
         let mut file = File::open(path).map_err(unread)?;
-        let summary = match summary(&mut file) {
+        let summary = match read_summary(&mut file) {
             // One that leaves out a part of what the file holds is as good as none.
-            Ok(found) => found.filter(|s| !s.chunk_indexes.is_empty() && s.unaccounted().is_none()),
+            Ok(found) => found.filter(|s| !s.chunk_indexes.is_empty() && s.describe_unaccounted().is_none()),
             Err(Unread::System(source)) => return Err(unread(source)),
             // The walk says what is wrong.
             Err(Unread::Damaged) => None,
@@ -78,7 +78,7 @@ impl Recording {
                 let chunks = summary.chunk_indexes.iter().filter_map(Stretch::of_index).collect();
                 (topics_of(summary.channels.values().map(|c| c.as_ref())), chunks, None)
             }
-            None => walked(path)?,
+            None => walk_recording(path)?,
         };
         chunks.sort_by_key(|c: &Stretch| (c.start, c.offset));
         let range = chunks.first().map(|first| (first.start, chunks.iter().map(|c| c.end).fold(first.end, u64::max)));
@@ -103,18 +103,18 @@ impl Recording {
     }
 
     /// First and last time, ns since 1970.
-    pub fn range(&self) -> (u64, u64) {
+    pub fn time_range(&self) -> (u64, u64) {
         self.range
     }
 
     /// The messages of a chunk by their time, of some channels; in words where it is damaged.
-    pub(super) fn messages(&self, chunk: &Stretch, channels: &BTreeSet<u16>) -> Result<Vec<Message>, String> {
-        let decoded = DecodedChunk::decode(&self.body(chunk)?).map_err(|e| format!("a chunk is damaged: {e}"))?;
+    pub(super) fn read_messages(&self, chunk: &Stretch, channels: &BTreeSet<u16>) -> Result<Vec<Message>, String> {
+        let decoded = DecodedChunk::decode(&self.read_body(chunk)?).map_err(|e| format!("a chunk is damaged: {e}"))?;
         let mut records = decoded.into_cursor();
         let mut messages = Vec::new();
         let mut place = 0;
         while let Some(record) = records.next_record().map_err(|e| e.to_string())? {
-            self.digests.check(&record)?;
+            self.digests.check_definition(&record)?;
             if let Record::Message { header, data } = record
                 && channels.contains(&header.channel_id)
             {
@@ -127,7 +127,7 @@ impl Recording {
         Ok(messages)
     }
 
-    fn body(&self, chunk: &Stretch) -> Result<Bytes, String> {
+    fn read_body(&self, chunk: &Stretch) -> Result<Bytes, String> {
         if !(FRAME..=FRAME + LARGEST_CHUNK).contains(&chunk.length) {
             return Err(format!("a chunk of {} bytes", chunk.length));
         }
@@ -162,7 +162,7 @@ enum Unread {
     Damaged,
 }
 
-fn summary(file: &mut File) -> Result<Option<RunSummary>, Unread> {
+fn read_summary(file: &mut File) -> Result<Option<RunSummary>, Unread> {
     let bytes = file.metadata().map_err(Unread::System)?.len();
     let tail = read_range(file, tail_range(bytes)).map_err(Unread::System)?;
     let Some(range) = summary_range(&tail, bytes) else { return Ok(None) };
@@ -180,7 +180,7 @@ fn read_range(file: &mut File, range: Range<u64>) -> io::Result<Vec<u8>> {
 type Walked = (BTreeMap<u16, Topic>, Vec<Stretch>, Option<String>);
 
 // The index of a file that has none.
-fn walked(path: &Path) -> Result<Walked, Error> {
+fn walk_recording(path: &Path) -> Result<Walked, Error> {
     let unread = |e: ResyncError| {
         let reason = match e {
             ResyncError::Read { source, .. } => source.to_string(),
@@ -197,7 +197,7 @@ fn walked(path: &Path) -> Result<Walked, Error> {
             RecordingItem::Chunk(chunk) => chunk,
             // Those of a chunk have a CRC and count for more.
             RecordingItem::Definition(record) => {
-                let _ = definitions.learn(&record);
+                let _ = definitions.learn_definition(&record);
                 continue;
             }
             _ => continue,
@@ -205,7 +205,7 @@ fn walked(path: &Path) -> Result<Walked, Error> {
         let mut times = Vec::new();
         let mut channels = BTreeSet::new();
         for record in &chunk.records {
-            definitions.learn(record).map_err(|what| Error::Unplayable {
+            definitions.learn_definition(record).map_err(|what| Error::Unplayable {
                 path: path.to_owned(),
                 reason: format!("the chunk at byte {}: {what}", chunk.offset),
             })?;

@@ -15,7 +15,7 @@ use tungstenite::client::IntoClientRequest as _;
 
 use super::*;
 use crate::run::RunRequest;
-use crate::run::simulate::simulate;
+use crate::run::simulate::run_simulation;
 
 const SMALL_RIG: &str = include_str!("../../../tests/fixtures/small_rig.toml");
 const START: i64 = 1_767_600_000_000_000_000;
@@ -31,7 +31,7 @@ fn run(folder: &Path, surface: &str, hours: f64) -> PathBuf {
     let specimen = PanelSpecimen::Relief(PanelRelief::by_name("flat").expect("a relief"));
     let start = Timestamp(START).plus_secs(hours * 3_600.0);
     let run = RunRequest::new(&rig, surface.parse().expect("an id"), &specimen, start, folder);
-    simulate(&run, Origin::Simulated, &AtomicBool::new(false), &mut |_| {}).expect("a run").0
+    run_simulation(&run, Origin::Simulated, &AtomicBool::new(false), &mut |_| {}).expect("a run").0
 }
 
 /// Topic, time and content.

@@ -8,9 +8,9 @@ use crate::rig::{AmbientSensor, AudioInterface, AudioTake, DrivePower, RobotArms
 ///
 /// # Panics
 /// If they do not.
-pub fn robots(robots: &mut dyn RobotArms, reachable: [[f64; 3]; 2], unreachable: [[f64; 3]; 2]) {
+pub fn check_robots(robots: &mut dyn RobotArms, reachable: [[f64; 3]; 2], unreachable: [[f64; 3]; 2]) {
     let [microphone, speaker] = reachable;
-    assert!(robots.power(DrivePower::On).is_ok(), "the drives switch on");
+    assert!(robots.switch_drives(DrivePower::On).is_ok(), "the drives switch on");
     let stand = robots.move_to(microphone, speaker).unwrap_or_else(|e| panic!("{e}"));
     for (wanted, reached) in [(microphone, stand.microphone_mm), (speaker, stand.speaker_mm)] {
         let off = wanted.iter().zip(reached).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt();
@@ -20,16 +20,16 @@ pub fn robots(robots: &mut dyn RobotArms, reachable: [[f64; 3]; 2], unreachable:
     for bad in [f64::NAN, f64::INFINITY] {
         assert!(robots.move_to([bad, microphone[1], microphone[2]], speaker).is_err(), "{bad} is no position");
     }
-    assert!(robots.power(DrivePower::Off).is_ok(), "the drives switch off");
+    assert!(robots.switch_drives(DrivePower::Off).is_ok(), "the drives switch off");
     assert!(robots.move_to(speaker, microphone).is_err(), "nothing moves without power");
-    assert!(robots.power(DrivePower::On).is_ok(), "the drives switch on again");
+    assert!(robots.switch_drives(DrivePower::On).is_ok(), "the drives switch on again");
 }
 
 /// Checks that takes are as long as the output, that the loopback carries the output, and that time advances.
 ///
 /// # Panics
 /// If a check fails.
-pub fn audio(audio: &mut dyn AudioInterface) {
+pub fn check_audio(audio: &mut dyn AudioInterface) {
     assert!(audio.rate_hz() > 0.0);
     // Its frequency rises, so that it resembles itself at one delay only.
     let tone: Vec<f32> = (0..4_800).map(|n| n as f32).map(|n| 0.25 * (n * (0.2 + n * 1e-4)).sin()).collect();
@@ -45,7 +45,7 @@ pub fn audio(audio: &mut dyn AudioInterface) {
         let sent = output.iter().map(|x| f64::from(*x).powi(2)).sum::<f64>() / output.len() as f64;
         if sent > 0.0 {
             assert!((0.01..4.0).contains(&(power(&take.loopback) / sent)), "the loopback has the output's level");
-            let likeness = likeness(output, &take.loopback);
+            let likeness = highest_correlation(output, &take.loopback);
             assert!(likeness > 0.8, "the loopback carries the output: correlation {likeness}");
         } else {
             assert!(power(&take.loopback) < 1e-6, "silence stays silent");
@@ -55,7 +55,7 @@ pub fn audio(audio: &mut dyn AudioInterface) {
 }
 
 // Highest normalised correlation at any delay up to a quarter of the output: converters take their time.
-fn likeness(output: &[f32], loopback: &[i32]) -> f64 {
+fn highest_correlation(output: &[f32], loopback: &[i32]) -> f64 {
     let norm = |x: &mut dyn Iterator<Item = f64>| x.map(|x| x * x).sum::<f64>().sqrt();
     let whole = norm(&mut output.iter().map(|x| f64::from(*x))) * norm(&mut loopback.iter().map(|x| f64::from(*x)));
     let at = |delay: usize| output.iter().zip(&loopback[delay..]).map(|(x, y)| f64::from(*x) * f64::from(*y)).sum();
@@ -66,10 +66,10 @@ fn likeness(output: &[f32], loopback: &[i32]) -> f64 {
 ///
 /// # Panics
 /// If a check fails.
-pub fn sensor(sensor: &mut dyn AmbientSensor) {
+pub fn check_sensor(sensor: &mut dyn AmbientSensor) {
     let mut last = Timestamp(i64::MIN);
     for _ in 0..10 {
-        let reading = sensor.read().unwrap_or_else(|e| panic!("{e}"));
+        let reading = sensor.read_ambient().unwrap_or_else(|e| panic!("{e}"));
         assert!(reading.at >= last);
         last = reading.at;
         assert!((-20.0..=60.0).contains(&reading.temperature_c), "{reading:?}");

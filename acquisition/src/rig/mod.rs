@@ -31,10 +31,10 @@ pub trait RobotArms: Send {
     ///
     /// # Errors
     /// [`Error::Device`].
-    fn power(&mut self, power: DrivePower) -> Result<(), Error>;
+    fn switch_drives(&mut self, power: DrivePower) -> Result<(), Error>;
 
     /// Returns the problems that were handled since the last call, for the run's log.
-    fn notices(&mut self) -> Vec<String> {
+    fn take_notices(&mut self) -> Vec<String> {
         Vec::new()
     }
 }
@@ -73,7 +73,7 @@ pub trait AudioInterface: Send {
     fn play_and_record(&mut self, output: &[f32], take: &mut AudioTake) -> Result<(), Error>;
 
     /// Returns the problems that were handled since the last call, for the run's log.
-    fn notices(&mut self) -> Vec<String> {
+    fn take_notices(&mut self) -> Vec<String> {
         Vec::new()
     }
 }
@@ -95,10 +95,10 @@ pub trait AmbientSensor: Send {
     ///
     /// # Errors
     /// [`Error::Device`].
-    fn read(&mut self) -> Result<AmbientReading, Error>;
+    fn read_ambient(&mut self) -> Result<AmbientReading, Error>;
 
     /// Returns the problems that were handled since the last call, for the run's log.
-    fn notices(&mut self) -> Vec<String> {
+    fn take_notices(&mut self) -> Vec<String> {
         Vec::new()
     }
 }
@@ -132,10 +132,10 @@ pub struct RigDevices {
 
 impl RigDevices {
     /// Returns the problems that were handled since the last call, each with its device.
-    pub fn notices(&mut self) -> Vec<(&'static str, String)> {
+    pub fn take_notices(&mut self) -> Vec<(&'static str, String)> {
         let of = |device, notices: Vec<String>| notices.into_iter().map(move |notice| (device, notice));
-        let (robots, audio) = (self.robots.notices(), self.audio.notices());
-        of("robots", robots).chain(of("audio", audio)).chain(of("sensor", self.sensor.notices())).collect()
+        let (robots, audio) = (self.robots.take_notices(), self.audio.take_notices());
+        of("robots", robots).chain(of("audio", audio)).chain(of("sensor", self.sensor.take_notices())).collect()
     }
 }
 

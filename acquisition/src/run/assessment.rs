@@ -60,7 +60,7 @@ impl TakeAssessor {
             length: TransformLength::Fast,
         })?;
         Ok(Self {
-            scratch: plan.scratch(),
+            scratch: plan.make_scratch(),
             plan,
             response: vec![0.0; recording_len],
             signal_len: response_len(rig).min(recording_len),
@@ -71,15 +71,15 @@ impl TakeAssessor {
     /// Assesses one recording; samples are fractions of full scale.
     ///
     /// # Errors
-    /// As [`DeconvolutionPlan::run`]: a silent loopback leaves nothing to assess.
-    pub fn assess(
+    /// As [`DeconvolutionPlan::deconvolve_recording`]: a silent loopback leaves nothing to assess.
+    pub fn assess_take(
         &mut self,
         microphone: &[f32],
         loopback: &[f32],
         expected_arrival_secs: f64,
         clipped_samples: u32,
     ) -> Result<TakeAssessment, Error> {
-        self.plan.run(microphone, loopback, &mut self.response, &mut self.scratch)?;
+        self.plan.deconvolve_recording(microphone, loopback, &mut self.response, &mut self.scratch)?;
         Ok(TakeAssessment {
             snr_db: self.snr_db(),
             clipped_samples,
@@ -126,7 +126,7 @@ impl TakeAssessor {
 
 impl TakeAssessment {
     /// Returns the rig's reasons against the recording; empty if it would accept it.
-    pub fn objections(&self, limits: &Validation, outside_level_db: f64) -> Vec<TakeObjection> {
+    pub fn find_objections(&self, limits: &Validation, outside_level_db: f64) -> Vec<TakeObjection> {
         let mut reasons = Vec::new();
         if self.clipped_samples > 0 {
             reasons.push(TakeObjection::Clipped { samples: self.clipped_samples });
@@ -181,7 +181,7 @@ mod tests {
             .collect();
         microphone[delay..].iter_mut().zip(&loopback).for_each(|(m, l)| *m += 0.3 * l);
         let mut assessor = TakeAssessor::new(&rig, loopback.len()).expect("a plan");
-        assessor.assess(&microphone, &loopback, expected / 96e3, 0).expect("assessed")
+        assessor.assess_take(&microphone, &loopback, expected / 96e3, 0).expect("assessed")
     }
 
     #[test]

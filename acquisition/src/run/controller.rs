@@ -158,10 +158,10 @@ impl<'a> RunController<'a> {
         output.resize(recording_len, 0.0);
         Ok(Self {
             rig,
-            grid: rig.grid()?,
+            grid: rig.build_grid()?,
             devices,
             output,
-            scratch: deconvolution.scratch(),
+            scratch: deconvolution.make_scratch(),
             ir: vec![0.0; deconvolution.output_len()],
             deconvolution,
             assessor: TakeAssessor::new(rig, recording_len).map_err(failed)?,
@@ -195,7 +195,7 @@ impl<'a> RunController<'a> {
         control: &RunControl,
         observe: &mut dyn FnMut(RunEvent<'_>),
     ) -> Result<RunOutcome, Error> {
-        let begun = self.air()?;
+        let begun = self.read_ambient()?;
         let watch = RunMonitor::new(recorder.partial(), begun.at);
         let (tried, options) = (work.before.clone(), work.options);
         let attempts = tried.values().map(|t| u64::from(t.attempts)).sum();
@@ -246,7 +246,7 @@ impl<'a> RunController<'a> {
                 std::thread::sleep(PAUSE_LOOKS);
             }
             observe(RunEvent::Continued);
-            run.ended = run.ended.max(self.air()?.at);
+            run.ended = run.ended.max(self.read_ambient()?.at);
             run.say(LogLevel::Info, "continued by hand")?;
         }
         Ok(is_set(&control.stop))
@@ -260,7 +260,7 @@ impl<'a> RunController<'a> {
         observe: &mut dyn FnMut(RunEvent<'_>),
     ) -> Error {
         // The caller must get the first failure; that these fail after it too would only hide it.
-        let _ = self.devices.robots.power(DrivePower::Off);
+        let _ = self.devices.robots.switch_drives(DrivePower::Off);
         let told = run.say(LogLevel::Error, &format!("broken off at pair {}: {error}", pair.id.0));
         let _ = told.and_then(|()| run.checkpoint(observe));
         error
@@ -276,11 +276,11 @@ impl<'a> RunController<'a> {
         let mut objections = Vec::new();
         for attempt in 1..=self.rig.validation.attempts {
             // What is not on the disk yet must fit, and the attempt that is made next.
-            run.watch.disk(run.recorder.bytes_to_end() + run.options.keep.attempt_bytes(self.rig))?;
+            run.watch.check_disk(run.recorder.bytes_to_end() + run.options.keep.attempt_bytes(self.rig))?;
             let is_last = attempt == self.rig.validation.attempts;
-            let mut made = self.attempt(run, pair, before + attempt, is_last)?;
-            run.watch.at(made.at)?;
-            self.record(run, &made)?;
+            let mut made = self.attempt_pair(run, pair, before + attempt, is_last)?;
+            run.watch.note_time(made.at)?;
+            self.record_attempt(run, &made)?;
             run.attempts += 1;
             run.ended = made.at.plus_secs(self.output.len() as f64 / self.rig.sweep.rate_hz.get());
             observe(RunEvent::Attempt(&made.measurement));
@@ -290,7 +290,7 @@ impl<'a> RunController<'a> {
             run.tried.insert(pair.id.0, PairAttempts { attempts: before + attempt, accepted });
             run.unsafe_verdicts.push(made.measurement);
             if accepted {
-                run.watch.accepted();
+                run.watch.note_accepted();
                 return Ok(());
             }
             if verdict == Verdict::Rejected {

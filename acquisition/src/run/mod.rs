@@ -124,9 +124,9 @@ impl<'a> RunRequest<'a> {
     ///
     /// # Errors
     /// [`Error`]; a run that was begun leaves its `.partial` file.
-    pub fn measure(&self, session: RunSession<'_>) -> Result<MeasuredRun, Error> {
+    pub fn measure_run(&self, session: RunSession<'_>) -> Result<MeasuredRun, Error> {
         let panel = PreparedPanel::new(self.specimen, self.rig)?;
-        let arms = Choreography::of(self.rig)?;
+        let arms = Choreography::for_rig(self.rig)?;
         let request =
             DeviceRequest { rig: self.rig, panel: &panel, start: self.start, seed: self.seed, arms: arms.clone() };
         let devices = open_devices(&request, session.pace).map_err(controller::Error::from)?;
@@ -159,12 +159,12 @@ impl<'a> RunRequest<'a> {
         surface.macro_reference = self.macro_reference.clone();
         surface.project = self.project.clone();
         let relief = panel.geometry.as_ref().map(|PanelGeometry { heights, mesh, .. }| {
-            let original = panel.original();
+            let original = panel.original_file();
             RecordedRelief { heights, mesh, original }
         });
         let start = RunStart { manifest: &manifest, rig: self.rig, surface: &surface, relief, plan };
         let none = BTreeMap::new();
-        let mut job = job(panel, self.rig, self.folder, self.keep, &none, self.start, arms);
+        let mut job = build_job(panel, self.rig, self.folder, self.keep, &none, self.start, arms);
         if start.plan.is_none() {
             job.when_stopped = WhenStopped::Ended;
         }
@@ -192,8 +192,8 @@ impl<'a> RunRequest<'a> {
 ///
 /// # Errors
 /// [`Error::Resume`] if it cannot be resumed; the file is as it was.
-pub fn resume(partial: &Path, session: RunSession<'_>) -> Result<MeasuredRun, Error> {
-    let held = Held::read(partial)?;
+pub fn resume_run(partial: &Path, session: RunSession<'_>) -> Result<MeasuredRun, Error> {
+    let held = Held::from_file(partial)?;
     let _span = run_span(&held.manifest).entered();
     let no_plan = |text: String| recovery::Error::NoPlan { path: partial.to_owned(), source: text.into() };
     let plan = RunPlan::from_metadata(&held.plan).map_err(no_plan)?;
@@ -210,13 +210,13 @@ pub fn resume(partial: &Path, session: RunSession<'_>) -> Result<MeasuredRun, Er
     };
     // A repeated seed would give the same noise again.
     let seed = plan.seed.wrapping_add(held.attempts.wrapping_add(1).wrapping_mul(0x9E37_79B9));
-    let arms = Choreography::of(&held.rig)?;
+    let arms = Choreography::for_rig(&held.rig)?;
     let request = DeviceRequest { rig: &held.rig, panel: &panel, start, seed, arms: arms.clone() };
     let devices = open_devices(&request, session.pace).map_err(controller::Error::from)?;
-    let job = job(&panel, &held.rig, folder_of(partial), plan.keep, &held.pairs, start, arms);
+    let job = build_job(&panel, &held.rig, folder_of(partial), plan.keep, &held.pairs, start, arms);
     let mut controller = RunController::new(&held.rig, devices)?;
     check_fitness(&job, &mut controller, session.preflight)?;
-    let (recorder, _) = Recorder::resume(partial)?;
+    let (recorder, _) = Recorder::resume_recording(partial)?;
     Ok(job.measure(&mut controller, recorder, session)?)
 }
 
@@ -229,11 +229,11 @@ fn check_fitness(job: &RunJob<'_>, controller: &mut RunController<'_>, preflight
     if preflight == PreflightMode::Skip {
         return Ok(());
     }
-    let findings = job.look_over(controller, job.rig.grid()?.pairs());
+    let findings = job.look_over(controller, job.rig.build_grid()?.pairs());
     if findings.is_empty() { Ok(()) } else { Err(Error::Unfit { findings }) }
 }
 
-fn job<'a>(
+fn build_job<'a>(
     panel: &'a PreparedPanel,
     rig: &'a Rig,
     folder: &'a Path,

@@ -109,7 +109,7 @@ impl TakeObjection {
 }
 
 /// Returns objections to values that no room has; values that the reading leaves unknown are not among them.
-pub(crate) fn implausible(reading: &AmbientReading) -> Vec<TakeObjection> {
+pub(crate) fn find_implausible(reading: &AmbientReading) -> Vec<TakeObjection> {
     let values = [
         ("a temperature", reading.temperature_c, "C", TEMPERATURE_C),
         ("a humidity", reading.humidity_pct, "%", HUMIDITY_PCT),

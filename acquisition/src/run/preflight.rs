@@ -7,7 +7,7 @@ use echolake_schema::{Pair, Rig};
 use crate::disk::free_bytes;
 use crate::run::assessment::{quiet_range, response_len};
 use crate::run::controller::RunController;
-use crate::run::objection::implausible;
+use crate::run::objection::find_implausible;
 use crate::run::recording_mode::RecordingMode;
 
 /// Bytes per recorded sample of both channels and audio, compressed: 4.92 in a simulated run with sweeps of 0.5 s.
@@ -56,13 +56,13 @@ pub fn expected_bytes(rig: &Rig, keep: RecordingMode, pairs: usize) -> u64 {
 }
 
 /// Checks that the disk has room for a run of so many pairs.
-pub fn disk(folder: &Path, rig: &Rig, keep: RecordingMode, pairs: usize) -> Option<PreflightFinding> {
+pub fn check_disk(folder: &Path, rig: &Rig, keep: RecordingMode, pairs: usize) -> Option<PreflightFinding> {
     // A file system that does not report its free space is no reason to refuse.
     let free = free_bytes(folder).ok()?;
-    room(folder, free, expected_bytes(rig, keep, pairs) + keep.attempt_bytes(rig) + KEPT_FREE)
+    check_free_space(folder, free, expected_bytes(rig, keep, pairs) + keep.attempt_bytes(rig) + KEPT_FREE)
 }
 
-fn room(folder: &Path, free: u64, needed: u64) -> Option<PreflightFinding> {
+fn check_free_space(folder: &Path, free: u64, needed: u64) -> Option<PreflightFinding> {
     let megabytes = |bytes: u64| bytes as f64 / 1e6;
     (free < needed).then(|| {
         let what = format!(
@@ -97,18 +97,18 @@ pub fn quiet_part(rig: &Rig) -> Option<PreflightFinding> {
 
 /// Checks sensor, loopback, level and room: a reading, and a take at a pair that is not recorded. A single take may be
 /// spoiled, so it is repeated as often as the rig allows.
-pub fn devices(controller: &mut RunController<'_>, pair: Pair) -> Vec<PreflightFinding> {
+pub fn check_devices(controller: &mut RunController<'_>, pair: Pair) -> Vec<PreflightFinding> {
     let failed = |error: crate::rig::Error| {
         vec![PreflightFinding::new(
             error.to_string(),
             "is it plugged in, switched on, and named rightly in the rig file?",
         )]
     };
-    let reading = match controller.air() {
+    let reading = match controller.read_ambient() {
         Ok(reading) => reading,
         Err(error) => return failed(error),
     };
-    let nonsense = implausible(&reading);
+    let nonsense = find_implausible(&reading);
     if !nonsense.is_empty() {
         return nonsense
             .iter()
@@ -117,7 +117,7 @@ pub fn devices(controller: &mut RunController<'_>, pair: Pair) -> Vec<PreflightF
     }
     let mut objections = Vec::new();
     for _ in 0..controller.rig().validation.attempts {
-        match controller.trial(pair) {
+        match controller.try_pair(pair) {
             Ok((_, found)) if found.is_empty() => return Vec::new(),
             Ok((_, found)) => objections = found,
             Err(error) => return failed(error),
@@ -162,8 +162,8 @@ mod tests {
     #[test]
     fn a_full_disk_is_told_before_there_is_a_file() {
         let folder = Path::new("/data");
-        assert_eq!(room(folder, 100, 100), None);
-        let finding = room(folder, 99_000_000, 700_000_000).expect("a finding").to_string();
+        assert_eq!(check_free_space(folder, 100, 100), None);
+        let finding = check_free_space(folder, 99_000_000, 700_000_000).expect("a finding").to_string();
         assert!(
             finding.contains("99.0 MB are left") && finding.contains("about 700.0") && finding.contains("--ir-only")
         );

@@ -90,12 +90,13 @@ impl RunJob<'_> {
     /// Runs the preflight checks; returns those that failed.
     pub(crate) fn look_over(&self, controller: &mut RunController<'_>, pairs: &[Pair]) -> Vec<PreflightFinding> {
         let todo: Vec<_> = pairs.iter().filter(|p| !self.before.get(&p.id.0).is_some_and(|t| t.accepted)).collect();
-        let mut findings: Vec<_> = preflight::disk(self.folder, self.rig, self.keep, todo.len()).into_iter().collect();
+        let mut findings: Vec<_> =
+            preflight::check_disk(self.folder, self.rig, self.keep, todo.len()).into_iter().collect();
         if let Some(finding) = preflight::quiet_part(self.rig) {
             // Takes would be refused for the same reason.
             findings.push(finding);
         } else if let Some(first) = todo.first() {
-            findings.extend(preflight::devices(controller, **first));
+            findings.extend(preflight::check_devices(controller, **first));
         }
         findings
     }
@@ -108,18 +109,18 @@ impl RunJob<'_> {
         session: RunSession<'_>,
     ) -> Result<MeasuredRun, controller::Error> {
         let origin = controller.origin();
-        let mut pairs = self.rig.grid()?.pairs().to_vec();
+        let mut pairs = self.rig.build_grid()?.pairs().to_vec();
         if let Some(arms) = &self.arms {
-            recorder.arms(self.started, arms.cell(), name_of(origin))?;
-            arms.sort(&mut pairs);
+            recorder.record_arms(self.started, arms.cell(), name_of(origin))?;
+            arms.sort_pairs(&mut pairs);
         }
         if let Some(tap) = session.tap {
             recorder.listen(tap, self.started, self.shape);
         }
         // The preflight check moved the arms to the first pair, if it ran.
-        let first = self.arms.as_ref().and_then(|arms| arms.standing(pairs.first()?.id).ok());
+        let first = self.arms.as_ref().and_then(|arms| arms.pose_at(pairs.first()?.id).ok());
         if let Some(stand) = first {
-            recorder.stand(self.started, &[stand.microphone, stand.speaker])?;
+            recorder.record_arm_frames(self.started, &[stand.microphone, stand.speaker])?;
         }
         let checkpoint_every = session.checkpoint_every.unwrap_or_else(|| checkpoint_every(origin));
         let options = RunOptions { keep: self.keep, checkpoint_every };

@@ -19,7 +19,7 @@ use crate::run::{Error, RunRequest};
 ///
 /// # Errors
 /// [`Error`]; a run that was begun leaves its `.partial` file.
-pub fn simulate(
+pub fn run_simulation(
     request: &RunRequest<'_>,
     origin: Origin,
     stop: &AtomicBool,
@@ -44,7 +44,7 @@ pub fn simulate(
     };
     let RunRequest { rig, start, seed, .. } = *request;
     let panel = PreparedPanel::new(request.specimen, rig)?;
-    let arms = Choreography::of(rig)?;
+    let arms = Choreography::for_rig(rig)?;
     let devices = DeviceRequest { rig, panel: &panel, start, seed, arms: arms.clone() };
     let mut devices = simulated_devices(&devices, session.pace).map_err(controller::Error::from)?;
     devices.origin = origin;

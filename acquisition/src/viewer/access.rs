@@ -37,7 +37,7 @@ impl AccessCheck {
     }
 
     /// Returns the URL for viewers, with the token.
-    pub(super) fn url(&self, address: SocketAddr) -> String {
+    pub(super) fn viewer_url(&self, address: SocketAddr) -> String {
         let token = self.token.as_ref().map(|token| format!("/?token={token}")).unwrap_or_default();
         format!("ws://{address}{token}")
     }
@@ -45,12 +45,15 @@ impl AccessCheck {
     /// # Errors
     /// The refusal, if the handshake may not go on.
     #[expect(clippy::result_large_err, reason = "tungstenite's own type")]
-    pub(super) fn check(&self, request: &Request) -> Result<(), ErrorResponse> {
+    pub(super) fn check_request(&self, request: &Request) -> Result<(), ErrorResponse> {
         for origin in request.headers().get_all(ORIGIN) {
             let origin = String::from_utf8_lossy(origin.as_bytes());
-            if !self.allows(&origin) {
+            if !self.allows_origin(&origin) {
                 let hint = "hint: --allow-origin lets a page of elsewhere look on";
-                return Err(refusal(StatusCode::FORBIDDEN, format!("pages of `{origin}` may not look on; {hint}\n")));
+                return Err(refusal_response(
+                    StatusCode::FORBIDDEN,
+                    format!("pages of `{origin}` may not look on; {hint}\n"),
+                ));
             }
         }
         let given = request.uri().query().unwrap_or_default().split('&').find_map(|pair| pair.strip_prefix("token="));
@@ -58,19 +61,19 @@ impl AccessCheck {
         match &self.token {
             Some(token) if !bool::from(token.as_bytes().ct_eq(given.as_bytes())) => {
                 let sentence = "a token is needed here; hint: open the whole address that echolake printed\n";
-                Err(refusal(StatusCode::FORBIDDEN, sentence.to_owned()))
+                Err(refusal_response(StatusCode::FORBIDDEN, sentence.to_owned()))
             }
             _ => Ok(()),
         }
     }
 
-    fn allows(&self, origin: &str) -> bool {
+    fn allows_origin(&self, origin: &str) -> bool {
         origin == INSTALLED_VIEWER || is_local(origin) || self.allowed_origins.iter().any(|allowed| allowed == origin)
     }
 }
 
 /// An answer that ends a handshake.
-pub(super) fn refusal(status: StatusCode, sentence: String) -> ErrorResponse {
+pub(super) fn refusal_response(status: StatusCode, sentence: String) -> ErrorResponse {
     let mut refused = ErrorResponse::new(Some(sentence));
     *refused.status_mut() = status;
     refused
@@ -93,7 +96,7 @@ mod tests {
     fn is_let_in(check: &AccessCheck, path: &str, origins: &[&str]) -> bool {
         let request =
             origins.iter().fold(Request::builder().uri(path), |request, origin| request.header(ORIGIN, *origin));
-        check.check(&request.body(()).expect("a request")).is_ok()
+        check.check_request(&request.body(()).expect("a request")).is_ok()
     }
 
     #[test]
@@ -101,7 +104,7 @@ mod tests {
         let named = "https://viewer.example";
         let access = ViewerAccess { allowed_origins: vec![named.to_owned()], is_open: false };
         let check = AccessCheck::new(access, ([127, 0, 0, 1], 8765).into());
-        assert_eq!(check.url(([127, 0, 0, 1], 8765).into()), "ws://127.0.0.1:8765");
+        assert_eq!(check.viewer_url(([127, 0, 0, 1], 8765).into()), "ws://127.0.0.1:8765");
         assert!(is_let_in(&check, "/", &[]));
         for origin in
             ["http://localhost", "http://localhost:8090", "http://127.0.0.1:80", "http://[::1]:8080", "file://", named]
@@ -133,7 +136,7 @@ mod tests {
     fn other_machines_need_the_token() {
         let address = ([0, 0, 0, 0], 8765).into();
         let check = AccessCheck::new(ViewerAccess::default(), address);
-        let url = check.url(address);
+        let url = check.viewer_url(address);
         let path = url.strip_prefix("ws://0.0.0.0:8765").expect("the address");
         let token = path.strip_prefix("/?token=").expect("a token");
         assert_eq!(token.len(), 32);
@@ -142,7 +145,7 @@ mod tests {
         for wrong in ["/", "/?token=", &path[..path.len() - 1], &format!("{path}0"), &format!("/?other={token}")] {
             assert!(!is_let_in(&check, wrong, &[]), "{wrong}");
         }
-        assert_ne!(AccessCheck::new(ViewerAccess::default(), address).url(address), url);
+        assert_ne!(AccessCheck::new(ViewerAccess::default(), address).viewer_url(address), url);
         let open = AccessCheck::new(ViewerAccess { is_open: true, ..ViewerAccess::default() }, address);
         assert!(is_let_in(&open, "/", &[]) && !is_let_in(&open, "/", &["http://evil.example"]));
     }

@@ -10,7 +10,7 @@ use tungstenite::http::{HeaderValue, StatusCode};
 use tungstenite::protocol::WebSocketConfig;
 use tungstenite::{Message, WebSocket};
 
-use super::access::{AccessCheck, refusal};
+use super::access::{AccessCheck, refusal_response};
 use super::handshakes::{LONGEST_HANDSHAKE, TimedStream};
 use super::protocol::{self, ClientRequest};
 use super::queue::OutgoingItem;
@@ -24,26 +24,30 @@ const PATIENCE: Duration = Duration::from_secs(10);
 const LARGEST_WISH: usize = 1 << 20;
 
 /// Serves a client, whose handshake is pending, until it or the server is gone.
-pub(super) fn serve(stream: Arc<TcpStream>, shared: &ViewerState) {
+pub(super) fn serve_client(stream: Arc<TcpStream>, shared: &ViewerState) {
     // After any error here the client is disconnected, and may connect again.
     let shaken = shake_hands(stream.clone(), shared);
     shared.handshakes.remove(&stream);
     drop(stream);
     let Ok(shaken) = shaken else { return };
-    let Some(queue) = shared.join() else { return };
-    let _ = talk(shaken, shared, &queue);
-    shared.leave(&queue);
+    let Some(queue) = shared.add_client() else { return };
+    let _ = exchange_messages(shaken, shared, &queue);
+    shared.remove_client(&queue);
 }
 
-fn choose(access: &AccessCheck, request: &Request, mut response: Response) -> Result<Response, ErrorResponse> {
-    access.check(request)?;
+fn answer_handshake(
+    access: &AccessCheck,
+    request: &Request,
+    mut response: Response,
+) -> Result<Response, ErrorResponse> {
+    access.check_request(request)?;
     let offered = request.headers().get_all("Sec-WebSocket-Protocol").iter().filter_map(|v| v.to_str().ok());
-    match protocol::choose(offered) {
+    match protocol::choose_subprotocol(offered) {
         Some(chosen) => {
             response.headers_mut().insert("Sec-WebSocket-Protocol", HeaderValue::from_static(chosen));
             Ok(response)
         }
-        None => Err(refusal(StatusCode::BAD_REQUEST, "open this address in Foxglove\n".to_owned())),
+        None => Err(refusal_response(StatusCode::BAD_REQUEST, "open this address in Foxglove\n".to_owned())),
     }
 }
 
@@ -54,7 +58,7 @@ fn shake_hands(
     stream.set_nodelay(true)?;
     stream.set_write_timeout(Some(PATIENCE))?;
     let config = WebSocketConfig::default().max_message_size(Some(LARGEST_WISH)).max_frame_size(Some(LARGEST_WISH));
-    let choose = |request: &Request, response: Response| choose(&shared.access, request, response);
+    let choose = |request: &Request, response: Response| answer_handshake(&shared.access, request, response);
     let stream = TimedStream::new(stream, LONGEST_HANDSHAKE);
     let mut socket = tungstenite::accept_hdr_with_config(stream, choose, Some(config)).map_err(|e| e.to_string())?;
     socket.get_mut().lift_deadline();
@@ -62,21 +66,21 @@ fn shake_hands(
     Ok(socket)
 }
 
-fn talk(
+fn exchange_messages(
     mut socket: WebSocket<TimedStream>,
     shared: &ViewerState,
     queue: &Arc<ClientQueue>,
 ) -> Result<(), Box<dyn std::error::Error>> {
     socket.send(Message::text(protocol::server_info(&shared.clock)))?;
-    socket.send(Message::text(protocol::advertise(&shared.topics())))?;
+    socket.send(Message::text(protocol::advertise_channels(&shared.topics())))?;
     while !shared.has_ended() {
-        listen(&mut socket, shared, queue)?;
+        handle_request(&mut socket, shared, queue)?;
         while let Some(outgoing) = queue.pop() {
             socket.write(Message::binary(match outgoing {
                 OutgoingItem::Message(subscription, message) => {
                     protocol::message_data(subscription, message.log_time_nanos, &message.data)
                 }
-                OutgoingItem::Time(nanos) => protocol::time(nanos),
+                OutgoingItem::Time(nanos) => protocol::time_message(nanos),
                 OutgoingItem::State(encoded) => encoded,
             }))?;
         }
@@ -87,13 +91,13 @@ fn talk(
     Ok(socket.flush()?)
 }
 
-fn listen(
+fn handle_request(
     socket: &mut WebSocket<TimedStream>,
     shared: &ViewerState,
     queue: &Arc<ClientQueue>,
 ) -> Result<(), tungstenite::Error> {
     let wish = match socket.read() {
-        Ok(Message::Text(text)) => protocol::wish(&text),
+        Ok(Message::Text(text)) => protocol::parse_request(&text),
         Ok(Message::Binary(bytes)) => protocol::playback_request(&bytes).map(ClientRequest::Playback),
         Ok(_) => None,
         Err(tungstenite::Error::Io(e))
@@ -104,9 +108,9 @@ fn listen(
         Err(error) => return Err(error),
     };
     match wish {
-        Some(ClientRequest::Subscribe(wishes)) => shared.subscribe(queue, &wishes),
-        Some(ClientRequest::Unsubscribe(ids)) => shared.unsubscribe(queue, &ids),
-        Some(ClientRequest::Playback(request)) => shared.control(queue, request),
+        Some(ClientRequest::Subscribe(wishes)) => shared.subscribe_client(queue, &wishes),
+        Some(ClientRequest::Unsubscribe(ids)) => shared.unsubscribe_client(queue, &ids),
+        Some(ClientRequest::Playback(request)) => shared.control_playback(queue, request),
         None => {}
     }
     Ok(())

@@ -103,7 +103,7 @@ impl ViewerServer {
         });
         let thread = std::thread::spawn({
             let shared = shared.clone();
-            move || accept(&listener, &shared)
+            move || accept_clients(&listener, &shared)
         });
         Ok(Self { address, shared, thread: Some(thread) })
     }
@@ -113,10 +113,10 @@ impl ViewerServer {
     }
 
     pub(crate) fn url(&self) -> String {
-        self.shared.access.url(self.address)
+        self.shared.access.viewer_url(self.address)
     }
 
-    pub(crate) fn shared(&self) -> &Arc<ViewerState> {
+    pub(crate) fn shared_state(&self) -> &Arc<ViewerState> {
         &self.shared
     }
 }
@@ -133,7 +133,7 @@ impl Drop for ViewerServer {
 }
 
 impl ViewerState {
-    fn state(&self) -> MutexGuard<'_, State> {
+    fn lock_state(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -142,53 +142,53 @@ impl ViewerState {
     }
 
     pub(crate) fn topics(&self) -> Vec<Topic> {
-        self.state().topics.clone()
+        self.lock_state().topics.clone()
     }
 
     pub(crate) fn set_topics(&self, topics: Vec<Topic>) {
-        self.state().topics = topics;
+        self.lock_state().topics = topics;
     }
 
     /// Returns the connected clients.
     pub(crate) fn clients(&self) -> Vec<Arc<ClientQueue>> {
-        self.state().clients.clone()
+        self.lock_state().clients.clone()
     }
 
     /// Messages that clients lost because they did not keep up.
-    pub(crate) fn lost(&self) -> u64 {
+    pub(crate) fn lost_messages(&self) -> u64 {
         self.lost.load(Ordering::Relaxed)
     }
 
     /// Returns a counter that changes whenever the wanted channels may have.
-    pub(crate) fn wishes(&self) -> u64 {
+    pub(crate) fn wish_counter(&self) -> u64 {
         self.wishes.load(Ordering::Acquire)
     }
 
     /// Returns the channels whose messages go to any client now.
-    pub(crate) fn wanted(&self) -> BTreeSet<u16> {
-        self.state().clients.iter().flat_map(|client| client.receiving()).collect()
+    pub(crate) fn wanted_channels(&self) -> BTreeSet<u16> {
+        self.lock_state().clients.iter().flat_map(|client| client.receiving_channels()).collect()
     }
 
     /// Sends a client the current state of channels; new messages follow from here on.
-    pub(crate) fn prime(&self, queue: &ClientQueue, channels: &BTreeSet<u16>, known: &[PendingMessage]) {
-        queue.prime(channels, known);
+    pub(crate) fn prime_client(&self, queue: &ClientQueue, channels: &BTreeSet<u16>, known: &[PendingMessage]) {
+        queue.queue_current_state(channels, known);
         self.wishes.fetch_add(1, Ordering::Release);
     }
 
     /// Returns whether all subscribed clients have enough to read: then more messages help none of them.
     pub(crate) fn all_are_busy(&self) -> bool {
-        let state = self.state();
+        let state = self.lock_state();
         let mut watching = state.clients.iter().filter(|client| client.is_receiving()).peekable();
         watching.peek().is_some() && watching.all(|client| client.is_busy())
     }
 
     /// Sends a message to all its subscribers; retains it for new clients, if `is_kept`.
-    pub(crate) fn send(&self, channel: u16, log_time_nanos: u64, data: &[u8], is_kept: bool) {
-        let mut state = self.state();
+    pub(crate) fn send_message(&self, channel: u16, log_time_nanos: u64, data: &[u8], is_kept: bool) {
+        let mut state = self.lock_state();
         if matches!(self.clock, ViewerClock::Messages) {
             state.announce_time(log_time_nanos);
         }
-        let wanted: Vec<_> = state.clients.iter().filter(|c| c.receives(channel)).cloned().collect();
+        let wanted: Vec<_> = state.clients.iter().filter(|c| c.receives_channel(channel)).cloned().collect();
         // Without a receiver nothing is copied.
         if wanted.is_empty() && !is_kept {
             return;
@@ -202,10 +202,10 @@ impl ViewerState {
     }
 
     /// Subscribes a client to channels; it first gets their current state.
-    fn subscribe(&self, queue: &Arc<ClientQueue>, wishes: &[(u32, u16)]) {
+    fn subscribe_client(&self, queue: &Arc<ClientQueue>, wishes: &[(u32, u16)]) {
         let channels: BTreeSet<u16> = wishes.iter().map(|(_, channel)| *channel).collect();
         // No new message comes between the current state and those that follow.
-        let state = self.state();
+        let state = self.lock_state();
         wishes.iter().for_each(|(subscription, channel)| queue.subscribe(*channel, *subscription));
         match &self.clock {
             ViewerClock::Playback(playback) => {
@@ -215,25 +215,25 @@ impl ViewerState {
             }
             ViewerClock::Wall | ViewerClock::Messages => {
                 let known: Vec<_> = channels.iter().filter_map(|channel| state.last.get(channel)).cloned().collect();
-                self.prime(queue, &channels, &known);
+                self.prime_client(queue, &channels, &known);
             }
         }
     }
 
-    fn unsubscribe(&self, queue: &ClientQueue, subscriptions: &[u32]) {
+    fn unsubscribe_client(&self, queue: &ClientQueue, subscriptions: &[u32]) {
         queue.unsubscribe(subscriptions);
         self.wishes.fetch_add(1, Ordering::Release);
     }
 
-    fn control(&self, queue: &ClientQueue, request: PlaybackRequest) {
+    fn control_playback(&self, queue: &ClientQueue, request: PlaybackRequest) {
         if let ViewerClock::Playback(playback) = &self.clock {
             queue.hear_of_playback();
             let _ = playback.commands.send(PlayerCommand::Playback(request));
         }
     }
 
-    fn join(&self) -> Option<Arc<ClientQueue>> {
-        let mut state = self.state();
+    fn add_client(&self) -> Option<Arc<ClientQueue>> {
+        let mut state = self.lock_state();
         (state.clients.len() < CLIENTS).then(|| {
             let queue = Arc::new(ClientQueue::default());
             if let Some(nanos) = state.announced_nanos {
@@ -244,8 +244,8 @@ impl ViewerState {
         })
     }
 
-    fn leave(&self, queue: &Arc<ClientQueue>) {
-        self.state().clients.retain(|client| !Arc::ptr_eq(client, queue));
+    fn remove_client(&self, queue: &Arc<ClientQueue>) {
+        self.lock_state().clients.retain(|client| !Arc::ptr_eq(client, queue));
         self.wishes.fetch_add(1, Ordering::Release);
     }
 }
@@ -260,7 +260,7 @@ impl State {
     }
 }
 
-fn accept(listener: &TcpListener, shared: &Arc<ViewerState>) {
+fn accept_clients(listener: &TcpListener, shared: &Arc<ViewerState>) {
     let mut threads: Vec<JoinHandle<()>> = Vec::new();
     for stream in listener.incoming() {
         if shared.has_ended() {
@@ -273,7 +273,7 @@ fn accept(listener: &TcpListener, shared: &Arc<ViewerState>) {
             continue;
         }
         let shared = shared.clone();
-        threads.push(std::thread::spawn(move || client::serve(stream, &shared)));
+        threads.push(std::thread::spawn(move || client::serve_client(stream, &shared)));
     }
     for thread in threads {
         // A panic in a client's thread does not end the run.

@@ -100,7 +100,7 @@ struct Advertised<'a> {
 }
 
 /// Returns the subprotocol for a client that offers these headers.
-pub(super) fn choose<'a>(offered: impl Iterator<Item = &'a str>) -> Option<&'static str> {
+pub(super) fn choose_subprotocol<'a>(offered: impl Iterator<Item = &'a str>) -> Option<&'static str> {
     let offered: Vec<_> = offered.flat_map(|header| header.split(',')).map(str::trim).collect();
     SUBPROTOCOLS.into_iter().find(|p| offered.contains(p))
 }
@@ -124,7 +124,7 @@ pub(super) fn server_info(clock: &ViewerClock) -> String {
 }
 
 /// Returns the message that advertises the channels.
-pub(super) fn advertise(topics: &[Topic]) -> String {
+pub(super) fn advertise_channels(topics: &[Topic]) -> String {
     let channels: Vec<_> = topics
         .iter()
         .map(|t| Advertised {
@@ -150,7 +150,7 @@ pub(super) fn message_data(subscription: u32, log_time_nanos: u64, data: &[u8]) 
 }
 
 /// Returns the message that tells the time.
-pub(super) fn time(nanos: u64) -> Vec<u8> {
+pub(super) fn time_message(nanos: u64) -> Vec<u8> {
     [&[TIME][..], &nanos.to_le_bytes()].concat()
 }
 
@@ -189,7 +189,7 @@ pub(super) fn playback_request(bytes: &[u8]) -> Option<PlaybackRequest> {
 }
 
 /// Parses a client's request; None if it does not concern a server that only shows data.
-pub(super) fn wish(text: &str) -> Option<ClientRequest> {
+pub(super) fn parse_request(text: &str) -> Option<ClientRequest> {
     Some(match serde_json::from_str(text).ok()? {
         FromClient::Subscribe { subscriptions } => {
             ClientRequest::Subscribe(subscriptions.into_iter().map(|s| (s.id, s.channel_id)).collect())
@@ -249,7 +249,7 @@ mod tests {
             request_id: "i".into(),
         };
         assert_eq!(state.encode(), [5, 3, 0x39, 0x30, 0, 0, 0, 0, 0, 0, 0, 0, 0x80, 0x3f, 1, 1, 0, 0, 0, b'i']);
-        assert_eq!(time(1), [2, 1, 0, 0, 0, 0, 0, 0, 0]);
+        assert_eq!(time_message(1), [2, 1, 0, 0, 0, 0, 0, 0, 0]);
         let (commands, _) = std::sync::mpsc::sync_channel(0);
         let playback = PlaybackControl { range: (1_000_000, 2_000_000_005), commands };
         let info = server_info(&ViewerClock::Playback(playback));
@@ -261,13 +261,16 @@ mod tests {
     #[test]
     fn clients_are_understood_or_ignored() {
         let subscribe = r#"{"op":"subscribe","subscriptions":[{"id":7,"channelId":3}]}"#;
-        assert_eq!(wish(subscribe), Some(ClientRequest::Subscribe(vec![(7, 3)])));
-        assert_eq!(wish(r#"{"op":"unsubscribe","subscriptionIds":[7]}"#), Some(ClientRequest::Unsubscribe(vec![7])));
+        assert_eq!(parse_request(subscribe), Some(ClientRequest::Subscribe(vec![(7, 3)])));
+        assert_eq!(
+            parse_request(r#"{"op":"unsubscribe","subscriptionIds":[7]}"#),
+            Some(ClientRequest::Unsubscribe(vec![7]))
+        );
         for other in ["", "{}", r#"{"op":"getParameters"}"#, r#"{"op":"subscribe","subscriptions":[{"id":-1}]}"#] {
-            assert_eq!(wish(other), None, "{other}");
+            assert_eq!(parse_request(other), None, "{other}");
         }
-        assert_eq!(choose(["foxglove.websocket.v1, foxglove.sdk.v1"].into_iter()), Some("foxglove.sdk.v1"));
-        assert_eq!(choose(["foxglove.websocket.v1"].into_iter()), Some("foxglove.websocket.v1"));
-        assert_eq!(choose(["chat"].into_iter()), None);
+        assert_eq!(choose_subprotocol(["foxglove.websocket.v1, foxglove.sdk.v1"].into_iter()), Some("foxglove.sdk.v1"));
+        assert_eq!(choose_subprotocol(["foxglove.websocket.v1"].into_iter()), Some("foxglove.websocket.v1"));
+        assert_eq!(choose_subprotocol(["chat"].into_iter()), None);
     }
 }

@@ -65,7 +65,7 @@ enum QueueEntry {
 }
 
 impl QueueEntry {
-    fn bytes(&self) -> usize {
+    fn pending_bytes(&self) -> usize {
         match self {
             Self::Message(waiting) => ENTRY_BYTES + waiting.data.len(),
             Self::Kept(_) => 0,
@@ -74,7 +74,7 @@ impl QueueEntry {
         }
     }
 
-    fn kept(&self) -> usize {
+    fn kept_bytes(&self) -> usize {
         match self {
             Self::Kept(waiting) => ENTRY_BYTES + waiting.data.len(),
             _ => 0,
@@ -84,8 +84,8 @@ impl QueueEntry {
 
 impl QueueState {
     // Adds an entry, and drops the oldest ones that are too much; returns how many messages were among them.
-    fn add(&mut self, entry: QueueEntry) -> u64 {
-        self.bytes += entry.bytes();
+    fn add_entry(&mut self, entry: QueueEntry) -> u64 {
+        self.bytes += entry.pending_bytes();
         self.entries.push_back(entry);
         let mut lost = 0;
         while self.bytes > WAITING_BYTES {
@@ -95,7 +95,7 @@ impl QueueState {
             let oldest = first(|entry| matches!(entry, QueueEntry::Message(_) | QueueEntry::Time(_)));
             let oldest = oldest.or_else(|| first(|entry| matches!(entry, QueueEntry::State(_))));
             let Some(dropped) = oldest.and_then(|at| self.entries.remove(at)) else { break };
-            self.bytes -= dropped.bytes();
+            self.bytes -= dropped.pending_bytes();
             lost += u64::from(matches!(dropped, QueueEntry::Message(_)));
         }
         lost
@@ -103,64 +103,64 @@ impl QueueState {
 }
 
 impl ClientQueue {
-    fn inner(&self) -> MutexGuard<'_, QueueState> {
+    fn lock_inner(&self) -> MutexGuard<'_, QueueState> {
         self.inner.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    pub(crate) fn wanted(&self) -> Vec<u16> {
-        self.inner().wanted.keys().copied().collect()
+    pub(crate) fn wanted_channels(&self) -> Vec<u16> {
+        self.lock_inner().wanted.keys().copied().collect()
     }
 
     /// Returns the subscribed channels whose messages go to it now.
-    pub(super) fn receiving(&self) -> Vec<u16> {
-        self.inner().wanted.iter().filter(|(_, wanted)| wanted.primed).map(|(channel, _)| *channel).collect()
+    pub(super) fn receiving_channels(&self) -> Vec<u16> {
+        self.lock_inner().wanted.iter().filter(|(_, wanted)| wanted.primed).map(|(channel, _)| *channel).collect()
     }
 
     /// Returns whether messages of any channel go to it now.
     pub(super) fn is_receiving(&self) -> bool {
-        self.inner().wanted.values().any(|wanted| wanted.primed)
+        self.lock_inner().wanted.values().any(|wanted| wanted.primed)
     }
 
     /// Returns whether messages of a channel go to it now.
-    pub(crate) fn receives(&self, channel: u16) -> bool {
-        self.inner().wanted.get(&channel).is_some_and(|w| w.primed)
+    pub(crate) fn receives_channel(&self, channel: u16) -> bool {
+        self.lock_inner().wanted.get(&channel).is_some_and(|w| w.primed)
     }
 
     /// Returns whether it has enough to read for now.
     pub(super) fn is_busy(&self) -> bool {
-        let inner = self.inner();
+        let inner = self.lock_inner();
         inner.bytes + inner.kept >= WAITING_BYTES / 2
     }
 
     /// Returns the bytes of pending entries but those of the current state.
     #[cfg(test)]
-    pub(crate) fn bytes(&self) -> usize {
-        self.inner().bytes
+    pub(crate) fn pending_bytes(&self) -> usize {
+        self.lock_inner().bytes
     }
 
     pub(super) fn subscribe(&self, channel: u16, subscription: u32) {
-        self.inner().wanted.insert(channel, ChannelSubscription { subscription, primed: false });
+        self.lock_inner().wanted.insert(channel, ChannelSubscription { subscription, primed: false });
     }
 
     pub(super) fn unsubscribe(&self, subscriptions: &[u32]) {
-        self.inner().wanted.retain(|_, wanted| !subscriptions.contains(&wanted.subscription));
+        self.lock_inner().wanted.retain(|_, wanted| !subscriptions.contains(&wanted.subscription));
     }
 
     pub(super) fn hear_of_playback(&self) {
-        self.inner().controls = true;
+        self.lock_inner().controls = true;
     }
 
     /// Queues the current state of channels, by time; new messages follow from here on.
-    pub(crate) fn prime(&self, channels: &BTreeSet<u16>, known: &[PendingMessage]) {
-        let mut inner = self.inner();
+    pub(crate) fn queue_current_state(&self, channels: &BTreeSet<u16>, known: &[PendingMessage]) {
+        let mut inner = self.lock_inner();
         inner.wanted.iter_mut().filter(|(id, _)| channels.contains(id)).for_each(|(_, wanted)| wanted.primed = true);
         let known: Vec<_> = known.iter().filter(|waiting| channels.contains(&waiting.channel)).cloned().collect();
         let known: Vec<_> = known.into_iter().map(QueueEntry::Kept).collect();
-        let new: usize = known.iter().map(QueueEntry::kept).sum();
+        let new: usize = known.iter().map(QueueEntry::kept_bytes).sum();
         if inner.kept + new > WAITING_BYTES {
             // A client that has not read the older state for so long does not need it any more.
             inner.entries.retain(|e| !matches!(e, QueueEntry::Kept(waiting) if channels.contains(&waiting.channel)));
-            inner.kept = inner.entries.iter().map(QueueEntry::kept).sum();
+            inner.kept = inner.entries.iter().map(QueueEntry::kept_bytes).sum();
         }
         inner.kept += new;
         inner.entries.extend(known);
@@ -168,44 +168,44 @@ impl ClientQueue {
 
     /// Queues a new message; returns how many old ones are dropped for it.
     pub(super) fn push(&self, message: PendingMessage) -> u64 {
-        self.inner().add(QueueEntry::Message(message))
+        self.lock_inner().add_entry(QueueEntry::Message(message))
     }
 
     /// Queues the time; of several pending times only the latest matters.
     pub(crate) fn tell_time(&self, nanos: u64) {
-        let mut inner = self.inner();
+        let mut inner = self.lock_inner();
         if let Some(QueueEntry::Time(_)) = inner.entries.back() {
             inner.entries.pop_back();
             inner.bytes -= ENTRY_BYTES;
         }
-        inner.add(QueueEntry::Time(nanos));
+        inner.add_entry(QueueEntry::Time(nanos));
     }
 
     /// Queues the state of playback, if the client controls it.
     pub(crate) fn tell_state(&self, encoded: Vec<u8>) {
-        let mut inner = self.inner();
+        let mut inner = self.lock_inner();
         if inner.controls {
-            inner.add(QueueEntry::State(encoded));
+            inner.add_entry(QueueEntry::State(encoded));
         }
     }
 
     /// Drops pending messages, because they are of another time; states are answers and stay. Channels need their
     /// current state anew.
-    pub(crate) fn forget(&self) {
-        let mut inner = self.inner();
+    pub(crate) fn forget_pending(&self) {
+        let mut inner = self.lock_inner();
         inner.entries.retain(|entry| matches!(entry, QueueEntry::State(_)));
-        inner.bytes = inner.entries.iter().map(QueueEntry::bytes).sum();
+        inner.bytes = inner.entries.iter().map(QueueEntry::pending_bytes).sum();
         inner.kept = 0;
         inner.wanted.values_mut().for_each(|wanted| wanted.primed = false);
     }
 
     /// Returns the next item to send.
     pub(crate) fn pop(&self) -> Option<OutgoingItem> {
-        let mut inner = self.inner();
+        let mut inner = self.lock_inner();
         loop {
             let entry = inner.entries.pop_front()?;
-            inner.bytes -= entry.bytes();
-            inner.kept -= entry.kept();
+            inner.bytes -= entry.pending_bytes();
+            inner.kept -= entry.kept_bytes();
             match entry {
                 QueueEntry::Time(nanos) => return Some(OutgoingItem::Time(nanos)),
                 QueueEntry::State(encoded) => return Some(OutgoingItem::State(encoded)),
@@ -244,13 +244,13 @@ mod tests {
         let queue = ClientQueue::default();
         queue.subscribe(1, 10);
         queue.subscribe(2, 20);
-        queue.prime(&[1, 2].into(), &[waiting(1, 5, WAITING_BYTES)]);
+        queue.queue_current_state(&[1, 2].into(), &[waiting(1, 5, WAITING_BYTES)]);
         let lost: u64 = (10..15).map(|time| queue.push(waiting(2, time, WAITING_BYTES / 3 - ENTRY_BYTES))).sum();
         assert_eq!(lost, 2);
         // One alone that is larger than all that may wait is still sent.
         assert_eq!(queue.push(waiting(2, 15, 2 * WAITING_BYTES)), 3);
         assert_eq!(drained(&queue), [(1, 5), (2, 15)]);
-        assert_eq!(queue.bytes(), 0);
+        assert_eq!(queue.pending_bytes(), 0);
     }
 
     #[test]
@@ -260,20 +260,20 @@ mod tests {
         queue.tell_state(vec![1]);
         assert_eq!(drained(&queue), [], "states are for those who control");
         queue.hear_of_playback();
-        queue.prime(&[1].into(), &[waiting(1, 5, 1)]);
+        queue.queue_current_state(&[1].into(), &[waiting(1, 5, 1)]);
         queue.push(waiting(1, 6, 1));
         queue.tell_state(vec![1]);
         queue.tell_time(7);
-        queue.forget();
-        assert!(!queue.receives(1), "until it is told where things stand");
-        queue.prime(&[1].into(), &[waiting(1, 2, 1)]);
-        queue.prime(&[1].into(), &[waiting(1, 3, 1), waiting(2, 3, 1), waiting(1, 3, 1)]);
+        queue.forget_pending();
+        assert!(!queue.receives_channel(1), "until it is told where things stand");
+        queue.queue_current_state(&[1].into(), &[waiting(1, 2, 1)]);
+        queue.queue_current_state(&[1].into(), &[waiting(1, 3, 1), waiting(2, 3, 1), waiting(1, 3, 1)]);
         queue.tell_time(3);
         queue.tell_time(4);
         assert_eq!(drained(&queue), [(0, 0), (1, 2), (1, 3), (1, 3), (0, 4)]);
         // A queue that is not read does not grow without bounds.
         for time in 0..9 {
-            queue.prime(&[1].into(), &[waiting(1, time, WAITING_BYTES / 2)]);
+            queue.queue_current_state(&[1].into(), &[waiting(1, time, WAITING_BYTES / 2)]);
             assert!(queue.is_busy());
         }
         assert_eq!(drained(&queue), [(1, 8)]);
@@ -283,7 +283,7 @@ mod tests {
     fn times_and_states_count_and_do_not_grow_without_bounds() {
         let queue = ClientQueue::default();
         queue.subscribe(1, 10);
-        queue.prime(&[1].into(), &[]);
+        queue.queue_current_state(&[1].into(), &[]);
         queue.hear_of_playback();
         queue.tell_state(vec![1; 100]);
         let half = WAITING_BYTES / 2 / ENTRY_BYTES;
@@ -291,20 +291,20 @@ mod tests {
         for time in 0..2 * half as u64 {
             queue.push(waiting(1, time, 0));
             queue.tell_time(time);
-            assert!(queue.bytes() <= WAITING_BYTES);
+            assert!(queue.pending_bytes() <= WAITING_BYTES);
         }
         let left = drained(&queue);
         assert_eq!((left[0], left.len()), ((0, 0), 1 + 2 * half - 3), "the answer stays, the oldest others are gone");
         assert_eq!(left.last(), Some(&(0, 2 * half as u64 - 1)));
-        assert_eq!(queue.bytes(), 0);
+        assert_eq!(queue.pending_bytes(), 0);
         for _ in 0..100 {
             queue.tell_state(vec![1; WAITING_BYTES / 10]);
-            assert!(queue.bytes() <= WAITING_BYTES);
+            assert!(queue.pending_bytes() <= WAITING_BYTES);
         }
         assert_eq!(drained(&queue).len(), 9);
         queue.tell_state(vec![1; 100]);
-        queue.forget();
-        assert_eq!(queue.bytes(), ENTRY_BYTES + 100);
-        assert_eq!((drained(&queue).len(), queue.bytes()), (1, 0));
+        queue.forget_pending();
+        assert_eq!(queue.pending_bytes(), ENTRY_BYTES + 100);
+        assert_eq!((drained(&queue).len(), queue.pending_bytes()), (1, 0));
     }
 }

@@ -17,7 +17,7 @@ pub(crate) struct SignalLevels {
 }
 
 impl SignalLevels {
-    pub(crate) fn of<T: RealSample>(recording: &[T], loopback: &[T]) -> Result<Self, Error> {
+    pub(crate) fn from_signals<T: RealSample>(recording: &[T], loopback: &[T]) -> Result<Self, Error> {
         let (x, s) = (sampled_energy(recording), sampled_energy(loopback));
         for (what, energy) in [("the recording", x), ("the loopback", s)] {
             if !energy.is_finite() {
@@ -62,7 +62,7 @@ impl<T: RealSample> BinPower<T> {
         Self { sums: [T::default(); LANES], least: [T::max_value(); LANES] }
     }
 
-    pub(crate) fn add(&mut self, powers: &[T]) {
+    pub(crate) fn add_powers(&mut self, powers: &[T]) {
         let (whole, rest) = powers.as_chunks::<LANES>();
         whole.iter().for_each(|lanes| self.add_lanes(lanes));
         self.add_lanes(rest);
@@ -76,11 +76,11 @@ impl<T: RealSample> BinPower<T> {
         }
     }
 
-    pub(crate) fn sum(&self) -> f64 {
+    pub(crate) fn power_sum(&self) -> f64 {
         self.sums.into_iter().map(T::f64).sum()
     }
 
-    pub(crate) fn least(&self) -> f64 {
+    pub(crate) fn least_power(&self) -> f64 {
         self.least.into_iter().map(T::f64).fold(f64::INFINITY, f64::min)
     }
 }

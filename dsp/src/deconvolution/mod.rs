@@ -83,7 +83,7 @@ const PIECE: usize = 64;
 ///     length: TransformLength::Fast,
 /// })?;
 /// let mut ir = [0.0; 8];
-/// plan.run(&recording, &loopback, &mut ir, &mut plan.scratch())?;
+/// plan.deconvolve_recording(&recording, &loopback, &mut ir, &mut plan.make_scratch())?;
 /// assert!((ir[3] - 0.5).abs() < 0.05, "{ir:?}");
 /// # Ok::<(), echolake_dsp::Error>(())
 /// ```
@@ -153,14 +153,14 @@ impl<T: RealSample> DeconvolutionPlan<T> {
         })
     }
 
-    /// Buffers for [`Self::run`]; one per thread.
-    pub fn scratch(&self) -> DeconvolutionScratch<T> {
+    /// Buffers for [`Self::deconvolve_recording`]; one per thread.
+    pub fn make_scratch(&self) -> DeconvolutionScratch<T> {
         let work = self.forward.get_inplace_scratch_len();
         let work = work.max(self.inverse.spectrum_len() + self.inverse.scratch_len());
         DeconvolutionScratch {
             joint: AlignedBuffer::new(self.len + 1),
             work: AlignedBuffer::new(work),
-            sums: self.inverse.sums(),
+            sums: self.inverse.make_sums(),
         }
     }
 
@@ -173,7 +173,7 @@ impl<T: RealSample> DeconvolutionPlan<T> {
     ///
     /// # Errors
     /// [`Error::Length`], [`Error::NoLoopback`], or [`Error::NotFinite`].
-    pub fn run(
+    pub fn deconvolve_recording(
         &self,
         recording: &[T],
         loopback: &[T],
@@ -200,20 +200,26 @@ impl<T: RealSample> DeconvolutionPlan<T> {
         check_len("the response", ir.len(), self.output_len)?;
         let DeconvolutionScratch { joint, work, sums } = scratch;
         let (joint, work) = (joint.values(), work.values());
-        let levels = SignalLevels::of(recording, loopback)?;
-        self.transform(recording, loopback, levels.gains.map(T::of), joint, work);
+        let levels = SignalLevels::from_signals(recording, loopback)?;
+        self.transform_jointly(recording, loopback, levels.gains.map(T::of), joint, work);
         let (quotient, work) = work.split_at_mut(self.inverse.spectrum_len());
-        self.divide(limits_hz, joint, levels.rounding, quotient)?;
+        self.divide_spectra(limits_hz, joint, levels.rounding, quotient)?;
         let kept = ir.len().min(self.len);
         let (ir, rest) = ir.split_at_mut(kept);
-        self.inverse.run(quotient, T::of(levels.gains[1] / levels.gains[0] / self.len as f64), ir, sums, work);
+        self.inverse.compute_samples(
+            quotient,
+            T::of(levels.gains[1] / levels.gains[0] / self.len as f64),
+            ir,
+            sums,
+            work,
+        );
         rest.fill(T::default());
         // Finite samples can still be too large for a spectrum; that spoils every sample of the response.
         if ir.iter().all(|x| x.f64().is_finite()) { Ok(()) } else { Err(Error::NotFinite { what: "the response" }) }
     }
 
     // Z of both signals times their gains, x + i s.
-    fn transform(&self, x: &[T], s: &[T], gains: [T; 2], joint: &mut [Complex<T>], work: &mut [Complex<T>]) {
+    fn transform_jointly(&self, x: &[T], s: &[T], gains: [T; 2], joint: &mut [Complex<T>], work: &mut [Complex<T>]) {
         let [x_gain, s_gain] = gains;
         for (z, (x, s)) in joint.iter_mut().zip(x.iter().zip(s)) {
             *z = Complex::new(*x * x_gain, *s * s_gain);
@@ -224,7 +230,7 @@ impl<T: RealSample> DeconvolutionPlan<T> {
     }
 
     // Lays X / S for the inverse transform: first the bins in range, because a floor follows from them.
-    fn divide(
+    fn divide_spectra(
         &self,
         limits_hz: [f64; 2],
         joint: &[Complex<T>],
@@ -233,12 +239,12 @@ impl<T: RealSample> DeconvolutionPlan<T> {
     ) -> Result<(), Error> {
         let (first, end) = (*self.in_range.start(), *self.in_range.end() + 1);
         let power = self.divide_bins(first..end, T::default(), |_| T::of(1.0), joint, quotient);
-        let mean = power.sum() / (end - first) as f64;
+        let mean = power.power_sum() / (end - first) as f64;
         // One sample that is not finite spoils all bins.
         if !mean.is_finite() {
             return Err(Error::NotFinite { what: "the recording or the loopback" });
         }
-        if !(mean > rounding && power.least() > 0.0) {
+        if !(mean > rounding && power.least_power() > 0.0) {
             return Err(Error::NoLoopback);
         }
         let beyond = [0..first, end..self.len / 2 + 1];
@@ -257,7 +263,7 @@ impl<T: RealSample> DeconvolutionPlan<T> {
                 let falling = (((high_hz - width_hz) / self.step_hz).ceil() as usize).clamp(rising, end);
                 self.divide_bins(first..rising, T::default(), gain, joint, quotient);
                 self.divide_bins(falling..end, T::default(), gain, joint, quotient);
-                beyond.into_iter().for_each(|bins| self.silence(bins, quotient));
+                beyond.into_iter().for_each(|bins| self.silence_bins(bins, quotient));
                 return Ok(());
             }
             SpectralDivision::Floored { floor_db } => T::of(mean * 10f64.powf(floor_db / 10.0)),
@@ -273,9 +279,9 @@ impl<T: RealSample> DeconvolutionPlan<T> {
         Ok(())
     }
 
-    fn silence(&self, bins: Range<usize>, quotient: &mut [Complex<T>]) {
+    fn silence_bins(&self, bins: Range<usize>, quotient: &mut [Complex<T>]) {
         for first in bins.clone().step_by(PIECE) {
-            self.inverse.lay(first, &[Complex::default(); PIECE][..PIECE.min(bins.end - first)], quotient);
+            self.inverse.lay_bins(first, &[Complex::default(); PIECE][..PIECE.min(bins.end - first)], quotient);
         }
     }
 
@@ -299,8 +305,8 @@ impl<T: RealSample> DeconvolutionPlan<T> {
             for (i, ((z, mirrored), (to, power))) in bins.zip(piece.iter_mut().zip(&mut powers)).enumerate() {
                 (*to, *power) = divide_bin(*z, *mirrored, gain(first + i), floor);
             }
-            self.inverse.lay(first, &piece[..count], quotient);
-            total.add(&powers[..count]);
+            self.inverse.lay_bins(first, &piece[..count], quotient);
+            total.add_powers(&powers[..count]);
         }
         total
     }
@@ -355,20 +361,29 @@ mod tests {
             length: TransformLength::Fast,
         })
         .expect("a plan");
-        let (mut ir, mut scratch) = (vec![0.0; 10], plan.scratch());
+        let (mut ir, mut scratch) = (vec![0.0; 10], plan.make_scratch());
         let noise: Vec<f32> = (0..100).map(|i| ((i * 37) % 19) as f32 - 9.0).collect();
-        assert_eq!(plan.run(&noise, &[0.0; 100], &mut ir, &mut scratch), Err(Error::NoLoopback));
+        assert_eq!(plan.deconvolve_recording(&noise, &[0.0; 100], &mut ir, &mut scratch), Err(Error::NoLoopback));
         let mut broken = noise.clone();
         broken[50] = f32::NAN;
-        assert!(matches!(plan.run(&broken, &noise, &mut ir, &mut scratch), Err(Error::NotFinite { .. })));
-        assert!(matches!(plan.run(&noise[1..], &noise, &mut ir, &mut scratch), Err(Error::Length { .. })));
+        assert!(matches!(
+            plan.deconvolve_recording(&broken, &noise, &mut ir, &mut scratch),
+            Err(Error::NotFinite { .. })
+        ));
+        assert!(matches!(
+            plan.deconvolve_recording(&noise[1..], &noise, &mut ir, &mut scratch),
+            Err(Error::Length { .. })
+        ));
         // Finite, but its power is past what an f32 holds.
         let loud: Vec<f32> = noise.iter().map(|x| x * 1e20).collect();
-        assert!(matches!(plan.run(&noise, &loud, &mut ir, &mut scratch), Err(Error::NotFinite { .. })));
-        assert!(matches!(plan.run(&loud, &loud, &mut ir, &mut scratch), Err(Error::NotFinite { .. })));
+        assert!(matches!(
+            plan.deconvolve_recording(&noise, &loud, &mut ir, &mut scratch),
+            Err(Error::NotFinite { .. })
+        ));
+        assert!(matches!(plan.deconvolve_recording(&loud, &loud, &mut ir, &mut scratch), Err(Error::NotFinite { .. })));
         let faint: Vec<f32> = noise.iter().map(|x| x * 1e-30).collect();
-        assert_eq!(plan.run(&noise, &faint, &mut ir, &mut scratch), Err(Error::NoLoopback));
-        plan.run(&noise, &noise, &mut ir, &mut scratch).expect("good after bad");
+        assert_eq!(plan.deconvolve_recording(&noise, &faint, &mut ir, &mut scratch), Err(Error::NoLoopback));
+        plan.deconvolve_recording(&noise, &noise, &mut ir, &mut scratch).expect("good after bad");
         assert!((ir[0] - ir.iter().copied().fold(0.0, f32::max)).abs() < 1e-6, "{ir:?}");
     }
 
@@ -423,7 +438,7 @@ mod tests {
             })
             .expect("a plan");
             let mut ir = vec![0.0; len];
-            plan.run(&recording, &loopback, &mut ir, &mut plan.scratch()).expect("a response");
+            plan.deconvolve_recording(&recording, &loopback, &mut ir, &mut plan.make_scratch()).expect("a response");
             let forward = f64::plan_real_forward(len);
             let mut bins = forward.make_output_vec();
             forward.process(&mut ir, &mut bins).expect("a spectrum");
@@ -470,7 +485,7 @@ mod tests {
             let loopback: Vec<f64> = (0..len).map(|i| f64::from((i as u32 * 7919) % 101) - 33.0).collect();
             let recording: Vec<f64> = (0..len).map(|i| 0.5 * loopback[(i + len - delay) % len]).collect();
             let mut ir = vec![f64::NAN; output_len];
-            plan.run(&recording, &loopback, &mut ir, &mut plan.scratch()).expect("a response");
+            plan.deconvolve_recording(&recording, &loopback, &mut ir, &mut plan.make_scratch()).expect("a response");
             for (n, x) in ir.iter().enumerate() {
                 let expected = if n == delay { 0.5 } else { 0.0 };
                 assert!((x - expected).abs() < 1e-10, "{len}, {output_len}: sample {n} is {x}");
@@ -496,7 +511,7 @@ mod tests {
         let run = |gain: f32| {
             let recording: Vec<f32> = (0..4_096).map(|i| if i < 9 { 0.0 } else { gain * loopback[i - 9] }).collect();
             let mut ir = vec![f32::NAN; 100];
-            plan.run(&recording, &loopback, &mut ir, &mut plan.scratch()).expect("a response");
+            plan.deconvolve_recording(&recording, &loopback, &mut ir, &mut plan.make_scratch()).expect("a response");
             ir.iter().map(|x| f64::from(x / gain)).collect::<Vec<_>>()
         };
         let even = run(1.0);
@@ -522,7 +537,7 @@ mod tests {
         .expect("a plan");
         let noise: Vec<f64> = (0..99).map(|i| f64::from((i * 37) % 19) - 9.0).collect();
         let mut ir = vec![f64::NAN; 120];
-        plan.run(&noise, &noise, &mut ir, &mut plan.scratch()).expect("a response");
+        plan.deconvolve_recording(&noise, &noise, &mut ir, &mut plan.make_scratch()).expect("a response");
         assert!(ir[..99].iter().all(|x| x.is_finite()));
         assert_eq!(&ir[99..], &[0.0; 21]);
     }

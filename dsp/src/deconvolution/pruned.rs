@@ -49,12 +49,12 @@ impl<T: RealSample> PrunedInverse<T> {
     }
 
     /// Room for sums between strands.
-    pub(crate) fn sums(&self) -> Vec<Complex<T>> {
+    pub(crate) fn make_sums(&self) -> Vec<Complex<T>> {
         vec![Complex::default(); self.turns.len()]
     }
 
     /// Lays bins from `first` on, none of them past n / 2, into their strands; all from 0 to n / 2 must be laid.
-    pub(crate) fn lay(&self, first: usize, mut bins: &[Complex<T>], spectrum: &mut [Complex<T>]) {
+    pub(crate) fn lay_bins(&self, first: usize, mut bins: &[Complex<T>], spectrum: &mut [Complex<T>]) {
         let (mut q, mut r) = (first / self.strands, first % self.strands);
         while !bins.is_empty() {
             let (now, later) = bins.split_at(bins.len().min(self.strands - r));
@@ -81,7 +81,7 @@ impl<T: RealSample> PrunedInverse<T> {
     /// Computes the samples, times `scale`; what was laid is used up.
     ///
     /// out `[samples wanted]`
-    pub(crate) fn run(
+    pub(crate) fn compute_samples(
         &self,
         spectrum: &mut [Complex<T>],
         scale: T,
@@ -136,11 +136,11 @@ mod tests {
             let mut strands = vec![Complex::new(f64::NAN, f64::NAN); plan.spectrum_len()];
             // In two pieces, the later one first.
             let half = bins.len() / 2;
-            plan.lay(half, &bins[half..], &mut strands);
-            plan.lay(0, &bins[..half], &mut strands);
+            plan.lay_bins(half, &bins[half..], &mut strands);
+            plan.lay_bins(0, &bins[..half], &mut strands);
             let mut out = vec![f64::NAN; output_len];
             let mut work = vec![Complex::default(); plan.scratch_len()];
-            plan.run(&mut strands, 1.0 / n as f64, &mut out, &mut plan.sums(), &mut work);
+            plan.compute_samples(&mut strands, 1.0 / n as f64, &mut out, &mut plan.make_sums(), &mut work);
             for (m, x) in out.iter().take(n).enumerate() {
                 let term = |k: usize| {
                     let weight = if k == 0 || 2 * k == n { 1.0 } else { 2.0 };

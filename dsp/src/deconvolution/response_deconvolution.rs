@@ -40,11 +40,11 @@ impl<T: RealSample> ResponseDeconvolution<T> {
     }
 
     /// Buffers for [`Self::run_within`]; one per thread.
-    pub fn scratch(&self) -> ResponseScratch<T> {
+    pub fn make_scratch(&self) -> ResponseScratch<T> {
         ResponseScratch(match &self.0 {
-            Precision::Same(plan) => PrecisionScratch::Same(plan.scratch()),
+            Precision::Same(plan) => PrecisionScratch::Same(plan.make_scratch()),
             Precision::Double(plan) => PrecisionScratch::Double {
-                scratch: plan.scratch(),
+                scratch: plan.make_scratch(),
                 recording: Vec::new(),
                 loopback: Vec::new(),
                 ir: vec![0.0; plan.output_len()],
@@ -130,9 +130,11 @@ mod tests {
         let wide = |x: &[f32]| x.iter().map(|x| f64::from(*x)).collect::<Vec<_>>();
         let exact = DeconvolutionPlan::<f64>::new(params(division)).expect("a plan");
         let mut expected = vec![f64::NAN; 384];
-        exact.run(&wide(&recording), &wide(&loopback), &mut expected, &mut exact.scratch()).expect("a response");
+        exact
+            .deconvolve_recording(&wide(&recording), &wide(&loopback), &mut expected, &mut exact.make_scratch())
+            .expect("a response");
         let plan = ResponseDeconvolution::<f32>::new(params(division)).expect("a plan");
-        let (mut found, mut scratch) = (vec![f32::NAN; plan.output_len()], plan.scratch());
+        let (mut found, mut scratch) = (vec![f32::NAN; plan.output_len()], plan.make_scratch());
         plan.run_within(RANGE_HZ, &recording, &loopback, &mut found, &mut scratch).expect("a response");
         let greatest = expected.iter().fold(0.0f64, |most, x| most.max(x.abs()));
         found.iter().zip(&expected).fold(0.0f64, |most, (a, b)| most.max((f64::from(*a) - b).abs())) / greatest
@@ -154,9 +156,9 @@ mod tests {
         let [tapered, literal] = [SpectralDivision::Tapered, SpectralDivision::Literal]
             .map(|division| ResponseDeconvolution::<f32>::new(params(division)).expect("a plan"));
         let (samples, mut ir) = (vec![1.0; LEN], vec![0.0; 384]);
-        let result = tapered.run_within(RANGE_HZ, &samples, &samples, &mut ir, &mut literal.scratch());
+        let result = tapered.run_within(RANGE_HZ, &samples, &samples, &mut ir, &mut literal.make_scratch());
         assert!(matches!(result, Err(Error::Setting { .. })), "{result:?}");
-        let result = literal.run_within(RANGE_HZ, &samples, &samples, &mut ir[1..], &mut literal.scratch());
+        let result = literal.run_within(RANGE_HZ, &samples, &samples, &mut ir[1..], &mut literal.make_scratch());
         assert!(matches!(result, Err(Error::Length { .. })), "{result:?}");
     }
 }

@@ -24,7 +24,7 @@ impl Default for DiffusionSums {
 
 impl DiffusionSums {
     /// Adds a receiver by its level, dB. Minus infinity is a receiver without sound; NaN makes the coefficient NaN.
-    pub fn add(&mut self, level_db: f64) {
+    pub fn add_level(&mut self, level_db: f64) {
         let (energy, square) = if level_db == f64::NEG_INFINITY { (0.0, 0.0) } else { (1.0, 1.0) };
         self.merge(&Self { receivers: 1, loudest_db: level_db, energy, square });
     }
@@ -40,7 +40,7 @@ impl DiffusionSums {
             return;
         }
         let loudest = self.loudest_db.max(other.loudest_db);
-        let (ours, theirs) = (ratio(self.loudest_db, loudest), ratio(other.loudest_db, loudest));
+        let (ours, theirs) = (energy_ratio(self.loudest_db, loudest), energy_ratio(other.loudest_db, loudest));
         self.loudest_db = loudest;
         self.energy = self.energy * ours + other.energy * theirs;
         self.square = self.square * ours * ours + other.square * theirs * theirs;
@@ -67,21 +67,21 @@ impl DiffusionSums {
 }
 
 /// Energy of a level over that of the loudest. Two infinite ones are NaN, as is one that is NaN.
-fn ratio(level_db: f64, loudest_db: f64) -> f64 {
+fn energy_ratio(level_db: f64, loudest_db: f64) -> f64 {
     if level_db == loudest_db && level_db.is_finite() { 1.0 } else { 10f64.powf((level_db - loudest_db) / 10.0) }
 }
 
 /// The coefficient of one list of levels, dB; None of fewer than two, or of no sound.
 ///
 /// ```
-/// use echolake_dsp::diffusion::diffusion;
+/// use echolake_dsp::diffusion::diffusion_of_levels;
 ///
-/// assert_eq!(diffusion(&[60.0, 60.0, 60.0]), Some(1.0));
-/// assert_eq!(diffusion(&[60.0, f64::NEG_INFINITY, f64::NEG_INFINITY]), Some(0.0));
+/// assert_eq!(diffusion_of_levels(&[60.0, 60.0, 60.0]), Some(1.0));
+/// assert_eq!(diffusion_of_levels(&[60.0, f64::NEG_INFINITY, f64::NEG_INFINITY]), Some(0.0));
 /// ```
-pub fn diffusion<T: crate::RealSample>(levels_db: &[T]) -> Option<f64> {
+pub fn diffusion_of_levels<T: crate::RealSample>(levels_db: &[T]) -> Option<f64> {
     let mut sums = DiffusionSums::default();
-    levels_db.iter().for_each(|level| sums.add(level.f64()));
+    levels_db.iter().for_each(|level| sums.add_level(level.f64()));
     sums.coefficient()
 }
 
@@ -92,17 +92,17 @@ mod tests {
     #[test]
     fn equal_levels_are_diffuse_and_one_direction_is_not() {
         for level in [-300.0, 0.0, 94.0, 4_000.0] {
-            assert!((diffusion(&[level; 37]).expect("one") - 1.0).abs() < 1e-12, "{level}");
+            assert!((diffusion_of_levels(&[level; 37]).expect("one") - 1.0).abs() < 1e-12, "{level}");
         }
         let mut one = [f64::NEG_INFINITY; 37];
         one[20] = 80.0;
-        assert_eq!(diffusion(&one), Some(0.0));
+        assert_eq!(diffusion_of_levels(&one), Some(0.0));
         one.fill(-40.0);
         one[3] = 80.0;
-        assert!(diffusion(&one).expect("one") < 1e-10);
+        assert!(diffusion_of_levels(&one).expect("one") < 1e-10);
         // Half of the receivers alike, the others silent: (n/2 - 1) / (n - 1).
         let half: Vec<f32> = (0..10).map(|i| if i < 5 { 3.0 } else { f32::NEG_INFINITY }).collect();
-        assert!((diffusion(&half).expect("one") - 4.0 / 9.0).abs() < 1e-12);
+        assert!((diffusion_of_levels(&half).expect("one") - 4.0 / 9.0).abs() < 1e-12);
     }
 
     #[test]
@@ -111,10 +111,10 @@ mod tests {
         let e: Vec<f64> = levels.iter().map(|l| 10f64.powf(l / 10.0)).collect();
         let (sum, square) = (e.iter().sum::<f64>(), e.iter().map(|e| e * e).sum::<f64>());
         let expected = (sum * sum - square) / (4.0 * square);
-        assert!((diffusion(&levels).expect("one") - expected).abs() < 1e-12);
+        assert!((diffusion_of_levels(&levels).expect("one") - expected).abs() < 1e-12);
         let (mut first, mut second) = (DiffusionSums::default(), DiffusionSums::default());
-        levels[..2].iter().for_each(|l| first.add(*l));
-        levels[2..].iter().for_each(|l| second.add(*l));
+        levels[..2].iter().for_each(|l| first.add_level(*l));
+        levels[2..].iter().for_each(|l| second.add_level(*l));
         first.merge(&DiffusionSums::from_parts(second.parts()));
         first.merge(&DiffusionSums::default());
         assert!((first.coefficient().expect("one") - expected).abs() < 1e-12);
@@ -122,10 +122,10 @@ mod tests {
 
     #[test]
     fn too_few_or_no_sound_have_none() {
-        assert_eq!(diffusion::<f64>(&[]), None);
-        assert_eq!(diffusion(&[3.0]), None);
-        assert_eq!(diffusion(&[f64::NEG_INFINITY; 4]), None);
-        assert!(diffusion(&[1.0, f64::NAN]).expect("not a number").is_nan());
-        assert!(diffusion(&[f64::INFINITY, f64::INFINITY]).expect("not a number").is_nan());
+        assert_eq!(diffusion_of_levels::<f64>(&[]), None);
+        assert_eq!(diffusion_of_levels(&[3.0]), None);
+        assert_eq!(diffusion_of_levels(&[f64::NEG_INFINITY; 4]), None);
+        assert!(diffusion_of_levels(&[1.0, f64::NAN]).expect("not a number").is_nan());
+        assert!(diffusion_of_levels(&[f64::INFINITY, f64::INFINITY]).expect("not a number").is_nan());
     }
 }

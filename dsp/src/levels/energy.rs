@@ -1,7 +1,7 @@
 //! Energy, its running sum along time, and both over Flat's.
 
 use crate::RealSample;
-pub use crate::foam::subtract;
+pub use crate::foam::subtract_foam;
 
 /// Sum of squares.
 pub fn energy<T: RealSample>(x: &[T]) -> f64 {
@@ -17,7 +17,7 @@ pub fn rms<T: RealSample>(x: &[T]) -> f64 {
 ///
 /// ir, curve  `[n]`
 pub fn cumulate_whole<T: RealSample>(ir: &[T], scale: f64, curve: &mut [T]) {
-    accumulate(ir, scale.recip(), curve);
+    accumulate_energy(ir, scale.recip(), curve);
 }
 
 /// Running sum of squares of each band, summed up in f64.
@@ -26,7 +26,7 @@ pub fn cumulate_whole<T: RealSample>(ir: &[T], scale: f64, curve: &mut [T]) {
 pub fn cumulative_energy<T: RealSample>(bands: &[T], curves: &mut [T], len: usize) {
     let len = len.max(1);
     for (band, curve) in bands.chunks_exact(len).zip(curves.chunks_exact_mut(len)) {
-        accumulate(band, 1.0, curve);
+        accumulate_energy(band, 1.0, curve);
     }
 }
 
@@ -75,7 +75,7 @@ const BLOCK: usize = 8;
 ///
 /// Within a block the sums come from doubling (to each, the one 1, 2 and 4 before it), which leaves one dependent
 /// addition a block instead of one a sample.
-pub(crate) fn accumulate<T: RealSample>(band: &[T], factor: f64, curve: &mut [T]) -> f64 {
+pub(crate) fn accumulate_energy<T: RealSample>(band: &[T], factor: f64, curve: &mut [T]) -> f64 {
     let (mut sum, (blocks, rest)) = (0.0, band.as_chunks::<BLOCK>());
     let (curve_blocks, curve_rest) = curve.as_chunks_mut::<BLOCK>();
     for (block, out) in blocks.iter().zip(curve_blocks) {

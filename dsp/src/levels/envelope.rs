@@ -18,7 +18,7 @@ use crate::{Error, RealSample};
 /// let burst = |n: i32| (f64::from(n) * 0.8).cos() * (-f64::from(n - 32).powi(2) / 64.0).exp();
 /// let burst: Vec<f64> = (0..64).map(burst).collect();
 /// let mut envelope = [0.0; 64];
-/// plan.run(&burst, &mut envelope, &mut plan.scratch())?;
+/// plan.compute_envelope(&burst, &mut envelope, &mut plan.make_scratch())?;
 /// assert!((envelope[32] - 1.0).abs() < 1e-3 && (envelope[40] - (-1f64).exp()).abs() < 1e-3);
 /// # Ok::<(), echolake_dsp::Error>(())
 /// ```
@@ -51,8 +51,8 @@ impl EnvelopePlan {
         Ok(Self { len, padded_len, forward, inverse })
     }
 
-    /// Buffers for [`Self::run`]; one per thread.
-    pub fn scratch(&self) -> EnvelopeScratch {
+    /// Buffers for [`Self::compute_envelope`]; one per thread.
+    pub fn make_scratch(&self) -> EnvelopeScratch {
         let work = self.forward.get_inplace_scratch_len().max(self.inverse.get_inplace_scratch_len());
         EnvelopeScratch { signal: vec![Complex::default(); self.padded_len], work: vec![Complex::default(); work] }
     }
@@ -61,7 +61,12 @@ impl EnvelopePlan {
     ///
     /// # Errors
     /// [`Error::Length`] or [`Error::NotFinite`].
-    pub fn run(&self, response: &[f64], envelope: &mut [f64], scratch: &mut EnvelopeScratch) -> Result<(), Error> {
+    pub fn compute_envelope(
+        &self,
+        response: &[f64],
+        envelope: &mut [f64],
+        scratch: &mut EnvelopeScratch,
+    ) -> Result<(), Error> {
         check_len("the response", response.len(), self.len)?;
         check_len("the envelope", envelope.len(), self.len)?;
         check_finite("the response", response)?;
@@ -95,12 +100,12 @@ mod tests {
         let gauss = |i: usize| (-((i as f64 - 150.0) / 20.0).powi(2)).exp();
         for len in [384, 401] {
             let plan = EnvelopePlan::new(len).expect("a plan");
-            let mut scratch = plan.scratch();
+            let mut scratch = plan.make_scratch();
             for phase in [0.0, 1.0, 2.0] {
                 let carrier = |i: usize| (std::f64::consts::TAU * 12e3 * i as f64 / 96e3 + phase).cos();
                 let burst: Vec<f64> = (0..len).map(|i| gauss(i) * carrier(i)).collect();
                 let mut envelope = vec![f64::NAN; len];
-                plan.run(&burst, &mut envelope, &mut scratch).expect("an envelope");
+                plan.compute_envelope(&burst, &mut envelope, &mut scratch).expect("an envelope");
                 assert!(envelope.iter().enumerate().all(|(i, x)| (x - gauss(i)).abs() < 1e-5), "{len} {phase}");
             }
         }
@@ -110,9 +115,9 @@ mod tests {
     fn bad_signals_are_refused() {
         assert!(EnvelopePlan::new(0).is_err());
         let plan = EnvelopePlan::new(2).expect("a plan");
-        let mut scratch = plan.scratch();
-        assert!(matches!(plan.run(&[0.0], &mut [0.0; 2], &mut scratch), Err(Error::Length { .. })));
-        let nan = plan.run(&[0.0, f64::NAN], &mut [0.0; 2], &mut scratch);
+        let mut scratch = plan.make_scratch();
+        assert!(matches!(plan.compute_envelope(&[0.0], &mut [0.0; 2], &mut scratch), Err(Error::Length { .. })));
+        let nan = plan.compute_envelope(&[0.0, f64::NAN], &mut [0.0; 2], &mut scratch);
         assert_eq!(nan, Err(Error::NotFinite { what: "the response" }));
     }
 }

@@ -9,7 +9,7 @@ use realfft::num_complex::Complex;
 use rustfft::{Fft, FftDirection};
 
 use crate::error::check_len;
-use crate::uncertainty::{EnergySensitivity, angle};
+use crate::uncertainty::{EnergySensitivity, bin_angle};
 use crate::{Error, RealSample};
 
 /// The itersine window on |x| <= 1/2: sin(pi/2 cos^2(pi x)), 0 elsewhere.
@@ -22,7 +22,7 @@ pub fn itersine(x: f64) -> f64 {
 
 /// Gain of one band at a frequency. The first band takes all that is lower, the last all that is higher;
 /// a band that is not there has none.
-pub fn gain(centres_hz: &[f64], band: usize, frequency_hz: f64) -> f64 {
+pub fn band_gain(centres_hz: &[f64], band: usize, frequency_hz: f64) -> f64 {
     let (Some(first), true) = (centres_hz.first(), band < centres_hz.len()) else { return 0.0 };
     let last = (centres_hz.len() - 1) as f64;
     let octaves = (frequency_hz.abs() / first).log2().clamp(0.0, last);
@@ -42,8 +42,8 @@ pub fn gain(centres_hz: &[f64], band: usize, frequency_hz: f64) -> f64 {
 /// let plan = echolake_dsp::filter_bank::FilterBankPlan::new(384, 96e3, &[5_000.0, 10_000.0, 20_000.0])?;
 /// let mut ir = vec![0.0; 384];
 /// ir[7] = 2.0;
-/// let mut bands = vec![0.0; plan.bands() * plan.len()];
-/// plan.run(&ir, &mut bands, &mut plan.scratch())?;
+/// let mut bands = vec![0.0; plan.band_count() * plan.len()];
+/// plan.split_bands(&ir, &mut bands, &mut plan.make_scratch())?;
 /// let energy: f64 = bands.iter().map(|x| x * x).sum();
 /// assert!((energy - 4.0).abs() < 1e-9);
 /// # Ok::<(), echolake_dsp::Error>(())
@@ -96,11 +96,11 @@ impl<T: RealSample> FilterBankPlan<T> {
             return Err(Error::Setting { what: "the signal's length", actual: "0".into(), expected: "1 or more" });
         }
         let frequency = |k: usize| k as f64 * rate_hz / len as f64;
-        let gains = |band| (0..len / 2 + 1).map(move |k| T::of(gain(centres_hz, band, frequency(k))));
+        let gains = |band| (0..len / 2 + 1).map(move |k| T::of(band_gain(centres_hz, band, frequency(k))));
         let bands: Vec<usize> = (0..centres_hz.len()).collect();
         let couple = |bands: &[usize]| {
             let scaled = |band: Option<&usize>, k| {
-                T::of(band.map_or(0.0, |band| gain(centres_hz, *band, frequency(k)) / len as f64))
+                T::of(band.map_or(0.0, |band| band_gain(centres_hz, *band, frequency(k)) / len as f64))
             };
             let at = |k: usize| Complex::new(scaled(bands.first(), k), scaled(bands.get(1), k));
             BandCouple::new((0..len / 2 + 1).map(at).collect())
@@ -116,7 +116,7 @@ impl<T: RealSample> FilterBankPlan<T> {
     }
 
     /// Number of bands.
-    pub fn bands(&self) -> usize {
+    pub fn band_count(&self) -> usize {
         self.bands
     }
 
@@ -126,8 +126,8 @@ impl<T: RealSample> FilterBankPlan<T> {
         self.len
     }
 
-    /// Buffers for [`Self::run`]; one per thread.
-    pub fn scratch(&self) -> FilterBankScratch<T> {
+    /// Buffers for [`Self::split_bands`]; one per thread.
+    pub fn make_scratch(&self) -> FilterBankScratch<T> {
         let work = self.forward.get_scratch_len().max(self.inverse.get_inplace_scratch_len());
         FilterBankScratch {
             signal: self.forward.make_input_vec(),
@@ -142,12 +142,12 @@ impl<T: RealSample> FilterBankPlan<T> {
     ///
     /// # Errors
     /// [`Error::Length`] or [`Error::NotFinite`].
-    pub fn run(&self, ir: &[T], bands: &mut [T], scratch: &mut FilterBankScratch<T>) -> Result<(), Error> {
+    pub fn split_bands(&self, ir: &[T], bands: &mut [T], scratch: &mut FilterBankScratch<T>) -> Result<(), Error> {
         check_len("the bands", bands.len(), self.bands * self.len)?;
-        self.spectrum(ir, scratch)?;
+        self.compute_spectrum(ir, scratch)?;
         let FilterBankScratch { spectrum, coupled, work, .. } = scratch;
         for (couple, coupled) in self.couples.iter().zip(coupled.chunks_exact_mut(self.len)) {
-            couple.filter(spectrum, coupled);
+            couple.filter_spectrum(spectrum, coupled);
         }
         self.inverse.process_with_scratch(coupled, work);
         for (out, coupled) in bands.chunks_mut(2 * self.len).zip(coupled.chunks_exact(self.len)) {
@@ -162,11 +162,16 @@ impl<T: RealSample> FilterBankPlan<T> {
     ///
     /// # Errors
     /// [`Error::Length`] or [`Error::NotFinite`].
-    pub fn energies(&self, ir: &[T], energies: &mut [f64], scratch: &mut FilterBankScratch<T>) -> Result<(), Error> {
+    pub fn compute_energies(
+        &self,
+        ir: &[T],
+        energies: &mut [f64],
+        scratch: &mut FilterBankScratch<T>,
+    ) -> Result<(), Error> {
         check_len("the energies", energies.len(), self.bands)?;
-        self.spectrum(ir, scratch)?;
+        self.compute_spectrum(ir, scratch)?;
         for (gains, energy) in self.gains.chunks_exact(scratch.spectrum.len()).zip(energies) {
-            let power = |(k, (c, g)): (usize, (&Complex<T>, &T))| self.weight(k) * (*g * *g * c.norm_sqr()).f64();
+            let power = |(k, (c, g)): (usize, (&Complex<T>, &T))| self.bin_weight(k) * (*g * *g * c.norm_sqr()).f64();
             *energy = scratch.spectrum.iter().zip(gains).enumerate().map(power).sum::<f64>() / self.len as f64;
         }
         Ok(())
@@ -177,7 +182,7 @@ impl<T: RealSample> FilterBankPlan<T> {
     ///
     /// # Errors
     /// [`Error::Length`] or [`Error::NotFinite`].
-    pub fn sensitivities(
+    pub fn compute_sensitivities(
         &self,
         reflected: &[T],
         direct: &[T],
@@ -186,14 +191,15 @@ impl<T: RealSample> FilterBankPlan<T> {
         scratch: &mut FilterBankScratch<T>,
     ) -> Result<(), Error> {
         check_len("the sensitivities", sensitivities.len(), self.bands)?;
-        self.spectrum(direct, scratch)?;
+        self.compute_spectrum(direct, scratch)?;
         std::mem::swap(&mut scratch.spectrum, &mut scratch.direct);
-        self.spectrum(reflected, scratch)?;
+        self.compute_spectrum(reflected, scratch)?;
         let direct = &scratch.direct;
         for (gains, sensitivity) in self.gains.chunks_exact(direct.len()).zip(sensitivities) {
             let mut sum = EnergySensitivity::default();
             for (bin, ((x, d), gain)) in scratch.spectrum.iter().zip(direct).zip(gains).enumerate() {
-                let (weight, angle) = (self.weight(bin) * gain.f64().powi(2) / self.len as f64, angle(bin, self.len));
+                let (weight, angle) =
+                    (self.bin_weight(bin) * gain.f64().powi(2) / self.len as f64, bin_angle(bin, self.len));
                 let (product, power) = ((x.conj() * d), d.norm_sqr().f64());
                 let energy = weight * x.norm_sqr().f64();
                 sum.energy += energy;
@@ -215,17 +221,17 @@ impl<T: RealSample> FilterBankPlan<T> {
     /// [`Error::Length`] or [`Error::NotFinite`].
     pub fn add_power(&self, signal: &[T], power: &mut [f64], scratch: &mut FilterBankScratch<T>) -> Result<(), Error> {
         check_len("the power spectrum", power.len(), self.len / 2 + 1)?;
-        self.spectrum(signal, scratch)?;
+        self.compute_spectrum(signal, scratch)?;
         power.iter_mut().zip(&scratch.spectrum).for_each(|(power, x)| *power += x.norm_sqr().f64());
         Ok(())
     }
 
     // A bin counts for its mirror image too, except 0 Hz and, if the length is even, the last one.
-    fn weight(&self, bin: usize) -> f64 {
+    fn bin_weight(&self, bin: usize) -> f64 {
         if bin == 0 || 2 * bin == self.len { 1.0 } else { 2.0 }
     }
 
-    fn spectrum(&self, ir: &[T], scratch: &mut FilterBankScratch<T>) -> Result<(), Error> {
+    fn compute_spectrum(&self, ir: &[T], scratch: &mut FilterBankScratch<T>) -> Result<(), Error> {
         check_len("the response", ir.len(), self.len)?;
         let FilterBankScratch { signal, spectrum, work, .. } = scratch;
         signal.copy_from_slice(ir);
@@ -248,7 +254,7 @@ impl<T: RealSample> BandCouple<T> {
     }
 
     // A bin k and its mirror image n - k: both bands are real, so it is conj X[k] with the same gains.
-    fn filter(&self, spectrum: &[Complex<T>], out: &mut [Complex<T>]) {
+    fn filter_spectrum(&self, spectrum: &[Complex<T>], out: &mut [Complex<T>]) {
         let Range { start, end } = self.bins;
         let (low, high) = out.split_at_mut(spectrum.len());
         low[..start].fill(Complex::default());
@@ -275,11 +281,11 @@ mod tests {
         for centres in lists {
             for i in 0..10_000 {
                 let hz = f64::from(i) * 4.8;
-                let sum: f64 = (0..centres.len()).map(|b| gain(centres, b, hz).powi(2)).sum();
+                let sum: f64 = (0..centres.len()).map(|b| band_gain(centres, b, hz).powi(2)).sum();
                 assert!((sum - 1.0).abs() < 1e-14, "{} bands at {hz} Hz: {sum}", centres.len());
             }
             for (band, hz) in centres.iter().enumerate() {
-                assert!((gain(centres, band, *hz) - 1.0).abs() < 1e-12, "{hz} Hz is the middle of its band");
+                assert!((band_gain(centres, band, *hz) - 1.0).abs() < 1e-12, "{hz} Hz is the middle of its band");
             }
         }
     }
@@ -289,10 +295,10 @@ mod tests {
         for len in [1, 2, 3, 383, 384, 399, 400, 401, 512, 997] {
             let plan = FilterBankPlan::<f64>::new(len, 96e3, &PAPER).expect("a plan");
             let ir: Vec<f64> = (0..len).map(|i| f64::from((i as u32 * 7919) % 101) - 50.0).collect();
-            let (mut bands, mut scratch) = (vec![f64::NAN; 5 * len], plan.scratch());
+            let (mut bands, mut scratch) = (vec![f64::NAN; 5 * len], plan.make_scratch());
             let mut energies = vec![f64::NAN; 5];
-            plan.run(&ir, &mut bands, &mut scratch).expect("split");
-            plan.energies(&ir, &mut energies, &mut scratch).expect("energies");
+            plan.split_bands(&ir, &mut bands, &mut scratch).expect("split");
+            plan.compute_energies(&ir, &mut energies, &mut scratch).expect("energies");
             let whole: f64 = ir.iter().map(|x| x * x).sum();
             let split: f64 = bands.iter().map(|x| x * x).sum();
             assert!((split / whole - 1.0).abs() < 1e-12, "{len}: {split} {whole}");
@@ -312,18 +318,21 @@ mod tests {
             assert!(FilterBankPlan::<f32>::new(384, bad, &PAPER).is_err(), "{bad} Hz");
         }
         assert!(FilterBankPlan::<f32>::new(0, 96e3, &PAPER).is_err());
-        assert_eq!((gain(&[], 0, 1e3), gain(&PAPER, 5, 1e3)), (0.0, 0.0));
+        assert_eq!((band_gain(&[], 0, 1e3), band_gain(&PAPER, 5, 1e3)), (0.0, 0.0));
     }
 
     #[test]
     fn signals_that_are_not_finite_are_refused() {
         let plan = FilterBankPlan::<f32>::new(16, 96e3, &PAPER).expect("a plan");
-        let (mut bands, mut energies, mut scratch) = (vec![0.0; 80], vec![0.0; 5], plan.scratch());
+        let (mut bands, mut energies, mut scratch) = (vec![0.0; 80], vec![0.0; 5], plan.make_scratch());
         for bad in [f32::NAN, f32::INFINITY] {
             let mut ir = [1.0; 16];
             ir[9] = bad;
-            assert_eq!(plan.run(&ir, &mut bands, &mut scratch), Err(Error::NotFinite { what: "the response" }));
-            assert_eq!(plan.energies(&ir, &mut energies, &mut scratch), Err(Error::NotFinite { what: "the response" }));
+            assert_eq!(plan.split_bands(&ir, &mut bands, &mut scratch), Err(Error::NotFinite { what: "the response" }));
+            assert_eq!(
+                plan.compute_energies(&ir, &mut energies, &mut scratch),
+                Err(Error::NotFinite { what: "the response" })
+            );
         }
     }
 
@@ -334,7 +343,7 @@ mod tests {
             let plan = FilterBankPlan::<f64>::new(len, 48e3, &[1e3]).expect("a plan");
             let ir: Vec<f64> = (0..len).map(|i| f64::from(i as u32) - 3.5).collect();
             let mut bands = vec![f64::NAN; len];
-            plan.run(&ir, &mut bands, &mut plan.scratch()).expect("split");
+            plan.split_bands(&ir, &mut bands, &mut plan.make_scratch()).expect("split");
             assert!(ir.iter().zip(&bands).all(|(a, b)| (a - b).abs() < 1e-12), "{len}: {bands:?}");
         }
     }

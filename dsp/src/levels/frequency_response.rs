@@ -21,7 +21,7 @@ const PADDING: usize = 4;
 /// let mut impulse = [0.0; 64];
 /// impulse[48] = 10.0;
 /// let mut found = FrequencyResponse::default();
-/// plan.run(&impulse, 1.0 / 3.0, 0.5e-3, &mut found, &mut plan.scratch())?;
+/// plan.compute_response(&impulse, 1.0 / 3.0, 0.5e-3, &mut found, &mut plan.make_scratch())?;
 /// assert!(found.level_db.iter().all(|level| (level - 20.0).abs() < 1e-9));
 /// assert!(found.phase_deg.iter().chain(&found.group_delay_secs).all(|x| x.abs() < 1e-6));
 /// # Ok::<(), echolake_dsp::Error>(())
@@ -81,8 +81,8 @@ impl FrequencyResponsePlan {
         (first..=last).map(move |bin| bin as f64 * width_hz)
     }
 
-    /// Buffers for [`Self::run`]; one per thread.
-    pub fn scratch(&self) -> FrequencyResponseScratch {
+    /// Buffers for [`Self::compute_response`]; one per thread.
+    pub fn make_scratch(&self) -> FrequencyResponseScratch {
         let bins = self.padded_len / 2 + 1;
         FrequencyResponseScratch {
             signal: self.forward.make_input_vec(),
@@ -103,7 +103,7 @@ impl FrequencyResponsePlan {
     ///
     /// # Errors
     /// [`Error::Length`] or [`Error::NotFinite`].
-    pub fn run(
+    pub fn compute_response(
         &self,
         response: &[f64],
         octaves: f64,
@@ -114,9 +114,9 @@ impl FrequencyResponsePlan {
         check_len("the response", response.len(), self.len)?;
         check_finite("the response", response)?;
         let FrequencyResponseScratch { signal, spectrum, delayed, work, values, sums, power } = scratch;
-        self.transform(response.iter().copied(), signal, spectrum, work);
+        self.transform_samples(response.iter().copied(), signal, spectrum, work);
         let times = (0..self.len).map(|n| n as f64 / self.rate_hz);
-        self.transform(response.iter().zip(times).map(|(x, time)| x * time), signal, delayed, work);
+        self.transform_samples(response.iter().zip(times).map(|(x, time)| x * time), signal, delayed, work);
         let [first, last] = self.range;
 
         values.iter_mut().zip(&*spectrum).for_each(|(out, x)| *out = x.norm_sqr());
@@ -143,7 +143,7 @@ impl FrequencyResponsePlan {
         Ok(())
     }
 
-    fn transform(
+    fn transform_samples(
         &self,
         samples: impl Iterator<Item = f64>,
         signal: &mut [f64],
@@ -210,10 +210,11 @@ mod tests {
 
     fn analysed(response: &[f64], octaves: f64, removed_secs: f64) -> (Vec<f64>, FrequencyResponse) {
         let plan = FrequencyResponsePlan::new(response.len(), RATE_HZ, [2e3, 40e3]).expect("a plan");
-        let mut scratch = plan.scratch();
+        let mut scratch = plan.make_scratch();
         let mut found = FrequencyResponse { level_db: vec![f64::NAN; 3], ..FrequencyResponse::default() };
-        plan.run(&impulse(3, 2.0)[..response.len()], 0.5, 0.1, &mut found, &mut scratch).expect("a dirty scratch");
-        plan.run(response, octaves, removed_secs, &mut found, &mut scratch).expect("a response");
+        plan.compute_response(&impulse(3, 2.0)[..response.len()], 0.5, 0.1, &mut found, &mut scratch)
+            .expect("a dirty scratch");
+        plan.compute_response(response, octaves, removed_secs, &mut found, &mut scratch).expect("a response");
         let frequencies: Vec<f64> = plan.frequencies_hz().collect();
         assert_eq!(frequencies.len(), found.level_db.len());
         (frequencies, found)
@@ -290,12 +291,12 @@ mod tests {
         }
         let plan = FrequencyResponsePlan::new(2, RATE_HZ, [2e3, 40e3]).expect("a plan");
         let mut found = FrequencyResponse::default();
-        let mut scratch = plan.scratch();
-        let short = plan.run(&[0.0], 0.0, 0.0, &mut found, &mut scratch);
+        let mut scratch = plan.make_scratch();
+        let short = plan.compute_response(&[0.0], 0.0, 0.0, &mut found, &mut scratch);
         assert!(matches!(short, Err(Error::Length { .. })));
-        let infinite = plan.run(&[0.0, f64::INFINITY], 0.0, 0.0, &mut found, &mut scratch);
+        let infinite = plan.compute_response(&[0.0, f64::INFINITY], 0.0, 0.0, &mut found, &mut scratch);
         assert_eq!(infinite, Err(Error::NotFinite { what: "the response" }));
-        plan.run(&[0.0; 2], 1.0, 0.0, &mut found, &mut scratch).expect("silence");
+        plan.compute_response(&[0.0; 2], 1.0, 0.0, &mut found, &mut scratch).expect("silence");
         assert!(found.level_db.iter().all(|level| *level == -200.0), "{found:?}");
         assert!(found.group_delay_secs.iter().all(|delay| *delay == 0.0), "{found:?}");
     }

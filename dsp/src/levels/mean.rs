@@ -7,9 +7,9 @@ use crate::{Error, RealSample};
 ///
 /// ```
 /// let mut mean = echolake_dsp::mean::SignalMean::default();
-/// mean.add(&[1.0, 3.0])?;
-/// mean.add(&[3.0, 5.0])?;
-/// assert_eq!(mean.values().collect::<Vec<_>>(), [2.0, 4.0]);
+/// mean.add_signal(&[1.0, 3.0])?;
+/// mean.add_signal(&[3.0, 5.0])?;
+/// assert_eq!(mean.mean_values().collect::<Vec<_>>(), [2.0, 4.0]);
 /// # Ok::<(), echolake_dsp::Error>(())
 /// ```
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -23,8 +23,8 @@ impl SignalMean {
     ///
     /// # Errors
     /// [`Error::Length`] if it is not as long as those before.
-    pub fn add<T: RealSample>(&mut self, signal: &[T]) -> Result<(), Error> {
-        self.fit(signal.len())?;
+    pub fn add_signal<T: RealSample>(&mut self, signal: &[T]) -> Result<(), Error> {
+        self.fit_length(signal.len())?;
         T::add_to(signal, &mut self.sums);
         self.count += 1;
         Ok(())
@@ -33,12 +33,12 @@ impl SignalMean {
     /// Adds the sums of `count` other signals.
     ///
     /// # Errors
-    /// As [`Self::add`].
-    pub fn merge(&mut self, sums: &[f64], count: u64) -> Result<(), Error> {
+    /// As [`Self::add_signal`].
+    pub fn merge_sums(&mut self, sums: &[f64], count: u64) -> Result<(), Error> {
         if count == 0 {
             return Ok(());
         }
-        self.fit(sums.len())?;
+        self.fit_length(sums.len())?;
         self.sums.iter_mut().zip(sums).for_each(|(sum, x)| *sum += x);
         self.count += count;
         Ok(())
@@ -55,11 +55,11 @@ impl SignalMean {
     }
 
     /// The mean, sample by sample.
-    pub fn values(&self) -> impl Iterator<Item = f64> {
+    pub fn mean_values(&self) -> impl Iterator<Item = f64> {
         self.sums.iter().map(|sum| sum / self.count as f64)
     }
 
-    fn fit(&mut self, len: usize) -> Result<(), Error> {
+    fn fit_length(&mut self, len: usize) -> Result<(), Error> {
         if self.count == 0 {
             self.sums.resize(len, 0.0);
         }
@@ -73,7 +73,7 @@ impl SignalMean {
 ///
 /// # Errors
 /// [`Error::Length`] if they are not equally long.
-pub fn multiply<T: RealSample>(x: &[T], y: &[T], out: &mut [T]) -> Result<(), Error> {
+pub fn multiply_samples<T: RealSample>(x: &[T], y: &[T], out: &mut [T]) -> Result<(), Error> {
     check_len("the second list", y.len(), x.len())?;
     check_len("the product", out.len(), x.len())?;
     out.iter_mut().zip(x.iter().zip(y)).for_each(|(out, (x, y))| *out = *x * *y);
@@ -87,22 +87,22 @@ mod tests {
     #[test]
     fn means_are_of_each_sample() {
         let (mut first, mut second) = (SignalMean::default(), SignalMean::default());
-        first.add(&[1.0f32, 2.0]).expect("equally long");
-        second.add(&[3.0, 6.0]).expect("equally long");
-        second.add(&[5.0, 1.0]).expect("equally long");
-        first.merge(second.sums(), second.count()).expect("equally long");
-        first.merge(&[], 0).expect("nothing");
-        assert_eq!((first.values().collect::<Vec<_>>(), first.count()), (vec![3.0, 3.0], 3));
-        assert!(matches!(first.add(&[1.0]), Err(Error::Length { actual: 1, expected: 2, .. })));
-        assert!(matches!(first.merge(&[1.0], 1), Err(Error::Length { .. })));
-        assert_eq!(SignalMean::default().values().count(), 0);
+        first.add_signal(&[1.0f32, 2.0]).expect("equally long");
+        second.add_signal(&[3.0, 6.0]).expect("equally long");
+        second.add_signal(&[5.0, 1.0]).expect("equally long");
+        first.merge_sums(second.sums(), second.count()).expect("equally long");
+        first.merge_sums(&[], 0).expect("nothing");
+        assert_eq!((first.mean_values().collect::<Vec<_>>(), first.count()), (vec![3.0, 3.0], 3));
+        assert!(matches!(first.add_signal(&[1.0]), Err(Error::Length { actual: 1, expected: 2, .. })));
+        assert!(matches!(first.merge_sums(&[1.0], 1), Err(Error::Length { .. })));
+        assert_eq!(SignalMean::default().mean_values().count(), 0);
     }
 
     #[test]
     fn products_are_of_each_sample() {
         let mut out = [f64::NAN; 2];
-        multiply(&[2.0, 3.0], &[-1.0, 0.5], &mut out).expect("equally long");
+        multiply_samples(&[2.0, 3.0], &[-1.0, 0.5], &mut out).expect("equally long");
         assert_eq!(out, [-2.0, 1.5]);
-        assert!(multiply(&[2.0, 3.0], &[1.0], &mut out).is_err());
+        assert!(multiply_samples(&[2.0, 3.0], &[1.0], &mut out).is_err());
     }
 }

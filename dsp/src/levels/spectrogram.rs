@@ -7,7 +7,7 @@ use realfft::num_complex::Complex;
 
 use crate::error::{check_finite, check_len};
 use crate::level::plotted_power_to_db;
-use crate::spectrum::bins;
+use crate::spectrum::bin_count;
 use crate::{Error, RealSample};
 
 /// Shorter windows are padded up to this length, so that bins are close enough for a picture.
@@ -52,13 +52,13 @@ impl SpectrogramPlan {
     }
 
     /// Windows of a response.
-    pub fn times(&self) -> usize {
+    pub fn time_count(&self) -> usize {
         self.len.div_ceil(self.step)
     }
 
     /// Bins of a window.
-    pub fn bins(&self) -> usize {
-        bins(self.padded_len)
+    pub fn bin_count(&self) -> usize {
+        bin_count(self.padded_len)
     }
 
     /// Distance of the bins, Hz.
@@ -66,8 +66,8 @@ impl SpectrogramPlan {
         rate_hz / self.padded_len as f64
     }
 
-    /// Buffers for [`Self::run`]; one per thread.
-    pub fn scratch(&self) -> SpectrogramScratch {
+    /// Buffers for [`Self::compute_levels`]; one per thread.
+    pub fn make_scratch(&self) -> SpectrogramScratch {
         SpectrogramScratch {
             signal: self.forward.make_input_vec(),
             spectrum: self.forward.make_output_vec(),
@@ -79,12 +79,17 @@ impl SpectrogramPlan {
     ///
     /// # Errors
     /// [`Error::Length`] or [`Error::NotFinite`].
-    pub fn run(&self, response: &[f64], levels_db: &mut [f64], scratch: &mut SpectrogramScratch) -> Result<(), Error> {
+    pub fn compute_levels(
+        &self,
+        response: &[f64],
+        levels_db: &mut [f64],
+        scratch: &mut SpectrogramScratch,
+    ) -> Result<(), Error> {
         check_len("the response", response.len(), self.len)?;
-        check_len("the levels", levels_db.len(), self.times() * self.bins())?;
+        check_len("the levels", levels_db.len(), self.time_count() * self.bin_count())?;
         check_finite("the response", response)?;
         let SpectrogramScratch { signal, spectrum, work } = scratch;
-        for (time, levels) in levels_db.chunks_exact_mut(self.bins()).enumerate() {
+        for (time, levels) in levels_db.chunks_exact_mut(self.bin_count()).enumerate() {
             signal.fill(0.0);
             let half = self.window.len() / 2;
             for (i, (to, weight)) in signal.iter_mut().zip(&self.window).enumerate() {
@@ -106,8 +111,8 @@ mod tests {
     const RATE_HZ: f64 = 96e3;
 
     fn levels(plan: &SpectrogramPlan, response: &[f64]) -> Vec<f64> {
-        let mut levels = vec![f64::NAN; plan.times() * plan.bins()];
-        plan.run(response, &mut levels, &mut plan.scratch()).expect("levels");
+        let mut levels = vec![f64::NAN; plan.time_count() * plan.bin_count()];
+        plan.compute_levels(response, &mut levels, &mut plan.make_scratch()).expect("levels");
         levels
     }
 
@@ -120,8 +125,8 @@ mod tests {
         let highest = (0..levels.len()).max_by(|a, b| levels[*a].total_cmp(&levels[*b])).expect("levels");
         // Half of the Hann window's sum, 48 / 2, because a sine is two lines.
         assert!((levels[highest] - 20.0 * 12f64.log10()).abs() < 0.1, "{}", levels[highest]);
-        assert!(((highest % plan.bins()) as f64 * plan.bin_hz(RATE_HZ) - 15e3).abs() <= plan.bin_hz(RATE_HZ));
-        assert!((2 * (highest / plan.bins())).abs_diff(200) < 60);
+        assert!(((highest % plan.bin_count()) as f64 * plan.bin_hz(RATE_HZ) - 15e3).abs() <= plan.bin_hz(RATE_HZ));
+        assert!((2 * (highest / plan.bin_count())).abs_diff(200) < 60);
         assert_eq!(levels[0], -200.0, "silence before it");
     }
 
@@ -132,11 +137,11 @@ mod tests {
             response[6] = 1.0;
             let plan = SpectrogramPlan::new(len, window_len, step).expect("a plan");
             let levels = levels(&plan, &response);
-            for time in 0..plan.times() {
+            for time in 0..plan.time_count() {
                 let at = (6 + window_len / 2).checked_sub(time * step);
                 let weight = at.and_then(|at| plan.window.get(at)).copied().unwrap_or(0.0);
                 let expected = plotted_power_to_db(weight * weight);
-                let row = &levels[time * plan.bins()..(time + 1) * plan.bins()];
+                let row = &levels[time * plan.bin_count()..(time + 1) * plan.bin_count()];
                 assert!(row.iter().all(|level| (level - expected).abs() < 1e-9), "{len} {time}: {row:?}");
             }
         }
@@ -148,10 +153,10 @@ mod tests {
             assert!(SpectrogramPlan::new(len, window_len, step).is_err(), "{len} {window_len} {step}");
         }
         let plan = SpectrogramPlan::new(2, 4, 1).expect("a plan");
-        let mut levels = vec![0.0; 2 * plan.bins()];
-        let mut scratch = plan.scratch();
-        assert!(matches!(plan.run(&[0.0], &mut levels, &mut scratch), Err(Error::Length { .. })));
-        let nan = plan.run(&[0.0, f64::NAN], &mut levels, &mut scratch);
+        let mut levels = vec![0.0; 2 * plan.bin_count()];
+        let mut scratch = plan.make_scratch();
+        assert!(matches!(plan.compute_levels(&[0.0], &mut levels, &mut scratch), Err(Error::Length { .. })));
+        let nan = plan.compute_levels(&[0.0, f64::NAN], &mut levels, &mut scratch);
         assert_eq!(nan, Err(Error::NotFinite { what: "the response" }));
     }
 }

@@ -17,7 +17,7 @@ use crate::{Error, RealSample};
 /// ```
 /// let plan = echolake_dsp::spectrum::SpectrumPlan::new(4)?;
 /// let mut levels = [f64::NAN; 3];
-/// plan.levels_db(&[0.0, 10.0, 0.0, 0.0], &mut levels, &mut plan.scratch())?;
+/// plan.levels_db(&[0.0, 10.0, 0.0, 0.0], &mut levels, &mut plan.make_scratch())?;
 /// assert_eq!(levels, [20.0; 3]);
 /// # Ok::<(), echolake_dsp::Error>(())
 /// ```
@@ -34,7 +34,7 @@ pub struct SpectrumScratch<T> {
 }
 
 /// Bins of a signal of `len` samples; none of no samples.
-pub fn bins(len: usize) -> usize {
+pub fn bin_count(len: usize) -> usize {
     if len == 0 { 0 } else { len / 2 + 1 }
 }
 
@@ -56,7 +56,7 @@ impl<T: RealSample> SpectrumPlan<T> {
     }
 
     /// Buffers for [`Self::levels_db`]; one per thread.
-    pub fn scratch(&self) -> SpectrumScratch<T> {
+    pub fn make_scratch(&self) -> SpectrumScratch<T> {
         SpectrumScratch {
             signal: self.forward.make_input_vec(),
             spectrum: self.forward.make_output_vec(),
@@ -70,7 +70,7 @@ impl<T: RealSample> SpectrumPlan<T> {
     /// [`Error::Length`] or [`Error::NotFinite`].
     pub fn levels_db(&self, ir: &[T], levels: &mut [T], scratch: &mut SpectrumScratch<T>) -> Result<(), Error> {
         check_len("the response", ir.len(), self.len)?;
-        check_len("the levels", levels.len(), bins(self.len))?;
+        check_len("the levels", levels.len(), bin_count(self.len))?;
         let SpectrumScratch { signal, spectrum, work } = scratch;
         signal.copy_from_slice(ir);
         let not_finite = Error::NotFinite { what: "the response" };
@@ -95,15 +95,15 @@ mod tests {
     fn a_single_sample_is_flat_and_a_tone_stands_in_its_bin() {
         for len in [1, 2, 15, 384] {
             let plan = SpectrumPlan::<f64>::new(len).expect("a plan");
-            let (mut ir, mut levels) = (vec![0.0; len], vec![f64::NAN; bins(len)]);
+            let (mut ir, mut levels) = (vec![0.0; len], vec![f64::NAN; bin_count(len)]);
             ir[len / 2] = 10.0;
-            plan.levels_db(&ir, &mut levels, &mut plan.scratch()).expect("levels");
+            plan.levels_db(&ir, &mut levels, &mut plan.make_scratch()).expect("levels");
             assert!(levels.iter().all(|x| (x - 20.0).abs() < 1e-9), "{len}: {levels:?}");
         }
         let plan = SpectrumPlan::<f64>::new(96).expect("a plan");
         let tone: Vec<f64> = (0..96).map(|n| (std::f64::consts::TAU * 7.0 * f64::from(n) / 96.0).cos()).collect();
         let mut levels = vec![f64::NAN; 49];
-        plan.levels_db(&tone, &mut levels, &mut plan.scratch()).expect("levels");
+        plan.levels_db(&tone, &mut levels, &mut plan.make_scratch()).expect("levels");
         assert_eq!(bin_hz(7, 96, 96e3), 7_000.0);
         assert!((levels[7] - 20.0 * 48f64.log10()).abs() < 1e-9);
         assert!(levels.iter().enumerate().all(|(k, x)| k == 7 || *x < -200.0));
@@ -113,7 +113,7 @@ mod tests {
     fn bad_signals_are_refused() {
         assert!(SpectrumPlan::<f32>::new(0).is_err());
         let plan = SpectrumPlan::<f32>::new(4).expect("a plan");
-        let (mut levels, mut scratch) = ([0.0; 3], plan.scratch());
+        let (mut levels, mut scratch) = ([0.0; 3], plan.make_scratch());
         assert!(matches!(plan.levels_db(&[0.0; 3], &mut levels, &mut scratch), Err(Error::Length { .. })));
         let nan = plan.levels_db(&[0.0, f32::NAN, 0.0, 0.0], &mut levels, &mut scratch);
         assert_eq!(nan, Err(Error::NotFinite { what: "the response" }));

@@ -58,7 +58,7 @@ pub struct DirectSoundResidual {
 /// let direct: Vec<f64> = (0..384).map(|n| (-(f64::from(n) - 80.0).powi(2) / 8.0).exp()).collect();
 /// let reflected: Vec<f64> = direct.iter().map(|x| 0.01 * x).collect();
 /// for _ in 0..24 {
-///     assert!(fit.add(&reflected, &direct, 80.0 / 96e3, 200.0 / 96e3)?);
+///     assert!(fit.add_pair(&reflected, &direct, 80.0 / 96e3, 200.0 / 96e3)?);
 /// }
 /// let residual = fit.finish().ok_or("24 pairs are enough")?;
 /// assert!((residual.gain.mean - 0.01).abs() < 1e-9 && residual.delay.mean.abs() < 1e-9);
@@ -167,20 +167,26 @@ impl<T: RealSample> ResidualFit<T> {
     ///
     /// # Errors
     /// [`Error::Length`] or [`Error::NotFinite`].
-    pub fn add(&mut self, reflected: &[T], direct: &[T], direct_secs: f64, reflected_secs: f64) -> Result<bool, Error> {
+    pub fn add_pair(
+        &mut self,
+        reflected: &[T],
+        direct: &[T],
+        direct_secs: f64,
+        reflected_secs: f64,
+    ) -> Result<bool, Error> {
         check_len("the response", reflected.len(), self.len)?;
         check_len("the direct sound", direct.len(), self.len)?;
         let quiet = ((direct_secs - NOISE_SECS) * self.rate_hz).clamp(0.0, self.len as f64) as usize;
-        let spectrum = self.spectrum(reflected)?;
-        let reflected = self.signal(&spectrum, |_| Complex::new(1.0, 0.0))?;
+        let spectrum = self.signal_spectrum(reflected)?;
+        let reflected = self.filtered_signal(&spectrum, |_| Complex::new(1.0, 0.0))?;
         self.noise.0 += quiet;
         self.noise.1 += reflected[..quiet].iter().map(|x| x.f64().powi(2)).sum::<f64>();
         if reflected_secs - direct_secs < LEAST_SEPARATION_SECS || !(direct_secs + reflected_secs).is_finite() {
             return Ok(false);
         }
-        let spectrum = self.spectrum(direct)?;
-        let direct = self.signal(&spectrum, |_| Complex::new(1.0, 0.0))?;
-        let derivative = self.signal(&spectrum, |bin| Complex::new(0.0, angle(bin, self.len)))?;
+        let spectrum = self.signal_spectrum(direct)?;
+        let direct = self.filtered_signal(&spectrum, |_| Complex::new(1.0, 0.0))?;
+        let derivative = self.filtered_signal(&spectrum, |bin| Complex::new(0.0, bin_angle(bin, self.len)))?;
         let gate = |n: usize| {
             let secs = n as f64 / self.rate_hz - (reflected_secs - GATE_SECS[0]);
             let fall = (secs / (GATE_SECS[0] - GATE_SECS[1])).clamp(0.0, 1.0);
@@ -198,8 +204,8 @@ impl<T: RealSample> ResidualFit<T> {
         if !(determinant > 1e-6 * dd * ss) {
             return Ok(false);
         }
-        self.gains.add((xd * ss - xs * ds) / determinant);
-        self.delays.add((xs * dd - xd * ds) / determinant);
+        self.gains.add_value((xd * ss - xs * ds) / determinant);
+        self.delays.add_value((xs * dd - xd * ds) / determinant);
         Ok(true)
     }
 
@@ -213,7 +219,7 @@ impl<T: RealSample> ResidualFit<T> {
         })
     }
 
-    fn spectrum(&self, signal: &[T]) -> Result<Vec<Complex<T>>, Error> {
+    fn signal_spectrum(&self, signal: &[T]) -> Result<Vec<Complex<T>>, Error> {
         let (mut signal, mut spectrum) = (signal.to_vec(), self.forward.make_output_vec());
         let done = self.forward.process(&mut signal, &mut spectrum);
         let finite = done.is_ok() && spectrum.first().is_some_and(|dc| dc.re.f64().is_finite());
@@ -221,7 +227,11 @@ impl<T: RealSample> ResidualFit<T> {
     }
 
     // Within the sweep's range, times a factor of each bin.
-    fn signal(&self, spectrum: &[Complex<T>], factor: impl Fn(usize) -> Complex<f64>) -> Result<Vec<T>, Error> {
+    fn filtered_signal(
+        &self,
+        spectrum: &[Complex<T>],
+        factor: impl Fn(usize) -> Complex<f64>,
+    ) -> Result<Vec<T>, Error> {
         let bins = spectrum.iter().zip(&self.bin_gains).enumerate();
         let mut filtered: Vec<_> = bins
             .map(|(bin, (x, gain))| {
@@ -241,12 +251,12 @@ impl<T: RealSample> ResidualFit<T> {
 }
 
 /// Returns a bin's angle per sample, by which a derivative multiplies it; half of the rate has none.
-pub(crate) fn angle(bin: usize, len: usize) -> f64 {
+pub(crate) fn bin_angle(bin: usize, len: usize) -> f64 {
     if 2 * bin == len { 0.0 } else { std::f64::consts::TAU * bin as f64 / len as f64 }
 }
 
 impl ErrorSums {
-    fn add(&mut self, value: f64) {
+    fn add_value(&mut self, value: f64) {
         self.count += 1;
         self.sum += value;
         self.squares += value * value;
@@ -260,7 +270,7 @@ impl ErrorSums {
 
 impl EnergySensitivity {
     /// Sums the sensitivities of bands to that of their sum.
-    pub fn total(bands: &[Self]) -> Self {
+    pub fn sum_of_bands(bands: &[Self]) -> Self {
         bands.iter().fold(Self::default(), |a, b| Self {
             energy: a.energy + b.energy,
             gain: a.gain + b.gain,
@@ -385,10 +395,10 @@ mod tests {
     fn energies_change_as_told_by_gain_and_delay() {
         let plan = DerivationPlan::new(LEN, RATE_HZ, &[2.5e3, 5e3, 10e3, 20e3, 40e3]).expect("a plan");
         let (direct, reflected) = (pulse(80.0), sum(&pulse(84.3), 0.2, &pulse(120.0)));
-        let mut scratch = plan.scratch();
+        let mut scratch = plan.make_scratch();
         let mut sensitivities = |signal: &[f64]| {
             let mut found = [EnergySensitivity::default(); 5];
-            plan.sensitivities(signal, &direct, |_| 0.01, &mut found, &mut scratch).expect("sensitivities");
+            plan.compute_sensitivities(signal, &direct, |_| 0.01, &mut found, &mut scratch).expect("sensitivities");
             found
         };
         let before = sensitivities(&reflected);
@@ -420,7 +430,7 @@ mod tests {
             let left = sum(&sum(&pulse(80.0 + delay), 0.005, &direct), -1.0, &direct);
             let mut reflected = sum(&left, 0.7, &pulse(at));
             reflected.iter_mut().enumerate().for_each(|(n, x)| *x += noise(n, pair));
-            assert_eq!(fit.add(&reflected, &direct, 80.0 / RATE_HZ, at / RATE_HZ), Ok(true));
+            assert_eq!(fit.add_pair(&reflected, &direct, 80.0 / RATE_HZ, at / RATE_HZ), Ok(true));
         }
         let found = fit.finish().expect("40 pairs");
         assert!((found.delay.mean - 0.02).abs() < 0.001, "{found:?}");
@@ -434,11 +444,11 @@ mod tests {
         let mut fit = ResidualFit::<f64>::new(LEN, RATE_HZ, RANGE_HZ).expect("a fit");
         let direct = pulse(80.0);
         for _ in 1..LEAST_PAIRS {
-            assert_eq!(fit.add(&direct, &direct, 80.0 / RATE_HZ, 160.0 / RATE_HZ), Ok(true));
+            assert_eq!(fit.add_pair(&direct, &direct, 80.0 / RATE_HZ, 160.0 / RATE_HZ), Ok(true));
         }
-        assert_eq!(fit.add(&direct, &direct, 80.0 / RATE_HZ, 110.0 / RATE_HZ), Ok(false));
-        assert_eq!(fit.add(&[0.0; LEN], &[0.0; LEN], 80.0 / RATE_HZ, 160.0 / RATE_HZ), Ok(false));
-        assert!(matches!(fit.add(&direct[1..], &direct, 0.0, 0.001), Err(Error::Length { .. })));
+        assert_eq!(fit.add_pair(&direct, &direct, 80.0 / RATE_HZ, 110.0 / RATE_HZ), Ok(false));
+        assert_eq!(fit.add_pair(&[0.0; LEN], &[0.0; LEN], 80.0 / RATE_HZ, 160.0 / RATE_HZ), Ok(false));
+        assert!(matches!(fit.add_pair(&direct[1..], &direct, 0.0, 0.001), Err(Error::Length { .. })));
         assert!(fit.finish().is_none());
         for (len, rate_hz, range_hz) in [(0, RATE_HZ, RANGE_HZ), (9, f64::NAN, RANGE_HZ), (9, RATE_HZ, [2e3, 50e3])] {
             assert!(ResidualFit::<f32>::new(len, rate_hz, range_hz).is_err());

@@ -8,10 +8,10 @@ use crate::RealSample;
 ///
 /// ```
 /// let mut reflected = [0.0; 2];
-/// echolake_dsp::foam::subtract(&[1.0, 2.0], &[1.0, 0.5], &mut reflected);
+/// echolake_dsp::foam::subtract_foam(&[1.0, 2.0], &[1.0, 0.5], &mut reflected);
 /// assert_eq!(reflected, [0.0, 1.5]);
 /// ```
-pub fn subtract<T: RealSample>(ir: &[T], foam: &[T], out: &mut [T]) {
+pub fn subtract_foam<T: RealSample>(ir: &[T], foam: &[T], out: &mut [T]) {
     out.iter_mut().zip(ir.iter().zip(foam)).for_each(|(out, (ir, foam))| *out = *ir - *foam);
 }
 
@@ -22,7 +22,7 @@ mod tests {
     #[test]
     fn the_difference_is_taken_sample_by_sample() {
         let mut out = [f64::NAN; 3];
-        subtract(&[3.0, 2.0, 1.0], &[1.0, 2.0, 4.0], &mut out);
+        subtract_foam(&[3.0, 2.0, 1.0], &[1.0, 2.0, 4.0], &mut out);
         assert_eq!(out, [2.0, 0.0, -3.0]);
     }
 }

@@ -42,7 +42,7 @@ const LOADING: f64 = 1e-4;
 ///     ir
 /// };
 /// for _ in 0..24 {
-///     assert!(fit.add(&response(0.04), &response(0.84), 80.0 / 96e3, 160.0 / 96e3)?);
+///     assert!(fit.add_pair(&response(0.04), &response(0.84), 80.0 / 96e3, 160.0 / 96e3)?);
 /// }
 /// let reflection = fit.finish().ok_or("24 pairs are enough")?;
 /// let mut direct = vec![0.0; 384];
@@ -99,7 +99,7 @@ impl<T: RealSample> FoamReflectionFit<T> {
     ///
     /// # Errors
     /// [`Error::Length`] or [`Error::NotFinite`].
-    pub fn add(&mut self, foam: &[T], flat: &[T], direct_secs: f64, reflected_secs: f64) -> Result<bool, Error> {
+    pub fn add_pair(&mut self, foam: &[T], flat: &[T], direct_secs: f64, reflected_secs: f64) -> Result<bool, Error> {
         check_len("Foam's response", foam.len(), self.len)?;
         check_len("Flat's response", flat.len(), self.len)?;
         let inside = (reflected_secs + FILTER_SECS[1]) * self.rate_hz < self.len as f64;
@@ -245,7 +245,7 @@ mod tests {
         let mut fitted = 0;
         for (direct, reflected) in arrivals() {
             let (foam, flat) = (response(direct, reflected, &foam), response(direct, reflected, &flat));
-            let added = fit.add(&foam, &flat, direct / RATE_HZ, reflected / RATE_HZ).expect("added");
+            let added = fit.add_pair(&foam, &flat, direct / RATE_HZ, reflected / RATE_HZ).expect("added");
             fitted += usize::from(added);
         }
         let reflection = fit.finish().expect("an estimate");
@@ -269,7 +269,7 @@ mod tests {
         let fit = |pairs: usize, flat: f64| {
             let mut fit = FoamReflectionFit::<f64>::new(LEN, RATE_HZ).expect("a fit");
             for _ in 0..pairs {
-                let added = fit.add(&responses(0.05), &responses(flat), 60.0 / RATE_HZ, 120.0 / RATE_HZ);
+                let added = fit.add_pair(&responses(0.05), &responses(flat), 60.0 / RATE_HZ, 120.0 / RATE_HZ);
                 assert_eq!(added, Ok(true));
             }
             fit.finish()
@@ -284,13 +284,17 @@ mod tests {
         let mut fit = FoamReflectionFit::<f64>::new(LEN, RATE_HZ).expect("a fit");
         let (foam, flat) = (response(60.0, 90.0, &[(0.0, 0.1)]), response(60.0, 90.0, &[(0.0, 0.8)]));
         for [direct, reflected] in [[60.0, 90.0], [60.0, 360.0], [f64::NAN, 120.0]] {
-            assert_eq!(fit.add(&foam, &flat, direct / RATE_HZ, reflected / RATE_HZ), Ok(false), "{direct} {reflected}");
+            assert_eq!(
+                fit.add_pair(&foam, &flat, direct / RATE_HZ, reflected / RATE_HZ),
+                Ok(false),
+                "{direct} {reflected}"
+            );
         }
         let mut broken = foam.clone();
         broken[200] = f64::NAN;
-        let result = fit.add(&broken, &flat, 60.0 / RATE_HZ, 120.0 / RATE_HZ);
+        let result = fit.add_pair(&broken, &flat, 60.0 / RATE_HZ, 120.0 / RATE_HZ);
         assert!(matches!(result, Err(Error::NotFinite { .. })), "{result:?}");
-        assert!(matches!(fit.add(&foam[1..], &flat, 0.0, 0.001), Err(Error::Length { .. })));
+        assert!(matches!(fit.add_pair(&foam[1..], &flat, 0.0, 0.001), Err(Error::Length { .. })));
         assert_eq!(fit.pairs, 0);
         assert!(FoamReflectionFit::<f32>::new(0, RATE_HZ).is_err() && FoamReflectionFit::<f32>::new(9, 1e3).is_err());
     }

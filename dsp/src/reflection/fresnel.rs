@@ -1,6 +1,6 @@
 //! The first Fresnel zone of a reflection in the plane z = 0.
 
-use crate::geometry::{across, image_mm, specular_point};
+use crate::geometry::{horizontal_mm, image_mm, specular_point};
 
 /// An ellipse in the plane z = 0.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -31,7 +31,7 @@ pub fn first_fresnel_zone(
     speed_of_sound_m_s: f64,
 ) -> FresnelZone {
     let (from, to) = (speaker[2], microphone[2]);
-    let distance = across(microphone, speaker);
+    let distance = horizontal_mm(microphone, speaker);
     let excess = speed_of_sound_m_s * 1e3 / frequency_hz / 2.0;
     let path = image_mm(microphone, speaker) + excess;
     let k = from * from - to * to - distance * distance;
@@ -58,7 +58,7 @@ mod tests {
     fn the_rim_is_half_a_wavelength_longer() {
         let (microphone, speaker) = ([-100.0, 30.0, 124.0], [150.0, -60.0, 304.0]);
         let zone = first_fresnel_zone(microphone, speaker, 5_000.0, 343.0);
-        let d = across(microphone, speaker);
+        let d = horizontal_mm(microphone, speaker);
         let [ux, uy] = [(microphone[0] - speaker[0]) / d, (microphone[1] - speaker[1]) / d];
         let ends = [
             (zone.semi_major_mm * ux, zone.semi_major_mm * uy),

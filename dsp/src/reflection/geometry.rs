@@ -2,7 +2,7 @@
 
 /// Length of the direct path, mm.
 pub fn direct_mm(microphone: [f64; 3], speaker: [f64; 3]) -> f64 {
-    length([0, 1, 2].map(|i| microphone[i] - speaker[i]))
+    vector_length([0, 1, 2].map(|i| microphone[i] - speaker[i]))
 }
 
 /// Length of the path by the speaker's mirror image, mm.
@@ -15,12 +15,12 @@ pub fn direct_mm(microphone: [f64; 3], speaker: [f64; 3]) -> f64 {
 /// assert_eq!(specular_point(microphone, speaker), [15.0, 0.0]);
 /// ```
 pub fn image_mm(microphone: [f64; 3], speaker: [f64; 3]) -> f64 {
-    direct_mm(microphone, mirrored(speaker))
+    direct_mm(microphone, mirrored_point(speaker))
 }
 
 /// Angle of that path against the plane's normal, degrees.
 pub fn incidence_deg(microphone: [f64; 3], speaker: [f64; 3]) -> f64 {
-    across(microphone, speaker).atan2(microphone[2] + speaker[2]).to_degrees()
+    horizontal_mm(microphone, speaker).atan2(microphone[2] + speaker[2]).to_degrees()
 }
 
 /// Point at which that path meets the plane, mm.
@@ -30,15 +30,15 @@ pub fn specular_point(microphone: [f64; 3], speaker: [f64; 3]) -> [f64; 2] {
 }
 
 /// Horizontal distance, mm.
-pub(crate) fn across(microphone: [f64; 3], speaker: [f64; 3]) -> f64 {
+pub(crate) fn horizontal_mm(microphone: [f64; 3], speaker: [f64; 3]) -> f64 {
     (microphone[0] - speaker[0]).hypot(microphone[1] - speaker[1])
 }
 
-fn mirrored([x, y, z]: [f64; 3]) -> [f64; 3] {
+fn mirrored_point([x, y, z]: [f64; 3]) -> [f64; 3] {
     [x, y, -z]
 }
 
-fn length(d: [f64; 3]) -> f64 {
+fn vector_length(d: [f64; 3]) -> f64 {
     d.iter().map(|x| x * x).sum::<f64>().sqrt()
 }
 

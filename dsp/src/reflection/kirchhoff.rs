@@ -46,7 +46,7 @@ const DB_PER_NEPER: f64 = 20.0 * std::f64::consts::LOG10_E;
 /// let flat = HeightField::from_fn(585.0, 32, |_, _| 0.0);
 /// let plan = KirchhoffPlan::new(&flat, 96e3, 384);
 /// let down = |x| TransducerPose { position_mm: [x, 0.0, 200.0], axis: [0.0, 0.0, -1.0] };
-/// let (one, none) = (plan.filter(|_| 1.0.into()), plan.filter(|_| 0.0.into()));
+/// let (one, none) = (plan.spectrum_at_bins(|_| 1.0.into()), plan.spectrum_at_bins(|_| 0.0.into()));
 /// let path = SoundPath {
 ///     microphone: down(-100.0),
 ///     speaker: down(100.0),
@@ -56,7 +56,7 @@ const DB_PER_NEPER: f64 = 20.0 * std::f64::consts::LOG10_E;
 ///     reflection: &none,
 /// };
 /// let mut ir = [0.0; 384];
-/// plan.response(&path, &mut plan.scratch(), &mut ir)?;
+/// plan.compute_response(&path, &mut plan.make_scratch(), &mut ir)?;
 /// // Without a reflection, the direct sound alone: 0.2 m at 343 m/s are 56 samples.
 /// assert_eq!((0..384).max_by(|a, b| ir[*a].total_cmp(&ir[*b])), Some(56));
 /// # Ok::<(), echolake_dsp::Error>(())
@@ -113,7 +113,7 @@ pub struct SoundPath<'a> {
     pub speed_of_sound_m_s: f64,
     /// The air's absorption at a frequency in Hz, dB/m.
     pub absorption_db_per_m: &'a dyn Fn(f64) -> f64,
-    /// Spectrum of the direct sound, a filter of [`KirchhoffPlan::filter`].
+    /// Spectrum of the direct sound, a filter of [`KirchhoffPlan::spectrum_at_bins`].
     pub direct: &'a [Complex<f32>],
     /// Spectrum of the reflection, the relief's reflection factor included.
     pub reflection: &'a [Complex<f32>],
@@ -192,9 +192,9 @@ impl KirchhoffPlan {
             len,
             forward: f32::plan_real_forward(len * OVERSAMPLING),
             inverse: f32::plan_real_inverse(len),
-            fade: bins.clone().map(|k| fade(share(k)) as f32).collect(),
-            correction: bins.clone().map(|k| correction(share(k)) as f32).collect(),
-            interpolation: bins.map(|k| interpolation(share(k))).collect(),
+            fade: bins.clone().map(|k| fade_gain(share(k)) as f32).collect(),
+            correction: bins.clone().map(|k| deposit_correction(share(k)) as f32).collect(),
+            interpolation: bins.map(|k| interpolation_weights(share(k))).collect(),
         }
     }
 
@@ -217,13 +217,13 @@ impl KirchhoffPlan {
     }
 
     /// Values of a spectrum at the bins of a response.
-    pub fn filter(&self, at_hz: impl Fn(f64) -> Complex<f64>) -> Vec<Complex<f32>> {
+    pub fn spectrum_at_bins(&self, at_hz: impl Fn(f64) -> Complex<f64>) -> Vec<Complex<f32>> {
         let value = |k: usize| at_hz(self.frequency_hz(k));
         (0..self.len / 2 + 1).map(value).map(|x| Complex::new(x.re as f32, x.im as f32)).collect()
     }
 
-    /// Buffers for [`Self::response`]; one per thread.
-    pub fn scratch(&self) -> KirchhoffScratch {
+    /// Buffers for [`Self::compute_response`]; one per thread.
+    pub fn make_scratch(&self) -> KirchhoffScratch {
         let wide = self.len * OVERSAMPLING;
         KirchhoffScratch {
             derivative: vec![f32x4::ZERO; wide],
@@ -242,7 +242,12 @@ impl KirchhoffPlan {
     ///
     /// # Errors
     /// [`Error::Length`] if `out`, `scratch` or a filter is not the plan's; `out` is left as it was.
-    pub fn response(&self, path: &SoundPath<'_>, scratch: &mut KirchhoffScratch, out: &mut [f32]) -> Result<(), Error> {
+    pub fn compute_response(
+        &self,
+        path: &SoundPath<'_>,
+        scratch: &mut KirchhoffScratch,
+        out: &mut [f32],
+    ) -> Result<(), Error> {
         check_len("the response", out.len(), self.len)?;
         check_len("the scratch", scratch.wide.len(), self.len * OVERSAMPLING)?;
         check_len("the direct sound's filter", path.direct.len(), self.fade.len())?;
@@ -250,9 +255,9 @@ impl KirchhoffPlan {
         let per_metre = self.rate_hz * OVERSAMPLING as f64 / path.speed_of_sound_m_s;
         scratch.derivative.fill(f32x4::ZERO);
         scratch.plain.fill(0.0);
-        self.gather(path, per_metre as f32, scratch);
-        absorb(&mut scratch.derivative, self.attenuation(path, per_metre));
-        self.transform(path, scratch);
+        self.gather_facets(path, per_metre as f32, scratch);
+        absorb_weights(&mut scratch.derivative, self.step_attenuation(path, per_metre));
+        self.transform_pulses(path, scratch);
         self.add_direct(path, scratch);
         // Lengths are the plan's own, so the transform cannot refuse; it asks for real ends only.
         scratch.narrow[0].im = 0.0;
@@ -267,13 +272,13 @@ impl KirchhoffPlan {
         bin as f64 * self.rate_hz / self.len as f64
     }
 
-    fn gather(&self, path: &SoundPath<'_>, per_metre: f32, scratch: &mut KirchhoffScratch) {
+    fn gather_facets(&self, path: &SoundPath<'_>, per_metre: f32, scratch: &mut KirchhoffScratch) {
         let KirchhoffScratch { derivative, plain, .. } = scratch;
         let ends = [ViewPoint::from_pose(path.microphone), ViewPoint::from_pose(path.speaker)];
         let last = plain.len() - 2;
         let end = f32x8::splat((last + 1) as f32);
         for group in &self.facets.groups {
-            let weights = group.weights(ends, self.scattering);
+            let weights = group.facet_weights(ends, self.scattering);
             let arrival = weights.path * per_metre;
             let index = arrival.fast_trunc_int();
             let after = arrival - f32x8::from_i32x8(index);
@@ -294,7 +299,10 @@ impl KirchhoffPlan {
                 let (here, after) = (here[lane], after[lane]);
                 *plain += levels[lane] * here;
                 *plain_after += levels[lane] * after;
-                let (a, b) = (self.microphone.gains(from_microphone[lane]), self.speaker.gains(from_speaker[lane]));
+                let (a, b) = (
+                    self.microphone.gains_towards(from_microphone[lane]),
+                    self.speaker.gains_towards(from_speaker[lane]),
+                );
                 let weight = slopes[lane] * a * b;
                 *sum += weight * here;
                 *sum_after += weight * after;
@@ -303,13 +311,13 @@ impl KirchhoffPlan {
     }
 
     // The factor from one time to the next, in which sound travels on.
-    fn attenuation(&self, path: &SoundPath<'_>, per_metre: f64) -> [f32; NODES] {
+    fn step_attenuation(&self, path: &SoundPath<'_>, per_metre: f64) -> [f32; NODES] {
         let db_per_m = |node| (path.absorption_db_per_m)(node_hz(node, self.rate_hz));
         std::array::from_fn(|node| (-db_per_m(node) / DB_PER_NEPER / per_metre).exp() as f32)
     }
 
     // H(f) = (2 pi i f A(f)/c + B(f)) / sinc^2, which undoes the linear deposit, at the lower rate.
-    fn transform(&self, path: &SoundPath<'_>, scratch: &mut KirchhoffScratch) {
+    fn transform_pulses(&self, path: &SoundPath<'_>, scratch: &mut KirchhoffScratch) {
         let KirchhoffScratch { derivative, plain, wide, spectrum, work, narrow, .. } = scratch;
         // Lengths are the plan's own, so the transforms cannot refuse.
         narrow.fill(Complex::default());
@@ -336,8 +344,8 @@ impl KirchhoffPlan {
         let way: [f64; 3] =
             std::array::from_fn(|i| (path.microphone.position_mm[i] - path.speaker.position_mm[i]) / 1e3);
         let distance = dot(way, way).sqrt();
-        let microphone = self.microphone.gains(direction(-dot(path.microphone.axis, way) / distance));
-        let speaker = self.speaker.gains(direction(dot(path.speaker.axis, way) / distance));
+        let microphone = self.microphone.gains_towards(direction_index(-dot(path.microphone.axis, way) / distance));
+        let speaker = self.speaker.gains_towards(direction_index(dot(path.speaker.axis, way) / distance));
         let gains = (microphone * speaker).to_array();
         for (k, to) in scratch.narrow.iter_mut().enumerate() {
             let hz = self.frequency_hz(k);
@@ -353,7 +361,7 @@ impl KirchhoffPlan {
 impl ReliefFacets {
     fn new(relief: &HeightField) -> Self {
         let cells = relief.cells();
-        let pitch = metres(relief.pitch_mm());
+        let pitch = metres_from_mm(relief.pitch_mm());
         let firsts = (0..cells).flat_map(|iy| (0..cells).step_by(LANES).map(move |first| (first, iy)));
         Self { area: pitch * pitch, groups: firsts.map(|(first, iy)| FacetGroup::new(relief, first, iy)).collect() }
     }
@@ -366,21 +374,21 @@ impl FacetGroup {
             |value: &dyn Fn(usize) -> f32| f32x8::new(std::array::from_fn(|lane| value((first + lane).min(last))));
         Self {
             place: [
-                lanes(&|ix| metres(relief.centre_mm(ix))),
-                lanes(&|_| metres(relief.centre_mm(iy))),
-                lanes(&|ix| metres(relief.at(ix, iy).into())),
+                lanes(&|ix| metres_from_mm(relief.centre_mm(ix))),
+                lanes(&|_| metres_from_mm(relief.centre_mm(iy))),
+                lanes(&|ix| metres_from_mm(relief.cell_height(ix, iy).into())),
             ],
-            slope: [0, 1].map(|axis| lanes(&|ix| relief.gradient(ix, iy)[axis])),
+            slope: [0, 1].map(|axis| lanes(&|ix| relief.gradient_at(ix, iy)[axis])),
             presence: f32x8::new(std::array::from_fn(|lane| if first + lane <= last { 1.0 } else { 0.0 })),
         }
     }
 
     #[inline]
-    fn weights(&self, [microphone, speaker]: [ViewPoint; 2], scattering: FacetScattering) -> FacetWeights {
-        let (near, far) = (microphone.view(self), speaker.view(self));
+    fn facet_weights(&self, [microphone, speaker]: [ViewPoint; 2], scattering: FacetScattering) -> FacetWeights {
+        let (near, far) = (microphone.view_facets(self), speaker.view_facets(self));
         let [derivative, plain] = match scattering {
             FacetScattering::FacingTangent => facing_tangent(&near, &far),
-            FacetScattering::Blended => blended(&near, &far),
+            FacetScattering::Blended => blended_weights(&near, &far),
         };
         let product = near.nearness * far.nearness * self.presence;
         FacetWeights {
@@ -404,7 +412,7 @@ impl DirectivityTable {
     }
 
     #[inline]
-    fn gains(&self, direction: i32) -> f32x4 {
+    fn gains_towards(&self, direction: i32) -> f32x4 {
         self.0[(direction as usize).min(DIRECTIONS - 1)]
     }
 }
@@ -412,13 +420,13 @@ impl DirectivityTable {
 impl ViewPoint {
     fn from_pose(pose: TransducerPose) -> Self {
         Self {
-            position: pose.position_mm.map(|x| f32x8::splat(metres(x))),
+            position: pose.position_mm.map(|x| f32x8::splat(metres_from_mm(x))),
             axis: pose.axis.map(|x| f32x8::splat(x as f32)),
         }
     }
 
     #[inline]
-    fn view(&self, facets: &FacetGroup) -> FacetView {
+    fn view_facets(&self, facets: &FacetGroup) -> FacetView {
         let [px, py, pz] = self.position;
         let [x, y, z] = facets.place;
         let (dx, dy, dz) = (px - x, py - y, pz - z);
@@ -440,22 +448,22 @@ impl ViewPoint {
 
 // Weights of the derivative and of the plain pulse, but for 1/(r1 r2).
 #[inline]
-fn tangent(a: &FacetView, b: &FacetView) -> [f32x8; 2] {
+fn tangent_weights(a: &FacetView, b: &FacetView) -> [f32x8; 2] {
     [a.cosine + b.cosine, a.cosine * a.nearness + b.cosine * b.nearness]
 }
 
 #[inline]
 fn facing_tangent(a: &FacetView, b: &FacetView) -> [f32x8; 2] {
     let faces = a.cosine.fast_min(b.cosine).simd_gt(f32x8::ZERO);
-    let [derivative, plain] = tangent(a, b);
+    let [derivative, plain] = tangent_weights(a, b);
     [derivative & faces, plain & faces]
 }
 
 #[inline]
-fn blended(a: &FacetView, b: &FacetView) -> [f32x8; 2] {
+fn blended_weights(a: &FacetView, b: &FacetView) -> [f32x8; 2] {
     let along = a.way[0] * b.way[0] + a.way[1] * b.way[1];
     let small_slope = 4.0 * (1.0 + along) / (a.way[2] + b.way[2]).fast_max(f32x8::splat(LEAST_RISE));
-    let [derivative, plain] = tangent(a, b);
+    let [derivative, plain] = tangent_weights(a, b);
     [0.5 * (derivative + small_slope), 0.5 * (plain + small_slope * 0.5 * (a.nearness + b.nearness))]
 }
 
@@ -470,11 +478,11 @@ fn first_two<T>(values: &mut [T]) -> Option<&mut [T; 2]> {
 }
 
 // Place of a cosine in a directivity table.
-fn direction(cosine: f64) -> i32 {
+fn direction_index(cosine: f64) -> i32 {
     ((1.0 - cosine as f32) * HALF_DIRECTIONS + 0.5) as i32
 }
 
-fn metres(mm: f64) -> f32 {
+fn metres_from_mm(mm: f64) -> f32 {
     (mm / 1e3) as f32
 }
 
@@ -492,7 +500,7 @@ fn node_square(node: usize) -> f64 {
 }
 
 // Weights of the nodes at a frequency: the polynomial of its square through them.
-fn interpolation(frequency_over_rate: f64) -> [f32; NODES] {
+fn interpolation_weights(frequency_over_rate: f64) -> [f32; NODES] {
     let square = (frequency_over_rate / HIGHEST_NODE).min(1.0).powi(2);
     let factor = |node, other| (square - node_square(other)) / (node_square(node) - node_square(other));
     let others = |node| (0..NODES).filter(move |other| *other != node);
@@ -500,7 +508,7 @@ fn interpolation(frequency_over_rate: f64) -> [f32; NODES] {
 }
 
 // Sound that arrives later has come farther.
-fn absorb(weights: &mut [f32x4], per_step: [f32; NODES]) {
+fn absorb_weights(weights: &mut [f32x4], per_step: [f32; NODES]) {
     let mut left = f32x4::ONE;
     for weight in weights {
         *weight *= left;
@@ -509,14 +517,14 @@ fn absorb(weights: &mut [f32x4], per_step: [f32; NODES]) {
 }
 
 // 1/sinc^2 of the linear deposit.
-fn correction(frequency_over_rate: f64) -> f64 {
+fn deposit_correction(frequency_over_rate: f64) -> f64 {
     let x = PI * frequency_over_rate / OVERSAMPLING as f64;
     let sinc = if x == 0.0 { 1.0 } else { x.sin() / x };
     1.0 / (sinc * sinc)
 }
 
 // A half-cosine from the pass edge to half the sampling rate.
-fn fade(frequency_over_rate: f64) -> f64 {
+fn fade_gain(frequency_over_rate: f64) -> f64 {
     let share = ((frequency_over_rate - PASS) / (0.5 - PASS)).clamp(0.0, 1.0);
     0.5 + 0.5 * (PI * share).cos()
 }
@@ -562,7 +570,8 @@ mod tests {
     const DIRECT: Conditions = Conditions { direct: 1.0, reflection: 0.0, db_per_m: 0.0 };
 
     fn response(plan: &KirchhoffPlan, [microphone, speaker]: [[f64; 3]; 2], conditions: Conditions) -> Vec<f32> {
-        let [direct, reflection] = [conditions.direct, conditions.reflection].map(|gain| plan.filter(|_| gain.into()));
+        let [direct, reflection] =
+            [conditions.direct, conditions.reflection].map(|gain| plan.spectrum_at_bins(|_| gain.into()));
         let path = SoundPath {
             microphone: pose(microphone),
             speaker: pose(speaker),
@@ -572,7 +581,7 @@ mod tests {
             reflection: &reflection,
         };
         let mut out = vec![0.0; plan.len()];
-        plan.response(&path, &mut plan.scratch(), &mut out).expect("a response");
+        plan.compute_response(&path, &mut plan.make_scratch(), &mut out).expect("a response");
         out
     }
 
@@ -653,7 +662,7 @@ mod tests {
         let plate = HeightField::from_fn(PANEL_SIZE_MM, 20, |_, _| 0.0);
         let [plan, longer] = [256, 512].map(|len| KirchhoffPlan::new(&plate, RATE, len));
         let respond = |filters: &KirchhoffPlan, scratch: &mut KirchhoffScratch, len: usize| {
-            let filter = filters.filter(|_| 1.0.into());
+            let filter = filters.spectrum_at_bins(|_| 1.0.into());
             let path = SoundPath {
                 microphone: pose([0.0, 0.0, 124.0]),
                 speaker: pose([0.0, 150.0, 124.0]),
@@ -663,16 +672,16 @@ mod tests {
                 reflection: &filter,
             };
             let mut out = vec![7.0; len];
-            let outcome = plan.response(&path, scratch, &mut out);
+            let outcome = plan.compute_response(&path, scratch, &mut out);
             (outcome, out.iter().all(|x| *x == 7.0))
         };
         let refused = |actual, expected, what| (Err(Error::Length { what, actual, expected }), true);
         for len in [0, 1, 255, 257, 512] {
-            assert_eq!(respond(&plan, &mut plan.scratch(), len), refused(len, 256, "the response"));
+            assert_eq!(respond(&plan, &mut plan.make_scratch(), len), refused(len, 256, "the response"));
         }
-        assert_eq!(respond(&plan, &mut longer.scratch(), 256), refused(4_096, 2_048, "the scratch"));
-        assert_eq!(respond(&longer, &mut plan.scratch(), 256), refused(257, 129, "the direct sound's filter"));
-        assert_eq!(respond(&plan, &mut plan.scratch(), 256), (Ok(()), false));
+        assert_eq!(respond(&plan, &mut longer.make_scratch(), 256), refused(4_096, 2_048, "the scratch"));
+        assert_eq!(respond(&longer, &mut plan.make_scratch(), 256), refused(257, 129, "the direct sound's filter"));
+        assert_eq!(respond(&plan, &mut plan.make_scratch(), 256), (Ok(()), false));
     }
 
     const BESIDE: [[f64; 3]; 2] = [[0.0, 0.0, 124.0], [0.0, 150.0, 124.0]];

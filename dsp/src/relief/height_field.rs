@@ -60,19 +60,19 @@ impl HeightField {
     }
 
     /// Height of a cell, mm.
-    pub fn at(&self, ix: usize, iy: usize) -> f32 {
+    pub fn cell_height(&self, ix: usize, iy: usize) -> f32 {
         self.heights_mm[iy * self.cells + ix]
     }
 
     /// Slope of a cell along x and y, from its neighbours.
-    pub fn gradient(&self, ix: usize, iy: usize) -> [f32; 2] {
+    pub fn gradient_at(&self, ix: usize, iy: usize) -> [f32; 2] {
         let last = self.cells - 1;
         let pitch = self.pitch_mm() as f32;
         let (left, right) = (ix.saturating_sub(1), (ix + 1).min(last));
         let (below, above) = (iy.saturating_sub(1), (iy + 1).min(last));
         [
-            (self.at(right, iy) - self.at(left, iy)) / (pitch * (right - left) as f32),
-            (self.at(ix, above) - self.at(ix, below)) / (pitch * (above - below) as f32),
+            (self.cell_height(right, iy) - self.cell_height(left, iy)) / (pitch * (right - left) as f32),
+            (self.cell_height(ix, above) - self.cell_height(ix, below)) / (pitch * (above - below) as f32),
         ]
     }
 
@@ -84,7 +84,7 @@ impl HeightField {
             (low, at - low as f64)
         };
         let ((ix, u), (iy, v)) = (position(x_mm), position(y_mm));
-        let h = |i, j| f64::from(self.at(i, j));
+        let h = |i, j| f64::from(self.cell_height(i, j));
         let lower = h(ix, iy) * (1.0 - u) + h(ix + 1, iy) * u;
         let upper = h(ix, iy + 1) * (1.0 - u) + h(ix + 1, iy + 1) * u;
         lower * (1.0 - v) + upper * v
@@ -101,7 +101,7 @@ impl HeightField {
         for iy in 0..cells {
             let mut row = 0.0;
             for ix in 0..cells {
-                row += f64::from(self.at(ix, iy));
+                row += f64::from(self.cell_height(ix, iy));
                 sums[(iy + 1) * (cells + 1) + ix + 1] = sums[iy * (cells + 1) + ix + 1] + row;
             }
         }
@@ -114,7 +114,7 @@ impl HeightField {
                 let inside = sum(columns.end, rows.end) - sum(columns.start, rows.end) - sum(columns.end, rows.start)
                     + sum(columns.start, rows.start);
                 let mean = inside / (columns.len() * rows.len()) as f64;
-                squares += (f64::from(self.at(ix, iy)) - mean).powi(2);
+                squares += (f64::from(self.cell_height(ix, iy)) - mean).powi(2);
             }
         }
         (squares / (cells * cells) as f64).sqrt()
@@ -170,7 +170,7 @@ mod tests {
     fn a_plane_keeps_its_slope_and_heights() {
         let plane = HeightField::from_fn(100.0, 50, |x, y| 0.1 * x - 0.2 * y);
         for (ix, iy) in [(0, 0), (10, 30), (49, 49)] {
-            let [dx, dy] = plane.gradient(ix, iy);
+            let [dx, dy] = plane.gradient_at(ix, iy);
             assert!((dx - 0.1).abs() < 1e-5 && (dy + 0.2).abs() < 1e-5, "{dx} {dy}");
         }
         assert!((plane.height_at(12.3, -4.5) - (1.23 + 0.9)).abs() < 1e-4);

@@ -4,20 +4,20 @@ use echolake_schema::Symmetry;
 
 use crate::Error;
 
-/// Moves a square map of heights as [`Symmetry::apply`] moves points about its centre: the height at p moves to M p.
+/// Moves a square map of heights as [`Symmetry::move_position`] moves points about its centre: the height at p moves to M p.
 ///
 /// heights, out  `[side x side]`, row by row along x, y ascending
 ///
 /// ```
 /// let mut turned = [0; 4];
-/// echolake_dsp::heights::moved(&[1, 2, 3, 4], echolake_schema::Symmetry::Rot90, &mut turned)?;
+/// echolake_dsp::heights::move_heights(&[1, 2, 3, 4], echolake_schema::Symmetry::Rot90, &mut turned)?;
 /// assert_eq!(turned, [3, 1, 4, 2]);
 /// # Ok::<(), echolake_dsp::Error>(())
 /// ```
 ///
 /// # Errors
 /// [`Error::Setting`] if they are no square, [`Error::Length`] if `out` is not as long.
-pub fn moved<T: Copy>(heights: &[T], symmetry: Symmetry, out: &mut [T]) -> Result<(), Error> {
+pub fn move_heights<T: Copy>(heights: &[T], symmetry: Symmetry, out: &mut [T]) -> Result<(), Error> {
     let side = heights.len().isqrt();
     if side * side != heights.len() {
         let actual = format!("{} values", heights.len());
@@ -59,7 +59,7 @@ const GREYS: [f32; 2] = [18.0, 250.0];
 ///
 /// # Errors
 /// [`Error::Setting`] if they are no square.
-pub fn shaded(heights: &[f32], pitch_mm: f32) -> Result<Vec<u8>, Error> {
+pub fn shade_heights(heights: &[f32], pitch_mm: f32) -> Result<Vec<u8>, Error> {
     let side = heights.len().isqrt();
     if side * side != heights.len() {
         let actual = format!("{} values", heights.len());
@@ -90,16 +90,16 @@ mod tests {
     fn light_comes_from_the_upper_left() {
         // A ridge along y in the middle of seven columns.
         let heights: Vec<f32> = (0..49).map(|i| if i % 7 == 3 { 5.0 } else { 0.0 }).collect();
-        let pixels = shaded(&heights, 5.0).expect("a square");
+        let pixels = shade_heights(&heights, 5.0).expect("a square");
         let row = &pixels[21..28];
         assert!(row[2] > row[0], "its left side faces the light: {row:?}");
         assert!(row[4] < row[0], "its right side turns away: {row:?}");
         assert_eq!(row[0], (SHADE + LIT * LIGHT[2]) as u8, "level ground");
         // What is higher in the picture has a greater y: a slope down towards smaller y turns away from the light.
         let slope: Vec<f32> = (0..49).map(|i| (i / 7) as f32 * 5.0).collect();
-        assert!(shaded(&slope, 5.0).expect("a square")[24] < row[0]);
-        assert!(shaded(&[0.0; 3], 1.0).is_err());
-        assert_eq!(shaded(&[], 1.0).expect("nothing"), Vec::<u8>::new());
+        assert!(shade_heights(&slope, 5.0).expect("a square")[24] < row[0]);
+        assert!(shade_heights(&[0.0; 3], 1.0).is_err());
+        assert_eq!(shade_heights(&[], 1.0).expect("nothing"), Vec::<u8>::new());
     }
 
     #[test]
@@ -109,9 +109,9 @@ mod tests {
             let centre = (side as f64 - 1.0) / 2.0;
             for symmetry in Symmetry::ALL {
                 let mut after = vec![f32::NAN; heights.len()];
-                moved(&heights, symmetry, &mut after).expect("a square");
+                move_heights(&heights, symmetry, &mut after).expect("a square");
                 for (x, y) in [(0, 0), (side / 3, 0), (side - 1, side / 2), (side / 2, side - 1)] {
-                    let [u, v, _] = symmetry.apply([x as f64 - centre, y as f64 - centre, 0.0]);
+                    let [u, v, _] = symmetry.move_position([x as f64 - centre, y as f64 - centre, 0.0]);
                     let (to_x, to_y) = ((u + centre).round() as usize, (v + centre).round() as usize);
                     assert_eq!(after[to_y * side + to_x], heights[y * side + x], "{} {side}", symmetry.name());
                 }
@@ -125,13 +125,14 @@ mod tests {
         let heights: Vec<u32> = (0..25).collect();
         let apply = |heights: &[u32], symmetry| {
             let mut out = vec![0; heights.len()];
-            moved(heights, symmetry, &mut out).expect("a square");
+            move_heights(heights, symmetry, &mut out).expect("a square");
             out
         };
         for first in Symmetry::ALL {
             for second in Symmetry::ALL {
-                let point = second.apply(first.apply([1.0, 3.0, 0.0]));
-                let both = Symmetry::ALL.into_iter().find(|s| s.apply([1.0, 3.0, 0.0]) == point).expect("closed");
+                let point = second.move_position(first.move_position([1.0, 3.0, 0.0]));
+                let both =
+                    Symmetry::ALL.into_iter().find(|s| s.move_position([1.0, 3.0, 0.0]) == point).expect("closed");
                 assert_eq!(apply(&apply(&heights, first), second), apply(&heights, both));
             }
         }
@@ -139,8 +140,8 @@ mod tests {
 
     #[test]
     fn what_is_no_square_is_refused() {
-        assert!(moved(&[1.0; 3], Symmetry::Identity, &mut [0.0; 3]).is_err());
-        assert!(moved(&[1.0; 4], Symmetry::Identity, &mut [0.0; 3]).is_err());
-        assert_eq!(moved::<f64>(&[], Symmetry::Rot90, &mut []), Ok(()));
+        assert!(move_heights(&[1.0; 3], Symmetry::Identity, &mut [0.0; 3]).is_err());
+        assert!(move_heights(&[1.0; 4], Symmetry::Identity, &mut [0.0; 3]).is_err());
+        assert_eq!(move_heights::<f64>(&[], Symmetry::Rot90, &mut []), Ok(()));
     }
 }

@@ -18,9 +18,9 @@ const SETTLED: f64 = 1e-10;
 ///
 /// ```
 /// let mut rows = [vec![0.0, 7.0], vec![2.0, 7.0], vec![4.0, 7.0]];
-/// let found = echolake_dsp::components::PrincipalComponents::of(&mut rows, 1)?;
-/// assert!((found.explained()[0] - 1.0).abs() < 1e-9);
-/// assert!((found.distance(0, 2) - 8f64.sqrt()).abs() < 1e-9);
+/// let found = echolake_dsp::components::PrincipalComponents::from_rows(&mut rows, 1)?;
+/// assert!((found.explained_shares()[0] - 1.0).abs() < 1e-9);
+/// assert!((found.row_distance(0, 2) - 8f64.sqrt()).abs() < 1e-9);
 /// # Ok::<(), echolake_dsp::Error>(())
 /// ```
 #[derive(Debug, Clone)]
@@ -41,17 +41,17 @@ impl PrincipalComponents {
     ///
     /// # Errors
     /// [`Error::Length`] if the rows are not equally long.
-    pub fn of(rows: &mut [Vec<f32>], count: usize) -> Result<Self, Error> {
+    pub fn from_rows(rows: &mut [Vec<f32>], count: usize) -> Result<Self, Error> {
         let length = rows.first().map_or(0, Vec::len);
         for row in rows.iter() {
             check_len("a row", row.len(), length)?;
         }
-        let features = centre(rows, length);
+        let features = centre_features(rows, length);
         let n = rows.len();
         let mut gram = vec![0.0; n * n];
         for i in 0..n {
             for j in 0..=i {
-                let product = inner(&rows[i], &rows[j]);
+                let product = inner_product(&rows[i], &rows[j]);
                 gram[i * n + j] = product;
                 gram[j * n + i] = product;
             }
@@ -59,7 +59,7 @@ impl PrincipalComponents {
         let mut left = gram.clone();
         let mut found = Self { features, rows: n, gram, vectors: Vec::new(), values: Vec::new() };
         for _ in 0..count.min(n) {
-            let (value, vector) = leading(&mut left, n);
+            let (value, vector) = take_eigenpair(&mut left, n);
             found.values.push(value);
             found.vectors.push(vector);
         }
@@ -67,12 +67,12 @@ impl PrincipalComponents {
     }
 
     /// Features that all rows have.
-    pub fn features(&self) -> usize {
+    pub fn feature_count(&self) -> usize {
         self.features
     }
 
     /// Rows.
-    pub fn rows(&self) -> usize {
+    pub fn row_count(&self) -> usize {
         self.rows
     }
 
@@ -80,12 +80,12 @@ impl PrincipalComponents {
     ///
     /// # Panics
     /// If there is no such row.
-    pub fn products(&self, row: usize) -> &[f64] {
+    pub fn row_products(&self, row: usize) -> &[f64] {
         &self.gram[row * self.rows..][..self.rows]
     }
 
     /// Share of the variance by component; 0 if nothing varies.
-    pub fn explained(&self) -> Vec<f64> {
+    pub fn explained_shares(&self) -> Vec<f64> {
         let all: f64 = (0..self.rows).map(|i| self.gram[i * self.rows + i]).sum();
         self.values.iter().map(|value| if all > 0.0 { value / all } else { 0.0 }).collect()
     }
@@ -94,7 +94,7 @@ impl PrincipalComponents {
     ///
     /// # Panics
     /// If there is no such row.
-    pub fn position(&self, row: usize) -> Vec<f64> {
+    pub fn row_position(&self, row: usize) -> Vec<f64> {
         let scale = (self.features.max(1) as f64).sqrt();
         let along = |(value, vector): (&f64, &Vec<f64>)| vector[row] * value.max(0.0).sqrt() / scale;
         self.values.iter().zip(&self.vectors).map(along).collect()
@@ -104,7 +104,7 @@ impl PrincipalComponents {
     ///
     /// # Panics
     /// If there are no such rows.
-    pub fn distance(&self, one: usize, other: usize) -> f64 {
+    pub fn row_distance(&self, one: usize, other: usize) -> f64 {
         let at = |i: usize, j: usize| self.gram[i * self.rows + j];
         let square = at(one, one) + at(other, other) - 2.0 * at(one, other);
         (square.max(0.0) / self.features.max(1) as f64).sqrt()
@@ -112,7 +112,7 @@ impl PrincipalComponents {
 }
 
 // Takes each feature's mean off; returns how many are kept. Those that are not make no difference: they become zeros.
-fn centre(rows: &mut [Vec<f32>], length: usize) -> usize {
+fn centre_features(rows: &mut [Vec<f32>], length: usize) -> usize {
     let count = rows.len() as f64;
     let mut features = 0;
     for f in 0..length {
@@ -126,7 +126,7 @@ fn centre(rows: &mut [Vec<f32>], length: usize) -> usize {
     features
 }
 
-fn inner(a: &[f32], b: &[f32]) -> f64 {
+fn inner_product(a: &[f32], b: &[f32]) -> f64 {
     let block = |(a, b): (&[f32], &[f32])| {
         let mut sums = [0.0_f32; LANES];
         let (whole_a, rest_a) = a.as_chunks::<LANES>();
@@ -143,7 +143,7 @@ fn inner(a: &[f32], b: &[f32]) -> f64 {
 }
 
 // The greatest eigenvalue and its vector, by power iteration; takes them out of the matrix.
-fn leading(matrix: &mut [f64], n: usize) -> (f64, Vec<f64>) {
+fn take_eigenpair(matrix: &mut [f64], n: usize) -> (f64, Vec<f64>) {
     // Of the columns, the longest: it is never across all that is left.
     let norm = |column: &[f64]| column.iter().map(|x| x * x).sum::<f64>().sqrt();
     let longest = matrix.chunks_exact(n).max_by(|a, b| norm(a).total_cmp(&norm(b)));
@@ -182,30 +182,30 @@ mod tests {
         let (long, short) = ([3.0, -1.0, -2.0, 0.0], [0.1, 0.1, -0.1, -0.1]);
         let mut rows: Vec<Vec<f32>> =
             (0..4).map(|i| vec![5.0 + 3.0 * long[i] - 4.0 * short[i], 4.0 * long[i] + 3.0 * short[i]]).collect();
-        let found = PrincipalComponents::of(&mut rows, 3).expect("equally long");
-        assert_eq!(found.features(), 2);
+        let found = PrincipalComponents::from_rows(&mut rows, 3).expect("equally long");
+        assert_eq!(found.feature_count(), 2);
         // Both directions have a length of five.
         for (i, along) in long.iter().enumerate() {
             let expected = 5.0 * along.abs() / 2f32.sqrt();
-            assert!((found.position(i)[0].abs() as f32 - expected).abs() < 2e-2, "{:?}", found.position(i));
+            assert!((found.row_position(i)[0].abs() as f32 - expected).abs() < 2e-2, "{:?}", found.row_position(i));
         }
-        let explained = found.explained();
+        let explained = found.explained_shares();
         assert!(explained[0] > 0.99 && (explained.iter().sum::<f64>() - 1.0).abs() < 1e-6, "{explained:?}");
         let apart = 5.0 * f32::hypot(long[0] - long[1], short[0] - short[1]) / 2f32.sqrt();
-        assert!((found.distance(0, 1) as f32 - apart).abs() < 1e-4);
+        assert!((found.row_distance(0, 1) as f32 - apart).abs() < 1e-4);
     }
 
     #[test]
     fn what_is_not_a_number_is_left_out() {
         let mut rows = vec![vec![1.0, f32::NAN, 2.0], vec![3.0, 1.0, 2.0], vec![5.0, 1.0, 2.0]];
-        let found = PrincipalComponents::of(&mut rows, 2).expect("equally long");
-        assert_eq!(found.features(), 2);
-        assert!((found.distance(0, 2) - 4.0 / 2f64.sqrt()).abs() < 1e-6);
-        assert!(PrincipalComponents::of(&mut [vec![1.0], vec![]], 1).is_err());
-        let nothing = PrincipalComponents::of(&mut [], 3).expect("nothing");
-        assert!(nothing.explained().is_empty());
-        let alike = PrincipalComponents::of(&mut [vec![1.0; 9], vec![1.0; 9]], 1).expect("equally long");
-        assert_eq!((alike.explained(), alike.position(0)), (vec![0.0], vec![0.0]));
+        let found = PrincipalComponents::from_rows(&mut rows, 2).expect("equally long");
+        assert_eq!(found.feature_count(), 2);
+        assert!((found.row_distance(0, 2) - 4.0 / 2f64.sqrt()).abs() < 1e-6);
+        assert!(PrincipalComponents::from_rows(&mut [vec![1.0], vec![]], 1).is_err());
+        let nothing = PrincipalComponents::from_rows(&mut [], 3).expect("nothing");
+        assert!(nothing.explained_shares().is_empty());
+        let alike = PrincipalComponents::from_rows(&mut [vec![1.0; 9], vec![1.0; 9]], 1).expect("equally long");
+        assert_eq!((alike.explained_shares(), alike.row_position(0)), (vec![0.0], vec![0.0]));
     }
 
     // The sum in blocks is the sum.
@@ -215,7 +215,7 @@ mod tests {
             let a: Vec<f32> = (0..length).map(|i| (i as f32 * 0.37).sin()).collect();
             let b: Vec<f32> = (0..length).map(|i| (i as f32 * 0.91).cos() + 0.5).collect();
             let plain: f64 = a.iter().zip(&b).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum();
-            assert!((inner(&a, &b) - plain).abs() < 1e-5 * (length as f64).max(1.0), "{length}");
+            assert!((inner_product(&a, &b) - plain).abs() < 1e-5 * (length as f64).max(1.0), "{length}");
         }
     }
 }

@@ -48,7 +48,7 @@ pub fn pearson<T: RealSample>(x: &[T], y: &[T]) -> Result<Option<f64>, Error> {
 ///
 /// ```
 /// let plan = echolake_dsp::correlation::CorrelationPlan::new(4)?;
-/// let later_and_louder = plan.similarity(&[1.0, 2.0, 0.0, 0.0], &[0.0, 0.0, 3.0, 6.0], &mut plan.scratch())?;
+/// let later_and_louder = plan.compute_similarity(&[1.0, 2.0, 0.0, 0.0], &[0.0, 0.0, 3.0, 6.0], &mut plan.make_scratch())?;
 /// assert!(later_and_louder.is_some_and(|x| (x - 1.0).abs() < 1e-9));
 /// # Ok::<(), echolake_dsp::Error>(())
 /// ```
@@ -78,8 +78,8 @@ impl<T: RealSample> CorrelationPlan<T> {
         Ok(Self { len, forward: T::plan_real_forward(padded), inverse: T::plan_real_inverse(padded) })
     }
 
-    /// Buffers for [`Self::similarity`]; one per thread.
-    pub fn scratch(&self) -> CorrelationScratch<T> {
+    /// Buffers for [`Self::compute_similarity`]; one per thread.
+    pub fn make_scratch(&self) -> CorrelationScratch<T> {
         let work = self.forward.get_scratch_len().max(self.inverse.get_scratch_len());
         CorrelationScratch {
             signal: self.forward.make_input_vec(),
@@ -93,8 +93,13 @@ impl<T: RealSample> CorrelationPlan<T> {
     ///
     /// # Errors
     /// [`Error::Length`] or [`Error::NotFinite`].
-    pub fn similarity(&self, x: &[T], y: &[T], scratch: &mut CorrelationScratch<T>) -> Result<Option<f64>, Error> {
-        let scales = [self.scale("the first signal", x)?, self.scale("the second signal", y)?];
+    pub fn compute_similarity(
+        &self,
+        x: &[T],
+        y: &[T],
+        scratch: &mut CorrelationScratch<T>,
+    ) -> Result<Option<f64>, Error> {
+        let scales = [self.signal_scale("the first signal", x)?, self.signal_scale("the second signal", y)?];
         let [Some(x_scale), Some(y_scale)] = scales else { return Ok(None) };
         let CorrelationScratch { signal, spectra, work } = scratch;
         for ((values, scale), spectrum) in [(x, x_scale), (y, y_scale)].into_iter().zip(spectra.iter_mut()) {
@@ -116,7 +121,7 @@ impl<T: RealSample> CorrelationPlan<T> {
     }
 
     // Factor that scales a signal to an energy of 1; None if it has none.
-    fn scale(&self, what: &'static str, signal: &[T]) -> Result<Option<f64>, Error> {
+    fn signal_scale(&self, what: &'static str, signal: &[T]) -> Result<Option<f64>, Error> {
         check_len(what, signal.len(), self.len)?;
         let energy = energy(signal);
         if !energy.is_finite() {
@@ -165,13 +170,13 @@ mod tests {
             let x: Vec<f32> = (0..len).map(|n| if n < len.div_ceil(2) { 1.0 + n as f32 } else { 0.0 }).collect();
             let shift = len / 2;
             let y: Vec<f32> = (0..len).map(|n| n.checked_sub(shift).map_or(0.0, |n| 7.0 * x[n])).collect();
-            let mut scratch = plan.scratch();
+            let mut scratch = plan.make_scratch();
             for (a, b) in [(&x, &y), (&y, &x), (&x, &x)] {
-                let alike = plan.similarity(a, b, &mut scratch).expect("finite").expect("some");
+                let alike = plan.compute_similarity(a, b, &mut scratch).expect("finite").expect("some");
                 assert!((alike - 1.0).abs() < 1e-5, "{len}: {alike}");
             }
-            assert_eq!(plan.similarity(&x, &vec![0.0; len], &mut scratch), Ok(None));
-            assert!(plan.similarity(&x, &vec![f32::NAN; len], &mut scratch).is_err());
+            assert_eq!(plan.compute_similarity(&x, &vec![0.0; len], &mut scratch), Ok(None));
+            assert!(plan.compute_similarity(&x, &vec![f32::NAN; len], &mut scratch).is_err());
         }
     }
 
@@ -188,7 +193,7 @@ mod tests {
         };
         let greatest = (-30..=30).map(at).fold(f64::NEG_INFINITY, f64::max);
         let plan = CorrelationPlan::<f64>::new(x.len()).expect("a plan");
-        let alike = plan.similarity(&x, &y, &mut plan.scratch()).expect("finite").expect("some");
+        let alike = plan.compute_similarity(&x, &y, &mut plan.make_scratch()).expect("finite").expect("some");
         assert!((alike - greatest / (energy(&x) * energy(&y)).sqrt()).abs() < 1e-12);
     }
 

@@ -22,7 +22,7 @@ const LONGEST: f64 = 2.0;
 /// use echolake_dsp::self_organising_map::SelfOrganisingMap;
 ///
 /// let mut rows: Vec<Vec<f32>> = (0..40).map(|i| vec![i as f32, 0.5 * i as f32, if i < 20 { 0.0 } else { 30.0
-/// }]).collect(); let map = SelfOrganisingMap::of(&PrincipalComponents::of(&mut rows, 2)?);
+/// }]).collect(); let map = SelfOrganisingMap::from_components(&PrincipalComponents::from_rows(&mut rows, 2)?);
 /// // Neighbours share a unit or are beside one another; the ends are far apart.
 /// let distance = |a: [usize; 2], b: [usize; 2]| a[0].abs_diff(b[0]).max(a[1].abs_diff(b[1]));
 /// assert!(distance(map.units[3], map.units[4]) <= 1);
@@ -42,8 +42,8 @@ pub struct SelfOrganisingMap {
 
 impl SelfOrganisingMap {
     /// Trains a map of the rows whose components these are; without rows it has no units.
-    pub fn of(components: &PrincipalComponents) -> Self {
-        let count = components.rows();
+    pub fn from_components(components: &PrincipalComponents) -> Self {
+        let count = components.row_count();
         let size = size_of(components);
         let [columns, rows] = size;
         let total = columns * rows;
@@ -55,11 +55,11 @@ impl SelfOrganisingMap {
         let mut units = UnitMeans::new(total, count);
         for round in 0..ROUNDS {
             let width = first_width * (LAST_WIDTH / first_width).powf(round as f64 / (ROUNDS - 1) as f64);
-            units.train(components, &winners, size, width);
-            winners = (0..count).map(|row| units.nearest(components, row)).collect();
+            units.train_round(components, &winners, size, width);
+            winners = (0..count).map(|row| units.nearest_unit(components, row)).collect();
         }
-        let borders = (0..total).map(|unit| units.border(unit, size)).collect();
-        let scale = (components.features().max(1) as f64).sqrt();
+        let borders = (0..total).map(|unit| units.unit_border(unit, size)).collect();
+        let scale = (components.feature_count().max(1) as f64).sqrt();
         Self {
             size,
             units: winners.into_iter().map(|unit| [unit % columns, unit / columns]).collect(),
@@ -82,14 +82,14 @@ impl UnitMeans {
         Self { count, products: vec![0.0; units * count], between: vec![0.0; units * units] }
     }
 
-    fn train(&mut self, components: &PrincipalComponents, winners: &[usize], size: [usize; 2], width: f64) {
+    fn train_round(&mut self, components: &PrincipalComponents, winners: &[usize], size: [usize; 2], width: f64) {
         let (count, units) = (self.count, self.between.len().isqrt());
         // Sums over the rows of each unit: a mean is made of these, as the neighbourhood counts units.
         let mut sums = vec![0.0; units * count];
         let mut members = vec![0.0; units];
         for (row, unit) in winners.iter().enumerate() {
             members[*unit] += 1.0;
-            let products = components.products(row);
+            let products = components.row_products(row);
             sums[unit * count..][..count].iter_mut().zip(products).for_each(|(sum, product)| *sum += product);
         }
         let place = |unit: usize| [(unit % size[0]) as f64, (unit / size[0]) as f64];
@@ -118,8 +118,8 @@ impl UnitMeans {
         }
     }
 
-    fn nearest(&self, components: &PrincipalComponents, row: usize) -> usize {
-        let own = components.products(row)[row];
+    fn nearest_unit(&self, components: &PrincipalComponents, row: usize) -> usize {
+        let own = components.row_products(row)[row];
         let units = self.between.len().isqrt();
         let square =
             |unit: usize| own - 2.0 * self.products[unit * self.count + row] + self.between[unit * (units + 1)];
@@ -127,7 +127,7 @@ impl UnitMeans {
         (0..units).min_by(|a, b| square(*a).total_cmp(&square(*b))).unwrap_or(0)
     }
 
-    fn border(&self, unit: usize, [columns, rows]: [usize; 2]) -> f64 {
+    fn unit_border(&self, unit: usize, [columns, rows]: [usize; 2]) -> f64 {
         let units = columns * rows;
         let (x, y) = (unit % columns, unit / columns);
         let beside = [(x > 0, unit.wrapping_sub(1)), (x + 1 < columns, unit + 1)];
@@ -143,19 +143,19 @@ impl UnitMeans {
 
 // As long and wide as the first two components vary.
 fn size_of(components: &PrincipalComponents) -> [usize; 2] {
-    let explained = components.explained();
+    let explained = components.explained_shares();
     let [first, second] = [0, 1].map(|i| explained.get(i).copied().unwrap_or(0.0));
     let longer = if second > 0.0 { (first / second).sqrt().clamp(1.0, LONGEST) } else { LONGEST };
-    let units = UNITS_PER_ROOT * (components.rows() as f64).sqrt();
+    let units = UNITS_PER_ROOT * (components.row_count() as f64).sqrt();
     let columns = (units * longer).sqrt().round();
     [columns as usize, (columns / longer).round() as usize]
 }
 
 // The units where the first two components put the rows.
 fn first_winners(components: &PrincipalComponents, size: [usize; 2]) -> Vec<usize> {
-    let places: Vec<[f64; 2]> = (0..components.rows())
+    let places: Vec<[f64; 2]> = (0..components.row_count())
         .map(|row| {
-            let position = components.position(row);
+            let position = components.row_position(row);
             [0, 1].map(|axis| position.get(axis).copied().unwrap_or(0.0))
         })
         .collect();
@@ -177,7 +177,7 @@ mod tests {
     use super::*;
 
     fn trained(rows: &mut [Vec<f32>]) -> SelfOrganisingMap {
-        SelfOrganisingMap::of(&PrincipalComponents::of(rows, 2).expect("equally long"))
+        SelfOrganisingMap::from_components(&PrincipalComponents::from_rows(rows, 2).expect("equally long"))
     }
 
     #[test]

@@ -55,15 +55,15 @@ pub async fn write_responses(
     let pending = PendingFolder::create(folder)?;
     let mut files = Vec::new();
     for (done, run) in runs.iter().enumerate() {
-        let responses = SurfaceResponses::read(lake, &snapshot, run).await?;
+        let responses = SurfaceResponses::read_run(lake, &snapshot, run).await?;
         match format {
-            ResponseFormat::Sofa => files.push(sofa::write(lake, &responses, &pending)?),
-            ResponseFormat::Npz => files.extend(npz::write(lake, &snapshot, &responses, &pending).await?),
+            ResponseFormat::Sofa => files.push(sofa::write_sofa(lake, &responses, &pending)?),
+            ResponseFormat::Npz => files.extend(npz::write_npz(lake, &snapshot, &responses, &pending).await?),
         }
         progress(done + 1, runs.len());
     }
     if format == ResponseFormat::Npz {
-        files.extend(npz::describe(lake, &snapshot, &runs, &pending).await?);
+        files.extend(npz::write_descriptions(lake, &snapshot, &runs, &pending).await?);
     }
     pending.publish()?;
     Ok(files)
@@ -75,7 +75,7 @@ pub async fn write_responses(
 /// [`Error::Damaged`] if a response is not of the rig's length, and others.
 pub fn write_sofa_file(lake: &Lake, run: &VisibleRun, rows: &RecordBatch, path: &Path) -> Result<()> {
     let responses = SurfaceResponses::from_rows(lake, run, rows)?;
-    sofa::create(path, lake, &responses).map_err(|e| Error::write(path, e))
+    sofa::create_sofa(path, lake, &responses).map_err(|e| Error::write(path, e))
 }
 
 /// The columns of `measurements` that a SOFA file is made of.
@@ -97,16 +97,16 @@ fn newest_runs(snapshot: &LakeSnapshot, surfaces: &[SurfaceId]) -> Result<Vec<Vi
 }
 
 impl SurfaceResponses {
-    async fn read(lake: &Lake, snapshot: &LakeSnapshot, run: &VisibleRun) -> Result<Self> {
+    async fn read_run(lake: &Lake, snapshot: &LakeSnapshot, run: &VisibleRun) -> Result<Self> {
         let batch = rows::of_run(lake, snapshot, Table::Measurements, &run.run, &SOFA_COLUMNS).await?;
         Self::from_rows(lake, run, &batch)
     }
 
     fn from_rows(lake: &Lake, run: &VisibleRun, batch: &RecordBatch) -> Result<Self> {
         let damaged = |reason: String| Error::damaged(format!("measurements, run {}", run.run), reason);
-        let ids = rows::numbers::<Int32Type>(batch, "pair_id")?;
-        let times = rows::numbers::<Int64Type>(batch, "log_time_ns")?;
-        let temperatures = rows::numbers::<Float64Type>(batch, "temperature_c")?;
+        let ids = rows::number_column::<Int32Type>(batch, "pair_id")?;
+        let times = rows::number_column::<Int64Type>(batch, "log_time_ns")?;
+        let temperatures = rows::number_column::<Float64Type>(batch, "temperature_c")?;
         let lists = batch.column_by_name("ir").and_then(|c| c.as_list_opt::<i32>());
         let lists = lists.ok_or_else(|| damaged("no `ir`".into()))?;
         let values = lists.values().as_primitive::<Float32Type>().values();

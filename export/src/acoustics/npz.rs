@@ -17,7 +17,7 @@ use crate::output::{PendingFolder, WrittenFile};
 use crate::rows;
 
 /// Writes a surface's files.
-pub(super) async fn write(
+pub(super) async fn write_npz(
     lake: &Lake,
     snapshot: &LakeSnapshot,
     responses: &SurfaceResponses,
@@ -37,23 +37,23 @@ pub(super) async fn write(
     let temperatures = Array1::from_vec(responses.celsius.clone());
     let name = format!("{surface}.npz");
     let mut files = vec![
-        folder.write(
+        folder.write_file(
             &name,
-            &archive(&[("matrix", &matrix)], &[("temperatures", &temperatures)])
-                .map_err(|e| Error::write(&folder.named(&name), e))?,
+            &npz_archive(&[("matrix", &matrix)], &[("temperatures", &temperatures)])
+                .map_err(|e| Error::write(&folder.final_path(&name), e))?,
         )?,
     ];
-    if let Some(heights) = heights(lake, snapshot, responses).await? {
+    if let Some(heights) = read_heights(lake, snapshot, responses).await? {
         let name = format!("{surface}_mat.npz");
-        files.push(folder.write(
+        files.push(folder.write_file(
             &name,
-            &archive(&[("surface", &heights)], &[]).map_err(|e| Error::write(&folder.named(&name), e))?,
+            &npz_archive(&[("surface", &heights)], &[]).map_err(|e| Error::write(&folder.final_path(&name), e))?,
         )?);
     }
     Ok(files)
 }
 
-fn archive(
+fn npz_archive(
     matrices: &[(&str, &Array2<f64>)],
     vectors: &[(&str, &Array1<f64>)],
 ) -> std::result::Result<Vec<u8>, ndarray_npy::WriteNpzError> {
@@ -67,10 +67,16 @@ fn archive(
     Ok(npz.finish()?.into_inner())
 }
 
-async fn heights(lake: &Lake, snapshot: &LakeSnapshot, responses: &SurfaceResponses) -> Result<Option<Array2<f64>>> {
+async fn read_heights(
+    lake: &Lake,
+    snapshot: &LakeSnapshot,
+    responses: &SurfaceResponses,
+) -> Result<Option<Array2<f64>>> {
     let run = &responses.run.run;
     let batch = rows::of_run(lake, snapshot, Table::Heightmaps, run, &["symmetry", "heights_mm"]).await?;
-    let Some(row) = rows::texts(&batch, "symmetry").iter().position(|s| *s == "identity") else { return Ok(None) };
+    let Some(row) = rows::text_column(&batch, "symmetry").iter().position(|s| *s == "identity") else {
+        return Ok(None);
+    };
     let list = batch.column(1).as_list::<i32>().value(row);
     let values = list.as_primitive::<Float32Type>().values().iter().map(|h| f64::from(*h)).collect();
     let side = Table::HEIGHTMAP_CELLS;
@@ -78,21 +84,21 @@ async fn heights(lake: &Lake, snapshot: &LakeSnapshot, responses: &SurfaceRespon
 }
 
 /// Writes `combinations.csv` (the pair of each matrix row) and `panel_info.csv` (one row per surface).
-pub(super) async fn describe(
+pub(super) async fn write_descriptions(
     lake: &Lake,
     snapshot: &LakeSnapshot,
     runs: &[VisibleRun],
     folder: &PendingFolder,
 ) -> Result<Vec<WrittenFile>> {
-    let combinations = combinations(lake).map_err(|e| Error::write(&folder.named("combinations.csv"), e))?;
+    let combinations = combinations_csv(lake).map_err(|e| Error::write(&folder.final_path("combinations.csv"), e))?;
     let mut info = csv::Writer::from_writer(Vec::new());
-    let failed = |e: csv::Error| Error::write(&folder.named("panel_info.csv"), e);
+    let failed = |e: csv::Error| Error::write(&folder.final_path("panel_info.csv"), e);
     info.write_record(GIR_PANEL_INFO).map_err(failed)?;
     let columns =
         ["surface_id", "typology", "macrostructure", "material", "flat_reference", "foam_reference", "macro_reference"];
     for run in runs {
         let batch = rows::of_run(lake, snapshot, Table::Surfaces, &run.run, &columns).await?;
-        let text = |column| rows::texts(&batch, column).first().copied().unwrap_or_default();
+        let text = |column| rows::text_column(&batch, column).first().copied().unwrap_or_default();
         let shape = rows::optional_texts(&batch, "macro_reference").first().copied().flatten();
         let (sand, binder) = text("material").split_once("; ").unwrap_or((text("material"), ""));
         let row = [
@@ -106,12 +112,12 @@ pub(super) async fn describe(
         ];
         info.write_record(row).map_err(failed)?;
     }
-    let info = info.into_inner().map_err(|e| Error::write(&folder.named("panel_info.csv"), e))?;
-    Ok(vec![folder.write("combinations.csv", &combinations)?, folder.write("panel_info.csv", &info)?])
+    let info = info.into_inner().map_err(|e| Error::write(&folder.final_path("panel_info.csv"), e))?;
+    Ok(vec![folder.write_file("combinations.csv", &combinations)?, folder.write_file("panel_info.csv", &info)?])
 }
 
 // 1-based, as in the data set.
-fn combinations(lake: &Lake) -> std::result::Result<Vec<u8>, csv::Error> {
+fn combinations_csv(lake: &Lake) -> std::result::Result<Vec<u8>, csv::Error> {
     let mut csv = csv::Writer::from_writer(Vec::new());
     csv.write_record(GIR_COMBINATIONS)?;
     let points = lake.grid().points();

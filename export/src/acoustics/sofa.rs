@@ -20,22 +20,26 @@ const KELVIN: f64 = 273.15;
 struct Dimensions(Vec<(char, usize, H5Dataset)>);
 
 /// Writes `<surface>.sofa`.
-pub(super) fn write(lake: &Lake, responses: &SurfaceResponses, folder: &PendingFolder) -> Result<WrittenFile> {
+pub(super) fn write_sofa(lake: &Lake, responses: &SurfaceResponses, folder: &PendingFolder) -> Result<WrittenFile> {
     let name = format!("{}.sofa", responses.run.surface);
-    let path = folder.meanwhile(&name);
-    create(&path, lake, responses).map_err(|e| Error::write(&folder.named(&name), e))?;
-    let bytes = std::fs::read(&path).map_err(|e| Error::write(&folder.named(&name), e))?;
+    let path = folder.partial_path(&name);
+    create_sofa(&path, lake, responses).map_err(|e| Error::write(&folder.final_path(&name), e))?;
+    let bytes = std::fs::read(&path).map_err(|e| Error::write(&folder.final_path(&name), e))?;
     Ok(WrittenFile { name, bytes: bytes.len() as u64, sha256: hex::encode(Sha256::digest(&bytes)) })
 }
 
 /// Creates a file at `path`.
-pub(super) fn create(path: &Path, lake: &Lake, responses: &SurfaceResponses) -> std::result::Result<(), Hdf5Error> {
+pub(super) fn create_sofa(
+    path: &Path,
+    lake: &Lake,
+    responses: &SurfaceResponses,
+) -> std::result::Result<(), Hdf5Error> {
     let file = H5File::options().track_order(true).track_times(false).create(path)?;
-    fill(&file, lake, responses)?;
+    fill_sofa(&file, lake, responses)?;
     file.close()
 }
 
-fn fill(file: &H5File, lake: &Lake, responses: &SurfaceResponses) -> std::result::Result<(), Hdf5Error> {
+fn fill_sofa(file: &H5File, lake: &Lake, responses: &SurfaceResponses) -> std::result::Result<(), Hdf5Error> {
     let rig = lake.rig();
     let reference = rig.impulse_response.reference_temperature_c.get();
     let first = Timestamp(responses.log_time_ns.iter().copied().min().unwrap_or(0)).to_string();
@@ -71,18 +75,21 @@ fn fill(file: &H5File, lake: &Lake, responses: &SurfaceResponses) -> std::result
         file.set_attr_string(name, value)?;
     }
     let pairs = responses.pairs.len();
-    let dimensions =
-        Dimensions::create(file, &[('M', pairs), ('R', 1), ('E', 1), ('N', responses.length), ('C', 3), ('I', 1)])?;
+    let dimensions = Dimensions::create_scales(
+        file,
+        &[('M', pairs), ('R', 1), ('E', 1), ('N', responses.length), ('C', 3), ('I', 1)],
+    )?;
     let cartesian: &[(&str, &str)] = &[("Type", "cartesian"), ("Units", "metre")];
     let points = lake.grid().points();
     let at = |of: &dyn Fn(usize) -> usize| -> Vec<f64> {
-        responses.pairs.iter().flat_map(|pair| metres(&points[of(*pair as usize)])).collect()
+        responses.pairs.iter().flat_map(|pair| position_m(&points[of(*pair as usize)])).collect()
     };
     let pair = |id: usize| lake.grid().pairs()[id];
     let listeners = at(&|id| pair(id).microphone.index());
     let sources = at(&|id| pair(id).speaker.index());
-    let put =
-        |name: &str, shape: &str, values: &[f64], attributes| dimensions.write(file, name, shape, values, attributes);
+    let put = |name: &str, shape: &str, values: &[f64], attributes| {
+        dimensions.write_dataset(file, name, shape, values, attributes)
+    };
     put("ListenerPosition", "MC", &listeners, cartesian)?;
     put("ListenerView", "IC", &[1.0, 0.0, 0.0], cartesian)?;
     put("ListenerUp", "IC", &[0.0, 0.0, 1.0], &[])?;
@@ -100,12 +107,12 @@ fn fill(file: &H5File, lake: &Lake, responses: &SurfaceResponses) -> std::result
     put("Data.Delay", "IR", &[0.0], &[])
 }
 
-fn metres(point: &Point) -> [f64; 3] {
+fn position_m(point: &Point) -> [f64; 3] {
     point.position_mm.map(|mm| mm / 1e3)
 }
 
 impl Dimensions {
-    fn create(file: &H5File, sizes: &[(char, usize)]) -> std::result::Result<Self, Hdf5Error> {
+    fn create_scales(file: &H5File, sizes: &[(char, usize)]) -> std::result::Result<Self, Hdf5Error> {
         let mut all = Vec::new();
         for (letter, size) in sizes {
             let scale = file.new_dataset::<f32>().shape([*size]).create(&letter.to_string())?;
@@ -116,7 +123,7 @@ impl Dimensions {
         Ok(Self(all))
     }
 
-    fn write(
+    fn write_dataset(
         &self,
         file: &H5File,
         name: &str,

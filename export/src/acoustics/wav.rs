@@ -30,12 +30,12 @@ pub async fn write_wav(
     let mut runs = open_runs(lake, taken, check).await?;
     let pending = PendingFolder::create(folder)?;
     let mut manifest = csv::Writer::from_writer(Vec::new());
-    let failed = |e: csv::Error| Error::write(&pending.named("manifest.csv"), e);
+    let failed = |e: csv::Error| Error::write(&pending.final_path("manifest.csv"), e);
     manifest.write_record(WAV_MANIFEST).map_err(failed)?;
     let mut done = 0;
     for run in &mut runs {
         while let Some(measured) = run.next().await? {
-            let recording = WavRecording::of(&measured)?;
+            let recording = WavRecording::from_measured(&measured)?;
             let name = format!(
                 "{}/{}-p{:04}-a{}.wav",
                 run.surface(),
@@ -44,10 +44,10 @@ pub async fn write_wav(
                 recording.sweep.attempt
             );
             let bytes = recording
-                .wav()
+                .encode_wav()
                 .map_err(|reason| Error::damaged(run.file(), format!("pair {}: {reason}", recording.sweep.pair_id)))?;
-            pending.write(&name, &bytes)?;
-            let row = recording.row(lake, run.surface().as_str(), &name).ok_or_else(|| {
+            pending.write_file(&name, &bytes)?;
+            let row = recording.table_row(lake, run.surface().as_str(), &name).ok_or_else(|| {
                 Error::damaged(run.file(), format!("pair {}, which the rig does not have", recording.sweep.pair_id))
             })?;
             manifest.write_record(WAV_MANIFEST.map(|c| row.get(c).map_or("", String::as_str))).map_err(failed)?;
@@ -55,8 +55,8 @@ pub async fn write_wav(
             progress(done, taken.len());
         }
     }
-    let manifest = manifest.into_inner().map_err(|e| Error::write(&pending.named("manifest.csv"), e))?;
-    pending.write("manifest.csv", &manifest)?;
+    let manifest = manifest.into_inner().map_err(|e| Error::write(&pending.final_path("manifest.csv"), e))?;
+    pending.write_file("manifest.csv", &manifest)?;
     pending.publish()?;
     Ok(done)
 }
@@ -69,21 +69,22 @@ struct WavRecording {
 }
 
 impl WavRecording {
-    fn of(measured: &Measured) -> Result<Self> {
+    fn from_measured(measured: &Measured) -> Result<Self> {
         let damaged = |e: prost::DecodeError| Error::damaged(&measured.file, e);
-        let Some((time_ns, sweep)) = measured.message(topics::SWEEP) else {
+        let Some((time_ns, sweep)) = measured.first_message(topics::SWEEP) else {
             let reason = format!(
                 "run {} was recorded without sweeps; hint: export sofa and export npz write its responses",
                 measured.run
             );
             return Err(Error::Nothing { reason });
         };
-        let verdict = measured.message(topics::MEASUREMENT).map(|(_, data)| Measurement::decode(data)).transpose();
+        let verdict =
+            measured.first_message(topics::MEASUREMENT).map(|(_, data)| Measurement::decode(data)).transpose();
         let sweep = SweepRecording::decode(sweep).map_err(damaged)?;
         Ok(Self { sweep, verdict: verdict.map_err(damaged)?.unwrap_or_default(), time_ns })
     }
 
-    fn row(&self, lake: &Lake, surface: &str, name: &str) -> Option<BTreeMap<&'static str, String>> {
+    fn table_row(&self, lake: &Lake, surface: &str, name: &str) -> Option<BTreeMap<&'static str, String>> {
         let pair = lake.grid().pairs().get(self.sweep.pair_id as usize)?;
         let [microphone, speaker] = [pair.microphone, pair.speaker].map(|id| lake.grid().points()[id.index()].label());
         let known = |x: f64| if x.is_finite() { x.to_string() } else { String::new() };
@@ -102,9 +103,9 @@ impl WavRecording {
     }
 
     // Both channels bit for bit as they were recorded.
-    fn wav(&self) -> std::result::Result<Vec<u8>, String> {
+    fn encode_wav(&self) -> std::result::Result<Vec<u8>, String> {
         let format = self.sweep.format();
-        let width = format.bytes().ok_or("its sample format is unknown")?;
+        let width = format.sample_bytes().ok_or("its sample format is unknown")?;
         let count = self.sweep.sample_count as usize;
         for channel in [&self.sweep.microphone, &self.sweep.loopback] {
             if count.checked_mul(width) != Some(channel.len()) {
@@ -119,12 +120,12 @@ impl WavRecording {
             sample_format: if float { hound::SampleFormat::Float } else { hound::SampleFormat::Int },
         };
         let mut bytes = Cursor::new(Vec::with_capacity(44 + 2 * count * width));
-        let written = WavWriter::new(&mut bytes, spec).and_then(|writer| self.interleave(writer, format, count));
+        let written = WavWriter::new(&mut bytes, spec).and_then(|writer| self.write_interleaved(writer, format, count));
         written.map_err(|e| e.to_string())?;
         Ok(bytes.into_inner())
     }
 
-    fn interleave<W: Write + Seek>(
+    fn write_interleaved<W: Write + Seek>(
         &self,
         mut to: WavWriter<W>,
         format: SampleFormat,
@@ -133,8 +134,8 @@ impl WavRecording {
         for i in 0..count {
             for channel in [&self.sweep.microphone, &self.sweep.loopback] {
                 match format {
-                    SampleFormat::F32le => to.write_sample(f32::from_le_bytes(four(channel, 4 * i)))?,
-                    _ => to.write_sample(integer(format, channel, i, count))?,
+                    SampleFormat::F32le => to.write_sample(f32::from_le_bytes(four_bytes(channel, 4 * i)))?,
+                    _ => to.write_sample(integer_sample(format, channel, i, count))?,
                 }
             }
         }
@@ -142,17 +143,17 @@ impl WavRecording {
     }
 }
 
-fn four(bytes: &[u8], at: usize) -> [u8; 4] {
+fn four_bytes(bytes: &[u8], at: usize) -> [u8; 4] {
     [bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]]
 }
 
 // Sample i of a channel whose length was checked.
-fn integer(format: SampleFormat, b: &[u8], i: usize, count: usize) -> i32 {
+fn integer_sample(format: SampleFormat, b: &[u8], i: usize, count: usize) -> i32 {
     match format {
         SampleFormat::S16le => i32::from(i16::from_le_bytes([b[2 * i], b[2 * i + 1]])),
         SampleFormat::S24le => i32::from_le_bytes([0, b[3 * i], b[3 * i + 1], b[3 * i + 2]]) >> 8,
         SampleFormat::S24Split => i32::from_le_bytes([0, b[i], b[count + 2 * i], b[count + 2 * i + 1]]) >> 8,
-        _ => i32::from_le_bytes(four(b, 4 * i)),
+        _ => i32::from_le_bytes(four_bytes(b, 4 * i)),
     }
 }
 
@@ -176,7 +177,7 @@ mod tests {
                 ..SweepRecording::default()
             };
             let recording = WavRecording { sweep, verdict: Measurement::default(), time_ns: 0 };
-            let wav = recording.wav().expect("a file");
+            let wav = recording.encode_wav().expect("a file");
             let mut reader = hound::WavReader::new(Cursor::new(wav)).expect("a WAV file");
             assert_eq!((reader.spec().bits_per_sample, reader.spec().sample_rate), (24, 96_000));
             let read: Vec<i32> = reader.samples().map(|s| s.expect("a sample")).collect();
@@ -193,6 +194,6 @@ mod tests {
             ..SweepRecording::default()
         };
         let recording = WavRecording { sweep, verdict: Measurement::default(), time_ns: 0 };
-        assert!(recording.wav().is_err_and(|e| e.contains("6 bytes for 9")));
+        assert!(recording.encode_wav().is_err_and(|e| e.contains("6 bytes for 9")));
     }
 }

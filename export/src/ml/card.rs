@@ -57,7 +57,7 @@ impl CardContents<'_> {
 }
 
 /// Returns the text of the card.
-pub(super) fn write(about: &CardContents<'_>) -> String {
+pub(super) fn card_text(about: &CardContents<'_>) -> String {
     let mut text = front_matter(about);
     let split = about.plan.set.split;
     let _ = write!(text, "# Reflections of relief surfaces\n\n{}\n\n", about.summary());
@@ -97,21 +97,21 @@ pub(super) fn write(about: &CardContents<'_>) -> String {
             text,
             "\n{} surfaces are left out, because another side of their panel is held out: {}.",
             about.exported.left_out.len(),
-            listed(&about.exported.left_out)
+            listed_names(&about.exported.left_out)
         );
     }
     if about.exported.waiting > 0 {
         let _ = writeln!(text, "\n{} runs that wait for their references are left out.", about.exported.waiting);
     }
-    files(&mut text, about);
+    add_files_section(&mut text, about);
     let fields = about.plan.schema().fields();
     let _ = writeln!(text, "\n## Columns of the measurements\n");
-    columns(&mut text, fields.iter().map(AsRef::as_ref));
-    if let Ok(schema) = heights::schema() {
+    add_column_table(&mut text, fields.iter().map(AsRef::as_ref));
+    if let Ok(schema) = heights::height_map_schema() {
         let _ = writeln!(text, "\n## Columns of the height maps\n");
-        columns(&mut text, schema.fields().iter().map(AsRef::as_ref));
+        add_column_table(&mut text, schema.fields().iter().map(AsRef::as_ref));
     }
-    usage(&mut text);
+    add_usage_section(&mut text);
     if about.plan.set.license.is_none() {
         text.push_str(
             "\nNo licence of the data is known (`license: unknown` above); `--license cc-by-4.0` names one.\n",
@@ -150,7 +150,7 @@ fn front_matter(about: &CardContents<'_>) -> String {
 }
 
 /// Returns the names of surfaces, separated by commas.
-pub(super) fn listed(surfaces: &[SurfaceId]) -> String {
+pub(super) fn listed_names(surfaces: &[SurfaceId]) -> String {
     surfaces.iter().map(SurfaceId::as_str).collect::<Vec<_>>().join(", ")
 }
 
@@ -167,7 +167,7 @@ fn size_category(rows: u64) -> &'static str {
     }
 }
 
-fn files(text: &mut String, about: &CardContents<'_>) {
+fn add_files_section(text: &mut String, about: &CardContents<'_>) {
     text.push_str(
         "\n## Files\n\n- `data/<split>-*.parquet`: measurements. Whole surfaces in a file, one row group a surface, in \
          a drawn order.\n- `heightmaps/<split>.parquet`: the surfaces' heights, joined by `surface_id` and \
@@ -197,15 +197,15 @@ fn files(text: &mut String, about: &CardContents<'_>) {
     );
 }
 
-fn columns<'a>(text: &mut String, fields: impl Iterator<Item = &'a Field>) {
+fn add_column_table<'a>(text: &mut String, fields: impl Iterator<Item = &'a Field>) {
     text.push_str("| column | type | unit | meaning |\n| --- | --- | --- | --- |\n");
     for field in fields {
         let of = |key: &str| field.metadata().get(key).map_or("", String::as_str);
-        let _ = writeln!(text, "| `{}` | {} | {} | {} |", field.name(), kind(field), of(UNIT), of(COMMENT));
+        let _ = writeln!(text, "| `{}` | {} | {} | {} |", field.name(), column_type(field), of(UNIT), of(COMMENT));
     }
 }
 
-fn kind(field: &Field) -> String {
+fn column_type(field: &Field) -> String {
     match field.data_type() {
         DataType::FixedSizeList(_, length) => format!("{length} x float32"),
         DataType::Utf8 => "string".into(),
@@ -213,7 +213,7 @@ fn kind(field: &Field) -> String {
     }
 }
 
-fn usage(text: &mut String) {
+fn add_usage_section(text: &mut String) {
     text.push_str(
         r#"
 ## Loading
@@ -236,7 +236,7 @@ has the responses that the levels are of.
 }
 
 /// Returns the text of `surfaces.csv`: the run file and the derivations behind each surface's rows.
-pub(super) fn sources(shards: &[(&Shard, Vec<u64>)]) -> Result<String> {
+pub(super) fn sources_csv(shards: &[(&Shard, Vec<u64>)]) -> Result<String> {
     let mut csv = csv::Writer::from_writer(Vec::new());
     let failed = |e: csv::Error| Error::damaged("surfaces.csv", e);
     csv.write_record([

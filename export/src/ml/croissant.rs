@@ -12,10 +12,10 @@ use crate::error::{Error, Result};
 const PARQUET: &str = "application/x-parquet";
 
 /// The metadata as JSON-LD.
-pub(super) fn write(about: &CardContents<'_>) -> Result<String> {
+pub(super) fn croissant_json(about: &CardContents<'_>) -> Result<String> {
     let exported = about.exported;
     let mut distribution: Vec<Value> = Vec::new();
-    let mut record_sets = vec![splits()];
+    let mut record_sets = vec![split_record_set()];
     for part in &exported.parts {
         let name = part.part.name();
         let id = format!("measurements-{name}");
@@ -32,7 +32,7 @@ pub(super) fn write(about: &CardContents<'_>) -> Result<String> {
                 &format!("heightmaps/{name}.parquet"),
                 &format!("Height maps of split {name}"),
             ));
-            let schema = heights::schema()?;
+            let schema = heights::height_map_schema()?;
             let about = format!("Height maps of {} surfaces", part.height_maps);
             record_sets.push(record_set(&id, &about, schema.fields().iter().map(AsRef::as_ref)));
         }
@@ -49,7 +49,7 @@ pub(super) fn write(about: &CardContents<'_>) -> Result<String> {
         })
     }));
     let mut document = json!({
-        "@context": context(),
+        "@context": json_context(),
         "@type": "sc:Dataset",
         "name": "relief-reflections",
         "description": format!(
@@ -85,7 +85,7 @@ fn file_set(id: &str, includes: &str, description: &str) -> Value {
 }
 
 // The names of the splits, to which the field `split` of every row refers.
-fn splits() -> Value {
+fn split_record_set() -> Value {
     let data: Vec<_> = SplitPart::ALL
         .iter()
         .map(|part| {
@@ -145,7 +145,7 @@ fn record_field(set: &str, field: &Field) -> Value {
 }
 
 // The context that the specification prescribes.
-fn context() -> Value {
+fn json_context() -> Value {
     json!({
         "@language": "en",
         "@vocab": "https://schema.org/",

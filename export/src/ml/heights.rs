@@ -9,24 +9,24 @@ use arrow::record_batch::RecordBatch;
 use echolake_lake::{Lake, LakeSnapshot};
 use echolake_schema::tables::Table;
 
-use super::columns::{field, list};
-use super::measurements::fixed;
+use super::columns::{described_field, list_type};
+use super::measurements::fixed_lists;
 use super::split::SplitPart;
 use super::surfaces::TrainingSurface;
 use crate::error::{Error, Result};
 use crate::rows;
 
 /// The schema of the files of height maps.
-pub(super) fn schema() -> Result<SchemaRef> {
+pub(super) fn height_map_schema() -> Result<SchemaRef> {
     Ok(Arc::new(Schema::new(vec![
-        field("surface_id", DataType::Utf8, "", "The surface"),
-        field("symmetry", DataType::Utf8, "", "What the map is turned by, as the measurements' column says"),
-        field("split", DataType::Utf8, "", "train, validation or test"),
-        field("group", DataType::Utf8, "", "Physical panel"),
-        field("size_mm", DataType::Float32, "mm", "Edge of the square"),
-        field(
+        described_field("surface_id", DataType::Utf8, "", "The surface"),
+        described_field("symmetry", DataType::Utf8, "", "What the map is turned by, as the measurements' column says"),
+        described_field("split", DataType::Utf8, "", "train, validation or test"),
+        described_field("group", DataType::Utf8, "", "Physical panel"),
+        described_field("size_mm", DataType::Float32, "mm", "Edge of the square"),
+        described_field(
             "heights_mm",
-            list(Table::HEIGHTMAP_CELLS * Table::HEIGHTMAP_CELLS)?,
+            list_type(Table::HEIGHTMAP_CELLS * Table::HEIGHTMAP_CELLS)?,
             "mm",
             "Mean height of each cell: 128 rows along y, each of 128 along x, both ascending",
         ),
@@ -34,7 +34,7 @@ pub(super) fn schema() -> Result<SchemaRef> {
 }
 
 /// Reads a surface's height maps under these symmetries; None if it has none.
-pub(super) async fn read(
+pub(super) async fn read_height_maps(
     lake: &Lake,
     snapshot: &LakeSnapshot,
     surface: &TrainingSurface,
@@ -44,27 +44,27 @@ pub(super) async fn read(
     let columns = ["symmetry", "size_mm", "heights_mm"];
     for run in surface.runs.iter().rev() {
         let batch = rows::of_run(lake, snapshot, Table::Heightmaps, &run.visible.run, &columns).await?;
-        let wanted = rows::texts(&batch, "symmetry").into_iter().map(|s| Some(symmetries.contains(&s))).collect();
+        let wanted = rows::text_column(&batch, "symmetry").into_iter().map(|s| Some(symmetries.contains(&s))).collect();
         let failed = |e: arrow::error::ArrowError| Error::damaged(format!("heightmaps, {}", surface.id), e);
         let batch = filter_record_batch(&batch, &wanted).map_err(failed)?;
         if batch.num_rows() > 0 {
-            return arranged(surface, part, &batch).map_err(failed).map(Some);
+            return arranged_batch(surface, part, &batch).map_err(failed).map(Some);
         }
     }
     Ok(None)
 }
 
-fn arranged(
+fn arranged_batch(
     surface: &TrainingSurface,
     part: SplitPart,
     batch: &RecordBatch,
 ) -> std::result::Result<RecordBatch, arrow::error::ArrowError> {
-    let schema = schema().map_err(|e| arrow::error::ArrowError::SchemaError(e.to_string()))?;
+    let schema = height_map_schema().map_err(|e| arrow::error::ArrowError::SchemaError(e.to_string()))?;
     let count = batch.num_rows();
     let same = |text: &str| -> ArrayRef { Arc::new(StringArray::from_iter_values(std::iter::repeat_n(text, count))) };
     let lists = batch.column(2).as_list::<i32>();
     let (from, to) = (lists.value_offsets()[0] as usize, lists.value_offsets()[lists.len()] as usize);
-    let heights = fixed(lists.values().slice(from, to - from), schema.field(5).data_type())?;
+    let heights = fixed_lists(lists.values().slice(from, to - from), schema.field(5).data_type())?;
     let columns = vec![
         same(surface.id.as_str()),
         batch.column(0).clone(),

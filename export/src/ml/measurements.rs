@@ -26,7 +26,7 @@ pub(super) struct SymmetryMoves(Vec<(Symmetry, Vec<MovedPair>)>);
 
 impl SymmetryMoves {
     /// Returns all symmetries of the grid, or the identity alone.
-    pub(super) fn of(grid: &Grid, symmetries: super::RowSymmetries) -> Self {
+    pub(super) fn from_grid(grid: &Grid, symmetries: super::RowSymmetries) -> Self {
         let wanted: &[Symmetry] = match symmetries {
             super::RowSymmetries::None => &[Symmetry::Identity],
             super::RowSymmetries::All => &Symmetry::ALL,
@@ -35,7 +35,7 @@ impl SymmetryMoves {
     }
 
     /// Returns the names of the symmetries.
-    pub(super) fn names(&self) -> Vec<&'static str> {
+    pub(super) fn symmetry_names(&self) -> Vec<&'static str> {
         self.0.iter().map(|(symmetry, _)| symmetry.name()).collect()
     }
 }
@@ -56,18 +56,18 @@ pub(super) struct RunRows {
 
 impl RowBuilder<'_> {
     /// Reads the chosen columns of the pairs that the run has in all of the chosen tables.
-    pub(super) async fn read(&self, run: &TrainingRun) -> Result<RunRows> {
+    pub(super) async fn read_rows(&self, run: &TrainingRun) -> Result<RunRows> {
         let mut tables = HashMap::new();
         let mut pairs: Option<Vec<u32>> = None;
         for table in [Table::Measurements, Table::Nce, Table::Tnce] {
-            let mut names = self.columns.of(table);
+            let mut names = self.columns.of_table(table);
             // Rows need TNCE values even if no column of `tnce` is chosen: every row must be normalised by references.
             if names.is_empty() && table != Table::Tnce {
                 continue;
             }
             names.push("pair_id");
             let batch = rows::of_run(self.lake, self.snapshot, table, &run.visible.run, &names).await?;
-            let places = places(&batch, self.lake.grid().pairs().len())?;
+            let places = pair_rows(&batch, self.lake.grid().pairs().len())?;
             let mut known: Vec<u32> = places.keys().copied().collect();
             if let Some(others) = &pairs {
                 known.retain(|pair| others.binary_search(pair).is_ok());
@@ -82,7 +82,7 @@ impl RowBuilder<'_> {
             let (batch, places) = &tables[table];
             let order: UInt32Array = pairs.iter().map(|pair| places[pair]).collect();
             values.push(
-                column(batch, field, &order)
+                ordered_column(batch, field, &order)
                     .map_err(|e| Error::damaged(format!("{}, {}", table.name(), run.visible.run), e))?,
             );
         }
@@ -90,17 +90,21 @@ impl RowBuilder<'_> {
     }
 
     /// Returns the rows under each symmetry, one batch per symmetry.
-    pub(super) fn batches(
+    pub(super) fn row_batches(
         &self,
         surface: &TrainingSurface,
         run: &TrainingRun,
         part: SplitPart,
         rows: &RunRows,
     ) -> Result<Vec<RecordBatch>> {
-        self.moves.0.iter().map(|(symmetry, moved)| self.batch(surface, run, part, rows, (*symmetry, moved))).collect()
+        self.moves
+            .0
+            .iter()
+            .map(|(symmetry, moved)| self.row_batch(surface, run, part, rows, (*symmetry, moved)))
+            .collect()
     }
 
-    fn batch(
+    fn row_batch(
         &self,
         surface: &TrainingSurface,
         run: &TrainingRun,
@@ -128,32 +132,32 @@ impl RowBuilder<'_> {
             points(|m| m.pair.microphone),
             points(|m| m.pair.speaker),
             Arc::new(BooleanArray::from_iter(moved.iter().map(|m| Some(m.swapped)))),
-            self.positions("microphone_mm", &moved, |m| m.pair.microphone)?,
-            self.positions("speaker_mm", &moved, |m| m.pair.speaker)?,
+            self.position_column("microphone_mm", &moved, |m| m.pair.microphone)?,
+            self.position_column("speaker_mm", &moved, |m| m.pair.speaker)?,
         ];
         columns.extend(rows.values.iter().cloned());
         RecordBatch::try_new(self.columns.schema().clone(), columns).map_err(|e| Error::damaged(&run.visible.run, e))
     }
 
-    fn positions(&self, column: &str, moved: &[MovedPair], of: fn(&MovedPair) -> PointId) -> Result<ArrayRef> {
+    fn position_column(&self, column: &str, moved: &[MovedPair], of: fn(&MovedPair) -> PointId) -> Result<ArrayRef> {
         let points = self.lake.grid().points();
         let values = moved.iter().flat_map(|m| points[of(m).index()].position_mm.map(|mm| mm as f32));
         let values: ArrayRef = Arc::new(Float32Array::from_iter_values(values));
         let kind = self.columns.schema().field_with_name(column).map(|f| f.data_type().clone());
-        kind.and_then(|kind| fixed(values, &kind)).map_err(|e| Error::damaged(column, e))
+        kind.and_then(|kind| fixed_lists(values, &kind)).map_err(|e| Error::damaged(column, e))
     }
 }
 
 // The row of each pair. A pair occurs once in a run; of duplicates the last one wins.
-fn places(batch: &RecordBatch, pairs: usize) -> Result<HashMap<u32, u32>> {
-    let ids = rows::numbers::<Int32Type>(batch, "pair_id")?;
+fn pair_rows(batch: &RecordBatch, pairs: usize) -> Result<HashMap<u32, u32>> {
+    let ids = rows::number_column::<Int32Type>(batch, "pair_id")?;
     let place =
         |(row, id): (usize, &i32)| Some((u32::try_from(*id).ok().filter(|id| (*id as usize) < pairs)?, row as u32));
     let all: Option<HashMap<_, _>> = ids.iter().enumerate().map(place).collect();
     all.ok_or_else(|| Error::damaged("pair_id", "a pair that the rig does not have"))
 }
 
-fn column(batch: &RecordBatch, field: &FieldRef, order: &UInt32Array) -> std::result::Result<ArrayRef, String> {
+fn ordered_column(batch: &RecordBatch, field: &FieldRef, order: &UInt32Array) -> std::result::Result<ArrayRef, String> {
     let array = batch.column_by_name(field.name()).ok_or_else(|| format!("no column `{}`", field.name()))?;
     let taken = take(array, order, None).map_err(|e| e.to_string())?;
     match field.data_type() {
@@ -164,14 +168,17 @@ fn column(batch: &RecordBatch, field: &FieldRef, order: &UInt32Array) -> std::re
                 return Err(format!("`{}` has {} values, expected {length}", field.name(), lists.value_length(row)));
             }
             let (from, to) = (lists.value_offsets()[0], lists.value_offsets()[lists.len()]);
-            fixed(lists.values().slice(from as usize, (to - from) as usize), list).map_err(|e| e.to_string())
+            fixed_lists(lists.values().slice(from as usize, (to - from) as usize), list).map_err(|e| e.to_string())
         }
         plain => cast(&taken, plain).map_err(|e| e.to_string()),
     }
 }
 
 /// Returns the values as lists of one length.
-pub(super) fn fixed(values: ArrayRef, kind: &DataType) -> std::result::Result<ArrayRef, arrow::error::ArrowError> {
+pub(super) fn fixed_lists(
+    values: ArrayRef,
+    kind: &DataType,
+) -> std::result::Result<ArrayRef, arrow::error::ArrowError> {
     let DataType::FixedSizeList(child, length) = kind else { return Ok(values) };
     Ok(Arc::new(FixedSizeListArray::try_new(child.clone(), *length, values, None)?))
 }

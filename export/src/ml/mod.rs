@@ -120,14 +120,15 @@ struct Shard {
 impl Plan {
     async fn new(lake: &Lake, snapshot: &LakeSnapshot, set: &TrainingSet) -> Result<Self> {
         let columns = TrainingColumns::choose(lake.rig(), &set.columns)?;
-        let (mut surfaces, waiting) = surfaces::read(lake, snapshot).await?;
+        let (mut surfaces, waiting) = surfaces::read_surfaces(lake, snapshot).await?;
         let references: Vec<_> =
             surfaces.extract_if(.., |s| s.reference && !set.references).map(|reference| reference.id).collect();
         if surfaces.is_empty() {
-            let reason = format!("the lake has references only ({}); hint: --references", card::listed(&references));
+            let reason =
+                format!("the lake has references only ({}); hint: --references", card::listed_names(&references));
             return Err(Error::Nothing { reason });
         }
-        let parts = split::assign(&surfaces, set.split)?;
+        let parts = split::assign_parts(&surfaces, set.split)?;
         let mut left_out = Vec::new();
         let mut of_part: [Vec<TrainingSurface>; 3] = Default::default();
         for (surface, part) in surfaces.into_iter().zip(parts) {
@@ -136,9 +137,12 @@ impl Plan {
                 None => left_out.push(surface.id),
             }
         }
-        let shards =
-            SplitPart::ALL.into_iter().zip(of_part).flat_map(|(part, of)| shards(part, of, set.split.seed)).collect();
-        let moves = SymmetryMoves::of(lake.grid(), set.symmetries);
+        let shards = SplitPart::ALL
+            .into_iter()
+            .zip(of_part)
+            .flat_map(|(part, of)| deal_shards(part, of, set.split.seed))
+            .collect();
+        let moves = SymmetryMoves::from_grid(lake.grid(), set.symmetries);
         Ok(Self { set: set.clone(), columns, moves, shards, left_out, references, waiting })
     }
 
@@ -152,8 +156,8 @@ impl Plan {
 }
 
 // Dealt like cards in a drawn order, so that every file has surfaces of every kind.
-fn shards(part: SplitPart, mut surfaces: Vec<TrainingSurface>, seed: u64) -> Vec<Shard> {
-    surfaces.sort_by_cached_key(|s| split::digest(seed, s.id.as_str()));
+fn deal_shards(part: SplitPart, mut surfaces: Vec<TrainingSurface>, seed: u64) -> Vec<Shard> {
+    surfaces.sort_by_cached_key(|s| split::order_digest(seed, s.id.as_str()));
     let count = SHARDS.max(surfaces.len().div_ceil(SURFACES_A_SHARD)).min(surfaces.len());
     let mut shards: Vec<_> = (0..count)
         .map(|i| Shard {
@@ -183,9 +187,9 @@ pub async fn write_training_set(
     let (mut parts, mut files) = (Vec::new(), Vec::new());
     for part in SplitPart::ALL {
         if plan.of_part(part).next().is_some() {
-            let (written, height_maps) = shard::heights(lake, &snapshot, &plan, part, &pending).await?;
+            let (written, height_maps) = shard::write_height_maps(lake, &snapshot, &plan, part, &pending).await?;
             files.extend(written);
-            parts.push(counts(&plan, part, height_maps));
+            parts.push(part_counts(&plan, part, height_maps));
         }
     }
     let job = Arc::new(ExportJob { lake: lake.clone(), snapshot, plan, folder: pending });
@@ -199,17 +203,17 @@ pub async fn write_training_set(
         sources.push((one, rows));
         files.push(file);
     }
-    files.push(pending.write("surfaces.csv", card::sources(&sources)?.as_bytes())?);
+    files.push(pending.write_file("surfaces.csv", card::sources_csv(&sources)?.as_bytes())?);
     let (left_out, references) = (plan.left_out.clone(), plan.references.clone());
     let mut exported = ExportSummary { parts, left_out, references, waiting: plan.waiting, files };
     let lake_version = snapshot.lake_version().unwrap_or(0);
     let about = card::CardContents { lake, lake_version, plan, exported: &exported };
-    let (croissant, readme) = (croissant::write(&about)?, card::write(&about));
-    exported.files.push(pending.write("croissant.json", croissant.as_bytes())?);
-    exported.files.push(pending.write("README.md", readme.as_bytes())?);
+    let (croissant, readme) = (croissant::croissant_json(&about)?, card::card_text(&about));
+    exported.files.push(pending.write_file("croissant.json", croissant.as_bytes())?);
+    exported.files.push(pending.write_file("README.md", readme.as_bytes())?);
     exported.files.sort_by(|a, b| a.name.cmp(&b.name));
     let sums: String = exported.files.iter().map(|f| format!("{}  {}\n", f.sha256, f.name)).collect();
-    pending.write("SHA256SUMS", sums.as_bytes())?;
+    pending.write_file("SHA256SUMS", sums.as_bytes())?;
     let job = Arc::into_inner(job).ok_or_else(|| Error::write(folder, "a part of the export is still at work"))?;
     job.folder.publish()?;
     Ok(exported)
@@ -233,7 +237,7 @@ async fn shards_of(
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     let spawn = |at: usize| {
         let job = job.clone();
-        tokio::spawn(async move { shard::write(&job, &job.plan.shards[at]).await })
+        tokio::spawn(async move { shard::write_shard(&job, &job.plan.shards[at]).await })
     };
     let stop = AtomicBool::new(false);
     let wanted = (0..job.plan.shards.len()).take_while(|_| !stop.load(Ordering::Relaxed));
@@ -257,7 +261,7 @@ async fn shards_of(
     failed.map_or(Ok(written), Err)
 }
 
-fn counts(plan: &Plan, part: SplitPart, height_maps: usize) -> PartCounts {
+fn part_counts(plan: &Plan, part: SplitPart, height_maps: usize) -> PartCounts {
     let panels: std::collections::HashSet<_> = plan.of_part(part).map(|s| s.id.panel().to_owned()).collect();
     let files = plan.shards.iter().filter(|s| s.part == part).count();
     PartCounts { part, files, panels: panels.len(), surfaces: plan.of_part(part).count(), rows: 0, height_maps }

@@ -29,27 +29,27 @@ struct ShardWriter<'a> {
 
 impl<'a> ShardWriter<'a> {
     fn create(folder: &'a PendingFolder, name: &'a str, schema: &SchemaRef) -> Result<Self> {
-        let file = folder.file(name)?;
-        let writer = ArrowWriter::try_new(file, schema.clone(), Some(properties(schema)));
-        Ok(Self { writer: writer.map_err(|e| Error::write(&folder.named(name), e))?, folder, name })
+        let file = folder.create_file(name)?;
+        let writer = ArrowWriter::try_new(file, schema.clone(), Some(writer_properties(schema)));
+        Ok(Self { writer: writer.map_err(|e| Error::write(&folder.final_path(name), e))?, folder, name })
     }
 
     fn write(&mut self, batch: &RecordBatch) -> Result<()> {
-        self.writer.write(batch).map_err(|e| Error::write(&self.folder.named(self.name), e))
+        self.writer.write(batch).map_err(|e| Error::write(&self.folder.final_path(self.name), e))
     }
 
     fn end_row_group(&mut self) -> Result<()> {
-        self.writer.flush().map_err(|e| Error::write(&self.folder.named(self.name), e))
+        self.writer.flush().map_err(|e| Error::write(&self.folder.final_path(self.name), e))
     }
 
     fn finish(self) -> Result<WrittenFile> {
-        let file = self.writer.into_inner().map_err(|e| Error::write(&self.folder.named(self.name), e))?;
+        let file = self.writer.into_inner().map_err(|e| Error::write(&self.folder.final_path(self.name), e))?;
         file.finish()
     }
 }
 
 /// Writes a file of measurements; returns it, and the rows of each surface.
-pub(super) async fn write(job: &ExportJob, shard: &Shard) -> Result<(WrittenFile, Vec<u64>)> {
+pub(super) async fn write_shard(job: &ExportJob, shard: &Shard) -> Result<(WrittenFile, Vec<u64>)> {
     let ExportJob { lake, snapshot, plan, folder } = job;
     let mut writer = ShardWriter::create(folder, &shard.name, plan.schema())?;
     let maker = RowBuilder { lake, snapshot, columns: &plan.columns, moves: &plan.moves };
@@ -57,8 +57,8 @@ pub(super) async fn write(job: &ExportJob, shard: &Shard) -> Result<(WrittenFile
     for surface in &shard.surfaces {
         let mut rows = 0;
         for run in &surface.runs {
-            let of_run = maker.read(run).await?;
-            for batch in maker.batches(surface, run, shard.part, &of_run)? {
+            let of_run = maker.read_rows(run).await?;
+            for batch in maker.row_batches(surface, run, shard.part, &of_run)? {
                 rows += batch.num_rows() as u64;
                 writer.write(&batch)?;
             }
@@ -70,7 +70,7 @@ pub(super) async fn write(job: &ExportJob, shard: &Shard) -> Result<(WrittenFile
 }
 
 /// Writes the height maps of a part; returns the file, if there are any, and the number of surfaces that have them.
-pub(super) async fn heights(
+pub(super) async fn write_height_maps(
     lake: &Lake,
     snapshot: &LakeSnapshot,
     plan: &Plan,
@@ -78,12 +78,14 @@ pub(super) async fn heights(
     folder: &PendingFolder,
 ) -> Result<(Option<WrittenFile>, usize)> {
     let name = format!("heightmaps/{}.parquet", part.name());
-    let symmetries = plan.moves.names();
+    let symmetries = plan.moves.symmetry_names();
     let (mut writer, mut count) = (None, 0);
     for surface in plan.of_part(part) {
-        let Some(batch) = heights::read(lake, snapshot, surface, part, &symmetries).await? else { continue };
+        let Some(batch) = heights::read_height_maps(lake, snapshot, surface, part, &symmetries).await? else {
+            continue;
+        };
         if writer.is_none() {
-            writer = Some(ShardWriter::create(folder, &name, &heights::schema()?)?);
+            writer = Some(ShardWriter::create(folder, &name, &heights::height_map_schema()?)?);
         }
         if let Some(writer) = &mut writer {
             writer.write(&batch)?;
@@ -95,7 +97,7 @@ pub(super) async fn heights(
 }
 
 // Samples do not repeat, so a dictionary only costs; byte stream split compresses them best.
-fn properties(schema: &SchemaRef) -> WriterProperties {
+fn writer_properties(schema: &SchemaRef) -> WriterProperties {
     let mut builder = WriterProperties::builder()
         .set_compression(Compression::ZSTD(ZstdLevel::try_new(ZSTD_LEVEL).unwrap_or_default()))
         .set_created_by(concat!("echolake ", env!("CARGO_PKG_VERSION")).to_owned())

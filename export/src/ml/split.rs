@@ -78,9 +78,9 @@ impl SplitPart {
 
 /// Returns the part of each surface, in the given order; None for a surface that is left out because another side of
 /// its panel is in a rarer part.
-pub(super) fn assign(surfaces: &[TrainingSurface], split: SplitParams) -> Result<Vec<Option<SplitPart>>> {
-    let drawn = draw(surfaces, split)?;
-    let own = |surface: &TrainingSurface| match (surface.reference, drawn.get(&category(surface, split.by))) {
+pub(super) fn assign_parts(surfaces: &[TrainingSurface], split: SplitParams) -> Result<Vec<Option<SplitPart>>> {
+    let drawn = draw_parts(surfaces, split)?;
+    let own = |surface: &TrainingSurface| match (surface.reference, drawn.get(&split_category(surface, split.by))) {
         (false, Some(part)) => *part,
         // References are in the numbers of every other surface already.
         _ => SplitPart::Train,
@@ -104,9 +104,9 @@ pub(super) fn assign(surfaces: &[TrainingSurface], split: SplitParams) -> Result
 }
 
 // Draws a part for each category: sorted by digest, the first fill the test set, the next the validation set.
-fn draw(surfaces: &[TrainingSurface], split: SplitParams) -> Result<BTreeMap<String, SplitPart>> {
+fn draw_parts(surfaces: &[TrainingSurface], split: SplitParams) -> Result<BTreeMap<String, SplitPart>> {
     let mut counts: BTreeMap<String, usize> = BTreeMap::new();
-    surfaces.iter().filter(|s| !s.reference).for_each(|s| *counts.entry(category(s, split.by)).or_default() += 1);
+    surfaces.iter().filter(|s| !s.reference).for_each(|s| *counts.entry(split_category(s, split.by)).or_default() += 1);
     if split.by == SplitBy::Nothing {
         return Ok(counts.into_keys().map(|c| (c, SplitPart::Train)).collect());
     }
@@ -124,7 +124,7 @@ fn draw(surfaces: &[TrainingSurface], split: SplitParams) -> Result<BTreeMap<Str
         return Err(Error::Split { by: split.by.name(), reason });
     }
     let mut order: Vec<_> = counts.into_iter().collect();
-    order.sort_by_cached_key(|(category, _)| digest(split.seed, category));
+    order.sort_by_cached_key(|(category, _)| order_digest(split.seed, category));
     let mut left = order.len();
     let mut order = order.into_iter();
     let mut drawn = BTreeMap::new();
@@ -143,7 +143,7 @@ fn draw(surfaces: &[TrainingSurface], split: SplitParams) -> Result<BTreeMap<Str
     Ok(drawn)
 }
 
-fn category(surface: &TrainingSurface, by: SplitBy) -> String {
+fn split_category(surface: &TrainingSurface, by: SplitBy) -> String {
     match by {
         SplitBy::Panel | SplitBy::Nothing => surface.id.panel().to_owned(),
         SplitBy::Typology => surface.typology.clone(),
@@ -152,7 +152,7 @@ fn category(surface: &TrainingSurface, by: SplitBy) -> String {
 }
 
 /// Returns a digest for a pseudorandom order that is the same on every machine.
-pub(super) fn digest(seed: u64, name: &str) -> [u8; 32] {
+pub(super) fn order_digest(seed: u64, name: &str) -> [u8; 32] {
     let mut sha = Sha256::new();
     sha.update(seed.to_le_bytes());
     sha.update(name.as_bytes());
@@ -190,7 +190,7 @@ mod tests {
         for by in [SplitBy::Panel, SplitBy::Typology, SplitBy::Nothing] {
             for seed in 0..50 {
                 let surfaces = lake();
-                let parts = assign(&surfaces, SplitParams { by, seed, ..SplitParams::default() }).expect("split");
+                let parts = assign_parts(&surfaces, SplitParams { by, seed, ..SplitParams::default() }).expect("split");
                 let mut of_panel: HashMap<&str, HashSet<SplitPart>> = HashMap::new();
                 for (surface, part) in surfaces.iter().zip(&parts) {
                     of_panel.entry(surface.id.panel()).or_default().extend(*part);
@@ -206,7 +206,8 @@ mod tests {
     #[test]
     fn a_typology_that_is_held_out_is_never_trained_on() {
         let surfaces = lake();
-        let parts = assign(&surfaces, SplitParams { by: SplitBy::Typology, ..SplitParams::default() }).expect("split");
+        let parts =
+            assign_parts(&surfaces, SplitParams { by: SplitBy::Typology, ..SplitParams::default() }).expect("split");
         let of = |part| -> HashSet<&str> {
             let of_part = surfaces.iter().zip(&parts).filter(|(_, p)| **p == Some(part));
             of_part.map(|(s, _)| s.typology.as_str()).collect()
@@ -221,7 +222,7 @@ mod tests {
         let mut surfaces = lake();
         surfaces[30].reference = true;
         for seed in 0..20 {
-            let parts = assign(&surfaces, SplitParams { seed, ..SplitParams::default() }).expect("split");
+            let parts = assign_parts(&surfaces, SplitParams { seed, ..SplitParams::default() }).expect("split");
             for (surface, part) in surfaces.iter().zip(parts) {
                 if surface.reference || surface.id.panel() == surfaces[30].id.panel() {
                     assert_eq!(part, Some(SplitPart::Train), "{}", surface.id);
@@ -233,9 +234,9 @@ mod tests {
     #[test]
     fn what_cannot_be_split_says_so() {
         let few: Vec<_> = lake().into_iter().take(4).collect();
-        let error = assign(&few, SplitParams::default()).expect_err("two panels").to_string();
+        let error = assign_parts(&few, SplitParams::default()).expect_err("two panels").to_string();
         assert!(error.contains("has 2 of them, expected 3"), "{error}");
-        let error = assign(&lake(), SplitParams { test: 0.6, validation: 0.5, ..SplitParams::default() })
+        let error = assign_parts(&lake(), SplitParams { test: 0.6, validation: 0.5, ..SplitParams::default() })
             .expect_err("too much");
         assert!(error.to_string().contains("0.6 and 0.5"), "{error}");
     }

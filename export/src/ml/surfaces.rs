@@ -29,18 +29,18 @@ pub(super) struct TrainingRun {
 }
 
 /// Reads all surfaces that have a derived run, sorted by name, and the number of runs that wait for references.
-pub(super) async fn read(lake: &Lake, snapshot: &LakeSnapshot) -> Result<(Vec<TrainingSurface>, usize)> {
+pub(super) async fn read_surfaces(lake: &Lake, snapshot: &LakeSnapshot) -> Result<(Vec<TrainingSurface>, usize)> {
     let mut surfaces = BTreeMap::new();
     let mut references = HashSet::new();
     let columns = ["surface_id", "typology", "macrostructure", "origin", "flat_reference", "foam_reference"];
     for file in snapshot.files(Table::Surfaces) {
         let batch = rows::of_file(lake, Table::Surfaces, file, &columns).await?;
         for column in ["flat_reference", "foam_reference"] {
-            references.extend(rows::texts(&batch, column).into_iter().map(str::to_owned));
+            references.extend(rows::text_column(&batch, column).into_iter().map(str::to_owned));
         }
-        let (typologies, origins) = (rows::texts(&batch, "typology"), rows::texts(&batch, "origin"));
+        let (typologies, origins) = (rows::text_column(&batch, "typology"), rows::text_column(&batch, "origin"));
         let macrostructures = rows::optional_texts(&batch, "macrostructure");
-        for (row, id) in rows::texts(&batch, "surface_id").into_iter().enumerate() {
+        for (row, id) in rows::text_column(&batch, "surface_id").into_iter().enumerate() {
             let surface = TrainingSurface {
                 id: id.parse()?,
                 typology: typologies[row].to_owned(),
@@ -60,7 +60,7 @@ pub(super) async fn read(lake: &Lake, snapshot: &LakeSnapshot) -> Result<(Vec<Tr
             continue;
         }
         let row = rows::of_run(lake, snapshot, Table::Runs, &visible.run, &["file_sha256"]).await?;
-        let file_sha256 = rows::texts(&row, "file_sha256").first().copied().unwrap_or_default().to_owned();
+        let file_sha256 = rows::text_column(&row, "file_sha256").first().copied().unwrap_or_default().to_owned();
         surface.runs.push(TrainingRun { visible: visible.clone(), file_sha256 });
     }
     let mut surfaces: Vec<_> = surfaces.into_values().filter(|s| !s.runs.is_empty()).collect();

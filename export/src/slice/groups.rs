@@ -65,14 +65,14 @@ impl Groups {
     pub(super) fn new(source: Source, taken: &[Taken], topics: &[String]) -> Self {
         let wanted = Wanted {
             keys: taken.iter().map(|t| (t.pair, t.attempt)).collect(),
-            times: taken.iter().map(|t| (t.time(), (t.pair, t.attempt))).collect(),
+            times: taken.iter().map(|t| (t.message_time(), (t.pair, t.attempt))).collect(),
         };
         let topic = |id: &u16| source.channels.get(id).map_or("", |c| c.topic.as_str());
         let named = |id: &u16| is_named(topics, topic(id));
         let has_once =
             |chunk: &&ChunkIndex| chunk.message_index_offsets.keys().any(|id| is_once(topic(id)) && named(id));
         let once = source.chunks.iter().filter(has_once).cloned().collect();
-        let lanes = lanes(&source.chunks).into_iter().filter(|(channels, _)| channels.iter().any(named));
+        let lanes = split_lanes(&source.chunks).into_iter().filter(|(channels, _)| channels.iter().any(named));
         let lanes = lanes.map(|(channels, chunks)| {
             let keyed = channels.iter().any(|id| names_pair(topic(id)));
             Lane::new(keyed, chunks, &wanted)
@@ -83,7 +83,7 @@ impl Groups {
     /// The next messages of topics that stand in the file once; None after the last.
     pub(super) async fn next_once(&mut self) -> Result<Option<Vec<Message>>> {
         let Some(chunk) = self.once.pop_front() else { return Ok(None) };
-        let mut messages = self.source.messages(&chunk).await?;
+        let mut messages = self.source.read_messages(&chunk).await?;
         messages.retain(|m| is_once(&m.channel.topic));
         Ok(Some(messages))
     }
@@ -94,7 +94,7 @@ impl Groups {
     /// [`Error::Changed`] where one of them is not in the file.
     pub(super) async fn next(&mut self) -> Result<Option<Vec<Message>>> {
         for lane in &mut self.lanes {
-            lane.fill(&self.source, &self.wanted).await?;
+            lane.fill_ready(&self.source, &self.wanted).await?;
         }
         let first = self.lanes.iter().filter_map(|lane| lane.ready.front()).min_by_key(|open| open.time);
         let Some(key) = first.map(|open| open.key) else { return self.all_found().map(|()| None) };
@@ -122,7 +122,7 @@ impl Groups {
 }
 
 // Channels that share a chunk, by way of others too, and their chunks in the file's order.
-fn lanes(chunks: &[ChunkIndex]) -> Vec<(BTreeSet<u16>, Vec<ChunkIndex>)> {
+fn split_lanes(chunks: &[ChunkIndex]) -> Vec<(BTreeSet<u16>, Vec<ChunkIndex>)> {
     let mut lanes: Vec<(BTreeSet<u16>, Vec<ChunkIndex>)> = Vec::new();
     for chunk in chunks.iter().filter(|c| c.message_start_time <= c.message_end_time) {
         let mut merged = (chunk.message_index_offsets.keys().copied().collect::<BTreeSet<_>>(), vec![chunk.clone()]);
@@ -147,20 +147,20 @@ impl Lane {
     }
 
     // Reads until the lane's next measurement is whole, or it has none.
-    async fn fill(&mut self, source: &Source, wanted: &Wanted) -> Result<()> {
+    async fn fill_ready(&mut self, source: &Source, wanted: &Wanted) -> Result<()> {
         while self.ready.is_empty() {
             let Some(chunk) = self.chunks.pop_front() else {
-                self.close(wanted);
+                self.close_group(wanted);
                 return Ok(());
             };
             let at = self.starts.binary_search(&chunk.chunk_start_offset).unwrap_or(0);
             if self.last != at.checked_sub(1).map(|before| self.starts[before]) {
                 // What went before stands in chunks that have nothing wanted.
-                self.close(wanted);
+                self.close_group(wanted);
                 self.pending.clear();
             }
             self.last = Some(chunk.chunk_start_offset);
-            for message in source.messages(&chunk).await? {
+            for message in source.read_messages(&chunk).await? {
                 if !is_once(&message.channel.topic) {
                     self.sort_in(message, wanted);
                 }
@@ -175,7 +175,7 @@ impl Lane {
         if let Some(key) = key {
             let verdict = (topic == topics::MEASUREMENT).then_some(time);
             if self.open.as_ref().is_none_or(|open| open.key != key) {
-                self.close(wanted);
+                self.close_group(wanted);
                 self.open = Some(Open { key, messages: std::mem::take(&mut self.pending), time, verdict: None });
             }
             if let Some(open) = &mut self.open {
@@ -198,7 +198,7 @@ impl Lane {
         }
     }
 
-    fn close(&mut self, wanted: &Wanted) {
+    fn close_group(&mut self, wanted: &Wanted) {
         self.ready.extend(self.open.take().filter(|open| wanted.keys.contains(&open.key)));
     }
 }

@@ -22,7 +22,7 @@ use futures::stream::{self, BoxStream, StreamExt as _};
 use crate::error::{Error, Result};
 use crate::rows;
 use groups::{Groups, is_once};
-pub use outline::{Outline, OutlineSchema, OutlineTopic, outline};
+pub use outline::{Outline, OutlineSchema, OutlineTopic, outline_slice};
 use repeats::WrittenContents;
 use source::{Message, RunFile, Source};
 use writer::SliceWriter;
@@ -66,9 +66,9 @@ impl Taken {
         let negative = |column: &str, value: i64| damaged(format!("{column} is {value}"));
         let runs = batch.column_by_name(run).and_then(|c| cast(c, &DataType::Utf8).ok());
         let runs = runs.ok_or_else(|| damaged(format!("no column {run}")))?;
-        let pairs = rows::numbers::<Int32Type>(batch, pair)?;
-        let attempts = rows::numbers::<Int32Type>(batch, attempt)?;
-        let times = rows::numbers::<Int64Type>(batch, time)?;
+        let pairs = rows::number_column::<Int32Type>(batch, pair)?;
+        let attempts = rows::number_column::<Int32Type>(batch, attempt)?;
+        let times = rows::number_column::<Int64Type>(batch, time)?;
         if let Some(early) = times.iter().find(|time| **time < 0) {
             return Err(negative(time, *early));
         }
@@ -81,7 +81,7 @@ impl Taken {
     }
 
     // As messages have it.
-    fn time(&self) -> u64 {
+    fn message_time(&self) -> u64 {
         u64::try_from(self.log_time_ns).unwrap_or(0)
     }
 }
@@ -131,7 +131,7 @@ pub(crate) struct Measured {
 
 impl Measured {
     /// Time and content of the first message of a topic.
-    pub(crate) fn message(&self, topic: &str) -> Option<(i64, Bytes)> {
+    pub(crate) fn first_message(&self, topic: &str) -> Option<(i64, Bytes)> {
         let found = self.messages.iter().find(|m| m.channel.topic == topic)?;
         Some((i64::try_from(found.log_time).unwrap_or(0), found.data.clone()))
     }
@@ -162,7 +162,7 @@ impl OpenedRun {
 /// Opens the runs of measurements, each checked.
 pub(crate) async fn open_runs(lake: &Lake, taken: &[Taken], check: Check) -> Result<Vec<OpenedRun>> {
     let mut opened = Vec::new();
-    for (file, taken) in files(lake, &lake.whole_snapshot().await?, taken.to_vec()).await? {
+    for (file, taken) in run_files(lake, &lake.whole_snapshot().await?, taken.to_vec()).await? {
         let source = Source::open(lake.store(), file, check).await?;
         opened.push(OpenedRun(Groups::new(source, &taken, &[])));
     }
@@ -170,7 +170,7 @@ pub(crate) async fn open_runs(lake: &Lake, taken: &[Taken], check: Check) -> Res
 }
 
 // The runs of measurements with their files, by their start; at least one.
-async fn files(lake: &Lake, snapshot: &LakeSnapshot, taken: Vec<Taken>) -> Result<Vec<(RunFile, Vec<Taken>)>> {
+async fn run_files(lake: &Lake, snapshot: &LakeSnapshot, taken: Vec<Taken>) -> Result<Vec<(RunFile, Vec<Taken>)>> {
     if taken.is_empty() {
         return Err(Error::Nothing { reason: "no measurement is selected".into() });
     }
@@ -183,7 +183,7 @@ async fn files(lake: &Lake, snapshot: &LakeSnapshot, taken: Vec<Taken>) -> Resul
     }
     let mut runs = Vec::new();
     for (run, taken) in by_run {
-        runs.push((RunFile::find(lake, snapshot, &run).await?, taken));
+        runs.push((RunFile::find_run(lake, snapshot, &run).await?, taken));
     }
     runs.sort_by_key(|(file, _)| file.started_ns);
     Ok(runs)
@@ -250,7 +250,7 @@ impl Slice {
     /// [`Error::Changed`] for a file that is not the ingested one.
     pub async fn open(lake: &Lake, snapshot: &LakeSnapshot, params: SliceParams) -> Result<Self> {
         let SliceParams { taken, topics, layout, check } = params;
-        let (runs, mut known) = (files(lake, snapshot, taken).await?, BTreeSet::new());
+        let (runs, mut known) = (run_files(lake, snapshot, taken).await?, BTreeSet::new());
         let (mut first, lead) = (None, runs[0].0.run.clone());
         for (file, _) in &runs {
             let source = Source::open(lake.store(), file.clone(), check).await?;
@@ -259,7 +259,7 @@ impl Slice {
         }
         check_topics(&topics, &known)?;
         let mut writer = SliceWriter::new(layout)?;
-        writer.metadata(about(&runs, &topics))?;
+        writer.write_metadata(slice_metadata(&runs, &topics))?;
         Ok(Self {
             lake: lake.clone(),
             several: runs.len() > 1,
@@ -283,11 +283,11 @@ impl Slice {
     pub async fn next(&mut self) -> Result<Option<Bytes>> {
         loop {
             let Some(writer) = &mut self.writer else { return Ok(None) };
-            if let Some(piece) = writer.take() {
+            if let Some(piece) = writer.take_written() {
                 return Ok(Some(piece));
             }
-            if !self.advance().await? {
-                self.release(u64::MAX)?;
+            if !self.advance_one().await? {
+                self.release_until(u64::MAX)?;
                 return self.writer.take().map(SliceWriter::finish).transpose();
             }
         }
@@ -299,7 +299,7 @@ impl Slice {
     }
 
     // Goes on by one measurement; false after the last.
-    async fn advance(&mut self) -> Result<bool> {
+    async fn advance_one(&mut self) -> Result<bool> {
         let head = |run: &OpenRun| run.next.first().map_or(0, |m| m.log_time);
         let earliest = (0..self.open.len()).min_by_key(|i| head(&self.open[*i]));
         let at = earliest.map(|i| head(&self.open[i]));
@@ -307,14 +307,14 @@ impl Slice {
         match (earliest, starts) {
             (None, None) => return Ok(false),
             (Some(i), starts) if starts.is_none_or(|s| at.is_some_and(|at| at < s)) => {
-                self.release(at.unwrap_or(0))?;
+                self.release_until(at.unwrap_or(0))?;
                 let run = &mut self.open[i];
                 let group = std::mem::take(&mut run.next);
                 match run.groups.next().await? {
                     Some(next) => run.next = next,
                     None => drop(self.open.remove(i)),
                 }
-                group.into_iter().for_each(|message| self.wait(message));
+                group.into_iter().for_each(|message| self.queue_message(message));
             }
             _ => self.open_next().await?,
         }
@@ -323,7 +323,7 @@ impl Slice {
 
     async fn open_next(&mut self) -> Result<()> {
         let Some((file, taken)) = self.runs.pop_front() else { return Ok(()) };
-        self.release(file.started_ns)?;
+        self.release_until(file.started_ns)?;
         let source = match self.first.take() {
             Some(source) => source,
             None => Source::open(self.lake.store(), file, Check::Ends).await?,
@@ -334,11 +334,11 @@ impl Slice {
             metadata.extend(self.attach_all(&source).await?);
         }
         if let Some(writer) = &mut self.writer {
-            writer.metadata(Metadata { name: SLICE_RUN_METADATA.into(), metadata })?;
+            writer.write_metadata(Metadata { name: SLICE_RUN_METADATA.into(), metadata })?;
         }
         let mut groups = Groups::new(source, &taken, &self.topics);
         while let Some(messages) = groups.next_once().await? {
-            messages.into_iter().for_each(|message| self.wait(message));
+            messages.into_iter().for_each(|message| self.queue_message(message));
         }
         if let Some(next) = groups.next().await? {
             self.open.push(OpenRun { groups, next });
@@ -350,7 +350,7 @@ impl Slice {
     async fn attach_all(&mut self, source: &Source) -> Result<BTreeMap<String, String>> {
         let mut references = BTreeMap::new();
         let mut number = 0;
-        while let (Some(mut attachment), Some(writer)) = (source.attachment(number).await?, &mut self.writer) {
+        while let (Some(mut attachment), Some(writer)) = (source.read_attachment(number).await?, &mut self.writer) {
             number += 1;
             if self.several {
                 let name = format!("{}/{}", source.file.run, attachment.name);
@@ -360,12 +360,12 @@ impl Slice {
                 }
                 attachment.name = name;
             }
-            writer.attach(&attachment)?;
+            writer.write_attachment(&attachment)?;
         }
         Ok(references)
     }
 
-    fn wait(&mut self, message: Message) {
+    fn queue_message(&mut self, message: Message) {
         if is_named(&self.topics, &message.channel.topic) {
             self.arrived += 1;
             self.waiting.push(Reverse(Waiting { order: (message.log_time, self.arrived), message }));
@@ -373,7 +373,7 @@ impl Slice {
     }
 
     // Writes what is earlier than anything that is still to come.
-    fn release(&mut self, until: u64) -> Result<()> {
+    fn release_until(&mut self, until: u64) -> Result<()> {
         let Some(writer) = &mut self.writer else { return Ok(()) };
         while self.waiting.peek().is_some_and(|Reverse(w)| w.order.0 < until || until == u64::MAX) {
             let Some(Reverse(Waiting { message, .. })) = self.waiting.pop() else { break };
@@ -383,7 +383,7 @@ impl Slice {
             }
             self.last_time = message.log_time;
             if !self.written.is_repeat(&message) {
-                writer.write(message)?;
+                writer.write_message(message)?;
             }
         }
         Ok(())
@@ -401,7 +401,7 @@ fn check_topics(topics: &[String], known: &BTreeSet<String>) -> Result<()> {
     Err(Error::Unknown { kind: "topic", name: missing.clone(), known })
 }
 
-fn about(runs: &[(RunFile, Vec<Taken>)], topics: &[String]) -> Metadata {
+fn slice_metadata(runs: &[(RunFile, Vec<Taken>)], topics: &[String]) -> Metadata {
     let measurements: usize = runs.iter().map(|(_, taken)| taken.len()).sum();
     let mut metadata = BTreeMap::from([
         ("format".to_owned(), "1".to_owned()),

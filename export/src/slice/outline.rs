@@ -7,7 +7,7 @@ use echolake_recording::ChunkIndex;
 
 use super::groups::is_once;
 use super::source::Source;
-use super::{SliceParams, Taken, check_topics, files, is_named};
+use super::{SliceParams, Taken, check_topics, is_named, run_files};
 use crate::error::Result;
 
 /// What a slice will hold.
@@ -49,14 +49,14 @@ pub struct OutlineSchema {
 ///
 /// # Errors
 /// As [`super::Slice::open`].
-pub async fn outline(lake: &Lake, snapshot: &LakeSnapshot, params: SliceParams) -> Result<Outline> {
+pub async fn outline_slice(lake: &Lake, snapshot: &LakeSnapshot, params: SliceParams) -> Result<Outline> {
     let SliceParams { taken, topics, check, .. } = params;
     let (mut outline, mut known) =
         (Outline { start_ns: i64::MAX, end_ns: i64::MIN, ..Outline::default() }, BTreeSet::new());
-    for (file, taken) in files(lake, snapshot, taken).await? {
+    for (file, taken) in run_files(lake, snapshot, taken).await? {
         let source = Source::open(lake.store(), file, check).await?;
         known.extend(source.channels.values().map(|c| c.topic.clone()));
-        outline.add(&source, &taken, &topics);
+        outline.add_source(&source, &taken, &topics);
     }
     check_topics(&topics, &known)?;
     outline.topics.sort_by(|a, b| a.name.cmp(&b.name));
@@ -64,10 +64,14 @@ pub async fn outline(lake: &Lake, snapshot: &LakeSnapshot, params: SliceParams) 
 }
 
 impl Outline {
-    fn add(&mut self, source: &Source, taken: &[Taken], topics: &[String]) {
+    fn add_source(&mut self, source: &Source, taken: &[Taken], topics: &[String]) {
         for channel in source.channels.values().filter(|c| is_named(topics, &c.topic)) {
             let schema = channel.schema.as_ref().map(|s| {
-                self.schema(OutlineSchema { name: s.name.clone(), encoding: s.encoding.clone(), data: s.data.to_vec() })
+                self.schema_index(OutlineSchema {
+                    name: s.name.clone(),
+                    encoding: s.encoding.clone(),
+                    data: s.data.to_vec(),
+                })
             });
             let (name, message_encoding) = (channel.topic.clone(), channel.message_encoding.clone());
             let topic = OutlineTopic { name, message_encoding, schema };
@@ -75,7 +79,7 @@ impl Outline {
                 self.topics.push(topic);
             }
         }
-        let times: BTreeSet<_> = taken.iter().map(Taken::time).collect();
+        let times: BTreeSet<_> = taken.iter().map(Taken::message_time).collect();
         // Chunks that are read; a measurement's messages are not all of its very time.
         let is_read = |chunk: &&ChunkIndex| {
             let once =
@@ -89,7 +93,7 @@ impl Outline {
         self.end_ns = self.end_ns.max(signed(read().map(|c| c.message_end_time).max()));
     }
 
-    fn schema(&mut self, schema: OutlineSchema) -> usize {
+    fn schema_index(&mut self, schema: OutlineSchema) -> usize {
         self.schemas.iter().position(|known| *known == schema).unwrap_or_else(|| {
             self.schemas.push(schema);
             self.schemas.len() - 1

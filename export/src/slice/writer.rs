@@ -71,49 +71,51 @@ impl Default for Lane {
 impl SliceWriter {
     pub(super) fn new(layout: Layout) -> Result<Self> {
         let out = Shared::default();
-        let writer = stream_writer(out.clone()).map_err(failed)?;
+        let writer = stream_writer(out.clone()).map_err(writer_error)?;
         let lanes = vec![Lane::default()];
         Ok(Self { writer, out, layout, lanes, lane_of: HashMap::new(), sequence: 0, messages: 0, has_more: false })
     }
 
     /// What was written since, where a chunk or an attachment is in it.
-    pub(super) fn take(&mut self) -> Option<Bytes> {
+    pub(super) fn take_written(&mut self) -> Option<Bytes> {
         std::mem::take(&mut self.has_more).then(|| std::mem::take(&mut *self.out.lock()).into())
     }
 
-    pub(super) fn metadata(&mut self, metadata: Metadata) -> Result<()> {
+    pub(super) fn write_metadata(&mut self, metadata: Metadata) -> Result<()> {
         self.flush_all()?;
-        self.writer.write_metadata(&metadata).map_err(failed)
+        self.writer.write_metadata(&metadata).map_err(writer_error)
     }
 
-    pub(super) fn attach(&mut self, attachment: &Attachment<'_>) -> Result<()> {
+    pub(super) fn write_attachment(&mut self, attachment: &Attachment<'_>) -> Result<()> {
         self.flush_all()?;
         self.has_more = true;
-        self.writer.attach(attachment).map_err(failed)
+        self.writer.attach(attachment).map_err(writer_error)
     }
 
     /// Writes a message; they come by time.
-    pub(super) fn write(&mut self, message: Message) -> Result<()> {
+    pub(super) fn write_message(&mut self, message: Message) -> Result<()> {
         let channel = &message.channel;
         let schema = match &channel.schema {
-            Some(schema) => self.writer.add_schema(&schema.name, &schema.encoding, &schema.data).map_err(failed)?,
+            Some(schema) => {
+                self.writer.add_schema(&schema.name, &schema.encoding, &schema.data).map_err(writer_error)?
+            }
             None => 0,
         };
         let added = self.writer.add_channel(schema, &channel.topic, &channel.message_encoding, &channel.metadata);
-        let channel_id = added.map_err(failed)?;
+        let channel_id = added.map_err(writer_error)?;
         self.sequence = self.sequence.wrapping_add(1);
         self.messages += 1;
-        let lane = self.lane(&message);
+        let lane = self.lane_index(&message);
         let Message { log_time, publish_time, data, .. } = message;
         let header = MessageHeader { channel_id, sequence: self.sequence, log_time, publish_time };
         let of = &mut self.lanes[lane];
         of.bytes += data.len();
         of.messages.push((header, data));
-        if of.bytes >= of.enough { self.flush(lane) } else { Ok(()) }
+        if of.bytes >= of.enough { self.flush_lane(lane) } else { Ok(()) }
     }
 
     // Light topics share a lane; one that turns out to be heavy gets its own.
-    fn lane(&mut self, message: &Message) -> usize {
+    fn lane_index(&mut self, message: &Message) -> usize {
         if self.layout == Layout::InTime {
             return 0;
         }
@@ -134,7 +136,7 @@ impl SliceWriter {
     }
 
     // A lane becomes a chunk.
-    fn flush(&mut self, lane: usize) -> Result<()> {
+    fn flush_lane(&mut self, lane: usize) -> Result<()> {
         let of = &mut self.lanes[lane];
         if of.messages.is_empty() {
             return Ok(());
@@ -143,27 +145,27 @@ impl SliceWriter {
         of.enough = (of.enough * 2).min(CHUNK_BYTES);
         self.has_more = true;
         for (header, data) in of.messages.drain(..) {
-            self.writer.write_to_known_channel(&header, &data).map_err(failed)?;
+            self.writer.write_to_known_channel(&header, &data).map_err(writer_error)?;
         }
-        self.writer.flush().map_err(failed)
+        self.writer.flush().map_err(writer_error)
     }
 
     fn flush_all(&mut self) -> Result<()> {
         let first = |lane: &Lane| lane.messages.first().map_or(u64::MAX, |(header, _)| header.log_time);
         let mut order: Vec<_> = (0..self.lanes.len()).collect();
         order.sort_by_key(|lane| first(&self.lanes[*lane]));
-        order.into_iter().try_for_each(|lane| self.flush(lane))
+        order.into_iter().try_for_each(|lane| self.flush_lane(lane))
     }
 
     /// Ends the file; returns the rest of it.
     pub(super) fn finish(mut self) -> Result<Bytes> {
         self.flush_all()?;
-        self.writer.finish().map_err(failed)?;
+        self.writer.finish().map_err(writer_error)?;
         Ok(std::mem::take(&mut *self.out.lock()).into())
     }
 }
 
 // It writes to memory, so what fails is what it is given.
-fn failed(error: McapError) -> Error {
+fn writer_error(error: McapError) -> Error {
     Error::damaged("the slice", error)
 }

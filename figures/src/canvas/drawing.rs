@@ -129,7 +129,7 @@ pub(crate) struct DrawnShape {
 }
 
 impl DrawnShape {
-    pub(crate) fn opaque(mut self, opacity: f32) -> Self {
+    pub(crate) fn with_opacity(mut self, opacity: f32) -> Self {
         self.opacity = opacity;
         self
     }
@@ -140,36 +140,36 @@ impl DrawnShape {
     }
 }
 
-fn shape(geometry: ShapeGeometry, fill: Option<FigureColour>, stroke: Option<StrokeStyle>) -> DrawnShape {
+fn plain_shape(geometry: ShapeGeometry, fill: Option<FigureColour>, stroke: Option<StrokeStyle>) -> DrawnShape {
     DrawnShape { geometry, fill, opacity: 1.0, stroke, data: Vec::new() }
 }
 
 pub(crate) fn filled_rect([x, y]: [f32; 2], [width, height]: [f32; 2], fill: FigureColour) -> DrawnShape {
-    shape(ShapeGeometry::Rect { x, y, width, height }, Some(fill), None)
+    plain_shape(ShapeGeometry::Rect { x, y, width, height }, Some(fill), None)
 }
 
 pub(crate) fn framed_rect([x, y]: [f32; 2], [width, height]: [f32; 2], stroke: StrokeStyle) -> DrawnShape {
-    shape(ShapeGeometry::Rect { x, y, width, height }, None, Some(stroke))
+    plain_shape(ShapeGeometry::Rect { x, y, width, height }, None, Some(stroke))
 }
 
-pub(crate) fn line(points: Vec<[f32; 2]>, stroke: StrokeStyle) -> DrawnShape {
-    shape(ShapeGeometry::Path { points, closed: false }, None, Some(stroke))
+pub(crate) fn stroked_line(points: Vec<[f32; 2]>, stroke: StrokeStyle) -> DrawnShape {
+    plain_shape(ShapeGeometry::Path { points, closed: false }, None, Some(stroke))
 }
 
 pub(crate) fn filled_area(points: Vec<[f32; 2]>, fill: FigureColour) -> DrawnShape {
-    shape(ShapeGeometry::Path { points, closed: true }, Some(fill), None)
+    plain_shape(ShapeGeometry::Path { points, closed: true }, Some(fill), None)
 }
 
-pub(crate) fn ellipse(centre: [f32; 2], radii: [f32; 2], angle_deg: f32, fill: FigureColour) -> DrawnShape {
-    shape(ShapeGeometry::Ellipse { centre, radii, angle_deg }, Some(fill), None)
+pub(crate) fn filled_ellipse(centre: [f32; 2], radii: [f32; 2], angle_deg: f32, fill: FigureColour) -> DrawnShape {
+    plain_shape(ShapeGeometry::Ellipse { centre, radii, angle_deg }, Some(fill), None)
 }
 
-pub(crate) fn picture([x, y]: [f32; 2], side: f32, pixels: Vec<u8>, columns: usize) -> DrawnShape {
-    shape(ShapeGeometry::Picture { x, y, side, pixels, columns }, None, None)
+pub(crate) fn picture_shape([x, y]: [f32; 2], side: f32, pixels: Vec<u8>, columns: usize) -> DrawnShape {
+    plain_shape(ShapeGeometry::Picture { x, y, side, pixels, columns }, None, None)
 }
 
 /// Text in ink of ordinary size.
-pub(crate) fn label(at: [f32; 2], text: impl Into<String>, anchor: TextAnchor) -> DrawnShape {
+pub(crate) fn ink_label(at: [f32; 2], text: impl Into<String>, anchor: TextAnchor) -> DrawnShape {
     sized_label(at, text, anchor, TEXT_PX, FigureColour::Ink)
 }
 
@@ -181,13 +181,17 @@ pub(crate) fn sized_label(
     colour: FigureColour,
 ) -> DrawnShape {
     let geometry = ShapeGeometry::Text { at, text: text.into(), size_px, anchor, upwards: false };
-    shape(geometry, Some(colour), None)
+    plain_shape(geometry, Some(colour), None)
 }
 
 /// Text that runs upwards, its middle at a point.
 pub(crate) fn upward_label(at: [f32; 2], text: impl Into<String>) -> DrawnShape {
     let (text, anchor) = (text.into(), TextAnchor::Middle);
-    shape(ShapeGeometry::Text { at, text, size_px: TEXT_PX, anchor, upwards: true }, Some(FigureColour::Ink), None)
+    plain_shape(
+        ShapeGeometry::Text { at, text, size_px: TEXT_PX, anchor, upwards: true },
+        Some(FigureColour::Ink),
+        None,
+    )
 }
 
 impl FigureDrawing {
@@ -195,14 +199,14 @@ impl FigureDrawing {
         Self { width_px, height_px, shapes: Vec::new(), notes: notes.clone() }
     }
 
-    pub(crate) fn add(&mut self, shape: DrawnShape) {
+    pub(crate) fn add_shape(&mut self, shape: DrawnShape) {
         self.shapes.push(shape);
     }
 
     /// Adds the title at the top.
     pub(crate) fn add_title(&mut self) {
         let text = fitted_text(&self.notes.title, TITLE_PX, self.width_px - 2.0 * TITLE_MARGIN);
-        self.add(sized_label([TITLE_MARGIN, 20.0], text, TextAnchor::Start, TITLE_PX, FigureColour::Ink));
+        self.add_shape(sized_label([TITLE_MARGIN, 20.0], text, TextAnchor::Start, TITLE_PX, FigureColour::Ink));
     }
 
     /// Adds a line of text at the foot that says where the figure comes from, if its data is simulated.
@@ -213,6 +217,6 @@ impl FigureDrawing {
             text = self.notes.origin_word().to_owned();
         }
         let at = [self.width_px - 8.0, self.height_px - 6.0];
-        self.add(sized_label(at, text, TextAnchor::End, SMALL_PX, FigureColour::Quiet));
+        self.add_shape(sized_label(at, text, TextAnchor::End, SMALL_PX, FigureColour::Quiet));
     }
 }

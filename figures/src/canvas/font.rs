@@ -14,24 +14,25 @@ const MISSING: GlyphId = GlyphId(0);
 static FACE: LazyLock<Option<Face<'static>>> = LazyLock::new(|| Face::parse(FONT, 0).ok());
 
 /// Returns the font; none if its file is no font, which a test excludes.
-pub(crate) fn face() -> Option<&'static Face<'static>> {
+pub(crate) fn font_face() -> Option<&'static Face<'static>> {
     FACE.as_ref()
 }
 
 /// Returns the glyphs of a text; a character that the font lacks is a box.
-pub(crate) fn glyphs(text: &str) -> impl Iterator<Item = GlyphId> {
+pub(crate) fn text_glyphs(text: &str) -> impl Iterator<Item = GlyphId> {
     let shown = text.chars().filter(|character| !character.is_control());
-    shown.filter_map(|character| Some(face()?.glyph_index(character).unwrap_or(MISSING)))
+    shown.filter_map(|character| Some(font_face()?.glyph_index(character).unwrap_or(MISSING)))
 }
 
 /// Returns a glyph's width for a font of 1 px.
-pub(crate) fn advance(glyph: GlyphId) -> f32 {
-    face().map_or(0.0, |face| f32::from(face.glyph_hor_advance(glyph).unwrap_or(0)) / f32::from(face.units_per_em()))
+pub(crate) fn glyph_advance(glyph: GlyphId) -> f32 {
+    font_face()
+        .map_or(0.0, |face| f32::from(face.glyph_hor_advance(glyph).unwrap_or(0)) / f32::from(face.units_per_em()))
 }
 
 /// Returns a text's width.
 pub(crate) fn text_width(text: &str, size_px: f32) -> f32 {
-    size_px * glyphs(text).map(advance).sum::<f32>()
+    size_px * text_glyphs(text).map(glyph_advance).sum::<f32>()
 }
 
 /// Returns a text that fits into a width: the end of a longer one is an ellipsis.
@@ -48,8 +49,8 @@ pub(crate) fn fitted_text(text: &str, size_px: f32, room_px: f32) -> String {
 }
 
 /// Outlines a glyph in units of the font.
-pub(crate) fn outline(glyph: GlyphId, builder: &mut impl OutlineBuilder) {
-    if let Some(face) = face() {
+pub(crate) fn outline_glyph(glyph: GlyphId, builder: &mut impl OutlineBuilder) {
+    if let Some(face) = font_face() {
         face.outline_glyph(glyph, builder);
     }
 }
@@ -61,10 +62,10 @@ mod tests {
     #[test]
     fn the_font_has_what_figures_say() {
         let text = "−20 dB, 2.5 kHz, 21.5 °C, 0…4 ms · ± µ";
-        assert!(glyphs(text).all(|glyph| glyph != MISSING));
+        assert!(text_glyphs(text).all(|glyph| glyph != MISSING));
         let width = text_width("2.5 kHz", 12.0);
         assert!((38.0..48.0).contains(&width), "{width}");
-        assert_eq!(glyphs("a\u{1f600}\n").count(), 2, "a box for what it lacks, nothing for a line break");
+        assert_eq!(text_glyphs("a\u{1f600}\n").count(), 2, "a box for what it lacks, nothing for a line break");
     }
 
     #[test]

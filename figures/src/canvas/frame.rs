@@ -25,7 +25,7 @@ impl PlotAxis {
     }
 
     /// Returns where a value is, 0 at the low end, 1 at the high end; values beyond are at the ends.
-    fn share(self, value: f64) -> f64 {
+    fn axis_share(self, value: f64) -> f64 {
         let share = if self.is_log {
             (value / self.low).ln() / (self.high / self.low).ln()
         } else {
@@ -35,7 +35,7 @@ impl PlotAxis {
     }
 
     /// Returns about `count` round numbers in the range.
-    pub(crate) fn ticks(self, count: usize) -> Vec<f64> {
+    pub(crate) fn round_ticks(self, count: usize) -> Vec<f64> {
         let step = round_step((self.high - self.low) / count.max(1) as f64);
         let [first, last] = [(self.low / step - 1e-9).ceil() as i64, (self.high / step + 1e-9).floor() as i64];
         (first..=last).map(|i| i as f64 * step).collect()
@@ -66,26 +66,26 @@ pub(crate) struct PlotFrame {
 
 impl PlotFrame {
     /// Returns where a value is on the page.
-    pub(crate) fn place(&self, x: f64, y: f64) -> [f32; 2] {
-        let x = self.left + self.width * self.x.share(x) as f32;
-        [x, self.top + self.height * (1.0 - self.y.share(y)) as f32]
+    pub(crate) fn page_position(&self, x: f64, y: f64) -> [f32; 2] {
+        let x = self.left + self.width * self.x.axis_share(x) as f32;
+        [x, self.top + self.height * (1.0 - self.y.axis_share(y)) as f32]
     }
 
     /// Draws lines at ticks, and their numbers; those of y only if they are asked for.
     pub(crate) fn draw_grid(&self, drawing: &mut FigureDrawing, x_ticks: &[f64], y_ticks: &[f64], with_y: bool) {
         let rule = StrokeStyle::new(FigureColour::Rule, 1.0);
         for tick in y_ticks {
-            let [_, y] = self.place(self.x.low, *tick);
-            drawing.add(line(vec![[self.left, y], [self.left + self.width, y]], rule));
+            let [_, y] = self.page_position(self.x.low, *tick);
+            drawing.add_shape(stroked_line(vec![[self.left, y], [self.left + self.width, y]], rule));
             if with_y {
                 let at = [self.left - 6.0, y + 4.0];
-                drawing.add(label(at, number_text(*tick), TextAnchor::End));
+                drawing.add_shape(ink_label(at, number_text(*tick), TextAnchor::End));
             }
         }
         for tick in x_ticks {
-            let [x, _] = self.place(*tick, self.y.low);
-            drawing.add(line(vec![[x, self.top], [x, self.top + self.height]], rule));
-            drawing.add(label([x, self.top + self.height + 16.0], number_text(*tick), TextAnchor::Middle));
+            let [x, _] = self.page_position(*tick, self.y.low);
+            drawing.add_shape(stroked_line(vec![[x, self.top], [x, self.top + self.height]], rule));
+            drawing.add_shape(ink_label([x, self.top + self.height + 16.0], number_text(*tick), TextAnchor::Middle));
         }
     }
 
@@ -93,15 +93,15 @@ impl PlotFrame {
     pub(crate) fn draw_axes(&self, drawing: &mut FigureDrawing) {
         let [right, bottom] = [self.left + self.width, self.top + self.height];
         let corner = vec![[self.left, self.top], [self.left, bottom], [right, bottom]];
-        drawing.add(line(corner, StrokeStyle::new(FigureColour::Ink, 1.0)));
+        drawing.add_shape(stroked_line(corner, StrokeStyle::new(FigureColour::Ink, 1.0)));
     }
 
     /// Draws the titles of the axes.
     pub(crate) fn draw_titles(&self, drawing: &mut FigureDrawing, x: &str, y: &str) {
         let bottom = self.top + self.height;
-        drawing.add(label([self.left + self.width / 2.0, bottom + 34.0], x, TextAnchor::Middle));
+        drawing.add_shape(ink_label([self.left + self.width / 2.0, bottom + 34.0], x, TextAnchor::Middle));
         if !y.is_empty() {
-            drawing.add(upward_label([self.left - 44.0, self.top + self.height / 2.0], y));
+            drawing.add_shape(upward_label([self.left - 44.0, self.top + self.height / 2.0], y));
         }
     }
 }
@@ -110,8 +110,8 @@ impl PlotFrame {
 pub(crate) fn draw_legend(drawing: &mut FigureDrawing, [x, y]: [f32; 2], entries: &[(FigureColour, String)]) {
     let mut x = x;
     for (colour, name) in entries {
-        drawing.add(filled_rect([x, y - 9.0], [10.0, 10.0], *colour));
-        drawing.add(sized_label([x + 14.0, y], name, TextAnchor::Start, SMALL_PX, FigureColour::Ink));
+        drawing.add_shape(filled_rect([x, y - 9.0], [10.0, 10.0], *colour));
+        drawing.add_shape(sized_label([x + 14.0, y], name, TextAnchor::Start, SMALL_PX, FigureColour::Ink));
         x += legend_width(name);
     }
 }
@@ -128,9 +128,9 @@ mod tests {
 
     #[test]
     fn ticks_are_round() {
-        assert_eq!(PlotAxis::linear(0.0, 4.0).ticks(4), [0.0, 1.0, 2.0, 3.0, 4.0]);
-        assert_eq!(PlotAxis::linear(0.0, 1.05).ticks(5), [0.0, 0.5, 1.0]);
-        let ticks: Vec<_> = PlotAxis::linear(-0.013, 0.021).ticks(4).into_iter().map(number_text).collect();
+        assert_eq!(PlotAxis::linear(0.0, 4.0).round_ticks(4), [0.0, 1.0, 2.0, 3.0, 4.0]);
+        assert_eq!(PlotAxis::linear(0.0, 1.05).round_ticks(5), [0.0, 0.5, 1.0]);
+        let ticks: Vec<_> = PlotAxis::linear(-0.013, 0.021).round_ticks(4).into_iter().map(number_text).collect();
         assert_eq!(ticks, ["\u{2212}0.01", "0", "0.01", "0.02"]);
     }
 }

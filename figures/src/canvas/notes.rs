@@ -30,7 +30,7 @@ impl FigureNotes {
     }
 
     /// Name and text of each note that is not empty.
-    pub(crate) fn named(&self) -> Vec<(&'static str, String)> {
+    pub(crate) fn named_notes(&self) -> Vec<(&'static str, String)> {
         let all = [
             ("Title", self.title.clone()),
             ("Command", self.command.clone()),

@@ -1,6 +1,6 @@
 //! The surface that a layer's pairs see: first Fresnel zones on the panel, seen from above.
 
-use crate::canvas::drawing::{FigureColour, FigureDrawing, StrokeStyle, TextAnchor, ellipse, framed_rect, label};
+use crate::canvas::drawing::{FigureColour, FigureDrawing, StrokeStyle, TextAnchor, filled_ellipse, framed_rect, ink_label};
 use crate::canvas::frame::number_text;
 use crate::canvas::notes::FigureNotes;
 
@@ -53,22 +53,22 @@ impl CoverageFigure {
         let opacity = (20.0 / zones.len().max(1) as f32).clamp(0.04, 0.5);
         for zone in zones {
             let radii = zone.radii_mm.map(|r| r as f32 * scale);
-            let shape = ellipse(place(zone.centre_mm), radii, -zone.angle_deg as f32, FigureColour::Accent);
-            drawing.add(shape.opaque(opacity));
+            let shape = filled_ellipse(place(zone.centre_mm), radii, -zone.angle_deg as f32, FigureColour::Accent);
+            drawing.add_shape(shape.with_opacity(opacity));
         }
         let edge = self.panel_mm as f32 * scale;
         let frame = StrokeStyle::new(FigureColour::Ink, 1.0);
-        drawing.add(framed_rect([middle[0] - edge / 2.0, middle[1] - edge / 2.0], [edge, edge], frame));
+        drawing.add_shape(framed_rect([middle[0] - edge / 2.0, middle[1] - edge / 2.0], [edge, edge], frame));
         for point in &self.points_mm {
-            drawing.add(ellipse(place(*point), [1.6, 1.6], 0.0, FigureColour::Ink));
+            drawing.add_shape(filled_ellipse(place(*point), [1.6, 1.6], 0.0, FigureColour::Ink));
         }
         let extent = zones.iter().map(|zone| (2.0 * zone.radii_mm[0], 2.0 * zone.radii_mm[1]));
         let (least, most) =
             extent.fold((f64::MAX, 0.0f64), |(least, most), (along, across)| (least.min(across), most.max(along)));
-        drawing.add(label([left, top - 6.0], format!("{} kHz", number_text(hz / 1e3)), TextAnchor::Start));
+        drawing.add_shape(ink_label([left, top - 6.0], format!("{} kHz", number_text(hz / 1e3)), TextAnchor::Start));
         if most > 0.0 {
             let text = format!("{} zones, diameters {least:.0} to {most:.0} mm", zones.len());
-            drawing.add(label([left, top + self.panel_px + 18.0], text, TextAnchor::Start));
+            drawing.add_shape(ink_label([left, top + self.panel_px + 18.0], text, TextAnchor::Start));
         }
     }
 }

@@ -1,9 +1,9 @@
 //! The filter bank: gains of the bands over frequency, and the sum of their squares, which is 1.
 
-use echolake_dsp::filter_bank::gain;
+use echolake_dsp::filter_bank::band_gain;
 
 use crate::canvas::colours::band_colour;
-use crate::canvas::drawing::{FigureColour, FigureDrawing, StrokeStyle, line};
+use crate::canvas::drawing::{FigureColour, FigureDrawing, StrokeStyle, stroked_line};
 use crate::canvas::frame::{PlotAxis, PlotFrame, draw_legend};
 use crate::canvas::notes::FigureNotes;
 
@@ -37,21 +37,25 @@ impl FilterFigure {
             .into_iter()
             .filter(|t| (x.low..=x.high).contains(t))
             .collect();
-        frame.draw_grid(&mut drawing, &ticks, &y.ticks(5), true);
+        frame.draw_grid(&mut drawing, &ticks, &y.round_ticks(5), true);
         let edge = StrokeStyle { dash_px: 3.0, ..StrokeStyle::new(FigureColour::Quiet, 1.0) };
         for limit in [self.low_hz, self.high_hz] {
-            drawing.add(line(vec![frame.place(limit / 1e3, 0.0), frame.place(limit / 1e3, y.high)], edge));
+            drawing.add_shape(stroked_line(
+                vec![frame.page_position(limit / 1e3, 0.0), frame.page_position(limit / 1e3, y.high)],
+                edge,
+            ));
         }
         let curve = |value: &dyn Fn(f64) -> f64| -> Vec<[f32; 2]> {
             let frequency = |i: usize| x.low * (x.high / x.low).powf(i as f64 / (POINTS - 1) as f64);
-            (0..POINTS).map(frequency).map(|khz| frame.place(khz, value(1e3 * khz))).collect()
+            (0..POINTS).map(frequency).map(|khz| frame.page_position(khz, value(1e3 * khz))).collect()
         };
         for band in 0..self.centres_hz.len() {
-            let points = curve(&|hz| gain(&self.centres_hz, band, hz));
-            drawing.add(line(points, StrokeStyle::new(band_colour(band), 2.0)));
+            let points = curve(&|hz| band_gain(&self.centres_hz, band, hz));
+            drawing.add_shape(stroked_line(points, StrokeStyle::new(band_colour(band), 2.0)));
         }
-        let sum = curve(&|hz| (0..self.centres_hz.len()).map(|band| gain(&self.centres_hz, band, hz).powi(2)).sum());
-        drawing.add(line(sum, StrokeStyle { dash_px: 5.0, ..StrokeStyle::new(FigureColour::Ink, 1.2) }));
+        let sum =
+            curve(&|hz| (0..self.centres_hz.len()).map(|band| band_gain(&self.centres_hz, band, hz).powi(2)).sum());
+        drawing.add_shape(stroked_line(sum, StrokeStyle { dash_px: 5.0, ..StrokeStyle::new(FigureColour::Ink, 1.2) }));
         frame.draw_axes(&mut drawing);
         frame.draw_titles(&mut drawing, "Frequency, kHz", "Gain");
         let names = self.centres_hz.iter().enumerate().map(|(i, hz)| (band_colour(i), format!("{} kHz", hz / 1e3)));

@@ -4,7 +4,7 @@ use echolake_schema::{Grid, Point};
 
 use crate::canvas::colours::{DIFFERENCE_DB, HIGH_DB, LOW_DB, LevelPalette, difference_colour, ink_on, level_colour};
 use crate::canvas::drawing::{
-    FigureColour, FigureDrawing, SMALL_PX, StrokeStyle, TEXT_PX, TextAnchor, filled_rect, framed_rect, label,
+    FigureColour, FigureDrawing, SMALL_PX, StrokeStyle, TEXT_PX, TextAnchor, filled_rect, framed_rect, ink_label,
     sized_label,
 };
 use crate::canvas::font::{fitted_text, text_width};
@@ -138,7 +138,7 @@ impl GridFigure {
         format!("TNCE for microphone {microphone}, {unit}")
     }
 
-    fn layout(&self) -> PanelLayout {
+    fn panel_layout(&self) -> PanelLayout {
         let labels = if self.panel_px < NARROW { NARROW_LABELS } else { LABELS };
         let layers = self.layers.len().max(1) as f32;
         let side = ((self.panel_px - labels - GAP * (layers - 1.0)) / layers).floor().max(12.0);
@@ -147,7 +147,7 @@ impl GridFigure {
 
     /// Lays out the figure.
     pub fn draw(&self, notes: &FigureNotes) -> FigureDrawing {
-        let layout = self.layout();
+        let layout = self.panel_layout();
         let columns = self.columns.clamp(1, self.panels.len().max(1));
         let rows = self.panels.len().div_ceil(columns);
         let (margin, top) = if self.with_caption { (12.0, 40.0) } else { (0.0, 0.0) };
@@ -163,13 +163,13 @@ impl GridFigure {
             let at = [margin + (place % columns) as f32 * step[0], top + (place / columns) as f32 * step[1]];
             if self.with_caption {
                 let title = fitted_text(&panel.title, TEXT_PX, self.panel_px - layout.labels);
-                drawing.add(label([at[0] + layout.labels, at[1] + 10.0], title, TextAnchor::Start));
+                drawing.add_shape(ink_label([at[0] + layout.labels, at[1] + 10.0], title, TextAnchor::Start));
             }
             self.draw_panel(&mut drawing, panel, &layout, [at[0], at[1] + title_px]);
         }
         if self.with_caption {
             let at = [margin + layout.labels, top + rows as f32 * step[1] + 2.0];
-            let mut scales: Vec<_> = self.panels.iter().map(|panel| self.scale(panel)).collect();
+            let mut scales: Vec<_> = self.panels.iter().map(|panel| self.panel_scale(panel)).collect();
             scales.dedup();
             for (i, scale) in scales.into_iter().take(2).enumerate() {
                 draw_scale(&mut drawing, [at[0] + 300.0 * i as f32, at[1]], scale);
@@ -179,23 +179,23 @@ impl GridFigure {
         drawing
     }
 
-    fn scale(&self, panel: &GridPanel) -> GridScale {
+    fn panel_scale(&self, panel: &GridPanel) -> GridScale {
         if panel.is_difference { GridScale::Differences } else { GridScale::Levels(self.palette) }
     }
 
     fn draw_panel(&self, drawing: &mut FigureDrawing, panel: &GridPanel, layout: &PanelLayout, [left, top]: [f32; 2]) {
-        let scale = self.scale(panel);
+        let scale = self.panel_scale(panel);
         let block_x = |layer: usize| left + layout.labels + layer as f32 * (layout.side + GAP);
         for (number, layer) in self.layers.iter().enumerate() {
             let at = [block_x(number) + layout.side / 2.0, top + 14.0];
-            drawing.add(sized_label(at, &layer.label, TextAnchor::Middle, TEXT_PX, FigureColour::Quiet));
+            drawing.add_shape(sized_label(at, &layer.label, TextAnchor::Middle, TEXT_PX, FigureColour::Quiet));
         }
         for (band, name) in self.bands.iter().enumerate() {
             let row_top = top + HEADER + band as f32 * (layout.side + GAP);
-            drawing.add(label([left, row_top + layout.side / 2.0 + 4.0], name, TextAnchor::Start));
+            drawing.add_shape(ink_label([left, row_top + layout.side / 2.0 + 4.0], name, TextAnchor::Start));
             for (number, layer) in self.layers.iter().enumerate() {
                 let block = BlockLayout::new(layer, layout.side, [block_x(number), row_top]);
-                drawing.add(filled_rect(
+                drawing.add_shape(filled_rect(
                     [block.x - 1.0, block.y - 1.0],
                     [block.size * block.columns as f32 + 2.0, block.size * block.rows as f32 + 2.0],
                     FigureColour::Block,
@@ -203,7 +203,13 @@ impl GridFigure {
                 for position in &layer.positions {
                     let level = panel.levels_db.get(band).and_then(|levels| *levels.get(position.point)?);
                     let level = level.filter(|level| !level.is_nan());
-                    self.draw_cell(drawing, block.cell(*position), block.size, (band, position.point, level), scale);
+                    self.draw_cell(
+                        drawing,
+                        block.cell_corner(*position),
+                        block.size,
+                        (band, position.point, level),
+                        scale,
+                    );
                 }
             }
         }
@@ -218,14 +224,14 @@ impl GridFigure {
         scale: GridScale,
     ) {
         let is_microphone = point == self.microphone;
-        let colour = level.map(|level| scale.colour(level));
+        let colour = level.map(|level| scale.level_rgb(level));
         let fill = match (is_microphone, colour) {
             (true, _) => FigureColour::Accent,
             (false, Some(rgb)) => FigureColour::Rgb(rgb),
             (false, None) => FigureColour::Block,
         };
         let cell = filled_rect([x, y], [size, size], fill);
-        drawing.add(cell.with_data("row", band).with_data("point", point));
+        drawing.add_shape(cell.with_data("row", band).with_data("point", point));
         let text_px = (size * 0.7).floor().clamp(7.0, 13.0);
         let mark = match (is_microphone, level) {
             (true, _) => Some(("M", FigureColour::Paper)),
@@ -234,13 +240,13 @@ impl GridFigure {
         };
         if let Some((text, colour)) = mark {
             let at = [x + size / 2.0, y + size / 2.0 + text_px * 0.36];
-            drawing.add(sized_label(at, text, TextAnchor::Middle, text_px, colour));
+            drawing.add_shape(sized_label(at, text, TextAnchor::Middle, text_px, colour));
         } else if let (Some(rgb), GridScale::Levels(LevelPalette::Safe), Some(level)) = (colour, scale, level)
             && level > 0.0
         {
             let inset = (size / 4.0).floor().max(2.0);
             let stroke = StrokeStyle::new(FigureColour::Rgb(ink_on(rgb)), 1.0);
-            drawing.add(framed_rect([x + inset, y + inset], [size - 2.0 * inset, size - 2.0 * inset], stroke));
+            drawing.add_shape(framed_rect([x + inset, y + inset], [size - 2.0 * inset, size - 2.0 * inset], stroke));
         }
     }
 }
@@ -266,14 +272,14 @@ impl BlockLayout {
     }
 
     // y grows upwards, as seen from above.
-    fn cell(&self, position: GridPosition) -> [f32; 2] {
+    fn cell_corner(&self, position: GridPosition) -> [f32; 2] {
         let row = self.rows - 1 - position.row;
         [self.x + self.size * position.column as f32, self.y + self.size * row as f32]
     }
 }
 
 impl GridScale {
-    fn colour(self, level_db: f64) -> [u8; 3] {
+    fn level_rgb(self, level_db: f64) -> [u8; 3] {
         match self {
             Self::Levels(palette) => level_colour(level_db, palette),
             Self::Differences => difference_colour(level_db),
@@ -291,18 +297,18 @@ fn draw_scale(drawing: &mut FigureDrawing, [x, y]: [f32; 2], scale: GridScale) {
     for step in 0..STEPS {
         let value = low + (high - low) * step as f64 / (STEPS - 1) as f64;
         let at = [x + step as f32 * STEP_PX, y];
-        drawing.add(filled_rect(at, [STEP_PX + 0.2, 11.0], FigureColour::Rgb(scale.colour(value))));
+        drawing.add_shape(filled_rect(at, [STEP_PX + 0.2, 11.0], FigureColour::Rgb(scale.level_rgb(value))));
     }
     let width = STEPS as f32 * STEP_PX;
-    drawing.add(framed_rect([x, y], [width, 11.0], StrokeStyle::new(FigureColour::Quiet, 1.0)));
+    drawing.add_shape(framed_rect([x, y], [width, 11.0], StrokeStyle::new(FigureColour::Quiet, 1.0)));
     for tick in ticks {
         let sign = if *tick > 0.0 { "+" } else { "" };
         let text = format!("{sign}{}", number_text(*tick));
         let at = [x + width * ((tick - low) / (high - low)) as f32, y + 24.0];
-        drawing.add(sized_label(at, &text, TextAnchor::Middle, SMALL_PX, FigureColour::Ink));
+        drawing.add_shape(sized_label(at, &text, TextAnchor::Middle, SMALL_PX, FigureColour::Ink));
     }
     let last = [x + width + 8.0 + text_width("+6", SMALL_PX), y + 24.0];
-    drawing.add(sized_label(last, "dB", TextAnchor::Start, SMALL_PX, FigureColour::Ink));
+    drawing.add_shape(sized_label(last, "dB", TextAnchor::Start, SMALL_PX, FigureColour::Ink));
 }
 
 #[cfg(test)]

@@ -3,7 +3,7 @@
 use echolake_dsp::components::PrincipalComponents;
 
 use crate::canvas::colours::kind_colour;
-use crate::canvas::drawing::{FigureColour, FigureDrawing, SMALL_PX, TextAnchor, ellipse, sized_label};
+use crate::canvas::drawing::{FigureColour, FigureDrawing, SMALL_PX, TextAnchor, filled_ellipse, sized_label};
 use crate::canvas::font::{fitted_text, text_width};
 use crate::canvas::frame::{PlotAxis, PlotFrame, draw_legend, legend_width};
 use crate::canvas::notes::FigureNotes;
@@ -78,16 +78,16 @@ impl MapFigure {
         for (row, entries) in rows.iter().enumerate() {
             draw_legend(&mut drawing, [64.0, 42.0 + row as f32 * 16.0], entries);
         }
-        let [x, y] = [0, 1].map(|axis| self.range(axis));
+        let [x, y] = [0, 1].map(|axis| self.axis_range(axis));
         let frame = PlotFrame { left: 64.0, top, width: self.width_px - 80.0, height, x, y };
-        frame.draw_grid(&mut drawing, &x.ticks(6), &y.ticks(6), true);
+        frame.draw_grid(&mut drawing, &x.round_ticks(6), &y.round_ticks(6), true);
         let mut names = NameLabels::default();
         for surface in &self.positions {
             let kind = kinds.iter().position(|kind| *kind == surface.kind).unwrap_or(0);
-            let at = frame.place(surface.position_db[0], surface.position_db[1]);
-            drawing.add(ellipse(at, [4.0, 4.0], 0.0, kind_colour(kind)).opaque(0.85));
+            let at = frame.page_position(surface.position_db[0], surface.position_db[1]);
+            drawing.add_shape(filled_ellipse(at, [4.0, 4.0], 0.0, kind_colour(kind)).with_opacity(0.85));
             if self.positions.len() <= MOST_NAMES {
-                names.add(&mut drawing, at, &surface.name);
+                names.draw_name(&mut drawing, at, &surface.name);
             }
         }
         frame.draw_axes(&mut drawing);
@@ -100,7 +100,7 @@ impl MapFigure {
         drawing
     }
 
-    fn range(&self, axis: usize) -> PlotAxis {
+    fn axis_range(&self, axis: usize) -> PlotAxis {
         let values = self.positions.iter().map(|p| p.position_db[axis]);
         let (low, high) = values.fold((f64::MAX, f64::MIN), |(low, high), v| (low.min(v), high.max(v)));
         if low > high {
@@ -119,7 +119,7 @@ struct NameLabels {
 
 impl NameLabels {
     /// Draws a name beside its point, below those that are in its way.
-    fn add(&mut self, drawing: &mut FigureDrawing, [x, y]: [f32; 2], name: &str) {
+    fn draw_name(&mut self, drawing: &mut FigureDrawing, [x, y]: [f32; 2], name: &str) {
         let width = text_width(name, SMALL_PX);
         let is_right = x + 8.0 + width <= drawing.width_px;
         let left = if is_right { x + 6.0 } else { x - 6.0 - width };
@@ -131,7 +131,7 @@ impl NameLabels {
             baseline = line + SMALL_PX;
         }
         self.drawn.push([left, left + width, baseline]);
-        drawing.add(sized_label([left, baseline], name, TextAnchor::Start, SMALL_PX, FigureColour::Ink));
+        drawing.add_shape(sized_label([left, baseline], name, TextAnchor::Start, SMALL_PX, FigureColour::Ink));
     }
 }
 

@@ -1,7 +1,7 @@
 //! Cumulative energy of the bands over time, stacked.
 
 use crate::canvas::colours::band_colour;
-use crate::canvas::drawing::{FigureColour, FigureDrawing, StrokeStyle, TEXT_PX, TextAnchor, filled_area, label, line};
+use crate::canvas::drawing::{FigureColour, FigureDrawing, StrokeStyle, TEXT_PX, TextAnchor, filled_area, ink_label, line};
 use crate::canvas::font::fitted_text;
 use crate::canvas::frame::{PlotAxis, PlotFrame, draw_legend};
 use crate::canvas::notes::FigureNotes;
@@ -67,7 +67,7 @@ impl NceFigure {
             entries.push((FigureColour::Ink, "Flat, total (dashed)".into()));
         }
         draw_legend(&mut drawing, [LEFT, legend_y], &entries);
-        let stacks: Vec<_> = self.panels.iter().map(NcePanel::stack).collect();
+        let stacks: Vec<_> = self.panels.iter().map(NcePanel::stack_bands).collect();
         let values = stacks.iter().flatten().chain(self.panels.iter().map(|panel| &panel.flat_total)).flatten();
         let highest = values.filter(|value| value.is_finite()).fold(0.0f32, |most, value| most.max(*value));
         let y = PlotAxis::linear(0.0, f64::from(highest) * 1.05);
@@ -79,17 +79,17 @@ impl NceFigure {
             let left = LEFT + (place % columns) as f32 * step[0];
             let top = top + (place / columns) as f32 * step[1];
             let frame = PlotFrame { left, top, width: plot[0], height: plot[1], x, y };
-            frame.draw_grid(&mut drawing, &x.ticks(5), &y.ticks(5), is_first);
+            frame.draw_grid(&mut drawing, &x.round_ticks(5), &y.round_ticks(5), is_first);
             self.draw_stack(&mut drawing, &frame, stack);
             if !panel.flat_total.is_empty() {
                 let dashed = StrokeStyle { dash_px: 5.0, ..StrokeStyle::new(FigureColour::Ink, 1.4) };
-                drawing.add(line(self.points(&frame, &panel.flat_total), dashed));
+                drawing.add_shape(stroked_line(self.curve_points(&frame, &panel.flat_total), dashed));
             }
             frame.draw_axes(&mut drawing);
             frame.draw_titles(&mut drawing, "Time, ms", if is_first { "NCE over Flat\u{2019}s total" } else { "" });
             if self.with_caption {
                 let title = fitted_text(&panel.title, TEXT_PX, plot[0]);
-                drawing.add(label([left, top - 12.0], title, TextAnchor::Start));
+                drawing.add_shape(ink_label([left, top - 12.0], title, TextAnchor::Start));
             }
         }
         if self.with_caption {
@@ -98,17 +98,17 @@ impl NceFigure {
         drawing
     }
 
-    fn points(&self, frame: &PlotFrame, values: &[f32]) -> Vec<[f32; 2]> {
+    fn curve_points(&self, frame: &PlotFrame, values: &[f32]) -> Vec<[f32; 2]> {
         let known = self.time_ms.iter().zip(values).filter(|(_, value)| value.is_finite());
-        known.map(|(time, value)| frame.place(*time, f64::from(*value))).collect()
+        known.map(|(time, value)| frame.page_position(*time, f64::from(*value))).collect()
     }
 
     fn draw_stack(&self, drawing: &mut FigureDrawing, frame: &PlotFrame, stack: &[Vec<f32>]) {
         let mut below = vec![0.0; self.time_ms.len()];
         for (band, sums) in stack.iter().enumerate() {
-            let mut points = self.points(frame, sums);
-            points.extend(self.points(frame, &below).into_iter().rev());
-            drawing.add(filled_area(points, band_colour(band)).with_data("band", band));
+            let mut points = self.curve_points(frame, sums);
+            points.extend(self.curve_points(frame, &below).into_iter().rev());
+            drawing.add_shape(filled_area(points, band_colour(band)).with_data("band", band));
             below.clone_from(sums);
         }
     }
@@ -116,7 +116,7 @@ impl NceFigure {
 
 impl NcePanel {
     /// Returns each band on top of those below it.
-    fn stack(&self) -> Vec<Vec<f32>> {
+    fn stack_bands(&self) -> Vec<Vec<f32>> {
         let mut sums: Vec<Vec<f32>> = Vec::new();
         for curve in &self.bands {
             let under = sums.last().map_or(&[][..], |last| last);
@@ -135,7 +135,7 @@ mod tests {
     fn bands_are_on_top_of_each_other() {
         let panel =
             NcePanel { title: "a".into(), bands: vec![vec![0.0, 0.25], vec![0.0, 0.5]], flat_total: vec![0.0, 1.0] };
-        assert_eq!(panel.stack(), [[0.0, 0.25], [0.0, 0.75]]);
+        assert_eq!(panel.stack_bands(), [[0.0, 0.25], [0.0, 0.75]]);
         let bands = vec!["2.5 kHz".into(), "5 kHz".into()];
         let time_ms = vec![0.0, 4.0];
         let mut figure =

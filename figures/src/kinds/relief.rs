@@ -1,7 +1,7 @@
 //! Reliefs in oblique light, side by side, to one scale.
 
 use crate::canvas::drawing::{
-    FigureColour, FigureDrawing, SMALL_PX, StrokeStyle, TEXT_PX, TextAnchor, framed_rect, label, line, picture,
+    FigureColour, FigureDrawing, SMALL_PX, StrokeStyle, TEXT_PX, TextAnchor, framed_rect, ink_label, line, picture,
     sized_label,
 };
 use crate::canvas::font::fitted_text;
@@ -45,12 +45,18 @@ impl ReliefFigure {
         drawing.add_title();
         for (place, panel) in self.panels.iter().enumerate() {
             let [x, y] = [12.0 + (place % columns) as f32 * step[0], 36.0 + (place / columns) as f32 * step[1]];
-            drawing.add(label([x, y + 12.0], fitted_text(&panel.title, TEXT_PX, side), TextAnchor::Start));
-            drawing.add(picture([x, y + 18.0], side, panel.shaded.clone(), panel.cells));
-            drawing.add(framed_rect([x, y + 18.0], [side, side], StrokeStyle::new(FigureColour::Quiet, 0.5)));
+            drawing.add_shape(ink_label([x, y + 12.0], fitted_text(&panel.title, TEXT_PX, side), TextAnchor::Start));
+            drawing.add_shape(picture_shape([x, y + 18.0], side, panel.shaded.clone(), panel.cells));
+            drawing.add_shape(framed_rect([x, y + 18.0], [side, side], StrokeStyle::new(FigureColour::Quiet, 0.5)));
             let [low, high] = panel.extent_mm;
             let text = format!("{low:.1} to {high:.1} mm").replace('-', "\u{2212}");
-            drawing.add(sized_label([x, y + side + 30.0], text, TextAnchor::Start, SMALL_PX, FigureColour::Quiet));
+            drawing.add_shape(sized_label(
+                [x, y + side + 30.0],
+                text,
+                TextAnchor::Start,
+                SMALL_PX,
+                FigureColour::Quiet,
+            ));
         }
         self.draw_scale(&mut drawing, height - 24.0);
         drawing.add_origin();
@@ -59,7 +65,7 @@ impl ReliefFigure {
 
     fn draw_scale(&self, drawing: &mut FigureDrawing, y: f32) {
         let bar = self.panel_px * 100.0 / self.panel_mm as f32;
-        drawing.add(line(vec![[12.0, y], [12.0 + bar, y]], StrokeStyle::new(FigureColour::Ink, 2.0)));
-        drawing.add(sized_label([12.0, y + 14.0], "100 mm", TextAnchor::Start, SMALL_PX, FigureColour::Ink));
+        drawing.add_shape(stroked_line(vec![[12.0, y], [12.0 + bar, y]], StrokeStyle::new(FigureColour::Ink, 2.0)));
+        drawing.add_shape(sized_label([12.0, y + 14.0], "100 mm", TextAnchor::Start, SMALL_PX, FigureColour::Ink));
     }
 }

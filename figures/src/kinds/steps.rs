@@ -2,7 +2,7 @@
 //! removal of direct sound.
 
 use crate::canvas::colours::kind_colour;
-use crate::canvas::drawing::{FigureDrawing, StrokeStyle, TextAnchor, label, line};
+use crate::canvas::drawing::{FigureDrawing, StrokeStyle, TextAnchor, ink_label, stroked_line};
 use crate::canvas::frame::{PlotAxis, PlotFrame, draw_legend, legend_width};
 use crate::canvas::notes::FigureNotes;
 
@@ -56,23 +56,23 @@ impl StepsFigure {
         for (place, row) in self.rows.iter().enumerate() {
             let top = 58.0 + place as f32 * (ROW + BETWEEN);
             let frame = PlotFrame { left: 70.0, top, width: self.width_px - 86.0, height: ROW, x, y };
-            frame.draw_grid(&mut drawing, &x.ticks(8), &y.ticks(4), true);
+            frame.draw_grid(&mut drawing, &x.round_ticks(8), &y.round_ticks(4), true);
             for (kind, trace) in row.traces.iter().enumerate() {
                 let time = |i: usize| i as f64 * trace.step_ms;
                 let samples = trace.samples.iter().enumerate().filter(|(_, sample)| sample.is_finite());
                 let shown = samples.filter(|(i, _)| (self.from_ms..=self.to_ms).contains(&time(*i)));
-                let points = shown.map(|(i, sample)| frame.place(time(i), f64::from(*sample))).collect();
-                drawing.add(line(points, StrokeStyle::new(kind_colour(kind), 1.2)));
+                let points = shown.map(|(i, sample)| frame.page_position(time(i), f64::from(*sample))).collect();
+                drawing.add_shape(stroked_line(points, StrokeStyle::new(kind_colour(kind), 1.2)));
             }
             frame.draw_axes(&mut drawing);
             frame.draw_titles(&mut drawing, "", "Amplitude");
-            drawing.add(label([70.0, top - 10.0], &row.title, TextAnchor::Start));
+            drawing.add_shape(ink_label([70.0, top - 10.0], &row.title, TextAnchor::Start));
             let entries: Vec<_> =
                 row.traces.iter().enumerate().map(|(i, t)| (kind_colour(i), t.name.clone())).collect();
             let width: f32 = entries.iter().map(|(_, name)| legend_width(name)).sum();
             draw_legend(&mut drawing, [self.width_px - 16.0 - width, top - 10.0], &entries);
         }
-        drawing.add(label([self.width_px / 2.0, height - 28.0], "Time, ms", TextAnchor::Middle));
+        drawing.add_shape(ink_label([self.width_px / 2.0, height - 28.0], "Time, ms", TextAnchor::Middle));
         drawing.add_origin();
         drawing
     }

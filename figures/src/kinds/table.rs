@@ -35,7 +35,7 @@ pub struct FigureTable {
 }
 
 impl TableRow {
-    fn text(&self, value: Option<f64>) -> String {
+    fn value_text(&self, value: Option<f64>) -> String {
         let Some(value) = value.filter(|value| value.is_finite()) else { return "\u{2013}".into() };
         let text = format!("{value:.*}", self.decimals);
         // No minus before what is rounded to nothing.
@@ -47,7 +47,7 @@ impl TableRow {
 
 impl FigureTable {
     /// Returns the lowest and the highest value of a column, if they differ as they are written.
-    fn extremes(&self, column: usize) -> Option<[f64; 2]> {
+    fn column_extremes(&self, column: usize) -> Option<[f64; 2]> {
         let values = || self.rows.iter().filter_map(|row| row.values.get(column)?.filter(|value| value.is_finite()));
         let low = values().fold(f64::MAX, f64::min);
         let high = values().fold(f64::MIN, f64::max);
@@ -56,15 +56,15 @@ impl FigureTable {
 
     /// Returns the table as LaTeX; the colours of extremes need the packages `colortbl` and `xcolor`.
     pub fn to_latex(&self, notes: &FigureNotes) -> String {
-        let mut out = comments(notes, "% ");
+        let mut out = comment_lines(notes, "% ");
         let columns = "c".repeat(self.columns.len());
         let heads: Vec<_> = self.columns.iter().map(|name| latex_text(name)).collect();
         let _ = writeln!(out, "\\begin{{tabular}}{{l{columns}}}\n\\hline");
         let _ = writeln!(out, "{} & {} \\\\\n\\hline\\hline", latex_text(&self.corner), heads.join(" & "));
         for row in &self.rows {
             let cells = row.values.iter().enumerate().map(|(column, value)| {
-                let text = latex_text(&row.text(*value).replace('-', "\u{2212}"));
-                match (self.extremes(column), value) {
+                let text = latex_text(&row.value_text(*value).replace('-', "\u{2212}"));
+                match (self.column_extremes(column), value) {
                     (Some([low, _]), Some(value)) if low == *value => format!("{{\\cellcolor{QUIETEST}}}{text}"),
                     (Some([_, high]), Some(value)) if high == *value => format!("{{\\cellcolor{LOUDEST}}}{text}"),
                     _ => text,
@@ -79,7 +79,7 @@ impl FigureTable {
 
     /// Returns the table as CSV, its notes in lines that begin with `#`. Values are not rounded.
     pub fn to_csv(&self, notes: &FigureNotes) -> String {
-        let mut out = comments(notes, "# ");
+        let mut out = comment_lines(notes, "# ");
         let heads: Vec<_> = [&self.corner].into_iter().chain(&self.columns).map(|name| csv_text(name)).collect();
         let _ = writeln!(out, "{}", heads.join(","));
         for row in &self.rows {
@@ -94,14 +94,14 @@ impl FigureTable {
 
     /// Returns the table as Markdown, its notes in a comment; extremes are bold (highest) and italic (lowest).
     pub fn to_markdown(&self, notes: &FigureNotes) -> String {
-        let notes = comments(notes, "").replace("-->", "-- >");
+        let notes = comment_lines(notes, "").replace("-->", "-- >");
         let mut out = if notes.is_empty() { notes } else { format!("<!--\n{notes}-->\n\n") };
         let _ = writeln!(out, "| {} | {} |", markdown_text(&self.corner), self.columns.join(" | "));
         let _ = writeln!(out, "| --- |{}", " ---: |".repeat(self.columns.len()));
         for row in &self.rows {
             let cells = row.values.iter().enumerate().map(|(column, value)| {
-                let text = row.text(*value).replace('-', "\u{2212}");
-                match (self.extremes(column), value) {
+                let text = row.value_text(*value).replace('-', "\u{2212}");
+                match (self.column_extremes(column), value) {
                     (Some([low, _]), Some(value)) if low == *value => format!("*{text}*"),
                     (Some([_, high]), Some(value)) if high == *value => format!("**{text}**"),
                     _ => text,
@@ -113,9 +113,9 @@ impl FigureTable {
     }
 }
 
-fn comments(notes: &FigureNotes, mark: &str) -> String {
+fn comment_lines(notes: &FigureNotes, mark: &str) -> String {
     let line = |(name, text): (&str, String)| format!("{mark}{name}: {}\n", text.replace(['\n', '\r'], " "));
-    notes.named().into_iter().map(line).collect()
+    notes.named_notes().into_iter().map(line).collect()
 }
 
 fn latex_text(text: &str) -> String {

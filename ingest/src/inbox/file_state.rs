@@ -29,7 +29,7 @@ impl FileState {
     ///
     /// # Errors
     /// [`Error::Gone`], or [`Error::Read`] if it is no plain file.
-    pub(crate) fn read(lake: &Lake, source: &RunSource) -> Result<Option<Self>> {
+    pub(crate) fn from_source(lake: &Lake, source: &RunSource) -> Result<Option<Self>> {
         let found = match source {
             // No link in the lake is followed, also if it has just taken a file's place.
             RunSource::Lake(path) => match local_file(lake, path) {
@@ -40,10 +40,10 @@ impl FileState {
         };
         let meta = found.map_err(|e| match e.kind() {
             ErrorKind::NotFound => Error::Gone { file: source.to_string() },
-            _ => Error::read(source, e),
+            _ => Error::read_failure(source, e),
         })?;
         if !meta.is_file() {
-            return Err(Error::read(source, io::Error::new(ErrorKind::InvalidInput, "it is no plain file")));
+            return Err(Error::read_failure(source, io::Error::new(ErrorKind::InvalidInput, "it is no plain file")));
         }
         Ok(Some(Self::from_metadata(&meta)))
     }
@@ -57,8 +57,8 @@ impl FileState {
     ///
     /// # Errors
     /// [`Error::Changed`], [`Error::Gone`].
-    pub(super) fn check(before: Option<Self>, lake: &Lake, source: &RunSource) -> Result<()> {
-        let (Some(before), Some(after)) = (before, Self::read(lake, source)?) else { return Ok(()) };
+    pub(super) fn check_state(before: Option<Self>, lake: &Lake, source: &RunSource) -> Result<()> {
+        let (Some(before), Some(after)) = (before, Self::from_source(lake, source)?) else { return Ok(()) };
         if before == after {
             return Ok(());
         }
@@ -88,7 +88,7 @@ impl<'a> ReadFile<'a> {
     ///
     /// # Errors
     /// [`Error::OtherDigest`], or an error of the lake.
-    pub(crate) async fn check(
+    pub(crate) async fn check_digest(
         lake: &Lake,
         source: &RunSource,
         FileVersion { e_tag, state }: FileVersion,
@@ -109,7 +109,7 @@ impl<'a> ReadFile<'a> {
 pub(super) async fn recorded_digest(lake: &Lake, source: &RunSource) -> Result<Option<String>> {
     match source {
         RunSource::Lake(path) if source.is_in_inbox() && can_have_record(path) => {
-            read_digest_record(lake.store().as_ref(), path).await.map_err(|e| Error::read(source, e))
+            read_digest_record(lake.store().as_ref(), path).await.map_err(|e| Error::read_failure(source, e))
         }
         _ => Ok(None),
     }
@@ -130,15 +130,15 @@ impl FileVersion {
     /// Reads the version of a source, before it is read itself.
     ///
     /// # Errors
-    /// As of [`FileState::read`].
-    pub(crate) async fn read(lake: &Lake, source: &RunSource) -> Result<Self> {
+    /// As of [`FileState::from_source`].
+    pub(crate) async fn from_source(lake: &Lake, source: &RunSource) -> Result<Self> {
         let e_tag = match source {
             RunSource::Lake(path) if lake.is_remote() && source.is_in_inbox() => {
                 lake.store().head(path).await.ok().and_then(|meta| meta.e_tag)
             }
             _ => None,
         };
-        Ok(Self { e_tag, state: FileState::read(lake, source)? })
+        Ok(Self { e_tag, state: FileState::from_source(lake, source)? })
     }
 }
 
@@ -147,5 +147,5 @@ impl FileVersion {
 /// # Errors
 /// [`Error::Changed`], [`Error::Gone`].
 pub(crate) fn check_unchanged(lake: &Lake, source: &RunSource, file: &ReadFile<'_>) -> Result<()> {
-    FileState::check(file.state, lake, source)
+    FileState::check_state(file.state, lake, source)
 }

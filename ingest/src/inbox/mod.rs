@@ -9,7 +9,7 @@ mod run_source;
 
 pub(crate) use file_state::{FileVersion, ReadFile, check_unchanged};
 pub use pending_files::{
-    PendingFiles, RecordingState, UnfinishedRecording, find_runs, list_arrivals, list_pending, pending, rig_of_run,
+    PendingFiles, RecordingState, UnfinishedRecording, find_runs, list_arrivals, list_pending, pending_runs, rig_of_run,
 };
 pub(crate) use quarantine::{quarantine_file, set_file_aside};
 pub(crate) use reading_mark::ReadingMark;

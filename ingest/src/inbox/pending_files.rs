@@ -58,7 +58,7 @@ pub enum RecordingState {
 
 impl PendingFiles {
     /// Returns the run files as sources of an ingest.
-    pub fn sources(&self) -> Vec<RunSource> {
+    pub fn run_sources(&self) -> Vec<RunSource> {
         self.runs.iter().map(|run| RunSource::Lake(run.location.clone())).collect()
     }
 }
@@ -73,7 +73,7 @@ pub async fn list_pending(lake: &Lake) -> Result<PendingFiles> {
     let mut pending = list_arrivals(lake).await?;
     let mut runs = lake.list_folder(RUNS).await?;
     let of_run = Table::ALL.into_iter().filter(|table| table.source() == Source::Run);
-    let lacking: BTreeSet<_> = of_run.flat_map(|table| snapshot.lacking(table)).map(|of| &of.run).collect();
+    let lacking: BTreeSet<_> = of_run.flat_map(|table| snapshot.lacking_rows(table)).map(|of| &of.run).collect();
     let is_whole = |path: &Path| known_run(&snapshot, path).is_some_and(|run| !lacking.contains(run));
     runs.files.retain(|meta| is_run_file(meta) && !is_whole(&meta.location));
     pending.runs.append(&mut runs.files);
@@ -89,8 +89,8 @@ pub async fn list_pending(lake: &Lake) -> Result<PendingFiles> {
 ///
 /// # Errors
 /// As of [`list_pending`].
-pub async fn pending(lake: &Lake) -> Result<Vec<RunSource>> {
-    Ok(list_pending(lake).await?.sources())
+pub async fn pending_runs(lake: &Lake) -> Result<Vec<RunSource>> {
+    Ok(list_pending(lake).await?.run_sources())
 }
 
 /// Lists what is in the inbox alone: one request to an object store, which has files as a whole or not at all.
@@ -144,7 +144,7 @@ pub async fn find_runs(lake: &Lake, names: &[&str]) -> Result<Vec<Option<Path>>>
         let in_folder = [INBOX, RUNS].iter().any(|folder| file.starts_with(&format!("{folder}/")));
         let run = file.strip_suffix(".mcap").and_then(|run| run.parse::<RunId>().ok());
         // A run's name has its surface: most are found without a listing.
-        let surface = run.as_ref().and_then(|run| run.untagged().split_once('-')?.1.parse().ok());
+        let surface = run.as_ref().and_then(|run| run.untagged_name().split_once('-')?.1.parse().ok());
         let places = [
             in_folder.then(|| file.clone()),
             Some(format!("{INBOX}/{file}")),
@@ -177,7 +177,7 @@ async fn is_there(lake: &Lake, path: &Path) -> Result<bool> {
     match lake.store().head(path).await {
         Ok(_) => Ok(true),
         Err(object_store::Error::NotFound { .. }) => Ok(false),
-        Err(e) => Err(Error::read(path, e)),
+        Err(e) => Err(Error::read_failure(path, e)),
     }
 }
 
@@ -191,7 +191,7 @@ pub async fn rig_of_run(file: &FsPath) -> Result<Option<Rig>> {
     }
     let (path, name) = (absolute_path(file)?, file.display().to_string());
     let opened = OpenedRun { store: Arc::new(LocalFileSystem::new()), path, name };
-    Ok(RunHead::read(&opened).await.and_then(|head| head.rig))
+    Ok(RunHead::read_from(&opened).await.and_then(|head| head.rig))
 }
 
 async fn recording_state(lake: &Lake, partial: &Path) -> RecordingState {
@@ -200,7 +200,7 @@ async fn recording_state(lake: &Lake, partial: &Path) -> RecordingState {
         return RecordingState::Running;
     }
     let opened = OpenedRun { store: lake.store(), path: partial.clone(), name: partial.to_string() };
-    match RunHead::read(&opened).await {
+    match RunHead::read_from(&opened).await {
         Some(head) if head.has_plan => RecordingState::Resumable,
         Some(head) if head.origin.is_imported() => RecordingState::Import,
         _ => RecordingState::CutOff,

@@ -11,11 +11,11 @@ use std::path::{Path, PathBuf};
 
 use echolake_lake::Lake;
 
-use super::pending_files::pending;
+use super::pending_files::pending_runs;
 use super::quarantine::quarantine_file;
 use super::run_source::RunSource;
 use crate::error::{Error, Result};
-use crate::references::digest;
+use crate::references::digest_parts;
 use crate::report::FileReport;
 
 /// Folder of the marks. Deleting `tables/` deletes them, too.
@@ -76,19 +76,19 @@ impl SuspectFile {
     /// Returns the suspects among the files that are in no table yet.
     ///
     /// # Errors
-    /// As of [`pending`].
-    pub async fn pending(lake: &Lake) -> Result<Vec<Self>> {
-        Ok(pending(lake).await?.iter().filter_map(|source| Self::from_source(lake, source)).collect())
+    /// As of [`pending_runs`].
+    pub async fn find_pending(lake: &Lake) -> Result<Vec<Self>> {
+        Ok(pending_runs(lake).await?.iter().filter_map(|source| Self::from_source(lake, source)).collect())
     }
 
     /// Records the death of a process that ingested this file alone; `ending` describes it. If the process had moved the
     /// file to its place, it is the suspect that is not among those of `before` the process.
     ///
     /// # Errors
-    /// As of [`pending`]; [`Error::Read`] if the mark cannot be written.
+    /// As of [`pending_runs`]; [`Error::Read`] if the mark cannot be written.
     pub async fn add_death(&mut self, lake: &Lake, ending: &str, before: &[Self]) -> Result<()> {
         self.endings.push(ending.to_owned());
-        let mut suspects = Self::pending(lake).await?;
+        let mut suspects = Self::find_pending(lake).await?;
         if suspects.iter().all(|suspect| suspect.source != self.source) {
             suspects.retain(|suspect| before.iter().all(|known| known.source != suspect.source));
             if let Some(moved) = suspects.pop() {
@@ -99,7 +99,7 @@ impl SuspectFile {
         // Writes all endings, because the process has recreated the mark.
         let mark = OpenOptions::new().write(true).truncate(true).open(&self.mark);
         match mark.and_then(|mut mark| writeln!(mark, "{}", self.endings.join("\n"))) {
-            Err(e) if e.kind() != ErrorKind::NotFound => Err(Error::read(self.mark.display(), e)),
+            Err(e) if e.kind() != ErrorKind::NotFound => Err(Error::read_failure(self.mark.display(), e)),
             _ => Ok(()),
         }
     }
@@ -108,7 +108,7 @@ impl SuspectFile {
     ///
     /// # Errors
     /// Errors of the lake.
-    pub async fn refuse(&self, lake: &Lake) -> Result<Option<FileReport>> {
+    pub async fn refuse_if_deadly(&self, lake: &Lake) -> Result<Option<FileReport>> {
         if self.endings.len() < MOST_DEATHS {
             return Ok(None);
         }
@@ -126,7 +126,7 @@ impl SuspectFile {
 // Named by a digest, because a path may be longer than a file name.
 fn mark_path(lake: &Lake, source: &RunSource) -> Option<PathBuf> {
     let RunSource::Lake(path) = source else { return None };
-    Some(lake.folder()?.join(Path::new(FOLDER)).join(digest(&[path.as_ref()])))
+    Some(lake.folder()?.join(Path::new(FOLDER)).join(digest_parts(&[path.as_ref()])))
 }
 
 #[cfg(test)]
@@ -159,14 +159,17 @@ mod tests {
         let die = || fs::write(mark_path(&lake, &source).expect("a lake in a folder"), "").expect("written");
         die();
         let mut suspect = SuspectFile::from_source(&lake, &source).expect("a suspect");
-        assert!(suspect.refuse(&lake).await.expect("asked").is_none(), "nothing was seen of it yet");
+        assert!(suspect.refuse_if_deadly(&lake).await.expect("asked").is_none(), "nothing was seen of it yet");
         suspect.add_death(&lake, "signal: 6 (SIGABRT)", &[]).await.expect("written");
-        assert!(suspect.refuse(&lake).await.expect("asked").is_none(), "its parent may have been killed with it");
+        assert!(
+            suspect.refuse_if_deadly(&lake).await.expect("asked").is_none(),
+            "its parent may have been killed with it"
+        );
         // The next process looked at the file, then began to read it.
         drop(ReadingMark::new(&lake, &source));
         die();
         suspect.add_death(&lake, "signal: 9 (SIGKILL)", &[]).await.expect("written");
-        let report = suspect.refuse(&lake).await.expect("asked").expect("refused");
+        let report = suspect.refuse_if_deadly(&lake).await.expect("asked").expect("refused");
         let FileReport::Refused { moved: Some(moved), why, .. } = report else { panic!("{report:?}") };
         assert!(why.to_string().contains("signal: 6 (SIGABRT), signal: 9 (SIGKILL)"), "{why}");
         let reason = ObjectPath::from(format!("{moved}.reason.txt"));
@@ -185,7 +188,7 @@ mod tests {
             drop(ReadingMark::new(&lake, &RunSource::Lake(path.clone())));
             fs::write(mark_path(&lake, &RunSource::Lake(path.clone())).expect("in a folder"), "").expect("written");
         }
-        let before = SuspectFile::pending(&lake).await.expect("listed");
+        let before = SuspectFile::find_pending(&lake).await.expect("listed");
         assert_eq!(before.len(), 2);
         let mut suspect = SuspectFile::from_source(&lake, &RunSource::Lake(first.clone())).expect("a suspect");
         suspect.add_death(&lake, "once", &before).await.expect("written");

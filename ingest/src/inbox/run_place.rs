@@ -41,7 +41,7 @@ pub(crate) async fn move_to_place(
     file: &ReadFile<'_>,
     is_known: bool,
 ) -> Result<()> {
-    let checked = FileState::check(file.state, lake, source);
+    let checked = FileState::check_state(file.state, lake, source);
     if matches!(source, RunSource::Lake(from) if from == to) {
         return checked;
     }
@@ -62,7 +62,9 @@ pub(crate) async fn move_to_place(
     }
     match source {
         RunSource::File(_) if there == PlaceContent::Same => Ok(()),
-        RunSource::File(from) => copy_in(lake, from, to, &mut || FileState::check(file.state, lake, source)).await,
+        RunSource::File(from) => {
+            copy_in(lake, from, to, &mut || FileState::check_state(file.state, lake, source)).await
+        }
         RunSource::Lake(from) => {
             move_record(lake, from, to, file).await.map_err(|e| write_error(to, e))?;
             if there == PlaceContent::Same {
@@ -79,7 +81,7 @@ pub(crate) async fn move_to_place(
                 moved => moved.map_err(|fault| fault.into_error(to))?,
             }
             // Who has it open writes on, under whatever name.
-            if let Err(changed) = FileState::check(file.state, lake, &RunSource::Lake(to.clone())) {
+            if let Err(changed) = FileState::check_state(file.state, lake, &RunSource::Lake(to.clone())) {
                 lake.store().rename(to, from).await.map_err(|e| write_error(from, e))?;
                 return Err(changed);
             }
@@ -122,7 +124,7 @@ async fn look_at_place(lake: &Lake, to: &Path, file: &FileIntegrity, is_known: b
     if is_known {
         return Ok(PlaceContent::Same);
     }
-    let sha256 = object_sha256(store.as_ref(), to, bytes, &mut |_| {}).await.map_err(|e| Error::read(to, e))?;
+    let sha256 = object_sha256(store.as_ref(), to, bytes, &mut |_| {}).await.map_err(|e| Error::read_failure(to, e))?;
     Ok(if sha256 == file.sha256 { PlaceContent::Same } else { PlaceContent::Other(sha256) })
 }
 
@@ -164,7 +166,7 @@ impl StoreFault {
     pub(super) fn into_error(self, to: &Path) -> Error {
         match self {
             Self::Store(error) => write_error(to, error),
-            Self::Changed { expected, actual } => Error::read(
+            Self::Changed { expected, actual } => Error::read_failure(
                 to,
                 format!("its copy has {actual}, expected {expected}; hint: the copy is deleted, run the command again"),
             ),
@@ -234,7 +236,7 @@ async fn copy_in(lake: &Lake, from: &FsPath, to: &Path, check: &mut (dyn FnMut()
     let (store, source) = (lake.store(), LocalFileSystem::new());
     let failed = |e: object_store::Error| write_error(to, e);
     let path = absolute_path(from)?;
-    let size = source.head(&path).await.map_err(|e| Error::read(from.display(), e))?.size;
+    let size = source.head(&path).await.map_err(|e| Error::read_failure(from.display(), e))?.size;
     // An object appears as a whole; a file is under another name first, so that a run's own name never holds part of it.
     if lake.is_remote() {
         copy_parts(&source, &path, size, store.as_ref(), to).await.map_err(failed)?;
@@ -311,8 +313,8 @@ mod tests {
             let (damage, lost, is_data_whole) = (Vec::new(), Vec::new(), true);
             let integrity = FileIntegrity { bytes: 5, sha256, closed: true, damage, lost, is_data_whole };
             fs::write(file, "12345").expect("written");
-            let version = FileVersion::read(&lake, &source).await.expect("there");
-            let read = ReadFile::check(&lake, &source, version, &integrity).await.expect("read");
+            let version = FileVersion::from_source(&lake, &source).await.expect("there");
+            let read = ReadFile::check_digest(&lake, &source, version, &integrity).await.expect("read");
             fs::write(file, "123456").expect("written");
             let changed = move_to_place(&lake, &source, &to, &read, false).await.expect_err("it is another file");
             assert!(matches!(changed, Error::Changed { .. }) && changed.to_string().contains("6 bytes"), "{changed}");
@@ -322,7 +324,7 @@ mod tests {
             assert!(gone.is_refusal(), "{gone}");
             // A link in its place is not followed.
             std::os::unix::fs::symlink("/etc/passwd", file).expect("linked");
-            let followed = FileVersion::read(&lake, &source).await.is_ok();
+            let followed = FileVersion::from_source(&lake, &source).await.is_ok();
             assert_eq!(followed, matches!(source, RunSource::File(_)));
             fs::remove_file(file).expect("removed");
         }

@@ -42,7 +42,7 @@ pub(crate) struct OpenedRun {
 }
 
 impl RunSource {
-    pub(crate) fn open(&self, lake: &Lake) -> Result<OpenedRun> {
+    pub(crate) fn open_run(&self, lake: &Lake) -> Result<OpenedRun> {
         let name = self.to_string();
         match self {
             Self::Lake(path) => Ok(OpenedRun { store: lake.store(), path: path.clone(), name }),
@@ -102,7 +102,7 @@ pub(crate) async fn has_end_at(store: &dyn ObjectStore, path: &Path, bytes: u64)
 pub(crate) async fn check_end(opened: &OpenedRun) -> Result<()> {
     let failed = |e: object_store::Error| match e {
         object_store::Error::NotFound { .. } => Error::Gone { file: opened.name.clone() },
-        e => Error::read(&opened.name, e),
+        e => Error::read_failure(&opened.name, e),
     };
     let bytes = opened.store.head(&opened.path).await.map_err(failed)?.size;
     if has_end_at(opened.store.as_ref(), &opened.path, bytes).await.map_err(failed)? {
@@ -119,6 +119,6 @@ pub(crate) async fn check_end(opened: &OpenedRun) -> Result<()> {
 
 /// Returns the absolute path of a file of this machine, for its store.
 pub(super) fn absolute_path(file: &FsPath) -> Result<Path> {
-    let absolute = std::path::absolute(file).map_err(|e| Error::read(file.display(), e))?;
-    Path::from_absolute_path(absolute).map_err(|e| Error::read(file.display(), e))
+    let absolute = std::path::absolute(file).map_err(|e| Error::read_failure(file.display(), e))?;
+    Path::from_absolute_path(absolute).map_err(|e| Error::read_failure(file.display(), e))
 }

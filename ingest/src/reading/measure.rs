@@ -49,10 +49,10 @@ pub(crate) struct RunBudget(AtomicU64);
 impl RunBudget {
     /// Takes the memory of an empty chunk.
     pub(crate) fn take_chunk(&self) -> Result<(), String> {
-        self.take(CHUNK_BYTES)
+        self.take_bytes(CHUNK_BYTES)
     }
 
-    fn take(&self, bytes: u64) -> Result<(), String> {
+    fn take_bytes(&self, bytes: u64) -> Result<(), String> {
         let taken = self.0.fetch_update(Ordering::Relaxed, Ordering::Relaxed, |left| left.checked_sub(bytes));
         taken.map(drop).map_err(|_| "the run holds more than ingest has memory for".to_owned())
     }
@@ -77,7 +77,7 @@ impl RecordingPlan {
         let mut buffers = found.unwrap_or_else(|| MeasurementBuffers {
             microphone: vec![0.0; len],
             loopback: vec![0.0; len],
-            scratch: self.plan.scratch(),
+            scratch: self.plan.make_scratch(),
         });
         let done = work(&mut buffers);
         idle().push(buffers);
@@ -170,7 +170,7 @@ impl Measurer {
     }
 
     /// Reads all messages of a chunk, within the run's budget. A damaged message is reported and skipped.
-    pub(crate) fn process(
+    pub(crate) fn process_chunk(
         &self,
         offset: u64,
         chunk: &DecodedChunk,
@@ -186,7 +186,7 @@ impl Measurer {
             out.last_time_ns = out.last_time_ns.max(message.log_time_ns);
             let Some(channel) = channels.get(&message.channel) else {
                 // Its chunk waited for the summary, which does not have the channel either.
-                if out.damaged.is_empty() || budget.take(LINE_BYTES).is_ok() {
+                if out.damaged.is_empty() || budget.take_bytes(LINE_BYTES).is_ok() {
                     list_damage(&mut out.damaged, || {
                         format!("a message of channel {}, which nothing introduces", message.channel)
                     });
@@ -201,28 +201,30 @@ impl Measurer {
                 topics::LOG => MESSAGE_BYTES + length,
                 _ => continue,
             };
-            let taken = budget.take(memory).and_then(|()| match channel.topic.as_str() {
-                topics::SWEEP => decode::<SweepRecording>(&channel.schema, chunk.share(message.data))
-                    .and_then(|s| self.sweep(offset, &message, &s))
+            let taken = budget.take_bytes(memory).and_then(|()| match channel.topic.as_str() {
+                topics::SWEEP => decode_message::<SweepRecording>(&channel.schema, chunk.share_bytes(message.data))
+                    .and_then(|s| self.measure_sweep(offset, &message, &s))
                     .map(|response| {
                         swept.extend(response.iter().map(|r| (r.pair, r.attempt)));
                         out.responses.extend(response);
                     }),
-                topics::IR => decode::<ImpulseResponse>(&channel.schema, chunk.share(message.data))
-                    .and_then(|i| self.ir(offset, &message, &i, &swept))
+                topics::IR => decode_message::<ImpulseResponse>(&channel.schema, chunk.share_bytes(message.data))
+                    .and_then(|i| self.convert_ir(offset, &message, &i, &swept))
                     .map(|r| out.responses.extend(r)),
-                topics::MEASUREMENT => decode::<Measurement>(&channel.schema, chunk.share(message.data))
+                topics::MEASUREMENT => decode_message::<Measurement>(&channel.schema, chunk.share_bytes(message.data))
                     .and_then(|m| self.known_pair(m.pair_id).map(|()| m))
                     .map(|m| out.verdicts.push((message.log_time_ns, m))),
-                topics::ENVIRONMENT => decode::<AmbientSample>(&channel.schema, chunk.share(message.data))
-                    .map(|a| out.readings.push((message.log_time_ns, a))),
+                topics::ENVIRONMENT => {
+                    decode_message::<AmbientSample>(&channel.schema, chunk.share_bytes(message.data))
+                        .map(|a| out.readings.push((message.log_time_ns, a)))
+                }
                 topics::LOG => Event::decode(message.data)
                     .map_err(|e| e.to_string())
                     .map(|e| out.events.push((message.log_time_ns, e))),
                 _ => Ok(()),
             });
             if let Err(reason) = taken
-                && (out.damaged.is_empty() || budget.take(LINE_BYTES).is_ok())
+                && (out.damaged.is_empty() || budget.take_bytes(LINE_BYTES).is_ok())
             {
                 list_damage(&mut out.damaged, || {
                     format!("a message of `{}` at {} ns: {reason}", channel.topic, message.log_time_ns)
@@ -233,7 +235,7 @@ impl Measurer {
     }
 
     // None if the loopback is silent: the recording is intact, and its attempt was rejected for the silence.
-    fn sweep(
+    fn measure_sweep(
         &self,
         chunk_offset: u64,
         message: &ChunkMessage<'_>,
@@ -246,13 +248,13 @@ impl Measurer {
         let count = sweep.sample_count as usize;
         check_bytes(format, count, &sweep.microphone)?;
         check_bytes(format, count, &sweep.loopback)?;
-        let planned = self.plan(count)?;
+        let planned = self.recording_plan(count)?;
         let mut ir = vec![0.0; self.rig.impulse_response.length];
         let measured = planned.with_buffers(count, |buffers| {
             let MeasurementBuffers { microphone, loopback, scratch } = buffers;
-            samples::decode(format, &sweep.microphone, microphone).map_err(|e| e.to_string())?;
-            samples::decode(format, &sweep.loopback, loopback).map_err(|e| e.to_string())?;
-            match planned.plan.ir(microphone, loopback, celsius.get(), &mut ir, scratch) {
+            samples::decode_samples(format, &sweep.microphone, microphone).map_err(|e| e.to_string())?;
+            samples::decode_samples(format, &sweep.loopback, loopback).map_err(|e| e.to_string())?;
+            match planned.plan.compute_ir(microphone, loopback, celsius.get(), &mut ir, scratch) {
                 Ok(()) => Ok(true),
                 Err(echolake_dsp::Error::NoLoopback) => Ok(false),
                 Err(e) => Err(e.to_string()),
@@ -273,7 +275,7 @@ impl Measurer {
     }
 
     // None if the chunk has its recording, too, which is preferred: then the response is only checked.
-    fn ir(
+    fn convert_ir(
         &self,
         chunk_offset: u64,
         message: &ChunkMessage<'_>,
@@ -298,7 +300,7 @@ impl Measurer {
         } else if swept.contains(&(given.pair_id, given.attempt)) {
             return Ok(None);
         } else {
-            self.correction.run(&given.samples, celsius.get(), &mut ir);
+            self.correction.correct_response(&given.samples, celsius.get(), &mut ir);
             ResponseSource::Ir
         };
         Ok(Some(Response {
@@ -312,7 +314,7 @@ impl Measurer {
         }))
     }
 
-    fn plan(&self, recording_len: usize) -> Result<Arc<RecordingPlan>, String> {
+    fn recording_plan(&self, recording_len: usize) -> Result<Arc<RecordingPlan>, String> {
         let longest = LONGEST_RECORDING.max(4 * self.rig.recording_len());
         if recording_len > longest {
             return Err(format!("it has {recording_len} samples, more than {longest}"));
@@ -349,7 +351,7 @@ impl Measurer {
 }
 
 // Does not copy the samples: they stay in the chunk.
-fn decode<M: RunMessage>(schema: &str, data: Bytes) -> Result<M, String> {
+fn decode_message<M: RunMessage>(schema: &str, data: Bytes) -> Result<M, String> {
     if schema != M::FULL_NAME {
         return Err(format!("its schema is `{schema}`, expected `{}`", M::FULL_NAME));
     }
@@ -358,7 +360,7 @@ fn decode<M: RunMessage>(schema: &str, data: Bytes) -> Result<M, String> {
 
 // The count comes from the file: checked against the bytes before anything is allocated for it.
 fn check_bytes(format: SampleFormat, count: usize, bytes: &[u8]) -> Result<(), String> {
-    let width = format.bytes().ok_or("its sample format is unknown")?;
+    let width = format.sample_bytes().ok_or("its sample format is unknown")?;
     match count.checked_mul(width) == Some(bytes.len()) {
         true => Ok(()),
         false => Err(format!("it has {} bytes for {count} samples of {width}", bytes.len())),
@@ -382,7 +384,8 @@ mod tests {
             temperature_c: 6.5,
         };
         let chunk = Bytes::from(sent.encode_to_vec());
-        let received: SweepRecording = decode(SweepRecording::FULL_NAME, chunk.clone()).expect("the same message");
+        let received: SweepRecording =
+            decode_message(SweepRecording::FULL_NAME, chunk.clone()).expect("the same message");
         assert_eq!(received, sent);
         for samples in [&received.microphone, &received.loopback] {
             assert!(chunk.as_ptr_range().contains(&samples.as_ptr()), "they are copied");

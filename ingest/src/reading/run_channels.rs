@@ -29,13 +29,13 @@ pub(crate) struct RunDefinitions {
 impl RunDefinitions {
     /// Learns a definition outside of chunks. The first of an id counts: a chunk's definitions have its CRC, those of the
     /// summary may be damaged.
-    pub(crate) fn learn(&mut self, record: &Record<'_>) {
+    pub(crate) fn learn_definition(&mut self, record: &Record<'_>) {
         match record {
             Record::Schema { header, .. } => {
                 self.schemas.entry(header.id).or_insert_with(|| kept_name(&header.name));
             }
             Record::Channel(channel) if !self.channels.contains_key(&channel.id) => {
-                let described = self.described(channel);
+                let described = self.describe_channel(channel);
                 Arc::make_mut(&mut self.channels).insert(channel.id, described);
             }
             _ => {}
@@ -49,7 +49,7 @@ impl RunDefinitions {
     pub(crate) fn learn_chunk(&mut self, chunk: &DecodedChunk) -> Result<(), String> {
         for (code, body) in chunk.records().filter(|(code, _)| matches!(*code, opcode::SCHEMA | opcode::CHANNEL)) {
             let Ok(record) = parse_record(code, body) else { continue };
-            self.learn(&record);
+            self.learn_definition(&record);
             match &record {
                 Record::Schema { header, .. } => {
                     let (known, now) = (self.schemas.get(&header.id), kept_name(&header.name));
@@ -58,7 +58,7 @@ impl RunDefinitions {
                     }
                 }
                 Record::Channel(channel) => {
-                    let (known, now) = (self.channels.get(&channel.id), self.described(channel));
+                    let (known, now) = (self.channels.get(&channel.id), self.describe_channel(channel));
                     if let Some(known) = known.filter(|known| **known != now) {
                         let (topics, schemas) = ([&known.topic, &now.topic], [&known.schema, &now.schema]);
                         return Err(format!(
@@ -73,13 +73,13 @@ impl RunDefinitions {
         Ok(())
     }
 
-    fn described(&self, channel: &echolake_recording::ChannelRecord) -> RunChannel {
+    fn describe_channel(&self, channel: &echolake_recording::ChannelRecord) -> RunChannel {
         let schema = self.schemas.get(&channel.schema_id).cloned().unwrap_or_default();
         RunChannel { topic: kept_name(&channel.topic), schema }
     }
 
     /// Returns whether the channels of all messages of a chunk are known.
-    pub(crate) fn knows(&self, chunk: &DecodedChunk) -> bool {
+    pub(crate) fn has_channels_of(&self, chunk: &DecodedChunk) -> bool {
         chunk.messages().all(|message| self.channels.contains_key(&message.channel))
     }
 }
@@ -106,7 +106,7 @@ mod tests {
         writer.finish().expect("finished");
         drop(writer);
         let mut splitter = RecordSplitter::new(8);
-        splitter.push(&file.into_inner()[8..]);
+        splitter.push_bytes(&file.into_inner()[8..]);
         loop {
             let record = splitter.next_record().expect("sound").expect("a chunk");
             if record.code == opcode::CHUNK {

@@ -45,14 +45,19 @@ enum ChunkMeasurement {
 
 impl RunContent {
     /// Reads a run; its chunks are measured on all cores while the next ones are fetched.
-    pub(crate) async fn read(lake: &Lake, measurer: &Arc<Measurer>, cores: &Cores, opened: &OpenedRun) -> Result<Self> {
+    pub(crate) async fn read_from(
+        lake: &Lake,
+        measurer: &Arc<Measurer>,
+        cores: &Cores,
+        opened: &OpenedRun,
+    ) -> Result<Self> {
         let name = opened.name.as_str();
         let mut reader = ResyncReader::open(opened.store.clone(), opened.path.clone(), name.to_owned()).await?;
         let mut envelope = RunEnvelope::default();
         let mut definitions = RunDefinitions::default();
         let mut whole = ChunkResults { last_time_ns: i64::MIN, ..ChunkResults::default() };
         let mut checked = false;
-        let busy = cores.busy();
+        let busy = cores.mark_busy();
         let budget = Arc::new(measurer.run_budget());
         let mut measured: Vec<ChunkMeasurement> = Vec::new();
         let mut seen = HashSet::new();
@@ -62,7 +67,7 @@ impl RunContent {
             match item {
                 ResyncItem::Chunk(raw) => {
                     if !checked && envelope.is_complete() {
-                        envelope.check(lake, name)?;
+                        envelope.checked_manifest(lake, name)?;
                         checked = true;
                     }
                     let (begin, length) = (raw.offset, raw.body.len() as u64);
@@ -74,22 +79,24 @@ impl RunContent {
                         }
                         Ok((offset, chunk)) => {
                             let learned = definitions.learn_chunk(&chunk);
-                            learned.map_err(|what| Error::read(name, format!("the chunk at byte {offset}: {what}")))?;
-                            if !definitions.knows(&chunk) {
+                            learned.map_err(|what| {
+                                Error::read_failure(name, format!("the chunk at byte {offset}: {what}"))
+                            })?;
+                            if !definitions.has_channels_of(&chunk) {
                                 waiting.push((offset, length));
                                 continue;
                             }
                             let (measurer, channels) = (measurer.clone(), definitions.channels.clone());
                             let (budget, permit) = (budget.clone(), raw.permit);
                             let work = move || {
-                                let measured = measurer.process(offset, &chunk, &channels, &budget);
+                                let measured = measurer.process_chunk(offset, &chunk, &channels, &budget);
                                 drop((chunk, permit));
                                 measured
                             };
                             // Another core would have to fetch what this one has in its cache, so it gets a chunk only
                             // where it has nothing else to do. That also bounds how many are in memory.
                             measured.push(match cores.is_one_idle() {
-                                true => ChunkMeasurement::Elsewhere(cores.begin(work)),
+                                true => ChunkMeasurement::Elsewhere(cores.begin_on_core(work)),
                                 false => ChunkMeasurement::Here(work()),
                             });
                             tokio::task::yield_now().await;
@@ -102,31 +109,33 @@ impl RunContent {
                 }
                 ResyncItem::Attachment(found) => envelope.keep_attachment(found.name, found.data),
                 ResyncItem::Metadata(record) => envelope.keep_metadata(record),
-                ResyncItem::Definition(record) => definitions.learn(&record),
+                ResyncItem::Definition(record) => definitions.learn_definition(&record),
             }
         }
-        let manifest = envelope.check(lake, name)?;
+        let manifest = envelope.checked_manifest(lake, name)?;
         drop(busy);
         for part in measured {
             whole.append(match part {
                 ChunkMeasurement::Here(part) => part,
-                ChunkMeasurement::Elsewhere(part) => part.done().await,
+                ChunkMeasurement::Elsewhere(part) => part.wait_for_result().await,
             });
         }
         for (offset, length) in waiting {
-            let raw = reader.again(offset, length).await?;
-            let (offset, chunk) = decode_chunk(&raw).map_err(|e| Error::read(name, e))?;
+            let raw = reader.reread_chunk(offset, length).await?;
+            let (offset, chunk) = decode_chunk(&raw).map_err(|e| Error::read_failure(name, e))?;
             let (measurer, channels, budget) = (measurer.clone(), definitions.channels.clone(), budget.clone());
-            whole.append(cores.compute(move || measurer.process(offset, &chunk, &channels, &budget)).await);
+            whole.append(
+                cores.compute_on_core(move || measurer.process_chunk(offset, &chunk, &channels, &budget)).await,
+            );
         }
         let integrity = reader.finish().await?;
         if !integrity.damage.is_empty() || !integrity.closed {
             check_manifest(&manifest, name)?;
         }
-        Self::assemble(manifest, envelope, whole, integrity, name)
+        Self::from_parts(manifest, envelope, whole, integrity, name)
     }
 
-    fn assemble(
+    fn from_parts(
         manifest: RunManifest,
         envelope: RunEnvelope,
         whole: ChunkResults,
@@ -147,8 +156,8 @@ impl RunContent {
         let attempts = whole.verdicts.len() as u64;
         let accepted = join_verdicts(whole.verdicts, responses, &mut damaged);
         Ok(Self {
-            surface: envelope.surface(name)?,
-            heights_mm: envelope.heights(),
+            surface: envelope.parse_surface(name)?,
+            heights_mm: envelope.decode_heights(),
             manifest,
             end,
             accepted,

@@ -39,7 +39,7 @@ pub(crate) struct RunHead {
 
 impl RunHead {
     /// Reads them; None if the file does not begin as a run.
-    pub(crate) async fn read(opened: &OpenedRun) -> Option<Self> {
+    pub(crate) async fn read_from(opened: &OpenedRun) -> Option<Self> {
         let (store, path) = (opened.store.clone(), opened.path.clone());
         let mut reader = ResyncReader::open(store, path, opened.name.clone()).await.ok()?.without_digest();
         let mut envelope = RunEnvelope::default();
@@ -52,10 +52,10 @@ impl RunHead {
             }
         }
         let manifest = RunManifest::from_metadata(envelope.metadata.get(topics::RUN_METADATA)?).ok()?;
-        let surface = envelope.surface(&opened.name).ok()?;
+        let surface = envelope.parse_surface(&opened.name).ok()?;
         let references = [surface.flat_reference, surface.foam_reference].into_iter().flatten().collect();
         let has_plan = envelope.metadata.contains_key(topics::RUN_PLAN_METADATA);
-        let rig = envelope.rig(&opened.name).ok();
+        let rig = envelope.parse_rig(&opened.name).ok();
         Some(Self { surface: manifest.surface_id, references, origin: manifest.origin, has_plan, rig })
     }
 }
@@ -82,17 +82,17 @@ impl RunEnvelope {
     }
 
     // Checked before chunks are measured where that can be, so that a wrong file costs nothing.
-    pub(super) fn check(&self, lake: &Lake, name: &str) -> Result<RunManifest> {
+    pub(super) fn checked_manifest(&self, lake: &Lake, name: &str) -> Result<RunManifest> {
         let Some(record) = self.metadata.get(topics::RUN_METADATA) else {
             return Err(Error::Foreign { file: name.to_owned() });
         };
         let manifest =
             RunManifest::from_metadata(record).map_err(|cause| Error::Manifest { file: name.to_owned(), cause })?;
-        lake.fits(&self.rig(name)?)?;
+        lake.check_rig(&self.parse_rig(name)?)?;
         Ok(manifest)
     }
 
-    fn rig(&self, name: &str) -> Result<Rig> {
+    fn parse_rig(&self, name: &str) -> Result<Rig> {
         let wrong = |source: ErrorCause| Error::Attachment {
             file: name.to_owned(),
             attachment: topics::RIG_ATTACHMENT,
@@ -103,7 +103,7 @@ impl RunEnvelope {
         Rig::from_toml(text).map_err(|e| wrong(e.into()))
     }
 
-    pub(super) fn surface(&self, name: &str) -> Result<SurfaceRecord> {
+    pub(super) fn parse_surface(&self, name: &str) -> Result<SurfaceRecord> {
         let wrong = |source: ErrorCause| Error::Attachment {
             file: name.to_owned(),
             attachment: topics::SURFACE_ATTACHMENT,
@@ -113,7 +113,7 @@ impl RunEnvelope {
         serde_json::from_slice(bytes).map_err(|e| wrong(e.into()))
     }
 
-    pub(super) fn heights(&self) -> Vec<f32> {
+    pub(super) fn decode_heights(&self) -> Vec<f32> {
         let bytes = self.attachments.get(topics::HEIGHTS_ATTACHMENT).map_or(&[][..], |b| &b[..]);
         bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect()
     }

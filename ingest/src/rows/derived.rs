@@ -21,14 +21,14 @@ pub(crate) struct ReferenceVersions<'a> {
 pub(crate) struct SymmetryPairs(Vec<(Symmetry, Vec<MovedPair>)>);
 
 impl SymmetryPairs {
-    pub(crate) fn of(grid: &Grid) -> Self {
+    pub(crate) fn from_grid(grid: &Grid) -> Self {
         let moved = |symmetry| grid.moved_pairs(symmetry).map(|pairs| (symmetry, pairs));
         Self(Symmetry::ALL.into_iter().filter_map(moved).collect())
     }
 }
 
 /// Builds rows of `nce`.
-pub(crate) fn nce(
+pub(crate) fn nce_rows(
     rig: &Rig,
     grid: &Grid,
     keys: &RunKeys,
@@ -36,15 +36,15 @@ pub(crate) fn nce(
     of: ReferenceVersions<'_>,
 ) -> Result<RecordBatch> {
     let mut columns = keys.begin_rows(Table::Nce, rig, derived.pairs.len());
-    columns.pairs("", grid_pairs(grid, derived.pairs.iter())).lists("reflected_ir", derived.reflected);
+    columns.push_pairs("", grid_pairs(grid, derived.pairs.iter())).push_lists("reflected_ir", derived.reflected);
     for (band, curves) in rig.band_names().iter().zip(derived.curves) {
-        columns.lists(&format!("nce_{band}"), curves);
+        columns.push_lists(&format!("nce_{band}"), curves);
     }
-    Ok(columns.text("flat_version", of.flat).text("foam_version", of.foam).finish()?)
+    Ok(columns.fill_text("flat_version", of.flat).fill_text("foam_version", of.foam).finish()?)
 }
 
 /// Builds rows of `tnce`.
-pub(crate) fn tnce(
+pub(crate) fn tnce_rows(
     rig: &Rig,
     grid: &Grid,
     keys: &RunKeys,
@@ -52,13 +52,13 @@ pub(crate) fn tnce(
     of: ReferenceVersions<'_>,
 ) -> Result<RecordBatch> {
     let mut columns = keys.begin_rows(Table::Tnce, rig, derived.pairs.len());
-    columns.pairs("", grid_pairs(grid, derived.pairs.iter()));
+    columns.push_pairs("", grid_pairs(grid, derived.pairs.iter()));
     energy_columns(&mut columns, rig, derived, 1);
     let shapes = derived.shape_columns(&rig.band_names(), rig.sweep.rate_hz.get());
     for (name, values) in shapes.into_iter().chain(derived.uncertainty_columns(&rig.band_names())) {
-        columns.floats(&name, values);
+        columns.push_floats(&name, values);
     }
-    Ok(columns.text("flat_version", of.flat).text("foam_version", of.foam).finish()?)
+    Ok(columns.fill_text("flat_version", of.flat).fill_text("foam_version", of.foam).finish()?)
 }
 
 /// Builds rows of `tnce_d4`, grouped by pair, one per symmetry. Symmetries that the grid lacks are left out.
@@ -80,13 +80,13 @@ pub(crate) fn tnce_d4(
     let moved = rows.iter().map(|(_, moved)| Some(&moved.pair));
     let mut columns = keys.begin_rows(Table::TnceD4, rig, rows.len());
     columns
-        .pairs("", grid_pairs(grid, measured))
-        .texts("symmetry", rows.iter().map(|(symmetry, _)| symmetry.name()))
-        .flags("swapped", rows.iter().map(|(_, moved)| moved.swapped))
-        .pairs("d4_", moved.clone())
-        .positions(grid, moved);
+        .push_pairs("", grid_pairs(grid, measured))
+        .push_texts("symmetry", rows.iter().map(|(symmetry, _)| symmetry.name()))
+        .push_flags("swapped", rows.iter().map(|(_, moved)| moved.swapped))
+        .push_pairs("d4_", moved.clone())
+        .push_positions(grid, moved);
     energy_columns(&mut columns, rig, derived, each);
-    Ok(columns.text("flat_version", of.flat).text("foam_version", of.foam).finish()?)
+    Ok(columns.fill_text("flat_version", of.flat).fill_text("foam_version", of.foam).finish()?)
 }
 
 fn grid_pairs<'a>(
@@ -99,6 +99,6 @@ fn grid_pairs<'a>(
 // Repeats each measurement's numbers in `each` rows.
 fn energy_columns(columns: &mut BatchBuilder, rig: &Rig, derived: &DerivedRows, each: usize) {
     for (name, values) in derived.energy_columns(&rig.band_names()) {
-        columns.doubles(&name, values.into_iter().flat_map(|x| std::iter::repeat_n(x, each)));
+        columns.push_doubles(&name, values.into_iter().flat_map(|x| std::iter::repeat_n(x, each)));
     }
 }

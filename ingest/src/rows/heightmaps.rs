@@ -1,7 +1,7 @@
 //! Rows of table `heightmaps`: the relief at 128 x 128, under each symmetry.
 
 use arrow::record_batch::RecordBatch;
-use echolake_dsp::heights::moved;
+use echolake_dsp::heights::move_heights;
 use echolake_schema::tables::Table;
 use echolake_schema::{Rig, Symmetry};
 
@@ -11,7 +11,7 @@ use crate::error::{Error, Result};
 const CELLS: usize = Table::HEIGHTMAP_CELLS;
 
 /// Builds one row per symmetry; None if the heights are not a square.
-pub(crate) fn rows(rig: &Rig, keys: &RunKeys, heights_mm: &[f32]) -> Result<Option<RecordBatch>> {
+pub(crate) fn heightmap_rows(rig: &Rig, keys: &RunKeys, heights_mm: &[f32]) -> Result<Option<RecordBatch>> {
     let side = heights_mm.len().isqrt();
     if side == 0 || side * side != heights_mm.len() {
         return Ok(None);
@@ -20,26 +20,26 @@ pub(crate) fn rows(rig: &Rig, keys: &RunKeys, heights_mm: &[f32]) -> Result<Opti
     let rows = Symmetry::ALL.len();
     let mut all = vec![0.0; rows * small.len()];
     for (symmetry, out) in Symmetry::ALL.into_iter().zip(all.chunks_exact_mut(small.len())) {
-        moved(&small, symmetry, out).map_err(|cause| Error::Kernel { file: keys.run.to_string(), cause })?;
+        move_heights(&small, symmetry, out).map_err(|cause| Error::Kernel { file: keys.run.to_string(), cause })?;
     }
     let batch = keys
         .begin_rows(Table::Heightmaps, rig, rows)
-        .texts("symmetry", Symmetry::ALL.map(Symmetry::name))
-        .ints("cells", std::iter::repeat_n(CELLS as i32, rows))
-        .floats("size_mm", std::iter::repeat_n(rig.panel.size_mm as f32, rows))
-        .lists("heights_mm", all)
+        .push_texts("symmetry", Symmetry::ALL.map(Symmetry::name))
+        .push_ints("cells", std::iter::repeat_n(CELLS as i32, rows))
+        .push_floats("size_mm", std::iter::repeat_n(rig.panel.size_mm as f32, rows))
+        .push_lists("heights_mm", all)
         .finish()?;
     Ok(Some(batch))
 }
 
 // Each small cell is the mean of the area it covers, first along x, then along y.
 fn area_mean(heights: &[f32], side: usize) -> Vec<f32> {
-    let weights = weights(side);
-    let narrow: Vec<f32> = heights.chunks_exact(side).flat_map(|row| shrink(row, &weights)).collect();
+    let weights = cell_weights(side);
+    let narrow: Vec<f32> = heights.chunks_exact(side).flat_map(|row| shrink_line(row, &weights)).collect();
     let mut small = vec![0.0; CELLS * CELLS];
     for x in 0..CELLS {
         let column: Vec<f32> = (0..side).map(|y| narrow[y * CELLS + x]).collect();
-        for (y, mean) in shrink(&column, &weights).into_iter().enumerate() {
+        for (y, mean) in shrink_line(&column, &weights).into_iter().enumerate() {
             small[y * CELLS + x] = mean;
         }
     }
@@ -47,7 +47,7 @@ fn area_mean(heights: &[f32], side: usize) -> Vec<f32> {
 }
 
 /// Returns for each small cell the first large cell that it covers, and the weight of each covered cell.
-fn weights(side: usize) -> Vec<(usize, Vec<f64>)> {
+fn cell_weights(side: usize) -> Vec<(usize, Vec<f64>)> {
     let scale = side as f64 / CELLS as f64;
     let weights = |cell: usize| {
         let (from, to) = (cell as f64 * scale, (cell + 1) as f64 * scale);
@@ -59,7 +59,7 @@ fn weights(side: usize) -> Vec<(usize, Vec<f64>)> {
     (0..CELLS).map(weights).collect()
 }
 
-fn shrink(line: &[f32], weights: &[(usize, Vec<f64>)]) -> Vec<f32> {
+fn shrink_line(line: &[f32], weights: &[(usize, Vec<f64>)]) -> Vec<f32> {
     let mean = |(first, shares): &(usize, Vec<f64>)| {
         line[*first..].iter().zip(shares).map(|(h, share)| f64::from(*h) * share).sum::<f64>() as f32
     };

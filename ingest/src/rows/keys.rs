@@ -18,9 +18,9 @@ impl RunKeys {
     pub(super) fn begin_rows(&self, table: Table, rig: &Rig, rows: usize) -> BatchBuilder {
         let mut columns = BatchBuilder::new(table, rig, rows);
         columns
-            .text("surface_id", self.surface.as_str())
-            .text("run_id", self.run.as_str())
-            .text("code_version", CODE_VERSION);
+            .fill_text("surface_id", self.surface.as_str())
+            .fill_text("run_id", self.run.as_str())
+            .fill_text("code_version", CODE_VERSION);
         columns
     }
 }

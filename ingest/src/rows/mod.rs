@@ -12,6 +12,6 @@ pub(crate) mod surfaces;
 pub(crate) use keys::RunKeys;
 
 /// Returns None for NaN and infinities.
-fn finite(value: f64) -> Option<f64> {
+fn finite_value(value: f64) -> Option<f64> {
     value.is_finite().then_some(value)
 }

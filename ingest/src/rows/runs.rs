@@ -28,7 +28,7 @@ const WAITING: &str = "waiting";
 const PARTIAL: &str = "partial";
 
 /// Builds the row of a newly ingested run.
-pub(crate) fn row(
+pub(crate) fn new_run_row(
     lake: &Lake,
     keys: &RunKeys,
     content: &RunContent,
@@ -44,24 +44,24 @@ pub(crate) fn row(
         ("pressure_min_hpa", "pressure_max_hpa", |m| m.pressure_hpa),
     ] {
         let values = || content.accepted.iter().map(|(m, _)| of(m)).filter(|x| x.is_finite());
-        columns.floats(lowest, [values().reduce(f64::min).map(|x| x as f32)]);
-        columns.floats(highest, [values().reduce(f64::max).map(|x| x as f32)]);
+        columns.push_floats(lowest, [values().reduce(f64::min).map(|x| x as f32)]);
+        columns.push_floats(highest, [values().reduce(f64::max).map(|x| x as f32)]);
     }
     columns
-        .text("origin", content.manifest.origin.label())
-        .text("project", content.surface.project.as_ref().map(ProjectName::as_str))
-        .text("rig", content.manifest.rig.as_str())
-        .times("started", [content.manifest.started.0])
-        .times("ended", [ended])
-        .longs("measurements", [content.accepted.len() as i64])
-        .longs("rejected", [content.rejected as i64])
-        .longs("attempts", [content.attempts as i64])
-        .longs("damaged", [content.damaged.len() as i64])
-        .texts("file", [Lake::run_path(&keys.surface, &keys.run)])
-        .longs("file_bytes", [content.integrity.bytes as i64])
-        .text("file_sha256", content.integrity.sha256.as_str())
-        .text("recorded_by", content.manifest.software.as_str())
-        .text("run_derivation", run_derivation);
+        .fill_text("origin", content.manifest.origin.label())
+        .fill_text("project", content.surface.project.as_ref().map(ProjectName::as_str))
+        .fill_text("rig", content.manifest.rig.as_str())
+        .push_times("started", [content.manifest.started.0])
+        .push_times("ended", [ended])
+        .push_longs("measurements", [content.accepted.len() as i64])
+        .push_longs("rejected", [content.rejected as i64])
+        .push_longs("attempts", [content.attempts as i64])
+        .push_longs("damaged", [content.damaged.len() as i64])
+        .push_texts("file", [Lake::run_path(&keys.surface, &keys.run)])
+        .push_longs("file_bytes", [content.integrity.bytes as i64])
+        .fill_text("file_sha256", content.integrity.sha256.as_str())
+        .fill_text("recorded_by", content.manifest.software.as_str())
+        .fill_text("run_derivation", run_derivation);
     Ok(push_references(&mut columns, partial, references).finish()?)
 }
 
@@ -88,11 +88,11 @@ fn push_references<'a>(
         false => WAITING,
     };
     columns
-        .text("state", state)
-        .text("missing", references.missing.as_str())
-        .text("reference_derivation", references.derivation.as_deref())
-        .text("flat_version", references.flat_version.as_deref())
-        .text("foam_version", references.foam_version.as_deref())
+        .fill_text("state", state)
+        .fill_text("missing", references.missing.as_str())
+        .fill_text("reference_derivation", references.derivation.as_deref())
+        .fill_text("flat_version", references.flat_version.as_deref())
+        .fill_text("foam_version", references.foam_version.as_deref())
 }
 
 /// Returns a text of the row.

@@ -10,7 +10,7 @@ use echolake_schema::Rig;
 use echolake_schema::tables::{BandStatistics, Table};
 
 use super::derived::ReferenceVersions;
-use super::{RunKeys, finite};
+use super::{RunKeys, finite_value};
 use crate::error::Result;
 
 /// Values of a surface's pairs, in each band and of the total.
@@ -26,7 +26,7 @@ pub(crate) struct SurfaceLevels {
 }
 
 /// Builds one row per band and one for the total.
-pub(crate) fn rows(
+pub(crate) fn stats_rows(
     rig: &Rig,
     keys: &RunKeys,
     levels: &SurfaceLevels,
@@ -42,28 +42,28 @@ pub(crate) fn rows(
     }
     let batch = keys
         .begin_rows(Table::SurfaceStats, rig, stats.len())
-        .texts("band", stats.iter().map(|s| &s.band))
-        .doubles("band_hz", rig.bands.centres_hz.iter().map(|hz| Some(*hz)).chain([None]))
-        .ints("measurements", stats.iter().map(|s| s.measurements))
-        .doubles("p90_mean_db", stats.iter().map(|s| s.p90_mean_db))
-        .doubles("p5_db", stats.iter().map(|s| s.p5_db))
-        .doubles("p50_db", stats.iter().map(|s| s.p50_db))
-        .doubles("p95_db", stats.iter().map(|s| s.p95_db))
-        .doubles("min_db", stats.iter().map(|s| s.min_db))
-        .doubles("max_db", stats.iter().map(|s| s.max_db))
-        .doubles("spread_db", stats.iter().map(|s| s.spread_db))
-        .doubles("p90_mean_u_db", stats.iter().map(|s| s.p90_mean_u_db))
-        .doubles("unbiased_p90_mean_db", stats.iter().map(|s| s.unbiased_p90_mean_db))
-        .lists("mean_nce", mean_curves(&levels.curves))
-        .text("flat_version", of.flat)
-        .text("foam_version", of.foam)
+        .push_texts("band", stats.iter().map(|s| &s.band))
+        .push_doubles("band_hz", rig.bands.centres_hz.iter().map(|hz| Some(*hz)).chain([None]))
+        .push_ints("measurements", stats.iter().map(|s| s.measurements))
+        .push_doubles("p90_mean_db", stats.iter().map(|s| s.p90_mean_db))
+        .push_doubles("p5_db", stats.iter().map(|s| s.p5_db))
+        .push_doubles("p50_db", stats.iter().map(|s| s.p50_db))
+        .push_doubles("p95_db", stats.iter().map(|s| s.p95_db))
+        .push_doubles("min_db", stats.iter().map(|s| s.min_db))
+        .push_doubles("max_db", stats.iter().map(|s| s.max_db))
+        .push_doubles("spread_db", stats.iter().map(|s| s.spread_db))
+        .push_doubles("p90_mean_u_db", stats.iter().map(|s| s.p90_mean_u_db))
+        .push_doubles("unbiased_p90_mean_db", stats.iter().map(|s| s.unbiased_p90_mean_db))
+        .push_lists("mean_nce", mean_curves(&levels.curves))
+        .fill_text("flat_version", of.flat)
+        .fill_text("foam_version", of.foam)
         .finish()?;
     Ok(batch)
 }
 
 // The bands' curves, then their sum; nothing without measurements.
 fn mean_curves(bands: &[SignalMean]) -> Vec<f32> {
-    let means: Vec<Vec<f64>> = bands.iter().map(|band| band.values().collect()).collect();
+    let means: Vec<Vec<f64>> = bands.iter().map(|band| band.mean_values().collect()).collect();
     let length = means.first().map_or(0, Vec::len);
     let total = (0..length).map(|i| means.iter().map(|mean| mean[i]).sum());
     means.iter().flatten().copied().chain(total).map(|x: f64| x as f32).collect()
@@ -77,7 +77,7 @@ fn stats_of(band: String, values: &[f64]) -> BandStatistics {
         return BandStatistics { band, measurements, ..BandStatistics::default() };
     }
     sorted.sort_by(f64::total_cmp);
-    let db = |power: f64| finite(power_to_db(power));
+    let db = |power: f64| finite_value(power_to_db(power));
     let levels: Vec<f64> = sorted.iter().filter_map(|x| db(*x)).collect();
     BandStatistics {
         band,
@@ -88,7 +88,7 @@ fn stats_of(band: String, values: &[f64]) -> BandStatistics {
         p95_db: db(percentile(&sorted, 95.0)),
         min_db: db(sorted[0]),
         max_db: db(sorted[sorted.len() - 1]),
-        spread_db: spread(&levels),
+        spread_db: standard_deviation(&levels),
         p90_mean_u_db: None,
         unbiased_p90_mean_db: None,
     }
@@ -105,13 +105,13 @@ fn p90_mean_uncertainty(values: &[f64], errors: &[ErrorMoments]) -> Option<f64> 
         common += value * error.mean;
         variance += value * value * error.variance;
     }
-    finite(10.0 / LN_10 * (common * common + variance).sqrt() / sum)
+    finite_value(10.0 / LN_10 * (common * common + variance).sqrt() / sum)
 }
 
-fn spread(levels: &[f64]) -> Option<f64> {
+fn standard_deviation(levels: &[f64]) -> Option<f64> {
     let count = levels.len() as f64;
     let mean = levels.iter().sum::<f64>() / count;
-    finite((levels.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / count).sqrt())
+    finite_value((levels.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / count).sqrt())
 }
 
 #[cfg(test)]
@@ -141,7 +141,7 @@ mod tests {
         let mut bands = vec![SignalMean::default(); 2];
         assert!(mean_curves(&bands).is_empty());
         for (band, curves) in bands.iter_mut().zip([[[0.0f32, 2.0], [1.0, 4.0]], [[0.0, 1.0], [0.0, 3.0]]]) {
-            curves.iter().for_each(|curve| band.add(curve).expect("equally long"));
+            curves.iter().for_each(|curve| band.add_signal(curve).expect("equally long"));
         }
         assert_eq!(mean_curves(&bands), [0.5, 3.0, 0.0, 2.0, 0.5, 5.0]);
     }

@@ -13,7 +13,7 @@ use super::RunKeys;
 use crate::error::Result;
 
 /// Builds the row of a run's surface; references that it does not name default to the lake's.
-pub(crate) fn row(
+pub(crate) fn surface_row(
     rig: &Rig,
     keys: &RunKeys,
     surface: &SurfaceRecord,
@@ -22,42 +22,42 @@ pub(crate) fn row(
     heights_mm: &[f32],
 ) -> Result<RecordBatch> {
     let mesh = surface.mesh.as_ref();
-    let relief = relief(heights_mm).or(mesh.map(|m| [m.relief_mm[0] as f32, m.relief_mm[1] as f32, f32::NAN]));
+    let relief = relief_stats(heights_mm).or(mesh.map(|m| [m.relief_mm[0] as f32, m.relief_mm[1] as f32, f32::NAN]));
     let known = |i: usize| [relief.map(|r| r[i]).filter(|x| x.is_finite())];
     let flat = surface.flat_reference.as_ref().unwrap_or(&references.flat);
     let foam = surface.foam_reference.as_ref().unwrap_or(&references.foam);
-    let heights = square(heights_mm, rig.panel.size_mm);
+    let heights = height_field(heights_mm, rig.panel.size_mm);
     let mut row = keys.begin_rows(Table::Surfaces, rig, 1);
     for (band, hz) in rig.band_names().iter().zip(&rig.bands.centres_hz) {
         let phase = heights.as_ref().and_then(|heights| detail_phase(heights, rig, *hz));
-        row.floats(&format!("detail_phase_{band}"), [phase]);
+        row.push_floats(&format!("detail_phase_{band}"), [phase]);
     }
     let row = row
-        .text("panel", keys.surface.panel())
-        .ints("side", [keys.surface.side().map(i32::from)])
-        .text("typology", surface.typology.as_str())
-        .text("macrostructure", surface.macrostructure.as_deref())
-        .text("mesostructure", surface.mesostructure.as_deref())
-        .text("microstructure", surface.microstructure.as_deref())
-        .text("material", surface.material.as_deref())
-        .doubles("reflection_factor", [surface.reflection_factor])
-        .text("flat_reference", flat.as_str())
-        .text("foam_reference", foam.as_str())
-        .text("macro_reference", surface.macro_reference.as_ref().map(SurfaceId::as_str))
-        .texts("parameters", [surface.parameters.to_string()])
-        .text("mesh_file", mesh.map(|m| m.file.as_str()))
-        .longs("mesh_triangles", [mesh.map(|m| m.triangles as i64)])
-        .flags("mesh_watertight", [mesh.map(|m| m.watertight)])
-        .floats("relief_min_mm", known(0))
-        .floats("relief_max_mm", known(1))
-        .floats("relief_rms_mm", known(2))
-        .text("origin", origin)
-        .text("project", surface.project.as_ref().map(ProjectName::as_str))
+        .fill_text("panel", keys.surface.panel())
+        .push_ints("side", [keys.surface.side().map(i32::from)])
+        .fill_text("typology", surface.typology.as_str())
+        .fill_text("macrostructure", surface.macrostructure.as_deref())
+        .fill_text("mesostructure", surface.mesostructure.as_deref())
+        .fill_text("microstructure", surface.microstructure.as_deref())
+        .fill_text("material", surface.material.as_deref())
+        .push_doubles("reflection_factor", [surface.reflection_factor])
+        .fill_text("flat_reference", flat.as_str())
+        .fill_text("foam_reference", foam.as_str())
+        .fill_text("macro_reference", surface.macro_reference.as_ref().map(SurfaceId::as_str))
+        .push_texts("parameters", [surface.parameters.to_string()])
+        .fill_text("mesh_file", mesh.map(|m| m.file.as_str()))
+        .push_longs("mesh_triangles", [mesh.map(|m| m.triangles as i64)])
+        .push_flags("mesh_watertight", [mesh.map(|m| m.watertight)])
+        .push_floats("relief_min_mm", known(0))
+        .push_floats("relief_max_mm", known(1))
+        .push_floats("relief_rms_mm", known(2))
+        .fill_text("origin", origin)
+        .fill_text("project", surface.project.as_ref().map(ProjectName::as_str))
         .finish()?;
     Ok(row)
 }
 
-fn square(heights_mm: &[f32], size_mm: f64) -> Option<HeightField> {
+fn height_field(heights_mm: &[f32], size_mm: f64) -> Option<HeightField> {
     let side = heights_mm.len().isqrt();
     let mut all = heights_mm.iter().copied().map(f64::from);
     let is_square = side > 1 && side * side == heights_mm.len();
@@ -72,7 +72,7 @@ fn detail_phase(heights: &HeightField, rig: &Rig, hz: f64) -> Option<f32> {
 }
 
 // Minimum, maximum and root mean square height about the mean.
-fn relief(heights_mm: &[f32]) -> Option<[f32; 3]> {
+fn relief_stats(heights_mm: &[f32]) -> Option<[f32; 3]> {
     if heights_mm.is_empty() {
         return None;
     }
@@ -95,11 +95,11 @@ mod tests {
         let rig = Rig::paper();
         let grooves = |cells: usize| {
             let row = move |i: usize| if i.is_multiple_of(5) { -1.0f32 } else { 0.0 };
-            square(&(0..cells * cells).map(|i| row(i % cells)).collect::<Vec<_>>(), 585.0).expect("square")
+            height_field(&(0..cells * cells).map(|i| row(i % cells)).collect::<Vec<_>>(), 585.0).expect("square")
         };
         let phase = detail_phase(&grooves(260), &rig, 10e3).expect("there");
         assert!((phase - 0.4 * (TAU * 10.0 / 343.2) as f32).abs() < 0.01, "{phase}");
         assert_eq!(detail_phase(&grooves(100), &rig, 40e3), None);
-        assert_eq!(square(&[0.0; 6], 585.0), None);
+        assert_eq!(height_field(&[0.0; 6], 585.0), None);
     }
 }

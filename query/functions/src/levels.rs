@@ -5,7 +5,7 @@ use arrow::datatypes::DataType;
 use datafusion::error::Result;
 use echolake_dsp::level::{amplitude_to_db, power_to_db, sound_pressure_level_db};
 
-use crate::adapters::answers::{grow, lists, numbers};
+use crate::adapters::answers::{append_defaults, build_lists, build_numbers};
 use crate::adapters::arguments::{CallArguments, SampleElement, like};
 use crate::adapters::description::{ArgumentKind, FunctionDescription, FunctionFamily, FunctionParameter};
 use crate::adapters::scalar::ScalarKernel;
@@ -103,9 +103,13 @@ static LIST_DB: FunctionDescription = FunctionDescription {
     related: &["db", "nce"],
 };
 
-fn level(arguments: &CallArguments<'_>, level: impl Fn(f64) -> f64, there: impl Fn(f64) -> bool) -> Result<ArrayRef> {
-    let x = arguments.numbers(0)?;
-    numbers(arguments, |row| Ok(Some(x.at(row)).filter(|x| there(*x) || x.is_nan()).map(&level)))
+fn compute_levels(
+    arguments: &CallArguments<'_>,
+    level: impl Fn(f64) -> f64,
+    there: impl Fn(f64) -> bool,
+) -> Result<ArrayRef> {
+    let x = arguments.number_values(0)?;
+    build_numbers(arguments, |row| Ok(Some(x.value_at(row)).filter(|x| there(*x) || x.is_nan()).map(&level)))
 }
 
 impl ScalarKernel for DbFunction {
@@ -113,12 +117,12 @@ impl ScalarKernel for DbFunction {
         &DB
     }
 
-    fn returns(&self, _: &[DataType]) -> DataType {
+    fn answer_type(&self, _: &[DataType]) -> DataType {
         DataType::Float64
     }
 
-    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
-        level(arguments, power_to_db, |x| x > 0.0)
+    fn compute_answers<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
+        compute_levels(arguments, power_to_db, |x| x > 0.0)
     }
 }
 
@@ -127,12 +131,12 @@ impl ScalarKernel for DbAmplitudeFunction {
         &DB_AMPLITUDE
     }
 
-    fn returns(&self, _: &[DataType]) -> DataType {
+    fn answer_type(&self, _: &[DataType]) -> DataType {
         DataType::Float64
     }
 
-    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
-        level(arguments, amplitude_to_db, |x| x != 0.0)
+    fn compute_answers<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
+        compute_levels(arguments, amplitude_to_db, |x| x != 0.0)
     }
 }
 
@@ -141,12 +145,12 @@ impl ScalarKernel for SplFunction {
         &SPL
     }
 
-    fn returns(&self, _: &[DataType]) -> DataType {
+    fn answer_type(&self, _: &[DataType]) -> DataType {
         DataType::Float64
     }
 
-    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
-        level(arguments, sound_pressure_level_db, |x| x > 0.0)
+    fn compute_answers<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
+        compute_levels(arguments, sound_pressure_level_db, |x| x > 0.0)
     }
 }
 
@@ -155,15 +159,18 @@ impl ScalarKernel for ListDbFunction {
         &LIST_DB
     }
 
-    fn returns(&self, arguments: &[DataType]) -> DataType {
-        like(&arguments[0])
+    fn answer_type(&self, arguments: &[DataType]) -> DataType {
+        same_list_type(&arguments[0])
     }
 
-    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
-        let list = arguments.samples::<T>(0)?;
-        lists::<T>(arguments, list.room(arguments.rows()), |row, out| {
-            let list = list.at(row)?;
-            grow(out, list.len()).iter_mut().zip(list).for_each(|(out, x)| *out = T::of(power_to_db(x.f64())));
+    fn compute_answers<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
+        let list = arguments.sample_lists::<T>(0)?;
+        build_lists::<T>(arguments, list.sample_capacity(arguments.row_count()), |row, out| {
+            let list = list.samples_at(row)?;
+            append_defaults(out, list.len())
+                .iter_mut()
+                .zip(list)
+                .for_each(|(out, x)| *out = T::of(power_to_db(x.f64())));
             Ok(true)
         })
     }

@@ -16,9 +16,9 @@ use std::sync::Arc;
 use datafusion::logical_expr::{AggregateUDF, ScalarUDF};
 use echolake_schema::Rig;
 
-use adapters::aggregate::udaf;
+use adapters::aggregate::wrap_aggregate;
 use adapters::rig::RigFacts;
-use adapters::scalar::udf;
+use adapters::scalar::wrap_scalar;
 use aggregates::{average, p90_mean, value_counts};
 use comparison::{alike, diffusion};
 use geometry::{fresnel, sound, symmetry};
@@ -44,36 +44,36 @@ impl FunctionSet {
     /// # Errors
     /// [`echolake_schema::Error`] if the rig has no grid.
     pub fn all(rig: &Rig) -> Result<Self, echolake_schema::Error> {
-        let facts = Arc::new(RigFacts::of(rig)?);
+        let facts = Arc::new(RigFacts::from_rig(rig)?);
         let mut scalar = vec![
-            udf(levels::DbFunction),
-            udf(levels::DbAmplitudeFunction),
-            udf(levels::SplFunction),
-            udf(levels::ListDbFunction),
-            udf(band_energy::BandEnergyFunction::new(&facts)),
-            udf(nce::NceFunction(facts.clone())),
-            udf(spectrum::SpectrumFunction),
-            udf(spectrum::SpectrumFrequenciesFunction(facts.clone())),
-            udf(decay::EdcFunction),
-            udf(decay::ArrivalFunction(facts.clone())),
-            udf(alike::PearsonFunction),
-            udf(alike::SimilarityFunction),
-            udf(diffusion::DiffusionFunction),
-            udf(fresnel::FresnelFunction),
-            udf(sound::SpeedOfSoundFunction),
-            udf(symmetry::D4PositionFunction),
-            udf(symmetry::D4PointFunction(facts.clone())),
-            udf(symmetry::D4PairFunction(facts.clone())),
-            udf(symmetry::D4HeightmapFunction),
-            udf(lists::ListMultiplyFunction),
-            udf(lists::ListEnergyFunction),
-            udf(lists::ListRmsFunction),
+            wrap_scalar(levels::DbFunction),
+            wrap_scalar(levels::DbAmplitudeFunction),
+            wrap_scalar(levels::SplFunction),
+            wrap_scalar(levels::ListDbFunction),
+            wrap_scalar(band_energy::BandEnergyFunction::new(&facts)),
+            wrap_scalar(nce::NceFunction(facts.clone())),
+            wrap_scalar(spectrum::SpectrumFunction),
+            wrap_scalar(spectrum::SpectrumFrequenciesFunction(facts.clone())),
+            wrap_scalar(decay::EdcFunction),
+            wrap_scalar(decay::ArrivalFunction(facts.clone())),
+            wrap_scalar(alike::PearsonFunction),
+            wrap_scalar(alike::SimilarityFunction),
+            wrap_scalar(diffusion::DiffusionFunction),
+            wrap_scalar(fresnel::FresnelFunction),
+            wrap_scalar(sound::SpeedOfSoundFunction),
+            wrap_scalar(symmetry::D4PositionFunction),
+            wrap_scalar(symmetry::D4PointFunction(facts.clone())),
+            wrap_scalar(symmetry::D4PairFunction(facts.clone())),
+            wrap_scalar(symmetry::D4HeightmapFunction),
+            wrap_scalar(lists::ListMultiplyFunction),
+            wrap_scalar(lists::ListEnergyFunction),
+            wrap_scalar(lists::ListRmsFunction),
         ];
-        scalar.extend(rise::CurveShapeFunction::all(&facts).map(udf));
+        scalar.extend(rise::CurveShapeFunction::all(&facts).map(wrap_scalar));
         let aggregate = vec![
-            udaf(p90_mean::P90MeanFunction),
-            udaf(diffusion::DiffusionCoefficientFunction),
-            udaf(average::AvgListFunction),
+            wrap_aggregate(p90_mean::P90MeanFunction),
+            wrap_aggregate(diffusion::DiffusionCoefficientFunction),
+            wrap_aggregate(average::AvgListFunction),
             AggregateUDF::new_from_impl(value_counts::ValueCountFunction::mode()),
             AggregateUDF::new_from_impl(value_counts::ValueCountFunction::histogram()),
         ];

@@ -4,9 +4,9 @@ use arrow::array::ArrayRef;
 use arrow::datatypes::DataType;
 use datafusion::error::Result;
 use echolake_dsp::energy::{energy, rms};
-use echolake_dsp::mean::multiply;
+use echolake_dsp::mean::multiply_samples;
 
-use crate::adapters::answers::{grow, lists, numbers};
+use crate::adapters::answers::{append_defaults, build_lists, build_numbers};
 use crate::adapters::arguments::{CallArguments, SampleElement, like};
 use crate::adapters::description::{ArgumentKind, FunctionDescription, FunctionFamily, FunctionParameter};
 use crate::adapters::scalar::ScalarKernel;
@@ -76,15 +76,15 @@ impl ScalarKernel for ListMultiplyFunction {
         &MULTIPLY
     }
 
-    fn returns(&self, arguments: &[DataType]) -> DataType {
-        like(&arguments[0])
+    fn answer_type(&self, arguments: &[DataType]) -> DataType {
+        same_list_type(&arguments[0])
     }
 
-    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
-        let (x, y) = (arguments.samples::<T>(0)?, arguments.samples::<T>(1)?);
-        lists::<T>(arguments, x.room(arguments.rows()), |row, out| {
-            let (x, y) = (x.at(row)?, y.at(row)?);
-            multiply(x, y, grow(out, x.len())).map_err(|e| arguments.refused(row, &e))?;
+    fn compute_answers<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
+        let (x, y) = (arguments.sample_lists::<T>(0)?, arguments.sample_lists::<T>(1)?);
+        build_lists::<T>(arguments, x.sample_capacity(arguments.row_count()), |row, out| {
+            let (x, y) = (x.samples_at(row)?, y.samples_at(row)?);
+            multiply_samples(x, y, append_defaults(out, x.len())).map_err(|e| arguments.refused_row(row, &e))?;
             Ok(true)
         })
     }
@@ -95,13 +95,13 @@ impl ScalarKernel for ListEnergyFunction {
         &ENERGY
     }
 
-    fn returns(&self, _: &[DataType]) -> DataType {
+    fn answer_type(&self, _: &[DataType]) -> DataType {
         DataType::Float64
     }
 
-    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
-        let list = arguments.samples::<T>(0)?;
-        numbers(arguments, |row| Ok(Some(energy(list.at(row)?))))
+    fn compute_answers<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
+        let list = arguments.sample_lists::<T>(0)?;
+        build_numbers(arguments, |row| Ok(Some(energy(list.samples_at(row)?))))
     }
 }
 
@@ -110,12 +110,12 @@ impl ScalarKernel for ListRmsFunction {
         &RMS
     }
 
-    fn returns(&self, _: &[DataType]) -> DataType {
+    fn answer_type(&self, _: &[DataType]) -> DataType {
         DataType::Float64
     }
 
-    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
-        let list = arguments.samples::<T>(0)?;
-        numbers(arguments, |row| Ok(Some(rms(list.at(row)?))))
+    fn compute_answers<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
+        let list = arguments.sample_lists::<T>(0)?;
+        build_numbers(arguments, |row| Ok(Some(rms(list.samples_at(row)?))))
     }
 }

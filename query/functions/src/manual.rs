@@ -26,7 +26,7 @@ For sums, differences and multiples of lists DataFusion has `list_add`, `list_su
 This page is generated; `ECHOLAKE_RENEW=1 cargo test --profile quick --workspace manual` writes it.
 ";
 
-fn page() -> String {
+fn manual_page() -> String {
     let functions = FunctionSet::all(&Rig::paper()).expect("the built-in rig is valid");
     let scalar = functions.scalar().iter().filter_map(|f| Some((f.name(), f.documentation()?)));
     let aggregate = functions.aggregate().iter().filter_map(|f| Some((f.name(), f.documentation()?)));
@@ -35,13 +35,13 @@ fn page() -> String {
     for family in FunctionFamily::ALL {
         let _ = write!(page, "\n## {}\n", family.title());
         for (name, documentation) in all.iter().filter(|(_, d)| d.doc_section.label == family.title()) {
-            page += &entry(name, documentation);
+            page += &manual_entry(name, documentation);
         }
     }
     page
 }
 
-fn entry(name: &str, documentation: &Documentation) -> String {
+fn manual_entry(name: &str, documentation: &Documentation) -> String {
     let Documentation { description, syntax_example, sql_example, arguments, related_udfs, .. } = documentation;
     let mut text = format!("\n### {name}\n\n    {syntax_example}\n\n{description}\n\n");
     for (argument, about) in arguments.iter().flatten() {
@@ -57,7 +57,7 @@ fn entry(name: &str, documentation: &Documentation) -> String {
 
 #[test]
 fn manual_is_fresh() {
-    let page = page();
+    let page = manual_page();
     if std::env::var_os(RENEW).is_some() {
         std::fs::write(PAGE, &page).expect("the page is written");
     }

@@ -131,7 +131,7 @@ impl<T: ArrowPrimitiveType> Numbers<T> {
     }
 
     /// Adds several values at once, as those of a packed list of floats.
-    pub(super) fn extend(&mut self, values: impl ExactSizeIterator<Item = T::Native>) {
+    pub(super) fn append_values(&mut self, values: impl ExactSizeIterator<Item = T::Native>) {
         self.nulls.append_n_non_nulls(values.len());
         self.values.extend(values);
     }
@@ -150,7 +150,7 @@ impl<T: ArrowPrimitiveType> Numbers<T> {
     }
 
     fn finish(&mut self) -> PrimitiveArray<T> {
-        PrimitiveArray::new(ScalarBuffer::from(take(&mut self.values)), self.nulls.finish())
+        PrimitiveArray::new(ScalarBuffer::from(take_values(&mut self.values)), self.nulls.finish())
     }
 }
 
@@ -209,7 +209,7 @@ impl List {
     }
 
     fn finish_offsets(&mut self) -> OffsetBuffer<i32> {
-        let ends = take(&mut self.offsets);
+        let ends = take_values(&mut self.offsets);
         self.offsets.push(0);
         OffsetBuffer::new(ScalarBuffer::from(ends))
     }
@@ -295,9 +295,9 @@ pub(super) fn append_text(column: &mut BinaryBuilder, text: &[u8]) {
 
 /// Bytes that one value of a type takes, what is in its lists and texts aside: they are what a message of few bytes can
 /// make many of.
-pub(super) fn width(kind: &DataType) -> usize {
+pub(super) fn value_width(kind: &DataType) -> usize {
     match kind {
-        DataType::Struct(fields) => fields.iter().map(|f| width(f.data_type())).sum::<usize>() + 1,
+        DataType::Struct(fields) => fields.iter().map(|f| value_width(f.data_type())).sum::<usize>() + 1,
         other => other.primitive_width().unwrap_or(4),
     }
 }
@@ -309,7 +309,7 @@ fn finish_bytes(column: &mut BinaryBuilder) -> BinaryArray {
 }
 
 // As for bytes.
-fn take<T>(values: &mut Vec<T>) -> Vec<T> {
+fn take_values<T>(values: &mut Vec<T>) -> Vec<T> {
     let next = Vec::with_capacity(values.len());
     std::mem::replace(values, next)
 }

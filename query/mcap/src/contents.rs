@@ -47,9 +47,9 @@ pub struct Contents {
 ///
 /// # Errors
 /// If the file cannot be read.
-pub async fn contents(run: &VisibleRun, snapshot: &LakeSnapshot, files: &McapFiles) -> Result<Contents> {
-    let file = open(run, snapshot, files).await?;
-    let bytes = sizes(&file, files).await?;
+pub async fn read_contents(run: &VisibleRun, snapshot: &LakeSnapshot, files: &McapFiles) -> Result<Contents> {
+    let file = open_run(run, snapshot, files).await?;
+    let bytes = channel_sizes(&file, files).await?;
     let topic = |(id, channel): (&u16, &super::file::Channel)| Topic {
         topic: channel.topic.clone(),
         schema: channel.schema.name.clone(),
@@ -66,13 +66,13 @@ pub async fn contents(run: &VisibleRun, snapshot: &LakeSnapshot, files: &McapFil
 ///
 /// # Errors
 /// As [`contents`].
-pub async fn attachment(
+pub async fn read_attachment(
     run: &VisibleRun,
     snapshot: &LakeSnapshot,
     ending: &str,
     files: &McapFiles,
 ) -> Result<Option<Bytes>> {
-    let file = open(run, snapshot, files).await?;
+    let file = open_run(run, snapshot, files).await?;
     let Some(found) = file.attachments.iter().find(|a| a.name.ends_with(ending)) else { return Ok(None) };
     let range = found.range.clone();
     if range.end - range.start > LARGEST_CHUNK {
@@ -90,13 +90,13 @@ pub async fn attachment(
     }
 }
 
-async fn open(run: &VisibleRun, snapshot: &LakeSnapshot, files: &McapFiles) -> Result<Arc<McapFile>, Fault> {
+async fn open_run(run: &VisibleRun, snapshot: &LakeSnapshot, files: &McapFiles) -> Result<Arc<McapFile>, Fault> {
     let path = Lake::run_path(&run.surface, &run.run);
-    files.open(&path, files.known_sizes(snapshot).await.get(&path).copied()).await
+    files.open_file(&path, files.known_sizes(snapshot).await.get(&path).copied()).await
 }
 
 // Bytes by channel; None where the file does not tell.
-async fn sizes(file: &McapFile, files: &McapFiles) -> Result<Option<HashMap<u16, u64>>, Fault> {
+async fn channel_sizes(file: &McapFile, files: &McapFiles) -> Result<Option<HashMap<u16, u64>>, Fault> {
     let told = file.walked.is_none() && file.pieces.iter().all(|p| p.index > 0);
     if !told || file.pieces.iter().map(|p| p.index).sum::<u64>() > MOST_INDEXES {
         return Ok(None);

@@ -38,7 +38,7 @@ impl Fault {
     }
 
     /// Makes the error of a call.
-    pub(super) fn call(what: impl Into<String>, hint: impl Into<String>) -> Self {
+    pub(super) fn invalid_call(what: impl Into<String>, hint: impl Into<String>) -> Self {
         Self::Call { what: what.into(), hint: hint.into() }
     }
 }

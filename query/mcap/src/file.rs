@@ -13,7 +13,7 @@ use echolake_lake::{Lake, LakeSnapshot};
 use echolake_lake_tables::SmallTables;
 use echolake_recording::{
     ChannelDefinitions, DefinitionDigests, FRAME_BYTES, MAGIC, Record, RecordFrame, RecordSplitter, RunSummary,
-    SplitRecord, describe, find_part, opcode, parse_record, summary_range, tail_range,
+    SplitRecord, describe_mcap_error, find_part, opcode, parse_record, summary_range, tail_range,
 };
 use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt as _};
@@ -91,7 +91,7 @@ struct SummaryWeighter;
 
 impl Weighter<FileVersion, Arc<McapFile>> for SummaryWeighter {
     fn weight(&self, _: &FileVersion, file: &Arc<McapFile>) -> u64 {
-        file.memory() as u64
+        file.memory_bytes() as u64
     }
 }
 
@@ -106,13 +106,13 @@ impl McapFiles {
     /// Returns the sizes of the runs' files, if files need not be asked for them.
     pub(super) async fn known_sizes(&self, snapshot: &LakeSnapshot) -> HashMap<Path, u64> {
         match &self.sizes {
-            Some(sizes) => sizes.read(snapshot).await,
+            Some(sizes) => sizes.read_sizes(snapshot).await,
             None => HashMap::new(),
         }
     }
 
     /// Opens a file of the lake's store, whose size may be known.
-    pub(super) async fn open(&self, path: &Path, known_bytes: Option<u64>) -> Result<Arc<McapFile>, Fault> {
+    pub(super) async fn open_file(&self, path: &Path, known_bytes: Option<u64>) -> Result<Arc<McapFile>, Fault> {
         let (bytes, modified) = match known_bytes {
             // A run's file never changes.
             Some(bytes) => (bytes, 0),
@@ -124,7 +124,7 @@ impl McapFiles {
         };
         let opening = Opening { files: self, path, bytes };
         let version = (path.clone(), bytes, modified);
-        self.cache.get_or_insert_async(&version, async { opening.file().await.map(Arc::new) }).await
+        self.cache.get_or_insert_async(&version, async { opening.read_file().await.map(Arc::new) }).await
     }
 
     /// Reads a range of a file.
@@ -139,7 +139,7 @@ impl McapFiles {
 }
 
 impl McapFile {
-    fn memory(&self) -> usize {
+    fn memory_bytes(&self) -> usize {
         let channels = self.channels.values().map(|c| c.topic.len() + c.schema.data.len() + 256).sum::<usize>();
         let pieces = self.pieces.iter().map(|p| 64 + 2 * p.channels.as_ref().map_or(0, |c| c.len())).sum::<usize>();
         channels + pieces
@@ -154,28 +154,28 @@ struct Opening<'a> {
 }
 
 impl Opening<'_> {
-    async fn file(&self) -> Result<McapFile, Fault> {
+    async fn read_file(&self) -> Result<McapFile, Fault> {
         match self.summary_file().await? {
             Ok(file) => Ok(file),
-            Err(reason) => self.walk(reason).await,
+            Err(reason) => self.walk_file(reason).await,
         }
     }
 
     // The text is the reason why the summary does not do.
     async fn summary_file(&self) -> Result<Result<McapFile, String>, Fault> {
-        let tail = self.read(tail_range(self.bytes)).await?;
+        let tail = self.read_range(tail_range(self.bytes)).await?;
         let Some(range) = summary_range(&tail, self.bytes) else { return Ok(Err("it has no summary".to_owned())) };
         let start = range.start;
         let from_end = self.bytes - start;
         let summary = match tail.len() as u64 >= from_end {
             true => tail.slice(tail.len() - from_end as usize..),
-            false => self.read(range).await?,
+            false => self.read_range(range).await?,
         };
         let summary = match RunSummary::parse(&summary) {
             Ok(summary) => summary,
-            Err(e) => return Ok(Err(format!("its summary is damaged: {}", describe(&e)))),
+            Err(e) => return Ok(Err(format!("its summary is damaged: {}", describe_mcap_error(&e)))),
         };
-        if let Some(what) = summary.unaccounted() {
+        if let Some(what) = summary.describe_unaccounted() {
             return Ok(Err(format!("its summary {what}")));
         }
         let Some(unlisted) = summary.unlisted_ranges(start) else {
@@ -195,12 +195,12 @@ impl Opening<'_> {
         let mut block = Bytes::new();
         while !range.is_empty() {
             if block.len() < FRAME_BYTES {
-                block = self.read(range.start..range.end.min(range.start + UNLISTED_BLOCK)).await?;
+                block = self.read_range(range.start..range.end.min(range.start + UNLISTED_BLOCK)).await?;
             }
             if block.len() < FRAME_BYTES {
                 return Ok(true);
             }
-            let RecordFrame { code, length } = RecordFrame::read(&block);
+            let RecordFrame { code, length } = RecordFrame::from_bytes(&block);
             let bytes = length.saturating_add(FRAME_BYTES as u64);
             if matches!(code, opcode::MESSAGE | opcode::CHUNK) || bytes > range.end - range.start {
                 return Ok(true);
@@ -213,11 +213,11 @@ impl Opening<'_> {
 
     // Whether it ends as a file does that was not cut off.
     async fn is_closed(&self) -> Result<bool, Fault> {
-        let end = self.read(self.bytes.saturating_sub(MAGIC.len() as u64)..self.bytes).await?;
+        let end = self.read_range(self.bytes.saturating_sub(MAGIC.len() as u64)..self.bytes).await?;
         Ok(end[..] == *MAGIC && self.bytes > MAGIC.len() as u64)
     }
 
-    async fn read(&self, range: Range<u64>) -> Result<Bytes, Fault> {
+    async fn read_range(&self, range: Range<u64>) -> Result<Bytes, Fault> {
         if range.is_empty() {
             return Ok(Bytes::new());
         }
@@ -260,14 +260,14 @@ impl Opening<'_> {
         Some(McapFile { path, bytes: self.bytes, walked: None, channels, digests, pieces, attachments })
     }
 
-    fn damaged(&self, offset: u64, what: impl Into<String>) -> Fault {
+    fn damaged_at(&self, offset: u64, what: impl Into<String>) -> Fault {
         Fault::damaged(self.path, offset, what)
     }
 
     // Whether the record at `offset`, which claims more bytes than there are, is what a file that was cut off ends in.
     async fn check_end(&self, offset: u64) -> Result<(), Fault> {
         if self.is_closed().await? {
-            return Err(self.damaged(offset, "a record claims more bytes than there are"));
+            return Err(self.damaged_at(offset, "a record claims more bytes than there are"));
         }
         self.check_nothing_follows(offset + 1).await
     }
@@ -275,12 +275,12 @@ impl Opening<'_> {
     // The walk ends here: what a second file behind this one holds, or a chunk behind damage, would be left out.
     async fn check_nothing_follows(&self, mut offset: u64) -> Result<(), Fault> {
         while offset + FRAME_BYTES as u64 <= self.bytes {
-            let bytes = self.read(offset..(offset + BLOCK).min(self.bytes)).await?;
+            let bytes = self.read_range(offset..(offset + BLOCK).min(self.bytes)).await?;
             match find_part(&bytes, self.bytes - offset) {
                 Ok(position) => {
                     let what = "another file, or a part of this one, begins here behind what is read; \
                                 hint: `echolake recover` keeps what is whole";
-                    return Err(self.damaged(offset + position as u64, what));
+                    return Err(self.damaged_at(offset + position as u64, what));
                 }
                 Err(searched) => offset += searched.max(1) as u64,
             }
@@ -290,10 +290,10 @@ impl Opening<'_> {
     }
 
     // Goes through all records up to the end of the data or of what there is of them.
-    async fn walk(&self, mut reason: String) -> Result<McapFile, Fault> {
-        let start = self.read(0..(MAGIC.len() as u64).min(self.bytes)).await?;
+    async fn walk_file(&self, mut reason: String) -> Result<McapFile, Fault> {
+        let start = self.read_range(0..(MAGIC.len() as u64).min(self.bytes)).await?;
         if start[..] != *MAGIC {
-            return Err(self.damaged(0, "it does not begin as an MCAP file does"));
+            return Err(self.damaged_at(0, "it does not begin as an MCAP file does"));
         }
         let mut splitter = RecordSplitter::new(MAGIC.len() as u64);
         let mut walk = Walk::default();
@@ -309,22 +309,22 @@ impl Opening<'_> {
                 reason = format!("it is cut off at byte {offset} of {}", self.bytes);
                 break;
             }
-            match splitter.next_record().map_err(|what| self.damaged(offset, what))? {
+            match splitter.next_record().map_err(|what| self.damaged_at(offset, what))? {
                 Ok(SplitRecord { code: opcode::DATA_END | opcode::FOOTER, .. }) => {
                     self.check_nothing_follows(splitter.offset()).await?;
                     break;
                 }
-                Ok(record) => walk.record(&record).map_err(|what| self.damaged(offset, what))?,
+                Ok(record) => walk.add_record(&record).map_err(|what| self.damaged_at(offset, what))?,
                 Err(missing) => {
-                    let block = self.read(read..(read + BLOCK.max(missing)).min(self.bytes)).await?;
+                    let block = self.read_range(read..(read + BLOCK.max(missing)).min(self.bytes)).await?;
                     read += block.len() as u64;
-                    splitter.push(&block);
+                    splitter.push_bytes(&block);
                     tokio::task::yield_now().await;
                 }
             }
         }
         let attachments = std::mem::take(&mut walk.attachments);
-        let (channels, pieces) = walk.finish().map_err(|(offset, what)| self.damaged(offset, what))?;
+        let (channels, pieces) = walk.finish().map_err(|(offset, what)| self.damaged_at(offset, what))?;
         let (path, walked, digests) = (self.path.clone(), Some(reason), DefinitionDigests::default());
         Ok(McapFile { path, bytes: self.bytes, walked, channels, digests, pieces, attachments })
     }
@@ -349,7 +349,7 @@ fn with_raw_schemas(channels: &BTreeMap<u16, Arc<echolake_recording::Channel<'st
 type WalkedParts = (BTreeMap<u16, Channel>, Vec<Piece>);
 
 /// The damage of a message whose channel nothing describes.
-pub(super) fn undescribed(channel: u16) -> String {
+pub(super) fn undescribed_channel(channel: u16) -> String {
     format!("it has a message of channel {channel}, which no record describes")
 }
 
@@ -366,16 +366,16 @@ struct Walk {
 }
 
 impl Walk {
-    fn record(&mut self, record: &SplitRecord) -> Result<(), String> {
-        let range = record.offset..record.end();
+    fn add_record(&mut self, record: &SplitRecord) -> Result<(), String> {
+        let range = record.offset..record.end_offset();
         match record.code {
-            opcode::CHUNK => self.chunk(range, record.body.clone()),
+            opcode::CHUNK => self.add_chunk(range, record.body.clone()),
             opcode::MESSAGE | opcode::SCHEMA | opcode::CHANNEL => {
-                let parsed = parse_record(record.code, &record.body).map_err(|e| describe(&e))?;
+                let parsed = parse_record(record.code, &record.body).map_err(|e| describe_mcap_error(&e))?;
                 let mut seen = Seen::default();
-                self.see(&parsed, &mut seen)?;
+                self.see_record(&parsed, &mut seen)?;
                 if record.code == opcode::MESSAGE {
-                    self.message(range, seen);
+                    self.add_message(range, seen);
                 }
                 Ok(())
             }
@@ -395,21 +395,21 @@ impl Walk {
         }
     }
 
-    fn chunk(&mut self, range: Range<u64>, body: Bytes) -> Result<(), String> {
+    fn add_chunk(&mut self, range: Range<u64>, body: Bytes) -> Result<(), String> {
         self.open = false;
         let mut seen = Seen::default();
         let mut records = PieceRecords::from_chunk(body)?;
         while let Some(record) = records.next_record()? {
-            self.see(&record, &mut seen)?;
+            self.see_record(&record, &mut seen)?;
         }
         if let Some(times) = seen.times {
-            self.pieces.push(seen.piece(PieceKind::Chunk, range, times));
+            self.pieces.push(seen.into_piece(PieceKind::Chunk, range, times));
         }
         Ok(())
     }
 
     // Messages in no chunk are read together.
-    fn message(&mut self, range: Range<u64>, seen: Seen) {
+    fn add_message(&mut self, range: Range<u64>, seen: Seen) {
         let Some(times) = seen.times else { return };
         if let Some(piece) = self.pieces.last_mut().filter(|p| self.open && range.end - p.range.start <= PIECE) {
             piece.range.end = range.end;
@@ -418,13 +418,13 @@ impl Walk {
             let channels: BTreeSet<u16> = channels.collect();
             piece.channels = Some(channels.into_iter().collect());
         } else {
-            self.pieces.push(seen.piece(PieceKind::Loose, range, times));
+            self.pieces.push(seen.into_piece(PieceKind::Loose, range, times));
             self.open = true;
         }
     }
 
-    fn see(&mut self, record: &Record<'_>, seen: &mut Seen) -> Result<(), String> {
-        self.definitions.learn(record)?;
+    fn see_record(&mut self, record: &Record<'_>, seen: &mut Seen) -> Result<(), String> {
+        self.definitions.learn_definition(record)?;
         if let Record::Message { header, .. } = record {
             let now = (header.log_time, header.log_time);
             let widen = |times: (u64, u64)| (times.0.min(now.0), times.1.max(now.1));
@@ -440,8 +440,8 @@ impl Walk {
     fn finish(self) -> Result<WalkedParts, (u64, String)> {
         let mut channels = with_raw_schemas(&self.definitions.into_channels());
         if let Some(unknown) = self.seen.keys().find(|id| !channels.contains_key(id)) {
-            let piece = self.pieces.iter().find(|piece| piece.has(*unknown));
-            return Err((piece.map_or(0, |piece| piece.range.start), undescribed(*unknown)));
+            let piece = self.pieces.iter().find(|piece| piece.has_channel(*unknown));
+            return Err((piece.map_or(0, |piece| piece.range.start), undescribed_channel(*unknown)));
         }
         for (id, channel) in &mut channels {
             let seen = self.seen.get(id);
@@ -460,7 +460,7 @@ struct Seen {
 }
 
 impl Seen {
-    fn piece(self, kind: PieceKind, range: Range<u64>, times: (u64, u64)) -> Piece {
+    fn into_piece(self, kind: PieceKind, range: Range<u64>, times: (u64, u64)) -> Piece {
         Piece { kind, range, times, channels: Some(self.channels.into_iter().collect()), index: 0, plain: 0 }
     }
 }

@@ -36,7 +36,7 @@ use datafusion::sql::sqlparser::ast::{
 use echolake_lake::LakeSnapshot;
 use echolake_schema::tables::Table;
 
-pub use contents::{Contents, Topic, attachment, contents};
+pub use contents::{Contents, Topic, read_attachment, read_contents};
 use error::Fault;
 pub use file::{Attachment, McapFiles};
 #[cfg(fuzzing)]
@@ -84,7 +84,7 @@ pub async fn register(
 ) -> PlanResult<()> {
     let mut tables: HashMap<Function, HashMap<Vec<String>, Arc<dyn TableProvider>>> = HashMap::new();
     for (function, arguments) in calls.0 {
-        snapshot.check(Table::Runs).map_err(|fault| DataFusionError::External(fault.into()))?;
+        snapshot.check_table(Table::Runs).map_err(|fault| DataFusionError::External(fault.into()))?;
         let of = tables.entry(function).or_default();
         if let Entry::Vacant(place) = of.entry(arguments) {
             let table = table(function, place.key(), snapshot, files).await?;
@@ -104,14 +104,14 @@ async fn table(
     snapshot: &LakeSnapshot,
     files: &Arc<McapFiles>,
 ) -> Result<Arc<dyn TableProvider>, Fault> {
-    let usage = || Fault::call(format!("{} is called with {} texts", function.name(), arguments.len()), USAGE);
+    let usage = || Fault::invalid_call(format!("{} is called with {} texts", function.name(), arguments.len()), USAGE);
     let pattern = arguments.first().ok_or_else(usage)?;
-    let open = || Target::open(pattern, snapshot, files);
+    let open = || Target::open_all(pattern, snapshot, files);
     Ok(match (function, arguments) {
-        (Function::Columns, [_, topic]) => Arc::new(table::columns(open().await?, topic, files)?),
-        (Function::Messages, [_]) => Arc::new(table::messages(open().await?, None, files)?),
-        (Function::Messages, [_, topic]) => Arc::new(table::messages(open().await?, Some(topic), files)?),
-        (Function::Topics, [_]) => topics::table(open().await?, files).await?,
+        (Function::Columns, [_, topic]) => Arc::new(table::decoded_table(open().await?, topic, files)?),
+        (Function::Messages, [_]) => Arc::new(table::message_table(open().await?, None, files)?),
+        (Function::Messages, [_, topic]) => Arc::new(table::message_table(open().await?, Some(topic), files)?),
+        (Function::Topics, [_]) => topics::channel_table(open().await?, files).await?,
         _ => return Err(usage()),
     })
 }

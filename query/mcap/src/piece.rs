@@ -31,7 +31,7 @@ pub(super) struct Piece {
 
 impl Piece {
     /// Returns true if it may have messages of a channel.
-    pub(super) fn has(&self, channel: u16) -> bool {
+    pub(super) fn has_channel(&self, channel: u16) -> bool {
         self.channels.as_ref().is_none_or(|channels| channels.contains(&channel))
     }
 }

@@ -46,7 +46,7 @@ impl Head {
         Self::Data,
     ];
 
-    pub(super) fn field(self) -> Field {
+    pub(super) fn column_field(self) -> Field {
         match self {
             Self::Surface => Field::new("surface_id", DataType::Utf8, true),
             Self::Run => Field::new("run_id", DataType::Utf8, true),
@@ -115,7 +115,7 @@ impl Rows {
             match heads.get(*place) {
                 Some(head) => {
                     output.push(Output::Head(wanted.len()));
-                    wanted.push((*head, Column::new(head.field().data_type())));
+                    wanted.push((*head, Column::new(head.column_field().data_type())));
                 }
                 None => output.push(Output::Own(place - heads.len())),
             }
@@ -134,7 +134,7 @@ impl Rows {
     }
 
     /// Adds a message; true once a batch is ready.
-    pub(super) fn push(
+    pub(super) fn push_message(
         &mut self,
         message: &Message<'_>,
         mapping: Option<(usize, &Mapping)>,
@@ -142,23 +142,23 @@ impl Rows {
         if let Some((id, mapping)) = mapping
             && self.current.as_ref().is_none_or(|current| current.mapping != id)
         {
-            self.finish()?;
-            self.current = Some(self.decoder(id, mapping));
+            self.finish_batch()?;
+            self.current = Some(self.create_current(id, mapping));
         }
         let mut bytes = 0;
         if let Some(current) = &mut self.current {
-            if let Err(e) = current.decoder.push(message.data) {
+            if let Err(e) = current.decoder.push_message(message.data) {
                 return Ok(Err(e));
             }
-            bytes = current.decoder.bytes();
+            bytes = current.decoder.buffered_bytes();
             self.unfit += current.decoder.take_unfit();
         }
         for (head, column) in &mut self.heads {
-            self.bytes += head.push(message, column);
+            self.bytes += head.push_value(message, column);
         }
         self.count += 1;
         if self.count >= self.most || self.bytes + bytes >= BATCH_BYTES {
-            self.finish()?;
+            self.finish_batch()?;
         }
         Ok(Ok(!self.ready.is_empty()))
     }
@@ -169,12 +169,12 @@ impl Rows {
     }
 
     /// A batch that is ready.
-    pub(super) fn take(&mut self) -> Option<RecordBatch> {
+    pub(super) fn take_batch(&mut self) -> Option<RecordBatch> {
         self.ready.pop_front()
     }
 
     /// Makes a batch of the rows so far.
-    pub(super) fn finish(&mut self) -> Result<(), ArrowError> {
+    pub(super) fn finish_batch(&mut self) -> Result<(), ArrowError> {
         let count = std::mem::take(&mut self.count);
         self.bytes = 0;
         if count == 0 {
@@ -185,7 +185,7 @@ impl Rows {
             Some(current) => current.decoder.finish()?,
             None => Vec::new(),
         };
-        let arrays = self.arrays(&heads, own, count);
+        let arrays = self.output_arrays(&heads, own, count);
         let options = RecordBatchOptions::new().with_row_count(Some(count));
         self.ready.push_back(RecordBatch::try_new_with_options(self.schema.clone(), arrays, &options)?);
         Ok(())
@@ -194,7 +194,7 @@ impl Rows {
 
 impl Head {
     // The bytes that the value takes.
-    fn push(self, message: &Message<'_>, column: &mut Column) -> usize {
+    fn push_value(self, message: &Message<'_>, column: &mut Column) -> usize {
         // A time that 64 bits with a sign do not hold, from the year 2262 on, is null.
         let nanos = |time: u64| i64::try_from(time).ok();
         match (self, column) {
@@ -222,7 +222,7 @@ impl Head {
 
 impl Rows {
     // Of the layout's columns those that are asked for.
-    fn decoder(&self, id: usize, mapping: &Mapping) -> Current {
+    fn create_current(&self, id: usize, mapping: &Mapping) -> Current {
         let place = |output: &Output| match output {
             Output::Own(i) => mapping.columns.get(*i).copied().flatten(),
             Output::Head(_) => None,
@@ -230,10 +230,10 @@ impl Rows {
         let places: Vec<_> = self.output.iter().map(place).collect();
         let wanted: Vec<_> = places.iter().copied().flatten().collect();
         let has = places.iter().map(Option::is_some).collect();
-        Current { mapping: id, decoder: mapping.layout.decoder(&wanted), has }
+        Current { mapping: id, decoder: mapping.layout.create_decoder(&wanted), has }
     }
 
-    fn arrays(&self, heads: &[ArrayRef], own: Vec<ArrayRef>, count: usize) -> Vec<ArrayRef> {
+    fn output_arrays(&self, heads: &[ArrayRef], own: Vec<ArrayRef>, count: usize) -> Vec<ArrayRef> {
         let mut own = own.into_iter();
         let has = |i: usize| self.current.as_ref().is_some_and(|current| current.has[i]);
         let one = |(i, (output, field)): (usize, (&Output, &Arc<Field>))| match output {

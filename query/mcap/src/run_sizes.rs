@@ -24,17 +24,17 @@ impl RunSizes {
     }
 
     /// Returns the sizes that are known. A file that is missing here is asked for its size.
-    pub(super) async fn read(&self, snapshot: &LakeSnapshot) -> HashMap<Path, u64> {
+    pub(super) async fn read_sizes(&self, snapshot: &LakeSnapshot) -> HashMap<Path, u64> {
         let files: Vec<_> = snapshot.files(Table::Runs).iter().collect();
         if SmallTables::cached_columns(Table::Runs, &self.schema, files.iter().copied()).is_none() {
             return HashMap::new();
         }
-        let rows = self.small.rows(Table::Runs, &self.schema, &files).await;
-        rows.ok().and_then(|rows| sizes(&rows)).unwrap_or_default()
+        let rows = self.small.read_rows(Table::Runs, &self.schema, &files).await;
+        rows.ok().and_then(|rows| sizes_by_path(&rows)).unwrap_or_default()
     }
 }
 
-fn sizes(rows: &RecordBatch) -> Option<HashMap<Path, u64>> {
+fn sizes_by_path(rows: &RecordBatch) -> Option<HashMap<Path, u64>> {
     let files = rows.column_by_name("file")?.as_string_opt::<i32>()?;
     let bytes = rows.column_by_name("file_bytes")?.as_primitive_opt::<Int64Type>()?;
     let known = files.iter().zip(bytes).filter_map(|(file, bytes)| {

@@ -25,7 +25,7 @@ use futures::stream::{self, BoxStream};
 use futures::{StreamExt as _, TryStreamExt as _};
 
 use super::error::Fault;
-use super::file::{McapFile, McapFiles, undescribed};
+use super::file::{McapFile, McapFiles, undescribed_channel};
 use super::piece::{Piece, PieceRecords};
 use super::rows::{Head, Mapping, Message, Rows};
 
@@ -59,12 +59,15 @@ pub(super) struct Source {
 
 impl Source {
     /// Returns the pieces that may have messages of the channels in the time.
-    pub(super) fn pieces<'a>(&'a self, times: Option<&'a RangeInclusive<i64>>) -> impl Iterator<Item = &'a Piece> {
+    pub(super) fn pieces_within<'a>(
+        &'a self,
+        times: Option<&'a RangeInclusive<i64>>,
+    ) -> impl Iterator<Item = &'a Piece> {
         let nanos = |time: u64| i64::try_from(time).unwrap_or(i64::MAX);
         let within = move |p: &&Piece| {
             times.is_none_or(|times| nanos(p.times.1) >= *times.start() && nanos(p.times.0) <= *times.end())
         };
-        let meant = |p: &&Piece| self.channels.keys().any(|channel| p.has(*channel));
+        let meant = |p: &&Piece| self.channels.keys().any(|channel| p.has_channel(*channel));
         self.file.pieces.iter().filter(within).filter(meant)
     }
 }
@@ -116,7 +119,7 @@ impl McapExec {
             }
             taken += piece.range.end - piece.range.start;
             if let Some(reads) = partitions.last_mut() {
-                add(reads, source, piece);
+                add_piece(reads, source, piece);
             }
         }
         let properties = PlanProperties::new(
@@ -133,7 +136,7 @@ impl McapExec {
 }
 
 // To the last read, where the piece is near enough, or as another one.
-fn add(reads: &mut Vec<FileRead>, source: usize, piece: Piece) {
+fn add_piece(reads: &mut Vec<FileRead>, source: usize, piece: Piece) {
     let near = |r: &&mut FileRead| {
         let gap = piece.range.start.checked_sub(r.range.end);
         r.source == source && gap.is_some_and(|gap| gap <= GAP) && piece.range.end - r.range.start <= READ
@@ -205,7 +208,7 @@ impl ExecutionPlan for McapExec {
         let most = context.session_config().batch_size();
         let scanner = Scanner {
             scan: scan.clone(),
-            reads: fetch(scan.parts.clone(), reads, count("bytes_read")),
+            reads: fetch_reads(scan.parts.clone(), reads, count("bytes_read")),
             fetched: None,
             current: None,
             rows: Rows::new(scan.schema.clone(), &scan.parts.heads, &scan.projection, most),
@@ -216,14 +219,14 @@ impl ExecutionPlan for McapExec {
             baseline: BaselineMetrics::new(&self.metrics, partition),
         };
         let batches = stream::try_unfold(scanner, |mut scanner| async move {
-            Ok(scanner.next().await?.map(|batch| (batch, scanner)))
+            Ok(scanner.next_batch().await?.map(|batch| (batch, scanner)))
         });
         Ok(make_cooperative(Box::pin(RecordBatchStreamAdapter::new(scan.schema.clone(), batches))))
     }
 }
 
 // The next ones are on their way while one is decoded.
-fn fetch(
+fn fetch_reads(
     parts: Arc<Parts>,
     reads: Vec<FileRead>,
     bytes_read: Count,
@@ -271,28 +274,28 @@ struct Current {
 }
 
 impl Scanner {
-    async fn next(&mut self) -> Result<Option<RecordBatch>> {
+    async fn next_batch(&mut self) -> Result<Option<RecordBatch>> {
         loop {
-            if let Some(batch) = self.rows.take() {
+            if let Some(batch) = self.rows.take_batch() {
                 self.baseline.record_output(batch.num_rows());
                 return Ok(Some(batch));
             }
-            if self.left == 0 || !self.open().await? {
-                self.rows.finish()?;
+            if self.left == 0 || !self.open_piece().await? {
+                self.rows.finish_batch()?;
                 self.left = 0;
-                let Some(batch) = self.rows.take() else { return Ok(None) };
+                let Some(batch) = self.rows.take_batch() else { return Ok(None) };
                 self.baseline.record_output(batch.num_rows());
                 return Ok(Some(batch));
             }
             let elapsed = self.baseline.elapsed_compute().clone();
             let _timer = elapsed.timer();
-            self.decode()?;
+            self.decode_piece()?;
             self.unfit.add(self.rows.take_unfit());
         }
     }
 
     // Whether there is a piece at hand, or another one.
-    async fn open(&mut self) -> Result<bool> {
+    async fn open_piece(&mut self) -> Result<bool> {
         while self.current.is_none() {
             let Some(fetched) = &mut self.fetched else {
                 match self.reads.try_next().await? {
@@ -323,21 +326,21 @@ impl Scanner {
     }
 
     // Continues with the piece at hand until a batch is ready.
-    fn decode(&mut self) -> Result<()> {
+    fn decode_piece(&mut self) -> Result<()> {
         let Some(Current { source, offset, records }) = &mut self.current else { return Ok(()) };
         let parts = &self.scan.parts;
         let source = &parts.sources[*source];
         let path = &source.file.path;
         while let Some(record) = records.next_record().map_err(|what| Fault::damaged(path, *offset, what))? {
             let Record::Message { header, data } = &record else {
-                source.file.digests.check(&record).map_err(|what| Fault::damaged(path, *offset, what))?;
+                source.file.digests.check_definition(&record).map_err(|what| Fault::damaged(path, *offset, what))?;
                 continue;
             };
             let Some((topic, mapping)) = source.channels.get(&header.channel_id) else {
                 if source.file.channels.contains_key(&header.channel_id) {
                     continue;
                 }
-                return Err(Fault::damaged(path, *offset, undescribed(header.channel_id)).into());
+                return Err(Fault::damaged(path, *offset, undescribed_channel(header.channel_id)).into());
             };
             if let Some(times) = &self.scan.times
                 && !i64::try_from(header.log_time).is_ok_and(|nanos| times.contains(&nanos))
@@ -346,7 +349,7 @@ impl Scanner {
             }
             let message = Message { run: source.run.as_ref(), topic, header, data };
             let mapping = parts.mappings.as_ref().map(|all| (*mapping, &all[*mapping]));
-            let is_ready = self.rows.push(&message, mapping)?.map_err(|what| Fault::Message {
+            let is_ready = self.rows.push_message(&message, mapping)?.map_err(|what| Fault::Message {
                 file: path.to_string(),
                 topic: topic.clone(),
                 sequence: header.sequence,

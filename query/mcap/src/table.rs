@@ -39,7 +39,7 @@ pub(super) struct McapTable {
 }
 
 /// The table of a topic's messages, a column a field.
-pub(super) fn columns(targets: Vec<Target>, topic: &str, files: &Arc<McapFiles>) -> Result<McapTable, Fault> {
+pub(super) fn decoded_table(targets: Vec<Target>, topic: &str, files: &Arc<McapFiles>) -> Result<McapTable, Fault> {
     let channels_of = |target: &Target| -> Vec<(u16, Channel)> {
         let meant = target.file.channels.iter().filter(|(_, channel)| channel.topic == topic);
         meant.map(|(id, channel)| (*id, channel.clone())).collect()
@@ -56,14 +56,14 @@ pub(super) fn columns(targets: Vec<Target>, topic: &str, files: &Arc<McapFiles>)
     };
     let sources = targets.iter().map(source).collect();
     let heads = Head::OF_COLUMNS.to_vec();
-    let (schema, mappings) = layouts.table(&heads, topic)?;
+    let (schema, mappings) = layouts.into_schema(&heads, topic)?;
     let name = format!("topic={topic}");
     let parts = Parts { name, files: files.clone(), heads, sources, mappings: Some(mappings) };
     Ok(McapTable { schema, parts: Arc::new(parts) })
 }
 
 /// The table of messages as they are, of one topic or of all.
-pub(super) fn messages(targets: Vec<Target>, topic: Option<&str>, files: &Arc<McapFiles>) -> Result<McapTable, Fault> {
+pub(super) fn message_table(targets: Vec<Target>, topic: Option<&str>, files: &Arc<McapFiles>) -> Result<McapTable, Fault> {
     let known = |t: &Target| t.file.channels.values().any(|c| topic.is_none_or(|topic| c.topic == topic));
     if let Some(topic) = topic.filter(|_| !targets.iter().any(known)) {
         return Err(no_topic(&targets, topic));
@@ -74,7 +74,7 @@ pub(super) fn messages(targets: Vec<Target>, topic: Option<&str>, files: &Arc<Mc
         Source { run: target.run, file: target.file, channels }
     };
     let heads = Head::OF_MESSAGES.to_vec();
-    let schema = Arc::new(Schema::new(heads.iter().map(|h| h.field()).collect::<Vec<_>>()));
+    let schema = Arc::new(Schema::new(heads.iter().map(|h| h.column_field()).collect::<Vec<_>>()));
     let name = topic.map_or_else(|| "all topics".to_owned(), |topic| format!("topic={topic}"));
     let sources = targets.into_iter().map(source).collect();
     let parts = Parts { name, files: files.clone(), heads, sources, mappings: None };
@@ -89,7 +89,7 @@ fn no_topic(targets: &[Target], topic: &str) -> Fault {
         true => "there are no topics in it".to_owned(),
         false => format!("the topics are {}{more}", listed.join(", ")),
     };
-    Fault::call(format!("no topic `{topic}`"), hint)
+    Fault::invalid_call(format!("no topic `{topic}`"), hint)
 }
 
 /// The different schemas that a topic has in the files, and the first file of each.
@@ -122,7 +122,7 @@ impl Layouts {
                     empty.push((target, channel.schema));
                 } else if !layouts.known.contains_key(&channel.schema) {
                     match layout_of(&target.file, topic, &channel.schema) {
-                        Ok(layout) => layouts.add(&target.file, &channel.schema, layout),
+                        Ok(layout) => layouts.add_layout(&target.file, &channel.schema, layout),
                         Err(refusal) => refusals.push((target, channel.schema, refusal)),
                     }
                 }
@@ -134,7 +134,7 @@ impl Layouts {
                 continue;
             }
             match layout_of(&target.file, topic, &schema) {
-                Ok(layout) if layouts.fits(&layout) => layouts.add(&target.file, &schema, layout),
+                Ok(layout) if layouts.fits_others(&layout) => layouts.add_layout(&target.file, &schema, layout),
                 Ok(_) => {}
                 Err(refusal) => refusal_of_empty = refusal_of_empty.or(Some(refusal)),
             }
@@ -143,7 +143,7 @@ impl Layouts {
             if layouts.all.is_empty() || is_supported(&schema) {
                 return Err(refusal);
             }
-            layouts.add(&target.file, &schema, MessageLayout::without_columns());
+            layouts.add_layout(&target.file, &schema, MessageLayout::without_columns());
         }
         match refusal_of_empty {
             Some(refusal) if layouts.all.is_empty() => Err(refusal),
@@ -151,13 +151,13 @@ impl Layouts {
         }
     }
 
-    fn add(&mut self, file: &McapFile, schema: &Arc<RawSchema>, layout: MessageLayout) {
+    fn add_layout(&mut self, file: &McapFile, schema: &Arc<RawSchema>, layout: MessageLayout) {
         self.known.insert(schema.clone(), self.all.len());
         self.all.push(SchemaLayout { file: file.path.to_string(), layout: Arc::new(layout) });
     }
 
     // Whether no column has another type than one of its name in the others.
-    fn fits(&self, layout: &MessageLayout) -> bool {
+    fn fits_others(&self, layout: &MessageLayout) -> bool {
         let clashes = |field: &Arc<Field>| {
             let mut others = self.all.iter().filter_map(|other| other.layout.fields.find(field.name()));
             others.any(|(_, other)| other != field)
@@ -166,8 +166,8 @@ impl Layouts {
     }
 
     // The columns of all schemas: those of one name are one column, which a schema may lack.
-    fn table(self, heads: &[Head], topic: &str) -> Result<(SchemaRef, Vec<Mapping>), Fault> {
-        let mut fields: Vec<Field> = heads.iter().map(|h| h.field()).collect();
+    fn into_schema(self, heads: &[Head], topic: &str) -> Result<(SchemaRef, Vec<Mapping>), Fault> {
+        let mut fields: Vec<Field> = heads.iter().map(|h| h.column_field()).collect();
         let taken: BTreeSet<String> = fields.iter().map(|f| f.name().clone()).collect();
         let own_names: BTreeSet<String> =
             self.all.iter().flat_map(|one| one.layout.fields.iter().map(|f| f.name().clone())).collect();
@@ -236,25 +236,26 @@ impl TableProvider for McapTable {
     }
 
     boxed_scan!(self, state, projection, filters, limit => {
-        ready(self.messages(state, projection, filters, limit)).boxed()
+        ready(self.scan_messages(state, projection, filters, limit)).boxed()
     });
 }
 
 impl McapTable {
-    fn messages(
+    fn scan_messages(
         &self,
         state: &dyn Session,
         projection: Option<&Vec<usize>>,
         filters: &[Expr],
         limit: Option<usize>,
     ) -> Result<Arc<dyn ExecutionPlan>> {
-        let times = filters.iter().filter_map(times_of).reduce(both);
-        let shown = self.runs(filters.iter().filter(|f| is_of_runs(f)), state)?;
+        let times = filters.iter().filter_map(times_of).reduce(intersect_ranges);
+        let shown = self.shown_sources(filters.iter().filter(|f| is_of_runs(f)), state)?;
         let sources = &self.parts.sources;
         let all = sources.iter().map(|source| source.file.pieces.len()).sum();
         let pieces = sources.iter().enumerate().filter(|(i, _)| shown[*i]);
-        let pieces =
-            pieces.flat_map(|(i, source)| source.pieces(times.as_ref()).map(move |piece| (i, piece.clone()))).collect();
+        let pieces = pieces
+            .flat_map(|(i, source)| source.pieces_within(times.as_ref()).map(move |piece| (i, piece.clone())))
+            .collect();
         let projection = projection.cloned().unwrap_or_else(|| (0..self.schema.fields().len()).collect());
         let schema = Arc::new(self.schema.project(&projection)?);
         let scan = Scan { parts: self.parts.clone(), schema, projection, times, limit };
@@ -262,8 +263,8 @@ impl McapTable {
     }
 
     // Which files pass the filters of surface and run.
-    fn runs<'a>(&self, filters: impl Iterator<Item = &'a Expr>, state: &dyn Session) -> Result<Vec<bool>> {
-        let schema = Arc::new(Schema::new(vec![Head::Surface.field(), Head::Run.field()]));
+    fn shown_sources<'a>(&self, filters: impl Iterator<Item = &'a Expr>, state: &dyn Session) -> Result<Vec<bool>> {
+        let schema = Arc::new(Schema::new(vec![Head::Surface.column_field(), Head::Run.column_field()]));
         let of = |s: &Source| s.run.clone().unzip();
         let (surfaces, runs): (Vec<_>, Vec<_>) = self.parts.sources.iter().map(of).unzip();
         let columns: [StringArray; 2] = [surfaces.into_iter().collect(), runs.into_iter().collect()];
@@ -304,10 +305,12 @@ fn is_of_runs(filter: &Expr) -> bool {
 fn times_of(filter: &Expr) -> Option<RangeInclusive<i64>> {
     match filter {
         Expr::BinaryExpr(BinaryExpr { left, op: Operator::And, right }) => {
-            Some(both(times_of(left)?, times_of(right)?))
+            Some(intersect_ranges(times_of(left)?, times_of(right)?))
         }
-        Expr::BinaryExpr(BinaryExpr { left, op, right }) if is_time(left) => compared(*op, nanos_of(right)?),
-        Expr::BinaryExpr(BinaryExpr { left, op, right }) if is_time(right) => compared(op.swap()?, nanos_of(left)?),
+        Expr::BinaryExpr(BinaryExpr { left, op, right }) if is_time(left) => comparison_range(*op, nanos_of(right)?),
+        Expr::BinaryExpr(BinaryExpr { left, op, right }) if is_time(right) => {
+            comparison_range(op.swap()?, nanos_of(left)?)
+        }
         Expr::Between(between) if !between.negated && is_time(&between.expr) => {
             Some(nanos_of(&between.low)?..=nanos_of(&between.high)?)
         }
@@ -316,11 +319,11 @@ fn times_of(filter: &Expr) -> Option<RangeInclusive<i64>> {
 }
 
 // The times that are in both ranges.
-fn both(one: RangeInclusive<i64>, other: RangeInclusive<i64>) -> RangeInclusive<i64> {
+fn intersect_ranges(one: RangeInclusive<i64>, other: RangeInclusive<i64>) -> RangeInclusive<i64> {
     *one.start().max(other.start())..=*one.end().min(other.end())
 }
 
-fn compared(op: Operator, nanos: i64) -> Option<RangeInclusive<i64>> {
+fn comparison_range(op: Operator, nanos: i64) -> Option<RangeInclusive<i64>> {
     // An empty range: nothing is below the least number.
     const NONE: RangeInclusive<i64> = RangeInclusive::new(1, 0);
     Some(match op {

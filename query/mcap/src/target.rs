@@ -29,23 +29,26 @@ pub(super) struct Target {
 
 impl Target {
     /// Opens the files that `pattern` means, each once.
-    pub(super) async fn open(pattern: &str, snapshot: &LakeSnapshot, files: &McapFiles) -> Result<Vec<Self>, Fault> {
+    pub(super) async fn open_all(pattern: &str, snapshot: &LakeSnapshot, files: &McapFiles) -> Result<Vec<Self>, Fault> {
         let mut meant = BTreeMap::new();
         for part in pattern.split(',').map(str::trim) {
             if part.contains('/') || part.ends_with(EXTENSION) {
-                let path = path(part)?;
+                let path = parse_path(part)?;
                 let run = snapshot.runs().find(|r| Lake::run_path(&r.surface, &r.run) == path);
                 if run.is_none() && snapshot.is_restricted() {
-                    return Err(Fault::call(format!("`{part}` is the file of no run that you may see"), RUNS_ALONE));
+                    return Err(Fault::invalid_call(
+                        format!("`{part}` is the file of no run that you may see"),
+                        RUNS_ALONE,
+                    ));
                 }
-                meant.insert(path, run.map(names));
+                meant.insert(path, run.map(run_names));
             } else {
-                meant.extend(runs(part, snapshot)?);
+                meant.extend(matching_runs(part, snapshot)?);
             }
         }
         let sizes = &files.known_sizes(snapshot).await;
         let open = |(path, run)| async move {
-            let file = files.open(&path, sizes.get(&path).copied()).await?;
+            let file = files.open_file(&path, sizes.get(&path).copied()).await?;
             Ok(Self { run, file })
         };
         futures::stream::iter(meant).map(open).buffered(OPENED_AT_ONCE).try_collect().await
@@ -55,24 +58,29 @@ impl Target {
 /// A file, and the surface and run that it is; None of a foreign one.
 type Meant = (Path, Option<(String, String)>);
 
-fn names(run: &VisibleRun) -> (String, String) {
+fn run_names(run: &VisibleRun) -> (String, String) {
     (run.surface.to_string(), run.run.to_string())
 }
 
-fn runs(pattern: &str, snapshot: &LakeSnapshot) -> Result<Vec<Meant>, Fault> {
-    let meant = |r: &&VisibleRun| matches(pattern, r.surface.as_str()) || matches(pattern, r.run.as_str());
-    let found = snapshot.runs().filter(meant).map(|r| (Lake::run_path(&r.surface, &r.run), Some(names(r))));
+fn matching_runs(pattern: &str, snapshot: &LakeSnapshot) -> Result<Vec<Meant>, Fault> {
+    let meant =
+        |r: &&VisibleRun| matches_pattern(pattern, r.surface.as_str()) || matches_pattern(pattern, r.run.as_str());
+    let found = snapshot.runs().filter(meant).map(|r| (Lake::run_path(&r.surface, &r.run), Some(run_names(r))));
     let found: Vec<_> = found.collect();
     match found.is_empty() {
-        true => Err(Fault::call(format!("no surface and no run is called `{pattern}`"), format!("it may be {FORMS}"))),
+        true => Err(Fault::invalid_call(
+            format!("no surface and no run is called `{pattern}`"),
+            format!("it may be {FORMS}"),
+        )),
         false => Ok(found),
     }
 }
 
 // Only files that are named as recordings are, by the very place that they have in the lake's store.
-fn path(text: &str) -> Result<Path, Fault> {
-    let wrong =
-        |why: &str| Fault::call(format!("`{text}` is no file in the lake: {why}"), format!("it may be {FORMS}"));
+fn parse_path(text: &str) -> Result<Path, Fault> {
+    let wrong = |why: &str| {
+        Fault::invalid_call(format!("`{text}` is no file in the lake: {why}"), format!("it may be {FORMS}"))
+    };
     if text.contains(['*', '?']) {
         return Err(wrong("patterns are for surfaces and runs"));
     }
@@ -88,7 +96,7 @@ fn path(text: &str) -> Result<Path, Fault> {
 }
 
 /// Whether a text is of a pattern in which `*` stands for anything and `?` for one character.
-fn matches(pattern: &str, text: &str) -> bool {
+fn matches_pattern(pattern: &str, text: &str) -> bool {
     let (pattern, text): (Vec<_>, Vec<_>) = (pattern.chars().collect(), text.chars().collect());
     let (mut p, mut t) = (0, 0);
     // The last star, and where what it stands for ends: one character more each time the rest does not fit.
@@ -133,13 +141,13 @@ mod tests {
             ("*a*b", "xaxxbx", false),
             ("", "flat", false),
         ] {
-            assert_eq!(matches(pattern, text), expected, "{pattern} {text}");
+            assert_eq!(matches_pattern(pattern, text), expected, "{pattern} {text}");
         }
     }
 
     #[test]
     fn a_path_stays_in_the_lake() {
-        assert_eq!(path("inbox/a b.mcap").expect("a path").as_ref(), "inbox/a b.mcap");
+        assert_eq!(parse_path("inbox/a b.mcap").expect("a path").as_ref(), "inbox/a b.mcap");
         for outside in [
             "../x.mcap",
             "inbox/../../x.mcap",
@@ -156,7 +164,7 @@ mod tests {
             "inbox/x\0.mcap",
             "/",
         ] {
-            assert!(path(outside).is_err(), "{outside}");
+            assert!(parse_path(outside).is_err(), "{outside}");
         }
     }
 }

@@ -11,7 +11,7 @@ use datafusion::error::Result as QueryResult;
 use datafusion::prelude::SessionContext;
 use datafusion::sql::parser::Statement;
 use datafusion::sql::sqlparser::ast::VisitMut as _;
-use echolake_lake::{FileName, Lake, ReferenceSurfaces, VisibleRun, encode};
+use echolake_lake::{FileName, Lake, ReferenceSurfaces, VisibleRun, encode_batches};
 use echolake_lake_tables::SmallTables;
 use echolake_schema::Rig;
 use echolake_schema::tables::Table;
@@ -142,9 +142,9 @@ async fn put_run(lake: &TestLake, surface: &str, run: &str, file: Vec<u8>) {
         }
     };
     let batch = RecordBatch::try_new(schema.clone(), schema.fields().iter().map(column).collect()).expect("a row");
-    let file = encode(Table::Runs, &schema, &[batch]).expect("encoded");
-    let staged = lake.lake.stage(Table::Runs, &FileName::Pointer(pointer.clone()), file).await.expect("staged");
-    lake.lake.commit(&[staged]).await.expect("committed");
+    let file = encode_batches(Table::Runs, &schema, &[batch]).expect("encoded");
+    let staged = lake.lake.stage_file(Table::Runs, &FileName::Pointer(pointer.clone()), file).await.expect("staged");
+    lake.lake.commit_staged(&[staged]).await.expect("committed");
 }
 
 /// A channel of a file: its topic, encoding and schema, and its messages.

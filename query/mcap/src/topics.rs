@@ -28,16 +28,17 @@ const LARGEST_INDEX: u64 = 16 << 20;
 type Times = Option<(u64, u64)>;
 
 /// A row for each channel of each file.
-pub(super) async fn table(targets: Vec<Target>, files: &Arc<McapFiles>) -> Result<Arc<dyn TableProvider>, Fault> {
+pub(super) async fn channel_table(targets: Vec<Target>, files: &Arc<McapFiles>) -> Result<Arc<dyn TableProvider>, Fault> {
     let times = |target: Target| async move {
-        let times = times(&target.file, files).await?;
+        let times = channel_times(&target.file, files).await?;
         Ok::<_, Fault>((target, times))
     };
     let found: Vec<_> = futures::stream::iter(targets).map(times).buffered(AT_ONCE).try_collect().await?;
-    let rows: Vec<_> = found.iter().flat_map(|(target, times)| rows(target, times)).collect();
-    let batch = batch(&rows).map_err(|e| Fault::call(format!("the topics make no table: {e}"), "this is a bug"))?;
+    let rows: Vec<_> = found.iter().flat_map(|(target, times)| channel_rows(target, times)).collect();
+    let batch = channel_batch(&rows)
+        .map_err(|e| Fault::invalid_call(format!("the topics make no table: {e}"), "this is a bug"))?;
     let table = MemTable::try_new(batch.schema(), vec![vec![batch]]);
-    Ok(Arc::new(table.map_err(|e| Fault::call(e.strip_backtrace(), "this is a bug"))?))
+    Ok(Arc::new(table.map_err(|e| Fault::invalid_call(e.strip_backtrace(), "this is a bug"))?))
 }
 
 struct Row<'a> {
@@ -47,29 +48,29 @@ struct Row<'a> {
     chunk_bytes: u64,
 }
 
-fn rows<'a>(target: &'a Target, times: &'a HashMap<u16, (u64, u64)>) -> impl Iterator<Item = Row<'a>> {
+fn channel_rows<'a>(target: &'a Target, times: &'a HashMap<u16, (u64, u64)>) -> impl Iterator<Item = Row<'a>> {
     target.file.channels.iter().map(|(id, channel)| {
         let size = |p: &Piece| p.range.end - p.range.start;
-        let chunk_bytes = target.file.pieces.iter().filter(|p| p.has(*id)).map(size).sum();
+        let chunk_bytes = target.file.pieces.iter().filter(|p| p.has_channel(*id)).map(size).sum();
         Row { target, channel, times: times.get(id).copied(), chunk_bytes }
     })
 }
 
-fn batch(rows: &[Row<'_>]) -> Result<RecordBatch, arrow::error::ArrowError> {
-    fn text<'a>(rows: &'a [Row<'a>], of: impl Fn(&'a Row<'a>) -> Option<&'a str>) -> ArrayRef {
+fn channel_batch(rows: &[Row<'_>]) -> Result<RecordBatch, arrow::error::ArrowError> {
+    fn text_column<'a>(rows: &'a [Row<'a>], of: impl Fn(&'a Row<'a>) -> Option<&'a str>) -> ArrayRef {
         Arc::new(rows.iter().map(of).collect::<StringArray>())
     }
-    fn long(rows: &[Row<'_>], of: impl Fn(&Row<'_>) -> Option<u64>) -> ArrayRef {
+    fn integer_column(rows: &[Row<'_>], of: impl Fn(&Row<'_>) -> Option<u64>) -> ArrayRef {
         Arc::new(rows.iter().map(|r| of(r).and_then(|n| i64::try_from(n).ok())).collect::<Int64Array>())
     }
-    fn time(rows: &[Row<'_>], of: impl Fn((u64, u64)) -> u64) -> ArrayRef {
+    fn time_column(rows: &[Row<'_>], of: impl Fn((u64, u64)) -> u64) -> ArrayRef {
         let nanos = |r: &Row<'_>| r.times.and_then(|times| i64::try_from(of(times)).ok());
         Arc::new(rows.iter().map(nanos).collect::<TimestampNanosecondArray>().with_timezone(UTC))
     }
     let named = |name: &str, kind, nullable| Field::new(name, kind, nullable);
     let schema = Schema::new(vec![
-        Head::Surface.field(),
-        Head::Run.field(),
+        Head::Surface.column_field(),
+        Head::Run.column_field(),
         named("file", DataType::Utf8, false),
         named("topic", DataType::Utf8, false),
         named("schema_name", DataType::Utf8, false),
@@ -90,18 +91,18 @@ fn batch(rows: &[Row<'_>]) -> Result<RecordBatch, arrow::error::ArrowError> {
     };
     let read_by: Vec<String> = rows.iter().map(read_by).collect();
     let columns: Vec<ArrayRef> = vec![
-        text(rows, |r| r.target.run.as_ref().map(|(surface, _)| surface.as_str())),
-        text(rows, |r| r.target.run.as_ref().map(|(_, run)| run.as_str())),
-        text(rows, |r| Some(r.target.file.path.as_ref())),
-        text(rows, |r| Some(&r.channel.topic)),
-        text(rows, |r| Some(&r.channel.schema.name)),
-        text(rows, |r| Some(&r.channel.schema.encoding)),
-        text(rows, |r| Some(&r.channel.schema.messages)),
-        long(rows, |r| r.channel.messages),
-        time(rows, |times| times.0),
-        time(rows, |times| times.1),
-        long(rows, |r| Some(r.chunk_bytes)),
-        long(rows, |r| Some(r.target.file.bytes)),
+        text_column(rows, |r| r.target.run.as_ref().map(|(surface, _)| surface.as_str())),
+        text_column(rows, |r| r.target.run.as_ref().map(|(_, run)| run.as_str())),
+        text_column(rows, |r| Some(r.target.file.path.as_ref())),
+        text_column(rows, |r| Some(&r.channel.topic)),
+        text_column(rows, |r| Some(&r.channel.schema.name)),
+        text_column(rows, |r| Some(&r.channel.schema.encoding)),
+        text_column(rows, |r| Some(&r.channel.schema.messages)),
+        integer_column(rows, |r| r.channel.messages),
+        time_column(rows, |times| times.0),
+        time_column(rows, |times| times.1),
+        integer_column(rows, |r| Some(r.chunk_bytes)),
+        integer_column(rows, |r| Some(r.target.file.bytes)),
         Arc::new(BooleanArray::from(indexed)),
         Arc::new(StringArray::from(read_by)),
     ];
@@ -110,14 +111,14 @@ fn batch(rows: &[Row<'_>]) -> Result<RecordBatch, arrow::error::ArrowError> {
 
 // Times of each channel's first and last message: from the message indexes behind the first and the last chunks that
 // have it, and behind others only where their times overlap. Chunks without message indexes are read themselves.
-async fn times(file: &McapFile, files: &McapFiles) -> Result<HashMap<u16, (u64, u64)>, Fault> {
+async fn channel_times(file: &McapFile, files: &McapFiles) -> Result<HashMap<u16, (u64, u64)>, Fault> {
     let mut found = HashMap::new();
     let mut indexes = Indexes { file, files, read: HashMap::new() };
     for (id, channel) in &file.channels {
         if let Some(times) = channel.times {
             found.insert(*id, times);
         } else if channel.messages != Some(0)
-            && let Some(times) = indexes.times(*id).await?
+            && let Some(times) = indexes.read_times(*id).await?
         {
             found.insert(*id, times);
         }
@@ -135,8 +136,8 @@ struct Indexes<'a> {
 impl Indexes<'_> {
     // Times of a channel's first and last message. Once the piece that begins first and the one that ends last are
     // read, most others lie between them.
-    async fn times(&mut self, channel: u16) -> Result<Times, Fault> {
-        let mut pieces: Vec<_> = self.file.pieces.iter().filter(|p| p.has(channel)).collect();
+    async fn read_times(&mut self, channel: u16) -> Result<Times, Fault> {
+        let mut pieces: Vec<_> = self.file.pieces.iter().filter(|p| p.has_channel(channel)).collect();
         pieces.sort_by_key(|p| p.times.0);
         if let Some(latest) = (1..pieces.len()).max_by_key(|i| pieces[*i].times.1) {
             pieces[1..=latest].rotate_right(1);
@@ -146,7 +147,7 @@ impl Indexes<'_> {
             if times.is_some_and(|(first, last)| first <= piece.times.0 && piece.times.1 <= last) {
                 continue;
             }
-            if let Some((first, last)) = self.of(piece, channel).await? {
+            if let Some((first, last)) = self.piece_times(piece, channel).await? {
                 times = Some(times.map_or((first, last), |times| (times.0.min(first), times.1.max(last))));
             }
         }
@@ -154,7 +155,7 @@ impl Indexes<'_> {
     }
 
     // None if the channel has no messages in the piece.
-    async fn of(&mut self, piece: &Piece, channel: u16) -> Result<Times, Fault> {
+    async fn piece_times(&mut self, piece: &Piece, channel: u16) -> Result<Times, Fault> {
         let place = piece.range.start;
         if !self.read.contains_key(&place) {
             let path = &self.file.path;

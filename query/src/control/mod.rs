@@ -1,7 +1,7 @@
 //! Limits of queries: a [`QueryTicket`] signals whether a query may continue, [`pool`] counts the memory of its
 //! operators.
 //!
-//! DataFusion ends a query only at an await, and allocates between two checks of its pool. [`RunningQueries::overdue`]
+//! DataFusion ends a query only at an await, and allocates between two checks of its pool. [`RunningQueries::longest_overdue`]
 //! finds work that does not end soon after its ticket was stopped; a server then ends the whole process, which serves
 //! one client alone.
 
@@ -79,16 +79,16 @@ impl QueryTicket {
     }
 
     /// Returns the reason for which the query was stopped, if it was.
-    pub(crate) fn why(&self) -> Option<&StopReason> {
+    pub(crate) fn stop_reason(&self) -> Option<&StopReason> {
         self.stop.get().map(|(why, _)| why)
     }
 
     /// Waits until the query must end.
-    pub(crate) async fn stopped(&self) -> StopReason {
+    pub(crate) async fn wait_for_stop(&self) -> StopReason {
         loop {
             // Subscribes before the check, or a stop between them would be missed.
             let stopped = self.stopped.notified();
-            if let Some(why) = self.why() {
+            if let Some(why) = self.stop_reason() {
                 return why.clone();
             }
             stopped.await;
@@ -96,7 +96,7 @@ impl QueryTicket {
     }
 
     /// Bytes that its operators have reserved.
-    pub(crate) fn held(&self) -> &Arc<HeldMemory> {
+    pub(crate) fn held_memory(&self) -> &Arc<HeldMemory> {
         &self.held
     }
 
@@ -107,7 +107,7 @@ impl QueryTicket {
     }
 
     // Time for which work has continued after the query was ended.
-    fn overdue(&self) -> Option<Duration> {
+    fn overdue_time(&self) -> Option<Duration> {
         let (_, at) = self.stop.get()?;
         (self.working.load(Ordering::Relaxed) > 0).then(|| at.elapsed())
     }
@@ -115,7 +115,10 @@ impl QueryTicket {
 
 impl fmt::Debug for QueryTicket {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("QueryTicket").field("stop", &self.why()).field("held", &self.held).finish_non_exhaustive()
+        f.debug_struct("QueryTicket")
+            .field("stop", &self.stop_reason())
+            .field("held", &self.held)
+            .finish_non_exhaustive()
     }
 }
 
@@ -124,23 +127,23 @@ impl fmt::Debug for QueryTicket {
 pub(crate) struct RunningQueries(Mutex<Vec<Weak<QueryTicket>>>);
 
 impl RunningQueries {
-    pub(crate) fn add(&self, ticket: &Arc<QueryTicket>) {
+    pub(crate) fn add_ticket(&self, ticket: &Arc<QueryTicket>) {
         let mut tickets = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         tickets.retain(|t| t.strong_count() > 0);
         tickets.push(Arc::downgrade(ticket));
     }
 
     /// Counts the queries that run or wait.
-    pub(crate) fn count(&self) -> usize {
-        self.live().iter().filter(|t| t.why().is_none()).count()
+    pub(crate) fn count_running(&self) -> usize {
+        self.live_tickets().iter().filter(|t| t.stop_reason().is_none()).count()
     }
 
     /// Returns the longest time for which work has continued after its query was ended; None if there is none.
-    pub(crate) fn overdue(&self) -> Option<Duration> {
-        self.live().iter().filter_map(|t| t.overdue()).max()
+    pub(crate) fn longest_overdue(&self) -> Option<Duration> {
+        self.live_tickets().iter().filter_map(|t| t.overdue_time()).max()
     }
 
-    fn live(&self) -> Vec<Arc<QueryTicket>> {
+    fn live_tickets(&self) -> Vec<Arc<QueryTicket>> {
         let tickets = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         tickets.iter().filter_map(Weak::upgrade).collect()
     }

@@ -27,7 +27,7 @@ pub(crate) struct HeldMemory {
 
 impl HeldMemory {
     /// Returns the most that was held, bytes.
-    pub(crate) fn peak(&self) -> usize {
+    pub(crate) fn peak_bytes(&self) -> usize {
         self.peak.load(Ordering::Relaxed)
     }
 
@@ -54,7 +54,7 @@ impl PartialPool {
         Self { all, holder, limit, held }
     }
 
-    fn refused(&self, consumer: &str, bytes: usize, held: usize) -> DataFusionError {
+    fn exhausted_error(&self, consumer: &str, bytes: usize, held: usize) -> DataFusionError {
         let mib = |bytes: usize| bytes.div_ceil(1 << 20);
         DataFusionError::ResourcesExhausted(format!(
             "{consumer} needs {} MiB more; {} {} of its {} MiB",
@@ -98,7 +98,7 @@ impl MemoryPool for PartialPool {
     fn try_grow(&self, reservation: &MemoryReservation, additional: usize) -> Result<()> {
         let consumer = reservation.consumer().name();
         let counted = self.held.try_grow(additional, self.limit);
-        counted.map_err(|held| self.refused(consumer, additional, held))?;
+        counted.map_err(|held| self.exhausted_error(consumer, additional, held))?;
         self.all.try_grow(reservation, additional).inspect_err(|_| self.held.shrink(additional))
     }
 
@@ -137,6 +137,6 @@ mod tests {
         first.free();
         second.try_grow(6).expect("what is given back is free");
         assert_eq!(all.reserved(), 14);
-        assert_eq!((client_held.now.load(Ordering::Relaxed), client_held.peak()), (6, 6));
+        assert_eq!((client_held.now.load(Ordering::Relaxed), client_held.peak_bytes()), (6, 6));
     }
 }

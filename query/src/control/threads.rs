@@ -85,16 +85,19 @@ impl QueryThreadGroups {
     /// Begins work on the group with the least of it, or on another if its threads do not respond; returns its task,
     /// whose output is always `Some`. None during shutdown. If the caller stops waiting, the work has begun already or is
     /// dropped.
-    pub(crate) async fn begin<T: Send + 'static>(&self, work: BoxFuture<'static, T>) -> Option<JoinHandle<Option<T>>> {
+    pub(crate) async fn begin_work<T: Send + 'static>(
+        &self,
+        work: BoxFuture<'static, T>,
+    ) -> Option<JoinHandle<Option<T>>> {
         let mut groups: Vec<_> = self.0.iter().collect();
-        groups.sort_by_cached_key(|group| group.load());
+        groups.sort_by_cached_key(|group| group.current_load());
         let mut groups = groups.into_iter();
         let (begin, mut begun) = oneshot::channel();
         let offer = WorkOffer(Arc::new(Mutex::new(Some((work, begin)))));
         let mut tasks = Vec::new();
         let number = loop {
             let Some(group) = groups.next() else { break begun.await };
-            tasks.push(group.threads.handle()?.spawn(accept(offer.0.clone(), tasks.len(), group.work.clone())));
+            tasks.push(group.threads.handle()?.spawn(accept_work(offer.0.clone(), tasks.len(), group.work.clone())));
             if let Ok(number) = timeout(RESPONSE_LIMIT, &mut begun).await {
                 break number;
             }
@@ -105,7 +108,7 @@ impl QueryThreadGroups {
 
 impl ThreadGroup {
     // Tasks are also connections to stores, and what is left of ended work.
-    fn load(&self) -> (usize, usize) {
+    fn current_load(&self) -> (usize, usize) {
         let tasks = self.threads.handle().map_or(0, |threads| threads.metrics().num_alive_tasks());
         (Arc::strong_count(&self.work) - 1, tasks)
     }
@@ -125,7 +128,7 @@ impl<T> Drop for WorkOffer<T> {
 }
 
 // Returns None if another group has begun the work, or it was withdrawn.
-async fn accept<T>(offer: UnbegunWork<T>, number: usize, _counted: Arc<()>) -> Option<T> {
+async fn accept_work<T>(offer: UnbegunWork<T>, number: usize, _counted: Arc<()>) -> Option<T> {
     let (work, begin) = offer.lock().unwrap_or_else(PoisonError::into_inner).take()?;
     begin.send(number).ok()?;
     Some(work.await)
@@ -159,7 +162,7 @@ mod tests {
         let place = Arc::new(());
         let held = place.clone();
         let work = async move { drop(held) }.boxed();
-        let waiting = timeout(RESPONSE_LIMIT * 10, groups.begin(work)).await;
+        let waiting = timeout(RESPONSE_LIMIT * 10, groups.begin_work(work)).await;
         assert!(waiting.is_err(), "all threads are held");
         assert_eq!(Arc::strong_count(&place), 1);
         drop(release);

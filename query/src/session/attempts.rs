@@ -23,19 +23,19 @@ pub(crate) fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
 
 /// Attempts that would read `secret`, write under `outside`, or change the lake or another session.
 pub(crate) fn attempts(secret: &Path, outside: &Path) -> Vec<String> {
-    let mut all = reads(&secret.display().to_string());
-    all.extend(writes(&outside.display().to_string()));
-    all.extend(changes());
-    all.extend(settings(&outside.display().to_string()));
-    all.extend(patterns(&secret.display().to_string()));
-    let hidden: Vec<_> = all.iter().filter(|a| !a.contains(';')).step_by(3).flat_map(|a| wrapped(a)).collect();
+    let mut all = read_attempts(&secret.display().to_string());
+    all.extend(write_attempts(&outside.display().to_string()));
+    all.extend(change_attempts());
+    all.extend(setting_attempts(&outside.display().to_string()));
+    all.extend(pattern_attempts(&secret.display().to_string()));
+    let hidden: Vec<_> = all.iter().filter(|a| !a.contains(';')).step_by(3).flat_map(|a| wrap_attempt(a)).collect();
     all.extend(hidden);
     all.sort();
     all.dedup();
     all
 }
 
-fn reads(secret: &str) -> Vec<String> {
+fn read_attempts(secret: &str) -> Vec<String> {
     let up = format!("../../../../../../../../..{secret}");
     let places = [
         secret.to_owned(),
@@ -81,7 +81,7 @@ fn reads(secret: &str) -> Vec<String> {
     all
 }
 
-fn writes(outside: &str) -> Vec<String> {
+fn write_attempts(outside: &str) -> Vec<String> {
     let mut all = Vec::new();
     for format in ["csv", "parquet", "json", "arrow"] {
         let file = format!("{outside}/written.{format}");
@@ -111,7 +111,7 @@ fn writes(outside: &str) -> Vec<String> {
     all
 }
 
-fn changes() -> Vec<String> {
+fn change_attempts() -> Vec<String> {
     let mut all: Vec<String> = Vec::new();
     for table in ["runs", "measurements", "tnce", "points", "information_schema.tables", "pg_catalog.pg_class"] {
         for text in [
@@ -177,7 +177,7 @@ fn changes() -> Vec<String> {
     all
 }
 
-fn settings(outside: &str) -> Vec<String> {
+fn setting_attempts(outside: &str) -> Vec<String> {
     let mut all = Vec::new();
     for (name, value) in [
         ("datafusion.runtime.memory_limit", "900G"),
@@ -203,7 +203,7 @@ fn settings(outside: &str) -> Vec<String> {
 }
 
 // Names of surfaces, runs and topics that are paths, invalid patterns, broken quotes.
-fn patterns(secret: &str) -> Vec<String> {
+fn pattern_attempts(secret: &str) -> Vec<String> {
     let mut all = Vec::new();
     for name in [
         secret.to_owned(),
@@ -230,7 +230,7 @@ fn patterns(secret: &str) -> Vec<String> {
 }
 
 // The same after a statement that reads.
-fn wrapped(attempt: &str) -> [String; 4] {
+fn wrap_attempt(attempt: &str) -> [String; 4] {
     [
         format!("select 1; {attempt}"),
         format!("explain analyze {attempt}"),

@@ -9,7 +9,7 @@ use arrow::record_batch::RecordBatch;
 use arrow::util::pretty::pretty_format_batches;
 use bytes::Bytes;
 use echolake_functions::FunctionSet;
-use echolake_lake::{FileName, Lake, ReferenceSurfaces, VisibleRun, encode};
+use echolake_lake::{FileName, Lake, ReferenceSurfaces, VisibleRun, encode_batches};
 use echolake_schema::tables::Table;
 use echolake_schema::{Rig, Symmetry};
 use expect_test::expect;
@@ -142,12 +142,12 @@ async fn put(lake: &Lake, surface: &str, golden: &[RecordBatch], ir: &str, refle
             }
         };
         let batch = RecordBatch::try_new(schema.clone(), schema.fields().iter().map(column).collect()).expect("rows");
-        let file = encode(table, &schema, &[batch]).expect("encoded");
-        staged.push(lake.stage(table, &name, file).await.expect("staged"));
+        let file = encode_batches(table, &schema, &[batch]).expect("encoded");
+        staged.push(lake.stage_file(table, &name, file).await.expect("staged"));
     }
-    let row = staged.pop().expect("the run's row").replacing(&pointer, &[]);
+    let row = staged.pop().expect("the run's row").with_replaced_rows(&pointer, &[]);
     staged.push(row);
-    lake.commit(&staged).await.expect("committed");
+    lake.commit_staged(&staged).await.expect("committed");
 }
 
 /// Energy of each case in a band, from the golden bands of the panel; for Flat, which has none, the total energy.
@@ -303,7 +303,8 @@ async fn aggregates_are_the_same_however_rows_are_divided() {
     let expected = echolake_dsp::level::p90_mean(&one, &mut Vec::new()).expect("some");
     let sql = format!("select p from (select g, p90_mean(x) as p from {values} group by g) where g = 3");
     assert!(close(small.number(&sql).await, expected));
-    let expected = echolake_dsp::diffusion::diffusion(&one.iter().map(|x| x / 50.0).collect::<Vec<_>>()).expect("some");
+    let expected =
+        echolake_dsp::diffusion::diffusion_of_levels(&one.iter().map(|x| x / 50.0).collect::<Vec<_>>()).expect("some");
     let sql =
         format!("select d from (select g, diffusion_coefficient(x / 50) as d from {values} group by g) where g = 3");
     assert!(close(small.number(&sql).await, expected));

@@ -26,7 +26,7 @@ async fn engine(memory: Option<usize>) -> (tempfile::TempDir, QueryEngine) {
 }
 
 fn session(engine: &QueryEngine, quota: QueryQuota) -> Session {
-    engine.session(&Arc::new(EngineClient::new("somebody", quota)))
+    engine.open_session(&Arc::new(EngineClient::new("somebody", quota)))
 }
 
 async fn outcome(session: &Session, sql: &str) -> Result<u64, Error> {
@@ -53,7 +53,7 @@ async fn a_query_ends_when_it_is_cancelled() {
         let ended = tokio::time::timeout(END_LIMIT, reading).await.expect("in time").expect("no panic");
         assert!(matches!(ended, Err(Error::Cancelled)), "{sql}: {ended:?}");
     }
-    assert_eq!(engine.running(), 0, "what is cancelled does not count");
+    assert_eq!(engine.count_running(), 0, "what is cancelled does not count");
 }
 
 #[tokio::test]
@@ -109,7 +109,7 @@ async fn work_that_holds_its_threads_delays_no_query() {
         Ok::<(), Error>(())
     };
     let holder = engine.clone();
-    let holding = tokio::spawn(async move { holder.supervise(None, hold_all).await });
+    let holding = tokio::spawn(async move { holder.supervise_work(None, hold_all).await });
     for _ in 0..cores {
         tokio::time::timeout(END_LIMIT, begun.recv()).await.expect("in time").expect("it begins");
     }
@@ -121,7 +121,7 @@ async fn work_that_holds_its_threads_delays_no_query() {
                 begin.send(()).expect("somebody counts");
                 std::future::pending::<Result<(), Error>>().await
             };
-            busy.supervise(None, work).await
+            busy.supervise_work(None, work).await
         });
         tokio::time::timeout(END_LIMIT, begun.recv()).await.expect("in time").expect("it begins");
     }
@@ -180,21 +180,21 @@ mod slow {
     async fn what_does_not_end_is_found() {
         let (_folder, engine) = engine(None).await;
         let session = session(&engine, QueryQuota { time: Some(Duration::from_millis(250)), ..QueryQuota::default() });
-        assert_eq!(engine.overdue(), None);
+        assert_eq!(engine.longest_overdue(), None);
         // One call of a function, computed while the query is planned, for a second or more.
         let sql = "select levenshtein(repeat('a', 15000), repeat('b', 15000))";
         let begun = Instant::now();
         loop {
             assert!(matches!(outcome(&session, sql).await, Err(Error::TimeLimit { .. })));
             tokio::time::sleep(Duration::from_millis(100)).await;
-            if engine.overdue().is_some() {
+            if engine.longest_overdue().is_some() {
                 break;
             }
             // On a busy machine a query may end before it comes to the call.
             assert!(begun.elapsed() < END_LIMIT, "no call goes on");
         }
         let begun = Instant::now();
-        while engine.overdue().is_some() {
+        while engine.longest_overdue().is_some() {
             assert!(begun.elapsed() < END_LIMIT, "the call is over, and is not forgotten");
             tokio::time::sleep(Duration::from_millis(50)).await;
         }

@@ -7,7 +7,7 @@ use arrow::buffer::OffsetBuffer;
 use arrow::compute::cast;
 use arrow::datatypes::{DataType, Field};
 use arrow::record_batch::RecordBatch;
-use echolake_lake::{FileName, Lake, ReferenceSurfaces, VisibleRun, encode};
+use echolake_lake::{FileName, Lake, ReferenceSurfaces, VisibleRun, encode_batches};
 use echolake_schema::Rig;
 use echolake_schema::tables::Table;
 use echolake_testing::StoreDouble;
@@ -82,11 +82,11 @@ async fn put_run(lake: &Lake, number: usize) {
         let schema = table.schema(lake.rig());
         let count = if matches!(table, Table::Surfaces | Table::Runs) { 1 } else { PAIRS };
         let columns = schema.fields().iter().map(|f| column(f, count, &run, file_bytes)).collect();
-        let file = encode(table, &schema, &[RecordBatch::try_new(schema.clone(), columns).expect("rows")]);
+        let file = encode_batches(table, &schema, &[RecordBatch::try_new(schema.clone(), columns).expect("rows")]);
         let name = if table == Table::Runs { FileName::Pointer(run.clone()) } else { rows.clone() };
-        staged.push(lake.stage(table, &name, file.expect("encoded")).await.expect("staged"));
+        staged.push(lake.stage_file(table, &name, file.expect("encoded")).await.expect("staged"));
     }
-    lake.commit(&staged).await.expect("committed");
+    lake.commit_staged(&staged).await.expect("committed");
 }
 
 async fn lake() -> (Arc<StoreDouble<()>>, Lake) {

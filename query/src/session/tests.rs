@@ -6,7 +6,7 @@ use arrow::array::{ArrayRef, AsArray as _, Int64Array, StringArray, new_null_arr
 use arrow::compute::cast;
 use arrow::datatypes::{DataType, Field, Float64Type, Int64Type};
 use datafusion::execution::object_store::ObjectStoreUrl;
-use echolake_lake::{FileName, ReferenceSurfaces, VisibleRun, encode};
+use echolake_lake::{FileName, ReferenceSurfaces, VisibleRun, encode_batches};
 use echolake_schema::Rig;
 use echolake_schema::tables::Table;
 use expect_test::{Expect, expect};
@@ -48,7 +48,7 @@ async fn placeholders_have_the_types_that_the_query_determines() {
         ("select $1", vec![None]),
     ] {
         let prepared = session.prepare(sql).await.unwrap_or_else(|e| panic!("{sql}: {e}"));
-        assert_eq!(prepared.parameters().expect(sql), expected, "{sql}");
+        assert_eq!(prepared.parameter_types().expect(sql), expected, "{sql}");
     }
 }
 
@@ -82,7 +82,7 @@ async fn a_predicate_stays_within_its_parentheses() {
     let session = Session::new(&lake).expect("a session");
     let select = "select pair_id from pairs where pair_id < 10 and";
     let count = async |predicate: &str| {
-        let sql = session.selecting(select, predicate, PredicateForm::AnyExpression)?;
+        let sql = session.append_predicate(select, predicate, PredicateForm::AnyExpression)?;
         let (mut answer, mut count) = (session.query(&sql).await?, 0);
         while let Some(batch) = answer.next().await? {
             count += batch.num_rows();
@@ -124,7 +124,7 @@ async fn a_predicate_of_comparisons_has_nothing_else() {
     let (_folder, lake) = lake().await;
     let session = Session::new(&lake).expect("a session");
     let select = "select pair_id from pairs where run_id = 'a' and";
-    let selecting = |predicate: &str| session.selecting(select, predicate, PredicateForm::Comparisons);
+    let selecting = |predicate: &str| session.append_predicate(select, predicate, PredicateForm::Comparisons);
     let longest = format!("pair_id in ({})", "1,".repeat(1_017) + "1");
     assert!(longest.len() <= 2_048);
     for comparisons in [
@@ -206,7 +206,7 @@ async fn nothing_but_reading_is_allowed() {
     let file = format!("select * from '{}'", folder.path().join("lake/lake.toml").display());
     assert!(session.query(&file).await.is_err(), "files are no tables");
     let machine = ObjectStoreUrl::parse("file:///").expect("a URL");
-    let machine = session.engine.context().runtime_env().object_store(machine);
+    let machine = session.engine.create_context().runtime_env().object_store(machine);
     assert!(machine.is_err(), "the machine's files are no store of a query");
     assert_eq!(rows(&session, "select * from points").await.iter().map(|b| b.num_rows()).sum::<usize>(), 78);
 }
@@ -394,12 +394,12 @@ async fn put_events(lake: &Lake, surface: &str, run: &str, derivation: &str, lin
             }
         };
         let batch = RecordBatch::try_new(schema.clone(), schema.fields().iter().map(column).collect()).expect("rows");
-        let file = encode(table, &schema, &[batch]).expect("encoded");
-        staged.push(lake.stage(table, &name, file).await.expect("staged"));
+        let file = encode_batches(table, &schema, &[batch]).expect("encoded");
+        staged.push(lake.stage_file(table, &name, file).await.expect("staged"));
     }
-    let row = staged.pop().expect("the run's row").replacing(&pointer, &old);
+    let row = staged.pop().expect("the run's row").with_replaced_rows(&pointer, &old);
     staged.push(row);
-    lake.commit(&staged).await.expect("committed");
+    lake.commit_staged(&staged).await.expect("committed");
 }
 
 async fn check_replaced_rows(others: usize) {

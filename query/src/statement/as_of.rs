@@ -10,7 +10,7 @@ use datafusion::sql::sqlparser::ast::{
 };
 use echolake_lake::LakeMoment;
 
-use super::syntax_walk::walk;
+use super::syntax_walk::walk_syntax;
 use super::tree;
 use crate::Error;
 
@@ -42,7 +42,7 @@ impl PastTableName {
                 at: at.to_owned(),
             }));
         };
-        let table = tree::normalized(ident);
+        let table = tree::normalized_name(ident);
         let at = version_text(version).ok_or_else(|| not_a_moment(&version.to_string()))?.to_owned();
         Ok(Some(Self { name: format!("{table}{MARK}{at}"), table, at }))
     }
@@ -51,7 +51,7 @@ impl PastTableName {
     ///
     /// # Errors
     /// [`Error::Query`] if it is neither a version nor a time.
-    pub(crate) fn moment(&self) -> Result<LakeMoment, Error> {
+    pub(crate) fn parse_moment(&self) -> Result<LakeMoment, Error> {
         self.at.parse().map_err(|_| not_a_moment(&self.at))
     }
 }
@@ -64,7 +64,7 @@ pub(crate) fn find_past_tables(statement: &Statement) -> Result<BTreeSet<PastTab
     match statement {
         Statement::Statement(sql) => {
             let mut found = PastTableVisitor(BTreeSet::new());
-            match walk(sql.as_ref(), &mut found) {
+            match walk_syntax(sql.as_ref(), &mut found) {
                 ControlFlow::Break(error) => Err(*error),
                 ControlFlow::Continue(()) => Ok(found.0),
             }
@@ -98,19 +98,19 @@ impl Visitor for PastTableVisitor {
 
     // `DESCRIBE "nce@12"` has no table factor.
     fn pre_visit_relation(&mut self, relation: &ObjectName) -> ControlFlow<Box<Error>> {
-        self.add(relation, None)
+        self.add_table(relation, None)
     }
 
     fn pre_visit_table_factor(&mut self, factor: &TableFactor) -> ControlFlow<Box<Error>> {
         match factor {
-            TableFactor::Table { name, version: Some(version), .. } => self.add(name, Some(version)),
+            TableFactor::Table { name, version: Some(version), .. } => self.add_table(name, Some(version)),
             _ => ControlFlow::Continue(()),
         }
     }
 }
 
 impl PastTableVisitor {
-    fn add(&mut self, name: &ObjectName, version: Option<&TableVersion>) -> ControlFlow<Box<Error>> {
+    fn add_table(&mut self, name: &ObjectName, version: Option<&TableVersion>) -> ControlFlow<Box<Error>> {
         match PastTableName::from_table(name, version) {
             Ok(past) => self.0.extend(past),
             Err(error) => return ControlFlow::Break(Box::new(error)),

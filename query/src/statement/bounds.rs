@@ -97,7 +97,7 @@ pub fn check_statement_bounds(sql: &str, dialect: &dyn Dialect) -> Result<(), Er
     let mut statements = 0;
     let pivots = tokens.iter().filter(|t| matches!(t, Token::Word(w) if is_one_of(w, &PIVOT_WORDS))).count();
     if pivots > MOST_PIVOTS {
-        return refused("pivots", MOST_PIVOTS, "WITH gives a name to what stands inside");
+        return refuse_excess("pivots", MOST_PIVOTS, "WITH gives a name to what stands inside");
     }
     let mut before = &Token::EOF;
     // `1_000_` is a number with a column's name behind it, and `12x` as well.
@@ -144,35 +144,39 @@ pub fn check_statement_bounds(sql: &str, dialect: &dyn Dialect) -> Result<(), Er
             Token::Word(word) if is_one_of(word, &QUERY_OPERATORS) => innermost.query_operators += 1,
             Token::Word(word) => innermost.operators += usize::from(is_one_of(word, &OPERATORS)),
             Token::Number(..) | Token::Placeholder(_) => {}
-            literal if has_types && nested(literal) > MOST_NESTED => {
-                return refused("brackets in the name of a type", MOST_NESTED, "types that are less deep");
+            literal if has_types && nesting_depth(literal) > MOST_NESTED => {
+                return refuse_excess("brackets in the name of a type", MOST_NESTED, "types that are less deep");
             }
             literal if is_string(literal) => {}
             _ => innermost.operators += 1,
         }
         let innermost = open.last().map_or((0, 0), |bracket| (bracket.operators, bracket.query_operators));
         if open.len() > MOST_NESTED {
-            return refused("brackets in brackets", MOST_NESTED, "WITH gives a name to what stands inside");
+            return refuse_excess("brackets in brackets", MOST_NESTED, "WITH gives a name to what stands inside");
         }
         if doublings > MOST_DOUBLINGS {
             let most = (MOST_DOUBLINGS / if call_doublings > 0.0 { 1.0 } else { 2.3 }) as usize;
-            return refused("calls in calls", most, "WITH gives a name to what stands inside");
+            return refuse_excess("calls in calls", most, "WITH gives a name to what stands inside");
         }
         if innermost.0 > MOST_CHAINED {
-            return refused("operators in one expression", MOST_CHAINED, "IN, or a join with VALUES, takes long lists");
+            return refuse_excess(
+                "operators in one expression",
+                MOST_CHAINED,
+                "IN, or a join with VALUES, takes long lists",
+            );
         }
         if innermost.1 > MOST_CHAINED {
-            return refused("joins or unions in one query", MOST_CHAINED, "VALUES takes long lists");
+            return refuse_excess("joins or unions in one query", MOST_CHAINED, "VALUES takes long lists");
         }
         if statements > MOST_STATEMENTS {
-            return refused("statements", MOST_STATEMENTS, "send them one after the other");
+            return refuse_excess("statements", MOST_STATEMENTS, "send them one after the other");
         }
         before = token;
     }
     Ok(())
 }
 
-fn refused(what: &str, most: usize, hint: &str) -> Result<(), Error> {
+fn refuse_excess(what: &str, most: usize, hint: &str) -> Result<(), Error> {
     Err(Error::Query {
         message: format!("the query has more than {most} {what}"),
         place: None,
@@ -181,13 +185,13 @@ fn refused(what: &str, most: usize, hint: &str) -> Result<(), Error> {
 }
 
 fn is_string(token: &Token) -> bool {
-    text(token).is_some()
+    literal_text(token).is_some()
 }
 
 /// Returns the maximum nesting of brackets in a literal.
-fn nested(token: &Token) -> usize {
+fn nesting_depth(token: &Token) -> usize {
     let (mut now, mut most) = (0usize, 0);
-    for byte in text(token).unwrap_or_default().bytes() {
+    for byte in literal_text(token).unwrap_or_default().bytes() {
         match byte {
             b'(' | b'[' | b'<' => now += 1,
             b')' | b']' | b'>' => now = now.saturating_sub(1),
@@ -198,7 +202,7 @@ fn nested(token: &Token) -> usize {
     most
 }
 
-fn text(token: &Token) -> Option<&str> {
+fn literal_text(token: &Token) -> Option<&str> {
     match token {
         Token::SingleQuotedString(text)
         | Token::DoubleQuotedString(text)

@@ -10,7 +10,7 @@ use datafusion::sql::sqlparser::ast::{
     ObjectName, ObjectNamePart, Query, Select, TableFactor, TableWithJoins, Visitor,
 };
 
-use super::syntax_walk::walk;
+use super::syntax_walk::walk_syntax;
 use super::{hints, tree};
 use crate::Error;
 
@@ -26,8 +26,8 @@ const NEAREST: &str = "JOIN ... ON a.t >= b.t QUALIFY row_number() over (partiti
 /// [`Error::Query`] with the clause and what to write instead.
 pub(super) fn check_clauses(statement: &Statement, sql: &str, state: &SessionState) -> Result<(), Error> {
     match statement {
-        Statement::Statement(parsed) => match walk(parsed.as_ref(), &mut ClauseVisitor { state }) {
-            ControlFlow::Break(ignored) => Err(Error::clause(sql, &ignored.clause, ignored.hint)),
+        Statement::Statement(parsed) => match walk_syntax(parsed.as_ref(), &mut ClauseVisitor { state }) {
+            ControlFlow::Break(ignored) => Err(Error::unsupported_clause(sql, &ignored.clause, ignored.hint)),
             ControlFlow::Continue(()) => Ok(()),
         },
         Statement::Explain(explain) => check_clauses(&explain.statement, sql, state),
@@ -157,7 +157,7 @@ impl ClauseVisitor<'_> {
     // A scalar function and nothing else.
     fn is_scalar(&self, name: &ObjectName) -> bool {
         let [ObjectNamePart::Identifier(name)] = name.0.as_slice() else { return false };
-        let name = tree::normalized(name);
+        let name = tree::normalized_name(name);
         self.state.scalar_functions().contains_key(&name)
             && !self.state.aggregate_functions().contains_key(&name)
             && !self.state.window_functions().contains_key(&name)

@@ -10,7 +10,7 @@ use datafusion::sql::sqlparser::ast::{
 use datafusion::sql::sqlparser::tokenizer::Location;
 use regex::RegexBuilder;
 
-use super::syntax_walk::{walk, walk_mut};
+use super::syntax_walk::{walk_mut, walk_syntax};
 use super::tree;
 use crate::Error;
 
@@ -52,11 +52,11 @@ pub(super) fn has_columns(select: &Select) -> bool {
         _ => None,
     });
     let conditions = [&select.selection, &select.having, &select.qualify].into_iter().flatten();
-    items.chain(conditions).any(|expr| !calls(expr).is_empty())
+    items.chain(conditions).any(|expr| !find_calls(expr).is_empty())
 }
 
 /// Returns an error with a hint and without a place.
-pub(super) fn refused(message: String, hint: String) -> Error {
+pub(super) fn hinted_error(message: String, hint: String) -> Error {
     Error::Query { message, place: None, hint: Some(hint) }
 }
 
@@ -65,7 +65,7 @@ impl ColumnsExpansion<'_> {
     ///
     /// # Errors
     /// [`Error::Query`] if a column is not there, or too many are.
-    pub(super) fn expand(&mut self, select: &mut Select) -> Result<(), Error> {
+    pub(super) fn expand_select(&mut self, select: &mut Select) -> Result<(), Error> {
         let mut projection = Vec::with_capacity(select.projection.len());
         for item in std::mem::take(&mut select.projection) {
             self.expand_item(item, &mut projection)?;
@@ -80,15 +80,15 @@ impl ColumnsExpansion<'_> {
     fn expand_item(&mut self, item: SelectItem, items: &mut Vec<SelectItem>) -> Result<(), Error> {
         match item {
             SelectItem::UnnamedExpr(expr) => {
-                items.extend(self.copies(expr)?.into_iter().map(|(expr, _)| tree::item(expr, None)));
+                items.extend(self.column_copies(expr)?.into_iter().map(|(expr, _)| tree::select_item(expr, None)));
             }
             SelectItem::ExprWithAlias { expr, alias } => {
-                let copies = self.copies(expr)?;
+                let copies = self.column_copies(expr)?;
                 if copies.len() > 1 && !alias.value.contains('\\') {
                     let hint = format!("AS \"{}_\\0\", where \\0 is a column's name", alias.value);
-                    return Err(refused(format!("`{alias}` would be the name of {} columns", copies.len()), hint));
+                    return Err(hinted_error(format!("`{alias}` would be the name of {} columns", copies.len()), hint));
                 }
-                let named = |(expr, column)| tree::item(expr, Some(alias_of(&alias, column)));
+                let named = |(expr, column)| tree::select_item(expr, Some(alias_of(&alias, column)));
                 items.extend(copies.into_iter().map(named));
             }
             other => items.push(other),
@@ -97,28 +97,28 @@ impl ColumnsExpansion<'_> {
     }
 
     fn expand_condition(&mut self, condition: &mut Expr) -> Result<(), Error> {
-        let copies = self.copies(condition.clone())?;
+        let copies = self.column_copies(condition.clone())?;
         if copies.len() > MOST_CONDITIONS {
             let hint = "a regular expression that fewer columns match".to_owned();
-            return Err(refused(format!("more than {MOST_CONDITIONS} columns in a condition"), hint));
+            return Err(hinted_error(format!("more than {MOST_CONDITIONS} columns in a condition"), hint));
         }
-        if let Some(all) = copies.into_iter().map(|(expr, _)| expr).reduce(tree::and) {
+        if let Some(all) = copies.into_iter().map(|(expr, _)| expr).reduce(tree::and_conditions) {
             *condition = all;
         }
         Ok(())
     }
 
     // One copy of an expression for each column that its `COLUMNS` choose; all must choose the same.
-    fn copies(&mut self, expr: Expr) -> Result<Vec<(Expr, Option<ChosenColumn>)>, Error> {
-        let calls = calls(&expr);
+    fn column_copies(&mut self, expr: Expr) -> Result<Vec<(Expr, Option<ChosenColumn>)>, Error> {
+        let calls = find_calls(&expr);
         let mut first: Option<Vec<ChosenColumn>> = None;
         for call in &calls {
-            let chosen = self.chosen(call).map_err(|error| error.at(self.sql, place(call)))?;
+            let chosen = self.chosen_columns(call).map_err(|error| error.with_place(self.sql, call_location(call)))?;
             let is_same = |known: &Vec<ChosenColumn>| known.iter().map(|c| &c.name).eq(chosen.iter().map(|c| &c.name));
             if !first.as_ref().is_none_or(is_same) {
                 let message = "COLUMNS of one expression choose different columns".to_owned();
                 let hint = "the same COLUMNS(...) at each place, or write the columns out".to_owned();
-                return Err(refused(message, hint).at(self.sql, place(call)));
+                return Err(hinted_error(message, hint).with_place(self.sql, call_location(call)));
             }
             first.get_or_insert(chosen);
         }
@@ -133,52 +133,52 @@ impl ColumnsExpansion<'_> {
         Ok(first.into_iter().map(copy).collect())
     }
 
-    fn chosen(&mut self, call: &Function) -> Result<Vec<ChosenColumn>, Error> {
+    fn chosen_columns(&mut self, call: &Function) -> Result<Vec<ChosenColumn>, Error> {
         self.take_bytes(CHOICE_BYTES + self.schema.fields().len() * COLUMN_BYTES)?;
-        let chosen = match argument(call) {
-            Some(FunctionArgExpr::Wildcard) => self.all(|_, _| true),
+        let chosen = match only_argument(call) {
+            Some(FunctionArgExpr::Wildcard) => self.filter_columns(|_, _| true),
             Some(FunctionArgExpr::QualifiedWildcard(table)) => {
                 let table = last_name(table);
-                self.all(|qualifier, _| qualifier.map(TableReference::table) == table.as_deref())
+                self.filter_columns(|qualifier, _| qualifier.map(TableReference::table) == table.as_deref())
             }
             Some(FunctionArgExpr::WildcardWithOptions(options)) if only_excludes(options) => {
-                let excluded = excluded(options);
+                let excluded = excluded_names(options);
                 if let Some(unknown) = excluded.iter().find(|name| !self.schema.has_column_with_unqualified_name(name))
                 {
-                    return Err(refused(format!("no column `{unknown}`"), self.listed()));
+                    return Err(hinted_error(format!("no column `{unknown}`"), self.columns_hint()));
                 }
-                self.all(|_, name| !excluded.iter().any(|excluded| excluded == name))
+                self.filter_columns(|_, name| !excluded.iter().any(|excluded| excluded == name))
             }
             Some(FunctionArgExpr::Expr(Expr::Value(ValueWithSpan {
                 value: Value::SingleQuotedString(pattern),
                 ..
-            }))) => self.matching(pattern)?,
-            _ => return Err(refused(format!("`{call}` does not say which columns"), FORMS.to_owned())),
+            }))) => self.matching_columns(pattern)?,
+            _ => return Err(hinted_error(format!("`{call}` does not say which columns"), FORMS.to_owned())),
         };
         if chosen.is_empty() {
-            return Err(refused(format!("`{call}` chooses no column"), self.listed()));
+            return Err(hinted_error(format!("`{call}` chooses no column"), self.columns_hint()));
         }
         Ok(chosen)
     }
 
-    fn all(&self, is_chosen: impl Fn(Option<&TableReference>, &str) -> bool) -> Vec<ChosenColumn> {
+    fn filter_columns(&self, is_chosen: impl Fn(Option<&TableReference>, &str) -> bool) -> Vec<ChosenColumn> {
         let chosen = self.schema.iter().filter(|(qualifier, field)| is_chosen(*qualifier, field.name()));
-        chosen.map(|(qualifier, field)| column(qualifier, field.name(), Vec::new())).collect()
+        chosen.map(|(qualifier, field)| chosen_column(qualifier, field.name(), Vec::new())).collect()
     }
 
-    fn matching(&self, pattern: &str) -> Result<Vec<ChosenColumn>, Error> {
+    fn matching_columns(&self, pattern: &str) -> Result<Vec<ChosenColumn>, Error> {
         let regex = RegexBuilder::new(pattern).size_limit(REGEX_BYTES).build().map_err(|e| {
-            refused(format!("`{pattern}` is no regular expression: {e}"), "COLUMNS('tnce_band_.*')".to_owned())
+            hinted_error(format!("`{pattern}` is no regular expression: {e}"), "COLUMNS('tnce_band_.*')".to_owned())
         })?;
         let chosen = self.schema.iter().filter_map(|(qualifier, field)| {
             let captures = regex.captures(field.name())?;
             let group = |group: Option<regex::Match<'_>>| group.map_or_else(String::new, |m| m.as_str().to_owned());
-            Some(column(qualifier, field.name(), captures.iter().map(group).collect()))
+            Some(chosen_column(qualifier, field.name(), captures.iter().map(group).collect()))
         });
         Ok(chosen.collect())
     }
 
-    fn listed(&self) -> String {
+    fn columns_hint(&self) -> String {
         let names: Vec<_> = self.schema.fields().iter().map(|field| field.name().as_str()).take(LISTED).collect();
         let more = if self.schema.fields().len() > LISTED { ", ..." } else { "" };
         format!("the columns are {}{more}", names.join(", "))
@@ -187,18 +187,18 @@ impl ColumnsExpansion<'_> {
     fn take_bytes(&mut self, bytes: usize) -> Result<(), Error> {
         *self.bytes_left = self.bytes_left.checked_sub(bytes).ok_or_else(|| {
             let message = "the query is too long once COLUMNS are written out".to_owned();
-            refused(message, "fewer columns at a time, or WITH for what is repeated".to_owned())
+            hinted_error(message, "fewer columns at a time, or WITH for what is repeated".to_owned())
         })?;
         Ok(())
     }
 }
 
-fn column(qualifier: Option<&TableReference>, name: &str, groups: Vec<String>) -> ChosenColumn {
-    let quoted = tree::quoted(name);
+fn chosen_column(qualifier: Option<&TableReference>, name: &str, groups: Vec<String>) -> ChosenColumn {
+    let quoted = tree::quoted_ident(name);
     let expr = match qualifier {
         Some(qualifier) => {
             let parts = qualifier.to_vec();
-            Expr::CompoundIdentifier(parts.iter().map(|part| tree::quoted(part)).chain([quoted]).collect())
+            Expr::CompoundIdentifier(parts.iter().map(|part| tree::quoted_ident(part)).chain([quoted]).collect())
         }
         None => Expr::Identifier(quoted),
     };
@@ -208,46 +208,46 @@ fn column(qualifier: Option<&TableReference>, name: &str, groups: Vec<String>) -
 // `\0` is the match, `\1` to `\9` are the groups of a regular expression; without one, `\0` is the column's name.
 fn alias_of(alias: &Ident, column: Option<ChosenColumn>) -> Ident {
     let Some(column) = column.filter(|_| alias.value.contains('\\')) else { return alias.clone() };
-    let mut name = tree::normalized(alias);
+    let mut name = tree::normalized_name(alias);
     for digit in 0..10 {
         let group = column.groups.get(digit).map_or("", String::as_str);
         let group = if digit == 0 && column.groups.is_empty() { &column.name } else { group };
         name = name.replace(&format!("\\{digit}"), group);
     }
-    tree::quoted(&name)
+    tree::quoted_ident(&name)
 }
 
 fn is_columns(function: &Function) -> bool {
     tree::plain_name(&function.name).is_some_and(|name| name == "columns")
 }
 
-fn place(function: &Function) -> Location {
+fn call_location(function: &Function) -> Location {
     function.name.0.first().and_then(|part| part.as_ident()).map_or(Location::empty(), |name| name.span.start)
 }
 
 // The calls of `COLUMNS` in an expression, outermost first.
-fn calls(expr: &Expr) -> Vec<Function> {
+fn find_calls(expr: &Expr) -> Vec<Function> {
     let mut found = CallVisitor(Vec::new());
     // The walk never breaks off.
-    let _ = walk(expr, &mut found);
+    let _ = walk_syntax(expr, &mut found);
     found.0
 }
 
 // The names that `* EXCLUDE (...)` or `* EXCEPT (...)` leaves out.
-fn excluded(options: &WildcardAdditionalOptions) -> Vec<String> {
+fn excluded_names(options: &WildcardAdditionalOptions) -> Vec<String> {
     let mut names: Vec<String> = match &options.opt_exclude {
         Some(ExcludeSelectItem::Single(name)) => last_name(name).into_iter().collect(),
         Some(ExcludeSelectItem::Multiple(names)) => names.iter().filter_map(last_name).collect(),
         None => Vec::new(),
     };
     if let Some(ExceptSelectItem { first_element, additional_elements }) = &options.opt_except {
-        names.extend([first_element].into_iter().chain(additional_elements).map(tree::normalized));
+        names.extend([first_element].into_iter().chain(additional_elements).map(tree::normalized_name));
     }
     names
 }
 
 fn last_name(name: &ObjectName) -> Option<String> {
-    name.0.last().and_then(|part| part.as_ident()).map(tree::normalized)
+    name.0.last().and_then(|part| part.as_ident()).map(tree::normalized_name)
 }
 
 fn only_excludes(options: &WildcardAdditionalOptions) -> bool {
@@ -257,7 +257,7 @@ fn only_excludes(options: &WildcardAdditionalOptions) -> bool {
         && options.opt_alias.is_none()
 }
 
-fn argument(function: &Function) -> Option<&FunctionArgExpr> {
+fn only_argument(function: &Function) -> Option<&FunctionArgExpr> {
     let FunctionArguments::List(list) = &function.args else { return None };
     match list.args.as_slice() {
         [FunctionArg::Unnamed(argument)] if list.clauses.is_empty() => Some(argument),

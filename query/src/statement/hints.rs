@@ -136,7 +136,7 @@ pub(crate) fn with_hint(message: String) -> String {
 }
 
 /// Returns a message without the suggestion, which is in the hint, and without the planner's own structures.
-pub(crate) fn short(message: &str) -> String {
+pub(crate) fn shorten_message(message: &str) -> String {
     let message = match message.split_once("Did you mean ") {
         Some((message, _)) if message.starts_with("Invalid function") => {
             message.trim_end().trim_end_matches('.').replace("Invalid function '", "no function `").replace('\'', "`")

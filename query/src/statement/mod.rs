@@ -44,15 +44,17 @@ use dialect::LakeDialect;
 pub(crate) fn parse_statement(sql: &str, recursion_limit: usize) -> Result<Statement, Error> {
     check_statement_bounds(sql, &LakeDialect)?;
     let tokens = Tokenizer::new(&LakeDialect, sql).tokenize_with_location();
-    let tokens = summarize::read_summarize(tokens.map_err(|e| Error::syntax(sql, e.into()))?);
+    let tokens = summarize::read_summarize(tokens.map_err(|e| Error::from_tokenizer(sql, e.into()))?);
     let builder = DFParserBuilder::new(tokens).with_dialect(&LakeDialect).with_recursion_limit(recursion_limit);
     let statements = builder.build().and_then(|mut parser| parser.parse_statements());
-    match <[Statement; 1]>::try_from(Vec::from(statements.map_err(|e| Error::plan(sql, &e))?)) {
+    match <[Statement; 1]>::try_from(Vec::from(statements.map_err(|e| Error::from_planning(sql, &e))?)) {
         Ok([statement]) => Ok(statement),
-        Err(none) if none.is_empty() => Err(columns::refused("no statement".into(), "select * from surfaces".into())),
+        Err(none) if none.is_empty() => {
+            Err(columns::hinted_error("no statement".into(), "select * from surfaces".into()))
+        }
         Err(_) => {
             let hint = "the prompt takes several, each ended by ;";
-            Err(columns::refused("one statement at a time".into(), hint.into()))
+            Err(columns::hinted_error("one statement at a time".into(), hint.into()))
         }
     }
 }
@@ -71,7 +73,7 @@ pub(crate) async fn prepare_statement(
     clauses::check_clauses(&statement, sql, state)?;
     let plan = state.statement_to_plan(statement).await;
     let plan = plan.and_then(placeholders::infer_types).and_then(integer_casts::round_casts);
-    let plan = plan.map_err(|e| Error::plan(sql, &e))?;
+    let plan = plan.map_err(|e| Error::from_planning(sql, &e))?;
     // `SELECT INTO` reads by its first word and makes a table by its plan.
     let reading = SQLOptions::new().with_allow_ddl(false).with_allow_dml(false).with_allow_statements(false);
     reading.verify_plan(&plan).map_err(|_| Error::NotReading { statement: plan.display().to_string() })?;

@@ -17,7 +17,7 @@ pub enum PredicateForm {
     Comparisons,
 }
 
-/// Appends a predicate to the query `select` for [`Session::selecting`](crate::Session::selecting). `parse` parses a
+/// Appends a predicate to the query `select` for [`Session::append_predicate`](crate::Session::append_predicate). `parse` parses a
 /// query.
 ///
 /// # Errors
@@ -30,27 +30,27 @@ pub(crate) fn append_predicate(
 ) -> Result<String, Error> {
     if form == PredicateForm::Comparisons && predicate.len() > MOST_COMPARISON_BYTES {
         let message = format!("the predicate has {} bytes, {MOST_COMPARISON_BYTES} may be here", predicate.len());
-        return Err(refused(message, "BETWEEN and IN are shorter than many comparisons"));
+        return Err(hinted_error(message, "BETWEEN and IN are shorter than many comparisons"));
     }
     // The line breaks keep a comment in the predicate from reaching further.
     let query = |predicate: &str| format!("{select} (\n{predicate}\n)");
     let given = query(predicate);
     let (mut asked, mut ours) = (parse(&given)?, parse(&query("true"))?);
-    match (emptied(&mut asked), emptied(&mut ours)) {
+    match (take_predicate(&mut asked), take_predicate(&mut ours)) {
         (Some(inner), Some(_)) if asked == ours => {
             if form == PredicateForm::Comparisons {
                 check_comparisons(&inner)?;
             }
             Ok(given)
         }
-        _ => Err(refused(
+        _ => Err(hinted_error(
             "the predicate is not one expression".to_owned(),
             "what may stand behind WHERE, as `snr_db < 35 and pair_id < 100`",
         )),
     }
 }
 
-fn refused(message: String, hint: &str) -> Error {
+fn hinted_error(message: String, hint: &str) -> Error {
     Error::Query { message, place: None, hint: Some(hint.to_owned()) }
 }
 
@@ -72,7 +72,7 @@ fn check_comparisons(predicate: &Expr) -> Result<(), Error> {
             Expr::Between { expr, low, high, .. } => pending.extend([&**expr, &**low, &**high]),
             Expr::InList { expr, list, .. } if list.iter().all(is_literal) => pending.push(expr),
             _ => {
-                return Err(refused(
+                return Err(hinted_error(
                     "the predicate has more than comparisons of columns and literals, which is all it may have here"
                         .to_owned(),
                     "=, <>, <, <=, >, >=, BETWEEN, IN, IS NULL, AND, OR and NOT, as `snr_db < 35 and pair_id < 100`",
@@ -101,7 +101,7 @@ fn is_literal(expression: &Expr) -> bool {
 }
 
 // Takes the expression in the parentheses of the last condition out of a query.
-fn emptied(statement: &mut Statement) -> Option<Expr> {
+fn take_predicate(statement: &mut Statement) -> Option<Expr> {
     let Statement::Statement(sql) = statement else { return None };
     let Sql::Query(query) = sql.as_mut() else { return None };
     let SetExpr::Select(select) = query.body.as_mut() else { return None };

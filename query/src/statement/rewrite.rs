@@ -29,9 +29,9 @@ use datafusion::sql::sqlparser::ast::{
 use futures::FutureExt as _;
 
 use super::as_of::rewrite_as_of;
-use super::columns::{ColumnsExpansion, has_columns, refused};
+use super::columns::{ColumnsExpansion, has_columns, hinted_error};
 use super::summarize::{summarized_query, write_summary};
-use super::syntax_walk::{walk, walk_mut};
+use super::syntax_walk::{walk_mut, walk_syntax};
 use super::tree;
 use crate::Error;
 
@@ -126,15 +126,15 @@ impl VisitorMut for RewriteVisitor<'_> {
     }
 
     fn post_visit_select(&mut self, select: &mut Select) -> Visit {
-        if has_columns(select) { visited(self.expand_columns(select)) } else { ControlFlow::Continue(()) }
+        if has_columns(select) { visit_outcome(self.expand_columns(select)) } else { ControlFlow::Continue(()) }
     }
 
     fn pre_visit_table_factor(&mut self, factor: &mut TableFactor) -> Visit {
-        visited(rewrite_as_of(factor))
+        visit_outcome(rewrite_as_of(factor))
     }
 
     fn post_visit_table_factor(&mut self, factor: &mut TableFactor) -> Visit {
-        visited(self.expand_summary(factor))
+        visit_outcome(self.expand_summary(factor))
     }
 
     fn pre_visit_value(&mut self, value: &mut ValueWithSpan) -> Visit {
@@ -161,7 +161,7 @@ impl VisitorMut for RewriteVisitor<'_> {
 impl RewriteVisitor<'_> {
     fn expand_columns(&mut self, select: &mut Select) -> Result<(), Error> {
         let schema = self.look_up(select.from.clone())?;
-        ColumnsExpansion { schema: &schema, sql: self.sql, bytes_left: &mut self.bytes_left }.expand(select)
+        ColumnsExpansion { schema: &schema, sql: self.sql, bytes_left: &mut self.bytes_left }.expand_select(select)
     }
 
     fn expand_summary(&mut self, factor: &mut TableFactor) -> Result<(), Error> {
@@ -180,7 +180,7 @@ impl RewriteVisitor<'_> {
         }
         self.lookups_left = self.lookups_left.checked_sub(1).ok_or_else(|| {
             let message = format!("the query has more than {MOST_LOOKUPS} subqueries with COLUMNS");
-            refused(message, "WITH for what is repeated".to_owned())
+            hinted_error(message, "WITH for what is repeated".to_owned())
         })?;
         let mut query = tree::parse_query("SELECT *")?;
         if let SetExpr::Select(select) = &mut *query.body {
@@ -193,19 +193,19 @@ impl RewriteVisitor<'_> {
         let planned = self.state.statement_to_plan(Statement::Statement(Box::new(Sql::Query(query)))).now_or_never();
         // The tables of a query's context are in memory, so that planning never waits.
         let waits = || Error::Execution { message: "the columns of a table are not known at once".to_owned() };
-        let plan = planned.ok_or_else(waits)?.map_err(|e| Error::plan(self.sql, &e))?;
+        let plan = planned.ok_or_else(waits)?.map_err(|e| Error::from_planning(self.sql, &e))?;
         Ok(DFSchema::clone(plan.schema()))
     }
 
     // Of several of one name the innermost is meant, and a WITH names each once.
     fn last_ctes(&self) -> Vec<Cte> {
-        let name = |cte: &Cte| tree::normalized(&cte.alias.name);
+        let name = |cte: &Cte| tree::normalized_name(&cte.alias.name);
         let is_last = |(at, cte): &(usize, &Cte)| self.ctes[at + 1..].iter().all(|later| name(later) != name(cte));
         self.ctes.iter().enumerate().filter(is_last).map(|(_, cte)| cte.clone()).collect()
     }
 }
 
-fn visited(result: Result<(), Error>) -> Visit {
+fn visit_outcome(result: Result<(), Error>) -> Visit {
     match result {
         Ok(()) => ControlFlow::Continue(()),
         Err(error) => ControlFlow::Break(Box::new(error)),
@@ -215,7 +215,7 @@ fn visited(result: Result<(), Error>) -> Visit {
 // `FETCH FIRST n ROWS ONLY` becomes `LIMIT n`.
 fn limit_fetched_rows(query: &mut Query) {
     let Some(Fetch { with_ties: false, percent: false, quantity }) = &query.fetch else { return };
-    let rows = Some(quantity.clone().unwrap_or_else(|| tree::number(1)));
+    let rows = Some(quantity.clone().unwrap_or_else(|| tree::number_literal(1)));
     match &mut query.limit_clause {
         limit @ None => *limit = Some(LimitClause::LimitOffset { limit: rows, offset: None, limit_by: Vec::new() }),
         Some(LimitClause::LimitOffset { limit: limit @ None, .. }) => *limit = rows,
@@ -232,7 +232,7 @@ fn order_by_all(query: &mut Query) {
     if !select.projection.iter().all(is_one) {
         return;
     }
-    let by = |column| OrderByExpr { expr: tree::number(column), options: *options, with_fill: None };
+    let by = |column| OrderByExpr { expr: tree::number_literal(column), options: *options, with_fill: None };
     let columns = i64::try_from(select.projection.len()).unwrap_or(0);
     *kind = OrderByKind::Expressions((1..=columns).map(by).collect());
 }
@@ -240,8 +240,8 @@ fn order_by_all(query: &mut Query) {
 // `list[2:]` and `list[:2]` have both ends; which ones those of a stride are depends on its sign.
 fn close_slice(access: &mut AccessExpr) {
     if let AccessExpr::Subscript(Subscript::Slice { lower_bound, upper_bound, stride: None }) = access {
-        lower_bound.get_or_insert_with(|| tree::number(1));
-        upper_bound.get_or_insert_with(|| tree::number(-1));
+        lower_bound.get_or_insert_with(|| tree::number_literal(1));
+        upper_bound.get_or_insert_with(|| tree::number_literal(-1));
     }
 }
 
@@ -256,20 +256,20 @@ fn rewrite_function(function: &mut Function) -> Result<Option<Expr>, Error> {
     if extreme.is_none() && name != "if" && name != "count_if" {
         return Ok(None);
     }
-    match (name.as_str(), extreme, arguments(function).as_deref()) {
+    match (name.as_str(), extreme, plain_arguments(function).as_deref()) {
         (_, Some(is_greatest), Some([of, by])) => {
             check_extreme(&name, function)?;
             take_at_extreme(function, of, by, is_greatest);
         }
         (_, Some(_), _) => {
             let hint = "arg_max(x, y) of one row, array_agg(x ORDER BY y DESC)[1:3] of several".to_owned();
-            return Err(refused(format!("`{name}` takes two values"), hint));
+            return Err(hinted_error(format!("`{name}` takes two values"), hint));
         }
         ("if", _, Some([condition, then, otherwise])) => {
-            return Ok(Some(case(condition, then, Some(otherwise))));
+            return Ok(Some(case_expression(condition, then, Some(otherwise))));
         }
         ("count_if", _, Some([condition])) => {
-            set_argument(function, "count", case(condition, &tree::number(1), None));
+            set_argument(function, "count", case_expression(condition, &tree::number_literal(1), None));
         }
         _ => {}
     }
@@ -284,11 +284,11 @@ fn extreme_of(name: &str) -> Option<bool> {
 fn check_extreme(name: &str, function: &Function) -> Result<(), Error> {
     if function.over.is_some() {
         let hint = "first_value(x) OVER (PARTITION BY p ORDER BY y DESC), or QUALIFY row_number() OVER (...) = 1";
-        return Err(refused(format!("`{name}` of two values has no OVER"), hint.to_owned()));
+        return Err(hinted_error(format!("`{name}` of two values has no OVER"), hint.to_owned()));
     }
-    if walk(&function.args, &mut ExtremeVisitor).is_break() {
+    if walk_syntax(&function.args, &mut ExtremeVisitor).is_break() {
         let hint = "the inner one in a subquery of FROM, or in WITH".to_owned();
-        return Err(refused(format!("`{name}` has another such aggregate in it"), hint));
+        return Err(hinted_error(format!("`{name}` has another such aggregate in it"), hint));
     }
     Ok(())
 }
@@ -307,7 +307,7 @@ impl Visitor for ExtremeVisitor {
     }
 }
 
-fn case(condition: &Expr, then: &Expr, otherwise: Option<&Expr>) -> Expr {
+fn case_expression(condition: &Expr, then: &Expr, otherwise: Option<&Expr>) -> Expr {
     Expr::Case {
         case_token: AttachedToken::empty(),
         end_token: AttachedToken::empty(),
@@ -317,7 +317,7 @@ fn case(condition: &Expr, then: &Expr, otherwise: Option<&Expr>) -> Expr {
     }
 }
 
-fn arguments(function: &Function) -> Option<Vec<Expr>> {
+fn plain_arguments(function: &Function) -> Option<Vec<Expr>> {
     let FunctionArguments::List(list) = &function.args else { return None };
     let expr = |argument: &FunctionArg| match argument {
         FunctionArg::Unnamed(FunctionArgExpr::Expr(expr)) => Some(expr.clone()),
@@ -342,9 +342,9 @@ fn take_at_extreme(function: &mut Function, of: &Expr, by: &Expr, is_greatest: b
         list.clauses.push(FunctionArgumentClause::OrderBy(order));
     }
     let is_there = |expr: &Expr| Expr::IsNotNull(Box::new(Expr::Nested(Box::new(expr.clone()))));
-    let are_there = tree::and(is_there(of), is_there(by));
+    let are_there = tree::and_conditions(is_there(of), is_there(by));
     function.filter = Some(Box::new(match function.filter.take() {
-        Some(filter) => tree::and(*filter, are_there),
+        Some(filter) => tree::and_conditions(*filter, are_there),
         None => are_there,
     }));
 }

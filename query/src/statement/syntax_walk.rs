@@ -10,7 +10,7 @@ use datafusion::sql::sqlparser::ast::{
 };
 
 /// Walks over a part of a syntax tree; returns what the visitor broke off with.
-pub(crate) fn walk<B>(node: &impl Visit, visitor: &mut dyn Visitor<Break = B>) -> ControlFlow<B> {
+pub(crate) fn walk_syntax<B>(node: &impl Visit, visitor: &mut dyn Visitor<Break = B>) -> ControlFlow<B> {
     let mut kept = KeptBreak { visitor, broken: None };
     match node.visit(&mut SharedVisitor(&mut kept)) {
         ControlFlow::Break(()) => kept.broken.map_or(ControlFlow::Continue(()), ControlFlow::Break),

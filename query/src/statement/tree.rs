@@ -12,21 +12,21 @@ use crate::Error;
 /// [`Error::Query`] if it is none.
 pub(super) fn parse_query(sql: &str) -> Result<Box<Query>, Error> {
     let parsed = Parser::new(&LakeDialect).try_with_sql(sql).and_then(|mut parser| parser.parse_query());
-    parsed.map_err(|error| Error::syntax(sql, error))
+    parsed.map_err(|error| Error::from_tokenizer(sql, error))
 }
 
 /// Returns a number.
-pub(super) fn number(number: i64) -> Expr {
+pub(super) fn number_literal(number: i64) -> Expr {
     Expr::value(Value::Number(number.to_string(), false))
 }
 
 /// Returns a name as it is, whatever its letters.
-pub(super) fn quoted(name: &str) -> Ident {
+pub(super) fn quoted_ident(name: &str) -> Ident {
     Ident::with_quote('"', name)
 }
 
 /// Returns the name by which the planner knows an identifier.
-pub(super) fn normalized(ident: &Ident) -> String {
+pub(super) fn normalized_name(ident: &Ident) -> String {
     if ident.quote_style.is_some() { ident.value.clone() } else { ident.value.to_lowercase() }
 }
 
@@ -39,13 +39,13 @@ pub(super) fn plain_name(name: &ObjectName) -> Option<String> {
 }
 
 /// Returns the conjunction of two conditions.
-pub(super) fn and(left: Expr, right: Expr) -> Expr {
+pub(super) fn and_conditions(left: Expr, right: Expr) -> Expr {
     let nested = |expr| Box::new(Expr::Nested(Box::new(expr)));
     Expr::BinaryOp { left: nested(left), op: BinaryOperator::And, right: nested(right) }
 }
 
 /// Returns a select item, under an alias if there is one.
-pub(super) fn item(expr: Expr, alias: Option<Ident>) -> SelectItem {
+pub(super) fn select_item(expr: Expr, alias: Option<Ident>) -> SelectItem {
     match alias {
         Some(alias) => SelectItem::ExprWithAlias { expr, alias },
         None => SelectItem::UnnamedExpr(expr),

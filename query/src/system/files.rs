@@ -11,7 +11,7 @@ use datafusion::error::Result;
 use echolake_lake::{DataFile, FileName, LakeSnapshot, VisibleRun};
 use echolake_schema::tables::Table;
 
-use super::{SystemRows, batch, column, schema};
+use super::{SystemRows, build_batch, build_schema, column_field};
 
 #[derive(Debug)]
 pub(super) struct LakeFiles {
@@ -19,26 +19,32 @@ pub(super) struct LakeFiles {
 }
 
 /// The columns of the table.
-pub(super) fn columns() -> SchemaRef {
-    schema([
-        column("table", DataType::Utf8, false, "", "Table that the file is of"),
-        column("path", DataType::Utf8, false, "", "Path of the file in the lake"),
-        column("bytes", DataType::Int64, false, "B", "Size; if it has rows of other projects, the share of those seen"),
-        column("rows", DataType::Int64, false, "1", "Rows that readers see"),
-        column("runs", DataType::Int64, false, "1", "Runs whose rows readers see in it; 0 for tables of the rig"),
-        column("surface_id", DataType::Utf8, true, "", "Surface of its run; null unless it has one run"),
-        column("run_id", DataType::Utf8, true, "", "Its run; null unless it has one"),
-        column("version", DataType::Int64, false, "1", "Version of the table that added it"),
+pub(super) fn table_schema() -> SchemaRef {
+    build_schema([
+        column_field("table", DataType::Utf8, false, "", "Table that the file is of"),
+        column_field("path", DataType::Utf8, false, "", "Path of the file in the lake"),
+        column_field(
+            "bytes",
+            DataType::Int64,
+            false,
+            "B",
+            "Size; if it has rows of other projects, the share of those seen",
+        ),
+        column_field("rows", DataType::Int64, false, "1", "Rows that readers see"),
+        column_field("runs", DataType::Int64, false, "1", "Runs whose rows readers see in it; 0 for tables of the rig"),
+        column_field("surface_id", DataType::Utf8, true, "", "Surface of its run; null unless it has one run"),
+        column_field("run_id", DataType::Utf8, true, "", "Its run; null unless it has one"),
+        column_field("version", DataType::Int64, false, "1", "Version of the table that added it"),
     ])
 }
 
 #[async_trait]
 impl SystemRows for LakeFiles {
     fn schema(&self) -> SchemaRef {
-        columns()
+        table_schema()
     }
 
-    async fn rows(&self, _: &dyn Session) -> Result<RecordBatch> {
+    async fn read_rows(&self, _: &dyn Session) -> Result<RecordBatch> {
         let all = Table::ALL.into_iter().flat_map(|table| self.snapshot.files(table).iter().map(move |f| (table, f)));
         let files: Vec<_> = all.map(|(table, file)| (table, file, runs_of(file))).collect();
         let long = |value: &dyn Fn(&DataFile) -> u64| {
@@ -54,7 +60,7 @@ impl SystemRows for LakeFiles {
         let table = StringArray::from_iter_values(files.iter().map(|(table, _, _)| table.name()));
         let path = StringArray::from_iter_values(files.iter().map(|(_, file, _)| file.path.as_ref()));
         let runs = Int64Array::from_iter_values(files.iter().map(|(_, _, runs)| runs.len() as i64));
-        batch(
+        build_batch(
             self.schema(),
             vec![
                 Arc::new(table),

@@ -16,7 +16,7 @@ use futures::{StreamExt as _, TryStreamExt as _, stream};
 use object_store::path::Path;
 use object_store::{ObjectMeta, ObjectStoreExt as _};
 
-use super::{SystemRows, batch, column, schema, time};
+use super::{SystemRows, build_batch, build_schema, column_field, time_type};
 
 /// End of the name of a reason beside a refused file.
 const REASON: &str = ".reason.txt";
@@ -53,39 +53,45 @@ enum InboxReason {
 }
 
 /// The columns of the table.
-pub(super) fn columns() -> SchemaRef {
-    schema([
-        column(
+pub(super) fn table_schema() -> SchemaRef {
+    build_schema([
+        column_field(
             "state",
             DataType::Utf8,
             false,
             "",
             "waiting (for ingest), recording (not closed), incomplete (no end yet), refused, or unusable (never opened)",
         ),
-        column("path", DataType::Utf8, false, "", "Path of the file in the lake"),
-        column("bytes", DataType::Int64, false, "B", "Size"),
-        column("changed", time(), false, "", "Time of its last change, UTC"),
-        column("reason", DataType::Utf8, true, "", "Why ingest refuses it, the first 4096 bytes; null if it does not"),
+        column_field("path", DataType::Utf8, false, "", "Path of the file in the lake"),
+        column_field("bytes", DataType::Int64, false, "B", "Size"),
+        column_field("changed", time_type(), false, "", "Time of its last change, UTC"),
+        column_field(
+            "reason",
+            DataType::Utf8,
+            true,
+            "",
+            "Why ingest refuses it, the first 4096 bytes; null if it does not",
+        ),
     ])
 }
 
 #[async_trait]
 impl SystemRows for LakeInbox {
     fn schema(&self) -> SchemaRef {
-        columns()
+        table_schema()
     }
 
-    async fn rows(&self, _: &dyn Session) -> Result<RecordBatch> {
-        let mut files = self.files().await?;
+    async fn read_rows(&self, _: &dyn Session) -> Result<RecordBatch> {
+        let mut files = self.list_files().await?;
         let reasons: Vec<_> =
             files.iter_mut().map(|file| std::mem::replace(&mut file.reason, InboxReason::None)).collect();
-        let reasons = stream::iter(reasons).map(|reason| self.text(reason)).buffered(READS_AT_ONCE);
+        let reasons = stream::iter(reasons).map(|reason| self.read_reason(reason)).buffered(READS_AT_ONCE);
         let reasons: Vec<Option<String>> = reasons.try_collect().await.map_err(store_failed)?;
         let state = StringArray::from_iter_values(files.iter().map(|file| file.state));
         let path = StringArray::from_iter_values(files.iter().map(|file| file.path.as_str()));
         let bytes = Int64Array::from_iter_values(files.iter().map(|file| file.bytes as i64));
         let changed = files.iter().map(|file| file.changed_micros);
-        batch(
+        build_batch(
             self.schema(),
             vec![
                 Arc::new(state),
@@ -100,7 +106,7 @@ impl SystemRows for LakeInbox {
 
 impl LakeInbox {
     // None for readers of some projects: a file's project is not known before it is ingested.
-    async fn files(&self) -> Result<Vec<InboxFile>> {
+    async fn list_files(&self) -> Result<Vec<InboxFile>> {
         if self.lake.is_restricted() {
             return Ok(Vec::new());
         }
@@ -109,8 +115,8 @@ impl LakeInbox {
         let mut files = Vec::new();
         for object in inbox.files {
             match waiting_state(&object) {
-                Some(WAITING) if !self.has_end(&object).await => files.push(InboxFile::of(INCOMPLETE, object)),
-                Some(state) => files.push(InboxFile::of(state, object)),
+                Some(WAITING) if !self.has_end(&object).await => files.push(InboxFile::from_object(INCOMPLETE, object)),
+                Some(state) => files.push(InboxFile::from_object(state, object)),
                 None => {}
             }
         }
@@ -124,7 +130,7 @@ impl LakeInbox {
             let reason =
                 Path::parse(format!("{}{REASON}", object.location)).ok().and_then(|path| reasons.remove(&path));
             let reason = reason.map_or(InboxReason::None, InboxReason::Object);
-            files.push(InboxFile { reason, ..InboxFile::of("refused", object) });
+            files.push(InboxFile { reason, ..InboxFile::from_object("refused", object) });
         }
         Ok(files)
     }
@@ -139,7 +145,7 @@ impl LakeInbox {
         tail.map_or(true, |tail| has_file_end(&tail))
     }
 
-    async fn text(&self, reason: InboxReason) -> object_store::Result<Option<String>> {
+    async fn read_reason(&self, reason: InboxReason) -> object_store::Result<Option<String>> {
         let reason = match reason {
             InboxReason::Object(reason) if reason.size > 0 => reason,
             InboxReason::Text(text) => return Ok(Some(text)),
@@ -155,7 +161,7 @@ impl LakeInbox {
 }
 
 impl InboxFile {
-    fn of(state: &'static str, object: ObjectMeta) -> Self {
+    fn from_object(state: &'static str, object: ObjectMeta) -> Self {
         let ObjectMeta { location, size, last_modified, .. } = object;
         let changed_micros = last_modified.timestamp_micros();
         Self { state, path: location.to_string(), bytes: size, changed_micros, reason: InboxReason::None }

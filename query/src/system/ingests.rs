@@ -15,7 +15,7 @@ use datafusion::physical_plan::collect;
 use echolake_lake::{Lake, LakeSnapshot};
 use echolake_schema::tables::Table;
 
-use super::{SystemRows, batch, column, schema, time};
+use super::{SystemRows, build_batch, build_schema, column_field, time_type};
 
 /// Columns of `runs` that are among those of `system.ingests`.
 const OF_RUNS: [&str; 9] =
@@ -29,29 +29,35 @@ pub(super) struct LakeIngests {
 }
 
 /// The columns of the table, by those of `runs`.
-pub(super) fn columns(runs: &SchemaRef) -> SchemaRef {
+pub(super) fn table_schema(runs: &SchemaRef) -> SchemaRef {
     let own = [
-        column("version", DataType::Int64, true, "1", "Version of the lake in which the run has its present rows"),
-        column("ingested", time(), true, "", "Time of that version, UTC; null if the log no longer has it"),
+        column_field(
+            "version",
+            DataType::Int64,
+            true,
+            "1",
+            "Version of the lake in which the run has its present rows",
+        ),
+        column_field("ingested", time_type(), true, "", "Time of that version, UTC; null if the log no longer has it"),
     ];
     let of_runs = OF_RUNS.iter().filter_map(|name| runs.field_with_name(name).ok().cloned());
-    schema(own.into_iter().chain(of_runs))
+    build_schema(own.into_iter().chain(of_runs))
 }
 
 #[async_trait]
 impl SystemRows for LakeIngests {
     fn schema(&self) -> SchemaRef {
-        columns(&self.runs.schema())
+        table_schema(&self.runs.schema())
     }
 
-    async fn rows(&self, session: &dyn Session) -> Result<RecordBatch> {
+    async fn read_rows(&self, session: &dyn Session) -> Result<RecordBatch> {
         let runs = self.runs.schema();
         let columns = OF_RUNS.iter().map(|name| Ok(runs.index_of(name)?)).collect::<Result<Vec<_>>>()?;
         let plan = self.runs.scan(session, Some(&columns), &[], None).await?;
         let schema = plan.schema();
         let rows = concat_batches(&schema, &collect(plan, session.task_ctx()).await?)?;
         let failed = |e: echolake_lake::Error| DataFusionError::External(Box::new(e));
-        let times = self.lake.log().versions(Table::Runs).await.map_err(failed)?;
+        let times = self.lake.commit_log().list_versions(Table::Runs).await.map_err(failed)?;
         let times: HashMap<_, _> = times.iter().map(|v| (v.version, v.committed.timestamp_micros())).collect();
         let names = rows.column(1).as_string_opt::<i32>();
         let names = names.ok_or_else(|| DataFusionError::Internal("names of runs are texts".to_owned()))?;
@@ -66,6 +72,6 @@ impl SystemRows for LakeIngests {
             ),
         ];
         columns.extend(rows.columns().iter().cloned());
-        batch(self.schema(), columns)
+        build_batch(self.schema(), columns)
     }
 }

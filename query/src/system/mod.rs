@@ -41,7 +41,7 @@ trait SystemRows: std::fmt::Debug + Send + Sync {
     fn schema(&self) -> SchemaRef;
 
     /// Returns its rows.
-    async fn rows(&self, session: &dyn Session) -> Result<RecordBatch>;
+    async fn read_rows(&self, session: &dyn Session) -> Result<RecordBatch>;
 }
 
 /// A table whose rows are computed when it is scanned.
@@ -65,7 +65,7 @@ impl TableProvider for SystemTable {
         _: &[Expr],
         _: Option<usize>,
     ) -> Result<Arc<dyn ExecutionPlan>> {
-        let rows = self.0.rows(session).await?;
+        let rows = self.0.read_rows(session).await?;
         Ok(MemorySourceConfig::try_new_exec(&[vec![rows]], self.0.schema(), projection.cloned())?)
     }
 }
@@ -88,15 +88,15 @@ pub(crate) fn lake_tables(
 /// Returns the names and columns of the tables that every lake has; `runs` are the columns of its table of that name.
 pub(crate) fn lake_columns(runs: &SchemaRef) -> [(&'static str, SchemaRef); 4] {
     [
-        ("versions", versions::columns()),
-        ("files", files::columns()),
-        ("inbox", inbox::columns()),
-        ("ingests", ingests::columns(runs)),
+        ("versions", versions::table_schema()),
+        ("files", files::table_schema()),
+        ("inbox", inbox::table_schema()),
+        ("ingests", ingests::table_schema(runs)),
     ]
 }
 
 /// Returns the meaning of a system table.
-pub(crate) fn meaning(name: &str) -> Option<&'static str> {
+pub(crate) fn system_meaning(name: &str) -> Option<&'static str> {
     Some(match name {
         "versions" => "One row per version of a table: time, operation, files and rows that came and went.",
         "files" => "One row per data file of the snapshot: table, path, bytes, rows, surface and run.",
@@ -113,7 +113,7 @@ pub(crate) fn meaning(name: &str) -> Option<&'static str> {
 /// Returns the tables that the program around the engine has of itself.
 pub(crate) fn engine_tables(source: &Arc<dyn SystemSource>) -> Vec<(&'static str, Arc<dyn TableProvider>)> {
     let mut tables = Vec::new();
-    for (name, schema) in source.tables() {
+    for (name, schema) in source.table_schemas() {
         let rows = SourceRows { source: source.clone(), name, schema };
         tables.push((name, Arc::new(SystemTable(Box::new(rows))) as Arc<dyn TableProvider>));
     }
@@ -121,21 +121,21 @@ pub(crate) fn engine_tables(source: &Arc<dyn SystemSource>) -> Vec<(&'static str
 }
 
 /// A column with its unit, empty if it has none, and its meaning.
-fn column(name: &str, kind: DataType, is_nullable: bool, unit: &str, comment: &str) -> Field {
+fn column_field(name: &str, kind: DataType, is_nullable: bool, unit: &str, comment: &str) -> Field {
     let metadata = [(UNIT.to_owned(), unit.to_owned()), (COMMENT.to_owned(), comment.to_owned())];
     Field::new(name, kind, is_nullable).with_metadata(HashMap::from(metadata))
 }
 
 /// The type of times.
-fn time() -> DataType {
+fn time_type() -> DataType {
     DataType::Timestamp(TimeUnit::Microsecond, Some("UTC".into()))
 }
 
-fn schema(columns: impl IntoIterator<Item = Field>) -> SchemaRef {
+fn build_schema(columns: impl IntoIterator<Item = Field>) -> SchemaRef {
     Arc::new(Schema::new(columns.into_iter().collect::<Vec<_>>()))
 }
 
-fn batch(schema: SchemaRef, columns: Vec<ArrayRef>) -> Result<RecordBatch> {
+fn build_batch(schema: SchemaRef, columns: Vec<ArrayRef>) -> Result<RecordBatch> {
     Ok(RecordBatch::try_new(schema, columns)?)
 }
 

@@ -14,13 +14,13 @@ use super::SystemRows;
 #[async_trait]
 pub trait SystemSource: std::fmt::Debug + Send + Sync {
     /// Returns the names and schemas of its tables.
-    fn tables(&self) -> Vec<(&'static str, SchemaRef)>;
+    fn table_schemas(&self) -> Vec<(&'static str, SchemaRef)>;
 
     /// Returns the rows of a table, as they are now.
     ///
     /// # Errors
     /// Reason that there are none.
-    async fn rows(&self, table: &'static str) -> std::result::Result<RecordBatch, String>;
+    async fn read_rows(&self, table: &'static str) -> std::result::Result<RecordBatch, String>;
 }
 
 #[derive(Debug)]
@@ -36,7 +36,7 @@ impl SystemRows for SourceRows {
         self.schema.clone()
     }
 
-    async fn rows(&self, _: &dyn Session) -> Result<RecordBatch> {
-        self.source.rows(self.name).await.map_err(DataFusionError::Execution)
+    async fn read_rows(&self, _: &dyn Session) -> Result<RecordBatch> {
+        self.source.read_rows(self.name).await.map_err(DataFusionError::Execution)
     }
 }

@@ -19,12 +19,12 @@ struct Numbers;
 
 #[async_trait]
 impl SystemSource for Numbers {
-    fn tables(&self) -> Vec<(&'static str, SchemaRef)> {
+    fn table_schemas(&self) -> Vec<(&'static str, SchemaRef)> {
         vec![("numbers", Arc::new(Schema::new(vec![Field::new("n", DataType::Int64, false)])))]
     }
 
-    async fn rows(&self, table: &'static str) -> Result<RecordBatch, String> {
-        let [(name, schema)] = self.tables().try_into().map_err(|_| "one table")?;
+    async fn read_rows(&self, table: &'static str) -> Result<RecordBatch, String> {
+        let [(name, schema)] = self.table_schemas().try_into().map_err(|_| "one table")?;
         assert_eq!(table, name);
         RecordBatch::try_new(schema, vec![Arc::new(Int64Array::from(vec![1, 2]))]).map_err(|e| e.to_string())
     }
@@ -43,7 +43,7 @@ fn session_of(lake: &Lake, source: Option<Arc<dyn SystemSource>>) -> Session {
     if let Some(source) = source {
         engine.add_system_tables(source);
     }
-    engine.session(&Arc::new(EngineClient::new("test", QueryQuota::default())))
+    engine.open_session(&Arc::new(EngineClient::new("test", QueryQuota::default())))
 }
 
 async fn number(session: &Session, sql: &str) -> i64 {

@@ -12,7 +12,7 @@ use echolake_lake::{Lake, TableChange};
 use echolake_schema::tables::Table;
 use futures::future::try_join_all;
 
-use super::{SystemRows, batch, column, schema, time};
+use super::{SystemRows, build_batch, build_schema, column_field, time_type};
 
 #[derive(Debug)]
 pub(super) struct LakeVersions {
@@ -20,16 +20,22 @@ pub(super) struct LakeVersions {
 }
 
 /// The columns of the table.
-pub(super) fn columns() -> SchemaRef {
-    schema([
-        column("table", DataType::Utf8, false, "", "The table"),
-        column("version", DataType::Int64, false, "1", "Version, for VERSION AS OF; the lake's is that of runs"),
-        column("committed", time(), false, "", "Time of its commit, UTC"),
-        column("operation", DataType::Utf8, true, "", "What the writer says it did"),
-        column("files_added", DataType::Int64, false, "1", "Files that came"),
-        column("files_removed", DataType::Int64, false, "1", "Files that went"),
-        column("rows_added", DataType::Int64, true, "1", "Rows of the files that came; null if a file does not say"),
-        column(
+pub(super) fn table_schema() -> SchemaRef {
+    build_schema([
+        column_field("table", DataType::Utf8, false, "", "The table"),
+        column_field("version", DataType::Int64, false, "1", "Version, for VERSION AS OF; the lake's is that of runs"),
+        column_field("committed", time_type(), false, "", "Time of its commit, UTC"),
+        column_field("operation", DataType::Utf8, true, "", "What the writer says it did"),
+        column_field("files_added", DataType::Int64, false, "1", "Files that came"),
+        column_field("files_removed", DataType::Int64, false, "1", "Files that went"),
+        column_field(
+            "rows_added",
+            DataType::Int64,
+            true,
+            "1",
+            "Rows of the files that came; null if a file does not say",
+        ),
+        column_field(
             "rows_removed",
             DataType::Int64,
             true,
@@ -42,13 +48,13 @@ pub(super) fn columns() -> SchemaRef {
 #[async_trait]
 impl SystemRows for LakeVersions {
     fn schema(&self) -> SchemaRef {
-        columns()
+        table_schema()
     }
 
-    async fn rows(&self, _: &dyn Session) -> Result<RecordBatch> {
-        let log = self.lake.log();
+    async fn read_rows(&self, _: &dyn Session) -> Result<RecordBatch> {
+        let log = self.lake.commit_log();
         let changes = Table::ALL.into_iter().map(|table| async move {
-            let changes = log.changes(table).await.map_err(|e| DataFusionError::External(Box::new(e)))?;
+            let changes = log.list_changes(table).await.map_err(|e| DataFusionError::External(Box::new(e)))?;
             Ok::<_, DataFusionError>(changes.into_iter().map(move |change| (table, change)))
         });
         let changes: Vec<(Table, TableChange)> = try_join_all(changes).await?.into_iter().flatten().collect();
@@ -59,7 +65,7 @@ impl SystemRows for LakeVersions {
         let table = StringArray::from_iter_values(changes.iter().map(|(table, _)| table.name()));
         let times = changes.iter().map(|(_, change)| change.version.committed.timestamp_micros());
         let operation: StringArray = changes.iter().map(|(_, change)| change.operation.as_deref()).collect();
-        batch(
+        build_batch(
             self.schema(),
             vec![
                 Arc::new(table),

@@ -3,8 +3,8 @@
 
 use echolake_schema::{Grid, Symmetry};
 
-pub(super) fn sql(grid: &Grid) -> String {
-    let has = |s: &Symmetry| grid.permutation(*s).is_some() && grid.moved_pairs(*s).is_some();
+pub(super) fn view_sql(grid: &Grid) -> String {
+    let has = |s: &Symmetry| grid.point_permutation(*s).is_some() && grid.moved_pairs(*s).is_some();
     let row = |(id, s): (usize, Symmetry)| format!("(CAST({id} AS INT), '{}')", s.name());
     let symmetries: Vec<_> = Symmetry::ALL.into_iter().enumerate().filter(|(_, s)| has(s)).map(row).collect();
     let ends =

@@ -4,7 +4,7 @@ use std::collections::HashMap;
 
 use echolake_schema::Rig;
 
-use super::{RE_FLAT_BAND, RE_FLAT_TOTAL, note};
+use super::{RE_FLAT_BAND, RE_FLAT_TOTAL, column_note};
 
 // Column of `surface_stats`, name of its columns here, unit and meaning.
 const STATS: [(&str, &str, &str, &str); 4] = [
@@ -14,20 +14,23 @@ const STATS: [(&str, &str, &str, &str); 4] = [
     ("spread_db", "spread", "dB", "Standard deviation of TNCE in dB over the pairs"),
 ];
 
-fn bands(rig: &Rig) -> Vec<String> {
+fn level_bands(rig: &Rig) -> Vec<String> {
     rig.band_names().into_iter().chain(["total".to_owned()]).collect()
 }
 
-pub(super) fn sql(rig: &Rig) -> String {
+pub(super) fn view_sql(rig: &Rig) -> String {
     let names: Vec<_> = STATS
         .iter()
-        .flat_map(|(column, name, ..)| bands(rig).into_iter().map(move |b| (*column, format!("{name}_{b}_db"), b)))
+        .flat_map(|(column, name, ..)| {
+            level_bands(rig).into_iter().map(move |b| (*column, format!("{name}_{b}_db"), b))
+        })
         .collect();
     let pivot = |(column, name, band): &(&str, String, String)| {
         format!("max(CASE WHEN band = '{band}' THEN {column} END) AS {name}")
     };
     let own = names.iter().map(|(_, name, _)| format!("t.{name}"));
-    let against = bands(rig).into_iter().map(|b| format!("t.level_{b}_db - f.level_{b}_db AS against_flat_{b}_db"));
+    let against =
+        level_bands(rig).into_iter().map(|b| format!("t.level_{b}_db - f.level_{b}_db AS against_flat_{b}_db"));
     let levels: Vec<_> = own.chain(against).collect();
     let statistics = format!(
         "(SELECT run_id, {} FROM surface_stats GROUP BY run_id)",
@@ -51,23 +54,23 @@ pub(super) fn sql(rig: &Rig) -> String {
     )
 }
 
-pub(super) fn notes(rig: &Rig) -> HashMap<String, HashMap<String, String>> {
+pub(super) fn column_notes(rig: &Rig) -> HashMap<String, HashMap<String, String>> {
     let own = [
-        note("runs", "1", "Runs of the surface"),
-        note("all_measurements", "1", "Accepted measurements of all of its runs"),
-        note("first_started", "", "Start of its first run, UTC"),
-        note("last_ended", "", "End of its last run, UTC"),
-        note("run_id", "", "Its newest run; what follows is of that"),
+        column_note("runs", "1", "Runs of the surface"),
+        column_note("all_measurements", "1", "Accepted measurements of all of its runs"),
+        column_note("first_started", "", "Start of its first run, UTC"),
+        column_note("last_ended", "", "End of its last run, UTC"),
+        column_note("run_id", "", "Its newest run; what follows is of that"),
     ];
     let levels = STATS.iter().flat_map(|(_, name, unit, comment)| {
-        bands(rig).into_iter().map(move |b| {
+        level_bands(rig).into_iter().map(move |b| {
             let of = if b == "total" { "all bands".to_owned() } else { format!("the band at {b} Hz") };
-            note(format!("{name}_{b}_db"), unit, format!("{comment}, {of}, newest run"))
+            column_note(format!("{name}_{b}_db"), unit, format!("{comment}, {of}, newest run"))
         })
     });
-    let against = bands(rig).into_iter().map(|b| {
+    let against = level_bands(rig).into_iter().map(|b| {
         let name = format!("against_flat_{b}_db");
-        note(name, RE_FLAT_BAND, format!("level_{b}_db less that of the surface's Flat"))
+        column_note(name, RE_FLAT_BAND, format!("level_{b}_db less that of the surface's Flat"))
     });
     own.into_iter().chain(levels).chain(against).collect()
 }

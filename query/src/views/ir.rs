@@ -17,17 +17,17 @@ pub(super) const GEOMETRY: [&str; 11] = [
 ];
 
 /// Returns the SQL of the geometry columns for the pair of a row of `table`.
-pub(super) fn geometry(table: &str) -> String {
+pub(super) fn geometry_columns(table: &str) -> String {
     let column = |name: &&str| format!("pair_{name}({table}.pair_id) AS {name}");
     GEOMETRY.iter().map(column).collect::<Vec<_>>().join(", ")
 }
 
-pub(super) fn sql() -> String {
+pub(super) fn view_sql() -> String {
     format!(
         "SELECT m.surface_id, m.run_id, m.pair_id, m.microphone, m.speaker, {}, m.log_time_ns, m.log_time, \
          m.temperature_c, m.snr_db, m.ir, n.reflected_ir \
          FROM measurements m LEFT JOIN nce n \
          ON n.surface_id = m.surface_id AND n.run_id = m.run_id AND n.pair_id = m.pair_id",
-        geometry("m")
+        geometry_columns("m")
     )
 }

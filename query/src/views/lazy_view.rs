@@ -24,7 +24,7 @@ type ViewPlanner = Box<dyn FnOnce() -> Result<ViewTable> + Send>;
 pub(crate) struct LazyView(LazyLock<Result<ViewTable>, ViewPlanner>);
 
 impl LazyView {
-    /// `tables` are those of [`LakeView::tables`].
+    /// `tables` are those of [`LakeView::source_tables`].
     pub(crate) fn new(
         view: LakeView,
         lake: &Lake,
@@ -32,10 +32,10 @@ impl LazyView {
         tables: HashMap<Table, Arc<dyn TableProvider>>,
     ) -> Self {
         let (lake, lookups) = (lake.clone(), lookups.clone());
-        Self(LazyLock::new(Box::new(move || view.over(&lake, &lookups, &tables))))
+        Self(LazyLock::new(Box::new(move || view.plan_over(&lake, &lookups, &tables))))
     }
 
-    fn planned(&self) -> Option<&ViewTable> {
+    fn planned_view(&self) -> Option<&ViewTable> {
         self.0.as_ref().ok()
     }
 }
@@ -43,7 +43,7 @@ impl LazyView {
 #[async_trait]
 impl TableProvider for LazyView {
     fn schema(&self) -> SchemaRef {
-        self.planned().map_or_else(|| Arc::new(Schema::empty()), TableProvider::schema)
+        self.planned_view().map_or_else(|| Arc::new(Schema::empty()), TableProvider::schema)
     }
 
     fn table_type(&self) -> TableType {
@@ -51,11 +51,11 @@ impl TableProvider for LazyView {
     }
 
     fn get_table_definition(&self) -> Option<&str> {
-        self.planned()?.get_table_definition()
+        self.planned_view()?.get_table_definition()
     }
 
     fn get_logical_plan(&self) -> Option<Cow<'_, LogicalPlan>> {
-        self.planned()?.get_logical_plan()
+        self.planned_view()?.get_logical_plan()
     }
 
     // DataFusion puts the plan of a view in the place of its scan.

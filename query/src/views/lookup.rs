@@ -36,14 +36,14 @@ impl LookupFunctions {
     ///
     /// # Errors
     /// If the rig's pairs cannot be laid out.
-    pub(crate) fn of(lake: &Lake) -> echolake_lake::Result<Self> {
-        let pairs = lake.pairs()?;
+    pub(crate) fn from_lake(lake: &Lake) -> echolake_lake::Result<Self> {
+        let pairs = lake.pair_rows()?;
         let columns = pairs.schema();
         let own = columns.fields().iter().zip(pairs.columns()).skip(1);
         let mut all: Vec<_> = own
             .map(|(field, values)| LookupFunction::new(OF_PAIR, field.name(), values.clone(), pairs.num_rows(), 1))
             .collect();
-        all.extend(moved(lake.grid()));
+        all.extend(moved_lookups(lake.grid()));
         Ok(Self(all.into_iter().map(|lookup| Arc::new(ScalarUDF::from(lookup))).collect()))
     }
 
@@ -52,14 +52,14 @@ impl LookupFunctions {
         self.0.iter().find(|function| function.name().strip_prefix(OF_PAIR) == Some(column))
     }
 
-    pub(super) fn register(&self, context: &SessionContext) {
+    pub(super) fn register_functions(&self, context: &SessionContext) {
         for function in &self.0 {
             context.register_udf(function.as_ref().clone());
         }
     }
 }
 
-fn moved(grid: &Grid) -> Vec<LookupFunction> {
+fn moved_lookups(grid: &Grid) -> Vec<LookupFunction> {
     // A symmetry that the grid lacks is in no view; nulls fill its place, so that the ids stay the same.
     let moved: Vec<Option<MovedPair>> = Symmetry::ALL
         .into_iter()
@@ -95,7 +95,7 @@ impl LookupFunction {
         Self { name: format!("{prefix}{name}"), values, pairs, signature }
     }
 
-    fn index(&self, pair: Option<i32>, symmetry: Option<i32>) -> Option<u32> {
+    fn value_index(&self, pair: Option<i32>, symmetry: Option<i32>) -> Option<u32> {
         let pair = usize::try_from(pair?).ok().filter(|p| *p < self.pairs)?;
         let index = usize::try_from(symmetry?).ok()?.checked_mul(self.pairs)?.checked_add(pair)?;
         u32::try_from(index).ok().filter(|_| index < self.values.len())
@@ -137,9 +137,9 @@ impl ScalarUDFImpl for LookupFunction {
         let indices: UInt32Array = match columns.get(1) {
             Some(symmetries) => {
                 let symmetries = symmetries.as_primitive::<Int32Type>();
-                pairs.iter().zip(symmetries).map(|(p, s)| self.index(p, s)).collect()
+                pairs.iter().zip(symmetries).map(|(p, s)| self.value_index(p, s)).collect()
             }
-            None => pairs.unary_opt(|p| self.index(Some(p), Some(0))),
+            None => pairs.unary_opt(|p| self.value_index(Some(p), Some(0))),
         };
         Ok(ColumnarValue::Array(take(&self.values, &indices, None)?))
     }

@@ -64,7 +64,7 @@ type ColumnNotes = HashMap<String, HashMap<String, String>>;
 /// ```
 pub fn table_meaning(name: &str) -> Option<&'static str> {
     if let Some((SYSTEM_SCHEMA, name)) = name.split_once('.') {
-        return system::meaning(name);
+        return system::system_meaning(name);
     }
     Table::by_name(name).map(Table::meaning).or_else(|| LakeView::by_name(name).map(LakeView::meaning))
 }
@@ -98,7 +98,7 @@ impl LakeView {
     }
 
     /// Returns the tables that it reads.
-    pub(crate) fn tables(self) -> &'static [Table] {
+    pub(crate) fn source_tables(self) -> &'static [Table] {
         match self {
             Self::Ir => &[Table::Measurements, Table::Nce],
             Self::TnceDb => &[Table::Tnce],
@@ -108,30 +108,30 @@ impl LakeView {
     }
 
     /// Returns its definition over the tables.
-    pub(crate) fn sql(self, lake: &Lake) -> String {
+    pub(crate) fn definition_sql(self, lake: &Lake) -> String {
         match self {
-            Self::Ir => ir::sql(),
-            Self::TnceDb => tnce_db::sql(lake.rig()),
-            Self::Augmented => augmented::sql(lake.grid()),
-            Self::Catalogue => catalogue::sql(lake.rig()),
+            Self::Ir => ir::view_sql(),
+            Self::TnceDb => tnce_db::view_sql(lake.rig()),
+            Self::Augmented => augmented::view_sql(lake.grid()),
+            Self::Catalogue => catalogue::view_sql(lake.rig()),
         }
     }
 
     // Columns taken from the tables keep their own metadata; these are the others.
-    fn notes(self, lake: &Lake) -> ColumnNotes {
+    fn column_notes(self, lake: &Lake) -> ColumnNotes {
         match self {
             Self::Ir => notes_of(Table::Pairs, lake),
-            Self::TnceDb => notes_of(Table::Pairs, lake).into_iter().chain(tnce_db::notes(lake.rig())).collect(),
+            Self::TnceDb => notes_of(Table::Pairs, lake).into_iter().chain(tnce_db::column_notes(lake.rig())).collect(),
             Self::Augmented => notes_of(Table::TnceD4, lake),
-            Self::Catalogue => catalogue::notes(lake.rig()),
+            Self::Catalogue => catalogue::column_notes(lake.rig()),
         }
     }
 
-    /// Plans the view over tables, which are those of [`LakeView::tables`].
+    /// Plans the view over tables, which are those of [`LakeView::source_tables`].
     ///
     /// # Errors
     /// If the view does not fit the tables, which is a bug in this crate.
-    pub(crate) fn over(
+    pub(crate) fn plan_over(
         self,
         lake: &Lake,
         lookups: &LookupFunctions,
@@ -141,13 +141,13 @@ impl LakeView {
         for (table, provider) in tables {
             context.register_table(table.name(), provider.clone())?;
         }
-        lookups.register(&context);
-        let sql = self.sql(lake);
+        lookups.register_functions(&context);
+        let sql = self.definition_sql(lake);
         // Planning only needs tables in memory, so it does not wait.
         let plan = context.state().create_logical_plan(&sql).now_or_never().ok_or_else(|| {
             DataFusionError::Internal(format!("planning the view {} waits for something", self.name()))
         })??;
-        Ok(ViewTable::new(annotated(plan, &self.notes(lake))?, Some(sql)))
+        Ok(ViewTable::new(annotate_columns(plan, &self.column_notes(lake))?, Some(sql)))
     }
 
     /// Returns its schema, which is empty if the view does not fit the lake's tables.
@@ -155,11 +155,11 @@ impl LakeView {
         let empty = |table: &Table| -> (Table, Arc<dyn TableProvider>) {
             (*table, Arc::new(EmptyTable::new(table.schema(lake.rig()))))
         };
-        LazyView::new(self, lake, lookups, self.tables().iter().map(empty).collect()).schema()
+        LazyView::new(self, lake, lookups, self.source_tables().iter().map(empty).collect()).schema()
     }
 }
 
-fn annotated(plan: LogicalPlan, notes: &ColumnNotes) -> Result<LogicalPlan> {
+fn annotate_columns(plan: LogicalPlan, notes: &ColumnNotes) -> Result<LogicalPlan> {
     let column = |field: &Arc<Field>| match notes.get(field.name()) {
         Some(note) => ident(field.name()).alias_with_metadata(field.name(), Some(FieldMetadata::from(note))),
         None => ident(field.name()),
@@ -168,7 +168,7 @@ fn annotated(plan: LogicalPlan, notes: &ColumnNotes) -> Result<LogicalPlan> {
     LogicalPlanBuilder::from(plan).project(columns)?.build()
 }
 
-fn note(column: impl Into<String>, unit: &str, comment: impl Into<String>) -> (String, HashMap<String, String>) {
+fn column_note(column: impl Into<String>, unit: &str, comment: impl Into<String>) -> (String, HashMap<String, String>) {
     let metadata = [(UNIT.to_owned(), unit.to_owned()), (COMMENT.to_owned(), comment.into())];
     (column.into(), HashMap::from(metadata))
 }

@@ -29,7 +29,7 @@ impl PairJoin {
     }
 
     // Returns the same rows without the join; None if the join is needed.
-    fn without(&self, join: &Join) -> Option<Result<LogicalPlan>> {
+    fn without_join(&self, join: &Join) -> Option<Result<LogicalPlan>> {
         let [(left, right)] = join.on.as_slice() else { return None };
         let (left, right) = (left.try_as_col()?, right.try_as_col()?);
         if join.filter.is_some() {
@@ -45,7 +45,7 @@ impl PairJoin {
         }
         let columns = join.schema.columns().into_iter();
         let columns = columns.map(|column| match pairs.schema().has_column(&column) {
-            true => self.of(&column, key, pairs),
+            true => self.lookup_column(&column, key, pairs),
             false => Some(Expr::Column(column)),
         });
         let columns: Vec<_> = columns.collect::<Option<_>>()?;
@@ -53,7 +53,7 @@ impl PairJoin {
     }
 
     // Returns a column of `pairs` as a lookup by `key`.
-    fn of(&self, column: &Column, key: &Column, pairs: &LogicalPlan) -> Option<Expr> {
+    fn lookup_column(&self, column: &Column, key: &Column, pairs: &LogicalPlan) -> Option<Expr> {
         let value = match column.name.as_str() {
             KEY => Expr::Column(key.clone()),
             name => self.0.of_pair(name)?.call(vec![Expr::Column(key.clone())]),
@@ -75,7 +75,7 @@ impl OptimizerRule for PairJoin {
 
     fn rewrite(&self, plan: LogicalPlan, _config: &dyn OptimizerConfig) -> Result<Transformed<LogicalPlan>> {
         match &plan {
-            LogicalPlan::Join(join) => match self.without(join) {
+            LogicalPlan::Join(join) => match self.without_join(join) {
                 Some(without) => Ok(Transformed::yes(without?)),
                 None => Ok(Transformed::no(plan)),
             },
@@ -86,17 +86,17 @@ impl OptimizerRule for PairJoin {
 
 // Returns whether the plan has all rows of `pairs`, with the key under its own name.
 fn is_pairs(plan: &LogicalPlan, key: &Column) -> bool {
-    key.name == KEY && scanned(plan, true) == Some(Table::Pairs)
+    key.name == KEY && scanned_table(plan, true) == Some(Table::Pairs)
 }
 
 // Returns whether the column is `pair_id` of a table of measurements, so that it has only pairs of the rig.
 fn is_measured(plan: &LogicalPlan, key: &Column) -> bool {
     let measured = [Table::Measurements, Table::Nce, Table::Tnce, Table::TnceD4];
-    key.name == KEY && scanned(plan, false).is_some_and(|table| measured.contains(&table))
+    key.name == KEY && scanned_table(plan, false).is_some_and(|table| measured.contains(&table))
 }
 
 /// Returns the table whose rows the plan has, with columns under their own names: `all` of its rows, or some.
-pub(super) fn scanned(plan: &LogicalPlan, all: bool) -> Option<Table> {
+pub(super) fn scanned_table(plan: &LogicalPlan, all: bool) -> Option<Table> {
     match plan {
         LogicalPlan::TableScan(scan) => {
             let provider = source_as_provider(&scan.source).ok()?;
@@ -104,11 +104,11 @@ pub(super) fn scanned(plan: &LogicalPlan, all: bool) -> Option<Table> {
             let whole = scan.filters.is_empty() && scan.fetch.is_none();
             provider.downcast_ref::<LakeTable>().map(LakeTable::table).filter(|_| whole || !all)
         }
-        LogicalPlan::Filter(filter) if !all => scanned(&filter.input, all),
-        LogicalPlan::SubqueryAlias(alias) => scanned(&alias.input, all),
+        LogicalPlan::Filter(filter) if !all => scanned_table(&filter.input, all),
+        LogicalPlan::SubqueryAlias(alias) => scanned_table(&alias.input, all),
         LogicalPlan::Projection(projection) => {
             let plain = projection.expr.iter().all(|e| matches!(e, Expr::Column(_)));
-            scanned(&projection.input, all).filter(|_| plain)
+            scanned_table(&projection.input, all).filter(|_| plain)
         }
         _ => None,
     }

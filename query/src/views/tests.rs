@@ -7,7 +7,7 @@ use arrow::buffer::OffsetBuffer;
 use arrow::compute::{cast, concat_batches};
 use arrow::datatypes::{DataType, Field, Float32Type, Float64Type, Int32Type, Int64Type};
 use arrow::record_batch::RecordBatch;
-use echolake_lake::{FileName, Lake, ReferenceSurfaces, RunRowCounts, VisibleRun, encode};
+use echolake_lake::{FileName, Lake, ReferenceSurfaces, RunRowCounts, VisibleRun, encode_batches};
 use echolake_schema::tables::{COMMENT, Table, UNIT};
 use echolake_schema::{Rig, Symmetry};
 
@@ -69,14 +69,14 @@ async fn put(lake: &Lake, surface: &str, run: &str) {
     for table in TABLES {
         let schema = table.schema(lake.rig());
         let columns = schema.fields().iter().map(|f| column(table, f, surface, run)).collect();
-        let file = encode(table, &schema, &[RecordBatch::try_new(schema.clone(), columns).expect("rows")]);
+        let file = encode_batches(table, &schema, &[RecordBatch::try_new(schema.clone(), columns).expect("rows")]);
         let name = if table == Table::Runs { FileName::Pointer(pointer.clone()) } else { rows.clone() };
-        let file = lake.stage(table, &name, file.expect("encoded")).await.expect("staged");
+        let file = lake.stage_file(table, &name, file.expect("encoded")).await.expect("staged");
         // The run has no rows in tables that are not here.
-        let counted = if table == Table::Runs { file.counting(RunRowCounts::default(), &staged) } else { file };
+        let counted = if table == Table::Runs { file.with_row_counts(RunRowCounts::default(), &staged) } else { file };
         staged.push(counted);
     }
-    lake.commit(&staged).await.expect("committed");
+    lake.commit_staged(&staged).await.expect("committed");
 }
 
 async fn rows(session: &Session, sql: &str) -> RecordBatch {
@@ -103,7 +103,7 @@ async fn views_are_listed_and_every_column_says_what_it_means() {
     let session = Session::new(&lake).expect("a session");
     let listed = "select count(*) from information_schema.tables where table_type = 'VIEW' and table_schema = 'public'";
     assert_eq!(number(&session, listed).await, LakeView::ALL.len() as i64);
-    for (name, schema) in session.tables() {
+    for (name, schema) in session.table_schemas() {
         for field in schema.fields() {
             let metadata = field.metadata();
             assert!(metadata.get(COMMENT).is_some_and(|c| c.len() > 5), "{name}.{}", field.name());
@@ -202,7 +202,7 @@ async fn the_past_is_seen_until_it_is_vacuumed() {
     let count = async |of: &str| number(&session, &format!("select count(*) from {of}")).await;
     put(&lake, "0001_0", "r1").await;
     assert_eq!(count("runs").await, 1);
-    let first = lake.versions().await.expect("versions").pop().expect("a version");
+    let first = lake.list_versions().await.expect("versions").pop().expect("a version");
     put(&lake, "0002_0", "r2").await;
     assert_eq!(count("runs").await, 2, "what is committed is seen by the next query");
     let (number, then) = (first.version, first.committed.to_rfc3339());
@@ -249,7 +249,7 @@ async fn pairs_are_looked_up_where_a_measurement_names_them() {
         "select n.pair_id, incidence_deg, microphone_x_mm from (select pair_id from nce where pair_id < 9) n, pairs
             where n.pair_id = pairs.pair_id",
     ];
-    let own = lake.pairs().expect("pairs");
+    let own = lake.pair_rows().expect("pairs");
     for sql in looked_up {
         let answer = rows(&session, &format!("{sql} order by 1")).await;
         assert!(!plan(&session, sql).await.contains("Join"), "{sql}");

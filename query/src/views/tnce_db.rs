@@ -4,8 +4,8 @@ use std::collections::HashMap;
 
 use echolake_schema::Rig;
 
-use super::ir::geometry;
-use super::{RE_FLAT_BAND, RE_FLAT_TOTAL, note};
+use super::ir::geometry_columns;
+use super::{RE_FLAT_BAND, RE_FLAT_TOTAL, column_note};
 
 /// A level of the view.
 struct LevelColumn {
@@ -23,7 +23,7 @@ impl LevelColumn {
     }
 }
 
-fn levels(rig: &Rig) -> Vec<LevelColumn> {
+fn level_columns(rig: &Rig) -> Vec<LevelColumn> {
     let bands = rig.band_names();
     let over_total = bands.iter().map(|b| {
         LevelColumn::new(format!("tnce_{b}"), RE_FLAT_TOTAL, &format!("of the band at {b} Hz over Flat's total"))
@@ -37,16 +37,16 @@ fn levels(rig: &Rig) -> Vec<LevelColumn> {
 }
 
 // Zero energy has no level: null.
-pub(super) fn sql(rig: &Rig) -> String {
+pub(super) fn view_sql(rig: &Rig) -> String {
     let level = |LevelColumn { energy, name, .. }: &LevelColumn| format!("10 * log10(nullif(t.{energy}, 0)) AS {name}");
-    let levels: Vec<_> = levels(rig).iter().map(level).collect();
+    let levels: Vec<_> = level_columns(rig).iter().map(level).collect();
     format!(
         "SELECT t.surface_id, t.run_id, t.pair_id, t.microphone, t.speaker, {}, {} FROM tnce t",
-        geometry("t"),
+        geometry_columns("t"),
         levels.join(", ")
     )
 }
 
-pub(super) fn notes(rig: &Rig) -> impl Iterator<Item = (String, HashMap<String, String>)> {
-    levels(rig).into_iter().map(|level| note(level.name, level.unit, level.comment))
+pub(super) fn column_notes(rig: &Rig) -> impl Iterator<Item = (String, HashMap<String, String>)> {
+    level_columns(rig).into_iter().map(|level| column_note(level.name, level.unit, level.comment))
 }

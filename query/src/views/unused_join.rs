@@ -13,7 +13,7 @@ use datafusion::optimizer::optimizer::ApplyOrder;
 use datafusion::optimizer::{OptimizerConfig, OptimizerRule};
 use echolake_schema::Table;
 
-use super::pair_join::scanned;
+use super::pair_join::scanned_table;
 
 /// The rule.
 #[derive(Debug)]
@@ -83,6 +83,6 @@ fn changes_nothing(join: &Join, used: &HashSet<Column>) -> bool {
 
 fn finds_one(right: &LogicalPlan, on: &[(Expr, Expr)]) -> bool {
     let keys: HashSet<_> = on.iter().filter_map(|(_, key)| key.try_as_col()).map(|key| key.name.as_str()).collect();
-    let key = scanned(right, false).map_or(&[] as &[_], Table::key);
+    let key = scanned_table(right, false).map_or(&[] as &[_], Table::key);
     !key.is_empty() && key.iter().all(|column| keys.contains(column))
 }

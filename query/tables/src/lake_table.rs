@@ -103,7 +103,7 @@ impl LakeTable {
 
     /// Makes it the table of this snapshot, which is refused if the snapshot has a fault in it.
     pub fn of_snapshot(self, snapshot: &Arc<LakeSnapshot>) -> Self {
-        let faulty = snapshot.check(self.table).is_err().then(|| snapshot.clone());
+        let faulty = snapshot.check_table(self.table).is_err().then(|| snapshot.clone());
         Self { faulty, ..self }
     }
 
@@ -124,7 +124,7 @@ impl LakeTable {
 
     // Prunes files by their statistics in the log. DataFusion would prune them, too, but only after opening each; a
     // query for one surface should not open the files of others.
-    fn kept(&self, state: &dyn Session, filters: &[Expr]) -> Result<Vec<&ScanFile>> {
+    fn kept_files(&self, state: &dyn Session, filters: &[Expr]) -> Result<Vec<&ScanFile>> {
         let all = || self.files.iter().collect();
         let Some(filter) = conjunction(filters.iter().cloned()) else { return Ok(all()) };
         let filter = state.create_physical_expr(filter, &self.columns)?;
@@ -152,8 +152,8 @@ impl LakeTable {
             source = source.with_metadata_size_hint(bytes);
         }
         let config = FileScanConfigBuilder::new(self.source.url.clone(), Arc::new(source))
-            .with_file_groups(groups(files, state.config().target_partitions()))
-            .with_statistics(self.known(files)?)
+            .with_file_groups(file_groups(files, state.config().target_partitions()))
+            .with_statistics(self.known_statistics(files)?)
             .with_batch_size((!lists).then_some(NARROW_BATCH_ROWS))
             .with_projection_indices(projection)?
             .with_limit(limit)
@@ -162,7 +162,7 @@ impl LakeTable {
     }
 
     // The columns in memory, if the table is small and the wanted ones are among them: each one's place in the cache.
-    async fn cached(&self, projection: Option<&Vec<usize>>) -> Result<Option<(RecordBatch, Vec<usize>)>> {
+    async fn cached_rows(&self, projection: Option<&Vec<usize>>) -> Result<Option<(RecordBatch, Vec<usize>)>> {
         let files = || self.files.iter().map(|f| &f.file);
         let Some(columns) = SmallTables::cached_columns(self.table, &self.schema, files()) else { return Ok(None) };
         let place = |column: usize| columns.iter().position(|cached| *cached == column);
@@ -173,13 +173,13 @@ impl LakeTable {
         let Some(wanted) = wanted else { return Ok(None) };
         let read = async || {
             let schema = Arc::new(self.schema.project(&columns)?);
-            self.source.small.rows(self.table, &schema, &files().collect::<Vec<_>>()).await
+            self.source.small.read_rows(self.table, &schema, &files().collect::<Vec<_>>()).await
         };
         let rows = self.rows.get_or_try_init(read).await?;
         Ok(Some((rows.clone(), wanted)))
     }
 
-    fn known(&self, files: &[&ScanFile]) -> Result<Statistics> {
+    fn known_statistics(&self, files: &[&ScanFile]) -> Result<Statistics> {
         if files.len() == self.files.len() {
             return Ok(self.all.clone());
         }
@@ -241,14 +241,14 @@ impl ScanFile {
         };
         // A restricted lake's scan does not read hidden rows; other scans filter them out.
         let only_visible = is_restricted && !file.hidden.is_empty();
-        let known = Arc::new(if only_visible { known_of_parts(&file, schema) } else { known(&file, schema) });
+        let known = Arc::new(if only_visible { known_of_parts(&file, schema) } else { file_statistics(&file, schema) });
         let part = PartitionedFile::new_from_meta(meta).with_statistics(known.clone());
         Self { file, part, known }
     }
 }
 
 // Statistics of a file from the log, so that a query for one surface does not open the files of others.
-fn known(file: &DataFile, schema: &SchemaRef) -> Statistics {
+fn file_statistics(file: &DataFile, schema: &SchemaRef) -> Statistics {
     let mut known = Statistics::new_unknown(schema);
     known.num_rows = Precision::Exact(file.rows as usize);
     for (field, column) in schema.fields().iter().zip(&mut known.column_statistics) {
@@ -257,8 +257,8 @@ fn known(file: &DataFile, schema: &SchemaRef) -> Statistics {
         }
         let Some(stats) = &file.stats else { continue };
         let kind = field.data_type();
-        let least = stats.min.get(field.name()).and_then(|v| scalar(kind, v.as_str(), v.as_i64()));
-        let greatest = stats.max.get(field.name()).and_then(|v| scalar(kind, v.as_str(), v.as_i64()));
+        let least = stats.min.get(field.name()).and_then(|v| scalar_bound(kind, v.as_str(), v.as_i64()));
+        let greatest = stats.max.get(field.name()).and_then(|v| scalar_bound(kind, v.as_str(), v.as_i64()));
         if let (Some(least), Some(greatest)) = (least, greatest) {
             column.min_value = Precision::Exact(least);
             column.max_value = Precision::Exact(greatest);
@@ -286,7 +286,7 @@ fn known_of_parts(file: &DataFile, schema: &SchemaRef) -> Statistics {
 
 // Only for integers and texts, as keys are. JSON does not represent every float exactly, so the file's own statistics
 // serve for those.
-fn scalar(kind: &DataType, text: Option<&str>, int: Option<i64>) -> Option<ScalarValue> {
+fn scalar_bound(kind: &DataType, text: Option<&str>, int: Option<i64>) -> Option<ScalarValue> {
     match kind {
         DataType::Utf8 => text.filter(|t| t.chars().count() < WHOLE_TEXT).map(ScalarValue::from),
         DataType::Int32 => int.and_then(|v| i32::try_from(v).ok()).map(ScalarValue::from),
@@ -295,7 +295,7 @@ fn scalar(kind: &DataType, text: Option<&str>, int: Option<i64>) -> Option<Scala
     }
 }
 
-fn groups(files: &[&ScanFile], count: usize) -> Vec<FileGroup> {
+fn file_groups(files: &[&ScanFile], count: usize) -> Vec<FileGroup> {
     let mut groups: Vec<(u64, Vec<PartitionedFile>)> = vec![(0, Vec::new()); count.clamp(1, files.len().max(1))];
     for file in files {
         if let Some((bytes, group)) = groups.iter_mut().min_by_key(|g| g.0) {
@@ -334,11 +334,11 @@ impl TableProvider for LakeTable {
         Some(statistics)
     }
 
-    boxed_scan!(self, state, projection, filters, limit => self.rows(state, projection, filters, limit));
+    boxed_scan!(self, state, projection, filters, limit => self.scan_rows(state, projection, filters, limit));
 }
 
 impl LakeTable {
-    fn rows<'a>(
+    fn scan_rows<'a>(
         &'a self,
         state: &'a dyn Session,
         projection: Option<&'a Vec<usize>>,
@@ -347,9 +347,9 @@ impl LakeTable {
     ) -> BoxFuture<'a, Result<Arc<dyn ExecutionPlan>>> {
         let rows = async move {
             if let Some(snapshot) = &self.faulty {
-                snapshot.check(self.table).map_err(|fault| DataFusionError::External(fault.into()))?;
+                snapshot.check_table(self.table).map_err(|fault| DataFusionError::External(fault.into()))?;
             }
-            match self.cached(projection).await? {
+            match self.cached_rows(projection).await? {
                 Some((rows, wanted)) => {
                     let schema = rows.schema();
                     let rows = MemorySourceConfig::try_new_exec(&[vec![rows]], schema, Some(wanted))?;
@@ -369,7 +369,7 @@ impl LakeTable {
         filters: &[Expr],
         limit: Option<usize>,
     ) -> Result<Arc<dyn ExecutionPlan>> {
-        let kept = self.kept(state, filters)?;
+        let kept = self.kept_files(state, filters)?;
         let (whole, partial): (Vec<_>, Vec<_>) = kept.into_iter().partition(|f| f.file.hidden.is_empty());
         match (whole.is_empty(), partial.is_empty()) {
             (true, true) => {

@@ -66,16 +66,16 @@ impl PartitionStream for VisibleRows {
             async move {
                 let names: Vec<_> = schema.fields().iter().map(|field| field.name().as_str()).collect();
                 let columns = if names.is_empty() { vec![RUN] } else { names };
-                let batches = lake.rows(table, &file, &columns, range).await.map_err(unread)?;
+                let batches = lake.read_rows(table, &file, &columns, range).await.map_err(read_error)?;
                 let wanted = schema.clone();
-                Ok::<_, DataFusionError>(batches.map(move |batch| with_columns(&batch.map_err(unread)?, &wanted)))
+                Ok::<_, DataFusionError>(batches.map(move |batch| with_columns(&batch.map_err(read_error)?, &wanted)))
             }
         });
         Box::pin(RecordBatchStreamAdapter::new(self.schema.clone(), rows.try_flatten()))
     }
 }
 
-fn unread(error: echolake_lake::Error) -> DataFusionError {
+fn read_error(error: echolake_lake::Error) -> DataFusionError {
     DataFusionError::External(Box::new(error))
 }
 

@@ -48,7 +48,7 @@ impl ParquetFileReaderFactory for LakeReaderFactory {
         let counters = Arc::new(CacheCounters::default());
         let cached = self.lake.store_for_scan(counters.clone());
         let store = cached.clone().unwrap_or_else(|| self.lake.store());
-        let footer_read = self.footer_reads.of(&file.object_meta.location);
+        let footer_read = self.footer_reads.footer_lock(&file.object_meta.location);
         let readers = CachedParquetFileReaderFactory::new(store, self.metadata.clone());
         let reader = readers.create_reader(partition_index, file, metadata_size_hint, metrics)?;
         let reader = Box::new(FooterReader { reader, footer_read });
@@ -72,7 +72,7 @@ impl ParquetFileReaderFactory for LakeReaderFactory {
 struct FooterReads(Mutex<HashMap<Path, Weak<AsyncMutex<()>>>>);
 
 impl FooterReads {
-    fn of(&self, path: &Path) -> Arc<AsyncMutex<()>> {
+    fn footer_lock(&self, path: &Path) -> Arc<AsyncMutex<()>> {
         let mut reads = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(read) = reads.get(path).and_then(Weak::upgrade) {
             return read;
@@ -128,8 +128,8 @@ struct CountingReader {
 }
 
 impl CountingReader {
-    fn report(&mut self) {
-        let now = self.counters.counts();
+    fn report_counts(&mut self) {
+        let now = self.counters.read_counts();
         let before = std::mem::replace(&mut self.reported, now);
         let difference = |now: u64, before: u64| usize::try_from(now - before).unwrap_or(usize::MAX);
         self.counts.memory_hits.add(difference(now.memory_hits, before.memory_hits));
@@ -143,7 +143,7 @@ impl AsyncFileReader for CountingReader {
     fn get_bytes(&mut self, range: Range<u64>) -> BoxFuture<'_, ParquetResult<Bytes>> {
         async move {
             let read = self.reader.get_bytes(range).await;
-            self.report();
+            self.report_counts();
             read
         }
         .boxed()
@@ -152,7 +152,7 @@ impl AsyncFileReader for CountingReader {
     fn get_byte_ranges(&mut self, ranges: Vec<Range<u64>>) -> BoxFuture<'_, ParquetResult<Vec<Bytes>>> {
         async move {
             let read = self.reader.get_byte_ranges(ranges).await;
-            self.report();
+            self.report_counts();
             read
         }
         .boxed()
@@ -164,7 +164,7 @@ impl AsyncFileReader for CountingReader {
     ) -> BoxFuture<'a, ParquetResult<Arc<ParquetMetaData>>> {
         async move {
             let read = self.reader.get_metadata(options).await;
-            self.report();
+            self.report_counts();
             read
         }
         .boxed()
@@ -179,14 +179,14 @@ mod tests {
     async fn readers_of_a_footer_wait_for_each_other_and_leave_nothing() {
         let reads = FooterReads::default();
         let (file, other) = (Path::from("a.parquet"), Path::from("b.parquet"));
-        let first = reads.of(&file);
+        let first = reads.footer_lock(&file);
         let reading = first.lock().await;
-        assert!(reads.of(&file).try_lock().is_err());
-        assert!(reads.of(&other).try_lock().is_ok());
+        assert!(reads.footer_lock(&file).try_lock().is_err());
+        assert!(reads.footer_lock(&other).try_lock().is_ok());
         drop(reading);
-        assert!(reads.of(&file).try_lock().is_ok());
+        assert!(reads.footer_lock(&file).try_lock().is_ok());
         drop(first);
-        let _third = reads.of(&other);
+        let _third = reads.footer_lock(&other);
         assert_eq!(reads.0.lock().expect("locked").len(), 1);
     }
 }

@@ -63,19 +63,19 @@ impl SmallTables {
     ///
     /// # Errors
     /// If a file does not agree with its log.
-    pub async fn rows(&self, table: Table, schema: &SchemaRef, files: &[&DataFile]) -> Result<RecordBatch> {
-        let mut rows = self.known(table, files);
+    pub async fn read_rows(&self, table: Table, schema: &SchemaRef, files: &[&DataFile]) -> Result<RecordBatch> {
+        let mut rows = self.known_rows(table, files);
         let reading = self.reading.lock().unwrap_or_else(PoisonError::into_inner).entry(table).or_default().clone();
         let _reading = if rows.len() < files.len() {
             let turn = reading.lock().await;
-            rows = self.known(table, files);
+            rows = self.known_rows(table, files);
             Some(turn)
         } else {
             None
         };
         let missing: Vec<DataFile> =
             files.iter().filter(|f| !rows.contains_key(&f.path)).map(|f| (*f).clone()).collect();
-        let read: Vec<_> = missing.into_iter().map(|file| self.read(table, schema, file)).collect();
+        let read: Vec<_> = missing.into_iter().map(|file| self.read_file(table, schema, file)).collect();
         let together = if self.lake.is_remote() { TOGETHER_REMOTE } else { TOGETHER };
         let read: Vec<_> = futures::stream::iter(read).buffered(together).try_collect().await?;
         rows.extend(read);
@@ -91,7 +91,7 @@ impl SmallTables {
         Ok(all)
     }
 
-    fn known(&self, table: Table, files: &[&DataFile]) -> HashMap<Path, KnownRows> {
+    fn known_rows(&self, table: Table, files: &[&DataFile]) -> HashMap<Path, KnownRows> {
         let known = self.files.lock().unwrap_or_else(PoisonError::into_inner);
         let known = known.get(&table);
         let rows = |file: &&DataFile| {
@@ -101,12 +101,12 @@ impl SmallTables {
         files.iter().filter_map(rows).collect()
     }
 
-    async fn read(&self, table: Table, schema: &SchemaRef, file: DataFile) -> Result<(Path, KnownRows)> {
+    async fn read_file(&self, table: Table, schema: &SchemaRef, file: DataFile) -> Result<(Path, KnownRows)> {
         let failed = |e: echolake_lake::Error| DataFusionError::External(Box::new(e));
         let columns: Vec<_> = schema.fields().iter().map(|field| field.name().as_str()).collect();
         let mut batches = Vec::new();
         for range in file.visible_ranges() {
-            let stream = self.lake.rows(table, &file, &columns, range).await.map_err(failed)?;
+            let stream = self.lake.read_rows(table, &file, &columns, range).await.map_err(failed)?;
             batches.extend(stream.try_collect::<Vec<_>>().await.map_err(failed)?);
         }
         let rows = concat_batches(schema, &batches)?;

@@ -64,7 +64,7 @@ impl Column {
         self
     }
 
-    pub(super) fn field(self) -> Field {
+    pub(super) fn into_field(self) -> Field {
         let metadata = HashMap::from([(UNIT.to_owned(), self.unit.to_owned()), (COMMENT.to_owned(), self.comment)]);
         Field::new(self.name, self.data_type, self.nullable).with_metadata(metadata)
     }

@@ -31,12 +31,12 @@ fn code_version() -> Column {
     Column::text("code_version", "Version of the code that derived this row")
 }
 
-fn project() -> Column {
+fn project_column() -> Column {
     Column::text("project", "Project that the run was recorded for; tokens of projects see the rows of their runs")
         .or_null()
 }
 
-fn references() -> Vec<Column> {
+fn reference_columns() -> Vec<Column> {
     vec![
         Column::text(
             "flat_version",
@@ -46,7 +46,7 @@ fn references() -> Vec<Column> {
     ]
 }
 
-pub(super) fn surfaces(bands: &[String]) -> Vec<Column> {
+pub(super) fn surface_columns(bands: &[String]) -> Vec<Column> {
     let mut columns = run_keys();
     columns.extend([
         Column::text("panel", "Physical panel that the surface is a side of"),
@@ -74,17 +74,17 @@ pub(super) fn surfaces(bands: &[String]) -> Vec<Column> {
                        simulated levels of single pairs are off by about 1 dB and more";
         Column::float(format!("detail_phase_{band}"), "1", format!("{comment}, band at {band} Hz")).or_null()
     }));
-    columns.extend([Column::text("origin", ORIGINS), project(), code_version()]);
+    columns.extend([Column::text("origin", ORIGINS), project_column(), code_version()]);
     columns
 }
 
-pub(super) fn runs() -> Vec<Column> {
+pub(super) fn run_columns() -> Vec<Column> {
     let mut columns = run_keys();
     columns.extend([
         Column::text("state", "complete; waiting: references are missing; partial: the file was cut off"),
         Column::text("missing", "References that are missing, separated by commas; empty where none is"),
         Column::text("origin", ORIGINS),
-        project(),
+        project_column(),
         Column::text("rig", "Name of the rig"),
         Column::long("started_ns", "ns", "Start since 1970-01-01 UTC"),
         Column::time("started", "Start, UTC"),
@@ -114,7 +114,7 @@ pub(super) fn runs() -> Vec<Column> {
     columns
 }
 
-pub(super) fn points() -> Vec<Column> {
+pub(super) fn point_columns() -> Vec<Column> {
     vec![
         Column::int("point_id", "", "Grid point, 0-based in (layer, gridx, gridy) order"),
         Column::int("layer", "", "Layer, 0 the lowest"),
@@ -126,13 +126,13 @@ pub(super) fn points() -> Vec<Column> {
     ]
 }
 
-pub(super) fn pairs() -> Vec<Column> {
+pub(super) fn pair_columns() -> Vec<Column> {
     let mut columns = vec![
         Column::int("pair_id", "", "Pair, 0-based in (microphone, speaker) order"),
         Column::int("microphone", "", "Grid point of the microphone"),
         Column::int("speaker", "", "Grid point of the speaker"),
     ];
-    columns.extend(positions());
+    columns.extend(position_columns());
     columns.extend([
         Column::double("direct_mm", "mm", "Direct path"),
         Column::double("image_mm", "mm", "Path by the mirror image in the reference plane"),
@@ -155,7 +155,7 @@ pub(super) fn pairs() -> Vec<Column> {
     columns
 }
 
-fn positions() -> [Column; 6] {
+fn position_columns() -> [Column; 6] {
     [
         Column::double("microphone_x_mm", "mm", "x of the microphone"),
         Column::double("microphone_y_mm", "mm", "y of the microphone"),
@@ -166,7 +166,7 @@ fn positions() -> [Column; 6] {
     ]
 }
 
-pub(super) fn measurements() -> Vec<Column> {
+pub(super) fn measurement_columns() -> Vec<Column> {
     let mut columns = pair_keys();
     columns.extend(log_time());
     columns.extend([
@@ -198,19 +198,19 @@ pub(super) fn measurements() -> Vec<Column> {
     columns
 }
 
-pub(super) fn nce(bands: &[String]) -> Vec<Column> {
+pub(super) fn nce_columns(bands: &[String]) -> Vec<Column> {
     let mut columns = pair_keys();
     columns.push(Column::floats("reflected_ir", "1", "Impulse response with Foam's subtracted"));
     columns.extend(bands.iter().map(|band| {
         let comment = format!("Cumulative energy of the band at {band} Hz over Flat's total energy, along time");
         Column::floats(format!("nce_{band}"), "1", comment)
     }));
-    columns.extend(references());
+    columns.extend(reference_columns());
     columns.push(code_version());
     columns
 }
 
-fn energies(bands: &[String]) -> Vec<Column> {
+fn energy_columns(bands: &[String]) -> Vec<Column> {
     let per_band = |prefix: &str, unit, comment: &str| -> Vec<Column> {
         let column = |band| Column::double(format!("{prefix}_{band}"), unit, format!("{comment}, band at {band} Hz"));
         bands.iter().map(column).collect()
@@ -223,12 +223,12 @@ fn energies(bands: &[String]) -> Vec<Column> {
     columns
 }
 
-pub(super) fn tnce(bands: &[String]) -> Vec<Column> {
+pub(super) fn tnce_columns(bands: &[String]) -> Vec<Column> {
     let mut columns = pair_keys();
-    columns.extend(energies(bands));
+    columns.extend(energy_columns(bands));
     columns.extend(curve_shapes(bands));
     columns.extend(level_uncertainties(bands));
-    columns.extend(references());
+    columns.extend(reference_columns());
     columns.push(code_version());
     columns
 }
@@ -267,14 +267,14 @@ pub(super) fn tnce_d4(bands: &[String]) -> Vec<Column> {
         Column::int("d4_microphone", "", "Grid point of the microphone after it"),
         Column::int("d4_speaker", "", "Grid point of the speaker after it"),
     ]);
-    columns.extend(positions());
-    columns.extend(energies(bands));
-    columns.extend(references());
+    columns.extend(position_columns());
+    columns.extend(energy_columns(bands));
+    columns.extend(reference_columns());
     columns.push(code_version());
     columns
 }
 
-pub(super) fn heightmaps() -> Vec<Column> {
+pub(super) fn heightmap_columns() -> Vec<Column> {
     let mut columns = run_keys();
     columns.extend([
         Column::text("symmetry", "identity, rot90, rot180, rot270, mirror_x, mirror_y, mirror_diag or mirror_anti"),
@@ -286,7 +286,7 @@ pub(super) fn heightmaps() -> Vec<Column> {
     columns
 }
 
-pub(super) fn environment() -> Vec<Column> {
+pub(super) fn environment_columns() -> Vec<Column> {
     let mut columns = run_keys();
     columns.extend(log_time());
     columns.extend([
@@ -299,7 +299,7 @@ pub(super) fn environment() -> Vec<Column> {
     columns
 }
 
-pub(super) fn events() -> Vec<Column> {
+pub(super) fn event_columns() -> Vec<Column> {
     let mut columns = run_keys();
     columns.extend(log_time());
     columns.extend([
@@ -340,7 +340,7 @@ pub(super) fn surface_stats() -> Vec<Column> {
         Column::floats("mean_nce", "1", "Mean of the NCE curves over the pairs, along time; total is the bands' sum")
             .or_null(),
     ]);
-    columns.extend(references());
+    columns.extend(reference_columns());
     columns.push(code_version());
     columns
 }

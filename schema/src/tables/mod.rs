@@ -115,7 +115,7 @@ impl Table {
     /// Its schema in a lake of this rig.
     pub fn schema(self, rig: &Rig) -> SchemaRef {
         let columns = (self.definition().columns)(&rig.band_names());
-        Arc::new(Schema::new(columns.into_iter().map(Column::field).collect::<Vec<_>>()))
+        Arc::new(Schema::new(columns.into_iter().map(Column::into_field).collect::<Vec<_>>()))
     }
 
     /// Cells along each side of a stored height map.
@@ -123,23 +123,25 @@ impl Table {
 
     fn definition(self) -> TableDefinition {
         match self {
-            Self::Surfaces => define("surfaces", Source::Run, &["surface_id"], definitions::surfaces),
-            Self::Runs => define("runs", Source::Pointer, &["run_id"], |_| definitions::runs()),
-            Self::Points => define("points", Source::Rig, &["point_id"], |_| definitions::points()),
-            Self::Pairs => define("pairs", Source::Rig, &["pair_id"], |_| definitions::pairs()),
-            Self::Measurements => define("measurements", Source::Run, &PAIR_KEY, |_| definitions::measurements()),
-            Self::Nce => define("nce", Source::References, &PAIR_KEY, definitions::nce),
-            Self::Tnce => define("tnce", Source::References, &PAIR_KEY, definitions::tnce),
+            Self::Surfaces => define_table("surfaces", Source::Run, &["surface_id"], definitions::surface_columns),
+            Self::Runs => define_table("runs", Source::Pointer, &["run_id"], |_| definitions::run_columns()),
+            Self::Points => define_table("points", Source::Rig, &["point_id"], |_| definitions::point_columns()),
+            Self::Pairs => define_table("pairs", Source::Rig, &["pair_id"], |_| definitions::pair_columns()),
+            Self::Measurements => {
+                define_table("measurements", Source::Run, &PAIR_KEY, |_| definitions::measurement_columns())
+            }
+            Self::Nce => define_table("nce", Source::References, &PAIR_KEY, definitions::nce_columns),
+            Self::Tnce => define_table("tnce", Source::References, &PAIR_KEY, definitions::tnce_columns),
             Self::TnceD4 => {
-                define("tnce_d4", Source::References, &["run_id", "pair_id", "symmetry"], definitions::tnce_d4)
+                define_table("tnce_d4", Source::References, &["run_id", "pair_id", "symmetry"], definitions::tnce_d4)
             }
-            Self::Heightmaps => {
-                define("heightmaps", Source::Run, &["surface_id", "symmetry"], |_| definitions::heightmaps())
-            }
-            Self::Environment => define("environment", Source::Run, &[], |_| definitions::environment()),
-            Self::Events => define("events", Source::Run, &[], |_| definitions::events()),
+            Self::Heightmaps => define_table("heightmaps", Source::Run, &["surface_id", "symmetry"], |_| {
+                definitions::heightmap_columns()
+            }),
+            Self::Environment => define_table("environment", Source::Run, &[], |_| definitions::environment_columns()),
+            Self::Events => define_table("events", Source::Run, &[], |_| definitions::event_columns()),
             Self::SurfaceStats => {
-                define("surface_stats", Source::References, &["run_id", "band"], |_| definitions::surface_stats())
+                define_table("surface_stats", Source::References, &["run_id", "band"], |_| definitions::surface_stats())
             }
         }
     }
@@ -156,7 +158,7 @@ struct TableDefinition {
     columns: fn(&[String]) -> Vec<Column>,
 }
 
-fn define(
+fn define_table(
     name: &'static str,
     source: Source,
     key: &'static [&'static str],

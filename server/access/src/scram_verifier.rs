@@ -44,7 +44,7 @@ impl ScramVerifier {
     /// Makes a verifier that no token passes, for a name without one. Its salt is always the same for a name, as that of a
     /// verifier is, and nobody computes it without the secret.
     pub(crate) fn unpassable(name: &str, secret: &[u8]) -> Self {
-        let of = |purpose: &[u8]| sign(&sign(secret, purpose), name.as_bytes());
+        let of = |purpose: &[u8]| hmac_sign(&hmac_sign(secret, purpose), name.as_bytes());
         let (salt, stored_key) = (of(b"salt")[..SALT_BYTES].to_vec(), of(b"stored key"));
         Self { iterations: ITERATIONS, salt, stored_key, server_key: of(b"server key") }
     }
@@ -52,8 +52,8 @@ impl ScramVerifier {
     fn with_salt(token: &str, salt: Vec<u8>, iterations: NonZeroU32) -> Self {
         let mut salted = [0; 32];
         pbkdf2::derive(pbkdf2::PBKDF2_HMAC_SHA256, iterations, &salt, token.as_bytes(), &mut salted);
-        let stored_key = sha256(&sign(&salted, b"Client Key"));
-        let server_key = sign(&salted, b"Server Key");
+        let stored_key = sha256(&hmac_sign(&salted, b"Client Key"));
+        let server_key = hmac_sign(&salted, b"Server Key");
         Self { iterations, salt, stored_key, server_key }
     }
 
@@ -69,18 +69,18 @@ impl ScramVerifier {
 
     /// Checks a client's proof of the messages of a login; returns the server's, if it is right.
     pub fn check_proof(&self, messages: &str, proof: &[u8]) -> Option<[u8; 32]> {
-        let signature = sign(&self.stored_key, messages.as_bytes());
+        let signature = hmac_sign(&self.stored_key, messages.as_bytes());
         let proof: &[u8; 32] = proof.try_into().ok()?;
         let mut client_key = [0; 32];
         for ((key, proof), signature) in client_key.iter_mut().zip(proof).zip(signature) {
             *key = proof ^ signature;
         }
         let is_right: bool = sha256(&client_key).ct_eq(&self.stored_key).into();
-        is_right.then(|| sign(&self.server_key, messages.as_bytes()))
+        is_right.then(|| hmac_sign(&self.server_key, messages.as_bytes()))
     }
 }
 
-fn sign(key: &[u8], message: &[u8]) -> [u8; 32] {
+fn hmac_sign(key: &[u8], message: &[u8]) -> [u8; 32] {
     let signed = hmac::sign(&hmac::Key::new(hmac::HMAC_SHA256, key), message);
     let mut bytes = [0; 32];
     bytes.copy_from_slice(signed.as_ref());

@@ -25,18 +25,18 @@ pub struct NamedAccess {
 }
 
 impl NamedAccess {
-    fn file(&self) -> RwLockReadGuard<'_, TokenFile> {
+    fn lock_file(&self) -> RwLockReadGuard<'_, TokenFile> {
         self.file.read().unwrap_or_else(PoisonError::into_inner)
     }
 
     // The client of a token.
-    fn holder(&self, hash: &[u8; 32]) -> Result<Arc<ClientIdentity>, RequestFault> {
-        self.file().find(hash).map(|entry| entry.client.clone()).ok_or(RequestFault::Unauthenticated)
+    fn find_client(&self, hash: &[u8; 32]) -> Result<Arc<ClientIdentity>, RequestFault> {
+        self.lock_file().find_entry(hash).map(|entry| entry.client.clone()).ok_or(RequestFault::Unauthenticated)
     }
 
     // All clients that may ask now.
-    fn current(&self) -> Vec<Arc<ClientIdentity>> {
-        let file = self.file();
+    fn valid_clients(&self) -> Vec<Arc<ClientIdentity>> {
+        let file = self.lock_file();
         file.entries.iter().filter(|entry| entry.is_valid()).map(|entry| entry.client.clone()).collect()
     }
 }
@@ -62,14 +62,14 @@ impl TokenAccess {
     ///
     /// # Errors
     /// [`RequestFault::Unauthenticated`].
-    pub fn client(
+    pub fn client_of_token(
         &self,
         token: Option<&str>,
         local: impl FnOnce() -> ClientIdentity,
     ) -> Result<Arc<ClientIdentity>, RequestFault> {
         match self {
             Self::Open => Ok(Arc::new(local())),
-            Self::Named(named) => named.holder(&hash_of(token.unwrap_or_default())),
+            Self::Named(named) => named.find_client(&hash_of(token.unwrap_or_default())),
         }
     }
 
@@ -77,9 +77,9 @@ impl TokenAccess {
     /// like others, and no client.
     pub fn scram_client(&self, name: &str) -> (Option<Arc<ClientIdentity>>, Arc<ScramVerifier>) {
         let Self::Named(named) = self else { return (None, Arc::new(ScramVerifier::unpassable(name, &[]))) };
-        let file = named.file();
+        let file = named.lock_file();
         // Computed for known names, too, so that the time is the same.
-        let unpassable = ScramVerifier::unpassable(name, &file.secret());
+        let unpassable = ScramVerifier::unpassable(name, &file.stable_secret());
         match file.find_name(name).and_then(|entry| Some((entry.client.clone(), entry.scram.clone()?))) {
             Some((client, verifier)) => (Some(client), verifier),
             None => (None, Arc::new(unpassable)),
@@ -92,16 +92,16 @@ impl TokenAccess {
     /// [`RequestFault::Unauthenticated`].
     pub fn check_current(&self, client: &ClientIdentity) -> Result<(), RequestFault> {
         let Self::Named(named) = self else { return Ok(()) };
-        let file = named.file();
+        let file = named.lock_file();
         let is_current = file.find_name(&client.name).is_some_and(|entry| *entry.client == *client);
         is_current.then_some(()).ok_or(RequestFault::Unauthenticated)
     }
 
     /// Reads the file again if it changed; returns the names of clients that may no longer ask, or may do other things now. A
     /// file that cannot be read changes nothing.
-    pub fn renew(&self, known: &mut TokenFileState) -> Vec<String> {
+    pub fn reload_changed(&self, known: &mut TokenFileState) -> Vec<String> {
         let Self::Named(named) = self else { return Vec::new() };
-        let path = named.file().path().to_owned();
+        let path = named.lock_file().path().to_owned();
         let changed = std::fs::metadata(&path).ok().and_then(|about| Some((about.modified().ok()?, about.len())));
         if known.file.replace(changed).is_some_and(|before| before != changed) {
             match TokenFile::read_any(&path) {
@@ -112,7 +112,7 @@ impl TokenAccess {
                 Err(e) => tracing::warn!(error = &e as &dyn std::error::Error, "the tokens stay as they were"),
             }
         }
-        let before = std::mem::replace(&mut known.clients, named.current());
+        let before = std::mem::replace(&mut known.clients, named.valid_clients());
         let gone = before.into_iter().filter(|client| !known.clients.contains(client));
         gone.map(|client| client.name.clone()).collect()
     }
@@ -127,14 +127,14 @@ impl TokenAccess {
             return Err(RequestFault::NotFound { what: "a session".to_owned(), hint });
         };
         let hash = hash_of(token);
-        named.holder(&hash)?;
-        named.sessions.begin(hash).map_err(RequestFault::defect("no session can begin"))
+        named.find_client(&hash)?;
+        named.sessions.begin_session(hash).map_err(RequestFault::defect("no session can begin"))
     }
 
-    /// Returns the client of the session with this secret; as [`TokenAccess::client`].
+    /// Returns the client of the session with this secret; as [`TokenAccess::client_of_token`].
     ///
     /// # Errors
-    /// As [`TokenAccess::client`].
+    /// As [`TokenAccess::client_of_token`].
     pub fn client_of_session(
         &self,
         secret: &str,
@@ -142,7 +142,9 @@ impl TokenAccess {
     ) -> Result<Arc<ClientIdentity>, RequestFault> {
         match self {
             Self::Open => Ok(Arc::new(local())),
-            Self::Named(named) => named.holder(&named.sessions.holder(secret).ok_or(RequestFault::Unauthenticated)?),
+            Self::Named(named) => {
+                named.find_client(&named.sessions.find_holder(secret).ok_or(RequestFault::Unauthenticated)?)
+            }
         }
     }
 }
@@ -180,54 +182,58 @@ mod tests {
         let hash = hex::encode(Sha256::digest("x"));
         let line = |rest: &str| format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\n{rest}\n");
         std::fs::write(&path, line("expires = 2126-01-01T00:00:00Z")).expect("written");
-        let access = TokenAccess::new(Some(TokenFile::read(&path).expect("tokens")));
+        let access = TokenAccess::new(Some(TokenFile::read_from(&path).expect("tokens")));
         let mut known = TokenFileState::default();
-        assert!(access.renew(&mut known).is_empty());
-        let client = access.client(Some("x"), ClientIdentity::pages).expect("let in");
+        assert!(access.reload_changed(&mut known).is_empty());
+        let client = access.client_of_token(Some("x"), ClientIdentity::own_pages).expect("let in");
         let session = access.begin_session("x").expect("a session");
         let is_in = || {
-            let by_session = access.client_of_session(&session, ClientIdentity::pages).is_ok();
-            let by_token = access.client(Some("x"), ClientIdentity::pages).is_ok();
+            let by_session = access.client_of_session(&session, ClientIdentity::own_pages).is_ok();
+            let by_token = access.client_of_token(Some("x"), ClientIdentity::own_pages).is_ok();
             assert_eq!((by_session, by_token), (by_token, access.check_current(&client).is_ok()));
             by_token
         };
         assert!(is_in());
         // A half-written file changes nothing.
         std::fs::write(&path, "[[token]]\nname = 'a").expect("written");
-        assert!(access.renew(&mut known).is_empty() && is_in());
+        assert!(access.reload_changed(&mut known).is_empty() && is_in());
         std::fs::write(&path, line("expires = 2026-01-01T00:00:00Z")).expect("written");
-        assert_eq!(access.renew(&mut known), ["a"]);
+        assert_eq!(access.reload_changed(&mut known), ["a"]);
         assert!(!is_in());
         std::fs::write(&path, line("")).expect("written");
-        assert!(access.renew(&mut known).is_empty() && is_in());
+        assert!(access.reload_changed(&mut known).is_empty() && is_in());
         // Other projects are another view of the lake: what was asked so far ends.
         std::fs::write(&path, line("projects = ['brick']")).expect("written");
-        assert_eq!(access.renew(&mut known), ["a"]);
+        assert_eq!(access.reload_changed(&mut known), ["a"]);
         assert!(access.check_current(&client).is_err());
         std::fs::write(&path, line("")).expect("written");
-        assert_eq!(access.renew(&mut known), ["a"]);
+        assert_eq!(access.reload_changed(&mut known), ["a"]);
         assert!(is_in());
         std::fs::write(&path, "").expect("written");
-        assert_eq!(access.renew(&mut known), ["a"]);
+        assert_eq!(access.reload_changed(&mut known), ["a"]);
         assert!(!is_in());
-        assert!(TokenFile::read(&path).map(drop).expect_err("no tokens").to_string().contains("there is none"));
+        assert!(TokenFile::read_from(&path).map(drop).expect_err("no tokens").to_string().contains("there is none"));
     }
 
     #[test]
     fn a_fresh_token_lets_in_and_no_other_does() {
         let project: ProjectName = "brick".parse().expect("a name");
-        let fresh =
-            fresh("a \"quoted\" name", Some(1), std::slice::from_ref(&project), &[TokenScope::Sql, TokenScope::Files])
-                .expect("a token");
+        let fresh = generate_token(
+            "a \"quoted\" name",
+            Some(1),
+            std::slice::from_ref(&project),
+            &[TokenScope::Sql, TokenScope::Files],
+        )
+        .expect("a token");
         assert!(!fresh.lines.contains(&fresh.token), "only hashes of it are kept");
         let access = access_by(&fresh.lines);
-        let local = ClientIdentity::pages;
-        let client = access.client(Some(&fresh.token), local).expect("let in");
+        let local = ClientIdentity::own_pages;
+        let client = access.client_of_token(Some(&fresh.token), local).expect("let in");
         assert_eq!(client.name, "a \"quoted\" name");
         assert_eq!(client.projects, Some([project].into()));
         assert_eq!(client.quota().time, Some(std::time::Duration::from_secs(60)));
-        assert!(client.require(TokenScope::Files).is_ok(), "pages show meshes and link to files");
-        assert!(matches!(client.require(TokenScope::Metrics), Err(RequestFault::Forbidden { .. })));
+        assert!(client.require_scope(TokenScope::Files).is_ok(), "pages show meshes and link to files");
+        assert!(matches!(client.require_scope(TokenScope::Metrics), Err(RequestFault::Forbidden { .. })));
         let secret = access.begin_session(&fresh.token).expect("a session");
         assert_eq!(access.client_of_session(&secret, local).expect("let in"), client);
         assert!(matches!(access.client_of_session(&fresh.token, local), Err(RequestFault::Unauthenticated)));
@@ -239,12 +245,13 @@ mod tests {
         assert_eq!(unpassable.iterations(), verifier.iterations());
         assert_eq!(access.scram_client("b").1, unpassable, "a name's salt is always the same");
         assert_ne!(access.scram_client("c").1.salt(), unpassable.salt());
-        let other = access_by(&crate::tokens::fresh("x", None, &[], &[TokenScope::Sql]).expect("a token").lines);
+        let other =
+            access_by(&crate::tokens::generate_token("x", None, &[], &[TokenScope::Sql]).expect("a token").lines);
         assert_ne!(other.scram_client("b").1.salt(), unpassable.salt(), "nobody computes it");
-        let other = crate::tokens::fresh("b", None, &[], &[TokenScope::Sql]).expect("a token").token;
+        let other = crate::tokens::generate_token("b", None, &[], &[TokenScope::Sql]).expect("a token").token;
         let cut = &fresh.token[..fresh.token.len() - 1];
         for wrong in [None, Some(""), Some(other.as_str()), Some(cut)] {
-            assert!(matches!(access.client(wrong, local), Err(RequestFault::Unauthenticated)), "{wrong:?}");
+            assert!(matches!(access.client_of_token(wrong, local), Err(RequestFault::Unauthenticated)), "{wrong:?}");
         }
     }
 
@@ -253,8 +260,8 @@ mod tests {
         let hash = hex::encode(Sha256::digest("x"));
         let allowed = |scopes: &str| {
             let access = access_by(&format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\n{scopes}"));
-            let client = access.client(Some("x"), ClientIdentity::pages).expect("let in");
-            [TokenScope::Sql, TokenScope::Files, TokenScope::Metrics].map(|scope| client.require(scope).is_ok())
+            let client = access.client_of_token(Some("x"), ClientIdentity::own_pages).expect("let in");
+            [TokenScope::Sql, TokenScope::Files, TokenScope::Metrics].map(|scope| client.require_scope(scope).is_ok())
         };
         assert_eq!(allowed(""), [true, true, false]);
         assert_eq!(allowed("scopes = ['sql']"), [true, false, false]);

@@ -69,7 +69,7 @@ fn reading() -> Vec<TokenScope> {
 }
 
 impl Line {
-    fn entry(&self) -> Result<TokenEntry, String> {
+    fn to_entry(&self) -> Result<TokenEntry, String> {
         let name = &self.name;
         let mut hash = [0; 32];
         hex::decode_to_slice(&self.sha256, &mut hash)
@@ -82,11 +82,11 @@ impl Line {
         let scram = self.scram.as_ref().map(|text| {
             text.parse().map(Arc::new).map_err(|wrong: String| format!("the scram of `{name}` is wrong: {wrong}"))
         });
-        let client = Arc::new(self.identity(token)?);
+        let client = Arc::new(self.to_identity(token)?);
         Ok(TokenEntry { client, hash, scram: scram.transpose()?, expires: expires.transpose()? })
     }
 
-    fn identity(&self, token: Option<u64>) -> Result<ClientIdentity, String> {
+    fn to_identity(&self, token: Option<u64>) -> Result<ClientIdentity, String> {
         let name = &self.name;
         let at_least_one = |what: &str, value: Option<u64>| match value {
             Some(0) => Err(format!("{what} of `{name}` is 0; hint: leave it out where there is no limit")),
@@ -131,7 +131,7 @@ impl TokenFile {
     ///
     /// # Errors
     /// [`Error::ReadTokens`], [`Error::Tokens`].
-    pub fn read(path: &Path) -> Result<Self, Error> {
+    pub fn read_from(path: &Path) -> Result<Self, Error> {
         let file = Self::read_any(path)?;
         if file.entries.is_empty() {
             let message = "there is none; hint: `echolake token NAME` makes one".to_owned();
@@ -143,7 +143,7 @@ impl TokenFile {
     /// Reads a file in which no token may be left.
     ///
     /// # Errors
-    /// As [`TokenFile::read`].
+    /// As [`TokenFile::read_from`].
     pub(crate) fn read_any(path: &Path) -> Result<Self, Error> {
         let text =
             std::fs::read_to_string(path).map_err(|source| Error::ReadTokens { path: path.to_owned(), source })?;
@@ -156,7 +156,7 @@ impl TokenFile {
     /// The defect.
     pub(crate) fn parse(path: &Path, text: &str) -> Result<Self, String> {
         let file: TokenList = toml::from_str(text).map_err(|e| e.to_string())?;
-        let entries = file.token.iter().map(Line::entry).collect::<Result<Vec<_>, _>>()?;
+        let entries = file.token.iter().map(Line::to_entry).collect::<Result<Vec<_>, _>>()?;
         for (i, entry) in entries.iter().enumerate() {
             let is_same = |e: &TokenEntry| e.client.name == entry.client.name || e.hash == entry.hash;
             if entries[..i].iter().any(is_same) {
@@ -173,7 +173,7 @@ impl TokenFile {
 
     /// Finds a token's line by its hash.
     // Every hash is compared to its end, so that the time does not tell which token is nearly right.
-    pub(crate) fn find(&self, hash: &[u8; 32]) -> Option<&TokenEntry> {
+    pub(crate) fn find_entry(&self, hash: &[u8; 32]) -> Option<&TokenEntry> {
         let mut found = None;
         for entry in &self.entries {
             let same: Choice = entry.hash.ct_eq(hash);
@@ -185,7 +185,7 @@ impl TokenFile {
     }
 
     /// A secret that is the same after a restart, and for as long as the first line stays.
-    pub(crate) fn secret(&self) -> [u8; 32] {
+    pub(crate) fn stable_secret(&self) -> [u8; 32] {
         self.entries.first().map_or([0; 32], |entry| entry.hash)
     }
 
@@ -207,7 +207,7 @@ pub struct FreshToken {
 ///
 /// # Errors
 /// [`Error::Random`].
-pub fn fresh(
+pub fn generate_token(
     name: &str,
     days: Option<u32>,
     projects: &[ProjectName],

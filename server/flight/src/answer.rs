@@ -19,7 +19,7 @@ use futures::{Stream, StreamExt as _, TryStreamExt as _, stream};
 use prost::Message as _;
 use tonic::{Response, Status};
 
-use super::status::status;
+use super::status::grpc_status;
 
 /// The stream that DoGet sends.
 pub(super) type FlightStream = Pin<Box<dyn Stream<Item = Result<FlightData, Status>> + Send>>;
@@ -31,7 +31,7 @@ pub(super) struct AnnouncedColumns(pub(super) SchemaRef);
 impl AnswerEncoder for AnnouncedColumns {
     type Item = RecordBatch;
 
-    fn batch(&mut self, batch: RecordBatch) -> Result<Vec<RecordBatch>, RequestFault> {
+    fn encode_batch(&mut self, batch: RecordBatch) -> Result<Vec<RecordBatch>, RequestFault> {
         let wrong = RequestFault::defect::<ArrowError>("an answer does not have the announced columns");
         let columns = batch.columns().iter().zip(self.0.fields()).map(|(column, field)| {
             if column.data_type() == field.data_type() { Ok(column.clone()) } else { cast(column, field.data_type()) }
@@ -40,7 +40,7 @@ impl AnswerEncoder for AnnouncedColumns {
         Ok(vec![RecordBatch::try_new(self.0.clone(), columns).map_err(wrong)?])
     }
 
-    fn end(self) -> Result<Vec<RecordBatch>, RequestFault> {
+    fn encode_end(self) -> Result<Vec<RecordBatch>, RequestFault> {
         Ok(Vec::new())
     }
 }
@@ -51,30 +51,30 @@ pub(super) fn is_settled(schema: &Schema) -> bool {
 }
 
 /// The rows of a run. The answer begins with the first of them: until then, the door may ask another engine.
-pub(super) async fn run(
+pub(super) async fn query_response(
     schema: SchemaRef,
     mut running: RunningQuery<RecordBatch>,
 ) -> Result<Response<FlightStream>, RequestFault> {
-    let first = running.next().await?;
+    let first = running.next_part().await?;
     let batches = stream::try_unfold((first, running), |(first, mut running)| async move {
         let batch = match first {
             Some(batch) => Ok(Some(batch)),
-            None => running.next().await,
+            None => running.next_part().await,
         };
-        let batch = batch.map_err(|fault| FlightError::Tonic(Box::new(status(&fault))))?;
+        let batch = batch.map_err(|fault| FlightError::Tonic(Box::new(grpc_status(&fault))))?;
         Ok(batch.map(|batch| (batch, (None, running))))
     });
-    Ok(send(schema, batches))
+    Ok(stream_response(schema, batches))
 }
 
 /// The rows of a batch.
-pub(super) fn batch(batch: Result<RecordBatch, FlightError>) -> Result<Response<FlightStream>, Status> {
+pub(super) fn batch_response(batch: Result<RecordBatch, FlightError>) -> Result<Response<FlightStream>, Status> {
     let batch = batch.map_err(|e| Status::internal(e.to_string()))?;
-    Ok(send(batch.schema(), stream::iter([Ok(batch)])))
+    Ok(stream_response(batch.schema(), stream::iter([Ok(batch)])))
 }
 
 // The encoder cuts batches to 2 MiB, half of what gRPC's clients take by default.
-fn send(
+fn stream_response(
     schema: SchemaRef,
     batches: impl Stream<Item = Result<RecordBatch, FlightError>> + Send + 'static,
 ) -> Response<FlightStream> {
@@ -83,7 +83,7 @@ fn send(
 }
 
 /// The ticket and the columns with which an answer is fetched.
-pub(super) fn info(
+pub(super) fn info_response(
     schema: Option<&Schema>,
     ticket: &impl ProstMessageExt,
     descriptor: FlightDescriptor,
@@ -104,6 +104,6 @@ pub(super) fn schema_bytes(schema: &Schema) -> Result<Bytes, Status> {
 }
 
 /// Columns, shared.
-pub(super) fn shared(schema: Schema) -> SchemaRef {
+pub(super) fn share_schema(schema: Schema) -> SchemaRef {
     Arc::new(schema)
 }

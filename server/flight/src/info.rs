@@ -35,7 +35,7 @@ pub(super) fn sql_info() -> Result<SqlInfoData, FlightError> {
 }
 
 /// Types of columns.
-pub(super) fn types() -> Result<XdbcTypeInfoData, FlightError> {
+pub(super) fn column_types() -> Result<XdbcTypeInfoData, FlightError> {
     let mut types = XdbcTypeInfoDataBuilder::new();
     let quoted = Some("'");
     for (name, kind, size, quote) in [
@@ -105,6 +105,6 @@ mod tests {
     fn both_can_be_told() {
         let read_only = sql_info().expect("built").record_batch([SqlInfo::FlightSqlServerReadOnly as u32]);
         assert_eq!(read_only.expect("a batch").num_rows(), 1);
-        assert_eq!(types().expect("built").record_batch(None).expect("a batch").num_rows(), 8);
+        assert_eq!(column_types().expect("built").record_batch(None).expect("a batch").num_rows(), 8);
     }
 }

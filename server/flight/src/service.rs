@@ -34,7 +34,7 @@ use tonic::{Request, Response, Status, Streaming};
 
 use super::answer::{self, AnnouncedColumns, FlightStream, is_settled};
 use super::statements::{HeldStatement, HeldStatements};
-use super::status::status;
+use super::status::grpc_status;
 use super::{info, values};
 
 /// The action that ends a query by what GetFlightInfo gave.
@@ -54,57 +54,66 @@ pub(super) struct LakeFlightService {
 
 impl LakeFlightService {
     pub(super) fn new(service: QueryService) -> Result<Self, FlightError> {
-        Ok(Self { service, statements: HeldStatements::default(), sql_info: info::sql_info()?, types: info::types()? })
+        Ok(Self {
+            service,
+            statements: HeldStatements::default(),
+            sql_info: info::sql_info()?,
+            types: info::column_types()?,
+        })
     }
 
-    fn client(&self) -> Result<Arc<EngineClient>, Status> {
-        self.service.client(TokenScope::Sql).map_err(|fault| status(&fault))
+    fn sql_client(&self) -> Result<Arc<EngineClient>, Status> {
+        self.service.authorised_client(TokenScope::Sql).map_err(|fault| grpc_status(&fault))
     }
 
-    async fn plan(&self, client: &Arc<EngineClient>, sql: String) -> Result<HeldStatement, Status> {
-        let (session, sql): (_, Arc<str>) = (Arc::new(self.service.session(client)), sql.into());
-        let prepared = self.prepare(&session, &sql).await?;
+    async fn plan_sql(&self, client: &Arc<EngineClient>, sql: String) -> Result<HeldStatement, Status> {
+        let (session, sql): (_, Arc<str>) = (Arc::new(self.service.begin_session(client)), sql.into());
+        let prepared = self.prepare_sql(&session, &sql).await?;
         let values = ParamValues::from(Vec::<ScalarValue>::new());
         let schema = prepared.schema();
         Ok(HeldStatement { session, sql, prepared, schema, values, stop: StopSignal::new() })
     }
 
-    async fn prepare(&self, session: &Arc<Session>, sql: &Arc<str>) -> Result<Arc<PreparedQuery>, Status> {
+    async fn prepare_sql(&self, session: &Arc<Session>, sql: &Arc<str>) -> Result<Arc<PreparedQuery>, Status> {
         let (planner, sql) = (session.clone(), sql.clone());
-        let planned = self.service.plan(session.client(), async move { Ok(planner.prepare(&sql).await?) }).await;
-        Ok(Arc::new(planned.map_err(|f| status(&f))?))
+        let planned = self.service.plan_query(session.client(), async move { Ok(planner.prepare(&sql).await?) }).await;
+        Ok(Arc::new(planned.map_err(|f| grpc_status(&f))?))
     }
 
     // The statement of a handle. An engine that replaced another one plans it again, without bound values.
-    async fn find(&self, client: &Arc<EngineClient>, handle: &[u8]) -> Result<HeldStatement, Status> {
-        let lost = match self.statements.find(client.name(), handle) {
+    async fn find_statement(&self, client: &Arc<EngineClient>, handle: &[u8]) -> Result<HeldStatement, Status> {
+        let lost = match self.statements.find_statement(client.name(), handle) {
             Ok(found) => return Ok(found),
-            Err(fault) => status(&fault),
+            Err(fault) => grpc_status(&fault),
         };
-        let sql = HeldStatements::text(handle).ok_or(lost)?;
-        let statement = self.plan(client, sql).await?;
-        self.statements.keep_as(handle, statement.clone()).map_err(|f| status(&f))?;
+        let sql = HeldStatements::carried_text(handle).ok_or(lost)?;
+        let statement = self.plan_sql(client, sql).await?;
+        self.statements.keep_as(handle, statement.clone()).map_err(|f| grpc_status(&f))?;
         Ok(statement)
     }
 
     // A statement of a client's handle, for a run of its own.
-    async fn prepared(&self, client: &Arc<EngineClient>, handle: &[u8]) -> Result<HeldStatement, Status> {
-        Ok(HeldStatement { stop: StopSignal::new(), ..self.find(client, handle).await? })
+    async fn statement_for_run(&self, client: &Arc<EngineClient>, handle: &[u8]) -> Result<HeldStatement, Status> {
+        Ok(HeldStatement { stop: StopSignal::new(), ..self.find_statement(client, handle).await? })
     }
 
     // A ticket of its own for each run, so that binding other values meanwhile does not change it.
-    fn ticket(&self, statement: HeldStatement, descriptor: FlightDescriptor) -> Result<Response<FlightInfo>, Status> {
+    fn ticket_info(
+        &self,
+        statement: HeldStatement,
+        descriptor: FlightDescriptor,
+    ) -> Result<Response<FlightInfo>, Status> {
         let schema = statement.schema.clone();
-        let handle = self.statements.keep(statement).map_err(|f| status(&f))?;
+        let handle = self.statements.keep_statement(statement).map_err(|f| grpc_status(&f))?;
         let ticket = TicketStatementQuery { statement_handle: handle };
-        answer::info(is_settled(&schema).then_some(schema.as_ref()), &ticket, descriptor)
+        answer::info_response(is_settled(&schema).then_some(schema.as_ref()), &ticket, descriptor)
     }
 
     // Plans the statement again if the lake has changed since it was planned.
-    async fn run(&self, mut statement: HeldStatement) -> Result<Response<FlightStream>, Status> {
+    async fn run_statement(&self, mut statement: HeldStatement) -> Result<Response<FlightStream>, Status> {
         let is_current = statement.session.is_current(&statement.prepared).await;
-        if !is_current.map_err(|error| status(&error.into()))? {
-            statement.prepared = self.prepare(&statement.session, &statement.sql).await?;
+        if !is_current.map_err(|error| grpc_status(&error.into()))? {
+            statement.prepared = self.prepare_sql(&statement.session, &statement.sql).await?;
         }
         let told = is_settled(&statement.schema).then(|| statement.schema.clone());
         let job = QueryJob {
@@ -115,27 +124,29 @@ impl LakeFlightService {
             stop: statement.stop,
         };
         let given = told.clone();
-        let begun =
-            self.service.begin(job, move |schema| Ok(AnnouncedColumns(given.unwrap_or_else(|| schema.clone())))).await;
-        let running = begun.map_err(|f| status(&f))?;
+        let begun = self
+            .service
+            .begin_query(job, move |schema| Ok(AnnouncedColumns(given.unwrap_or_else(|| schema.clone()))))
+            .await;
+        let running = begun.map_err(|f| grpc_status(&f))?;
         let schema = told.unwrap_or_else(|| running.schema.clone());
-        answer::run(schema, running).await.map_err(|f| status(&f))
+        answer::query_response(schema, running).await.map_err(|f| grpc_status(&f))
     }
 
-    fn cancel(&self, client: &EngineClient, info: &FlightInfo) -> Result<(), Status> {
+    fn cancel_query(&self, client: &EngineClient, info: &FlightInfo) -> Result<(), Status> {
         for endpoint in &info.endpoint {
             let ticket = endpoint.ticket.as_ref().map(|t| t.ticket.clone()).unwrap_or_default();
             let handle = Any::decode(ticket).ok().and_then(|any| any.unpack::<TicketStatementQuery>().ok().flatten());
             let handle = handle.ok_or_else(|| Status::invalid_argument("this ticket is of no query"))?;
-            let found = self.statements.find(client.name(), &handle.statement_handle);
-            found.map_err(|f| status(&f))?.stop.stop();
+            let found = self.statements.find_statement(client.name(), &handle.statement_handle);
+            found.map_err(|f| grpc_status(&f))?.stop.stop();
         }
         Ok(())
     }
 }
 
 fn read_only() -> Status {
-    status(&RequestFault::Query(QueryError::NotReading { statement: "an update".to_owned() }))
+    grpc_status(&RequestFault::Query(QueryError::NotReading { statement: "an update".to_owned() }))
 }
 
 fn batch_info<T: arrow_flight::sql::ProstMessageExt>(
@@ -143,12 +154,12 @@ fn batch_info<T: arrow_flight::sql::ProstMessageExt>(
     schema: &Schema,
     request: Request<FlightDescriptor>,
 ) -> Result<Response<FlightInfo>, Status> {
-    answer::info(Some(schema), query, request.into_inner())
+    answer::info_response(Some(schema), query, request.into_inner())
 }
 
 // Nothing in a lake is declared a key.
 fn no_keys() -> Result<Response<FlightStream>, Status> {
-    answer::batch(Ok(arrow::array::RecordBatch::new_empty(answer::shared(info::key_schema()))))
+    answer::batch_response(Ok(arrow::array::RecordBatch::new_empty(answer::share_schema(info::key_schema()))))
 }
 
 #[tonic::async_trait]
@@ -160,7 +171,7 @@ impl FlightSqlService for LakeFlightService {
         &self,
         request: Request<Streaming<HandshakeRequest>>,
     ) -> Result<Response<Pin<Box<dyn Stream<Item = Result<HandshakeResponse, Status>> + Send>>>, Status> {
-        self.client()?;
+        self.sql_client()?;
         let token = request.metadata().get("authorization").and_then(|v| v.to_str().ok()).and_then(of_header);
         let token = token.unwrap_or_default();
         let payload = Bytes::from(token.clone().into_bytes());
@@ -177,9 +188,9 @@ impl FlightSqlService for LakeFlightService {
         query: CommandStatementQuery,
         request: Request<FlightDescriptor>,
     ) -> Result<Response<FlightInfo>, Status> {
-        let client = self.client()?;
-        let statement = self.plan(&client, query.query).await?;
-        self.ticket(statement, request.into_inner())
+        let client = self.sql_client()?;
+        let statement = self.plan_sql(&client, query.query).await?;
+        self.ticket_info(statement, request.into_inner())
     }
 
     async fn do_get_statement(
@@ -187,9 +198,9 @@ impl FlightSqlService for LakeFlightService {
         ticket: TicketStatementQuery,
         _: Request<Ticket>,
     ) -> Result<Response<<Self as FlightService>::DoGetStream>, Status> {
-        let client = self.client()?;
-        let found = self.find(&client, &ticket.statement_handle).await?;
-        self.run(found).await
+        let client = self.sql_client()?;
+        let found = self.find_statement(&client, &ticket.statement_handle).await?;
+        self.run_statement(found).await
     }
 
     async fn do_action_create_prepared_statement(
@@ -197,9 +208,9 @@ impl FlightSqlService for LakeFlightService {
         query: ActionCreatePreparedStatementRequest,
         _: Request<Action>,
     ) -> Result<ActionCreatePreparedStatementResult, Status> {
-        let client = self.client()?;
-        let statement = self.plan(&client, query.query).await?;
-        let parameters = values::parameter_schema(&statement.prepared).map_err(|f| status(&f))?;
+        let client = self.sql_client()?;
+        let statement = self.plan_sql(&client, query.query).await?;
+        let parameters = values::parameter_schema(&statement.prepared).map_err(|f| grpc_status(&f))?;
         let dataset_schema = match is_settled(&statement.schema) {
             true => answer::schema_bytes(&statement.schema)?,
             false => Bytes::new(),
@@ -207,7 +218,7 @@ impl FlightSqlService for LakeFlightService {
         Ok(ActionCreatePreparedStatementResult {
             dataset_schema,
             parameter_schema: answer::schema_bytes(&parameters)?,
-            prepared_statement_handle: self.statements.keep(statement).map_err(|f| status(&f))?,
+            prepared_statement_handle: self.statements.keep_statement(statement).map_err(|f| grpc_status(&f))?,
         })
     }
 
@@ -216,11 +227,12 @@ impl FlightSqlService for LakeFlightService {
         query: CommandPreparedStatementQuery,
         request: Request<PeekableFlightDataStream>,
     ) -> Result<DoPutPreparedStatementResult, Status> {
-        let client = self.client()?;
+        let client = self.sql_client()?;
         let handle = query.prepared_statement_handle;
-        let statement = self.find(&client, &handle).await?;
-        let values = values::read(request.into_inner(), &statement.prepared).await.map_err(|f| status(&f))?;
-        self.statements.bind(client.name(), &handle, values).map_err(|f| status(&f))?;
+        let statement = self.find_statement(&client, &handle).await?;
+        let values =
+            values::read_values(request.into_inner(), &statement.prepared).await.map_err(|f| grpc_status(&f))?;
+        self.statements.bind_values(client.name(), &handle, values).map_err(|f| grpc_status(&f))?;
         Ok(DoPutPreparedStatementResult { prepared_statement_handle: Some(handle) })
     }
 
@@ -229,9 +241,9 @@ impl FlightSqlService for LakeFlightService {
         query: CommandPreparedStatementQuery,
         request: Request<FlightDescriptor>,
     ) -> Result<Response<FlightInfo>, Status> {
-        let client = self.client()?;
-        let statement = self.prepared(&client, &query.prepared_statement_handle).await?;
-        self.ticket(statement, request.into_inner())
+        let client = self.sql_client()?;
+        let statement = self.statement_for_run(&client, &query.prepared_statement_handle).await?;
+        self.ticket_info(statement, request.into_inner())
     }
 
     async fn do_get_prepared_statement(
@@ -239,9 +251,9 @@ impl FlightSqlService for LakeFlightService {
         query: CommandPreparedStatementQuery,
         _: Request<Ticket>,
     ) -> Result<Response<<Self as FlightService>::DoGetStream>, Status> {
-        let client = self.client()?;
-        let statement = self.prepared(&client, &query.prepared_statement_handle).await?;
-        self.run(statement).await
+        let client = self.sql_client()?;
+        let statement = self.statement_for_run(&client, &query.prepared_statement_handle).await?;
+        self.run_statement(statement).await
     }
 
     async fn do_action_close_prepared_statement(
@@ -249,8 +261,8 @@ impl FlightSqlService for LakeFlightService {
         query: ActionClosePreparedStatementRequest,
         _: Request<Action>,
     ) -> Result<(), Status> {
-        let client = self.client()?;
-        self.statements.forget(client.name(), &query.prepared_statement_handle);
+        let client = self.sql_client()?;
+        self.statements.forget_statement(client.name(), &query.prepared_statement_handle);
         Ok(())
     }
 
@@ -259,9 +271,9 @@ impl FlightSqlService for LakeFlightService {
         query: ActionCancelQueryRequest,
         _: Request<Action>,
     ) -> Result<ActionCancelQueryResult, Status> {
-        let client = self.client()?;
+        let client = self.sql_client()?;
         let info = FlightInfo::decode(query.info).map_err(|e| Status::invalid_argument(e.to_string()))?;
-        self.cancel(&client, &info)?;
+        self.cancel_query(&client, &info)?;
         Ok(ActionCancelQueryResult { result: CANCELLED })
     }
 
@@ -269,15 +281,15 @@ impl FlightSqlService for LakeFlightService {
         &self,
         request: Request<Action>,
     ) -> Result<Response<<Self as FlightService>::DoActionStream>, Status> {
-        let client = self.client()?;
+        let client = self.sql_client()?;
         let action = request.into_inner();
         if action.r#type != CANCEL_FLIGHT_INFO {
-            return Err(status(&RequestFault::unsupported(format!("the action `{}`", action.r#type))));
+            return Err(grpc_status(&RequestFault::unsupported(format!("the action `{}`", action.r#type))));
         }
         let asked =
             CancelFlightInfoRequest::decode(action.body).map_err(|e| Status::invalid_argument(e.to_string()))?;
         let info = asked.info.ok_or_else(|| Status::invalid_argument("no FlightInfo to cancel"))?;
-        self.cancel(&client, &info)?;
+        self.cancel_query(&client, &info)?;
         let body = CancelFlightInfoResult::new(CancelStatus::Cancelled).encode_to_vec().into();
         Ok(Response::new(stream::iter([Ok(arrow_flight::Result { body })]).boxed()))
     }
@@ -287,7 +299,7 @@ impl FlightSqlService for LakeFlightService {
         query: CommandGetCatalogs,
         request: Request<FlightDescriptor>,
     ) -> Result<Response<FlightInfo>, Status> {
-        self.client()?;
+        self.sql_client()?;
         batch_info(&query, &query.into_builder().schema(), request)
     }
 
@@ -296,10 +308,10 @@ impl FlightSqlService for LakeFlightService {
         query: CommandGetCatalogs,
         _: Request<Ticket>,
     ) -> Result<Response<<Self as FlightService>::DoGetStream>, Status> {
-        self.client()?;
+        self.sql_client()?;
         let mut catalogs = query.into_builder();
         catalogs.append(CATALOG);
-        answer::batch(catalogs.build())
+        answer::batch_response(catalogs.build())
     }
 
     async fn get_flight_info_schemas(
@@ -307,7 +319,7 @@ impl FlightSqlService for LakeFlightService {
         query: CommandGetDbSchemas,
         request: Request<FlightDescriptor>,
     ) -> Result<Response<FlightInfo>, Status> {
-        self.client()?;
+        self.sql_client()?;
         batch_info(&query, &query.clone().into_builder().schema(), request)
     }
 
@@ -316,11 +328,11 @@ impl FlightSqlService for LakeFlightService {
         query: CommandGetDbSchemas,
         _: Request<Ticket>,
     ) -> Result<Response<<Self as FlightService>::DoGetStream>, Status> {
-        self.client()?;
+        self.sql_client()?;
         let mut schemas = query.into_builder();
         schemas.append(CATALOG, SCHEMA);
         schemas.append(CATALOG, SYSTEM_SCHEMA);
-        answer::batch(schemas.build())
+        answer::batch_response(schemas.build())
     }
 
     async fn get_flight_info_tables(
@@ -328,7 +340,7 @@ impl FlightSqlService for LakeFlightService {
         query: CommandGetTables,
         request: Request<FlightDescriptor>,
     ) -> Result<Response<FlightInfo>, Status> {
-        self.client()?;
+        self.sql_client()?;
         batch_info(&query, &query.clone().into_builder().schema(), request)
     }
 
@@ -337,14 +349,14 @@ impl FlightSqlService for LakeFlightService {
         query: CommandGetTables,
         _: Request<Ticket>,
     ) -> Result<Response<<Self as FlightService>::DoGetStream>, Status> {
-        self.client()?;
+        self.sql_client()?;
         let mut tables = query.into_builder();
-        let own = self.service.tables().into_iter().map(|table| (SCHEMA, table));
+        let own = self.service.lake_tables().into_iter().map(|table| (SCHEMA, table));
         let system = self.service.system_tables().into_iter().map(|table| (SYSTEM_SCHEMA, table));
         for (of, (name, schema)) in own.chain(system) {
             tables.append(CATALOG, of, name, TABLE, &schema).map_err(|e| Status::internal(e.to_string()))?;
         }
-        answer::batch(tables.build())
+        answer::batch_response(tables.build())
     }
 
     async fn get_flight_info_table_types(
@@ -352,7 +364,7 @@ impl FlightSqlService for LakeFlightService {
         query: CommandGetTableTypes,
         request: Request<FlightDescriptor>,
     ) -> Result<Response<FlightInfo>, Status> {
-        self.client()?;
+        self.sql_client()?;
         batch_info(&query, &query.into_builder().schema(), request)
     }
 
@@ -361,10 +373,10 @@ impl FlightSqlService for LakeFlightService {
         query: CommandGetTableTypes,
         _: Request<Ticket>,
     ) -> Result<Response<<Self as FlightService>::DoGetStream>, Status> {
-        self.client()?;
+        self.sql_client()?;
         let mut kinds = query.into_builder();
         kinds.append(TABLE);
-        answer::batch(kinds.build())
+        answer::batch_response(kinds.build())
     }
 
     async fn get_flight_info_sql_info(
@@ -372,7 +384,7 @@ impl FlightSqlService for LakeFlightService {
         query: CommandGetSqlInfo,
         request: Request<FlightDescriptor>,
     ) -> Result<Response<FlightInfo>, Status> {
-        self.client()?;
+        self.sql_client()?;
         batch_info(&query, &self.sql_info.schema(), request)
     }
 
@@ -381,8 +393,8 @@ impl FlightSqlService for LakeFlightService {
         query: CommandGetSqlInfo,
         _: Request<Ticket>,
     ) -> Result<Response<<Self as FlightService>::DoGetStream>, Status> {
-        self.client()?;
-        answer::batch(query.into_builder(&self.sql_info).build())
+        self.sql_client()?;
+        answer::batch_response(query.into_builder(&self.sql_info).build())
     }
 
     async fn get_flight_info_xdbc_type_info(
@@ -390,7 +402,7 @@ impl FlightSqlService for LakeFlightService {
         query: CommandGetXdbcTypeInfo,
         request: Request<FlightDescriptor>,
     ) -> Result<Response<FlightInfo>, Status> {
-        self.client()?;
+        self.sql_client()?;
         batch_info(&query, &self.types.schema(), request)
     }
 
@@ -399,8 +411,8 @@ impl FlightSqlService for LakeFlightService {
         query: CommandGetXdbcTypeInfo,
         _: Request<Ticket>,
     ) -> Result<Response<<Self as FlightService>::DoGetStream>, Status> {
-        self.client()?;
-        answer::batch(query.into_builder(&self.types).build())
+        self.sql_client()?;
+        answer::batch_response(query.into_builder(&self.types).build())
     }
 
     async fn get_flight_info_primary_keys(
@@ -408,7 +420,7 @@ impl FlightSqlService for LakeFlightService {
         query: CommandGetPrimaryKeys,
         request: Request<FlightDescriptor>,
     ) -> Result<Response<FlightInfo>, Status> {
-        self.client()?;
+        self.sql_client()?;
         batch_info(&query, &info::primary_key_schema(), request)
     }
 
@@ -417,8 +429,10 @@ impl FlightSqlService for LakeFlightService {
         _: CommandGetPrimaryKeys,
         _: Request<Ticket>,
     ) -> Result<Response<<Self as FlightService>::DoGetStream>, Status> {
-        self.client()?;
-        answer::batch(Ok(arrow::array::RecordBatch::new_empty(answer::shared(info::primary_key_schema()))))
+        self.sql_client()?;
+        answer::batch_response(Ok(arrow::array::RecordBatch::new_empty(answer::share_schema(
+            info::primary_key_schema(),
+        ))))
     }
 
     async fn get_flight_info_exported_keys(
@@ -426,7 +440,7 @@ impl FlightSqlService for LakeFlightService {
         query: CommandGetExportedKeys,
         request: Request<FlightDescriptor>,
     ) -> Result<Response<FlightInfo>, Status> {
-        self.client()?;
+        self.sql_client()?;
         batch_info(&query, &info::key_schema(), request)
     }
 
@@ -435,7 +449,7 @@ impl FlightSqlService for LakeFlightService {
         _: CommandGetExportedKeys,
         _: Request<Ticket>,
     ) -> Result<Response<<Self as FlightService>::DoGetStream>, Status> {
-        self.client()?;
+        self.sql_client()?;
         no_keys()
     }
 
@@ -444,7 +458,7 @@ impl FlightSqlService for LakeFlightService {
         query: CommandGetImportedKeys,
         request: Request<FlightDescriptor>,
     ) -> Result<Response<FlightInfo>, Status> {
-        self.client()?;
+        self.sql_client()?;
         batch_info(&query, &info::key_schema(), request)
     }
 
@@ -453,7 +467,7 @@ impl FlightSqlService for LakeFlightService {
         _: CommandGetImportedKeys,
         _: Request<Ticket>,
     ) -> Result<Response<<Self as FlightService>::DoGetStream>, Status> {
-        self.client()?;
+        self.sql_client()?;
         no_keys()
     }
 
@@ -462,7 +476,7 @@ impl FlightSqlService for LakeFlightService {
         query: CommandGetCrossReference,
         request: Request<FlightDescriptor>,
     ) -> Result<Response<FlightInfo>, Status> {
-        self.client()?;
+        self.sql_client()?;
         batch_info(&query, &info::key_schema(), request)
     }
 
@@ -471,7 +485,7 @@ impl FlightSqlService for LakeFlightService {
         _: CommandGetCrossReference,
         _: Request<Ticket>,
     ) -> Result<Response<<Self as FlightService>::DoGetStream>, Status> {
-        self.client()?;
+        self.sql_client()?;
         no_keys()
     }
 
@@ -480,9 +494,9 @@ impl FlightSqlService for LakeFlightService {
         query: CommandStatementUpdate,
         _: Request<PeekableFlightDataStream>,
     ) -> Result<i64, Status> {
-        let client = self.client()?;
+        let client = self.sql_client()?;
         // What is wrong with the statement itself is worth more than that updates are not for here.
-        self.plan(&client, query.query).await?;
+        self.plan_sql(&client, query.query).await?;
         Err(read_only())
     }
 
@@ -491,7 +505,7 @@ impl FlightSqlService for LakeFlightService {
         _: CommandStatementIngest,
         _: Request<PeekableFlightDataStream>,
     ) -> Result<i64, Status> {
-        self.client()?;
+        self.sql_client()?;
         Err(read_only())
     }
 
@@ -500,7 +514,7 @@ impl FlightSqlService for LakeFlightService {
         _: CommandPreparedStatementUpdate,
         _: Request<PeekableFlightDataStream>,
     ) -> Result<i64, Status> {
-        self.client()?;
+        self.sql_client()?;
         Err(read_only())
     }
 
@@ -509,8 +523,8 @@ impl FlightSqlService for LakeFlightService {
         _: ActionBeginTransactionRequest,
         _: Request<Action>,
     ) -> Result<ActionBeginTransactionResult, Status> {
-        self.client()?;
-        Err(status(&RequestFault::unsupported("a transaction (each query sees one frozen view of the lake)")))
+        self.sql_client()?;
+        Err(grpc_status(&RequestFault::unsupported("a transaction (each query sees one frozen view of the lake)")))
     }
 
     // What the server is, is not for others to say.

@@ -47,7 +47,7 @@ struct StatementEntry {
 
 impl HeldStatements {
     /// Keeps a statement.
-    pub(super) fn keep(&self, statement: HeldStatement) -> Result<Bytes, RequestFault> {
+    pub(super) fn keep_statement(&self, statement: HeldStatement) -> Result<Bytes, RequestFault> {
         let mut handle = StatementHandle::default();
         getrandom::fill(&mut handle).map_err(RequestFault::defect("no random bytes"))?;
         let sql = Some(statement.sql.clone()).filter(|sql| sql.len() <= CARRIED_BYTES);
@@ -58,19 +58,19 @@ impl HeldStatements {
 
     /// Keeps a statement under a handle that another engine made.
     pub(super) fn keep_as(&self, handle: &[u8], statement: HeldStatement) -> Result<(), RequestFault> {
-        let (handle, _) = handle.split_first_chunk().ok_or_else(gone)?;
+        let (handle, _) = handle.split_first_chunk().ok_or_else(missing_statement)?;
         self.insert(*handle, statement);
         Ok(())
     }
 
     /// The text that a handle carries.
-    pub(super) fn text(handle: &[u8]) -> Option<String> {
+    pub(super) fn carried_text(handle: &[u8]) -> Option<String> {
         let (_, sql) = handle.split_first_chunk::<{ size_of::<StatementHandle>() }>()?;
         String::from_utf8(sql.to_vec()).ok().filter(|sql| !sql.is_empty())
     }
 
     fn insert(&self, handle: StatementHandle, statement: HeldStatement) {
-        let mut all = self.lock();
+        let mut all = self.lock_statements();
         all.retain(|_, kept| kept.used.elapsed() < KEPT);
         let owner = statement.session.client().name();
         let mut own: Vec<_> = all
@@ -86,41 +86,41 @@ impl HeldStatements {
     }
 
     /// The statement of a client's handle.
-    pub(super) fn find(&self, client: &str, handle: &[u8]) -> Result<HeldStatement, RequestFault> {
-        self.with(client, handle, |kept| kept.statement.clone())
+    pub(super) fn find_statement(&self, client: &str, handle: &[u8]) -> Result<HeldStatement, RequestFault> {
+        self.with_entry(client, handle, |kept| kept.statement.clone())
     }
 
     /// Sets the values of its placeholders.
-    pub(super) fn bind(&self, client: &str, handle: &[u8], values: ParamValues) -> Result<(), RequestFault> {
-        self.with(client, handle, |kept| kept.statement.values = values)
+    pub(super) fn bind_values(&self, client: &str, handle: &[u8], values: ParamValues) -> Result<(), RequestFault> {
+        self.with_entry(client, handle, |kept| kept.statement.values = values)
     }
 
     /// Forgets it; a running query continues.
-    pub(super) fn forget(&self, client: &str, handle: &[u8]) {
-        if self.find(client, handle).is_ok() {
-            self.lock().retain(|known, _| !handle.starts_with(known));
+    pub(super) fn forget_statement(&self, client: &str, handle: &[u8]) {
+        if self.find_statement(client, handle).is_ok() {
+            self.lock_statements().retain(|known, _| !handle.starts_with(known));
         }
     }
 
-    fn with<T>(
+    fn with_entry<T>(
         &self,
         client: &str,
         handle: &[u8],
         act: impl FnOnce(&mut StatementEntry) -> T,
     ) -> Result<T, RequestFault> {
-        let (handle, _) = handle.split_first_chunk().ok_or_else(gone)?;
-        let mut all = self.lock();
+        let (handle, _) = handle.split_first_chunk().ok_or_else(missing_statement)?;
+        let mut all = self.lock_statements();
         let kept = all.get_mut(handle).filter(|kept| kept.statement.session.client().name() == client);
-        let kept = kept.filter(|kept| kept.used.elapsed() < KEPT).ok_or_else(gone)?;
+        let kept = kept.filter(|kept| kept.used.elapsed() < KEPT).ok_or_else(missing_statement)?;
         kept.used = Instant::now();
         Ok(act(kept))
     }
 
-    fn lock(&self) -> MutexGuard<'_, HashMap<StatementHandle, StatementEntry>> {
+    fn lock_statements(&self) -> MutexGuard<'_, HashMap<StatementHandle, StatementEntry>> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-fn gone() -> RequestFault {
+fn missing_statement() -> RequestFault {
     RequestFault::NotFound { what: "this statement".to_owned(), hint: "ask again: it may have expired" }
 }

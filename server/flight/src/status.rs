@@ -13,18 +13,18 @@ const LINE: &str = "echolake-line";
 const COLUMN: &str = "echolake-column";
 
 /// A failure as a status.
-pub fn status(fault: &RequestFault) -> Status {
+pub fn grpc_status(fault: &RequestFault) -> Status {
     let code = fault.code();
     let mut metadata = MetadataMap::new();
     metadata.insert(CODE, MetadataValue::from_static(code.name()));
-    if let Some(place) = fault.parts().place {
+    if let Some(place) = fault.text_parts().place {
         metadata.insert(LINE, MetadataValue::from(place.line));
         metadata.insert(COLUMN, MetadataValue::from(place.column));
     }
-    Status::with_metadata(grpc(code), fault.to_string(), metadata)
+    Status::with_metadata(grpc_code(code), fault.to_string(), metadata)
 }
 
-fn grpc(code: FaultCode) -> Grpc {
+fn grpc_code(code: FaultCode) -> Grpc {
     match code {
         FaultCode::Query | FaultCode::Request | FaultCode::Format | FaultCode::Method => Grpc::InvalidArgument,
         FaultCode::ReadOnly | FaultCode::Forbidden | FaultCode::Foreign => Grpc::PermissionDenied,

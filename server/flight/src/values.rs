@@ -14,7 +14,7 @@ use futures::TryStreamExt as _;
 
 /// The placeholders as columns.
 pub(super) fn parameter_schema(prepared: &PreparedQuery) -> Result<Schema, RequestFault> {
-    let fields = prepared.parameters()?.into_iter().enumerate().map(|(i, kind)| {
+    let fields = prepared.parameter_types()?.into_iter().enumerate().map(|(i, kind)| {
         let kind = kind.unwrap_or(DataType::Null);
         Field::new(format!("${}", i + 1), kind, true)
     });
@@ -22,7 +22,7 @@ pub(super) fn parameter_schema(prepared: &PreparedQuery) -> Result<Schema, Reque
 }
 
 // What a compressed body says of its own length is believed, and allocated, before anything is unpacked.
-fn uncompressed(message: FlightData) -> Result<FlightData, FlightError> {
+fn require_uncompressed(message: FlightData) -> Result<FlightData, FlightError> {
     let header = root_as_message(&message.data_header).map_err(|e| FlightError::DecodeError(e.to_string()))?;
     let batch = header.header_as_dictionary_batch().and_then(|dictionary| dictionary.data());
     let batch = header.header_as_record_batch().or(batch);
@@ -35,13 +35,13 @@ fn uncompressed(message: FlightData) -> Result<FlightData, FlightError> {
 }
 
 /// The values that a client puts.
-pub(super) async fn read(
+pub(super) async fn read_values(
     stream: PeekableFlightDataStream,
     prepared: &PreparedQuery,
 ) -> Result<ParamValues, RequestFault> {
-    let wrong = |e: FlightError| RequestFault::request(format!("the values cannot be read: {e}"));
+    let wrong = |e: FlightError| RequestFault::bad_request(format!("the values cannot be read: {e}"));
     let data = stream.into_peekable().map_err(|status| FlightError::Tonic(Box::new(status)));
-    let data = data.and_then(async |message| uncompressed(message));
+    let data = data.and_then(async |message| require_uncompressed(message));
     let mut batches = FlightRecordBatchStream::new_from_flight_data(data);
     let mut row: Option<RecordBatch> = None;
     while let Some(batch) = batches.try_next().await.map_err(wrong)? {
@@ -52,13 +52,13 @@ pub(super) async fn read(
         }
     }
     let Some(row) = row else { return Ok(ParamValues::from(Vec::<ScalarValue>::new())) };
-    let kinds = prepared.parameters()?;
+    let kinds = prepared.parameter_types()?;
     if row.num_columns() != kinds.len() {
         let (given, wanted) = (row.num_columns(), kinds.len());
-        return Err(RequestFault::request(format!("{given} values for {wanted} placeholders")));
+        return Err(RequestFault::bad_request(format!("{given} values for {wanted} placeholders")));
     }
     let values = row.columns().iter().zip(kinds).enumerate().map(|(i, (column, kind))| {
-        let wrong = |e| RequestFault::request(format!("the value of ${}: {e}", i + 1));
+        let wrong = |e| RequestFault::bad_request(format!("the value of ${}: {e}", i + 1));
         let value = ScalarValue::try_from_array(column, 0).map_err(wrong)?;
         match kind {
             Some(kind) if kind != value.data_type() => value.cast_to(&kind).map_err(wrong),

@@ -35,7 +35,7 @@ impl ConditionOutcome {
     }
 
     /// Returns the response instead of the answer; `headers` are those that 304 and the answer have in common.
-    pub fn response(self, etag: &str, headers: impl IntoResponseParts) -> Option<Response> {
+    pub fn early_response(self, etag: &str, headers: impl IntoResponseParts) -> Option<Response> {
         match self {
             Self::Answer => None,
             Self::NotModified => Some((StatusCode::NOT_MODIFIED, headers, ()).into_response()),

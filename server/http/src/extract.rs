@@ -26,7 +26,7 @@ impl<S: Send + Sync, T: DeserializeOwned + Send> FromRequestParts<S> for PathPar
 
     async fn from_request_parts(parts: &mut Parts, state: &S) -> Result<Self, ProblemResponse> {
         let path = Path::from_request_parts(parts, state).await;
-        let Path(path) = path.map_err(|_| RequestFault::request("the path is not UTF-8"))?;
+        let Path(path) = path.map_err(|_| RequestFault::bad_request("the path is not UTF-8"))?;
         Ok(Self(path))
     }
 }
@@ -54,7 +54,7 @@ pub(super) fn parse_query<T: DeserializeOwned>(uri: &Uri) -> Result<T, RequestFa
         if defect == LIST_FOUND {
             defect = "it is there twice".to_owned();
         }
-        RequestFault::request(match error.path().iter().next() {
+        RequestFault::bad_request(match error.path().iter().next() {
             Some(Segment::Map { key: name }) => format!("`{name}`: {defect}"),
             _ => format!("the parameters are not right: {defect}"),
         })

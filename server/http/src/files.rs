@@ -18,7 +18,7 @@ use utoipa::IntoParams;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
-use super::catalogue::{self, CatalogueRequest, LakeCatalogue, RunPath, SnapshotView, text};
+use super::catalogue::{self, CatalogueRequest, LakeCatalogue, RunPath, SnapshotView, text_value};
 use super::extract::{BinaryContent, PathParams};
 use super::problem::ProblemResponse;
 use super::ranges::{FileDescription, RangeAnswer};
@@ -65,9 +65,9 @@ async fn run_file(
     PathParams(path): PathParams<RunPath>,
     headers: HeaderMap,
 ) -> Result<Response, ProblemResponse> {
-    catalogue.service().client(TokenScope::Files)?;
-    let view = catalogue.view().await?;
-    let run = catalogue::run(&view, &path.run_id)?;
+    catalogue.service().authorised_client(TokenScope::Files)?;
+    let view = catalogue.current_view().await?;
+    let run = catalogue::find_run(&view, &path.run_id)?;
     let FileRow { file_sha256, file_bytes } = file_row(&catalogue, &view, run.run.as_str()).await?;
     let described = FileDescription {
         etag: format!("\"{file_sha256}\""),
@@ -77,7 +77,7 @@ async fn run_file(
     };
     let bytes = u64::try_from(file_bytes).unwrap_or(0);
     let stored = RangedFile { path: Lake::run_path(&run.surface, &run.run), bytes, described };
-    Ok(stored.answer(catalogue.lake(), &headers).await?)
+    Ok(stored.answer_request(catalogue.lake(), &headers).await?)
 }
 
 /// One Parquet file; Range.
@@ -98,12 +98,12 @@ async fn table_file(
     PathParams(path): PathParams<TableFilePath>,
     headers: HeaderMap,
 ) -> Result<Response, ProblemResponse> {
-    catalogue.service().client(TokenScope::Files)?;
-    let table = catalogue::table(&path.table)?;
+    catalogue.service().authorised_client(TokenScope::Files)?;
+    let table = catalogue::find_table(&path.table)?;
     let name = &path.file;
-    let view = catalogue.view().await?;
+    let view = catalogue.current_view().await?;
     let hint = "GET /api/v1/tables/{table} lists what there is";
-    let file = catalogue.shown(&view, table, name);
+    let file = catalogue.find_file(&view, table, name);
     let file = file
         .ok_or_else(|| RequestFault::NotFound { what: format!("file `{name}` of table `{}`", table.name()), hint })?;
     let described = FileDescription {
@@ -113,7 +113,7 @@ async fn table_file(
         policy: "same-origin",
     };
     let stored = RangedFile { path: file.path.clone(), bytes: file.bytes, described };
-    Ok(stored.answer(catalogue.lake(), &headers).await?)
+    Ok(stored.answer_request(catalogue.lake(), &headers).await?)
 }
 
 #[derive(Deserialize)]
@@ -125,7 +125,8 @@ struct FileRow {
 // What a run's row says of its file.
 async fn file_row(catalogue: &LakeCatalogue, view: &Arc<SnapshotView>, run: &str) -> Result<FileRow, RequestFault> {
     let sql = "select file_sha256, file_bytes from runs where run_id = $1";
-    let rows: Vec<FileRow> = CatalogueRequest::new(catalogue, view, false).rows(sql, vec![text(run)]).await?;
+    let rows: Vec<FileRow> =
+        CatalogueRequest::new(catalogue, view, false).read_rows(sql, vec![text_value(run)]).await?;
     let hint = "GET /api/v1/runs lists what there is";
     rows.into_iter().next().ok_or(RequestFault::NotFound { what: format!("run `{run}`"), hint })
 }
@@ -138,7 +139,7 @@ struct RangedFile {
 }
 
 impl RangedFile {
-    async fn answer(&self, lake: &Lake, headers: &HeaderMap) -> Result<Response, RequestFault> {
+    async fn answer_request(&self, lake: &Lake, headers: &HeaderMap) -> Result<Response, RequestFault> {
         let store = lake.store();
         let unread = |e: object_store::Error| match e {
             object_store::Error::NotFound { .. } => {
@@ -149,7 +150,7 @@ impl RangedFile {
                 RequestFault::Unreadable
             }
         };
-        let part = match self.described.asked(headers, self.bytes) {
+        let part = match self.described.range_answer(headers, self.bytes) {
             RangeAnswer::Answer(answer) => return Ok(answer),
             RangeAnswer::Part(part) => part,
         };
@@ -169,6 +170,6 @@ impl RangedFile {
                 }))
             }
         };
-        Ok(self.described.part(&part, body))
+        Ok(self.described.part_response(&part, body))
     }
 }

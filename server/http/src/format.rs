@@ -21,9 +21,9 @@ const FORMATS: [(AnswerFormat, &[&str]); 4] = [
 ];
 
 /// The format of this name.
-pub(super) fn named(name: &str) -> Result<AnswerFormat, RequestFault> {
+pub(super) fn format_by_name(name: &str) -> Result<AnswerFormat, RequestFault> {
     let known = FORMATS.iter().map(|(format, _)| *format).find(|f| f.name() == name);
-    known.ok_or_else(|| RequestFault::request(format!("no format `{name}`; hint: {}", format_names().join(", "))))
+    known.ok_or_else(|| RequestFault::bad_request(format!("no format `{name}`; hint: {}", format_names().join(", "))))
 }
 
 /// The names of all formats.
@@ -32,7 +32,7 @@ pub(super) fn format_names() -> [&'static str; 4] {
 }
 
 /// The format that an `Accept` header likes best.
-pub(super) fn accepted(accept: &str) -> Result<AnswerFormat, RequestFault> {
+pub(super) fn accepted_format(accept: &str) -> Result<AnswerFormat, RequestFault> {
     let mut best: Option<(f32, AnswerFormat)> = None;
     for range in accept.split(',') {
         let mut parts = range.split(';').map(str::trim);
@@ -47,18 +47,18 @@ pub(super) fn accepted(accept: &str) -> Result<AnswerFormat, RequestFault> {
     }
     best.map(|(_, format)| format).ok_or_else(|| {
         let types: Vec<_> = FORMATS.iter().map(|(_, types)| types[0]).collect();
-        RequestFault::request(format!("nothing in `Accept: {accept}` can be had; hint: {}", types.join(", ")))
+        RequestFault::bad_request(format!("nothing in `Accept: {accept}` can be had; hint: {}", types.join(", ")))
     })
 }
 
 /// Returns whether an Arrow stream is preferred to JSON.
 pub(super) fn prefers_arrow(headers: &HeaderMap) -> bool {
     let accept = headers.get(header::ACCEPT).and_then(|v| v.to_str().ok()).unwrap_or_default();
-    accepted(accept).is_ok_and(|format| format == AnswerFormat::Arrow)
+    accepted_format(accept).is_ok_and(|format| format == AnswerFormat::Arrow)
 }
 
 /// Returns whether the client accepts an encoding of HTTP.
-pub fn takes(headers: &HeaderMap, encoding: &str) -> bool {
+pub fn accepts_encoding(headers: &HeaderMap, encoding: &str) -> bool {
     let accepted = headers.get(header::ACCEPT_ENCODING).and_then(|v| v.to_str().ok()).unwrap_or_default();
     accepted.split(',').any(|one| {
         let mut parts = one.split(';').map(str::trim);
@@ -82,7 +82,7 @@ pub(super) struct FormatEncoder {
 struct SharedBuffer(Arc<Mutex<Vec<u8>>>);
 
 impl SharedBuffer {
-    fn take(&self) -> Vec<Bytes> {
+    fn take_bytes(&self) -> Vec<Bytes> {
         let bytes = take(&mut *self.0.lock().unwrap_or_else(PoisonError::into_inner));
         if bytes.is_empty() { Vec::new() } else { vec![bytes.into()] }
     }
@@ -110,14 +110,14 @@ impl FormatEncoder {
 impl AnswerEncoder for FormatEncoder {
     type Item = Bytes;
 
-    fn batch(&mut self, batch: RecordBatch) -> Result<Vec<Bytes>, RequestFault> {
+    fn encode_batch(&mut self, batch: RecordBatch) -> Result<Vec<Bytes>, RequestFault> {
         self.writer.write(&batch)?;
-        Ok(self.written.take())
+        Ok(self.written.take_bytes())
     }
 
-    fn end(self) -> Result<Vec<Bytes>, RequestFault> {
+    fn encode_end(self) -> Result<Vec<Bytes>, RequestFault> {
         self.writer.finish()?;
-        Ok(self.written.take())
+        Ok(self.written.take_bytes())
     }
 }
 
@@ -138,17 +138,17 @@ mod tests {
             ("application/json;q=0", None),
             ("", None),
         ] {
-            assert_eq!(accepted(accept).ok(), expected, "{accept}");
+            assert_eq!(accepted_format(accept).ok(), expected, "{accept}");
         }
     }
 
     #[test]
     fn formats_have_names_and_types() {
         for (format, types) in FORMATS {
-            assert_eq!(named(format.name()).ok(), Some(format));
+            assert_eq!(format_by_name(format.name()).ok(), Some(format));
             assert_eq!(media_type(format), types[0]);
-            assert_eq!(accepted(types[0]).ok(), Some(format));
+            assert_eq!(accepted_format(types[0]).ok(), Some(format));
         }
-        assert!(named("table").is_err_and(|e| e.to_string().contains("json, arrow, csv, parquet")));
+        assert!(format_by_name("table").is_err_and(|e| e.to_string().contains("json, arrow, csv, parquet")));
     }
 }

@@ -55,7 +55,7 @@ impl FromRequestParts<QueryService> for MayQuery {
     type Rejection = ProblemResponse;
 
     async fn from_request_parts(_: &mut Parts, service: &QueryService) -> Result<Self, ProblemResponse> {
-        Ok(Self(service.client(TokenScope::Sql)?))
+        Ok(Self(service.authorised_client(TokenScope::Sql)?))
     }
 }
 
@@ -74,7 +74,7 @@ pub async fn own_pages_only(State(is_open): State<bool>, request: Request, next:
 /// [`RequestFault::Foreign`] if it does not.
 pub(super) fn is_own(uri: &Uri, headers: &HeaderMap) -> Result<(), RequestFault> {
     // HTTP/1.1 wants one Host; with two, the check and the routing may use different ones.
-    let host = match (headers.get_all(header::HOST).iter().count(), text(headers, &header::HOST)) {
+    let host = match (headers.get_all(header::HOST).iter().count(), header_text(headers, &header::HOST)) {
         (1, Some(host)) => host,
         (_, host) => return Err(RequestFault::Foreign { what: "host", found: host.unwrap_or_default() }),
     };
@@ -93,13 +93,13 @@ pub(super) fn is_own(uri: &Uri, headers: &HeaderMap) -> Result<(), RequestFault>
 /// # Errors
 /// [`RequestFault::Foreign`] if it is.
 pub fn is_same_origin(headers: &HeaderMap) -> Result<(), RequestFault> {
-    let host = text(headers, &header::HOST).unwrap_or_default();
-    if let Some(origin) = text(headers, &header::ORIGIN)
+    let host = header_text(headers, &header::HOST).unwrap_or_default();
+    if let Some(origin) = header_text(headers, &header::ORIGIN)
         && !ORIGIN_SCHEMES.iter().any(|scheme| origin.strip_prefix(scheme) == Some(&host))
     {
         return Err(RequestFault::Foreign { what: "origin", found: origin });
     }
-    match text(headers, &FETCH_SITE) {
+    match header_text(headers, &FETCH_SITE) {
         Some(site) if site != "same-origin" && site != "none" => {
             Err(RequestFault::Foreign { what: "site", found: site })
         }
@@ -107,7 +107,7 @@ pub fn is_same_origin(headers: &HeaderMap) -> Result<(), RequestFault> {
     }
 }
 
-fn text(headers: &HeaderMap, name: &HeaderName) -> Option<String> {
+fn header_text(headers: &HeaderMap, name: &HeaderName) -> Option<String> {
     headers.get(name).map(|v| String::from_utf8_lossy(v.as_bytes()).into_owned())
 }
 

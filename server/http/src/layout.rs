@@ -14,7 +14,7 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::conditions::ConditionOutcome;
-use super::ranges::{POLICY, cors};
+use super::ranges::{POLICY, cors_layer};
 
 /// The panel with the arms, the response that was heard last, the air, verdicts, the log. Repeated fields come first in
 /// Lichtblick's table of a message, which has no choice of columns, so verdicts are shown as a list of fields.
@@ -47,13 +47,13 @@ impl ViewerLayout {
 
 /// The route of the layout. Lichtblick names a layout from a URL by its file name, and replaces its own layout of that
 /// name.
-pub(super) fn routes() -> OpenApiRouter<ViewerLayout> {
+pub(super) fn layout_routes() -> OpenApiRouter<ViewerLayout> {
     OpenApiRouter::new().routes(routes!(layout))
 }
 
 /// The layout for viewers on pages of any origin.
 pub fn for_viewers(layout: ViewerLayout) -> Router {
-    Router::from(routes()).method_not_allowed_fallback(super::problem::refuse_method).layer(cors()).with_state(layout)
+    Router::from(layout_routes()).method_not_allowed_fallback(super::problem::refuse_method).layer(cors_layer()).with_state(layout)
 }
 
 /// A layout for Foxglove and Lichtblick: panel and arms, response, air, measurement, log.
@@ -70,7 +70,7 @@ async fn layout(State(layout): State<ViewerLayout>, headers: HeaderMap) -> Respo
         (header::ETAG, &layout.etag),
         (POLICY, "cross-origin"),
     ];
-    let instead = ConditionOutcome::new(&headers, &layout.etag).response(&layout.etag, common.clone());
+    let instead = ConditionOutcome::new(&headers, &layout.etag).early_response(&layout.etag, common.clone());
     instead.unwrap_or_else(|| (common, layout.text.to_string()).into_response())
 }
 

@@ -59,7 +59,7 @@ struct ManifestFile {
 }
 
 /// The route of the list.
-pub(super) fn routes() -> OpenApiRouter<LakeCatalogue> {
+pub(super) fn manifest_routes() -> OpenApiRouter<LakeCatalogue> {
     OpenApiRouter::new().routes(routes!(files))
 }
 
@@ -79,44 +79,44 @@ async fn files(
     QueryParams(query): QueryParams<FilesQuery>,
     headers: HeaderMap,
 ) -> Result<Response, ProblemResponse> {
-    catalogue.service().client(TokenScope::Files)?;
-    let tables = query.table.iter().map(|name| catalogue::table(name));
+    catalogue.service().authorised_client(TokenScope::Files)?;
+    let tables = query.table.iter().map(|name| catalogue::find_table(name));
     let tables = tables.collect::<Result<Vec<_>, RequestFault>>()?;
-    let view = catalogue.view().await?;
-    let origin = origin(&headers);
+    let view = catalogue.current_view().await?;
+    let origin = server_origin(&headers);
     // The answer has the tables that were asked for, and the server's address as this client knows it.
-    let etag = view.etag(&format!("{origin} files {:?}", query.table));
+    let etag = view.answer_etag(&format!("{origin} files {:?}", query.table));
     let validators = [
         (header::ETAG, etag.as_str()),
         (header::CACHE_CONTROL, "private, no-cache"),
         (header::VARY, "Host, X-Forwarded-Proto"),
     ];
-    if let Some(instead) = ConditionOutcome::new(&headers, &etag).response(&etag, validators.clone()) {
+    if let Some(instead) = ConditionOutcome::new(&headers, &etag).early_response(&etag, validators.clone()) {
         return Ok(instead);
     }
     let all: Vec<_> = Table::ALL.into_iter().filter(|table| tables.is_empty() || tables.contains(table)).collect();
     let snapshot = &view.snapshot;
     for table in &all {
-        snapshot.check(*table).map_err(|fault| RequestFault::Query(fault.into()))?;
+        snapshot.check_table(*table).map_err(|fault| RequestFault::Query(fault.into()))?;
     }
     let files = all.iter().flat_map(|table| {
         let origin = &origin;
-        snapshot.readable_files(*table).filter_map(move |file| ManifestFile::of(origin, *table, file))
+        snapshot.readable_files(*table).filter_map(move |file| ManifestFile::from_data_file(origin, *table, file))
     });
-    let rows_elsewhere = all.iter().filter_map(|table| RowsElsewhere::of(snapshot, *table)).collect();
+    let rows_elsewhere = all.iter().filter_map(|table| RowsElsewhere::from_snapshot(snapshot, *table)).collect();
     let manifest = FileManifest { version: &view.version, files: files.collect(), rows_elsewhere };
     Ok((validators, axum::Json(manifest)).into_response())
 }
 
 /// The origin of this server's URLs as the client sees it: behind a proxy with TLS, `https`.
-pub(super) fn origin(headers: &HeaderMap) -> String {
+pub(super) fn server_origin(headers: &HeaderMap) -> String {
     let text = |name: HeaderName| headers.get(name).and_then(|v| v.to_str().ok());
     let scheme = if is_encrypted(headers) { "https" } else { "http" };
     format!("{scheme}://{}", text(header::HOST).unwrap_or_default())
 }
 
 impl RowsElsewhere {
-    fn of(snapshot: &LakeSnapshot, table: Table) -> Option<Self> {
+    fn from_snapshot(snapshot: &LakeSnapshot, table: Table) -> Option<Self> {
         let all: u64 = snapshot.files(table).iter().map(DataFile::visible_rows).sum();
         let readable: u64 = snapshot.readable_files(table).map(DataFile::visible_rows).sum();
         (all > readable).then(|| Self { table: table.name(), rows: all - readable })
@@ -124,7 +124,7 @@ impl RowsElsewhere {
 }
 
 impl ManifestFile {
-    fn of(origin: &str, table: Table, file: &DataFile) -> Option<Self> {
+    fn from_data_file(origin: &str, table: Table, file: &DataFile) -> Option<Self> {
         let (name, rows) = (file.path.filename()?, file.visible_rows());
         Some(Self {
             table: table.name(),

@@ -64,10 +64,10 @@ impl From<RequestFault> for ProblemResponse {
 
 impl ProblemResponse {
     /// Returns the failure as a response.
-    pub fn answer(&self) -> Response {
+    pub fn to_response(&self) -> Response {
         let code = self.0.code();
-        let (status, title) = status(code);
-        let parts = self.0.parts();
+        let (status, title) = status_and_title(code);
+        let parts = self.0.text_parts();
         let body = ProblemBody {
             kind: format!("urn:echolake:problem:{}", code.name()),
             title,
@@ -96,7 +96,7 @@ impl ProblemResponse {
 
 impl IntoResponse for ProblemResponse {
     fn into_response(self) -> Response {
-        self.answer()
+        self.to_response()
     }
 }
 
@@ -105,7 +105,7 @@ pub(super) async fn refuse_method() -> ProblemResponse {
     ProblemResponse(RequestFault::Method)
 }
 
-fn status(code: FaultCode) -> (StatusCode, &'static str) {
+fn status_and_title(code: FaultCode) -> (StatusCode, &'static str) {
     match code {
         FaultCode::Query => (StatusCode::BAD_REQUEST, "The query is not right"),
         FaultCode::ReadOnly => (StatusCode::FORBIDDEN, "Only reading is allowed"),
@@ -146,7 +146,7 @@ mod tests {
     #[test]
     fn a_refusal_for_a_while_says_for_how_long() {
         let retry = |fault| {
-            let answer = ProblemResponse(fault).answer();
+            let answer = ProblemResponse(fault).to_response();
             let secs = answer.headers().get(header::RETRY_AFTER).and_then(|secs| secs.to_str().ok()?.parse().ok());
             (answer.status().as_u16(), secs)
         };

@@ -17,7 +17,7 @@ const API_VERSION: HeaderName = HeaderName::from_static("api-version");
 const FETCH_MODE: HeaderName = HeaderName::from_static("sec-fetch-mode");
 
 /// The CORS headers of routes that other origins may read: from anywhere, without credentials, with what ranges need.
-pub fn cors() -> CorsLayer {
+pub fn cors_layer() -> CorsLayer {
     CorsLayer::new()
         .allow_origin(Any)
         .allow_methods([Method::GET, Method::HEAD])
@@ -67,49 +67,49 @@ pub(super) struct FilePart {
 
 impl FileDescription {
     /// Determines the answer to a request, for a file of `bytes` bytes.
-    pub(super) fn asked(&self, headers: &HeaderMap, bytes: u64) -> RangeAnswer {
+    pub(super) fn range_answer(&self, headers: &HeaderMap, bytes: u64) -> RangeAnswer {
         if let Some(instead) = self.condition_answer(headers) {
             return RangeAnswer::Answer(instead);
         }
-        match self.wanted(headers, bytes) {
+        match self.wanted_range(headers, bytes) {
             WantedRange::Whole => RangeAnswer::Part(FilePart { range: 0..bytes, of: None }),
             WantedRange::Part(range) => RangeAnswer::Part(FilePart { range, of: Some(bytes) }),
-            WantedRange::Nothing => RangeAnswer::Answer(self.nothing(bytes)),
+            WantedRange::Nothing => RangeAnswer::Answer(self.unsatisfiable_response(bytes)),
         }
     }
 
     /// Returns the answer to a client that has this version already, 304, or that wants another one, 412.
     pub(super) fn condition_answer(&self, headers: &HeaderMap) -> Option<Response> {
         let outcome = ConditionOutcome::new(headers, &self.etag);
-        let mut response = outcome.response(&self.etag, ())?;
+        let mut response = outcome.early_response(&self.etag, ())?;
         if outcome == ConditionOutcome::NotModified {
             return Some(self.with_headers(response));
         }
-        insert(response.headers_mut(), POLICY, self.policy);
+        insert_header(response.headers_mut(), POLICY, self.policy);
         Some(response)
     }
 
     /// Bytes as they were asked for.
-    pub(super) fn part(&self, part: &FilePart, body: Body) -> Response {
+    pub(super) fn part_response(&self, part: &FilePart, body: Body) -> Response {
         let status = if part.of.is_some() { StatusCode::PARTIAL_CONTENT } else { StatusCode::OK };
         let mut response = self.with_headers((status, body).into_response());
         let (out, range) = (response.headers_mut(), &part.range);
         out.insert(header::CONTENT_LENGTH, (range.end - range.start).into());
         if let Some(bytes) = part.of {
-            insert(out, header::CONTENT_RANGE, &format!("bytes {}-{}/{bytes}", range.start, range.end - 1));
+            insert_header(out, header::CONTENT_RANGE, &format!("bytes {}-{}/{bytes}", range.start, range.end - 1));
         }
         response
     }
 
     /// All bytes, as they come.
-    pub(super) fn stream(&self, body: Body) -> Response {
+    pub(super) fn stream_response(&self, body: Body) -> Response {
         self.with_headers(body.into_response())
     }
 
-    fn nothing(&self, bytes: u64) -> Response {
+    fn unsatisfiable_response(&self, bytes: u64) -> Response {
         let mut response = ProblemResponse(RequestFault::Range { bytes }).into_response();
-        insert(response.headers_mut(), header::CONTENT_RANGE, &format!("bytes */{bytes}"));
-        insert(response.headers_mut(), POLICY, self.policy);
+        insert_header(response.headers_mut(), header::CONTENT_RANGE, &format!("bytes */{bytes}"));
+        insert_header(response.headers_mut(), POLICY, self.policy);
         response
     }
 
@@ -123,22 +123,22 @@ impl FileDescription {
             (header::CACHE_CONTROL, "private, no-cache, no-transform"),
             (POLICY, self.policy),
         ] {
-            insert(out, name, value);
+            insert_header(out, name, value);
         }
         response
     }
 
-    fn wanted(&self, headers: &HeaderMap, bytes: u64) -> WantedRange {
+    fn wanted_range(&self, headers: &HeaderMap, bytes: u64) -> WantedRange {
         let text = |name: HeaderName| headers.get(name).and_then(|v| v.to_str().ok());
         // A range of what the file no longer is would be none of it.
         if text(header::IF_RANGE).is_some_and(|known| known != self.etag) {
             return WantedRange::Whole;
         }
-        text(header::RANGE).map_or(WantedRange::Whole, |range| WantedRange::of(range, bytes))
+        text(header::RANGE).map_or(WantedRange::Whole, |range| WantedRange::from_header(range, bytes))
     }
 }
 
-fn insert(headers: &mut HeaderMap, name: HeaderName, value: &str) {
+fn insert_header(headers: &mut HeaderMap, name: HeaderName, value: &str) {
     if let Ok(value) = HeaderValue::from_str(value) {
         headers.insert(name, value);
     }
@@ -155,7 +155,7 @@ enum WantedRange {
 
 impl WantedRange {
     // RFC 9110, section 14: a header that makes no sense, and several ranges at once, are answered by the whole file.
-    fn of(range: &str, bytes: u64) -> Self {
+    fn from_header(range: &str, bytes: u64) -> Self {
         let Some((first, last)) = range.strip_prefix("bytes=").and_then(|r| r.trim().split_once('-')) else {
             return Self::Whole;
         };
@@ -193,7 +193,7 @@ mod tests {
             ("bytes=0-18446744073709551615", WantedRange::Part(0..1000)),
             ("bytes=99999999999999999999-", WantedRange::Whole),
         ] {
-            assert_eq!(WantedRange::of(range, 1000), expected, "{range}");
+            assert_eq!(WantedRange::from_header(range, 1000), expected, "{range}");
         }
     }
 }

@@ -19,7 +19,7 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::extract::{BinaryContent, QueryParams};
-use super::format::{FormatEncoder, accepted, format_names, media_type, named};
+use super::format::{FormatEncoder, accepted_format, format_by_name, format_names, media_type};
 use super::guard::MayQuery;
 use super::problem::ProblemResponse;
 use crate::request_protocol::http_job;
@@ -59,8 +59,8 @@ fn format_schema() -> RefOr<Schema> {
 }
 
 /// The route of queries.
-pub(super) fn routes() -> OpenApiRouter<QueryService> {
-    OpenApiRouter::new().routes(routes!(post))
+pub(super) fn sql_routes() -> OpenApiRouter<QueryService> {
+    OpenApiRouter::new().routes(routes!(post_sql))
 }
 
 /// Answers one read-only query.
@@ -82,40 +82,40 @@ pub(super) fn routes() -> OpenApiRouter<QueryService> {
         (Vec<HashMap<String, Value>> = "application/json")
     )))
 )]
-async fn post(
+async fn post_sql(
     State(service): State<QueryService>,
     MayQuery(client): MayQuery,
     QueryParams(params): QueryParams<SqlParams>,
     headers: HeaderMap,
     body: Result<Bytes, BytesRejection>,
 ) -> Result<Response, ProblemResponse> {
-    let request = parse_body(&headers, &whole(body)?)?;
-    let format = format(&headers, params.format.or(request.format))?;
+    let request = parse_body(&headers, &whole_body(body)?)?;
+    let format = choose_format(&headers, params.format.or(request.format))?;
     let format = match (params.escape_formulas.or(request.escape_formulas).unwrap_or(false), format) {
         (false, format) => format,
         (true, AnswerFormat::Csv) => AnswerFormat::SpreadsheetCsv,
         (true, other) => {
             let message = format!("`escape_formulas` is for CSV, and the answer is {}; hint: format=csv", other.name());
-            return Err(RequestFault::request(message).into());
+            return Err(RequestFault::bad_request(message).into());
         }
     };
-    let job = http_job(Arc::new(service.session(&client)), QueryWork::Sql(request.query));
-    let mut running = service.begin(job, move |schema| FormatEncoder::new(format, schema)).await?;
+    let job = http_job(Arc::new(service.begin_session(&client)), QueryWork::Sql(request.query));
+    let mut running = service.begin_query(job, move |schema| FormatEncoder::new(format, schema)).await?;
     // A query that fails at once still has a status to say so with.
-    let first = running.next().await?;
+    let first = running.next_part().await?;
     let headers = [(header::CONTENT_TYPE, media_type(format))];
-    Ok((headers, Body::from_stream(rest(first, running))).into_response())
+    Ok((headers, Body::from_stream(remaining_parts(first, running))).into_response())
 }
 
 // An error on the way breaks the connection off: a short answer would look like a whole one.
-fn rest(
+fn remaining_parts(
     first: Option<Bytes>,
     running: RunningQuery<Bytes>,
 ) -> impl stream::Stream<Item = Result<Bytes, RequestFault>> + Send {
     stream::try_unfold((first, running), |(first, mut running)| async move {
         let part = match first {
             Some(part) => Some(part),
-            None => running.next().await?,
+            None => running.next_part().await?,
         };
         Ok(part.map(|part| (part, (None, running))))
     })
@@ -125,10 +125,10 @@ fn rest(
 ///
 /// # Errors
 /// [`RequestFault::TooLarge`], [`RequestFault::Request`].
-pub(super) fn whole(body: Result<Bytes, BytesRejection>) -> Result<Bytes, RequestFault> {
+pub(super) fn whole_body(body: Result<Bytes, BytesRejection>) -> Result<Bytes, RequestFault> {
     body.map_err(|rejection| match rejection.status() {
         StatusCode::PAYLOAD_TOO_LARGE => RequestFault::TooLarge { limit: LARGEST },
-        _ => RequestFault::request("the request's body did not come whole"),
+        _ => RequestFault::bad_request("the request's body did not come whole"),
     })
 }
 
@@ -136,22 +136,22 @@ fn parse_body(headers: &HeaderMap, body: &[u8]) -> Result<SqlRequest, RequestFau
     let kind = headers.get(header::CONTENT_TYPE).and_then(|v| v.to_str().ok()).unwrap_or_default();
     match kind.split(';').next().unwrap_or_default().trim().to_ascii_lowercase().as_str() {
         "application/json" => serde_json::from_slice(body).map_err(|e| {
-            RequestFault::request(format!("the body is not as expected: {e}; hint: {{\"query\": \"select 1\"}}"))
+            RequestFault::bad_request(format!("the body is not as expected: {e}; hint: {{\"query\": \"select 1\"}}"))
         }),
         "text/plain" | "application/sql" => match std::str::from_utf8(body) {
             Ok(query) => Ok(SqlRequest { query: query.to_owned(), format: None, escape_formulas: None }),
-            Err(_) => Err(RequestFault::request("the query is not UTF-8")),
+            Err(_) => Err(RequestFault::bad_request("the query is not UTF-8")),
         },
-        other => Err(RequestFault::request(format!(
+        other => Err(RequestFault::bad_request(format!(
             "a query does not come as `{other}`; hint: Content-Type application/json, application/sql or text/plain"
         ))),
     }
 }
 
-fn format(headers: &HeaderMap, name: Option<String>) -> Result<AnswerFormat, RequestFault> {
+fn choose_format(headers: &HeaderMap, name: Option<String>) -> Result<AnswerFormat, RequestFault> {
     match (name, headers.get(header::ACCEPT).and_then(|v| v.to_str().ok())) {
-        (Some(name), _) => named(&name),
-        (None, Some(accept)) => accepted(accept),
+        (Some(name), _) => format_by_name(&name),
+        (None, Some(accept)) => accepted_format(accept),
         (None, None) => Ok(AnswerFormat::Json),
     }
 }

@@ -54,7 +54,7 @@ pub(super) struct PgCatalog {
 impl PgCatalog {
     /// For a lake's tables, views and functions.
     pub(super) fn new(service: &QueryService) -> Result<Self, Error> {
-        let own_functions = service.functions();
+        let own_functions = service.own_functions();
         let library = Arc::new(PgCatalogStaticTables::try_new()?);
         let types = read_numbers(library.pg_type.data(), "typname")?;
         let procedures = read_numbers(library.pg_proc.data(), "proname")?;
@@ -67,7 +67,7 @@ impl PgCatalog {
             add_functions(functions, &own_functions)?;
         }
         // What the field's functions return depends on what they are given.
-        let own_signatures = own_functions.iter().map(|f| (f.arguments().to_owned(), String::new()));
+        let own_signatures = own_functions.iter().map(|f| (f.argument_list().to_owned(), String::new()));
         signatures.extend((OWN_NUMBERS..).zip(own_signatures));
         let fixed = batches.iter().map(|(name, batches)| (name.clone(), batches[0].schema())).collect();
         let relations = CatalogRelations::new(service, &definitions, fixed);
@@ -88,17 +88,17 @@ impl PgCatalog {
         }
         let mut tables = NamedTables::new();
         for (name, batches) in batches {
-            empty.add(&name, &batches);
+            empty.add_table(&name, &batches);
             tables.insert(name, memory_table(batches)?);
         }
-        let mut functions = functions::fixed();
-        functions.extend(functions::lookups(CatalogNumbers {
+        let mut functions = functions::fixed_functions();
+        functions.extend(functions::lookup_functions(CatalogNumbers {
             types,
             procedures,
             relations: relations.table_numbers(),
             schemas: SCHEMAS.map(|(number, name)| (name.to_owned(), number)).into(),
             signatures,
-            comments: relations.comments(),
+            comments: relations.all_comments(),
             definitions: relations.view_definitions(),
         }));
         Ok(Self {
@@ -116,7 +116,7 @@ impl PgCatalog {
     }
 
     /// Makes what extends the session of this number and these settings.
-    pub(super) fn extend(&self, pid: i32, settings: &Arc<SessionSettings>) -> ContextExtension {
+    pub(super) fn session_extension(&self, pid: i32, settings: &Arc<SessionSettings>) -> ContextExtension {
         let catalog = self.clone();
         let own = functions::of_session(pid, settings);
         let schema = Arc::new(CatalogSchema {
@@ -125,10 +125,10 @@ impl PgCatalog {
             pid,
             settings: settings.clone(),
         });
-        Arc::new(move |context| catalog.register(context, schema.clone(), &own))
+        Arc::new(move |context| catalog.register_in(context, schema.clone(), &own))
     }
 
-    fn register(
+    fn register_in(
         &self,
         context: &SessionContext,
         schema: Arc<dyn SchemaProvider>,
@@ -183,7 +183,7 @@ impl SchemaProvider for CatalogSchema {
 
     async fn table(&self, name: &str) -> Result<Option<Arc<dyn TableProvider>>> {
         if let Some(table) = self.session_tables.iter().find(|table| table.name == name) {
-            return memory_table(vec![table.make_session_rows(self.pid, &self.settings.all())?]).map(Some);
+            return memory_table(vec![table.make_session_rows(self.pid, &self.settings.all_values())?]).map(Some);
         }
         Ok(self.tables.get(name).cloned())
     }
@@ -204,7 +204,7 @@ struct InformationSchema {
 }
 
 impl InformationSchema {
-    fn others(&self) -> Option<InformationSchemaProvider> {
+    fn other_tables(&self) -> Option<InformationSchemaProvider> {
         let catalogs = self.catalogs.upgrade()?;
         Some(InformationSchemaProvider::new(catalogs).with_table_functions(self.functions.clone()))
     }
@@ -213,14 +213,14 @@ impl InformationSchema {
 #[async_trait]
 impl SchemaProvider for InformationSchema {
     fn table_names(&self) -> Vec<String> {
-        let mut names: Vec<_> = self.others().map(|others| others.table_names()).unwrap_or_default();
+        let mut names: Vec<_> = self.other_tables().map(|others| others.table_names()).unwrap_or_default();
         names.retain(|name| !self.own.contains_key(name));
         names.extend(self.own.keys().cloned());
         names
     }
 
     async fn table(&self, name: &str) -> Result<Option<Arc<dyn TableProvider>>> {
-        match (self.own.get(name), self.others()) {
+        match (self.own.get(name), self.other_tables()) {
             (Some(own), _) => Ok(Some(own.clone())),
             (None, Some(others)) => others.table(name).await,
             (None, None) => Ok(None),
@@ -228,7 +228,7 @@ impl SchemaProvider for InformationSchema {
     }
 
     fn table_exist(&self, name: &str) -> bool {
-        self.own.contains_key(name) || self.others().is_some_and(|others| others.table_exist(name))
+        self.own.contains_key(name) || self.other_tables().is_some_and(|others| others.table_exist(name))
     }
 }
 

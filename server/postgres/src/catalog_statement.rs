@@ -147,7 +147,7 @@ pub(super) struct EmptyRelations {
 
 impl EmptyRelations {
     /// Adds what of a table is empty.
-    pub(super) fn add(&mut self, table: &str, batches: &[RecordBatch]) {
+    pub(super) fn add_table(&mut self, table: &str, batches: &[RecordBatch]) {
         if batches.iter().all(|batch| batch.num_rows() == 0) {
             self.tables.insert(table.to_owned());
         }
@@ -196,7 +196,11 @@ impl EmptyRelations {
 }
 
 /// Adapts a statement about the server alone, whose common tables have these names.
-pub(super) fn adapt(mut statement: Statement, names: Vec<String>, empty: &EmptyRelations) -> Statement {
+pub(super) fn adapt_catalog_statement(
+    mut statement: Statement,
+    names: Vec<String>,
+    empty: &EmptyRelations,
+) -> Statement {
     if names.first().is_some_and(|name| name == TYPE_TREE)
         && let Some(known) = parse_statement(TYPES)
     {
@@ -386,7 +390,7 @@ impl CatalogAdapter<'_> {
         if query.limit_clause.is_some() {
             return None;
         }
-        let list = Expr::Subquery(Box::new(aggregated(query, "array_agg")?));
+        let list = Expr::Subquery(Box::new(aggregate_query(query, "array_agg")?));
         parse_expr(&format!("coalesce({list}, ARRAY[])"))
     }
 }
@@ -467,7 +471,7 @@ fn single_value(query: &Query) -> Option<Expr> {
     let one_row = match has_aggregate(value) {
         true if is_first => Query { limit_clause: None, ..query.clone() },
         true => return None,
-        false => aggregated(query, "first_value")?,
+        false => aggregate_query(query, "first_value")?,
     };
     Some(Expr::Subquery(Box::new(one_row)))
 }
@@ -508,7 +512,7 @@ fn selected_value(query: &Query) -> Option<(&Select, &Expr)> {
 }
 
 // The query whose one row is an aggregate of its values, in its order.
-fn aggregated(query: &Query, aggregate: &str) -> Option<Query> {
+fn aggregate_query(query: &Query, aggregate: &str) -> Option<Query> {
     let (select, value) = selected_value(query)?;
     let name = match &select.projection[..] {
         [SelectItem::ExprWithAlias { alias, .. }] => Some(&alias.value),
@@ -553,7 +557,7 @@ mod tests {
         let mut statement = parse_statement(sql).expect(sql);
         adapt_columns(&mut statement);
         let names = find_catalog_names(&mut statement).expect("it is about the server");
-        assert_eq!(adapt(statement, names, &empty).to_string(), expected);
+        assert_eq!(adapt_catalog_statement(statement, names, &empty).to_string(), expected);
     }
 
     #[test]

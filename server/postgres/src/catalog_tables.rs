@@ -217,7 +217,7 @@ impl CatalogRelations {
     ) -> Self {
         let mut views = service.view_definitions();
         let mut relations = Vec::new();
-        for (number, (name, schema)) in (FIRST_TABLE..).zip(service.tables()) {
+        for (number, (name, schema)) in (FIRST_TABLE..).zip(service.lake_tables()) {
             let table = CatalogRelation::new(number, SCHEMA, name.to_owned(), schema);
             relations.push(CatalogRelation {
                 is_view: Table::by_name(name).is_none(),
@@ -262,7 +262,7 @@ impl CatalogRelations {
     }
 
     /// Returns comments of the lake's tables and their columns.
-    pub(super) fn comments(&self) -> CatalogComments {
+    pub(super) fn all_comments(&self) -> CatalogComments {
         let mut comments = CatalogComments::new();
         for of in self.0.iter().filter(|of| of.is_own()) {
             let name = if of.namespace.0 == PUBLIC { of.name.clone() } else { format!("{SYSTEM_SCHEMA}.{}", of.name) };
@@ -281,17 +281,17 @@ impl CatalogRelations {
     pub(super) fn make_rows(&self, definition: &TableDefinition) -> Result<RecordBatch> {
         let all = self.0.iter();
         let sources: Vec<RowValues> = match definition.source {
-            "relation" => all.map(CatalogRelation::values).collect(),
-            "table" => all.filter(|of| !of.is_view).map(CatalogRelation::values).collect(),
-            "view" => all.filter(|of| of.is_view).map(CatalogRelation::values).collect(),
-            "own" => all.filter(|of| of.is_own()).map(CatalogRelation::values).collect(),
+            "relation" => all.map(CatalogRelation::row_values).collect(),
+            "table" => all.filter(|of| !of.is_view).map(CatalogRelation::row_values).collect(),
+            "view" => all.filter(|of| of.is_view).map(CatalogRelation::row_values).collect(),
+            "own" => all.filter(|of| of.is_own()).map(CatalogRelation::row_values).collect(),
             "column" => all.flat_map(CatalogRelation::column_values).collect(),
             "schema" => SCHEMAS
                 .map(|(number, name)| {
                     RowValues::from([("schema_number", number.to_string()), ("schema", name.to_owned())])
                 })
                 .into(),
-            "comment" => self.comments().into_iter().map(comment_values).collect(),
+            "comment" => self.all_comments().into_iter().map(comment_values).collect(),
             "server" => vec![RowValues::new()],
             _ => Vec::new(),
         };
@@ -314,7 +314,7 @@ impl CatalogRelation {
         [PUBLIC, SYSTEM].contains(&self.namespace.0)
     }
 
-    fn values(&self) -> RowValues {
+    fn row_values(&self) -> RowValues {
         let mut values = RowValues::from([
             ("number", self.number.to_string()),
             ("table", self.name.clone()),
@@ -348,7 +348,7 @@ impl CatalogRelation {
         let is_list =
             matches!(field.data_type(), DataType::List(_) | DataType::LargeList(_) | DataType::FixedSizeList(..));
         let is_nullable = field.is_nullable();
-        let mut values = self.values();
+        let mut values = self.row_values();
         values.extend([
             ("column", field.name().clone()),
             ("position", position.to_string()),

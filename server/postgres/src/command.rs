@@ -18,7 +18,7 @@ use pgwire::messages::response::{NoticeResponse, TransactionStatus};
 use super::connection::PostgresConnection;
 use super::copy::{CopyRowEncoder, send_copy};
 use super::cursor::{CommandRun, QueryCursor};
-use super::rows::{RowEncoder, fields, response, text_fields, texts};
+use super::rows::{RowEncoder, column_fields, rows_response, text_fields, text_response};
 use super::settings::SessionSettings;
 use super::sqlstate::failure;
 use super::statement::ClientStatement;
@@ -33,8 +33,8 @@ pub(super) fn find_columns(
     format: &Format,
 ) -> Result<Vec<FieldInfo>, RequestFault> {
     let fields = match statement {
-        ClientStatement::Query(planned) => fields(&planned.prepared.schema(), format)?,
-        ClientStatement::Fetch { name, .. } => fields(&connection.cursor(name)?.schema, format)?,
+        ClientStatement::Query(planned) => column_fields(&planned.prepared.schema(), format)?,
+        ClientStatement::Fetch { name, .. } => column_fields(&connection.find_cursor(name)?.schema, format)?,
         ClientStatement::Show(Some(name)) => text_fields(&[name]),
         ClientStatement::Show(None) => text_fields(&ALL),
         _ => return Ok(Vec::new()),
@@ -70,28 +70,28 @@ where
         ClientStatement::Query(planned) => {
             let encode = format.clone();
             let running = connection
-                .run(run, planned, values, move |schema| RowEncoder::new(schema, &encode))
+                .run_planned(run, planned, values, move |schema| RowEncoder::new(schema, &encode))
                 .await
                 .map_err(failure)?;
-            return Ok(Some(response(running, format).map_err(failure)?));
+            return Ok(Some(rows_response(running, format).map_err(failure)?));
         }
         ClientStatement::Copy(planned, form) => {
             let encode = form.clone();
             let running = connection
-                .run(run, planned, values, move |schema| CopyRowEncoder::new(schema, &encode))
+                .run_planned(run, planned, values, move |schema| CopyRowEncoder::new(schema, &encode))
                 .await
                 .map_err(failure)?;
             send_copy(client, form, running).await?;
             return Ok(None);
         }
         ClientStatement::Declare { name, planned, held } => {
-            let running = connection.run(run, planned, values, |_| Ok(BatchEncoder)).await.map_err(failure)?;
-            connection.declare(name, QueryCursor::new(running, *held)).map_err(failure)?;
+            let running = connection.run_planned(run, planned, values, |_| Ok(BatchEncoder)).await.map_err(failure)?;
+            connection.declare_cursor(name, QueryCursor::new(running, *held)).map_err(failure)?;
             "DECLARE CURSOR"
         }
         ClientStatement::Fetch { name, rows } => {
             return Ok(Some(
-                connection.cursor(name).map_err(failure)?.fetch(*rows, run, format).await.map_err(failure)?,
+                connection.find_cursor(name).map_err(failure)?.fetch_rows(*rows, run, format).await.map_err(failure)?,
             ));
         }
         ClientStatement::Show(name) => {
@@ -100,7 +100,7 @@ where
         // Transactions are kept as far as clients see them: there is nothing to commit, and nothing to roll back.
         ClientStatement::Begin => {
             if status == TransactionStatus::Transaction {
-                warn(client, "25001", "there is already a transaction in progress").await?;
+                send_warning(client, "25001", "there is already a transaction in progress").await?;
             }
             client.set_transaction_status(TransactionStatus::Transaction);
             "BEGIN"
@@ -115,7 +115,7 @@ where
         }
         ClientStatement::Commit | ClientStatement::Rollback => {
             if status == TransactionStatus::Idle {
-                warn(client, "25P01", "there is no transaction in progress").await?;
+                send_warning(client, "25P01", "there is no transaction in progress").await?;
             }
             connection.end_transaction();
             client.portal_store().clear_portals();
@@ -129,28 +129,28 @@ where
         }
         ClientStatement::Discard(DiscardObject::ALL) => {
             client.portal_store().clear_portals();
-            connection.settings.reset(None).map_err(failure)?;
-            connection.close(None).map_err(failure)?;
+            connection.settings.reset_values(None).map_err(failure)?;
+            connection.close_cursors(None).map_err(failure)?;
             "DISCARD ALL"
         }
         ClientStatement::Discard(_) => "DISCARD",
         ClientStatement::Unlisten => "UNLISTEN",
         ClientStatement::Close(name) => {
-            connection.close(name.as_deref()).map_err(failure)?;
+            connection.close_cursors(name.as_deref()).map_err(failure)?;
             if name.is_some() { "CLOSE CURSOR" } else { "CLOSE CURSOR ALL" }
         }
         ClientStatement::Set(pairs) => {
             pairs
                 .iter()
                 .try_for_each(|(name, value)| match value.eq_ignore_ascii_case("default") {
-                    true => connection.settings.reset(Some(name)),
-                    false => connection.settings.set(name, value),
+                    true => connection.settings.reset_values(Some(name)),
+                    false => connection.settings.set_value(name, value),
                 })
                 .map_err(failure)?;
             "SET"
         }
         ClientStatement::Reset(name) => {
-            connection.settings.reset(name.as_deref()).map_err(failure)?;
+            connection.settings.reset_values(name.as_deref()).map_err(failure)?;
             "RESET"
         }
     };
@@ -160,15 +160,15 @@ where
 
 fn show_settings(settings: &SessionSettings, name: Option<&str>) -> Result<QueryResponse, RequestFault> {
     let Some(name) = name else {
-        let all: Vec<_> = settings.all().into_iter().map(|(name, value)| vec![name.to_owned(), value]).collect();
-        return texts(&ALL, &all);
+        let all: Vec<_> = settings.all_values().into_iter().map(|(name, value)| vec![name.to_owned(), value]).collect();
+        return text_response(&ALL, &all);
     };
-    let mut rows = texts(&[name], &[vec![settings.get(name)?]])?;
+    let mut rows = text_response(&[name], &[vec![settings.get(name)?]])?;
     rows.set_command_tag("SHOW");
     Ok(rows)
 }
 
-async fn warn<C>(client: &mut C, state: &str, message: &str) -> PgWireResult<()>
+async fn send_warning<C>(client: &mut C, state: &str, message: &str) -> PgWireResult<()>
 where
     C: Sink<PgWireBackendMessage> + Unpin,
     PgWireError: From<<C as Sink<PgWireBackendMessage>>::Error>,

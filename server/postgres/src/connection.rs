@@ -45,10 +45,10 @@ impl PostgresState {
     }
 
     /// Cancels the query on the connection of this key.
-    pub(super) fn cancel(&self, pid: i32, key: &SecretKey) {
-        let found = lock(&self.running).get(&(pid, key.to_bytes())).cloned();
+    pub(super) fn cancel_query(&self, pid: i32, key: &SecretKey) {
+        let found = lock_mutex(&self.running).get(&(pid, key.to_bytes())).cloned();
         if let Some(current) = found {
-            lock(&current).stop();
+            lock_mutex(&current).stop();
         }
     }
 }
@@ -66,7 +66,7 @@ pub(super) struct PostgresConnection {
 impl Drop for PostgresConnection {
     fn drop(&mut self) {
         if let Some(key) = self.key.get() {
-            lock(&self.shared.running).remove(key);
+            lock_mutex(&self.shared.running).remove(key);
         }
     }
 }
@@ -103,12 +103,16 @@ impl PostgresConnection {
             true => SecretKey::Bytes(Bytes::copy_from_slice(&secret)),
             false => SecretKey::I32(i32::from_be_bytes([secret[0], secret[1], secret[2], secret[3]])),
         };
-        let session = self.shared.service.session(client).extended(self.shared.catalog.extend(pid, &self.settings));
+        let session = self
+            .shared
+            .service
+            .begin_session(client)
+            .with_extension(self.shared.catalog.session_extension(pid, &self.settings));
         let known = (pid, key.to_bytes());
         if self.session.set(Arc::new(session)).is_err() || self.key.set(known.clone()).is_err() {
-            return Err(RequestFault::request("this connection is logged in already"));
+            return Err(RequestFault::bad_request("this connection is logged in already"));
         }
-        lock(&self.shared.running).insert(known, self.current.clone());
+        lock_mutex(&self.shared.running).insert(known, self.current.clone());
         Ok((pid, key))
     }
 
@@ -123,14 +127,14 @@ impl PostgresConnection {
     }
 
     /// Begins a command: a CancelRequest ends this one from now on.
-    pub(super) fn command(&self) -> CommandRun {
+    pub(super) fn begin_command(&self) -> CommandRun {
         let stop = StopSignal::new();
-        *lock(&self.current) = stop.clone();
-        CommandRun { stop, limit: self.settings.statement_timeout().map(SessionTimeLimit::of) }
+        *lock_mutex(&self.current) = stop.clone();
+        CommandRun { stop, limit: self.settings.statement_timeout().map(SessionTimeLimit::from_now) }
     }
 
     /// Parses and plans. Boxed for the same reason as [`echolake_query::OpaqueValue`].
-    pub(super) fn statements<'a>(
+    pub(super) fn plan_statements<'a>(
         &'a self,
         sql: &'a str,
         run: &'a CommandRun,
@@ -143,29 +147,31 @@ impl PostgresConnection {
             let sql: Arc<str> = sql.into();
             let work = async move {
                 let mut statements = Vec::new();
-                for parsed in statement::parse(&shared.parser, shared.catalog.empty_relations(), &session, &sql)? {
-                    statements.push(statement::plan(&session, &sql, parsed).await?);
+                for parsed in
+                    statement::parse_statements(&shared.parser, shared.catalog.empty_relations(), &session, &sql)?
+                {
+                    statements.push(statement::plan_statement(&session, &sql, parsed).await?);
                 }
                 Ok(statements)
             };
-            self.planned(run, work).await
+            self.plan_within(run, work).await
         };
         statements.boxed()
     }
 
-    async fn planned<T: Send + 'static>(
+    async fn plan_within<T: Send + 'static>(
         &self,
         run: &CommandRun,
         work: impl Future<Output = Result<T, RequestFault>> + Send + 'static,
     ) -> Result<T, RequestFault> {
         tokio::select! {
-            fault = ended(&run.stop, run.limit) => Err(fault),
-            planned = self.shared.service.plan(self.session()?.client(), work) => planned,
+            fault = wait_for_fault(&run.stop, run.limit) => Err(fault),
+            planned = self.shared.service.plan_query(self.session()?.client(), work) => planned,
         }
     }
 
     /// Runs a planned statement; plans it again if the lake has changed since.
-    pub(super) async fn run<E: AnswerEncoder>(
+    pub(super) async fn run_planned<E: AnswerEncoder>(
         &self,
         run: &CommandRun,
         planned: &Arc<PlannedQuery>,
@@ -174,7 +180,7 @@ impl PostgresConnection {
     ) -> Result<RunningQuery<E::Item>, RequestFault> {
         let session = self.session()?.clone();
         let (planner, known) = (session.clone(), planned.clone());
-        let prepared = self.planned(run, async move { Ok(known.current(&planner).await?) }).await?;
+        let prepared = self.plan_within(run, async move { Ok(known.current_plan(&planner).await?) }).await?;
         if prepared.schema() != planned.prepared.schema() {
             return Err(RequestFault::unsupported("a prepared statement whose columns have changed since"));
         }
@@ -185,14 +191,14 @@ impl PostgresConnection {
             limit: run.limit,
             stop: run.stop.clone(),
         };
-        self.shared.service.begin(job, encode).await
+        self.shared.service.begin_query(job, encode).await
     }
 
     /// Keeps a cursor.
-    pub(super) fn declare(&self, name: &str, cursor: QueryCursor) -> Result<(), RequestFault> {
-        let mut cursors = lock(&self.cursors);
+    pub(super) fn declare_cursor(&self, name: &str, cursor: QueryCursor) -> Result<(), RequestFault> {
+        let mut cursors = lock_mutex(&self.cursors);
         if cursors.contains_key(name) {
-            return Err(RequestFault::request(format!("cursor \"{name}\" already exists")));
+            return Err(RequestFault::bad_request(format!("cursor \"{name}\" already exists")));
         }
         if cursors.len() >= CURSORS {
             return Err(RequestFault::TooMany { what: "cursors", limit: CURSORS });
@@ -202,29 +208,29 @@ impl PostgresConnection {
     }
 
     /// A cursor.
-    pub(super) fn cursor(&self, name: &str) -> Result<Arc<QueryCursor>, RequestFault> {
+    pub(super) fn find_cursor(&self, name: &str) -> Result<Arc<QueryCursor>, RequestFault> {
         let missing = || RequestFault::NotFound { what: format!("cursor \"{name}\""), hint: "DECLARE it first" };
-        lock(&self.cursors).get(name).cloned().ok_or_else(missing)
+        lock_mutex(&self.cursors).get(name).cloned().ok_or_else(missing)
     }
 
     /// Closes a cursor, or all of them.
-    pub(super) fn close(&self, name: Option<&str>) -> Result<(), RequestFault> {
+    pub(super) fn close_cursors(&self, name: Option<&str>) -> Result<(), RequestFault> {
         match name {
             Some(name) => {
-                self.cursor(name)?;
-                lock(&self.cursors).remove(name);
+                self.find_cursor(name)?;
+                lock_mutex(&self.cursors).remove(name);
             }
-            None => lock(&self.cursors).clear(),
+            None => lock_mutex(&self.cursors).clear(),
         }
         Ok(())
     }
 
     /// Ends a transaction: the cursors go that are not held.
     pub(super) fn end_transaction(&self) {
-        lock(&self.cursors).retain(|_, cursor| cursor.held);
+        lock_mutex(&self.cursors).retain(|_, cursor| cursor.held);
     }
 }
 
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+fn lock_mutex<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

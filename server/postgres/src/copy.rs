@@ -22,7 +22,7 @@ use pgwire::messages::PgWireBackendMessage;
 use pgwire::messages::copy::{CopyData, CopyDone, CopyOutResponse};
 
 use super::columns::parse_statement;
-use super::rows::{encoding, fields, sent_columns, text_fields};
+use super::rows::{column_fields, encoding_fault, sent_columns, text_fields};
 use super::sqlstate::failure;
 
 /// A binary copy without rows: signature, no flags, no extension, and the trailer.
@@ -60,7 +60,7 @@ pub(super) fn read_copy(
         return Err(RequestFault::Query(QueryError::NotReading { statement: format!("COPY TO {target}") }));
     }
     let mut form = CopyForm::default();
-    options.into_iter().try_for_each(|option| form.set(option))?;
+    options.into_iter().try_for_each(|option| form.set_option(option))?;
     legacy.into_iter().try_for_each(|option| form.set_legacy(option))?;
     let query = match source {
         CopySource::Query(query) => Sql::Query(query),
@@ -69,14 +69,14 @@ pub(super) fn read_copy(
             let columns = if columns.is_empty() { "*".to_owned() } else { columns.join(", ") };
             // Both were parsed as names, and print as such.
             parse_statement(&format!("SELECT {columns} FROM {table_name}"))
-                .ok_or_else(|| RequestFault::request(format!("`{table_name}` cannot be copied")))?
+                .ok_or_else(|| RequestFault::bad_request(format!("`{table_name}` cannot be copied")))?
         }
     };
     Ok((query, form))
 }
 
 impl CopyForm {
-    fn set(&mut self, option: CopyOption) -> Result<(), RequestFault> {
+    fn set_option(&mut self, option: CopyOption) -> Result<(), RequestFault> {
         match option {
             CopyOption::Format(format) => {
                 self.format = match format.value.to_ascii_lowercase().as_str() {
@@ -89,7 +89,7 @@ impl CopyForm {
             CopyOption::Delimiter(mark) | CopyOption::Quote(mark)
                 if !mark.is_ascii() || mark.is_ascii_alphanumeric() || ['\n', '\r', '\0', '\\'].contains(&mark) =>
             {
-                return Err(RequestFault::request(format!("{mark:?} cannot separate or quote")));
+                return Err(RequestFault::bad_request(format!("{mark:?} cannot separate or quote")));
             }
             CopyOption::Delimiter(mark) => self.delimiter = Some(mark),
             CopyOption::Quote(mark) => self.quote = Some(mark),
@@ -109,7 +109,7 @@ impl CopyForm {
             CopyLegacyOption::Header => CopyOption::Header(true),
             CopyLegacyOption::Csv(options) => {
                 for option in options {
-                    self.set(match option {
+                    self.set_option(match option {
                         CopyLegacyCsvOption::Header => CopyOption::Header(true),
                         CopyLegacyCsvOption::Quote(mark) => CopyOption::Quote(mark),
                         other => return Err(RequestFault::unsupported(format!("COPY with {other}"))),
@@ -119,7 +119,7 @@ impl CopyForm {
             }
             other => return Err(RequestFault::unsupported(format!("COPY with {other}"))),
         };
-        self.set(option)
+        self.set_option(option)
     }
 
     fn is_binary(&self) -> bool {
@@ -130,7 +130,7 @@ impl CopyForm {
         if self.is_binary() { Format::UnifiedBinary } else { Format::UnifiedText }
     }
 
-    fn encoder(&self, fields: Arc<Vec<FieldInfo>>) -> CopyEncoder {
+    fn make_encoder(&self, fields: Arc<Vec<FieldInfo>>) -> CopyEncoder {
         let delimiter = |usual: char| self.delimiter.unwrap_or(usual).to_string();
         match self.format {
             CopyFormat::Binary => CopyEncoder::new_binary(fields),
@@ -158,7 +158,7 @@ impl CopyForm {
             return Ok(None);
         }
         let names: Vec<_> = fields.iter().map(FieldInfo::name).collect();
-        let mut encoder = self.encoder(text_fields(&names));
+        let mut encoder = self.make_encoder(text_fields(&names));
         names.iter().try_for_each(|name| encoder.encode_field(name))?;
         Ok(Some(encoder.take_copy()))
     }
@@ -173,29 +173,29 @@ pub(super) struct CopyRowEncoder {
 impl CopyRowEncoder {
     /// For an answer of these columns.
     pub(super) fn new(schema: &SchemaRef, form: &CopyForm) -> Result<Self, RequestFault> {
-        let fields = fields(schema, &form.value_format())?;
-        Ok(Self { encoder: form.encoder(fields.clone()), fields })
+        let fields = column_fields(schema, &form.value_format())?;
+        Ok(Self { encoder: form.make_encoder(fields.clone()), fields })
     }
 }
 
 impl AnswerEncoder for CopyRowEncoder {
     type Item = Vec<CopyData>;
 
-    fn batch(&mut self, batch: RecordBatch) -> Result<Vec<Vec<CopyData>>, RequestFault> {
+    fn encode_batch(&mut self, batch: RecordBatch) -> Result<Vec<Vec<CopyData>>, RequestFault> {
         let batch = sent_columns(&self.fields, batch)?;
         let schema = batch.schema();
         let mut rows = Vec::with_capacity(batch.num_rows());
         for row in 0..batch.num_rows() {
             for (i, column) in batch.columns().iter().enumerate() {
                 encode_value(&mut self.encoder, column, row, schema.field(i), &self.fields[i])
-                    .map_err(|e| encoding(&e))?;
+                    .map_err(|e| encoding_fault(&e))?;
             }
             rows.push(self.encoder.take_copy());
         }
         Ok(vec![rows])
     }
 
-    fn end(self) -> Result<Vec<Vec<CopyData>>, RequestFault> {
+    fn encode_end(self) -> Result<Vec<Vec<CopyData>>, RequestFault> {
         Ok(Vec::new())
     }
 }
@@ -211,7 +211,7 @@ where
     C::Error: Debug,
     PgWireError: From<<C as Sink<PgWireBackendMessage>>::Error>,
 {
-    let fields = fields(&running.schema, &form.value_format()).map_err(failure)?;
+    let fields = column_fields(&running.schema, &form.value_format()).map_err(failure)?;
     let code = i16::from(form.is_binary());
     let begin = CopyOutResponse::new(code as i8, fields.len() as i16, vec![code; fields.len()]);
     client.feed(PgWireBackendMessage::CopyOutResponse(begin)).await?;
@@ -219,7 +219,7 @@ where
         client.feed(PgWireBackendMessage::CopyData(line)).await?;
     }
     let mut count = 0;
-    while let Some(rows) = running.next().await.map_err(failure)? {
+    while let Some(rows) = running.next_part().await.map_err(failure)? {
         count += rows.len();
         for row in rows {
             client.feed(PgWireBackendMessage::CopyData(row)).await?;

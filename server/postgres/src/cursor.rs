@@ -13,7 +13,7 @@ use pgwire::error::PgWireError;
 use pgwire::messages::data::DataRow;
 use tokio::sync::Mutex;
 
-use super::rows::{RowEncoder, fields, flat};
+use super::rows::{RowEncoder, column_fields, flatten_rows};
 use super::sqlstate::failure;
 
 /// Stop signal and time limit of a command.
@@ -46,7 +46,7 @@ impl RemainingRows {
         }
         let batch = match self.begun.take() {
             Some(batch) => batch,
-            None => match self.running.next().await? {
+            None => match self.running.next_part().await? {
                 Some(batch) => batch,
                 None => return Ok(None),
             },
@@ -55,7 +55,7 @@ impl RemainingRows {
         if count < batch.num_rows() {
             self.begun = Some(batch.slice(count, batch.num_rows() - count));
         }
-        encoder.encode(batch.slice(0, count)).map(Some)
+        encoder.encode_rows(batch.slice(0, count)).map(Some)
     }
 }
 
@@ -66,7 +66,7 @@ impl QueryCursor {
     }
 
     /// The next rows; None for all.
-    pub(super) async fn fetch(
+    pub(super) async fn fetch_rows(
         &self,
         count: Option<u64>,
         run: &CommandRun,
@@ -91,7 +91,7 @@ impl QueryCursor {
                 Ok::<_, PgWireError>(Some((part, (rows, left))))
             }
         });
-        let mut response = QueryResponse::new(fields(&self.schema, format)?, flat(parts));
+        let mut response = QueryResponse::new(column_fields(&self.schema, format)?, flatten_rows(parts));
         response.set_command_tag("FETCH");
         Ok(response)
     }

@@ -25,7 +25,7 @@ use super::columns::array_elements;
 use super::command::{execute_statement, find_columns};
 use super::connection::PostgresConnection;
 use super::names::OID;
-use super::rows::fields;
+use super::rows::column_fields;
 use super::sqlstate::failure;
 use super::statement::ClientStatement;
 
@@ -52,16 +52,16 @@ impl QueryParser for StatementPlanner {
     where
         C: ClientInfo + Unpin + Send + Sync,
     {
-        let run = self.0.command();
-        let mut statements = self.0.statements(sql, &run).await.map_err(failure)?;
+        let run = self.0.begin_command();
+        let mut statements = self.0.plan_statements(sql, &run).await.map_err(failure)?;
         match statements.len() {
             0 | 1 => Ok(statements.pop()),
-            _ => Err(failure(RequestFault::request("cannot insert multiple commands into a prepared statement"))),
+            _ => Err(failure(RequestFault::bad_request("cannot insert multiple commands into a prepared statement"))),
         }
     }
 
     fn get_parameter_types(&self, statement: &ClientStatement) -> PgWireResult<Vec<Type>> {
-        let kinds = kinds(statement).map_err(failure)?;
+        let kinds = parameter_types(statement).map_err(failure)?;
         // If the query does not determine the type, Postgres takes a text.
         let one = |kind: Option<DataType>| match kind {
             Some(DataType::List(element)) if element.name() == OID => Ok(Type::OID_ARRAY),
@@ -76,11 +76,11 @@ impl QueryParser for StatementPlanner {
     }
 }
 
-fn kinds(statement: &ClientStatement) -> Result<Vec<Option<DataType>>, RequestFault> {
+fn parameter_types(statement: &ClientStatement) -> Result<Vec<Option<DataType>>, RequestFault> {
     match statement {
         ClientStatement::Query(planned)
         | ClientStatement::Copy(planned, _)
-        | ClientStatement::Declare { planned, .. } => Ok(planned.prepared.parameters()?),
+        | ClientStatement::Declare { planned, .. } => Ok(planned.prepared.parameter_types()?),
         _ => Ok(Vec::new()),
     }
 }
@@ -105,24 +105,25 @@ fn list_value(
     if portal.parameter_format.is_binary(at) && !is_text {
         return Ok(None);
     }
-    let refused = || RequestFault::request(format!("the value of ${} is no array of one dimension", at + 1));
+    let refused = || RequestFault::bad_request(format!("the value of ${} is no array of one dimension", at + 1));
     let elements = str::from_utf8(bytes).ok().and_then(array_elements).ok_or_else(refused)?;
     let elements: Vec<_> = elements.into_iter().map(ScalarValue::Utf8).collect();
     let texts = ScalarValue::List(ScalarValue::new_list_nullable(&elements, &DataType::Utf8));
-    let value = texts.cast_to(&list).map_err(|e| RequestFault::request(format!("the value of ${}: {e}", at + 1)))?;
+    let value =
+        texts.cast_to(&list).map_err(|e| RequestFault::bad_request(format!("the value of ${}: {e}", at + 1)))?;
     Ok(Some(value))
 }
 
 fn read_values(portal: &Portal<ClientStatement>) -> Result<ParamValues, RequestFault> {
-    let kinds = kinds(&portal.statement.statement)?;
+    let kinds = parameter_types(&portal.statement.statement)?;
     let given = portal.parameter_len();
     if given != kinds.len() {
-        return Err(RequestFault::request(format!("{given} values for {} placeholders", kinds.len())));
+        return Err(RequestFault::bad_request(format!("{given} values for {} placeholders", kinds.len())));
     }
     if let Format::Individual(codes) = &portal.parameter_format
         && codes.len() != given
     {
-        return Err(RequestFault::request(format!("{} formats for {given} values", codes.len())));
+        return Err(RequestFault::bad_request(format!("{} formats for {given} values", codes.len())));
     }
     // If neither side gives the type, it is the text that was advertised.
     let told = |i: usize| {
@@ -139,8 +140,8 @@ fn read_values(portal: &Portal<ClientStatement>) -> Result<ParamValues, RequestF
     let unread = portal.parameters.iter().zip(&lists);
     others.parameters = unread.map(|(value, list)| value.clone().filter(|_| list.is_none())).collect();
     let values = deserialize_parameters(&others, &hints).map_err(|e| match e {
-        PgWireError::UserError(info) => RequestFault::request(info.message.clone()),
-        other => RequestFault::request(other.to_string()),
+        PgWireError::UserError(info) => RequestFault::bad_request(info.message.clone()),
+        other => RequestFault::bad_request(other.to_string()),
     })?;
     let ParamValues::List(mut values) = values else { return Ok(values) };
     for (value, list) in values.iter_mut().zip(lists) {
@@ -194,9 +195,9 @@ impl ExtendedQueryHandler for ExtendedQueries {
     {
         if let Some(name) = message.name.as_deref().filter(|_| message.target_type == TARGET_TYPE_BYTE_PORTAL)
             && client.portal_store().get_portal(name).is_none()
-            && let Ok(cursor) = self.connection.cursor(name)
+            && let Ok(cursor) = self.connection.find_cursor(name)
         {
-            let columns = fields(&cursor.schema, &Format::UnifiedText).map_err(failure)?;
+            let columns = column_fields(&cursor.schema, &Format::UnifiedText).map_err(failure)?;
             return send_describe_response(client, &DescribePortalResponse::new(columns.to_vec())).await;
         }
         self._on_describe(client, message).await
@@ -243,7 +244,7 @@ impl ExtendedQueries {
         let mut state = state.lock().await;
         if matches!(*state, PortalExecutionState::Initial) {
             let values = read_values(portal).map_err(failure)?;
-            let run = self.connection.command();
+            let run = self.connection.begin_command();
             let statement = &portal.statement.statement;
             let format = &portal.result_column_format;
             match execute_statement(&self.connection, client, &run, statement, values, format).await? {

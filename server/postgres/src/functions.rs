@@ -67,7 +67,7 @@ struct CatalogFunction {
 }
 
 impl CatalogFunction {
-    fn udf(
+    fn make_udf(
         name: &'static str,
         kind: DataType,
         volatility: Volatility,
@@ -119,20 +119,22 @@ impl ScalarUDFImpl for CatalogFunction {
     }
 }
 
-fn constant(name: &'static str, answer: ScalarValue) -> Arc<ScalarUDF> {
-    CatalogFunction::udf(name, answer.data_type(), Volatility::Stable, move |_, rows| answer.to_array_of_size(rows))
+fn constant_function(name: &'static str, answer: ScalarValue) -> Arc<ScalarUDF> {
+    CatalogFunction::make_udf(name, answer.data_type(), Volatility::Stable, move |_, rows| {
+        answer.to_array_of_size(rows)
+    })
 }
 
 // A function of a text; NULL of NULL.
 fn text_of_text(name: &'static str, find: impl Fn(&str) -> String + Send + Sync + 'static) -> Arc<ScalarUDF> {
-    CatalogFunction::udf(name, DataType::Utf8, Volatility::Stable, move |args, _| {
+    CatalogFunction::make_udf(name, DataType::Utf8, Volatility::Stable, move |args, _| {
         let texts = text_argument(name, args, 0)?;
         Ok(Arc::new(texts.iter().map(|text| text.map(&find)).collect::<StringArray>()))
     })
 }
 
 fn number_of_name(name: &'static str, find: impl Fn(&str) -> Option<i32> + Send + Sync + 'static) -> Arc<ScalarUDF> {
-    CatalogFunction::udf(name, DataType::Int32, Volatility::Stable, move |args, _| {
+    CatalogFunction::make_udf(name, DataType::Int32, Volatility::Stable, move |args, _| {
         let names = text_argument(name, args, 0)?;
         Ok(Arc::new(names.iter().map(|name| find_number(name?, &find)).collect::<Int32Array>()))
     })
@@ -145,31 +147,31 @@ fn find_number(name: &str, find: impl Fn(&str) -> Option<i32>) -> Option<i32> {
 }
 
 fn text_of_number(name: &'static str, find: impl Fn(i32) -> Option<String> + Send + Sync + 'static) -> Arc<ScalarUDF> {
-    CatalogFunction::udf(name, DataType::Utf8, Volatility::Stable, move |args, _| {
+    CatalogFunction::make_udf(name, DataType::Utf8, Volatility::Stable, move |args, _| {
         let numbers = number_argument(name, args, 0)?;
         Ok(Arc::new(numbers.iter().map(|number| find(number?)).collect::<StringArray>()))
     })
 }
 
-fn argument<'a>(function: &str, args: &'a [ArrayRef], at: usize) -> Result<&'a ArrayRef> {
+fn argument_at<'a>(function: &str, args: &'a [ArrayRef], at: usize) -> Result<&'a ArrayRef> {
     let missing = || DataFusionError::Execution(format!("{function} needs {} arguments at least", at + 1));
     args.get(at).ok_or_else(missing)
 }
 
 fn text_argument(function: &str, args: &[ArrayRef], at: usize) -> Result<StringArray> {
-    Ok(cast(argument(function, args, at)?, &DataType::Utf8)?.as_string().clone())
+    Ok(cast(argument_at(function, args, at)?, &DataType::Utf8)?.as_string().clone())
 }
 
 fn number_argument(function: &str, args: &[ArrayRef], at: usize) -> Result<Int32Array> {
-    Ok(cast(argument(function, args, at)?, &DataType::Int32)?.as_primitive().clone())
+    Ok(cast(argument_at(function, args, at)?, &DataType::Int32)?.as_primitive().clone())
 }
 
-fn valid(texts: &StringArray, row: usize) -> Option<&str> {
+fn text_at(texts: &StringArray, row: usize) -> Option<&str> {
     texts.is_valid(row).then(|| texts.value(row))
 }
 
 /// Makes the functions that are the same in all sessions.
-pub(super) fn fixed() -> Vec<Arc<ScalarUDF>> {
+pub(super) fn fixed_functions() -> Vec<Arc<ScalarUDF>> {
     let of_library = [
         pg::create_current_database_udf(echolake_service::CATALOG),
         pg::create_current_schema_udf(),
@@ -193,40 +195,40 @@ pub(super) fn fixed() -> Vec<Arc<ScalarUDF>> {
         pg::array_bounds_udf::create_array_lower_udf(),
     ];
     let mut all: Vec<_> = of_library.into_iter().map(Arc::new).collect();
-    all.extend(TEXTS.map(|(name, text)| constant(name, ScalarValue::Utf8(text.map(str::to_owned)))));
-    all.extend(TRUE.split(' ').map(|name| constant(name, ScalarValue::Boolean(Some(true)))));
-    all.extend(FALSE.split(' ').map(|name| constant(name, ScalarValue::Boolean(Some(false)))));
-    all.extend(SIZES.split(' ').map(|name| constant(name, ScalarValue::Int64(Some(0)))));
+    all.extend(TEXTS.map(|(name, text)| constant_function(name, ScalarValue::Utf8(text.map(str::to_owned)))));
+    all.extend(TRUE.split(' ').map(|name| constant_function(name, ScalarValue::Boolean(Some(true)))));
+    all.extend(FALSE.split(' ').map(|name| constant_function(name, ScalarValue::Boolean(Some(false)))));
+    all.extend(SIZES.split(' ').map(|name| constant_function(name, ScalarValue::Int64(Some(0)))));
     for name in PRIVILEGES.split(' ') {
-        all.push(CatalogFunction::udf(name, DataType::Boolean, Volatility::Stable, move |args, _| {
+        all.push(CatalogFunction::make_udf(name, DataType::Boolean, Volatility::Stable, move |args, _| {
             let asked = text_argument(name, args, args.len().saturating_sub(1))?;
             Ok(Arc::new(asked.iter().map(|asked| asked.map(may_do)).collect::<BooleanArray>()))
         }));
     }
     all.extend([
-        constant("version", ScalarValue::Utf8(Some(format!("PostgreSQL {VERSION}")))),
-        constant("pg_my_temp_schema", ScalarValue::Int32(Some(0))),
-        constant("pg_index_column_has_property", ScalarValue::Boolean(None)),
-        constant("pg_char_to_encoding", ScalarValue::Int32(Some(ENCODING))),
+        constant_function("version", ScalarValue::Utf8(Some(format!("PostgreSQL {VERSION}")))),
+        constant_function("pg_my_temp_schema", ScalarValue::Int32(Some(0))),
+        constant_function("pg_index_column_has_property", ScalarValue::Boolean(None)),
+        constant_function("pg_char_to_encoding", ScalarValue::Int32(Some(ENCODING))),
         text_of_text("quote_literal", quote_literal),
         text_of_number("function_name", |number| function_name(number).map(str::to_owned)),
-        CatalogFunction::udf("pg_size_pretty", DataType::Utf8, Volatility::Stable, |args, _| {
-            let sizes = cast(argument("pg_size_pretty", args, 0)?, &DataType::Int64)?;
+        CatalogFunction::make_udf("pg_size_pretty", DataType::Utf8, Volatility::Stable, |args, _| {
+            let sizes = cast(argument_at("pg_size_pretty", args, 0)?, &DataType::Int64)?;
             let pretty = sizes.as_primitive::<Int64Type>().iter().map(|size| size.map(pretty_size));
             Ok(Arc::new(pretty.collect::<StringArray>()))
         }),
-        CatalogFunction::udf("pg_typeof", DataType::Utf8, Volatility::Stable, |args, rows| {
-            let name = type_name(argument("pg_typeof", args, 0)?.data_type());
+        CatalogFunction::make_udf("pg_typeof", DataType::Utf8, Volatility::Stable, |args, rows| {
+            let name = type_name(argument_at("pg_typeof", args, 0)?.data_type());
             Ok(Arc::new(StringArray::from_iter_values(std::iter::repeat_n(name, rows))))
         }),
-        CatalogFunction::udf("like_escape", DataType::Utf8, Volatility::Stable, |args, _| {
+        CatalogFunction::make_udf("like_escape", DataType::Utf8, Volatility::Stable, |args, _| {
             let patterns = text_argument("like_escape", args, 0)?;
             let escapes = text_argument("like_escape", args, 1)?;
             let pairs = patterns.iter().zip(&escapes).map(|(pattern, escape)| pattern.zip(escape));
             Ok(Arc::new(pairs.map(|pair| pair.map(|(p, e)| escape_pattern(p, e))).collect::<StringArray>()))
         }),
-        CatalogFunction::udf("format", DataType::Utf8, Volatility::Stable, format_texts),
-        CatalogFunction::udf("json_build_object", DataType::Utf8, Volatility::Stable, |args, rows| {
+        CatalogFunction::make_udf("format", DataType::Utf8, Volatility::Stable, format_texts),
+        CatalogFunction::make_udf("json_build_object", DataType::Utf8, Volatility::Stable, |args, rows| {
             let objects: Vec<_> = (0..rows).map(|row| json_object(args, row)).collect::<Result<_>>()?;
             Ok(Arc::new(StringArray::from(objects)))
         }),
@@ -248,7 +250,7 @@ pub(super) struct CatalogNumbers {
 }
 
 /// Makes the functions that look something up in the catalogue: NULL if it is not there.
-pub(super) fn lookups(numbers: CatalogNumbers) -> Vec<Arc<ScalarUDF>> {
+pub(super) fn lookup_functions(numbers: CatalogNumbers) -> Vec<Arc<ScalarUDF>> {
     let CatalogNumbers { types, procedures, relations, schemas, signatures, comments, definitions } = numbers;
     let signatures = Arc::new(signatures);
     let results = signatures.clone();
@@ -260,26 +262,26 @@ pub(super) fn lookups(numbers: CatalogNumbers) -> Vec<Arc<ScalarUDF>> {
         number_of_name("to_regproc", move |name| procedures.get(name.split('(').next().unwrap_or(name)).copied()),
         number_of_name("to_regclass", move |name| relations.get(name).copied()),
         number_of_name("to_regnamespace", move |name| schemas.get(name).copied()),
-        text_of_number("pg_get_function_arguments", move |number| Some(signature(&signatures, number).0)),
-        text_of_number("pg_get_function_identity_arguments", move |number| Some(signature(&identities, number).0)),
-        text_of_number("pg_get_function_result", move |number| Some(signature(&results, number).1)),
+        text_of_number("pg_get_function_arguments", move |number| Some(find_signature(&signatures, number).0)),
+        text_of_number("pg_get_function_identity_arguments", move |number| Some(find_signature(&identities, number).0)),
+        text_of_number("pg_get_function_result", move |number| Some(find_signature(&results, number).1)),
         text_of_number("pg_get_viewdef", move |view| definitions.get(&view).cloned()),
         text_of_number("obj_description", move |table| table_comments.get(&(table, 0)).cloned()),
-        CatalogFunction::udf("col_description", DataType::Utf8, Volatility::Stable, move |args, _| {
+        CatalogFunction::make_udf("col_description", DataType::Utf8, Volatility::Stable, move |args, _| {
             let tables = number_argument("col_description", args, 0)?;
             let columns = number_argument("col_description", args, 1)?;
             let places = tables.iter().zip(&columns);
             let found = places.map(|(table, column)| comments.get(&(table?, column?)).cloned());
             Ok(Arc::new(found.collect::<StringArray>()))
         }),
-        CatalogFunction::udf("pg_table_is_visible", DataType::Boolean, Volatility::Stable, |args, _| {
+        CatalogFunction::make_udf("pg_table_is_visible", DataType::Boolean, Volatility::Stable, |args, _| {
             let tables = number_argument("pg_table_is_visible", args, 0)?;
             Ok(Arc::new(tables.iter().map(|table| table.map(is_searched)).collect::<BooleanArray>()))
         }),
     ]
 }
 
-fn signature(signatures: &HashMap<i32, (String, String)>, number: i32) -> (String, String) {
+fn find_signature(signatures: &HashMap<i32, (String, String)>, number: i32) -> (String, String) {
     signatures.get(&number).cloned().unwrap_or_default()
 }
 
@@ -288,8 +290,8 @@ pub(super) fn of_session(pid: i32, settings: &Arc<SessionSettings>) -> Vec<Arc<S
     let own = settings.clone();
     let current = settings.clone();
     vec![
-        constant("pg_backend_pid", ScalarValue::Int32(Some(pid))),
-        CatalogFunction::udf("current_setting", DataType::Utf8, Volatility::Stable, move |args, rows| {
+        constant_function("pg_backend_pid", ScalarValue::Int32(Some(pid))),
+        CatalogFunction::make_udf("current_setting", DataType::Utf8, Volatility::Stable, move |args, rows| {
             let names = text_argument("current_setting", args, 0)?;
             let missing_ok = match args.get(1) {
                 Some(column) => cast(column, &DataType::Boolean)?.as_boolean().clone(),
@@ -302,12 +304,12 @@ pub(super) fn of_session(pid: i32, settings: &Arc<SessionSettings>) -> Vec<Arc<S
                 });
             Ok(Arc::new(found.collect::<Result<StringArray>>()?))
         }),
-        CatalogFunction::udf("set_config", DataType::Utf8, Volatility::Volatile, move |args, _| {
+        CatalogFunction::make_udf("set_config", DataType::Utf8, Volatility::Volatile, move |args, _| {
             let names = text_argument("set_config", args, 0)?;
             let values = text_argument("set_config", args, 1)?;
             let found = names.iter().zip(&values).map(|(name, value)| {
                 let Some(name) = name else { return Ok(None) };
-                let set = value.map_or(Ok(()), |value| own.set(name, value));
+                let set = value.map_or(Ok(()), |value| own.set_value(name, value));
                 let value = set.and_then(|()| own.get(name));
                 value.map(Some).map_err(|fault| DataFusionError::Execution(fault.to_string()))
             });
@@ -386,8 +388,8 @@ fn format_texts(args: &[ArrayRef], rows: usize) -> Result<ArrayRef> {
     let pattern = text_argument("format", args, 0)?;
     let values: Vec<_> = (1..args.len()).map(|at| text_argument("format", args, at)).collect::<Result<_>>()?;
     let one = |row: usize| -> Result<Option<String>> {
-        let Some(pattern) = valid(&pattern, row) else { return Ok(None) };
-        let values: Vec<_> = values.iter().map(|value| valid(value, row)).collect();
+        let Some(pattern) = text_at(&pattern, row) else { return Ok(None) };
+        let values: Vec<_> = values.iter().map(|value| text_at(value, row)).collect();
         format_text(pattern, &values).map(Some)
     };
     Ok(Arc::new((0..rows).map(one).collect::<Result<StringArray>>()?))

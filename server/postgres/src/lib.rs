@@ -43,26 +43,26 @@ use startup::LoginHandler;
 pub const PID_PARAMETER: &str = "echolake.pid";
 
 /// Answers Postgres' protocol on an engine's socket.
-pub async fn serve(service: QueryService, listener: UnixListener) -> Result<(), Error> {
+pub async fn serve_postgres_socket(service: QueryService, listener: UnixListener) -> Result<(), Error> {
     let shared = Arc::new(connection::PostgresState::new(service)?);
     loop {
         let (socket, _) = listener.accept().await.map_err(Error::System)?;
         let connection = Arc::new(PostgresConnection::new(shared.clone()));
-        tokio::spawn(attend(socket, connection).instrument(continue_connection()));
+        tokio::spawn(attend_socket(socket, connection).instrument(continue_connection()));
     }
 }
 
 // A connection's queries end with it: dropping the handlers drops the answers that they send.
-async fn attend(socket: UnixStream, connection: Arc<PostgresConnection>) {
-    let Ok((socket, watched)) = twice(socket) else { return };
+async fn attend_socket(socket: UnixStream, connection: Arc<PostgresConnection>) {
+    let Ok((socket, watched)) = duplicate_socket(socket) else { return };
     tokio::select! {
         // What breaks the protocol is the client's own affair.
         _ = process_socket_unix(socket, ProtocolHandlers(connection.clone())) => {}
-        () = gone(&watched, &connection) => {}
+        () = wait_for_hangup(&watched, &connection) => {}
     }
 }
 
-fn twice(socket: UnixStream) -> io::Result<(UnixStream, UnixStream)> {
+fn duplicate_socket(socket: UnixStream) -> io::Result<(UnixStream, UnixStream)> {
     let socket = socket.into_std()?;
     let watched = socket.try_clone()?;
     Ok((UnixStream::from_std(socket)?, UnixStream::from_std(watched)?))
@@ -70,7 +70,7 @@ fn twice(socket: UnixStream) -> io::Result<(UnixStream, UnixStream)> {
 
 // While a query runs, the connection is not read, so that its end must be watched for. Nothing runs before a login, and
 // a client that sends a CancelRequest hangs up behind it: it is read all the same.
-async fn gone(socket: &UnixStream, connection: &PostgresConnection) {
+async fn wait_for_hangup(socket: &UnixStream, connection: &PostgresConnection) {
     connection.logged_in().await;
     while let Ok(ready) = socket.ready(Interest::READABLE).await
         && !ready.is_read_closed()
@@ -105,6 +105,6 @@ struct CancelRequestHandler(Arc<PostgresConnection>);
 #[async_trait]
 impl CancelHandler for CancelRequestHandler {
     async fn on_cancel_request(&self, request: CancelRequest) {
-        self.0.shared().cancel(request.pid, &request.secret_key);
+        self.0.shared().cancel_query(request.pid, &request.secret_key);
     }
 }

@@ -25,12 +25,12 @@ use super::fixed_tables::{VECTOR_KEY, function_name};
 use super::sqlstate::failure;
 
 /// Columns as fields.
-pub(super) fn fields(schema: &Schema, format: &Format) -> Result<Arc<Vec<FieldInfo>>, RequestFault> {
+pub(super) fn column_fields(schema: &Schema, format: &Format) -> Result<Arc<Vec<FieldInfo>>, RequestFault> {
     let count = schema.fields().len();
     if let Format::Individual(codes) = format
         && codes.len() != count
     {
-        return Err(RequestFault::request(format!("{} formats for {count} columns", codes.len())));
+        return Err(RequestFault::bad_request(format!("{} formats for {count} columns", codes.len())));
     }
     // A cast keeps the metadata of what it casts: numbers alone are those of the catalogue.
     let own = |field: &FieldRef| match field.data_type() {
@@ -40,7 +40,7 @@ pub(super) fn fields(schema: &Schema, format: &Format) -> Result<Arc<Vec<FieldIn
         kind => Arc::new(Field::new(field.name(), kind.clone(), field.is_nullable())),
     };
     let sent = Schema::new(schema.fields().iter().map(own).collect::<Vec<_>>());
-    let fields = arrow_schema_to_pg_fields(&sent, format, None).map_err(|e| encoding(&e))?;
+    let fields = arrow_schema_to_pg_fields(&sent, format, None).map_err(|e| encoding_fault(&e))?;
     let settled = |(field, (own, column)): (FieldInfo, (&FieldRef, &FieldRef))| {
         // A column of nothing but NULL is a text to Postgres' clients.
         let kind = match *field.datatype() {
@@ -56,7 +56,7 @@ pub(super) fn fields(schema: &Schema, format: &Format) -> Result<Arc<Vec<FieldIn
 }
 
 // The numbers of a list, with spaces between them.
-fn spaced(list: ArrayRef) -> Option<String> {
+fn spaced_numbers(list: ArrayRef) -> Option<String> {
     let numbers = cast(&list, &DataType::Utf8).ok()?;
     let numbers: Vec<_> = numbers.as_string::<i32>().iter().flatten().collect();
     Some(numbers.join(" "))
@@ -67,7 +67,7 @@ fn is_cast_number(field: &FieldRef) -> bool {
 }
 
 /// The fault for a value that cannot be sent to a Postgres client.
-pub(super) fn encoding(error: &PgWireError) -> RequestFault {
+pub(super) fn encoding_fault(error: &PgWireError) -> RequestFault {
     let message = match error {
         PgWireError::UserError(info) => info.message.clone(),
         other => other.to_string(),
@@ -81,14 +81,14 @@ pub(super) struct RowEncoder(Arc<Vec<FieldInfo>>);
 impl RowEncoder {
     /// For an answer of these columns.
     pub(super) fn new(schema: &SchemaRef, format: &Format) -> Result<Self, RequestFault> {
-        Ok(Self(fields(schema, format)?))
+        Ok(Self(column_fields(schema, format)?))
     }
 
     /// The rows of a batch.
-    pub(super) fn encode(&self, batch: RecordBatch) -> Result<Vec<DataRow>, RequestFault> {
+    pub(super) fn encode_rows(&self, batch: RecordBatch) -> Result<Vec<DataRow>, RequestFault> {
         let batch = sent_columns(&self.0, batch)?;
         let rows: PgWireResult<Vec<_>> = encode_recordbatch(self.0.clone(), batch).collect();
-        rows.map_err(|e| encoding(&e))
+        rows.map_err(|e| encoding_fault(&e))
     }
 }
 
@@ -100,7 +100,7 @@ impl RowEncoder {
 pub(super) fn sent_columns(infos: &[FieldInfo], batch: RecordBatch) -> Result<RecordBatch, RequestFault> {
     let columns = infos.iter().zip(batch.columns()).map(|(info, column)| sent_column(info, column));
     let columns: Result<Vec<_>, ArrowError> = columns.collect();
-    let refused = |e: ArrowError| encoding(&PgWireError::ApiError(e.into()));
+    let refused = |e: ArrowError| encoding_fault(&PgWireError::ApiError(e.into()));
     let columns = columns.map_err(refused)?;
     let own = batch.schema();
     let field = |(field, column): (&FieldRef, &ArrayRef)| match column.data_type() {
@@ -122,7 +122,7 @@ fn sent_column(info: &FieldInfo, column: &ArrayRef) -> Result<ArrayRef, ArrowErr
             Arc::new(numbers.iter().map(|number| function_name(number?)).collect::<StringArray>())
         }
         (_, Some(lists)) if is_text && *info.datatype() == Type::TEXT => {
-            Arc::new(lists.iter().map(|list| list.and_then(spaced)).collect::<StringArray>())
+            Arc::new(lists.iter().map(|list| list.and_then(spaced_numbers)).collect::<StringArray>())
         }
         _ => column.clone(),
     })
@@ -131,27 +131,30 @@ fn sent_column(info: &FieldInfo, column: &ArrayRef) -> Result<ArrayRef, ArrowErr
 impl AnswerEncoder for RowEncoder {
     type Item = Vec<DataRow>;
 
-    fn batch(&mut self, batch: RecordBatch) -> Result<Vec<Vec<DataRow>>, RequestFault> {
-        Ok(vec![self.encode(batch)?])
+    fn encode_batch(&mut self, batch: RecordBatch) -> Result<Vec<Vec<DataRow>>, RequestFault> {
+        Ok(vec![self.encode_rows(batch)?])
     }
 
-    fn end(self) -> Result<Vec<Vec<DataRow>>, RequestFault> {
+    fn encode_end(self) -> Result<Vec<Vec<DataRow>>, RequestFault> {
         Ok(Vec::new())
     }
 }
 
 /// The rows of a run, as they come.
-pub(super) fn response(running: RunningQuery<Vec<DataRow>>, format: &Format) -> Result<QueryResponse, RequestFault> {
-    let fields = fields(&running.schema, format)?;
+pub(super) fn rows_response(
+    running: RunningQuery<Vec<DataRow>>,
+    format: &Format,
+) -> Result<QueryResponse, RequestFault> {
+    let fields = column_fields(&running.schema, format)?;
     let parts = stream::try_unfold(running, |mut running| async move {
-        let part = running.next().await.map_err(failure)?;
+        let part = running.next_part().await.map_err(failure)?;
         Ok::<_, PgWireError>(part.map(|part| (part, running)))
     });
-    Ok(QueryResponse::new(fields, flat(parts)))
+    Ok(QueryResponse::new(fields, flatten_rows(parts)))
 }
 
 /// Rows one by one.
-pub(super) fn flat(
+pub(super) fn flatten_rows(
     parts: impl Stream<Item = PgWireResult<Vec<DataRow>>> + Send + 'static,
 ) -> impl Stream<Item = PgWireResult<DataRow>> + Send + 'static {
     parts.map_ok(|rows| stream::iter(rows.into_iter().map(Ok))).try_flatten()
@@ -164,13 +167,13 @@ pub(super) fn text_fields(names: &[&str]) -> Arc<Vec<FieldInfo>> {
 }
 
 /// Rows of text.
-pub(super) fn texts(names: &[&str], rows: &[Vec<String>]) -> Result<QueryResponse, RequestFault> {
+pub(super) fn text_response(names: &[&str], rows: &[Vec<String>]) -> Result<QueryResponse, RequestFault> {
     let fields = text_fields(names);
     let mut encoder = DataRowEncoder::new(fields.clone());
     let mut encoded = Vec::with_capacity(rows.len());
     for row in rows {
         for value in row {
-            encoder.encode_field(value).map_err(|e| encoding(&e))?;
+            encoder.encode_field(value).map_err(|e| encoding_fault(&e))?;
         }
         encoded.push(Ok(encoder.take_row()));
     }

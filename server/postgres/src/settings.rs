@@ -76,17 +76,17 @@ pub(super) struct SessionSettings(Mutex<BTreeMap<&'static str, String>>);
 
 impl SessionSettings {
     /// Sets one.
-    pub(super) fn set(&self, name: &str, value: &str) -> Result<(), RequestFault> {
-        let (name, _, may) = known(name)?;
+    pub(super) fn set_value(&self, name: &str, value: &str) -> Result<(), RequestFault> {
+        let (name, _, may) = find_setting(name)?;
         let value = value.trim();
         let allowed = match may {
             AllowedChange::Read => false,
             AllowedChange::Set => value.chars().count() <= LONGEST,
             AllowedChange::Keep(values) => values.iter().any(|v| value.eq_ignore_ascii_case(v)),
-            AllowedChange::Time => time(value).is_some(),
+            AllowedChange::Time => parse_duration(value).is_some(),
         };
         if !allowed {
-            return Err(RequestFault::request(format!("`{name}` cannot be set to `{value}` here")));
+            return Err(RequestFault::bad_request(format!("`{name}` cannot be set to `{value}` here")));
         }
         // What is kept to stays as it is shown; times and words are shown as they were set.
         if matches!(may, AllowedChange::Set | AllowedChange::Time) {
@@ -103,19 +103,19 @@ impl SessionSettings {
 
     /// One of them.
     pub(super) fn get(&self, name: &str) -> Result<String, RequestFault> {
-        let (name, value, _) = known(name)?;
+        let (name, value, _) = find_setting(name)?;
         let set = self.0.lock().unwrap_or_else(PoisonError::into_inner).get(name).cloned();
         Ok(set.unwrap_or_else(|| value.to_owned()))
     }
 
     /// All of them.
-    pub(super) fn all(&self) -> Vec<(&'static str, String)> {
+    pub(super) fn all_values(&self) -> Vec<(&'static str, String)> {
         KNOWN.iter().map(|(name, value, _)| (*name, self.get(name).unwrap_or_else(|_| (*value).to_owned()))).collect()
     }
 
     /// One as it was at first, or all of them.
-    pub(super) fn reset(&self, name: Option<&str>) -> Result<(), RequestFault> {
-        let name = name.map(known).transpose()?.map(|(name, ..)| name);
+    pub(super) fn reset_values(&self, name: Option<&str>) -> Result<(), RequestFault> {
+        let name = name.map(find_setting).transpose()?.map(|(name, ..)| name);
         let keeps = |known: &&str| *known == "session_authorization" || name.is_some_and(|n| n != *known);
         self.0.lock().unwrap_or_else(PoisonError::into_inner).retain(|known, _| keeps(known));
         Ok(())
@@ -123,11 +123,11 @@ impl SessionSettings {
 
     /// The session's own limit of a query's time.
     pub(super) fn statement_timeout(&self) -> Option<Duration> {
-        self.get("statement_timeout").ok().and_then(|v| time(&v)).filter(|t| !t.is_zero())
+        self.get("statement_timeout").ok().and_then(|v| parse_duration(&v)).filter(|t| !t.is_zero())
     }
 }
 
-fn known(name: &str) -> Result<(&'static str, &'static str, AllowedChange), RequestFault> {
+fn find_setting(name: &str) -> Result<(&'static str, &'static str, AllowedChange), RequestFault> {
     let lower = name.to_ascii_lowercase();
     let found = KNOWN.iter().find(|(known, ..)| *known == lower);
     found.copied().ok_or_else(|| RequestFault::NotFound {
@@ -137,7 +137,7 @@ fn known(name: &str) -> Result<(&'static str, &'static str, AllowedChange), Requ
 }
 
 // A number is of milliseconds; units as in Postgres.
-fn time(value: &str) -> Option<Duration> {
+fn parse_duration(value: &str) -> Option<Duration> {
     let value = value.trim();
     let end = value.find(|c: char| !c.is_ascii_digit()).unwrap_or(value.len());
     let number: u64 = value[..end].parse().ok()?;
@@ -167,7 +167,7 @@ mod tests {
             ("default_transaction_read_only", "on"),
             ("TimeZone", "Europe/Zurich"),
         ] {
-            settings.set(name, value).expect(name);
+            settings.set_value(name, value).expect(name);
         }
         for (name, value) in [
             ("client_encoding", "LATIN1"),
@@ -180,13 +180,13 @@ mod tests {
             ("statement_timeout", "-1"),
             ("statement_timeout", "9999999999999999999"),
         ] {
-            assert!(settings.set(name, value).is_err(), "{name} = {value}");
+            assert!(settings.set_value(name, value).is_err(), "{name} = {value}");
         }
         assert_eq!(settings.get("Application_Name").expect("set"), "psql");
-        settings.reset(Some("application_name")).expect("reset");
+        settings.reset_values(Some("application_name")).expect("reset");
         assert_eq!(settings.get("application_name").expect("reset"), "");
         assert_eq!(settings.get("timezone").expect("set"), "Europe/Zurich");
-        settings.reset(None).expect("reset");
+        settings.reset_values(None).expect("reset");
         assert_eq!(settings.get("timezone").expect("reset"), "UTC");
         assert!(KNOWN.is_sorted_by_key(|(name, ..)| *name));
     }
@@ -196,10 +196,10 @@ mod tests {
         let settings = SessionSettings::default();
         assert_eq!(settings.statement_timeout(), None);
         for (value, millis) in [("250", 250), ("500ms", 500), ("2s", 2_000), (" 1 min", 60_000)] {
-            settings.set("statement_timeout", value).expect(value);
+            settings.set_value("statement_timeout", value).expect(value);
             assert_eq!(settings.statement_timeout(), Some(Duration::from_millis(millis)), "{value}");
         }
-        settings.set("statement_timeout", "0").expect("set");
+        settings.set_value("statement_timeout", "0").expect("set");
         assert_eq!(settings.statement_timeout(), None);
     }
 }

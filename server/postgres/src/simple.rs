@@ -37,8 +37,8 @@ impl SimpleQueryHandler for SimpleQueries {
             return Err(PgWireError::NotReadyForQuery);
         }
         client.set_state(PgWireConnectionState::QueryInProgress);
-        let run = self.0.command();
-        let statements = self.0.statements(&query.query, &run).await.map_err(failure)?;
+        let run = self.0.begin_command();
+        let statements = self.0.plan_statements(&query.query, &run).await.map_err(failure)?;
         if statements.is_empty() {
             client.feed(PgWireBackendMessage::EmptyQueryResponse(EmptyQueryResponse::new())).await?;
         }

@@ -20,21 +20,21 @@ pub fn fatal_message(fault: &RequestFault) -> BytesMut {
 }
 
 /// A failure that ends the connection.
-pub(super) fn fatal(fault: &RequestFault) -> PgWireError {
-    info("FATAL", fault)
+pub(super) fn fatal_error(fault: &RequestFault) -> PgWireError {
+    error_with_severity("FATAL", fault)
 }
 
 // Clients mark the place in their own copy of the text.
-fn info(severity: &str, fault: &RequestFault) -> PgWireError {
-    let FaultParts { message, place, hint } = fault.parts();
-    let mut info = ErrorInfo::new(severity.to_owned(), state(fault).to_owned(), message);
+fn error_with_severity(severity: &str, fault: &RequestFault) -> PgWireError {
+    let FaultParts { message, place, hint } = fault.text_parts();
+    let mut info = ErrorInfo::new(severity.to_owned(), fault_sqlstate(fault).to_owned(), message);
     info.position = place.map(|place| place.position.to_string());
     info.hint = hint;
     PgWireError::UserError(Box::new(info))
 }
 
 // Appendix A of Postgres' manual.
-fn state(fault: &RequestFault) -> &'static str {
+fn fault_sqlstate(fault: &RequestFault) -> &'static str {
     match fault {
         RequestFault::Query(QueryError::Query { message, .. }) if message.starts_with("no table ") => "42P01",
         RequestFault::Query(QueryError::Query { message, .. }) if message.starts_with("no column ") => "42703",

@@ -17,7 +17,7 @@ use pgwire::messages::{PgWireBackendMessage, PgWireFrontendMessage, ProtocolVers
 use super::PID_PARAMETER;
 use super::connection::PostgresConnection;
 use super::settings::VERSION;
-use super::sqlstate::fatal;
+use super::sqlstate::fatal_error;
 
 /// Logs in.
 pub(super) struct LoginHandler(pub(super) Arc<PostgresConnection>);
@@ -34,11 +34,11 @@ impl StartupHandler for LoginHandler {
             PgWireFrontendMessage::Startup(startup) => {
                 protocol_negotiation(client, &startup).await?;
                 save_startup_parameters_to_metadata(client, &startup);
-                self.begin_with(client.metadata()).map_err(|fault| fatal(&fault))?;
+                self.begin_with(client.metadata()).map_err(|fault| fatal_error(&fault))?;
                 client.set_state(PgWireConnectionState::AuthenticationInProgress);
                 self.let_in(client).await
             }
-            _ => Err(fatal(&RequestFault::request("the protocol's startup is expected"))),
+            _ => Err(fatal_error(&RequestFault::bad_request("the protocol's startup is expected"))),
         }
     }
 }
@@ -51,10 +51,10 @@ impl LoginHandler {
         PgWireError: From<<C as Sink<PgWireBackendMessage>>::Error>,
     {
         let service = &self.0.shared().service;
-        let who = service.client(TokenScope::Sql).map_err(|fault| fatal(&fault))?;
+        let who = service.authorised_client(TokenScope::Sql).map_err(|fault| fatal_error(&fault))?;
         let wide = client.protocol_version() != ProtocolVersion::PROTOCOL3_0;
         let given = client.metadata().get(PID_PARAMETER).and_then(|pid| pid.parse().ok());
-        let (pid, key) = self.0.log_in(&who, given, wide).map_err(|fault| fatal(&fault))?;
+        let (pid, key) = self.0.log_in(&who, given, wide).map_err(|fault| fatal_error(&fault))?;
         client.set_pid_and_secret_key(pid, key);
         let mut parameters = DefaultServerParameterProvider::default();
         parameters.server_version = VERSION.to_owned();
@@ -78,7 +78,7 @@ impl LoginHandler {
         }
         // A setting that a driver always sends is applied if it is known, and is no reason to refuse the client.
         for (name, value) in given {
-            let _ = settings.set(name, value);
+            let _ = settings.set_value(name, value);
         }
         let words: Vec<_> = given.get("options").map(|o| o.split_whitespace().collect()).unwrap_or_default();
         let mut words = words.into_iter();
@@ -89,8 +89,8 @@ impl LoginHandler {
             };
             let (name, value) = pair
                 .and_then(|p| p.split_once('='))
-                .ok_or_else(|| RequestFault::request(format!("`{word}` is no option; hint: -c name=value")))?;
-            settings.set(name, value)?;
+                .ok_or_else(|| RequestFault::bad_request(format!("`{word}` is no option; hint: -c name=value")))?;
+            settings.set_value(name, value)?;
         }
         Ok(())
     }

@@ -13,7 +13,7 @@ use datafusion_pg_catalog::sql::PostgresCompatibilityParser;
 use echolake_query::{Error as QueryError, OpaqueValue, PreparedQuery, Session, check_statement_bounds};
 use echolake_service::RequestFault;
 
-use super::catalog_statement::{EmptyRelations, adapt, find_catalog_names};
+use super::catalog_statement::{EmptyRelations, adapt_catalog_statement, find_catalog_names};
 use super::columns::adapt_columns;
 use super::copy::{CopyForm, read_copy};
 
@@ -37,7 +37,7 @@ impl PlannedQuery {
     }
 
     /// Its plan on the present lake: the first one, or another if the lake has changed since.
-    pub(super) async fn current(&self, session: &Session) -> Result<Arc<PreparedQuery>, QueryError> {
+    pub(super) async fn current_plan(&self, session: &Session) -> Result<Arc<PreparedQuery>, QueryError> {
         if session.is_current(&self.prepared).await? {
             return Ok(self.prepared.clone());
         }
@@ -78,7 +78,7 @@ pub(super) enum ClientStatement {
 
 /// Parses the statements of a text. Those about the server alone are adapted, all others stay as they are written, but
 /// for what [`adapt_columns`] adds.
-pub(super) fn parse(
+pub(super) fn parse_statements(
     parser: &PostgresCompatibilityParser,
     empty: &EmptyRelations,
     session: &Session,
@@ -88,7 +88,7 @@ pub(super) fn parse(
     let sql = if sql.trim_end_matches([' ', ';']).eq_ignore_ascii_case(ABORT) { ROLLBACK } else { sql };
     // DataFusion's own parser knows more, such as DESCRIBE, and gives the position of an error.
     let Ok(mut statements) = Parser::parse_sql(&PostgreSqlDialect {}, sql) else {
-        return Ok(vec![session.parse(sql)?]);
+        return Ok(vec![session.parse_sql(sql)?]);
     };
     if statements.len() > TOGETHER {
         return Err(RequestFault::TooMany { what: "statements in one text", limit: TOGETHER });
@@ -102,7 +102,7 @@ pub(super) fn parse(
 fn adapt_statement(mut statement: Sql, empty: &EmptyRelations) -> Parsed {
     adapt_columns(&mut statement);
     if let Some(names) = find_catalog_names(&mut statement) {
-        statement = adapt(statement, names, empty);
+        statement = adapt_catalog_statement(statement, names, empty);
     }
     Parsed::Statement(Box::new(statement))
 }
@@ -118,7 +118,11 @@ fn replace_queries(parser: &PostgresCompatibilityParser, sql: &str, written: &mu
 }
 
 /// Makes of a statement what can be done.
-pub(super) async fn plan(session: &Session, sql: &Arc<str>, parsed: Parsed) -> Result<ClientStatement, RequestFault> {
+pub(super) async fn plan_statement(
+    session: &Session,
+    sql: &Arc<str>,
+    parsed: Parsed,
+) -> Result<ClientStatement, RequestFault> {
     let query = async |statement: Parsed| PlannedQuery::new(session, sql, statement).await;
     let statement = match parsed {
         Parsed::Statement(statement) => *statement,
@@ -131,20 +135,22 @@ pub(super) async fn plan(session: &Session, sql: &Arc<str>, parsed: Parsed) -> R
         Sql::Rollback { .. } => ClientStatement::Savepoint("ROLLBACK"),
         Sql::Savepoint { .. } => ClientStatement::Savepoint("SAVEPOINT"),
         Sql::ReleaseSavepoint { .. } => ClientStatement::Savepoint("RELEASE"),
-        Sql::Set(set) => ClientStatement::Set(settings(set)?),
+        Sql::Set(set) => ClientStatement::Set(assigned_settings(set)?),
         Sql::Reset(reset) => ClientStatement::Reset(match reset.reset {
             Reset::ALL => None,
             Reset::ConfigurationParameter(name) => Some(name.to_string()),
         }),
-        Sql::ShowVariable { variable } => ClientStatement::Show(shown(&variable)),
+        Sql::ShowVariable { variable } => ClientStatement::Show(shown_setting(&variable)),
         Sql::Discard { object_type } => ClientStatement::Discard(object_type),
         Sql::UNLISTEN { .. } => ClientStatement::Unlisten,
         Sql::Deallocate { name, .. } => ClientStatement::Deallocate(unless_all(&name)),
         Sql::Declare { stmts } => {
-            let (name, held, asked) = declared(stmts)?;
+            let (name, held, asked) = declared_cursor(stmts)?;
             ClientStatement::Declare { name, held, planned: query(asked).await? }
         }
-        Sql::Fetch { name, direction, .. } => ClientStatement::Fetch { name: name.value, rows: forward(&direction)? },
+        Sql::Fetch { name, direction, .. } => {
+            ClientStatement::Fetch { name: name.value, rows: fetch_count(&direction)? }
+        }
         Sql::Close { cursor: CloseCursor::All } => ClientStatement::Close(None),
         Sql::Close { cursor: CloseCursor::Specific { name } } => ClientStatement::Close(Some(name.value)),
         Sql::Copy { source, to: true, target, options, legacy_options, .. } => {
@@ -161,7 +167,7 @@ fn unless_all(name: &Ident) -> Option<String> {
 }
 
 // SHOW TRANSACTION ISOLATION LEVEL and SHOW TIME ZONE have names of their own.
-fn shown(variable: &[Ident]) -> Option<String> {
+fn shown_setting(variable: &[Ident]) -> Option<String> {
     let words: Vec<_> = variable.iter().map(|i| i.value.to_ascii_lowercase()).collect();
     match words.join(" ").as_str() {
         "all" => None,
@@ -172,10 +178,10 @@ fn shown(variable: &[Ident]) -> Option<String> {
     }
 }
 
-fn settings(set: Set) -> Result<Vec<(String, String)>, RequestFault> {
+fn assigned_settings(set: Set) -> Result<Vec<(String, String)>, RequestFault> {
     match set {
-        Set::SingleAssignment { variable, values, .. } => Ok(vec![(name(&variable), text(&values)?)]),
-        Set::SetTimeZone { value, .. } => Ok(vec![("timezone".to_owned(), text(&[value])?)]),
+        Set::SingleAssignment { variable, values, .. } => Ok(vec![(join_name(&variable), setting_value(&values)?)]),
+        Set::SetTimeZone { value, .. } => Ok(vec![("timezone".to_owned(), setting_value(&[value])?)]),
         Set::SetNames { charset_name, .. } => Ok(vec![("client_encoding".to_owned(), charset_name.value)]),
         // All transactions read, and see what is there when each of their queries begins.
         Set::SetTransaction { .. } => Ok(Vec::new()),
@@ -183,23 +189,23 @@ fn settings(set: Set) -> Result<Vec<(String, String)>, RequestFault> {
     }
 }
 
-fn name(name: &ObjectName) -> String {
+fn join_name(name: &ObjectName) -> String {
     let parts = name.0.iter().map(|p| p.as_ident().map_or_else(|| p.to_string(), |i| i.value.clone()));
     parts.collect::<Vec<_>>().join(".")
 }
 
-fn text(values: &[Expr]) -> Result<String, RequestFault> {
+fn setting_value(values: &[Expr]) -> Result<String, RequestFault> {
     let one = |value: &Expr| match value {
         Expr::Value(ValueWithSpan { value: Value::SingleQuotedString(text), .. }) => Ok(text.clone()),
         Expr::Value(value) => Ok(value.to_string()),
         Expr::Identifier(word) => Ok(word.value.clone()),
         Expr::UnaryOp { .. } | Expr::Interval(_) => Ok(value.to_string()),
-        other => Err(RequestFault::request(format!("`{other}` is no value of a setting"))),
+        other => Err(RequestFault::bad_request(format!("`{other}` is no value of a setting"))),
     };
     Ok(values.iter().map(one).collect::<Result<Vec<_>, _>>()?.join(", "))
 }
 
-fn declared(mut statements: Vec<Declare>) -> Result<(String, bool, Parsed), RequestFault> {
+fn declared_cursor(mut statements: Vec<Declare>) -> Result<(String, bool, Parsed), RequestFault> {
     let refused = || RequestFault::unsupported("DECLARE of anything but one cursor");
     let (Some(declare), true) = (statements.pop(), statements.is_empty()) else { return Err(refused()) };
     let (Some(name), Some(query), Some(DeclareType::Cursor)) =
@@ -214,12 +220,12 @@ fn declared(mut statements: Vec<Declare>) -> Result<(String, bool, Parsed), Requ
     Ok((name.value.clone(), declare.hold == Some(true), statement))
 }
 
-fn forward(direction: &FetchDirection) -> Result<Option<u64>, RequestFault> {
+fn fetch_count(direction: &FetchDirection) -> Result<Option<u64>, RequestFault> {
     let count = |limit: &ValueWithSpan| {
         limit
             .to_string()
             .parse()
-            .map_err(|_| RequestFault::request(format!("`{limit}` is no number of rows to go forward")))
+            .map_err(|_| RequestFault::bad_request(format!("`{limit}` is no number of rows to go forward")))
     };
     match direction {
         FetchDirection::Next | FetchDirection::Forward { limit: None } => Ok(Some(1)),

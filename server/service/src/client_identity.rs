@@ -50,7 +50,7 @@ pub struct ClientIdentity {
 
 impl ClientIdentity {
     /// A client of a server without tokens.
-    pub fn local(name: impl Into<String>) -> Self {
+    pub fn local_client(name: impl Into<String>) -> Self {
         let scopes = vec![TokenScope::Sql, TokenScope::Files, TokenScope::Metrics];
         Self {
             name: name.into(),
@@ -66,23 +66,23 @@ impl ClientIdentity {
     }
 
     /// The server's own pages.
-    pub fn pages() -> Self {
-        Self::local(PAGES)
+    pub fn own_pages() -> Self {
+        Self::local_client(PAGES)
     }
 
     /// Programs of this machine, over HTTP or Flight SQL.
-    pub fn programs() -> Self {
-        Self::local(PROGRAMS)
+    pub fn local_programs() -> Self {
+        Self::local_client(PROGRAMS)
     }
 
     /// A user of this machine, by their own word, over Postgres' protocol.
-    pub fn user(name: &str) -> Self {
-        Self::local(format!("user {name}"))
+    pub fn local_user(name: &str) -> Self {
+        Self::local_client(format!("user {name}"))
     }
 
     /// Pages of other origins.
-    pub fn foreign() -> Self {
-        Self::local(FOREIGN)
+    pub fn foreign_pages() -> Self {
+        Self::local_client(FOREIGN)
     }
 
     /// Limits of its queries.
@@ -107,7 +107,7 @@ impl ClientIdentity {
     ///
     /// # Errors
     /// [`RequestFault::Forbidden`].
-    pub fn require(&self, scope: TokenScope) -> Result<(), RequestFault> {
+    pub fn require_scope(&self, scope: TokenScope) -> Result<(), RequestFault> {
         match self.scopes.contains(&scope) {
             true => Ok(()),
             false => Err(RequestFault::Forbidden { name: self.name.clone(), scope }),

@@ -31,46 +31,46 @@ pub(crate) struct DoorRows {
 
 impl DoorRows {
     /// Takes the door's answer.
-    pub(crate) fn answer(&self, number: u64, rows: ActivityRows) {
-        if let Some(waiting) = self.lock().remove(&number) {
+    pub(crate) fn take_answer(&self, number: u64, rows: ActivityRows) {
+        if let Some(waiting) = self.lock_waiting().remove(&number) {
             // Who asked may be gone.
             let _ = waiting.send(rows);
         }
     }
 
-    async fn ask(&self, table: ActivityTable) -> Result<ActivityRows, String> {
+    async fn ask_door(&self, table: ActivityTable) -> Result<ActivityRows, String> {
         let number = self.last.fetch_add(1, Ordering::Relaxed);
         let (send, answer) = oneshot::channel();
-        self.lock().insert(number, send);
-        EngineReport::Ask { number, table }.send();
+        self.lock_waiting().insert(number, send);
+        EngineReport::Ask { number, table }.send_line();
         let rows = tokio::time::timeout(ANSWER_LIMIT, answer).await;
-        self.lock().remove(&number);
+        self.lock_waiting().remove(&number);
         rows.ok().and_then(Result::ok).ok_or_else(|| "the server did not list its activity".to_owned())
     }
 
-    fn lock(&self) -> MutexGuard<'_, HashMap<u64, oneshot::Sender<ActivityRows>>> {
+    fn lock_waiting(&self) -> MutexGuard<'_, HashMap<u64, oneshot::Sender<ActivityRows>>> {
         self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
 #[async_trait]
 impl SystemSource for DoorRows {
-    fn tables(&self) -> Vec<(&'static str, SchemaRef)> {
-        TABLES.map(|(name, table)| (name, schema(table))).to_vec()
+    fn table_schemas(&self) -> Vec<(&'static str, SchemaRef)> {
+        TABLES.map(|(name, table)| (name, activity_schema(table))).to_vec()
     }
 
-    async fn rows(&self, table: &'static str) -> Result<RecordBatch, String> {
+    async fn read_rows(&self, table: &'static str) -> Result<RecordBatch, String> {
         let Some((_, table)) = TABLES.into_iter().find(|(name, _)| *name == table) else {
             return Err(format!("there is no table system.{table}"));
         };
-        match self.ask(table).await? {
+        match self.ask_door(table).await? {
             ActivityRows::Queries(queries) => row_batch(table, &queries),
             ActivityRows::Connections(connections) => row_batch(table, &connections),
         }
     }
 }
 
-fn schema(table: ActivityTable) -> SchemaRef {
+fn activity_schema(table: ActivityTable) -> SchemaRef {
     let column = |(name, kind, is_nullable, unit, comment): (&str, DataType, bool, &str, &str)| {
         let metadata = [(UNIT.to_owned(), unit.to_owned()), (COMMENT.to_owned(), comment.to_owned())];
         Field::new(name, kind, is_nullable).with_metadata(HashMap::from(metadata))
@@ -106,7 +106,7 @@ fn schema(table: ActivityTable) -> SchemaRef {
 }
 
 fn row_batch<T: Serialize>(table: ActivityTable, rows: &[T]) -> Result<RecordBatch, String> {
-    let schema = schema(table);
+    let schema = activity_schema(table);
     let batch = serde_arrow::to_record_batch(schema.fields(), &rows).map_err(|e| e.to_string())?;
     RecordBatch::try_new(schema, batch.columns().to_vec()).map_err(|e| e.to_string())
 }

@@ -41,14 +41,14 @@ static QUEUED: Mutex<Vec<u8>> = Mutex::new(Vec::new());
 
 impl EngineReport {
     /// Writes the line, and those that wait before it.
-    pub fn send(&self) {
-        self.queue();
+    pub fn send_line(&self) {
+        self.queue_line();
         Self::send_queued();
     }
 
     /// Lets the line wait for [`EngineReport::send_queued`]: a write for each of a thousand queries a second would slow them
     /// down.
-    pub(crate) fn queue(&self) {
+    pub(crate) fn queue_line(&self) {
         let mut queued = QUEUED.lock().unwrap_or_else(PoisonError::into_inner);
         let whole = queued.len();
         match serde_json::to_writer(&mut *queued, self) {
@@ -59,8 +59,8 @@ impl EngineReport {
 
     /// Reports a failed request, and writes it to the log.
     pub fn record_failure(fault: &RequestFault) {
-        Self::Failure(fault.code()).queue();
-        fault.log();
+        Self::Failure(fault.code()).queue_line();
+        fault.log_failure();
     }
 
     /// Writes the lines that wait.

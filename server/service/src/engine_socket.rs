@@ -19,7 +19,7 @@ pub enum EngineSocket {
 
 impl EngineSocket {
     /// The path of this socket in an engine's folder.
-    pub fn path(self, folder: &Path) -> PathBuf {
+    pub fn path_in(self, folder: &Path) -> PathBuf {
         folder.join(match self {
             Self::Http => "http",
             Self::FlightSql => "flight",
@@ -28,7 +28,7 @@ impl EngineSocket {
     }
 
     /// Listens on it.
-    pub fn listen(self, folder: &Path) -> Result<UnixListener, Error> {
-        UnixListener::bind(self.path(folder)).map_err(Error::System)
+    pub fn listen_in(self, folder: &Path) -> Result<UnixListener, Error> {
+        UnixListener::bind(self.path_in(folder)).map_err(Error::System)
     }
 }

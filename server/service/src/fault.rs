@@ -315,7 +315,7 @@ pub struct FaultParts {
 
 impl RequestFault {
     /// Returns the parts of its text.
-    pub fn parts(&self) -> FaultParts {
+    pub fn text_parts(&self) -> FaultParts {
         if let Self::Query(QueryError::Query { message, place, hint }) = self {
             return FaultParts { message: message.clone(), place: place.clone(), hint: hint.clone() };
         }
@@ -329,7 +329,7 @@ impl RequestFault {
     }
 
     /// A request that is not understood.
-    pub fn request(message: impl Into<String>) -> Self {
+    pub fn bad_request(message: impl Into<String>) -> Self {
         Self::Request { message: message.into() }
     }
 
@@ -348,7 +348,7 @@ impl RequestFault {
 
     /// Writes it to the log: as a warning if the client is not to blame for it, else for debugging, because its text may
     /// quote a statement.
-    pub fn log(&self) {
+    pub fn log_failure(&self) {
         let (code, text) = (self.code(), self.to_string());
         match code {
             FaultCode::Internal | FaultCode::Lake | FaultCode::Changed | FaultCode::EngineEnded => {

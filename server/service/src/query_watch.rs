@@ -54,9 +54,14 @@ impl RunningWatches {
     }
 
     /// Watches a query that begins, until the timer is dropped.
-    pub(crate) fn begin(self: &Arc<Self>, protocol: ServerProtocol, statement: &str, stop: &StopSignal) -> QueryTimer {
+    pub(crate) fn begin_watch(
+        self: &Arc<Self>,
+        protocol: ServerProtocol,
+        statement: &str,
+        stop: &StopSignal,
+    ) -> QueryTimer {
         let number = self.last.fetch_add(1, Ordering::Relaxed);
-        self.lock().insert(number, stop.clone());
+        self.lock_running().insert(number, stop.clone());
         let watch = QueryWatch {
             number,
             statement: statement.chars().take(STATEMENT_CHARS).collect(),
@@ -69,18 +74,18 @@ impl RunningWatches {
             outcome: OnceLock::new(),
         };
         let (statement, started) = (watch.statement.clone(), Utc::now().timestamp_micros());
-        EngineReport::Started(QueryStart { number, protocol, statement, started }).queue();
+        EngineReport::Started(QueryStart { number, protocol, statement, started }).queue_line();
         QueryTimer { watch: Arc::new(watch), watches: self.clone() }
     }
 
     /// Cancels a query, if it runs.
-    pub(crate) fn cancel(&self, number: u64) {
-        if let Some(stop) = self.lock().get(&number) {
+    pub(crate) fn cancel_query(&self, number: u64) {
+        if let Some(stop) = self.lock_running().get(&number) {
             stop.stop();
         }
     }
 
-    fn lock(&self) -> MutexGuard<'_, HashMap<u64, StopSignal>> {
+    fn lock_running(&self) -> MutexGuard<'_, HashMap<u64, StopSignal>> {
         self.running.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -94,8 +99,8 @@ impl QueryTimer {
 
 impl Drop for QueryTimer {
     fn drop(&mut self) {
-        self.watches.lock().remove(&self.watch.number);
-        let end = self.watch.end();
+        self.watches.lock_running().remove(&self.watch.number);
+        let end = self.watch.query_end();
         if self.watches.slow.is_some_and(|slow| end.seconds >= slow.as_secs_f64()) {
             tracing::warn!(
                 seconds = end.seconds,
@@ -109,18 +114,18 @@ impl Drop for QueryTimer {
                 "a slow query"
             );
         }
-        EngineReport::Ended(end).queue();
+        EngineReport::Ended(end).queue_line();
     }
 }
 
 impl QueryWatch {
     /// Records that it is planned.
-    pub(crate) fn planned(&self) {
+    pub(crate) fn record_planned(&self) {
         let _ = self.planned.set(self.begun.elapsed());
     }
 
     /// Counts rows of its answer.
-    pub(crate) fn answered(&self, batch: &RecordBatch) {
+    pub(crate) fn count_rows(&self, batch: &RecordBatch) {
         let _ = self.first_row.set(self.begun.elapsed());
         let bytes = batch.columns().iter().map(|column| column.to_data().get_slice_memory_size().unwrap_or(0));
         self.rows.fetch_add(batch.num_rows() as u64, Ordering::Relaxed);
@@ -128,16 +133,16 @@ impl QueryWatch {
     }
 
     /// Records the memory that its operators held.
-    pub(crate) fn held(&self, bytes: usize) {
+    pub(crate) fn record_memory(&self, bytes: usize) {
         self.memory.fetch_max(bytes as u64, Ordering::Relaxed);
     }
 
     /// Records its outcome, a failure or none; the first counts. A query without one was abandoned by its client.
-    pub fn finish(&self, failure: Option<&RequestFault>) {
+    pub fn record_outcome(&self, failure: Option<&RequestFault>) {
         let _ = self.outcome.set(failure.map(RequestFault::code));
     }
 
-    fn end(&self) -> QueryEnd {
+    fn query_end(&self) -> QueryEnd {
         let seconds = |time: &OnceLock<Duration>| time.get().map(Duration::as_secs_f64);
         QueryEnd {
             number: self.number,
@@ -161,23 +166,23 @@ mod tests {
     #[test]
     fn an_abandoned_query_was_cancelled() {
         let watches = Arc::new(RunningWatches::default());
-        let timer = watches.begin(ServerProtocol::Http, "select 1", &StopSignal::new());
-        assert_eq!(timer.watch().end().failure, Some(FaultCode::Cancelled));
-        timer.watch().finish(None);
-        timer.watch().finish(Some(&RequestFault::Internal));
-        assert_eq!(timer.watch().end().failure, None, "the first outcome counts");
+        let timer = watches.begin_watch(ServerProtocol::Http, "select 1", &StopSignal::new());
+        assert_eq!(timer.watch().query_end().failure, Some(FaultCode::Cancelled));
+        timer.watch().record_outcome(None);
+        timer.watch().record_outcome(Some(&RequestFault::Internal));
+        assert_eq!(timer.watch().query_end().failure, None, "the first outcome counts");
     }
 
     #[test]
     fn a_query_is_cancelled_by_its_number() {
         let watches = Arc::new(RunningWatches::default());
         let stop = StopSignal::new();
-        let timer = watches.begin(ServerProtocol::Http, "select 1", &stop);
-        watches.cancel(timer.watch().number + 1);
-        assert!(stop.stopped().now_or_never().is_none());
-        watches.cancel(timer.watch().number);
-        assert!(stop.stopped().now_or_never().is_some());
+        let timer = watches.begin_watch(ServerProtocol::Http, "select 1", &stop);
+        watches.cancel_query(timer.watch().number + 1);
+        assert!(stop.wait_for_stop().now_or_never().is_none());
+        watches.cancel_query(timer.watch().number);
+        assert!(stop.wait_for_stop().now_or_never().is_some());
         drop(timer);
-        assert!(watches.lock().is_empty());
+        assert!(watches.lock_running().is_empty());
     }
 }

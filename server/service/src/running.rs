@@ -27,10 +27,10 @@ pub trait AnswerEncoder: Send + 'static {
     type Item: Send + 'static;
 
     /// Encodes rows.
-    fn batch(&mut self, batch: RecordBatch) -> Result<Vec<Self::Item>, RequestFault>;
+    fn encode_batch(&mut self, batch: RecordBatch) -> Result<Vec<Self::Item>, RequestFault>;
 
     /// Encodes the end of the answer, after the last row.
-    fn end(self) -> Result<Vec<Self::Item>, RequestFault>;
+    fn encode_end(self) -> Result<Vec<Self::Item>, RequestFault>;
 }
 
 /// Rows as they are.
@@ -39,11 +39,11 @@ pub struct BatchEncoder;
 impl AnswerEncoder for BatchEncoder {
     type Item = RecordBatch;
 
-    fn batch(&mut self, batch: RecordBatch) -> Result<Vec<RecordBatch>, RequestFault> {
+    fn encode_batch(&mut self, batch: RecordBatch) -> Result<Vec<RecordBatch>, RequestFault> {
         Ok(vec![batch])
     }
 
-    fn end(self) -> Result<Vec<RecordBatch>, RequestFault> {
+    fn encode_end(self) -> Result<Vec<RecordBatch>, RequestFault> {
         Ok(Vec::new())
     }
 }
@@ -71,7 +71,7 @@ pub struct SessionTimeLimit {
 
 impl SessionTimeLimit {
     /// This long, from now.
-    pub fn of(time: Duration) -> Self {
+    pub fn from_now(time: Duration) -> Self {
         Self { time, end: Instant::now() + time }
     }
 }
@@ -79,7 +79,7 @@ impl SessionTimeLimit {
 impl<T: Send + 'static> RunningQuery<T> {
     /// Ends the query, whose further rows nobody wants: it was answered.
     pub fn finish_early(mut self) {
-        self.watch.finish(None);
+        self.watch.record_outcome(None);
         self.task.abort_all();
     }
 
@@ -87,12 +87,12 @@ impl<T: Send + 'static> RunningQuery<T> {
     ///
     /// # Errors
     /// What ended the query before its end.
-    pub async fn next(&mut self) -> Result<Option<T>, RequestFault> {
+    pub async fn next_part(&mut self) -> Result<Option<T>, RequestFault> {
         let limit = self.limit;
         tokio::select! {
             biased;
-            fault = ended(&self.stop, limit) => {
-                self.watch.finish(Some(&fault));
+            fault = wait_for_fault(&self.stop, limit) => {
+                self.watch.record_outcome(Some(&fault));
                 self.task.abort_all();
                 self.span.in_scope(|| EngineReport::record_failure(&fault));
                 return Err(fault);
@@ -101,26 +101,26 @@ impl<T: Send + 'static> RunningQuery<T> {
                 return Ok(Some(item));
             }
         }
-        finish(&mut self.task).await.map(|()| None)
+        finish_task(&mut self.task).await.map(|()| None)
     }
 }
 
 /// Waits until the query is stopped or its session's time limit is reached; returns the matching fault.
-pub async fn ended(stop: &StopSignal, limit: Option<SessionTimeLimit>) -> RequestFault {
+pub async fn wait_for_fault(stop: &StopSignal, limit: Option<SessionTimeLimit>) -> RequestFault {
     match limit {
         None => {
-            stop.stopped().await;
+            stop.wait_for_stop().await;
             RequestFault::Cancelled
         }
         Some(limit) => tokio::select! {
-            () = stop.stopped() => RequestFault::Cancelled,
+            () = stop.wait_for_stop() => RequestFault::Cancelled,
             () = tokio::time::sleep_until(limit.end) => RequestFault::Timeout { limit: limit.time },
         },
     }
 }
 
 /// Returns the result of a task that sends nothing more.
-pub async fn finish(task: &mut JoinSet<Result<(), RequestFault>>) -> Result<(), RequestFault> {
+pub async fn finish_task(task: &mut JoinSet<Result<(), RequestFault>>) -> Result<(), RequestFault> {
     match task.join_next().await {
         None => Ok(()),
         Some(Ok(done)) => done,
@@ -129,7 +129,7 @@ pub async fn finish(task: &mut JoinSet<Result<(), RequestFault>>) -> Result<(), 
 }
 
 /// Rows in parts that are cheap to hold.
-pub(crate) fn parts(batch: &RecordBatch) -> impl Iterator<Item = RecordBatch> {
+pub(crate) fn split_batch(batch: &RecordBatch) -> impl Iterator<Item = RecordBatch> {
     let rows = batch.num_rows();
     let row_bytes = batch.get_array_memory_size() / rows.max(1);
     let step = (PART_BYTES / row_bytes.max(1)).max(1);
@@ -146,9 +146,9 @@ mod tests {
     fn parts_are_all_rows_in_order() {
         let numbers: ArrayRef = Arc::new(Int64Array::from_iter_values(0..1_500_000));
         let batch = RecordBatch::try_from_iter([("n", numbers)]).expect("a batch");
-        let parts: Vec<_> = parts(&batch).collect();
+        let parts: Vec<_> = split_batch(&batch).collect();
         assert!(parts.len() > 1);
         assert_eq!(arrow::compute::concat_batches(&batch.schema(), &parts).expect("together"), batch);
-        assert_eq!(super::parts(&batch.slice(0, 0)).count(), 0);
+        assert_eq!(super::split_batch(&batch.slice(0, 0)).count(), 0);
     }
 }

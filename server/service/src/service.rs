@@ -22,7 +22,7 @@ use crate::door_rows::DoorRows;
 use crate::engine_report::EngineReport;
 use crate::fault::{FaultCode, RequestFault};
 use crate::query_watch::{QueryTimer, QueryWatch, RunningWatches};
-use crate::running::{AnswerEncoder, RunningQuery, SessionTimeLimit, WAITING, ended, finish, parts};
+use crate::running::{AnswerEncoder, RunningQuery, SessionTimeLimit, WAITING, finish_task, split_batch, parts};
 use crate::server_protocol::ServerProtocol;
 use crate::stop_signal::StopSignal;
 use crate::token_scope::TokenScope;
@@ -57,7 +57,7 @@ pub enum QueryWork {
 }
 
 impl QueryWork {
-    fn statement(&self) -> &str {
+    fn statement_text(&self) -> &str {
         match self {
             Self::Sql(sql) => sql,
             Self::Prepared(prepared, _) => prepared.sql(),
@@ -94,7 +94,7 @@ impl Drop for ActivityGuard {
 
 impl ActivityCounter {
     /// Counts one more, until the guard is dropped.
-    pub fn enter(&self) -> ActivityGuard {
+    pub fn begin_work(&self) -> ActivityGuard {
         self.0.fetch_add(1, Ordering::Relaxed);
         ActivityGuard(self.clone())
     }
@@ -149,8 +149,8 @@ impl QueryService {
     ///
     /// # Errors
     /// [`RequestFault::Forbidden`].
-    pub fn client(&self, scope: TokenScope) -> Result<Arc<EngineClient>, RequestFault> {
-        self.0.identity.require(scope).inspect_err(EngineReport::record_failure)?;
+    pub fn authorised_client(&self, scope: TokenScope) -> Result<Arc<EngineClient>, RequestFault> {
+        self.0.identity.require_scope(scope).inspect_err(EngineReport::record_failure)?;
         Ok(self.0.client.clone())
     }
 
@@ -160,21 +160,21 @@ impl QueryService {
     }
 
     /// Reports a failed request to the door, which counts them.
-    pub fn failed(&self, code: FaultCode) {
-        EngineReport::Failure(code).queue();
+    pub fn report_failure(&self, code: FaultCode) {
+        EngineReport::Failure(code).queue_line();
     }
 
     /// Watches a query, or other work that is listed among queries, until the timer is dropped.
-    pub fn watch(&self, protocol: ServerProtocol, statement: &str, stop: &StopSignal) -> QueryTimer {
-        self.0.watches.begin(protocol, statement, stop)
+    pub fn watch_query(&self, protocol: ServerProtocol, statement: &str, stop: &StopSignal) -> QueryTimer {
+        self.0.watches.begin_watch(protocol, statement, stop)
     }
 
     /// Does what the door says; ends with the door.
-    pub async fn obey(&self, mut messages: mpsc::UnboundedReceiver<DoorMessage>) {
+    pub async fn obey_door(&self, mut messages: mpsc::UnboundedReceiver<DoorMessage>) {
         while let Some(message) = messages.recv().await {
             match message {
-                DoorMessage::Cancel(number) => self.0.watches.cancel(number),
-                DoorMessage::Rows { number, rows } => self.0.door_rows.answer(number, rows),
+                DoorMessage::Cancel(number) => self.0.watches.cancel_query(number),
+                DoorMessage::Rows { number, rows } => self.0.door_rows.take_answer(number, rows),
                 // An engine has one client.
                 DoorMessage::Client(_) => {}
             }
@@ -182,45 +182,45 @@ impl QueryService {
     }
 
     /// Begins a session: one per connection, or one per request if the protocol has no connections.
-    pub fn session(&self, client: &Arc<EngineClient>) -> Session {
-        self.0.engine.session(client)
+    pub fn begin_session(&self, client: &Arc<EngineClient>) -> Session {
+        self.0.engine.open_session(client)
     }
 
     /// The tables and their schemas.
-    pub fn tables(&self) -> Vec<(&'static str, SchemaRef)> {
-        self.session(&self.0.client).tables().collect()
+    pub fn lake_tables(&self) -> Vec<(&'static str, SchemaRef)> {
+        self.begin_session(&self.0.client).table_schemas().collect()
     }
 
     /// The tables of the schema `system`, and their schemas.
     pub fn system_tables(&self) -> Vec<(&'static str, SchemaRef)> {
-        self.session(&self.0.client).system_tables()
+        self.begin_session(&self.0.client).system_tables()
     }
 
     /// All tables by the names that SQL has for them, and their schemas: those of the lake, then those of the schema
     /// `system`.
     pub fn all_tables(&self) -> Vec<(String, SchemaRef)> {
-        self.session(&self.0.client).all_tables()
+        self.begin_session(&self.0.client).all_tables()
     }
 
     /// The views' definitions by their names.
     pub fn view_definitions(&self) -> HashMap<&'static str, String> {
-        self.session(&self.0.client).view_definitions().collect()
+        self.begin_session(&self.0.client).view_definitions().collect()
     }
 
     /// The field's functions.
-    pub fn functions(&self) -> Vec<SqlFunction> {
+    pub fn own_functions(&self) -> Vec<SqlFunction> {
         self.all_functions().into_iter().filter(|f| f.is_own).collect()
     }
 
     /// All functions, the field's and DataFusion's.
     pub fn all_functions(&self) -> Vec<SqlFunction> {
-        self.session(&self.0.client).functions()
+        self.begin_session(&self.0.client).sql_functions()
     }
 
     /// Spawns work on the encoder threads; dropping the returned task aborts it.
-    pub fn spawn<T: Send + 'static>(&self, work: impl Future<Output = T> + Send + 'static) -> JoinSet<T> {
+    pub fn spawn_work<T: Send + 'static>(&self, work: impl Future<Output = T> + Send + 'static) -> JoinSet<T> {
         let mut task = JoinSet::new();
-        let guard = self.0.activity.enter();
+        let guard = self.0.activity.begin_work();
         if let Some(threads) = self.0.encoders.handle() {
             let work = async move {
                 let _guard = guard;
@@ -233,27 +233,27 @@ impl QueryService {
 
     /// Parses and plans for a client, away from the threads that answer connections. Boxed for the same reason as
     /// [`echolake_query::OpaqueValue`].
-    pub fn plan<T: Send + 'static>(
+    pub fn plan_query<T: Send + 'static>(
         &self,
         client: &EngineClient,
         work: impl Future<Output = Result<T, RequestFault>> + Send + 'static,
     ) -> BoxFuture<'_, Result<T, RequestFault>> {
-        let (guard, time) = (self.0.activity.enter(), client.quota().time);
+        let (guard, time) = (self.0.activity.begin_work(), client.quota().time);
         let work = async move {
             let _guard = guard;
             work.await
         };
         let work = work.in_current_span();
-        let planned = async move { self.0.engine.supervise(time, work).await };
+        let planned = async move { self.0.engine.supervise_work(time, work).await };
         planned.inspect_err(EngineReport::record_failure).boxed()
     }
 
     /// Computes something long, which waits for nothing.
-    pub async fn crunch<T: Send + 'static>(
+    pub async fn compute_blocking<T: Send + 'static>(
         &self,
         work: impl FnOnce() -> T + Send + 'static,
     ) -> Result<T, RequestFault> {
-        let guard = self.0.activity.enter();
+        let guard = self.0.activity.begin_work();
         let work = move || {
             let _guard = guard;
             work()
@@ -263,11 +263,11 @@ impl QueryService {
         handle.await.map_err(RequestFault::defect("computing ended its task"))
     }
 
-    /// Begins a query; its columns are known when this returns. Boxed as [`QueryService::plan`].
+    /// Begins a query; its columns are known when this returns. Boxed as [`QueryService::plan_query`].
     ///
     /// # Errors
     /// What is wrong with the query, or ended it.
-    pub fn begin<E: AnswerEncoder>(
+    pub fn begin_query<E: AnswerEncoder>(
         &self,
         job: QueryJob,
         encode: impl FnOnce(&SchemaRef) -> Result<E, RequestFault> + Send + 'static,
@@ -277,29 +277,29 @@ impl QueryService {
             let (to, items) = mpsc::channel(WAITING);
             let (stop, limit) = (job.stop.clone(), job.limit);
             let span = tracing::error_span!("query", protocol = job.protocol.name(), client = self.0.identity.name);
-            let timer = span.in_scope(|| self.watch(job.protocol, job.work.statement(), &job.stop));
+            let timer = span.in_scope(|| self.watch_query(job.protocol, job.work.statement_text(), &job.stop));
             let (watch, stopped) = (timer.watch().clone(), stop.clone());
             let work = async move {
                 let done = tokio::select! {
-                    done = run(timer.watch(), job, encode, columns, to) => done,
+                    done = run_query(timer.watch(), job, encode, columns, to) => done,
                     // Also if nobody fetches rows at present; who does says so.
-                    () = stopped.stopped() => return Err(RequestFault::Cancelled),
+                    () = stopped.wait_for_stop() => return Err(RequestFault::Cancelled),
                 };
-                timer.watch().finish(done.as_ref().err());
+                timer.watch().record_outcome(done.as_ref().err());
                 done.inspect_err(EngineReport::record_failure)
             };
-            let mut task = self.spawn(work.instrument(span.clone()));
+            let mut task = self.spawn_work(work.instrument(span.clone()));
             tokio::select! {
                 biased;
-                fault = ended(&stop, limit) => {
-                    watch.finish(Some(&fault));
+                fault = wait_for_fault(&stop, limit) => {
+                    watch.record_outcome(Some(&fault));
                     span.in_scope(|| EngineReport::record_failure(&fault));
                     Err(fault)
                 }
                 schema = known => match schema {
                     Ok(schema) => Ok(RunningQuery { schema, items, task, stop, limit, watch, span }),
                     // It ended without having any: it says why.
-                    Err(_) => finish(&mut task).await.and(Err(RequestFault::Internal)),
+                    Err(_) => finish_task(&mut task).await.and(Err(RequestFault::Internal)),
                 }
             }
         };
@@ -307,7 +307,7 @@ impl QueryService {
     }
 }
 
-async fn run<E: AnswerEncoder>(
+async fn run_query<E: AnswerEncoder>(
     watch: &QueryWatch,
     job: QueryJob,
     encode: impl FnOnce(&SchemaRef) -> Result<E, RequestFault>,
@@ -318,25 +318,25 @@ async fn run<E: AnswerEncoder>(
         QueryWork::Sql(sql) => job.session.query(&sql).await?,
         QueryWork::Prepared(prepared, values) => job.session.execute(&prepared, values).await?,
     };
-    watch.planned();
+    watch.record_planned();
     let mut encoder = encode(&answer.schema)?;
     // If sending fails, here and below, the receiver is gone: the query ends by being dropped.
     if columns.send(answer.schema.clone()).is_err() {
         return Ok(());
     }
     while let Some(batch) = answer.next().await? {
-        watch.answered(&batch);
-        watch.held(answer.peak_memory());
-        for part in parts(&batch) {
-            for item in encoder.batch(part)? {
+        watch.count_rows(&batch);
+        watch.record_memory(answer.peak_memory());
+        for part in split_batch(&batch) {
+            for item in encoder.encode_batch(part)? {
                 if to.send(item).await.is_err() {
                     return Ok(());
                 }
             }
         }
     }
-    watch.held(answer.peak_memory());
-    for item in encoder.end()? {
+    watch.record_memory(answer.peak_memory());
+    for item in encoder.encode_end()? {
         if to.send(item).await.is_err() {
             return Ok(());
         }

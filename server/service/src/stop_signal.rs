@@ -18,7 +18,7 @@ impl StopSignal {
     }
 
     /// Waits until the query is stopped.
-    pub async fn stopped(&self) {
+    pub async fn wait_for_stop(&self) {
         // The sender lives in `self`, so there is no error to come.
         let _ = self.0.subscribe().wait_for(|stopped| *stopped).await;
     }

@@ -36,7 +36,7 @@ impl ServerActivity {
     }
 
     /// Returns when the server started.
-    pub(crate) fn started(&self) -> DateTime<Utc> {
+    pub(crate) fn start_time(&self) -> DateTime<Utc> {
         self.started
     }
 
@@ -47,7 +47,7 @@ impl ServerActivity {
 
     /// Returns what an engine last found in the lake, and when; None if the lake could not be read, or nobody has looked
     /// yet.
-    pub(crate) fn lake(&self) -> Option<(Instant, LakeFigures)> {
+    pub(crate) fn lake_figures(&self) -> Option<(Instant, LakeFigures)> {
         let (at, figures) = (*self.lake.lock().unwrap_or_else(PoisonError::into_inner))?;
         Some((at, figures?))
     }
@@ -58,11 +58,13 @@ impl ServerActivity {
     }
 
     /// The rows of a table that a client may see: its own, or all if it may see the server's figures.
-    pub(crate) fn rows(&self, table: ActivityTable, client: &ClientIdentity) -> ActivityRows {
-        let all = client.require(TokenScope::Metrics).is_ok();
+    pub(crate) fn visible_rows(&self, table: ActivityTable, client: &ClientIdentity) -> ActivityRows {
+        let all = client.require_scope(TokenScope::Metrics).is_ok();
         match table {
-            ActivityTable::Queries => ActivityRows::Queries(self.queries.rows(&client.name, all)),
-            ActivityTable::Connections => ActivityRows::Connections(self.connections.rows(&client.name, all)),
+            ActivityTable::Queries => ActivityRows::Queries(self.queries.query_rows(&client.name, all)),
+            ActivityTable::Connections => {
+                ActivityRows::Connections(self.connections.connection_rows(&client.name, all))
+            }
         }
     }
 }

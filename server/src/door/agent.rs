@@ -66,7 +66,7 @@ impl AgentDoor {
         let activity = Arc::new(ServerActivity::new()?);
         let engines = EnginePool::new(lake, engines, activity, Arc::new(TokenAccess::new(None)))?;
         // No page of elsewhere reaches standard input.
-        let client = ClientIdentity { is_open: false, ..ClientIdentity::local(AGENT) };
+        let client = ClientIdentity { is_open: false, ..ClientIdentity::local_client(AGENT) };
         Ok(Self { route: Arc::new(AgentRoute { engines, client, host, scheme }) })
     }
 
@@ -74,7 +74,7 @@ impl AgentDoor {
     ///
     /// # Errors
     /// [`Error::System`].
-    pub async fn run(self, stop: impl Future<Output = ()>) -> Result<(), Error> {
+    pub async fn answer_until(self, stop: impl Future<Output = ()>) -> Result<(), Error> {
         let mut upkeep = JoinSet::new();
         upkeep.spawn(self.route.engines.clone().retire_idle());
         tokio::select! {
@@ -114,7 +114,7 @@ async fn answer_lines(route: &Arc<AgentRoute>, mut lines: mpsc::Receiver<InputLi
         let key = id.to_string();
         let task = tasks.spawn(async move {
             let _place = place;
-            match route.answer(message.into()).await {
+            match route.answer_message(message.into()).await {
                 Ok(Some(answer)) => write_line(&answer),
                 Ok(None) => {}
                 Err(fault) => write_error(&id, INTERNAL, &fault.to_string()),
@@ -127,14 +127,14 @@ async fn answer_lines(route: &Arc<AgentRoute>, mut lines: mpsc::Receiver<InputLi
 
 impl AgentRoute {
     // The answer to a message; none to a notification.
-    async fn answer(&self, message: Bytes) -> Result<Option<Bytes>, RequestFault> {
+    async fn answer_message(&self, message: Bytes) -> Result<Option<Bytes>, RequestFault> {
         let mut request = Request::post(MCP).body(Body::from(message)).map_err(|_| RequestFault::Internal)?;
         let headers = request.headers_mut();
         headers.insert(header::HOST, self.host.clone());
         headers.insert(FORWARDED_PROTO, self.scheme.clone());
         let (span, _) = begin_request(headers, ServerProtocol::Mcp);
         let work = async {
-            let response = self.engines.forward(&self.client, request, EngineProtocol::Http, None).await?;
+            let response = self.engines.forward_request(&self.client, request, EngineProtocol::Http, None).await?;
             if response.status() == StatusCode::ACCEPTED {
                 return Ok(None);
             }

@@ -11,9 +11,9 @@ const ECDSA: &[u8] = &[0x2a, 0x86, 0x48, 0xce, 0x3d, 0x04, 0x03];
 
 /// Returns the hash of a certificate (DER), by the hash of its own signature; None if that has none of its own.
 pub(super) fn certificate_hash(certificate: &[u8]) -> Option<Vec<u8>> {
-    let certified = DerElement::first(certificate)?.content;
-    let algorithm = DerElement::first(DerElement::first(certified)?.rest)?;
-    let identifier = DerElement::first(algorithm.content)?;
+    let certified = DerElement::read_first(certificate)?.content;
+    let algorithm = DerElement::read_first(DerElement::read_first(certified)?.rest)?;
+    let identifier = DerElement::read_first(algorithm.content)?;
     let (last, family) = identifier.content.split_last()?;
     let hash = match (family, last) {
         // MD5 and SHA-1 are replaced.

@@ -65,7 +65,7 @@ struct PlaceState {
 }
 
 impl PlaceState {
-    fn client(&self) -> MutexGuard<'_, Option<String>> {
+    fn lock_client(&self) -> MutexGuard<'_, Option<String>> {
         self.client.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -73,10 +73,10 @@ impl PlaceState {
         self.working.load(Ordering::Relaxed) == 0
     }
 
-    fn row(&self, protocol: ServerProtocol) -> OpenConnection {
+    fn connection_row(&self, protocol: ServerProtocol) -> OpenConnection {
         OpenConnection {
             id: self.id,
-            client: self.client().clone(),
+            client: self.lock_client().clone(),
             protocol: protocol.name().to_owned(),
             peer: self.peer.to_string(),
             started: self.started,
@@ -98,19 +98,19 @@ struct ProtocolPlaces {
 
 impl OpenConnections {
     /// The number of open connections of each protocol, and its limit.
-    pub(crate) fn counts(&self) -> Vec<(ServerProtocol, usize, usize)> {
+    pub(crate) fn protocol_counts(&self) -> Vec<(ServerProtocol, usize, usize)> {
         let all = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        all.iter().map(|places| (places.protocol, places.taken.lock().len(), places.most)).collect()
+        all.iter().map(|places| (places.protocol, places.taken.lock_places().len(), places.most)).collect()
     }
 
     /// The connections of a client, or of all.
-    pub(crate) fn rows(&self, client: &str, all: bool) -> Vec<OpenConnection> {
+    pub(crate) fn connection_rows(&self, client: &str, all: bool) -> Vec<OpenConnection> {
         let protocols = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let mut rows = Vec::new();
         for places in protocols.iter() {
-            let taken = places.taken.lock();
-            let seen = taken.iter().filter(|place| all || place.client().as_deref() == Some(client));
-            rows.extend(seen.map(|place| place.row(places.protocol)));
+            let taken = places.taken.lock_places();
+            let seen = taken.iter().filter(|place| all || place.lock_client().as_deref() == Some(client));
+            rows.extend(seen.map(|place| place.connection_row(places.protocol)));
         }
         rows
     }
@@ -123,21 +123,21 @@ impl ConnectionPlaces {
     }
 
     /// Lists its connections among those of all protocols.
-    pub(super) fn listed(self, connections: &OpenConnections, protocol: ServerProtocol) -> Self {
+    pub(super) fn listed_among(self, connections: &OpenConnections, protocol: ServerProtocol) -> Self {
         let places = ProtocolPlaces { protocol, most: self.most, taken: self.taken.clone() };
         connections.0.lock().unwrap_or_else(PoisonError::into_inner).push(places);
         self
     }
 
     /// The next connection in its place. If all places are taken by connections that work, it waits.
-    pub(super) async fn next(&self) -> PlacedStream {
+    pub(super) async fn next_connection(&self) -> PlacedStream {
         loop {
             match self.listener.accept().await {
                 Ok((stream, peer)) => {
                     // Answers are written whole: waiting for more of them only delays.
                     let _ = stream.set_nodelay(true);
                     if self.make_room(peer.ip()).await {
-                        return self.place(stream, peer);
+                        return self.place_stream(stream, peer);
                     }
                 }
                 // A client that hung up already is no problem; a lack of sockets passes.
@@ -147,17 +147,20 @@ impl ConnectionPlaces {
     }
 
     /// Attends to connections, each in a task of its own; never ends.
-    pub(super) async fn attend<F: Future<Output = ()> + Send + 'static>(self, attend: impl Fn(PlacedStream) -> F) {
+    pub(super) async fn attend_connections<F: Future<Output = ()> + Send + 'static>(
+        self,
+        attend: impl Fn(PlacedStream) -> F,
+    ) {
         let mut open = JoinSet::new();
         loop {
             tokio::select! {
-                stream = self.next() => drop(open.spawn(attend(stream))),
+                stream = self.next_connection() => drop(open.spawn(attend(stream))),
                 Some(_) = open.join_next() => {}
             }
         }
     }
 
-    fn place(&self, stream: TcpStream, peer: SocketAddr) -> PlacedStream {
+    fn place_stream(&self, stream: TcpStream, peer: SocketAddr) -> PlacedStream {
         let state = PlaceState {
             id: random_id(),
             peer,
@@ -171,7 +174,7 @@ impl ConnectionPlaces {
             evicted: Notify::new(),
         };
         let state = Arc::new(state);
-        self.taken.lock().push(state.clone());
+        self.taken.lock_places().push(state.clone());
         PlacedStream { stream, state, taken: self.taken.clone(), turn_bytes: 0, stalled: None }
     }
 
@@ -180,7 +183,7 @@ impl ConnectionPlaces {
         loop {
             let freed = self.taken.freed.notified();
             {
-                let mut all = self.taken.lock();
+                let mut all = self.taken.lock_places();
                 let own = all.iter().filter(|place| place.address == address).count();
                 let is_crowd = !address.is_loopback() && own >= (self.most / 2).max(1);
                 if !is_crowd && all.len() < self.most {
@@ -212,7 +215,7 @@ fn oldest_idle(all: &[Arc<PlaceState>], may: impl Fn(&PlaceState) -> bool) -> Op
 }
 
 impl TakenPlaces {
-    fn lock(&self) -> MutexGuard<'_, Vec<Arc<PlaceState>>> {
+    fn lock_places(&self) -> MutexGuard<'_, Vec<Arc<PlaceState>>> {
         self.all.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -228,17 +231,17 @@ pub(super) struct PlacedStream {
 
 impl PlacedStream {
     /// Ends if the connection must leave its place.
-    pub(super) fn evicted(&self) -> impl Future<Output = ()> + Send + 'static {
+    pub(super) fn wait_for_eviction(&self) -> impl Future<Output = ()> + Send + 'static {
         let state = self.state.clone();
         async move { state.evicted.notified().await }
     }
 
     /// Marks the begin of work on the connection.
-    pub(super) fn work(&self) -> PlaceWork {
+    pub(super) fn work_handle(&self) -> PlaceWork {
         PlaceWork(self.state.clone())
     }
 
-    fn watch(&mut self, context: &mut Context<'_>, written: Poll<io::Result<usize>>) -> Poll<io::Result<usize>> {
+    fn watch_write(&mut self, context: &mut Context<'_>, written: Poll<io::Result<usize>>) -> Poll<io::Result<usize>> {
         if let Poll::Ready(done) = &written {
             self.stalled = None;
             self.state.written.fetch_add(*done.as_ref().unwrap_or(&0), Ordering::Relaxed);
@@ -251,7 +254,7 @@ impl PlacedStream {
 
 impl Drop for PlacedStream {
     fn drop(&mut self) {
-        self.taken.lock().retain(|place| !Arc::ptr_eq(place, &self.state));
+        self.taken.lock_places().retain(|place| !Arc::ptr_eq(place, &self.state));
         self.taken.freed.notify_one();
     }
 }
@@ -269,7 +272,7 @@ impl PlaceWork {
 
     /// Takes note of the client of a request; returns true if the one before was another's.
     pub(super) fn name_client(&self, name: &str) -> bool {
-        let mut known = self.0.client();
+        let mut known = self.0.lock_client();
         let is_other = known.as_deref() != Some(name);
         if is_other {
             *known = Some(name.to_owned());
@@ -283,7 +286,7 @@ impl PlaceWork {
     }
 
     /// Waits until the connection does no work, and sends nothing more of what was done.
-    pub(super) async fn quiet(&self) {
+    pub(super) async fn wait_until_quiet(&self) {
         let mut written = None;
         while !(self.0.is_idle() && written == Some(self.0.written.load(Ordering::Relaxed))) {
             written = self.0.is_idle().then(|| self.0.written.load(Ordering::Relaxed));
@@ -291,7 +294,7 @@ impl PlaceWork {
         }
     }
 
-    pub(super) fn begin(&self) -> WorkingPlace {
+    pub(super) fn begin_work(&self) -> WorkingPlace {
         self.0.working.fetch_add(1, Ordering::Relaxed);
         WorkingPlace(self.0.clone())
     }
@@ -331,7 +334,7 @@ impl AsyncRead for PlacedStream {
 impl AsyncWrite for PlacedStream {
     fn poll_write(mut self: Pin<&mut Self>, context: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
         let written = Pin::new(&mut self.stream).poll_write(context, bytes);
-        self.watch(context, written)
+        self.watch_write(context, written)
     }
 
     fn poll_write_vectored(
@@ -340,7 +343,7 @@ impl AsyncWrite for PlacedStream {
         parts: &[IoSlice<'_>],
     ) -> Poll<io::Result<usize>> {
         let written = Pin::new(&mut self.stream).poll_write_vectored(context, parts);
-        self.watch(context, written)
+        self.watch_write(context, written)
     }
 
     fn is_write_vectored(&self) -> bool {
@@ -372,17 +375,19 @@ mod tests {
         for _ in 0..4 {
             clients.push(TcpStream::connect(address).await.expect("connected"));
         }
-        let first = places.next().await;
-        let second = places.next().await;
-        let working = first.work().begin();
-        let third = places.next().await;
-        tokio::time::timeout(Duration::from_secs(60), second.evicted()).await.expect("it must leave its place");
-        let _third_works = third.work().begin();
-        let waited = tokio::time::timeout(Duration::from_millis(50), places.next()).await;
+        let first = places.next_connection().await;
+        let second = places.next_connection().await;
+        let working = first.work_handle().begin_work();
+        let third = places.next_connection().await;
+        tokio::time::timeout(Duration::from_secs(60), second.wait_for_eviction())
+            .await
+            .expect("it must leave its place");
+        let _third_works = third.work_handle().begin_work();
+        let waited = tokio::time::timeout(Duration::from_millis(50), places.next_connection()).await;
         assert!(waited.is_err(), "all places are taken by connections that work");
         drop((working, first));
         clients.push(TcpStream::connect(address).await.expect("connected"));
-        let next = tokio::time::timeout(Duration::from_secs(60), places.next()).await.expect("a free place");
+        let next = tokio::time::timeout(Duration::from_secs(60), places.next_connection()).await.expect("a free place");
         assert_eq!(Some(next.state.address), clients[4].local_addr().ok().map(|a| a.ip()));
         assert!(next.state.id.abs_diff(third.state.id) > 1_000, "ids do not tell how many connect");
     }
@@ -398,16 +403,18 @@ mod tests {
             let socket = TcpSocket::new_v4().expect("a socket");
             socket.bind(source.parse().expect("an address")).expect("bound");
             clients.push(socket.connect(address).await.expect("connected"));
-            taken.push(places.next().await);
+            taken.push(places.next_connection().await);
         }
-        tokio::time::timeout(Duration::from_secs(60), taken[1].evicted()).await.expect("it must leave its place");
-        let stays = tokio::time::timeout(Duration::from_millis(50), taken[0].evicted()).await;
+        tokio::time::timeout(Duration::from_secs(60), taken[1].wait_for_eviction())
+            .await
+            .expect("it must leave its place");
+        let stays = tokio::time::timeout(Duration::from_millis(50), taken[0].wait_for_eviction()).await;
         assert!(stays.is_err(), "the only one of its address stays, though it is the oldest");
-        let _works: Vec<_> = taken[2..].iter().map(|place| place.work().begin()).collect();
+        let _works: Vec<_> = taken[2..].iter().map(|place| place.work_handle().begin_work()).collect();
         let socket = TcpSocket::new_v4().expect("a socket");
         socket.bind("127.0.0.3:0".parse().expect("an address")).expect("bound");
         let mut refused = socket.connect(address).await.expect("connected");
-        assert!(tokio::time::timeout(Duration::from_millis(50), places.next()).await.is_err());
+        assert!(tokio::time::timeout(Duration::from_millis(50), places.next_connection()).await.is_err());
         assert_eq!(refused.read(&mut [0]).await.expect("closed"), 0, "a crowd that works takes no other's place");
     }
 
@@ -417,10 +424,10 @@ mod tests {
         let address = listener.local_addr().expect("its address");
         let places = ConnectionPlaces::new(listener, 1);
         let mut client = TcpStream::connect(address).await.expect("connected");
-        let next = tokio::time::timeout(Duration::from_secs(60), places.next());
+        let next = tokio::time::timeout(Duration::from_secs(60), places.next_connection());
         let mut place = next.await.expect("the only place");
         tokio::spawn(async move { while client.write_all(&[0; 1024]).await.is_ok() {} });
-        let work = place.work();
+        let work = place.work_handle();
         let mut buffer = vec![0; IDLE_BYTES / 4];
         for _ in 0..12 {
             place.read_exact(&mut buffer).await.expect("a request");

@@ -10,7 +10,7 @@ pub(super) struct DerElement<'a> {
 
 impl<'a> DerElement<'a> {
     /// Reads the first element; None if there is no whole one.
-    pub(super) fn first(der: &'a [u8]) -> Option<Self> {
+    pub(super) fn read_first(der: &'a [u8]) -> Option<Self> {
         let (&[_kind, length], rest) = der.split_first_chunk()?;
         let (bytes, rest) = match length {
             0..=0x7f => (usize::from(length), rest),

@@ -25,7 +25,7 @@ impl Drop for AwaitedConnection {
 
 impl ServerDrain {
     /// Takes nothing new from now on.
-    pub(super) fn begin(&self) {
+    pub(super) fn begin_drain(&self) {
         self.0.begun.send_replace(true);
     }
 
@@ -35,13 +35,13 @@ impl ServerDrain {
     }
 
     /// Waits until nothing new is taken.
-    pub(super) async fn begun(&self) {
+    pub(super) async fn wait_until_begun(&self) {
         // The sender lives in `self`, so there is no error to come.
         let _ = self.0.begun.subscribe().wait_for(|begun| *begun).await;
     }
 
     /// Counts a connection whose end is awaited; None if it comes too late for that.
-    pub(super) fn enter(&self) -> Option<AwaitedConnection> {
+    pub(super) fn count_connection(&self) -> Option<AwaitedConnection> {
         // Counted before the look: one that finds no end begun is awaited by the end that follows.
         self.0.open.send_modify(|open| *open += 1);
         let counted = AwaitedConnection(self.clone());
@@ -49,12 +49,12 @@ impl ServerDrain {
     }
 
     /// Returns the number of awaited connections.
-    pub(super) fn open(&self) -> usize {
+    pub(super) fn open_connections(&self) -> usize {
         *self.0.open.borrow()
     }
 
     /// Waits until no awaited connection is open.
-    pub(super) async fn emptied(&self) {
+    pub(super) async fn wait_until_empty(&self) {
         let _ = self.0.open.subscribe().wait_for(|open| *open == 0).await;
     }
 }
@@ -68,13 +68,13 @@ mod tests {
     #[test]
     fn connections_before_the_end_are_awaited() {
         let drain = ServerDrain::default();
-        let first = drain.enter().expect("before the end");
-        assert!(drain.begun().now_or_never().is_none());
-        drain.begin();
-        assert!(drain.begun().now_or_never().is_some());
-        assert!(drain.enter().is_none(), "too late");
-        assert!(drain.emptied().now_or_never().is_none());
+        let first = drain.count_connection().expect("before the end");
+        assert!(drain.wait_until_begun().now_or_never().is_none());
+        drain.begin_drain();
+        assert!(drain.wait_until_begun().now_or_never().is_some());
+        assert!(drain.count_connection().is_none(), "too late");
+        assert!(drain.wait_until_empty().now_or_never().is_none());
         drop(first);
-        assert!(drain.emptied().now_or_never().is_some());
+        assert!(drain.wait_until_empty().now_or_never().is_some());
     }
 }

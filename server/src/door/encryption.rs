@@ -40,7 +40,7 @@ pub struct CertificateFiles {
 type FileStates = Vec<Option<(SystemTime, u64)>>;
 
 impl CertificateFiles {
-    fn states(&self) -> FileStates {
+    fn file_states(&self) -> FileStates {
         let state = |path: &PathBuf| {
             let about = std::fs::metadata(path).ok()?;
             Some((about.modified().ok()?, about.len()))
@@ -48,7 +48,7 @@ impl CertificateFiles {
         [&self.certificate, &self.key].into_iter().map(state).collect()
     }
 
-    fn load(&self) -> Result<Arc<CertifiedKey>, Error> {
+    fn load_certificate(&self) -> Result<Arc<CertifiedKey>, Error> {
         let wrong = |source| Error::Certificate { path: self.key.clone(), source };
         let chain = read_certificates(&self.certificate)?;
         let key = PrivateKeyDer::from_pem_file(&self.key).map_err(|e| wrong(e.into()))?;
@@ -86,7 +86,7 @@ impl ServerEncryption {
     /// # Errors
     /// [`Error::Certificate`].
     pub(super) fn new(files: CertificateFiles) -> Result<Self, Error> {
-        Ok(Self { loaded: files.load()?, files, protocols: Vec::new() })
+        Ok(Self { loaded: files.load_certificate()?, files, protocols: Vec::new() })
     }
 
     /// Returns the encryption of a protocol, which clients may name in the handshake by one of these names.
@@ -102,15 +102,15 @@ impl ServerEncryption {
 
     /// Takes changed files for new connections; open ones keep what they began with. Never ends.
     pub(super) async fn keep_up(self) {
-        let mut known = self.files.states();
+        let mut known = self.files.file_states();
         loop {
             tokio::time::sleep(LOOK_EVERY).await;
-            let states = self.files.states();
+            let states = self.files.file_states();
             if states == known {
                 continue;
             }
-            match self.files.load() {
-                Ok(loaded) => self.renew(&loaded),
+            match self.files.load_certificate() {
+                Ok(loaded) => self.renew_protocols(&loaded),
                 // One of them may be still to come.
                 Err(e) => tracing::warn!(error = &e as &dyn std::error::Error, "the old certificates stay in use"),
             }
@@ -118,7 +118,7 @@ impl ServerEncryption {
         }
     }
 
-    fn renew(&self, loaded: &Arc<CertifiedKey>) {
+    fn renew_protocols(&self, loaded: &Arc<CertifiedKey>) {
         for protocol in &self.protocols {
             let names = protocol.read().unwrap_or_else(PoisonError::into_inner).names;
             match ProtocolTls::new(names, loaded) {
@@ -178,9 +178,9 @@ impl ProtocolEncryption {
     }
 
     /// Shakes hands with a client, if connections are encrypted; None if that fails, or takes too long.
-    pub(super) async fn accept(&self, stream: PlacedStream) -> Option<DoorStream> {
+    pub(super) async fn shake_hands(&self, stream: PlacedStream) -> Option<DoorStream> {
         let Some(acceptor) = self.acceptor() else { return Some(Either::Left(stream)) };
-        let evicted = stream.evicted();
+        let evicted = stream.wait_for_eviction();
         tokio::select! {
             shaken = tokio::time::timeout(HANDSHAKE, acceptor.accept(stream)) => match shaken {
                 Ok(Ok(encrypted)) => Some(Either::Right(Box::new(encrypted))),

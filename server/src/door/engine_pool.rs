@@ -132,7 +132,7 @@ impl EnginePool {
     /// # Errors
     /// [`RequestFault::Unauthenticated`] if the client's token is no longer one; [`RequestFault::TooMany`] if other
     /// clients' engines are all answering; [`RequestFault::Backoff`]; [`RequestFault::EngineEnded`].
-    pub(super) async fn lease(&self, client: &ClientIdentity) -> Result<EngineLease, RequestFault> {
+    pub(super) async fn lease_for(&self, client: &ClientIdentity) -> Result<EngineLease, RequestFault> {
         let lease = self.lease_engine(client).await?;
         self.0.memory_watcher.unpark();
         Ok(lease)
@@ -140,48 +140,49 @@ impl EnginePool {
 
     async fn lease_engine(&self, client: &ClientIdentity) -> Result<EngineLease, RequestFault> {
         self.0.access.check_current(client)?;
-        let own = self.client(&client.name);
-        if let Some(lease) = own.lease(client) {
+        let own = self.client_engine(&client.name);
+        if let Some(lease) = own.lease_current(client) {
             return Ok(lease);
         }
         let mut state = own.state.lock().await;
         // Another request that held the lock may have started one.
-        if let Some(lease) = own.lease(client) {
+        if let Some(lease) = own.lease_current(client) {
             return Ok(lease);
         }
         own.end_outdated(client);
         self.count_end(&own, &mut state).await;
-        match state.backoff() {
+        match state.backoff_left() {
             wait if wait > BACKOFF_WAIT => return Err(RequestFault::Backoff { ends: state.ends, wait }),
             wait => tokio::time::sleep(wait).await,
         }
         self.make_room(&own).await?;
         let engine = self.take_spare().map_err(RequestFault::defect("no engine can be started"))?;
-        if let Err(EndReason::Failed(reason)) = engine.assign(client).await {
+        if let Err(EndReason::Failed(reason)) = engine.assign_client(client).await {
             self.record_start(false);
             state.ends += 1;
             state.last_end = Some(Instant::now());
             tracing::error!(reason, "an engine did not start");
             return Err(RequestFault::EngineEnded { reason });
         }
-        let lease =
-            engine.lease().ok_or_else(|| RequestFault::EngineEnded { reason: "it ended at once".to_owned() })?;
+        let lease = engine
+            .hold_for_request()
+            .ok_or_else(|| RequestFault::EngineEnded { reason: "it ended at once".to_owned() })?;
         self.record_start(true);
         // The file of tokens may have changed while the engine started.
         if let Err(refused) = self.0.access.check_current(client) {
-            engine.end(EndReason::Retired);
+            engine.kill_process(EndReason::Retired);
             return Err(refused);
         }
-        *lock(&own.current) = Some(engine);
+        *lock_mutex(&own.current) = Some(engine);
         Ok(lease)
     }
 
-    fn client(&self, name: &str) -> Arc<ClientEngine> {
-        lock(&self.0.clients).entry(name.to_owned()).or_default().clone()
+    fn client_engine(&self, name: &str) -> Arc<ClientEngine> {
+        lock_mutex(&self.0.clients).entry(name.to_owned()).or_default().clone()
     }
 
     async fn count_end(&self, own: &ClientEngine, state: &mut ClientState) {
-        let ended = lock(&own.current).take();
+        let ended = lock_mutex(&own.current).take();
         let Some(ended) = ended else { return };
         if let Some(EndReason::Failed(reason)) = ended.why_ended().await {
             tracing::warn!(reason, "an engine ended");
@@ -200,7 +201,7 @@ impl EnginePool {
         let free = async {
             loop {
                 let freed = self.0.freed.notified();
-                let live = self.live();
+                let live = self.list_live();
                 if live.len() < self.0.settings.count {
                     return;
                 }
@@ -212,22 +213,22 @@ impl EnginePool {
                 }
             }
         };
-        debug_assert!(lock(&own.current).is_none());
+        debug_assert!(lock_mutex(&own.current).is_none());
         let limit = self.0.settings.count;
         tokio::time::timeout(PLACE_WAIT, free).await.map_err(|_| RequestFault::TooMany { what: "clients", limit })
     }
 
-    fn live(&self) -> Vec<Arc<EngineProcess>> {
+    fn list_live(&self) -> Vec<Arc<EngineProcess>> {
         live_engines(&self.0.clients)
     }
 
     fn take_spare(&self) -> std::io::Result<Arc<EngineProcess>> {
-        let spare = lock(&self.0.spare).take().filter(|engine| !engine.has_ended());
+        let spare = lock_mutex(&self.0.spare).take().filter(|engine| !engine.has_ended());
         self.0.spare_taken.notify_one();
-        spare.map_or_else(|| self.start(), Ok)
+        spare.map_or_else(|| self.start_engine(), Ok)
     }
 
-    fn start(&self) -> std::io::Result<Arc<EngineProcess>> {
+    fn start_engine(&self) -> std::io::Result<Arc<EngineProcess>> {
         let name = format!("engine-{}", self.0.started.fetch_add(1, Ordering::Relaxed));
         let start = EngineStart {
             settings: &self.0.settings,
@@ -236,7 +237,7 @@ impl EnginePool {
             sockets: self.0.folders.sockets.path().join(&name),
             spills: self.0.folders.spills.path().join(&name),
         };
-        EngineProcess::start(start, self.0.activity.clone())
+        EngineProcess::spawn_process(start, self.0.activity.clone())
     }
 
     /// Keeps a spare engine, and ends idle ones; never ends.
@@ -249,7 +250,7 @@ impl EnginePool {
     /// # Errors
     /// [`RequestFault::NotReady`].
     pub(super) fn check_start(&self) -> Result<(), RequestFault> {
-        let reason = match *lock(&self.0.last_start) {
+        let reason = match *lock_mutex(&self.0.last_start) {
             Some(StartOutcome::Ready) => return Ok(()),
             Some(StartOutcome::Failed) => "no engine can be started",
             None => "its first engine is starting",
@@ -258,7 +259,7 @@ impl EnginePool {
     }
 
     fn record_start(&self, is_ready: bool) {
-        *lock(&self.0.last_start) = Some(if is_ready { StartOutcome::Ready } else { StartOutcome::Failed });
+        *lock_mutex(&self.0.last_start) = Some(if is_ready { StartOutcome::Ready } else { StartOutcome::Failed });
     }
 
     async fn keep_spare(&self) {
@@ -274,7 +275,7 @@ impl EnginePool {
                 }
             };
             let watch = async {
-                if let Err(reason) = spare.started().await {
+                if let Err(reason) = spare.wait_until_ready().await {
                     self.record_start(false);
                     tracing::error!(?reason, "a spare engine did not start");
                     tokio::time::sleep(START_AGAIN).await;
@@ -291,12 +292,12 @@ impl EnginePool {
     }
 
     fn spare_or_start(&self) -> std::io::Result<Arc<EngineProcess>> {
-        let spare = lock(&self.0.spare).clone().filter(|spare| !spare.has_ended());
+        let spare = lock_mutex(&self.0.spare).clone().filter(|spare| !spare.has_ended());
         if let Some(spare) = spare {
             return Ok(spare);
         }
-        let started = self.start()?;
-        *lock(&self.0.spare) = Some(started.clone());
+        let started = self.start_engine()?;
+        *lock_mutex(&self.0.spare) = Some(started.clone());
         Ok(started)
     }
 
@@ -305,43 +306,43 @@ impl EnginePool {
         loop {
             tokio::time::sleep(IDLE / 10).await;
             // One with connections stays until its place is needed.
-            for engine in self.live().into_iter().filter(|engine| !engine.has_requests()) {
+            for engine in self.list_live().into_iter().filter(|engine| !engine.has_requests()) {
                 engine.retire_after(IDLE);
             }
             // Clients may come under any number of names.
-            lock(&self.0.clients).retain(|_, client| client.is_known() || Arc::strong_count(client) > 1);
+            lock_mutex(&self.0.clients).retain(|_, client| client.is_known() || Arc::strong_count(client) > 1);
         }
     }
 
     /// Ends a client's engine, with all that it answers.
     pub(super) fn end_client(&self, name: &str) {
-        let own = lock(&self.0.clients).get(name).cloned();
-        if let Some(engine) = own.and_then(|own| lock(&own.current).clone()) {
-            engine.end(EndReason::Retired);
+        let own = lock_mutex(&self.0.clients).get(name).cloned();
+        if let Some(engine) = own.and_then(|own| lock_mutex(&own.current).clone()) {
+            engine.kill_process(EndReason::Retired);
         }
     }
 
     /// Ends all engines.
     pub(super) async fn end_all(&self) {
-        let spare = lock(&self.0.spare).take();
-        for engine in self.live().into_iter().chain(spare) {
-            engine.end(EndReason::Retired);
+        let spare = lock_mutex(&self.0.spare).take();
+        for engine in self.list_live().into_iter().chain(spare) {
+            engine.kill_process(EndReason::Retired);
             engine.wait_for_end().await;
         }
     }
 
     /// Cancels a query of an engine's process by its number there.
-    pub(super) async fn cancel(&self, pid: u32, number: u64) {
-        let engine = self.live().into_iter().find(|engine| engine.pid() == pid);
+    pub(super) async fn cancel_query(&self, pid: u32, number: u64) {
+        let engine = self.list_live().into_iter().find(|engine| engine.pid() == pid);
         if let Some(engine) = engine {
             // One that ends meanwhile runs nothing.
-            let _ = engine.send(&DoorMessage::Cancel(number)).await;
+            let _ = engine.send_message(&DoorMessage::Cancel(number)).await;
         }
     }
 
     /// Gauges of the engines.
-    pub(super) fn gauges(&self) -> PoolGauges {
-        let live = self.live();
+    pub(super) fn pool_gauges(&self) -> PoolGauges {
+        let live = self.list_live();
         PoolGauges {
             engines: live.len(),
             most_engines: self.0.settings.count,
@@ -353,27 +354,30 @@ impl EnginePool {
     }
 
     /// Space on the disks of the lake, if it is in a folder, and of temporary files.
-    pub(super) fn disks(&self) -> Vec<(&'static str, DiskSpace)> {
+    pub(super) fn disk_spaces(&self) -> Vec<(&'static str, DiskSpace)> {
         let folders = [("lake", self.0.lake.folder()), ("temp", Some(self.0.folders.spills.path()))];
         folders.into_iter().filter_map(|(name, folder)| Some((name, disk_space(folder?)?))).collect()
     }
 }
 
 impl ClientEngine {
-    fn lease(&self, client: &ClientIdentity) -> Option<EngineLease> {
-        lock(&self.current).as_ref().filter(|engine| engine.is_of(client)).and_then(EngineProcess::lease)
+    fn lease_current(&self, client: &ClientIdentity) -> Option<EngineLease> {
+        lock_mutex(&self.current)
+            .as_ref()
+            .filter(|engine| engine.is_of(client))
+            .and_then(EngineProcess::hold_for_request)
     }
 
     // An engine knows what its client may do from its start.
     fn end_outdated(&self, client: &ClientIdentity) {
-        if let Some(engine) = lock(&self.current).as_ref().filter(|engine| !engine.is_of(client)) {
-            engine.end(EndReason::Retired);
+        if let Some(engine) = lock_mutex(&self.current).as_ref().filter(|engine| !engine.is_of(client)) {
+            engine.kill_process(EndReason::Retired);
         }
     }
 
     // Whether it has an engine, or had ones that ended and are not forgotten.
     fn is_known(&self) -> bool {
-        let has_engine = lock(&self.current).as_ref().is_some_and(|engine| !engine.has_ended());
+        let has_engine = lock_mutex(&self.current).as_ref().is_some_and(|engine| !engine.has_ended());
         let last_end = self.state.try_lock().ok().and_then(|state| state.last_end);
         has_engine || last_end.is_some_and(|at| at.elapsed() < FORGIVEN)
     }
@@ -381,7 +385,7 @@ impl ClientEngine {
 
 impl ClientState {
     // Time that is left of the backoff.
-    fn backoff(&self) -> Duration {
+    fn backoff_left(&self) -> Duration {
         let whole = match self.ends {
             0 | 1 => Duration::ZERO,
             ends => LONGEST_BACKOFF.min(FIRST_BACKOFF * 2_u32.saturating_pow(ends - 2)),
@@ -392,8 +396,8 @@ impl ClientState {
 
 // The engines that have a client.
 fn live_engines(clients: &ClientEngines) -> Vec<Arc<EngineProcess>> {
-    let clients = lock(clients);
-    let engines = clients.values().filter_map(|client| lock(&client.current).clone());
+    let clients = lock_mutex(clients);
+    let engines = clients.values().filter_map(|client| lock_mutex(&client.current).clone());
     engines.filter(|engine| !engine.has_ended()).collect()
 }
 
@@ -403,7 +407,10 @@ fn end_large_engines(clients: &ClientEngines, memory: usize, uncounted: usize) -
     let sizes: Vec<_> = live_engines(clients).into_iter().map(|engine| (size(&engine), engine)).collect();
     for (bytes, engine) in &sizes {
         if let Some(limit) = engine.memory_limit().filter(|limit| bytes > limit) {
-            engine.end(EndReason::Failed(format!("its client's queries took more than {} MB", limit / 1_000_000)));
+            engine.kill_process(EndReason::Failed(format!(
+                "its client's queries took more than {} MB",
+                limit / 1_000_000
+            )));
         }
     }
     if sizes.iter().map(|(bytes, _)| bytes).sum::<usize>() > memory
@@ -412,13 +419,13 @@ fn end_large_engines(clients: &ClientEngines, memory: usize, uncounted: usize) -
         && (largest.has_queries() || !largest.retire_after(Duration::ZERO))
     {
         let reason = format!("queries took more than {} MiB, and its client's the most", memory >> 20);
-        largest.end(EndReason::Failed(reason));
+        largest.kill_process(EndReason::Failed(reason));
     }
     let is_working = |engine: &EngineProcess| engine.idle_time().is_none_or(|idle| idle < AFTERWORK);
     sizes.iter().any(|(_, engine)| engine.has_queries() || is_working(engine))
 }
 
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+fn lock_mutex<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
@@ -428,11 +435,11 @@ mod tests {
 
     #[test]
     fn waits_grow_to_a_limit_and_pass() {
-        let waits = |ends| ClientState { ends, last_end: None }.backoff();
+        let waits = |ends| ClientState { ends, last_end: None }.backoff_left();
         assert_eq!([0, 1, 2, 3].map(waits), [0, 0, 250, 500].map(Duration::from_millis));
         assert_eq!(waits(u32::MAX), LONGEST_BACKOFF);
         let ago = |secs| Instant::now().checked_sub(Duration::from_secs(secs));
-        let left = |secs| ClientState { ends: 9, last_end: ago(secs) }.backoff();
+        let left = |secs| ClientState { ends: 9, last_end: ago(secs) }.backoff_left();
         assert!(left(20) <= Duration::from_secs(10) && left(20) > Duration::from_secs(9));
         assert_eq!(left(30), Duration::ZERO, "whoever asked meanwhile");
     }

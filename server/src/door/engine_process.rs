@@ -116,7 +116,7 @@ impl EngineProcess {
     ///
     /// # Errors
     /// The system gives no folder or process.
-    pub(super) fn start(start: EngineStart<'_>, activity: Arc<ServerActivity>) -> io::Result<Arc<Self>> {
+    pub(super) fn spawn_process(start: EngineStart<'_>, activity: Arc<ServerActivity>) -> io::Result<Arc<Self>> {
         std::fs::create_dir(&start.sockets)?;
         std::fs::create_dir(&start.spills)?;
         let mut child = Command::new(&start.settings.program)
@@ -164,7 +164,7 @@ impl EngineProcess {
             ended: SetOnce::new(),
             flight: tokio::sync::Mutex::default(),
         });
-        tokio::spawn(supervise(engine.clone(), child, stdout, start.spills, activity));
+        tokio::spawn(supervise_engine(engine.clone(), child, stdout, start.spills, activity));
         Ok(engine)
     }
 
@@ -172,7 +172,7 @@ impl EngineProcess {
     ///
     /// # Errors
     /// It ended before that.
-    pub(super) async fn started(&self) -> Result<(), EndReason> {
+    pub(super) async fn wait_until_ready(&self) -> Result<(), EndReason> {
         tokio::select! {
             _ = self.ready.wait() => Ok(()),
             reason = self.ended.wait() => Err(reason.clone()),
@@ -183,15 +183,15 @@ impl EngineProcess {
     ///
     /// # Errors
     /// It ended before that.
-    pub(super) async fn assign(&self, client: &ClientIdentity) -> Result<(), EndReason> {
+    pub(super) async fn assign_client(&self, client: &ClientIdentity) -> Result<(), EndReason> {
         let failed = |e: io::Error| EndReason::Failed(format!("it could not be told whose it is: {e}"));
-        self.started().await?;
+        self.wait_until_ready().await?;
         let _ = self.base_bytes.set(private_bytes(self.pid).unwrap_or(0));
         if let Some(limit) = client.memory_bytes {
             let _ = self.memory_limit.set(limit);
         }
         let _ = self.client.set(client.clone());
-        self.send(&DoorMessage::Client(client.clone())).await.map_err(failed)
+        self.send_message(&DoorMessage::Client(client.clone())).await.map_err(failed)
     }
 
     /// Returns whether it is the engine of a client who may do just this.
@@ -203,7 +203,7 @@ impl EngineProcess {
     ///
     /// # Errors
     /// It has ended.
-    pub(super) async fn send(&self, message: &DoorMessage) -> io::Result<()> {
+    pub(super) async fn send_message(&self, message: &DoorMessage) -> io::Result<()> {
         let mut line = serde_json::to_vec(message)?;
         line.push(b'\n');
         self.stdin.lock().await.write_all(&line).await
@@ -218,13 +218,13 @@ impl EngineProcess {
     ///
     /// # Errors
     /// The engine is not there any more.
-    pub(super) async fn connect(&self, socket: EngineSocket) -> io::Result<UnixStream> {
-        UnixStream::connect(socket.path(&self.folder)).await
+    pub(super) async fn connect_socket(&self, socket: EngineSocket) -> io::Result<UnixStream> {
+        UnixStream::connect(socket.path_in(&self.folder)).await
     }
 
     /// Holds it for one request; None if it is ending.
-    pub(super) fn lease(self: &Arc<Self>) -> Option<EngineLease> {
-        let mut usage = self.usage();
+    pub(super) fn hold_for_request(self: &Arc<Self>) -> Option<EngineLease> {
+        let mut usage = self.lock_usage();
         if usage.is_ending || self.has_ended() {
             return None;
         }
@@ -236,8 +236,8 @@ impl EngineProcess {
     }
 
     /// Kills it; the first reason counts.
-    pub(super) fn end(&self, why: EndReason) {
-        self.usage().is_ending = true;
+    pub(super) fn kill_process(&self, why: EndReason) {
+        self.lock_usage().is_ending = true;
         let _ = self.why_killed.set(why);
         // One that is gone already needs no kill.
         let _ = pidfd_send_signal(&self.process, Signal::KILL);
@@ -245,13 +245,13 @@ impl EngineProcess {
 
     /// Kills it if nobody has waited for it for longer than `time`.
     pub(super) fn retire_after(&self, time: Duration) -> bool {
-        let mut usage = self.usage();
+        let mut usage = self.lock_usage();
         if usage.idle_time().is_none_or(|idle| idle < time) {
             return false;
         }
         usage.is_ending = true;
         drop(usage);
-        self.end(EndReason::Retired);
+        self.kill_process(EndReason::Retired);
         true
     }
 
@@ -260,7 +260,7 @@ impl EngineProcess {
         self.ended.get().is_some()
     }
 
-    fn usage(&self) -> MutexGuard<'_, EngineUsage> {
+    fn lock_usage(&self) -> MutexGuard<'_, EngineUsage> {
         self.usage.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -281,7 +281,7 @@ impl EngineProcess {
 
     /// Returns whether requests are open, such as connections of Postgres' protocol.
     pub(super) fn has_requests(&self) -> bool {
-        !self.usage().requests.is_empty()
+        !self.lock_usage().requests.is_empty()
     }
 
     /// Returns whether queries run, or wait for their rows to be fetched.
@@ -291,7 +291,7 @@ impl EngineProcess {
 
     /// Time for which no client has waited for it; None if one does, or was silent for a moment only.
     pub(super) fn idle_time(&self) -> Option<Duration> {
-        self.usage().idle_time()
+        self.lock_usage().idle_time()
     }
 
     /// Bytes that its client's queries may occupy; None if they have no limit of their own.
@@ -327,20 +327,20 @@ impl EngineLease {
 
     /// Records whether the engine waits, from now on, for the client to ask or to read; else the client waits for it.
     pub(super) fn set_waiting(&self, is_waiting: bool) {
-        self.engine.usage().requests.insert(self.number, is_waiting.then(Instant::now));
+        self.engine.lock_usage().requests.insert(self.number, is_waiting.then(Instant::now));
     }
 }
 
 impl Drop for EngineLease {
     fn drop(&mut self) {
-        let mut usage = self.engine.usage();
+        let mut usage = self.engine.lock_usage();
         usage.requests.remove(&self.number);
         usage.last_used = Instant::now();
     }
 }
 
 // Reads what the engine reports until it ends, and says then how.
-async fn supervise(
+async fn supervise_engine(
     engine: Arc<EngineProcess>,
     mut child: Child,
     stdout: ChildStdout,
@@ -350,12 +350,12 @@ async fn supervise(
     let mut reports = EngineReports { activity, protocols: HashMap::new(), why: None };
     let mut lines = BufReader::new(stdout).lines();
     while let Ok(Some(line)) = lines.next_line().await {
-        reports.take(&line, &engine);
+        reports.take_report(&line, &engine);
     }
     // Its output has ended, so that it is ending, too, or was never meant to.
     let _ = child.start_kill();
     let status = child.wait().await;
-    reports.activity.metrics.lose(reports.activity.queries.end_engine(engine.pid));
+    reports.activity.metrics.count_lost(reports.activity.queries.end_engine(engine.pid));
     let found =
         || reports.why.clone().unwrap_or_else(|| status.map_or_else(|e| e.to_string(), |s| format!("it ended by {s}")));
     let why = engine.why_killed.get().cloned().unwrap_or_else(|| EndReason::Failed(found()));
@@ -374,34 +374,34 @@ struct EngineReports {
 }
 
 impl EngineReports {
-    fn take(&mut self, line: &str, engine: &Arc<EngineProcess>) {
+    fn take_report(&mut self, line: &str, engine: &Arc<EngineProcess>) {
         let activity = &self.activity;
         match serde_json::from_str(line) {
             Ok(EngineReport::Ready) => drop(engine.ready.set(())),
             Ok(EngineReport::Ending(why)) => self.why = Some(why),
             Ok(EngineReport::Started(start)) => {
-                activity.metrics.begin(start.protocol);
+                activity.metrics.count_begin(start.protocol);
                 self.protocols.insert(start.number, start.protocol);
                 engine.queries.store(self.protocols.len(), Ordering::Relaxed);
                 let client = engine.client.get().map_or("", |client| client.name.as_str());
-                activity.queries.begin(client, engine.pid, start);
+                activity.queries.log_begin(client, engine.pid, start);
             }
             Ok(EngineReport::Ended(end)) => {
                 if let Some(protocol) = self.protocols.remove(&end.number) {
                     engine.queries.store(self.protocols.len(), Ordering::Relaxed);
-                    activity.metrics.end(protocol, &end);
-                    activity.queries.end(engine.pid, &end);
+                    activity.metrics.count_end(protocol, &end);
+                    activity.queries.log_end(engine.pid, &end);
                 }
             }
-            Ok(EngineReport::Failure(code)) => activity.metrics.failed(code),
+            Ok(EngineReport::Failure(code)) => activity.metrics.count_failure(code),
             Ok(EngineReport::Lake(figures)) => activity.set_lake(figures),
-            Ok(EngineReport::Cache(counts)) => activity.metrics.cached(&counts),
+            Ok(EngineReport::Cache(counts)) => activity.metrics.count_cached(&counts),
             Ok(EngineReport::Ask { number, table }) => {
                 let Some(client) = engine.client.get() else { return };
-                let message = DoorMessage::Rows { number, rows: activity.rows(table, client) };
+                let message = DoorMessage::Rows { number, rows: activity.visible_rows(table, client) };
                 let engine = engine.clone();
                 // Beside this: an engine that does not read must not keep its reports from being read.
-                tokio::spawn(async move { drop(engine.send(&message).await) });
+                tokio::spawn(async move { drop(engine.send_message(&message).await) });
             }
             Err(_) => tracing::warn!(line, "an engine wrote what is no report"),
         }

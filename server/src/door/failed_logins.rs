@@ -36,7 +36,7 @@ impl FailedLogins {
     ///
     /// # Errors
     /// [`RequestFault::FailedLogins`].
-    pub(super) fn check(&self, peer: SocketAddr) -> Result<(), RequestFault> {
+    pub(super) fn check_address(&self, peer: SocketAddr) -> Result<(), RequestFault> {
         let Some(address) = self.counted_address(peer) else { return Ok(()) };
         let windows = self.windows.lock().unwrap_or_else(PoisonError::into_inner);
         let window = windows.get(&address).filter(|window| window.failures >= MOST_FAILURES);
@@ -47,7 +47,7 @@ impl FailedLogins {
     }
 
     /// Counts a failure.
-    pub(super) fn count(&self, peer: SocketAddr) {
+    pub(super) fn count_failure(&self, peer: SocketAddr) {
         let Some(address) = self.counted_address(peer) else { return };
         let mut windows = self.windows.lock().unwrap_or_else(PoisonError::into_inner);
         if windows.len() >= MOST_ADDRESSES && !windows.contains_key(&address) {
@@ -84,7 +84,7 @@ mod tests {
 
     fn fail(logins: &FailedLogins, text: &str, times: u32) {
         for _ in 0..times {
-            logins.count(address(text));
+            logins.count_failure(address(text));
         }
     }
 
@@ -92,15 +92,15 @@ mod tests {
     fn an_address_is_refused_after_too_many_failures_and_no_other_is() {
         let logins = FailedLogins::new(true);
         fail(&logins, "192.0.2.1", MOST_FAILURES - 1);
-        assert!(logins.check(address("192.0.2.1")).is_ok());
+        assert!(logins.check_address(address("192.0.2.1")).is_ok());
         fail(&logins, "::ffff:192.0.2.1", 1);
         assert!(
-            matches!(logins.check(address("192.0.2.1")), Err(RequestFault::FailedLogins { wait }) if wait <= WINDOW)
+            matches!(logins.check_address(address("192.0.2.1")), Err(RequestFault::FailedLogins { wait }) if wait <= WINDOW)
         );
-        assert!(logins.check(address("192.0.2.2")).is_ok());
+        assert!(logins.check_address(address("192.0.2.2")).is_ok());
         fail(&logins, "2001:db8::1", MOST_FAILURES);
-        assert!(logins.check(address("2001:db8::ffff:2")).is_err(), "of the same network");
-        assert!(logins.check(address("2001:db8:0:1::1")).is_ok());
+        assert!(logins.check_address(address("2001:db8::ffff:2")).is_err(), "of the same network");
+        assert!(logins.check_address(address("2001:db8:0:1::1")).is_ok());
     }
 
     #[test]
@@ -109,9 +109,9 @@ mod tests {
         let begun = Instant::now().checked_sub(WINDOW).expect("a system that runs for a minute");
         let old = FailureWindow { begun, failures: MOST_FAILURES };
         logins.windows.lock().expect("no panic").insert(address("192.0.2.1").ip(), old);
-        assert!(logins.check(address("192.0.2.1")).is_ok());
+        assert!(logins.check_address(address("192.0.2.1")).is_ok());
         fail(&logins, "192.0.2.1", 1);
-        assert!(logins.check(address("192.0.2.1")).is_ok(), "it counts anew");
+        assert!(logins.check_address(address("192.0.2.1")).is_ok(), "it counts anew");
     }
 
     #[test]
@@ -119,14 +119,16 @@ mod tests {
         let (open, proxied) = (FailedLogins::new(true), FailedLogins::new(false));
         fail(&open, "127.0.0.1", 2 * MOST_FAILURES);
         fail(&proxied, "192.0.2.1", 2 * MOST_FAILURES);
-        assert!(open.check(address("127.0.0.1")).is_ok() && proxied.check(address("192.0.2.1")).is_ok());
+        assert!(
+            open.check_address(address("127.0.0.1")).is_ok() && proxied.check_address(address("192.0.2.1")).is_ok()
+        );
     }
 
     #[test]
     fn addresses_are_bounded() {
         let logins = FailedLogins::new(true);
         for number in 0..MOST_ADDRESSES as u32 + 9 {
-            logins.count(SocketAddr::new(IpAddr::V4((0x0a00_0000 + number).into()), 1));
+            logins.count_failure(SocketAddr::new(IpAddr::V4((0x0a00_0000 + number).into()), 1));
         }
         assert_eq!(logins.windows.lock().expect("no panic").len(), MOST_ADDRESSES);
     }

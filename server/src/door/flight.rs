@@ -17,7 +17,7 @@ use tracing::Instrument as _;
 use super::connection_places::{ConnectionPlaces, PlaceWork, PlacedStream};
 use super::encryption::ProtocolEncryption;
 use super::forward::EngineProtocol;
-use super::http_connection::{drive, http2_builder};
+use super::http_connection::{drive_connection, http2_builder};
 use crate::door::server_door::ServerDoor;
 
 /// Connections at once. With those of the other protocols they are within the 1024 files that systems often allow.
@@ -26,15 +26,16 @@ const MOST: usize = 128;
 const INTERACTIVE: [&str; 3] = ["DoPut", "DoExchange", "Handshake"];
 
 /// Answers connections; never ends.
-pub(super) async fn serve(door: ServerDoor, listener: TcpListener, encryption: ProtocolEncryption) {
-    let places = ConnectionPlaces::new(listener, MOST).listed(&door.activity().connections, ServerProtocol::FlightSql);
-    places.attend(|stream| answer(stream, encryption.clone(), door.clone())).await;
+pub(super) async fn serve_flight_clients(door: ServerDoor, listener: TcpListener, encryption: ProtocolEncryption) {
+    let places =
+        ConnectionPlaces::new(listener, MOST).listed_among(&door.activity().connections, ServerProtocol::FlightSql);
+    places.attend_connections(|stream| answer_flight_connection(stream, encryption.clone(), door.clone())).await;
 }
 
-async fn answer(stream: PlacedStream, encryption: ProtocolEncryption, door: ServerDoor) {
-    let evicted = stream.evicted();
-    let work = stream.work();
-    let Some(stream) = encryption.accept(stream).await else { return };
+async fn answer_flight_connection(stream: PlacedStream, encryption: ProtocolEncryption, door: ServerDoor) {
+    let evicted = stream.wait_for_eviction();
+    let work = stream.work_handle();
+    let Some(stream) = encryption.shake_hands(stream).await else { return };
     let (drain, place) = (door.drain().clone(), work.clone());
     let service = service_fn(move |mut request: Request<Incoming>| {
         work.hear_request();
@@ -43,7 +44,7 @@ async fn answer(stream: PlacedStream, encryption: ProtocolEncryption, door: Serv
         let answer = async move {
             let mut response = door.answer_flight(request, &work).await.unwrap_or_else(|fault| {
                 door.metrics().record_failure(&fault);
-                status(&fault).into_http()
+                grpc_status(&fault).into_http()
             });
             response.headers_mut().insert(REQUEST_ID, id);
             Ok::<_, Infallible>(response)
@@ -52,7 +53,7 @@ async fn answer(stream: PlacedStream, encryption: ProtocolEncryption, door: Serv
     });
     let mut builder = http2_builder();
     let connection = builder.initial_stream_window_size(WINDOW_BYTES).serve_connection(TokioIo::new(stream), service);
-    drive(connection, |connection| connection.graceful_shutdown(), evicted, &drain, &place).await;
+    drive_connection(connection, |connection| connection.graceful_shutdown(), evicted, &drain, &place).await;
 }
 
 impl ServerDoor {
@@ -65,15 +66,15 @@ impl ServerDoor {
             return Err(RequestFault::Draining);
         }
         let token = request.headers().get(header::AUTHORIZATION).and_then(|v| v.to_str().ok()).and_then(of_header);
-        self.failed_logins().check(work.peer())?;
-        let found = self.access().client(token.as_deref(), ClientIdentity::programs);
+        self.failed_logins().check_address(work.peer())?;
+        let found = self.access().client_of_token(token.as_deref(), ClientIdentity::local_programs);
         if let (Some(_), Err(RequestFault::Unauthenticated)) = (&token, &found) {
-            self.failed_logins().count(work.peer());
+            self.failed_logins().count_failure(work.peer());
         }
         let client = self.note_client(work, ServerProtocol::FlightSql, found)?;
         let is_interactive = INTERACTIVE.iter().any(|method| request.uri().path().ends_with(method));
         let wire = if is_interactive { EngineProtocol::InteractiveGrpc } else { EngineProtocol::Grpc };
-        let response = self.engines().forward(&client, request.map(Body::new), wire, Some(work)).await?;
+        let response = self.engines().forward_request(&client, request.map(Body::new), wire, Some(work)).await?;
         Ok(response.map(Body::new))
     }
 }

@@ -67,7 +67,7 @@ impl EnginePool {
     ///
     /// # Errors
     /// [`RequestFault::EngineEnded`], [`RequestFault::TooMany`], [`RequestFault::TooLarge`], [`RequestFault::Request`].
-    pub(super) async fn forward(
+    pub(super) async fn forward_request(
         &self,
         client: &ClientIdentity,
         request: Request<Body>,
@@ -80,33 +80,35 @@ impl EnginePool {
             parts.headers.remove(name);
         }
         let mut body = match wire {
-            EngineProtocol::InteractiveGrpc => RequestBody::stream(Bytes::new(), BodyReader::new(body, 1), usize::MAX),
+            EngineProtocol::InteractiveGrpc => {
+                RequestBody::from_reader(Bytes::new(), BodyReader::new(body, 1), usize::MAX)
+            }
             EngineProtocol::Http => read_body(body, &parts.headers, LARGEST_HTTP).await?,
             EngineProtocol::Grpc => read_body(body, &parts.headers, LARGEST_GRPC).await?,
         };
-        let working = work.map(PlaceWork::begin);
+        let working = work.map(PlaceWork::begin_work);
         let mut ended = None;
         loop {
-            let lease = match self.lease(client).await {
+            let lease = match self.lease_for(client).await {
                 // The cause is what ended the first engine.
                 Err(RequestFault::Backoff { ends, wait }) => {
                     return Err(ended.unwrap_or(RequestFault::Backoff { ends, wait }));
                 }
                 leased => leased?,
             };
-            let (sent, fault, again) = body.send();
-            let answer = EngineAnswer::fetch(lease.engine(), request_of(&parts, sent), wire).await;
+            let (sent, fault, again) = body.into_parts();
+            let answer = EngineAnswer::fetch_from(lease.engine(), request_of(&parts, sent), wire).await;
             match (answer, again) {
-                (Ok(answer), _) => return Ok(answer.with(lease, working)),
+                (Ok(answer), _) => return Ok(answer.into_engine_response(lease, working)),
                 (Err(failed), Some(again)) => {
                     body = again;
-                    ended = Some(why(&lease, &failed).await);
+                    ended = Some(find_engine_fault(&lease, &failed).await);
                 }
                 (Err(failed), None) => {
                     let fault = fault.lock().unwrap_or_else(PoisonError::into_inner).take();
                     return Err(match fault {
                         Some(fault) => fault,
-                        None => why(&lease, &failed).await,
+                        None => find_engine_fault(&lease, &failed).await,
                     });
                 }
             }
@@ -117,7 +119,7 @@ impl EnginePool {
 impl RequestBody {
     // The rest of a body, after `read`, in pieces. It fails if it is too long or takes too long: one that just ended
     // would look whole.
-    fn stream(read: Bytes, rest: BodyReader, most: usize) -> Self {
+    fn from_reader(read: Bytes, rest: BodyReader, most: usize) -> Self {
         let fault = BodyFault::default();
         let found = fault.clone();
         let stream = stream::try_unfold((read, rest, most), move |(read, mut rest, left)| {
@@ -141,7 +143,7 @@ impl RequestBody {
     }
 
     // Returns the body to send, its fault, and a copy for a retry.
-    fn send(self) -> (Body, BodyFault, Option<Self>) {
+    fn into_parts(self) -> (Body, BodyFault, Option<Self>) {
         match self {
             Self::Whole(bytes) => {
                 let again = Self::Streamed(Body::from(bytes.clone()), BodyFault::default());
@@ -160,7 +162,7 @@ fn request_of(parts: &Parts, body: Body) -> Request<Body> {
     request
 }
 
-async fn why(lease: &EngineLease, failed: &str) -> RequestFault {
+async fn find_engine_fault(lease: &EngineLease, failed: &str) -> RequestFault {
     match lease.engine().why_ended().await {
         Some(EndReason::Failed(reason)) => RequestFault::EngineEnded { reason },
         Some(EndReason::Retired) => RequestFault::EngineEnded { reason: "the server needed its place".to_owned() },
@@ -181,7 +183,7 @@ async fn read_body(body: Body, headers: &HeaderMap, limit: usize) -> Result<Requ
     let read = rest.next_piece().await?;
     match rest.is_ended {
         true => Ok(RequestBody::Whole(read)),
-        false => Ok(RequestBody::stream(read, rest, limit)),
+        false => Ok(RequestBody::from_reader(read, rest, limit)),
     }
 }
 
@@ -205,15 +207,15 @@ impl BodyReader {
     // Empty at the end.
     async fn next_piece(&mut self) -> Result<Bytes, RequestFault> {
         let mut piece = BytesMut::new();
-        let filled = tokio::time::timeout_at(self.end, self.fill(&mut piece)).await;
-        filled.map_err(|_| RequestFault::request(format!("the body took longer than {BODY_LIMIT:?}")))??;
+        let filled = tokio::time::timeout_at(self.end, self.fill_piece(&mut piece)).await;
+        filled.map_err(|_| RequestFault::bad_request(format!("the body took longer than {BODY_LIMIT:?}")))??;
         Ok(piece.freeze())
     }
 
-    async fn fill(&mut self, piece: &mut BytesMut) -> Result<(), RequestFault> {
+    async fn fill_piece(&mut self, piece: &mut BytesMut) -> Result<(), RequestFault> {
         while !self.is_ended && piece.len() < self.piece_bytes {
             let part = self.parts.try_next().await;
-            match part.map_err(|_| RequestFault::request("the request's body did not come whole"))? {
+            match part.map_err(|_| RequestFault::bad_request("the request's body did not come whole"))? {
                 Some(part) => {
                     self.part_count += 1;
                     self.bytes += part.len();
@@ -222,7 +224,7 @@ impl BodyReader {
                 None => self.is_ended = true,
             }
             if self.part_count > FREE_PARTS && self.bytes < self.part_count * LEAST_PART_BYTES {
-                return Err(RequestFault::request(format!(
+                return Err(RequestFault::bad_request(format!(
                     "the body comes in parts of less than {LEAST_PART_BYTES} bytes"
                 )));
             }
@@ -238,11 +240,11 @@ struct EngineAnswer {
 }
 
 impl EngineAnswer {
-    async fn fetch(engine: &EngineProcess, request: Request<Body>, wire: EngineProtocol) -> Result<Self, String> {
+    async fn fetch_from(engine: &EngineProcess, request: Request<Body>, wire: EngineProtocol) -> Result<Self, String> {
         let mut connection = JoinSet::new();
         let response = match wire {
             EngineProtocol::Http => {
-                let stream = engine.connect(EngineSocket::Http).await.map_err(|e| e.to_string())?;
+                let stream = engine.connect_socket(EngineSocket::Http).await.map_err(|e| e.to_string())?;
                 let (mut sender, driver) = http1::handshake(TokioIo::new(stream)).await.map_err(|e| e.to_string())?;
                 connection.spawn(async move { drop(driver.await) });
                 sender.send_request(request).await
@@ -255,7 +257,7 @@ impl EngineAnswer {
         Ok(Self { response, connection, wire })
     }
 
-    fn with(self, lease: EngineLease, working: Option<WorkingPlace>) -> Response<EngineBody> {
+    fn into_engine_response(self, lease: EngineLease, working: Option<WorkingPlace>) -> Response<EngineBody> {
         let Self { response, connection, wire } = self;
         lease.set_waiting(true);
         response.map(|incoming| {
@@ -280,7 +282,7 @@ impl EngineProcess {
         if let Some(sender) = shared.as_ref().filter(|sender| !sender.is_closed()) {
             return Ok(sender.clone());
         }
-        let stream = self.connect(EngineSocket::FlightSql).await.map_err(|e| e.to_string())?;
+        let stream = self.connect_socket(EngineSocket::FlightSql).await.map_err(|e| e.to_string())?;
         let handshake = http2::Builder::new(TokioExecutor::new())
             .initial_stream_window_size(WINDOW_BYTES)
             // Requests are held back each by its own window, never by another's.
@@ -311,7 +313,7 @@ pub(super) struct EngineBody {
 impl EngineBody {
     // gRPC reports a failure in trailers behind the answer, so that the client sees it; HTTP/1.1 breaks the connection
     // off.
-    fn failure(&self) -> Option<Frame<Bytes>> {
+    fn failure_frame(&self) -> Option<Frame<Bytes>> {
         let reason = match self.lease.engine().end_reason() {
             Some(EndReason::Failed(reason)) => reason.clone(),
             Some(EndReason::Retired) => "the server needed its place, and nobody read its answer".to_owned(),
@@ -322,7 +324,7 @@ impl EngineBody {
             return None;
         }
         let mut trailers = HeaderMap::new();
-        echolake_flight::status(&RequestFault::EngineEnded { reason }).add_header(&mut trailers).ok()?;
+        echolake_flight::grpc_status(&RequestFault::EngineEnded { reason }).add_header(&mut trailers).ok()?;
         Some(Frame::trailers(trailers))
     }
 }
@@ -343,7 +345,7 @@ impl hyper::body::Body for EngineBody {
         match polled {
             Poll::Ready(Some(Err(failed))) => {
                 self.is_ended = true;
-                Poll::Ready(Some(self.failure().ok_or(failed)))
+                Poll::Ready(Some(self.failure_frame().ok_or(failed)))
             }
             other => other,
         }

@@ -25,30 +25,30 @@ pub(super) fn http2_builder() -> http2::Builder<TokioExecutor> {
 }
 
 /// Answers a connection to its end: that of its client, an eviction, or the server's.
-pub(super) async fn drive<C: Future>(
+pub(super) async fn drive_connection<C: Future>(
     connection: C,
     shut_down: impl FnOnce(Pin<&mut C>),
     evicted: impl Future<Output = ()>,
     drain: &ServerDrain,
     place: &PlaceWork,
 ) {
-    let awaited = drain.enter();
+    let awaited = drain.count_connection();
     let mut connection = pin!(connection);
     // A connection that breaks off is its client's matter.
     tokio::select! {
         _ = connection.as_mut() => return,
         () = evicted => return,
         // One that comes later may ask, and is told that nothing is taken.
-        () = drain.begun(), if awaited.is_some() => shut_down(connection.as_mut()),
+        () = drain.wait_until_begun(), if awaited.is_some() => shut_down(connection.as_mut()),
     }
     tokio::select! {
         _ = connection => {}
-        () = place.quiet() => {}
+        () = place.wait_until_quiet() => {}
     }
 }
 
 /// Gives a request of HTTP/2 the form of HTTP/1.1, which routes, guards and engines read: its authority becomes its Host.
-pub(super) fn restate<B>(request: &mut Request<B>) {
+pub(super) fn restate_as_http1<B>(request: &mut Request<B>) {
     if request.version() != Version::HTTP_2 {
         return;
     }
@@ -71,7 +71,7 @@ mod tests {
         let request = |version, uri: &str| {
             let request = Request::builder().version(version).uri(uri).header("host", "other");
             let mut request = request.body(()).expect("a request");
-            restate(&mut request);
+            restate_as_http1(&mut request);
             (request.uri().to_string(), request.headers()["host"].to_str().expect("a text").to_owned())
         };
         let expected = ("/a?b=c".to_owned(), "lab:8080".to_owned());

@@ -103,16 +103,16 @@ impl LakeServer {
         Ok(Self {
             encryption: settings.certificate.map(ServerEncryption::new).transpose()?,
             door: ServerDoor::new(lake, access, settings.is_behind_proxy, settings.engines)?,
-            http: listen(settings.http)?,
-            flight_sql: listen(settings.flight_sql)?,
+            http: optional_listener(settings.http)?,
+            flight_sql: optional_listener(settings.flight_sql)?,
             #[cfg(feature = "postgres")]
-            postgres: listen(settings.postgres)?,
+            postgres: optional_listener(settings.postgres)?,
             drain_limit: settings.drain,
         })
     }
 
     /// Returns the listening addresses, as URLs.
-    pub fn addresses(&self) -> Vec<String> {
+    pub fn listening_urls(&self) -> Vec<String> {
         let is_encrypted = self.encryption.is_some();
         let url = |schemes: [&str; 2], listener: &Option<TcpListener>, path: &str| {
             let address = listener.as_ref()?.local_addr().ok()?;
@@ -133,7 +133,7 @@ impl LakeServer {
     ///
     /// # Errors
     /// [`Error::System`].
-    pub async fn run(self, stop: impl Future<Output = ()>) -> Result<(), Error> {
+    pub async fn serve_until(self, stop: impl Future<Output = ()>) -> Result<(), Error> {
         let mut tasks = JoinSet::new();
         let mut upkeep = JoinSet::new();
         upkeep.spawn(self.door.engines().clone().keep_up());
@@ -151,38 +151,38 @@ impl LakeServer {
             upkeep.spawn(encryption.keep_up());
         }
         if let Some(listener) = self.http {
-            tasks.spawn(http::serve(self.door.clone(), listener, http_tls));
+            tasks.spawn(http::serve_http_clients(self.door.clone(), listener, http_tls));
         }
         if let Some(listener) = self.flight_sql {
-            tasks.spawn(flight::serve(self.door.clone(), listener, flight_tls));
+            tasks.spawn(flight::serve_flight_clients(self.door.clone(), listener, flight_tls));
         }
         #[cfg(feature = "postgres")]
         if let Some(listener) = self.postgres {
-            tasks.spawn(postgres::serve(self.door.clone(), listener, postgres_tls));
+            tasks.spawn(postgres::serve_postgres_clients(self.door.clone(), listener, postgres_tls));
         }
         tokio::select! {
             () = stop => {}
             Some(Err(failed)) = tasks.join_next() => return Err(Error::System(std::io::Error::other(failed))),
         }
         let drain = self.door.drain();
-        drain.begin();
+        drain.begin_drain();
         // Connections that come now are told so, until the others have their answers.
-        if tokio::time::timeout(self.drain_limit, drain.emptied()).await.is_err() {
-            tracing::warn!(connections = drain.open(), "answers that took too long are broken off");
+        if tokio::time::timeout(self.drain_limit, drain.wait_until_empty()).await.is_err() {
+            tracing::warn!(connections = drain.open_connections(), "answers that took too long are broken off");
         }
         self.door.engines().end_all().await;
         Ok(())
     }
 }
 
-fn listen(address: Option<SocketAddr>) -> Result<Option<TcpListener>, Error> {
+fn optional_listener(address: Option<SocketAddr>) -> Result<Option<TcpListener>, Error> {
     match address {
         None => Ok(None),
-        Some(address) => bind(address).map(Some).map_err(|source| Error::Bind { address, source }),
+        Some(address) => bind_listener(address).map(Some).map_err(|source| Error::Bind { address, source }),
     }
 }
 
-fn bind(address: SocketAddr) -> std::io::Result<TcpListener> {
+fn bind_listener(address: SocketAddr) -> std::io::Result<TcpListener> {
     let socket = if address.is_ipv4() { TcpSocket::new_v4() } else { TcpSocket::new_v6() }?;
     socket.set_reuseaddr(true)?;
     // Connections have what their listener has.

@@ -32,8 +32,8 @@ pub(crate) struct RunningPlace {
 
 impl QueryLog {
     /// Takes note of a query that begins in an engine.
-    pub(crate) fn begin(&self, client: &str, engine: u32, start: QueryStart) {
-        let mut queries = self.lock();
+    pub(crate) fn log_begin(&self, client: &str, engine: u32, start: QueryStart) {
+        let mut queries = self.lock_queries();
         let query = LoggedQuery {
             id: random_id(),
             client: client.to_owned(),
@@ -52,8 +52,8 @@ impl QueryLog {
     }
 
     /// Takes note of the end of a query.
-    pub(crate) fn end(&self, engine: u32, end: &QueryEnd) {
-        let mut queries = self.lock();
+    pub(crate) fn log_end(&self, engine: u32, end: &QueryEnd) {
+        let mut queries = self.lock_queries();
         let Some(mut query) = queries.running.remove(&(engine, end.number)) else { return };
         query.outcome = end.failure.map_or("answered", FaultCode::name).to_owned();
         query.plan_seconds = end.plan_seconds;
@@ -61,24 +61,24 @@ impl QueryLog {
         query.seconds = Some(end.seconds);
         (query.rows, query.bytes) = (Some(end.rows), Some(end.bytes));
         query.memory_bytes = Some(end.memory);
-        queries.remember(query);
+        queries.remember_query(query);
     }
 
     /// Takes note of the end of an engine, and of all that it ran; returns how many queries these were.
     pub(crate) fn end_engine(&self, engine: u32) -> usize {
-        let mut queries = self.lock();
+        let mut queries = self.lock_queries();
         let lost: Vec<_> = queries.running.extract_if(|(of, _), _| *of == engine).map(|(_, query)| query).collect();
         let count = lost.len();
         for mut query in lost {
             query.outcome = FaultCode::EngineEnded.name().to_owned();
-            queries.remember(query);
+            queries.remember_query(query);
         }
         count
     }
 
     /// Finds a query that runs.
-    pub(crate) fn find(&self, id: u64) -> Option<RunningPlace> {
-        let queries = self.lock();
+    pub(crate) fn find_running(&self, id: u64) -> Option<RunningPlace> {
+        let queries = self.lock_queries();
         let mut running = queries.running.iter().filter(|(_, query)| query.id == id);
         running.next().map(|((engine, number), query)| RunningPlace {
             client: query.client.clone(),
@@ -88,8 +88,8 @@ impl QueryLog {
     }
 
     /// The queries of a client, the latest first. With `all`, those of the others too, without their texts.
-    pub(crate) fn rows(&self, client: &str, all: bool) -> Vec<LoggedQuery> {
-        let queries = self.lock();
+    pub(crate) fn query_rows(&self, client: &str, all: bool) -> Vec<LoggedQuery> {
+        let queries = self.lock_queries();
         let known = queries.running.values().chain(&queries.ended);
         let mut rows: Vec<_> = known.filter(|query| all || query.client == client).cloned().collect();
         rows.iter_mut().filter(|query| query.client != client).for_each(|query| query.statement = None);
@@ -97,13 +97,13 @@ impl QueryLog {
         rows
     }
 
-    fn lock(&self) -> MutexGuard<'_, LoggedQueries> {
+    fn lock_queries(&self) -> MutexGuard<'_, LoggedQueries> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
 impl LoggedQueries {
-    fn remember(&mut self, query: LoggedQuery) {
+    fn remember_query(&mut self, query: LoggedQuery) {
         if self.ended.len() >= REMEMBERED {
             self.ended.pop_front();
         }
@@ -118,8 +118,8 @@ mod tests {
 
     fn begin(log: &QueryLog, client: &str, engine: u32, number: u64) {
         let statement = format!("select {number}");
-        let started = log.rows(client, true).len() as i64;
-        log.begin(client, engine, QueryStart { number, protocol: ServerProtocol::Http, statement, started });
+        let started = log.query_rows(client, true).len() as i64;
+        log.log_begin(client, engine, QueryStart { number, protocol: ServerProtocol::Http, statement, started });
     }
 
     fn end(number: u64, failure: Option<FaultCode>) -> QueryEnd {
@@ -132,13 +132,13 @@ mod tests {
         let log = QueryLog::default();
         begin(&log, "ann", 7, 0);
         begin(&log, "bob", 8, 0);
-        let ann = log.rows("ann", false);
+        let ann = log.query_rows("ann", false);
         assert_eq!((ann.len(), ann[0].statement.as_deref()), (1, Some("select 0")));
-        let all = log.rows("ann", true);
+        let all = log.query_rows("ann", true);
         let told: Vec<_> = all.iter().map(|q| (q.client.as_str(), q.statement.is_some())).collect();
         assert_eq!(told, [("bob", false), ("ann", true)], "texts are their client's alone");
         let bobs = RunningPlace { client: "bob".to_owned(), engine: 8, number: 0 };
-        assert_eq!(log.find(all[0].id), Some(bobs));
+        assert_eq!(log.find_running(all[0].id), Some(bobs));
     }
 
     #[test]
@@ -147,14 +147,14 @@ mod tests {
         begin(&log, "ann", 7, 0);
         begin(&log, "ann", 7, 1);
         begin(&log, "ann", 7, 2);
-        log.end(7, &end(0, None));
-        log.end(7, &end(1, Some(FaultCode::TimeLimit)));
-        log.end(9, &end(2, None));
+        log.log_end(7, &end(0, None));
+        log.log_end(7, &end(1, Some(FaultCode::TimeLimit)));
+        log.log_end(9, &end(2, None));
         assert_eq!(log.end_engine(7), 1);
-        let rows = log.rows("ann", false);
+        let rows = log.query_rows("ann", false);
         let outcomes: Vec<_> = rows.iter().map(|query| query.outcome.as_str()).collect();
         assert_eq!(outcomes, ["query_ended_engine", "time_limit", "answered"]);
-        assert_eq!(log.find(rows[0].id), None);
+        assert_eq!(log.find_running(rows[0].id), None);
     }
 
     #[test]
@@ -162,9 +162,9 @@ mod tests {
         let log = QueryLog::default();
         for number in 0..REMEMBERED as u64 + 10 {
             begin(&log, "ann", 7, number);
-            log.end(7, &end(number, None));
+            log.log_end(7, &end(number, None));
         }
-        let rows = log.rows("ann", false);
+        let rows = log.query_rows("ann", false);
         let oldest = rows.last().and_then(|query| query.statement.as_deref());
         assert_eq!((rows.len(), oldest), (REMEMBERED, Some("select 10")));
     }
@@ -173,7 +173,7 @@ mod tests {
     fn ids_do_not_tell_what_others_ask() {
         let log = QueryLog::default();
         (0..9).for_each(|number| begin(&log, "ann", 7, number));
-        let ids: Vec<_> = log.rows("ann", false).iter().map(|query| query.id).collect();
+        let ids: Vec<_> = log.query_rows("ann", false).iter().map(|query| query.id).collect();
         assert!(ids.windows(2).all(|pair| pair[0].abs_diff(pair[1]) > 1_000), "{ids:?}");
         assert!(ids.iter().all(|id| *id < 1 << 53), "pages compute with them");
     }

@@ -40,7 +40,7 @@ impl ReadinessCheck {
         let is_readable = match *last {
             Some((at, is_readable)) if at.elapsed() < LOOK_LASTS => is_readable,
             _ => {
-                let is_readable = self.look().await;
+                let is_readable = self.is_lake_readable().await;
                 *last = Some((Instant::now(), is_readable));
                 is_readable
             }
@@ -48,7 +48,7 @@ impl ReadinessCheck {
         is_readable.then_some(()).ok_or(UNREADABLE)
     }
 
-    async fn look(&self) -> bool {
+    async fn is_lake_readable(&self) -> bool {
         match tokio::time::timeout(LOOK_LIMIT, self.lake.check_readable()).await {
             Ok(Ok(())) => true,
             Ok(Err(failed)) => {

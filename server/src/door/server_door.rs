@@ -76,19 +76,19 @@ impl ServerDoor {
     ///
     /// # Errors
     /// [`RequestFault::Internal`].
-    pub(crate) async fn figures(&self) -> Result<String, RequestFault> {
+    pub(crate) async fn gather_figures(&self) -> Result<String, RequestFault> {
         let activity = self.activity();
         let is_ready = self.check_ready().await.is_ok();
         let gauges = ServerGauges {
-            pool: self.0.engines.gauges(),
-            connections: activity.connections.counts(),
+            pool: self.0.engines.pool_gauges(),
+            connections: activity.connections.protocol_counts(),
             // A lake that does not answer may be on a disk that does not answer either.
-            disks: if is_ready { self.0.engines.disks() } else { Vec::new() },
-            lake: activity.lake().map(|(at, figures)| (at.elapsed(), figures)),
+            disks: if is_ready { self.0.engines.disk_spaces() } else { Vec::new() },
+            lake: activity.lake_figures().map(|(at, figures)| (at.elapsed(), figures)),
             is_ready,
-            process_start: activity.started().timestamp_micros() as f64 / 1e6,
+            process_start: activity.start_time().timestamp_micros() as f64 / 1e6,
         };
-        activity.metrics.text(&gauges).map_err(RequestFault::defect("the figures cannot be written"))
+        activity.metrics.prometheus_text(&gauges).map_err(RequestFault::defect("the figures cannot be written"))
     }
 
     /// Reads the file of tokens again when it changes, and ends what clients without a token were doing; never ends.
@@ -96,7 +96,7 @@ impl ServerDoor {
         let mut known = TokenFileState::default();
         let mut ended = Vec::new();
         loop {
-            let gone = self.0.access.renew(&mut known);
+            let gone = self.0.access.reload_changed(&mut known);
             gone.iter().for_each(|client| tracing::warn!(client, "it may no longer ask, or may do other things now"));
             // Those of the last look again: a request may have begun between its check and its engine's end.
             ended.iter().chain(&gone).for_each(|client: &String| self.0.engines.end_client(client));
@@ -122,13 +122,13 @@ impl ServerDoor {
     /// # Errors
     /// [`RequestFault::NotFound`] if none that the client may end runs.
     pub(crate) async fn cancel_query(&self, client: &ClientIdentity, id: u64) -> Result<(), RequestFault> {
-        let may_any = client.require(TokenScope::Metrics).is_ok();
-        let running = self.activity().queries.find(id).filter(|query| may_any || query.client == client.name);
+        let may_any = client.require_scope(TokenScope::Metrics).is_ok();
+        let running = self.activity().queries.find_running(id).filter(|query| may_any || query.client == client.name);
         let Some(query) = running else {
             let hint = "select id from system.queries where outcome = 'running'";
             return Err(RequestFault::NotFound { what: format!("query {id}"), hint });
         };
-        self.0.engines.cancel(query.engine, query.number).await;
+        self.0.engines.cancel_query(query.engine, query.number).await;
         Ok(())
     }
 

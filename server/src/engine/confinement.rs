@@ -22,7 +22,7 @@ const OVERHEAD_BYTES: u64 = 1 << 30;
 const STATM_DATA: usize = 5;
 
 /// Returns what this machine lacks to confine engines, for people.
-pub fn missing() -> Option<&'static str> {
+pub fn missing_support() -> Option<&'static str> {
     let tried = Ruleset::default()
         .set_compatibility(CompatLevel::HardRequirement)
         .handle_access(AccessFs::from_all(ABI::V1))
@@ -41,7 +41,7 @@ pub fn missing() -> Option<&'static str> {
 pub fn confine_files(lake: &Path, own: &[&Path]) -> io::Result<()> {
     let mut readable = linked_folders(lake);
     readable.push(lake.to_owned());
-    confine(&readable, own, &[])
+    confine_process(&readable, own, &[])
 }
 
 /// Lets the process read what it needs to reach the lake's object store, read and write `own` folders, and nothing else;
@@ -50,10 +50,10 @@ pub fn confine_files(lake: &Path, own: &[&Path]) -> io::Result<()> {
 /// # Errors
 /// The system refuses.
 pub fn confine_to_store(store: &RemoteAccess, own: &[&Path]) -> io::Result<()> {
-    confine(&store.files, own, &store.ports)
+    confine_process(&store.files, own, &store.ports)
 }
 
-fn confine(readable: &[PathBuf], own: &[&Path], ports: &[u16]) -> io::Result<()> {
+fn confine_process(readable: &[PathBuf], own: &[&Path], ports: &[u16]) -> io::Result<()> {
     let connections = ports.iter().map(|port| Ok::<_, RulesetError>(NetPort::new(*port, AccessNet::ConnectTcp)));
     // The place of a panic in the log has the names of its functions.
     let program = std::env::current_exe();

@@ -33,13 +33,13 @@ const REMOTE_LAKE_LOOK: Duration = Duration::from_secs(60);
 /// [`Error::System`], [`Error::Query`], [`Error::Transport`].
 pub async fn run_engine(lake: &Lake, sockets: &Path, memory: usize, slow: Option<Duration>) -> Result<(), Error> {
     let mut messages = read_messages();
-    let http = EngineSocket::Http.listen(sockets)?;
-    let flight_sql = EngineSocket::FlightSql.listen(sockets)?;
+    let http = EngineSocket::Http.listen_in(sockets)?;
+    let flight_sql = EngineSocket::FlightSql.listen_in(sockets)?;
     #[cfg(feature = "postgres")]
-    let postgres = EngineSocket::Postgres.listen(sockets)?;
+    let postgres = EngineSocket::Postgres.listen_in(sockets)?;
     let engine = QueryEngine::new(lake, Some(memory))?;
     warm_up(&engine).await?;
-    EngineReport::Ready.send();
+    EngineReport::Ready.send_line();
     let identity = tokio::select! {
         identity = next_client(&mut messages) => identity,
         never = report_lake(lake, &engine) => match never {},
@@ -55,19 +55,19 @@ pub async fn run_engine(lake: &Lake, sockets: &Path, memory: usize, slow: Option
     };
     let service = QueryService::new(lake, engine, identity, slow)?;
     // If the engine is new, this plans all views, which the watchdog would take for work that nobody waits for.
-    drop(service.tables());
+    drop(service.lake_tables());
     // Behind the start of its threads, whose stacks count.
     confinement::limit_memory(limit).map_err(Error::System)?;
-    watchdog::start(&service).map_err(Error::System)?;
+    watchdog::start_watchdog(&service).map_err(Error::System)?;
     let obeying = service.clone();
     #[cfg(feature = "postgres")]
     let postgres = echolake_postgres::serve(service.clone(), postgres);
     #[cfg(not(feature = "postgres"))]
     let postgres = std::future::pending();
     tokio::select! {
-        () = obeying.obey(messages) => Ok(()),
-        failed = echolake_http::serve(service.clone(), http) => failed,
-        failed = echolake_flight::serve(service.clone(), flight_sql) => failed,
+        () = obeying.obey_door(messages) => Ok(()),
+        failed = echolake_http::serve_http_socket(service.clone(), http) => failed,
+        failed = echolake_flight::serve_flight_socket(service.clone(), flight_sql) => failed,
         failed = postgres => failed,
     }
 }
@@ -98,27 +98,27 @@ async fn next_client(messages: &mut mpsc::UnboundedReceiver<DoorMessage>) -> Opt
 
 // Reports the lake's figures again and again: an engine that waits for a client has nothing else to do.
 async fn report_lake(lake: &Lake, engine: &QueryEngine) -> Infallible {
-    let session = engine.session(&Arc::new(EngineClient::new("lake figures", QueryQuota::default())));
+    let session = engine.open_session(&Arc::new(EngineClient::new("lake figures", QueryQuota::default())));
     loop {
-        let figures = match session.snapshot().await {
-            Ok(snapshot) => match Table::ALL.into_iter().try_for_each(|table| snapshot.check(table)) {
-                Ok(()) => LakeFigures::read(lake, &snapshot).await.map_err(|e| e.to_string()),
+        let figures = match session.current_snapshot().await {
+            Ok(snapshot) => match Table::ALL.into_iter().try_for_each(|table| snapshot.check_table(table)) {
+                Ok(()) => LakeFigures::from_lake(lake, &snapshot).await.map_err(|e| e.to_string()),
                 Err(fault) => Err(fault.to_string()),
             },
             Err(e) => Err(e.to_string()),
         };
         let figures = figures.inspect_err(|error| tracing::warn!(error, "the lake cannot be read")).ok();
-        EngineReport::Lake(figures).send();
+        EngineReport::Lake(figures).send_line();
         tokio::time::sleep(if lake.is_remote() { REMOTE_LAKE_LOOK } else { LAKE_LOOK }).await;
     }
 }
 
 async fn warm_up(engine: &QueryEngine) -> Result<(), Error> {
-    let session = engine.session(&Arc::new(EngineClient::new("warm-up", QueryQuota::default())));
+    let session = engine.open_session(&Arc::new(EngineClient::new("warm-up", QueryQuota::default())));
     // A defect of the lake is reported to each client that queries it.
     let answer = async { session.query(WARM_UP).await?.next().await };
     drop(answer.boxed().await);
     // Plans all views.
-    drop(session.tables());
+    drop(session.table_schemas());
     Ok(())
 }

@@ -18,35 +18,35 @@ const BUSY: f64 = 0.5;
 ///
 /// # Errors
 /// The system gives no thread.
-pub(super) fn start(service: &QueryService) -> std::io::Result<()> {
+pub(super) fn start_watchdog(service: &QueryService) -> std::io::Result<()> {
     let service = service.clone();
-    std::thread::Builder::new().name("watchdog".to_owned()).spawn(move || watch(&service))?;
+    std::thread::Builder::new().name("watchdog".to_owned()).spawn(move || watch_service(&service))?;
     Ok(())
 }
 
-fn watch(service: &QueryService) {
+fn watch_service(service: &QueryService) {
     let mut idle = IdleWork::default();
     let mut cached = CacheCounts::default();
     loop {
         std::thread::sleep(INTERVAL);
         EngineReport::send_queued();
-        if service.engine().overdue().is_some_and(|time| time > GRACE) {
-            end("a query that was ended did not stop");
+        if service.engine().longest_overdue().is_some_and(|time| time > GRACE) {
+            end_process("a query that was ended did not stop");
         }
-        if idle.look(service.activity().count() == 0) > GRACE {
-            end("work that nobody waits for did not stop");
+        if idle.measure_busy_time(service.activity().count() == 0) > GRACE {
+            end_process("work that nobody waits for did not stop");
         }
         if let Some(counts) = service.lake().cache_counts()
             && counts != cached
         {
-            EngineReport::Cache(counts.since(&cached)).send();
+            EngineReport::Cache(counts.since(&cached)).send_line();
             cached = counts;
         }
     }
 }
 
-fn end(why: &str) -> ! {
-    EngineReport::Ending(why.to_owned()).send();
+fn end_process(why: &str) -> ! {
+    EngineReport::Ending(why.to_owned()).send_line();
     std::process::abort()
 }
 
@@ -58,7 +58,7 @@ struct IdleWork {
 }
 
 impl IdleWork {
-    fn look(&mut self, is_idle: bool) -> Duration {
+    fn measure_busy_time(&mut self, is_idle: bool) -> Duration {
         let (now, cpu) = (Instant::now(), cpu_time());
         if let (Some((then, before)), true) = (self.last, is_idle)
             && cpu.saturating_sub(before).as_secs_f64() > BUSY * (now - then).as_secs_f64()

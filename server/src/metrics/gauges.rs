@@ -47,10 +47,10 @@ pub(crate) struct PoolGauges {
 
 impl ServerGauges {
     /// Registers all of them with their values.
-    pub(super) fn register(&self, registry: &Registry) -> Result<()> {
+    pub(super) fn register_all(&self, registry: &Registry) -> Result<()> {
         let moment = MomentRegistry(registry);
-        moment.constant("echolake_build_info", "Always 1.", ("version", env!("CARGO_PKG_VERSION")), 1.0)?;
-        moment.gauge(
+        moment.register_labelled("echolake_build_info", "Always 1.", ("version", env!("CARGO_PKG_VERSION")), 1.0)?;
+        moment.register_gauge(
             "echolake_ready",
             "1 if requests are answered, as /ready says.",
             f64::from(u8::from(self.is_ready)),
@@ -58,18 +58,23 @@ impl ServerGauges {
         self.register_pool(&moment)?;
         for (protocol, open, most) in &self.connections {
             let label = ("protocol", protocol.name());
-            moment.constant("echolake_connections", "Open connections.", label, *open as f64)?;
-            moment.constant("echolake_connections_limit", "Connections that may be open.", label, *most as f64)?;
+            moment.register_labelled("echolake_connections", "Open connections.", label, *open as f64)?;
+            moment.register_labelled(
+                "echolake_connections_limit",
+                "Connections that may be open.",
+                label,
+                *most as f64,
+            )?;
         }
         for (folder, disk) in &self.disks {
             let label = ("folder", *folder);
-            moment.constant(
+            moment.register_labelled(
                 "echolake_disk_free_bytes",
                 "Free space on the folder's disk.",
                 label,
                 disk.free_bytes as f64,
             )?;
-            moment.constant("echolake_disk_bytes", "Size of the folder's disk.", label, disk.bytes as f64)?;
+            moment.register_labelled("echolake_disk_bytes", "Size of the folder's disk.", label, disk.bytes as f64)?;
         }
         self.register_lake(&moment)?;
         self.register_process(&moment)
@@ -77,33 +82,37 @@ impl ServerGauges {
 
     fn register_pool(&self, moment: &MomentRegistry<'_>) -> Result<()> {
         let pool = &self.pool;
-        moment.gauge("echolake_engines", "Engines that have a client.", pool.engines as f64)?;
-        moment.gauge("echolake_engines_limit", "Engines that may have a client.", pool.most_engines as f64)?;
-        moment.gauge("echolake_engine_memory_bytes", "Memory that queries occupy.", pool.bytes as f64)?;
-        moment.gauge(
+        moment.register_gauge("echolake_engines", "Engines that have a client.", pool.engines as f64)?;
+        moment.register_gauge("echolake_engines_limit", "Engines that may have a client.", pool.most_engines as f64)?;
+        moment.register_gauge("echolake_engine_memory_bytes", "Memory that queries occupy.", pool.bytes as f64)?;
+        moment.register_gauge(
             "echolake_engine_memory_limit_bytes",
             "Memory that queries may occupy.",
             pool.most_bytes as f64,
         )?;
-        moment.counter("echolake_engine_starts_total", "Engines that were started.", pool.started as f64)?;
+        moment.register_counter("echolake_engine_starts_total", "Engines that were started.", pool.started as f64)?;
         let failed = pool.failed as f64;
-        moment.counter("echolake_engine_failures_total", "Engines that ended while they had a client.", failed)
+        moment.register_counter("echolake_engine_failures_total", "Engines that ended while they had a client.", failed)
     }
 
     // Left out while they are unknown: 0 runs would be a claim.
     fn register_lake(&self, moment: &MomentRegistry<'_>) -> Result<()> {
         let Some((age, lake)) = &self.lake else { return Ok(()) };
-        moment.gauge("echolake_lake_version", "Version of the lake.", lake.version as f64)?;
-        moment.gauge("echolake_lake_surfaces", "Surfaces of the lake.", lake.surfaces as f64)?;
-        moment.gauge("echolake_lake_runs", "Runs of the lake.", lake.runs as f64)?;
-        moment.gauge("echolake_lake_table_bytes", "Bytes of the tables' files.", lake.table_bytes as f64)?;
-        moment.gauge("echolake_lake_look_age_seconds", "Time since the lake was looked at.", age.as_secs_f64())?;
+        moment.register_gauge("echolake_lake_version", "Version of the lake.", lake.version as f64)?;
+        moment.register_gauge("echolake_lake_surfaces", "Surfaces of the lake.", lake.surfaces as f64)?;
+        moment.register_gauge("echolake_lake_runs", "Runs of the lake.", lake.runs as f64)?;
+        moment.register_gauge("echolake_lake_table_bytes", "Bytes of the tables' files.", lake.table_bytes as f64)?;
+        moment.register_gauge(
+            "echolake_lake_look_age_seconds",
+            "Time since the lake was looked at.",
+            age.as_secs_f64(),
+        )?;
         let folders =
             [("inbox", "that wait for ingest", lake.inbox), ("quarantine", "that ingest refused", lake.quarantine)];
         for (folder, which, figures) in folders {
             let name = |unit: &str| format!("echolake_{folder}_{unit}");
-            moment.gauge(&name("runs"), &format!("Run files {which}."), figures.files as f64)?;
-            moment.gauge(&name("bytes"), &format!("Bytes of run files {which}."), figures.bytes as f64)?;
+            moment.register_gauge(&name("runs"), &format!("Run files {which}."), figures.files as f64)?;
+            moment.register_gauge(&name("bytes"), &format!("Bytes of run files {which}."), figures.bytes as f64)?;
         }
         Ok(())
     }
@@ -112,17 +121,25 @@ impl ServerGauges {
     fn register_process(&self, moment: &MomentRegistry<'_>) -> Result<()> {
         let cpu = clock_gettime(ClockId::ProcessCPUTime);
         let cpu_seconds = cpu.tv_sec as f64 + cpu.tv_nsec as f64 / 1e9;
-        moment.counter("process_cpu_seconds_total", "Processor time of the door, without engines.", cpu_seconds)?;
+        moment.register_counter(
+            "process_cpu_seconds_total",
+            "Processor time of the door, without engines.",
+            cpu_seconds,
+        )?;
         let start = self.process_start;
-        moment.gauge("process_start_time_seconds", "Time of the start, since 1970.", start)?;
+        moment.register_gauge("process_start_time_seconds", "Time of the start, since 1970.", start)?;
         if let Some(bytes) = resident_bytes() {
-            moment.gauge("process_resident_memory_bytes", "Memory of the door, without engines.", bytes as f64)?;
+            moment.register_gauge(
+                "process_resident_memory_bytes",
+                "Memory of the door, without engines.",
+                bytes as f64,
+            )?;
         }
         if let Ok(files) = std::fs::read_dir("/proc/self/fd") {
-            moment.gauge("process_open_fds", "Files and sockets that are open.", files.count() as f64)?;
+            moment.register_gauge("process_open_fds", "Files and sockets that are open.", files.count() as f64)?;
         }
         if let Some(most) = getrlimit(Resource::Nofile).current {
-            moment.gauge("process_max_fds", "Files and sockets that may be open.", most as f64)?;
+            moment.register_gauge("process_max_fds", "Files and sockets that may be open.", most as f64)?;
         }
         Ok(())
     }
@@ -131,21 +148,21 @@ impl ServerGauges {
 struct MomentRegistry<'a>(&'a Registry);
 
 impl MomentRegistry<'_> {
-    fn gauge(&self, name: &str, help: &str, value: f64) -> Result<()> {
-        self.register(Gauge::with_opts(Opts::new(name, help))?, value)
+    fn register_gauge(&self, name: &str, help: &str, value: f64) -> Result<()> {
+        self.register_value(Gauge::with_opts(Opts::new(name, help))?, value)
     }
 
-    fn constant(&self, name: &str, help: &str, (label, text): (&str, &str), value: f64) -> Result<()> {
-        self.register(Gauge::with_opts(Opts::new(name, help).const_label(label, text))?, value)
+    fn register_labelled(&self, name: &str, help: &str, (label, text): (&str, &str), value: f64) -> Result<()> {
+        self.register_value(Gauge::with_opts(Opts::new(name, help).const_label(label, text))?, value)
     }
 
-    fn counter(&self, name: &str, help: &str, value: f64) -> Result<()> {
+    fn register_counter(&self, name: &str, help: &str, value: f64) -> Result<()> {
         let counter = Counter::with_opts(Opts::new(name, help))?;
         counter.inc_by(value);
         self.0.register(Box::new(counter))
     }
 
-    fn register(&self, gauge: Gauge, value: f64) -> Result<()> {
+    fn register_value(&self, gauge: Gauge, value: f64) -> Result<()> {
         gauge.set(value);
         let collector: Box<dyn Collector> = Box::new(gauge);
         self.0.register(collector)
@@ -176,7 +193,7 @@ mod tests {
             is_ready: true,
             ..ServerGauges::default()
         };
-        let text = ServerMetrics::new().and_then(|metrics| metrics.text(&gauges)).expect("distinct names");
+        let text = ServerMetrics::new().and_then(|metrics| metrics.prometheus_text(&gauges)).expect("distinct names");
         for line in [
             "echolake_connections{protocol=\"http\"} 2",
             "echolake_connections_limit{protocol=\"postgres\"} 128",

@@ -31,7 +31,7 @@ impl AcknowledgementWriter {
     }
 
     /// Writes the attempts that are safe on the disk.
-    pub(super) fn observe(&mut self, event: &RunEvent<'_>) {
+    pub(super) fn observe_event(&mut self, event: &RunEvent<'_>) {
         let RunEvent::Safe { verdicts, .. } = event else { return };
         let mut lines = String::new();
         for m in *verdicts {

@@ -13,7 +13,7 @@ use super::AcquireArgs;
 use crate::UsageError;
 
 /// Returns the specimen that the arguments name. A real panel is what it is, whatever its surface is called.
-pub(super) fn of(args: &AcquireArgs, rig: &Rig) -> anyhow::Result<PanelSpecimen> {
+pub(super) fn choose_specimen(args: &AcquireArgs, rig: &Rig) -> anyhow::Result<PanelSpecimen> {
     let is_simulated = rig.devices.are_simulated();
     if args.no_geometry {
         let hint = "the simulated rig measures the panel's geometry; hint: leave out --no-geometry";
@@ -37,14 +37,14 @@ pub(super) fn of(args: &AcquireArgs, rig: &Rig) -> anyhow::Result<PanelSpecimen>
             set_all(&mut relief, &args.set)?;
             PanelSpecimen::Relief(relief)
         }
-        (None, None) => PanelSpecimen::Relief(relief(args.panel.as_deref(), surface, &args.set)?),
+        (None, None) => PanelSpecimen::Relief(choose_relief(args.panel.as_deref(), surface, &args.set)?),
     })
 }
 
 /// Checks that a mesh can be measured with a rig.
 pub(in crate::commands) fn check_mesh(specimen: &PanelSpecimen, rig: &Rig) -> anyhow::Result<()> {
     if let PanelSpecimen::Mesh(path, side) = specimen {
-        Mesh::read(path)?.seen_from(*side).check(rig.panel.size_mm, rig.panel.depth_mm, path)?;
+        Mesh::from_file(path)?.seen_from(*side).check_solid(rig.panel.size_mm, rig.panel.depth_mm, path)?;
     }
     Ok(())
 }
@@ -61,8 +61,8 @@ pub(super) fn macro_reference(args: &AcquireArgs, rig: &Rig) -> anyhow::Result<O
 }
 
 /// The named relief, or the one that the surface's name begins with, with its parameters set.
-fn relief(name: Option<&str>, surface: &SurfaceId, set: &[String]) -> anyhow::Result<PanelRelief> {
-    let guessed = || PanelRelief::guess(surface.as_str());
+fn choose_relief(name: Option<&str>, surface: &SurfaceId, set: &[String]) -> anyhow::Result<PanelRelief> {
+    let guessed = || PanelRelief::guess_name(surface.as_str());
     let name = name.or_else(guessed).with_context(|| {
         format!(
             "unknown surface `{surface}`: no relief is known for it; hint: --panel {} or --mesh FILE",
@@ -84,7 +84,7 @@ pub(in crate::commands) fn set_all(relief: &mut PanelRelief, set: &[String]) -> 
     for setting in set {
         let (key, value) =
             setting.split_once('=').with_context(|| format!("`--set {setting}` has no `=`; hint: --set key=value"))?;
-        relief.set(key, value)?;
+        relief.set_parameter(key, value)?;
     }
     relief.check_depth()?;
     Ok(())

@@ -44,7 +44,7 @@ impl RunWatcher {
         metrics: RunMetrics,
         folder: PathBuf,
     ) -> Self {
-        let mut task = progress.task(surface.to_owned(), planned, "pairs");
+        let mut task = progress.start_task(surface.to_owned(), planned, "pairs");
         task.begin_at(accepted);
         Self {
             task,
@@ -62,7 +62,7 @@ impl RunWatcher {
     }
 
     /// Records an event. Measured pairs count as done; the line says how many of them are safe on the disk.
-    pub(in crate::commands) fn observe(&mut self, event: &RunEvent<'_>) {
+    pub(in crate::commands) fn observe_event(&mut self, event: &RunEvent<'_>) {
         self.metrics.observe(event);
         match event {
             RunEvent::Pair(pair) => {
@@ -74,8 +74,8 @@ impl RunWatcher {
                 self.accepted += u64::from(m.verdict() == Verdict::Accepted);
                 self.repeats += u64::from(m.verdict() == Verdict::Repeated);
                 self.given_up += u64::from(m.verdict() == Verdict::Rejected);
-                self.task.note(self.line());
-                self.task.at(self.accepted);
+                self.task.set_note(self.status_line());
+                self.task.set_done(self.accepted);
             }
             RunEvent::Safe { accepted, cost, .. } => {
                 self.cost = *cost;
@@ -83,21 +83,21 @@ impl RunWatcher {
                     self.metrics.disk_free(bytes);
                 }
                 (self.accepted, self.safe) = (*accepted, *accepted);
-                self.task.note(self.line());
-                self.task.at(*accepted);
+                self.task.set_note(self.status_line());
+                self.task.set_done(*accepted);
             }
             RunEvent::Paused => {
-                self.task.say("paused: everything measured is safe; `p` and Enter, or SIGUSR1, continues")
+                self.task.print_message("paused: everything measured is safe; `p` and Enter, or SIGUSR1, continues")
             }
-            RunEvent::Continued => self.task.say("continued"),
+            RunEvent::Continued => self.task.print_message("continued"),
         }
     }
 
     /// Reports the end of the run, or that it was aborted.
-    pub(in crate::commands) fn done(self, end: Option<RunEnd>) {
+    pub(in crate::commands) fn report_end(self, end: Option<RunEnd>) {
         if self.cost.checkpoints > 0 {
             let (busy, whole) = (self.cost.busy.as_secs_f64(), self.begun.elapsed().as_secs_f64());
-            self.task.say(&format!(
+            self.task.print_message(&format!(
                 "writing took {busy:.2} s of the run's {whole:.2} s ({:.2} s waiting for the disk); {:.1} MB in {} checkpoints",
                 self.cost.waited.as_secs_f64(),
                 self.cost.bytes as f64 / 1e6,
@@ -106,15 +106,15 @@ impl RunWatcher {
         }
         match end {
             Some(RunEnd { accepted, rejected, attempts, .. }) => {
-                self.task.done(format!("{accepted} pairs accepted, {rejected} given up, {attempts} attempts"));
+                self.task.finish_with(format!("{accepted} pairs accepted, {rejected} given up, {attempts} attempts"));
             }
             // The error says why; a run that was refused never began.
             None if self.cost.checkpoints == 0 => self.task.dismiss(),
-            None => self.task.done("aborted"),
+            None => self.task.finish_with("aborted"),
         }
     }
 
-    fn line(&self) -> String {
+    fn status_line(&self) -> String {
         let Self { pair, snr_db, repeats, given_up, safe, .. } = self;
         format!("{pair}, SNR {snr_db:.1} dB, {repeats} repeated, {given_up} given up, {safe} safe on the disk")
     }
@@ -125,18 +125,18 @@ impl RunWatcher {
 ///
 /// # Errors
 /// The system refused a handler.
-pub(super) fn obey(control: &Arc<RunControl>) -> anyhow::Result<StopRequest> {
+pub(super) fn obey_signals(control: &Arc<RunControl>) -> anyhow::Result<StopRequest> {
     let stop = StopRequest::listen("stopping after the current pair; Ctrl-C again stops at once")?;
     let mut pauses = signal(SignalKind::user_defined1()).context("cannot listen to SIGUSR1")?;
     let (stopped, made) = (control.clone(), stop.clone());
     tokio::spawn(async move {
-        made.wait().await;
+        made.wait_until_made().await;
         stopped.stop.store(true, Ordering::Relaxed);
     });
     let paused = control.clone();
     tokio::spawn(async move {
         while pauses.recv().await.is_some() {
-            toggle(&paused);
+            toggle_pause(&paused);
         }
     });
     if std::io::stdin().is_terminal() {
@@ -144,7 +144,7 @@ pub(super) fn obey(control: &Arc<RunControl>) -> anyhow::Result<StopRequest> {
         std::thread::spawn(move || {
             for line in std::io::stdin().lock().lines().map_while(Result::ok) {
                 if line.trim().eq_ignore_ascii_case("p") {
-                    toggle(&paused);
+                    toggle_pause(&paused);
                 }
             }
         });
@@ -152,7 +152,7 @@ pub(super) fn obey(control: &Arc<RunControl>) -> anyhow::Result<StopRequest> {
     Ok(stop)
 }
 
-fn toggle(control: &RunControl) {
+fn toggle_pause(control: &RunControl) {
     control.pause.fetch_xor(true, Ordering::Relaxed);
 }
 
@@ -166,13 +166,14 @@ mod tests {
         let metrics = RunMetrics::new("flat", 45, 3);
         let mut watcher = RunWatcher::new(&CommandProgress::new(), "flat", 45, 3, metrics, PathBuf::from("."));
         let mut attempt = |verdict: Verdict| {
-            watcher.observe(&RunEvent::Attempt(&Measurement { verdict: verdict.into(), ..Measurement::default() }));
-            (watcher.accepted, watcher.line())
+            watcher
+                .observe_event(&RunEvent::Attempt(&Measurement { verdict: verdict.into(), ..Measurement::default() }));
+            (watcher.accepted, watcher.status_line())
         };
         assert_eq!(attempt(Verdict::Repeated).0, 3);
         let (accepted, line) = attempt(Verdict::Accepted);
         assert!(accepted == 4 && line.ends_with("1 repeated, 0 given up, 3 safe on the disk"), "{accepted} {line}");
-        watcher.observe(&RunEvent::Safe { verdicts: &[], accepted: 4, cost: Cost::default() });
-        assert!(watcher.line().ends_with("4 safe on the disk"), "{}", watcher.line());
+        watcher.observe_event(&RunEvent::Safe { verdicts: &[], accepted: 4, cost: Cost::default() });
+        assert!(watcher.status_line().ends_with("4 safe on the disk"), "{}", watcher.status_line());
     }
 }

@@ -113,7 +113,7 @@ fn default_runs() -> usize {
 
 impl CampaignDefinition {
     /// Reads a campaign's file.
-    pub(super) fn read(path: &Path) -> anyhow::Result<Self> {
+    pub(super) fn from_file(path: &Path) -> anyhow::Result<Self> {
         let text =
             std::fs::read_to_string(path).with_context(|| format!("cannot read campaign `{}`", path.display()))?;
         let parsed: Result<Self, _> = toml::from_str(&text);
@@ -134,7 +134,7 @@ impl CampaignDefinition {
     }
 
     /// Returns Flat and Foam of all surfaces: the file's, else the lake's.
-    pub(super) fn references(&self, lake: &ReferenceSurfaces) -> [SurfaceId; 2] {
+    pub(super) fn reference_surfaces(&self, lake: &ReferenceSurfaces) -> [SurfaceId; 2] {
         let named = &self.references;
         [named.flat.as_ref().unwrap_or(&lake.flat), named.foam.as_ref().unwrap_or(&lake.foam)].map(Clone::clone)
     }
@@ -162,11 +162,12 @@ impl CampaignDefinition {
                 );
             }
         }
-        let missing = references.iter().filter(|reference| !listed.contains(reference)).map(NamedSurface::reference);
+        let missing =
+            references.iter().filter(|reference| !listed.contains(reference)).map(NamedSurface::for_reference);
         let missing: Vec<_> = missing.collect();
         let all = missing.iter().chain(&self.surfaces);
         let made = all.zip(0u64..).map(|(surface, number)| {
-            surface.make(self.seed.wrapping_mul(1_000).wrapping_add(number * MOST_RUNS as u64), unnamed)
+            surface.make_surface(self.seed.wrapping_mul(1_000).wrapping_add(number * MOST_RUNS as u64), unnamed)
         });
         made.collect()
     }
@@ -202,7 +203,7 @@ impl CampaignDefinition {
 }
 
 impl NamedSurface {
-    fn reference(name: &SurfaceId) -> Self {
+    fn for_reference(name: &SurfaceId) -> Self {
         Self {
             name: name.clone(),
             relief: None,
@@ -215,7 +216,7 @@ impl NamedSurface {
         }
     }
 
-    fn make(&self, seed: u64, unnamed: UnnamedGeometry) -> anyhow::Result<CampaignSurface> {
+    fn make_surface(&self, seed: u64, unnamed: UnnamedGeometry) -> anyhow::Result<CampaignSurface> {
         let name = &self.name;
         ensure!(
             (1..=MOST_RUNS).contains(&self.runs),
@@ -245,7 +246,7 @@ impl NamedSurface {
     // With the reference that the paper's panels have.
     fn measured_relief(&self, unnamed: UnnamedGeometry) -> anyhow::Result<(PanelSpecimen, Option<SurfaceId>)> {
         let name = &self.name;
-        let guessed = || PanelRelief::guess(name.as_str()).filter(|_| unnamed == UnnamedGeometry::Guessed);
+        let guessed = || PanelRelief::guess_name(name.as_str()).filter(|_| unnamed == UnnamedGeometry::Guessed);
         let relief = match (self.relief.as_deref().or_else(guessed), unnamed) {
             (Some(relief), _) => relief,
             (None, UnnamedGeometry::Unknown) => return Ok((PanelSpecimen::NoGeometry, None)),
@@ -265,7 +266,7 @@ impl NamedSurface {
             .with_context(|| format!("`relief` of surface `{name}`"))?;
         let mut set = || {
             for (key, value) in &self.parameters {
-                member.relief.set(key, value.as_str().unwrap_or(&value.to_string()))?;
+                member.relief.set_parameter(key, value.as_str().unwrap_or(&value.to_string()))?;
             }
             member.relief.check_depth()
         };
@@ -289,7 +290,7 @@ mod tests {
 
     fn made_surfaces(text: &str, unnamed: UnnamedGeometry) -> anyhow::Result<Vec<CampaignSurface>> {
         let campaign: CampaignDefinition = toml::from_str(text)?;
-        let surfaces = campaign.make_surfaces(&campaign.references(&ReferenceSurfaces::default()), unnamed)?;
+        let surfaces = campaign.make_surfaces(&campaign.reference_surfaces(&ReferenceSurfaces::default()), unnamed)?;
         campaign.check_expected(&surfaces, &["2500", "total"].map(str::to_owned))?;
         Ok(surfaces)
     }

@@ -13,7 +13,7 @@ use echolake_acquisition::run::{self, RunRequest};
 use echolake_schema::{Rig, SurfaceId, Timestamp};
 
 use crate::CommandOutcome;
-use crate::commands::acquire::unfinished;
+use crate::commands::acquire::unfinished_recordings;
 use crate::commands::acquire::watch::RunWatcher;
 use crate::commands::simulated_runs::PlannedRun;
 use crate::progress::CommandProgress;
@@ -31,7 +31,7 @@ pub(super) struct RealRuns {
 impl RealRuns {
     /// Measures all runs; those that were stopped or cut off are resumed. When `stop` becomes true, it ends after the
     /// current pair.
-    pub(super) fn measure(&self, stop: &AtomicBool, progress: &CommandProgress) -> anyhow::Result<CommandOutcome> {
+    pub(super) fn measure_all(&self, stop: &AtomicBool, progress: &CommandProgress) -> anyhow::Result<CommandOutcome> {
         let mut outcome = CommandOutcome::Whole;
         let mut in_place: Option<&SurfaceId> = None;
         for planned in &self.runs {
@@ -47,7 +47,7 @@ impl RealRuns {
                 format!("surface `{}`; hint: the same command again resumes the campaign", planned.surface)
             })?;
             if run.left > 0 {
-                progress.say(format!("stopped with {} pairs left in `{}`", run.left, path.display()));
+                progress.print_message(format!("stopped with {} pairs left in `{}`", run.left, path.display()));
                 break;
             }
             if run.end.rejected > 0 {
@@ -64,15 +64,16 @@ impl RealRuns {
         progress: &CommandProgress,
     ) -> anyhow::Result<MeasuredRun> {
         let surface = planned.surface.as_str();
-        let pairs = self.rig.grid()?.pairs().len() as u64;
-        let begun = unfinished(&self.folder, surface).into_iter().max();
-        let accepted = begun.as_deref().map(Held::read).transpose()?.map_or(0, |held| held.accepted() as u64);
+        let pairs = self.rig.build_grid()?.pairs().len() as u64;
+        let begun = unfinished_recordings(&self.folder, surface).into_iter().max();
+        let accepted =
+            begun.as_deref().map(Held::from_file).transpose()?.map_or(0, |held| held.accepted_count() as u64);
         let metrics = RunMetrics::new(surface, pairs, accepted);
         let mut watcher = RunWatcher::new(progress, surface, pairs, accepted, metrics, self.folder.clone());
         let control = RunControl::default();
         let mut observe = |event: RunEvent<'_>| {
             control.stop.store(stop.load(Ordering::Relaxed), Ordering::Relaxed);
-            watcher.observe(&event);
+            watcher.observe_event(&event);
         };
         let session = RunSession {
             control: &control,
@@ -83,15 +84,15 @@ impl RealRuns {
             pace: TakePace::Fast,
         };
         let measured = match &begun {
-            Some(partial) => run::resume(partial, session),
-            None => self.request(planned).measure(session),
+            Some(partial) => run::resume_run(partial, session),
+            None => self.run_request(planned).measure_run(session),
         };
-        watcher.done(measured.as_ref().ok().map(|measured| measured.outcome.end));
+        watcher.report_end(measured.as_ref().ok().map(|measured| measured.outcome.end));
         Ok(measured?)
     }
 
     // Begins now: the time of a planned run is that of a simulation.
-    fn request<'a>(&'a self, planned: &'a PlannedRun) -> RunRequest<'a> {
+    fn run_request<'a>(&'a self, planned: &'a PlannedRun) -> RunRequest<'a> {
         RunRequest {
             rig: &self.rig,
             surface: planned.surface.clone(),
@@ -111,7 +112,7 @@ impl RealRuns {
 
 // A panel that is not the surface's would be measured under its name.
 fn confirm_panel(surface: &SurfaceId, progress: &CommandProgress) -> anyhow::Result<()> {
-    progress.say(format!("put surface `{surface}` in place, then press Enter"));
+    progress.print_message(format!("put surface `{surface}` in place, then press Enter"));
     let read = std::io::stdin().lock().read_line(&mut String::new()).context("cannot read stdin")?;
     anyhow::ensure!(
         read > 0,

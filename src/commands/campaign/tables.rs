@@ -99,14 +99,14 @@ impl LevelTableRow {
         }
     }
 
-    fn expects(&self) -> bool {
+    fn has_expected(&self) -> bool {
         !self.expected_db.is_empty()
     }
 
-    fn cell(&self, band: &str) -> String {
-        let level = self.levels_db.get(band).map_or_else(|| "-".to_owned(), |level| rounded(*level));
+    fn format_cell(&self, band: &str) -> String {
+        let level = self.levels_db.get(band).map_or_else(|| "-".to_owned(), |level| format_level(*level));
         match self.expected_db.get(band) {
-            Some(expected) => format!("{level} ({})", rounded(*expected)),
+            Some(expected) => format!("{level} ({})", format_level(*expected)),
             None => level,
         }
     }
@@ -117,10 +117,11 @@ impl LevelTable {
     pub(super) fn to_text(&self, bands: &[String], colours: TableColours) -> String {
         let relative = |surface: &String| format!("dB relative to {surface}");
         let unit = self.relative_to.as_ref().map_or_else(|| "dB re Flat total".to_owned(), relative);
-        let beside = if self.rows.iter().any(LevelTableRow::expects) { ", expected in brackets" } else { "" };
+        let beside = if self.rows.iter().any(LevelTableRow::has_expected) { ", expected in brackets" } else { "" };
         let mut text = format!("Mean TNCE of the values up to the 90th percentile, {unit}{beside}\n");
         let names = self.rows.iter().map(|row| row.surface.len()).max().unwrap_or(0).max("surface".len());
-        let cells: Vec<Vec<String>> = self.rows.iter().map(|row| bands.iter().map(|b| row.cell(b)).collect()).collect();
+        let cells: Vec<Vec<String>> =
+            self.rows.iter().map(|row| bands.iter().map(|b| row.format_cell(b)).collect()).collect();
         let heads: Vec<_> = bands.iter().map(|b| if b == "total" { b.clone() } else { format!("{b} Hz") }).collect();
         let width =
             |column: usize| cells.iter().map(|row| row[column].len()).max().unwrap_or(0).max(heads[column].len());
@@ -131,7 +132,7 @@ impl LevelTable {
         for (row, cells) in self.rows.iter().zip(&cells) {
             let _ = write!(text, "\n{:<names$}", row.surface);
             for ((band, cell), &width) in bands.iter().zip(cells).zip(&widths) {
-                let (on, off) = match self.colour(row, band) {
+                let (on, off) = match self.cell_colour(row, band) {
                     Some(colour) if colours == TableColours::Extremes => (colour, PLAIN),
                     _ => ("", ""),
                 };
@@ -145,7 +146,7 @@ impl LevelTable {
     }
 
     // Two levels that are alike have no extremes.
-    fn colour(&self, row: &LevelTableRow, band: &str) -> Option<&'static str> {
+    fn cell_colour(&self, row: &LevelTableRow, band: &str) -> Option<&'static str> {
         let own = *row.levels_db.get(band)?;
         let all = || self.rows.iter().filter_map(|row| row.levels_db.get(band).copied());
         let (least, greatest) = (all().fold(own, f64::min), all().fold(own, f64::max));
@@ -159,7 +160,7 @@ impl LevelTable {
 }
 
 // Without the sign of a zero.
-fn rounded(level_db: f64) -> String {
+fn format_level(level_db: f64) -> String {
     format!("{:.2}", (level_db * 100.0).round() / 100.0 + 0.0)
 }
 

@@ -21,7 +21,7 @@ use serde::Serialize;
 use crate::CommandOutcome;
 #[cfg(feature = "lake")]
 use crate::commands::serve::ServeArgs;
-use crate::commands::{print, size};
+use crate::commands::{format_size, print_line};
 
 /// Versions of what reads and writes the lake's files, and of all else that was compiled in.
 const LOCK_FILE: &str = include_str!("../../../Cargo.lock");
@@ -77,11 +77,11 @@ impl InstallationFact {
 }
 
 /// Prints the report; an error if the installation cannot do its job.
-pub(super) async fn run(json: bool, lake_url: &str) -> anyhow::Result<CommandOutcome> {
+pub(super) async fn report_installation(json: bool, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let report = examine_installation(lake_url).await;
     match json {
-        true => print(&serde_json::to_string_pretty(&report)?)?,
-        false => print(text(&report).trim_end())?,
+        true => print_line(&serde_json::to_string_pretty(&report)?)?,
+        false => print_line(report_text(&report).trim_end())?,
     }
     let failed: Vec<_> =
         report.facts.iter().filter(|f| f.state == FactState::Failed).map(|f| f.name.as_str()).collect();
@@ -90,11 +90,11 @@ pub(super) async fn run(json: bool, lake_url: &str) -> anyhow::Result<CommandOut
 }
 
 async fn examine_installation(lake_url: &str) -> InstallationReport {
-    let mut facts = vec![pages(), audio(), formats(), system(), processor(), memory()];
-    facts.extend(lake(lake_url).await);
+    let mut facts = vec![pages(), audio_fact(), format_fact(), system_fact(), processor_fact(), memory_fact()];
+    facts.extend(lake_facts(lake_url).await);
     facts.push(temporary_files(&env::temp_dir()));
     #[cfg(feature = "lake")]
-    facts.extend(ports());
+    facts.extend(port_facts());
     InstallationReport {
         version: env!("CARGO_PKG_VERSION"),
         commit: COMMIT,
@@ -103,7 +103,7 @@ async fn examine_installation(lake_url: &str) -> InstallationReport {
     }
 }
 
-fn text(report: &InstallationReport) -> String {
+fn report_text(report: &InstallationReport) -> String {
     let commit = report.commit.unwrap_or("unknown");
     let mut out = format!("echolake {} (commit {commit}), {}\n\n", report.version, report.program);
     for InstallationFact { name, state, found, hint } in &report.facts {
@@ -121,7 +121,10 @@ fn text(report: &InstallationReport) -> String {
 #[cfg(feature = "lake")]
 fn pages() -> InstallationFact {
     let name = "pages";
-    match CataloguePages::THIS_BUILD.problem().map(|problem| problem.split_once("; hint: ").unwrap_or((problem, ""))) {
+    match CataloguePages::THIS_BUILD
+        .missing_reason()
+        .map(|problem| problem.split_once("; hint: ").unwrap_or((problem, "")))
+    {
         None => InstallationFact::ok(name, "the catalogue's pages are part of the program"),
         Some((problem, hint)) => InstallationFact::note(name, problem, hint),
     }
@@ -133,7 +136,7 @@ fn pages() -> InstallationFact {
     InstallationFact::note("pages", "built for the rig alone, without tables and server", hint)
 }
 
-fn audio() -> InstallationFact {
+fn audio_fact() -> InstallationFact {
     let name = "audio";
     if cfg!(not(feature = "alsa")) {
         let hint = "audio devices need a build from source with `--features alsa`; the simulated rig needs none";
@@ -149,7 +152,7 @@ fn audio() -> InstallationFact {
     InstallationFact::ok(name, format!("ALSA: {}", devices.join(", ")))
 }
 
-fn formats() -> InstallationFact {
+fn format_fact() -> InstallationFact {
     let crates = FORMAT_CRATES.into_iter().filter_map(|name| Some(format!("{name} {}", locked_version(name)?)));
     let versions: Vec<_> = [format!("lake format {LAKE_FORMAT}")].into_iter().chain(crates).collect();
     InstallationFact::ok("formats", versions.join(", "))
@@ -161,7 +164,7 @@ fn locked_version(name: &str) -> Option<&'static str> {
     package.split_once("version = \"")?.1.split('"').next()
 }
 
-fn system() -> InstallationFact {
+fn system_fact() -> InstallationFact {
     let kernel = fs::read_to_string("/proc/sys/kernel/osrelease").unwrap_or_default();
     InstallationFact::ok("system", format!("{OS} {}, {ARCH}, {}", kernel.trim(), c_library()))
 }
@@ -175,7 +178,7 @@ fn c_library() -> String {
     version.map_or("glibc".to_owned(), |output| String::from_utf8_lossy(&output.stdout).trim().to_owned())
 }
 
-fn processor() -> InstallationFact {
+fn processor_fact() -> InstallationFact {
     let listed = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
     let model = listed.lines().find_map(|line| line.strip_prefix("model name")?.split_once(": "));
     let threads = std::thread::available_parallelism().map_or(1, usize::from);
@@ -183,20 +186,22 @@ fn processor() -> InstallationFact {
     InstallationFact::ok("processor", format!("{threads} threads{model}"))
 }
 
-fn memory() -> InstallationFact {
+fn memory_fact() -> InstallationFact {
     let listed = fs::read_to_string("/proc/meminfo").unwrap_or_default();
     let bytes = |name: &str| {
         let line = listed.lines().find_map(|line| line.strip_prefix(name))?;
         Some(1024 * line.trim_start_matches(':').trim().split(' ').next()?.parse::<u64>().ok()?)
     };
     match (bytes("MemTotal"), bytes("MemAvailable")) {
-        (Some(total), Some(free)) => InstallationFact::ok("memory", format!("{} of {} free", size(free), size(total))),
+        (Some(total), Some(free)) => {
+            InstallationFact::ok("memory", format!("{} of {} free", format_size(free), format_size(total)))
+        }
         _ => InstallationFact::note("memory", "unknown", "/proc/meminfo does not tell it"),
     }
 }
 
 /// The lake's place: whether there is a lake, how much room it has, and whether its file system does what is asked of it.
-async fn lake(lake_url: &str) -> Vec<InstallationFact> {
+async fn lake_facts(lake_url: &str) -> Vec<InstallationFact> {
     let opened = Lake::open(lake_url).await;
     let state = match &opened {
         Ok(_) => InstallationFact::ok("lake", format!("{lake_url} is a lake")),
@@ -249,7 +254,7 @@ fn temporary_files(folder: &Path) -> InstallationFact {
 fn free_space(name: &str, folder: &Path, wanted: u64, hint: &str) -> InstallationFact {
     match free_bytes(folder) {
         Ok(free) => {
-            let found = format!("{} free in {}", size(free), folder.display());
+            let found = format!("{} free in {}", format_size(free), folder.display());
             if free < wanted { InstallationFact::note(name, found, hint) } else { InstallationFact::ok(name, found) }
         }
         Err(error) => InstallationFact::note(name, format!("{}: {error}", folder.display()), hint),
@@ -283,17 +288,17 @@ fn try_files_in(scratch: &Path) -> Result<(), (&'static str, io::Error)> {
 
 /// The ports that `serve` listens on by default.
 #[cfg(feature = "lake")]
-fn ports() -> Vec<InstallationFact> {
+fn port_facts() -> Vec<InstallationFact> {
     let serve = ServeArgs::augment_args(clap::Command::new("serve"));
     let defaults = serve.get_arguments().filter_map(|argument| {
         let address: SocketAddr = argument.get_default_values().first()?.to_str()?.parse().ok()?;
         Some((argument.get_long()?.to_owned(), address))
     });
-    defaults.map(|(option, address)| port(&option, address)).collect()
+    defaults.map(|(option, address)| port_fact(&option, address)).collect()
 }
 
 #[cfg(feature = "lake")]
-fn port(option: &str, address: SocketAddr) -> InstallationFact {
+fn port_fact(option: &str, address: SocketAddr) -> InstallationFact {
     let name = format!("port {}", address.port());
     match TcpListener::bind(address) {
         Ok(_) => InstallationFact::ok(&name, format!("{address} is free (serve --{option})")),

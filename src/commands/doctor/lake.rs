@@ -2,39 +2,39 @@
 
 use std::fmt::Write as _;
 
-use echolake_ingest::doctor::{FindingSeverity, LakeFinding, LakeReport, examine};
+use echolake_ingest::doctor::{FindingSeverity, LakeFinding, LakeReport, examine_lake};
 use echolake_lake::Lake;
 
 use crate::CommandOutcome;
-use crate::commands::{print, size};
+use crate::commands::{format_size, print_line};
 use crate::progress::CommandProgress;
 
-pub(super) async fn run(json: bool, lake_url: &str) -> anyhow::Result<CommandOutcome> {
+pub(super) async fn report_lake(json: bool, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let lake = Lake::open(lake_url).await?;
     let progress = CommandProgress::new();
     let mut task = None;
-    let report = examine(&lake, &mut |step| {
-        task.get_or_insert_with(|| progress.task("check", step.total as u64, "files")).at(step.done as u64);
+    let report = examine_lake(&lake, &mut |step| {
+        task.get_or_insert_with(|| progress.start_task("check", step.total as u64, "files")).set_done(step.done as u64);
     })
     .await?;
     if let Some(task) = task {
-        task.done(format!("{} runs", report.runs));
+        task.finish_with(format!("{} runs", report.runs));
     }
     match json {
-        true => print(&serde_json::to_string_pretty(&report)?)?,
-        false => print(&text(&lake, &report))?,
+        true => print_line(&serde_json::to_string_pretty(&report)?)?,
+        false => print_line(&report_text(&lake, &report))?,
     }
     Ok(if report.is_damaged() { CommandOutcome::WithLoss } else { CommandOutcome::Whole })
 }
 
-fn text(lake: &Lake, report: &LakeReport) -> String {
+fn report_text(lake: &Lake, report: &LakeReport) -> String {
     let (rig, division) = (lake.rig(), lake.rig().impulse_response.division.name());
     let direct = lake.config().references.direct_sound.name();
     let mut out = format!("lake {}, rig {}, {division} division, direct sound: {direct}\n", lake.location(), rig.name);
-    let _ = writeln!(out, "{} runs, {} in run files\n", report.runs, size(report.run_bytes));
+    let _ = writeln!(out, "{} runs, {} in run files\n", report.runs, format_size(report.run_bytes));
     let _ = writeln!(out, "{:<14} {:>6} {:>10} {:>10}", "table", "files", "rows", "size");
     for t in &report.tables {
-        let _ = writeln!(out, "{:<14} {:>6} {:>10} {:>10}", t.table, t.files, t.rows, size(t.bytes));
+        let _ = writeln!(out, "{:<14} {:>6} {:>10} {:>10}", t.table, t.files, t.rows, format_size(t.bytes));
     }
     for LakeFinding { severity, subject, what } in &report.findings {
         let word = match severity {

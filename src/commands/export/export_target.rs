@@ -61,19 +61,19 @@ struct RemoteExport {
 
 impl PendingExport {
     /// Prepares a folder of files. In an object store nothing may be below its name.
-    pub(super) async fn folder(target: &ExportTarget) -> anyhow::Result<Self> {
+    pub(super) async fn prepare_folder(target: &ExportTarget) -> anyhow::Result<Self> {
         match target {
             ExportTarget::Local(path) => Ok(Self { path: path.clone(), remote: None }),
             ExportTarget::Remote(location) => {
                 let folder = ObjectFolder::open(location)?;
                 folder.ensure_empty().await?;
-                Self::remote(folder, "export", location)
+                Self::prepare_remote(folder, "export", location)
             }
         }
     }
 
     /// Prepares a single file.
-    pub(super) async fn file(target: &ExportTarget) -> anyhow::Result<Self> {
+    pub(super) async fn prepare_file(target: &ExportTarget) -> anyhow::Result<Self> {
         match target {
             ExportTarget::Local(path) => Ok(Self { path: path.clone(), remote: None }),
             ExportTarget::Remote(location) => {
@@ -82,12 +82,12 @@ impl PendingExport {
                     named.with_context(|| format!("`{location}` names no object; hint: s3://bucket/prefix/NAME"))?;
                 let folder = ObjectFolder::open(parent)?;
                 folder.ensure_absent(name).await?;
-                Self::remote(folder, name, location)
+                Self::prepare_remote(folder, name, location)
             }
         }
     }
 
-    fn remote(folder: ObjectFolder, name: &str, location: &str) -> anyhow::Result<Self> {
+    fn prepare_remote(folder: ObjectFolder, name: &str, location: &str) -> anyhow::Result<Self> {
         let spool = tempfile::Builder::new().prefix("echolake-export-").tempdir();
         let spool = spool.context("cannot make a temporary folder; hint: $TMPDIR names another disk")?;
         let (path, location) = (spool.path().join(name), location.to_owned());
@@ -104,7 +104,7 @@ impl PendingExport {
         let Some(RemoteExport { folder, spool, location }) = self.remote else { return Ok(()) };
         if self.path.is_file() {
             let name = self.path.file_name().unwrap_or_default().to_string_lossy();
-            folder.send(&self.path, &name).await?;
+            folder.send_file(&self.path, &name).await?;
             return Ok(());
         }
         let mut names = Vec::new();
@@ -123,7 +123,7 @@ impl PendingExport {
         }
         names.retain(|name| name != CHECKSUMS);
         for name in names.iter().map(String::as_str).chain([CHECKSUMS]) {
-            folder.send(&self.path.join(name), name).await?;
+            folder.send_file(&self.path.join(name), name).await?;
         }
         eprintln!("{location}: {} files and {CHECKSUMS}", names.len());
         Ok(())

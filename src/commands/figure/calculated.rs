@@ -14,8 +14,8 @@ pub(super) fn write_filters(source: &FigureSource, args: &FiltersArgs) -> anyhow
     let rig = source.lake.rig();
     let centres_hz = rig.bands.centres_hz.clone();
     let figure = FilterFigure { centres_hz, low_hz: rig.sweep.low_hz, high_hz: rig.sweep.high_hz, width_px: 620.0 };
-    let title = args.output.title(|| "Filter bank".into());
-    args.output.write_drawing(&figure.draw(&source.notes(title, String::new(), &[])), &[])
+    let title = args.output.title_or(|| "Filter bank".into());
+    args.output.write_drawing(&figure.draw(&source.figure_notes(title, String::new(), &[])), &[])
 }
 
 pub(super) fn write_coverage(source: &FigureSource, args: &CoverageArgs) -> anyhow::Result<()> {
@@ -30,18 +30,18 @@ pub(super) fn write_coverage(source: &FigureSource, args: &CoverageArgs) -> anyh
         false => args.frequencies.clone(),
     };
     anyhow::ensure!(frequencies.iter().all(|hz| *hz > 0.0 && hz.is_finite()), "`--frequencies` are Hz, above 0");
-    let zones = |hz: f64| pairs.iter().map(|(microphone, speaker)| zone(microphone, speaker, hz)).collect();
+    let zones = |hz: f64| pairs.iter().map(|(microphone, speaker)| coverage_zone(microphone, speaker, hz)).collect();
     let figure = CoverageFigure {
         panel_mm: rig.panel.size_mm,
         points_mm: points.iter().map(|point| [point.position_mm[0], point.position_mm[1]]).collect(),
         frequencies: frequencies.iter().map(|hz| (*hz, zones(*hz))).collect(),
         panel_px: 300.0,
     };
-    let title = args.output.title(|| format!("First Fresnel zones of the pairs of layer {}", args.layer));
-    args.output.write_drawing(&figure.draw(&source.notes(title, String::new(), &[])), &[])
+    let title = args.output.title_or(|| format!("First Fresnel zones of the pairs of layer {}", args.layer));
+    args.output.write_drawing(&figure.draw(&source.figure_notes(title, String::new(), &[])), &[])
 }
 
-fn zone(microphone: &Point, speaker: &Point, frequency_hz: f64) -> CoverageZone {
+fn coverage_zone(microphone: &Point, speaker: &Point, frequency_hz: f64) -> CoverageZone {
     let (to, from) = (microphone.position_mm, speaker.position_mm);
     let zone = first_fresnel_zone(to, from, frequency_hz, SPEED_M_S);
     CoverageZone {

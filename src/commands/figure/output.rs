@@ -28,7 +28,10 @@ impl OutputArgs {
     ///
     /// # Errors
     /// If only some of the files are named by surfaces.
-    pub(super) fn groups<'a>(&self, surfaces: &'a [SelectedSurface]) -> anyhow::Result<Vec<&'a [SelectedSurface]>> {
+    pub(super) fn group_surfaces<'a>(
+        &self,
+        surfaces: &'a [SelectedSurface],
+    ) -> anyhow::Result<Vec<&'a [SelectedSurface]>> {
         let named = self.output.iter().filter(|path| path.to_string_lossy().contains(PLACEHOLDER)).count();
         match named {
             0 => Ok(vec![surfaces]),
@@ -38,7 +41,7 @@ impl OutputArgs {
     }
 
     /// Returns the title: the one that was asked for, or this.
-    pub(super) fn title(&self, otherwise: impl FnOnce() -> String) -> String {
+    pub(super) fn title_or(&self, otherwise: impl FnOnce() -> String) -> String {
         self.title.clone().unwrap_or_else(otherwise)
     }
 
@@ -47,8 +50,8 @@ impl OutputArgs {
         if self.output.is_empty() {
             return Ok(std::io::stdout().write_all(drawing.to_svg().as_bytes())?);
         }
-        for path in self.paths(surfaces)? {
-            match extension(&path) {
+        for path in self.output_paths(surfaces)? {
+            match path_extension(&path) {
                 "svg" => write_file(&path, drawing.to_svg().as_bytes())?,
                 "pdf" => write_file(&path, &drawing.to_pdf()?)?,
                 "png" => write_file(&path, &drawing.to_png()?)?,
@@ -66,10 +69,10 @@ impl OutputArgs {
         surfaces: &[SelectedSurface],
     ) -> anyhow::Result<()> {
         if self.output.is_empty() {
-            return Ok(super::super::print(table.to_markdown(&FigureNotes::default()).trim_end())?);
+            return Ok(super::super::print_line(table.to_markdown(&FigureNotes::default()).trim_end())?);
         }
-        for path in self.paths(surfaces)? {
-            let text = match extension(&path) {
+        for path in self.output_paths(surfaces)? {
+            let text = match path_extension(&path) {
                 "tex" => table.to_latex(notes),
                 "csv" => table.to_csv(notes),
                 "md" => table.to_markdown(notes),
@@ -80,7 +83,7 @@ impl OutputArgs {
         Ok(())
     }
 
-    fn paths(&self, surfaces: &[SelectedSurface]) -> anyhow::Result<Vec<PathBuf>> {
+    fn output_paths(&self, surfaces: &[SelectedSurface]) -> anyhow::Result<Vec<PathBuf>> {
         let path = |path: &PathBuf| match (path.to_str(), surfaces.first()) {
             (Some(text), Some(surface)) => Ok(PathBuf::from(text.replace(PLACEHOLDER, &surface.surface_id))),
             (Some(text), None) if text.contains(PLACEHOLDER) => {
@@ -92,7 +95,7 @@ impl OutputArgs {
     }
 }
 
-fn extension(path: &Path) -> &str {
+fn path_extension(path: &Path) -> &str {
     path.extension().and_then(|extension| extension.to_str()).unwrap_or("")
 }
 
@@ -106,6 +109,6 @@ fn write_file(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     partial.push(".partial");
     std::fs::write(&partial, bytes).with_context(failed)?;
     std::fs::rename(&partial, path).with_context(failed)?;
-    eprintln!("{}: {}", path.display(), super::super::size(bytes.len() as u64));
+    eprintln!("{}: {}", path.display(), super::super::format_size(bytes.len() as u64));
     Ok(())
 }

@@ -3,7 +3,7 @@
 use anyhow::Context as _;
 use echolake_figures::FigureNotes;
 use echolake_lake::Lake;
-use echolake_query::figure_rows::{lake_version, quoted};
+use echolake_query::figure_rows::{lake_version, quote_literal};
 use echolake_query::{PredicateForm, Session};
 use echolake_schema::{Point, SurfaceId};
 use serde::Deserialize;
@@ -37,13 +37,13 @@ pub(super) struct FigureSource {
 impl FigureSource {
     pub(super) async fn open(lake: Lake) -> anyhow::Result<Self> {
         let session = Session::new(&lake)?;
-        let version = lake_version(session.snapshot().await?.as_ref());
+        let version = lake_version(session.current_snapshot().await?.as_ref());
         Ok(Self { lake, session, version })
     }
 
     /// Returns the rows of a query.
-    pub(super) async fn rows<T: DeserializeOwned>(&self, sql: &str) -> anyhow::Result<Vec<T>> {
-        crate::commands::sql::rows(&self.session, sql).await
+    pub(super) async fn query_rows<T: DeserializeOwned>(&self, sql: &str) -> anyhow::Result<Vec<T>> {
+        crate::commands::sql::query_rows(&self.session, sql).await
     }
 
     /// Returns the session.
@@ -55,24 +55,24 @@ impl FigureSource {
     ///
     /// # Errors
     /// If one is not in the lake, or none is selected.
-    pub(super) async fn surfaces(&self, selection: &SelectionArgs) -> anyhow::Result<Vec<SelectedSurface>> {
+    pub(super) async fn selected_surfaces(&self, selection: &SelectionArgs) -> anyhow::Result<Vec<SelectedSurface>> {
         let names: Vec<_> = selection.surfaces.iter().map(|surface| surface.as_str()).collect();
-        let mut selected = self.named(&names).await?;
+        let mut selected = self.named_surfaces(&names).await?;
         if let Some(predicate) = &selection.predicate {
-            let more = self.selected(predicate).await?;
+            let more = self.surfaces_where(predicate).await?;
             selected.extend(more.into_iter().filter(|surface| !names.contains(&surface.surface_id.as_str())));
         }
         Ok(selected)
     }
 
     /// Returns the surfaces of these names, in their order.
-    pub(super) async fn named(&self, names: &[&str]) -> anyhow::Result<Vec<SelectedSurface>> {
+    pub(super) async fn named_surfaces(&self, names: &[&str]) -> anyhow::Result<Vec<SelectedSurface>> {
         if names.is_empty() {
             return Ok(Vec::new());
         }
-        let list: Vec<_> = names.iter().map(|name| quoted(name)).collect();
+        let list: Vec<_> = names.iter().map(|name| quote_literal(name)).collect();
         let sql = format!("{SURFACES} where surface_id in ({}) order by run_id desc", list.join(", "));
-        let found: Vec<SelectedSurface> = self.rows(&sql).await?;
+        let found: Vec<SelectedSurface> = self.query_rows(&sql).await?;
         let surface = |name: &&str| {
             let surface = found.iter().find(|surface| surface.surface_id == *name).cloned();
             surface.with_context(|| {
@@ -86,16 +86,16 @@ impl FigureSource {
     ///
     /// # Errors
     /// If it is not in the lake.
-    pub(super) async fn base(&self, surface: Option<&SurfaceId>) -> anyhow::Result<Option<SelectedSurface>> {
+    pub(super) async fn base_surface(&self, surface: Option<&SurfaceId>) -> anyhow::Result<Option<SelectedSurface>> {
         let names: Vec<_> = surface.map(|surface| surface.as_str()).into_iter().collect();
-        Ok(self.named(&names).await?.pop())
+        Ok(self.named_surfaces(&names).await?.pop())
     }
 
     /// Returns the surfaces that a predicate selects, by name.
-    pub(super) async fn selected(&self, predicate: &str) -> anyhow::Result<Vec<SelectedSurface>> {
+    pub(super) async fn surfaces_where(&self, predicate: &str) -> anyhow::Result<Vec<SelectedSurface>> {
         let select = format!("{SURFACES} where");
-        let sql = self.session.selecting(&select, predicate, PredicateForm::AnyExpression).context("--where")?;
-        let mut found: Vec<SelectedSurface> = self.rows(&sql).await.context("--where")?;
+        let sql = self.session.append_predicate(&select, predicate, PredicateForm::AnyExpression).context("--where")?;
+        let mut found: Vec<SelectedSurface> = self.query_rows(&sql).await.context("--where")?;
         anyhow::ensure!(!found.is_empty(), "`{predicate}` selects no surface; hint: `echolake sql` tries predicates");
         found.sort_by(|a, b| (&a.surface_id, &b.run_id).cmp(&(&b.surface_id, &a.run_id)));
         found.dedup_by(|a, b| a.surface_id == b.surface_id);
@@ -103,7 +103,7 @@ impl FigureSource {
     }
 
     /// Returns the grid point that is named, or the one of the lowest layer that is nearest to the middle.
-    pub(super) fn microphone(&self, named: Option<&str>) -> anyhow::Result<&Point> {
+    pub(super) fn microphone_point(&self, named: Option<&str>) -> anyhow::Result<&Point> {
         let grid = self.lake.grid();
         if let Some(text) = named {
             let by_number = text.parse::<usize>().ok();
@@ -122,7 +122,7 @@ impl FigureSource {
     }
 
     /// Returns what a figure of these surfaces says of itself.
-    pub(super) fn notes<'a>(
+    pub(super) fn figure_notes<'a>(
         &self,
         title: String,
         query: String,

@@ -12,7 +12,7 @@ use echolake_figures::{
 };
 use echolake_query::figure_rows::{
     CurveRow, GridCell, GridLevels, LevelReference, LevelVectors, band_keys, band_labels, curves_query, grid_query,
-    level_vectors_query, point_filter, quoted, thinned_samples, times_ms, total_curve,
+    level_vectors_query, point_filter, quote_literal, thinned_samples, times_ms, total_curve,
 };
 use serde::Deserialize;
 
@@ -25,8 +25,8 @@ const CURVE_POINTS: usize = 192;
 const COMPONENTS: usize = 2;
 
 pub(super) async fn write_grid(source: &FigureSource, args: &GridArgs) -> anyhow::Result<()> {
-    let surfaces = source.surfaces(&args.selection).await?;
-    let microphone = source.microphone(args.microphone.as_deref())?;
+    let surfaces = source.selected_surfaces(&args.selection).await?;
+    let microphone = source.microphone_point(args.microphone.as_deref())?;
     let over = LevelReference::from(args.over);
     let rig = source.lake.rig();
     let (labels, keys) = (band_labels(rig), band_keys(rig));
@@ -37,14 +37,14 @@ pub(super) async fn write_grid(source: &FigureSource, args: &GridArgs) -> anyhow
             vec![found.with_context(|| format!("there is no band `{key}`; hint: {}", keys.join(", ")))?]
         }
     };
-    let base = match source.base(args.less.as_ref()).await? {
+    let base = match source.base_surface(args.less.as_ref()).await? {
         Some(surface) => {
             let levels = read_grid(source, &surface.surface_id, microphone.id.index(), over).await?;
             Some((surface, levels.bands))
         }
         None => None,
     };
-    for group in args.output.groups(&surfaces)? {
+    for group in args.output.group_surfaces(&surfaces)? {
         let mut panels = Vec::new();
         for surface in group {
             let id = &surface.surface_id;
@@ -63,9 +63,9 @@ pub(super) async fn write_grid(source: &FigureSource, args: &GridArgs) -> anyhow
             with_caption: true,
         };
         let default = || GridFigure::default_title(&microphone.label(), over.unit());
-        let query = queries(group, |id| grid_query(rig, over, id, &microphone.id.index().to_string()));
+        let query = first_query(group, |id| grid_query(rig, over, id, &microphone.id.index().to_string()));
         let used = group.iter().chain(base.as_ref().map(|(surface, _)| surface));
-        let notes = source.notes(args.output.title(default), query, used);
+        let notes = source.figure_notes(args.output.title_or(default), query, used);
         args.output.write_drawing(&figure.draw(&notes), group)?;
     }
     Ok(())
@@ -78,26 +78,27 @@ async fn read_grid(
     over: LevelReference,
 ) -> anyhow::Result<GridLevels> {
     let rig = source.lake.rig();
-    let cells: Vec<GridCell> = source.rows(&grid_query(rig, over, &quoted(surface), &microphone.to_string())).await?;
+    let cells: Vec<GridCell> =
+        source.query_rows(&grid_query(rig, over, &quote_literal(surface), &microphone.to_string())).await?;
     let (points, bands) = (source.lake.grid().points().len(), rig.bands.centres_hz.len() + 1);
     Ok(GridLevels::from_cells(cells, microphone, points, bands))
 }
 
 // The first surface's query; the others differ by its name alone.
-fn queries(surfaces: &[SelectedSurface], query: impl Fn(&str) -> String) -> String {
-    surfaces.first().map_or_else(String::new, |surface| query(&quoted(&surface.surface_id)))
+fn first_query(surfaces: &[SelectedSurface], query: impl Fn(&str) -> String) -> String {
+    surfaces.first().map_or_else(String::new, |surface| query(&quote_literal(&surface.surface_id)))
 }
 
 pub(super) async fn write_nce(source: &FigureSource, args: &NceArgs) -> anyhow::Result<()> {
-    let surfaces = source.surfaces(&args.selection).await?;
+    let surfaces = source.selected_surfaces(&args.selection).await?;
     let rig = source.lake.rig();
-    let point = args.microphone.as_ref().map(|named| source.microphone(Some(named))).transpose()?;
+    let point = args.microphone.as_ref().map(|named| source.microphone_point(Some(named))).transpose()?;
     let filter = point.map_or_else(String::new, |point| point_filter(&point.id.index().to_string()));
     let kept = thinned_samples(rig.impulse_response.length, CURVE_POINTS);
     let mut bands = band_labels(rig);
     bands.pop();
     let mut flat_totals: HashMap<&str, Vec<f32>> = HashMap::new();
-    for group in args.output.groups(&surfaces)? {
+    for group in args.output.group_surfaces(&surfaces)? {
         let mut panels = Vec::new();
         for surface in group {
             let (id, flat) = (surface.surface_id.as_str(), surface.flat_reference.as_str());
@@ -119,8 +120,8 @@ pub(super) async fn write_nce(source: &FigureSource, args: &NceArgs) -> anyhow::
             columns: args.columns as usize,
             with_caption: true,
         };
-        let title = args.output.title(|| NceFigure::default_title(point.map(|point| point.label()).as_deref()));
-        let notes = source.notes(title, queries(group, |id| curves_query(rig, id, &filter)), group);
+        let title = args.output.title_or(|| NceFigure::default_title(point.map(|point| point.label()).as_deref()));
+        let notes = source.figure_notes(title, first_query(group, |id| curves_query(rig, id, &filter)), group);
         args.output.write_drawing(&figure.draw(&notes), group)?;
     }
     Ok(())
@@ -133,9 +134,9 @@ async fn read_curves(
     filter: &str,
     kept: &[usize],
 ) -> anyhow::Result<Option<Vec<Vec<f32>>>> {
-    let query = curves_query(source.lake.rig(), &quoted(surface), filter);
-    let row: Option<CurveRow> = source.rows(&query).await?.pop();
-    Ok(row.map(|row| row.thinned(kept)))
+    let query = curves_query(source.lake.rig(), &quote_literal(surface), filter);
+    let row: Option<CurveRow> = source.query_rows(&query).await?.pop();
+    Ok(row.map(|row| row.curves_at(kept)))
 }
 
 #[derive(Deserialize)]
@@ -154,10 +155,10 @@ struct DerivedResponse {
 
 pub(super) async fn write_steps(source: &FigureSource, args: &StepsArgs) -> anyhow::Result<()> {
     let id = args.surface.as_str();
-    let surfaces = source.named(&[id]).await?;
+    let surfaces = source.named_surfaces(&[id]).await?;
     let rig = source.lake.rig();
     let run = surfaces[0].run_id.as_deref().with_context(|| format!("surface `{id}` has no run"))?;
-    let (quoted_run, pair) = (quoted(run), args.pair);
+    let (quoted_run, pair) = (quote_literal(run), args.pair);
     let recorded = format!(
         "select samples, sample_rate_hz, temperature_c, temperature_corrected from mcap({quoted_run}, '/ir') \
          where pair_id = {pair} and attempt = \
@@ -168,8 +169,8 @@ pub(super) async fn write_steps(source: &FigureSource, args: &StepsArgs) -> anyh
          left join nce n on n.run_id = m.run_id and n.pair_id = m.pair_id where m.run_id = {quoted_run} and m.pair_id = {pair}"
     );
     let missing = || format!("surface `{id}` has no pair {pair}; hint: 0 to {}", source.lake.grid().pairs().len() - 1);
-    let raw = source.rows::<RecordedResponse>(&recorded).await?.pop().with_context(missing)?;
-    let DerivedResponse { ir, reflected_ir } = source.rows(&derived).await?.pop().with_context(missing)?;
+    let raw = source.query_rows::<RecordedResponse>(&recorded).await?.pop().with_context(missing)?;
+    let DerivedResponse { ir, reflected_ir } = source.query_rows(&derived).await?.pop().with_context(missing)?;
     let hint = || format!("surface `{id}` has no reflected responses; hint: its Foam is missing");
     let reflected = reflected_ir.with_context(hint)?;
     let reference = rig.impulse_response.reference_temperature_c.get();
@@ -184,7 +185,7 @@ pub(super) async fn write_steps(source: &FigureSource, args: &StepsArgs) -> anyh
                 anyhow::ensure!((-60.0..=80.0).contains(celsius), "`--celsius` is {celsius}; it is -60 to 80");
                 let mut samples = vec![0.0; ir.len()];
                 let correction = ResponseCorrection::<f32>::new(reference, rig.impulse_response.division);
-                correction.run(&raw.samples, *celsius, &mut samples);
+                correction.correct_response(&raw.samples, *celsius, &mut samples);
                 traces.push(trace(format!("as if measured at {celsius} °C"), samples, own_step));
             }
             traces
@@ -204,21 +205,21 @@ pub(super) async fn write_steps(source: &FigureSource, args: &StepsArgs) -> anyh
         },
     ];
     let figure = StepsFigure { rows, from_ms: 0.0, to_ms: own_step * ir.len() as f64, width_px: 720.0 };
-    let title = args.output.title(|| format!("Response of {id}, pair {pair}"));
-    let notes = source.notes(title, format!("{recorded}; {derived}"), &surfaces);
+    let title = args.output.title_or(|| format!("Response of {id}, pair {pair}"));
+    let notes = source.figure_notes(title, format!("{recorded}; {derived}"), &surfaces);
     args.output.write_drawing(&figure.draw(&notes), &surfaces)
 }
 
 pub(super) async fn write_map(source: &FigureSource, args: &MapArgs) -> anyhow::Result<()> {
     let predicate = args.predicate.as_deref().unwrap_or("surface_id <> foam_reference");
-    let surfaces = source.selected(predicate).await?;
+    let surfaces = source.surfaces_where(predicate).await?;
     let names: Vec<_> = surfaces.iter().map(|surface| surface.surface_id.clone()).collect();
     let rig = source.lake.rig();
     let mut vectors = LevelVectors::new(&names, source.lake.grid().pairs().len(), rig.bands.centres_hz.len(), 1);
     let query = level_vectors_query(rig, "1");
     let mut answer = source.session().query(&query).await?;
     while let Some(batch) = answer.next().await? {
-        vectors.add(&batch)?;
+        vectors.add_batch(&batch)?;
     }
     let has_levels: Vec<_> = vectors.rows.iter().map(|row| row.iter().any(|level| level.is_finite())).collect();
     let mut placed = has_levels.iter();
@@ -226,12 +227,12 @@ pub(super) async fn write_map(source: &FigureSource, args: &MapArgs) -> anyhow::
     let surfaces: Vec<_> =
         surfaces.into_iter().zip(has_levels).filter(|(_, has)| *has).map(|(surface, _)| surface).collect();
     anyhow::ensure!(surfaces.len() > 1, "a map needs two surfaces with energies");
-    let found = PrincipalComponents::of(&mut vectors.rows, COMPONENTS)?;
+    let found = PrincipalComponents::from_rows(&mut vectors.rows, COMPONENTS)?;
     let rows = surfaces.iter().enumerate();
     let rows = rows.map(|(i, surface)| (i, surface.surface_id.as_str(), surface.typology.as_str()));
     let figure = MapFigure::of_components(&found, [0, 1], rows);
-    let title = args.output.title(|| MapFigure::default_title(surfaces.len(), LevelReference::FlatBand.unit()));
-    args.output.write_drawing(&figure.draw(&source.notes(title, query, &surfaces)), &[])
+    let title = args.output.title_or(|| MapFigure::default_title(surfaces.len(), LevelReference::FlatBand.unit()));
+    args.output.write_drawing(&figure.draw(&source.figure_notes(title, query, &surfaces)), &[])
 }
 
 #[derive(Deserialize)]
@@ -242,17 +243,17 @@ struct HeightmapRow {
 }
 
 pub(super) async fn write_relief(source: &FigureSource, args: &ReliefArgs) -> anyhow::Result<()> {
-    let surfaces = source.surfaces(&args.selection).await?;
+    let surfaces = source.selected_surfaces(&args.selection).await?;
     let query = |id: &str| {
         format!(
             "select cells, size_mm, heights_mm from heightmaps where surface_id = {id} and symmetry = 'identity' \
              order by run_id desc limit 1"
         )
     };
-    for group in args.output.groups(&surfaces)? {
+    for group in args.output.group_surfaces(&surfaces)? {
         let mut panels = Vec::new();
         for surface in group {
-            let row = source.rows::<HeightmapRow>(&query(&quoted(&surface.surface_id))).await?.pop();
+            let row = source.query_rows::<HeightmapRow>(&query(&quote_literal(&surface.surface_id))).await?.pop();
             let row = row.filter(|row| row.cells > 0 && row.heights_mm.len() == row.cells * row.cells);
             let missing =
                 || format!("surface `{}` has no height map; hint: its run came without a mesh", surface.surface_id);
@@ -261,15 +262,15 @@ pub(super) async fn write_relief(source: &FigureSource, args: &ReliefArgs) -> an
             let extent = heights.fold([f64::MAX, f64::MIN], |[low, high], h| [low.min(h), high.max(h)]);
             panels.push(ReliefPanel {
                 title: surface.surface_id.clone(),
-                shaded: heights::shaded(&row.heights_mm, row.size_mm / row.cells as f32)?,
+                shaded: heights::shade_heights(&row.heights_mm, row.size_mm / row.cells as f32)?,
                 cells: row.cells,
                 extent_mm: extent,
             });
         }
         let panel_mm = source.lake.rig().panel.size_mm;
         let figure = ReliefFigure { panels, panel_mm, panel_px: 200.0, columns: args.columns as usize };
-        let title = args.output.title(|| "Reliefs in oblique light".into());
-        let notes = source.notes(title, queries(group, query), group);
+        let title = args.output.title_or(|| "Reliefs in oblique light".into());
+        let notes = source.figure_notes(title, first_query(group, query), group);
         args.output.write_drawing(&figure.draw(&notes), group)?;
     }
     Ok(())

@@ -4,7 +4,7 @@ use std::collections::HashMap;
 
 use anyhow::Context as _;
 use echolake_figures::{FigureTable, TableRow};
-use echolake_query::figure_rows::{LevelReference, band_keys, band_labels, band_list, quoted};
+use echolake_query::figure_rows::{LevelReference, band_keys, band_labels, band_list, quote_literal};
 use serde::Deserialize;
 
 use super::source::{FigureSource, SelectedSurface};
@@ -27,20 +27,20 @@ struct SurfaceMeans {
 type QueriedTable = (FigureTable, String);
 
 pub(super) async fn write_table(source: &FigureSource, args: &TableArgs) -> anyhow::Result<()> {
-    let surfaces = source.surfaces(&args.selection).await?;
-    let base = source.base(args.less.as_ref()).await?;
+    let surfaces = source.selected_surfaces(&args.selection).await?;
+    let base = source.base_surface(args.less.as_ref()).await?;
     anyhow::ensure!(
         base.is_none() || args.values != ValuesArg::Energies,
         "--less subtracts levels, and --values energies has none; hint: leave one of them out"
     );
-    for group in args.output.groups(&surfaces)? {
+    for group in args.output.group_surfaces(&surfaces)? {
         let (table, query) = match args.values {
             ValuesArg::Levels => level_table(source, group, base.as_ref(), "p90_mean_db").await?,
             ValuesArg::UnbiasedLevels => level_table(source, group, base.as_ref(), "unbiased_p90_mean_db").await?,
             ValuesArg::Energies => energy_table(source, group).await?,
         };
-        let title = args.output.title(|| default_title(args.values, group, base.as_ref()));
-        let notes = source.notes(title, query, group.iter().chain(&base));
+        let title = args.output.title_or(|| default_title(args.values, group, base.as_ref()));
+        let notes = source.figure_notes(title, query, group.iter().chain(&base));
         args.output.write_table(&table, &notes, group)?;
     }
     Ok(())
@@ -66,7 +66,7 @@ fn level_unit(surfaces: &[SelectedSurface], base: Option<&SelectedSurface>) -> S
 }
 
 fn surface_list(surfaces: &[&str]) -> String {
-    surfaces.iter().map(|name| quoted(name)).collect::<Vec<_>>().join(", ")
+    surfaces.iter().map(|name| quote_literal(name)).collect::<Vec<_>>().join(", ")
 }
 
 async fn level_table(
@@ -82,7 +82,7 @@ async fn level_table(
         "select surface_id, band, {column} as level_db from surface_stats where surface_id in ({}) order by run_id",
         surface_list(&all)
     );
-    let rows: Vec<BandLevel> = source.rows(&query).await?;
+    let rows: Vec<BandLevel> = source.query_rows(&query).await?;
     // Of several runs of a surface, the newest counts.
     let levels: HashMap<_, _> =
         rows.iter().map(|row| ((row.surface_id.as_str(), row.band.as_str()), row.level_db)).collect();
@@ -121,7 +121,7 @@ async fn energy_table(source: &FigureSource, surfaces: &[SelectedSurface]) -> an
     let list = surface_list(&names);
     let query =
         format!("select surface_id, {means} as means from tnce where surface_id in ({list}) group by surface_id");
-    let rows: Vec<SurfaceMeans> = source.rows(&query).await?;
+    let rows: Vec<SurfaceMeans> = source.query_rows(&query).await?;
     let of = |name: &str| {
         let row = rows.iter().find(|row| row.surface_id == name);
         row.with_context(|| format!("surface `{name}` has no energies; hint: `echolake doctor` says what is missing"))

@@ -5,7 +5,7 @@ use echolake_panel::relief::{Error, PanelRelief, ParameterDomain, ReliefParamete
 
 use crate::CommandOutcome;
 
-pub(super) fn run(name: Option<&str>, json: bool) -> anyhow::Result<CommandOutcome> {
+pub(super) fn list_panels(name: Option<&str>, json: bool) -> anyhow::Result<CommandOutcome> {
     let panels: Vec<_> =
         PaperPanel::ALL.into_iter().filter(|panel| name.is_none_or(|name| name == panel.name)).collect();
     let names: Vec<&str> = name.map_or_else(|| PanelRelief::NAMES.to_vec(), |name| vec![name]);
@@ -16,15 +16,15 @@ pub(super) fn run(name: Option<&str>, json: bool) -> anyhow::Result<CommandOutco
         serde_json::to_string_pretty(&reliefs.iter().map(json_of).chain(panels).collect::<Vec<_>>())?
     } else {
         let panels = panels.iter().map(described_panel);
-        reliefs.iter().map(described).chain(panels).collect::<Vec<_>>().join("\n\n")
+        reliefs.iter().map(describe_relief).chain(panels).collect::<Vec<_>>().join("\n\n")
     };
-    super::super::print(&text)?;
+    super::super::print_line(&text)?;
     Ok(CommandOutcome::Whole)
 }
 
 fn json_of(relief: &PanelRelief) -> serde_json::Value {
     serde_json::json!({
-        "relief": relief.name(), "typology": relief.typology(), "parameters": relief.describe(),
+        "relief": relief.name(), "typology": relief.typology(), "parameters": relief.describe_parameters(),
     })
 }
 
@@ -44,13 +44,13 @@ fn described_panel(panel: &PaperPanel) -> String {
     format!("{name} (panel of the paper: {relief})\n  printed: {printed}\n  assumed: {assumed}{reference}{settings}")
 }
 
-fn described(relief: &PanelRelief) -> String {
-    let parameters = relief.describe();
-    let lines = parameters.iter().map(line).collect::<String>();
+fn describe_relief(relief: &PanelRelief) -> String {
+    let parameters = relief.describe_parameters();
+    let lines = parameters.iter().map(parameter_line).collect::<String>();
     format!("{} ({}){}", relief.name(), relief.typology(), if lines.is_empty() { ": no parameters" } else { &lines })
 }
 
-fn line(parameter: &ReliefParameter) -> String {
+fn parameter_line(parameter: &ReliefParameter) -> String {
     let default = match parameter.domain {
         ParameterDomain::Number { default, .. } => default.to_string(),
         ParameterDomain::Whole { default, .. } => default.to_string(),

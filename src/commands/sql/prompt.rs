@@ -35,9 +35,9 @@ struct PromptSettings {
     pager: bool,
 }
 
-pub(super) async fn run(session: &Session, lake: &Lake) -> anyhow::Result<()> {
+pub(super) async fn run_prompt(session: &Session, lake: &Lake) -> anyhow::Result<()> {
     let mut editor: Editor<WordCompleter, DefaultHistory> = Editor::new()?;
-    editor.set_helper(Some(WordCompleter::of(session)));
+    editor.set_helper(Some(WordCompleter::from_session(session)));
     editor.set_completion_type(CompletionType::List);
     editor.set_max_history_size(HISTORY)?;
     editor.set_history_ignore_dups(true)?;
@@ -62,12 +62,12 @@ pub(super) async fn run(session: &Session, lake: &Lake) -> anyhow::Result<()> {
             Err(e) => return Err(e.into()),
         };
         if begun.is_empty()
-            && let Some(command) = command::parse(&line)
+            && let Some(command) = command::parse_command(&line)
         {
             editor.add_history_entry(line.trim_end())?;
             match command {
                 Ok(PromptCommand::Quit) => break,
-                Ok(command) => obey(command, session, &mut settings)?,
+                Ok(command) => obey_command(command, session, &mut settings)?,
                 Err(message) => eprintln!("error: {message}"),
             }
             continue;
@@ -79,7 +79,7 @@ pub(super) async fn run(session: &Session, lake: &Lake) -> anyhow::Result<()> {
         }
         let sql = std::mem::take(&mut begun);
         editor.add_history_entry(sql.trim_end())?;
-        answer(session, sql.trim_end().trim_end_matches(';'), &mut settings).await;
+        answer_query(session, sql.trim_end().trim_end_matches(';'), &mut settings).await;
         // Kept at once: a closed terminal must not cost the history of a day.
         if let Some(file) = &history
             && let Err(e) = editor.append_history(file)
@@ -90,7 +90,7 @@ pub(super) async fn run(session: &Session, lake: &Lake) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn obey(command: PromptCommand, session: &Session, settings: &mut PromptSettings) -> anyhow::Result<()> {
+fn obey_command(command: PromptCommand, session: &Session, settings: &mut PromptSettings) -> anyhow::Result<()> {
     match command {
         PromptCommand::Quit => {}
         PromptCommand::Help => eprintln!("{HELP}"),
@@ -108,8 +108,8 @@ fn obey(command: PromptCommand, session: &Session, settings: &mut PromptSettings
         }
         PromptCommand::Output(path) => settings.output = path,
         PromptCommand::Tables | PromptCommand::Columns(_) | PromptCommand::Functions(_) => {
-            match description(session, &command) {
-                Ok(text) => pager::show(settings.pager, &text)?,
+            match command_description(session, &command) {
+                Ok(text) => pager::show_text(settings.pager, &text)?,
                 Err(e) => eprintln!("error: {e}"),
             }
         }
@@ -122,16 +122,17 @@ pub(super) fn command_answer(session: &Session, query: &str) -> Option<anyhow::R
     if !query.trim_start().starts_with('\\') {
         return None;
     }
-    let answer = |command: Result<PromptCommand, String>| description(session, &command.map_err(anyhow::Error::msg)?);
-    command::parse(query).map(answer)
+    let answer =
+        |command: Result<PromptCommand, String>| command_description(session, &command.map_err(anyhow::Error::msg)?);
+    command::parse_command(query).map(answer)
 }
 
 // Of tables, columns and functions; the other commands change the prompt.
-fn description(session: &Session, command: &PromptCommand) -> anyhow::Result<String> {
+fn command_description(session: &Session, command: &PromptCommand) -> anyhow::Result<String> {
     match command {
-        PromptCommand::Tables => Ok(tables(session)),
-        PromptCommand::Columns(table) => columns(session, table),
-        PromptCommand::Functions(part) => functions(session, part.as_deref()),
+        PromptCommand::Tables => Ok(list_tables(session)),
+        PromptCommand::Columns(table) => list_columns(session, table),
+        PromptCommand::Functions(part) => list_functions(session, part.as_deref()),
         _ => anyhow::bail!(
             "a command of the prompt alone; hint: `echolake sql` without a query, or \\d, \\d TABLE, \\df"
         ),
@@ -143,7 +144,7 @@ fn on_or_off(is_on: bool) -> &'static str {
 }
 
 // An error or an interrupt ends the query, not the prompt.
-async fn answer(session: &Session, sql: &str, settings: &mut PromptSettings) {
+async fn answer_query(session: &Session, sql: &str, settings: &mut PromptSettings) {
     let begun = Instant::now();
     let outcome = interrupted_or_given(session, sql, settings).await;
     settings.output = None;
@@ -158,12 +159,12 @@ async fn answer(session: &Session, sql: &str, settings: &mut PromptSettings) {
 async fn interrupted_or_given(session: &Session, sql: &str, settings: &PromptSettings) -> anyhow::Result<usize> {
     let mut interrupts = interrupt_signal()?;
     tokio::select! {
-        outcome = give(session, sql, settings) => outcome,
+        outcome = give_answer(session, sql, settings) => outcome,
         _ = interrupts.recv() => Err(anyhow::anyhow!("stopped")),
     }
 }
 
-async fn give(session: &Session, sql: &str, settings: &PromptSettings) -> anyhow::Result<usize> {
+async fn give_answer(session: &Session, sql: &str, settings: &PromptSettings) -> anyhow::Result<usize> {
     let answer = session.query(sql).await?;
     if let Some(path) = &settings.output {
         return super::to_file(answer, settings.format, path).await;
@@ -174,12 +175,12 @@ async fn give(session: &Session, sql: &str, settings: &PromptSettings) -> anyhow
         settings.format.name()
     );
     let mut page = pager::PageOutput::open(settings.pager);
-    let rows = super::write(answer, settings.format, &mut page).await?;
+    let rows = super::write_answer(answer, settings.format, &mut page).await?;
     page.flush().context("cannot write the answer")?;
     Ok(rows)
 }
 
-fn tables(session: &Session) -> String {
+fn list_tables(session: &Session) -> String {
     session
         .all_tables()
         .into_iter()
@@ -188,7 +189,7 @@ fn tables(session: &Session) -> String {
         .join("\n")
 }
 
-fn columns(session: &Session, table: &str) -> anyhow::Result<String> {
+fn list_columns(session: &Session, table: &str) -> anyhow::Result<String> {
     let found = session.all_tables().into_iter().find(|(name, _)| *name == table);
     let (_, schema) = found.with_context(|| format!("no table `{table}`; hint: \\d lists them"))?;
     let line = |field: &arrow::datatypes::Field| {
@@ -202,9 +203,9 @@ fn columns(session: &Session, table: &str) -> anyhow::Result<String> {
     Ok(schema.fields().iter().map(|f| line(f)).collect::<Vec<_>>().join("\n"))
 }
 
-fn functions(session: &Session, part: Option<&str>) -> anyhow::Result<String> {
+fn list_functions(session: &Session, part: Option<&str>) -> anyhow::Result<String> {
     let fits = |name: &str| part.is_none_or(|part| name.contains(part));
-    let mut found: Vec<_> = session.functions().into_iter().filter(|f| fits(&f.name)).collect();
+    let mut found: Vec<_> = session.sql_functions().into_iter().filter(|f| fits(&f.name)).collect();
     if let Some(whole) = found.iter().position(|f| part == Some(f.name.as_str())) {
         found = vec![found.swap_remove(whole)];
     }

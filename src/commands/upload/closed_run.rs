@@ -18,7 +18,7 @@ pub(super) struct ClosedRun {
 
 impl ClosedRun {
     /// Reads manifest and rig of a run file.
-    pub(super) fn read(path: &Path) -> anyhow::Result<Self> {
+    pub(super) fn from_file(path: &Path) -> anyhow::Result<Self> {
         let name = path.display();
         ensure!(
             !is_partial(path),

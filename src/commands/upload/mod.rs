@@ -59,18 +59,18 @@ struct RefusedUpload {
     reason: String,
 }
 
-pub(crate) async fn run(args: &UploadArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
+pub(crate) async fn run_upload(args: &UploadArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let stop = StopRequest::listen("stopping; what was sent is kept")?;
     let progress = CommandProgress::new();
     let files = run_files(&args.files, &progress)?;
     let mut summary = UploadSummary::default();
     let uploaded = tokio::select! {
         uploaded = upload_all(&files, lake_url, &progress, &mut summary) => uploaded,
-        () = stop.wait() => Err(anyhow::anyhow!("stopped; hint: run the same command again to resume")),
+        () = stop.wait_until_made() => Err(anyhow::anyhow!("stopped; hint: run the same command again to resume")),
     };
     match args.json {
-        true => super::print(&serde_json::to_string_pretty(&summary)?)?,
-        false => summary.runs.iter().try_for_each(|run| super::print(&run.path))?,
+        true => super::print_line(&serde_json::to_string_pretty(&summary)?)?,
+        false => summary.runs.iter().try_for_each(|run| super::print_line(&run.path))?,
     }
     uploaded?;
     if files.is_empty() {
@@ -86,7 +86,7 @@ pub(crate) async fn run(args: &UploadArgs, lake_url: &str) -> anyhow::Result<Com
 
 /// Uploads one closed run; errors keep it where it is.
 pub(super) async fn upload_one(file: &Path, lake_url: &str, progress: &CommandProgress) -> anyhow::Result<()> {
-    let run = ClosedRun::read(file)?;
+    let run = ClosedRun::from_file(file)?;
     let lake = open_or_make(lake_url, &run.rig).await?;
     upload_file(file, &run, &lake, progress).await.map(drop)
 }
@@ -94,10 +94,11 @@ pub(super) async fn upload_one(file: &Path, lake_url: &str, progress: &CommandPr
 /// Checks that runs of a rig can be uploaded to a location. A store that cannot be reached now may be there later.
 pub(super) async fn check_location(lake_url: &str, rig: &Rig, progress: &CommandProgress) -> anyhow::Result<()> {
     match Lake::open(lake_url).await {
-        Ok(lake) => Ok(lake.fits(rig)?),
+        Ok(lake) => Ok(lake.check_rig(rig)?),
         Err(LakeError::NoLake { .. }) if remote_access(lake_url).is_some() => Ok(()),
         Err(error @ LakeError::Store { .. }) => {
-            progress.say(format!("warning: {error}; the run is recorded, and its upload is tried at its end"));
+            progress
+                .print_message(format!("warning: {error}; the run is recorded, and its upload is tried at its end"));
             Ok(())
         }
         Err(error) => Err(error.into()),
@@ -116,7 +117,7 @@ fn run_files(named: &[PathBuf], progress: &CommandProgress) -> anyhow::Result<Ve
         let listed = listed().with_context(|| format!("cannot list `{}`", path.display()))?;
         let (partial, listed): (Vec<_>, Vec<_>) = listed.into_iter().partition(|file| is_partial(file));
         for unfinished in partial {
-            progress.say(format!("note: `{}` is unfinished and stays", unfinished.display()));
+            progress.print_message(format!("note: `{}` is unfinished and stays", unfinished.display()));
         }
         let mut runs: Vec<_> = listed.into_iter().filter(|f| f.extension().is_some_and(|e| e == EXTENSION)).collect();
         runs.sort();
@@ -135,12 +136,12 @@ async fn upload_all(
     let mut lake = None;
     for file in files {
         let uploaded = async {
-            let run = ClosedRun::read(file)?;
+            let run = ClosedRun::from_file(file)?;
             let lake = match &lake {
                 Some(lake) => lake,
                 None => lake.insert(open_or_make(lake_url, &run.rig).await?),
             };
-            lake.fits(&run.rig)?;
+            lake.check_rig(&run.rig)?;
             upload_file(file, &run, lake, progress).await
         };
         match uploaded.await {
@@ -148,7 +149,7 @@ async fn upload_all(
             Err(error) if concerns_lake(&error) => return Err(error),
             Err(error) => {
                 let reason = describe_error(&error);
-                progress.say(format!("error: {reason}"));
+                progress.print_message(format!("error: {reason}"));
                 summary.refused.push(RefusedUpload { file: file.display().to_string(), reason });
             }
         }
@@ -189,9 +190,9 @@ async fn upload_file(
 ) -> anyhow::Result<UploadedRun> {
     let size = std::fs::metadata(file).with_context(|| format!("cannot read `{}`", file.display()))?.len();
     let path = file.to_owned();
-    let mut reading = progress.task("read", size / MEGABYTE, "MB");
+    let mut reading = progress.start_task("read", size / MEGABYTE, "MB");
     let digest = move || {
-        let digest = echolake_lake::file_sha256(&path, &mut |bytes| reading.at(bytes / MEGABYTE));
+        let digest = echolake_lake::file_sha256(&path, &mut |bytes| reading.set_done(bytes / MEGABYTE));
         reading.dismiss();
         digest
     };
@@ -200,13 +201,13 @@ async fn upload_file(
     let (surface, run) = (run.manifest.surface_id.clone(), run.manifest.run_id.clone());
     let upload = RunUpload { file: file.to_owned(), surface, run, bytes, sha256 };
     let mut bars = UploadBars { progress, total: bytes / MEGABYTE, sending: None, comparing: None };
-    let outcome = lake.upload_run(&upload, &mut |step, bytes| bars.show(step, bytes)).await;
+    let outcome = lake.upload_run(&upload, &mut |step, bytes| bars.show_bytes(step, bytes)).await;
     let RunUpload { surface, run, bytes, sha256, .. } = upload;
-    bars.end(outcome.is_ok().then(|| format!("{run}, {}, SHA-256 compared", super::size(bytes))));
+    bars.end_bars(outcome.is_ok().then(|| format!("{run}, {}, SHA-256 compared", super::format_size(bytes))));
     let (path, uploaded) = match outcome? {
         UploadOutcome::Uploaded(path) => (path.to_string(), true),
         UploadOutcome::Present(path) => {
-            progress.say(format!("{run}: is in the lake already, at `{path}`, with the same SHA-256"));
+            progress.print_message(format!("{run}: is in the lake already, at `{path}`, with the same SHA-256"));
             (path.to_string(), false)
         }
     };
@@ -224,23 +225,23 @@ struct UploadBars<'a> {
 }
 
 impl UploadBars<'_> {
-    fn show(&mut self, step: UploadStep, bytes: u64) {
+    fn show_bytes(&mut self, step: UploadStep, bytes: u64) {
         let (bar, name) = match step {
             UploadStep::Send => (&mut self.sending, "upload"),
             UploadStep::Compare => (&mut self.comparing, "compare"),
         };
         let begin = || {
-            let mut task = self.progress.task(name, self.total, "MB");
+            let mut task = self.progress.start_task(name, self.total, "MB");
             task.begin_at(bytes / MEGABYTE);
             task
         };
-        bar.get_or_insert_with(begin).at(bytes / MEGABYTE);
+        bar.get_or_insert_with(begin).set_done(bytes / MEGABYTE);
     }
 
-    fn end(self, done: Option<String>) {
+    fn end_bars(self, done: Option<String>) {
         self.comparing.into_iter().for_each(TaskProgress::dismiss);
         match (self.sending, done) {
-            (Some(task), Some(done)) => task.done(done),
+            (Some(task), Some(done)) => task.finish_with(done),
             (sending, _) => sending.into_iter().for_each(TaskProgress::dismiss),
         }
     }

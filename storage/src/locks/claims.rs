@@ -112,32 +112,32 @@ impl WorkClaims {
     }
 
     /// Claims work by its name.
-    pub async fn claim(&self, work: &str) -> ClaimOutcome {
+    pub async fn claim_work(&self, work: &str) -> ClaimOutcome {
         let key = key_of(work);
         // A store that fails will fail the work, too, and say so.
-        self.state.claim(&key).await.unwrap_or(ClaimOutcome::Granted)
+        self.state.claim_key(&key).await.unwrap_or(ClaimOutcome::Granted)
     }
 
     /// Gives work back, soon.
-    pub fn release(&self, work: &str) {
+    pub fn release_work(&self, work: &str) {
         // Without its keeper, all is given back already.
         let _ = self.ended.send(key_of(work));
     }
 
     /// Looks at all claims, in one request and one for each claim that is new.
-    pub async fn look(&self) {
+    pub async fn refresh_claims(&self) {
         // A store that fails will fail the work, too, and say so.
-        let _ = self.state.look().await;
+        let _ = self.state.refresh_claims().await;
     }
 
     /// Returns whether, at the last look, nobody alive held this work, this process included.
     pub fn is_free(&self, work: &str) -> bool {
-        let (key, board) = (key_of(work), self.state.board());
+        let (key, board) = (key_of(work), self.state.lock_board());
         !board.held.contains_key(&key) && board.seen.get(&key).is_none_or(|seen| self.state.is_dead(seen))
     }
 
     /// Gives back all that is held.
-    pub async fn close(self) {
+    pub async fn release_all(self) {
         drop(self.ended);
         // A panic there has nothing to do with the work.
         let _ = self.keeper.await;
@@ -145,7 +145,7 @@ impl WorkClaims {
 }
 
 impl ClaimState {
-    fn board(&self) -> MutexGuard<'_, ClaimBoard> {
+    fn lock_board(&self) -> MutexGuard<'_, ClaimBoard> {
         self.board.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -153,45 +153,45 @@ impl ClaimState {
         claim.has_ended() || claim.since.elapsed() >= self.times.dead_after
     }
 
-    async fn claim(&self, key: &str) -> StoreResult<ClaimOutcome> {
-        let dead = || self.board().seen.get(key).filter(|claim| self.is_dead(claim)).cloned();
+    async fn claim_key(&self, key: &str) -> StoreResult<ClaimOutcome> {
+        let dead = || self.lock_board().seen.get(key).filter(|claim| self.is_dead(claim)).cloned();
         // What was seen long ago may be gone since.
         if dead().is_some() {
-            self.look().await?;
+            self.refresh_claims().await?;
         }
         let mut number = dead().map_or(1, |claim| claim.number + 1);
-        if !self.create(key, number).await? {
-            self.look().await?;
-            let ended = self.board().seen.get(key).filter(|claim| claim.has_ended()).map(|claim| claim.number);
+        if !self.create_claim(key, number).await? {
+            self.refresh_claims().await?;
+            let ended = self.lock_board().seen.get(key).filter(|claim| claim.has_ended()).map(|claim| claim.number);
             let Some(last) = ended else { return Ok(ClaimOutcome::Denied) };
             number = last + 1;
-            if !self.create(key, number).await? {
+            if !self.create_claim(key, number).await? {
                 return Ok(ClaimOutcome::Denied);
             }
         }
-        let mut board = self.board();
+        let mut board = self.lock_board();
         board.seen.remove(key);
         board.held.insert(key.to_owned(), number);
         Ok(ClaimOutcome::Granted)
     }
 
     // Notes the highest number of each claim of others, and when it was first seen.
-    async fn look(&self) -> StoreResult<()> {
+    async fn refresh_claims(&self) -> StoreResult<()> {
         let mut highest: HashMap<String, u64> = HashMap::new();
-        for (key, number) in self.numbers().await? {
+        for (key, number) in self.list_claims().await? {
             let last = highest.entry(key).or_default();
             *last = number.max(*last);
         }
         let news: Vec<_> = {
-            let mut board = self.board();
+            let mut board = self.lock_board();
             let ClaimBoard { seen, held } = &mut *board;
             seen.retain(|key, claim| highest.get(key) == Some(&claim.number));
             highest.retain(|key, _| !held.contains_key(key) && !seen.contains_key(key));
             highest.into_iter().collect()
         };
-        let claims = news.iter().map(|(key, number)| self.read(key, *number));
+        let claims = news.iter().map(|(key, number)| self.read_claim(key, *number));
         let claims = join_all(claims).await;
-        let mut board = self.board();
+        let mut board = self.lock_board();
         let claims = news.into_iter().zip(claims).filter(|((key, _), _)| !board.held.contains_key(key));
         let claims: Vec<_> = claims.map(|((key, _), claim)| (key, claim)).collect();
         board.seen.extend(claims);
@@ -199,52 +199,52 @@ impl ClaimState {
     }
 
     // One that cannot be read lives until its time is over.
-    async fn read(&self, key: &str, number: u64) -> SeenClaim {
+    async fn read_claim(&self, key: &str, number: u64) -> SeenClaim {
         let since = Instant::now();
-        let text = async { self.store.get(&object(key, number)).await?.bytes().await };
+        let text = async { self.store.get(&claim_path(key, number)).await?.bytes().await };
         let process = |text: &Bytes| serde_json::from_slice(text.split(|byte| *byte == b'\n').nth(1)?).ok();
         SeenClaim { number, since, holder: text.await.ok().as_ref().and_then(process) }
     }
 
     // Returns whether it was created; false if another process has the number.
-    async fn create(&self, key: &str, number: u64) -> StoreResult<bool> {
+    async fn create_claim(&self, key: &str, number: u64) -> StoreResult<bool> {
         let text = format!("{} {number}\n{}\n", self.holder, self.process);
-        create_object(self.store.as_ref(), &object(key, number), text.into()).await
+        create_object(self.store.as_ref(), &claim_path(key, number), text.into()).await
     }
 
-    async fn numbers(&self) -> StoreResult<Vec<(String, u64)>> {
+    async fn list_claims(&self) -> StoreResult<Vec<(String, u64)>> {
         let there: Vec<_> = self.store.list(Some(&Path::from(FOLDER))).try_collect().await?;
         Ok(there.iter().filter_map(|meta| claim_of(&meta.location)).collect())
     }
 
     // The first number stays until the end, so that to create it is to find the work free.
-    async fn renew(&self) {
-        let held: Vec<_> = self.board().held.iter().map(|(key, number)| (key.clone(), *number)).collect();
+    async fn renew_claims(&self) {
+        let held: Vec<_> = self.lock_board().held.iter().map(|(key, number)| (key.clone(), *number)).collect();
         for (key, number) in held {
-            match self.create(&key, number + 1).await {
+            match self.create_claim(&key, number + 1).await {
                 Ok(true) => {
-                    self.board().held.insert(key.clone(), number + 1);
+                    self.lock_board().held.insert(key.clone(), number + 1);
                     if number > 1 {
-                        let _ = self.store.delete(&object(&key, number)).await;
+                        let _ = self.store.delete(&claim_path(&key, number)).await;
                     }
                 }
                 // Another process took it over, or its objects were deleted; the work goes on.
-                Ok(false) => drop(self.board().held.remove(&key)),
+                Ok(false) => drop(self.lock_board().held.remove(&key)),
                 Err(_) => {}
             }
         }
     }
 
     async fn give_back(&self, keys: &[String]) {
-        let held: Vec<_> = keys.iter().filter(|key| self.board().held.remove(*key).is_some()).collect();
+        let held: Vec<_> = keys.iter().filter(|key| self.lock_board().held.remove(*key).is_some()).collect();
         if held.is_empty() {
             return;
         }
-        let mut numbers = self.numbers().await.unwrap_or_default();
+        let mut numbers = self.list_claims().await.unwrap_or_default();
         numbers.sort_unstable_by_key(|(_, number)| std::cmp::Reverse(*number));
         for (key, number) in numbers.iter().filter(|(key, _)| held.contains(&key)) {
             // One that stays is dead after a while.
-            let _ = self.store.delete(&object(key, *number)).await;
+            let _ = self.store.delete(&claim_path(key, *number)).await;
         }
     }
 }
@@ -265,10 +265,10 @@ async fn keep_claims(state: Arc<ClaimState>, mut released: mpsc::UnboundedReceiv
                 }
                 None => break,
             },
-            _ = renewals.tick() => state.renew().await,
+            _ = renewals.tick() => state.renew_claims().await,
         }
     }
-    let held: Vec<_> = state.board().held.keys().cloned().collect();
+    let held: Vec<_> = state.lock_board().held.keys().cloned().collect();
     state.give_back(&held).await;
 }
 
@@ -276,7 +276,7 @@ fn key_of(work: &str) -> String {
     hex::encode(Sha256::digest(work.as_bytes()))[..KEY_DIGITS].to_owned()
 }
 
-fn object(key: &str, number: u64) -> Path {
+fn claim_path(key: &str, number: u64) -> Path {
     Path::from(format!("{FOLDER}/{key}.{number:020}"))
 }
 
@@ -313,72 +313,72 @@ mod tests {
     async fn of_many_one_is_granted_and_after_its_end_another() {
         let lake = lake().await;
         let claimers: Vec<_> = (0..8).map(|_| WorkClaims::start(&lake, ClaimTimes::default())).collect();
-        let outcomes = futures::future::join_all(claimers.iter().map(|claims| claims.claim(WORK))).await;
+        let outcomes = futures::future::join_all(claimers.iter().map(|claims| claims.claim_work(WORK))).await;
         let granted: Vec<_> = (0..8).filter(|n| outcomes[*n] == ClaimOutcome::Granted).collect();
         assert_eq!(granted.len(), 1, "{outcomes:?}");
         let other = &claimers[(granted[0] + 1) % 8];
-        assert_eq!(other.claim("another.mcap").await, ClaimOutcome::Granted);
+        assert_eq!(other.claim_work("another.mcap").await, ClaimOutcome::Granted);
         let third = &claimers[(granted[0] + 2) % 8];
         for claims in [third, &claimers[granted[0]]] {
-            claims.look().await;
+            claims.refresh_claims().await;
             assert!(!claims.is_free(WORK) && claims.is_free("free.mcap"));
         }
         for claims in claimers {
-            claims.close().await;
+            claims.release_all().await;
         }
         assert!(objects(&lake).await.is_empty());
         let next = WorkClaims::start(&lake, ClaimTimes::default());
-        assert_eq!(next.claim(WORK).await, ClaimOutcome::Granted);
+        assert_eq!(next.claim_work(WORK).await, ClaimOutcome::Granted);
     }
 
     #[tokio::test]
     async fn a_claim_of_a_process_that_was_killed_on_this_machine_is_dead_at_once() {
         let lake = lake().await;
         let mut child = std::process::Command::new("sleep").arg("600").spawn().expect("it starts");
-        let running = ProcessIdentity::find(child.id()).expect("it runs");
+        let running = ProcessIdentity::from_pid(child.id()).expect("it runs");
         let text = format!("host 1 x 1\n{}\n", serde_json::to_string(&running).expect("text"));
-        lake.store().put(&object(&key_of(WORK), 1), text.into()).await.expect("written");
+        lake.store().put(&claim_path(&key_of(WORK), 1), text.into()).await.expect("written");
         let patient = || WorkClaims::start(&lake, ClaimTimes { renew_every: Duration::from_secs(3600), ..LIVELY });
         let first = patient();
-        assert_eq!(first.claim(WORK).await, ClaimOutcome::Denied);
+        assert_eq!(first.claim_work(WORK).await, ClaimOutcome::Denied);
         assert!(!first.is_free(WORK));
         child.kill().expect("killed");
         child.wait().expect("ended");
         assert!(first.is_free(WORK), "it looked before");
         let (second, third) = (patient(), patient());
-        assert_eq!(second.claim(WORK).await, ClaimOutcome::Granted);
-        assert_eq!(third.claim(WORK).await, ClaimOutcome::Denied, "the second one runs");
+        assert_eq!(second.claim_work(WORK).await, ClaimOutcome::Granted);
+        assert_eq!(third.claim_work(WORK).await, ClaimOutcome::Denied, "the second one runs");
     }
 
     #[tokio::test]
     async fn a_claim_is_dead_if_its_number_stays_the_same_and_alive_if_it_changes() {
         let lake = lake().await;
         let dead = WorkClaims::start(&lake, STOPPED);
-        assert_eq!(dead.claim(WORK).await, ClaimOutcome::Granted);
+        assert_eq!(dead.claim_work(WORK).await, ClaimOutcome::Granted);
         let second = WorkClaims::start(&lake, STOPPED);
-        assert_eq!(second.claim(WORK).await, ClaimOutcome::Denied, "seen for the first time");
-        second.look().await;
+        assert_eq!(second.claim_work(WORK).await, ClaimOutcome::Denied, "seen for the first time");
+        second.refresh_claims().await;
         assert!(second.is_free(WORK));
-        assert_eq!(second.claim(WORK).await, ClaimOutcome::Granted, "its number did not change");
+        assert_eq!(second.claim_work(WORK).await, ClaimOutcome::Granted, "its number did not change");
         // It was not dead: it finds its number taken, and gives back nothing of the other's.
-        dead.state.renew().await;
-        dead.close().await;
+        dead.state.renew_claims().await;
+        dead.release_all().await;
         let third = WorkClaims::start(&lake, ClaimTimes::default());
-        assert_eq!(third.claim(WORK).await, ClaimOutcome::Denied);
-        second.close().await;
+        assert_eq!(third.claim_work(WORK).await, ClaimOutcome::Denied);
+        second.release_all().await;
         assert!(objects(&lake).await.is_empty());
 
         let alive = WorkClaims::start(&lake, LIVELY);
-        assert_eq!(alive.claim(WORK).await, ClaimOutcome::Granted);
+        assert_eq!(alive.claim_work(WORK).await, ClaimOutcome::Granted);
         let patient = ClaimTimes { dead_after: Duration::from_millis(500), ..STOPPED };
         let other = WorkClaims::start(&lake, patient);
         for _ in 0..10 {
             tokio::time::sleep(Duration::from_millis(100)).await;
-            assert_eq!(other.claim(WORK).await, ClaimOutcome::Denied);
+            assert_eq!(other.claim_work(WORK).await, ClaimOutcome::Denied);
         }
-        alive.release(WORK);
+        alive.release_work(WORK);
         for _ in 0..500 {
-            if other.claim(WORK).await == ClaimOutcome::Granted {
+            if other.claim_work(WORK).await == ClaimOutcome::Granted {
                 return;
             }
             tokio::time::sleep(Duration::from_millis(10)).await;

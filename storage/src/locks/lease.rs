@@ -64,7 +64,7 @@ impl LeaseRecord {
         self.expires > Utc::now() && !self.process.as_ref().is_some_and(ProcessIdentity::has_ended)
     }
 
-    fn bytes(&self) -> Vec<u8> {
+    fn to_json(&self) -> Vec<u8> {
         // A struct of texts and numbers always has a JSON form.
         serde_json::to_vec_pretty(self).unwrap_or_default()
     }
@@ -79,15 +79,15 @@ impl MaintenanceLease {
         lake.ensure_exclusive().await?;
         let (store, location, record) = (lake.store(), lake.location().to_owned(), LeaseRecord::new());
         let last = last_number(store.as_ref()).await?;
-        if let Some(held) = read(store.as_ref(), last).await?
+        if let Some(held) = read_lease(store.as_ref(), last).await?
             && held.is_held()
         {
-            return Err(maintained(location, &held));
+            return Err(maintained_error(location, &held));
         }
         let number = last + 1;
-        if !create(store.as_ref(), number, &record).await? {
-            let held = read(store.as_ref(), number).await?.unwrap_or(record);
-            return Err(maintained(location, &held));
+        if !create_lease(store.as_ref(), number, &record).await? {
+            let held = read_lease(store.as_ref(), number).await?.unwrap_or(record);
+            return Err(maintained_error(location, &held));
         }
         delete_before(store.as_ref(), number).await;
         let now = Instant::now();
@@ -103,7 +103,7 @@ impl MaintenanceLease {
         let lost = || Error::LeaseLost { location: self.location.clone() };
         if self.renewed.elapsed() >= RENEW_EVERY {
             self.record.expires = Utc::now() + HOLDS;
-            if !create(self.store.as_ref(), self.number + 1, &self.record).await? {
+            if !create_lease(self.store.as_ref(), self.number + 1, &self.record).await? {
                 return Err(lost());
             }
             self.number += 1;
@@ -111,7 +111,7 @@ impl MaintenanceLease {
             self.renewed = Instant::now();
             self.looked = self.renewed;
         } else if self.looked.elapsed() >= self.look_every {
-            if read(self.store.as_ref(), self.number + 1).await?.is_some() {
+            if read_lease(self.store.as_ref(), self.number + 1).await?.is_some() {
                 return Err(lost());
             }
             self.looked = Instant::now();
@@ -125,19 +125,19 @@ impl MaintenanceLease {
     /// What the store says.
     pub(crate) async fn release(mut self) -> Result<()> {
         self.record.expires = DateTime::UNIX_EPOCH;
-        if create(self.store.as_ref(), self.number + 1, &self.record).await? {
+        if create_lease(self.store.as_ref(), self.number + 1, &self.record).await? {
             delete_before(self.store.as_ref(), self.number + 1).await;
         }
         Ok(())
     }
 }
 
-fn maintained(location: String, held: &LeaseRecord) -> Error {
+fn maintained_error(location: String, held: &LeaseRecord) -> Error {
     let until = held.expires.format("%Y-%m-%d %H:%M:%S UTC").to_string();
     Error::Maintained { location, host: held.host.clone(), pid: held.pid, until }
 }
 
-fn object(number: u64) -> Path {
+fn lease_path(number: u64) -> Path {
     Path::from(format!("{FOLDER}/{number:020}.json"))
 }
 
@@ -145,33 +145,33 @@ fn number_of(path: &Path) -> Option<u64> {
     path.filename()?.strip_suffix(".json")?.parse().ok()
 }
 
-async fn numbers(store: &dyn ObjectStore) -> object_store::Result<Vec<u64>> {
+async fn list_numbers(store: &dyn ObjectStore) -> object_store::Result<Vec<u64>> {
     let there: Vec<_> = store.list(Some(&Path::from(FOLDER))).try_collect().await?;
     Ok(there.iter().filter_map(|object| number_of(&object.location)).collect())
 }
 
 async fn last_number(store: &dyn ObjectStore) -> Result<u64> {
-    let numbers = numbers(store).await.map_err(|e| Error::store("list", FOLDER, e))?;
+    let numbers = list_numbers(store).await.map_err(|e| Error::store_failure("list", FOLDER, e))?;
     Ok(numbers.into_iter().max().unwrap_or(0))
 }
 
 // Returns whether it was created; false if another process took the number.
-async fn create(store: &dyn ObjectStore, number: u64, record: &LeaseRecord) -> Result<bool> {
-    let created = create_object(store, &object(number), record.bytes().into()).await;
-    created.map_err(|e| Error::store("write", object(number), e))
+async fn create_lease(store: &dyn ObjectStore, number: u64, record: &LeaseRecord) -> Result<bool> {
+    let created = create_object(store, &lease_path(number), record.to_json().into()).await;
+    created.map_err(|e| Error::store_failure("write", lease_path(number), e))
 }
 
 // Lower numbers say nothing any more; those that stay are deleted by the next holder.
 async fn delete_before(store: &dyn ObjectStore, number: u64) {
-    for old in numbers(store).await.unwrap_or_default().into_iter().filter(|old| *old < number) {
-        let _ = store.delete(&object(old)).await;
+    for old in list_numbers(store).await.unwrap_or_default().into_iter().filter(|old| *old < number) {
+        let _ = store.delete(&lease_path(old)).await;
     }
 }
 
 // One that cannot be read holds from its making on, as any other.
-async fn read(store: &dyn ObjectStore, number: u64) -> Result<Option<LeaseRecord>> {
-    let failed = |e| Error::store("read", object(number), e);
-    let found = match store.get(&object(number)).await {
+async fn read_lease(store: &dyn ObjectStore, number: u64) -> Result<Option<LeaseRecord>> {
+    let failed = |e| Error::store_failure("read", lease_path(number), e);
+    let found = match store.get(&lease_path(number)).await {
         Ok(found) => found,
         Err(object_store::Error::NotFound { .. }) => return Ok(None),
         Err(e) => return Err(failed(e)),
@@ -214,9 +214,9 @@ mod tests {
         let lake = lake().await;
         let mut first = MaintenanceLease::acquire(&lake).await.expect("free");
         let mut child = std::process::Command::new("sleep").arg("600").spawn().expect("it starts");
-        let running = ProcessIdentity::find(child.id()).expect("it runs");
+        let running = ProcessIdentity::from_pid(child.id()).expect("it runs");
         first.record.process = Some(running);
-        lake.store().put(&object(first.number), first.record.bytes().into()).await.expect("written");
+        lake.store().put(&lease_path(first.number), first.record.to_json().into()).await.expect("written");
         assert!(matches!(MaintenanceLease::acquire(&lake).await, Err(Error::Maintained { .. })));
         child.kill().expect("killed");
         child.wait().expect("ended");
@@ -228,13 +228,13 @@ mod tests {
         let lake = lake().await;
         let mut first = MaintenanceLease::acquire(&lake).await.expect("free");
         first.record.expires = Utc::now() - TimeDelta::seconds(1);
-        lake.store().put(&object(first.number), first.record.bytes().into()).await.expect("written");
+        lake.store().put(&lease_path(first.number), first.record.to_json().into()).await.expect("written");
         let mut second = MaintenanceLease::acquire(&lake).await.expect("run out");
         assert!(matches!(first.ensure_held().await, Err(Error::LeaseLost { .. })));
         first.release().await.expect("not ours, left alone");
         second.ensure_held().await.expect("held");
         second.release().await.expect("given back");
-        let there = numbers(lake.store().as_ref()).await.expect("listed");
+        let there = list_numbers(lake.store().as_ref()).await.expect("listed");
         assert_eq!(there, [3], "taken twice and given back, and no number is used again");
     }
 }

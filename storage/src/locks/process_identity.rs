@@ -27,12 +27,12 @@ enum ProcessState {
 impl ProcessIdentity {
     /// Returns the identity of this process; None if the system does not tell.
     pub(super) fn current() -> Option<Self> {
-        Self::find(std::process::id())
+        Self::from_pid(std::process::id())
     }
 
     /// Returns the identity of a running process of this machine.
-    pub(super) fn find(pid: u32) -> Option<Self> {
-        let ProcessState::Running { started_ticks } = state(pid) else { return None };
+    pub(super) fn from_pid(pid: u32) -> Option<Self> {
+        let ProcessState::Running { started_ticks } = process_state(pid) else { return None };
         let boot = fs::read_to_string("/proc/sys/kernel/random/boot_id").ok()?.trim().to_owned();
         let namespace = fs::read_link("/proc/self/ns/pid").ok()?.to_string_lossy().into_owned();
         Some(Self { boot, namespace, pid, started_ticks })
@@ -42,9 +42,9 @@ impl ProcessIdentity {
     pub(super) fn has_ended(&self) -> bool {
         let is_here = Self::current().is_some_and(|here| here.boot == self.boot && here.namespace == self.namespace);
         is_here
-            && match state(self.pid) {
+            && match process_state(self.pid) {
                 // Some systems hide the processes of others; the first one is hidden then, too.
-                ProcessState::Absent => matches!(state(1), ProcessState::Running { .. }),
+                ProcessState::Absent => matches!(process_state(1), ProcessState::Running { .. }),
                 ProcessState::Running { started_ticks } => started_ticks != self.started_ticks,
                 ProcessState::Unknown => false,
             }
@@ -52,7 +52,7 @@ impl ProcessIdentity {
 }
 
 // One that was killed and that its parent has not waited for yet counts as absent.
-fn state(pid: u32) -> ProcessState {
+fn process_state(pid: u32) -> ProcessState {
     let text = match fs::read_to_string(format!("/proc/{pid}/stat")) {
         Ok(text) => text,
         Err(error) if error.kind() == ErrorKind::NotFound => return ProcessState::Absent,
@@ -83,7 +83,7 @@ mod tests {
     fn what_runs_has_not_ended_and_what_was_killed_has() {
         assert!(!ProcessIdentity::current().expect("Linux tells").has_ended());
         let mut child = Command::new("sleep").arg("600").spawn().expect("it starts");
-        let identity = ProcessIdentity::find(child.id()).expect("it runs");
+        let identity = ProcessIdentity::from_pid(child.id()).expect("it runs");
         assert!(!identity.has_ended());
         let successor = ProcessIdentity { started_ticks: identity.started_ticks + 1, ..identity.clone() };
         assert!(successor.has_ended(), "its id is another process's by now");

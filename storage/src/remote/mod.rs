@@ -32,7 +32,7 @@ pub(crate) use exclusion::{ExclusionFault, create_object, probe_exclusion};
 pub use object_folder::ObjectFolder;
 pub(crate) use part_store::PartStore;
 #[cfg(feature = "tables")]
-pub(crate) use retrying::backoff;
+pub(crate) use retrying::backoff_time;
 pub(crate) use retrying::{RetriedError, RetryingStore};
 
 /// Abilities of an object store beyond reads and writes of whole objects.
@@ -57,7 +57,7 @@ pub(crate) fn open_store(url: &Url) -> Result<(Arc<dyn ObjectStore>, PartStore),
         return Err("expected a bucket and a prefix, and nothing else".into());
     }
     let prefix = ObjectPath::from_url_path(url.path())?;
-    let (store, parts) = settings::store(url.scheme(), bucket)?;
+    let (store, parts) = settings::build_store(url.scheme(), bucket)?;
     let parts = PartStore::new(parts, prefix.clone());
     let store: Arc<dyn ObjectStore> = Arc::new(RetryingStore::new(store));
     let has_prefix = !prefix.as_ref().is_empty();

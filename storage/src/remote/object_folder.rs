@@ -19,7 +19,7 @@ use crate::{Error, Result};
 /// # async fn example() -> echolake_lake::Result<()> {
 /// let folder = echolake_lake::ObjectFolder::open("s3://bucket/reliefs")?;
 /// folder.ensure_empty().await?;
-/// folder.send(std::path::Path::new("reliefs/README.md"), "README.md").await?;
+/// folder.send_file(std::path::Path::new("reliefs/README.md"), "README.md").await?;
 /// # Ok(())
 /// # }
 /// ```
@@ -48,7 +48,7 @@ impl ObjectFolder {
     /// [`Error::ObjectExists`], or what the store says.
     pub async fn ensure_empty(&self) -> Result<()> {
         let first = self.store.list(None).try_next().await;
-        match first.map_err(|e| Error::store("list", &self.location, e))? {
+        match first.map_err(|e| Error::store_failure("list", &self.location, e))? {
             Some(_) => Err(Error::ObjectExists { path: self.location.clone() }),
             None => Ok(()),
         }
@@ -63,7 +63,7 @@ impl ObjectFolder {
         match self.store.head(&Path::from(name)).await {
             Ok(_) => Err(Error::ObjectExists { path }),
             Err(StoreError::NotFound { .. }) => Ok(()),
-            Err(e) => Err(Error::store("read", path, e)),
+            Err(e) => Err(Error::store_failure("read", path, e)),
         }
     }
 
@@ -71,11 +71,11 @@ impl ObjectFolder {
     ///
     /// # Errors
     /// [`Error::ObjectExists`], [`Error::UploadFile`] if the file cannot be read, or what the store says.
-    pub async fn send(&self, file: &FsPath, name: &str) -> Result<()> {
+    pub async fn send_file(&self, file: &FsPath, name: &str) -> Result<()> {
         let (to, text) = (Path::from(name), object_text(&self.location, name));
         let failed = |action: &'static str| {
             let text = text.clone();
-            move |e| Error::store(action, text, e)
+            move |e| Error::store_failure(action, text, e)
         };
         let unreadable = |source| Error::UploadFile { action: "read", file: file.to_owned(), source, hint: "" };
         let bytes = std::fs::metadata(file).map_err(unreadable)?.len();

@@ -7,7 +7,7 @@ use object_store::multipart::{MultipartStore, PartId};
 use object_store::path::Path;
 use object_store::{PutPayload, Result as StoreResult};
 
-use super::retrying::retry;
+use super::retrying::retry_operation;
 
 /// Uploads in parts to a lake's part of a bucket. Whatever can be repeated is repeated.
 pub(crate) struct PartStore {
@@ -33,7 +33,7 @@ impl PartStore {
     /// Begins an upload; returns its id. An id whose answer was lost is never used: the bucket's rule aborts it.
     pub(crate) async fn begin_upload(&self, path: &Path) -> StoreResult<String> {
         let path = self.path_in_bucket(path);
-        retry(|| self.store.create_multipart(&path)).await
+        retry_operation(|| self.store.create_multipart(&path)).await
     }
 
     /// Uploads a part; parts count from 0. Returns its id.
@@ -45,7 +45,7 @@ impl PartStore {
         part: PutPayload,
     ) -> StoreResult<String> {
         let (path, upload) = (self.path_in_bucket(path), upload.to_owned());
-        let part_id = retry(|| self.store.put_part(&path, &upload, number, part.clone())).await?;
+        let part_id = retry_operation(|| self.store.put_part(&path, &upload, number, part.clone())).await?;
         Ok(part_id.content_id)
     }
 
@@ -53,6 +53,6 @@ impl PartStore {
     pub(crate) async fn complete_upload(&self, path: &Path, upload: &str, parts: Vec<String>) -> StoreResult<()> {
         let (path, upload) = (self.path_in_bucket(path), upload.to_owned());
         let parts: Vec<_> = parts.into_iter().map(|content_id| PartId { content_id }).collect();
-        retry(|| self.store.complete_multipart(&path, &upload, parts.clone())).await.map(drop)
+        retry_operation(|| self.store.complete_multipart(&path, &upload, parts.clone())).await.map(drop)
     }
 }

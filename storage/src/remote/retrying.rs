@@ -41,7 +41,7 @@ pub(crate) struct RetriedError {
 }
 
 /// Time to wait after this many failures, half of it by chance, so that writers that met once do not meet again.
-pub(crate) fn backoff(failures: u32) -> Duration {
+pub(crate) fn backoff_time(failures: u32) -> Duration {
     let longest = FIRST_BACKOFF.saturating_mul(1 << failures.saturating_sub(1).min(10)).min(LONGEST_BACKOFF);
     let chance = (Uuid::new_v4().as_u128() >> 96) as f64 / f64::from(u32::MAX);
     longest.mul_f64(0.5 + chance / 2.0)
@@ -65,13 +65,13 @@ impl RetryingStore {
 }
 
 /// Repeats an operation that may be repeated until it succeeds, fails for good, or was tried too often.
-pub(super) async fn retry<T, F: Future<Output = StoreResult<T>>>(work: impl Fn() -> F) -> StoreResult<T> {
+pub(super) async fn retry_operation<T, F: Future<Output = StoreResult<T>>>(work: impl Fn() -> F) -> StoreResult<T> {
     let begun = Instant::now();
     let mut tries = 1;
     loop {
         match work().await {
             Err(error) if may_have_happened(&error) && tries < RETRY_LIMIT && begun.elapsed() < RETRY_FOR => {
-                tokio::time::sleep(backoff(tries)).await;
+                tokio::time::sleep(backoff_time(tries)).await;
                 tries += 1;
             }
             Err(source) if tries > 1 && may_have_happened(&source) => return Err(given_up(tries, source)),
@@ -86,7 +86,7 @@ fn given_up(tries: u32, source: StoreError) -> StoreError {
 
 // The object may be there because of an own try that was not answered, and it may be absent though the store says that it
 // is there: some refuse both of two that meet.
-async fn create(
+async fn put_new(
     inner: &dyn ObjectStore,
     location: &Path,
     payload: &PutPayload,
@@ -99,12 +99,12 @@ async fn create(
             Err(error) if may_have_happened(&error) || matches!(error, StoreError::AlreadyExists { .. }) => error,
             done => return done,
         };
-        let there = retry(|| async { inner.get_opts(location, GetOptions::default()).await?.bytes().await });
+        let there = retry_operation(|| async { inner.get_opts(location, GetOptions::default()).await?.bytes().await });
         match there.await {
             Ok(there) if there == Bytes::from(payload.clone()) => return Ok(PutResult { e_tag: None, version: None }),
             Ok(_) => return Err(StoreError::AlreadyExists { path: location.to_string(), source: Box::new(error) }),
             Err(StoreError::NotFound { .. }) if tries < RETRY_LIMIT && begun.elapsed() < RETRY_FOR => {
-                tokio::time::sleep(backoff(tries)).await;
+                tokio::time::sleep(backoff_time(tries)).await;
             }
             Err(_) => return Err(given_up(tries, error)),
         }
@@ -113,7 +113,7 @@ async fn create(
 }
 
 // Fetches a body of moderate size as a whole.
-async fn get(inner: &dyn ObjectStore, location: &Path, options: GetOptions) -> StoreResult<GetResult> {
+async fn get_whole(inner: &dyn ObjectStore, location: &Path, options: GetOptions) -> StoreResult<GetResult> {
     let has_body = !options.head;
     let found = inner.get_opts(location, options).await?;
     if !has_body || found.range.end - found.range.start > WHOLE_BODY {
@@ -150,8 +150,10 @@ impl fmt::Display for RetryingStore {
 impl ObjectStore for RetryingStore {
     async fn put_opts(&self, location: &Path, payload: PutPayload, opts: PutOptions) -> StoreResult<PutResult> {
         match opts.mode {
-            PutMode::Overwrite => retry(|| self.inner.put_opts(location, payload.clone(), opts.clone())).await,
-            PutMode::Create => create(self.inner.as_ref(), location, &payload, &opts).await,
+            PutMode::Overwrite => {
+                retry_operation(|| self.inner.put_opts(location, payload.clone(), opts.clone())).await
+            }
+            PutMode::Create => put_new(self.inner.as_ref(), location, &payload, &opts).await,
             PutMode::Update(_) => self.inner.put_opts(location, payload, opts).await,
         }
     }
@@ -161,15 +163,15 @@ impl ObjectStore for RetryingStore {
         location: &Path,
         opts: PutMultipartOptions,
     ) -> StoreResult<Box<dyn MultipartUpload>> {
-        retry(|| self.inner.put_multipart_opts(location, opts.clone())).await
+        retry_operation(|| self.inner.put_multipart_opts(location, opts.clone())).await
     }
 
     async fn get_opts(&self, location: &Path, options: GetOptions) -> StoreResult<GetResult> {
-        retry(|| get(self.inner.as_ref(), location, options.clone())).await
+        retry_operation(|| get_whole(self.inner.as_ref(), location, options.clone())).await
     }
 
     async fn get_ranges(&self, location: &Path, ranges: &[Range<u64>]) -> StoreResult<Vec<Bytes>> {
-        retry(|| self.inner.get_ranges(location, ranges)).await
+        retry_operation(|| self.inner.get_ranges(location, ranges)).await
     }
 
     fn delete_stream(&self, locations: BoxStream<'static, StoreResult<Path>>) -> BoxStream<'static, StoreResult<Path>> {
@@ -188,28 +190,30 @@ impl ObjectStore for RetryingStore {
                 }
                 Ok(())
             };
-            retry(all).await.map(|()| locations)
+            retry_operation(all).await.map(|()| locations)
         };
         stream_of(delete)
     }
 
     fn list(&self, prefix: Option<&Path>) -> BoxStream<'static, StoreResult<ObjectMeta>> {
         let (inner, prefix) = (self.inner.clone(), prefix.cloned());
-        stream_of(async move { retry(|| inner.list(prefix.as_ref()).try_collect()).await })
+        stream_of(async move { retry_operation(|| inner.list(prefix.as_ref()).try_collect()).await })
     }
 
     fn list_with_offset(&self, prefix: Option<&Path>, offset: &Path) -> BoxStream<'static, StoreResult<ObjectMeta>> {
         let (inner, prefix, offset) = (self.inner.clone(), prefix.cloned(), offset.clone());
-        stream_of(async move { retry(|| inner.list_with_offset(prefix.as_ref(), &offset).try_collect()).await })
+        stream_of(
+            async move { retry_operation(|| inner.list_with_offset(prefix.as_ref(), &offset).try_collect()).await },
+        )
     }
 
     async fn list_with_delimiter(&self, prefix: Option<&Path>) -> StoreResult<ListResult> {
-        retry(|| self.inner.list_with_delimiter(prefix)).await
+        retry_operation(|| self.inner.list_with_delimiter(prefix)).await
     }
 
     async fn copy_opts(&self, from: &Path, to: &Path, options: CopyOptions) -> StoreResult<()> {
         match options.mode {
-            CopyMode::Overwrite => retry(|| self.inner.copy_opts(from, to, options.clone())).await,
+            CopyMode::Overwrite => retry_operation(|| self.inner.copy_opts(from, to, options.clone())).await,
             CopyMode::Create => self.inner.copy_opts(from, to, options).await,
         }
     }

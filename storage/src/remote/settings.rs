@@ -38,8 +38,9 @@ pub fn remote_access(location: &str) -> Option<RemoteAccess> {
         "gs" => &["GOOGLE_BASE_URL"],
         _ => &["AZURE_STORAGE_ENDPOINT", "AZURE_ENDPOINT"],
     };
-    let urls = endpoints.iter().chain(&["HTTPS_PROXY", "https_proxy", "HTTP_PROXY", "http_proxy"]).filter_map(variable);
-    let urls = urls.chain(variable(&"AWS_CONTAINER_CREDENTIALS_FULL_URI"));
+    let urls =
+        endpoints.iter().chain(&["HTTPS_PROXY", "https_proxy", "HTTP_PROXY", "http_proxy"]).filter_map(read_variable);
+    let urls = urls.chain(read_variable(&"AWS_CONTAINER_CREDENTIALS_FULL_URI"));
     let mut ports: Vec<_> = urls.filter_map(|url| Url::parse(&url).ok()?.port_or_known_default()).collect();
     ports.extend(ALWAYS);
     ports.sort_unstable();
@@ -72,7 +73,7 @@ pub fn remote_access(location: &str) -> Option<RemoteAccess> {
         "/usr/lib",
         "/etc/ld.so.cache",
     ];
-    let files = system.iter().map(PathBuf::from).chain(named.iter().filter_map(variable).map(PathBuf::from));
+    let files = system.iter().map(PathBuf::from).chain(named.iter().filter_map(read_variable).map(PathBuf::from));
     Some(RemoteAccess { ports, files: files.collect() })
 }
 
@@ -80,11 +81,11 @@ pub fn remote_access(location: &str) -> Option<RemoteAccess> {
 pub(super) type BucketStore = (Arc<dyn ObjectStore>, Arc<dyn MultipartStore>);
 
 /// The store of a bucket.
-pub(super) fn store(scheme: &str, bucket: &str) -> Result<BucketStore, ErrorCause> {
+pub(super) fn build_store(scheme: &str, bucket: &str) -> Result<BucketStore, ErrorCause> {
     let (timeout, key) = (REQUEST_TIMEOUT, ClientConfigKey::Timeout);
     Ok(match scheme {
         "s3" => {
-            let builder = AmazonS3Builder::from_env().with_bucket_name(bucket).with_retry(retries()?);
+            let builder = AmazonS3Builder::from_env().with_bucket_name(bucket).with_retry(retry_config()?);
             let endpoint = [AmazonS3ConfigKey::S3Endpoint, AmazonS3ConfigKey::Endpoint];
             let endpoint = endpoint.iter().find_map(|key| builder.get_config_value(key));
             let allows_http = builder.get_config_value(&AmazonS3ConfigKey::Client(ClientConfigKey::AllowHttp));
@@ -97,32 +98,32 @@ pub(super) fn store(scheme: &str, bucket: &str) -> Result<BucketStore, ErrorCaus
                 )
                 .into());
             }
-            both(builder.with_config(AmazonS3ConfigKey::Client(key), timeout).build()?)
+            bucket_store(builder.with_config(AmazonS3ConfigKey::Client(key), timeout).build()?)
         }
         "gs" => {
-            let builder = GoogleCloudStorageBuilder::from_env().with_bucket_name(bucket).with_retry(retries()?);
-            both(builder.with_config(GoogleConfigKey::Client(key), timeout).build()?)
+            let builder = GoogleCloudStorageBuilder::from_env().with_bucket_name(bucket).with_retry(retry_config()?);
+            bucket_store(builder.with_config(GoogleConfigKey::Client(key), timeout).build()?)
         }
         "az" => {
-            let builder = MicrosoftAzureBuilder::from_env().with_container_name(bucket).with_retry(retries()?);
-            both(builder.with_config(AzureConfigKey::Client(key), timeout).build()?)
+            let builder = MicrosoftAzureBuilder::from_env().with_container_name(bucket).with_retry(retry_config()?);
+            bucket_store(builder.with_config(AzureConfigKey::Client(key), timeout).build()?)
         }
         scheme => return Err(format!("this build does not reach `{scheme}://`").into()),
     })
 }
 
-fn both<S: ObjectStore + MultipartStore>(store: S) -> BucketStore {
+fn bucket_store<S: ObjectStore + MultipartStore>(store: S) -> BucketStore {
     let store = Arc::new(store);
     (store.clone(), store)
 }
 
-fn retries() -> Result<RetryConfig, ErrorCause> {
-    let Some(text) = variable(&MAX_ATTEMPTS) else { return Ok(RetryConfig::default()) };
+fn retry_config() -> Result<RetryConfig, ErrorCause> {
+    let Some(text) = read_variable(&MAX_ATTEMPTS) else { return Ok(RetryConfig::default()) };
     let attempts: usize = text.parse().map_err(|_| format!("{MAX_ATTEMPTS} is `{text}`, expected a number"))?;
     Ok(RetryConfig { max_retries: attempts.saturating_sub(1), ..RetryConfig::default() })
 }
 
-fn variable(name: &&str) -> Option<String> {
+fn read_variable(name: &&str) -> Option<String> {
     std::env::var(name).ok().filter(|text| !text.is_empty())
 }
 

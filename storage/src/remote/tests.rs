@@ -14,7 +14,7 @@ use object_store::path::Path;
 use object_store::{Error as StoreError, ObjectStore, ObjectStoreExt as _, PutMode, PutOptions, PutPayload};
 
 use super::{ExclusionFault, RetryingStore, probe_exclusion};
-use crate::{CommitOutcome, Error, FileName, Lake, ReferenceSurfaces, encode};
+use crate::{CommitOutcome, Error, FileName, Lake, ReferenceSurfaces, encode_batches};
 
 /// Faults of a store.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -140,7 +140,7 @@ async fn what_is_cut_off_is_fetched_again_and_what_never_comes_says_how_often_it
         .await
         .expect("deleted");
     assert!(faulty.behaviour.count.load(Ordering::SeqCst) > 0);
-    let gone = Error::store(
+    let gone = Error::store_failure(
         "read",
         "x",
         StoreError::Generic {
@@ -169,18 +169,18 @@ async fn a_view_costs_a_request_a_table_and_a_commit_of_many_runs_a_few() {
         for table in tables {
             let (surface, run) = ("flat".parse().expect("an id"), format!("r{number}").parse().expect("an id"));
             let name = FileName::Rows { surface, run, derivation: "ab".into() };
-            let file = encode(table, &table.schema(lake.rig()), &[]).expect("encoded");
-            staged.push(lake.stage(table, &name, file).await.expect("staged").made_from(&before));
+            let file = encode_batches(table, &table.schema(lake.rig()), &[]).expect("encoded");
+            staged.push(lake.stage_file(table, &name, file).await.expect("staged").made_from(&before));
         }
     }
     store.take_requests();
-    lake.commit(&staged).await.expect("committed");
+    lake.commit_staged(&staged).await.expect("committed");
     let requests = store.take_requests();
     for table in tables {
         let of_table = requests.iter().filter(|r| r.contains(&format!("tables/{}/", table.name()))).count();
         assert!((1..=6).contains(&of_table), "{table:?}: {requests:?}");
     }
-    lake.commit(&staged).await.expect("there before");
+    lake.commit_staged(&staged).await.expect("there before");
     assert_eq!(store.take_requests().len(), tables.len(), "a look at each");
 }
 
@@ -192,7 +192,7 @@ mod slow {
     async fn commits_whose_answers_are_lost_are_made_once_and_known_to_be_made() {
         for seed in 1..=3 {
             let store = StoreFaults::in_memory(StoreFault::Unreliable, seed);
-            let rows = lake(store.clone()).await.expect("made").pairs().expect("rows");
+            let rows = lake(store.clone()).await.expect("made").pair_rows().expect("rows");
             let write = |writer: usize| {
                 let (store, rows) = (store.clone(), rows.clone());
                 tokio::spawn(async move {
@@ -207,7 +207,8 @@ mod slow {
             for writer in [0, 1, 2, 3].map(write) {
                 writer.await.expect("no panic");
             }
-            let files = lake(store.clone()).await.expect("opened").log().files(Table::Pairs).await.expect("files");
+            let files =
+                lake(store.clone()).await.expect("opened").commit_log().list_files(Table::Pairs).await.expect("files");
             assert_eq!(files.len(), 25, "seed {seed}: the rig's own and 24");
             assert!(store.behaviour.count.load(Ordering::SeqCst) > 20, "seed {seed}");
         }

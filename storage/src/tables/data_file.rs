@@ -68,43 +68,43 @@ impl FileEncoder {
     ///
     /// # Errors
     /// [`Error::Encode`] if the batch does not have the table's schema.
-    pub fn write(&mut self, batch: &RecordBatch) -> Result<()> {
+    pub fn write_batch(&mut self, batch: &RecordBatch) -> Result<()> {
         let table = self.table;
-        self.stats.add(batch);
-        self.writer(batch)?.write(batch).map_err(|e| failed(table, e))
+        self.stats.add_batch(batch);
+        self.ensure_writer(batch)?.write(batch).map_err(|e| encode_error(table, e))
     }
 
     /// The file.
     ///
     /// # Errors
-    /// As [`Self::write`].
+    /// As [`Self::write_batch`].
     pub fn finish(mut self) -> Result<EncodedFile> {
         let table = self.table;
-        self.writer(&RecordBatch::new_empty(self.schema.clone()))?;
+        self.ensure_writer(&RecordBatch::new_empty(self.schema.clone()))?;
         let bytes = match self.writer {
-            Some(writer) => writer.into_inner().map_err(|e| failed(table, e))?,
+            Some(writer) => writer.into_inner().map_err(|e| encode_error(table, e))?,
             None => Vec::new(),
         };
         let rows = self.stats.rows as u64;
-        Ok(EncodedFile { bytes: bytes.into(), rows, stats: self.stats.json().to_string() })
+        Ok(EncodedFile { bytes: bytes.into(), rows, stats: self.stats.into_json().to_string() })
     }
 
-    fn writer(&mut self, first: &RecordBatch) -> Result<&mut ArrowWriter<Vec<u8>>> {
+    fn ensure_writer(&mut self, first: &RecordBatch) -> Result<&mut ArrowWriter<Vec<u8>>> {
         let table = self.table;
         let made = match self.writer.take() {
             Some(writer) => writer,
             None => {
-                let properties = properties(table, &self.schema, first);
+                let properties = writer_properties(table, &self.schema, first);
                 let options = ArrowWriterOptions::new().with_properties(properties).with_skip_arrow_metadata(true);
                 ArrowWriter::try_new_with_options(Vec::new(), self.schema.clone(), options)
-                    .map_err(|e| failed(table, e))?
+                    .map_err(|e| encode_error(table, e))?
             }
         };
         Ok(self.writer.insert(made))
     }
 }
 
-fn failed(table: Table, error: ParquetError) -> Error {
+fn encode_error(table: Table, error: ParquetError) -> Error {
     Error::Encode { table: table.name(), reason: error.to_string() }
 }
 
@@ -112,9 +112,9 @@ fn failed(table: Table, error: ParquetError) -> Error {
 ///
 /// # Errors
 /// [`Error::Encode`] if the batches do not have the table's schema.
-pub fn encode(table: Table, schema: &SchemaRef, batches: &[RecordBatch]) -> Result<EncodedFile> {
+pub fn encode_batches(table: Table, schema: &SchemaRef, batches: &[RecordBatch]) -> Result<EncodedFile> {
     let mut encoder = FileEncoder::new(table, schema.clone());
-    batches.iter().try_for_each(|batch| encoder.write(batch))?;
+    batches.iter().try_for_each(|batch| encoder.write_batch(batch))?;
     encoder.finish()
 }
 
@@ -123,7 +123,7 @@ pub fn encode(table: Table, schema: &SchemaRef, batches: &[RecordBatch]) -> Resu
 //
 // Single numbers that do not repeat (zstd makes them an eighth smaller) are not compressed: a reader makes a
 // decompressor for each column of each file, which takes longer than reading three thousand of them.
-fn properties(table: Table, schema: &SchemaRef, first: &RecordBatch) -> WriterProperties {
+fn writer_properties(table: Table, schema: &SchemaRef, first: &RecordBatch) -> WriterProperties {
     let (rows, bytes) = (first.num_rows(), first.get_array_memory_size());
     let rows_a_group = if rows == 0 { 1 } else { (ROW_GROUP_BYTES * rows / bytes.max(1)).max(1) };
     let mut builder = WriterProperties::builder()
@@ -192,7 +192,7 @@ impl StatsCollector {
         Self { rows: 0, columns: columns.map(column).collect() }
     }
 
-    fn add(&mut self, batch: &RecordBatch) {
+    fn add_batch(&mut self, batch: &RecordBatch) {
         self.rows += batch.num_rows();
         for column in self.columns.iter_mut().filter(|c| c.index < batch.num_columns()) {
             let values = batch.column(column.index);
@@ -205,13 +205,13 @@ impl StatsCollector {
                 continue;
             };
             column.extremes = Some(match column.extremes.take() {
-                Some((l, h)) => (if less(&low, &l) { low } else { l }, if less(&h, &high) { high } else { h }),
+                Some((l, h)) => (if is_less(&low, &l) { low } else { l }, if is_less(&h, &high) { high } else { h }),
                 None => (low, high),
             });
         }
     }
 
-    fn json(self) -> Value {
+    fn into_json(self) -> Value {
         let (mut least, mut greatest, mut nulls) = (Map::new(), Map::new(), Map::new());
         for column in self.columns {
             nulls.insert(column.name.clone(), column.nulls.into());
@@ -236,11 +236,11 @@ fn extremes_of(column: &Arc<dyn Array>) -> Option<(Value, Value)> {
         }
         DataType::Float32 => {
             let floats = column.as_primitive::<Float32Type>();
-            finite(f64::from(min(floats)?), f64::from(max(floats)?))
+            finite_extremes(f64::from(min(floats)?), f64::from(max(floats)?))
         }
         DataType::Float64 => {
             let doubles = column.as_primitive::<Float64Type>();
-            finite(min(doubles)?, max(doubles)?)
+            finite_extremes(min(doubles)?, max(doubles)?)
         }
         DataType::Utf8 => {
             let texts = column.as_string::<i32>();
@@ -252,11 +252,11 @@ fn extremes_of(column: &Arc<dyn Array>) -> Option<(Value, Value)> {
 }
 
 // Arrow orders NaN above all numbers, JSON has none: a column with one gets no statistics.
-fn finite(low: f64, high: f64) -> Option<(Value, Value)> {
+fn finite_extremes(low: f64, high: f64) -> Option<(Value, Value)> {
     (low.is_finite() && high.is_finite()).then(|| (low.into(), high.into()))
 }
 
-fn less(a: &Value, b: &Value) -> bool {
+fn is_less(a: &Value, b: &Value) -> bool {
     match (a, b) {
         (Value::String(a), Value::String(b)) => a < b,
         _ => match (a.as_i64(), b.as_i64()) {
@@ -299,7 +299,7 @@ mod tests {
             "nullCount": { "id": 0, "name": 1, "x": 0 },
         });
         let mut stats = StatsCollector::new(&schema);
-        batches.iter().for_each(|b| stats.add(b));
-        assert_eq!(stats.json(), expected);
+        batches.iter().for_each(|b| stats.add_batch(b));
+        assert_eq!(stats.into_json(), expected);
     }
 }

@@ -54,12 +54,12 @@ pub struct VisibleRun {
 
 impl VisibleRun {
     /// Common beginning of the names of all of the run's rows in `runs`.
-    pub(crate) fn prefix(&self) -> String {
+    pub(crate) fn name_prefix(&self) -> String {
         format!("{}.{}.", self.surface, self.run)
     }
 
     /// Both derivations, as the name of the run's row has them.
-    pub(crate) fn derivations(&self) -> String {
+    pub(crate) fn joined_derivations(&self) -> String {
         format!("{}.{}", self.run_derivation, self.reference_derivation.as_deref().unwrap_or(WITHOUT))
     }
 }
@@ -76,7 +76,7 @@ impl FileName {
             Self::Rig { derivation } => format!("rig.{derivation}{EXTENSION}"),
             Self::Merged { digest } => format!("{MERGED}.{digest}{EXTENSION}"),
             Self::Rows { surface, run, derivation } => format!("{surface}.{run}.{derivation}{EXTENSION}"),
-            Self::Pointer(run) => format!("{}{}{EXTENSION}", run.prefix(), run.derivations()),
+            Self::Pointer(run) => format!("{}{}{EXTENSION}", run.name_prefix(), run.joined_derivations()),
         }
     }
 

@@ -13,7 +13,7 @@ mod table_fault;
 mod versions;
 
 pub use batch_builder::BatchBuilder;
-pub use data_file::{EncodedFile, FileEncoder, encode};
+pub use data_file::{EncodedFile, FileEncoder, encode_batches};
 pub use file_name::{FileName, VisibleRun};
 pub use log::{
     CommitEffect, CommitLog, CommitOutcome, DataFile, FileHistory, FileStats, LoggedFile, NewFile, RemovalRecord,
@@ -52,7 +52,7 @@ impl StagedFile {
     /// to: a row of `runs` that it lacked supersedes them.
     #[must_use]
     pub fn made_from(mut self, snapshot: &LakeSnapshot) -> Self {
-        self.file.seen_runs = snapshot.version(Table::Runs).unwrap_or(0);
+        self.file.seen_runs = snapshot.log_version(Table::Runs).unwrap_or(0);
         self.file.run_version = snapshot.run_version(&self.file.name);
         self
     }
@@ -60,7 +60,7 @@ impl StagedFile {
     /// Records the rows that the run's other tables have: those of `counts`, and of these files. Without them its row of
     /// `runs` says no more than that there are some.
     #[must_use]
-    pub fn counting<'a>(mut self, mut counts: RunRowCounts, files: impl IntoIterator<Item = &'a Self>) -> Self {
+    pub fn with_row_counts<'a>(mut self, mut counts: RunRowCounts, files: impl IntoIterator<Item = &'a Self>) -> Self {
         files.into_iter().for_each(|file| counts.set_rows(file.table, file.rows));
         self.file.row_counts = Some(counts);
         self
@@ -74,9 +74,9 @@ impl StagedFile {
     /// Makes a run's row replace its present rows, which are these files or none. If there are others by the time of
     /// the commit, the outcome is [`CommitOutcome::Outdated`].
     #[must_use]
-    pub fn replacing<'a>(mut self, run: &VisibleRun, old: impl IntoIterator<Item = &'a DataFile>) -> Self {
-        let files = old.into_iter().map(DataFile::logged).collect();
-        self.file.replaces = Some(ReplacedFiles { prefix: Some(run.prefix()), files });
+    pub fn with_replaced_rows<'a>(mut self, run: &VisibleRun, old: impl IntoIterator<Item = &'a DataFile>) -> Self {
+        let files = old.into_iter().map(DataFile::logged_file).collect();
+        self.file.replaces = Some(ReplacedFiles { prefix: Some(run.name_prefix()), files });
         self
     }
 }
@@ -90,13 +90,13 @@ impl Lake {
         // The logs are read meanwhile; nothing is written before the store's answer.
         let (exclusive, snapshot) = join(self.ensure_exclusive(), self.snapshot()).await;
         exclusive?;
-        try_join_all(Table::ALL.into_iter().map(|table| self.log().ensure(table))).await?;
+        try_join_all(Table::ALL.into_iter().map(|table| self.commit_log().ensure_table(table))).await?;
         let grid = self.grid();
         let derivation = || FileName::Rig { derivation: format!("v{LAKE_FORMAT}") };
         let of_rig = Table::ALL.into_iter().filter(|t| t.source() == Source::Rig).map(|table| async move {
             let rows = match table {
-                Table::Points => rig_tables::points(self.rig(), grid)?,
-                _ => self.pairs()?,
+                Table::Points => rig_tables::point_rows(self.rig(), grid)?,
+                _ => self.pair_rows()?,
             };
             self.append_rows(table, &derivation(), &[rows]).await
         });
@@ -108,8 +108,8 @@ impl Lake {
     ///
     /// # Errors
     /// [`Error::Encode`] if the rig has no such columns, which is a mistake in this crate.
-    pub fn pairs(&self) -> Result<RecordBatch> {
-        rig_tables::pairs(self.rig(), self.grid())
+    pub fn pair_rows(&self) -> Result<RecordBatch> {
+        rig_tables::pair_rows(self.rig(), self.grid())
     }
 
     /// A frozen view of what readers may see.
@@ -127,13 +127,13 @@ impl Lake {
     /// # Ok::<(), Box<dyn std::error::Error>>(())
     /// ```
     ///
-    /// A table that lacks rows, or whose log cannot be read, is a fault of the snapshot: [`LakeSnapshot::check`].
+    /// A table that lacks rows, or whose log cannot be read, is a fault of the snapshot: [`LakeSnapshot::check_table`].
     ///
     /// # Errors
     /// [`Error::Log`] if the log of `runs` is damaged, [`Error::NoLake`] if the lake is gone.
     pub async fn snapshot(&self) -> Result<LakeSnapshot> {
-        let mut snapshot = LakeSnapshot::take(self.log()).await?.restricted(self.is_restricted());
-        if snapshot.version(Table::Runs).is_none() {
+        let mut snapshot = LakeSnapshot::take_from(self.commit_log()).await?.with_restriction(self.is_restricted());
+        if snapshot.log_version(Table::Runs).is_none() {
             self.check_readable().await?;
             if has_run_files(self.store().as_ref()).await? {
                 snapshot.set_fault(TableFault::without_log(Table::Runs));
@@ -148,7 +148,7 @@ impl Lake {
     /// [`Error::Incomplete`] if one lacks rows; as [`Lake::snapshot`].
     pub async fn whole_snapshot(&self) -> Result<LakeSnapshot> {
         let snapshot = self.snapshot().await?;
-        Table::ALL.into_iter().try_for_each(|table| snapshot.check(table))?;
+        Table::ALL.into_iter().try_for_each(|table| snapshot.check_table(table))?;
         Ok(snapshot)
     }
 
@@ -156,11 +156,11 @@ impl Lake {
     ///
     /// # Errors
     /// What the store says.
-    pub async fn stage(&self, table: Table, name: &FileName, file: EncodedFile) -> Result<StagedFile> {
+    pub async fn stage_file(&self, table: Table, name: &FileName, file: EncodedFile) -> Result<StagedFile> {
         let name = name.compose();
         let path = table_folder(table).join(name.as_str());
         let (bytes, stats, rows) = (file.bytes.len() as u64, file.stats, file.rows);
-        self.store().put(&path, file.bytes.into()).await.map_err(|e| Error::store("write", &path, e))?;
+        self.store().put(&path, file.bytes.into()).await.map_err(|e| Error::store_failure("write", &path, e))?;
         let (parts, replaces, row_counts) = (Vec::new(), None, None);
         let file = NewFile { name, bytes, stats, replaces, parts, seen_runs: 0, run_version: 0, row_counts };
         Ok(StagedFile { table, file, rows })
@@ -170,8 +170,8 @@ impl Lake {
     ///
     /// # Errors
     /// [`Error::Log`] if the table's log is damaged.
-    pub async fn has(&self, table: Table, name: &FileName) -> Result<bool> {
-        self.log().has(table, &name.compose()).await
+    pub async fn has_file(&self, table: Table, name: &FileName) -> Result<bool> {
+        self.commit_log().has_file(table, &name.compose()).await
     }
 
     /// Commits staged files, once per table. All tables commit concurrently except `runs`, which is last: from that
@@ -184,7 +184,7 @@ impl Lake {
     ///
     /// # tokio::runtime::Runtime::new()?.block_on(async {
     /// let lake = Lake::open_or_create("memory://", &Rig::paper(), &ReferenceSurfaces::default()).await?;
-    /// let file = encode(Table::Pairs, &Table::Pairs.schema(lake.rig()), &[lake.pairs()?])?;
+    /// let file = encode(Table::Pairs, &Table::Pairs.schema(lake.rig()), &[lake.pair_rows()?])?;
     /// let name = FileName::Rig { derivation: "example".into() };
     /// let staged = [lake.stage(Table::Pairs, &name, file).await?];
     /// assert_eq!(lake.commit(&staged).await?, [CommitOutcome::Now]);
@@ -196,7 +196,7 @@ impl Lake {
     ///
     /// # Errors
     /// What the store says. Tables that were committed before stay so, unseen by readers; repeating the call resumes.
-    pub async fn commit(&self, staged: &[StagedFile]) -> Result<Vec<CommitOutcome>> {
+    pub async fn commit_staged(&self, staged: &[StagedFile]) -> Result<Vec<CommitOutcome>> {
         let mut outcomes = vec![CommitOutcome::Before; staged.len()];
         let (pointers, others): (Vec<_>, Vec<_>) = Table::ALL.into_iter().partition(|table| *table == Table::Runs);
         for tables in [others, pointers] {
@@ -215,7 +215,7 @@ impl Lake {
             return Ok(Vec::new());
         }
         let add = of.iter().map(|i| staged[*i].file.clone()).collect();
-        let done = self.log().commit(table, &TableCommit { add, ..TableCommit::default() }).await?;
+        let done = self.commit_log().commit_change(table, &TableCommit { add, ..TableCommit::default() }).await?;
         Ok(of.into_iter().zip(done).collect())
     }
 
@@ -224,11 +224,11 @@ impl Lake {
     /// # Errors
     /// [`Error::Encode`] if the rows do not fit the table, or what the store says.
     pub async fn append_rows(&self, table: Table, name: &FileName, batches: &[RecordBatch]) -> Result<CommitOutcome> {
-        if self.has(table, name).await? {
+        if self.has_file(table, name).await? {
             return Ok(CommitOutcome::Before);
         }
-        let staged = self.stage(table, name, encode(table, &table.schema(self.rig()), batches)?).await?;
-        Ok(self.commit(&[staged]).await?[0])
+        let staged = self.stage_file(table, name, encode_batches(table, &table.schema(self.rig()), batches)?).await?;
+        Ok(self.commit_staged(&[staged]).await?[0])
     }
 
     /// Removes from the logs all files that no run's row names any more, and those of other programs; merged files are
@@ -248,14 +248,14 @@ impl Lake {
     pub async fn remove_superseded_in(&self, snapshot: &LakeSnapshot) -> Result<usize> {
         let mut count = 0;
         for table in Table::ALL {
-            let gone = snapshot.superseded(table).iter().chain(snapshot.foreign(table));
-            let remove: Vec<_> = gone.map(DataFile::logged).collect();
+            let gone = snapshot.superseded_files(table).iter().chain(snapshot.foreign_files(table));
+            let remove: Vec<_> = gone.map(DataFile::logged_file).collect();
             if !remove.is_empty() {
                 count += remove.len();
-                self.log().commit(table, &TableCommit { remove, ..TableCommit::default() }).await?;
+                self.commit_log().commit_change(table, &TableCommit { remove, ..TableCommit::default() }).await?;
             }
-            for file in snapshot.outgrown(table) {
-                self.rewrite(table, file).await?;
+            for file in snapshot.outgrown_files(table) {
+                self.rewrite_file(table, file).await?;
                 count += 1;
             }
         }
@@ -282,12 +282,12 @@ mod tests {
     #[tokio::test]
     async fn the_same_rows_twice_are_added_once() {
         let lake = paper("memory://").await.expect("made");
-        let grid = lake.rig().grid().expect("a grid");
-        let rows = || vec![rig_tables::points(lake.rig(), &grid).expect("rows")];
+        let grid = lake.rig().build_grid().expect("a grid");
+        let rows = || vec![rig_tables::point_rows(lake.rig(), &grid).expect("rows")];
         let name = || FileName::Rig { derivation: "test".into() };
         assert_eq!(lake.append_rows(Table::Points, &name(), &rows()).await.expect("added"), CommitOutcome::Now);
         assert_eq!(lake.append_rows(Table::Points, &name(), &rows()).await.expect("known"), CommitOutcome::Before);
-        assert_eq!(lake.log().files(Table::Points).await.expect("files").len(), 2);
+        assert_eq!(lake.commit_log().list_files(Table::Points).await.expect("files").len(), 2);
     }
 
     // A lake of a version whose surface_stats had one column less.
@@ -318,17 +318,17 @@ mod tests {
         let batch = RecordBatch::try_new(older.clone(), older.fields().iter().map(column).collect()).expect("a row");
         let name = FileName::Rig { derivation: "older".into() };
         let lake = Lake::open(&url).await.expect("opened");
-        let file = encode(table, &older, std::slice::from_ref(&batch)).expect("encoded");
-        lake.commit(&[lake.stage(table, &name, file).await.expect("staged")]).await.expect("committed");
+        let file = encode_batches(table, &older, std::slice::from_ref(&batch)).expect("encoded");
+        lake.commit_staged(&[lake.stage_file(table, &name, file).await.expect("staged")]).await.expect("committed");
 
         lake.ensure_tables().await.expect("added");
         lake.ensure_tables().await.expect("there already");
-        assert_eq!(lake.log().version(table).await.expect("a log"), Some(2));
+        assert_eq!(lake.commit_log().newest_version(table).await.expect("a log"), Some(2));
         let commit = std::fs::read_to_string(log.join("00000000000000000002.json")).expect("a commit");
         assert!(commit.contains("ADD COLUMNS") && commit.contains("spread_db") && commit.contains(added), "{commit}");
-        let files = lake.log().files(table).await.expect("files");
+        let files = lake.commit_log().list_files(table).await.expect("files");
         for columns in [&[] as &[&str], &["measurements", added]] {
-            let rows = lake.rows(table, &files[0], columns, 0..1).await.expect("rows");
+            let rows = lake.read_rows(table, &files[0], columns, 0..1).await.expect("rows");
             let rows: Vec<_> = rows.try_collect().await.expect("a batch");
             assert_eq!(rows[0].schema(), wanted_schema(&schema, columns));
             let value = rows[0].column_by_name("measurements").expect("there").as_primitive::<Int32Type>().value(0);
@@ -344,9 +344,9 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         let url = folder.path().join("lake").display().to_string();
         let lakes = [paper(&url).await.expect("made"), paper(&url).await.expect("opened")];
-        let grid = lakes[0].rig().grid().expect("a grid");
+        let grid = lakes[0].rig().build_grid().expect("a grid");
         let write = |lake: Lake, writer: usize| {
-            let rows = rig_tables::points(lake.rig(), &grid).expect("rows");
+            let rows = rig_tables::point_rows(lake.rig(), &grid).expect("rows");
             tokio::spawn(async move {
                 for i in 0..10 {
                     let name = FileName::Rig { derivation: format!("{writer}x{i}") };
@@ -357,6 +357,6 @@ mod tests {
         let [a, b] = lakes.clone();
         let (a, b) = tokio::join!(write(a, 0), write(b, 1));
         a.and(b).expect("both done");
-        assert_eq!(lakes[0].log().files(Table::Points).await.expect("files").len(), 21);
+        assert_eq!(lakes[0].commit_log().list_files(Table::Points).await.expect("files").len(), 21);
     }
 }

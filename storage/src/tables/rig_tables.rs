@@ -13,22 +13,22 @@ use crate::Result;
 const GEOMETRY_SPEED_OF_SOUND: f64 = 343.0;
 
 /// The rows of table `points`.
-pub(crate) fn points(rig: &Rig, grid: &Grid) -> Result<RecordBatch> {
+pub(crate) fn point_rows(rig: &Rig, grid: &Grid) -> Result<RecordBatch> {
     let points = grid.points();
     let axis = |i: usize| points.iter().map(move |p| p.position_mm[i]);
     BatchBuilder::new(Table::Points, rig, points.len())
-        .ints("point_id", points.iter().map(|p| p.id.0 as i32))
-        .ints("layer", points.iter().map(|p| p.layer as i32))
-        .ints("gridx", points.iter().map(|p| p.gridx as i32))
-        .ints("gridy", points.iter().map(|p| p.gridy as i32))
-        .doubles("x_mm", axis(0))
-        .doubles("y_mm", axis(1))
-        .doubles("z_mm", axis(2))
+        .push_ints("point_id", points.iter().map(|p| p.id.0 as i32))
+        .push_ints("layer", points.iter().map(|p| p.layer as i32))
+        .push_ints("gridx", points.iter().map(|p| p.gridx as i32))
+        .push_ints("gridy", points.iter().map(|p| p.gridy as i32))
+        .push_doubles("x_mm", axis(0))
+        .push_doubles("y_mm", axis(1))
+        .push_doubles("z_mm", axis(2))
         .finish()
 }
 
 /// The rows of table `pairs`.
-pub(crate) fn pairs(rig: &Rig, grid: &Grid) -> Result<RecordBatch> {
+pub(crate) fn pair_rows(rig: &Rig, grid: &Grid) -> Result<RecordBatch> {
     let ends: Vec<([f64; 3], [f64; 3])> = grid
         .pairs()
         .iter()
@@ -42,16 +42,16 @@ pub(crate) fn pairs(rig: &Rig, grid: &Grid) -> Result<RecordBatch> {
         })
     };
     BatchBuilder::new(Table::Pairs, rig, ends.len())
-        .pairs("", grid.pairs().iter().map(Some))
-        .positions(grid, grid.pairs().iter().map(Some))
-        .doubles("direct_mm", each(&direct_mm))
-        .doubles("image_mm", each(&image_mm))
-        .doubles("incidence_deg", each(&incidence_deg))
-        .doubles("specular_x_mm", each(&|m, s| specular_point(m, s)[0]))
-        .doubles("specular_y_mm", each(&|m, s| specular_point(m, s)[1]))
-        .doubles("fresnel_major_2000_mm", zone(2_000.0, true))
-        .doubles("fresnel_minor_2000_mm", zone(2_000.0, false))
-        .doubles("fresnel_major_40000_mm", zone(40_000.0, true))
-        .doubles("fresnel_minor_40000_mm", zone(40_000.0, false))
+        .push_pairs("", grid.pairs().iter().map(Some))
+        .push_positions(grid, grid.pairs().iter().map(Some))
+        .push_doubles("direct_mm", each(&direct_mm))
+        .push_doubles("image_mm", each(&image_mm))
+        .push_doubles("incidence_deg", each(&incidence_deg))
+        .push_doubles("specular_x_mm", each(&|m, s| specular_point(m, s)[0]))
+        .push_doubles("specular_y_mm", each(&|m, s| specular_point(m, s)[1]))
+        .push_doubles("fresnel_major_2000_mm", zone(2_000.0, true))
+        .push_doubles("fresnel_minor_2000_mm", zone(2_000.0, false))
+        .push_doubles("fresnel_major_40000_mm", zone(40_000.0, true))
+        .push_doubles("fresnel_minor_40000_mm", zone(40_000.0, false))
         .finish()
 }

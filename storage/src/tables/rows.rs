@@ -69,7 +69,7 @@ impl Lake {
     /// # tokio::runtime::Runtime::new()?.block_on(async {
     /// let lake = Lake::open_or_create("memory://", &Rig::paper(), &ReferenceSurfaces::default()).await?;
     /// let snapshot = lake.snapshot().await?;
-    /// let rows = lake.rows(Table::Pairs, &snapshot.files(Table::Pairs)[0], &["pair_id", "direct_mm"], 10..13).await?;
+    /// let rows = lake.read_rows(Table::Pairs, &snapshot.files(Table::Pairs)[0], &["pair_id", "direct_mm"], 10..13).await?;
     /// let batches: Vec<_> = rows.try_collect().await?;
     /// assert_eq!((batches[0].num_rows(), batches[0].num_columns()), (3, 2));
     /// # Ok::<(), echolake_lake::Error>(())
@@ -79,7 +79,7 @@ impl Lake {
     ///
     /// # Errors
     /// [`Error::DataFile`] if the file is not what its log says, also in the stream.
-    pub async fn rows(
+    pub async fn read_rows(
         &self,
         table: Table,
         file: &DataFile,
@@ -87,7 +87,7 @@ impl Lake {
         rows: Range<u64>,
     ) -> Result<BoxStream<'static, Result<RecordBatch>>> {
         let path = file.path.clone();
-        let damaged = move |e: ParquetError| unread(&path, e);
+        let damaged = move |e: ParquetError| unread_error(&path, e);
         let mut reader = StoredFile { store: self.store(), path: file.path.clone(), bytes: file.bytes };
         let options = ArrowReaderOptions::new().with_page_index_policy(PageIndexPolicy::Optional);
         let metadata = reader.get_metadata(Some(&options)).await.map_err(damaged.clone())?;
@@ -115,7 +115,7 @@ impl Lake {
     }
 }
 
-fn unread(path: &Path, error: ParquetError) -> Error {
+fn unread_error(path: &Path, error: ParquetError) -> Error {
     let damaged = |source: ErrorCause| Error::DataFile { file: path.to_string(), source };
     match error {
         ParquetError::External(source) => match source.downcast::<StoreError>() {
@@ -172,13 +172,13 @@ mod tests {
     #[test]
     fn a_store_that_does_not_answer_is_no_damage_and_an_absent_file_is() {
         let path = Path::from("tables/nce/x.parquet");
-        let fault = |fault: StoreError| unread(&path, ParquetError::External(Box::new(fault)));
+        let fault = |fault: StoreError| unread_error(&path, ParquetError::External(Box::new(fault)));
         let source: ErrorCause = "connection reset".into();
         let away = fault(StoreError::Generic { store: "S3", source });
         assert_eq!(away.to_string(), "cannot read `tables/nce/x.parquet`: connection reset");
         let absent = fault(StoreError::NotFound { path: path.to_string(), source: "404".into() });
         assert!(matches!(absent, Error::DataFile { .. }), "{absent}");
-        let damaged = unread(&path, ParquetError::EOF("too short".into()));
+        let damaged = unread_error(&path, ParquetError::EOF("too short".into()));
         assert!(matches!(damaged, Error::DataFile { .. }), "{damaged}");
     }
 }

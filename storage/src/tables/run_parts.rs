@@ -85,8 +85,8 @@ pub(crate) fn encode_parts(parts: &[RunPart]) -> String {
 pub(crate) fn decode_parts(text: &str) -> Option<Vec<RunPart>> {
     let parts: Vec<LoggedPart> = serde_json::from_str(text).ok()?;
     let one = |part: LoggedPart| match part {
-        LoggedPart::Rows(name, rows) => RunPart::parse(&name.into(), rows, None),
-        LoggedPart::Pointer(name, rows, version) => RunPart::parse(&name.into(), rows, Some(version)),
+        LoggedPart::Rows(name, rows) => RunPart::from_path(&name.into(), rows, None),
+        LoggedPart::Pointer(name, rows, version) => RunPart::from_path(&name.into(), rows, Some(version)),
     };
     parts.into_iter().map(one).collect::<Option<Vec<_>>>().filter(|parts| !parts.is_empty())
 }
@@ -94,17 +94,17 @@ pub(crate) fn decode_parts(text: &str) -> Option<Vec<RunPart>> {
 impl RunPart {
     /// The only part of a file of one run; None if the file has another name.
     pub(crate) fn of_file(file: &DataFile) -> Option<Self> {
-        let part = Self::parse(&file.path, file.rows, Some(file.log_version))?;
+        let part = Self::from_path(&file.path, file.rows, Some(file.log_version))?;
         Some(Self { row_counts: file.row_counts.clone(), ..part })
     }
 
-    fn parse(path: &Path, rows: u64, row_version: Option<u64>) -> Option<Self> {
+    fn from_path(path: &Path, rows: u64, row_version: Option<u64>) -> Option<Self> {
         match FileName::parse(path)? {
             FileName::Rows { surface, run, derivation } => {
                 Some(Self { surface, run, derivation, rows, row_version: None, row_counts: None })
             }
             FileName::Pointer(pointer) => {
-                let derivation = pointer.derivations();
+                let derivation = pointer.joined_derivations();
                 let (row_version, row_counts) = (Some(row_version?), None);
                 Some(Self { surface: pointer.surface, run: pointer.run, derivation, rows, row_version, row_counts })
             }

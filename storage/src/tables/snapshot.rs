@@ -47,7 +47,7 @@ struct NewestRuns {
 }
 
 impl NewestRuns {
-    fn of(runs: &BTreeMap<RunId, CurrentRun>) -> Self {
+    fn from_runs(runs: &BTreeMap<RunId, CurrentRun>) -> Self {
         let mut newest = Self::default();
         for CurrentRun { run, project, .. } in runs.values() {
             newest.of_surface.insert(run.surface.clone(), run.run.clone());
@@ -68,7 +68,7 @@ type ReadView = std::result::Result<Option<TableView>, TableFault>;
 async fn views_of_others(log: &dyn CommitLog) -> Result<Vec<(Table, ReadView)>> {
     let others = Table::ALL.into_iter().filter(|table| *table != Table::Runs);
     let read = others.map(|table| async move {
-        match log.view(table).await {
+        match log.view_table(table).await {
             Err(Error::Log { source, .. }) => Ok((table, Err(TableFault::unreadable(table, source.to_string())))),
             view => view.map(|view| (table, Ok(view))),
         }
@@ -81,10 +81,11 @@ impl LakeSnapshot {
     /// all at once if it is still the version of the last look.
     ///
     /// If `runs` has a newer version than a view that lacks rows, ingest has replaced them meanwhile: the view is taken again.
-    pub(crate) async fn take(log: &dyn CommitLog) -> Result<Self> {
+    pub(crate) async fn take_from(log: &dyn CommitLog) -> Result<Self> {
         for _ in 0..TAKE_TRIES {
             let snapshot = Self::take_once(log).await?;
-            if snapshot.faults.is_empty() || log.version(Table::Runs).await? == snapshot.version(Table::Runs) {
+            if snapshot.faults.is_empty() || log.newest_version(Table::Runs).await? == snapshot.log_version(Table::Runs)
+            {
                 return Ok(snapshot);
             }
         }
@@ -93,11 +94,11 @@ impl LakeSnapshot {
 
     async fn take_once(log: &dyn CommitLog) -> Result<Self> {
         let known = log.known_version(Table::Runs).await;
-        let (pointers, mut views) = try_join(log.view(Table::Runs), views_of_others(log)).await?;
+        let (pointers, mut views) = try_join(log.view_table(Table::Runs), views_of_others(log)).await?;
         if known.is_none() || pointers.as_ref().map(|view| view.version) != known {
             views = views_of_others(log).await?;
         }
-        let mut snapshot = Self::naming(pointers.as_ref().map_or(&[], |view| view.files.as_slice()));
+        let mut snapshot = Self::from_pointers(pointers.as_ref().map_or(&[], |view| view.files.as_slice()));
         let is_rebuilding = pointers.as_ref().is_some_and(|view| view.is_rebuilding);
         for (table, view) in views.into_iter().chain([(Table::Runs, Ok(pointers))]) {
             match view {
@@ -115,14 +116,14 @@ impl LakeSnapshot {
     }
 
     // Without the files of any table.
-    fn naming(pointers: &[DataFile]) -> Self {
+    fn from_pointers(pointers: &[DataFile]) -> Self {
         let runs = current_runs(pointers);
-        Self { newest: NewestRuns::of(&runs), runs, ..Self::default() }
+        Self { newest: NewestRuns::from_runs(&runs), runs, ..Self::default() }
     }
 
     /// The view of one table that a version of `runs` gives, its files as the log had them then.
-    pub(crate) fn of(pointers: &[DataFile], table: Table, files: Vec<DataFile>) -> Self {
-        let mut snapshot = Self::naming(pointers);
+    pub(crate) fn from_table_files(pointers: &[DataFile], table: Table, files: Vec<DataFile>) -> Self {
+        let mut snapshot = Self::from_pointers(pointers);
         snapshot.sort_in(table, files);
         snapshot
     }
@@ -131,7 +132,7 @@ impl LakeSnapshot {
     ///
     /// # Errors
     /// [`Error::Incomplete`], or [`Error::Log`] if its log is damaged.
-    pub fn check(&self, table: Table) -> Result<()> {
+    pub fn check_table(&self, table: Table) -> Result<()> {
         let of_runs = || self.faults.get(&Table::Runs).filter(|_| table.source() != Source::Rig);
         match self.faults.get(&table).or_else(of_runs) {
             Some(fault) => Err(fault.to_error()),
@@ -149,18 +150,18 @@ impl LakeSnapshot {
     }
 
     /// The runs that have other rows in a table than `runs` names.
-    pub fn lacking(&self, table: Table) -> &[LackingRows] {
+    pub fn lacking_rows(&self, table: Table) -> &[LackingRows] {
         self.lacking.get(&table).map_or(&[], Vec::as_slice)
     }
 
     /// Returns whether a run lacks rows in one of the tables of a source.
     pub fn lacks_rows(&self, run: &RunId, source: Source) -> bool {
         let of_source = Table::ALL.into_iter().filter(|table| table.source() == source);
-        of_source.flat_map(|table| self.lacking(table)).any(|lacking| lacking.run == *run)
+        of_source.flat_map(|table| self.lacking_rows(table)).any(|lacking| lacking.run == *run)
     }
 
     /// The files of a table that another program put into its log; empty for readers of some projects.
-    pub fn foreign(&self, table: Table) -> &[DataFile] {
+    pub fn foreign_files(&self, table: Table) -> &[DataFile] {
         self.foreign.get(&table).map_or(&[], Vec::as_slice)
     }
 
@@ -171,7 +172,7 @@ impl LakeSnapshot {
 
     /// The same view, of a reader of some projects.
     #[must_use]
-    pub(crate) fn restricted(mut self, is_restricted: bool) -> Self {
+    pub(crate) fn with_restriction(mut self, is_restricted: bool) -> Self {
         self.is_restricted = is_restricted;
         if is_restricted {
             // They may be of other projects. Rows of this reader that are in them are missing besides.
@@ -190,14 +191,14 @@ impl LakeSnapshot {
     /// added since is shown to nobody else. None if there was no table, and for views of the past.
     pub fn lake_version(&self) -> Option<u64> {
         match self.is_restricted {
-            false => self.version(Table::Runs),
+            false => self.log_version(Table::Runs),
             true => self.runs.values().map(|current| current.log_version).max(),
         }
     }
 
     /// The version of a table's log that the view was taken of; that of `runs` is the lake's. None if there was no
     /// table, and for views of the past.
-    pub fn version(&self, table: Table) -> Option<u64> {
+    pub fn log_version(&self, table: Table) -> Option<u64> {
         self.versions.get(&table).copied()
     }
 
@@ -213,12 +214,12 @@ impl LakeSnapshot {
 
     /// The files of a table that belong to a run that readers see, but are no longer seen themselves. Excludes files
     /// whose author had seen the run's present row: that ingest may be about to replace it by one that names them.
-    pub fn superseded(&self, table: Table) -> &[DataFile] {
+    pub fn superseded_files(&self, table: Table) -> &[DataFile] {
         self.hidden.get(&table).map_or(&[], Vec::as_slice)
     }
 
     /// Merged files of a table that readers see in part, and whose other parts are superseded.
-    pub(crate) fn outgrown(&self, table: Table) -> &[DataFile] {
+    pub(crate) fn outgrown_files(&self, table: Table) -> &[DataFile] {
         self.outgrown.get(&table).map_or(&[], Vec::as_slice)
     }
 
@@ -233,7 +234,7 @@ impl LakeSnapshot {
     }
 
     /// The project of a run; None if it was given none.
-    pub fn project(&self, run: &RunId) -> Option<&ProjectName> {
+    pub fn project_of(&self, run: &RunId) -> Option<&ProjectName> {
         self.runs.get(run)?.project.as_ref()
     }
 
@@ -276,8 +277,8 @@ impl LakeSnapshot {
         let is_without_rig = table.source() == Source::Rig && sorted.seen.is_empty() && !self.runs.is_empty();
         let lacking = self.compare_rows(table, &sorted.logged);
         let fault = match (lacking.is_empty(), sorted.foreign.first()) {
-            (false, _) => Some(TableFault::lacking(table, &lacking)),
-            (true, Some(file)) => Some(TableFault::foreign(table, file)),
+            (false, _) => Some(TableFault::from_lacking(table, &lacking)),
+            (true, Some(file)) => Some(TableFault::from_foreign(table, file)),
             (true, None) => is_without_rig.then(|| TableFault::without_rig(table)),
         };
         fault.into_iter().for_each(|fault| self.set_fault(fault));
@@ -298,7 +299,7 @@ impl LakeSnapshot {
         let needed = named.filter(|current| self.run_place(table, current) != RowsPlace::Superseded);
         let compared = needed.filter_map(|current| {
             let actual = logged.get(&current.run.run).copied();
-            let expected = current.row_counts.as_ref().and_then(|counts| counts.rows(table));
+            let expected = current.row_counts.as_ref().and_then(|counts| counts.rows_of(table));
             let is_whole = match (expected, &current.row_counts) {
                 (Some(expected), _) => actual.unwrap_or(0) == expected,
                 (None, Some(_)) => true,
@@ -355,7 +356,7 @@ impl LakeSnapshot {
         let Some(current) = self.runs.get(run) else { return RowsPlace::Unseen };
         let is_named = match table.source() {
             Source::References => current.run.reference_derivation.as_deref() == Some(derivation),
-            Source::Pointer => current.run.derivations() == derivation,
+            Source::Pointer => current.run.joined_derivations() == derivation,
             _ => current.run.run_derivation == derivation,
         };
         match is_named {
@@ -426,7 +427,7 @@ struct SortedFiles {
 fn current_runs(files: &[DataFile]) -> BTreeMap<RunId, CurrentRun> {
     let mut rows: Vec<_> =
         files.iter().flat_map(|file| list_pointers(file).into_iter().map(move |row| (row, file))).collect();
-    rows.sort_by_key(|(row, _)| (row.version, row.run.derivations()));
+    rows.sort_by_key(|(row, _)| (row.version, row.run.joined_derivations()));
     let current = |(row, file): (RunPointer<'_>, &DataFile)| CurrentRun {
         log_version: row.version,
         project: file.project(),
@@ -453,7 +454,7 @@ mod tests {
 
     fn view(files: &[(Table, &str, u64)]) -> LakeSnapshot {
         let of = |table| files.iter().filter(|f| f.0 == table).map(|f| file(f.0, f.1, f.2)).collect::<Vec<_>>();
-        let mut snapshot = LakeSnapshot::naming(&of(Table::Runs));
+        let mut snapshot = LakeSnapshot::from_pointers(&of(Table::Runs));
         Table::ALL.into_iter().for_each(|table| snapshot.sort_in(table, of(table)));
         snapshot
     }
@@ -466,7 +467,7 @@ mod tests {
     fn rows_are_seen_once_runs_names_them() {
         let before = view(&[(Table::Measurements, "flat.r1.ab.parquet", 1)]);
         assert!(before.files(Table::Measurements).is_empty());
-        assert!(before.superseded(Table::Measurements).is_empty(), "its ingest may still be going on");
+        assert!(before.superseded_files(Table::Measurements).is_empty(), "its ingest may still be going on");
         let after = view(&[
             (Table::Measurements, "flat.r1.ab.parquet", 1),
             (Table::Nce, "flat.r1.cd.parquet", 1),
@@ -476,7 +477,7 @@ mod tests {
         ]);
         assert_eq!(names(after.files(Table::Measurements)), ["flat.r1.ab.parquet"]);
         assert_eq!(names(after.files(Table::Nce)), ["flat.r1.cd.parquet"]);
-        assert_eq!(names(after.superseded(Table::Nce)), ["flat.r1.old.parquet"]);
+        assert_eq!(names(after.superseded_files(Table::Nce)), ["flat.r1.old.parquet"]);
     }
 
     #[test]
@@ -487,7 +488,7 @@ mod tests {
             (Table::Tnce, "flat.r1.cd.parquet", 1),
         ]);
         assert_eq!(names(both.files(Table::Runs)), ["flat.r1.ab.cd.parquet"]);
-        assert_eq!(names(both.superseded(Table::Runs)), ["flat.r1.ab.none.parquet"]);
+        assert_eq!(names(both.superseded_files(Table::Runs)), ["flat.r1.ab.none.parquet"]);
         assert_eq!(names(both.files(Table::Tnce)), ["flat.r1.cd.parquet"]);
     }
 
@@ -512,7 +513,7 @@ mod tests {
     }
 
     fn lacking(snapshot: &LakeSnapshot, table: Table) -> Vec<(String, Option<u64>, u64)> {
-        let rows = snapshot.lacking(table).iter();
+        let rows = snapshot.lacking_rows(table).iter();
         rows.map(|lacking| (lacking.run.to_string(), lacking.expected, lacking.actual)).collect()
     }
 
@@ -520,21 +521,24 @@ mod tests {
     fn rows_of_each_run_are_compared_with_what_its_row_names() {
         let row = counting(file(Table::Runs, "flat.r1.ab.cd.parquet", 5), &[(Table::Nce, 4), (Table::Events, 0)]);
         let older = file(Table::Runs, "wood.r2.ab.none.parquet", 5);
-        let of = |table, files| LakeSnapshot::of(&[row.clone(), older.clone()], table, files);
+        let of = |table, files| LakeSnapshot::from_table_files(&[row.clone(), older.clone()], table, files);
         let four = DataFile { rows: 4, ..file(Table::Nce, "flat.r1.cd.parquet", 5) };
-        assert!(of(Table::Nce, vec![four.clone()]).check(Table::Nce).is_ok(), "the older run waits for references");
+        assert!(
+            of(Table::Nce, vec![four.clone()]).check_table(Table::Nce).is_ok(),
+            "the older run waits for references"
+        );
         let three = of(Table::Nce, vec![DataFile { rows: 3, ..four.clone() }]);
         assert_eq!(lacking(&three, Table::Nce), [("r1".to_owned(), Some(4), 3)]);
-        let error = three.check(Table::Nce).expect_err("refused").to_string();
+        let error = three.check_table(Table::Nce).expect_err("refused").to_string();
         assert!(error.contains("`nce`") && error.contains("run `r1` has 3 rows, expected 4"), "{error}");
         assert_eq!(lacking(&of(Table::Nce, Vec::new()), Table::Nce), [("r1".to_owned(), Some(4), 0)]);
         let other = of(Table::Nce, vec![file(Table::Nce, "flat.r1.ef.parquet", 5)]);
         assert_eq!(lacking(&other, Table::Nce), [("r1".to_owned(), Some(4), 0)]);
         let merged = of(Table::Nce, vec![merged(Table::Nce, &[("flat.r1.cd.parquet", 4), ("x.r9.cd.parquet", 3)])]);
-        assert!(merged.check(Table::Nce).is_ok());
+        assert!(merged.check_table(Table::Nce).is_ok());
         // A row that does not count the others still has some of each.
         assert_eq!(lacking(&of(Table::Events, Vec::new()), Table::Events), [("r2".to_owned(), None, 0)]);
-        assert!(of(Table::Heightmaps, Vec::new()).check(Table::Heightmaps).is_ok());
+        assert!(of(Table::Heightmaps, Vec::new()).check_table(Table::Heightmaps).is_ok());
     }
 
     #[test]
@@ -543,11 +547,13 @@ mod tests {
         let row = |name: &str| counting(file(Table::Runs, name, 5), &counts);
         let rows = [row("flat.r1.ab.none.parquet"), row("flat.r2.ab.none.parquet")];
         let newest = file(Table::Surfaces, "flat.r2.ab.parquet", 5);
-        assert!(LakeSnapshot::of(&rows, Table::Surfaces, vec![newest]).check(Table::Surfaces).is_ok());
+        assert!(
+            LakeSnapshot::from_table_files(&rows, Table::Surfaces, vec![newest]).check_table(Table::Surfaces).is_ok()
+        );
         let older = file(Table::Surfaces, "flat.r1.ab.parquet", 5);
-        let snapshot = LakeSnapshot::of(&rows, Table::Surfaces, vec![older]);
+        let snapshot = LakeSnapshot::from_table_files(&rows, Table::Surfaces, vec![older]);
         assert_eq!(lacking(&snapshot, Table::Surfaces), [("r2".to_owned(), Some(1), 0)]);
-        assert!(LakeSnapshot::of(&[], Table::Measurements, Vec::new()).is_whole());
+        assert!(LakeSnapshot::from_table_files(&[], Table::Measurements, Vec::new()).is_whole());
     }
 
     #[test]
@@ -555,12 +561,12 @@ mod tests {
         let row = counting(file(Table::Runs, "flat.r1.ab.none.parquet", 5), &[(Table::Measurements, 1)]);
         let rows = file(Table::Measurements, "flat.r1.ab.parquet", 5);
         let foreign = file(Table::Measurements, "part-00000-c528.zstd.parquet", 0);
-        let snapshot = LakeSnapshot::of(&[row], Table::Measurements, vec![rows, foreign]);
-        let error = snapshot.check(Table::Measurements).expect_err("refused").to_string();
+        let snapshot = LakeSnapshot::from_table_files(&[row], Table::Measurements, vec![rows, foreign]);
+        let error = snapshot.check_table(Table::Measurements).expect_err("refused").to_string();
         assert!(error.contains("another program put `tables/measurements/part-00000-c528.zstd.parquet`"), "{error}");
-        assert_eq!(names(snapshot.foreign(Table::Measurements)), ["part-00000-c528.zstd.parquet"]);
-        let seen = snapshot.restricted(true);
-        assert!(seen.check(Table::Measurements).is_ok() && seen.foreign(Table::Measurements).is_empty());
+        assert_eq!(names(snapshot.foreign_files(Table::Measurements)), ["part-00000-c528.zstd.parquet"]);
+        let seen = snapshot.with_restriction(true);
+        assert!(seen.check_table(Table::Measurements).is_ok() && seen.foreign_files(Table::Measurements).is_empty());
     }
 
     fn merged(table: Table, parts: &[(&str, u64)]) -> DataFile {
@@ -574,7 +580,7 @@ mod tests {
     fn parts_are_seen_and_superseded_as_files_were() {
         let runs = |wood: &str| {
             let pointers = ["flat.r1.ab.cd.parquet".to_owned(), format!("wood.r2.ab.{wood}.parquet")];
-            let mut snapshot = LakeSnapshot::naming(&pointers.map(|name| file(Table::Runs, &name, 5)));
+            let mut snapshot = LakeSnapshot::from_pointers(&pointers.map(|name| file(Table::Runs, &name, 5)));
             let files = vec![
                 file(Table::Nce, "flat.r1.cd.parquet", 9),
                 merged(Table::Nce, &[("flat.r1.cd.parquet", 4), ("wood.r2.ef.parquet", 3)]),
@@ -591,12 +597,12 @@ mod tests {
         assert_eq!((partly.visible_rows(), &partly.hidden), (3, &vec![r1]), "the same rows once more");
         let visible: Vec<_> = partly.visible_parts().map(|(part, rows)| (part.run.clone(), rows)).collect();
         assert_eq!(visible, [(r2.clone(), 4..7)]);
-        assert!(both.superseded(Table::Nce).is_empty());
-        assert_eq!(names(both.outgrown(Table::Nce)), ["merged.aa.parquet"]);
+        assert!(both.superseded_files(Table::Nce).is_empty());
+        assert_eq!(names(both.outgrown_files(Table::Nce)), ["merged.aa.parquet"]);
         assert_eq!(both.files_of(Table::Nce, &r2).count(), 1);
 
         let replaced = runs("gh");
         assert_eq!(names(replaced.files(Table::Nce)), ["flat.r1.cd.parquet", "wood.r2.gh.parquet"]);
-        assert_eq!(names(replaced.superseded(Table::Nce)), ["merged.aa.parquet"]);
+        assert_eq!(names(replaced.superseded_files(Table::Nce)), ["merged.aa.parquet"]);
     }
 }

@@ -41,7 +41,7 @@ impl TableFault {
         Self { table, is_of_foreign_files: false, is_unreadable: false, found: found.into() }
     }
 
-    pub(crate) fn lacking(table: Table, lacking: &[LackingRows]) -> Self {
+    pub(crate) fn from_lacking(table: Table, lacking: &[LackingRows]) -> Self {
         let first = lacking.first().map(ToString::to_string).unwrap_or_default();
         match lacking.len() {
             0 | 1 => Self::new(table, first),
@@ -49,7 +49,7 @@ impl TableFault {
         }
     }
 
-    pub(crate) fn foreign(table: Table, file: &DataFile) -> Self {
+    pub(crate) fn from_foreign(table: Table, file: &DataFile) -> Self {
         let found = format!("another program put `{}` into its log", file.path);
         Self { is_of_foreign_files: true, ..Self::new(table, found) }
     }

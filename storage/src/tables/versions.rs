@@ -75,8 +75,8 @@ impl Lake {
     ///
     /// # Errors
     /// What the store says.
-    pub async fn versions(&self) -> Result<Vec<TableVersion>> {
-        self.log().versions(Table::Runs).await
+    pub async fn list_versions(&self) -> Result<Vec<TableVersion>> {
+        self.commit_log().list_versions(Table::Runs).await
     }
 
     /// The lake's version at a moment: for a time, the newest that was committed by then.
@@ -84,7 +84,7 @@ impl Lake {
     /// # Errors
     /// [`Error::NoMoment`] if the log does not hold it.
     pub async fn version_at(&self, moment: LakeMoment) -> Result<u64> {
-        let versions = self.versions().await?;
+        let versions = self.list_versions().await?;
         let found = match moment {
             LakeMoment::Version(number) => versions.iter().find(|v| v.version == number),
             LakeMoment::Time(time) => versions.iter().rfind(|v| v.committed <= time),
@@ -97,19 +97,19 @@ impl Lake {
     /// # Errors
     /// [`Error::Vacuumed`] if files of it are deleted, or what the store says.
     pub async fn snapshot_at(&self, version: u64, table: Table) -> Result<LakeSnapshot> {
-        let pointers = self.log().files_at(Table::Runs, version).await?;
-        let mut files = self.log().files(table).await?;
+        let pointers = self.commit_log().files_at(Table::Runs, version).await?;
+        let mut files = self.commit_log().list_files(table).await?;
         if table.source() != Source::Rig && !shows_all(&pointers, table, &files) {
-            files = self.log().files_of_all_versions(table).await?;
+            files = self.commit_log().files_of_all_versions(table).await?;
         }
         let there = self.list_files(table).await?;
-        let wanted = LakeSnapshot::of(&pointers, table, files.clone());
-        if let Some(lacking) = wanted.lacking(table).first() {
+        let wanted = LakeSnapshot::from_table_files(&pointers, table, files.clone());
+        if let Some(lacking) = wanted.lacking_rows(table).first() {
             let moment = LakeMoment::Version(version).to_string();
             return Err(Error::Forgotten { moment, table: table.name(), lacking: lacking.to_string() });
         }
         files.retain(|file| there.contains(&file.path));
-        let snapshot = LakeSnapshot::of(&pointers, table, files);
+        let snapshot = LakeSnapshot::from_table_files(&pointers, table, files);
         let shown = snapshot.shown_runs(table);
         // Another file may have the same rows.
         let is_missing = |file: &&DataFile| {
@@ -127,14 +127,14 @@ impl Lake {
     async fn list_files(&self, table: Table) -> Result<HashSet<Path>> {
         let folder = table_folder(table);
         let there = self.store().list_with_delimiter(Some(&folder)).await;
-        let there = there.map_err(|e| Error::store("list", &folder, e))?;
+        let there = there.map_err(|e| Error::store_failure("list", &folder, e))?;
         Ok(there.objects.into_iter().map(|o| o.location).collect())
     }
 }
 
 // Returns whether these files have the rows of all runs.
 fn shows_all(pointers: &[DataFile], table: Table, files: &[DataFile]) -> bool {
-    let snapshot = LakeSnapshot::of(pointers, table, files.to_vec());
+    let snapshot = LakeSnapshot::from_table_files(pointers, table, files.to_vec());
     snapshot.shown_runs(table).len() == snapshot.runs().count()
 }
 
@@ -154,11 +154,11 @@ mod tests {
     use echolake_schema::{Rig, RunId};
 
     use super::*;
-    use crate::{CommitOutcome, FileName, ReferenceSurfaces, StagedFile, VisibleRun, encode};
+    use crate::{CommitOutcome, FileName, ReferenceSurfaces, StagedFile, VisibleRun, encode_batches};
 
     async fn stage(lake: &Lake, table: Table, name: &FileName) -> StagedFile {
-        let file = encode(table, &table.schema(lake.rig()), &[]).expect("encoded");
-        lake.stage(table, name, file).await.expect("staged").made_from(&lake.snapshot().await.expect("a view"))
+        let file = encode_batches(table, &table.schema(lake.rig()), &[]).expect("encoded");
+        lake.stage_file(table, name, file).await.expect("staged").made_from(&lake.snapshot().await.expect("a view"))
     }
 
     // Commits rows of `nce`, then the run's row in place of its present one; returns the lake's version.
@@ -173,10 +173,11 @@ mod tests {
         let rows = FileName::Rows { surface, run, derivation: derivation.to_owned() };
         let snapshot = lake.snapshot().await.expect("a view");
         let old: Vec<_> = snapshot.files_of(Table::Runs, &visible.run).cloned().collect();
-        let pointer = stage(lake, Table::Runs, &FileName::Pointer(visible.clone())).await.replacing(&visible, &old);
+        let pointer =
+            stage(lake, Table::Runs, &FileName::Pointer(visible.clone())).await.with_replaced_rows(&visible, &old);
         let staged = [stage(lake, Table::Nce, &rows).await, pointer];
-        assert_eq!(lake.commit(&staged).await.expect("committed"), [CommitOutcome::Now; 2]);
-        lake.snapshot().await.expect("a view").version(Table::Runs).expect("a log")
+        assert_eq!(lake.commit_staged(&staged).await.expect("committed"), [CommitOutcome::Now; 2]);
+        lake.snapshot().await.expect("a view").log_version(Table::Runs).expect("a log")
     }
 
     /// Writes the times of a table's commits: a minute from each to the next, by a clock that is off by some hours.
@@ -209,7 +210,7 @@ mod tests {
             set_commit_times(&made, table, hours);
 
             let lake = Lake::open(&url).await.expect("opened");
-            let versions = lake.versions().await.expect("versions");
+            let versions = lake.list_versions().await.expect("versions");
             for (version, names) in &expected {
                 let committed = versions.iter().find(|v| v.version == *version).expect("held").committed;
                 let at = lake.version_at(LakeMoment::Time(committed)).await.expect("a version");

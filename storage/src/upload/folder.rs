@@ -52,7 +52,7 @@ pub(super) async fn send_to_folder(
         return Err(Error::UploadDamaged { location, path, expected, actual });
     }
     let from = Path::from(format!("{INBOX}/{}.mcap.{STAGED}", run.run));
-    lake.store().rename(&from, to).await.map_err(|e| Error::store("write", to, e))
+    lake.store().rename(&from, to).await.map_err(|e| Error::store_failure("write", to, e))
 }
 
 /// A copy in progress.

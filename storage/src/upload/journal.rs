@@ -71,13 +71,13 @@ impl UploadJournal {
         file.read_to_end(&mut text).map_err(failed)?;
         let (location, sha256) = (location.to_owned(), run.sha256.clone());
         let wanted = UploadHead { location, path: to.to_string(), sha256, bytes: run.bytes };
-        let (upload, parts) = parse(&String::from_utf8_lossy(&text), &wanted).unwrap_or_default();
+        let (upload, parts) = parse_journal(&String::from_utf8_lossy(&text), &wanted).unwrap_or_default();
         let mut journal = Self { path, file, wanted, upload, parts };
         match journal.upload {
             // What is added must not continue a line that a cut left unfinished.
-            Some(_) if text.last() != Some(&b'\n') => journal.append("\n")?,
+            Some(_) if text.last() != Some(&b'\n') => journal.append_text("\n")?,
             Some(_) => {}
-            None => journal.restart()?,
+            None => journal.restart_upload()?,
         }
         Ok(journal)
     }
@@ -88,17 +88,17 @@ impl UploadJournal {
     }
 
     /// Id of the upload, once it is begun.
-    pub(super) fn upload(&self) -> Option<&str> {
+    pub(super) fn upload_id(&self) -> Option<&str> {
         self.upload.as_deref()
     }
 
     /// Ids of the parts that are in the store, by number.
-    pub(super) fn parts(&self) -> &BTreeMap<usize, String> {
+    pub(super) fn part_ids(&self) -> &BTreeMap<usize, String> {
         &self.parts
     }
 
     /// Notes the beginning of an upload.
-    pub(super) fn begin(&mut self, upload: String) -> Result<()> {
+    pub(super) fn begin_upload(&mut self, upload: String) -> Result<()> {
         let line = FirstLine { head: self.wanted.clone(), upload: upload.clone() };
         self.append_line(&line)?;
         self.upload = Some(upload);
@@ -113,31 +113,31 @@ impl UploadJournal {
     }
 
     /// Forgets the upload: it is begun anew.
-    pub(super) fn restart(&mut self) -> Result<()> {
+    pub(super) fn restart_upload(&mut self) -> Result<()> {
         (self.upload, self.parts) = (None, BTreeMap::new());
         let emptied = self.file.set_len(0).and_then(|()| self.file.rewind());
         emptied.map_err(|e| journal_error("write", &self.path, e))
     }
 
     /// Deletes it: the upload is at its end.
-    pub(super) fn remove(self) -> Result<()> {
+    pub(super) fn delete_journal(self) -> Result<()> {
         std::fs::remove_file(&self.path).map_err(|e| journal_error("delete", &self.path, e))
     }
 
     fn append_line(&mut self, line: &impl Serialize) -> Result<()> {
         // Texts and numbers always have a JSON form.
         let text = serde_json::to_string(line).unwrap_or_default();
-        self.append(&format!("{text}\n"))
+        self.append_text(&format!("{text}\n"))
     }
 
     // A whole line in one call, so that a kill leaves all of it or none.
-    fn append(&mut self, text: &str) -> Result<()> {
+    fn append_text(&mut self, text: &str) -> Result<()> {
         self.file.write_all(text.as_bytes()).map_err(|e| journal_error("write", &self.path, e))
     }
 }
 
 // None if the text is the journal of another upload, or of none.
-fn parse(text: &str, wanted: &UploadHead) -> Option<(Option<String>, BTreeMap<usize, String>)> {
+fn parse_journal(text: &str, wanted: &UploadHead) -> Option<(Option<String>, BTreeMap<usize, String>)> {
     let mut lines = text.split_inclusive('\n').filter(|line| line.ends_with('\n'));
     let FirstLine { head, upload } = serde_json::from_str(lines.next()?).ok()?;
     if head != *wanted {
@@ -177,17 +177,17 @@ mod tests {
         assert!(!journal.is_begun());
         let busy = open(&run).expect_err("locked").to_string();
         assert!(busy.contains("r.mcap") && busy.contains("hint: "), "{busy}");
-        journal.begin("id".to_owned()).expect("written");
+        journal.begin_upload("id".to_owned()).expect("written");
         journal.add_part(1, "one".to_owned()).expect("written");
-        journal.append("{\"part\":0,\"i").expect("written");
+        journal.append_text("{\"part\":0,\"i").expect("written");
         drop(journal);
         let mut journal = open(&run).expect("there");
-        assert_eq!(journal.upload(), Some("id"));
+        assert_eq!(journal.upload_id(), Some("id"));
         journal.add_part(2, "two".to_owned()).expect("written");
         drop(journal);
-        let parts = open(&run).expect("there").parts().clone();
+        let parts = open(&run).expect("there").part_ids().clone();
         assert_eq!(parts.keys().copied().collect::<Vec<_>>(), [1, 2]);
-        open(&run).expect("there").remove().expect("deleted");
+        open(&run).expect("there").delete_journal().expect("deleted");
         assert!(!open(&run).expect("new").is_begun());
     }
 
@@ -198,11 +198,11 @@ mod tests {
         let others =
             [RunUpload { sha256: "cd".to_owned(), ..first.clone() }, RunUpload { bytes: 101, ..first.clone() }];
         for other in others {
-            open(&first).expect("new").begin("id".to_owned()).expect("written");
+            open(&first).expect("new").begin_upload("id".to_owned()).expect("written");
             assert!(!open(&other).expect("there").is_begun(), "{other:?}");
             assert!(!open(&first).expect("there").is_begun(), "forgotten");
         }
-        open(&first).expect("new").begin("id".to_owned()).expect("written");
+        open(&first).expect("new").begin_upload("id".to_owned()).expect("written");
         let elsewhere = UploadJournal::open(&first, "s3://other", &Path::from("inbox/r.mcap"));
         assert!(!elsewhere.expect("there").is_begun());
     }

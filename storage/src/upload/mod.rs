@@ -77,7 +77,7 @@ impl Lake {
         if self.holds_run(run, &ingested).await? {
             return Ok(UploadOutcome::Present(ingested));
         }
-        let mut journal = match self.parts() {
+        let mut journal = match self.part_store() {
             Some(_) => Some(UploadJournal::open(run, self.location(), &inbox)?),
             None => None,
         };
@@ -88,7 +88,7 @@ impl Lake {
             }
         } else {
             self.reserve_name(run, &inbox).await?;
-            match (self.parts(), &mut journal) {
+            match (self.part_store(), &mut journal) {
                 (Some(store), Some(journal)) => parts::send_parts(self, store, journal, run, &inbox, progress).await?,
                 _ => folder::send_to_folder(self, run, &inbox, progress).await?,
             }
@@ -96,7 +96,9 @@ impl Lake {
         let outcome = self.compare_upload(run, &inbox, &ingested, progress).await;
         match outcome {
             // What is there is deleted, so that the next upload begins anew.
-            Err(error @ Error::UploadDamaged { .. }) => journal.map_or(Ok(()), UploadJournal::remove).and(Err(error)),
+            Err(error @ Error::UploadDamaged { .. }) => {
+                journal.map_or(Ok(()), UploadJournal::delete_journal).and(Err(error))
+            }
             Err(error) => Err(error),
             Ok(outcome) => finish_upload(journal, outcome),
         }
@@ -104,7 +106,7 @@ impl Lake {
 
     // Returns whether the same file is there; another one is an error.
     async fn holds_run(&self, run: &RunUpload, path: &Path) -> Result<bool> {
-        let failed = |e| Error::store("read", path, e);
+        let failed = |e| Error::store_failure("read", path, e);
         let store = self.store();
         let bytes = match store.head(path).await {
             Ok(meta) => meta.size,
@@ -134,10 +136,10 @@ impl Lake {
         let (store, record) = (self.store(), digest_record_path(inbox));
         let text = digest_record(&run.sha256, inbox);
         let created = create_object(store.as_ref(), &record, text.into()).await;
-        if created.map_err(|e| Error::store("write", &record, e))? {
+        if created.map_err(|e| Error::store_failure("write", &record, e))? {
             return Ok(());
         }
-        match read_digest_record(store.as_ref(), inbox).await.map_err(|e| Error::store("read", &record, e))? {
+        match read_digest_record(store.as_ref(), inbox).await.map_err(|e| Error::store_failure("read", &record, e))? {
             Some(other) if other != run.sha256 => {
                 Err(self.other_upload(inbox, format!("SHA-256 {other}"), format!("SHA-256 {}", run.sha256)))
             }
@@ -158,7 +160,7 @@ impl Lake {
         match object_sha256(store.as_ref(), inbox, run.bytes, &mut compared).await {
             Ok(actual) if actual == run.sha256 => Ok(UploadOutcome::Uploaded(inbox.clone())),
             Ok(actual) => {
-                store.delete(inbox).await.map_err(|e| Error::store("delete", inbox, e))?;
+                store.delete(inbox).await.map_err(|e| Error::store_failure("delete", inbox, e))?;
                 let (location, path, expected) = (self.location().to_owned(), inbox.to_string(), run.sha256.clone());
                 Err(Error::UploadDamaged { location, path, expected, actual })
             }
@@ -169,7 +171,7 @@ impl Lake {
             Err(StoreError::NotFound { .. }) => {
                 Err(Error::UploadGone { location: self.location().to_owned(), path: inbox.to_string() })
             }
-            Err(e) => Err(Error::store("read back", inbox, e)),
+            Err(e) => Err(Error::store_failure("read back", inbox, e)),
         }
     }
 
@@ -179,7 +181,7 @@ impl Lake {
 }
 
 fn finish_upload(journal: Option<UploadJournal>, outcome: UploadOutcome) -> Result<UploadOutcome> {
-    journal.map_or(Ok(()), UploadJournal::remove)?;
+    journal.map_or(Ok(()), UploadJournal::delete_journal)?;
     Ok(outcome)
 }
 

@@ -55,7 +55,7 @@ pub(super) async fn send_parts(
     if journal.is_begun() {
         match try_send(lake, store, journal, run, to, progress).await {
             // The store has aborted the upload, as its rule may say after a day.
-            Err(SendFault::Forgotten(_)) => journal.restart()?,
+            Err(SendFault::Forgotten(_)) => journal.restart_upload()?,
             done => return done.map_err(|fault| fault.into_error(to)),
         }
     }
@@ -70,11 +70,12 @@ async fn try_send(
     to: &Path,
     progress: UploadProgress<'_>,
 ) -> std::result::Result<(), SendFault> {
-    let upload = match journal.upload() {
+    let upload = match journal.upload_id() {
         Some(upload) => upload.to_owned(),
         None => {
-            let upload = store.begin_upload(to).await.map_err(|e| Error::store("begin the upload of", to, e))?;
-            journal.begin(upload.clone())?;
+            let upload =
+                store.begin_upload(to).await.map_err(|e| Error::store_failure("begin the upload of", to, e))?;
+            journal.begin_upload(upload.clone())?;
             upload
         }
     };
@@ -85,9 +86,9 @@ async fn try_send(
         begin..(begin + size).min(run.bytes)
     };
     let mut sent: u64 =
-        journal.parts().keys().map(|number| range(*number)).map(|r| r.end.saturating_sub(r.start)).sum();
+        journal.part_ids().keys().map(|number| range(*number)).map(|r| r.end.saturating_sub(r.start)).sum();
     progress(UploadStep::Send, sent);
-    let missing: Vec<_> = (0..count).filter(|number| !journal.parts().contains_key(number)).collect();
+    let missing: Vec<_> = (0..count).filter(|number| !journal.part_ids().contains_key(number)).collect();
     let send_one = |number: usize| {
         let (upload, range) = (&upload, range(number));
         async move {
@@ -103,7 +104,7 @@ async fn try_send(
         sent += range.end - range.start;
         progress(UploadStep::Send, sent);
     }
-    let parts = journal.parts().values().take(count).cloned().collect();
+    let parts = journal.part_ids().values().take(count).cloned().collect();
     let Err(error) = store.complete_upload(to, &upload, parts).await else { return Ok(()) };
     // Its answer may have been lost, now or before a kill: then the store has the object, and not the upload any more.
     match lake.store().head(to).await {
@@ -126,14 +127,14 @@ pub(crate) async fn read_part(file: &FsPath, range: std::ops::Range<u64>) -> Res
 fn fault_of(action: &'static str, to: &Path, error: StoreError) -> SendFault {
     match error {
         StoreError::NotFound { .. } => SendFault::Forgotten(error),
-        error => SendFault::Failed(Error::store(action, to, error)),
+        error => SendFault::Failed(Error::store_failure(action, to, error)),
     }
 }
 
 impl SendFault {
     fn into_error(self, to: &Path) -> Error {
         match self {
-            Self::Forgotten(error) => Error::store("upload", to, error),
+            Self::Forgotten(error) => Error::store_failure("upload", to, error),
             Self::Failed(error) => error,
         }
     }

@@ -53,8 +53,8 @@ impl AttackRow {
         let goals = [
             ("the door lives", !matches!(self.fate, ServerFate::Died(_) | ServerFate::Capped)),
             ("light queries are right", self.light.failures.is_empty()),
-            ("light queries within 300 ms", longest(&self.light.queries) <= LIGHT_GOAL),
-            ("/health within 100 ms", longest(&self.light.health) <= HEALTH_GOAL),
+            ("light queries within 300 ms", longest_time(&self.light.queries) <= LIGHT_GOAL),
+            ("/health within 100 ms", longest_time(&self.light.health) <= HEALTH_GOAL),
             ("memory within limit + 200 MiB", self.peak.total_mib <= self.memory_goal_mib()),
             ("door within 300 MiB", self.peak.door_mib <= DOOR_GOAL_MIB),
             ("idle again", self.idle_time <= IDLE_GOAL && self.fate != ServerFate::Busy),
@@ -84,7 +84,7 @@ impl AttackRow {
     }
 }
 
-fn longest(times: &[Duration]) -> Duration {
+fn longest_time(times: &[Duration]) -> Duration {
     times.iter().max().copied().unwrap_or_default()
 }
 
@@ -96,9 +96,9 @@ pub(super) fn print_row(row: &AttackRow) {
         row.name,
         row.protocol,
         millis(percentile(&row.light.queries, 0.5)),
-        millis(longest(&row.light.queries)),
+        millis(longest_time(&row.light.queries)),
         row.light.failures.len(),
-        millis(longest(&row.light.health)),
+        millis(longest_time(&row.light.health)),
         row.peak.door_mib,
         row.peak.total_mib,
         millis(row.idle_time),

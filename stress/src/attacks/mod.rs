@@ -44,7 +44,7 @@ pub(crate) struct AttackArgs {
     quick: bool,
 }
 
-pub(crate) fn run(args: &AttackArgs) -> Result<()> {
+pub(crate) fn run_attacks(args: &AttackArgs) -> Result<()> {
     let mut cases = if args.quick { quick_cases() } else { all_cases() };
     cases.retain(|case| args.only.as_ref().is_none_or(|part| case.title().contains(part.as_str())));
     ensure!(!cases.is_empty(), "no attack has this in `NAME PROTOCOL`");

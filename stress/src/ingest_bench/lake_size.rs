@@ -11,7 +11,11 @@ use super::parquet_files::{StoredTableFile, raw_bytes};
 use super::report::{FigureGoal, FigureReport};
 use super::simulated::IngestedLake;
 
-pub(crate) fn measure(ingested: &IngestedLake, files: &[StoredTableFile], report: &mut FigureReport) -> Result<()> {
+pub(crate) fn measure_lake_size(
+    ingested: &IngestedLake,
+    files: &[StoredTableFile],
+    report: &mut FigureReport,
+) -> Result<()> {
     report.title("Size of tables/, logs included, against the same numbers as raw f32 and f64")?;
     report.line(&format!("{:<14} {:>9} {:>12} {:>12} {:>8}", "table", "rows", "bytes a row", "raw a row", "ratio"))?;
     let (mut all_raw, mut all_arrays) = (0, 0);

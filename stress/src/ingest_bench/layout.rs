@@ -10,7 +10,9 @@ use parquet::file::metadata::{PageIndexPolicy, ParquetMetaDataReader};
 use parquet::file::properties::WriterPropertiesBuilder;
 
 use super::IngestBenchArgs;
-use super::parquet_files::{FileRows, LEVEL, NumberEncoding, PAGE_BYTES, StoredTableFile, builder_as, read_all, zstd};
+use super::parquet_files::{
+    FileRows, LEVEL, NumberEncoding, PAGE_BYTES, StoredTableFile, builder_as, read_all, zstd_compression,
+};
 use super::report::FigureReport;
 
 /// Page sizes that are compared.
@@ -23,7 +25,7 @@ struct FileLayout {
     compression: Compression,
 }
 
-pub(crate) fn measure(
+pub(crate) fn measure_layouts(
     args: &IngestBenchArgs,
     files: &[StoredTableFile],
     rows: &[FileRows],
@@ -39,22 +41,22 @@ pub(crate) fn measure(
             rows.raw as f64 / 1e6,
             args.repeats()
         ))?;
-        layouts(args, &file.bytes, rows, report)?;
-        pages(&file.bytes, rows, report)?;
+        compare_layouts(args, &file.bytes, rows, report)?;
+        compare_page_sizes(&file.bytes, rows, report)?;
     }
     Ok(())
 }
 
-fn layouts(args: &IngestBenchArgs, file: &Bytes, rows: &FileRows, report: &mut FigureReport) -> Result<()> {
+fn compare_layouts(args: &IngestBenchArgs, file: &Bytes, rows: &FileRows, report: &mut FigureReport) -> Result<()> {
     let layout = |name, numbers, compression| FileLayout { name, numbers, compression };
     let metadata = ParquetMetaDataReader::new().parse_and_finish(file)?;
     let candidates = [
-        layout("as stored: byte stream split, zstd 1", NumberEncoding::AsStored, zstd(LEVEL)),
-        layout("byte stream split, zstd 3", NumberEncoding::AsStored, zstd(3)),
+        layout("as stored: byte stream split, zstd 1", NumberEncoding::AsStored, zstd_compression(LEVEL)),
+        layout("byte stream split, zstd 3", NumberEncoding::AsStored, zstd_compression(3)),
         layout("byte stream split, snappy", NumberEncoding::AsStored, Compression::SNAPPY),
         layout("byte stream split, uncompressed", NumberEncoding::AsStored, Compression::UNCOMPRESSED),
-        layout("plain, zstd 1", NumberEncoding::Plain, zstd(LEVEL)),
-        layout("dictionary, zstd 1", NumberEncoding::Dictionary, zstd(LEVEL)),
+        layout("plain, zstd 1", NumberEncoding::Plain, zstd_compression(LEVEL)),
+        layout("dictionary, zstd 1", NumberEncoding::Dictionary, zstd_compression(LEVEL)),
     ];
     report.line(&format!("{:<40} {:>10} {:>12} {:>12}", "layout", "of raw", "write MB/s", "read MB/s"))?;
     for FileLayout { name, numbers, compression } in candidates {
@@ -80,7 +82,7 @@ fn layouts(args: &IngestBenchArgs, file: &Bytes, rows: &FileRows, report: &mut F
 }
 
 // What a reader that knows the file's indices fetches for one row of its first list column.
-fn pages(file: &Bytes, rows: &FileRows, report: &mut FigureReport) -> Result<()> {
+fn compare_page_sizes(file: &Bytes, rows: &FileRows, report: &mut FigureReport) -> Result<()> {
     let metadata = ParquetMetaDataReader::new().parse_and_finish(file)?;
     report.line(&format!("{:<40} {:>10} {:>12} {:>12}", "page size", "of raw", "row fetched", "page index"))?;
     for bytes in PAGES {

@@ -61,15 +61,15 @@ impl IngestBenchArgs {
     }
 }
 
-pub(crate) fn run(args: &IngestBenchArgs) -> Result<()> {
+pub(crate) fn run_ingest_bench(args: &IngestBenchArgs) -> Result<()> {
     let folder = match &args.folder {
         Some(parent) => tempfile::tempdir_in(parent)?,
         None => tempfile::tempdir()?,
     };
     let mut report = FigureReport::new();
     super::block_on(async {
-        sweeps::measure(args, folder.path(), &mut report).await?;
-        responses::measure(args, folder.path(), &mut report).await
+        sweeps::measure_sweeps(args, folder.path(), &mut report).await?;
+        responses::measure_responses(args, folder.path(), &mut report).await
     })?;
     report.finish()
 }

@@ -51,12 +51,12 @@ pub(crate) enum NumberEncoding {
     Dictionary,
 }
 
-pub(crate) fn zstd(level: i32) -> Compression {
+pub(crate) fn zstd_compression(level: i32) -> Compression {
     Compression::ZSTD(ZstdLevel::try_new(level).unwrap_or_default())
 }
 
 /// All files that ingest wrote.
-pub(crate) async fn files(lake: &Lake) -> anyhow::Result<Vec<StoredTableFile>> {
+pub(crate) async fn read_table_files(lake: &Lake) -> anyhow::Result<Vec<StoredTableFile>> {
     let snapshot = lake.snapshot().await?;
     let mut found = Vec::new();
     for table in Table::ALL.into_iter().filter(|t| t.source() != Source::Rig) {
@@ -117,8 +117,9 @@ pub(crate) fn raw_bytes(metadata: &ParquetMetaData) -> u64 {
 
 /// Writer properties as a file records them, its numbers' encoding apart; compressed as the lake's files are.
 pub(crate) fn builder_as(metadata: &ParquetMetaData, numbers: NumberEncoding) -> WriterPropertiesBuilder {
-    let mut builder =
-        WriterProperties::builder().set_compression(zstd(LEVEL)).set_statistics_enabled(EnabledStatistics::Page);
+    let mut builder = WriterProperties::builder()
+        .set_compression(zstd_compression(LEVEL))
+        .set_statistics_enabled(EnabledStatistics::Page);
     let Some(group) = metadata.row_groups().first() else { return builder };
     builder = builder.set_max_row_group_row_count(Some(group.num_rows().max(1) as usize));
     for column in group.columns() {

@@ -10,12 +10,12 @@ use echolake_acquisition::run::controller::RecordingMode;
 
 use super::IngestBenchArgs;
 use super::meter::{CostMeter, MeasuredCost};
-use super::parquet_files::{FileRows, files};
+use super::parquet_files::{FileRows, read_table_files};
 use super::report::{FigureGoal, FigureReport};
 use super::simulated::{IngestedLake, SimulationOrder};
 use super::{lake_size, layout};
 
-pub(crate) async fn measure(args: &IngestBenchArgs, folder: &Path, report: &mut FigureReport) -> Result<()> {
+pub(crate) async fn measure_responses(args: &IngestBenchArgs, folder: &Path, report: &mut FigureReport) -> Result<()> {
     let runs = folder.join("responses");
     let order = SimulationOrder {
         count: args.runs(),
@@ -35,7 +35,7 @@ pub(crate) async fn measure(args: &IngestBenchArgs, folder: &Path, report: &mut 
         last = Some(ingested);
     }
     let last = last.context("no repeats")?;
-    let found = files(&last.lake).await?;
+    let found = read_table_files(&last.lake).await?;
     let rows = found.iter().map(FileRows::read).collect::<Result<Vec<_>>>()?;
     let of_panels: Vec<_> = rows.iter().filter(|r| !r.of_reference).collect();
     let mut written = 0;
@@ -70,8 +70,8 @@ pub(crate) async fn measure(args: &IngestBenchArgs, folder: &Path, report: &mut 
     report.goal("speed of ingest / of the parquet crate, by CPU time", 100.0 * alone.cpu / panels.cpu, "%", HALF)?;
     report.figure("the same by wall time", 100.0 * alone.wall / panels.wall, "%")?;
     report.goal("peak memory of the ingest", peak, "MiB", FigureGoal::AtMost(600.0))?;
-    lake_size::measure(&last, &found, report)?;
-    layout::measure(args, &found, &rows, report)
+    lake_size::measure_lake_size(&last, &found, report)?;
+    layout::measure_layouts(args, &found, &rows, report)
 }
 
 const HALF: FigureGoal = FigureGoal::AtLeast(50.0);

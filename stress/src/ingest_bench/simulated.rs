@@ -7,8 +7,8 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use anyhow::{Context as _, Result, ensure};
 use echolake_acquisition::run::RunRequest;
 use echolake_acquisition::run::controller::RecordingMode;
-use echolake_acquisition::run::simulate::simulate;
-use echolake_ingest::{FileReport, LakeIngest, pending};
+use echolake_acquisition::run::simulate::run_simulation;
+use echolake_ingest::{FileReport, LakeIngest, pending_runs};
 use echolake_lake::{Lake, ReferenceSurfaces};
 use echolake_panel::PanelSpecimen;
 use echolake_panel::collection::{CollectionSurface, collection};
@@ -68,7 +68,7 @@ impl SimulationOrder<'_> {
     /// Makes them, on all cores.
     pub(crate) fn make(&self) -> Result<SimulatedRuns> {
         std::fs::create_dir_all(self.folder)?;
-        let members = collection(self.seed, self.count)?;
+        let members = collection_surfaces(self.seed, self.count)?;
         let cores = std::thread::available_parallelism().map_or(1, usize::from);
         let next = AtomicUsize::new(0);
         let work = || -> Result<Vec<_>> {
@@ -109,8 +109,9 @@ impl SimulationOrder<'_> {
             ..RunRequest::new(&rig, member.surface.clone(), &specimen, start, self.folder)
         };
         let stop = AtomicBool::new(false);
-        let made =
-            simulate(&run, Origin::Simulated, &stop, &mut |done| stop.store(done >= self.pairs, Ordering::Relaxed));
+        let made = run_simulation(&run, Origin::Simulated, &stop, &mut |done| {
+            stop.store(done >= self.pairs, Ordering::Relaxed)
+        });
         made.with_context(|| format!("surface {}", member.surface))
     }
 }
@@ -135,7 +136,7 @@ impl SimulatedRuns {
         for (files, cost) in [references, panels].into_iter().zip(&mut costs) {
             put_into_inbox(files, folder)?;
             let meter = CostMeter::start()?;
-            ingest.ingest_runs(pending(&lake).await?, &mut report).await?;
+            ingest.ingest_runs(pending_runs(&lake).await?, &mut report).await?;
             ingest.complete_runs(&mut |_, _| {}).await?;
             *cost = meter.stop()?;
         }

@@ -35,7 +35,7 @@ struct SampledRecording {
     loopback: Vec<f32>,
 }
 
-pub(crate) async fn measure(args: &IngestBenchArgs, folder: &Path, report: &mut FigureReport) -> Result<()> {
+pub(crate) async fn measure_sweeps(args: &IngestBenchArgs, folder: &Path, report: &mut FigureReport) -> Result<()> {
     let runs = folder.join("sweeps");
     let order = SimulationOrder {
         count: RUNS,
@@ -45,7 +45,7 @@ pub(crate) async fn measure(args: &IngestBenchArgs, folder: &Path, report: &mut 
         folder: &runs,
     };
     let runs = order.make()?;
-    let recordings = sampled(&runs)?;
+    let recordings = sample_recordings(&runs)?;
     let length = recordings.first().context("no recordings")?.microphone.len();
     let padded = fast_length(length);
     let (mut whole, mut panels) = (MeasuredCost::NONE, MeasuredCost::NONE);
@@ -56,8 +56,8 @@ pub(crate) async fn measure(args: &IngestBenchArgs, folder: &Path, report: &mut 
         whole = whole.least(ingested.whole);
         panels = panels.least(ingested.panels);
         peak = peak.max(ingested.peak_mib);
-        bare = bare.min(transforms(&recordings, padded)?);
-        unpadded = unpadded.min(transforms(&recordings, SWEEP_LEN)?);
+        bare = bare.min(time_transforms(&recordings, padded)?);
+        unpadded = unpadded.min(time_transforms(&recordings, SWEEP_LEN)?);
     }
     let (count, all) = (runs.panels.attempts as f64, runs.all.attempts as f64);
     let each = panels.cpu / count;
@@ -73,7 +73,7 @@ pub(crate) async fn measure(args: &IngestBenchArgs, folder: &Path, report: &mut 
     report.goal("ingest / bare transforms", each / bare, "x", FigureGoal::AtMost(3.0))?;
     report.figure("the same with the references'", whole.cpu / all / bare, "x")?;
     report.figure(&format!("ingest / bare transforms of {SWEEP_LEN}"), each / unpadded, "x")?;
-    match reference(args, folder, &recordings) {
+    match time_reference(args, folder, &recordings) {
         Ok(process) => {
             report.figure("pipeline.py's process, CPU a recording, one core", process * 1e6, "us")?;
             report.goal("pipeline.py's process / ingest", process / each, "x", FigureGoal::AtLeast(20.0))?;
@@ -84,7 +84,7 @@ pub(crate) async fn measure(args: &IngestBenchArgs, folder: &Path, report: &mut 
 }
 
 // Recordings spread over the last run, because the reference pipeline's cost depends on the temperature.
-fn sampled(runs: &SimulatedRuns) -> Result<Vec<SampledRecording>> {
+fn sample_recordings(runs: &SimulatedRuns) -> Result<Vec<SampledRecording>> {
     let bytes = std::fs::read(runs.files.last().context("no runs")?)?;
     let mut found = Vec::new();
     let every = (runs.all.attempts as usize / RUNS / SAMPLED).max(1);
@@ -107,14 +107,14 @@ impl SampledRecording {
         let sweep = SweepRecording::decode(data)?;
         let (mut microphone, mut loopback) =
             (vec![0.0; sweep.sample_count as usize], vec![0.0; sweep.sample_count as usize]);
-        samples::decode(sweep.format(), &sweep.microphone, &mut microphone)?;
-        samples::decode(sweep.format(), &sweep.loopback, &mut loopback)?;
+        samples::decode_samples(sweep.format(), &sweep.microphone, &mut microphone)?;
+        samples::decode_samples(sweep.format(), &sweep.loopback, &mut loopback)?;
         Ok(Self { celsius: sweep.temperature_c, microphone, loopback })
     }
 }
 
 // CPU seconds that the two transforms of a recording take, of `length` samples each.
-fn transforms(recordings: &[SampledRecording], length: usize) -> Result<f64> {
+fn time_transforms(recordings: &[SampledRecording], length: usize) -> Result<f64> {
     let forward = f32::plan_real_forward(length);
     let (mut input, mut spectrum) = (forward.make_input_vec(), forward.make_output_vec());
     let mut work = forward.make_scratch_vec();
@@ -137,7 +137,7 @@ fn transforms(recordings: &[SampledRecording], length: usize) -> Result<f64> {
 }
 
 // CPU seconds that the reference pipeline takes per recording, on one core.
-fn reference(args: &IngestBenchArgs, folder: &Path, recordings: &[SampledRecording]) -> Result<f64> {
+fn time_reference(args: &IngestBenchArgs, folder: &Path, recordings: &[SampledRecording]) -> Result<f64> {
     let pipeline = args.reference.join("pipeline.py");
     ensure!(pipeline.is_file(), "no `{}`; hint: --reference DIR", pipeline.display());
     let file = folder.join("recordings.f32");

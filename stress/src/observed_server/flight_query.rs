@@ -18,7 +18,7 @@ const LARGEST_MESSAGE: usize = 2 << 30;
 pub(crate) type FlightClient = FlightSqlServiceClient<Channel>;
 
 /// Runs a query; rows are compared as CSV, which does not depend on how they are cut into batches.
-pub(super) fn query(client: &QueryClient, sql: &str) -> QueryOutcome {
+pub(super) fn query_flight(client: &QueryClient, sql: &str) -> QueryOutcome {
     let mut digest = AnswerDigest::default();
     match client.connections.run(fetch_rows(client, sql, &mut digest)) {
         Some(Ok(())) => QueryOutcome::Answer(digest),

@@ -20,7 +20,7 @@ struct AnswerHead {
 }
 
 /// Runs a query; the answer is CSV.
-pub(super) fn query(client: &QueryClient, sql: &str) -> QueryOutcome {
+pub(super) fn query_http(client: &QueryClient, sql: &str) -> QueryOutcome {
     let request = HttpRequest::post("/api/v1/sql?format=csv", sql).with("content-type", "text/plain");
     send_request(client, request)
 }

@@ -87,7 +87,7 @@ impl ObservedServer {
         }
         run_echolake(binary, folder.path(), &["ingest"])?;
         let tokens = make_tokens(binary, folder.path(), groups)?;
-        let served = serve(binary, folder.path());
+        let served = serve_lake(binary, folder.path());
         let mut server = Self { folder, binary: binary.to_owned(), tokens, served, runs: Vec::new(), restarts: 0 };
         server.runs = server.list_runs()?;
         server.warm_up();
@@ -138,7 +138,7 @@ impl ObservedServer {
     /// Kills it with its engines and starts another on the same lake.
     pub(crate) fn restart(&mut self) {
         self.process_tree().kill();
-        self.served = serve(&self.binary, self.folder.path());
+        self.served = serve_lake(&self.binary, self.folder.path());
         self.restarts += 1;
         self.warm_up();
     }
@@ -178,7 +178,7 @@ impl Drop for ObservedServer {
     }
 }
 
-fn serve(binary: &Path, folder: &Path) -> ServedLake {
+fn serve_lake(binary: &Path, folder: &Path) -> ServedLake {
     ServedLake::start(binary, folder, &["--tokens", "tokens.toml", "--memory", QUERY_MEMORY_MIB])
 }
 

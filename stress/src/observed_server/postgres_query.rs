@@ -128,7 +128,7 @@ impl PostgresClient {
 
 /// Runs a query by the simple protocol.
 pub(super) fn query_simple(client: &QueryClient, sql: &str) -> QueryOutcome {
-    query(client, &tagged_message(b'Q', &[sql.as_bytes(), b"\0"].concat()))
+    exchange_messages(client, &tagged_message(b'Q', &[sql.as_bytes(), b"\0"].concat()))
 }
 
 /// Runs a query by the extended protocol: Parse, Bind, Describe, Execute, Sync.
@@ -140,10 +140,10 @@ pub(super) fn query_extended(client: &QueryClient, sql: &str) -> QueryOutcome {
         tagged_message(b'E', b"\0\0\0\0\0"),
         tagged_message(b'S', b""),
     ];
-    query(client, &messages.concat())
+    exchange_messages(client, &messages.concat())
 }
 
-fn query(client: &QueryClient, messages: &[u8]) -> QueryOutcome {
+fn exchange_messages(client: &QueryClient, messages: &[u8]) -> QueryOutcome {
     match PostgresClient::log_in(client) {
         // The answer may come before all of a large query is read.
         Ok(Ok(mut session)) => {

@@ -7,11 +7,11 @@ impl QueryClient {
     /// Runs a query and reads its answer to the end.
     pub(crate) fn query(&self, protocol: QueryProtocol, sql: &str) -> QueryOutcome {
         let outcome = match protocol {
-            QueryProtocol::Http => http_query::query(self, sql),
+            QueryProtocol::Http => http_query::query_http(self, sql),
             QueryProtocol::SliceFilter => http_query::query_slice(self, &slice_filter(sql)),
             QueryProtocol::PostgresSimple => postgres_query::query_simple(self, sql),
             QueryProtocol::PostgresExtended => postgres_query::query_extended(self, sql),
-            QueryProtocol::FlightSql => flight_query::query(self, sql),
+            QueryProtocol::FlightSql => flight_query::query_flight(self, sql),
         };
         let is_lost = matches!(outcome, QueryOutcome::Truncated | QueryOutcome::Disconnected);
         if is_lost && self.connections.is_closed() { QueryOutcome::Abandoned } else { outcome }

@@ -50,30 +50,30 @@ struct QueryTimes {
     rows: u64,
 }
 
-pub(crate) async fn run(args: &QueryBenchArgs) -> Result<()> {
+pub(crate) async fn run_query_bench(args: &QueryBenchArgs) -> Result<()> {
     let lake = Lake::open(&args.lake).await?;
     let session = Session::new(&lake)?;
     let mut peer = match &args.python {
-        Some(python) => Some(DuckdbPeer::start(python, &files(&lake).await?, args.threads)?),
+        Some(python) => Some(DuckdbPeer::start(python, &visible_files(&lake).await?, args.threads)?),
         None => None,
     };
     let surface = middle_surface(&lake).await?;
     let mut rows = Vec::new();
-    for query in queries::all(&surface, 1234).into_iter().filter(|q| q.name.contains(&args.only)) {
+    for query in queries::bench_queries(&surface, 1234).into_iter().filter(|q| q.name.contains(&args.only)) {
         if args.explain {
-            explain(&session, &query).await?;
+            explain_query(&session, &query).await?;
         } else {
-            rows.push(compare(&session, peer.as_mut(), &query, args.runs).await?);
+            rows.push(compare_engines(&session, peer.as_mut(), &query, args.runs).await?);
         }
     }
     if !args.explain {
-        report(&rows, peer.as_ref().map(|p| p.version.as_str()))?;
+        print_report(&rows, peer.as_ref().map(|p| p.version.as_str()))?;
     }
     Ok(())
 }
 
 // One untimed run of each, then in turns.
-async fn compare(
+async fn compare_engines(
     session: &Session,
     mut peer: Option<&mut DuckdbPeer>,
     query: &BenchQuery,
@@ -82,7 +82,7 @@ async fn compare(
     let (mut own, mut other) = (Vec::new(), Vec::new());
     let mut rows = 0;
     for run in 0..=runs {
-        let (seconds, digest) = ask(session, query).await?;
+        let (seconds, digest) = time_query(session, query).await?;
         rows = digest.rows;
         own.extend((run > 0).then_some(seconds));
         if let Some(peer) = &mut peer {
@@ -94,14 +94,14 @@ async fn compare(
     Ok(QueryTimes { name: query.name, own: median(own), peer: (!other.is_empty()).then(|| median(other)), rows })
 }
 
-async fn ask(session: &Session, query: &BenchQuery) -> Result<(f64, RowsDigest)> {
+async fn time_query(session: &Session, query: &BenchQuery) -> Result<(f64, RowsDigest)> {
     let start = Instant::now();
-    let batches = collect(session, &query.sql).await.with_context(|| query.name)?;
+    let batches = collect_batches(session, &query.sql).await.with_context(|| query.name)?;
     let seconds = start.elapsed().as_secs_f64();
     Ok((seconds, RowsDigest::of(&batches)?))
 }
 
-async fn collect(session: &Session, sql: &str) -> Result<Vec<RecordBatch>> {
+async fn collect_batches(session: &Session, sql: &str) -> Result<Vec<RecordBatch>> {
     let mut answer = session.query(sql).await?;
     let mut batches = Vec::new();
     while let Some(batch) = answer.next().await? {
@@ -110,9 +110,9 @@ async fn collect(session: &Session, sql: &str) -> Result<Vec<RecordBatch>> {
     Ok(batches)
 }
 
-async fn explain(session: &Session, query: &BenchQuery) -> Result<()> {
-    collect(session, &query.sql).await?;
-    let batches = collect(session, &format!("EXPLAIN ANALYZE {}", query.sql)).await?;
+async fn explain_query(session: &Session, query: &BenchQuery) -> Result<()> {
+    collect_batches(session, &query.sql).await?;
+    let batches = collect_batches(session, &format!("EXPLAIN ANALYZE {}", query.sql)).await?;
     let text = arrow::util::pretty::pretty_format_batches(&batches)?;
     writeln!(std::io::stdout(), "{}\n{text}", query.name)?;
     Ok(())
@@ -124,7 +124,7 @@ fn median(mut seconds: Vec<f64>) -> f64 {
 }
 
 // Just what readers see, so that both engines read the same rows.
-async fn files(lake: &Lake) -> Result<Vec<(String, Vec<String>)>> {
+async fn visible_files(lake: &Lake) -> Result<Vec<(String, Vec<String>)>> {
     let folder = lake.folder().context("the peer reads lakes in folders")?;
     let snapshot = lake.snapshot().await?;
     let mut tables = Vec::new();
@@ -143,7 +143,7 @@ async fn middle_surface(lake: &Lake) -> Result<String> {
     Ok(runs.get(runs.len() / 2).context("the lake has no runs")?.surface.to_string())
 }
 
-fn report(rows: &[QueryTimes], version: Option<&str>) -> Result<()> {
+fn print_report(rows: &[QueryTimes], version: Option<&str>) -> Result<()> {
     let mut out = std::io::stdout().lock();
     writeln!(out, "{:<20} {:>9} {:>12} {:>12} {:>7}", "query", "rows", "echolake ms", "duckdb ms", "ratio")?;
     let mut logs = Vec::new();

@@ -12,7 +12,7 @@ pub(crate) struct BenchQuery {
 }
 
 /// The queries about a surface and a pair of the lake.
-pub(crate) fn all(surface: &str, pair: i64) -> Vec<BenchQuery> {
+pub(crate) fn bench_queries(surface: &str, pair: i64) -> Vec<BenchQuery> {
     let mut queries: Vec<BenchQuery> = Vec::new();
     // Each text begins after its name, which ends at a colon or with its line.
     for part in include_str!("queries.sql").split("\n\n-- ").skip(1) {

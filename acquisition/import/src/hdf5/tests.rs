@@ -35,7 +35,7 @@ impl Hdf5Folder {
             let index = |name: &str| dimensions.iter().position(|d| *d == name).map_or(0, |axis| at[axis]);
             value(index("measurement"), index("microphone"), index("speaker"), index("sample"))
         };
-        let numbers: Vec<f64> = (0..shape.iter().product()).map(|i| number(super::place(i, &shape))).collect();
+        let numbers: Vec<f64> = (0..shape.iter().product()).map(|i| number(super::place_in_grid(i, &shape))).collect();
         let mut file = FileBuilder::new();
         let mut group = file.create_group("data");
         let stored_shape: Vec<u64> = shape.iter().map(|n| *n as u64).collect();
@@ -104,7 +104,7 @@ fn every_order_of_dimensions_is_the_same_set() {
         (&["speaker", "sample", "measurement", "microphone"], None),
         (&["measurement", "microphone", "sample", "speaker"], Some(&[2, 1, 37, 2])),
     ];
-    let grid = rig().grid().expect("a grid");
+    let grid = rig().build_grid().expect("a grid");
     for (dimensions, chunk) in orders {
         let place = Hdf5Folder::new(dimensions, chunk);
         let runs = place.import(&place.mapping(dimensions, ("", "")), None).expect("imported");

@@ -140,7 +140,7 @@ fn responses_of_others_come_at_their_own_temperature_and_in_the_order_of_time() 
     let irs = irs(&runs[0]);
     assert_eq!(irs.iter().map(|(time, _)| *time / 1_000_000_000).collect::<Vec<_>>(), [1_767_600_000, 1_767_600_012]);
     // Points 0 and 2, then 0 and 1: as the rig counts its pairs.
-    let grid = rig().grid().expect("a grid");
+    let grid = rig().build_grid().expect("a grid");
     let pair = |speaker: usize| grid.parse_pair(&grid.points()[0], &grid.points()[speaker]).expect("a pair").0;
     assert_eq!(irs.iter().map(|(_, ir)| ir.pair_id).collect::<Vec<_>>(), [pair(2), pair(1)]);
     for (number, (_, ir)) in irs.iter().enumerate() {
@@ -220,7 +220,7 @@ fn responses_of_several_receivers_and_emitters() {
         .without("MeasurementDate");
     let runs = place.import(&[("a.sofa", mimo)], None).expect("imported");
     let found = irs(&runs[0]);
-    let grid = rig().grid().expect("a grid");
+    let grid = rig().build_grid().expect("a grid");
     let pair = |speaker: usize| grid.parse_pair(&grid.points()[0], &grid.points()[speaker]).expect("a pair").0;
     assert_eq!(found.iter().map(|(_, ir)| ir.pair_id).collect::<Vec<_>>(), [pair(2), pair(1)]);
     for (emitter, (_, ir)) in found.iter().enumerate() {

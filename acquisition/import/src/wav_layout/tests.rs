@@ -77,8 +77,8 @@ fn open(bytes: &[u8]) -> Result<(WavChannel, tempfile::TempDir), String> {
 
 fn check_bytes(what: &str, bytes: &[u8], expected: &[i32]) -> Option<String> {
     let (channel, _folder) = open(bytes).unwrap_or_else(|e| panic!("{what}: {e}"));
-    assert_eq!(channel.format(), SampleFormat::S24Split, "{what}");
-    let read = channel.read(SampleFormat::S24Split).expect("samples");
+    assert_eq!(channel.sample_format(), SampleFormat::S24Split, "{what}");
+    let read = channel.read_samples(SampleFormat::S24Split).expect("samples");
     assert_eq!(read.bytes, echolake_schema::samples::split_24(expected), "{what}");
     let fractions: Vec<f32> = expected.iter().map(|x| *x as f32 / 8_388_608.0).collect();
     assert_eq!(read.fractions, fractions, "{what}");
@@ -127,8 +127,9 @@ fn channels_are_told_apart() {
     let file = WavBytes::new(plain_format(1, 2, 24, 3), packed(&both, 3, 0)).bytes(&[0]);
     check_bytes("the first", &file, &NUMBERS);
     let (_, folder) = open(&file).expect("two channels");
-    let read =
-        WavChannel::open(folder.path(), "a.wav#2").and_then(|c| c.read(SampleFormat::S24Split)).expect("samples");
+    let read = WavChannel::open(folder.path(), "a.wav#2")
+        .and_then(|c| c.read_samples(SampleFormat::S24Split))
+        .expect("samples");
     assert_eq!(read.bytes, echolake_schema::samples::split_24(&NUMBERS.map(|x| -x)));
 }
 

@@ -17,9 +17,9 @@ const ARRAY_BUFFER: u64 = 34962;
 const ELEMENT_ARRAY_BUFFER: u64 = 34963;
 
 /// The mesh as a GLB file: positions, normals, indices.
-pub(super) fn write(mesh: &Mesh) -> Vec<u8> {
+pub(super) fn write_glb(mesh: &Mesh) -> Vec<u8> {
     let positions: Vec<[f32; 3]> = mesh.vertices_mm.iter().map(|v| to_gltf(*v)).collect();
-    let normals = normals(mesh);
+    let normals = vertex_normals(mesh);
     let count = positions.len();
     let bound =
         |f: fn(f32, f32) -> f32, start: f32| positions.iter().fold([start; 3], |m, p| [0, 1, 2].map(|i| f(m[i], p[i])));
@@ -47,11 +47,11 @@ pub(super) fn write(mesh: &Mesh) -> Vec<u8> {
         ],
         "buffers": [{ "byteLength": bin.len() }],
     });
-    pack(document.to_string().into_bytes(), bin)
+    pack_glb(document.to_string().into_bytes(), bin)
 }
 
 // The crate writes the header's version and length itself.
-fn pack(json: Vec<u8>, bin: Vec<u8>) -> Vec<u8> {
+fn pack_glb(json: Vec<u8>, bin: Vec<u8>) -> Vec<u8> {
     let header = Header { magic: *b"glTF", version: 2, length: 0 };
     let mut file = Vec::with_capacity(json.len() + bin.len() + 32);
     // A vector takes all bytes.
@@ -68,7 +68,7 @@ fn from_gltf([x, y, z]: [f32; 3]) -> [f32; 3] {
 }
 
 // Each vertex's normal is the mean of its triangles' by area.
-fn normals(mesh: &Mesh) -> Vec<[f32; 3]> {
+fn vertex_normals(mesh: &Mesh) -> Vec<[f32; 3]> {
     let mut sums = vec![[0.0f32; 3]; mesh.vertices_mm.len()];
     for triangle in &mesh.triangles {
         let [a, b, c] = triangle.map(|i| mesh.vertices_mm[i as usize]);

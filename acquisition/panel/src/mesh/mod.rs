@@ -89,7 +89,7 @@ impl Mesh {
     ///
     /// # Errors
     /// [`Error`], naming the file and the place in it.
-    pub fn read(path: &Path) -> Result<Self, Error> {
+    pub fn from_file(path: &Path) -> Result<Self, Error> {
         let format = MeshFormat::from_path(path)?;
         let failed = |source| Error::Read { path: path.to_owned(), source };
         let size = std::fs::metadata(path).map_err(failed)?.len();
@@ -103,19 +103,19 @@ impl Mesh {
     /// Reads a file's bytes; `path` is for messages.
     ///
     /// # Errors
-    /// As [`Mesh::read`].
+    /// As [`Mesh::from_file`].
     pub fn from_bytes(format: MeshFormat, bytes: &[u8], path: &Path) -> Result<Self, Error> {
         match format {
             MeshFormat::Glb => glb::parse(bytes, path),
-            MeshFormat::Stl => stl::parse(bytes, path),
+            MeshFormat::Stl => stl::parse_stl(bytes, path),
         }
     }
 
     /// The bytes of a file.
     pub fn to_bytes(&self, format: MeshFormat) -> Vec<u8> {
         match format {
-            MeshFormat::Glb => glb::write(self),
-            MeshFormat::Stl => stl::write(self),
+            MeshFormat::Glb => glb::write_glb(self),
+            MeshFormat::Stl => stl::write_stl(self),
         }
     }
 }
@@ -139,10 +139,10 @@ mod tests {
     fn what_is_written_is_read() {
         let mesh = small();
         for format in READ {
-            let again = parse(format, &mesh.to_bytes(format)).expect("its own file").welded();
+            let again = parse(format, &mesh.to_bytes(format)).expect("its own file").to_welded();
             assert_eq!(again.triangles.len(), mesh.triangles.len(), "{format:?}");
             assert!((again.volume_mm3() / mesh.volume_mm3() - 1.0).abs() < 1e-5, "{format:?}");
-            assert_eq!(again.check(585.0, 40.0, Path::new("panel")).map(drop), Ok(()), "{format:?}");
+            assert_eq!(again.check_solid(585.0, 40.0, Path::new("panel")).map(drop), Ok(()), "{format:?}");
         }
     }
 
@@ -172,7 +172,7 @@ mod tests {
                     let at = (state >> 33) as usize % broken.len();
                     broken[at] ^= (state >> 20) as u8 | 1;
                     if let Ok(mesh) = parse(format, &broken) {
-                        let _ = mesh.check(585.0, 40.0, Path::new("panel"));
+                        let _ = mesh.check_solid(585.0, 40.0, Path::new("panel"));
                     }
                 }
             }

@@ -12,13 +12,13 @@ const CORE_MM: f64 = 42.0;
 impl Mesh {
     /// A closed solid: the relief on top, four walls, and a plane at `base_mm` below.
     pub fn from_height_field(relief: &HeightField, base_mm: f32) -> Self {
-        Self::between(relief, |_, _| base_mm)
+        Self::from_surfaces(relief, |_, _| base_mm)
     }
 
     /// A panel with a relief on either side, 100 mm thick at most: the planes that heights count from are 42 mm apart,
     /// so that the deepest reliefs leave 20 mm between them. The panel is turned over about its y axis to see its back.
     pub fn double_sided(front: &HeightField, back: &HeightField) -> Self {
-        Self::between(front, |x, y| (-CORE_MM - back.height_at(-x, y)) as f32)
+        Self::from_surfaces(front, |x, y| (-CORE_MM - back.height_at(-x, y)) as f32)
     }
 
     /// Returns the mesh with a side above: the back is turned over, to the height of the front of our panels.
@@ -32,7 +32,7 @@ impl Mesh {
         self
     }
 
-    fn between(relief: &HeightField, below: impl Fn(f64, f64) -> f32) -> Self {
+    fn from_surfaces(relief: &HeightField, below: impl Fn(f64, f64) -> f32) -> Self {
         let side = relief.cells() + 1;
         let at = |i: usize| (i as f64 / relief.cells() as f64 - 0.5) * relief.size_mm();
         let mut mesh = Self::default();
@@ -65,7 +65,7 @@ impl Mesh {
     }
 
     /// The same mesh with vertices at one place made one: STL shares none.
-    pub fn welded(&self) -> Self {
+    pub fn to_welded(&self) -> Self {
         let mut index: HashMap<[u32; 3], u32> = HashMap::new();
         let mut vertices_mm = Vec::new();
         // Adding zero turns -0.0, which has other bits, into 0.0.
@@ -106,7 +106,7 @@ impl Mesh {
     /// # Errors
     /// [`Error::Empty`], [`Error::Open`], [`Error::TooLarge`], or [`Error::Syntax`] for numbers that are none and
     /// for holes.
-    pub fn check(&self, panel_mm: f64, depth_mm: f64, path: &Path) -> Result<Self, Error> {
+    pub fn check_solid(&self, panel_mm: f64, depth_mm: f64, path: &Path) -> Result<Self, Error> {
         if self.triangles.is_empty() {
             return Err(Error::Empty { path: path.to_owned() });
         }
@@ -125,7 +125,7 @@ impl Mesh {
                 expected: format!("up to {panel_mm} x {panel_mm} mm with a relief of {depth_mm} mm"),
             });
         }
-        let welded = self.welded();
+        let welded = self.to_welded();
         if let (edges @ 1.., place) = welded.open_edges() {
             return Err(Error::Open { path: path.to_owned(), edges, place });
         }
@@ -172,7 +172,7 @@ impl Mesh {
                 let cell = |x: f64, c: f64| ((x - c) / panel_mm + 0.5) * cells as f64 - 0.5;
                 [cell(v[0], centre[0]), cell(v[1], centre[1]), v[2]]
             });
-            rasterise(corners, cells, &mut tops);
+            rasterise_triangle(corners, cells, &mut tops);
         }
         fill_rim(&mut tops, cells);
         if let Some(hole) = tops.iter().position(|t| !t.is_finite()) {
@@ -217,7 +217,7 @@ fn fill_rim(tops: &mut [f32], cells: usize) {
 }
 
 // Raises every cell whose centre lies under the triangle, seen from above, to the triangle.
-fn rasterise(corners: [[f64; 3]; 3], cells: usize, tops: &mut [f32]) {
+fn rasterise_triangle(corners: [[f64; 3]; 3], cells: usize, tops: &mut [f32]) {
     let [a, b, c] = corners;
     let area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]);
     if area.abs() < 1e-12 {
@@ -251,7 +251,7 @@ mod tests {
     fn a_box_has_its_volume_and_is_closed() {
         let mesh = Mesh::from_height_field(&HeightField::from_fn(100.0, 5, |_, _| 0.0), -20.0);
         assert!((mesh.volume_mm3() - 100.0 * 100.0 * 20.0).abs() < 1e-3);
-        assert_eq!(mesh.check(100.0, 40.0, Path::new("box")).map(drop), Ok(()));
+        assert_eq!(mesh.check_solid(100.0, 40.0, Path::new("box")).map(drop), Ok(()));
     }
 
     // The thinnest and the thickest that two reliefs can make, and which way round the back is.
@@ -263,13 +263,13 @@ mod tests {
         assert!((thickness(&Mesh::double_sided(&level(low), &level(low))) - 20.0).abs() < 1e-4);
         let thickest = Mesh::double_sided(&level(high), &level(high));
         assert!((thickness(&thickest) - 100.0).abs() < 1e-3);
-        assert_eq!(thickest.check(PANEL_SIZE_MM, 40.0, Path::new("panel")).map(drop), Ok(()));
+        assert_eq!(thickest.check_solid(PANEL_SIZE_MM, 40.0, Path::new("panel")).map(drop), Ok(()));
         // The back's left, seen from behind, is the front's right.
         let slope = HeightField::from_fn(PANEL_SIZE_MM, 8, |x, _| x / 100.0);
         let panel = Mesh::double_sided(&level(0.0), &slope);
         let lowest = panel.vertices_mm.iter().copied().min_by(|a, b| a[2].total_cmp(&b[2])).expect("vertices");
         assert!(lowest[0] < 0.0 && lowest[2] < -44.0, "{lowest:?}");
-        assert_eq!(panel.check(PANEL_SIZE_MM, 40.0, Path::new("panel")).map(drop), Ok(()));
+        assert_eq!(panel.check_solid(PANEL_SIZE_MM, 40.0, Path::new("panel")).map(drop), Ok(()));
     }
 
     #[test]
@@ -278,7 +278,7 @@ mod tests {
         let (front, back) = (of("river_rock"), of("macrostructure"));
         let path = Path::new("panel");
         let panel = Mesh::double_sided(&front, &back).seen_from(PanelSide::Back);
-        assert_eq!(panel.check(PANEL_SIZE_MM, 40.0, path).map(drop), Ok(()), "it is closed, its outside outside");
+        assert_eq!(panel.check_solid(PANEL_SIZE_MM, 40.0, path).map(drop), Ok(()), "it is closed, its outside outside");
         assert!(panel.volume_mm3() > 0.0);
         let seen = panel.to_height_field(100, PANEL_SIZE_MM, 40.0, path).expect("heights");
         let off = |field: &HeightField| {
@@ -306,18 +306,18 @@ mod tests {
         let good = Mesh::from_height_field(&HeightField::from_fn(585.0, 5, |_, _| 0.0), -20.0);
         let mut open = good.clone();
         open.triangles.pop();
-        assert!(matches!(open.check(585.0, 40.0, path), Err(Error::Open { edges: 3, .. })));
-        assert!(matches!(Mesh::default().check(585.0, 40.0, path), Err(Error::Empty { .. })));
-        assert!(matches!(good.check(500.0, 40.0, path), Err(Error::TooLarge { .. })));
+        assert!(matches!(open.check_solid(585.0, 40.0, path), Err(Error::Open { edges: 3, .. })));
+        assert!(matches!(Mesh::default().check_solid(585.0, 40.0, path), Err(Error::Empty { .. })));
+        assert!(matches!(good.check_solid(500.0, 40.0, path), Err(Error::TooLarge { .. })));
         let mut nan = good.clone();
         nan.vertices_mm[3][1] = f32::NAN;
-        assert!(nan.check(585.0, 40.0, path).expect_err("NaN").to_string().contains("vertex 3"));
+        assert!(nan.check_solid(585.0, 40.0, path).expect_err("NaN").to_string().contains("vertex 3"));
         let deep =
             Mesh::from_height_field(&HeightField::from_fn(585.0, 20, |x, _| if x < 0.0 { 0.0 } else { 60.0 }), -20.0);
         assert!(matches!(deep.to_height_field(50, 585.0, 40.0, path), Err(Error::TooLarge { .. })));
-        assert!(deep.check(585.0, 40.0, path).expect_err("deep").to_string().contains("60.0 mm deep"));
+        assert!(deep.check_solid(585.0, 40.0, path).expect_err("deep").to_string().contains("60.0 mm deep"));
         let small = Mesh::from_height_field(&HeightField::from_fn(100.0, 5, |_, _| 0.0), -20.0);
-        assert!(small.check(585.0, 40.0, path).expect_err("small").to_string().contains("a hole at x = -291"));
+        assert!(small.check_solid(585.0, 40.0, path).expect_err("small").to_string().contains("a hole at x = -291"));
     }
 
     /// A plate from -50 mm to 0 with a square hole of this width right through it, its middle at (100, 30) mm.
@@ -346,7 +346,7 @@ mod tests {
             let mesh = plate_with_hole(width);
             let solid = f64::from(50.0 * (585.0 * 585.0 - width * width));
             assert!((mesh.volume_mm3() / solid - 1.0).abs() < 1e-6, "a closed solid: {}", mesh.volume_mm3());
-            let error = mesh.check(585.0, 40.0, Path::new("hole.stl")).expect_err("a hole").to_string();
+            let error = mesh.check_solid(585.0, 40.0, Path::new("hole.stl")).expect_err("a hole").to_string();
             // The first cell within the hole is next to its lower left corner.
             let [x, y] = [100.0, 30.0].map(|middle| middle - width / 2.0 + 1.0);
             let named: Vec<f32> =
@@ -362,9 +362,9 @@ mod tests {
         let mesh = Mesh::from_height_field(&slope, -20.0);
         let again = mesh.to_height_field(FACETS, 585.0, 40.0, Path::new("slope")).expect("heights");
         for iy in [0, 100, FACETS - 1] {
-            assert_eq!(again.at(0, iy), again.at(1, iy));
+            assert_eq!(again.cell_height(0, iy), again.cell_height(1, iy));
             // The slope's corner, half of its own cells within the edge, is at -5.70 mm.
-            assert!((again.at(1, iy) + 5.69).abs() < 0.02, "{}", again.at(1, iy));
+            assert!((again.cell_height(1, iy) + 5.69).abs() < 0.02, "{}", again.cell_height(1, iy));
         }
     }
 }

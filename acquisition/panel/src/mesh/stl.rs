@@ -8,7 +8,7 @@ const HEADER: usize = 80;
 const FACET: usize = 50;
 
 /// The mesh as binary STL.
-pub(super) fn write(mesh: &Mesh) -> Vec<u8> {
+pub(super) fn write_stl(mesh: &Mesh) -> Vec<u8> {
     let mut file = vec![0; HEADER];
     file[..8].copy_from_slice(b"echolake");
     file.extend((mesh.triangles.len() as u32).to_le_bytes());
@@ -21,16 +21,16 @@ pub(super) fn write(mesh: &Mesh) -> Vec<u8> {
     file
 }
 
-pub(super) fn parse(bytes: &[u8], path: &Path) -> Result<Mesh, Error> {
+pub(super) fn parse_stl(bytes: &[u8], path: &Path) -> Result<Mesh, Error> {
     let count = bytes.get(HEADER..HEADER + 4).and_then(|b| b.try_into().ok()).map(u32::from_le_bytes);
     let expected = count.map(|n| HEADER as u64 + 4 + FACET as u64 * u64::from(n));
     // Binary files may begin with `solid` too; their length tells them apart.
     if expected == Some(bytes.len() as u64) {
-        return Ok(binary(&bytes[HEADER + 4..]));
+        return Ok(parse_binary(&bytes[HEADER + 4..]));
     }
     // A name may be in any alphabet and encoding, but text has no zeros, and binary numbers do.
     if bytes.starts_with(b"solid") && !bytes.contains(&0) {
-        return text(bytes, path);
+        return parse_text(bytes, path);
     }
     Err(Error::Syntax {
         path: path.to_owned(),
@@ -40,25 +40,25 @@ pub(super) fn parse(bytes: &[u8], path: &Path) -> Result<Mesh, Error> {
     })
 }
 
-fn binary(facets: &[u8]) -> Mesh {
+fn parse_binary(facets: &[u8]) -> Mesh {
     let float = |b: &[u8]| f32::from_le_bytes([b[0], b[1], b[2], b[3]]);
     let corner = |b: &[u8]| [float(&b[0..4]), float(&b[4..8]), float(&b[8..12])];
     let corners = facets.chunks_exact(FACET).flat_map(|f| [corner(&f[12..24]), corner(&f[24..36]), corner(&f[36..48])]);
-    soup(corners.collect())
+    triangle_soup(corners.collect())
 }
 
-fn text(bytes: &[u8], path: &Path) -> Result<Mesh, Error> {
+fn parse_text(bytes: &[u8], path: &Path) -> Result<Mesh, Error> {
     let text = String::from_utf8_lossy(bytes);
     let mut corners = Vec::new();
     for (number, line) in text.lines().enumerate() {
         if let Some(rest) = line.trim().strip_prefix("vertex") {
-            corners.push(numbers::<3>(rest, path, number)?);
+            corners.push(parse_numbers::<3>(rest, path, number)?);
         }
     }
     let complete = corners.len().is_multiple_of(3)
         && text.trim_end().lines().last().is_some_and(|l| l.trim_start().starts_with("endsolid"));
     if complete {
-        return Ok(soup(corners));
+        return Ok(triangle_soup(corners));
     }
     Err(Error::Syntax {
         path: path.to_owned(),
@@ -69,7 +69,7 @@ fn text(bytes: &[u8], path: &Path) -> Result<Mesh, Error> {
 }
 
 /// The first numbers of a line.
-fn numbers<const N: usize>(text: &str, path: &Path, line: usize) -> Result<[f32; N], Error> {
+fn parse_numbers<const N: usize>(text: &str, path: &Path, line: usize) -> Result<[f32; N], Error> {
     let mut words = text.split_whitespace();
     let mut out = [0.0; N];
     for slot in &mut out {
@@ -84,7 +84,7 @@ fn numbers<const N: usize>(text: &str, path: &Path, line: usize) -> Result<[f32;
     Ok(out)
 }
 
-fn soup(vertices_mm: Vec<[f32; 3]>) -> Mesh {
+fn triangle_soup(vertices_mm: Vec<[f32; 3]>) -> Mesh {
     let triangles = (0..vertices_mm.len() as u32 / 3).map(|t| [3 * t, 3 * t + 1, 3 * t + 2]).collect();
     Mesh { vertices_mm, triangles }
 }
@@ -101,20 +101,20 @@ mod tests {
 
     #[test]
     fn names_may_be_in_any_alphabet() {
-        let expected = parse(&text(b"wall"), Path::new("a.stl")).expect("a triangle");
+        let expected = parse_stl(&text(b"wall"), Path::new("a.stl")).expect("a triangle");
         assert_eq!(expected.vertices_mm, [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]);
         // UTF-8, and the same in Latin-1.
         for name in ["Mauerstück".as_bytes(), b"Mauerst\xFCck"] {
-            assert_eq!(parse(&text(name), Path::new("a.stl")), Ok(expected.clone()), "{name:?}");
+            assert_eq!(parse_stl(&text(name), Path::new("a.stl")), Ok(expected.clone()), "{name:?}");
         }
     }
 
     #[test]
     fn a_binary_file_that_was_cut_off_is_no_text() {
-        let mut bytes = write(&Mesh { vertices_mm: vec![[1.5; 3]; 3], triangles: vec![[0, 1, 2]] });
+        let mut bytes = write_stl(&Mesh { vertices_mm: vec![[1.5; 3]; 3], triangles: vec![[0, 1, 2]] });
         bytes[..6].copy_from_slice(b"solid ");
-        assert!(parse(&bytes, Path::new("a.stl")).is_ok());
+        assert!(parse_stl(&bytes, Path::new("a.stl")).is_ok());
         let cut = bytes.len() - 10;
-        assert!(parse(&bytes[..cut], Path::new("a.stl")).expect_err("cut").to_string().contains("124 bytes"));
+        assert!(parse_stl(&bytes[..cut], Path::new("a.stl")).expect_err("cut").to_string().contains("124 bytes"));
     }
 }

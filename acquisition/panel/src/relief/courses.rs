@@ -5,7 +5,7 @@ use super::chance::SeededRandom;
 use super::microstructure::{JOINT_SHAPE, joint_depth, joint_width};
 use super::parameter::{ParameterLayer, ReliefParameter};
 use super::settings::{FULL_SCALE, WallSettings};
-use super::stone::{StoneFaces, bulge, lean, pillow, projection};
+use super::stone::{StoneFaces, pillow_rise, stone_bulge, stone_lean, stone_projection};
 use super::stones::{SEED, StoneLayout, StoneSpot};
 
 const MESO: ParameterLayer = ParameterLayer::Mesostructure;
@@ -13,25 +13,25 @@ const MESO: ParameterLayer = ParameterLayer::Mesostructure;
 const PILLOW: f64 = 0.35;
 
 const fn course_height([low, high, default]: [f64; 3]) -> ReliefParameter {
-    ReliefParameter::mm("course_height_mm", MESO, [low, high, default], "mean height of a course")
+    ReliefParameter::new_mm("course_height_mm", MESO, [low, high, default], "mean height of a course")
 }
 
 const fn stone_length(default: f64) -> ReliefParameter {
-    ReliefParameter::mm("stone_length_mm", MESO, [150.0, 1500.0, default], "mean length of a stone")
+    ReliefParameter::new_mm("stone_length_mm", MESO, [150.0, 1500.0, default], "mean length of a stone")
 }
 
-const fn variation(default: f64) -> ReliefParameter {
+const fn size_variation(default: f64) -> ReliefParameter {
     let about = "courses and stones differ from their mean by up to this share of it";
-    ReliefParameter::number("variation", MESO, "share", [0.0, 0.7, default], about)
+    ReliefParameter::new_number("variation", MESO, "share", [0.0, 0.7, default], about)
 }
 
 pub(super) const ASHLAR: [ReliefParameter; 10] = [
     course_height([80.0, 600.0, 250.0]),
     stone_length(500.0),
-    variation(0.4),
-    projection(80.0, 15.0),
-    lean(5.0),
-    bulge(40.0, 10.0),
+    size_variation(0.4),
+    stone_projection(80.0, 15.0),
+    stone_lean(5.0),
+    stone_bulge(40.0, 10.0),
     SEED,
     JOINT_SHAPE,
     joint_width(10.0),
@@ -42,10 +42,10 @@ pub(super) const ASHLAR: [ReliefParameter; 10] = [
 pub(super) const SLATE: [ReliefParameter; 10] = [
     course_height([20.0, 150.0, 50.0]),
     stone_length(600.0),
-    variation(0.6),
-    projection(80.0, 60.0),
-    lean(10.0),
-    bulge(40.0, 0.0),
+    size_variation(0.6),
+    stone_projection(80.0, 60.0),
+    stone_lean(10.0),
+    stone_bulge(40.0, 0.0),
     SEED,
     JOINT_SHAPE,
     joint_width(4.0),
@@ -67,32 +67,32 @@ struct StoneCourse {
 }
 
 impl CoursedStones {
-    pub(super) fn of(settings: &WallSettings) -> Self {
+    pub(super) fn from_settings(settings: &WallSettings) -> Self {
         let height = settings.course_height_mm / FULL_SCALE;
         let length = settings.stone_length_mm / FULL_SCALE;
         let variation = settings.variation;
         let chance = SeededRandom::new(settings.seed, 0xA541);
         let half = PANEL_SIZE_MM / 2.0;
-        let (mut courses, mut top) = (Vec::<StoneCourse>::new(), -half - height * chance.unit(0));
+        let (mut courses, mut top) = (Vec::<StoneCourse>::new(), -half - height * chance.unit_number(0));
         while top < half {
-            let row = chance.at(-1, courses.len() as i64);
-            let height = height * (1.0 + variation * row.signed(0));
+            let row = chance.at_place(-1, courses.len() as i64);
+            let height = height * (1.0 + variation * row.signed_number(0));
             top += height;
             let below = courses.last().map_or(&[][..], |c: &StoneCourse| &c.ends);
-            courses.push(StoneCourse { top, height, ends: ends(row, length, variation, below) });
+            courses.push(StoneCourse { top, height, ends: stone_ends(row, length, variation, below) });
         }
-        Self { courses, faces: StoneFaces::of(settings), chance }
+        Self { courses, faces: StoneFaces::from_settings(settings), chance }
     }
 }
 
 // Ends of a course's stones from beyond the left to beyond the right of the panel. Joints do not run on from one
 // course into the next: an end that falls next to one below is moved off it.
-fn ends(row: SeededRandom, length: f64, variation: f64, below: &[f64]) -> Vec<f64> {
+fn stone_ends(row: SeededRandom, length: f64, variation: f64, below: &[f64]) -> Vec<f64> {
     let clear = 0.15 * length * (1.0 - variation);
-    let mut at = -PANEL_SIZE_MM / 2.0 - 2.0 * length * row.unit(1);
+    let mut at = -PANEL_SIZE_MM / 2.0 - 2.0 * length * row.unit_number(1);
     let mut ends = Vec::new();
     for n in 2.. {
-        at += length * (1.0 + variation * row.signed(n));
+        at += length * (1.0 + variation * row.signed_number(n));
         if let Some(near) = below.iter().find(|end| (**end - at).abs() < clear) {
             at = near + clear;
         }
@@ -105,7 +105,7 @@ fn ends(row: SeededRandom, length: f64, variation: f64, below: &[f64]) -> Vec<f6
 }
 
 impl StoneLayout for CoursedStones {
-    fn spot(&self, x: f64, y: f64, half_joint: f64) -> StoneSpot {
+    fn spot_at(&self, x: f64, y: f64, half_joint: f64) -> StoneSpot {
         let row = self.courses.partition_point(|c| c.top <= y).min(self.courses.len() - 1);
         let course = &self.courses[row];
         let column = course.ends.partition_point(|end| *end <= x).min(course.ends.len() - 1);
@@ -115,8 +115,8 @@ impl StoneLayout for CoursedStones {
         let (half_length, half_height) = ((right - left) / 2.0, course.height / 2.0);
         let (dx, dy) = (x - (left + right) / 2.0, y - (course.top - half_height));
         let to_joint = (half_length - dx.abs()).min(half_height - dy.abs()).max(0.0);
-        let stone = self.chance.at(column as i64, row as i64);
-        let rise = pillow(to_joint - half_joint, PILLOW * 2.0 * half_height.min(half_length));
-        StoneSpot { to_joint, face: self.faces.height(stone, [dx / half_length, dy / half_height], rise) }
+        let stone = self.chance.at_place(column as i64, row as i64);
+        let rise = pillow_rise(to_joint - half_joint, PILLOW * 2.0 * half_height.min(half_length));
+        StoneSpot { to_joint, face: self.faces.face_height(stone, [dx / half_length, dy / half_height], rise) }
     }
 }

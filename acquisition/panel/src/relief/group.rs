@@ -10,7 +10,7 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 
 use super::chance::SeededRandom;
-use super::parameter::rounded;
+use super::parameter::round_in_range;
 use super::{Error as ReliefError, PanelRelief, ParameterDomain, ReliefParameter};
 
 /// Ranges that a group is drawn from; `ranges.toml`.
@@ -119,16 +119,16 @@ impl GroupRanges {
         if !(ranges.target_spread_db > 0.0 && ranges.target_spread_db.is_finite()) {
             return Err(Error::Text { reason: "target_spread_db must be above 0".to_owned() });
         }
-        ranges.check()?;
+        ranges.check_ranges()?;
         Ok(ranges)
     }
 
     // One draw tries the numbers; every word is tried by itself.
-    fn check(&self) -> Result<(), Error> {
-        let mut relief = self.draw(1)?.swap_remove(0);
+    fn check_ranges(&self) -> Result<(), Error> {
+        let mut relief = self.draw_reliefs(1)?.swap_remove(0);
         for (key, range) in &self.ranges {
             if let ParameterRange::Words(words) = range {
-                words.iter().try_for_each(|word| relief.set(key, word))?;
+                words.iter().try_for_each(|word| relief.set_parameter(key, word))?;
             }
         }
         Ok(())
@@ -145,26 +145,26 @@ impl GroupRanges {
     ///
     /// # Errors
     /// [`Error`], if a parameter is none of the relief's, or is refused.
-    pub fn draw(&self, count: usize) -> Result<Vec<PanelRelief>, Error> {
+    pub fn draw_reliefs(&self, count: usize) -> Result<Vec<PanelRelief>, Error> {
         let mut shared = PanelRelief::by_name(&self.relief)?;
         for (key, value) in &self.fixed {
-            shared.set(key, value.as_str().unwrap_or(&value.to_string()))?;
+            shared.set_parameter(key, value.as_str().unwrap_or(&value.to_string()))?;
         }
-        let known = shared.describe();
+        let known = shared.describe_parameters();
         let mut drawn = vec![shared; count];
         let own_seed = |p: &&ReliefParameter| p.key == "seed" && !self.fixed.contains_key("seed");
         if let Some(seed) = known.iter().find(own_seed) {
             let chance = SeededRandom::new(self.seed, 0x5EED);
             for (n, relief) in drawn.iter_mut().enumerate() {
-                relief.set(seed.key, &(chance.whole(n as u64) % 1_000_000).to_string())?;
+                relief.set_parameter(seed.key, &(chance.whole_number(n as u64) % 1_000_000).to_string())?;
             }
         }
         for (number, (key, range)) in self.ranges.iter().enumerate() {
             let chance = SeededRandom::new(self.seed, number as u64);
-            let place = chance.shuffled(count);
+            let place = chance.random_order(count);
             for (n, relief) in drawn.iter_mut().enumerate() {
-                let part = (place[n] as f64 + chance.at(n as i64, 0).unit(0)) / count as f64;
-                relief.set(key, &range.value(key, &known, part, place[n])?)?;
+                let part = (place[n] as f64 + chance.at_place(n as i64, 0).unit_number(0)) / count as f64;
+                relief.set_parameter(key, &range.value_at(key, &known, part, place[n])?)?;
             }
         }
         drawn.iter().try_for_each(PanelRelief::check_depth)?;
@@ -174,11 +174,11 @@ impl GroupRanges {
     /// Computes the next group's ranges from this one's results.
     ///
     /// # Errors
-    /// [`Error::Results`] for fewer than two surfaces or levels that are no numbers, else as [`Self::draw`].
-    pub fn next(&self, results: &[BandLevel]) -> Result<GroupStep, Error> {
-        let spread_db = spread(results)?;
+    /// [`Error::Results`] for fewer than two surfaces or levels that are no numbers, else as [`Self::draw_reliefs`].
+    pub fn next_step(&self, results: &[BandLevel]) -> Result<GroupStep, Error> {
+        let spread_db = level_spread(results)?;
         let factor = (self.target_spread_db / spread_db.max(1e-9)).clamp(1.0 / LARGEST_STEP, LARGEST_STEP);
-        let known = PanelRelief::by_name(&self.relief)?.describe();
+        let known = PanelRelief::by_name(&self.relief)?.describe_parameters();
         let (judgement, change) = if factor > 1.0 { ("too alike", "wider") } else { ("far apart", "narrower") };
         let mut reasons = vec![format!(
             "The last group's results lie {spread_db:.2} dB apart, {:.2} dB are wanted: {judgement}, so ranges become \
@@ -188,8 +188,8 @@ impl GroupRanges {
         let mut next = Self { seed: self.seed.wrapping_add(1), ..self.clone() };
         for (key, range) in &mut next.ranges {
             let before = range.clone();
-            if let (ParameterRange::Numbers(range), Some([low, high])) = (&mut *range, limits(key, &known)) {
-                *range = stretched(*range, factor, [low, high]);
+            if let (ParameterRange::Numbers(range), Some([low, high])) = (&mut *range, parameter_limits(key, &known)) {
+                *range = stretch_range(*range, factor, [low, high]);
             }
             reasons.push(match (&before, &*range) {
                 (ParameterRange::Numbers(a), ParameterRange::Numbers(b)) if a == b => {
@@ -201,32 +201,32 @@ impl GroupRanges {
                 _ => format!("{key}: words stay as they are."),
             });
         }
-        next.check()?;
+        next.check_ranges()?;
         Ok(GroupStep { ranges: next, spread_db, factor, reasons })
     }
 }
 
 impl ParameterRange {
     /// Returns the value at a share of the range, or the `place`-th word.
-    fn value(&self, key: &str, known: &[ReliefParameter], share: f64, place: usize) -> Result<String, Error> {
+    fn value_at(&self, key: &str, known: &[ReliefParameter], share: f64, place: usize) -> Result<String, Error> {
         match self {
             Self::Words(words) if !words.is_empty() => Ok(words[place % words.len()].clone()),
-            Self::Words(_) => Err(self.refused(key, known)),
+            Self::Words(_) => Err(self.range_error(key, known)),
             Self::Numbers([from, to]) => {
                 // What is no number of the relief's is refused by name when it is set.
-                let Some([low, high]) = limits(key, known) else { return Ok(from.to_string()) };
+                let Some([low, high]) = parameter_limits(key, known) else { return Ok(from.to_string()) };
                 if !(low <= *from && from < to && *to <= high) {
-                    return Err(self.refused(key, known));
+                    return Err(self.range_error(key, known));
                 }
                 let value = from + (to - from) * share;
                 let whole = known.iter().any(|p| p.key == key && matches!(p.domain, ParameterDomain::Whole { .. }));
-                let value = if whole { value.round() } else { rounded(value, to - from) };
+                let value = if whole { value.round() } else { round_in_range(value, to - from) };
                 Ok(value.clamp(*from, *to).to_string())
             }
         }
     }
 
-    fn refused(&self, key: &str, known: &[ReliefParameter]) -> Error {
+    fn range_error(&self, key: &str, known: &[ReliefParameter]) -> Error {
         let given = match self {
             Self::Numbers([from, to]) => format!("{from} to {to}"),
             Self::Words(words) => format!("{words:?}"),
@@ -236,7 +236,7 @@ impl ParameterRange {
     }
 }
 
-fn limits(key: &str, known: &[ReliefParameter]) -> Option<[f64; 2]> {
+fn parameter_limits(key: &str, known: &[ReliefParameter]) -> Option<[f64; 2]> {
     known.iter().find(|p| p.key == key).and_then(|p| match p.domain {
         ParameterDomain::Number { low, high, .. } => Some([low, high]),
         ParameterDomain::Whole { low, high, .. } => Some([low as f64, high as f64]),
@@ -245,13 +245,13 @@ fn limits(key: &str, known: &[ReliefParameter]) -> Option<[f64; 2]> {
 }
 
 // Widens about the middle, within the limits; a part that is cut off on one side is not added on the other.
-fn stretched([from, to]: [f64; 2], factor: f64, [low, high]: [f64; 2]) -> [f64; 2] {
+fn stretch_range([from, to]: [f64; 2], factor: f64, [low, high]: [f64; 2]) -> [f64; 2] {
     let (middle, half) = ((from + to) / 2.0, (to - from) / 2.0 * factor);
-    [(middle - half).max(low), (middle + half).min(high)].map(|x| rounded(x, to - from))
+    [(middle - half).max(low), (middle + half).min(high)].map(|x| round_in_range(x, to - from))
 }
 
 /// Standard deviation of the surfaces' levels in each band, mean over the bands, dB.
-fn spread(results: &[BandLevel]) -> Result<f64, Error> {
+fn level_spread(results: &[BandLevel]) -> Result<f64, Error> {
     let mut bands: BTreeMap<&str, Vec<f64>> = BTreeMap::new();
     for result in results {
         if !result.level_db.is_finite() {
@@ -297,8 +297,8 @@ mod tests {
     #[test]
     fn a_group_fills_its_ranges_evenly() {
         let ranges = GroupRanges::from_toml(TEXT).expect("ranges");
-        let group = ranges.draw(8).expect("a group");
-        assert_eq!(group, ranges.draw(8).expect("a group"));
+        let group = ranges.draw_reliefs(8).expect("a group");
+        assert_eq!(group, ranges.draw_reliefs(8).expect("a group"));
         for (key, low, width) in [("joint_depth_mm", 10.0, 10.0), ("stone_length_mm", 400.0, 400.0)] {
             let mut parts: Vec<_> =
                 group.iter().map(|r| ((number(r, key) - low - 0.05) / width * 8.0) as i64).collect();
@@ -311,24 +311,24 @@ mod tests {
         let seeds: std::collections::BTreeSet<_> = group.iter().map(|r| r.parameters()["seed"].to_string()).collect();
         assert_eq!(seeds.len(), 8);
         let other = GroupRanges { seed: 4, ..ranges };
-        assert_ne!(other.draw(8).expect("a group"), group);
+        assert_ne!(other.draw_reliefs(8).expect("a group"), group);
     }
 
     #[test]
     fn alike_results_widen_and_different_ones_narrow() {
         let ranges = GroupRanges::from_toml(TEXT).expect("ranges");
         // Standard deviation 0.5 dB, 1 is wanted: twice as wide.
-        let wider = ranges.next(&results([0.0, 0.5, 1.0])).expect("a step");
+        let wider = ranges.next_step(&results([0.0, 0.5, 1.0])).expect("a step");
         assert_eq!((wider.spread_db, wider.factor), (0.5, 2.0));
         assert_eq!(wider.ranges.ranges["joint_depth_mm"], ParameterRange::Numbers([5.0, 25.0]));
         assert_eq!(wider.ranges.seed, 4);
-        let narrower = ranges.next(&results([-1.25, 0.0, 1.25])).expect("a step");
+        let narrower = ranges.next_step(&results([-1.25, 0.0, 1.25])).expect("a step");
         assert_eq!(narrower.ranges.ranges["stone_length_mm"], ParameterRange::Numbers([440.0, 760.0]));
         assert!(narrower.reasons[0].contains("far apart") && narrower.reasons.len() == 4, "{:?}", narrower.reasons);
         // Six steps meet the parameter's limits; results that are the same are no division by zero.
         let mut last = ranges;
         for _ in 0..6 {
-            last = last.next(&results([1.0, 1.0, 1.0])).expect("a step").ranges;
+            last = last.next_step(&results([1.0, 1.0, 1.0])).expect("a step").ranges;
         }
         assert_eq!(last.ranges["joint_depth_mm"], ParameterRange::Numbers([0.0, 80.0]));
         assert_eq!(GroupRanges::from_toml(&last.to_toml()), Ok(last));
@@ -348,7 +348,7 @@ mod tests {
         check("coursed_ashlar", "marble", "no relief");
         check("= 1.0", "= 0.0", "target_spread_db");
         let ranges = GroupRanges::from_toml(TEXT).expect("ranges");
-        assert!(matches!(ranges.next(&results([0.0; 3])[..1]), Err(Error::Results { .. })));
-        assert!(matches!(ranges.next(&results([0.0, f64::NAN, 1.0])), Err(Error::Results { .. })));
+        assert!(matches!(ranges.next_step(&results([0.0; 3])[..1]), Err(Error::Results { .. })));
+        assert!(matches!(ranges.next_step(&results([0.0, f64::NAN, 1.0])), Err(Error::Results { .. })));
     }
 }

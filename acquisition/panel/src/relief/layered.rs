@@ -29,21 +29,24 @@ pub struct LayeredWall {
 impl LayeredWall {
     /// A wall with its default parameters.
     pub fn new(mesostructure: StoneArrangement) -> Self {
-        Self::with(mesostructure, |_, parameter| parameter.default_setting())
+        Self::with_values(mesostructure, |_, parameter| parameter.default_setting())
     }
 
     /// A wall with every parameter drawn from its range; its large shape is as deep as the rest leaves room for.
-    pub(super) fn drawn(mesostructure: StoneArrangement, chance: SeededRandom) -> Self {
-        let mut wall = Self::with(mesostructure, |n, parameter| parameter.domain.value(chance.unit(n)));
+    pub(super) fn from_chance(mesostructure: StoneArrangement, chance: SeededRandom) -> Self {
+        let mut wall =
+            Self::with_values(mesostructure, |n, parameter| parameter.domain.value_at(chance.unit_number(n)));
         let rest: f64 = wall.depths_mm().iter().filter(|(key, _)| *key != MACRO_DEPTH).map(|(_, mm)| mm).sum();
         let room = (10.0 * (DEEPEST_MM - rest)).floor() / 10.0;
         wall.settings.macro_depth_mm = wall.settings.macro_depth_mm.min(room);
         wall
     }
 
-    fn with(mesostructure: StoneArrangement, value: impl Fn(u64, &ReliefParameter) -> ParameterValue) -> Self {
+    fn with_values(mesostructure: StoneArrangement, value: impl Fn(u64, &ReliefParameter) -> ParameterValue) -> Self {
         let mut wall = Self { mesostructure, settings: Box::default() };
-        wall.set((0..).zip(parameters(mesostructure)).map(|(n, parameter)| (parameter.key, value(n, &parameter))));
+        wall.set_values(
+            (0..).zip(wall_parameters(mesostructure)).map(|(n, parameter)| (parameter.key, value(n, &parameter))),
+        );
         let shape = &mut wall.settings.macrostructure;
         if mesostructure == StoneArrangement::Macrostructure && *shape == MacrostructureShape::Flat {
             // Without stones and flat it would be Flat.
@@ -58,7 +61,7 @@ impl LayeredWall {
     }
 
     /// Its joints and skin, in words.
-    pub fn microstructure(&self) -> String {
+    pub fn microstructure_text(&self) -> String {
         let WallSettings { roughness_mm, joint_width_mm, joint_depth_mm, joint_shape, .. } = *self.settings;
         let skin = if roughness_mm == 0.0 { "smooth".to_owned() } else { format!("rough by {roughness_mm} mm") };
         let told = |mm: f64, jitter: f64| if jitter == 0.0 { mm.to_string() } else { format!("{mm} +- {jitter}") };
@@ -68,18 +71,18 @@ impl LayeredWall {
             _ if joint_width_mm == 0.0 || self.mesostructure == StoneArrangement::Macrostructure => skin,
             JointShape::Flush => format!("flush joints {width} mm wide, {skin}"),
             _ => {
-                let shape = self.word("joint_shape");
+                let shape = self.parameter_word("joint_shape");
                 format!("{shape} joints {width} mm wide and {depth} mm deep, {skin}")
             }
         }
     }
 
     /// Its large shape.
-    pub fn macrostructure(&self) -> String {
-        self.word("macrostructure")
+    pub fn macrostructure_name(&self) -> String {
+        self.parameter_word("macrostructure")
     }
 
-    fn word(&self, key: &str) -> String {
+    fn parameter_word(&self, key: &str) -> String {
         self.parameters().remove(key).and_then(|v| v.as_str().map(str::to_owned)).unwrap_or_default()
     }
 
@@ -88,7 +91,7 @@ impl LayeredWall {
         let Ok(serde_json::Value::Object(mut all)) = serde_json::to_value(&self.settings) else {
             return serde_json::Map::new();
         };
-        let own = parameters(self.mesostructure);
+        let own = wall_parameters(self.mesostructure);
         all.retain(|key, _| own.iter().any(|p| p.key == key));
         all
     }
@@ -96,13 +99,13 @@ impl LayeredWall {
     /// Makes the parameter's value here its default.
     pub(super) fn name_default(&self, parameter: &mut ReliefParameter) {
         if let ParameterDomain::Choice { options, default } = &mut parameter.domain {
-            let set = self.word(parameter.key);
+            let set = self.parameter_word(parameter.key);
             *default = options.iter().find(|o| **o == set).unwrap_or(default);
         }
     }
 
     /// Sets parameters to values of their domains.
-    pub(super) fn set(&mut self, values: impl IntoIterator<Item = (&'static str, ParameterValue)>) {
+    pub(super) fn set_values(&mut self, values: impl IntoIterator<Item = (&'static str, ParameterValue)>) {
         let mut all = self.parameters();
         all.extend(values.into_iter().map(|(key, value)| (key.to_owned(), value.into())));
         // Values of a parameter's domain fit its field; a test tries them.
@@ -154,17 +157,17 @@ impl LayeredWall {
     /// Its heights, each the mean over its cell. Their mean is 0 if that keeps them within the relief.
     pub(super) fn height_field(&self, cells: usize) -> HeightField {
         let settings = &self.settings;
-        let shape = MacrostructureModel::of(settings);
-        let skin = MicrostructureModel::of(settings);
-        let stones = self.mesostructure.stones(settings);
+        let shape = MacrostructureModel::from_settings(settings);
+        let skin = MicrostructureModel::from_settings(settings);
+        let stones = self.mesostructure.stone_layout(settings);
         let half_joint = settings.joint_width_mm / FULL_SCALE / 2.0;
         let height = |x: f64, y: f64| {
             let relief = stones.as_ref().map_or(0.0, |stones| {
-                let spot = stones.spot(x, y, half_joint);
+                let spot = stones.spot_at(x, y, half_joint);
                 let half_width = skin.half_width(x, y);
-                if spot.to_joint < half_width { skin.joint(spot.to_joint, half_width, x, y) } else { spot.face }
+                if spot.to_joint < half_width { skin.joint_height(spot.to_joint, half_width, x, y) } else { spot.face }
             });
-            shape.height(x, y) + relief + skin.roughness(x, y)
+            shape.height_at(x, y) + relief + skin.roughness_at(x, y)
         };
         let pitch = PANEL_SIZE_MM / cells.max(2) as f64;
         let places = ((pitch / DETAIL_MM).ceil() as usize).clamp(2, 6);
@@ -173,12 +176,12 @@ impl LayeredWall {
             let rows = (0..places).map(|j| (0..places).map(|i| height(x + off(i), y + off(j))).sum::<f64>());
             rows.sum::<f64>() / (places * places) as f64
         };
-        centred(HeightField::from_fn(PANEL_SIZE_MM, cells, mean))
+        centre_heights(HeightField::from_fn(PANEL_SIZE_MM, cells, mean))
     }
 }
 
 /// Parameters of all layers of a wall.
-pub(super) fn parameters(mesostructure: StoneArrangement) -> Vec<ReliefParameter> {
+pub(super) fn wall_parameters(mesostructure: StoneArrangement) -> Vec<ReliefParameter> {
     let own = mesostructure.parameters().iter().copied();
     let seed = own.clone().all(|p| p.key != SEED.key).then_some(SEED);
     let jitter = own.clone().any(|p| p.key == JOINT_SHAPE.key).then_some(JITTER);
@@ -191,7 +194,7 @@ pub(super) fn parameters(mesostructure: StoneArrangement) -> Vec<ReliefParameter
         .collect()
 }
 
-fn centred(heights: HeightField) -> HeightField {
+fn centre_heights(heights: HeightField) -> HeightField {
     let all = heights.heights_mm();
     let mean = all.iter().copied().map(f64::from).sum::<f64>() / all.len() as f64;
     let [low, high] = heights.extent_mm().map(f64::from);
@@ -206,7 +209,7 @@ mod tests {
 
     fn wall(name: &str, settings: &[(&str, &str)]) -> PanelRelief {
         let mut relief = PanelRelief::by_name(name).expect(name);
-        settings.iter().for_each(|(key, value)| relief.set(key, value).expect(key));
+        settings.iter().for_each(|(key, value)| relief.set_parameter(key, value).expect(key));
         relief
     }
 
@@ -264,18 +267,18 @@ mod tests {
     #[test]
     fn values_out_of_range_are_refused_by_name_range_and_hint() {
         let mut relief = wall("coursed_ashlar", &[]);
-        let refused = relief.set("joint_depth_mm", "90").expect_err("too deep").to_string();
+        let refused = relief.set_parameter("joint_depth_mm", "90").expect_err("too deep").to_string();
         assert_eq!(
             refused,
             "parameter `joint_depth_mm` of relief `coursed_ashlar` is `90`, expected 0 to 80 mm full scale; \
              hint: how far the joints lie behind the stones' faces"
         );
-        let refused = relief.set("joint_shape", "round").expect_err("no shape").to_string();
+        let refused = relief.set_parameter("joint_shape", "round").expect_err("no shape").to_string();
         assert!(refused.contains("recessed, flush, raked, concave, v"), "{refused}");
         for value in ["NaN", "inf", "", "-1", "1e9"] {
-            assert!(relief.set("stone_length_mm", value).is_err(), "{value}");
+            assert!(relief.set_parameter("stone_length_mm", value).is_err(), "{value}");
         }
-        let refused = relief.set("brick_length_mm", "200").expect_err("no bricks").to_string();
+        let refused = relief.set_parameter("brick_length_mm", "200").expect_err("no bricks").to_string();
         assert!(refused.contains("course_height_mm"), "{refused}");
     }
 
@@ -291,7 +294,7 @@ mod tests {
         // The share of the wall that lies in joints, along one bed joint of 0.05 mm steps.
         let share = |relief: &PanelRelief| {
             let PanelRelief::Layered(wall) = relief else { return Vec::new() };
-            let skin = MicrostructureModel::of(&wall.settings);
+            let skin = MicrostructureModel::from_settings(&wall.settings);
             (0..2000).map(|n| 20.0 * skin.half_width(f64::from(n) * 0.3, 7.0)).collect::<Vec<f64>>()
         };
         assert!(share(&plain).iter().all(|mm| (mm - 15.0).abs() < 1e-9));
@@ -311,8 +314,8 @@ mod tests {
     fn parameters_go_through_json() {
         for name in PanelRelief::NAMES {
             let mut relief = PanelRelief::by_name(name).expect(name);
-            if relief.describe().iter().any(|p| p.key == "seed") {
-                relief.set("seed", "9").expect("a seed");
+            if relief.describe_parameters().iter().any(|p| p.key == "seed") {
+                relief.set_parameter("seed", "9").expect("a seed");
             }
             assert_eq!(PanelRelief::from_json(&relief.to_json().to_string()), Ok(relief));
         }
@@ -379,30 +382,30 @@ mod tests {
         fn every_combination_fits_the_relief() {
             for mesostructure in StoneArrangement::ALL {
                 let mut greatest = PanelRelief::Layered(LayeredWall::new(mesostructure));
-                let parameters = greatest.describe();
+                let parameters = greatest.describe_parameters();
                 for parameter in &parameters {
                     match parameter.domain {
                         ParameterDomain::Number { high, .. } => {
-                            greatest.set(parameter.key, &high.to_string()).expect("in range");
+                            greatest.set_parameter(parameter.key, &high.to_string()).expect("in range");
                             assert_eq!(greatest.parameters()[parameter.key], high);
                         }
-                        ParameterDomain::Whole { .. } => greatest.set(parameter.key, "7").expect("in range"),
+                        ParameterDomain::Whole { .. } => greatest.set_parameter(parameter.key, "7").expect("in range"),
                         ParameterDomain::Choice { .. } => {}
                     }
                 }
-                greatest.set("macrostructure", "convex").expect("a shape");
+                greatest.set_parameter("macrostructure", "convex").expect("a shape");
                 let refused = greatest.check_depth().expect_err("too deep").to_string();
                 assert!(refused.contains("macro_depth_mm=400") && refused.contains("expected 400 mm"), "{refused}");
-                greatest.set("macro_depth_mm", "0").expect("in range");
+                greatest.set_parameter("macro_depth_mm", "0").expect("in range");
                 let PanelRelief::Layered(wall) = &greatest else { continue };
                 let room = DEEPEST_MM - wall.depths_mm().iter().map(|(_, mm)| mm).sum::<f64>();
                 assert!(room >= 50.0, "{mesostructure:?}: {room}");
-                greatest.set("macro_depth_mm", &room.to_string()).expect("in range");
+                greatest.set_parameter("macro_depth_mm", &room.to_string()).expect("in range");
                 for parameter in &parameters {
                     let ParameterDomain::Choice { options, .. } = parameter.domain else { continue };
                     for option in options {
                         let mut relief = greatest.clone();
-                        relief.set(parameter.key, option).expect("an option");
+                        relief.set_parameter(parameter.key, option).expect("an option");
                         assert_eq!(relief.parameters()[parameter.key], *option);
                         assert_eq!(relief.check_depth(), Ok(()));
                         let [low, high] = relief.height_field(40).extent_mm().map(f64::from);

@@ -8,13 +8,13 @@ use super::settings::{FULL_SCALE, MacrostructureShape, WallSettings};
 const LAYER: ParameterLayer = ParameterLayer::Macrostructure;
 
 pub(super) const PARAMETERS: [ReliefParameter; 4] = [
-    ReliefParameter::choice(
+    ReliefParameter::new_choice(
         "macrostructure",
         LAYER,
         &["flat", "wavy_x", "wavy_y", "wavy_xy", "convex", "concave"],
         "the wall's large shape: waves along x, along y or both, a dome or a bowl",
     ),
-    ReliefParameter::mm(
+    ReliefParameter::new_mm(
         "macro_depth_mm",
         LAYER,
         [0.0, 400.0, 120.0],
@@ -22,8 +22,8 @@ pub(super) const PARAMETERS: [ReliefParameter; 4] = [
          and 2500 mm long focus by 10 dB at some pairs in their troughs, a bowl over the whole panel is too shallow \
          for that",
     ),
-    ReliefParameter::mm("macro_wavelength_mm", LAYER, [600.0, 6000.0, 2500.0], "from crest to crest"),
-    ReliefParameter::number(
+    ReliefParameter::new_mm("macro_wavelength_mm", LAYER, [600.0, 6000.0, 2500.0], "from crest to crest"),
+    ReliefParameter::new_number(
         "macro_phase",
         LAYER,
         "turns",
@@ -43,7 +43,7 @@ pub(super) struct MacrostructureModel {
 }
 
 impl MacrostructureModel {
-    pub(super) fn of(settings: &WallSettings) -> Self {
+    pub(super) fn from_settings(settings: &WallSettings) -> Self {
         Self {
             shape: settings.macrostructure,
             depth: settings.macro_depth_mm / FULL_SCALE,
@@ -53,7 +53,7 @@ impl MacrostructureModel {
     }
 
     /// Height over its lowest point, model mm.
-    pub(super) fn height(&self, x: f64, y: f64) -> f64 {
+    pub(super) fn height_at(&self, x: f64, y: f64) -> f64 {
         let half = PANEL_SIZE_MM / 2.0;
         // 1 in the middle, 0 in the corners.
         let dome = || 1.0 - (x * x + y * y) / (2.0 * half * half);

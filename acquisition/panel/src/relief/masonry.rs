@@ -4,7 +4,7 @@ use super::chance::SeededRandom;
 use super::microstructure::{JOINT_SHAPE, joint_depth, joint_width};
 use super::parameter::{ParameterLayer, ReliefParameter};
 use super::settings::{FULL_SCALE, WallSettings};
-use super::stone::{StoneFaces, lean, projection};
+use super::stone::{StoneFaces, stone_lean, stone_projection};
 use super::stones::{SEED, StoneLayout, StoneSpot};
 
 const MESO: ParameterLayer = ParameterLayer::Mesostructure;
@@ -12,15 +12,15 @@ const MESO: ParameterLayer = ParameterLayer::Mesostructure;
 pub(super) const PARAMETERS: [ReliefParameter; 8] = [
     // The defaults are the German Reichsformat of 250 x 120 x 65 mm; the Swiss format is 250 x 120 x 60, NF 240 x 115 x
     // 71, DF 240 x 115 x 52, and the paper's bricks are 215 x 102.5 x 65.
-    ReliefParameter::mm(
+    ReliefParameter::new_mm(
         "brick_length_mm",
         MESO,
         [150.0, 600.0, 250.0],
         "length of a brick; in Flemish bond a header shows half of it, less half a joint",
     ),
-    ReliefParameter::mm("brick_height_mm", MESO, [40.0, 250.0, 65.0], "height of a brick"),
-    projection(80.0, 4.0),
-    lean(3.0),
+    ReliefParameter::new_mm("brick_height_mm", MESO, [40.0, 250.0, 65.0], "height of a brick"),
+    stone_projection(80.0, 4.0),
+    stone_lean(3.0),
     SEED,
     JOINT_SHAPE,
     joint_width(10.0),
@@ -47,19 +47,19 @@ pub(super) struct MasonryStones {
 }
 
 impl MasonryStones {
-    pub(super) fn of(settings: &WallSettings, bond: BrickBond) -> Self {
+    pub(super) fn from_settings(settings: &WallSettings, bond: BrickBond) -> Self {
         Self {
             bond,
             length: settings.brick_length_mm / FULL_SCALE,
             height: settings.brick_height_mm / FULL_SCALE,
             joint: settings.joint_width_mm / FULL_SCALE,
-            faces: StoneFaces::of(settings),
+            faces: StoneFaces::from_settings(settings),
             chance: SeededRandom::new(settings.seed, 0xB41C),
         }
     }
 
     /// Column, place along the brick from its middle, and half the distance between its joints' middles.
-    fn along(&self, x: f64, course: i64) -> (i64, f64, f64) {
+    fn locate_brick(&self, x: f64, course: i64) -> (i64, f64, f64) {
         let stretcher = self.length + self.joint;
         let header = stretcher / 2.0;
         let odd = course.rem_euclid(2) as f64;
@@ -87,12 +87,16 @@ impl MasonryStones {
 }
 
 impl StoneLayout for MasonryStones {
-    fn spot(&self, x: f64, y: f64, _half_joint: f64) -> StoneSpot {
+    fn spot_at(&self, x: f64, y: f64, _half_joint: f64) -> StoneSpot {
         let half_height = (self.height + self.joint) / 2.0;
         let course = (y / (2.0 * half_height)).floor();
         let dy = y - (2.0 * course + 1.0) * half_height;
-        let (column, dx, half_length) = self.along(x, course as i64);
-        let face = self.faces.height(self.chance.at(column, course as i64), [dx / half_length, dy / half_height], 0.0);
+        let (column, dx, half_length) = self.locate_brick(x, course as i64);
+        let face = self.faces.face_height(
+            self.chance.at_place(column, course as i64),
+            [dx / half_length, dy / half_height],
+            0.0,
+        );
         StoneSpot { to_joint: (half_length - dx.abs()).min(half_height - dy.abs()), face }
     }
 }

@@ -87,16 +87,20 @@ impl StoneArrangement {
     }
 
     /// Returns its stones; None if it has none.
-    pub(super) fn stones(self, settings: &WallSettings) -> Option<Box<dyn StoneLayout>> {
+    pub(super) fn stone_layout(self, settings: &WallSettings) -> Option<Box<dyn StoneLayout>> {
         Some(match self {
             Self::Macrostructure => return None,
-            Self::StretcherBond => Box::new(masonry::MasonryStones::of(settings, masonry::BrickBond::Stretcher)),
-            Self::FlemishBond => Box::new(masonry::MasonryStones::of(settings, masonry::BrickBond::Flemish)),
-            Self::CoursedAshlar | Self::SlatedStone => Box::new(courses::CoursedStones::of(settings)),
-            Self::PolygonalRubble => Box::new(voronoi::StoneCells::of(settings, voronoi::StoneOutline::Polygons)),
-            Self::RiverRock => Box::new(voronoi::StoneCells::of(settings, voronoi::StoneOutline::Round)),
-            Self::Primitives => Box::new(primitives::PrimitiveStones::of(settings)),
-            Self::PrimitiveRoot => Box::new(wells::DiffuserWells::of(settings)),
+            Self::StretcherBond => {
+                Box::new(masonry::MasonryStones::from_settings(settings, masonry::BrickBond::Stretcher))
+            }
+            Self::FlemishBond => Box::new(masonry::MasonryStones::from_settings(settings, masonry::BrickBond::Flemish)),
+            Self::CoursedAshlar | Self::SlatedStone => Box::new(courses::CoursedStones::from_settings(settings)),
+            Self::PolygonalRubble => {
+                Box::new(voronoi::StoneCells::from_settings(settings, voronoi::StoneOutline::Polygons))
+            }
+            Self::RiverRock => Box::new(voronoi::StoneCells::from_settings(settings, voronoi::StoneOutline::Round)),
+            Self::Primitives => Box::new(primitives::PrimitiveStones::from_settings(settings)),
+            Self::PrimitiveRoot => Box::new(wells::DiffuserWells::from_settings(settings)),
         })
     }
 }

@@ -141,9 +141,9 @@ const SHARES: [(StoneArrangement, usize); 9] = [
 const DECK_SIZE: u64 = 150;
 
 // Kinds of walls in an order of chance; a small collection has one of each kind first.
-fn deck(chance: SeededRandom) -> Vec<StoneArrangement> {
+fn shuffle_deck(chance: SeededRandom) -> Vec<StoneArrangement> {
     let kinds: Vec<_> = SHARES.iter().flat_map(|(kind, count)| std::iter::repeat_n(*kind, *count)).collect();
-    let mut deck: Vec<_> = chance.shuffled(kinds.len()).into_iter().map(|n| kinds[n]).collect();
+    let mut deck: Vec<_> = chance.random_order(kinds.len()).into_iter().map(|n| kinds[n]).collect();
     for first in 0..SHARES.len() {
         let is_new = |n: &usize| !deck[..first].contains(&deck[*n]);
         if let Some(next) = (first..deck.len()).find(is_new) {
@@ -207,14 +207,14 @@ impl PanelRelief {
     /// None for those of [`PaperPanel::ALL`].
     pub fn from_paper(panel: &PaperPanel) -> Result<Self, Error> {
         let mut relief = Self::by_name(panel.relief)?;
-        panel.settings.iter().try_for_each(|(key, value)| relief.set(key, value))?;
+        panel.settings.iter().try_for_each(|(key, value)| relief.set_parameter(key, value))?;
         relief.check_depth()?;
         Ok(relief)
     }
 
     /// Returns the panel of the paper that has a surface's name, or the relief that the name begins with: the longest
     /// name that matches.
-    pub fn guess(surface: &str) -> Option<&'static str> {
+    pub fn guess_name(surface: &str) -> Option<&'static str> {
         if let Some(panel) = PaperPanel::by_name(surface) {
             return Some(panel.name);
         }
@@ -226,10 +226,10 @@ impl PanelRelief {
     /// Relief `number` of the collection that `seed` names; it does not depend on how many there are. Every 150 from a
     /// multiple of it are 92 walls of brick, 46 of stone and 12 others, in any order, but the first nine are one of
     /// each kind; their parameters are from all of their ranges.
-    pub fn drawn(seed: u64, number: u64) -> Self {
+    pub fn from_seed(seed: u64, number: u64) -> Self {
         let chance = SeededRandom::new(seed, 0xDECC);
-        let deck = deck(chance.at((number / DECK_SIZE) as i64, 1));
-        Self::Layered(LayeredWall::drawn(deck[(number % DECK_SIZE) as usize], chance.at(number as i64, 0)))
+        let deck = shuffle_deck(chance.at_place((number / DECK_SIZE) as i64, 1));
+        Self::Layered(LayeredWall::from_chance(deck[(number % DECK_SIZE) as usize], chance.at_place(number as i64, 0)))
     }
 
     /// Parses the text of [`PanelRelief::to_json`]; every parameter is checked, missing ones have their defaults.
@@ -243,7 +243,7 @@ impl PanelRelief {
         let mut relief = Self::by_name(name.ok_or_else(|| wrong("they do not name a `relief`".to_owned()))?)?;
         let parameters = fields.get("parameters").and_then(|p| p.as_object());
         for (key, value) in parameters.ok_or_else(|| wrong("they have no `parameters`".to_owned()))? {
-            relief.set(key, value.as_str().unwrap_or(&value.to_string()))?;
+            relief.set_parameter(key, value.as_str().unwrap_or(&value.to_string()))?;
         }
         relief.check_depth()?;
         Ok(relief)
@@ -260,10 +260,10 @@ impl PanelRelief {
     }
 
     /// Returns the parameters, with ranges and defaults.
-    pub fn describe(&self) -> Vec<ReliefParameter> {
+    pub fn describe_parameters(&self) -> Vec<ReliefParameter> {
         match self {
             Self::Layered(wall) => {
-                let mut all = layered::parameters(wall.mesostructure());
+                let mut all = layered::wall_parameters(wall.mesostructure());
                 let fresh = LayeredWall::new(wall.mesostructure());
                 all.iter_mut().for_each(|p| fresh.name_default(p));
                 all
@@ -288,9 +288,9 @@ impl PanelRelief {
     ///
     /// # Errors
     /// [`Error::Parameter`] or [`Error::Value`], which name the valid ones.
-    pub fn set(&mut self, key: &str, value: &str) -> Result<(), Error> {
+    pub fn set_parameter(&mut self, key: &str, value: &str) -> Result<(), Error> {
         let relief = self.name();
-        let known = self.describe();
+        let known = self.describe_parameters();
         let parameter = known.iter().find(|p| p.key == key).ok_or_else(|| Error::Parameter {
             relief,
             given: key.to_owned(),
@@ -299,10 +299,10 @@ impl PanelRelief {
                 names => names.join(", "),
             },
         })?;
-        let setting = parameter.parse(relief, value)?;
+        let setting = parameter.parse_value(relief, value)?;
         match self {
-            Self::Layered(wall) => wall.set([(parameter.key, setting)]),
-            Self::Prd(prd) => prd.set(&setting).map_err(|expected| Error::Value {
+            Self::Layered(wall) => wall.set_values([(parameter.key, setting)]),
+            Self::Prd(prd) => prd.set_value(&setting).map_err(|expected| Error::Value {
                 relief,
                 key: key.to_owned(),
                 given: value.to_owned(),
@@ -361,7 +361,7 @@ impl PanelRelief {
             Self::Flat | Self::Foam | Self::Wood => HeightField::from_fn(PANEL_SIZE_MM, cells, |_, _| 0.0),
             Self::Prd(prd) => {
                 let depths = prd.depths_mm();
-                HeightField::from_fn(PANEL_SIZE_MM, cells, |x, y| prd.height(&depths, x, y))
+                HeightField::from_fn(PANEL_SIZE_MM, cells, |x, y| prd.height_at(&depths, x, y))
             }
             Self::Layered(wall) => wall.height_field(cells),
         }
@@ -377,17 +377,17 @@ mod tests {
     #[test]
     fn parameters_are_set_by_name() {
         let mut prd = PanelRelief::by_name("prd").expect("a relief");
-        prd.set("depth_mm", "6").expect("a parameter");
-        prd.set("prime", "31").expect("a parameter");
+        prd.set_parameter("depth_mm", "6").expect("a parameter");
+        prd.set_parameter("prime", "31").expect("a parameter");
         assert_eq!((&prd.parameters()["depth_mm"], &prd.parameters()["prime"]), (&6.0.into(), &31.into()));
-        let unknown = prd.set("colour", "red").expect_err("unknown").to_string();
+        let unknown = prd.set_parameter("colour", "red").expect_err("unknown").to_string();
         assert!(unknown.contains("has no parameter `colour`; hint: prime, depth_mm"), "{unknown}");
         for (key, value) in
             [("depth_mm", "NaN"), ("depth_mm", "-1"), ("depth_mm", "39"), ("prime", "32"), ("prime", "1.5")]
         {
-            assert!(prd.set(key, value).is_err(), "{key}={value}");
+            assert!(prd.set_parameter(key, value).is_err(), "{key}={value}");
         }
-        assert!(PanelRelief::Flat.set("depth", "1").expect_err("none").to_string().contains("it has none"));
+        assert!(PanelRelief::Flat.set_parameter("depth", "1").expect_err("none").to_string().contains("it has none"));
         assert!(PanelRelief::by_name("marble").expect_err("unknown").to_string().contains("river_rock"));
     }
 
@@ -396,15 +396,15 @@ mod tests {
         for (old, new) in RENAMED {
             let refused = PanelRelief::by_name(old).expect_err("gone").to_string();
             assert!(refused.contains(&format!("`{old}` is gone")) && refused.contains(&format!("panel {new} --list")));
-            assert_eq!(PanelRelief::guess(&format!("{old}_2")), Some(new));
+            assert_eq!(PanelRelief::guess_name(&format!("{old}_2")), Some(new));
         }
-        assert_eq!(PanelRelief::guess("flemish_bond_2"), Some("flemish_bond"));
-        assert_eq!(PanelRelief::guess("0001_0"), None);
+        assert_eq!(PanelRelief::guess_name("flemish_bond_2"), Some("flemish_bond"));
+        assert_eq!(PanelRelief::guess_name("0001_0"), None);
     }
 
     #[test]
     fn collections_are_their_seeds() {
-        let drawn = |seed| (0..2 * DECK_SIZE).map(|n| PanelRelief::drawn(seed, n)).collect::<Vec<_>>();
+        let drawn = |seed| (0..2 * DECK_SIZE).map(|n| PanelRelief::from_seed(seed, n)).collect::<Vec<_>>();
         assert_eq!(drawn(1), drawn(1));
         let (one, two) = (drawn(1), drawn(2));
         assert!(one.iter().zip(&two).all(|(a, b)| a != b));
@@ -414,7 +414,7 @@ mod tests {
             let count = |part: &str| block.iter().filter(|relief| relief.typology().contains(part)).count();
             assert_eq!((count("brick"), count("stone")), (92, 46));
         }
-        let first: BTreeSet<_> = (1..9).map(|seed| PanelRelief::drawn(seed, 0).name()).collect();
+        let first: BTreeSet<_> = (1..9).map(|seed| PanelRelief::from_seed(seed, 0).name()).collect();
         assert!(first.len() > 3, "the order changes: {first:?}");
         // What is drawn can be set, so it is within the ranges, and a panel has room for it.
         for relief in one {

@@ -77,7 +77,7 @@ pub enum ParameterValue {
 
 impl ReliefParameter {
     /// A number in millimetres of the full-scale wall.
-    pub(super) const fn mm(
+    pub(super) const fn new_mm(
         key: &'static str,
         layer: ParameterLayer,
         [low, high, default]: [f64; 3],
@@ -87,7 +87,7 @@ impl ReliefParameter {
     }
 
     /// A number of another unit.
-    pub(super) const fn number(
+    pub(super) const fn new_number(
         key: &'static str,
         layer: ParameterLayer,
         unit: &'static str,
@@ -98,7 +98,7 @@ impl ReliefParameter {
     }
 
     /// A word; the first is the default.
-    pub(super) const fn choice(
+    pub(super) const fn new_choice(
         key: &'static str,
         layer: ParameterLayer,
         options: &'static [&'static str],
@@ -108,7 +108,7 @@ impl ReliefParameter {
     }
 
     /// A whole number.
-    pub(super) const fn whole(
+    pub(super) const fn new_whole(
         key: &'static str,
         layer: ParameterLayer,
         [low, high, default]: [u64; 3],
@@ -130,7 +130,7 @@ impl ReliefParameter {
     ///
     /// # Errors
     /// [`Error::Value`], which names the domain.
-    pub fn parse(&self, relief: &'static str, text: &str) -> Result<ParameterValue, Error> {
+    pub fn parse_value(&self, relief: &'static str, text: &str) -> Result<ParameterValue, Error> {
         let setting = match self.domain {
             ParameterDomain::Number { low, high, .. } => {
                 text.parse().ok().filter(|x: &f64| (low..=high).contains(x)).map(ParameterValue::Number)
@@ -154,10 +154,10 @@ impl ReliefParameter {
 
 impl ParameterDomain {
     /// Returns the value at a share of the domain, from 0 to below 1. Seeds stay below a million.
-    pub(super) fn value(&self, share: f64) -> ParameterValue {
+    pub(super) fn value_at(&self, share: f64) -> ParameterValue {
         match *self {
             Self::Number { low, high, .. } => {
-                ParameterValue::Number(rounded(low + (high - low) * share, high - low).clamp(low, high))
+                ParameterValue::Number(round_in_range(low + (high - low) * share, high - low).clamp(low, high))
             }
             Self::Whole { low, high, .. } => {
                 ParameterValue::Whole(low + ((high.min(999_999) - low) as f64 * share) as u64)
@@ -170,7 +170,7 @@ impl ParameterDomain {
 }
 
 /// Rounds a value of a range, so that it is easy to read.
-pub(super) fn rounded(value: f64, width: f64) -> f64 {
+pub(super) fn round_in_range(value: f64, width: f64) -> f64 {
     let steps = if width < 10.0 { 1_000.0 } else { 10.0 };
     (value * steps).round() / steps
 }

@@ -5,8 +5,8 @@ use super::parameter::{ParameterLayer, ParameterValue, ReliefParameter};
 
 /// Parameters of relief `prd`; its lengths are the panel's own.
 pub(super) const PARAMETERS: [ReliefParameter; 2] = [
-    ReliefParameter::whole("prime", ParameterLayer::Whole, [5, LARGEST_PRIME, 157], "the prime p; p - 1 wells"),
-    ReliefParameter::number(
+    ReliefParameter::new_whole("prime", ParameterLayer::Whole, [5, LARGEST_PRIME, 157], "the prime p; p - 1 wells"),
+    ReliefParameter::new_number(
         "depth_mm",
         ParameterLayer::Whole,
         "mm on the panel",
@@ -42,9 +42,9 @@ impl PrimitiveRootDiffuser {
     ///
     /// # Errors
     /// Returns the expected value.
-    pub(super) fn set(&mut self, value: &ParameterValue) -> Result<(), &'static str> {
+    pub(super) fn set_value(&mut self, value: &ParameterValue) -> Result<(), &'static str> {
         match *value {
-            ParameterValue::Whole(prime) if is_prime(prime) && (Self { prime, ..*self }).sides().is_some() => {
+            ParameterValue::Whole(prime) if is_prime(prime) && (Self { prime, ..*self }).well_counts().is_some() => {
                 self.prime = prime;
             }
             ParameterValue::Number(depth_mm) => self.depth_mm = depth_mm,
@@ -54,7 +54,7 @@ impl PrimitiveRootDiffuser {
     }
 
     /// Wells along x and y: the squarest rectangle whose sides have no common factor.
-    pub fn sides(&self) -> Option<(u64, u64)> {
+    pub fn well_counts(&self) -> Option<(u64, u64)> {
         let wells = self.prime.saturating_sub(1);
         let coprime = |n: &u64| wells.is_multiple_of(*n) && gcd(*n, wells / n) == 1;
         let narrow = (2..=wells.isqrt()).rev().find(coprime)?;
@@ -62,21 +62,21 @@ impl PrimitiveRootDiffuser {
     }
 
     /// The least primitive root.
-    pub fn root(&self) -> u64 {
+    pub fn least_root(&self) -> u64 {
         (2..self.prime).find(|g| self.is_root(*g)).unwrap_or(1)
     }
 
     /// g^k mod p for k = 0 to p - 2.
-    pub fn sequence(&self) -> Vec<u64> {
-        let root = self.root();
+    pub fn root_sequence(&self) -> Vec<u64> {
+        let root = self.least_root();
         std::iter::successors(Some(1), |x| Some(x * root % self.prime)).take(self.prime as usize - 1).collect()
     }
 
     /// Depth of each well, mm, row by row along x.
     pub(super) fn depths_mm(&self) -> Vec<f64> {
-        let Some((n, m)) = self.sides() else { return vec![0.0] };
+        let Some((n, m)) = self.well_counts() else { return vec![0.0] };
         let mut depths = vec![0.0; (n * m) as usize];
-        for (k, value) in (0u64..).zip(self.sequence()) {
+        for (k, value) in (0u64..).zip(self.root_sequence()) {
             let (x, y) = (k % n, k % m);
             depths[(y * n + x) as usize] = value as f64 * self.depth_mm / self.prime as f64;
         }
@@ -84,8 +84,8 @@ impl PrimitiveRootDiffuser {
     }
 
     /// Height at a place; the mean of all wells is 0.
-    pub(super) fn height(&self, depths: &[f64], x: f64, y: f64) -> f64 {
-        let (n, m) = self.sides().unwrap_or((1, 1));
+    pub(super) fn height_at(&self, depths: &[f64], x: f64, y: f64) -> f64 {
+        let (n, m) = self.well_counts().unwrap_or((1, 1));
         let well = |v: f64, count: u64| (((v / PANEL_SIZE_MM + 0.5) * count as f64) as u64).min(count - 1);
         // Depths run from depth/p to depth (p-1)/p, so half of it is their mean; 9 mm up keeps them in the relief.
         let depth = depths[(well(y, m) * n + well(x, n)) as usize];
@@ -95,7 +95,7 @@ impl PrimitiveRootDiffuser {
     // g is a root if no power g^((p-1)/q), q a prime factor of p - 1, is 1.
     fn is_root(&self, g: u64) -> bool {
         let order = self.prime - 1;
-        prime_factors(order).into_iter().all(|q| power(g, order / q, self.prime) != 1)
+        prime_factors(order).into_iter().all(|q| power_mod(g, order / q, self.prime) != 1)
     }
 }
 
@@ -121,7 +121,7 @@ fn prime_factors(mut n: u64) -> Vec<u64> {
     factors
 }
 
-fn power(base: u64, mut exponent: u64, modulus: u64) -> u64 {
+fn power_mod(base: u64, mut exponent: u64, modulus: u64) -> u64 {
     let (mut result, mut square) = (1, base % modulus);
     while exponent > 0 {
         if exponent % 2 == 1 {
@@ -146,8 +146,8 @@ mod tests {
     #[test]
     fn the_default_is_12_by_13_and_every_depth_stands_once() {
         let prd = PrimitiveRootDiffuser::default();
-        assert_eq!(prd.sides(), Some((12, 13)));
-        let mut sequence = prd.sequence();
+        assert_eq!(prd.well_counts(), Some((12, 13)));
+        let mut sequence = prd.root_sequence();
         sequence.sort_unstable();
         assert_eq!(sequence, (1..157).collect::<Vec<_>>());
         assert!(prd.depths_mm().iter().all(|d| *d > 0.0), "the diagonal meets every well");
@@ -158,7 +158,7 @@ mod tests {
     #[test]
     fn its_spectrum_is_flat() {
         let prd = PrimitiveRootDiffuser::default();
-        let (sequence, p) = (prd.sequence(), prd.prime as f64);
+        let (sequence, p) = (prd.root_sequence(), prd.prime as f64);
         for order in 0..sequence.len() {
             let (mut re, mut im) = (0.0, 0.0);
             for (k, value) in sequence.iter().enumerate() {
@@ -175,9 +175,9 @@ mod tests {
     fn what_is_no_diffuser_is_refused() {
         let mut prd = PrimitiveRootDiffuser::default();
         for prime in [0, 4, 5, 9, 17, 15, 10_008] {
-            assert!(prd.set(&ParameterValue::Whole(prime)).is_err(), "{prime}");
+            assert!(prd.set_value(&ParameterValue::Whole(prime)).is_err(), "{prime}");
         }
-        assert_eq!(prd.set(&ParameterValue::Whole(31)), Ok(()));
-        assert_eq!(prd.sides(), Some((5, 6)));
+        assert_eq!(prd.set_value(&ParameterValue::Whole(31)), Ok(()));
+        assert_eq!(prd.well_counts(), Some((5, 6)));
     }
 }

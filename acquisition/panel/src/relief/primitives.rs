@@ -9,17 +9,17 @@ use super::stones::{SEED, StoneLayout, StoneSpot};
 const MESO: ParameterLayer = ParameterLayer::Mesostructure;
 
 pub(super) const PARAMETERS: [ReliefParameter; 10] = [
-    ReliefParameter::choice(
+    ReliefParameter::new_choice(
         "primitive",
         MESO,
         &["pyramid", "hemisphere", "box", "wedge", "ridge", "cone", "cylinder"],
         "the solid that is repeated; a wedge rises to one side, a ridge to its middle line",
     ),
-    ReliefParameter::mm("primitive_size_mm", MESO, [100.0, 2000.0, 450.0], "edge of a solid's base"),
-    ReliefParameter::mm("primitive_height_mm", MESO, [0.0, 150.0, 150.0], "height of a solid"),
-    ReliefParameter::mm("gap_mm", MESO, [0.0, 500.0, 30.0], "between the bases of two solids"),
-    ReliefParameter::number("variation", MESO, "share", [0.0, 1.0, 0.0], "solids are lower by up to this share"),
-    ReliefParameter::choice(
+    ReliefParameter::new_mm("primitive_size_mm", MESO, [100.0, 2000.0, 450.0], "edge of a solid's base"),
+    ReliefParameter::new_mm("primitive_height_mm", MESO, [0.0, 150.0, 150.0], "height of a solid"),
+    ReliefParameter::new_mm("gap_mm", MESO, [0.0, 500.0, 30.0], "between the bases of two solids"),
+    ReliefParameter::new_number("variation", MESO, "share", [0.0, 1.0, 0.0], "solids are lower by up to this share"),
+    ReliefParameter::new_choice(
         "turn",
         MESO,
         &["alike", "alternating", "random"],
@@ -43,7 +43,7 @@ pub(super) struct PrimitiveStones {
 }
 
 impl PrimitiveStones {
-    pub(super) fn of(settings: &WallSettings) -> Self {
+    pub(super) fn from_settings(settings: &WallSettings) -> Self {
         let half_size = settings.primitive_size_mm / FULL_SCALE / 2.0;
         Self {
             solid: settings.primitive,
@@ -56,11 +56,11 @@ impl PrimitiveStones {
         }
     }
 
-    fn turned(&self, place: [f64; 2], cell: [i64; 2], stone: SeededRandom) -> [f64; 2] {
+    fn turn_place(&self, place: [f64; 2], cell: [i64; 2], stone: SeededRandom) -> [f64; 2] {
         let quarters = match self.turn {
             SolidTurn::Alike => 0,
             SolidTurn::Alternating => (cell[0] + cell[1]).rem_euclid(2) as u64,
-            SolidTurn::Random => stone.whole(3) % 4,
+            SolidTurn::Random => stone.whole_number(3) % 4,
         };
         (0..quarters).fold(place, |[u, v], _| [v, -u])
     }
@@ -68,7 +68,7 @@ impl PrimitiveStones {
 
 impl SolidShape {
     /// Height as a share of the greatest, at a place from -1 to 1 in both directions.
-    fn share(self, [u, v]: [f64; 2]) -> f64 {
+    fn height_share(self, [u, v]: [f64; 2]) -> f64 {
         if u.abs() > 1.0 || v.abs() > 1.0 {
             return 0.0;
         }
@@ -86,16 +86,16 @@ impl SolidShape {
 }
 
 impl StoneLayout for PrimitiveStones {
-    fn spot(&self, x: f64, y: f64, _half_joint: f64) -> StoneSpot {
+    fn spot_at(&self, x: f64, y: f64, _half_joint: f64) -> StoneSpot {
         let pitch = 2.0 * self.half_pitch;
         // A solid stands in the panel's middle.
         let cell = [x, y].map(|v| (v / pitch + 0.5).floor());
         let [dx, dy] = [x - cell[0] * pitch, y - cell[1] * pitch];
         let cell = cell.map(|c| c as i64);
-        let stone = self.chance.at(cell[0], cell[1]);
-        let place = self.turned([dx / self.half_size, dy / self.half_size], cell, stone);
-        let height = self.height * (1.0 - self.variation * stone.unit(0));
+        let stone = self.chance.at_place(cell[0], cell[1]);
+        let place = self.turn_place([dx / self.half_size, dy / self.half_size], cell, stone);
+        let height = self.height * (1.0 - self.variation * stone.unit_number(0));
         let to_joint = (self.half_pitch - dx.abs()).min(self.half_pitch - dy.abs()).max(0.0);
-        StoneSpot { to_joint, face: height * self.solid.share(place) }
+        StoneSpot { to_joint, face: height * self.solid.height_share(place) }
     }
 }

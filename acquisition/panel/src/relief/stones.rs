@@ -3,7 +3,7 @@
 use super::parameter::{ParameterLayer, ReliefParameter};
 
 /// Seed of the wall; its range is that of whole numbers that a double holds exactly.
-pub(super) const SEED: ReliefParameter = ReliefParameter::whole(
+pub(super) const SEED: ReliefParameter = ReliefParameter::new_whole(
     "seed",
     ParameterLayer::Mesostructure,
     [0, 9_007_199_254_740_991, 1],
@@ -22,5 +22,5 @@ pub(super) struct StoneSpot {
 /// Arrangement of a wall's stones.
 pub(super) trait StoneLayout {
     /// The stone at a place; `half_joint` is half a joint's width, model mm.
-    fn spot(&self, x: f64, y: f64, half_joint: f64) -> StoneSpot;
+    fn spot_at(&self, x: f64, y: f64, half_joint: f64) -> StoneSpot;
 }

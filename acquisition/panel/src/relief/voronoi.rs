@@ -5,7 +5,7 @@ use super::chance::SeededRandom;
 use super::microstructure::{JOINT_SHAPE, joint_depth, joint_width};
 use super::parameter::{ParameterLayer, ReliefParameter};
 use super::settings::{FULL_SCALE, WallSettings};
-use super::stone::{StoneFaces, bulge, lean, pillow, projection};
+use super::stone::{StoneFaces, pillow_rise, stone_bulge, stone_lean, stone_projection};
 use super::stones::{SEED, StoneLayout, StoneSpot};
 
 const MESO: ParameterLayer = ParameterLayer::Mesostructure;
@@ -16,11 +16,11 @@ const REACH: i64 = 2;
 /// Bulging rubble is level from this distance to its edges on, as a share of the way to its middle.
 const PILLOW: f64 = 0.5;
 
-const fn size([low, high, default]: [f64; 3]) -> ReliefParameter {
-    ReliefParameter::mm("stone_size_mm", MESO, [low, high, default], "mean distance between the middles of stones")
+const fn stone_size([low, high, default]: [f64; 3]) -> ReliefParameter {
+    ReliefParameter::new_mm("stone_size_mm", MESO, [low, high, default], "mean distance between the middles of stones")
 }
 
-const IRREGULARITY: ReliefParameter = ReliefParameter::number(
+const IRREGULARITY: ReliefParameter = ReliefParameter::new_number(
     "irregularity",
     MESO,
     "share",
@@ -28,15 +28,15 @@ const IRREGULARITY: ReliefParameter = ReliefParameter::number(
     "how far the stones' middles leave their lattice: 0 makes all stones alike",
 );
 const ELONGATION: ReliefParameter =
-    ReliefParameter::number("elongation", MESO, "ratio", [1.0, 3.0, 1.3], "stones are longer than high by this");
+    ReliefParameter::new_number("elongation", MESO, "ratio", [1.0, 3.0, 1.3], "stones are longer than high by this");
 
 pub(super) const RUBBLE: [ReliefParameter; 10] = [
-    size([100.0, 1200.0, 400.0]),
+    stone_size([100.0, 1200.0, 400.0]),
     IRREGULARITY,
     ELONGATION,
-    projection(80.0, 20.0),
-    lean(10.0),
-    bulge(40.0, 15.0),
+    stone_projection(80.0, 20.0),
+    stone_lean(10.0),
+    stone_bulge(40.0, 15.0),
     SEED,
     JOINT_SHAPE,
     joint_width(20.0),
@@ -44,11 +44,11 @@ pub(super) const RUBBLE: [ReliefParameter; 10] = [
 ];
 
 pub(super) const RIVER_ROCK: [ReliefParameter; 9] = [
-    size([80.0, 800.0, 280.0]),
+    stone_size([80.0, 800.0, 280.0]),
     IRREGULARITY,
     ELONGATION,
-    projection(30.0, 20.0),
-    bulge(120.0, 70.0),
+    stone_projection(30.0, 20.0),
+    stone_bulge(120.0, 70.0),
     SEED,
     JOINT_SHAPE,
     joint_width(15.0),
@@ -85,7 +85,7 @@ struct Stone {
 }
 
 impl StoneCells {
-    pub(super) fn of(settings: &WallSettings, outline: StoneOutline) -> Self {
+    pub(super) fn from_settings(settings: &WallSettings, outline: StoneOutline) -> Self {
         let size = settings.stone_size_mm / FULL_SCALE;
         let scale = [size * settings.elongation, size];
         let chance = SeededRandom::new(settings.seed, 0x5701);
@@ -96,11 +96,12 @@ impl StoneCells {
             let (ix, iy) = (first[0] + (n % counts[0]) as i64, first[1] + (n / counts[0]) as i64);
             // Odd rows are shifted by half a stone, so that stones without irregularity are hexagons.
             let shift = 0.5 * iy.rem_euclid(2) as f64;
-            let off = |n| 0.45 * settings.irregularity * chance.at(ix, iy).signed(n);
+            let off = |n| 0.45 * settings.irregularity * chance.at_place(ix, iy).signed_number(n);
             Stone { middle: [ix as f64 + shift + off(8), iy as f64 + off(9)], radius: 0.0 }
         };
         let stones = (0..counts[0] * counts[1]).map(stone).collect();
-        let mut cells = Self { scale, first, row: counts[0], stones, outline, faces: StoneFaces::of(settings), chance };
+        let mut cells =
+            Self { scale, first, row: counts[0], stones, outline, faces: StoneFaces::from_settings(settings), chance };
         let radius = |n: usize| cells.to_border(cells.stones[n].middle, n);
         let radii: Vec<f64> = (0..cells.stones.len()).map(radius).collect();
         cells.stones.iter_mut().zip(radii).for_each(|(stone, radius)| stone.radius = radius);
@@ -108,7 +109,7 @@ impl StoneCells {
     }
 
     /// Numbers of the stones around a place.
-    fn around(&self, place: [f64; 2]) -> impl Iterator<Item = usize> + '_ {
+    fn stones_around(&self, place: [f64; 2]) -> impl Iterator<Item = usize> + '_ {
         let rows = self.stones.len() / self.row;
         let range = move |i: usize, count: usize| {
             let at = place[i].round() as i64 - self.first[i];
@@ -123,11 +124,11 @@ impl StoneCells {
         let distance = |other: usize| {
             let other = self.stones[other].middle;
             // The border between two is straight in the stretched lattice too.
-            let gap = squared(place, other) - squared(place, middle);
+            let gap = squared_distance(place, other) - squared_distance(place, middle);
             let slope = [0, 1].map(|i| 2.0 * (other[i] - middle[i]) / self.scale[i]);
             (gap / (slope[0] * slope[0] + slope[1] * slope[1]).sqrt()).max(1e-6)
         };
-        let distances = self.around(place).filter(|n| *n != own).map(distance);
+        let distances = self.stones_around(place).filter(|n| *n != own).map(distance);
         match self.outline {
             StoneOutline::Polygons => distances.fold(f64::INFINITY, f64::min),
             // Like the least of them, but smooth if two are alike.
@@ -136,25 +137,25 @@ impl StoneCells {
     }
 }
 
-fn squared(a: [f64; 2], b: [f64; 2]) -> f64 {
+fn squared_distance(a: [f64; 2], b: [f64; 2]) -> f64 {
     let d = [a[0] - b[0], a[1] - b[1]];
     d[0] * d[0] + d[1] * d[1]
 }
 
 impl StoneLayout for StoneCells {
-    fn spot(&self, x: f64, y: f64, half_joint: f64) -> StoneSpot {
+    fn spot_at(&self, x: f64, y: f64, half_joint: f64) -> StoneSpot {
         let place = [x / self.scale[0], y / self.scale[1]];
         let nearest = |(best, least): (usize, f64), n: usize| {
-            let distance = squared(place, self.stones[n].middle);
+            let distance = squared_distance(place, self.stones[n].middle);
             if distance < least { (n, distance) } else { (best, least) }
         };
-        let (own, _) = self.around(place).fold((0, f64::INFINITY), nearest);
+        let (own, _) = self.stones_around(place).fold((0, f64::INFINITY), nearest);
         let Stone { middle, radius } = &self.stones[own];
         let to_border = self.to_border(place, own);
         let (to_joint, rise) = match self.outline {
             StoneOutline::Polygons => {
                 let level = PILLOW * (radius - half_joint).max(0.1 * radius);
-                (to_border, pillow(to_border - half_joint, level))
+                (to_border, pillow_rise(to_border - half_joint, level))
             }
             StoneOutline::Round => {
                 let to_joint = (to_border - CORNERS * radius).max(0.0);
@@ -163,8 +164,9 @@ impl StoneLayout for StoneCells {
                 (to_joint, t * (2.0 - t))
             }
         };
-        let stone = self.chance.at(self.first[0] + (own % self.row) as i64, self.first[1] + (own / self.row) as i64);
+        let stone =
+            self.chance.at_place(self.first[0] + (own % self.row) as i64, self.first[1] + (own / self.row) as i64);
         let from_middle = [0, 1].map(|i| 2.0 * (place[i] - middle[i]));
-        StoneSpot { to_joint, face: self.faces.height(stone, from_middle, rise) }
+        StoneSpot { to_joint, face: self.faces.face_height(stone, from_middle, rise) }
     }
 }

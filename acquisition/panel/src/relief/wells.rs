@@ -9,13 +9,13 @@ use super::{PANEL_SIZE_MM, PrimitiveRootDiffuser};
 const MESO: ParameterLayer = ParameterLayer::Mesostructure;
 
 pub(super) const PARAMETERS: [ReliefParameter; 5] = [
-    ReliefParameter::choice(
+    ReliefParameter::new_choice(
         "prime",
         MESO,
         &["157", "31", "43", "73", "211", "241", "307", "421", "463", "601", "757"],
         "p of the sequence g^k mod p; p - 1 wells, nearly square for these",
     ),
-    ReliefParameter::mm(
+    ReliefParameter::new_mm(
         "well_depth_mm",
         MESO,
         [10.0, 150.0, 150.0],
@@ -34,18 +34,18 @@ pub(super) struct DiffuserWells {
 }
 
 impl DiffuserWells {
-    pub(super) fn of(settings: &WallSettings) -> Self {
+    pub(super) fn from_settings(settings: &WallSettings) -> Self {
         let deepest = settings.well_depth_mm / FULL_SCALE;
         // The options are primes, and the smallest is 31.
         let prime = settings.prime.parse().unwrap_or(31);
         let diffuser = PrimitiveRootDiffuser { prime, depth_mm: deepest };
-        let (n, m) = diffuser.sides().unwrap_or((1, 1));
+        let (n, m) = diffuser.well_counts().unwrap_or((1, 1));
         Self { depths: diffuser.depths_mm(), sides: [n as f64, m as f64], deepest }
     }
 }
 
 impl StoneLayout for DiffuserWells {
-    fn spot(&self, x: f64, y: f64, _half_joint: f64) -> StoneSpot {
+    fn spot_at(&self, x: f64, y: f64, _half_joint: f64) -> StoneSpot {
         let mut to_joint = f64::INFINITY;
         let mut well = [0, 0];
         for (i, v) in [x, y].into_iter().enumerate() {

@@ -13,8 +13,8 @@ use crate::rig::drivers;
 use crate::rig::robots::Choreography;
 use crate::rig::{Error, RigDevices};
 use crate::run::session::TakePace;
-use paced::paced;
-use simulated::{RigSimulation, devices};
+use paced::paced_devices;
+use simulated::{RigSimulation, simulated_rig};
 
 /// Inputs for opening a rig's devices.
 pub(crate) struct DeviceRequest<'a> {
@@ -46,7 +46,7 @@ pub(crate) fn simulated_devices(request: &DeviceRequest<'_>, pace: TakePace) -> 
     let Some(geometry) = &request.panel.geometry else {
         return Err(Error::Device { device: "simulated rig", reason: "it needs the panel's geometry".into() });
     };
-    let devices = devices(&RigSimulation {
+    let devices = simulated_rig(&RigSimulation {
         rig: request.rig,
         relief: &geometry.heights,
         material: geometry.material,
@@ -56,6 +56,6 @@ pub(crate) fn simulated_devices(request: &DeviceRequest<'_>, pace: TakePace) -> 
     })?;
     Ok(match pace {
         TakePace::Fast => devices,
-        TakePace::Secs(secs) => paced(devices, secs),
+        TakePace::Secs(secs) => paced_devices(devices, secs),
     })
 }

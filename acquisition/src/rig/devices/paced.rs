@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use crate::rig::{AudioInterface, AudioTake, Error, RigDevices};
 
 /// Wraps devices so that takes last at least `secs`.
-pub(crate) fn paced(mut devices: RigDevices, secs: f64) -> RigDevices {
+pub(crate) fn paced_devices(mut devices: RigDevices, secs: f64) -> RigDevices {
     let pace = Duration::try_from_secs_f64(secs).unwrap_or_default();
     devices.audio = Box::new(Paced { inner: devices.audio, pace });
     devices
@@ -29,7 +29,7 @@ impl AudioInterface for Paced {
         Ok(())
     }
 
-    fn notices(&mut self) -> Vec<String> {
-        self.inner.notices()
+    fn take_notices(&mut self) -> Vec<String> {
+        self.inner.take_notices()
     }
 }

@@ -112,12 +112,12 @@ type SharedWorld = Arc<Mutex<SimulatedWorld>>;
 ///
 /// # Errors
 /// [`Error::Device`] if the rig's grid has no points.
-pub fn devices(simulation: &RigSimulation<'_>) -> Result<RigDevices, Error> {
+pub fn simulated_rig(simulation: &RigSimulation<'_>) -> Result<RigDevices, Error> {
     let failed = |e: echolake_schema::Error| Error::Device {
         device: "simulated rig",
         reason: DeviceFault::with_cause(e.to_string(), e),
     };
-    let grid = simulation.rig.grid().map_err(failed)?;
+    let grid = simulation.rig.build_grid().map_err(failed)?;
     let mut rng = ChaCha8Rng::seed_from_u64(simulation.seed);
     let points: Vec<_> = grid.points().iter().map(|p| p.position_mm).collect();
     let rate_hz = simulation.rig.sweep.rate_hz.get();
@@ -129,16 +129,19 @@ pub fn devices(simulation: &RigSimulation<'_>) -> Result<RigDevices, Error> {
     if effects.directivity {
         plan = plan.with_directivity(transducers::microphone_directivity, transducers::speaker_directivity);
     }
-    let direct = plan.filter(|hz| if effects.transducer_response { transducers::response(hz) } else { 1.0.into() });
+    let direct =
+        plan.spectrum_at_bins(
+            |hz| if effects.transducer_response { transducers::on_axis_response(hz) } else { 1.0.into() },
+        );
     let is_silent = simulation.material == SurfaceMaterial::MelamineFoam && !effects.foam_reflection;
-    let reflection = plan.filter(|hz| match effects.material_spectra {
+    let reflection = plan.spectrum_at_bins(|hz| match effects.material_spectra {
         _ if is_silent => 0.0.into(),
-        true => simulation.material.reflection(hz),
+        true => simulation.material.reflection_at(hz),
         false => simulation.material.reflection_factor().into(),
     });
     let reflection = direct.iter().zip(&reflection).map(|(transducers, relief)| transducers * relief).collect();
     let world = Arc::new(Mutex::new(SimulatedWorld {
-        calibration_mm: calibration(points.len(), effects.calibration_mm),
+        calibration_mm: draw_calibration(points.len(), effects.calibration_mm),
         effects,
         grid,
         now: simulation.start,
@@ -158,7 +161,7 @@ pub fn devices(simulation: &RigSimulation<'_>) -> Result<RigDevices, Error> {
             rate_hz,
             direct,
             reflection,
-            scratch: plan.scratch(),
+            scratch: plan.make_scratch(),
             response: vec![0.0; plan.len()],
             plan,
             output: None,
@@ -169,7 +172,7 @@ pub fn devices(simulation: &RigSimulation<'_>) -> Result<RigDevices, Error> {
 }
 
 // Displacements of both arms at each point.
-fn calibration(points: usize, mean_mm: f64) -> [Vec<[f64; 3]>; 2] {
+fn draw_calibration(points: usize, mean_mm: f64) -> [Vec<[f64; 3]>; 2] {
     let mut rng = ChaCha8Rng::seed_from_u64(CALIBRATION_SEED);
     let mut axis = || {
         let normal: f64 = StandardNormal.sample(&mut rng);
@@ -188,34 +191,34 @@ fn response_len(relief: &HeightField, points: &[[f64; 3]], rate_hz: f64) -> usiz
     (samples as usize).next_power_of_two()
 }
 
-fn lock(world: &SharedWorld) -> MutexGuard<'_, SimulatedWorld> {
+fn lock_world(world: &SharedWorld) -> MutexGuard<'_, SimulatedWorld> {
     world.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl SimulatedWorld {
     fn temperature_c(&self) -> f64 {
-        let drift = 0.8 * (TAU * self.hours() / 7.0 + self.air.phase).sin() + self.air.walk;
+        let drift = 0.8 * (TAU * self.elapsed_hours() / 7.0 + self.air.phase).sin() + self.air.walk;
         21.5 + if self.effects.noise_and_drift { drift } else { 0.0 }
     }
 
     fn humidity_pct(&self) -> f64 {
-        45.0 + 4.0 * (TAU * self.hours() / 9.0).sin()
+        45.0 + 4.0 * (TAU * self.elapsed_hours() / 9.0).sin()
     }
 
     fn pressure_hpa(&self) -> f64 {
-        965.0 + 1.5 * (TAU * self.hours() / 20.0).cos()
+        965.0 + 1.5 * (TAU * self.elapsed_hours() / 20.0).cos()
     }
 
-    fn hours(&self) -> f64 {
+    fn elapsed_hours(&self) -> f64 {
         (self.now.0 - self.start.0) as f64 / 3.6e12
     }
 
-    fn normal(&mut self) -> f64 {
+    fn draw_normal(&mut self) -> f64 {
         if self.effects.noise_and_drift { StandardNormal.sample(&mut self.rng) } else { 0.0 }
     }
 
     // Where an arm really is that was sent to a point.
-    fn displaced(&mut self, tool: Tool, point: usize) -> [f64; 3] {
+    fn displaced_position(&mut self, tool: Tool, point: usize) -> [f64; 3] {
         let told = self.grid.points()[point].position_mm;
         let calibration = self.calibration_mm[tool as usize][point];
         let per_axis = self.effects.repeatability_mm / 3f64.sqrt();
@@ -231,7 +234,7 @@ struct SimulatedRobots {
 
 impl RobotArms for SimulatedRobots {
     fn move_to(&mut self, microphone_mm: [f64; 3], speaker_mm: [f64; 3]) -> Result<ArmPositions, Error> {
-        let mut world = lock(&self.world);
+        let mut world = lock_world(&self.world);
         let refuse = |reason| Error::Unreachable { microphone_mm, speaker_mm, reason };
         if world.power == DrivePower::Off {
             return Err(refuse("the drives are off"));
@@ -247,18 +250,19 @@ impl RobotArms for SimulatedRobots {
         };
         // The model knows the roles that the grid gives.
         let known = self.arms.as_ref().filter(|_| world.grid.pair_id(a, b).is_some());
-        let joints = known.and_then(|arms| arms.standing(pair).ok()).map(|stand| [stand.microphone, stand.speaker]);
-        let position_mm = [world.displaced(Tool::Microphone, microphone), world.displaced(Tool::Speaker, speaker)];
-        let axes = self.axes(joints.as_ref(), microphone_mm, speaker_mm);
+        let joints = known.and_then(|arms| arms.pose_at(pair).ok()).map(|stand| [stand.microphone, stand.speaker]);
+        let position_mm =
+            [world.displaced_position(Tool::Microphone, microphone), world.displaced_position(Tool::Speaker, speaker)];
+        let axes = self.transducer_axes(joints.as_ref(), microphone_mm, speaker_mm);
         world.microphone = TransducerPose { position_mm: position_mm[0], axis: axes[0] };
         world.speaker = TransducerPose { position_mm: position_mm[1], axis: axes[1] };
         // The encoders' residual, which the controller knows of; of the displacement it does not.
-        let mut off = |mm: [f64; 3]| mm.map(|x| x + 0.01 * world.normal().clamp(-2.0, 2.0));
+        let mut off = |mm: [f64; 3]| mm.map(|x| x + 0.01 * world.draw_normal().clamp(-2.0, 2.0));
         Ok(ArmPositions { microphone_mm: off(microphone_mm), speaker_mm: off(speaker_mm), joints })
     }
 
-    fn power(&mut self, power: DrivePower) -> Result<(), Error> {
-        lock(&self.world).power = power;
+    fn switch_drives(&mut self, power: DrivePower) -> Result<(), Error> {
+        lock_world(&self.world).power = power;
         Ok(())
     }
 }
@@ -266,11 +270,16 @@ impl RobotArms for SimulatedRobots {
 impl SimulatedRobots {
     // Axes of microphone and speaker: as the arms hold them, or, without a model of the arms, the microphone straight
     // down and the speaker at the point that mirrors to it.
-    fn axes(&self, joints: Option<&[Joints; 2]>, microphone_mm: [f64; 3], speaker_mm: [f64; 3]) -> [[f64; 3]; 2] {
+    fn transducer_axes(
+        &self,
+        joints: Option<&[Joints; 2]>,
+        microphone_mm: [f64; 3],
+        speaker_mm: [f64; 3],
+    ) -> [[f64; 3]; 2] {
         if let (Some(arms), Some([microphone, speaker])) = (&self.arms, joints) {
             let cell = arms.cell();
             return [(Tool::Microphone, microphone), (Tool::Speaker, speaker)]
-                .map(|(tool, joints)| cell.arm(tool).axis(joints));
+                .map(|(tool, joints)| cell.arm_with_tool(tool).tool_axis(joints));
         }
         let [x, y] = specular_point(microphone_mm, speaker_mm);
         let aim = [x - speaker_mm[0], y - speaker_mm[1], -speaker_mm[2]];
@@ -282,15 +291,15 @@ impl SimulatedRobots {
 struct SimulatedSensor(SharedWorld);
 
 impl AmbientSensor for SimulatedSensor {
-    fn read(&mut self) -> Result<AmbientReading, Error> {
-        let mut world = lock(&self.0);
+    fn read_ambient(&mut self) -> Result<AmbientReading, Error> {
+        let mut world = lock_world(&self.0);
         // A resolution of 0.01 C, and as much noise.
-        let temperature_c = ((world.temperature_c() + 0.005 * world.normal()) * 100.0).round() / 100.0;
+        let temperature_c = ((world.temperature_c() + 0.005 * world.draw_normal()) * 100.0).round() / 100.0;
         Ok(AmbientReading {
             at: world.now,
             temperature_c,
-            humidity_pct: world.humidity_pct() + 0.1 * world.normal(),
-            pressure_hpa: world.pressure_hpa() + 0.02 * world.normal(),
+            humidity_pct: world.humidity_pct() + 0.1 * world.draw_normal(),
+            pressure_hpa: world.pressure_hpa() + 0.02 * world.draw_normal(),
             outside_level_db: world.outside_level_db,
         })
     }
@@ -327,12 +336,12 @@ impl AudioInterface for SimulatedAudio {
     }
 
     fn play_and_record(&mut self, output: &[f32], take: &mut AudioTake) -> Result<(), Error> {
-        let mut world = lock(&self.world);
+        let mut world = lock_world(&self.world);
         world.now = world.now.plus_secs(TAKE_SECS);
-        world.air.walk += 0.002 * world.normal();
+        world.air.walk += 0.002 * world.draw_normal();
         let spoiled = world.effects.noise_and_drift && world.rng.random_bool(SPOILED);
         let level = if spoiled { SPOILED_LEVEL_DB } else { 42.0 };
-        world.outside_level_db = level + 1.5 * world.normal();
+        world.outside_level_db = level + 1.5 * world.draw_normal();
         let temperature_c = world.temperature_c();
         let air = AirAbsorption::new(temperature_c, world.humidity_pct(), world.pressure_hpa());
         let absorbs = world.effects.air_absorption;
@@ -348,17 +357,17 @@ impl AudioInterface for SimulatedAudio {
             device: "simulated room",
             reason: DeviceFault::with_cause(e.to_string(), e),
         };
-        self.plan.response(&path, &mut self.scratch, &mut self.response).map_err(failed)?;
+        self.plan.compute_response(&path, &mut self.scratch, &mut self.response).map_err(failed)?;
         let played = match &mut self.output {
             Some(played) if played.output == output => played,
             other => other.insert(Played::new(output, self.rate_hz, self.response.len())),
         };
-        played.through(&self.response);
+        played.convolve_with(&self.response);
         let room = if spoiled { SPOILED_NOISE } else { NOISE[0] };
         let noise = if world.power == DrivePower::On { room.hypot(DRIVES) } else { room };
         take.started = Some(world.now);
-        quantise(&played.signal[..output.len()], MICROPHONE_GAIN, noise, &mut world, &mut take.microphone);
-        quantise(&played.loopback, 1.0, NOISE[1], &mut world, &mut take.loopback);
+        quantise_signal(&played.signal[..output.len()], MICROPHONE_GAIN, noise, &mut world, &mut take.microphone);
+        quantise_signal(&played.loopback, 1.0, NOISE[1], &mut world, &mut take.loopback);
         Ok(())
     }
 }
@@ -387,13 +396,13 @@ impl Played {
             let response = pole * delay;
             *x *= Complex::new(response.re as f32, response.im as f32);
         }
-        played.through(&[1.0]);
+        played.convolve_with(&[1.0]);
         played.loopback = played.signal[..output.len()].to_vec();
         played
     }
 
     // `signal` becomes the output through the converter and this response.
-    fn through(&mut self, response: &[f32]) {
+    fn convolve_with(&mut self, response: &[f32]) {
         let len = self.signal.len();
         self.signal.fill(0.0);
         self.signal[..response.len()].copy_from_slice(response);
@@ -410,10 +419,10 @@ impl Played {
 }
 
 // 24 bits with noise; samples over full scale are clipped.
-fn quantise(signal: &[f32], gain: f64, noise: f64, world: &mut SimulatedWorld, out: &mut Vec<i32>) {
+fn quantise_signal(signal: &[f32], gain: f64, noise: f64, world: &mut SimulatedWorld, out: &mut Vec<i32>) {
     out.clear();
     out.extend(signal.iter().map(|x| {
-        let value = f64::from(*x) * gain + noise * world.normal();
+        let value = f64::from(*x) * gain + noise * world.draw_normal();
         (value * FULL_SCALE).round().clamp(-FULL_SCALE, FULL_SCALE - 1.0) as i32
     }));
 }
@@ -429,19 +438,20 @@ mod tests {
         let (rig, relief) = (Rig::paper(), PanelRelief::Flat.height_field(40));
         let start = Timestamp(1_767_600_000_000_000_000);
         let material = SurfaceMaterial::CoatedPrint;
-        devices(&RigSimulation { rig: &rig, relief: &relief, material, start, seed, arms: None }).expect("devices")
+        simulated_rig(&RigSimulation { rig: &rig, relief: &relief, material, start, seed, arms: None })
+            .expect("devices")
     }
 
     #[test]
     fn it_conforms() {
         let mut devices = simulated(1);
         let (near, far) = ([-187.5, -187.5, 124.0], [-187.5, -112.5, 124.0]);
-        conformance::robots(devices.robots.as_mut(), [near, far], [near, near]);
-        conformance::robots(devices.robots.as_mut(), [near, far], [near, [0.0, 0.0, 5_000.0]]);
+        conformance::check_robots(devices.robots.as_mut(), [near, far], [near, near]);
+        conformance::check_robots(devices.robots.as_mut(), [near, far], [near, [0.0, 0.0, 5_000.0]]);
         // One straight over the other: the grid leaves that pair out.
-        conformance::robots(devices.robots.as_mut(), [near, far], [near, [-187.5, -187.5, 214.0]]);
-        conformance::audio(devices.audio.as_mut());
-        conformance::sensor(devices.sensor.as_mut());
+        conformance::check_robots(devices.robots.as_mut(), [near, far], [near, [-187.5, -187.5, 214.0]]);
+        conformance::check_audio(devices.audio.as_mut());
+        conformance::check_sensor(devices.sensor.as_mut());
         assert_eq!(devices.origin, Origin::Simulated);
     }
 
@@ -449,7 +459,7 @@ mod tests {
     fn drives_are_heard_until_they_are_off() {
         let (mut devices, mut take) = (simulated(1), AudioTake::default());
         let mut noise = |power| {
-            devices.robots.power(power).expect("a switch");
+            devices.robots.switch_drives(power).expect("a switch");
             devices.audio.play_and_record(&[0.0; 4_000], &mut take).expect("a take");
             let sum: f64 = take.microphone.iter().map(|x| (f64::from(*x) / FULL_SCALE).powi(2)).sum();
             (sum / 4_000.0).sqrt()
@@ -463,7 +473,8 @@ mod tests {
     #[test]
     fn responses_hold_the_farthest_echo_at_any_rate() {
         let relief = PanelRelief::Flat.height_field(40);
-        let points: Vec<_> = Rig::paper().grid().expect("a grid").points().iter().map(|p| p.position_mm).collect();
+        let points: Vec<_> =
+            Rig::paper().build_grid().expect("a grid").points().iter().map(|p| p.position_mm).collect();
         // From over one corner to the far corner and back, 743.8 mm each way: the third layer's outermost point.
         for rate_hz in [48e3, 96e3, 192e3] {
             let echo = 2.0 * 0.7438 / 331.3 * rate_hz;

@@ -22,14 +22,15 @@ const MICROPHONE_DB: [(f64, f64); 5] = [(0.0, 0.0), (30.0, -2.0), (60.0, -4.0), 
 const MICROPHONE_HZ: f64 = 40_000.0;
 
 /// Spectrum of tweeter and microphone on their axes.
-pub(super) fn response(frequency_hz: f64) -> Complex<f64> {
+pub(super) fn on_axis_response(frequency_hz: f64) -> Complex<f64> {
     let microphone = Complex::new(1.0, frequency_hz / MICROPHONE_POLE_HZ).inv();
-    let tweeter: Complex<f64> = RESONANCES.iter().map(|resonance| peak(frequency_hz, *resonance)).product();
+    let tweeter: Complex<f64> =
+        RESONANCES.iter().map(|resonance| resonance_response(frequency_hz, *resonance)).product();
     tweeter * microphone * TWEETER_FACTOR
 }
 
 // A bell of this gain around its frequency, with the least phase that goes with it.
-fn peak(frequency_hz: f64, (resonance_hz, gain_db, quality): (f64, f64, f64)) -> Complex<f64> {
+fn resonance_response(frequency_hz: f64, (resonance_hz, gain_db, quality): (f64, f64, f64)) -> Complex<f64> {
     let at = Complex::new(0.0, frequency_hz / resonance_hz);
     let (gain, width) = (10f64.powf(gain_db / 40.0), at / quality);
     (at * at + width * gain + 1.0) / (at * at + width / gain + 1.0)
@@ -38,7 +39,7 @@ fn peak(frequency_hz: f64, (resonance_hz, gain_db, quality): (f64, f64, f64)) ->
 /// Gain of the tweeter at a cosine against its axis: a piston in a baffle, behind which it is as loud as beside it.
 pub(super) fn speaker_directivity(cosine: f64, frequency_hz: f64) -> f64 {
     let sine = (1.0 - cosine.max(0.0).powi(2)).max(0.0).sqrt();
-    piston(TAU * frequency_hz / SPEED_M_S * MEMBRANE_M * sine)
+    piston_directivity(TAU * frequency_hz / SPEED_M_S * MEMBRANE_M * sine)
 }
 
 /// Gain of the microphone at a cosine against its axis: in dB it grows with the square of the frequency, as a small
@@ -52,7 +53,7 @@ pub(super) fn microphone_directivity(cosine: f64, frequency_hz: f64) -> f64 {
 }
 
 // 2 J1(x)/x, as the mean of e^(i x t) over the membrane: Gauss-Chebyshev quadrature of the second kind.
-fn piston(x: f64) -> f64 {
+fn piston_directivity(x: f64) -> f64 {
     let step = PI / (MEMBRANE_NODES + 1) as f64;
     let node = |i: usize| {
         let (sine, cosine) = (i as f64 * step).sin_cos();
@@ -69,7 +70,7 @@ mod tests {
     fn a_piston_has_its_nulls() {
         // Zeros of J1, and 2 J1(1) (Abramowitz and Stegun, tables 9.1 and 9.5).
         for (x, expected) in [(0.0, 1.0), (1.0, 0.880_101_171_5), (3.831_705_970_2, 0.0), (7.015_586_669_8, 0.0)] {
-            assert!((piston(x) - expected).abs() < 1e-9, "{x}");
+            assert!((piston_directivity(x) - expected).abs() < 1e-9, "{x}");
         }
         // At 40 kHz the first is 31 degrees off the axis; to the sides of 2 kHz the tweeter is all but alike.
         assert!(speaker_directivity(31.5f64.to_radians().cos(), 40e3).abs() < 0.02);
@@ -85,7 +86,7 @@ mod tests {
         let at_40_khz = Complex::new(1.0, 40e3 / MICROPHONE_POLE_HZ).inv();
         assert!((20.0 * at_40_khz.norm().log10() + 1.0).abs() < 0.01);
         for resonance in RESONANCES {
-            let level = |hz| 20.0 * peak(hz, resonance).norm().log10();
+            let level = |hz| 20.0 * resonance_response(hz, resonance).norm().log10();
             assert!((level(resonance.0) - resonance.1).abs() < 1e-9 && level(resonance.0 / 20.0).abs() < 0.1);
         }
     }

@@ -37,7 +37,9 @@ pub fn open(rig: &Rig) -> Result<Option<RigDevices>, Error> {
         },
         robots: match robots {
             RobotsParams::Simulated => return Err(simulated_beside_real()),
-            RobotsParams::Rosbridge(params) => Box::new(rosbridge::RosbridgeRobots::connect(params, Cell::of(rig))?),
+            RobotsParams::Rosbridge(params) => {
+                Box::new(rosbridge::RosbridgeRobots::connect(params, Cell::from_rig(rig))?)
+            }
         },
         origin: Origin::Measured,
     }))

@@ -59,7 +59,7 @@ impl FakeDevices {
     fn devices_with_sensor_timeout(&self, audio: AlignedAudio<LoopbackCable>, sensor_secs: f64) -> RigDevices {
         let params =
             RosbridgeParams { url: self.bridge.url(), speed: 1.0, timeout_secs: PATIENT_SECS, ..Default::default() };
-        let robots = RosbridgeRobots::connect(&params, Cell::of(&self.rig)).expect("connected");
+        let robots = RosbridgeRobots::connect(&params, Cell::from_rig(&self.rig)).expect("connected");
         RigDevices {
             robots: Box::new(robots),
             audio: Box::new(audio),
@@ -95,7 +95,7 @@ impl FinishedRun {
 fn begun(room: &FakeDevices, folder: &Path) -> Recorder {
     let (rig, start) = (&room.rig, Timestamp::now());
     let mut recorder = create_flat(&folder.join("run.mcap"), rig, start, Some(BTreeMap::new()));
-    recorder.arms(start, Arc::new(Cell::of(rig)), "rig").expect("recorded");
+    recorder.record_arms(start, Arc::new(Cell::from_rig(rig)), "rig").expect("recorded");
     recorder
 }
 
@@ -108,7 +108,7 @@ fn measure(
     progress: &mut dyn FnMut(&mut FakeDevices, usize),
 ) -> Result<RunEnd, RunError> {
     let rig = room.rig.clone();
-    let grid = rig.grid().expect("a grid");
+    let grid = rig.build_grid().expect("a grid");
     let mut controller = RunController::new(&rig, devices).expect("a plan");
     let options = RunOptions { keep: RecordingMode::Sweeps, checkpoint_every: 1 };
     let mut begun = 0;
@@ -221,7 +221,7 @@ mod slow {
         drop(recorder);
 
         let mut room = FakeDevices::new();
-        let (mut recorder, held) = Recorder::resume(&partial).expect("gone on with");
+        let (mut recorder, held) = Recorder::resume_recording(&partial).expect("gone on with");
         assert!((1..3).contains(&held.pairs.len()), "{:?}", held.pairs);
         let devices = room.devices(since(Timestamp::now(), &[]));
         let end = measure(&mut room, devices, &mut recorder, &held.pairs, &mut |_, _| ()).expect("a whole run");

@@ -64,7 +64,7 @@ impl Tool {
     }
 
     /// Angle between the flange's axis and the tool's, rad.
-    pub const fn bend(self) -> f64 {
+    pub const fn bend_rad(self) -> f64 {
         match self {
             Self::Microphone => 0.0,
             Self::Speaker => std::f64::consts::FRAC_PI_4,
@@ -88,8 +88,8 @@ impl Tool {
     }
 
     // Flange to tool: the tool's z is its acoustic axis, its origin the acoustic centre.
-    pub(super) fn pose(self) -> Pose {
-        let turn = DQuat::from_rotation_y(self.bend());
+    pub(super) fn pose_on_flange(self) -> Pose {
+        let turn = DQuat::from_rotation_y(self.bend_rad());
         let centre = DVec3::new(0.0, 0.0, self.length_m()) + turn * DVec3::new(0.0, 0.0, self.reach_m());
         Pose::from_parts(centre, turn)
     }
@@ -162,13 +162,13 @@ impl RobotArm {
     }
 
     /// Returns the direction of its tool's acoustic axis.
-    pub fn axis(&self, joints: &Joints) -> [f64; 3] {
-        self.frames(joints)[7].transform_vector(DVec3::Z).to_array()
+    pub fn tool_axis(&self, joints: &Joints) -> [f64; 3] {
+        self.frames_over_panel(joints)[7].transform_vector(DVec3::Z).to_array()
     }
 
     /// Frames over the panel: foot, links 1 to 6 (the last is the flange), tool.
-    pub fn frames(&self, joints: &Joints) -> [Pose; 8] {
-        let mut frames = self.steps(joints);
+    pub fn frames_over_panel(&self, joints: &Joints) -> [Pose; 8] {
+        let mut frames = self.relative_frames(joints);
         for i in 1..frames.len() {
             frames[i] = frames[i - 1].compose(frames[i]);
         }
@@ -176,24 +176,24 @@ impl RobotArm {
     }
 
     /// Each frame over the one before it, the foot over the panel.
-    pub fn steps(&self, joints: &Joints) -> [Pose; 8] {
-        let [a, b, c, d, e, f] = steps(joints);
-        [self.foot, a, b, c, d, e, f, self.tool.pose()]
+    pub fn relative_frames(&self, joints: &Joints) -> [Pose; 8] {
+        let [a, b, c, d, e, f] = link_poses(joints);
+        [self.foot, a, b, c, d, e, f, self.tool.pose_on_flange()]
     }
 
     /// Returns all joints that bring the tool to this pose, in their ranges or not.
-    pub fn solve(&self, tool: Pose) -> Vec<Joints> {
-        let flange = self.foot.inverse().compose(tool).compose(self.tool.pose().inverse());
+    pub fn solve_joints(&self, tool: Pose) -> Vec<Joints> {
+        let flange = self.foot.inverse().compose(tool).compose(self.tool.pose_on_flange().inverse());
         let mut found: Vec<Joints> = self.kinematics.inverse(&flange);
-        found.iter_mut().flatten().for_each(|q| *q = wrapped(*q));
+        found.iter_mut().flatten().for_each(|q| *q = wrap_angle(*q));
         found
     }
 
     /// The arm as capsules.
-    pub fn capsules(&self, joints: &Joints) -> [LinkCapsule; 6] {
-        let frames = self.frames(joints);
+    pub fn link_capsules(&self, joints: &Joints) -> [LinkCapsule; 6] {
+        let frames = self.frames_over_panel(joints);
         let at = |i: usize| frames[i].translation;
-        let bend = frames[6].transform_point(DVec3::new(0.0, 0.0, self.tool.length_m() * self.straight()));
+        let bend = frames[6].transform_point(DVec3::new(0.0, 0.0, self.tool.length_m() * self.holder_share()));
         let [holder, transducer] = self.tool.radii_m();
         let capsule = |part, from, to, radius| LinkCapsule { part, from, to, radius };
         [
@@ -207,7 +207,7 @@ impl RobotArm {
     }
 
     // End of the holder and begin of the transducer, as a share of the length along the flange's axis.
-    fn straight(&self) -> f64 {
+    fn holder_share(&self) -> f64 {
         match self.tool {
             Tool::Microphone => 0.8,
             Tool::Speaker => 1.0,
@@ -216,7 +216,7 @@ impl RobotArm {
 }
 
 /// Poses of each link over the one before, foot to flange.
-fn steps(q: &Joints) -> [Pose; 6] {
+fn link_poses(q: &Joints) -> [Pose; 6] {
     let (y, z) = (DQuat::from_rotation_y, DQuat::from_rotation_z);
     let step = |x: [f64; 3], turn| Pose::from_parts(DVec3::from_array(x), turn);
     [
@@ -230,13 +230,13 @@ fn steps(q: &Joints) -> [Pose; 6] {
 }
 
 /// Returns the joints of an idle arm.
-pub fn home() -> Joints {
+pub fn home_joints() -> Joints {
     HOME_DEG.map(f64::to_radians)
 }
 
 /// Weighted squared distance of joints from home; the solver prefers small ones.
 pub(super) fn from_home(joints: &Joints) -> f64 {
-    let home = home();
+    let home = home_joints();
     (0..6).map(|i| WEIGHTS[i] * (joints[i] - home[i]).powi(2)).sum()
 }
 
@@ -250,7 +250,7 @@ pub fn travel_secs(from: &Joints, to: &Joints) -> f64 {
     (0..6).map(|i| (from[i] - to[i]).abs().to_degrees() / SPEEDS_DEG[i]).fold(0.0, f64::max)
 }
 
-fn wrapped(angle: f64) -> f64 {
+fn wrap_angle(angle: f64) -> f64 {
     use std::f64::consts::{PI, TAU};
     (angle + PI).rem_euclid(TAU) - PI
 }
@@ -265,7 +265,7 @@ mod tests {
 
     #[test]
     fn straight_up_it_is_as_high_as_the_data_sheet_says() {
-        let [.., flange, tool] = arm(Tool::Microphone).frames(&[0.0; 6]);
+        let [.., flange, tool] = arm(Tool::Microphone).frames_over_panel(&[0.0; 6]);
         assert!((flange.translation.z - (1.295 - 0.2)).abs() < 1e-12, "{flange:?}");
         assert!((tool.translation.z - (1.795 - 0.2)).abs() < 1e-12, "{tool:?}");
         // 920 mm of reach: shoulder to flange.
@@ -277,12 +277,12 @@ mod tests {
         for (tool, seed) in [(Tool::Microphone, 0.1), (Tool::Speaker, 0.35)] {
             let arm = arm(tool);
             let joints = [0.4 + seed, -0.3, 1.7, 0.5, 0.8 - seed, -0.6];
-            let wanted = arm.frames(&joints)[7];
-            let found = arm.solve(wanted);
+            let wanted = arm.frames_over_panel(&joints)[7];
+            let found = arm.solve_joints(wanted);
             assert!(found.iter().any(|q| q.iter().zip(joints).all(|(a, b)| (a - b).abs() < 1e-6)), "{found:?}");
             assert!(found.len() >= 4, "elbow and wrist both ways");
             for q in &found {
-                let reached = arm.frames(q)[7];
+                let reached = arm.frames_over_panel(q)[7];
                 assert!(reached.translation.distance(wanted.translation) < 1e-7, "{q:?}");
                 assert!(reached.angular_distance(wanted) < 1e-6, "{q:?}");
             }
@@ -291,16 +291,16 @@ mod tests {
 
     #[test]
     fn the_speaker_looks_45_degrees_off_the_flange() {
-        let frames = arm(Tool::Speaker).frames(&[0.3, 0.2, 1.0, 0.1, 0.7, 0.2]);
+        let frames = arm(Tool::Speaker).frames_over_panel(&[0.3, 0.2, 1.0, 0.1, 0.7, 0.2]);
         let axis = |pose: Pose| pose.transform_vector(DVec3::Z);
         assert!((axis(frames[6]).angle_between(axis(frames[7])).to_degrees() - 45.0).abs() < 1e-9);
     }
 
     #[test]
     fn joints_beyond_their_range_are_refused() {
-        assert!(in_range(&home()));
+        assert!(in_range(&home_joints()));
         for (joint, degrees) in [(1, 128.0), (2, -153.0), (4, -122.0)] {
-            let mut joints = home();
+            let mut joints = home_joints();
             joints[joint] = f64::to_radians(degrees);
             assert!(!in_range(&joints), "{joint}");
         }

@@ -7,8 +7,8 @@ use echolake_schema::robots::{RobotCell, Rod};
 use rs_opw_kinematics::glam::{DQuat, DVec3};
 use rs_opw_kinematics::kinematic_traits::Pose;
 
-use super::arm::{ArmPart, Joints, LinkCapsule, RobotArm, Tool, from_home, home, in_range};
-use super::clearance::{ArmSurroundings, touches_itself, touching};
+use super::arm::{ArmPart, Joints, LinkCapsule, RobotArm, Tool, from_home, home_joints, in_range};
+use super::clearance::{ArmSurroundings, touches_itself, touching_parts};
 
 /// Inclinations of the microphone's rod that are tried, degrees from the vertical: its wrist then stays on its own
 /// side, and the speaker has room above the microphone.
@@ -36,15 +36,15 @@ impl SpeakerAim {
     const ALL: [Self; 3] = [Self::Specular, Self::Steeper, Self::Down];
 
     // The axis from `speaker` for a microphone at `microphone`, both in m over the mirror plane z = 0.
-    fn axis(self, microphone: DVec3, speaker: DVec3) -> DVec3 {
+    fn aim_axis(self, microphone: DVec3, speaker: DVec3) -> DVec3 {
         let share = speaker.z / (speaker.z + microphone.z);
         let specular = speaker + (microphone - speaker) * share;
         let foot = DVec3::new(speaker.x, speaker.y, 0.0);
-        let target = foot + (DVec3::new(specular.x, specular.y, 0.0) - foot) * self.towards();
+        let target = foot + (DVec3::new(specular.x, specular.y, 0.0) - foot) * self.specular_share();
         (target - speaker).normalize()
     }
 
-    fn towards(self) -> f64 {
+    fn specular_share(self) -> f64 {
         match self {
             Self::Specular => 1.0,
             Self::Steeper => 0.5,
@@ -66,8 +66,8 @@ pub struct ArmPose {
 
 impl ArmPose {
     /// Both arms at home.
-    pub fn home() -> Self {
-        Self { microphone: home(), speaker: home(), aim: SpeakerAim::Down }
+    pub fn at_home() -> Self {
+        Self { microphone: home_joints(), speaker: home_joints(), aim: SpeakerAim::Down }
     }
 }
 
@@ -93,7 +93,7 @@ pub enum UnreachableReason {
 
 impl UnreachableReason {
     /// Returns the reason as a static text, for [`crate::rig::Error::Unreachable`].
-    pub fn reason(&self) -> &'static str {
+    pub fn reason_text(&self) -> &'static str {
         match self {
             Self::NoPosition => "a position is not a number",
             Self::OutOfReach(Tool::Microphone) => "the microphone's arm does not reach that far",
@@ -148,17 +148,17 @@ impl Cell {
     }
 
     /// A rig's arms.
-    pub fn of(rig: &Rig) -> Self {
+    pub fn from_rig(rig: &Rig) -> Self {
         Self::new(&rig.robots, rig.panel.size_mm)
     }
 
     /// Returns the arms' surroundings.
-    pub fn around(&self) -> &ArmSurroundings {
+    pub fn arm_surroundings(&self) -> &ArmSurroundings {
         &self.around
     }
 
     /// The arm that carries a tool.
-    pub fn arm(&self, tool: Tool) -> &RobotArm {
+    pub fn arm_with_tool(&self, tool: Tool) -> &RobotArm {
         match tool {
             Tool::Microphone => &self.microphone,
             Tool::Speaker => &self.speaker,
@@ -167,7 +167,7 @@ impl Cell {
 
     /// Returns the positions of microphone and speaker for given joints, mm.
     pub fn positions_mm(&self, microphone: &Joints, speaker: &Joints) -> [[f64; 3]; 2] {
-        [self.microphone.frames(microphone), self.speaker.frames(speaker)]
+        [self.microphone.frames_over_panel(microphone), self.speaker.frames_over_panel(speaker)]
             .map(|frames| (frames[7].translation * 1e3).to_array())
     }
 
@@ -175,11 +175,11 @@ impl Cell {
     ///
     /// # Errors
     /// [`UnreachableReason`], with the obstacle.
-    pub fn reach(&self, microphone_mm: [f64; 3], speaker_mm: [f64; 3]) -> Result<ArmPose, UnreachableReason> {
+    pub fn reach_positions(&self, microphone_mm: [f64; 3], speaker_mm: [f64; 3]) -> Result<ArmPose, UnreachableReason> {
         self.reach_with(&self.microphone_ways(microphone_mm), microphone_mm, speaker_mm)
     }
 
-    /// As [`Self::reach`], with the microphone's ways found before: they do not depend on the speaker.
+    /// As [`Self::reach_positions`], with the microphone's ways found before: they do not depend on the speaker.
     ///
     /// # Errors
     /// [`UnreachableReason`].
@@ -198,7 +198,7 @@ impl Cell {
             let solved = self.speaker_solutions(microphone_mm, speaker_mm, aim);
             for most in TRIED {
                 let ways = self.clear_ways(&self.speaker, &solved, most).0;
-                match ways.and_then(|speakers| self.together(microphones, &speakers)) {
+                match ways.and_then(|speakers| self.pick_clear_pair(microphones, &speakers)) {
                     Ok([microphone, speaker]) => return Ok(ArmPose { microphone, speaker, aim }),
                     Err(e) => failure = failure.max(Some(e)),
                 }
@@ -224,16 +224,16 @@ impl Cell {
             let turn = DQuat::from_rotation_z(heading + turn) * DQuat::from_rotation_y(PI - tilt);
             Pose::from_parts(position, turn)
         };
-        self.clear_ways(&self.microphone, &solutions(&self.microphone, poses.map(pose)), usize::MAX)
+        self.clear_ways(&self.microphone, &sorted_solutions(&self.microphone, poses.map(pose)), usize::MAX)
     }
 
     fn speaker_solutions(&self, microphone_mm: [f64; 3], speaker_mm: [f64; 3], aim: SpeakerAim) -> Vec<Joints> {
         let [microphone, speaker] = [microphone_mm, speaker_mm].map(|mm| DVec3::from_array(mm) / 1e3);
         // From below the panel's plane no mirror is seen; straight down will do, and is refused as what it is.
-        let axis = if speaker.z > 0.0 && microphone.z > 0.0 { aim.axis(microphone, speaker) } else { -DVec3::Z };
+        let axis = if speaker.z > 0.0 && microphone.z > 0.0 { aim.aim_axis(microphone, speaker) } else { -DVec3::Z };
         let aimed = DQuat::from_rotation_arc(DVec3::Z, axis);
         let roll = |i: usize| aimed * DQuat::from_rotation_z(i as f64 * TAU / ROLLS as f64);
-        solutions(&self.speaker, (0..ROLLS).map(|i| Pose::from_parts(speaker, roll(i))))
+        sorted_solutions(&self.speaker, (0..ROLLS).map(|i| Pose::from_parts(speaker, roll(i))))
     }
 
     // The first ways, nearest to home, in which an arm touches neither itself nor its surroundings.
@@ -245,7 +245,7 @@ impl Cell {
         };
         let mut ways = Vec::new();
         for joints in solved.iter().filter(|joints| in_range(joints)) {
-            let capsules = arm.capsules(joints);
+            let capsules = arm.link_capsules(joints);
             if !self.around.is_clear(&capsules) || touches_itself(&capsules, self.around.margin_m) {
                 failure = UnreachableReason::Touches(arm.tool());
                 continue;
@@ -259,7 +259,7 @@ impl Cell {
     }
 
     // The ways that are nearest to home together, of those in which the arms keep clear of each other.
-    fn together(
+    fn pick_clear_pair(
         &self,
         microphones: &[ArmSolution],
         speakers: &[ArmSolution],
@@ -272,7 +272,7 @@ impl Cell {
                 if best.as_ref().is_some_and(|(least, _)| cost >= *least) {
                     break;
                 }
-                match touching(&a.capsules, &b.capsules, self.around.margin_m) {
+                match touching_parts(&a.capsules, &b.capsules, self.around.margin_m) {
                     None => best = Some((cost, [a.joints, b.joints])),
                     Some((a, b)) => touch = touch.or(Some(UnreachableReason::ArmsTouch(a, b))),
                 }
@@ -283,15 +283,16 @@ impl Cell {
 
     /// Returns whether both arms keep clear of each other and of their surroundings.
     pub fn is_clear(&self, microphone: &Joints, speaker: &Joints) -> bool {
-        let [a, b] = [self.microphone.capsules(microphone), self.speaker.capsules(speaker)];
+        let [a, b] = [self.microphone.link_capsules(microphone), self.speaker.link_capsules(speaker)];
         let alone = |arm| self.around.is_clear(arm) && !touches_itself(arm, self.around.margin_m);
-        alone(&a) && alone(&b) && touching(&a, &b, self.around.margin_m).is_none()
+        alone(&a) && alone(&b) && touching_parts(&a, &b, self.around.margin_m).is_none()
     }
 }
 
 // All joints that bring an arm's tool to one of these poses, nearest to home first.
-fn solutions(arm: &RobotArm, poses: impl Iterator<Item = Pose>) -> Vec<Joints> {
-    let mut found: Vec<(f64, Joints)> = poses.flat_map(|pose| arm.solve(pose)).map(|q| (from_home(&q), q)).collect();
+fn sorted_solutions(arm: &RobotArm, poses: impl Iterator<Item = Pose>) -> Vec<Joints> {
+    let mut found: Vec<(f64, Joints)> =
+        poses.flat_map(|pose| arm.solve_joints(pose)).map(|q| (from_home(&q), q)).collect();
     found.sort_by(|a, b| a.0.total_cmp(&b.0));
     found.into_iter().map(|(_, joints)| joints).collect()
 }
@@ -301,20 +302,20 @@ mod tests {
     use super::*;
 
     fn cell() -> Cell {
-        Cell::of(&Rig::paper())
+        Cell::from_rig(&Rig::paper())
     }
 
     #[test]
     fn the_tools_are_where_they_were_told_to_be_and_the_speaker_aims() {
         let (cell, microphone, speaker) = (cell(), [-37.5, 112.5, 124.0], [93.75, -93.75, 214.0]);
-        let stand = cell.reach(microphone, speaker).expect("within reach");
+        let stand = cell.reach_positions(microphone, speaker).expect("within reach");
         for (wanted, reached) in [microphone, speaker].iter().zip(cell.positions_mm(&stand.microphone, &stand.speaker))
         {
             assert!(wanted.iter().zip(reached).all(|(a, b)| (a - b).abs() < 1e-6), "{reached:?}");
         }
         assert_eq!(stand.aim, SpeakerAim::Specular);
         // A ray along the axis, mirrored by the plane z = 0, meets the microphone.
-        let frame = cell.arm(Tool::Speaker).frames(&stand.speaker)[7];
+        let frame = cell.arm_with_tool(Tool::Speaker).frames_over_panel(&stand.speaker)[7];
         let axis = frame.transform_vector(DVec3::Z);
         let to_image = (DVec3::new(-0.0375, 0.1125, -0.124) - frame.translation).normalize();
         assert!(axis.angle_between(to_image) < 1e-7);
@@ -325,7 +326,7 @@ mod tests {
     fn what_cannot_be_reached_has_a_reason() {
         let cell = cell();
         let near = [-187.5, -187.5, 124.0];
-        let reason = |microphone, speaker| cell.reach(microphone, speaker).expect_err("out of reach");
+        let reason = |microphone, speaker| cell.reach_positions(microphone, speaker).expect_err("out of reach");
         assert_eq!(reason(near, [0.0, 0.0, 5_000.0]), UnreachableReason::OutOfReach(Tool::Speaker));
         assert_eq!(reason([0.0, 2_000.0, 124.0], near), UnreachableReason::OutOfReach(Tool::Microphone));
         assert_eq!(reason([f64::NAN, 0.0, 124.0], near), UnreachableReason::NoPosition);

@@ -7,7 +7,7 @@ use echolake_schema::robots::VisitOrder;
 use echolake_schema::{Error, Grid, Pair, PairId, Rig};
 
 use super::cell::{ArmPose, ArmSolutions, Cell, UnreachableReason};
-use super::plan::{PlanParams, plan};
+use super::plan::{PlanParams, plan_visit_order};
 
 /// The last one that was computed: a lake's runs have one rig, and computing it takes a second.
 static LAST: Mutex<Option<(RigKey, Option<Arc<Choreography>>)>> = Mutex::new(None);
@@ -34,7 +34,7 @@ pub struct MissingPair {
     pub why: UnreachableReason,
 }
 
-fn key(rig: &Rig) -> RigKey {
+fn rig_key(rig: &Rig) -> RigKey {
     format!("{:?} {:?} {}", rig.robots, rig.grid, rig.panel.size_mm)
 }
 
@@ -49,16 +49,16 @@ impl Choreography {
     ///
     /// # Errors
     /// [`Error::Quantity`] if the grid is not valid.
-    pub fn of(rig: &Rig) -> Result<Option<Arc<Self>>, Error> {
-        let key = key(rig);
+    pub fn for_rig(rig: &Rig) -> Result<Option<Arc<Self>>, Error> {
+        let key = rig_key(rig);
         let mut last = LAST.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some((_, found)) = last.as_ref().filter(|(of, _)| *of == key) {
             return Ok(found.clone());
         }
         let mut arms = Self::new(rig)?;
         // The paper's whole grid is within reach: a test checks it, and runs need not wait for it.
-        let found = if key == self::key(&Rig::paper()) || arms.missing().is_empty() {
-            arms.turns = (rig.robots.order == VisitOrder::Planned).then(|| arms.planned());
+        let found = if key == self::rig_key(&Rig::paper()) || arms.missing_pairs().is_empty() {
+            arms.turns = (rig.robots.order == VisitOrder::Planned).then(|| arms.planned_turns());
             Some(Arc::new(arms))
         } else {
             None
@@ -72,9 +72,9 @@ impl Choreography {
     /// # Errors
     /// [`Error::Quantity`] if the grid is not valid.
     pub fn new(rig: &Rig) -> Result<Self, Error> {
-        let grid = rig.grid()?;
+        let grid = rig.build_grid()?;
         Ok(Self {
-            cell: Arc::new(Cell::of(rig)),
+            cell: Arc::new(Cell::from_rig(rig)),
             ways: vec![OnceLock::new(); grid.points().len()],
             standings: vec![OnceLock::new(); grid.pairs().len()],
             grid,
@@ -83,15 +83,15 @@ impl Choreography {
     }
 
     /// Returns the pairs that the arms cannot reach, with the reasons.
-    pub fn missing(&self) -> Vec<MissingPair> {
-        let missing = |pair: &Pair| self.standing(pair.id).err().map(|why| MissingPair { pair: *pair, why });
+    pub fn missing_pairs(&self) -> Vec<MissingPair> {
+        let missing = |pair: &Pair| self.pose_at(pair.id).err().map(|why| MissingPair { pair: *pair, why });
         self.grid.pairs().iter().filter_map(missing).collect()
     }
 
-    fn planned(&self) -> HashMap<PairId, usize> {
-        let reached = |pair: &Pair| Some((pair.id, self.standing(pair.id).ok()?));
+    fn planned_turns(&self) -> HashMap<PairId, usize> {
+        let reached = |pair: &Pair| Some((pair.id, self.pose_at(pair.id).ok()?));
         let (pairs, standings): (Vec<_>, Vec<_>) = self.grid.pairs().iter().filter_map(reached).unzip();
-        plan(&standings, PlanParams::default()).into_iter().map(|at| pairs[at]).zip(0..).collect()
+        plan_visit_order(&standings, PlanParams::default()).into_iter().map(|at| pairs[at]).zip(0..).collect()
     }
 
     /// Returns the model of the arms.
@@ -103,7 +103,7 @@ impl Choreography {
     ///
     /// # Errors
     /// [`UnreachableReason`].
-    pub fn standing(&self, pair: PairId) -> Result<ArmPose, UnreachableReason> {
+    pub fn pose_at(&self, pair: PairId) -> Result<ArmPose, UnreachableReason> {
         let (Some(lock), Some(pair)) = (self.standings.get(pair.index()), self.grid.pair(pair)) else {
             return Err(UnreachableReason::NoPosition);
         };
@@ -116,7 +116,7 @@ impl Choreography {
     }
 
     /// Sorts pairs into the rig's visiting order.
-    pub fn sort(&self, pairs: &mut [Pair]) {
+    pub fn sort_pairs(&self, pairs: &mut [Pair]) {
         if let Some(turns) = &self.turns {
             pairs.sort_by_key(|pair| turns.get(&pair.id));
         }
@@ -131,10 +131,10 @@ mod tests {
     #[test]
     fn the_whole_grid_of_the_paper_is_within_reach() {
         let rig = Rig::paper();
-        let arms = Choreography::of(&rig).expect("a grid").expect("within reach");
-        let grid = rig.grid().expect("a grid");
+        let arms = Choreography::for_rig(&rig).expect("a grid").expect("within reach");
+        let grid = rig.build_grid().expect("a grid");
         for pair in grid.pairs() {
-            let ArmPose { microphone, speaker, aim } = arms.standing(pair.id).expect("within reach");
+            let ArmPose { microphone, speaker, aim } = arms.pose_at(pair.id).expect("within reach");
             assert_eq!(aim, SpeakerAim::Specular);
             assert!(arms.cell.is_clear(&microphone, &speaker), "{pair:?}");
             let wanted = [pair.microphone, pair.speaker].map(|id| grid.points()[id.index()].position_mm);
@@ -148,9 +148,9 @@ mod tests {
     fn what_is_out_of_reach_is_named() {
         let mut rig = Rig::paper();
         rig.robots.speaker_foot_mm[0] = 900.0;
-        let missing = Choreography::new(&rig).expect("a grid").missing();
+        let missing = Choreography::new(&rig).expect("a grid").missing_pairs();
         assert!(missing.iter().all(|m| m.why.to_string().starts_with("speaker arm")), "{:?}", missing.first());
-        assert!(missing.len() > 500 && Choreography::of(&rig).expect("a grid").is_none());
+        assert!(missing.len() > 500 && Choreography::for_rig(&rig).expect("a grid").is_none());
     }
 
     mod slow {
@@ -162,9 +162,9 @@ mod tests {
                 "robots.order = \"planned\"\n[[grid.layers]]\npoints_per_side = 3\npitch_mm = 150\nheight_mm = 200",
             )
             .expect("a rig");
-            let pairs = rig.grid().expect("a grid").pairs().to_vec();
+            let pairs = rig.build_grid().expect("a grid").pairs().to_vec();
             let mut sorted = pairs.clone();
-            Choreography::of(&rig).expect("a grid").expect("within reach").sort(&mut sorted);
+            Choreography::for_rig(&rig).expect("a grid").expect("within reach").sort_pairs(&mut sorted);
             assert_ne!(sorted, pairs);
             sorted.sort_by_key(|p| p.id);
             assert_eq!(sorted, pairs);

@@ -18,19 +18,19 @@ pub struct ArmSurroundings {
 }
 
 /// Distance of two capsules' surfaces, m; negative if they overlap.
-pub fn distance(a: &LinkCapsule, b: &LinkCapsule) -> f64 {
-    between(a.from, a.to, b.from, b.to) - a.radius - b.radius
+pub fn capsule_distance(a: &LinkCapsule, b: &LinkCapsule) -> f64 {
+    segment_distance(a.from, a.to, b.from, b.to) - a.radius - b.radius
 }
 
 /// The first parts of two arms that are nearer to each other than `margin_m`.
-pub fn touching(a: &[LinkCapsule; 6], b: &[LinkCapsule; 6], margin_m: f64) -> Option<(ArmPart, ArmPart)> {
-    let near = |a: &&LinkCapsule, b: &LinkCapsule| distance(a, b) < margin_m;
+pub fn touching_parts(a: &[LinkCapsule; 6], b: &[LinkCapsule; 6], margin_m: f64) -> Option<(ArmPart, ArmPart)> {
+    let near = |a: &&LinkCapsule, b: &LinkCapsule| capsule_distance(a, b) < margin_m;
     a.iter().rev().find_map(|a| b.iter().rev().find(|b| near(&a, b)).map(|b| (a.part, b.part)))
 }
 
 /// Returns whether an arm touches itself: wrist and tool with column and upper arm. Neighbours touch always.
 pub fn touches_itself(arm: &[LinkCapsule; 6], margin_m: f64) -> bool {
-    arm[3..].iter().any(|outer| arm[..2].iter().any(|inner| distance(outer, inner) < margin_m))
+    arm[3..].iter().any(|outer| arm[..2].iter().any(|inner| capsule_distance(outer, inner) < margin_m))
 }
 
 impl ArmSurroundings {
@@ -62,7 +62,7 @@ impl ArmSurroundings {
 }
 
 // Least distance of two segments (Ericson, Real-Time Collision Detection, 5.1.9).
-fn between(p1: DVec3, q1: DVec3, p2: DVec3, q2: DVec3) -> f64 {
+fn segment_distance(p1: DVec3, q1: DVec3, p2: DVec3, q2: DVec3) -> f64 {
     let (d1, d2, r) = (q1 - p1, q2 - p2, p1 - p2);
     let (a, e, f) = (d1.dot(d1), d2.dot(d2), d2.dot(r));
     let (b, c) = (d1.dot(d2), d1.dot(r));
@@ -101,7 +101,7 @@ mod tests {
                 .flat_map(|i| (0..=200).map(move |j| (i, j)))
                 .map(|(i, j)| along(p1, q1, i).distance(along(p2, q2, j)))
                 .fold(f64::MAX, f64::min);
-            let found = between(p1, q1, p2, q2);
+            let found = segment_distance(p1, q1, p2, q2);
             assert!(found <= searched + 1e-12 && searched < found + 0.02, "{found} {searched}");
         }
     }
@@ -109,7 +109,7 @@ mod tests {
     #[test]
     fn points_and_parallels_have_distances_too() {
         let check = |a: [[f64; 3]; 2], b: [[f64; 3]; 2], expected: f64| {
-            let found = distance(&capsule(a[0], a[1], 0.1), &capsule(b[0], b[1], 0.2));
+            let found = capsule_distance(&capsule(a[0], a[1], 0.1), &capsule(b[0], b[1], 0.2));
             assert!((found - (expected - 0.3)).abs() < 1e-12, "{found}");
         };
         check([[0.0; 3], [1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0], [1.0, 1.0, 0.0]], 1.0);

@@ -35,25 +35,25 @@ pub fn joint_names(tool: Tool) -> [String; 6] {
 
 impl Cell {
     /// Both arms, table and panel as URDF; `name` says what they are, and whether they are simulated.
-    pub fn urdf(&self, name: &str) -> String {
+    pub fn to_urdf(&self, name: &str) -> String {
         let mut out = String::from("<?xml version=\"1.0\"?>\n");
         let name = name.replace(['<', '>', '&', '"'], "_");
         // Writing to a String cannot fail.
         let _ = writeln!(out, "<robot name=\"{name}\">");
-        let table = PANEL_M + self.around().table_m - TABLE_M[2] / 2.0;
+        let table = PANEL_M + self.arm_surroundings().table_m - TABLE_M[2] / 2.0;
         let [x, y, z] = TABLE_M;
-        link(&mut out, "world", &format!("<box size=\"{x} {y} {z}\"/>"), table, "0.45 0.4 0.35");
-        link(&mut out, "panel", "", 0.0, "");
-        fixed(&mut out, "world", "panel", [0.0, 0.0, PANEL_M], [0.0; 3]);
+        write_link(&mut out, "world", &format!("<box size=\"{x} {y} {z}\"/>"), table, "0.45 0.4 0.35");
+        write_link(&mut out, "panel", "", 0.0, "");
+        write_fixed_joint(&mut out, "world", "panel", [0.0, 0.0, PANEL_M], [0.0; 3]);
         for tool in [Tool::Microphone, Tool::Speaker] {
-            arm(&mut out, self.arm(tool));
+            write_arm(&mut out, self.arm_with_tool(tool));
         }
         out.push_str("</robot>\n");
         out
     }
 }
 
-fn arm(out: &mut String, arm: &RobotArm) {
+fn write_arm(out: &mut String, arm: &RobotArm) {
     let (tool, frames) = (arm.tool(), frame_names(arm.tool()));
     let cylinder = |radius: f64, length: f64| format!("<cylinder radius=\"{radius}\" length=\"{length}\"/>");
     let sphere = |radius: f64| format!("<sphere radius=\"{radius}\"/>");
@@ -70,11 +70,11 @@ fn arm(out: &mut String, arm: &RobotArm) {
         (cylinder(transducer, 0.04), -0.02),
     ];
     for (name, (shape, z)) in frames.iter().zip(&shapes) {
-        link(out, name, shape, *z, colour);
+        write_link(out, name, shape, *z, colour);
     }
-    let (foot, tool) = (arm.foot(), tool.pose());
+    let (foot, tool) = (arm.foot(), tool.pose_on_flange());
     let over_floor = (foot.translation + DVec3::new(0.0, 0.0, PANEL_M)).to_array();
-    fixed(out, "world", &frames[0], over_floor, turns(foot));
+    write_fixed_joint(out, "world", &frames[0], over_floor, roll_pitch_yaw(foot));
     for (i, joint) in joint_names(arm.tool()).iter().enumerate() {
         let origin = match i {
             0 => format!("0 0 {SHOULDER_M}"),
@@ -93,10 +93,10 @@ fn arm(out: &mut String, arm: &RobotArm) {
              <limit lower=\"{low}\" upper=\"{high}\" effort=\"0\" velocity=\"{speed}\"/></joint>"
         );
     }
-    fixed(out, &frames[6], &frames[7], tool.translation.to_array(), turns(tool));
+    write_fixed_joint(out, &frames[6], &frames[7], tool.translation.to_array(), roll_pitch_yaw(tool));
 }
 
-fn link(out: &mut String, name: &str, shape: &str, z: f64, colour: &str) {
+fn write_link(out: &mut String, name: &str, shape: &str, z: f64, colour: &str) {
     let _ = match shape {
         "" => writeln!(out, "  <link name=\"{name}\"/>"),
         shape => writeln!(
@@ -107,7 +107,7 @@ fn link(out: &mut String, name: &str, shape: &str, z: f64, colour: &str) {
     };
 }
 
-fn fixed(out: &mut String, parent: &str, child: &str, [x, y, z]: [f64; 3], [a, b, c]: [f64; 3]) {
+fn write_fixed_joint(out: &mut String, parent: &str, child: &str, [x, y, z]: [f64; 3], [a, b, c]: [f64; 3]) {
     let _ = writeln!(
         out,
         "  <joint name=\"{parent}-{child}\" type=\"fixed\"><origin xyz=\"{x} {y} {z}\" rpy=\"{a} {b} {c}\"/>\
@@ -116,7 +116,7 @@ fn fixed(out: &mut String, parent: &str, child: &str, [x, y, z]: [f64; 3], [a, b
 }
 
 // URDF turns about x, then y, then z, all of them fixed.
-fn turns(pose: Pose) -> [f64; 3] {
+fn roll_pitch_yaw(pose: Pose) -> [f64; 3] {
     let (z, y, x) = pose.rotation.to_euler(rs_opw_kinematics::glam::EulerRot::ZYX);
     [x, y, z]
 }

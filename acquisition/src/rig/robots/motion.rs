@@ -53,7 +53,7 @@ impl MotionCourse {
     ];
 
     // The poses on the way, the last included.
-    fn stops(self, back_deg: [f64; 2], from: &Pose, to: &Pose) -> Vec<Pose> {
+    fn stops_between(self, back_deg: [f64; 2], from: &Pose, to: &Pose) -> Vec<Pose> {
         let ([m0, s0], [m1, s1]) = (*from, *to);
         let [mb0, sb0, mb1, sb1] = [m0, s0, m1, s1].map(|joints| drawn_back(joints, back_deg));
         match self {
@@ -89,21 +89,21 @@ pub struct ArmMotion {
 }
 
 /// Returns a course on which nothing touches, the quickest of its kind; None if no [`MotionCourse`] is one.
-pub fn course(cell: &Cell, from: &ArmPose, to: &ArmPose) -> Option<ArmMotion> {
+pub fn plan_motion(cell: &Cell, from: &ArmPose, to: &ArmPose) -> Option<ArmMotion> {
     let [from, to] = [from, to].map(|s| [s.microphone, s.speaker]);
     let motion = |(course, back_deg): (MotionCourse, [f64; 2])| {
-        ArmMotion::new(course, &from, course.stops(back_deg, &from, &to))
+        ArmMotion::new(course, &from, course.stops_between(back_deg, &from, &to))
     };
     let ways = BACKS_DEG.iter().flat_map(|back_deg| MotionCourse::SIMPLE.map(|course| (course, *back_deg)));
     let mut motions: Vec<_> = ways.map(motion).collect();
     motions.sort_by(|a, b| a.secs.total_cmp(&b.secs));
-    let is_free = |motion: &ArmMotion| legs(&from, &motion.stops).all(|(a, b)| is_clear(cell, a, b));
+    let is_free = |motion: &ArmMotion| motion_legs(&from, &motion.stops).all(|(a, b)| is_clear(cell, a, b));
     motions.into_iter().find(is_free).or_else(|| both_drawn_back(cell, &from, &to))
 }
 
 // Any way out of the first pose with any way out of the second, backwards.
 fn both_drawn_back(cell: &Cell, from: &Pose, to: &Pose) -> Option<ArmMotion> {
-    let (outs, ins) = (retreats(cell, from), retreats(cell, to));
+    let (outs, ins) = (find_retreats(cell, from), find_retreats(cell, to));
     let pairs = outs.iter().flat_map(|out| ins.iter().map(move |back| (out, back)));
     let motion = |(out, back): (&Vec<Pose>, &Vec<Pose>)| {
         let stops = out.iter().chain(back.iter().rev()).chain([to]).copied().collect();
@@ -116,21 +116,21 @@ fn both_drawn_back(cell: &Cell, from: &Pose, to: &Pose) -> Option<ArmMotion> {
 }
 
 // The ways in which both arms can draw back from a pose: the stops of each.
-fn retreats(cell: &Cell, from: &Pose) -> Vec<Vec<Pose>> {
+fn find_retreats(cell: &Cell, from: &Pose) -> Vec<Vec<Pose>> {
     let [m, s] = *from;
     let backs = BACKS_DEG.iter().flat_map(|a| BACKS_DEG.iter().map(move |b| (drawn_back(m, *a), drawn_back(s, *b))));
     let ways = backs.flat_map(|(mb, sb)| [vec![[mb, sb]], vec![[mb, s], [mb, sb]], vec![[m, sb], [mb, sb]]]);
-    ways.filter(|stops| legs(from, stops).all(|(a, b)| is_clear(cell, a, b))).collect()
+    ways.filter(|stops| motion_legs(from, stops).all(|(a, b)| is_clear(cell, a, b))).collect()
 }
 
 impl ArmMotion {
     fn new(course: MotionCourse, from: &Pose, stops: Vec<Pose>) -> Self {
-        let secs = legs(from, &stops).map(|(a, b)| leg_secs(a, b)).sum();
+        let secs = motion_legs(from, &stops).map(|(a, b)| leg_secs(a, b)).sum();
         Self { course, stops, secs }
     }
 }
 
-fn legs<'a>(from: &'a Pose, stops: &'a [Pose]) -> impl Iterator<Item = (&'a Pose, &'a Pose)> {
+fn motion_legs<'a>(from: &'a Pose, stops: &'a [Pose]) -> impl Iterator<Item = (&'a Pose, &'a Pose)> {
     std::iter::once(from).chain(stops).zip(stops)
 }
 

@@ -9,7 +9,7 @@ use echolake_schema::{Celsius, Pair, Timestamp};
 use super::{Error, NAME, RunController, RunProgress};
 use crate::rig::{AmbientReading, ArmPositions, DrivePower, Error as RigError};
 use crate::run::assessment::TakeAssessment;
-use crate::run::objection::{ARRIVAL, SIGNAL_TO_NOISE, TakeObjection, implausible};
+use crate::run::objection::{ARRIVAL, SIGNAL_TO_NOISE, TakeObjection, find_implausible};
 use crate::run::recorder::LogLevel;
 use crate::run::recording_mode::RecordingMode;
 
@@ -46,29 +46,29 @@ struct Judged {
 }
 
 impl RunController<'_> {
-    pub(super) fn attempt(
+    pub(super) fn attempt_pair(
         &mut self,
         run: &mut RunProgress<'_>,
         pair: Pair,
         number: u32,
         is_last: bool,
     ) -> Result<AttemptResult, Error> {
-        let [microphone, speaker] = self.positions(pair);
-        self.devices.robots.power(DrivePower::On)?;
+        let [microphone, speaker] = self.pair_positions(pair);
+        self.devices.robots.switch_drives(DrivePower::On)?;
         let reached = match self.devices.robots.move_to(microphone, speaker) {
             Ok(reached) => reached,
             // A retry would not change it; the other pairs may be reached.
             Err(refusal @ RigError::Unreachable { .. }) => {
-                self.devices.robots.power(DrivePower::Off)?;
-                return self.refused(pair, number, refusal);
+                self.devices.robots.switch_drives(DrivePower::Off)?;
+                return self.refused_attempt(pair, number, refusal);
             }
             Err(error) => return Err(error.into()),
         };
         // The drives hum; the arms hold by their brakes while the sweep is recorded.
-        self.devices.robots.power(DrivePower::Off)?;
-        self.take(run)?;
-        let reading = self.air()?;
-        let Judged { assessment, response, objections } = self.judge(microphone, speaker, &reading);
+        self.devices.robots.switch_drives(DrivePower::Off)?;
+        self.make_take(run)?;
+        let reading = self.read_ambient()?;
+        let Judged { assessment, response, objections } = self.judge_take(microphone, speaker, &reading);
         let verdict = match (objections.is_empty(), is_last) {
             (true, _) => Verdict::Accepted,
             (false, false) => Verdict::Repeated,
@@ -88,26 +88,26 @@ impl RunController<'_> {
     }
 
     /// Makes a take at a pair and judges it without recording it: a check of the rig before a run.
-    pub(crate) fn trial(&mut self, pair: Pair) -> Result<(TakeAssessment, Vec<TakeObjection>), RigError> {
-        let [microphone, speaker] = self.positions(pair);
-        self.devices.robots.power(DrivePower::On)?;
+    pub(crate) fn try_pair(&mut self, pair: Pair) -> Result<(TakeAssessment, Vec<TakeObjection>), RigError> {
+        let [microphone, speaker] = self.pair_positions(pair);
+        self.devices.robots.switch_drives(DrivePower::On)?;
         self.devices.robots.move_to(microphone, speaker)?;
-        self.devices.robots.power(DrivePower::Off)?;
+        self.devices.robots.switch_drives(DrivePower::Off)?;
         self.devices.audio.play_and_record(&self.output, &mut self.take)?;
-        let reading = self.air()?;
-        let judged = self.judge(microphone, speaker, &reading);
+        let reading = self.read_ambient()?;
+        let judged = self.judge_take(microphone, speaker, &reading);
         Ok((judged.assessment, judged.objections))
     }
 
     /// Reads the air, with retries if the sensor fails.
-    pub(crate) fn air(&mut self) -> Result<AmbientReading, RigError> {
-        persistently(|| self.devices.sensor.read())
+    pub(crate) fn read_ambient(&mut self) -> Result<AmbientReading, RigError> {
+        retry_device(|| self.devices.sensor.read_ambient())
     }
 
     // An interface that lost samples is retried: nothing of that take is kept.
-    fn take(&mut self, run: &mut RunProgress<'_>) -> Result<(), Error> {
+    fn make_take(&mut self, run: &mut RunProgress<'_>) -> Result<(), Error> {
         let mut lost = Vec::new();
-        let taken = persistently(|| {
+        let taken = retry_device(|| {
             let taken = self.devices.audio.play_and_record(&self.output, &mut self.take);
             lost.extend(taken.as_ref().err().map(ToString::to_string));
             taken
@@ -118,12 +118,12 @@ impl RunController<'_> {
         Ok(taken?)
     }
 
-    fn positions(&self, pair: Pair) -> [[f64; 3]; 2] {
+    fn pair_positions(&self, pair: Pair) -> [[f64; 3]; 2] {
         [pair.microphone, pair.speaker].map(|id| self.grid.points()[id.index()].position_mm)
     }
 
-    fn refused(&mut self, pair: Pair, number: u32, refusal: RigError) -> Result<AttemptResult, Error> {
-        let reading = self.air()?;
+    fn refused_attempt(&mut self, pair: Pair, number: u32, refusal: RigError) -> Result<AttemptResult, Error> {
+        let reading = self.read_ambient()?;
         let objections = vec![TakeObjection::Refused { refusal }];
         let unknown = f64::NAN;
         let measurement = Measurement {
@@ -144,40 +144,45 @@ impl RunController<'_> {
         })
     }
 
-    fn judge(&mut self, microphone: [f64; 3], speaker: [f64; 3], reading: &AmbientReading) -> Judged {
+    fn judge_take(&mut self, microphone: [f64; 3], speaker: [f64; 3], reading: &AmbientReading) -> Judged {
         let mut clipped = to_fractions(&self.take.microphone, &mut self.microphone);
         clipped += to_fractions(&self.take.loopback, &mut self.loopback);
         let arrival = direct_mm(microphone, speaker) / 1e3 / speed_of_sound(reading.temperature_c);
-        match self.assess(arrival, clipped, reading.temperature_c) {
+        match self.deconvolve_and_assess(arrival, clipped, reading.temperature_c) {
             Ok(assessment) => {
-                let mut objections = assessment.objections(&self.rig.validation, reading.outside_level_db);
-                objections.extend(unknowns(&assessment, reading));
-                objections.extend(implausible(reading));
+                let mut objections = assessment.find_objections(&self.rig.validation, reading.outside_level_db);
+                objections.extend(find_unknowns(&assessment, reading));
+                objections.extend(find_implausible(reading));
                 Judged { assessment, response: ResponseState::Deconvolved, objections }
             }
             Err(cause) => {
                 let objections = vec![TakeObjection::Broken { reason: cause.to_string() }];
-                Judged { assessment: nothing(clipped), response: ResponseState::Missing, objections }
+                Judged { assessment: unknown_assessment(clipped), response: ResponseState::Missing, objections }
             }
         }
     }
 
-    fn assess(&mut self, arrival_secs: f64, clipped: u32, celsius: f64) -> Result<TakeAssessment, echolake_dsp::Error> {
+    fn deconvolve_and_assess(
+        &mut self,
+        arrival_secs: f64,
+        clipped: u32,
+        celsius: f64,
+    ) -> Result<TakeAssessment, echolake_dsp::Error> {
         let (sweep, reference) = (&self.rig.sweep, self.rig.impulse_response.reference_temperature_c.get());
         let limits_hz = response_limits_hz([sweep.low_hz, sweep.high_hz], resampling_ratio(celsius, reference));
         self.deconvolution.run_within(limits_hz, &self.microphone, &self.loopback, &mut self.ir, &mut self.scratch)?;
-        self.assessor.assess(&self.microphone, &self.loopback, arrival_secs, clipped)
+        self.assessor.assess_take(&self.microphone, &self.loopback, arrival_secs, clipped)
     }
 
     // The order within an attempt is kept for live views. In the file a verdict follows its messages because
     // the recorder writes its chunk last.
-    pub(super) fn record(&mut self, run: &mut RunProgress<'_>, made: &AttemptResult) -> Result<(), Error> {
+    pub(super) fn record_attempt(&mut self, run: &mut RunProgress<'_>, made: &AttemptResult) -> Result<(), Error> {
         let (at, m, reading) = (made.at, &made.measurement, &made.reading);
         let sample_rate_hz = self.rig.sweep.rate_hz.get();
         if let Some(reached) = made.reached {
             run.recorder.poses(at, reached.microphone_mm, reached.speaker_mm)?;
             if let Some(joints) = &reached.joints {
-                run.recorder.joints(at, joints)?;
+                run.recorder.record_joints(at, joints)?;
             }
         }
         let sample = AmbientSample {
@@ -187,7 +192,7 @@ impl RunController<'_> {
             outside_level_db: reading.outside_level_db,
         };
         run.recorder.environment(reading.at, &sample)?;
-        for (device, notice) in self.devices.notices() {
+        for (device, notice) in self.devices.take_notices() {
             run.recorder.log(at, LogLevel::Warning, device, &notice)?;
         }
         // Without a temperature they are useless; the verdict has the sensor's values.
@@ -227,7 +232,7 @@ impl RunController<'_> {
 }
 
 // Retries a device that fails, a few times.
-fn persistently<T>(mut ask: impl FnMut() -> Result<T, RigError>) -> Result<T, RigError> {
+fn retry_device<T>(mut ask: impl FnMut() -> Result<T, RigError>) -> Result<T, RigError> {
     for _ in 1..TRIES {
         if let Ok(answer) = ask() {
             return Ok(answer);
@@ -259,7 +264,7 @@ fn verdict_on(
 }
 
 // A comparison with NaN raises no objection, and a take with unknown values is no good one.
-fn unknowns(found: &TakeAssessment, reading: &AmbientReading) -> Vec<TakeObjection> {
+fn find_unknowns(found: &TakeAssessment, reading: &AmbientReading) -> Vec<TakeObjection> {
     let values = [
         (SIGNAL_TO_NOISE, found.snr_db),
         (ARRIVAL, found.arrival_error_us),
@@ -277,7 +282,7 @@ fn to_fractions(samples: &[i32], out: &mut Vec<f32>) -> u32 {
     samples.iter().filter(|x| **x <= -(1 << 23) || **x >= (1 << 23) - 1).count() as u32
 }
 
-fn nothing(clipped_samples: u32) -> TakeAssessment {
+fn unknown_assessment(clipped_samples: u32) -> TakeAssessment {
     let unknown = f64::NAN;
     TakeAssessment { snr_db: unknown, clipped_samples, loopback_dbfs: unknown, arrival_error_us: unknown }
 }

@@ -13,7 +13,7 @@ use echolake_schema::{Rig, Timestamp, topics};
 use prost::Message as _;
 
 use super::*;
-use crate::rig::devices::simulated::{RigSimulation, devices};
+use crate::rig::devices::simulated::{RigSimulation, simulated_rig};
 use crate::rig::{
     AmbientReading, AmbientSensor, ArmPositions, AudioInterface, AudioTake, Error as RigError, RigDevices, RobotArms,
 };
@@ -55,8 +55,8 @@ struct FaultyAudio(Box<dyn AudioInterface>, SharedFault);
 struct FaultyArms(Box<dyn RobotArms>, SharedFault);
 
 impl AmbientSensor for FaultySensor {
-    fn read(&mut self) -> Result<AmbientReading, RigError> {
-        let reading = self.0.read();
+    fn read_ambient(&mut self) -> Result<AmbientReading, RigError> {
+        let reading = self.0.read_ambient();
         if self.1.is_on(&self.1.takes) { (self.1.fault.reading)(reading) } else { reading }
     }
 }
@@ -82,8 +82,8 @@ impl RobotArms for FaultyArms {
         self.0.move_to(microphone_mm, speaker_mm)
     }
 
-    fn power(&mut self, power: DrivePower) -> Result<(), RigError> {
-        self.0.power(power)
+    fn switch_drives(&mut self, power: DrivePower) -> Result<(), RigError> {
+        self.0.switch_drives(power)
     }
 }
 
@@ -94,7 +94,8 @@ fn rig() -> Rig {
 fn simulated(rig: &Rig, fault: DeviceFault, start: Timestamp, seed: u64) -> (RigDevices, SharedFault) {
     let relief = PanelRelief::Flat.height_field(60);
     let material = SurfaceMaterial::CoatedPrint;
-    let inner = devices(&RigSimulation { rig, relief: &relief, material, start, seed, arms: None }).expect("devices");
+    let inner =
+        simulated_rig(&RigSimulation { rig, relief: &relief, material, start, seed, arms: None }).expect("devices");
     let shared = SharedFault { fault, takes: Arc::default(), moves: Arc::default(), mended: Arc::default() };
     let faulty = RigDevices {
         robots: Box::new(FaultyArms(inner.robots, shared.clone())),
@@ -139,12 +140,12 @@ fn check(fault: DeviceFault, expected: &str) -> (Vec<Measurement>, Vec<String>) 
     drop(recorder);
 
     let partial = path.with_extension("mcap.partial");
-    let held = Held::read(&partial).expect("what is held");
+    let held = Held::from_file(&partial).expect("what is held");
     let after = held.last.plus_secs(60.0);
     let (mended, shared) = simulated(&rig, fault, after, 4);
     shared.mended.store(true, Ordering::Relaxed);
     let mut controller = RunController::new(&rig, mended).expect("a controller");
-    let (mut recorder, held) = Recorder::resume(&partial).expect("gone on with");
+    let (mut recorder, held) = Recorder::resume_recording(&partial).expect("gone on with");
     let work = RunWorkload { pairs: &pairs, before: &held.pairs, options };
     let outcome = controller.run(&mut recorder, &work, &control, &mut note).expect("a whole run");
     assert_eq!((outcome.left, outcome.end.accepted, outcome.end.rejected), (0, PAIRS as u64, 0));
@@ -305,7 +306,7 @@ fn what_is_not_fit_is_told_before_the_run() {
         shared.takes.store(AT, Ordering::Relaxed);
         let mut controller = RunController::new(&rig, devices).expect("a controller");
         let first = controller.grid.pairs()[0];
-        preflight::devices(&mut controller, first).iter().map(ToString::to_string).collect::<Vec<_>>().join("\n")
+        preflight::check_devices(&mut controller, first).iter().map(ToString::to_string).collect::<Vec<_>>().join("\n")
     };
     assert_eq!(told(NONE), "");
     let gone = |_| Err(RigError::Device { device: "ambient sensor", reason: "no such port".into() });
@@ -356,6 +357,6 @@ fn a_run_is_paused_and_continued_and_stopped() {
     assert_eq!((outcome.left, outcome.end.accepted), (PAIRS - 7, 7));
     assert_eq!(heard, ["3 safe", "paused", "continued", "4 safe"]);
     drop(recorder);
-    let held = Held::read(&path.with_extension("mcap.partial")).expect("what is held");
-    assert_eq!((held.accepted(), held.lost, held.damage.len()), (7, Vec::new(), 0));
+    let held = Held::from_file(&path.with_extension("mcap.partial")).expect("what is held");
+    assert_eq!((held.accepted_count(), held.lost, held.damage.len()), (7, Vec::new(), 0));
 }

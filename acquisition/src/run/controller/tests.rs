@@ -9,7 +9,7 @@ use echolake_schema::messages::{ImpulseResponse, Message as RunMessage, SweepRec
 use echolake_schema::topics;
 
 use super::*;
-use crate::rig::devices::simulated::{RigSimulation, devices};
+use crate::rig::devices::simulated::{RigSimulation, simulated_rig};
 use crate::rig::{AmbientReading, AmbientSensor, ArmPositions, AudioInterface, Error as RigError, RobotArms};
 use crate::run::recorder::tests::create_flat;
 
@@ -52,8 +52,8 @@ impl AudioInterface for Slower {
 struct Deaf(Box<dyn AmbientSensor>);
 
 impl AmbientSensor for Deaf {
-    fn read(&mut self) -> Result<AmbientReading, RigError> {
-        Ok(AmbientReading { outside_level_db: f64::NAN, ..self.0.read()? })
+    fn read_ambient(&mut self) -> Result<AmbientReading, RigError> {
+        Ok(AmbientReading { outside_level_db: f64::NAN, ..self.0.read_ambient()? })
     }
 }
 
@@ -73,11 +73,11 @@ impl RobotArms for Failing {
         }
     }
 
-    fn power(&mut self, power: DrivePower) -> Result<(), RigError> {
+    fn switch_drives(&mut self, power: DrivePower) -> Result<(), RigError> {
         if power == DrivePower::Off {
             self.switched_off.fetch_add(1, Ordering::Relaxed);
         }
-        self.inner.power(power)
+        self.inner.switch_drives(power)
     }
 }
 
@@ -91,7 +91,7 @@ fn start() -> Timestamp {
 
 fn simulated(rig: &Rig, material: SurfaceMaterial, seed: u64) -> RigDevices {
     let relief = PanelRelief::Flat.height_field(60);
-    devices(&RigSimulation { rig, relief: &relief, material, start: start(), seed, arms: None }).expect("devices")
+    simulated_rig(&RigSimulation { rig, relief: &relief, material, start: start(), seed, arms: None }).expect("devices")
 }
 
 fn faulty(rig: &Rig, fault: fn(&mut AudioTake), takes: u32) -> RigDevices {
@@ -319,7 +319,7 @@ fn samples_are_recorded_bit_by_bit() {
     let expected: Vec<i32> = (0..=rig.recording_len()).map(pattern).collect();
     for (bytes, expected) in [(&sweep.microphone, &expected[..]), (&sweep.loopback, &expected[1..])] {
         let mut fractions = vec![0.0; rig.recording_len()];
-        echolake_schema::samples::decode(sweep.format(), bytes, &mut fractions).expect("samples");
+        echolake_schema::samples::decode_samples(sweep.format(), bytes, &mut fractions).expect("samples");
         assert!(fractions.iter().zip(expected).all(|(y, x)| (y * 8_388_608.0) as i32 == *x));
     }
 }
@@ -336,7 +336,8 @@ fn a_stop_waits_for_its_pair() {
 fn a_failing_device_ends_the_run_and_leaves_what_was_recorded() {
     let rig = quick();
     let (mut devices, switched_off) = (simulated(&rig, SurfaceMaterial::CoatedPrint, 3), Arc::new(AtomicU32::new(0)));
-    devices.robots = Box::new(Failing { inner: devices.robots, moves: 0, switched_off: switched_off.clone() });
+    devices.robots =
+        Box::new(Failing { inner: devices.robots, moves: 0, switched_off: switched_off.clone() });
     let run = run_of(&rig, devices, 9);
     assert!(matches!(&run.end, Err(Error::Device(RigError::Device { device: "left arm", .. }))), "{:?}", run.end);
     assert_eq!(run.verdicts().len(), 2);

@@ -26,7 +26,7 @@ impl RunMonitor {
     }
 
     /// Records that a pair was accepted.
-    pub(super) fn accepted(&mut self) {
+    pub(super) fn note_accepted(&mut self) {
         self.given_up = 0;
     }
 
@@ -48,7 +48,7 @@ impl RunMonitor {
     ///
     /// # Errors
     /// [`Error::Clock`] if it is before that of the last event.
-    pub(super) fn at(&mut self, now: Timestamp) -> Result<(), Error> {
+    pub(super) fn note_time(&mut self, now: Timestamp) -> Result<(), Error> {
         if now < self.last {
             let back_secs = (self.last.0 - now.0) as f64 / 1e9;
             return Err(Error::Clock { before: self.last, now, back_secs });
@@ -61,7 +61,7 @@ impl RunMonitor {
     ///
     /// # Errors
     /// [`Error::DiskNearlyFull`].
-    pub(super) fn disk(&self, needed: u64) -> Result<(), Error> {
+    pub(super) fn check_disk(&self, needed: u64) -> Result<(), Error> {
         // A file system that does not report it will refuse to write in the end.
         let Ok(free) = (self.free)(&self.folder) else { return Ok(()) };
         if free >= needed {
@@ -82,7 +82,7 @@ mod tests {
         let mut watch = RunMonitor::new(Path::new("run.mcap"), Timestamp(0));
         let loud = [TakeObjection::Outside { level_db: 80.0, most_db: 65.0 }];
         assert!(watch.given_up(&loud).is_ok() && watch.given_up(&loud).is_ok());
-        watch.accepted();
+        watch.note_accepted();
         assert!(watch.given_up(&loud).is_ok() && watch.given_up(&loud).is_ok());
         let error = watch.given_up(&loud).expect_err("the third in a row").to_string();
         assert!(
@@ -95,10 +95,10 @@ mod tests {
     fn a_disk_that_fills_up_is_noticed_before_it_is_full() {
         let mut watch = RunMonitor::new(Path::new("run.mcap"), Timestamp(0));
         watch.free = |_| Ok(5_000_000);
-        assert!(watch.disk(5_000_000).is_ok());
-        let error = watch.disk(5_100_000).expect_err("too little").to_string();
+        assert!(watch.check_disk(5_000_000).is_ok());
+        let error = watch.check_disk(5_100_000).expect_err("too little").to_string();
         assert!(error.contains("5.0 MB are left, 5.1 are kept free to end the run"), "{error}");
         watch.free = |_| Err(std::io::ErrorKind::Unsupported.into());
-        assert!(watch.disk(u64::MAX).is_ok(), "what cannot be told is no reason to stop");
+        assert!(watch.check_disk(u64::MAX).is_ok(), "what cannot be told is no reason to stop");
     }
 }

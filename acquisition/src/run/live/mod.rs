@@ -66,12 +66,12 @@ impl LiveServer {
 
     /// Returns the number of connected clients.
     pub fn clients(&self) -> usize {
-        self.0.shared().clients().len()
+        self.0.shared_state().clients().len()
     }
 
     /// Returns the tap through which a recorder sends its messages.
     pub fn tap(&self) -> Box<dyn Tap> {
-        Box::new(LiveTap { shared: self.0.shared().clone(), light: Vec::new() })
+        Box::new(LiveTap { shared: self.0.shared_state().clone(), light: Vec::new() })
     }
 }
 
@@ -88,7 +88,7 @@ impl Tap for LiveTap {
     }
 
     fn message(&mut self, channel: u16, log_time_nanos: u64, data: &[u8]) {
-        self.shared.send(channel, log_time_nanos, data, self.light.contains(&channel));
+        self.shared.send_message(channel, log_time_nanos, data, self.light.contains(&channel));
     }
 }
 

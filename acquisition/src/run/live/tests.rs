@@ -131,14 +131,14 @@ fn a_client_that_sleeps_loses_the_oldest_and_stops_nobody() {
     json(&mut socket);
     socket.send(Message::text(r#"{"op":"subscribe","subscriptions":[{"id":1,"channelId":2}]}"#)).expect("sent");
     let begun = Instant::now();
-    while !server.0.shared().clients().iter().any(|c| c.receives(2)) {
+    while !server.0.shared_state().clients().iter().any(|c| c.receives_channel(2)) {
         assert!(begun.elapsed() < ANSWER_LIMIT, "the subscription arrives");
         std::thread::sleep(Duration::from_millis(5));
     }
     for time in 0..UNREAD {
         tap.message(2, time, &vec![0; 1 << 20]);
     }
-    let waiting = server.0.shared().clients()[0].bytes();
+    let waiting = server.0.shared_state().clients()[0].pending_bytes();
     assert!(waiting <= WAITING_BYTES, "{waiting}");
     let mut last = 0;
     while last != UNREAD - 1 {

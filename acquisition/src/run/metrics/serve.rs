@@ -37,7 +37,7 @@ impl MetricsServer {
                         return;
                     }
                     // A client without an answer asks again.
-                    let _ = stream.and_then(|stream| answer(stream, &metrics));
+                    let _ = stream.and_then(|stream| answer_request(stream, &metrics));
                 }
             }
         });
@@ -61,7 +61,7 @@ impl Drop for MetricsServer {
     }
 }
 
-fn answer(mut stream: TcpStream, metrics: &RunMetrics) -> io::Result<()> {
+fn answer_request(mut stream: TcpStream, metrics: &RunMetrics) -> io::Result<()> {
     stream.set_read_timeout(Some(PATIENCE))?;
     stream.set_write_timeout(Some(PATIENCE))?;
     let mut request = Vec::new();

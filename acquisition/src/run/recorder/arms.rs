@@ -49,12 +49,12 @@ impl Arms {
 }
 
 impl Recorder {
-    /// Records the arms' shape, `/robot_description`; from now on [`Self::joints`] tells how they stand, and
+    /// Records the arms' shape, `/robot_description`; from now on [`Self::record_joints`] tells how they stand, and
     /// [`Self::poses`] leaves `/tf` to it. `name` says what the arms are, and whether they are simulated.
     ///
     /// # Errors
     /// [`Error::Write`].
-    pub fn arms(&mut self, at: Timestamp, cell: Arc<Cell>, name: &str) -> Result<(), Error> {
+    pub fn record_arms(&mut self, at: Timestamp, cell: Arc<Cell>, name: &str) -> Result<(), Error> {
         let (schema, encoding, text) = STRING_SCHEMA;
         let channels = self.writer.mcap.add_schema(schema, encoding, text).and_then(|schema| {
             let none = Default::default();
@@ -64,7 +64,7 @@ impl Recorder {
             Ok((description, [joints(topics::MICROPHONE_JOINTS)?, joints(topics::SPEAKER_JOINTS)?]))
         });
         let (description, joints) = channels.map_err(|e| self.failed(system_cause(e)))?;
-        let message = cdr_string(&cell.urdf(name));
+        let message = cdr_string(&cell.to_urdf(name));
         // A run that is gone on with has it already.
         if !self.is_resumed {
             self.write(description, at, &message)?;
@@ -78,7 +78,7 @@ impl Recorder {
     ///
     /// # Errors
     /// [`Error::Write`].
-    pub fn stand(&mut self, at: Timestamp, joints: &[Joints; 2]) -> Result<(), Error> {
+    pub fn record_arm_frames(&mut self, at: Timestamp, joints: &[Joints; 2]) -> Result<(), Error> {
         let Some(cell) = self.arms.as_ref().filter(|_| !self.is_resumed).map(|arms| arms.cell.clone()) else {
             return Ok(());
         };
@@ -86,11 +86,11 @@ impl Recorder {
     }
 
     /// Records the joints of the microphone's and the speaker's arm, rad, and `/tf` of both arms' links. Without
-    /// [`Self::arms`] it records nothing.
+    /// [`Self::record_arms`] it records nothing.
     ///
     /// # Errors
     /// [`Error::Write`].
-    pub fn joints(&mut self, at: Timestamp, joints: &[Joints; 2]) -> Result<(), Error> {
+    pub fn record_joints(&mut self, at: Timestamp, joints: &[Joints; 2]) -> Result<(), Error> {
         let Some(Arms { cell, joints: channels, .. }) = &self.arms else { return Ok(()) };
         let (cell, channels) = (cell.clone(), *channels);
         self.foxglove(self.channels.tf, at, &scene::arm_frames(at, &cell, joints))?;

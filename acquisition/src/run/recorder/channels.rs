@@ -31,7 +31,7 @@ pub(super) struct Channels {
 
 impl Channels {
     /// Which chunks a channel's messages go to.
-    pub(super) fn part(&self, channel: u16) -> ChunkLane {
+    pub(super) fn chunk_lane(&self, channel: u16) -> ChunkLane {
         match channel {
             c if c == self.sweep || c == self.audio => ChunkLane::Sweeps,
             c if c == self.ir => ChunkLane::Responses,
@@ -58,7 +58,7 @@ impl Channels {
     }
 
     /// Declares every topic, so that a reader knows all of them whatever the run holds.
-    pub(super) fn register(writer: &mut Writer<impl Write + Seek>) -> McapResult<Self> {
+    pub(super) fn register_topics(writer: &mut Writer<impl Write + Seek>) -> McapResult<Self> {
         use foxglove::messages as fg;
         Ok(Self {
             tf: foxglove_channel::<fg::FrameTransforms>(writer, topics::TF)?,
@@ -80,7 +80,7 @@ impl Channels {
 pub(crate) fn own_channels() -> BTreeMap<u16, Arc<Channel<'static>>> {
     let mut file = Cursor::new(Vec::new());
     let written = Writer::new(&mut file).and_then(|mut writer| {
-        Channels::register(&mut writer)?;
+        Channels::register_topics(&mut writer)?;
         writer.finish()
     });
     // Memory is written without fail.

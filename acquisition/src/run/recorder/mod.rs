@@ -27,7 +27,7 @@ use echolake_schema::messages::{
 use echolake_schema::{ErrorCause, Rig, SurfaceRecord, Timestamp, samples, topics};
 use foxglove::Encode;
 
-use crate::disk::{folder_of, sync};
+use crate::disk::{folder_of, sync_to_disk};
 use channels::Channels;
 pub(crate) use channels::own_channels;
 pub use error::Error;
@@ -230,14 +230,14 @@ impl Recorder {
                 self.attach(at, &own_name(file.name), file.media_type, file.bytes)?;
             }
         }
-        self.channels = Channels::register(&mut self.writer.mcap).map_err(|e| self.failed(system_cause(e)))?;
+        self.channels = Channels::register_topics(&mut self.writer.mcap).map_err(|e| self.failed(system_cause(e)))?;
         if let (Some(relief), Some(glb)) = (&start.relief, glb) {
-            self.foxglove(self.channels.scene, at, &scene::panel(at, glb))?;
-            self.foxglove(self.channels.points, at, &scene::points(at, relief.heights))?;
+            self.foxglove(self.channels.scene, at, &scene::panel_scene(at, glb))?;
+            self.foxglove(self.channels.points, at, &scene::panel_points(at, relief.heights))?;
         }
         self.checkpoint()?;
         // The file's name, too, survives a power cut from here on.
-        sync(folder_of(&self.partial)).map_err(|e| self.failed(e.into()))
+        sync_to_disk(folder_of(&self.partial)).map_err(|e| self.failed(e.into()))
     }
 
     /// Lets `tap` hear every message from now on, and shows it the panel, which is in the file since its head.
@@ -251,10 +251,10 @@ impl Recorder {
             let time = u64::try_from(at.0).unwrap_or(0);
             let mut encoded = Vec::new();
             // A Vec grows, so encoding into it cannot fail.
-            let _ = scene::panel(at, mesh.to_bytes(MeshFormat::Glb)).encode(&mut encoded);
+            let _ = scene::panel_scene(at, mesh.to_bytes(MeshFormat::Glb)).encode(&mut encoded);
             tap.message(self.channels.scene, time, &encoded);
             encoded.clear();
-            let _ = scene::points(at, heights).encode(&mut encoded);
+            let _ = scene::panel_points(at, heights).encode(&mut encoded);
             tap.message(self.channels.points, time, &encoded);
         }
         self.tap = Some(tap);
@@ -278,10 +278,10 @@ impl Recorder {
     /// [`Error::Write`]; so do all methods below.
     pub fn poses(&mut self, at: Timestamp, microphone_mm: [f64; 3], speaker_mm: [f64; 3]) -> Result<(), Error> {
         if self.arms.is_none() {
-            self.foxglove(self.channels.tf, at, &scene::frames(at, microphone_mm, speaker_mm))?;
+            self.foxglove(self.channels.tf, at, &scene::tool_frames(at, microphone_mm, speaker_mm))?;
         }
-        self.foxglove(self.channels.microphone, at, &scene::pose(at, microphone_mm))?;
-        self.foxglove(self.channels.speaker, at, &scene::pose(at, speaker_mm))
+        self.foxglove(self.channels.microphone, at, &scene::pose_over_panel(at, microphone_mm))?;
+        self.foxglove(self.channels.speaker, at, &scene::pose_over_panel(at, speaker_mm))
     }
 
     /// Records a reading of the ambient sensor.
@@ -293,7 +293,7 @@ impl Recorder {
     pub fn sweep(&mut self, at: Timestamp, recording: &SweepRecording) -> Result<(), Error> {
         self.own(self.channels.sweep, at, recording)?;
         let rate = (recording.sample_rate_hz / SLOWER).round() as u32;
-        self.foxglove(self.channels.audio, at, &scene::audio(at, top_16_bits(recording), rate))?;
+        self.foxglove(self.channels.audio, at, &scene::sweep_audio(at, top_16_bits(recording), rate))?;
         self.end_large(ChunkLane::Sweeps)
     }
 
@@ -312,7 +312,7 @@ impl Recorder {
     /// Records a line of the run's log. The process's own log has it for debugging alone: commands tell their user.
     pub fn log(&mut self, at: Timestamp, level: LogLevel, name: &str, message: &str) -> Result<(), Error> {
         tracing::debug!(source = name, run_level = ?level, "{message}");
-        self.foxglove(self.channels.log, at, &scene::log(at, level, name, message))
+        self.foxglove(self.channels.log, at, &scene::log_message(at, level, name, message))
     }
 
     /// Ends the chunks and waits until they are on the disk: what was recorded survives a power cut, and may be
@@ -324,7 +324,7 @@ impl Recorder {
         let begun = Instant::now();
         self.writer.end_all().map_err(|e| self.failed(system_cause(e)))?;
         let written = Instant::now();
-        self.writer.sync().map_err(|e| self.failed(system_cause(e)))?;
+        self.writer.sync_chunks().map_err(|e| self.failed(system_cause(e)))?;
         self.cost.checkpoints += 1;
         self.cost.waited += written.elapsed();
         self.cost.busy += begun.elapsed();
@@ -384,7 +384,7 @@ impl Recorder {
         let log_time = u64::try_from(at.0).unwrap_or(0);
         self.sequence += 1;
         let header = MessageHeader { channel_id, sequence: self.sequence, log_time, publish_time: log_time };
-        self.writer.push(self.channels.part(channel_id), header, data);
+        self.writer.push_message(self.channels.chunk_lane(channel_id), header, data);
         self.cost.messages += 1;
         self.cost.bytes += data.len() as u64;
         self.cost.busy += begun.elapsed();

@@ -16,7 +16,7 @@ use prost::Message as _;
 
 use super::Recorder;
 use super::channels::Channels;
-use crate::disk::{folder_of, sync};
+use crate::disk::{folder_of, sync_to_disk};
 use crate::recovery::{Error, RecordingCopy, RecordingSurvey, is_end, lock};
 
 /// What the name of a recording ends in until it is whole.
@@ -63,9 +63,9 @@ impl Held {
     /// # Errors
     /// [`Error::Headless`] if it was broken off before its first checkpoint, [`Error::Unusable`] if its manifest cannot
     /// be read, [`Error::NoPlan`] if it was not begun as a run that can be resumed, or its plan or rig cannot be read.
-    pub fn read(partial: &Path) -> Result<Self, Error> {
-        let mut survey = RecordingSurvey::read(partial)?;
-        let manifest = survey.manifest(partial)?;
+    pub fn from_file(partial: &Path) -> Result<Self, Error> {
+        let mut survey = RecordingSurvey::from_file(partial)?;
+        let manifest = survey.run_manifest(partial)?;
         let no_plan = |source: ErrorCause| Error::NoPlan { path: partial.to_owned(), source };
         let rig = survey.rig.take().ok_or_else(|| no_plan("its rig is missing or damaged".into()))?;
         let rig = Rig::from_toml(&rig).map_err(|e| no_plan(e.into()))?;
@@ -75,10 +75,10 @@ impl Held {
         let mut walk = RecordingReader::open(partial)?;
         while let Some(item) = walk.next_item()? {
             if let RecordingItem::Chunk(chunk) = item {
-                chunk.records.iter().for_each(|record| seen.learn(record, &survey.channels));
+                chunk.records.iter().for_each(|record| seen.learn_record(record, &survey.channels));
             }
         }
-        let (lost, bytes) = survey.lost();
+        let (lost, bytes) = survey.loss_and_size();
         Ok(Self {
             plan,
             last: Timestamp(seen.last.max(manifest.started.0)),
@@ -86,7 +86,7 @@ impl Held {
             rig,
             attempts: seen.verdicts.len() as u64,
             times: seen.verdicts.iter().map(|(time, _)| *time).collect(),
-            pairs: seen.pairs(),
+            pairs: seen.pair_attempts(),
             bytes,
             damage: survey.damage().to_vec(),
             lost: lost.to_vec(),
@@ -100,7 +100,7 @@ impl Held {
     }
 
     /// Pairs with an accepted measurement: they are safe and are not measured again.
-    pub fn accepted(&self) -> usize {
+    pub fn accepted_count(&self) -> usize {
         self.pairs.values().filter(|pair| pair.accepted).count()
     }
 }
@@ -116,7 +116,7 @@ struct Seen {
 }
 
 impl Seen {
-    fn learn(&mut self, record: &Record<'_>, channels: &BTreeMap<u16, Arc<Channel<'static>>>) {
+    fn learn_record(&mut self, record: &Record<'_>, channels: &BTreeMap<u16, Arc<Channel<'static>>>) {
         let Record::Message { header, data } = record else { return };
         self.last = self.last.max(i64::try_from(header.log_time).unwrap_or(i64::MAX));
         match channels.get(&header.channel_id).map(|channel| channel.topic.as_str()) {
@@ -129,7 +129,7 @@ impl Seen {
     }
 
     // A verdict whose sweep and response are lost accepts nothing: the pair is measured again.
-    fn pairs(&self) -> BTreeMap<u32, PairAttempts> {
+    fn pair_attempts(&self) -> BTreeMap<u32, PairAttempts> {
         let mut pairs = BTreeMap::new();
         for (time, verdict) in &self.verdicts {
             let tried = pairs.entry(verdict.pair_id).or_insert(PairAttempts { attempts: 0, accepted: false });
@@ -146,9 +146,9 @@ impl Recorder {
     /// whatever happens.
     ///
     /// # Errors
-    /// As [`Held::read`]; [`Error::Busy`] where somebody records it, [`Error::Finished`] where the run is whole
+    /// As [`Held::from_file`]; [`Error::Busy`] where somebody records it, [`Error::Finished`] where the run is whole
     /// already, [`Error::Write`] where there is no room for the copy.
-    pub fn resume(partial: &Path) -> Result<(Self, Held), Error> {
+    pub fn resume_recording(partial: &Path) -> Result<(Self, Held), Error> {
         let path = partial.with_extension("");
         if partial.extension().is_none_or(|e| e != PARTIAL) {
             let source = "its name does not end in `.partial`: it is whole, or somebody else's".into();
@@ -159,9 +159,9 @@ impl Recorder {
         }
         // Held until the copy stands in its place.
         let _lock = lock(partial)?;
-        let held = Held::read(partial)?;
+        let held = Held::from_file(partial)?;
         let copy = path.with_extension("mcap.resuming");
-        match Self::behind(&held, partial, &path, &copy) {
+        match Self::resume_behind(&held, partial, &path, &copy) {
             Ok(recorder) => Ok((recorder, held)),
             Err(error) => {
                 // Whatever stands there is half a copy of what is whole elsewhere.
@@ -171,7 +171,7 @@ impl Recorder {
         }
     }
 
-    fn behind(held: &Held, partial: &Path, path: &Path, copy: &Path) -> Result<Self, Error> {
+    fn resume_behind(held: &Held, partial: &Path, path: &Path, copy: &Path) -> Result<Self, Error> {
         let failed = |source: ErrorCause| Error::Write { path: copy.to_owned(), source };
         let file = OpenOptions::new().write(true).create(true).truncate(true).open(copy);
         let file = file.map_err(|e| failed(e.into()))?;
@@ -184,14 +184,14 @@ impl Recorder {
             |part: ChunkLane, header: &MessageHeader| part == ChunkLane::Light || held.times.contains(&header.log_time);
         while let Some(item) = walk.next_item()? {
             if !is_end(&item) {
-                taken.take(item, &acknowledged).map_err(|e| failed(system_cause(e)))?;
+                taken.copy_item(item, &acknowledged).map_err(|e| failed(system_cause(e)))?;
             }
         }
         let sequence = taken.sequence;
-        let channels = Channels::register(&mut writer.mcap).map_err(|e| failed(system_cause(e)))?;
-        writer.sync().map_err(|e| failed(system_cause(e)))?;
+        let channels = Channels::register_topics(&mut writer.mcap).map_err(|e| failed(system_cause(e)))?;
+        writer.sync_chunks().map_err(|e| failed(system_cause(e)))?;
         std::fs::rename(copy, partial).map_err(|e| failed(e.into()))?;
-        sync(folder_of(partial)).map_err(|e| failed(e.into()))?;
+        sync_to_disk(folder_of(partial)).map_err(|e| failed(e.into()))?;
         Ok(Self::with(writer, path.to_owned(), PathBuf::from(partial), channels, sequence))
     }
 }

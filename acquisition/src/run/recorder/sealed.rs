@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use super::Error;
-use crate::disk::{folder_of, sync};
+use crate::disk::{folder_of, sync_to_disk};
 
 /// A recording that is whole and on the disk as `<path>.partial`. Dropped, it stays there.
 #[derive(Debug)]
@@ -31,7 +31,7 @@ impl Sealed {
             return Err(Error::Exists { path: self.path });
         }
         let renamed = std::fs::rename(&self.partial, &self.path);
-        match renamed.and_then(|()| sync(folder_of(&self.path))) {
+        match renamed.and_then(|()| sync_to_disk(folder_of(&self.path))) {
             Ok(()) => Ok(self.path),
             Err(e) => Err(Error::Write { path: self.path, partial: self.partial, source: e.into() }),
         }

@@ -210,14 +210,14 @@ fn viewers_see_metres_and_frames() {
 fn arms_are_shown_where_their_joints_are_known() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("run.mcap");
-    let arms = Choreography::of(&Rig::paper()).expect("a grid").expect("within reach");
+    let arms = Choreography::for_rig(&Rig::paper()).expect("a grid").expect("within reach");
     let at = START.plus_secs(1.0);
     begun(&path, |recorder| {
         let mut recorder = recorder.expect("a recorder");
-        recorder.arms(START, arms.cell(), "simulated & <odd>").expect("recorded");
+        recorder.record_arms(START, arms.cell(), "simulated & <odd>").expect("recorded");
         recorder.poses(at, MICROPHONE_MM, SPEAKER_MM).expect("recorded");
-        let stand = arms.standing(PairId(100)).expect("within reach");
-        recorder.joints(at, &[stand.microphone, stand.speaker]).expect("recorded");
+        let stand = arms.pose_at(PairId(100)).expect("within reach");
+        recorder.record_joints(at, &[stand.microphone, stand.speaker]).expect("recorded");
         recorder.finish(&end()).expect("finished");
     });
     let file = std::fs::read(&path).expect("the file");
@@ -237,7 +237,7 @@ fn arms_are_shown_where_their_joints_are_known() {
     }
     assert!(frames.iter().all(|f| links.contains(&f.parent_frame_id.as_str())));
 
-    let grid = Rig::paper().grid().expect("a grid");
+    let grid = Rig::paper().build_grid().expect("a grid");
     let pair = grid.pairs()[100];
     let joints = [topics::MICROPHONE_JOINTS, topics::SPEAKER_JOINTS].map(|t| shown::<fg::JointStates>(&file, t).joints);
     for (tool, point, joints) in [("microphone", pair.microphone, &joints[0]), ("speaker", pair.speaker, &joints[1])] {

@@ -7,14 +7,14 @@ use std::path::Path;
 use echolake_recording::{ChunkWriter, RecordingReader, prove_file};
 use echolake_schema::ErrorCause;
 
-use crate::disk::{folder_of, free_bytes, sync};
+use crate::disk::{folder_of, free_bytes, sync_to_disk};
 use crate::recovery::{RecordingCopy, RecordingSurvey};
 
 /// Puts a whole recording's messages into larger chunks. Until the copy is proven and on the disk the recording is as
 /// it was; so it is where an error is returned.
 pub(super) fn with_larger_chunks(partial: &Path, path: &Path) -> Result<(), ErrorCause> {
     let copy = path.with_extension("mcap.sealing");
-    let made = copied(partial, &copy);
+    let made = replace_by_copy(partial, &copy);
     if made.is_err() {
         // Half a copy of what is whole.
         let _ = std::fs::remove_file(&copy);
@@ -22,12 +22,12 @@ pub(super) fn with_larger_chunks(partial: &Path, path: &Path) -> Result<(), Erro
     made
 }
 
-fn copied(partial: &Path, copy: &Path) -> Result<(), ErrorCause> {
-    let survey = RecordingSurvey::read(partial)?;
+fn replace_by_copy(partial: &Path, copy: &Path) -> Result<(), ErrorCause> {
+    let survey = RecordingSurvey::from_file(partial)?;
     if let Some(damage) = survey.damage().first() {
         return Err(damage.clone().into());
     }
-    if free_bytes(folder_of(copy)).is_ok_and(|free| free < survey.lost().1) {
+    if free_bytes(folder_of(copy)).is_ok_and(|free| free < survey.loss_and_size().1) {
         return Err("there is no room for a copy".into());
     }
     let file = OpenOptions::new().write(true).create(true).truncate(true).open(copy)?;
@@ -35,13 +35,13 @@ fn copied(partial: &Path, copy: &Path) -> Result<(), ErrorCause> {
     let mut taken = RecordingCopy::new(&mut writer, &survey.channels);
     let mut walk = RecordingReader::open(partial)?;
     while let Some(item) = walk.next_item()? {
-        taken.take(item, &|_, _| true)?;
+        taken.copy_item(item, &|_, _| true)?;
     }
     writer.finish()?;
     prove_file(copy)?;
-    if RecordingSurvey::read(copy)?.counts != survey.counts {
+    if RecordingSurvey::from_file(copy)?.counts != survey.counts {
         return Err("the copy has other messages".into());
     }
     std::fs::rename(copy, partial)?;
-    Ok(sync(folder_of(partial))?)
+    Ok(sync_to_disk(folder_of(partial))?)
 }

@@ -7,8 +7,8 @@ use echolake_panel::relief::PanelRelief;
 
 use super::*;
 use crate::run::recorder::Held;
-use crate::run::simulate::simulate;
-use crate::run::{RunRequest, resume};
+use crate::run::simulate::run_simulation;
+use crate::run::{RunRequest, resume_run};
 use echolake_recording::prove_file;
 
 const SMALL_RIG: &str = include_str!("../../../../tests/fixtures/small_rig.toml");
@@ -44,15 +44,15 @@ fn a_run_that_is_stopped_is_gone_on_with() {
             pace: TakePace::Fast,
         };
         let measured = match &partial {
-            None => run(&rig, &specimen, folder.path()).measure(session),
-            Some(partial) => resume(partial, session),
+            None => run(&rig, &specimen, folder.path()).measure_run(session),
+            Some(partial) => resume_run(partial, session),
         };
         let measured = measured.expect("a session");
         left.push(measured.outcome.left);
         if measured.outcome.left == 0 {
             assert_eq!((measured.outcome.end.accepted, measured.outcome.end.rejected), (PAIRS, 0));
             assert_eq!(prove_file(&measured.path), Ok(()));
-            assert_eq!(Held::read(&measured.path).expect("the run").accepted() as u64, PAIRS);
+            assert_eq!(Held::from_file(&measured.path).expect("the run").accepted_count() as u64, PAIRS);
             break;
         }
         assert!(measured.path.extension().is_some_and(|e| e == "partial"), "{measured:?}");
@@ -68,7 +68,7 @@ fn a_run_that_nobody_goes_on_with_is_ended_where_it_is_stopped() {
     let (rig, specimen) = (Rig::from_toml(SMALL_RIG).expect("a rig"), flat());
     let folder = tempfile::tempdir().expect("a folder");
     let stop = AtomicBool::new(false);
-    let measured = simulate(&run(&rig, &specimen, folder.path()), Origin::Simulated, &stop, &mut |done| {
+    let measured = run_simulation(&run(&rig, &specimen, folder.path()), Origin::Simulated, &stop, &mut |done| {
         stop.store(done >= 3, Ordering::Relaxed);
     });
     let (path, end) = measured.expect("a run");

@@ -9,7 +9,7 @@ use pdf_writer::{Content, Filter, Finish as _, Name, Pdf, Rect, Ref, Str, TextSt
 
 use super::{ellipse_curves, text_offset};
 use crate::canvas::drawing::{DrawnShape, FigureDrawing, ShapeGeometry};
-use crate::canvas::font::{FONT, advance, face, glyphs};
+use crate::canvas::font::{FONT, font_face, glyph_advance, text_glyphs};
 
 /// Points (1/72 inch) per px.
 const POINTS: f32 = 0.75;
@@ -42,7 +42,7 @@ impl FigureDrawing {
     pub fn to_pdf(&self) -> io::Result<Vec<u8>> {
         let mut page = PdfPage { content: Content::new(), pictures: Vec::new(), opacities: Vec::new() };
         page.content.transform([POINTS, 0.0, 0.0, -POINTS, 0.0, self.height_px * POINTS]);
-        self.shapes.iter().for_each(|shape| page.draw(shape));
+        self.shapes.iter().for_each(|shape| page.draw_shape(shape));
         let PdfPage { content, pictures, opacities } = page;
         let mut pdf = Pdf::new();
         pdf.catalog(CATALOG).pages(PAGES);
@@ -68,13 +68,13 @@ impl FigureDrawing {
             pdf.ext_graphics(state_ref(opacity)).non_stroking_alpha(f32::from(opacity) / f32::from(OPACITIES));
         }
         for (place, (pixels, columns)) in pictures.iter().enumerate() {
-            let packed = compress(pixels)?;
+            let packed = compress_zlib(pixels)?;
             let mut image = pdf.image_xobject(picture_ref(place), &packed);
             image.filter(Filter::FlateDecode);
             image.width(*columns as i32).height((pixels.len() / columns) as i32).bits_per_component(8);
             image.color_space().device_gray();
         }
-        pdf.stream(CONTENTS, &compress(&content.finish())?).filter(Filter::FlateDecode);
+        pdf.stream(CONTENTS, &compress_zlib(&content.finish())?).filter(Filter::FlateDecode);
         write_font(&mut pdf)?;
         let notes = &self.notes;
         let mut info = pdf.document_info(INFO);
@@ -85,7 +85,7 @@ impl FigureDrawing {
     }
 }
 
-fn compress(bytes: &[u8]) -> io::Result<Vec<u8>> {
+fn compress_zlib(bytes: &[u8]) -> io::Result<Vec<u8>> {
     let mut encoder = ZlibEncoder::new(Vec::new(), Compression::default());
     encoder.write_all(bytes)?;
     encoder.finish()
@@ -115,7 +115,7 @@ struct PdfPage<'a> {
 }
 
 impl<'a> PdfPage<'a> {
-    fn draw(&mut self, shape: &'a DrawnShape) {
+    fn draw_shape(&mut self, shape: &'a DrawnShape) {
         self.content.save_state();
         if let Some(fill) = shape.fill {
             let [r, g, b] = fill.rgb().map(|part| f32::from(part) / 255.0);
@@ -136,7 +136,7 @@ impl<'a> PdfPage<'a> {
             }
             self.content.set_parameters(Name(&state_name(opacity)));
         }
-        self.outline(&shape.geometry);
+        self.draw_outline(&shape.geometry);
         match (&shape.geometry, shape.fill, shape.stroke) {
             (ShapeGeometry::Text { .. } | ShapeGeometry::Picture { .. }, ..) => {}
             (_, Some(_), Some(_)) => _ = self.content.fill_nonzero_and_stroke(),
@@ -147,7 +147,7 @@ impl<'a> PdfPage<'a> {
         self.content.restore_state();
     }
 
-    fn outline(&mut self, geometry: &'a ShapeGeometry) {
+    fn draw_outline(&mut self, geometry: &'a ShapeGeometry) {
         let content = &mut self.content;
         match geometry {
             ShapeGeometry::Rect { x, y, width, height } => _ = content.rect(*x, *y, *width, *height),
@@ -175,7 +175,7 @@ impl<'a> PdfPage<'a> {
             }
             ShapeGeometry::Text { at, text, size_px, anchor, upwards } => {
                 let offset = text_offset(text, *size_px, *anchor);
-                let codes: Vec<u8> = glyphs(text).flat_map(|glyph| glyph.0.to_be_bytes()).collect();
+                let codes: Vec<u8> = text_glyphs(text).flat_map(|glyph| glyph.0.to_be_bytes()).collect();
                 // y is downwards on the page, so letters are turned over again.
                 let matrix = if *upwards {
                     [0.0, -1.0, -1.0, 0.0, at[0], at[1] - offset]
@@ -194,14 +194,14 @@ impl<'a> PdfPage<'a> {
 }
 
 fn write_font(pdf: &mut Pdf) -> io::Result<()> {
-    let Some(face) = face() else { return Ok(()) };
+    let Some(face) = font_face() else { return Ok(()) };
     let mut font = pdf.type0_font(FONT_REF);
     font.base_font(BASE_FONT).encoding_predefined(Name(b"Identity-H")).descendant_font(CID_FONT).to_unicode(TO_UNICODE);
     font.finish();
     let mut cid = pdf.cid_font(CID_FONT);
     cid.subtype(CidFontType::Type2).base_font(BASE_FONT).system_info(SYSTEM).font_descriptor(DESCRIPTOR);
     cid.cid_to_gid_map_predefined(Name(b"Identity"));
-    let widths = (0..face.number_of_glyphs()).map(|glyph| 1000.0 * advance(ttf_parser::GlyphId(glyph)));
+    let widths = (0..face.number_of_glyphs()).map(|glyph| 1000.0 * glyph_advance(ttf_parser::GlyphId(glyph)));
     cid.widths().consecutive(0, widths);
     cid.finish();
     let milli = 1000.0 / f32::from(face.units_per_em());
@@ -214,7 +214,7 @@ fn write_font(pdf: &mut Pdf) -> io::Result<()> {
     descriptor.ascent(f32::from(face.ascender()) * milli).descent(f32::from(face.descender()) * milli);
     descriptor.cap_height(f32::from(face.capital_height().unwrap_or(0)) * milli);
     descriptor.finish();
-    let packed = compress(FONT)?;
+    let packed = compress_zlib(FONT)?;
     let mut file = pdf.stream(FONT_FILE, &packed);
     file.filter(Filter::FlateDecode).pair(Name(b"Length1"), FONT.len() as i32);
     file.finish();

@@ -8,7 +8,7 @@ use zeno::{Cap, Command, Join, Mask, Stroke, Style, Transform, Vector};
 
 use super::{ellipse_curves, text_offset};
 use crate::canvas::drawing::{DrawnShape, FigureColour, FigureDrawing, ShapeGeometry, StrokeStyle};
-use crate::canvas::font::{advance, face, glyphs, outline, text_width};
+use crate::canvas::font::{font_face, glyph_advance, outline_glyph, text_glyphs, text_width};
 use crate::canvas::picture::encode_png;
 
 /// Pixels per px of a drawing: 192 dots per inch.
@@ -37,10 +37,10 @@ impl FigureDrawing {
             let mut canvas = PixelStrip { pixels, scale, width, top, rows };
             let [first, last] = [top, top + rows].map(|row| row as f32 / scale);
             let shown = self.shapes.iter().zip(&extents).filter(|(_, [from, to])| *to >= first && *from <= last);
-            shown.for_each(|(shape, _)| canvas.draw(shape));
+            shown.for_each(|(shape, _)| canvas.draw_shape(shape));
             canvas.pixels.iter().map(|part| part.round() as u8).collect::<Vec<u8>>()
         });
-        encode_png(strips, [width, height], ColorType::Rgb, &self.notes.named())
+        encode_png(strips, [width, height], ColorType::Rgb, &self.notes.named_notes())
     }
 }
 
@@ -76,7 +76,7 @@ struct PixelStrip {
 }
 
 impl PixelStrip {
-    fn draw(&mut self, shape: &DrawnShape) {
+    fn draw_shape(&mut self, shape: &DrawnShape) {
         match (&shape.geometry, shape.fill) {
             (ShapeGeometry::Picture { x, y, side, pixels, columns }, _) => {
                 return self.draw_picture([*x, *y], *side, pixels, *columns);
@@ -87,7 +87,7 @@ impl PixelStrip {
             }
             (geometry, Some(fill)) => {
                 let (path, placed) = path_of(geometry);
-                self.cover(&path, placed, Style::default(), fill.rgb(), shape.opacity);
+                self.cover_path(&path, placed, Style::default(), fill.rgb(), shape.opacity);
             }
             (_, None) => {}
         }
@@ -99,11 +99,11 @@ impl PixelStrip {
             if dash_px > 0.0 {
                 stroke.dash(&dashes, 0.0);
             }
-            self.cover(&path, placed, stroke.into(), colour.rgb(), 1.0);
+            self.cover_path(&path, placed, stroke.into(), colour.rgb(), 1.0);
         }
     }
 
-    fn cover(&mut self, path: &[Command], placed: Transform, style: Style<'_>, rgb: [u8; 3], opacity: f32) {
+    fn cover_path(&mut self, path: &[Command], placed: Transform, style: Style<'_>, rgb: [u8; 3], opacity: f32) {
         let transform = placed.then_scale(self.scale, self.scale).then_translate(0.0, -(self.top as f32));
         let (coverage, place) = Mask::new(path).style(style).transform(Some(transform)).render();
         let columns = place.width as usize;
@@ -111,13 +111,13 @@ impl PixelStrip {
             let Ok(y) = usize::try_from(place.top + row as i32) else { continue };
             for (column, share) in line.iter().enumerate().filter(|(_, share)| **share > 0) {
                 if let Ok(x) = usize::try_from(place.left + column as i32) {
-                    self.blend(x, y, rgb, opacity * f32::from(*share) / 255.0);
+                    self.blend_pixel(x, y, rgb, opacity * f32::from(*share) / 255.0);
                 }
             }
         }
     }
 
-    fn blend(&mut self, x: usize, y: usize, rgb: [u8; 3], share: f32) {
+    fn blend_pixel(&mut self, x: usize, y: usize, rgb: [u8; 3], share: f32) {
         if x >= self.width || y >= self.rows {
             return;
         }
@@ -148,7 +148,7 @@ impl PixelStrip {
         for (row, column) in (0..count).flat_map(|row| (0..count).map(move |column| (row, column))) {
             let cell = (row * columns / count) * columns + column * columns / count;
             if let (Some(grey), Some(y)) = (pixels.get(cell), (top + row).checked_sub(self.top)) {
-                self.blend(left + column, y, [*grey; 3], 1.0);
+                self.blend_pixel(left + column, y, [*grey; 3], 1.0);
             }
         }
     }
@@ -172,11 +172,11 @@ fn path_of(geometry: &ShapeGeometry) -> (Vec<Command>, Transform) {
             placed = Transform::new(cos, sin, -sin, cos, centre[0], centre[1]);
         }
         ShapeGeometry::Text { at, text, size_px, anchor, upwards } => {
-            let em = face().map_or(0.0, |face| size_px / f32::from(face.units_per_em()));
+            let em = font_face().map_or(0.0, |face| size_px / f32::from(face.units_per_em()));
             let mut pen = GlyphPen { path, x: text_offset(text, *size_px, *anchor), em };
-            for glyph in glyphs(text) {
-                outline(glyph, &mut pen);
-                pen.x += advance(glyph) * size_px;
+            for glyph in text_glyphs(text) {
+                outline_glyph(glyph, &mut pen);
+                pen.x += glyph_advance(glyph) * size_px;
             }
             path = pen.path;
             placed = if *upwards {
@@ -208,26 +208,26 @@ struct GlyphPen {
 }
 
 impl GlyphPen {
-    fn at(&self, x: f32, y: f32) -> Vector {
+    fn point_at(&self, x: f32, y: f32) -> Vector {
         Vector::new(self.x + x * self.em, -y * self.em)
     }
 }
 
 impl OutlineBuilder for GlyphPen {
     fn move_to(&mut self, x: f32, y: f32) {
-        self.path.push(Command::MoveTo(self.at(x, y)));
+        self.path.push(Command::MoveTo(self.point_at(x, y)));
     }
 
     fn line_to(&mut self, x: f32, y: f32) {
-        self.path.push(Command::LineTo(self.at(x, y)));
+        self.path.push(Command::LineTo(self.point_at(x, y)));
     }
 
     fn quad_to(&mut self, x1: f32, y1: f32, x: f32, y: f32) {
-        self.path.push(Command::QuadTo(self.at(x1, y1), self.at(x, y)));
+        self.path.push(Command::QuadTo(self.point_at(x1, y1), self.point_at(x, y)));
     }
 
     fn curve_to(&mut self, x1: f32, y1: f32, x2: f32, y2: f32, x: f32, y: f32) {
-        self.path.push(Command::CurveTo(self.at(x1, y1), self.at(x2, y2), self.at(x, y)));
+        self.path.push(Command::CurveTo(self.point_at(x1, y1), self.point_at(x2, y2), self.point_at(x, y)));
     }
 
     fn close(&mut self) {
@@ -238,7 +238,7 @@ impl OutlineBuilder for GlyphPen {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::canvas::drawing::{TextAnchor, filled_rect, label};
+    use crate::canvas::drawing::{TextAnchor, filled_rect, ink_label};
     use crate::canvas::notes::FigureNotes;
     use crate::canvas::picture::tests::decode_png;
 
@@ -247,9 +247,9 @@ mod tests {
     fn strips_make_one_picture() {
         let mut tall = FigureDrawing::new(1500.0, 1500.0, &FigureNotes::default());
         let accent = FigureColour::Accent;
-        tall.add(filled_rect([10.0, 10.0], [20.0, 1480.0], accent));
+        tall.add_shape(filled_rect([10.0, 10.0], [20.0, 1480.0], accent));
         for row in 0..100 {
-            tall.add(label([40.0, 15.0 * row as f32], "M", TextAnchor::Start));
+            tall.add_shape(ink_label([40.0, 15.0 * row as f32], "M", TextAnchor::Start));
         }
         let (size, pixels) = decode_png(&tall.to_png().expect("a file"));
         assert_eq!(size, [3000, 3000]);

@@ -12,7 +12,7 @@ use datafusion::logical_expr::{
     Accumulator, AggregateUDF, AggregateUDFImpl, Documentation, EmitTo, GroupsAccumulator, Signature, Volatility,
 };
 
-use super::arguments::{CallArguments, check, coerced};
+use super::arguments::{CallArguments, check_arguments, coerced_types};
 use super::description::FunctionDescription;
 use super::scalar::identify_by_name;
 
@@ -25,37 +25,37 @@ pub(crate) trait AggregateKernel: Send + Sync + Clone + 'static {
     fn description(&self) -> &'static FunctionDescription;
 
     /// Returns the type of its answer; the arguments' types are already checked.
-    fn returns(&self, arguments: &[DataType]) -> DataType;
+    fn answer_type(&self, arguments: &[DataType]) -> DataType;
 
     /// Returns names and types of the state's columns, which are passed between the steps of a query.
-    fn state(&self) -> Vec<(&'static str, DataType)>;
+    fn state_columns(&self) -> Vec<(&'static str, DataType)>;
 
     /// Adds a batch of rows to the groups.
     ///
     /// # Errors
     /// If a value is invalid; the error names its row.
-    fn update(&self, arguments: &CallArguments<'_>, groups: &mut GroupStates<'_, Self>) -> Result<()>;
+    fn update_groups(&self, arguments: &CallArguments<'_>, groups: &mut GroupStates<'_, Self>) -> Result<()>;
 
     /// Merges states of other partial aggregations into the groups.
     ///
     /// # Errors
     /// If a state does not fit the one here.
-    fn merge(&self, states: &[ArrayRef], groups: &mut GroupStates<'_, Self>) -> Result<()>;
+    fn merge_states(&self, states: &[ArrayRef], groups: &mut GroupStates<'_, Self>) -> Result<()>;
 
     /// Returns the states, one row per group.
     ///
     /// # Errors
     /// If there are more values than an array can hold.
-    fn keep(&self, groups: &[Self::Group]) -> Result<Vec<ArrayRef>>;
+    fn group_states(&self, groups: &[Self::Group]) -> Result<Vec<ArrayRef>>;
 
     /// Returns the answers, one row per group.
     ///
     /// # Errors
     /// If there are more values than an array can hold.
-    fn answer(&self, groups: &[Self::Group], returns: &DataType) -> Result<ArrayRef>;
+    fn group_answers(&self, groups: &[Self::Group], returns: &DataType) -> Result<ArrayRef>;
 
     /// Returns the bytes that a group holds on the heap.
-    fn heap(_group: &Self::Group) -> usize {
+    fn heap_bytes(_group: &Self::Group) -> usize {
         0
     }
 }
@@ -71,14 +71,14 @@ pub(crate) struct GroupStates<'a, A: AggregateKernel> {
 
 impl<A: AggregateKernel> GroupStates<'_, A> {
     /// Updates the group of a row, unless the filter excludes the row.
-    pub(crate) fn at(&mut self, row: usize, change: impl FnOnce(&mut A::Group) -> Result<()>) -> Result<()> {
+    pub(crate) fn update_at(&mut self, row: usize, change: impl FnOnce(&mut A::Group) -> Result<()>) -> Result<()> {
         if self.filter.is_some_and(|filter| !filter.value(row) || arrow::array::Array::is_null(filter, row)) {
             return Ok(());
         }
         let Some(group) = self.all.get_mut(self.of.map_or(0, |of| of[row])) else { return Ok(()) };
-        let before = A::heap(group);
+        let before = A::heap_bytes(group);
         let done = change(group);
-        *self.heap += A::heap(group).saturating_sub(before);
+        *self.heap += A::heap_bytes(group).saturating_sub(before);
         done
     }
 }
@@ -99,8 +99,8 @@ struct Accumulated<A: AggregateKernel> {
 }
 
 /// Wraps the function for DataFusion.
-pub(crate) fn udaf(function: impl AggregateKernel) -> AggregateUDF {
-    let documentation = function.description().documentation();
+pub(crate) fn wrap_aggregate(function: impl AggregateKernel) -> AggregateUDF {
+    let documentation = function.description().build_documentation();
     AggregateUDF::new_from_impl(AggregateAdapter {
         function,
         signature: Signature::user_defined(Volatility::Immutable),
@@ -109,7 +109,7 @@ pub(crate) fn udaf(function: impl AggregateKernel) -> AggregateUDF {
 }
 
 impl<A: AggregateKernel> AggregateAdapter<A> {
-    fn accumulated(&self, args: &AccumulatorArgs<'_>) -> Result<Accumulated<A>> {
+    fn create_accumulated(&self, args: &AccumulatorArgs<'_>) -> Result<Accumulated<A>> {
         if args.is_distinct {
             let name = self.function.description().name;
             let hint = "take them from a subquery with SELECT DISTINCT";
@@ -130,21 +130,21 @@ impl<A: AggregateKernel> AggregateUDFImpl for AggregateAdapter<A> {
     }
 
     fn coerce_types(&self, types: &[DataType]) -> Result<Vec<DataType>> {
-        Ok(coerced(self.function.description(), types))
+        Ok(coerced_types(self.function.description(), types))
     }
 
     fn return_type(&self, types: &[DataType]) -> Result<DataType> {
-        check(self.function.description(), types)?;
-        Ok(self.function.returns(types))
+        check_arguments(self.function.description(), types)?;
+        Ok(self.function.answer_type(types))
     }
 
     fn state_fields(&self, args: StateFieldsArgs) -> Result<Vec<FieldRef>> {
         let field = |(name, kind)| Field::new(format_state_name(args.name, name), kind, true).into();
-        Ok(self.function.state().into_iter().map(field).collect())
+        Ok(self.function.state_columns().into_iter().map(field).collect())
     }
 
     fn accumulator(&self, args: AccumulatorArgs) -> Result<Box<dyn Accumulator>> {
-        let mut one = self.accumulated(&args)?;
+        let mut one = self.create_accumulated(&args)?;
         one.groups.push(A::Group::default());
         Ok(Box::new(one))
     }
@@ -154,7 +154,7 @@ impl<A: AggregateKernel> AggregateUDFImpl for AggregateAdapter<A> {
     }
 
     fn create_groups_accumulator(&self, args: AccumulatorArgs) -> Result<Box<dyn GroupsAccumulator>> {
-        Ok(Box::new(self.accumulated(&args)?))
+        Ok(Box::new(self.create_accumulated(&args)?))
     }
 
     fn documentation(&self) -> Option<&Documentation> {
@@ -163,48 +163,53 @@ impl<A: AggregateKernel> AggregateUDFImpl for AggregateAdapter<A> {
 }
 
 impl<A: AggregateKernel> Accumulated<A> {
-    fn update(&mut self, values: &[ArrayRef], of: Option<&[usize]>, filter: Option<&BooleanArray>) -> Result<()> {
+    fn update_groups(
+        &mut self,
+        values: &[ArrayRef],
+        of: Option<&[usize]>,
+        filter: Option<&BooleanArray>,
+    ) -> Result<()> {
         let Self { function, groups, heap, .. } = self;
-        let arguments = CallArguments::columns(function.description(), values);
-        function.update(&arguments, &mut GroupStates { all: groups, heap, of, filter })
+        let arguments = CallArguments::from_batch(function.description(), values);
+        function.update_groups(&arguments, &mut GroupStates { all: groups, heap, of, filter })
     }
 
-    fn merge(&mut self, states: &[ArrayRef], of: Option<&[usize]>) -> Result<()> {
+    fn merge_states(&mut self, states: &[ArrayRef], of: Option<&[usize]>) -> Result<()> {
         let Self { function, groups, heap, .. } = self;
-        function.merge(states, &mut GroupStates { all: groups, heap, of, filter: None })
+        function.merge_states(states, &mut GroupStates { all: groups, heap, of, filter: None })
     }
 
-    fn take(&mut self, emit: EmitTo) -> Vec<A::Group> {
+    fn take_groups(&mut self, emit: EmitTo) -> Vec<A::Group> {
         let taken = emit.take_needed(&mut self.groups);
-        self.heap -= taken.iter().map(A::heap).sum::<usize>().min(self.heap);
+        self.heap -= taken.iter().map(A::heap_bytes).sum::<usize>().min(self.heap);
         taken
     }
 
-    fn bytes(&self) -> usize {
+    fn held_bytes(&self) -> usize {
         size_of::<Self>() + self.groups.capacity() * size_of::<A::Group>() + self.heap
     }
 }
 
 impl<A: AggregateKernel> Accumulator for Accumulated<A> {
     fn update_batch(&mut self, values: &[ArrayRef]) -> Result<()> {
-        self.update(values, None, None)
+        self.update_groups(values, None, None)
     }
 
     fn merge_batch(&mut self, states: &[ArrayRef]) -> Result<()> {
-        self.merge(states, None)
+        self.merge_states(states, None)
     }
 
     fn evaluate(&mut self) -> Result<ScalarValue> {
-        ScalarValue::try_from_array(&self.function.answer(&self.groups, &self.returns)?, 0)
+        ScalarValue::try_from_array(&self.function.group_answers(&self.groups, &self.returns)?, 0)
     }
 
     fn state(&mut self) -> Result<Vec<ScalarValue>> {
-        let columns = self.function.keep(&self.groups)?;
+        let columns = self.function.group_states(&self.groups)?;
         columns.iter().map(|column| ScalarValue::try_from_array(column, 0)).collect()
     }
 
     fn size(&self) -> usize {
-        self.bytes()
+        self.held_bytes()
     }
 }
 
@@ -217,36 +222,36 @@ impl<A: AggregateKernel> GroupsAccumulator for Accumulated<A> {
         total: usize,
     ) -> Result<()> {
         self.groups.resize_with(total, A::Group::default);
-        self.update(values, Some(of), filter)
+        self.update_groups(values, Some(of), filter)
     }
 
     fn merge_batch(&mut self, states: &[ArrayRef], of: &[usize], total: usize) -> Result<()> {
         self.groups.resize_with(total, A::Group::default);
-        self.merge(states, Some(of))
+        self.merge_states(states, Some(of))
     }
 
     fn evaluate(&mut self, emit: EmitTo) -> Result<ArrayRef> {
-        let groups = self.take(emit);
-        self.function.answer(&groups, &self.returns)
+        let groups = self.take_groups(emit);
+        self.function.group_answers(&groups, &self.returns)
     }
 
     fn state(&mut self, emit: EmitTo) -> Result<Vec<ArrayRef>> {
-        let groups = self.take(emit);
-        self.function.keep(&groups)
+        let groups = self.take_groups(emit);
+        self.function.group_states(&groups)
     }
 
     fn convert_to_state(&self, values: &[ArrayRef], filter: Option<&BooleanArray>) -> Result<Vec<ArrayRef>> {
-        let arguments = CallArguments::columns(self.function.description(), values);
-        let of: Vec<usize> = (0..arguments.rows()).collect();
+        let arguments = CallArguments::from_batch(self.function.description(), values);
+        let of: Vec<usize> = (0..arguments.row_count()).collect();
         let mut groups = Vec::new();
         groups.resize_with(of.len(), A::Group::default);
         let rows = &mut GroupStates { all: &mut groups, heap: &mut 0, of: Some(&of), filter };
-        self.function.update(&arguments, rows)?;
-        self.function.keep(&groups)
+        self.function.update_groups(&arguments, rows)?;
+        self.function.group_states(&groups)
     }
 
     fn size(&self) -> usize {
-        self.bytes()
+        self.held_bytes()
     }
 }
 

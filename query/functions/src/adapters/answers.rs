@@ -11,13 +11,13 @@ use datafusion::error::{DataFusionError, Result};
 use super::arguments::{CallArguments, SampleElement};
 
 /// Builds one number per row; None is null.
-pub(crate) fn numbers(
+pub(crate) fn build_numbers(
     arguments: &CallArguments<'_>,
     mut number: impl FnMut(usize) -> Result<Option<f64>>,
 ) -> Result<ArrayRef> {
-    let mut values = Vec::with_capacity(arguments.rows());
-    let mut valid = NullBufferBuilder::new(arguments.rows());
-    for row in 0..arguments.rows() {
+    let mut values = Vec::with_capacity(arguments.row_count());
+    let mut valid = NullBufferBuilder::new(arguments.row_count());
+    for row in 0..arguments.row_count() {
         let value = if arguments.is_null(row) { None } else { number(row)? };
         values.push(value.unwrap_or_default());
         valid.append(value.is_some());
@@ -27,16 +27,16 @@ pub(crate) fn numbers(
 
 /// Builds one list per row, with a capacity of `room` values in all. `list` appends a row's values; if it returns
 /// false, the row is null.
-pub(crate) fn lists<T: SampleElement>(
+pub(crate) fn build_lists<T: SampleElement>(
     arguments: &CallArguments<'_>,
     room: usize,
     mut list: impl FnMut(usize, &mut Vec<T>) -> Result<bool>,
 ) -> Result<ArrayRef> {
     let mut values = Vec::with_capacity(room.min(i32::MAX as usize));
-    let mut offsets = Vec::with_capacity(arguments.rows() + 1);
-    let mut valid = NullBufferBuilder::new(arguments.rows());
+    let mut offsets = Vec::with_capacity(arguments.row_count() + 1);
+    let mut valid = NullBufferBuilder::new(arguments.row_count());
     offsets.push(0);
-    for row in 0..arguments.rows() {
+    for row in 0..arguments.row_count() {
         let start = values.len();
         let there = !arguments.is_null(row) && list(row, &mut values)?;
         if !there {
@@ -61,15 +61,15 @@ pub(crate) fn list_array<T: SampleElement>(
 }
 
 /// Builds one struct of numbers per row. `numbers` fills them; if it returns false, the row is null.
-pub(crate) fn structs(
+pub(crate) fn build_structs(
     arguments: &CallArguments<'_>,
     fields: &Fields,
     mut numbers: impl FnMut(usize, &mut [f64]) -> Result<bool>,
 ) -> Result<ArrayRef> {
-    let mut columns = vec![Vec::with_capacity(arguments.rows()); fields.len()];
-    let mut valid = NullBufferBuilder::new(arguments.rows());
+    let mut columns = vec![Vec::with_capacity(arguments.row_count()); fields.len()];
+    let mut valid = NullBufferBuilder::new(arguments.row_count());
     let mut values = vec![0.0; fields.len()];
-    for row in 0..arguments.rows() {
+    for row in 0..arguments.row_count() {
         let there = !arguments.is_null(row) && numbers(row, &mut values)?;
         valid.append(there);
         for (column, value) in columns.iter_mut().zip(&values) {
@@ -80,7 +80,7 @@ pub(crate) fn structs(
     // The fields' own arrays need the nulls, too: a field taken out of a null struct must be null.
     let column = |values: Vec<f64>| -> ArrayRef { Arc::new(Float64Array::new(values.into(), nulls.clone())) };
     let columns = columns.into_iter().map(column).collect();
-    Ok(Arc::new(StructArray::try_new_with_length(fields.clone(), columns, nulls, arguments.rows())?))
+    Ok(Arc::new(StructArray::try_new_with_length(fields.clone(), columns, nulls, arguments.row_count())?))
 }
 
 /// Returns the fields of a struct of numbers.
@@ -89,7 +89,7 @@ pub(crate) fn number_fields<'a>(names: impl IntoIterator<Item = &'a str>) -> Fie
 }
 
 /// Appends `by` default values and returns them.
-pub(crate) fn grow<T: SampleElement>(values: &mut Vec<T>, by: usize) -> &mut [T] {
+pub(crate) fn append_defaults<T: SampleElement>(values: &mut Vec<T>, by: usize) -> &mut [T] {
     let start = values.len();
     values.resize(start + by, T::default());
     &mut values[start..]

@@ -61,17 +61,17 @@ pub(crate) struct TextValues<'a> {
     constant: bool,
 }
 
-/// Returns the types to which a call's arguments are cast. Unsuitable types are kept: [`check`] refuses them.
-pub(crate) fn coerced(description: &FunctionDescription, types: &[DataType]) -> Vec<DataType> {
+/// Returns the types to which a call's arguments are cast. Unsuitable types are kept: [`check_arguments`] refuses them.
+pub(crate) fn coerced_types(description: &FunctionDescription, types: &[DataType]) -> Vec<DataType> {
     let kind = |i: usize| description.parameters.get(i).map(|p| p.kind);
     let samples = types.iter().enumerate().filter(|(i, _)| kind(*i) == Some(ArgumentKind::Samples));
-    let narrow = samples.clone().any(|(_, t)| element(t) == Some(&DataType::Float32))
+    let narrow = samples.clone().any(|(_, t)| element_type(t) == Some(&DataType::Float32))
         && samples
             .into_iter()
-            .all(|(_, t)| matches!(element(t), Some(DataType::Float32 | DataType::Null)) || t.is_null());
+            .all(|(_, t)| matches!(element_type(t), Some(DataType::Float32 | DataType::Null)) || t.is_null());
     let wanted = if narrow { DataType::Float32 } else { DataType::Float64 };
     let coerce = |(i, given): (usize, &DataType)| match kind(i) {
-        Some(ArgumentKind::Samples) if given.is_null() || element(given).is_some_and(is_number) => match given {
+        Some(ArgumentKind::Samples) if given.is_null() || element_type(given).is_some_and(is_number) => match given {
             DataType::List(child) if *child.data_type() == wanted => given.clone(),
             _ => list_of(wanted.clone()),
         },
@@ -83,28 +83,28 @@ pub(crate) fn coerced(description: &FunctionDescription, types: &[DataType]) -> 
     types.iter().enumerate().map(coerce).collect()
 }
 
-/// Checks the number of arguments and their types, after [`coerced`].
-pub(crate) fn check(description: &FunctionDescription, types: &[DataType]) -> Result<()> {
+/// Checks the number of arguments and their types, after [`coerced_types`].
+pub(crate) fn check_arguments(description: &FunctionDescription, types: &[DataType]) -> Result<()> {
     let (most, name) = (description.parameters.len(), description.name);
     if !(most - description.optional..=most).contains(&types.len()) {
         let given = match types.len() {
             1 => "1 argument is".to_owned(),
             count => format!("{count} arguments are"),
         };
-        return Err(DataFusionError::Plan(format!("`{name}`: {given} given; hint: {}", description.syntax())));
+        return Err(DataFusionError::Plan(format!("`{name}`: {given} given; hint: {}", description.call_syntax())));
     }
     for (i, (given, FunctionParameter { name: parameter, kind, about })) in
         types.iter().zip(description.parameters).enumerate()
     {
         let fits = match kind {
-            ArgumentKind::Samples => matches!(element(given), Some(DataType::Float32 | DataType::Float64)),
+            ArgumentKind::Samples => matches!(element_type(given), Some(DataType::Float32 | DataType::Float64)),
             ArgumentKind::Number => *given == DataType::Float64,
             ArgumentKind::Integer => *given == DataType::Int64,
             ArgumentKind::Text => *given == DataType::Utf8,
             ArgumentKind::Value => true,
         };
         if !fits {
-            let (i, words) = (i + 1, kind.words());
+            let (i, words) = (i + 1, kind.display_words());
             let message =
                 format!("`{name}`: argument {i}, `{parameter}`, is {given}, not {words}; hint: it is {about}");
             return Err(DataFusionError::Plan(message));
@@ -124,7 +124,7 @@ pub(crate) fn like(list: &DataType) -> DataType {
 }
 
 /// Returns the element type of a list.
-pub(crate) fn element(list: &DataType) -> Option<&DataType> {
+pub(crate) fn element_type(list: &DataType) -> Option<&DataType> {
     match list {
         DataType::List(child)
         | DataType::LargeList(child)
@@ -153,17 +153,17 @@ impl<'a> CallArguments<'a> {
             ColumnarValue::Array(array) => Ok(ArgumentColumn { array: array.clone(), constant: false }),
             ColumnarValue::Scalar(value) => Ok(ArgumentColumn { array: value.to_array_of_size(1)?, constant: true }),
         };
-        Ok(Self::of(description, values.iter().map(column).collect::<Result<_>>()?, rows))
+        Ok(Self::from_columns(description, values.iter().map(column).collect::<Result<_>>()?, rows))
     }
 
     /// Arguments from a batch of an aggregate's input.
-    pub(crate) fn columns(description: &'a FunctionDescription, arrays: &[ArrayRef]) -> Self {
+    pub(crate) fn from_batch(description: &'a FunctionDescription, arrays: &[ArrayRef]) -> Self {
         let rows = arrays.first().map_or(0, |a| a.len());
         let column = |array: &ArrayRef| ArgumentColumn { array: array.clone(), constant: false };
-        Self::of(description, arrays.iter().map(column).collect(), rows)
+        Self::from_columns(description, arrays.iter().map(column).collect(), rows)
     }
 
-    fn of(description: &'a FunctionDescription, columns: Vec<ArgumentColumn>, rows: usize) -> Self {
+    fn from_columns(description: &'a FunctionDescription, columns: Vec<ArgumentColumn>, rows: usize) -> Self {
         let nulls = columns.iter().fold(None, |nulls: Option<NullBuffer>, column| match column.constant {
             true if column.array.is_null(0) => Some(NullBuffer::new_null(rows)),
             true => nulls,
@@ -173,12 +173,12 @@ impl<'a> CallArguments<'a> {
     }
 
     /// Returns the number of rows of the answer.
-    pub(crate) fn rows(&self) -> usize {
+    pub(crate) fn row_count(&self) -> usize {
         self.rows
     }
 
     /// Returns the number of given arguments.
-    pub(crate) fn given(&self) -> usize {
+    pub(crate) fn argument_count(&self) -> usize {
         self.columns.len()
     }
 
@@ -188,7 +188,7 @@ impl<'a> CallArguments<'a> {
     }
 
     /// Returns an argument as lists of `T`.
-    pub(crate) fn samples<T: SampleElement>(&self, argument: usize) -> Result<SampleLists<'_, T>> {
+    pub(crate) fn sample_lists<T: SampleElement>(&self, argument: usize) -> Result<SampleLists<'_, T>> {
         let ArgumentColumn { array, constant } = &self.columns[argument];
         let list = array.as_list_opt::<i32>().ok_or_else(|| self.other_type(argument))?;
         let values = list.values().as_primitive_opt::<T::Arrow>().ok_or_else(|| self.other_type(argument))?;
@@ -203,35 +203,35 @@ impl<'a> CallArguments<'a> {
     }
 
     /// Returns an argument as numbers.
-    pub(crate) fn numbers(&self, argument: usize) -> Result<NumberValues<'_, f64>> {
+    pub(crate) fn number_values(&self, argument: usize) -> Result<NumberValues<'_, f64>> {
         let ArgumentColumn { array, constant } = &self.columns[argument];
         let values = array.as_primitive_opt::<Float64Type>().ok_or_else(|| self.other_type(argument))?;
         Ok(NumberValues { values: values.values(), constant: *constant })
     }
 
     /// Returns an argument as whole numbers.
-    pub(crate) fn integers(&self, argument: usize) -> Result<NumberValues<'_, i64>> {
+    pub(crate) fn integer_values(&self, argument: usize) -> Result<NumberValues<'_, i64>> {
         let ArgumentColumn { array, constant } = &self.columns[argument];
         let values = array.as_primitive_opt::<Int64Type>().ok_or_else(|| self.other_type(argument))?;
         Ok(NumberValues { values: values.values(), constant: *constant })
     }
 
     /// Returns an argument as texts.
-    pub(crate) fn texts(&self, argument: usize) -> Result<TextValues<'_>> {
+    pub(crate) fn text_values(&self, argument: usize) -> Result<TextValues<'_>> {
         let ArgumentColumn { array, constant } = &self.columns[argument];
         let values = array.as_string_opt::<i32>().ok_or_else(|| self.other_type(argument))?;
         Ok(TextValues { values, constant: *constant })
     }
 
     /// Returns the error for an invalid argument of a row, with a hint.
-    pub(crate) fn wrong(&self, argument: usize, row: usize, is: impl Debug, hint: &str) -> DataFusionError {
+    pub(crate) fn invalid_argument(&self, argument: usize, row: usize, is: impl Debug, hint: &str) -> DataFusionError {
         let (name, parameter) = (self.description.name, self.description.parameters[argument].name);
         let row = row + 1;
         DataFusionError::Execution(format!("`{name}`: `{parameter}` is {is:?} in row {row} of its batch; hint: {hint}"))
     }
 
     /// Returns the error for a row that a kernel refused.
-    pub(crate) fn refused(&self, row: usize, error: &echolake_dsp::Error) -> DataFusionError {
+    pub(crate) fn refused_row(&self, row: usize, error: &echolake_dsp::Error) -> DataFusionError {
         let hint = match error {
             echolake_dsp::Error::Length { .. } => "the lists of a row must be equally long",
             echolake_dsp::Error::NotFinite { .. } => {
@@ -249,14 +249,14 @@ impl<'a> CallArguments<'a> {
         DataFusionError::Execution(format!(
             "`{name}`: argument {} is {kind}; hint: {}",
             argument + 1,
-            self.description.syntax()
+            self.description.call_syntax()
         ))
     }
 }
 
 impl<'a, T> SampleLists<'a, T> {
     /// Returns the samples of a row that is not null.
-    pub(crate) fn at(&self, row: usize) -> Result<&'a [T]> {
+    pub(crate) fn samples_at(&self, row: usize) -> Result<&'a [T]> {
         let row = if self.constant { 0 } else { row };
         let offsets = self.list.value_offsets();
         let (from, to) = (offsets[row] as usize, offsets[row + 1] as usize);
@@ -267,7 +267,7 @@ impl<'a, T> SampleLists<'a, T> {
     }
 
     /// Returns the approximate number of samples of all rows, as capacity for an answer of the same size.
-    pub(crate) fn room(&self, rows: usize) -> usize {
+    pub(crate) fn sample_capacity(&self, rows: usize) -> usize {
         let offsets = self.list.value_offsets();
         let whole = (offsets[offsets.len() - 1] - offsets[0]) as usize;
         if self.constant { whole.saturating_mul(rows) } else { whole }
@@ -285,14 +285,14 @@ impl<'a, T> SampleLists<'a, T> {
 
 impl<N: Copy> NumberValues<'_, N> {
     /// Returns the number of a row that is not null.
-    pub(crate) fn at(&self, row: usize) -> N {
+    pub(crate) fn value_at(&self, row: usize) -> N {
         self.values[if self.constant { 0 } else { row }]
     }
 }
 
 impl TextValues<'_> {
     /// Returns the text of a row that is not null.
-    pub(crate) fn at(&self, row: usize) -> &str {
+    pub(crate) fn text_at(&self, row: usize) -> &str {
         self.values.value(if self.constant { 0 } else { row })
     }
 }

@@ -74,7 +74,7 @@ impl FunctionFamily {
 
 impl ArgumentKind {
     /// Returns a description for errors and the manual.
-    pub(crate) fn words(self) -> &'static str {
+    pub(crate) fn display_words(self) -> &'static str {
         match self {
             Self::Samples => "a list of numbers",
             Self::Number => "a number",
@@ -87,7 +87,7 @@ impl ArgumentKind {
 
 impl FunctionDescription {
     /// Returns the call syntax, `nce(ir, flat_energy[, centre_hz])`.
-    pub(crate) fn syntax(&self) -> String {
+    pub(crate) fn call_syntax(&self) -> String {
         let required = self.parameters.len() - self.optional;
         let mut text = format!("{}(", self.name);
         for (i, parameter) in self.parameters.iter().enumerate() {
@@ -103,12 +103,13 @@ impl FunctionDescription {
     }
 
     /// Returns DataFusion's form of the description.
-    pub(crate) fn documentation(&self) -> Documentation {
+    pub(crate) fn build_documentation(&self) -> Documentation {
         let section = DocSection { include: true, label: self.family.title(), description: None };
         let example = format!("```sql\n> {};\n{}\n```", self.example, self.answer);
-        let mut built = Documentation::builder(section, self.about, self.syntax()).with_sql_example(example);
+        let mut built = Documentation::builder(section, self.about, self.call_syntax()).with_sql_example(example);
         for parameter in self.parameters {
-            built = built.with_argument(parameter.name, format!("{}, {}", parameter.kind.words(), parameter.about));
+            built =
+                built.with_argument(parameter.name, format!("{}, {}", parameter.kind.display_words(), parameter.about));
         }
         self.related.iter().fold(built, |built, name| built.with_related_udf(*name)).build()
     }

@@ -22,7 +22,7 @@ impl<P> PerLength<P> {
     }
 
     /// Returns the plan for a length.
-    pub(crate) fn get(
+    pub(crate) fn plan_for(
         &mut self,
         len: usize,
         make: impl FnOnce(usize) -> Result<P, echolake_dsp::Error>,

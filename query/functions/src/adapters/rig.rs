@@ -14,19 +14,19 @@ pub(crate) struct RigFacts {
 }
 
 impl RigFacts {
-    pub(crate) fn of(rig: &Rig) -> Result<Self, Error> {
-        let grid: Grid = rig.grid()?;
+    pub(crate) fn from_rig(rig: &Rig) -> Result<Self, Error> {
+        let grid: Grid = rig.build_grid()?;
         Ok(Self {
             rate_hz: rig.sweep.rate_hz.get(),
             centres_hz: rig.bands.centres_hz.clone(),
             band_names: rig.band_names(),
-            points: Symmetry::ALL.map(|s| grid.permutation(s)).into(),
+            points: Symmetry::ALL.map(|s| grid.point_permutation(s)).into(),
             pairs: Symmetry::ALL.map(|s| grid.moved_pairs(s)).into(),
         })
     }
 
     /// Returns the band with this centre, within the rounding of decimals.
-    pub(crate) fn band(&self, centre_hz: f64) -> Option<usize> {
+    pub(crate) fn band_index(&self, centre_hz: f64) -> Option<usize> {
         self.centres_hz.iter().position(|hz| (hz / centre_hz - 1.0).abs() < 1e-3)
     }
 

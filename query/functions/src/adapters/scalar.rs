@@ -8,7 +8,7 @@ use datafusion::logical_expr::{
     ColumnarValue, Documentation, ScalarFunctionArgs, ScalarUDF, ScalarUDFImpl, Signature, Volatility,
 };
 
-use super::arguments::{CallArguments, SampleElement, check, coerced, element};
+use super::arguments::{CallArguments, SampleElement, check_arguments, coerced_types, element_type};
 use super::description::FunctionDescription;
 
 /// A function of the values of one row. A null argument makes the answer null.
@@ -17,13 +17,13 @@ pub(crate) trait ScalarKernel: Send + Sync + 'static {
     fn description(&self) -> &'static FunctionDescription;
 
     /// Returns the type of its answer; the arguments' types are already checked.
-    fn returns(&self, arguments: &[DataType]) -> DataType;
+    fn answer_type(&self, arguments: &[DataType]) -> DataType;
 
     /// Computes the answers for a batch; `T` is the element type of its first list, or f64.
     ///
     /// # Errors
     /// If a value is invalid; the error names its row.
-    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef>;
+    fn compute_answers<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef>;
 }
 
 /// Adapts a [`ScalarKernel`] to DataFusion's trait.
@@ -34,8 +34,8 @@ struct ScalarAdapter<F> {
 }
 
 /// Wraps the function for DataFusion.
-pub(crate) fn udf(function: impl ScalarKernel) -> ScalarUDF {
-    let documentation = function.description().documentation();
+pub(crate) fn wrap_scalar(function: impl ScalarKernel) -> ScalarUDF {
+    let documentation = function.description().build_documentation();
     ScalarUDF::new_from_impl(ScalarAdapter {
         function,
         signature: Signature::user_defined(Volatility::Immutable),
@@ -53,12 +53,12 @@ impl<F: ScalarKernel> ScalarUDFImpl for ScalarAdapter<F> {
     }
 
     fn coerce_types(&self, types: &[DataType]) -> Result<Vec<DataType>> {
-        Ok(coerced(self.function.description(), types))
+        Ok(coerced_types(self.function.description(), types))
     }
 
     fn return_type(&self, types: &[DataType]) -> Result<DataType> {
-        check(self.function.description(), types)?;
-        Ok(self.function.returns(types))
+        check_arguments(self.function.description(), types)?;
+        Ok(self.function.answer_type(types))
     }
 
     fn is_strict(&self) -> bool {
@@ -69,9 +69,13 @@ impl<F: ScalarKernel> ScalarUDFImpl for ScalarAdapter<F> {
         let constant = args.args.iter().all(|value| matches!(value, ColumnarValue::Scalar(_)));
         let rows = if constant { 1 } else { args.number_rows };
         let arguments = CallArguments::new(self.function.description(), &args.args, rows)?;
-        let narrow = args.args.iter().find_map(|value| element(&value.data_type()).cloned()) == Some(DataType::Float32);
-        let answer =
-            if narrow { self.function.call::<f32>(&arguments)? } else { self.function.call::<f64>(&arguments)? };
+        let narrow =
+            args.args.iter().find_map(|value| element_type(&value.data_type()).cloned()) == Some(DataType::Float32);
+        let answer = if narrow {
+            self.function.compute_answers::<f32>(&arguments)?
+        } else {
+            self.function.compute_answers::<f64>(&arguments)?
+        };
         Ok(if constant {
             ColumnarValue::Scalar(ScalarValue::try_from_array(&answer, 0)?)
         } else {

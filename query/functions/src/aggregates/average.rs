@@ -10,7 +10,7 @@ use echolake_dsp::mean::SignalMean;
 
 use crate::adapters::aggregate::{AggregateKernel, GroupStates};
 use crate::adapters::answers::list_array;
-use crate::adapters::arguments::{CallArguments, SampleElement, element, like, list_of};
+use crate::adapters::arguments::{CallArguments, SampleElement, element_type, like, list_of};
 use crate::adapters::description::{ArgumentKind, FunctionDescription, FunctionFamily, FunctionParameter};
 
 /// `avg_list`.
@@ -35,20 +35,20 @@ static DESCRIPTION: FunctionDescription = FunctionDescription {
 };
 
 impl AvgListFunction {
-    fn add<T: SampleElement>(arguments: &CallArguments<'_>, groups: &mut GroupStates<'_, Self>) -> Result<()> {
-        let lists = arguments.samples::<T>(0)?;
-        for row in (0..arguments.rows()).filter(|row| !arguments.is_null(*row)) {
-            let list = lists.at(row)?;
-            groups.at(row, |group| group.add(list).map_err(|e| arguments.refused(row, &e)))?;
+    fn add_lists<T: SampleElement>(arguments: &CallArguments<'_>, groups: &mut GroupStates<'_, Self>) -> Result<()> {
+        let lists = arguments.sample_lists::<T>(0)?;
+        for row in (0..arguments.row_count()).filter(|row| !arguments.is_null(*row)) {
+            let list = lists.samples_at(row)?;
+            groups.update_at(row, |group| group.add_signal(list).map_err(|e| arguments.refused_row(row, &e)))?;
         }
         Ok(())
     }
 
-    fn lists<T: SampleElement>(groups: &[SignalMean]) -> Result<ArrayRef> {
+    fn mean_lists<T: SampleElement>(groups: &[SignalMean]) -> Result<ArrayRef> {
         let mut values = Vec::new();
-        groups.iter().for_each(|group| values.extend(group.values().map(T::of)));
+        groups.iter().for_each(|group| values.extend(group.mean_values().map(T::of)));
         let nulls = NullBuffer::from_iter(groups.iter().map(|group| group.count() > 0));
-        Ok(Arc::new(list_array::<T>(values, offsets(groups)?, Some(nulls))?))
+        Ok(Arc::new(list_array::<T>(values, list_offsets(groups)?, Some(nulls))?))
     }
 }
 
@@ -59,28 +59,28 @@ impl AggregateKernel for AvgListFunction {
         &DESCRIPTION
     }
 
-    fn returns(&self, arguments: &[DataType]) -> DataType {
-        like(&arguments[0])
+    fn answer_type(&self, arguments: &[DataType]) -> DataType {
+        same_list_type(&arguments[0])
     }
 
-    fn state(&self) -> Vec<(&'static str, DataType)> {
+    fn state_columns(&self) -> Vec<(&'static str, DataType)> {
         vec![("sums", list_of(DataType::Float64)), ("count", DataType::UInt64)]
     }
 
-    fn update(&self, arguments: &CallArguments<'_>, groups: &mut GroupStates<'_, Self>) -> Result<()> {
-        match arguments.samples::<f32>(0) {
-            Ok(_) => Self::add::<f32>(arguments, groups),
-            Err(_) => Self::add::<f64>(arguments, groups),
+    fn update_groups(&self, arguments: &CallArguments<'_>, groups: &mut GroupStates<'_, Self>) -> Result<()> {
+        match arguments.sample_lists::<f32>(0) {
+            Ok(_) => Self::add_lists::<f32>(arguments, groups),
+            Err(_) => Self::add_lists::<f64>(arguments, groups),
         }
     }
 
-    fn merge(&self, states: &[ArrayRef], groups: &mut GroupStates<'_, Self>) -> Result<()> {
+    fn merge_states(&self, states: &[ArrayRef], groups: &mut GroupStates<'_, Self>) -> Result<()> {
         let (lists, counts) = (states[0].as_list::<i32>(), states[1].as_primitive::<UInt64Type>().values());
         let sums = lists.values().as_primitive::<Float64Type>().values();
         for (row, ends) in lists.value_offsets().windows(2).enumerate() {
             let sums = &sums[ends[0] as usize..ends[1] as usize];
-            groups.at(row, |group| {
-                let merged = group.merge(sums, counts[row]);
+            groups.update_at(row, |group| {
+                let merged = group.merge_sums(sums, counts[row]);
                 merged.map_err(|e| {
                     DataFusionError::Execution(format!("`avg_list`: {e}; hint: group by what has one length"))
                 })
@@ -89,25 +89,25 @@ impl AggregateKernel for AvgListFunction {
         Ok(())
     }
 
-    fn keep(&self, groups: &[SignalMean]) -> Result<Vec<ArrayRef>> {
+    fn group_states(&self, groups: &[SignalMean]) -> Result<Vec<ArrayRef>> {
         let sums: Vec<f64> = groups.iter().flat_map(|group| group.sums().iter().copied()).collect();
         let counts: UInt64Array = groups.iter().map(|group| Some(group.count())).collect();
-        Ok(vec![Arc::new(list_array::<f64>(sums, offsets(groups)?, None)?), Arc::new(counts)])
+        Ok(vec![Arc::new(list_array::<f64>(sums, list_offsets(groups)?, None)?), Arc::new(counts)])
     }
 
-    fn answer(&self, groups: &[SignalMean], returns: &DataType) -> Result<ArrayRef> {
-        match element(returns) {
-            Some(DataType::Float32) => Self::lists::<f32>(groups),
-            _ => Self::lists::<f64>(groups),
+    fn group_answers(&self, groups: &[SignalMean], returns: &DataType) -> Result<ArrayRef> {
+        match element_type(returns) {
+            Some(DataType::Float32) => Self::mean_lists::<f32>(groups),
+            _ => Self::mean_lists::<f64>(groups),
         }
     }
 
-    fn heap(group: &SignalMean) -> usize {
+    fn heap_bytes(group: &SignalMean) -> usize {
         size_of_val(group.sums())
     }
 }
 
-fn offsets(groups: &[SignalMean]) -> Result<Vec<i32>> {
+fn list_offsets(groups: &[SignalMean]) -> Result<Vec<i32>> {
     let ends = groups.iter().scan(0usize, |end, group| {
         *end += group.sums().len();
         Some(i32::try_from(*end))

@@ -45,30 +45,32 @@ impl AggregateKernel for P90MeanFunction {
         &DESCRIPTION
     }
 
-    fn returns(&self, _: &[DataType]) -> DataType {
+    fn answer_type(&self, _: &[DataType]) -> DataType {
         DataType::Float64
     }
 
-    fn state(&self) -> Vec<(&'static str, DataType)> {
+    fn state_columns(&self) -> Vec<(&'static str, DataType)> {
         vec![("values", list_of(DataType::Float64))]
     }
 
-    fn update(&self, arguments: &CallArguments<'_>, groups: &mut GroupStates<'_, Self>) -> Result<()> {
-        let values = arguments.numbers(0)?;
-        for row in (0..arguments.rows()).filter(|row| !arguments.is_null(*row) && values.at(*row).is_finite()) {
-            groups.at(row, |group| {
-                group.push(values.at(row));
+    fn update_groups(&self, arguments: &CallArguments<'_>, groups: &mut GroupStates<'_, Self>) -> Result<()> {
+        let values = arguments.number_values(0)?;
+        for row in
+            (0..arguments.row_count()).filter(|row| !arguments.is_null(*row) && values.value_at(*row).is_finite())
+        {
+            groups.update_at(row, |group| {
+                group.push(values.value_at(row));
                 Ok(())
             })?;
         }
         Ok(())
     }
 
-    fn merge(&self, states: &[ArrayRef], groups: &mut GroupStates<'_, Self>) -> Result<()> {
+    fn merge_states(&self, states: &[ArrayRef], groups: &mut GroupStates<'_, Self>) -> Result<()> {
         let lists = states[0].as_list::<i32>();
         let values = lists.values().as_primitive::<Float64Type>().values();
         for (row, ends) in lists.value_offsets().windows(2).enumerate() {
-            groups.at(row, |group| {
+            groups.update_at(row, |group| {
                 group.extend_from_slice(&values[ends[0] as usize..ends[1] as usize]);
                 Ok(())
             })?;
@@ -76,7 +78,7 @@ impl AggregateKernel for P90MeanFunction {
         Ok(())
     }
 
-    fn keep(&self, groups: &[Vec<f64>]) -> Result<Vec<ArrayRef>> {
+    fn group_states(&self, groups: &[Vec<f64>]) -> Result<Vec<ArrayRef>> {
         let mut offsets = vec![0];
         let mut end = 0usize;
         for group in groups {
@@ -88,12 +90,12 @@ impl AggregateKernel for P90MeanFunction {
         Ok(vec![Arc::new(list_array::<f64>(groups.concat(), offsets, None)?)])
     }
 
-    fn answer(&self, groups: &[Vec<f64>], _: &DataType) -> Result<ArrayRef> {
+    fn group_answers(&self, groups: &[Vec<f64>], _: &DataType) -> Result<ArrayRef> {
         let mut scratch = Vec::new();
         Ok(Arc::new(groups.iter().map(|group| p90_mean(group, &mut scratch)).collect::<Float64Array>()))
     }
 
-    fn heap(group: &Vec<f64>) -> usize {
+    fn heap_bytes(group: &Vec<f64>) -> usize {
         group.capacity() * size_of::<f64>()
     }
 }

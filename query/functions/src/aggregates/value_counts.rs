@@ -74,7 +74,7 @@ impl ValueCountFunction {
 
     fn new(answer: CountAnswer, description: &FunctionDescription) -> Self {
         let signature = Signature::any(1, Volatility::Immutable);
-        Self { answer, signature, documentation: description.documentation() }
+        Self { answer, signature, documentation: description.build_documentation() }
     }
 }
 
@@ -145,7 +145,7 @@ struct ValueCounts {
 }
 
 impl ValueCounts {
-    fn add(&mut self, values: &dyn Array, row: usize, count: i64) -> Result<()> {
+    fn add_value(&mut self, values: &dyn Array, row: usize, count: i64) -> Result<()> {
         let value = ScalarValue::try_from_array(values, row)?;
         if value.is_null() {
             return Ok(());
@@ -160,14 +160,14 @@ impl ValueCounts {
         Ok(())
     }
 
-    fn sorted(&self) -> Vec<(&ScalarValue, i64)> {
+    fn sorted_counts(&self) -> Vec<(&ScalarValue, i64)> {
         let mut sorted: Vec<_> = self.counts.iter().map(|(value, count)| (value, *count)).collect();
         sorted.sort_by(|(a, _), (b, _)| a.partial_cmp(b).unwrap_or(Ordering::Equal));
         sorted
     }
 
-    fn mode(&self) -> Result<ScalarValue> {
-        let sorted = self.sorted();
+    fn mode_value(&self) -> Result<ScalarValue> {
+        let sorted = self.sorted_counts();
         let most = sorted.iter().map(|(_, count)| *count).max();
         match sorted.into_iter().find(|(_, count)| Some(*count) == most) {
             Some((value, _)) => Ok(value.clone()),
@@ -175,8 +175,8 @@ impl ValueCounts {
         }
     }
 
-    fn histogram(&self) -> Result<ScalarValue> {
-        let sorted = self.sorted();
+    fn histogram_map(&self) -> Result<ScalarValue> {
+        let sorted = self.sorted_counts();
         if sorted.is_empty() {
             return ScalarValue::try_from(&DataType::Map(entries_field(&self.of), false));
         }
@@ -191,7 +191,7 @@ impl ValueCounts {
 
 impl Accumulator for ValueCounts {
     fn update_batch(&mut self, values: &[ArrayRef]) -> Result<()> {
-        (0..values[0].len()).try_for_each(|row| self.add(&values[0], row, 1))
+        (0..values[0].len()).try_for_each(|row| self.add_value(&values[0], row, 1))
     }
 
     fn merge_batch(&mut self, states: &[ArrayRef]) -> Result<()> {
@@ -199,14 +199,14 @@ impl Accumulator for ValueCounts {
         for row in 0..values.len() {
             let (values, counts) = (values.value(row), counts.value(row));
             let counts = counts.as_primitive::<Int64Type>();
-            (0..values.len()).try_for_each(|at| self.add(&values, at, counts.value(at)))?;
+            (0..values.len()).try_for_each(|at| self.add_value(&values, at, counts.value(at)))?;
         }
         Ok(())
     }
 
     fn state(&mut self) -> Result<Vec<ScalarValue>> {
         let (values, counts): (Vec<_>, Vec<_>) =
-            self.sorted().into_iter().map(|(value, count)| (value.clone(), ScalarValue::from(count))).unzip();
+            self.sorted_counts().into_iter().map(|(value, count)| (value.clone(), ScalarValue::from(count))).unzip();
         Ok(vec![
             ScalarValue::List(ScalarValue::new_list_nullable(&values, &self.of)),
             ScalarValue::List(ScalarValue::new_list_nullable(&counts, &DataType::Int64)),
@@ -215,8 +215,8 @@ impl Accumulator for ValueCounts {
 
     fn evaluate(&mut self) -> Result<ScalarValue> {
         match self.answer {
-            CountAnswer::Mode => self.mode(),
-            CountAnswer::Histogram => self.histogram(),
+            CountAnswer::Mode => self.mode_value(),
+            CountAnswer::Histogram => self.histogram_map(),
         }
     }
 

@@ -6,7 +6,7 @@ use datafusion::error::Result;
 use echolake_dsp::Error;
 use echolake_dsp::correlation::{CorrelationPlan, pearson};
 
-use crate::adapters::answers::numbers;
+use crate::adapters::answers::build_numbers;
 use crate::adapters::arguments::{CallArguments, SampleElement};
 use crate::adapters::description::{ArgumentKind, FunctionDescription, FunctionFamily, FunctionParameter};
 use crate::adapters::per_length::PerLength;
@@ -69,13 +69,15 @@ impl ScalarKernel for PearsonFunction {
         &PEARSON
     }
 
-    fn returns(&self, _: &[DataType]) -> DataType {
+    fn answer_type(&self, _: &[DataType]) -> DataType {
         DataType::Float64
     }
 
-    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
-        let (x, y) = (arguments.samples::<T>(0)?, arguments.samples::<T>(1)?);
-        numbers(arguments, |row| pearson(x.at(row)?, y.at(row)?).map_err(|e| arguments.refused(row, &e)))
+    fn compute_answers<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
+        let (x, y) = (arguments.sample_lists::<T>(0)?, arguments.sample_lists::<T>(1)?);
+        build_numbers(arguments, |row| {
+            pearson(x.samples_at(row)?, y.samples_at(row)?).map_err(|e| arguments.refused_row(row, &e))
+        })
     }
 }
 
@@ -84,28 +86,28 @@ impl ScalarKernel for SimilarityFunction {
         &SIMILARITY
     }
 
-    fn returns(&self, _: &[DataType]) -> DataType {
+    fn answer_type(&self, _: &[DataType]) -> DataType {
         DataType::Float64
     }
 
-    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
-        let (x, y) = (arguments.samples::<T>(0)?, arguments.samples::<T>(1)?);
+    fn compute_answers<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
+        let (x, y) = (arguments.sample_lists::<T>(0)?, arguments.sample_lists::<T>(1)?);
         let mut plans = PerLength::new(SIMILARITY.name);
-        numbers(arguments, |row| {
-            let (x, y) = (x.at(row)?, y.at(row)?);
+        build_numbers(arguments, |row| {
+            let (x, y) = (x.samples_at(row)?, y.samples_at(row)?);
             if x.len() != y.len() {
                 let error = Error::Length { what: "the second response", actual: y.len(), expected: x.len() };
-                return Err(arguments.refused(row, &error));
+                return Err(arguments.refused_row(row, &error));
             }
             if x.is_empty() {
                 return Ok(None);
             }
-            let (plan, scratch) = plans.get(x.len(), |len| {
+            let (plan, scratch) = plans.plan_for(x.len(), |len| {
                 let plan = CorrelationPlan::<T>::new(len)?;
-                let scratch = plan.scratch();
+                let scratch = plan.make_scratch();
                 Ok((plan, scratch))
             })?;
-            plan.similarity(x, y, scratch).map_err(|e| arguments.refused(row, &e))
+            plan.compute_similarity(x, y, scratch).map_err(|e| arguments.refused_row(row, &e))
         })
     }
 }

@@ -5,10 +5,10 @@ use std::sync::Arc;
 use arrow::array::{ArrayRef, AsArray as _, Float64Array, UInt64Array};
 use arrow::datatypes::{DataType, Float64Type, UInt64Type};
 use datafusion::error::Result;
-use echolake_dsp::diffusion::{DiffusionSums, diffusion};
+use echolake_dsp::diffusion::{DiffusionSums, diffusion_of_levels};
 
 use crate::adapters::aggregate::{AggregateKernel, GroupStates};
-use crate::adapters::answers::numbers;
+use crate::adapters::answers::build_numbers;
 use crate::adapters::arguments::{CallArguments, SampleElement};
 use crate::adapters::description::{ArgumentKind, FunctionDescription, FunctionFamily, FunctionParameter};
 use crate::adapters::scalar::ScalarKernel;
@@ -71,13 +71,13 @@ impl ScalarKernel for DiffusionFunction {
         &LIST
     }
 
-    fn returns(&self, _: &[DataType]) -> DataType {
+    fn answer_type(&self, _: &[DataType]) -> DataType {
         DataType::Float64
     }
 
-    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
-        let levels = arguments.samples::<T>(0)?;
-        numbers(arguments, |row| Ok(diffusion(levels.at(row)?)))
+    fn compute_answers<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
+        let levels = arguments.sample_lists::<T>(0)?;
+        build_numbers(arguments, |row| Ok(diffusion_of_levels(levels.samples_at(row)?)))
     }
 }
 
@@ -88,32 +88,32 @@ impl AggregateKernel for DiffusionCoefficientFunction {
         &ROWS
     }
 
-    fn returns(&self, _: &[DataType]) -> DataType {
+    fn answer_type(&self, _: &[DataType]) -> DataType {
         DataType::Float64
     }
 
-    fn state(&self) -> Vec<(&'static str, DataType)> {
+    fn state_columns(&self) -> Vec<(&'static str, DataType)> {
         let number = |name| (name, DataType::Float64);
         vec![("receivers", DataType::UInt64), number("loudest_db"), number("energy"), number("square")]
     }
 
-    fn update(&self, arguments: &CallArguments<'_>, groups: &mut GroupStates<'_, Self>) -> Result<()> {
-        let levels = arguments.numbers(0)?;
-        for row in (0..arguments.rows()).filter(|row| !arguments.is_null(*row)) {
-            groups.at(row, |group| {
-                group.add(levels.at(row));
+    fn update_groups(&self, arguments: &CallArguments<'_>, groups: &mut GroupStates<'_, Self>) -> Result<()> {
+        let levels = arguments.number_values(0)?;
+        for row in (0..arguments.row_count()).filter(|row| !arguments.is_null(*row)) {
+            groups.update_at(row, |group| {
+                group.add_level(levels.value_at(row));
                 Ok(())
             })?;
         }
         Ok(())
     }
 
-    fn merge(&self, states: &[ArrayRef], groups: &mut GroupStates<'_, Self>) -> Result<()> {
+    fn merge_states(&self, states: &[ArrayRef], groups: &mut GroupStates<'_, Self>) -> Result<()> {
         let receivers = states[0].as_primitive::<UInt64Type>().values();
         let [loudest, energy, square] = [1, 2, 3].map(|i| states[i].as_primitive::<Float64Type>().values());
         let parts = receivers.iter().zip(loudest).zip(energy.iter().zip(square));
         for (row, ((receivers, loudest), (energy, square))) in parts.enumerate() {
-            groups.at(row, |group| {
+            groups.update_at(row, |group| {
                 group.merge(&DiffusionSums::from_parts((*receivers, *loudest, *energy, *square)));
                 Ok(())
             })?;
@@ -121,7 +121,7 @@ impl AggregateKernel for DiffusionCoefficientFunction {
         Ok(())
     }
 
-    fn keep(&self, groups: &[DiffusionSums]) -> Result<Vec<ArrayRef>> {
+    fn group_states(&self, groups: &[DiffusionSums]) -> Result<Vec<ArrayRef>> {
         let parts = || groups.iter().map(DiffusionSums::parts);
         let number = |values: Vec<f64>| -> ArrayRef { Arc::new(Float64Array::from(values)) };
         Ok(vec![
@@ -132,7 +132,7 @@ impl AggregateKernel for DiffusionCoefficientFunction {
         ])
     }
 
-    fn answer(&self, groups: &[DiffusionSums], _: &DataType) -> Result<ArrayRef> {
+    fn group_answers(&self, groups: &[DiffusionSums], _: &DataType) -> Result<ArrayRef> {
         Ok(Arc::new(groups.iter().map(DiffusionSums::coefficient).collect::<Float64Array>()))
     }
 }

@@ -21,7 +21,7 @@ pub(crate) struct FresnelFunction;
 static FIELDS: LazyLock<Fields> =
     LazyLock::new(|| number_fields(["centre_x_mm", "centre_y_mm", "major_mm", "minor_mm"]));
 
-const fn mm(name: &'static str, about: &'static str) -> FunctionParameter {
+const fn number_parameter(name: &'static str, about: &'static str) -> FunctionParameter {
     FunctionParameter { name, kind: ArgumentKind::Number, about }
 }
 
@@ -32,14 +32,14 @@ static DESCRIPTION: FunctionDescription = FunctionDescription {
             most half a wavelength longer. A struct of its centre, `centre_x_mm` and `centre_y_mm`, and its diameters in the \
             plane of incidence, `major_mm`, and across it, `minor_mm`, in mm.",
     parameters: &[
-        mm("mic_x", "x of the microphone, mm"),
-        mm("mic_y", "y of the microphone, mm"),
-        mm("mic_z", "height of the microphone over the plane, mm, above 0"),
-        mm("speaker_x", "x of the speaker, mm"),
-        mm("speaker_y", "y of the speaker, mm"),
-        mm("speaker_z", "height of the speaker over the plane, mm, above 0"),
-        mm("frequency_hz", "frequency, Hz, above 0"),
-        mm("speed_m_s", "speed of sound, m/s, above 0; 343 if not given"),
+        number_parameter("mic_x", "x of the microphone, mm"),
+        number_parameter("mic_y", "y of the microphone, mm"),
+        number_parameter("mic_z", "height of the microphone over the plane, mm, above 0"),
+        number_parameter("speaker_x", "x of the speaker, mm"),
+        number_parameter("speaker_y", "y of the speaker, mm"),
+        number_parameter("speaker_z", "height of the speaker over the plane, mm, above 0"),
+        number_parameter("frequency_hz", "frequency, Hz, above 0"),
+        number_parameter("speed_m_s", "speed of sound, m/s, above 0; 343 if not given"),
     ],
     optional: 1,
     example: "select round(max(fresnel(m.x_mm, m.y_mm, m.z_mm, s.x_mm, s.y_mm, s.z_mm, 2000)['major_mm']), 1) as largest_mm \
@@ -58,19 +58,19 @@ impl ScalarKernel for FresnelFunction {
         &DESCRIPTION
     }
 
-    fn returns(&self, _: &[DataType]) -> DataType {
+    fn answer_type(&self, _: &[DataType]) -> DataType {
         DataType::Struct(FIELDS.clone())
     }
 
-    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
-        let given = (0..arguments.given()).map(|i| arguments.numbers(i)).collect::<Result<Vec<_>>>()?;
-        structs(arguments, &FIELDS, |row, out| {
+    fn compute_answers<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
+        let given = (0..arguments.argument_count()).map(|i| arguments.number_values(i)).collect::<Result<Vec<_>>>()?;
+        build_structs(arguments, &FIELDS, |row, out| {
             let mut values = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, SPEED_OF_SOUND];
             for (i, (value, given)) in values.iter_mut().zip(&given).enumerate() {
-                *value = given.at(row);
+                *value = given.value_at(row);
                 let positive = matches!(i, 2 | 5 | 6 | 7);
                 if !value.is_finite() || (positive && *value <= 0.0) {
-                    return Err(arguments.wrong(i, row, *value, DESCRIPTION.parameters[i].about));
+                    return Err(arguments.invalid_argument(i, row, *value, DESCRIPTION.parameters[i].about));
                 }
             }
             let [mx, my, mz, sx, sy, sz, hz, speed] = values;

@@ -5,7 +5,7 @@ use arrow::datatypes::DataType;
 use datafusion::error::Result;
 use echolake_dsp::temperature::speed_of_sound;
 
-use crate::adapters::answers::numbers;
+use crate::adapters::answers::build_numbers;
 use crate::adapters::arguments::{CallArguments, SampleElement};
 use crate::adapters::description::{ArgumentKind, FunctionDescription, FunctionFamily, FunctionParameter};
 use crate::adapters::scalar::ScalarKernel;
@@ -41,15 +41,15 @@ impl ScalarKernel for SpeedOfSoundFunction {
         &DESCRIPTION
     }
 
-    fn returns(&self, _: &[DataType]) -> DataType {
+    fn answer_type(&self, _: &[DataType]) -> DataType {
         DataType::Float64
     }
 
-    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
-        let celsius = arguments.numbers(0)?;
-        numbers(arguments, |row| match celsius.at(row) {
+    fn compute_answers<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
+        let celsius = arguments.number_values(0)?;
+        build_numbers(arguments, |row| match celsius.value_at(row) {
             celsius if celsius < ABSOLUTE_ZERO => {
-                Err(arguments.wrong(0, row, celsius, "it is in degrees Celsius, -273.15 or more"))
+                Err(arguments.invalid_argument(0, row, celsius, "it is in degrees Celsius, -273.15 or more"))
             }
             celsius => Ok(Some(speed_of_sound(celsius))),
         })

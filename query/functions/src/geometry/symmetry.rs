@@ -6,10 +6,10 @@ use arrow::array::{ArrayRef, BooleanArray, Int32Array, StructArray};
 use arrow::buffer::NullBuffer;
 use arrow::datatypes::{DataType, Field, Fields};
 use datafusion::error::{DataFusionError, Result};
-use echolake_dsp::heights::moved;
+use echolake_dsp::heights::move_heights;
 use echolake_schema::Symmetry;
 
-use crate::adapters::answers::{grow, lists, number_fields, structs};
+use crate::adapters::answers::{append_defaults, lists, number_fields, structs};
 use crate::adapters::arguments::{CallArguments, SampleElement, TextValues, like};
 use crate::adapters::description::{ArgumentKind, FunctionDescription, FunctionFamily, FunctionParameter};
 use crate::adapters::rig::RigFacts;
@@ -124,19 +124,31 @@ static D4_HEIGHTMAP: FunctionDescription = FunctionDescription {
 };
 
 /// Returns the symmetry of a row.
-fn symmetry(arguments: &CallArguments<'_>, texts: &TextValues<'_>, argument: usize, row: usize) -> Result<Symmetry> {
-    let name = texts.at(row);
+fn row_symmetry(
+    arguments: &CallArguments<'_>,
+    texts: &TextValues<'_>,
+    argument: usize,
+    row: usize,
+) -> Result<Symmetry> {
+    let name = texts.text_at(row);
     let found = Symmetry::ALL.into_iter().find(|s| s.name() == name);
-    found.ok_or_else(|| arguments.wrong(argument, row, name, SYMMETRY.about))
+    found.ok_or_else(|| arguments.invalid_argument(argument, row, name, SYMMETRY.about))
 }
 
 /// Returns the image of a row's point or pair, out of the images of all.
 fn of_all<'a, M>(arguments: &CallArguments<'_>, row: usize, id: i64, all: Option<&'a [M]>) -> Result<&'a M> {
     let Some(all) = all else {
-        return Err(arguments.wrong(1, row, "no symmetry of the lake's grid", "table points lists the grid"));
+        return Err(arguments.invalid_argument(
+            1,
+            row,
+            "no symmetry of the lake's grid",
+            "table points lists the grid",
+        ));
     };
     let found = usize::try_from(id).ok().and_then(|id| all.get(id));
-    found.ok_or_else(|| arguments.wrong(0, row, id, &format!("the lake has 0 to {}", all.len().saturating_sub(1))))
+    found.ok_or_else(|| {
+        arguments.invalid_argument(0, row, id, &format!("the lake has 0 to {}", all.len().saturating_sub(1)))
+    })
 }
 
 impl ScalarKernel for D4PositionFunction {
@@ -144,14 +156,15 @@ impl ScalarKernel for D4PositionFunction {
         &D4_POSITION
     }
 
-    fn returns(&self, _: &[DataType]) -> DataType {
+    fn answer_type(&self, _: &[DataType]) -> DataType {
         DataType::Struct(POSITION_FIELDS.clone())
     }
 
-    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
-        let (x, y, names) = (arguments.numbers(0)?, arguments.numbers(1)?, arguments.texts(2)?);
-        structs(arguments, &POSITION_FIELDS, |row, out| {
-            let [x, y, _] = symmetry(arguments, &names, 2, row)?.apply([x.at(row), y.at(row), 0.0]);
+    fn compute_answers<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
+        let (x, y, names) = (arguments.number_values(0)?, arguments.number_values(1)?, arguments.text_values(2)?);
+        build_structs(arguments, &POSITION_FIELDS, |row, out| {
+            let [x, y, _] =
+                row_symmetry(arguments, &names, 2, row)?.move_position([x.value_at(row), y.value_at(row), 0.0]);
             // 0 x -5 is -0, which reads oddly.
             out.copy_from_slice(&[x + 0.0, y + 0.0]);
             Ok(true)
@@ -164,20 +177,20 @@ impl ScalarKernel for D4PointFunction {
         &D4_POINT
     }
 
-    fn returns(&self, _: &[DataType]) -> DataType {
+    fn answer_type(&self, _: &[DataType]) -> DataType {
         DataType::Int32
     }
 
-    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
-        let (ids, names) = (arguments.integers(0)?, arguments.texts(1)?);
+    fn compute_answers<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
+        let (ids, names) = (arguments.integer_values(0)?, arguments.text_values(1)?);
         let point = |row| {
             if arguments.is_null(row) {
                 return Ok(None);
             }
-            let symmetry = symmetry(arguments, &names, 1, row)?;
-            of_all(arguments, row, ids.at(row), self.0.moved_points(symmetry)).map(|p| Some(p.0 as i32))
+            let symmetry = row_symmetry(arguments, &names, 1, row)?;
+            of_all(arguments, row, ids.value_at(row), self.0.moved_points(symmetry)).map(|p| Some(p.0 as i32))
         };
-        Ok(Arc::new((0..arguments.rows()).map(point).collect::<Result<Int32Array>>()?))
+        Ok(Arc::new((0..arguments.row_count()).map(point).collect::<Result<Int32Array>>()?))
     }
 }
 
@@ -186,20 +199,20 @@ impl ScalarKernel for D4PairFunction {
         &D4_PAIR
     }
 
-    fn returns(&self, _: &[DataType]) -> DataType {
+    fn answer_type(&self, _: &[DataType]) -> DataType {
         DataType::Struct(PAIR_FIELDS.clone())
     }
 
-    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
-        let (ids, names) = (arguments.integers(0)?, arguments.texts(1)?);
+    fn compute_answers<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
+        let (ids, names) = (arguments.integer_values(0)?, arguments.text_values(1)?);
         let pair = |row| {
             if arguments.is_null(row) {
                 return Ok(None);
             }
-            let symmetry = symmetry(arguments, &names, 1, row)?;
-            of_all(arguments, row, ids.at(row), self.0.moved_pairs(symmetry)).map(Some)
+            let symmetry = row_symmetry(arguments, &names, 1, row)?;
+            of_all(arguments, row, ids.value_at(row), self.0.moved_pairs(symmetry)).map(Some)
         };
-        let moved = (0..arguments.rows()).map(pair).collect::<Result<Vec<_>, DataFusionError>>()?;
+        let moved = (0..arguments.row_count()).map(pair).collect::<Result<Vec<_>, DataFusionError>>()?;
         let pairs: Int32Array = moved.iter().map(|m| m.map(|m| m.pair.id.0 as i32)).collect();
         let swapped: BooleanArray = moved.iter().map(|m| m.map(|m| m.swapped)).collect();
         let nulls = NullBuffer::from_iter(moved.iter().map(Option::is_some));
@@ -213,15 +226,15 @@ impl ScalarKernel for D4HeightmapFunction {
         &D4_HEIGHTMAP
     }
 
-    fn returns(&self, arguments: &[DataType]) -> DataType {
-        like(&arguments[0])
+    fn answer_type(&self, arguments: &[DataType]) -> DataType {
+        same_list_type(&arguments[0])
     }
 
-    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
-        let (maps, names) = (arguments.samples::<T>(0)?, arguments.texts(1)?);
-        lists::<T>(arguments, maps.room(arguments.rows()), |row, out| {
-            let (map, symmetry) = (maps.at(row)?, symmetry(arguments, &names, 1, row)?);
-            moved(map, symmetry, grow(out, map.len())).map_err(|e| arguments.refused(row, &e))?;
+    fn compute_answers<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
+        let (maps, names) = (arguments.sample_lists::<T>(0)?, arguments.text_values(1)?);
+        build_lists::<T>(arguments, maps.sample_capacity(arguments.row_count()), |row, out| {
+            let (map, symmetry) = (maps.samples_at(row)?, row_symmetry(arguments, &names, 1, row)?);
+            move_heights(map, symmetry, append_defaults(out, map.len())).map_err(|e| arguments.refused_row(row, &e))?;
             Ok(true)
         })
     }

@@ -55,7 +55,7 @@ impl BandEnergyFunction {
     }
 
     /// Returns a function that writes a row's energies into a slice; it returns false if the row has no samples.
-    fn energies<'a, T: SampleElement>(
+    fn energy_writer<'a, T: SampleElement>(
         &'a self,
         arguments: &'a CallArguments<'_>,
         ir: &'a SampleLists<'a, T>,
@@ -63,16 +63,16 @@ impl BandEnergyFunction {
         let RigFacts { rate_hz, centres_hz, .. } = &*self.facts;
         let mut plans = PerLength::new(DESCRIPTION.name);
         move |row, energies| {
-            let ir = ir.at(row)?;
+            let ir = ir.samples_at(row)?;
             if ir.is_empty() {
                 return Ok(false);
             }
-            let (plan, scratch) = plans.get(ir.len(), |len| {
+            let (plan, scratch) = plans.plan_for(ir.len(), |len| {
                 let plan = FilterBankPlan::<T>::new(len, *rate_hz, centres_hz)?;
-                let scratch = plan.scratch();
+                let scratch = plan.make_scratch();
                 Ok((plan, scratch))
             })?;
-            plan.energies(ir, energies, scratch).map_err(|e| arguments.refused(row, &e))?;
+            plan.compute_energies(ir, energies, scratch).map_err(|e| arguments.refused_row(row, &e))?;
             Ok(true)
         }
     }
@@ -83,25 +83,25 @@ impl ScalarKernel for BandEnergyFunction {
         &DESCRIPTION
     }
 
-    fn returns(&self, arguments: &[DataType]) -> DataType {
+    fn answer_type(&self, arguments: &[DataType]) -> DataType {
         if arguments.len() > 1 { DataType::Float64 } else { DataType::Struct(self.fields.clone()) }
     }
 
-    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
-        let (ir, bands) = (arguments.samples::<T>(0)?, self.facts.centres_hz.len());
-        let mut energies = self.energies(arguments, &ir);
-        if arguments.given() == 1 {
-            return structs(arguments, &self.fields, |row, values| {
+    fn compute_answers<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
+        let (ir, bands) = (arguments.sample_lists::<T>(0)?, self.facts.centres_hz.len());
+        let mut energies = self.energy_writer(arguments, &ir);
+        if arguments.argument_count() == 1 {
+            return build_structs(arguments, &self.fields, |row, values| {
                 let there = energies(row, &mut values[..bands])?;
                 values[bands] = values[..bands].iter().sum();
                 Ok(there)
             });
         }
-        let (centre, mut all) = (arguments.numbers(1)?, vec![0.0; bands]);
-        numbers(arguments, |row| {
-            let centre = centre.at(row);
-            let band = self.facts.band(centre);
-            let band = band.ok_or_else(|| arguments.wrong(1, row, centre, &self.facts.bands_hint()))?;
+        let (centre, mut all) = (arguments.number_values(1)?, vec![0.0; bands]);
+        build_numbers(arguments, |row| {
+            let centre = centre.value_at(row);
+            let band = self.facts.band_index(centre);
+            let band = band.ok_or_else(|| arguments.invalid_argument(1, row, centre, &self.facts.bands_hint()))?;
             Ok(energies(row, &mut all)?.then(|| all[band]))
         })
     }

@@ -8,7 +8,7 @@ use datafusion::error::Result;
 use echolake_dsp::arrival::first_arrival;
 use echolake_dsp::decay::energy_decay_db;
 
-use crate::adapters::answers::{grow, lists, numbers};
+use crate::adapters::answers::{append_defaults, build_lists, build_numbers};
 use crate::adapters::arguments::{CallArguments, SampleElement, like};
 use crate::adapters::description::{ArgumentKind, FunctionDescription, FunctionFamily, FunctionParameter};
 use crate::adapters::rig::RigFacts;
@@ -70,15 +70,15 @@ impl ScalarKernel for EdcFunction {
         &EDC
     }
 
-    fn returns(&self, arguments: &[DataType]) -> DataType {
-        like(&arguments[0])
+    fn answer_type(&self, arguments: &[DataType]) -> DataType {
+        same_list_type(&arguments[0])
     }
 
-    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
-        let ir = arguments.samples::<T>(0)?;
-        lists::<T>(arguments, ir.room(arguments.rows()), |row, out| {
-            let ir = ir.at(row)?;
-            let there = energy_decay_db(ir, grow(out, ir.len()));
+    fn compute_answers<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
+        let ir = arguments.sample_lists::<T>(0)?;
+        build_lists::<T>(arguments, ir.sample_capacity(arguments.row_count()), |row, out| {
+            let ir = ir.samples_at(row)?;
+            let there = energy_decay_db(ir, append_defaults(out, ir.len()));
             if there { Ok(true) } else { require_finite(arguments, row, ir).map(|()| false) }
         })
     }
@@ -89,17 +89,22 @@ impl ScalarKernel for ArrivalFunction {
         &ARRIVAL
     }
 
-    fn returns(&self, _: &[DataType]) -> DataType {
+    fn answer_type(&self, _: &[DataType]) -> DataType {
         DataType::Float64
     }
 
-    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
-        let ir = arguments.samples::<T>(0)?;
-        let threshold = if arguments.given() > 1 { Some(arguments.numbers(1)?) } else { None };
-        numbers(arguments, |row| {
-            let (ir, threshold) = (ir.at(row)?, threshold.as_ref().map_or(ARRIVAL_DB, |t| t.at(row)));
+    fn compute_answers<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
+        let ir = arguments.sample_lists::<T>(0)?;
+        let threshold = if arguments.argument_count() > 1 { Some(arguments.number_values(1)?) } else { None };
+        build_numbers(arguments, |row| {
+            let (ir, threshold) = (ir.samples_at(row)?, threshold.as_ref().map_or(ARRIVAL_DB, |t| t.value_at(row)));
             if !(threshold <= 0.0) {
-                return Err(arguments.wrong(1, row, threshold, "it is relative to the greatest sample: 0 dB or less"));
+                return Err(arguments.invalid_argument(
+                    1,
+                    row,
+                    threshold,
+                    "it is relative to the greatest sample: 0 dB or less",
+                ));
             }
             match first_arrival(ir, threshold) {
                 Some(samples) => Ok(Some(samples / self.0.rate_hz * 1e3)),
@@ -114,5 +119,5 @@ pub(crate) fn require_finite<T: SampleElement>(arguments: &CallArguments<'_>, ro
     if ir.iter().all(|x| x.f64().is_finite()) {
         return Ok(());
     }
-    Err(arguments.refused(row, &echolake_dsp::Error::NotFinite { what: "the response" }))
+    Err(arguments.refused_row(row, &echolake_dsp::Error::NotFinite { what: "the response" }))
 }

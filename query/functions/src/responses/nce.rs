@@ -8,7 +8,7 @@ use datafusion::error::Result;
 use echolake_dsp::energy::cumulate_whole;
 use echolake_dsp::filter_bank::FilterBankPlan;
 
-use crate::adapters::answers::{grow, lists};
+use crate::adapters::answers::{append_defaults, build_lists};
 use crate::adapters::arguments::{CallArguments, SampleElement, like};
 use crate::adapters::description::{ArgumentKind, FunctionDescription, FunctionFamily, FunctionParameter};
 use crate::adapters::per_length::PerLength;
@@ -53,36 +53,36 @@ impl ScalarKernel for NceFunction {
         &DESCRIPTION
     }
 
-    fn returns(&self, arguments: &[DataType]) -> DataType {
-        like(&arguments[0])
+    fn answer_type(&self, arguments: &[DataType]) -> DataType {
+        same_list_type(&arguments[0])
     }
 
-    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
-        let (ir, flat) = (arguments.samples::<T>(0)?, arguments.numbers(1)?);
-        let room = ir.room(arguments.rows());
-        if arguments.given() == 2 {
-            return lists::<T>(arguments, room, |row, out| {
-                let (ir, flat) = (ir.at(row)?, flat.at(row));
-                cumulate_whole(ir, flat, grow(out, ir.len()));
+    fn compute_answers<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
+        let (ir, flat) = (arguments.sample_lists::<T>(0)?, arguments.number_values(1)?);
+        let room = ir.sample_capacity(arguments.row_count());
+        if arguments.argument_count() == 2 {
+            return build_lists::<T>(arguments, room, |row, out| {
+                let (ir, flat) = (ir.samples_at(row)?, flat.value_at(row));
+                cumulate_whole(ir, flat, append_defaults(out, ir.len()));
                 Ok(flat > 0.0)
             });
         }
-        let centre = arguments.numbers(2)?;
+        let centre = arguments.number_values(2)?;
         let mut plans = PerLength::new(DESCRIPTION.name);
-        lists::<T>(arguments, room, |row, out| {
-            let (ir, flat, centre) = (ir.at(row)?, flat.at(row), centre.at(row));
-            let band = self.0.band(centre);
-            let band = band.ok_or_else(|| arguments.wrong(2, row, centre, &self.0.bands_hint()))?;
+        build_lists::<T>(arguments, room, |row, out| {
+            let (ir, flat, centre) = (ir.samples_at(row)?, flat.value_at(row), centre.value_at(row));
+            let band = self.0.band_index(centre);
+            let band = band.ok_or_else(|| arguments.invalid_argument(2, row, centre, &self.0.bands_hint()))?;
             if ir.is_empty() {
                 return Ok(flat > 0.0);
             }
-            let (plan, scratch, bands) = plans.get(ir.len(), |len| {
+            let (plan, scratch, bands) = plans.plan_for(ir.len(), |len| {
                 let plan = FilterBankPlan::<T>::new(len, self.0.rate_hz, &self.0.centres_hz)?;
-                let (scratch, bands) = (plan.scratch(), vec![T::default(); plan.bands() * len]);
+                let (scratch, bands) = (plan.make_scratch(), vec![T::default(); plan.band_count() * len]);
                 Ok((plan, scratch, bands))
             })?;
-            plan.run(ir, bands, scratch).map_err(|e| arguments.refused(row, &e))?;
-            cumulate_whole(&bands[band * ir.len()..][..ir.len()], flat, grow(out, ir.len()));
+            plan.split_bands(ir, bands, scratch).map_err(|e| arguments.refused_row(row, &e))?;
+            cumulate_whole(&bands[band * ir.len()..][..ir.len()], flat, append_defaults(out, ir.len()));
             Ok(flat > 0.0)
         })
     }

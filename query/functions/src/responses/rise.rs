@@ -38,7 +38,7 @@ impl CurveShapeFunction {
 fn require_rising<T: SampleElement>(arguments: &CallArguments<'_>, row: usize, curve: &[T]) -> Result<()> {
     let Some(at) = curve.windows(2).position(|pair| pair[1].f64() < pair[0].f64()) else { return Ok(()) };
     let falls = format_args!("less in sample {} than in the one before", at + 2);
-    Err(arguments.wrong(0, row, falls, "a cumulative curve does not fall; nce() makes one of a response"))
+    Err(arguments.invalid_argument(0, row, falls, "a cumulative curve does not fall; nce() makes one of a response"))
 }
 
 const CURVE: &[FunctionParameter] = &[FunctionParameter {
@@ -105,14 +105,14 @@ impl ScalarKernel for CurveShapeFunction {
         self.description
     }
 
-    fn returns(&self, _: &[DataType]) -> DataType {
+    fn answer_type(&self, _: &[DataType]) -> DataType {
         DataType::Float64
     }
 
-    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
-        let (curves, per_ms) = (arguments.samples::<T>(0)?, self.facts.rate_hz / 1e3);
-        numbers(arguments, |row| {
-            let curve = curves.at(row)?;
+    fn compute_answers<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
+        let (curves, per_ms) = (arguments.sample_lists::<T>(0)?, self.facts.rate_hz / 1e3);
+        build_numbers(arguments, |row| {
+            let curve = curves.samples_at(row)?;
             require_rising(arguments, row, curve)?;
             match curve_shape(curve) {
                 Some(shape) => Ok(Some((self.value)(&shape, per_ms))),

@@ -5,9 +5,9 @@ use std::sync::Arc;
 use arrow::array::ArrayRef;
 use arrow::datatypes::DataType;
 use datafusion::error::Result;
-use echolake_dsp::spectrum::{SpectrumPlan, bin_hz, bins};
+use echolake_dsp::spectrum::{SpectrumPlan, bin_count, bin_hz};
 
-use crate::adapters::answers::{grow, lists};
+use crate::adapters::answers::{append_defaults, build_lists};
 use crate::adapters::arguments::{CallArguments, SampleElement, like, list_of};
 use crate::adapters::description::{ArgumentKind, FunctionDescription, FunctionFamily, FunctionParameter};
 use crate::adapters::per_length::PerLength;
@@ -66,26 +66,26 @@ impl ScalarKernel for SpectrumFunction {
         &SPECTRUM
     }
 
-    fn returns(&self, arguments: &[DataType]) -> DataType {
-        like(&arguments[0])
+    fn answer_type(&self, arguments: &[DataType]) -> DataType {
+        same_list_type(&arguments[0])
     }
 
-    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
-        let ir = arguments.samples::<T>(0)?;
+    fn compute_answers<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
+        let ir = arguments.sample_lists::<T>(0)?;
         let mut plans = PerLength::new(SPECTRUM.name);
-        let room = bins(ir.room(arguments.rows())) + arguments.rows();
-        lists::<T>(arguments, room, |row, out| {
-            let ir = ir.at(row)?;
+        let room = bin_count(ir.sample_capacity(arguments.row_count())) + arguments.row_count();
+        build_lists::<T>(arguments, room, |row, out| {
+            let ir = ir.samples_at(row)?;
             if ir.is_empty() {
                 return Ok(true);
             }
-            let (plan, scratch) = plans.get(ir.len(), |len| {
+            let (plan, scratch) = plans.plan_for(ir.len(), |len| {
                 let plan = SpectrumPlan::<T>::new(len)?;
-                let scratch = plan.scratch();
+                let scratch = plan.make_scratch();
                 Ok((plan, scratch))
             })?;
-            let levels = grow(out, bins(ir.len()));
-            plan.levels_db(ir, levels, scratch).map_err(|e| arguments.refused(row, &e))?;
+            let levels = append_defaults(out, bin_count(ir.len()));
+            plan.levels_db(ir, levels, scratch).map_err(|e| arguments.refused_row(row, &e))?;
             Ok(true)
         })
     }
@@ -96,18 +96,23 @@ impl ScalarKernel for SpectrumFrequenciesFunction {
         &FREQUENCIES
     }
 
-    fn returns(&self, _: &[DataType]) -> DataType {
+    fn answer_type(&self, _: &[DataType]) -> DataType {
         list_of(DataType::Float64)
     }
 
-    fn call<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
-        let lengths = arguments.integers(0)?;
-        lists::<f64>(arguments, 0, |row, out| {
-            let given = lengths.at(row);
+    fn compute_answers<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
+        let lengths = arguments.integer_values(0)?;
+        build_lists::<f64>(arguments, 0, |row, out| {
+            let given = lengths.value_at(row);
             let Some(len) = usize::try_from(given).ok().filter(|_| given <= MOST) else {
-                return Err(arguments.wrong(0, row, given, "it is the number of samples, as array_length(ir)"));
+                return Err(arguments.invalid_argument(
+                    0,
+                    row,
+                    given,
+                    "it is the number of samples, as array_length(ir)",
+                ));
             };
-            out.extend((0..bins(len)).map(|bin| bin_hz(bin, len, self.0.rate_hz)));
+            out.extend((0..bin_count(len)).map(|bin| bin_hz(bin, len, self.0.rate_hz)));
             Ok(true)
         })
     }

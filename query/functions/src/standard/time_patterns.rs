@@ -57,19 +57,19 @@ impl PatternFunction {
     fn translate_argument(&self, pattern: &ColumnarValue) -> Result<ColumnarValue> {
         Ok(match pattern {
             ColumnarValue::Scalar(value) => match value.try_as_str() {
-                Some(Some(text)) => ColumnarValue::Scalar(ScalarValue::Utf8(Some(self.translate(text)?))),
+                Some(Some(text)) => ColumnarValue::Scalar(ScalarValue::Utf8(Some(self.translate_pattern(text)?))),
                 _ => pattern.clone(),
             },
             ColumnarValue::Array(texts) => {
                 let texts = cast(texts, &DataType::Utf8)?;
                 let translated =
-                    texts.as_string::<i32>().iter().map(|text| text.map(|t| self.translate(t)).transpose());
+                    texts.as_string::<i32>().iter().map(|text| text.map(|t| self.translate_pattern(t)).transpose());
                 ColumnarValue::Array(Arc::new(translated.collect::<Result<StringArray>>()?))
             }
         })
     }
 
-    fn translate(&self, pattern: &str) -> Result<String> {
+    fn translate_pattern(&self, pattern: &str) -> Result<String> {
         let translated = chrono_pattern(pattern).map_err(|part| {
             DataFusionError::Execution(format!(
                 "{} does not know `{part}` in the pattern `{pattern}`; it knows YYYY, MM, DD, HH24, MI, SS, MS, US and \

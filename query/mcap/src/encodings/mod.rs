@@ -11,7 +11,7 @@ use arrow::array::ArrayRef;
 use arrow::datatypes::Fields;
 use arrow::error::ArrowError;
 
-use super::column::{Column, Record, width};
+use super::column::{Column, Record, value_width};
 
 /// The encodings whose messages have columns.
 static ENCODINGS: [&dyn MessageEncoding; 3] = [&protobuf::ProtobufEncoding, &json::JsonEncoding, &ros2::Ros2Encoding];
@@ -31,11 +31,11 @@ pub(super) struct RawSchema {
 /// An encoding of messages.
 trait MessageEncoding: Sync {
     /// Returns the encodings of messages that it reads, each with that of their schema.
-    fn names(&self) -> &'static [(&'static str, &'static str)];
+    fn encoding_names(&self) -> &'static [(&'static str, &'static str)];
 
     /// Returns true if it reads messages with such a schema, unless the schema is damaged.
-    fn supports(&self, channel: &RawSchema) -> bool {
-        self.names().contains(&(&channel.messages, &channel.encoding))
+    fn supports_schema(&self, channel: &RawSchema) -> bool {
+        self.encoding_names().contains(&(&channel.messages, &channel.encoding))
     }
 
     /// Parses a schema that it supports into the columns of a message, and what decodes them. The text of an error is
@@ -46,13 +46,14 @@ trait MessageEncoding: Sync {
 /// A parsed schema.
 trait MessageType: fmt::Debug + Send + Sync {
     /// Returns a decoder of the columns at `wanted`, which are `fields`.
-    fn decoder(&self, wanted: &[usize], fields: &Fields) -> Box<dyn MessageDecoder>;
+    fn create_decoder(&self, wanted: &[usize], fields: &Fields) -> Box<dyn MessageDecoder>;
 }
 
 /// Decodes messages of one type.
 trait MessageDecoder: Send {
     /// Adds the values of a message to the columns, one to each.
-    fn decode(&mut self, message: &[u8], columns: &mut [Column], tally: &mut RowTally) -> Result<(), Malformed>;
+    fn decode_message(&mut self, message: &[u8], columns: &mut [Column], tally: &mut RowTally)
+    -> Result<(), Malformed>;
 }
 
 /// The reason why bytes are no message of their schema.
@@ -108,10 +109,10 @@ impl MessageLayout {
     }
 
     /// Returns a decoder of the columns at `wanted`.
-    pub(super) fn decoder(&self, wanted: &[usize]) -> RowDecoder {
+    pub(super) fn create_decoder(&self, wanted: &[usize]) -> RowDecoder {
         let fields: Fields = wanted.iter().map(|i| self.fields[*i].clone()).collect();
-        let width = fields.iter().map(|f| width(f.data_type())).sum();
-        let decoder = self.message_type.as_ref().map(|message_type| message_type.decoder(wanted, &fields));
+        let width = fields.iter().map(|f| value_width(f.data_type())).sum();
+        let decoder = self.message_type.as_ref().map(|message_type| message_type.create_decoder(wanted, &fields));
         RowDecoder { decoder, columns: Record::new(&fields).columns, width, tally: RowTally::default() }
     }
 }
@@ -122,11 +123,11 @@ pub(super) fn is_supported(schema: &RawSchema) -> bool {
 }
 
 fn find_encoding(schema: &RawSchema) -> Option<&'static dyn MessageEncoding> {
-    ENCODINGS.into_iter().find(|encoding| encoding.supports(schema))
+    ENCODINGS.into_iter().find(|encoding| encoding.supports_schema(schema))
 }
 
 fn describe_unknown(schema: &RawSchema) -> String {
-    let names = ENCODINGS.iter().flat_map(|encoding| encoding.names());
+    let names = ENCODINGS.iter().flat_map(|encoding| encoding.encoding_names());
     let known: Vec<_> = names.map(|(messages, schema)| describe_names(messages, schema)).collect();
     let actual = describe_names(&schema.messages, &schema.encoding);
     format!("its messages are {actual}, which is not decoded; decoded are {}", known.join(", "))
@@ -150,16 +151,16 @@ pub(super) struct RowDecoder {
 
 impl RowDecoder {
     /// Adds a message as one row. After an error it is of no more use.
-    pub(super) fn push(&mut self, message: &[u8]) -> Result<(), Malformed> {
+    pub(super) fn push_message(&mut self, message: &[u8]) -> Result<(), Malformed> {
         self.tally.add_bytes(self.width)?;
         match &mut self.decoder {
-            Some(decoder) => decoder.decode(message, &mut self.columns, &mut self.tally),
+            Some(decoder) => decoder.decode_message(message, &mut self.columns, &mut self.tally),
             None => Ok(()),
         }
     }
 
     /// Returns the bytes of the rows since the last [`Self::finish`], roughly.
-    pub(super) fn bytes(&self) -> usize {
+    pub(super) fn buffered_bytes(&self) -> usize {
         self.tally.bytes
     }
 

@@ -13,7 +13,7 @@ use utoipa::{IntoParams, ToSchema};
 
 use super::super::extract::{PathParams, QueryParams, WholeNumber};
 use super::content::{AnswerContent, EndpointAnswer};
-use super::pair::{PairPath, ResponseSignal, geometry, measurement, reflected};
+use super::pair::{PairPath, ResponseSignal, read_geometry, read_measurement, read_reflected};
 use super::request::CatalogueRequest;
 
 /// Samples that are analysed; what follows them is left out.
@@ -100,12 +100,12 @@ pub(super) async fn analysis(
     PathParams(path): PathParams<PairPath>,
     QueryParams(query): QueryParams<AnalysisQuery>,
 ) -> EndpointAnswer {
-    let entry = request.surface(&path.surface_id).await?;
-    let pair = request.pair(&path.pair_id)?;
+    let entry = request.find_surface(&path.surface_id).await?;
+    let pair = request.parse_pair(&path.pair_id)?;
     let found = tokio::try_join!(
-        measurement(&request, entry, pair),
-        reflected(&request, entry, pair),
-        geometry(&request, pair)
+        read_measurement(&request, entry, pair),
+        read_reflected(&request, entry, pair),
+        read_geometry(&request, pair)
     );
     let (measurement, [own, flat], geometry) = found?;
     let rig = request.catalogue.lake().rig();
@@ -129,7 +129,7 @@ pub(super) async fn analysis(
     };
     let surface_id = entry.surface.surface_id.clone();
     let analyse = move || {
-        let measured = analyser.analyse(&measurement.ir)?;
+        let measured = analyser.analyse_samples(&measurement.ir)?;
         Ok(PairAnalysis {
             surface_id,
             pair_id: pair,
@@ -139,12 +139,13 @@ pub(super) async fn analysis(
             direct_db: analyser.highest_around(&measured.envelope_db, direct_s),
             frequency_hz: analyser.frequencies_hz(&measurement.ir)?,
             measured,
-            reflected: own.as_deref().map(|samples| analyser.analyse(samples)).transpose()?,
-            flat_reflected: flat.as_deref().map(|samples| analyser.analyse(samples)).transpose()?,
+            reflected: own.as_deref().map(|samples| analyser.analyse_samples(samples)).transpose()?,
+            flat_reflected: flat.as_deref().map(|samples| analyser.analyse_samples(samples)).transpose()?,
         })
     };
-    let found: Result<PairAnalysis, echolake_dsp::Error> = request.catalogue.service().crunch(analyse).await?;
-    Ok(AnswerContent::json(&found.map_err(no_analysis(pair))?)?)
+    let found: Result<PairAnalysis, echolake_dsp::Error> =
+        request.catalogue.service().compute_blocking(analyse).await?;
+    Ok(AnswerContent::encode_json(&found.map_err(no_analysis(pair))?)?)
 }
 
 /// Kernels with their settings.
@@ -156,30 +157,30 @@ struct ResponseAnalyser {
 }
 
 impl ResponseAnalyser {
-    fn plan(&self, len: usize) -> Result<FrequencyResponsePlan, echolake_dsp::Error> {
+    fn plan_response(&self, len: usize) -> Result<FrequencyResponsePlan, echolake_dsp::Error> {
         FrequencyResponsePlan::new(len, self.rate_hz, self.range_hz)
     }
 
-    fn analyse(&self, samples: &[f32]) -> Result<ResponseAnalysis, echolake_dsp::Error> {
+    fn analyse_samples(&self, samples: &[f32]) -> Result<ResponseAnalysis, echolake_dsp::Error> {
         let samples = first_samples(samples);
         let mut envelope = vec![0.0; samples.len()];
         let plan = EnvelopePlan::new(samples.len())?;
-        plan.run(&samples, &mut envelope, &mut plan.scratch())?;
-        let plan = self.plan(samples.len())?;
+        plan.compute_envelope(&samples, &mut envelope, &mut plan.make_scratch())?;
+        let plan = self.plan_response(samples.len())?;
         let mut response = FrequencyResponse::default();
-        plan.run(&samples, self.octaves, self.removed_s, &mut response, &mut plan.scratch())?;
+        plan.compute_response(&samples, self.octaves, self.removed_s, &mut response, &mut plan.make_scratch())?;
         let delays_ms = response.group_delay_secs.iter().map(|seconds| 1000.0 * seconds);
         Ok(ResponseAnalysis {
             sample_db: samples.iter().map(|x| plotted_power_to_db(x * x) as f32).collect(),
             envelope_db: envelope.iter().map(|x| plotted_power_to_db(x * x) as f32).collect(),
-            level_db: thinned(response.level_db.iter().copied()),
-            phase_deg: thinned(response.phase_deg.iter().copied()),
-            group_delay_ms: thinned(delays_ms),
+            level_db: thin_values(response.level_db.iter().copied()),
+            phase_deg: thin_values(response.phase_deg.iter().copied()),
+            group_delay_ms: thin_values(delays_ms),
         })
     }
 
     fn frequencies_hz(&self, samples: &[f32]) -> Result<Vec<f64>, echolake_dsp::Error> {
-        let all: Vec<f64> = self.plan(samples.len().min(MOST_SAMPLES))?.frequencies_hz().collect();
+        let all: Vec<f64> = self.plan_response(samples.len().min(MOST_SAMPLES))?.frequencies_hz().collect();
         let step = all.len().div_ceil(MOST_FREQUENCIES);
         Ok(all.into_iter().step_by(step).collect())
     }
@@ -229,12 +230,12 @@ pub(super) async fn spectrogram(
     PathParams(path): PathParams<PairPath>,
     QueryParams(query): QueryParams<SpectrogramQuery>,
 ) -> EndpointAnswer {
-    let entry = request.surface(&path.surface_id).await?;
-    let pair = request.pair(&path.pair_id)?;
-    let samples = query.signal.read(&request, entry, pair).await?;
+    let entry = request.find_surface(&path.surface_id).await?;
+    let pair = request.parse_pair(&path.pair_id)?;
+    let samples = query.signal.read_samples(&request, entry, pair).await?;
     let rate_hz = request.catalogue.lake().rig().sweep.rate_hz.get();
-    let found = request.catalogue.service().crunch(move || find_spectrogram(&samples, rate_hz)).await?;
-    Ok(AnswerContent::json(&found.map_err(no_analysis(pair))?)?)
+    let found = request.catalogue.service().compute_blocking(move || find_spectrogram(&samples, rate_hz)).await?;
+    Ok(AnswerContent::encode_json(&found.map_err(no_analysis(pair))?)?)
 }
 
 fn find_spectrogram(samples: &[f32], rate_hz: f64) -> Result<Spectrogram, echolake_dsp::Error> {
@@ -242,13 +243,13 @@ fn find_spectrogram(samples: &[f32], rate_hz: f64) -> Result<Spectrogram, echola
     let window = (WINDOW_SECS * rate_hz).round().clamp(2.0, MOST_FREQUENCIES as f64) as usize;
     let step = samples.len().div_ceil(MOST_WINDOWS).max(LEAST_STEP);
     let plan = SpectrogramPlan::new(samples.len(), window, step)?;
-    let mut levels = vec![0.0; plan.times() * plan.bins()];
-    plan.run(&samples, &mut levels, &mut plan.scratch())?;
+    let mut levels = vec![0.0; plan.time_count() * plan.bin_count()];
+    plan.compute_levels(&samples, &mut levels, &mut plan.make_scratch())?;
     let highest = levels.iter().copied().fold(f64::NEG_INFINITY, f64::max);
     Ok(Spectrogram {
-        times: plan.times(),
+        times: plan.time_count(),
         step_s: step as f64 / rate_hz,
-        bins: plan.bins(),
+        bins: plan.bin_count(),
         bin_hz: plan.bin_hz(rate_hz),
         level_db: levels.iter().map(|level| ((10.0 * (level - highest)).round() / 10.0) as f32).collect(),
     })
@@ -258,7 +259,7 @@ fn first_samples(samples: &[f32]) -> Vec<f64> {
     samples.iter().take(MOST_SAMPLES).copied().map(f64::from).collect()
 }
 
-fn thinned(values: impl ExactSizeIterator<Item = f64>) -> Vec<f32> {
+fn thin_values(values: impl ExactSizeIterator<Item = f64>) -> Vec<f32> {
     let step = values.len().div_ceil(MOST_FREQUENCIES).max(1);
     values.step_by(step).map(|value| value as f32).collect()
 }
@@ -282,7 +283,7 @@ mod tests {
     fn an_impulse_is_found_where_it_is() {
         let mut samples = vec![0.0; 384];
         samples[100] = 0.5;
-        let found = ANALYSER.analyse(&samples).expect("an analysis");
+        let found = ANALYSER.analyse_samples(&samples).expect("an analysis");
         let frequencies = ANALYSER.frequencies_hz(&samples).expect("frequencies");
         assert_eq!([found.level_db.len(), found.phase_deg.len(), found.group_delay_ms.len()], [frequencies.len(); 3]);
         let level = 20.0 * 0.5f32.log10();
@@ -297,7 +298,7 @@ mod tests {
     fn long_responses_have_bounded_answers() {
         let mut samples = vec![0.0; 100_000];
         samples[70] = 1.0;
-        let found = ANALYSER.analyse(&samples).expect("an analysis");
+        let found = ANALYSER.analyse_samples(&samples).expect("an analysis");
         assert_eq!([found.sample_db.len(), found.envelope_db.len()], [MOST_SAMPLES; 2]);
         let frequencies = ANALYSER.frequencies_hz(&samples).expect("frequencies");
         assert!(frequencies.len() <= MOST_FREQUENCIES && frequencies.len() == found.level_db.len());
@@ -308,7 +309,7 @@ mod tests {
 
     #[test]
     fn damaged_responses_are_named() {
-        let fault = ANALYSER.analyse(&[f32::NAN; 4]).map_err(no_analysis(7)).err().expect("a fault");
+        let fault = ANALYSER.analyse_samples(&[f32::NAN; 4]).map_err(no_analysis(7)).err().expect("a fault");
         assert!(fault.to_string().contains("pair 7: the response has samples that are not finite"), "{fault}");
     }
 }

@@ -29,7 +29,7 @@ impl AnswerContent {
 
     /// The same, to be saved as a file of this name.
     #[must_use]
-    pub(super) fn named(mut self, name: String) -> Self {
+    pub(super) fn with_name(mut self, name: String) -> Self {
         self.name = Some(name);
         self
     }
@@ -38,7 +38,7 @@ impl AnswerContent {
     ///
     /// # Errors
     /// [`RequestFault::Internal`] if it cannot be written, which is a defect.
-    pub(super) fn json(value: &impl Serialize) -> Result<Self, RequestFault> {
+    pub(super) fn encode_json(value: &impl Serialize) -> Result<Self, RequestFault> {
         let bytes = serde_json::to_vec(value).map_err(RequestFault::defect("an answer makes no JSON"))?;
         Ok(Self::new("application/json", bytes))
     }
@@ -46,16 +46,16 @@ impl AnswerContent {
     /// Reads JSON back as a value.
     ///
     /// # Errors
-    /// As [`AnswerContent::json`].
-    pub(super) fn value(&self) -> Result<Value, RequestFault> {
+    /// As [`AnswerContent::encode_json`].
+    pub(super) fn decode_json(&self) -> Result<Value, RequestFault> {
         serde_json::from_slice(&self.bytes).map_err(RequestFault::defect("an answer is no JSON"))
     }
 
     /// Rows as an Arrow stream.
     ///
     /// # Errors
-    /// As [`AnswerContent::json`].
-    pub(super) fn arrow(batch: &RecordBatch) -> Result<Self, RequestFault> {
+    /// As [`AnswerContent::encode_json`].
+    pub(super) fn encode_arrow(batch: &RecordBatch) -> Result<Self, RequestFault> {
         let written = || {
             let mut writer = StreamWriter::try_new(Vec::new(), &batch.schema())?;
             writer.write(batch)?;

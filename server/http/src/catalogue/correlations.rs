@@ -64,7 +64,7 @@ pub(super) async fn correlations(
     Extension(request): Extension<CatalogueRequest>,
     QueryParams(query): QueryParams<CorrelationsQuery>,
 ) -> EndpointAnswer {
-    let summary = request.summary().await?;
+    let summary = request.read_summary().await?;
     let is_chosen = |entry: &&SurfaceEntry| {
         let typology = entry.surface.typology.as_str();
         !entry.surface.is_reference()
@@ -72,21 +72,21 @@ pub(super) async fn correlations(
     };
     let chosen: Vec<_> = summary.entries.iter().filter(is_chosen).collect();
     let mut items = Vec::new();
-    for (parameter, values) in columns(&chosen) {
+    for (parameter, values) in parameter_columns(&chosen) {
         for (b, band) in summary.bands.iter().enumerate() {
             let both = values.iter().filter_map(|(i, value)| Some((*value, chosen[*i].surface.against_flat_db[b]?)));
             let (x, y): (Vec<_>, Vec<_>) = both.unzip();
             // They are equally long.
             let r = if x.len() < LEAST { None } else { pearson(&x, &y).unwrap_or(None) };
-            let unit = unit(&parameter);
+            let unit = parameter_unit(&parameter);
             items.push(BandCorrelation { parameter: parameter.clone(), unit, band: band.key.clone(), r, n: x.len() });
         }
     }
-    Ok(AnswerContent::json(&CorrelationTable { method: "pearson", items, surfaces: chosen.len() })?)
+    Ok(AnswerContent::encode_json(&CorrelationTable { method: "pearson", items, surfaces: chosen.len() })?)
 }
 
 // Each parameter's values, with the surface that has them.
-fn columns(chosen: &[&SurfaceEntry]) -> BTreeMap<String, Vec<(usize, f64)>> {
+fn parameter_columns(chosen: &[&SurfaceEntry]) -> BTreeMap<String, Vec<(usize, f64)>> {
     let mut columns: BTreeMap<String, Vec<(usize, f64)>> = BTreeMap::new();
     for (i, entry) in chosen.iter().enumerate() {
         let own = [
@@ -110,7 +110,7 @@ fn columns(chosen: &[&SurfaceEntry]) -> BTreeMap<String, Vec<(usize, f64)>> {
     columns
 }
 
-fn unit(parameter: &str) -> &'static str {
+fn parameter_unit(parameter: &str) -> &'static str {
     match parameter.rsplit('_').next() {
         Some("mm") => "mm",
         Some("deg") => "deg",

@@ -14,7 +14,7 @@ use utoipa::{IntoParams, ToSchema};
 
 use super::super::extract::{BinaryContent, PathParams, QueryParams, WholeNumber};
 use super::content::{AnswerContent, EndpointAnswer};
-use super::request::{CatalogueRequest, SurfacePath, number, text};
+use super::request::{CatalogueRequest, SurfacePath, number_value, text_value};
 use super::snapshot::summary::SurfaceEntry;
 
 /// Curves of a surface beside those of its Flat.
@@ -44,11 +44,11 @@ pub(super) enum PairSelection {
 }
 
 impl PairSelection {
-    fn filter(&self) -> (String, Option<ScalarValue>) {
+    fn sql_filter(&self) -> (String, Option<ScalarValue>) {
         match self {
             Self::All => (String::new(), None),
-            Self::Point(point) => (point_filter("$2"), Some(number(*point))),
-            Self::Pair(pair) => (" and pair_id = $2".to_owned(), Some(number(*pair))),
+            Self::Point(point) => (point_filter("$2"), Some(number_value(*point))),
+            Self::Pair(pair) => (" and pair_id = $2".to_owned(), Some(number_value(*pair))),
         }
     }
 }
@@ -56,26 +56,26 @@ impl PairSelection {
 impl CurveSet {
     /// # Errors
     /// Those of its query.
-    pub(super) async fn read(
+    pub(super) async fn read_curves(
         request: &CatalogueRequest,
         entry: &SurfaceEntry,
         over: PairSelection,
         points: usize,
     ) -> Result<Self, RequestFault> {
         let rig = request.catalogue.lake().rig();
-        let (filter, value) = over.filter();
+        let (filter, value) = over.sql_filter();
         let sql = curves_query(rig, "$1", &filter);
         let kept_sql = matches!(over, PairSelection::All).then(|| kept_curves_query(rig, "$1"));
         let first = async |sql: &str, values| -> Result<Option<CurveRow>, RequestFault> {
-            Ok(request.rows(sql, values).await?.into_iter().next())
+            Ok(request.read_rows(sql, values).await?.into_iter().next())
         };
         let read = async |surface: &str| -> Result<Option<CurveRow>, RequestFault> {
             if let Some(sql) = &kept_sql
-                && let Some(row) = first(sql, vec![text(surface)]).await?
+                && let Some(row) = first(sql, vec![text_value(surface)]).await?
             {
                 return Ok(Some(row));
             }
-            first(&sql, [text(surface)].into_iter().chain(value.clone()).collect()).await
+            first(&sql, [text_value(surface)].into_iter().chain(value.clone()).collect()).await
         };
         let (id, flat) = (&entry.surface.surface_id, &entry.surface.flat_reference);
         // What is left of Foam without Foam is no energy of a surface.
@@ -97,7 +97,7 @@ impl CurveSet {
     }
 
     // A column of times and one a band of either surface.
-    fn batch(&self, rig: &Rig) -> Result<RecordBatch, RequestFault> {
+    fn to_batch(&self, rig: &Rig) -> Result<RecordBatch, RequestFault> {
         let column = |values: &[f32]| -> ArrayRef {
             let padded = (0..self.time_ms.len()).map(|i| values.get(i).copied().map(f64::from));
             Arc::new(padded.collect::<Float64Array>())
@@ -115,7 +115,7 @@ impl CurveSet {
 }
 
 fn thinned_curves(surface: &str, row: Option<&CurveRow>, rig: &Rig, kept: &[usize]) -> SurfaceCurves {
-    let bands = row.map_or_else(|| vec![Vec::new(); rig.band_names().len()], |row| row.thinned(kept));
+    let bands = row.map_or_else(|| vec![Vec::new(); rig.band_names().len()], |row| row.curves_at(kept));
     SurfaceCurves { surface_id: surface.to_owned(), pairs: row.map_or(0, |row| row.pairs), bands }
 }
 
@@ -156,14 +156,14 @@ pub(super) async fn curves(
     PathParams(path): PathParams<SurfacePath>,
     QueryParams(query): QueryParams<CurvesQuery>,
 ) -> EndpointAnswer {
-    let entry = request.surface(&path.surface_id).await?;
+    let entry = request.find_surface(&path.surface_id).await?;
     let over = match &query.microphone {
-        Some(point) => PairSelection::Point(request.microphone(point)?),
+        Some(point) => PairSelection::Point(request.parse_microphone(point)?),
         None => PairSelection::All,
     };
-    let set = CurveSet::read(&request, entry, over, query.points.get()).await?;
+    let set = CurveSet::read_curves(&request, entry, over, query.points.get()).await?;
     Ok(match request.as_arrow {
-        true => AnswerContent::arrow(&set.batch(request.catalogue.lake().rig())?)?,
-        false => AnswerContent::json(&set)?,
+        true => AnswerContent::encode_arrow(&set.to_batch(request.catalogue.lake().rig())?)?,
+        false => AnswerContent::encode_json(&set)?,
     })
 }

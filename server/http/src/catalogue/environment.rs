@@ -7,7 +7,7 @@ use utoipa::{IntoParams, ToSchema};
 
 use super::super::extract::{PathParams, QueryParams, WholeNumber};
 use super::content::{AnswerContent, EndpointAnswer};
-use super::request::{CatalogueRequest, RunPath, long, text};
+use super::request::{CatalogueRequest, RunPath, nanos_value, text_value};
 
 /// A reading, or the mean of some.
 #[derive(Deserialize)]
@@ -88,8 +88,8 @@ pub(super) async fn environment(
     PathParams(path): PathParams<RunPath>,
     QueryParams(query): QueryParams<EnvironmentQuery>,
 ) -> EndpointAnswer {
-    let run = request.run(&path.run_id)?.run.to_string();
-    let span: Vec<TimeSpan> = request.rows(SPAN, vec![text(&run)]).await?;
+    let run = request.find_run(&path.run_id)?.run.to_string();
+    let span: Vec<TimeSpan> = request.read_rows(SPAN, vec![text_value(&run)]).await?;
     let none = || RequestFault::NoData {
         what: format!("run `{run}`"),
         data: "readings of the air",
@@ -100,6 +100,6 @@ pub(super) async fn environment(
     };
     // One more than the last falls into the last interval too.
     let width = (last.saturating_sub(first) / query.points.get() as i64).saturating_add(1);
-    let rows = request.rows(MEANS, vec![text(&run), long(first), long(width)]).await?;
-    Ok(AnswerContent::json(&AirSeries::new(rows, first, &start))?)
+    let rows = request.read_rows(MEANS, vec![text_value(&run), nanos_value(first), nanos_value(width)]).await?;
+    Ok(AnswerContent::encode_json(&AirSeries::new(rows, first, &start))?)
 }

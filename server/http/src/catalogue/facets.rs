@@ -205,7 +205,7 @@ enum SurfaceMeasure {
 
 impl SurfaceMeasure {
     // References have neither level nor relief: they are what others are measured by.
-    fn of(self, entry: &SurfaceEntry) -> Option<f64> {
+    fn value_of(self, entry: &SurfaceEntry) -> Option<f64> {
         let is_design = !entry.surface.is_reference();
         let value = match self {
             Self::Level(band) => entry.surface.against_flat_db[band].filter(|_| is_design),
@@ -224,12 +224,12 @@ enum SurfaceFilter<'a> {
 }
 
 impl SurfaceFilter<'_> {
-    fn passes(&self, entry: &SurfaceEntry) -> bool {
+    fn is_passed_by(&self, entry: &SurfaceEntry) -> bool {
         match self {
             Self::Words(words) => words.iter().all(|word| entry.words.contains(word)),
-            Self::Facet(facet, wanted) => wanted.contains(&value(*facet, &entry.surface)),
+            Self::Facet(facet, wanted) => wanted.contains(&facet_value(*facet, &entry.surface)),
             Self::Measure(measure, ranges) => {
-                measure.of(entry).is_some_and(|value| ranges.iter().any(|range| range.contains(&value)))
+                measure.value_of(entry).is_some_and(|value| ranges.iter().any(|range| range.contains(&value)))
             }
         }
     }
@@ -243,11 +243,14 @@ impl SurfaceFilter<'_> {
     }
 }
 
-fn value(facet: usize, surface: &SurfaceSummary) -> &str {
+fn facet_value(facet: usize, surface: &SurfaceSummary) -> &str {
     (FACETS[facet].value)(surface).unwrap_or(UNKNOWN)
 }
 
-fn filters<'a>(query: &'a SurfacesQuery, summary: &CatalogueSummary) -> Result<Vec<SurfaceFilter<'a>>, RequestFault> {
+fn surface_filters<'a>(
+    query: &'a SurfacesQuery,
+    summary: &CatalogueSummary,
+) -> Result<Vec<SurfaceFilter<'a>>, RequestFault> {
     let mut filters = Vec::new();
     let words: Vec<_> = query.q.iter().flat_map(|q| q.split_whitespace()).map(str::to_lowercase).collect();
     if !words.is_empty() {
@@ -266,17 +269,17 @@ fn filters<'a>(query: &'a SurfacesQuery, summary: &CatalogueSummary) -> Result<V
     }
     let mut levels: BTreeMap<usize, Vec<_>> = BTreeMap::new();
     for level in &query.level {
-        levels.entry(band(summary, "level", &level.band)?).or_default().push(level.range.0.clone());
+        levels.entry(find_band(summary, "level", &level.band)?).or_default().push(level.range.0.clone());
     }
     filters
         .extend(levels.into_iter().map(|(band, ranges)| SurfaceFilter::Measure(SurfaceMeasure::Level(band), ranges)));
     Ok(filters)
 }
 
-fn band(summary: &CatalogueSummary, name: &str, key: &str) -> Result<usize, RequestFault> {
+fn find_band(summary: &CatalogueSummary, name: &str, key: &str) -> Result<usize, RequestFault> {
     summary.bands.iter().position(|band| band.key == key).ok_or_else(|| {
         let keys: Vec<_> = summary.bands.iter().map(|band| band.key.as_str()).collect();
-        RequestFault::request(format!("`{name}` names no band of the lake; hint: {}", keys.join(", ")))
+        RequestFault::bad_request(format!("`{name}` names no band of the lake; hint: {}", keys.join(", ")))
     })
 }
 
@@ -289,8 +292,8 @@ enum FilterOutcome {
     Out,
 }
 
-fn standing(filters: &[SurfaceFilter<'_>], entry: &SurfaceEntry) -> FilterOutcome {
-    let mut against = filters.iter().enumerate().filter(|(_, filter)| !filter.passes(entry));
+fn filter_outcome(filters: &[SurfaceFilter<'_>], entry: &SurfaceEntry) -> FilterOutcome {
+    let mut against = filters.iter().enumerate().filter(|(_, filter)| !filter.is_passed_by(entry));
     match (against.next(), against.next()) {
         (None, _) => FilterOutcome::In,
         (Some((only, _)), None) => FilterOutcome::But(only),
@@ -317,24 +320,24 @@ pub(super) async fn surfaces(
     Extension(request): Extension<CatalogueRequest>,
     QueryParams(query): QueryParams<SurfacesQuery>,
 ) -> EndpointAnswer {
-    let summary = request.summary().await?;
-    let filters = filters(&query, summary)?;
-    let order = order(&query, summary)?;
-    let all: Vec<_> = summary.entries.iter().map(|entry| (entry, standing(&filters, entry))).collect();
+    let summary = request.read_summary().await?;
+    let filters = surface_filters(&query, summary)?;
+    let order = surface_order(&query, summary)?;
+    let all: Vec<_> = summary.entries.iter().map(|entry| (entry, filter_outcome(&filters, entry))).collect();
     let mut left: Vec<_> =
         all.iter().filter(|(_, standing)| *standing == FilterOutcome::In).map(|(entry, _)| *entry).collect();
-    left.sort_by(|a, b| order.compare(a, b));
-    Ok(AnswerContent::json(&SurfacePage {
+    left.sort_by(|a, b| order.compare_entries(a, b));
+    Ok(AnswerContent::encode_json(&SurfacePage {
         total: left.len(),
         offset: query.offset.get(),
         items: left.into_iter().skip(query.offset.get()).take(query.limit.get()).map(|entry| &entry.surface).collect(),
-        facets: (0..FACETS.len()).map(|facet| counts(facet, &filters, &all)).collect(),
-        histograms: histograms(summary, &filters, &all),
+        facets: (0..FACETS.len()).map(|facet| count_facet(facet, &filters, &all)).collect(),
+        histograms: surface_histograms(summary, &filters, &all),
         counts: "exact",
     })?)
 }
 
-fn counts<'a>(
+fn count_facet<'a>(
     facet: usize,
     filters: &[SurfaceFilter<'_>],
     all: &[(&'a SurfaceEntry, FilterOutcome)],
@@ -342,20 +345,21 @@ fn counts<'a>(
     let own = filters.iter().position(|f| f.is_of_facet(facet));
     let mut counts: BTreeMap<&str, usize> = BTreeMap::new();
     for (entry, standing) in all {
-        *counts.entry(value(facet, &entry.surface)).or_default() += usize::from(counted(*standing, own));
+        *counts.entry(facet_value(facet, &entry.surface)).or_default() += usize::from(is_counted(*standing, own));
     }
     let mut values: Vec<_> = counts.into_iter().map(|(value, count)| FacetValue { value, count }).collect();
     values.sort_by(|a, b| b.count.cmp(&a.count).then_with(|| a.value.cmp(b.value)));
     values.truncate(MOST_VALUES);
-    let distinguishes = distinguishes(facet, all);
+    let distinguishes = is_distinguishing(facet, all);
     FacetCounts { name: FACETS[facet].name, label: FACETS[facet].label, distinguishes, values }
 }
 
-fn distinguishes(facet: usize, all: &[(&SurfaceEntry, FilterOutcome)]) -> bool {
+fn is_distinguishing(facet: usize, all: &[(&SurfaceEntry, FilterOutcome)]) -> bool {
     let designs = || all.iter().map(|(entry, _)| &entry.surface).filter(|surface| !surface.is_reference());
-    let values: BTreeSet<_> = designs().map(|surface| value(facet, surface)).collect();
+    let values: BTreeSet<_> = designs().map(|surface| facet_value(facet, surface)).collect();
     let is_same = |earlier: usize| {
-        let both: BTreeSet<_> = designs().map(|surface| (value(facet, surface), value(earlier, surface))).collect();
+        let both: BTreeSet<_> =
+            designs().map(|surface| (facet_value(facet, surface), facet_value(earlier, surface))).collect();
         let others: BTreeSet<_> = both.iter().map(|(_, earlier)| *earlier).collect();
         both.len() == values.len() && both.len() == others.len()
     };
@@ -363,7 +367,7 @@ fn distinguishes(facet: usize, all: &[(&SurfaceEntry, FilterOutcome)]) -> bool {
 }
 
 // Whether a surface is let through by all filters but one's own.
-fn counted(standing: FilterOutcome, own: Option<usize>) -> bool {
+fn is_counted(standing: FilterOutcome, own: Option<usize>) -> bool {
     match standing {
         FilterOutcome::In => true,
         FilterOutcome::But(only) => Some(only) == own,
@@ -371,7 +375,7 @@ fn counted(standing: FilterOutcome, own: Option<usize>) -> bool {
     }
 }
 
-fn histograms(
+fn surface_histograms(
     summary: &CatalogueSummary,
     filters: &[SurfaceFilter<'_>],
     all: &[(&SurfaceEntry, FilterOutcome)],
@@ -385,14 +389,15 @@ fn histograms(
     ];
     let all = levels.chain(others).filter_map(|(measure, name, label, unit)| {
         let own = filters.iter().position(|f| f.is_of(measure));
-        let values = all.iter().filter_map(|(entry, standing)| Some((measure.of(entry)?, counted(*standing, own))));
-        Some(SurfaceHistogram { name, label, unit, bins: bins(&values.collect::<Vec<_>>())? })
+        let values =
+            all.iter().filter_map(|(entry, standing)| Some((measure.value_of(entry)?, is_counted(*standing, own))));
+        Some(SurfaceHistogram { name, label, unit, bins: histogram_bins(&values.collect::<Vec<_>>())? })
     });
     all.collect()
 }
 
 // Bins over all values, which do not move when something is filtered; counts of those that are left.
-fn bins(values: &[(f64, bool)]) -> Option<Vec<HistogramBin>> {
+fn histogram_bins(values: &[(f64, bool)]) -> Option<Vec<HistogramBin>> {
     let low = values.iter().map(|v| v.0).min_by(f64::total_cmp)?;
     let high = values.iter().map(|v| v.0).max_by(f64::total_cmp)?;
     let width = ((high - low) / BINS as f64).max(LEAST_WIDTH);
@@ -422,9 +427,9 @@ enum SortKey {
     Spread(usize),
 }
 
-fn order(query: &SurfacesQuery, summary: &CatalogueSummary) -> Result<SurfaceOrder, RequestFault> {
+fn surface_order(query: &SurfacesQuery, summary: &CatalogueSummary) -> Result<SurfaceOrder, RequestFault> {
     let band = match &query.sort_band {
-        Some(key) => band(summary, "sort_band", key)?,
+        Some(key) => find_band(summary, "sort_band", key)?,
         None => summary.bands.len() - 1,
     };
     let by = match query.sort {
@@ -438,13 +443,13 @@ fn order(query: &SurfacesQuery, summary: &CatalogueSummary) -> Result<SurfaceOrd
 }
 
 impl SurfaceOrder {
-    fn compare(&self, a: &SurfaceEntry, b: &SurfaceEntry) -> Ordering {
+    fn compare_entries(&self, a: &SurfaceEntry, b: &SurfaceEntry) -> Ordering {
         let turned = |ordering: Ordering| if self.descends { ordering.reverse() } else { ordering };
         let value = |entry: &SurfaceEntry| match self.by.as_ref()? {
-            SortKey::Measure(measure) => measure.of(entry),
+            SortKey::Measure(measure) => measure.value_of(entry),
             SortKey::Spread(band) => entry.surface.spread_db[*band],
         };
-        let names = || natural(&a.surface.surface_id, &b.surface.surface_id);
+        let names = || natural_order(&a.surface.surface_id, &b.surface.surface_id);
         match (self.by.is_some(), value(a), value(b)) {
             (false, ..) => turned(names()),
             (true, Some(x), Some(y)) => turned(x.total_cmp(&y)).then_with(names),
@@ -455,7 +460,7 @@ impl SurfaceOrder {
 }
 
 // Digits by the number that they make: `panel_9` before `panel_10`.
-fn natural(a: &str, b: &str) -> Ordering {
+fn natural_order(a: &str, b: &str) -> Ordering {
     let (mut a, mut b) = (a, b);
     loop {
         let (digits_a, digits_b) = (leading_digits(a), leading_digits(b));
@@ -492,25 +497,25 @@ mod tests {
     #[test]
     fn names_sort_as_people_count() {
         let mut names = ["p10", "p9", "flat", "p9b", "0015_0", "15_0", "p", "é2", "é10"];
-        names.sort_by(|a, b| natural(a, b));
+        names.sort_by(|a, b| natural_order(a, b));
         assert_eq!(names, ["15_0", "0015_0", "flat", "p", "p9", "p9b", "p10", "é2", "é10"]);
     }
 
     #[test]
     fn bins_hold_what_is_counted() {
         let values: Vec<_> = (0..48).map(|i| (f64::from(i), i % 2 == 0)).collect();
-        let bins = bins(&values).expect("bins");
+        let bins = histogram_bins(&values).expect("bins");
         assert_eq!(bins.len(), BINS);
         assert_eq!(bins.iter().map(|b| b.count).sum::<usize>(), 24);
         assert!((bins[BINS - 1].to - 47.0).abs() < 1e-9);
-        assert!(super::bins(&[]).is_none());
-        assert_eq!(super::bins(&[(3.0, true)]).expect("one value")[0].count, 1);
+        assert!(super::histogram_bins(&[]).is_none());
+        assert_eq!(super::histogram_bins(&[(3.0, true)]).expect("one value")[0].count, 1);
     }
 
     #[test]
     fn a_facet_leaves_its_own_filter_out() {
-        assert!(counted(FilterOutcome::In, None) && counted(FilterOutcome::But(2), Some(2)));
-        assert!(!counted(FilterOutcome::But(2), Some(1)) && !counted(FilterOutcome::But(0), None));
-        assert!(!counted(FilterOutcome::Out, Some(0)));
+        assert!(is_counted(FilterOutcome::In, None) && is_counted(FilterOutcome::But(2), Some(2)));
+        assert!(!is_counted(FilterOutcome::But(2), Some(1)) && !is_counted(FilterOutcome::But(0), None));
+        assert!(!is_counted(FilterOutcome::Out, Some(0)));
     }
 }

@@ -7,7 +7,7 @@ use echolake_figures::{
     FigureDrawing, FigureNotes, GridFigure, GridLayer, GridPanel, LevelPalette, MapFigure, NceFigure, NcePanel,
 };
 use echolake_query::figure_rows::{
-    LevelReference, band_labels, curves_query, grid_query, lake_version, level_vectors_query, point_filter, quoted,
+    LevelReference, band_labels, curves_query, grid_query, lake_version, level_vectors_query, point_filter, quote_literal,
     total_curve,
 };
 use echolake_service::RequestFault;
@@ -17,7 +17,7 @@ use utoipa::{IntoParams, ToSchema};
 use super::super::extract::{BinaryContent, PathParams, QueryParams, WholeNumber};
 use super::content::{AnswerContent, EndpointAnswer};
 use super::curves::{CurveSet, PairSelection};
-use super::map::positions;
+use super::map::surface_positions;
 use super::request::{CatalogueRequest, SurfacePath};
 use super::snapshot::summary::SurfaceEntry;
 use super::surface::{GridNormalisation, read_grid, required_microphone};
@@ -43,7 +43,7 @@ impl FigureFormat {
     ///
     /// # Errors
     /// Those of computing beside the requests, and a drawing that the format cannot hold.
-    async fn write(self, request: &CatalogueRequest, drawing: FigureDrawing) -> EndpointAnswer {
+    async fn write_drawing(self, request: &CatalogueRequest, drawing: FigureDrawing) -> EndpointAnswer {
         let write = move || -> io::Result<AnswerContent> {
             Ok(match self {
                 Self::Svg => AnswerContent::new("image/svg+xml", drawing.to_svg()),
@@ -51,7 +51,7 @@ impl FigureFormat {
                 Self::Png => AnswerContent::new("image/png", drawing.to_png()?),
             })
         };
-        let written = request.catalogue.service().crunch(write).await?;
+        let written = request.catalogue.service().compute_blocking(write).await?;
         Ok(written.map_err(RequestFault::defect("a figure cannot be written"))?)
     }
 }
@@ -135,19 +135,19 @@ pub(super) async fn grid_figure(
     PathParams(path): PathParams<SurfacePath>,
     QueryParams(query): QueryParams<GridFigureQuery>,
 ) -> EndpointAnswer {
-    let entries = surfaces(&request, &path.surface_id, &query.beside).await?;
+    let entries = find_surfaces(&request, &path.surface_id, &query.beside).await?;
     let microphone = required_microphone(&request, query.microphone.as_deref())?;
     let lake = request.catalogue.lake();
-    let keys = &request.summary().await?.bands;
+    let keys = &request.read_summary().await?.bands;
     let shown: Vec<usize> = match &query.band {
         None => (0..keys.len()).collect(),
         Some(key) => vec![keys.iter().position(|band| band.key == *key).ok_or_else(|| {
-            RequestFault::request(format!("`band` is `{key}`; hint: a key of `bands` of GET /api/v1/lake"))
+            RequestFault::bad_request(format!("`band` is `{key}`; hint: a key of `bands` of GET /api/v1/lake"))
         })?],
     };
     let base = match &query.less {
         Some(name) => {
-            let entry = request.surface(name).await?;
+            let entry = request.find_surface(name).await?;
             Some((entry, read_grid(&request, entry, microphone, query.over).await?))
         }
         None => None,
@@ -183,11 +183,11 @@ pub(super) async fn grid_figure(
     let used: Vec<_> = entries.iter().copied().chain(base.iter().map(|(base, _)| *base)).collect();
     let notes = FigureNotes {
         title: GridFigure::default_title(&point, over.unit()),
-        command: command("grid", &entries, &options),
-        query: grid_query(lake.rig(), over, &quoted(&path.surface_id), &microphone.to_string()),
-        ..notes(&request, &used)
+        command: figure_command("grid", &entries, &options),
+        query: grid_query(lake.rig(), over, &quote_literal(&path.surface_id), &microphone.to_string()),
+        ..figure_notes(&request, &used)
     };
-    query.format.write(&request, figure.draw(&notes)).await
+    query.format.write_drawing(&request, figure.draw(&notes)).await
 }
 
 /// The contents of a plot of NCE curves.
@@ -230,14 +230,14 @@ pub(super) async fn curves_figure(
     PathParams(path): PathParams<SurfacePath>,
     QueryParams(query): QueryParams<CurvesFigureQuery>,
 ) -> EndpointAnswer {
-    let entries = surfaces(&request, &path.surface_id, &query.beside).await?;
-    let microphone = query.microphone.as_deref().map(|point| request.microphone(point)).transpose()?;
+    let entries = find_surfaces(&request, &path.surface_id, &query.beside).await?;
+    let microphone = query.microphone.as_deref().map(|point| request.parse_microphone(point)).transpose()?;
     let rig = request.catalogue.lake().rig();
     let mut time_ms = Vec::new();
     let mut panels = Vec::new();
     for entry in &entries {
         let over = microphone.map_or(PairSelection::All, PairSelection::Point);
-        let set = CurveSet::read(&request, entry, over, query.points.get()).await?;
+        let set = CurveSet::read_curves(&request, entry, over, query.points.get()).await?;
         let flat_total = total_curve(&set.flat.bands);
         panels.push(NcePanel { title: entry.surface.surface_id.clone(), bands: set.surface.bands, flat_total });
         time_ms = set.time_ms;
@@ -252,11 +252,11 @@ pub(super) async fn curves_figure(
     let options: Vec<_> = microphone.iter().map(|point| format!("--microphone {point}")).collect();
     let notes = FigureNotes {
         title: NceFigure::default_title(point.map(|point| point.label()).as_deref()),
-        command: command("nce", &entries, &options),
-        query: curves_query(rig, &quoted(&path.surface_id), &filter),
-        ..notes(&request, &entries)
+        command: figure_command("nce", &entries, &options),
+        query: curves_query(rig, &quote_literal(&path.surface_id), &filter),
+        ..figure_notes(&request, &entries)
     };
-    query.format.write(&request, figure.draw(&notes)).await
+    query.format.write_drawing(&request, figure.draw(&notes)).await
 }
 
 /// Two principal components of the map.
@@ -273,7 +273,7 @@ enum MapAxes {
 }
 
 impl MapAxes {
-    fn components(self) -> [usize; 2] {
+    fn component_indices(self) -> [usize; 2] {
         match self {
             Self::FirstSecond => [0, 1],
             Self::FirstThird => [0, 2],
@@ -311,11 +311,11 @@ pub(super) async fn map_figure(
     Extension(request): Extension<CatalogueRequest>,
     QueryParams(query): QueryParams<MapFigureQuery>,
 ) -> EndpointAnswer {
-    let summary = request.summary().await?;
-    let places = positions(&request).await?;
-    let components = query.axes.components();
+    let summary = request.read_summary().await?;
+    let places = surface_positions(&request).await?;
+    let components = query.axes.component_indices();
     let placed: Vec<_> =
-        places.names.iter().enumerate().filter_map(|(i, name)| Some((i, summary.entry(name)?))).collect();
+        places.names.iter().enumerate().filter_map(|(i, name)| Some((i, summary.find_entry(name)?))).collect();
     let surfaces =
         placed.iter().map(|(i, entry)| (*i, entry.surface.surface_id.as_str(), entry.surface.typology.as_str()));
     let entries: Vec<_> = placed.iter().map(|(_, entry)| *entry).collect();
@@ -324,36 +324,36 @@ pub(super) async fn map_figure(
         title: MapFigure::default_title(entries.len(), LevelReference::FlatBand.unit()),
         command: if components == [0, 1] { "echolake figure map".into() } else { String::new() },
         query: level_vectors_query(request.catalogue.lake().rig(), "1"),
-        ..notes(&request, &entries)
+        ..figure_notes(&request, &entries)
     };
-    query.format.write(&request, figure.draw(&notes)).await
+    query.format.write_drawing(&request, figure.draw(&notes)).await
 }
 
-async fn surfaces<'a>(
+async fn find_surfaces<'a>(
     request: &'a CatalogueRequest,
     first: &str,
     beside: &[String],
 ) -> Result<Vec<&'a SurfaceEntry>, RequestFault> {
     if beside.len() >= MOST_SURFACES {
         let text = format!("`beside` is there {} times; hint: {} at most", beside.len(), MOST_SURFACES - 1);
-        return Err(RequestFault::request(text));
+        return Err(RequestFault::bad_request(text));
     }
-    let mut entries = vec![request.surface(first).await?];
+    let mut entries = vec![request.find_surface(first).await?];
     for name in beside {
-        entries.push(request.surface(name).await?);
+        entries.push(request.find_surface(name).await?);
     }
     Ok(entries)
 }
 
 /// Returns the command that writes the same figure to a file.
-fn command(kind: &str, entries: &[&SurfaceEntry], options: &[String]) -> String {
+fn figure_command(kind: &str, entries: &[&SurfaceEntry], options: &[String]) -> String {
     let names = entries.iter().map(|entry| entry.surface.surface_id.as_str());
     let words: Vec<_> =
         ["echolake figure", kind].into_iter().chain(names).chain(options.iter().map(String::as_str)).collect();
     words.join(" ")
 }
 
-fn notes(request: &CatalogueRequest, entries: &[&SurfaceEntry]) -> FigureNotes {
+fn figure_notes(request: &CatalogueRequest, entries: &[&SurfaceEntry]) -> FigureNotes {
     let origins = entries.iter().map(|entry| entry.surface.origin.clone());
     FigureNotes::of_lake(lake_version(&request.view.snapshot), origins)
 }

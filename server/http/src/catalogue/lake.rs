@@ -80,22 +80,22 @@ pub(super) async fn lake(Extension(request): Extension<CatalogueRequest>) -> End
     let lake = request.catalogue.lake();
     let rig = lake.rig();
     let points: Vec<GridPoint> = request
-        .rows("select point_id, layer, gridx, gridy, x_mm, y_mm, z_mm from points order by point_id", Vec::new())
+        .read_rows("select point_id, layer, gridx, gridy, x_mm, y_mm, z_mm from points order by point_id", Vec::new())
         .await?;
     let runs: Vec<RunTotals> =
-        request.rows("select count(*) as runs, sum(measurements) as measurements from runs", Vec::new()).await?;
-    let summary = request.summary().await?;
+        request.read_rows("select count(*) as runs, sum(measurements) as measurements from runs", Vec::new()).await?;
+    let summary = request.read_summary().await?;
     let counts = LakeCounts {
         surfaces: summary.entries.len(),
         runs: runs.first().map_or(0, |r| r.runs),
         measurements: runs.first().and_then(|r| r.measurements).unwrap_or(0),
         pairs: lake.grid().pairs().len(),
     };
-    Ok(AnswerContent::json(&LakeDescription {
-        name: name(lake.location()),
+    Ok(AnswerContent::encode_json(&LakeDescription {
+        name: lake_name(lake.location()),
         version: &request.view.version,
         software: concat!("echolake ", env!("CARGO_PKG_VERSION")),
-        bands: bands(rig),
+        bands: describe_bands(rig),
         rate_hz: rig.sweep.rate_hz.get(),
         low_hz: rig.sweep.low_hz,
         high_hz: rig.sweep.high_hz,
@@ -114,6 +114,6 @@ pub(super) async fn lake(Extension(request): Extension<CatalogueRequest>) -> End
 }
 
 // The lake's path on the server's disk is not disclosed.
-fn name(location: &str) -> &str {
+fn lake_name(location: &str) -> &str {
     location.split(['/', '\\']).rfind(|part| !part.is_empty()).unwrap_or("lake")
 }

@@ -84,21 +84,21 @@ pub(super) async fn map(
     Extension(request): Extension<CatalogueRequest>,
     QueryParams(query): QueryParams<MapQuery>,
 ) -> EndpointAnswer {
-    let summary = request.summary().await?;
-    let places = positions(&request).await?;
-    let typology = |name: &str| summary.entry(name).map_or("", |entry| entry.surface.typology.as_str());
+    let summary = request.read_summary().await?;
+    let places = surface_positions(&request).await?;
+    let typology = |name: &str| summary.find_entry(name).map_or("", |entry| entry.surface.typology.as_str());
     let point = |(i, name)| MapPoint {
         surface_id: name,
         typology: typology(name),
-        position: places.components.position(i),
+        position: places.components.row_position(i),
         unit: places.units.units[i],
-        neighbours: places.neighbours(i, query.neighbours.get()),
+        neighbours: places.nearest_surfaces(i, query.neighbours.get()),
     };
     let names: std::collections::HashSet<_> = places.names.iter().map(String::as_str).collect();
     let all = summary.entries.iter().map(|entry| entry.surface.surface_id.as_str());
-    Ok(AnswerContent::json(&SurfaceMap {
-        features: places.components.features(),
-        explained: places.components.explained(),
+    Ok(AnswerContent::encode_json(&SurfaceMap {
+        features: places.components.feature_count(),
+        explained: places.components.explained_shares(),
         units: MapUnits {
             columns: places.units.size[0],
             rows: places.units.size[1],
@@ -113,7 +113,7 @@ pub(super) async fn map(
 ///
 /// # Errors
 /// Those of its query.
-pub(super) async fn positions(request: &CatalogueRequest) -> Result<&SurfacePositions, RequestFault> {
+pub(super) async fn surface_positions(request: &CatalogueRequest) -> Result<&SurfacePositions, RequestFault> {
     request.view.places.get_or_try_init(|| find_positions(request)).await
 }
 
@@ -122,7 +122,7 @@ pub(super) async fn positions(request: &CatalogueRequest) -> Result<&SurfacePosi
 /// # Errors
 /// Those of its query.
 async fn find_positions(request: &CatalogueRequest) -> Result<SurfacePositions, RequestFault> {
-    let summary = request.summary().await?;
+    let summary = request.read_summary().await?;
     let rig = request.catalogue.lake().rig();
     let known = summary.entries.iter().filter(|e| e.surface.against_flat_db.iter().any(Option::is_some));
     let names: Vec<_> = known.map(|e| e.surface.surface_id.clone()).take(MOST_SURFACES).collect();
@@ -132,16 +132,16 @@ async fn find_positions(request: &CatalogueRequest) -> Result<SurfacePositions, 
     let step = products.div_ceil(MOST_PRODUCTS).max(1);
     let mut vectors = LevelVectors::new(&names, pairs, bands.len(), step);
     let sql = level_vectors_query(rig, "$1");
-    let mut rows = request.batches(&sql, vec![ScalarValue::Int32(i32::try_from(step).ok())]).await?;
-    while let Some(batch) = rows.next().await? {
-        vectors.add(&batch).map_err(RequestFault::defect("the map's columns are not as expected"))?;
+    let mut rows = request.stream_batches(&sql, vec![ScalarValue::Int32(i32::try_from(step).ok())]).await?;
+    while let Some(batch) = rows.next_part().await? {
+        vectors.add_batch(&batch).map_err(RequestFault::defect("the map's columns are not as expected"))?;
     }
     let place = move || {
-        let components = PrincipalComponents::of(&mut vectors.rows, COMPONENTS)?;
-        let units = SelfOrganisingMap::of(&components);
+        let components = PrincipalComponents::from_rows(&mut vectors.rows, COMPONENTS)?;
+        let units = SelfOrganisingMap::from_components(&components);
         Ok::<_, echolake_dsp::Error>((components, units))
     };
-    let found = request.catalogue.service().crunch(place).await?;
+    let found = request.catalogue.service().compute_blocking(place).await?;
     let (components, units) = found.map_err(RequestFault::defect("surfaces have no places"))?;
     Ok(SurfacePositions { names, components, units })
 }

@@ -1,6 +1,6 @@
 //! The catalogue: the data of the pages, each a query of the lake, answered once per snapshot and cached.
 //!
-//! [`table_routes`] and [`file_routes`] list the endpoints. [`respond`] stands before all of them: whether the client may
+//! [`table_routes`] and [`file_routes`] list the endpoints. [`answer_through_cache`] stands before all of them: whether the client may
 //! ask, whether it has the answer already, and whether the cache does.
 
 mod analysis;
@@ -41,10 +41,10 @@ use super::extract::PathParams;
 use super::format;
 use super::problem::ProblemResponse;
 use request::SurfacePath;
-pub(super) use request::{CatalogueRequest, RunPath, run, text};
+pub(super) use request::{CatalogueRequest, RunPath, find_run, text_value};
 use snapshot::view::SnapshotViews;
 pub(super) use snapshot::view::{SnapshotView, VisibleFile};
-pub(super) use tables::{ColumnDescription, table};
+pub(super) use tables::{ColumnDescription, find_table};
 
 /// The endpoints that are answered from tables.
 pub(super) fn table_routes() -> OpenApiRouter {
@@ -92,9 +92,9 @@ impl LakeCatalogue {
     }
 
     /// Routes of the endpoints.
-    pub(super) fn router(&self) -> Router {
+    pub(super) fn endpoint_router(&self) -> Router {
         let cached = |routes: OpenApiRouter, scope| {
-            Router::from(routes).route_layer(from_fn_with_state((self.clone(), scope), respond))
+            Router::from(routes).route_layer(from_fn_with_state((self.clone(), scope), answer_through_cache))
         };
         cached(table_routes(), TokenScope::Sql).merge(cached(file_routes(), TokenScope::Files))
     }
@@ -104,9 +104,9 @@ impl LakeCatalogue {
     /// # Errors
     /// [`RequestFault::NotFound`], or those of its queries.
     pub(super) async fn surface_value(&self, surface: &str) -> Result<Value, RequestFault> {
-        let request = CatalogueRequest::new(self, &self.view().await?, false);
+        let request = CatalogueRequest::new(self, &self.current_view().await?, false);
         let path = PathParams(SurfacePath { surface_id: surface.to_owned() });
-        Box::pin(surface::surface(Extension(request), path)).await.map_err(|problem| problem.0)?.value()
+        Box::pin(surface::surface(Extension(request), path)).await.map_err(|problem| problem.0)?.decode_json()
     }
 
     /// Returns the answer of a run's endpoint.
@@ -114,9 +114,9 @@ impl LakeCatalogue {
     /// # Errors
     /// As [`LakeCatalogue::surface_value`].
     pub(super) async fn run_value(&self, run: &str) -> Result<Value, RequestFault> {
-        let request = CatalogueRequest::new(self, &self.view().await?, false);
+        let request = CatalogueRequest::new(self, &self.current_view().await?, false);
         let path = PathParams(RunPath { run_id: run.to_owned() });
-        Box::pin(runs::run(Extension(request), path)).await.map_err(|problem| problem.0)?.value()
+        Box::pin(runs::run(Extension(request), path)).await.map_err(|problem| problem.0)?.decode_json()
     }
 
     pub(super) fn service(&self) -> &QueryService {
@@ -128,18 +128,18 @@ impl LakeCatalogue {
     }
 
     /// The lake as it is now, with what was computed of it already.
-    pub(super) async fn view(&self) -> Result<Arc<SnapshotView>, RequestFault> {
-        self.0.views.current(&self.0.service).await
+    pub(super) async fn current_view(&self) -> Result<Arc<SnapshotView>, RequestFault> {
+        self.0.views.current_view(&self.0.service).await
     }
 
     /// A table's file of this name, of the lake as it is or as it was while the server ran.
-    pub(super) fn shown(&self, view: &SnapshotView, table: Table, name: &str) -> Option<VisibleFile> {
-        self.0.views.shown(view, table, name)
+    pub(super) fn find_file(&self, view: &SnapshotView, table: Table, name: &str) -> Option<VisibleFile> {
+        self.0.views.find_file(view, table, name)
     }
 }
 
 /// Answers a request from the cache, or by its endpoint.
-async fn respond(
+async fn answer_through_cache(
     State((catalogue, scope)): State<(LakeCatalogue, TokenScope)>,
     mut request: Request,
     next: Next,
@@ -147,14 +147,14 @@ async fn respond(
     if !matches!(*request.method(), Method::GET | Method::HEAD) {
         return Ok(next.run(request).await);
     }
-    catalogue.service().client(scope)?;
-    let view = catalogue.view().await?;
+    catalogue.service().authorised_client(scope)?;
+    let view = catalogue.current_view().await?;
     let headers = request.headers().clone();
     let as_arrow = format::prefers_arrow(&headers);
     let address = request.uri().path_and_query().map_or_else(String::new, ToString::to_string);
-    let etag = view.etag(&format!("{address} {as_arrow}"));
+    let etag = view.answer_etag(&format!("{address} {as_arrow}"));
     let outcome = ConditionOutcome::new(&headers, &etag);
-    let instead = || outcome.response(&etag, [(header::ETAG, &etag)]);
+    let instead = || outcome.early_response(&etag, [(header::ETAG, &etag)]);
     // Only an answer has this tag: a client that names it had the answer, which need not be made again.
     if is_named(&headers, &etag)
         && let (ConditionOutcome::NotModified, Some(unchanged)) = (outcome, instead())
@@ -166,10 +166,10 @@ async fn respond(
     *request.method_mut() = Method::GET;
     request.extensions_mut().insert(CatalogueRequest::new(&catalogue, &view, as_arrow));
     match view.answers.get_or_make(&key, next.run(request)).await {
-        Ok(answer) => Ok(instead().unwrap_or_else(|| with_validators(answer.respond(&headers), &etag))),
+        Ok(answer) => Ok(instead().unwrap_or_else(|| with_validators(answer.to_response(&headers), &etag))),
         Err(failed) => {
             let code = failed.extensions().get::<FaultCode>().copied();
-            catalogue.service().failed(code.unwrap_or(FaultCode::Internal));
+            catalogue.service().report_failure(code.unwrap_or(FaultCode::Internal));
             Ok(failed)
         }
     }

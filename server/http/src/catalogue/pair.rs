@@ -14,7 +14,7 @@ use super::super::extract::{BinaryContent, PathParams};
 use super::content::{AnswerContent, EndpointAnswer};
 use super::curves::{CurveSet, PairSelection};
 use super::environment::{AirReading, AirSeries};
-use super::request::{CatalogueRequest, long, missing, number, text};
+use super::request::{CatalogueRequest, missing_item, nanos_value, number_value, text_value};
 use super::runs::RunLogEntry;
 use super::snapshot::summary::SurfaceEntry;
 
@@ -176,13 +176,13 @@ const AIR: &str = "select log_time_ns as ns, temperature_c, humidity_pct, pressu
 
 impl CatalogueRequest {
     /// The pair of this number.
-    pub(super) fn pair(&self, text: &str) -> Result<usize, RequestFault> {
+    pub(super) fn parse_pair(&self, text: &str) -> Result<usize, RequestFault> {
         let pairs = self.catalogue.lake().grid().pairs().len();
         let digits = !text.is_empty() && text.bytes().all(|b| b.is_ascii_digit());
         match (digits, text.parse::<usize>()) {
             (true, Ok(pair)) if pair < pairs => Ok(pair),
-            (true, _) => Err(missing(format!("pair `{text}`"), "table `pairs` lists what there is")),
-            _ => Err(RequestFault::request(format!("the pair is `{text}`; hint: a whole number below {pairs}"))),
+            (true, _) => Err(missing_item(format!("pair `{text}`"), "table `pairs` lists what there is")),
+            _ => Err(RequestFault::bad_request(format!("the pair is `{text}`; hint: a whole number below {pairs}"))),
         }
     }
 }
@@ -191,34 +191,35 @@ impl CatalogueRequest {
 ///
 /// # Errors
 /// Those of its query.
-pub(super) async fn geometry(request: &CatalogueRequest, pair: usize) -> Result<PairGeometry, RequestFault> {
-    let found = request.rows::<PairGeometry>(GEOMETRY, vec![number(pair)]).await?.into_iter().next();
-    found.map(PairGeometry::with_fresnel).ok_or_else(|| missing(format!("pair {pair}"), "ask for another one"))
+pub(super) async fn read_geometry(request: &CatalogueRequest, pair: usize) -> Result<PairGeometry, RequestFault> {
+    let found = request.read_rows::<PairGeometry>(GEOMETRY, vec![number_value(pair)]).await?.into_iter().next();
+    found.map(PairGeometry::with_fresnel).ok_or_else(|| missing_item(format!("pair {pair}"), "ask for another one"))
 }
 
 /// The newest measurement of a pair.
 ///
 /// # Errors
 /// [`RequestFault::NotFound`] if there is none.
-pub(super) async fn measurement(
+pub(super) async fn read_measurement(
     request: &CatalogueRequest,
     entry: &SurfaceEntry,
     pair: usize,
 ) -> Result<PairMeasurement, RequestFault> {
     let id = &entry.surface.surface_id;
-    let found = request.rows(MEASUREMENT, vec![text(id), number(pair)]).await?.into_iter().next();
+    let found = request.read_rows(MEASUREMENT, vec![text_value(id), number_value(pair)]).await?.into_iter().next();
     let what = || format!("a measurement of pair {pair} on surface `{id}`");
-    found.ok_or_else(|| missing(what(), "its run may be partial; another pair may be there"))
+    found.ok_or_else(|| missing_item(what(), "its run may be partial; another pair may be there"))
 }
 
 /// The responses of a surface and of its Flat after Foam's were subtracted, if they are known.
-pub(super) async fn reflected(
+pub(super) async fn read_reflected(
     request: &CatalogueRequest,
     entry: &SurfaceEntry,
     pair: usize,
 ) -> Result<[Option<Vec<f32>>; 2], RequestFault> {
     let (id, flat) = (&entry.surface.surface_id, &entry.surface.flat_reference);
-    let rows: Vec<ReflectedResponse> = request.rows(REFLECTED, vec![text(id), text(flat), number(pair)]).await?;
+    let rows: Vec<ReflectedResponse> =
+        request.read_rows(REFLECTED, vec![text_value(id), text_value(flat), number_value(pair)]).await?;
     let of = |surface: &str| rows.iter().find(|row| row.surface_id == surface).and_then(|row| row.reflected.clone());
     Ok([of(id), of(flat)])
 }
@@ -246,17 +247,17 @@ impl ResponseSignal {
     ///
     /// # Errors
     /// [`RequestFault::NoData`] if Foam is missing, [`RequestFault::NotFound`] if the pair was not measured.
-    pub(super) async fn read(
+    pub(super) async fn read_samples(
         self,
         request: &CatalogueRequest,
         entry: &SurfaceEntry,
         pair: usize,
     ) -> Result<Vec<f32>, RequestFault> {
-        let measurement = measurement(request, entry, pair).await?;
+        let measurement = read_measurement(request, entry, pair).await?;
         let samples = match self {
             Self::Measured => Some(measurement.ir),
             Self::Reflected => {
-                let [own, _] = reflected(request, entry, pair).await?;
+                let [own, _] = read_reflected(request, entry, pair).await?;
                 own
             }
         };
@@ -295,30 +296,33 @@ pub(super) async fn pair(
     Extension(request): Extension<CatalogueRequest>,
     PathParams(path): PathParams<PairPath>,
 ) -> EndpointAnswer {
-    let entry = request.surface(&path.surface_id).await?;
-    let pair = request.pair(&path.pair_id)?;
-    let responses = tokio::try_join!(measurement(&request, entry, pair), reflected(&request, entry, pair));
+    let entry = request.find_surface(&path.surface_id).await?;
+    let pair = request.parse_pair(&path.pair_id)?;
+    let responses = tokio::try_join!(read_measurement(&request, entry, pair), read_reflected(&request, entry, pair));
     let (measurement, [own, flat]) = responses?;
     if request.as_arrow {
-        return Ok(samples(&request, &measurement.ir, own.as_deref(), flat.as_deref())?);
+        return Ok(encode_samples(&request, &measurement.ir, own.as_deref(), flat.as_deref())?);
     }
     let (geometry, energies, moved, curves, attempts, air) = tokio::try_join!(
-        geometry(&request, pair),
-        energies(&request, entry, pair, &measurement.run_id),
-        symmetries(&request, entry, pair, &measurement.run_id),
-        CurveSet::read(&request, entry, PairSelection::Pair(pair), usize::MAX),
+        read_geometry(&request, pair),
+        read_energies(&request, entry, pair, &measurement.run_id),
+        read_symmetries(&request, entry, pair, &measurement.run_id),
+        CurveSet::read_curves(&request, entry, PairSelection::Pair(pair), usize::MAX),
         // The controller's messages about a pair begin so.
-        request.rows::<RunLogEntry>(ATTEMPTS, vec![text(&measurement.run_id), text(&format!("pair {pair},%"))]),
-        request.rows::<AirReading>(
+        request.read_rows::<RunLogEntry>(
+            ATTEMPTS,
+            vec![text_value(&measurement.run_id), text_value(&format!("pair {pair},%"))]
+        ),
+        request.read_rows::<AirReading>(
             AIR,
             vec![
-                text(&measurement.run_id),
-                long(measurement.log_time_ns.saturating_sub(AROUND_NS)),
-                long(measurement.log_time_ns.saturating_add(AROUND_NS)),
+                text_value(&measurement.run_id),
+                nanos_value(measurement.log_time_ns.saturating_sub(AROUND_NS)),
+                nanos_value(measurement.log_time_ns.saturating_add(AROUND_NS)),
             ],
         ),
     )?;
-    Ok(AnswerContent::json(&PairDetail {
+    Ok(AnswerContent::encode_json(&PairDetail {
         surface_id: &entry.surface.surface_id,
         pair: geometry,
         environment: AirSeries::new(air, measurement.log_time_ns, &measurement.log_time),
@@ -347,7 +351,7 @@ impl PairGeometry {
     }
 }
 
-async fn energies(
+async fn read_energies(
     request: &CatalogueRequest,
     entry: &SurfaceEntry,
     pair: usize,
@@ -363,9 +367,9 @@ async fn energies(
         "select {total} as total, {band} as band, {total_u} as total_u_db, {band_u} as band_u_db from tnce \
          where surface_id = $1 and pair_id = $2 and run_id = $3"
     );
-    let values = vec![text(&entry.surface.surface_id), number(pair), text(run)];
+    let values = vec![text_value(&entry.surface.surface_id), number_value(pair), text_value(run)];
     let nothing = vec![None; rig.band_names().len() + 1];
-    let found = request.rows(&sql, values).await?.into_iter().next();
+    let found = request.read_rows(&sql, values).await?.into_iter().next();
     Ok(found.unwrap_or_else(|| PairEnergies {
         total: nothing.clone(),
         band: nothing.clone(),
@@ -374,7 +378,7 @@ async fn energies(
     }))
 }
 
-async fn symmetries(
+async fn read_symmetries(
     request: &CatalogueRequest,
     entry: &SurfaceEntry,
     pair: usize,
@@ -387,7 +391,9 @@ async fn symmetries(
          and t.pair_id = d.d4_pair_id where d.surface_id = $1 and d.pair_id = $2 and d.run_id = $3 \
          and t.surface_id = $1 and t.run_id = $3 order by d.symmetry"
     );
-    let rows = request.rows(&sql, vec![text(&entry.surface.surface_id), number(pair), text(run)]).await?;
+    let rows = request
+        .read_rows(&sql, vec![text_value(&entry.surface.surface_id), number_value(pair), text_value(run)])
+        .await?;
     let levels = |row: SymmetryRow| SymmetricPair {
         symmetry: row.symmetry,
         pair_id: row.pair_id,
@@ -399,7 +405,7 @@ async fn symmetries(
     Ok(rows.into_iter().map(levels).collect())
 }
 
-fn samples(
+fn encode_samples(
     request: &CatalogueRequest,
     measured: &[f32],
     own: Option<&[f32]>,
@@ -418,5 +424,5 @@ fn samples(
         ("flat_reflected", column(flat)),
     ];
     let batch = RecordBatch::try_from_iter_with_nullable(columns.map(|(name, values)| (name, values, true)));
-    AnswerContent::arrow(&batch.map_err(RequestFault::defect("samples make no batch"))?)
+    AnswerContent::encode_arrow(&batch.map_err(RequestFault::defect("samples make no batch"))?)
 }

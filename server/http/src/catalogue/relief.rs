@@ -8,7 +8,7 @@ use serde::Deserialize;
 
 use super::super::extract::{BinaryContent, PathParams};
 use super::content::{AnswerContent, EndpointAnswer};
-use super::request::{CatalogueRequest, SurfacePath, missing, text};
+use super::request::{CatalogueRequest, SurfacePath, missing_item, text_value};
 
 #[derive(Deserialize)]
 struct HeightmapRow {
@@ -20,9 +20,9 @@ struct HeightmapRow {
 const HEIGHTS: &str = "select cells, size_mm, heights_mm from heightmaps \
     where surface_id = $1 and symmetry = 'identity' order by run_id desc limit 1";
 
-async fn read(request: &CatalogueRequest, path: &SurfacePath) -> Result<HeightmapRow, RequestFault> {
-    let id = &request.surface(&path.surface_id).await?.surface.surface_id;
-    let rows: Vec<HeightmapRow> = request.rows(HEIGHTS, vec![text(id)]).await?;
+async fn read_heightmap(request: &CatalogueRequest, path: &SurfacePath) -> Result<HeightmapRow, RequestFault> {
+    let id = &request.find_surface(&path.surface_id).await?.surface.surface_id;
+    let rows: Vec<HeightmapRow> = request.read_rows(HEIGHTS, vec![text_value(id)]).await?;
     let found = rows.into_iter().next().filter(|row| row.cells > 0 && row.heights_mm.len() == row.cells * row.cells);
     let hint = "its run came without a mesh";
     found.ok_or_else(|| RequestFault::NoData { what: format!("surface `{id}`"), data: "height map", hint })
@@ -45,7 +45,7 @@ pub(super) async fn heightmap(
     Extension(request): Extension<CatalogueRequest>,
     PathParams(path): PathParams<SurfacePath>,
 ) -> EndpointAnswer {
-    let heights = read(&request, &path).await?.heights_mm;
+    let heights = read_heightmap(&request, &path).await?.heights_mm;
     let bytes: Vec<u8> = heights.iter().flat_map(|h| h.to_le_bytes()).collect();
     Ok(AnswerContent::new("application/octet-stream", bytes))
 }
@@ -65,8 +65,8 @@ pub(super) async fn thumbnail(
     Extension(request): Extension<CatalogueRequest>,
     PathParams(path): PathParams<SurfacePath>,
 ) -> EndpointAnswer {
-    let row = read(&request, &path).await?;
-    let pixels = heights::shaded(&row.heights_mm, row.size_mm / row.cells as f32)
+    let row = read_heightmap(&request, &path).await?;
+    let pixels = heights::shade_heights(&row.heights_mm, row.size_mm / row.cells as f32)
         .map_err(RequestFault::defect("a height map makes no picture"))?;
     let file = encode_grey_png(&pixels, row.cells).map_err(RequestFault::defect("a height map makes no picture"))?;
     Ok(AnswerContent::new("image/png", file))
@@ -88,15 +88,17 @@ pub(super) async fn mesh(
     Extension(request): Extension<CatalogueRequest>,
     PathParams(path): PathParams<SurfacePath>,
 ) -> EndpointAnswer {
-    let surface = &request.surface(&path.surface_id).await?.surface;
+    let surface = &request.find_surface(&path.surface_id).await?.surface;
     let id = &surface.surface_id;
-    let run =
-        surface.run_id.as_deref().ok_or_else(|| missing(format!("a run of surface `{id}`"), "it is a reference"))?;
+    let run = surface
+        .run_id
+        .as_deref()
+        .ok_or_else(|| missing_item(format!("a run of surface `{id}`"), "it is a reference"))?;
     let session = request.view.session.clone();
-    let visible = request.run(run)?.clone();
-    let read = async move { Ok(session.attachment(&visible, ".glb").await?) };
-    let bytes = request.catalogue.service().plan(request.view.session.client(), read).await?;
+    let visible = request.find_run(run)?.clone();
+    let read = async move { Ok(session.read_attachment(&visible, ".glb").await?) };
+    let bytes = request.catalogue.service().plan_query(request.view.session.client(), read).await?;
     let hint = "its run came without one; the height map may be there";
     let bytes = bytes.ok_or_else(|| RequestFault::NoData { what: format!("surface `{id}`"), data: "GLB", hint })?;
-    Ok(AnswerContent::new("model/gltf-binary", bytes).named(format!("{id}.glb")))
+    Ok(AnswerContent::new("model/gltf-binary", bytes).with_name(format!("{id}.glb")))
 }

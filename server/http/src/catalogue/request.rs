@@ -44,17 +44,17 @@ pub(in super::super) struct RunPath {
 }
 
 /// A text, to be bound.
-pub(in super::super) fn text(value: &str) -> ScalarValue {
+pub(in super::super) fn text_value(value: &str) -> ScalarValue {
     ScalarValue::Utf8(Some(value.to_owned()))
 }
 
 /// A number of a point or a pair, to be bound.
-pub(super) fn number(value: usize) -> ScalarValue {
+pub(super) fn number_value(value: usize) -> ScalarValue {
     ScalarValue::Int32(i32::try_from(value).ok())
 }
 
 /// A time or a duration in nanoseconds, to be bound.
-pub(super) fn long(value: i64) -> ScalarValue {
+pub(super) fn nanos_value(value: i64) -> ScalarValue {
     ScalarValue::Int64(Some(value))
 }
 
@@ -65,90 +65,91 @@ impl CatalogueRequest {
     }
 
     /// All surfaces in short.
-    pub(super) async fn summary(&self) -> Result<&CatalogueSummary, RequestFault> {
+    pub(super) async fn read_summary(&self) -> Result<&CatalogueSummary, RequestFault> {
         let read = || async {
             let (surfaces, statistics) =
-                tokio::try_join!(self.rows(SURFACES, Vec::new()), self.rows(BAND_STATISTICS, Vec::new()))?;
-            Ok(CatalogueSummary::new(surfaces, statistics, bands(self.catalogue.lake().rig())))
+                tokio::try_join!(self.read_rows(SURFACES, Vec::new()), self.read_rows(BAND_STATISTICS, Vec::new()))?;
+            Ok(CatalogueSummary::new(surfaces, statistics, describe_bands(self.catalogue.lake().rig())))
         };
         self.view.summary.get_or_try_init(read).await
     }
 
     /// The surface of this name.
-    pub(super) async fn surface(&self, name: &str) -> Result<&SurfaceEntry, RequestFault> {
+    pub(super) async fn find_surface(&self, name: &str) -> Result<&SurfaceEntry, RequestFault> {
         let known = name.parse::<SurfaceId>().ok();
         let found = match known {
-            Some(id) => self.summary().await?.entry(id.as_str()),
+            Some(id) => self.read_summary().await?.find_entry(id.as_str()),
             None => None,
         };
-        found.ok_or_else(|| missing(format!("surface `{name}`"), "GET /api/v1/surfaces lists what there is"))
+        found.ok_or_else(|| missing_item(format!("surface `{name}`"), "GET /api/v1/surfaces lists what there is"))
     }
 
     /// The run of this name, as the snapshot shows it.
-    pub(super) fn run(&self, name: &str) -> Result<&VisibleRun, RequestFault> {
-        run(&self.view, name)
+    pub(super) fn find_run(&self, name: &str) -> Result<&VisibleRun, RequestFault> {
+        find_run(&self.view, name)
     }
 
     /// Reads the parameter `microphone`, a grid point of the lake.
-    pub(super) fn microphone(&self, text: &str) -> Result<usize, RequestFault> {
+    pub(super) fn parse_microphone(&self, text: &str) -> Result<usize, RequestFault> {
         let last = self.catalogue.lake().grid().points().len().saturating_sub(1);
-        parse_whole(text, 0..=last).map_err(|e| RequestFault::request(format!("`microphone`: {e}")))
+        parse_whole(text, 0..=last).map_err(|e| RequestFault::bad_request(format!("`microphone`: {e}")))
     }
 
     /// The rows of a query. `sql` is a text of the program's own; what came with the request is among `values`.
-    pub(in super::super) async fn rows<T: DeserializeOwned + Send + 'static>(
+    pub(in super::super) async fn read_rows<T: DeserializeOwned + Send + 'static>(
         &self,
         sql: &str,
         values: Vec<ScalarValue>,
     ) -> Result<Vec<T>, RequestFault> {
         let decoder = RowDecoder::new(sql.to_owned());
-        let mut running = self.begin(sql, values, |_| Ok(decoder)).await?;
+        let mut running = self.begin_query(sql, values, |_| Ok(decoder)).await?;
         let mut rows = Vec::new();
-        while let Some(part) = running.next().await? {
+        while let Some(part) = running.next_part().await? {
             rows.extend(part);
         }
         Ok(rows)
     }
 
     /// The batches of a query, as they come.
-    pub(super) async fn batches(
+    pub(super) async fn stream_batches(
         &self,
         sql: &str,
         values: Vec<ScalarValue>,
     ) -> Result<RunningQuery<RecordBatch>, RequestFault> {
-        self.begin(sql, values, |_| Ok(BatchEncoder)).await
+        self.begin_query(sql, values, |_| Ok(BatchEncoder)).await
     }
 
-    async fn begin<E: AnswerEncoder>(
+    async fn begin_query<E: AnswerEncoder>(
         &self,
         sql: &str,
         values: Vec<ScalarValue>,
         encode: impl FnOnce(&arrow::datatypes::SchemaRef) -> Result<E, RequestFault> + Send + 'static,
     ) -> Result<RunningQuery<E::Item>, RequestFault> {
         let service = self.catalogue.service();
-        let prepared = match self.view.prepared(sql) {
+        let prepared = match self.view.find_prepared(sql) {
             Some(prepared) => prepared,
             None => {
                 let (session, text) = (self.view.session.clone(), sql.to_owned());
-                let planned =
-                    service.plan(self.view.session.client(), async move { Ok(session.prepare(&text).await?) }).await?;
+                let planned = service
+                    .plan_query(self.view.session.client(), async move { Ok(session.prepare(&text).await?) })
+                    .await?;
                 let planned = Arc::new(planned);
                 self.view.keep_prepared(sql, planned.clone());
                 planned
             }
         };
         let job = http_job(self.view.session.clone(), QueryWork::Prepared(prepared, ParamValues::from(values)));
-        service.begin(job, encode).await
+        service.begin_query(job, encode).await
     }
 }
 
 /// The run of this name.
-pub(in super::super) fn run<'a>(view: &'a SnapshotView, name: &str) -> Result<&'a VisibleRun, RequestFault> {
+pub(in super::super) fn find_run<'a>(view: &'a SnapshotView, name: &str) -> Result<&'a VisibleRun, RequestFault> {
     let found = name.parse::<RunId>().ok().and_then(|id| view.snapshot.run(&id));
-    found.ok_or_else(|| missing(format!("run `{name}`"), "GET /api/v1/runs lists what there is"))
+    found.ok_or_else(|| missing_item(format!("run `{name}`"), "GET /api/v1/runs lists what there is"))
 }
 
 /// The fault for a missing item.
-pub(super) fn missing(what: String, hint: &'static str) -> RequestFault {
+pub(super) fn missing_item(what: String, hint: &'static str) -> RequestFault {
     RequestFault::NotFound { what, hint }
 }

@@ -31,7 +31,7 @@ impl<T> RowDecoder<T> {
 impl<T: DeserializeOwned + Send + 'static> AnswerEncoder for RowDecoder<T> {
     type Item = Vec<T>;
 
-    fn batch(&mut self, batch: RecordBatch) -> Result<Vec<Vec<T>>, RequestFault> {
+    fn encode_batch(&mut self, batch: RecordBatch) -> Result<Vec<Vec<T>>, RequestFault> {
         self.bytes += batch.columns().iter().map(slice_bytes).sum::<usize>();
         if self.bytes > MOST_BYTES {
             return Err(RequestFault::TooLarge { limit: MOST_BYTES });
@@ -47,7 +47,7 @@ impl<T: DeserializeOwned + Send + 'static> AnswerEncoder for RowDecoder<T> {
         }
     }
 
-    fn end(self) -> Result<Vec<Vec<T>>, RequestFault> {
+    fn encode_end(self) -> Result<Vec<Vec<T>>, RequestFault> {
         Ok(Vec::new())
     }
 }
@@ -61,11 +61,11 @@ fn slice_bytes(column: &ArrayRef) -> usize {
 fn finite_batch(batch: &RecordBatch) -> Result<RecordBatch, ArrowError> {
     let schema = batch.schema();
     let columns = schema.fields().iter().zip(batch.columns());
-    let columns = columns.map(|(field, column)| Ok::<_, ArrowError>((field.name(), finite(column)?, true)));
+    let columns = columns.map(|(field, column)| Ok::<_, ArrowError>((field.name(), finite_values(column)?, true)));
     RecordBatch::try_from_iter_with_nullable(columns.collect::<Result<Vec<_>, ArrowError>>()?)
 }
 
-fn finite(column: &ArrayRef) -> Result<ArrayRef, ArrowError> {
+fn finite_values(column: &ArrayRef) -> Result<ArrayRef, ArrowError> {
     Ok(match column.data_type() {
         DataType::Float32 => {
             let numbers = column.as_primitive::<Float32Type>();
@@ -78,7 +78,12 @@ fn finite(column: &ArrayRef) -> Result<ArrayRef, ArrowError> {
         DataType::List(item) => {
             let list = column.as_list::<i32>();
             let item = Arc::new(item.as_ref().clone().with_nullable(true));
-            Arc::new(ListArray::try_new(item, list.offsets().clone(), finite(list.values())?, list.nulls().cloned())?)
+            Arc::new(ListArray::try_new(
+                item,
+                list.offsets().clone(),
+                finite_values(list.values())?,
+                list.nulls().cloned(),
+            )?)
         }
         _ => column.clone(),
     })
@@ -135,20 +140,20 @@ mod tests {
         ];
         let mut decoder = RowDecoder::<NamedRow>::new(String::new());
         let rows = |decoded: Vec<Vec<NamedRow>>| decoded.into_iter().flatten().collect::<Vec<_>>();
-        assert_eq!(rows(decoder.batch(batch()).expect("rows")), expected);
+        assert_eq!(rows(decoder.encode_batch(batch()).expect("rows")), expected);
         // A part of a batch counts without the rest.
-        assert_eq!(rows(decoder.batch(batch().slice(1, 1)).expect("rows")), expected[1..]);
+        assert_eq!(rows(decoder.encode_batch(batch().slice(1, 1)).expect("rows")), expected[1..]);
     }
 
     #[test]
     fn rows_are_bounded_and_a_null_is_no_number() {
         let mut decoder = RowDecoder::<NamedRow> { bytes: MOST_BYTES, ..RowDecoder::new(String::new()) };
-        assert!(matches!(decoder.batch(batch()), Err(RequestFault::TooLarge { .. })));
+        assert!(matches!(decoder.encode_batch(batch()), Err(RequestFault::TooLarge { .. })));
         #[derive(Deserialize)]
         struct LevelRow {
             #[expect(dead_code, reason = "it is only read")]
             level: f32,
         }
-        assert!(matches!(RowDecoder::<LevelRow>::new(String::new()).batch(batch()), Err(RequestFault::Internal)));
+        assert!(matches!(RowDecoder::<LevelRow>::new(String::new()).encode_batch(batch()), Err(RequestFault::Internal)));
     }
 }

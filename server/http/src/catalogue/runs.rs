@@ -7,7 +7,7 @@ use utoipa::{IntoParams, ToSchema};
 
 use super::super::extract::{PathParams, QueryParams, WholeNumber};
 use super::content::{AnswerContent, EndpointAnswer};
-use super::request::{CatalogueRequest, RunPath, missing, text};
+use super::request::{CatalogueRequest, RunPath, missing_item, text_value};
 
 /// Lines of a run's log that are answered.
 const MOST_EVENTS: usize = 200;
@@ -102,7 +102,7 @@ enum RunSort {
 }
 
 impl RunSort {
-    fn expression(self) -> &'static str {
+    fn sort_expression(self) -> &'static str {
         match self {
             Self::Started => "started_ns",
             Self::RunId => "run_id",
@@ -154,12 +154,12 @@ pub(super) async fn runs(
     Extension(request): Extension<CatalogueRequest>,
     QueryParams(query): QueryParams<RunsQuery>,
 ) -> EndpointAnswer {
-    let column = query.sort.expression();
+    let column = query.sort.sort_expression();
     let order = match query.order {
         RunDirection::Desc => "desc",
         RunDirection::Asc => "asc",
     };
-    let chosen = vec![text(&query.q.to_lowercase()), text(&query.surface_id), text(&query.state)];
+    let chosen = vec![text_value(&query.q.to_lowercase()), text_value(&query.surface_id), text_value(&query.state)];
     let page = format!(
         "select {COLUMNS} from runs where {CHOSEN} order by {column} {order} nulls last, run_id limit $5 offset $4"
     );
@@ -168,9 +168,9 @@ pub(super) async fn runs(
     let part = [whole(query.offset.get()), whole(query.limit.get())];
     let values = chosen.iter().cloned().chain(part).collect();
     let (items, total) =
-        tokio::try_join!(request.rows::<RunRecord>(&page, values), request.rows::<RunCount>(&count, chosen))?;
+        tokio::try_join!(request.read_rows::<RunRecord>(&page, values), request.read_rows::<RunCount>(&count, chosen))?;
     let total = total.first().map_or(0, |c| c.total);
-    Ok(AnswerContent::json(&RunPage { total, offset: query.offset.get(), items })?)
+    Ok(AnswerContent::encode_json(&RunPage { total, offset: query.offset.get(), items })?)
 }
 
 /// One run.
@@ -256,8 +256,8 @@ pub(super) async fn run(
     Extension(request): Extension<CatalogueRequest>,
     PathParams(path): PathParams<RunPath>,
 ) -> EndpointAnswer {
-    let visible = request.run(&path.run_id)?.clone();
-    let id = text(visible.run.as_str());
+    let visible = request.find_run(&path.run_id)?.clone();
+    let id = text_value(visible.run.as_str());
     let limits = &request.catalogue.lake().rig().validation;
     let real = |value: f64| ScalarValue::Float64(Some(value));
     let flags = vec![id.clone(), real(limits.snr_db), real(limits.arrival_us), real(limits.outside_level_db)];
@@ -268,13 +268,13 @@ pub(super) async fn run(
     );
     let (session, service) = (request.view.session.clone(), request.catalogue.service());
     let (contents, run, repeats, flags, events) = tokio::try_join!(
-        service.plan(request.view.session.client(), async move { Ok(session.contents(&visible).await?) }),
-        request.rows::<RunRecord>(&one, vec![id.clone()]),
-        request.rows::<AttemptCount>(REPEATS, vec![id.clone()]),
-        request.rows::<QualityFlags>(FLAGS, flags),
-        request.rows::<RunLogEntry>(&log, vec![id.clone()]),
+        service.plan_query(request.view.session.client(), async move { Ok(session.read_contents(&visible).await?) }),
+        request.read_rows::<RunRecord>(&one, vec![id.clone()]),
+        request.read_rows::<AttemptCount>(REPEATS, vec![id.clone()]),
+        request.read_rows::<QualityFlags>(FLAGS, flags),
+        request.read_rows::<RunLogEntry>(&log, vec![id.clone()]),
     )?;
-    let run = run.into_iter().next().ok_or_else(|| missing("this run".into(), "ask again"))?;
+    let run = run.into_iter().next().ok_or_else(|| missing_item("this run".into(), "ask again"))?;
     let topic = |t: echolake_query::Topic| RunTopic {
         topic: t.topic,
         schema: t.schema,
@@ -284,17 +284,17 @@ pub(super) async fn run(
     };
     let attachment =
         |a: echolake_query::Attachment| RunAttachment { name: a.name, media_type: a.media_type, bytes: a.bytes };
-    Ok(AnswerContent::json(&RunDetail {
+    Ok(AnswerContent::encode_json(&RunDetail {
         run,
         topics: contents.topics.into_iter().map(topic).collect(),
         attachments: contents.attachments.into_iter().map(attachment).collect(),
-        quality: flags.first().map_or_else(Vec::new, |flags| quality(flags, limits)),
+        quality: flags.first().map_or_else(Vec::new, |flags| quality_counts(flags, limits)),
         repeats,
         events,
     })?)
 }
 
-fn quality(flags: &QualityFlags, limits: &echolake_schema::rig::Validation) -> Vec<QualityCount> {
+fn quality_counts(flags: &QualityFlags, limits: &echolake_schema::rig::Validation) -> Vec<QualityCount> {
     let flag = |flag, label, measurements| QualityCount { flag, label, measurements };
     vec![
         flag("clipped", "clipped samples".to_owned(), flags.clipped),

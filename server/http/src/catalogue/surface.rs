@@ -11,7 +11,7 @@ use utoipa::{IntoParams, ToSchema};
 
 use super::super::extract::{PathParams, QueryParams};
 use super::content::{AnswerContent, EndpointAnswer};
-use super::request::{CatalogueRequest, SurfacePath, number, text};
+use super::request::{CatalogueRequest, SurfacePath, number_value, text_value};
 use super::snapshot::summary::{SurfaceEntry, SurfaceSummary};
 
 /// One surface.
@@ -92,7 +92,7 @@ pub(super) async fn surface(
     Extension(request): Extension<CatalogueRequest>,
     PathParams(path): PathParams<SurfacePath>,
 ) -> EndpointAnswer {
-    let entry = request.surface(&path.surface_id).await?;
+    let entry = request.find_surface(&path.surface_id).await?;
     let (id, flat) = (&entry.surface.surface_id, &entry.surface.flat_reference);
     let means = band_list(request.catalogue.lake().rig(), |band| format!("avg(tnce_{band})"));
     let means =
@@ -104,13 +104,16 @@ pub(super) async fn surface(
         phases.join(", ")
     );
     let (found, of_flat, rows, phases, runs) = tokio::try_join!(
-        request.rows::<BandStatistics>(STATISTICS, vec![text(id)]),
-        request.rows::<BandStatistics>(STATISTICS, vec![text(flat)]),
-        request.rows::<SurfaceMeans>(&means, vec![text(id), text(flat)]),
-        request.rows::<DetailPhases>(&phases, vec![text(id)]),
-        request.rows::<SurfaceRun>("select run_id from runs where surface_id = $1 order by started_ns", vec![text(id)]),
+        request.read_rows::<BandStatistics>(STATISTICS, vec![text_value(id)]),
+        request.read_rows::<BandStatistics>(STATISTICS, vec![text_value(flat)]),
+        request.read_rows::<SurfaceMeans>(&means, vec![text_value(id), text_value(flat)]),
+        request.read_rows::<DetailPhases>(&phases, vec![text_value(id)]),
+        request.read_rows::<SurfaceRun>(
+            "select run_id from runs where surface_id = $1 order by started_ns",
+            vec![text_value(id)]
+        ),
     )?;
-    let bands = &request.summary().await?.bands;
+    let bands = &request.read_summary().await?.bands;
     let mean = |surface: &str| {
         let own = rows.iter().find(|row| row.surface_id == surface);
         own.map_or_else(|| vec![None; bands.len()], |row| row.means.clone())
@@ -118,7 +121,7 @@ pub(super) async fn surface(
     let mut by_band = newest_by_band(found);
     let of_flat = newest_by_band(of_flat);
     let unbiased = |band: &str| of_flat.get(band).and_then(|row| row.unbiased_p90_mean_db);
-    Ok(AnswerContent::json(&SurfaceDetail {
+    Ok(AnswerContent::encode_json(&SurfaceDetail {
         surface: &entry.surface,
         parameters: &entry.parameters,
         mesh_triangles: entry.mesh_triangles,
@@ -198,10 +201,10 @@ pub(super) async fn grid(
     PathParams(path): PathParams<SurfacePath>,
     QueryParams(query): QueryParams<GridQuery>,
 ) -> EndpointAnswer {
-    let entry = request.surface(&path.surface_id).await?;
+    let entry = request.find_surface(&path.surface_id).await?;
     let microphone = required_microphone(&request, query.microphone.as_deref())?;
     let levels = read_grid(&request, entry, microphone, query.over).await?;
-    Ok(AnswerContent::json(&SurfaceGrid {
+    Ok(AnswerContent::encode_json(&SurfaceGrid {
         surface_id: &entry.surface.surface_id,
         microphone,
         over: query.over,
@@ -225,7 +228,9 @@ impl From<GridNormalisation> for LevelReference {
 /// # Errors
 /// [`RequestFault::Request`] if it names none.
 pub(super) fn required_microphone(request: &CatalogueRequest, named: Option<&str>) -> Result<usize, RequestFault> {
-    request.microphone(named.ok_or_else(|| RequestFault::request("`microphone` is missing; hint: a grid point"))?)
+    request.parse_microphone(
+        named.ok_or_else(|| RequestFault::bad_request("`microphone` is missing; hint: a grid point"))?,
+    )
 }
 
 /// Reads the levels of a surface over the grid.
@@ -239,7 +244,8 @@ pub(super) async fn read_grid(
     over: GridNormalisation,
 ) -> Result<GridLevels, RequestFault> {
     let sql = grid_query(request.catalogue.lake().rig(), over.into(), "$1", "$2");
-    let cells: Vec<GridCell> = request.rows(&sql, vec![text(&entry.surface.surface_id), number(microphone)]).await?;
+    let cells: Vec<GridCell> =
+        request.read_rows(&sql, vec![text_value(&entry.surface.surface_id), number_value(microphone)]).await?;
     let points = request.catalogue.lake().grid().points().len();
-    Ok(GridLevels::from_cells(cells, microphone, points, request.summary().await?.bands.len()))
+    Ok(GridLevels::from_cells(cells, microphone, points, request.read_summary().await?.bands.len()))
 }

@@ -9,7 +9,7 @@ use utoipa::{IntoParams, ToSchema};
 
 use super::super::extract::PathParams;
 use super::content::{AnswerContent, EndpointAnswer};
-use super::request::{CatalogueRequest, missing};
+use super::request::{CatalogueRequest, missing_item};
 
 /// A table or view.
 #[derive(Serialize, ToSchema)]
@@ -34,7 +34,7 @@ pub(in super::super) struct ColumnDescription {
 
 impl ColumnDescription {
     /// The column of a field.
-    pub(in super::super) fn of(field: &Field) -> Self {
+    pub(in super::super) fn from_field(field: &Field) -> Self {
         let metadata = |key: &str| field.metadata().get(key).filter(|text| !text.is_empty()).cloned();
         Self {
             name: field.name().clone(),
@@ -59,9 +59,11 @@ impl ColumnDescription {
 pub(super) async fn tables(Extension(request): Extension<CatalogueRequest>) -> EndpointAnswer {
     let table = |(name, schema): (String, SchemaRef)| TableDescription {
         name,
-        columns: schema.fields().iter().map(|f| ColumnDescription::of(f)).collect(),
+        columns: schema.fields().iter().map(|f| ColumnDescription::from_field(f)).collect(),
     };
-    Ok(AnswerContent::json(&request.catalogue.service().all_tables().into_iter().map(table).collect::<Vec<_>>())?)
+    Ok(AnswerContent::encode_json(
+        &request.catalogue.service().all_tables().into_iter().map(table).collect::<Vec<_>>(),
+    )?)
 }
 
 /// The path of a table.
@@ -92,8 +94,8 @@ pub(super) async fn table_files(
     Extension(request): Extension<CatalogueRequest>,
     PathParams(path): PathParams<TablePath>,
 ) -> EndpointAnswer {
-    let table = table(&path.table)?;
-    request.view.snapshot.check(table).map_err(|fault| RequestFault::Query(fault.into()))?;
+    let table = find_table(&path.table)?;
+    request.view.snapshot.check_table(table).map_err(|fault| RequestFault::Query(fault.into()))?;
     let files = request.view.snapshot.readable_files(table);
     let file = |file: &'_ echolake_lake::DataFile| {
         let rows = Some(file.visible_rows());
@@ -101,10 +103,11 @@ pub(super) async fn table_files(
     };
     let files: Vec<_> = files.filter_map(file).collect();
     let files = files.iter().map(|(file, bytes, rows)| TableFile { file, bytes: *bytes, rows: *rows });
-    Ok(AnswerContent::json(&files.collect::<Vec<_>>())?)
+    Ok(AnswerContent::encode_json(&files.collect::<Vec<_>>())?)
 }
 
 /// The table of a name.
-pub(in super::super) fn table(name: &str) -> Result<Table, RequestFault> {
-    Table::by_name(name).ok_or_else(|| missing(format!("table `{name}`"), "GET /api/v1/tables lists what there is"))
+pub(in super::super) fn find_table(name: &str) -> Result<Table, RequestFault> {
+    Table::by_name(name)
+        .ok_or_else(|| missing_item(format!("table `{name}`"), "GET /api/v1/tables lists what there is"))
 }

@@ -43,14 +43,14 @@ pub(super) async fn wav(
     PathParams(path): PathParams<PairPath>,
     QueryParams(query): QueryParams<WavQuery>,
 ) -> EndpointAnswer {
-    let entry = request.surface(&path.surface_id).await?;
-    let pair = request.pair(&path.pair_id)?;
-    let samples = query.signal.read(&request, entry, pair).await?;
+    let entry = request.find_surface(&path.surface_id).await?;
+    let pair = request.parse_pair(&path.pair_id)?;
+    let samples = query.signal.read_samples(&request, entry, pair).await?;
     let rate_hz = request.catalogue.lake().rig().sweep.rate_hz.get() / query.slowdown.get() as f64;
     let file = write_wav(&samples, rate_hz.round() as u32);
     let file = file.map_err(RequestFault::defect("a response makes no WAV file"))?;
     let name = format!("{}-{pair}-{}.wav", entry.surface.surface_id, query.signal.name());
-    Ok(AnswerContent::new("audio/wav", file).named(name))
+    Ok(AnswerContent::new("audio/wav", file).with_name(name))
 }
 
 fn write_wav(samples: &[f32], rate_hz: u32) -> hound::Result<Vec<u8>> {

@@ -97,13 +97,13 @@ impl ProtocolRequest {
     ///
     /// # Errors
     /// They do not, or the revision is not known.
-    pub(super) fn revision(&self, headers: &HeaderMap) -> Result<ProtocolRevision, MethodError> {
+    pub(super) fn read_revision(&self, headers: &HeaderMap) -> Result<ProtocolRevision, MethodError> {
         let header = |name: &str| headers.get(name).map(|value| String::from_utf8_lossy(value.as_bytes()));
         let of_header = header(VERSION_HEADER);
         let named = self.params.get("_meta").and_then(|meta| meta.get(VERSION_KEY));
         let Some(named) = named else {
             return match of_header {
-                Some(version) if !HANDSHAKES.contains(&&*version) => Err(MethodError::version(&version)),
+                Some(version) if !HANDSHAKES.contains(&&*version) => Err(MethodError::unsupported_version(&version)),
                 _ => Ok(ProtocolRevision::Handshake),
             };
         };
@@ -121,16 +121,16 @@ impl ProtocolRequest {
                 return Err(MethodError::new(HEADER_MISMATCH, message));
             }
         }
-        if named == STATELESS { Ok(ProtocolRevision::Stateless) } else { Err(MethodError::version(named)) }
+        if named == STATELESS { Ok(ProtocolRevision::Stateless) } else { Err(MethodError::unsupported_version(named)) }
     }
 
     /// The answer to `initialize`.
-    pub(super) fn handshake(&self, instructions: &str) -> Value {
+    pub(super) fn handshake_result(&self, instructions: &str) -> Value {
         let wanted = self.params.get("protocolVersion").and_then(Value::as_str).unwrap_or_default();
         let version = HANDSHAKES.into_iter().find(|known| *known == wanted).unwrap_or(NEWEST_HANDSHAKE);
         json!({
             "protocolVersion": version,
-            "capabilities": capabilities(),
+            "capabilities": server_capabilities(),
             "serverInfo": server_info(),
             "instructions": instructions,
         })
@@ -158,7 +158,7 @@ impl ProtocolRequest {
 
 impl ProtocolRevision {
     /// Adds to a result what the revision wants in it.
-    pub(super) fn complete(self, mut result: Value) -> Value {
+    pub(super) fn complete_result(self, mut result: Value) -> Value {
         if let (Self::Stateless, Some(fields)) = (self, result.as_object_mut()) {
             fields.insert("resultType".to_owned(), "complete".into());
             fields.insert("_meta".to_owned(), json!({ SERVER_KEY: server_info() }));
@@ -171,7 +171,7 @@ impl ProtocolRevision {
     }
 
     /// The status of an answer with this error: 200 before it was said which one.
-    pub(super) fn status(self, error: &MethodError) -> StatusCode {
+    pub(super) fn error_status(self, error: &MethodError) -> StatusCode {
         match (self, error.code) {
             (Self::Handshake, _) => StatusCode::OK,
             (Self::Stateless, UNKNOWN_METHOD) => StatusCode::NOT_FOUND,
@@ -185,7 +185,7 @@ impl MethodError {
         Self { code, message, data: None }
     }
 
-    fn version(requested: &str) -> Self {
+    fn unsupported_version(requested: &str) -> Self {
         let supported: Vec<_> = HANDSHAKES.into_iter().chain([STATELESS]).collect();
         let message = format!("revision `{requested}` is not supported; hint: {}", supported.join(", "));
         let data = Some(json!({ "supported": supported, "requested": requested }));
@@ -199,7 +199,7 @@ impl MethodError {
     }
 
     /// The error as the answer to a request.
-    pub(super) fn answer(self, id: &Value, status: StatusCode) -> Response {
+    pub(super) fn into_answer(self, id: &Value, status: StatusCode) -> Response {
         let mut error = json!({ "code": self.code, "message": self.message });
         if let Some(data) = self.data {
             error["data"] = data;
@@ -209,10 +209,10 @@ impl MethodError {
 }
 
 /// The answer to `server/discover`.
-pub(super) fn discovery(instructions: &str) -> Value {
+pub(super) fn discovery_result(instructions: &str) -> Value {
     json!({
         "supportedVersions": HANDSHAKES.into_iter().chain([STATELESS]).collect::<Vec<_>>(),
-        "capabilities": capabilities(),
+        "capabilities": server_capabilities(),
         "instructions": instructions,
     })
 }
@@ -220,16 +220,20 @@ pub(super) fn discovery(instructions: &str) -> Value {
 /// The result of a tool: what it answers, as a value and as text for clients that read no values.
 pub(super) fn tool_result(answer: Result<Value, RequestFault>) -> Value {
     match answer {
-        Ok(value) => json!({ "content": [text(value.to_string())], "structuredContent": value, "isError": false }),
-        Err(fault) => json!({ "content": [text(format!("{}: {fault}", fault.code().name()))], "isError": true }),
+        Ok(value) => {
+            json!({ "content": [text_content(value.to_string())], "structuredContent": value, "isError": false })
+        }
+        Err(fault) => {
+            json!({ "content": [text_content(format!("{}: {fault}", fault.code().name()))], "isError": true })
+        }
     }
 }
 
-fn text(text: String) -> Value {
+fn text_content(text: String) -> Value {
     json!({ "type": "text", "text": text })
 }
 
-fn capabilities() -> Value {
+fn server_capabilities() -> Value {
     json!({ "tools": {} })
 }
 
@@ -278,7 +282,7 @@ mod tests {
             let asked = request(json!({
                 "jsonrpc": "2.0", "id": 1, "method": "initialize", "params": { "protocolVersion": wanted }
             }));
-            assert_eq!(asked.handshake("")["protocolVersion"], expected);
+            assert_eq!(asked.handshake_result("")["protocolVersion"], expected);
         }
     }
 
@@ -291,7 +295,7 @@ mod tests {
             let headers = headers
                 .iter()
                 .map(|(name, value)| (axum::http::HeaderName::from_static(name), HeaderValue::from_static(value)));
-            asked.revision(&headers.collect()).map_err(|error| error.code)
+            asked.read_revision(&headers.collect()).map_err(|error| error.code)
         };
         assert_eq!(check(None, &[]), Ok(ProtocolRevision::Handshake));
         assert_eq!(check(None, &[(VERSION_HEADER, "2025-06-18")]), Ok(ProtocolRevision::Handshake));

@@ -21,7 +21,7 @@ use bytes::Bytes;
 use serde_json::{Value, json};
 
 use super::catalogue::LakeCatalogue;
-use super::manifest::origin;
+use super::manifest::server_origin;
 use super::problem::ProblemResponse;
 use super::slices::SliceService;
 use super::sql;
@@ -46,7 +46,7 @@ pub(crate) struct AgentService {
 }
 
 /// The route of agents.
-pub(crate) fn routes(catalogue: &LakeCatalogue, slices: &SliceService) -> Router {
+pub(crate) fn agent_routes(catalogue: &LakeCatalogue, slices: &SliceService) -> Router {
     let agents = AgentService { catalogue: catalogue.clone(), slices: slices.clone() };
     Router::new().route(MCP, post(answer_message)).with_state(agents)
 }
@@ -56,7 +56,7 @@ async fn answer_message(
     headers: HeaderMap,
     body: Result<Bytes, BytesRejection>,
 ) -> Response {
-    let message = match sql::whole(body) {
+    let message = match sql::whole_body(body) {
         Ok(body) => ClientMessage::parse(&body),
         Err(fault) => return ProblemResponse(fault).into_response(),
     };
@@ -64,34 +64,33 @@ async fn answer_message(
         Ok(ClientMessage::Request(request)) => request,
         // Nothing is kept between messages that a notification could change.
         Ok(ClientMessage::Notification) => return StatusCode::ACCEPTED.into_response(),
-        Err(error) => return error.answer(&Value::Null, StatusCode::BAD_REQUEST),
+        Err(error) => return error.into_answer(&Value::Null, StatusCode::BAD_REQUEST),
     };
-    let revision = match request.revision(&headers) {
+    let revision = match request.read_revision(&headers) {
         Ok(revision) => revision,
-        Err(error) => return error.answer(&request.id, StatusCode::BAD_REQUEST),
+        Err(error) => return error.into_answer(&request.id, StatusCode::BAD_REQUEST),
     };
-    match agents.result(&request, &origin(&headers)).await {
-        Ok(result) => {
-            Json(json!({ "jsonrpc": "2.0", "id": request.id, "result": revision.complete(result) })).into_response()
-        }
+    match agents.method_result(&request, &server_origin(&headers)).await {
+        Ok(result) => Json(json!({ "jsonrpc": "2.0", "id": request.id, "result": revision.complete_result(result) }))
+            .into_response(),
         Err(error) => {
-            let status = revision.status(&error);
-            error.answer(&request.id, status)
+            let status = revision.error_status(&error);
+            error.into_answer(&request.id, status)
         }
     }
 }
 
 impl AgentService {
-    async fn result(&self, request: &ProtocolRequest, origin: &str) -> Result<Value, MethodError> {
+    async fn method_result(&self, request: &ProtocolRequest, origin: &str) -> Result<Value, MethodError> {
         match request.method.as_str() {
-            "initialize" => Ok(request.handshake(INSTRUCTIONS)),
-            "server/discover" => Ok(message::discovery(INSTRUCTIONS)),
+            "initialize" => Ok(request.handshake_result(INSTRUCTIONS)),
+            "server/discover" => Ok(message::discovery_result(INSTRUCTIONS)),
             "ping" => Ok(json!({})),
             "tools/list" => Ok(json!({ "tools": AgentTool::ALL.map(AgentTool::description) })),
             "tools/call" => {
                 let (tool, arguments) = request.tool_call()?;
                 let call = ToolCall { agents: self, origin };
-                Ok(message::tool_result(call.answer(tool, arguments).await))
+                Ok(message::tool_result(call.answer_call(tool, arguments).await))
             }
             other => Err(MethodError::unknown_method(other)),
         }

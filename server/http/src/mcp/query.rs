@@ -22,7 +22,7 @@ impl ToolCall<'_> {
     ///
     /// # Errors
     /// A defect of the statement, or the cause of its end.
-    pub(super) async fn query(
+    pub(super) async fn run_query(
         &self,
         client: &Arc<EngineClient>,
         sql: String,
@@ -31,17 +31,17 @@ impl ToolCall<'_> {
         let most = max_rows.unwrap_or(USUAL_ROWS);
         if !(1..=MOST_ROWS).contains(&most) {
             let message = format!("`max_rows` is {most}; hint: 1 to {MOST_ROWS}, or sums and means in SQL");
-            return Err(RequestFault::request(message));
+            return Err(RequestFault::bad_request(message));
         }
         let service = self.agents.catalogue.service();
-        let job = http_job(Arc::new(service.session(client)), QueryWork::Sql(sql));
+        let job = http_job(Arc::new(service.begin_session(client)), QueryWork::Sql(sql));
         let most = usize::try_from(most).unwrap_or(usize::MAX);
-        let mut running = service.begin(job, move |schema| Ok(CappedRows::new(schema, most))).await?;
+        let mut running = service.begin_query(job, move |schema| Ok(CappedRows::new(schema, most))).await?;
         let mut rows = Vec::new();
         let mut end = AnswerEnd::Whole;
         let schema = running.schema.clone();
         while end == AnswerEnd::Whole
-            && let Some(page) = running.next().await?
+            && let Some(page) = running.next_part().await?
         {
             rows.extend(page.rows);
             end = page.end;
@@ -56,7 +56,7 @@ impl ToolCall<'_> {
         };
         let columns: Vec<_> = schema.fields().iter().map(column).collect();
         let mut answer = json!({ "columns": columns, "row_count": rows.len(), "truncated": end != AnswerEnd::Whole });
-        if let Some(note) = end.note(most) {
+        if let Some(note) = end.truncation_note(most) {
             answer["note"] = note.into();
         }
         answer["rows"] = rows.into();
@@ -73,7 +73,7 @@ enum AnswerEnd {
 }
 
 impl AnswerEnd {
-    fn note(self, most_rows: usize) -> Option<String> {
+    fn truncation_note(self, most_rows: usize) -> Option<String> {
         let instead = "hint: aggregate or filter in SQL, or POST /api/v1/sql for all rows";
         match self {
             Self::Whole => None,
@@ -101,7 +101,7 @@ impl CappedRows {
         Self { schema: schema.clone(), rows_left: most_rows, bytes_left: MOST_BYTES }
     }
 
-    fn lists(&self, part: &RecordBatch) -> Result<Vec<Value>, RequestFault> {
+    fn row_lists(&self, part: &RecordBatch) -> Result<Vec<Value>, RequestFault> {
         let mut text = Vec::new();
         let mut writer = AnswerWriter::new(AnswerFormat::Json, &self.schema, &mut text)?;
         writer.write(part)?;
@@ -119,12 +119,12 @@ impl CappedRows {
 impl AnswerEncoder for CappedRows {
     type Item = RowPage;
 
-    fn batch(&mut self, batch: RecordBatch) -> Result<Vec<RowPage>, RequestFault> {
+    fn encode_batch(&mut self, batch: RecordBatch) -> Result<Vec<RowPage>, RequestFault> {
         let mut rows = Vec::new();
         let mut end = AnswerEnd::Whole;
         let wanted = batch.num_rows().min(self.rows_left);
         'parts: for at in (0..wanted).step_by(PART_ROWS) {
-            for row in self.lists(&batch.slice(at, PART_ROWS.min(wanted - at)))? {
+            for row in self.row_lists(&batch.slice(at, PART_ROWS.min(wanted - at)))? {
                 let bytes = row.to_string().len();
                 if bytes > self.bytes_left {
                     end = AnswerEnd::Bytes;
@@ -141,7 +141,7 @@ impl AnswerEncoder for CappedRows {
         Ok(vec![RowPage { rows, end }])
     }
 
-    fn end(self) -> Result<Vec<RowPage>, RequestFault> {
+    fn encode_end(self) -> Result<Vec<RowPage>, RequestFault> {
         Ok(Vec::new())
     }
 }
@@ -159,7 +159,7 @@ mod tests {
     }
 
     fn page(rows: &mut CappedRows, batch: RecordBatch) -> (Vec<Value>, AnswerEnd) {
-        let page = rows.batch(batch).expect("rows").remove(0);
+        let page = rows.encode_batch(batch).expect("rows").remove(0);
         (page.rows, page.end)
     }
 

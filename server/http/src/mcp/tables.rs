@@ -35,7 +35,7 @@ impl ToolCall<'_> {
             let hint = "list_tables names all";
             return Err(RequestFault::NotFound { what: format!("table `{name}`"), hint });
         };
-        let columns: Vec<_> = schema.fields().iter().map(|field| ColumnDescription::of(field)).collect();
+        let columns: Vec<_> = schema.fields().iter().map(|field| ColumnDescription::from_field(field)).collect();
         let mut table = json!({ "name": name, "meaning": table_meaning(name), "columns": columns });
         if let Some(definition) = service.view_definitions().remove(name) {
             table["definition"] = definition.into();

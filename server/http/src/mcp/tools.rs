@@ -103,7 +103,7 @@ impl AgentTool {
         }
     }
 
-    fn about(self) -> String {
+    fn description_text(self) -> String {
         match self {
             Self::ListTables => "Lists the tables and views of the lake, and what a row of each is.".to_owned(),
             Self::DescribeTable => {
@@ -139,7 +139,7 @@ impl AgentTool {
         }
     }
 
-    fn schema(self) -> Value {
+    fn input_schema(self) -> Value {
         let text = |about: &str| json!({ "type": "string", "description": about });
         let texts = |about: &str| json!({ "type": "array", "items": { "type": "string" }, "description": about });
         let (properties, required): (Value, &[&str]) = match self {
@@ -173,18 +173,18 @@ impl AgentTool {
     pub(super) fn description(self) -> Value {
         json!({
             "name": self.name(),
-            "description": self.about(),
-            "inputSchema": self.schema(),
+            "description": self.description_text(),
+            "inputSchema": self.input_schema(),
             "annotations": { "readOnlyHint": true, "openWorldHint": false },
         })
     }
 
-    fn parse<T: DeserializeOwned>(self, arguments: Map<String, Value>) -> Result<T, RequestFault> {
+    fn parse_arguments<T: DeserializeOwned>(self, arguments: Map<String, Value>) -> Result<T, RequestFault> {
         serde_json::from_value(Value::Object(arguments)).map_err(|e| {
-            let properties = self.schema()["properties"].take();
+            let properties = self.input_schema()["properties"].take();
             let known: Vec<_> = properties.as_object().into_iter().flat_map(Map::keys).map(String::as_str).collect();
             let hint = if known.is_empty() { "it takes none".to_owned() } else { known.join(", ") };
-            RequestFault::request(format!("the arguments of `{}` are not right: {e}; hint: {hint}", self.name()))
+            RequestFault::bad_request(format!("the arguments of `{}` are not right: {e}; hint: {hint}", self.name()))
         })
     }
 }
@@ -194,34 +194,38 @@ impl ToolCall<'_> {
     ///
     /// # Errors
     /// A defect of the arguments, a missing scope, or what ended the work.
-    pub(super) async fn answer(&self, tool: AgentTool, arguments: Map<String, Value>) -> Result<Value, RequestFault> {
-        let client = self.agents.catalogue.service().client(TokenScope::Sql)?;
+    pub(super) async fn answer_call(
+        &self,
+        tool: AgentTool,
+        arguments: Map<String, Value>,
+    ) -> Result<Value, RequestFault> {
+        let client = self.agents.catalogue.service().authorised_client(TokenScope::Sql)?;
         match tool {
             AgentTool::ListTables => {
-                let NoArguments {} = tool.parse(arguments)?;
+                let NoArguments {} = tool.parse_arguments(arguments)?;
                 Ok(self.list_tables())
             }
             AgentTool::DescribeTable => {
-                let TableArguments { table } = tool.parse(arguments)?;
+                let TableArguments { table } = tool.parse_arguments(arguments)?;
                 self.describe_table(&table)
             }
             AgentTool::Query => {
-                let QueryArguments { sql, max_rows } = tool.parse(arguments)?;
-                Box::pin(self.query(&client, sql, max_rows)).await
+                let QueryArguments { sql, max_rows } = tool.parse_arguments(arguments)?;
+                Box::pin(self.run_query(&client, sql, max_rows)).await
             }
             AgentTool::ListFunctions => {
-                let FunctionArguments { search } = tool.parse(arguments)?;
+                let FunctionArguments { search } = tool.parse_arguments(arguments)?;
                 Ok(self.list_functions(search.as_deref()))
             }
             AgentTool::SurfaceSummary => {
-                let SurfaceArguments { surface_id } = tool.parse(arguments)?;
+                let SurfaceArguments { surface_id } = tool.parse_arguments(arguments)?;
                 Box::pin(self.surface_summary(&surface_id)).await
             }
             AgentTool::RunSummary => {
-                let RunArguments { run_id } = tool.parse(arguments)?;
+                let RunArguments { run_id } = tool.parse_arguments(arguments)?;
                 Box::pin(self.run_summary(&run_id)).await
             }
-            AgentTool::SliceUrl => self.slice_url(tool.parse::<SliceArguments>(arguments)?).await,
+            AgentTool::SliceUrl => self.slice_url(tool.parse_arguments::<SliceArguments>(arguments)?).await,
         }
     }
 }
@@ -246,7 +250,7 @@ mod tests {
     fn arguments_that_are_not_right_are_refused_with_those_that_are() {
         let parse = |arguments: Value| {
             let arguments = arguments.as_object().cloned().unwrap_or_default();
-            AgentTool::Query.parse::<QueryArguments>(arguments).map(|a| a.sql).map_err(|e| e.to_string())
+            AgentTool::Query.parse_arguments::<QueryArguments>(arguments).map(|a| a.sql).map_err(|e| e.to_string())
         };
         assert_eq!(parse(json!({ "sql": "select 1", "max_rows": 3 })), Ok("select 1".to_owned()));
         for wrong in [

@@ -37,7 +37,7 @@ pub(super) struct SliceResources {
 
 impl SliceTask {
     /// Begins, in one of its client's places.
-    pub(super) fn begin(
+    pub(super) fn begin_cutting(
         service: &QueryService,
         client: &Arc<EngineClient>,
         snapshot: Arc<LakeSnapshot>,
@@ -48,19 +48,19 @@ impl SliceTask {
         let (of, client) = (service.clone(), client.clone());
         let SliceResources { place: room, turns } = room;
         let protocol = request_protocol();
-        let task = service.spawn(async move {
+        let task = service.spawn_work(async move {
             let work = async {
                 let stop = StopSignal::new();
-                let timer = of.watch(protocol, LISTED_AS, &stop);
+                let timer = of.watch_query(protocol, LISTED_AS, &stop);
                 let _held = (client.place_within(HANDOVER).await?, room);
                 let done = tokio::select! {
-                    done = cut(&of, &snapshot, params, client.quota().time, &turns, to) => done,
-                    () = stop.stopped() => Err(RequestFault::Cancelled),
+                    done = cut_slice(&of, &snapshot, params, client.quota().time, &turns, to) => done,
+                    () = stop.wait_for_stop() => Err(RequestFault::Cancelled),
                 };
-                timer.watch().finish(done.as_ref().err());
+                timer.watch().record_outcome(done.as_ref().err());
                 done
             };
-            work.await.inspect_err(|fault| of.failed(fault.code()))
+            work.await.inspect_err(|fault| of.report_failure(fault.code()))
         });
         Self { pieces, task }
     }
@@ -72,12 +72,12 @@ impl SliceTask {
     pub(super) async fn next(&mut self) -> Result<Option<Bytes>, RequestFault> {
         match self.pieces.recv().await {
             Some(piece) => Ok(Some(piece)),
-            None => finish(&mut self.task).await.map(|()| None),
+            None => finish_task(&mut self.task).await.map(|()| None),
         }
     }
 }
 
-async fn cut(
+async fn cut_slice(
     service: &QueryService,
     snapshot: &LakeSnapshot,
     params: SliceParams,

@@ -8,7 +8,7 @@ use axum::response::{IntoResponse as _, Response};
 use base64::Engine as _;
 use base64::prelude::BASE64_STANDARD as BASE64;
 use chrono::{DateTime, SecondsFormat};
-use echolake_export::{Layout, OutlineSchema, OutlineTopic, Taken, outline};
+use echolake_export::{Layout, OutlineSchema, OutlineTopic, Taken, outline_slice};
 use echolake_schema::RunId;
 use echolake_service::RequestFault;
 use serde::Serialize;
@@ -18,7 +18,7 @@ use super::super::extract::QueryParams;
 use super::super::files::RUN;
 use super::super::problem::ProblemResponse;
 use super::query::{MOST_RUNS, SliceParameters};
-use super::selection::digest;
+use super::selection::slice_digest;
 use super::{SLICE, SliceQuery, SliceRequest, SliceService};
 
 /// The manifest.
@@ -85,16 +85,16 @@ struct FoxgloveSchema {
     responses((status = 200, description = "OK", body = FoxgloveManifest)),
     extensions(("x-sql" = json!(["select run_id, pair_id, attempt, log_time_ns from measurements where (...)"])))
 )]
-pub(super) async fn manifest(
+pub(super) async fn get_manifest(
     State(slices): State<SliceService>,
     QueryParams(params): QueryParams<SliceParameters>,
     uri: Uri,
     headers: HeaderMap,
 ) -> Result<Response, ProblemResponse> {
-    let request = slices.request(params, &uri, &headers).await?;
+    let request = slices.read_request(params, &uri, &headers).await?;
     let manifest = match request.question.is_of_whole_runs() {
         true => whole_runs(&request.question),
-        false => streamed(&slices, request).await?,
+        false => streamed_manifest(&slices, request).await?,
     };
     Ok(axum::Json(manifest).into_response())
 }
@@ -107,33 +107,34 @@ fn whole_runs(question: &SliceQuery) -> FoxgloveManifest {
 }
 
 // One source per run: within a run a topic has one schema, and adding to the lake does not change other runs' keys.
-async fn streamed(slices: &SliceService, mut request: SliceRequest) -> Result<FoxgloveManifest, RequestFault> {
+async fn streamed_manifest(slices: &SliceService, mut request: SliceRequest) -> Result<FoxgloveManifest, RequestFault> {
     // Its data are read as they come, so they have to ascend.
     request.question.layout = Layout::InTime;
-    let selection = slices.selection(&request).await?;
+    let selection = slices.find_selection(&request).await?;
     let runs: Vec<_> = selection.taken.chunk_by(|a, b| a.run == b.run).collect();
     if runs.len() > MOST_RUNS {
-        return Err(RequestFault::request(format!(
+        return Err(RequestFault::bad_request(format!(
             "{} runs are selected, {MOST_RUNS} may be; hint: run=RUN",
             runs.len()
         )));
     }
     let mut sources = Vec::new();
     for taken in &runs {
-        sources.push(source(slices, &request, taken).await?);
+        sources.push(streamed_source(slices, &request, taken).await?);
     }
     Ok(FoxgloveManifest { name: format!("{} measurements of {} runs", selection.taken.len(), runs.len()), sources })
 }
 
-async fn source(
+async fn streamed_source(
     slices: &SliceService,
     request: &SliceRequest,
     taken: &[Taken],
 ) -> Result<FoxgloveSource, RequestFault> {
     let service = slices.0.catalogue.service();
     let (params, lake, snapshot) =
-        (SliceService::params(request, taken.to_vec()), service.lake().clone(), request.view.snapshot.clone());
-    let found = service.plan(&request.client, async move { Ok(outline(&lake, &snapshot, params).await?) }).await?;
+        (SliceService::slice_params(request, taken.to_vec()), service.lake().clone(), request.view.snapshot.clone());
+    let found =
+        service.plan_query(&request.client, async move { Ok(outline_slice(&lake, &snapshot, params).await?) }).await?;
     let number = |index: usize| u16::try_from(index + 1).ok();
     let topic = |topic: OutlineTopic| FoxgloveTopic {
         name: topic.name,
@@ -144,18 +145,18 @@ async fn source(
         let OutlineSchema { name, encoding, data } = schema;
         Some(FoxgloveSchema { id: number(index)?, name, encoding, data: BASE64.encode(&data) })
     };
-    let digest = digest(&request.view, &request.question, taken);
+    let digest = slice_digest(&request.view, &request.question, taken);
     Ok(FoxgloveSource::Streamed {
         url: format!("{SLICE}?{}&id={digest}", request.question.query_of([&taken[0].run])),
         id: format!("echolake-{digest}"),
         topics: found.topics.into_iter().map(topic).collect(),
         schemas: found.schemas.into_iter().enumerate().filter_map(schema).collect(),
-        start_time: time(found.start_ns),
-        end_time: time(found.end_ns),
+        start_time: format_nanos(found.start_ns),
+        end_time: format_nanos(found.end_ns),
     })
 }
 
-fn time(nanos: i64) -> String {
+fn format_nanos(nanos: i64) -> String {
     DateTime::from_timestamp_nanos(nanos).to_rfc3339_opts(SecondsFormat::Nanos, true)
 }
 
@@ -165,6 +166,6 @@ mod tests {
 
     #[test]
     fn times_keep_their_nanoseconds() {
-        assert_eq!(time(1_767_758_400_000_000_001), "2026-01-07T04:00:00.000000001Z");
+        assert_eq!(format_nanos(1_767_758_400_000_000_001), "2026-01-07T04:00:00.000000001Z");
     }
 }

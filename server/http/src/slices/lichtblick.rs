@@ -13,7 +13,7 @@ use serde_json::{Value, json};
 
 use super::super::extract::parse_query;
 use super::super::files::RUN;
-use super::super::manifest::origin;
+use super::super::manifest::server_origin;
 use super::super::problem::ProblemResponse;
 use super::query::{MOST_RUNS, SliceParameters};
 use super::{SLICE, SliceRequest, SliceService};
@@ -26,14 +26,14 @@ const OF_SLICE: &str = "q.";
 const SEPARATOR: char = '.';
 
 /// Answers the URLs of a session's MCAP files, in the form in which Lichtblick reads all answers.
-pub(super) async fn session(
+pub(super) async fn get_session(
     State(slices): State<SliceService>,
     Path(id): Path<String>,
     uri: Uri,
     headers: HeaderMap,
 ) -> Result<Response, ProblemResponse> {
-    let request = slices.request(parse_id(&id)?, &uri, &headers).await?;
-    let files = slices.session_files(&request, &origin(&headers)).await?;
+    let request = slices.read_request(parse_id(&id)?, &uri, &headers).await?;
+    let files = slices.session_files(&request, &server_origin(&headers)).await?;
     let now = Utc::now().to_rfc3339_opts(SecondsFormat::Secs, true);
     let answer = json!({ "data": { "mcaps": files }, "timestamp": now, "path": format!("session/{id}") });
     Ok(axum::Json(answer).into_response())
@@ -47,7 +47,9 @@ fn parse_id(id: &str) -> Result<SliceParameters, RequestFault> {
     let uri = decoded.and_then(|query| format!("{SLICE}?{}", String::from_utf8(query).ok()?).parse().ok());
     let uri: Uri = uri.ok_or_else(|| {
         let hint = "q. and the parameters of a slice (run=RUN&where=pair_id%3C5) in base 64 for URLs";
-        RequestFault::request(format!("`{id}` is no session; hint: names of runs with dots between them, or {hint}"))
+        RequestFault::bad_request(format!(
+            "`{id}` is no session; hint: names of runs with dots between them, or {hint}"
+        ))
     })?;
     parse_query(&uri)
 }
@@ -58,22 +60,24 @@ impl SliceService {
         let question = &request.question;
         if question.is_of_whole_runs() {
             let url = |run: &RunId| format!("{origin}{}", RUN.replace("{run_id}", run.as_str()));
-            return Ok(question.runs.iter().map(|run| file(request, run, url(run))).collect());
+            return Ok(question.runs.iter().map(|run| session_file(request, run, url(run))).collect());
         }
-        let selection = self.selection(request).await?;
+        let selection = self.find_selection(request).await?;
         let mut runs: Vec<_> = selection.taken.iter().map(|taken| &taken.run).collect();
         runs.dedup();
         if runs.len() > MOST_RUNS {
             let found = runs.len();
-            return Err(RequestFault::request(format!("{found} runs are selected, {MOST_RUNS} may be; hint: run=RUN")));
+            return Err(RequestFault::bad_request(format!(
+                "{found} runs are selected, {MOST_RUNS} may be; hint: run=RUN"
+            )));
         }
         // A comma would be the end of the URL, and is encoded in it.
         let url = |run: &RunId| format!("{origin}{SLICE}?{}", question.query_of([run]));
-        Ok(runs.into_iter().map(|run| file(request, run, url(run))).collect())
+        Ok(runs.into_iter().map(|run| session_file(request, run, url(run))).collect())
     }
 }
 
-fn file(request: &SliceRequest, run: &RunId, url: String) -> Value {
+fn session_file(request: &SliceRequest, run: &RunId, url: String) -> Value {
     let surface = request.view.snapshot.run(run).map(|visible| visible.surface.as_str());
     json!({ "url": url, "metadata": { "run_id": run.as_str(), "surface_id": surface } })
 }

@@ -71,13 +71,13 @@ struct SlicesState {
 }
 
 /// Routes of slices and of their manifest.
-pub(super) fn routes() -> OpenApiRouter<SliceService> {
-    OpenApiRouter::new().routes(routes!(slice)).routes(routes!(foxglove::manifest)).routes(routes!(sofa::sofa))
+pub(super) fn slice_routes() -> OpenApiRouter<SliceService> {
+    OpenApiRouter::new().routes(routes!(slice)).routes(routes!(foxglove::get_manifest)).routes(routes!(sofa::get_sofa))
 }
 
 /// Slices and their manifest for viewers on pages of any origin.
 pub(super) fn for_viewers(slices: SliceService) -> Router {
-    let routes = Router::from(routes()).route(LICHTBLICK_SESSION, get(lichtblick::session));
+    let routes = Router::from(slice_routes()).route(LICHTBLICK_SESSION, get(lichtblick::get_session));
     routes.method_not_allowed_fallback(super::problem::refuse_method).with_state(slices)
 }
 
@@ -112,11 +112,11 @@ impl SliceService {
     ///
     /// # Errors
     /// A defect of the predicate, a missing scope, or a slice without measurements.
-    pub(super) async fn address(&self, params: SliceParameters) -> Result<SliceAddress, RequestFault> {
-        let client = self.authorise()?;
+    pub(super) async fn slice_address(&self, params: SliceParameters) -> Result<SliceAddress, RequestFault> {
+        let client = self.authorise_client()?;
         let question = SliceQuery::new(params)?;
         let request = self.known_runs(client, question).await?;
-        let selection = self.selection(&request).await?;
+        let selection = self.find_selection(&request).await?;
         let query = request.question.query_of(&request.question.runs);
         let mut runs: Vec<_> = selection.taken.iter().map(|taken| taken.run.clone()).collect();
         runs.dedup();
@@ -129,27 +129,27 @@ impl SliceService {
     }
 
     // A slice holds what files do, and is chosen by SQL.
-    fn authorise(&self) -> Result<Arc<EngineClient>, RequestFault> {
+    fn authorise_client(&self) -> Result<Arc<EngineClient>, RequestFault> {
         let service = self.0.catalogue.service();
-        service.client(TokenScope::Files)?;
-        service.client(TokenScope::Sql)
+        service.authorised_client(TokenScope::Files)?;
+        service.authorised_client(TokenScope::Sql)
     }
 
     async fn known_runs(&self, client: Arc<EngineClient>, question: SliceQuery) -> Result<SliceRequest, RequestFault> {
-        let view = self.0.catalogue.view().await?;
+        let view = self.0.catalogue.current_view().await?;
         for run in &question.runs {
-            super::catalogue::run(&view, run.as_str())?;
+            super::catalogue::find_run(&view, run.as_str())?;
         }
         Ok(SliceRequest { client, view, question })
     }
 
-    async fn request(
+    async fn read_request(
         &self,
         params: SliceParameters,
         uri: &Uri,
         headers: &HeaderMap,
     ) -> Result<SliceRequest, RequestFault> {
-        let client = self.authorise()?;
+        let client = self.authorise_client()?;
         let mut question = SliceQuery::new(params)?;
         // Without tokens a page of elsewhere may read the runs whose names it knows, and ask nothing of others, nor
         // anything that costs more than reading them.
@@ -164,11 +164,11 @@ impl SliceService {
         self.known_runs(client, question).await
     }
 
-    async fn selection(&self, request: &SliceRequest) -> Result<Arc<SliceSelection>, RequestFault> {
-        self.0.selections.of(&self.0.catalogue, request).await
+    async fn find_selection(&self, request: &SliceRequest) -> Result<Arc<SliceSelection>, RequestFault> {
+        self.0.selections.get_or_select(&self.0.catalogue, request).await
     }
 
-    fn params(request: &SliceRequest, taken: Vec<Taken>) -> SliceParams {
+    fn slice_params(request: &SliceRequest, taken: Vec<Taken>) -> SliceParams {
         SliceParams {
             taken,
             topics: request.question.topics.clone(),
@@ -178,7 +178,7 @@ impl SliceService {
         }
     }
 
-    async fn answer(
+    async fn answer_slice(
         &self,
         request: &SliceRequest,
         selection: &SliceSelection,
@@ -194,25 +194,33 @@ impl SliceService {
             return Ok(instead);
         }
         if !needs_length(method, headers) {
-            let mut cutting = self.cut(request, selection)?;
+            let mut cutting = self.start_cutting(request, selection)?;
             // What fails at once still has a status to say so with.
             let first = cutting.next().await?;
-            return Ok(described.stream(Body::from_stream(rest(first, cutting))));
+            return Ok(described.stream_response(Body::from_stream(remaining_pieces(first, cutting))));
         }
-        let cut = async { self.cut(request, selection) };
-        let whole = self.0.spool.once(&selection.digest, cut).await?;
-        Ok(match described.asked(headers, whole.bytes()) {
+        let cut = async { self.start_cutting(request, selection) };
+        let whole = self.0.spool.get_or_cut(&selection.digest, cut).await?;
+        Ok(match described.range_answer(headers, whole.bytes()) {
             RangeAnswer::Answer(answer) => answer,
-            RangeAnswer::Part(part) => described.part(&part, Body::from_stream(whole.read(part.range.clone()))),
+            RangeAnswer::Part(part) => {
+                described.part_response(&part, Body::from_stream(whole.read_range(part.range.clone())))
+            }
         })
     }
 
-    fn cut(&self, request: &SliceRequest, selection: &SliceSelection) -> Result<SliceTask, RequestFault> {
-        let params = Self::params(request, selection.taken.clone());
+    fn start_cutting(&self, request: &SliceRequest, selection: &SliceSelection) -> Result<SliceTask, RequestFault> {
+        let params = Self::slice_params(request, selection.taken.clone());
         let places = self.0.places.clone();
         let place = places.try_acquire_owned().map_err(|_| RequestFault::TooMany { what: "slices", limit: MOST })?;
         let room = SliceResources { place, turns: self.0.turns.clone() };
-        Ok(SliceTask::begin(self.0.catalogue.service(), &request.client, request.view.snapshot.clone(), params, room))
+        Ok(SliceTask::begin_cutting(
+            self.0.catalogue.service(),
+            &request.client,
+            request.view.snapshot.clone(),
+            params,
+            room,
+        ))
     }
 }
 
@@ -242,12 +250,12 @@ async fn slice(
     uri: Uri,
     headers: HeaderMap,
 ) -> Result<Response, ProblemResponse> {
-    let request = slices.request(params, &uri, &headers).await?;
-    let selection = slices.selection(&request).await?;
+    let request = slices.read_request(params, &uri, &headers).await?;
+    let selection = slices.find_selection(&request).await?;
     if request.question.id.as_ref().is_some_and(|id| *id != selection.digest) {
         return Err(RequestFault::Gone { what: "this slice", hint: "ask for the manifest again" }.into());
     }
-    let answer = slices.answer(&request, &selection, &method, &headers).await?;
+    let answer = slices.answer_slice(&request, &selection, &method, &headers).await?;
     let mut runs: Vec<_> = selection.taken.iter().map(|taken| &taken.run).collect();
     runs.dedup();
     Ok(name_runs(answer, &runs))
@@ -273,7 +281,7 @@ fn name_runs(mut answer: Response, runs: &[&RunId]) -> Response {
 }
 
 // A failure on the way breaks the connection off: a short slice would look like a whole one.
-fn rest(
+fn remaining_pieces(
     first: Option<bytes::Bytes>,
     cutting: SliceTask,
 ) -> impl stream::Stream<Item = Result<bytes::Bytes, RequestFault>> + Send {

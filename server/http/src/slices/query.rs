@@ -85,11 +85,11 @@ impl SliceQuery {
         runs.sort();
         runs.dedup();
         if runs.len() > MOST_RUNS {
-            return Err(RequestFault::request(format!("{} runs are named, {MOST_RUNS} may be", runs.len())));
+            return Err(RequestFault::bad_request(format!("{} runs are named, {MOST_RUNS} may be", runs.len())));
         }
         let predicate = params.predicate;
         if predicate.is_none() && runs.is_empty() {
-            return Err(RequestFault::request("`where` is missing; hint: where=surface_id='flat' and pair_id<100"));
+            return Err(RequestFault::bad_request("`where` is missing; hint: where=surface_id='flat' and pair_id<100"));
         }
         let layout = match params.layout {
             SliceLayout::ByTopic => Layout::ByTopic,
@@ -104,7 +104,7 @@ impl SliceQuery {
     }
 
     /// The beginning of the query, which the predicate completes.
-    pub(super) fn select(&self) -> String {
+    pub(super) fn select_clause(&self) -> String {
         self.select_of(&Taken::COLUMNS.join(", "))
     }
 
@@ -156,7 +156,7 @@ mod tests {
         let asked = asked.unwrap_or_else(|e| panic!("{e}"));
         assert_eq!(asked.predicate.as_deref(), Some("snr_db < 35 and '\u{e9}&'='+'"));
         assert_eq!((&asked.topics[..], asked.layout), (&["/ir".to_owned(), "/tf".to_owned()][..], Layout::ByTopic));
-        assert!(asked.select().ends_with("where run_id in ('a', 'b') and"), "{}", asked.select());
+        assert!(asked.select_clause().ends_with("where run_id in ('a', 'b') and"), "{}", asked.select_clause());
         let again = question(&asked.query_of(&asked.runs[1..])).unwrap_or_else(|e| panic!("{e}"));
         assert_eq!(
             (&again.predicate, &again.topics, &again.runs[..]),

@@ -59,19 +59,19 @@ impl SelectionCache {
     ///
     /// # Errors
     /// A defect of the predicate, or what ended its query; [`RequestFault::NoData`] if it selects nothing.
-    pub(super) async fn of(
+    pub(super) async fn get_or_select(
         &self,
         catalogue: &LakeCatalogue,
         request: &SliceRequest,
     ) -> Result<Arc<SliceSelection>, RequestFault> {
         let SliceRequest { client, view, question } = request;
-        let asked = format!("{:?} {} {}", question.form, question.select(), question.predicate());
+        let asked = format!("{:?} {} {}", question.form, question.select_clause(), question.predicate());
         let described = format!("{} {} {asked}", question.layout_name(), question.topics.join(","));
         let key = (client.name().to_owned(), view.version.clone(), described);
         let select = async {
-            let mut taken = taken(catalogue, request).await?;
+            let mut taken = select_measurements(catalogue, request).await?;
             taken.sort_by(|a, b| (&a.run, a.log_time_ns, a.pair).cmp(&(&b.run, b.log_time_ns, b.pair)));
-            let digest = digest(view, question, &taken);
+            let digest = slice_digest(view, question, &taken);
             Ok(Arc::new(SliceSelection { taken, digest }))
         };
         self.0.get_or_insert_async(&key, select).await
@@ -83,22 +83,22 @@ impl SliceRequest {
     ///
     /// # Errors
     /// A defect of the predicate, or a limit.
-    pub(super) async fn begin(
+    pub(super) async fn begin_query(
         &self,
         service: &QueryService,
         select: String,
     ) -> Result<RunningQuery<RecordBatch>, RequestFault> {
-        let session = Arc::new(service.session(&self.client));
+        let session = Arc::new(service.begin_session(&self.client));
         let (asking, predicate, form) = (session.clone(), self.question.predicate().to_owned(), self.question.form);
-        let sql = service.plan(&self.client, async move { Ok(asking.selecting(&select, &predicate, form)?) }).await?;
-        service.begin(http_job(session, QueryWork::Sql(sql)), |_| Ok(BatchEncoder)).await
+        let sql = service.plan_query(&self.client, async move { Ok(asking.append_predicate(&select, &predicate, form)?) }).await?;
+        service.begin_query(http_job(session, QueryWork::Sql(sql)), |_| Ok(BatchEncoder)).await
     }
 }
 
-async fn taken(catalogue: &LakeCatalogue, request: &SliceRequest) -> Result<Vec<Taken>, RequestFault> {
-    let mut running = request.begin(catalogue.service(), request.question.select()).await?;
+async fn select_measurements(catalogue: &LakeCatalogue, request: &SliceRequest) -> Result<Vec<Taken>, RequestFault> {
+    let mut running = request.begin_query(catalogue.service(), request.question.select_clause()).await?;
     let mut taken = Vec::new();
-    while let Some(batch) = running.next().await? {
+    while let Some(batch) = running.next_part().await? {
         taken.extend(Taken::of_batch(&batch)?);
         if taken.len() > MOST {
             return Err(RequestFault::SliceTooLarge { limit: MOST });
@@ -115,7 +115,7 @@ async fn taken(catalogue: &LakeCatalogue, request: &SliceRequest) -> Result<Vec<
 
 /// Says which slice measurements make: they are sorted by run, time and pair.
 // A run's derivation is a digest of its file, among others.
-pub(super) fn digest(view: &SnapshotView, question: &SliceQuery, taken: &[Taken]) -> String {
+pub(super) fn slice_digest(view: &SnapshotView, question: &SliceQuery, taken: &[Taken]) -> String {
     let mut digest = Sha256::new();
     let mut add = |text: &str| {
         digest.update((text.len() as u64).to_le_bytes());

@@ -57,19 +57,19 @@ pub(super) struct SofaParameters {
         "select pair_id, log_time_ns, temperature_c, ir from measurements where run_id = $1 and (...)"
     ])))
 )]
-pub(super) async fn sofa(
+pub(super) async fn get_sofa(
     State(slices): State<SliceService>,
     QueryParams(params): QueryParams<SofaParameters>,
     uri: Uri,
     headers: HeaderMap,
 ) -> Result<Response, ProblemResponse> {
     let params = SliceParameters::new(params.predicate, params.run.into_iter().collect(), Vec::new());
-    let request = slices.request(params, &uri, &headers).await?;
-    let rows = slices.responses(&request).await?;
+    let request = slices.read_request(params, &uri, &headers).await?;
+    let rows = slices.read_responses(&request).await?;
     let run = only_run(&request, &rows)?;
     let (name, run_id) = (format!("{}.sofa", run.surface), run.run.clone());
     let lake = slices.0.catalogue.lake().clone();
-    let made = slices.0.catalogue.service().crunch(move || sofa_bytes(&lake, &run, &rows)).await??;
+    let made = slices.0.catalogue.service().compute_blocking(move || sofa_bytes(&lake, &run, &rows)).await??;
     let described = FileDescription {
         etag: format!("\"{}\"", hex::encode(&Sha256::digest(&made)[..16])),
         media_type: "application/x-hdf5",
@@ -78,7 +78,7 @@ pub(super) async fn sofa(
     if let Some(instead) = described.condition_answer(&headers) {
         return Ok(instead);
     }
-    let mut response = described.stream(made.into());
+    let mut response = described.stream_response(made.into());
     let saved = format!("attachment; filename=\"{name}\"");
     if let Ok(saved) = HeaderValue::try_from(saved) {
         response.headers_mut().insert(header::CONTENT_DISPOSITION, saved);
@@ -90,12 +90,12 @@ pub(super) async fn sofa(
 
 impl SliceService {
     // The rows of the measurements, read by the client's own query.
-    async fn responses(&self, request: &SliceRequest) -> Result<RecordBatch, RequestFault> {
+    async fn read_responses(&self, request: &SliceRequest) -> Result<RecordBatch, RequestFault> {
         let select = request.question.select_of(&format!("run_id, {}", SOFA_COLUMNS.join(", ")));
-        let mut running = request.begin(self.0.catalogue.service(), select).await?;
+        let mut running = request.begin_query(self.0.catalogue.service(), select).await?;
         let most = self.0.catalogue.lake().grid().pairs().len();
         let mut batches: Vec<RecordBatch> = Vec::new();
-        while let Some(batch) = running.next().await? {
+        while let Some(batch) = running.next_part().await? {
             batches.push(batch);
             // A run has a measurement of a pair: these are of several.
             if batches.iter().map(RecordBatch::num_rows).sum::<usize>() > most {
@@ -107,7 +107,7 @@ impl SliceService {
 }
 
 fn several_runs() -> RequestFault {
-    RequestFault::request("the measurements are of several runs, and a SOFA file has those of one; hint: run=RUN")
+    RequestFault::bad_request("the measurements are of several runs, and a SOFA file has those of one; hint: run=RUN")
 }
 
 // The run that all rows are of.
@@ -120,7 +120,7 @@ fn only_run(request: &SliceRequest, rows: &RecordBatch) -> Result<VisibleRun, Re
         return Err(RequestFault::NoData { what: "what is selected".to_owned(), data: "measurements", hint });
     };
     match names.all(|name| name == first) {
-        true => super::super::catalogue::run(&request.view, first).cloned(),
+        true => super::super::catalogue::find_run(&request.view, first).cloned(),
         false => Err(several_runs()),
     }
 }

@@ -100,16 +100,16 @@ impl SliceSpool {
     ///
     /// # Errors
     /// Those of cutting, and [`RequestFault::NoRoom`].
-    pub(super) async fn once<S: PieceSource>(
+    pub(super) async fn get_or_cut<S: PieceSource>(
         &self,
         key: &str,
         cut: impl Future<Output = Result<S, RequestFault>> + Send,
     ) -> Result<Arc<SpooledSlice>, RequestFault> {
-        let fill = async { self.fill(cut.await?).await.map(Arc::new) };
+        let fill = async { self.fill_slice(cut.await?).await.map(Arc::new) };
         self.0.slices.get_or_insert_async(key, fill).await
     }
 
-    async fn fill(&self, mut cutting: impl PieceSource) -> Result<SpooledSlice, RequestFault> {
+    async fn fill_slice(&self, mut cutting: impl PieceSource) -> Result<SpooledSlice, RequestFault> {
         let file = on_disk(tempfile::tempfile).await.map_err(disk_fault)?;
         let mut slice = SpooledSlice { file, bytes: 0, spool: self.clone() };
         while let Some(piece) = cutting.next_piece().await? {
@@ -167,7 +167,7 @@ impl SpooledSlice {
     }
 
     /// Bytes of it, a block at a time.
-    pub(super) fn read(
+    pub(super) fn read_range(
         self: &Arc<Self>,
         range: Range<u64>,
     ) -> impl Stream<Item = Result<Bytes, RequestFault>> + Send + use<> {
@@ -213,7 +213,7 @@ mod tests {
     #[tokio::test]
     async fn a_client_evicts_its_own_and_leaves_the_disk_to_others() {
         let spool = SliceSpool::new(|| Some(FREE.load(Ordering::Relaxed)));
-        let keep = async |key, bytes| spool.once(key, async { Ok(ZeroSource(bytes)) }).await.map(drop);
+        let keep = async |key, bytes| spool.get_or_cut(key, async { Ok(ZeroSource(bytes)) }).await.map(drop);
         for key in ["a", "b"] {
             keep(key, 100_000).await.expect("room");
         }

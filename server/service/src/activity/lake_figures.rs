@@ -35,21 +35,21 @@ impl LakeFigures {
     ///
     /// # Errors
     /// The store does not list a folder.
-    pub async fn read(lake: &Lake, snapshot: &LakeSnapshot) -> echolake_lake::Result<Self> {
+    pub async fn from_lake(lake: &Lake, snapshot: &LakeSnapshot) -> echolake_lake::Result<Self> {
         let bytes = |table: Table| snapshot.files(table).iter().map(|file| file.bytes).sum::<u64>();
         Ok(Self {
-            version: snapshot.version(Table::Runs).unwrap_or(0),
+            version: snapshot.log_version(Table::Runs).unwrap_or(0),
             surfaces: snapshot.files(Table::Surfaces).iter().map(echolake_lake::DataFile::visible_rows).sum(),
             runs: snapshot.runs().count() as u64,
             table_bytes: Table::ALL.into_iter().map(bytes).sum(),
-            inbox: FolderFigures::read(lake, "inbox").await?,
-            quarantine: FolderFigures::read(lake, "quarantine").await?,
+            inbox: FolderFigures::from_folder(lake, "inbox").await?,
+            quarantine: FolderFigures::from_folder(lake, "quarantine").await?,
         })
     }
 }
 
 impl FolderFigures {
-    async fn read(lake: &Lake, folder: &str) -> echolake_lake::Result<Self> {
+    async fn from_folder(lake: &Lake, folder: &str) -> echolake_lake::Result<Self> {
         let listing = lake.list_folder(folder).await?;
         let runs = listing.files.iter().filter(|object| object.location.as_ref().ends_with(".mcap"));
         Ok(runs.fold(Self::default(), |sum, object| Self { files: sum.files + 1, bytes: sum.bytes + object.size }))

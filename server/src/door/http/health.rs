@@ -10,7 +10,7 @@ use echolake_service::{ClientIdentity, FaultCode, RequestFault, TokenScope};
 use serde::Serialize;
 use utoipa::ToSchema;
 
-use super::authentication::authenticate;
+use super::authentication::authenticate_client;
 use crate::door::server_door::ServerDoor;
 
 /// The state of the server.
@@ -49,7 +49,7 @@ pub(super) async fn ready(State(door): State<ServerDoor>) -> Result<Json<ServerH
 pub(super) async fn refuse_while_draining(State(door): State<ServerDoor>, request: Request, next: Next) -> Response {
     let is_operators = matches!(request.uri().path(), "/health" | "/ready" | "/metrics");
     if door.drain().is_begun() && !is_operators {
-        door.metrics().failed(FaultCode::Stopping);
+        door.metrics().count_failure(FaultCode::Stopping);
         return ProblemResponse(RequestFault::Draining).into_response();
     }
     next.run(request).await
@@ -66,7 +66,9 @@ pub(super) async fn metrics(
     State(door): State<ServerDoor>,
     headers: HeaderMap,
 ) -> Result<impl IntoResponse, ProblemResponse> {
-    let client = authenticate(door.access(), &headers, ClientIdentity::pages);
-    client.and_then(|client| client.require(TokenScope::Metrics)).inspect_err(|f| door.metrics().failed(f.code()))?;
-    Ok(([(header::CONTENT_TYPE, "text/plain; version=0.0.4; charset=utf-8")], door.figures().await?))
+    let client = authenticate_client(door.access(), &headers, ClientIdentity::own_pages);
+    client
+        .and_then(|client| client.require_scope(TokenScope::Metrics))
+        .inspect_err(|f| door.metrics().count_failure(f.code()))?;
+    Ok(([(header::CONTENT_TYPE, "text/plain; version=0.0.4; charset=utf-8")], door.gather_figures().await?))
 }

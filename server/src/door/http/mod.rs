@@ -34,7 +34,7 @@ use super::connection_places::{ConnectionPlaces, PlaceWork, PlacedStream};
 use super::drain::ServerDrain;
 use super::encryption::{ProtocolEncryption, agreed_protocol};
 use super::forward::EngineProtocol;
-use super::http_connection::{HTTP_2, drive, http2_builder, restate};
+use super::http_connection::{HTTP_2, drive_connection, http2_builder, restate_as_http1};
 use crate::door::server_door::ServerDoor;
 use authentication::authenticate;
 use router::door_router;
@@ -47,22 +47,31 @@ const MOST: usize = 512;
 const HEAD: Duration = Duration::from_secs(30);
 
 /// Answers connections; never ends.
-pub(super) async fn serve(door: ServerDoor, listener: TcpListener, encryption: ProtocolEncryption) {
+pub(super) async fn serve_http_clients(door: ServerDoor, listener: TcpListener, encryption: ProtocolEncryption) {
     let router = door_router(&door);
-    let places = ConnectionPlaces::new(listener, MOST).listed(&door.activity().connections, ServerProtocol::Http);
-    places.attend(|stream| answer(stream, encryption.clone(), router.clone(), door.drain().clone())).await;
+    let places = ConnectionPlaces::new(listener, MOST).listed_among(&door.activity().connections, ServerProtocol::Http);
+    places
+        .attend_connections(|stream| {
+            answer_http_connection(stream, encryption.clone(), router.clone(), door.drain().clone())
+        })
+        .await;
 }
 
-async fn answer(stream: PlacedStream, encryption: ProtocolEncryption, router: Router, drain: ServerDrain) {
-    let evicted = stream.evicted();
-    let work = stream.work();
-    let Some(stream) = encryption.accept(stream).await else { return };
+async fn answer_http_connection(
+    stream: PlacedStream,
+    encryption: ProtocolEncryption,
+    router: Router,
+    drain: ServerDrain,
+) {
+    let evicted = stream.wait_for_eviction();
+    let work = stream.work_handle();
+    let Some(stream) = encryption.shake_hands(stream).await else { return };
     let is_http2 = agreed_protocol(&stream) == Some(HTTP_2);
     let place = work.clone();
     let answers = TowerToHyperService::new(router);
     let service = service_fn(move |mut request: hyper::Request<Incoming>| {
         work.hear_request();
-        restate(&mut request);
+        restate_as_http1(&mut request);
         if encryption.is_on() {
             request.headers_mut().insert(FORWARDED_PROTO, HeaderValue::from_static("https"));
         }
@@ -72,11 +81,11 @@ async fn answer(stream: PlacedStream, encryption: ProtocolEncryption, router: Ro
     let stream = TokioIo::new(stream);
     if is_http2 {
         let connection = http2_builder().serve_connection(stream, service);
-        drive(connection, |connection| connection.graceful_shutdown(), evicted, &drain, &place).await;
+        drive_connection(connection, |connection| connection.graceful_shutdown(), evicted, &drain, &place).await;
     } else {
         let mut builder = http1::Builder::new();
         let connection = builder.timer(TokioTimer::new()).header_read_timeout(HEAD).serve_connection(stream, service);
-        drive(connection, |connection| connection.graceful_shutdown(), evicted, &drain, &place).await;
+        drive_connection(connection, |connection| connection.graceful_shutdown(), evicted, &drain, &place).await;
     }
 }
 
@@ -100,7 +109,7 @@ impl ServerDoor {
         let peer = request.extensions().get::<PlaceWork>().map(PlaceWork::peer);
         // A page that nobody has logged in to shows no token.
         let login = peer.filter(|_| shows_token(&request));
-        let mut response = match login.map_or(Ok(()), |peer| door.failed_logins().check(peer)) {
+        let mut response = match login.map_or(Ok(()), |peer| door.failed_logins().check_address(peer)) {
             Ok(()) => next.run(request).instrument(span.clone()).await,
             Err(fault) => ProblemResponse(fault).into_response(),
         };
@@ -108,12 +117,12 @@ impl ServerDoor {
             && !door.access().is_open()
         {
             if let (Some(peer), FaultCode::Unauthenticated) = (login, code) {
-                door.failed_logins().count(peer);
+                door.failed_logins().count_failure(peer);
             }
             span.in_scope(|| audit::record_refusal(peer, ServerProtocol::Http, *code));
         }
         response.headers_mut().insert(REQUEST_ID, id);
-        door.metrics().answered(response.status().as_u16(), begun.elapsed().as_secs_f64());
+        door.metrics().count_answer(response.status().as_u16(), begun.elapsed().as_secs_f64());
         response
     }
 
@@ -121,16 +130,16 @@ impl ServerDoor {
         let work = request.extensions().get::<PlaceWork>().cloned().ok_or(RequestFault::Internal)?;
         let site = request_site(request.uri(), request.headers());
         let local = || match site {
-            RequestSite::Foreign => ClientIdentity::foreign(),
-            RequestSite::OwnPage => ClientIdentity::pages(),
-            RequestSite::Program => ClientIdentity::programs(),
+            RequestSite::Foreign => ClientIdentity::foreign_pages(),
+            RequestSite::OwnPage => ClientIdentity::own_pages(),
+            RequestSite::Program => ClientIdentity::local_programs(),
         };
         // A refusal is noted with those of the other routes.
-        let client = authenticate(self.access(), request.headers(), local)?;
+        let client = authenticate_client(self.access(), request.headers(), local)?;
         let client = self.note_client(&work, ServerProtocol::Http, Ok(client))?;
         let path = request.uri().path().to_owned();
         let method = request.method().clone();
-        let mut response = self.engines().forward(&client, request, EngineProtocol::Http, Some(&work)).await?;
+        let mut response = self.engines().forward_request(&client, request, EngineProtocol::Http, Some(&work)).await?;
         let runs = response.headers_mut().remove(SLICED_RUNS);
         if !self.access().is_open() {
             let runs = runs.as_ref().and_then(|runs| runs.to_str().ok());

@@ -18,7 +18,7 @@ use super::router::door_routes;
 static DOCUMENT: LazyLock<String> = LazyLock::new(|| {
     let mut text = Vec::new();
     // A value whose keys are texts is always written.
-    let _ = document().serialize(&mut Serializer::with_formatter(&mut text, PrettyFormatter::with_indent(b" ")));
+    let _ = build_openapi().serialize(&mut Serializer::with_formatter(&mut text, PrettyFormatter::with_indent(b" ")));
     text.push(b'\n');
     String::from_utf8(text).unwrap_or_default()
 });
@@ -47,11 +47,11 @@ struct ContractHead;
     tag = "operation",
     responses((status = 200, description = "OK", body = HashMap<String, Value>))
 )]
-pub(super) async fn get() -> impl IntoResponse {
+pub(super) async fn get_openapi() -> impl IntoResponse {
     ([(header::CONTENT_TYPE, "application/json"), (header::CACHE_CONTROL, "no-cache")], DOCUMENT.as_str())
 }
 
-fn document() -> Value {
+fn build_openapi() -> Value {
     let [validated, mut others] = contract_parts();
     others.merge(door_routes().into_openapi());
     let mut document = ContractHead::openapi();

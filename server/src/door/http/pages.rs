@@ -84,14 +84,14 @@ fn inline_scripts(page: &str) -> impl Iterator<Item = &str> {
 
 /// Answers all other paths. The pages decide themselves what an address shows, so every one of them has the same
 /// file.
-pub(super) async fn fallback(method: Method, uri: Uri, headers: HeaderMap) -> Response {
+pub(super) async fn serve_page(method: Method, uri: Uri, headers: HeaderMap) -> Response {
     let manual_path = uri.path().strip_prefix(MANUAL_PATH).filter(|rest| rest.is_empty() || rest.starts_with('/'));
     let (found, policy) = match manual_path {
         Some("" | "/") if !MANUAL.is_empty() => return Redirect::permanent(MANUAL_INDEX).into_response(),
         Some(path) => (find_manual_file(path), MANUAL_POLICY.as_str()),
         None => (find_page(uri.path()), POLICY),
     };
-    let Some((page, tag)) = found else { return missing(manual_path.is_some()).await };
+    let Some((page, tag)) = found else { return missing_page(manual_path.is_some()).await };
     if method != Method::GET && method != Method::HEAD {
         let mut response = ProblemResponse(RequestFault::Method).into_response();
         response.headers_mut().insert(header::ALLOW, HeaderValue::from_static("GET,HEAD"));
@@ -105,17 +105,17 @@ pub(super) async fn fallback(method: Method, uri: Uri, headers: HeaderMap) -> Re
         (header::VARY, "Accept-Encoding"),
         (header::ETAG, tag),
     ];
-    if let Some(instead) = ConditionOutcome::new(&headers, tag).response(tag, common.clone()) {
+    if let Some(instead) = ConditionOutcome::new(&headers, tag).early_response(tag, common.clone()) {
         return instead;
     }
-    let (body, encoding) = page.body(&headers);
+    let (body, encoding) = page.choose_body(&headers);
     let encoding = encoding.map(|encoding| [(header::CONTENT_ENCODING, encoding)]);
     (common, encoding, body).into_response()
 }
 
-async fn missing(is_of_manual: bool) -> Response {
+async fn missing_page(is_of_manual: bool) -> Response {
     if !is_of_manual {
-        return nothing().await.into_response();
+        return refuse_unknown_path().await.into_response();
     }
     let hint = match MANUAL {
         [] => "this program was built without its manual; docs/build.sh makes it for the next build",
@@ -138,16 +138,16 @@ fn find_page(path: &str) -> Option<&'static (&'static PageFile, String)> {
 }
 
 impl PageFile {
-    fn body(&self, headers: &HeaderMap) -> (Bytes, Option<&'static str>) {
-        match self.brotli.filter(|_| takes(headers, "br")) {
+    fn choose_body(&self, headers: &HeaderMap) -> (Bytes, Option<&'static str>) {
+        match self.brotli.filter(|_| accepts_encoding(headers, "br")) {
             Some(packed) => (Bytes::from_static(packed), Some("br")),
-            None if self.is_gzip && takes(headers, "gzip") => (Bytes::from_static(self.bytes), Some("gzip")),
-            None if self.is_gzip => (self.unpack().into(), None),
+            None if self.is_gzip && accepts_encoding(headers, "gzip") => (Bytes::from_static(self.bytes), Some("gzip")),
+            None if self.is_gzip => (self.unpack_gzip().into(), None),
             None => (Bytes::from_static(self.bytes), None),
         }
     }
 
-    fn unpack(&self) -> Vec<u8> {
+    fn unpack_gzip(&self) -> Vec<u8> {
         let mut bytes = Vec::new();
         // It was packed by the build, and what cannot be read of it is not there.
         let _ = GzDecoder::new(self.bytes).read_to_end(&mut bytes);
@@ -174,7 +174,7 @@ mod tests {
 
     #[tokio::test]
     async fn the_manual_is_shown_with_its_own_scripts_alone() {
-        let ask = async |path: &'static str| fallback(Method::GET, Uri::from_static(path), HeaderMap::new()).await;
+        let ask = async |path: &'static str| serve_page(Method::GET, Uri::from_static(path), HeaderMap::new()).await;
         if MANUAL.is_empty() {
             assert!(std::env::var_os("ECHOLAKE_NO_SKIP").is_none(), "the manual is not built; hint: docs/build.sh");
             let response = ask("/docs").await;
@@ -202,7 +202,7 @@ mod tests {
 
     async fn ask_path(path: &str) -> StatusCode {
         let uri = format!("{MANUAL_PATH}{path}").parse().expect("a path");
-        fallback(Method::GET, uri, HeaderMap::new()).await.status()
+        serve_page(Method::GET, uri, HeaderMap::new()).await.status()
     }
 
     #[cfg(not(pages_not_built))]
@@ -213,9 +213,9 @@ mod tests {
         let script = PAGES.iter().find(|p| p.path.starts_with("/assets/index-") && p.path.ends_with(".js"));
         let script = script.expect("a script");
         let packed = HeaderMap::from_iter([(header::ACCEPT_ENCODING, HeaderValue::from_static("gzip"))]);
-        let (gzip, named) = script.body(&packed);
+        let (gzip, named) = script.choose_body(&packed);
         assert_eq!(named, Some("gzip"));
-        let (plain, named) = script.body(&HeaderMap::new());
+        let (plain, named) = script.choose_body(&HeaderMap::new());
         assert_eq!(named, None);
         // gzip ends with the length of what it packed.
         let length = gzip.last_chunk().map(|length| u32::from_le_bytes(*length));

@@ -6,7 +6,7 @@ use axum::http::{HeaderMap, StatusCode};
 use echolake_http::ProblemResponse;
 use echolake_service::{ClientIdentity, RequestFault};
 
-use super::authentication::authenticate;
+use super::authentication::authenticate_client;
 use crate::door::server_door::ServerDoor;
 
 /// Cancels a query of the client's own; of any client, with a token for metrics.
@@ -20,7 +20,7 @@ use crate::door::server_door::ServerDoor;
     params(("id" = u64, Path, description = "Number of the query")),
     responses((status = 202, description = "It is being ended"))
 )]
-pub(super) async fn cancel(
+pub(super) async fn post_cancellation(
     State(door): State<ServerDoor>,
     id: Result<Path<u64>, PathRejection>,
     headers: HeaderMap,
@@ -35,8 +35,8 @@ async fn cancel_query(
     id: Result<Path<u64>, PathRejection>,
     headers: &HeaderMap,
 ) -> Result<(), RequestFault> {
-    let client = authenticate(door.access(), headers, ClientIdentity::programs)?;
+    let client = authenticate_client(door.access(), headers, ClientIdentity::local_programs)?;
     let Path(id) =
-        id.map_err(|_| RequestFault::request("a query has a number; hint: select id from system.queries"))?;
+        id.map_err(|_| RequestFault::bad_request("a query has a number; hint: select id from system.queries"))?;
     door.cancel_query(&client, id).await
 }

@@ -36,15 +36,15 @@ struct SessionRequest {
     request_body = SessionRequest,
     responses((status = 204, description = "The cookie is set"))
 )]
-pub(super) async fn post(
+pub(super) async fn post_session(
     State(door): State<ServerDoor>,
     headers: HeaderMap,
     body: Result<Bytes, BytesRejection>,
 ) -> Result<impl IntoResponse, ProblemResponse> {
     let body = body.ok().filter(|b| b.len() <= LARGEST).ok_or(RequestFault::TooLarge { limit: LARGEST })?;
     let SessionRequest { token } = serde_json::from_slice(&body)
-        .map_err(|_| RequestFault::request("the body is not as expected; hint: {\"token\": \"echolake_...\"}"))?;
-    let secret = door.access().begin_session(&token).inspect_err(|f| door.metrics().failed(f.code()))?;
+        .map_err(|_| RequestFault::bad_request("the body is not as expected; hint: {\"token\": \"echolake_...\"}"))?;
+    let secret = door.access().begin_session(&token).inspect_err(|f| door.metrics().count_failure(f.code()))?;
     // Behind TLS, this server's or a proxy's, the cookie never leaves it.
     let secure = if is_encrypted(&headers) { "; Secure" } else { "" };
     let cookie =

@@ -39,28 +39,28 @@ impl CancelKeys {
     }
 
     /// A key of `bytes` random bytes: four in protocol 3.0, more in 3.2. None if the system gives none.
-    pub(super) fn make(pid: i32, bytes: usize) -> Option<CancelKey> {
+    pub(super) fn make_key(pid: i32, bytes: usize) -> Option<CancelKey> {
         let mut secret = vec![0; bytes.min(32)];
         getrandom::fill(&mut secret).ok()?;
         Some(CancelKey { pid, secret })
     }
 
     /// Lets this key cancel queries of the target's connection from now on.
-    pub(super) fn set(&self, key: &CancelKey, target: CancelTarget) {
-        self.lock().insert((key.pid, key.secret.clone()), target);
+    pub(super) fn set_target(&self, key: &CancelKey, target: CancelTarget) {
+        self.lock_keys().insert((key.pid, key.secret.clone()), target);
     }
 
     /// Removes a key.
-    pub(super) fn remove(&self, key: &CancelKey) {
-        self.lock().remove(&(key.pid, key.secret.clone()));
+    pub(super) fn remove_key(&self, key: &CancelKey) {
+        self.lock_keys().remove(&(key.pid, key.secret.clone()));
     }
 
     /// Cancels the query on the connection of a key; false if there is none.
-    pub(super) async fn cancel(&self, pid: i32, secret: &[u8]) -> bool {
-        let found = self.lock().get(&(pid, secret.to_vec())).cloned();
+    pub(super) async fn cancel_query(&self, pid: i32, secret: &[u8]) -> bool {
+        let found = self.lock_keys().get(&(pid, secret.to_vec())).cloned();
         let Some(target) = found else { return false };
         // An engine that is gone runs nothing.
-        if let Ok(mut stream) = target.engine.connect(EngineSocket::Postgres).await
+        if let Ok(mut stream) = target.engine.connect_socket(EngineSocket::Postgres).await
             && stream.write_all(&cancel_message(target.pid, &target.secret)).await.is_ok()
         {
             // The engine closes the connection behind it.
@@ -69,7 +69,7 @@ impl CancelKeys {
         true
     }
 
-    fn lock(&self) -> MutexGuard<'_, HashMap<(i32, Vec<u8>), CancelTarget>> {
+    fn lock_keys(&self) -> MutexGuard<'_, HashMap<(i32, Vec<u8>), CancelTarget>> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

@@ -27,11 +27,11 @@ impl FrameHeader {
     ///
     /// # Errors
     /// [`RequestFault::Request`] if the length is impossible.
-    pub(super) fn peek(buffer: &[u8]) -> Result<Option<Self>, RequestFault> {
+    pub(super) fn peek_from(buffer: &[u8]) -> Result<Option<Self>, RequestFault> {
         let Some((&[kind, a, b, c, d], _)) = buffer.split_first_chunk() else { return Ok(None) };
         match i32::from_be_bytes([a, b, c, d]) {
             length @ 4.. => Ok(Some(Self { kind, bytes: length.unsigned_abs() as usize + 1 })),
-            length => Err(RequestFault::request(format!("a message of {length} bytes; a length is 4 at least"))),
+            length => Err(RequestFault::bad_request(format!("a message of {length} bytes; a length is 4 at least"))),
         }
     }
 
@@ -39,13 +39,15 @@ impl FrameHeader {
     ///
     /// # Errors
     /// [`RequestFault::TooLarge`], [`RequestFault::Request`].
-    pub(super) fn check(self) -> Result<(), RequestFault> {
+    pub(super) fn check_header(self) -> Result<(), RequestFault> {
         let limit = match self.kind {
             b'Q' | b'P' => TEXT,
             b'B' => VALUES,
             b'p' => PASSWORD,
             b'D' | b'C' | b'E' | b'H' | b'S' | b'X' | b'c' | b'f' | b'd' | b'F' => NAMES,
-            other => return Err(RequestFault::request(format!("a message of the type {other:#04x}, which is none"))),
+            other => {
+                return Err(RequestFault::bad_request(format!("a message of the type {other:#04x}, which is none")));
+            }
         };
         match self.bytes <= limit {
             true => Ok(()),
@@ -61,7 +63,8 @@ impl FrameHeader {
     pub(super) fn check_parts(self, message: &[u8]) -> Result<(), RequestFault> {
         let body = message.get(HEADER..).unwrap_or_default();
         let kind = char::from(self.kind);
-        let wrong = || RequestFault::request(format!("a message of the type `{kind}` that ends before its last part"));
+        let wrong =
+            || RequestFault::bad_request(format!("a message of the type `{kind}` that ends before its last part"));
         MessageParts(body).skip_all(self.kind).ok_or_else(wrong)
     }
 }
@@ -74,12 +77,12 @@ impl MessageParts<'_> {
         match kind {
             b'Q' => self.skip_text(),
             b'D' | b'C' => {
-                self.skip(1)?;
+                self.skip_bytes(1)?;
                 self.skip_text()
             }
             b'E' => {
                 self.skip_text()?;
-                self.skip(4)
+                self.skip_bytes(4)
             }
             b'P' => {
                 self.skip_text()?;
@@ -93,7 +96,7 @@ impl MessageParts<'_> {
                 for _ in 0..self.0.try_get_u16().ok()? {
                     // A negative length is that of a null.
                     let bytes = usize::try_from(self.0.try_get_i32().ok()?).unwrap_or(0);
-                    self.skip(bytes)?;
+                    self.skip_bytes(bytes)?;
                 }
                 self.skip_numbers(2)
             }
@@ -104,16 +107,16 @@ impl MessageParts<'_> {
     // Up to and with the zero byte.
     fn skip_text(&mut self) -> Option<()> {
         let end = self.0.iter().position(|byte| *byte == 0)?;
-        self.skip(end + 1)
+        self.skip_bytes(end + 1)
     }
 
     // A count, and so many numbers.
     fn skip_numbers(&mut self, bytes_each: usize) -> Option<()> {
         let count = self.0.try_get_u16().ok()?;
-        self.skip(usize::from(count) * bytes_each)
+        self.skip_bytes(usize::from(count) * bytes_each)
     }
 
-    fn skip(&mut self, bytes: usize) -> Option<()> {
+    fn skip_bytes(&mut self, bytes: usize) -> Option<()> {
         self.0 = self.0.get(bytes..)?;
         Some(())
     }
@@ -164,7 +167,7 @@ impl StartupPacket {
     /// # Errors
     /// [`RequestFault::Request`].
     pub(super) fn parse(mut packet: &[u8]) -> Result<Self, RequestFault> {
-        let wrong = || RequestFault::request("the protocol's startup is expected");
+        let wrong = || RequestFault::bad_request("the protocol's startup is expected");
         match packet.try_get_i32().map_err(|_| wrong())? {
             TLS => Ok(Self::Encryption { is_tls: true }),
             GSS => Ok(Self::Encryption { is_tls: false }),
@@ -196,13 +199,13 @@ mod tests {
         let header = |kind: u8, length: i32| {
             let mut bytes = vec![kind];
             bytes.extend(length.to_be_bytes());
-            FrameHeader::peek(&bytes)
+            FrameHeader::peek_from(&bytes)
         };
-        assert_eq!(FrameHeader::peek(b"Q\0\0\0").expect("no harm"), None);
+        assert_eq!(FrameHeader::peek_from(b"Q\0\0\0").expect("no harm"), None);
         for length in [i32::MIN, -1, 0, 3] {
             assert!(header(b'Q', length).is_err(), "{length}");
         }
-        let check = |kind, length| header(kind, length).expect("a length").expect("whole").check();
+        let check = |kind, length| header(kind, length).expect("a length").expect("whole").check_header();
         assert!(check(b'Q', 2 << 20).is_ok() && check(b'B', 4 << 20).is_err() && check(b'S', 4).is_ok());
         for (kind, length) in [(b'Q', 0x3fff_fff0), (b'P', i32::MAX), (b'E', 5000), (b'!', 4), (b'd', 1 << 20)] {
             assert!(check(kind, length).is_err(), "{kind} {length}");

@@ -38,14 +38,15 @@ const TOKEN_USER: &str = "token";
 const WRONG_KEY: Duration = Duration::from_secs(1);
 
 /// Answers connections; never ends.
-pub(super) async fn serve(door: ServerDoor, listener: TcpListener, encryption: ProtocolEncryption) {
-    let places = ConnectionPlaces::new(listener, MOST).listed(&door.activity().connections, ServerProtocol::Postgres);
+pub(super) async fn serve_postgres_clients(door: ServerDoor, listener: TcpListener, encryption: ProtocolEncryption) {
+    let places =
+        ConnectionPlaces::new(listener, MOST).listed_among(&door.activity().connections, ServerProtocol::Postgres);
     let keys = Arc::new(CancelKeys::default());
     places
-        .attend(|stream| {
+        .attend_connections(|stream| {
             let (door, keys, encryption) = (door.clone(), keys.clone(), encryption.clone());
-            let place = LoginPlace { door, keys, encryption, work: stream.work() };
-            attend(stream, place)
+            let place = LoginPlace { door, keys, encryption, work: stream.work_handle() };
+            attend_client(stream, place)
         })
         .await;
 }
@@ -58,8 +59,8 @@ struct LoginPlace {
     work: PlaceWork,
 }
 
-async fn attend(stream: PlacedStream, place: LoginPlace) {
-    let (evicted, work) = (stream.evicted(), place.work.clone());
+async fn attend_client(stream: PlacedStream, place: LoginPlace) {
+    let (evicted, work) = (stream.wait_for_eviction(), place.work.clone());
     let login = async {
         tokio::select! {
             login = tokio::time::timeout(LOGIN, place.log_in(stream)) => login.ok().flatten(),
@@ -67,15 +68,15 @@ async fn attend(stream: PlacedStream, place: LoginPlace) {
         }
     };
     let Some((mut stream, mut session)) = login.await else { return };
-    let Some(_awaited) = place.door.drain().enter() else {
-        place.refuse(&mut stream, &RequestFault::Draining).await;
+    let Some(_awaited) = place.door.drain().count_connection() else {
+        place.refuse_client(&mut stream, &RequestFault::Draining).await;
         return;
     };
     work.hear_request();
     mark_startup(&mut session.startup, PID_PARAMETER, &session.pid.to_string(), STARTUP);
-    let _working = work.begin();
+    let _working = work.begin_work();
     let span = begin_connection(&mut session.startup, &session.client.name, STARTUP);
-    MessageRelay::new(stream, place.door, place.keys, session).run().instrument(span).await;
+    MessageRelay::new(stream, place.door, place.keys, session).answer_client().instrument(span).await;
 }
 
 /// A client that is logged in.
@@ -98,7 +99,7 @@ impl LoginPlace {
                 // What follows is encrypted.
                 (Ok(LoginStep::Encrypt), DoorStream::Left(plain)) => {
                     let before = self.encryption.certificate_hash();
-                    stream = self.encryption.accept(plain).await?;
+                    stream = self.encryption.shake_hands(plain).await?;
                     // If it was renewed meanwhile, the client may have got either.
                     certificate = before.filter(|before| self.encryption.certificate_hash().as_ref() == Some(before));
                 }
@@ -117,13 +118,13 @@ impl LoginPlace {
         match login {
             Ok(login) => Some((stream, login)),
             Err(fault) => {
-                self.refuse(&mut stream, &fault).await;
+                self.refuse_client(&mut stream, &fault).await;
                 None
             }
         }
     }
 
-    async fn refuse(&self, stream: &mut DoorStream, fault: &RequestFault) {
+    async fn refuse_client(&self, stream: &mut DoorStream, fault: &RequestFault) {
         self.door.metrics().record_failure(fault);
         // A client that hangs up needs no reason.
         let _ = stream.write_all(&fatal_message(fault)).await;
@@ -147,22 +148,22 @@ impl LoginPlace {
                 }
             }
             StartupPacket::Cancel { pid, secret } => {
-                if !self.keys.cancel(pid, &secret).await {
+                if !self.keys.cancel_query(pid, &secret).await {
                     tokio::time::sleep(WRONG_KEY).await;
                 }
                 Ok(LoginStep::Nothing)
             }
             StartupPacket::Session { .. } if self.encryption.is_on() && !is_encrypted => {
-                Err(RequestFault::request("this server encrypts its connections; hint: sslmode=require"))
+                Err(RequestFault::bad_request("this server encrypts its connections; hint: sslmode=require"))
             }
             StartupPacket::Session { .. } if self.door.drain().is_begun() => Err(RequestFault::Draining),
             StartupPacket::Session { user } => {
-                self.door.failed_logins().check(self.work.peer())?;
-                let found = self.authenticate(stream, &user, certificate).await;
+                self.door.failed_logins().check_address(self.work.peer())?;
+                let found = self.authenticate_user(stream, &user, certificate).await;
                 if let Err(RequestFault::Unauthenticated) = &found {
-                    self.door.failed_logins().count(self.work.peer());
+                    self.door.failed_logins().count_failure(self.work.peer());
                 }
-                let found = found.and_then(|client| client.require(TokenScope::Sql).map(|()| client));
+                let found = found.and_then(|client| client.require_scope(TokenScope::Sql).map(|()| client));
                 let client = self.door.note_client(&self.work, ServerProtocol::Postgres, found)?;
                 let pid = CancelKeys::make_pid().map_err(RequestFault::defect("no random bytes"))?;
                 Ok(LoginStep::Done(PostgresLogin { client, startup, pid }))
@@ -174,7 +175,7 @@ impl LoginPlace {
 impl LoginPlace {
     // Users of one name alone send their token. All others prove that they have the one of their name, whether there is such
     // a name or not: nobody learns by asking which names there are.
-    async fn authenticate(
+    async fn authenticate_user(
         &self,
         stream: &mut DoorStream,
         user: &str,
@@ -182,7 +183,7 @@ impl LoginPlace {
     ) -> Result<Arc<ClientIdentity>, RequestFault> {
         let access = self.door.access();
         if access.is_open() {
-            return access.client(None, || ClientIdentity::user(user));
+            return access.client_of_token(None, || ClientIdentity::local_user(user));
         }
         if user != TOKEN_USER {
             let (client, verifier) = access.scram_client(user);
@@ -192,7 +193,7 @@ impl LoginPlace {
             return Ok(client);
         }
         let token = read_password(stream).await?;
-        access.client(Some(&token), || ClientIdentity::user(user))
+        access.client_of_token(Some(&token), || ClientIdentity::local_user(user))
     }
 }
 
@@ -201,12 +202,12 @@ async fn prove_token(
     verifier: &ScramVerifier,
     certificate: Option<&[u8]>,
 ) -> Result<(), RequestFault> {
-    stream.write_all(&methods_message(certificate.is_some())).await.map_err(|_| broken())?;
+    stream.write_all(&methods_message(certificate.is_some())).await.map_err(|_| broken_login())?;
     let first = read_response(stream).await?;
-    let exchange = ScramExchange::begin(&first, verifier, certificate)?;
-    stream.write_all(&exchange.first_message()).await.map_err(|_| broken())?;
+    let exchange = ScramExchange::read_first(&first, verifier, certificate)?;
+    stream.write_all(&exchange.first_message()).await.map_err(|_| broken_login())?;
     let last = read_response(stream).await?;
-    stream.write_all(&exchange.finish(&last)?).await.map_err(|_| broken())
+    stream.write_all(&exchange.finish_exchange(&last)?).await.map_err(|_| broken_login())
 }
 
 /// What follows on a packet before the session.
@@ -221,8 +222,8 @@ enum LoginStep {
     Nothing,
 }
 
-fn broken() -> RequestFault {
-    RequestFault::request("the login did not come whole")
+fn broken_login() -> RequestFault {
+    RequestFault::bad_request("the login did not come whole")
 }
 
 // None at the end of the connection.
@@ -233,16 +234,16 @@ async fn read_startup(stream: &mut DoorStream) -> Result<Option<BytesMut>, Reque
     }
     let bytes = usize::try_from(i32::from_be_bytes(length)).unwrap_or(0);
     if !(8..=STARTUP).contains(&bytes) {
-        return Err(RequestFault::request(format!("a startup packet of {bytes} bytes; it has 8 to {STARTUP}")));
+        return Err(RequestFault::bad_request(format!("a startup packet of {bytes} bytes; it has 8 to {STARTUP}")));
     }
     let mut packet = BytesMut::zeroed(bytes);
     packet[..4].copy_from_slice(&length);
-    stream.read_exact(&mut packet[4..]).await.map_err(|_| broken())?;
+    stream.read_exact(&mut packet[4..]).await.map_err(|_| broken_login())?;
     Ok(Some(packet))
 }
 
 async fn read_password(stream: &mut DoorStream) -> Result<String, RequestFault> {
-    stream.write_all(&PASSWORD_WANTED).await.map_err(|_| broken())?;
+    stream.write_all(&PASSWORD_WANTED).await.map_err(|_| broken_login())?;
     let mut password = read_response(stream).await?;
     let end = password.iter().position(|byte| *byte == 0).unwrap_or(password.len());
     String::from_utf8(password.copy_to_bytes(end).to_vec()).map_err(|_| RequestFault::Unauthenticated)
@@ -251,13 +252,13 @@ async fn read_password(stream: &mut DoorStream) -> Result<String, RequestFault> 
 // What a client answers to a request for a password, or for a part of a proof.
 async fn read_response(stream: &mut DoorStream) -> Result<BytesMut, RequestFault> {
     let mut header = [0; HEADER];
-    stream.read_exact(&mut header).await.map_err(|_| broken())?;
-    let Some(header) = FrameHeader::peek(&header)? else { return Err(broken()) };
+    stream.read_exact(&mut header).await.map_err(|_| broken_login())?;
+    let Some(header) = FrameHeader::peek_from(&header)? else { return Err(broken_login()) };
     if header.kind != b'p' {
-        return Err(RequestFault::request("a password is expected"));
+        return Err(RequestFault::bad_request("a password is expected"));
     }
-    header.check()?;
+    header.check_header()?;
     let mut response = BytesMut::zeroed(header.bytes - HEADER);
-    stream.read_exact(&mut response).await.map_err(|_| broken())?;
+    stream.read_exact(&mut response).await.map_err(|_| broken_login())?;
     Ok(response)
 }

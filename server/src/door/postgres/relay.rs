@@ -51,7 +51,7 @@ struct AwaitedAnswers {
 }
 
 impl AwaitedAnswers {
-    fn ask(&mut self, kind: u8) {
+    fn count_request(&mut self, kind: u8) {
         match kind {
             b'Q' => self.ends += 1,
             b'S' => {
@@ -64,7 +64,7 @@ impl AwaitedAnswers {
         }
     }
 
-    fn answer(&mut self, kind: u8) {
+    fn count_answer(&mut self, kind: u8) {
         match kind {
             b'Z' => self.ends = self.ends.saturating_sub(1),
             b'1' | b'2' | b'3' | b'T' | b'n' | b'C' | b'I' | b's' => {
@@ -103,14 +103,14 @@ enum RelayEnd {
     Broken(Box<RequestFault>),
 }
 
-fn broken(fault: RequestFault) -> RelayEnd {
+fn broken_relay(fault: RequestFault) -> RelayEnd {
     RelayEnd::Broken(Box::new(fault))
 }
 
 impl Drop for MessageRelay {
     fn drop(&mut self) {
         if let Some(key) = &self.key {
-            self.keys.remove(key);
+            self.keys.remove_key(key);
         }
     }
 }
@@ -133,7 +133,7 @@ impl MessageRelay {
     }
 
     /// Answers the client until it or its engine ends, or until the server drains and nothing is asked.
-    pub(super) async fn run(mut self) {
+    pub(super) async fn answer_client(mut self) {
         if let Err(Some(fault)) = self.converse().await {
             self.door.metrics().record_failure(&fault);
             self.outgoing.extend_from_slice(&fatal_message(&fault));
@@ -145,7 +145,7 @@ impl MessageRelay {
 
     // The error is the last message to the client; None if the client is gone, or cannot be sent one.
     async fn converse(&mut self) -> Result<(), Option<RequestFault>> {
-        let mut link = self.connect().await?;
+        let mut link = self.connect_engine().await?;
         let end = self.pass_on(&mut link).await;
         match end {
             RelayEnd::Client => Ok(()),
@@ -165,7 +165,7 @@ impl MessageRelay {
             let is_unread = !self.outgoing.is_empty();
             link.lease.set_waiting(is_unread || !self.awaited.is_any());
             tokio::select! {
-                () = drain.begun(), if !is_unread && !self.awaited.is_any() => {
+                () = drain.wait_until_begun(), if !is_unread && !self.awaited.is_any() => {
                     self.outgoing = fatal_message(&RequestFault::Disconnected);
                     return RelayEnd::Client;
                 }
@@ -205,8 +205,8 @@ impl MessageRelay {
             if self.rest > 0 {
                 return Ok(());
             }
-            let Some(header) = FrameHeader::peek(&self.incoming).map_err(broken)? else { return Ok(()) };
-            header.check().map_err(broken)?;
+            let Some(header) = FrameHeader::peek_from(&self.incoming).map_err(broken_relay)? else { return Ok(()) };
+            header.check_header().map_err(broken_relay)?;
             let there = header.bytes.min(self.incoming.len());
             if there < header.bytes.min(ASK_BYTES) {
                 return Ok(());
@@ -216,9 +216,9 @@ impl MessageRelay {
             }
             // Of a longer one, the engine ends the connection.
             if there == header.bytes {
-                header.check_parts(&self.incoming[..there]).map_err(broken)?;
+                header.check_parts(&self.incoming[..there]).map_err(broken_relay)?;
             }
-            self.awaited.ask(header.kind);
+            self.awaited.count_request(header.kind);
             self.rest = header.bytes - there;
             link.outgoing.extend_from_slice(&self.incoming.split_to(there));
         }
@@ -237,12 +237,12 @@ impl MessageRelay {
                 continue;
             }
             let there = &link.incoming[passed..];
-            let header = FrameHeader::peek(there).map_err(|_| RelayEnd::Engine)?;
+            let header = FrameHeader::peek_from(there).map_err(|_| RelayEnd::Engine)?;
             let Some(header) = header else { break };
             if there.len() < header.bytes && header.bytes <= READ_BYTES {
                 break;
             }
-            self.awaited.answer(header.kind);
+            self.awaited.count_answer(header.kind);
             let bytes = header.bytes.min(there.len());
             (passed, link.rest) = (passed + bytes, header.bytes - bytes);
         }
@@ -252,10 +252,10 @@ impl MessageRelay {
     }
 
     // Begins a session on the client's engine, or, if that ended before the session began, on the next one.
-    async fn connect(&mut self) -> Result<EngineLink, Option<RequestFault>> {
+    async fn connect_engine(&mut self) -> Result<EngineLink, Option<RequestFault>> {
         let mut ended = None;
         loop {
-            let lease = match self.door.engines().lease(&self.login.client).await {
+            let lease = match self.door.engines().lease_for(&self.login.client).await {
                 Ok(lease) => lease,
                 Err(fault) => return Err(ended.or(Some(fault))),
             };
@@ -273,7 +273,7 @@ impl MessageRelay {
 
     // None if the engine refuses the session; its error message is passed on to the client.
     async fn start_session(&mut self, lease: EngineLease) -> io::Result<Option<EngineLink>> {
-        let (read, write) = lease.engine().connect(EngineSocket::Postgres).await?.into_split();
+        let (read, write) = lease.engine().connect_socket(EngineSocket::Postgres).await?.into_split();
         let (incoming, outgoing) = (BytesMut::with_capacity(READ_BYTES), BytesMut::new());
         let mut link = EngineLink { lease, read, write, incoming, outgoing, rest: 0 };
         link.write.write_all(&self.login.startup).await?;
@@ -297,10 +297,10 @@ impl MessageRelay {
     // Keeps the engine's key, and returns the door's own for the client.
     fn take_key(&mut self, link: &EngineLink, mut engine_key: &[u8]) -> BytesMut {
         let pid = engine_key.try_get_i32().unwrap_or(0);
-        self.key = CancelKeys::make(self.login.pid, engine_key.len());
+        self.key = CancelKeys::make_key(self.login.pid, engine_key.len());
         let Some(key) = &self.key else { return BytesMut::new() };
         let target = CancelTarget { engine: link.lease.engine().clone(), pid, secret: engine_key.to_vec() };
-        self.keys.set(key, target);
+        self.keys.set_target(key, target);
         key_message(key.pid, &key.secret)
     }
 
@@ -320,7 +320,7 @@ impl MessageRelay {
 impl EngineLink {
     async fn next_message(&mut self) -> io::Result<(u8, BytesMut)> {
         loop {
-            let header = FrameHeader::peek(&self.incoming).map_err(io::Error::other)?;
+            let header = FrameHeader::peek_from(&self.incoming).map_err(io::Error::other)?;
             if let Some(header) = header.filter(|header| header.bytes <= self.incoming.len()) {
                 return Ok((header.kind, self.incoming.split_to(header.bytes)));
             }
@@ -340,7 +340,7 @@ mod tests {
         let mut awaited = AwaitedAnswers::default();
         for part in conversation.split(' ') {
             for kind in part[1..].bytes() {
-                if part.starts_with('>') { awaited.ask(kind) } else { awaited.answer(kind) }
+                if part.starts_with('>') { awaited.count_request(kind) } else { awaited.count_answer(kind) }
             }
         }
         awaited.is_any()

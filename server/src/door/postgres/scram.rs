@@ -49,8 +49,8 @@ pub(super) struct ScramExchange<'a> {
     server_first: String,
 }
 
-fn malformed(what: &str) -> RequestFault {
-    RequestFault::request(format!("the login by SCRAM is malformed: {what}"))
+fn malformed_login(what: &str) -> RequestFault {
+    RequestFault::bad_request(format!("the login by SCRAM is malformed: {what}"))
 }
 
 impl<'a> ScramExchange<'a> {
@@ -58,7 +58,7 @@ impl<'a> ScramExchange<'a> {
     ///
     /// # Errors
     /// [`RequestFault::Request`].
-    pub(super) fn begin(
+    pub(super) fn read_first(
         message: &[u8],
         verifier: &'a ScramVerifier,
         certificate: Option<&[u8]>,
@@ -78,10 +78,10 @@ impl<'a> ScramExchange<'a> {
         // The binding, whoever the client acts for, then the message proper.
         let mut parts = first.splitn(3, ',');
         let (Some(flag), Some(authorized), Some(bare)) = (parts.next(), parts.next(), parts.next()) else {
-            return Err(malformed("its first message has not three parts"));
+            return Err(malformed_login("its first message has not three parts"));
         };
         if !authorized.is_empty() {
-            return Err(malformed("it acts for another user"));
+            return Err(malformed_login("it acts for another user"));
         }
         let mut binding = format!("{flag},,").into_bytes();
         match (method, flag, certificate) {
@@ -90,13 +90,14 @@ impl<'a> ScramExchange<'a> {
             }
             // `y`: the client could bind, and was told that the server cannot.
             (METHOD, "n", _) | (METHOD, "y", None) => {}
-            _ => return Err(malformed("method and binding to the certificate differ from what was offered")),
+            _ => return Err(malformed_login("method and binding to the certificate differ from what was offered")),
         }
         check_extensions(bare)?;
         let mut attributes = bare.split(',');
-        let _user = attributes.next().and_then(|part| part.strip_prefix("n=")).ok_or_else(|| malformed("no `n=`"))?;
+        let _user =
+            attributes.next().and_then(|part| part.strip_prefix("n=")).ok_or_else(|| malformed_login("no `n=`"))?;
         let nonce = attributes.next().and_then(|part| part.strip_prefix("r=")).filter(|nonce| !nonce.is_empty());
-        let nonce = format!("{}{own_nonce}", nonce.ok_or_else(|| malformed("no `r=` behind `n=`"))?);
+        let nonce = format!("{}{own_nonce}", nonce.ok_or_else(|| malformed_login("no `r=` behind `n=`"))?);
         let server_first = format!("r={nonce},s={},i={}", verifier.salt(), verifier.iterations());
         let messages = format!("{bare},{server_first}");
         Ok(Self { verifier, binding, nonce, messages, server_first })
@@ -111,19 +112,19 @@ impl<'a> ScramExchange<'a> {
     ///
     /// # Errors
     /// [`RequestFault::Unauthenticated`] if the client has not the token, [`RequestFault::Request`].
-    pub(super) fn finish(&self, message: &[u8]) -> Result<BytesMut, RequestFault> {
-        let last = str::from_utf8(message).map_err(|_| malformed("its last message is no text"))?;
-        let (unproved, proof) = last.rsplit_once(",p=").ok_or_else(|| malformed("no `p=`"))?;
+    pub(super) fn finish_exchange(&self, message: &[u8]) -> Result<BytesMut, RequestFault> {
+        let last = str::from_utf8(message).map_err(|_| malformed_login("its last message is no text"))?;
+        let (unproved, proof) = last.rsplit_once(",p=").ok_or_else(|| malformed_login("no `p=`"))?;
         check_extensions(unproved)?;
         let mut parts = unproved.split(',');
         let binding = parts.next().and_then(|part| BASE64.decode(part.strip_prefix("c=")?).ok());
         if binding.as_deref() != Some(&self.binding[..]) {
-            return Err(malformed("it is bound to another certificate"));
+            return Err(malformed_login("it is bound to another certificate"));
         }
         if parts.next().and_then(|part| part.strip_prefix("r=")) != Some(self.nonce.as_str()) {
-            return Err(malformed("`r=` is not the server's"));
+            return Err(malformed_login("`r=` is not the server's"));
         }
-        let proof = BASE64.decode(proof).map_err(|_| malformed("`p=` is not in base 64"))?;
+        let proof = BASE64.decode(proof).map_err(|_| malformed_login("`p=` is not in base 64"))?;
         let messages = format!("{},{unproved}", self.messages);
         let answer = self.verifier.check_proof(&messages, &proof).ok_or(RequestFault::Unauthenticated)?;
         Ok(sasl_message(SASL_FINAL, format!("v={}", BASE64.encode(answer)).as_bytes()))
@@ -133,13 +134,13 @@ impl<'a> ScramExchange<'a> {
 // A client that sends `m=` must not be let in by a server that does not know what it wants (RFC 5802, section 5.1).
 fn check_extensions(message: &str) -> Result<(), RequestFault> {
     match message.split(',').any(|attribute| attribute.starts_with("m=")) {
-        true => Err(malformed("it wants an extension (`m=`), and there is none")),
+        true => Err(malformed_login("it wants an extension (`m=`), and there is none")),
         false => Ok(()),
     }
 }
 
 fn initial_response(message: &[u8]) -> Result<(&str, &str), RequestFault> {
-    split_response(message).ok_or_else(|| malformed("its first message is cut off or no text"))
+    split_response(message).ok_or_else(|| malformed_login("its first message is cut off or no text"))
 }
 
 // A method's name with a zero behind it, a length, a message.
@@ -174,14 +175,17 @@ mod tests {
         let exchange = ScramExchange::with_nonce(&first, &verifier, None, OWN_NONCE).expect("a first message");
         assert_eq!(&exchange.first_message()[9..], format!("r={NONCE},s=W22ZaJ0SNY7soEsUEjb6gQ==,i=4096").as_bytes());
         let last = format!("c=biws,r={NONCE},p={PROOF}");
-        let answer = exchange.finish(last.as_bytes()).expect("let in");
+        let answer = exchange.finish_exchange(last.as_bytes()).expect("let in");
         assert_eq!(&answer[9..], b"v=6rriTRBi23WpRR/wtup+mMhUZUn/dB5nLTJRsjl95G4=");
         let wrong = last.replace("p=d", "p=e");
-        assert!(matches!(exchange.finish(wrong.as_bytes()), Err(RequestFault::Unauthenticated)));
+        assert!(matches!(exchange.finish_exchange(wrong.as_bytes()), Err(RequestFault::Unauthenticated)));
         for malformed in
             ["", "c=biws", &last.replace("biws", "eSws"), &last.replace("k0", "k1"), &last.replace(",p=", ",q=")]
         {
-            assert!(matches!(exchange.finish(malformed.as_bytes()), Err(RequestFault::Request { .. })), "{malformed}");
+            assert!(
+                matches!(exchange.finish_exchange(malformed.as_bytes()), Err(RequestFault::Request { .. })),
+                "{malformed}"
+            );
         }
     }
 
@@ -198,7 +202,7 @@ mod tests {
         }
         let first = initial(METHOD, "n,,n=user,r=rOprNGfwEbeRWgbNEkqO");
         let exchange = ScramExchange::with_nonce(&first, &verifier, None, OWN_NONCE).expect("a first message");
-        let last = exchange.finish(format!("c=biws,r={NONCE},m=x,p={PROOF}").as_bytes());
+        let last = exchange.finish_exchange(format!("c=biws,r={NONCE},m=x,p={PROOF}").as_bytes());
         assert!(matches!(last, Err(RequestFault::Request { .. })));
     }
 
@@ -207,7 +211,7 @@ mod tests {
         let verifier = VERIFIER.parse().expect("a verifier");
         let begin = |method, flag: &str, certificate| {
             let first = initial(method, &format!("{flag},,n=,r=abc"));
-            ScramExchange::begin(&first, &verifier, certificate).map(|exchange| exchange.binding)
+            ScramExchange::read_first(&first, &verifier, certificate).map(|exchange| exchange.binding)
         };
         let hash = Some(&b"hash"[..]);
         assert_eq!(begin(METHOD, "n", hash).expect("unbound"), b"n,,");
@@ -226,7 +230,7 @@ mod tests {
             assert!(begin(method, flag, certificate).is_err(), "{method} {flag}");
         }
         for cut in [&b""[..], b"SCRAM-SHA-256", b"SCRAM-SHA-256\0\0\0\0\x09n,,", b"SCRAM-SHA-256\0\0\0\0\x03n,,"] {
-            assert!(ScramExchange::begin(cut, &verifier, None).is_err(), "{cut:?}");
+            assert!(ScramExchange::read_first(cut, &verifier, None).is_err(), "{cut:?}");
         }
     }
 }

@@ -39,7 +39,7 @@ pub(super) enum PromptCommand {
 }
 
 /// Parses the command of a line; None if it is SQL.
-pub(super) fn parse(line: &str) -> Option<Result<PromptCommand, String>> {
+pub(super) fn parse_command(line: &str) -> Option<Result<PromptCommand, String>> {
     let line = line.trim();
     let (word, rest) = line.split_once(char::is_whitespace).unwrap_or((line, ""));
     let rest = rest.trim().trim_end_matches(';').trim_end();
@@ -67,14 +67,14 @@ mod tests {
 
     #[test]
     fn lines_are_orders_or_sql() {
-        assert_eq!(parse("\\d  runs;"), Some(Ok(PromptCommand::Columns("runs".to_owned()))));
-        assert_eq!(parse("\\d"), Some(Ok(PromptCommand::Tables)));
-        assert_eq!(parse("  quit "), Some(Ok(PromptCommand::Quit)));
-        assert_eq!(parse("\\f CSV"), Some(Ok(PromptCommand::Format(AnswerFormat::Csv))));
-        assert_eq!(parse("\\o a b.csv"), Some(Ok(PromptCommand::Output(Some("a b.csv".into())))));
-        assert_eq!(parse("select 1;"), None);
-        assert_eq!(parse(""), None);
-        assert!(matches!(parse("\\f xls"), Some(Err(m)) if m.contains("xls")));
-        assert!(matches!(parse("\\z"), Some(Err(m)) if m.contains("\\z")));
+        assert_eq!(parse_command("\\d  runs;"), Some(Ok(PromptCommand::Columns("runs".to_owned()))));
+        assert_eq!(parse_command("\\d"), Some(Ok(PromptCommand::Tables)));
+        assert_eq!(parse_command("  quit "), Some(Ok(PromptCommand::Quit)));
+        assert_eq!(parse_command("\\f CSV"), Some(Ok(PromptCommand::Format(AnswerFormat::Csv))));
+        assert_eq!(parse_command("\\o a b.csv"), Some(Ok(PromptCommand::Output(Some("a b.csv".into())))));
+        assert_eq!(parse_command("select 1;"), None);
+        assert_eq!(parse_command(""), None);
+        assert!(matches!(parse_command("\\f xls"), Some(Err(m)) if m.contains("xls")));
+        assert!(matches!(parse_command("\\z"), Some(Err(m)) if m.contains("\\z")));
     }
 }

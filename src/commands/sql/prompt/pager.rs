@@ -62,6 +62,6 @@ impl Drop for PageOutput {
 }
 
 /// Shows a text.
-pub(super) fn show(is_paged: bool, text: &str) -> std::io::Result<()> {
+pub(super) fn show_text(is_paged: bool, text: &str) -> std::io::Result<()> {
     writeln!(PageOutput::open(is_paged), "{text}")
 }

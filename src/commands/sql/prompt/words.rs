@@ -61,15 +61,15 @@ pub(super) struct WordCompleter {
 
 impl WordCompleter {
     /// The names that a session knows.
-    pub(super) fn of(session: &Session) -> Self {
+    pub(super) fn from_session(session: &Session) -> Self {
         let columns = |schema: &arrow::datatypes::Schema| schema.fields().iter().map(|f| f.name().clone()).collect();
         Self {
             tables: session.all_tables().into_iter().map(|(name, schema)| (name, columns(&schema))).collect(),
-            functions: session.functions().into_iter().map(|f| f.name).collect(),
+            functions: session.sql_functions().into_iter().map(|f| f.name).collect(),
         }
     }
 
-    fn candidates(&self, line: &str, start: usize, begun: &str) -> Vec<String> {
+    fn find_candidates(&self, line: &str, start: usize, begun: &str) -> Vec<String> {
         let fits = |word: &&String| word.starts_with(&begun.to_lowercase());
         let before = line[..start].split_whitespace().next_back().map(str::to_lowercase);
         if before.as_deref().is_some_and(|word| BEFORE_TABLE.contains(&word)) {
@@ -84,7 +84,7 @@ impl WordCompleter {
         if begun.starts_with('\\') {
             return COMMANDS.iter().filter(|c| c.starts_with(begun)).map(|c| (*c).to_owned()).collect();
         }
-        let mut found: Vec<String> = self.columns(line).filter(fits).cloned().collect();
+        let mut found: Vec<String> = self.named_columns(line).filter(fits).cloned().collect();
         found.sort();
         found.dedup();
         found.extend(self.tables.keys().filter(fits).cloned());
@@ -94,7 +94,7 @@ impl WordCompleter {
     }
 
     // Columns of the tables that the line names; of all, if it names none yet.
-    fn columns<'a>(&'a self, line: &'a str) -> impl Iterator<Item = &'a String> {
+    fn named_columns<'a>(&'a self, line: &'a str) -> impl Iterator<Item = &'a String> {
         let words: Vec<_> = line.split(|c: char| !is_part(c)).collect();
         let is_named = |table: &String| words.iter().any(|w| w.eq_ignore_ascii_case(table));
         let any = self.tables.keys().any(is_named);
@@ -114,7 +114,7 @@ impl Completer for WordCompleter {
         let start =
             line[..pos].rfind(|c| !is_part(c)).map_or(0, |i| i + line[i..].chars().next().map_or(1, char::len_utf8));
         let pair = |word: String| Pair { display: word.clone(), replacement: word };
-        Ok((start, self.candidates(line, start, &line[start..pos]).into_iter().map(pair).collect()))
+        Ok((start, self.find_candidates(line, start, &line[start..pos]).into_iter().map(pair).collect()))
     }
 }
 
@@ -132,7 +132,7 @@ mod tests {
 
     fn completed(line: &str) -> Vec<String> {
         let start = line.rfind(|c| !is_part(c)).map_or(0, |i| i + 1);
-        words().candidates(line, start, &line[start..])
+        words().find_candidates(line, start, &line[start..])
     }
 
     #[test]

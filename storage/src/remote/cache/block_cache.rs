@@ -55,15 +55,15 @@ impl BlockCache {
         Self { memory, folder: folder.map(Arc::new), counters: CacheCounters::default() }
     }
 
-    pub(crate) fn counts(&self) -> CacheCounts {
-        self.counters.counts()
+    pub(crate) fn read_counts(&self) -> CacheCounts {
+        self.counters.read_counts()
     }
 
     /// Reads blocks of an object. Blocks behind its end are left out.
     ///
     /// # Errors
     /// What the store says.
-    pub(super) async fn blocks(
+    pub(super) async fn read_blocks(
         &self,
         store: &dyn ObjectStore,
         path: &Path,
@@ -82,11 +82,11 @@ impl BlockCache {
         let missing = self.take_from_folder(path, missing, &mut blocks).await;
         counts.disk_hits = blocks.len() as u64 - counts.memory_hits;
         counts.misses = missing.len() as u64;
-        let requests = neighbours(missing);
+        let requests = group_neighbours(missing);
         counts.requests = requests.len() as u64;
         let mut fetches = Vec::new();
         for guards in requests {
-            fetches.push(self.fetch(store, path, guards).boxed());
+            fetches.push(self.fetch_blocks(store, path, guards).boxed());
         }
         let mut fetches = stream::iter(fetches).buffer_unordered(CONCURRENT_REQUESTS);
         let mut failure = None;
@@ -98,7 +98,7 @@ impl BlockCache {
                 Err(error) => failure = Some(error),
             }
         }
-        [Some(&self.counters), scan].into_iter().flatten().for_each(|counters| counters.add(&counts));
+        [Some(&self.counters), scan].into_iter().flatten().for_each(|counters| counters.add_counts(&counts));
         failure.map_or(Ok(blocks), Err)
     }
 
@@ -112,7 +112,7 @@ impl BlockCache {
         let Some(folder) = self.folder.clone().filter(|_| !missing.is_empty()) else { return missing };
         let numbers: Vec<_> = missing.iter().map(|(number, _)| *number).collect();
         let path = path.clone();
-        let read = move || numbers.iter().map(|number| folder.read(&path, *number)).collect::<Vec<_>>();
+        let read = move || numbers.iter().map(|number| folder.read_block(&path, *number)).collect::<Vec<_>>();
         // A reader that panics has found nothing.
         let found = tokio::task::spawn_blocking(read).await.unwrap_or_default();
         let mut left = Vec::new();
@@ -130,7 +130,7 @@ impl BlockCache {
     }
 
     // Fetches neighbouring blocks by one request.
-    async fn fetch(
+    async fn fetch_blocks(
         &self,
         store: &dyn ObjectStore,
         path: &Path,
@@ -163,7 +163,7 @@ impl BlockCache {
     async fn put_into_folder(&self, path: &Path, fetched: &[(u64, CachedBlock)]) {
         let Some(folder) = self.folder.clone() else { return };
         let (path, fetched) = (path.clone(), fetched.to_vec());
-        let write = move || fetched.iter().for_each(|(number, block)| folder.write(&path, *number, block));
+        let write = move || fetched.iter().for_each(|(number, block)| folder.write_block(&path, *number, block));
         let _ = tokio::task::spawn_blocking(write).await;
     }
 }
@@ -174,7 +174,7 @@ fn part_of(range: Range<u64>, start: u64, length: usize) -> Range<usize> {
     place(range.start)..place(range.end)
 }
 
-fn neighbours(missing: Vec<(u64, BlockGuard<'_>)>) -> Vec<Vec<(u64, BlockGuard<'_>)>> {
+fn group_neighbours(missing: Vec<(u64, BlockGuard<'_>)>) -> Vec<Vec<(u64, BlockGuard<'_>)>> {
     let mut groups: Vec<Vec<(u64, BlockGuard<'_>)>> = Vec::new();
     for (number, guard) in missing {
         match groups.last_mut() {

@@ -91,29 +91,29 @@ impl BlockFolder {
     }
 
     /// Reads a block; None if it is not there, or is damaged.
-    pub(super) fn read(&self, object: &Path, number: u64) -> Option<CachedBlock> {
+    pub(super) fn read_block(&self, object: &Path, number: u64) -> Option<CachedBlock> {
         let path = self.block_path(object, number);
         let mut file = File::open(&path).ok()?;
         let mut bytes = Vec::new();
         file.read_to_end(&mut bytes).ok()?;
-        let Some(block) = decode(bytes.into(), object) else {
+        let Some(block) = decode_block(bytes.into(), object) else {
             // It is fetched and written again.
             let _ = fs::remove_file(&path);
             return None;
         };
-        touch(&path, &file);
+        touch_block(&path, &file);
         Some(block)
     }
 
     /// Writes a block, if there is or can be room for it.
-    pub(super) fn write(&self, object: &Path, number: u64, block: &CachedBlock) {
+    pub(super) fn write_block(&self, object: &Path, number: u64, block: &CachedBlock) {
         // The cache does without it.
         let _ = self.try_write(object, number, block);
     }
 
     fn try_write(&self, object: &Path, number: u64, block: &CachedBlock) -> io::Result<()> {
         let path = self.block_path(object, number);
-        let bytes = encode(object, block);
+        let bytes = encode_block(object, block);
         let size = bytes.len() as u64;
         if size > self.limit {
             return Ok(());
@@ -126,8 +126,8 @@ impl BlockFolder {
         let known = read_usage(&mut usage)?;
         let used = match known {
             Some(used) if used + size <= self.limit => used,
-            Some(_) => self.evict((self.limit / 8 * KEPT_EIGHTHS).min(self.limit - size))?,
-            None => self.evict(self.limit - size)?,
+            Some(_) => self.evict_blocks((self.limit / 8 * KEPT_EIGHTHS).min(self.limit - size))?,
+            None => self.evict_blocks(self.limit - size)?,
         };
         // Before the block: a process that dies in between has counted too much, never too little.
         write_usage(&mut usage, used + size)?;
@@ -143,7 +143,7 @@ impl BlockFolder {
     }
 
     // Deletes the blocks of all lakes that were not read for longest, until so many bytes are left; returns how many.
-    fn evict(&self, target: u64) -> io::Result<u64> {
+    fn evict_blocks(&self, target: u64) -> io::Result<u64> {
         let mut files = Vec::new();
         list_blocks(&self.root, &mut files)?;
         files.sort_by_key(|file| file.read);
@@ -179,7 +179,7 @@ fn digest_of(text: &str) -> String {
 }
 
 // The file's time tells eviction when it was read.
-fn touch(path: &FsPath, file: &File) {
+fn touch_block(path: &FsPath, file: &File) {
     let is_recent = |time: SystemTime| time.elapsed().is_ok_and(|age| age < TOUCHED);
     if file.metadata().and_then(|metadata| metadata.modified()).is_ok_and(is_recent) {
         return;
@@ -215,7 +215,7 @@ fn write_usage(file: &mut File, used: u64) -> io::Result<()> {
     file.write_all(format!("{used}\n").as_bytes())
 }
 
-fn encode(object: &Path, block: &CachedBlock) -> Vec<u8> {
+fn encode_block(object: &Path, block: &CachedBlock) -> Vec<u8> {
     let path = object.as_ref().as_bytes();
     let mut bytes = Vec::with_capacity(HEADER_BYTES + path.len() + block.bytes.len());
     bytes.extend(MAGIC);
@@ -231,7 +231,7 @@ fn encode(object: &Path, block: &CachedBlock) -> Vec<u8> {
 }
 
 // None if it is no whole block of this object.
-fn decode(bytes: Bytes, object: &Path) -> Option<CachedBlock> {
+fn decode_block(bytes: Bytes, object: &Path) -> Option<CachedBlock> {
     let (magic, rest) = bytes.split_first_chunk::<8>()?;
     let (checksum, rest) = rest.split_first_chunk::<4>()?;
     if *magic != MAGIC || u32::from_le_bytes(*checksum) != crc32fast::hash(rest) {

@@ -45,7 +45,7 @@ impl CacheCounts {
 
 impl CacheCounters {
     /// Adds to the counters.
-    pub fn add(&self, counts: &CacheCounts) {
+    pub fn add_counts(&self, counts: &CacheCounts) {
         let pairs = [
             (&self.memory_hits, counts.memory_hits),
             (&self.disk_hits, counts.disk_hits),
@@ -59,7 +59,7 @@ impl CacheCounters {
     }
 
     /// Returns the values.
-    pub fn counts(&self) -> CacheCounts {
+    pub fn read_counts(&self) -> CacheCounts {
         let value = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
         CacheCounts {
             memory_hits: value(&self.memory_hits),

@@ -41,12 +41,12 @@ impl CachedStore {
         Self { scan: Some(counters), ..self.clone() }
     }
 
-    pub(crate) fn cache(&self) -> &BlockCache {
+    pub(crate) fn block_cache(&self) -> &BlockCache {
         &self.cache
     }
 
     // Returns None if the cache has no answer: the store says why.
-    async fn read(&self, path: &Path, ranges: &[Range<u64>]) -> StoreResult<Option<CachedRead>> {
+    async fn read_ranges(&self, path: &Path, ranges: &[Range<u64>]) -> StoreResult<Option<CachedRead>> {
         let total: u64 = ranges.iter().map(|range| range.end.saturating_sub(range.start)).sum();
         let is_readable = ranges.iter().all(|range| range.start < range.end) && total > 0 && total <= LARGEST_READ;
         if !is_immutable(path) || !is_readable {
@@ -54,7 +54,7 @@ impl CachedStore {
         }
         let numbers: BTreeSet<u64> =
             ranges.iter().flat_map(|range| range.start / BLOCK_BYTES..range.end.div_ceil(BLOCK_BYTES)).collect();
-        let read = self.cache.blocks(self.inner.as_ref(), path, numbers, self.scan.as_deref()).boxed();
+        let read = self.cache.read_blocks(self.inner.as_ref(), path, numbers, self.scan.as_deref()).boxed();
         let blocks = read.await?;
         let Some(block) = blocks.values().next() else { return Ok(None) };
         let object_bytes = block.object_bytes;
@@ -89,7 +89,7 @@ fn is_immutable(path: &Path) -> bool {
     }
 }
 
-fn bounded(options: &GetOptions) -> Option<Range<u64>> {
+fn bounded_range(options: &GetOptions) -> Option<Range<u64>> {
     let GetOptions { if_match, if_none_match, if_modified_since, if_unmodified_since, range, version, head, .. } =
         options;
     let is_plain = if_match.is_none()
@@ -125,8 +125,9 @@ impl ObjectStore for CachedStore {
     }
 
     async fn get_opts(&self, location: &Path, options: GetOptions) -> StoreResult<GetResult> {
-        let Some(range) = bounded(&options) else { return self.inner.get_opts(location, options).await };
-        let Some(CachedRead { meta, mut parts }) = self.read(location, std::slice::from_ref(&range)).await? else {
+        let Some(range) = bounded_range(&options) else { return self.inner.get_opts(location, options).await };
+        let Some(CachedRead { meta, mut parts }) = self.read_ranges(location, std::slice::from_ref(&range)).await?
+        else {
             return self.inner.get_opts(location, options).await;
         };
         let bytes = parts.pop().unwrap_or_default();
@@ -136,7 +137,7 @@ impl ObjectStore for CachedStore {
     }
 
     async fn get_ranges(&self, location: &Path, ranges: &[Range<u64>]) -> StoreResult<Vec<Bytes>> {
-        match self.read(location, ranges).await? {
+        match self.read_ranges(location, ranges).await? {
             Some(read) => Ok(read.parts),
             None => self.inner.get_ranges(location, ranges).await,
         }

@@ -55,7 +55,7 @@ async fn ranges_are_those_of_the_store_and_a_block_is_fetched_once() {
             assert!(bytes == content[start as usize..end as usize], "{start}..{end}");
         }
     }
-    let fetched = cached.cache().counts();
+    let fetched = cached.block_cache().read_counts();
     assert_eq!((fetched.misses, fetched.fetched_bytes), (6, FILE_BYTES), "each block once");
     store.take_requests();
     let ranges = [10..20, BLOCK_BYTES - 5..BLOCK_BYTES + 5, FILE_BYTES - 3..FILE_BYTES];
@@ -111,7 +111,7 @@ async fn what_may_change_is_not_cached() {
             assert_eq!(cached.get_range(&path, 0..6).await.expect("read"), text, "{name}");
         }
     }
-    assert_eq!(cached.cache().counts(), CacheCounts::default());
+    assert_eq!(cached.block_cache().read_counts(), CacheCounts::default());
 }
 
 #[tokio::test]
@@ -125,7 +125,7 @@ async fn processes_share_a_folder_and_damage_is_fetched_again() {
     let scan = Arc::new(CacheCounters::default());
     assert_eq!((read("lake", &scan).await, read("lake", &scan).await), (1, 0));
     let expected = CacheCounts { disk_hits: 6, misses: 6, requests: 1, fetched_bytes: FILE_BYTES, memory_hits: 0 };
-    assert_eq!(scan.counts(), expected);
+    assert_eq!(scan.read_counts(), expected);
     assert_eq!(read("another", &scan).await, 1, "its objects have the same names");
     let damage: [fn(&mut Vec<u8>); 4] = [
         |bytes| bytes.truncate(9),
@@ -191,6 +191,6 @@ async fn all_processes_together_keep_to_the_limit_and_keep_what_was_read_last() 
     store.take_requests();
     let again = cached(&store, Some(folder(place.path(), 16, "new")));
     again.get_range(&objects[0], 0..9).await.expect("read");
-    assert_eq!(again.cache().counts().disk_hits, 1);
+    assert_eq!(again.block_cache().read_counts().disk_hits, 1);
     assert!(used() <= 16 * BLOCK_BYTES && !abandoned.exists(), "{} bytes", used());
 }

@@ -49,7 +49,7 @@ impl RunRowCounts {
     }
 
     /// The number of rows in a table; None if it does not say.
-    pub fn rows(&self, table: Table) -> Option<u64> {
+    pub fn rows_of(&self, table: Table) -> Option<u64> {
         self.0.get(table.name()).copied()
     }
 }
@@ -73,7 +73,7 @@ pub struct RunPart {
 
 impl DataFile {
     /// The file as its log's present version has it.
-    pub fn logged(&self) -> LoggedFile {
+    pub fn logged_file(&self) -> LoggedFile {
         LoggedFile { name: self.path.filename().unwrap_or_default().to_owned(), log_version: self.log_version }
     }
 
@@ -173,7 +173,7 @@ pub struct ReplacedFiles {
 
 impl ReplacedFiles {
     /// The files that go.
-    pub(crate) fn removed(&self) -> impl Iterator<Item = &LoggedFile> {
+    pub(crate) fn removed_files(&self) -> impl Iterator<Item = &LoggedFile> {
         let is_of_place = |name: &str| self.prefix.as_deref().is_none_or(|prefix| name.starts_with(prefix));
         self.files.iter().filter(move |file| is_of_place(&file.name))
     }
@@ -267,34 +267,34 @@ pub enum CommitOutcome {
 #[async_trait]
 pub trait CommitLog: Send + Sync + std::fmt::Debug {
     /// Makes the table if it is missing.
-    async fn ensure(&self, table: Table) -> Result<()>;
+    async fn ensure_table(&self, table: Table) -> Result<()>;
     /// The table as of now; None if there is no table.
-    async fn view(&self, table: Table) -> Result<Option<TableView>>;
+    async fn view_table(&self, table: Table) -> Result<Option<TableView>>;
     /// The table's files as of now; none if there is no table.
-    async fn files(&self, table: Table) -> Result<Vec<DataFile>> {
-        Ok(self.view(table).await?.unwrap_or_default().files)
+    async fn list_files(&self, table: Table) -> Result<Vec<DataFile>> {
+        Ok(self.view_table(table).await?.unwrap_or_default().files)
     }
     /// The version that an earlier look found, without a look; None if there was none.
     async fn known_version(&self, table: Table) -> Option<u64>;
     /// The table's newest version; None if there is no table.
-    async fn version(&self, table: Table) -> Result<Option<u64>>;
+    async fn newest_version(&self, table: Table) -> Result<Option<u64>>;
     /// Returns whether there is a version after this one, in one request to the store; if the log was cleaned up since,
-    /// it may not see what [`CommitLog::version`] sees.
+    /// it may not see what [`CommitLog::newest_version`] sees.
     async fn has_after(&self, table: Table, version: u64) -> Result<bool>;
     /// The versions that the log still holds, oldest first.
-    async fn versions(&self, table: Table) -> Result<Vec<TableVersion>>;
+    async fn list_versions(&self, table: Table) -> Result<Vec<TableVersion>>;
     /// The versions that the log still holds with their changes, oldest first: a request to the store for each.
-    async fn changes(&self, table: Table) -> Result<Vec<TableChange>>;
+    async fn list_changes(&self, table: Table) -> Result<Vec<TableChange>>;
     /// The table's files as of a version that the log still holds.
     async fn files_at(&self, table: Table, version: u64) -> Result<Vec<DataFile>>;
     /// The files of all versions that the log still holds; none if there is no table.
     async fn files_of_all_versions(&self, table: Table) -> Result<Vec<DataFile>>;
     /// Returns whether a file of this name is in the log.
-    async fn has(&self, table: Table, name: &str) -> Result<bool>;
+    async fn has_file(&self, table: Table, name: &str) -> Result<bool>;
     /// Names of the current and the removed files; None if there is no log.
-    async fn history(&self, table: Table) -> Result<Option<FileHistory>>;
+    async fn file_history(&self, table: Table) -> Result<Option<FileHistory>>;
     /// Makes a change; returns the outcome of each new file, in order. Repeating the same change adds nothing.
-    async fn commit(&self, table: Table, commit: &TableCommit) -> Result<Vec<CommitOutcome>>;
+    async fn commit_change(&self, table: Table, commit: &TableCommit) -> Result<Vec<CommitOutcome>>;
 }
 
 #[cfg(test)]

@@ -50,19 +50,19 @@ impl ProjectLog {
         runs.filter(|run| !self.common.contains(&run.surface)).map(|run| run.run).collect()
     }
 
-    fn refuse<T>(table: Table, action: &'static str) -> Result<T> {
+    fn refuse_action<T>(table: Table, action: &'static str) -> Result<T> {
         Err(Error::Restricted { table: table.name(), action })
     }
 }
 
 #[async_trait]
 impl CommitLog for ProjectLog {
-    async fn ensure(&self, table: Table) -> Result<()> {
-        Self::refuse(table, "made")
+    async fn ensure_table(&self, table: Table) -> Result<()> {
+        Self::refuse_action(table, "made")
     }
 
-    async fn view(&self, table: Table) -> Result<Option<TableView>> {
-        let mut view = self.log.view(table).await?;
+    async fn view_table(&self, table: Table) -> Result<Option<TableView>> {
+        let mut view = self.log.view_table(table).await?;
         if let Some(view) = &mut view {
             self.keep_visible(table, &mut view.files);
         }
@@ -73,8 +73,8 @@ impl CommitLog for ProjectLog {
         self.log.known_version(table).await
     }
 
-    async fn version(&self, table: Table) -> Result<Option<u64>> {
-        self.log.version(table).await
+    async fn newest_version(&self, table: Table) -> Result<Option<u64>> {
+        self.log.newest_version(table).await
     }
 
     async fn has_after(&self, table: Table, version: u64) -> Result<bool> {
@@ -82,9 +82,9 @@ impl CommitLog for ProjectLog {
     }
 
     // Up to the one that added the newest row that is seen: how many came after it is a matter of other projects.
-    async fn versions(&self, table: Table) -> Result<Vec<TableVersion>> {
-        let newest = self.files(Table::Runs).await?.iter().flat_map(list_pointers).map(|row| row.version).max();
-        let mut versions = self.log.versions(table).await?;
+    async fn list_versions(&self, table: Table) -> Result<Vec<TableVersion>> {
+        let newest = self.list_files(Table::Runs).await?.iter().flat_map(list_pointers).map(|row| row.version).max();
+        let mut versions = self.log.list_versions(table).await?;
         if table == Table::Runs {
             versions.retain(|version| newest.is_some_and(|newest| version.version <= newest));
         }
@@ -92,15 +92,15 @@ impl CommitLog for ProjectLog {
     }
 
     // The versions that added what is seen now. A commit may change files of several projects.
-    async fn changes(&self, table: Table) -> Result<Vec<TableChange>> {
-        let snapshot = LakeSnapshot::take(self).await?;
+    async fn list_changes(&self, table: Table) -> Result<Vec<TableChange>> {
+        let snapshot = LakeSnapshot::take_from(self).await?;
         let mut added = BTreeMap::<u64, (u64, u64)>::new();
         for file in snapshot.files(table) {
             let (files, rows) = added.entry(file.log_version).or_default();
             *files += 1;
             *rows += file.visible_rows();
         }
-        let versions = self.log.versions(table).await?.into_iter();
+        let versions = self.log.list_versions(table).await?.into_iter();
         let seen = versions.filter_map(|version| {
             let (files_added, rows_added) = *added.get(&version.version)?;
             let (rows_added, files_removed, rows_removed) = (Some(rows_added), 0, None);
@@ -121,15 +121,15 @@ impl CommitLog for ProjectLog {
         Ok(files)
     }
 
-    async fn has(&self, table: Table, _: &str) -> Result<bool> {
-        Self::refuse(table, "searched for names")
+    async fn has_file(&self, table: Table, _: &str) -> Result<bool> {
+        Self::refuse_action(table, "searched for names")
     }
 
-    async fn history(&self, table: Table) -> Result<Option<FileHistory>> {
-        Self::refuse(table, "searched for names")
+    async fn file_history(&self, table: Table) -> Result<Option<FileHistory>> {
+        Self::refuse_action(table, "searched for names")
     }
 
-    async fn commit(&self, table: Table, _: &TableCommit) -> Result<Vec<CommitOutcome>> {
-        Self::refuse(table, "written")
+    async fn commit_change(&self, table: Table, _: &TableCommit) -> Result<Vec<CommitOutcome>> {
+        Self::refuse_action(table, "written")
     }
 }

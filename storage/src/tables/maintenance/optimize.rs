@@ -89,9 +89,11 @@ impl Lake {
     ) -> Result<OptimizeReport> {
         self.remove_superseded().await?;
         let snapshot = self.snapshot().await?;
-        let readers = FileReaders::of(self, &snapshot);
-        let plans: Vec<_> =
-            Table::ALL.into_iter().map(|table| (table, plan(&snapshot, &readers, table, target_bytes))).collect();
+        let readers = FileReaders::from_snapshot(self, &snapshot);
+        let plans: Vec<_> = Table::ALL
+            .into_iter()
+            .map(|table| (table, plan_merges(&snapshot, &readers, table, target_bytes)))
+            .collect();
         let total = plans.iter().flat_map(|(_, groups)| groups).map(Vec::len).sum();
         let (mut report, mut done) = (OptimizeReport::default(), 0);
         for (table, groups) in plans.into_iter().filter(|(_, groups)| !groups.is_empty()) {
@@ -104,7 +106,7 @@ impl Lake {
                     report.stopped = true;
                     break;
                 }
-                match self.merge(table, group, CommitEffect::Layout.into(), Some(&mut *lease)).await? {
+                match self.merge_files(table, group, CommitEffect::Layout.into(), Some(&mut *lease)).await? {
                     (CommitOutcome::Outdated, _) => of.outdated += 1,
                     (_, bytes) => {
                         of.merged += group.len();
@@ -121,7 +123,7 @@ impl Lake {
     }
 
     /// Rewrites a merged file without its superseded rows. If another writer did so meanwhile, nothing changes.
-    pub(crate) async fn rewrite(&self, table: Table, file: &DataFile) -> Result<CommitOutcome> {
+    pub(crate) async fn rewrite_file(&self, table: Table, file: &DataFile) -> Result<CommitOutcome> {
         self.rewrite_without(table, file, None).await
     }
 
@@ -133,30 +135,30 @@ impl Lake {
         removal: Option<RemovalRecord>,
     ) -> Result<CommitOutcome> {
         let change = TableCommit { removal, ..TableCommit::default() };
-        let (outcome, _) = self.merge(table, std::slice::from_ref(file), change, None).await?;
+        let (outcome, _) = self.merge_files(table, std::slice::from_ref(file), change, None).await?;
         Ok(outcome)
     }
 
     // One file in the place of several, by a commit that adds nothing else; returns its size, too.
-    async fn merge(
+    async fn merge_files(
         &self,
         table: Table,
         files: &[DataFile],
         change: TableCommit,
         mut lease: Option<&mut MaintenanceLease>,
     ) -> Result<(CommitOutcome, u64)> {
-        let mut slices: Vec<_> = files.iter().flat_map(slices).collect();
-        slices.sort_by(|a, b| key(&a.part).cmp(&key(&b.part)));
+        let mut slices: Vec<_> = files.iter().flat_map(run_slices).collect();
+        slices.sort_by(|a, b| part_key(&a.part).cmp(&part_key(&b.part)));
         let mut encoder = FileEncoder::new(table, table.schema(self.rig()));
         for slice in &slices {
             if let Some(lease) = lease.as_deref_mut() {
                 lease.ensure_held().await?;
             }
-            let mut batches = self.rows(table, slice.file, &[], slice.rows.clone()).await?;
+            let mut batches = self.read_rows(table, slice.file, &[], slice.rows.clone()).await?;
             let mut rows = 0;
             while let Some(batch) = batches.try_next().await? {
                 rows += batch.num_rows() as u64;
-                encoder.write(&batch)?;
+                encoder.write_batch(&batch)?;
             }
             if rows != slice.part.rows {
                 let source = format!("{rows} rows were read of {} of run {}", slice.part.rows, slice.part.run).into();
@@ -164,8 +166,8 @@ impl Lake {
             }
         }
         let parts: Vec<_> = slices.into_iter().map(|s| s.part).collect();
-        let mut staged = self.stage(table, &name(&parts), encoder.finish()?).await?;
-        let replaced = files.iter().map(DataFile::logged).collect();
+        let mut staged = self.stage_file(table, &merged_name(&parts), encoder.finish()?).await?;
+        let replaced = files.iter().map(DataFile::logged_file).collect();
         staged.file.replaces = Some(ReplacedFiles { prefix: None, files: replaced });
         staged.file.parts = parts;
         if let Some(lease) = lease {
@@ -173,7 +175,7 @@ impl Lake {
         }
         let bytes = staged.file.bytes;
         let commit = TableCommit { add: vec![staged.file], ..change };
-        let outcome = self.log().commit(table, &commit).await?;
+        let outcome = self.commit_log().commit_change(table, &commit).await?;
         Ok((outcome[0], bytes))
     }
 }
@@ -185,18 +187,18 @@ struct RunSlice<'a> {
     rows: std::ops::Range<u64>,
 }
 
-fn slices(file: &DataFile) -> Vec<RunSlice<'_>> {
+fn run_slices(file: &DataFile) -> Vec<RunSlice<'_>> {
     if let Some(part) = RunPart::of_file(file) {
         return vec![RunSlice { file, rows: 0..file.rows, part }];
     }
     file.visible_parts().map(|(part, rows)| RunSlice { file, part: part.clone(), rows }).collect()
 }
 
-fn key(part: &RunPart) -> (&str, &str) {
+fn part_key(part: &RunPart) -> (&str, &str) {
     (part.surface.as_str(), part.run.as_str())
 }
 
-fn name(parts: &[RunPart]) -> FileName {
+fn merged_name(parts: &[RunPart]) -> FileName {
     let mut sha = Sha256::new();
     for part in parts {
         sha.update(part.file_name());
@@ -229,21 +231,21 @@ struct FileReaders<'a> {
 }
 
 impl<'a> FileReaders<'a> {
-    fn of(lake: &'a Lake, snapshot: &'a LakeSnapshot) -> Self {
-        let has_projects = snapshot.runs().any(|run| snapshot.project(&run.run).is_some());
+    fn from_snapshot(lake: &'a Lake, snapshot: &'a LakeSnapshot) -> Self {
+        let has_projects = snapshot.runs().any(|run| snapshot.project_of(&run.run).is_some());
         Self { snapshot, references: &lake.config().references, has_projects }
     }
 
-    fn audience(&self, table: Table, file: &DataFile) -> RunAudience {
+    fn audience_of(&self, table: Table, file: &DataFile) -> RunAudience {
         let of = |slice: &RunSlice<'_>| {
-            let project = self.snapshot.project(&slice.part.run).cloned();
+            let project = self.snapshot.project_of(&slice.part.run).cloned();
             match [&self.references.flat, &self.references.foam].contains(&&slice.part.surface) {
                 _ if !self.has_projects => RunAudience::Common,
                 true => RunAudience::References(project.filter(|_| table == Table::Runs)),
                 false => RunAudience::Project(project),
             }
         };
-        let mut audiences = slices(file).iter().map(of).collect::<Vec<_>>();
+        let mut audiences = run_slices(file).iter().map(of).collect::<Vec<_>>();
         audiences.dedup();
         match audiences.len() {
             1 => audiences.remove(0),
@@ -253,14 +255,19 @@ impl<'a> FileReaders<'a> {
 }
 
 // Neighbours by surface and run in groups of about the wanted size, so that a query for a surface opens few files.
-fn plan(snapshot: &LakeSnapshot, readers: &FileReaders<'_>, table: Table, target_bytes: u64) -> Vec<Vec<DataFile>> {
+fn plan_merges(
+    snapshot: &LakeSnapshot,
+    readers: &FileReaders<'_>,
+    table: Table,
+    target_bytes: u64,
+) -> Vec<Vec<DataFile>> {
     if table.source() == Source::Rig {
         return Vec::new();
     }
     let is_small = |f: &&DataFile| f.bytes < target_bytes / 2 && f.hidden.is_empty();
-    let first = |f: &DataFile| slices(f).first().map(|s| (s.part.surface.clone(), s.part.run.clone()));
+    let first = |f: &DataFile| run_slices(f).first().map(|s| (s.part.surface.clone(), s.part.run.clone()));
     let mut small: Vec<_> = snapshot.files(table).iter().filter(is_small).cloned().collect();
-    let place = |file: &DataFile| (readers.audience(table, file), references(table, file));
+    let place = |file: &DataFile| (readers.audience_of(table, file), surface_references(table, file));
     small.sort_by_cached_key(|file| (place(file), first(file)));
     let (mut groups, mut bytes) = (vec![Vec::new()], 0);
     let mut last = None;
@@ -281,7 +288,7 @@ fn plan(snapshot: &LakeSnapshot, readers: &FileReaders<'_>, table: Table, target
 }
 
 // The references of a file's surfaces, which are the same for all of them.
-fn references(table: Table, file: &DataFile) -> Option<[Option<String>; 2]> {
+fn surface_references(table: Table, file: &DataFile) -> Option<[Option<String>; 2]> {
     let text = |column| Some(file.stats.as_ref()?.min.get(column)?.as_str()?.to_owned());
     (table == Table::Surfaces).then(|| [text("flat_reference"), text("foam_reference")])
 }

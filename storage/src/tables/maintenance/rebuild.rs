@@ -27,12 +27,12 @@ impl Lake {
     }
 
     async fn empty_table(&self, table: Table) -> Result<()> {
-        let Some(view) = self.log().view(table).await? else { return Ok(()) };
+        let Some(view) = self.commit_log().view_table(table).await? else { return Ok(()) };
         if table == Table::Runs {
             self.delta_log().set_rebuilding(true).await?;
         }
-        let remove = view.files.iter().map(DataFile::logged).collect();
-        self.log().commit(table, &TableCommit { remove, ..TableCommit::default() }).await.map(drop)
+        let remove = view.files.iter().map(DataFile::logged_file).collect();
+        self.commit_log().commit_change(table, &TableCommit { remove, ..TableCommit::default() }).await.map(drop)
     }
 
     /// Ends a rebuild of `runs`, of which the caller knows that all run files are in it again, or refused.

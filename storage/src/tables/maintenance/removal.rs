@@ -35,7 +35,7 @@ impl Lake {
     pub async fn has_rows_of(&self, run: &RunId) -> Result<bool> {
         let runs = BTreeSet::from([run.clone()]);
         for table in Table::ALL {
-            if self.log().files(table).await?.iter().any(|file| !parts_of(file, &runs).is_empty()) {
+            if self.commit_log().list_files(table).await?.iter().any(|file| !parts_of(file, &runs).is_empty()) {
                 return Ok(true);
             }
         }
@@ -45,13 +45,13 @@ impl Lake {
     async fn remove_rows(&self, table: Table, removal: &RemovalRecord) -> Result<usize> {
         let mut count = 0;
         for _ in 0..ROUNDS {
-            let files = self.log().files(table).await?;
+            let files = self.commit_log().list_files(table).await?;
             let (mut whole, mut shared) = (Vec::new(), Vec::new());
             for file in files {
                 match parts_of(&file, &removal.runs) {
                     of if of.is_empty() => {}
                     of if of.len() < file.parts.len() => shared.push(DataFile { hidden: of, ..file }),
-                    _ => whole.push(file.logged()),
+                    _ => whole.push(file.logged_file()),
                 }
             }
             if whole.is_empty() && shared.is_empty() {
@@ -61,7 +61,7 @@ impl Lake {
             if !whole.is_empty() {
                 let removal = Some(removal.clone());
                 let commit = TableCommit { remove: whole, removal, ..TableCommit::default() };
-                self.log().commit(table, &commit).await?;
+                self.commit_log().commit_change(table, &commit).await?;
             }
             for file in &shared {
                 self.rewrite_without(table, file, Some(removal.clone())).await?;

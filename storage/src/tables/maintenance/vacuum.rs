@@ -105,7 +105,7 @@ impl Lake {
             while let Some(one) = gone.next().await {
                 match one {
                     Err(e) if !matches!(e, object_store::Error::NotFound { .. }) => {
-                        return Err(Error::store("delete", "tables", e));
+                        return Err(Error::store_failure("delete", "tables", e));
                     }
                     _ => {}
                 }
@@ -122,12 +122,12 @@ impl Lake {
         let old = |modified| is_over(modified, None, now, keep);
         for table in Table::ALL {
             let there = self.store().list_with_delimiter(Some(&table_folder(table))).await;
-            let there = there.map_err(|e| Error::store("list", table_folder(table), e))?;
+            let there = there.map_err(|e| Error::store_failure("list", table_folder(table), e))?;
             // Without a log, nothing says what the files are.
-            let Some(history) = self.log().history(table).await? else { continue };
+            let Some(history) = self.commit_log().file_history(table).await? else { continue };
             for meta in there.objects {
                 if is_left_over(&history, &meta.location, |gone| is_over(meta.last_modified, gone, now, keep)) {
-                    files.push(DeletedFile::stored(meta.location, meta.size));
+                    files.push(DeletedFile::from_object(meta.location, meta.size));
                 }
             }
         }
@@ -136,10 +136,14 @@ impl Lake {
         let unfinished = inbox.into_iter().filter(|m| is_unfinished(&m.location) && old(m.last_modified));
         // Claims of processes that died.
         let claims = Path::from(CLAIMS_FOLDER);
-        let claims: Vec<_> =
-            self.store().list(Some(&claims)).try_collect().await.map_err(|e| Error::store("list", claims, e))?;
+        let claims: Vec<_> = self
+            .store()
+            .list(Some(&claims))
+            .try_collect()
+            .await
+            .map_err(|e| Error::store_failure("list", claims, e))?;
         let claims = claims.into_iter().filter(|meta| old(meta.last_modified));
-        files.extend(unfinished.chain(claims).map(|meta| DeletedFile::stored(meta.location, meta.size)));
+        files.extend(unfinished.chain(claims).map(|meta| DeletedFile::from_object(meta.location, meta.size)));
         if let Some(lake) = self.folder() {
             let mut temporaries = Vec::new();
             ["tables", INBOX].iter().for_each(|name| find_temporaries(&lake.join(name), &mut temporaries));
@@ -155,7 +159,7 @@ impl Lake {
 }
 
 impl DeletedFile {
-    fn stored(path: Path, bytes: u64) -> Self {
+    fn from_object(path: Path, bytes: u64) -> Self {
         Self { path: path.to_string(), bytes, place: FileAccess::Store(path) }
     }
 }

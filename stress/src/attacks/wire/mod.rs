@@ -84,7 +84,7 @@ impl WirePort {
 
     // Postgres' server answers all before it sees the end; those of HTTP take an end for a client that is gone.
     fn flood(self, client: &QueryClient, stream: &TcpStream, block: BlockMaker, count: usize) -> io::Result<()> {
-        (0..count).try_for_each(|number| send(stream, &block(client, number)))?;
+        (0..count).try_for_each(|number| send_bytes(stream, &block(client, number)))?;
         self.end_writing(stream)
     }
 
@@ -93,7 +93,7 @@ impl WirePort {
     }
 }
 
-const fn attack(name: &'static str, connections: usize, opening: BytesMaker, flow: WireFlow) -> WireAttack {
+const fn define_attack(name: &'static str, connections: usize, opening: BytesMaker, flow: WireFlow) -> WireAttack {
     WireAttack { name, connections, opening, flow }
 }
 
@@ -127,7 +127,7 @@ impl WireAttack {
     // Sends all; returns the beginning of what came back.
     fn talk(&self, port: WirePort, client: &QueryClient, stream: &TcpStream, opening: &[u8]) -> Vec<u8> {
         // A server may close as soon as it has seen enough, so that no failure to send is one of the attack's.
-        let _ = send(stream, opening);
+        let _ = send_bytes(stream, opening);
         match self.flow {
             WireFlow::ReadAnswer => read_meanwhile(stream, || port.end_writing(stream)),
             WireFlow::Hold => wait_for_close(client),
@@ -137,19 +137,19 @@ impl WireAttack {
                 wait_for_close(client)
             }
             WireFlow::Flood(block, count) => read_meanwhile(stream, || port.flood(client, stream, block, count)),
-            WireFlow::Drip(block) => read_meanwhile(stream, || drip(stream, &block(client))),
+            WireFlow::Drip(block) => read_meanwhile(stream, || drip_bytes(stream, &block(client))),
         }
     }
 }
 
-fn send(mut stream: &TcpStream, bytes: &[u8]) -> io::Result<()> {
+fn send_bytes(mut stream: &TcpStream, bytes: &[u8]) -> io::Result<()> {
     stream.write_all(bytes)
 }
 
-fn drip(stream: &TcpStream, bytes: &[u8]) -> io::Result<()> {
+fn drip_bytes(stream: &TcpStream, bytes: &[u8]) -> io::Result<()> {
     bytes.iter().try_for_each(|byte| {
         std::thread::sleep(DRIP_EVERY);
-        send(stream, &[*byte])
+        send_bytes(stream, &[*byte])
     })
 }
 

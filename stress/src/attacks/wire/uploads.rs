@@ -47,7 +47,7 @@ pub(super) const ATTACKS: &[UploadAttack] = &[
     UploadAttack { name: "short bodies", uploads: short_bodies, repeats: 1 },
     UploadAttack {
         name: "batches without an end",
-        uploads: || Ok(vec![encode(&numbers(), None)?]),
+        uploads: || Ok(vec![encode_column(&number_column(), None)?]),
         repeats: 10_000_000,
     },
 ];
@@ -72,7 +72,8 @@ impl UploadAttack {
 
 async fn put_parameters(client: &QueryClient, mut upload: Vec<FlightData>, repeats: usize) -> Result<(), FlightError> {
     let mut flight = flight_client(client).await?;
-    let command = CommandPreparedStatementQuery { prepared_statement_handle: prepare(&mut flight).await?.into() };
+    let command =
+        CommandPreparedStatementQuery { prepared_statement_handle: prepare_statement(&mut flight).await?.into() };
     if let Some(first) = upload.first_mut() {
         first.flight_descriptor = Some(FlightDescriptor::new_cmd(command.as_any().encode_to_vec()));
     }
@@ -84,7 +85,7 @@ async fn put_parameters(client: &QueryClient, mut upload: Vec<FlightData>, repea
 }
 
 // Returns the handle of a statement with a placeholder; the crate's own keeps it to itself.
-async fn prepare(flight: &mut FlightClient) -> Result<Vec<u8>, FlightError> {
+async fn prepare_statement(flight: &mut FlightClient) -> Result<Vec<u8>, FlightError> {
     let request =
         ActionCreatePreparedStatementRequest { query: "select $1::bigint as n".to_owned(), transaction_id: None };
     let action = Action::new("CreatePreparedStatement", request.as_any().encode_to_vec());
@@ -96,11 +97,11 @@ async fn prepare(flight: &mut FlightClient) -> Result<Vec<u8>, FlightError> {
     Ok(created.map_or_else(Vec::new, |created| created.prepared_statement_handle.to_vec()))
 }
 
-fn numbers() -> ArrayRef {
+fn number_column() -> ArrayRef {
     Arc::new(Int64Array::from(vec![7; 1000]))
 }
 
-fn encode(column: &ArrayRef, compression: Option<CompressionType>) -> Result<Vec<FlightData>, ArrowError> {
+fn encode_column(column: &ArrayRef, compression: Option<CompressionType>) -> Result<Vec<FlightData>, ArrowError> {
     let batch = RecordBatch::try_from_iter([("$1", column.clone())])?;
     let options = IpcWriteOptions::default().try_with_compression(compression)?;
     let encoder = FlightDataEncoderBuilder::new().with_options(options).with_max_flight_data_size(usize::MAX);
@@ -110,8 +111,8 @@ fn encode(column: &ArrayRef, compression: Option<CompressionType>) -> Result<Vec
 
 // Each buffer of a compressed body begins with its length as it was.
 fn lying_body(compression: CompressionType) -> Result<Vec<Vec<FlightData>>, ArrowError> {
-    let mut upload = encode(&numbers(), Some(compression))?;
-    let honest = (8 * numbers().len() as i64).to_le_bytes();
+    let mut upload = encode_column(&number_column(), Some(compression))?;
+    let honest = (8 * number_column().len() as i64).to_le_bytes();
     for message in &mut upload {
         let mut body = message.data_body.to_vec();
         if let Some(place) = body.windows(8).position(|bytes| bytes == honest) {
@@ -124,12 +125,12 @@ fn lying_body(compression: CompressionType) -> Result<Vec<Vec<FlightData>>, Arro
 
 fn zstd_bomb() -> Result<Vec<Vec<FlightData>>, ArrowError> {
     let text: ArrayRef = Arc::new(StringArray::from(vec![" ".repeat(LONG_TEXT_BYTES)]));
-    Ok(vec![encode(&text, Some(CompressionType::ZSTD))?])
+    Ok(vec![encode_column(&text, Some(CompressionType::ZSTD))?])
 }
 
 // One number of the last header is another each time.
 fn lying_headers() -> Result<Vec<Vec<FlightData>>, ArrowError> {
-    let upload = encode(&numbers(), None)?;
+    let upload = encode_column(&number_column(), None)?;
     let length = upload.last().map_or(0, |message| message.data_header.len());
     let places = (0..length.saturating_sub(4)).step_by(4);
     Ok(places.flat_map(|place| EXTREMES.map(|number| with_number(&upload, place, number))).collect())
@@ -146,7 +147,7 @@ fn with_number(upload: &[FlightData], place: usize, number: u32) -> Vec<FlightDa
 }
 
 fn short_bodies() -> Result<Vec<Vec<FlightData>>, ArrowError> {
-    let upload = encode(&numbers(), None)?;
+    let upload = encode_column(&number_column(), None)?;
     let shortened = |length: usize| {
         let mut short = upload.clone();
         if let Some(last) = short.last_mut() {

@@ -16,7 +16,7 @@ pub(super) struct LoopbackDelay {
 ///
 /// output     `[n]`      full scale 1.0
 /// recording  `[n + m]`  any scale; delays 0 to m are tried
-pub(super) fn locate(output: &[f32], recording: &[i32]) -> LoopbackDelay {
+pub(super) fn locate_output(output: &[f32], recording: &[i32]) -> LoopbackDelay {
     let (Some(most), false) = (recording.len().checked_sub(output.len()), output.is_empty()) else {
         return LoopbackDelay { at: 0, likeness: 0.0 };
     };
@@ -66,9 +66,9 @@ mod tests {
                 recording[delay + n] = (-1e6 * x) as i32;
             }
             // Turned upside down it is not alike, whatever the delay.
-            assert!(locate(&output, &recording).likeness < 0.5);
+            assert!(locate_output(&output, &recording).likeness < 0.5);
             recording.iter_mut().for_each(|x| *x = -*x);
-            let found = locate(&output, &recording);
+            let found = locate_output(&output, &recording);
             assert!(found.at == delay && found.likeness > 0.999, "{delay}: {found:?}");
         }
     }
@@ -76,7 +76,7 @@ mod tests {
     #[test]
     fn nothing_is_like_silence() {
         for (output, recording) in [(vec![1.0; 10], vec![0; 20]), (vec![], vec![1; 5]), (vec![1.0; 10], vec![1; 5])] {
-            assert_eq!(locate(&output, &recording), LoopbackDelay { at: 0, likeness: 0.0 });
+            assert_eq!(locate_output(&output, &recording), LoopbackDelay { at: 0, likeness: 0.0 });
         }
     }
 }

@@ -8,7 +8,7 @@ pub(super) mod tests;
 use echolake_schema::Timestamp;
 
 use crate::rig::{AudioInterface, AudioTake, Error};
-use delay::{LoopbackDelay, locate};
+use delay::{LoopbackDelay, locate_output};
 
 pub(crate) const DEVICE: &str = "audio interface";
 /// Least correlation of loopback and output, -1 to 1: below it the loopback carries something else.
@@ -91,7 +91,7 @@ impl<D: AudioDuplex> AlignedAudio<D> {
         if rms(output) < SILENCE {
             return Ok(self.delay);
         }
-        let found = locate(output, &self.recorded.loopback);
+        let found = locate_output(output, &self.recorded.loopback);
         if found.likeness < LIKENESS {
             return Err(TransferError::Permanent(self.no_loopback(&found)));
         }
@@ -100,7 +100,7 @@ impl<D: AudioDuplex> AlignedAudio<D> {
         if part >= SHORTEST_PART {
             let ends = [0, output.len() - part].map(|from| {
                 let window = from..(from + part + self.recorded.loopback.len() - output.len());
-                locate(&output[from..from + part], &self.recorded.loopback[window]).at
+                locate_output(&output[from..from + part], &self.recorded.loopback[window]).at
             });
             if ends[0] != ends[1] {
                 let why = format!("{} samples went missing or came twice", ends[1].abs_diff(ends[0]));
@@ -155,7 +155,7 @@ impl<D: AudioDuplex> AudioInterface for AlignedAudio<D> {
         failed("no take was tried".into())
     }
 
-    fn notices(&mut self) -> Vec<String> {
+    fn take_notices(&mut self) -> Vec<String> {
         std::mem::take(&mut self.notices)
     }
 }

@@ -68,7 +68,7 @@ fn sweep() -> Vec<f32> {
 
 #[test]
 fn it_conforms() {
-    conformance::audio(&mut with(&[]));
+    conformance::check_audio(&mut with(&[]));
 }
 
 #[test]
@@ -86,14 +86,14 @@ fn takes_with_gaps_are_repeated_and_told_of() {
     for fault in [CableFault::Overrun, CableFault::Dropped(1), CableFault::Dropped(300), CableFault::Short] {
         let (mut audio, mut take) = (with(&[fault, fault]), AudioTake::default());
         audio.play_and_record(&sweep(), &mut take).expect("the third try");
-        let notices = audio.notices();
+        let notices = audio.take_notices();
         assert_eq!(notices.len(), 2, "{notices:?}");
         assert!(notices.iter().all(|n| n.starts_with("take repeated: ")), "{notices:?}");
-        assert!(audio.notices().is_empty());
+        assert!(audio.take_notices().is_empty());
     }
     let mut audio = with(&[CableFault::Dropped(1)]);
     audio.play_and_record(&sweep(), &mut AudioTake::default()).expect("the second try");
-    assert_eq!(audio.notices(), ["take repeated: 1 samples went missing or came twice"]);
+    assert_eq!(audio.take_notices(), ["take repeated: 1 samples went missing or came twice"]);
 }
 
 #[test]

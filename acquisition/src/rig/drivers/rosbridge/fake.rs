@@ -66,7 +66,7 @@ struct FakeArm {
 }
 
 impl FakeArm {
-    fn joints(&self, fault: BridgeFault) -> Joints {
+    fn current_joints(&self, fault: BridgeFault) -> Joints {
         let share = if self.secs > 0.0 { (self.began.elapsed().as_secs_f64() / self.secs).min(1.0) } else { 1.0 };
         let share = if fault == BridgeFault::StopsHalfWay { share.min(0.5) } else { share };
         std::array::from_fn(|i| self.from[i] + share * (self.to[i] - self.from[i]))
@@ -82,7 +82,7 @@ impl FakeBridge {
         let listener = TcpListener::bind(address)?;
         listener.set_nonblocking(true)?;
         let address = listener.local_addr()?;
-        let home = ArmPose::home();
+        let home = ArmPose::at_home();
         let arm = |at| FakeArm { from: at, to: at, began: Instant::now(), secs: 0.0, power: false };
         let world = Arc::new(Mutex::new(FakeWorld {
             arms: [arm(home.microphone), arm(home.speaker)],
@@ -90,7 +90,7 @@ impl FakeBridge {
         }));
         let stop = Arc::new(AtomicBool::new(false));
         let (theirs, stopped) = (world.clone(), stop.clone());
-        let thread = std::thread::spawn(move || accept(&listener, &theirs, &stopped));
+        let thread = std::thread::spawn(move || accept_clients(&listener, &theirs, &stopped));
         Ok(Self { address, world, stop, thread: Some(thread) })
     }
 
@@ -101,12 +101,12 @@ impl FakeBridge {
 
     /// Sets the fault from now on.
     pub fn set_fault(&self, fault: BridgeFault) {
-        lock(&self.world).fault = fault;
+        lock_world(&self.world).fault = fault;
     }
 
     /// Returns whether both arms' motors are on.
     pub fn has_power(&self) -> bool {
-        lock(&self.world).arms.iter().all(|arm| arm.power)
+        lock_world(&self.world).arms.iter().all(|arm| arm.power)
     }
 }
 
@@ -117,17 +117,17 @@ impl Drop for FakeBridge {
     }
 }
 
-fn lock(world: &Mutex<FakeWorld>) -> MutexGuard<'_, FakeWorld> {
+fn lock_world(world: &Mutex<FakeWorld>) -> MutexGuard<'_, FakeWorld> {
     world.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-fn accept(listener: &TcpListener, world: &Arc<Mutex<FakeWorld>>, stop: &Arc<AtomicBool>) {
+fn accept_clients(listener: &TcpListener, world: &Arc<Mutex<FakeWorld>>, stop: &Arc<AtomicBool>) {
     let mut clients = Vec::new();
     while !stop.load(Ordering::Relaxed) {
         match listener.accept() {
             Ok((stream, _)) => {
                 let (world, stop) = (world.clone(), stop.clone());
-                clients.push(std::thread::spawn(move || BridgeClient::serve(stream, &world, &stop)));
+                clients.push(std::thread::spawn(move || BridgeClient::serve_client(stream, &world, &stop)));
             }
             Err(_) => std::thread::sleep(PAUSE),
         }
@@ -141,7 +141,7 @@ struct BridgeClient {
 }
 
 impl BridgeClient {
-    fn serve(stream: TcpStream, world: &Mutex<FakeWorld>, stop: &AtomicBool) {
+    fn serve_client(stream: TcpStream, world: &Mutex<FakeWorld>, stop: &AtomicBool) {
         let set = stream
             .set_nonblocking(false)
             .and_then(|()| stream.set_nodelay(true))
@@ -156,11 +156,11 @@ impl BridgeClient {
         while !stop.load(Ordering::Relaxed) {
             match client.socket.read() {
                 Ok(Message::Text(text)) => {
-                    if lock(world).fault == BridgeFault::HangsUp {
+                    if lock_world(world).fault == BridgeFault::HangsUp {
                         return;
                     }
-                    let answer = client.answer(text.as_str(), world);
-                    if answer.is_some_and(|answer| client.say(&answer.to_string()).is_err()) {
+                    let answer = client.answer_message(text.as_str(), world);
+                    if answer.is_some_and(|answer| client.send_text(&answer.to_string()).is_err()) {
                         return;
                     }
                 }
@@ -170,21 +170,21 @@ impl BridgeClient {
             }
             if Instant::now() >= next {
                 next = Instant::now() + TICK;
-                if client.publish(world).is_err() {
+                if client.publish_states(world).is_err() {
                     return;
                 }
             }
         }
     }
 
-    fn say(&mut self, text: &str) -> Result<(), tungstenite::Error> {
+    fn send_text(&mut self, text: &str) -> Result<(), tungstenite::Error> {
         self.socket.send(Message::text(text))
     }
 
-    fn publish(&mut self, world: &Mutex<FakeWorld>) -> Result<(), tungstenite::Error> {
+    fn publish_states(&mut self, world: &Mutex<FakeWorld>) -> Result<(), tungstenite::Error> {
         let (fault, joints) = {
-            let world = lock(world);
-            (world.fault, [0, 1].map(|i| world.arms[i].joints(world.fault)))
+            let world = lock_world(world);
+            (world.fault, [0, 1].map(|i| world.arms[i].current_joints(world.fault)))
         };
         let names: Vec<_> = (1..=6).map(|i| format!("joint_{i}")).collect();
         for (name, joints) in NAMES.iter().zip(joints) {
@@ -199,15 +199,15 @@ impl BridgeClient {
                     continue;
                 }
                 match fault {
-                    BridgeFault::Nonsense => self.say("\u{fffd}{\"op\":")?,
-                    _ => self.say(&json!({"op": "publish", "topic": topic, "msg": message}).to_string())?,
+                    BridgeFault::Nonsense => self.send_text("\u{fffd}{\"op\":")?,
+                    _ => self.send_text(&json!({"op": "publish", "topic": topic, "msg": message}).to_string())?,
                 }
             }
         }
         Ok(())
     }
 
-    fn answer(&mut self, text: &str, world: &Mutex<FakeWorld>) -> Option<Value> {
+    fn answer_message(&mut self, text: &str, world: &Mutex<FakeWorld>) -> Option<Value> {
         let complaint = |words: &str| Some(json!({"op": "status", "level": "error", "msg": words}));
         let Ok(message) = serde_json::from_str::<Value>(text) else { return complaint("no JSON") };
         let topic = || message["topic"].as_str().unwrap_or_default().to_owned();
@@ -220,9 +220,10 @@ impl BridgeClient {
                 self.topics.retain(|t| *t != topic());
                 None
             }
-            Some("publish") => follow(&topic(), &message["msg"], &mut lock(world)).and_then(complaint),
+            Some("publish") => follow_trajectory(&topic(), &message["msg"], &mut lock_world(world)).and_then(complaint),
             Some("call_service") => {
-                let (success, words) = switch(message["service"].as_str().unwrap_or_default(), &mut lock(world));
+                let (success, words) =
+                    switch_motors(message["service"].as_str().unwrap_or_default(), &mut lock_world(world));
                 Some(json!({"op": "service_response", "id": message["id"], "service": message["service"],
                     "values": {"success": success, "message": words}, "result": true}))
             }
@@ -233,7 +234,7 @@ impl BridgeClient {
 }
 
 // Starts an arm's move; returns a complaint if it is refused.
-fn follow(topic: &str, message: &Value, world: &mut FakeWorld) -> Option<&'static str> {
+fn follow_trajectory(topic: &str, message: &Value, world: &mut FakeWorld) -> Option<&'static str> {
     let Some(i) = NAMES.iter().position(|n| topic.strip_prefix(n) == Some("/joint_path_command")) else {
         return Some("nobody listens to this topic");
     };
@@ -250,12 +251,12 @@ fn follow(topic: &str, message: &Value, world: &mut FakeWorld) -> Option<&'stati
     let Ok(target) = <Joints>::try_from(positions) else { return Some("expected six positions") };
     let time = &point["time_from_start"];
     let part = |name: &str| time[name].as_f64().unwrap_or(0.0);
-    (arm.from, arm.to, arm.began) = (arm.joints(fault), target, Instant::now());
+    (arm.from, arm.to, arm.began) = (arm.current_joints(fault), target, Instant::now());
     arm.secs = part("secs") + part("nsecs") / 1e9;
     None
 }
 
-fn switch(service: &str, world: &mut FakeWorld) -> (bool, &'static str) {
+fn switch_motors(service: &str, world: &mut FakeWorld) -> (bool, &'static str) {
     let Some((i, verb)) = NAMES.iter().enumerate().find_map(|(i, n)| Some((i, service.strip_prefix(n)?))) else {
         return (false, "no such service");
     };

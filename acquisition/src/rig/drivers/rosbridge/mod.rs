@@ -1,5 +1,5 @@
 //! Both arms behind a rosbridge (WebSocket, JSON): trajectories out, joint states in, motors on and off. The joints for
-//! a pair, and the way there without touching, are computed here, by [`crate::rig::robots`].
+//! a pair, and the way there without touching, are computed here, by [`crate::rig::check_robots`].
 
 pub mod fake;
 #[cfg(test)]
@@ -14,7 +14,7 @@ use echolake_schema::devices::RosbridgeParams;
 use tungstenite::stream::MaybeTlsStream;
 use tungstenite::{Message, WebSocket};
 
-use crate::rig::robots::{ArmPose, Cell, Joints, SpeakerAim, course};
+use crate::rig::robots::{ArmPose, Cell, Joints, SpeakerAim, plan_motion};
 use crate::rig::{ArmPositions, DeviceFault, DrivePower, Error, RobotArms};
 use wire::{ArmRole, BridgeMessage};
 
@@ -75,7 +75,7 @@ impl RosbridgeRobots {
                 _ => return Err(failed("only plain ws:// is spoken".into())),
             }
             self.socket = Some(socket);
-            for message in wire::greeting(&self.params) {
+            for message in wire::opening_messages(&self.params) {
                 self.send(&message)?;
             }
         }
@@ -91,7 +91,7 @@ impl RosbridgeRobots {
     // The next message, or nothing within a pause.
     fn receive(&mut self) -> Result<Option<BridgeMessage>, Error> {
         match self.connected()?.read() {
-            Ok(Message::Text(text)) => match wire::read(text.as_str(), &self.params) {
+            Ok(Message::Text(text)) => match wire::parse_message(text.as_str(), &self.params) {
                 Ok(incoming) => {
                     match &incoming {
                         BridgeMessage::Joints(side, joints) => self.joints[*side as usize] = Some(*joints),
@@ -158,7 +158,7 @@ impl RosbridgeRobots {
         let secs = (way(0).max(way(1)) / self.params.speed).max(LEAST_SECS);
         for side in ArmRole::BOTH {
             if way(side as usize) > 0.0 {
-                self.send(&wire::trajectory(&self.params, side, &target[side as usize], secs))?;
+                self.send(&wire::trajectory_message(&self.params, side, &target[side as usize], secs))?;
             }
         }
         let (end, mut stands) = (self.deadline(secs), 0);
@@ -204,7 +204,7 @@ impl RosbridgeRobots {
     fn call(&mut self, side: ArmRole, service: &str) -> Result<(), Error> {
         self.calls += 1;
         let id = format!("echolake-{}", self.calls);
-        self.send(&wire::trigger(&self.params, side, service, &id))?;
+        self.send(&wire::trigger_call(&self.params, side, service, &id))?;
         let name = format!("{}/{service}", side.namespace(&self.params));
         let end = self.deadline(0.0);
         while Instant::now() < end {
@@ -226,11 +226,11 @@ impl RobotArms for RosbridgeRobots {
         if self.power == DrivePower::Off {
             return Err(refuse("the drives are off"));
         }
-        let target = self.cell.reach(microphone_mm, speaker_mm).map_err(|why| refuse(why.reason()))?;
+        let target = self.cell.reach_positions(microphone_mm, speaker_mm).map_err(|why| refuse(why.reason_text()))?;
         let [microphone, speaker] = self.current()?;
         let from = ArmPose { microphone, speaker, aim: SpeakerAim::Down };
         let motion =
-            course(&self.cell, &from, &target).ok_or_else(|| refuse("no way there without touching is known"))?;
+            plan_motion(&self.cell, &from, &target).ok_or_else(|| refuse("no way there without touching is known"))?;
         let mut joints = [microphone, speaker];
         for stop in &motion.stops {
             joints = self.drive(stop)?;
@@ -239,7 +239,7 @@ impl RobotArms for RosbridgeRobots {
         Ok(ArmPositions { microphone_mm, speaker_mm, joints: Some(joints) })
     }
 
-    fn power(&mut self, power: DrivePower) -> Result<(), Error> {
+    fn switch_drives(&mut self, power: DrivePower) -> Result<(), Error> {
         let service = match power {
             DrivePower::On => "robot_enable",
             DrivePower::Off => "robot_disable",
@@ -251,7 +251,7 @@ impl RobotArms for RosbridgeRobots {
         Ok(())
     }
 
-    fn notices(&mut self) -> Vec<String> {
+    fn take_notices(&mut self) -> Vec<String> {
         std::mem::take(&mut self.notices)
     }
 }

@@ -19,17 +19,17 @@ fn bridge() -> FakeBridge {
 fn connected(bridge: &FakeBridge) -> RosbridgeRobots {
     let params =
         RosbridgeParams { url: bridge.url(), speed: 1.0, timeout_secs: PATIENT_SECS, ..RosbridgeParams::default() };
-    RosbridgeRobots::connect(&params, Cell::of(&Rig::paper())).expect("connected")
+    RosbridgeRobots::connect(&params, Cell::from_rig(&Rig::paper())).expect("connected")
 }
 
 #[test]
 fn it_conforms() {
     let bridge = bridge();
     let mut robots = connected(&bridge);
-    conformance::robots(&mut robots, NEAR, [NEAR[0], [0.0, 0.0, 5_000.0]]);
-    conformance::robots(&mut robots, NEAR, [NEAR[0], NEAR[0]]);
+    conformance::check_robots(&mut robots, NEAR, [NEAR[0], [0.0, 0.0, 5_000.0]]);
+    conformance::check_robots(&mut robots, NEAR, [NEAR[0], NEAR[0]]);
     assert!(bridge.has_power());
-    robots.power(DrivePower::Off).expect("a switch");
+    robots.switch_drives(DrivePower::Off).expect("a switch");
     assert!(!bridge.has_power());
 }
 
@@ -37,10 +37,10 @@ fn it_conforms() {
 fn joints_are_those_that_the_arms_told() {
     let bridge = bridge();
     let mut robots = connected(&bridge);
-    robots.power(DrivePower::On).expect("a switch");
+    robots.switch_drives(DrivePower::On).expect("a switch");
     let reached = robots.move_to(NEAR[0], NEAR[1]).expect("reached");
     let joints = reached.joints.expect("joints");
-    let wanted = Cell::of(&Rig::paper()).reach(NEAR[0], NEAR[1]).expect("within reach");
+    let wanted = Cell::from_rig(&Rig::paper()).reach_positions(NEAR[0], NEAR[1]).expect("within reach");
     for (is, wanted) in joints.iter().flatten().zip(wanted.microphone.iter().chain(&wanted.speaker)) {
         assert!((is - wanted).abs().to_degrees() < 0.02, "{is} {wanted}");
     }
@@ -51,7 +51,7 @@ fn motors_that_stay_off_are_named() {
     let bridge = bridge();
     let mut robots = connected(&bridge);
     bridge.set_fault(BridgeFault::NoPower);
-    let error = robots.power(DrivePower::On).expect_err("refused").to_string();
+    let error = robots.switch_drives(DrivePower::On).expect_err("refused").to_string();
     assert!(error.contains("`/microphone/robot_enable` refuses: the safety chain is open"), "{error}");
     let error = robots.move_to(NEAR[0], NEAR[1]).expect_err("no power").to_string();
     assert!(error.contains("the drives are off"), "{error}");
@@ -60,7 +60,7 @@ fn motors_that_stay_off_are_named() {
 #[test]
 fn a_bridge_that_is_not_there_is_named() {
     let params = RosbridgeParams { url: "ws://127.0.0.1:1".into(), ..RosbridgeParams::default() };
-    let error = RosbridgeRobots::connect(&params, Cell::of(&Rig::paper())).err().expect("nobody").to_string();
+    let error = RosbridgeRobots::connect(&params, Cell::from_rig(&Rig::paper())).err().expect("nobody").to_string();
     assert!(error.contains("cannot reach `ws://127.0.0.1:1`") && error.contains("is rosbridge running"), "{error}");
 }
 
@@ -72,7 +72,7 @@ mod slow {
         let check = |fault, expected: &str| {
             let bridge = bridge();
             let mut robots = connected(&bridge);
-            robots.power(DrivePower::On).expect("a switch");
+            robots.switch_drives(DrivePower::On).expect("a switch");
             bridge.set_fault(fault);
             robots.params.timeout_secs = IMPATIENT_SECS;
             let error = robots.move_to(NEAR[0], NEAR[1]).expect_err(expected).to_string();
@@ -80,7 +80,7 @@ mod slow {
             assert!(error.starts_with("robots: ") && error.contains(expected), "{fault:?}: {error}");
             // Back to normal, the next try does; after a lost connection the motors have to be switched on again.
             bridge.set_fault(BridgeFault::None);
-            robots.power(DrivePower::On).expect("a switch");
+            robots.switch_drives(DrivePower::On).expect("a switch");
             robots.move_to(NEAR[0], NEAR[1]).unwrap_or_else(|e| panic!("{fault:?}: {e}"));
         };
         check(BridgeFault::Refuses, "the bridge refuses the target: the target is outside of the joints' ranges");
@@ -98,6 +98,6 @@ mod slow {
         bridge.set_fault(BridgeFault::Nonsense);
         robots.params.timeout_secs = IMPATIENT_SECS;
         let _ = robots.current();
-        assert!(robots.notices().iter().any(|n| n.contains("no JSON")));
+        assert!(robots.take_notices().iter().any(|n| n.contains("no JSON")));
     }
 }

@@ -45,7 +45,7 @@ pub enum BridgeMessage {
 }
 
 /// Returns the messages that open a session: subscriptions to joints and states, announcement of trajectories.
-pub fn greeting(params: &RosbridgeParams) -> Vec<Value> {
+pub fn opening_messages(params: &RosbridgeParams) -> Vec<Value> {
     let topics = |side: ArmRole| {
         let name = side.namespace(params);
         [
@@ -62,7 +62,7 @@ pub fn greeting(params: &RosbridgeParams) -> Vec<Value> {
 }
 
 /// Returns a trajectory of one point, from the arm's current joints.
-pub fn trajectory(params: &RosbridgeParams, side: ArmRole, target: &Joints, secs: f64) -> Value {
+pub fn trajectory_message(params: &RosbridgeParams, side: ArmRole, target: &Joints, secs: f64) -> Value {
     let still: Joints = [0.0; 6];
     let point = json!({
         "positions": target, "velocities": still, "accelerations": [], "effort": [],
@@ -75,7 +75,7 @@ pub fn trajectory(params: &RosbridgeParams, side: ArmRole, target: &Joints, secs
 }
 
 /// A call of `std_srvs/Trigger`.
-pub fn trigger(params: &RosbridgeParams, side: ArmRole, service: &str, id: &str) -> Value {
+pub fn trigger_call(params: &RosbridgeParams, side: ArmRole, service: &str, id: &str) -> Value {
     json!({"op": "call_service", "id": id, "service": format!("{}/{service}", side.namespace(params)),
         "type": "std_srvs/Trigger", "args": {}})
 }
@@ -84,11 +84,11 @@ pub fn trigger(params: &RosbridgeParams, side: ArmRole, service: &str, id: &str)
 ///
 /// # Errors
 /// A text that names the fault in the message.
-pub fn read(text: &str, params: &RosbridgeParams) -> Result<BridgeMessage, String> {
+pub fn parse_message(text: &str, params: &RosbridgeParams) -> Result<BridgeMessage, String> {
     let value: Value = serde_json::from_str(text).map_err(|e| format!("no JSON: {e}"))?;
     let word = |value: &Value| value.as_str().unwrap_or_default().to_owned();
     match value["op"].as_str() {
-        Some("publish") => published(&value["topic"], &value["msg"], params),
+        Some("publish") => parse_published(&value["topic"], &value["msg"], params),
         Some("service_response") => {
             let said = &value["values"];
             // The bridge reports whether the call came through, the service whether it succeeded.
@@ -105,12 +105,14 @@ pub fn read(text: &str, params: &RosbridgeParams) -> Result<BridgeMessage, Strin
     }
 }
 
-fn published(topic: &Value, message: &Value, params: &RosbridgeParams) -> Result<BridgeMessage, String> {
+fn parse_published(topic: &Value, message: &Value, params: &RosbridgeParams) -> Result<BridgeMessage, String> {
     let topic = topic.as_str().unwrap_or_default();
     for side in ArmRole::BOTH {
         match topic.strip_prefix(side.namespace(params)) {
-            Some("/joint_states") => return joints(message, params).map(|joints| BridgeMessage::Joints(side, joints)),
-            Some("/robot_status") => return Ok(status(side, message)),
+            Some("/joint_states") => {
+                return parse_joints(message, params).map(|joints| BridgeMessage::Joints(side, joints));
+            }
+            Some("/robot_status") => return Ok(parse_status(side, message)),
             _ => {}
         }
     }
@@ -118,7 +120,7 @@ fn published(topic: &Value, message: &Value, params: &RosbridgeParams) -> Result
 }
 
 // Joints may come in any order, and among others.
-fn joints(message: &Value, params: &RosbridgeParams) -> Result<Joints, String> {
+fn parse_joints(message: &Value, params: &RosbridgeParams) -> Result<Joints, String> {
     let empty = Vec::new();
     let list = |name: &str| message[name].as_array().unwrap_or(&empty);
     let mut found = [0.0; 6];
@@ -131,7 +133,7 @@ fn joints(message: &Value, params: &RosbridgeParams) -> Result<Joints, String> {
 }
 
 // industrial_msgs/RobotStatus: three-valued, -1 unknown, 0 no, 1 yes.
-fn status(side: ArmRole, message: &Value) -> BridgeMessage {
+fn parse_status(side: ArmRole, message: &Value) -> BridgeMessage {
     let is = |name: &str| message[name]["val"].as_i64() == Some(1);
     match () {
         () if is("e_stopped") => BridgeMessage::Fault(side, "emergency stop".into()),
@@ -147,7 +149,7 @@ mod tests {
     #[test]
     fn messages_are_read() {
         let params = RosbridgeParams::default();
-        let check = |text: &str, expected: Result<BridgeMessage, &str>| match (read(text, &params), expected) {
+        let check = |text: &str, expected: Result<BridgeMessage, &str>| match (parse_message(text, &params), expected) {
             (Ok(found), Ok(expected)) => assert_eq!(found, expected, "{text}"),
             (Err(found), Err(expected)) => assert!(found.contains(expected), "{text}: {found}"),
             (found, expected) => panic!("{text}: {found:?}, expected {expected:?}"),

@@ -149,7 +149,7 @@ impl ReceivedLines {
 }
 
 impl AmbientSensor for SerialSensor {
-    fn read(&mut self) -> Result<AmbientReading, Error> {
+    fn read_ambient(&mut self) -> Result<AmbientReading, Error> {
         let end = Instant::now() + Duration::from_secs_f64(self.params.timeout_secs);
         let (mut taken, mut lost) = (ReceivedLines::default(), None::<ErrorCause>);
         loop {
@@ -187,7 +187,7 @@ impl AmbientSensor for SerialSensor {
         }
     }
 
-    fn notices(&mut self) -> Vec<String> {
+    fn take_notices(&mut self) -> Vec<String> {
         std::mem::take(&mut self.notices)
     }
 }

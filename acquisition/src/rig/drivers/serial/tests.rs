@@ -100,24 +100,24 @@ fn path_of(port: &SerialPort) -> PathBuf {
 }
 
 fn message(sensor: &mut SerialSensor) -> String {
-    sensor.read().expect_err("no reading").to_string()
+    sensor.read_ambient().expect_err("no reading").to_string()
 }
 
 #[test]
 fn it_conforms() {
     let fake = FakeSensor::sending(GOOD);
     let mut sensor = SerialSensor::open(&fake.params(PATIENT_SECS)).expect("open");
-    conformance::sensor(&mut sensor);
-    assert_eq!(sensor.read().expect("a reading").temperature_c, 21.5);
+    conformance::check_sensor(&mut sensor);
+    assert_eq!(sensor.read_ambient().expect("a reading").temperature_c, 21.5);
 }
 
 #[test]
 fn the_loudest_since_the_last_reading_counts() {
     let fake = FakeSensor::sending("T=20 RH=45 P=965 L=42\nT=20 RH=45 P=965 L=71\nT=21 RH=45 P=965 L=40\n");
     let mut sensor = SerialSensor::open(&fake.params(PATIENT_SECS)).expect("open");
-    sensor.read().expect("a reading");
+    sensor.read_ambient().expect("a reading");
     fake.fill_line();
-    let reading = sensor.read().expect("a reading");
+    let reading = sensor.read_ambient().expect("a reading");
     assert_eq!((reading.temperature_c, reading.outside_level_db), (21.0, 71.0));
 }
 
@@ -126,10 +126,10 @@ fn nonsense_between_good_lines_is_told_of() {
     let fake = FakeSensor::sending("T=21.5 RH=45 P=965 L=42\n\u{1}?garbage\nT=999 RH=45 P=965 L=42\n");
     let mut sensor = SerialSensor::open(&fake.params(PATIENT_SECS)).expect("open");
     fake.fill_line();
-    assert_eq!(sensor.read().expect("a reading").temperature_c, 21.5);
-    let notices = sensor.notices().join("\n");
+    assert_eq!(sensor.read_ambient().expect("a reading").temperature_c, 21.5);
+    let notices = sensor.take_notices().join("\n");
     assert!(notices.contains("lines of nonsense") && notices.contains("expected -40 to 85"), "{notices}");
-    assert!(sensor.notices().is_empty(), "told once");
+    assert!(sensor.take_notices().is_empty(), "told once");
 }
 
 #[test]
@@ -155,17 +155,17 @@ mod slow {
     fn an_unplugged_sensor_is_named_and_found_again() {
         let mut first = FakeSensor::sending(GOOD);
         let mut sensor = SerialSensor::open(&first.params(PATIENT_SECS)).expect("open");
-        sensor.read().expect("a reading");
+        sensor.read_ambient().expect("a reading");
         sensor.params.timeout_secs = IMPATIENT_SECS;
         first.unplug();
         // What the line still held may be read once more.
-        let error = (0..3).find_map(|_| sensor.read().err()).expect("unplugged").to_string();
+        let error = (0..3).find_map(|_| sensor.read_ambient().err()).expect("unplugged").to_string();
         assert!(error.contains("lost `") && error.contains("still plugged in"), "{error}");
         let second = FakeSensor::sending(GOOD);
         symlink(&second.link, &first.link).expect("linked");
         sensor.params.timeout_secs = PATIENT_SECS;
-        sensor.read().expect("found again");
-        let notices = sensor.notices().join("\n");
+        sensor.read_ambient().expect("found again");
+        let notices = sensor.take_notices().join("\n");
         assert!(notices.contains("lost `") && notices.contains("is open again"), "{notices}");
     }
 

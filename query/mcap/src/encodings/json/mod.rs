@@ -10,7 +10,7 @@ use echolake_schema::tables::LIST_CHILD;
 use serde_json::{Map, Number, Value};
 
 use super::{Malformed, MessageDecoder, MessageEncoding, MessageType, RawSchema, RowTally, strip_byte_order_mark};
-use crate::column::{Column, DEEPEST, MOST_LEAVES, append_text, integer_type, width};
+use crate::column::{Column, DEEPEST, MOST_LEAVES, append_text, integer_type, value_width};
 
 /// A parsed value takes about this many bytes for each byte of its text, at worst.
 const PARSED: usize = 16;
@@ -24,7 +24,7 @@ const NO_OBJECT: Malformed = Malformed::Invalid("it is no JSON object");
 pub(super) struct JsonEncoding;
 
 impl MessageEncoding for JsonEncoding {
-    fn names(&self) -> &'static [(&'static str, &'static str)] {
+    fn encoding_names(&self) -> &'static [(&'static str, &'static str)] {
         &[("json", "jsonschema"), ("json", "")]
     }
 
@@ -32,8 +32,8 @@ impl MessageEncoding for JsonEncoding {
         let schema = strip_byte_order_mark(&channel.data);
         if !schema.iter().all(u8::is_ascii_whitespace) {
             let schema: Value = serde_json::from_slice(schema).map_err(|e| format!("its schema is no JSON: {e}"))?;
-            if let Some(properties) = properties(&schema) {
-                return Ok((fields(properties, 1, &mut 0)?, Box::new(JsonType::Properties)));
+            if let Some(properties) = object_properties(&schema) {
+                return Ok((object_fields(properties, 1, &mut 0)?, Box::new(JsonType::Properties)));
             }
         }
         Ok((Fields::from(vec![Field::new("json", DataType::Utf8, true)]), Box::new(JsonType::Text)))
@@ -50,22 +50,22 @@ enum JsonType {
 }
 
 impl MessageType for JsonType {
-    fn decoder(&self, _: &[usize], fields: &Fields) -> Box<dyn MessageDecoder> {
+    fn create_decoder(&self, _: &[usize], fields: &Fields) -> Box<dyn MessageDecoder> {
         Box::new(JsonDecoder { json_type: *self, fields: fields.clone() })
     }
 }
 
-fn properties(schema: &Value) -> Option<&Map<String, Value>> {
+fn object_properties(schema: &Value) -> Option<&Map<String, Value>> {
     schema.get("properties")?.as_object().filter(|p| !p.is_empty())
 }
 
-fn fields(properties: &Map<String, Value>, depth: usize, leaves: &mut usize) -> Result<Fields, String> {
-    let one = |(name, schema): (&String, &Value)| Ok(Field::new(name, kind(schema, depth, leaves)?, true));
+fn object_fields(properties: &Map<String, Value>, depth: usize, leaves: &mut usize) -> Result<Fields, String> {
+    let one = |(name, schema): (&String, &Value)| Ok(Field::new(name, column_type(schema, depth, leaves)?, true));
     properties.iter().map(one).collect()
 }
 
 // What has no type of its own, such as a choice of several, is given as JSON.
-fn kind(schema: &Value, depth: usize, leaves: &mut usize) -> Result<DataType, String> {
+fn column_type(schema: &Value, depth: usize, leaves: &mut usize) -> Result<DataType, String> {
     *leaves += 1;
     if *leaves > MOST_LEAVES {
         return Err(format!("its schema has more than {MOST_LEAVES} columns"));
@@ -81,17 +81,17 @@ fn kind(schema: &Value, depth: usize, leaves: &mut usize) -> Result<DataType, St
     };
     Ok(match name {
         Some("number") => DataType::Float64,
-        Some("integer") => integer(schema),
+        Some("integer") => integer_type_of(schema),
         Some("boolean") => DataType::Boolean,
         Some("array") if depth < DEEPEST => match schema.get("items") {
             Some(items) => {
-                let child = kind(items, depth + 1, leaves)?;
+                let child = column_type(items, depth + 1, leaves)?;
                 DataType::List(Arc::new(Field::new(LIST_CHILD, child, true)))
             }
             None => DataType::Utf8,
         },
-        Some("object") if depth < DEEPEST => match properties(schema) {
-            Some(properties) => DataType::Struct(fields(properties, depth + 1, leaves)?),
+        Some("object") if depth < DEEPEST => match object_properties(schema) {
+            Some(properties) => DataType::Struct(object_fields(properties, depth + 1, leaves)?),
             None => DataType::Utf8,
         },
         _ => DataType::Utf8,
@@ -100,7 +100,7 @@ fn kind(schema: &Value, depth: usize, leaves: &mut usize) -> Result<DataType, St
 
 // 64 bits with a sign if the schema bounds it so. Of others nobody knows the sign, and JSON's numbers are commonly those
 // of 64 bits with a sign or without.
-fn integer(schema: &Value) -> DataType {
+fn integer_type_of(schema: &Value) -> DataType {
     let bounded = |name| schema.get(name).is_some_and(Value::is_i64);
     let format = schema.get("format").and_then(Value::as_str);
     let is_named = format.is_some_and(|name| matches!(name, "int8" | "int16" | "int32" | "int64"));
@@ -117,7 +117,12 @@ struct JsonDecoder {
 }
 
 impl MessageDecoder for JsonDecoder {
-    fn decode(&mut self, message: &[u8], columns: &mut [Column], tally: &mut RowTally) -> Result<(), Malformed> {
+    fn decode_message(
+        &mut self,
+        message: &[u8],
+        columns: &mut [Column],
+        tally: &mut RowTally,
+    ) -> Result<(), Malformed> {
         match (self.json_type, columns) {
             // Nothing is asked of the message: it is not parsed.
             (_, []) => Ok(()),
@@ -127,7 +132,7 @@ impl MessageDecoder for JsonDecoder {
                 Ok(())
             }
             (_, columns) => {
-                let message = parse(message, tally)?;
+                let message = parse_message(message, tally)?;
                 let message = message.as_object().ok_or(NO_OBJECT)?;
                 push_members(columns, &self.fields, message, tally)
             }
@@ -135,7 +140,7 @@ impl MessageDecoder for JsonDecoder {
     }
 }
 
-fn parse(message: &[u8], tally: &mut RowTally) -> Result<Value, Malformed> {
+fn parse_message(message: &[u8], tally: &mut RowTally) -> Result<Value, Malformed> {
     RowTally::default().add_bytes(message.len().saturating_mul(PARSED))?;
     let message = strip_byte_order_mark(message);
     if let Ok(message) = serde_json::from_slice(message) {
@@ -200,12 +205,17 @@ fn push_members(
     tally: &mut RowTally,
 ) -> Result<(), Malformed> {
     for (field, column) in fields.iter().zip(columns) {
-        push(column, field.data_type(), members.get(field.name()), tally)?;
+        push_value(column, field.data_type(), members.get(field.name()), tally)?;
     }
     Ok(())
 }
 
-fn push(column: &mut Column, kind: &DataType, value: Option<&Value>, tally: &mut RowTally) -> Result<(), Malformed> {
+fn push_value(
+    column: &mut Column,
+    kind: &DataType,
+    value: Option<&Value>,
+    tally: &mut RowTally,
+) -> Result<(), Malformed> {
     let Some(value) = value.filter(|v| !v.is_null()) else {
         column.append_null();
         return Ok(());
@@ -233,10 +243,10 @@ fn push(column: &mut Column, kind: &DataType, value: Option<&Value>, tally: &mut
             c.append_value(text.as_bytes());
         }
         (Column::List(list), DataType::List(child), Value::Array(values)) => {
-            let each = width(child.data_type());
+            let each = value_width(child.data_type());
             for value in values {
                 tally.add_bytes(each)?;
-                push(&mut list.values, child.data_type(), Some(value), tally)?;
+                push_value(&mut list.values, child.data_type(), Some(value), tally)?;
             }
             list.end_row();
         }

@@ -6,7 +6,7 @@ use arrow::datatypes::{DataType, Fields};
 use prost_reflect::{FieldDescriptor, Kind as ProtoKind, MessageDescriptor};
 
 use super::wire::{FieldReader, WireKind, WireValue};
-use crate::column::{Column, List, append_text, width};
+use crate::column::{Column, List, append_text, value_width};
 use crate::encodings::{Malformed, MessageDecoder, RowTally};
 
 const NANOS: i64 = 1_000_000_000;
@@ -25,8 +25,13 @@ impl ProtobufDecoder {
 }
 
 impl MessageDecoder for ProtobufDecoder {
-    fn decode(&mut self, message: &[u8], columns: &mut [Column], tally: &mut RowTally) -> Result<(), Malformed> {
-        self.0.decode(message, columns, tally)
+    fn decode_message(
+        &mut self,
+        message: &[u8],
+        columns: &mut [Column],
+        tally: &mut RowTally,
+    ) -> Result<(), Malformed> {
+        self.0.decode_message(message, columns, tally)
     }
 }
 
@@ -100,7 +105,7 @@ impl Numbers {
         Self::Table(table)
     }
 
-    fn find(&self, number: u32) -> Option<usize> {
+    fn field_index(&self, number: u32) -> Option<usize> {
         match self {
             Self::Table(table) => table.get(number as usize).copied().flatten(),
             Self::Map(map) => map.get(&number).copied(),
@@ -123,27 +128,27 @@ impl Node {
             numbers.push(descriptor.number());
             fields.push(FieldNode::new(descriptor, field.data_type(), oneof));
         }
-        let width = types.iter().map(|f| width(f.data_type())).sum::<usize>() + 1;
+        let width = types.iter().map(|f| value_width(f.data_type())).sum::<usize>() + 1;
         Self { fields, numbers: Numbers::new(&numbers), width, oneofs: vec![None; names.len()] }
     }
 
-    fn decode(&mut self, data: &[u8], columns: &mut [Column], tally: &mut RowTally) -> Result<(), Malformed> {
-        self.fields.iter_mut().for_each(FieldNode::forget);
+    fn decode_message(&mut self, data: &[u8], columns: &mut [Column], tally: &mut RowTally) -> Result<(), Malformed> {
+        self.fields.iter_mut().for_each(FieldNode::forget_value);
         self.oneofs.fill(None);
         let mut wire = FieldReader::new(data);
         while !wire.is_at_end() {
             let (number, value) = wire.read_field()?;
-            if let Some(i) = self.numbers.find(number) {
-                self.see(i, value, data, columns, tally)?;
+            if let Some(i) = self.numbers.field_index(number) {
+                self.see_field(i, value, data, columns, tally)?;
             }
         }
         for (field, column) in self.fields.iter_mut().zip(columns) {
-            field.end(data, column, tally)?;
+            field.end_message(data, column, tally)?;
         }
         Ok(())
     }
 
-    fn see(
+    fn see_field(
         &mut self,
         i: usize,
         value: WireValue,
@@ -154,15 +159,15 @@ impl Node {
         let field = &mut self.fields[i];
         match field.label {
             Label::Repeated => match &mut columns[i] {
-                Column::List(list) => field.kind.append(value, data, list, tally),
+                Column::List(list) => field.kind.append_elements(value, data, list, tally),
                 _ => Ok(()),
             },
             Label::Single | Label::Map => {
-                if field.keep(value)
+                if field.keep_value(value)
                     && let Some(oneof) = field.oneof
                     && let Some(before) = self.oneofs[oneof].replace(i).filter(|before| *before != i)
                 {
-                    self.fields[before].forget();
+                    self.fields[before].forget_value();
                 }
                 Ok(())
             }
@@ -186,7 +191,7 @@ impl FieldNode {
     }
 
     // A list of places is kept for the next message, emptied.
-    fn forget(&mut self) {
+    fn forget_value(&mut self) {
         match &mut self.found {
             Found::Bytes(places) if !places.is_empty() => places.clear(),
             Found::Number(_) => self.found = Found::Nothing,
@@ -196,11 +201,11 @@ impl FieldNode {
 
     // Keeps a value until the message ends, since a later one may take its place; what has another wire type is no
     // value of this field.
-    fn keep(&mut self, value: WireValue) -> bool {
+    fn keep_value(&mut self, value: WireValue) -> bool {
         match value {
-            WireValue::Number(wire, number) if wire == self.kind.wire() => self.found = Found::Number(number),
-            WireValue::Bytes(from, to) if self.kind.wire() == WireKind::Bytes => {
-                let merges = self.label == Label::Map || self.kind.merges();
+            WireValue::Number(wire, number) if wire == self.kind.wire_kind() => self.found = Found::Number(number),
+            WireValue::Bytes(from, to) if self.kind.wire_kind() == WireKind::Bytes => {
+                let merges = self.label == Label::Map || self.kind.merges_parts();
                 match &mut self.found {
                     Found::Bytes(places) => {
                         if !merges {
@@ -216,7 +221,7 @@ impl FieldNode {
         true
     }
 
-    fn end(&mut self, data: &[u8], column: &mut Column, tally: &mut RowTally) -> Result<(), Malformed> {
+    fn end_message(&mut self, data: &[u8], column: &mut Column, tally: &mut RowTally) -> Result<(), Malformed> {
         match (self.label, column) {
             (Label::Repeated, Column::List(list)) => {
                 list.end_row();
@@ -226,7 +231,7 @@ impl FieldNode {
                 if let (Kind::Message(entry), Found::Bytes(places)) = (&mut self.kind, &mut self.found) {
                     keep_last_of_each_key(data, places);
                     for (from, to) in places.iter() {
-                        entry.append(&data[*from..*to], &mut list.values, tally)?;
+                        entry.append_message(&data[*from..*to], &mut list.values, tally)?;
                     }
                 }
                 list.end_row();
@@ -252,7 +257,7 @@ impl FieldNode {
                 column.append_null();
                 Ok(())
             }
-            _ if self.kind.wire() == WireKind::Bytes => self.kind.push_bytes(&[], column, tally),
+            _ if self.kind.wire_kind() == WireKind::Bytes => self.kind.push_bytes(&[], column, tally),
             _ => self.kind.push_number(0, column, tally),
         }
     }
@@ -260,10 +265,10 @@ impl FieldNode {
 
 impl Node {
     // One more element of a list of messages.
-    fn append(&mut self, data: &[u8], values: &mut Column, tally: &mut RowTally) -> Result<(), Malformed> {
+    fn append_message(&mut self, data: &[u8], values: &mut Column, tally: &mut RowTally) -> Result<(), Malformed> {
         if let Column::Struct(record) = values {
             tally.add_bytes(self.width)?;
-            self.decode(data, &mut record.columns, tally)?;
+            self.decode_message(data, &mut record.columns, tally)?;
             record.end_row();
         }
         Ok(())
@@ -302,7 +307,7 @@ impl Kind {
         }
     }
 
-    fn wire(&self) -> WireKind {
+    fn wire_kind(&self) -> WireKind {
         match self {
             Self::Number(wire, _) => *wire,
             Self::Enum(_) => WireKind::Varint,
@@ -310,12 +315,12 @@ impl Kind {
         }
     }
 
-    fn merges(&self) -> bool {
+    fn merges_parts(&self) -> bool {
         matches!(self, Self::Message(_) | Self::Time | Self::Opaque)
     }
 
     // One more value of a repeated field, or a packed list of them.
-    fn append(
+    fn append_elements(
         &mut self,
         value: WireValue,
         data: &[u8],
@@ -323,11 +328,11 @@ impl Kind {
         tally: &mut RowTally,
     ) -> Result<(), Malformed> {
         match value {
-            WireValue::Number(wire, number) if wire == self.wire() => {
+            WireValue::Number(wire, number) if wire == self.wire_kind() => {
                 tally.add_bytes(8)?;
                 self.push_number(number, &mut list.values, tally)
             }
-            WireValue::Bytes(from, to) if self.wire() == WireKind::Bytes => {
+            WireValue::Bytes(from, to) if self.wire_kind() == WireKind::Bytes => {
                 self.push_bytes(&data[from..to], &mut list.values, tally)
             }
             WireValue::Bytes(from, to) => self.append_packed(&data[from..to], &mut list.values, tally),
@@ -337,13 +342,13 @@ impl Kind {
 
     fn append_packed(&self, packed: &[u8], values: &mut Column, tally: &mut RowTally) -> Result<(), Malformed> {
         let (four, eight) = (packed.as_chunks::<4>(), packed.as_chunks::<8>());
-        match self.wire() {
+        match self.wire_kind() {
             WireKind::Four if four.1.is_empty() => {
                 tally.add_bytes(packed.len())?;
                 match values {
-                    Column::F32(c) => c.extend(four.0.iter().map(|b| f32::from_le_bytes(*b))),
-                    Column::I32(c) => c.extend(four.0.iter().map(|b| i32::from_le_bytes(*b))),
-                    Column::U32(c) => c.extend(four.0.iter().map(|b| u32::from_le_bytes(*b))),
+                    Column::F32(c) => c.append_values(four.0.iter().map(|b| f32::from_le_bytes(*b))),
+                    Column::I32(c) => c.append_values(four.0.iter().map(|b| i32::from_le_bytes(*b))),
+                    Column::U32(c) => c.append_values(four.0.iter().map(|b| u32::from_le_bytes(*b))),
                     _ => {}
                 }
                 Ok(())
@@ -351,9 +356,9 @@ impl Kind {
             WireKind::Eight if eight.1.is_empty() => {
                 tally.add_bytes(packed.len())?;
                 match values {
-                    Column::F64(c) => c.extend(eight.0.iter().map(|b| f64::from_le_bytes(*b))),
-                    Column::I64(c) => c.extend(eight.0.iter().map(|b| i64::from_le_bytes(*b))),
-                    Column::U64(c) => c.extend(eight.0.iter().map(|b| u64::from_le_bytes(*b))),
+                    Column::F64(c) => c.append_values(eight.0.iter().map(|b| f64::from_le_bytes(*b))),
+                    Column::I64(c) => c.append_values(eight.0.iter().map(|b| i64::from_le_bytes(*b))),
+                    Column::U64(c) => c.append_values(eight.0.iter().map(|b| u64::from_le_bytes(*b))),
                     _ => {}
                 }
                 Ok(())
@@ -400,14 +405,14 @@ impl Kind {
 
     fn push_bytes(&mut self, data: &[u8], column: &mut Column, tally: &mut RowTally) -> Result<(), Malformed> {
         match (self, column) {
-            (Self::Message(node), column) => node.append(data, column, tally)?,
+            (Self::Message(node), column) => node.append_message(data, column, tally)?,
             (Self::Time, Column::Time(c)) => {
                 tally.add_bytes(8)?;
-                c.append_option(nanos(data)?);
+                c.append_option(parse_nanos(data)?);
             }
             (Self::Time, Column::Duration(c)) => {
                 tally.add_bytes(8)?;
-                c.append_option(nanos(data)?);
+                c.append_option(parse_nanos(data)?);
             }
             (Self::Empty, Column::Bool(c)) => {
                 tally.add_bytes(1)?;
@@ -428,7 +433,7 @@ impl Kind {
 }
 
 /// Nanoseconds of a Timestamp or Duration; None where 64 bits do not hold them (from the year 2262 on).
-fn nanos(data: &[u8]) -> Result<Option<i64>, Malformed> {
+fn parse_nanos(data: &[u8]) -> Result<Option<i64>, Malformed> {
     let (mut seconds, mut rest) = (0i64, 0i32);
     let mut wire = FieldReader::new(data);
     while !wire.is_at_end() {

@@ -22,18 +22,18 @@ use decoder::ProtobufDecoder;
 pub(super) struct ProtobufEncoding;
 
 impl MessageEncoding for ProtobufEncoding {
-    fn names(&self) -> &'static [(&'static str, &'static str)] {
+    fn encoding_names(&self) -> &'static [(&'static str, &'static str)] {
         &[("protobuf", "protobuf")]
     }
 
     fn parse_schema(&self, channel: &RawSchema) -> Result<(Fields, Box<dyn MessageType>), String> {
         let message = message_type(&channel.name, &channel.data)?;
-        Ok((fields(&message)?, Box::new(message)))
+        Ok((message_columns(&message)?, Box::new(message)))
     }
 }
 
 impl MessageType for MessageDescriptor {
-    fn decoder(&self, wanted: &[usize], fields: &Fields) -> Box<dyn MessageDecoder> {
+    fn create_decoder(&self, wanted: &[usize], fields: &Fields) -> Box<dyn MessageDecoder> {
         Box::new(ProtobufDecoder::new(self, wanted, fields))
     }
 }
@@ -52,8 +52,8 @@ fn message_type(name: &str, data: &[u8]) -> Result<MessageDescriptor, String> {
 }
 
 // The columns of a message type, nested ones within structs.
-fn fields(message: &MessageDescriptor) -> Result<Fields, String> {
-    Types { within: Vec::new(), leaves: 0 }.fields(message)
+fn message_columns(message: &MessageDescriptor) -> Result<Fields, String> {
+    Types { within: Vec::new(), leaves: 0 }.message_fields(message)
 }
 
 /// Makes Arrow's types of Protobuf's.
@@ -64,34 +64,34 @@ struct Types {
 }
 
 impl Types {
-    fn fields(&mut self, message: &MessageDescriptor) -> Result<Fields, String> {
+    fn message_fields(&mut self, message: &MessageDescriptor) -> Result<Fields, String> {
         self.within.push(message.full_name().to_owned());
-        let fields = message.fields().map(|f| self.field(&f)).collect();
+        let fields = message.fields().map(|f| self.column_field(&f)).collect();
         self.within.pop();
         fields
     }
 
-    fn field(&mut self, field: &FieldDescriptor) -> Result<Field, String> {
+    fn column_field(&mut self, field: &FieldDescriptor) -> Result<Field, String> {
         let list = |child: DataType| {
             let nullable = may_overflow(&child);
             DataType::List(Arc::new(Field::new(LIST_CHILD, child, nullable)))
         };
         if field.is_map() {
-            return Ok(Field::new(field.name(), self.map(field)?, false));
+            return Ok(Field::new(field.name(), self.map_type(field)?, false));
         }
-        let kind = self.kind(&field.kind())?;
+        let kind = self.column_type(&field.kind())?;
         Ok(match field.is_list() {
             true => Field::new(field.name(), list(kind), false),
             false => Field::new(field.name(), kind, field.supports_presence()),
         })
     }
 
-    fn map(&mut self, field: &FieldDescriptor) -> Result<DataType, String> {
+    fn map_type(&mut self, field: &FieldDescriptor) -> Result<DataType, String> {
         let Some(entry) = field.kind().as_message().cloned() else {
             return Err(format!("`{}` is a map without entries", field.full_name()));
         };
-        let key = Field::new("key", self.kind(&entry.map_entry_key_field().kind())?, false);
-        let value = self.kind(&entry.map_entry_value_field().kind())?;
+        let key = Field::new("key", self.column_type(&entry.map_entry_key_field().kind())?, false);
+        let value = self.column_type(&entry.map_entry_value_field().kind())?;
         let nullable = may_overflow(&value);
         let value = Field::new("value", value, nullable);
         let entries = Field::new("entries", DataType::Struct(Fields::from(vec![key, value])), false);
@@ -99,7 +99,7 @@ impl Types {
     }
 
     // A message within itself would never end, so it is given as its bytes; so is what stands too deep.
-    fn kind(&mut self, kind: &ProtoKind) -> Result<DataType, String> {
+    fn column_type(&mut self, kind: &ProtoKind) -> Result<DataType, String> {
         self.leaves += 1;
         if self.leaves > MOST_LEAVES {
             return Err(format!("its schema has more than {MOST_LEAVES} columns"));
@@ -119,7 +119,7 @@ impl Types {
                 "google.protobuf.Duration" => duration_type(),
                 name if self.within.iter().any(|w| w == name) || self.within.len() >= DEEPEST => DataType::Binary,
                 _ if message.fields().len() == 0 => DataType::Boolean,
-                _ => DataType::Struct(self.fields(message)?),
+                _ => DataType::Struct(self.message_fields(message)?),
             },
         })
     }

@@ -288,14 +288,14 @@ fn same_message(name: &str, message: &DynamicMessage, array: &ArrayRef, row: usi
 }
 
 fn layout(descriptor: &MessageDescriptor) -> MessageLayout {
-    let fields = fields(descriptor).expect("columns");
+    let fields = message_columns(descriptor).expect("columns");
     MessageLayout { fields, message_type: Some(Box::new(descriptor.clone())) }
 }
 
 fn decoder(descriptor: &MessageDescriptor) -> RowDecoder {
     let layout = layout(descriptor);
     let all: Vec<_> = (0..layout.fields.len()).collect();
-    layout.decoder(&all)
+    layout.create_decoder(&all)
 }
 
 fn finish(decoder: &mut RowDecoder) -> Vec<ArrayRef> {
@@ -320,7 +320,7 @@ fn random_messages_are_decoded_as_reflection_does() {
             bytes.extend([0xC3, 0xBB, 0x01, 0x08, 0x07, 0xC4, 0xBB, 0x01]);
         }
         expected.push(DynamicMessage::decode(descriptor.clone(), bytes.as_slice()).expect("a message"));
-        decoder.push(&bytes).expect("decoded");
+        decoder.push_message(&bytes).expect("decoded");
     }
     let arrays = finish(&mut decoder);
     for (row, message) in expected.iter().enumerate() {
@@ -338,11 +338,11 @@ fn some_columns_are_those_of_all() {
     let mut random = Random(3);
     let messages: Vec<_> = (0..40).map(|_| random_message(&descriptor, &mut random, 0).encode_to_vec()).collect();
     let mut whole = decoder(&descriptor);
-    messages.iter().for_each(|m| whole.push(m).expect("decoded"));
+    messages.iter().for_each(|m| whole.push_message(m).expect("decoded"));
     let whole = finish(&mut whole);
     for wanted in [vec![], vec![3], vec![70, 2, 61]] {
-        let mut some = layout.decoder(&wanted);
-        messages.iter().for_each(|m| some.push(m).expect("decoded"));
+        let mut some = layout.create_decoder(&wanted);
+        messages.iter().for_each(|m| some.push_message(m).expect("decoded"));
         let some = finish(&mut some);
         assert_eq!(some.len(), wanted.len());
         wanted.iter().zip(&some).for_each(|(i, array)| assert_eq!(array, &whole[*i], "{}", layout.fields[*i].name()));
@@ -351,7 +351,7 @@ fn some_columns_are_those_of_all() {
 
 #[test]
 fn a_message_within_itself_is_its_bytes() {
-    let fields = fields(&all()).expect("columns");
+    let fields = message_columns(&all()).expect("columns");
     let kind = |name: &str| fields.find(name).map(|(_, f)| f.data_type().clone());
     assert_eq!(kind("s_again"), Some(DataType::Binary));
     let Some(DataType::Struct(inner)) = kind("s_m") else { panic!("no struct") };
@@ -414,12 +414,12 @@ fn an_edition_is_read_by_its_presence() {
     ] {
         let set = set_of("editions", field_features, file_features, &NAMES);
         let message = message_type("M", &set).expect("a message type");
-        let names: Vec<_> = fields(&message).expect("columns").iter().map(|f| f.name().clone()).collect();
+        let names: Vec<_> = message_columns(&message).expect("columns").iter().map(|f| f.name().clone()).collect();
         assert_eq!(names, ["m", "e", "a"]);
         let mut decoder = decoder(&message);
         // An empty one, then a = 5 and e = 1.
-        decoder.push(&[]).expect("decoded");
-        decoder.push(&[7 << 3, 5, 2 << 3, 1]).expect("decoded");
+        decoder.push_message(&[]).expect("decoded");
+        decoder.push_message(&[7 << 3, 5, 2 << 3, 1]).expect("decoded");
         let columns = finish(&mut decoder);
         let numbers = columns[2].as_primitive::<Int32Type>();
         assert_eq!((numbers.iter().next().flatten(), numbers.value(1)), (expected, 5), "{field_features:?}");
@@ -446,8 +446,8 @@ fn of_several_names_the_first_is_shown() {
     for (syntax, names) in [("proto2", NAMES), ("proto3", [NAMES[1], NAMES[0], NAMES[3], NAMES[2]])] {
         let message = message_type("M", &set_of(syntax, &[], &[], &names)).expect("a message type");
         let mut decoder = decoder(&message);
-        decoder.push(&[2 << 3, 1]).expect("decoded");
-        decoder.push(&[2 << 3, 0]).expect("decoded");
+        decoder.push_message(&[2 << 3, 1]).expect("decoded");
+        decoder.push_message(&[2 << 3, 0]).expect("decoded");
         let columns = finish(&mut decoder);
         let shown: Vec<_> = columns[1].as_string::<i32>().iter().flatten().collect();
         assert_eq!(shown, ["UP", "NONE"], "{syntax}");
@@ -464,7 +464,7 @@ fn damaged_descriptors_are_refused_or_read() {
             let at = random.below(set.len() as u64) as usize;
             set[at] ^= 1 << random.below(8);
             match message_type("M", &set) {
-                Ok(message) => read += usize::from(fields(&message).is_ok()),
+                Ok(message) => read += usize::from(message_columns(&message).is_ok()),
                 Err(_) => refused += 1,
             }
         }
@@ -514,7 +514,7 @@ mod slow {
         prost_reflect::prost::encoding::encode_varint(u64::from(tag), &mut element);
         element.push(0);
         let bytes = element.repeat(30_000_000);
-        assert_eq!(decoder(&descriptor).push(&bytes), Err(Malformed::Expands));
+        assert_eq!(decoder(&descriptor).push_message(&bytes), Err(Malformed::Expands));
     }
 
     #[test]
@@ -529,7 +529,7 @@ mod slow {
                 bytes[at] = random.next() as u8;
             }
             let mut decoder = decoder(&descriptor);
-            if decoder.push(&bytes).is_ok() {
+            if decoder.push_message(&bytes).is_ok() {
                 assert!(finish(&mut decoder).iter().all(|array| array.len() == 1));
             }
         }

@@ -38,26 +38,26 @@ impl<'a> FieldReader<'a> {
 
     /// Reads a field's number and value.
     pub(super) fn read_field(&mut self) -> Result<(u32, WireValue), Malformed> {
-        let (number, kind) = self.tag()?;
+        let (number, kind) = self.read_tag()?;
         let value = match kind {
             0 => WireValue::Number(WireKind::Varint, self.read_varint()?),
-            1 => WireValue::Number(WireKind::Eight, u64::from_le_bytes(self.array()?)),
+            1 => WireValue::Number(WireKind::Eight, u64::from_le_bytes(self.read_array()?)),
             2 => {
-                let (from, to) = self.bytes()?;
+                let (from, to) = self.read_byte_range()?;
                 WireValue::Bytes(from, to)
             }
             3 => {
                 let from = self.at;
-                WireValue::Bytes(from, self.group()?)
+                WireValue::Bytes(from, self.skip_group()?)
             }
-            5 => WireValue::Number(WireKind::Four, u64::from(u32::from_le_bytes(self.array()?))),
+            5 => WireValue::Number(WireKind::Four, u64::from(u32::from_le_bytes(self.read_array()?))),
             4 => return Err(Malformed::Invalid("a group ends that did not begin")),
             _ => return Err(NO_TAG),
         };
         Ok((number, value))
     }
 
-    fn tag(&mut self) -> Result<(u32, u8), Malformed> {
+    fn read_tag(&mut self) -> Result<(u32, u8), Malformed> {
         let tag = self.read_varint()?;
         match u32::try_from(tag >> 3) {
             Ok(number) if number > 0 => Ok((number, (tag & 7) as u8)),
@@ -83,13 +83,13 @@ impl<'a> FieldReader<'a> {
         })
     }
 
-    fn array<const N: usize>(&mut self) -> Result<[u8; N], Malformed> {
+    fn read_array<const N: usize>(&mut self) -> Result<[u8; N], Malformed> {
         let bytes = self.data[self.at..].first_chunk::<N>().ok_or(Malformed::Ends)?;
         self.at += N;
         Ok(*bytes)
     }
 
-    fn bytes(&mut self) -> Result<(usize, usize), Malformed> {
+    fn read_byte_range(&mut self) -> Result<(usize, usize), Malformed> {
         let length = usize::try_from(self.read_varint()?).map_err(|_| Malformed::Ends)?;
         let from = self.at;
         let to = from.checked_add(length).filter(|to| *to <= self.data.len()).ok_or(Malformed::Ends)?;
@@ -98,18 +98,18 @@ impl<'a> FieldReader<'a> {
     }
 
     // Passes a group; where its content ends.
-    fn group(&mut self) -> Result<usize, Malformed> {
+    fn skip_group(&mut self) -> Result<usize, Malformed> {
         let mut depth = 1;
         loop {
             let end = self.at;
-            let (_, kind) = self.tag()?;
+            let (_, kind) = self.read_tag()?;
             match kind {
                 0 => drop(self.read_varint()?),
-                1 => drop(self.array::<8>()?),
-                2 => drop(self.bytes()?),
+                1 => drop(self.read_array::<8>()?),
+                2 => drop(self.read_byte_range()?),
                 3 => depth += 1,
                 4 => depth -= 1,
-                5 => drop(self.array::<4>()?),
+                5 => drop(self.read_array::<4>()?),
                 _ => return Err(NO_TAG),
             }
             if depth == 0 {

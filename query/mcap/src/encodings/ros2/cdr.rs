@@ -33,7 +33,7 @@ impl<'a> CdrReader<'a> {
     }
 
     /// Returns the number of bytes that are left.
-    pub(super) fn rest(&self) -> usize {
+    pub(super) fn bytes_left(&self) -> usize {
         self.data.len().saturating_sub(self.at)
     }
 

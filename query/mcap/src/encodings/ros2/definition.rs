@@ -77,18 +77,18 @@ impl MessageDefinition {
         let mut parser = Parser { parts, leaves: 0 };
         match parser.service_of(name) {
             Some(service) => parser.service_event(&service),
-            None => parser.definition(&short(name), 1),
+            None => parser.parse_definition(&short_name(name), 1),
         }
     }
 
     /// Returns the columns.
-    pub(super) fn fields(&self) -> Fields {
+    pub(super) fn column_fields(&self) -> Fields {
         self.members.iter().map(|m| Field::new(&m.name, m.data_type(), false)).collect()
     }
 }
 
 /// Both `geometry_msgs/Point` and `geometry_msgs/msg/Point` are meant by either.
-fn short(name: &str) -> String {
+fn short_name(name: &str) -> String {
     name.replace("/msg/", "/")
 }
 
@@ -101,7 +101,7 @@ fn add_part<'a>(parts: &mut HashMap<String, Vec<&'a str>>, title: &str, lines: V
         }
         // There may be an empty one in front of the first line of `=`.
         None if lines.is_empty() && parts.is_empty() && title.ends_with(EVENT) => {}
-        None => drop(parts.entry(short(title)).or_insert(lines)),
+        None => drop(parts.entry(short_name(title)).or_insert(lines)),
     }
 }
 
@@ -129,8 +129,8 @@ impl Parser<'_> {
             member("sequence_number", MemberKind::I64, MemberCount::One),
         ];
         let info = MessageDefinition { members: info };
-        let request = self.definition(&format!("{service}{REQUEST}"), 2)?;
-        let response = self.definition(&format!("{service}{RESPONSE}"), 2)?;
+        let request = self.parse_definition(&format!("{service}{REQUEST}"), 2)?;
+        let response = self.parse_definition(&format!("{service}{RESPONSE}"), 2)?;
         let members = vec![
             member("info", MemberKind::Message(info), MemberCount::One),
             member("request", MemberKind::Message(request), MemberCount::Sequence),
@@ -139,7 +139,7 @@ impl Parser<'_> {
         Ok(MessageDefinition { members })
     }
 
-    fn definition(&mut self, name: &str, depth: usize) -> Result<MessageDefinition, String> {
+    fn parse_definition(&mut self, name: &str, depth: usize) -> Result<MessageDefinition, String> {
         if depth > DEEPEST {
             return Err(format!("`{name}` stands more than {DEEPEST} messages deep, or within itself"));
         }
@@ -149,7 +149,7 @@ impl Parser<'_> {
         let package = name.split_once('/').map_or("", |(package, _)| package).to_owned();
         let mut members: Vec<MessageMember> = Vec::new();
         for line in lines {
-            let Some(member) = self.member(line, &package, depth)? else { continue };
+            let Some(member) = self.parse_member(line, &package, depth)? else { continue };
             if members.iter().any(|other| other.name == member.name) {
                 return Err(format!("`{name}` has two members `{}`", member.name));
             }
@@ -159,7 +159,7 @@ impl Parser<'_> {
     }
 
     // None for constants.
-    fn member(&mut self, line: &str, package: &str, depth: usize) -> Result<Option<MessageMember>, String> {
+    fn parse_member(&mut self, line: &str, package: &str, depth: usize) -> Result<Option<MessageMember>, String> {
         let line = line.split('#').next().unwrap_or("").trim();
         let Some((kind, rest)) = line.split_once(char::is_whitespace) else {
             return Err(format!("`{line}` is no member of a message"));
@@ -174,12 +174,12 @@ impl Parser<'_> {
         if behind.trim_start().starts_with('=') {
             return Ok(None);
         }
-        let (kind, count) = count(kind).ok_or_else(|| format!("`{line}` has no length that could be one"))?;
-        let kind = self.kind(kind, package, depth)?;
+        let (kind, count) = parse_count(kind).ok_or_else(|| format!("`{line}` has no length that could be one"))?;
+        let kind = self.parse_kind(kind, package, depth)?;
         Ok(Some(MessageMember { name: name.to_owned(), kind, count }))
     }
 
-    fn kind(&mut self, name: &str, package: &str, depth: usize) -> Result<MemberKind, String> {
+    fn parse_kind(&mut self, name: &str, package: &str, depth: usize) -> Result<MemberKind, String> {
         let bare = name.split("<=").next().unwrap_or(name);
         Ok(match bare {
             "bool" => MemberKind::Bool,
@@ -195,18 +195,18 @@ impl Parser<'_> {
             "float64" => MemberKind::F64,
             "string" => MemberKind::Text,
             "wstring" => return Err("how a `wstring` is encoded depends on who wrote it".to_owned()),
-            _ => match short(bare).as_str() {
+            _ => match short_name(bare).as_str() {
                 "builtin_interfaces/Time" => MemberKind::Time,
                 "builtin_interfaces/Duration" => MemberKind::Duration,
-                full if full.contains('/') => MemberKind::Message(self.definition(full, depth + 1)?),
-                local => MemberKind::Message(self.definition(&format!("{package}/{local}"), depth + 1)?),
+                full if full.contains('/') => MemberKind::Message(self.parse_definition(full, depth + 1)?),
+                local => MemberKind::Message(self.parse_definition(&format!("{package}/{local}"), depth + 1)?),
             },
         })
     }
 }
 
 // `float64[36]`, `float64[]`, `float64[<=5]`, `string<=10[<=5]`.
-fn count(kind: &str) -> Option<(&str, MemberCount)> {
+fn parse_count(kind: &str) -> Option<(&str, MemberCount)> {
     let Some((base, length)) = kind.strip_suffix(']').and_then(|k| k.rsplit_once('[')) else {
         return Some((kind, MemberCount::One));
     };
@@ -253,7 +253,7 @@ impl MemberKind {
             Self::Time => time_type(),
             Self::Duration => duration_type(),
             Self::Message(definition) if definition.members.is_empty() => DataType::Boolean,
-            Self::Message(definition) => DataType::Struct(definition.fields()),
+            Self::Message(definition) => DataType::Struct(definition.column_fields()),
         }
     }
 }

@@ -6,7 +6,7 @@ mod definition;
 use arrow::datatypes::Fields;
 
 use super::{Malformed, MessageDecoder, MessageEncoding, MessageType, RawSchema, RowTally, strip_byte_order_mark};
-use crate::column::{Column, append_text, width};
+use crate::column::{Column, append_text, value_width};
 use cdr::CdrReader;
 use definition::{MemberCount, MemberKind, MessageDefinition, MessageMember};
 
@@ -16,7 +16,7 @@ const NANOS: i64 = 1_000_000_000;
 pub(super) struct Ros2Encoding;
 
 impl MessageEncoding for Ros2Encoding {
-    fn names(&self) -> &'static [(&'static str, &'static str)] {
+    fn encoding_names(&self) -> &'static [(&'static str, &'static str)] {
         &[("cdr", "ros2msg")]
     }
 
@@ -24,12 +24,12 @@ impl MessageEncoding for Ros2Encoding {
         let text = std::str::from_utf8(strip_byte_order_mark(&channel.data));
         let text = text.map_err(|e| format!("its schema is no text: {e}"))?;
         let definition = MessageDefinition::parse(&channel.name, text)?;
-        Ok((definition.fields(), Box::new(definition)))
+        Ok((definition.column_fields(), Box::new(definition)))
     }
 }
 
 impl MessageType for MessageDefinition {
-    fn decoder(&self, wanted: &[usize], _: &Fields) -> Box<dyn MessageDecoder> {
+    fn create_decoder(&self, wanted: &[usize], _: &Fields) -> Box<dyn MessageDecoder> {
         // What stands behind the last wanted member need not be read.
         let last = wanted.iter().copied().max().map_or(0, |last| last + 1);
         let members = self.members.iter().take(last).cloned().enumerate();
@@ -45,10 +45,15 @@ struct Ros2Decoder {
 }
 
 impl MessageDecoder for Ros2Decoder {
-    fn decode(&mut self, message: &[u8], columns: &mut [Column], tally: &mut RowTally) -> Result<(), Malformed> {
+    fn decode_message(
+        &mut self,
+        message: &[u8],
+        columns: &mut [Column],
+        tally: &mut RowTally,
+    ) -> Result<(), Malformed> {
         let mut cdr = CdrReader::new(message)?;
         for (member, column) in &self.members {
-            member.read(&mut cdr, column.map(|i| &mut columns[i]), tally)?;
+            member.read_member(&mut cdr, column.map(|i| &mut columns[i]), tally)?;
         }
         Ok(())
     }
@@ -56,14 +61,14 @@ impl MessageDecoder for Ros2Decoder {
 
 impl MessageMember {
     // Reads the member, into a column or past it: CDR has no lengths to jump by.
-    fn read(
+    fn read_member(
         &self,
         cdr: &mut CdrReader<'_>,
         column: Option<&mut Column>,
         tally: &mut RowTally,
     ) -> Result<(), Malformed> {
         let count = match self.count {
-            MemberCount::One => return self.kind.read(cdr, column, tally),
+            MemberCount::One => return self.kind.read_value(cdr, column, tally),
             MemberCount::Fixed(count) => count,
             MemberCount::Sequence => cdr.read_u32()? as usize,
         };
@@ -76,22 +81,22 @@ impl MessageMember {
             return Ok(());
         }
         // Every value takes a byte at least, so a count beyond the rest is a lie.
-        if count > cdr.rest() {
+        if count > cdr.bytes_left() {
             return Err(Malformed::Ends);
         }
         match column {
             Some(Column::List(list)) => {
-                tally.add_bytes(count.saturating_mul(width(&self.kind.data_type())))?;
+                tally.add_bytes(count.saturating_mul(value_width(&self.kind.data_type())))?;
                 if !self.kind.read_many(cdr, count, &mut list.values)? {
                     for _ in 0..count {
-                        self.kind.read(cdr, Some(&mut *list.values), tally)?;
+                        self.kind.read_value(cdr, Some(&mut *list.values), tally)?;
                     }
                 }
                 list.end_row();
             }
             _ => {
                 for _ in 0..count {
-                    self.kind.read(cdr, None, tally)?;
+                    self.kind.read_value(cdr, None, tally)?;
                 }
             }
         }
@@ -110,7 +115,7 @@ macro_rules! add_value {
 }
 
 impl MemberKind {
-    fn read(
+    fn read_value(
         &self,
         cdr: &mut CdrReader<'_>,
         column: Option<&mut Column>,
@@ -137,7 +142,7 @@ impl MemberKind {
                     append_text(c, bytes);
                 }
             }
-            Self::Message(definition) => return definition.read(cdr, column, tally),
+            Self::Message(definition) => return definition.read_message(cdr, column, tally),
         }
         Ok(())
     }
@@ -147,11 +152,11 @@ impl MemberKind {
         match (self, column) {
             (Self::F32, Column::F32(c)) => {
                 let Some(values) = cdr.read_many::<4>(count)? else { return Ok(false) };
-                c.extend(values.iter().map(|b| f32::from_le_bytes(*b)));
+                c.append_values(values.iter().map(|b| f32::from_le_bytes(*b)));
             }
             (Self::F64, Column::F64(c)) => {
                 let Some(values) = cdr.read_many::<8>(count)? else { return Ok(false) };
-                c.extend(values.iter().map(|b| f64::from_le_bytes(*b)));
+                c.append_values(values.iter().map(|b| f64::from_le_bytes(*b)));
             }
             _ => return Ok(false),
         }
@@ -166,7 +171,7 @@ fn read_nanos(cdr: &mut CdrReader<'_>) -> Result<i64, Malformed> {
 }
 
 impl MessageDefinition {
-    fn read(
+    fn read_message(
         &self,
         cdr: &mut CdrReader<'_>,
         column: Option<&mut Column>,
@@ -177,13 +182,13 @@ impl MessageDefinition {
             _ if self.members.is_empty() => add_value!(column, Bool, cdr.read_array::<1>().map(|_| true)?),
             Some(Column::Struct(record)) => {
                 for (member, column) in self.members.iter().zip(&mut record.columns) {
-                    member.read(cdr, Some(column), tally)?;
+                    member.read_member(cdr, Some(column), tally)?;
                 }
                 record.end_row();
             }
             _ => {
                 for member in &self.members {
-                    member.read(cdr, None, tally)?;
+                    member.read_member(cdr, None, tally)?;
                 }
             }
         }

@@ -85,10 +85,10 @@ impl CachedAnswer {
     }
 
     /// Returns the response to a request with these headers.
-    pub(in super::super) fn respond(&self, request: &HeaderMap) -> Response {
+    pub(in super::super) fn to_response(&self, request: &HeaderMap) -> Response {
         let packs = self.headers.get(header::CONTENT_TYPE).is_some_and(is_packable);
-        let is_worth = packs && self.bytes.len() >= WORTH_PACKING && takes(request, "gzip");
-        let packed = is_worth.then(|| self.packed.get_or_init(|| pack(&self.bytes).ok()).clone());
+        let is_worth = packs && self.bytes.len() >= WORTH_PACKING && accepts_encoding(request, "gzip");
+        let packed = is_worth.then(|| self.packed.get_or_init(|| pack_gzip(&self.bytes).ok()).clone());
         match packed.flatten() {
             Some(packed) => (self.headers.clone(), [(header::CONTENT_ENCODING, "gzip")], packed).into_response(),
             None => (self.headers.clone(), self.bytes.clone()).into_response(),
@@ -101,7 +101,7 @@ fn is_packable(media_type: &HeaderValue) -> bool {
     ["application/json", "application/octet-stream", ARROW].contains(&media_type.to_str().unwrap_or_default())
 }
 
-fn pack(bytes: &[u8]) -> io::Result<Bytes> {
+fn pack_gzip(bytes: &[u8]) -> io::Result<Bytes> {
     let mut packed = Vec::new();
     GzEncoder::new(bytes, LEVEL).read_to_end(&mut packed)?;
     Ok(packed.into())
@@ -174,7 +174,7 @@ mod tests {
         let accepting =
             |value: &str| HeaderMap::from_iter([(header::ACCEPT_ENCODING, value.parse().expect("a value"))]);
         let cached = CachedAnswer::from_response(answer(vec![b'7'; 5000])).await.expect("an answer");
-        let packed = cached.respond(&accepting("br, gzip;q=0.9"));
+        let packed = cached.to_response(&accepting("br, gzip;q=0.9"));
         assert_eq!(packed.headers()[header::CONTENT_ENCODING], "gzip");
         let packed = to_bytes(packed.into_body(), usize::MAX).await.expect("bytes");
         assert!(packed.len() < 100);
@@ -182,10 +182,10 @@ mod tests {
         GzDecoder::new(&packed[..]).read_to_end(&mut plain).expect("gzip");
         assert_eq!(plain, cached.bytes);
         for other in ["identity", "gzip;q=0", "br"] {
-            assert!(!cached.respond(&accepting(other)).headers().contains_key(header::CONTENT_ENCODING), "{other}");
+            assert!(!cached.to_response(&accepting(other)).headers().contains_key(header::CONTENT_ENCODING), "{other}");
         }
         let picture = AnswerContent::new("image/png", vec![0; 5000]).into_response();
         let picture = CachedAnswer::from_response(picture).await.expect("an answer");
-        assert!(!picture.respond(&accepting("gzip")).headers().contains_key(header::CONTENT_ENCODING));
+        assert!(!picture.to_response(&accepting("gzip")).headers().contains_key(header::CONTENT_ENCODING));
     }
 }

@@ -17,7 +17,7 @@ pub(in super::super) struct BandDescription {
 }
 
 /// The rig's bands, the total last.
-pub(in super::super) fn bands(rig: &Rig) -> Vec<BandDescription> {
+pub(in super::super) fn describe_bands(rig: &Rig) -> Vec<BandDescription> {
     let keys = band_keys(rig).into_iter();
     let centres = rig.bands.centres_hz.iter().copied().map(Some).chain([None]);
     let described = keys.zip(centres).zip(band_labels(rig));
@@ -30,7 +30,7 @@ mod tests {
 
     #[test]
     fn the_total_is_last_and_always_there() {
-        let keys = |rig: &Rig| bands(rig).into_iter().map(|band| band.key).collect::<Vec<_>>();
+        let keys = |rig: &Rig| describe_bands(rig).into_iter().map(|band| band.key).collect::<Vec<_>>();
         let mut rig = Rig::paper();
         assert_eq!(keys(&rig), ["2500", "5000", "10000", "20000", "40000", "total"]);
         // No lake has such a rig; facets sort by the last band.

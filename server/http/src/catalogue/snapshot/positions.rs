@@ -14,9 +14,9 @@ pub(in super::super) struct SurfacePositions {
 
 impl SurfacePositions {
     /// The `count` surfaces nearest to one.
-    pub(in super::super) fn neighbours(&self, of: usize, count: usize) -> Vec<SurfaceNeighbour<'_>> {
+    pub(in super::super) fn nearest_surfaces(&self, of: usize, count: usize) -> Vec<SurfaceNeighbour<'_>> {
         let others = self.names.iter().enumerate().filter(|(i, _)| *i != of);
-        let mut near: Vec<_> = others.map(|(i, name)| (self.components.distance(of, i), name)).collect();
+        let mut near: Vec<_> = others.map(|(i, name)| (self.components.row_distance(of, i), name)).collect();
         near.sort_by(|a, b| a.0.total_cmp(&b.0));
         near.into_iter()
             .take(count)

@@ -152,19 +152,19 @@ impl CatalogueSummary {
         }
         // The newest of several rows counts, as run names sort by time.
         let newest: HashMap<_, _> = rows.into_iter().map(|row| (row.surface_id.clone(), row)).collect();
-        let mut entries: Vec<_> = newest.into_values().map(|row| entry(row, &levels, &bands)).collect();
+        let mut entries: Vec<_> = newest.into_values().map(|row| surface_entry(row, &levels, &bands)).collect();
         entries.sort_by(|a, b| a.surface.surface_id.cmp(&b.surface.surface_id));
         let places = entries.iter().enumerate().map(|(i, e)| (e.surface.surface_id.clone(), i)).collect();
         Self { bands, entries, places }
     }
 
     /// The surface of a name.
-    pub(in super::super) fn entry(&self, surface: &str) -> Option<&SurfaceEntry> {
+    pub(in super::super) fn find_entry(&self, surface: &str) -> Option<&SurfaceEntry> {
         self.places.get(surface).map(|place| &self.entries[*place])
     }
 }
 
-fn entry(row: SurfaceRow, levels: &SurfaceLevels, bands: &[BandDescription]) -> SurfaceEntry {
+fn surface_entry(row: SurfaceRow, levels: &SurfaceLevels, bands: &[BandDescription]) -> SurfaceEntry {
     let of = |surface: &str| -> Vec<_> {
         let own = levels.get(surface);
         bands.iter().map(|band| own.and_then(|own| own.get(&band.key)).copied().unwrap_or_default()).collect()

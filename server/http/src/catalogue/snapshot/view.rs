@@ -42,7 +42,7 @@ pub(crate) struct SnapshotView {
 impl SnapshotView {
     fn new(snapshot: Arc<LakeSnapshot>, session: Arc<Session>) -> Self {
         Self {
-            version: version(&snapshot),
+            version: snapshot_version(&snapshot),
             snapshot,
             session,
             answers: AnswerCache::default(),
@@ -55,12 +55,12 @@ impl SnapshotView {
 
     /// Returns the tag of an answer of this snapshot: a digest of the version and of the answer's `name`, which no
     /// other answer has.
-    pub(crate) fn etag(&self, name: &str) -> String {
+    pub(crate) fn answer_etag(&self, name: &str) -> String {
         let digest = Sha256::new().chain_update(&self.version).chain_update(name).finalize();
         format!("\"{}\"", hex::encode(&digest[..VERSION_BYTES]))
     }
 
-    pub(in super::super) fn prepared(&self, sql: &str) -> Option<Arc<PreparedQuery>> {
+    pub(in super::super) fn find_prepared(&self, sql: &str) -> Option<Arc<PreparedQuery>> {
         self.prepared.lock().unwrap_or_else(PoisonError::into_inner).get(sql).cloned()
     }
 
@@ -76,7 +76,7 @@ impl SnapshotView {
 }
 
 // The version of a snapshot: a digest of its files' names and visible rows.
-fn version(snapshot: &LakeSnapshot) -> String {
+fn snapshot_version(snapshot: &LakeSnapshot) -> String {
     let mut digest = Sha256::new();
     digest.update(env!("CARGO_PKG_VERSION"));
     for table in Table::ALL {
@@ -97,11 +97,11 @@ pub(crate) struct VisibleFile {
 }
 
 impl VisibleFile {
-    fn of(table: Table, file: &DataFile) -> Self {
+    fn from_data_file(table: Table, file: &DataFile) -> Self {
         Self { table, path: file.path.clone(), bytes: file.bytes }
     }
 
-    fn is(&self, table: Table, name: &str) -> bool {
+    fn is_named(&self, table: Table, name: &str) -> bool {
         self.table == table && self.path.filename() == Some(name)
     }
 }
@@ -123,21 +123,22 @@ impl SnapshotViews {
     ///
     /// # Errors
     /// The snapshot cannot be read.
-    pub(in super::super) async fn current(&self, service: &QueryService) -> Result<Arc<SnapshotView>, RequestFault> {
-        let known = self.seen().view.clone();
+    pub(in super::super) async fn current_view(&self, service: &QueryService) -> Result<Arc<SnapshotView>, RequestFault> {
+        let known = self.lock_history().view.clone();
         let session = match &known {
             Some(view) => view.session.clone(),
-            None => session(service),
+            None => catalogue_session(service),
         };
         let asking = session.clone();
-        let snapshot = service.plan(session.client(), async move { Ok(asking.snapshot().await?) }).await?;
-        let mut seen = self.seen();
+        let snapshot =
+            service.plan_query(session.client(), async move { Ok(asking.current_snapshot().await?) }).await?;
+        let mut seen = self.lock_history();
         match seen.view.as_ref().filter(|view| Arc::ptr_eq(&view.snapshot, &snapshot)) {
             Some(view) => Ok(view.clone()),
             None => {
                 let view = Arc::new(SnapshotView::new(snapshot, session));
                 let before = seen.view.replace(view.clone());
-                let gone = before.map(|before| gone(&before.snapshot, &view.snapshot)).unwrap_or_default();
+                let gone = before.map(|before| removed_files(&before.snapshot, &view.snapshot)).unwrap_or_default();
                 seen.earlier.extend(gone);
                 let too_many = seen.earlier.len().saturating_sub(EARLIER);
                 seen.earlier.drain(..too_many);
@@ -147,30 +148,30 @@ impl SnapshotViews {
     }
 
     /// A file that a view shows, or that an earlier one did. A file with rows of other projects is none for a client of some.
-    pub(in super::super) fn shown(&self, view: &SnapshotView, table: Table, name: &str) -> Option<VisibleFile> {
+    pub(in super::super) fn find_file(&self, view: &SnapshotView, table: Table, name: &str) -> Option<VisibleFile> {
         let now = view.snapshot.readable_files(table).find(|file| file.path.filename() == Some(name));
-        let earlier = || self.seen().earlier.iter().find(|file| file.is(table, name)).cloned();
-        now.map(|file| VisibleFile::of(table, file)).or_else(earlier)
+        let earlier = || self.lock_history().earlier.iter().find(|file| file.is_named(table, name)).cloned();
+        now.map(|file| VisibleFile::from_data_file(table, file)).or_else(earlier)
     }
 
-    fn seen(&self) -> std::sync::MutexGuard<'_, ViewHistory> {
+    fn lock_history(&self) -> std::sync::MutexGuard<'_, ViewHistory> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
 // The files that a snapshot shows and the next does not.
-fn gone(before: &LakeSnapshot, after: &LakeSnapshot) -> Vec<VisibleFile> {
+fn removed_files(before: &LakeSnapshot, after: &LakeSnapshot) -> Vec<VisibleFile> {
     let mut gone = Vec::new();
     for table in Table::ALL {
         let stay: HashSet<_> = after.files(table).iter().map(|file| &file.path).collect();
         let left = before.readable_files(table).filter(|file| !stay.contains(&file.path));
-        gone.extend(left.map(|file| VisibleFile::of(table, file)));
+        gone.extend(left.map(|file| VisibleFile::from_data_file(table, file)));
     }
     gone
 }
 
 // The client was authorised before; the quota of its own queries does not apply to these.
-fn session(service: &QueryService) -> Arc<Session> {
+fn catalogue_session(service: &QueryService) -> Arc<Session> {
     let quota = QueryQuota { time: Some(LONGEST), ..QueryQuota::default() };
-    Arc::new(service.session(&Arc::new(EngineClient::new("catalogue", quota))))
+    Arc::new(service.begin_session(&Arc::new(EngineClient::new("catalogue", quota))))
 }

@@ -15,7 +15,7 @@ const TOGETHER: usize = 16;
 
 /// Lists the versions whose commits are in a log folder, oldest first.
 pub(super) async fn list_versions(store: &dyn ObjectStore, folder: &Path) -> Result<Vec<TableVersion>> {
-    let there = store.list_with_delimiter(Some(folder)).await.map_err(|e| Error::store("list", folder, e))?;
+    let there = store.list_with_delimiter(Some(folder)).await.map_err(|e| Error::store_failure("list", folder, e))?;
     let mut commits: Vec<_> = there
         .objects
         .into_iter()
@@ -49,8 +49,8 @@ pub(super) fn commit_number(path: &Path) -> Option<u64> {
 async fn commit_time(store: &dyn ObjectStore, path: &Path) -> Result<Option<DateTime<Utc>>> {
     let range = Some(GetRange::Bounded(0..COMMIT_HEAD));
     let head = store.get_opts(path, GetOptions { range, ..GetOptions::default() }).await;
-    let head = head.map_err(|e| Error::store("read", path, e))?;
-    let bytes = head.bytes().await.map_err(|e| Error::store("read", path, e))?;
+    let head = head.map_err(|e| Error::store_failure("read", path, e))?;
+    let bytes = head.bytes().await.map_err(|e| Error::store_failure("read", path, e))?;
     let text = String::from_utf8_lossy(&bytes);
     let millis = text.lines().find_map(millis_of);
     Ok(millis.and_then(DateTime::from_timestamp_millis))

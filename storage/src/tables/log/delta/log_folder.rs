@@ -76,9 +76,9 @@ impl<'a> LogFolder<'a> {
     }
 
     /// The table at its newest version, or at the given one; None if it has no log.
-    pub(super) async fn load(&self, at: Option<u64>) -> Result<Option<TableState>> {
-        let listing = self.list().await?;
-        let Some(newest) = listing.newest() else { return Ok(None) };
+    pub(super) async fn load_state(&self, at: Option<u64>) -> Result<Option<TableState>> {
+        let listing = self.list_log().await?;
+        let Some(newest) = listing.newest_version() else { return Ok(None) };
         let last = at.unwrap_or(newest).min(newest);
         let mut state = TableState::default();
         let next = match listing.checkpoint_before(last) {
@@ -98,8 +98,8 @@ impl<'a> LogFolder<'a> {
 
     /// The table at its newest version, with the files of all versions that the log still holds.
     pub(super) async fn load_all_versions(&self) -> Result<Option<TableState>> {
-        let listing = self.list().await?;
-        let Some(newest) = listing.newest() else { return Ok(None) };
+        let listing = self.list_log().await?;
+        let Some(newest) = listing.newest_version() else { return Ok(None) };
         let mut state = TableState::default();
         let next = match listing.checkpoints.first_key_value() {
             Some((version, checkpoint)) if !listing.commits.contains(&0) => {
@@ -130,7 +130,7 @@ impl<'a> LogFolder<'a> {
         checkpoint: &CheckpointFiles,
     ) -> Result<u64> {
         for file in &checkpoint.files {
-            state.apply(version, self.read_checkpoint(file).await?);
+            state.apply_lines(version, self.read_checkpoint(file).await?);
         }
         Ok(version + 1)
     }
@@ -143,7 +143,7 @@ impl<'a> LogFolder<'a> {
     ) -> Result<()> {
         let commits = futures::stream::iter(versions).map(|version| async move {
             let lines = self.read_commit(version).await?;
-            let missing = || self.damaged(&format!("version {version} is missing, `{}`", commit_name(version)));
+            let missing = || self.damage_error(&format!("version {version} is missing, `{}`", commit_name(version)));
             Ok::<_, Error>((version, lines.ok_or_else(missing)?))
         });
         let mut commits = commits.buffered(CONCURRENT_READS);
@@ -155,7 +155,7 @@ impl<'a> LogFolder<'a> {
 
     /// Brings a state up to the newest version. Returns None if the log was cleaned up beyond it, so that it must be
     /// loaded again; that costs a request, and is looked at only on demand.
-    pub(super) async fn advance(
+    pub(super) async fn advance_state(
         &self,
         mut state: Arc<TableState>,
         is_in_doubt: bool,
@@ -186,7 +186,7 @@ impl<'a> LogFolder<'a> {
         let (mut changes, mut rows) = (Vec::new(), HashMap::new());
         while let Some((version, lines)) = commits.try_next().await? {
             // One that is gone by now was cleaned up.
-            changes.extend(lines.map(|lines| change(version, lines, &mut rows)));
+            changes.extend(lines.map(|lines| table_change(version, lines, &mut rows)));
         }
         Ok(changes)
     }
@@ -196,7 +196,7 @@ impl<'a> LogFolder<'a> {
         match self.store.head(&path).await {
             Ok(_) => Ok(true),
             Err(object_store::Error::NotFound { .. }) => Ok(false),
-            Err(e) => Err(Error::store("read", path, e)),
+            Err(e) => Err(Error::store_failure("read", path, e)),
         }
     }
 
@@ -208,19 +208,19 @@ impl<'a> LogFolder<'a> {
             if let Some(Value::Object(info)) = &mut line.commit_info {
                 info.insert(LINES.to_owned(), lines.len().into());
             }
-            serde_json::to_writer(&mut text, &line).map_err(|e| self.failed("written", e))?;
+            serde_json::to_writer(&mut text, &line).map_err(|e| self.log_error("written", e))?;
             text.push(b'\n');
         }
         let path = self.path.clone().join(commit_name(version));
         match self.store.put_opts(&path, text.into(), PutMode::Create.into()).await {
             Ok(_) => Ok(CommitAttempt::Written),
             Err(object_store::Error::AlreadyExists { .. }) => Ok(CommitAttempt::Taken),
-            Err(e) => Err(Error::store("write", path, e)),
+            Err(e) => Err(Error::store_failure("write", path, e)),
         }
     }
 
     /// Writes a checkpoint and deletes what is older than the log's retention, if this version is due for it.
-    pub(super) async fn maintain(&self, state: &TableState, now: DateTime<Utc>) -> Result<()> {
+    pub(super) async fn maintain_log(&self, state: &TableState, now: DateTime<Utc>) -> Result<()> {
         if !state.version.is_multiple_of(CHECKPOINT_INTERVAL) || state.version == 0 {
             return Ok(());
         }
@@ -230,19 +230,19 @@ impl<'a> LogFolder<'a> {
 
     async fn write_checkpoint(&self, state: &TableState, now: DateTime<Utc>) -> Result<()> {
         let lines = state.checkpoint_lines(now.timestamp_millis());
-        let file = encode_checkpoint(&lines).map_err(|e| self.failed("written", e))?;
+        let file = encode_checkpoint(&lines).map_err(|e| self.log_error("written", e))?;
         let hint = json!({ "version": state.version, "size": lines.len(), "sizeInBytes": file.len(),
             "numOfAddFiles": state.files.len() });
         let path = self.path.clone().join(checkpoint_name(state.version));
-        self.store.put(&path, file.into()).await.map_err(|e| Error::store("write", path, e))?;
+        self.store.put(&path, file.into()).await.map_err(|e| Error::store_failure("write", path, e))?;
         let path = self.path.clone().join(LAST_CHECKPOINT);
-        self.store.put(&path, hint.to_string().into()).await.map_err(|e| Error::store("write", path, e))?;
+        self.store.put(&path, hint.to_string().into()).await.map_err(|e| Error::store_failure("write", path, e))?;
         Ok(())
     }
 
     // Deletes everything before the newest checkpoint that is itself older than the retention.
     async fn delete_expired(&self, now: DateTime<Utc>) -> Result<()> {
-        let listing = self.list().await?;
+        let listing = self.list_log().await?;
         let is_old = |version: &&u64| {
             let path = self.path.clone().join(checkpoint_name(**version));
             listing.modified.get(&path).is_some_and(|modified| now - *modified > LOG_RETENTION)
@@ -253,7 +253,7 @@ impl<'a> LogFolder<'a> {
         for path in commits.chain(checkpoints) {
             match self.store.delete(&path).await {
                 Ok(()) | Err(object_store::Error::NotFound { .. }) => {}
-                Err(e) => return Err(Error::store("delete", path, e)),
+                Err(e) => return Err(Error::store_failure("delete", path, e)),
             }
         }
         Ok(())
@@ -261,24 +261,32 @@ impl<'a> LogFolder<'a> {
 
     /// Returns the versions since the newest checkpoint, if another one was due long ago.
     pub(super) async fn overdue_checkpoint(&self) -> Result<Option<u64>> {
-        let listing = self.list().await?;
-        let since = listing.newest().unwrap_or(0) - listing.checkpoints.keys().next_back().copied().unwrap_or(0);
+        let listing = self.list_log().await?;
+        let since =
+            listing.newest_version().unwrap_or(0) - listing.checkpoints.keys().next_back().copied().unwrap_or(0);
         Ok((since >= 2 * CHECKPOINT_INTERVAL).then_some(since))
     }
 
     /// Deletes the log.
-    pub(super) async fn delete(&self) -> Result<()> {
-        let listed: Vec<_> =
-            self.store.list(Some(&self.path)).try_collect().await.map_err(|e| Error::store("list", &self.path, e))?;
+    pub(super) async fn delete_log(&self) -> Result<()> {
+        let listed: Vec<_> = self
+            .store
+            .list(Some(&self.path))
+            .try_collect()
+            .await
+            .map_err(|e| Error::store_failure("list", &self.path, e))?;
         for object in listed {
-            self.store.delete(&object.location).await.map_err(|e| Error::store("delete", object.location, e))?;
+            self.store
+                .delete(&object.location)
+                .await
+                .map_err(|e| Error::store_failure("delete", object.location, e))?;
         }
         Ok(())
     }
 
-    async fn list(&self) -> Result<LogListing> {
+    async fn list_log(&self) -> Result<LogListing> {
         let there = self.store.list_with_delimiter(Some(&self.path)).await;
-        let there = there.map_err(|e| Error::store("list", &self.path, e))?;
+        let there = there.map_err(|e| Error::store_failure("list", &self.path, e))?;
         let mut listing = LogListing::default();
         for object in there.objects {
             if let Some(version) = commit_number(&object.location) {
@@ -296,7 +304,7 @@ impl<'a> LogFolder<'a> {
 
     async fn read_commit(&self, version: u64) -> Result<Option<Vec<LogLine>>> {
         let path = self.path.clone().join(commit_name(version));
-        let Some(bytes) = self.read(&path).await? else { return Ok(None) };
+        let Some(bytes) = self.read_object(&path).await? else { return Ok(None) };
         let mut lines = Vec::new();
         for (number, line) in bytes.split(|b| *b == b'\n').enumerate().filter(|(_, line)| !line.trim_ascii().is_empty())
         {
@@ -304,7 +312,7 @@ impl<'a> LogFolder<'a> {
                 let (told, place) = (e.to_string(), format!("line {}, column {}", number + 1, e.column()));
                 // serde counts lines within this one.
                 let reason = told.split(" at line ").next().unwrap_or_default();
-                self.damaged(&format!("`{}` {place}: expected an action, {reason}", commit_name(version)))
+                self.damage_error(&format!("`{}` {place}: expected an action, {reason}", commit_name(version)))
             })?;
             lines.push(line);
         }
@@ -323,26 +331,28 @@ impl<'a> LogFolder<'a> {
             None => return Ok(()),
         };
         let found = if lines.is_empty() { "none".to_owned() } else { lines.len().to_string() };
-        Err(self.damaged(&format!("`{}`: expected {expected}, found {found}", commit_name(version))))
+        Err(self.damage_error(&format!("`{}`: expected {expected}, found {found}", commit_name(version))))
     }
 
     async fn read_checkpoint(&self, path: &Path) -> Result<Vec<LogLine>> {
         let name = path.filename().unwrap_or_default();
-        let bytes = self.read(path).await?.ok_or_else(|| self.damaged(&format!("`{name}` is gone")))?;
-        decode_checkpoint(bytes).map_err(|e| self.damaged(&format!("`{name}`: {e}")))
+        let bytes = self.read_object(path).await?.ok_or_else(|| self.damage_error(&format!("`{name}` is gone")))?;
+        decode_checkpoint(bytes).map_err(|e| self.damage_error(&format!("`{name}`: {e}")))
     }
 
-    async fn read(&self, path: &Path) -> Result<Option<bytes::Bytes>> {
+    async fn read_object(&self, path: &Path) -> Result<Option<bytes::Bytes>> {
         let read = async { self.store.get(path).await?.bytes().await };
         match read.await {
             Ok(bytes) => Ok(Some(bytes)),
             Err(object_store::Error::NotFound { .. }) => Ok(None),
-            Err(e) => Err(Error::store("read", path, e)),
+            Err(e) => Err(Error::store_failure("read", path, e)),
         }
     }
 
     fn check_readable(&self, state: &TableState) -> Result<()> {
-        let Some(protocol) = &state.protocol else { return Err(self.damaged("it names no version of the protocol")) };
+        let Some(protocol) = &state.protocol else {
+            return Err(self.damage_error("it names no version of the protocol"));
+        };
         self.check_protocol("read", "reader", "reads", protocol.min_reader_version, READER_VERSION)
     }
 
@@ -360,14 +370,14 @@ impl<'a> LogFolder<'a> {
             "another program has raised it to Delta's {role} version {needed}, echolake {verb} version {supported}; {}",
             rebuild_hint(self.table)
         );
-        Err(self.failed(action, reason))
+        Err(self.log_error(action, reason))
     }
 
-    fn damaged(&self, what: &str) -> Error {
-        self.failed("read", format!("{what}; {}", rebuild_hint(self.table)))
+    fn damage_error(&self, what: &str) -> Error {
+        self.log_error("read", format!("{what}; {}", rebuild_hint(self.table)))
     }
 
-    fn failed(&self, action: &'static str, source: impl Into<ErrorCause>) -> Error {
+    fn log_error(&self, action: &'static str, source: impl Into<ErrorCause>) -> Error {
         Error::Log { table: self.table.name(), action, source: source.into() }
     }
 }
@@ -378,7 +388,7 @@ pub(super) fn own_protocol() -> super::actions::ProtocolVersions {
 }
 
 impl LogListing {
-    fn newest(&self) -> Option<u64> {
+    fn newest_version(&self) -> Option<u64> {
         self.commits.last().copied().max(self.checkpoints.last_key_value().map(|(version, _)| *version))
     }
 
@@ -403,7 +413,7 @@ fn checkpoint_number(path: &Path) -> Option<(u64, usize)> {
 }
 
 // `rows` are those of each file that came so far.
-fn change(version: TableVersion, lines: Vec<LogLine>, rows: &mut HashMap<String, Option<u64>>) -> TableChange {
+fn table_change(version: TableVersion, lines: Vec<LogLine>, rows: &mut HashMap<String, Option<u64>>) -> TableChange {
     let mut change = TableChange {
         version,
         operation: None,
@@ -465,31 +475,31 @@ mod tests {
                 lines.push(serde_json::from_str(PROTOCOL).expect("a line"));
             }
             assert_eq!(log.write_commit(version, &lines).await.expect("written"), CommitAttempt::Written);
-            state.apply(version, lines);
-            log.maintain(&state, Utc::now()).await.expect("maintained");
+            state.apply_lines(version, lines);
+            log.maintain_log(&state, Utc::now()).await.expect("maintained");
         }
         state
     }
 
     async fn load_error(store: &InMemory) -> String {
-        LogFolder::new(Table::Nce, store).load(None).await.expect_err("refused").to_string()
+        LogFolder::new(Table::Nce, store).load_state(None).await.expect_err("refused").to_string()
     }
 
     #[tokio::test]
     async fn every_version_is_read_with_and_without_a_checkpoint() {
         let store = InMemory::new();
-        assert!(LogFolder::new(Table::Nce, &store).load(None).await.expect("read").is_none(), "no log yet");
+        assert!(LogFolder::new(Table::Nce, &store).load_state(None).await.expect("read").is_none(), "no log yet");
         write_log(&store, 205).await;
         let log = LogFolder::new(Table::Nce, &store);
         for version in [0, 1, 99, 100, 101, 150, 200, 204] {
-            let state = log.load(Some(version)).await.expect("read").expect("a table");
+            let state = log.load_state(Some(version)).await.expect("read").expect("a table");
             assert_eq!((state.version, state.files.len() as u64), (version, version + 1));
         }
         // Before a checkpoint, commits may be cleaned up.
         for version in 0..150 {
             store.delete(&path(&commit_name(version))).await.expect("deleted");
         }
-        assert_eq!(log.load(None).await.expect("read").expect("a table").files.len(), 205);
+        assert_eq!(log.load_state(None).await.expect("read").expect("a table").files.len(), 205);
         store.delete(&path(&commit_name(202))).await.expect("deleted");
         let error = load_error(&store).await;
         assert!(error.contains("version 202 is missing") && error.contains("hint"), "{error}");
@@ -502,13 +512,13 @@ mod tests {
         let log = LogFolder::new(Table::Nce, &store);
         assert_eq!(log.write_commit(2, &[add("late")]).await.expect("tried"), CommitAttempt::Taken);
         log.write_commit(3, &[add("new")]).await.expect("written");
-        let advanced = log.advance(state.clone(), true).await.expect("read").expect("followed");
+        let advanced = log.advance_state(state.clone(), true).await.expect("read").expect("followed");
         assert_eq!((advanced.version, advanced.files.len()), (3, 4));
         // A log that was cleaned up beyond what is known has neither that version nor the next.
         for version in 0..4 {
             store.delete(&path(&commit_name(version))).await.expect("deleted");
         }
-        assert!(log.advance(state, true).await.expect("read").is_none());
+        assert!(log.advance_state(state, true).await.expect("read").is_none());
     }
 
     #[tokio::test]
@@ -521,7 +531,7 @@ mod tests {
         log.delete_expired(Utc::now() + LOG_RETENTION + TimeDelta::minutes(1)).await.expect("deleted");
         assert!(!log.has_version(199).await.expect("looked") && log.has_version(200).await.expect("looked"));
         assert!(store.head(&path(&checkpoint_name(100))).await.is_err());
-        let loaded = log.load(None).await.expect("read").expect("a table");
+        let loaded = log.load_state(None).await.expect("read").expect("a table");
         assert!(loaded.files.keys().eq(state.files.keys()));
     }
 
@@ -542,14 +552,14 @@ mod tests {
             assert!(error.contains(said) && error.contains("`echolake rebuild nce`"), "{kept}: {error}");
         }
         put(&store, &commit_name(1), whole).await;
-        assert_eq!(log.load(None).await.expect("read").expect("a table").files.len(), 2);
+        assert_eq!(log.load_state(None).await.expect("read").expect("a table").files.len(), 2);
         let text = |line: LogLine| serde_json::to_string(&line).expect("text");
         for (number, readable) in [(text(info("echolake/0.9.0")), false), (text(info("delta-rs:1.5.0")), true)] {
             put(&store, &commit_name(2), number.clone()).await;
-            assert_eq!(log.load(None).await.is_ok(), readable, "{number}");
+            assert_eq!(log.load_state(None).await.is_ok(), readable, "{number}");
         }
         put(&store, &commit_name(2), format!("{}\n{}", text(info("echolake/0.9.0")), text(add("c")))).await;
-        assert_eq!(log.load(None).await.expect("read").expect("a table").files.len(), 3);
+        assert_eq!(log.load_state(None).await.expect("read").expect("a table").files.len(), 3);
     }
 
     #[tokio::test]
@@ -570,10 +580,10 @@ mod tests {
         let part = format!("{:020}.checkpoint.0000000001.0000000002.parquet", 0);
         put(&store, &part, "one of two").await;
         let log = LogFolder::new(Table::Nce, &store);
-        let state = log.load(None).await.expect("read").expect("a table");
+        let state = log.load_state(None).await.expect("read").expect("a table");
         log.check_writable(&state).expect("ours");
         put(&store, &commit_name(1), r#"{"protocol":{"minReaderVersion":1,"minWriterVersion":7}}"#).await;
-        let state = log.load(None).await.expect("read").expect("a table");
+        let state = log.load_state(None).await.expect("read").expect("a table");
         assert!(log.check_writable(&state).expect_err("newer").to_string().contains("writer version 7"));
     }
 }

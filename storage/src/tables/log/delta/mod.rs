@@ -28,7 +28,7 @@ use self::actions::{AddFile, FileFormat, LogLine, TableMetadata};
 use self::log_folder::{CommitAttempt, LogFolder, own_protocol, rebuild_hint};
 use self::table_state::{ENGINE, TableState, mark_rebuild};
 use crate::location::LakeLocation;
-use crate::remote::backoff;
+use crate::remote::backoff_time;
 use crate::tables::file_name::{is_merged, table_folder};
 use crate::tables::run_parts::{decode_parts, encode_parts};
 use crate::{
@@ -83,12 +83,12 @@ impl DeltaLog {
     // Writers that met once do not meet again at once. On a folder, the next try costs nothing.
     async fn wait_after_loss(&self, losses: usize) {
         if self.is_remote {
-            tokio::time::sleep(backoff(u32::try_from(losses).unwrap_or(u32::MAX))).await;
+            tokio::time::sleep(backoff_time(u32::try_from(losses).unwrap_or(u32::MAX))).await;
         }
     }
 
     /// The table as of now, or None if it has no log.
-    async fn load(&self, table: Table) -> Result<Option<Arc<TableState>>> {
+    async fn load_table(&self, table: Table) -> Result<Option<Arc<TableState>>> {
         let log = self.log_folder(table);
         let known = self.loaded.lock().await.get(&table).cloned();
         let mut found = Instant::now();
@@ -98,12 +98,12 @@ impl DeltaLog {
                 if !is_in_doubt {
                     found = known.found;
                 }
-                log.advance(known.state, is_in_doubt).await?
+                log.advance_state(known.state, is_in_doubt).await?
             }
             None => None,
         };
         if state.is_none() {
-            state = log.load(None).await?.map(Arc::new);
+            state = log.load_state(None).await?.map(Arc::new);
         }
         let mut loaded = self.loaded.lock().await;
         match &state {
@@ -115,17 +115,17 @@ impl DeltaLog {
 
     /// The id that a table was given when it was made.
     pub(crate) async fn table_id(&self, table: Table) -> Result<Option<String>> {
-        Ok(self.load(table).await?.and_then(|state| Some(state.metadata.as_ref()?.id.clone())))
+        Ok(self.load_table(table).await?.and_then(|state| Some(state.metadata.as_ref()?.id.clone())))
     }
 
     // The state of a recent look, where a look takes long; what is written against an older one than the newest fails.
-    async fn known(&self, table: Table) -> Option<Arc<TableState>> {
+    async fn known_state(&self, table: Table) -> Option<Arc<TableState>> {
         let known = self.loaded.lock().await.get(&table).cloned();
         known.filter(|known| self.is_remote && known.found.elapsed() <= LOG_LASTS).map(|known| known.state)
     }
 
-    async fn require(&self, table: Table) -> Result<Arc<TableState>> {
-        self.load(table).await?.ok_or_else(|| Error::Log {
+    async fn require_table(&self, table: Table) -> Result<Arc<TableState>> {
+        self.load_table(table).await?.ok_or_else(|| Error::Log {
             table: table.name(),
             action: "read",
             source: "it has no log; hint: `echolake ingest` makes it again from the runs".into(),
@@ -144,7 +144,7 @@ impl DeltaLog {
             let info = commit_info("ADD COLUMNS", json!({ "columns": added }), Utc::now().timestamp_millis());
             let lines = [info, LogLine { meta_data: Some(metadata), ..LogLine::default() }];
             let attempt = log.write_commit(state.version + 1, &lines).await?;
-            state = self.require(table).await?;
+            state = self.require_table(table).await?;
             if attempt == CommitAttempt::Written {
                 return Ok(());
             }
@@ -157,7 +157,8 @@ impl DeltaLog {
     pub(crate) async fn set_rebuilding(&self, is_rebuilding: bool) -> Result<()> {
         let table = Table::Runs;
         for losses in 1..=COMMIT_TRIES {
-            let Some(state) = self.load(table).await?.filter(|state| state.is_rebuilding() != is_rebuilding) else {
+            let Some(state) = self.load_table(table).await?.filter(|state| state.is_rebuilding() != is_rebuilding)
+            else {
                 return Ok(());
             };
             let log = self.log_folder(table);
@@ -175,7 +176,7 @@ impl DeltaLog {
 
     /// Deletes a table's log.
     pub(crate) async fn delete_log(&self, table: Table) -> Result<()> {
-        self.log_folder(table).delete().await?;
+        self.log_folder(table).delete_log().await?;
         self.loaded.lock().await.remove(&table);
         Ok(())
     }
@@ -200,7 +201,7 @@ impl DeltaLog {
             let mut state = TableState::clone(state);
             state.apply_commit(state.version + 1, lines);
             // The commit is done; a checkpoint only spares readers some work, and the next one makes up for it.
-            if let Err(error) = log.maintain(&state, now).await {
+            if let Err(error) = log.maintain_log(&state, now).await {
                 let (table, error) = (table.name(), &error as &dyn std::error::Error);
                 tracing::warn!(table, error, "the log's checkpoint cannot be written, or old versions not be deleted");
             }
@@ -228,15 +229,15 @@ struct PendingChange<'a> {
 }
 
 impl<'a> PendingChange<'a> {
-    fn of(commit: &'a TableCommit, mut known: HashMap<String, KnownFile>) -> Self {
+    fn from_commit(commit: &'a TableCommit, mut known: HashMap<String, KnownFile>) -> Self {
         let gone = commit.remove.iter().filter(|file| is_known(file, &known));
         let remove = gone.map(|file| file.name.clone()).collect();
         let (effect, removal) = (commit.effect, commit.removal.as_ref());
         let mut change = Self { outcomes: Vec::new(), add: Vec::new(), remove, effect, removal };
         for file in &commit.add {
-            let outcome = change.outcome(file, &known);
+            let outcome = change.decide_outcome(file, &known);
             if outcome == CommitOutcome::Now {
-                for replaced in file.replaces.iter().flat_map(ReplacedFiles::removed) {
+                for replaced in file.replaces.iter().flat_map(ReplacedFiles::removed_files) {
                     known.remove(&replaced.name);
                     change.remove.insert(replaced.name.clone());
                 }
@@ -277,16 +278,15 @@ impl<'a> PendingChange<'a> {
 
     // An Add whose author had not seen the row of the run that this one will replace may be cleaned up at any moment; it
     // is added again.
-    fn outcome(&self, file: &NewFile, known: &HashMap<String, KnownFile>) -> CommitOutcome {
+    fn decide_outcome(&self, file: &NewFile, known: &HashMap<String, KnownFile>) -> CommitOutcome {
         if known.get(&file.name).is_some_and(|known| known.seen_runs >= file.run_version) {
             return CommitOutcome::Before;
         }
         let Some(replaces) = &file.replaces else { return CommitOutcome::Now };
         let expected = replaces.files.iter().all(|file| is_known(file, known));
-        let alone = replaces
-            .prefix
-            .as_ref()
-            .is_none_or(|prefix| known.keys().filter(|n| n.starts_with(prefix)).count() == replaces.removed().count());
+        let alone = replaces.prefix.as_ref().is_none_or(|prefix| {
+            known.keys().filter(|n| n.starts_with(prefix)).count() == replaces.removed_files().count()
+        });
         if expected && alone { CommitOutcome::Now } else { CommitOutcome::Outdated }
     }
 }
@@ -300,7 +300,7 @@ pub(crate) async fn has_run_files(store: &dyn ObjectStore) -> Result<bool> {
     let folder = Path::from(RUNS);
     let is_run = |path: &Path| path.extension() == Some("mcap");
     let mut listed = store.list(Some(&folder));
-    while let Some(object) = listed.try_next().await.map_err(|e| Error::store("list", &folder, e))? {
+    while let Some(object) = listed.try_next().await.map_err(|e| Error::store_failure("list", &folder, e))? {
         if is_run(&object.location) {
             return Ok(true);
         }
@@ -310,10 +310,10 @@ pub(crate) async fn has_run_files(store: &dyn ObjectStore) -> Result<bool> {
 
 #[async_trait]
 impl CommitLog for DeltaLog {
-    async fn ensure(&self, table: Table) -> Result<()> {
-        let known = match self.known(table).await {
+    async fn ensure_table(&self, table: Table) -> Result<()> {
+        let known = match self.known_state(table).await {
             Some(state) => Some(state),
-            None => self.load(table).await?,
+            None => self.load_table(table).await?,
         };
         if let Some(state) = known {
             return self.add_columns(table, state).await;
@@ -340,8 +340,8 @@ impl CommitLog for DeltaLog {
         self.log_folder(table).write_commit(0, &lines).await.map(drop)
     }
 
-    async fn view(&self, table: Table) -> Result<Option<TableView>> {
-        let Some(state) = self.load(table).await? else { return Ok(None) };
+    async fn view_table(&self, table: Table) -> Result<Option<TableView>> {
+        let Some(state) = self.load_table(table).await? else { return Ok(None) };
         let is_rebuilding = table == Table::Runs && state.is_rebuilding();
         Ok(Some(TableView { version: state.version, files: data_files(table, &state)?, is_rebuilding }))
     }
@@ -350,24 +350,24 @@ impl CommitLog for DeltaLog {
         self.loaded.lock().await.get(&table).map(|known| known.state.version)
     }
 
-    async fn version(&self, table: Table) -> Result<Option<u64>> {
-        Ok(self.load(table).await?.map(|state| state.version))
+    async fn newest_version(&self, table: Table) -> Result<Option<u64>> {
+        Ok(self.load_table(table).await?.map(|state| state.version))
     }
 
     async fn has_after(&self, table: Table, version: u64) -> Result<bool> {
         self.log_folder(table).has_version(version + 1).await
     }
 
-    async fn versions(&self, table: Table) -> Result<Vec<TableVersion>> {
+    async fn list_versions(&self, table: Table) -> Result<Vec<TableVersion>> {
         self.log_folder(table).list_versions().await
     }
 
-    async fn changes(&self, table: Table) -> Result<Vec<TableChange>> {
+    async fn list_changes(&self, table: Table) -> Result<Vec<TableChange>> {
         self.log_folder(table).list_changes().await
     }
 
     async fn files_at(&self, table: Table, version: u64) -> Result<Vec<DataFile>> {
-        match self.log_folder(table).load(Some(version)).await? {
+        match self.log_folder(table).load_state(Some(version)).await? {
             Some(state) => data_files(table, &state),
             None => Ok(Vec::new()),
         }
@@ -380,16 +380,16 @@ impl CommitLog for DeltaLog {
         }
     }
 
-    async fn has(&self, table: Table, name: &str) -> Result<bool> {
+    async fn has_file(&self, table: Table, name: &str) -> Result<bool> {
         let has = |state: &TableState| state.files.keys().any(|path| decoded_name(path) == name);
-        if self.known(table).await.is_some_and(|state| has(&state)) {
+        if self.known_state(table).await.is_some_and(|state| has(&state)) {
             return Ok(true);
         }
-        Ok(self.load(table).await?.is_some_and(|state| has(&state)))
+        Ok(self.load_table(table).await?.is_some_and(|state| has(&state)))
     }
 
-    async fn history(&self, table: Table) -> Result<Option<FileHistory>> {
-        let Some(state) = self.load(table).await? else { return Ok(None) };
+    async fn file_history(&self, table: Table) -> Result<Option<FileHistory>> {
+        let Some(state) = self.load_table(table).await? else { return Ok(None) };
         let removed = state.removed.values().map(|remove| {
             let at = remove.deletion_timestamp.and_then(DateTime::from_timestamp_millis);
             (file_name(&remove.path), at.unwrap_or_default())
@@ -398,14 +398,14 @@ impl CommitLog for DeltaLog {
         Ok(Some(FileHistory { current, removed: removed.collect() }))
     }
 
-    async fn commit(&self, table: Table, commit: &TableCommit) -> Result<Vec<CommitOutcome>> {
-        let mut known = self.known(table).await;
+    async fn commit_change(&self, table: Table, commit: &TableCommit) -> Result<Vec<CommitOutcome>> {
+        let mut known = self.known_state(table).await;
         for losses in 1..=COMMIT_TRIES {
             let (state, is_newest) = match known.take() {
                 Some(state) => (state, false),
-                None => (self.require(table).await?, true),
+                None => (self.require_table(table).await?, true),
             };
-            let change = PendingChange::of(commit, known_files(&state));
+            let change = PendingChange::from_commit(commit, known_files(&state));
             // Only the newest version tells what is not to be written.
             if !is_newest && !change.is_all_of(commit) {
                 continue;
@@ -464,8 +464,8 @@ fn data_file(table: Table, add: &AddFile) -> Result<DataFile> {
         log_version: number_tag(add, LOG_VERSION),
         seen_runs: number_tag(add, SEEN_RUNS),
         stats: stats.map(file_stats),
-        row_counts: tag(add, ROWS).and_then(|text| serde_json::from_str(text).ok()),
-        parts: if is_merged(&name) { parts(table, add)? } else { Vec::new() },
+        row_counts: find_tag(add, ROWS).and_then(|text| serde_json::from_str(text).ok()),
+        parts: if is_merged(&name) { parts_of_file(table, add)? } else { Vec::new() },
         hidden: Vec::new(),
         path: table_folder(table).join(name),
     })
@@ -486,20 +486,20 @@ fn decoded_name(path: &str) -> Cow<'_, str> {
     percent_decode_str(path).decode_utf8_lossy()
 }
 
-fn tag<'a>(add: &'a AddFile, name: &str) -> Option<&'a str> {
+fn find_tag<'a>(add: &'a AddFile, name: &str) -> Option<&'a str> {
     add.tags.as_ref()?.get(name)?.as_deref()
 }
 
 // Adds of earlier versions of the program have no such tags.
 fn number_tag(add: &AddFile, name: &str) -> u64 {
-    tag(add, name).and_then(|text| text.parse().ok()).unwrap_or(0)
+    find_tag(add, name).and_then(|text| text.parse().ok()).unwrap_or(0)
 }
 
-fn parts(table: Table, add: &AddFile) -> Result<Vec<RunPart>> {
-    let counts = tag(add, ROWS).and_then(|text| serde_json::from_str::<Vec<Option<RunRowCounts>>>(text).ok());
+fn parts_of_file(table: Table, add: &AddFile) -> Result<Vec<RunPart>> {
+    let counts = find_tag(add, ROWS).and_then(|text| serde_json::from_str::<Vec<Option<RunRowCounts>>>(text).ok());
     let mut counts = counts.unwrap_or_default().into_iter();
     let counted = |part| RunPart { row_counts: counts.next().flatten(), ..part };
-    let parts = tag(add, PARTS).and_then(decode_parts).map(|parts| parts.into_iter().map(counted).collect());
+    let parts = find_tag(add, PARTS).and_then(decode_parts).map(|parts| parts.into_iter().map(counted).collect());
     parts.ok_or_else(|| {
         let source = format!("`{}` has lost the list of its parts; {}", add.path, rebuild_hint(table)).into();
         Error::Log { table: table.name(), action: "read", source }
@@ -619,7 +619,7 @@ mod tests {
             remove: vec![logged("c", 3), logged("d", 3), logged("e", 2)],
             ..TableCommit::default()
         };
-        let change = PendingChange::of(&commit, names(&["a", "c", "e"]));
+        let change = PendingChange::from_commit(&commit, names(&["a", "c", "e"]));
         assert_eq!(change.outcomes, [CommitOutcome::Before, CommitOutcome::Now, CommitOutcome::Before]);
         assert_eq!(change.add.iter().map(|f| f.name.as_str()).collect::<Vec<_>>(), ["b"]);
         assert_eq!(change.remove.iter().collect::<Vec<_>>(), ["c"]);
@@ -630,7 +630,7 @@ mod tests {
         let outcome = |run_version| {
             let commit =
                 TableCommit { add: vec![NewFile { run_version, ..file("a", None) }], ..TableCommit::default() };
-            PendingChange::of(&commit, names(&["a"])).outcomes[0]
+            PendingChange::from_commit(&commit, names(&["a"])).outcomes[0]
         };
         assert_eq!([0, 5, 6].map(outcome), [CommitOutcome::Before, CommitOutcome::Before, CommitOutcome::Now]);
     }
@@ -639,7 +639,7 @@ mod tests {
     fn a_file_takes_the_place_of_what_it_expects_there_and_of_nothing_else() {
         let outcomes = |add: Vec<NewFile>, there: &[&str]| {
             let commit = TableCommit { add, ..TableCommit::default() };
-            let change = PendingChange::of(&commit, names(there));
+            let change = PendingChange::from_commit(&commit, names(there));
             (change.outcomes.clone(), change.remove.into_iter().collect::<Vec<_>>())
         };
         let new = || file("x.2", Some(("x.", &["x.1"])));

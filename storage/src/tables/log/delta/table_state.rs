@@ -33,7 +33,7 @@ pub(super) const ENGINE: &str = "echolake/";
 
 impl TableState {
     /// Applies the actions of a version, or of a checkpoint.
-    pub(super) fn apply(&mut self, version: u64, lines: Vec<LogLine>) {
+    pub(super) fn apply_lines(&mut self, version: u64, lines: Vec<LogLine>) {
         self.version = version;
         for line in lines {
             self.apply_line(line);
@@ -43,7 +43,7 @@ impl TableState {
     /// Applies the actions of a version, and looks at whose they are.
     pub(super) fn apply_commit(&mut self, version: u64, lines: Vec<LogLine>) {
         self.look_at_author(&lines);
-        self.apply(version, lines);
+        self.apply_lines(version, lines);
     }
 
     /// Looks at whose a commit is that may have been applied with a checkpoint.
@@ -78,7 +78,7 @@ impl TableState {
 
     /// Applies the actions of a version but for removals.
     pub(super) fn apply_additions(&mut self, version: u64, lines: Vec<LogLine>) {
-        self.apply(version, lines.into_iter().map(|line| LogLine { remove: None, ..line }).collect());
+        self.apply_lines(version, lines.into_iter().map(|line| LogLine { remove: None, ..line }).collect());
     }
 
     fn apply_line(&mut self, line: LogLine) {
@@ -156,7 +156,7 @@ mod tests {
             state.apply_commit(state.version + 1, lines.iter().map(|json| line(json)).collect());
             assert_eq!(state.is_rebuilding(), expected, "{lines:?}");
             let mut from_checkpoint = TableState::default();
-            from_checkpoint.apply(state.version, state.checkpoint_lines(0));
+            from_checkpoint.apply_lines(state.version, state.checkpoint_lines(0));
             assert_eq!(from_checkpoint.is_rebuilding(), expected, "{lines:?}, from a checkpoint");
         };
         check(&[own, metadata, add], false);
@@ -169,7 +169,7 @@ mod tests {
     #[test]
     fn later_actions_win_and_a_checkpoint_says_the_same() {
         let mut state = TableState::default();
-        state.apply(
+        state.apply_lines(
             0,
             vec![
                 line(r#"{"commitInfo":{"timestamp":1}}"#),
@@ -179,7 +179,7 @@ mod tests {
                 line(r#"{"add":{"path":"b","partitionValues":{},"size":2,"modificationTime":1,"dataChange":true}}"#),
             ],
         );
-        state.apply(
+        state.apply_lines(
             1,
             vec![
                 line(r#"{"remove":{"path":"a","deletionTimestamp":1000,"dataChange":true}}"#),
@@ -189,7 +189,7 @@ mod tests {
             ],
         );
         let again = r#"{"add":{"path":"b","partitionValues":{},"size":3,"modificationTime":2,"dataChange":true}}"#;
-        state.apply(2, vec![line(again)]);
+        state.apply_lines(2, vec![line(again)]);
         let check = |state: &TableState, removed: &[&str]| {
             assert_eq!(state.files.values().map(|f| (f.path.as_str(), f.size)).collect::<Vec<_>>(), [("b", 3)]);
             assert_eq!(state.removed.keys().map(String::as_str).collect::<Vec<_>>(), removed);
@@ -199,7 +199,7 @@ mod tests {
         check(&state, &["a"]);
         for (now, removed) in [(1000 + TOMBSTONE_MILLIS - 1, &["a"][..]), (1000 + TOMBSTONE_MILLIS, &[])] {
             let mut from_checkpoint = TableState::default();
-            from_checkpoint.apply(2, state.checkpoint_lines(now));
+            from_checkpoint.apply_lines(2, state.checkpoint_lines(now));
             check(&from_checkpoint, removed);
         }
     }

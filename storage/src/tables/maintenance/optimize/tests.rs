@@ -20,7 +20,7 @@ use parquet::basic::Encoding;
 use parquet::file::metadata::{PageIndexPolicy, ParquetMetaDataReader};
 
 use super::*;
-use crate::{ReferenceSurfaces, VisibleRun, encode};
+use crate::{ReferenceSurfaces, VisibleRun, encode_batches};
 
 const TABLE: Table = Table::Nce;
 const ROWS: usize = 20;
@@ -89,29 +89,29 @@ async fn put(lake: &Lake, surface: &str, run: &str, derivation: &str, value: usi
         let schema = table.schema(lake.rig());
         let columns = schema.fields().iter().map(|f| column(f, surface, run, value)).collect();
         let rows = RecordBatch::try_new(schema.clone(), columns).expect("rows");
-        let file = encode(table, &schema, &[rows]).expect("encoded");
-        staged.push(lake.stage(table, &name, file).await.expect("staged"));
+        let file = encode_batches(table, &schema, &[rows]).expect("encoded");
+        staged.push(lake.stage_file(table, &name, file).await.expect("staged"));
     }
-    let row = staged.pop().expect("the run's row").replacing(&pointer, &old);
+    let row = staged.pop().expect("the run's row").with_replaced_rows(&pointer, &old);
     staged.push(row);
-    lake.commit(&staged).await.expect("committed");
+    lake.commit_staged(&staged).await.expect("committed");
 }
 
 /// The rows that readers see, sorted by surface and run.
 async fn seen(lake: &Lake) -> RecordBatch {
     let snapshot = lake.snapshot().await.expect("a view");
-    let mut slices: Vec<_> = snapshot.files(TABLE).iter().flat_map(slices).collect();
-    slices.sort_by(|a, b| key(&a.part).cmp(&key(&b.part)));
+    let mut slices: Vec<_> = snapshot.files(TABLE).iter().flat_map(run_slices).collect();
+    slices.sort_by(|a, b| part_key(&a.part).cmp(&part_key(&b.part)));
     let mut batches = Vec::new();
     for slice in slices {
-        let rows = lake.rows(TABLE, slice.file, &[], slice.rows).await.expect("a stream");
+        let rows = lake.read_rows(TABLE, slice.file, &[], slice.rows).await.expect("a stream");
         batches.extend(rows.try_collect::<Vec<_>>().await.expect("rows"));
     }
     concat_batches(&TABLE.schema(lake.rig()), &batches).expect("rows of one schema")
 }
 
 async fn files(lake: &Lake) -> Vec<DataFile> {
-    lake.log().files(TABLE).await.expect("a log")
+    lake.commit_log().list_files(TABLE).await.expect("a log")
 }
 
 async fn optimize(lake: &Lake) -> OptimizeReport {
@@ -205,7 +205,7 @@ async fn a_merge_of_what_is_replaced_meanwhile_changes_nothing() {
     put(&lake, "flat", "r1", "d2", 77).await;
     lake.remove_superseded().await.expect("cleaned up");
     let (before, named) = (seen(&lake).await, files(&lake).await);
-    let (outcome, _) = lake.merge(TABLE, &planned, CommitEffect::Layout.into(), None).await.expect("no error");
+    let (outcome, _) = lake.merge_files(TABLE, &planned, CommitEffect::Layout.into(), None).await.expect("no error");
     assert_eq!(outcome, CommitOutcome::Outdated);
     assert_eq!(files(&lake).await, named);
     assert!(seen(&lake).await == before, "other rows");
@@ -222,7 +222,7 @@ async fn of_two_merges_at_once_one_is_made() {
             let (store, planned) = (store.clone(), planned.clone());
             tokio::spawn(async move {
                 let lake = open(&store).await;
-                lake.merge(TABLE, &planned[range], CommitEffect::Layout.into(), None).await.expect("no error").0
+                lake.merge_files(TABLE, &planned[range], CommitEffect::Layout.into(), None).await.expect("no error").0
             })
         };
         let (a, b) = tokio::join!(merge(0..4), merge(1..5));
@@ -256,7 +256,7 @@ async fn vacuum_deletes_what_is_merged_and_nothing_that_is_named() {
     let (store, lake) = five().await;
     let mut singles = Vec::new();
     for table in [TABLE, Table::Runs, Table::Surfaces] {
-        singles.extend(lake.log().files(table).await.expect("a log"));
+        singles.extend(lake.commit_log().list_files(table).await.expect("a log"));
     }
     optimize(&lake).await;
     let before = seen(&lake).await;
@@ -292,7 +292,7 @@ fn reader_of(lake: &Lake, projects: &[&str]) -> Lake {
 
 async fn seen_runs(lake: &Lake) -> Vec<String> {
     let snapshot = lake.snapshot().await.expect("a view");
-    let mut rows: Vec<_> = snapshot.files(TABLE).iter().flat_map(slices).map(|s| s.part.run.to_string()).collect();
+    let mut rows: Vec<_> = snapshot.files(TABLE).iter().flat_map(run_slices).map(|s| s.part.run.to_string()).collect();
     rows.sort();
     assert_eq!(rows, snapshot.runs().map(|run| run.run.to_string()).collect::<Vec<_>>());
     rows
@@ -305,7 +305,7 @@ async fn readers_of_projects_see_their_runs_and_the_references() {
         let reader = reader_of(&lake, projects);
         assert_eq!(seen_runs(&reader).await, expected, "{projects:?}");
         let newest: u64 = expected.last().map_or(0, |run| run[1..].parse().expect("a number"));
-        let versions = reader.versions().await.expect("versions");
+        let versions = reader.list_versions().await.expect("versions");
         assert_eq!(versions.last().map(|version| version.version), Some(newest + 1), "{projects:?}");
         for version in versions.iter().map(|version| version.version) {
             let then = reader.snapshot_at(version, TABLE).await.expect("held");
@@ -313,7 +313,7 @@ async fn readers_of_projects_see_their_runs_and_the_references() {
             let expected = expected.iter().filter(|run| run[1..].parse::<u64>().expect("a number") < version);
             assert_eq!(runs, expected.copied().collect::<Vec<_>>(), "{projects:?} {version}");
         }
-        let changes = reader.log().changes(TABLE).await.expect("changes");
+        let changes = reader.commit_log().list_changes(TABLE).await.expect("changes");
         assert_eq!(changes.iter().map(|change| change.files_added).sum::<u64>(), expected.len() as u64);
     };
     check(&["a"], &["r0", "r1", "r2", "r3"]).await;
@@ -339,7 +339,7 @@ async fn projects_are_not_merged_and_readers_see_parts_of_files_that_were() {
     };
     assert_eq!((seen_runs(&reader_of(&lake, &["a"])).await.len(), whole(&reader_of(&lake, &["a"])).await), (4, 2));
     // As a version without projects merged them.
-    lake.merge(TABLE, &merged, CommitEffect::Layout.into(), None).await.expect("merged");
+    lake.merge_files(TABLE, &merged, CommitEffect::Layout.into(), None).await.expect("merged");
     assert_eq!(files(&lake).await.len(), 1);
     let reader = reader_of(&lake, &["a"]);
     assert_eq!(
@@ -366,7 +366,7 @@ async fn rows_of_runs(lake: &Lake) -> Vec<(String, String, u64)> {
 }
 
 async fn only_merged(lake: &Lake, table: Table) -> DataFile {
-    let mut merged = lake.log().files(table).await.expect("a log");
+    let mut merged = lake.commit_log().list_files(table).await.expect("a log");
     merged.retain(|file| !file.parts.is_empty());
     assert_eq!(merged.len(), 1, "{table:?}");
     merged.remove(0)
@@ -378,7 +378,7 @@ async fn a_merged_row_of_a_run_keeps_its_version_and_its_newer_one_counts() {
     let before = rows_of_runs(&lake).await;
     optimize(&lake).await;
     assert_eq!(rows_of_runs(&lake).await, before);
-    assert_eq!(lake.log().files(Table::Runs).await.expect("a log").len(), 1);
+    assert_eq!(lake.commit_log().list_files(Table::Runs).await.expect("a log").len(), 1);
     put(&lake, "flat", "r1", "d2", 77).await;
     let then = lake.snapshot().await.expect("a view");
     put(&lake, "wood", "r0", "d2", 78).await;
@@ -389,7 +389,7 @@ async fn a_merged_row_of_a_run_keeps_its_version_and_its_newer_one_counts() {
     expected.push(row("r9", "d1", 9));
     assert_eq!(rows_of_runs(&lake).await, expected);
     // A clean-up that began before the second one puts the older row of r0 into a newer file.
-    lake.rewrite(Table::Runs, &then.outgrown(Table::Runs)[0]).await.expect("written anew");
+    lake.rewrite_file(Table::Runs, &then.outgrown_files(Table::Runs)[0]).await.expect("written anew");
     let merged = only_merged(&lake, Table::Runs).await;
     assert_eq!((merged.log_version, merged.parts.len()), (10, 4));
     assert_eq!(rows_of_runs(&lake).await, expected);
@@ -412,10 +412,10 @@ async fn of_two_who_replace_a_merged_row_one_does() {
     let (flat, wood) = (run("r1"), run("r0"));
     let replace = async |run: &VisibleRun, derivation: &str| {
         let pointer = VisibleRun { reference_derivation: Some(derivation.to_owned()), ..run.clone() };
-        let file = encode(Table::Runs, &Table::Runs.schema(lake.rig()), &[]).expect("encoded");
-        let staged = lake.stage(Table::Runs, &FileName::Pointer(pointer.clone()), file).await.expect("staged");
-        let staged = staged.made_from(&view).replacing(&pointer, view.files_of(Table::Runs, &run.run));
-        lake.commit(&[staged]).await.expect("no error")[0]
+        let file = encode_batches(Table::Runs, &Table::Runs.schema(lake.rig()), &[]).expect("encoded");
+        let staged = lake.stage_file(Table::Runs, &FileName::Pointer(pointer.clone()), file).await.expect("staged");
+        let staged = staged.made_from(&view).with_replaced_rows(&pointer, view.files_of(Table::Runs, &run.run));
+        lake.commit_staged(&[staged]).await.expect("no error")[0]
     };
     assert_eq!(replace(&flat, "d2").await, CommitOutcome::Now);
     assert_eq!(replace(&flat, "d3").await, CommitOutcome::Outdated, "another one's row is there");
@@ -433,7 +433,7 @@ async fn of_two_who_replace_a_merged_row_one_does() {
 #[tokio::test]
 async fn a_past_version_of_runs_is_seen_once_its_files_are_merged_and_deleted() {
     let (_, lake) = five().await;
-    let version = lake.snapshot().await.expect("a view").version(Table::Runs).expect("a log");
+    let version = lake.snapshot().await.expect("a view").log_version(Table::Runs).expect("a log");
     optimize(&lake).await;
     put(&lake, "cube", "r9", "d1", 9).await;
     optimize(&lake).await;
@@ -486,7 +486,7 @@ async fn projects_have_rows_of_runs_of_their_own() {
     let lake = of_projects().await;
     let before = [rows_of_runs(&reader_of(&lake, &["a"])).await, rows_of_runs(&reader_of(&lake, &["b"])).await];
     optimize(&lake).await;
-    let merged = lake.log().files(Table::Runs).await.expect("a log");
+    let merged = lake.commit_log().list_files(Table::Runs).await.expect("a log");
     assert_eq!(merged.iter().map(|file| file.parts.len().max(1)).sum::<usize>(), 8);
     assert_eq!(merged.len(), 4, "references, of a, of b, and of none: {merged:?}");
     let after = [rows_of_runs(&reader_of(&lake, &["a"])).await, rows_of_runs(&reader_of(&lake, &["b"])).await];
@@ -501,7 +501,7 @@ async fn references_are_seen_in_a_file_that_was_merged_before_there_were_project
     let reader = reader_of(&lake, &["a"]);
     let runs: Vec<_> = rows_of_runs(&reader).await.into_iter().map(|(run, _, version)| (run, version)).collect();
     assert_eq!(runs, [("r1".to_owned(), 2), ("r3".to_owned(), 4), ("r5".to_owned(), 7)]);
-    let versions = reader.versions().await.expect("versions");
+    let versions = reader.list_versions().await.expect("versions");
     assert_eq!(versions.last().map(|version| version.version), Some(7));
     let snapshot = reader.snapshot().await.expect("a view");
     let partly: Vec<_> = snapshot.files(Table::Runs).iter().filter(|file| !file.hidden.is_empty()).collect();

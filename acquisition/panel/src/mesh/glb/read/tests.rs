@@ -12,7 +12,7 @@ fn plate() -> Mesh {
 
 /// The plate's file, its JSON changed.
 fn file(change: impl FnOnce(&mut Value)) -> Vec<u8> {
-    let bytes = super::super::write(&plate());
+    let bytes = super::super::write_glb(&plate());
     let glb = Glb::from_slice(&bytes).expect("its own file");
     let mut document = serde_json::from_slice(&glb.json).expect("its own JSON");
     change(&mut document);
@@ -20,7 +20,7 @@ fn file(change: impl FnOnce(&mut Value)) -> Vec<u8> {
 }
 
 fn packed(document: &Value, bin: &[u8]) -> Vec<u8> {
-    super::super::pack(document.to_string().into_bytes(), bin.to_vec())
+    super::super::pack_glb(document.to_string().into_bytes(), bin.to_vec())
 }
 
 fn remove(document: &mut Value, key: &str) {
