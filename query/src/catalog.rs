@@ -148,7 +148,7 @@ impl LakeCatalog {
     /// As [`LakeCatalog::read_contents`].
     pub(crate) async fn read_attachment(&self, run: &VisibleRun, ending: &str) -> Result<Option<Bytes>, Error> {
         let snapshot = &self.fresh_snapshot().await?.snapshot;
-        mcap_tables::attachment(run, snapshot, ending, &self.runs).await.map_err(mcap_failed)
+        mcap_tables::read_attachment(run, snapshot, ending, &self.runs).await.map_err(mcap_failed)
     }
 
     /// Returns the views with their definitions.
@@ -339,9 +339,9 @@ fn find_mcap_calls(statement: &mut Statement, calls: &mut McapCalls) {
 // A call that is not right is the query's fault. What is wrong with a file is said as it is, without the store's hints.
 fn mcap_failed(error: DataFusionError) -> Error {
     match error {
-        DataFusionError::Plan(_) => Error::plan("", &error),
+        DataFusionError::Plan(_) => Error::from_planning("", &error),
         DataFusionError::Execution(message) => Error::Execution { message },
-        other => failed(other),
+        other => execution_error(other),
     }
 }
 

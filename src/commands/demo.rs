@@ -7,7 +7,7 @@ use echolake_acquisition::run::controller::RecordingMode;
 use echolake_ingest::pending_runs;
 use echolake_lake::{Lake, ReferenceSurfaces};
 use echolake_panel::PanelSpecimen;
-use echolake_panel::collection::{CollectionSurface, collection};
+use echolake_panel::collection::{CollectionSurface, collection_surfaces};
 use echolake_query::Session;
 use echolake_schema::Rig;
 

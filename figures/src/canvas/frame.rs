@@ -1,7 +1,8 @@
 //! The frame of a plot: axes with round numbers, and places of values in it.
 
 use crate::canvas::drawing::{
-    FigureColour, FigureDrawing, SMALL_PX, StrokeStyle, TextAnchor, filled_rect, label, line, sized_label, upward_label,
+    FigureColour, FigureDrawing, SMALL_PX, StrokeStyle, TextAnchor, filled_rect, ink_label, sized_label, stroked_line,
+    upward_label,
 };
 use crate::canvas::font::text_width;
 

@@ -1,6 +1,8 @@
 //! The surface that a layer's pairs see: first Fresnel zones on the panel, seen from above.
 
-use crate::canvas::drawing::{FigureColour, FigureDrawing, StrokeStyle, TextAnchor, filled_ellipse, framed_rect, ink_label};
+use crate::canvas::drawing::{
+    FigureColour, FigureDrawing, StrokeStyle, TextAnchor, filled_ellipse, framed_rect, ink_label,
+};
 use crate::canvas::frame::number_text;
 use crate::canvas::notes::FigureNotes;
 

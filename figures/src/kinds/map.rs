@@ -48,10 +48,10 @@ impl MapFigure {
         let position = |(row, name, kind): (usize, &str, &str)| MapPosition {
             name: name.to_owned(),
             kind: kind.to_owned(),
-            position_db: of(&found.position(row)),
+            position_db: of(&found.row_position(row)),
         };
         let positions = surfaces.map(position).collect();
-        Self { positions, components, explained: of(&found.explained()), width_px: WIDTH_PX }
+        Self { positions, components, explained: of(&found.explained_shares()), width_px: WIDTH_PX }
     }
 
     /// Returns the title that a map has if it is given no other.

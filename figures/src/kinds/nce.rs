@@ -1,7 +1,9 @@
 //! Cumulative energy of the bands over time, stacked.
 
 use crate::canvas::colours::band_colour;
-use crate::canvas::drawing::{FigureColour, FigureDrawing, StrokeStyle, TEXT_PX, TextAnchor, filled_area, ink_label, line};
+use crate::canvas::drawing::{
+    FigureColour, FigureDrawing, StrokeStyle, TEXT_PX, TextAnchor, filled_area, ink_label, stroked_line,
+};
 use crate::canvas::font::fitted_text;
 use crate::canvas::frame::{PlotAxis, PlotFrame, draw_legend};
 use crate::canvas::notes::FigureNotes;

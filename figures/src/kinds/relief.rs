@@ -1,8 +1,8 @@
 //! Reliefs in oblique light, side by side, to one scale.
 
 use crate::canvas::drawing::{
-    FigureColour, FigureDrawing, SMALL_PX, StrokeStyle, TEXT_PX, TextAnchor, framed_rect, ink_label, line, picture,
-    sized_label,
+    FigureColour, FigureDrawing, SMALL_PX, StrokeStyle, TEXT_PX, TextAnchor, framed_rect, ink_label, picture_shape,
+    sized_label, stroked_line,
 };
 use crate::canvas::font::fitted_text;
 use crate::canvas::notes::FigureNotes;

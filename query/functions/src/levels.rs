@@ -6,7 +6,7 @@ use datafusion::error::Result;
 use echolake_dsp::level::{amplitude_to_db, power_to_db, sound_pressure_level_db};
 
 use crate::adapters::answers::{append_defaults, build_lists, build_numbers};
-use crate::adapters::arguments::{CallArguments, SampleElement, like};
+use crate::adapters::arguments::{CallArguments, SampleElement, same_list_type};
 use crate::adapters::description::{ArgumentKind, FunctionDescription, FunctionFamily, FunctionParameter};
 use crate::adapters::scalar::ScalarKernel;
 

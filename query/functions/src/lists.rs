@@ -7,7 +7,7 @@ use echolake_dsp::energy::{energy, rms};
 use echolake_dsp::mean::multiply_samples;
 
 use crate::adapters::answers::{append_defaults, build_lists, build_numbers};
-use crate::adapters::arguments::{CallArguments, SampleElement, like};
+use crate::adapters::arguments::{CallArguments, SampleElement, same_list_type};
 use crate::adapters::description::{ArgumentKind, FunctionDescription, FunctionFamily, FunctionParameter};
 use crate::adapters::scalar::ScalarKernel;
 

@@ -63,7 +63,11 @@ pub(super) fn decoded_table(targets: Vec<Target>, topic: &str, files: &Arc<McapF
 }
 
 /// The table of messages as they are, of one topic or of all.
-pub(super) fn message_table(targets: Vec<Target>, topic: Option<&str>, files: &Arc<McapFiles>) -> Result<McapTable, Fault> {
+pub(super) fn message_table(
+    targets: Vec<Target>,
+    topic: Option<&str>,
+    files: &Arc<McapFiles>,
+) -> Result<McapTable, Fault> {
     let known = |t: &Target| t.file.channels.values().any(|c| topic.is_none_or(|topic| c.topic == topic));
     if let Some(topic) = topic.filter(|_| !targets.iter().any(known)) {
         return Err(no_topic(&targets, topic));

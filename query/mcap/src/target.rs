@@ -29,7 +29,11 @@ pub(super) struct Target {
 
 impl Target {
     /// Opens the files that `pattern` means, each once.
-    pub(super) async fn open_all(pattern: &str, snapshot: &LakeSnapshot, files: &McapFiles) -> Result<Vec<Self>, Fault> {
+    pub(super) async fn open_all(
+        pattern: &str,
+        snapshot: &LakeSnapshot,
+        files: &McapFiles,
+    ) -> Result<Vec<Self>, Fault> {
         let mut meant = BTreeMap::new();
         for part in pattern.split(',').map(str::trim) {
             if part.contains('/') || part.ends_with(EXTENSION) {

@@ -28,7 +28,10 @@ const LARGEST_INDEX: u64 = 16 << 20;
 type Times = Option<(u64, u64)>;
 
 /// A row for each channel of each file.
-pub(super) async fn channel_table(targets: Vec<Target>, files: &Arc<McapFiles>) -> Result<Arc<dyn TableProvider>, Fault> {
+pub(super) async fn channel_table(
+    targets: Vec<Target>,
+    files: &Arc<McapFiles>,
+) -> Result<Arc<dyn TableProvider>, Fault> {
     let times = |target: Target| async move {
         let times = channel_times(&target.file, files).await?;
         Ok::<_, Fault>((target, times))

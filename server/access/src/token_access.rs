@@ -167,7 +167,7 @@ mod tests {
     use echolake_schema::ProjectName;
 
     use super::*;
-    use crate::tokens::fresh;
+    use crate::tokens::generate_token;
     use echolake_service::TokenScope;
 
     fn access_by(lines: &str) -> TokenAccess {

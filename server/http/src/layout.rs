@@ -53,7 +53,10 @@ pub(super) fn layout_routes() -> OpenApiRouter<ViewerLayout> {
 
 /// The layout for viewers on pages of any origin.
 pub fn for_viewers(layout: ViewerLayout) -> Router {
-    Router::from(layout_routes()).method_not_allowed_fallback(super::problem::refuse_method).layer(cors_layer()).with_state(layout)
+    Router::from(layout_routes())
+        .method_not_allowed_fallback(super::problem::refuse_method)
+        .layer(cors_layer())
+        .with_state(layout)
 }
 
 /// A layout for Foxglove and Lichtblick: panel and arms, response, air, measurement, log.

@@ -29,11 +29,11 @@ use utoipa::openapi::OpenApi;
 
 use catalogue::LakeCatalogue;
 pub use conditions::ConditionOutcome;
-pub use format::takes;
+pub use format::accepts_encoding;
 pub use guard::{FORWARDED_PROTO, RequestSite, is_encrypted, is_same_origin, own_pages_only, request_site};
 pub use mcp::MCP;
 pub use problem::{ProblemBody, ProblemResponse};
-pub use ranges::cors;
+pub use ranges::cors_layer;
 pub use slices::SLICED_RUNS;
 use slices::{FOXGLOVE_MANIFEST, LICHTBLICK_SESSION, SLICE, SOFA, SliceService};
 
@@ -41,12 +41,12 @@ use slices::{FOXGLOVE_MANIFEST, LICHTBLICK_SESSION, SLICE, SOFA, SliceService};
 pub const VIEWER_PATHS: [&str; 5] = [files::RUN, SLICE, SOFA, FOXGLOVE_MANIFEST, LICHTBLICK_SESSION];
 
 /// Answers HTTP on an engine's socket; a connection is one request.
-pub async fn serve(service: QueryService, listener: UnixListener) -> Result<(), Error> {
+pub async fn serve_http_socket(service: QueryService, listener: UnixListener) -> Result<(), Error> {
     let router = engine_router(&service);
     loop {
         let (stream, _) = listener.accept().await.map_err(Error::System)?;
         let answers = TowerToHyperService::new(router.clone());
-        let guard = service.activity().enter();
+        let guard = service.activity().begin_work();
         tokio::spawn(async move {
             let _guard = guard;
             // A connection that breaks off is the door's matter.
@@ -58,30 +58,30 @@ pub async fn serve(service: QueryService, listener: UnixListener) -> Result<(), 
 fn engine_router(service: &QueryService) -> Router {
     let catalogue = LakeCatalogue::new(service.clone());
     let slices = SliceService::new(&catalogue);
-    let files = files::own_routes().merge(manifest::routes());
-    let own = Router::from(sql::routes())
+    let files = files::own_routes().merge(manifest::manifest_routes());
+    let own = Router::from(sql::sql_routes())
         .with_state(service.clone())
-        .merge(catalogue.router())
+        .merge(catalogue.endpoint_router())
         .merge(Router::from(files).with_state(catalogue.clone()))
-        .merge(of_protocol(ServerProtocol::Mcp, mcp::routes(&catalogue, &slices)))
+        .merge(with_protocol(ServerProtocol::Mcp, mcp::agent_routes(&catalogue, &slices)))
         .layer(from_fn_with_state(service.is_open(), guard::own_pages_only));
     let viewers = Router::from(files::viewer_routes()).with_state(catalogue.clone());
-    let all = own.merge(viewers).merge(slices::for_viewers(slices)).fallback(nothing);
+    let all = own.merge(viewers).merge(slices::for_viewers(slices)).fallback(refuse_unknown_path);
     with_refusals(all).layer(from_fn(trace_request))
 }
 
-fn of_protocol(protocol: ServerProtocol, routes: Router) -> Router {
+fn with_protocol(protocol: ServerProtocol, routes: Router) -> Router {
     routes.layer(from_fn_with_state(protocol, request_protocol::set_protocol))
 }
 
 /// The contract of an engine's routes and of the layout's: of those whose answers to GET have an ETag, and of the others.
 pub fn contract_parts() -> [OpenApi; 2] {
-    let files = files::viewer_routes().merge(files::own_routes()).merge(manifest::routes());
+    let files = files::viewer_routes().merge(files::own_routes()).merge(manifest::manifest_routes());
     let mut validated = catalogue::table_routes().merge(catalogue::file_routes()).into_openapi();
-    validated.merge(layout::routes().into_openapi());
+    validated.merge(layout::layout_routes().into_openapi());
     validated.merge(files.into_openapi());
-    let mut others = sql::routes().into_openapi();
-    others.merge(slices::routes().into_openapi());
+    let mut others = sql::sql_routes().into_openapi();
+    others.merge(slices::slice_routes().into_openapi());
     [validated, others]
 }
 
@@ -89,12 +89,12 @@ pub fn contract_parts() -> [OpenApi; 2] {
 pub fn with_refusals(router: Router) -> Router {
     router
         .method_not_allowed_fallback(problem::refuse_method)
-        .layer(CatchPanicLayer::custom(|_| ProblemResponse(RequestFault::Internal).answer()))
+        .layer(CatchPanicLayer::custom(|_| ProblemResponse(RequestFault::Internal).to_response()))
         .layer(map_response(guard::security_headers))
 }
 
 /// Answers a path that does not exist.
-pub async fn nothing() -> ProblemResponse {
+pub async fn refuse_unknown_path() -> ProblemResponse {
     ProblemResponse(RequestFault::NotFound {
         what: "this path".to_owned(),
         hint: "GET /api/v1/openapi.json lists what there is",

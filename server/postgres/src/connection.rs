@@ -8,7 +8,7 @@ use bytes::Bytes;
 use datafusion::common::ParamValues;
 use datafusion_pg_catalog::sql::PostgresCompatibilityParser;
 use echolake_query::{EngineClient, Session};
-use echolake_service::running::{AnswerEncoder, RunningQuery, SessionTimeLimit, ended};
+use echolake_service::running::{AnswerEncoder, RunningQuery, SessionTimeLimit, wait_for_fault};
 use echolake_service::{Error, QueryJob, QueryService, QueryWork, RequestFault, ServerProtocol, StopSignal};
 use futures::FutureExt as _;
 use futures::future::BoxFuture;

@@ -8,14 +8,14 @@ use pgwire::messages::PgWireBackendMessage;
 
 /// A failure that leaves the connection open.
 pub(super) fn failure(fault: RequestFault) -> PgWireError {
-    info("ERROR", &fault)
+    error_with_severity("ERROR", &fault)
 }
 
 /// A failure that ends the connection, as a message.
 pub fn fatal_message(fault: &RequestFault) -> BytesMut {
     let mut bytes = BytesMut::new();
     // It is a message of a few hundred bytes, which is no reason for the library to refuse it.
-    let _ = PgWireBackendMessage::ErrorResponse(ErrorInfo::from(fatal(fault)).into()).encode(&mut bytes);
+    let _ = PgWireBackendMessage::ErrorResponse(ErrorInfo::from(fatal_error(fault)).into()).encode(&mut bytes);
     bytes
 }
 

@@ -22,7 +22,9 @@ use crate::door_rows::DoorRows;
 use crate::engine_report::EngineReport;
 use crate::fault::{FaultCode, RequestFault};
 use crate::query_watch::{QueryTimer, QueryWatch, RunningWatches};
-use crate::running::{AnswerEncoder, RunningQuery, SessionTimeLimit, WAITING, finish_task, split_batch, parts};
+use crate::running::{
+    AnswerEncoder, RunningQuery, SessionTimeLimit, WAITING, finish_task, split_batch, wait_for_fault,
+};
 use crate::server_protocol::ServerProtocol;
 use crate::stop_signal::StopSignal;
 use crate::token_scope::TokenScope;

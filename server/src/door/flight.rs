@@ -4,7 +4,7 @@ use std::convert::Infallible;
 
 use axum::body::Body;
 use axum::http::{Request, Response, header};
-use echolake_flight::{WINDOW_BYTES, status};
+use echolake_flight::{WINDOW_BYTES, grpc_status};
 use echolake_service::authorization::of_header;
 use echolake_service::request_span::{REQUEST_ID, begin_request};
 use echolake_service::{ClientIdentity, RequestFault, ServerProtocol};

@@ -61,7 +61,7 @@ pub async fn run_engine(lake: &Lake, sockets: &Path, memory: usize, slow: Option
     watchdog::start_watchdog(&service).map_err(Error::System)?;
     let obeying = service.clone();
     #[cfg(feature = "postgres")]
-    let postgres = echolake_postgres::serve(service.clone(), postgres);
+    let postgres = echolake_postgres::serve_postgres_socket(service.clone(), postgres);
     #[cfg(not(feature = "postgres"))]
     let postgres = std::future::pending();
     tokio::select! {

@@ -11,7 +11,7 @@ use echolake_acquisition::run::simulate::run_simulation;
 use echolake_ingest::{FileReport, LakeIngest, pending_runs};
 use echolake_lake::{Lake, ReferenceSurfaces};
 use echolake_panel::PanelSpecimen;
-use echolake_panel::collection::{CollectionSurface, collection};
+use echolake_panel::collection::{CollectionSurface, collection_surfaces};
 use echolake_schema::manifest::{Origin, RunEnd};
 use echolake_schema::{Rig, Timestamp};
 

@@ -336,8 +336,7 @@ fn a_stop_waits_for_its_pair() {
 fn a_failing_device_ends_the_run_and_leaves_what_was_recorded() {
     let rig = quick();
     let (mut devices, switched_off) = (simulated(&rig, SurfaceMaterial::CoatedPrint, 3), Arc::new(AtomicU32::new(0)));
-    devices.robots =
-        Box::new(Failing { inner: devices.robots, moves: 0, switched_off: switched_off.clone() });
+    devices.robots = Box::new(Failing { inner: devices.robots, moves: 0, switched_off: switched_off.clone() });
     let run = run_of(&rig, devices, 9);
     assert!(matches!(&run.end, Err(Error::Device(RigError::Device { device: "left arm", .. }))), "{:?}", run.end);
     assert_eq!(run.verdicts().len(), 2);

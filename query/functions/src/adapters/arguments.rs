@@ -119,8 +119,8 @@ pub(crate) fn list_of(element: DataType) -> DataType {
 }
 
 /// Returns the type of a list with the same element type.
-pub(crate) fn like(list: &DataType) -> DataType {
-    list_of(element(list).cloned().unwrap_or(DataType::Float64))
+pub(crate) fn same_list_type(list: &DataType) -> DataType {
+    list_of(element_type(list).cloned().unwrap_or(DataType::Float64))
 }
 
 /// Returns the element type of a list.
@@ -324,9 +324,12 @@ mod tests {
         let lists = ListArray::new(field, offsets, Arc::new(values), None).slice(1, 2);
         let arguments =
             CallArguments::new(&DESCRIPTION, &[ColumnarValue::Array(Arc::new(lists))], 2).expect("arguments");
-        let samples = arguments.samples::<f32>(0).expect("f32");
-        assert_eq!((samples.at(0).expect("whole"), samples.at(1).expect("whole")), (&[3.0][..], &[4.0, 5.0][..]));
-        assert_eq!(samples.room(2), 3);
-        assert!(arguments.samples::<f64>(0).is_err());
+        let samples = arguments.sample_lists::<f32>(0).expect("f32");
+        assert_eq!(
+            (samples.samples_at(0).expect("whole"), samples.samples_at(1).expect("whole")),
+            (&[3.0][..], &[4.0, 5.0][..])
+        );
+        assert_eq!(samples.sample_capacity(2), 3);
+        assert!(arguments.sample_lists::<f64>(0).is_err());
     }
 }

@@ -10,7 +10,7 @@ use echolake_dsp::mean::SignalMean;
 
 use crate::adapters::aggregate::{AggregateKernel, GroupStates};
 use crate::adapters::answers::list_array;
-use crate::adapters::arguments::{CallArguments, SampleElement, element_type, like, list_of};
+use crate::adapters::arguments::{CallArguments, SampleElement, element_type, list_of, same_list_type};
 use crate::adapters::description::{ArgumentKind, FunctionDescription, FunctionFamily, FunctionParameter};
 
 /// `avg_list`.

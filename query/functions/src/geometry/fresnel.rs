@@ -7,7 +7,7 @@ use arrow::datatypes::{DataType, Fields};
 use datafusion::error::Result;
 use echolake_dsp::fresnel::first_fresnel_zone;
 
-use crate::adapters::answers::{number_fields, structs};
+use crate::adapters::answers::{build_structs, number_fields};
 use crate::adapters::arguments::{CallArguments, SampleElement};
 use crate::adapters::description::{ArgumentKind, FunctionDescription, FunctionFamily, FunctionParameter};
 use crate::adapters::scalar::ScalarKernel;

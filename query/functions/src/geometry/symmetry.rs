@@ -9,8 +9,8 @@ use datafusion::error::{DataFusionError, Result};
 use echolake_dsp::heights::move_heights;
 use echolake_schema::Symmetry;
 
-use crate::adapters::answers::{append_defaults, lists, number_fields, structs};
-use crate::adapters::arguments::{CallArguments, SampleElement, TextValues, like};
+use crate::adapters::answers::{append_defaults, build_lists, build_structs, number_fields};
+use crate::adapters::arguments::{CallArguments, SampleElement, TextValues, same_list_type};
 use crate::adapters::description::{ArgumentKind, FunctionDescription, FunctionFamily, FunctionParameter};
 use crate::adapters::rig::RigFacts;
 use crate::adapters::scalar::ScalarKernel;

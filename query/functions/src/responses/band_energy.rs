@@ -7,7 +7,7 @@ use arrow::datatypes::{DataType, Fields};
 use datafusion::error::Result;
 use echolake_dsp::filter_bank::FilterBankPlan;
 
-use crate::adapters::answers::{number_fields, numbers, structs};
+use crate::adapters::answers::{build_numbers, build_structs, number_fields};
 use crate::adapters::arguments::{CallArguments, SampleElement, SampleLists};
 use crate::adapters::description::{ArgumentKind, FunctionDescription, FunctionFamily, FunctionParameter};
 use crate::adapters::per_length::PerLength;

@@ -9,7 +9,7 @@ use echolake_dsp::arrival::first_arrival;
 use echolake_dsp::decay::energy_decay_db;
 
 use crate::adapters::answers::{append_defaults, build_lists, build_numbers};
-use crate::adapters::arguments::{CallArguments, SampleElement, like};
+use crate::adapters::arguments::{CallArguments, SampleElement, same_list_type};
 use crate::adapters::description::{ArgumentKind, FunctionDescription, FunctionFamily, FunctionParameter};
 use crate::adapters::rig::RigFacts;
 use crate::adapters::scalar::ScalarKernel;

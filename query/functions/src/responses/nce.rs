@@ -9,7 +9,7 @@ use echolake_dsp::energy::cumulate_whole;
 use echolake_dsp::filter_bank::FilterBankPlan;
 
 use crate::adapters::answers::{append_defaults, build_lists};
-use crate::adapters::arguments::{CallArguments, SampleElement, like};
+use crate::adapters::arguments::{CallArguments, SampleElement, same_list_type};
 use crate::adapters::description::{ArgumentKind, FunctionDescription, FunctionFamily, FunctionParameter};
 use crate::adapters::per_length::PerLength;
 use crate::adapters::rig::RigFacts;

@@ -8,7 +8,7 @@ use datafusion::error::Result;
 use echolake_dsp::rise::{CurveShape, curve_shape};
 
 use super::decay::require_finite;
-use crate::adapters::answers::numbers;
+use crate::adapters::answers::build_numbers;
 use crate::adapters::arguments::{CallArguments, SampleElement};
 use crate::adapters::description::{ArgumentKind, FunctionDescription, FunctionFamily, FunctionParameter};
 use crate::adapters::rig::RigFacts;

@@ -8,7 +8,7 @@ use datafusion::error::Result;
 use echolake_dsp::spectrum::{SpectrumPlan, bin_count, bin_hz};
 
 use crate::adapters::answers::{append_defaults, build_lists};
-use crate::adapters::arguments::{CallArguments, SampleElement, like, list_of};
+use crate::adapters::arguments::{CallArguments, SampleElement, list_of, same_list_type};
 use crate::adapters::description::{ArgumentKind, FunctionDescription, FunctionFamily, FunctionParameter};
 use crate::adapters::per_length::PerLength;
 use crate::adapters::rig::RigFacts;

@@ -7,8 +7,8 @@ use echolake_figures::{
     FigureDrawing, FigureNotes, GridFigure, GridLayer, GridPanel, LevelPalette, MapFigure, NceFigure, NcePanel,
 };
 use echolake_query::figure_rows::{
-    LevelReference, band_labels, curves_query, grid_query, lake_version, level_vectors_query, point_filter, quote_literal,
-    total_curve,
+    LevelReference, band_labels, curves_query, grid_query, lake_version, level_vectors_query, point_filter,
+    quote_literal, total_curve,
 };
 use echolake_service::RequestFault;
 use serde::Deserialize;

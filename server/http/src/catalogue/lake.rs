@@ -6,7 +6,7 @@ use utoipa::ToSchema;
 
 use super::content::{AnswerContent, EndpointAnswer};
 use super::request::CatalogueRequest;
-use super::snapshot::bands::{BandDescription, bands};
+use super::snapshot::bands::{BandDescription, describe_bands};
 
 /// The lake.
 #[derive(Serialize, ToSchema)]

@@ -15,7 +15,7 @@ use utoipa::IntoParams;
 use super::super::extract::parse_whole;
 use super::LakeCatalogue;
 use super::rows::RowDecoder;
-use super::snapshot::bands::bands;
+use super::snapshot::bands::describe_bands;
 use super::snapshot::summary::{BAND_STATISTICS, CatalogueSummary, SURFACES, SurfaceEntry};
 use super::snapshot::view::SnapshotView;
 use crate::request_protocol::http_job;

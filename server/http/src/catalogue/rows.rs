@@ -154,6 +154,9 @@ mod tests {
             #[expect(dead_code, reason = "it is only read")]
             level: f32,
         }
-        assert!(matches!(RowDecoder::<LevelRow>::new(String::new()).encode_batch(batch()), Err(RequestFault::Internal)));
+        assert!(matches!(
+            RowDecoder::<LevelRow>::new(String::new()).encode_batch(batch()),
+            Err(RequestFault::Internal)
+        ));
     }
 }

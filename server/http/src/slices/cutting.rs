@@ -7,7 +7,7 @@ use bytes::Bytes;
 use echolake_export::{Slice, SliceParams};
 use echolake_lake::LakeSnapshot;
 use echolake_query::{EngineClient, Error as QueryError};
-use echolake_service::running::{WAITING, finish};
+use echolake_service::running::{WAITING, finish_task};
 use echolake_service::{QueryService, RequestFault, StopSignal};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio::task::JoinSet;

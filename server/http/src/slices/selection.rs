@@ -90,7 +90,9 @@ impl SliceRequest {
     ) -> Result<RunningQuery<RecordBatch>, RequestFault> {
         let session = Arc::new(service.begin_session(&self.client));
         let (asking, predicate, form) = (session.clone(), self.question.predicate().to_owned(), self.question.form);
-        let sql = service.plan_query(&self.client, async move { Ok(asking.append_predicate(&select, &predicate, form)?) }).await?;
+        let sql = service
+            .plan_query(&self.client, async move { Ok(asking.append_predicate(&select, &predicate, form)?) })
+            .await?;
         service.begin_query(http_job(session, QueryWork::Sql(sql)), |_| Ok(BatchEncoder)).await
     }
 }

@@ -36,7 +36,7 @@ use super::encryption::{ProtocolEncryption, agreed_protocol};
 use super::forward::EngineProtocol;
 use super::http_connection::{HTTP_2, drive_connection, http2_builder, restate_as_http1};
 use crate::door::server_door::ServerDoor;
-use authentication::authenticate;
+use authentication::authenticate_client;
 use router::door_router;
 
 /// Path to which a browser shows a token.

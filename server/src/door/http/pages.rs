@@ -9,7 +9,7 @@ use axum::http::{HeaderMap, HeaderValue, Method, Uri, header};
 use axum::response::{IntoResponse as _, Redirect, Response};
 use base64::Engine as _;
 use base64::prelude::BASE64_STANDARD;
-use echolake_http::{ConditionOutcome, ProblemResponse, nothing, takes};
+use echolake_http::{ConditionOutcome, ProblemResponse, accepts_encoding, refuse_unknown_path};
 use echolake_service::RequestFault;
 use flate2::read::GzDecoder;
 use sha2::{Digest as _, Sha256};

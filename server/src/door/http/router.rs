@@ -3,7 +3,7 @@
 use axum::Router;
 use axum::middleware::from_fn_with_state;
 use axum::routing::any;
-use echolake_http::{MCP, VIEWER_PATHS, cors, layout, own_pages_only, with_refusals};
+use echolake_http::{MCP, VIEWER_PATHS, cors_layer, layout, own_pages_only, with_refusals};
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
@@ -21,11 +21,11 @@ pub(super) fn door_router(door: &ServerDoor) -> Router {
     let forwarded = ["/api/{*path}", MCP]
         .into_iter()
         .fold(Router::new(), |router, path| router.route(path, any(ServerDoor::forward_http)));
-    let forwarded = forwarded.merge(viewers.layer(cors()));
+    let forwarded = forwarded.merge(viewers.layer(cors_layer()));
     #[cfg(feature = "web")]
-    let rest = pages::fallback;
+    let rest = pages::serve_page;
     #[cfg(not(feature = "web"))]
-    let rest = echolake_http::nothing;
+    let rest = echolake_http::refuse_unknown_path;
     let all =
         own.merge(forwarded).with_state(door.clone()).merge(layout::for_viewers(door.layout().clone())).fallback(rest);
     let all = with_refusals(all.layer(from_fn_with_state(door.clone(), health::refuse_while_draining)));
@@ -35,9 +35,9 @@ pub(super) fn door_router(door: &ServerDoor) -> Router {
 /// What the door answers itself, but for pages and the layout.
 pub(super) fn door_routes() -> OpenApiRouter<ServerDoor> {
     OpenApiRouter::new()
-        .routes(routes!(session::post))
-        .routes(routes!(queries::cancel))
-        .routes(routes!(openapi::get))
+        .routes(routes!(session::post_session))
+        .routes(routes!(queries::post_cancellation))
+        .routes(routes!(openapi::get_openapi))
         .routes(routes!(health::metrics))
         .routes(routes!(health::health))
         .routes(routes!(health::ready))

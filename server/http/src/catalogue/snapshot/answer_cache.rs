@@ -15,7 +15,7 @@ use quick_cache::Weighter;
 use quick_cache::sync::Cache;
 
 use crate::catalogue::content::ARROW;
-use crate::format::takes;
+use crate::format::accepts_encoding;
 use crate::problem::ProblemResponse;
 
 /// Maximum size of the cached answers of one snapshot, bytes.

@@ -123,7 +123,10 @@ impl SnapshotViews {
     ///
     /// # Errors
     /// The snapshot cannot be read.
-    pub(in super::super) async fn current_view(&self, service: &QueryService) -> Result<Arc<SnapshotView>, RequestFault> {
+    pub(in super::super) async fn current_view(
+        &self,
+        service: &QueryService,
+    ) -> Result<Arc<SnapshotView>, RequestFault> {
         let known = self.lock_history().view.clone();
         let session = match &known {
             Some(view) => view.session.clone(),
