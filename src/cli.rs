@@ -53,12 +53,12 @@ use crate::logging::{FORMAT_VARIABLE, LogFormat};
 pub(crate) struct CliArguments {
     /// The lake: a folder, a file:// URL or s3://bucket/prefix.
     #[arg(long, global = true, env = "ECHOLAKE_LAKE", default_value = "lake", value_name = "URL")]
-    pub(crate) lake: String,
+    pub lake: String,
     /// Format of the log on stderr; RUST_LOG sets its levels.
     #[arg(long, global = true, env = FORMAT_VARIABLE, default_value = "text", value_name = "FORMAT")]
-    pub(crate) log_format: LogFormat,
+    pub log_format: LogFormat,
     #[command(subcommand)]
-    pub(crate) command: CliCommand,
+    pub command: CliCommand,
 }
 
 #[derive(Debug, Subcommand)]
@@ -150,7 +150,7 @@ pub(crate) enum LakeCommand {
 
 impl CliArguments {
     /// Gives up what the command does not need. To be called before there are threads.
-    pub(crate) fn confine_process(&self) -> anyhow::Result<()> {
+    pub fn confine_process(&self) -> anyhow::Result<()> {
         match &self.command {
             #[cfg(feature = "lake")]
             CliCommand::Lake(LakeCommand::Engine(args)) => args.confine_process(&self.lake),
@@ -160,12 +160,12 @@ impl CliArguments {
 
     /// Returns whether the command has clients of its own, whose requests are spans.
     #[cfg(feature = "otlp")]
-    pub(crate) fn answers_clients(&self) -> bool {
+    pub fn answers_clients(&self) -> bool {
         matches!(&self.command, CliCommand::Lake(LakeCommand::Serve(_)))
     }
 
     /// Runs the command.
-    pub(crate) async fn run_command(self) -> anyhow::Result<CommandOutcome> {
+    pub async fn run_command(self) -> anyhow::Result<CommandOutcome> {
         let lake = &self.lake;
         match &self.command {
             #[cfg(feature = "lake")]

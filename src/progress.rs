@@ -35,12 +35,12 @@ pub(crate) struct TaskProgress {
 }
 
 impl CommandProgress {
-    pub(crate) fn new() -> Self {
+    pub fn new() -> Self {
         Self { bars: std::io::stderr().is_terminal().then(MultiProgress::new) }
     }
 
     /// A task of `total` units.
-    pub(crate) fn start_task(&self, name: impl Into<String>, total: u64, unit: &'static str) -> TaskProgress {
+    pub fn start_task(&self, name: impl Into<String>, total: u64, unit: &'static str) -> TaskProgress {
         let name = name.into();
         let pace = Arc::<Mutex<String>>::default();
         let bar = self.bars.as_ref().map(|bars| {
@@ -53,7 +53,7 @@ impl CommandProgress {
     }
 
     /// Prints a line among the bars.
-    pub(crate) fn print_message(&self, line: impl AsRef<str>) {
+    pub fn print_message(&self, line: impl AsRef<str>) {
         match &self.bars {
             Some(bars) => bars.suspend(|| eprintln!("{}", line.as_ref())),
             None => eprintln!("{}", line.as_ref()),
@@ -63,12 +63,12 @@ impl CommandProgress {
 
 impl TaskProgress {
     /// Returns whether a number that is set now is shown.
-    pub(crate) fn is_due(&self) -> bool {
+    pub fn is_due(&self) -> bool {
         self.bar.is_some() || self.last_line.elapsed() >= LINE_EVERY
     }
 
     /// Sets the number of units that are done.
-    pub(crate) fn set_done(&mut self, done: u64) {
+    pub fn set_done(&mut self, done: u64) {
         match &self.bar {
             Some(bar) => {
                 let bar = bar.clone();
@@ -96,7 +96,7 @@ impl TaskProgress {
     }
 
     /// Prints a line that stays.
-    pub(crate) fn print_message(&self, line: &str) {
+    pub fn print_message(&self, line: &str) {
         match &self.bar {
             Some(bar) => bar.suspend(|| eprintln!("{line}")),
             None => eprintln!("{}: {line}", self.name),
@@ -104,7 +104,7 @@ impl TaskProgress {
     }
 
     /// Shows a remark below the bar, or in the line.
-    pub(crate) fn set_note(&mut self, note: String) {
+    pub fn set_note(&mut self, note: String) {
         if let Some(bar) = &self.bar {
             if self.note.is_empty() {
                 bar.set_style(bar_style(self.unit, BarLines::Two, &self.pace));
@@ -115,7 +115,7 @@ impl TaskProgress {
     }
 
     /// Sets the number of units that were done before the start: they do not count in the rate.
-    pub(crate) fn begin_at(&mut self, done: u64) {
+    pub fn begin_at(&mut self, done: u64) {
         self.done_before = done;
         if let Some(bar) = &self.bar {
             bar.set_position(done);
@@ -123,14 +123,14 @@ impl TaskProgress {
     }
 
     /// Ends the task without a line: there was nothing to do.
-    pub(crate) fn dismiss(self) {
+    pub fn dismiss(self) {
         if let Some(bar) = &self.bar {
             bar.finish_and_clear();
         }
     }
 
     /// Ends the task, with `what` as its result.
-    pub(crate) fn finish_with(self, what: impl AsRef<str>) {
+    pub fn finish_with(self, what: impl AsRef<str>) {
         if let Some(bar) = &self.bar {
             bar.finish_and_clear();
         }

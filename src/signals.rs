@@ -33,7 +33,7 @@ impl StopRequest {
     ///
     /// # Errors
     /// The system refused a handler.
-    pub(crate) fn listen(reply: impl Display + Send + 'static) -> anyhow::Result<Self> {
+    pub fn listen(reply: impl Display + Send + 'static) -> anyhow::Result<Self> {
         let mut signals = StopSignals::register_handlers()?;
         let request = Self { flag: Arc::new(AtomicBool::new(false)), made: Arc::new(Notify::new()) };
         let listener = request.clone();
@@ -50,17 +50,17 @@ impl StopRequest {
 
     /// Returns a flag that becomes true with the request, for threads that poll it.
     #[cfg(feature = "lake")]
-    pub(crate) fn flag(&self) -> &Arc<AtomicBool> {
+    pub fn flag(&self) -> &Arc<AtomicBool> {
         &self.flag
     }
 
     /// Returns whether the request was made.
-    pub(crate) fn is_made(&self) -> bool {
+    pub fn is_made(&self) -> bool {
         self.flag.load(Ordering::SeqCst)
     }
 
     /// Waits until the request is made.
-    pub(crate) async fn wait_until_made(&self) {
+    pub async fn wait_until_made(&self) {
         // Hears of a request from here on, so that none falls between the look and the wait.
         let made = self.made.notified();
         if !self.is_made() {

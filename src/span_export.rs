@@ -24,7 +24,7 @@ impl SpanExport {
     ///
     /// # Errors
     /// A variable names no collector that can be reached by gRPC.
-    pub(crate) fn start() -> anyhow::Result<Option<Self>> {
+    pub fn start() -> anyhow::Result<Option<Self>> {
         let is_set = |name: &str| std::env::var(name).is_ok_and(|value| !value.is_empty());
         if !is_set(OTEL_EXPORTER_OTLP_ENDPOINT) && !is_set(OTEL_EXPORTER_OTLP_TRACES_ENDPOINT) {
             return Ok(None);
@@ -41,7 +41,7 @@ impl SpanExport {
     }
 
     /// Returns the layer of the log that exports spans.
-    pub(crate) fn layer(&self) -> LogLayer {
+    pub fn layer(&self) -> LogLayer {
         Box::new(tracing_opentelemetry::layer().with_tracer(self.0.tracer(NAME)))
     }
 }

@@ -26,13 +26,13 @@ const RUNS_PER_KILL: usize = 50;
 #[derive(Debug, Default)]
 pub(crate) struct AcquireKillCounts {
     /// Processes that were killed while they worked.
-    pub(crate) killed: usize,
+    pub killed: usize,
     /// Of these, before there was a recording.
-    pub(crate) before_the_file: usize,
+    pub before_the_file: usize,
     /// Runs that were brought to their end.
-    pub(crate) runs: usize,
+    pub runs: usize,
     /// Attempts that were acknowledged, in all runs.
-    pub(crate) acknowledged: usize,
+    pub acknowledged: usize,
 }
 
 /// A campaign in a folder of its own.
@@ -48,7 +48,7 @@ pub(crate) struct AcquireKillCampaign {
 type VerdictKey = (u32, u32, String);
 
 impl AcquireKillCampaign {
-    pub(crate) fn new(binary: &Path, seed: u64) -> Self {
+    pub fn new(binary: &Path, seed: u64) -> Self {
         let folder = tempfile::tempdir().expect("a folder");
         std::fs::write(folder.path().join("rig.toml"), SMALL_RIG).expect("written");
         std::fs::create_dir(folder.path().join("disk")).expect("made");
@@ -56,7 +56,7 @@ impl AcquireKillCampaign {
     }
 
     /// With a disk that forgets at each kill what was not synced; nothing if this machine cannot mount one.
-    pub(crate) fn with_power_cuts(binary: &Path, seed: u64) -> Option<Self> {
+    pub fn with_power_cuts(binary: &Path, seed: u64) -> Option<Self> {
         let mut campaign = Self::new(binary, seed);
         let disk = ForgetfulDisk::new();
         let mounted = disk.mount(&campaign.folder.path().join("disk"))?;
@@ -79,7 +79,7 @@ impl AcquireKillCampaign {
     ///
     /// # Panics
     /// A measurement is lost or doubled; the text names it.
-    pub(crate) fn kills(&mut self, kills: usize, told: &mut dyn FnMut(&AcquireKillCounts)) -> AcquireKillCounts {
+    pub fn kills(&mut self, kills: usize, told: &mut dyn FnMut(&AcquireKillCounts)) -> AcquireKillCounts {
         let mut whole = self.undisturbed();
         let mut outcome = AcquireKillCounts::default();
         while outcome.killed < kills {

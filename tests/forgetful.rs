@@ -48,13 +48,13 @@ enum DiskNode {
 type FolderEntries = BTreeMap<OsString, u64>;
 
 impl ForgetfulDisk {
-    pub(crate) fn new() -> Self {
+    pub fn new() -> Self {
         let root = DiskNode::Folder { now: FolderEntries::new(), safe: FolderEntries::new() };
         Self(Arc::new(Mutex::new(FileTree { nodes: BTreeMap::from([(ROOT, root)]), next: ROOT + 1 })))
     }
 
     /// Mounts the disk; nothing if this machine does not allow it.
-    pub(crate) fn mount(&self, at: &Path) -> Option<DiskMount> {
+    pub fn mount(&self, at: &Path) -> Option<DiskMount> {
         let options = [MountOption::FSName("forgetful".into())];
         match fuser::spawn_mount2(DiskFileSystem(self.0.clone()), at, &options) {
             Ok(session) => Some(DiskMount { _session: session }),
@@ -66,7 +66,7 @@ impl ForgetfulDisk {
     }
 
     /// Cuts the power. The disk must not be mounted.
-    pub(crate) fn cut(&self, random: &mut ChaCha8Rng) {
+    pub fn cut(&self, random: &mut ChaCha8Rng) {
         let mut tree = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         for node in tree.nodes.values_mut() {
             match node {

@@ -36,29 +36,29 @@ pub(crate) const MIB: u64 = 1 << 20;
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct HostileSizes {
     /// Files of records that only seem to be some.
-    pub(crate) false_records: usize,
+    pub false_records: usize,
     /// Decompressed size of a chunk that is just small enough to be read.
-    pub(crate) bomb: u64,
+    pub bomb: u64,
     /// Sparse records that are too large.
-    pub(crate) sparse: u64,
+    pub sparse: u64,
 }
 
 /// Counts of a round.
 #[derive(Debug, Default)]
 pub(crate) struct HostileOutcome {
     /// Files in the inbox.
-    pub(crate) files: usize,
+    pub files: usize,
     /// Good runs of which everything is in the tables.
-    pub(crate) good: usize,
+    pub good: usize,
     /// Good runs.
-    pub(crate) good_expected: usize,
+    pub good_expected: usize,
     /// Files that were put aside.
-    pub(crate) quarantined: usize,
+    pub quarantined: usize,
     /// Exits of processes that were started again.
-    pub(crate) deaths: Vec<String>,
+    pub deaths: Vec<String>,
     /// The most memory that a process had at a time.
-    pub(crate) peak_mib: u64,
-    pub(crate) elapsed: Duration,
+    pub peak_mib: u64,
+    pub elapsed: Duration,
 }
 
 /// A campaign in a folder of its own.
@@ -95,7 +95,7 @@ struct HostileFile {
 
 impl HostileCampaign {
     /// Measures the good runs and the template.
-    pub(crate) fn new(binary: &Path, seed: u64) -> Self {
+    pub fn new(binary: &Path, seed: u64) -> Self {
         let folder = tempfile::tempdir().expect("a folder");
         fs::write(folder.path().join("rig.toml"), SMALL_RIG).expect("written");
         let acquire = |lake: &str, surface: &str| {
@@ -117,7 +117,7 @@ impl HostileCampaign {
     ///
     /// # Panics
     /// It takes longer than `limit`, or `ingest` ends again and again.
-    pub(crate) fn round(&self, crafted: Option<HostileSizes>, mutants: Range<u64>, limit: Duration) -> HostileOutcome {
+    pub fn round(&self, crafted: Option<HostileSizes>, mutants: Range<u64>, limit: Duration) -> HostileOutcome {
         let lake = self.folder.path().join("round");
         // The first round finds none.
         let _ = fs::remove_dir_all(&lake);

@@ -27,9 +27,9 @@ pub(crate) fn table_queries() -> impl Iterator<Item = (&'static str, String)> {
 #[derive(Debug, Default)]
 pub(crate) struct KillCounts {
     /// Processes that were killed while they worked.
-    pub(crate) killed: usize,
+    pub killed: usize,
     /// Processes that ended before their moment came.
-    pub(crate) ended: usize,
+    pub ended: usize,
 }
 
 /// A campaign in a folder of its own.
@@ -41,12 +41,12 @@ pub(crate) struct KillCampaign {
 
 impl KillCampaign {
     /// Measures the runs of the lake that every round begins with.
-    pub(crate) fn new(binary: &Path, seed: u64) -> Self {
+    pub fn new(binary: &Path, seed: u64) -> Self {
         Self::of(binary, seed, SURFACES.len())
     }
 
     /// The same with so many runs, of the same surfaces again and again.
-    pub(crate) fn of(binary: &Path, seed: u64, runs: usize) -> Self {
+    pub fn of(binary: &Path, seed: u64, runs: usize) -> Self {
         let folder = tempfile::tempdir().expect("a folder");
         std::fs::write(folder.path().join("rig.toml"), SMALL_RIG).expect("written");
         let campaign = Self { folder, binary: binary.to_owned(), random: ChaCha8Rng::seed_from_u64(seed) };
@@ -63,7 +63,7 @@ impl KillCampaign {
     ///
     /// # Panics
     /// The tables are not those of an undisturbed ingest; the text names the round.
-    pub(crate) fn rounds(&mut self, rounds: usize, told: &mut dyn FnMut(usize, &KillCounts)) -> KillCounts {
+    pub fn rounds(&mut self, rounds: usize, told: &mut dyn FnMut(usize, &KillCounts)) -> KillCounts {
         let (mut whole, expected) = self.undisturbed();
         let mut outcome = KillCounts::default();
         for round in 0..rounds {
@@ -94,7 +94,7 @@ impl KillCampaign {
     ///
     /// # Panics
     /// As [`Self::rounds`].
-    pub(crate) fn halves(&mut self, rounds: usize, told: &mut dyn FnMut(usize, &KillCounts)) -> KillCounts {
+    pub fn halves(&mut self, rounds: usize, told: &mut dyn FnMut(usize, &KillCounts)) -> KillCounts {
         let (whole, expected) = self.undisturbed();
         let mut outcome = KillCounts::default();
         for round in 0..rounds {

@@ -22,7 +22,7 @@ pub(crate) struct PendingFolder {
 
 impl PendingFolder {
     /// Creates a partial folder for `path`, where nothing or an empty folder may exist.
-    pub(crate) fn create(path: &Path) -> Result<Self> {
+    pub fn create(path: &Path) -> Result<Self> {
         let empty = fs::read_dir(path).is_ok_and(|mut entries| entries.next().is_none());
         if path.symlink_metadata().is_ok() && !empty {
             return Err(Error::Exists { path: path.to_owned(), hint: "name a new folder" });
@@ -36,7 +36,7 @@ impl PendingFolder {
     }
 
     /// Creates a file in the folder; `name` may contain folders.
-    pub(crate) fn create_file(&self, name: &str) -> Result<HashedFile> {
+    pub fn create_file(&self, name: &str) -> Result<HashedFile> {
         let path = self.partial.join(name);
         if let Some(folder) = path.parent() {
             fs::create_dir_all(folder).map_err(|e| Error::write(&self.path.join(name), e))?;
@@ -45,24 +45,24 @@ impl PendingFolder {
     }
 
     /// Writes a small file.
-    pub(crate) fn write_file(&self, name: &str, content: &[u8]) -> Result<WrittenFile> {
+    pub fn write_file(&self, name: &str, content: &[u8]) -> Result<WrittenFile> {
         let mut file = self.create_file(name)?;
         file.write_all(content).map_err(|e| Error::write(&self.path.join(name), e))?;
         file.finish()
     }
 
     /// Returns the final path of a file, for messages.
-    pub(crate) fn final_path(&self, name: &str) -> PathBuf {
+    pub fn final_path(&self, name: &str) -> PathBuf {
         self.path.join(name)
     }
 
     /// Returns the path of a file while the folder is being written.
-    pub(crate) fn partial_path(&self, name: &str) -> PathBuf {
+    pub fn partial_path(&self, name: &str) -> PathBuf {
         self.partial.join(name)
     }
 
     /// Syncs the folder and renames it to its final name.
-    pub(crate) fn publish(mut self) -> Result<()> {
+    pub fn publish(mut self) -> Result<()> {
         let named = sync_tree(&self.partial).and_then(|()| fs::rename(&self.partial, &self.path));
         named.and_then(|()| sync_parent(&self.path)).map_err(|e| Error::write(&self.path, e))?;
         self.published = true;
@@ -108,7 +108,7 @@ impl HashedFile {
     }
 
     /// Flushes the file and syncs it to disk.
-    pub(crate) fn finish(mut self) -> Result<WrittenFile> {
+    pub fn finish(mut self) -> Result<WrittenFile> {
         let synced = self.file.flush().and_then(|()| self.file.get_ref().sync_all());
         synced.map_err(|e| Error::write(&self.named, e))?;
         Ok(WrittenFile { name: self.name, bytes: self.bytes, sha256: hex::encode(self.sha.finalize()) })

@@ -15,21 +15,21 @@ use crate::rows::RunKeys;
 /// The lake with one snapshot of it. Cheap to clone.
 #[derive(Clone)]
 pub(crate) struct IngestContext {
-    pub(crate) lake: Lake,
-    pub(crate) cores: Cores,
-    pub(crate) snapshot: Arc<LakeSnapshot>,
-    pub(crate) finder: SharedFinder,
+    pub lake: Lake,
+    pub cores: Cores,
+    pub snapshot: Arc<LakeSnapshot>,
+    pub finder: SharedFinder,
 }
 
 impl IngestContext {
-    pub(crate) fn new(lake: &Lake, cores: &Cores, snapshot: LakeSnapshot) -> Self {
+    pub fn new(lake: &Lake, cores: &Cores, snapshot: LakeSnapshot) -> Self {
         let snapshot = Arc::new(snapshot);
         let finder = ReferenceFinder::new_shared(lake, snapshot.clone());
         Self { lake: lake.clone(), cores: cores.clone(), snapshot, finder }
     }
 
     /// Stages a run's files of one derivation.
-    pub(crate) async fn stage_rows(
+    pub async fn stage_rows(
         &self,
         keys: &RunKeys,
         derivation: &str,
@@ -45,7 +45,7 @@ impl IngestContext {
 
     /// Stages the files that follow from a run's references, then in the list its row of `runs`, which replaces the rows in
     /// the snapshot. After its commit readers see the files that the row names, and nothing else of the run.
-    pub(crate) async fn stage_derived(
+    pub async fn stage_derived(
         &self,
         run: VisibleRun,
         row: &[RecordBatch],

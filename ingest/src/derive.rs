@@ -23,7 +23,7 @@ const SLICE: usize = 256;
 
 /// Loaded references, and the name of the derivation with them.
 pub(crate) struct ReferenceDerivation {
-    pub(crate) name: String,
+    pub name: String,
     flat_version: String,
     foam_version: String,
     references: LoadedReferences,
@@ -31,7 +31,7 @@ pub(crate) struct ReferenceDerivation {
 
 impl ReferenceDerivation {
     /// Loads the wanted references; None if one is missing.
-    pub(crate) async fn new(
+    pub async fn new(
         context: &IngestContext,
         run_derivation: &str,
         wanted: &WantedReferences,
@@ -48,7 +48,7 @@ impl ReferenceDerivation {
     }
 
     /// Derives every pair that both references have. Returns the files, and the run row's references.
-    pub(crate) async fn derive_run(
+    pub async fn derive_run(
         self,
         context: &IngestContext,
         keys: &RunKeys,

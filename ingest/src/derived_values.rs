@@ -14,9 +14,9 @@ pub(crate) type MeanResponses = HashMap<u32, MeanResponse>;
 /// Mean of a pair's responses.
 #[derive(Debug, Clone)]
 pub(crate) struct MeanResponse {
-    pub(crate) ir: Vec<f32>,
+    pub ir: Vec<f32>,
     /// Mean temperature of the air, C.
-    pub(crate) celsius: f64,
+    pub celsius: f64,
 }
 
 /// Values of each pair of Flat.
@@ -25,11 +25,11 @@ pub(crate) type FlatPairs = HashMap<u32, FlatPair>;
 /// Values of a pair of Flat without the direct sound.
 #[derive(Debug, Clone)]
 pub(crate) struct FlatPair {
-    pub(crate) energies: FlatEnergies,
+    pub energies: FlatEnergies,
     /// `[bands]`.
-    pub(crate) sensitivities: Vec<EnergySensitivity>,
+    pub sensitivities: Vec<EnergySensitivity>,
     /// Temperature of the air, C.
-    pub(crate) celsius: f64,
+    pub celsius: f64,
 }
 
 /// Returns the derivation plan for a rig's responses.
@@ -57,18 +57,18 @@ pub(crate) fn temperature_response(
 /// A run's impulse responses.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct RunResponses {
-    pub(crate) pairs: Vec<u32>,
+    pub pairs: Vec<u32>,
     /// `[pairs x length]`.
-    pub(crate) irs: Vec<f32>,
+    pub irs: Vec<f32>,
     /// `[pairs]`: temperature of the air, C.
-    pub(crate) celsius: Vec<f64>,
+    pub celsius: Vec<f64>,
 }
 
 /// Values derived from some of a run's measurements.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct DerivedRows {
     bands: usize,
-    pub(crate) pairs: Vec<u32>,
+    pub pairs: Vec<u32>,
     /// `[pairs x length]`.
     reflected: Vec<f32>,
     /// `[bands][pairs x length]`.
@@ -91,16 +91,16 @@ pub(crate) struct DerivedRows {
 /// Responses and curves of [`DerivedRows`].
 #[derive(Debug, Clone, Default)]
 pub(crate) struct DerivedLists {
-    pub(crate) pairs: Vec<u32>,
+    pub pairs: Vec<u32>,
     /// `[pairs x length]`.
-    pub(crate) reflected: Vec<f32>,
+    pub reflected: Vec<f32>,
     /// `[bands][pairs x length]`.
-    pub(crate) curves: Vec<Vec<f32>>,
+    pub curves: Vec<Vec<f32>>,
 }
 
 impl DerivedLists {
     /// Adds the curves, `length` samples each, to the means of their bands.
-    pub(crate) fn add_curves(&self, length: usize, means: &mut [SignalMean]) -> Result<(), echolake_dsp::Error> {
+    pub fn add_curves(&self, length: usize, means: &mut [SignalMean]) -> Result<(), echolake_dsp::Error> {
         for (mean, curves) in means.iter_mut().zip(&self.curves) {
             curves.chunks_exact(length).try_for_each(|curve| mean.add_signal(curve))?;
         }
@@ -110,12 +110,12 @@ impl DerivedLists {
 
 impl DerivedRows {
     /// Returns an empty set of rows with this number of bands.
-    pub(crate) fn new(bands: usize) -> Self {
+    pub fn new(bands: usize) -> Self {
         Self { bands, curves: vec![Vec::new(); bands], ..Self::default() }
     }
 
     /// Appends the values of one measurement.
-    pub(crate) fn push(&mut self, pair: u32, derived: &DerivedResponse<f32>) {
+    pub fn push(&mut self, pair: u32, derived: &DerivedResponse<f32>) {
         self.pairs.push(pair);
         self.reflected.extend_from_slice(&derived.reflected);
         let length = derived.reflected.len();
@@ -129,12 +129,12 @@ impl DerivedRows {
     }
 
     /// Appends the TNCE of one measurement without Foam's reflection.
-    pub(crate) fn push_unbiased(&mut self, energies: &[f64], flat: &FlatEnergies) {
+    pub fn push_unbiased(&mut self, energies: &[f64], flat: &FlatEnergies) {
         self.unbiased.extend(energies.iter().map(|energy| energy / flat.total));
     }
 
     /// Appends the errors of one measurement, in air of a temperature in C, from its sensitivities and Flat's.
-    pub(crate) fn push_errors(
+    pub fn push_errors(
         &mut self,
         levels: &LevelUncertainty,
         of: &[EnergySensitivity],
@@ -152,7 +152,7 @@ impl DerivedRows {
     }
 
     /// Moves out the responses and curves, which are empty afterwards.
-    pub(crate) fn take_lists(&mut self) -> DerivedLists {
+    pub fn take_lists(&mut self) -> DerivedLists {
         DerivedLists {
             pairs: self.pairs.clone(),
             reflected: std::mem::take(&mut self.reflected),
@@ -161,7 +161,7 @@ impl DerivedRows {
     }
 
     /// Returns the values of every column from `tnce_*` to `energy_total`, by its name.
-    pub(crate) fn energy_columns(&self, bands: &[String]) -> Vec<(String, Vec<f64>)> {
+    pub fn energy_columns(&self, bands: &[String]) -> Vec<(String, Vec<f64>)> {
         let mut columns = vec![
             ("tnce_total".into(), self.sum_bands(&self.tnce)),
             ("energy_total".into(), self.sum_bands(&self.energies)),
@@ -175,7 +175,7 @@ impl DerivedRows {
     }
 
     /// Returns the values of `rise_*_ms`, `centre_*_ms` and `slope_*_per_ms`, by their names; null without energy.
-    pub(crate) fn shape_columns(&self, bands: &[String], rate_hz: f64) -> Vec<(String, Vec<Option<f32>>)> {
+    pub fn shape_columns(&self, bands: &[String], rate_hz: f64) -> Vec<(String, Vec<Option<f32>>)> {
         let per_ms = rate_hz / 1e3;
         let column = |band: usize, value: &dyn Fn(&CurveShape) -> f64| {
             let shapes = self.shapes.iter().skip(band).step_by(self.bands);
@@ -192,7 +192,7 @@ impl DerivedRows {
     }
 
     /// Returns the values of every column `*_u_db`, by its name; null if they are not known.
-    pub(crate) fn uncertainty_columns(&self, bands: &[String]) -> Vec<(String, Vec<Option<f32>>)> {
+    pub fn uncertainty_columns(&self, bands: &[String]) -> Vec<(String, Vec<Option<f32>>)> {
         let over_total = bands.iter().map(|band| format!("tnce_{band}_u_db")).chain(["tnce_total_u_db".to_owned()]);
         let names: Vec<_> = over_total.chain(bands.iter().map(|band| format!("tnce_band_{band}_u_db"))).collect();
         let each = names.len();
@@ -204,18 +204,18 @@ impl DerivedRows {
     }
 
     /// Returns the relative errors of `tnce_*` and `tnce_total`; without values if they are not known.
-    pub(crate) fn error_columns(&self) -> Vec<Vec<ErrorMoments>> {
+    pub fn error_columns(&self) -> Vec<Vec<ErrorMoments>> {
         let each = self.bands + 1;
         (0..each).map(|at| self.errors.iter().skip(at).step_by(each).copied().collect()).collect()
     }
 
     /// Returns the values of `tnce_*` and `tnce_total`.
-    pub(crate) fn tnce_columns(&self) -> Vec<Vec<f64>> {
+    pub fn tnce_columns(&self) -> Vec<Vec<f64>> {
         self.band_columns(&self.tnce)
     }
 
     /// Returns the same without Foam's reflection; without values if that is not known.
-    pub(crate) fn unbiased_columns(&self) -> Vec<Vec<f64>> {
+    pub fn unbiased_columns(&self) -> Vec<Vec<f64>> {
         self.band_columns(&self.unbiased)
     }
 

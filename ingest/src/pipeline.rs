@@ -50,37 +50,37 @@ impl Drop for BusyCore {
 /// A finished job, ready for the commit.
 pub(crate) struct ReadyJob<R> {
     /// Files in the store; the last one decides the job's outcome.
-    pub(crate) staged: Vec<StagedFile>,
-    pub(crate) report: R,
+    pub staged: Vec<StagedFile>,
+    pub report: R,
 }
 
 /// A job with its result: its report, and the outcome of its last file (None if it had no files).
 pub(crate) type JobOutcome<J, R> = (J, Result<(R, Option<CommitOutcome>)>);
 
 impl Cores {
-    pub(crate) fn all() -> Result<Self> {
+    pub fn all() -> Result<Self> {
         let pool = ThreadPoolBuilder::new().thread_name(|i| format!("compute-{i}")).build();
         let pool = pool.map_err(|source| Error::Threads { source })?;
         Ok(Self { pool: Arc::new(pool), busy: Arc::default() })
     }
 
-    pub(crate) fn count(&self) -> usize {
+    pub fn count(&self) -> usize {
         self.pool.current_num_threads()
     }
 
     /// Counts the caller as a busy core.
-    pub(crate) fn mark_busy(&self) -> BusyCore {
+    pub fn mark_busy(&self) -> BusyCore {
         self.busy.fetch_add(1, Ordering::Relaxed);
         BusyCore(self.busy.clone())
     }
 
     /// Returns whether a core is idle.
-    pub(crate) fn is_one_idle(&self) -> bool {
+    pub fn is_one_idle(&self) -> bool {
         self.busy.load(Ordering::Relaxed) < self.count()
     }
 
     /// Starts a computation on a core of its own once one is free, in the order of the calls.
-    pub(crate) fn begin_on_core<T: Send + 'static>(
+    pub fn begin_on_core<T: Send + 'static>(
         &self,
         work: impl FnOnce() -> T + Send + 'static,
     ) -> PendingComputation<T> {
@@ -96,14 +96,14 @@ impl Cores {
     }
 
     /// Computes on a core of its own, as [`Self::begin_on_core`] does, and waits for the result.
-    pub(crate) async fn compute_on_core<T: Send + 'static>(&self, work: impl FnOnce() -> T + Send + 'static) -> T {
+    pub async fn compute_on_core<T: Send + 'static>(&self, work: impl FnOnce() -> T + Send + 'static) -> T {
         self.begin_on_core(work).wait_for_result().await
     }
 }
 
 impl<T> PendingComputation<T> {
     /// Waits for the result; a panic of the computation is resumed here.
-    pub(crate) async fn wait_for_result(self) -> T {
+    pub async fn wait_for_result(self) -> T {
         match self.0.await {
             Ok(Ok(done)) => done,
             Ok(Err(panic)) => resume_unwind(panic),

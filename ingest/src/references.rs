@@ -47,19 +47,19 @@ pub(crate) struct ReferenceResponses {
     direct: Arc<MeanResponses>,
     flat: Arc<FlatPairs>,
     /// Residual of Flat; None if it cannot be measured.
-    pub(crate) flat_residual: Option<DirectSoundResidual>,
+    pub flat_residual: Option<DirectSoundResidual>,
     /// Change of energies with the temperature of the air.
-    pub(crate) air: Arc<TemperatureResponse>,
+    pub air: Arc<TemperatureResponse>,
 }
 
 /// References as the lake subtracts them, and those without Foam's reflection.
 #[derive(Debug, Clone)]
 pub(crate) struct LoadedReferences {
-    pub(crate) chosen: ReferenceResponses,
+    pub chosen: ReferenceResponses,
     /// None if Foam's reflection cannot be estimated: few pairs, or arrivals that are not apart.
-    pub(crate) estimated: Option<ReferenceResponses>,
+    pub estimated: Option<ReferenceResponses>,
     /// The surface whose only run Flat's energies are from.
-    pub(crate) only_flat: Option<SurfaceId>,
+    pub only_flat: Option<SurfaceId>,
 }
 
 /// One finder for all workers: they share its cache.
@@ -68,13 +68,13 @@ pub(crate) type SharedFinder = Arc<Mutex<ReferenceFinder>>;
 /// The surfaces that a surface names as its references.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct ReferenceNames {
-    pub(crate) flat: SurfaceId,
-    pub(crate) foam: SurfaceId,
+    pub flat: SurfaceId,
+    pub foam: SurfaceId,
 }
 
 impl ReferenceNames {
     /// Returns the names that a run's surface gives, else the lake's.
-    pub(crate) fn from_surface(surface: &SurfaceRecord, references: &ReferenceSurfaces) -> Self {
+    pub fn from_surface(surface: &SurfaceRecord, references: &ReferenceSurfaces) -> Self {
         Self {
             flat: surface.flat_reference.clone().unwrap_or_else(|| references.flat.clone()),
             foam: surface.foam_reference.clone().unwrap_or_else(|| references.foam.clone()),
@@ -85,8 +85,8 @@ impl ReferenceNames {
 /// The references of a surface, as far as the lake has them.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct WantedReferences {
-    pub(crate) flat: ReferenceVersion,
-    pub(crate) foam: ReferenceVersion,
+    pub flat: ReferenceVersion,
+    pub foam: ReferenceVersion,
     /// Flat's own Foam.
     flat_foam: ReferenceVersion,
     direct_sound: DirectSound,
@@ -95,9 +95,9 @@ pub(crate) struct WantedReferences {
 /// One reference.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct ReferenceVersion {
-    pub(crate) surface: SurfaceId,
+    pub surface: SurfaceId,
     /// None if the lake has no run of the surface.
-    pub(crate) version: Option<String>,
+    pub version: Option<String>,
 }
 
 impl ReferenceVersion {
@@ -108,7 +108,7 @@ impl ReferenceVersion {
 }
 
 impl ReferenceFinder {
-    pub(crate) fn new(lake: &Lake, snapshot: Arc<LakeSnapshot>) -> Self {
+    pub fn new(lake: &Lake, snapshot: Arc<LakeSnapshot>) -> Self {
         let mut runs: HashMap<_, Vec<_>> = HashMap::new();
         for run in snapshot.runs() {
             runs.entry(run.surface.clone()).or_default().push(format!("{}.{}", run.run, run.run_derivation));
@@ -124,17 +124,17 @@ impl ReferenceFinder {
         Self { lake: lake.clone(), snapshot, names, versions, means: HashMap::new(), loaded: HashMap::new() }
     }
 
-    pub(crate) fn new_shared(lake: &Lake, snapshot: Arc<LakeSnapshot>) -> SharedFinder {
+    pub fn new_shared(lake: &Lake, snapshot: Arc<LakeSnapshot>) -> SharedFinder {
         Arc::new(Mutex::new(Self::new(lake, snapshot)))
     }
 
     /// Returns the references with which the surface's rows must be derived.
-    pub(crate) fn wanted_references(&self, surface: &SurfaceId) -> WantedReferences {
+    pub fn wanted_references(&self, surface: &SurfaceId) -> WantedReferences {
         self.wanted_by(self.reference_names(surface))
     }
 
     /// The same for a surface with these names.
-    pub(crate) fn wanted_by(&self, ReferenceNames { flat, foam }: ReferenceNames) -> WantedReferences {
+    pub fn wanted_by(&self, ReferenceNames { flat, foam }: ReferenceNames) -> WantedReferences {
         let flat_foam = self.reference_names(&flat).foam;
         WantedReferences {
             flat: self.find_version(flat),
@@ -148,7 +148,7 @@ impl ReferenceFinder {
     ///
     /// # Errors
     /// [`Error::FoamReflection`] if the lake wants it estimated and it cannot be.
-    pub(crate) async fn load_references(
+    pub async fn load_references(
         &mut self,
         wanted: &WantedReferences,
         cores: &Cores,
@@ -281,7 +281,7 @@ impl ReferenceResponses {
     }
 
     /// Returns the direct sound of a pair and its values of Flat, if the references have the pair.
-    pub(crate) fn of_pair(&self, pair: u32) -> Option<(&[f32], &FlatPair)> {
+    pub fn of_pair(&self, pair: u32) -> Option<(&[f32], &FlatPair)> {
         Some((self.direct.get(&pair)?.ir.as_slice(), self.flat.get(&pair)?))
     }
 }
@@ -341,19 +341,19 @@ fn estimate_references(
 
 impl WantedReferences {
     /// Returns Flat's version and Foam's; None if one is missing. Flat's version includes that of its own Foam.
-    pub(crate) fn version_pair(&self) -> Option<(String, String)> {
+    pub fn version_pair(&self) -> Option<(String, String)> {
         let (flat, flat_foam) = (self.flat.version.as_ref()?, self.flat_foam.version.as_ref()?);
         Some((format!("{flat}-{}", digest_parts(&[flat_foam])), self.foam.version.clone()?))
     }
 
     /// Returns the derivation's name for a run with these references.
-    pub(crate) fn derivation_name(&self, run_derivation: &str) -> Option<String> {
+    pub fn derivation_name(&self, run_derivation: &str) -> Option<String> {
         let (flat, foam) = self.version_pair()?;
         Some(digest_parts(&[run_derivation, &flat, &foam, CODE_VERSION, ROWS_REVISION, self.direct_sound.name()]))
     }
 
     /// Returns the names of the missing references, for messages.
-    pub(crate) fn missing_names(&self) -> String {
+    pub fn missing_names(&self) -> String {
         let absent = [&self.flat, &self.foam, &self.flat_foam].into_iter().filter(|f| f.version.is_none());
         let names: BTreeSet<_> = absent.map(|f| f.surface.as_str()).collect();
         names.into_iter().collect::<Vec<_>>().join(", ")

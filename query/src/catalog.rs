@@ -65,7 +65,7 @@ struct CatalogSnapshot {
 impl LakeCatalog {
     /// # Errors
     /// [`Error::Lake`] if the rig cannot be laid out.
-    pub(crate) fn new(lake: &Lake, source: FileReaders) -> Result<Self, Error> {
+    pub fn new(lake: &Lake, source: FileReaders) -> Result<Self, Error> {
         let lookups = LookupFunctions::from_lake(lake)?;
         let small = source.small.clone();
         Ok(Self {
@@ -81,7 +81,7 @@ impl LakeCatalog {
     }
 
     /// Returns the optimizer rules for plans over these tables and views, the same for every snapshot.
-    pub(crate) fn optimizer_rules(&self) -> [Arc<dyn OptimizerRule + Send + Sync>; 3] {
+    pub fn optimizer_rules(&self) -> [Arc<dyn OptimizerRule + Send + Sync>; 3] {
         [Arc::new(UnusedJoin), Arc::new(PairJoin::new(&self.lookups)), Arc::new(SortedNulls)]
     }
 
@@ -92,7 +92,7 @@ impl LakeCatalog {
     /// # Errors
     /// [`Error::Lake`] if the lake cannot be read, or not as of the moment that the statement names;
     /// [`Error::Query`] if that is no moment.
-    pub(crate) async fn register_tables(
+    pub async fn register_tables(
         &self,
         context: &SessionContext,
         system: Vec<(&'static str, Arc<dyn TableProvider>)>,
@@ -128,7 +128,7 @@ impl LakeCatalog {
     ///
     /// # Errors
     /// [`Error::Lake`] if the lake cannot be read, or `runs` is not whole.
-    pub(crate) async fn current_snapshot(&self) -> Result<Arc<LakeSnapshot>, Error> {
+    pub async fn current_snapshot(&self) -> Result<Arc<LakeSnapshot>, Error> {
         let snapshot = self.fresh_snapshot().await?.snapshot.clone();
         snapshot.check_table(Table::Runs)?;
         Ok(snapshot)
@@ -138,7 +138,7 @@ impl LakeCatalog {
     ///
     /// # Errors
     /// [`Error::Execution`] if the file cannot be read.
-    pub(crate) async fn read_contents(&self, run: &VisibleRun) -> Result<Contents, Error> {
+    pub async fn read_contents(&self, run: &VisibleRun) -> Result<Contents, Error> {
         mcap_tables::read_contents(run, &self.fresh_snapshot().await?.snapshot, &self.runs).await.map_err(mcap_failed)
     }
 
@@ -146,23 +146,23 @@ impl LakeCatalog {
     ///
     /// # Errors
     /// As [`LakeCatalog::read_contents`].
-    pub(crate) async fn read_attachment(&self, run: &VisibleRun, ending: &str) -> Result<Option<Bytes>, Error> {
+    pub async fn read_attachment(&self, run: &VisibleRun, ending: &str) -> Result<Option<Bytes>, Error> {
         let snapshot = &self.fresh_snapshot().await?.snapshot;
         mcap_tables::read_attachment(run, snapshot, ending, &self.runs).await.map_err(mcap_failed)
     }
 
     /// Returns the views with their definitions.
-    pub(crate) fn view_definitions(&self) -> impl Iterator<Item = (&'static str, String)> {
+    pub fn view_definitions(&self) -> impl Iterator<Item = (&'static str, String)> {
         LakeView::ALL.into_iter().map(|view| (view.name(), view.definition_sql(&self.lake)))
     }
 
     /// Returns the system tables that every lake has, with their schemas.
-    pub(crate) fn system_tables(&self) -> [(&'static str, SchemaRef); 4] {
+    pub fn system_tables(&self) -> [(&'static str, SchemaRef); 4] {
         system::lake_columns(&Table::Runs.schema(self.lake.rig()))
     }
 
     /// Returns the tables and views with their schemas.
-    pub(crate) fn table_schemas(&self) -> impl Iterator<Item = (&'static str, SchemaRef)> {
+    pub fn table_schemas(&self) -> impl Iterator<Item = (&'static str, SchemaRef)> {
         let tables = || Table::ALL.into_iter().map(|table| (table.name(), table.schema(self.lake.rig())));
         let views = || LakeView::ALL.into_iter().map(|view| (view.name(), view.schema(&self.lake, &self.lookups)));
         self.names.get_or_init(|| tables().chain(views()).collect()).iter().cloned()

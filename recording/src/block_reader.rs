@@ -35,7 +35,7 @@ pub(crate) struct BlockReader {
 impl BlockReader {
     /// Opens a file of a store; what is wrong with it shows when it is read.
     #[cfg(feature = "store")]
-    pub(crate) async fn open(store: Arc<dyn ObjectStore>, path: Path) -> Self {
+    pub async fn open(store: Arc<dyn ObjectStore>, path: Path) -> Self {
         // A range, as other stores than a disk begin to send what is asked for.
         let first = GetOptions { range: Some((0..1).into()), ..GetOptions::default() };
         let file = match store.get_opts(&path, first).await.map(|found| found.payload) {
@@ -46,7 +46,7 @@ impl BlockReader {
     }
 
     /// Reads an open file.
-    pub(crate) fn from_file(file: File) -> Self {
+    pub fn from_file(file: File) -> Self {
         Self {
             #[cfg(feature = "store")]
             stored: None,
@@ -57,12 +57,12 @@ impl BlockReader {
 
     /// Returns whether other files of a store are read beside it.
     #[cfg(feature = "store")]
-    pub(crate) fn is_shared(&self) -> bool {
+    pub fn is_shared(&self) -> bool {
         self.stored.is_some()
     }
 
     /// Bytes that are fetched at least, where the file has them.
-    pub(crate) fn readahead_bytes(&self) -> u64 {
+    pub fn readahead_bytes(&self) -> u64 {
         #[cfg(feature = "store")]
         if self.file.is_none() {
             return FROM_STORE;
@@ -71,7 +71,7 @@ impl BlockReader {
     }
 
     /// Some of the file's bytes. Their memory serves the next block, where nothing holds this one any more.
-    pub(crate) async fn read_block(&mut self, range: Range<u64>) -> Result<Bytes, ErrorCause> {
+    pub async fn read_block(&mut self, range: Range<u64>) -> Result<Bytes, ErrorCause> {
         if self.file.is_none() {
             return self.read_range(range).await;
         }
@@ -90,7 +90,7 @@ impl BlockReader {
     }
 
     /// Some of the file's bytes, elsewhere than where the walk is.
-    pub(crate) async fn read_range(&mut self, range: Range<u64>) -> Result<Bytes, ErrorCause> {
+    pub async fn read_range(&mut self, range: Range<u64>) -> Result<Bytes, ErrorCause> {
         #[cfg(feature = "store")]
         if let Some((store, path)) = &self.stored {
             return Ok(store.get_range(path, range).await?);

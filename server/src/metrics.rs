@@ -36,7 +36,7 @@ impl ServerMetrics {
     ///
     /// # Errors
     /// A defect: two metrics of one name.
-    pub(crate) fn new() -> Result<Self> {
+    pub fn new() -> Result<Self> {
         let histogram = |name: &str, help: &str| HistogramOpts::new(name, help).buckets(BUCKETS.to_vec());
         let query_time = histogram("echolake_query_seconds", "Time of a query, to its last row sent.");
         let request_time = histogram("echolake_http_request_seconds", "Time of a request, to the head of its answer.");
@@ -95,13 +95,13 @@ impl ServerMetrics {
     }
 
     /// Counts a query that begins.
-    pub(crate) fn count_begin(&self, protocol: ServerProtocol) {
+    pub fn count_begin(&self, protocol: ServerProtocol) {
         self.queries.with_label_values(&[protocol.name()]).inc();
         self.running.inc();
     }
 
     /// Counts a query that has ended.
-    pub(crate) fn count_end(&self, protocol: ServerProtocol, end: &QueryEnd) {
+    pub fn count_end(&self, protocol: ServerProtocol, end: &QueryEnd) {
         let outcome = end.failure.map_or(ANSWERED, FaultCode::name);
         self.seconds.with_label_values(&[protocol.name(), outcome]).observe(end.seconds);
         self.rows.inc_by(end.rows);
@@ -110,19 +110,19 @@ impl ServerMetrics {
     }
 
     /// Counts queries that ended with their engine.
-    pub(crate) fn count_lost(&self, queries: usize) {
+    pub fn count_lost(&self, queries: usize) {
         self.running.sub(i64::try_from(queries).unwrap_or(i64::MAX));
     }
 
     /// Counts an answer over HTTP by the first digit of its status.
-    pub(crate) fn count_answer(&self, status: u16, seconds: f64) {
+    pub fn count_answer(&self, status: u16, seconds: f64) {
         let class = ["1xx", "2xx", "3xx", "4xx", "5xx"];
         let class = class.get(usize::from(status / 100).wrapping_sub(1)).copied().unwrap_or("other");
         self.requests.with_label_values(&[class]).observe(seconds);
     }
 
     /// Counts what an engine read of an object store.
-    pub(crate) fn count_cached(&self, counts: &CacheCounts) {
+    pub fn count_cached(&self, counts: &CacheCounts) {
         let CacheCounts { memory_hits, disk_hits, misses, requests, fetched_bytes } = *counts;
         for (from, blocks) in [("memory", memory_hits), ("disk", disk_hits), ("store", misses)] {
             self.cache_blocks.with_label_values(&[from]).inc_by(blocks);
@@ -132,12 +132,12 @@ impl ServerMetrics {
     }
 
     /// Counts a failed request.
-    pub(crate) fn count_failure(&self, code: FaultCode) {
+    pub fn count_failure(&self, code: FaultCode) {
         self.failures.with_label_values(&[code.name()]).inc();
     }
 
     /// Counts a failed request and writes it to the log.
-    pub(crate) fn record_failure(&self, fault: &RequestFault) {
+    pub fn record_failure(&self, fault: &RequestFault) {
         self.count_failure(fault.code());
         fault.log_failure();
     }
@@ -146,7 +146,7 @@ impl ServerMetrics {
     ///
     /// # Errors
     /// A defect: two metrics of one name, or values that are not as their metric.
-    pub(crate) fn prometheus_text(&self, gauges: &ServerGauges) -> Result<String> {
+    pub fn prometheus_text(&self, gauges: &ServerGauges) -> Result<String> {
         let moment = Registry::new();
         gauges.register_all(&moment)?;
         let mut families = self.registry.gather();

@@ -36,79 +36,79 @@ use watch::RunWatcher;
 pub(crate) struct AcquireArgs {
     /// Name of the measured surface, as 0015_0.
     #[arg(long, required_unless_present = "resume")]
-    pub(crate) surface: Option<SurfaceId>,
+    pub surface: Option<SurfaceId>,
     /// Resume a run that was stopped or cut off: its `.mcap.partial`. Measurements that are safe in it are not repeated.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["surface", "panel", "parameters", "set", "mesh", "side", "no_geometry", "rig", "flat", "foam", "macro_reference", "project", "seed", "ir_only"])]
-    pub(crate) resume: Option<PathBuf>,
+    pub resume: Option<PathBuf>,
     /// Relief by a name of `echolake panel --list`; by default, on the simulated rig, the one that the surface's name
     /// begins with.
     #[arg(long, value_name = "NAME", conflicts_with = "mesh")]
-    pub(crate) panel: Option<String>,
+    pub panel: Option<String>,
     /// A JSON file of parameters, as `echolake panel` writes them, in place of a name.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["mesh", "panel"])]
-    pub(crate) parameters: Option<PathBuf>,
+    pub parameters: Option<PathBuf>,
     /// Set a parameter of the relief; repeatable.
     #[arg(long, value_name = "KEY=VALUE")]
-    pub(crate) set: Vec<String>,
+    pub set: Vec<String>,
     /// Measure a mesh instead of a relief: a GLB or STL file.
     #[arg(long)]
-    pub(crate) mesh: Option<PathBuf>,
+    pub mesh: Option<PathBuf>,
     /// The side of the mesh that is measured: the back is seen when the panel is turned over about its y axis.
     #[arg(long, value_name = "front|back", value_parser = parse_side, requires = "mesh")]
-    pub(crate) side: Option<PanelSide>,
+    pub side: Option<PanelSide>,
     /// Record a real panel without its geometry.
     #[arg(long, conflicts_with_all = ["mesh", "panel", "parameters", "set"])]
-    pub(crate) no_geometry: bool,
+    pub no_geometry: bool,
     /// Rig file; by default the lake's rig, or the paper's for a new lake.
     #[arg(long)]
-    pub(crate) rig: Option<PathBuf>,
+    pub rig: Option<PathBuf>,
     /// Reference surface to normalise by; by default the lake's.
     #[arg(long)]
-    pub(crate) flat: Option<SurfaceId>,
+    pub flat: Option<SurfaceId>,
     /// Reference surface whose direct sound is subtracted; by default the lake's.
     #[arg(long)]
-    pub(crate) foam: Option<SurfaceId>,
+    pub foam: Option<SurfaceId>,
     /// Surface that has the large shape of this one and nothing on it; by default known for the paper's panels.
     #[arg(long, value_name = "NAME")]
-    pub(crate) macro_reference: Option<SurfaceId>,
+    pub macro_reference: Option<SurfaceId>,
     /// Project that the surface belongs to; tokens of the query service may be limited to projects.
     #[arg(long, value_name = "NAME")]
-    pub(crate) project: Option<ProjectName>,
+    pub project: Option<ProjectName>,
     /// Seed of the simulation.
     #[arg(long, default_value_t = 1)]
-    pub(crate) seed: u64,
+    pub seed: u64,
     /// Record no sweeps, only impulse responses.
     #[arg(long)]
-    pub(crate) ir_only: bool,
+    pub ir_only: bool,
     /// Pairs between two checkpoints: the most that a power cut costs, and how long until a pair is reported as safe. By
     /// default 1 on a real rig, 200 on the simulated one.
     #[arg(long, value_name = "PAIRS", value_parser = clap::value_parser!(u32).range(1..))]
-    pub(crate) checkpoint_every: Option<u32>,
+    pub checkpoint_every: Option<u32>,
     /// Minimum duration of a simulated take in seconds; a real rig needs 12.3.
     #[arg(long, value_name = "SECS", default_value_t = 0.0)]
-    pub(crate) pace: f64,
+    pub pace: f64,
     /// Start even if the disk, sensor, level or loopback check fails.
     #[arg(long)]
-    pub(crate) skip_checks: bool,
+    pub skip_checks: bool,
     /// Start even if another run is recorded into the lake, or with the same devices.
     #[arg(long)]
-    pub(crate) force: bool,
+    pub force: bool,
     /// Append one line to this file for every attempt that is safe on the disk: pair, attempt, verdict, SNR in dB. `-` is
     /// stdout.
     #[arg(long, value_name = "FILE")]
-    pub(crate) acknowledge: Option<PathBuf>,
+    pub acknowledge: Option<PathBuf>,
     /// Serve a live view of the run to Foxglove and Lichtblick at ws://ADDR.
     #[arg(long, value_name = "ADDR")]
-    pub(crate) live: Option<std::net::SocketAddr>,
+    pub live: Option<std::net::SocketAddr>,
     #[command(flatten)]
-    pub(crate) viewers: ViewerArgs,
+    pub viewers: ViewerArgs,
     /// Serve metrics for Prometheus under http://ADDR/metrics.
     #[arg(long, value_name = "ADDR")]
-    pub(crate) metrics: Option<std::net::SocketAddr>,
+    pub metrics: Option<std::net::SocketAddr>,
     /// Upload the run, once it is closed, to the lake at this location, as s3://bucket/prefix. The recording stays here.
     #[cfg(feature = "upload")]
     #[arg(long, value_name = "URL")]
-    pub(crate) upload: Option<String>,
+    pub upload: Option<String>,
 }
 
 impl AcquireArgs {

@@ -51,12 +51,12 @@ impl FromStr for CacheSize {
 
 impl CacheArgs {
     /// The folder, if there is one.
-    pub(crate) fn cache_folder(&self) -> Option<CacheFolder> {
+    pub fn cache_folder(&self) -> Option<CacheFolder> {
         Some(CacheFolder { path: self.cache.clone()?, bytes: self.cache_size.0 })
     }
 
     /// Opens a lake with the cache.
-    pub(crate) async fn open_lake(&self, url: &str) -> anyhow::Result<Lake> {
+    pub async fn open_lake(&self, url: &str) -> anyhow::Result<Lake> {
         let lake = Lake::open(url).await?;
         if self.cache.is_some() && !lake.is_remote() {
             eprintln!("note: --cache is for lakes on object stores; `{}` is read without", lake.location());

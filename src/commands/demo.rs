@@ -24,22 +24,22 @@ pub(crate) struct DemoArgs {
     /// brick walls per stone wall, as in the paper), and the paper's own panels by name.
     /// Surfaces that the lake has are not measured again.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=LARGEST as i64))]
-    pub(crate) surfaces: Option<u32>,
+    pub surfaces: Option<u32>,
     /// Record no sweeps, only impulse responses: a tenth of the space.
     #[arg(long)]
-    pub(crate) ir_only: bool,
+    pub ir_only: bool,
     /// Do not serve the catalogue afterwards.
     #[arg(long)]
-    pub(crate) no_serve: bool,
+    pub no_serve: bool,
     /// Leave the runs in the lake's inbox/.
     #[arg(long, hide = true)]
-    pub(crate) no_ingest: bool,
+    pub no_ingest: bool,
     /// The rig; by default that of the paper with sweeps of 0.05 s.
     #[arg(long)]
-    pub(crate) rig: Option<PathBuf>,
+    pub rig: Option<PathBuf>,
     /// Seed of the simulation: the same seed gives the same data.
     #[arg(long, default_value_t = 1)]
-    pub(crate) seed: u64,
+    pub seed: u64,
 }
 
 /// The surfaces, in the order in which they are measured: name and relief are the same.

@@ -11,10 +11,10 @@ use clap::Args;
 pub(crate) struct DoctorArgs {
     /// Report what this installation can do instead: pages, audio, formats, disk, ports. The lake's data are not read.
     #[arg(long = "self")]
-    pub(crate) installation: bool,
+    pub installation: bool,
     /// Print the report as JSON.
     #[arg(long)]
-    pub(crate) json: bool,
+    pub json: bool,
 }
 
 pub(crate) async fn run_doctor(args: &DoctorArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {

@@ -29,16 +29,16 @@ use clap::Args;
 #[derive(Debug, Args)]
 pub(crate) struct IngestArgs {
     /// Run files, or names of runs in the lake; by default all that are not in the tables yet.
-    pub(crate) runs: Vec<String>,
+    pub runs: Vec<String>,
     /// Keep running and ingest new files of the lake's inbox, until Ctrl-C.
     #[arg(long, conflicts_with_all = ["runs", "json"])]
-    pub(crate) watch: bool,
+    pub watch: bool,
     /// Print what was done as JSON.
     #[arg(long)]
-    pub(crate) json: bool,
+    pub json: bool,
     /// Take in this file of the lake alone, for the ingest that started this one.
     #[arg(long, hide = true, value_name = "PATH", conflicts_with_all = ["runs", "watch", "json"])]
-    pub(crate) suspect: Option<String>,
+    pub suspect: Option<String>,
 }
 
 /// Time between two looks at the inbox.
@@ -54,7 +54,7 @@ const PANICKED: i32 = 101;
 /// The results of all files.
 #[derive(Default, Serialize, Deserialize)]
 pub(crate) struct IngestSummary {
-    pub(crate) taken: Vec<IngestedRun>,
+    pub taken: Vec<IngestedRun>,
     refused: Vec<RefusedFile>,
     /// Number of files that other ingests took.
     #[serde(skip)]

@@ -11,10 +11,10 @@ use echolake_lake::TARGET_BYTES;
 pub(crate) struct OptimizeArgs {
     /// Size of the merged files in MB; files of half of it and more are left alone.
     #[arg(long, value_name = "MB", default_value_t = TARGET_BYTES >> 20, value_parser = clap::value_parser!(u64).range(1..=1024))]
-    pub(crate) target_mb: u64,
+    pub target_mb: u64,
     /// Print what was done as JSON.
     #[arg(long)]
-    pub(crate) json: bool,
+    pub json: bool,
 }
 
 pub(crate) async fn run_optimize(args: &OptimizeArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {

@@ -16,7 +16,7 @@ use crate::CommandOutcome;
 pub(crate) struct RebuildArgs {
     /// The table; by default all. Until its rows are there again, queries of it are refused.
     #[arg(value_parser = PossibleValuesParser::new(Table::ALL.map(Table::name)))]
-    pub(crate) table: Option<String>,
+    pub table: Option<String>,
 }
 
 pub(crate) async fn run_rebuild(args: &RebuildArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {

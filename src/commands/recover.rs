@@ -11,13 +11,13 @@ use std::path::PathBuf;
 #[derive(Debug, Args)]
 pub(crate) struct RecoverArgs {
     /// The recording that was stopped, cut off or damaged; it is only read.
-    pub(crate) file: PathBuf,
+    pub file: PathBuf,
     /// Path of the rebuilt file; by default beside it, without `.partial`.
     #[arg(short, long, value_name = "FILE")]
-    pub(crate) output: Option<PathBuf>,
+    pub output: Option<PathBuf>,
     /// Print what was done as JSON.
     #[arg(long)]
-    pub(crate) json: bool,
+    pub json: bool,
 }
 
 pub(crate) fn run_recover(args: &RecoverArgs) -> anyhow::Result<CommandOutcome> {

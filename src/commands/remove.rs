@@ -13,16 +13,16 @@ use crate::progress::CommandProgress;
 pub(crate) struct RemoveArgs {
     /// Names of the runs.
     #[arg(required = true)]
-    pub(crate) runs: Vec<String>,
+    pub runs: Vec<String>,
     /// Delete the runs' files instead of moving them to `quarantine/`.
     #[arg(long)]
-    pub(crate) delete: bool,
+    pub delete: bool,
     /// List what would be removed, and remove nothing.
     #[arg(long)]
-    pub(crate) dry_run: bool,
+    pub dry_run: bool,
     /// Print what was done as JSON.
     #[arg(long)]
-    pub(crate) json: bool,
+    pub json: bool,
 }
 
 pub(crate) async fn run_remove(args: &RemoveArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {

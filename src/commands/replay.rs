@@ -20,18 +20,18 @@ use echolake_acquisition::replay::SPEEDS;
 pub(crate) struct ReplayArgs {
     /// Names of runs or surfaces (the newest run of each), or .mcap files; they are played one after the other.
     #[arg(required = true, value_name = "RUN")]
-    pub(crate) runs: Vec<String>,
+    pub runs: Vec<String>,
     /// Address to listen on.
     #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:8765")]
-    pub(crate) listen: std::net::SocketAddr,
+    pub listen: std::net::SocketAddr,
     #[command(flatten)]
-    pub(crate) viewers: ViewerArgs,
+    pub viewers: ViewerArgs,
     /// Initial speed, as a factor of real time.
     #[arg(long, value_name = "X", default_value_t = 1.0, value_parser = parse_speed)]
-    pub(crate) speed: f32,
+    pub speed: f32,
     /// Start paused, until a viewer presses play; by default playback begins with the first viewer.
     #[arg(long)]
-    pub(crate) paused: bool,
+    pub paused: bool,
 }
 
 /// Access of viewers.
@@ -39,14 +39,14 @@ pub(crate) struct ReplayArgs {
 pub(crate) struct ViewerArgs {
     /// Allow a viewer that is a web page of another origin, such as `https://app.foxglove.dev`; repeatable.
     #[arg(long = "allow-origin", value_name = "URL", value_parser = parse_origin)]
-    pub(crate) allowed_origins: Vec<String>,
+    pub allowed_origins: Vec<String>,
     /// Allow other machines without the token that is part of the printed address.
     #[arg(long)]
-    pub(crate) open: bool,
+    pub open: bool,
 }
 
 impl ViewerArgs {
-    pub(crate) fn viewer_access(&self) -> ViewerAccess {
+    pub fn viewer_access(&self) -> ViewerAccess {
         ViewerAccess { allowed_origins: self.allowed_origins.clone(), is_open: self.open }
     }
 }

@@ -81,12 +81,12 @@ pub(super) struct QueryArgs {
 
 impl QueryArgs {
     /// Opens a lake with the cache.
-    pub(super) async fn open_lake(&self, url: &str) -> anyhow::Result<Lake> {
+    pub async fn open_lake(&self, url: &str) -> anyhow::Result<Lake> {
         self.cache.open_lake(url).await
     }
 
     /// Returns the settings of `count` engines of a lake.
-    pub(super) fn engine_settings(&self, lake: &Lake, count: u32) -> anyhow::Result<EngineSettings> {
+    pub fn engine_settings(&self, lake: &Lake, count: u32) -> anyhow::Result<EngineSettings> {
         Ok(EngineSettings {
             temp: self.temp.clone(),
             slow: self.log_slow,
@@ -117,7 +117,7 @@ pub(crate) struct EngineArgs {
 
 impl EngineArgs {
     /// Gives up what an engine does not need. To be called before there are threads.
-    pub(crate) fn confine_process(&self, lake_url: &str) -> anyhow::Result<()> {
+    pub fn confine_process(&self, lake_url: &str) -> anyhow::Result<()> {
         let temp = std::env::temp_dir();
         let cache = self.cache.cache_folder();
         let own: Vec<_> = [self.sockets.as_path(), &temp]

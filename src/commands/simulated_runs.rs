@@ -33,29 +33,29 @@ const TOLD_EACH: usize = 20;
 
 /// A run to simulate.
 pub(super) struct PlannedRun {
-    pub(super) surface: SurfaceId,
-    pub(super) specimen: PanelSpecimen,
+    pub surface: SurfaceId,
+    pub specimen: PanelSpecimen,
     /// The surface that has its large shape alone.
-    pub(super) macro_reference: Option<SurfaceId>,
+    pub macro_reference: Option<SurfaceId>,
     /// References, if they are not the lake's.
-    pub(super) flat: Option<SurfaceId>,
-    pub(super) foam: Option<SurfaceId>,
-    pub(super) project: Option<ProjectName>,
+    pub flat: Option<SurfaceId>,
+    pub foam: Option<SurfaceId>,
+    pub project: Option<ProjectName>,
     /// Time of its begin: with the surface's name it tells whether the run is there already.
-    pub(super) start: Timestamp,
-    pub(super) seed: u64,
+    pub start: Timestamp,
+    pub seed: u64,
 }
 
 /// Runs to simulate.
 pub(super) struct SimulationPlan {
-    pub(super) rig: Rig,
+    pub rig: Rig,
     /// In the order in which they are measured.
-    pub(super) runs: Vec<PlannedRun>,
-    pub(super) keep: RecordingMode,
+    pub runs: Vec<PlannedRun>,
+    pub keep: RecordingMode,
     /// Folder of the recordings.
-    pub(super) folder: PathBuf,
+    pub folder: PathBuf,
     /// Names, without their tags, of the runs that are there already.
-    pub(super) known: HashSet<String>,
+    pub known: HashSet<String>,
 }
 
 /// State shared by the threads of a simulation.
@@ -81,7 +81,7 @@ struct SimulationTotals {
 
 impl SimulationPlan {
     /// Measures the surfaces that are missing. When `stop` becomes true, it ends after those that are being measured.
-    pub(super) fn measure_missing(mut self, stop: &AtomicBool, progress: &CommandProgress) -> anyhow::Result<()> {
+    pub fn measure_missing(mut self, stop: &AtomicBool, progress: &CommandProgress) -> anyhow::Result<()> {
         self.look_for_runs()?;
         let plan = &self;
         let cores = std::thread::available_parallelism().map_or(1, usize::from);

@@ -28,13 +28,13 @@ use crate::progress::CommandProgress;
 #[derive(Debug, Args)]
 pub(crate) struct TwinArgs {
     /// The measured surface.
-    pub(crate) surface: SurfaceId,
+    pub surface: SurfaceId,
     /// Number of listed pairs, those with the largest differences.
     #[arg(long, value_name = "N", default_value_t = 10)]
-    pub(crate) pairs: usize,
+    pub pairs: usize,
     /// Print the differences as JSON.
     #[arg(long)]
-    pub(crate) json: bool,
+    pub json: bool,
 }
 
 /// Begin of the names of computed surfaces.

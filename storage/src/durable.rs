@@ -35,7 +35,7 @@ pub(crate) struct DurableFileSystem {
 }
 
 impl DurableFileSystem {
-    pub(crate) fn new(lake: &FsPath) -> Self {
+    pub fn new(lake: &FsPath) -> Self {
         Self { inner: LocalFileSystem::new(), lake: lake.to_owned() }
     }
 

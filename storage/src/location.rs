@@ -22,21 +22,21 @@ use crate::{Error, Result};
 #[derive(Debug, Clone)]
 pub(crate) struct LakeLocation {
     /// As the user wrote it.
-    pub(crate) text: String,
+    pub text: String,
     /// The folder, if it is one.
-    pub(crate) folder: Option<PathBuf>,
+    pub folder: Option<PathBuf>,
     /// The lake alone.
-    pub(crate) store: Arc<dyn ObjectStore>,
+    pub store: Arc<dyn ObjectStore>,
     /// If it is an object store: what it does beyond `store`.
     #[cfg(feature = "remote")]
-    pub(crate) remote: Option<Arc<RemoteStore>>,
+    pub remote: Option<Arc<RemoteStore>>,
     /// The same store, if it has a cache.
     #[cfg(feature = "tables")]
-    pub(crate) cached: Option<CachedStore>,
+    pub cached: Option<CachedStore>,
 }
 
 impl LakeLocation {
-    pub(crate) fn parse(text: &str) -> Result<Self> {
+    pub fn parse(text: &str) -> Result<Self> {
         let wrong = |source: ErrorCause| Error::Location { location: without_secrets(text), source };
         if text.trim().is_empty() {
             return Err(wrong("it is empty".into()));
@@ -66,7 +66,7 @@ impl LakeLocation {
     /// # Errors
     /// [`Error::NotExclusive`], or what the store says.
     #[cfg(feature = "remote")]
-    pub(crate) async fn ensure_exclusive(&self) -> Result<()> {
+    pub async fn ensure_exclusive(&self) -> Result<()> {
         let Some(remote) = &self.remote else { return Ok(()) };
         let probe = async {
             probe_exclusion(&self.store).await.map_err(|fault| match fault {
@@ -78,7 +78,7 @@ impl LakeLocation {
     }
 
     /// A store that holds nothing but the lake.
-    pub(crate) fn from_store(text: &str, store: Arc<dyn ObjectStore>) -> Self {
+    pub fn from_store(text: &str, store: Arc<dyn ObjectStore>) -> Self {
         Self {
             text: text.to_owned(),
             folder: None,
@@ -91,7 +91,7 @@ impl LakeLocation {
     }
 
     /// The same, of a store that is taken for a remote one if its name is a URL of one.
-    pub(crate) fn named_store(name: &str, store: Arc<dyn ObjectStore>) -> Self {
+    pub fn named_store(name: &str, store: Arc<dyn ObjectStore>) -> Self {
         Self {
             #[cfg(feature = "remote")]
             remote: crate::remote_access(name).map(|_| Arc::default()),

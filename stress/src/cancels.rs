@@ -126,13 +126,13 @@ enum IdleOutcome {
 /// A query and an end of it.
 #[derive(Debug)]
 pub(crate) struct CancelRow {
-    pub(crate) title: String,
+    pub title: String,
     /// From the end until the server was idle.
     times: Vec<Duration>,
     /// Number of times that the query was not running when it should have been ended.
     ended_before: usize,
     /// Number of times that the server still worked at the limit, or died.
-    pub(crate) failures: usize,
+    pub failures: usize,
 }
 
 impl CancelRow {

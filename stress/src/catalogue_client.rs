@@ -36,13 +36,13 @@ impl<T: Read + Write + Send> ByteStream for T {}
 
 impl CatalogueServer {
     /// A server at `127.0.0.1:8080`, in plain text, without a token.
-    pub(crate) fn new(address: &str) -> Self {
+    pub fn new(address: &str) -> Self {
         let headers = format!("host: {address}\r\naccept: application/json, */*\r\n");
         Self { address: address.to_owned(), headers, encryption: None }
     }
 
     /// Sends it a token with each request.
-    pub(crate) fn with_token(mut self, token: &str) -> Self {
+    pub fn with_token(mut self, token: &str) -> Self {
         self.headers += &format!("authorization: Bearer {token}\r\n");
         self
     }
@@ -51,7 +51,7 @@ impl CatalogueServer {
     ///
     /// # Errors
     /// The file is no certificate.
-    pub(crate) fn with_certificate(mut self, certificate: &Path) -> Result<Self> {
+    pub fn with_certificate(mut self, certificate: &Path) -> Result<Self> {
         self.encryption = Some(Arc::new(trusting_config(certificate)?));
         Ok(self)
     }
@@ -60,7 +60,7 @@ impl CatalogueServer {
     ///
     /// # Errors
     /// The server does not listen, or is another one.
-    pub(crate) fn connect(&self) -> Result<CatalogueConnection> {
+    pub fn connect(&self) -> Result<CatalogueConnection> {
         let stream = TcpStream::connect(&self.address)?;
         stream.set_nodelay(true)?;
         stream.set_read_timeout(Some(ANSWER_LIMIT))?;
@@ -80,7 +80,7 @@ impl CatalogueConnection {
     ///
     /// # Errors
     /// The connection ends, or the answer is none.
-    pub(crate) fn get(&mut self, path: &str) -> Result<(u16, Vec<u8>)> {
+    pub fn get(&mut self, path: &str) -> Result<(u16, Vec<u8>)> {
         let head = format!("GET {path} HTTP/1.1\r\n{}\r\n", self.headers);
         self.stream.get_mut().write_all(head.as_bytes())?;
         self.stream.get_mut().flush()?;

@@ -65,8 +65,8 @@ pub(crate) struct HostileClientsArgs {
 /// The server quiet and under attack.
 #[derive(Debug)]
 pub(crate) struct HostileReport {
-    pub(crate) quiet: AnswerTally,
-    pub(crate) attacked: AnswerTally,
+    pub quiet: AnswerTally,
+    pub attacked: AnswerTally,
     attacks: BTreeMap<String, usize>,
     restarts: usize,
 }
@@ -97,7 +97,7 @@ impl HostileReport {
     }
 
     /// Returns whether every answer was right and the server lives.
-    pub(crate) fn is_right(&self) -> bool {
+    pub fn is_right(&self) -> bool {
         self.attacked.is_right() && self.restarts == 0
     }
 

@@ -37,10 +37,10 @@ pub(crate) enum FuzzTarget {
 
 impl FuzzTarget {
     /// All targets.
-    pub(crate) const ALL: [Self; 3] = [Self::Sql, Self::Wire, Self::Mcap];
+    pub const ALL: [Self; 3] = [Self::Sql, Self::Wire, Self::Mcap];
 
     /// Its name on a command line.
-    pub(crate) fn name(self) -> &'static str {
+    pub fn name(self) -> &'static str {
         match self {
             Self::Sql => "sql",
             Self::Wire => "wire",
@@ -52,13 +52,13 @@ impl FuzzTarget {
 /// Counts of a campaign.
 #[derive(Debug, Default)]
 pub(crate) struct FuzzCounts {
-    pub(crate) rounds: usize,
+    pub rounds: usize,
     /// Rounds whose query did not fail, or whose bytes got some back.
-    pub(crate) answered: usize,
+    pub answered: usize,
     /// Connections that ended by a panic of pgwire's decoder (0.41 panics on some messages of Postgres' protocol).
-    pub(crate) broken: usize,
+    pub broken: usize,
     /// The most that the server's process held in memory after a round, KiB.
-    pub(crate) resident_kib: u64,
+    pub resident_kib: u64,
 }
 
 /// A server and what is thrown at it.
@@ -72,7 +72,7 @@ pub(crate) struct FuzzCampaign {
 
 impl FuzzCampaign {
     /// Measures a surface, ingests it, and serves the lake by [`ServedLake::start`] or its like.
-    pub(crate) fn new(binary: &Path, seed: u64, serve: fn(&Path, &Path, &[&str]) -> ServedLake) -> Self {
+    pub fn new(binary: &Path, seed: u64, serve: fn(&Path, &Path, &[&str]) -> ServedLake) -> Self {
         let folder = tempfile::tempdir().expect("a folder");
         let path = |name: &str| folder.path().join(name);
         std::fs::write(path("rig.toml"), SMALL_RIG).expect("written");
@@ -100,7 +100,7 @@ impl FuzzCampaign {
     ///
     /// # Panics
     /// The server is harmed; the text names the cause.
-    pub(crate) fn throw(&mut self, target: FuzzTarget, go_on: &mut dyn FnMut(&FuzzCounts) -> bool) -> FuzzCounts {
+    pub fn throw(&mut self, target: FuzzTarget, go_on: &mut dyn FnMut(&FuzzCounts) -> bool) -> FuzzCounts {
         let mut outcome = FuzzCounts::default();
         while go_on(&outcome) {
             let (thrown, answered) = match target {

@@ -85,7 +85,7 @@ enum RequestFault {
 }
 
 impl S3Double {
-    pub(crate) fn start(behaviour: StoreBehaviour) -> Self {
+    pub fn start(behaviour: StoreBehaviour) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").expect("a port");
         let endpoint = format!("http://{}", listener.local_addr().expect("its address"));
         let seed = if let StoreBehaviour::Unreliable(seed) = behaviour { seed } else { 0 };
@@ -117,7 +117,7 @@ impl S3Double {
     }
 
     /// Variables with which a command reaches it.
-    pub(crate) fn environment(&self) -> [(&'static str, String); 5] {
+    pub fn environment(&self) -> [(&'static str, String); 5] {
         [
             ("AWS_ENDPOINT_URL", self.endpoint.clone()),
             ("AWS_ALLOW_HTTP", "true".to_owned()),
@@ -131,50 +131,50 @@ impl S3Double {
         self.state.lock().expect("no panic")
     }
 
-    pub(crate) fn put(&self, key: &str, bytes: Vec<u8>) {
+    pub fn put(&self, key: &str, bytes: Vec<u8>) {
         self.state().put(key, bytes);
     }
 
-    pub(crate) fn set_behaviour(&self, behaviour: StoreBehaviour) {
+    pub fn set_behaviour(&self, behaviour: StoreBehaviour) {
         self.state().behaviour = behaviour;
     }
 
-    pub(crate) fn keys(&self) -> Vec<String> {
+    pub fn keys(&self) -> Vec<String> {
         self.state().objects.keys().cloned().collect()
     }
 
     /// The requests since the last call: method and key.
-    pub(crate) fn take_requests(&self) -> Vec<String> {
+    pub fn take_requests(&self) -> Vec<String> {
         std::mem::take(&mut self.state().log)
     }
 
-    pub(crate) fn get(&self, key: &str) -> Vec<u8> {
+    pub fn get(&self, key: &str) -> Vec<u8> {
         let state = self.state();
         state.objects.get(key).unwrap_or_else(|| panic!("no `{key}` in {:?}", state.objects.keys())).bytes.clone()
     }
 
     /// Loses all parts behind so many.
-    pub(crate) fn limit_parts(&self, limit: usize) {
+    pub fn limit_parts(&self, limit: usize) {
         self.state().part_limit = limit;
     }
 
     /// Number of open connections.
-    pub(crate) fn connections(&self) -> usize {
+    pub fn connections(&self) -> usize {
         self.state().connections
     }
 
     /// Number of parts that were stored.
-    pub(crate) fn parts(&self) -> usize {
+    pub fn parts(&self) -> usize {
         self.state().parts
     }
 
     /// Forgets all uploads that are not complete, as a bucket's rule does after a day.
-    pub(crate) fn abort_uploads(&self) {
+    pub fn abort_uploads(&self) {
         self.state().uploads.clear();
     }
 
     /// Requests, and faults among them.
-    pub(crate) fn counts(&self) -> (usize, usize) {
+    pub fn counts(&self) -> (usize, usize) {
         let state = self.state();
         (state.requests, state.faults)
     }

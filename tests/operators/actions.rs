@@ -31,9 +31,9 @@ pub(super) enum ActionNeed {
 
 /// An action: its name in a failure's sequence, what it needs, and what it does.
 pub(super) struct OperatorAction {
-    pub(super) name: &'static str,
-    pub(super) need: ActionNeed,
-    pub(super) run: fn(&mut OperatorRound<'_>) -> Result<(), String>,
+    pub name: &'static str,
+    pub need: ActionNeed,
+    pub run: fn(&mut OperatorRound<'_>) -> Result<(), String>,
 }
 
 const fn action(

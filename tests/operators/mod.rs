@@ -62,11 +62,11 @@ pub(crate) struct OperatorCampaign {
 
 /// A round that failed.
 pub(crate) struct RoundFailure {
-    pub(crate) seed: u64,
-    pub(crate) actions: Vec<String>,
+    pub seed: u64,
+    pub actions: Vec<String>,
     /// The first answer that was wrong.
-    pub(crate) answer: String,
-    pub(crate) folder: PathBuf,
+    pub answer: String,
+    pub folder: PathBuf,
 }
 
 /// A round: a lake, and what is known of it.
@@ -99,7 +99,7 @@ struct CommandEnd {
 
 impl OperatorCampaign {
     /// Measures the runs, and looks for what its actions need; `python` has the package deltalake.
-    pub(crate) fn new(binary: &Path, seed: u64, python: Option<PathBuf>) -> Self {
+    pub fn new(binary: &Path, seed: u64, python: Option<PathBuf>) -> Self {
         let folder = tempfile::tempdir().expect("a folder").keep();
         std::fs::write(folder.join("rig.toml"), SMALL_RIG).expect("written");
         let mut campaign = Self {
@@ -183,7 +183,7 @@ impl OperatorCampaign {
     }
 
     /// Runs rounds, each of a seed of its own; `told` is called after each with its seed and failure.
-    pub(crate) fn rounds(&self, rounds: u64, told: &mut dyn FnMut(u64, Option<&RoundFailure>)) -> Vec<RoundFailure> {
+    pub fn rounds(&self, rounds: u64, told: &mut dyn FnMut(u64, Option<&RoundFailure>)) -> Vec<RoundFailure> {
         let mut failures = Vec::new();
         for number in 0..rounds {
             let seed = self.seed.wrapping_add(number);

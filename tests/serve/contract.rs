@@ -6,18 +6,18 @@ use serde_json::Value;
 pub(super) struct ApiContract(Value);
 
 impl ApiContract {
-    pub(super) fn read() -> Self {
+    pub fn read() -> Self {
         Self(serde_json::from_str(include_str!("../../web/openapi.json")).expect("JSON"))
     }
 
     /// Its paths that are asked by GET.
-    pub(super) fn gets(&self) -> impl Iterator<Item = &str> {
+    pub fn gets(&self) -> impl Iterator<Item = &str> {
         let paths = self.0["paths"].as_object().expect("paths");
         paths.iter().filter(|(_, methods)| methods.get("get").is_some()).map(|(path, _)| path.as_str())
     }
 
     /// Returns the defects of an answer to GET.
-    pub(super) fn objections(&self, path: &str, status: u16, media_type: &str, body: &[u8]) -> Vec<String> {
+    pub fn objections(&self, path: &str, status: u16, media_type: &str, body: &[u8]) -> Vec<String> {
         let responses = &self.0["paths"][path]["get"]["responses"];
         let own = responses.get(status.to_string());
         let response = self.resolved(own.unwrap_or(&responses["default"]));

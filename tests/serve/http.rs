@@ -19,50 +19,50 @@ pub(crate) struct HttpRequest {
 /// An answer.
 #[derive(Debug)]
 pub(crate) struct HttpResponse {
-    pub(crate) status: u16,
+    pub status: u16,
     headers: Vec<(String, String)>,
-    pub(crate) body: Vec<u8>,
+    pub body: Vec<u8>,
     /// True if its end was received.
-    pub(crate) is_whole: bool,
+    pub is_whole: bool,
 }
 
 impl HttpRequest {
-    pub(crate) fn get(path: &str) -> Self {
+    pub fn get(path: &str) -> Self {
         let (headers, body) = (String::new(), String::new());
         Self { method: "GET", path: path.to_owned(), host: None, headers, body, is_chunked: false }
     }
 
-    pub(crate) fn head(path: &str) -> Self {
+    pub fn head(path: &str) -> Self {
         Self { method: "HEAD", ..Self::get(path) }
     }
 
-    pub(crate) fn options(path: &str) -> Self {
+    pub fn options(path: &str) -> Self {
         Self { method: "OPTIONS", ..Self::get(path) }
     }
 
-    pub(crate) fn post(path: &str, body: &str) -> Self {
+    pub fn post(path: &str, body: &str) -> Self {
         Self { method: "POST", body: body.to_owned(), ..Self::get(path) }
     }
 
-    pub(crate) fn with(mut self, name: &str, value: &str) -> Self {
+    pub fn with(mut self, name: &str, value: &str) -> Self {
         let _ = write!(self.headers, "{name}: {value}\r\n");
         self
     }
 
-    pub(crate) fn host(mut self, host: &str) -> Self {
+    pub fn host(mut self, host: &str) -> Self {
         self.host = Some(host.to_owned());
         self
     }
 
     /// Sends the body as one chunk, so that its length is not known before its end.
-    pub(crate) fn chunked(mut self) -> Self {
+    pub fn chunked(mut self) -> Self {
         self.body = format!("{:x}\r\n{}\r\n0\r\n\r\n", self.body.len(), self.body);
         self.is_chunked = true;
         self
     }
 
     /// Sends it and does not wait.
-    pub(crate) fn begin(self, server: &ServedLake) -> TcpStream {
+    pub fn begin(self, server: &ServedLake) -> TcpStream {
         let bytes = self.bytes(&server.http);
         let (head, body) = bytes.split_at(bytes.len() - self.body.len());
         let mut stream = ServedLake::connect(&server.http);
@@ -73,7 +73,7 @@ impl HttpRequest {
     }
 
     /// Returns the request as it is sent to this address.
-    pub(crate) fn bytes(&self, address: &str) -> Vec<u8> {
+    pub fn bytes(&self, address: &str) -> Vec<u8> {
         let length = match self.is_chunked {
             true => "transfer-encoding: chunked".to_owned(),
             false => format!("content-length: {}", self.body.len()),
@@ -88,12 +88,12 @@ impl HttpRequest {
         [head.as_bytes(), self.body.as_bytes()].concat()
     }
 
-    pub(crate) fn send(self, server: &ServedLake) -> HttpResponse {
+    pub fn send(self, server: &ServedLake) -> HttpResponse {
         self.attempt(server).expect("headers")
     }
 
     /// None if the connection ended before an answer began.
-    pub(crate) fn attempt(self, server: &ServedLake) -> Option<HttpResponse> {
+    pub fn attempt(self, server: &ServedLake) -> Option<HttpResponse> {
         let name = format!("{} {}", self.method, self.path);
         let mut stream = self.begin(server);
         let mut bytes = Vec::new();
@@ -108,7 +108,7 @@ impl HttpRequest {
 
 impl HttpResponse {
     /// Reads an answer; None if its head is not whole.
-    pub(crate) fn read(bytes: &[u8]) -> Option<Self> {
+    pub fn read(bytes: &[u8]) -> Option<Self> {
         let end = bytes.windows(4).position(|w| w == b"\r\n\r\n")?;
         let head = std::str::from_utf8(&bytes[..end]).expect("text");
         let mut lines = head.lines();
@@ -121,11 +121,11 @@ impl HttpResponse {
         Some(Self { status, headers, body, is_whole })
     }
 
-    pub(crate) fn header(&self, name: &str) -> Option<&str> {
+    pub fn header(&self, name: &str) -> Option<&str> {
         self.headers.iter().find(|(known, _)| known == name).map(|(_, value)| value.as_str())
     }
 
-    pub(crate) fn text(&self) -> String {
+    pub fn text(&self) -> String {
         String::from_utf8(self.body.clone()).expect("text")
     }
 }

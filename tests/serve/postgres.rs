@@ -18,12 +18,12 @@ pub(crate) type TextRows = Result<Vec<Vec<Option<String>>>, String>;
 
 impl WireClient {
     /// Connects as the user who sends a token; if none is required, the session has begun.
-    pub(crate) fn connect(server: &ServedLake, options: Option<&str>) -> Self {
+    pub fn connect(server: &ServedLake, options: Option<&str>) -> Self {
         Self::attempt(server, options).unwrap_or_else(|state| panic!("refused: {state}"))
     }
 
     /// The same; the error is the state of the refusal.
-    pub(crate) fn attempt(server: &ServedLake, options: Option<&str>) -> Result<Self, String> {
+    pub fn attempt(server: &ServedLake, options: Option<&str>) -> Result<Self, String> {
         let (mut client, request) = Self::begin_login(server, "token", options)?;
         if request == [0; 4] {
             assert_eq!(client.ready(), None);
@@ -32,7 +32,7 @@ impl WireClient {
     }
 
     /// Connects as this user; returns how the server wants to know that it is.
-    pub(crate) fn start(server: &ServedLake, user: &str, options: Option<&str>) -> (Self, Vec<u8>) {
+    pub fn start(server: &ServedLake, user: &str, options: Option<&str>) -> (Self, Vec<u8>) {
         Self::begin_login(server, user, options).unwrap_or_else(|state| panic!("refused: {state}"))
     }
 
@@ -57,41 +57,41 @@ impl WireClient {
     }
 
     /// The number of the connection, as the server announces it.
-    pub(crate) fn pid(&self) -> i32 {
+    pub fn pid(&self) -> i32 {
         self.key.first_chunk().map_or(0, |pid| i32::from_be_bytes(*pid))
     }
 
     /// The state of the message with which the server ends the connection.
-    pub(crate) fn farewell(&mut self) -> String {
+    pub fn farewell(&mut self) -> String {
         let (kind, body) = self.message();
         assert_eq!(kind, b'E', "{}", String::from_utf8_lossy(&body));
         state(&body)
     }
 
     /// Sends a token; returns the state of the refusal.
-    pub(crate) fn log_in(&mut self, token: &str) -> Option<String> {
+    pub fn log_in(&mut self, token: &str) -> Option<String> {
         self.send(b'p', &[token.as_bytes(), b"\0"].concat());
         self.ready()
     }
 
-    pub(crate) fn query(&mut self, sql: &str) -> TextRows {
+    pub fn query(&mut self, sql: &str) -> TextRows {
         self.begin(sql);
         self.rows()
     }
 
     /// The same by the extended protocol, with values as texts whose types the server finds.
-    pub(crate) fn query_extended(&mut self, sql: &str, values: &[&str]) -> TextRows {
+    pub fn query_extended(&mut self, sql: &str, values: &[&str]) -> TextRows {
         self.prepare("", sql);
         self.execute("", values)
     }
 
     /// Prepares a statement of this name, without waiting for the answer.
-    pub(crate) fn prepare(&mut self, name: &str, sql: &str) {
+    pub fn prepare(&mut self, name: &str, sql: &str) {
         self.send(b'P', &[name.as_bytes(), b"\0", sql.as_bytes(), b"\0", &[0; 2]].concat());
     }
 
     /// Runs a prepared statement.
-    pub(crate) fn execute(&mut self, name: &str, values: &[&str]) -> TextRows {
+    pub fn execute(&mut self, name: &str, values: &[&str]) -> TextRows {
         let mut bound = [b"\0", name.as_bytes(), b"\0", &[0; 2], &(values.len() as i16).to_be_bytes()[..]].concat();
         for value in values {
             bound.extend((value.len() as i32).to_be_bytes());
@@ -105,12 +105,12 @@ impl WireClient {
     }
 
     /// Asks and does not wait.
-    pub(crate) fn begin(&mut self, sql: &str) {
+    pub fn begin(&mut self, sql: &str) {
         self.send(b'Q', &[sql.as_bytes(), b"\0"].concat());
     }
 
     /// The rows of what was asked.
-    pub(crate) fn rows(&mut self) -> TextRows {
+    pub fn rows(&mut self) -> TextRows {
         let (mut rows, mut failed) = (Vec::new(), None);
         loop {
             match self.message() {
@@ -125,7 +125,7 @@ impl WireClient {
     }
 
     /// The fields of the error of a query that is refused.
-    pub(crate) fn refusal(&mut self, sql: &str) -> BTreeMap<char, String> {
+    pub fn refusal(&mut self, sql: &str) -> BTreeMap<char, String> {
         self.begin(sql);
         let mut fields = BTreeMap::new();
         loop {
@@ -141,7 +141,7 @@ impl WireClient {
     }
 
     /// Ends what runs, as a second connection does.
-    pub(crate) fn cancel(&self, server: &ServedLake) {
+    pub fn cancel(&self, server: &ServedLake) {
         let mut stream = ServedLake::connect(&server.postgres);
         let mut packet = ((8 + self.key.len()) as i32).to_be_bytes().to_vec();
         packet.extend(80_877_102_i32.to_be_bytes());
@@ -150,7 +150,7 @@ impl WireClient {
     }
 
     /// The state of the error with which a connection ends that sends no answer to its end.
-    pub(crate) fn end_state(&mut self) -> String {
+    pub fn end_state(&mut self) -> String {
         let state = loop {
             match self.message() {
                 (b'E', body) => break state(&body),
@@ -162,7 +162,7 @@ impl WireClient {
         state
     }
 
-    pub(crate) fn send_raw(&mut self, bytes: &[u8]) {
+    pub fn send_raw(&mut self, bytes: &[u8]) {
         self.stream.write_all(bytes).expect("sent");
     }
 

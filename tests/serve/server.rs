@@ -21,14 +21,14 @@ pub(crate) struct ServedLake {
     /// Tunnels that its addresses lead through if it is encrypted.
     _tunnels: Option<ServerTunnels>,
     /// `host:port` of each protocol.
-    pub(crate) http: String,
-    pub(crate) flight_sql: String,
-    pub(crate) postgres: String,
+    pub http: String,
+    pub flight_sql: String,
+    pub postgres: String,
 }
 
 impl ServedLake {
     /// Serves the lake `lake` of a folder.
-    pub(crate) fn start(binary: &Path, folder: &Path, more: &[&str]) -> Self {
+    pub fn start(binary: &Path, folder: &Path, more: &[&str]) -> Self {
         if std::env::var_os(ENCRYPTED_VARIABLE).is_some() {
             return Self::start_encrypted(binary, folder, more);
         }
@@ -36,7 +36,7 @@ impl ServedLake {
     }
 
     /// Serves it with a certificate; the addresses are those of tunnels, which encrypt what clients send.
-    pub(crate) fn start_encrypted(binary: &Path, folder: &Path, more: &[&str]) -> Self {
+    pub fn start_encrypted(binary: &Path, folder: &Path, more: &[&str]) -> Self {
         // A server that is started again keeps its certificate.
         if !folder.join("tls").exists() {
             let mut command = Command::new(binary);
@@ -64,7 +64,7 @@ impl ServedLake {
     }
 
     /// Serves the lake that a command's first arguments name.
-    pub(crate) fn start_command(command: &mut Command, more: &[&str]) -> Self {
+    pub fn start_command(command: &mut Command, more: &[&str]) -> Self {
         let any = "127.0.0.1:0";
         command
             .args(["serve", "--listen", any, "--flight-sql", any, "--postgres", any])
@@ -82,7 +82,7 @@ impl ServedLake {
     }
 
     /// A connection to one of its addresses, on which nothing is waited for without a limit.
-    pub(crate) fn connect(address: &str) -> TcpStream {
+    pub fn connect(address: &str) -> TcpStream {
         let stream = TcpStream::connect(address).expect("connected");
         stream.set_read_timeout(Some(ANSWER_LIMIT)).expect("a limit of time");
         stream.set_write_timeout(Some(ANSWER_LIMIT)).expect("a limit of time");
@@ -90,45 +90,45 @@ impl ServedLake {
     }
 
     /// Its process id.
-    pub(crate) fn id(&self) -> u32 {
+    pub fn id(&self) -> u32 {
         self.child.id()
     }
 
     /// Returns the lines it wrote to stderr so far.
-    pub(crate) fn said(&self) -> Vec<String> {
+    pub fn said(&self) -> Vec<String> {
         self.child.stderr().lines().map(str::to_owned).collect()
     }
 
     /// Returns whether its process is running.
-    pub(crate) fn is_up(&mut self) -> bool {
+    pub fn is_up(&mut self) -> bool {
         self.child.is_running()
     }
 
     /// Returns the resident memory of its process, in KiB.
-    pub(crate) fn resident_kib(&self) -> u64 {
+    pub fn resident_kib(&self) -> u64 {
         let status = std::fs::read_to_string(format!("/proc/{}/status", self.id())).unwrap_or_default();
         let line = status.lines().find_map(|l| l.strip_prefix("VmRSS:"));
         line.and_then(|l| l.trim().split(' ').next()).and_then(|n| n.parse().ok()).unwrap_or(0)
     }
 
     /// Stops it; returns its exit code.
-    pub(crate) fn terminate(&mut self) -> Option<i32> {
+    pub fn terminate(&mut self) -> Option<i32> {
         self.signal("TERM");
         self.wait()
     }
 
     /// Sends it a signal.
-    pub(crate) fn signal(&self, name: &str) {
+    pub fn signal(&self, name: &str) {
         self.child.signal(name);
     }
 
     /// Waits for a line on stderr with this text in it.
-    pub(crate) fn wait_for_line(&mut self, part: &str) {
+    pub fn wait_for_line(&mut self, part: &str) {
         self.child.wait_for_line(part);
     }
 
     /// Waits for its end; returns its exit code.
-    pub(crate) fn wait(&mut self) -> Option<i32> {
+    pub fn wait(&mut self) -> Option<i32> {
         self.child.wait().status.code()
     }
 }

@@ -53,7 +53,7 @@ impl ServerTunnels {
     ///
     /// # Errors
     /// The file is no certificate, or there are no threads.
-    pub(crate) fn new(certificate: &Path) -> Result<Self> {
+    pub fn new(certificate: &Path) -> Result<Self> {
         let runtime = Builder::new_multi_thread().worker_threads(1).enable_io().build()?;
         Ok(Self { runtime: Some(runtime), config: trusting_config(certificate)? })
     }
@@ -62,7 +62,7 @@ impl ServerTunnels {
     ///
     /// # Errors
     /// No port is free.
-    pub(crate) fn open(&self, target: String, opening: TunnelOpening) -> Result<String> {
+    pub fn open(&self, target: String, opening: TunnelOpening) -> Result<String> {
         let mut config = self.config.clone();
         if opening == TunnelOpening::FlightSql {
             config.alpn_protocols = vec![HTTP_2.to_vec()];

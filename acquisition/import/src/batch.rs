@@ -15,20 +15,20 @@ pub(crate) struct ImportBatch {
 
 impl ImportBatch {
     /// Begins one of the runs.
-    pub(crate) fn create_run(&mut self, path: &Path, start: &RunStart<'_>) -> Result<Recorder, Error> {
+    pub fn create_run(&mut self, path: &Path, start: &RunStart<'_>) -> Result<Recorder, Error> {
         let recorder = Recorder::create(path, start)?;
         self.ours.push(recorder.partial().to_owned());
         Ok(recorder)
     }
 
     /// Ends one of the runs: it is whole and on the disk.
-    pub(crate) fn seal_run(&mut self, recorder: Recorder, end: &RunEnd) -> Result<(), Error> {
+    pub fn seal_run(&mut self, recorder: Recorder, end: &RunEnd) -> Result<(), Error> {
         self.sealed.push(recorder.seal(end)?);
         Ok(())
     }
 
     /// Gives all runs their names.
-    pub(crate) fn publish_all(mut self) -> Result<(), Error> {
+    pub fn publish_all(mut self) -> Result<(), Error> {
         // Conflicts that can be known are found before the first run has its name.
         if let Some(taken) = self.sealed.iter().find(|run| run.path().exists()) {
             return Err(Error::Exists { path: taken.path().to_owned() });

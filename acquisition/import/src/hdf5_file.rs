@@ -25,39 +25,39 @@ pub(crate) struct Hdf5File {
 /// A variable that is in memory.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Hdf5Variable {
-    pub(crate) shape: Vec<usize>,
-    pub(crate) values: Vec<f64>,
+    pub shape: Vec<usize>,
+    pub values: Vec<f64>,
 }
 
 /// A variable of a file, of which parts are read.
 pub(crate) struct Hdf5Dataset {
     dataset: Dataset,
-    pub(crate) shape: Vec<usize>,
+    pub shape: Vec<usize>,
     /// Rows that are stored together.
-    pub(crate) chunk_rows: usize,
+    pub chunk_rows: usize,
 }
 
 impl Hdf5File {
-    pub(crate) fn open(path: &Path) -> Result<Self, String> {
+    pub fn open(path: &Path) -> Result<Self, String> {
         let size_bytes = std::fs::metadata(path).map_err(|e| e.to_string())?.len();
         let file = File::open_streaming(path).map_err(describe_error)?;
         Ok(Self { file, size_bytes })
     }
 
     /// Returns an attribute of the file; empty if it is missing.
-    pub(crate) fn root_text(&self, name: &str) -> String {
+    pub fn root_text(&self, name: &str) -> String {
         let found = self.file.root().attrs().ok().and_then(|mut attributes| attributes.remove(name));
         found.as_ref().and_then(AttrValue::as_str).unwrap_or_default().to_owned()
     }
 
     /// Returns an attribute of a variable; empty if it is missing.
-    pub(crate) fn text_of(&self, variable: &str, name: &str) -> String {
+    pub fn text_of(&self, variable: &str, name: &str) -> String {
         let found = self.read_attribute(variable, name).ok().flatten();
         found.as_ref().and_then(AttrValue::as_str).unwrap_or_default().to_owned()
     }
 
     /// Returns a number that is an attribute of a variable.
-    pub(crate) fn number_of(&self, variable: &str, name: &str) -> Result<f64, String> {
+    pub fn number_of(&self, variable: &str, name: &str) -> Result<f64, String> {
         let found = self.read_attribute(variable, name).map_err(describe_error)?.ok_or("it is missing")?;
         let number = found.as_f64().or_else(|| found.as_i64().map(|integer| integer as f64));
         number.ok_or_else(|| format!("{} and not one number", found.type_name()))
@@ -68,7 +68,7 @@ impl Hdf5File {
     }
 
     /// Returns the paths of variables, of a file with very many only the first.
-    pub(crate) fn variable_names(&self) -> Vec<String> {
+    pub fn variable_names(&self) -> Vec<String> {
         let mut names = Vec::new();
         let mut groups: Vec<(Group, String, usize)> = vec![(self.file.root(), String::new(), 0)];
         let mut seen = 0;
@@ -84,7 +84,7 @@ impl Hdf5File {
     }
 
     /// Opens a variable; None if it is missing.
-    pub(crate) fn open_dataset(&self, name: &str) -> Result<Option<Hdf5Dataset>, String> {
+    pub fn open_dataset(&self, name: &str) -> Result<Option<Hdf5Dataset>, String> {
         let dataset = match self.file.dataset(name) {
             Err(Hdf5Error::Format(FormatError::PathNotFound(_)) | Hdf5Error::NotAGroup(_)) => return Ok(None),
             opened => opened.map_err(describe_error)?,
@@ -113,7 +113,7 @@ impl Hdf5File {
     }
 
     /// Reads a variable; None if it is missing.
-    pub(crate) fn read_variable(&self, name: &str) -> Result<Option<Hdf5Variable>, String> {
+    pub fn read_variable(&self, name: &str) -> Result<Option<Hdf5Variable>, String> {
         let Some(dataset) = self.open_dataset(name)? else { return Ok(None) };
         let values = dataset.read_block(&vec![0; dataset.shape.len()], &dataset.shape)?;
         Ok(Some(Hdf5Variable { shape: dataset.shape, values }))
@@ -122,7 +122,7 @@ impl Hdf5File {
 
 impl Hdf5Dataset {
     /// Reads the block of `counts` numbers that begins at `starts`, row by row. Rows are read with all that is in them.
-    pub(crate) fn read_block(&self, starts: &[usize], counts: &[usize]) -> Result<Vec<f64>, String> {
+    pub fn read_block(&self, starts: &[usize], counts: &[usize]) -> Result<Vec<f64>, String> {
         let count = counts.iter().try_fold(1usize, |count, n| count.checked_mul(*n)).filter(|n| *n <= MOST);
         let count = count.ok_or_else(|| format!("{counts:?} numbers, more than {MOST}"))?;
         let (&[start, ref starts @ ..], &[rows, ref counts @ ..], [_, within @ ..]) = (starts, counts, &self.shape[..])

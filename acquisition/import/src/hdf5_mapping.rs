@@ -12,22 +12,22 @@ use crate::{Error, content_error};
 #[serde(deny_unknown_fields)]
 pub(crate) struct Hdf5Mapping {
     /// The HDF5 file; a relative path begins at the mapping's folder.
-    pub(crate) file: PathBuf,
+    pub file: PathBuf,
     /// One per measurement, or a single one.
-    pub(crate) surfaces: Vec<String>,
-    pub(crate) responses: ResponseMapping,
-    pub(crate) sampling_rate: RateMapping,
-    pub(crate) microphones: PositionMapping,
-    pub(crate) speakers: PositionMapping,
-    pub(crate) temperature: Option<TemperatureMapping>,
+    pub surfaces: Vec<String>,
+    pub responses: ResponseMapping,
+    pub sampling_rate: RateMapping,
+    pub microphones: PositionMapping,
+    pub speakers: PositionMapping,
+    pub temperature: Option<TemperatureMapping>,
 }
 
 /// The dataset of the responses.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct ResponseMapping {
-    pub(crate) dataset: String,
-    pub(crate) dimensions: Vec<DatasetDimension>,
+    pub dataset: String,
+    pub dimensions: Vec<DatasetDimension>,
 }
 
 /// A dimension of a dataset.
@@ -53,20 +53,20 @@ pub(crate) enum RateMapping {
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct StoredRate {
-    pub(crate) dataset: String,
-    pub(crate) attribute: Option<String>,
+    pub dataset: String,
+    pub attribute: Option<String>,
 }
 
 /// A dataset of positions, three numbers each.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct PositionMapping {
-    pub(crate) dataset: String,
+    pub dataset: String,
     /// By default those of the dataset's attribute `Units`.
-    pub(crate) units: Option<String>,
+    pub units: Option<String>,
     /// Cartesian or spherical; by default that of the dataset's attribute `Type`, or cartesian.
     #[serde(rename = "type")]
-    pub(crate) kind: Option<String>,
+    pub kind: Option<String>,
 }
 
 /// The temperature of the air: a number, or the dataset that has it.
@@ -81,11 +81,11 @@ pub(crate) enum TemperatureMapping {
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct StoredTemperatures {
-    pub(crate) dataset: String,
-    pub(crate) units: TemperatureUnit,
+    pub dataset: String,
+    pub units: TemperatureUnit,
     /// Empty for one temperature of all.
     #[serde(default)]
-    pub(crate) dimensions: Vec<DatasetDimension>,
+    pub dimensions: Vec<DatasetDimension>,
 }
 
 /// A unit of temperatures.
@@ -98,7 +98,7 @@ pub(crate) enum TemperatureUnit {
 
 impl Hdf5Mapping {
     /// Reads a mapping file.
-    pub(crate) fn from_file(path: &Path) -> Result<Self, Error> {
+    pub fn from_file(path: &Path) -> Result<Self, Error> {
         let unread = |e: std::io::Error| Error::Read { path: path.to_owned(), source: e.into() };
         let text = std::fs::read_to_string(path).map_err(unread)?;
         let mut mapping: Self = toml::from_str(&text).map_err(|e| {
@@ -110,7 +110,7 @@ impl Hdf5Mapping {
     }
 
     /// Returns the surfaces' names, checked: one per measurement.
-    pub(crate) fn parse_surfaces(&self, path: &Path, measurements: usize) -> Result<Vec<SurfaceId>, Error> {
+    pub fn parse_surfaces(&self, path: &Path, measurements: usize) -> Result<Vec<SurfaceId>, Error> {
         let place = "surfaces";
         if self.surfaces.len() != measurements {
             let expected = format!("{measurements}, one per measurement of `{}`", self.responses.dataset);
@@ -127,7 +127,7 @@ impl Hdf5Mapping {
 
 impl DatasetDimension {
     /// Its name in mapping files.
-    pub(crate) fn label(self) -> &'static str {
+    pub fn label(self) -> &'static str {
         match self {
             Self::Microphone => "microphone",
             Self::Speaker => "speaker",

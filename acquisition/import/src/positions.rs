@@ -28,13 +28,13 @@ enum Scale {
 /// A type or unit that is not known.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct FrameFault {
-    pub(crate) actual: String,
-    pub(crate) expected: &'static str,
+    pub actual: String,
+    pub expected: &'static str,
 }
 
 impl CoordinateFrame {
     /// Reads a type (cartesian if empty) and units: one of all coordinates, or a list; metres and degrees if empty.
-    pub(crate) fn parse(kind: &str, units: &str) -> Result<Self, FrameFault> {
+    pub fn parse(kind: &str, units: &str) -> Result<Self, FrameFault> {
         let is_spherical = match kind.trim().to_lowercase().as_str() {
             "cartesian" | "" => false,
             "spherical" => true,
@@ -65,7 +65,7 @@ impl CoordinateFrame {
     }
 
     /// Returns a position as cartesian coordinates, mm.
-    pub(crate) fn position_mm(&self, position: [f64; 3]) -> [f64; 3] {
+    pub fn position_mm(&self, position: [f64; 3]) -> [f64; 3] {
         let [a, b, c] = [0, 1, 2].map(|i| self.scales[i].scale_value(position[i]));
         if !self.is_spherical {
             return [a, b, c].map(to_nano);

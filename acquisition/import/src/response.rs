@@ -7,17 +7,17 @@ use echolake_schema::{Celsius, Grid, Pair, Rig, Timestamp};
 
 /// A response, recorded as the file has it.
 pub(crate) struct ImportedResponse {
-    pub(crate) pair: Pair,
-    pub(crate) at: Timestamp,
-    pub(crate) celsius: Celsius,
-    pub(crate) samples: Vec<f32>,
+    pub pair: Pair,
+    pub at: Timestamp,
+    pub celsius: Celsius,
+    pub samples: Vec<f32>,
     /// True if it is on the time axis of the rig's reference temperature.
-    pub(crate) is_corrected: bool,
+    pub is_corrected: bool,
 }
 
 impl ImportedResponse {
     /// Records it as the pair's first attempt, accepted.
-    pub(crate) fn record_response(self, recorder: &mut Recorder, rig: &Rig, grid: &Grid) -> Result<(), Error> {
+    pub fn record_response(self, recorder: &mut Recorder, rig: &Rig, grid: &Grid) -> Result<(), Error> {
         let Self { pair, at, celsius, samples, is_corrected } = self;
         let (unknown, celsius) = (f64::NAN, celsius.get());
         let [m, s] = [pair.microphone, pair.speaker].map(|id| grid.points()[id.index()].position_mm);

@@ -12,19 +12,19 @@ use crate::wav_layout::{SampleCoding, WavLayout};
 pub(crate) struct WavChannel {
     path: PathBuf,
     channel: u16,
-    pub(crate) layout: WavLayout,
+    pub layout: WavLayout,
 }
 
 /// The samples of a channel.
 pub(crate) struct ChannelSamples {
-    pub(crate) bytes: Vec<u8>,
-    pub(crate) fractions: Vec<f32>,
-    pub(crate) clipped: u32,
+    pub bytes: Vec<u8>,
+    pub fractions: Vec<f32>,
+    pub clipped: u32,
 }
 
 impl WavChannel {
     /// Opens `file.wav`, or `file.wav#2` for its second channel. The text of an error names the fault.
-    pub(crate) fn open(folder: &Path, reference: &str) -> Result<Self, String> {
+    pub fn open(folder: &Path, reference: &str) -> Result<Self, String> {
         let (name, channel) = match reference.rsplit_once('#') {
             Some((name, number)) => {
                 let number: u16 = number.parse().map_err(|_| format!("`#{number}` is no channel number"))?;
@@ -49,12 +49,12 @@ impl WavChannel {
     }
 
     /// Returns its file and channel, for messages.
-    pub(crate) fn label(&self) -> String {
+    pub fn label(&self) -> String {
         format!("`{}`, channel {}", self.path.display(), self.channel + 1)
     }
 
     /// Returns the format that stores its samples without loss.
-    pub(crate) fn sample_format(&self) -> SampleFormat {
+    pub fn sample_format(&self) -> SampleFormat {
         match (self.layout.coding, self.layout.bits) {
             (SampleCoding::Float, _) => SampleFormat::F32le,
             (SampleCoding::Integer, ..=16) => SampleFormat::S16le,
@@ -64,7 +64,7 @@ impl WavChannel {
     }
 
     /// Reads its samples, as bytes of `format`, which is its own or a wider one.
-    pub(crate) fn read_samples(&self, format: SampleFormat) -> Result<ChannelSamples, String> {
+    pub fn read_samples(&self, format: SampleFormat) -> Result<ChannelSamples, String> {
         let failed = |fault: String| format!("`{}` {fault}", self.path.display());
         let mut out = ChannelSamples { bytes: Vec::new(), fractions: Vec::new(), clipped: 0 };
         if self.layout.coding == SampleCoding::Float {

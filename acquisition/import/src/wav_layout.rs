@@ -30,21 +30,21 @@ pub(crate) enum SampleCoding {
 /// Coding and place of a file's samples.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct WavLayout {
-    pub(crate) coding: SampleCoding,
-    pub(crate) rate_hz: u32,
-    pub(crate) channels: u16,
+    pub coding: SampleCoding,
+    pub rate_hz: u32,
+    pub channels: u16,
     /// Bytes of a sample: 2 to 4.
     width: usize,
     /// Bits of a sample that are valid.
-    pub(crate) bits: u32,
+    pub bits: u32,
     /// Unused bits above the valid ones; those below are 0.
     unused_above: u32,
     /// Place of the first sample, bytes.
     start: u64,
     /// Samples of each channel.
-    pub(crate) samples: u64,
+    pub samples: u64,
     /// A fault of the header that cost nothing.
-    pub(crate) warning: Option<String>,
+    pub warning: Option<String>,
 }
 
 /// A chunk's name, and the place and length of its content.
@@ -64,7 +64,7 @@ struct ChunkReader {
 
 impl WavLayout {
     /// Reads the layout; the text of an error says what the file is or has instead.
-    pub(crate) fn read(path: &Path) -> Result<Self, String> {
+    pub fn read(path: &Path) -> Result<Self, String> {
         let mut chunks = ChunkReader::open(path)?;
         let (mut format, mut long_bytes, mut data) = (None, None, None);
         while let Some(mut chunk) = chunks.next(data.is_some())? {
@@ -176,13 +176,13 @@ impl WavLayout {
     }
 
     /// Visits the integers of a channel, counted from 0, as the uppermost of 32 bits.
-    pub(crate) fn visit_integers(&self, path: &Path, channel: u16, mut visit: impl FnMut(i32)) -> Result<(), String> {
+    pub fn visit_integers(&self, path: &Path, channel: u16, mut visit: impl FnMut(i32)) -> Result<(), String> {
         let first = usize::from(channel) * self.width;
         self.visit(path, |frame| visit(upper_bits(&frame[first..first + self.width]) << self.unused_above))
     }
 
     /// Visits the floats of a channel, counted from 0.
-    pub(crate) fn visit_floats(&self, path: &Path, channel: u16, mut visit: impl FnMut(f32)) -> Result<(), String> {
+    pub fn visit_floats(&self, path: &Path, channel: u16, mut visit: impl FnMut(f32)) -> Result<(), String> {
         let first = usize::from(channel) * self.width;
         self.visit(path, |frame| visit(f32::from_bits(upper_bits(&frame[first..first + self.width]) as u32)))
     }

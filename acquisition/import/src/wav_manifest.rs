@@ -17,16 +17,16 @@ const NEEDED: usize = 6;
 /// A row of the manifest, checked.
 #[derive(Debug, Clone)]
 pub(crate) struct ManifestRow {
-    pub(crate) line: u64,
-    pub(crate) recording: WavChannel,
-    pub(crate) loopback: WavChannel,
-    pub(crate) format: SampleFormat,
-    pub(crate) pair: Pair,
-    pub(crate) celsius: Celsius,
-    pub(crate) humidity_pct: f64,
-    pub(crate) pressure_hpa: f64,
-    pub(crate) recorded_at: Option<Timestamp>,
-    pub(crate) attempt: u32,
+    pub line: u64,
+    pub recording: WavChannel,
+    pub loopback: WavChannel,
+    pub format: SampleFormat,
+    pub pair: Pair,
+    pub celsius: Celsius,
+    pub humidity_pct: f64,
+    pub pressure_hpa: f64,
+    pub recorded_at: Option<Timestamp>,
+    pub attempt: u32,
 }
 
 /// A manifest's rows by surface.

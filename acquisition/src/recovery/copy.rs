@@ -18,14 +18,14 @@ pub(crate) struct RecordingCopy<'a> {
     /// Whether they are described in `out`: its first chunk describes them all.
     is_described: bool,
     /// What was copied so far.
-    pub(crate) counts: MessageCounts,
+    pub counts: MessageCounts,
     /// The highest number of a message.
-    pub(crate) sequence: u32,
+    pub sequence: u32,
 }
 
 impl<'a> RecordingCopy<'a> {
     /// A copy into `out` of messages of these channels.
-    pub(crate) fn new(out: &'a mut ChunkWriter, channels: &'a BTreeMap<u16, Arc<Channel<'static>>>) -> Self {
+    pub fn new(out: &'a mut ChunkWriter, channels: &'a BTreeMap<u16, Arc<Channel<'static>>>) -> Self {
         Self { out, channels, is_described: false, counts: MessageCounts::new(), sequence: 0 }
     }
 
@@ -33,7 +33,7 @@ impl<'a> RecordingCopy<'a> {
     ///
     /// # Errors
     /// The writer's.
-    pub(crate) fn copy_item(
+    pub fn copy_item(
         &mut self,
         item: RecordingItem,
         keep: &dyn Fn(ChunkLane, &MessageHeader) -> bool,

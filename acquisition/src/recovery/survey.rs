@@ -15,13 +15,13 @@ use crate::run::recorder::{SOFTWARE, own_channels};
 /// What is whole of a recording.
 pub(crate) struct RecordingSurvey {
     /// The file's channels. What describes them may stand anywhere in it.
-    pub(crate) channels: BTreeMap<u16, Arc<Channel<'static>>>,
+    pub channels: BTreeMap<u16, Arc<Channel<'static>>>,
     /// Metadata by name; the first of a name counts.
-    pub(crate) metadata: BTreeMap<String, BTreeMap<String, String>>,
+    pub metadata: BTreeMap<String, BTreeMap<String, String>>,
     /// The rig's attachment.
-    pub(crate) rig: Option<String>,
+    pub rig: Option<String>,
     /// Messages by topic.
-    pub(crate) counts: MessageCounts,
+    pub counts: MessageCounts,
     chunks: u64,
     integrity: FileIntegrity,
 }
@@ -32,7 +32,7 @@ impl RecordingSurvey {
     /// # Errors
     /// [`Error::Read`], [`Error::Headless`] if it is no MCAP file, [`Error::Unusable`] if its channels contradict each
     /// other.
-    pub(crate) fn from_file(path: &Path) -> Result<Self, Error> {
+    pub fn from_file(path: &Path) -> Result<Self, Error> {
         let mut walk = RecordingReader::open(path)?;
         let mut definitions = ChannelDefinitions::default();
         let (mut metadata, mut rig, mut by_channel, mut chunks) = (BTreeMap::new(), None, BTreeMap::new(), 0);
@@ -93,7 +93,7 @@ impl RecordingSurvey {
     ///
     /// # Errors
     /// [`Error::Headless`] if nothing was measured, [`Error::Unusable`] if something was and no run can be made of it.
-    pub(crate) fn run_manifest(&self, path: &Path) -> Result<RunManifest, Error> {
+    pub fn run_manifest(&self, path: &Path) -> Result<RunManifest, Error> {
         let path = path.to_owned();
         let found = self.integrity.damage.first().cloned().unwrap_or_else(|| "it ends".to_owned());
         let whole = format!("{} chunks of it are whole", self.chunks);
@@ -120,27 +120,27 @@ impl RecordingSurvey {
     }
 
     /// Returns whether it says how its run ended.
-    pub(crate) fn has_end(&self) -> bool {
+    pub fn has_end(&self) -> bool {
         self.metadata.contains_key(topics::RUN_END_METADATA)
     }
 
     /// Returns whether the file was closed and nothing in it is damaged.
-    pub(crate) fn is_undamaged(&self) -> bool {
+    pub fn is_undamaged(&self) -> bool {
         self.integrity.closed && self.integrity.damage.is_empty()
     }
 
     /// Returns what is damaged, in words; nothing if it is the summary alone, which can be made again.
-    pub(crate) fn damage(&self) -> &[String] {
+    pub fn damage(&self) -> &[String] {
         if self.integrity.is_data_whole { &[] } else { &self.integrity.damage }
     }
 
     /// Returns the bytes that are lost, and the file's size.
-    pub(crate) fn loss_and_size(&self) -> (&[Range<u64>], u64) {
+    pub fn loss_and_size(&self) -> (&[Range<u64>], u64) {
         (&self.integrity.lost, self.integrity.bytes)
     }
 
     /// Returns the report of a recording that was only read.
-    pub(crate) fn survey_report(&self, from: &Path) -> Report {
+    pub fn survey_report(&self, from: &Path) -> Report {
         let FileIntegrity { bytes, lost, .. } = &self.integrity;
         let lost_bytes: u64 = lost.iter().map(|range| range.end - range.start).sum();
         Report {

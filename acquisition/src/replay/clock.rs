@@ -18,27 +18,27 @@ pub(super) struct ReplayClock {
 
 impl ReplayClock {
     /// Makes a clock that is stopped at a time.
-    pub(super) fn new(at: u64, speed: f32) -> Self {
+    pub fn new(at: u64, speed: f32) -> Self {
         Self { shown: at, since: None, speed: speed.clamp(*SPEEDS.start(), *SPEEDS.end()) }
     }
 
-    pub(super) fn now(&self) -> u64 {
+    pub fn now(&self) -> u64 {
         let gone = self.since.map_or(0.0, |since| since.elapsed().as_nanos() as f64 * f64::from(self.speed));
         self.shown.saturating_add(gone as u64)
     }
 
-    pub(super) fn speed(&self) -> f32 {
+    pub fn speed(&self) -> f32 {
         self.speed
     }
 
     /// Sets its time; a running clock goes on running.
-    pub(super) fn set_time(&mut self, at: u64) {
+    pub fn set_time(&mut self, at: u64) {
         self.shown = at;
         self.since = self.since.map(|_| Instant::now());
     }
 
     /// Changes its speed; values that are no speed change nothing.
-    pub(super) fn set_speed(&mut self, speed: f32) {
+    pub fn set_speed(&mut self, speed: f32) {
         if speed.is_finite() && speed > 0.0 {
             self.set_time(self.now());
             self.speed = speed.clamp(*SPEEDS.start(), *SPEEDS.end());
@@ -46,7 +46,7 @@ impl ReplayClock {
     }
 
     /// Starts or stops it.
-    pub(super) fn set_running(&mut self, goes: bool) {
+    pub fn set_running(&mut self, goes: bool) {
         if goes != self.since.is_some() {
             self.shown = self.now();
             self.since = goes.then(Instant::now);
@@ -54,7 +54,7 @@ impl ReplayClock {
     }
 
     /// Returns the wait until it shows a time.
-    pub(super) fn time_until(&self, at: u64) -> Duration {
+    pub fn time_until(&self, at: u64) -> Duration {
         Duration::from_secs_f64(at.saturating_sub(self.now()) as f64 / 1e9 / f64::from(self.speed))
     }
 }

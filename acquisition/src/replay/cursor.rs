@@ -24,28 +24,28 @@ pub(super) struct MessageCursor {
 
 impl MessageCursor {
     /// Starts right behind `passed`, with these of the file's channels.
-    pub(super) fn starting_behind(passed: Key, wanted: BTreeSet<u16>) -> Self {
+    pub fn starting_behind(passed: Key, wanted: BTreeSet<u16>) -> Self {
         Self { wanted, passed, ..Self::default() }
     }
 
     /// Returns the key of the last message that was given out or skipped.
-    pub(super) fn last_passed(&self) -> Key {
+    pub fn last_passed(&self) -> Key {
         self.passed
     }
 
     /// Skips all messages up to this key.
-    pub(super) fn skip_to(&mut self, upto: Key) {
+    pub fn skip_to(&mut self, upto: Key) {
         self.passed = self.passed.max(upto);
     }
 
     /// Returns the time of the next message; None behind the last.
-    pub(super) fn peek_time(&mut self, recording: &Recording, damages: &mut Vec<ChunkDamage>) -> Option<u64> {
+    pub fn peek_time(&mut self, recording: &Recording, damages: &mut Vec<ChunkDamage>) -> Option<u64> {
         self.open_chunks(recording, damages);
         self.earliest_head().map(|(_, key)| key.0)
     }
 
     /// Returns the next message, if [`Self::peek_time`] saw one.
-    pub(super) fn pop_message(&mut self) -> Option<Message> {
+    pub fn pop_message(&mut self) -> Option<Message> {
         let (at, key) = self.earliest_head()?;
         let message = self.open[at].pop_front()?;
         if self.open[at].is_empty() {

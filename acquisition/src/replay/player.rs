@@ -29,14 +29,14 @@ pub(super) fn recording_secs(recording: &Recording) -> f64 {
 /// The topics of all recordings, each once.
 pub(super) struct ReplayTopics {
     /// With the channels that clients know.
-    pub(super) all: Vec<Topic>,
+    pub all: Vec<Topic>,
     /// Of each recording: the clients' channel by the file's.
     of: Vec<BTreeMap<u16, u16>>,
 }
 
 impl ReplayTopics {
     /// None if there are more topics than channels.
-    pub(super) fn from_recordings(recordings: &[Recording]) -> Option<Self> {
+    pub fn from_recordings(recordings: &[Recording]) -> Option<Self> {
         let (mut all, mut of) = (Vec::<Topic>::new(), Vec::new());
         for recording in recordings {
             let mut channels = BTreeMap::new();
@@ -76,7 +76,7 @@ pub(super) struct ReplayPlayer {
 }
 
 impl ReplayPlayer {
-    pub(super) fn new(
+    pub fn new(
         recordings: Vec<Recording>,
         topics: ReplayTopics,
         options: ReplayOptions,
@@ -100,7 +100,7 @@ impl ReplayPlayer {
     }
 
     /// Plays until the server has ended.
-    pub(super) fn run_player(mut self, commands: &Receiver<PlayerCommand>) {
+    pub fn run_player(mut self, commands: &Receiver<PlayerCommand>) {
         while !self.shared.has_ended() {
             let wait = self.play_step();
             self.tell_interface();

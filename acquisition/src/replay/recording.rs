@@ -36,10 +36,10 @@ pub struct Recording {
 /// What is known of a chunk without reading it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Stretch {
-    pub(super) start: u64,
-    pub(super) end: u64,
-    pub(super) offset: u64,
-    pub(super) length: u64,
+    pub start: u64,
+    pub end: u64,
+    pub offset: u64,
+    pub length: u64,
     /// Nothing where the index does not tell.
     channels: Option<BTreeSet<u16>>,
 }
@@ -50,9 +50,9 @@ pub(super) type Key = (u64, u64, u32);
 /// A message of a recording.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Message {
-    pub(super) key: Key,
-    pub(super) channel: u16,
-    pub(super) data: Vec<u8>,
+    pub key: Key,
+    pub channel: u16,
+    pub data: Vec<u8>,
 }
 
 impl Recording {
@@ -151,7 +151,7 @@ impl Stretch {
     }
 
     /// Whether it may have messages of one of these channels.
-    pub(super) fn has_any(&self, channels: &BTreeSet<u16>) -> bool {
+    pub fn has_any(&self, channels: &BTreeSet<u16>) -> bool {
         self.channels.as_ref().is_none_or(|has| !has.is_disjoint(channels))
     }
 }

@@ -66,15 +66,15 @@ pub struct MeasuredRun {
 
 /// A run to measure, apart from its recorder.
 pub(crate) struct RunJob<'a> {
-    pub(crate) rig: &'a Rig,
-    pub(crate) folder: &'a Path,
-    pub(crate) shape: Option<Shape<'a>>,
-    pub(crate) keep: RecordingMode,
-    pub(crate) before: &'a BTreeMap<u32, PairAttempts>,
-    pub(crate) started: Timestamp,
+    pub rig: &'a Rig,
+    pub folder: &'a Path,
+    pub shape: Option<Shape<'a>>,
+    pub keep: RecordingMode,
+    pub before: &'a BTreeMap<u32, PairAttempts>,
+    pub started: Timestamp,
     /// Joints of the arms at each pair, if the arms are known.
-    pub(crate) arms: Option<Arc<Choreography>>,
-    pub(crate) when_stopped: WhenStopped,
+    pub arms: Option<Arc<Choreography>>,
+    pub when_stopped: WhenStopped,
 }
 
 /// Treatment of a run's file when the run is stopped.
@@ -88,7 +88,7 @@ pub(crate) enum WhenStopped {
 
 impl RunJob<'_> {
     /// Runs the preflight checks; returns those that failed.
-    pub(crate) fn look_over(&self, controller: &mut RunController<'_>, pairs: &[Pair]) -> Vec<PreflightFinding> {
+    pub fn look_over(&self, controller: &mut RunController<'_>, pairs: &[Pair]) -> Vec<PreflightFinding> {
         let todo: Vec<_> = pairs.iter().filter(|p| !self.before.get(&p.id.0).is_some_and(|t| t.accepted)).collect();
         let mut findings: Vec<_> =
             preflight::check_disk(self.folder, self.rig, self.keep, todo.len()).into_iter().collect();
@@ -102,7 +102,7 @@ impl RunJob<'_> {
     }
 
     /// Measures the pairs that are left, with a recorder that has begun. If it is stopped the file stays `.partial`.
-    pub(crate) fn measure(
+    pub fn measure(
         &self,
         controller: &mut RunController<'_>,
         mut recorder: Recorder,

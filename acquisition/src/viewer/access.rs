@@ -30,14 +30,14 @@ pub(super) struct AccessCheck {
 
 impl AccessCheck {
     /// Draws a token if other machines reach the address.
-    pub(super) fn new(access: ViewerAccess, address: SocketAddr) -> Self {
+    pub fn new(access: ViewerAccess, address: SocketAddr) -> Self {
         let needs_token = !address.ip().is_loopback() && !access.is_open;
         let token = needs_token.then(|| format!("{:032x}", rand::random::<u128>()));
         Self { allowed_origins: access.allowed_origins, token }
     }
 
     /// Returns the URL for viewers, with the token.
-    pub(super) fn viewer_url(&self, address: SocketAddr) -> String {
+    pub fn viewer_url(&self, address: SocketAddr) -> String {
         let token = self.token.as_ref().map(|token| format!("/?token={token}")).unwrap_or_default();
         format!("ws://{address}{token}")
     }
@@ -45,7 +45,7 @@ impl AccessCheck {
     /// # Errors
     /// The refusal, if the handshake may not go on.
     #[expect(clippy::result_large_err, reason = "tungstenite's own type")]
-    pub(super) fn check_request(&self, request: &Request) -> Result<(), ErrorResponse> {
+    pub fn check_request(&self, request: &Request) -> Result<(), ErrorResponse> {
         for origin in request.headers().get_all(ORIGIN) {
             let origin = String::from_utf8_lossy(origin.as_bytes());
             if !self.allows_origin(&origin) {

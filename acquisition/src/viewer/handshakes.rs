@@ -19,7 +19,7 @@ pub(super) struct PendingHandshakes(Mutex<Vec<(IpAddr, Arc<TcpStream>)>>);
 
 impl PendingHandshakes {
     /// Adds a client's, in the order of connecting; ends the oldest one if there are too many.
-    pub(super) fn add(&self, stream: &Arc<TcpStream>) -> io::Result<()> {
+    pub fn add(&self, stream: &Arc<TcpStream>) -> io::Result<()> {
         let address = stream.peer_addr()?.ip();
         let mut pending = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let is_full = pending.iter().filter(|(of, _)| *of == address).count() >= MOST_OF_ADDRESS;
@@ -38,7 +38,7 @@ impl PendingHandshakes {
     }
 
     /// Removes a client's, because it is done or has failed.
-    pub(super) fn remove(&self, stream: &Arc<TcpStream>) {
+    pub fn remove(&self, stream: &Arc<TcpStream>) {
         let mut pending = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         pending.retain(|(_, other)| !Arc::ptr_eq(other, stream));
     }
@@ -46,18 +46,18 @@ impl PendingHandshakes {
 
 /// A client's connection, whose reads time out at the handshake's deadline, however slowly it drips.
 pub(super) struct TimedStream {
-    pub(super) stream: Arc<TcpStream>,
+    pub stream: Arc<TcpStream>,
     deadline: Option<Instant>,
 }
 
 impl TimedStream {
     /// A stream whose handshake has this long.
-    pub(super) fn new(stream: Arc<TcpStream>, limit: Duration) -> Self {
+    pub fn new(stream: Arc<TcpStream>, limit: Duration) -> Self {
         Self { stream, deadline: Some(Instant::now() + limit) }
     }
 
     /// Ends the handshake's time: from now on the stream has its own limits.
-    pub(super) fn lift_deadline(&mut self) {
+    pub fn lift_deadline(&mut self) {
         self.deadline = None;
     }
 }

@@ -46,9 +46,9 @@ pub(crate) enum ViewerClock {
 /// Playback that clients may control.
 pub(crate) struct PlaybackControl {
     /// First and last time of the data, ns since 1970.
-    pub(crate) range: (u64, u64),
+    pub range: (u64, u64),
     /// Queue of the player's commands.
-    pub(crate) commands: SyncSender<PlayerCommand>,
+    pub commands: SyncSender<PlayerCommand>,
 }
 
 /// Requests of clients to a player.
@@ -84,7 +84,7 @@ struct State {
 
 impl ViewerServer {
     /// Listens; port 0 takes a free one.
-    pub(crate) fn start(
+    pub fn start(
         address: SocketAddr,
         access: ViewerAccess,
         topics: Vec<Topic>,
@@ -108,15 +108,15 @@ impl ViewerServer {
         Ok(Self { address, shared, thread: Some(thread) })
     }
 
-    pub(crate) fn address(&self) -> SocketAddr {
+    pub fn address(&self) -> SocketAddr {
         self.address
     }
 
-    pub(crate) fn url(&self) -> String {
+    pub fn url(&self) -> String {
         self.shared.access.viewer_url(self.address)
     }
 
-    pub(crate) fn shared_state(&self) -> &Arc<ViewerState> {
+    pub fn shared_state(&self) -> &Arc<ViewerState> {
         &self.shared
     }
 }
@@ -137,53 +137,53 @@ impl ViewerState {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    pub(crate) fn has_ended(&self) -> bool {
+    pub fn has_ended(&self) -> bool {
         self.ended.load(Ordering::Relaxed)
     }
 
-    pub(crate) fn topics(&self) -> Vec<Topic> {
+    pub fn topics(&self) -> Vec<Topic> {
         self.lock_state().topics.clone()
     }
 
-    pub(crate) fn set_topics(&self, topics: Vec<Topic>) {
+    pub fn set_topics(&self, topics: Vec<Topic>) {
         self.lock_state().topics = topics;
     }
 
     /// Returns the connected clients.
-    pub(crate) fn clients(&self) -> Vec<Arc<ClientQueue>> {
+    pub fn clients(&self) -> Vec<Arc<ClientQueue>> {
         self.lock_state().clients.clone()
     }
 
     /// Messages that clients lost because they did not keep up.
-    pub(crate) fn lost_messages(&self) -> u64 {
+    pub fn lost_messages(&self) -> u64 {
         self.lost.load(Ordering::Relaxed)
     }
 
     /// Returns a counter that changes whenever the wanted channels may have.
-    pub(crate) fn wish_counter(&self) -> u64 {
+    pub fn wish_counter(&self) -> u64 {
         self.wishes.load(Ordering::Acquire)
     }
 
     /// Returns the channels whose messages go to any client now.
-    pub(crate) fn wanted_channels(&self) -> BTreeSet<u16> {
+    pub fn wanted_channels(&self) -> BTreeSet<u16> {
         self.lock_state().clients.iter().flat_map(|client| client.receiving_channels()).collect()
     }
 
     /// Sends a client the current state of channels; new messages follow from here on.
-    pub(crate) fn prime_client(&self, queue: &ClientQueue, channels: &BTreeSet<u16>, known: &[PendingMessage]) {
+    pub fn prime_client(&self, queue: &ClientQueue, channels: &BTreeSet<u16>, known: &[PendingMessage]) {
         queue.queue_current_state(channels, known);
         self.wishes.fetch_add(1, Ordering::Release);
     }
 
     /// Returns whether all subscribed clients have enough to read: then more messages help none of them.
-    pub(crate) fn all_are_busy(&self) -> bool {
+    pub fn all_are_busy(&self) -> bool {
         let state = self.lock_state();
         let mut watching = state.clients.iter().filter(|client| client.is_receiving()).peekable();
         watching.peek().is_some() && watching.all(|client| client.is_busy())
     }
 
     /// Sends a message to all its subscribers; retains it for new clients, if `is_kept`.
-    pub(crate) fn send_message(&self, channel: u16, log_time_nanos: u64, data: &[u8], is_kept: bool) {
+    pub fn send_message(&self, channel: u16, log_time_nanos: u64, data: &[u8], is_kept: bool) {
         let mut state = self.lock_state();
         if matches!(self.clock, ViewerClock::Messages) {
             state.announce_time(log_time_nanos);

@@ -37,13 +37,13 @@ pub(super) enum ClientRequest {
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct PlaybackRequest {
     /// True to play, false to pause.
-    pub(crate) plays: bool,
+    pub plays: bool,
     /// As a factor of real time.
-    pub(crate) speed: f32,
+    pub speed: f32,
     /// The time to go to first, ns since 1970.
-    pub(crate) seek: Option<u64>,
+    pub seek: Option<u64>,
     /// Identifier that the answer repeats.
-    pub(crate) id: String,
+    pub id: String,
 }
 
 /// Status of a player.
@@ -58,15 +58,15 @@ pub(crate) enum PlaybackStatus {
 /// State of playback.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct PlaybackState {
-    pub(crate) status: PlaybackStatus,
+    pub status: PlaybackStatus,
     /// ns since 1970.
-    pub(crate) current_time: u64,
+    pub current_time: u64,
     /// As a factor of real time.
-    pub(crate) speed: f32,
+    pub speed: f32,
     /// Time was set: viewers clear their data.
-    pub(crate) did_seek: bool,
+    pub did_seek: bool,
     /// Id of the request that this answers; empty if it answers none.
-    pub(crate) request_id: String,
+    pub request_id: String,
 }
 
 #[derive(Deserialize)]
@@ -156,7 +156,7 @@ pub(super) fn time_message(nanos: u64) -> Vec<u8> {
 
 impl PlaybackState {
     /// Encodes it: status, time, speed, whether time was set, length and bytes of the request's id.
-    pub(crate) fn encode(&self) -> Vec<u8> {
+    pub fn encode(&self) -> Vec<u8> {
         let mut out = vec![PLAYBACK_STATE, self.status as u8];
         out.extend(self.current_time.to_le_bytes());
         out.extend(self.speed.to_le_bytes());

@@ -12,9 +12,9 @@ const ENTRY_BYTES: usize = 64;
 /// A pending message.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct PendingMessage {
-    pub(crate) channel: u16,
-    pub(crate) log_time_nanos: u64,
-    pub(crate) data: Arc<[u8]>,
+    pub channel: u16,
+    pub log_time_nanos: u64,
+    pub data: Arc<[u8]>,
 }
 
 /// The next item to send to a client.
@@ -107,51 +107,51 @@ impl ClientQueue {
         self.inner.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    pub(crate) fn wanted_channels(&self) -> Vec<u16> {
+    pub fn wanted_channels(&self) -> Vec<u16> {
         self.lock_inner().wanted.keys().copied().collect()
     }
 
     /// Returns the subscribed channels whose messages go to it now.
-    pub(super) fn receiving_channels(&self) -> Vec<u16> {
+    pub fn receiving_channels(&self) -> Vec<u16> {
         self.lock_inner().wanted.iter().filter(|(_, wanted)| wanted.primed).map(|(channel, _)| *channel).collect()
     }
 
     /// Returns whether messages of any channel go to it now.
-    pub(super) fn is_receiving(&self) -> bool {
+    pub fn is_receiving(&self) -> bool {
         self.lock_inner().wanted.values().any(|wanted| wanted.primed)
     }
 
     /// Returns whether messages of a channel go to it now.
-    pub(crate) fn receives_channel(&self, channel: u16) -> bool {
+    pub fn receives_channel(&self, channel: u16) -> bool {
         self.lock_inner().wanted.get(&channel).is_some_and(|w| w.primed)
     }
 
     /// Returns whether it has enough to read for now.
-    pub(super) fn is_busy(&self) -> bool {
+    pub fn is_busy(&self) -> bool {
         let inner = self.lock_inner();
         inner.bytes + inner.kept >= WAITING_BYTES / 2
     }
 
     /// Returns the bytes of pending entries but those of the current state.
     #[cfg(test)]
-    pub(crate) fn pending_bytes(&self) -> usize {
+    pub fn pending_bytes(&self) -> usize {
         self.lock_inner().bytes
     }
 
-    pub(super) fn subscribe(&self, channel: u16, subscription: u32) {
+    pub fn subscribe(&self, channel: u16, subscription: u32) {
         self.lock_inner().wanted.insert(channel, ChannelSubscription { subscription, primed: false });
     }
 
-    pub(super) fn unsubscribe(&self, subscriptions: &[u32]) {
+    pub fn unsubscribe(&self, subscriptions: &[u32]) {
         self.lock_inner().wanted.retain(|_, wanted| !subscriptions.contains(&wanted.subscription));
     }
 
-    pub(super) fn hear_of_playback(&self) {
+    pub fn hear_of_playback(&self) {
         self.lock_inner().controls = true;
     }
 
     /// Queues the current state of channels, by time; new messages follow from here on.
-    pub(crate) fn queue_current_state(&self, channels: &BTreeSet<u16>, known: &[PendingMessage]) {
+    pub fn queue_current_state(&self, channels: &BTreeSet<u16>, known: &[PendingMessage]) {
         let mut inner = self.lock_inner();
         inner.wanted.iter_mut().filter(|(id, _)| channels.contains(id)).for_each(|(_, wanted)| wanted.primed = true);
         let known: Vec<_> = known.iter().filter(|waiting| channels.contains(&waiting.channel)).cloned().collect();
@@ -167,12 +167,12 @@ impl ClientQueue {
     }
 
     /// Queues a new message; returns how many old ones are dropped for it.
-    pub(super) fn push(&self, message: PendingMessage) -> u64 {
+    pub fn push(&self, message: PendingMessage) -> u64 {
         self.lock_inner().add_entry(QueueEntry::Message(message))
     }
 
     /// Queues the time; of several pending times only the latest matters.
-    pub(crate) fn tell_time(&self, nanos: u64) {
+    pub fn tell_time(&self, nanos: u64) {
         let mut inner = self.lock_inner();
         if let Some(QueueEntry::Time(_)) = inner.entries.back() {
             inner.entries.pop_back();
@@ -182,7 +182,7 @@ impl ClientQueue {
     }
 
     /// Queues the state of playback, if the client controls it.
-    pub(crate) fn tell_state(&self, encoded: Vec<u8>) {
+    pub fn tell_state(&self, encoded: Vec<u8>) {
         let mut inner = self.lock_inner();
         if inner.controls {
             inner.add_entry(QueueEntry::State(encoded));
@@ -191,7 +191,7 @@ impl ClientQueue {
 
     /// Drops pending messages, because they are of another time; states are answers and stay. Channels need their
     /// current state anew.
-    pub(crate) fn forget_pending(&self) {
+    pub fn forget_pending(&self) {
         let mut inner = self.lock_inner();
         inner.entries.retain(|entry| matches!(entry, QueueEntry::State(_)));
         inner.bytes = inner.entries.iter().map(QueueEntry::pending_bytes).sum();
@@ -200,7 +200,7 @@ impl ClientQueue {
     }
 
     /// Returns the next item to send.
-    pub(crate) fn pop(&self) -> Option<OutgoingItem> {
+    pub fn pop(&self) -> Option<OutgoingItem> {
         let mut inner = self.lock_inner();
         loop {
             let entry = inner.entries.pop_front()?;

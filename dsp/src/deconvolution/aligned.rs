@@ -12,7 +12,7 @@ pub(crate) struct AlignedBuffer<T> {
 }
 
 impl<T: Clone + Default> AlignedBuffer<T> {
-    pub(crate) fn new(len: usize) -> Self {
+    pub fn new(len: usize) -> Self {
         let slack = LINE / size_of::<T>().max(1);
         let room = vec![T::default(); len + slack];
         // A pointer that cannot be aligned is served as it is: this is about speed only.
@@ -20,7 +20,7 @@ impl<T: Clone + Default> AlignedBuffer<T> {
         Self { room, start, len }
     }
 
-    pub(crate) fn values(&mut self) -> &mut [T] {
+    pub fn values(&mut self) -> &mut [T] {
         &mut self.room[self.start..self.start + self.len]
     }
 }

@@ -11,13 +11,13 @@ const LANES: usize = 8;
 pub(crate) struct SignalLevels {
     /// Powers of two that bring the recording and the loopback to an energy of 1: in one transform, the rounding of the
     /// louder signal is noise in the other.
-    pub(crate) gains: [f64; 2],
+    pub gains: [f64; 2],
     /// Power of a bin that rounding alone may leave.
-    pub(crate) rounding: f64,
+    pub rounding: f64,
 }
 
 impl SignalLevels {
-    pub(crate) fn from_signals<T: RealSample>(recording: &[T], loopback: &[T]) -> Result<Self, Error> {
+    pub fn from_signals<T: RealSample>(recording: &[T], loopback: &[T]) -> Result<Self, Error> {
         let (x, s) = (sampled_energy(recording), sampled_energy(loopback));
         for (what, energy) in [("the recording", x), ("the loopback", s)] {
             if !energy.is_finite() {
@@ -58,11 +58,11 @@ pub(crate) struct BinPower<T: RealSample> {
 }
 
 impl<T: RealSample> BinPower<T> {
-    pub(crate) fn none() -> Self {
+    pub fn none() -> Self {
         Self { sums: [T::default(); LANES], least: [T::max_value(); LANES] }
     }
 
-    pub(crate) fn add_powers(&mut self, powers: &[T]) {
+    pub fn add_powers(&mut self, powers: &[T]) {
         let (whole, rest) = powers.as_chunks::<LANES>();
         whole.iter().for_each(|lanes| self.add_lanes(lanes));
         self.add_lanes(rest);
@@ -76,11 +76,11 @@ impl<T: RealSample> BinPower<T> {
         }
     }
 
-    pub(crate) fn power_sum(&self) -> f64 {
+    pub fn power_sum(&self) -> f64 {
         self.sums.into_iter().map(T::f64).sum()
     }
 
-    pub(crate) fn least_power(&self) -> f64 {
+    pub fn least_power(&self) -> f64 {
         self.least.into_iter().map(T::f64).fold(f64::INFINITY, f64::min)
     }
 }

@@ -25,7 +25,7 @@ pub(crate) struct PrunedInverse<T: RealSample> {
 }
 
 impl<T: RealSample> PrunedInverse<T> {
-    pub(crate) fn new(n: usize, output_len: usize) -> Self {
+    pub fn new(n: usize, output_len: usize) -> Self {
         let strand_len = strand_len(n, output_len);
         let turn = |m: usize| {
             let (im, re) = (std::f64::consts::TAU * m as f64 / n as f64).sin_cos();
@@ -40,21 +40,21 @@ impl<T: RealSample> PrunedInverse<T> {
     }
 
     /// Values of the spectrum's strands, with the gaps between them.
-    pub(crate) fn spectrum_len(&self) -> usize {
+    pub fn spectrum_len(&self) -> usize {
         (self.strands / 2 + 1) * (self.strand_len + GAP)
     }
 
-    pub(crate) fn scratch_len(&self) -> usize {
+    pub fn scratch_len(&self) -> usize {
         self.inverse.get_inplace_scratch_len()
     }
 
     /// Room for sums between strands.
-    pub(crate) fn make_sums(&self) -> Vec<Complex<T>> {
+    pub fn make_sums(&self) -> Vec<Complex<T>> {
         vec![Complex::default(); self.turns.len()]
     }
 
     /// Lays bins from `first` on, none of them past n / 2, into their strands; all from 0 to n / 2 must be laid.
-    pub(crate) fn lay_bins(&self, first: usize, mut bins: &[Complex<T>], spectrum: &mut [Complex<T>]) {
+    pub fn lay_bins(&self, first: usize, mut bins: &[Complex<T>], spectrum: &mut [Complex<T>]) {
         let (mut q, mut r) = (first / self.strands, first % self.strands);
         while !bins.is_empty() {
             let (now, later) = bins.split_at(bins.len().min(self.strands - r));
@@ -81,7 +81,7 @@ impl<T: RealSample> PrunedInverse<T> {
     /// Computes the samples, times `scale`; what was laid is used up.
     ///
     /// out `[samples wanted]`
-    pub(crate) fn compute_samples(
+    pub fn compute_samples(
         &self,
         spectrum: &mut [Complex<T>],
         scale: T,

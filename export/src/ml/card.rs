@@ -17,16 +17,16 @@ Building Acoustics 28(4), 345-360. https://doi.org/10.1177/1351010X20986901";
 
 /// Contents of a card: the lake and its version, the plan, and the export's counts.
 pub(super) struct CardContents<'a> {
-    pub(super) lake: &'a Lake,
+    pub lake: &'a Lake,
     /// The version of table `runs` that the rows are of, as `AS OF` takes it.
-    pub(super) lake_version: u64,
-    pub(super) plan: &'a Plan,
-    pub(super) exported: &'a ExportSummary,
+    pub lake_version: u64,
+    pub plan: &'a Plan,
+    pub exported: &'a ExportSummary,
 }
 
 impl CardContents<'_> {
     /// Returns a summary of one sentence.
-    pub(super) fn summary(&self) -> String {
+    pub fn summary(&self) -> String {
         let rows: u64 = self.exported.parts.iter().map(|p| p.rows).sum();
         let surfaces: usize = self.exported.parts.iter().map(|p| p.surfaces).sum();
         let rate = self.lake.rig().sweep.rate_hz.get();
@@ -38,7 +38,7 @@ impl CardContents<'_> {
     }
 
     /// Returns the origins of the surfaces: measured, simulated, imported.
-    pub(super) fn origins(&self) -> Vec<String> {
+    pub fn origins(&self) -> Vec<String> {
         let mut origins: Vec<_> =
             SplitPart::ALL.iter().flat_map(|p| self.plan.of_part(*p)).map(|s| s.origin.clone()).collect();
         origins.sort();

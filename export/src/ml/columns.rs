@@ -43,7 +43,7 @@ fn default_columns(rig: &Rig) -> Vec<String> {
 
 impl TrainingColumns {
     /// Chooses the columns of these names; the defaults if there are no names.
-    pub(super) fn choose(rig: &Rig, names: &[String]) -> Result<Self> {
+    pub fn choose(rig: &Rig, names: &[String]) -> Result<Self> {
         let tables: Vec<_> = TABLES.into_iter().map(|table| (table, table.schema(rig))).collect();
         let usual = default_columns(rig);
         let mut chosen: Vec<(Table, FieldRef)> = Vec::new();
@@ -61,17 +61,17 @@ impl TrainingColumns {
     }
 
     /// The schema of the training set.
-    pub(super) fn schema(&self) -> &SchemaRef {
+    pub fn schema(&self) -> &SchemaRef {
         &self.schema
     }
 
     /// The chosen columns of a table.
-    pub(super) fn of_table(&self, table: Table) -> Vec<&str> {
+    pub fn of_table(&self, table: Table) -> Vec<&str> {
         self.chosen.iter().filter(|(from, _)| *from == table).map(|(_, field)| field.name().as_str()).collect()
     }
 
     /// Every chosen column with its table, in order.
-    pub(super) fn chosen(&self) -> &[(Table, FieldRef)] {
+    pub fn chosen(&self) -> &[(Table, FieldRef)] {
         &self.chosen
     }
 }

@@ -26,7 +26,7 @@ pub(super) struct SymmetryMoves(Vec<(Symmetry, Vec<MovedPair>)>);
 
 impl SymmetryMoves {
     /// Returns all symmetries of the grid, or the identity alone.
-    pub(super) fn from_grid(grid: &Grid, symmetries: super::RowSymmetries) -> Self {
+    pub fn from_grid(grid: &Grid, symmetries: super::RowSymmetries) -> Self {
         let wanted: &[Symmetry] = match symmetries {
             super::RowSymmetries::None => &[Symmetry::Identity],
             super::RowSymmetries::All => &Symmetry::ALL,
@@ -35,17 +35,17 @@ impl SymmetryMoves {
     }
 
     /// Returns the names of the symmetries.
-    pub(super) fn symmetry_names(&self) -> Vec<&'static str> {
+    pub fn symmetry_names(&self) -> Vec<&'static str> {
         self.0.iter().map(|(symmetry, _)| symmetry.name()).collect()
     }
 }
 
 /// Builds the rows of runs from a snapshot of the lake.
 pub(super) struct RowBuilder<'a> {
-    pub(super) lake: &'a Lake,
-    pub(super) snapshot: &'a LakeSnapshot,
-    pub(super) columns: &'a TrainingColumns,
-    pub(super) moves: &'a SymmetryMoves,
+    pub lake: &'a Lake,
+    pub snapshot: &'a LakeSnapshot,
+    pub columns: &'a TrainingColumns,
+    pub moves: &'a SymmetryMoves,
 }
 
 /// Rows of a run before any symmetry, in the order of their pairs.
@@ -56,7 +56,7 @@ pub(super) struct RunRows {
 
 impl RowBuilder<'_> {
     /// Reads the chosen columns of the pairs that the run has in all of the chosen tables.
-    pub(super) async fn read_rows(&self, run: &TrainingRun) -> Result<RunRows> {
+    pub async fn read_rows(&self, run: &TrainingRun) -> Result<RunRows> {
         let mut tables = HashMap::new();
         let mut pairs: Option<Vec<u32>> = None;
         for table in [Table::Measurements, Table::Nce, Table::Tnce] {
@@ -90,7 +90,7 @@ impl RowBuilder<'_> {
     }
 
     /// Returns the rows under each symmetry, one batch per symmetry.
-    pub(super) fn row_batches(
+    pub fn row_batches(
         &self,
         surface: &TrainingSurface,
         run: &TrainingRun,

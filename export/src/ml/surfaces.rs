@@ -12,20 +12,20 @@ use crate::rows;
 /// A surface, and its runs that are derived.
 #[derive(Debug, Clone)]
 pub(super) struct TrainingSurface {
-    pub(super) id: SurfaceId,
-    pub(super) typology: String,
-    pub(super) macrostructure: Option<String>,
-    pub(super) origin: String,
+    pub id: SurfaceId,
+    pub typology: String,
+    pub macrostructure: Option<String>,
+    pub origin: String,
     /// True if other surfaces name it as their Flat or Foam, or its typology is `reference`.
-    pub(super) reference: bool,
-    pub(super) runs: Vec<TrainingRun>,
+    pub reference: bool,
+    pub runs: Vec<TrainingRun>,
 }
 
 /// A run and the digest of its file.
 #[derive(Debug, Clone)]
 pub(super) struct TrainingRun {
-    pub(super) visible: VisibleRun,
-    pub(super) file_sha256: String,
+    pub visible: VisibleRun,
+    pub file_sha256: String,
 }
 
 /// Reads all surfaces that have a derived run, sorted by name, and the number of runs that wait for references.

@@ -19,7 +19,7 @@ type Key = (u32, u32);
 
 /// Reads a run's measurements, one after the other.
 pub(super) struct Groups {
-    pub(super) source: Source,
+    pub source: Source,
     /// Chunks with topics that stand in the file once.
     once: VecDeque<ChunkIndex>,
     wanted: Wanted,
@@ -62,7 +62,7 @@ struct Open {
 
 impl Groups {
     /// Reads the measurements of a run; lanes that have none of the topics are not read, where topics are named.
-    pub(super) fn new(source: Source, taken: &[Taken], topics: &[String]) -> Self {
+    pub fn new(source: Source, taken: &[Taken], topics: &[String]) -> Self {
         let wanted = Wanted {
             keys: taken.iter().map(|t| (t.pair, t.attempt)).collect(),
             times: taken.iter().map(|t| (t.message_time(), (t.pair, t.attempt))).collect(),
@@ -81,7 +81,7 @@ impl Groups {
     }
 
     /// The next messages of topics that stand in the file once; None after the last.
-    pub(super) async fn next_once(&mut self) -> Result<Option<Vec<Message>>> {
+    pub async fn next_once(&mut self) -> Result<Option<Vec<Message>>> {
         let Some(chunk) = self.once.pop_front() else { return Ok(None) };
         let mut messages = self.source.read_messages(&chunk).await?;
         messages.retain(|m| is_once(&m.channel.topic));
@@ -92,7 +92,7 @@ impl Groups {
     ///
     /// # Errors
     /// [`Error::Changed`] where one of them is not in the file.
-    pub(super) async fn next(&mut self) -> Result<Option<Vec<Message>>> {
+    pub async fn next(&mut self) -> Result<Option<Vec<Message>>> {
         for lane in &mut self.lanes {
             lane.fill_ready(&self.source, &self.wanted).await?;
         }

@@ -123,15 +123,15 @@ pub struct SliceParams {
 /// The messages of one measurement.
 pub(crate) struct Measured {
     /// Its run.
-    pub(crate) run: RunId,
+    pub run: RunId,
     /// The run's file.
-    pub(crate) file: String,
+    pub file: String,
     messages: Vec<Message>,
 }
 
 impl Measured {
     /// Time and content of the first message of a topic.
-    pub(crate) fn first_message(&self, topic: &str) -> Option<(i64, Bytes)> {
+    pub fn first_message(&self, topic: &str) -> Option<(i64, Bytes)> {
         let found = self.messages.iter().find(|m| m.channel.topic == topic)?;
         Some((i64::try_from(found.log_time).unwrap_or(0), found.data.clone()))
     }
@@ -141,20 +141,20 @@ impl Measured {
 pub(crate) struct OpenedRun(Groups);
 
 impl OpenedRun {
-    pub(crate) async fn next(&mut self) -> Result<Option<Measured>> {
+    pub async fn next(&mut self) -> Result<Option<Measured>> {
         let (run, file) = (self.run().clone(), self.file().to_owned());
         Ok(self.0.next().await?.map(|messages| Measured { run, file, messages }))
     }
 
-    pub(crate) fn run(&self) -> &RunId {
+    pub fn run(&self) -> &RunId {
         &self.0.source.file.run
     }
 
-    pub(crate) fn surface(&self) -> &SurfaceId {
+    pub fn surface(&self) -> &SurfaceId {
         &self.0.source.file.surface
     }
 
-    pub(crate) fn file(&self) -> &str {
+    pub fn file(&self) -> &str {
         self.0.source.file.path.as_ref()
     }
 }

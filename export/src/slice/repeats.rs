@@ -43,7 +43,7 @@ struct PointContent {
 
 impl WrittenContents {
     /// Returns whether a message shows again what its topic has shown last; messages come by time.
-    pub(super) fn is_repeat(&mut self, message: &Message) -> bool {
+    pub fn is_repeat(&mut self, message: &Message) -> bool {
         let topic = &message.channel.topic;
         if !is_once(topic) {
             return false;
@@ -53,7 +53,7 @@ impl WrittenContents {
     }
 
     /// Returns the name of an attachment with the same bytes; without one, these bytes have `name` from now on.
-    pub(super) fn attached_name(&mut self, name: &str, data: &[u8]) -> Option<String> {
+    pub fn attached_name(&mut self, name: &str, data: &[u8]) -> Option<String> {
         let digest = Sha256::digest(data).into();
         let known = self.attachments.get(&digest).cloned();
         if known.is_none() {

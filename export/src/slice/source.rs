@@ -26,39 +26,39 @@ const BLOCK: u64 = 4 << 20;
 /// What the lake says of a run's file.
 #[derive(Debug, Clone)]
 pub(super) struct RunFile {
-    pub(super) run: RunId,
-    pub(super) surface: SurfaceId,
-    pub(super) path: Path,
-    pub(super) bytes: u64,
-    pub(super) sha256: String,
-    pub(super) started_ns: u64,
+    pub run: RunId,
+    pub surface: SurfaceId,
+    pub path: Path,
+    pub bytes: u64,
+    pub sha256: String,
+    pub started_ns: u64,
 }
 
 /// A run's file, opened.
 pub(super) struct Source {
-    pub(super) file: RunFile,
+    pub file: RunFile,
     store: Arc<dyn ObjectStore>,
-    pub(super) channels: BTreeMap<u16, Arc<Channel<'static>>>,
+    pub channels: BTreeMap<u16, Arc<Channel<'static>>>,
     digests: DefinitionDigests,
     /// In the file's order.
-    pub(super) chunks: Vec<ChunkIndex>,
+    pub chunks: Vec<ChunkIndex>,
     attachments: Vec<Range<u64>>,
     /// The run's manifest.
-    pub(super) manifest: BTreeMap<String, String>,
+    pub manifest: BTreeMap<String, String>,
 }
 
 /// A message, its samples still where the chunk has them.
 #[derive(Debug, Clone)]
 pub(super) struct Message {
-    pub(super) channel: Arc<Channel<'static>>,
-    pub(super) log_time: u64,
-    pub(super) publish_time: u64,
-    pub(super) data: Bytes,
+    pub channel: Arc<Channel<'static>>,
+    pub log_time: u64,
+    pub publish_time: u64,
+    pub data: Bytes,
 }
 
 impl RunFile {
     /// Looks a run up.
-    pub(super) async fn find_run(lake: &Lake, snapshot: &LakeSnapshot, run: &RunId) -> Result<Self> {
+    pub async fn find_run(lake: &Lake, snapshot: &LakeSnapshot, run: &RunId) -> Result<Self> {
         let columns = ["surface_id", "run_id", "started_ns", "file", "file_bytes", "file_sha256"];
         let row = rows::of_run(lake, snapshot, Table::Runs, run, &columns).await?;
         let text = |column| rows::text_column(&row, column).first().map(|text| (*text).to_owned());
@@ -84,7 +84,7 @@ impl RunFile {
 
 impl Source {
     /// Opens a run's file and checks that it is the one that was ingested.
-    pub(super) async fn open(store: Arc<dyn ObjectStore>, file: RunFile, check: Check) -> Result<Self> {
+    pub async fn open(store: Arc<dyn ObjectStore>, file: RunFile, check: Check) -> Result<Self> {
         let tail = read_tail(store.as_ref(), &file).await?;
         let mut source = Self {
             file,
@@ -150,7 +150,7 @@ impl Source {
         }
     }
 
-    pub(super) fn damaged_error(&self, error: &McapError) -> Error {
+    pub fn damaged_error(&self, error: &McapError) -> Error {
         Error::damaged(&self.file.path, describe_mcap_error(error))
     }
 
@@ -159,7 +159,7 @@ impl Source {
     }
 
     /// What is attached to the file, one at a time.
-    pub(super) async fn read_attachment(&self, number: usize) -> Result<Option<Attachment<'static>>> {
+    pub async fn read_attachment(&self, number: usize) -> Result<Option<Attachment<'static>>> {
         let Some(range) = self.attachments.get(number) else { return Ok(None) };
         let record = self.read_range(range.clone()).await?;
         let mut record = RecordCursor::new(record);
@@ -176,7 +176,7 @@ impl Source {
     }
 
     /// All messages of a chunk, in the file's order; its CRC is checked before the first is given out.
-    pub(super) async fn read_messages(&self, chunk: &ChunkIndex) -> Result<Vec<Message>> {
+    pub async fn read_messages(&self, chunk: &ChunkIndex) -> Result<Vec<Message>> {
         let record = self
             .read_range(chunk.chunk_start_offset..chunk.chunk_start_offset.saturating_add(chunk.chunk_length))
             .await?;

@@ -49,7 +49,7 @@ pub(super) struct SliceWriter {
     /// The lane of each topic.
     lane_of: HashMap<String, usize>,
     sequence: u32,
-    pub(super) messages: u64,
+    pub messages: u64,
     /// Whether there is more than what a file begins with.
     has_more: bool,
 }
@@ -69,7 +69,7 @@ impl Default for Lane {
 }
 
 impl SliceWriter {
-    pub(super) fn new(layout: Layout) -> Result<Self> {
+    pub fn new(layout: Layout) -> Result<Self> {
         let out = Shared::default();
         let writer = stream_writer(out.clone()).map_err(writer_error)?;
         let lanes = vec![Lane::default()];
@@ -77,23 +77,23 @@ impl SliceWriter {
     }
 
     /// What was written since, where a chunk or an attachment is in it.
-    pub(super) fn take_written(&mut self) -> Option<Bytes> {
+    pub fn take_written(&mut self) -> Option<Bytes> {
         std::mem::take(&mut self.has_more).then(|| std::mem::take(&mut *self.out.lock()).into())
     }
 
-    pub(super) fn write_metadata(&mut self, metadata: Metadata) -> Result<()> {
+    pub fn write_metadata(&mut self, metadata: Metadata) -> Result<()> {
         self.flush_all()?;
         self.writer.write_metadata(&metadata).map_err(writer_error)
     }
 
-    pub(super) fn write_attachment(&mut self, attachment: &Attachment<'_>) -> Result<()> {
+    pub fn write_attachment(&mut self, attachment: &Attachment<'_>) -> Result<()> {
         self.flush_all()?;
         self.has_more = true;
         self.writer.attach(attachment).map_err(writer_error)
     }
 
     /// Writes a message; they come by time.
-    pub(super) fn write_message(&mut self, message: Message) -> Result<()> {
+    pub fn write_message(&mut self, message: Message) -> Result<()> {
         let channel = &message.channel;
         let schema = match &channel.schema {
             Some(schema) => {
@@ -158,7 +158,7 @@ impl SliceWriter {
     }
 
     /// Ends the file; returns the rest of it.
-    pub(super) fn finish(mut self) -> Result<Bytes> {
+    pub fn finish(mut self) -> Result<Bytes> {
         self.flush_all()?;
         self.writer.finish().map_err(writer_error)?;
         Ok(std::mem::take(&mut *self.out.lock()).into())

@@ -34,7 +34,7 @@ pub(crate) enum FigureColour {
 }
 
 impl FigureColour {
-    pub(crate) fn rgb(self) -> [u8; 3] {
+    pub fn rgb(self) -> [u8; 3] {
         match self {
             Self::Ink => [22, 24, 26],
             Self::Quiet => [82, 88, 91],
@@ -47,7 +47,7 @@ impl FigureColour {
     }
 
     /// Returns the name by which a style sheet replaces the colour.
-    pub(crate) fn theme_name(self) -> Option<&'static str> {
+    pub fn theme_name(self) -> Option<&'static str> {
         match self {
             Self::Ink => Some("ink"),
             Self::Quiet => Some("quiet"),
@@ -63,14 +63,14 @@ impl FigureColour {
 /// A line's colour, width and dashes.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct StrokeStyle {
-    pub(crate) colour: FigureColour,
-    pub(crate) width_px: f32,
+    pub colour: FigureColour,
+    pub width_px: f32,
     /// Length of dashes and of the gaps between them, px; 0 for none.
-    pub(crate) dash_px: f32,
+    pub dash_px: f32,
 }
 
 impl StrokeStyle {
-    pub(crate) fn new(colour: FigureColour, width_px: f32) -> Self {
+    pub fn new(colour: FigureColour, width_px: f32) -> Self {
         Self { colour, width_px, dash_px: 0.0 }
     }
 }
@@ -120,21 +120,21 @@ pub(crate) enum ShapeGeometry {
 /// A shape, how it is painted, and what a page reads from it.
 #[derive(Debug, Clone)]
 pub(crate) struct DrawnShape {
-    pub(crate) geometry: ShapeGeometry,
-    pub(crate) fill: Option<FigureColour>,
-    pub(crate) opacity: f32,
-    pub(crate) stroke: Option<StrokeStyle>,
+    pub geometry: ShapeGeometry,
+    pub fill: Option<FigureColour>,
+    pub opacity: f32,
+    pub stroke: Option<StrokeStyle>,
     /// Attributes `data-*` of the SVG.
-    pub(crate) data: Vec<(&'static str, usize)>,
+    pub data: Vec<(&'static str, usize)>,
 }
 
 impl DrawnShape {
-    pub(crate) fn with_opacity(mut self, opacity: f32) -> Self {
+    pub fn with_opacity(mut self, opacity: f32) -> Self {
         self.opacity = opacity;
         self
     }
 
-    pub(crate) fn with_data(mut self, name: &'static str, value: usize) -> Self {
+    pub fn with_data(mut self, name: &'static str, value: usize) -> Self {
         self.data.push((name, value));
         self
     }

@@ -9,19 +9,19 @@ use crate::canvas::font::text_width;
 /// An axis: the range that it shows.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct PlotAxis {
-    pub(crate) low: f64,
-    pub(crate) high: f64,
-    pub(crate) is_log: bool,
+    pub low: f64,
+    pub high: f64,
+    pub is_log: bool,
 }
 
 impl PlotAxis {
-    pub(crate) fn linear(low: f64, high: f64) -> Self {
+    pub fn linear(low: f64, high: f64) -> Self {
         // A range of nothing would divide by it.
         let high = if high > low { high } else { low + 1.0 };
         Self { low, high, is_log: false }
     }
 
-    pub(crate) fn log(low: f64, high: f64) -> Self {
+    pub fn log(low: f64, high: f64) -> Self {
         Self { low, high, is_log: true }
     }
 
@@ -36,7 +36,7 @@ impl PlotAxis {
     }
 
     /// Returns about `count` round numbers in the range.
-    pub(crate) fn round_ticks(self, count: usize) -> Vec<f64> {
+    pub fn round_ticks(self, count: usize) -> Vec<f64> {
         let step = round_step((self.high - self.low) / count.max(1) as f64);
         let [first, last] = [(self.low / step - 1e-9).ceil() as i64, (self.high / step + 1e-9).floor() as i64];
         (first..=last).map(|i| i as f64 * step).collect()
@@ -57,23 +57,23 @@ pub(crate) fn number_text(value: f64) -> String {
 /// The place of a plot on its page, and its axes.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct PlotFrame {
-    pub(crate) left: f32,
-    pub(crate) top: f32,
-    pub(crate) width: f32,
-    pub(crate) height: f32,
-    pub(crate) x: PlotAxis,
-    pub(crate) y: PlotAxis,
+    pub left: f32,
+    pub top: f32,
+    pub width: f32,
+    pub height: f32,
+    pub x: PlotAxis,
+    pub y: PlotAxis,
 }
 
 impl PlotFrame {
     /// Returns where a value is on the page.
-    pub(crate) fn page_position(&self, x: f64, y: f64) -> [f32; 2] {
+    pub fn page_position(&self, x: f64, y: f64) -> [f32; 2] {
         let x = self.left + self.width * self.x.axis_share(x) as f32;
         [x, self.top + self.height * (1.0 - self.y.axis_share(y)) as f32]
     }
 
     /// Draws lines at ticks, and their numbers; those of y only if they are asked for.
-    pub(crate) fn draw_grid(&self, drawing: &mut FigureDrawing, x_ticks: &[f64], y_ticks: &[f64], with_y: bool) {
+    pub fn draw_grid(&self, drawing: &mut FigureDrawing, x_ticks: &[f64], y_ticks: &[f64], with_y: bool) {
         let rule = StrokeStyle::new(FigureColour::Rule, 1.0);
         for tick in y_ticks {
             let [_, y] = self.page_position(self.x.low, *tick);
@@ -91,14 +91,14 @@ impl PlotFrame {
     }
 
     /// Draws the axes; to be called after what they frame.
-    pub(crate) fn draw_axes(&self, drawing: &mut FigureDrawing) {
+    pub fn draw_axes(&self, drawing: &mut FigureDrawing) {
         let [right, bottom] = [self.left + self.width, self.top + self.height];
         let corner = vec![[self.left, self.top], [self.left, bottom], [right, bottom]];
         drawing.add_shape(stroked_line(corner, StrokeStyle::new(FigureColour::Ink, 1.0)));
     }
 
     /// Draws the titles of the axes.
-    pub(crate) fn draw_titles(&self, drawing: &mut FigureDrawing, x: &str, y: &str) {
+    pub fn draw_titles(&self, drawing: &mut FigureDrawing, x: &str, y: &str) {
         let bottom = self.top + self.height;
         drawing.add_shape(ink_label([self.left + self.width / 2.0, bottom + 34.0], x, TextAnchor::Middle));
         if !y.is_empty() {

@@ -24,12 +24,12 @@ pub(crate) struct MortalStore {
 }
 
 impl MortalStore {
-    pub(crate) fn new(last: usize, death: DeathMoment) -> Self {
+    pub fn new(last: usize, death: DeathMoment) -> Self {
         Self { writes: AtomicUsize::new(0), last, death }
     }
 
     /// Returns whether the store has died.
-    pub(crate) fn has_died(&self) -> bool {
+    pub fn has_died(&self) -> bool {
         self.writes.load(Ordering::SeqCst) > self.last
     }
 }

@@ -16,8 +16,8 @@ pub(crate) type Interlude = Arc<dyn Fn() -> BoxFuture<'static, ()> + Send + Sync
 
 /// A store whose commits have the times of a skewed clock.
 pub(crate) struct SkewedStore {
-    pub(crate) skew: TimeDelta,
-    pub(crate) interlude: Option<Interlude>,
+    pub skew: TimeDelta,
+    pub interlude: Option<Interlude>,
 }
 
 impl SkewedStore {

@@ -29,7 +29,7 @@ impl FileState {
     ///
     /// # Errors
     /// [`Error::Gone`], or [`Error::Read`] if it is no plain file.
-    pub(crate) fn from_source(lake: &Lake, source: &RunSource) -> Result<Option<Self>> {
+    pub fn from_source(lake: &Lake, source: &RunSource) -> Result<Option<Self>> {
         let found = match source {
             // No link in the lake is followed, also if it has just taken a file's place.
             RunSource::Lake(path) => match local_file(lake, path) {
@@ -57,7 +57,7 @@ impl FileState {
     ///
     /// # Errors
     /// [`Error::Changed`], [`Error::Gone`].
-    pub(super) fn check_state(before: Option<Self>, lake: &Lake, source: &RunSource) -> Result<()> {
+    pub fn check_state(before: Option<Self>, lake: &Lake, source: &RunSource) -> Result<()> {
         let (Some(before), Some(after)) = (before, Self::from_source(lake, source)?) else { return Ok(()) };
         if before == after {
             return Ok(());
@@ -74,13 +74,13 @@ impl std::fmt::Display for FileState {
 
 /// A run's file as it was read.
 pub(crate) struct ReadFile<'a> {
-    pub(crate) integrity: &'a FileIntegrity,
+    pub integrity: &'a FileIntegrity,
     /// Tag of the object when its reading began, if its store has tags.
-    pub(crate) e_tag: Option<String>,
+    pub e_tag: Option<String>,
     /// Its state when its reading began, if it is on this machine.
-    pub(crate) state: Option<FileState>,
+    pub state: Option<FileState>,
     /// SHA-256 that was recorded when it was uploaded.
-    pub(crate) recorded: Option<String>,
+    pub recorded: Option<String>,
 }
 
 impl<'a> ReadFile<'a> {
@@ -88,7 +88,7 @@ impl<'a> ReadFile<'a> {
     ///
     /// # Errors
     /// [`Error::OtherDigest`], or an error of the lake.
-    pub(crate) async fn check_digest(
+    pub async fn check_digest(
         lake: &Lake,
         source: &RunSource,
         FileVersion { e_tag, state }: FileVersion,
@@ -131,7 +131,7 @@ impl FileVersion {
     ///
     /// # Errors
     /// As of [`FileState::from_source`].
-    pub(crate) async fn from_source(lake: &Lake, source: &RunSource) -> Result<Self> {
+    pub async fn from_source(lake: &Lake, source: &RunSource) -> Result<Self> {
         let e_tag = match source {
             RunSource::Lake(path) if lake.is_remote() && source.is_in_inbox() => {
                 lake.store().head(path).await.ok().and_then(|meta| meta.e_tag)

@@ -32,7 +32,7 @@ pub(crate) struct ReadingMark {
 impl ReadingMark {
     /// Marks a file. None if it is not in the lake, if another ingest reads it, or if the disk is full: a missing mark
     /// must not fail the ingest.
-    pub(crate) fn new(lake: &Lake, source: &RunSource) -> Option<Self> {
+    pub fn new(lake: &Lake, source: &RunSource) -> Option<Self> {
         let path = mark_path(lake, source)?;
         fs::create_dir_all(path.parent()?).ok()?;
         let lock = OpenOptions::new().append(true).create(true).open(&path).ok()?;

@@ -163,7 +163,7 @@ impl From<object_store::Error> for StoreFault {
 }
 
 impl StoreFault {
-    pub(super) fn into_error(self, to: &Path) -> Error {
+    pub fn into_error(self, to: &Path) -> Error {
         match self {
             Self::Store(error) => write_error(to, error),
             Self::Changed { expected, actual } => Error::read_failure(

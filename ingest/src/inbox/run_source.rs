@@ -35,10 +35,10 @@ impl std::fmt::Display for RunSource {
 
 /// A source that is opened for reading.
 pub(crate) struct OpenedRun {
-    pub(crate) store: Arc<dyn ObjectStore>,
-    pub(crate) path: Path,
+    pub store: Arc<dyn ObjectStore>,
+    pub path: Path,
     /// Name for messages.
-    pub(crate) name: String,
+    pub name: String,
 }
 
 impl RunSource {

@@ -48,7 +48,7 @@ pub(crate) struct RunBudget(AtomicU64);
 
 impl RunBudget {
     /// Takes the memory of an empty chunk.
-    pub(crate) fn take_chunk(&self) -> Result<(), String> {
+    pub fn take_chunk(&self) -> Result<(), String> {
         self.take_bytes(CHUNK_BYTES)
     }
 
@@ -88,25 +88,25 @@ impl RecordingPlan {
 /// Results of one chunk.
 #[derive(Debug, Default)]
 pub(crate) struct ChunkResults {
-    pub(crate) responses: Vec<Response>,
-    pub(crate) verdicts: Vec<(i64, Measurement)>,
-    pub(crate) readings: Vec<(i64, AmbientSample)>,
-    pub(crate) events: Vec<(i64, Event)>,
+    pub responses: Vec<Response>,
+    pub verdicts: Vec<(i64, Measurement)>,
+    pub readings: Vec<(i64, AmbientSample)>,
+    pub events: Vec<(i64, Event)>,
     /// Descriptions of what could not be read.
-    pub(crate) damaged: Vec<String>,
-    pub(crate) last_time_ns: i64,
+    pub damaged: Vec<String>,
+    pub last_time_ns: i64,
 }
 
 /// One impulse response at the reference temperature, cropped.
 #[derive(Debug, Clone)]
 pub(crate) struct Response {
-    pub(crate) pair: u32,
-    pub(crate) attempt: u32,
-    pub(crate) log_time_ns: i64,
-    pub(crate) chunk_offset: u64,
-    pub(crate) temperature_c: f64,
-    pub(crate) source: ResponseSource,
-    pub(crate) ir: Vec<f32>,
+    pub pair: u32,
+    pub attempt: u32,
+    pub log_time_ns: i64,
+    pub chunk_offset: u64,
+    pub temperature_c: f64,
+    pub source: ResponseSource,
+    pub ir: Vec<f32>,
 }
 
 /// Origin of a response; the greater is preferred.
@@ -118,7 +118,7 @@ pub(crate) enum ResponseSource {
 }
 
 impl ResponseSource {
-    pub(crate) fn label(self) -> &'static str {
+    pub fn label(self) -> &'static str {
         match self {
             Self::Corrected => "corrected",
             Self::Ir => "ir",
@@ -131,16 +131,16 @@ impl ResponseSource {
 #[derive(Clone, PartialEq, prost::Message)]
 pub(crate) struct Event {
     #[prost(int32, tag = "2")]
-    pub(crate) level: i32,
+    pub level: i32,
     #[prost(string, tag = "3")]
-    pub(crate) message: String,
+    pub message: String,
     #[prost(string, tag = "4")]
-    pub(crate) name: String,
+    pub name: String,
 }
 
 impl Event {
     /// Returns the name of the line's foxglove.Log level.
-    pub(crate) fn level_name(&self) -> &'static str {
+    pub fn level_name(&self) -> &'static str {
         ["unknown", "debug", "info", "warning", "error", "fatal"]
             .get(usize::try_from(self.level).unwrap_or(0))
             .copied()
@@ -149,7 +149,7 @@ impl Event {
 }
 
 impl Measurer {
-    pub(crate) fn new(lake: &Lake) -> Self {
+    pub fn new(lake: &Lake) -> Self {
         let response = &lake.rig().impulse_response;
         Self {
             rig: lake.rig().clone(),
@@ -160,7 +160,7 @@ impl Measurer {
     }
 
     /// Returns the budget of one run: every pair may have its attempts, each recorded and as a response.
-    pub(crate) fn run_budget(&self) -> RunBudget {
+    pub fn run_budget(&self) -> RunBudget {
         let attempts = u64::from(self.pairs) * u64::from(self.rig.validation.attempts);
         RunBudget(AtomicU64::new(SPARE_BYTES + attempts * (2 * self.response_bytes() + VERDICT_BYTES)))
     }
@@ -170,7 +170,7 @@ impl Measurer {
     }
 
     /// Reads all messages of a chunk, within the run's budget. A damaged message is reported and skipped.
-    pub(crate) fn process_chunk(
+    pub fn process_chunk(
         &self,
         offset: u64,
         chunk: &DecodedChunk,

@@ -14,8 +14,8 @@ pub(crate) type RunChannels = HashMap<u16, RunChannel>;
 /// A channel.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct RunChannel {
-    pub(crate) topic: String,
-    pub(crate) schema: String,
+    pub topic: String,
+    pub schema: String,
 }
 
 /// Schemas and channels seen so far; a channel comes behind its schema.
@@ -23,13 +23,13 @@ pub(crate) struct RunChannel {
 pub(crate) struct RunDefinitions {
     schemas: HashMap<u16, String>,
     /// Chunks that are being measured share them.
-    pub(crate) channels: Arc<RunChannels>,
+    pub channels: Arc<RunChannels>,
 }
 
 impl RunDefinitions {
     /// Learns a definition outside of chunks. The first of an id counts: a chunk's definitions have its CRC, those of the
     /// summary may be damaged.
-    pub(crate) fn learn_definition(&mut self, record: &Record<'_>) {
+    pub fn learn_definition(&mut self, record: &Record<'_>) {
         match record {
             Record::Schema { header, .. } => {
                 self.schemas.entry(header.id).or_insert_with(|| kept_name(&header.name));
@@ -46,7 +46,7 @@ impl RunDefinitions {
     ///
     /// # Errors
     /// What is different, if an id is used again for something else: nobody could tell whose the messages are.
-    pub(crate) fn learn_chunk(&mut self, chunk: &DecodedChunk) -> Result<(), String> {
+    pub fn learn_chunk(&mut self, chunk: &DecodedChunk) -> Result<(), String> {
         for (code, body) in chunk.records().filter(|(code, _)| matches!(*code, opcode::SCHEMA | opcode::CHANNEL)) {
             let Ok(record) = parse_record(code, body) else { continue };
             self.learn_definition(&record);
@@ -79,7 +79,7 @@ impl RunDefinitions {
     }
 
     /// Returns whether the channels of all messages of a chunk are known.
-    pub(crate) fn has_channels_of(&self, chunk: &DecodedChunk) -> bool {
+    pub fn has_channels_of(&self, chunk: &DecodedChunk) -> bool {
         chunk.messages().all(|message| self.channels.contains_key(&message.channel))
     }
 }

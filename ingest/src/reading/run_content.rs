@@ -18,23 +18,23 @@ use crate::pipeline::{Cores, PendingComputation};
 
 /// A run, read.
 pub(crate) struct RunContent {
-    pub(crate) manifest: RunManifest,
-    pub(crate) end: Option<RunEnd>,
-    pub(crate) surface: SurfaceRecord,
+    pub manifest: RunManifest,
+    pub end: Option<RunEnd>,
+    pub surface: SurfaceRecord,
     /// Heights over a square of the panel's size, mm; empty where the run has none.
-    pub(crate) heights_mm: Vec<f32>,
+    pub heights_mm: Vec<f32>,
     /// Accepted measurements by pair.
-    pub(crate) accepted: Vec<(Measurement, Response)>,
-    pub(crate) rejected: u64,
-    pub(crate) attempts: u64,
-    pub(crate) readings: Vec<(i64, AmbientSample)>,
-    pub(crate) events: Vec<(i64, Event)>,
-    pub(crate) last_time_ns: i64,
-    pub(crate) integrity: FileIntegrity,
+    pub accepted: Vec<(Measurement, Response)>,
+    pub rejected: u64,
+    pub attempts: u64,
+    pub readings: Vec<(i64, AmbientSample)>,
+    pub events: Vec<(i64, Event)>,
+    pub last_time_ns: i64,
+    pub integrity: FileIntegrity,
     /// `recover` made the file of a recording that had no defect.
-    pub(crate) recovered_whole: bool,
+    pub recovered_whole: bool,
     /// What could not be read, in words.
-    pub(crate) damaged: Vec<String>,
+    pub damaged: Vec<String>,
 }
 
 /// What became of a chunk, or will.
@@ -45,7 +45,7 @@ enum ChunkMeasurement {
 
 impl RunContent {
     /// Reads a run; its chunks are measured on all cores while the next ones are fetched.
-    pub(crate) async fn read_from(
+    pub async fn read_from(
         lake: &Lake,
         measurer: &Arc<Measurer>,
         cores: &Cores,
@@ -173,12 +173,12 @@ impl RunContent {
     }
 
     /// The file was closed and says how the run ended.
-    pub(crate) fn is_whole(&self) -> bool {
+    pub fn is_whole(&self) -> bool {
         self.integrity.closed && self.end.is_some()
     }
 
     /// The run was stopped before its end, and `recover` found nothing that was lost.
-    pub(crate) fn is_stopped(&self) -> bool {
+    pub fn is_stopped(&self) -> bool {
         self.integrity.closed && self.end.is_none() && self.recovered_whole
     }
 }

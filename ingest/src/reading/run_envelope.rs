@@ -14,7 +14,7 @@ use crate::inbox::OpenedRun;
 /// The records outside of chunks, as far as ingest needs them: a file may have any number of others.
 #[derive(Default)]
 pub(super) struct RunEnvelope {
-    pub(super) metadata: BTreeMap<String, BTreeMap<String, String>>,
+    pub metadata: BTreeMap<String, BTreeMap<String, String>>,
     attachments: BTreeMap<String, Bytes>,
 }
 
@@ -29,17 +29,17 @@ const LARGEST_TEXT: usize = 1 << 20;
 /// The records of a run before its first measurement.
 #[derive(Debug)]
 pub(crate) struct RunHead {
-    pub(crate) surface: SurfaceId,
-    pub(crate) references: Vec<SurfaceId>,
-    pub(crate) origin: Origin,
+    pub surface: SurfaceId,
+    pub references: Vec<SurfaceId>,
+    pub origin: Origin,
     /// It has the plan by which the run is resumed.
-    pub(crate) has_plan: bool,
-    pub(crate) rig: Option<Rig>,
+    pub has_plan: bool,
+    pub rig: Option<Rig>,
 }
 
 impl RunHead {
     /// Reads them; None if the file does not begin as a run.
-    pub(crate) async fn read_from(opened: &OpenedRun) -> Option<Self> {
+    pub async fn read_from(opened: &OpenedRun) -> Option<Self> {
         let (store, path) = (opened.store.clone(), opened.path.clone());
         let mut reader = ResyncReader::open(store, path, opened.name.clone()).await.ok()?.without_digest();
         let mut envelope = RunEnvelope::default();
@@ -62,7 +62,7 @@ impl RunHead {
 
 impl RunEnvelope {
     // The first of a name counts.
-    pub(super) fn keep_attachment(&mut self, name: String, data: Bytes) {
+    pub fn keep_attachment(&mut self, name: String, data: Bytes) {
         let most = if name == topics::HEIGHTS_ATTACHMENT { LARGEST_HEIGHTS } else { LARGEST_TEXT };
         if NEEDED_ATTACHMENTS.contains(&name.as_str()) && data.len() <= most {
             // A copy: the bytes are part of whatever was fetched with them.
@@ -70,19 +70,19 @@ impl RunEnvelope {
         }
     }
 
-    pub(super) fn keep_metadata(&mut self, record: Metadata) {
+    pub fn keep_metadata(&mut self, record: Metadata) {
         if NEEDED_METADATA.contains(&record.name.as_str()) {
             self.metadata.entry(record.name).or_insert(record.metadata);
         }
     }
 
     // Other writers may put what the run is behind its first chunks.
-    pub(super) fn is_complete(&self) -> bool {
+    pub fn is_complete(&self) -> bool {
         self.metadata.contains_key(topics::RUN_METADATA) && self.attachments.contains_key(topics::RIG_ATTACHMENT)
     }
 
     // Checked before chunks are measured where that can be, so that a wrong file costs nothing.
-    pub(super) fn checked_manifest(&self, lake: &Lake, name: &str) -> Result<RunManifest> {
+    pub fn checked_manifest(&self, lake: &Lake, name: &str) -> Result<RunManifest> {
         let Some(record) = self.metadata.get(topics::RUN_METADATA) else {
             return Err(Error::Foreign { file: name.to_owned() });
         };
@@ -103,7 +103,7 @@ impl RunEnvelope {
         Rig::from_toml(text).map_err(|e| wrong(e.into()))
     }
 
-    pub(super) fn parse_surface(&self, name: &str) -> Result<SurfaceRecord> {
+    pub fn parse_surface(&self, name: &str) -> Result<SurfaceRecord> {
         let wrong = |source: ErrorCause| Error::Attachment {
             file: name.to_owned(),
             attachment: topics::SURFACE_ATTACHMENT,
@@ -113,7 +113,7 @@ impl RunEnvelope {
         serde_json::from_slice(bytes).map_err(|e| wrong(e.into()))
     }
 
-    pub(super) fn decode_heights(&self) -> Vec<f32> {
+    pub fn decode_heights(&self) -> Vec<f32> {
         let bytes = self.attachments.get(topics::HEIGHTS_ATTACHMENT).map_or(&[][..], |b| &b[..]);
         bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect()
     }

@@ -13,15 +13,15 @@ use crate::error::Result;
 /// Versions of the references that the rows used.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct ReferenceVersions<'a> {
-    pub(crate) flat: &'a str,
-    pub(crate) foam: &'a str,
+    pub flat: &'a str,
+    pub foam: &'a str,
 }
 
 /// The image of each pair under each symmetry that the grid has.
 pub(crate) struct SymmetryPairs(Vec<(Symmetry, Vec<MovedPair>)>);
 
 impl SymmetryPairs {
-    pub(crate) fn from_grid(grid: &Grid) -> Self {
+    pub fn from_grid(grid: &Grid) -> Self {
         let moved = |symmetry| grid.moved_pairs(symmetry).map(|pairs| (symmetry, pairs));
         Self(Symmetry::ALL.into_iter().filter_map(moved).collect())
     }

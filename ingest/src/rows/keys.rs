@@ -9,13 +9,13 @@ use crate::CODE_VERSION;
 /// Key columns of every row of a run.
 #[derive(Debug, Clone)]
 pub(crate) struct RunKeys {
-    pub(crate) surface: SurfaceId,
-    pub(crate) run: RunId,
+    pub surface: SurfaceId,
+    pub run: RunId,
 }
 
 impl RunKeys {
     /// Returns a builder that has the run's keys and the code version.
-    pub(super) fn begin_rows(&self, table: Table, rig: &Rig, rows: usize) -> BatchBuilder {
+    pub fn begin_rows(&self, table: Table, rig: &Rig, rows: usize) -> BatchBuilder {
         let mut columns = BatchBuilder::new(table, rig, rows);
         columns
             .fill_text("surface_id", self.surface.as_str())

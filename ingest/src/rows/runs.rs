@@ -14,10 +14,10 @@ use crate::reading::RunContent;
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(crate) struct RunReferences {
     /// Description of missing references; empty if none is missing.
-    pub(crate) missing: String,
-    pub(crate) derivation: Option<String>,
-    pub(crate) flat_version: Option<String>,
-    pub(crate) foam_version: Option<String>,
+    pub missing: String,
+    pub derivation: Option<String>,
+    pub flat_version: Option<String>,
+    pub foam_version: Option<String>,
 }
 
 /// State of a run with all of its rows.

@@ -16,13 +16,13 @@ use crate::error::Result;
 /// Values of a surface's pairs, in each band and of the total.
 pub(crate) struct SurfaceLevels {
     /// TNCE.
-    pub(crate) tnce: Vec<Vec<f64>>,
+    pub tnce: Vec<Vec<f64>>,
     /// The same without Foam's reflection; none if it is not known.
-    pub(crate) unbiased: Vec<Vec<f64>>,
+    pub unbiased: Vec<Vec<f64>>,
     /// Relative errors of TNCE; none if they are not known.
-    pub(crate) errors: Vec<Vec<ErrorMoments>>,
+    pub errors: Vec<Vec<ErrorMoments>>,
     /// Mean NCE curves of the bands.
-    pub(crate) curves: Vec<SignalMean>,
+    pub curves: Vec<SignalMean>,
 }
 
 /// Builds one row per band and one for the total.

@@ -103,7 +103,7 @@ pub(super) struct Numbers<T: ArrowPrimitiveType> {
 /// Columns side by side.
 pub(super) struct Record {
     fields: Fields,
-    pub(super) columns: Vec<Column>,
+    pub columns: Vec<Column>,
     nulls: NullBufferBuilder,
 }
 
@@ -111,7 +111,7 @@ pub(super) struct Record {
 pub(super) struct List {
     field: FieldRef,
     offsets: Vec<i32>,
-    pub(super) values: Box<Column>,
+    pub values: Box<Column>,
     nulls: NullBufferBuilder,
 }
 
@@ -125,19 +125,19 @@ impl<T: ArrowPrimitiveType> Numbers<T> {
     }
 
     /// Adds a value.
-    pub(super) fn append_value(&mut self, value: T::Native) {
+    pub fn append_value(&mut self, value: T::Native) {
         self.values.push(value);
         self.nulls.append_non_null();
     }
 
     /// Adds several values at once, as those of a packed list of floats.
-    pub(super) fn append_values(&mut self, values: impl ExactSizeIterator<Item = T::Native>) {
+    pub fn append_values(&mut self, values: impl ExactSizeIterator<Item = T::Native>) {
         self.nulls.append_n_non_nulls(values.len());
         self.values.extend(values);
     }
 
     /// Adds a value, or a missing one.
-    pub(super) fn append_option(&mut self, value: Option<T::Native>) {
+    pub fn append_option(&mut self, value: Option<T::Native>) {
         match value {
             Some(value) => self.append_value(value),
             None => self.append_null(),
@@ -156,7 +156,7 @@ impl<T: ArrowPrimitiveType> Numbers<T> {
 
 impl Record {
     /// Makes columns of these fields.
-    pub(super) fn new(fields: &Fields) -> Self {
+    pub fn new(fields: &Fields) -> Self {
         let columns = fields.iter().map(|f| Column::new(f.data_type())).collect();
         Self { fields: fields.clone(), columns, nulls: NullBufferBuilder::new(0) }
     }
@@ -166,7 +166,7 @@ impl Record {
     }
 
     /// Ends a record that is there, for which each column has got a value.
-    pub(super) fn end_row(&mut self) {
+    pub fn end_row(&mut self) {
         self.nulls.append_non_null();
     }
 
@@ -193,7 +193,7 @@ impl List {
     }
 
     /// Ends a list, of the values that were added since the last one.
-    pub(super) fn end_row(&mut self) {
+    pub fn end_row(&mut self) {
         self.push_offset();
         self.nulls.append_non_null();
     }
@@ -217,7 +217,7 @@ impl List {
 
 impl Column {
     /// Makes an empty column of a type.
-    pub(super) fn new(kind: &DataType) -> Self {
+    pub fn new(kind: &DataType) -> Self {
         match kind {
             DataType::Boolean => Self::Bool(BooleanBuilder::new()),
             DataType::Int8 => Self::I8(Numbers::new()),
@@ -247,12 +247,12 @@ impl Column {
     }
 
     /// Adds a value that is missing.
-    pub(super) fn append_null(&mut self) {
+    pub fn append_null(&mut self) {
         with_builder!(self, builder => builder.append_null());
     }
 
     /// Returns the array of all values, and empties the column.
-    pub(super) fn finish(&mut self) -> Result<ArrayRef, ArrowError> {
+    pub fn finish(&mut self) -> Result<ArrayRef, ArrowError> {
         Ok(match self {
             Self::Bool(c) => Arc::new(c.finish()),
             Self::I8(c) => Arc::new(c.finish()),

@@ -33,12 +33,12 @@ pub(super) enum Fault {
 
 impl Fault {
     /// Makes the error of a file's damage.
-    pub(super) fn damaged(file: &Path, offset: u64, what: impl Into<String>) -> Self {
+    pub fn damaged(file: &Path, offset: u64, what: impl Into<String>) -> Self {
         Self::Damaged { file: file.to_string(), offset, what: what.into() }
     }
 
     /// Makes the error of a call.
-    pub(super) fn invalid_call(what: impl Into<String>, hint: impl Into<String>) -> Self {
+    pub fn invalid_call(what: impl Into<String>, hint: impl Into<String>) -> Self {
         Self::Call { what: what.into(), hint: hint.into() }
     }
 }

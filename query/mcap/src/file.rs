@@ -37,16 +37,16 @@ const CACHED_BYTES: u64 = 64 << 20;
 /// What is known of a file before any message is read.
 #[derive(Debug)]
 pub(super) struct McapFile {
-    pub(super) path: Path,
-    pub(super) bytes: u64,
+    pub path: Path,
+    pub bytes: u64,
     /// The reason why it was walked; None if its summary told where what is.
-    pub(super) walked: Option<String>,
-    pub(super) channels: BTreeMap<u16, Channel>,
+    pub walked: Option<String>,
+    pub channels: BTreeMap<u16, Channel>,
     /// Those of its summary; a walk compares all schemas and channels by itself.
-    pub(super) digests: DefinitionDigests,
+    pub digests: DefinitionDigests,
     /// In the file's order, without overlaps.
-    pub(super) pieces: Vec<Piece>,
-    pub(super) attachments: Vec<Attachment>,
+    pub pieces: Vec<Piece>,
+    pub attachments: Vec<Attachment>,
 }
 
 /// A file within a run's file.
@@ -65,12 +65,12 @@ pub struct Attachment {
 /// A channel.
 #[derive(Debug, Clone)]
 pub(super) struct Channel {
-    pub(super) topic: String,
-    pub(super) schema: Arc<RawSchema>,
+    pub topic: String,
+    pub schema: Arc<RawSchema>,
     /// Messages, where that is known.
-    pub(super) messages: Option<u64>,
+    pub messages: Option<u64>,
     /// Times of its first and last message, where the file was walked.
-    pub(super) times: Option<(u64, u64)>,
+    pub times: Option<(u64, u64)>,
 }
 
 /// Opens files, and caches their summaries.

@@ -17,21 +17,21 @@ pub(super) enum PieceKind {
 /// A chunk, or a run of messages in none.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Piece {
-    pub(super) kind: PieceKind,
-    pub(super) range: Range<u64>,
+    pub kind: PieceKind,
+    pub range: Range<u64>,
     /// Times of its earliest and latest message, ns.
-    pub(super) times: (u64, u64),
+    pub times: (u64, u64),
     /// Channels of its messages; None where the index does not say.
-    pub(super) channels: Option<Box<[u16]>>,
+    pub channels: Option<Box<[u16]>>,
     /// Bytes of message indexes behind it.
-    pub(super) index: u64,
+    pub index: u64,
     /// Bytes of its records before compression, where its index tells.
-    pub(super) plain: u64,
+    pub plain: u64,
 }
 
 impl Piece {
     /// Returns true if it may have messages of a channel.
-    pub(super) fn has_channel(&self, channel: u16) -> bool {
+    pub fn has_channel(&self, channel: u16) -> bool {
         self.channels.as_ref().is_none_or(|channels| channels.contains(&channel))
     }
 }
@@ -42,12 +42,12 @@ pub(super) struct PieceRecords {
     chunk: Option<Bytes>,
     records: RecordCursor,
     /// Memory that reading may take, in bytes.
-    pub(super) memory: usize,
+    pub memory: usize,
 }
 
 impl PieceRecords {
     /// Reads a whole chunk record, or several other records. The text of an error is the damage.
-    pub(super) fn new(bytes: Bytes, kind: PieceKind) -> Result<Self, String> {
+    pub fn new(bytes: Bytes, kind: PieceKind) -> Result<Self, String> {
         match kind {
             PieceKind::Chunk => Self::from_chunk(chunk_body(&bytes)?),
             PieceKind::Loose => Ok(Self { chunk: None, memory: bytes.len(), records: RecordCursor::new(bytes) }),
@@ -55,14 +55,14 @@ impl PieceRecords {
     }
 
     /// Reads the records of a chunk, given its body.
-    pub(super) fn from_chunk(body: Bytes) -> Result<Self, String> {
+    pub fn from_chunk(body: Bytes) -> Result<Self, String> {
         let memory = DecodedChunk::memory_of(&body).map_err(|e| format!("its chunk is damaged: {e}"))?;
         let memory = usize::try_from(memory).map_err(|e| e.to_string())?;
         Ok(Self { chunk: Some(body), records: RecordCursor::new(Bytes::new()), memory })
     }
 
     /// Returns the next record; None behind the last one. The text of an error is the damage.
-    pub(super) fn next_record(&mut self) -> Result<Option<Record<'_>>, String> {
+    pub fn next_record(&mut self) -> Result<Option<Record<'_>>, String> {
         if let Some(body) = self.chunk.take() {
             let decoded = DecodedChunk::decode(&body).map_err(|e| format!("its chunk is damaged: {e}"))?;
             self.records = decoded.into_cursor();

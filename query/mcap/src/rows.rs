@@ -31,10 +31,10 @@ pub(super) enum Head {
 
 impl Head {
     /// Those in front of a message's own columns.
-    pub(super) const OF_COLUMNS: [Self; 6] =
+    pub const OF_COLUMNS: [Self; 6] =
         [Self::Surface, Self::Run, Self::Time, Self::TimeNanos, Self::Published, Self::Sequence];
     /// Those of messages that are given as they are.
-    pub(super) const OF_MESSAGES: [Self; 9] = [
+    pub const OF_MESSAGES: [Self; 9] = [
         Self::Surface,
         Self::Run,
         Self::Topic,
@@ -46,7 +46,7 @@ impl Head {
         Self::Data,
     ];
 
-    pub(super) fn column_field(self) -> Field {
+    pub fn column_field(self) -> Field {
         match self {
             Self::Surface => Field::new("surface_id", DataType::Utf8, true),
             Self::Run => Field::new("run_id", DataType::Utf8, true),
@@ -63,18 +63,18 @@ impl Head {
 
 /// A message and where it comes from.
 pub(super) struct Message<'a> {
-    pub(super) run: Option<&'a (String, String)>,
-    pub(super) topic: &'a str,
-    pub(super) header: &'a MessageHeader,
-    pub(super) data: &'a [u8],
+    pub run: Option<&'a (String, String)>,
+    pub topic: &'a str,
+    pub header: &'a MessageHeader,
+    pub data: &'a [u8],
 }
 
 /// A schema of some files, and where the table's own columns are in it.
 #[derive(Debug, Clone)]
 pub(super) struct Mapping {
-    pub(super) layout: Arc<MessageLayout>,
+    pub layout: Arc<MessageLayout>,
     /// For each column of the messages in the table, its place in the layout.
-    pub(super) columns: Vec<Option<usize>>,
+    pub columns: Vec<Option<usize>>,
 }
 
 /// Makes batches of messages.
@@ -109,7 +109,7 @@ enum Output {
 
 impl Rows {
     /// Rows with some of the columns of a table that begins with `heads`.
-    pub(super) fn new(schema: SchemaRef, heads: &[Head], projection: &[usize], most: usize) -> Self {
+    pub fn new(schema: SchemaRef, heads: &[Head], projection: &[usize], most: usize) -> Self {
         let (mut output, mut wanted) = (Vec::new(), Vec::new());
         for place in projection {
             match heads.get(*place) {
@@ -134,7 +134,7 @@ impl Rows {
     }
 
     /// Adds a message; true once a batch is ready.
-    pub(super) fn push_message(
+    pub fn push_message(
         &mut self,
         message: &Message<'_>,
         mapping: Option<(usize, &Mapping)>,
@@ -164,17 +164,17 @@ impl Rows {
     }
 
     /// Takes the number of values since the last call that are null because they are not of their column's type.
-    pub(super) fn take_unfit(&mut self) -> usize {
+    pub fn take_unfit(&mut self) -> usize {
         std::mem::take(&mut self.unfit)
     }
 
     /// A batch that is ready.
-    pub(super) fn take_batch(&mut self) -> Option<RecordBatch> {
+    pub fn take_batch(&mut self) -> Option<RecordBatch> {
         self.ready.pop_front()
     }
 
     /// Makes a batch of the rows so far.
-    pub(super) fn finish_batch(&mut self) -> Result<(), ArrowError> {
+    pub fn finish_batch(&mut self) -> Result<(), ArrowError> {
         let count = std::mem::take(&mut self.count);
         self.bytes = 0;
         if count == 0 {

@@ -19,12 +19,12 @@ pub(super) struct RunSizes {
 }
 
 impl RunSizes {
-    pub(super) fn new(lake: &Lake, small: &Arc<SmallTables>) -> Self {
+    pub fn new(lake: &Lake, small: &Arc<SmallTables>) -> Self {
         Self { small: small.clone(), schema: Table::Runs.schema(lake.rig()) }
     }
 
     /// Returns the sizes that are known. A file that is missing here is asked for its size.
-    pub(super) async fn read_sizes(&self, snapshot: &LakeSnapshot) -> HashMap<Path, u64> {
+    pub async fn read_sizes(&self, snapshot: &LakeSnapshot) -> HashMap<Path, u64> {
         let files: Vec<_> = snapshot.files(Table::Runs).iter().collect();
         if SmallTables::cached_columns(Table::Runs, &self.schema, files.iter().copied()).is_none() {
             return HashMap::new();

@@ -40,26 +40,26 @@ const AHEAD: usize = 2;
 #[derive(Debug)]
 pub(super) struct Parts {
     /// What it is called in plans.
-    pub(super) name: String,
-    pub(super) files: Arc<McapFiles>,
-    pub(super) heads: Vec<Head>,
-    pub(super) sources: Vec<Source>,
+    pub name: String,
+    pub files: Arc<McapFiles>,
+    pub heads: Vec<Head>,
+    pub sources: Vec<Source>,
     /// None in a table of messages as they are.
-    pub(super) mappings: Option<Vec<Mapping>>,
+    pub mappings: Option<Vec<Mapping>>,
 }
 
 /// One file.
 #[derive(Debug)]
 pub(super) struct Source {
-    pub(super) run: Option<(String, String)>,
-    pub(super) file: Arc<McapFile>,
+    pub run: Option<(String, String)>,
+    pub file: Arc<McapFile>,
     /// The channels that are meant: topic, and which mapping they have.
-    pub(super) channels: BTreeMap<u16, (String, usize)>,
+    pub channels: BTreeMap<u16, (String, usize)>,
 }
 
 impl Source {
     /// Returns the pieces that may have messages of the channels in the time.
-    pub(super) fn pieces_within<'a>(
+    pub fn pieces_within<'a>(
         &'a self,
         times: Option<&'a RangeInclusive<i64>>,
     ) -> impl Iterator<Item = &'a Piece> {
@@ -75,14 +75,14 @@ impl Source {
 /// What a scan is asked for.
 #[derive(Debug)]
 pub(super) struct Scan {
-    pub(super) parts: Arc<Parts>,
+    pub parts: Arc<Parts>,
     /// Columns that are asked for, by their place in the table.
-    pub(super) projection: Vec<usize>,
+    pub projection: Vec<usize>,
     /// The same as fields.
-    pub(super) schema: SchemaRef,
+    pub schema: SchemaRef,
     /// Times of messages, ns; None if all are asked for, also those that have no such time.
-    pub(super) times: Option<RangeInclusive<i64>>,
-    pub(super) limit: Option<usize>,
+    pub times: Option<RangeInclusive<i64>>,
+    pub limit: Option<usize>,
 }
 
 /// The plan of a scan.
@@ -106,7 +106,7 @@ struct FileRead {
 
 impl McapExec {
     /// A plan that reads `pieces`, each with its source, in up to `most` partitions of about the same size.
-    pub(super) fn new(scan: Scan, pieces: Vec<(usize, Piece)>, all: usize, most: usize) -> Self {
+    pub fn new(scan: Scan, pieces: Vec<(usize, Piece)>, all: usize, most: usize) -> Self {
         let count = pieces.len();
         let bytes: u64 = pieces.iter().map(|(_, p)| p.range.end - p.range.start).sum();
         let share = bytes.div_ceil(most.max(1) as u64).max(1);

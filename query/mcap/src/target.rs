@@ -23,13 +23,13 @@ const RUNS_ALONE: &str = "tokens of projects read files of their runs alone; sel
 #[derive(Debug, Clone)]
 pub(super) struct Target {
     /// Surface and run; None for a file that is no run of the lake.
-    pub(super) run: Option<(String, String)>,
-    pub(super) file: Arc<McapFile>,
+    pub run: Option<(String, String)>,
+    pub file: Arc<McapFile>,
 }
 
 impl Target {
     /// Opens the files that `pattern` means, each once.
-    pub(super) async fn open_all(
+    pub async fn open_all(
         pattern: &str,
         snapshot: &LakeSnapshot,
         files: &McapFiles,

@@ -149,11 +149,11 @@ async fn put_run(lake: &TestLake, surface: &str, run: &str, file: Vec<u8>) {
 
 /// A channel of a file: its topic, encoding and schema, and its messages.
 pub(crate) struct TestChannel<'a> {
-    pub(crate) topic: &'a str,
-    pub(crate) encoding: &'a str,
+    pub topic: &'a str,
+    pub encoding: &'a str,
     /// Name, encoding and data.
-    pub(crate) schema: (&'a str, &'a str, &'a [u8]),
-    pub(crate) messages: &'a [&'a [u8]],
+    pub schema: (&'a str, &'a str, &'a [u8]),
+    pub messages: &'a [&'a [u8]],
 }
 
 pub(crate) fn file_of(channels: &[TestChannel<'_>]) -> Vec<u8> {

@@ -57,7 +57,7 @@ impl Drop for WorkGuard {
 }
 
 impl QueryTicket {
-    pub(crate) fn new() -> Self {
+    pub fn new() -> Self {
         Self {
             stop: OnceLock::new(),
             stopped: Notify::new(),
@@ -68,23 +68,23 @@ impl QueryTicket {
     }
 
     /// Sets the task that stops the query at its timeout.
-    pub(crate) fn set_timer(&self, timer: AbortHandle) {
+    pub fn set_timer(&self, timer: AbortHandle) {
         let _ = self.timer.set(timer);
     }
 
     /// Stops the query; the first reason counts.
-    pub(crate) fn stop(&self, why: StopReason) {
+    pub fn stop(&self, why: StopReason) {
         let _ = self.stop.set((why, Instant::now()));
         self.stopped.notify_waiters();
     }
 
     /// Returns the reason for which the query was stopped, if it was.
-    pub(crate) fn stop_reason(&self) -> Option<&StopReason> {
+    pub fn stop_reason(&self) -> Option<&StopReason> {
         self.stop.get().map(|(why, _)| why)
     }
 
     /// Waits until the query must end.
-    pub(crate) async fn wait_for_stop(&self) -> StopReason {
+    pub async fn wait_for_stop(&self) -> StopReason {
         loop {
             // Subscribes before the check, or a stop between them would be missed.
             let stopped = self.stopped.notified();
@@ -96,12 +96,12 @@ impl QueryTicket {
     }
 
     /// Bytes that its operators have reserved.
-    pub(crate) fn held_memory(&self) -> &Arc<HeldMemory> {
+    pub fn held_memory(&self) -> &Arc<HeldMemory> {
         &self.held
     }
 
     /// Registers work for the query.
-    pub(crate) fn begin_work(self: &Arc<Self>) -> WorkGuard {
+    pub fn begin_work(self: &Arc<Self>) -> WorkGuard {
         self.working.fetch_add(1, Ordering::Relaxed);
         WorkGuard(self.clone())
     }
@@ -127,19 +127,19 @@ impl fmt::Debug for QueryTicket {
 pub(crate) struct RunningQueries(Mutex<Vec<Weak<QueryTicket>>>);
 
 impl RunningQueries {
-    pub(crate) fn add_ticket(&self, ticket: &Arc<QueryTicket>) {
+    pub fn add_ticket(&self, ticket: &Arc<QueryTicket>) {
         let mut tickets = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         tickets.retain(|t| t.strong_count() > 0);
         tickets.push(Arc::downgrade(ticket));
     }
 
     /// Counts the queries that run or wait.
-    pub(crate) fn count_running(&self) -> usize {
+    pub fn count_running(&self) -> usize {
         self.live_tickets().iter().filter(|t| t.stop_reason().is_none()).count()
     }
 
     /// Returns the longest time for which work has continued after its query was ended; None if there is none.
-    pub(crate) fn longest_overdue(&self) -> Option<Duration> {
+    pub fn longest_overdue(&self) -> Option<Duration> {
         self.live_tickets().iter().filter_map(|t| t.overdue_time()).max()
     }
 

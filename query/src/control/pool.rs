@@ -27,7 +27,7 @@ pub(crate) struct HeldMemory {
 
 impl HeldMemory {
     /// Returns the most that was held, bytes.
-    pub(crate) fn peak_bytes(&self) -> usize {
+    pub fn peak_bytes(&self) -> usize {
         self.peak.load(Ordering::Relaxed)
     }
 
@@ -50,7 +50,7 @@ impl HeldMemory {
 }
 
 impl PartialPool {
-    pub(crate) fn new(all: Arc<dyn MemoryPool>, holder: &'static str, limit: usize, held: Arc<HeldMemory>) -> Self {
+    pub fn new(all: Arc<dyn MemoryPool>, holder: &'static str, limit: usize, held: Arc<HeldMemory>) -> Self {
         Self { all, holder, limit, held }
     }
 

@@ -77,7 +77,7 @@ impl QueryThreadGroups {
     ///
     /// # Errors
     /// As [`QueryThreads::new`].
-    pub(crate) fn per_core(name: &str) -> std::io::Result<Self> {
+    pub fn per_core(name: &str) -> std::io::Result<Self> {
         let group = || Ok(ThreadGroup { threads: QueryThreads::per_core(name)?, work: Arc::default() });
         Ok(Self(std::iter::repeat_with(group).take(GROUPS).collect::<std::io::Result<_>>()?))
     }
@@ -85,7 +85,7 @@ impl QueryThreadGroups {
     /// Begins work on the group with the least of it, or on another if its threads do not respond; returns its task,
     /// whose output is always `Some`. None during shutdown. If the caller stops waiting, the work has begun already or is
     /// dropped.
-    pub(crate) async fn begin_work<T: Send + 'static>(
+    pub async fn begin_work<T: Send + 'static>(
         &self,
         work: BoxFuture<'static, T>,
     ) -> Option<JoinHandle<Option<T>>> {

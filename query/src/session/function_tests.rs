@@ -28,7 +28,7 @@ pub(crate) struct SmallLake {
 }
 
 impl SmallLake {
-    pub(crate) async fn new() -> Self {
+    pub async fn new() -> Self {
         let folder = tempfile::tempdir().expect("a folder");
         let url = folder.path().join("lake").display().to_string();
         let lake = Lake::open_or_create(&url, &Rig::paper(), &ReferenceSurfaces::default()).await.expect("a lake");
@@ -39,7 +39,7 @@ impl SmallLake {
         Self { _folder: folder, session, golden }
     }
 
-    pub(crate) async fn batches(&self, sql: &str) -> Result<Vec<RecordBatch>, Error> {
+    pub async fn batches(&self, sql: &str) -> Result<Vec<RecordBatch>, Error> {
         let mut answer = self.session.query(sql).await?;
         let mut batches = vec![RecordBatch::new_empty(answer.schema.clone())];
         while let Some(batch) = answer.next().await? {

@@ -23,11 +23,11 @@ const FORMS: &str = "VERSION AS OF 12, or TIMESTAMP AS OF '2026-11-21T10:00:00Z'
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) struct PastTableName {
     /// Its name as the query has it, `nce@12`.
-    pub(crate) name: String,
+    pub name: String,
     /// The name of the table.
-    pub(crate) table: String,
+    pub table: String,
     /// The moment, as text.
-    pub(crate) at: String,
+    pub at: String,
 }
 
 impl PastTableName {
@@ -51,7 +51,7 @@ impl PastTableName {
     ///
     /// # Errors
     /// [`Error::Query`] if it is neither a version nor a time.
-    pub(crate) fn parse_moment(&self) -> Result<LakeMoment, Error> {
+    pub fn parse_moment(&self) -> Result<LakeMoment, Error> {
         self.at.parse().map_err(|_| not_a_moment(&self.at))
     }
 }

@@ -29,11 +29,11 @@ const FORMS: &str = "COLUMNS('regular expression'), COLUMNS(*), COLUMNS(t.*) or 
 /// Writes out the calls of `COLUMNS` of one select.
 pub(super) struct ColumnsExpansion<'a> {
     /// The columns of FROM.
-    pub(super) schema: &'a DFSchema,
+    pub schema: &'a DFSchema,
     /// The statement's text, for places of errors.
-    pub(super) sql: &'a str,
+    pub sql: &'a str,
     /// Bytes by which the statement may still grow.
-    pub(super) bytes_left: &'a mut usize,
+    pub bytes_left: &'a mut usize,
 }
 
 /// A column that `COLUMNS` chose.
@@ -65,7 +65,7 @@ impl ColumnsExpansion<'_> {
     ///
     /// # Errors
     /// [`Error::Query`] if a column is not there, or too many are.
-    pub(super) fn expand_select(&mut self, select: &mut Select) -> Result<(), Error> {
+    pub fn expand_select(&mut self, select: &mut Select) -> Result<(), Error> {
         let mut projection = Vec::with_capacity(select.projection.len());
         for item in std::mem::take(&mut select.projection) {
             self.expand_item(item, &mut projection)?;

@@ -15,7 +15,7 @@ use super::{SystemRows, build_batch, build_schema, column_field};
 
 #[derive(Debug)]
 pub(super) struct LakeFiles {
-    pub(super) snapshot: Arc<LakeSnapshot>,
+    pub snapshot: Arc<LakeSnapshot>,
 }
 
 /// The columns of the table.

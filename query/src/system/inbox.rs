@@ -32,7 +32,7 @@ const INCOMPLETE: &str = "incomplete";
 
 #[derive(Debug)]
 pub(super) struct LakeInbox {
-    pub(super) lake: Lake,
+    pub lake: Lake,
 }
 
 /// A run file or another entry, and why it is not ingested.

@@ -23,9 +23,9 @@ const OF_RUNS: [&str; 9] =
 
 #[derive(Debug)]
 pub(super) struct LakeIngests {
-    pub(super) lake: Lake,
-    pub(super) snapshot: Arc<LakeSnapshot>,
-    pub(super) runs: Arc<dyn TableProvider>,
+    pub lake: Lake,
+    pub snapshot: Arc<LakeSnapshot>,
+    pub runs: Arc<dyn TableProvider>,
 }
 
 /// The columns of the table, by those of `runs`.

@@ -25,9 +25,9 @@ pub trait SystemSource: std::fmt::Debug + Send + Sync {
 
 #[derive(Debug)]
 pub(super) struct SourceRows {
-    pub(super) source: Arc<dyn SystemSource>,
-    pub(super) name: &'static str,
-    pub(super) schema: SchemaRef,
+    pub source: Arc<dyn SystemSource>,
+    pub name: &'static str,
+    pub schema: SchemaRef,
 }
 
 #[async_trait]

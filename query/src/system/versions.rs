@@ -16,7 +16,7 @@ use super::{SystemRows, build_batch, build_schema, column_field, time_type};
 
 #[derive(Debug)]
 pub(super) struct LakeVersions {
-    pub(super) lake: Lake,
+    pub lake: Lake,
 }
 
 /// The columns of the table.

@@ -25,7 +25,7 @@ pub(crate) struct LazyView(LazyLock<Result<ViewTable>, ViewPlanner>);
 
 impl LazyView {
     /// `tables` are those of [`LakeView::source_tables`].
-    pub(crate) fn new(
+    pub fn new(
         view: LakeView,
         lake: &Lake,
         lookups: &LookupFunctions,

@@ -36,7 +36,7 @@ impl LookupFunctions {
     ///
     /// # Errors
     /// If the rig's pairs cannot be laid out.
-    pub(crate) fn from_lake(lake: &Lake) -> echolake_lake::Result<Self> {
+    pub fn from_lake(lake: &Lake) -> echolake_lake::Result<Self> {
         let pairs = lake.pair_rows()?;
         let columns = pairs.schema();
         let own = columns.fields().iter().zip(pairs.columns()).skip(1);
@@ -48,11 +48,11 @@ impl LookupFunctions {
     }
 
     /// Returns the lookup function of a column of `pairs`.
-    pub(super) fn of_pair(&self, column: &str) -> Option<&Arc<ScalarUDF>> {
+    pub fn of_pair(&self, column: &str) -> Option<&Arc<ScalarUDF>> {
         self.0.iter().find(|function| function.name().strip_prefix(OF_PAIR) == Some(column))
     }
 
-    pub(super) fn register_functions(&self, context: &SessionContext) {
+    pub fn register_functions(&self, context: &SessionContext) {
         for function in &self.0 {
             context.register_udf(function.as_ref().clone());
         }

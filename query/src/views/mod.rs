@@ -71,10 +71,10 @@ pub fn table_meaning(name: &str) -> Option<&'static str> {
 
 impl LakeView {
     /// All views.
-    pub(crate) const ALL: [Self; 4] = [Self::Ir, Self::TnceDb, Self::Augmented, Self::Catalogue];
+    pub const ALL: [Self; 4] = [Self::Ir, Self::TnceDb, Self::Augmented, Self::Catalogue];
 
     /// Returns its name in SQL.
-    pub(crate) fn name(self) -> &'static str {
+    pub fn name(self) -> &'static str {
         match self {
             Self::Ir => "ir",
             Self::TnceDb => "tnce_db",
@@ -93,12 +93,12 @@ impl LakeView {
     }
 
     /// Returns the view with this name.
-    pub(crate) fn by_name(name: &str) -> Option<Self> {
+    pub fn by_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|v| v.name() == name)
     }
 
     /// Returns the tables that it reads.
-    pub(crate) fn source_tables(self) -> &'static [Table] {
+    pub fn source_tables(self) -> &'static [Table] {
         match self {
             Self::Ir => &[Table::Measurements, Table::Nce],
             Self::TnceDb => &[Table::Tnce],
@@ -108,7 +108,7 @@ impl LakeView {
     }
 
     /// Returns its definition over the tables.
-    pub(crate) fn definition_sql(self, lake: &Lake) -> String {
+    pub fn definition_sql(self, lake: &Lake) -> String {
         match self {
             Self::Ir => ir::view_sql(),
             Self::TnceDb => tnce_db::view_sql(lake.rig()),
@@ -131,7 +131,7 @@ impl LakeView {
     ///
     /// # Errors
     /// If the view does not fit the tables, which is a bug in this crate.
-    pub(crate) fn plan_over(
+    pub fn plan_over(
         self,
         lake: &Lake,
         lookups: &LookupFunctions,
@@ -151,7 +151,7 @@ impl LakeView {
     }
 
     /// Returns its schema, which is empty if the view does not fit the lake's tables.
-    pub(crate) fn schema(self, lake: &Lake, lookups: &LookupFunctions) -> SchemaRef {
+    pub fn schema(self, lake: &Lake, lookups: &LookupFunctions) -> SchemaRef {
         let empty = |table: &Table| -> (Table, Arc<dyn TableProvider>) {
             (*table, Arc::new(EmptyTable::new(table.schema(lake.rig()))))
         };

@@ -24,7 +24,7 @@ pub(crate) struct PairJoin(LookupFunctions);
 
 impl PairJoin {
     /// Creates the rule with a lake's lookups.
-    pub(crate) fn new(lookups: &LookupFunctions) -> Self {
+    pub fn new(lookups: &LookupFunctions) -> Self {
         Self(lookups.clone())
     }
 

@@ -26,45 +26,45 @@ impl Column {
         Self { name: name.into(), data_type, nullable: false, unit, comment: comment.into() }
     }
 
-    pub(super) fn text(name: &str, comment: &str) -> Self {
+    pub fn text(name: &str, comment: &str) -> Self {
         Self::new(name, DataType::Utf8, "", comment)
     }
 
-    pub(super) fn flag(name: &str, comment: &str) -> Self {
+    pub fn flag(name: &str, comment: &str) -> Self {
         Self::new(name, DataType::Boolean, "", comment)
     }
 
-    pub(super) fn int(name: &str, unit: &'static str, comment: &str) -> Self {
+    pub fn int(name: &str, unit: &'static str, comment: &str) -> Self {
         Self::new(name, DataType::Int32, unit, comment)
     }
 
-    pub(super) fn long(name: &str, unit: &'static str, comment: &str) -> Self {
+    pub fn long(name: &str, unit: &'static str, comment: &str) -> Self {
         Self::new(name, DataType::Int64, unit, comment)
     }
 
-    pub(super) fn float(name: impl Into<String>, unit: &'static str, comment: impl Into<String>) -> Self {
+    pub fn float(name: impl Into<String>, unit: &'static str, comment: impl Into<String>) -> Self {
         Self::new(name, DataType::Float32, unit, comment)
     }
 
-    pub(super) fn double(name: impl Into<String>, unit: &'static str, comment: impl Into<String>) -> Self {
+    pub fn double(name: impl Into<String>, unit: &'static str, comment: impl Into<String>) -> Self {
         Self::new(name, DataType::Float64, unit, comment)
     }
 
-    pub(super) fn time(name: &str, comment: &str) -> Self {
+    pub fn time(name: &str, comment: &str) -> Self {
         Self::new(name, DataType::Timestamp(TimeUnit::Microsecond, Some("UTC".into())), "", comment)
     }
 
-    pub(super) fn floats(name: impl Into<String>, unit: &'static str, comment: impl Into<String>) -> Self {
+    pub fn floats(name: impl Into<String>, unit: &'static str, comment: impl Into<String>) -> Self {
         let child = Field::new(LIST_CHILD, DataType::Float32, false);
         Self::new(name, DataType::List(Arc::new(child)), unit, comment)
     }
 
-    pub(super) fn or_null(mut self) -> Self {
+    pub fn or_null(mut self) -> Self {
         self.nullable = true;
         self
     }
 
-    pub(super) fn into_field(self) -> Field {
+    pub fn into_field(self) -> Field {
         let metadata = HashMap::from([(UNIT.to_owned(), self.unit.to_owned()), (COMMENT.to_owned(), self.comment)]);
         Field::new(self.name, self.data_type, self.nullable).with_metadata(metadata)
     }

@@ -29,7 +29,7 @@ impl BrowserSessions {
     ///
     /// # Errors
     /// The system gives no random bytes.
-    pub(crate) fn begin_session(&self, holder: [u8; 32]) -> io::Result<String> {
+    pub fn begin_session(&self, holder: [u8; 32]) -> io::Result<String> {
         let mut random = [0; 32];
         getrandom::fill(&mut random)?;
         let secret = hex::encode(random);
@@ -43,7 +43,7 @@ impl BrowserSessions {
     }
 
     /// Returns the hash of the token of the session with this secret.
-    pub(crate) fn find_holder(&self, secret: &str) -> Option<[u8; 32]> {
+    pub fn find_holder(&self, secret: &str) -> Option<[u8; 32]> {
         let hash: [u8; 32] = Sha256::digest(secret).into();
         let sessions = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         sessions.iter().find(|s| s.hash == hash && s.begun.elapsed() < LIFETIME).map(|s| s.holder)

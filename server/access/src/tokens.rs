@@ -25,16 +25,16 @@ pub struct TokenFile {
 
 /// A line of a token.
 pub(crate) struct TokenEntry {
-    pub(crate) client: Arc<ClientIdentity>,
+    pub client: Arc<ClientIdentity>,
     hash: [u8; 32],
     /// For logins that do not send the token; a line from an older version has none.
-    pub(crate) scram: Option<Arc<ScramVerifier>>,
+    pub scram: Option<Arc<ScramVerifier>>,
     expires: Option<DateTime<Utc>>,
 }
 
 impl TokenEntry {
     /// Returns whether it has not expired.
-    pub(crate) fn is_valid(&self) -> bool {
+    pub fn is_valid(&self) -> bool {
         self.expires.is_none_or(|expires| Utc::now() < expires)
     }
 }

@@ -26,7 +26,7 @@ pub(super) type FlightStream = Pin<Box<dyn Stream<Item = Result<FlightData, Stat
 
 /// Encodes rows with the columns that were announced: the plan's, which may differ from those of its run in
 /// nullability.
-pub(super) struct AnnouncedColumns(pub(super) SchemaRef);
+pub(super) struct AnnouncedColumns(pub SchemaRef);
 
 impl AnswerEncoder for AnnouncedColumns {
     type Item = RecordBatch;

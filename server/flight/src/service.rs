@@ -53,7 +53,7 @@ pub(super) struct LakeFlightService {
 }
 
 impl LakeFlightService {
-    pub(super) fn new(service: QueryService) -> Result<Self, FlightError> {
+    pub fn new(service: QueryService) -> Result<Self, FlightError> {
         Ok(Self {
             service,
             statements: HeldStatements::default(),

@@ -25,15 +25,15 @@ type StatementHandle = [u8; 16];
 #[derive(Clone)]
 pub(super) struct HeldStatement {
     /// The session it was planned in; its client owns the handle.
-    pub(super) session: Arc<Session>,
-    pub(super) sql: Arc<str>,
-    pub(super) prepared: Arc<PreparedQuery>,
+    pub session: Arc<Session>,
+    pub sql: Arc<str>,
+    pub prepared: Arc<PreparedQuery>,
     /// Columns as they were announced to the client.
-    pub(super) schema: SchemaRef,
+    pub schema: SchemaRef,
     /// Values of its placeholders.
-    pub(super) values: ParamValues,
+    pub values: ParamValues,
     /// Ends its run.
-    pub(super) stop: StopSignal,
+    pub stop: StopSignal,
 }
 
 /// The statements of all clients.
@@ -47,7 +47,7 @@ struct StatementEntry {
 
 impl HeldStatements {
     /// Keeps a statement.
-    pub(super) fn keep_statement(&self, statement: HeldStatement) -> Result<Bytes, RequestFault> {
+    pub fn keep_statement(&self, statement: HeldStatement) -> Result<Bytes, RequestFault> {
         let mut handle = StatementHandle::default();
         getrandom::fill(&mut handle).map_err(RequestFault::defect("no random bytes"))?;
         let sql = Some(statement.sql.clone()).filter(|sql| sql.len() <= CARRIED_BYTES);
@@ -57,14 +57,14 @@ impl HeldStatements {
     }
 
     /// Keeps a statement under a handle that another engine made.
-    pub(super) fn keep_as(&self, handle: &[u8], statement: HeldStatement) -> Result<(), RequestFault> {
+    pub fn keep_as(&self, handle: &[u8], statement: HeldStatement) -> Result<(), RequestFault> {
         let (handle, _) = handle.split_first_chunk().ok_or_else(missing_statement)?;
         self.insert(*handle, statement);
         Ok(())
     }
 
     /// The text that a handle carries.
-    pub(super) fn carried_text(handle: &[u8]) -> Option<String> {
+    pub fn carried_text(handle: &[u8]) -> Option<String> {
         let (_, sql) = handle.split_first_chunk::<{ size_of::<StatementHandle>() }>()?;
         String::from_utf8(sql.to_vec()).ok().filter(|sql| !sql.is_empty())
     }
@@ -86,17 +86,17 @@ impl HeldStatements {
     }
 
     /// The statement of a client's handle.
-    pub(super) fn find_statement(&self, client: &str, handle: &[u8]) -> Result<HeldStatement, RequestFault> {
+    pub fn find_statement(&self, client: &str, handle: &[u8]) -> Result<HeldStatement, RequestFault> {
         self.with_entry(client, handle, |kept| kept.statement.clone())
     }
 
     /// Sets the values of its placeholders.
-    pub(super) fn bind_values(&self, client: &str, handle: &[u8], values: ParamValues) -> Result<(), RequestFault> {
+    pub fn bind_values(&self, client: &str, handle: &[u8], values: ParamValues) -> Result<(), RequestFault> {
         self.with_entry(client, handle, |kept| kept.statement.values = values)
     }
 
     /// Forgets it; a running query continues.
-    pub(super) fn forget_statement(&self, client: &str, handle: &[u8]) {
+    pub fn forget_statement(&self, client: &str, handle: &[u8]) {
         if self.find_statement(client, handle).is_ok() {
             self.lock_statements().retain(|known, _| !handle.starts_with(known));
         }

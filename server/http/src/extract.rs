@@ -19,7 +19,7 @@ use super::problem::ProblemResponse;
 const LIST_FOUND: &str = "unsupported value";
 
 /// The named parts of a path.
-pub(super) struct PathParams<T>(pub(super) T);
+pub(super) struct PathParams<T>(pub T);
 
 impl<S: Send + Sync, T: DeserializeOwned + Send> FromRequestParts<S> for PathParams<T> {
     type Rejection = ProblemResponse;
@@ -33,7 +33,7 @@ impl<S: Send + Sync, T: DeserializeOwned + Send> FromRequestParts<S> for PathPar
 
 /// The parameters after the path's `?`. A field that is a list has all values of its name; another name may be there
 /// once.
-pub(super) struct QueryParams<T>(pub(super) T);
+pub(super) struct QueryParams<T>(pub T);
 
 impl<S: Send + Sync, T: DeserializeOwned> FromRequestParts<S> for QueryParams<T> {
     type Rejection = ProblemResponse;
@@ -78,7 +78,7 @@ pub(super) struct WholeNumber<const LOW: usize, const HIGH: usize, const DEFAULT
 
 impl<const LOW: usize, const HIGH: usize, const DEFAULT: usize> WholeNumber<LOW, HIGH, DEFAULT> {
     /// Returns the number.
-    pub(super) fn get(self) -> usize {
+    pub fn get(self) -> usize {
         self.0
     }
 }
@@ -120,14 +120,14 @@ pub(super) fn parse_whole(text: &str, bounds: RangeInclusive<usize>) -> Result<u
 
 /// A range of numbers, written `lo..hi`.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct NumberRange(pub(super) RangeInclusive<f64>);
+pub(super) struct NumberRange(pub RangeInclusive<f64>);
 
 impl NumberRange {
     /// Reads `lo..hi`.
     ///
     /// # Errors
     /// The text, and what is allowed.
-    pub(super) fn parse(text: &str) -> Result<Self, String> {
+    pub fn parse(text: &str) -> Result<Self, String> {
         let number = |text: &str| text.parse::<f64>().ok().filter(|n| n.is_finite());
         let bounds = text.split_once("..").and_then(|(low, high)| Some(number(low)?..=number(high)?));
         let bounds = bounds.filter(|b| b.start() <= b.end());

@@ -101,7 +101,7 @@ impl Write for SharedBuffer {
 
 impl FormatEncoder {
     /// Begins an answer of this schema.
-    pub(super) fn new(format: AnswerFormat, schema: &SchemaRef) -> Result<Self, RequestFault> {
+    pub fn new(format: AnswerFormat, schema: &SchemaRef) -> Result<Self, RequestFault> {
         let written = SharedBuffer::default();
         Ok(Self { writer: AnswerWriter::new(format, schema, written.clone())?, written })
     }

@@ -24,7 +24,7 @@ const ORIGIN_SCHEMES: [&str; 2] = ["http://", "https://"];
 const FETCH_SITE: HeaderName = HeaderName::from_static("sec-fetch-site");
 
 /// A client that is authorised for SQL.
-pub(super) struct MayQuery(pub(super) Arc<EngineClient>);
+pub(super) struct MayQuery(pub Arc<EngineClient>);
 
 /// The origin of a request, according to its headers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -44,10 +44,10 @@ pub(super) fn needs_length(method: &Method, headers: &HeaderMap) -> bool {
 
 /// A file that never changes, as its answers describe it.
 pub(super) struct FileDescription {
-    pub(super) etag: String,
-    pub(super) media_type: &'static str,
+    pub etag: String,
+    pub media_type: &'static str,
     /// The origins that may embed it, as `Cross-Origin-Resource-Policy` has them.
-    pub(super) policy: &'static str,
+    pub policy: &'static str,
 }
 
 /// The kind of answer to a request.
@@ -60,14 +60,14 @@ pub(super) enum RangeAnswer {
 
 /// Bytes of a file.
 pub(super) struct FilePart {
-    pub(super) range: Range<u64>,
+    pub range: Range<u64>,
     /// The file's length, if these are not all of its bytes.
     of: Option<u64>,
 }
 
 impl FileDescription {
     /// Determines the answer to a request, for a file of `bytes` bytes.
-    pub(super) fn range_answer(&self, headers: &HeaderMap, bytes: u64) -> RangeAnswer {
+    pub fn range_answer(&self, headers: &HeaderMap, bytes: u64) -> RangeAnswer {
         if let Some(instead) = self.condition_answer(headers) {
             return RangeAnswer::Answer(instead);
         }
@@ -79,7 +79,7 @@ impl FileDescription {
     }
 
     /// Returns the answer to a client that has this version already, 304, or that wants another one, 412.
-    pub(super) fn condition_answer(&self, headers: &HeaderMap) -> Option<Response> {
+    pub fn condition_answer(&self, headers: &HeaderMap) -> Option<Response> {
         let outcome = ConditionOutcome::new(headers, &self.etag);
         let mut response = outcome.early_response(&self.etag, ())?;
         if outcome == ConditionOutcome::NotModified {
@@ -90,7 +90,7 @@ impl FileDescription {
     }
 
     /// Bytes as they were asked for.
-    pub(super) fn part_response(&self, part: &FilePart, body: Body) -> Response {
+    pub fn part_response(&self, part: &FilePart, body: Body) -> Response {
         let status = if part.of.is_some() { StatusCode::PARTIAL_CONTENT } else { StatusCode::OK };
         let mut response = self.with_headers((status, body).into_response());
         let (out, range) = (response.headers_mut(), &part.range);
@@ -102,7 +102,7 @@ impl FileDescription {
     }
 
     /// All bytes, as they come.
-    pub(super) fn stream_response(&self, body: Body) -> Response {
+    pub fn stream_response(&self, body: Body) -> Response {
         self.with_headers(body.into_response())
     }
 

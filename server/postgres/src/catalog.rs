@@ -53,7 +53,7 @@ pub(super) struct PgCatalog {
 
 impl PgCatalog {
     /// For a lake's tables, views and functions.
-    pub(super) fn new(service: &QueryService) -> Result<Self, Error> {
+    pub fn new(service: &QueryService) -> Result<Self, Error> {
         let own_functions = service.own_functions();
         let library = Arc::new(PgCatalogStaticTables::try_new()?);
         let types = read_numbers(library.pg_type.data(), "typname")?;
@@ -111,12 +111,12 @@ impl PgCatalog {
     }
 
     /// Returns what has no rows.
-    pub(super) fn empty_relations(&self) -> &EmptyRelations {
+    pub fn empty_relations(&self) -> &EmptyRelations {
         &self.empty
     }
 
     /// Makes what extends the session of this number and these settings.
-    pub(super) fn session_extension(&self, pid: i32, settings: &Arc<SessionSettings>) -> ContextExtension {
+    pub fn session_extension(&self, pid: i32, settings: &Arc<SessionSettings>) -> ContextExtension {
         let catalog = self.clone();
         let own = functions::of_session(pid, settings);
         let schema = Arc::new(CatalogSchema {

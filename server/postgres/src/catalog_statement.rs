@@ -142,12 +142,12 @@ pub(super) struct EmptyRelations {
     /// Columns of lists, which are NULL in all rows. A column of `pg_catalog` has its table in its name.
     lists: HashSet<String>,
     /// Functions that give rows in Postgres, and are tables here.
-    pub(super) calls: HashSet<String>,
+    pub calls: HashSet<String>,
 }
 
 impl EmptyRelations {
     /// Adds what of a table is empty.
-    pub(super) fn add_table(&mut self, table: &str, batches: &[RecordBatch]) {
+    pub fn add_table(&mut self, table: &str, batches: &[RecordBatch]) {
         if batches.iter().all(|batch| batch.num_rows() == 0) {
             self.tables.insert(table.to_owned());
         }

@@ -71,8 +71,8 @@ pub(super) type CatalogComments = HashMap<(i32, i32), String>;
 /// The definition of a table.
 #[derive(Debug)]
 pub(super) struct TableDefinition {
-    pub(super) schema: &'static str,
-    pub(super) name: &'static str,
+    pub schema: &'static str,
+    pub name: &'static str,
     /// What has a row in it.
     source: &'static str,
     columns: Vec<ColumnDefinition>,
@@ -100,12 +100,12 @@ pub(super) fn read_definitions() -> Vec<TableDefinition> {
 
 impl TableDefinition {
     /// Returns whether its rows differ from session to session.
-    pub(super) fn is_of_session(&self) -> bool {
+    pub fn is_of_session(&self) -> bool {
         ["setting", "session"].contains(&self.source)
     }
 
     /// Returns whether it is a function in Postgres.
-    pub(super) fn is_call(&self) -> bool {
+    pub fn is_call(&self) -> bool {
         self.source == CALL
     }
 
@@ -117,7 +117,7 @@ impl TableDefinition {
     ///
     /// # Errors
     /// If a value is not of its column's type.
-    pub(super) fn make_rows(&self, sources: &[RowValues]) -> Result<RecordBatch> {
+    pub fn make_rows(&self, sources: &[RowValues]) -> Result<RecordBatch> {
         let columns = self.columns.iter().map(|column| column.make_values(sources)).collect::<Result<_>>()?;
         Ok(RecordBatch::try_new(self.arrow_schema(), columns)?)
     }
@@ -126,7 +126,7 @@ impl TableDefinition {
     ///
     /// # Errors
     /// As [`Self::make_rows`].
-    pub(super) fn make_session_rows(&self, pid: i32, settings: &[(&'static str, String)]) -> Result<RecordBatch> {
+    pub fn make_session_rows(&self, pid: i32, settings: &[(&'static str, String)]) -> Result<RecordBatch> {
         if self.source == "setting" {
             let settings =
                 settings.iter().map(|(name, value)| [("setting", (*name).to_owned()), ("value", value.clone())]);
@@ -210,7 +210,7 @@ pub(super) struct CatalogRelations(Vec<CatalogRelation>);
 
 impl CatalogRelations {
     /// Of the lake's tables and views, the system tables, those of the definitions, and the fixed ones of `pg_catalog`.
-    pub(super) fn new(
+    pub fn new(
         service: &QueryService,
         definitions: &[TableDefinition],
         fixed: Vec<(String, SchemaRef)>,
@@ -244,12 +244,12 @@ impl CatalogRelations {
     }
 
     /// Returns definitions of views by their numbers.
-    pub(super) fn view_definitions(&self) -> HashMap<i32, String> {
+    pub fn view_definitions(&self) -> HashMap<i32, String> {
         self.0.iter().filter_map(|of| Some((of.number, of.definition.clone()?))).collect()
     }
 
     /// Returns numbers of tables by name, and by schema and name.
-    pub(super) fn table_numbers(&self) -> HashMap<String, i32> {
+    pub fn table_numbers(&self) -> HashMap<String, i32> {
         let mut numbers = HashMap::new();
         // A name without a schema is the lake's, then that of `pg_catalog`.
         for of in self.0.iter().rev() {
@@ -262,7 +262,7 @@ impl CatalogRelations {
     }
 
     /// Returns comments of the lake's tables and their columns.
-    pub(super) fn all_comments(&self) -> CatalogComments {
+    pub fn all_comments(&self) -> CatalogComments {
         let mut comments = CatalogComments::new();
         for of in self.0.iter().filter(|of| of.is_own()) {
             let name = if of.namespace.0 == PUBLIC { of.name.clone() } else { format!("{SYSTEM_SCHEMA}.{}", of.name) };
@@ -278,7 +278,7 @@ impl CatalogRelations {
     ///
     /// # Errors
     /// As [`TableDefinition::make_rows`].
-    pub(super) fn make_rows(&self, definition: &TableDefinition) -> Result<RecordBatch> {
+    pub fn make_rows(&self, definition: &TableDefinition) -> Result<RecordBatch> {
         let all = self.0.iter();
         let sources: Vec<RowValues> = match definition.source {
             "relation" => all.map(CatalogRelation::row_values).collect(),

@@ -30,22 +30,22 @@ type BackendKey = (i32, Bytes);
 
 /// State shared by all connections.
 pub(super) struct PostgresState {
-    pub(super) service: QueryService,
-    pub(super) parser: PostgresCompatibilityParser,
-    pub(super) catalog: PgCatalog,
+    pub service: QueryService,
+    pub parser: PostgresCompatibilityParser,
+    pub catalog: PgCatalog,
     next_pid: AtomicI32,
     running: Mutex<HashMap<BackendKey, Arc<Mutex<StopSignal>>>>,
 }
 
 impl PostgresState {
-    pub(super) fn new(service: QueryService) -> Result<Self, Error> {
+    pub fn new(service: QueryService) -> Result<Self, Error> {
         let catalog = PgCatalog::new(&service)?;
         let parser = PostgresCompatibilityParser::new();
         Ok(Self { service, parser, catalog, next_pid: AtomicI32::new(1), running: Mutex::default() })
     }
 
     /// Cancels the query on the connection of this key.
-    pub(super) fn cancel_query(&self, pid: i32, key: &SecretKey) {
+    pub fn cancel_query(&self, pid: i32, key: &SecretKey) {
         let found = lock_mutex(&self.running).get(&(pid, key.to_bytes())).cloned();
         if let Some(current) = found {
             lock_mutex(&current).stop();
@@ -60,7 +60,7 @@ pub(super) struct PostgresConnection {
     key: OnceLock<BackendKey>,
     current: Arc<Mutex<StopSignal>>,
     cursors: Mutex<HashMap<String, Arc<QueryCursor>>>,
-    pub(super) settings: Arc<SessionSettings>,
+    pub settings: Arc<SessionSettings>,
 }
 
 impl Drop for PostgresConnection {
@@ -73,7 +73,7 @@ impl Drop for PostgresConnection {
 
 impl PostgresConnection {
     /// A connection without a login.
-    pub(super) fn new(shared: Arc<PostgresState>) -> Self {
+    pub fn new(shared: Arc<PostgresState>) -> Self {
         Self {
             shared,
             session: SetOnce::new(),
@@ -84,13 +84,13 @@ impl PostgresConnection {
         }
     }
 
-    pub(super) fn shared(&self) -> &PostgresState {
+    pub fn shared(&self) -> &PostgresState {
         &self.shared
     }
 
     /// Logs a client in, whose connection has a number if the door gave one; returns what a CancelRequest must show.
     /// `wide` keys are of protocol 3.2.
-    pub(super) fn log_in(
+    pub fn log_in(
         &self,
         client: &Arc<EngineClient>,
         pid: Option<i32>,
@@ -117,24 +117,24 @@ impl PostgresConnection {
     }
 
     /// Its session.
-    pub(super) fn session(&self) -> Result<&Arc<Session>, RequestFault> {
+    pub fn session(&self) -> Result<&Arc<Session>, RequestFault> {
         self.session.get().ok_or(RequestFault::Unauthenticated)
     }
 
     /// Waits for the login.
-    pub(super) async fn logged_in(&self) {
+    pub async fn logged_in(&self) {
         self.session.wait().await;
     }
 
     /// Begins a command: a CancelRequest ends this one from now on.
-    pub(super) fn begin_command(&self) -> CommandRun {
+    pub fn begin_command(&self) -> CommandRun {
         let stop = StopSignal::new();
         *lock_mutex(&self.current) = stop.clone();
         CommandRun { stop, limit: self.settings.statement_timeout().map(SessionTimeLimit::from_now) }
     }
 
     /// Parses and plans. Boxed for the same reason as [`echolake_query::OpaqueValue`].
-    pub(super) fn plan_statements<'a>(
+    pub fn plan_statements<'a>(
         &'a self,
         sql: &'a str,
         run: &'a CommandRun,
@@ -171,7 +171,7 @@ impl PostgresConnection {
     }
 
     /// Runs a planned statement; plans it again if the lake has changed since.
-    pub(super) async fn run_planned<E: AnswerEncoder>(
+    pub async fn run_planned<E: AnswerEncoder>(
         &self,
         run: &CommandRun,
         planned: &Arc<PlannedQuery>,
@@ -195,7 +195,7 @@ impl PostgresConnection {
     }
 
     /// Keeps a cursor.
-    pub(super) fn declare_cursor(&self, name: &str, cursor: QueryCursor) -> Result<(), RequestFault> {
+    pub fn declare_cursor(&self, name: &str, cursor: QueryCursor) -> Result<(), RequestFault> {
         let mut cursors = lock_mutex(&self.cursors);
         if cursors.contains_key(name) {
             return Err(RequestFault::bad_request(format!("cursor \"{name}\" already exists")));
@@ -208,13 +208,13 @@ impl PostgresConnection {
     }
 
     /// A cursor.
-    pub(super) fn find_cursor(&self, name: &str) -> Result<Arc<QueryCursor>, RequestFault> {
+    pub fn find_cursor(&self, name: &str) -> Result<Arc<QueryCursor>, RequestFault> {
         let missing = || RequestFault::NotFound { what: format!("cursor \"{name}\""), hint: "DECLARE it first" };
         lock_mutex(&self.cursors).get(name).cloned().ok_or_else(missing)
     }
 
     /// Closes a cursor, or all of them.
-    pub(super) fn close_cursors(&self, name: Option<&str>) -> Result<(), RequestFault> {
+    pub fn close_cursors(&self, name: Option<&str>) -> Result<(), RequestFault> {
         match name {
             Some(name) => {
                 self.find_cursor(name)?;
@@ -226,7 +226,7 @@ impl PostgresConnection {
     }
 
     /// Ends a transaction: the cursors go that are not held.
-    pub(super) fn end_transaction(&self) {
+    pub fn end_transaction(&self) {
         lock_mutex(&self.cursors).retain(|_, cursor| cursor.held);
     }
 }

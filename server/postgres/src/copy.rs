@@ -172,7 +172,7 @@ pub(super) struct CopyRowEncoder {
 
 impl CopyRowEncoder {
     /// For an answer of these columns.
-    pub(super) fn new(schema: &SchemaRef, form: &CopyForm) -> Result<Self, RequestFault> {
+    pub fn new(schema: &SchemaRef, form: &CopyForm) -> Result<Self, RequestFault> {
         let fields = column_fields(schema, &form.value_format())?;
         Ok(Self { encoder: form.make_encoder(fields.clone()), fields })
     }

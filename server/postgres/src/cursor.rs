@@ -19,16 +19,16 @@ use super::sqlstate::failure;
 /// Stop signal and time limit of a command.
 #[derive(Clone)]
 pub(super) struct CommandRun {
-    pub(super) stop: StopSignal,
-    pub(super) limit: Option<SessionTimeLimit>,
+    pub stop: StopSignal,
+    pub limit: Option<SessionTimeLimit>,
 }
 
 /// A cursor.
 pub(super) struct QueryCursor {
     /// Its columns.
-    pub(super) schema: SchemaRef,
+    pub schema: SchemaRef,
     /// True if it outlives its transaction (WITH HOLD).
-    pub(super) held: bool,
+    pub held: bool,
     rows: Arc<Mutex<RemainingRows>>,
 }
 
@@ -60,13 +60,13 @@ impl RemainingRows {
 }
 
 impl QueryCursor {
-    pub(super) fn new(running: RunningQuery<RecordBatch>, held: bool) -> Self {
+    pub fn new(running: RunningQuery<RecordBatch>, held: bool) -> Self {
         let schema = running.schema.clone();
         Self { schema, held, rows: Arc::new(Mutex::new(RemainingRows { running, begun: None })) }
     }
 
     /// The next rows; None for all.
-    pub(super) async fn fetch_rows(
+    pub async fn fetch_rows(
         &self,
         count: Option<u64>,
         run: &CommandRun,

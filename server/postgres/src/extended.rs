@@ -36,7 +36,7 @@ pub(super) struct ExtendedQueries {
 }
 
 impl ExtendedQueries {
-    pub(super) fn new(connection: Arc<PostgresConnection>) -> Self {
+    pub fn new(connection: Arc<PostgresConnection>) -> Self {
         Self { parser: Arc::new(StatementPlanner(connection.clone())), connection }
     }
 }

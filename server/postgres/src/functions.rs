@@ -238,15 +238,15 @@ pub(super) fn fixed_functions() -> Vec<Arc<ScalarUDF>> {
 
 /// What the catalogue's numbers stand for.
 pub(super) struct CatalogNumbers {
-    pub(super) types: HashMap<String, i32>,
-    pub(super) procedures: HashMap<String, i32>,
-    pub(super) relations: HashMap<String, i32>,
-    pub(super) schemas: HashMap<String, i32>,
+    pub types: HashMap<String, i32>,
+    pub procedures: HashMap<String, i32>,
+    pub relations: HashMap<String, i32>,
+    pub schemas: HashMap<String, i32>,
     /// Arguments and results of functions.
-    pub(super) signatures: HashMap<i32, (String, String)>,
-    pub(super) comments: CatalogComments,
+    pub signatures: HashMap<i32, (String, String)>,
+    pub comments: CatalogComments,
     /// Definitions of views.
-    pub(super) definitions: HashMap<i32, String>,
+    pub definitions: HashMap<i32, String>,
 }
 
 /// Makes the functions that look something up in the catalogue: NULL if it is not there.

@@ -80,12 +80,12 @@ pub(super) struct RowEncoder(Arc<Vec<FieldInfo>>);
 
 impl RowEncoder {
     /// For an answer of these columns.
-    pub(super) fn new(schema: &SchemaRef, format: &Format) -> Result<Self, RequestFault> {
+    pub fn new(schema: &SchemaRef, format: &Format) -> Result<Self, RequestFault> {
         Ok(Self(column_fields(schema, format)?))
     }
 
     /// The rows of a batch.
-    pub(super) fn encode_rows(&self, batch: RecordBatch) -> Result<Vec<DataRow>, RequestFault> {
+    pub fn encode_rows(&self, batch: RecordBatch) -> Result<Vec<DataRow>, RequestFault> {
         let batch = sent_columns(&self.0, batch)?;
         let rows: PgWireResult<Vec<_>> = encode_recordbatch(self.0.clone(), batch).collect();
         rows.map_err(|e| encoding_fault(&e))

@@ -76,7 +76,7 @@ pub(super) struct SessionSettings(Mutex<BTreeMap<&'static str, String>>);
 
 impl SessionSettings {
     /// Sets one.
-    pub(super) fn set_value(&self, name: &str, value: &str) -> Result<(), RequestFault> {
+    pub fn set_value(&self, name: &str, value: &str) -> Result<(), RequestFault> {
         let (name, _, may) = find_setting(name)?;
         let value = value.trim();
         let allowed = match may {
@@ -96,25 +96,25 @@ impl SessionSettings {
     }
 
     /// Stores the user name, as the client gave it at login.
-    pub(super) fn set_user(&self, user: &str) {
+    pub fn set_user(&self, user: &str) {
         let user = user.chars().take(LONGEST).collect();
         self.0.lock().unwrap_or_else(PoisonError::into_inner).insert("session_authorization", user);
     }
 
     /// One of them.
-    pub(super) fn get(&self, name: &str) -> Result<String, RequestFault> {
+    pub fn get(&self, name: &str) -> Result<String, RequestFault> {
         let (name, value, _) = find_setting(name)?;
         let set = self.0.lock().unwrap_or_else(PoisonError::into_inner).get(name).cloned();
         Ok(set.unwrap_or_else(|| value.to_owned()))
     }
 
     /// All of them.
-    pub(super) fn all_values(&self) -> Vec<(&'static str, String)> {
+    pub fn all_values(&self) -> Vec<(&'static str, String)> {
         KNOWN.iter().map(|(name, value, _)| (*name, self.get(name).unwrap_or_else(|_| (*value).to_owned()))).collect()
     }
 
     /// One as it was at first, or all of them.
-    pub(super) fn reset_values(&self, name: Option<&str>) -> Result<(), RequestFault> {
+    pub fn reset_values(&self, name: Option<&str>) -> Result<(), RequestFault> {
         let name = name.map(find_setting).transpose()?.map(|(name, ..)| name);
         let keeps = |known: &&str| *known == "session_authorization" || name.is_some_and(|n| n != *known);
         self.0.lock().unwrap_or_else(PoisonError::into_inner).retain(|known, _| keeps(known));
@@ -122,7 +122,7 @@ impl SessionSettings {
     }
 
     /// The session's own limit of a query's time.
-    pub(super) fn statement_timeout(&self) -> Option<Duration> {
+    pub fn statement_timeout(&self) -> Option<Duration> {
         self.get("statement_timeout").ok().and_then(|v| parse_duration(&v)).filter(|t| !t.is_zero())
     }
 }

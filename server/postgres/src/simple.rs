@@ -21,7 +21,7 @@ use super::connection::PostgresConnection;
 use super::sqlstate::failure;
 
 /// Answers simple queries.
-pub(super) struct SimpleQueries(pub(super) Arc<PostgresConnection>);
+pub(super) struct SimpleQueries(pub Arc<PostgresConnection>);
 
 #[async_trait]
 impl SimpleQueryHandler for SimpleQueries {

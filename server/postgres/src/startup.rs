@@ -20,7 +20,7 @@ use super::settings::VERSION;
 use super::sqlstate::fatal_error;
 
 /// Logs in.
-pub(super) struct LoginHandler(pub(super) Arc<PostgresConnection>);
+pub(super) struct LoginHandler(pub Arc<PostgresConnection>);
 
 #[async_trait]
 impl StartupHandler for LoginHandler {

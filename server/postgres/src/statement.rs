@@ -25,7 +25,7 @@ const ROLLBACK: &str = "rollback";
 
 /// A planned query.
 pub(super) struct PlannedQuery {
-    pub(super) prepared: Arc<PreparedQuery>,
+    pub prepared: Arc<PreparedQuery>,
     statement: OpaqueValue<Parsed>,
     sql: Arc<str>,
 }
@@ -37,7 +37,7 @@ impl PlannedQuery {
     }
 
     /// Its plan on the present lake: the first one, or another if the lake has changed since.
-    pub(super) async fn current_plan(&self, session: &Session) -> Result<Arc<PreparedQuery>, QueryError> {
+    pub async fn current_plan(&self, session: &Session) -> Result<Arc<PreparedQuery>, QueryError> {
         if session.is_current(&self.prepared).await? {
             return Ok(self.prepared.clone());
         }

@@ -31,7 +31,7 @@ pub(crate) struct DoorRows {
 
 impl DoorRows {
     /// Takes the door's answer.
-    pub(crate) fn take_answer(&self, number: u64, rows: ActivityRows) {
+    pub fn take_answer(&self, number: u64, rows: ActivityRows) {
         if let Some(waiting) = self.lock_waiting().remove(&number) {
             // Who asked may be gone.
             let _ = waiting.send(rows);

@@ -49,12 +49,12 @@ pub struct QueryTimer {
 
 impl RunningWatches {
     /// Logs queries from `slow` on.
-    pub(crate) fn new(slow: Option<Duration>) -> Self {
+    pub fn new(slow: Option<Duration>) -> Self {
         Self { slow, ..Self::default() }
     }
 
     /// Watches a query that begins, until the timer is dropped.
-    pub(crate) fn begin_watch(
+    pub fn begin_watch(
         self: &Arc<Self>,
         protocol: ServerProtocol,
         statement: &str,
@@ -79,7 +79,7 @@ impl RunningWatches {
     }
 
     /// Cancels a query, if it runs.
-    pub(crate) fn cancel_query(&self, number: u64) {
+    pub fn cancel_query(&self, number: u64) {
         if let Some(stop) = self.lock_running().get(&number) {
             stop.stop();
         }

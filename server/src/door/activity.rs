@@ -13,9 +13,9 @@ use crate::metrics::ServerMetrics;
 
 /// The door's knowledge of the server.
 pub(crate) struct ServerActivity {
-    pub(crate) metrics: ServerMetrics,
-    pub(crate) queries: QueryLog,
-    pub(crate) connections: OpenConnections,
+    pub metrics: ServerMetrics,
+    pub queries: QueryLog,
+    pub connections: OpenConnections,
     lake: Mutex<Option<(Instant, Option<LakeFigures>)>>,
     started: DateTime<Utc>,
 }
@@ -25,7 +25,7 @@ impl ServerActivity {
     ///
     /// # Errors
     /// [`Error::System`], which is a defect.
-    pub(crate) fn new() -> Result<Self, Error> {
+    pub fn new() -> Result<Self, Error> {
         Ok(Self {
             metrics: ServerMetrics::new().map_err(|e| Error::System(std::io::Error::other(e)))?,
             queries: QueryLog::default(),
@@ -36,29 +36,29 @@ impl ServerActivity {
     }
 
     /// Returns when the server started.
-    pub(crate) fn start_time(&self) -> DateTime<Utc> {
+    pub fn start_time(&self) -> DateTime<Utc> {
         self.started
     }
 
     /// Takes what an engine found in the lake.
-    pub(crate) fn set_lake(&self, figures: Option<LakeFigures>) {
+    pub fn set_lake(&self, figures: Option<LakeFigures>) {
         *self.lake.lock().unwrap_or_else(PoisonError::into_inner) = Some((Instant::now(), figures));
     }
 
     /// Returns what an engine last found in the lake, and when; None if the lake could not be read, or nobody has looked
     /// yet.
-    pub(crate) fn lake_figures(&self) -> Option<(Instant, LakeFigures)> {
+    pub fn lake_figures(&self) -> Option<(Instant, LakeFigures)> {
         let (at, figures) = (*self.lake.lock().unwrap_or_else(PoisonError::into_inner))?;
         Some((at, figures?))
     }
 
     /// Returns whether the last engine that looked could not read the lake.
-    pub(crate) fn is_lake_unreadable(&self) -> bool {
+    pub fn is_lake_unreadable(&self) -> bool {
         matches!(*self.lake.lock().unwrap_or_else(PoisonError::into_inner), Some((_, None)))
     }
 
     /// The rows of a table that a client may see: its own, or all if it may see the server's figures.
-    pub(crate) fn visible_rows(&self, table: ActivityTable, client: &ClientIdentity) -> ActivityRows {
+    pub fn visible_rows(&self, table: ActivityTable, client: &ClientIdentity) -> ActivityRows {
         let all = client.require_scope(TokenScope::Metrics).is_ok();
         match table {
             ActivityTable::Queries => ActivityRows::Queries(self.queries.query_rows(&client.name, all)),

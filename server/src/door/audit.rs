@@ -23,11 +23,11 @@ pub(super) fn record_login(peer: SocketAddr, protocol: ServerProtocol, client: &
 
 /// An answer that may be a file.
 pub(super) struct HandedFile<'a> {
-    pub(super) client: &'a str,
+    pub client: &'a str,
     /// Its path without parameters: they may be texts of statements.
-    pub(super) path: &'a str,
+    pub path: &'a str,
     /// The runs of a slice.
-    pub(super) runs: Option<&'a str>,
+    pub runs: Option<&'a str>,
 }
 
 /// Writes a line about a file that is handed out, if its path is one of files.

@@ -98,13 +98,13 @@ struct ProtocolPlaces {
 
 impl OpenConnections {
     /// The number of open connections of each protocol, and its limit.
-    pub(crate) fn protocol_counts(&self) -> Vec<(ServerProtocol, usize, usize)> {
+    pub fn protocol_counts(&self) -> Vec<(ServerProtocol, usize, usize)> {
         let all = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         all.iter().map(|places| (places.protocol, places.taken.lock_places().len(), places.most)).collect()
     }
 
     /// The connections of a client, or of all.
-    pub(crate) fn connection_rows(&self, client: &str, all: bool) -> Vec<OpenConnection> {
+    pub fn connection_rows(&self, client: &str, all: bool) -> Vec<OpenConnection> {
         let protocols = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let mut rows = Vec::new();
         for places in protocols.iter() {
@@ -118,19 +118,19 @@ impl OpenConnections {
 
 impl ConnectionPlaces {
     /// Places of an address.
-    pub(super) fn new(listener: TcpListener, most: usize) -> Self {
+    pub fn new(listener: TcpListener, most: usize) -> Self {
         Self { listener, most, taken: Arc::default() }
     }
 
     /// Lists its connections among those of all protocols.
-    pub(super) fn listed_among(self, connections: &OpenConnections, protocol: ServerProtocol) -> Self {
+    pub fn listed_among(self, connections: &OpenConnections, protocol: ServerProtocol) -> Self {
         let places = ProtocolPlaces { protocol, most: self.most, taken: self.taken.clone() };
         connections.0.lock().unwrap_or_else(PoisonError::into_inner).push(places);
         self
     }
 
     /// The next connection in its place. If all places are taken by connections that work, it waits.
-    pub(super) async fn next_connection(&self) -> PlacedStream {
+    pub async fn next_connection(&self) -> PlacedStream {
         loop {
             match self.listener.accept().await {
                 Ok((stream, peer)) => {
@@ -147,7 +147,7 @@ impl ConnectionPlaces {
     }
 
     /// Attends to connections, each in a task of its own; never ends.
-    pub(super) async fn attend_connections<F: Future<Output = ()> + Send + 'static>(
+    pub async fn attend_connections<F: Future<Output = ()> + Send + 'static>(
         self,
         attend: impl Fn(PlacedStream) -> F,
     ) {
@@ -231,13 +231,13 @@ pub(super) struct PlacedStream {
 
 impl PlacedStream {
     /// Ends if the connection must leave its place.
-    pub(super) fn wait_for_eviction(&self) -> impl Future<Output = ()> + Send + 'static {
+    pub fn wait_for_eviction(&self) -> impl Future<Output = ()> + Send + 'static {
         let state = self.state.clone();
         async move { state.evicted.notified().await }
     }
 
     /// Marks the begin of work on the connection.
-    pub(super) fn work_handle(&self) -> PlaceWork {
+    pub fn work_handle(&self) -> PlaceWork {
         PlaceWork(self.state.clone())
     }
 
@@ -265,13 +265,13 @@ pub(super) struct PlaceWork(Arc<PlaceState>);
 
 impl PlaceWork {
     /// Takes note of a request: what was sent up to here was one.
-    pub(super) fn hear_request(&self) {
+    pub fn hear_request(&self) {
         self.0.requests.fetch_add(1, Ordering::Relaxed);
         self.0.idle_bytes.store(0, Ordering::Relaxed);
     }
 
     /// Takes note of the client of a request; returns true if the one before was another's.
-    pub(super) fn name_client(&self, name: &str) -> bool {
+    pub fn name_client(&self, name: &str) -> bool {
         let mut known = self.0.lock_client();
         let is_other = known.as_deref() != Some(name);
         if is_other {
@@ -281,12 +281,12 @@ impl PlaceWork {
     }
 
     /// The address of the other side.
-    pub(super) fn peer(&self) -> SocketAddr {
+    pub fn peer(&self) -> SocketAddr {
         self.0.peer
     }
 
     /// Waits until the connection does no work, and sends nothing more of what was done.
-    pub(super) async fn wait_until_quiet(&self) {
+    pub async fn wait_until_quiet(&self) {
         let mut written = None;
         while !(self.0.is_idle() && written == Some(self.0.written.load(Ordering::Relaxed))) {
             written = self.0.is_idle().then(|| self.0.written.load(Ordering::Relaxed));
@@ -294,7 +294,7 @@ impl PlaceWork {
         }
     }
 
-    pub(super) fn begin_work(&self) -> WorkingPlace {
+    pub fn begin_work(&self) -> WorkingPlace {
         self.0.working.fetch_add(1, Ordering::Relaxed);
         WorkingPlace(self.0.clone())
     }

@@ -3,14 +3,14 @@
 /// An element.
 pub(super) struct DerElement<'a> {
     /// Its content.
-    pub(super) content: &'a [u8],
+    pub content: &'a [u8],
     /// The bytes that follow it.
-    pub(super) rest: &'a [u8],
+    pub rest: &'a [u8],
 }
 
 impl<'a> DerElement<'a> {
     /// Reads the first element; None if there is no whole one.
-    pub(super) fn read_first(der: &'a [u8]) -> Option<Self> {
+    pub fn read_first(der: &'a [u8]) -> Option<Self> {
         let (&[_kind, length], rest) = der.split_first_chunk()?;
         let (bytes, rest) = match length {
             0..=0x7f => (usize::from(length), rest),

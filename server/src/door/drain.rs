@@ -25,23 +25,23 @@ impl Drop for AwaitedConnection {
 
 impl ServerDrain {
     /// Takes nothing new from now on.
-    pub(super) fn begin_drain(&self) {
+    pub fn begin_drain(&self) {
         self.0.begun.send_replace(true);
     }
 
     /// Returns whether nothing new is taken.
-    pub(crate) fn is_begun(&self) -> bool {
+    pub fn is_begun(&self) -> bool {
         *self.0.begun.borrow()
     }
 
     /// Waits until nothing new is taken.
-    pub(super) async fn wait_until_begun(&self) {
+    pub async fn wait_until_begun(&self) {
         // The sender lives in `self`, so there is no error to come.
         let _ = self.0.begun.subscribe().wait_for(|begun| *begun).await;
     }
 
     /// Counts a connection whose end is awaited; None if it comes too late for that.
-    pub(super) fn count_connection(&self) -> Option<AwaitedConnection> {
+    pub fn count_connection(&self) -> Option<AwaitedConnection> {
         // Counted before the look: one that finds no end begun is awaited by the end that follows.
         self.0.open.send_modify(|open| *open += 1);
         let counted = AwaitedConnection(self.clone());
@@ -49,12 +49,12 @@ impl ServerDrain {
     }
 
     /// Returns the number of awaited connections.
-    pub(super) fn open_connections(&self) -> usize {
+    pub fn open_connections(&self) -> usize {
         *self.0.open.borrow()
     }
 
     /// Waits until no awaited connection is open.
-    pub(super) async fn wait_until_empty(&self) {
+    pub async fn wait_until_empty(&self) {
         let _ = self.0.open.subscribe().wait_for(|open| *open == 0).await;
     }
 }

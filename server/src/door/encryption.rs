@@ -85,7 +85,7 @@ impl ServerEncryption {
     ///
     /// # Errors
     /// [`Error::Certificate`].
-    pub(super) fn new(files: CertificateFiles) -> Result<Self, Error> {
+    pub fn new(files: CertificateFiles) -> Result<Self, Error> {
         Ok(Self { loaded: files.load_certificate()?, files, protocols: Vec::new() })
     }
 
@@ -93,7 +93,7 @@ impl ServerEncryption {
     ///
     /// # Errors
     /// [`Error::System`].
-    pub(super) fn of_protocol(&mut self, names: &'static [&'static [u8]]) -> Result<ProtocolEncryption, Error> {
+    pub fn of_protocol(&mut self, names: &'static [&'static [u8]]) -> Result<ProtocolEncryption, Error> {
         let tls = ProtocolTls::new(names, &self.loaded).map_err(|e| Error::System(io::Error::other(e)))?;
         let tls = Arc::new(RwLock::new(tls));
         self.protocols.push(tls.clone());
@@ -101,7 +101,7 @@ impl ServerEncryption {
     }
 
     /// Takes changed files for new connections; open ones keep what they began with. Never ends.
-    pub(super) async fn keep_up(self) {
+    pub async fn keep_up(self) {
         let mut known = self.files.file_states();
         loop {
             tokio::time::sleep(LOOK_EVERY).await;
@@ -160,7 +160,7 @@ pub(super) struct ProtocolEncryption(Option<Arc<RwLock<ProtocolTls>>>);
 
 impl ProtocolEncryption {
     /// Returns whether connections are encrypted.
-    pub(super) fn is_on(&self) -> bool {
+    pub fn is_on(&self) -> bool {
         self.0.is_some()
     }
 
@@ -172,13 +172,13 @@ impl ProtocolEncryption {
 
     /// Returns the hash of the certificate by which logins are bound to it.
     #[cfg(feature = "postgres")]
-    pub(super) fn certificate_hash(&self) -> Option<Vec<u8>> {
+    pub fn certificate_hash(&self) -> Option<Vec<u8>> {
         let tls = self.0.as_ref()?.read().unwrap_or_else(PoisonError::into_inner);
         certificate_hash(tls.certificate.cert.first()?)
     }
 
     /// Shakes hands with a client, if connections are encrypted; None if that fails, or takes too long.
-    pub(super) async fn shake_hands(&self, stream: PlacedStream) -> Option<DoorStream> {
+    pub async fn shake_hands(&self, stream: PlacedStream) -> Option<DoorStream> {
         let Some(acceptor) = self.acceptor() else { return Some(Either::Left(stream)) };
         let evicted = stream.wait_for_eviction();
         tokio::select! {

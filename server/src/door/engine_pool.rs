@@ -84,7 +84,7 @@ struct ClientState {
 }
 
 impl EnginePool {
-    pub(super) fn new(
+    pub fn new(
         lake: &Lake,
         settings: EngineSettings,
         activity: Arc<ServerActivity>,
@@ -132,7 +132,7 @@ impl EnginePool {
     /// # Errors
     /// [`RequestFault::Unauthenticated`] if the client's token is no longer one; [`RequestFault::TooMany`] if other
     /// clients' engines are all answering; [`RequestFault::Backoff`]; [`RequestFault::EngineEnded`].
-    pub(super) async fn lease_for(&self, client: &ClientIdentity) -> Result<EngineLease, RequestFault> {
+    pub async fn lease_for(&self, client: &ClientIdentity) -> Result<EngineLease, RequestFault> {
         let lease = self.lease_engine(client).await?;
         self.0.memory_watcher.unpark();
         Ok(lease)
@@ -241,7 +241,7 @@ impl EnginePool {
     }
 
     /// Keeps a spare engine, and ends idle ones; never ends.
-    pub(super) async fn keep_up(self) {
+    pub async fn keep_up(self) {
         tokio::join!(self.keep_spare(), self.clone().retire_idle());
     }
 
@@ -249,7 +249,7 @@ impl EnginePool {
     ///
     /// # Errors
     /// [`RequestFault::NotReady`].
-    pub(super) fn check_start(&self) -> Result<(), RequestFault> {
+    pub fn check_start(&self) -> Result<(), RequestFault> {
         let reason = match *lock_mutex(&self.0.last_start) {
             Some(StartOutcome::Ready) => return Ok(()),
             Some(StartOutcome::Failed) => "no engine can be started",
@@ -302,7 +302,7 @@ impl EnginePool {
     }
 
     /// Ends the engines that are idle; never ends.
-    pub(super) async fn retire_idle(self) {
+    pub async fn retire_idle(self) {
         loop {
             tokio::time::sleep(IDLE / 10).await;
             // One with connections stays until its place is needed.
@@ -315,7 +315,7 @@ impl EnginePool {
     }
 
     /// Ends a client's engine, with all that it answers.
-    pub(super) fn end_client(&self, name: &str) {
+    pub fn end_client(&self, name: &str) {
         let own = lock_mutex(&self.0.clients).get(name).cloned();
         if let Some(engine) = own.and_then(|own| lock_mutex(&own.current).clone()) {
             engine.kill_process(EndReason::Retired);
@@ -323,7 +323,7 @@ impl EnginePool {
     }
 
     /// Ends all engines.
-    pub(super) async fn end_all(&self) {
+    pub async fn end_all(&self) {
         let spare = lock_mutex(&self.0.spare).take();
         for engine in self.list_live().into_iter().chain(spare) {
             engine.kill_process(EndReason::Retired);
@@ -332,7 +332,7 @@ impl EnginePool {
     }
 
     /// Cancels a query of an engine's process by its number there.
-    pub(super) async fn cancel_query(&self, pid: u32, number: u64) {
+    pub async fn cancel_query(&self, pid: u32, number: u64) {
         let engine = self.list_live().into_iter().find(|engine| engine.pid() == pid);
         if let Some(engine) = engine {
             // One that ends meanwhile runs nothing.
@@ -341,7 +341,7 @@ impl EnginePool {
     }
 
     /// Gauges of the engines.
-    pub(super) fn pool_gauges(&self) -> PoolGauges {
+    pub fn pool_gauges(&self) -> PoolGauges {
         let live = self.list_live();
         PoolGauges {
             engines: live.len(),
@@ -354,7 +354,7 @@ impl EnginePool {
     }
 
     /// Space on the disks of the lake, if it is in a folder, and of temporary files.
-    pub(super) fn disk_spaces(&self) -> Vec<(&'static str, DiskSpace)> {
+    pub fn disk_spaces(&self) -> Vec<(&'static str, DiskSpace)> {
         let folders = [("lake", self.0.lake.folder()), ("temp", Some(self.0.folders.spills.path()))];
         folders.into_iter().filter_map(|(name, folder)| Some((name, disk_space(folder?)?))).collect()
     }

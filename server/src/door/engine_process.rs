@@ -74,7 +74,7 @@ pub(super) struct EngineProcess {
     process: OwnedFd,
     why_killed: OnceLock<EndReason>,
     ended: SetOnce<EndReason>,
-    pub(super) flight: tokio::sync::Mutex<Option<http2::SendRequest<Body>>>,
+    pub flight: tokio::sync::Mutex<Option<http2::SendRequest<Body>>>,
 }
 
 struct EngineUsage {
@@ -98,13 +98,13 @@ impl EngineUsage {
 
 /// Parameters with which an engine is started.
 pub(super) struct EngineStart<'a> {
-    pub(super) settings: &'a EngineSettings,
-    pub(super) lake: &'a str,
+    pub settings: &'a EngineSettings,
+    pub lake: &'a str,
     /// The lake's folder, if it is in one.
-    pub(super) lake_folder: Option<&'a Path>,
+    pub lake_folder: Option<&'a Path>,
     /// Folders that are the engine's own.
-    pub(super) sockets: PathBuf,
-    pub(super) spills: PathBuf,
+    pub sockets: PathBuf,
+    pub spills: PathBuf,
 }
 
 fn cache_arguments(cache: &CacheFolder) -> [OsString; 4] {
@@ -116,7 +116,7 @@ impl EngineProcess {
     ///
     /// # Errors
     /// The system gives no folder or process.
-    pub(super) fn spawn_process(start: EngineStart<'_>, activity: Arc<ServerActivity>) -> io::Result<Arc<Self>> {
+    pub fn spawn_process(start: EngineStart<'_>, activity: Arc<ServerActivity>) -> io::Result<Arc<Self>> {
         std::fs::create_dir(&start.sockets)?;
         std::fs::create_dir(&start.spills)?;
         let mut child = Command::new(&start.settings.program)
@@ -172,7 +172,7 @@ impl EngineProcess {
     ///
     /// # Errors
     /// It ended before that.
-    pub(super) async fn wait_until_ready(&self) -> Result<(), EndReason> {
+    pub async fn wait_until_ready(&self) -> Result<(), EndReason> {
         tokio::select! {
             _ = self.ready.wait() => Ok(()),
             reason = self.ended.wait() => Err(reason.clone()),
@@ -183,7 +183,7 @@ impl EngineProcess {
     ///
     /// # Errors
     /// It ended before that.
-    pub(super) async fn assign_client(&self, client: &ClientIdentity) -> Result<(), EndReason> {
+    pub async fn assign_client(&self, client: &ClientIdentity) -> Result<(), EndReason> {
         let failed = |e: io::Error| EndReason::Failed(format!("it could not be told whose it is: {e}"));
         self.wait_until_ready().await?;
         let _ = self.base_bytes.set(private_bytes(self.pid).unwrap_or(0));
@@ -195,7 +195,7 @@ impl EngineProcess {
     }
 
     /// Returns whether it is the engine of a client who may do just this.
-    pub(super) fn is_of(&self, client: &ClientIdentity) -> bool {
+    pub fn is_of(&self, client: &ClientIdentity) -> bool {
         self.client.get().is_some_and(|own| own == client)
     }
 
@@ -203,14 +203,14 @@ impl EngineProcess {
     ///
     /// # Errors
     /// It has ended.
-    pub(super) async fn send_message(&self, message: &DoorMessage) -> io::Result<()> {
+    pub async fn send_message(&self, message: &DoorMessage) -> io::Result<()> {
         let mut line = serde_json::to_vec(message)?;
         line.push(b'\n');
         self.stdin.lock().await.write_all(&line).await
     }
 
     /// Its process id.
-    pub(super) fn pid(&self) -> u32 {
+    pub fn pid(&self) -> u32 {
         self.pid
     }
 
@@ -218,12 +218,12 @@ impl EngineProcess {
     ///
     /// # Errors
     /// The engine is not there any more.
-    pub(super) async fn connect_socket(&self, socket: EngineSocket) -> io::Result<UnixStream> {
+    pub async fn connect_socket(&self, socket: EngineSocket) -> io::Result<UnixStream> {
         UnixStream::connect(socket.path_in(&self.folder)).await
     }
 
     /// Holds it for one request; None if it is ending.
-    pub(super) fn hold_for_request(self: &Arc<Self>) -> Option<EngineLease> {
+    pub fn hold_for_request(self: &Arc<Self>) -> Option<EngineLease> {
         let mut usage = self.lock_usage();
         if usage.is_ending || self.has_ended() {
             return None;
@@ -236,7 +236,7 @@ impl EngineProcess {
     }
 
     /// Kills it; the first reason counts.
-    pub(super) fn kill_process(&self, why: EndReason) {
+    pub fn kill_process(&self, why: EndReason) {
         self.lock_usage().is_ending = true;
         let _ = self.why_killed.set(why);
         // One that is gone already needs no kill.
@@ -244,7 +244,7 @@ impl EngineProcess {
     }
 
     /// Kills it if nobody has waited for it for longer than `time`.
-    pub(super) fn retire_after(&self, time: Duration) -> bool {
+    pub fn retire_after(&self, time: Duration) -> bool {
         let mut usage = self.lock_usage();
         if usage.idle_time().is_none_or(|idle| idle < time) {
             return false;
@@ -256,7 +256,7 @@ impl EngineProcess {
     }
 
     /// Returns whether its process has ended.
-    pub(super) fn has_ended(&self) -> bool {
+    pub fn has_ended(&self) -> bool {
         self.ended.get().is_some()
     }
 
@@ -265,42 +265,42 @@ impl EngineProcess {
     }
 
     /// Returns the reason of its end, if it has ended.
-    pub(super) fn end_reason(&self) -> Option<&EndReason> {
+    pub fn end_reason(&self) -> Option<&EndReason> {
         self.ended.get()
     }
 
     /// Waits a moment for how it ended; None if it lives.
-    pub(super) async fn why_ended(&self) -> Option<EndReason> {
+    pub async fn why_ended(&self) -> Option<EndReason> {
         tokio::time::timeout(REASON_WAIT, self.ended.wait()).await.ok().cloned()
     }
 
     /// Waits until it has ended.
-    pub(super) async fn wait_for_end(&self) {
+    pub async fn wait_for_end(&self) {
         self.ended.wait().await;
     }
 
     /// Returns whether requests are open, such as connections of Postgres' protocol.
-    pub(super) fn has_requests(&self) -> bool {
+    pub fn has_requests(&self) -> bool {
         !self.lock_usage().requests.is_empty()
     }
 
     /// Returns whether queries run, or wait for their rows to be fetched.
-    pub(super) fn has_queries(&self) -> bool {
+    pub fn has_queries(&self) -> bool {
         self.queries.load(Ordering::Relaxed) > 0
     }
 
     /// Time for which no client has waited for it; None if one does, or was silent for a moment only.
-    pub(super) fn idle_time(&self) -> Option<Duration> {
+    pub fn idle_time(&self) -> Option<Duration> {
         self.lock_usage().idle_time()
     }
 
     /// Bytes that its client's queries may occupy; None if they have no limit of their own.
-    pub(super) fn memory_limit(&self) -> Option<usize> {
+    pub fn memory_limit(&self) -> Option<usize> {
         self.memory_limit.get().copied()
     }
 
     /// Bytes of memory that it occupies over what it did when it was assigned to its client.
-    pub(super) fn grown_bytes(&self) -> usize {
+    pub fn grown_bytes(&self) -> usize {
         let base = self.base_bytes.get().copied().unwrap_or(0);
         private_bytes(self.pid).unwrap_or(0).saturating_sub(base)
     }
@@ -321,12 +321,12 @@ pub(super) struct EngineLease {
 }
 
 impl EngineLease {
-    pub(super) fn engine(&self) -> &Arc<EngineProcess> {
+    pub fn engine(&self) -> &Arc<EngineProcess> {
         &self.engine
     }
 
     /// Records whether the engine waits, from now on, for the client to ask or to read; else the client waits for it.
-    pub(super) fn set_waiting(&self, is_waiting: bool) {
+    pub fn set_waiting(&self, is_waiting: bool) {
         self.engine.lock_usage().requests.insert(self.number, is_waiting.then(Instant::now));
     }
 }

@@ -28,7 +28,7 @@ struct FailureWindow {
 
 impl FailedLogins {
     /// None so far. Not counted where all clients have the address of a proxy.
-    pub(super) fn new(is_counted: bool) -> Self {
+    pub fn new(is_counted: bool) -> Self {
         Self { is_counted, windows: Mutex::default() }
     }
 
@@ -36,7 +36,7 @@ impl FailedLogins {
     ///
     /// # Errors
     /// [`RequestFault::FailedLogins`].
-    pub(super) fn check_address(&self, peer: SocketAddr) -> Result<(), RequestFault> {
+    pub fn check_address(&self, peer: SocketAddr) -> Result<(), RequestFault> {
         let Some(address) = self.counted_address(peer) else { return Ok(()) };
         let windows = self.windows.lock().unwrap_or_else(PoisonError::into_inner);
         let window = windows.get(&address).filter(|window| window.failures >= MOST_FAILURES);
@@ -47,7 +47,7 @@ impl FailedLogins {
     }
 
     /// Counts a failure.
-    pub(super) fn count_failure(&self, peer: SocketAddr) {
+    pub fn count_failure(&self, peer: SocketAddr) {
         let Some(address) = self.counted_address(peer) else { return };
         let mut windows = self.windows.lock().unwrap_or_else(PoisonError::into_inner);
         if windows.len() >= MOST_ADDRESSES && !windows.contains_key(&address) {

@@ -67,7 +67,7 @@ impl EnginePool {
     ///
     /// # Errors
     /// [`RequestFault::EngineEnded`], [`RequestFault::TooMany`], [`RequestFault::TooLarge`], [`RequestFault::Request`].
-    pub(super) async fn forward_request(
+    pub async fn forward_request(
         &self,
         client: &ClientIdentity,
         request: Request<Body>,

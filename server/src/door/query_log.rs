@@ -24,15 +24,15 @@ struct LoggedQueries {
 /// A query that runs in an engine.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct RunningPlace {
-    pub(crate) client: String,
+    pub client: String,
     /// Process of its engine, and its number there.
-    pub(crate) engine: u32,
-    pub(crate) number: u64,
+    pub engine: u32,
+    pub number: u64,
 }
 
 impl QueryLog {
     /// Takes note of a query that begins in an engine.
-    pub(crate) fn log_begin(&self, client: &str, engine: u32, start: QueryStart) {
+    pub fn log_begin(&self, client: &str, engine: u32, start: QueryStart) {
         let mut queries = self.lock_queries();
         let query = LoggedQuery {
             id: random_id(),
@@ -52,7 +52,7 @@ impl QueryLog {
     }
 
     /// Takes note of the end of a query.
-    pub(crate) fn log_end(&self, engine: u32, end: &QueryEnd) {
+    pub fn log_end(&self, engine: u32, end: &QueryEnd) {
         let mut queries = self.lock_queries();
         let Some(mut query) = queries.running.remove(&(engine, end.number)) else { return };
         query.outcome = end.failure.map_or("answered", FaultCode::name).to_owned();
@@ -65,7 +65,7 @@ impl QueryLog {
     }
 
     /// Takes note of the end of an engine, and of all that it ran; returns how many queries these were.
-    pub(crate) fn end_engine(&self, engine: u32) -> usize {
+    pub fn end_engine(&self, engine: u32) -> usize {
         let mut queries = self.lock_queries();
         let lost: Vec<_> = queries.running.extract_if(|(of, _), _| *of == engine).map(|(_, query)| query).collect();
         let count = lost.len();
@@ -77,7 +77,7 @@ impl QueryLog {
     }
 
     /// Finds a query that runs.
-    pub(crate) fn find_running(&self, id: u64) -> Option<RunningPlace> {
+    pub fn find_running(&self, id: u64) -> Option<RunningPlace> {
         let queries = self.lock_queries();
         let mut running = queries.running.iter().filter(|(_, query)| query.id == id);
         running.next().map(|((engine, number), query)| RunningPlace {
@@ -88,7 +88,7 @@ impl QueryLog {
     }
 
     /// The queries of a client, the latest first. With `all`, those of the others too, without their texts.
-    pub(crate) fn query_rows(&self, client: &str, all: bool) -> Vec<LoggedQuery> {
+    pub fn query_rows(&self, client: &str, all: bool) -> Vec<LoggedQuery> {
         let queries = self.lock_queries();
         let known = queries.running.values().chain(&queries.ended);
         let mut rows: Vec<_> = known.filter(|query| all || query.client == client).cloned().collect();

@@ -23,7 +23,7 @@ pub(super) struct ReadinessCheck {
 }
 
 impl ReadinessCheck {
-    pub(super) fn new(lake: &Lake) -> Self {
+    pub fn new(lake: &Lake) -> Self {
         Self { lake: lake.clone(), last: Mutex::default() }
     }
 
@@ -31,7 +31,7 @@ impl ReadinessCheck {
     ///
     /// # Errors
     /// [`RequestFault::NotReady`].
-    pub(super) async fn check_lake(&self, activity: &ServerActivity) -> Result<(), RequestFault> {
+    pub async fn check_lake(&self, activity: &ServerActivity) -> Result<(), RequestFault> {
         // Its logs are looked at by an engine, now and then.
         if activity.is_lake_unreadable() {
             return Err(UNREADABLE);

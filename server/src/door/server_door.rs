@@ -40,7 +40,7 @@ impl ServerDoor {
     ///
     /// # Errors
     /// [`Error::Temp`].
-    pub(super) fn new(
+    pub fn new(
         lake: &Lake,
         access: Arc<TokenAccess>,
         is_behind_proxy: bool,
@@ -55,20 +55,20 @@ impl ServerDoor {
     }
 
     /// Failed logins of the last minute.
-    pub(super) fn failed_logins(&self) -> &FailedLogins {
+    pub fn failed_logins(&self) -> &FailedLogins {
         &self.0.failed_logins
     }
 
-    pub(crate) fn access(&self) -> &TokenAccess {
+    pub fn access(&self) -> &TokenAccess {
         &self.0.access
     }
 
-    pub(crate) fn metrics(&self) -> &ServerMetrics {
+    pub fn metrics(&self) -> &ServerMetrics {
         &self.0.activity.metrics
     }
 
     /// Queries and connections of the server.
-    pub(crate) fn activity(&self) -> &ServerActivity {
+    pub fn activity(&self) -> &ServerActivity {
         &self.0.activity
     }
 
@@ -76,7 +76,7 @@ impl ServerDoor {
     ///
     /// # Errors
     /// [`RequestFault::Internal`].
-    pub(crate) async fn gather_figures(&self) -> Result<String, RequestFault> {
+    pub async fn gather_figures(&self) -> Result<String, RequestFault> {
         let activity = self.activity();
         let is_ready = self.check_ready().await.is_ok();
         let gauges = ServerGauges {
@@ -92,7 +92,7 @@ impl ServerDoor {
     }
 
     /// Reads the file of tokens again when it changes, and ends what clients without a token were doing; never ends.
-    pub(super) async fn watch_tokens(self) {
+    pub async fn watch_tokens(self) {
         let mut known = TokenFileState::default();
         let mut ended = Vec::new();
         loop {
@@ -109,7 +109,7 @@ impl ServerDoor {
     ///
     /// # Errors
     /// [`RequestFault::Draining`], [`RequestFault::NotReady`].
-    pub(crate) async fn check_ready(&self) -> Result<(), RequestFault> {
+    pub async fn check_ready(&self) -> Result<(), RequestFault> {
         if self.0.drain.is_begun() {
             return Err(RequestFault::Draining);
         }
@@ -121,7 +121,7 @@ impl ServerDoor {
     ///
     /// # Errors
     /// [`RequestFault::NotFound`] if none that the client may end runs.
-    pub(crate) async fn cancel_query(&self, client: &ClientIdentity, id: u64) -> Result<(), RequestFault> {
+    pub async fn cancel_query(&self, client: &ClientIdentity, id: u64) -> Result<(), RequestFault> {
         let may_any = client.require_scope(TokenScope::Metrics).is_ok();
         let running = self.activity().queries.find_running(id).filter(|query| may_any || query.client == client.name);
         let Some(query) = running else {
@@ -133,12 +133,12 @@ impl ServerDoor {
     }
 
     /// The server's end.
-    pub(crate) fn drain(&self) -> &ServerDrain {
+    pub fn drain(&self) -> &ServerDrain {
         &self.0.drain
     }
 
     /// Takes note of who asks on a connection, or of a refusal; returns `found`.
-    pub(super) fn note_client(
+    pub fn note_client(
         &self,
         work: &PlaceWork,
         protocol: ServerProtocol,
@@ -158,12 +158,12 @@ impl ServerDoor {
     }
 
     /// The layout of its lake's runs.
-    pub(crate) fn layout(&self) -> &ViewerLayout {
+    pub fn layout(&self) -> &ViewerLayout {
         &self.0.layout
     }
 
     /// The engines.
-    pub(super) fn engines(&self) -> &EnginePool {
+    pub fn engines(&self) -> &EnginePool {
         &self.0.engines
     }
 }

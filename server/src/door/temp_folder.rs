@@ -27,8 +27,8 @@ const TMPFS: u64 = 0x0102_1994;
 
 /// The folders of a server; they are removed when this is dropped.
 pub(super) struct ServerFolders {
-    pub(super) sockets: LockedFolder,
-    pub(super) spills: LockedFolder,
+    pub sockets: LockedFolder,
+    pub spills: LockedFolder,
 }
 
 /// A folder whose process lives: its lock file is locked. It is removed when this is dropped.
@@ -43,7 +43,7 @@ impl ServerFolders {
     ///
     /// # Errors
     /// [`Error::Temp`].
-    pub(super) fn new(lake: &Lake, temp: Option<&Path>) -> Result<Self, Error> {
+    pub fn new(lake: &Lake, temp: Option<&Path>) -> Result<Self, Error> {
         let system = std::env::temp_dir();
         let failed = |path: &Path| {
             let path = path.to_owned();
@@ -90,7 +90,7 @@ impl LockedFolder {
         }
     }
 
-    pub(super) fn path(&self) -> &Path {
+    pub fn path(&self) -> &Path {
         self.folder.path()
     }
 }

@@ -11,43 +11,43 @@ use rustix::time::{ClockId, clock_gettime};
 /// Gauges of one moment.
 #[derive(Default)]
 pub(crate) struct ServerGauges {
-    pub(crate) pool: PoolGauges,
+    pub pool: PoolGauges,
     /// Open connections of each protocol that is served, and their limit.
-    pub(crate) connections: Vec<(ServerProtocol, usize, usize)>,
+    pub connections: Vec<(ServerProtocol, usize, usize)>,
     /// Space on the disks of `lake` and `temp`.
-    pub(crate) disks: Vec<(&'static str, DiskSpace)>,
+    pub disks: Vec<(&'static str, DiskSpace)>,
     /// The last figures of the lake, and their age.
-    pub(crate) lake: Option<(Duration, LakeFigures)>,
-    pub(crate) is_ready: bool,
+    pub lake: Option<(Duration, LakeFigures)>,
+    pub is_ready: bool,
     /// Seconds since 1970.
-    pub(crate) process_start: f64,
+    pub process_start: f64,
 }
 
 /// Space of a file system.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct DiskSpace {
     /// Bytes that this user may still write.
-    pub(crate) free_bytes: u64,
-    pub(crate) bytes: u64,
+    pub free_bytes: u64,
+    pub bytes: u64,
 }
 
 /// Gauges of the engines.
 #[derive(Default)]
 pub(crate) struct PoolGauges {
     /// Engines that have a client, and their limit.
-    pub(crate) engines: usize,
-    pub(crate) most_engines: usize,
+    pub engines: usize,
+    pub most_engines: usize,
     /// Bytes that their queries occupy, and their limit.
-    pub(crate) bytes: usize,
-    pub(crate) most_bytes: usize,
+    pub bytes: usize,
+    pub most_bytes: usize,
     /// Engines since the start: those that were started, and those that ended while they had a client.
-    pub(crate) started: usize,
-    pub(crate) failed: u64,
+    pub started: usize,
+    pub failed: u64,
 }
 
 impl ServerGauges {
     /// Registers all of them with their values.
-    pub(super) fn register_all(&self, registry: &Registry) -> Result<()> {
+    pub fn register_all(&self, registry: &Registry) -> Result<()> {
         let moment = MomentRegistry(registry);
         moment.register_labelled("echolake_build_info", "Always 1.", ("version", env!("CARGO_PKG_VERSION")), 1.0)?;
         moment.register_gauge(

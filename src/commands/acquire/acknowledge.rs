@@ -20,7 +20,7 @@ enum AcknowledgementTarget {
 
 impl AcknowledgementWriter {
     /// Opens the list for more lines; `-` is stdout.
-    pub(super) fn open(path: &Path) -> anyhow::Result<Self> {
+    pub fn open(path: &Path) -> anyhow::Result<Self> {
         if path == Path::new("-") {
             return Ok(Self { out: AcknowledgementTarget::Stdout });
         }
@@ -31,7 +31,7 @@ impl AcknowledgementWriter {
     }
 
     /// Writes the attempts that are safe on the disk.
-    pub(super) fn observe_event(&mut self, event: &RunEvent<'_>) {
+    pub fn observe_event(&mut self, event: &RunEvent<'_>) {
         let RunEvent::Safe { verdicts, .. } = event else { return };
         let mut lines = String::new();
         for m in *verdicts {

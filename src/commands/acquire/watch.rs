@@ -36,7 +36,7 @@ pub(in crate::commands) struct RunWatcher {
 
 impl RunWatcher {
     /// Of a run over `planned` pairs, `accepted` of which are measured already.
-    pub(in crate::commands) fn new(
+    pub fn new(
         progress: &CommandProgress,
         surface: &str,
         planned: u64,
@@ -62,7 +62,7 @@ impl RunWatcher {
     }
 
     /// Records an event. Measured pairs count as done; the line says how many of them are safe on the disk.
-    pub(in crate::commands) fn observe_event(&mut self, event: &RunEvent<'_>) {
+    pub fn observe_event(&mut self, event: &RunEvent<'_>) {
         self.metrics.observe(event);
         match event {
             RunEvent::Pair(pair) => {
@@ -94,7 +94,7 @@ impl RunWatcher {
     }
 
     /// Reports the end of the run, or that it was aborted.
-    pub(in crate::commands) fn report_end(self, end: Option<RunEnd>) {
+    pub fn report_end(self, end: Option<RunEnd>) {
         if self.cost.checkpoints > 0 {
             let (busy, whole) = (self.cost.busy.as_secs_f64(), self.begun.elapsed().as_secs_f64());
             self.task.print_message(&format!(

@@ -21,22 +21,22 @@ const MOST_RUNS: usize = 1_000;
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct CampaignDefinition {
-    pub(super) name: String,
+    pub name: String,
     /// Its purpose; printed above its tables.
     #[serde(default)]
-    pub(super) about: String,
+    pub about: String,
     /// The rig's file, beside this one.
     rig: Option<PathBuf>,
     /// The project that its surfaces belong to.
-    pub(super) project: Option<ProjectName>,
+    pub project: Option<ProjectName>,
     /// Seed of the simulation.
     #[serde(default = "default_seed")]
-    pub(super) seed: u64,
+    pub seed: u64,
     #[serde(default)]
     references: NamedReferences,
     surfaces: Vec<NamedSurface>,
     #[serde(default)]
-    pub(super) expected: Vec<ExpectedLevels>,
+    pub expected: Vec<ExpectedLevels>,
 }
 
 /// References of all surfaces of a campaign, if they are not the lake's.
@@ -71,14 +71,14 @@ struct NamedSurface {
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct ExpectedLevels {
-    pub(super) surface: SurfaceId,
+    pub surface: SurfaceId,
     /// The surface that they are relative to; Flat if there is none.
-    pub(super) relative_to: Option<SurfaceId>,
+    pub relative_to: Option<SurfaceId>,
     /// Levels by the names of bands, and `total`.
-    pub(super) levels_db: BTreeMap<String, f64>,
+    pub levels_db: BTreeMap<String, f64>,
     /// Their source.
     #[serde(default)]
-    pub(super) source: String,
+    pub source: String,
 }
 
 /// What a surface is whose relief or mesh the file does not name.
@@ -95,12 +95,12 @@ pub(super) enum UnnamedGeometry {
 /// A surface of a campaign, with its geometry.
 #[derive(Debug)]
 pub(super) struct CampaignSurface {
-    pub(super) surface: SurfaceId,
-    pub(super) specimen: PanelSpecimen,
+    pub surface: SurfaceId,
+    pub specimen: PanelSpecimen,
     /// The surface that has its large shape alone.
-    pub(super) macro_reference: Option<SurfaceId>,
-    pub(super) seed: u64,
-    pub(super) runs: usize,
+    pub macro_reference: Option<SurfaceId>,
+    pub seed: u64,
+    pub runs: usize,
 }
 
 fn default_seed() -> u64 {
@@ -113,7 +113,7 @@ fn default_runs() -> usize {
 
 impl CampaignDefinition {
     /// Reads a campaign's file.
-    pub(super) fn from_file(path: &Path) -> anyhow::Result<Self> {
+    pub fn from_file(path: &Path) -> anyhow::Result<Self> {
         let text =
             std::fs::read_to_string(path).with_context(|| format!("cannot read campaign `{}`", path.display()))?;
         let parsed: Result<Self, _> = toml::from_str(&text);
@@ -128,24 +128,24 @@ impl CampaignDefinition {
     }
 
     /// Returns the path of the rig's file, which is named relative to the campaign's.
-    pub(super) fn rig_file(&self, path: &Path) -> Option<PathBuf> {
+    pub fn rig_file(&self, path: &Path) -> Option<PathBuf> {
         let rig = self.rig.as_ref()?;
         Some(path.parent().map_or_else(|| rig.clone(), |folder| folder.join(rig)))
     }
 
     /// Returns Flat and Foam of all surfaces: the file's, else the lake's.
-    pub(super) fn reference_surfaces(&self, lake: &ReferenceSurfaces) -> [SurfaceId; 2] {
+    pub fn reference_surfaces(&self, lake: &ReferenceSurfaces) -> [SurfaceId; 2] {
         let named = &self.references;
         [named.flat.as_ref().unwrap_or(&lake.flat), named.foam.as_ref().unwrap_or(&lake.foam)].map(Clone::clone)
     }
 
     /// Returns Flat and Foam if the file names them.
-    pub(super) fn named_references(&self) -> [Option<SurfaceId>; 2] {
+    pub fn named_references(&self) -> [Option<SurfaceId>; 2] {
         [self.references.flat.clone(), self.references.foam.clone()]
     }
 
     /// Makes the surfaces in the order in which they are measured: references that the file does not list come first.
-    pub(super) fn make_surfaces(
+    pub fn make_surfaces(
         &self,
         references: &[SurfaceId],
         unnamed: UnnamedGeometry,
@@ -173,7 +173,7 @@ impl CampaignDefinition {
     }
 
     /// Checks that all that is expected has the names of surfaces and of bands.
-    pub(super) fn check_expected(&self, surfaces: &[CampaignSurface], bands: &[String]) -> anyhow::Result<()> {
+    pub fn check_expected(&self, surfaces: &[CampaignSurface], bands: &[String]) -> anyhow::Result<()> {
         let names: Vec<_> = surfaces.iter().map(|surface| surface.surface.as_str()).collect();
         for (ExpectedLevels { surface, relative_to, levels_db, .. }, number) in self.expected.iter().zip(1..) {
             for (key, name) in [("surface", Some(surface)), ("relative_to", relative_to.as_ref())] {

@@ -20,18 +20,18 @@ use crate::progress::CommandProgress;
 
 /// Runs that are measured with the devices of the rig file.
 pub(super) struct RealRuns {
-    pub(super) rig: Rig,
+    pub rig: Rig,
     /// In the order in which they are measured.
-    pub(super) runs: Vec<PlannedRun>,
-    pub(super) keep: RecordingMode,
+    pub runs: Vec<PlannedRun>,
+    pub keep: RecordingMode,
     /// Folder of the recordings.
-    pub(super) folder: PathBuf,
+    pub folder: PathBuf,
 }
 
 impl RealRuns {
     /// Measures all runs; those that were stopped or cut off are resumed. When `stop` becomes true, it ends after the
     /// current pair.
-    pub(super) fn measure_all(&self, stop: &AtomicBool, progress: &CommandProgress) -> anyhow::Result<CommandOutcome> {
+    pub fn measure_all(&self, stop: &AtomicBool, progress: &CommandProgress) -> anyhow::Result<CommandOutcome> {
         let mut outcome = CommandOutcome::Whole;
         let mut in_place: Option<&SurfaceId> = None;
         for planned in &self.runs {

@@ -114,7 +114,7 @@ impl LevelTableRow {
 
 impl LevelTable {
     /// Returns its text, a column for each band.
-    pub(super) fn to_text(&self, bands: &[String], colours: TableColours) -> String {
+    pub fn to_text(&self, bands: &[String], colours: TableColours) -> String {
         let relative = |surface: &String| format!("dB relative to {surface}");
         let unit = self.relative_to.as_ref().map_or_else(|| "dB re Flat total".to_owned(), relative);
         let beside = if self.rows.iter().any(LevelTableRow::has_expected) { ", expected in brackets" } else { "" };

@@ -21,7 +21,7 @@ pub(super) enum ExportTarget {
 
 impl ExportTarget {
     /// Parses an argument.
-    pub(super) fn parse(text: &str) -> Result<Self, String> {
+    pub fn parse(text: &str) -> Result<Self, String> {
         match text.split_once("://") {
             None => Ok(Self::Local(text.into())),
             Some(("file", path)) if path.starts_with('/') => Ok(Self::Local(path.into())),
@@ -61,7 +61,7 @@ struct RemoteExport {
 
 impl PendingExport {
     /// Prepares a folder of files. In an object store nothing may be below its name.
-    pub(super) async fn prepare_folder(target: &ExportTarget) -> anyhow::Result<Self> {
+    pub async fn prepare_folder(target: &ExportTarget) -> anyhow::Result<Self> {
         match target {
             ExportTarget::Local(path) => Ok(Self { path: path.clone(), remote: None }),
             ExportTarget::Remote(location) => {
@@ -73,7 +73,7 @@ impl PendingExport {
     }
 
     /// Prepares a single file.
-    pub(super) async fn prepare_file(target: &ExportTarget) -> anyhow::Result<Self> {
+    pub async fn prepare_file(target: &ExportTarget) -> anyhow::Result<Self> {
         match target {
             ExportTarget::Local(path) => Ok(Self { path: path.clone(), remote: None }),
             ExportTarget::Remote(location) => {
@@ -95,12 +95,12 @@ impl PendingExport {
     }
 
     /// Returns the path on this machine to write to.
-    pub(super) fn path(&self) -> &Path {
+    pub fn path(&self) -> &Path {
         &self.path
     }
 
     /// Sends what was written to its target: data first, checksums last.
-    pub(super) async fn publish(self) -> anyhow::Result<()> {
+    pub async fn publish(self) -> anyhow::Result<()> {
         let Some(RemoteExport { folder, spool, location }) = self.remote else { return Ok(()) };
         if self.path.is_file() {
             let name = self.path.file_name().unwrap_or_default().to_string_lossy();

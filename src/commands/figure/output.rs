@@ -28,7 +28,7 @@ impl OutputArgs {
     ///
     /// # Errors
     /// If only some of the files are named by surfaces.
-    pub(super) fn group_surfaces<'a>(
+    pub fn group_surfaces<'a>(
         &self,
         surfaces: &'a [SelectedSurface],
     ) -> anyhow::Result<Vec<&'a [SelectedSurface]>> {
@@ -41,12 +41,12 @@ impl OutputArgs {
     }
 
     /// Returns the title: the one that was asked for, or this.
-    pub(super) fn title_or(&self, otherwise: impl FnOnce() -> String) -> String {
+    pub fn title_or(&self, otherwise: impl FnOnce() -> String) -> String {
         self.title.clone().unwrap_or_else(otherwise)
     }
 
     /// Writes a drawing to its files.
-    pub(super) fn write_drawing(&self, drawing: &FigureDrawing, surfaces: &[SelectedSurface]) -> anyhow::Result<()> {
+    pub fn write_drawing(&self, drawing: &FigureDrawing, surfaces: &[SelectedSurface]) -> anyhow::Result<()> {
         if self.output.is_empty() {
             return Ok(std::io::stdout().write_all(drawing.to_svg().as_bytes())?);
         }
@@ -62,7 +62,7 @@ impl OutputArgs {
     }
 
     /// Writes a table to its files.
-    pub(super) fn write_table(
+    pub fn write_table(
         &self,
         table: &FigureTable,
         notes: &FigureNotes,

@@ -17,37 +17,37 @@ const LOCAL_OPTIONS: [&str; 4] = ["--lake", "-o", "--output", "--log-format"];
 /// A surface of a figure.
 #[derive(Debug, Clone, Deserialize)]
 pub(super) struct SelectedSurface {
-    pub(super) surface_id: String,
-    pub(super) run_id: Option<String>,
-    pub(super) typology: String,
-    pub(super) flat_reference: String,
-    pub(super) foam_reference: String,
-    pub(super) origin: String,
+    pub surface_id: String,
+    pub run_id: Option<String>,
+    pub typology: String,
+    pub flat_reference: String,
+    pub foam_reference: String,
+    pub origin: String,
 }
 
 const SURFACES: &str = "select surface_id, run_id, typology, flat_reference, foam_reference, origin from surfaces";
 
 /// The lake, and one session of queries.
 pub(super) struct FigureSource {
-    pub(super) lake: Lake,
+    pub lake: Lake,
     session: Session,
     version: String,
 }
 
 impl FigureSource {
-    pub(super) async fn open(lake: Lake) -> anyhow::Result<Self> {
+    pub async fn open(lake: Lake) -> anyhow::Result<Self> {
         let session = Session::new(&lake)?;
         let version = lake_version(session.current_snapshot().await?.as_ref());
         Ok(Self { lake, session, version })
     }
 
     /// Returns the rows of a query.
-    pub(super) async fn query_rows<T: DeserializeOwned>(&self, sql: &str) -> anyhow::Result<Vec<T>> {
+    pub async fn query_rows<T: DeserializeOwned>(&self, sql: &str) -> anyhow::Result<Vec<T>> {
         crate::commands::sql::query_rows(&self.session, sql).await
     }
 
     /// Returns the session.
-    pub(super) fn session(&self) -> &Session {
+    pub fn session(&self) -> &Session {
         &self.session
     }
 
@@ -55,7 +55,7 @@ impl FigureSource {
     ///
     /// # Errors
     /// If one is not in the lake, or none is selected.
-    pub(super) async fn selected_surfaces(&self, selection: &SelectionArgs) -> anyhow::Result<Vec<SelectedSurface>> {
+    pub async fn selected_surfaces(&self, selection: &SelectionArgs) -> anyhow::Result<Vec<SelectedSurface>> {
         let names: Vec<_> = selection.surfaces.iter().map(|surface| surface.as_str()).collect();
         let mut selected = self.named_surfaces(&names).await?;
         if let Some(predicate) = &selection.predicate {
@@ -66,7 +66,7 @@ impl FigureSource {
     }
 
     /// Returns the surfaces of these names, in their order.
-    pub(super) async fn named_surfaces(&self, names: &[&str]) -> anyhow::Result<Vec<SelectedSurface>> {
+    pub async fn named_surfaces(&self, names: &[&str]) -> anyhow::Result<Vec<SelectedSurface>> {
         if names.is_empty() {
             return Ok(Vec::new());
         }
@@ -86,13 +86,13 @@ impl FigureSource {
     ///
     /// # Errors
     /// If it is not in the lake.
-    pub(super) async fn base_surface(&self, surface: Option<&SurfaceId>) -> anyhow::Result<Option<SelectedSurface>> {
+    pub async fn base_surface(&self, surface: Option<&SurfaceId>) -> anyhow::Result<Option<SelectedSurface>> {
         let names: Vec<_> = surface.map(|surface| surface.as_str()).into_iter().collect();
         Ok(self.named_surfaces(&names).await?.pop())
     }
 
     /// Returns the surfaces that a predicate selects, by name.
-    pub(super) async fn surfaces_where(&self, predicate: &str) -> anyhow::Result<Vec<SelectedSurface>> {
+    pub async fn surfaces_where(&self, predicate: &str) -> anyhow::Result<Vec<SelectedSurface>> {
         let select = format!("{SURFACES} where");
         let sql = self.session.append_predicate(&select, predicate, PredicateForm::AnyExpression).context("--where")?;
         let mut found: Vec<SelectedSurface> = self.query_rows(&sql).await.context("--where")?;
@@ -103,7 +103,7 @@ impl FigureSource {
     }
 
     /// Returns the grid point that is named, or the one of the lowest layer that is nearest to the middle.
-    pub(super) fn microphone_point(&self, named: Option<&str>) -> anyhow::Result<&Point> {
+    pub fn microphone_point(&self, named: Option<&str>) -> anyhow::Result<&Point> {
         let grid = self.lake.grid();
         if let Some(text) = named {
             let by_number = text.parse::<usize>().ok();
@@ -122,7 +122,7 @@ impl FigureSource {
     }
 
     /// Returns what a figure of these surfaces says of itself.
-    pub(super) fn figure_notes<'a>(
+    pub fn figure_notes<'a>(
         &self,
         title: String,
         query: String,

@@ -12,13 +12,13 @@ use echolake_schema::{Rig, topics};
 
 /// The beginning of a closed run file.
 pub(super) struct ClosedRun {
-    pub(super) manifest: RunManifest,
-    pub(super) rig: Rig,
+    pub manifest: RunManifest,
+    pub rig: Rig,
 }
 
 impl ClosedRun {
     /// Reads manifest and rig of a run file.
-    pub(super) fn from_file(path: &Path) -> anyhow::Result<Self> {
+    pub fn from_file(path: &Path) -> anyhow::Result<Self> {
         let name = path.display();
         ensure!(
             !is_partial(path),

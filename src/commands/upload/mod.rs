@@ -25,10 +25,10 @@ const MEGABYTE: u64 = 1_000_000;
 pub(crate) struct UploadArgs {
     /// Closed run files, or folders of them; of a folder, recordings in progress are left out.
     #[arg(required = true, value_name = "FILE|FOLDER")]
-    pub(crate) files: Vec<PathBuf>,
+    pub files: Vec<PathBuf>,
     /// Print what was done as JSON.
     #[arg(long)]
-    pub(crate) json: bool,
+    pub json: bool,
 }
 
 /// The results of all files.

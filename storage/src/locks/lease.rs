@@ -75,7 +75,7 @@ impl MaintenanceLease {
     ///
     /// # Errors
     /// [`Error::Maintained`] if another process holds it, or what the store says.
-    pub(crate) async fn acquire(lake: &Lake) -> Result<Self> {
+    pub async fn acquire(lake: &Lake) -> Result<Self> {
         lake.ensure_exclusive().await?;
         let (store, location, record) = (lake.store(), lake.location().to_owned(), LeaseRecord::new());
         let last = last_number(store.as_ref()).await?;
@@ -99,7 +99,7 @@ impl MaintenanceLease {
     ///
     /// # Errors
     /// [`Error::LeaseLost`] if another process has taken it over, or what the store says.
-    pub(crate) async fn ensure_held(&mut self) -> Result<()> {
+    pub async fn ensure_held(&mut self) -> Result<()> {
         let lost = || Error::LeaseLost { location: self.location.clone() };
         if self.renewed.elapsed() >= RENEW_EVERY {
             self.record.expires = Utc::now() + HOLDS;
@@ -123,7 +123,7 @@ impl MaintenanceLease {
     ///
     /// # Errors
     /// What the store says.
-    pub(crate) async fn release(mut self) -> Result<()> {
+    pub async fn release(mut self) -> Result<()> {
         self.record.expires = DateTime::UNIX_EPOCH;
         if create_lease(self.store.as_ref(), self.number + 1, &self.record).await? {
             delete_before(self.store.as_ref(), self.number + 1).await;

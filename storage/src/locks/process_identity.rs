@@ -26,12 +26,12 @@ enum ProcessState {
 
 impl ProcessIdentity {
     /// Returns the identity of this process; None if the system does not tell.
-    pub(super) fn current() -> Option<Self> {
+    pub fn current() -> Option<Self> {
         Self::from_pid(std::process::id())
     }
 
     /// Returns the identity of a running process of this machine.
-    pub(super) fn from_pid(pid: u32) -> Option<Self> {
+    pub fn from_pid(pid: u32) -> Option<Self> {
         let ProcessState::Running { started_ticks } = process_state(pid) else { return None };
         let boot = fs::read_to_string("/proc/sys/kernel/random/boot_id").ok()?.trim().to_owned();
         let namespace = fs::read_link("/proc/self/ns/pid").ok()?.to_string_lossy().into_owned();
@@ -39,7 +39,7 @@ impl ProcessIdentity {
     }
 
     /// Returns whether the process has ended. False for processes of other machines, of which this one cannot tell.
-    pub(super) fn has_ended(&self) -> bool {
+    pub fn has_ended(&self) -> bool {
         let is_here = Self::current().is_some_and(|here| here.boot == self.boot && here.namespace == self.namespace);
         is_here
             && match process_state(self.pid) {

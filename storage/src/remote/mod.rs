@@ -39,9 +39,9 @@ pub(crate) use retrying::{RetriedError, RetryingStore};
 #[derive(Debug, Default)]
 pub(crate) struct RemoteStore {
     /// The result of the probe that writers make first.
-    pub(crate) probed: OnceCell<()>,
+    pub probed: OnceCell<()>,
     /// Uploads in parts.
-    pub(crate) parts: Option<PartStore>,
+    pub parts: Option<PartStore>,
 }
 
 /// Opens the store of a URL such as `s3://bucket/prefix`, from its prefix on. Nothing is requested yet.

@@ -22,7 +22,7 @@ impl fmt::Debug for PartStore {
 }
 
 impl PartStore {
-    pub(super) fn new(store: Arc<dyn MultipartStore>, prefix: Path) -> Self {
+    pub fn new(store: Arc<dyn MultipartStore>, prefix: Path) -> Self {
         Self { store, prefix }
     }
 
@@ -31,13 +31,13 @@ impl PartStore {
     }
 
     /// Begins an upload; returns its id. An id whose answer was lost is never used: the bucket's rule aborts it.
-    pub(crate) async fn begin_upload(&self, path: &Path) -> StoreResult<String> {
+    pub async fn begin_upload(&self, path: &Path) -> StoreResult<String> {
         let path = self.path_in_bucket(path);
         retry_operation(|| self.store.create_multipart(&path)).await
     }
 
     /// Uploads a part; parts count from 0. Returns its id.
-    pub(crate) async fn put_part(
+    pub async fn put_part(
         &self,
         path: &Path,
         upload: &str,
@@ -50,7 +50,7 @@ impl PartStore {
     }
 
     /// Makes the object of all parts, by their ids in order.
-    pub(crate) async fn complete_upload(&self, path: &Path, upload: &str, parts: Vec<String>) -> StoreResult<()> {
+    pub async fn complete_upload(&self, path: &Path, upload: &str, parts: Vec<String>) -> StoreResult<()> {
         let (path, upload) = (self.path_in_bucket(path), upload.to_owned());
         let parts: Vec<_> = parts.into_iter().map(|content_id| PartId { content_id }).collect();
         retry_operation(|| self.store.complete_multipart(&path, &upload, parts.clone())).await.map(drop)

@@ -36,8 +36,8 @@ const WHOLE_BODY: u64 = 16 << 20;
 #[derive(Debug, thiserror::Error)]
 #[error("{source}")]
 pub(crate) struct RetriedError {
-    pub(crate) tries: u32,
-    pub(crate) source: StoreError,
+    pub tries: u32,
+    pub source: StoreError,
 }
 
 /// Time to wait after this many failures, half of it by chance, so that writers that met once do not meet again.
@@ -59,7 +59,7 @@ pub(crate) struct RetryingStore {
 }
 
 impl RetryingStore {
-    pub(crate) fn new(inner: Arc<dyn ObjectStore>) -> Self {
+    pub fn new(inner: Arc<dyn ObjectStore>) -> Self {
         Self { inner }
     }
 }

@@ -22,10 +22,10 @@ pub(crate) fn run_of_file(file: &DataFile) -> Option<RunId> {
 
 /// A run's row in `runs`.
 pub(crate) struct RunPointer<'a> {
-    pub(crate) run: VisibleRun,
+    pub run: VisibleRun,
     /// The version of `runs` that added it.
-    pub(crate) version: u64,
-    pub(crate) row_counts: Option<&'a RunRowCounts>,
+    pub version: u64,
+    pub row_counts: Option<&'a RunRowCounts>,
 }
 
 /// Lists the rows of `runs` that a file of that table shows.

@@ -29,9 +29,9 @@ impl std::fmt::Display for LackingRows {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct TableFault {
     /// The table.
-    pub(crate) table: Table,
+    pub table: Table,
     /// Files of another program are all that is wrong.
-    pub(crate) is_of_foreign_files: bool,
+    pub is_of_foreign_files: bool,
     is_unreadable: bool,
     found: String,
 }
@@ -41,7 +41,7 @@ impl TableFault {
         Self { table, is_of_foreign_files: false, is_unreadable: false, found: found.into() }
     }
 
-    pub(crate) fn from_lacking(table: Table, lacking: &[LackingRows]) -> Self {
+    pub fn from_lacking(table: Table, lacking: &[LackingRows]) -> Self {
         let first = lacking.first().map(ToString::to_string).unwrap_or_default();
         match lacking.len() {
             0 | 1 => Self::new(table, first),
@@ -49,28 +49,28 @@ impl TableFault {
         }
     }
 
-    pub(crate) fn from_foreign(table: Table, file: &DataFile) -> Self {
+    pub fn from_foreign(table: Table, file: &DataFile) -> Self {
         let found = format!("another program put `{}` into its log", file.path);
         Self { is_of_foreign_files: true, ..Self::new(table, found) }
     }
 
-    pub(crate) fn without_rig(table: Table) -> Self {
+    pub fn without_rig(table: Table) -> Self {
         Self::new(table, "it has none of the rig's rows")
     }
 
-    pub(crate) fn without_log(table: Table) -> Self {
+    pub fn without_log(table: Table) -> Self {
         Self::new(table, "it has no log, and `runs/` has run files")
     }
 
-    pub(crate) fn unfinished() -> Self {
+    pub fn unfinished() -> Self {
         Self::new(Table::Runs, "it was emptied or changed by another program, and not all run files are in it again")
     }
 
-    pub(crate) fn unreadable(table: Table, found: String) -> Self {
+    pub fn unreadable(table: Table, found: String) -> Self {
         Self { is_unreadable: true, ..Self::new(table, found) }
     }
 
-    pub(crate) fn to_error(&self) -> Error {
+    pub fn to_error(&self) -> Error {
         let (table, found) = (self.table.name(), self.found.clone());
         match self.is_unreadable {
             true => Error::Log { table, action: "read", source: found.into() },

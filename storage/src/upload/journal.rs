@@ -55,7 +55,7 @@ impl UploadJournal {
     ///
     /// # Errors
     /// [`Error::UploadBusy`], or [`Error::UploadFile`] if it cannot be read or written.
-    pub(super) fn open(run: &RunUpload, location: &str, to: &Path) -> Result<Self> {
+    pub fn open(run: &RunUpload, location: &str, to: &Path) -> Result<Self> {
         let mut path = run.file.as_os_str().to_owned();
         path.push(".");
         path.push(SUFFIX);
@@ -83,22 +83,22 @@ impl UploadJournal {
     }
 
     /// Returns whether parts may have been sent.
-    pub(super) fn is_begun(&self) -> bool {
+    pub fn is_begun(&self) -> bool {
         self.upload.is_some()
     }
 
     /// Id of the upload, once it is begun.
-    pub(super) fn upload_id(&self) -> Option<&str> {
+    pub fn upload_id(&self) -> Option<&str> {
         self.upload.as_deref()
     }
 
     /// Ids of the parts that are in the store, by number.
-    pub(super) fn part_ids(&self) -> &BTreeMap<usize, String> {
+    pub fn part_ids(&self) -> &BTreeMap<usize, String> {
         &self.parts
     }
 
     /// Notes the beginning of an upload.
-    pub(super) fn begin_upload(&mut self, upload: String) -> Result<()> {
+    pub fn begin_upload(&mut self, upload: String) -> Result<()> {
         let line = FirstLine { head: self.wanted.clone(), upload: upload.clone() };
         self.append_line(&line)?;
         self.upload = Some(upload);
@@ -106,21 +106,21 @@ impl UploadJournal {
     }
 
     /// Notes a part that is in the store.
-    pub(super) fn add_part(&mut self, part: usize, id: String) -> Result<()> {
+    pub fn add_part(&mut self, part: usize, id: String) -> Result<()> {
         self.append_line(&PartLine { part, id: id.clone() })?;
         self.parts.insert(part, id);
         Ok(())
     }
 
     /// Forgets the upload: it is begun anew.
-    pub(super) fn restart_upload(&mut self) -> Result<()> {
+    pub fn restart_upload(&mut self) -> Result<()> {
         (self.upload, self.parts) = (None, BTreeMap::new());
         let emptied = self.file.set_len(0).and_then(|()| self.file.rewind());
         emptied.map_err(|e| journal_error("write", &self.path, e))
     }
 
     /// Deletes it: the upload is at its end.
-    pub(super) fn delete_journal(self) -> Result<()> {
+    pub fn delete_journal(self) -> Result<()> {
         std::fs::remove_file(&self.path).map_err(|e| journal_error("delete", &self.path, e))
     }
 

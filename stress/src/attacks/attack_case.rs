@@ -28,7 +28,7 @@ impl AttackCase {
         Self { family, kind }
     }
 
-    pub(crate) fn name(&self) -> &'static str {
+    pub fn name(&self) -> &'static str {
         match self.kind {
             AttackKind::Sql(attack, _) => attack.name,
             AttackKind::Wire(_, attack) => attack.name,
@@ -36,7 +36,7 @@ impl AttackCase {
         }
     }
 
-    pub(crate) fn protocol(&self) -> &'static str {
+    pub fn protocol(&self) -> &'static str {
         match self.kind {
             AttackKind::Sql(_, protocol) => protocol.name(),
             AttackKind::Wire(port, _) => port.name(),
@@ -45,12 +45,12 @@ impl AttackCase {
     }
 
     /// Returns what `--only` looks at.
-    pub(crate) fn title(&self) -> String {
+    pub fn title(&self) -> String {
         format!("{} {}", self.name(), self.protocol())
     }
 
     /// Attacks until the end, or until the client's connections are closed; returns how each connection ended.
-    pub(crate) fn run(&self, client: &QueryClient) -> Vec<String> {
+    pub fn run(&self, client: &QueryClient) -> Vec<String> {
         match self.kind {
             AttackKind::Sql(attack, protocol) => ask_at_once(client, protocol, &(attack.text)()),
             AttackKind::Wire(port, attack) => attack.run(port, client),

@@ -31,25 +31,25 @@ pub(crate) enum ServerFate {
 /// An attack over one protocol and what it did.
 #[derive(Debug, Clone)]
 pub(crate) struct AttackRow {
-    pub(super) name: &'static str,
-    pub(super) protocol: &'static str,
+    pub name: &'static str,
+    pub protocol: &'static str,
     /// Outcome of each of the attacker's connections.
-    pub(super) outcomes: Vec<String>,
-    pub(super) took: Duration,
-    pub(super) light: LightReport,
-    pub(super) peak: MemoryPeak,
+    pub outcomes: Vec<String>,
+    pub took: Duration,
+    pub light: LightReport,
+    pub peak: MemoryPeak,
     /// Memory of all processes before.
-    pub(super) idle_mib: u64,
+    pub idle_mib: u64,
     /// Memory that the attacker's queries may hold.
-    pub(super) limit_mib: u64,
+    pub limit_mib: u64,
     /// Processor time in the second that begins half a second after the attack.
-    pub(super) idle_time: Duration,
-    pub(super) fate: ServerFate,
+    pub idle_time: Duration,
+    pub fate: ServerFate,
 }
 
 impl AttackRow {
     /// Returns the goals that it misses.
-    pub(crate) fn missed_goals(&self) -> Vec<&'static str> {
+    pub fn missed_goals(&self) -> Vec<&'static str> {
         let goals = [
             ("the door lives", !matches!(self.fate, ServerFate::Died(_) | ServerFate::Capped)),
             ("light queries are right", self.light.failures.is_empty()),

@@ -23,12 +23,12 @@ pub(super) struct AttackTrial<'a> {
 
 impl<'a> AttackTrial<'a> {
     /// `number` says which of the hostile clients attacks.
-    pub(super) fn new(server: &'a mut ObservedServer, number: usize) -> Self {
+    pub fn new(server: &'a mut ObservedServer, number: usize) -> Self {
         let attacker = server.client("hostile", number);
         Self { server, attacker }
     }
 
-    pub(super) fn run(mut self, case: &AttackCase, seconds: f64) -> AttackRow {
+    pub fn run(mut self, case: &AttackCase, seconds: f64) -> AttackRow {
         let idle_mib = self.server.process_tree().memory().total_kib >> 10;
         let watch = MemoryWatch::start(self.server.process_tree());
         let light = LightLoad::start(self.server);

@@ -11,8 +11,8 @@ const TICKS: f64 = 100.0;
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct MeasuredCost {
     /// CPU time of all threads, user and system.
-    pub(crate) cpu: f64,
-    pub(crate) wall: f64,
+    pub cpu: f64,
+    pub wall: f64,
 }
 
 /// A clock that runs.
@@ -22,24 +22,24 @@ pub(crate) struct CostMeter {
 }
 
 impl MeasuredCost {
-    pub(crate) const NONE: Self = Self { cpu: f64::INFINITY, wall: f64::INFINITY };
+    pub const NONE: Self = Self { cpu: f64::INFINITY, wall: f64::INFINITY };
 
-    pub(crate) fn plus(self, other: Self) -> Self {
+    pub fn plus(self, other: Self) -> Self {
         Self { cpu: self.cpu + other.cpu, wall: self.wall + other.wall }
     }
 
     /// The least of both, each by itself: what disturbs one need not disturb the other.
-    pub(crate) fn least(self, other: Self) -> Self {
+    pub fn least(self, other: Self) -> Self {
         Self { cpu: self.cpu.min(other.cpu), wall: self.wall.min(other.wall) }
     }
 }
 
 impl CostMeter {
-    pub(crate) fn start() -> Result<Self> {
+    pub fn start() -> Result<Self> {
         Ok(Self { cpu: process_cpu()?, wall: Instant::now() })
     }
 
-    pub(crate) fn stop(self) -> Result<MeasuredCost> {
+    pub fn stop(self) -> Result<MeasuredCost> {
         Ok(MeasuredCost { cpu: process_cpu()? - self.cpu, wall: self.wall.elapsed().as_secs_f64() })
     }
 }

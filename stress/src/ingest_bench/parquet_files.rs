@@ -23,23 +23,23 @@ const BATCH_ROWS: usize = 512;
 
 /// A file that ingest wrote.
 pub(crate) struct StoredTableFile {
-    pub(crate) table: Table,
+    pub table: Table,
     /// It is of a reference's run.
-    pub(crate) of_reference: bool,
-    pub(crate) bytes: Bytes,
+    pub of_reference: bool,
+    pub bytes: Bytes,
 }
 
 /// A file's rows, and how they were written.
 pub(crate) struct FileRows {
-    pub(crate) table: Table,
-    pub(crate) of_reference: bool,
-    pub(crate) schema: SchemaRef,
-    pub(crate) batches: Vec<RecordBatch>,
-    pub(crate) properties: WriterProperties,
+    pub table: Table,
+    pub of_reference: bool,
+    pub schema: SchemaRef,
+    pub batches: Vec<RecordBatch>,
+    pub properties: WriterProperties,
     /// Size as it was.
-    pub(crate) bytes: u64,
+    pub bytes: u64,
     /// Its numbers as raw f32 and f64.
-    pub(crate) raw: u64,
+    pub raw: u64,
 }
 
 /// Encoding of columns of numbers.
@@ -76,7 +76,7 @@ pub(crate) async fn read_table_files(lake: &Lake) -> anyhow::Result<Vec<StoredTa
 }
 
 impl FileRows {
-    pub(crate) fn read(
+    pub fn read(
         &StoredTableFile { table, of_reference, bytes: ref file }: &StoredTableFile,
     ) -> anyhow::Result<Self> {
         let builder = ParquetRecordBatchReaderBuilder::try_new(file.clone())?.with_batch_size(BATCH_ROWS);
@@ -90,7 +90,7 @@ impl FileRows {
     }
 
     /// Writes them with the parquet crate and nothing else.
-    pub(crate) fn write(&self, properties: &WriterProperties) -> ParquetResult<Vec<u8>> {
+    pub fn write(&self, properties: &WriterProperties) -> ParquetResult<Vec<u8>> {
         let options = ArrowWriterOptions::new().with_properties(properties.clone()).with_skip_arrow_metadata(true);
         let mut writer = ArrowWriter::try_new_with_options(Vec::new(), self.schema.clone(), options)?;
         self.batches.iter().try_for_each(|batch| writer.write(batch))?;

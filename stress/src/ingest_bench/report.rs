@@ -34,23 +34,23 @@ impl FigureGoal {
 }
 
 impl FigureReport {
-    pub(crate) fn new() -> Self {
+    pub fn new() -> Self {
         Self { missed: Vec::new(), goals: 0 }
     }
 
-    pub(crate) fn title(&mut self, text: &str) -> Result<()> {
+    pub fn title(&mut self, text: &str) -> Result<()> {
         Ok(writeln!(std::io::stdout().lock(), "\n{text}")?)
     }
 
-    pub(crate) fn line(&mut self, text: &str) -> Result<()> {
+    pub fn line(&mut self, text: &str) -> Result<()> {
         Ok(writeln!(std::io::stdout().lock(), "  {text}")?)
     }
 
-    pub(crate) fn figure(&mut self, name: &str, figure: f64, unit: &str) -> Result<()> {
+    pub fn figure(&mut self, name: &str, figure: f64, unit: &str) -> Result<()> {
         self.line(&format!("{name:<66} {figure:>10.3} {unit}"))
     }
 
-    pub(crate) fn goal(&mut self, name: &str, figure: f64, unit: &str, goal: FigureGoal) -> Result<()> {
+    pub fn goal(&mut self, name: &str, figure: f64, unit: &str, goal: FigureGoal) -> Result<()> {
         self.goals += 1;
         let outcome = match goal.is_met(figure) {
             true => "met",
@@ -63,7 +63,7 @@ impl FigureReport {
     }
 
     /// Says how many goals were met; a missed one is no failure of the benchmark.
-    pub(crate) fn finish(self) -> Result<()> {
+    pub fn finish(self) -> Result<()> {
         let met = self.goals - self.missed.len();
         let missed =
             if self.missed.is_empty() { String::new() } else { format!("; missed: {}", self.missed.join(", ")) };

@@ -28,45 +28,45 @@ pub(crate) const REFERENCES: usize = 2;
 /// Runs' files.
 pub(crate) struct SimulatedRuns {
     /// In the collection's order.
-    pub(crate) files: Vec<PathBuf>,
+    pub files: Vec<PathBuf>,
     /// All of them.
-    pub(crate) all: RunCounts,
+    pub all: RunCounts,
     /// Those that are no references.
-    pub(crate) panels: RunCounts,
+    pub panels: RunCounts,
 }
 
 /// Attempts, accepted measurements and bytes of some runs.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct RunCounts {
-    pub(crate) attempts: u64,
-    pub(crate) accepted: u64,
-    pub(crate) bytes: u64,
+    pub attempts: u64,
+    pub accepted: u64,
+    pub bytes: u64,
 }
 
 /// Runs to be made.
 pub(crate) struct SimulationOrder<'a> {
-    pub(crate) count: usize,
-    pub(crate) keep: RecordingMode,
+    pub count: usize,
+    pub keep: RecordingMode,
     /// Pairs after which each run is stopped.
-    pub(crate) pairs: usize,
-    pub(crate) seed: u64,
-    pub(crate) folder: &'a Path,
+    pub pairs: usize,
+    pub seed: u64,
+    pub folder: &'a Path,
 }
 
 /// A lake that has just taken in runs.
 pub(crate) struct IngestedLake {
-    pub(crate) lake: Lake,
-    pub(crate) folder: PathBuf,
+    pub lake: Lake,
+    pub folder: PathBuf,
     /// Of all runs.
-    pub(crate) whole: MeasuredCost,
+    pub whole: MeasuredCost,
     /// Of those that are no references, with the references there.
-    pub(crate) panels: MeasuredCost,
-    pub(crate) peak_mib: f64,
+    pub panels: MeasuredCost,
+    pub peak_mib: f64,
 }
 
 impl SimulationOrder<'_> {
     /// Makes them, on all cores.
-    pub(crate) fn make(&self) -> Result<SimulatedRuns> {
+    pub fn make(&self) -> Result<SimulatedRuns> {
         std::fs::create_dir_all(self.folder)?;
         let members = collection_surfaces(self.seed, self.count)?;
         let cores = std::thread::available_parallelism().map_or(1, usize::from);
@@ -118,7 +118,7 @@ impl SimulationOrder<'_> {
 
 impl SimulatedRuns {
     /// Ingests them into a lake of its own, which replaces the one before.
-    pub(crate) async fn ingest(&self, folder: &Path) -> Result<IngestedLake> {
+    pub async fn ingest(&self, folder: &Path) -> Result<IngestedLake> {
         if folder.exists() {
             std::fs::remove_dir_all(folder)?;
         }

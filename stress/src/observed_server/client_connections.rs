@@ -27,15 +27,15 @@ pub(crate) struct ClientConnections {
 }
 
 impl ClientConnections {
-    pub(crate) fn new(source: Ipv4Addr) -> Self {
+    pub fn new(source: Ipv4Addr) -> Self {
         Self { source, streams: Mutex::default(), is_closed: watch::Sender::new(false) }
     }
 
-    pub(crate) fn source(&self) -> Ipv4Addr {
+    pub fn source(&self) -> Ipv4Addr {
         self.source
     }
 
-    pub(crate) fn is_closed(&self) -> bool {
+    pub fn is_closed(&self) -> bool {
         *self.is_closed.borrow()
     }
 
@@ -43,7 +43,7 @@ impl ClientConnections {
     ///
     /// # Errors
     /// The connection is not accepted, or all are closed already.
-    pub(crate) fn connect(&self, address: &str) -> io::Result<Arc<TcpStream>> {
+    pub fn connect(&self, address: &str) -> io::Result<Arc<TcpStream>> {
         if self.is_closed() {
             return Err(io::ErrorKind::ConnectionAborted.into());
         }
@@ -60,7 +60,7 @@ impl ClientConnections {
     }
 
     /// Closes all connections: whoever reads or writes on one gets an error.
-    pub(crate) fn close_all(&self) {
+    pub fn close_all(&self) {
         self.is_closed.send_replace(true);
         let mut streams = self.streams.lock().unwrap_or_else(PoisonError::into_inner);
         for stream in streams.drain(..) {
@@ -70,7 +70,7 @@ impl ClientConnections {
     }
 
     /// Does something, and closes the connections at the limit, which ends whatever it waits for.
-    pub(crate) fn close_after<T>(&self, limit: Duration, work: impl FnOnce() -> T) -> T {
+    pub fn close_after<T>(&self, limit: Duration, work: impl FnOnce() -> T) -> T {
         let (done, wait) = channel::<()>();
         std::thread::scope(|scope| {
             scope.spawn(move || {
@@ -85,7 +85,7 @@ impl ClientConnections {
     }
 
     /// Runs asynchronous work of the client to its end; None if its connections are closed before.
-    pub(crate) fn run<T>(&self, work: impl Future<Output = T>) -> Option<T> {
+    pub fn run<T>(&self, work: impl Future<Output = T>) -> Option<T> {
         let mut closing = self.is_closed.subscribe();
         CLIENT_RUNTIME.block_on(async {
             tokio::select! {

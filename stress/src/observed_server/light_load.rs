@@ -30,11 +30,11 @@ enum LightProbe {
 #[derive(Debug, Clone, Default)]
 pub(crate) struct LightReport {
     /// Times of light queries, those that failed included.
-    pub(crate) queries: Vec<Duration>,
+    pub queries: Vec<Duration>,
     /// Times of `/health`.
-    pub(crate) health: Vec<Duration>,
+    pub health: Vec<Duration>,
     /// Answers that were not the right ones.
-    pub(crate) failures: Vec<String>,
+    pub failures: Vec<String>,
 }
 
 /// Threads that probe until they are stopped.
@@ -44,7 +44,7 @@ pub(crate) struct LightLoad {
 }
 
 impl LightLoad {
-    pub(crate) fn start(server: &ObservedServer) -> Self {
+    pub fn start(server: &ObservedServer) -> Self {
         let report = Arc::<Mutex<LightReport>>::default();
         let kinds = [(LightProbe::HttpQuery, 0), (LightProbe::PostgresQuery, 1), (LightProbe::Health, 2)];
         let probes = kinds.map(|(probe, number)| {
@@ -57,12 +57,12 @@ impl LightLoad {
     }
 
     /// Begins no more probes.
-    pub(crate) fn pause(&self) {
+    pub fn pause(&self) {
         self.probes.iter().for_each(RepeatedWork::stop);
     }
 
     /// Waits for the probes that run, and returns what all of them found.
-    pub(crate) fn stop(self) -> LightReport {
+    pub fn stop(self) -> LightReport {
         drop(self.probes);
         self.report.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }

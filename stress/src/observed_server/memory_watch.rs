@@ -14,10 +14,10 @@ const MEMORY_CAP_MIB: u64 = 6 << 10;
 /// The most that was in memory, MiB.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct MemoryPeak {
-    pub(crate) door_mib: u64,
-    pub(crate) total_mib: u64,
+    pub door_mib: u64,
+    pub total_mib: u64,
     /// True if the processes were killed because they took too much.
-    pub(crate) is_capped: bool,
+    pub is_capped: bool,
 }
 
 /// Samples until it is dropped.
@@ -27,7 +27,7 @@ pub(crate) struct MemoryWatch {
 }
 
 impl MemoryWatch {
-    pub(crate) fn start(tree: ProcessTree) -> Self {
+    pub fn start(tree: ProcessTree) -> Self {
         let peak = Arc::<Mutex<MemoryPeak>>::default();
         let sampled = peak.clone();
         let _sampler = RepeatedWork::start(SAMPLE_EVERY, move || take_sample(tree, &sampled));
@@ -35,7 +35,7 @@ impl MemoryWatch {
     }
 
     /// Returns the peak so far.
-    pub(crate) fn peak(&self) -> MemoryPeak {
+    pub fn peak(&self) -> MemoryPeak {
         *self.peak.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

@@ -42,10 +42,10 @@ const WARM_UP_QUERIES: usize = 5;
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct ClientGroup {
     /// The token file has `NAME-0`, `NAME-1`, ...
-    pub(crate) name: &'static str,
-    pub(crate) count: usize,
+    pub name: &'static str,
+    pub count: usize,
     /// Lines of the token file: `seconds = 10`.
-    pub(crate) limits: &'static str,
+    pub limits: &'static str,
 }
 
 /// A token and whose it is.
@@ -58,9 +58,9 @@ struct ClientToken {
 /// Addresses of the protocols.
 #[derive(Debug, Clone)]
 pub(crate) struct ServerAddresses {
-    pub(crate) http: String,
-    pub(crate) flight_sql: String,
-    pub(crate) postgres: String,
+    pub http: String,
+    pub flight_sql: String,
+    pub postgres: String,
 }
 
 /// A server, restarted if it dies.
@@ -71,7 +71,7 @@ pub(crate) struct ObservedServer {
     served: ServedLake,
     runs: Vec<String>,
     /// Number of restarts.
-    pub(crate) restarts: usize,
+    pub restarts: usize,
 }
 
 impl ObservedServer {
@@ -79,7 +79,7 @@ impl ObservedServer {
     ///
     /// # Errors
     /// A command fails.
-    pub(crate) fn start(binary: &Path, groups: &[ClientGroup]) -> Result<Self> {
+    pub fn start(binary: &Path, groups: &[ClientGroup]) -> Result<Self> {
         let folder = tempfile::tempdir()?;
         std::fs::write(folder.path().join("rig.toml"), SMALL_RIG)?;
         for surface in SURFACES {
@@ -94,49 +94,49 @@ impl ObservedServer {
         Ok(server)
     }
 
-    pub(crate) fn addresses(&self) -> ServerAddresses {
+    pub fn addresses(&self) -> ServerAddresses {
         let ServedLake { http, flight_sql, postgres, .. } = &self.served;
         ServerAddresses { http: http.clone(), flight_sql: flight_sql.clone(), postgres: postgres.clone() }
     }
 
     /// Returns the token of client `NAME-NUMBER`; numbers beyond the group's begin again at 0.
-    pub(crate) fn token(&self, group: &str, number: usize) -> &str {
+    pub fn token(&self, group: &str, number: usize) -> &str {
         let is_member = |t: &&ClientToken| t.name.rsplit_once('-').is_some_and(|(name, _)| name == group);
         let members: Vec<_> = self.tokens.iter().filter(is_member).collect();
         members.get(number % members.len().max(1)).map_or("", |member| &member.token)
     }
 
     /// Returns a client of the group with connections of its own.
-    pub(crate) fn client(&self, group: &str, number: usize) -> QueryClient {
+    pub fn client(&self, group: &str, number: usize) -> QueryClient {
         QueryClient::new(self.addresses(), self.token(group, number), self.run_name())
     }
 
     /// Returns the name of a run of the lake.
-    pub(crate) fn run_name(&self) -> &str {
+    pub fn run_name(&self) -> &str {
         self.runs.first().map_or("", String::as_str)
     }
 
     /// Returns the number of runs of the lake.
-    pub(crate) fn run_count(&self) -> usize {
+    pub fn run_count(&self) -> usize {
         self.runs.len()
     }
 
-    pub(crate) fn process_tree(&self) -> ProcessTree {
+    pub fn process_tree(&self) -> ProcessTree {
         ProcessTree::new(self.served.id())
     }
 
-    pub(crate) fn is_alive(&mut self) -> bool {
+    pub fn is_alive(&mut self) -> bool {
         self.served.is_up()
     }
 
     /// Returns the last lines that it wrote to stderr.
-    pub(crate) fn last_words(&self) -> String {
+    pub fn last_words(&self) -> String {
         let said = self.served.said();
         said[said.len().saturating_sub(3)..].join(" / ")
     }
 
     /// Kills it with its engines and starts another on the same lake.
-    pub(crate) fn restart(&mut self) {
+    pub fn restart(&mut self) {
         self.process_tree().kill();
         self.served = serve_lake(&self.binary, self.folder.path());
         self.restarts += 1;
@@ -144,7 +144,7 @@ impl ObservedServer {
     }
 
     /// Waits until its processes work less than a hundredth of the time; returns false if they still do at the limit.
-    pub(crate) fn wait_until_idle(&self, limit: Duration) -> bool {
+    pub fn wait_until_idle(&self, limit: Duration) -> bool {
         let begun = Instant::now();
         while begun.elapsed() < limit {
             if self.process_tree().processor_time_over(Duration::from_millis(300)) <= Duration::from_millis(10) {

@@ -50,7 +50,7 @@ impl PostgresClient {
     ///
     /// # Errors
     /// The connection ends, or the state of a refusal.
-    pub(crate) fn log_in(client: &QueryClient) -> io::Result<Result<Self, String>> {
+    pub fn log_in(client: &QueryClient) -> io::Result<Result<Self, String>> {
         let stream = client.connections.connect(&client.addresses.postgres)?;
         let password = tagged_message(b'p', &[client.token.as_bytes(), b"\0"].concat());
         (&*stream).write_all(&[startup_message(), password].concat())?;
@@ -70,7 +70,7 @@ impl PostgresClient {
     ///
     /// # Errors
     /// The connection ends.
-    pub(crate) fn send(&self, bytes: &[u8]) -> io::Result<()> {
+    pub fn send(&self, bytes: &[u8]) -> io::Result<()> {
         (&*self.stream).write_all(bytes)
     }
 
@@ -78,12 +78,12 @@ impl PostgresClient {
     ///
     /// # Errors
     /// The connection ends.
-    pub(crate) fn begin_query(&self, sql: &str) -> io::Result<()> {
+    pub fn begin_query(&self, sql: &str) -> io::Result<()> {
         self.send(&tagged_message(b'Q', &[sql.as_bytes(), b"\0"].concat()))
     }
 
     /// Reads the answer of the sent messages, up to the next ReadyForQuery.
-    pub(crate) fn read_answer(&mut self) -> QueryOutcome {
+    pub fn read_answer(&mut self) -> QueryOutcome {
         let mut digest = AnswerDigest::default();
         let mut failed = None;
         let mut is_complete = false;
@@ -103,7 +103,7 @@ impl PostgresClient {
     ///
     /// # Errors
     /// The server does not accept it.
-    pub(crate) fn send_cancel(&self, client: &QueryClient) -> io::Result<()> {
+    pub fn send_cancel(&self, client: &QueryClient) -> io::Result<()> {
         let stream = client.connections.connect(&client.addresses.postgres)?;
         let body = [&CANCEL_CODE.to_be_bytes()[..], &self.cancel_key].concat();
         (&*stream).write_all(&[&message_length(&body)[..], &body].concat())

@@ -29,32 +29,32 @@ struct ProcessEntry {
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct TreeMemory {
     /// Of the process that was started: it holds the connections.
-    pub(crate) door_kib: u64,
+    pub door_kib: u64,
     /// Of all processes.
-    pub(crate) total_kib: u64,
+    pub total_kib: u64,
 }
 
 impl ProcessTree {
-    pub(crate) fn new(root: u32) -> Self {
+    pub fn new(root: u32) -> Self {
         Self { root }
     }
 
     /// Returns the processor time of all of its processes since their start, those that ended included.
-    pub(crate) fn processor_time(&self) -> Duration {
+    pub fn processor_time(&self) -> Duration {
         let ticks = |p: &ProcessEntry| p.own_ticks + if p.pid == self.root { p.child_ticks } else { 0 };
         let total: u64 = self.processes().iter().map(ticks).sum();
         CLOCK_TICK * u32::try_from(total).unwrap_or(u32::MAX)
     }
 
     /// Returns the processor time that its processes take from now on for so long.
-    pub(crate) fn processor_time_over(&self, time: Duration) -> Duration {
+    pub fn processor_time_over(&self, time: Duration) -> Duration {
         let before = self.processor_time();
         std::thread::sleep(time);
         self.processor_time().saturating_sub(before)
     }
 
     /// Returns the time from `since` until the processes become idle; None if they are not at the limit.
-    pub(crate) fn time_until_idle(&self, since: Instant, limit: Duration) -> Option<Duration> {
+    pub fn time_until_idle(&self, since: Instant, limit: Duration) -> Option<Duration> {
         const LOOK_EVERY: Duration = Duration::from_millis(20);
         // A tick in so many looks is what a server that waits takes.
         const IDLE_LOOKS: usize = 5;
@@ -74,7 +74,7 @@ impl ProcessTree {
 
     /// Returns the memory of its processes. Pages of the program's file are in memory once, however many processes map
     /// them, so they are counted once.
-    pub(crate) fn memory(&self) -> TreeMemory {
+    pub fn memory(&self) -> TreeMemory {
         let mut memory = TreeMemory::default();
         let mut most_mapped = 0;
         for process in self.processes() {
@@ -92,12 +92,12 @@ impl ProcessTree {
     }
 
     /// Returns the processes below the one that was started: its engines.
-    pub(crate) fn children(&self) -> Vec<u32> {
+    pub fn children(&self) -> Vec<u32> {
         self.processes().iter().map(|p| p.pid).filter(|pid| *pid != self.root).collect()
     }
 
     /// Kills all of its processes, the first one first, so that none is started again.
-    pub(crate) fn kill(&self) {
+    pub fn kill(&self) {
         for process in self.processes() {
             kill_process(process.pid);
         }

@@ -5,7 +5,7 @@ use super::{flight_query, http_query, postgres_query};
 
 impl QueryClient {
     /// Runs a query and reads its answer to the end.
-    pub(crate) fn query(&self, protocol: QueryProtocol, sql: &str) -> QueryOutcome {
+    pub fn query(&self, protocol: QueryProtocol, sql: &str) -> QueryOutcome {
         let outcome = match protocol {
             QueryProtocol::Http => http_query::query_http(self, sql),
             QueryProtocol::SliceFilter => http_query::query_slice(self, &slice_filter(sql)),

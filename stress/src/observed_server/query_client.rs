@@ -19,12 +19,12 @@ pub(crate) enum QueryProtocol {
 }
 
 impl QueryProtocol {
-    pub(crate) const ALL: [Self; 5] =
+    pub const ALL: [Self; 5] =
         [Self::Http, Self::PostgresSimple, Self::PostgresExtended, Self::FlightSql, Self::SliceFilter];
     /// Those that answer with the rows of any query.
-    pub(crate) const ROWS: [Self; 4] = [Self::Http, Self::PostgresSimple, Self::PostgresExtended, Self::FlightSql];
+    pub const ROWS: [Self; 4] = [Self::Http, Self::PostgresSimple, Self::PostgresExtended, Self::FlightSql];
 
-    pub(crate) fn name(self) -> &'static str {
+    pub fn name(self) -> &'static str {
         match self {
             Self::Http => "http",
             Self::PostgresSimple => "postgres-simple",
@@ -53,12 +53,12 @@ pub(crate) enum QueryOutcome {
 /// Digest that distinguishes answers: size and hash.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default)]
 pub(crate) struct AnswerDigest {
-    pub(crate) bytes: u64,
+    pub bytes: u64,
     hash: u64,
 }
 
 impl AnswerDigest {
-    pub(crate) fn update(&mut self, bytes: &[u8]) {
+    pub fn update(&mut self, bytes: &[u8]) {
         self.bytes += bytes.len() as u64;
         for byte in bytes {
             // FNV-1a (Fowler, Noll, Vo), which does not depend on how the bytes are cut.
@@ -93,20 +93,20 @@ impl fmt::Display for QueryOutcome {
 /// A client of a server. Every query has a connection of its own.
 #[derive(Clone)]
 pub(crate) struct QueryClient {
-    pub(crate) addresses: ServerAddresses,
-    pub(crate) token: String,
-    pub(crate) run: String,
-    pub(crate) connections: Arc<ClientConnections>,
+    pub addresses: ServerAddresses,
+    pub token: String,
+    pub run: String,
+    pub connections: Arc<ClientConnections>,
 }
 
 impl QueryClient {
-    pub(crate) fn new(addresses: ServerAddresses, token: &str, run: &str) -> Self {
+    pub fn new(addresses: ServerAddresses, token: &str, run: &str) -> Self {
         let connections = Arc::new(ClientConnections::new(Ipv4Addr::LOCALHOST));
         Self { addresses, token: token.to_owned(), run: run.to_owned(), connections }
     }
 
     /// Lets it come from another address.
-    pub(crate) fn with_source(mut self, source: Ipv4Addr) -> Self {
+    pub fn with_source(mut self, source: Ipv4Addr) -> Self {
         self.connections = Arc::new(ClientConnections::new(source));
         self
     }

@@ -13,7 +13,7 @@ pub(super) struct RepeatedWork {
 
 impl RepeatedWork {
     /// Starts the work, again and again so long after its beginning before.
-    pub(super) fn start(every: Duration, mut work: impl FnMut() + Send + 'static) -> Self {
+    pub fn start(every: Duration, mut work: impl FnMut() + Send + 'static) -> Self {
         let is_stopped = Arc::<AtomicBool>::default();
         let stop = is_stopped.clone();
         let thread = std::thread::spawn(move || {
@@ -27,7 +27,7 @@ impl RepeatedWork {
     }
 
     /// Does not begin the work again.
-    pub(super) fn stop(&self) {
+    pub fn stop(&self) {
         self.is_stopped.store(true, Ordering::Relaxed);
     }
 }

@@ -33,30 +33,30 @@ pub(crate) fn take_right_answers(client: &QueryClient, queries: &[&'static str])
 #[derive(Debug, Default)]
 pub(crate) struct AnswerTally {
     /// Times of right answers.
-    pub(crate) times: Vec<Duration>,
+    pub times: Vec<Duration>,
     /// Number of answers that look whole and are not the right ones.
-    pub(crate) wrong: usize,
+    pub wrong: usize,
     /// Number of errors with a code, by protocol and code.
-    pub(crate) refused: BTreeMap<String, usize>,
+    pub refused: BTreeMap<String, usize>,
     /// Number of answers over HTTP that were broken off, which is how it shows an error after the first byte.
-    pub(crate) broken_off: usize,
+    pub broken_off: usize,
     /// Number of connections that ended without a code, by protocol and how.
-    pub(crate) lost: BTreeMap<String, usize>,
+    pub lost: BTreeMap<String, usize>,
 }
 
 impl AnswerTally {
     /// Returns whether each answer was right, or seen to be none.
-    pub(crate) fn is_honest(&self) -> bool {
+    pub fn is_honest(&self) -> bool {
         self.wrong == 0 && self.lost.is_empty()
     }
 
     /// Returns whether each answer was right.
-    pub(crate) fn is_right(&self) -> bool {
+    pub fn is_right(&self) -> bool {
         self.is_honest() && self.refused.is_empty() && self.broken_off == 0
     }
 
     /// Counts the outcome of a query.
-    pub(crate) fn add(&mut self, protocol: QueryProtocol, outcome: QueryOutcome, right: &QueryOutcome, took: Duration) {
+    pub fn add(&mut self, protocol: QueryProtocol, outcome: QueryOutcome, right: &QueryOutcome, took: Duration) {
         let name = || format!("{}: {outcome}", protocol.name());
         match &outcome {
             outcome if outcome == right => self.times.push(took),

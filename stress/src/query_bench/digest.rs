@@ -12,12 +12,12 @@ const TOLERANCE: f64 = 1e-9;
 /// Rows, and of each column the sum of its numbers or of its texts' lengths.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct RowsDigest {
-    pub(crate) rows: u64,
-    pub(crate) sums: Vec<f64>,
+    pub rows: u64,
+    pub sums: Vec<f64>,
 }
 
 impl RowsDigest {
-    pub(crate) fn of(batches: &[RecordBatch]) -> Result<Self> {
+    pub fn of(batches: &[RecordBatch]) -> Result<Self> {
         let rows = batches.iter().map(|b| b.num_rows() as u64).sum();
         let columns = batches.first().map_or(0, RecordBatch::num_columns);
         let mut sums = vec![0.0; columns];
@@ -30,7 +30,7 @@ impl RowsDigest {
     }
 
     /// Returns whether two answers are the same but for rounding.
-    pub(crate) fn agrees(&self, other: &Self) -> bool {
+    pub fn agrees(&self, other: &Self) -> bool {
         let near = |a: &f64, b: &f64| (a - b).abs() <= TOLERANCE * a.abs().max(b.abs()).max(1.0);
         self.rows == other.rows
             && self.sums.len() == other.sums.len()

@@ -18,12 +18,12 @@ pub(crate) struct DuckdbPeer {
     ask: ChildStdin,
     answers: BufReader<ChildStdout>,
     /// DuckDB's version.
-    pub(crate) version: String,
+    pub version: String,
 }
 
 impl DuckdbPeer {
     /// Starts it, with a view a table over just these files.
-    pub(crate) fn start(python: &Path, tables: &[(String, Vec<String>)], threads: usize) -> Result<Self> {
+    pub fn start(python: &Path, tables: &[(String, Vec<String>)], threads: usize) -> Result<Self> {
         let mut child = Command::new(python)
             .arg(SCRIPT)
             .stdin(Stdio::piped())
@@ -41,7 +41,7 @@ impl DuckdbPeer {
     }
 
     /// Answers a query; seconds, and what came.
-    pub(crate) fn query(&mut self, sql: &str) -> Result<(f64, RowsDigest)> {
+    pub fn query(&mut self, sql: &str) -> Result<(f64, RowsDigest)> {
         let answer = self.exchange(&json!({ "sql": sql }))?;
         let seconds = answer["seconds"].as_f64().context("the peer gave no time")?;
         let sums = answer["sums"].as_array().context("the peer gave no sums")?;

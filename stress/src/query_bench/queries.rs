@@ -4,11 +4,11 @@
 /// One query of the benchmark.
 pub(crate) struct BenchQuery {
     /// Short name.
-    pub(crate) name: &'static str,
+    pub name: &'static str,
     /// Query for echolake.
-    pub(crate) sql: String,
+    pub sql: String,
     /// Query for DuckDB, if its tables need other words for the same rows.
-    pub(crate) peer: Option<String>,
+    pub peer: Option<String>,
 }
 
 /// The queries about a surface and a pair of the lake.

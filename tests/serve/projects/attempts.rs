@@ -2,15 +2,15 @@
 
 /// The names of what a client of another project must not see.
 pub(super) struct HiddenRun {
-    pub(super) surface: String,
-    pub(super) run: String,
+    pub surface: String,
+    pub run: String,
 }
 
 /// A statement that shows hidden runs to whoever may see them.
 pub(super) struct ProjectAttempt {
-    pub(super) sql: String,
+    pub sql: String,
     /// Its answer depends on rows alone, not on the files and versions in which they are.
-    pub(super) is_exact: bool,
+    pub is_exact: bool,
 }
 
 /// Tables and views that have rows of runs.

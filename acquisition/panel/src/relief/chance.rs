@@ -16,40 +16,40 @@ const fn mix_bits(mut x: u64) -> u64 {
 const STEP: u64 = 0x9E37_79B9_7F4A_7C15;
 
 impl SeededRandom {
-    pub(super) fn new(seed: u64, purpose: u64) -> Self {
+    pub fn new(seed: u64, purpose: u64) -> Self {
         Self(mix_bits(seed.wrapping_mul(STEP).wrapping_add(mix_bits(purpose.wrapping_add(STEP)))))
     }
 
     /// The chance of one place of a lattice.
-    pub(super) fn at_place(self, x: i64, y: i64) -> Self {
+    pub fn at_place(self, x: i64, y: i64) -> Self {
         let row = mix_bits(self.0.wrapping_add((y as u64).wrapping_mul(STEP)));
         Self(mix_bits(row ^ (x as u64).wrapping_mul(0xD6E8_FEB8_6659_FD93)))
     }
 
     /// The `n`-th number of it, 0 to 1 (never 1).
-    pub(super) fn unit_number(self, n: u64) -> f64 {
+    pub fn unit_number(self, n: u64) -> f64 {
         (self.whole_number(n) >> 11) as f64 / (1u64 << 53) as f64
     }
 
     /// The same, -1 to 1.
-    pub(super) fn signed_number(self, n: u64) -> f64 {
+    pub fn signed_number(self, n: u64) -> f64 {
         2.0 * self.unit_number(n) - 1.0
     }
 
     /// The `n`-th whole number of it.
-    pub(super) fn whole_number(self, n: u64) -> u64 {
+    pub fn whole_number(self, n: u64) -> u64 {
         mix_bits(self.0.wrapping_add((n + 1).wrapping_mul(STEP)))
     }
 
     /// Returns 0 to `count - 1` in an order of chance.
-    pub(super) fn random_order(self, count: usize) -> Vec<usize> {
+    pub fn random_order(self, count: usize) -> Vec<usize> {
         let mut order: Vec<usize> = (0..count).collect();
         order.sort_by_key(|n| self.at_place(*n as i64, 1).whole_number(0));
         order
     }
 
     /// Smooth noise over the plane, -1 to 1, with features of about the length 1.
-    pub(super) fn smooth_noise(self, x: f64, y: f64) -> f64 {
+    pub fn smooth_noise(self, x: f64, y: f64) -> f64 {
         let (ix, iy) = (x.floor(), y.floor());
         let corner = |dx: i64, dy: i64| self.at_place(ix as i64 + dx, iy as i64 + dy).signed_number(0);
         let (u, v) = (fade_curve(x - ix), fade_curve(y - iy));

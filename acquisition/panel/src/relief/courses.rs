@@ -67,7 +67,7 @@ struct StoneCourse {
 }
 
 impl CoursedStones {
-    pub(super) fn from_settings(settings: &WallSettings) -> Self {
+    pub fn from_settings(settings: &WallSettings) -> Self {
         let height = settings.course_height_mm / FULL_SCALE;
         let length = settings.stone_length_mm / FULL_SCALE;
         let variation = settings.variation;

@@ -43,7 +43,7 @@ pub(super) struct MacrostructureModel {
 }
 
 impl MacrostructureModel {
-    pub(super) fn from_settings(settings: &WallSettings) -> Self {
+    pub fn from_settings(settings: &WallSettings) -> Self {
         Self {
             shape: settings.macrostructure,
             depth: settings.macro_depth_mm / FULL_SCALE,
@@ -53,7 +53,7 @@ impl MacrostructureModel {
     }
 
     /// Height over its lowest point, model mm.
-    pub(super) fn height_at(&self, x: f64, y: f64) -> f64 {
+    pub fn height_at(&self, x: f64, y: f64) -> f64 {
         let half = PANEL_SIZE_MM / 2.0;
         // 1 in the middle, 0 in the corners.
         let dome = || 1.0 - (x * x + y * y) / (2.0 * half * half);

@@ -47,7 +47,7 @@ pub(super) struct MasonryStones {
 }
 
 impl MasonryStones {
-    pub(super) fn from_settings(settings: &WallSettings, bond: BrickBond) -> Self {
+    pub fn from_settings(settings: &WallSettings, bond: BrickBond) -> Self {
         Self {
             bond,
             length: settings.brick_length_mm / FULL_SCALE,

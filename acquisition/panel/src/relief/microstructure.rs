@@ -71,7 +71,7 @@ pub(super) struct MicrostructureModel {
 }
 
 impl MicrostructureModel {
-    pub(super) fn from_settings(settings: &WallSettings) -> Self {
+    pub fn from_settings(settings: &WallSettings) -> Self {
         Self {
             shape: settings.joint_shape,
             half_width: settings.joint_width_mm / FULL_SCALE / 2.0,
@@ -85,7 +85,7 @@ impl MicrostructureModel {
     }
 
     /// Returns half the width of the joints near a place, model mm.
-    pub(super) fn half_width(&self, x: f64, y: f64) -> f64 {
+    pub fn half_width(&self, x: f64, y: f64) -> f64 {
         (self.half_width + self.jitter_at(2, self.half_width_jitter, x, y)).max(0.0)
     }
 
@@ -100,7 +100,7 @@ impl MicrostructureModel {
 
     /// Returns the height of a joint under the wall's plane, at a distance from its middle that is below its
     /// `half_width` here.
-    pub(super) fn joint_height(&self, to_middle: f64, half_width: f64, x: f64, y: f64) -> f64 {
+    pub fn joint_height(&self, to_middle: f64, half_width: f64, x: f64, y: f64) -> f64 {
         // 0 at the joint's edges, 1 in its middle.
         let in_joint = ((half_width - to_middle) / half_width).clamp(0.0, 1.0);
         let share = match self.shape {
@@ -117,7 +117,7 @@ impl MicrostructureModel {
     }
 
     /// Unevenness of the skin: three octaves of noise, each half as high as the one before.
-    pub(super) fn roughness_at(&self, x: f64, y: f64) -> f64 {
+    pub fn roughness_at(&self, x: f64, y: f64) -> f64 {
         if self.roughness == 0.0 {
             return 0.0;
         }

@@ -43,7 +43,7 @@ pub(super) struct PrimitiveStones {
 }
 
 impl PrimitiveStones {
-    pub(super) fn from_settings(settings: &WallSettings) -> Self {
+    pub fn from_settings(settings: &WallSettings) -> Self {
         let half_size = settings.primitive_size_mm / FULL_SCALE / 2.0;
         Self {
             solid: settings.primitive,

@@ -31,7 +31,7 @@ pub(super) struct StoneFaces {
 }
 
 impl StoneFaces {
-    pub(super) fn from_settings(settings: &WallSettings) -> Self {
+    pub fn from_settings(settings: &WallSettings) -> Self {
         Self {
             projection: settings.projection_mm / FULL_SCALE,
             lean: settings.lean_mm / FULL_SCALE,
@@ -41,7 +41,7 @@ impl StoneFaces {
 
     /// Height of a stone's face. `place` runs from -1 to 1 over the stone, `rise` from 0 at its edge to 1 where it
     /// bulges most.
-    pub(super) fn face_height(&self, stone: SeededRandom, place: [f64; 2], rise: f64) -> f64 {
+    pub fn face_height(&self, stone: SeededRandom, place: [f64; 2], rise: f64) -> f64 {
         let slope = [stone.signed_number(1), stone.signed_number(2)];
         // Leaning stones turn out of the wall, never into it.
         let lean: f64 = (0..2).map(|i| slope[i] * place[i].clamp(-1.0, 1.0) + slope[i].abs()).sum();

@@ -14,9 +14,9 @@ pub(super) const SEED: ReliefParameter = ReliefParameter::new_whole(
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct StoneSpot {
     /// To the middle of the nearest joint, 0 or more.
-    pub(super) to_joint: f64,
+    pub to_joint: f64,
     /// Height of the stone's face over the wall's plane, 0 or more; unused inside the joint.
-    pub(super) face: f64,
+    pub face: f64,
 }
 
 /// Arrangement of a wall's stones.

@@ -85,7 +85,7 @@ struct Stone {
 }
 
 impl StoneCells {
-    pub(super) fn from_settings(settings: &WallSettings, outline: StoneOutline) -> Self {
+    pub fn from_settings(settings: &WallSettings, outline: StoneOutline) -> Self {
         let size = settings.stone_size_mm / FULL_SCALE;
         let scale = [size * settings.elongation, size];
         let chance = SeededRandom::new(settings.seed, 0x5701);

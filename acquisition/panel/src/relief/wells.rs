@@ -34,7 +34,7 @@ pub(super) struct DiffuserWells {
 }
 
 impl DiffuserWells {
-    pub(super) fn from_settings(settings: &WallSettings) -> Self {
+    pub fn from_settings(settings: &WallSettings) -> Self {
         let deepest = settings.well_depth_mm / FULL_SCALE;
         // The options are primes, and the smallest is 31.
         let prime = settings.prime.parse().unwrap_or(31);

@@ -18,13 +18,13 @@ use simulated::{RigSimulation, simulated_rig};
 
 /// Inputs for opening a rig's devices.
 pub(crate) struct DeviceRequest<'a> {
-    pub(crate) rig: &'a Rig,
+    pub rig: &'a Rig,
     /// Panel that simulated devices measure; `start` and `seed` are of their clock and noise.
-    pub(crate) panel: &'a PreparedPanel,
-    pub(crate) start: Timestamp,
-    pub(crate) seed: u64,
+    pub panel: &'a PreparedPanel,
+    pub start: Timestamp,
+    pub seed: u64,
     /// Joints of the arms at each pair, if a model of them is known.
-    pub(crate) arms: Option<Arc<Choreography>>,
+    pub arms: Option<Arc<Choreography>>,
 }
 
 /// Opens the devices that the rig file names; simulated ones only if it says so for all of them.

@@ -29,7 +29,7 @@ impl AlsaDuplex {
     ///
     /// # Errors
     /// [`Error::Device`] if it is not there, or does not support the rate, the format or the channels.
-    pub(super) fn open(params: &AlsaParams, rate_hz: f64) -> Result<Self, Error> {
+    pub fn open(params: &AlsaParams, rate_hz: f64) -> Result<Self, Error> {
         let failed = |text: String| Error::Device { device: DEVICE, reason: text.into() };
         if rate_hz.fract() != 0.0 || !(1.0..=1e6).contains(&rate_hz) {
             return Err(failed(format!("{rate_hz} Hz is no whole rate up to 1 MHz")));

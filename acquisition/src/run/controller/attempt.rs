@@ -20,9 +20,9 @@ const FULL_SCALE: f32 = 8_388_608.0;
 const TRIES: usize = 3;
 /// One attempt with its measurement.
 pub(super) struct AttemptResult {
-    pub(super) at: Timestamp,
-    pub(super) measurement: Measurement,
-    pub(super) objections: Vec<TakeObjection>,
+    pub at: Timestamp,
+    pub measurement: Measurement,
+    pub objections: Vec<TakeObjection>,
     reading: AmbientReading,
     /// Positions of the arms; None if they refused.
     reached: Option<ArmPositions>,

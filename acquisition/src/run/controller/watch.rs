@@ -21,12 +21,12 @@ pub(super) struct RunMonitor {
 
 impl RunMonitor {
     /// Starts at a time, for a recording at `path`.
-    pub(super) fn new(path: &Path, last: Timestamp) -> Self {
+    pub fn new(path: &Path, last: Timestamp) -> Self {
         Self { folder: folder_of(path).to_owned(), given_up: 0, last, free: free_bytes }
     }
 
     /// Records that a pair was accepted.
-    pub(super) fn note_accepted(&mut self) {
+    pub fn note_accepted(&mut self) {
         self.given_up = 0;
     }
 
@@ -34,7 +34,7 @@ impl RunMonitor {
     ///
     /// # Errors
     /// [`Error::Lasting`] if too many were in a row.
-    pub(super) fn given_up(&mut self, reasons: &[TakeObjection]) -> Result<(), Error> {
+    pub fn given_up(&mut self, reasons: &[TakeObjection]) -> Result<(), Error> {
         self.given_up += 1;
         if self.given_up < LASTING {
             return Ok(());
@@ -48,7 +48,7 @@ impl RunMonitor {
     ///
     /// # Errors
     /// [`Error::Clock`] if it is before that of the last event.
-    pub(super) fn note_time(&mut self, now: Timestamp) -> Result<(), Error> {
+    pub fn note_time(&mut self, now: Timestamp) -> Result<(), Error> {
         if now < self.last {
             let back_secs = (self.last.0 - now.0) as f64 / 1e9;
             return Err(Error::Clock { before: self.last, now, back_secs });
@@ -61,7 +61,7 @@ impl RunMonitor {
     ///
     /// # Errors
     /// [`Error::DiskNearlyFull`].
-    pub(super) fn check_disk(&self, needed: u64) -> Result<(), Error> {
+    pub fn check_disk(&self, needed: u64) -> Result<(), Error> {
         // A file system that does not report it will refuse to write in the end.
         let Ok(free) = (self.free)(&self.folder) else { return Ok(()) };
         if free >= needed {

@@ -25,7 +25,7 @@ pub(super) struct Arms {
 
 impl Arms {
     /// What live views subscribe to.
-    pub(super) fn topics(&self) -> Vec<Topic> {
+    pub fn topics(&self) -> Vec<Topic> {
         let (schema, encoding, text) = STRING_SCHEMA;
         let [microphone, speaker] = self.joints;
         vec![
@@ -43,7 +43,7 @@ impl Arms {
     }
 
     /// The description's channel and message.
-    pub(super) fn description(&self) -> (u16, &[u8]) {
+    pub fn description(&self) -> (u16, &[u8]) {
         (self.description.0, &self.description.1)
     }
 }

@@ -16,22 +16,22 @@ use super::Topic;
 /// Channels of the topics, in the order of their registration.
 #[derive(Default)]
 pub(super) struct Channels {
-    pub(super) tf: u16,
-    pub(super) scene: u16,
-    pub(super) points: u16,
-    pub(super) microphone: u16,
-    pub(super) speaker: u16,
-    pub(super) sweep: u16,
-    pub(super) audio: u16,
-    pub(super) ir: u16,
-    pub(super) environment: u16,
-    pub(super) measurement: u16,
-    pub(super) log: u16,
+    pub tf: u16,
+    pub scene: u16,
+    pub points: u16,
+    pub microphone: u16,
+    pub speaker: u16,
+    pub sweep: u16,
+    pub audio: u16,
+    pub ir: u16,
+    pub environment: u16,
+    pub measurement: u16,
+    pub log: u16,
 }
 
 impl Channels {
     /// Which chunks a channel's messages go to.
-    pub(super) fn chunk_lane(&self, channel: u16) -> ChunkLane {
+    pub fn chunk_lane(&self, channel: u16) -> ChunkLane {
         match channel {
             c if c == self.sweep || c == self.audio => ChunkLane::Sweeps,
             c if c == self.ir => ChunkLane::Responses,
@@ -40,7 +40,7 @@ impl Channels {
     }
 
     /// All of them, as readers need them.
-    pub(super) fn topics(&self) -> Vec<Topic> {
+    pub fn topics(&self) -> Vec<Topic> {
         use foxglove::messages as fg;
         vec![
             foxglove_topic::<fg::FrameTransforms>(self.tf, topics::TF),
@@ -58,7 +58,7 @@ impl Channels {
     }
 
     /// Declares every topic, so that a reader knows all of them whatever the run holds.
-    pub(super) fn register_topics(writer: &mut Writer<impl Write + Seek>) -> McapResult<Self> {
+    pub fn register_topics(writer: &mut Writer<impl Write + Seek>) -> McapResult<Self> {
         use foxglove::messages as fg;
         Ok(Self {
             tf: foxglove_channel::<fg::FrameTransforms>(writer, topics::TF)?,

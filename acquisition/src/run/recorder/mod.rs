@@ -53,8 +53,8 @@ const END_BYTES: u64 = 1 << 20;
 /// A panel as viewers show it.
 #[derive(Clone, Copy)]
 pub(crate) struct Shape<'a> {
-    pub(crate) heights: &'a HeightField,
-    pub(crate) mesh: &'a Mesh,
+    pub heights: &'a HeightField,
+    pub mesh: &'a Mesh,
 }
 
 /// What is known when a run starts.

@@ -71,7 +71,7 @@ pub(crate) struct GroupStates<'a, A: AggregateKernel> {
 
 impl<A: AggregateKernel> GroupStates<'_, A> {
     /// Updates the group of a row, unless the filter excludes the row.
-    pub(crate) fn update_at(&mut self, row: usize, change: impl FnOnce(&mut A::Group) -> Result<()>) -> Result<()> {
+    pub fn update_at(&mut self, row: usize, change: impl FnOnce(&mut A::Group) -> Result<()>) -> Result<()> {
         if self.filter.is_some_and(|filter| !filter.value(row) || arrow::array::Array::is_null(filter, row)) {
             return Ok(());
         }

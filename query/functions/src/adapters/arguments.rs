@@ -148,7 +148,7 @@ fn is_text(kind: &DataType) -> bool {
 
 impl<'a> CallArguments<'a> {
     /// Arguments of a call of a scalar function; constants are kept as one value.
-    pub(crate) fn new(description: &'a FunctionDescription, values: &[ColumnarValue], rows: usize) -> Result<Self> {
+    pub fn new(description: &'a FunctionDescription, values: &[ColumnarValue], rows: usize) -> Result<Self> {
         let column = |value: &ColumnarValue| match value {
             ColumnarValue::Array(array) => Ok(ArgumentColumn { array: array.clone(), constant: false }),
             ColumnarValue::Scalar(value) => Ok(ArgumentColumn { array: value.to_array_of_size(1)?, constant: true }),
@@ -157,7 +157,7 @@ impl<'a> CallArguments<'a> {
     }
 
     /// Arguments from a batch of an aggregate's input.
-    pub(crate) fn from_batch(description: &'a FunctionDescription, arrays: &[ArrayRef]) -> Self {
+    pub fn from_batch(description: &'a FunctionDescription, arrays: &[ArrayRef]) -> Self {
         let rows = arrays.first().map_or(0, |a| a.len());
         let column = |array: &ArrayRef| ArgumentColumn { array: array.clone(), constant: false };
         Self::from_columns(description, arrays.iter().map(column).collect(), rows)
@@ -173,22 +173,22 @@ impl<'a> CallArguments<'a> {
     }
 
     /// Returns the number of rows of the answer.
-    pub(crate) fn row_count(&self) -> usize {
+    pub fn row_count(&self) -> usize {
         self.rows
     }
 
     /// Returns the number of given arguments.
-    pub(crate) fn argument_count(&self) -> usize {
+    pub fn argument_count(&self) -> usize {
         self.columns.len()
     }
 
     /// Returns whether an argument of the row is null, and so its answer.
-    pub(crate) fn is_null(&self, row: usize) -> bool {
+    pub fn is_null(&self, row: usize) -> bool {
         self.nulls.as_ref().is_some_and(|nulls| nulls.is_null(row))
     }
 
     /// Returns an argument as lists of `T`.
-    pub(crate) fn sample_lists<T: SampleElement>(&self, argument: usize) -> Result<SampleLists<'_, T>> {
+    pub fn sample_lists<T: SampleElement>(&self, argument: usize) -> Result<SampleLists<'_, T>> {
         let ArgumentColumn { array, constant } = &self.columns[argument];
         let list = array.as_list_opt::<i32>().ok_or_else(|| self.other_type(argument))?;
         let values = list.values().as_primitive_opt::<T::Arrow>().ok_or_else(|| self.other_type(argument))?;
@@ -203,35 +203,35 @@ impl<'a> CallArguments<'a> {
     }
 
     /// Returns an argument as numbers.
-    pub(crate) fn number_values(&self, argument: usize) -> Result<NumberValues<'_, f64>> {
+    pub fn number_values(&self, argument: usize) -> Result<NumberValues<'_, f64>> {
         let ArgumentColumn { array, constant } = &self.columns[argument];
         let values = array.as_primitive_opt::<Float64Type>().ok_or_else(|| self.other_type(argument))?;
         Ok(NumberValues { values: values.values(), constant: *constant })
     }
 
     /// Returns an argument as whole numbers.
-    pub(crate) fn integer_values(&self, argument: usize) -> Result<NumberValues<'_, i64>> {
+    pub fn integer_values(&self, argument: usize) -> Result<NumberValues<'_, i64>> {
         let ArgumentColumn { array, constant } = &self.columns[argument];
         let values = array.as_primitive_opt::<Int64Type>().ok_or_else(|| self.other_type(argument))?;
         Ok(NumberValues { values: values.values(), constant: *constant })
     }
 
     /// Returns an argument as texts.
-    pub(crate) fn text_values(&self, argument: usize) -> Result<TextValues<'_>> {
+    pub fn text_values(&self, argument: usize) -> Result<TextValues<'_>> {
         let ArgumentColumn { array, constant } = &self.columns[argument];
         let values = array.as_string_opt::<i32>().ok_or_else(|| self.other_type(argument))?;
         Ok(TextValues { values, constant: *constant })
     }
 
     /// Returns the error for an invalid argument of a row, with a hint.
-    pub(crate) fn invalid_argument(&self, argument: usize, row: usize, is: impl Debug, hint: &str) -> DataFusionError {
+    pub fn invalid_argument(&self, argument: usize, row: usize, is: impl Debug, hint: &str) -> DataFusionError {
         let (name, parameter) = (self.description.name, self.description.parameters[argument].name);
         let row = row + 1;
         DataFusionError::Execution(format!("`{name}`: `{parameter}` is {is:?} in row {row} of its batch; hint: {hint}"))
     }
 
     /// Returns the error for a row that a kernel refused.
-    pub(crate) fn refused_row(&self, row: usize, error: &echolake_dsp::Error) -> DataFusionError {
+    pub fn refused_row(&self, row: usize, error: &echolake_dsp::Error) -> DataFusionError {
         let hint = match error {
             echolake_dsp::Error::Length { .. } => "the lists of a row must be equally long",
             echolake_dsp::Error::NotFinite { .. } => {
@@ -256,7 +256,7 @@ impl<'a> CallArguments<'a> {
 
 impl<'a, T> SampleLists<'a, T> {
     /// Returns the samples of a row that is not null.
-    pub(crate) fn samples_at(&self, row: usize) -> Result<&'a [T]> {
+    pub fn samples_at(&self, row: usize) -> Result<&'a [T]> {
         let row = if self.constant { 0 } else { row };
         let offsets = self.list.value_offsets();
         let (from, to) = (offsets[row] as usize, offsets[row + 1] as usize);
@@ -267,7 +267,7 @@ impl<'a, T> SampleLists<'a, T> {
     }
 
     /// Returns the approximate number of samples of all rows, as capacity for an answer of the same size.
-    pub(crate) fn sample_capacity(&self, rows: usize) -> usize {
+    pub fn sample_capacity(&self, rows: usize) -> usize {
         let offsets = self.list.value_offsets();
         let whole = (offsets[offsets.len() - 1] - offsets[0]) as usize;
         if self.constant { whole.saturating_mul(rows) } else { whole }
@@ -285,14 +285,14 @@ impl<'a, T> SampleLists<'a, T> {
 
 impl<N: Copy> NumberValues<'_, N> {
     /// Returns the number of a row that is not null.
-    pub(crate) fn value_at(&self, row: usize) -> N {
+    pub fn value_at(&self, row: usize) -> N {
         self.values[if self.constant { 0 } else { row }]
     }
 }
 
 impl TextValues<'_> {
     /// Returns the text of a row that is not null.
-    pub(crate) fn text_at(&self, row: usize) -> &str {
+    pub fn text_at(&self, row: usize) -> &str {
         self.values.value(if self.constant { 0 } else { row })
     }
 }

@@ -5,18 +5,18 @@ use datafusion::logical_expr::{DocSection, Documentation};
 /// A function's name, arguments and meaning.
 #[derive(Debug)]
 pub(crate) struct FunctionDescription {
-    pub(crate) name: &'static str,
-    pub(crate) family: FunctionFamily,
+    pub name: &'static str,
+    pub family: FunctionFamily,
     /// Its result, with the unit.
-    pub(crate) about: &'static str,
-    pub(crate) parameters: &'static [FunctionParameter],
+    pub about: &'static str,
+    pub parameters: &'static [FunctionParameter],
     /// Number of trailing arguments that are optional.
-    pub(crate) optional: usize,
+    pub optional: usize,
     /// A query on a small lake.
-    pub(crate) example: &'static str,
+    pub example: &'static str,
     /// The answer to the example; a test compares it.
-    pub(crate) answer: &'static str,
-    pub(crate) related: &'static [&'static str],
+    pub answer: &'static str,
+    pub related: &'static [&'static str],
 }
 
 /// A chapter of the manual.
@@ -33,10 +33,10 @@ pub(crate) enum FunctionFamily {
 /// One argument.
 #[derive(Debug)]
 pub(crate) struct FunctionParameter {
-    pub(crate) name: &'static str,
-    pub(crate) kind: ArgumentKind,
+    pub name: &'static str,
+    pub kind: ArgumentKind,
     /// Its meaning, with the unit.
-    pub(crate) about: &'static str,
+    pub about: &'static str,
 }
 
 /// Kinds of arguments.
@@ -56,11 +56,11 @@ pub(crate) enum ArgumentKind {
 
 impl FunctionFamily {
     #[cfg(test)]
-    pub(crate) const ALL: [Self; 6] =
+    pub const ALL: [Self; 6] =
         [Self::Levels, Self::Responses, Self::Comparison, Self::Geometry, Self::Lists, Self::Aggregates];
 
     /// Returns its heading.
-    pub(crate) fn title(self) -> &'static str {
+    pub fn title(self) -> &'static str {
         match self {
             Self::Levels => "Levels",
             Self::Responses => "Impulse responses",
@@ -74,7 +74,7 @@ impl FunctionFamily {
 
 impl ArgumentKind {
     /// Returns a description for errors and the manual.
-    pub(crate) fn display_words(self) -> &'static str {
+    pub fn display_words(self) -> &'static str {
         match self {
             Self::Samples => "a list of numbers",
             Self::Number => "a number",
@@ -87,7 +87,7 @@ impl ArgumentKind {
 
 impl FunctionDescription {
     /// Returns the call syntax, `nce(ir, flat_energy[, centre_hz])`.
-    pub(crate) fn call_syntax(&self) -> String {
+    pub fn call_syntax(&self) -> String {
         let required = self.parameters.len() - self.optional;
         let mut text = format!("{}(", self.name);
         for (i, parameter) in self.parameters.iter().enumerate() {
@@ -103,7 +103,7 @@ impl FunctionDescription {
     }
 
     /// Returns DataFusion's form of the description.
-    pub(crate) fn build_documentation(&self) -> Documentation {
+    pub fn build_documentation(&self) -> Documentation {
         let section = DocSection { include: true, label: self.family.title(), description: None };
         let example = format!("```sql\n> {};\n{}\n```", self.example, self.answer);
         let mut built = Documentation::builder(section, self.about, self.call_syntax()).with_sql_example(example);

@@ -17,12 +17,12 @@ pub(crate) struct PerLength<P> {
 }
 
 impl<P> PerLength<P> {
-    pub(crate) fn new(function: &'static str) -> Self {
+    pub fn new(function: &'static str) -> Self {
         Self { function, plans: HashMap::new() }
     }
 
     /// Returns the plan for a length.
-    pub(crate) fn plan_for(
+    pub fn plan_for(
         &mut self,
         len: usize,
         make: impl FnOnce(usize) -> Result<P, echolake_dsp::Error>,

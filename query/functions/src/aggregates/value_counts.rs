@@ -64,11 +64,11 @@ pub(crate) struct ValueCountFunction {
 }
 
 impl ValueCountFunction {
-    pub(crate) fn mode() -> Self {
+    pub fn mode() -> Self {
         Self::new(CountAnswer::Mode, &MODE)
     }
 
-    pub(crate) fn histogram() -> Self {
+    pub fn histogram() -> Self {
         Self::new(CountAnswer::Histogram, &HISTOGRAM)
     }
 

@@ -19,10 +19,10 @@ use crate::adapters::scalar::ScalarKernel;
 pub(crate) struct D4PositionFunction;
 
 /// `d4_point`: a point of the grid.
-pub(crate) struct D4PointFunction(pub(crate) Arc<RigFacts>);
+pub(crate) struct D4PointFunction(pub Arc<RigFacts>);
 
 /// `d4_pair`: a pair.
-pub(crate) struct D4PairFunction(pub(crate) Arc<RigFacts>);
+pub(crate) struct D4PairFunction(pub Arc<RigFacts>);
 
 /// `d4_heightmap`: a height map.
 pub(crate) struct D4HeightmapFunction;

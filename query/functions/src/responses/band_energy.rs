@@ -48,7 +48,7 @@ static DESCRIPTION: FunctionDescription = FunctionDescription {
 };
 
 impl BandEnergyFunction {
-    pub(crate) fn new(facts: &Arc<RigFacts>) -> Self {
+    pub fn new(facts: &Arc<RigFacts>) -> Self {
         let mut names: Vec<_> = facts.band_names.iter().map(|name| format!("energy_{name}")).collect();
         names.push("energy_total".into());
         Self { facts: facts.clone(), fields: number_fields(names.iter().map(String::as_str)) }

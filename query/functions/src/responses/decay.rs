@@ -21,7 +21,7 @@ const ARRIVAL_DB: f64 = -20.0;
 pub(crate) struct EdcFunction;
 
 /// `arrival`.
-pub(crate) struct ArrivalFunction(pub(crate) Arc<RigFacts>);
+pub(crate) struct ArrivalFunction(pub Arc<RigFacts>);
 
 static EDC: FunctionDescription = FunctionDescription {
     name: "edc",

@@ -16,7 +16,7 @@ use crate::adapters::rig::RigFacts;
 use crate::adapters::scalar::ScalarKernel;
 
 /// `nce`.
-pub(crate) struct NceFunction(pub(crate) Arc<RigFacts>);
+pub(crate) struct NceFunction(pub Arc<RigFacts>);
 
 static DESCRIPTION: FunctionDescription = FunctionDescription {
     name: "nce",

@@ -24,7 +24,7 @@ pub(crate) struct CurveShapeFunction {
 
 impl CurveShapeFunction {
     /// All functions of this file.
-    pub(crate) fn all(facts: &Arc<RigFacts>) -> [Self; 3] {
+    pub fn all(facts: &Arc<RigFacts>) -> [Self; 3] {
         let function = |description, value| Self { facts: facts.clone(), description, value };
         [
             function(&RISE, |shape: &CurveShape, per_ms| shape.rise / per_ms),

@@ -21,7 +21,7 @@ const MOST: i64 = 1 << 20;
 pub(crate) struct SpectrumFunction;
 
 /// `spectrum_frequencies`.
-pub(crate) struct SpectrumFrequenciesFunction(pub(crate) Arc<RigFacts>);
+pub(crate) struct SpectrumFrequenciesFunction(pub Arc<RigFacts>);
 
 static SPECTRUM: FunctionDescription = FunctionDescription {
     name: "spectrum",

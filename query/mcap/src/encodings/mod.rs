@@ -20,12 +20,12 @@ static ENCODINGS: [&dyn MessageEncoding; 3] = [&protobuf::ProtobufEncoding, &jso
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Default)]
 pub(super) struct RawSchema {
     /// The message type's name.
-    pub(super) name: String,
+    pub name: String,
     /// The encoding of `data`, such as `protobuf`, `jsonschema` or `ros2msg`; empty if there is no schema.
-    pub(super) encoding: String,
+    pub encoding: String,
     /// The encoding of the messages, such as `protobuf`, `json` or `cdr`.
-    pub(super) messages: String,
-    pub(super) data: Vec<u8>,
+    pub messages: String,
+    pub data: Vec<u8>,
 }
 
 /// An encoding of messages.
@@ -88,14 +88,14 @@ impl RowTally {
 /// The columns of a schema's messages.
 #[derive(Debug)]
 pub(super) struct MessageLayout {
-    pub(super) fields: Fields,
+    pub fields: Fields,
     /// None if messages are not decoded.
     message_type: Option<Box<dyn MessageType>>,
 }
 
 impl MessageLayout {
     /// Parses a schema. The text of an error is its defect.
-    pub(super) fn from_schema(schema: &RawSchema) -> Result<Self, String> {
+    pub fn from_schema(schema: &RawSchema) -> Result<Self, String> {
         let encoding = find_encoding(schema).ok_or_else(|| describe_unknown(schema))?;
         let (fields, message_type) = encoding.parse_schema(schema)?;
         // Whatever a schema promises, files of another one may lack a column.
@@ -104,12 +104,12 @@ impl MessageLayout {
     }
 
     /// Returns the layout of messages that are not decoded: they have rows, and no columns of their own.
-    pub(super) fn without_columns() -> Self {
+    pub fn without_columns() -> Self {
         Self { fields: Fields::empty(), message_type: None }
     }
 
     /// Returns a decoder of the columns at `wanted`.
-    pub(super) fn create_decoder(&self, wanted: &[usize]) -> RowDecoder {
+    pub fn create_decoder(&self, wanted: &[usize]) -> RowDecoder {
         let fields: Fields = wanted.iter().map(|i| self.fields[*i].clone()).collect();
         let width = fields.iter().map(|f| value_width(f.data_type())).sum();
         let decoder = self.message_type.as_ref().map(|message_type| message_type.create_decoder(wanted, &fields));
@@ -151,7 +151,7 @@ pub(super) struct RowDecoder {
 
 impl RowDecoder {
     /// Adds a message as one row. After an error it is of no more use.
-    pub(super) fn push_message(&mut self, message: &[u8]) -> Result<(), Malformed> {
+    pub fn push_message(&mut self, message: &[u8]) -> Result<(), Malformed> {
         self.tally.add_bytes(self.width)?;
         match &mut self.decoder {
             Some(decoder) => decoder.decode_message(message, &mut self.columns, &mut self.tally),
@@ -160,17 +160,17 @@ impl RowDecoder {
     }
 
     /// Returns the bytes of the rows since the last [`Self::finish`], roughly.
-    pub(super) fn buffered_bytes(&self) -> usize {
+    pub fn buffered_bytes(&self) -> usize {
         self.tally.bytes
     }
 
     /// Takes the number of values since the last call that are null because they are not of their column's type.
-    pub(super) fn take_unfit(&mut self) -> usize {
+    pub fn take_unfit(&mut self) -> usize {
         std::mem::take(&mut self.tally.unfit)
     }
 
     /// Returns the rows so far, by column, and begins again without any.
-    pub(super) fn finish(&mut self) -> Result<Vec<ArrayRef>, ArrowError> {
+    pub fn finish(&mut self) -> Result<Vec<ArrayRef>, ArrowError> {
         self.tally.bytes = 0;
         self.columns.iter_mut().map(Column::finish).collect()
     }

@@ -23,13 +23,13 @@ pub(super) struct AnswerContent {
 
 impl AnswerContent {
     /// Bytes of a media type.
-    pub(super) fn new(media_type: &'static str, bytes: impl Into<Bytes>) -> Self {
+    pub fn new(media_type: &'static str, bytes: impl Into<Bytes>) -> Self {
         Self { media_type, bytes: bytes.into(), name: None }
     }
 
     /// The same, to be saved as a file of this name.
     #[must_use]
-    pub(super) fn with_name(mut self, name: String) -> Self {
+    pub fn with_name(mut self, name: String) -> Self {
         self.name = Some(name);
         self
     }
@@ -38,7 +38,7 @@ impl AnswerContent {
     ///
     /// # Errors
     /// [`RequestFault::Internal`] if it cannot be written, which is a defect.
-    pub(super) fn encode_json(value: &impl Serialize) -> Result<Self, RequestFault> {
+    pub fn encode_json(value: &impl Serialize) -> Result<Self, RequestFault> {
         let bytes = serde_json::to_vec(value).map_err(RequestFault::defect("an answer makes no JSON"))?;
         Ok(Self::new("application/json", bytes))
     }
@@ -47,7 +47,7 @@ impl AnswerContent {
     ///
     /// # Errors
     /// As [`AnswerContent::encode_json`].
-    pub(super) fn decode_json(&self) -> Result<Value, RequestFault> {
+    pub fn decode_json(&self) -> Result<Value, RequestFault> {
         serde_json::from_slice(&self.bytes).map_err(RequestFault::defect("an answer is no JSON"))
     }
 
@@ -55,7 +55,7 @@ impl AnswerContent {
     ///
     /// # Errors
     /// As [`AnswerContent::encode_json`].
-    pub(super) fn encode_arrow(batch: &RecordBatch) -> Result<Self, RequestFault> {
+    pub fn encode_arrow(batch: &RecordBatch) -> Result<Self, RequestFault> {
         let written = || {
             let mut writer = StreamWriter::try_new(Vec::new(), &batch.schema())?;
             writer.write(batch)?;

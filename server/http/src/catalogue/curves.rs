@@ -20,9 +20,9 @@ use super::snapshot::summary::SurfaceEntry;
 /// Curves of a surface beside those of its Flat.
 #[derive(Serialize, ToSchema)]
 pub(super) struct CurveSet {
-    pub(super) time_ms: Vec<f64>,
-    pub(super) surface: SurfaceCurves,
-    pub(super) flat: SurfaceCurves,
+    pub time_ms: Vec<f64>,
+    pub surface: SurfaceCurves,
+    pub flat: SurfaceCurves,
 }
 
 /// Curves of a surface.
@@ -33,7 +33,7 @@ pub(super) struct SurfaceCurves {
     /// Measurements that the mean is over.
     pairs: i64,
     /// By band (no total), then by time: NCE over Flat's total, linear.
-    pub(super) bands: Vec<Vec<f32>>,
+    pub bands: Vec<Vec<f32>>,
 }
 
 /// The pairs of which a mean is taken.
@@ -56,7 +56,7 @@ impl PairSelection {
 impl CurveSet {
     /// # Errors
     /// Those of its query.
-    pub(super) async fn read_curves(
+    pub async fn read_curves(
         request: &CatalogueRequest,
         entry: &SurfaceEntry,
         over: PairSelection,
@@ -92,7 +92,7 @@ impl CurveSet {
     }
 
     /// Returns whether the surface itself has curves.
-    pub(super) fn is_there(&self) -> bool {
+    pub fn is_there(&self) -> bool {
         self.surface.pairs > 0
     }
 

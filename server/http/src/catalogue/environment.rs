@@ -36,7 +36,7 @@ pub(super) struct AirSeries {
 
 impl AirSeries {
     /// Readings beside a time, which is given as a number and as a text.
-    pub(super) fn new(rows: Vec<AirReading>, start_ns: i64, start: &str) -> Self {
+    pub fn new(rows: Vec<AirReading>, start_ns: i64, start: &str) -> Self {
         let of = |value: fn(&AirReading) -> Option<f64>| rows.iter().map(value).collect();
         Self {
             time_s: rows.iter().map(|r| r.ns.saturating_sub(start_ns) as f64 / 1e9).collect(),

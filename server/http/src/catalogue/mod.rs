@@ -87,12 +87,12 @@ struct CatalogueState {
 }
 
 impl LakeCatalogue {
-    pub(super) fn new(service: QueryService) -> Self {
+    pub fn new(service: QueryService) -> Self {
         Self(Arc::new(CatalogueState { service, views: SnapshotViews::default() }))
     }
 
     /// Routes of the endpoints.
-    pub(super) fn endpoint_router(&self) -> Router {
+    pub fn endpoint_router(&self) -> Router {
         let cached = |routes: OpenApiRouter, scope| {
             Router::from(routes).route_layer(from_fn_with_state((self.clone(), scope), answer_through_cache))
         };
@@ -103,7 +103,7 @@ impl LakeCatalogue {
     ///
     /// # Errors
     /// [`RequestFault::NotFound`], or those of its queries.
-    pub(super) async fn surface_value(&self, surface: &str) -> Result<Value, RequestFault> {
+    pub async fn surface_value(&self, surface: &str) -> Result<Value, RequestFault> {
         let request = CatalogueRequest::new(self, &self.current_view().await?, false);
         let path = PathParams(SurfacePath { surface_id: surface.to_owned() });
         Box::pin(surface::surface(Extension(request), path)).await.map_err(|problem| problem.0)?.decode_json()
@@ -113,27 +113,27 @@ impl LakeCatalogue {
     ///
     /// # Errors
     /// As [`LakeCatalogue::surface_value`].
-    pub(super) async fn run_value(&self, run: &str) -> Result<Value, RequestFault> {
+    pub async fn run_value(&self, run: &str) -> Result<Value, RequestFault> {
         let request = CatalogueRequest::new(self, &self.current_view().await?, false);
         let path = PathParams(RunPath { run_id: run.to_owned() });
         Box::pin(runs::run(Extension(request), path)).await.map_err(|problem| problem.0)?.decode_json()
     }
 
-    pub(super) fn service(&self) -> &QueryService {
+    pub fn service(&self) -> &QueryService {
         &self.0.service
     }
 
-    pub(super) fn lake(&self) -> &Lake {
+    pub fn lake(&self) -> &Lake {
         self.0.service.lake()
     }
 
     /// The lake as it is now, with what was computed of it already.
-    pub(super) async fn current_view(&self) -> Result<Arc<SnapshotView>, RequestFault> {
+    pub async fn current_view(&self) -> Result<Arc<SnapshotView>, RequestFault> {
         self.0.views.current_view(&self.0.service).await
     }
 
     /// A table's file of this name, of the lake as it is or as it was while the server ran.
-    pub(super) fn find_file(&self, view: &SnapshotView, table: Table, name: &str) -> Option<VisibleFile> {
+    pub fn find_file(&self, view: &SnapshotView, table: Table, name: &str) -> Option<VisibleFile> {
         self.0.views.find_file(view, table, name)
     }
 }

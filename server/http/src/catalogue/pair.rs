@@ -25,9 +25,9 @@ const AROUND_NS: i64 = 900_000_000_000;
 #[derive(Deserialize, IntoParams)]
 #[into_params(parameter_in = Path)]
 pub(super) struct PairPath {
-    pub(super) surface_id: String,
+    pub surface_id: String,
     #[param(value_type = usize)]
-    pub(super) pair_id: String,
+    pub pair_id: String,
 }
 
 /// Everything about one impulse response.
@@ -74,8 +74,8 @@ pub(super) struct PairGeometry {
     speaker: i32,
     microphone_mm: [f64; 3],
     speaker_mm: [f64; 3],
-    pub(super) direct_mm: f64,
-    pub(super) image_mm: f64,
+    pub direct_mm: f64,
+    pub image_mm: f64,
     incidence_deg: f64,
     /// x, y in the panel's plane.
     specular_mm: [f64; 2],
@@ -97,7 +97,7 @@ pub(super) struct PairGeometry {
 pub(super) struct PairMeasurement {
     #[serde(skip_serializing)]
     #[schema(ignore)]
-    pub(super) ir: Vec<f32>,
+    pub ir: Vec<f32>,
     #[serde(skip_serializing)]
     #[schema(ignore)]
     log_time_ns: i64,
@@ -123,7 +123,7 @@ pub(super) struct PairMeasurement {
 #[derive(Deserialize)]
 pub(super) struct ReflectedResponse {
     surface_id: String,
-    pub(super) reflected: Option<Vec<f32>>,
+    pub reflected: Option<Vec<f32>>,
 }
 
 #[derive(Deserialize)]
@@ -176,7 +176,7 @@ const AIR: &str = "select log_time_ns as ns, temperature_c, humidity_pct, pressu
 
 impl CatalogueRequest {
     /// The pair of this number.
-    pub(super) fn parse_pair(&self, text: &str) -> Result<usize, RequestFault> {
+    pub fn parse_pair(&self, text: &str) -> Result<usize, RequestFault> {
         let pairs = self.catalogue.lake().grid().pairs().len();
         let digits = !text.is_empty() && text.bytes().all(|b| b.is_ascii_digit());
         match (digits, text.parse::<usize>()) {
@@ -236,7 +236,7 @@ pub(super) enum ResponseSignal {
 }
 
 impl ResponseSignal {
-    pub(super) fn name(self) -> &'static str {
+    pub fn name(self) -> &'static str {
         match self {
             Self::Reflected => "reflected",
             Self::Measured => "measured",
@@ -247,7 +247,7 @@ impl ResponseSignal {
     ///
     /// # Errors
     /// [`RequestFault::NoData`] if Foam is missing, [`RequestFault::NotFound`] if the pair was not measured.
-    pub(super) async fn read_samples(
+    pub async fn read_samples(
         self,
         request: &CatalogueRequest,
         entry: &SurfaceEntry,

@@ -23,24 +23,24 @@ use crate::request_protocol::http_job;
 /// A request to an endpoint.
 #[derive(Clone)]
 pub(in super::super) struct CatalogueRequest {
-    pub(super) catalogue: LakeCatalogue,
-    pub(super) view: Arc<SnapshotView>,
+    pub catalogue: LakeCatalogue,
+    pub view: Arc<SnapshotView>,
     /// True if an Arrow stream is preferred to JSON.
-    pub(super) as_arrow: bool,
+    pub as_arrow: bool,
 }
 
 /// The path of a surface.
 #[derive(Deserialize, IntoParams)]
 #[into_params(parameter_in = Path)]
 pub(super) struct SurfacePath {
-    pub(super) surface_id: String,
+    pub surface_id: String,
 }
 
 /// The path of a run.
 #[derive(Deserialize, IntoParams)]
 #[into_params(parameter_in = Path)]
 pub(in super::super) struct RunPath {
-    pub(in super::super) run_id: String,
+    pub run_id: String,
 }
 
 /// A text, to be bound.
@@ -60,12 +60,12 @@ pub(super) fn nanos_value(value: i64) -> ScalarValue {
 
 impl CatalogueRequest {
     /// A request for what a snapshot shows.
-    pub(in super::super) fn new(catalogue: &LakeCatalogue, view: &Arc<SnapshotView>, as_arrow: bool) -> Self {
+    pub fn new(catalogue: &LakeCatalogue, view: &Arc<SnapshotView>, as_arrow: bool) -> Self {
         Self { catalogue: catalogue.clone(), view: view.clone(), as_arrow }
     }
 
     /// All surfaces in short.
-    pub(super) async fn read_summary(&self) -> Result<&CatalogueSummary, RequestFault> {
+    pub async fn read_summary(&self) -> Result<&CatalogueSummary, RequestFault> {
         let read = || async {
             let (surfaces, statistics) =
                 tokio::try_join!(self.read_rows(SURFACES, Vec::new()), self.read_rows(BAND_STATISTICS, Vec::new()))?;
@@ -75,7 +75,7 @@ impl CatalogueRequest {
     }
 
     /// The surface of this name.
-    pub(super) async fn find_surface(&self, name: &str) -> Result<&SurfaceEntry, RequestFault> {
+    pub async fn find_surface(&self, name: &str) -> Result<&SurfaceEntry, RequestFault> {
         let known = name.parse::<SurfaceId>().ok();
         let found = match known {
             Some(id) => self.read_summary().await?.find_entry(id.as_str()),
@@ -85,18 +85,18 @@ impl CatalogueRequest {
     }
 
     /// The run of this name, as the snapshot shows it.
-    pub(super) fn find_run(&self, name: &str) -> Result<&VisibleRun, RequestFault> {
+    pub fn find_run(&self, name: &str) -> Result<&VisibleRun, RequestFault> {
         find_run(&self.view, name)
     }
 
     /// Reads the parameter `microphone`, a grid point of the lake.
-    pub(super) fn parse_microphone(&self, text: &str) -> Result<usize, RequestFault> {
+    pub fn parse_microphone(&self, text: &str) -> Result<usize, RequestFault> {
         let last = self.catalogue.lake().grid().points().len().saturating_sub(1);
         parse_whole(text, 0..=last).map_err(|e| RequestFault::bad_request(format!("`microphone`: {e}")))
     }
 
     /// The rows of a query. `sql` is a text of the program's own; what came with the request is among `values`.
-    pub(in super::super) async fn read_rows<T: DeserializeOwned + Send + 'static>(
+    pub async fn read_rows<T: DeserializeOwned + Send + 'static>(
         &self,
         sql: &str,
         values: Vec<ScalarValue>,
@@ -111,7 +111,7 @@ impl CatalogueRequest {
     }
 
     /// The batches of a query, as they come.
-    pub(super) async fn stream_batches(
+    pub async fn stream_batches(
         &self,
         sql: &str,
         values: Vec<ScalarValue>,

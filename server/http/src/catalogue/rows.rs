@@ -23,7 +23,7 @@ pub(super) struct RowDecoder<T> {
 
 impl<T> RowDecoder<T> {
     /// Begins the rows of a query.
-    pub(super) fn new(sql: String) -> Self {
+    pub fn new(sql: String) -> Self {
         Self { sql, bytes: 0, rows: PhantomData }
     }
 }

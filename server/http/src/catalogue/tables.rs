@@ -34,7 +34,7 @@ pub(in super::super) struct ColumnDescription {
 
 impl ColumnDescription {
     /// The column of a field.
-    pub(in super::super) fn from_field(field: &Field) -> Self {
+    pub fn from_field(field: &Field) -> Self {
         let metadata = |key: &str| field.metadata().get(key).filter(|text| !text.is_empty()).cloned();
         Self {
             name: field.name().clone(),

@@ -43,8 +43,8 @@ pub(super) enum ClientMessage {
 #[derive(Debug)]
 pub(super) struct ProtocolRequest {
     /// A number or a text.
-    pub(super) id: Value,
-    pub(super) method: String,
+    pub id: Value,
+    pub method: String,
     params: Map<String, Value>,
 }
 
@@ -68,7 +68,7 @@ impl ClientMessage {
     ///
     /// # Errors
     /// It is not one of JSON-RPC.
-    pub(super) fn parse(body: &[u8]) -> Result<Self, MethodError> {
+    pub fn parse(body: &[u8]) -> Result<Self, MethodError> {
         let message = serde_json::from_slice(body)
             .map_err(|e| MethodError::new(PARSE, format!("the message is not JSON: {e}; hint: JSON-RPC 2.0")))?;
         let invalid = |what: &str| MethodError::new(INVALID_REQUEST, format!("{what}; hint: one JSON-RPC 2.0 request"));
@@ -97,7 +97,7 @@ impl ProtocolRequest {
     ///
     /// # Errors
     /// They do not, or the revision is not known.
-    pub(super) fn read_revision(&self, headers: &HeaderMap) -> Result<ProtocolRevision, MethodError> {
+    pub fn read_revision(&self, headers: &HeaderMap) -> Result<ProtocolRevision, MethodError> {
         let header = |name: &str| headers.get(name).map(|value| String::from_utf8_lossy(value.as_bytes()));
         let of_header = header(VERSION_HEADER);
         let named = self.params.get("_meta").and_then(|meta| meta.get(VERSION_KEY));
@@ -125,7 +125,7 @@ impl ProtocolRequest {
     }
 
     /// The answer to `initialize`.
-    pub(super) fn handshake_result(&self, instructions: &str) -> Value {
+    pub fn handshake_result(&self, instructions: &str) -> Value {
         let wanted = self.params.get("protocolVersion").and_then(Value::as_str).unwrap_or_default();
         let version = HANDSHAKES.into_iter().find(|known| *known == wanted).unwrap_or(NEWEST_HANDSHAKE);
         json!({
@@ -140,7 +140,7 @@ impl ProtocolRequest {
     ///
     /// # Errors
     /// There is no such tool, or the arguments are not an object.
-    pub(super) fn tool_call(&self) -> Result<(AgentTool, Map<String, Value>), MethodError> {
+    pub fn tool_call(&self) -> Result<(AgentTool, Map<String, Value>), MethodError> {
         let name = self.params.get("name").and_then(Value::as_str).unwrap_or_default();
         let tool = AgentTool::ALL.into_iter().find(|tool| tool.name() == name).ok_or_else(|| {
             let known = AgentTool::ALL.map(AgentTool::name).join(", ");
@@ -158,7 +158,7 @@ impl ProtocolRequest {
 
 impl ProtocolRevision {
     /// Adds to a result what the revision wants in it.
-    pub(super) fn complete_result(self, mut result: Value) -> Value {
+    pub fn complete_result(self, mut result: Value) -> Value {
         if let (Self::Stateless, Some(fields)) = (self, result.as_object_mut()) {
             fields.insert("resultType".to_owned(), "complete".into());
             fields.insert("_meta".to_owned(), json!({ SERVER_KEY: server_info() }));
@@ -171,7 +171,7 @@ impl ProtocolRevision {
     }
 
     /// The status of an answer with this error: 200 before it was said which one.
-    pub(super) fn error_status(self, error: &MethodError) -> StatusCode {
+    pub fn error_status(self, error: &MethodError) -> StatusCode {
         match (self, error.code) {
             (Self::Handshake, _) => StatusCode::OK,
             (Self::Stateless, UNKNOWN_METHOD) => StatusCode::NOT_FOUND,
@@ -193,13 +193,13 @@ impl MethodError {
     }
 
     /// A method that is not there.
-    pub(super) fn unknown_method(method: &str) -> Self {
+    pub fn unknown_method(method: &str) -> Self {
         let hint = "initialize, ping, tools/list, tools/call, server/discover";
         Self::new(UNKNOWN_METHOD, format!("there is no method `{method}`; hint: {hint}"))
     }
 
     /// The error as the answer to a request.
-    pub(super) fn into_answer(self, id: &Value, status: StatusCode) -> Response {
+    pub fn into_answer(self, id: &Value, status: StatusCode) -> Response {
         let mut error = json!({ "code": self.code, "message": self.message });
         if let Some(data) = self.data {
             error["data"] = data;

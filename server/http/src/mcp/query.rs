@@ -22,7 +22,7 @@ impl ToolCall<'_> {
     ///
     /// # Errors
     /// A defect of the statement, or the cause of its end.
-    pub(super) async fn run_query(
+    pub async fn run_query(
         &self,
         client: &Arc<EngineClient>,
         sql: String,

@@ -11,7 +11,7 @@ impl ToolCall<'_> {
     ///
     /// # Errors
     /// A defect of the predicate, a missing scope, or a slice without measurements.
-    pub(super) async fn slice_url(&self, wanted: SliceArguments) -> Result<Value, RequestFault> {
+    pub async fn slice_url(&self, wanted: SliceArguments) -> Result<Value, RequestFault> {
         let params = SliceParameters::new(wanted.predicate, wanted.runs, wanted.topics);
         let slice = self.agents.slices.slice_address(params).await?;
         let origin = self.origin;

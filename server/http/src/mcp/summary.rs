@@ -13,7 +13,7 @@ impl ToolCall<'_> {
     ///
     /// # Errors
     /// [`RequestFault::NotFound`], or those of its queries.
-    pub(super) async fn surface_summary(&self, surface: &str) -> Result<Value, RequestFault> {
+    pub async fn surface_summary(&self, surface: &str) -> Result<Value, RequestFault> {
         let mut summary = self.agents.catalogue.surface_value(surface).await?;
         // A name that is found has letters, digits, `_` and `-` alone.
         let (origin, path) = (self.origin, format!("/surfaces/{surface}"));
@@ -29,7 +29,7 @@ impl ToolCall<'_> {
     ///
     /// # Errors
     /// [`RequestFault::NotFound`], or those of its queries.
-    pub(super) async fn run_summary(&self, run: &str) -> Result<Value, RequestFault> {
+    pub async fn run_summary(&self, run: &str) -> Result<Value, RequestFault> {
         let mut summary = self.agents.catalogue.run_value(run).await?;
         if let Some(events) = summary["events"].as_array_mut() {
             let left_out = events.len().saturating_sub(MOST_EVENTS);

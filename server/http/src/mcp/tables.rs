@@ -12,7 +12,7 @@ const MOST_FUNCTIONS: usize = 80;
 
 impl ToolCall<'_> {
     /// The tables and views.
-    pub(super) fn list_tables(&self) -> Value {
+    pub fn list_tables(&self) -> Value {
         let service = self.agents.catalogue.service();
         let views = service.view_definitions();
         let table = |name: &str| {
@@ -28,7 +28,7 @@ impl ToolCall<'_> {
     ///
     /// # Errors
     /// [`RequestFault::NotFound`].
-    pub(super) fn describe_table(&self, name: &str) -> Result<Value, RequestFault> {
+    pub fn describe_table(&self, name: &str) -> Result<Value, RequestFault> {
         let service = self.agents.catalogue.service();
         let found = service.all_tables().into_iter().find(|(known, _)| known == name);
         let Some((_, schema)) = found else {
@@ -44,7 +44,7 @@ impl ToolCall<'_> {
     }
 
     /// The functions; with a text, all that have it in their name or description.
-    pub(super) fn list_functions(&self, search: Option<&str>) -> Value {
+    pub fn list_functions(&self, search: Option<&str>) -> Value {
         let service = self.agents.catalogue.service();
         let wanted = search.unwrap_or_default().to_lowercase();
         let has = |text: &str| text.to_lowercase().contains(&wanted);

@@ -26,9 +26,9 @@ pub(super) enum AgentTool {
 
 /// A call of a tool.
 pub(super) struct ToolCall<'a> {
-    pub(super) agents: &'a AgentService,
+    pub agents: &'a AgentService,
     /// Of the server's pages, for links.
-    pub(super) origin: &'a str,
+    pub origin: &'a str,
 }
 
 #[derive(Deserialize)]
@@ -71,16 +71,16 @@ struct RunArguments {
 #[serde(deny_unknown_fields)]
 pub(super) struct SliceArguments {
     #[serde(default)]
-    pub(super) runs: Vec<String>,
+    pub runs: Vec<String>,
     #[serde(rename = "where")]
-    pub(super) predicate: Option<String>,
+    pub predicate: Option<String>,
     #[serde(default)]
-    pub(super) topics: Vec<String>,
+    pub topics: Vec<String>,
 }
 
 impl AgentTool {
     /// All of them.
-    pub(super) const ALL: [Self; 7] = [
+    pub const ALL: [Self; 7] = [
         Self::ListTables,
         Self::DescribeTable,
         Self::Query,
@@ -91,7 +91,7 @@ impl AgentTool {
     ];
 
     /// Its name.
-    pub(super) fn name(self) -> &'static str {
+    pub fn name(self) -> &'static str {
         match self {
             Self::ListTables => "list_tables",
             Self::DescribeTable => "describe_table",
@@ -170,7 +170,7 @@ impl AgentTool {
     }
 
     /// Its description for clients.
-    pub(super) fn description(self) -> Value {
+    pub fn description(self) -> Value {
         json!({
             "name": self.name(),
             "description": self.description_text(),
@@ -194,7 +194,7 @@ impl ToolCall<'_> {
     ///
     /// # Errors
     /// A defect of the arguments, a missing scope, or what ended the work.
-    pub(super) async fn answer_call(
+    pub async fn answer_call(
         &self,
         tool: AgentTool,
         arguments: Map<String, Value>,

@@ -30,14 +30,14 @@ pub(super) struct SliceTask {
 
 /// Server resources that a slice occupies.
 pub(super) struct SliceResources {
-    pub(super) place: OwnedSemaphorePermit,
+    pub place: OwnedSemaphorePermit,
     /// The permits of slices that are being worked on.
-    pub(super) turns: Arc<Semaphore>,
+    pub turns: Arc<Semaphore>,
 }
 
 impl SliceTask {
     /// Begins, in one of its client's places.
-    pub(super) fn begin_cutting(
+    pub fn begin_cutting(
         service: &QueryService,
         client: &Arc<EngineClient>,
         snapshot: Arc<LakeSnapshot>,
@@ -69,7 +69,7 @@ impl SliceTask {
     ///
     /// # Errors
     /// Why the slice cannot be cut, or not to its end.
-    pub(super) async fn next(&mut self) -> Result<Option<Bytes>, RequestFault> {
+    pub async fn next(&mut self) -> Result<Option<Bytes>, RequestFault> {
         match self.pieces.recv().await {
             Some(piece) => Ok(Some(piece)),
             None => finish_task(&mut self.task).await.map(|()| None),

@@ -90,15 +90,15 @@ struct SliceRequest {
 
 /// The addresses of a slice, and what is in it.
 pub(super) struct SliceAddress {
-    pub(super) path: String,
-    pub(super) manifest_path: String,
-    pub(super) measurements: usize,
-    pub(super) runs: Vec<RunId>,
+    pub path: String,
+    pub manifest_path: String,
+    pub measurements: usize,
+    pub runs: Vec<RunId>,
 }
 
 impl SliceService {
     /// Slices of a lake.
-    pub(super) fn new(catalogue: &LakeCatalogue) -> Self {
+    pub fn new(catalogue: &LakeCatalogue) -> Self {
         Self(Arc::new(SlicesState {
             catalogue: catalogue.clone(),
             selections: SelectionCache::default(),
@@ -112,7 +112,7 @@ impl SliceService {
     ///
     /// # Errors
     /// A defect of the predicate, a missing scope, or a slice without measurements.
-    pub(super) async fn slice_address(&self, params: SliceParameters) -> Result<SliceAddress, RequestFault> {
+    pub async fn slice_address(&self, params: SliceParameters) -> Result<SliceAddress, RequestFault> {
         let client = self.authorise_client()?;
         let question = SliceQuery::new(params)?;
         let request = self.known_runs(client, question).await?;

@@ -48,7 +48,7 @@ enum SliceLayout {
 
 impl SliceParameters {
     /// A slice by topic.
-    pub(in super::super) fn new(predicate: Option<String>, run: Vec<String>, topics: Vec<String>) -> Self {
+    pub fn new(predicate: Option<String>, run: Vec<String>, topics: Vec<String>) -> Self {
         Self { predicate, run, topics, layout: SliceLayout::ByTopic, id: None }
     }
 }
@@ -58,21 +58,21 @@ pub(super) struct SliceQuery {
     /// The predicate; None if all measurements of the runs are wanted.
     predicate: Option<String>,
     /// None, or the runs that the measurements are of.
-    pub(super) runs: Vec<RunId>,
+    pub runs: Vec<RunId>,
     /// The topics, sorted; all if there are none.
-    pub(super) topics: Vec<String>,
+    pub topics: Vec<String>,
     /// The distribution of messages over chunks.
-    pub(super) layout: Layout,
+    pub layout: Layout,
     /// The slice that is expected.
-    pub(super) id: Option<String>,
+    pub id: Option<String>,
     /// The syntax that is allowed in the predicate.
-    pub(super) form: PredicateForm,
+    pub form: PredicateForm,
 }
 
 impl SliceQuery {
     /// # Errors
     /// [`RequestFault::Request`] if it is not right.
-    pub(super) fn new(params: SliceParameters) -> Result<Self, RequestFault> {
+    pub fn new(params: SliceParameters) -> Result<Self, RequestFault> {
         let mut runs = Vec::new();
         for name in &params.run {
             let hint = "GET /api/v1/runs lists what there is";
@@ -99,17 +99,17 @@ impl SliceQuery {
     }
 
     /// The predicate; a true one if none was given.
-    pub(super) fn predicate(&self) -> &str {
+    pub fn predicate(&self) -> &str {
         self.predicate.as_deref().unwrap_or("true")
     }
 
     /// The beginning of the query, which the predicate completes.
-    pub(super) fn select_clause(&self) -> String {
+    pub fn select_clause(&self) -> String {
         self.select_of(&Taken::COLUMNS.join(", "))
     }
 
     /// The same with other columns.
-    pub(super) fn select_of(&self, columns: &str) -> String {
+    pub fn select_of(&self, columns: &str) -> String {
         // Names of runs have letters, digits, `_` and `-` alone.
         let named: Vec<_> = self.runs.iter().map(|run| format!("'{run}'")).collect();
         let runs = if named.is_empty() { String::new() } else { format!(" run_id in ({}) and", named.join(", ")) };
@@ -117,12 +117,12 @@ impl SliceQuery {
     }
 
     /// Returns whether it selects all of the runs that it names.
-    pub(super) fn is_of_whole_runs(&self) -> bool {
+    pub fn is_of_whole_runs(&self) -> bool {
         self.predicate.is_none() && self.topics.is_empty()
     }
 
     /// Returns its parameters for some runs, as the query part of a URL.
-    pub(super) fn query_of<'a>(&'a self, runs: impl IntoIterator<Item = &'a RunId>) -> String {
+    pub fn query_of<'a>(&'a self, runs: impl IntoIterator<Item = &'a RunId>) -> String {
         let mut pairs = vec![("layout", self.layout_name())];
         pairs.extend(self.predicate.as_deref().map(|predicate| ("where", predicate)));
         pairs.extend(runs.into_iter().map(|run| ("run", run.as_str())));
@@ -132,7 +132,7 @@ impl SliceQuery {
     }
 
     /// The name of its layout.
-    pub(super) fn layout_name(&self) -> &'static str {
+    pub fn layout_name(&self) -> &'static str {
         match self.layout {
             Layout::ByTopic => "by-topic",
             Layout::InTime => "in-time",

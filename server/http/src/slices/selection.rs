@@ -26,9 +26,9 @@ const FORMAT: &str = concat!("slice 1, echolake ", env!("CARGO_PKG_VERSION"));
 /// The input of a slice.
 pub(super) struct SliceSelection {
     /// By run, time and pair.
-    pub(super) taken: Vec<Taken>,
+    pub taken: Vec<Taken>,
     /// Says which slice it is: the same measurements, topics and layout, the same bytes.
-    pub(super) digest: String,
+    pub digest: String,
 }
 
 /// The client's name, the lake's version, and the question with all that is in it.
@@ -59,7 +59,7 @@ impl SelectionCache {
     ///
     /// # Errors
     /// A defect of the predicate, or what ended its query; [`RequestFault::NoData`] if it selects nothing.
-    pub(super) async fn get_or_select(
+    pub async fn get_or_select(
         &self,
         catalogue: &LakeCatalogue,
         request: &SliceRequest,
@@ -83,7 +83,7 @@ impl SliceRequest {
     ///
     /// # Errors
     /// A defect of the predicate, or a limit.
-    pub(super) async fn begin_query(
+    pub async fn begin_query(
         &self,
         service: &QueryService,
         select: String,

@@ -100,7 +100,7 @@ impl SliceSpool {
     ///
     /// # Errors
     /// Those of cutting, and [`RequestFault::NoRoom`].
-    pub(super) async fn get_or_cut<S: PieceSource>(
+    pub async fn get_or_cut<S: PieceSource>(
         &self,
         key: &str,
         cut: impl Future<Output = Result<S, RequestFault>> + Send,
@@ -162,12 +162,12 @@ fn disk_fault(error: io::Error) -> RequestFault {
 
 impl SpooledSlice {
     /// Its length.
-    pub(super) fn bytes(&self) -> u64 {
+    pub fn bytes(&self) -> u64 {
         self.bytes
     }
 
     /// Bytes of it, a block at a time.
-    pub(super) fn read_range(
+    pub fn read_range(
         self: &Arc<Self>,
         range: Range<u64>,
     ) -> impl Stream<Item = Result<Bytes, RequestFault>> + Send + use<> {

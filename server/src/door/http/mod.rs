@@ -95,7 +95,7 @@ fn shows_token(request: &Request) -> bool {
 
 impl ServerDoor {
     /// Forwards a request to the client's engine.
-    pub(crate) async fn forward_http(State(door): State<Self>, request: Request) -> Response {
+    pub async fn forward_http(State(door): State<Self>, request: Request) -> Response {
         door.answer_http(request).await.unwrap_or_else(|fault| {
             door.metrics().record_failure(&fault);
             ProblemResponse(fault).into_response()
@@ -103,7 +103,7 @@ impl ServerDoor {
     }
 
     /// Answers a request within its span, and names it in the answer; the layer of all routes.
-    pub(crate) async fn name_request(State(door): State<Self>, mut request: Request, next: Next) -> Response {
+    pub async fn name_request(State(door): State<Self>, mut request: Request, next: Next) -> Response {
         let begun = Instant::now();
         let (span, id) = begin_request(request.headers_mut(), ServerProtocol::Http);
         let peer = request.extensions().get::<PlaceWork>().map(PlaceWork::peer);

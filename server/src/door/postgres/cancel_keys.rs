@@ -12,15 +12,15 @@ use crate::door::engine_process::EngineProcess;
 /// The engine of a connection, and the key of its connection there.
 #[derive(Clone)]
 pub(super) struct CancelTarget {
-    pub(super) engine: Arc<EngineProcess>,
-    pub(super) pid: i32,
-    pub(super) secret: Vec<u8>,
+    pub engine: Arc<EngineProcess>,
+    pub pid: i32,
+    pub secret: Vec<u8>,
 }
 
 /// A connection's key.
 pub(super) struct CancelKey {
-    pub(super) pid: i32,
-    pub(super) secret: Vec<u8>,
+    pub pid: i32,
+    pub secret: Vec<u8>,
 }
 
 /// The keys of all connections.
@@ -32,31 +32,31 @@ impl CancelKeys {
     ///
     /// # Errors
     /// If the system gives no random bytes.
-    pub(super) fn make_pid() -> Result<i32, getrandom::Error> {
+    pub fn make_pid() -> Result<i32, getrandom::Error> {
         let mut random = [0; 4];
         getrandom::fill(&mut random)?;
         Ok((i32::from_be_bytes(random) & i32::MAX).max(1))
     }
 
     /// A key of `bytes` random bytes: four in protocol 3.0, more in 3.2. None if the system gives none.
-    pub(super) fn make_key(pid: i32, bytes: usize) -> Option<CancelKey> {
+    pub fn make_key(pid: i32, bytes: usize) -> Option<CancelKey> {
         let mut secret = vec![0; bytes.min(32)];
         getrandom::fill(&mut secret).ok()?;
         Some(CancelKey { pid, secret })
     }
 
     /// Lets this key cancel queries of the target's connection from now on.
-    pub(super) fn set_target(&self, key: &CancelKey, target: CancelTarget) {
+    pub fn set_target(&self, key: &CancelKey, target: CancelTarget) {
         self.lock_keys().insert((key.pid, key.secret.clone()), target);
     }
 
     /// Removes a key.
-    pub(super) fn remove_key(&self, key: &CancelKey) {
+    pub fn remove_key(&self, key: &CancelKey) {
         self.lock_keys().remove(&(key.pid, key.secret.clone()));
     }
 
     /// Cancels the query on the connection of a key; false if there is none.
-    pub(super) async fn cancel_query(&self, pid: i32, secret: &[u8]) -> bool {
+    pub async fn cancel_query(&self, pid: i32, secret: &[u8]) -> bool {
         let found = self.lock_keys().get(&(pid, secret.to_vec())).cloned();
         let Some(target) = found else { return false };
         // An engine that is gone runs nothing.

@@ -17,9 +17,9 @@ const PASSWORD: usize = 18 << 10;
 /// The first bytes of a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct FrameHeader {
-    pub(super) kind: u8,
+    pub kind: u8,
     /// Bytes of the whole message, with these.
-    pub(super) bytes: usize,
+    pub bytes: usize,
 }
 
 impl FrameHeader {
@@ -27,7 +27,7 @@ impl FrameHeader {
     ///
     /// # Errors
     /// [`RequestFault::Request`] if the length is impossible.
-    pub(super) fn peek_from(buffer: &[u8]) -> Result<Option<Self>, RequestFault> {
+    pub fn peek_from(buffer: &[u8]) -> Result<Option<Self>, RequestFault> {
         let Some((&[kind, a, b, c, d], _)) = buffer.split_first_chunk() else { return Ok(None) };
         match i32::from_be_bytes([a, b, c, d]) {
             length @ 4.. => Ok(Some(Self { kind, bytes: length.unsigned_abs() as usize + 1 })),
@@ -39,7 +39,7 @@ impl FrameHeader {
     ///
     /// # Errors
     /// [`RequestFault::TooLarge`], [`RequestFault::Request`].
-    pub(super) fn check_header(self) -> Result<(), RequestFault> {
+    pub fn check_header(self) -> Result<(), RequestFault> {
         let limit = match self.kind {
             b'Q' | b'P' => TEXT,
             b'B' => VALUES,
@@ -60,7 +60,7 @@ impl FrameHeader {
     ///
     /// # Errors
     /// [`RequestFault::Request`].
-    pub(super) fn check_parts(self, message: &[u8]) -> Result<(), RequestFault> {
+    pub fn check_parts(self, message: &[u8]) -> Result<(), RequestFault> {
         let body = message.get(HEADER..).unwrap_or_default();
         let kind = char::from(self.kind);
         let wrong =
@@ -166,7 +166,7 @@ impl StartupPacket {
     ///
     /// # Errors
     /// [`RequestFault::Request`].
-    pub(super) fn parse(mut packet: &[u8]) -> Result<Self, RequestFault> {
+    pub fn parse(mut packet: &[u8]) -> Result<Self, RequestFault> {
         let wrong = || RequestFault::bad_request("the protocol's startup is expected");
         match packet.try_get_i32().map_err(|_| wrong())? {
             TLS => Ok(Self::Encryption { is_tls: true }),

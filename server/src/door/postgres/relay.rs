@@ -116,7 +116,7 @@ impl Drop for MessageRelay {
 }
 
 impl MessageRelay {
-    pub(super) fn new(stream: DoorStream, door: ServerDoor, keys: Arc<CancelKeys>, login: PostgresLogin) -> Self {
+    pub fn new(stream: DoorStream, door: ServerDoor, keys: Arc<CancelKeys>, login: PostgresLogin) -> Self {
         let (read, write) = tokio::io::split(stream);
         Self {
             door,
@@ -133,7 +133,7 @@ impl MessageRelay {
     }
 
     /// Answers the client until it or its engine ends, or until the server drains and nothing is asked.
-    pub(super) async fn answer_client(mut self) {
+    pub async fn answer_client(mut self) {
         if let Err(Some(fault)) = self.converse().await {
             self.door.metrics().record_failure(&fault);
             self.outgoing.extend_from_slice(&fatal_message(&fault));

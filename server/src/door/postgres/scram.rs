@@ -58,7 +58,7 @@ impl<'a> ScramExchange<'a> {
     ///
     /// # Errors
     /// [`RequestFault::Request`].
-    pub(super) fn read_first(
+    pub fn read_first(
         message: &[u8],
         verifier: &'a ScramVerifier,
         certificate: Option<&[u8]>,
@@ -104,7 +104,7 @@ impl<'a> ScramExchange<'a> {
     }
 
     /// Returns the server's first message.
-    pub(super) fn first_message(&self) -> BytesMut {
+    pub fn first_message(&self) -> BytesMut {
         sasl_message(SASL_CONTINUE, self.server_first.as_bytes())
     }
 
@@ -112,7 +112,7 @@ impl<'a> ScramExchange<'a> {
     ///
     /// # Errors
     /// [`RequestFault::Unauthenticated`] if the client has not the token, [`RequestFault::Request`].
-    pub(super) fn finish_exchange(&self, message: &[u8]) -> Result<BytesMut, RequestFault> {
+    pub fn finish_exchange(&self, message: &[u8]) -> Result<BytesMut, RequestFault> {
         let last = str::from_utf8(message).map_err(|_| malformed_login("its last message is no text"))?;
         let (unproved, proof) = last.rsplit_once(",p=").ok_or_else(|| malformed_login("no `p=`"))?;
         check_extensions(unproved)?;

@@ -16,7 +16,7 @@ pub(super) enum PageOutput {
 
 impl PageOutput {
     /// The pager if one is wanted and available, else the terminal.
-    pub(super) fn open(is_wanted: bool) -> Self {
+    pub fn open(is_wanted: bool) -> Self {
         let terminal = std::io::stdout();
         if !is_wanted || !terminal.is_terminal() {
             return Self::Terminal(terminal);

@@ -61,7 +61,7 @@ pub(super) struct WordCompleter {
 
 impl WordCompleter {
     /// The names that a session knows.
-    pub(super) fn from_session(session: &Session) -> Self {
+    pub fn from_session(session: &Session) -> Self {
         let columns = |schema: &arrow::datatypes::Schema| schema.fields().iter().map(|f| f.name().clone()).collect();
         Self {
             tables: session.all_tables().into_iter().map(|(name, schema)| (name, columns(&schema))).collect(),

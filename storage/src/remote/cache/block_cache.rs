@@ -49,13 +49,13 @@ pub(crate) struct BlockCache {
 }
 
 impl BlockCache {
-    pub(crate) fn new(folder: Option<BlockFolder>) -> Self {
+    pub fn new(folder: Option<BlockFolder>) -> Self {
         // So few items are one shard, in which a block may take all the room.
         let memory = Cache::with_weighter(32, CACHE_MEMORY_BYTES, BlockWeighter);
         Self { memory, folder: folder.map(Arc::new), counters: CacheCounters::default() }
     }
 
-    pub(crate) fn read_counts(&self) -> CacheCounts {
+    pub fn read_counts(&self) -> CacheCounts {
         self.counters.read_counts()
     }
 
@@ -63,7 +63,7 @@ impl BlockCache {
     ///
     /// # Errors
     /// What the store says.
-    pub(super) async fn read_blocks(
+    pub async fn read_blocks(
         &self,
         store: &dyn ObjectStore,
         path: &Path,

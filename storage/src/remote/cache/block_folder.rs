@@ -19,9 +19,9 @@ use sha2::{Digest as _, Sha256};
 /// A block, and what the store says of its object.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct CachedBlock {
-    pub(super) bytes: Bytes,
-    pub(super) object_bytes: u64,
-    pub(super) modified: DateTime<Utc>,
+    pub bytes: Bytes,
+    pub object_bytes: u64,
+    pub modified: DateTime<Utc>,
 }
 
 /// The folder for a cache, and the bytes that it may hold.
@@ -81,7 +81,7 @@ impl BlockFolder {
     ///
     /// # Errors
     /// The folder cannot be made.
-    pub(crate) fn open(folder: &CacheFolder, lake_id: &str) -> io::Result<Self> {
+    pub fn open(folder: &CacheFolder, lake_id: &str) -> io::Result<Self> {
         folder.create()?;
         let lake = folder.path.join(&digest_of(lake_id)[..16]);
         fs::create_dir_all(&lake)?;
@@ -91,7 +91,7 @@ impl BlockFolder {
     }
 
     /// Reads a block; None if it is not there, or is damaged.
-    pub(super) fn read_block(&self, object: &Path, number: u64) -> Option<CachedBlock> {
+    pub fn read_block(&self, object: &Path, number: u64) -> Option<CachedBlock> {
         let path = self.block_path(object, number);
         let mut file = File::open(&path).ok()?;
         let mut bytes = Vec::new();
@@ -106,7 +106,7 @@ impl BlockFolder {
     }
 
     /// Writes a block, if there is or can be room for it.
-    pub(super) fn write_block(&self, object: &Path, number: u64, block: &CachedBlock) {
+    pub fn write_block(&self, object: &Path, number: u64, block: &CachedBlock) {
         // The cache does without it.
         let _ = self.try_write(object, number, block);
     }

@@ -32,16 +32,16 @@ pub(crate) struct CachedStore {
 }
 
 impl CachedStore {
-    pub(crate) fn new(inner: Arc<dyn ObjectStore>, cache: Arc<BlockCache>) -> Self {
+    pub fn new(inner: Arc<dyn ObjectStore>, cache: Arc<BlockCache>) -> Self {
         Self { inner, cache, scan: None }
     }
 
     /// The same store for one scan, which has counters of its own.
-    pub(crate) fn for_scan(&self, counters: Arc<CacheCounters>) -> Self {
+    pub fn for_scan(&self, counters: Arc<CacheCounters>) -> Self {
         Self { scan: Some(counters), ..self.clone() }
     }
 
-    pub(crate) fn block_cache(&self) -> &BlockCache {
+    pub fn block_cache(&self) -> &BlockCache {
         &self.cache
     }
 

@@ -28,7 +28,7 @@ pub(crate) struct ProjectLog {
 }
 
 impl ProjectLog {
-    pub(crate) fn new(log: Arc<DeltaLog>, projects: BTreeSet<ProjectName>, common: [SurfaceId; 2]) -> Self {
+    pub fn new(log: Arc<DeltaLog>, projects: BTreeSet<ProjectName>, common: [SurfaceId; 2]) -> Self {
         Self { log, projects, common }
     }
 

@@ -3,9 +3,9 @@
 /// A hostile statement.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct SqlAttack {
-    pub(crate) name: &'static str,
+    pub name: &'static str,
     /// Makes the statement.
-    pub(crate) text: fn() -> String,
+    pub text: fn() -> String,
 }
 
 pub(super) const fn define_attack(name: &'static str, text: fn() -> String) -> SqlAttack {

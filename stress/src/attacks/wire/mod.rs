@@ -51,7 +51,7 @@ pub(crate) enum WireFlow {
 /// Hostile bytes.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct WireAttack {
-    pub(crate) name: &'static str,
+    pub name: &'static str,
     /// Connections at once.
     connections: usize,
     /// The first bytes of each.
@@ -66,7 +66,7 @@ pub(crate) const WIRE_FAMILIES: [(WirePort, &[WireAttack]); 3] =
 pub(crate) const UPLOADS: &[UploadAttack] = uploads::ATTACKS;
 
 impl WirePort {
-    pub(crate) fn name(self) -> &'static str {
+    pub fn name(self) -> &'static str {
         match self {
             Self::Http => "http",
             Self::Postgres => "postgres",
@@ -99,7 +99,7 @@ const fn define_attack(name: &'static str, connections: usize, opening: BytesMak
 
 impl WireAttack {
     /// Runs it until it ends or the client's connections are closed; returns how each connection ended.
-    pub(crate) fn run(&self, port: WirePort, client: &QueryClient) -> Vec<String> {
+    pub fn run(&self, port: WirePort, client: &QueryClient) -> Vec<String> {
         let opening = (self.opening)(client);
         std::thread::scope(|scope| {
             let run = || self.run_connection(port, client, &opening);

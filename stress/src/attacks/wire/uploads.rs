@@ -28,7 +28,7 @@ const EXTREMES: [u32; 4] = [0x7fff_ffff, 0xffff_fff0, 0x8000_0000, 0x00ff_ffff];
 /// Parameters for a statement.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct UploadAttack {
-    pub(crate) name: &'static str,
+    pub name: &'static str,
     /// Makes the uploads, each the messages of one DoPut.
     uploads: fn() -> Result<Vec<Vec<FlightData>>, ArrowError>,
     /// Number of times that the last message of an upload is sent.
@@ -54,7 +54,7 @@ pub(super) const ATTACKS: &[UploadAttack] = &[
 
 impl UploadAttack {
     /// Runs it until it ends or the client's connections are closed; returns how each upload ended.
-    pub(crate) fn run(&self, client: &QueryClient) -> Vec<String> {
+    pub fn run(&self, client: &QueryClient) -> Vec<String> {
         let uploads = match (self.uploads)() {
             Ok(uploads) => uploads,
             Err(error) => return vec![format!("not made: {error}")],

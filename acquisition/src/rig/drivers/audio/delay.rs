@@ -7,9 +7,9 @@ use realfft::num_complex::Complex;
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct LoopbackDelay {
     /// First sample of the output.
-    pub(super) at: usize,
+    pub at: usize,
     /// Correlation there, -1 to 1.
-    pub(super) likeness: f64,
+    pub likeness: f64,
 }
 
 /// Finds an output in a recording that is longer than it. A silent recording has a likeness of 0.

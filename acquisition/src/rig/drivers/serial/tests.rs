@@ -31,7 +31,7 @@ pub(in crate::rig::drivers) struct FakeSensor {
 }
 
 impl FakeSensor {
-    pub(in crate::rig::drivers) fn sending(text: &'static str) -> Self {
+    pub fn sending(text: &'static str) -> Self {
         let (ours, theirs) = SerialPort::pair().expect("a pair of pseudo terminals");
         let folder = tempfile::tempdir().expect("a folder");
         let link = folder.path().join("sensor");
@@ -55,7 +55,7 @@ impl FakeSensor {
         Self { link, _folder: folder, text, count, stop, thread: Some(thread) }
     }
 
-    pub(in crate::rig::drivers) fn params(&self, timeout_secs: f64) -> SerialParams {
+    pub fn params(&self, timeout_secs: f64) -> SerialParams {
         SerialParams { path: self.link.display().to_string(), timeout_secs, ..SerialParams::default() }
     }
 
@@ -77,12 +77,12 @@ impl FakeSensor {
     }
 
     /// Something else from now on.
-    pub(in crate::rig::drivers) fn send(&self, text: &'static str) {
+    pub fn send(&self, text: &'static str) {
         *self.text.lock().expect("a text") = text;
     }
 
     /// Its end of the line is gone.
-    pub(in crate::rig::drivers) fn unplug(&mut self) {
+    pub fn unplug(&mut self) {
         let _ = std::fs::remove_file(&self.link);
         self.stop.store(true, Ordering::Relaxed);
         let _ = self.thread.take().map(JoinHandle::join);

@@ -18,7 +18,7 @@ pub(super) struct ProtobufDecoder(Node);
 
 impl ProtobufDecoder {
     /// Compiles a decoder of the columns at `wanted`, which are `fields`.
-    pub(super) fn new(message: &MessageDescriptor, wanted: &[usize], fields: &Fields) -> Self {
+    pub fn new(message: &MessageDescriptor, wanted: &[usize], fields: &Fields) -> Self {
         let descriptors: Vec<_> = message.fields().collect();
         Self(Node::new(wanted.iter().map(|i| &descriptors[*i]), fields))
     }

@@ -27,17 +27,17 @@ pub(super) struct FieldReader<'a> {
 
 impl<'a> FieldReader<'a> {
     /// Reads the fields of a message.
-    pub(super) fn new(data: &'a [u8]) -> Self {
+    pub fn new(data: &'a [u8]) -> Self {
         Self { data, at: 0 }
     }
 
     /// Returns true if there is no field left.
-    pub(super) fn is_at_end(&self) -> bool {
+    pub fn is_at_end(&self) -> bool {
         self.at >= self.data.len()
     }
 
     /// Reads a field's number and value.
-    pub(super) fn read_field(&mut self) -> Result<(u32, WireValue), Malformed> {
+    pub fn read_field(&mut self) -> Result<(u32, WireValue), Malformed> {
         let (number, kind) = self.read_tag()?;
         let value = match kind {
             0 => WireValue::Number(WireKind::Varint, self.read_varint()?),
@@ -67,7 +67,7 @@ impl<'a> FieldReader<'a> {
 
     /// Reads an integer of variable length.
     #[inline]
-    pub(super) fn read_varint(&mut self) -> Result<u64, Malformed> {
+    pub fn read_varint(&mut self) -> Result<u64, Malformed> {
         let mut value = 0;
         for (i, byte) in self.data[self.at..].iter().take(10).enumerate() {
             value |= u64::from(byte & 0x7F) << (7 * i);

@@ -20,14 +20,14 @@ const CLIENT_BYTES: usize = 16;
 /// A message type: its members in their order.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct MessageDefinition {
-    pub(super) members: Vec<MessageMember>,
+    pub members: Vec<MessageMember>,
 }
 
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct MessageMember {
     name: String,
-    pub(super) kind: MemberKind,
-    pub(super) count: MemberCount,
+    pub kind: MemberKind,
+    pub count: MemberCount,
 }
 
 /// How many values a member has.
@@ -61,7 +61,7 @@ pub(super) enum MemberKind {
 impl MessageDefinition {
     /// Reads a definition and those it names, which follow it behind lines of `=`. The text of an error says what is
     /// wrong.
-    pub(super) fn parse(name: &str, text: &str) -> Result<Self, String> {
+    pub fn parse(name: &str, text: &str) -> Result<Self, String> {
         let mut parts = HashMap::new();
         let (mut title, mut lines) = (name.to_owned(), Vec::new());
         for line in text.lines().map(str::trim) {
@@ -82,7 +82,7 @@ impl MessageDefinition {
     }
 
     /// Returns the columns.
-    pub(super) fn column_fields(&self) -> Fields {
+    pub fn column_fields(&self) -> Fields {
         self.members.iter().map(|m| Field::new(&m.name, m.data_type(), false)).collect()
     }
 }
@@ -220,7 +220,7 @@ fn parse_count(kind: &str) -> Option<(&str, MemberCount)> {
 
 impl MessageMember {
     /// Returns true if it is bytes: an image is no list of numbers.
-    pub(super) fn is_binary(&self) -> bool {
+    pub fn is_binary(&self) -> bool {
         self.count != MemberCount::One && self.kind == MemberKind::U8
     }
 
@@ -236,7 +236,7 @@ impl MessageMember {
 
 impl MemberKind {
     /// Returns the type of its column.
-    pub(super) fn data_type(&self) -> DataType {
+    pub fn data_type(&self) -> DataType {
         match self {
             Self::Bool => DataType::Boolean,
             Self::I8 => DataType::Int8,

@@ -53,7 +53,7 @@ impl AnswerCache {
     ///
     /// # Errors
     /// What `make` answers instead of 200, which is not cached.
-    pub(in super::super) async fn get_or_make(
+    pub async fn get_or_make(
         &self,
         key: &AnswerKey,
         make: impl Future<Output = Response>,
@@ -85,7 +85,7 @@ impl CachedAnswer {
     }
 
     /// Returns the response to a request with these headers.
-    pub(in super::super) fn to_response(&self, request: &HeaderMap) -> Response {
+    pub fn to_response(&self, request: &HeaderMap) -> Response {
         let packs = self.headers.get(header::CONTENT_TYPE).is_some_and(is_packable);
         let is_worth = packs && self.bytes.len() >= WORTH_PACKING && accepts_encoding(request, "gzip");
         let packed = is_worth.then(|| self.packed.get_or_init(|| pack_gzip(&self.bytes).ok()).clone());

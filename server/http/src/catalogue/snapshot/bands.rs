@@ -10,10 +10,10 @@ use utoipa::ToSchema;
 #[schema(as = Band)]
 pub(in super::super) struct BandDescription {
     /// As in column names: `2500`, ..., `total`.
-    pub(in super::super) key: String,
+    pub key: String,
     centre_hz: Option<f64>,
     /// As in pictures: `2.5 kHz`.
-    pub(in super::super) label: String,
+    pub label: String,
 }
 
 /// The rig's bands, the total last.

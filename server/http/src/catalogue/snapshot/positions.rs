@@ -7,14 +7,14 @@ use utoipa::ToSchema;
 
 /// Surfaces on the map.
 pub(in super::super) struct SurfacePositions {
-    pub(in super::super) names: Vec<String>,
-    pub(in super::super) components: PrincipalComponents,
-    pub(in super::super) units: SelfOrganisingMap,
+    pub names: Vec<String>,
+    pub components: PrincipalComponents,
+    pub units: SelfOrganisingMap,
 }
 
 impl SurfacePositions {
     /// The `count` surfaces nearest to one.
-    pub(in super::super) fn nearest_surfaces(&self, of: usize, count: usize) -> Vec<SurfaceNeighbour<'_>> {
+    pub fn nearest_surfaces(&self, of: usize, count: usize) -> Vec<SurfaceNeighbour<'_>> {
         let others = self.names.iter().enumerate().filter(|(i, _)| *i != of);
         let mut near: Vec<_> = others.map(|(i, name)| (self.components.row_distance(of, i), name)).collect();
         near.sort_by(|a, b| a.0.total_cmp(&b.0));

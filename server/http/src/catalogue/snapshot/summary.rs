@@ -17,69 +17,69 @@ const DAY_NS: f64 = 86_400e9;
 #[derive(Debug, Serialize, ToSchema)]
 #[schema(as = Surface)]
 pub(in super::super) struct SurfaceSummary {
-    pub(in super::super) surface_id: String,
-    pub(in super::super) run_id: Option<String>,
+    pub surface_id: String,
+    pub run_id: Option<String>,
     panel: String,
     side: Option<i32>,
-    pub(in super::super) typology: String,
-    pub(in super::super) macrostructure: Option<String>,
-    pub(in super::super) mesostructure: Option<String>,
+    pub typology: String,
+    pub macrostructure: Option<String>,
+    pub mesostructure: Option<String>,
     microstructure: Option<String>,
-    pub(in super::super) material: String,
-    pub(in super::super) flat_reference: String,
-    pub(in super::super) foam_reference: String,
-    pub(in super::super) origin: String,
+    pub material: String,
+    pub flat_reference: String,
+    pub foam_reference: String,
+    pub origin: String,
     #[schema(format = DateTime)]
     started: Option<String>,
     relief_min_mm: Option<f64>,
     relief_max_mm: Option<f64>,
-    pub(in super::super) relief_rms_mm: Option<f64>,
+    pub relief_rms_mm: Option<f64>,
     /// Mean TNCE of the values up to the 90th percentile, dB re Flat total. One value per band in the order of
     /// `lake.bands`, the total last; null if there is no value.
     level_db: Vec<Option<f64>>,
     /// `level_db` less that of the surface's Flat.
-    pub(in super::super) against_flat_db: Vec<Option<f64>>,
+    pub against_flat_db: Vec<Option<f64>>,
     /// Standard deviation of the pairs' TNCE in dB, by band as `level_db`.
-    pub(in super::super) spread_db: Vec<Option<f64>>,
+    pub spread_db: Vec<Option<f64>>,
 }
 
 impl SurfaceSummary {
     /// Returns whether it is a reference, which is no design.
-    pub(in super::super) fn is_reference(&self) -> bool {
+    pub fn is_reference(&self) -> bool {
         self.typology == REFERENCE
     }
 
     /// Returns whether it is the Foam that is subtracted from it, which leaves nothing.
-    pub(in super::super) fn is_foam(&self) -> bool {
+    pub fn is_foam(&self) -> bool {
         self.surface_id == self.foam_reference
     }
 }
 
 /// A surface, and what it is found and compared by.
 pub(in super::super) struct SurfaceEntry {
-    pub(in super::super) surface: SurfaceSummary,
+    pub surface: SurfaceSummary,
     /// Parameters of its relief's generator.
-    pub(in super::super) parameters: Map<String, Value>,
-    pub(in super::super) mesh_triangles: Option<i64>,
-    pub(in super::super) mesh_watertight: Option<bool>,
-    pub(in super::super) reflection_factor: Option<f64>,
+    pub parameters: Map<String, Value>,
+    pub mesh_triangles: Option<i64>,
+    pub mesh_watertight: Option<bool>,
+    pub reflection_factor: Option<f64>,
     /// Start of its run, days since 1970.
-    pub(in super::super) day: Option<f64>,
+    pub day: Option<f64>,
     /// The searched text, in lower case.
-    pub(in super::super) words: String,
+    pub words: String,
 }
 
 impl SurfaceEntry {
     /// From the lowest to the highest point.
-    pub(in super::super) fn relief_range_mm(&self) -> Option<f64> {
+    pub fn relief_range_mm(&self) -> Option<f64> {
         Some(self.surface.relief_max_mm? - self.surface.relief_min_mm?)
     }
 }
 
 /// All surfaces, by name.
 pub(in super::super) struct CatalogueSummary {
-    pub(in super::super) bands: Vec<BandDescription>,
-    pub(in super::super) entries: Vec<SurfaceEntry>,
+    pub bands: Vec<BandDescription>,
+    pub entries: Vec<SurfaceEntry>,
     places: HashMap<String, usize>,
 }
 
@@ -141,7 +141,7 @@ pub(in super::super) const BAND_STATISTICS: &str =
 
 impl CatalogueSummary {
     /// The surfaces of the rows of [`SURFACES`] with the statistics of [`BAND_STATISTICS`].
-    pub(in super::super) fn new(
+    pub fn new(
         rows: Vec<SurfaceRow>,
         statistics: Vec<BandStatistic>,
         bands: Vec<BandDescription>,
@@ -159,7 +159,7 @@ impl CatalogueSummary {
     }
 
     /// The surface of a name.
-    pub(in super::super) fn find_entry(&self, surface: &str) -> Option<&SurfaceEntry> {
+    pub fn find_entry(&self, surface: &str) -> Option<&SurfaceEntry> {
         self.places.get(surface).map(|place| &self.entries[*place])
     }
 }

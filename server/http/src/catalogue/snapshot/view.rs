@@ -27,12 +27,12 @@ const VERSION_BYTES: usize = 8;
 /// One snapshot.
 pub(crate) struct SnapshotView {
     /// Changes with every snapshot, and with the program.
-    pub(crate) version: String,
-    pub(crate) snapshot: Arc<LakeSnapshot>,
-    pub(in super::super) session: Arc<Session>,
-    pub(in super::super) answers: AnswerCache,
-    pub(in super::super) summary: OnceCell<CatalogueSummary>,
-    pub(in super::super) places: OnceCell<SurfacePositions>,
+    pub version: String,
+    pub snapshot: Arc<LakeSnapshot>,
+    pub session: Arc<Session>,
+    pub answers: AnswerCache,
+    pub summary: OnceCell<CatalogueSummary>,
+    pub places: OnceCell<SurfacePositions>,
     /// Mean curves over all pairs of the references that surfaces are beside, by name; there are few.
     flat_curves: Mutex<HashMap<String, Arc<OnceCell<Option<CurveRow>>>>>,
     /// Prepared queries by their text; there are few texts, because values are bound.
@@ -55,22 +55,22 @@ impl SnapshotView {
 
     /// Returns the tag of an answer of this snapshot: a digest of the version and of the answer's `name`, which no
     /// other answer has.
-    pub(crate) fn answer_etag(&self, name: &str) -> String {
+    pub fn answer_etag(&self, name: &str) -> String {
         let digest = Sha256::new().chain_update(&self.version).chain_update(name).finalize();
         format!("\"{}\"", hex::encode(&digest[..VERSION_BYTES]))
     }
 
-    pub(in super::super) fn find_prepared(&self, sql: &str) -> Option<Arc<PreparedQuery>> {
+    pub fn find_prepared(&self, sql: &str) -> Option<Arc<PreparedQuery>> {
         self.prepared.lock().unwrap_or_else(PoisonError::into_inner).get(sql).cloned()
     }
 
     /// The place of a reference's mean curves over all pairs.
-    pub(in super::super) fn flat_curves(&self, flat: &str) -> Arc<OnceCell<Option<CurveRow>>> {
+    pub fn flat_curves(&self, flat: &str) -> Arc<OnceCell<Option<CurveRow>>> {
         let mut known = self.flat_curves.lock().unwrap_or_else(PoisonError::into_inner);
         known.entry(flat.to_owned()).or_default().clone()
     }
 
-    pub(in super::super) fn keep_prepared(&self, sql: &str, prepared: Arc<PreparedQuery>) {
+    pub fn keep_prepared(&self, sql: &str, prepared: Arc<PreparedQuery>) {
         self.prepared.lock().unwrap_or_else(PoisonError::into_inner).insert(sql.to_owned(), prepared);
     }
 }
@@ -92,8 +92,8 @@ fn snapshot_version(snapshot: &LakeSnapshot) -> String {
 #[derive(Debug, Clone)]
 pub(crate) struct VisibleFile {
     table: Table,
-    pub(crate) path: StorePath,
-    pub(crate) bytes: u64,
+    pub path: StorePath,
+    pub bytes: u64,
 }
 
 impl VisibleFile {
@@ -123,7 +123,7 @@ impl SnapshotViews {
     ///
     /// # Errors
     /// The snapshot cannot be read.
-    pub(in super::super) async fn current_view(
+    pub async fn current_view(
         &self,
         service: &QueryService,
     ) -> Result<Arc<SnapshotView>, RequestFault> {
@@ -151,7 +151,7 @@ impl SnapshotViews {
     }
 
     /// A file that a view shows, or that an earlier one did. A file with rows of other projects is none for a client of some.
-    pub(in super::super) fn find_file(&self, view: &SnapshotView, table: Table, name: &str) -> Option<VisibleFile> {
+    pub fn find_file(&self, view: &SnapshotView, table: Table, name: &str) -> Option<VisibleFile> {
         let now = view.snapshot.readable_files(table).find(|file| file.path.filename() == Some(name));
         let earlier = || self.lock_history().earlier.iter().find(|file| file.is_named(table, name)).cloned();
         now.map(|file| VisibleFile::from_data_file(table, file)).or_else(earlier)

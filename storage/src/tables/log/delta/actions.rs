@@ -17,69 +17,69 @@ pub(super) type TextMap = BTreeMap<String, Option<String>>;
 pub(super) struct LogLine {
     /// Provenance; readers take the time from it. A commit's first line, and in no checkpoint.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(super) commit_info: Option<Value>,
+    pub commit_info: Option<Value>,
     /// Versions of the protocol that the table needs.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(super) protocol: Option<ProtocolVersions>,
+    pub protocol: Option<ProtocolVersions>,
     /// Schema and settings.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(super) meta_data: Option<TableMetadata>,
+    pub meta_data: Option<TableMetadata>,
     /// Another application's transaction; echolake writes none, and keeps those of others in checkpoints.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(super) txn: Option<ApplicationTransaction>,
+    pub txn: Option<ApplicationTransaction>,
     /// A file that comes.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(super) add: Option<AddFile>,
+    pub add: Option<AddFile>,
     /// A file that goes.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(super) remove: Option<RemoveFile>,
+    pub remove: Option<RemoveFile>,
 }
 
 /// The protocol that a table needs of those who read and of those who write it.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase")]
 pub(super) struct ProtocolVersions {
-    pub(super) min_reader_version: i32,
-    pub(super) min_writer_version: i32,
+    pub min_reader_version: i32,
+    pub min_writer_version: i32,
 }
 
 /// A table's schema and settings.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase")]
 pub(super) struct TableMetadata {
-    pub(super) id: String,
+    pub id: String,
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(super) name: Option<String>,
+    pub name: Option<String>,
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(super) description: Option<String>,
-    pub(super) format: FileFormat,
+    pub description: Option<String>,
+    pub format: FileFormat,
     /// The schema, JSON in a string.
-    pub(super) schema_string: String,
+    pub schema_string: String,
     #[serde(default)]
-    pub(super) partition_columns: Vec<String>,
+    pub partition_columns: Vec<String>,
     #[serde(default)]
-    pub(super) configuration: TextMap,
+    pub configuration: TextMap,
     /// Milliseconds since 1970.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(super) created_time: Option<i64>,
+    pub created_time: Option<i64>,
 }
 
 /// The format of a table's files: Parquet.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct FileFormat {
-    pub(super) provider: String,
+    pub provider: String,
     #[serde(default)]
-    pub(super) options: TextMap,
+    pub options: TextMap,
 }
 
 /// Progress that an application records of itself.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase")]
 pub(super) struct ApplicationTransaction {
-    pub(super) app_id: String,
-    pub(super) version: i64,
+    pub app_id: String,
+    pub version: i64,
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(super) last_updated: Option<i64>,
+    pub last_updated: Option<i64>,
 }
 
 /// A file that comes into the table.
@@ -87,42 +87,42 @@ pub(super) struct ApplicationTransaction {
 #[serde(rename_all = "camelCase")]
 pub(super) struct AddFile {
     /// Its place below the table's folder, percent-encoded.
-    pub(super) path: String,
+    pub path: String,
     #[serde(default)]
-    pub(super) partition_values: TextMap,
+    pub partition_values: TextMap,
     /// Bytes.
-    pub(super) size: i64,
+    pub size: i64,
     /// Milliseconds since 1970.
-    pub(super) modification_time: i64,
-    pub(super) data_change: bool,
+    pub modification_time: i64,
+    pub data_change: bool,
     /// JSON in a string.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(super) stats: Option<String>,
+    pub stats: Option<String>,
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(super) tags: Option<TextMap>,
+    pub tags: Option<TextMap>,
 }
 
 /// A file that goes out of the table; its bytes stay for readers of older versions.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase")]
 pub(super) struct RemoveFile {
-    pub(super) path: String,
+    pub path: String,
     /// Milliseconds since 1970.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(super) deletion_timestamp: Option<i64>,
-    pub(super) data_change: bool,
+    pub deletion_timestamp: Option<i64>,
+    pub data_change: bool,
     /// True if the two fields below are given.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(super) extended_file_metadata: Option<bool>,
+    pub extended_file_metadata: Option<bool>,
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(super) partition_values: Option<TextMap>,
+    pub partition_values: Option<TextMap>,
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(super) size: Option<i64>,
+    pub size: Option<i64>,
 }
 
 impl AddFile {
     /// The removal of this file at a time in milliseconds since 1970.
-    pub(super) fn removed_at(&self, now_millis: i64, data_change: bool) -> RemoveFile {
+    pub fn removed_at(&self, now_millis: i64, data_change: bool) -> RemoveFile {
         RemoveFile {
             path: self.path.clone(),
             deletion_timestamp: Some(now_millis),

@@ -71,12 +71,12 @@ struct CheckpointFiles {
 }
 
 impl<'a> LogFolder<'a> {
-    pub(super) fn new(table: Table, store: &'a dyn ObjectStore) -> Self {
+    pub fn new(table: Table, store: &'a dyn ObjectStore) -> Self {
         Self { table, path: table_folder(table).join("_delta_log"), store }
     }
 
     /// The table at its newest version, or at the given one; None if it has no log.
-    pub(super) async fn load_state(&self, at: Option<u64>) -> Result<Option<TableState>> {
+    pub async fn load_state(&self, at: Option<u64>) -> Result<Option<TableState>> {
         let listing = self.list_log().await?;
         let Some(newest) = listing.newest_version() else { return Ok(None) };
         let last = at.unwrap_or(newest).min(newest);
@@ -97,7 +97,7 @@ impl<'a> LogFolder<'a> {
     }
 
     /// The table at its newest version, with the files of all versions that the log still holds.
-    pub(super) async fn load_all_versions(&self) -> Result<Option<TableState>> {
+    pub async fn load_all_versions(&self) -> Result<Option<TableState>> {
         let listing = self.list_log().await?;
         let Some(newest) = listing.newest_version() else { return Ok(None) };
         let mut state = TableState::default();
@@ -155,7 +155,7 @@ impl<'a> LogFolder<'a> {
 
     /// Brings a state up to the newest version. Returns None if the log was cleaned up beyond it, so that it must be
     /// loaded again; that costs a request, and is looked at only on demand.
-    pub(super) async fn advance_state(
+    pub async fn advance_state(
         &self,
         mut state: Arc<TableState>,
         is_in_doubt: bool,
@@ -173,12 +173,12 @@ impl<'a> LogFolder<'a> {
     }
 
     /// Lists its versions, oldest first.
-    pub(super) async fn list_versions(&self) -> Result<Vec<TableVersion>> {
+    pub async fn list_versions(&self) -> Result<Vec<TableVersion>> {
         list_versions(self.store, &self.path).await
     }
 
     /// Lists its versions with what they changed, oldest first.
-    pub(super) async fn list_changes(&self) -> Result<Vec<TableChange>> {
+    pub async fn list_changes(&self) -> Result<Vec<TableChange>> {
         let versions = self.list_versions().await?;
         let commits = futures::stream::iter(versions)
             .map(|version| async move { Ok::<_, Error>((version, self.read_commit(version.version).await?)) });
@@ -191,7 +191,7 @@ impl<'a> LogFolder<'a> {
         Ok(changes)
     }
 
-    pub(super) async fn has_version(&self, version: u64) -> Result<bool> {
+    pub async fn has_version(&self, version: u64) -> Result<bool> {
         let path = self.path.clone().join(commit_name(version));
         match self.store.head(&path).await {
             Ok(_) => Ok(true),
@@ -201,7 +201,7 @@ impl<'a> LogFolder<'a> {
     }
 
     /// Writes a version, unless another writer has taken its number.
-    pub(super) async fn write_commit(&self, version: u64, lines: &[LogLine]) -> Result<CommitAttempt> {
+    pub async fn write_commit(&self, version: u64, lines: &[LogLine]) -> Result<CommitAttempt> {
         let mut text = Vec::new();
         for line in lines {
             let mut line = line.clone();
@@ -220,7 +220,7 @@ impl<'a> LogFolder<'a> {
     }
 
     /// Writes a checkpoint and deletes what is older than the log's retention, if this version is due for it.
-    pub(super) async fn maintain_log(&self, state: &TableState, now: DateTime<Utc>) -> Result<()> {
+    pub async fn maintain_log(&self, state: &TableState, now: DateTime<Utc>) -> Result<()> {
         if !state.version.is_multiple_of(CHECKPOINT_INTERVAL) || state.version == 0 {
             return Ok(());
         }
@@ -260,7 +260,7 @@ impl<'a> LogFolder<'a> {
     }
 
     /// Returns the versions since the newest checkpoint, if another one was due long ago.
-    pub(super) async fn overdue_checkpoint(&self) -> Result<Option<u64>> {
+    pub async fn overdue_checkpoint(&self) -> Result<Option<u64>> {
         let listing = self.list_log().await?;
         let since =
             listing.newest_version().unwrap_or(0) - listing.checkpoints.keys().next_back().copied().unwrap_or(0);
@@ -268,7 +268,7 @@ impl<'a> LogFolder<'a> {
     }
 
     /// Deletes the log.
-    pub(super) async fn delete_log(&self) -> Result<()> {
+    pub async fn delete_log(&self) -> Result<()> {
         let listed: Vec<_> = self
             .store
             .list(Some(&self.path))
@@ -357,7 +357,7 @@ impl<'a> LogFolder<'a> {
     }
 
     /// Refuses a table whose other writers rely on features that this one does not implement.
-    pub(super) fn check_writable(&self, state: &TableState) -> Result<()> {
+    pub fn check_writable(&self, state: &TableState) -> Result<()> {
         let needed = state.protocol.as_ref().map_or(0, |p| p.min_writer_version);
         self.check_protocol("written", "writer", "writes", needed, WRITER_VERSION)
     }

@@ -71,7 +71,7 @@ struct LoadedTable {
 }
 
 impl DeltaLog {
-    pub(crate) fn new(location: &LakeLocation, rig: Rig) -> Self {
+    pub fn new(location: &LakeLocation, rig: Rig) -> Self {
         let is_remote = location.remote.is_some();
         Self { store: location.store.clone(), is_remote, rig, loaded: Mutex::default() }
     }
@@ -114,7 +114,7 @@ impl DeltaLog {
     }
 
     /// The id that a table was given when it was made.
-    pub(crate) async fn table_id(&self, table: Table) -> Result<Option<String>> {
+    pub async fn table_id(&self, table: Table) -> Result<Option<String>> {
         Ok(self.load_table(table).await?.and_then(|state| Some(state.metadata.as_ref()?.id.clone())))
     }
 
@@ -154,7 +154,7 @@ impl DeltaLog {
     }
 
     /// Marks `runs` as being made again, or as whole.
-    pub(crate) async fn set_rebuilding(&self, is_rebuilding: bool) -> Result<()> {
+    pub async fn set_rebuilding(&self, is_rebuilding: bool) -> Result<()> {
         let table = Table::Runs;
         for losses in 1..=COMMIT_TRIES {
             let Some(state) = self.load_table(table).await?.filter(|state| state.is_rebuilding() != is_rebuilding)
@@ -175,13 +175,13 @@ impl DeltaLog {
     }
 
     /// Deletes a table's log.
-    pub(crate) async fn delete_log(&self, table: Table) -> Result<()> {
+    pub async fn delete_log(&self, table: Table) -> Result<()> {
         self.log_folder(table).delete_log().await?;
         self.loaded.lock().await.remove(&table);
         Ok(())
     }
 
-    pub(crate) async fn overdue_checkpoint(&self, table: Table) -> Result<Option<u64>> {
+    pub async fn overdue_checkpoint(&self, table: Table) -> Result<Option<u64>> {
         self.log_folder(table).overdue_checkpoint().await
     }
 

@@ -14,11 +14,11 @@ const TOMBSTONE_MILLIS: i64 = 7 * 24 * 3600 * 1000;
 #[derive(Debug, Clone, Default)]
 pub(super) struct TableState {
     /// The newest version that was applied.
-    pub(super) version: u64,
-    pub(super) protocol: Option<ProtocolVersions>,
-    pub(super) metadata: Option<TableMetadata>,
-    pub(super) files: BTreeMap<String, Arc<AddFile>>,
-    pub(super) removed: BTreeMap<String, Arc<RemoveFile>>,
+    pub version: u64,
+    pub protocol: Option<ProtocolVersions>,
+    pub metadata: Option<TableMetadata>,
+    pub files: BTreeMap<String, Arc<AddFile>>,
+    pub removed: BTreeMap<String, Arc<RemoveFile>>,
     transactions: BTreeMap<String, ApplicationTransaction>,
     /// Another program has added or removed files since this one last wrote the metadata.
     is_changed_by_others: bool,
@@ -33,7 +33,7 @@ pub(super) const ENGINE: &str = "echolake/";
 
 impl TableState {
     /// Applies the actions of a version, or of a checkpoint.
-    pub(super) fn apply_lines(&mut self, version: u64, lines: Vec<LogLine>) {
+    pub fn apply_lines(&mut self, version: u64, lines: Vec<LogLine>) {
         self.version = version;
         for line in lines {
             self.apply_line(line);
@@ -41,13 +41,13 @@ impl TableState {
     }
 
     /// Applies the actions of a version, and looks at whose they are.
-    pub(super) fn apply_commit(&mut self, version: u64, lines: Vec<LogLine>) {
+    pub fn apply_commit(&mut self, version: u64, lines: Vec<LogLine>) {
         self.look_at_author(&lines);
         self.apply_lines(version, lines);
     }
 
     /// Looks at whose a commit is that may have been applied with a checkpoint.
-    pub(super) fn look_at_author(&mut self, lines: &[LogLine]) {
+    pub fn look_at_author(&mut self, lines: &[LogLine]) {
         match is_own_commit(lines) {
             true if lines.iter().any(|line| line.meta_data.is_some()) => self.is_changed_by_others = false,
             false if lines.iter().any(|line| line.add.is_some() || line.remove.is_some()) => {
@@ -58,26 +58,26 @@ impl TableState {
     }
 
     /// Returns whether this program wrote the checkpoint of this version, which is all that was applied.
-    pub(super) fn is_own_checkpoint(&self, version: u64) -> bool {
+    pub fn is_own_checkpoint(&self, version: u64) -> bool {
         let checked = self.metadata.as_ref().and_then(|metadata| metadata.configuration.get(CHECKED)?.as_ref());
         checked.is_some_and(|checked| *checked == version.to_string())
     }
 
     /// Returns whether rows may be missing: the table is being made again, or another program has changed its files.
-    pub(super) fn is_rebuilding(&self) -> bool {
+    pub fn is_rebuilding(&self) -> bool {
         let is_marked = |metadata: &TableMetadata| metadata.configuration.contains_key(REBUILD);
         self.is_changed_by_others || self.metadata.as_ref().is_some_and(is_marked)
     }
 
     /// The metadata with or without the mark of a rebuild.
-    pub(super) fn metadata_marked(&self, is_rebuilding: bool) -> Option<TableMetadata> {
+    pub fn metadata_marked(&self, is_rebuilding: bool) -> Option<TableMetadata> {
         let mut metadata = self.metadata.clone()?;
         mark_rebuild(&mut metadata, is_rebuilding);
         Some(metadata)
     }
 
     /// Applies the actions of a version but for removals.
-    pub(super) fn apply_additions(&mut self, version: u64, lines: Vec<LogLine>) {
+    pub fn apply_additions(&mut self, version: u64, lines: Vec<LogLine>) {
         self.apply_lines(version, lines.into_iter().map(|line| LogLine { remove: None, ..line }).collect());
     }
 
@@ -98,7 +98,7 @@ impl TableState {
     }
 
     /// The rows of a checkpoint of this version.
-    pub(super) fn checkpoint_lines(&self, now_millis: i64) -> Vec<LogLine> {
+    pub fn checkpoint_lines(&self, now_millis: i64) -> Vec<LogLine> {
         let line = LogLine::default;
         let mut meta_data = self.metadata_marked(self.is_rebuilding());
         if let Some(metadata) = &mut meta_data {
