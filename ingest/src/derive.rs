@@ -31,11 +31,7 @@ pub(crate) struct ReferenceDerivation {
 
 impl ReferenceDerivation {
     /// Loads the wanted references; None if one is missing.
-    pub async fn new(
-        context: &IngestContext,
-        run_derivation: &str,
-        wanted: &WantedReferences,
-    ) -> Result<Option<Self>> {
+    pub async fn new(context: &IngestContext, run_derivation: &str, wanted: &WantedReferences) -> Result<Option<Self>> {
         let (Some((flat_version, foam_version)), Some(name)) =
             (wanted.version_pair(), wanted.derivation_name(run_derivation))
         else {
@@ -140,11 +136,10 @@ impl ReferenceDerivation {
                 if let Some(levels) = &levels {
                     let air = &self.references.chosen.air;
                     let metres = arrival_times(lake, *pair).map_or(0.0, |[_, reflected]| reflected * sound_m_s);
-                    let per_kelvin = |bin| air.per_kelvin(bin, metres);
                     plan.compute_sensitivities(
                         &derived.reflected,
                         direct,
-                        per_kelvin,
+                        |bin| air.per_kelvin(bin, metres),
                         &mut sensitivities,
                         &mut scratch,
                     )

@@ -134,13 +134,7 @@ impl DerivedRows {
     }
 
     /// Appends the errors of one measurement, in air of a temperature in C, from its sensitivities and Flat's.
-    pub fn push_errors(
-        &mut self,
-        levels: &LevelUncertainty,
-        of: &[EnergySensitivity],
-        flat: &FlatPair,
-        celsius: f64,
-    ) {
+    pub fn push_errors(&mut self, levels: &LevelUncertainty, of: &[EnergySensitivity], flat: &FlatPair, celsius: f64) {
         let warmer = celsius - flat.celsius;
         let (total, flat_total) =
             (EnergySensitivity::sum_of_bands(of), EnergySensitivity::sum_of_bands(&flat.sensitivities));

@@ -80,10 +80,7 @@ impl Cores {
     }
 
     /// Starts a computation on a core of its own once one is free, in the order of the calls.
-    pub fn begin_on_core<T: Send + 'static>(
-        &self,
-        work: impl FnOnce() -> T + Send + 'static,
-    ) -> PendingComputation<T> {
+    pub fn begin_on_core<T: Send + 'static>(&self, work: impl FnOnce() -> T + Send + 'static) -> PendingComputation<T> {
         let (sender, done) = oneshot::channel();
         let (busy, span) = (self.mark_busy(), Span::current());
         self.pool.spawn_fifo(move || {

@@ -101,8 +101,7 @@ pub(crate) async fn run_demo(args: &DemoArgs, lake_url: &str) -> anyhow::Result<
 }
 
 fn few_surfaces() -> anyhow::Result<Vec<CollectionSurface>> {
-    let member = |name: &&str| Ok(CollectionSurface::by_relief_name(name.parse()?, name)?);
-    SURFACES.iter().map(member).collect()
+    SURFACES.iter().map(|name: &&str| Ok(CollectionSurface::by_relief_name(name.parse()?, name)?)).collect()
 }
 
 // Without a file the demo's rig, whatever the lake's is: a lake of another rig refuses it.

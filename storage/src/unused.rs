@@ -53,6 +53,5 @@ pub(crate) fn remove_empty_folders(folder: &FsPath) {
 }
 
 async fn list_objects(lake: &Lake, below: Option<&Path>) -> Result<Vec<ObjectMeta>> {
-    let failed = |e| Error::store_failure("list", lake.location(), e);
-    lake.store().list(below).try_collect().await.map_err(failed)
+    lake.store().list(below).try_collect().await.map_err(|e| Error::store_failure("list", lake.location(), e))
 }

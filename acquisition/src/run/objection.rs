@@ -116,10 +116,9 @@ pub(crate) fn find_implausible(reading: &AmbientReading) -> Vec<TakeObjection> {
         ("a pressure", reading.pressure_hpa, "hPa", PRESSURE_HPA),
         ("a level outside", reading.outside_level_db, "dB", LEVEL_DB),
     ];
-    let wrong = |(_, value, _, [least, most]): &(_, f64, _, [f64; 2])| value < least || value > most;
     values
         .into_iter()
-        .filter(wrong)
+        .filter(|(_, value, _, [least, most]): &(_, f64, _, [f64; 2])| value < least || value > most)
         .map(|(what, value, unit, [least, most])| TakeObjection::Implausible { what, value, unit, least, most })
         .collect()
 }

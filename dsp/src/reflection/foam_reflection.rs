@@ -185,8 +185,7 @@ impl FoamReflection {
 fn solve_toeplitz(first: &[f64], wanted: &[f64]) -> Vec<f64> {
     let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
     let times = |x: &[f64]| -> Vec<f64> {
-        let row = |i: usize| x.iter().enumerate().map(|(j, x)| first[i.abs_diff(j)] * x).sum();
-        (0..x.len()).map(row).collect()
+        (0..x.len()).map(|i: usize| x.iter().enumerate().map(|(j, x)| first[i.abs_diff(j)] * x).sum()).collect()
     };
     let (mut solution, mut residual) = (vec![0.0; wanted.len()], wanted.to_vec());
     let mut direction = residual.clone();

@@ -212,8 +212,7 @@ async fn find_change(
         return Ok(Some((format!("{bytes} bytes"), format!("{} bytes", there.size))));
     }
     let Some(read) = read else { return Ok(None) };
-    let is_strong = |tag: &String| !tag.starts_with("W/");
-    if there.e_tag.as_ref().is_some_and(is_strong) && there.e_tag == read.e_tag {
+    if there.e_tag.as_ref().is_some_and(|tag: &String| !tag.starts_with("W/")) && there.e_tag == read.e_tag {
         return Ok(None);
     }
     let (actual, expected) = (object_sha256(store, copy, bytes, &mut |_| {}).await?, &read.integrity.sha256);

@@ -45,12 +45,7 @@ enum ChunkMeasurement {
 
 impl RunContent {
     /// Reads a run; its chunks are measured on all cores while the next ones are fetched.
-    pub async fn read_from(
-        lake: &Lake,
-        measurer: &Arc<Measurer>,
-        cores: &Cores,
-        opened: &OpenedRun,
-    ) -> Result<Self> {
+    pub async fn read_from(lake: &Lake, measurer: &Arc<Measurer>, cores: &Cores, opened: &OpenedRun) -> Result<Self> {
         let name = opened.name.as_str();
         let mut reader = ResyncReader::open(opened.store.clone(), opened.path.clone(), name.to_owned()).await?;
         let mut envelope = RunEnvelope::default();

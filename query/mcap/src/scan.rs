@@ -59,10 +59,7 @@ pub(super) struct Source {
 
 impl Source {
     /// Returns the pieces that may have messages of the channels in the time.
-    pub fn pieces_within<'a>(
-        &'a self,
-        times: Option<&'a RangeInclusive<i64>>,
-    ) -> impl Iterator<Item = &'a Piece> {
+    pub fn pieces_within<'a>(&'a self, times: Option<&'a RangeInclusive<i64>>) -> impl Iterator<Item = &'a Piece> {
         let nanos = |time: u64| i64::try_from(time).unwrap_or(i64::MAX);
         let within = move |p: &&Piece| {
             times.is_none_or(|times| nanos(p.times.1) >= *times.start() && nanos(p.times.0) <= *times.end())

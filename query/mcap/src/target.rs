@@ -29,11 +29,7 @@ pub(super) struct Target {
 
 impl Target {
     /// Opens the files that `pattern` means, each once.
-    pub async fn open_all(
-        pattern: &str,
-        snapshot: &LakeSnapshot,
-        files: &McapFiles,
-    ) -> Result<Vec<Self>, Fault> {
+    pub async fn open_all(pattern: &str, snapshot: &LakeSnapshot, files: &McapFiles) -> Result<Vec<Self>, Fault> {
         let mut meant = BTreeMap::new();
         for part in pattern.split(',').map(str::trim) {
             if part.contains('/') || part.ends_with(EXTENSION) {
@@ -91,9 +87,8 @@ fn parse_path(text: &str) -> Result<Path, Fault> {
     if !text.ends_with(EXTENSION) {
         return Err(wrong("its name does not end with .mcap"));
     }
-    let odd = |c: char| c.is_control() || matches!(c, '\\' | '%' | ':');
     let climbs = text.split('/').any(|part| matches!(part, "" | "." | ".."));
-    if climbs || text.contains(odd) {
+    if climbs || text.contains(|c: char| c.is_control() || matches!(c, '\\' | '%' | ':')) {
         return Err(wrong("it is not written as a place below the lake's own"));
     }
     Path::parse(text).map_err(|e| wrong(&e.to_string()))

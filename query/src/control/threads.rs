@@ -85,10 +85,7 @@ impl QueryThreadGroups {
     /// Begins work on the group with the least of it, or on another if its threads do not respond; returns its task,
     /// whose output is always `Some`. None during shutdown. If the caller stops waiting, the work has begun already or is
     /// dropped.
-    pub async fn begin_work<T: Send + 'static>(
-        &self,
-        work: BoxFuture<'static, T>,
-    ) -> Option<JoinHandle<Option<T>>> {
+    pub async fn begin_work<T: Send + 'static>(&self, work: BoxFuture<'static, T>) -> Option<JoinHandle<Option<T>>> {
         let mut groups: Vec<_> = self.0.iter().collect();
         groups.sort_by_cached_key(|group| group.current_load());
         let mut groups = groups.into_iter();

@@ -210,11 +210,7 @@ pub(super) struct CatalogRelations(Vec<CatalogRelation>);
 
 impl CatalogRelations {
     /// Of the lake's tables and views, the system tables, those of the definitions, and the fixed ones of `pg_catalog`.
-    pub fn new(
-        service: &QueryService,
-        definitions: &[TableDefinition],
-        fixed: Vec<(String, SchemaRef)>,
-    ) -> Self {
+    pub fn new(service: &QueryService, definitions: &[TableDefinition], fixed: Vec<(String, SchemaRef)>) -> Self {
         let mut views = service.view_definitions();
         let mut relations = Vec::new();
         for (number, (name, schema)) in (FIRST_TABLE..).zip(service.lake_tables()) {

@@ -54,12 +54,7 @@ impl RunningWatches {
     }
 
     /// Watches a query that begins, until the timer is dropped.
-    pub fn begin_watch(
-        self: &Arc<Self>,
-        protocol: ServerProtocol,
-        statement: &str,
-        stop: &StopSignal,
-    ) -> QueryTimer {
+    pub fn begin_watch(self: &Arc<Self>, protocol: ServerProtocol, statement: &str, stop: &StopSignal) -> QueryTimer {
         let number = self.last.fetch_add(1, Ordering::Relaxed);
         self.lock_running().insert(number, stop.clone());
         let watch = QueryWatch {

@@ -147,10 +147,7 @@ impl ConnectionPlaces {
     }
 
     /// Attends to connections, each in a task of its own; never ends.
-    pub async fn attend_connections<F: Future<Output = ()> + Send + 'static>(
-        self,
-        attend: impl Fn(PlacedStream) -> F,
-    ) {
+    pub async fn attend_connections<F: Future<Output = ()> + Send + 'static>(self, attend: impl Fn(PlacedStream) -> F) {
         let mut open = JoinSet::new();
         loop {
             tokio::select! {
@@ -261,7 +258,7 @@ impl Drop for PlacedStream {
 
 /// Marks a connection that works, which keeps its place. A request works once it is whole and authenticated.
 #[derive(Clone)]
-pub(super) struct PlaceWork(Arc<PlaceState>);
+pub(crate) struct PlaceWork(Arc<PlaceState>);
 
 impl PlaceWork {
     /// Takes note of a request: what was sent up to here was one.
@@ -301,7 +298,7 @@ impl PlaceWork {
 }
 
 /// Work on a connection, until this is dropped.
-pub(super) struct WorkingPlace(Arc<PlaceState>);
+pub(crate) struct WorkingPlace(Arc<PlaceState>);
 
 impl Drop for WorkingPlace {
     fn drop(&mut self) {

@@ -15,7 +15,7 @@ struct DrainState {
 }
 
 /// A connection whose end the server awaits, until this is dropped.
-pub(super) struct AwaitedConnection(ServerDrain);
+pub(crate) struct AwaitedConnection(ServerDrain);
 
 impl Drop for AwaitedConnection {
     fn drop(&mut self) {

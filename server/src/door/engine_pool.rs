@@ -40,7 +40,7 @@ const FORGIVEN: Duration = Duration::from_secs(60);
 
 /// The engines.
 #[derive(Clone)]
-pub(super) struct EnginePool(Arc<EnginePoolState>);
+pub(crate) struct EnginePool(Arc<EnginePoolState>);
 
 struct EnginePoolState {
     settings: EngineSettings,

@@ -50,7 +50,7 @@ pub struct EngineSettings {
 
 /// The reason for which an engine ended.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) enum EndReason {
+pub(crate) enum EndReason {
     /// The door needed it no more.
     Retired,
     /// A query, or a defect.
@@ -58,7 +58,7 @@ pub(super) enum EndReason {
 }
 
 /// An engine.
-pub(super) struct EngineProcess {
+pub(crate) struct EngineProcess {
     pid: u32,
     folder: PathBuf,
     stdin: tokio::sync::Mutex<ChildStdin>,
@@ -97,7 +97,7 @@ impl EngineUsage {
 }
 
 /// Parameters with which an engine is started.
-pub(super) struct EngineStart<'a> {
+pub(crate) struct EngineStart<'a> {
     pub settings: &'a EngineSettings,
     pub lake: &'a str,
     /// The lake's folder, if it is in one.
@@ -315,7 +315,7 @@ fn private_bytes(pid: u32) -> Option<usize> {
 }
 
 /// A request's hold on its engine.
-pub(super) struct EngineLease {
+pub(crate) struct EngineLease {
     engine: Arc<EngineProcess>,
     number: u64,
 }

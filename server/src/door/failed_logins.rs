@@ -16,7 +16,7 @@ const MOST_FAILURES: u32 = 20;
 const MOST_ADDRESSES: usize = 10_000;
 
 /// Failed logins of the last minute.
-pub(super) struct FailedLogins {
+pub(crate) struct FailedLogins {
     is_counted: bool,
     windows: Mutex<HashMap<IpAddr, FailureWindow>>,
 }

@@ -43,7 +43,7 @@ const OF_CONNECTION: [HeaderName; 4] =
 
 /// The protocol to an engine.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum EngineProtocol {
+pub(crate) enum EngineProtocol {
     /// HTTP/1.1, on a connection for each request.
     Http,
     /// HTTP/2, on one connection for all.
@@ -300,7 +300,7 @@ impl EngineProcess {
 }
 
 /// The body of an engine's answer. Dropping it ends the query.
-pub(super) struct EngineBody {
+pub(crate) struct EngineBody {
     incoming: Incoming,
     wire: EngineProtocol,
     lease: EngineLease,

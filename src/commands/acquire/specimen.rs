@@ -62,8 +62,7 @@ pub(super) fn macro_reference(args: &AcquireArgs, rig: &Rig) -> anyhow::Result<O
 
 /// The named relief, or the one that the surface's name begins with, with its parameters set.
 fn choose_relief(name: Option<&str>, surface: &SurfaceId, set: &[String]) -> anyhow::Result<PanelRelief> {
-    let guessed = || PanelRelief::guess_name(surface.as_str());
-    let name = name.or_else(guessed).with_context(|| {
+    let name = name.or_else(|| PanelRelief::guess_name(surface.as_str())).with_context(|| {
         format!(
             "unknown surface `{surface}`: no relief is known for it; hint: --panel {} or --mesh FILE",
             PanelRelief::NAMES.join("|")

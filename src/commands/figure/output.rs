@@ -28,10 +28,7 @@ impl OutputArgs {
     ///
     /// # Errors
     /// If only some of the files are named by surfaces.
-    pub fn group_surfaces<'a>(
-        &self,
-        surfaces: &'a [SelectedSurface],
-    ) -> anyhow::Result<Vec<&'a [SelectedSurface]>> {
+    pub fn group_surfaces<'a>(&self, surfaces: &'a [SelectedSurface]) -> anyhow::Result<Vec<&'a [SelectedSurface]>> {
         let named = self.output.iter().filter(|path| path.to_string_lossy().contains(PLACEHOLDER)).count();
         match named {
             0 => Ok(vec![surfaces]),

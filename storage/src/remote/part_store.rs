@@ -37,13 +37,7 @@ impl PartStore {
     }
 
     /// Uploads a part; parts count from 0. Returns its id.
-    pub async fn put_part(
-        &self,
-        path: &Path,
-        upload: &str,
-        number: usize,
-        part: PutPayload,
-    ) -> StoreResult<String> {
+    pub async fn put_part(&self, path: &Path, upload: &str, number: usize, part: PutPayload) -> StoreResult<String> {
         let (path, upload) = (self.path_in_bucket(path), upload.to_owned());
         let part_id = retry_operation(|| self.store.put_part(&path, &upload, number, part.clone())).await?;
         Ok(part_id.content_id)

@@ -76,9 +76,7 @@ pub(crate) async fn read_table_files(lake: &Lake) -> anyhow::Result<Vec<StoredTa
 }
 
 impl FileRows {
-    pub fn read(
-        &StoredTableFile { table, of_reference, bytes: ref file }: &StoredTableFile,
-    ) -> anyhow::Result<Self> {
+    pub fn read(&StoredTableFile { table, of_reference, bytes: ref file }: &StoredTableFile) -> anyhow::Result<Self> {
         let builder = ParquetRecordBatchReaderBuilder::try_new(file.clone())?.with_batch_size(BATCH_ROWS);
         let properties =
             builder_as(builder.metadata(), NumberEncoding::AsStored).set_data_page_size_limit(PAGE_BYTES).build();

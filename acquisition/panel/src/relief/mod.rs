@@ -145,8 +145,7 @@ fn shuffle_deck(chance: SeededRandom) -> Vec<StoneArrangement> {
     let kinds: Vec<_> = SHARES.iter().flat_map(|(kind, count)| std::iter::repeat_n(*kind, *count)).collect();
     let mut deck: Vec<_> = chance.random_order(kinds.len()).into_iter().map(|n| kinds[n]).collect();
     for first in 0..SHARES.len() {
-        let is_new = |n: &usize| !deck[..first].contains(&deck[*n]);
-        if let Some(next) = (first..deck.len()).find(is_new) {
+        if let Some(next) = (first..deck.len()).find(|n: &usize| !deck[..first].contains(&deck[*n])) {
             deck.swap(first, next);
         }
     }

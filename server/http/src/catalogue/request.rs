@@ -22,7 +22,7 @@ use crate::request_protocol::http_job;
 
 /// A request to an endpoint.
 #[derive(Clone)]
-pub(in super::super) struct CatalogueRequest {
+pub(crate) struct CatalogueRequest {
     pub catalogue: LakeCatalogue,
     pub view: Arc<SnapshotView>,
     /// True if an Arrow stream is preferred to JSON.
@@ -39,12 +39,12 @@ pub(super) struct SurfacePath {
 /// The path of a run.
 #[derive(Deserialize, IntoParams)]
 #[into_params(parameter_in = Path)]
-pub(in super::super) struct RunPath {
+pub(crate) struct RunPath {
     pub run_id: String,
 }
 
 /// A text, to be bound.
-pub(in super::super) fn text_value(value: &str) -> ScalarValue {
+pub(crate) fn text_value(value: &str) -> ScalarValue {
     ScalarValue::Utf8(Some(value.to_owned()))
 }
 
@@ -144,7 +144,7 @@ impl CatalogueRequest {
 }
 
 /// The run of this name.
-pub(in super::super) fn find_run<'a>(view: &'a SnapshotView, name: &str) -> Result<&'a VisibleRun, RequestFault> {
+pub(crate) fn find_run<'a>(view: &'a SnapshotView, name: &str) -> Result<&'a VisibleRun, RequestFault> {
     let found = name.parse::<RunId>().ok().and_then(|id| view.snapshot.run(&id));
     found.ok_or_else(|| missing_item(format!("run `{name}`"), "GET /api/v1/runs lists what there is"))
 }

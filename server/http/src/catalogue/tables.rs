@@ -22,7 +22,7 @@ struct TableDescription {
 /// A column.
 #[derive(Serialize, ToSchema)]
 #[schema(as = Column)]
-pub(in super::super) struct ColumnDescription {
+pub(crate) struct ColumnDescription {
     name: String,
     /// As Arrow writes it.
     #[serde(rename = "type")]
@@ -107,7 +107,7 @@ pub(super) async fn table_files(
 }
 
 /// The table of a name.
-pub(in super::super) fn find_table(name: &str) -> Result<Table, RequestFault> {
+pub(crate) fn find_table(name: &str) -> Result<Table, RequestFault> {
     Table::by_name(name)
         .ok_or_else(|| missing_item(format!("table `{name}`"), "GET /api/v1/tables lists what there is"))
 }

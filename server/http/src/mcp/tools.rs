@@ -194,11 +194,7 @@ impl ToolCall<'_> {
     ///
     /// # Errors
     /// A defect of the arguments, a missing scope, or what ended the work.
-    pub async fn answer_call(
-        &self,
-        tool: AgentTool,
-        arguments: Map<String, Value>,
-    ) -> Result<Value, RequestFault> {
+    pub async fn answer_call(&self, tool: AgentTool, arguments: Map<String, Value>) -> Result<Value, RequestFault> {
         let client = self.agents.catalogue.service().authorised_client(TokenScope::Sql)?;
         match tool {
             AgentTool::ListTables => {

@@ -17,7 +17,7 @@ const RESERVED: &AsciiSet = &NON_ALPHANUMERIC.remove(b'-').remove(b'.').remove(b
 #[derive(Default, Deserialize, IntoParams)]
 #[serde(default, deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
-pub(in super::super) struct SliceParameters {
+pub(crate) struct SliceParameters {
     /// An SQL predicate over the columns of table measurements; all measurements of the runs if there is none.
     #[serde(rename = "where")]
     #[param(example = "pair_id < 5")]

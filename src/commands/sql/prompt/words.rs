@@ -96,8 +96,7 @@ impl WordCompleter {
     // Columns of the tables that the line names; of all, if it names none yet.
     fn named_columns<'a>(&'a self, line: &'a str) -> impl Iterator<Item = &'a String> {
         let words: Vec<_> = line.split(|c: char| !is_part(c)).collect();
-        let is_named = |table: &String| words.iter().any(|w| w.eq_ignore_ascii_case(table));
-        let any = self.tables.keys().any(is_named);
+        let any = self.tables.keys().any(|table: &String| words.iter().any(|w| w.eq_ignore_ascii_case(table)));
         let named = move |table: &String| !any || words.iter().any(|w| w.eq_ignore_ascii_case(table));
         self.tables.iter().filter(move |(table, _)| named(table)).flat_map(|(_, columns)| columns)
     }

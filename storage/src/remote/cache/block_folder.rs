@@ -18,7 +18,7 @@ use sha2::{Digest as _, Sha256};
 
 /// A block, and what the store says of its object.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct CachedBlock {
+pub(crate) struct CachedBlock {
     pub bytes: Bytes,
     pub object_bytes: u64,
     pub modified: DateTime<Utc>,

@@ -26,10 +26,10 @@ const WORTH_PACKING: usize = 2000;
 const LEVEL: Compression = Compression::new(3);
 
 /// An address with its parameters, and whether the answer is an Arrow stream.
-pub(in super::super) type AnswerKey = (String, bool);
+pub(crate) type AnswerKey = (String, bool);
 
 /// Cache of answers of one snapshot.
-pub(in super::super) struct AnswerCache(Cache<AnswerKey, Arc<CachedAnswer>, AnswerWeighter>);
+pub(crate) struct AnswerCache(Cache<AnswerKey, Arc<CachedAnswer>, AnswerWeighter>);
 
 /// Weighs answers by their bytes, with those that they will have once they are packed, too.
 #[derive(Clone)]
@@ -64,7 +64,7 @@ impl AnswerCache {
 }
 
 /// An answer, without the headers that depend on the request.
-pub(in super::super) struct CachedAnswer {
+pub(crate) struct CachedAnswer {
     headers: HeaderMap,
     bytes: Bytes,
     /// None if it cannot be packed.

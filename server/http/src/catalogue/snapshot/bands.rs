@@ -8,7 +8,7 @@ use utoipa::ToSchema;
 /// A band, or the total, which has no centre.
 #[derive(Debug, Serialize, ToSchema)]
 #[schema(as = Band)]
-pub(in super::super) struct BandDescription {
+pub(crate) struct BandDescription {
     /// As in column names: `2500`, ..., `total`.
     pub key: String,
     centre_hz: Option<f64>,
@@ -17,7 +17,7 @@ pub(in super::super) struct BandDescription {
 }
 
 /// The rig's bands, the total last.
-pub(in super::super) fn describe_bands(rig: &Rig) -> Vec<BandDescription> {
+pub(crate) fn describe_bands(rig: &Rig) -> Vec<BandDescription> {
     let keys = band_keys(rig).into_iter();
     let centres = rig.bands.centres_hz.iter().copied().map(Some).chain([None]);
     let described = keys.zip(centres).zip(band_labels(rig));

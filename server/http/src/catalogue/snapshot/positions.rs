@@ -6,7 +6,7 @@ use serde::Serialize;
 use utoipa::ToSchema;
 
 /// Surfaces on the map.
-pub(in super::super) struct SurfacePositions {
+pub(crate) struct SurfacePositions {
     pub names: Vec<String>,
     pub components: PrincipalComponents,
     pub units: SelfOrganisingMap,
@@ -27,7 +27,7 @@ impl SurfacePositions {
 
 /// A surface that is near another one.
 #[derive(Serialize, ToSchema)]
-pub(in super::super) struct SurfaceNeighbour<'a> {
+pub(crate) struct SurfaceNeighbour<'a> {
     surface_id: &'a str,
     /// Root mean square over the features.
     distance_db: f64,

@@ -16,7 +16,7 @@ const DAY_NS: f64 = 86_400e9;
 /// A surface as the pages know it.
 #[derive(Debug, Serialize, ToSchema)]
 #[schema(as = Surface)]
-pub(in super::super) struct SurfaceSummary {
+pub(crate) struct SurfaceSummary {
     pub surface_id: String,
     pub run_id: Option<String>,
     panel: String,
@@ -56,7 +56,7 @@ impl SurfaceSummary {
 }
 
 /// A surface, and what it is found and compared by.
-pub(in super::super) struct SurfaceEntry {
+pub(crate) struct SurfaceEntry {
     pub surface: SurfaceSummary,
     /// Parameters of its relief's generator.
     pub parameters: Map<String, Value>,
@@ -77,7 +77,7 @@ impl SurfaceEntry {
 }
 
 /// All surfaces, by name.
-pub(in super::super) struct CatalogueSummary {
+pub(crate) struct CatalogueSummary {
     pub bands: Vec<BandDescription>,
     pub entries: Vec<SurfaceEntry>,
     places: HashMap<String, usize>,
@@ -85,7 +85,7 @@ pub(in super::super) struct CatalogueSummary {
 
 /// A surface and the start of its run.
 #[derive(Deserialize)]
-pub(in super::super) struct SurfaceRow {
+pub(crate) struct SurfaceRow {
     surface_id: String,
     run_id: Option<String>,
     panel: String,
@@ -120,7 +120,7 @@ fn decimal<'de, D: Deserializer<'de>>(column: D) -> Result<Option<f64>, D::Error
 
 /// Level and spread of a surface in a band.
 #[derive(Deserialize)]
-pub(in super::super) struct BandStatistic {
+pub(crate) struct BandStatistic {
     surface_id: String,
     band: String,
     p90_mean_db: Option<f64>,
@@ -131,21 +131,17 @@ pub(in super::super) struct BandStatistic {
 type SurfaceLevels = HashMap<String, HashMap<String, (Option<f64>, Option<f64>)>>;
 
 /// The query of [`SurfaceRow`].
-pub(in super::super) const SURFACES: &str = "select s.surface_id, s.run_id, s.panel, s.side, s.typology, s.macrostructure, s.mesostructure, \
+pub(crate) const SURFACES: &str = "select s.surface_id, s.run_id, s.panel, s.side, s.typology, s.macrostructure, s.mesostructure, \
     s.microstructure, s.material, s.flat_reference, s.foam_reference, s.parameters, s.mesh_triangles, s.mesh_watertight, \
     s.reflection_factor, s.relief_min_mm, s.relief_max_mm, s.relief_rms_mm, s.origin, r.started, r.started_ns \
     from surfaces s left join runs r on r.run_id = s.run_id order by s.surface_id, s.run_id";
 /// The query of [`BandStatistic`].
-pub(in super::super) const BAND_STATISTICS: &str =
+pub(crate) const BAND_STATISTICS: &str =
     "select surface_id, band, p90_mean_db, spread_db from surface_stats order by surface_id, run_id";
 
 impl CatalogueSummary {
     /// The surfaces of the rows of [`SURFACES`] with the statistics of [`BAND_STATISTICS`].
-    pub fn new(
-        rows: Vec<SurfaceRow>,
-        statistics: Vec<BandStatistic>,
-        bands: Vec<BandDescription>,
-    ) -> Self {
+    pub fn new(rows: Vec<SurfaceRow>, statistics: Vec<BandStatistic>, bands: Vec<BandDescription>) -> Self {
         let mut levels = SurfaceLevels::new();
         for stat in statistics {
             levels.entry(stat.surface_id).or_default().insert(stat.band, (stat.p90_mean_db, stat.spread_db));

@@ -108,7 +108,7 @@ impl VisibleFile {
 
 /// The newest snapshot that was seen.
 #[derive(Default)]
-pub(in super::super) struct SnapshotViews(Mutex<ViewHistory>);
+pub(crate) struct SnapshotViews(Mutex<ViewHistory>);
 
 #[derive(Default)]
 struct ViewHistory {
@@ -123,10 +123,7 @@ impl SnapshotViews {
     ///
     /// # Errors
     /// The snapshot cannot be read.
-    pub async fn current_view(
-        &self,
-        service: &QueryService,
-    ) -> Result<Arc<SnapshotView>, RequestFault> {
+    pub async fn current_view(&self, service: &QueryService) -> Result<Arc<SnapshotView>, RequestFault> {
         let known = self.lock_history().view.clone();
         let session = match &known {
             Some(view) => view.session.clone(),
