@@ -199,7 +199,8 @@ fn render_file_list(dist: &Path) -> io::Result<String> {
         let Some((_, media_type)) = TYPES.iter().find(|(known, _)| *known == ending) else { continue };
         let name = file.strip_prefix(dist).map_err(io::Error::other)?.to_string_lossy().replace('\\', "/");
         let packed = |ending: &str| Some(PathBuf::from(format!("{}.{ending}", file.display()))).filter(|p| p.exists());
-        let (gzip, brotli) = (packed("gz"), packed("br"));
+        let gzip = packed("gz");
+        let brotli = packed("br");
         let brotli = brotli.map_or("None".to_owned(), |file| format!("Some(include_bytes!({file:?}))"));
         let _ = writeln!(
             list,

@@ -26,14 +26,8 @@ use crate::commands::import::{self, ImportArgs};
 use crate::commands::ingest::{self, IngestArgs};
 #[cfg(feature = "lake")]
 use crate::commands::mcp::{self, McpArgs};
-#[cfg(feature = "lake")]
-use crate::commands::optimize::{self, OptimizeArgs};
 use crate::commands::panel::{self, PanelArgs};
-#[cfg(feature = "lake")]
-use crate::commands::rebuild::{self, RebuildArgs};
 use crate::commands::recover::{self, RecoverArgs};
-#[cfg(feature = "lake")]
-use crate::commands::remove::{self, RemoveArgs};
 use crate::commands::replay::{self, ReplayArgs};
 #[cfg(feature = "lake")]
 use crate::commands::serve::{self, CertificateArgs, EngineArgs, ServeArgs};
@@ -41,10 +35,16 @@ use crate::commands::serve::{self, CertificateArgs, EngineArgs, ServeArgs};
 use crate::commands::sql::{self, SqlArgs};
 #[cfg(feature = "lake")]
 use crate::commands::twin::{self, TwinArgs};
+#[cfg(feature = "lake")]
+use crate::commands::upkeep::optimize::{self, OptimizeArgs};
+#[cfg(feature = "lake")]
+use crate::commands::upkeep::rebuild::{self, RebuildArgs};
+#[cfg(feature = "lake")]
+use crate::commands::upkeep::remove::{self, RemoveArgs};
+#[cfg(feature = "lake")]
+use crate::commands::upkeep::vacuum::{self, VacuumArgs};
 #[cfg(feature = "upload")]
 use crate::commands::upload::{self, UploadArgs};
-#[cfg(feature = "lake")]
-use crate::commands::vacuum::{self, VacuumArgs};
 use crate::logging::{FORMAT_VARIABLE, LogFormat};
 
 /// A data lake and catalogue for sweep measurements.

@@ -48,7 +48,8 @@ impl CommandProgress {
             bars.add(ProgressBar::new(total).with_style(style).with_prefix(name.clone()))
         });
         let now = Instant::now();
-        let (note, first) = (String::new(), None);
+        let note = String::new();
+        let first = None;
         TaskProgress { name, unit, total, bar, pace, done_before: 0, first, begun: now, last_line: now, note }
     }
 

@@ -98,7 +98,8 @@ impl<T: RealSample> MeasurementPlan<T> {
         check_len("the response", ir.len(), self.ir_len)?;
         check_celsius("the temperature (C)", celsius)?;
         let limits_hz = response_limits_hz(self.range_hz, self.correction.time_ratio(celsius));
-        let (raw, deconvolution) = (&mut scratch.raw, &mut scratch.deconvolution);
+        let raw = &mut scratch.raw;
+        let deconvolution = &mut scratch.deconvolution;
         self.deconvolution.run_within(limits_hz, recording, loopback, raw, deconvolution)?;
         self.correction.correct_response(raw, celsius, ir);
         Ok(())
@@ -228,7 +229,8 @@ impl<T: RealSample> DerivationPlan<T> {
 
     /// Buffers for [`Self::derive_response`]; one per thread.
     pub fn make_scratch(&self) -> DerivationScratch<T> {
-        let (bands, len) = (self.bank.band_count(), self.bank.len());
+        let bands = self.bank.band_count();
+        let len = self.bank.len();
         DerivationScratch {
             bank: self.bank.make_scratch(),
             bands: vec![T::default(); bands * len],
@@ -238,7 +240,8 @@ impl<T: RealSample> DerivationPlan<T> {
 
     /// A place for results, which runs fill again and again.
     pub fn make_derived(&self) -> DerivedResponse<T> {
-        let (bands, len) = (self.bank.band_count(), self.bank.len());
+        let bands = self.bank.band_count();
+        let len = self.bank.len();
         DerivedResponse {
             reflected: vec![T::default(); len],
             curves: vec![T::default(); bands * len],
@@ -364,7 +367,8 @@ impl<T: RealSample> DerivationPlan<T> {
 }
 
 fn put_over<T: RealSample>(flat: &FlatEnergies, bands: &[T], derived: &mut DerivedResponse<T>) {
-    let (len, factor) = (derived.reflected.len(), flat.total.recip());
+    let len = derived.reflected.len();
+    let factor = flat.total.recip();
     let curves = bands.chunks_exact(len).zip(derived.curves.chunks_exact_mut(len));
     for ((band, curve), energy) in curves.zip(&mut derived.energies) {
         *energy = accumulate_energy(band, factor, curve);

@@ -84,7 +84,8 @@ fn measurement_params(recording_len: usize) -> MeasurementParams {
 fn check_deconvolution<T: RealSample>(length: TransformLength, output_len: impl Fn(usize) -> usize, tolerance: f64) {
     for case in read_golden().cases {
         for kind in ["foam", "flat", "panel"] {
-            let (x, s) = (&case[&format!("{kind}_recording")], &case[&format!("{kind}_loopback")]);
+            let x = &case[&format!("{kind}_recording")];
+            let s = &case[&format!("{kind}_loopback")];
             let output_len = output_len(x.len());
             let wanted = &case[&format!("{kind}_deconvolved")][..output_len];
             let MeasurementParams { rate_hz, low_hz, high_hz, division, .. } = measurement_params(x.len());
@@ -145,7 +146,8 @@ fn responses() {
 // exact ratio's: a relative error of 3.8e-6, past the README's 1e-6. With its fraction we are at 1.6e-7.
 #[test]
 fn responses_in_f64_without_padding() {
-    let (mut worst_exact, mut worst_fraction) = (0.0f64, 0.0f64);
+    let mut worst_exact = 0.0f64;
+    let mut worst_fraction = 0.0f64;
     for case in read_golden().cases {
         for kind in ["foam", "flat", "panel"] {
             let celsius = case[&format!("{kind}_celsius")][0];
@@ -165,7 +167,9 @@ fn responses_in_f64_without_padding() {
 
 /// Python's `Fraction.limit_denominator`, by which the reference chooses its ratios.
 fn nearest_fraction(x: f64, largest: u64) -> (u64, u64) {
-    let (mut before, mut last, mut rest) = ((0, 1), (1, 0), x);
+    let mut before = (0, 1);
+    let mut last = (1, 0);
+    let mut rest = x;
     loop {
         let whole = rest.floor() as u64;
         let next = (before.0 + whole * last.0, before.1 + whole * last.1);
@@ -185,9 +189,11 @@ fn nearest_fraction(x: f64, largest: u64) -> (u64, u64) {
 
 fn check_derivation<T: RealSample>(tolerance: f64) {
     let plan = DerivationPlan::<T>::new(LEN, 96e3, &CENTRES).expect("a plan");
-    let (mut derived, mut scratch) = (plan.make_derived(), plan.make_scratch());
+    let mut derived = plan.make_derived();
+    let mut scratch = plan.make_scratch();
     for case in read_golden().cases {
-        let (ir, foam) = (cast_samples::<T>(&case["panel_ir"]), cast_samples::<T>(&case["foam_ir"]));
+        let ir = cast_samples::<T>(&case["panel_ir"]);
+        let foam = cast_samples::<T>(&case["foam_ir"]);
         let flat = cast_samples::<T>(&case["flat_reflected_ir"]);
         plan.derive_response(&ir, &foam, &flat, &mut derived, &mut scratch).expect("derived");
         assert!(relative_error(&derived.reflected, &case["reflected_ir"]) <= tolerance);
@@ -218,7 +224,8 @@ fn dirty_scratch_changes_nothing() {
     let plan = MeasurementPlan::<f32>::new(&measurement_params(cases[0]["panel_recording"].len())).expect("a plan");
     let run = |case: &GoldenCase, scratch: &mut _| {
         let mut ir = vec![f32::NAN; LEN];
-        let (x, s) = (cast_samples(&case["panel_recording"]), cast_samples(&case["panel_loopback"]));
+        let x = cast_samples(&case["panel_recording"]);
+        let s = cast_samples(&case["panel_loopback"]);
         plan.compute_ir(&x, &s, case["panel_celsius"][0], &mut ir, scratch).expect("a response");
         ir
     };
@@ -247,13 +254,15 @@ fn dirty_derivation_scratch_changes_nothing() {
 // 0.0036 dB, nearly all of it from padding to a fast length and not from f32.
 #[test]
 fn recordings_to_levels_in_f32() {
-    let (mut worst, mut worst_db) = (0.0f64, 0.0f64);
+    let mut worst = 0.0f64;
+    let mut worst_db = 0.0f64;
     for case in read_golden().cases {
         let plan = MeasurementPlan::<f32>::new(&measurement_params(case["foam_recording"].len())).expect("a plan");
         let derivation = DerivationPlan::<f32>::new(LEN, 96e3, &CENTRES).expect("a plan");
         let [foam, flat, panel] = ["foam", "flat", "panel"].map(|kind| {
             let signal = |what: &str| cast_samples::<f32>(&case[&format!("{kind}_{what}")]);
-            let (mut ir, celsius) = (vec![0.0; LEN], case[&format!("{kind}_celsius")][0]);
+            let mut ir = vec![0.0; LEN];
+            let celsius = case[&format!("{kind}_celsius")][0];
             plan.compute_ir(&signal("recording"), &signal("loopback"), celsius, &mut ir, &mut plan.make_scratch())
                 .expect("one");
             ir
@@ -276,11 +285,13 @@ fn recordings_to_levels_in_f32() {
 #[test]
 fn bands_and_single_steps() {
     let plan = FilterBankPlan::<f64>::new(LEN, 96e3, &CENTRES).expect("a plan");
-    let (mut bands, mut scratch) = (vec![0.0; 5 * LEN], plan.make_scratch());
+    let mut bands = vec![0.0; 5 * LEN];
+    let mut scratch = plan.make_scratch();
     for case in read_golden().cases {
         plan.split_bands(&case["reflected_ir"], &mut bands, &mut scratch).expect("split");
         assert!(relative_error(&bands, &case["bands"]) <= 1e-9);
-        let (mut curves, mut last) = (vec![0.0; 5 * LEN], [0.0; 5]);
+        let mut curves = vec![0.0; 5 * LEN];
+        let mut last = [0.0; 5];
         cumulative_energy(&bands, &mut curves, LEN);
         nce(&mut curves, energy(&case["flat_reflected_ir"]));
         assert!(relative_error(&curves, &case["nce"]) <= 1e-9);

@@ -206,7 +206,8 @@ fn windowed_sinc(u: f64) -> f64 {
 /// Modified Bessel function of order 0 at sqrt(x), by its power series (Abramowitz and Stegun 9.6.12).
 fn bessel_i0(x: f64) -> f64 {
     let quarter = x / 4.0;
-    let (mut term, mut sum) = (1.0, 1.0);
+    let mut term = 1.0;
+    let mut sum = 1.0;
     for k in 1..60 {
         term *= quarter / f64::from(k * k);
         sum += term;

@@ -27,7 +27,8 @@ fuzz_target!(init: echolake_fuzz::write_seeds_on_request(), |bytes: &[u8]| {
 });
 
 async fn resync(bytes: &[u8]) {
-    let (store, path) = (Arc::new(InMemory::new()), Path::from("input.mcap"));
+    let store = Arc::new(InMemory::new());
+    let path = Path::from("input.mcap");
     store.put(&path, Bytes::copy_from_slice(bytes).into()).await.expect("in memory");
     let Ok(mut reader) = ResyncReader::open(store, path, "input.mcap".into()).await else { return };
     while let Ok(Some(item)) = reader.next_item().await {

@@ -100,7 +100,8 @@ fn postgres_seeds() -> Vec<Vec<u8>> {
     let query = |sql: &str| message(b'Q', &[sql.as_bytes(), b"\0"].concat());
     let parse = message(b'P', b"s\0select pair_id from pairs where pair_id = $1\0\0\x01\0\0\0\x17");
     let bind = message(b'B', b"c\0s\0\0\x01\0\0\0\x01\0\0\0\x017\0\x01\0\x01");
-    let (describe, execute) = (message(b'D', b"Pc\0"), message(b'E', b"c\0\0\0\0\x02"));
+    let describe = message(b'D', b"Pc\0");
+    let execute = message(b'E', b"c\0\0\0\0\x02");
     let (close, sync, flush, end) =
         (message(b'C', b"Ss\0"), message(b'S', b""), message(b'H', b""), message(b'X', b""));
     let cursor = "begin; declare c cursor for select * from points; fetch 2 from c; close c; commit";

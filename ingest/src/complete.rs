@@ -62,7 +62,9 @@ impl LakeIngest<'_> {
 
     // Returns the number of changed runs, and the lake's snapshot thereafter.
     async fn complete_in_rounds(&self, done: &mut CompletionReport<'_>) -> Result<(usize, Arc<LakeSnapshot>)> {
-        let (cores, mut count, mut rounds) = (Cores::all()?, 0, 0);
+        let cores = Cores::all()?;
+        let mut count = 0;
+        let mut rounds = 0;
         while rounds < ROUNDS {
             let round = do_round(self, &cores, done).await?;
             count += round.changed;
@@ -121,7 +123,8 @@ async fn do_round(ingest: &LakeIngest<'_>, cores: &Cores, done: &mut CompletionR
     let mut round = CompletionRound::default();
     let shared = claims.clone();
     let do_one = move |(run, wanted): (VisibleRun, WantedReferences)| {
-        let (context, claims) = (context.clone(), shared.clone());
+        let context = context.clone();
+        let claims = shared.clone();
         let span = tracing::error_span!("complete", run = %run.run, surface = %run.surface);
         let work = async move {
             if let Some(claims) = &claims {
@@ -177,7 +180,8 @@ async fn complete_run(
     run: &VisibleRun,
     wanted: &WantedReferences,
 ) -> Result<ReadyJob<CompletedRun>> {
-    let (lake, keys) = (&context.lake, RunKeys { surface: run.surface.clone(), run: run.run.clone() });
+    let lake = &context.lake;
+    let keys = RunKeys { surface: run.surface.clone(), run: run.run.clone() };
     let mut report = CompletedRun { run: run.run.clone(), surface: run.surface.clone(), measurements: 0 };
     let (files, references) = match ReferenceDerivation::new(context, &run.run_derivation, wanted).await? {
         Some(derivation) => {

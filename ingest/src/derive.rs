@@ -50,7 +50,9 @@ impl ReferenceDerivation {
         keys: &RunKeys,
         responses: RunResponses,
     ) -> Result<(Vec<(Table, EncodedFile)>, RunReferences)> {
-        let (this, for_rows, lake) = (Arc::new(self), keys.clone(), context.lake.clone());
+        let this = Arc::new(self);
+        let for_rows = keys.clone();
+        let lake = context.lake.clone();
         let derivation = this.clone();
         let (files, unpaired) =
             context.cores.compute_on_core(move || derivation.encode_tables(&lake, &for_rows, &responses)).await?;
@@ -70,7 +72,8 @@ impl ReferenceDerivation {
         keys: &RunKeys,
         responses: &RunResponses,
     ) -> Result<(Vec<(Table, EncodedFile)>, usize)> {
-        let (rig, grid) = (lake.rig(), lake.grid());
+        let rig = lake.rig();
+        let grid = lake.grid();
         let failed = |cause| Error::Kernel { file: keys.run.to_string(), cause };
         let moved = rows::derived::SymmetryPairs::from_grid(grid);
         let of = ReferenceVersions { flat: &self.flat_version, foam: &self.foam_version };
@@ -119,12 +122,15 @@ impl ReferenceDerivation {
         take: &mut dyn FnMut(&mut DerivedRows) -> Result<()>,
     ) -> Result<()> {
         let rig = lake.rig();
-        let (bands, length) = (rig.bands.centres_hz.len(), rig.impulse_response.length);
+        let bands = rig.bands.centres_hz.len();
+        let length = rig.impulse_response.length;
         let failed = |cause| Error::Kernel { file: keys.run.to_string(), cause };
         let plan = derivation_plan(rig).map_err(failed)?;
         let levels = self.level_uncertainty(lake, keys, responses)?;
         let sound_m_s = speed_of_sound(rig.impulse_response.reference_temperature_c.get());
-        let (mut scratch, mut derived, mut energies) = (plan.make_scratch(), plan.make_derived(), vec![0.0; bands]);
+        let mut scratch = plan.make_scratch();
+        let mut derived = plan.make_derived();
+        let mut energies = vec![0.0; bands];
         let mut sensitivities = vec![EnergySensitivity::default(); bands];
         let slices = responses.pairs.chunks(SLICE).zip(responses.irs.chunks(SLICE * length));
         for ((pairs, irs), temperatures) in slices.zip(responses.celsius.chunks(SLICE)) {

@@ -48,7 +48,8 @@ pub(crate) fn temperature_response(
     rig: &Rig,
     power: &[f64],
 ) -> std::result::Result<TemperatureResponse, echolake_dsp::Error> {
-    let (response, sweep) = (&rig.impulse_response, &rig.sweep);
+    let response = &rig.impulse_response;
+    let sweep = &rig.sweep;
     let range_hz = [sweep.low_hz, sweep.high_hz];
     let celsius = response.reference_temperature_c.get();
     TemperatureResponse::new(power, response.length, sweep.rate_hz.get(), range_hz, celsius)

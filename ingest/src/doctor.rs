@@ -200,7 +200,9 @@ async fn check_run(
     report: &mut LakeReport,
 ) -> Result<()> {
     let text = |column| text_of(row, column).unwrap_or_default();
-    let (run, path, state) = (text("run_id"), text("file"), text("state"));
+    let run = text("run_id");
+    let path = text("file");
+    let state = text("state");
     for finding in check_run_file(lake, &Path::from(path.as_str()), &text("file_sha256"), report).await? {
         report.add_finding(FindingSeverity::Damaged, &path, finding);
     }

@@ -106,7 +106,8 @@ impl<'a> LakeIngest<'a> {
         let (lacking, sources): (Vec<_>, Vec<_>) =
             sources.into_iter().partition(|source| source.run_in_place().is_some_and(|run| is_lacking(&run)));
         let (references, others) = self.order_sources(sources).await?;
-        let (cores, measurer) = (Cores::all()?, Arc::new(Measurer::new(self.lake)));
+        let cores = Cores::all()?;
+        let measurer = Arc::new(Measurer::new(self.lake));
         for sources in [lacking, references, others] {
             let mut claimed: Vec<RunSource> = Vec::new();
             let mut free = sources;
@@ -171,7 +172,9 @@ impl<'a> LakeIngest<'a> {
     ) -> Result<Vec<RunSource>> {
         let (cores, claims) = (work.context.cores.clone(), work.shared.as_ref().map(|shared| shared.claims.clone()));
         let release = |source: &RunSource| claims.iter().for_each(|claims| claims.release_work(source.work_name()));
-        let (mut refused, mut claimed, mut replaced) = (Vec::new(), Vec::new(), Vec::new());
+        let mut refused = Vec::new();
+        let mut claimed = Vec::new();
+        let mut replaced = Vec::new();
         let ended = &mut |(source, done): pipeline::JobOutcome<RunSource, IngestedRun>| match done {
             Ok((taken, outcome)) => {
                 if taken.replaced && outcome != Some(CommitOutcome::Outdated) {
@@ -293,7 +296,9 @@ impl IngestWork {
             kept.await?;
             return Ok(ReadyJob { staged: Vec::new(), report: taken });
         }
-        let (its_lake, for_rows, its_content) = (lake.clone(), keys.clone(), content.clone());
+        let its_lake = lake.clone();
+        let for_rows = keys.clone();
+        let its_content = content.clone();
         let of_the_run = async {
             let files = cores.compute_on_core(move || encode_run(&its_lake, &for_rows, &its_content)).await?;
             self.context.stage_rows(&keys, &derivation, files).await
@@ -356,7 +361,8 @@ impl IngestWork {
         }
         let shorter = rows::runs::number_of(&row, "file_bytes").and_then(|bytes| u64::try_from(bytes).ok());
         if let Some(bytes) = shorter.filter(|bytes| (1..content.integrity.bytes).contains(bytes)) {
-            let (store, path) = (opened.store.as_ref(), &opened.path);
+            let store = opened.store.as_ref();
+            let path = &opened.path;
             let failed = |e: object_store::Error| Error::read_failure(&opened.name, e);
             if !inbox::has_end_at(store, path, bytes).await.map_err(failed)?
                 && object_sha256(store, path, bytes, &mut |_| {}).await.map_err(failed)? == there

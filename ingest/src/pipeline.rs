@@ -82,7 +82,8 @@ impl Cores {
     /// Starts a computation on a core of its own once one is free, in the order of the calls.
     pub fn begin_on_core<T: Send + 'static>(&self, work: impl FnOnce() -> T + Send + 'static) -> PendingComputation<T> {
         let (sender, done) = oneshot::channel();
-        let (busy, span) = (self.mark_busy(), Span::current());
+        let busy = self.mark_busy();
+        let span = Span::current();
         self.pool.spawn_fifo(move || {
             let done = catch_unwind(AssertUnwindSafe(|| span.in_scope(work)));
             drop(busy);
@@ -136,7 +137,10 @@ where
     let mut workers = JoinSet::new();
     let halt = Arc::new(AtomicBool::new(false));
     for _ in 0..=cores.count() {
-        let (queue, sender, work, halt) = (queue.clone(), sender.clone(), work.clone(), halt.clone());
+        let queue = queue.clone();
+        let sender = sender.clone();
+        let work = work.clone();
+        let halt = halt.clone();
         workers.spawn(async move {
             while !halt.load(Ordering::Relaxed)
                 && let Some(job) = next(&queue)

@@ -30,7 +30,8 @@ pub(crate) async fn read_responses(lake: &Lake, snapshot: &LakeSnapshot, run: &R
             let celsius = batch.column_by_name("temperature_c").ok_or_else(|| lost("temperature_c"))?;
             out.celsius.extend(celsius.as_primitive::<Float64Type>().values());
             let irs = batch.column_by_name("ir").ok_or_else(|| lost("ir"))?.as_list::<i32>();
-            let (from, to) = (irs.value_offsets()[0] as usize, irs.value_offsets()[irs.len()] as usize);
+            let from = irs.value_offsets()[0] as usize;
+            let to = irs.value_offsets()[irs.len()] as usize;
             out.pairs.extend(pairs.values().iter().map(|p| *p as u32));
             out.irs.extend_from_slice(&irs.values().as_primitive::<Float32Type>().values()[from..to]);
         }

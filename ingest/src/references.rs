@@ -161,7 +161,8 @@ impl ReferenceFinder {
         let named = [&wanted.foam, &wanted.flat_foam, &wanted.flat];
         self.read_means(named).await?;
         let [foam, flat_foam, flat] = named.map(|of| self.means[of.version_key()].clone());
-        let (lake, is_foam_chosen) = (self.lake.clone(), wanted.direct_sound == DirectSound::Foam);
+        let lake = self.lake.clone();
+        let is_foam_chosen = wanted.direct_sound == DirectSound::Foam;
         let derive = move || {
             let of_foam = || ReferenceResponses::new(&lake, foam.clone(), &flat, &flat_foam);
             rayon::join(
@@ -170,7 +171,8 @@ impl ReferenceFinder {
             )
         };
         let (of_foam, estimated) = cores.compute_on_core(derive).await;
-        let (of_foam, estimated) = (of_foam?, estimated?);
+        let of_foam = of_foam?;
+        let estimated = estimated?;
         let chosen = of_foam.or_else(|| estimated.clone()).ok_or_else(|| Error::FoamReflection {
             foam: wanted.foam.surface.to_string(),
             flat: wanted.flat.surface.to_string(),
@@ -290,7 +292,8 @@ impl ReferenceResponses {
 pub(crate) fn arrival_times(lake: &Lake, pair: u32) -> Option<[f64; 2]> {
     let points = lake.grid().pair(PairId(pair))?;
     let position = |point| lake.grid().point(point).map(|point| point.position_mm);
-    let (microphone, speaker) = (position(points.microphone)?, position(points.speaker)?);
+    let microphone = position(points.microphone)?;
+    let speaker = position(points.speaker)?;
     let reference_c = lake.rig().impulse_response.reference_temperature_c.get();
     Some(
         [direct_mm(microphone, speaker), image_mm(microphone, speaker)]
@@ -342,7 +345,8 @@ fn estimate_references(
 impl WantedReferences {
     /// Returns Flat's version and Foam's; None if one is missing. Flat's version includes that of its own Foam.
     pub fn version_pair(&self) -> Option<(String, String)> {
-        let (flat, flat_foam) = (self.flat.version.as_ref()?, self.flat_foam.version.as_ref()?);
+        let flat = self.flat.version.as_ref()?;
+        let flat_foam = self.flat_foam.version.as_ref()?;
         Some((format!("{flat}-{}", digest_parts(&[flat_foam])), self.foam.version.clone()?))
     }
 

@@ -108,13 +108,15 @@ impl<W: Write + Send> AnswerWriter<W> {
         let inner = match format {
             AnswerFormat::Table => FormatWriter::Table(to, Vec::new()),
             AnswerFormat::Csv => {
-                let (mut to, mut text) = (to, Vec::new());
+                let mut to = to;
+                let mut text = Vec::new();
                 // A header even if there are no rows.
                 write_csv(&mut to, &mut text, &RecordBatch::new_empty(flat_schema(schema)), true)?;
                 FormatWriter::Csv(to, text)
             }
             AnswerFormat::SpreadsheetCsv => {
-                let (mut to, mut text) = (to, Vec::new());
+                let mut to = to;
+                let mut text = Vec::new();
                 let header = escape_formulas(&RecordBatch::new_empty(flat_schema(schema)));
                 write_csv(&mut to, &mut text, &header.map_err(|e| arrow_error(format, e))?, true)?;
                 FormatWriter::SpreadsheetCsv(to, text)

@@ -327,7 +327,8 @@ impl Session {
         mut statement: Statement,
         ticket: &Arc<QueryTicket>,
     ) -> Result<PreparedQuery, Error> {
-        let (session, sql) = (self.clone(), sql.to_owned());
+        let session = self.clone();
+        let sql = sql.to_owned();
         let plan = async move {
             let context = session.engine.create_context();
             let system = session.engine.system_tables();

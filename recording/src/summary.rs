@@ -229,7 +229,8 @@ impl DefinitionDigests {
         let Some((key, digest)) = digest_of(record) else { return Ok(()) };
         match self.by_id.get(&key) {
             Some(known) if *known != digest => {
-                let (kind, id) = (if key.0 == op::SCHEMA { "schema" } else { "channel" }, key.1);
+                let kind = if key.0 == op::SCHEMA { "schema" } else { "channel" };
+                let id = key.1;
                 Err(format!("{kind} {id} is used again: with other content than the summary has"))
             }
             _ => Ok(()),
@@ -281,7 +282,9 @@ impl ChannelDefinitions {
                 Some(known)
                     if known.encoding == header.encoding && known.data == *data && known.name == header.name => {}
                 Some(known) => {
-                    let (id, before, now) = (header.id, &known.name, &header.name);
+                    let id = header.id;
+                    let before = &known.name;
+                    let now = &header.name;
                     return Err(format!(
                         "schema {id} is used again: it is `{before}` and, with other content, `{now}`"
                     ));
@@ -299,7 +302,9 @@ impl ChannelDefinitions {
             Record::Channel(channel) => match self.channels.get(&channel.id) {
                 Some(known) if is_same_channel(known, channel) => {}
                 Some(known) => {
-                    let (id, before, now) = (channel.id, &known.topic, &channel.topic);
+                    let id = channel.id;
+                    let before = &known.topic;
+                    let now = &channel.topic;
                     return Err(format!(
                         "channel {id} is used again: it is `{before}` and, with other content, `{now}`"
                     ));

@@ -380,7 +380,8 @@ impl Rig {
     /// # Errors
     /// [`Error::Rig`] or [`Error::Quantity`], naming the field.
     pub fn check_consistency(&self) -> Result<(), Error> {
-        let (sweep, nyquist) = (&self.sweep, self.sweep.rate_hz.get() / 2.0);
+        let sweep = &self.sweep;
+        let nyquist = self.sweep.rate_hz.get() / 2.0;
         let positive = |x: f64, max: f64| x > 0.0 && x <= max;
         let rules = [
             (!self.name.trim().is_empty(), "name", "is empty".to_owned()),

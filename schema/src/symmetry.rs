@@ -106,7 +106,8 @@ impl Grid {
     }
 
     fn move_pair(&self, pair: Pair, to: &[PointId]) -> Option<MovedPair> {
-        let (microphone, speaker) = (to[pair.microphone.index()], to[pair.speaker.index()]);
+        let microphone = to[pair.microphone.index()];
+        let speaker = to[pair.speaker.index()];
         let (id, swapped) = match self.pair_id(microphone, speaker) {
             Some(id) => (id, false),
             None => (self.pair_id(speaker, microphone)?, true),

@@ -258,7 +258,8 @@ async fn upload_run(path: &Path, location: &str, stop: &StopRequest, progress: &
         () = stop.wait_until_made() => Err(anyhow::anyhow!("stopped")),
     };
     uploaded.map_err(|cause| {
-        let (path, cause) = (path.display(), describe_error(&cause));
+        let path = path.display();
+        let cause = describe_error(&cause);
         anyhow::anyhow!(
             "the run stays in `{path}` and was not uploaded to `{location}`: {cause}; hint: `echolake --lake {location} \
              upload {path}` continues"

@@ -176,7 +176,8 @@ async fn export_ml(lake: &Lake, args: &MlArgs) -> anyhow::Result<()> {
         references: args.references,
         license: args.license.clone(),
     };
-    let (progress, mut task) = (CommandProgress::new(), None);
+    let progress = CommandProgress::new();
+    let mut task = None;
     let pending = PendingExport::prepare_folder(&args.output).await?;
     let exported = write_training_set(lake, pending.path(), &set, &mut |done, total| {
         show_progress(&progress, &mut task, "surfaces", done, total);
@@ -255,7 +256,8 @@ async fn export_mcap(lake: &Lake, args: &McapArgs) -> anyhow::Result<()> {
 }
 
 async fn export_responses(lake: &Lake, args: &ResponseArgs, format: ResponseFormat) -> anyhow::Result<()> {
-    let (progress, mut task) = (CommandProgress::new(), None);
+    let progress = CommandProgress::new();
+    let mut task = None;
     let pending = PendingExport::prepare_folder(&args.output).await?;
     let files = write_responses(lake, pending.path(), format, &args.surfaces, &mut |done, total| {
         show_progress(&progress, &mut task, "surfaces", done, total);
@@ -268,7 +270,8 @@ async fn export_responses(lake: &Lake, args: &ResponseArgs, format: ResponseForm
 
 async fn export_wav(lake: &Lake, args: &WavArgs) -> anyhow::Result<()> {
     let taken = select_measurements(lake, &args.selection).await?;
-    let (progress, mut task) = (CommandProgress::new(), None);
+    let progress = CommandProgress::new();
+    let mut task = None;
     let pending = PendingExport::prepare_folder(&args.output).await?;
     let count = write_wav(lake, pending.path(), &taken, wanted_check(&args.selection), &mut |done, total| {
         show_progress(&progress, &mut task, "recordings", done, total);

@@ -166,7 +166,8 @@ async fn open_or_make(lake_url: &str, runs: &[String]) -> anyhow::Result<Lake> {
 // What is no run now and will not become one by itself, by its path, and why.
 fn passed_over(pending: &PendingFiles) -> Vec<(String, IngestError)> {
     let unusable = pending.unusable.iter().map(|entry| {
-        let (path, reason) = (entry.path.clone(), entry.reason.clone());
+        let path = entry.path.clone();
+        let reason = entry.reason.clone();
         (path.clone(), IngestError::Unusable { path, reason })
     });
     let cut_off = pending.recordings.iter().filter(|recording| recording.state == RecordingState::CutOff);
@@ -271,7 +272,9 @@ async fn ingest_and_complete(
         )),
     }
     outcome?;
-    let (mut task, mut rows, mut runs) = (None, 0, 0);
+    let mut task = None;
+    let mut rows = 0;
+    let mut runs = 0;
     let completed = &mut |completed: &CompletedRun, total: usize| {
         rows += completed.measurements;
         runs += 1;
@@ -384,9 +387,11 @@ impl WatchedInbox {
     // The files that can be ingested now. One that is being copied grows between two looks; one that does not end as a
     // closed file is still being copied, until it has not grown for a while.
     async fn list_settled(&mut self, lake: &Lake, pending: &PendingFiles) -> HashMap<String, WatchedState> {
-        let (mut settled, mut seen) = (HashMap::new(), HashMap::new());
+        let mut settled = HashMap::new();
+        let mut seen = HashMap::new();
         for meta in &pending.runs {
-            let (path, state) = (&meta.location, (meta.size, meta.last_modified));
+            let path = &meta.location;
+            let state = (meta.size, meta.last_modified);
             if self.given_up.get(path.as_ref()) == Some(&state) {
                 continue;
             }

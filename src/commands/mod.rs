@@ -18,14 +18,8 @@ pub(crate) mod import;
 pub(crate) mod ingest;
 #[cfg(feature = "lake")]
 pub(crate) mod mcp;
-#[cfg(feature = "lake")]
-pub(crate) mod optimize;
 pub(crate) mod panel;
-#[cfg(feature = "lake")]
-pub(crate) mod rebuild;
 pub(crate) mod recover;
-#[cfg(feature = "lake")]
-pub(crate) mod remove;
 pub(crate) mod replay;
 #[cfg(feature = "lake")]
 pub(crate) mod serve;
@@ -35,10 +29,10 @@ mod simulated_runs;
 pub(crate) mod sql;
 #[cfg(feature = "lake")]
 pub(crate) mod twin;
+#[cfg(feature = "lake")]
+pub(crate) mod upkeep;
 #[cfg(feature = "upload")]
 pub(crate) mod upload;
-#[cfg(feature = "lake")]
-pub(crate) mod vacuum;
 
 use std::net::SocketAddr;
 use std::path::Path;

@@ -99,7 +99,8 @@ pub(crate) async fn run_replay(args: &ReplayArgs, lake_url: &str) -> anyhow::Res
 
 // Opens recordings, sorted by time; returns also whether one is damaged.
 fn open_recordings(paths: &[PathBuf], progress: &CommandProgress) -> (Vec<Recording>, bool) {
-    let (mut recordings, mut lost) = (Vec::new(), false);
+    let mut recordings = Vec::new();
+    let mut lost = false;
     for opened in paths.iter().map(|path| Recording::open(path)) {
         match opened {
             Ok(recording) => {
@@ -160,7 +161,8 @@ fn describe_state(standing: &ReplayState) -> String {
 
 // Files by their paths, runs and surfaces by the lake's tables.
 async fn find_recordings(names: &[String], lake_url: &str) -> anyhow::Result<Vec<PathBuf>> {
-    let (mut paths, mut lake) = (Vec::new(), None);
+    let mut paths = Vec::new();
+    let mut lake = None;
     for name in names {
         let path = Path::new(name);
         if name.ends_with(".mcap") || name.ends_with(".mcap.partial") || path.is_file() {
@@ -183,7 +185,8 @@ pub(in crate::commands) async fn run_file(lake: &Lake, name: &str) -> anyhow::Re
     let folder =
         lake.folder().context("a replay needs a lake in a folder; hint: --lake FOLDER, or name .mcap files")?;
     let snapshot = lake.whole_snapshot().await?;
-    let (run, surface) = (name.parse::<RunId>().ok(), name.parse::<SurfaceId>().ok());
+    let run = name.parse::<RunId>().ok();
+    let surface = name.parse::<SurfaceId>().ok();
     let of_run = run.and_then(|run| snapshot.run(&run).cloned());
     let found = of_run.or_else(|| snapshot.runs().rfind(|r| Some(&r.surface) == surface.as_ref()).cloned());
     let found = found.with_context(|| {

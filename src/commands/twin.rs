@@ -224,7 +224,8 @@ impl ComputedRun {
 // Writes the panel's mesh to a file; returns the surface's project. Both stand in the run's file before its measurements.
 fn take_mesh(run: &Path, to: &Path) -> anyhow::Result<Option<ProjectName>> {
     let mut reader = RecordingReader::open(run)?;
-    let (mut mesh, mut record) = (None, None);
+    let mut mesh = None;
+    let mut record = None;
     while let (false, Some(item)) = (mesh.is_some() && record.is_some(), reader.next_item()?) {
         let RecordingItem::Attachment(attachment) = item else { continue };
         match attachment.name.as_str() {

@@ -369,7 +369,8 @@ fn answer_text(text: &str) -> Option<String> {
 
 // The client of object_store says in its text alone how often it repeated a request.
 fn tries_text(error: &object_store::Error) -> String {
-    let (mut tries, mut source) = (1, Some(error as &dyn std::error::Error));
+    let mut tries = 1;
+    let mut source = Some(error as &dyn std::error::Error);
     while let Some(cause) = source {
         #[cfg(feature = "remote")]
         if let Some(retried) = cause.downcast_ref::<crate::remote::RetriedError>() {

@@ -67,7 +67,8 @@ impl Lake {
         let failed = |e| Error::store_failure("list", folder, e);
         let mut listing = match self.folder() {
             Some(lake) => {
-                let (lake, folder) = (lake.to_owned(), folder.to_owned());
+                let lake = lake.to_owned();
+                let folder = folder.to_owned();
                 let walk = move || list_local_folder(&lake, &folder);
                 let join_failed = |source| failed(object_store::Error::JoinError { source });
                 let read_failed = |e: io::Error| {
@@ -121,7 +122,8 @@ fn list_local_folder(lake: &FsPath, folder: &str) -> io::Result<FolderListing> {
 }
 
 fn judge_entry(entry: &DirEntry, folder: &str, listing: &mut FolderListing, folders: &mut Vec<OpenFolder>) {
-    let (path, name) = (entry.path(), entry.file_name());
+    let path = entry.path();
+    let name = entry.file_name();
     let location = format!("{folder}/{}", escape_name(&name));
     let unusable =
         |reason: &str| UnusableEntry { reason: reason.to_owned(), ..UnusableEntry::new(location.clone(), &path) };

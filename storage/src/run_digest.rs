@@ -25,7 +25,9 @@ const LARGEST_RECORD: u64 = 4 << 10;
 /// # Errors
 /// The system refuses to read it.
 pub fn file_sha256(file: &FsPath, progress: &mut dyn FnMut(u64)) -> io::Result<(String, u64)> {
-    let (mut file, mut sha, mut bytes) = (File::open(file)?, Sha256::new(), 0);
+    let mut file = File::open(file)?;
+    let mut sha = Sha256::new();
+    let mut bytes = 0;
     let mut block = vec![0; 1 << 20];
     loop {
         match file.read(&mut block) {
@@ -56,7 +58,8 @@ pub async fn object_sha256(
         store.get_range(path, begin..(begin + BLOCK).min(bytes))
     };
     let mut blocks = stream::iter(0..bytes.div_ceil(BLOCK)).map(fetch).buffered(BLOCKS_AT_ONCE);
-    let (mut sha, mut read) = (Sha256::new(), 0);
+    let mut sha = Sha256::new();
+    let mut read = 0;
     while let Some(block) = blocks.try_next().await? {
         sha.update(&block);
         read += block.len() as u64;

@@ -73,7 +73,8 @@ fn transforms(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("transform");
     group.throughput(Throughput::Elements(n as u64));
     let forward = f32::plan_real_forward(n);
-    let (mut input, mut spectrum) = (forward.make_input_vec(), forward.make_output_vec());
+    let mut input = forward.make_input_vec();
+    let mut spectrum = forward.make_output_vec();
     let mut work = forward.make_scratch_vec();
     group.bench_function(BenchmarkId::new("two_real", n), |bencher| {
         bencher.iter(|| {
@@ -120,7 +121,8 @@ fn deconvolution(criterion: &mut Criterion) {
         ("exact", TransformLength::Exact, SpectralDivision::Tapered),
     ] {
         let plan = DeconvolutionPlan::<f32>::new(params(length, division)).expect("settings of the paper");
-        let (mut scratch, mut ir) = (plan.make_scratch(), vec![0.0; plan.output_len()]);
+        let mut scratch = plan.make_scratch();
+        let mut ir = vec![0.0; plan.output_len()];
         group.bench_function(BenchmarkId::new(name, n), |bencher| {
             bencher.iter(|| plan.deconvolve_recording(black_box(&recording), &loopback, &mut ir, &mut scratch));
         });
@@ -156,7 +158,8 @@ fn measurement(criterion: &mut Criterion) {
         reference_celsius: REFERENCE_CELSIUS,
     })
     .expect("settings of the paper");
-    let (mut scratch, mut ir) = (plan.make_scratch(), vec![0.0; IR_LEN]);
+    let mut scratch = plan.make_scratch();
+    let mut ir = vec![0.0; IR_LEN];
     let mut group = criterion.benchmark_group("measurement");
     group.throughput(Throughput::Elements(n as u64));
     group.bench_function(BenchmarkId::new("recording_to_response", n), |bencher| {
@@ -167,7 +170,8 @@ fn measurement(criterion: &mut Criterion) {
 fn filter_bank(criterion: &mut Criterion) {
     let ir = response();
     let plan = FilterBankPlan::<f32>::new(IR_LEN, RATE_HZ, &CENTRES_HZ).expect("bands of the paper");
-    let (mut scratch, mut bands) = (plan.make_scratch(), vec![0.0; plan.band_count() * IR_LEN]);
+    let mut scratch = plan.make_scratch();
+    let mut bands = vec![0.0; plan.band_count() * IR_LEN];
     let mut energies = vec![0.0; plan.band_count()];
     let mut group = criterion.benchmark_group("filter_bank");
     group.throughput(Throughput::Elements(IR_LEN as u64));
@@ -181,7 +185,8 @@ fn filter_bank(criterion: &mut Criterion) {
 
 fn energy(criterion: &mut Criterion) {
     let bands = response().repeat(CENTRES_HZ.len());
-    let (mut curves, mut per_band) = (vec![0.0; bands.len()], [0.0; CENTRES_HZ.len()]);
+    let mut curves = vec![0.0; bands.len()];
+    let mut per_band = [0.0; CENTRES_HZ.len()];
     let mut group = criterion.benchmark_group("energy");
     group.throughput(Throughput::Elements(bands.len() as u64));
     group.bench_function(BenchmarkId::new("nce", IR_LEN), |bencher| {
@@ -194,9 +199,11 @@ fn energy(criterion: &mut Criterion) {
 }
 
 fn derivation(criterion: &mut Criterion) {
-    let (ir, foam) = (response(), vec![0.0; IR_LEN]);
+    let ir = response();
+    let foam = vec![0.0; IR_LEN];
     let plan = DerivationPlan::<f32>::new(IR_LEN, RATE_HZ, &CENTRES_HZ).expect("bands of the paper");
-    let (mut scratch, mut derived) = (plan.make_scratch(), plan.make_derived());
+    let mut scratch = plan.make_scratch();
+    let mut derived = plan.make_derived();
     let energies = plan.flat_energies(&ir, &mut scratch).expect("a response");
     let mut group = criterion.benchmark_group("derivation");
     group.throughput(Throughput::Elements(IR_LEN as u64));
@@ -223,7 +230,8 @@ fn reflection(criterion: &mut Criterion) {
         direct: &one,
         reflection: &one,
     };
-    let (mut scratch, mut ir) = (plan.make_scratch(), vec![0.0; IR_LEN]);
+    let mut scratch = plan.make_scratch();
+    let mut ir = vec![0.0; IR_LEN];
     let mut group = criterion.benchmark_group("kirchhoff");
     group.throughput(Throughput::Elements((CELLS * CELLS) as u64));
     group.bench_function(BenchmarkId::new("response", CELLS), |bencher| {

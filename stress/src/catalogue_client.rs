@@ -84,7 +84,8 @@ impl CatalogueConnection {
         let head = format!("GET {path} HTTP/1.1\r\n{}\r\n", self.headers);
         self.stream.get_mut().write_all(head.as_bytes())?;
         self.stream.get_mut().flush()?;
-        let (mut status, mut length) = (0, None);
+        let mut status = 0;
+        let mut length = None;
         for line in (&mut self.stream).lines() {
             let line = line?;
             if line.is_empty() {

@@ -45,7 +45,8 @@ pub(crate) struct EngineKillsArgs {
 
 pub(crate) fn run_engine_kills(args: &EngineKillsArgs) -> Result<()> {
     let tally = run_kills(&super::echolake_path()?, args.kills, args.seed)?;
-    let (whole, wrong) = (tally.times.len(), tally.wrong);
+    let whole = tally.times.len();
+    let wrong = tally.wrong;
     println!("{} kills: {whole} answers whole, {wrong} wrong, {} broken off", args.kills, tally.broken_off);
     for (error, count) in tally.refused.iter().chain(&tally.lost) {
         println!("  {error}: {count}");
@@ -65,7 +66,10 @@ pub(crate) fn run_kills(binary: &Path, kills: usize, seed: u64) -> Result<Answer
     let is_stopped = AtomicBool::new(false);
     let killed = std::thread::scope(|scope| {
         for reader in 0..READERS {
-            let (server, right, tally, is_stopped) = (&server, &right, &tally, &is_stopped);
+            let server = &server;
+            let right = &right;
+            let tally = &tally;
+            let is_stopped = &is_stopped;
             scope.spawn(move || read_answers(server, reader, right, seed, tally, is_stopped));
         }
         let killed = kill_engines(&server, kills, seed);

@@ -33,7 +33,8 @@ fn parse_target(name: &str) -> Result<FuzzTarget, String> {
 pub(crate) fn run_fuzz_server(args: &FuzzArgs) -> Result<()> {
     let FuzzArgs { target, seconds, seed } = *args;
     let binary = super::echolake_path()?;
-    let (begun, mut told) = (Instant::now(), Instant::now());
+    let begun = Instant::now();
+    let mut told = Instant::now();
     let outcome = FuzzCampaign::new(&binary, seed, ServedLake::start).throw(target, &mut |so_far| {
         if told.elapsed() > TELL_EVERY {
             told = Instant::now();

@@ -31,7 +31,8 @@ pub(crate) fn run_hostile_ingest(args: &HostileFilesArgs) -> Result<()> {
     let HostileFilesArgs { count, seed, limit_secs } = *args;
     let campaign = HostileCampaign::new(&super::echolake_path()?, seed);
     let mut out = std::io::stdout().lock();
-    let (mut first, mut is_bad) = (0, false);
+    let mut first = 0;
+    let mut is_bad = false;
     let mut crafted = Some(SIZES);
     while first < count || crafted.is_some() {
         // The crafted ones have a round of their own.

@@ -117,7 +117,9 @@ fn report_order(
     order: &[usize],
 ) -> io::Result<()> {
     let mut courses: BTreeMap<String, usize> = BTreeMap::new();
-    let (mut secs, mut turned, mut last) = (0.0, 0.0, ArmPose::at_home());
+    let mut secs = 0.0;
+    let mut turned = 0.0;
+    let mut last = ArmPose::at_home();
     for next in order.iter().map(|i| standings[*i]) {
         match plan_motion(cell, &last, &next) {
             Some(motion) => {

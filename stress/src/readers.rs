@@ -149,7 +149,8 @@ impl ReaderLoad {
         let errors = Arc::new(AtomicU64::new(0));
         let end = Instant::now() + self.time;
         let reader = |number| {
-            let (load, errors) = (self.clone(), errors.clone());
+            let load = self.clone();
+            let errors = errors.clone();
             std::thread::spawn(move || load.read(number, end, &errors))
         };
         let readers: Vec<_> = (1..=self.readers).map(reader).collect();
@@ -204,7 +205,8 @@ pub(crate) fn run_readers(args: &ReadersArgs) -> Result<()> {
         server = server.with_certificate(certificate)?;
     }
     let contents = Arc::new(CatalogueContents::read(&server)?);
-    let (readers, time) = (args.readers, Duration::from_secs(args.seconds));
+    let readers = args.readers;
+    let time = Duration::from_secs(args.seconds);
     let mut heaviest = 0;
     let load = ReaderLoad { server, contents, kind: args.kind, readers, time };
     let times = load.measure(|| heaviest = heaviest.max(args.pid.and_then(resident_mib).unwrap_or(0)))?;

@@ -45,7 +45,11 @@ fn read_slice(address: &str, path: &str) -> Result<SliceTimes> {
     let begun = Instant::now();
     let mut stream = TcpStream::connect(address)?;
     stream.write_all(format!("GET {path} HTTP/1.1\r\nhost: {address}\r\nconnection: close\r\n\r\n").as_bytes())?;
-    let (mut head, mut first, mut bytes, mut block, mut end) = (Vec::new(), None, 0, vec![0; 64 << 10], Vec::new());
+    let mut head = Vec::new();
+    let mut first = None;
+    let mut bytes = 0;
+    let mut block = vec![0; 64 << 10];
+    let mut end = Vec::new();
     loop {
         let count = stream.read(&mut block)?;
         if count == 0 {
@@ -89,7 +93,8 @@ pub(crate) fn run_slices(args: &SlicesArgs) -> Result<()> {
         let path = slice_path(&args.run, 0..(args.pairs / share).max(1), more);
         let mut tries = (0..5).map(|_| read_slice(&args.address, &path)).collect::<Result<Vec<_>>>()?;
         tries.sort_by_key(|took| took.first);
-        let (median, slowest) = (&tries[2], &tries[4]);
+        let median = &tries[2];
+        let slowest = &tries[4];
         println!(
             "{name}: {} bytes, first after {:.1} ms (at most {:.1}), all after {:.1} ms",
             median.bytes,
@@ -98,7 +103,8 @@ pub(crate) fn run_slices(args: &SlicesArgs) -> Result<()> {
             milliseconds(median.all)
         );
     }
-    let (before, done) = (args.pid.and_then(resident_mib).unwrap_or(0), Arc::new(AtomicBool::new(false)));
+    let before = args.pid.and_then(resident_mib).unwrap_or(0);
+    let done = Arc::new(AtomicBool::new(false));
     let begun = Instant::now();
     let reader = |number: u64| {
         let args = args.clone();
@@ -110,7 +116,8 @@ pub(crate) fn run_slices(args: &SlicesArgs) -> Result<()> {
     };
     let readers: Vec<_> = (0..args.readers).map(reader).collect();
     let watch = {
-        let (args, done) = (args.clone(), done.clone());
+        let args = args.clone();
+        let done = done.clone();
         std::thread::spawn(move || {
             let mut heaviest = 0;
             while !done.load(Ordering::Relaxed) {

@@ -1,6 +1,6 @@
 """Compares the tables of a lake with an independent chain: `independent_chain.py --program ECHOLAKE`.
 
-The chain was written from the paper (Rust et al. 2021) and from the definitions in ARCHITECTURE.md and
+The chain was written from the paper (Rust et al. 2021) and from the definitions in docs/decisions/division.md and
 schema/src/rig.rs; it shares no code with the program. It reads the raw sweeps and loopbacks of run files with Python's
 mcap, computes responses, curves and levels in double precision, and compares them with the tables as deltalake reads
 them, in each variant of `impulse_response.division`. The program makes the lakes: the demo's six surfaces, simulated

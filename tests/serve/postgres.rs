@@ -292,6 +292,21 @@ fn a_prepared_statement_sees_the_lake_at_its_start() {
 }
 
 #[test]
+fn a_connection_keeps_500_prepared_statements() {
+    let place = super::lake();
+    let server = super::served(&place, &[]);
+    let mut client = WireClient::connect(&server, None);
+    let two = Ok(vec![vec![Some("2".to_owned())]]);
+    (0..500).for_each(|n| client.prepare(&format!("s{n}"), "select $1::int + 1"));
+    assert_eq!(client.execute("s499", &["1"]), two);
+    client.prepare("s500", "select $1::int + 1");
+    assert_eq!(client.execute("s500", &["1"]), Err("53300".to_owned()));
+    assert_eq!(client.query("deallocate s0"), Ok(Vec::new()));
+    client.prepare("s500", "select $1::int + 1");
+    assert_eq!(client.execute("s500", &["1"]), two);
+}
+
+#[test]
 fn what_is_sent_after_an_error_is_not_kept() {
     const MIB: usize = 1 << 20;
     let place = super::lake();

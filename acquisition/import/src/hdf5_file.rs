@@ -143,7 +143,8 @@ impl Hdf5Dataset {
         // Windows end where chunks do, if they can.
         let most = (WINDOW_NUMBERS / row).max(1);
         let step = if most > self.chunk_rows { most - most % self.chunk_rows } else { most };
-        let (mut at, end) = (start, start + rows);
+        let mut at = start;
+        let end = start + rows;
         while at < end {
             let next = end.min((at / step + 1) * step);
             let window = self.dataset.read_f64_rows(at as u64, (next - at) as u64).map_err(describe_error)?;
@@ -172,7 +173,8 @@ fn append_block(values: &[f64], shape: &[usize], starts: &[usize], counts: &[usi
 
 // The place of a number in a grid, row by row.
 pub(crate) fn place_in_grid(number: usize, grid: &[usize]) -> Vec<usize> {
-    let (mut left, mut at) = (number, vec![0; grid.len()]);
+    let mut left = number;
+    let mut at = vec![0; grid.len()];
     for (i, n) in grid.iter().enumerate().rev() {
         at[i] = left % n;
         left /= n;

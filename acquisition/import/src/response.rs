@@ -19,7 +19,8 @@ impl ImportedResponse {
     /// Records it as the pair's first attempt, accepted.
     pub fn record_response(self, recorder: &mut Recorder, rig: &Rig, grid: &Grid) -> Result<(), Error> {
         let Self { pair, at, celsius, samples, is_corrected } = self;
-        let (unknown, celsius) = (f64::NAN, celsius.get());
+        let unknown = f64::NAN;
+        let celsius = celsius.get();
         let [m, s] = [pair.microphone, pair.speaker].map(|id| grid.points()[id.index()].position_mm);
         recorder.poses(at, m, s)?;
         recorder.environment(

@@ -130,7 +130,8 @@ impl ManifestCells<'_> {
     }
 
     fn parse_row(&self, rig: &Rig, grid: &Grid) -> Result<ManifestRow, Error> {
-        let (recording, loopback) = (self.open_wav("recording")?, self.open_wav("loopback")?);
+        let recording = self.open_wav("recording")?;
+        let loopback = self.open_wav("loopback")?;
         let expected = rig.sweep.rate_hz.get();
         for (column, wav) in [("recording", &recording), ("loopback", &loopback)] {
             let actual = wav.layout.rate_hz;
@@ -178,7 +179,8 @@ impl ManifestCells<'_> {
             let found = grid.parse_point(self.needed_text(column)?);
             found.map_err(|e| self.cell_error(column, e.to_string()))
         };
-        let (microphone, speaker) = (point("microphone")?, point("speaker")?);
+        let microphone = point("microphone")?;
+        let speaker = point("speaker")?;
         let PairId(id) = grid.parse_pair(microphone, speaker).map_err(|e| self.cell_error("speaker", e.to_string()))?;
         Ok(grid.pairs()[id as usize])
     }

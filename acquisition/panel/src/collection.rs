@@ -49,7 +49,8 @@ impl CollectionSurface {
 /// [`Error::Quantity`] if there are more than [`LARGEST`].
 pub fn collection_surfaces(seed: u64, count: usize) -> Result<Vec<CollectionSurface>, Error> {
     if count > LARGEST {
-        let (quantity, expected) = ("number of surfaces", "20001 at most, as panels have four digits");
+        let quantity = "number of surfaces";
+        let expected = "20001 at most, as panels have four digits";
         return Err(Error::Quantity { quantity, actual: count.to_string(), expected });
     }
     let references = REFERENCES.map(|(name, relief)| (name.to_owned(), relief));

@@ -72,7 +72,8 @@ impl<'a> RecordingCopy<'a> {
             return Ok(());
         }
         for channel in self.channels.values() {
-            let (topic, encoding) = (&channel.topic, &channel.message_encoding);
+            let topic = &channel.topic;
+            let encoding = &channel.message_encoding;
             let schema = match &channel.schema {
                 Some(s) => self.out.mcap.add_schema_with_id(s.id, &s.name, &s.encoding, &s.data)?,
                 None => 0,

@@ -35,7 +35,10 @@ impl RecordingSurvey {
     pub fn from_file(path: &Path) -> Result<Self, Error> {
         let mut walk = RecordingReader::open(path)?;
         let mut definitions = ChannelDefinitions::default();
-        let (mut metadata, mut rig, mut by_channel, mut chunks) = (BTreeMap::new(), None, BTreeMap::new(), 0);
+        let mut metadata = BTreeMap::new();
+        let mut rig = None;
+        let mut by_channel = BTreeMap::new();
+        let mut chunks = 0;
         while let Some(item) = walk.next_item()? {
             match item {
                 RecordingItem::Metadata(m) => drop(metadata.entry(m.name).or_insert(m.metadata)),

@@ -37,7 +37,8 @@ pub(super) struct ReplayTopics {
 impl ReplayTopics {
     /// None if there are more topics than channels.
     pub fn from_recordings(recordings: &[Recording]) -> Option<Self> {
-        let (mut all, mut of) = (Vec::<Topic>::new(), Vec::new());
+        let mut all = Vec::<Topic>::new();
+        let mut of = Vec::new();
         for recording in recordings {
             let mut channels = BTreeMap::new();
             for (id, topic) in &recording.topics {
@@ -309,7 +310,8 @@ impl ReplayPlayer {
         let recording = &self.recordings[self.number];
         let before: f64 = self.recordings[..self.number].iter().map(recording_secs).sum();
         let within = (self.current_time() - recording.time_range().0) as f64 / 1e9;
-        let (viewers, lost) = (self.shared.clients().len(), self.shared.lost_messages());
+        let viewers = self.shared.clients().len();
+        let lost = self.shared.lost_messages();
         let mut told = self.told.lock().unwrap_or_else(PoisonError::into_inner);
         if told.recording != recording.path() {
             told.recording = recording.path().to_owned();

@@ -141,12 +141,14 @@ impl Recording {
 
 impl Stretch {
     fn of_index(index: &ChunkIndex) -> Option<Self> {
-        let (start, end) = (index.message_start_time, index.message_end_time);
+        let start = index.message_start_time;
+        let end = index.message_end_time;
         let channels: BTreeSet<u16> = index.message_index_offsets.keys().copied().collect();
         // That is how a chunk without messages looks.
         let is_empty = channels.is_empty() && start == 0 && end == 0;
         let channels = Some(channels).filter(|c| !c.is_empty());
-        let (offset, length) = (index.chunk_start_offset, index.chunk_length);
+        let offset = index.chunk_start_offset;
+        let length = index.chunk_length;
         (!is_empty && start <= end).then_some(Self { start, end, offset, length, channels })
     }
 
@@ -215,7 +217,8 @@ fn walk_recording(path: &Path) -> Result<Walked, Error> {
             }
         }
         if let (Some(start), Some(end)) = (times.iter().copied().min(), times.iter().copied().max()) {
-            let (offset, length) = (chunk.offset, chunk.length);
+            let offset = chunk.offset;
+            let length = chunk.length;
             chunks.push(Stretch { start, end, offset, length, channels: Some(channels) });
         }
     }

@@ -33,7 +33,8 @@ pub fn check_audio(audio: &mut dyn AudioInterface) {
     assert!(audio.rate_hz() > 0.0);
     // Its frequency rises, so that it resembles itself at one delay only.
     let tone: Vec<f32> = (0..4_800).map(|n| n as f32).map(|n| 0.25 * (n * (0.2 + n * 1e-4)).sin()).collect();
-    let (mut take, mut last) = (AudioTake::default(), Timestamp(i64::MIN));
+    let mut take = AudioTake::default();
+    let mut last = Timestamp(i64::MIN);
     for output in [&tone[..], &tone[..1_000], &[0.0; 2_000]] {
         audio.play_and_record(output, &mut take).unwrap_or_else(|e| panic!("{e}"));
         assert_eq!([take.microphone.len(), take.loopback.len()], [output.len(); 2]);

@@ -134,7 +134,8 @@ impl RigDevices {
     /// Returns the problems that were handled since the last call, each with its device.
     pub fn take_notices(&mut self) -> Vec<(&'static str, String)> {
         let of = |device, notices: Vec<String>| notices.into_iter().map(move |notice| (device, notice));
-        let (robots, audio) = (self.robots.take_notices(), self.audio.take_notices());
+        let robots = self.robots.take_notices();
+        let audio = self.audio.take_notices();
         of("robots", robots).chain(of("audio", audio)).chain(of("sensor", self.sensor.take_notices())).collect()
     }
 }

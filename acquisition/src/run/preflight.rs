@@ -77,7 +77,8 @@ fn check_free_space(folder: &Path, free: u64, needed: u64) -> Option<PreflightFi
 
 /// Checks that recordings have a quiet part behind the response, from which their noise is known.
 pub fn quiet_part(rig: &Rig) -> Option<PreflightFinding> {
-    let (recorded, response) = (rig.recording_len(), response_len(rig));
+    let recorded = rig.recording_len();
+    let response = response_len(rig);
     if !quiet_range(recorded, response).is_empty() {
         return None;
     }

@@ -102,7 +102,8 @@ fn open_lock_file(path: &Path) -> io::Result<File> {
 fn write_holder(file: &mut File, folder: &Path) -> io::Result<()> {
     file.set_len(0)?;
     file.rewind()?;
-    let (process, since) = (std::process::id(), Timestamp::now());
+    let process = std::process::id();
+    let since = Timestamp::now();
     write!(file, "process {process} records into `{}` since {since}", folder.display())
 }
 

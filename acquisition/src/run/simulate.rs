@@ -25,7 +25,8 @@ pub fn run_simulation(
     stop: &AtomicBool,
     progress: &mut dyn FnMut(usize),
 ) -> Result<(PathBuf, RunEnd), Error> {
-    let (control, mut done) = (RunControl::default(), 0);
+    let control = RunControl::default();
+    let mut done = 0;
     let mut observe = |event: RunEvent<'_>| match event {
         RunEvent::Pair(_) => control.stop.store(stop.load(Ordering::Relaxed), Ordering::Relaxed),
         RunEvent::Attempt(m) if m.verdict() != Verdict::Repeated => {

@@ -18,7 +18,8 @@ pub(crate) struct SignalLevels {
 
 impl SignalLevels {
     pub fn from_signals<T: RealSample>(recording: &[T], loopback: &[T]) -> Result<Self, Error> {
-        let (x, s) = (sampled_energy(recording), sampled_energy(loopback));
+        let x = sampled_energy(recording);
+        let s = sampled_energy(loopback);
         for (what, energy) in [("the recording", x), ("the loopback", s)] {
             if !energy.is_finite() {
                 return Err(Error::NotFinite { what });

@@ -199,7 +199,8 @@ impl<T: RealSample> DeconvolutionPlan<T> {
         check_len("the loopback", loopback.len(), self.recording_len)?;
         check_len("the response", ir.len(), self.output_len)?;
         let DeconvolutionScratch { joint, work, sums } = scratch;
-        let (joint, work) = (joint.values(), work.values());
+        let joint = joint.values();
+        let work = work.values();
         let levels = SignalLevels::from_signals(recording, loopback)?;
         self.transform_jointly(recording, loopback, levels.gains.map(T::of), joint, work);
         let (quotient, work) = work.split_at_mut(self.inverse.spectrum_len());
@@ -237,7 +238,8 @@ impl<T: RealSample> DeconvolutionPlan<T> {
         rounding: f64,
         quotient: &mut [Complex<T>],
     ) -> Result<(), Error> {
-        let (first, end) = (*self.in_range.start(), *self.in_range.end() + 1);
+        let first = *self.in_range.start();
+        let end = *self.in_range.end() + 1;
         let power = self.divide_bins(first..end, T::default(), |_| T::of(1.0), joint, quotient);
         let mean = power.power_sum() / (end - first) as f64;
         // One sample that is not finite spoils all bins.
@@ -295,7 +297,8 @@ impl<T: RealSample> DeconvolutionPlan<T> {
         joint: &[Complex<T>],
         quotient: &mut [Complex<T>],
     ) -> BinPower<T> {
-        let (mut piece, mut powers) = ([Complex::default(); PIECE], [T::default(); PIECE]);
+        let mut piece = [Complex::default(); PIECE];
+        let mut powers = [T::default(); PIECE];
         let mut total = BinPower::none();
         for first in bins.clone().step_by(PIECE) {
             let count = PIECE.min(bins.end - first);

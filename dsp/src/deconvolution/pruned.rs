@@ -55,7 +55,8 @@ impl<T: RealSample> PrunedInverse<T> {
 
     /// Lays bins from `first` on, none of them past n / 2, into their strands; all from 0 to n / 2 must be laid.
     pub fn lay_bins(&self, first: usize, mut bins: &[Complex<T>], spectrum: &mut [Complex<T>]) {
-        let (mut q, mut r) = (first / self.strands, first % self.strands);
+        let mut q = first / self.strands;
+        let mut r = first % self.strands;
         while !bins.is_empty() {
             let (now, later) = bins.split_at(bins.len().min(self.strands - r));
             self.lay_across(q, r, now, spectrum);
@@ -65,7 +66,9 @@ impl<T: RealSample> PrunedInverse<T> {
 
     // Bin q of strands r and on; the bin of a strand that is not kept counts for its mirror image, n - k.
     fn lay_across(&self, q: usize, r: usize, bins: &[Complex<T>], spectrum: &mut [Complex<T>]) {
-        let (p, row, last) = (self.strands, self.strand_len + GAP, self.strand_len - 1);
+        let p = self.strands;
+        let row = self.strand_len + GAP;
+        let last = self.strand_len - 1;
         let direct = spectrum.chunks_exact_mut(row).skip(r);
         direct.zip(bins).for_each(|(strand, bin)| strand[q] = *bin);
         let skipped = p.div_ceil(2).saturating_sub(r);

@@ -40,7 +40,8 @@ impl DiffusionSums {
             return;
         }
         let loudest = self.loudest_db.max(other.loudest_db);
-        let (ours, theirs) = (energy_ratio(self.loudest_db, loudest), energy_ratio(other.loudest_db, loudest));
+        let ours = energy_ratio(self.loudest_db, loudest);
+        let theirs = energy_ratio(other.loudest_db, loudest);
         self.loudest_db = loudest;
         self.energy = self.energy * ours + other.energy * theirs;
         self.square = self.square * ours * ours + other.square * theirs * theirs;

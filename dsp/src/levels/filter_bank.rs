@@ -200,7 +200,8 @@ impl<T: RealSample> FilterBankPlan<T> {
             for (bin, ((x, d), gain)) in scratch.spectrum.iter().zip(direct).zip(gains).enumerate() {
                 let (weight, angle) =
                     (self.bin_weight(bin) * gain.f64().powi(2) / self.len as f64, bin_angle(bin, self.len));
-                let (product, power) = ((x.conj() * d), d.norm_sqr().f64());
+                let product = x.conj() * d;
+                let power = d.norm_sqr().f64();
                 let energy = weight * x.norm_sqr().f64();
                 sum.energy += energy;
                 sum.temperature += energy * per_kelvin(bin);

@@ -195,7 +195,10 @@ impl<T: RealSample> ResidualFit<T> {
         // Least squares of gain x direct - delay x derivative.
         let [mut dd, mut ds, mut ss, mut xd, mut xs] = [0.0; 5];
         for (n, ((x, d), s)) in reflected.iter().zip(&direct).zip(&derivative).enumerate() {
-            let (weight, x, d, s) = (gate(n), x.f64(), d.f64(), -s.f64());
+            let weight = gate(n);
+            let x = x.f64();
+            let d = d.f64();
+            let s = -s.f64();
             (dd, ds, ss) = (dd + weight * d * d, ds + weight * d * s, ss + weight * s * s);
             (xd, xs) = (xd + weight * x * d, xs + weight * x * s);
         }
@@ -220,7 +223,8 @@ impl<T: RealSample> ResidualFit<T> {
     }
 
     fn signal_spectrum(&self, signal: &[T]) -> Result<Vec<Complex<T>>, Error> {
-        let (mut signal, mut spectrum) = (signal.to_vec(), self.forward.make_output_vec());
+        let mut signal = signal.to_vec();
+        let mut spectrum = self.forward.make_output_vec();
         let done = self.forward.process(&mut signal, &mut spectrum);
         let finite = done.is_ok() && spectrum.first().is_some_and(|dc| dc.re.f64().is_finite());
         finite.then_some(spectrum).ok_or(Error::NotFinite { what: "the response" })

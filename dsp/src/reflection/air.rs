@@ -27,7 +27,8 @@ impl AirAbsorption {
     /// Air of a temperature in C, a relative humidity in % and a pressure in hPa.
     pub fn new(temperature_c: f64, humidity_pct: f64, pressure_hpa: f64) -> Self {
         let kelvin = temperature_c + ZERO_CELSIUS_K;
-        let (warmth, pressure) = (kelvin / REFERENCE_K, pressure_hpa / REFERENCE_HPA);
+        let warmth = kelvin / REFERENCE_K;
+        let pressure = pressure_hpa / REFERENCE_HPA;
         let saturation = 10f64.powf(4.6151 - 6.8346 * (TRIPLE_POINT_K / kelvin).powf(1.261));
         // Molar concentration of water vapour, %.
         let water = humidity_pct * saturation / pressure;

@@ -138,7 +138,8 @@ impl<T: RealSample> FoamReflectionFit<T> {
             return None;
         }
         let samples = |secs: f64| (secs * self.rate_hz).round() as usize;
-        let (lead, behind) = (samples(-FILTER_SECS[0]), samples(FILTER_SECS[1]));
+        let lead = samples(-FILTER_SECS[0]);
+        let behind = samples(FILTER_SECS[1]);
         let correlation = |spectrum: &mut [Complex<f64>]| {
             let mut out = self.inverse.make_output_vec();
             // The ends of a real signal's spectrum are real.
@@ -187,9 +188,11 @@ fn solve_toeplitz(first: &[f64], wanted: &[f64]) -> Vec<f64> {
     let times = |x: &[f64]| -> Vec<f64> {
         (0..x.len()).map(|i: usize| x.iter().enumerate().map(|(j, x)| first[i.abs_diff(j)] * x).sum()).collect()
     };
-    let (mut solution, mut residual) = (vec![0.0; wanted.len()], wanted.to_vec());
+    let mut solution = vec![0.0; wanted.len()];
+    let mut residual = wanted.to_vec();
     let mut direction = residual.clone();
-    let (mut left, least) = (dot(&residual, &residual), 1e-20 * dot(wanted, wanted));
+    let mut left = dot(&residual, &residual);
+    let least = 1e-20 * dot(wanted, wanted);
     // Exact arithmetic needs as many steps as there are unknowns.
     for _ in 0..8 * wanted.len() {
         if left <= least {

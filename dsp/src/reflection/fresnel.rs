@@ -30,7 +30,8 @@ pub fn first_fresnel_zone(
     frequency_hz: f64,
     speed_of_sound_m_s: f64,
 ) -> FresnelZone {
-    let (from, to) = (speaker[2], microphone[2]);
+    let from = speaker[2];
+    let to = microphone[2];
     let distance = horizontal_mm(microphone, speaker);
     let excess = speed_of_sound_m_s * 1e3 / frequency_hz / 2.0;
     let path = image_mm(microphone, speaker) + excess;

@@ -284,8 +284,10 @@ impl KirchhoffPlan {
             let after = arrival - f32x8::from_i32x8(index);
             // What arrives past the end weighs nothing.
             let heard = arrival.simd_lt(end);
-            let (slopes, levels) = ((weights.derivative & heard).to_array(), (weights.plain & heard).to_array());
-            let (here, after) = ((1.0 - after).to_array(), after.to_array());
+            let slopes = (weights.derivative & heard).to_array();
+            let levels = (weights.plain & heard).to_array();
+            let here = (1.0 - after).to_array();
+            let after = after.to_array();
             let index = index.to_array();
             let from_microphone = weights.from_microphone.fast_trunc_int().to_array();
             let from_speaker = weights.from_speaker.fast_trunc_int().to_array();
@@ -296,7 +298,8 @@ impl KirchhoffPlan {
                 else {
                     continue;
                 };
-                let (here, after) = (here[lane], after[lane]);
+                let here = here[lane];
+                let after = after[lane];
                 *plain += levels[lane] * here;
                 *plain_after += levels[lane] * after;
                 let (a, b) = (
@@ -385,7 +388,8 @@ impl FacetGroup {
 
     #[inline]
     fn facet_weights(&self, [microphone, speaker]: [ViewPoint; 2], scattering: FacetScattering) -> FacetWeights {
-        let (near, far) = (microphone.view_facets(self), speaker.view_facets(self));
+        let near = microphone.view_facets(self);
+        let far = speaker.view_facets(self);
         let [derivative, plain] = match scattering {
             FacetScattering::FacingTangent => facing_tangent(&near, &far),
             FacetScattering::Blended => blended_weights(&near, &far),
@@ -429,7 +433,9 @@ impl ViewPoint {
     fn view_facets(&self, facets: &FacetGroup) -> FacetView {
         let [px, py, pz] = self.position;
         let [x, y, z] = facets.place;
-        let (dx, dy, dz) = (px - x, py - y, pz - z);
+        let dx = px - x;
+        let dy = py - y;
+        let dz = pz - z;
         let [slope_x, slope_y] = facets.slope;
         let distance = (dx * dx + dy * dy + dz * dz).sqrt();
         let nearness = 1.0 / distance;

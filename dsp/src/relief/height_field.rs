@@ -68,8 +68,10 @@ impl HeightField {
     pub fn gradient_at(&self, ix: usize, iy: usize) -> [f32; 2] {
         let last = self.cells - 1;
         let pitch = self.pitch_mm() as f32;
-        let (left, right) = (ix.saturating_sub(1), (ix + 1).min(last));
-        let (below, above) = (iy.saturating_sub(1), (iy + 1).min(last));
+        let left = ix.saturating_sub(1);
+        let right = (ix + 1).min(last);
+        let below = iy.saturating_sub(1);
+        let above = (iy + 1).min(last);
         [
             (self.cell_height(right, iy) - self.cell_height(left, iy)) / (pitch * (right - left) as f32),
             (self.cell_height(ix, above) - self.cell_height(ix, below)) / (pitch * (above - below) as f32),

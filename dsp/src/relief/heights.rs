@@ -27,10 +27,12 @@ pub fn move_heights<T: Copy>(heights: &[T], symmetry: Symmetry, out: &mut [T]) -
     // M is orthogonal, so its transpose leads back; along a row, the place it leads to moves by a fixed step. Doubled
     // coordinates about the centre stay whole numbers.
     let [[a, b], [c, d]] = symmetry.matrix().map(|row| row.map(|x| x as isize));
-    let (width, last) = (side as isize, side as isize - 1);
+    let width = side as isize;
+    let last = side as isize - 1;
     let step = a + b * width;
     for (y, row) in out.chunks_exact_mut(side.max(1)).enumerate() {
-        let (u, v) = (-last, 2 * y as isize - last);
+        let u = -last;
+        let v = 2 * y as isize - last;
         let mut from = (a * u + c * v + last) / 2 + (b * u + d * v + last) / 2 * width;
         for cell in row {
             *cell = heights[from as usize];
@@ -68,7 +70,9 @@ pub fn shade_heights(heights: &[f32], pitch_mm: f32) -> Result<Vec<u8>, Error> {
     let mut pixels = Vec::with_capacity(heights.len());
     for y in (0..side).rev() {
         let row = |y: usize| &heights[y * side..(y + 1) * side];
-        let (below, here, above) = (row(y.saturating_sub(1)), row(y), row((y + 1).min(side - 1)));
+        let below = row(y.saturating_sub(1));
+        let here = row(y);
+        let above = row((y + 1).min(side - 1));
         for x in 0..side {
             // Differences go over two cells.
             let slope = RELIEF / (2.0 * pitch_mm);

@@ -26,10 +26,14 @@ pub fn pearson<T: RealSample>(x: &[T], y: &[T]) -> Result<Option<f64>, Error> {
     check_len("the second signal", y.len(), x.len())?;
     let count = x.len() as f64;
     let mean = |x: &[T]| x.iter().map(|x| x.f64()).sum::<f64>() / count;
-    let (mean_x, mean_y) = (mean(x), mean(y));
-    let (mut xx, mut yy, mut xy) = (0.0, 0.0, 0.0);
+    let mean_x = mean(x);
+    let mean_y = mean(y);
+    let mut xx = 0.0;
+    let mut yy = 0.0;
+    let mut xy = 0.0;
     for (x, y) in x.iter().zip(y) {
-        let (dx, dy) = (x.f64() - mean_x, y.f64() - mean_y);
+        let dx = x.f64() - mean_x;
+        let dy = y.f64() - mean_y;
         xx += dx * dx;
         yy += dy * dy;
         xy += dx * dy;

@@ -83,7 +83,8 @@ impl UnitMeans {
     }
 
     fn train_round(&mut self, components: &PrincipalComponents, winners: &[usize], size: [usize; 2], width: f64) {
-        let (count, units) = (self.count, self.between.len().isqrt());
+        let count = self.count;
+        let units = self.between.len().isqrt();
         // Sums over the rows of each unit: a mean is made of these, as the neighbourhood counts units.
         let mut sums = vec![0.0; units * count];
         let mut members = vec![0.0; units];
@@ -129,7 +130,8 @@ impl UnitMeans {
 
     fn unit_border(&self, unit: usize, [columns, rows]: [usize; 2]) -> f64 {
         let units = columns * rows;
-        let (x, y) = (unit % columns, unit / columns);
+        let x = unit % columns;
+        let y = unit / columns;
         let beside = [(x > 0, unit.wrapping_sub(1)), (x + 1 < columns, unit + 1)];
         let beside = beside.into_iter().chain([(y > 0, unit.wrapping_sub(columns)), (y + 1 < rows, unit + columns)]);
         let at = |a: usize, b: usize| self.between[a * units + b];
@@ -168,7 +170,8 @@ fn first_winners(components: &PrincipalComponents, size: [usize; 2]) -> Vec<usiz
             (share * (size[axis] - 1) as f64).round() as usize
         }
     };
-    let (column, row) = (along(0), along(1));
+    let column = along(0);
+    let row = along(1);
     places.iter().map(|place| row(place) * size[0] + column(place)).collect()
 }
 

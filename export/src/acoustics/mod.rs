@@ -115,7 +115,8 @@ impl SurfaceResponses {
         order.sort_by_key(|row| ids[*row]);
         let mut samples = Vec::with_capacity(ids.len() * length);
         for row in &order {
-            let (from, to) = (lists.value_offsets()[*row] as usize, lists.value_offsets()[row + 1] as usize);
+            let from = lists.value_offsets()[*row] as usize;
+            let to = lists.value_offsets()[row + 1] as usize;
             if to - from != length {
                 return Err(damaged(format!("a response has {} samples, expected {length}", to - from)));
             }

@@ -23,7 +23,8 @@ pub(super) async fn write_npz(
     responses: &SurfaceResponses,
     folder: &PendingFolder,
 ) -> Result<Vec<WrittenFile>> {
-    let (surface, all) = (&responses.run.surface, lake.grid().pairs().len());
+    let surface = &responses.run.surface;
+    let all = lake.grid().pairs().len();
     if responses.pairs.len() != all {
         let reason = format!(
             "it has {} of the rig's {all} pairs, and a matrix has all; hint: export sofa writes what there is",
@@ -122,7 +123,8 @@ fn combinations_csv(lake: &Lake) -> std::result::Result<Vec<u8>, csv::Error> {
     csv.write_record(GIR_COMBINATIONS)?;
     let points = lake.grid().points();
     for pair in lake.grid().pairs() {
-        let (m, s) = (points[pair.microphone.index()], points[pair.speaker.index()]);
+        let m = points[pair.microphone.index()];
+        let s = points[pair.speaker.index()];
         let numbers = [pair.id.0 + 1, m.layer, m.gridx, m.gridy, s.layer, s.gridx, s.gridy];
         csv.write_record(numbers.map(|n| n.to_string()))?;
     }

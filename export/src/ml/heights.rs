@@ -63,7 +63,8 @@ fn arranged_batch(
     let count = batch.num_rows();
     let same = |text: &str| -> ArrayRef { Arc::new(StringArray::from_iter_values(std::iter::repeat_n(text, count))) };
     let lists = batch.column(2).as_list::<i32>();
-    let (from, to) = (lists.value_offsets()[0] as usize, lists.value_offsets()[lists.len()] as usize);
+    let from = lists.value_offsets()[0] as usize;
+    let to = lists.value_offsets()[lists.len()] as usize;
     let heights = fixed_lists(lists.values().slice(from, to - from), schema.field(5).data_type())?;
     let columns = vec![
         same(surface.id.as_str()),

@@ -167,7 +167,8 @@ fn ordered_column(batch: &RecordBatch, field: &FieldRef, order: &UInt32Array) ->
             if let Some(row) = wrong {
                 return Err(format!("`{}` has {} values, expected {length}", field.name(), lists.value_length(row)));
             }
-            let (from, to) = (lists.value_offsets()[0], lists.value_offsets()[lists.len()]);
+            let from = lists.value_offsets()[0];
+            let to = lists.value_offsets()[lists.len()];
             fixed_lists(lists.values().slice(from as usize, (to - from) as usize), list).map_err(|e| e.to_string())
         }
         plain => cast(&taken, plain).map_err(|e| e.to_string()),

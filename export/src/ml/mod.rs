@@ -184,7 +184,8 @@ pub async fn write_training_set(
     let snapshot = lake.whole_snapshot().await?;
     let plan = Plan::new(lake, &snapshot, set).await?;
     let pending = PendingFolder::create(folder)?;
-    let (mut parts, mut files) = (Vec::new(), Vec::new());
+    let mut parts = Vec::new();
+    let mut files = Vec::new();
     for part in SplitPart::ALL {
         if plan.of_part(part).next().is_some() {
             let (written, height_maps) = shard::write_height_maps(lake, &snapshot, &plan, part, &pending).await?;
@@ -204,11 +205,13 @@ pub async fn write_training_set(
         files.push(file);
     }
     files.push(pending.write_file("surfaces.csv", card::sources_csv(&sources)?.as_bytes())?);
-    let (left_out, references) = (plan.left_out.clone(), plan.references.clone());
+    let left_out = plan.left_out.clone();
+    let references = plan.references.clone();
     let mut exported = ExportSummary { parts, left_out, references, waiting: plan.waiting, files };
     let lake_version = snapshot.lake_version().unwrap_or(0);
     let about = card::CardContents { lake, lake_version, plan, exported: &exported };
-    let (croissant, readme) = (croissant::croissant_json(&about)?, card::card_text(&about));
+    let croissant = croissant::croissant_json(&about)?;
+    let readme = card::card_text(&about);
     exported.files.push(pending.write_file("croissant.json", croissant.as_bytes())?);
     exported.files.push(pending.write_file("README.md", readme.as_bytes())?);
     exported.files.sort_by(|a, b| a.name.cmp(&b.name));
@@ -233,7 +236,8 @@ async fn shards_of(
     progress: &mut dyn FnMut(usize, usize),
 ) -> Result<Vec<(WrittenFile, Vec<u64>)>> {
     let surfaces = |of: &Shard| of.surfaces.len();
-    let (mut done, total) = (0, job.plan.shards.iter().map(surfaces).sum());
+    let mut done = 0;
+    let total = job.plan.shards.iter().map(surfaces).sum();
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     let spawn = |at: usize| {
         let job = job.clone();
@@ -242,7 +246,8 @@ async fn shards_of(
     let stop = AtomicBool::new(false);
     let wanted = (0..job.plan.shards.len()).take_while(|_| !stop.load(Ordering::Relaxed));
     let mut running = futures::stream::iter(wanted).map(spawn).buffered(cores);
-    let (mut written, mut failed) = (Vec::new(), None);
+    let mut written = Vec::new();
+    let mut failed = None;
     // After a failure the running tasks are awaited, because they still write into the folder.
     while let Some(ended) = running.next().await {
         match ended.map_err(|e| Error::write(Path::new(&job.plan.shards[written.len()].name), e)).flatten() {

@@ -79,7 +79,8 @@ pub(super) async fn write_height_maps(
 ) -> Result<(Option<WrittenFile>, usize)> {
     let name = format!("heightmaps/{}.parquet", part.name());
     let symmetries = plan.moves.symmetry_names();
-    let (mut writer, mut count) = (None, 0);
+    let mut writer = None;
+    let mut count = 0;
     for surface in plan.of_part(part) {
         let Some(batch) = heights::read_height_maps(lake, snapshot, surface, part, &symmetries).await? else {
             continue;

@@ -115,7 +115,8 @@ fn draw_parts(surfaces: &[TrainingSurface], split: SplitParams) -> Result<BTreeM
         let reason = format!("shares of {} and {} do not leave anything to train with", split.test, split.validation);
         return Err(Error::Split { by: split.by.name(), reason });
     }
-    let (total, categories) = (counts.values().sum::<usize>(), counts.len());
+    let total = counts.values().sum::<usize>();
+    let categories = counts.len();
     let wanted = [(SplitPart::Test, split.test), (SplitPart::Validation, split.validation)];
     let needed = 1 + wanted.iter().filter(|(_, share)| *share > 0.0).count();
     if categories < needed {

@@ -38,7 +38,8 @@ pub(super) async fn read_surfaces(lake: &Lake, snapshot: &LakeSnapshot) -> Resul
         for column in ["flat_reference", "foam_reference"] {
             references.extend(rows::text_column(&batch, column).into_iter().map(str::to_owned));
         }
-        let (typologies, origins) = (rows::text_column(&batch, "typology"), rows::text_column(&batch, "origin"));
+        let typologies = rows::text_column(&batch, "typology");
+        let origins = rows::text_column(&batch, "origin");
         let macrostructures = rows::optional_texts(&batch, "macrostructure");
         for (row, id) in rows::text_column(&batch, "surface_id").into_iter().enumerate() {
             let surface = TrainingSurface {

@@ -170,7 +170,8 @@ impl Lane {
     }
 
     fn sort_in(&mut self, message: Message, wanted: &Wanted) {
-        let (topic, time) = (message.channel.topic.as_str(), message.log_time);
+        let topic = message.channel.topic.as_str();
+        let time = message.log_time;
         let key = if self.keyed { key_of(topic, &message.data) } else { wanted.times.get(&time).copied() };
         if let Some(key) = key {
             let verdict = (topic == topics::MEASUREMENT).then_some(time);

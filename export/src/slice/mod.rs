@@ -74,7 +74,8 @@ impl Taken {
         }
         let number = |column: &str, value: i32| u32::try_from(value).map_err(|_| negative(column, value.into()));
         let row = |(row, run): (usize, Option<&str>)| {
-            let (pair, attempt) = (number(pair, pairs[row])?, number(attempt, attempts[row])?);
+            let pair = number(pair, pairs[row])?;
+            let attempt = number(attempt, attempts[row])?;
             Ok(Self { run: run.unwrap_or_default().parse()?, pair, attempt, log_time_ns: times[row] })
         };
         runs.as_string::<i32>().iter().enumerate().map(row).collect()
@@ -142,7 +143,8 @@ pub(crate) struct OpenedRun(Groups);
 
 impl OpenedRun {
     pub async fn next(&mut self) -> Result<Option<Measured>> {
-        let (run, file) = (self.run().clone(), self.file().to_owned());
+        let run = self.run().clone();
+        let file = self.file().to_owned();
         Ok(self.0.next().await?.map(|messages| Measured { run, file, messages }))
     }
 
@@ -250,8 +252,10 @@ impl Slice {
     /// [`Error::Changed`] for a file that is not the ingested one.
     pub async fn open(lake: &Lake, snapshot: &LakeSnapshot, params: SliceParams) -> Result<Self> {
         let SliceParams { taken, topics, layout, check } = params;
-        let (runs, mut known) = (run_files(lake, snapshot, taken).await?, BTreeSet::new());
-        let (mut first, lead) = (None, runs[0].0.run.clone());
+        let runs = run_files(lake, snapshot, taken).await?;
+        let mut known = BTreeSet::new();
+        let mut first = None;
+        let lead = runs[0].0.run.clone();
         for (file, _) in &runs {
             let source = Source::open(lake.store(), file.clone(), check).await?;
             known.extend(source.channels.values().map(|c| c.topic.clone()));

@@ -73,7 +73,8 @@ impl Outline {
                     data: s.data.to_vec(),
                 })
             });
-            let (name, message_encoding) = (channel.topic.clone(), channel.message_encoding.clone());
+            let name = channel.topic.clone();
+            let message_encoding = channel.message_encoding.clone();
             let topic = OutlineTopic { name, message_encoding, schema };
             if !self.topics.contains(&topic) {
                 self.topics.push(topic);

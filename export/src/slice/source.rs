@@ -66,7 +66,8 @@ impl RunFile {
             return Err(Error::Unknown { kind: "run", name: run.to_string(), known: "those of table runs".into() });
         };
         let number = |column| rows::number_column::<Int64Type>(&row, column).map(|n| u64::try_from(n[0]).unwrap_or(0));
-        let (bytes, started_ns) = (number("file_bytes")?, number("started_ns")?);
+        let bytes = number("file_bytes")?;
+        let started_ns = number("started_ns")?;
         let surface = text("surface_id").unwrap_or_default().parse()?;
         Ok(Self { run: run.clone(), surface, path: Path::from(path), bytes, sha256, started_ns })
     }

@@ -186,7 +186,8 @@ pub(crate) fn sized_label(
 
 /// Text that runs upwards, its middle at a point.
 pub(crate) fn upward_label(at: [f32; 2], text: impl Into<String>) -> DrawnShape {
-    let (text, anchor) = (text.into(), TextAnchor::Middle);
+    let text = text.into();
+    let anchor = TextAnchor::Middle;
     plain_shape(
         ShapeGeometry::Text { at, text, size_px: TEXT_PX, anchor, upwards: true },
         Some(FigureColour::Ink),

@@ -60,7 +60,8 @@ async fn with_inbox(runs: &[(String, Bytes)]) -> Arc<InMemory> {
 }
 
 async fn ingest_pending(store: Arc<dyn ObjectStore>) -> crate::Result<Vec<FileReport>> {
-    let (lake, mut reports) = (open_lake(store).await?, Vec::new());
+    let lake = open_lake(store).await?;
+    let mut reports = Vec::new();
     let ingest = LakeIngest::new(&lake, Arc::default());
     ingest.ingest_runs(pending_runs(&lake).await?, &mut |report| reports.push(report)).await?;
     ingest.complete_runs(&mut |_, _| {}).await?;
@@ -71,7 +72,8 @@ async fn ingest_pending(store: Arc<dyn ObjectStore>) -> crate::Result<Vec<FileRe
 async fn read_tables(store: Arc<InMemory>) -> (BTreeMap<String, Bytes>, Vec<String>) {
     let lake = open_lake(store.clone()).await.expect("a lake");
     let snapshot = lake.snapshot().await.expect("a view");
-    let (mut seen, mut logged) = (BTreeMap::new(), Vec::new());
+    let mut seen = BTreeMap::new();
+    let mut logged = Vec::new();
     for table in Table::ALL {
         for file in snapshot.files(table) {
             let bytes = store.get(&file.path).await.expect("there").bytes().await.expect("bytes");
@@ -86,7 +88,8 @@ async fn read_tables(store: Arc<InMemory>) -> (BTreeMap<String, Bytes>, Vec<Stri
 
 /// Merges all files that can be, and deletes what nothing names any more.
 async fn tidy_lake(store: Arc<dyn ObjectStore>) -> echolake_lake::Result<()> {
-    let (lake, stop) = (open_lake(store).await?, AtomicBool::new(false));
+    let lake = open_lake(store).await?;
+    let stop = AtomicBool::new(false);
     lake.optimize(1 << 30, &stop, &mut |_| {}).await?;
     lake.vacuum(TimeDelta::zero(), DeletionMode::Real, &mut |_, _| {}).await?;
     Ok(())
@@ -153,7 +156,8 @@ async fn a_new_reference_run_rewrites_its_dependants_and_nothing_else() {
         let of = |files: &BTreeMap<String, Bytes>| {
             files.keys().filter(|k| k.starts_with(&format!("tables/{table}/"))).cloned().collect::<Vec<_>>()
         };
-        let (before, after) = (of(&before), of(&after));
+        let before = of(&before);
+        let after = of(&after);
         (before.iter().filter(|f| after.contains(f)).count(), before.len(), after.len())
     };
     // All derived rows used Flat; no other row did.
@@ -203,7 +207,8 @@ async fn refused_files_go_to_quarantine_with_the_reason_and_the_rest_goes_on() {
 async fn a_file_that_is_gone_when_it_is_read_does_not_end_the_batch() {
     let runs = simulate_runs(&["flat", "foam", "wood"]);
     let store = with_inbox(&runs).await;
-    let (lake, mut reports) = (open_lake(store.clone()).await.expect("a lake"), Vec::new());
+    let lake = open_lake(store.clone()).await.expect("a lake");
+    let mut reports = Vec::new();
     let sources = pending_runs(&lake).await.expect("listed");
     store.delete(&Path::from(format!("inbox/{}", runs[1].0))).await.expect("deleted");
     let ingest = LakeIngest::new(&lake, Arc::default());
@@ -417,7 +422,8 @@ mod slow {
             let listed: Vec<_> = store.list(Some(&Path::from("tables"))).try_collect().await.expect("listed");
             listed.iter().filter(|f| f.location.extension() == Some("parquet")).count()
         };
-        let (expected, kept) = (read_tables(undisturbed.clone()).await, files(undisturbed).await);
+        let expected = read_tables(undisturbed.clone()).await;
+        let kept = files(undisturbed).await;
         assert!(kept < files(start.clone()).await, "files are merged");
         let deaths = each_death(&start, tidy_lake, async |inner, death| {
             assert!(read_rows(inner.clone()).await == before, "{death}: other rows");
@@ -450,7 +456,8 @@ mod slow {
             let store = with_inbox(&runs).await;
             let done = Arc::new(AtomicBool::new(false));
             let clean_up = tokio::spawn({
-                let (store, done) = (skewed_store(&store, third, None), done.clone());
+                let store = skewed_store(&store, third, None);
+                let done = done.clone();
                 async move {
                     let lake = open_lake(store).await.expect("opened");
                     while !done.load(Ordering::SeqCst) {
@@ -459,8 +466,10 @@ mod slow {
                     }
                 }
             });
-            let (a, b) = (ingest_pending(skewed_store(&store, a, None)), ingest_pending(skewed_store(&store, b, None)));
-            let (a, b) = (tokio::spawn(a), tokio::spawn(b));
+            let a = ingest_pending(skewed_store(&store, a, None));
+            let b = ingest_pending(skewed_store(&store, b, None));
+            let a = tokio::spawn(a);
+            let b = tokio::spawn(b);
             a.await.expect("no panic").expect("ingested");
             b.await.expect("no panic").expect("ingested");
             // Each completes what it saw; the last one to end has seen everything.
@@ -485,12 +494,14 @@ mod slow {
         let never = ClaimTimes { renew_every: Duration::from_secs(3600), ..IMPATIENT };
         let dead = WorkClaims::start(&lake, never);
         assert_eq!(dead.claim_work(&runs[2].0).await, ClaimOutcome::Granted);
-        let (from, to) = (format!("inbox/{}", runs[2].0), format!("runs/wood/{}", runs[2].0));
+        let from = format!("inbox/{}", runs[2].0);
+        let to = format!("runs/wood/{}", runs[2].0);
         store.rename(&Path::from(from), &Path::from(to)).await.expect("moved");
         let alive = WorkClaims::start(&lake, IMPATIENT);
         assert_eq!(alive.claim_work(&runs[3].0).await, ClaimOutcome::Granted);
         let work = async || {
-            let (mut taken, mut claimed) = (Vec::new(), 0);
+            let mut taken = Vec::new();
+            let mut claimed = 0;
             let sources = pending_runs(&lake).await.expect("listed");
             let ingest = LakeIngest::new(&lake, Arc::default()).with_claims(IMPATIENT);
             let report = &mut |report: FileReport| match report {
@@ -558,7 +569,8 @@ mod slow {
         ingest_pending(store.clone()).await.expect("ingested");
         let done = Arc::new(AtomicBool::new(false));
         let upkeep = tokio::spawn({
-            let (store, done) = (store.clone(), done.clone());
+            let store = store.clone();
+            let done = done.clone();
             async move {
                 let mut rounds = 0;
                 while !done.load(Ordering::SeqCst) {
@@ -632,7 +644,8 @@ async fn another_file_in_a_runs_place_is_not_taken_for_it_though_it_is_as_long()
     other[middle] ^= 1;
     let place = Path::from(format!("runs/flat/{name}"));
     store.put(&place, other.clone().into()).await.expect("written");
-    let (lake, mut reports) = (open_lake(store.clone()).await.expect("a lake"), Vec::new());
+    let lake = open_lake(store.clone()).await.expect("a lake");
+    let mut reports = Vec::new();
     let source = RunSource::Lake(Path::from(format!("inbox/{name}")));
     LakeIngest::new(&lake, Arc::default()).ingest_runs(vec![source], &mut |r| reports.push(r)).await.expect("ingested");
     let [FileReport::Refused { why, moved: Some(moved), .. }] = reports.as_slice() else { panic!("{reports:?}") };

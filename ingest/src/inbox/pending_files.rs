@@ -189,7 +189,8 @@ pub async fn rig_of_run(file: &FsPath) -> Result<Option<Rig>> {
     if !file.is_file() {
         return Err(Error::NoRun { given: file.display().to_string() });
     }
-    let (path, name) = (absolute_path(file)?, file.display().to_string());
+    let path = absolute_path(file)?;
+    let name = file.display().to_string();
     let opened = OpenedRun { store: Arc::new(LocalFileSystem::new()), path, name };
     Ok(RunHead::read_from(&opened).await.and_then(|head| head.rig))
 }

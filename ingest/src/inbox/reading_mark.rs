@@ -112,7 +112,8 @@ impl SuspectFile {
         if self.endings.len() < MOST_DEATHS {
             return Ok(None);
         }
-        let (file, mark) = (self.source.to_string(), self.mark.display().to_string());
+        let file = self.source.to_string();
+        let mark = self.mark.display().to_string();
         let why = Error::Deadly { file, endings: self.endings.join(", "), mark };
         let moved = quarantine_file(lake, &self.source, &why).await?;
         // The file of an ingested run is not moved, and its mark stays.

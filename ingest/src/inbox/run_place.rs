@@ -232,7 +232,8 @@ pub(crate) async fn delete_run(lake: &Lake, path: &Path) -> Result<()> {
 
 // `check` is called when everything is copied, before the copy has the run's name.
 async fn copy_in(lake: &Lake, from: &FsPath, to: &Path, check: &mut (dyn FnMut() -> Result<()> + Send)) -> Result<()> {
-    let (store, source) = (lake.store(), LocalFileSystem::new());
+    let store = lake.store();
+    let source = LocalFileSystem::new();
     let failed = |e: object_store::Error| write_error(to, e);
     let path = absolute_path(from)?;
     let size = source.head(&path).await.map_err(|e| Error::read_failure(from.display(), e))?.size;

@@ -52,15 +52,18 @@ impl RunDefinitions {
             self.learn_definition(&record);
             match &record {
                 Record::Schema { header, .. } => {
-                    let (known, now) = (self.schemas.get(&header.id), kept_name(&header.name));
+                    let known = self.schemas.get(&header.id);
+                    let now = kept_name(&header.name);
                     if let Some(known) = known.filter(|known| **known != now) {
                         return Err(format!("schema {} is used again: it is `{known}`, and now `{now}`", header.id));
                     }
                 }
                 Record::Channel(channel) => {
-                    let (known, now) = (self.channels.get(&channel.id), self.describe_channel(channel));
+                    let known = self.channels.get(&channel.id);
+                    let now = self.describe_channel(channel);
                     if let Some(known) = known.filter(|known| **known != now) {
-                        let (topics, schemas) = ([&known.topic, &now.topic], [&known.schema, &now.schema]);
+                        let topics = [&known.topic, &now.topic];
+                        let schemas = [&known.schema, &now.schema];
                         return Err(format!(
                             "channel {} is used again: it is `{}` of `{}`, and now `{}` of `{}`",
                             channel.id, topics[0], schemas[0], topics[1], schemas[1]

@@ -65,7 +65,8 @@ impl RunContent {
                         envelope.checked_manifest(lake, name)?;
                         checked = true;
                     }
-                    let (begin, length) = (raw.offset, raw.body.len() as u64);
+                    let begin = raw.offset;
+                    let length = raw.body.len() as u64;
                     match budget.take_chunk().and_then(|()| decode_chunk(&raw)) {
                         Ok((offset, chunk)) if !seen.insert(chunk.identity()) => {
                             list_damage(&mut whole.damaged, || {
@@ -81,8 +82,10 @@ impl RunContent {
                                 waiting.push((offset, length));
                                 continue;
                             }
-                            let (measurer, channels) = (measurer.clone(), definitions.channels.clone());
-                            let (budget, permit) = (budget.clone(), raw.permit);
+                            let measurer = measurer.clone();
+                            let channels = definitions.channels.clone();
+                            let budget = budget.clone();
+                            let permit = raw.permit;
                             let work = move || {
                                 let measured = measurer.process_chunk(offset, &chunk, &channels, &budget);
                                 drop((chunk, permit));
@@ -118,7 +121,9 @@ impl RunContent {
         for (offset, length) in waiting {
             let raw = reader.reread_chunk(offset, length).await?;
             let (offset, chunk) = decode_chunk(&raw).map_err(|e| Error::read_failure(name, e))?;
-            let (measurer, channels, budget) = (measurer.clone(), definitions.channels.clone(), budget.clone());
+            let measurer = measurer.clone();
+            let channels = definitions.channels.clone();
+            let budget = budget.clone();
             whole.append(
                 cores.compute_on_core(move || measurer.process_chunk(offset, &chunk, &channels, &budget)).await,
             );

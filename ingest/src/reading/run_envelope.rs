@@ -40,7 +40,8 @@ pub(crate) struct RunHead {
 impl RunHead {
     /// Reads them; None if the file does not begin as a run.
     pub async fn read_from(opened: &OpenedRun) -> Option<Self> {
-        let (store, path) = (opened.store.clone(), opened.path.clone());
+        let store = opened.store.clone();
+        let path = opened.path.clone();
         let mut reader = ResyncReader::open(store, path, opened.name.clone()).await.ok()?.without_digest();
         let mut envelope = RunEnvelope::default();
         while let Ok(Some(item)) = reader.next_item().await {

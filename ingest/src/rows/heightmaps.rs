@@ -50,7 +50,8 @@ fn area_mean(heights: &[f32], side: usize) -> Vec<f32> {
 fn cell_weights(side: usize) -> Vec<(usize, Vec<f64>)> {
     let scale = side as f64 / CELLS as f64;
     let weights = |cell: usize| {
-        let (from, to) = (cell as f64 * scale, (cell + 1) as f64 * scale);
+        let from = cell as f64 * scale;
+        let to = (cell + 1) as f64 * scale;
         let first = from.floor() as usize;
         let last = (to.ceil() as usize).min(side);
         let share = |i: usize| ((to.min((i + 1) as f64) - from.max(i as f64)) / scale).max(0.0);

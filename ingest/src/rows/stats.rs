@@ -99,7 +99,9 @@ fn p90_mean_uncertainty(values: &[f64], errors: &[ErrorMoments]) -> Option<f64> 
     let mut sorted: Vec<f64> = values.iter().copied().filter(|x| x.is_finite()).collect();
     sorted.sort_by(f64::total_cmp);
     let limit = percentile(&sorted, 90.0);
-    let (mut sum, mut common, mut variance) = (0.0, 0.0, 0.0);
+    let mut sum = 0.0;
+    let mut common = 0.0;
+    let mut variance = 0.0;
     for (value, error) in values.iter().zip(errors).filter(|(value, _)| **value > 0.0 && **value <= limit) {
         sum += value;
         common += value * error.mean;

@@ -81,9 +81,11 @@ impl ScalarKernel for ListMultiplyFunction {
     }
 
     fn compute_answers<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
-        let (x, y) = (arguments.sample_lists::<T>(0)?, arguments.sample_lists::<T>(1)?);
+        let x = arguments.sample_lists::<T>(0)?;
+        let y = arguments.sample_lists::<T>(1)?;
         build_lists::<T>(arguments, x.sample_capacity(arguments.row_count()), |row, out| {
-            let (x, y) = (x.samples_at(row)?, y.samples_at(row)?);
+            let x = x.samples_at(row)?;
+            let y = y.samples_at(row)?;
             multiply_samples(x, y, append_defaults(out, x.len())).map_err(|e| arguments.refused_row(row, &e))?;
             Ok(true)
         })

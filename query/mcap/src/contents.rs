@@ -102,7 +102,8 @@ async fn channel_sizes(file: &McapFile, files: &McapFiles) -> Result<Option<Hash
         return Ok(None);
     }
     let read = |piece: &Piece| {
-        let (range, plain) = (piece.range.end..piece.range.end + piece.index, piece.plain);
+        let range = piece.range.end..piece.range.end + piece.index;
+        let plain = piece.plain;
         async move { Ok::<_, Fault>((files.read_range(&file.path, range).await?, plain)) }
     };
     let reads: Vec<_> = file.pieces.iter().map(read).collect();

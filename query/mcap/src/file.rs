@@ -226,7 +226,8 @@ impl Opening<'_> {
 
     // The summary accounts for all messages; None if it has them where they cannot be.
     fn indexed_file(&self, summary: RunSummary, start: u64) -> Option<McapFile> {
-        let (indexes, statistics) = (summary.chunk_indexes, summary.statistics?);
+        let indexes = summary.chunk_indexes;
+        let statistics = summary.statistics?;
         let pieces = indexes.into_iter().map(|index| {
             let end = index.chunk_start_offset.checked_add(index.chunk_length).filter(|end| *end <= start)?;
             let channels = index.message_index_offsets.keys().copied().collect::<Box<[_]>>();
@@ -256,7 +257,8 @@ impl Opening<'_> {
             Some(Attachment { name: index.name, media_type: index.media_type, bytes: index.data_size, range })
         });
         let attachments = attachments.collect();
-        let (path, digests) = (self.path.clone(), summary.digests);
+        let path = self.path.clone();
+        let digests = summary.digests;
         Some(McapFile { path, bytes: self.bytes, walked: None, channels, digests, pieces, attachments })
     }
 
@@ -325,7 +327,9 @@ impl Opening<'_> {
         }
         let attachments = std::mem::take(&mut walk.attachments);
         let (channels, pieces) = walk.finish().map_err(|(offset, what)| self.damaged_at(offset, what))?;
-        let (path, walked, digests) = (self.path.clone(), Some(reason), DefinitionDigests::default());
+        let path = self.path.clone();
+        let walked = Some(reason);
+        let digests = DefinitionDigests::default();
         Ok(McapFile { path, bytes: self.bytes, walked, channels, digests, pieces, attachments })
     }
 }
@@ -383,7 +387,8 @@ impl Walk {
                 self.open = false;
                 if let Ok(Record::Attachment { header, data, .. }) = parse_record(record.code, &record.body) {
                     let bytes = data.len() as u64;
-                    let (name, media_type) = (header.name, header.media_type);
+                    let name = header.name;
+                    let media_type = header.media_type;
                     self.attachments.push(Attachment { name, media_type, bytes, range });
                 }
                 Ok(())

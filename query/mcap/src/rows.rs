@@ -110,7 +110,8 @@ enum Output {
 impl Rows {
     /// Rows with some of the columns of a table that begins with `heads`.
     pub fn new(schema: SchemaRef, heads: &[Head], projection: &[usize], most: usize) -> Self {
-        let (mut output, mut wanted) = (Vec::new(), Vec::new());
+        let mut output = Vec::new();
+        let mut wanted = Vec::new();
         for place in projection {
             match heads.get(*place) {
                 Some(head) => {

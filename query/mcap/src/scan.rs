@@ -151,7 +151,8 @@ impl DisplayAs for McapExec {
     fn fmt_as(&self, _: DisplayFormatType, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let chosen: usize = self.partitions.iter().flatten().map(|read| read.pieces.len()).sum();
         let bytes: u64 = self.partitions.iter().flatten().map(|read| read.range.end - read.range.start).sum();
-        let (parts, fields) = (&self.scan.parts, self.scan.schema.fields());
+        let parts = &self.scan.parts;
+        let fields = self.scan.schema.fields();
         let columns: Vec<_> = fields.iter().map(|f| f.name().as_str()).collect();
         write!(f, "McapExec: {}, files={}, chunks={chosen} of {}", parts.name, parts.sources.len(), self.all)?;
         write!(f, ", bytes={bytes}, columns=[{}]", columns.join(", "))?;
@@ -229,7 +230,8 @@ fn fetch_reads(
     bytes_read: Count,
 ) -> BoxStream<'static, Result<(FileRead, Bytes), Fault>> {
     let one = move |read: FileRead| {
-        let (parts, bytes_read) = (parts.clone(), bytes_read.clone());
+        let parts = parts.clone();
+        let bytes_read = bytes_read.clone();
         async move {
             let bytes = parts.files.read_range(&parts.sources[read.source].file.path, read.range.clone()).await?;
             bytes_read.add(bytes.len());
@@ -297,7 +299,8 @@ impl Scanner {
             let Some(fetched) = &mut self.fetched else {
                 match self.reads.try_next().await? {
                     Some((read, bytes)) => {
-                        let (source, start) = (read.source, read.range.start);
+                        let source = read.source;
+                        let start = read.range.start;
                         self.fetched = Some(Fetched { source, start, bytes, pieces: read.pieces.into() });
                     }
                     None => return Ok(false),
@@ -309,7 +312,8 @@ impl Scanner {
                 continue;
             };
             // Between chunks others have their turn, and a query that is dropped ends.
-            let (source, offset) = (fetched.source, piece.range.start);
+            let source = fetched.source;
+            let offset = piece.range.start;
             let bytes =
                 fetched.bytes.slice((offset - fetched.start) as usize..(piece.range.end - fetched.start) as usize);
             let path = &self.scan.parts.sources[source].file.path;

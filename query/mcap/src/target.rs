@@ -97,7 +97,8 @@ fn parse_path(text: &str) -> Result<Path, Fault> {
 /// Whether a text is of a pattern in which `*` stands for anything and `?` for one character.
 fn matches_pattern(pattern: &str, text: &str) -> bool {
     let (pattern, text): (Vec<_>, Vec<_>) = (pattern.chars().collect(), text.chars().collect());
-    let (mut p, mut t) = (0, 0);
+    let mut p = 0;
+    let mut t = 0;
     // The last star, and where what it stands for ends: one character more each time the rest does not fit.
     let mut star: Option<(usize, usize)> = None;
     while t < text.len() {

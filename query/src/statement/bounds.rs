@@ -190,7 +190,8 @@ fn is_string(token: &Token) -> bool {
 
 /// Returns the maximum nesting of brackets in a literal.
 fn nesting_depth(token: &Token) -> usize {
-    let (mut now, mut most) = (0usize, 0);
+    let mut now = 0usize;
+    let mut most = 0;
     for byte in literal_text(token).unwrap_or_default().bytes() {
         match byte {
             b'(' | b'[' | b'<' => now += 1,

@@ -35,7 +35,8 @@ pub(crate) fn append_predicate(
     // The line breaks keep a comment in the predicate from reaching further.
     let query = |predicate: &str| format!("{select} (\n{predicate}\n)");
     let given = query(predicate);
-    let (mut asked, mut ours) = (parse(&given)?, parse(&query("true"))?);
+    let mut asked = parse(&given)?;
+    let mut ours = parse(&query("true"))?;
     match (take_predicate(&mut asked), take_predicate(&mut ours)) {
         (Some(inner), Some(_)) if asked == ours => {
             if form == PredicateForm::Comparisons {

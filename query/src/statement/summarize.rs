@@ -102,7 +102,8 @@ fn summary_text(schema: &Schema) -> String {
         ("q75", "double[]"),
         ("nulls", "bigint[]"),
     ];
-    let (mut outer, mut inner) = (String::new(), String::new());
+    let mut outer = String::new();
+    let mut inner = String::new();
     for ((name, list), values) in NAMES.into_iter().zip(columns) {
         let _ = write!(outer, "unnest(\"{name}\") as \"{name}\", ");
         let _ = write!(inner, "cast([{}] as {list}) as \"{name}\", ", values.join(", "));

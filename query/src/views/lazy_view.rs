@@ -31,7 +31,8 @@ impl LazyView {
         lookups: &LookupFunctions,
         tables: HashMap<Table, Arc<dyn TableProvider>>,
     ) -> Self {
-        let (lake, lookups) = (lake.clone(), lookups.clone());
+        let lake = lake.clone();
+        let lookups = lookups.clone();
         Self(LazyLock::new(Box::new(move || view.plan_over(&lake, &lookups, &tables))))
     }
 

@@ -31,7 +31,8 @@ impl PairJoin {
     // Returns the same rows without the join; None if the join is needed.
     fn without_join(&self, join: &Join) -> Option<Result<LogicalPlan>> {
         let [(left, right)] = join.on.as_slice() else { return None };
-        let (left, right) = (left.try_as_col()?, right.try_as_col()?);
+        let left = left.try_as_col()?;
+        let right = right.try_as_col()?;
         if join.filter.is_some() {
             return None;
         }

@@ -18,7 +18,8 @@ struct LevelColumn {
 
 impl LevelColumn {
     fn new(energy: String, unit: &'static str, energy_of: &str) -> Self {
-        let (name, comment) = (format!("{energy}_db"), format!("Level of the energy {energy_of}"));
+        let name = format!("{energy}_db");
+        let comment = format!("Level of the energy {energy_of}");
         Self { energy, name, unit, comment }
     }
 }

@@ -60,9 +60,14 @@ impl PartitionStream for VisibleRows {
     }
 
     fn execute(&self, _: Arc<TaskContext>) -> SendableRecordBatchStream {
-        let (lake, table, file, schema) = (self.lake.clone(), self.table, self.file.clone(), self.schema.clone());
+        let lake = self.lake.clone();
+        let table = self.table;
+        let file = self.file.clone();
+        let schema = self.schema.clone();
         let rows = futures::stream::iter(file.visible_ranges()).then(move |range| {
-            let (lake, file, schema) = (lake.clone(), file.clone(), schema.clone());
+            let lake = lake.clone();
+            let file = file.clone();
+            let schema = schema.clone();
             async move {
                 let names: Vec<_> = schema.fields().iter().map(|field| field.name().as_str()).collect();
                 let columns = if names.is_empty() { vec![RUN] } else { names };

@@ -45,7 +45,8 @@ impl ScramVerifier {
     /// verifier is, and nobody computes it without the secret.
     pub(crate) fn unpassable(name: &str, secret: &[u8]) -> Self {
         let of = |purpose: &[u8]| hmac_sign(&hmac_sign(secret, purpose), name.as_bytes());
-        let (salt, stored_key) = (of(b"salt")[..SALT_BYTES].to_vec(), of(b"stored key"));
+        let salt = of(b"salt")[..SALT_BYTES].to_vec();
+        let stored_key = of(b"stored key");
         Self { iterations: ITERATIONS, salt, stored_key, server_key: of(b"server key") }
     }
 

@@ -75,7 +75,8 @@ impl LakeFlightService {
     }
 
     async fn prepare_sql(&self, session: &Arc<Session>, sql: &Arc<str>) -> Result<Arc<PreparedQuery>, Status> {
-        let (planner, sql) = (session.clone(), sql.clone());
+        let planner = session.clone();
+        let sql = sql.clone();
         let planned = self.service.plan_query(session.client(), async move { Ok(planner.prepare(&sql).await?) }).await;
         Ok(Arc::new(planned.map_err(|f| grpc_status(&f))?))
     }

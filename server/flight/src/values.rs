@@ -54,7 +54,8 @@ pub(super) async fn read_values(
     let Some(row) = row else { return Ok(ParamValues::from(Vec::<ScalarValue>::new())) };
     let kinds = prepared.parameter_types()?;
     if row.num_columns() != kinds.len() {
-        let (given, wanted) = (row.num_columns(), kinds.len());
+        let given = row.num_columns();
+        let wanted = kinds.len();
         return Err(RequestFault::bad_request(format!("{given} values for {wanted} placeholders")));
     }
     let values = row.columns().iter().zip(kinds).enumerate().map(|(i, (column, kind))| {

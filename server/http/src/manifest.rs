@@ -125,7 +125,8 @@ impl RowsElsewhere {
 
 impl ManifestFile {
     fn from_data_file(origin: &str, table: Table, file: &DataFile) -> Option<Self> {
-        let (name, rows) = (file.path.filename()?, file.visible_rows());
+        let name = file.path.filename()?;
+        let rows = file.visible_rows();
         Some(Self {
             table: table.name(),
             url: format!("{origin}/api/v1/tables/{}/{name}", table.name()),

@@ -93,7 +93,8 @@ impl FileDescription {
     pub fn part_response(&self, part: &FilePart, body: Body) -> Response {
         let status = if part.of.is_some() { StatusCode::PARTIAL_CONTENT } else { StatusCode::OK };
         let mut response = self.with_headers((status, body).into_response());
-        let (out, range) = (response.headers_mut(), &part.range);
+        let out = response.headers_mut();
+        let range = &part.range;
         out.insert(header::CONTENT_LENGTH, (range.end - range.start).into());
         if let Some(bytes) = part.of {
             insert_header(out, header::CONTENT_RANGE, &format!("bytes {}-{}/{bytes}", range.start, range.end - 1));

@@ -143,7 +143,8 @@ impl PostgresConnection {
             if sql.len() > LARGEST {
                 return Err(RequestFault::TooLarge { limit: LARGEST });
             }
-            let (shared, session) = (self.shared.clone(), self.session()?.clone());
+            let shared = self.shared.clone();
+            let session = self.session()?.clone();
             let sql: Arc<str> = sql.into();
             let work = async move {
                 let mut statements = Vec::new();
@@ -179,7 +180,8 @@ impl PostgresConnection {
         encode: impl FnOnce(&arrow::datatypes::SchemaRef) -> Result<E, RequestFault> + Send + 'static,
     ) -> Result<RunningQuery<E::Item>, RequestFault> {
         let session = self.session()?.clone();
-        let (planner, known) = (session.clone(), planned.clone());
+        let planner = session.clone();
+        let known = planned.clone();
         let prepared = self.plan_within(run, async move { Ok(known.current_plan(&planner).await?) }).await?;
         if prepared.schema() != planned.prepared.schema() {
             return Err(RequestFault::unsupported("a prepared statement whose columns have changed since"));

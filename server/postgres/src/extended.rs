@@ -1,7 +1,7 @@
 //! The extended query protocol: parse, bind, describe, execute, with values and in parts.
 
 use std::fmt::Debug;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError, Weak};
 
 use arrow::datatypes::DataType;
 use arrow_pg::datatypes::df::deserialize_parameters;
@@ -27,7 +27,10 @@ use super::connection::PostgresConnection;
 use super::names::OID;
 use super::rows::column_fields;
 use super::sqlstate::failure;
-use super::statement::ClientStatement;
+use super::statement::{ClientStatement, PlannedQuery};
+
+/// Prepared statements of a connection at once.
+const PREPARED: usize = 500;
 
 /// Answers extended queries.
 pub(super) struct ExtendedQueries {
@@ -37,12 +40,30 @@ pub(super) struct ExtendedQueries {
 
 impl ExtendedQueries {
     pub fn new(connection: Arc<PostgresConnection>) -> Self {
-        Self { parser: Arc::new(StatementPlanner(connection.clone())), connection }
+        Self {
+            parser: Arc::new(StatementPlanner { connection: connection.clone(), kept: Mutex::default() }),
+            connection,
+        }
     }
 }
 
-/// Plans parsed statements.
-pub(super) struct StatementPlanner(Arc<PostgresConnection>);
+/// Plans statements that a client prepares, and counts those that it keeps.
+pub(super) struct StatementPlanner {
+    connection: Arc<PostgresConnection>,
+    kept: Mutex<Vec<Weak<PlannedQuery>>>,
+}
+
+impl StatementPlanner {
+    fn keep_query(&self, planned: &Arc<PlannedQuery>) -> Result<(), RequestFault> {
+        let mut kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
+        kept.retain(|query| query.strong_count() > 0);
+        if kept.len() >= PREPARED {
+            return Err(RequestFault::TooMany { what: "prepared statements", limit: PREPARED });
+        }
+        kept.push(Arc::downgrade(planned));
+        Ok(())
+    }
+}
 
 #[async_trait]
 impl QueryParser for StatementPlanner {
@@ -52,8 +73,13 @@ impl QueryParser for StatementPlanner {
     where
         C: ClientInfo + Unpin + Send + Sync,
     {
-        let run = self.0.begin_command();
-        let mut statements = self.0.plan_statements(sql, &run).await.map_err(failure)?;
+        let run = self.connection.begin_command();
+        let mut statements = self.connection.plan_statements(sql, &run).await.map_err(failure)?;
+        if let [statement] = &statements[..]
+            && let Some(planned) = planned_query(statement)
+        {
+            self.keep_query(planned).map_err(failure)?;
+        }
         match statements.len() {
             0 | 1 => Ok(statements.pop()),
             _ => Err(failure(RequestFault::bad_request("cannot insert multiple commands into a prepared statement"))),
@@ -72,17 +98,21 @@ impl QueryParser for StatementPlanner {
 
     fn get_result_schema(&self, statement: &ClientStatement, format: Option<&Format>) -> PgWireResult<Vec<FieldInfo>> {
         let format = format.unwrap_or(&Format::UnifiedText);
-        find_columns(&self.0, statement, format).map_err(failure)
+        find_columns(&self.connection, statement, format).map_err(failure)
+    }
+}
+
+fn planned_query(statement: &ClientStatement) -> Option<&Arc<PlannedQuery>> {
+    match statement {
+        ClientStatement::Query(planned)
+        | ClientStatement::Copy(planned, _)
+        | ClientStatement::Declare { planned, .. } => Some(planned),
+        _ => None,
     }
 }
 
 fn parameter_types(statement: &ClientStatement) -> Result<Vec<Option<DataType>>, RequestFault> {
-    match statement {
-        ClientStatement::Query(planned)
-        | ClientStatement::Copy(planned, _)
-        | ClientStatement::Declare { planned, .. } => Ok(planned.prepared.parameter_types()?),
-        _ => Ok(Vec::new()),
-    }
+    planned_query(statement).map_or(Ok(Vec::new()), |planned| Ok(planned.prepared.parameter_types()?))
 }
 
 // The value of a placeholder for a list that is sent as a text. The library takes `""` and `"NULL"` in it for NULL.

@@ -349,7 +349,8 @@ impl RequestFault {
     /// Writes it to the log: as a warning if the client is not to blame for it, else for debugging, because its text may
     /// quote a statement.
     pub fn log_failure(&self) {
-        let (code, text) = (self.code(), self.to_string());
+        let code = self.code();
+        let text = self.to_string();
         match code {
             FaultCode::Internal | FaultCode::Lake | FaultCode::Changed | FaultCode::EngineEnded => {
                 tracing::warn!(code = code.name(), text, "a request failed");

@@ -68,7 +68,8 @@ impl RunningWatches {
             memory: AtomicU64::new(0),
             outcome: OnceLock::new(),
         };
-        let (statement, started) = (watch.statement.clone(), Utc::now().timestamp_micros());
+        let statement = watch.statement.clone();
+        let started = Utc::now().timestamp_micros();
         EngineReport::Started(QueryStart { number, protocol, statement, started }).queue_line();
         QueryTimer { watch: Arc::new(watch), watches: self.clone() }
     }

@@ -31,7 +31,8 @@ pub fn begin_request(headers: &mut HeaderMap, protocol: ServerProtocol) -> (Span
     headers.insert(HEADER, HeaderValue::from(number));
     let id = headers.remove(REQUEST_ID).filter(is_sane).unwrap_or_else(random_id);
     headers.insert(REQUEST_ID, id.clone());
-    let (request_id, protocol) = (id.to_str().unwrap_or_default(), protocol.name());
+    let request_id = id.to_str().unwrap_or_default();
+    let protocol = protocol.name();
     let span =
         tracing::error_span!("request", number, request_id, trace = field::Empty, protocol, client = field::Empty);
     #[cfg(feature = "otlp")]
@@ -60,7 +61,10 @@ fn trace_id(headers: &HeaderMap) -> Option<&str> {
     let is_hex =
         |part: &str, length| part.len() == length && part.bytes().all(|b| matches!(b, b'0'..=b'9' | b'a'..=b'f'));
     let mut parts = text.split('-');
-    let (version, trace, parent, flags) = (parts.next()?, parts.next()?, parts.next()?, parts.next()?);
+    let version = parts.next()?;
+    let trace = parts.next()?;
+    let parent = parts.next()?;
+    let flags = parts.next()?;
     let is_right = is_hex(version, 2) && is_hex(trace, 32) && is_hex(parent, 16) && is_hex(flags, 2);
     (is_right && version != "ff" && trace.bytes().any(|b| b != b'0')).then_some(trace)
 }

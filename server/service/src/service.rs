@@ -240,7 +240,8 @@ impl QueryService {
         client: &EngineClient,
         work: impl Future<Output = Result<T, RequestFault>> + Send + 'static,
     ) -> BoxFuture<'_, Result<T, RequestFault>> {
-        let (guard, time) = (self.0.activity.begin_work(), client.quota().time);
+        let guard = self.0.activity.begin_work();
+        let time = client.quota().time;
         let work = async move {
             let _guard = guard;
             work.await
@@ -277,10 +278,12 @@ impl QueryService {
         let begun = async move {
             let (columns, known) = oneshot::channel();
             let (to, items) = mpsc::channel(WAITING);
-            let (stop, limit) = (job.stop.clone(), job.limit);
+            let stop = job.stop.clone();
+            let limit = job.limit;
             let span = tracing::error_span!("query", protocol = job.protocol.name(), client = self.0.identity.name);
             let timer = span.in_scope(|| self.watch_query(job.protocol, job.work.statement_text(), &job.stop));
-            let (watch, stopped) = (timer.watch().clone(), stop.clone());
+            let watch = timer.watch().clone();
+            let stopped = stop.clone();
             let work = async move {
                 let done = tokio::select! {
                     done = run_query(timer.watch(), job, encode, columns, to) => done,

@@ -108,7 +108,8 @@ async fn answer_lines(route: &Arc<AgentRoute>, mut lines: mpsc::Receiver<InputLi
             }
             continue;
         }
-        let (route, id) = (route.clone(), parsed["id"].clone());
+        let route = route.clone();
+        let id = parsed["id"].clone();
         // Never closed.
         let place = places.clone().acquire_owned().await;
         let key = id.to_string();

@@ -93,7 +93,8 @@ impl EnginePool {
         let folders = ServerFolders::new(lake, settings.temp.as_deref())?;
         let clients = Arc::<ClientEngines>::default();
         let blocks = if lake.is_remote() { CACHE_MEMORY_BYTES as usize } else { 0 };
-        let (memory, uncounted) = (settings.memory, CACHE_BYTES + blocks);
+        let memory = settings.memory;
+        let uncounted = CACHE_BYTES + blocks;
         // A thread of its own: it must not wait for what the door does for clients.
         let watched = Arc::downgrade(&clients);
         let watch = move || {

@@ -310,7 +310,8 @@ impl EngineProcess {
 fn private_bytes(pid: u32) -> Option<usize> {
     let text = std::fs::read_to_string(Path::new("/proc").join(pid.to_string()).join("statm")).ok()?;
     let mut pages = text.split(' ').skip(1).map_while(|n| n.parse::<usize>().ok());
-    let (resident, shared) = (pages.next()?, pages.next()?);
+    let resident = pages.next()?;
+    let shared = pages.next()?;
     Some(resident.saturating_sub(shared) * rustix::param::page_size())
 }
 

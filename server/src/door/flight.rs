@@ -36,10 +36,12 @@ async fn answer_flight_connection(stream: PlacedStream, encryption: ProtocolEncr
     let evicted = stream.wait_for_eviction();
     let work = stream.work_handle();
     let Some(stream) = encryption.shake_hands(stream).await else { return };
-    let (drain, place) = (door.drain().clone(), work.clone());
+    let drain = door.drain().clone();
+    let place = work.clone();
     let service = service_fn(move |mut request: Request<Incoming>| {
         work.hear_request();
-        let (door, work) = (door.clone(), work.clone());
+        let door = door.clone();
+        let work = work.clone();
         let (span, id) = begin_request(request.headers_mut(), ServerProtocol::FlightSql);
         let answer = async move {
             let mut response = door.answer_flight(request, &work).await.unwrap_or_else(|fault| {

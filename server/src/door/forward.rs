@@ -200,7 +200,8 @@ struct BodyReader {
 impl BodyReader {
     /// Reads pieces of at least so many bytes, but for the last.
     fn new(body: Body, piece_bytes: usize) -> Self {
-        let (parts, end) = (body.into_data_stream(), Instant::now() + BODY_LIMIT);
+        let parts = body.into_data_stream();
+        let end = Instant::now() + BODY_LIMIT;
         Self { parts, end, piece_bytes, part_count: 0, bytes: 0, is_ended: false }
     }
 

@@ -50,7 +50,8 @@ impl ServerDoor {
         let activity = Arc::new(ServerActivity::new()?);
         let engines = EnginePool::new(lake, settings, activity.clone(), access.clone())?;
         let layout = ViewerLayout::new(lake.rig());
-        let (readiness, drain) = (ReadinessCheck::new(lake), ServerDrain::default());
+        let readiness = ReadinessCheck::new(lake);
+        let drain = ServerDrain::default();
         Ok(Self(Arc::new(DoorState { access, activity, engines, readiness, drain, layout, failed_logins })))
     }
 

@@ -59,7 +59,8 @@ struct IdleWork {
 
 impl IdleWork {
     fn measure_busy_time(&mut self, is_idle: bool) -> Duration {
-        let (now, cpu) = (Instant::now(), cpu_time());
+        let now = Instant::now();
+        let cpu = cpu_time();
         if let (Some((then, before)), true) = (self.last, is_idle)
             && cpu.saturating_sub(before).as_secs_f64() > BUSY * (now - then).as_secs_f64()
         {

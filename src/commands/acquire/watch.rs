@@ -96,7 +96,8 @@ impl RunWatcher {
     /// Reports the end of the run, or that it was aborted.
     pub fn report_end(self, end: Option<RunEnd>) {
         if self.cost.checkpoints > 0 {
-            let (busy, whole) = (self.cost.busy.as_secs_f64(), self.begun.elapsed().as_secs_f64());
+            let busy = self.cost.busy.as_secs_f64();
+            let whole = self.begun.elapsed().as_secs_f64();
             self.task.print_message(&format!(
                 "writing took {busy:.2} s of the run's {whole:.2} s ({:.2} s waiting for the disk); {:.1} MB in {} checkpoints",
                 self.cost.waited.as_secs_f64(),
@@ -128,7 +129,8 @@ impl RunWatcher {
 pub(super) fn obey_signals(control: &Arc<RunControl>) -> anyhow::Result<StopRequest> {
     let stop = StopRequest::listen("stopping after the current pair; Ctrl-C again stops at once")?;
     let mut pauses = signal(SignalKind::user_defined1()).context("cannot listen to SIGUSR1")?;
-    let (stopped, made) = (control.clone(), stop.clone());
+    let stopped = control.clone();
+    let made = stop.clone();
     tokio::spawn(async move {
         made.wait_until_made().await;
         stopped.stop.store(true, Ordering::Relaxed);

@@ -149,7 +149,8 @@ impl LevelTable {
     fn cell_colour(&self, row: &LevelTableRow, band: &str) -> Option<&'static str> {
         let own = *row.levels_db.get(band)?;
         let all = || self.rows.iter().filter_map(|row| row.levels_db.get(band).copied());
-        let (least, greatest) = (all().fold(own, f64::min), all().fold(own, f64::max));
+        let least = all().fold(own, f64::min);
+        let greatest = all().fold(own, f64::max);
         match own {
             _ if greatest - least < 0.005 => None,
             _ if own == greatest => Some(GREATEST),

@@ -28,7 +28,8 @@ pub(super) async fn report_lake(json: bool, lake_url: &str) -> anyhow::Result<Co
 }
 
 fn report_text(lake: &Lake, report: &LakeReport) -> String {
-    let (rig, division) = (lake.rig(), lake.rig().impulse_response.division.name());
+    let rig = lake.rig();
+    let division = lake.rig().impulse_response.division.name();
     let direct = lake.config().references.direct_sound.name();
     let mut out = format!("lake {}, rig {}, {division} division, direct sound: {direct}\n", lake.location(), rig.name);
     let _ = writeln!(out, "{} runs, {} in run files\n", report.runs, format_size(report.run_bytes));

@@ -90,7 +90,8 @@ impl PendingExport {
     fn prepare_remote(folder: ObjectFolder, name: &str, location: &str) -> anyhow::Result<Self> {
         let spool = tempfile::Builder::new().prefix("echolake-export-").tempdir();
         let spool = spool.context("cannot make a temporary folder; hint: $TMPDIR names another disk")?;
-        let (path, location) = (spool.path().join(name), location.to_owned());
+        let path = spool.path().join(name);
+        let location = location.to_owned();
         Ok(Self { path, remote: Some(RemoteExport { folder, spool, location }) })
     }
 

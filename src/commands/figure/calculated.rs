@@ -19,7 +19,8 @@ pub(super) fn write_filters(source: &FigureSource, args: &FiltersArgs) -> anyhow
 }
 
 pub(super) fn write_coverage(source: &FigureSource, args: &CoverageArgs) -> anyhow::Result<()> {
-    let (rig, grid) = (source.lake.rig(), source.lake.grid());
+    let rig = source.lake.rig();
+    let grid = source.lake.grid();
     let points: Vec<_> = grid.points().iter().filter(|point| point.layer == args.layer).collect();
     anyhow::ensure!(!points.is_empty(), "the grid has no layer {}; hint: the lowest is 0", args.layer);
     let point = |id| grid.point(id).filter(|point| point.layer == args.layer);
@@ -42,7 +43,8 @@ pub(super) fn write_coverage(source: &FigureSource, args: &CoverageArgs) -> anyh
 }
 
 fn coverage_zone(microphone: &Point, speaker: &Point, frequency_hz: f64) -> CoverageZone {
-    let (to, from) = (microphone.position_mm, speaker.position_mm);
+    let to = microphone.position_mm;
+    let from = speaker.position_mm;
     let zone = first_fresnel_zone(to, from, frequency_hz, SPEED_M_S);
     CoverageZone {
         centre_mm: zone.centre_mm,

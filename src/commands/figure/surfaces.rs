@@ -29,7 +29,8 @@ pub(super) async fn write_grid(source: &FigureSource, args: &GridArgs) -> anyhow
     let microphone = source.microphone_point(args.microphone.as_deref())?;
     let over = LevelReference::from(args.over);
     let rig = source.lake.rig();
-    let (labels, keys) = (band_labels(rig), band_keys(rig));
+    let labels = band_labels(rig);
+    let keys = band_keys(rig);
     let shown: Vec<usize> = match &args.band {
         None => (0..keys.len()).collect(),
         Some(key) => {
@@ -80,7 +81,8 @@ async fn read_grid(
     let rig = source.lake.rig();
     let cells: Vec<GridCell> =
         source.query_rows(&grid_query(rig, over, &quote_literal(surface), &microphone.to_string())).await?;
-    let (points, bands) = (source.lake.grid().points().len(), rig.bands.centres_hz.len() + 1);
+    let points = source.lake.grid().points().len();
+    let bands = rig.bands.centres_hz.len() + 1;
     Ok(GridLevels::from_cells(cells, microphone, points, bands))
 }
 
@@ -101,7 +103,8 @@ pub(super) async fn write_nce(source: &FigureSource, args: &NceArgs) -> anyhow::
     for group in args.output.group_surfaces(&surfaces)? {
         let mut panels = Vec::new();
         for surface in group {
-            let (id, flat) = (surface.surface_id.as_str(), surface.flat_reference.as_str());
+            let id = surface.surface_id.as_str();
+            let flat = surface.flat_reference.as_str();
             let bands = read_curves(source, id, &filter, &kept)
                 .await?
                 .with_context(|| format!("surface `{id}` has no curves; hint: energies need Flat and Foam"))?;
@@ -158,7 +161,8 @@ pub(super) async fn write_steps(source: &FigureSource, args: &StepsArgs) -> anyh
     let surfaces = source.named_surfaces(&[id]).await?;
     let rig = source.lake.rig();
     let run = surfaces[0].run_id.as_deref().with_context(|| format!("surface `{id}` has no run"))?;
-    let (quoted_run, pair) = (quote_literal(run), args.pair);
+    let quoted_run = quote_literal(run);
+    let pair = args.pair;
     let recorded = format!(
         "select samples, sample_rate_hz, temperature_c, temperature_corrected from mcap({quoted_run}, '/ir') \
          where pair_id = {pair} and attempt = \

@@ -31,7 +31,8 @@ impl ClosedRun {
             "`{name}` was not closed: it has no summary at its end; hint: `echolake recover {name}` makes a run of what it \
              holds"
         );
-        let (mut manifest, mut rig) = (None, None);
+        let mut manifest = None;
+        let mut rig = None;
         while manifest.is_none() || rig.is_none() {
             match reader.next_item()? {
                 Some(RecordingItem::Metadata(record)) if record.name == topics::RUN_METADATA => {
@@ -66,7 +67,8 @@ impl ClosedRun {
 
 fn has_end(path: &Path) -> anyhow::Result<bool> {
     let read = || {
-        let (mut file, mut tail) = (File::open(path)?, Vec::new());
+        let mut file = File::open(path)?;
+        let mut tail = Vec::new();
         let bytes = file.metadata()?.len();
         file.seek(SeekFrom::Start(tail_range(bytes).start))?;
         file.take(bytes).read_to_end(&mut tail)?;

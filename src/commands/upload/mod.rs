@@ -198,7 +198,8 @@ async fn upload_file(
     };
     let digest = tokio::task::spawn_blocking(digest).await?;
     let (sha256, bytes) = digest.with_context(|| format!("cannot read `{}`", file.display()))?;
-    let (surface, run) = (run.manifest.surface_id.clone(), run.manifest.run_id.clone());
+    let surface = run.manifest.surface_id.clone();
+    let run = run.manifest.run_id.clone();
     let upload = RunUpload { file: file.to_owned(), surface, run, bytes, sha256 };
     let mut bars = UploadBars { progress, total: bytes / MEGABYTE, sending: None, comparing: None };
     let outcome = lake.upload_run(&upload, &mut |step, bytes| bars.show_bytes(step, bytes)).await;
@@ -211,7 +212,8 @@ async fn upload_file(
             (path.to_string(), false)
         }
     };
-    let (run_id, surface_id) = (run.to_string(), surface.to_string());
+    let run_id = run.to_string();
+    let surface_id = surface.to_string();
     Ok(UploadedRun { file: file.display().to_string(), run_id, surface_id, path, bytes, sha256, uploaded })
 }
 

@@ -132,7 +132,8 @@ impl WorkClaims {
 
     /// Returns whether, at the last look, nobody alive held this work, this process included.
     pub fn is_free(&self, work: &str) -> bool {
-        let (key, board) = (key_of(work), self.state.lock_board());
+        let key = key_of(work);
+        let board = self.state.lock_board();
         !board.held.contains_key(&key) && board.seen.get(&key).is_none_or(|seen| self.state.is_dead(seen))
     }
 

@@ -55,7 +55,9 @@ struct LeaseRecord {
 
 impl LeaseRecord {
     fn new() -> Self {
-        let (host, pid, now) = (host_name(), std::process::id(), Utc::now());
+        let host = host_name();
+        let pid = std::process::id();
+        let now = Utc::now();
         let holder = format!("{host}.{pid}.{}", now.timestamp_nanos_opt().unwrap_or_default());
         Self { holder, host, pid, process: ProcessIdentity::current(), expires: now + HOLDS }
     }
@@ -77,7 +79,9 @@ impl MaintenanceLease {
     /// [`Error::Maintained`] if another process holds it, or what the store says.
     pub async fn acquire(lake: &Lake) -> Result<Self> {
         lake.ensure_exclusive().await?;
-        let (store, location, record) = (lake.store(), lake.location().to_owned(), LeaseRecord::new());
+        let store = lake.store();
+        let location = lake.location().to_owned();
+        let record = LeaseRecord::new();
         let last = last_number(store.as_ref()).await?;
         if let Some(held) = read_lease(store.as_ref(), last).await?
             && held.is_held()

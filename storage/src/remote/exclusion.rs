@@ -29,7 +29,8 @@ pub(crate) enum ExclusionFault {
 /// [`ExclusionFault`].
 pub(crate) async fn probe_exclusion(store: &Arc<dyn ObjectStore>) -> Result<(), ExclusionFault> {
     let path = |name: &str| Path::from(format!("{FOLDER}/{}.{name}", Uuid::new_v4().simple()));
-    let (twice, race) = (path("twice"), path("race"));
+    let twice = path("twice");
+    let race = path("race");
     let (repeated, raced) = join(create_twice(store.as_ref(), &twice), race_for(store.as_ref(), &race)).await;
     // An object that stays does no harm.
     let _ = join(store.delete(&twice), store.delete(&race)).await;

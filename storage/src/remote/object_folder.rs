@@ -72,7 +72,8 @@ impl ObjectFolder {
     /// # Errors
     /// [`Error::ObjectExists`], [`Error::UploadFile`] if the file cannot be read, or what the store says.
     pub async fn send_file(&self, file: &FsPath, name: &str) -> Result<()> {
-        let (to, text) = (Path::from(name), object_text(&self.location, name));
+        let to = Path::from(name);
+        let text = object_text(&self.location, name);
         let failed = |action: &'static str| {
             let text = text.clone();
             move |e| Error::store_failure(action, text, e)
@@ -91,7 +92,9 @@ impl ObjectFolder {
         self.ensure_absent(name).await?;
         let upload = self.parts.begin_upload(&to).await.map_err(failed("begin the upload of"))?;
         let send_one = |number: u64| {
-            let (upload, to, range) = (&upload, &to, number * size..((number + 1) * size).min(bytes));
+            let upload = &upload;
+            let to = &to;
+            let range = number * size..((number + 1) * size).min(bytes);
             let failed = failed("write");
             async move {
                 let part = read_part(file, range).await?;

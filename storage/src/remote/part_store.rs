@@ -38,14 +38,16 @@ impl PartStore {
 
     /// Uploads a part; parts count from 0. Returns its id.
     pub async fn put_part(&self, path: &Path, upload: &str, number: usize, part: PutPayload) -> StoreResult<String> {
-        let (path, upload) = (self.path_in_bucket(path), upload.to_owned());
+        let path = self.path_in_bucket(path);
+        let upload = upload.to_owned();
         let part_id = retry_operation(|| self.store.put_part(&path, &upload, number, part.clone())).await?;
         Ok(part_id.content_id)
     }
 
     /// Makes the object of all parts, by their ids in order.
     pub async fn complete_upload(&self, path: &Path, upload: &str, parts: Vec<String>) -> StoreResult<()> {
-        let (path, upload) = (self.path_in_bucket(path), upload.to_owned());
+        let path = self.path_in_bucket(path);
+        let upload = upload.to_owned();
         let parts: Vec<_> = parts.into_iter().map(|content_id| PartId { content_id }).collect();
         retry_operation(|| self.store.complete_multipart(&path, &upload, parts.clone())).await.map(drop)
     }

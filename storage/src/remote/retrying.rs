@@ -196,12 +196,15 @@ impl ObjectStore for RetryingStore {
     }
 
     fn list(&self, prefix: Option<&Path>) -> BoxStream<'static, StoreResult<ObjectMeta>> {
-        let (inner, prefix) = (self.inner.clone(), prefix.cloned());
+        let inner = self.inner.clone();
+        let prefix = prefix.cloned();
         stream_of(async move { retry_operation(|| inner.list(prefix.as_ref()).try_collect()).await })
     }
 
     fn list_with_offset(&self, prefix: Option<&Path>, offset: &Path) -> BoxStream<'static, StoreResult<ObjectMeta>> {
-        let (inner, prefix, offset) = (self.inner.clone(), prefix.cloned(), offset.clone());
+        let inner = self.inner.clone();
+        let prefix = prefix.cloned();
+        let offset = offset.clone();
         stream_of(
             async move { retry_operation(|| inner.list_with_offset(prefix.as_ref(), &offset).try_collect()).await },
         )

@@ -82,7 +82,8 @@ pub(super) type BucketStore = (Arc<dyn ObjectStore>, Arc<dyn MultipartStore>);
 
 /// The store of a bucket.
 pub(super) fn build_store(scheme: &str, bucket: &str) -> Result<BucketStore, ErrorCause> {
-    let (timeout, key) = (REQUEST_TIMEOUT, ClientConfigKey::Timeout);
+    let timeout = REQUEST_TIMEOUT;
+    let key = ClientConfigKey::Timeout;
     Ok(match scheme {
         "s3" => {
             let builder = AmazonS3Builder::from_env().with_bucket_name(bucket).with_retry(retry_config()?);

@@ -87,7 +87,8 @@ impl BatchBuilder {
     pub fn push_lists(&mut self, name: &str, values: Vec<f32>) -> &mut Self {
         let each = values.len().checked_div(self.rows).unwrap_or(0);
         if each * self.rows != values.len() {
-            let (rows, actual) = (self.rows, values.len());
+            let rows = self.rows;
+            let actual = values.len();
             return self
                 .record_fault(format!("lists of column `{name}` have {actual} values, expected a multiple of {rows}"));
         }

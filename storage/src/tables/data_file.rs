@@ -124,7 +124,8 @@ pub fn encode_batches(table: Table, schema: &SchemaRef, batches: &[RecordBatch])
 // Single numbers that do not repeat (zstd makes them an eighth smaller) are not compressed: a reader makes a
 // decompressor for each column of each file, which takes longer than reading three thousand of them.
 fn writer_properties(table: Table, schema: &SchemaRef, first: &RecordBatch) -> WriterProperties {
-    let (rows, bytes) = (first.num_rows(), first.get_array_memory_size());
+    let rows = first.num_rows();
+    let bytes = first.get_array_memory_size();
     let rows_a_group = if rows == 0 { 1 } else { (ROW_GROUP_BYTES * rows / bytes.max(1)).max(1) };
     let mut builder = WriterProperties::builder()
         .set_compression(Compression::ZSTD(ZstdLevel::try_new(ZSTD_LEVEL).unwrap_or_default()))
@@ -212,7 +213,9 @@ impl StatsCollector {
     }
 
     fn into_json(self) -> Value {
-        let (mut least, mut greatest, mut nulls) = (Map::new(), Map::new(), Map::new());
+        let mut least = Map::new();
+        let mut greatest = Map::new();
+        let mut nulls = Map::new();
         for column in self.columns {
             nulls.insert(column.name.clone(), column.nulls.into());
             if let (Some((low, high)), false) = (column.extremes, column.unknown) {
@@ -244,7 +247,8 @@ fn extremes_of(column: &Arc<dyn Array>) -> Option<(Value, Value)> {
         }
         DataType::Utf8 => {
             let texts = column.as_string::<i32>();
-            let (low, high) = (min_string(texts)?, max_string(texts)?);
+            let low = min_string(texts)?;
+            let high = max_string(texts)?;
             (low.len() <= STATS_TEXT && high.len() <= STATS_TEXT).then(|| (low.into(), high.into()))
         }
         _ => None,

@@ -159,9 +159,13 @@ impl Lake {
     pub async fn stage_file(&self, table: Table, name: &FileName, file: EncodedFile) -> Result<StagedFile> {
         let name = name.compose();
         let path = table_folder(table).join(name.as_str());
-        let (bytes, stats, rows) = (file.bytes.len() as u64, file.stats, file.rows);
+        let bytes = file.bytes.len() as u64;
+        let stats = file.stats;
+        let rows = file.rows;
         self.store().put(&path, file.bytes.into()).await.map_err(|e| Error::store_failure("write", &path, e))?;
-        let (parts, replaces, row_counts) = (Vec::new(), None, None);
+        let parts = Vec::new();
+        let replaces = None;
+        let row_counts = None;
         let file = NewFile { name, bytes, stats, replaces, parts, seen_runs: 0, run_version: 0, row_counts };
         Ok(StagedFile { table, file, rows })
     }

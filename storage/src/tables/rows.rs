@@ -104,7 +104,8 @@ impl Lake {
             builder = builder.with_projection(mask);
         }
         if rows != (0..file.rows) {
-            let (skip, take) = (rows.start as usize, rows.end.saturating_sub(rows.start) as usize);
+            let skip = rows.start as usize;
+            let take = rows.end.saturating_sub(rows.start) as usize;
             let selection = RowSelection::from(vec![RowSelector::skip(skip), RowSelector::select(take)]);
             builder = builder.with_row_selection(selection);
         }

@@ -36,12 +36,14 @@ pub(crate) fn list_pointers(file: &DataFile) -> Vec<RunPointer<'_>> {
     };
     if file.parts.is_empty() {
         let shown = run(&file.path).filter(|run| !file.hidden.contains(&run.run));
-        let (version, row_counts) = (file.log_version, file.row_counts.as_ref());
+        let version = file.log_version;
+        let row_counts = file.row_counts.as_ref();
         return shown.map(|run| RunPointer { run, version, row_counts }).into_iter().collect();
     }
     let parts = file.visible_parts().map(|(part, _)| part);
     let pointers = parts.filter_map(|part| {
-        let (run, version) = (run(&part.file_name().into())?, part.row_version?);
+        let run = run(&part.file_name().into())?;
+        let version = part.row_version?;
         Some(RunPointer { run, version, row_counts: part.row_counts.as_ref() })
     });
     pointers.collect()
@@ -105,7 +107,8 @@ impl RunPart {
             }
             FileName::Pointer(pointer) => {
                 let derivation = pointer.joined_derivations();
-                let (row_version, row_counts) = (Some(row_version?), None);
+                let row_version = Some(row_version?);
+                let row_counts = None;
                 Some(Self { surface: pointer.surface, run: pointer.run, derivation, rows, row_version, row_counts })
             }
             FileName::Rig { .. } | FileName::Merged { .. } => None,

@@ -71,7 +71,8 @@ impl TableFault {
     }
 
     pub fn to_error(&self) -> Error {
-        let (table, found) = (self.table.name(), self.found.clone());
+        let table = self.table.name();
+        let found = self.found.clone();
         match self.is_unreadable {
             true => Error::Log { table, action: "read", source: found.into() },
             false => Error::Incomplete { table, found },

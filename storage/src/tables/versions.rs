@@ -120,7 +120,8 @@ impl Lake {
         if missing == 0 {
             return Ok(snapshot);
         }
-        let (moment, files) = (LakeMoment::Version(version).to_string(), wanted.files(table).len());
+        let moment = LakeMoment::Version(version).to_string();
+        let files = wanted.files(table).len();
         Err(Error::Vacuumed { moment, table: table.name(), missing, files })
     }
 

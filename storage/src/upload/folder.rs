@@ -48,7 +48,9 @@ pub(super) async fn send_to_folder(
     let (actual, _) = on_a_thread(&staged, digest).await?;
     if actual != run.sha256 {
         std::fs::remove_file(&staged).map_err(|e| staged_error(&staged, e))?;
-        let (location, path, expected) = (lake.location().to_owned(), to.to_string(), run.sha256.clone());
+        let location = lake.location().to_owned();
+        let path = to.to_string();
+        let expected = run.sha256.clone();
         return Err(Error::UploadDamaged { location, path, expected, actual });
     }
     let from = Path::from(format!("{INBOX}/{}.mcap.{STAGED}", run.run));

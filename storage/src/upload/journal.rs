@@ -69,7 +69,8 @@ impl UploadJournal {
         }
         let mut text = Vec::new();
         file.read_to_end(&mut text).map_err(failed)?;
-        let (location, sha256) = (location.to_owned(), run.sha256.clone());
+        let location = location.to_owned();
+        let sha256 = run.sha256.clone();
         let wanted = UploadHead { location, path: to.to_string(), sha256, bytes: run.bytes };
         let (upload, parts) = parse_journal(&String::from_utf8_lossy(&text), &wanted).unwrap_or_default();
         let mut journal = Self { path, file, wanted, upload, parts };

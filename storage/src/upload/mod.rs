@@ -133,7 +133,8 @@ impl Lake {
 
     // Creates the digest's record, or finds the same one there.
     async fn reserve_name(&self, run: &RunUpload, inbox: &Path) -> Result<()> {
-        let (store, record) = (self.store(), digest_record_path(inbox));
+        let store = self.store();
+        let record = digest_record_path(inbox);
         let text = digest_record(&run.sha256, inbox);
         let created = create_object(store.as_ref(), &record, text.into()).await;
         if created.map_err(|e| Error::store_failure("write", &record, e))? {
@@ -161,7 +162,9 @@ impl Lake {
             Ok(actual) if actual == run.sha256 => Ok(UploadOutcome::Uploaded(inbox.clone())),
             Ok(actual) => {
                 store.delete(inbox).await.map_err(|e| Error::store_failure("delete", inbox, e))?;
-                let (location, path, expected) = (self.location().to_owned(), inbox.to_string(), run.sha256.clone());
+                let location = self.location().to_owned();
+                let path = inbox.to_string();
+                let expected = run.sha256.clone();
                 Err(Error::UploadDamaged { location, path, expected, actual })
             }
             // An ingest has compared it, and moved it.

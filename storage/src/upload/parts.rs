@@ -90,7 +90,8 @@ async fn try_send(
     progress(UploadStep::Send, sent);
     let missing: Vec<_> = (0..count).filter(|number| !journal.part_ids().contains_key(number)).collect();
     let send_one = |number: usize| {
-        let (upload, range) = (&upload, range(number));
+        let upload = &upload;
+        let range = range(number);
         async move {
             let part = read_part(&run.file, range).await?;
             let id = store.put_part(to, upload, number, part.into()).await.map_err(|e| fault_of("write", to, e))?;

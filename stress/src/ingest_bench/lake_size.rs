@@ -18,11 +18,15 @@ pub(crate) fn measure_lake_size(
 ) -> Result<()> {
     report.title("Size of tables/, logs included, against the same numbers as raw f32 and f64")?;
     report.line(&format!("{:<14} {:>9} {:>12} {:>12} {:>8}", "table", "rows", "bytes a row", "raw a row", "ratio"))?;
-    let (mut all_raw, mut all_arrays) = (0, 0);
+    let mut all_raw = 0;
+    let mut all_arrays = 0;
     // Much of what is derived of the references is zero.
-    let (mut panels_bytes, mut panels_raw) = (0, 0);
+    let mut panels_bytes = 0;
+    let mut panels_raw = 0;
     for table in Table::ALL {
-        let (mut rows, mut bytes, mut raw) = (0, 0, 0);
+        let mut rows = 0;
+        let mut bytes = 0;
+        let mut raw = 0;
         for file in files.iter().filter(|f| f.table == table) {
             let metadata = ParquetMetaDataReader::new().parse_and_finish(&file.bytes)?;
             rows += metadata.file_metadata().num_rows();
@@ -38,7 +42,8 @@ pub(crate) fn measure_lake_size(
         if rows > 0 {
             let each = |bytes: f64| bytes / rows as f64;
             let ratio = if raw == 0 { "-".into() } else { format!("{:.1} %", 100.0 * bytes as f64 / raw as f64) };
-            let (a, b) = (each(bytes as f64), each(raw as f64));
+            let a = each(bytes as f64);
+            let b = each(raw as f64);
             report.line(&format!("{:<14} {rows:>9} {a:>12.1} {b:>12.1} {ratio:>8}", table.name()))?;
         }
     }

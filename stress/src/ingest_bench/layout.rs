@@ -62,7 +62,9 @@ fn compare_layouts(args: &IngestBenchArgs, file: &Bytes, rows: &FileRows, report
     for FileLayout { name, numbers, compression } in candidates {
         let properties = builder_as(&metadata, numbers).set_data_page_size_limit(PAGE_BYTES);
         let properties = properties.set_compression(compression).build();
-        let (mut size, mut write, mut read) = (0, f64::INFINITY, f64::INFINITY);
+        let mut size = 0;
+        let mut write = f64::INFINITY;
+        let mut read = f64::INFINITY;
         for _ in 0..args.repeats() {
             let begun = Instant::now();
             let written = Bytes::from(rows.write(&properties)?);
@@ -75,7 +77,9 @@ fn compare_layouts(args: &IngestBenchArgs, file: &Bytes, rows: &FileRows, report
             size = written.len();
         }
         let raw = rows.raw as f64;
-        let (ratio, write, read) = (100.0 * size as f64 / raw, raw / 1e6 / write, raw / 1e6 / read);
+        let ratio = 100.0 * size as f64 / raw;
+        let write = raw / 1e6 / write;
+        let read = raw / 1e6 / read;
         report.line(&format!("{name:<40} {ratio:>8.1} % {write:>12.0} {read:>12.0}"))?;
     }
     Ok(())

@@ -25,7 +25,9 @@ pub(crate) async fn measure_responses(args: &IngestBenchArgs, folder: &Path, rep
         folder: &runs,
     };
     let runs = order.make()?;
-    let (mut whole, mut panels, mut alone) = (MeasuredCost::NONE, MeasuredCost::NONE, MeasuredCost::NONE);
+    let mut whole = MeasuredCost::NONE;
+    let mut panels = MeasuredCost::NONE;
+    let mut alone = MeasuredCost::NONE;
     let (mut peak, mut last): (f64, Option<IngestedLake>) = (0.0, None);
     for _ in 0..args.repeats() {
         let ingested = runs.ingest(&folder.join("lake")).await?;
@@ -48,7 +50,8 @@ pub(crate) async fn measure_responses(args: &IngestBenchArgs, folder: &Path, rep
         fs::remove_dir_all(&target)?;
     }
     let stored: u64 = of_panels.iter().map(|r| r.bytes).sum();
-    let (count, all) = (runs.panels.accepted as f64, runs.all.accepted as f64);
+    let count = runs.panels.accepted as f64;
+    let all = runs.all.accepted as f64;
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     report.title(&format!(
         "{} runs without sweeps, two of them references: {all} impulse responses, {:.0} MB",
@@ -86,7 +89,8 @@ fn write_all(rows: &[&FileRows], folder: &Path) -> Result<usize> {
             let number = next.fetch_add(1, Ordering::Relaxed);
             let Some(rows) = rows.get(number) else { return Ok(bytes) };
             let encoded = rows.write(&rows.properties)?;
-            let (temporary, path) = (folder.join(format!("{number}#")), folder.join(format!("{number}.parquet")));
+            let temporary = folder.join(format!("{number}#"));
+            let path = folder.join(format!("{number}.parquet"));
             let mut file = File::create_new(&temporary)?;
             file.write_all(&encoded)?;
             file.sync_all()?;

@@ -125,7 +125,8 @@ impl SimulatedRuns {
         let lake =
             Lake::open_or_create(&folder.display().to_string(), &Rig::paper(), &ReferenceSurfaces::default()).await?;
         let ingest = LakeIngest::new(&lake, Arc::default());
-        let (mut accepted, mut refused) = (0, Vec::new());
+        let mut accepted = 0;
+        let mut refused = Vec::new();
         let mut report = |report| match report {
             FileReport::Ingested(run) => accepted += run.measurements as u64,
             other => refused.push(format!("{other:?}")),

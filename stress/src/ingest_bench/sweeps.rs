@@ -48,8 +48,10 @@ pub(crate) async fn measure_sweeps(args: &IngestBenchArgs, folder: &Path, report
     let recordings = sample_recordings(&runs)?;
     let length = recordings.first().context("no recordings")?.microphone.len();
     let padded = fast_length(length);
-    let (mut whole, mut panels) = (MeasuredCost::NONE, MeasuredCost::NONE);
-    let (mut bare, mut unpadded) = (f64::INFINITY, f64::INFINITY);
+    let mut whole = MeasuredCost::NONE;
+    let mut panels = MeasuredCost::NONE;
+    let mut bare = f64::INFINITY;
+    let mut unpadded = f64::INFINITY;
     let mut peak: f64 = 0.0;
     for _ in 0..args.repeats() {
         let ingested = runs.ingest(&folder.join("lake")).await?;
@@ -59,7 +61,8 @@ pub(crate) async fn measure_sweeps(args: &IngestBenchArgs, folder: &Path, report
         bare = bare.min(time_transforms(&recordings, padded)?);
         unpadded = unpadded.min(time_transforms(&recordings, SWEEP_LEN)?);
     }
-    let (count, all) = (runs.panels.attempts as f64, runs.all.attempts as f64);
+    let count = runs.panels.attempts as f64;
+    let all = runs.all.attempts as f64;
     let each = panels.cpu / count;
     report.title(&format!(
         "{RUNS} runs with sweeps, two of them references: {all} recordings of {length} samples, two channels, 24 bit; {:.0} MB",
@@ -116,7 +119,8 @@ impl SampledRecording {
 // CPU seconds that the two transforms of a recording take, of `length` samples each.
 fn time_transforms(recordings: &[SampledRecording], length: usize) -> Result<f64> {
     let forward = f32::plan_real_forward(length);
-    let (mut input, mut spectrum) = (forward.make_input_vec(), forward.make_output_vec());
+    let mut input = forward.make_input_vec();
+    let mut spectrum = forward.make_output_vec();
     let mut work = forward.make_scratch_vec();
     let meter = CostMeter::start()?;
     let begun = std::time::Instant::now();

@@ -42,7 +42,8 @@ fn column_sum(column: &ArrayRef) -> Result<f64> {
     Ok(match column.data_type() {
         DataType::List(_) => {
             let lists = column.as_list::<i32>();
-            let (from, to) = (lists.value_offsets()[0], lists.value_offsets()[lists.len()]);
+            let from = lists.value_offsets()[0];
+            let to = lists.value_offsets()[lists.len()];
             column_sum(&lists.values().slice(from as usize, (to - from) as usize))?
         }
         DataType::Utf8 | DataType::LargeUtf8 | DataType::Utf8View => {

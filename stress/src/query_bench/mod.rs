@@ -79,7 +79,8 @@ async fn compare_engines(
     query: &BenchQuery,
     runs: usize,
 ) -> Result<QueryTimes> {
-    let (mut own, mut other) = (Vec::new(), Vec::new());
+    let mut own = Vec::new();
+    let mut other = Vec::new();
     let mut rows = 0;
     for run in 0..=runs {
         let (seconds, digest) = time_query(session, query).await?;

@@ -42,7 +42,8 @@ pub(super) fn response_length(frequencies: &[f64], rate_hz: f64) -> Result<usize
 pub(super) fn invert_spectra(real: &[f64], imaginary: &[f64], length: usize) -> Result<Vec<f32>, usize> {
     let bins = length / 2 + 1;
     let plan = RealFftPlanner::<f64>::new().plan_fft_inverse(length);
-    let (mut spectrum, mut samples) = (plan.make_input_vec(), plan.make_output_vec());
+    let mut spectrum = plan.make_input_vec();
+    let mut samples = plan.make_output_vec();
     let mut scratch = plan.make_scratch_vec();
     let mut responses = Vec::with_capacity(real.len() / bins * length);
     for (number, (real, imaginary)) in real.chunks_exact(bins).zip(imaginary.chunks_exact(bins)).enumerate() {

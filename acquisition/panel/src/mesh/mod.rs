@@ -94,7 +94,8 @@ impl Mesh {
         let failed = |source| Error::Read { path: path.to_owned(), source };
         let size = std::fs::metadata(path).map_err(failed)?.len();
         if size > LARGEST_FILE {
-            let (place, actual) = ("the file".to_owned(), format!("{size} bytes"));
+            let place = "the file".to_owned();
+            let actual = format!("{size} bytes");
             return Err(Error::Syntax { path: path.to_owned(), place, actual, expected: "up to 1 GiB" });
         }
         Self::from_bytes(format, &std::fs::read(path).map_err(failed)?, path)

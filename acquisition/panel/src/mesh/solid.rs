@@ -39,7 +39,8 @@ impl Mesh {
         for top in [true, false] {
             for iy in 0..side {
                 for ix in 0..side {
-                    let (x, y) = (at(ix), at(iy));
+                    let x = at(ix);
+                    let y = at(iy);
                     let z = if top { relief.height_at(x, y) as f32 } else { below(x, y) };
                     mesh.vertices_mm.push([x as f32, y as f32, z]);
                 }
@@ -230,7 +231,8 @@ fn rasterise_triangle(corners: [[f64; 3]; 3], cells: usize, tops: &mut [f32]) {
     };
     for iy in range(1) {
         for ix in range(0) {
-            let (x, y) = (ix as f64, iy as f64);
+            let x = ix as f64;
+            let y = iy as f64;
             let v = ((x - a[0]) * (c[1] - a[1]) - (y - a[1]) * (c[0] - a[0])) / area;
             let w = ((b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0])) / area;
             if v >= -1e-9 && w >= -1e-9 && v + w <= 1.0 + 1e-9 {

@@ -50,9 +50,11 @@ impl SeededRandom {
 
     /// Smooth noise over the plane, -1 to 1, with features of about the length 1.
     pub fn smooth_noise(self, x: f64, y: f64) -> f64 {
-        let (ix, iy) = (x.floor(), y.floor());
+        let ix = x.floor();
+        let iy = y.floor();
         let corner = |dx: i64, dy: i64| self.at_place(ix as i64 + dx, iy as i64 + dy).signed_number(0);
-        let (u, v) = (fade_curve(x - ix), fade_curve(y - iy));
+        let u = fade_curve(x - ix);
+        let v = fade_curve(y - iy);
         let low = corner(0, 0) + (corner(1, 0) - corner(0, 0)) * u;
         let high = corner(0, 1) + (corner(1, 1) - corner(0, 1)) * u;
         low + (high - low) * v

@@ -73,7 +73,8 @@ impl CoursedStones {
         let variation = settings.variation;
         let chance = SeededRandom::new(settings.seed, 0xA541);
         let half = PANEL_SIZE_MM / 2.0;
-        let (mut courses, mut top) = (Vec::<StoneCourse>::new(), -half - height * chance.unit_number(0));
+        let mut courses = Vec::<StoneCourse>::new();
+        let mut top = -half - height * chance.unit_number(0);
         while top < half {
             let row = chance.at_place(-1, courses.len() as i64);
             let height = height * (1.0 + variation * row.signed_number(0));
@@ -112,8 +113,10 @@ impl StoneLayout for CoursedStones {
         let right = course.ends[column];
         // What lies left of the first end begins far beyond the panel.
         let left = column.checked_sub(1).map_or(right - 2.0 * PANEL_SIZE_MM, |before| course.ends[before]);
-        let (half_length, half_height) = ((right - left) / 2.0, course.height / 2.0);
-        let (dx, dy) = (x - (left + right) / 2.0, y - (course.top - half_height));
+        let half_length = (right - left) / 2.0;
+        let half_height = course.height / 2.0;
+        let dx = x - (left + right) / 2.0;
+        let dy = y - (course.top - half_height);
         let to_joint = (half_length - dx.abs()).min(half_height - dy.abs()).max(0.0);
         let stone = self.chance.at_place(column as i64, row as i64);
         let rise = pillow_rise(to_joint - half_joint, PILLOW * 2.0 * half_height.min(half_length));

@@ -246,7 +246,8 @@ fn parameter_limits(key: &str, known: &[ReliefParameter]) -> Option<[f64; 2]> {
 
 // Widens about the middle, within the limits; a part that is cut off on one side is not added on the other.
 fn stretch_range([from, to]: [f64; 2], factor: f64, [low, high]: [f64; 2]) -> [f64; 2] {
-    let (middle, half) = ((from + to) / 2.0, (to - from) / 2.0 * factor);
+    let middle = (from + to) / 2.0;
+    let half = (to - from) / 2.0 * factor;
     [(middle - half).max(low), (middle + half).min(high)].map(|x| round_in_range(x, to - from))
 }
 

@@ -77,7 +77,8 @@ impl PrimitiveRootDiffuser {
         let Some((n, m)) = self.well_counts() else { return vec![0.0] };
         let mut depths = vec![0.0; (n * m) as usize];
         for (k, value) in (0u64..).zip(self.root_sequence()) {
-            let (x, y) = (k % n, k % m);
+            let x = k % n;
+            let y = k % m;
             depths[(y * n + x) as usize] = value as f64 * self.depth_mm / self.prime as f64;
         }
         depths
@@ -122,7 +123,8 @@ fn prime_factors(mut n: u64) -> Vec<u64> {
 }
 
 fn power_mod(base: u64, mut exponent: u64, modulus: u64) -> u64 {
-    let (mut result, mut square) = (1, base % modulus);
+    let mut result = 1;
+    let mut square = base % modulus;
     while exponent > 0 {
         if exponent % 2 == 1 {
             result = result * square % modulus;

@@ -93,7 +93,8 @@ impl StoneCells {
         let first = scale.map(|s| (-PANEL_SIZE_MM / 2.0 / s).floor() as i64 - 2 * REACH);
         let counts = first.map(|first| (-2 * first + 1) as usize);
         let stone = |n: usize| {
-            let (ix, iy) = (first[0] + (n % counts[0]) as i64, first[1] + (n / counts[0]) as i64);
+            let ix = first[0] + (n % counts[0]) as i64;
+            let iy = first[1] + (n / counts[0]) as i64;
             // Odd rows are shifted by half a stone, so that stones without irregularity are hexagons.
             let shift = 0.5 * iy.rem_euclid(2) as f64;
             let off = |n| 0.45 * settings.irregularity * chance.at_place(ix, iy).signed_number(n);

@@ -184,7 +184,8 @@ fn draw_calibration(points: usize, mean_mm: f64) -> [Vec<[f64; 3]>; 2] {
 // The farthest echo comes by a corner of the panel, between the two points that are farthest from theirs, in air of
 // 0 C at the coldest.
 fn response_len(relief: &HeightField, points: &[[f64; 3]], rate_hz: f64) -> usize {
-    let (half, lowest) = (relief.size_mm() / 2.0, f64::from(relief.extent_mm()[0]));
+    let half = relief.size_mm() / 2.0;
+    let lowest = f64::from(relief.extent_mm()[0]);
     let to_corner = |[x, y, z]: [f64; 3]| (x.abs() + half).hypot(y.abs() + half).hypot(z - lowest);
     let farthest = points.iter().map(|p| to_corner(*p)).fold(0.0, f64::max);
     let samples = 2.0 * farthest / 1e3 / speed_of_sound(0.0) * rate_hz + RINGING;
@@ -376,7 +377,8 @@ impl Played {
     fn new(output: &[f32], rate_hz: f64, response_len: usize) -> Self {
         // Room for the response and the converter's delay behind the output, so that nothing wraps around.
         let len = fast_length(output.len() + response_len + 2 * CONVERTER_DELAY as usize);
-        let (forward, inverse) = (f32::plan_real_forward(len), f32::plan_real_inverse(len));
+        let forward = f32::plan_real_forward(len);
+        let inverse = f32::plan_real_inverse(len);
         let mut played = Self {
             output: output.to_vec(),
             loopback: Vec::new(),

@@ -32,7 +32,8 @@ pub(super) fn on_axis_response(frequency_hz: f64) -> Complex<f64> {
 // A bell of this gain around its frequency, with the least phase that goes with it.
 fn resonance_response(frequency_hz: f64, (resonance_hz, gain_db, quality): (f64, f64, f64)) -> Complex<f64> {
     let at = Complex::new(0.0, frequency_hz / resonance_hz);
-    let (gain, width) = (10f64.powf(gain_db / 40.0), at / quality);
+    let gain = 10f64.powf(gain_db / 40.0);
+    let width = at / quality;
     (at * at + width * gain + 1.0) / (at * at + width / gain + 1.0)
 }
 

@@ -118,7 +118,8 @@ impl AlsaDuplex {
     }
 
     fn channel(&self, bytes: &[u8], channel: u32, out: &mut Vec<i32>) {
-        let (size, channels) = (self.sample_bytes(), self.params.inputs as usize);
+        let size = self.sample_bytes();
+        let channels = self.params.inputs as usize;
         let at = size * (channel as usize - 1);
         out.clear();
         out.extend(bytes.chunks_exact(size * channels).map(|frame| decoded(&frame[at..at + size], self.params.format)));

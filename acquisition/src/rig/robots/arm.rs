@@ -217,7 +217,8 @@ impl RobotArm {
 
 /// Poses of each link over the one before, foot to flange.
 fn link_poses(q: &Joints) -> [Pose; 6] {
-    let (y, z) = (DQuat::from_rotation_y, DQuat::from_rotation_z);
+    let y = DQuat::from_rotation_y;
+    let z = DQuat::from_rotation_z;
     let step = |x: [f64; 3], turn| Pose::from_parts(DVec3::from_array(x), turn);
     [
         step([0.0, 0.0, SHOULDER_M], z(q[0])),

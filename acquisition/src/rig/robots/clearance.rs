@@ -45,7 +45,8 @@ impl ArmSurroundings {
 
     // The part of the segment that is over the panel, widened by radius and margin, has to be high enough.
     fn over_panel(&self, c: &LinkCapsule) -> bool {
-        let (reach, along) = (self.half_m + c.radius + self.margin_m, c.to - c.from);
+        let reach = self.half_m + c.radius + self.margin_m;
+        let along = c.to - c.from;
         let mut range = [0.0f64, 1.0];
         for (from, along) in [(c.from.x, along.x), (c.from.y, along.y)] {
             if along == 0.0 && from.abs() > reach {
@@ -63,9 +64,14 @@ impl ArmSurroundings {
 
 // Least distance of two segments (Ericson, Real-Time Collision Detection, 5.1.9).
 fn segment_distance(p1: DVec3, q1: DVec3, p2: DVec3, q2: DVec3) -> f64 {
-    let (d1, d2, r) = (q1 - p1, q2 - p2, p1 - p2);
-    let (a, e, f) = (d1.dot(d1), d2.dot(d2), d2.dot(r));
-    let (b, c) = (d1.dot(d2), d1.dot(r));
+    let d1 = q1 - p1;
+    let d2 = q2 - p2;
+    let r = p1 - p2;
+    let a = d1.dot(d1);
+    let e = d2.dot(d2);
+    let f = d2.dot(r);
+    let b = d1.dot(d2);
+    let c = d1.dot(r);
     let clamped = |x: f64| if x.is_finite() { x.clamp(0.0, 1.0) } else { 0.0 };
     let parallel = a * e - b * b;
     let s = if parallel > 1e-12 { clamped((b * f - c * e) / parallel) } else { 0.0 };

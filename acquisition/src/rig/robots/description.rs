@@ -54,7 +54,8 @@ impl Cell {
 }
 
 fn write_arm(out: &mut String, arm: &RobotArm) {
-    let (tool, frames) = (arm.tool(), frame_names(arm.tool()));
+    let tool = arm.tool();
+    let frames = frame_names(arm.tool());
     let cylinder = |radius: f64, length: f64| format!("<cylinder radius=\"{radius}\" length=\"{length}\"/>");
     let sphere = |radius: f64| format!("<sphere radius=\"{radius}\"/>");
     let [holder, transducer] = tool.radii_m();
@@ -72,7 +73,8 @@ fn write_arm(out: &mut String, arm: &RobotArm) {
     for (name, (shape, z)) in frames.iter().zip(&shapes) {
         write_link(out, name, shape, *z, colour);
     }
-    let (foot, tool) = (arm.foot(), tool.pose_on_flange());
+    let foot = arm.foot();
+    let tool = tool.pose_on_flange();
     let over_floor = (foot.translation + DVec3::new(0.0, 0.0, PANEL_M)).to_array();
     write_fixed_joint(out, "world", &frames[0], over_floor, roll_pitch_yaw(foot));
     for (i, joint) in joint_names(arm.tool()).iter().enumerate() {
@@ -85,7 +87,9 @@ fn write_arm(out: &mut String, arm: &RobotArm) {
         };
         let [low, high] = RANGES_DEG[i].map(f64::to_radians);
         let speed = SPEEDS_DEG[i].to_radians();
-        let (parent, child, axis) = (&frames[i], &frames[i + 1], AXES[i]);
+        let parent = &frames[i];
+        let child = &frames[i + 1];
+        let axis = AXES[i];
         let _ = writeln!(
             out,
             "  <joint name=\"{joint}\" type=\"revolute\"><origin xyz=\"{origin}\"/><parent link=\"{parent}\"/>\

@@ -103,7 +103,8 @@ pub fn plan_motion(cell: &Cell, from: &ArmPose, to: &ArmPose) -> Option<ArmMotio
 
 // Any way out of the first pose with any way out of the second, backwards.
 fn both_drawn_back(cell: &Cell, from: &Pose, to: &Pose) -> Option<ArmMotion> {
-    let (outs, ins) = (find_retreats(cell, from), find_retreats(cell, to));
+    let outs = find_retreats(cell, from);
+    let ins = find_retreats(cell, to);
     let pairs = outs.iter().flat_map(|out| ins.iter().map(move |back| (out, back)));
     let motion = |(out, back): (&Vec<Pose>, &Vec<Pose>)| {
         let stops = out.iter().chain(back.iter().rev()).chain([to]).copied().collect();

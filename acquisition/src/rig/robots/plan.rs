@@ -110,7 +110,8 @@ impl Tour {
         let mut best = (1e-6, None);
         for near in &self.near[place] {
             let l = self.at[*near];
-            let (low, high) = (k.min(l), k.max(l));
+            let low = k.min(l);
+            let high = k.max(l);
             for [from, to] in [[low + 1, high], [low, high.saturating_sub(1)]] {
                 if from >= 1 && from < to {
                     let saved = self.saved_secs(from, to);

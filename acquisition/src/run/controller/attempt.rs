@@ -168,7 +168,8 @@ impl RunController<'_> {
         clipped: u32,
         celsius: f64,
     ) -> Result<TakeAssessment, echolake_dsp::Error> {
-        let (sweep, reference) = (&self.rig.sweep, self.rig.impulse_response.reference_temperature_c.get());
+        let sweep = &self.rig.sweep;
+        let reference = self.rig.impulse_response.reference_temperature_c.get();
         let limits_hz = response_limits_hz([sweep.low_hz, sweep.high_hz], resampling_ratio(celsius, reference));
         self.deconvolution.run_within(limits_hz, &self.microphone, &self.loopback, &mut self.ir, &mut self.scratch)?;
         self.assessor.assess_take(&self.microphone, &self.loopback, arrival_secs, clipped)
@@ -177,7 +178,9 @@ impl RunController<'_> {
     // The order within an attempt is kept for live views. In the file a verdict follows its messages because
     // the recorder writes its chunk last.
     pub(super) fn record_attempt(&mut self, run: &mut RunProgress<'_>, made: &AttemptResult) -> Result<(), Error> {
-        let (at, m, reading) = (made.at, &made.measurement, &made.reading);
+        let at = made.at;
+        let m = &made.measurement;
+        let reading = &made.reading;
         let sample_rate_hz = self.rig.sweep.rate_hz.get();
         if let Some(reached) = made.reached {
             run.recorder.poses(at, reached.microphone_mm, reached.speaker_mm)?;

@@ -68,7 +68,8 @@ impl RunMonitor {
             return Ok(());
         }
         let megabytes = |bytes: u64| bytes as f64 / 1e6;
-        let (free_mb, needed_mb) = (megabytes(free), megabytes(needed));
+        let free_mb = megabytes(free);
+        let needed_mb = megabytes(needed);
         Err(Error::DiskNearlyFull { folder: self.folder.clone(), free_mb, needed_mb })
     }
 }

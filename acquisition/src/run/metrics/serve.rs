@@ -75,7 +75,8 @@ fn answer_request(mut stream: TcpStream, metrics: &RunMetrics) -> io::Result<()>
     let line = request.split(|b| *b == b'\r').next().unwrap_or_default();
     let line = String::from_utf8_lossy(line);
     let mut words = line.split(' ');
-    let (method, path) = (words.next().unwrap_or_default(), words.next().unwrap_or_default());
+    let method = words.next().unwrap_or_default();
+    let path = words.next().unwrap_or_default();
     let (status, body) = match (method, path.split('?').next()) {
         ("GET", Some("/metrics")) => ("200 OK", metrics.prometheus()),
         ("GET", _) => ("404 Not Found", "there is only /metrics\n".to_owned()),

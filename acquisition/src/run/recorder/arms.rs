@@ -92,7 +92,8 @@ impl Recorder {
     /// [`Error::Write`].
     pub fn record_joints(&mut self, at: Timestamp, joints: &[Joints; 2]) -> Result<(), Error> {
         let Some(Arms { cell, joints: channels, .. }) = &self.arms else { return Ok(()) };
-        let (cell, channels) = (cell.clone(), *channels);
+        let cell = cell.clone();
+        let channels = *channels;
         self.foxglove(self.channels.tf, at, &scene::arm_frames(at, &cell, joints))?;
         for ((tool, joints), channel) in [Tool::Microphone, Tool::Speaker].into_iter().zip(joints).zip(channels) {
             self.foxglove(channel, at, &scene::joint_states(at, tool, joints))?;

@@ -57,7 +57,8 @@ pub(super) fn arm_frames(at: Timestamp, cell: &Cell, joints: &[Joints; 2]) -> Fr
     };
     let mut transforms = vec![frame("world", "panel", [0.0, 0.0, PANEL_M], [0.0, 0.0, 0.0, 1.0])];
     for (tool, joints) in [Tool::Microphone, Tool::Speaker].into_iter().zip(joints) {
-        let (mut parent, names) = ("world".to_owned(), frame_names(tool));
+        let mut parent = "world".to_owned();
+        let names = frame_names(tool);
         for (i, (name, pose)) in names.into_iter().zip(cell.arm_with_tool(tool).relative_frames(joints)).enumerate() {
             let mut at = pose.translation.to_array();
             // Feet are known over the panel, and stand on the world.

@@ -57,11 +57,13 @@ impl HeightField {
 
     /// Tangent of the horizon's angle.
     fn horizon_tangent(&self, ix: usize, iy: usize, [dx, dy]: [f64; 2], steps: impl Iterator<Item = f64>) -> f64 {
-        let (here, pitch) = (f64::from(self.cell_height(ix, iy)), self.pitch_mm());
+        let here = f64::from(self.cell_height(ix, iy));
+        let pitch = self.pitch_mm();
         let last = (self.cells() - 1) as f64;
         let mut highest = 0.0f64;
         for step in steps {
-            let (x, y) = ((ix as f64 + dx * step).round(), (iy as f64 + dy * step).round());
+            let x = (ix as f64 + dx * step).round();
+            let y = (iy as f64 + dy * step).round();
             if x < 0.0 || y < 0.0 || x > last || y > last {
                 break;
             }

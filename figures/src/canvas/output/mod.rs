@@ -20,7 +20,8 @@ fn text_offset(text: &str, size_px: f32, anchor: TextAnchor) -> f32 {
 fn ellipse_curves([rx, ry]: [f32; 2]) -> ([f32; 2], [[[f32; 2]; 3]; 4]) {
     // A quarter of a circle as a cubic curve.
     const REACH: f32 = 0.552_284_8;
-    let (kx, ky) = (REACH * rx, REACH * ry);
+    let kx = REACH * rx;
+    let ky = REACH * ry;
     let curves = [
         [[rx, ky], [kx, ry], [0.0, ry]],
         [[-kx, ry], [-rx, ky], [-rx, 0.0]],

@@ -15,7 +15,8 @@ const FONTS: &str = "IBM Plex Sans,Helvetica Neue,Arial,sans-serif";
 impl FigureDrawing {
     /// Returns the drawing as an SVG file.
     pub fn to_svg(&self) -> String {
-        let (width, height) = (Number(self.width_px), Number(self.height_px));
+        let width = Number(self.width_px);
+        let height = Number(self.height_px);
         let notes = &self.notes;
         let mut svg = format!(
             "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{width}\" height=\"{height}\" viewBox=\"0 0 {width} \

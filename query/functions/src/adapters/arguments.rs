@@ -85,7 +85,8 @@ pub(crate) fn coerced_types(description: &FunctionDescription, types: &[DataType
 
 /// Checks the number of arguments and their types, after [`coerced_types`].
 pub(crate) fn check_arguments(description: &FunctionDescription, types: &[DataType]) -> Result<()> {
-    let (most, name) = (description.parameters.len(), description.name);
+    let most = description.parameters.len();
+    let name = description.name;
     if !(most - description.optional..=most).contains(&types.len()) {
         let given = match types.len() {
             1 => "1 argument is".to_owned(),
@@ -104,7 +105,8 @@ pub(crate) fn check_arguments(description: &FunctionDescription, types: &[DataTy
             ArgumentKind::Value => true,
         };
         if !fits {
-            let (i, words) = (i + 1, kind.display_words());
+            let i = i + 1;
+            let words = kind.display_words();
             let message =
                 format!("`{name}`: argument {i}, `{parameter}`, is {given}, not {words}; hint: it is {about}");
             return Err(DataFusionError::Plan(message));
@@ -225,7 +227,8 @@ impl<'a> CallArguments<'a> {
 
     /// Returns the error for an invalid argument of a row, with a hint.
     pub fn invalid_argument(&self, argument: usize, row: usize, is: impl Debug, hint: &str) -> DataFusionError {
-        let (name, parameter) = (self.description.name, self.description.parameters[argument].name);
+        let name = self.description.name;
+        let parameter = self.description.parameters[argument].name;
         let row = row + 1;
         DataFusionError::Execution(format!("`{name}`: `{parameter}` is {is:?} in row {row} of its batch; hint: {hint}"))
     }
@@ -239,13 +242,15 @@ impl<'a> CallArguments<'a> {
             }
             _ => self.description.about,
         };
-        let (name, row) = (self.description.name, row + 1);
+        let name = self.description.name;
+        let row = row + 1;
         DataFusionError::Execution(format!("`{name}`, row {row} of its batch: {error}; hint: {hint}"))
     }
 
     // Planning casts to the right types, so only plans built without it get here.
     fn other_type(&self, argument: usize) -> DataFusionError {
-        let (name, kind) = (self.description.name, self.columns[argument].array.data_type());
+        let name = self.description.name;
+        let kind = self.columns[argument].array.data_type();
         DataFusionError::Execution(format!(
             "`{name}`: argument {} is {kind}; hint: {}",
             argument + 1,
@@ -259,7 +264,8 @@ impl<'a, T> SampleLists<'a, T> {
     pub fn samples_at(&self, row: usize) -> Result<&'a [T]> {
         let row = if self.constant { 0 } else { row };
         let offsets = self.list.value_offsets();
-        let (from, to) = (offsets[row] as usize, offsets[row + 1] as usize);
+        let from = offsets[row] as usize;
+        let to = offsets[row + 1] as usize;
         match self.nulls {
             Some(nulls) if nulls.slice(from, to - from).null_count() > 0 => Err(self.null_inside(row, from, to)),
             _ => Ok(&self.values[from..to]),
@@ -275,7 +281,10 @@ impl<'a, T> SampleLists<'a, T> {
 
     fn null_inside(&self, row: usize, from: usize, to: usize) -> DataFusionError {
         let at = self.nulls.and_then(|nulls| (from..to).find(|i| nulls.is_null(*i))).unwrap_or(from) - from;
-        let (function, parameter, row, at) = (self.function, self.parameter, row + 1, at + 1);
+        let function = self.function;
+        let parameter = self.parameter;
+        let row = row + 1;
+        let at = at + 1;
         let hint = "array_compact() takes nulls out, or leave such rows out";
         DataFusionError::Execution(format!(
             "`{function}`: element {at} of `{parameter}` is null in row {row} of its batch; hint: {hint}"

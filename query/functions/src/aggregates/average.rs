@@ -75,7 +75,8 @@ impl AggregateKernel for AvgListFunction {
     }
 
     fn merge_states(&self, states: &[ArrayRef], groups: &mut GroupStates<'_, Self>) -> Result<()> {
-        let (lists, counts) = (states[0].as_list::<i32>(), states[1].as_primitive::<UInt64Type>().values());
+        let lists = states[0].as_list::<i32>();
+        let counts = states[1].as_primitive::<UInt64Type>().values();
         let sums = lists.values().as_primitive::<Float64Type>().values();
         for (row, ends) in lists.value_offsets().windows(2).enumerate() {
             let sums = &sums[ends[0] as usize..ends[1] as usize];

@@ -195,9 +195,11 @@ impl Accumulator for ValueCounts {
     }
 
     fn merge_batch(&mut self, states: &[ArrayRef]) -> Result<()> {
-        let (values, counts) = (states[0].as_list::<i32>(), states[1].as_list::<i32>());
+        let values = states[0].as_list::<i32>();
+        let counts = states[1].as_list::<i32>();
         for row in 0..values.len() {
-            let (values, counts) = (values.value(row), counts.value(row));
+            let values = values.value(row);
+            let counts = counts.value(row);
             let counts = counts.as_primitive::<Int64Type>();
             (0..values.len()).try_for_each(|at| self.add_value(&values, at, counts.value(at)))?;
         }

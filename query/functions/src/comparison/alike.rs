@@ -74,7 +74,8 @@ impl ScalarKernel for PearsonFunction {
     }
 
     fn compute_answers<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
-        let (x, y) = (arguments.sample_lists::<T>(0)?, arguments.sample_lists::<T>(1)?);
+        let x = arguments.sample_lists::<T>(0)?;
+        let y = arguments.sample_lists::<T>(1)?;
         build_numbers(arguments, |row| {
             pearson(x.samples_at(row)?, y.samples_at(row)?).map_err(|e| arguments.refused_row(row, &e))
         })
@@ -91,10 +92,12 @@ impl ScalarKernel for SimilarityFunction {
     }
 
     fn compute_answers<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
-        let (x, y) = (arguments.sample_lists::<T>(0)?, arguments.sample_lists::<T>(1)?);
+        let x = arguments.sample_lists::<T>(0)?;
+        let y = arguments.sample_lists::<T>(1)?;
         let mut plans = PerLength::new(SIMILARITY.name);
         build_numbers(arguments, |row| {
-            let (x, y) = (x.samples_at(row)?, y.samples_at(row)?);
+            let x = x.samples_at(row)?;
+            let y = y.samples_at(row)?;
             if x.len() != y.len() {
                 let error = Error::Length { what: "the second response", actual: y.len(), expected: x.len() };
                 return Err(arguments.refused_row(row, &error));

@@ -161,7 +161,9 @@ impl ScalarKernel for D4PositionFunction {
     }
 
     fn compute_answers<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
-        let (x, y, names) = (arguments.number_values(0)?, arguments.number_values(1)?, arguments.text_values(2)?);
+        let x = arguments.number_values(0)?;
+        let y = arguments.number_values(1)?;
+        let names = arguments.text_values(2)?;
         build_structs(arguments, &POSITION_FIELDS, |row, out| {
             let [x, y, _] =
                 row_symmetry(arguments, &names, 2, row)?.move_position([x.value_at(row), y.value_at(row), 0.0]);
@@ -182,7 +184,8 @@ impl ScalarKernel for D4PointFunction {
     }
 
     fn compute_answers<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
-        let (ids, names) = (arguments.integer_values(0)?, arguments.text_values(1)?);
+        let ids = arguments.integer_values(0)?;
+        let names = arguments.text_values(1)?;
         let point = |row| {
             if arguments.is_null(row) {
                 return Ok(None);
@@ -204,7 +207,8 @@ impl ScalarKernel for D4PairFunction {
     }
 
     fn compute_answers<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
-        let (ids, names) = (arguments.integer_values(0)?, arguments.text_values(1)?);
+        let ids = arguments.integer_values(0)?;
+        let names = arguments.text_values(1)?;
         let pair = |row| {
             if arguments.is_null(row) {
                 return Ok(None);
@@ -231,9 +235,11 @@ impl ScalarKernel for D4HeightmapFunction {
     }
 
     fn compute_answers<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
-        let (maps, names) = (arguments.sample_lists::<T>(0)?, arguments.text_values(1)?);
+        let maps = arguments.sample_lists::<T>(0)?;
+        let names = arguments.text_values(1)?;
         build_lists::<T>(arguments, maps.sample_capacity(arguments.row_count()), |row, out| {
-            let (map, symmetry) = (maps.samples_at(row)?, row_symmetry(arguments, &names, 1, row)?);
+            let map = maps.samples_at(row)?;
+            let symmetry = row_symmetry(arguments, &names, 1, row)?;
             move_heights(map, symmetry, append_defaults(out, map.len())).map_err(|e| arguments.refused_row(row, &e))?;
             Ok(true)
         })

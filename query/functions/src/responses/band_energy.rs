@@ -88,7 +88,8 @@ impl ScalarKernel for BandEnergyFunction {
     }
 
     fn compute_answers<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
-        let (ir, bands) = (arguments.sample_lists::<T>(0)?, self.facts.centres_hz.len());
+        let ir = arguments.sample_lists::<T>(0)?;
+        let bands = self.facts.centres_hz.len();
         let mut energies = self.energy_writer(arguments, &ir);
         if arguments.argument_count() == 1 {
             return build_structs(arguments, &self.fields, |row, values| {
@@ -97,7 +98,8 @@ impl ScalarKernel for BandEnergyFunction {
                 Ok(there)
             });
         }
-        let (centre, mut all) = (arguments.number_values(1)?, vec![0.0; bands]);
+        let centre = arguments.number_values(1)?;
+        let mut all = vec![0.0; bands];
         build_numbers(arguments, |row| {
             let centre = centre.value_at(row);
             let band = self.facts.band_index(centre);

@@ -58,11 +58,13 @@ impl ScalarKernel for NceFunction {
     }
 
     fn compute_answers<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
-        let (ir, flat) = (arguments.sample_lists::<T>(0)?, arguments.number_values(1)?);
+        let ir = arguments.sample_lists::<T>(0)?;
+        let flat = arguments.number_values(1)?;
         let room = ir.sample_capacity(arguments.row_count());
         if arguments.argument_count() == 2 {
             return build_lists::<T>(arguments, room, |row, out| {
-                let (ir, flat) = (ir.samples_at(row)?, flat.value_at(row));
+                let ir = ir.samples_at(row)?;
+                let flat = flat.value_at(row);
                 cumulate_whole(ir, flat, append_defaults(out, ir.len()));
                 Ok(flat > 0.0)
             });
@@ -70,7 +72,9 @@ impl ScalarKernel for NceFunction {
         let centre = arguments.number_values(2)?;
         let mut plans = PerLength::new(DESCRIPTION.name);
         build_lists::<T>(arguments, room, |row, out| {
-            let (ir, flat, centre) = (ir.samples_at(row)?, flat.value_at(row), centre.value_at(row));
+            let ir = ir.samples_at(row)?;
+            let flat = flat.value_at(row);
+            let centre = centre.value_at(row);
             let band = self.0.band_index(centre);
             let band = band.ok_or_else(|| arguments.invalid_argument(2, row, centre, &self.0.bands_hint()))?;
             if ir.is_empty() {
@@ -78,7 +82,8 @@ impl ScalarKernel for NceFunction {
             }
             let (plan, scratch, bands) = plans.plan_for(ir.len(), |len| {
                 let plan = FilterBankPlan::<T>::new(len, self.0.rate_hz, &self.0.centres_hz)?;
-                let (scratch, bands) = (plan.make_scratch(), vec![T::default(); plan.band_count() * len]);
+                let scratch = plan.make_scratch();
+                let bands = vec![T::default(); plan.band_count() * len];
                 Ok((plan, scratch, bands))
             })?;
             plan.split_bands(ir, bands, scratch).map_err(|e| arguments.refused_row(row, &e))?;

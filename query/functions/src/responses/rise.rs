@@ -110,7 +110,8 @@ impl ScalarKernel for CurveShapeFunction {
     }
 
     fn compute_answers<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
-        let (curves, per_ms) = (arguments.sample_lists::<T>(0)?, self.facts.rate_hz / 1e3);
+        let curves = arguments.sample_lists::<T>(0)?;
+        let per_ms = self.facts.rate_hz / 1e3;
         build_numbers(arguments, |row| {
             let curve = curves.samples_at(row)?;
             require_rising(arguments, row, curve)?;

@@ -77,7 +77,8 @@ impl CurveSet {
             }
             first(&sql, [text_value(surface)].into_iter().chain(value.clone()).collect()).await
         };
-        let (id, flat) = (&entry.surface.surface_id, &entry.surface.flat_reference);
+        let id = &entry.surface.surface_id;
+        let flat = &entry.surface.flat_reference;
         // What is left of Foam without Foam is no energy of a surface.
         let read_own = async || if entry.surface.is_foam() { Ok(None) } else { read(id).await };
         let known = request.view.flat_curves(flat);

@@ -461,13 +461,16 @@ impl SurfaceOrder {
 
 // Digits by the number that they make: `panel_9` before `panel_10`.
 fn natural_order(a: &str, b: &str) -> Ordering {
-    let (mut a, mut b) = (a, b);
+    let mut a = a;
+    let mut b = b;
     loop {
-        let (digits_a, digits_b) = (leading_digits(a), leading_digits(b));
+        let digits_a = leading_digits(a);
+        let digits_b = leading_digits(b);
         let ordering = match (digits_a.is_empty() || digits_b.is_empty(), a.chars().next(), b.chars().next()) {
             (false, ..) => {
                 let number = |text: &str| text.trim_start_matches('0').to_owned();
-                let (x, y) = (number(digits_a), number(digits_b));
+                let x = number(digits_a);
+                let y = number(digits_b);
                 x.len().cmp(&y.len()).then_with(|| x.cmp(&y)).then_with(|| digits_a.len().cmp(&digits_b.len()))
             }
             (true, None, None) => return Ordering::Equal,
@@ -477,7 +480,8 @@ fn natural_order(a: &str, b: &str) -> Ordering {
             return ordering;
         }
         let step = |text: &str, digits: &str| if digits.is_empty() { first_len(text) } else { digits.len() };
-        let (step_a, step_b) = (step(a, digits_a), step(b, digits_b));
+        let step_a = step(a, digits_a);
+        let step_b = step(b, digits_b);
         (a, b) = (&a[step_a..], &b[step_b..]);
     }
 }

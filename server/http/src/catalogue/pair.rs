@@ -217,7 +217,8 @@ pub(super) async fn read_reflected(
     entry: &SurfaceEntry,
     pair: usize,
 ) -> Result<[Option<Vec<f32>>; 2], RequestFault> {
-    let (id, flat) = (&entry.surface.surface_id, &entry.surface.flat_reference);
+    let id = &entry.surface.surface_id;
+    let flat = &entry.surface.flat_reference;
     let rows: Vec<ReflectedResponse> =
         request.read_rows(REFLECTED, vec![text_value(id), text_value(flat), number_value(pair)]).await?;
     let of = |surface: &str| rows.iter().find(|row| row.surface_id == surface).and_then(|row| row.reflected.clone());
@@ -360,7 +361,8 @@ async fn read_energies(
     let rig = request.catalogue.lake().rig();
     let over_total = |band: &str| format!("tnce_{band}");
     let over_band = |band: &str| if band == TOTAL_BAND { over_total(band) } else { format!("tnce_band_{band}") };
-    let (total, band) = (band_list(rig, over_total), band_list(rig, over_band));
+    let total = band_list(rig, over_total);
+    let band = band_list(rig, over_band);
     let total_u = band_list(rig, |band| format!("{}_u_db", over_total(band)));
     let band_u = band_list(rig, |band| format!("{}_u_db", over_band(band)));
     let sql = format!(

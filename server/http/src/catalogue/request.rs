@@ -129,7 +129,8 @@ impl CatalogueRequest {
         let prepared = match self.view.find_prepared(sql) {
             Some(prepared) => prepared,
             None => {
-                let (session, text) = (self.view.session.clone(), sql.to_owned());
+                let session = self.view.session.clone();
+                let text = sql.to_owned();
                 let planned = service
                     .plan_query(self.view.session.client(), async move { Ok(session.prepare(&text).await?) })
                     .await?;

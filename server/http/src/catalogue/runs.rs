@@ -266,7 +266,8 @@ pub(super) async fn run(
         "select log_time, level, name, message from (select * from events where run_id = $1 \
          order by level in ('debug', 'info', 'unknown'), log_time_ns limit {MOST_EVENTS}) order by log_time_ns"
     );
-    let (session, service) = (request.view.session.clone(), request.catalogue.service());
+    let session = request.view.session.clone();
+    let service = request.catalogue.service();
     let (contents, run, repeats, flags, events) = tokio::try_join!(
         service.plan_query(request.view.session.client(), async move { Ok(session.read_contents(&visible).await?) }),
         request.read_rows::<RunRecord>(&one, vec![id.clone()]),

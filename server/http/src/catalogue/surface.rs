@@ -93,7 +93,8 @@ pub(super) async fn surface(
     PathParams(path): PathParams<SurfacePath>,
 ) -> EndpointAnswer {
     let entry = request.find_surface(&path.surface_id).await?;
-    let (id, flat) = (&entry.surface.surface_id, &entry.surface.flat_reference);
+    let id = &entry.surface.surface_id;
+    let flat = &entry.surface.flat_reference;
     let means = band_list(request.catalogue.lake().rig(), |band| format!("avg(tnce_{band})"));
     let means =
         format!("select surface_id, {means} as means from tnce where surface_id in ($1, $2) group by surface_id");

@@ -16,7 +16,8 @@ impl ToolCall<'_> {
     pub async fn surface_summary(&self, surface: &str) -> Result<Value, RequestFault> {
         let mut summary = self.agents.catalogue.surface_value(surface).await?;
         // A name that is found has letters, digits, `_` and `-` alone.
-        let (origin, path) = (self.origin, format!("/surfaces/{surface}"));
+        let origin = self.origin;
+        let path = format!("/surfaces/{surface}");
         summary["links"] = json!({
             "page": format!("{origin}{path}"),
             "mesh": format!("{origin}/api/v1{path}/mesh.glb"),
@@ -36,7 +37,8 @@ impl ToolCall<'_> {
             events.drain(..left_out);
             summary["events_left_out"] = left_out.into();
         }
-        let (origin, path) = (self.origin, format!("/runs/{run}"));
+        let origin = self.origin;
+        let path = format!("/runs/{run}");
         summary["links"] = json!({
             "page": format!("{origin}{path}"),
             "file": format!("{origin}/api/v1{path}/file.mcap"),

@@ -45,7 +45,8 @@ impl SliceTask {
         room: SliceResources,
     ) -> Self {
         let (to, pieces) = mpsc::channel(WAITING);
-        let (of, client) = (service.clone(), client.clone());
+        let of = service.clone();
+        let client = client.clone();
         let SliceResources { place: room, turns } = room;
         let protocol = request_protocol();
         let task = service.spawn_work(async move {

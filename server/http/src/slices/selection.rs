@@ -89,7 +89,9 @@ impl SliceRequest {
         select: String,
     ) -> Result<RunningQuery<RecordBatch>, RequestFault> {
         let session = Arc::new(service.begin_session(&self.client));
-        let (asking, predicate, form) = (session.clone(), self.question.predicate().to_owned(), self.question.form);
+        let asking = session.clone();
+        let predicate = self.question.predicate().to_owned();
+        let form = self.question.form;
         let sql = service
             .plan_query(&self.client, async move { Ok(asking.append_predicate(&select, &predicate, form)?) })
             .await?;

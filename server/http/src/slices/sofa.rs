@@ -67,7 +67,8 @@ pub(super) async fn get_sofa(
     let request = slices.read_request(params, &uri, &headers).await?;
     let rows = slices.read_responses(&request).await?;
     let run = only_run(&request, &rows)?;
-    let (name, run_id) = (format!("{}.sofa", run.surface), run.run.clone());
+    let name = format!("{}.sofa", run.surface);
+    let run_id = run.run.clone();
     let lake = slices.0.catalogue.lake().clone();
     let made = slices.0.catalogue.service().compute_blocking(move || sofa_bytes(&lake, &run, &rows)).await??;
     let described = FileDescription {

@@ -176,7 +176,8 @@ impl SpooledSlice {
                 return Ok(None);
             }
             let end = range.end.min(range.start + BLOCK);
-            let (from, reading) = (range.start, slice.clone());
+            let from = range.start;
+            let reading = slice.clone();
             let read = on_disk(move || {
                 let mut block = vec![0; (end - from) as usize];
                 reading.file.read_exact_at(&mut block, from).map(|()| Bytes::from(block))

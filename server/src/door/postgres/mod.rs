@@ -44,7 +44,9 @@ pub(super) async fn serve_postgres_clients(door: ServerDoor, listener: TcpListen
     let keys = Arc::new(CancelKeys::default());
     places
         .attend_connections(|stream| {
-            let (door, keys, encryption) = (door.clone(), keys.clone(), encryption.clone());
+            let door = door.clone();
+            let keys = keys.clone();
+            let encryption = encryption.clone();
             let place = LoginPlace { door, keys, encryption, work: stream.work_handle() };
             attend_client(stream, place)
         })
@@ -60,7 +62,8 @@ struct LoginPlace {
 }
 
 async fn attend_client(stream: PlacedStream, place: LoginPlace) {
-    let (evicted, work) = (stream.wait_for_eviction(), place.work.clone());
+    let evicted = stream.wait_for_eviction();
+    let work = place.work.clone();
     let login = async {
         tokio::select! {
             login = tokio::time::timeout(LOGIN, place.log_in(stream)) => login.ok().flatten(),

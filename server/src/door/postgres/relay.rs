@@ -274,7 +274,8 @@ impl MessageRelay {
     // None if the engine refuses the session; its error message is passed on to the client.
     async fn start_session(&mut self, lease: EngineLease) -> io::Result<Option<EngineLink>> {
         let (read, write) = lease.engine().connect_socket(EngineSocket::Postgres).await?.into_split();
-        let (incoming, outgoing) = (BytesMut::with_capacity(READ_BYTES), BytesMut::new());
+        let incoming = BytesMut::with_capacity(READ_BYTES);
+        let outgoing = BytesMut::new();
         let mut link = EngineLink { lease, read, write, incoming, outgoing, rest: 0 };
         link.write.write_all(&self.login.startup).await?;
         loop {

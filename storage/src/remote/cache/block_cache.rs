@@ -70,7 +70,8 @@ impl BlockCache {
         numbers: BTreeSet<u64>,
         scan: Option<&CacheCounters>,
     ) -> StoreResult<BTreeMap<u64, CachedBlock>> {
-        let (mut blocks, mut missing) = (BTreeMap::new(), Vec::new());
+        let mut blocks = BTreeMap::new();
+        let mut missing = Vec::new();
         // In ascending order, so that two readers never wait for each other.
         for number in numbers {
             match self.memory.get_value_or_guard_async(&(path.clone(), number)).await {
@@ -139,7 +140,8 @@ impl BlockCache {
         let first = guards.first().map_or(0, |(number, _)| *number);
         let range = Some(GetRange::Bounded(first * BLOCK_BYTES..(first + guards.len() as u64) * BLOCK_BYTES));
         let found = store.get_opts(path, GetOptions { range, ..GetOptions::default() }).await?;
-        let (object, range) = (found.meta.clone(), found.range.clone());
+        let object = found.meta.clone();
+        let range = found.range.clone();
         let bytes = found.bytes().await?;
         if bytes.len() as u64 != range.end - range.start || range.start != first * BLOCK_BYTES {
             let source = format!("{} bytes came of {}..{}", bytes.len(), range.start, range.end).into();
@@ -162,7 +164,8 @@ impl BlockCache {
 
     async fn put_into_folder(&self, path: &Path, fetched: &[(u64, CachedBlock)]) {
         let Some(folder) = self.folder.clone() else { return };
-        let (path, fetched) = (path.clone(), fetched.to_vec());
+        let path = path.clone();
+        let fetched = fetched.to_vec();
         let write = move || fetched.iter().for_each(|(number, block)| folder.write_block(&path, *number, block));
         let _ = tokio::task::spawn_blocking(write).await;
     }

@@ -103,7 +103,9 @@ impl CommitLog for ProjectLog {
         let versions = self.log.list_versions(table).await?.into_iter();
         let seen = versions.filter_map(|version| {
             let (files_added, rows_added) = *added.get(&version.version)?;
-            let (rows_added, files_removed, rows_removed) = (Some(rows_added), 0, None);
+            let rows_added = Some(rows_added);
+            let files_removed = 0;
+            let rows_removed = None;
             Some(TableChange { version, operation: None, files_added, files_removed, rows_added, rows_removed })
         });
         Ok(seen.collect())

@@ -95,7 +95,8 @@ impl Lake {
             .map(|table| (table, plan_merges(&snapshot, &readers, table, target_bytes)))
             .collect();
         let total = plans.iter().flat_map(|(_, groups)| groups).map(Vec::len).sum();
-        let (mut report, mut done) = (OptimizeReport::default(), 0);
+        let mut report = OptimizeReport::default();
+        let mut done = 0;
         for (table, groups) in plans.into_iter().filter(|(_, groups)| !groups.is_empty()) {
             let name = table.name();
             let mut of =
@@ -269,7 +270,8 @@ fn plan_merges(
     let mut small: Vec<_> = snapshot.files(table).iter().filter(is_small).cloned().collect();
     let place = |file: &DataFile| (readers.audience_of(table, file), surface_references(table, file));
     small.sort_by_cached_key(|file| (place(file), first(file)));
-    let (mut groups, mut bytes) = (vec![Vec::new()], 0);
+    let mut groups = vec![Vec::new()];
+    let mut bytes = 0;
     let mut last = None;
     for file in small {
         let place = Some(place(&file));

@@ -46,7 +46,8 @@ impl Lake {
         let mut count = 0;
         for _ in 0..ROUNDS {
             let files = self.commit_log().list_files(table).await?;
-            let (mut whole, mut shared) = (Vec::new(), Vec::new());
+            let mut whole = Vec::new();
+            let mut shared = Vec::new();
             for file in files {
                 match parts_of(&file, &removal.runs) {
                     of if of.is_empty() => {}

@@ -118,7 +118,8 @@ impl Lake {
 
     // The store is listed before the logs are read, so that whatever is committed meanwhile is named.
     async fn left_over(&self, keep: TimeDelta) -> Result<VacuumReport> {
-        let (now, mut files) = (Utc::now(), Vec::new());
+        let now = Utc::now();
+        let mut files = Vec::new();
         let old = |modified| is_over(modified, None, now, keep);
         for table in Table::ALL {
             let there = self.store().list_with_delimiter(Some(&table_folder(table))).await;
@@ -182,7 +183,8 @@ fn is_over(modified: DateTime<Utc>, gone: Option<DateTime<Utc>>, now: DateTime<U
 // `name#123`: what a local write has not brought to its end. Folders that cannot be read hold none of ours.
 fn find_temporaries(folder: &FsPath, found: &mut Vec<(PathBuf, SystemTime, u64)>) {
     for entry in std::fs::read_dir(folder).into_iter().flatten().flatten() {
-        let (path, name) = (entry.path(), entry.file_name());
+        let path = entry.path();
+        let name = entry.file_name();
         let Ok(meta) = entry.metadata() else { continue };
         if meta.is_dir() {
             find_temporaries(&path, found);

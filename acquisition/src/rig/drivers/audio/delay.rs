@@ -21,7 +21,8 @@ pub(super) fn locate_output(output: &[f32], recording: &[i32]) -> LoopbackDelay 
         return LoopbackDelay { at: 0, likeness: 0.0 };
     };
     let len = (recording.len() + output.len()).next_power_of_two();
-    let (forward, inverse) = (f64::plan_real_forward(len), f64::plan_real_inverse(len));
+    let forward = f64::plan_real_forward(len);
+    let inverse = f64::plan_real_inverse(len);
     let spectrum = |samples: &mut dyn Iterator<Item = f64>| -> Vec<Complex<f64>> {
         let mut signal: Vec<f64> = samples.collect();
         signal.resize(len, 0.0);

@@ -89,7 +89,8 @@ impl FakeBridge {
             fault: BridgeFault::None,
         }));
         let stop = Arc::new(AtomicBool::new(false));
-        let (theirs, stopped) = (world.clone(), stop.clone());
+        let theirs = world.clone();
+        let stopped = stop.clone();
         let thread = std::thread::spawn(move || accept_clients(&listener, &theirs, &stopped));
         Ok(Self { address, world, stop, thread: Some(thread) })
     }
@@ -126,7 +127,8 @@ fn accept_clients(listener: &TcpListener, world: &Arc<Mutex<FakeWorld>>, stop: &
     while !stop.load(Ordering::Relaxed) {
         match listener.accept() {
             Ok((stream, _)) => {
-                let (world, stop) = (world.clone(), stop.clone());
+                let world = world.clone();
+                let stop = stop.clone();
                 clients.push(std::thread::spawn(move || BridgeClient::serve_client(stream, &world, &stop)));
             }
             Err(_) => std::thread::sleep(PAUSE),

@@ -155,7 +155,9 @@ fn parse_message(message: &[u8], tally: &mut RowTally) -> Result<Value, Malforme
 // The text with null in the place of NaN, infinities and numbers that 64 bits do not have, and how many there were.
 fn without_no_numbers(data: &[u8]) -> (Vec<u8>, usize) {
     let mut text = Vec::with_capacity(data.len());
-    let (mut replaced, mut at, mut in_string) = (0, 0, false);
+    let mut replaced = 0;
+    let mut at = 0;
+    let mut in_string = false;
     while at < data.len() {
         let rest = &data[at..];
         let name = NO_NUMBERS.iter().find(|name| !in_string && rest.starts_with(name.as_bytes()));

@@ -116,7 +116,8 @@ impl Numbers {
 impl Node {
     fn new<'a>(descriptors: impl Iterator<Item = &'a FieldDescriptor>, types: &Fields) -> Self {
         let mut names: Vec<String> = Vec::new();
-        let (mut fields, mut numbers) = (Vec::new(), Vec::new());
+        let mut fields = Vec::new();
+        let mut numbers = Vec::new();
         for (descriptor, field) in descriptors.zip(types) {
             let oneof = descriptor.containing_oneof().map(|oneof| {
                 let name = oneof.name().to_owned();
@@ -341,7 +342,8 @@ impl Kind {
     }
 
     fn append_packed(&self, packed: &[u8], values: &mut Column, tally: &mut RowTally) -> Result<(), Malformed> {
-        let (four, eight) = (packed.as_chunks::<4>(), packed.as_chunks::<8>());
+        let four = packed.as_chunks::<4>();
+        let eight = packed.as_chunks::<8>();
         match self.wire_kind() {
             WireKind::Four if four.1.is_empty() => {
                 tally.add_bytes(packed.len())?;
@@ -434,7 +436,8 @@ impl Kind {
 
 /// Nanoseconds of a Timestamp or Duration; None where 64 bits do not hold them (from the year 2262 on).
 fn parse_nanos(data: &[u8]) -> Result<Option<i64>, Malformed> {
-    let (mut seconds, mut rest) = (0i64, 0i32);
+    let mut seconds = 0i64;
+    let mut rest = 0i32;
     let mut wire = FieldReader::new(data);
     while !wire.is_at_end() {
         match wire.read_field()? {

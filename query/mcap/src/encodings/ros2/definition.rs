@@ -63,7 +63,8 @@ impl MessageDefinition {
     /// wrong.
     pub fn parse(name: &str, text: &str) -> Result<Self, String> {
         let mut parts = HashMap::new();
-        let (mut title, mut lines) = (name.to_owned(), Vec::new());
+        let mut title = name.to_owned();
+        let mut lines = Vec::new();
         for line in text.lines().map(str::trim) {
             if line.len() >= 3 && line.bytes().all(|b| b == b'=') {
                 add_part(&mut parts, &title, std::mem::take(&mut lines));

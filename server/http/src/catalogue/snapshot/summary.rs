@@ -165,7 +165,8 @@ fn surface_entry(row: SurfaceRow, levels: &SurfaceLevels, bands: &[BandDescripti
         let own = levels.get(surface);
         bands.iter().map(|band| own.and_then(|own| own.get(&band.key)).copied().unwrap_or_default()).collect()
     };
-    let (own, flat) = (of(&row.surface_id), of(&row.flat_reference));
+    let own = of(&row.surface_id);
+    let flat = of(&row.flat_reference);
     let against = own.iter().zip(&flat).map(|(own, flat)| Some(own.0? - flat.0?)).collect();
     let parameters = row.parameters.unwrap_or_default();
     let some = |text: &Option<String>| text.clone().unwrap_or_default();

@@ -183,7 +183,8 @@ impl<'a> LogFolder<'a> {
         let commits = futures::stream::iter(versions)
             .map(|version| async move { Ok::<_, Error>((version, self.read_commit(version.version).await?)) });
         let mut commits = commits.buffered(CONCURRENT_READS);
-        let (mut changes, mut rows) = (Vec::new(), HashMap::new());
+        let mut changes = Vec::new();
+        let mut rows = HashMap::new();
         while let Some((version, lines)) = commits.try_next().await? {
             // One that is gone by now was cleaned up.
             changes.extend(lines.map(|lines| table_change(version, lines, &mut rows)));
@@ -309,7 +310,8 @@ impl<'a> LogFolder<'a> {
         for (number, line) in bytes.split(|b| *b == b'\n').enumerate().filter(|(_, line)| !line.trim_ascii().is_empty())
         {
             let line = serde_json::from_slice(line).map_err(|e| {
-                let (told, place) = (e.to_string(), format!("line {}, column {}", number + 1, e.column()));
+                let told = e.to_string();
+                let place = format!("line {}, column {}", number + 1, e.column());
                 // serde counts lines within this one.
                 let reason = told.split(" at line ").next().unwrap_or_default();
                 self.damage_error(&format!("`{}` {place}: expected an action, {reason}", commit_name(version)))

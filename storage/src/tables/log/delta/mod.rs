@@ -202,7 +202,8 @@ impl DeltaLog {
             state.apply_commit(state.version + 1, lines);
             // The commit is done; a checkpoint only spares readers some work, and the next one makes up for it.
             if let Err(error) = log.maintain_log(&state, now).await {
-                let (table, error) = (table.name(), &error as &dyn std::error::Error);
+                let table = table.name();
+                let error = &error as &dyn std::error::Error;
                 tracing::warn!(table, error, "the log's checkpoint cannot be written, or old versions not be deleted");
             }
             let written = LoadedTable { state: Arc::new(state), found: Instant::now() };
@@ -232,7 +233,8 @@ impl<'a> PendingChange<'a> {
     fn from_commit(commit: &'a TableCommit, mut known: HashMap<String, KnownFile>) -> Self {
         let gone = commit.remove.iter().filter(|file| is_known(file, &known));
         let remove = gone.map(|file| file.name.clone()).collect();
-        let (effect, removal) = (commit.effect, commit.removal.as_ref());
+        let effect = commit.effect;
+        let removal = commit.removal.as_ref();
         let mut change = Self { outcomes: Vec::new(), add: Vec::new(), remove, effect, removal };
         for file in &commit.add {
             let outcome = change.decide_outcome(file, &known);

@@ -9,8 +9,8 @@ use echolake_schema::tables::{Source, Table};
 use futures::TryStreamExt as _;
 use object_store::ObjectStore as _;
 
-use super::ingest::{self, IngestArgs};
 use crate::CommandOutcome;
+use crate::commands::ingest::{self, IngestArgs};
 
 #[derive(Debug, Args)]
 pub(crate) struct RebuildArgs {

@@ -26,7 +26,7 @@ pub(crate) struct RemoveArgs {
 }
 
 pub(crate) async fn run_remove(args: &RemoveArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
-    let stop = super::stop_request()?;
+    let stop = crate::commands::stop_request()?;
     let lake = Lake::open(lake_url).await?;
     let progress = CommandProgress::new();
     let mut names = Vec::new();
@@ -48,11 +48,11 @@ pub(crate) async fn run_remove(args: &RemoveArgs, lake_url: &str) -> anyhow::Res
         removed?;
     }
     if args.json {
-        super::print_line(&serde_json::to_string_pretty(&removals)?)?;
+        crate::commands::print_line(&serde_json::to_string_pretty(&removals)?)?;
         return Ok(CommandOutcome::Whole);
     }
     for removal in &removals {
-        super::print_line(&describe_removal(removal, args))?;
+        crate::commands::print_line(&describe_removal(removal, args))?;
     }
     Ok(CommandOutcome::Whole)
 }
@@ -90,9 +90,11 @@ fn describe_removal(removal: &RunRemoval, args: &RemoveArgs) -> String {
     let would = if args.dry_run { "would be " } else { "" };
     let file = match (&removal.file, &removal.moved_to) {
         (None, _) => "its file was gone".to_owned(),
-        (Some(file), _) if args.delete => format!("`{file}` ({}) {would}deleted", super::format_size(*bytes)),
+        (Some(file), _) if args.delete => format!("`{file}` ({}) {would}deleted", crate::commands::format_size(*bytes)),
         (Some(_), Some(to)) => format!("its file is at `{to}`"),
-        (Some(file), None) => format!("`{file}` ({}) {would}moved to quarantine/", super::format_size(*bytes)),
+        (Some(file), None) => {
+            format!("`{file}` ({}) {would}moved to quarantine/", crate::commands::format_size(*bytes))
+        }
     };
     format!("{run}: {measurements} measurements {would}removed; {file}")
 }

@@ -18,7 +18,7 @@ pub(crate) struct OptimizeArgs {
 }
 
 pub(crate) async fn run_optimize(args: &OptimizeArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
-    let stop = super::stop_request()?;
+    let stop = crate::commands::stop_request()?;
     let lake = Lake::open(lake_url).await?;
     let progress = CommandProgress::new();
     let mut task = None;
@@ -35,9 +35,9 @@ pub(crate) async fn run_optimize(args: &OptimizeArgs, lake_url: &str) -> anyhow:
         task.finish_with(format!("{merged} files became {files}"));
     }
     match args.json {
-        true => super::print_line(&serde_json::to_string_pretty(&report)?)?,
+        true => crate::commands::print_line(&serde_json::to_string_pretty(&report)?)?,
         false if report.tables.is_empty() => eprintln!("nothing to merge: no table has two small files"),
-        false => super::print_line(&report_text(&report.tables))?,
+        false => crate::commands::print_line(&report_text(&report.tables))?,
     }
     if report.stopped {
         anyhow::bail!("stopped; what was merged stays merged; hint: run the same command again to resume");
@@ -48,7 +48,8 @@ pub(crate) async fn run_optimize(args: &OptimizeArgs, lake_url: &str) -> anyhow:
 fn report_text(tables: &[TableOptimizeReport]) -> String {
     let head = format!("{:<14} {:>7} {:>10} {:>7} {:>10}", "table", "merged", "size", "into", "size");
     let line = |t: &TableOptimizeReport| {
-        let (before, after) = (super::format_size(t.bytes_before), super::format_size(t.bytes_after));
+        let (before, after) =
+            (crate::commands::format_size(t.bytes_before), crate::commands::format_size(t.bytes_after));
         let outdated = match t.outdated {
             0 => String::new(),
             count => format!("  {count} merges dropped, ingest was faster"),

@@ -36,15 +36,19 @@ pub(crate) async fn run_vacuum(args: &VacuumArgs, lake_url: &str) -> anyhow::Res
         task.finish_with(format!("{} files", report.files.len()));
     }
     if args.json {
-        super::print_line(&serde_json::to_string_pretty(&report)?)?;
+        crate::commands::print_line(&serde_json::to_string_pretty(&report)?)?;
         return Ok(CommandOutcome::Whole);
     }
     if args.dry_run {
         for file in &report.files {
-            super::print_line(&format!("{} ({})", file.path, super::format_size(file.bytes)))?;
+            crate::commands::print_line(&format!("{} ({})", file.path, crate::commands::format_size(file.bytes)))?;
         }
     }
     let would = if args.dry_run { "would be " } else { "" };
-    super::print_line(&format!("{} files, {} {would}freed", report.files.len(), super::format_size(report.bytes)))?;
+    crate::commands::print_line(&format!(
+        "{} files, {} {would}freed",
+        report.files.len(),
+        crate::commands::format_size(report.bytes)
+    ))?;
     Ok(CommandOutcome::Whole)
 }
