@@ -9,8 +9,8 @@ use libfuzzer_sys::fuzz_target;
 fuzz_target!(init: echolake_fuzz::write_seeds_on_request(), |bytes: &[u8]| {
     let path = Path::new("input.stl");
     if let Ok(mesh) = Mesh::from_bytes(MeshFormat::Stl, bytes, path) {
-        let mesh = mesh.welded();
+        let mesh = mesh.to_welded();
         let _ = mesh.volume_mm3();
-        let _ = mesh.check(585.0, 40.0, path);
+        let _ = mesh.check_solid(585.0, 40.0, path);
     }
 });

@@ -82,8 +82,8 @@ impl FuzzedServer {
         unix::signal(SignalKind::pipe()).expect("a handler");
         let server = LakeServer::bind(&lake.lake, settings).expect("a server");
         drop(entered);
-        let addresses = server.addresses().iter().map(|url| address(url)).collect();
-        lake.runtime.spawn(async move { server.run(std::future::pending()).await.expect("a server") });
+        let addresses = server.listening_urls().iter().map(|url| address(url)).collect();
+        lake.runtime.spawn(async move { server.serve_until(std::future::pending()).await.expect("a server") });
         Self { addresses, _lake: lake }
     }
 

@@ -17,13 +17,13 @@ const QUERY_ROWS: u64 = 10_000;
 /// [`Error::System`], [`Error::Query`], [`Error::Transport`].
 pub async fn serve_engine(lake: &Lake, sockets: &Path, memory: usize) -> Result<(), Error> {
     let engine = QueryEngine::new(lake, Some(memory))?;
-    let mut identity = ClientIdentity::programs();
+    let mut identity = ClientIdentity::local_programs();
     identity.seconds = Some(QUERY_SECONDS);
     identity.rows = Some(QUERY_ROWS);
     let service = QueryService::new(lake, engine, identity, None)?;
     tokio::select! {
-        failed = echolake_http::serve(service.clone(), EngineSocket::Http.listen(sockets)?) => failed,
-        failed = echolake_flight::serve(service.clone(), EngineSocket::FlightSql.listen(sockets)?) => failed,
-        failed = echolake_postgres::serve(service, EngineSocket::Postgres.listen(sockets)?) => failed,
+        failed = echolake_http::serve_http_socket(service.clone(), EngineSocket::Http.listen_in(sockets)?) => failed,
+        failed = echolake_flight::serve_flight_socket(service.clone(), EngineSocket::FlightSql.listen_in(sockets)?) => failed,
+        failed = echolake_postgres::serve_postgres_socket(service, EngineSocket::Postgres.listen_in(sockets)?) => failed,
     }
 }
