@@ -1,6 +1,6 @@
-//! Embeds the catalogue's pages and the manual: lists their files for `src/door/http/pages.rs`. Pages that come with the
-//! sources, as in the archive of a release, are taken as they are. Else npm builds them in a copy below the target folder,
-//! which keeps the checkout clean. Without Node the program is built without pages, and says so.
+//! Embeds the catalogue's pages and the manual: lists their files for `src/door/http/pages.rs`. Pages that come with
+//! the sources, as in the archive of a release, are taken as they are. Else npm builds them in a copy below the target
+//! folder, which keeps the checkout clean. Without Node the program is built without pages, and says so.
 #![allow(clippy::print_stdout, reason = "that is how a build script speaks to cargo")]
 
 use std::env;

@@ -1,6 +1,6 @@
 //! Spans of `serve` to a collector of OpenTelemetry, by OTLP over gRPC. Its standard variables say where and how:
-//! `OTEL_EXPORTER_OTLP_ENDPOINT`, `OTEL_EXPORTER_OTLP_HEADERS`, `OTEL_SERVICE_NAME` and the like. Engines export nothing:
-//! they connect to nobody.
+//! `OTEL_EXPORTER_OTLP_ENDPOINT`, `OTEL_EXPORTER_OTLP_HEADERS`, `OTEL_SERVICE_NAME` and the like. Engines export
+//! nothing: they connect to nobody.
 
 use anyhow::Context as _;
 use opentelemetry::global;

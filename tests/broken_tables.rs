@@ -1,4 +1,5 @@
-//! Tables that lose rows: queries of them are refused, `doctor` says which rows are missing, and its hint brings them back.
+//! Tables that lose rows: queries of them are refused, `doctor` says which rows are missing, and its hint brings them
+//! back.
 
 use std::collections::BTreeMap;
 use std::fs;

@@ -1,5 +1,5 @@
-//! What people put into a lake's inbox: copies that are not whole yet, names and kinds of entries that no run has, files
-//! that are removed again.
+//! What people put into a lake's inbox: copies that are not whole yet, names and kinds of entries that no run has,
+//! files that are removed again.
 
 use std::ffi::OsStr;
 use std::os::unix::ffi::OsStrExt as _;

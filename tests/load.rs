@@ -50,8 +50,8 @@ mod slow {
             assert!(count("/ir") >= PAIRS as u64 && count("/ir") == count("/measurement"), "{surface}");
         }
 
-        // Killed in the middle: a run that is missing is measured again as it was, under another name, and the others are
-        // left alone.
+        // Killed in the middle: a run that is missing is measured again as it was, under another name, and the others
+        // are left alone.
         let lost = std::fs::read_dir(place.path("lake/inbox")).expect("the inbox").map(|e| e.expect("an entry").path());
         let lost = lost.into_iter().find(|p| p.to_string_lossy().contains("0001_1")).expect("a run");
         std::fs::rename(&lost, lost.with_extension("mcap.partial")).expect("renamed");

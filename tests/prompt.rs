@@ -1,5 +1,5 @@
-//! The prompt's own parts. It shows itself on a terminal alone, so that they are tested as functions; being compiled here,
-//! they need no test binary of the command.
+//! The prompt's own parts. It shows itself on a terminal alone, so that they are tested as functions; being compiled
+//! here, they need no test binary of the command.
 
 #[path = "../src/commands/sql/prompt/command.rs"]
 #[allow(dead_code, reason = "the prompt's, which wants more of it than its tests")]

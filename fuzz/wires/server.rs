@@ -127,7 +127,8 @@ fn address(url: &str) -> SocketAddr {
     behind.parse().expect("an address")
 }
 
-/// Makes libFuzzer's own hook, which ends the process, hear of panics in all threads, but not of those of pgwire's decoder.
+/// Makes libFuzzer's own hook, which ends the process, hear of panics in all threads, but not of those of pgwire's
+/// decoder.
 pub fn abort_on_panics() {
     let abort = std::panic::take_hook();
     let known = Mutex::new(HashSet::new());

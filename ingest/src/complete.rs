@@ -48,8 +48,8 @@ pub struct CompletionSummary {
 }
 
 impl LakeIngest<'_> {
-    /// Brings every run's derived rows up to date, and removes superseded rows. A run whose rows used the current references
-    /// is left alone.
+    /// Brings every run's derived rows up to date, and removes superseded rows. A run whose rows used the current
+    /// references is left alone.
     ///
     /// # Errors
     /// [`crate::Error`]; runs completed before stay so, and the same call resumes with the rest.

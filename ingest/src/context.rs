@@ -43,8 +43,8 @@ impl IngestContext {
         staged.collect()
     }
 
-    /// Stages the files that follow from a run's references, then in the list its row of `runs`, which replaces the rows in
-    /// the snapshot. After its commit readers see the files that the row names, and nothing else of the run.
+    /// Stages the files that follow from a run's references, then in the list its row of `runs`, which replaces the
+    /// rows in the snapshot. After its commit readers see the files that the row names, and nothing else of the run.
     pub async fn stage_derived(
         &self,
         run: VisibleRun,

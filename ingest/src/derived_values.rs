@@ -84,8 +84,8 @@ pub(crate) struct DerivedRows {
     unbiased: Vec<f64>,
     /// `[pairs x (bands + 1)]`: relative errors of TNCE, the total's last; empty if they are not known.
     errors: Vec<ErrorMoments>,
-    /// `[pairs x (2 bands + 1)]`: standard uncertainties of levels over Flat's total, of the total, and of levels over Flat's
-    /// same band; null without energy; empty if they are not known.
+    /// `[pairs x (2 bands + 1)]`: standard uncertainties of levels over Flat's total, of the total, and of levels over
+    /// Flat's same band; null without energy; empty if they are not known.
     uncertainties: Vec<Option<f64>>,
 }
 

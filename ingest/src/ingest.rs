@@ -62,8 +62,8 @@ struct SharedWork {
 }
 
 impl<'a> LakeIngest<'a> {
-    /// Creates an ingest into this lake. Once `stop` is set, no run is started; runs in progress are completed. On an object
-    /// store it shares the work with other ingests, for which it needs a Tokio runtime.
+    /// Creates an ingest into this lake. Once `stop` is set, no run is started; runs in progress are completed. On an
+    /// object store it shares the work with other ingests, for which it needs a Tokio runtime.
     pub fn new(lake: &'a Lake, stop: Arc<AtomicBool>) -> Self {
         let claims = lake.is_remote().then(|| Arc::new(WorkClaims::start(lake, ClaimTimes::default())));
         Self { lake, stop, claims, again: false }

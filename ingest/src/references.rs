@@ -312,7 +312,8 @@ fn kernel_error(cause: echolake_dsp::Error) -> Error {
     Error::Kernel { file: "the reference".to_owned(), cause }
 }
 
-// References without Foam's reflection. Flat's Foam may be another one than the surface's: both are of the same material.
+// References without Foam's reflection. Flat's Foam may be another one than the surface's: both are of the same
+// material.
 fn estimate_references(
     lake: &Lake,
     flat: &MeanResponses,

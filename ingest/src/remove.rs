@@ -1,7 +1,7 @@
 //! Takes runs out of a lake: their files leave `runs/` first, then their rows leave the tables.
 //!
-//! The order makes a removal that was cut off one that can be resumed: without its file, no ingest brings a run back. Its
-//! row in `runs` goes before its other rows, so that readers see all of it or nothing.
+//! The order makes a removal that was cut off one that can be resumed: without its file, no ingest brings a run back.
+//! Its row in `runs` goes before its other rows, so that readers see all of it or nothing.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -93,12 +93,12 @@ async fn find_removal(lake: &Lake, snapshot: &LakeSnapshot, name: &str) -> Resul
 }
 
 impl LakeIngest<'_> {
-    /// Removes runs from the lake. Rows that were derived with them as references follow by [`LakeIngest::complete_runs`]. The
-    /// same call resumes a removal that was cut off.
+    /// Removes runs from the lake. Rows that were derived with them as references follow by
+    /// [`LakeIngest::complete_runs`]. The same call resumes a removal that was cut off.
     ///
     /// # Errors
-    /// [`Error::CameBack`] if another ingest has ingested one of them meanwhile; a refusal of an older run whose surface
-    /// would lose its row, before anything is removed; or an error of the lake.
+    /// [`Error::CameBack`] if another ingest has ingested one of them meanwhile; a refusal of an older run whose
+    /// surface would lose its row, before anything is removed; or an error of the lake.
     pub async fn remove_runs(&self, removals: &mut [RunRemoval], file: RemovedFile, by: &str) -> Result<()> {
         let lake = self.lake;
         let runs: BTreeSet<RunId> = removals.iter().map(|removal| removal.run.clone()).collect();

@@ -65,8 +65,8 @@ impl EngineClient {
         Ok(QueryPermit(Some(place)))
     }
 
-    /// Acquires a permit like [`EngineClient::acquire_place`], but waits up to `wait` if all are taken; first come, first
-    /// served.
+    /// Acquires a permit like [`EngineClient::acquire_place`], but waits up to `wait` if all are taken; first come,
+    /// first served.
     ///
     /// # Errors
     /// [`Error::Busy`] if none becomes free within `wait`.

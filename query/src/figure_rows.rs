@@ -134,8 +134,8 @@ impl GridLevels {
     }
 }
 
-/// Returns the query of [`CurveRow`] for surfaces, a list of literals or placeholders; `filter` goes on with `and`, or is
-/// empty.
+/// Returns the query of [`CurveRow`] for surfaces, a list of literals or placeholders; `filter` goes on with `and`, or
+/// is empty.
 pub fn curves_query(rig: &Rig, surfaces: &str, filter: &str) -> String {
     let means: Vec<_> = rig.band_names().iter().map(|band| format!("avg_list(nce_{band})")).collect();
     format!(

@@ -1,5 +1,5 @@
-//! An engine within the process of a fuzz target, whose coverage counts there. It has no watchdog, which would end the process
-//! for work of the fuzzer itself.
+//! An engine within the process of a fuzz target, whose coverage counts there. It has no watchdog, which would end the
+//! process for work of the fuzzer itself.
 
 use std::path::Path;
 

@@ -1,5 +1,5 @@
-//! The lake over HTTP, Arrow Flight SQL and Postgres wire, reading only. A server is a door, which clients reach, and an
-//! engine process for each client, which parses and runs what it asks.
+//! The lake over HTTP, Arrow Flight SQL and Postgres wire, reading only. A server is a door, which clients reach, and
+//! an engine process for each client, which parses and runs what it asks.
 //!
 //! ```no_run,standalone_crate
 //! # async fn example(settings: echolake_server::ServerSettings) -> Result<(), Box<dyn std::error::Error>> {

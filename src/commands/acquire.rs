@@ -37,7 +37,8 @@ pub(crate) struct AcquireArgs {
     /// Name of the measured surface, as 0015_0.
     #[arg(long, required_unless_present = "resume")]
     pub surface: Option<SurfaceId>,
-    /// Resume a run that was stopped or cut off: its `.mcap.partial`. Measurements that are safe in it are not repeated.
+    /// Resume a run that was stopped or cut off: its `.mcap.partial`. Measurements that are safe in it are not
+    /// repeated.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["surface", "panel", "parameters", "set", "mesh", "side", "no_geometry", "rig", "flat", "foam", "macro_reference", "project", "seed", "ir_only"])]
     pub resume: Option<PathBuf>,
     /// Relief by a name of `echolake panel --list`; by default, on the simulated rig, the one that the surface's name
@@ -80,8 +81,8 @@ pub(crate) struct AcquireArgs {
     /// Record no sweeps, only impulse responses.
     #[arg(long)]
     pub ir_only: bool,
-    /// Pairs between two checkpoints: the most that a power cut costs, and how long until a pair is reported as safe. By
-    /// default 1 on a real rig, 200 on the simulated one.
+    /// Pairs between two checkpoints: the most that a power cut costs, and how long until a pair is reported as safe.
+    /// By default 1 on a real rig, 200 on the simulated one.
     #[arg(long, value_name = "PAIRS", value_parser = clap::value_parser!(u32).range(1..))]
     pub checkpoint_every: Option<u32>,
     /// Minimum duration of a simulated take in seconds; a real rig needs 12.3.
@@ -93,8 +94,8 @@ pub(crate) struct AcquireArgs {
     /// Start even if another run is recorded into the lake, or with the same devices.
     #[arg(long)]
     pub force: bool,
-    /// Append one line to this file for every attempt that is safe on the disk: pair, attempt, verdict, SNR in dB. `-` is
-    /// stdout.
+    /// Append one line to this file for every attempt that is safe on the disk: pair, attempt, verdict, SNR in dB. `-`
+    /// is stdout.
     #[arg(long, value_name = "FILE")]
     pub acknowledge: Option<PathBuf>,
     /// Serve a live view of the run to Foxglove and Lichtblick at ws://ADDR.
@@ -105,7 +106,8 @@ pub(crate) struct AcquireArgs {
     /// Serve metrics for Prometheus under http://ADDR/metrics.
     #[arg(long, value_name = "ADDR")]
     pub metrics: Option<std::net::SocketAddr>,
-    /// Upload the run, once it is closed, to the lake at this location, as s3://bucket/prefix. The recording stays here.
+    /// Upload the run, once it is closed, to the lake at this location, as s3://bucket/prefix. The recording stays
+    /// here.
     #[cfg(feature = "upload")]
     #[arg(long, value_name = "URL")]
     pub upload: Option<String>,

@@ -55,8 +55,8 @@ pub(crate) struct GridArgs {
     /// Grid point of the microphone: a number, layer/x/y, or x y z in mm. By default that in the middle of layer 0.
     #[arg(long, value_name = "POINT")]
     microphone: Option<String>,
-    /// Reference of the bands' levels: Flat's energy in the same band, as in the paper's grid plots, or in all bands, as in its
-    /// tables.
+    /// Reference of the bands' levels: Flat's energy in the same band, as in the paper's grid plots, or in all bands,
+    /// as in its tables.
     #[arg(long, value_enum, default_value_t = OverArg::Band)]
     over: OverArg,
     /// Only this band: its centre in Hz, or total.

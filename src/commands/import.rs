@@ -28,8 +28,8 @@ enum ImportCommand {
     Wav {
         /// CSV manifest of the recordings.
         manifest: PathBuf,
-        /// Rig of the recordings: sweep range, response length, bands, grid; by default the lake's, or the paper's for a new
-        /// lake.
+        /// Rig of the recordings: sweep range, response length, bands, grid; by default the lake's, or the paper's for
+        /// a new lake.
         #[arg(long)]
         rig: Option<PathBuf>,
     },

@@ -44,8 +44,8 @@ pub(crate) struct PanelArgs {
     /// written as FILE_0 and FILE_1. With --group, the output folder; with --next, the file of the next ranges.
     #[arg(short, long, required_unless_present = "list", value_name = "FILE")]
     output: Vec<PathBuf>,
-    /// Cells along each side of the mesh; by default 585 (1 mm each) for walls with joints, and 274 for flat, foam, wood
-    /// and prd.
+    /// Cells along each side of the mesh; by default 585 (1 mm each) for walls with joints, and 274 for flat, foam,
+    /// wood and prd.
     #[arg(long, value_parser = clap::value_parser!(u32).range(16..=2340))]
     cells: Option<u32>,
     /// Print all kinds and parameters with ranges, defaults and units, or those of the named kind.

@@ -44,7 +44,8 @@ pub(crate) struct ServeArgs {
     /// File of tokens; without it only this machine has access. `echolake token` makes its lines.
     #[arg(long, value_name = "FILE")]
     tokens: Option<PathBuf>,
-    /// Certificate of the server (PEM), with which all connections to it are encrypted; renewed files are taken while it runs.
+    /// Certificate of the server (PEM), with which all connections to it are encrypted; renewed files are taken while
+    /// it runs.
     #[arg(long, value_name = "FILE", requires = "key")]
     certificate: Option<PathBuf>,
     /// Private key of the certificate (PEM).
@@ -53,7 +54,8 @@ pub(crate) struct ServeArgs {
     /// Listen without encryption beyond this machine, because a proxy encrypts.
     #[arg(long, conflicts_with = "certificate")]
     plain_text_behind_a_proxy: bool,
-    /// Limit of concurrent clients. Each client's queries run in an engine, a process of its own; idle engines make room.
+    /// Limit of concurrent clients. Each client's queries run in an engine, a process of its own; idle engines make
+    /// room.
     #[arg(long, value_name = "N", default_value_t = ENGINES, value_parser = clap::value_parser!(u32).range(1..=256))]
     engines: u32,
     /// Time for which answers may go on after SIGTERM or Ctrl-C, as 30s or 5m; nothing new is taken meanwhile.

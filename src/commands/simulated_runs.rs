@@ -21,8 +21,8 @@ use crate::progress::{CommandProgress, TaskProgress};
 const FIRST_START: Timestamp = Timestamp(1_767_600_000_000_000_000);
 const RUN_EVERY_SECS: u32 = 39_600;
 
-/// Returns the start of a run by its number. Runs of different seeds begin at different seconds (before they repeat after
-/// 39,600 seeds), so that no run is taken for one of another seed.
+/// Returns the start of a run by its number. Runs of different seeds begin at different seconds (before they repeat
+/// after 39,600 seeds), so that no run is taken for one of another seed.
 pub(super) fn start_time(seed: u64, number: usize) -> Timestamp {
     let offset_secs = (seed % u64::from(RUN_EVERY_SECS)) as f64 - 1.0;
     FIRST_START.plus_secs(number as f64 * f64::from(RUN_EVERY_SECS) + offset_secs)

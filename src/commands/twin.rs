@@ -221,7 +221,8 @@ impl ComputedRun {
     }
 }
 
-// Writes the panel's mesh to a file; returns the surface's project. Both stand in the run's file before its measurements.
+// Writes the panel's mesh to a file; returns the surface's project. Both stand in the run's file before its
+// measurements.
 fn take_mesh(run: &Path, to: &Path) -> anyhow::Result<Option<ProjectName>> {
     let mut reader = RecordingReader::open(run)?;
     let mut mesh = None;

@@ -39,8 +39,8 @@ impl DurableFileSystem {
         Self { inner: LocalFileSystem::new(), lake: lake.to_owned() }
     }
 
-    // Opening a named pipe waits for its other end. A link in a folder that anybody may put files into is not followed: it
-    // would show files that are none of the lake's.
+    // Opening a named pipe waits for its other end. A link in a folder that anybody may put files into is not followed:
+    // it would show files that are none of the lake's.
     fn refuse_special(&self, location: &Path) -> Result<()> {
         let path = self.inner.path_to_filesystem(location)?;
         let what = match fs::metadata(&path) {

@@ -267,8 +267,8 @@ pub enum Error {
     Schema(#[from] echolake_schema::Error),
 }
 
-/// An object store's error. Its text is that of the innermost cause, which is what a user can act on: object_store wraps
-/// the system's error several times. Of a request that was repeated it says how often it was tried.
+/// An object store's error. Its text is that of the innermost cause, which is what a user can act on: object_store
+/// wraps the system's error several times. Of a request that was repeated it says how often it was tried.
 #[derive(Debug)]
 pub struct StoreError(pub object_store::Error);
 
@@ -292,7 +292,8 @@ impl Error {
         Self::Store { action, path: path.to_string(), source: StoreError(source) }
     }
 
-    /// Returns the error of a store that was asked for an object again and again in vain; any other fault is given back.
+    /// Returns the error of a store that was asked for an object again and again in vain; any other fault is given
+    /// back.
     ///
     /// # Errors
     /// The given fault.

@@ -97,8 +97,8 @@ impl Lake {
         Self::open_or_create_at(LakeLocation::parse(url)?, rig, references).await
     }
 
-    /// The same in a store that holds nothing but the lake; `name` is what messages call it. If it is a URL of an object
-    /// store, such as `s3://bucket/lake`, the store is taken for a remote one.
+    /// The same in a store that holds nothing but the lake; `name` is what messages call it. If it is a URL of an
+    /// object store, such as `s3://bucket/lake`, the store is taken for a remote one.
     ///
     /// # Errors
     /// As [`Lake::open_or_create`].
@@ -211,8 +211,8 @@ impl Lake {
         self.0.location.remote.is_some()
     }
 
-    /// Returns the lake with a cache of what never changes in it, in memory, and in a folder if there is one. A lake in a
-    /// folder needs none and is returned as it is.
+    /// Returns the lake with a cache of what never changes in it, in memory, and in a folder if there is one. A lake in
+    /// a folder needs none and is returned as it is.
     ///
     /// # Errors
     /// [`Error::CacheFolder`], or what the store says.
@@ -235,8 +235,8 @@ impl Lake {
         Ok(Self(Arc::new(OpenLake { location, ..self.0.as_ref().clone() })))
     }
 
-    /// Returns the lake as a reader of these projects sees it: with their runs, and those of the surfaces that `lake.toml`
-    /// names as references. All other runs do not exist in it, as of no version; it cannot be written.
+    /// Returns the lake as a reader of these projects sees it: with their runs, and those of the surfaces that
+    /// `lake.toml` names as references. All other runs do not exist in it, as of no version; it cannot be written.
     ///
     /// ```
     /// use echolake_lake::{Error, Lake, ReferenceSurfaces};
@@ -279,7 +279,8 @@ impl Lake {
         Some(Arc::new(cached.for_scan(counters)))
     }
 
-    /// Probes, once in a process, if an object store is fit to be written: if one alone can create an object. A folder is.
+    /// Probes, once in a process, if an object store is fit to be written: if one alone can create an object. A folder
+    /// is.
     ///
     /// # Errors
     /// [`Error::NotExclusive`], or what the store says.

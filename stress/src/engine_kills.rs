@@ -1,5 +1,5 @@
-//! Kills engines of a server, the processes below it that run queries, while clients read answers of known digests: every
-//! answer must be whole, or an error with its code, or be seen to be broken off.
+//! Kills engines of a server, the processes below it that run queries, while clients read answers of known digests:
+//! every answer must be whole, or an error with its code, or be seen to be broken off.
 #![allow(clippy::print_stdout, reason = "figures are what it is for")]
 
 use std::path::Path;

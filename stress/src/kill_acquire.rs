@@ -1,5 +1,5 @@
-//! Kills `echolake acquire` at random moments, many times, recovers and resumes, and compares what was acknowledged with
-//! what is there.
+//! Kills `echolake acquire` at random moments, many times, recovers and resumes, and compares what was acknowledged
+//! with what is there.
 
 use std::io::Write as _;
 

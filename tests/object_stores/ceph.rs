@@ -1,5 +1,5 @@
-//! The checks on Ceph's S3 gateway, in short. Its Debian packages are installed if that is possible; if it is not, the test
-//! is skipped and says so, and fails with `ECHOLAKE_NO_SKIP`.
+//! The checks on Ceph's S3 gateway, in short. Its Debian packages are installed if that is possible; if it is not, the
+//! test is skipped and says so, and fails with `ECHOLAKE_NO_SKIP`.
 
 use std::fs::File;
 use std::net::TcpListener;

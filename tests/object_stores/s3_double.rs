@@ -22,8 +22,8 @@ pub(crate) enum StoreBehaviour {
     Overwrites,
     /// Copies of objects that came in parts have one byte changed.
     DamagesCopies,
-    /// A fifth of the commits is made and not answered; of the rest a tenth is refused by 503, and a tenth by a 409 that
-    /// means nothing; a tenth of the listings is cut off, a twentieth of the reads is refused by 503.
+    /// A fifth of the commits is made and not answered; of the rest a tenth is refused by 503, and a tenth by a 409
+    /// that means nothing; a tenth of the listings is cut off, a twentieth of the reads is refused by 503.
     Unreliable(u64),
 }
 

@@ -173,8 +173,8 @@ fn damage_table(round: &mut OperatorRound<'_>) -> Result<(), String> {
         return Ok(());
     }
     let bytes = std::fs::read(&file).expect("read");
-    // A log that lost its newest commits is a whole log of an earlier version. Rows of other tables say what is missing;
-    // of `runs` only `doctor` does, by the run's file.
+    // A log that lost its newest commits is a whole log of an earlier version. Rows of other tables say what is
+    // missing; of `runs` only `doctor` does, by the run's file.
     let log = round.path("tables/runs/_delta_log");
     let is_pointer = entries(&log).iter().rfind(|path| path.extension().is_some_and(|e| e == "json")) == Some(&file);
     let how = match round.random.random_range(u32::from(is_pointer)..4) {

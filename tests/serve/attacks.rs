@@ -1,5 +1,5 @@
-//! Short forms of the campaigns `attacks`, `hostile-clients`, `engine-kills` and `cancels`. How soon others are answered
-//! depends on what else the machine does, so that it is measured there and not here.
+//! Short forms of the campaigns `attacks`, `hostile-clients`, `engine-kills` and `cancels`. How soon others are
+//! answered depends on what else the machine does, so that it is measured there and not here.
 
 #![allow(clippy::module_inception, reason = "the campaign has the name of its tests")]
 

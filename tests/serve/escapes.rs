@@ -1,5 +1,5 @@
-//! The attempts to get out of the gate, over each of the three protocols and by agents' tools, and ways out that only one of them has: none
-//! reads, writes or changes anything, and the server answers afterwards.
+//! The attempts to get out of the gate, over each of the three protocols and by agents' tools, and ways out that only
+//! one of them has: none reads, writes or changes anything, and the server answers afterwards.
 
 #[path = "../../query/src/session/attempts.rs"]
 mod attempts;

@@ -96,8 +96,8 @@ fn check_marks(marks: &[String], asked: &str, answer: &str) {
     }
 }
 
-/// References, one surface of project `ours`; the same runs in both folders, and in the second two others' that come last, and
-/// one that nobody has ingested.
+/// References, one surface of project `ours`; the same runs in both folders, and in the second two others' that come
+/// last, and one that nobody has ingested.
 fn with_and_without() -> [TestFolder; 2] {
     static WITHOUT: TestFolderTemplate = TestFolderTemplate::new();
     static WITH: TestFolderTemplate = TestFolderTemplate::new();

@@ -4,7 +4,8 @@ use echolake_schema::Symmetry;
 
 use crate::Error;
 
-/// Moves a square map of heights as [`Symmetry::move_position`] moves points about its centre: the height at p moves to M p.
+/// Moves a square map of heights as [`Symmetry::move_position`] moves points about its centre: the height at p moves to
+/// M p.
 ///
 /// heights, out  `[side x side]`, row by row along x, y ascending
 ///

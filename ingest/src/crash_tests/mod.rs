@@ -482,7 +482,8 @@ mod slow {
         }
     }
 
-    // Of eight runs, a process that died had claimed one, and had brought it to its place; a live one gives its own back.
+    // Of eight runs, a process that died had claimed one, and had brought it to its place; a live one gives its own
+    // back.
     #[tokio::test(flavor = "multi_thread")]
     async fn what_others_claimed_and_did_not_do_is_done_after_a_while_and_by_one_ingest_alone() {
         let runs = simulate_runs(&["flat", "foam", "wood", "prd", "brick", "wavy", "flat_2", "wood_2"]);
@@ -582,8 +583,8 @@ mod slow {
         });
         for (name, bytes) in &runs[2..] {
             store.put(&Path::from(format!("inbox/{name}")), bytes.clone().into()).await.expect("written");
-            // Nothing is kept for readers here, so that ingest may find a file gone that was merged meanwhile: it is run
-            // again.
+            // Nothing is kept for readers here, so that ingest may find a file gone that was merged meanwhile: it is
+            // run again.
             let mut tries = 0;
             while let Err(e) = ingest_pending(store.clone()).await {
                 tries += 1;

@@ -63,8 +63,8 @@ impl PendingFiles {
     }
 }
 
-/// Lists what is in no table yet: all of `inbox/`, and the run files of `runs/` that table `runs` does not name or whose
-/// rows are missing.
+/// Lists what is in no table yet: all of `inbox/`, and the run files of `runs/` that table `runs` does not name or
+/// whose rows are missing.
 ///
 /// # Errors
 /// [`Error::Lake`] if the snapshot or a folder cannot be read.
@@ -181,7 +181,8 @@ async fn is_there(lake: &Lake, path: &Path) -> Result<bool> {
     }
 }
 
-/// Reads the rig of a run file of this machine, for a lake that is made for it; None if the file does not begin as a run.
+/// Reads the rig of a run file of this machine, for a lake that is made for it; None if the file does not begin as a
+/// run.
 ///
 /// # Errors
 /// [`Error::NoRun`] if there is no such file.

@@ -81,8 +81,8 @@ impl SuspectFile {
         Ok(pending_runs(lake).await?.iter().filter_map(|source| Self::from_source(lake, source)).collect())
     }
 
-    /// Records the death of a process that ingested this file alone; `ending` describes it. If the process had moved the
-    /// file to its place, it is the suspect that is not among those of `before` the process.
+    /// Records the death of a process that ingested this file alone; `ending` describes it. If the process had moved
+    /// the file to its place, it is the suspect that is not among those of `before` the process.
     ///
     /// # Errors
     /// As of [`pending_runs`]; [`Error::Read`] if the mark cannot be written.

@@ -28,12 +28,12 @@ enum PlaceContent {
     Other(String),
 }
 
-/// Moves or copies a run's file to its place, before any row names it. `is_known` says that rows name this content, so that
-/// another one in its place is damage.
+/// Moves or copies a run's file to its place, before any row names it. `is_known` says that rows name this content, so
+/// that another one in its place is damage.
 ///
 /// # Errors
-/// [`Error::OtherContent`] if another file is there, [`Error::Changed`] if the file is not what was read, [`Error::Gone`] if
-/// it is no more, [`Error::Read`] if the copy is not what was read, or an error of the lake.
+/// [`Error::OtherContent`] if another file is there, [`Error::Changed`] if the file is not what was read,
+/// [`Error::Gone`] if it is no more, [`Error::Read`] if the copy is not what was read, or an error of the lake.
 pub(crate) async fn move_to_place(
     lake: &Lake,
     source: &RunSource,
@@ -90,8 +90,8 @@ pub(crate) async fn move_to_place(
     }
 }
 
-/// Puts a file into the place of a shorter one that has its beginning, after the commit of its rows: if the process ends
-/// before, the next ingest finds the file and its rows, and does the same.
+/// Puts a file into the place of a shorter one that has its beginning, after the commit of its rows: if the process
+/// ends before, the next ingest finds the file and its rows, and does the same.
 ///
 /// # Errors
 /// An error of the lake.
@@ -174,8 +174,8 @@ impl StoreFault {
     }
 }
 
-/// Moves an object: a folder renames it; an object store copies it, and only what is there as it was read is deleted where it
-/// came from.
+/// Moves an object: a folder renames it; an object store copies it, and only what is there as it was read is deleted
+/// where it came from.
 pub(super) async fn move_object(
     lake: &Lake,
     from: &Path,
@@ -237,7 +237,8 @@ async fn copy_in(lake: &Lake, from: &FsPath, to: &Path, check: &mut (dyn FnMut()
     let failed = |e: object_store::Error| write_error(to, e);
     let path = absolute_path(from)?;
     let size = source.head(&path).await.map_err(|e| Error::read_failure(from.display(), e))?.size;
-    // An object appears as a whole; a file is under another name first, so that a run's own name never holds part of it.
+    // An object appears as a whole; a file is under another name first, so that a run's own name never holds part of
+    // it.
     if lake.is_remote() {
         copy_parts(&source, &path, size, store.as_ref(), to).await.map_err(failed)?;
         if let Err(changed) = check() {

@@ -27,8 +27,8 @@ pub(crate) struct RunDefinitions {
 }
 
 impl RunDefinitions {
-    /// Learns a definition outside of chunks. The first of an id counts: a chunk's definitions have its CRC, those of the
-    /// summary may be damaged.
+    /// Learns a definition outside of chunks. The first of an id counts: a chunk's definitions have its CRC, those of
+    /// the summary may be damaged.
     pub fn learn_definition(&mut self, record: &Record<'_>) {
         match record {
             Record::Schema { header, .. } => {

@@ -88,8 +88,8 @@ fn relief_stats(heights_mm: &[f32]) -> Option<[f32; 3]> {
 mod tests {
     use super::*;
 
-    // A groove of a fifth of its period has a root mean square of 0.4 of its depth, and lies within all wavelengths that
-    // are longer than the period.
+    // A groove of a fifth of its period has a root mean square of 0.4 of its depth, and lies within all wavelengths
+    // that are longer than the period.
     #[test]
     fn details_are_told_where_cells_can_show_them() {
         let rig = Rig::paper();

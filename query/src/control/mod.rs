@@ -1,9 +1,9 @@
 //! Limits of queries: a [`QueryTicket`] signals whether a query may continue, [`pool`] counts the memory of its
 //! operators.
 //!
-//! DataFusion ends a query only at an await, and allocates between two checks of its pool. [`RunningQueries::longest_overdue`]
-//! finds work that does not end soon after its ticket was stopped; a server then ends the whole process, which serves
-//! one client alone.
+//! DataFusion ends a query only at an await, and allocates between two checks of its pool.
+//! [`RunningQueries::longest_overdue`] finds work that does not end soon after its ticket was stopped; a server then
+//! ends the whole process, which serves one client alone.
 
 pub(crate) mod pool;
 pub(crate) mod threads;

@@ -12,8 +12,8 @@ use tokio::time::timeout;
 /// Stack size of a thread, bytes: twice the need of the longest accepted chain of operators.
 const STACK_BYTES: usize = 16 << 20;
 
-/// Groups of threads of an engine: one fewer can be held, and queries still run. Each thread allocates between two looks
-/// at the memory that is left, so that there are few.
+/// Groups of threads of an engine: one fewer can be held, and queries still run. Each thread allocates between two
+/// looks at the memory that is left, so that there are few.
 const GROUPS: usize = 3;
 
 /// Time in which a group begins work; then another may, too.
@@ -83,8 +83,8 @@ impl QueryThreadGroups {
     }
 
     /// Begins work on the group with the least of it, or on another if its threads do not respond; returns its task,
-    /// whose output is always `Some`. None during shutdown. If the caller stops waiting, the work has begun already or is
-    /// dropped.
+    /// whose output is always `Some`. None during shutdown. If the caller stops waiting, the work has begun already or
+    /// is dropped.
     pub async fn begin_work<T: Send + 'static>(&self, work: BoxFuture<'static, T>) -> Option<JoinHandle<Option<T>>> {
         let mut groups: Vec<_> = self.0.iter().collect();
         groups.sort_by_cached_key(|group| group.current_load());

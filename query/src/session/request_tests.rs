@@ -108,7 +108,8 @@ async fn rows(session: &Session, sql: &str) -> Vec<RecordBatch> {
     batches
 }
 
-// The requests of a query that returns so many rows, but for the look at what is new, which all queries of a second share.
+// The requests of a query that returns so many rows, but for the look at what is new, which all queries of a second
+// share.
 async fn requests(session: &Session, store: &StoreDouble<()>, sql: &str, expected: usize) -> Vec<String> {
     store.take_requests();
     let count = rows(session, sql).await.iter().map(RecordBatch::num_rows).sum::<usize>();

@@ -441,8 +441,8 @@ async fn check_replaced_rows(others: usize) {
 mod slow {
     use super::*;
 
-    // Between the commit of a run's new rows and the clean-up, a merged file still holds its old ones. A small table is in
-    // memory, a larger one is scanned.
+    // Between the commit of a run's new rows and the clean-up, a merged file still holds its old ones. A small table is
+    // in memory, a larger one is scanned.
     #[tokio::test]
     async fn replaced_rows_of_a_merged_file_are_not_seen() {
         for others in [1, 20_000] {

@@ -17,8 +17,8 @@ pub enum PredicateForm {
     Comparisons,
 }
 
-/// Appends a predicate to the query `select` for [`Session::append_predicate`](crate::Session::append_predicate). `parse` parses a
-/// query.
+/// Appends a predicate to the query `select` for [`Session::append_predicate`](crate::Session::append_predicate).
+/// `parse` parses a query.
 ///
 /// # Errors
 /// [`Error::Query`] if the predicate is none, or is not of the form.

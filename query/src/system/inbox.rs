@@ -1,5 +1,5 @@
-//! `system.inbox`: run files of the lake's folder that are in no table yet: waiting, being recorded or copied, or refused;
-//! and entries of the inbox that nothing opens.
+//! `system.inbox`: run files of the lake's folder that are in no table yet: waiting, being recorded or copied, or
+//! refused; and entries of the inbox that nothing opens.
 
 use std::collections::HashMap;
 use std::sync::Arc;

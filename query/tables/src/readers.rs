@@ -1,5 +1,5 @@
-//! Readers of data files, which read a footer once for concurrent scans. If the lake has a cache, each reader counts its
-//! hits for `EXPLAIN ANALYZE`.
+//! Readers of data files, which read a footer once for concurrent scans. If the lake has a cache, each reader counts
+//! its hits for `EXPLAIN ANALYZE`.
 
 use std::collections::HashMap;
 use std::ops::Range;

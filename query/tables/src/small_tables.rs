@@ -1,5 +1,6 @@
 //! Cache of the rows of small tables: `runs`, `surfaces` and `surface_stats` have one file per run until they are
-//! merged, and most queries read them. A file never changes, so its rows are read once per process, many files concurrently.
+//! merged, and most queries read them. A file never changes, so its rows are read once per process, many files
+//! concurrently.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};

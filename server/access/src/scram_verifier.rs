@@ -1,5 +1,5 @@
-//! Verifiers of tokens for SCRAM-SHA-256 (RFC 5802, RFC 7677), by which clients of Postgres' protocol prove that they have
-//! a token without sending it. They are written as PostgreSQL writes them, and nobody can log in by having one.
+//! Verifiers of tokens for SCRAM-SHA-256 (RFC 5802, RFC 7677), by which clients of Postgres' protocol prove that they
+//! have a token without sending it. They are written as PostgreSQL writes them, and nobody can log in by having one.
 
 use std::fmt;
 use std::num::NonZeroU32;
@@ -41,8 +41,8 @@ impl ScramVerifier {
         Ok(Self::with_salt(token, salt, ITERATIONS))
     }
 
-    /// Makes a verifier that no token passes, for a name without one. Its salt is always the same for a name, as that of a
-    /// verifier is, and nobody computes it without the secret.
+    /// Makes a verifier that no token passes, for a name without one. Its salt is always the same for a name, as that
+    /// of a verifier is, and nobody computes it without the secret.
     pub(crate) fn unpassable(name: &str, secret: &[u8]) -> Self {
         let of = |purpose: &[u8]| hmac_sign(&hmac_sign(secret, purpose), name.as_bytes());
         let salt = of(b"salt")[..SALT_BYTES].to_vec();

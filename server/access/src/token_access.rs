@@ -73,8 +73,8 @@ impl TokenAccess {
         }
     }
 
-    /// Returns the verifier of a token's name, and its client. A name without one has a verifier that nobody passes and looks
-    /// like others, and no client.
+    /// Returns the verifier of a token's name, and its client. A name without one has a verifier that nobody passes and
+    /// looks like others, and no client.
     pub fn scram_client(&self, name: &str) -> (Option<Arc<ClientIdentity>>, Arc<ScramVerifier>) {
         let Self::Named(named) = self else { return (None, Arc::new(ScramVerifier::unpassable(name, &[]))) };
         let file = named.lock_file();
@@ -97,8 +97,8 @@ impl TokenAccess {
         is_current.then_some(()).ok_or(RequestFault::Unauthenticated)
     }
 
-    /// Reads the file again if it changed; returns the names of clients that may no longer ask, or may do other things now. A
-    /// file that cannot be read changes nothing.
+    /// Reads the file again if it changed; returns the names of clients that may no longer ask, or may do other things
+    /// now. A file that cannot be read changes nothing.
     pub fn reload_changed(&self, known: &mut TokenFileState) -> Vec<String> {
         let Self::Named(named) = self else { return Vec::new() };
         let path = named.lock_file().path().to_owned();

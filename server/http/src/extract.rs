@@ -1,4 +1,5 @@
-//! Typed parts of paths and typed parameters. Each defect is answered as a [`ProblemResponse`] that says what is allowed.
+//! Typed parts of paths and typed parameters. Each defect is answered as a [`ProblemResponse`] that says what is
+//! allowed.
 
 use std::ops::RangeInclusive;
 

@@ -1,6 +1,6 @@
-//! Access control of HTTP: without tokens it is for this machine's own programs and pages. A browser lets every page of the
-//! web send requests to loopback, and a name that its owner points there (DNS rebinding) lets it read the answers too; so
-//! without tokens `Host` and `Origin` must be this machine's.
+//! Access control of HTTP: without tokens it is for this machine's own programs and pages. A browser lets every page of
+//! the web send requests to loopback, and a name that its owner points there (DNS rebinding) lets it read the answers
+//! too; so without tokens `Host` and `Origin` must be this machine's.
 
 use std::net::IpAddr;
 use std::sync::Arc;

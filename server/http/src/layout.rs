@@ -19,8 +19,8 @@ use super::ranges::{POLICY, cors_layer};
 /// The panel with the arms, the response that was heard last, the air, verdicts, the log. Repeated fields come first in
 /// Lichtblick's table of a message, which has no choice of columns, so verdicts are shown as a list of fields.
 const TEMPLATE: &str = include_str!("layout.json");
-/// The template's mark for a response's last sample. Without a limit Lichtblick shows no response while messages of other
-/// topics come.
+/// The template's mark for a response's last sample. Without a limit Lichtblick shows no response while messages of
+/// other topics come.
 const LAST_SAMPLE: &str = "\"LAST_SAMPLE\"";
 /// Its mark for the rate of responses.
 const RATE_KHZ: &str = "RATE_KHZ";

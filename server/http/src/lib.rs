@@ -1,5 +1,5 @@
-//! HTTP of an engine, which reads the lake: queries, the catalogue, files and slices. Of what it has for the door, a server
-//! builds the rest.
+//! HTTP of an engine, which reads the lake: queries, the catalogue, files and slices. Of what it has for the door, a
+//! server builds the rest.
 
 mod catalogue;
 mod conditions;
@@ -74,7 +74,8 @@ fn with_protocol(protocol: ServerProtocol, routes: Router) -> Router {
     routes.layer(from_fn_with_state(protocol, request_protocol::set_protocol))
 }
 
-/// The contract of an engine's routes and of the layout's: of those whose answers to GET have an ETag, and of the others.
+/// The contract of an engine's routes and of the layout's: of those whose answers to GET have an ETag, and of the
+/// others.
 pub fn contract_parts() -> [OpenApi; 2] {
     let files = files::viewer_routes().merge(files::own_routes()).merge(manifest::manifest_routes());
     let mut validated = catalogue::table_routes().merge(catalogue::file_routes()).into_openapi();

@@ -46,8 +46,8 @@ impl EngineReport {
         Self::send_queued();
     }
 
-    /// Lets the line wait for [`EngineReport::send_queued`]: a write for each of a thousand queries a second would slow them
-    /// down.
+    /// Lets the line wait for [`EngineReport::send_queued`]: a write for each of a thousand queries a second would slow
+    /// them down.
     pub(crate) fn queue_line(&self) {
         let mut queued = QUEUED.lock().unwrap_or_else(PoisonError::into_inner);
         let whole = queued.len();

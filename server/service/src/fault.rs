@@ -346,8 +346,8 @@ impl RequestFault {
         }
     }
 
-    /// Writes it to the log: as a warning if the client is not to blame for it, else for debugging, because its text may
-    /// quote a statement.
+    /// Writes it to the log: as a warning if the client is not to blame for it, else for debugging, because its text
+    /// may quote a statement.
     pub fn log_failure(&self) {
         let code = self.code();
         let text = self.to_string();

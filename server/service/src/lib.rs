@@ -1,5 +1,5 @@
-//! What the protocols of a server share: the query engine and its client, queries that run, failures with their codes, spans
-//! of requests, and what an engine and its door tell each other.
+//! What the protocols of a server share: the query engine and its client, queries that run, failures with their codes,
+//! spans of requests, and what an engine and its door tell each other.
 
 mod activity;
 pub mod authorization;

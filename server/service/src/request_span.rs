@@ -24,8 +24,8 @@ const TRACE_PARENT: HeaderName = HeaderName::from_static("traceparent");
 /// Characters of a request's name that is taken over.
 const LONGEST_ID: usize = 128;
 
-/// Begins the span of a request, and marks the request with its number and name; a client's own number is replaced. Returns
-/// the name for the answer, too. The client is recorded once it is known.
+/// Begins the span of a request, and marks the request with its number and name; a client's own number is replaced.
+/// Returns the name for the answer, too. The client is recorded once it is known.
 pub fn begin_request(headers: &mut HeaderMap, protocol: ServerProtocol) -> (Span, HeaderValue) {
     let number = next_number();
     headers.insert(HEADER, HeaderValue::from(number));
@@ -69,8 +69,8 @@ fn trace_id(headers: &HeaderMap) -> Option<&str> {
     (is_right && version != "ff" && trace.bytes().any(|b| b != b'0')).then_some(trace)
 }
 
-/// Begins the span of a connection of Postgres' protocol that the door forwards, and marks its startup packet unless that
-/// would be larger than `limit`.
+/// Begins the span of a connection of Postgres' protocol that the door forwards, and marks its startup packet unless
+/// that would be larger than `limit`.
 pub fn begin_connection(startup: &mut BytesMut, client: &str, limit: usize) -> Span {
     let number = next_number();
     mark_startup(startup, PARAMETER, &number.to_string(), limit);

@@ -1,5 +1,5 @@
-//! Traces of OpenTelemetry: the span of a request continues its client's trace, and what the request is forwarded with names
-//! the span.
+//! Traces of OpenTelemetry: the span of a request continues its client's trace, and what the request is forwarded with
+//! names the span.
 
 use axum::http::{HeaderMap, HeaderName, HeaderValue};
 use opentelemetry::global;
@@ -28,8 +28,8 @@ impl Injector for TraceHeaders<'_> {
     }
 }
 
-/// Makes a span part of the trace that the headers name, or of a new one, and names the span in the headers. Does nothing
-/// if spans are not exported. To be called before the span is entered.
+/// Makes a span part of the trace that the headers name, or of a new one, and names the span in the headers. Does
+/// nothing if spans are not exported. To be called before the span is entered.
 pub(crate) fn join_trace(span: &Span, headers: &mut HeaderMap) {
     let mut headers = TraceHeaders(headers);
     let parent = global::get_text_map_propagator(|propagator| propagator.extract(&headers));

@@ -45,8 +45,8 @@ impl ServerActivity {
         *self.lake.lock().unwrap_or_else(PoisonError::into_inner) = Some((Instant::now(), figures));
     }
 
-    /// Returns what an engine last found in the lake, and when; None if the lake could not be read, or nobody has looked
-    /// yet.
+    /// Returns what an engine last found in the lake, and when; None if the lake could not be read, or nobody has
+    /// looked yet.
     pub fn lake_figures(&self) -> Option<(Instant, LakeFigures)> {
         let (at, figures) = (*self.lake.lock().unwrap_or_else(PoisonError::into_inner))?;
         Some((at, figures?))

@@ -1,6 +1,6 @@
-//! Places for connections: a listener accepts a limited number. If all are taken, a new connection evicts the oldest one
-//! without a request or a login, of the address that has the most, and never one of an address that has fewer than its
-//! own: slow senders and crowds lock out no other client.
+//! Places for connections: a listener accepts a limited number. If all are taken, a new connection evicts the oldest
+//! one without a request or a login, of the address that has the most, and never one of an address that has fewer than
+//! its own: slow senders and crowds lock out no other client.
 
 use std::cmp::Reverse;
 use std::collections::HashMap;

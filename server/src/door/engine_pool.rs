@@ -1,5 +1,5 @@
-//! The engines of a server: one for each client that asks, a spare that is ready for the next, and an end for those that
-//! are idle or take too much.
+//! The engines of a server: one for each client that asks, a spare that is ready for the next, and an end for those
+//! that are idle or take too much.
 
 use std::collections::HashMap;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
@@ -196,8 +196,8 @@ impl EnginePool {
         }
     }
 
-    // Waits until there is a place among the engines: the one that is idle for longest makes room, with the connections whose
-    // clients are silent.
+    // Waits until there is a place among the engines: the one that is idle for longest makes room, with the connections
+    // whose clients are silent.
     async fn make_room(&self, own: &Arc<ClientEngine>) -> Result<(), RequestFault> {
         let free = async {
             loop {

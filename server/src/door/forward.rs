@@ -26,8 +26,8 @@ use super::engine_process::{EndReason, EngineLease, EngineProcess};
 
 /// Bytes of a request up to which it is kept, so that it can be sent again to a new engine.
 const KEPT_BYTES: usize = 64 << 10;
-/// Bytes of a request: that of HTTP's endpoints, which answer sooner than they have read more, and gRPC's of one message
-/// with its length.
+/// Bytes of a request: that of HTTP's endpoints, which answer sooner than they have read more, and gRPC's of one
+/// message with its length.
 const LARGEST_HTTP: usize = 2 << 20;
 const LARGEST_GRPC: usize = (4 << 20) + 5;
 /// Parts of a body beyond which they must have so many bytes on average: each costs as much as one that says something.
@@ -63,7 +63,8 @@ enum RequestBody {
 type BodyFault = Arc<Mutex<Option<RequestFault>>>;
 
 impl EnginePool {
-    /// Answers a request by the engine of `client`; `work` marks its connection, if it came on one. If the engine ends before its answer begins, a new one is asked once.
+    /// Answers a request by the engine of `client`; `work` marks its connection, if it came on one. If the engine ends
+    /// before its answer begins, a new one is asked once.
     ///
     /// # Errors
     /// [`RequestFault::EngineEnded`], [`RequestFault::TooMany`], [`RequestFault::TooLarge`], [`RequestFault::Request`].

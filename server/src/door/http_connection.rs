@@ -47,7 +47,8 @@ pub(super) async fn drive_connection<C: Future>(
     }
 }
 
-/// Gives a request of HTTP/2 the form of HTTP/1.1, which routes, guards and engines read: its authority becomes its Host.
+/// Gives a request of HTTP/2 the form of HTTP/1.1, which routes, guards and engines read: its authority becomes its
+/// Host.
 pub(super) fn restate_as_http1<B>(request: &mut Request<B>) {
     if request.version() != Version::HTTP_2 {
         return;

@@ -1,5 +1,5 @@
-//! The door: the process that clients reach. It holds connections, finds out who asks, and forwards requests to the engine
-//! of that client. It parses no SQL and decodes no file, so that no request can end it.
+//! The door: the process that clients reach. It holds connections, finds out who asks, and forwards requests to the
+//! engine of that client. It parses no SQL and decodes no file, so that no request can end it.
 
 pub(crate) mod activity;
 mod agent;

@@ -16,7 +16,8 @@ const LANDLOCK: ABI = ABI::V5;
 /// The process's own figures, those of the processors, and random bytes.
 const SYSTEM: [&str; 4] = ["/proc", "/sys/fs/cgroup", "/sys/devices/system/cpu", "/dev/urandom"];
 /// Address space over what queries may hold, for a process that is running: stacks of threads that are still to come,
-/// caches, what the allocator keeps. The door looks at what is really used; this limit ends one huge allocation at once.
+/// caches, what the allocator keeps. The door looks at what is really used; this limit ends one huge allocation at
+/// once.
 const OVERHEAD_BYTES: u64 = 1 << 30;
 /// Place of the writable address space in `/proc/PID/statm`, in pages.
 const STATM_DATA: usize = 5;
@@ -33,8 +34,8 @@ pub fn missing_support() -> Option<&'static str> {
     )
 }
 
-/// Lets the process read `lake` and its own program, read and write `own` folders, and nothing else, and connect to no other
-/// machine. To be called before there are threads. A kernel without Landlock leaves the process as it is.
+/// Lets the process read `lake` and its own program, read and write `own` folders, and nothing else, and connect to no
+/// other machine. To be called before there are threads. A kernel without Landlock leaves the process as it is.
 ///
 /// # Errors
 /// The system refuses.
@@ -44,8 +45,8 @@ pub fn confine_files(lake: &Path, own: &[&Path]) -> io::Result<()> {
     confine_process(&readable, own, &[])
 }
 
-/// Lets the process read what it needs to reach the lake's object store, read and write `own` folders, and nothing else;
-/// connect over TCP to the store's ports alone. Otherwise as [`confine_files`].
+/// Lets the process read what it needs to reach the lake's object store, read and write `own` folders, and nothing
+/// else; connect over TCP to the store's ports alone. Otherwise as [`confine_files`].
 ///
 /// # Errors
 /// The system refuses.
@@ -80,7 +81,8 @@ fn linked_folders(lake: &Path) -> Vec<PathBuf> {
     entries.filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_symlink())).map(|entry| entry.path()).collect()
 }
 
-/// Limits what the process can allocate from now on to the `memory` bytes that its queries may hold, and a little besides.
+/// Limits what the process can allocate from now on to the `memory` bytes that its queries may hold, and a little
+/// besides.
 ///
 /// # Errors
 /// The system does not tell what the process has, or refuses.

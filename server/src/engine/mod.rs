@@ -19,12 +19,13 @@ use tokio::sync::mpsc;
 
 /// A query that has a new engine read what every query reads.
 const WARM_UP: &str = "select count(*) from runs";
-/// Time between two looks at the lake for its figures: in a folder, and on an object store, where three requests cost money.
+/// Time between two looks at the lake for its figures: in a folder, and on an object store, where three requests cost
+/// money.
 const LAKE_LOOK: Duration = Duration::from_secs(15);
 const REMOTE_LAKE_LOOK: Duration = Duration::from_secs(60);
 
-/// Answers one client's requests until standard input ends, which the door holds. Its queries may hold `memory` bytes; those
-/// that take as long as `slow` are logged.
+/// Answers one client's requests until standard input ends, which the door holds. Its queries may hold `memory` bytes;
+/// those that take as long as `slow` are logged.
 ///
 /// It is a spare at first: it reads the lake, reports that it is ready, and learns whose engine it is by the first line
 /// of standard input.

@@ -200,7 +200,8 @@ fn memory_fact() -> InstallationFact {
     }
 }
 
-/// The lake's place: whether there is a lake, how much room it has, and whether its file system does what is asked of it.
+/// The lake's place: whether there is a lake, how much room it has, and whether its file system does what is asked of
+/// it.
 async fn lake_facts(lake_url: &str) -> Vec<InstallationFact> {
     let opened = Lake::open(lake_url).await;
     let state = match &opened {

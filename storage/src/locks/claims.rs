@@ -1,9 +1,10 @@
 //! Claims on work: of several ingesters on one object store, one takes in a run, the others leave it to it.
 //!
-//! A claim is a row of numbered objects in `tables/_claims/`. To claim work is to create its number 1, which one process
-//! alone can. The holder creates the next number every few seconds; who waits sees the highest number change. A claim is
-//! dead if its number has not changed for a while by the clock of the one who waits, so that no two clocks need agree, or
-//! if its holder ran on the machine of the one who waits and has ended; who takes it over creates the next number. At its end the holder deletes the numbers, the first of them last.
+//! A claim is a row of numbered objects in `tables/_claims/`. To claim work is to create its number 1, which one
+//! process alone can. The holder creates the next number every few seconds; who waits sees the highest number change. A
+//! claim is dead if its number has not changed for a while by the clock of the one who waits, so that no two clocks
+//! need agree, or if its holder ran on the machine of the one who waits and has ended; who takes it over creates the
+//! next number. At its end the holder deletes the numbers, the first of them last.
 //!
 //! A claim saves work, and nothing rests on it: if the store fails, or a holder was stopped for long, two do the same
 //! work, and commits add it once.

@@ -3,8 +3,8 @@
 //! It keeps two processes from doing the same work, and the error of the second one names the first. Correctness does
 //! not depend on it: a merge is a commit of its own, which fails if another was faster.
 //!
-//! To take the lease, to renew it and to give it back is to create the next number, which one process alone can. Numbers
-//! are never used again, so that a holder that was stopped for long cannot take its place a second time.
+//! To take the lease, to renew it and to give it back is to create the next number, which one process alone can.
+//! Numbers are never used again, so that a holder that was stopped for long cannot take its place a second time.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};

@@ -3,8 +3,8 @@
 //! The client below repeats requests that a store answered with a fault of its own, and resumes bodies of objects where
 //! the store lets it. It gives up on a listing that is cut off and on a body that cannot be resumed, and it repeats
 //! nothing that was sent without an answer, unless that is safe. Here reads, listings, overwrites and deletions are
-//! repeated. A creation without an answer is looked up: if the object is there with the same content, it was made. What is
-//! created must therefore be unlike what others create under its name, or its author must not care who made it.
+//! repeated. A creation without an answer is looked up: if the object is there with the same content, it was made. What
+//! is created must therefore be unlike what others create under its name, or its author must not care who made it.
 
 use std::fmt;
 use std::ops::Range;
@@ -84,8 +84,8 @@ fn given_up(tries: u32, source: StoreError) -> StoreError {
     StoreError::Generic { store: "remote", source: Box::new(RetriedError { tries, source }) }
 }
 
-// The object may be there because of an own try that was not answered, and it may be absent though the store says that it
-// is there: some refuse both of two that meet.
+// The object may be there because of an own try that was not answered, and it may be absent though the store says that
+// it is there: some refuse both of two that meet.
 async fn put_new(
     inner: &dyn ObjectStore,
     location: &Path,

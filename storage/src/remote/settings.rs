@@ -29,8 +29,8 @@ pub struct RemoteAccess {
     pub files: Vec<PathBuf>,
 }
 
-/// Returns what a process needs to reach the store of a location, by this process's environment; None if the location is
-/// on this machine.
+/// Returns what a process needs to reach the store of a location, by this process's environment; None if the location
+/// is on this machine.
 pub fn remote_access(location: &str) -> Option<RemoteAccess> {
     let url = Url::parse(location).ok().filter(|url| matches!(url.scheme(), "s3" | "gs" | "az"))?;
     let endpoints = match url.scheme() {

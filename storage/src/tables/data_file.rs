@@ -22,7 +22,8 @@ use crate::{Error, Result};
 const PAGE_BYTES: usize = 128 * 1024;
 /// Size that a row group grows to, before encoding.
 const ROW_GROUP_BYTES: usize = 64 << 20;
-/// Of the levels of zstd, 1: samples become 1.3 to 2.2 points larger than at 3 and are written a sixth to a half faster.
+/// Of the levels of zstd, 1: samples become 1.3 to 2.2 points larger than at 3 and are written a sixth to a half
+/// faster.
 const ZSTD_LEVEL: i32 = 1;
 /// Rows are in its order, so that its differences are small.
 const PAIR: &str = "pair_id";

@@ -57,8 +57,8 @@ impl StagedFile {
         self
     }
 
-    /// Records the rows that the run's other tables have: those of `counts`, and of these files. Without them its row of
-    /// `runs` says no more than that there are some.
+    /// Records the rows that the run's other tables have: those of `counts`, and of these files. Without them its row
+    /// of `runs` says no more than that there are some.
     #[must_use]
     pub fn with_row_counts<'a>(mut self, mut counts: RunRowCounts, files: impl IntoIterator<Item = &'a Self>) -> Self {
         files.into_iter().for_each(|file| counts.set_rows(file.table, file.rows));

@@ -127,8 +127,8 @@ fn unread_error(path: &Path, error: ParquetError) -> Error {
     }
 }
 
-/// Prepares to read a file with its table's types. Columns that came to the table after the file was written are absent:
-/// [`add_missing_columns`] adds them.
+/// Prepares to read a file with its table's types. Columns that came to the table after the file was written are
+/// absent: [`add_missing_columns`] adds them.
 ///
 /// # Errors
 /// Columns of other types.

@@ -66,7 +66,8 @@ impl DataFile {
     }
 }
 
-/// A part in the log: the name that it had as a file of its own, and its rows; in `runs` also the version that added it.
+/// A part in the log: the name that it had as a file of its own, and its rows; in `runs` also the version that added
+/// it.
 #[derive(Deserialize)]
 #[serde(untagged)]
 enum LoggedPart {

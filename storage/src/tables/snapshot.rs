@@ -77,10 +77,11 @@ async fn views_of_others(log: &dyn CommitLog) -> Result<Vec<(Table, ReadView)>> 
 }
 
 impl LakeSnapshot {
-    /// Takes a view. The other tables are read after the version of `runs` was there, so that they hold whatever it names:
-    /// all at once if it is still the version of the last look.
+    /// Takes a view. The other tables are read after the version of `runs` was there, so that they hold whatever it
+    /// names: all at once if it is still the version of the last look.
     ///
-    /// If `runs` has a newer version than a view that lacks rows, ingest has replaced them meanwhile: the view is taken again.
+    /// If `runs` has a newer version than a view that lacks rows, ingest has replaced them meanwhile: the view is taken
+    /// again.
     pub(crate) async fn take_from(log: &dyn CommitLog) -> Result<Self> {
         for _ in 0..TAKE_TRIES {
             let snapshot = Self::take_once(log).await?;
@@ -187,8 +188,8 @@ impl LakeSnapshot {
         self.is_restricted
     }
 
-    /// The version of the lake in which readers saw this for the first time, or the present one: how many versions others
-    /// added since is shown to nobody else. None if there was no table, and for views of the past.
+    /// The version of the lake in which readers saw this for the first time, or the present one: how many versions
+    /// others added since is shown to nobody else. None if there was no table, and for views of the past.
     pub fn lake_version(&self) -> Option<u64> {
         match self.is_restricted {
             false => self.log_version(Table::Runs),
@@ -207,7 +208,8 @@ impl LakeSnapshot {
         self.files.get(&table).map_or(&[], Vec::as_slice)
     }
 
-    /// The files of a table that its readers may have as they are: for readers of some projects, those without hidden rows.
+    /// The files of a table that its readers may have as they are: for readers of some projects, those without hidden
+    /// rows.
     pub fn readable_files(&self, table: Table) -> impl Iterator<Item = &DataFile> {
         self.files(table).iter().filter(|file| !self.is_restricted || file.hidden.is_empty())
     }
@@ -386,7 +388,8 @@ impl LakeSnapshot {
             .is_some_and(|current| file.seen_runs < current.log_version)
     }
 
-    /// The version of `runs` that added the row of a file's run; 0 if the name is no run's rows, or the run is not seen.
+    /// The version of `runs` that added the row of a file's run; 0 if the name is no run's rows, or the run is not
+    /// seen.
     pub(crate) fn run_version(&self, name: &str) -> u64 {
         match FileName::parse(&Path::from(name)) {
             Some(FileName::Rows { run, .. }) => self.runs.get(&run).map_or(0, |current| current.log_version),

@@ -1,9 +1,9 @@
 //! Time travel: the versions that a table's log still holds, and the lake as it was at one of them.
 //!
-//! The lake's version is that of its table `runs`, because `runs` decides the rest: it names the derivations of the rows
-//! that are seen, and the same derivation means the same rows, whichever version of a table's log added their file. So the
-//! other tables' files are looked for in all versions of their logs. A time selects a version of `runs`, nothing else:
-//! the logs of two tables may have been written with clocks that differ.
+//! The lake's version is that of its table `runs`, because `runs` decides the rest: it names the derivations of the
+//! rows that are seen, and the same derivation means the same rows, whichever version of a table's log added their
+//! file. So the other tables' files are looked for in all versions of their logs. A time selects a version of `runs`,
+//! nothing else: the logs of two tables may have been written with clocks that differ.
 
 use std::collections::HashSet;
 use std::str::FromStr;

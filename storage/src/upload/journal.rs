@@ -1,5 +1,5 @@
-//! The journal of an upload in parts: `RUN.mcap.upload` beside the run file. Its first line says which upload it is, each
-//! further one which part is in the store. A line that a cut left unfinished is passed over.
+//! The journal of an upload in parts: `RUN.mcap.upload` beside the run file. Its first line says which upload it is,
+//! each further one which part is in the store. A line that a cut left unfinished is passed over.
 
 use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions, TryLockError};

@@ -1,10 +1,10 @@
 //! Uploads of closed run files to a lake's inbox, which continue after any cut.
 //!
 //! 1. The run must not be in the lake yet, in `inbox/` or `runs/`.
-//! 2. A record of the file's SHA-256 is created beside its place in `inbox/`. It keeps the name: of two different files,
-//!    one alone can have it. Ingest compares what it reads with the record.
-//! 3. The file goes up: to an object store in parts, whose ids a journal beside the file keeps (`parts.rs`); to a folder
-//!    by appending to a staged file (`folder.rs`). What is there when the upload is cut off is not sent again.
+//! 2. A record of the file's SHA-256 is created beside its place in `inbox/`. It keeps the name: of two different
+//!    files, one alone can have it. Ingest compares what it reads with the record.
+//! 3. The file goes up: to an object store in parts, whose ids a journal beside the file keeps (`parts.rs`); to a
+//!    folder by appending to a staged file (`folder.rs`). What is there when the upload is cut off is not sent again.
 //! 4. What arrived is read back and its SHA-256 compared. Only then is the journal deleted.
 
 mod folder;
@@ -64,8 +64,8 @@ pub enum UploadOutcome {
 type UploadProgress<'a> = &'a mut (dyn FnMut(UploadStep, u64) + Send);
 
 impl Lake {
-    /// Uploads a run file to `inbox/`, unless the lake has the same file already. The call may be cancelled or killed at
-    /// any moment; the next one continues where it was.
+    /// Uploads a run file to `inbox/`, unless the lake has the same file already. The call may be cancelled or killed
+    /// at any moment; the next one continues where it was.
     ///
     /// # Errors
     /// [`Error::OtherUpload`] if the lake has another file of this name, [`Error::UploadBusy`] if another process is

@@ -1,8 +1,8 @@
 //! Cost of ingest beside that of its unavoidable parts, side by side in one run: the bare transforms, the reference
 //! pipeline in NumPy, the parquet crate alone; and the size of a lake.
 //!
-//! With `--quick` it takes less than a minute. Ratios are of CPU time, the least of a few repeats that take turns, so that
-//! other programs disturb them little.
+//! With `--quick` it takes less than a minute. Ratios are of CPU time, the least of a few repeats that take turns, so
+//! that other programs disturb them little.
 
 mod lake_size;
 mod layout;

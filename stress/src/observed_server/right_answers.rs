@@ -10,8 +10,8 @@ use super::{QueryClient, QueryOutcome, QueryProtocol};
 /// The answer of each query over each protocol.
 pub(crate) type RightAnswers = BTreeMap<(QueryProtocol, &'static str), QueryOutcome>;
 
-/// Asks each query over each protocol that answers with rows, twice: an answer that is not always the same compares with
-/// nothing.
+/// Asks each query over each protocol that answers with rows, twice: an answer that is not always the same compares
+/// with nothing.
 ///
 /// # Errors
 /// A query fails, or has another answer the second time.

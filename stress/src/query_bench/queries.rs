@@ -1,5 +1,5 @@
-//! The twelve queries, written down once in `queries.sql`. Both engines get the same text, but for views that only echolake
-//! has.
+//! The twelve queries, written down once in `queries.sql`. Both engines get the same text, but for views that only
+//! echolake has.
 
 /// One query of the benchmark.
 pub(crate) struct BenchQuery {

@@ -9,8 +9,8 @@ const COUNTED: [&str; 4] = ["measurements", "nce", "tnce_d4", "heightmaps"];
 /// Rounds of each count: as many as a busy machine needs to show the shortest times.
 const LEAST_ROUNDS: usize = 3;
 const MOST_ROUNDS: usize = 10;
-/// Steps that a count spends on a row. If noise hides what few of them cost, more are tried: the time per row grows, the
-/// noise does not.
+/// Steps that a count spends on a row. If noise hides what few of them cost, more are tried: the time per row grows,
+/// the noise does not.
 const STEPS_PER_ROW: [u32; 3] = [200_000, 1_000_000, 5_000_000];
 
 // Counts rows of a surface, each of them slowly.

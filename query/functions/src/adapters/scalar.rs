@@ -88,7 +88,8 @@ impl<F: ScalarKernel> ScalarUDFImpl for ScalarAdapter<F> {
     }
 }
 
-/// Compares an adapter by its name: names are unique in an engine, and its plans never contain functions of another one.
+/// Compares an adapter by its name: names are unique in an engine, and its plans never contain functions of another
+/// one.
 macro_rules! identify_by_name {
     ($adapter:ident, $kernel:ident) => {
         impl<F: $kernel> ::std::fmt::Debug for $adapter<F> {

@@ -12,7 +12,8 @@ use datafusion::error::{DataFusionError, Result};
 use datafusion::functions::datetime::{to_char, to_date, to_timestamp};
 use datafusion::logical_expr::{ColumnarValue, Documentation, ScalarFunctionArgs, ScalarUDF, ScalarUDFImpl, Signature};
 
-/// Numbers, whose letters may be small, and what they are in DataFusion; of two that begin alike the longer comes first.
+/// Numbers, whose letters may be small, and what they are in DataFusion; of two that begin alike the longer comes
+/// first.
 const NUMBERS: [(&str, &str); 15] = [
     ("HH24", "%H"),
     ("HH12", "%I"),

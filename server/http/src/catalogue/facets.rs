@@ -1,5 +1,5 @@
-//! `GET /api/v1/surfaces`: a page of surfaces, with facets and histograms that leave their own filter out. All of it comes
-//! from the summary in memory, in one pass a request.
+//! `GET /api/v1/surfaces`: a page of surfaces, with facets and histograms that leave their own filter out. All of it
+//! comes from the summary in memory, in one pass a request.
 
 use std::cmp::Ordering;
 use std::collections::{BTreeMap, BTreeSet};

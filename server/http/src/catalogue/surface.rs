@@ -28,8 +28,8 @@ struct SurfaceDetail<'a> {
     /// Phase of the relief's details that are narrower than a wavelength, rad, by band without the total. Over 0.18 a
     /// simulated relief is off by 1 dB and more in single pairs; null if it is not known.
     detail_phase: Vec<Option<f64>>,
-    /// Mean over the pairs of Flat's TNCE, linear, over Flat's total. One value per band in the order of `lake.bands`, the
-    /// total last; null if there is no value.
+    /// Mean over the pairs of Flat's TNCE, linear, over Flat's total. One value per band in the order of `lake.bands`,
+    /// the total last; null if there is no value.
     flat_mean: Vec<Option<f64>>,
     /// Mean over the pairs of this surface's TNCE, as `flat_mean`; null of the Foam that is subtracted.
     mean: Vec<Option<f64>>,

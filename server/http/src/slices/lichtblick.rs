@@ -1,5 +1,5 @@
-//! Lichtblick's sessions: a viewer that is opened with `?sessionid=ID` asks the server that it was built for what there is
-//! to show. The ID says it by itself, so that nothing is kept: names of runs, or the parameters of a slice.
+//! Lichtblick's sessions: a viewer that is opened with `?sessionid=ID` asks the server that it was built for what there
+//! is to show. The ID says it by itself, so that nothing is kept: names of runs, or the parameters of a slice.
 
 use axum::extract::{Path, State};
 use axum::http::{HeaderMap, Uri};

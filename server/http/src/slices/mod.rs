@@ -226,9 +226,9 @@ impl SliceService {
 
 /// The messages of some measurements as an MCAP file.
 ///
-/// Streamed as it is cut; who sends Range, HEAD or Origin is told its length, and it is cut to its end first. CORS as for
-/// run files. The same measurements, topics and layout are the same bytes and the same ETag. Needs the scopes sql and
-/// files.
+/// Streamed as it is cut; who sends Range, HEAD or Origin is told its length, and it is cut to its end first. CORS as
+/// for run files. The same measurements, topics and layout are the same bytes and the same ETag. Needs the scopes sql
+/// and files.
 #[utoipa::path(
     get,
     path = SLICE,

@@ -1,5 +1,5 @@
-//! `GET /api/v1/slices.sofa`: responses of chosen measurements of one run as a SOFA file, which is made in memory: a run's
-//! responses are some ten megabytes.
+//! `GET /api/v1/slices.sofa`: responses of chosen measurements of one run as a SOFA file, which is made in memory: a
+//! run's responses are some ten megabytes.
 
 use arrow::array::{ArrayRef, AsArray as _};
 use arrow::compute::concat_batches;

@@ -20,8 +20,8 @@ use super::SliceTask;
 
 /// Bytes of all slices that are kept, and of one.
 const MOST_BYTES: u64 = 2 << 30;
-/// Part of the disk's space that a client's slices may take of what they and the free space have together: an engine has one
-/// client, and the others write to the same disk.
+/// Part of the disk's space that a client's slices may take of what they and the free space have together: an engine
+/// has one client, and the others write to the same disk.
 const SHARE: u64 = 4;
 /// Bytes that are read at a time.
 const BLOCK: u64 = 256 << 10;

@@ -1,5 +1,5 @@
-//! HTTP connections of the door: so many at once, each of which must say what it wants in time. An engine answers what reads
-//! the lake; the door answers the rest: pages, sessions, health and figures.
+//! HTTP connections of the door: so many at once, each of which must say what it wants in time. An engine answers what
+//! reads the lake; the door answers the rest: pages, sessions, health and figures.
 
 mod authentication;
 mod health;

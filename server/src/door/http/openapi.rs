@@ -1,5 +1,5 @@
-//! The contract: the paths that there are and their answers, for people, generated clients and tests. It is derived from
-//! the handlers and their types; `web/openapi.json`, which the types of the pages are generated from, is a copy.
+//! The contract: the paths that there are and their answers, for people, generated clients and tests. It is derived
+//! from the handlers and their types; `web/openapi.json`, which the types of the pages are generated from, is a copy.
 
 use std::sync::LazyLock;
 

@@ -176,8 +176,8 @@ impl LoginPlace {
 }
 
 impl LoginPlace {
-    // Users of one name alone send their token. All others prove that they have the one of their name, whether there is such
-    // a name or not: nobody learns by asking which names there are.
+    // Users of one name alone send their token. All others prove that they have the one of their name, whether there is
+    // such a name or not: nobody learns by asking which names there are.
     async fn authenticate_user(
         &self,
         stream: &mut DoorStream,

@@ -1,5 +1,5 @@
-//! The server's side of a login by SCRAM-SHA-256 (RFC 5802): two messages of each side. Within TLS a client may bind the
-//! login to the server's certificate, which nobody between the two has.
+//! The server's side of a login by SCRAM-SHA-256 (RFC 5802): two messages of each side. Within TLS a client may bind
+//! the login to the server's certificate, which nobody between the two has.
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD as BASE64;

@@ -1,5 +1,5 @@
-//! Blocks of objects: from memory, from the folder, or from the store by as few requests as possible. A block that several
-//! readers want at once is fetched once.
+//! Blocks of objects: from memory, from the folder, or from the store by as few requests as possible. A block that
+//! several readers want at once is fetched once.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;

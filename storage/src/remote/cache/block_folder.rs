@@ -1,9 +1,9 @@
 //! A folder of blocks that several processes share, with a limit for all of them together.
 //!
-//! A block is a file: written beside its name and renamed, so that it is there as a whole or not at all, and with a checksum,
-//! because nothing is synced. `usage` has the bytes of all blocks; who writes holds its lock, and deletes the blocks that
-//! were not read for longest if there is no room. All errors of the folder mean that a block is not cached: a disk that is
-//! full or a folder that was deleted slows queries down and ends none.
+//! A block is a file: written beside its name and renamed, so that it is there as a whole or not at all, and with a
+//! checksum, because nothing is synced. `usage` has the bytes of all blocks; who writes holds its lock, and deletes the
+//! blocks that were not read for longest if there is no room. All errors of the folder mean that a block is not cached:
+//! a disk that is full or a folder that was deleted slows queries down and ends none.
 
 use std::fs::{self, File, FileTimes, OpenOptions};
 use std::io::{self, Read as _, Seek as _, Write as _};

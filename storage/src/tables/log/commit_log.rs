@@ -33,7 +33,8 @@ pub struct DataFile {
     pub parts: Vec<RunPart>,
     /// The runs of parts that a snapshot does not show; empty as the log gives it.
     pub hidden: Vec<RunId>,
-    /// Of a run's row in `runs`: the rows that its other tables have. None if an earlier version of the program wrote it.
+    /// Of a run's row in `runs`: the rows that its other tables have. None if an earlier version of the program wrote
+    /// it.
     pub row_counts: Option<RunRowCounts>,
 }
 
@@ -154,15 +155,15 @@ pub struct NewFile {
     pub parts: Vec<RunPart>,
     /// The version of `runs` that its author had seen.
     pub seen_runs: u64,
-    /// The version of `runs` that added the row of its run which its author had seen; 0 if there was none. If the file is
-    /// in the log already, but its author had not seen that row, it is added again.
+    /// The version of `runs` that added the row of its run which its author had seen; 0 if there was none. If the file
+    /// is in the log already, but its author had not seen that row, it is added again.
     pub run_version: u64,
     /// Of a run's row in `runs`: the rows that its other tables have.
     pub row_counts: Option<RunRowCounts>,
 }
 
-/// The files that a new one replaces. If other files have taken their place, the new one is not added. A merged file in a
-/// place with a beginning stays, because it has other runs' rows: the newer row of the run counts.
+/// The files that a new one replaces. If other files have taken their place, the new one is not added. A merged file in
+/// a place with a beginning stays, because it has other runs' rows: the newer row of the run counts.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ReplacedFiles {
     /// Beginning of the names of all files in that place; None if the names alone are the place.

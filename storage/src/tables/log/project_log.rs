@@ -1,8 +1,8 @@
 //! The commit log as a reader of some projects sees it.
 //!
-//! `runs` decides what readers see, so this is the one place that leaves out runs of other projects: their rows in `runs`
-//! are in no version here, and therefore no snapshot shows a file of theirs. A run's project stands in the log itself,
-//! in the statistics of its row.
+//! `runs` decides what readers see, so this is the one place that leaves out runs of other projects: their rows in
+//! `runs` are in no version here, and therefore no snapshot shows a file of theirs. A run's project stands in the log
+//! itself, in the statistics of its row.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;

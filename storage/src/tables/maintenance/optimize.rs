@@ -1,10 +1,10 @@
 //! Merges small files of a table into large ones. Neither the rows that readers see nor their storage format changes.
 //!
 //! A merged file's Add lists its parts, (surface, run, derivation) each with its number of rows; a snapshot decides
-//! over every part as it would over a file of its own. A part of `runs` has, in addition, the version that added it: which
-//! of two rows of a run is newer does not change when one is merged. Runs of several projects are not merged, so that
-//! whoever may see one project has whole files of it; surfaces are merged with those of the same references alone, whose
-//! names ingest takes from the files' statistics.
+//! over every part as it would over a file of its own. A part of `runs` has, in addition, the version that added it:
+//! which of two rows of a run is newer does not change when one is merged. Runs of several projects are not merged, so
+//! that whoever may see one project has whole files of it; surfaces are merged with those of the same references alone,
+//! whose names ingest takes from the files' statistics.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 

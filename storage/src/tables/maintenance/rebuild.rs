@@ -5,8 +5,8 @@ use echolake_schema::tables::Table;
 use crate::{DataFile, Error, Lake, Result, TableCommit};
 
 impl Lake {
-    /// Removes all rows of these tables, or their logs if these cannot be read or written. Until ingest has derived the rows
-    /// again, readers of the tables are refused.
+    /// Removes all rows of these tables, or their logs if these cannot be read or written. Until ingest has derived the
+    /// rows again, readers of the tables are refused.
     ///
     /// # Errors
     /// What the store says.

@@ -15,8 +15,8 @@ use crate::{DataFile, Error, Lake, RemovalRecord, Result, TableCommit};
 const ROUNDS: usize = 20;
 
 impl Lake {
-    /// Removes all rows of some runs; repeating it resumes what was cut off. Returns the number of files that went or were
-    /// written without these rows.
+    /// Removes all rows of some runs; repeating it resumes what was cut off. Returns the number of files that went or
+    /// were written without these rows.
     ///
     /// # Errors
     /// What the store says. Tables that were changed before stay so.

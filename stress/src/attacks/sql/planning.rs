@@ -1,4 +1,5 @@
-//! Small statements whose plans are large, or are computed while they are planned: nothing runs yet that could be ended.
+//! Small statements whose plans are large, or are computed while they are planned: nothing runs yet that could be
+//! ended.
 
 use super::sql_attack::{SqlAttack, define_attack, query_chain, repeat_numbered};
 

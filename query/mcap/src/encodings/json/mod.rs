@@ -98,8 +98,8 @@ fn column_type(schema: &Value, depth: usize, leaves: &mut usize) -> Result<DataT
     })
 }
 
-// 64 bits with a sign if the schema bounds it so. Of others nobody knows the sign, and JSON's numbers are commonly those
-// of 64 bits with a sign or without.
+// 64 bits with a sign if the schema bounds it so. Of others nobody knows the sign, and JSON's numbers are commonly
+// those of 64 bits with a sign or without.
 fn integer_type_of(schema: &Value) -> DataType {
     let bounded = |name| schema.get(name).is_some_and(Value::is_i64);
     let format = schema.get("format").and_then(Value::as_str);

@@ -1,7 +1,7 @@
 //! Protobuf's editions, which the library of reflection does not know, as the syntax that it knows.
 //!
-//! An edition has features in the place of a syntax. Of all of them only the presence of fields changes what columns hold:
-//! the decoder reads packed and unpacked lists, and both encodings of messages, whatever the descriptor says.
+//! An edition has features in the place of a syntax. Of all of them only the presence of fields changes what columns
+//! hold: the decoder reads packed and unpacked lists, and both encodings of messages, whatever the descriptor says.
 
 use prost::Message;
 use prost_reflect::prost_types::{DescriptorProto, EnumDescriptorProto, FileDescriptorProto, FileDescriptorSet};

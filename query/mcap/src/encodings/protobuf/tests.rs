@@ -358,8 +358,8 @@ fn a_message_within_itself_is_its_bytes() {
     assert_eq!(inner.find("again").map(|(_, f)| f.data_type()), Some(&DataType::Binary));
 }
 
-// A file descriptor of message `M` with an int32 `a`, a message `m` and an enum `e`, in any syntax; then raw bytes that the
-// library's types lack.
+// A file descriptor of message `M` with an int32 `a`, a message `m` and an enum `e`, in any syntax; then raw bytes that
+// the library's types lack.
 fn set_of(syntax: &str, field_features: &[u8], file_features: &[u8], names: &[(&str, i32)]) -> Vec<u8> {
     fn delimited(tag: u8, bytes: &[u8]) -> Vec<u8> {
         let mut field = vec![tag << 3 | 2];

@@ -147,7 +147,8 @@ impl SnapshotViews {
         }
     }
 
-    /// A file that a view shows, or that an earlier one did. A file with rows of other projects is none for a client of some.
+    /// A file that a view shows, or that an earlier one did. A file with rows of other projects is none for a client of
+    /// some.
     pub fn find_file(&self, view: &SnapshotView, table: Table, name: &str) -> Option<VisibleFile> {
         let now = view.snapshot.readable_files(table).find(|file| file.path.filename() == Some(name));
         let earlier = || self.lock_history().earlier.iter().find(|file| file.is_named(table, name)).cloned();

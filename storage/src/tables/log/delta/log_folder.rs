@@ -112,7 +112,8 @@ impl<'a> LogFolder<'a> {
         Ok(Some(state))
     }
 
-    // Another program's checkpoint does not say that it has removed files before. Commits that cannot be read are not needed.
+    // Another program's checkpoint does not say that it has removed files before. Commits that cannot be read are not
+    // needed.
     async fn look_at_authors(&self, state: &mut TableState, listing: &LogListing, checkpoint: u64) {
         let first = checkpoint.saturating_sub(2 * CHECKPOINT_INTERVAL);
         for version in listing.commits.range(first..=checkpoint) {

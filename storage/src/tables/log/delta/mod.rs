@@ -38,8 +38,8 @@ use crate::{
 
 /// Tries of one commit against other writers; each loses to a commit that went through.
 const COMMIT_TRIES: usize = 50;
-/// Time for which a log on an object store is taken to hold the version that was found there. A log forgets versions after
-/// 30 days; tables that somebody deletes are missed only so much later.
+/// Time for which a log on an object store is taken to hold the version that was found there. A log forgets versions
+/// after 30 days; tables that somebody deletes are missed only so much later.
 const LOG_LASTS: Duration = Duration::from_secs(600);
 /// The tag of a merged file's Add that holds its parts.
 const PARTS: &str = "echolake.parts";
@@ -278,8 +278,8 @@ impl<'a> PendingChange<'a> {
         std::iter::once(commit_info(operation, parameters, now_millis)).chain(added).chain(removed).collect()
     }
 
-    // An Add whose author had not seen the row of the run that this one will replace may be cleaned up at any moment; it
-    // is added again.
+    // An Add whose author had not seen the row of the run that this one will replace may be cleaned up at any moment;
+    // it is added again.
     fn decide_outcome(&self, file: &NewFile, known: &HashMap<String, KnownFile>) -> CommitOutcome {
         if known.get(&file.name).is_some_and(|known| known.seen_runs >= file.run_version) {
             return CommitOutcome::Before;

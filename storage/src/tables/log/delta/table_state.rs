@@ -26,7 +26,8 @@ pub(super) struct TableState {
 
 /// The setting of a table's metadata that says that it is being made again, or that another program changed its files.
 const REBUILD: &str = "echolake.rebuild";
-/// The setting that this program's checkpoints have: their version. Those of others repeat an earlier one, or have none.
+/// The setting that this program's checkpoints have: their version. Those of others repeat an earlier one, or have
+/// none.
 const CHECKED: &str = "echolake.checkpoint";
 /// The beginning of `engineInfo` in commits of this program.
 pub(super) const ENGINE: &str = "echolake/";
