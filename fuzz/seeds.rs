@@ -68,8 +68,8 @@ const TEXT_STL: &str = "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nv
                         endfacet\nendsolid a\n";
 const COMBINATIONS: &str = "combination,mic_layer,mic_x,mic_y,speaker_layer,speaker_x,speaker_y\n\
                             1,0,0,0,0,1,0\n2,0,0,0,0,2,0\n3,0,1,0,0,2,0\n";
-const PANEL_INFO: &str = "panel id,flat reference,foam reference,macrostructure reference,mesostructure reference,sand type,\
-                          binder type\na,b,c,flat,river_rock,sand,\n";
+const PANEL_INFO: &str = "panel id,flat reference,foam reference,macrostructure reference,mesostructure reference,sand \
+                          type,binder type\na,b,c,flat,river_rock,sand,\n";
 
 // Noise, whose loopback is itself.
 fn wav(bits_per_sample: u16, sample_format: SampleFormat) -> Vec<u8> {

@@ -46,8 +46,8 @@ fn a_gir_folder_becomes_runs_with_references_of_their_own() {
     write("mean_flat_rfl_1", 0.5, 45, 400);
     write("mean_foam_1", 0.0, 45, 400);
     write("panel_0016_r180_0", 0.25, 45, 400);
-    let info = "panel id,flat reference,foam reference,macrostructure reference,mesostructure reference,sand type,binder type\n\
-                panel_0016_r180_0,mean_flat_rfl_1,mean_foam_1,mean_flat_rfl_1,Primitives,GS14,Furan\n\
+    let info = "panel id,flat reference,foam reference,macrostructure reference,mesostructure reference,sand \
+                type,binder type\npanel_0016_r180_0,mean_flat_rfl_1,mean_foam_1,mean_flat_rfl_1,Primitives,GS14,Furan\n\
                 mean_flat_rfl_1,mean_flat_rfl_1,mean_foam_1,flat,Baseline_mean,GS14,Furan\n";
     std::fs::write(folder.join("panel_info.csv"), info).expect("written");
     place.ok(&["import", "gir", "gir", "--rig", "rig.toml"]);
@@ -153,7 +153,8 @@ mod slow {
 
         // Flat over itself is 1, and its bands sum to it.
         let off =
-            "select max(abs(tnce_total - 1)) + max(abs(tnce_2500 + tnce_5000 + tnce_10000 + tnce_20000 + tnce_40000 - 1))
+            "select max(abs(tnce_total - 1)) + max(abs(tnce_2500 + tnce_5000 + tnce_10000 + tnce_20000 + tnce_40000 - \
+                1))
                    + max(abs(tnce_band_5000 - 1)) from tnce where surface_id = 'flat'";
         assert!(place.number(off) < 1e-4);
         // The second Foam run lies 25 dB under Flat at least, on the mean over the pairs.

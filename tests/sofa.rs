@@ -15,8 +15,8 @@ fn a_mapped_set_is_what_its_file_has() {
     place.acquire("flat", &["--ir-only"]);
     place.ok(&["ingest"]);
     place.ok(&["export", "sofa", "-o", &other.path("out").to_string_lossy()]);
-    let mapping = "file = \"out/flat.sofa\"\nsurfaces = [\"flat\"]\nsampling_rate = { dataset = \"Data.SamplingRate\" }\n\
-                   [responses]\ndataset = \"Data.IR\"\ndimensions = [\"speaker\", \"microphone\", \"sample\"]\n\
+    let mapping = "file = \"out/flat.sofa\"\nsurfaces = [\"flat\"]\nsampling_rate = { dataset = \"Data.SamplingRate\" \
+                   }\n[responses]\ndataset = \"Data.IR\"\ndimensions = [\"speaker\", \"microphone\", \"sample\"]\n\
                    [microphones]\ndataset = \"ListenerPosition\"\n[speakers]\ndataset = \"SourcePosition\"\n\
                    [temperature]\ndataset = \"RoomTemperature\"\nunits = \"kelvin\"\n";
     std::fs::write(other.path("set.toml"), mapping.replace("Data.IR", "Data.None")).expect("written");

@@ -37,7 +37,10 @@ mod slow {
         let names: Vec<_> = origins.iter().map(|row| row["surface_id"].as_str().expect("a name")).collect();
         assert_eq!(names, ["twin_flat", "twin_foam", "twin_stretcher_bond"]);
         assert_eq!(
-            place.sql("select flat_reference from surfaces where surface_id = 'twin_stretcher_bond'")[0]["flat_reference"],
+            place.sql(
+                "select flat_reference from surfaces where surface_id = \
+                'twin_stretcher_bond'"
+            )[0]["flat_reference"],
             "twin_flat"
         );
 

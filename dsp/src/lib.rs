@@ -21,7 +21,7 @@
 //!     reference_celsius: 20.0,
 //! })?;
 //! let mut ir = vec![0.0; 384];
-//! plan.ir(&recording, &loopback, 20.0, &mut ir, &mut plan.scratch())?;
+//! plan.compute_ir(&recording, &loopback, 20.0, &mut ir, &mut plan.make_scratch())?;
 //! let peak = (0..384).max_by(|a, b| ir[*a].total_cmp(&ir[*b]));
 //! assert_eq!(peak, Some(10));
 //! # Ok::<(), echolake_dsp::Error>(())

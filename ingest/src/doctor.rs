@@ -152,8 +152,8 @@ async fn find_faults(lake: &Lake, snapshot: &LakeSnapshot, report: &mut LakeRepo
             report.find_in(table, format!("{lacking}; hint: `echolake ingest` derives them again from the run's file"));
         }
         for file in snapshot.foreign_files(table) {
-            let what = "another program put it into the table's log; hint: `echolake ingest` removes it, and derives again \
-                        what it replaced";
+            let what = "another program put it into the table's log; hint: `echolake ingest` removes it, and derives \
+                        again what it replaced";
             report.add_finding(FindingSeverity::Damaged, &file.path, what);
         }
         if is_named
@@ -165,8 +165,8 @@ async fn find_faults(lake: &Lake, snapshot: &LakeSnapshot, report: &mut LakeRepo
         }
         if let Some(versions) = lake.overdue_checkpoint(table).await? {
             let what = format!(
-                "{versions} versions since its last checkpoint; hint: can the folder be written? The log of ingest says \
-                 why a checkpoint failed"
+                "{versions} versions since its last checkpoint; hint: can the folder be written? The log of ingest \
+                 says why a checkpoint failed"
             );
             report.add_finding(FindingSeverity::Note, format!("tables/{}/_delta_log", table.name()), what);
         }
@@ -293,8 +293,8 @@ async fn find_strays(lake: &Lake, snapshot: &LakeSnapshot, report: &mut LakeRepo
             }
             ("inbox" | "runs", "mcap") if !has_end(lake, &path).await.unwrap_or(true) => {
                 let what = format!(
-                    "it has no end after {} bytes: it is still being copied, or its recording was cut off; hint: copy it \
-                     again, or `echolake recover` makes a run of what it holds",
+                    "it has no end after {} bytes: it is still being copied, or its recording was cut off; hint: copy \
+                     it again, or `echolake recover` makes a run of what it holds",
                     meta.size
                 );
                 report.add_finding(FindingSeverity::Missing, &path, what);
@@ -306,13 +306,13 @@ async fn find_strays(lake: &Lake, snapshot: &LakeSnapshot, report: &mut LakeRepo
             }
             ("inbox", _) => (
                 FindingSeverity::Note,
-                "unfinished recording (still running, stopped or cut off); hint: `echolake acquire --resume` resumes it, \
-                 `echolake recover` makes a run of what it holds",
+                "unfinished recording (still running, stopped or cut off); hint: `echolake acquire --resume` resumes \
+                 it, `echolake recover` makes a run of what it holds",
             ),
             ("runs", _) => (
                 FindingSeverity::Damaged,
-                "in no table: an ingest reads it now or was cut off, or the log of `runs` lost its newest commits; hint: \
-                 `echolake ingest`",
+                "in no table: an ingest reads it now or was cut off, or the log of `runs` lost its newest commits; \
+                 hint: `echolake ingest`",
             ),
             // It is named with its file.
             ("quarantine", _) if path.as_ref().ends_with(".reason.txt") => continue,

@@ -18,7 +18,8 @@ pub enum Error {
     },
     /// The file is no MCAP file at all.
     #[error(
-        "`{file}` is not an MCAP file: it begins with {actual}, expected the magic bytes `89 MCAP 30 0D 0A`; hint: is it the right file?"
+        "`{file}` is not an MCAP file: it begins with {actual}, expected the magic bytes `89 MCAP 30 0D 0A`; hint: is \
+            it the right file?"
     )]
     NotMcap {
         /// The file.
@@ -28,7 +29,8 @@ pub enum Error {
     },
     /// An MCAP file, but not one of our runs.
     #[error(
-        "`{file}` is an MCAP file but no run of echolake: it has no metadata `echolake.run`; hint: only recordings of `echolake acquire` and `echolake import` can be ingested"
+        "`{file}` is an MCAP file but no run of echolake: it has no metadata `echolake.run`; hint: only recordings of \
+            `echolake acquire` and `echolake import` can be ingested"
     )]
     Foreign {
         /// The file.
@@ -64,8 +66,8 @@ pub enum Error {
     /// Another run of this name is in the lake.
     #[error(
         "run `{run}` is already in the lake with other content: `{file}` has SHA-256 {given}, the lake's file \
-         {there}; hint: a run file never changes once closed; if the given one is right, `echolake remove {run}` takes the \
-         lake's out"
+         {there}; hint: a run file never changes once closed; if the given one is right, `echolake remove {run}` takes \
+         the lake's out"
     )]
     OtherContent {
         /// The run.
@@ -92,8 +94,8 @@ pub enum Error {
     /// The file does not end as a closed file does: it is still being copied, or its recording was cut off.
     #[error(
         "`{file}` is not whole: it has {bytes} bytes, and its last {} are not the footer and the magic bytes that a \
-         closed file ends with; it stays where it is. hint: once its copy has ended, ingest it again; if its recording was \
-         cut off, `echolake recover` makes a run of what it holds",
+         closed file ends with; it stays where it is. hint: once its copy has ended, ingest it again; if its recording \
+         was cut off, `echolake recover` makes a run of what it holds",
         FILE_END_BYTES
     )]
     Unfinished {
@@ -104,8 +106,8 @@ pub enum Error {
     },
     /// A recording whose recorder died, and which cannot be resumed.
     #[error(
-        "`{file}` was cut off after {bytes} bytes: its recorder has ended; it stays where it is. hint: `echolake recover` \
-         makes a run of what it holds"
+        "`{file}` was cut off after {bytes} bytes: its recorder has ended; it stays where it is. hint: `echolake \
+         recover` makes a run of what it holds"
     )]
     CutOff {
         /// The file.
@@ -115,8 +117,8 @@ pub enum Error {
     },
     /// The file changed while it was read.
     #[error(
-        "`{file}` changed while it was read: {before}, now {after}; it stays where it is. hint: ingest it again once nothing \
-         writes it any more"
+        "`{file}` changed while it was read: {before}, now {after}; it stays where it is. hint: ingest it again once \
+         nothing writes it any more"
     )]
     Changed {
         /// The file.
@@ -148,7 +150,8 @@ pub enum Error {
     },
     /// The file is not the one that was uploaded.
     #[error(
-        "`{file}` is not what was uploaded: it has SHA-256 {actual}, and `{file}.sha256` says {recorded}; hint: upload it again"
+        "`{file}` is not what was uploaded: it has SHA-256 {actual}, and `{file}.sha256` says {recorded}; hint: upload \
+            it again"
     )]
     OtherDigest {
         /// The file.
@@ -160,7 +163,8 @@ pub enum Error {
     },
     /// Processes end while they ingest it.
     #[error(
-        "`{file}` is passed over: processes that took in this file alone ended on the way ({endings}); hint: to retry it, move it back into `inbox/`, or delete `{mark}`"
+        "`{file}` is passed over: processes that took in this file alone ended on the way ({endings}); hint: to retry \
+            it, move it back into `inbox/`, or delete `{mark}`"
     )]
     Deadly {
         /// The file.

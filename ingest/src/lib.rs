@@ -16,7 +16,7 @@
 //!     })
 //!     .await?;
 //! ingest.complete_runs(&mut |_, _| {}).await?;
-//! ingest.close().await;
+//! ingest.release_claims().await;
 //! # Ok(())
 //! # }
 //! ```

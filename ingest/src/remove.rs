@@ -109,8 +109,8 @@ impl LakeIngest<'_> {
                 RemovedFile::Kept => {
                     let now = chrono::Utc::now().format("%Y-%m-%dT%H:%M:%SZ");
                     let reason = format!(
-                        "run `{}` was removed from the lake by {by} at {now}; hint: to ingest it again, move it back into \
-                         `inbox/`",
+                        "run `{}` was removed from the lake by {by} at {now}; hint: to ingest it again, move it back \
+                         into `inbox/`",
                         removal.run
                     );
                     removal.moved_to = inbox::set_file_aside(lake, &path, &reason).await?.map(|path| path.to_string());

@@ -15,10 +15,10 @@ use crate::control::pool::{HeldMemory, PartialPool};
 /// use echolake_query::{EngineClient, QueryQuota};
 ///
 /// let client = EngineClient::new("guest", QueryQuota { concurrent: Some(1), ..QueryQuota::default() });
-/// let permit = client.place()?;
-/// assert!(client.place().is_err());
+/// let permit = client.acquire_place()?;
+/// assert!(client.acquire_place().is_err());
 /// drop(permit);
-/// assert!(client.place().is_ok());
+/// assert!(client.acquire_place().is_ok());
 /// # Ok::<(), echolake_query::Error>(())
 /// ```
 #[derive(Debug)]

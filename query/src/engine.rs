@@ -56,7 +56,7 @@ const SPILL_BYTES: u64 = 16 << 30;
 /// let lake = Lake::open_or_create("memory://", &Rig::paper(), &ReferenceSurfaces::default()).await?;
 /// let engine = QueryEngine::new(&lake, None)?;
 /// let client = EngineClient::new("guest", QueryQuota { rows: Some(1), ..QueryQuota::default() });
-/// let mut answer = engine.session(&Arc::new(client)).query("select * from points").await?;
+/// let mut answer = engine.open_session(&Arc::new(client)).query("select * from points").await?;
 /// assert!(matches!(answer.next().await, Err(Error::RowLimit { limit: 1 })));
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// # })?;

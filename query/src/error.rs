@@ -73,7 +73,8 @@ pub enum Error {
     #[error("the query was cancelled")]
     Cancelled,
     /// It took longer than its client may.
-    #[error("the query took longer than {} s; hint: ask for less, or for fewer surfaces at a time", limit.as_secs_f64())]
+    #[error("the query took longer than {} s; hint: ask for less, or for fewer surfaces at a \
+        time", limit.as_secs_f64())]
     TimeLimit {
         /// The client's time for a query.
         limit: Duration,
@@ -378,11 +379,11 @@ mod tests {
 
     #[test]
     fn a_store_that_does_not_answer_is_named_without_the_layers_above_it() {
-        let fault = "Parquet error: Failed to fetch metadata for file x.parquet: Object Store error: Generic remote error: \
-                     Generic S3 error: Error performing GET http://host:7480/lake/tables/x.parquet in 250.4ms, after 1 \
-                     retries, max_retries: 1, retry_timeout: 180s  - HTTP error: error sending request";
-        let expected = "cannot read `lake/tables/x.parquet` of the lake's store: HTTP error: error sending request; hint: \
-                        run the query again when the store answers";
+        let fault = "Parquet error: Failed to fetch metadata for file x.parquet: Object Store error: Generic remote \
+                     error: Generic S3 error: Error performing GET http://host:7480/lake/tables/x.parquet in 250.4ms, \
+                     after 1 retries, max_retries: 1, retry_timeout: 180s  - HTTP error: error sending request";
+        let expected = "cannot read `lake/tables/x.parquet` of the lake's store: HTTP error: error sending request; \
+                        hint: run the query again when the store answers";
         assert_eq!(store_fault(fault).as_deref(), Some(expected));
         assert_eq!(store_fault("division by zero"), None);
         assert!(damaged_file(&fault.replace(" x.parquet", " tables/nce/x.parquet")).is_none());
@@ -390,10 +391,10 @@ mod tests {
 
     #[test]
     fn a_file_that_is_gone_is_damage_with_a_way_out_and_without_the_servers_paths() {
-        let fault = "Parquet error: Failed to fetch metadata for file tables/nce/x.parquet: Object Store error: Object at \
-                     location /srv/lake/tables/nce/x.parquet not found: No such file or directory (os error 2)";
-        let expected = "`tables/nce/x.parquet` is damaged: it is not there; hint: `echolake rebuild nce` makes it again from \
-                        the runs";
+        let fault = "Parquet error: Failed to fetch metadata for file tables/nce/x.parquet: Object Store error: Object \
+                     at location /srv/lake/tables/nce/x.parquet not found: No such file or directory (os error 2)";
+        let expected = "`tables/nce/x.parquet` is damaged: it is not there; hint: `echolake rebuild nce` makes it \
+                        again from the runs";
         assert_eq!(damaged_file(fault).map(|error| error.to_string()).as_deref(), Some(expected));
         assert!(damaged_file("division by zero").is_none());
     }

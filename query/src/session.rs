@@ -225,7 +225,7 @@ impl Session {
     /// let lake = Lake::open_or_create("memory://", &Rig::paper(), &ReferenceSurfaces::default()).await?;
     /// let session = echolake_query::Session::new(&lake)?;
     /// let prepared = session.prepare("select pair_id from pairs where direct_mm > $1").await?;
-    /// assert_eq!(prepared.parameters()?, [Some(arrow::datatypes::DataType::Float64)]);
+    /// assert_eq!(prepared.parameter_types()?, [Some(arrow::datatypes::DataType::Float64)]);
     /// assert_eq!(prepared.schema().field(0).name(), "pair_id");
     /// # Ok::<(), Box<dyn std::error::Error>>(())
     /// # })?;
@@ -302,7 +302,7 @@ impl Session {
     /// let lake = Lake::open_or_create("memory://", &Rig::paper(), &ReferenceSurfaces::default()).await?;
     /// let session = Session::new(&lake)?;
     /// let select = "select 1 from pairs where";
-    /// let selecting = |predicate| session.selecting(select, predicate, PredicateForm::Comparisons);
+    /// let selecting = |predicate| session.append_predicate(select, predicate, PredicateForm::Comparisons);
     /// assert_eq!(selecting("pair_id < 9")?, "select 1 from pairs where (\npair_id < 9\n)");
     /// assert!(selecting("true) or (true").is_err());
     /// # Ok::<(), Box<dyn std::error::Error>>(())

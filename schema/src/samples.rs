@@ -6,7 +6,7 @@
 //!
 //! let bytes = samples::split_24(&[-0x80_0000, 0x40_0000]);
 //! let mut fractions = [0.0; 2];
-//! samples::decode(SampleFormat::S24Split, &bytes, &mut fractions)?;
+//! samples::decode_samples(SampleFormat::S24Split, &bytes, &mut fractions)?;
 //! assert_eq!(fractions, [-1.0, 0.5]);
 //! # Ok::<(), echolake_schema::Error>(())
 //! ```

@@ -10,7 +10,7 @@ use crate::{PairId, PointId};
 /// ```
 /// use echolake_schema::{Rig, Symmetry};
 ///
-/// assert_eq!(Symmetry::Rot90.apply([1.0, 2.0, 3.0]), [-2.0, 1.0, 3.0]);
+/// assert_eq!(Symmetry::Rot90.move_position([1.0, 2.0, 3.0]), [-2.0, 1.0, 3.0]);
 /// let moved = Rig::paper().build_grid()?.moved_pairs(Symmetry::Rot180);
 /// assert_eq!(moved.map(|pairs| pairs.len()), Some(2951));
 /// # Ok::<(), echolake_schema::Error>(())

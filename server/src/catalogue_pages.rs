@@ -26,12 +26,12 @@ impl CataloguePages {
         match self {
             Self::Embedded => None,
             Self::NotBuilt => Some(
-                "built without the catalogue's pages, because Node was missing or too old; hint: `pip install echolake`, or \
-                 install Node 20.19 (or 22.12) or newer with npm and build again",
+                "built without the catalogue's pages, because Node was missing or too old; hint: `pip install \
+                 echolake`, or install Node 20.19 (or 22.12) or newer with npm and build again",
             ),
             Self::LeftOut => Some(
-                "built without the catalogue's pages (feature `web`); hint: `pip install echolake`, or build with default \
-                 features",
+                "built without the catalogue's pages (feature `web`); hint: `pip install echolake`, or build with \
+                 default features",
             ),
         }
     }

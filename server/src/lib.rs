@@ -5,10 +5,10 @@
 //! # async fn example(settings: echolake_server::ServerSettings) -> Result<(), Box<dyn std::error::Error>> {
 //! let lake = echolake_lake::Lake::open("lake").await?;
 //! let server = echolake_server::LakeServer::bind(&lake, settings)?;
-//! for address in server.addresses() {
+//! for address in server.listening_urls() {
 //!     eprintln!("{address}");
 //! }
-//! server.run(std::future::pending()).await?;
+//! server.serve_until(std::future::pending()).await?;
 //! # Ok(())
 //! # }
 //! ```

@@ -263,8 +263,8 @@ async fn upload_run(path: &Path, location: &str, stop: &StopRequest, progress: &
         let path = path.display();
         let cause = describe_error(&cause);
         anyhow::anyhow!(
-            "the run stays in `{path}` and was not uploaded to `{location}`: {cause}; hint: `echolake --lake {location} \
-             upload {path}` continues"
+            "the run stays in `{path}` and was not uploaded to `{location}`: {cause}; hint: `echolake --lake \
+             {location} upload {path}` continues"
         )
     })
 }
@@ -300,8 +300,8 @@ fn check_not_ingested(partial: &Path, held: &Held) -> anyhow::Result<()> {
     let run = runs.map(|runs| runs.join(manifest.surface_id.as_str()).join(format!("{}.mcap", manifest.run_id)));
     if let Some(run) = run.filter(|run| run.exists()) {
         anyhow::bail!(
-            "`{}` was recovered, and its run is in the lake: `{}`; hint: measure the surface anew by `echolake acquire --surface \
-             {}`, since a run never changes once it is in the lake",
+            "`{}` was recovered, and its run is in the lake: `{}`; hint: measure the surface anew by `echolake acquire \
+             --surface {}`, since a run never changes once it is in the lake",
             partial.display(),
             run.display(),
             manifest.surface_id

@@ -182,8 +182,8 @@ async fn print_tables(lake: &Lake) -> anyhow::Result<&'static str> {
     };
     let rows: Vec<_> = lake.rig().band_names().iter().map(String::as_str).chain(["total"]).map(row).collect();
     let sql = format!(
-        "select band, round(flat, 3) as flat, round(panel, 3) as {COMPARED}, round(100 * (panel / flat - 1), 1) as \"difference %\" \
-         from ({}) order by band = 'total', length(band), band",
+        "select band, round(flat, 3) as flat, round(panel, 3) as {COMPARED}, round(100 * (panel / flat - 1), 1) as \
+         \"difference %\" from ({}) order by band = 'total', length(band), band",
         rows.join(" union all ")
     );
     super::sql::print_table(&session, &sql).await?;

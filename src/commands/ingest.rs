@@ -182,7 +182,8 @@ fn note_recording(UnfinishedRecording { path, bytes, state }: &UnfinishedRecordi
     let what = match state {
         RecordingState::Running => "is being recorded",
         RecordingState::Resumable => {
-            "is not finished; hint: `echolake acquire --resume` resumes it, `echolake recover` makes a run of what it holds"
+            "is not finished; hint: `echolake acquire --resume` resumes it, `echolake recover` makes a run of what it \
+                holds"
         }
         RecordingState::Import => "is part of an import that was cut off; hint: repeat the import",
         RecordingState::CutOff => return,
@@ -513,8 +514,8 @@ async fn sources_of(lake: &Lake, names: &[String]) -> anyhow::Result<Vec<RunSour
     for name in names {
         anyhow::ensure!(
             !is_partial(Path::new(name)),
-            "`{name}` is an unfinished recording, expected a run (.mcap); hint: `echolake acquire --resume {name}` resumes \
-             it, `echolake recover {name}` makes a run of what it holds"
+            "`{name}` is an unfinished recording, expected a run (.mcap); hint: `echolake acquire --resume {name}` \
+             resumes it, `echolake recover {name}` makes a run of what it holds"
         );
     }
     let named: Vec<_> = names.iter().map(String::as_str).filter(|name| !Path::new(name).is_file()).collect();

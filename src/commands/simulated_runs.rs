@@ -105,7 +105,8 @@ impl SimulationPlan {
             let (task, _) = whole.into_inner().unwrap_or_else(PoisonError::into_inner);
             let rate = accepted as f64 / begun.elapsed().as_secs_f64();
             task.finish_with(format!(
-                "{runs} of {count} surfaces made, {accepted} pairs in {attempts} attempts, {rate:.0} pairs a second, {:.0} MB",
+                "{runs} of {count} surfaces made, {accepted} pairs in {attempts} attempts, {rate:.0} pairs a second, \
+                    {:.0} MB",
                 bytes as f64 / 1e6
             ));
         }

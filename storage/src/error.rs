@@ -43,7 +43,8 @@ pub enum Error {
     },
     /// The object store lets several create the same object, so that writers would overwrite each other's commits.
     #[error(
-        "the object store of `{location}` cannot hold a lake: {observed}; hint: commits need a store that refuses to create an object that exists (`If-None-Match: *`), and a bucket without versions"
+        "the object store of `{location}` cannot hold a lake: {observed}; hint: commits need a store that refuses to \
+            create an object that exists (`If-None-Match: *`), and a bucket without versions"
     )]
     NotExclusive {
         /// The lake's location.
@@ -61,7 +62,8 @@ pub enum Error {
     },
     /// A later version wrote the lake.
     #[error(
-        "the lake at `{location}` has format {actual}, the newest that this version reads is {newest}; hint: update echolake"
+        "the lake at `{location}` has format {actual}, the newest that this version reads is {newest}; hint: update \
+            echolake"
     )]
     Newer {
         /// The lake's location.
@@ -73,7 +75,8 @@ pub enum Error {
     },
     /// The lake was made for another rig.
     #[error(
-        "rig `{given}` does not fit the lake at `{location}`, made for rig `{lake}`: {differences}; hint: use the lake's rig, or another lake"
+        "rig `{given}` does not fit the lake at `{location}`, made for rig `{lake}`: {differences}; hint: use the \
+            lake's rig, or another lake"
     )]
     OtherRig {
         /// The lake's location.
@@ -153,7 +156,8 @@ pub enum Error {
     },
     /// Another process holds the maintenance lease.
     #[error(
-        "`{location}` is being maintained by process {pid} on {host} (lease until {until}); hint: wait for it; where it has died, its lease ends by itself"
+        "`{location}` is being maintained by process {pid} on {host} (lease until {until}); hint: wait for it; where \
+            it has died, its lease ends by itself"
     )]
     Maintained {
         /// The lake's location.
@@ -181,7 +185,8 @@ pub enum Error {
     },
     /// Files of that moment are deleted.
     #[error(
-        "table `{table}` cannot be seen at {moment}: {missing} of its {files} files then are deleted; hint: `echolake vacuum --keep-hours` keeps files longer"
+        "table `{table}` cannot be seen at {moment}: {missing} of its {files} files then are deleted; hint: `echolake \
+            vacuum --keep-hours` keeps files longer"
     )]
     Vacuumed {
         /// The moment.
@@ -195,8 +200,8 @@ pub enum Error {
     },
     /// The log has forgotten rows of that moment.
     #[error(
-        "table `{table}` cannot be seen at {moment}: of the rows of then, its log does not have all: {lacking}; hint: ask \
-         for a newer version, `system.versions` lists them"
+        "table `{table}` cannot be seen at {moment}: of the rows of then, its log does not have all: {lacking}; hint: \
+         ask for a newer version, `system.versions` lists them"
     )]
     Forgotten {
         /// The moment.
@@ -226,7 +231,9 @@ pub enum Error {
     },
     /// A run of this name is in the lake, or on its way there, with other content.
     #[error(
-        "`{path}` of `{location}` is another file than the given one: it has {there}, the given file {given}; hint: a run file never changes once closed, so record it under another name; if an upload was given up, delete `{path}.sha256`"
+        "`{path}` of `{location}` is another file than the given one: it has {there}, the given file {given}; hint: a \
+            run file never changes once closed, so record it under another name; if an upload was given up, delete \
+            `{path}.sha256`"
     )]
     OtherUpload {
         /// The lake's location.
@@ -240,7 +247,8 @@ pub enum Error {
     },
     /// The uploaded object is not what was sent. It is deleted.
     #[error(
-        "`{path}` of `{location}` does not hold what was uploaded: it has SHA-256 {actual}, expected {expected}; hint: it is deleted, run the command again"
+        "`{path}` of `{location}` does not hold what was uploaded: it has SHA-256 {actual}, expected {expected}; hint: \
+            it is deleted, run the command again"
     )]
     UploadDamaged {
         /// The lake's location.
@@ -254,7 +262,8 @@ pub enum Error {
     },
     /// The uploaded object disappeared before it was compared.
     #[error(
-        "`{path}` of `{location}` disappeared before its SHA-256 was compared; hint: look into `quarantine/`, then run the command again"
+        "`{path}` of `{location}` disappeared before its SHA-256 was compared; hint: look into `quarantine/`, then run \
+            the command again"
     )]
     UploadGone {
         /// The lake's location.
@@ -423,9 +432,9 @@ mod tests {
         };
         check("the power is gone", "the power is gone");
         check(
-            "Error performing PUT http://host/x in 1.2s, after 3 retries, max_retries: 3, retry_timeout: 180s  - Server \
-             returned non-2xx status code: 503 Service Unavailable: <?xml version=\"1.0\"?><Error><Code>SlowDown</Code>\
-             <Message>Reduce your request rate.</Message></Error>",
+            "Error performing PUT http://host/x in 1.2s, after 3 retries, max_retries: 3, retry_timeout: 180s  - \
+             Server returned non-2xx status code: 503 Service Unavailable: <?xml \
+             version=\"1.0\"?><Error><Code>SlowDown</Code><Message>Reduce your request rate.</Message></Error>",
             "503 Service Unavailable, SlowDown (Reduce your request rate.) (tried 4 times)",
         );
         check(

@@ -14,7 +14,7 @@ use echolake_dsp::sweep::LinearSweep;
 use echolake_dsp::temperature::{TemperatureCorrection, resampling_ratio};
 use echolake_dsp::{Error, RealSample as _};
 use echolake_schema::messages::SampleFormat;
-use echolake_schema::samples::{decode, split_24};
+use echolake_schema::samples::{decode_samples, split_24};
 use rustfft::FftDirection;
 use rustfft::num_complex::Complex;
 
@@ -62,7 +62,7 @@ fn samples(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("samples");
     group.throughput(Throughput::Elements(out.len() as u64));
     group.bench_function(BenchmarkId::new("decode", out.len()), |bencher| {
-        bencher.iter(|| decode(SampleFormat::S24Split, black_box(&stored), &mut out));
+        bencher.iter(|| decode_samples(SampleFormat::S24Split, black_box(&stored), &mut out));
     });
 }
 

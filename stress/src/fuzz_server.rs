@@ -45,8 +45,8 @@ pub(crate) fn run_fuzz_server(args: &FuzzArgs) -> Result<()> {
     });
     writeln!(
         std::io::stdout(),
-        "{}, seed {seed}: {} rounds in {:.0?}, {} answered, {} broke their own connection's decoder, at most {} MiB; the \
-         server is well",
+        "{}, seed {seed}: {} rounds in {:.0?}, {} answered, {} broke their own connection's decoder, at most {} MiB; \
+         the server is well",
         target.name(),
         outcome.rounds,
         begun.elapsed(),

@@ -19,7 +19,8 @@ const GOOD: [&str; 16] = [
     "select * from runs version as of 1",
     "select case when x > 0 then sqrt(x) else null end from (values (1.0), (-1.0), ('NaN'::double)) v(x)",
     "explain analyze select approx_percentile_cont(tnce_total, 0.5) from tnce union all select 1 except select 2",
-    "select cast('2026-01-05T08:00:00Z' as timestamp) at time zone 'UTC', interval '3 months', date_trunc('hour', now())",
+    "select cast('2026-01-05T08:00:00Z' as timestamp) at time zone 'UTC', interval '3 months', date_trunc('hour', \
+        now())",
     "select array_agg(distinct pair_id order by pair_id)[1:3], map(['a'], [1])['a'], struct(1, 'x') from pairs",
     "select regexp_replace(surface_id, '(a+)+$', repeat('b', 10)), substr(surface_id, -1, 3) from surfaces",
 ];

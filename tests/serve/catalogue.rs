@@ -57,8 +57,9 @@ fn numbers_are_those_of_sql() {
     let server = served(&place, &[]);
     let grid = json(&get(&server, "/api/v1/surfaces/brick/grid?microphone=3&over=flat-band"));
     let rows = place.sql(
-        "select case when microphone = 3 then speaker else microphone end as point, microphone <> 3 as swapped, pair_id, \
-         10 * log10(tnce_band_10000) as level from tnce where surface_id = 'brick' and (microphone = 3 or speaker = 3)",
+        "select case when microphone = 3 then speaker else microphone end as point, microphone <> 3 as swapped, \
+         pair_id, 10 * log10(tnce_band_10000) as level from tnce where surface_id = 'brick' and (microphone = 3 or \
+         speaker = 3)",
     );
     assert!(rows.len() > 5, "{rows:?}");
     for row in &rows {
@@ -70,7 +71,8 @@ fn numbers_are_those_of_sql() {
     // As ingest kept them, and as the curves give them.
     let kept = &place.sql(
         "select max(abs(k - m)) as most, max(m) as top from (select unnest(s.mean_nce) as k, unnest(n.mean) as m
-         from surface_stats s join (select run_id, avg_list(nce_10000) as mean from nce group by run_id) n using (run_id)
+         from surface_stats s join (select run_id, avg_list(nce_10000) as mean from nce group by run_id) n using \
+         (run_id)
          where s.surface_id = 'brick' and s.band = '10000')",
     )[0];
     let (most, top) = (kept["most"].as_f64().expect("a difference"), kept["top"].as_f64().expect("a mean"));

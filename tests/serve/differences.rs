@@ -73,8 +73,8 @@ const WRITTEN: &[&str] = &[
     "select array_agg(pair_id order by pair_id desc) as v from pairs where pair_id < 5",
     "select case surface_id when 't' then 1 when 'flat' then 2 end as v from runs",
     "select case x when 't' then 1 else 0 end as v from (values ('true'), ('t'), ('false')) as q(x) order by v",
-    "select (select max(direct_mm) from pairs p where p.speaker = q.speaker) as v from points, pairs q where point_id = 0 \
-     order by q.pair_id limit 9",
+    "select (select max(direct_mm) from pairs p where p.speaker = q.speaker) as v from points, pairs q where point_id \
+     = 0 order by q.pair_id limit 9",
     "select (select pair_id from pairs order by pair_id desc limit 1) as v from points where point_id = 0",
     "select 2.7::int as a, 3.5::int as b, -2.5::int as c, 0.49::bigint as d from pairs limit 1",
     "select cast(direct_mm / 7 as int) as v from pairs order by pair_id",
@@ -108,8 +108,10 @@ const WRITTEN: &[&str] = &[
     "select log_time + interval '1 day 2 hours' as v, log_time - interval '3 months' as w from measurements limit 1",
     "select date_trunc('hour', log_time) as v, extract(year from log_time) as w from measurements limit 1",
     "select max(log_time) - min(log_time) > interval '0 seconds' as v from measurements",
-    "select row_number() over (order by pair_id) as v, rank() over (order by speaker) as w from pairs order by 1 limit 9",
-    "select ntile(4) over (order by pair_id) as v, lag(pair_id) over (order by pair_id) as w from pairs order by pair_id",
+    "select row_number() over (order by pair_id) as v, rank() over (order by speaker) as w from pairs order by 1 limit \
+        9",
+    "select ntile(4) over (order by pair_id) as v, lag(pair_id) over (order by pair_id) as w from pairs order by \
+        pair_id",
     "select pair_id from pairs where pair_id = any(array[1, 2, 99]) order by 1",
     "select pair_id from pairs where pair_id <> all(array[1, 2, null]) order by 1",
     "select pair_id from pairs where pair_id < any(array[2, 3]) order by 1",
@@ -275,8 +277,8 @@ impl StatementGenerator {
                 format!("select {list} as v from measurements order by pair_id limit {limit}")
             }
             8 => format!(
-                "select pair_id, (select count(*) from pairs p where p.speaker = q.speaker and p.pair_id > {limit}) as v \
-                 from pairs q order by pair_id limit {limit}"
+                "select pair_id, (select count(*) from pairs p where p.speaker = q.speaker and p.pair_id > {limit}) as \
+                 v from pairs q order by pair_id limit {limit}"
             ),
             9 => format!(
                 "select pair_id, row_number() over (partition by speaker order by pair_id) as r, \

@@ -233,15 +233,18 @@ fn the_catalogue_is_as_in_postgres() {
             "VIEW;BASE TABLE",
         ),
         (
-            "select udt_schema, udt_name, is_identity from information_schema.columns where column_name = 'ir' and table_name = 'measurements'",
+            "select udt_schema, udt_name, is_identity from information_schema.columns where column_name = 'ir' and \
+                table_name = 'measurements'",
             "pg_catalog,_float4,NO",
         ),
         (
-            "select format_type(atttypid, atttypmod) from pg_attribute where attrelid = 'measurements'::regclass and attname = 'ir'",
+            "select format_type(atttypid, atttypmod) from pg_attribute where attrelid = 'measurements'::regclass and \
+                attname = 'ir'",
             "real[]",
         ),
         (
-            "select count(*) > 10 from pg_description d where d.objoid = 'pairs'::regclass and classoid = 'pg_class'::regclass",
+            "select count(*) > 10 from pg_description d where d.objoid = 'pairs'::regclass and classoid = \
+                'pg_class'::regclass",
             "t",
         ),
         (
@@ -253,7 +256,8 @@ fn the_catalogue_is_as_in_postgres() {
         ("select p.proname from pg_type t join pg_proc p on p.oid = t.typinput where t.typname = 'bool'", "boolin"),
         ("select pg_get_function_result(oid) from pg_proc where proname = 'boolin'", "boolean"),
         (
-            "select c.relname, exists(select 1 from pg_constraint k where k.conrelid = c.oid) from pg_class c where relname = 'runs'",
+            "select c.relname, exists(select 1 from pg_constraint k where k.conrelid = c.oid) from pg_class c where \
+                relname = 'runs'",
             "runs,f",
         ),
         ("select pg_advisory_unlock_all()", ""),

@@ -157,7 +157,8 @@ mod slow {
         let server = served(&place, &[]);
         let cancel = |id: u64| HttpRequest::post(&format!("/api/v1/queries/{id}/cancel"), "").send(&server);
         let endless = "select id, client, statement from system.queries where outcome = 'running' \
-                       and (protocol = 'postgres' or statement like '%generate_series%' and statement not like '%system%')";
+                       and (protocol = 'postgres' or statement like '%generate_series%' and statement not like \
+                       '%system%')";
         let asked = HttpRequest::post("/api/v1/sql", ENDLESS).with("content-type", "text/plain").begin(&server);
         wait_until("it runs", || rows(&server, endless).len() == 1);
         let id = rows(&server, endless)[0]["id"].as_u64().expect("a number");

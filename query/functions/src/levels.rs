@@ -25,8 +25,8 @@ pub(crate) struct ListDbFunction;
 static DB: FunctionDescription = FunctionDescription {
     name: "db",
     family: FunctionFamily::Levels,
-    about: "Level of a ratio of energies or powers, 10 log10(x), in dB. What has no energy has no level: null for 0 and \
-            less, so that averages and files meet no infinity.",
+    about: "Level of a ratio of energies or powers, 10 log10(x), in dB. What has no energy has no level: null for 0 \
+            and less, so that averages and files meet no infinity.",
     parameters: &[FunctionParameter {
         name: "x",
         kind: ArgumentKind::Number,

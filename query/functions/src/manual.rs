@@ -15,7 +15,8 @@ const RENEW: &str = "ECHOLAKE_RENEW";
 
 const HEAD: &str = "# Functions of the field
 
-What `echolake sql` and the query service know beside [DataFusion's own functions](https://datafusion.apache.org/user-guide/sql/scalar_functions.html).
+What `echolake sql` and the query service know beside [DataFusion's own \
+functions](https://datafusion.apache.org/user-guide/sql/scalar_functions.html).
 Each calls a kernel of `dsp/`. A null argument makes a null answer. Lists may be of any number type and any of Arrow's
 list kinds; f32 stays f32 where the answer is a list. A null or NaN inside a list is an error where no answer could be
 right. The sampling rate, the bands and the grid are those of the lake's rig; the examples are of the paper's.

@@ -274,11 +274,13 @@ async fn symmetries_are_a_group_on_points_pairs_and_maps() {
         for sql in [
             format!("select count(*) from points where d4_point(d4_point(point_id, '{there}'), '{back}') <> point_id"),
             format!(
-                "select count(*) from pairs where d4_pair(d4_pair(pair_id, '{there}')['pair_id'], '{back}')['pair_id'] <> pair_id"
+                "select count(*) from pairs where d4_pair(d4_pair(pair_id, '{there}')['pair_id'], '{back}')['pair_id'] \
+                    <> pair_id"
             ),
             format!(
                 "select count(*) from points p join points q on q.point_id = d4_point(p.point_id, '{there}') \
-                 where abs(d4(p.x_mm, p.y_mm, '{there}')['x'] - q.x_mm) + abs(d4(p.x_mm, p.y_mm, '{there}')['y'] - q.y_mm) > 1e-9"
+                 where abs(d4(p.x_mm, p.y_mm, '{there}')['x'] - q.x_mm) + abs(d4(p.x_mm, p.y_mm, '{there}')['y'] - \
+                 q.y_mm) > 1e-9"
             ),
         ] {
             assert_eq!(small.number(&sql).await, 0.0, "{sql}");
@@ -339,8 +341,8 @@ async fn aggregates_are_the_same_however_rows_are_divided() {
 #[tokio::test]
 async fn bytes_have_a_length() {
     let small = SmallLake::new().await;
-    let lengths = "select [octet_length(b), octet_length('Å'), octet_length(x'010203'), coalesce(octet_length(null), -1)] \
-                   from (values (x'0102'), (x'00')) as bytes(b)";
+    let lengths = "select [octet_length(b), octet_length('Å'), octet_length(x'010203'), coalesce(octet_length(null), \
+                   -1)] from (values (x'0102'), (x'00')) as bytes(b)";
     assert_eq!(small.numbers(lengths).await, [2.0, 2.0, 3.0, -1.0, 1.0, 2.0, 3.0, -1.0]);
 }
 
@@ -358,7 +360,8 @@ async fn calls_of_mcap_are_refused_with_a_hint_and_errors_control_no_terminal() 
 #[tokio::test]
 async fn functions_are_listed() {
     let small = SmallLake::new().await;
-    let listed = "select count(distinct routine_name) from information_schema.routines where routine_name in ('edc', 'p90_mean')";
+    let listed = "select count(distinct routine_name) from information_schema.routines where routine_name in ('edc', \
+        'p90_mean')";
     let batch = small.rows(listed).await;
     assert_eq!(batch.column(0).as_primitive::<Int64Type>().value(0), 2);
     let edc = small.rows("select list_rms(ir) as r, edc(ir) as e from measurements where pair_id = 3").await;

@@ -60,7 +60,8 @@ pub(super) fn table_schema() -> SchemaRef {
             DataType::Utf8,
             false,
             "",
-            "waiting (for ingest), recording (not closed), incomplete (no end yet), refused, or unusable (never opened)",
+            "waiting (for ingest), recording (not closed), incomplete (no end yet), refused, or unusable (never \
+                opened)",
         ),
         column_field("path", DataType::Utf8, false, "", "Path of the file in the lake"),
         column_field("bytes", DataType::Int64, false, "B", "Size"),

@@ -161,7 +161,8 @@ impl RangedFile {
                 let found = store.get_opts(&self.path, GetOptions { range, ..GetOptions::default() }).await;
                 let found = found.map_err(unread)?;
                 if found.meta.size != self.bytes {
-                    tracing::warn!(path = %self.path, actual = found.meta.size, expected = self.bytes, "a file changed");
+                    tracing::warn!(path = %self.path, actual = found.meta.size, expected = self.bytes, "a file \
+                        changed");
                     return Err(RequestFault::Unreadable);
                 }
                 let stream = found.into_stream();

@@ -26,8 +26,8 @@ pub enum Error {
     },
     /// Tokens and rows would go over the network as they are.
     #[error(
-        "{address} can be reached from other machines, and nothing would be encrypted; hint: --certificate FILE and --key FILE, \
-         which `echolake certificate` makes, or --plain-text-behind-a-proxy"
+        "{address} can be reached from other machines, and nothing would be encrypted; hint: --certificate FILE and \
+         --key FILE, which `echolake certificate` makes, or --plain-text-behind-a-proxy"
     )]
     PlainText {
         /// The requested address.
@@ -37,7 +37,8 @@ pub enum Error {
     #[error(transparent)]
     Lake(#[from] echolake_lake::Error),
     /// A certificate or its key cannot be read.
-    #[error("cannot use the certificate or key in `{}`; hint: PEM files, as `echolake certificate` makes them", path.display())]
+    #[error("cannot use the certificate or key in `{}`; hint: PEM files, as `echolake certificate` makes \
+        them", path.display())]
     Certificate {
         /// The file.
         path: PathBuf,

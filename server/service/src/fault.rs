@@ -111,8 +111,8 @@ pub enum RequestFault {
     },
     /// The request comes from a web page of another origin, or names a host that is not this machine.
     #[error(
-        "{what} `{found}` is not this server's; hint: without tokens only pages of this server are answered, and others \
-         for files and slices of runs that they name (`run=RUN`)"
+        "{what} `{found}` is not this server's; hint: without tokens only pages of this server are answered, and \
+         others for files and slices of runs that they name (`run=RUN`)"
     )]
     Foreign {
         /// Part of the request: host, address, origin or fetch site.

@@ -29,8 +29,8 @@ pub fn missing_support() -> Option<&'static str> {
         .handle_access(AccessFs::from_all(ABI::V1))
         .and_then(Ruleset::create);
     tried.is_err().then_some(
-        "this kernel has no Landlock, or a filter keeps it from this program: engines are kept from other files by the program \
-         alone, not by the system",
+        "this kernel has no Landlock, or a filter keeps it from this program: engines are kept from other files by the \
+         program alone, not by the system",
     )
 }
 

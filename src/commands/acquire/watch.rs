@@ -99,7 +99,8 @@ impl RunWatcher {
             let busy = self.cost.busy.as_secs_f64();
             let whole = self.begun.elapsed().as_secs_f64();
             self.task.print_message(&format!(
-                "writing took {busy:.2} s of the run's {whole:.2} s ({:.2} s waiting for the disk); {:.1} MB in {} checkpoints",
+                "writing took {busy:.2} s of the run's {whole:.2} s ({:.2} s waiting for the disk); {:.1} MB in {} \
+                    checkpoints",
                 self.cost.waited.as_secs_f64(),
                 self.cost.bytes as f64 / 1e6,
                 self.cost.checkpoints

@@ -220,7 +220,8 @@ impl NamedSurface {
         let name = &self.name;
         ensure!(
             (1..=MOST_RUNS).contains(&self.runs),
-            "`runs` of surface `{name}` is {}, expected 1 to {MOST_RUNS}; hint: surfaces that are not needed are left out",
+            "`runs` of surface `{name}` is {}, expected 1 to {MOST_RUNS}; hint: surfaces that are not needed are left \
+                out",
             self.runs
         );
         let (specimen, macro_reference) = match &self.mesh {

@@ -170,7 +170,8 @@ pub(super) async fn write_steps(source: &FigureSource, args: &StepsArgs) -> anyh
     );
     let derived = format!(
         "select m.ir, n.reflected_ir from measurements m \
-         left join nce n on n.run_id = m.run_id and n.pair_id = m.pair_id where m.run_id = {quoted_run} and m.pair_id = {pair}"
+         left join nce n on n.run_id = m.run_id and n.pair_id = m.pair_id where m.run_id = {quoted_run} and m.pair_id \
+         = {pair}"
     );
     let missing = || format!("surface `{id}` has no pair {pair}; hint: 0 to {}", source.lake.grid().pairs().len() - 1);
     let raw = source.query_rows::<RecordedResponse>(&recorded).await?.pop().with_context(missing)?;

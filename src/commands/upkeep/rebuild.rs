@@ -44,8 +44,8 @@ async fn ensure_run_files(lake: &Lake) -> anyhow::Result<()> {
     let missing: Vec<_> = missing.into_iter().filter(|path| !there.contains(path)).collect();
     anyhow::ensure!(
         missing.is_empty(),
-        "`{}` is not there, from which rows would be derived again, and {} run files more; hint: bring them back from a \
-         copy, or rebuild tables that need no run file: nce, tnce, tnce_d4, surface_stats",
+        "`{}` is not there, from which rows would be derived again, and {} run files more; hint: bring them back from \
+         a copy, or rebuild tables that need no run file: nce, tnce, tnce_d4, surface_stats",
         missing[0],
         missing.len() - 1
     );

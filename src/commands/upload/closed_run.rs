@@ -22,14 +22,14 @@ impl ClosedRun {
         let name = path.display();
         ensure!(
             !is_partial(path),
-            "`{name}` is an unfinished recording, expected a closed run (.mcap); hint: `echolake acquire --resume {name}` \
-             resumes it, `echolake recover {name}` makes a run of what it holds"
+            "`{name}` is an unfinished recording, expected a closed run (.mcap); hint: `echolake acquire --resume \
+             {name}` resumes it, `echolake recover {name}` makes a run of what it holds"
         );
         let mut reader = RecordingReader::open(path)?;
         ensure!(
             has_end(path)?,
-            "`{name}` was not closed: it has no summary at its end; hint: `echolake recover {name}` makes a run of what it \
-             holds"
+            "`{name}` was not closed: it has no summary at its end; hint: `echolake recover {name}` makes a run of \
+             what it holds"
         );
         let mut manifest = None;
         let mut rig = None;
@@ -56,8 +56,8 @@ impl ClosedRun {
                 bail!("`{name}` is damaged: {damage}; hint: `echolake recover {name}` makes a run of what it holds")
             }
             _ => bail!(
-                "`{name}` is an MCAP file but no run of echolake: it has no metadata `{}` or no attachment `{}`; hint: only \
-                 recordings of `echolake acquire` and `echolake import` are uploaded",
+                "`{name}` is an MCAP file but no run of echolake: it has no metadata `{}` or no attachment `{}`; hint: \
+                 only recordings of `echolake acquire` and `echolake import` are uploaded",
                 topics::RUN_METADATA,
                 topics::RIG_ATTACHMENT
             ),

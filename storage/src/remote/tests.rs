@@ -148,8 +148,8 @@ async fn what_is_cut_off_is_fetched_again_and_what_never_comes_says_how_often_it
             source: Box::new(super::RetriedError { tries: 8, source: faulty.behaviour.lost() }),
         },
     );
-    let expected = "cannot read `x`: connection reset by peer (tried 8 times); hint: run the same command again when the \
-                    store answers; what was done stays";
+    let expected = "cannot read `x`: connection reset by peer (tried 8 times); hint: run the same command again when \
+                    the store answers; what was done stays";
     assert_eq!(gone.to_string(), expected);
 }
 

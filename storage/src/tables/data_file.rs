@@ -39,7 +39,7 @@ const STATS_TEXT: usize = 64;
 /// use echolake_schema::{Rig, tables::Table};
 ///
 /// let empty = FileEncoder::new(Table::Runs, Table::Runs.schema(&Rig::paper())).finish()?;
-/// assert_eq!(empty, echolake_lake::encode(Table::Runs, &Table::Runs.schema(&Rig::paper()), &[])?);
+/// assert_eq!(empty, echolake_lake::encode_batches(Table::Runs, &Table::Runs.schema(&Rig::paper()), &[])?);
 /// # Ok::<(), echolake_lake::Error>(())
 /// ```
 pub struct FileEncoder {

@@ -183,16 +183,16 @@ impl Lake {
     /// nothing.
     ///
     /// ```
-    /// use echolake_lake::{CommitOutcome, FileName, Lake, ReferenceSurfaces, encode};
+    /// use echolake_lake::{CommitOutcome, FileName, Lake, ReferenceSurfaces, encode_batches};
     /// use echolake_schema::{Rig, tables::Table};
     ///
     /// # tokio::runtime::Runtime::new()?.block_on(async {
     /// let lake = Lake::open_or_create("memory://", &Rig::paper(), &ReferenceSurfaces::default()).await?;
-    /// let file = encode(Table::Pairs, &Table::Pairs.schema(lake.rig()), &[lake.pair_rows()?])?;
+    /// let file = encode_batches(Table::Pairs, &Table::Pairs.schema(lake.rig()), &[lake.pair_rows()?])?;
     /// let name = FileName::Rig { derivation: "example".into() };
-    /// let staged = [lake.stage(Table::Pairs, &name, file).await?];
-    /// assert_eq!(lake.commit(&staged).await?, [CommitOutcome::Now]);
-    /// assert_eq!(lake.commit(&staged).await?, [CommitOutcome::Before]);
+    /// let staged = [lake.stage_file(Table::Pairs, &name, file).await?];
+    /// assert_eq!(lake.commit_staged(&staged).await?, [CommitOutcome::Now]);
+    /// assert_eq!(lake.commit_staged(&staged).await?, [CommitOutcome::Before]);
     /// # Ok::<(), echolake_lake::Error>(())
     /// # })?;
     /// # Ok::<(), Box<dyn std::error::Error>>(())

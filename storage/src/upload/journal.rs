@@ -14,7 +14,8 @@ use crate::{Error, Result};
 
 /// Suffix of a journal's name.
 const SUFFIX: &str = "upload";
-const HINT: &str = "; hint: the journal of an upload stands beside the run file; make its folder writable, or upload a copy of the file";
+const HINT: &str = "; hint: the journal of an upload stands beside the run file; make its folder writable, or upload a \
+    copy of the file";
 
 /// A journal, locked while its upload runs.
 #[derive(Debug)]

@@ -65,7 +65,8 @@ pub(crate) async fn measure_sweeps(args: &IngestBenchArgs, folder: &Path, report
     let all = runs.all.attempts as f64;
     let each = panels.cpu / count;
     report.title(&format!(
-        "{RUNS} runs with sweeps, two of them references: {all} recordings of {length} samples, two channels, 24 bit; {:.0} MB",
+        "{RUNS} runs with sweeps, two of them references: {all} recordings of {length} samples, two channels, 24 bit; \
+            {:.0} MB",
         runs.all.bytes as f64 / 1e6
     ))?;
     report.figure("ingest, references there, CPU a recording", each * 1e6, "us")?;

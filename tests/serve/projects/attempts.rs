@@ -76,8 +76,14 @@ fn across_tables(HiddenRun { surface, run }: &HiddenRun) -> Vec<String> {
         .iter()
         .flat_map(|table| {
             [
-                format!("select s.surface_id, count(*) as n from surfaces s join {table} t using (surface_id) group by 1 order by 1"),
-                format!("select count(t.surface_id) as n from pairs p left join {table} t on t.surface_id = '{surface}'"),
+                format!(
+                    "select s.surface_id, count(*) as n from surfaces s join {table} t using (surface_id) group by \
+                    1 order by 1"
+                ),
+                format!(
+                    "select count(t.surface_id) as n from pairs p left join {table} t on t.surface_id = \
+                    '{surface}'"
+                ),
                 format!("select (select max(surface_id) from {table}) as most"),
             ]
         })

@@ -4,7 +4,7 @@
 //! use echolake_acquisition::rig::robots::Cell;
 //!
 //! let cell = Cell::from_rig(&echolake_schema::Rig::paper());
-//! let standing = cell.reach([-37.5, 37.5, 124.0], [62.5, -62.5, 304.0])?;
+//! let standing = cell.reach_positions([-37.5, 37.5, 124.0], [62.5, -62.5, 304.0])?;
 //! assert!(cell.is_clear(&standing.microphone, &standing.speaker));
 //! # Ok::<(), echolake_acquisition::rig::robots::UnreachableReason>(())
 //! ```

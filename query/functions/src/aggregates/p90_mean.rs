@@ -19,9 +19,9 @@ pub(crate) struct P90MeanFunction;
 static DESCRIPTION: FunctionDescription = FunctionDescription {
     name: "p90_mean",
     family: FunctionFamily::Aggregates,
-    about: "Mean of the values up to their 90th percentile, which a few focusing pairs do not carry away, in the unit of x. \
-            Of TNCE, which is linear, `db(p90_mean(tnce_total))` is what the paper's tables and surface_stats.p90_mean_db \
-            say. Null values and those that are not finite do not count; null of none.",
+    about: "Mean of the values up to their 90th percentile, which a few focusing pairs do not carry away, in the unit \
+            of x. Of TNCE, which is linear, `db(p90_mean(tnce_total))` is what the paper's tables and \
+            surface_stats.p90_mean_db say. Null values and those that are not finite do not count; null of none.",
     parameters: &[FunctionParameter {
         name: "x",
         kind: ArgumentKind::Number,

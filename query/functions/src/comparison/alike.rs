@@ -21,8 +21,8 @@ pub(crate) struct SimilarityFunction;
 static PEARSON: FunctionDescription = FunctionDescription {
     name: "pearson",
     family: FunctionFamily::Comparison,
-    about: "Pearson's coefficient of correlation of two equally long lists, -1 to 1, without unit. Null where one of them \
-            does not vary, is shorter than two, or is not finite. Of two columns, corr() is the aggregate.",
+    about: "Pearson's coefficient of correlation of two equally long lists, -1 to 1, without unit. Null where one of \
+            them does not vary, is shorter than two, or is not finite. Of two columns, corr() is the aggregate.",
     parameters: &[
         FunctionParameter { name: "x", kind: ArgumentKind::Samples, about: "the first list" },
         FunctionParameter { name: "y", kind: ArgumentKind::Samples, about: "the second list, as long as the first" },
@@ -42,9 +42,9 @@ static PEARSON: FunctionDescription = FunctionDescription {
 static SIMILARITY: FunctionDescription = FunctionDescription {
     name: "similarity",
     family: FunctionFamily::Comparison,
-    about: "Greatest normalised cross-correlation of two equally long responses over all shifts, up to 1, without unit: 1 \
-            where one is the other, later or louder, whatever its level; an inverted one is not alike. Null where one has \
-            no energy.",
+    about: "Greatest normalised cross-correlation of two equally long responses over all shifts, up to 1, without \
+            unit: 1 where one is the other, later or louder, whatever its level; an inverted one is not alike. Null \
+            where one has no energy.",
     parameters: &[
         FunctionParameter { name: "ir", kind: ArgumentKind::Samples, about: "the first response" },
         FunctionParameter {

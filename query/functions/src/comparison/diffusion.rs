@@ -23,10 +23,11 @@ pub(crate) struct DiffusionCoefficientFunction;
 static LIST: FunctionDescription = FunctionDescription {
     name: "diffusion",
     family: FunctionFamily::Comparison,
-    about: "Directional diffusion coefficient of a list of levels at receivers around a surface, without unit: ((sum e)^2 - \
-            sum e^2) / ((n - 1) sum e^2), e = 10^(L/10), 1 where all are equal, 0 where all energy is at one. It has the \
-            form of ISO 17497-2, with equal weights; but that asks for receivers in the far field, and the grid of a rig is \
-            in the near field, so compare it with surfaces measured alike only. Null for fewer than two levels or no sound.",
+    about: "Directional diffusion coefficient of a list of levels at receivers around a surface, without unit: ((sum \
+            e)^2 - sum e^2) / ((n - 1) sum e^2), e = 10^(L/10), 1 where all are equal, 0 where all energy is at one. \
+            It has the form of ISO 17497-2, with equal weights; but that asks for receivers in the far field, and the \
+            grid of a rig is in the near field, so compare it with surfaces measured alike only. Null for fewer than \
+            two levels or no sound.",
     parameters: &[FunctionParameter {
         name: "levels_db",
         kind: ArgumentKind::Samples,
@@ -46,9 +47,9 @@ static LIST: FunctionDescription = FunctionDescription {
 static ROWS: FunctionDescription = FunctionDescription {
     name: "diffusion_coefficient",
     family: FunctionFamily::Aggregates,
-    about: "Directional diffusion coefficient over rows, one a receiver; see diffusion(), whose reservation about the near \
-            field holds here too. Take the rows of one speaker position. Null levels do not count; a receiver without sound \
-            is minus infinity.",
+    about: "Directional diffusion coefficient over rows, one a receiver; see diffusion(), whose reservation about the \
+            near field holds here too. Take the rows of one speaker position. Null levels do not count; a receiver \
+            without sound is minus infinity.",
     parameters: &[FunctionParameter {
         name: "level_db",
         kind: ArgumentKind::Number,

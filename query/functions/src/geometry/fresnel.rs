@@ -28,9 +28,9 @@ const fn number_parameter(name: &'static str, about: &'static str) -> FunctionPa
 static DESCRIPTION: FunctionDescription = FunctionDescription {
     name: "fresnel",
     family: FunctionFamily::Geometry,
-    about: "First Fresnel zone of the reflection in the panel's reference plane, z = 0: the ellipse within which a path is at \
-            most half a wavelength longer. A struct of its centre, `centre_x_mm` and `centre_y_mm`, and its diameters in the \
-            plane of incidence, `major_mm`, and across it, `minor_mm`, in mm.",
+    about: "First Fresnel zone of the reflection in the panel's reference plane, z = 0: the ellipse within which a \
+            path is at most half a wavelength longer. A struct of its centre, `centre_x_mm` and `centre_y_mm`, and its \
+            diameters in the plane of incidence, `major_mm`, and across it, `minor_mm`, in mm.",
     parameters: &[
         number_parameter("mic_x", "x of the microphone, mm"),
         number_parameter("mic_y", "y of the microphone, mm"),
@@ -42,8 +42,8 @@ static DESCRIPTION: FunctionDescription = FunctionDescription {
         number_parameter("speed_m_s", "speed of sound, m/s, above 0; 343 if not given"),
     ],
     optional: 1,
-    example: "select round(max(fresnel(m.x_mm, m.y_mm, m.z_mm, s.x_mm, s.y_mm, s.z_mm, 2000)['major_mm']), 1) as largest_mm \
-              from pairs join points m on m.point_id = microphone join points s on s.point_id = speaker",
+    example: "select round(max(fresnel(m.x_mm, m.y_mm, m.z_mm, s.x_mm, s.y_mm, s.z_mm, 2000)['major_mm']), 1) as \
+              largest_mm from pairs join points m on m.point_id = microphone join points s on s.point_id = speaker",
     answer: "\
 +------------+
 | largest_mm |

@@ -19,7 +19,8 @@ pub(crate) struct SpeedOfSoundFunction;
 static DESCRIPTION: FunctionDescription = FunctionDescription {
     name: "speed_of_sound",
     family: FunctionFamily::Geometry,
-    about: "Speed of sound in dry air, 331.3 sqrt(1 + T / 273.15), in m/s: what the responses of the lake are corrected by.",
+    about: "Speed of sound in dry air, 331.3 sqrt(1 + T / 273.15), in m/s: what the responses of the lake are \
+        corrected by.",
     parameters: &[FunctionParameter {
         name: "temperature_c",
         kind: ArgumentKind::Number,

@@ -42,9 +42,9 @@ static PAIR_FIELDS: LazyLock<Fields> = LazyLock::new(|| {
 static D4_POSITION: FunctionDescription = FunctionDescription {
     name: "d4",
     family: FunctionFamily::Geometry,
-    about: "A position under one of the eight symmetries of the square (D4) about the panel's centre: a struct of `x` and `y` \
-            in the unit of the arguments. rot90 turns counter-clockwise seen from above, mirror_x changes the sign of x, \
-            mirror_diag exchanges x and y.",
+    about: "A position under one of the eight symmetries of the square (D4) about the panel's centre: a struct of `x` \
+            and `y` in the unit of the arguments. rot90 turns counter-clockwise seen from above, mirror_x changes the \
+            sign of x, mirror_diag exchanges x and y.",
     parameters: &[
         FunctionParameter { name: "x", kind: ArgumentKind::Number, about: "x from the panel's centre, mm" },
         FunctionParameter { name: "y", kind: ArgumentKind::Number, about: "y from the panel's centre, mm" },
@@ -83,8 +83,8 @@ static D4_POINT: FunctionDescription = FunctionDescription {
 static D4_PAIR: FunctionDescription = FunctionDescription {
     name: "d4_pair",
     family: FunctionFamily::Geometry,
-    about: "The pair that a pair becomes under a symmetry: a struct of `pair_id` and `swapped`, which tells that microphone and \
-            speaker change places, so that the measurement stands for the other by reciprocity.",
+    about: "The pair that a pair becomes under a symmetry: a struct of `pair_id` and `swapped`, which tells that \
+            microphone and speaker change places, so that the measurement stands for the other by reciprocity.",
     parameters: &[
         FunctionParameter { name: "pair_id", kind: ArgumentKind::Integer, about: "a pair of table pairs" },
         SYMMETRY,
@@ -103,7 +103,8 @@ static D4_PAIR: FunctionDescription = FunctionDescription {
 static D4_HEIGHTMAP: FunctionDescription = FunctionDescription {
     name: "d4_heightmap",
     family: FunctionFamily::Geometry,
-    about: "A square map under a symmetry about its centre, in the unit of its values: what stood at p stands where p goes.",
+    about: "A square map under a symmetry about its centre, in the unit of its values: what stood at p stands where p \
+        goes.",
     parameters: &[
         FunctionParameter {
             name: "list",

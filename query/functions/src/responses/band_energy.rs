@@ -23,9 +23,9 @@ pub(crate) struct BandEnergyFunction {
 static DESCRIPTION: FunctionDescription = FunctionDescription {
     name: "band_energy",
     family: FunctionFamily::Responses,
-    about: "Energy of a response, sum of squares, in each band of the lake's itersine filter bank: a struct with a field \
-            a band, `energy_2500` and so on as in table tnce, and `energy_total`, their sum; of one band where its centre \
-            is given. Null for a list without samples.",
+    about: "Energy of a response, sum of squares, in each band of the lake's itersine filter bank: a struct with a \
+            field a band, `energy_2500` and so on as in table tnce, and `energy_total`, their sum; of one band where \
+            its centre is given. Null for a list without samples.",
     parameters: &[
         FunctionParameter {
             name: "ir",

@@ -26,8 +26,9 @@ pub(crate) struct ArrivalFunction(pub Arc<RigFacts>);
 static EDC: FunctionDescription = FunctionDescription {
     name: "edc",
     family: FunctionFamily::Responses,
-    about: "Energy decay curve by Schroeder's backward integration: the energy from each sample to the end over all of it, \
-            in dB. It starts at 0 dB; where nothing is left it is minus infinity. Null for a response without energy.",
+    about: "Energy decay curve by Schroeder's backward integration: the energy from each sample to the end over all of \
+            it, in dB. It starts at 0 dB; where nothing is left it is minus infinity. Null for a response without \
+            energy.",
     parameters: &[FunctionParameter { name: "ir", kind: ArgumentKind::Samples, about: "the response" }],
     optional: 0,
     example: "select edc([3, 0, 1, 0]) as levels",
@@ -43,9 +44,9 @@ static EDC: FunctionDescription = FunctionDescription {
 static ARRIVAL: FunctionDescription = FunctionDescription {
     name: "arrival",
     family: FunctionFamily::Responses,
-    about: "Time of the first arrival after the first sample, in ms at the lake's sampling rate: where the magnitude first \
-            reaches a level relative to its greatest, -20 dB if none is given, linearly interpolated between samples. Null \
-            for a response without sound.",
+    about: "Time of the first arrival after the first sample, in ms at the lake's sampling rate: where the magnitude \
+            first reaches a level relative to its greatest, -20 dB if none is given, linearly interpolated between \
+            samples. Null for a response without sound.",
     parameters: &[
         FunctionParameter {
             name: "ir",

@@ -22,8 +22,8 @@ static DESCRIPTION: FunctionDescription = FunctionDescription {
     name: "nce",
     family: FunctionFamily::Responses,
     about: "Normalised cumulative energy (NCE): the energy of a response up to each of its samples over Flat's total \
-            energy for the same pair; the last value is TNCE. Of the whole response, or of one band where its centre is \
-            given, as the columns `nce_2500` and so on of table nce. Null where Flat has no energy.",
+            energy for the same pair; the last value is TNCE. Of the whole response, or of one band where its centre \
+            is given, as the columns `nce_2500` and so on of table nce. Null where Flat has no energy.",
     parameters: &[
         FunctionParameter {
             name: "ir",

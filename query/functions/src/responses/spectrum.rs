@@ -26,9 +26,9 @@ pub(crate) struct SpectrumFrequenciesFunction(pub Arc<RigFacts>);
 static SPECTRUM: FunctionDescription = FunctionDescription {
     name: "spectrum",
     family: FunctionFamily::Responses,
-    about: "Levels of a response over frequency, 20 log10 of the magnitude of its discrete Fourier transform, in dB: n/2 + 1 \
-            values for n samples, at the frequencies that spectrum_frequencies(n) lists. Not scaled: a response is a gain, \
-            and a single sample of 1 is 0 dB throughout. Nothing is minus infinity.",
+    about: "Levels of a response over frequency, 20 log10 of the magnitude of its discrete Fourier transform, in dB: \
+            n/2 + 1 values for n samples, at the frequencies that spectrum_frequencies(n) lists. Not scaled: a \
+            response is a gain, and a single sample of 1 is 0 dB throughout. Nothing is minus infinity.",
     parameters: &[FunctionParameter { name: "ir", kind: ArgumentKind::Samples, about: "the response" }],
     optional: 0,
     example: "select spectrum([0, 10, 0, 0]) as levels",

@@ -147,9 +147,9 @@ pub(super) struct CurvesQuery {
         (inline(BinaryContent) = "application/vnd.apache.arrow.stream")
     ))),
     extensions(("x-sql" = json!([
-        "select band_hz, mean_nce from surface_stats where surface_id in ($1, $flat); of a microphone, and of surfaces of \
-         several runs: select nce_2500, ..., nce_40000 from nce where surface_id in ($1, $flat) [and (microphone = $2 or speaker = \
-         $2)]; averaged sample by sample",
+        "select band_hz, mean_nce from surface_stats where surface_id in ($1, $flat); of a microphone, and of surfaces \
+         of several runs: select nce_2500, ..., nce_40000 from nce where surface_id in ($1, $flat) [and (microphone = \
+         $2 or speaker = $2)]; averaged sample by sample",
     ])))
 )]
 pub(super) async fn curves(

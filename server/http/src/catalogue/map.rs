@@ -76,8 +76,8 @@ pub(super) struct MapQuery {
     params(MapQuery),
     responses((status = 200, description = "OK", body = SurfaceMap)),
     extensions(("x-sql" = json!([
-        "select surface_id, pair_id, tnce_band_2500, ..., tnce_band_40000 from tnce; Gram matrix, leading eigenvectors, \
-         batch self-organising map",
+        "select surface_id, pair_id, tnce_band_2500, ..., tnce_band_40000 from tnce; Gram matrix, leading \
+         eigenvectors, batch self-organising map",
     ])))
 )]
 pub(super) async fn map(

@@ -388,9 +388,9 @@ async fn read_symmetries(
 ) -> Result<Vec<SymmetricPair>, RequestFault> {
     let energies = band_list(request.catalogue.lake().rig(), |band| format!("t.tnce_{band}"));
     let sql = format!(
-        "select d.symmetry, d.d4_pair_id as pair_id, d.d4_microphone as microphone, d.d4_speaker as speaker, d.swapped, \
-         {energies} as energies from tnce_d4 d join tnce t on t.surface_id = d.surface_id and t.run_id = d.run_id \
-         and t.pair_id = d.d4_pair_id where d.surface_id = $1 and d.pair_id = $2 and d.run_id = $3 \
+        "select d.symmetry, d.d4_pair_id as pair_id, d.d4_microphone as microphone, d.d4_speaker as speaker, \
+         d.swapped, {energies} as energies from tnce_d4 d join tnce t on t.surface_id = d.surface_id and t.run_id = \
+         d.run_id and t.pair_id = d.d4_pair_id where d.surface_id = $1 and d.pair_id = $2 and d.run_id = $3 \
          and t.surface_id = $1 and t.run_id = $3 order by d.symmetry"
     );
     let rows = request

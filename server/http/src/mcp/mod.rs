@@ -32,11 +32,12 @@ use tools::{AgentTool, ToolCall};
 pub const MCP: &str = "/mcp";
 
 /// For an agent that knows nothing of the lake.
-const INSTRUCTIONS: &str = "A lake of acoustic measurements: impulse responses between grid points over relief surfaces, \
-    and the energy that each surface reflects against a flat plate (TNCE), by band. It can only be read. Begin with \
-    list_tables, then describe_table; columns have units and meanings. `tnce_db` has levels with geometry, `catalogue` one row \
-    per surface. SQL is DataFusion's with functions of the field (list_functions). Answers of `query` are cut off at a number \
-    of rows and bytes and say so, so aggregate in SQL instead of fetching rows. Links lead to pages for people.";
+const INSTRUCTIONS: &str = "A lake of acoustic measurements: impulse responses between grid points over relief \
+    surfaces, and the energy that each surface reflects against a flat plate (TNCE), by band. It can only be read. \
+    Begin with list_tables, then describe_table; columns have units and meanings. `tnce_db` has levels with geometry, \
+    `catalogue` one row per surface. SQL is DataFusion's with functions of the field (list_functions). Answers of \
+    `query` are cut off at a number of rows and bytes and say so, so aggregate in SQL instead of fetching rows. Links \
+    lead to pages for people.";
 
 /// The catalogue that tools ask, and its slices.
 #[derive(Clone)]

@@ -111,9 +111,9 @@ impl AgentTool {
                     .to_owned()
             }
             Self::Query => format!(
-                "Runs one read-only SQL query (DataFusion's dialect) and returns rows as lists in the order of the columns: at \
-                 most max_rows and {} kB of them; `truncated` says if there were more. Lists of samples are long: aggregate \
-                 or slice them.",
+                "Runs one read-only SQL query (DataFusion's dialect) and returns rows as lists in the order of the \
+                 columns: at most max_rows and {} kB of them; `truncated` says if there were more. Lists of samples \
+                 are long: aggregate or slice them.",
                 MOST_BYTES / 1000
             ),
             Self::ListFunctions => {
@@ -160,7 +160,8 @@ impl AgentTool {
             Self::SliceUrl => (
                 json!({
                     "runs": texts("runs whose measurements are wanted"),
-                    "where": text("an SQL predicate over the columns of measurements, as: snr_db < 35 and pair_id < 100"),
+                    "where": text("an SQL predicate over the columns of measurements, as: snr_db < 35 and pair_id < \
+                        100"),
                     "topics": texts("topics that are wanted; all if there are none"),
                 }),
                 &[],

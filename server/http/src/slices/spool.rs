@@ -156,7 +156,8 @@ async fn on_disk<T: Send + 'static>(work: impl FnOnce() -> io::Result<T> + Send 
 }
 
 fn disk_fault(error: io::Error) -> RequestFault {
-    tracing::warn!(error = &error as &dyn std::error::Error, folder = %std::env::temp_dir().display(), "a slice cannot be kept");
+    tracing::warn!(error = &error as &dyn std::error::Error, folder = %std::env::temp_dir().display(), "a slice cannot \
+        be kept");
     RequestFault::NoRoom { limit: MOST_BYTES }
 }
 

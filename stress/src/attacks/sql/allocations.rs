@@ -78,7 +78,9 @@ pub(super) const ATTACKS: &[SqlAttack] = &[
         "select count(distinct repeat(v::varchar, 100000)) from generate_series(1,1000000) t(v)".into()
     }),
     define_attack("series of nanoseconds", || {
-        "select cardinality(generate_series(timestamp '2000-01-01', timestamp '2100-01-01', interval '1 microsecond')) x".into()
+        "select cardinality(generate_series(timestamp '2000-01-01', timestamp '2100-01-01', interval '1 microsecond')) \
+            x"
+        .into()
     }),
     define_attack("range of dates", || {
         "select cardinality(range(date '0001-01-01', date '9999-12-31', interval '1 second')) x".into()

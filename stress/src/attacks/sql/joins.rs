@@ -45,8 +45,8 @@ pub(super) const ATTACKS: &[SqlAttack] = &[
             .into()
     }),
     define_attack("join with one key", || {
-        "select count(*) from generate_series(1,1000000) a(v) join generate_series(1,1000000) b(v) on a.v % 1 = b.v % 1 \
-         and a.v + b.v < 0"
+        "select count(*) from generate_series(1,1000000) a(v) join generate_series(1,1000000) b(v) on a.v % 1 = b.v % \
+         1 and a.v + b.v < 0"
             .into()
     }),
     define_attack("full join on an inequality", || {
@@ -55,11 +55,13 @@ pub(super) const ATTACKS: &[SqlAttack] = &[
             .into()
     }),
     define_attack("lateral unnest", || {
-        "select count(*) from (select unnest(range(0, v % 1000000)) u, v from generate_series(1,1000000) t(v)) where u < 0"
-            .into()
+        "select count(*) from (select unnest(range(0, v % 1000000)) u, v from generate_series(1,1000000) t(v)) where u \
+            < 0"
+        .into()
     }),
     define_attack("unnest in unnest", || {
-        "select count(*) from (select unnest(unnest(array_repeat(range(0,10000),10000))) x from generate_series(1,1000))"
+        "select count(*) from (select unnest(unnest(array_repeat(range(0,10000),10000))) x from \
+            generate_series(1,1000))"
             .into()
     }),
     define_attack("intersection of series", || {
@@ -68,8 +70,8 @@ pub(super) const ATTACKS: &[SqlAttack] = &[
             .into()
     }),
     define_attack("not in of a series", || {
-        "select count(*) from generate_series(1,100000000) t(v) where v not in (select w from generate_series(1,100000000) \
-         u(w))"
+        "select count(*) from generate_series(1,100000000) t(v) where v not in (select w from \
+         generate_series(1,100000000) u(w))"
             .into()
     }),
     define_attack("union of sorts", || {

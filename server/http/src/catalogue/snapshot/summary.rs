@@ -131,10 +131,10 @@ pub(crate) struct BandStatistic {
 type SurfaceLevels = HashMap<String, HashMap<String, (Option<f64>, Option<f64>)>>;
 
 /// The query of [`SurfaceRow`].
-pub(crate) const SURFACES: &str = "select s.surface_id, s.run_id, s.panel, s.side, s.typology, s.macrostructure, s.mesostructure, \
-    s.microstructure, s.material, s.flat_reference, s.foam_reference, s.parameters, s.mesh_triangles, s.mesh_watertight, \
-    s.reflection_factor, s.relief_min_mm, s.relief_max_mm, s.relief_rms_mm, s.origin, r.started, r.started_ns \
-    from surfaces s left join runs r on r.run_id = s.run_id order by s.surface_id, s.run_id";
+pub(crate) const SURFACES: &str = "select s.surface_id, s.run_id, s.panel, s.side, s.typology, s.macrostructure, \
+    s.mesostructure, s.microstructure, s.material, s.flat_reference, s.foam_reference, s.parameters, s.mesh_triangles, \
+    s.mesh_watertight, s.reflection_factor, s.relief_min_mm, s.relief_max_mm, s.relief_rms_mm, s.origin, r.started, \
+    r.started_ns from surfaces s left join runs r on r.run_id = s.run_id order by s.surface_id, s.run_id";
 /// The query of [`BandStatistic`].
 pub(crate) const BAND_STATISTICS: &str =
     "select surface_id, band, p90_mean_db, spread_db from surface_stats order by surface_id, run_id";
