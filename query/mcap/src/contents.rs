@@ -65,7 +65,7 @@ pub async fn read_contents(run: &VisibleRun, snapshot: &LakeSnapshot, files: &Mc
 /// The bytes of the first attachment whose name ends so.
 ///
 /// # Errors
-/// As [`contents`].
+/// As [`read_contents`].
 pub async fn read_attachment(
     run: &VisibleRun,
     snapshot: &LakeSnapshot,

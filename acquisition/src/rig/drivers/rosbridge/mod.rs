@@ -1,5 +1,5 @@
 //! Both arms behind a rosbridge (WebSocket, JSON): trajectories out, joint states in, motors on and off. The joints for
-//! a pair, and the way there without touching, are computed here, by [`crate::rig::check_robots`].
+//! a pair, and the way there without touching, are computed here, by [`crate::rig::robots`].
 
 pub mod fake;
 #[cfg(test)]
