@@ -20,6 +20,8 @@ const MOST_CHAINED: usize = 1_000;
 const MOST_STATEMENTS: usize = 1_000;
 /// Maximum doublings of the parser's time: 2^14 tries take a few hundredths of a second.
 const MOST_DOUBLINGS: f64 = 14.0;
+/// Maximum number of WITHs in WITHs: for each of them DataFusion looks for tables twice in what stands inside.
+const MOST_NESTED_WITH: usize = 14;
 /// Calls with a syntax of their own, which the parser tries up to five times.
 const TRIED_FIVE_TIMES: [&str; 20] = [
     "ANY",
@@ -64,6 +66,7 @@ const BRANCH_WORDS: [&str; 3] = ["WHEN", "THEN", "ELSE"];
 #[derive(Default)]
 struct OpenBracket {
     is_case: bool,
+    has_with: bool,
     /// Operators since the last comma, or the last word between branches.
     operators: usize,
     /// Set operators and joins.
@@ -142,6 +145,13 @@ pub fn check_statement_bounds(sql: &str, dialect: &dyn Dialect) -> Result<(), Er
             Token::Word(word) if innermost.is_case && is_one_of(word, &BRANCH_WORDS) => innermost.operators = 0,
             Token::Word(word) if innermost.is_case && is_one_of(word, &["END"]) => drop(open.pop()),
             Token::Word(word) if is_one_of(word, &QUERY_OPERATORS) => innermost.query_operators += 1,
+            Token::Word(word) if is_one_of(word, &["WITH"]) => {
+                innermost.has_with = true;
+                if open.iter().filter(|bracket| bracket.has_with).count() > MOST_NESTED_WITH {
+                    let hint = "one WITH can name all of them, one after the other";
+                    return refuse_excess("WITHs in WITHs", MOST_NESTED_WITH, hint);
+                }
+            }
             Token::Word(word) => innermost.operators += usize::from(is_one_of(word, &OPERATORS)),
             Token::Number(..) | Token::Placeholder(_) => {}
             literal if has_types && nesting_depth(literal) > MOST_NESTED => {
@@ -264,6 +274,8 @@ mod tests {
                 format!("select {}1{}", "cast(".repeat(6), " as int)".repeat(6)),
                 format!("select 1 {}", "union all select 1 + 1 ".repeat(1_000)),
                 "select '(((' || x[1]['a'] from t where not (a is null or b between 1 and 2)".to_owned(),
+                format!("{}select 1{}", "with a as (".repeat(14), ") select * from a".repeat(14)),
+                format!("with {} select 1", vec!["a as (with b as (select 1) select * from b)"; 100].join(", ")),
                 "select 1)))) + 1".to_owned(),
                 "select 1 + 1;".repeat(1_000),
                 "not sql at all '".to_owned(),
@@ -298,6 +310,7 @@ mod tests {
                 format!("select {}!{}", "cast(".repeat(22), " as int)".repeat(22)),
                 format!("select {}1{}", "(".repeat(101), ")".repeat(101)),
                 format!("select {}!{}", "array[".repeat(22), "]".repeat(22)),
+                format!("{}select 1{}", "with a as (".repeat(24), ") select * from a".repeat(24)),
                 "select 1 as n;".repeat(50_000),
             ] {
                 assert!(!passes(&sql), "{}", &sql[..60]);
