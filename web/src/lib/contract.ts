@@ -270,9 +270,9 @@ export interface paths {
         };
         /**
          * The messages of some measurements as an MCAP file.
-         * @description Streamed as it is cut; who sends Range, HEAD or Origin is told its length, and it is cut to its end first. CORS as for
-         *     run files. The same measurements, topics and layout are the same bytes and the same ETag. Needs the scopes sql and
-         *     files.
+         * @description Streamed as it is cut; who sends Range, HEAD or Origin is told its length, and it is cut to its end first. CORS as
+         *     for run files. The same measurements, topics and layout are the same bytes and the same ETag. Needs the scopes sql
+         *     and files.
          */
         readonly get: operations["slice"];
         readonly put?: never;
@@ -1172,8 +1172,8 @@ export interface components {
              */
             readonly detail_phase: readonly (number | null)[];
             /**
-             * @description Mean over the pairs of Flat's TNCE, linear, over Flat's total. One value per band in the order of `lake.bands`, the
-             *     total last; null if there is no value.
+             * @description Mean over the pairs of Flat's TNCE, linear, over Flat's total. One value per band in the order of `lake.bands`,
+             *     the total last; null if there is no value.
              */
             readonly flat_mean: readonly (number | null)[];
             /** @description Flat's `unbiased_p90_mean_db`, in the same order; null if there is no value. */
