@@ -21,9 +21,12 @@ pub async fn serve_engine(lake: &Lake, sockets: &Path, memory: usize) -> Result<
     identity.seconds = Some(QUERY_SECONDS);
     identity.rows = Some(QUERY_ROWS);
     let service = QueryService::new(lake, engine, identity, None)?;
+    let http = EngineSocket::Http.listen_in(sockets)?;
+    let flight_sql = EngineSocket::FlightSql.listen_in(sockets)?;
+    let postgres = EngineSocket::Postgres.listen_in(sockets)?;
     tokio::select! {
-        failed = echolake_http::serve_http_socket(service.clone(), EngineSocket::Http.listen_in(sockets)?) => failed,
-        failed = echolake_flight::serve_flight_socket(service.clone(), EngineSocket::FlightSql.listen_in(sockets)?) => failed,
-        failed = echolake_postgres::serve_postgres_socket(service, EngineSocket::Postgres.listen_in(sockets)?) => failed,
+        failed = echolake_http::serve_http_socket(service.clone(), http) => failed,
+        failed = echolake_flight::serve_flight_socket(service.clone(), flight_sql) => failed,
+        failed = echolake_postgres::serve_postgres_socket(service, postgres) => failed,
     }
 }

@@ -35,7 +35,7 @@ pub struct PanelGeometry {
     pub heights: HeightField,
     /// The panel as a solid.
     pub mesh: Mesh,
-    /// What its surface is of.
+    /// Material of its surface.
     pub material: SurfaceMaterial,
 }
 

@@ -1,4 +1,4 @@
-//! What travels from a speaker to a microphone: direct sound, reflections at a relief and at Foam.
+//! Sound from a speaker to a microphone: direct sound, reflections at a relief and at Foam.
 
 pub mod air;
 pub mod arrival;

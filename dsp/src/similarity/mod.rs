@@ -1,4 +1,4 @@
-//! How alike signals and rows are.
+//! Measures of likeness of signals and rows.
 
 pub mod components;
 pub mod correlation;

@@ -1,4 +1,4 @@
-//! How figures are drawn and written: shapes, colours and texts, plots around them, and the files they become.
+//! Drawing and writing of figures: shapes, colours and texts, plots around them, and the files they become.
 
 pub(crate) mod colours;
 pub(crate) mod drawing;

@@ -120,7 +120,7 @@ pub(super) fn can_have_record(path: &Path) -> bool {
     digest_record_path(path).filename().is_some_and(|name| name.len() <= LONGEST_FILE_NAME)
 }
 
-/// What tells whether a file changed since its reading began.
+/// ETag and state of a file, by which a change since its reading began is noticed.
 pub(crate) struct FileVersion {
     e_tag: Option<String>,
     state: Option<FileState>,

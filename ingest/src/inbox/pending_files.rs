@@ -21,7 +21,7 @@ const RUNS: &str = "runs";
 /// End of a recording's name until the file is complete.
 const PARTIAL: &str = ".mcap.partial";
 
-/// What is in no table yet.
+/// Files of the lake that are in no table yet.
 #[derive(Debug, Default)]
 pub struct PendingFiles {
     /// Run files.

@@ -229,7 +229,7 @@ fn select_responses(responses: Vec<Response>) -> BTreeMap<(u32, u32), Response> 
     best
 }
 
-// Pairs without an accepted attempt. A run that is gone on with tries those again that it gave up before.
+// Pairs without an accepted attempt. A resumed run tries those again that it gave up before.
 fn count_given_up(verdicts: &[(i64, Measurement)]) -> u64 {
     let of = |verdict: Verdict| -> HashSet<u32> {
         verdicts.iter().filter(|v| v.1.verdict() == verdict).map(|v| v.1.pair_id).collect()

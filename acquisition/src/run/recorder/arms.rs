@@ -65,7 +65,7 @@ impl Recorder {
         });
         let (description, joints) = channels.map_err(|e| self.failed(system_cause(e)))?;
         let message = cdr_string(&cell.to_urdf(name));
-        // A run that is gone on with has it already.
+        // A resumed run has it already.
         if !self.is_resumed {
             self.write(description, at, &message)?;
         }
@@ -74,7 +74,7 @@ impl Recorder {
     }
 
     /// Records `/tf` of both arms' links alone, at the beginning of a run: without it viewers have no place for
-    /// anything until the first pair is measured. A run that is gone on with has it already.
+    /// anything until the first pair is measured. A resumed run has it already.
     ///
     /// # Errors
     /// [`Error::Write`].

@@ -145,7 +145,7 @@ pub struct Recorder {
     encoded: Vec<u8>,
     tap: Option<Box<dyn Tap>>,
     cost: Cost,
-    /// The run is gone on with: what stands in a file once is there.
+    /// The run is resumed: the file has already what it has once.
     is_resumed: bool,
     /// The arms, where their joints are known.
     arms: Option<arms::Arms>,
