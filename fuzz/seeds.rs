@@ -6,8 +6,9 @@ use std::path::{Path, PathBuf};
 use echolake_import::import_wav;
 use echolake_panel::mesh::{Mesh, MeshFormat};
 use echolake_panel::relief::HeightField;
+use echolake_schema::messages::SampleFormat;
+use echolake_schema::samples::encode_wav;
 use hdf5_pure::{AttrValue, FileBuilder};
-use hound::{SampleFormat, WavSpec, WavWriter};
 use ndarray::Array2;
 use ndarray_npy::NpzWriter;
 
@@ -34,13 +35,12 @@ fn write_seeds(folder: PathBuf) {
         std::fs::create_dir_all(&folder).expect("a folder");
         std::fs::write(folder.join(name), bytes).expect("written");
     };
-    for (name, bits, format) in
-        [("16", 16, SampleFormat::Int), ("24", 24, SampleFormat::Int), ("f", 32, SampleFormat::Float)]
-    {
-        let bytes = wav(bits, format);
+    for (name, format) in [("16", SampleFormat::S16le), ("24", SampleFormat::S24le), ("f", SampleFormat::F32le)] {
+        let bytes = wav(format);
         put("wav", name, &bytes);
         put("mcap", name, &run(&bytes));
     }
+    put("rew", "text", rew_text().as_bytes());
     let heights = HeightField::from_fn(585.0, 3, |x, y| (x + y) / 100.0);
     let mesh = Mesh::from_height_field(&heights, -20.0);
     put("stl", "binary", &mesh.to_bytes(MeshFormat::Stl));
@@ -72,22 +72,23 @@ const PANEL_INFO: &str = "panel id,flat reference,foam reference,macrostructure 
                           type,binder type\na,b,c,flat,river_rock,sand,\n";
 
 // Noise, whose loopback is itself.
-fn wav(bits_per_sample: u16, sample_format: SampleFormat) -> Vec<u8> {
-    let spec = WavSpec { channels: 2, sample_rate: 96_000, bits_per_sample, sample_format };
-    let mut bytes = Cursor::new(Vec::new());
-    let mut writer = WavWriter::new(&mut bytes, spec).expect("a header");
-    for i in 0..FRAMES {
-        let sample = ((i * 7_919) % 20_011) as i32 - 10_005;
-        for _ in 0..2 {
-            match sample_format {
-                SampleFormat::Int => writer.write_sample(sample),
-                SampleFormat::Float => writer.write_sample(sample as f32 / 40_022.0),
-            }
-            .expect("written");
-        }
-    }
-    writer.finalize().expect("a length");
-    bytes.into_inner()
+fn wav(format: SampleFormat) -> Vec<u8> {
+    let width = format.sample_bytes().expect("a width");
+    let samples = (0..FRAMES).map(|i| ((i * 7_919) % 20_011) as i32 - 10_005);
+    let channel: Vec<u8> = match format {
+        SampleFormat::F32le => samples.flat_map(|x| (x as f32 / 40_022.0).to_le_bytes()).collect(),
+        _ => samples.flat_map(|x| x.to_le_bytes().into_iter().take(width)).collect(),
+    };
+    encode_wav(format, 96_000, &[&channel, &channel]).expect("a file")
+}
+
+fn rew_text() -> String {
+    let samples: String = (0..LENGTH).map(|n| format!("{}\n", if n == 100 { 0.5 } else { 1e-3 })).collect();
+    format!(
+        "* Impulse Response data saved by REW\n* IR is normalised\n* IR window has not been applied\n\
+         0.1 // Peak value before normalisation\n{LENGTH} // Response length\n\
+         1.0416666666666666E-5 // Sample interval (seconds)\n-0.0005 // Start time (seconds)\n* Data start\n{samples}"
+    )
 }
 
 /// Returns the run of a WAV import.
@@ -95,7 +96,7 @@ fn wav(bits_per_sample: u16, sample_format: SampleFormat) -> Vec<u8> {
 /// # Panics
 /// It cannot be written.
 pub fn run_of_wav() -> Vec<u8> {
-    run(&wav(16, SampleFormat::Int))
+    run(&wav(SampleFormat::S16le))
 }
 
 // The run of an import.

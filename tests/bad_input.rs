@@ -4,6 +4,8 @@ use std::path::Path;
 use std::process::Command;
 use std::time::Duration;
 
+use echolake_schema::messages::SampleFormat;
+use echolake_schema::samples::encode_wav;
 use echolake_testing::run_command;
 
 use super::{ECHOLAKE, TestFolder, stderr};
@@ -12,12 +14,10 @@ fn files(folder: &Path) -> usize {
     std::fs::read_dir(folder).map_or(0, Iterator::count)
 }
 
-fn wav(path: &Path, rate: u32, samples: &[i16]) {
-    let spec =
-        hound::WavSpec { channels: 1, sample_rate: rate, bits_per_sample: 16, sample_format: hound::SampleFormat::Int };
-    let mut writer = hound::WavWriter::create(path, spec).expect("a file");
-    samples.iter().for_each(|s| writer.write_sample(*s).expect("written"));
-    writer.finalize().expect("closed");
+fn wav(path: &Path, rate: u32, channels: &[&[i16]]) {
+    let bytes: Vec<Vec<u8>> = channels.iter().map(|c| c.iter().flat_map(|x| x.to_le_bytes()).collect()).collect();
+    let channels: Vec<&[u8]> = bytes.iter().map(Vec::as_slice).collect();
+    std::fs::write(path, encode_wav(SampleFormat::S16le, rate, &channels).expect("a file")).expect("written");
 }
 
 fn noise(len: usize) -> Vec<i16> {
@@ -29,9 +29,9 @@ const HEADER: &str = "surface,recording,loopback,microphone,speaker,temperature_
 #[test]
 fn manifests_and_wav_files() {
     let place = TestFolder::new();
-    wav(&place.path("good.wav"), 96_000, &noise(4_000));
-    wav(&place.path("short.wav"), 96_000, &noise(3_999));
-    wav(&place.path("slow.wav"), 48_000, &noise(4_000));
+    wav(&place.path("good.wav"), 96_000, &[&noise(4_000)]);
+    wav(&place.path("short.wav"), 96_000, &[&noise(3_999)]);
+    wav(&place.path("slow.wav"), 48_000, &[&noise(4_000)]);
     std::fs::write(place.path("empty.wav"), "").expect("written");
     std::fs::write(place.path("text.wav"), "RIFF, but not really").expect("written");
     let whole = std::fs::read(place.path("good.wav")).expect("read");
@@ -69,25 +69,15 @@ fn a_clipped_recording_is_kept_and_said() {
     let place = TestFolder::new();
     let mut clipped = noise(4_000);
     clipped[100] = i16::MAX;
-    wav(&place.path("clipped.wav"), 96_000, &clipped);
-    wav(&place.path("good.wav"), 96_000, &noise(4_000));
+    wav(&place.path("clipped.wav"), 96_000, &[&clipped]);
+    wav(&place.path("good.wav"), 96_000, &[&noise(4_000)]);
     std::fs::write(place.path("manifest.csv"), format!("{HEADER}a,clipped.wav,good.wav,0/0/0,0/0/1,20\n"))
         .expect("written");
     place.fails(0, &["import", "wav", "manifest.csv", "--rig", "rig.toml"], "1 samples clipped");
     place.ok(&["ingest"]);
     assert_eq!(place.number("select clipped_samples from measurements"), 1.0);
     // Of both channels of one file the loopback is the second: it is named, and the recording is not.
-    let spec = hound::WavSpec {
-        channels: 2,
-        sample_rate: 96_000,
-        bits_per_sample: 16,
-        sample_format: hound::SampleFormat::Int,
-    };
-    let mut writer = hound::WavWriter::create(place.path("both.wav"), spec).expect("a file");
-    noise(4_000).iter().zip(&clipped).for_each(|(recording, loopback)| {
-        writer.write_sample(*recording).and_then(|()| writer.write_sample(*loopback)).expect("written");
-    });
-    writer.finalize().expect("closed");
+    wav(&place.path("both.wav"), 96_000, &[&noise(4_000), &clipped]);
     std::fs::write(place.path("manifest.csv"), format!("{HEADER}b,both.wav,both.wav#2,0/0/0,0/0/1,20\n"))
         .expect("written");
     let expected = "line 2: 1 samples clipped in the loopback, `both.wav`, channel 2";

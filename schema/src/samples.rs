@@ -65,6 +65,50 @@ pub fn decode_samples(format: SampleFormat, bytes: &[u8], out: &mut [f32]) -> Re
     Ok(())
 }
 
+/// A WAV file of channels in one format, [`SampleFormat::S24Split`] becoming 24 bits a sample; of more than 4 GB it has
+/// a header of unknown length.
+///
+/// ```
+/// use echolake_schema::messages::SampleFormat;
+///
+/// let channel = [0.5f32, -0.25].map(f32::to_le_bytes).concat();
+/// let file = echolake_schema::samples::encode_wav(SampleFormat::F32le, 96_000, &[&channel, &channel])?;
+/// assert_eq!((file.len(), &file[..4], &file[36..40]), (44 + 16, &b"RIFF"[..], &b"data"[..]));
+/// # Ok::<(), echolake_schema::Error>(())
+/// ```
+///
+/// # Errors
+/// [`Error::SampleFormat`] if the format is unknown, [`Error::SampleBytes`] if a channel is not as long as the first.
+pub fn encode_wav(format: SampleFormat, rate_hz: u32, channels: &[&[u8]]) -> Result<Vec<u8>, Error> {
+    let width = format.sample_bytes().ok_or(Error::SampleFormat)?;
+    let samples = channels.first().map_or(0, |channel| channel.len() / width);
+    if let Some(wrong) = channels.iter().find(|channel| channel.len() != samples * width) {
+        return Err(Error::SampleBytes { actual: wrong.len(), samples, width });
+    }
+    let frame = width * channels.len();
+    let [riff_bytes, data_bytes] =
+        [36 + samples * frame, samples * frame].map(|bytes| u32::try_from(bytes).unwrap_or(u32::MAX).to_le_bytes());
+    let tag = if format == SampleFormat::F32le { 3 } else { 1 };
+    let [tag, channel_count, frame_bytes, bits] =
+        [tag, channels.len(), frame, 8 * width].map(|field| (field as u16).to_le_bytes());
+    let [rate, byte_rate] = [rate_hz, rate_hz.saturating_mul(frame as u32)].map(u32::to_le_bytes);
+    let mut file = [*b"RIFF", riff_bytes, *b"WAVE", *b"fmt ", 16u32.to_le_bytes()].concat();
+    file.extend([&tag[..], &channel_count, &rate, &byte_rate, &frame_bytes, &bits, b"data", &data_bytes].concat());
+    file.reserve(samples * frame);
+    for i in 0..samples {
+        for channel in channels {
+            match format {
+                SampleFormat::S24Split => {
+                    file.push(channel[i]);
+                    file.extend_from_slice(&channel[samples + 2 * i..][..2]);
+                }
+                _ => file.extend_from_slice(&channel[width * i..][..width]),
+            }
+        }
+    }
+    Ok(file)
+}
+
 fn decode_each<const N: usize>(bytes: &[u8], out: &mut [f32], decode: impl Fn([u8; N]) -> f32) {
     out.iter_mut().zip(bytes.as_chunks().0).for_each(|(y, b)| *y = decode(*b));
 }
@@ -108,6 +152,22 @@ mod tests {
         assert_eq!(bytes, [0x56, 0xFE, 0x34, 0x12, 0xFF, 0xFF]);
         assert_eq!(upper_16(&bytes), [0x34, 0x12, 0xFF, 0xFF]);
         assert!(upper_16(&[]).is_empty());
+    }
+
+    // The file that Python 3's module `wave` writes of these frames, and the bytes that SciPy's `wavfile` reads.
+    #[test]
+    fn wav_files_are_those_of_other_programs() {
+        let packed = [0x56, 0x34, 0x12, 0xFE, 0xFF, 0xFF];
+        let turned = [0xFE, 0xFF, 0xFF, 0x56, 0x34, 0x12];
+        let expected =
+            b"RIFF\x30\0\0\0WAVEfmt \x10\0\0\0\x01\0\x02\0\0\x77\x01\0\0\xca\x08\0\x06\0\x18\0data\x0c\0\0\0\
+                         \x56\x34\x12\xfe\xff\xff\xfe\xff\xff\x56\x34\x12";
+        let encoded = |format, channels: &[&[u8]]| encode_wav(format, 96_000, channels).expect("a file");
+        assert_eq!(encoded(SampleFormat::S24le, &[&packed, &turned]), expected);
+        let [first, second] = [[0x12_3456, -2], [-2, 0x12_3456]].map(|samples| split_24(&samples));
+        assert_eq!(encoded(SampleFormat::S24Split, &[&first, &second]), expected);
+        let uneven = encode_wav(SampleFormat::S24le, 96_000, &[&packed, &turned[..3]]);
+        assert_eq!(uneven, Err(Error::SampleBytes { actual: 3, samples: 2, width: 3 }));
     }
 
     #[test]

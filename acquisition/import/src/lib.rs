@@ -1,5 +1,5 @@
-//! Import of existing measurements as runs: WAV files listed in a manifest, the published GIR data set, SOFA files, and
-//! HDF5 files by a mapping.
+//! Import of existing measurements as runs: WAV files listed in a manifest, the published GIR data
+//! set, SOFA files, and HDF5 files by a mapping.
 
 mod batch;
 mod gir;
@@ -13,6 +13,7 @@ mod wav;
 mod wav_file;
 mod wav_layout;
 mod wav_manifest;
+mod wav_search;
 
 use std::path::{Path, PathBuf};
 
@@ -76,13 +77,15 @@ pub enum Error {
     /// The manifest has a wrong header.
     #[error(
         "manifest `{}`: {what}; hint: the columns are {}",
-        path.display(), echolake_schema::interchange::WAV_MANIFEST.join(", ")
+        path.display(), columns.join(", ")
     )]
     Header {
         /// The manifest.
         path: PathBuf,
         /// The fault.
         what: String,
+        /// The columns that it may have.
+        columns: &'static [&'static str],
     },
     /// A row of the manifest is wrong.
     #[error("manifest `{}`, line {line}, column `{column}`: {what}", path.display())]

@@ -3,6 +3,7 @@
 #[cfg(test)]
 mod tests;
 
+use std::ops::Range;
 use std::path::Path;
 
 use echolake_acquisition::run::assessment::TakeAssessor;
@@ -18,12 +19,15 @@ use echolake_schema::messages::{AmbientSample, ImpulseResponse, Measurement, Swe
 use echolake_schema::{Grid, Rig, SampleRate, SurfaceId, Timestamp};
 
 use crate::batch::ImportBatch;
-use crate::wav_file::WavChannel;
 use crate::wav_manifest::{self, ManifestRow};
-use crate::{Error, ImportOptions, ImportedRun};
+use crate::{Error, ImportOptions, ImportedRun, wav_search};
 
 /// Source name of the import's log entries.
 const NAME: &str = "import wav";
+/// Greatest difference of the direct sound's arrival from geometry that roughly known positions explain, us: 0.7 m.
+const ARRIVAL_US: f64 = 2_000.0;
+/// Amplitude, re the strongest sample that a response keeps, of one behind it that is no noise.
+const LATE_SHARE: f32 = 2.0;
 
 /// Returns the sampling rate of a manifest's first recording.
 ///
@@ -100,14 +104,34 @@ impl WavImport<'_> {
         row.recorded_at.unwrap_or_else(|| self.options.started.plus_secs(f64::from(index)))
     }
 
+    // The samples of a take that a sweep's own file tells of, so that its direct sound arrives after `arrival` s.
+    fn find_take(&self, row: &ManifestRow, arrival: f64) -> Result<Range<u64>, Error> {
+        let unread = |column, what| Error::Row { path: self.manifest.to_owned(), line: row.line, column, what };
+        let sweep = row.loopback.read_all(row.loopback.sample_format()).map_err(|e| unread("loopback", e))?.fractions;
+        let ir = &self.rig.impulse_response;
+        let reach = raw_len(ir.length, ir.reference_temperature_c.get());
+        let found = wav_search::find_sweep(&row.recording, &sweep, reach, self.rig);
+        let found = found.map_err(|e| unread("recording", e))?;
+        let start = found.checked_sub((arrival * self.rig.sweep.rate_hz.get()).round() as u64).ok_or_else(|| {
+            let what = format!("{} begins after the sweep, which arrives at its sample {found}", row.recording.label());
+            unread("recording", what)
+        })?;
+        let len = (sweep.len() + reach).max(self.rig.recording_len()) as u64;
+        Ok(start..(start + len).min(row.recording.layout.samples))
+    }
+
     // Import keeps all it is given: objections of the rig become warnings, not refusals.
     fn row(&self, recorder: &mut Recorder, row: &ManifestRow, at: Timestamp) -> Result<Option<String>, Error> {
         let unread = |column, what| Error::Row { path: self.manifest.to_owned(), line: row.line, column, what };
-        let microphone = row.recording.read_samples(row.format).map_err(|e| unread("recording", e))?;
-        let loopback = row.loopback.read_samples(row.format).map_err(|e| unread("loopback", e))?;
         let (rig, celsius) = (self.rig, row.celsius.get());
         let planned = |cause| Error::Plan { rig: rig.name.clone(), cause };
-        let len = microphone.fractions.len();
+        let [m, s] = [row.pair.microphone, row.pair.speaker].map(|id| self.grid.points()[id.index()].position_mm);
+        let arrival = direct_mm(m, s) / 1e3 / speed_of_sound(celsius);
+        let take = if row.is_sweep { self.find_take(row, arrival)? } else { 0..row.recording.layout.samples };
+        let taken_secs = take.start as f64 / rig.sweep.rate_hz.get();
+        let len = (take.end - take.start) as usize;
+        let loopback = row.loopback.read_samples(row.format, 0..len as u64).map_err(|e| unread("loopback", e))?;
+        let microphone = row.recording.read_samples(row.format, take).map_err(|e| unread("recording", e))?;
         let plan = ResponseDeconvolution::<f32>::new(DeconvolutionParams {
             recording_len: len,
             output_len: raw_len(rig.impulse_response.length, rig.impulse_response.reference_temperature_c.get())
@@ -125,12 +149,11 @@ impl WavImport<'_> {
         let limits_hz = response_limits_hz([rig.sweep.low_hz, rig.sweep.high_hz], rho);
         plan.run_within(limits_hz, &microphone.fractions, &loopback.fractions, &mut samples, &mut plan.make_scratch())
             .map_err(|e| unread("loopback", e.to_string()))?;
-        let [m, s] = [row.pair.microphone, row.pair.speaker].map(|id| self.grid.points()[id.index()].position_mm);
-        let arrival = direct_mm(m, s) / 1e3 / speed_of_sound(celsius);
         let clipped = microphone.clipped + loopback.clipped;
-        let assessment = TakeAssessor::new(rig, len)
-            .and_then(|mut a| a.assess_take(&microphone.fractions, &loopback.fractions, arrival, clipped))
-            .map_err(planned)?;
+        let mut assessor = TakeAssessor::new(rig, len).map_err(planned)?;
+        let mut assessment =
+            assessor.assess_take(&microphone.fractions, &loopback.fractions, arrival, clipped).map_err(planned)?;
+        check_response(assessor.response(), samples.len(), arrival, rig).map_err(|e| unread("recording", e))?;
         // The geometry of a foreign rig is known less well than its files say, and the level outside was not recorded:
         // the arrival is recorded, not judged, and so is a signal-to-noise ratio that a long response leaves no room
         // for.
@@ -139,11 +162,21 @@ impl WavImport<'_> {
         if judged.snr_db.is_nan() {
             judged.snr_db = f64::INFINITY;
         }
+        let mut reasons = Vec::new();
+        if row.is_sweep {
+            assessment.arrival_error_us = f64::NAN;
+            reasons.push(format!(
+                "no loopback: the sweep was found {taken_secs:.4} s into the recording, {}, and its direct sound is \
+                 taken to arrive when geometry and temperature say",
+                row.recording.label()
+            ));
+        } else if assessment.arrival_error_us.abs() > ARRIVAL_US {
+            reasons.push(describe_arrival(assessment.arrival_error_us, rig));
+        }
         let columns = [("recording", &row.recording), ("loopback", &row.loopback)];
-        let warned = |(column, wav): (&str, &WavChannel)| {
-            wav.layout.warning.as_ref().map(|warning| format!("{column}, {}: {warning}", wav.label()))
-        };
-        let mut reasons: Vec<_> = columns.into_iter().filter_map(warned).collect();
+        for (column, wav) in columns {
+            reasons.extend(wav.layout.warnings.iter().map(|warning| format!("{column}, {}: {warning}", wav.label())));
+        }
         for objection in judged.find_objections(&rig.validation, f64::NEG_INFINITY) {
             match objection {
                 // Where to lower the gain depends on which of both it is.
@@ -223,6 +256,37 @@ impl WavImport<'_> {
         recorder.checkpoint()?;
         Ok(warning)
     }
+}
+
+// Silence is not taken for a response: what is strongest in a recording is in the samples that are kept of it.
+fn check_response(response: &[f32], kept: usize, arrival: f64, rig: &Rig) -> Result<(), String> {
+    let strongest = |from, samples: &[f32]| {
+        let all = (from..).zip(samples.iter().map(|x| x.abs()));
+        all.max_by(|a: &(usize, f32), b| a.1.total_cmp(&b.1)).unwrap_or_default()
+    };
+    let (_, inside) = strongest(0, &response[..kept]);
+    let (peak, outside) = strongest(kept, &response[kept..]);
+    if outside <= LATE_SHARE * inside {
+        return Ok(());
+    }
+    let rate_hz = rig.sweep.rate_hz.get();
+    let late_us = (peak as f64 / rate_hz - arrival) * 1e6;
+    Err(format!(
+        "{}; the response of {} samples would be silence; hint: record a loopback, or name the file of the sweep alone, \
+         shorter than the recording, as the loopback, and import finds it in the recording",
+        describe_arrival(late_us, rig),
+        rig.impulse_response.length
+    ))
+}
+
+fn describe_arrival(off_us: f64, rig: &Rig) -> String {
+    let samples = (off_us.abs() / 1e6 * rig.sweep.rate_hz.get()).round();
+    let side = if off_us > 0.0 { "late" } else { "early" };
+    format!(
+        "the direct sound arrives {samples} samples ({:.1} ms) {side}: no loopback, or one without the latency of the \
+         interface",
+        off_us.abs() / 1e3
+    )
 }
 
 /// Checks all rows of a manifest and the files that they name, without importing them.

@@ -1,5 +1,6 @@
 //! One channel of a WAV file, checked before it is believed.
 
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use echolake_schema::messages::SampleFormat;
@@ -63,67 +64,68 @@ impl WavChannel {
         }
     }
 
-    /// Reads its samples, as bytes of `format`, which is its own or a wider one.
-    pub fn read_samples(&self, format: SampleFormat) -> Result<ChannelSamples, String> {
+    /// Reads a range of its samples, as bytes of `format`, which is its own or one that holds them; beyond its end they
+    /// are 0.
+    pub fn read_samples(&self, format: SampleFormat, range: Range<u64>) -> Result<ChannelSamples, String> {
         let failed = |fault: String| format!("`{}` {fault}", self.path.display());
-        let mut out = ChannelSamples { bytes: Vec::new(), fractions: Vec::new(), clipped: 0 };
+        let count = range.end.saturating_sub(range.start) as usize;
+        let width = format.sample_bytes().unwrap_or(4);
+        let mut out = ChannelSamples { bytes: Vec::new(), fractions: Vec::with_capacity(count), clipped: 0 };
+        let mut wide = Vec::new();
         if self.layout.coding == SampleCoding::Float {
             let visit = |x: f32| {
-                out.bytes.extend(x.to_le_bytes());
                 out.fractions.push(x);
                 out.clipped += u32::from(x.abs() >= 1.0);
             };
-            self.layout.visit_floats(&self.path, self.channel, visit).map_err(failed)?;
-            return match out.fractions.iter().find(|x| !x.is_finite()) {
-                Some(x) => Err(failed(format!("has a sample that is {x}"))),
-                None => Ok(out),
+            self.layout.visit_floats(&self.path, self.channel, range, visit).map_err(failed)?;
+            if let Some(x) = out.fractions.iter().find(|x| !x.is_finite()) {
+                return Err(failed(format!("has a sample that is {x}")));
+            }
+        } else {
+            let highest = i32::MAX - ((1u32 << (32 - self.layout.bits)) - 1) as i32;
+            let visit = |x: i32| {
+                wide.push(x >> (32 - 8 * width));
+                out.fractions.push((f64::from(x) / 2f64.powi(31)) as f32);
+                out.clipped += u32::from(x == i32::MIN || x >= highest);
             };
+            self.layout.visit_integers(&self.path, self.channel, range, visit).map_err(failed)?;
+            wide.resize(count, 0);
         }
-        let width = format.sample_bytes().unwrap_or(4);
-        let highest = i32::MAX - ((1u32 << (32 - self.layout.bits)) - 1) as i32;
-        let mut wide = Vec::with_capacity(self.layout.samples as usize);
-        let visit = |x: i32| {
-            wide.push(x >> (32 - 8 * width));
-            out.fractions.push((f64::from(x) / 2f64.powi(31)) as f32);
-            out.clipped += u32::from(x == i32::MIN || x >= highest);
-        };
-        self.layout.visit_integers(&self.path, self.channel, visit).map_err(failed)?;
+        out.fractions.resize(count, 0.0);
         out.bytes = match format {
+            SampleFormat::F32le => out.fractions.iter().flat_map(|x| x.to_le_bytes()).collect(),
             SampleFormat::S24Split => split_24(&wide),
             _ => wide.iter().flat_map(|x| x.to_le_bytes().into_iter().take(width)).collect(),
         };
         Ok(out)
     }
+
+    /// Reads all of its samples.
+    pub fn read_all(&self, format: SampleFormat) -> Result<ChannelSamples, String> {
+        self.read_samples(format, 0..self.layout.samples)
+    }
 }
 
-/// Returns the wider of two formats, if one holds the other's samples exactly.
+/// Returns the wider of two formats, if one holds the other's samples exactly; floats hold integers of 24 bits.
 pub(crate) fn common_format(a: SampleFormat, b: SampleFormat) -> Option<SampleFormat> {
-    match (a == b, a == SampleFormat::F32le || b == SampleFormat::F32le) {
-        (true, _) => Some(a),
-        (false, true) => None,
-        (false, false) => {
-            if a.sample_bytes() > b.sample_bytes() {
-                Some(a)
-            } else {
-                Some(b)
-            }
-        }
+    let is_float = [a, b].contains(&SampleFormat::F32le);
+    if is_float && a != b {
+        return (![a, b].contains(&SampleFormat::S32le)).then_some(SampleFormat::F32le);
     }
+    Some(if a.sample_bytes() > b.sample_bytes() { a } else { b })
 }
 
 #[cfg(test)]
 mod tests {
-    use echolake_schema::samples::decode_samples;
-    use hound::{SampleFormat as WavFormat, WavSpec};
+    use echolake_schema::samples::{decode_samples, encode_wav};
 
     use super::*;
 
-    fn written(folder: &Path, bits_per_sample: u16, samples: &[i32]) -> WavChannel {
-        let spec = WavSpec { channels: 1, sample_rate: 96_000, bits_per_sample, sample_format: WavFormat::Int };
-        let name = format!("{bits_per_sample}.wav");
-        let mut writer = hound::WavWriter::create(folder.join(&name), spec).expect("a file");
-        samples.iter().for_each(|x| writer.write_sample(*x).expect("a sample"));
-        writer.finalize().expect("a whole file");
+    fn written(folder: &Path, bits: usize, samples: &[i32]) -> WavChannel {
+        let format = [SampleFormat::S16le, SampleFormat::S24le, SampleFormat::S32le][bits / 8 - 2];
+        let bytes: Vec<u8> = samples.iter().flat_map(|x| x.to_le_bytes().into_iter().take(bits / 8)).collect();
+        let name = format!("{bits}.wav");
+        std::fs::write(folder.join(&name), encode_wav(format, 96_000, &[&bytes]).expect("a file")).expect("written");
         WavChannel::open(folder, &name).expect("a channel")
     }
 
@@ -138,7 +140,7 @@ mod tests {
             let channel = written(folder.path(), bits, &samples);
             assert_eq!(channel.sample_format(), format);
             for wider in widths.into_iter().filter(|(w, _)| *w >= bits).map(|(_, f)| f) {
-                let read = channel.read_samples(wider).expect("samples");
+                let read = channel.read_all(wider).expect("samples");
                 let mut decoded = [f32::NAN; 7];
                 decode_samples(wider, &read.bytes, &mut decoded).expect("bytes of this format");
                 assert_eq!(decoded.as_slice(), read.fractions, "{bits} bits as {wider:?}");

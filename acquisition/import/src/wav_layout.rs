@@ -8,6 +8,7 @@ mod tests;
 
 use std::fs::File;
 use std::io::{BufReader, ErrorKind, Read, Seek as _, SeekFrom};
+use std::ops::Range;
 use std::path::Path;
 
 /// Format tags of the `fmt` chunk.
@@ -22,8 +23,9 @@ const LONG_BYTES: u64 = 0xFFFF_FFFF;
 /// How a sample is coded.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum SampleCoding {
+    /// Signed, but for those of one byte.
     Integer,
-    /// 32 bits.
+    /// 32 or 64 bits.
     Float,
 }
 
@@ -33,7 +35,7 @@ pub(crate) struct WavLayout {
     pub coding: SampleCoding,
     pub rate_hz: u32,
     pub channels: u16,
-    /// Bytes of a sample: 2 to 4.
+    /// Bytes of a sample: 1 to 4, or 8.
     width: usize,
     /// Bits of a sample that are valid.
     pub bits: u32,
@@ -43,8 +45,8 @@ pub(crate) struct WavLayout {
     start: u64,
     /// Samples of each channel.
     pub samples: u64,
-    /// A fault of the header that cost nothing.
-    pub warning: Option<String>,
+    /// Faults of the header that cost nothing.
+    pub warnings: Vec<String>,
 }
 
 /// A chunk's name, and the place and length of its content.
@@ -74,12 +76,20 @@ impl WavLayout {
                 chunk.bytes = bytes;
             }
             let there = chunks.size - chunk.start;
-            let is_unknown = is_data && chunk.bytes > there && (UNKNOWN_BYTES..=LONG_BYTES).contains(&chunk.bytes);
+            let declared = chunk.bytes;
+            let is_unknown = is_data
+                && match declared {
+                    0 => there > 1 && chunks.head_at(chunk.start)?.is_none(),
+                    _ => declared > there && (UNKNOWN_BYTES..=LONG_BYTES).contains(&declared),
+                };
             if is_unknown {
                 chunk.bytes = there;
-            } else if is_data && chunk.bytes > there {
-                let declared = chunk.bytes;
-                return Err(format!("is cut off: its header says {declared} bytes of samples, {there} are there"));
+            } else if is_data && declared > there {
+                return Err(format!(
+                    "is cut off: its header says {declared} bytes of samples from byte {} on, {there} are there; hint: \
+                     copy it again",
+                    chunk.start
+                ));
             }
             match &chunk.name {
                 b"data" if data.is_some() => {
@@ -87,7 +97,7 @@ impl WavLayout {
                         "has a second `data` chunk at byte {place}, expected one; hint: export it again"
                     ));
                 }
-                b"data" => data = Some((chunk.start, chunk.bytes, is_unknown)),
+                b"data" => data = Some((chunk.start, chunk.bytes, is_unknown.then_some(declared))),
                 b"fmt " => format = Some(chunks.content::<40>(&chunk)?),
                 b"ds64" => {
                     let [_, _, _, _, _, _, _, _, length @ ..] = chunks.content::<16>(&chunk)?;
@@ -97,20 +107,25 @@ impl WavLayout {
             }
             chunks.pass(&chunk)?;
         }
-        let (start, bytes, is_unknown) = data.ok_or("is no WAV file that can be read: it has no `data` chunk")?;
+        let (start, bytes, unknown) = data.ok_or("is no WAV file that can be read: it has no `data` chunk")?;
         let format = format.ok_or("is no WAV file that can be read: it has no `fmt ` chunk")?;
         let mut layout = Self::from_format(&format)?;
         let frame_bytes = layout.frame_bytes() as u64;
-        if !is_unknown && !bytes.is_multiple_of(frame_bytes) {
+        if unknown.is_none() && !bytes.is_multiple_of(frame_bytes) {
             return Err(format!(
-                "ends within a sample: {bytes} bytes of samples, {frame_bytes} for one of each channel"
+                "ends within a sample: {bytes} bytes of samples from byte {start} on, {frame_bytes} for one of each \
+                 channel"
             ));
         }
-        (layout.start, layout.samples) = (start, bytes / frame_bytes);
-        layout.warning = is_unknown.then(|| {
+        layout.start = start;
+        layout.samples = bytes / frame_bytes;
+        if let Some(declared) = unknown {
             let samples = layout.samples;
-            format!("its header does not say how long it is: all of its {samples} samples to the file's end are taken")
-        });
+            layout.warnings.push(format!(
+                "its header says {declared} bytes of samples, {bytes} are there: all of its {samples} samples to the \
+                 file's end are taken"
+            ));
+        }
         layout.unused_above = layout.find_unused_above(path)?;
         Ok(layout)
     }
@@ -118,7 +133,8 @@ impl WavLayout {
     // Of the content of `fmt`; what it lacks of an extension is 0.
     fn from_format(format: &[u8; 40]) -> Result<Self, String> {
         let short = |at: usize| u16::from_le_bytes([format[at], format[at + 1]]);
-        let rate_hz = u32::from_le_bytes([format[4], format[5], format[6], format[7]]);
+        let long = |at: usize| u32::from_le_bytes([format[at], format[at + 1], format[at + 2], format[at + 3]]);
+        let rate_hz = long(4);
         let (channels, frame_bytes, stored_bits) = (short(2), usize::from(short(12)), short(14));
         let (tag, bits) = match short(0) {
             // Some writers leave the number of valid bits at 0.
@@ -133,18 +149,25 @@ impl WavLayout {
         let width = frame_bytes / usize::from(channels);
         let bits = u32::from(bits);
         let coding = match (tag, width, bits) {
+            (INTEGER, 1, 8) => SampleCoding::Integer,
             (INTEGER, 2..=4, 9..=32) if bits <= 8 * width as u32 => SampleCoding::Integer,
-            (FLOAT, 4, 32) => SampleCoding::Float,
+            (FLOAT, 4, 32) | (FLOAT, 8, 64) => SampleCoding::Float,
             (INTEGER | FLOAT, ..) => {
                 let kind = if tag == FLOAT { "float" } else { "integer" };
                 return Err(format!(
-                    "has {kind} samples of {bits} bits in {width} bytes, expected integers of 16, 24 or 32 bits or \
-                     floats of 32"
+                    "has {kind} samples of {bits} bits in {width} bytes, expected integers of 8, 16, 24 or 32 bits \
+                     or floats of 32 or 64"
                 ));
             }
             (other, ..) => return Err(format!("is coded by format {other:#06x}, expected plain integers or floats")),
         };
-        Ok(Self { coding, rate_hz, channels, width, bits, unused_above: 0, start: 0, samples: 0, warning: None })
+        let declared = u64::from(long(8));
+        let expected = u64::from(rate_hz) * frame_bytes as u64;
+        let warning = (declared != expected).then(|| {
+            format!("its header says {declared} bytes a second, expected {expected}: its rate of {rate_hz} Hz counts")
+        });
+        let warnings = Vec::from_iter(warning);
+        Ok(Self { coding, rate_hz, channels, width, bits, unused_above: 0, start: 0, samples: 0, warnings })
     }
 
     fn frame_bytes(&self) -> usize {
@@ -162,7 +185,7 @@ impl WavLayout {
         // The samples' bytes are the uppermost of 32 bits.
         let below = ((1u32 << unused) - 1) << (32 - width_bits);
         let (mut is_upper, mut is_lower) = (true, true);
-        self.visit(path, |frame| {
+        self.visit(path, 0..self.samples, |frame| {
             for x in frame.chunks_exact(self.width).map(upper_bits) {
                 is_upper &= x as u32 & below == 0;
                 is_lower &= x << unused >> unused == x;
@@ -175,25 +198,44 @@ impl WavLayout {
         }
     }
 
-    /// Visits the integers of a channel, counted from 0, as the uppermost of 32 bits.
-    pub fn visit_integers(&self, path: &Path, channel: u16, mut visit: impl FnMut(i32)) -> Result<(), String> {
+    /// Visits the integers of a channel, counted from 0, as the uppermost of 32 bits; of a range of samples, those that
+    /// there are.
+    pub fn visit_integers(
+        &self,
+        path: &Path,
+        channel: u16,
+        range: Range<u64>,
+        mut visit: impl FnMut(i32),
+    ) -> Result<(), String> {
         let first = usize::from(channel) * self.width;
-        self.visit(path, |frame| visit(upper_bits(&frame[first..first + self.width]) << self.unused_above))
+        self.visit(path, range, |frame| visit(upper_bits(&frame[first..first + self.width]) << self.unused_above))
     }
 
-    /// Visits the floats of a channel, counted from 0.
-    pub fn visit_floats(&self, path: &Path, channel: u16, mut visit: impl FnMut(f32)) -> Result<(), String> {
+    /// Visits the floats of a channel, as [`Self::visit_integers`] does.
+    pub fn visit_floats(
+        &self,
+        path: &Path,
+        channel: u16,
+        range: Range<u64>,
+        mut visit: impl FnMut(f32),
+    ) -> Result<(), String> {
         let first = usize::from(channel) * self.width;
-        self.visit(path, |frame| visit(f32::from_bits(upper_bits(&frame[first..first + self.width]) as u32)))
+        self.visit(path, range, |frame| {
+            let bytes = &frame[first..first + self.width];
+            visit(match bytes.try_into().map(f64::from_le_bytes) {
+                Ok(double) => double as f32,
+                Err(_) => f32::from_bits(upper_bits(bytes) as u32),
+            });
+        })
     }
 
     // Visits one sample of each channel after the other.
-    fn visit(&self, path: &Path, mut visit: impl FnMut(&[u8])) -> Result<(), String> {
+    fn visit(&self, path: &Path, range: Range<u64>, mut visit: impl FnMut(&[u8])) -> Result<(), String> {
         let failed = |e: std::io::Error| format!("cannot be read: {e}");
         let mut file = BufReader::new(File::open(path).map_err(failed)?);
-        file.seek(SeekFrom::Start(self.start)).map_err(failed)?;
         let mut frame = vec![0; self.frame_bytes()];
-        for _ in 0..self.samples {
+        file.seek(SeekFrom::Start(self.start + range.start * frame.len() as u64)).map_err(failed)?;
+        for _ in range.start..range.end.min(self.samples) {
             file.read_exact(&mut frame).map_err(failed)?;
             visit(&frame);
         }
@@ -201,8 +243,11 @@ impl WavLayout {
     }
 }
 
-// Little-endian bytes as the uppermost of 32 bits.
+// Little-endian bytes as the uppermost of 32 bits; a single byte counts from 0, its middle is silence.
 fn upper_bits(bytes: &[u8]) -> i32 {
+    if let [byte] = bytes {
+        return i32::from(byte ^ 0x80) << 24;
+    }
     bytes.iter().rev().fold(0u32, |x, byte| x << 8 | u32::from(*byte)).wrapping_shl(32 - 8 * bytes.len() as u32) as i32
 }
 
@@ -226,19 +271,27 @@ impl ChunkReader {
         if left == 0 || (left == 1 && has_data) {
             return Ok(None);
         }
-        let head: [u8; 8] = self.bytes_at(self.at)?;
-        let (name, length) = ([head[0], head[1], head[2], head[3]], [head[4], head[5], head[6], head[7]]);
-        let (start, bytes) = (self.at + 8, u64::from(u32::from_le_bytes(length)));
+        match (self.head_at(self.at)?, has_data) {
+            (Some(chunk), _) => Ok(Some(chunk)),
+            (None, true) => Err(format!(
+                "has {left} bytes behind its samples, from byte {} on, that are no chunk of a WAV file: its header \
+                 says fewer samples than there are, or it is damaged; hint: export it again",
+                self.at
+            )),
+            (None, false) => Err(format!("is no WAV file that can be read: byte {} begins no chunk", self.at)),
+        }
+    }
+
+    // The chunk that begins at a place, if one does.
+    fn head_at(&mut self, at: u64) -> Result<Option<ChunkHead>, String> {
+        let left = self.size.saturating_sub(at);
+        let head: [u8; 8] = self.bytes_at(at)?;
+        let [name @ .., a, b, c, d] = head;
+        let bytes = u64::from(u32::from_le_bytes([a, b, c, d]));
         let is_name = name.iter().all(|byte| (b' '..=b'~').contains(byte));
         let is_within = name == *b"data" || left >= 8 + bytes;
-        match (is_name && left >= 8 && is_within, has_data) {
-            (true, _) => Ok(Some(ChunkHead { name, start, bytes })),
-            (false, true) => Err(format!(
-                "has {left} bytes behind its samples that are no chunk of a WAV file: its header says fewer samples \
-                 than there are, or it is damaged; hint: export it again"
-            )),
-            (false, false) => Err(format!("is no WAV file that can be read: byte {} begins no chunk", self.at)),
-        }
+        let is_chunk = is_name && left >= 8 && is_within;
+        Ok(is_chunk.then_some(ChunkHead { name, start: at + 8, bytes }))
     }
 
     // Goes behind a chunk. One of odd length is padded; some writers do not.

@@ -20,6 +20,8 @@ pub(crate) struct ManifestRow {
     pub line: u64,
     pub recording: WavChannel,
     pub loopback: WavChannel,
+    /// True if `loopback` is the sweep's own file, and no recording.
+    pub is_sweep: bool,
     pub format: SampleFormat,
     pub pair: Pair,
     pub celsius: Celsius,
@@ -29,42 +31,46 @@ pub(crate) struct ManifestRow {
     pub attempt: u32,
 }
 
+/// Columns that a manifest may have.
+pub(crate) type ManifestColumns = &'static [&'static str];
+/// A manifest's rows, and the place of each column.
+type OpenManifest = (csv::Reader<std::fs::File>, Vec<Option<usize>>);
 /// A manifest's rows by surface.
 pub(crate) type WavManifest = BTreeMap<SurfaceId, Vec<ManifestRow>>;
 
 /// Opens a manifest and checks its header; returns the place of each column.
-fn open_manifest(path: &Path) -> Result<(csv::Reader<std::fs::File>, Vec<Option<usize>>), Error> {
+pub(crate) fn open_manifest(path: &Path, columns: ManifestColumns) -> Result<OpenManifest, Error> {
     let unreadable = |e: csv::Error| Error::Read { path: path.to_owned(), source: e.into() };
     let mut reader = csv::ReaderBuilder::new().trim(csv::Trim::All).from_path(path).map_err(unreadable)?;
     let header = reader.headers().map_err(unreadable)?.clone();
-    let wrong = |what| Error::Header { path: path.to_owned(), what };
+    let wrong = |what| Error::Header { path: path.to_owned(), what, columns };
     if header.is_empty() {
         return Err(wrong("it is empty".into()));
     }
-    if let Some(unknown) = header.iter().find(|h| !WAV_MANIFEST.contains(h)) {
+    if let Some(unknown) = header.iter().find(|h| !columns.contains(h)) {
         return Err(wrong(format!("unknown column `{unknown}`")));
     }
-    let places: Vec<_> = WAV_MANIFEST.iter().map(|c| header.iter().position(|h| h == *c)).collect();
+    let places: Vec<_> = columns.iter().map(|c| header.iter().position(|h| h == *c)).collect();
     match places[..NEEDED].iter().position(Option::is_none) {
-        Some(missing) => Err(wrong(format!("column `{}` is missing", WAV_MANIFEST[missing]))),
+        Some(missing) => Err(wrong(format!("column `{}` is missing", columns[missing]))),
         None => Ok((reader, places)),
     }
 }
 
 /// The first recording of a manifest.
 pub(crate) fn first_recording(path: &Path) -> Result<WavChannel, Error> {
-    let (mut reader, places) = open_manifest(path)?;
-    let record = next_record(path, &mut reader)?.ok_or_else(|| no_rows(path))?;
-    let cells = ManifestCells { path, places: &places, record: &record };
+    let (mut reader, places) = open_manifest(path, &WAV_MANIFEST)?;
+    let record = next_record(path, &mut reader)?.ok_or_else(|| no_rows(path, &WAV_MANIFEST))?;
+    let cells = ManifestCells { path, columns: &WAV_MANIFEST, places: &places, record: &record };
     cells.open_wav("recording")
 }
 
 /// Reads and checks all rows.
 pub(crate) fn read_manifest(path: &Path, rig: &Rig, grid: &Grid) -> Result<WavManifest, Error> {
-    let (mut reader, places) = open_manifest(path)?;
+    let (mut reader, places) = open_manifest(path, &WAV_MANIFEST)?;
     let mut manifest = WavManifest::new();
     while let Some(record) = next_record(path, &mut reader)? {
-        let cells = ManifestCells { path, places: &places, record: &record };
+        let cells = ManifestCells { path, columns: &WAV_MANIFEST, places: &places, record: &record };
         let surface: SurfaceId = cells.parse_cell("surface")?;
         let row = cells.parse_row(rig, grid)?;
         let rows = manifest.entry(surface).or_default();
@@ -77,10 +83,10 @@ pub(crate) fn read_manifest(path: &Path, rig: &Rig, grid: &Grid) -> Result<WavMa
         }
         rows.push(row);
     }
-    if manifest.is_empty() { Err(no_rows(path)) } else { Ok(manifest) }
+    if manifest.is_empty() { Err(no_rows(path, &WAV_MANIFEST)) } else { Ok(manifest) }
 }
 
-fn next_record(path: &Path, reader: &mut csv::Reader<std::fs::File>) -> Result<Option<StringRecord>, Error> {
+pub(crate) fn next_record(path: &Path, reader: &mut csv::Reader<std::fs::File>) -> Result<Option<StringRecord>, Error> {
     let mut record = StringRecord::new();
     match reader.read_record(&mut record) {
         Ok(true) => Ok(Some(record)),
@@ -89,44 +95,69 @@ fn next_record(path: &Path, reader: &mut csv::Reader<std::fs::File>) -> Result<O
     }
 }
 
-fn no_rows(path: &Path) -> Error {
-    Error::Header { path: path.to_owned(), what: "it has no rows".into() }
+pub(crate) fn no_rows(path: &Path, columns: ManifestColumns) -> Error {
+    Error::Header { path: path.to_owned(), what: "it has no rows".into(), columns }
 }
 
-struct ManifestCells<'a> {
-    path: &'a Path,
-    places: &'a [Option<usize>],
-    record: &'a StringRecord,
+/// The cells of a row.
+pub(crate) struct ManifestCells<'a> {
+    pub path: &'a Path,
+    pub columns: ManifestColumns,
+    pub places: &'a [Option<usize>],
+    pub record: &'a StringRecord,
 }
 
 impl ManifestCells<'_> {
     fn get(&self, column: &'static str) -> Option<&str> {
-        let index = WAV_MANIFEST.iter().position(|c| *c == column)?;
+        let index = self.columns.iter().position(|c| *c == column)?;
         self.record.get(self.places[index]?).filter(|text| !text.is_empty())
     }
 
-    fn cell_error(&self, column: &'static str, what: impl Into<String>) -> Error {
-        let line = self.record.position().map_or(0, csv::Position::line);
-        Error::Row { path: self.path.to_owned(), line, column, what: what.into() }
+    pub fn line(&self) -> u64 {
+        self.record.position().map_or(0, csv::Position::line)
     }
 
-    fn needed_text(&self, column: &'static str) -> Result<&str, Error> {
+    pub fn cell_error(&self, column: &'static str, what: impl Into<String>) -> Error {
+        Error::Row { path: self.path.to_owned(), line: self.line(), column, what: what.into() }
+    }
+
+    pub fn needed_text(&self, column: &'static str) -> Result<&str, Error> {
         self.get(column).ok_or_else(|| self.cell_error(column, "it is empty"))
     }
 
-    fn parse_cell<T: std::str::FromStr<Err = echolake_schema::Error>>(&self, column: &'static str) -> Result<T, Error> {
+    pub fn parse_cell<T: std::str::FromStr<Err = echolake_schema::Error>>(
+        &self,
+        column: &'static str,
+    ) -> Result<T, Error> {
         self.needed_text(column)?.parse().map_err(|e: T::Err| self.cell_error(column, e.to_string()))
     }
 
-    fn parse_number(&self, column: &'static str) -> Result<Option<f64>, Error> {
+    pub fn parse_number(&self, column: &'static str) -> Result<Option<f64>, Error> {
         let Some(text) = self.get(column) else { return Ok(None) };
         let number = text.parse().ok().filter(|x: &f64| x.is_finite());
         number.map(Some).ok_or_else(|| self.cell_error(column, format!("`{text}` is no number")))
     }
 
+    /// Returns the folder that files are named in.
+    pub fn folder(&self) -> &Path {
+        self.path.parent().unwrap_or(Path::new("."))
+    }
+
+    /// Returns the temperature.
+    pub fn parse_celsius(&self) -> Result<Celsius, Error> {
+        let column = "temperature_c";
+        let celsius = self.parse_number(column)?.ok_or_else(|| self.cell_error(column, "it is empty"))?;
+        Celsius::new(celsius).map_err(|e| self.cell_error(column, e.to_string()))
+    }
+
+    /// Returns the time of the recording, if there is one.
+    pub fn parse_time(&self) -> Result<Option<Timestamp>, Error> {
+        let time = self.get("recorded_at").map(Timestamp::parse).transpose();
+        time.map_err(|e| self.cell_error("recorded_at", e.to_string()))
+    }
+
     fn open_wav(&self, column: &'static str) -> Result<WavChannel, Error> {
-        let folder = self.path.parent().unwrap_or(Path::new("."));
-        WavChannel::open(folder, self.needed_text(column)?).map_err(|what| self.cell_error(column, what))
+        WavChannel::open(self.folder(), self.needed_text(column)?).map_err(|what| self.cell_error(column, what))
     }
 
     fn parse_row(&self, rig: &Rig, grid: &Grid) -> Result<ManifestRow, Error> {
@@ -143,38 +174,37 @@ impl ManifestCells<'_> {
             }
         }
         let [actual, expected] = [&loopback, &recording].map(|wav| wav.layout.samples);
-        if actual != expected {
-            let what = format!("{actual} samples, expected the recording's {expected}");
+        let length = rig.impulse_response.length as u64;
+        let is_sweep = actual + length <= expected;
+        if actual != expected && !is_sweep {
+            let what = format!(
+                "{actual} samples, expected the recording's {expected}, or the sweep alone, {length} samples shorter"
+            );
             return Err(self.cell_error("loopback", what));
         }
         let format = common_format(recording.sample_format(), loopback.sample_format()).ok_or_else(|| {
             self.cell_error(
                 "loopback",
-                "one of recording and loopback is float and the other integer; expected one kind",
+                "one of recording and loopback is float and the other an integer of 32 bits; expected one kind",
             )
         })?;
-        let celsius =
-            self.parse_number("temperature_c")?.ok_or_else(|| self.cell_error("temperature_c", "it is empty"))?;
         let attempt = self.get("attempt").map_or(Ok(1), str::parse).ok().filter(|a| (1..=1000).contains(a));
         Ok(ManifestRow {
-            line: self.record.position().map_or(0, csv::Position::line),
+            line: self.line(),
             format,
             pair: self.parse_pair(grid)?,
-            celsius: Celsius::new(celsius).map_err(|e| self.cell_error("temperature_c", e.to_string()))?,
+            celsius: self.parse_celsius()?,
             humidity_pct: self.parse_number("humidity_pct")?.unwrap_or(f64::NAN),
             pressure_hpa: self.parse_number("pressure_hpa")?.unwrap_or(f64::NAN),
-            recorded_at: self
-                .get("recorded_at")
-                .map(Timestamp::parse)
-                .transpose()
-                .map_err(|e| self.cell_error("recorded_at", e.to_string()))?,
+            recorded_at: self.parse_time()?,
             attempt: attempt.ok_or_else(|| self.cell_error("attempt", "expected a whole number from 1 to 1000"))?,
             recording,
             loopback,
+            is_sweep,
         })
     }
 
-    fn parse_pair(&self, grid: &Grid) -> Result<Pair, Error> {
+    pub fn parse_pair(&self, grid: &Grid) -> Result<Pair, Error> {
         let point = |column| {
             let found = grid.parse_point(self.needed_text(column)?);
             found.map_err(|e| self.cell_error(column, e.to_string()))

@@ -88,6 +88,11 @@ impl TakeAssessor {
         })
     }
 
+    /// Returns the whole response of the recording that was assessed last, as long as the recording.
+    pub fn response(&self) -> &[f32] {
+        &self.response
+    }
+
     // The deconvolution spreads noise over the whole length; far behind the response there is nothing else.
     fn snr_db(&self) -> f64 {
         let quiet = quiet_range(self.response.len(), self.signal_len);

@@ -1,14 +1,13 @@
 //! Recordings as WAV files, microphone and loopback in one, with a manifest that `import wav` takes back.
 
 use std::collections::BTreeMap;
-use std::io::{Cursor, Seek, Write};
 use std::path::Path;
 
 use echolake_lake::Lake;
 use echolake_schema::interchange::WAV_MANIFEST;
-use echolake_schema::messages::{Measurement, SampleFormat, SweepRecording};
+use echolake_schema::messages::{Measurement, SweepRecording};
+use echolake_schema::samples::encode_wav;
 use echolake_schema::{Timestamp, topics};
-use hound::{WavSpec, WavWriter};
 use prost::Message as _;
 
 use crate::error::{Error, Result};
@@ -112,78 +111,16 @@ impl WavRecording {
                 return Err(format!("it has {} bytes for {count} samples of {width}", channel.len()));
             }
         }
-        let float = format == SampleFormat::F32le;
-        let spec = WavSpec {
-            channels: 2,
-            sample_rate: self.sweep.sample_rate_hz.round() as u32,
-            bits_per_sample: 8 * width as u16,
-            sample_format: if float { hound::SampleFormat::Float } else { hound::SampleFormat::Int },
-        };
-        let mut bytes = Cursor::new(Vec::with_capacity(44 + 2 * count * width));
-        let written = WavWriter::new(&mut bytes, spec).and_then(|writer| self.write_interleaved(writer, format, count));
-        written.map_err(|e| e.to_string())?;
-        Ok(bytes.into_inner())
-    }
-
-    fn write_interleaved<W: Write + Seek>(
-        &self,
-        mut to: WavWriter<W>,
-        format: SampleFormat,
-        count: usize,
-    ) -> hound::Result<()> {
-        for i in 0..count {
-            for channel in [&self.sweep.microphone, &self.sweep.loopback] {
-                match format {
-                    SampleFormat::F32le => to.write_sample(f32::from_le_bytes(four_bytes(channel, 4 * i)))?,
-                    _ => to.write_sample(integer_sample(format, channel, i, count))?,
-                }
-            }
-        }
-        to.finalize()
-    }
-}
-
-fn four_bytes(bytes: &[u8], at: usize) -> [u8; 4] {
-    [bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]]
-}
-
-// Sample i of a channel whose length was checked.
-fn integer_sample(format: SampleFormat, b: &[u8], i: usize, count: usize) -> i32 {
-    match format {
-        SampleFormat::S16le => i32::from(i16::from_le_bytes([b[2 * i], b[2 * i + 1]])),
-        SampleFormat::S24le => i32::from_le_bytes([0, b[3 * i], b[3 * i + 1], b[3 * i + 2]]) >> 8,
-        SampleFormat::S24Split => i32::from_le_bytes([0, b[i], b[count + 2 * i], b[count + 2 * i + 1]]) >> 8,
-        _ => i32::from_le_bytes(four_bytes(b, 4 * i)),
+        let rate_hz = self.sweep.sample_rate_hz.round() as u32;
+        encode_wav(format, rate_hz, &[&self.sweep.microphone, &self.sweep.loopback]).map_err(|e| e.to_string())
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use echolake_schema::samples::split_24;
+    use echolake_schema::messages::SampleFormat;
 
     use super::*;
-
-    #[test]
-    fn samples_are_kept_to_the_bit() {
-        let samples = [0, 1, -1, 8_388_607, -8_388_608, 123_456];
-        let packed: Vec<u8> = samples.iter().flat_map(|x: &i32| x.to_le_bytes()[..3].to_vec()).collect();
-        for (format, bytes) in [(SampleFormat::S24Split, split_24(&samples)), (SampleFormat::S24le, packed)] {
-            let sweep = SweepRecording {
-                sample_rate_hz: 96e3,
-                sample_count: 6,
-                format: format.into(),
-                microphone: bytes.clone().into(),
-                loopback: bytes.into(),
-                ..SweepRecording::default()
-            };
-            let recording = WavRecording { sweep, verdict: Measurement::default(), time_ns: 0 };
-            let wav = recording.encode_wav().expect("a file");
-            let mut reader = hound::WavReader::new(Cursor::new(wav)).expect("a WAV file");
-            assert_eq!((reader.spec().bits_per_sample, reader.spec().sample_rate), (24, 96_000));
-            let read: Vec<i32> = reader.samples().map(|s| s.expect("a sample")).collect();
-            assert_eq!(read, samples.iter().flat_map(|x| [*x, *x]).collect::<Vec<_>>(), "{format:?}");
-        }
-    }
 
     #[test]
     fn lengths_that_the_bytes_do_not_bear_out_are_refused() {

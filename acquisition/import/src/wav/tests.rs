@@ -2,7 +2,9 @@
 
 use std::path::PathBuf;
 
-use hound::{SampleFormat, WavSpec, WavWriter};
+use echolake_dsp::sweep::LinearSweep;
+use echolake_schema::messages::SampleFormat;
+use echolake_schema::samples::encode_wav;
 
 use super::*;
 
@@ -32,14 +34,10 @@ impl WavFolder {
     }
 
     fn wav(&self, name: &str, last: f32) {
-        let (sample_rate, sample_format) = (96_000, SampleFormat::Float);
-        let spec = WavSpec { channels: 1, sample_rate, bits_per_sample: 32, sample_format };
-        let mut writer = WavWriter::create(self.0.path().join(name), spec).expect("a file");
-        for i in 1..SAMPLES {
-            writer.write_sample(((i * 7_919) % 20_011) as f32 / 40_022.0 - 0.25).expect("written");
-        }
-        writer.write_sample(last).expect("written");
-        writer.finalize().expect("closed");
+        let body = (1..SAMPLES).map(|i| ((i * 7_919) % 20_011) as f32 / 40_022.0 - 0.25);
+        let bytes: Vec<u8> = body.chain([last]).flat_map(f32::to_le_bytes).collect();
+        let file = encode_wav(SampleFormat::F32le, 96_000, &[&bytes]).expect("a file");
+        std::fs::write(self.0.path().join(name), file).expect("written");
     }
 
     fn import(&self, progress: &mut dyn FnMut(usize, usize)) -> Result<Vec<ImportedRun>, Error> {
@@ -111,4 +109,67 @@ fn messages_are_in_the_order_of_time_however_the_rows_are() {
     messages.for_each(|m| times.entry(m.channel.topic.clone()).or_default().push(m.log_time));
     assert_eq!(times["/measurement"].len(), 3);
     assert!(times.values().all(|of_topic| of_topic.is_sorted()), "{times:?}");
+}
+
+/// Samples of a recording whose direct sound is `late` samples later than geometry gives, and its sweep.
+fn late_take(late: usize) -> [Vec<f32>; 2] {
+    let sweep = LinearSweep { rate_hz: 96e3, duration_secs: 0.03, low_hz: 2e3, high_hz: 40e3, fade_secs: 1e-3 };
+    let sweep: Vec<f32> = sweep.samples().iter().map(|x| 0.5 * *x as f32).collect();
+    let mut recording = vec![0.0; late + expected_arrival()];
+    recording.extend(&sweep);
+    recording.resize(recording.len() + 4_000, 0.0);
+    [recording, sweep]
+}
+
+// Of the pair 0/0/0 and 0/0/1 of the paper's rig at 20 C.
+fn expected_arrival() -> usize {
+    let grid = Rig::paper().build_grid().expect("a grid");
+    let [m, s] = ["0/0/0", "0/0/1"].map(|label| grid.parse_point(label).expect("a point").position_mm);
+    (direct_mm(m, s) / 1e3 / speed_of_sound(20.0) * 96e3).round() as usize
+}
+
+fn import_take(recording: &[f32], loopback: &[f32]) -> Result<(Vec<String>, ImpulseResponse), Error> {
+    let place = WavFolder::new(0.5);
+    for (name, samples) in [("take.wav", recording), ("loopback.wav", loopback)] {
+        let bytes: Vec<u8> = samples.iter().flat_map(|x| x.to_le_bytes()).collect();
+        let file = encode_wav(SampleFormat::F32le, 96_000, &[&bytes]).expect("a file");
+        std::fs::write(place.0.path().join(name), file).expect("written");
+    }
+    let rows = "surface,recording,loopback,microphone,speaker,temperature_c\n\
+                a,take.wav,loopback.wav,0/0/0,0/0/1,20\n";
+    std::fs::write(place.manifest(), rows).expect("written");
+    let runs = place.import(&mut |_, _| {})?;
+    let file = std::fs::read(&runs[0].path).expect("the run");
+    let mut messages = mcap::MessageStream::new(&file).expect("an MCAP file").map(|m| m.expect("whole"));
+    let ir = messages.find(|m| m.channel.topic == echolake_schema::topics::IR).expect("a response");
+    Ok((runs[0].warnings.clone(), prost::Message::decode(&ir.data[..]).expect("decoded")))
+}
+
+fn peak_of(ir: &ImpulseResponse) -> Option<usize> {
+    (0..ir.samples.len()).max_by(|a, b| ir.samples[*a].abs().total_cmp(&ir.samples[*b].abs()))
+}
+
+// Latency of an interface without a loopback: behind the response it is refused, within it a warning names it.
+#[test]
+fn a_late_arrival_is_named_and_silence_is_no_response() {
+    let imported = |late: usize| {
+        let [recording, mut sweep] = late_take(late);
+        sweep.resize(recording.len(), 0.0);
+        import_take(&recording, &sweep)
+    };
+    let error = imported(9_600).expect_err("silence").to_string();
+    let expected = "the direct sound arrives 9600 samples (100.0 ms) late: no loopback";
+    assert!(error.contains(expected) && error.contains("the response of 384 samples would be silence"), "{error}");
+    let (warnings, ir) = imported(200).expect("within the response");
+    assert!(warnings[0].contains("the direct sound arrives 200 samples (2.1 ms) late: no loopback"), "{warnings:?}");
+    assert_eq!(peak_of(&ir), Some(expected_arrival() + 200));
+    assert!(imported(0).expect("in time").0.iter().all(|warning| !warning.contains("arrives")));
+}
+
+#[test]
+fn a_sweeps_own_file_places_the_take_by_geometry() {
+    let [recording, sweep] = late_take(30_000);
+    let (warnings, ir) = import_take(&recording, &sweep).expect("imported");
+    assert!(warnings[0].contains("no loopback: the sweep was found 0.3125 s into the recording"), "{warnings:?}");
+    assert_eq!(peak_of(&ir), Some(expected_arrival()));
 }

@@ -75,18 +75,18 @@ fn open(bytes: &[u8]) -> Result<(WavChannel, tempfile::TempDir), String> {
     WavChannel::open(folder.path(), "a.wav").map(|channel| (channel, folder))
 }
 
-fn check_bytes(what: &str, bytes: &[u8], expected: &[i32]) -> Option<String> {
+fn check_bytes(what: &str, bytes: &[u8], expected: &[i32]) -> Vec<String> {
     let (channel, _folder) = open(bytes).unwrap_or_else(|e| panic!("{what}: {e}"));
     assert_eq!(channel.sample_format(), SampleFormat::S24Split, "{what}");
-    let read = channel.read_samples(SampleFormat::S24Split).expect("samples");
+    let read = channel.read_all(SampleFormat::S24Split).expect("samples");
     assert_eq!(read.bytes, echolake_schema::samples::split_24(expected), "{what}");
     let fractions: Vec<f32> = expected.iter().map(|x| *x as f32 / 8_388_608.0).collect();
     assert_eq!(read.fractions, fractions, "{what}");
     assert_eq!(read.clipped, 1, "{what}");
-    channel.layout.warning
+    channel.layout.warnings
 }
 
-fn check(what: &str, file: &WavBytes) -> Option<String> {
+fn check(what: &str, file: &WavBytes) -> Vec<String> {
     check_bytes(what, &file.bytes(&[0]), &NUMBERS)
 }
 
@@ -97,7 +97,7 @@ fn refused(file: &WavBytes, expected: &str) {
 
 #[test]
 fn twenty_four_bits_are_the_same_however_they_are_stored() {
-    assert_eq!(check("plain", &WavBytes::plain()), None);
+    assert!(check("plain", &WavBytes::plain()).is_empty());
     let upper = packed(&NUMBERS, 4, 8);
     let lower = packed(&NUMBERS, 4, 0);
     check("upper bits of 32", &WavBytes::new(extensible_format(32, 24, 4), upper.clone()));
@@ -118,7 +118,24 @@ fn twenty_four_bits_are_the_same_however_they_are_stored() {
     check("a long format", &WavBytes::new(long, packed(&NUMBERS, 3, 0)));
     let mut wrong_rate = plain_format(1, 1, 24, 3);
     wrong_rate[8..12].copy_from_slice(&25_856u32.to_le_bytes());
-    check("bytes a second", &WavBytes::new(wrong_rate, packed(&NUMBERS, 3, 0)));
+    let warnings = check("bytes a second", &WavBytes::new(wrong_rate, packed(&NUMBERS, 3, 0)));
+    assert_eq!(warnings, ["its header says 25856 bytes a second, expected 288000: its rate of 96000 Hz counts"]);
+}
+
+#[test]
+fn doubles_and_bytes_have_the_same_full_scale() {
+    let doubles = [0.0, 0.5, -1.0, 0.25 + 1e-12].map(f64::to_le_bytes).concat();
+    let bytes = vec![128, 192, 0, 160];
+    for (bits, tag, data, format) in [(64, 3, doubles, SampleFormat::F32le), (8, 1, bytes, SampleFormat::S16le)] {
+        let file = WavBytes::new(plain_format(tag, 1, bits, bits / 8), data).bytes(&[]);
+        let (channel, _folder) = open(&file).unwrap_or_else(|e| panic!("{bits} bits: {e}"));
+        assert_eq!(channel.sample_format(), format);
+        let read = channel.read_all(format).expect("samples");
+        assert_eq!((read.fractions, read.clipped), (vec![0.0, 0.5, -1.0, 0.25], 1), "{bits} bits");
+    }
+    let large = WavBytes::new(plain_format(3, 1, 64, 8), 1e39f64.to_le_bytes().to_vec()).bytes(&[]);
+    let (channel, _folder) = open(&large).expect("a channel");
+    assert!(channel.read_all(SampleFormat::F32le).is_err_and(|e| e.contains("has a sample that is inf")));
 }
 
 #[test]
@@ -127,9 +144,8 @@ fn channels_are_told_apart() {
     let file = WavBytes::new(plain_format(1, 2, 24, 3), packed(&both, 3, 0)).bytes(&[0]);
     check_bytes("the first", &file, &NUMBERS);
     let (_, folder) = open(&file).expect("two channels");
-    let read = WavChannel::open(folder.path(), "a.wav#2")
-        .and_then(|c| c.read_samples(SampleFormat::S24Split))
-        .expect("samples");
+    let read =
+        WavChannel::open(folder.path(), "a.wav#2").and_then(|c| c.read_all(SampleFormat::S24Split)).expect("samples");
     assert_eq!(read.bytes, echolake_schema::samples::split_24(&NUMBERS.map(|x| -x)));
 }
 
@@ -151,35 +167,47 @@ fn long_files_say_their_length_elsewhere() {
         let sizes = [0u64, 18, 6].map(u64::to_le_bytes).concat();
         file.chunks.insert(0, (*b"ds64", length, [sizes, vec![0; length as usize - 24]].concat()));
         file.form = form;
-        assert_eq!(check("ds64", &file), None);
-        assert_eq!(check("a chunk behind it", &file.clone().with(b"LIST", vec![0; 8])), None);
+        assert!(check("ds64", &file).is_empty());
+        assert!(check("a chunk behind it", &file.clone().with(b"LIST", vec![0; 8])).is_empty());
         file.chunks[0].2[8] = 24;
-        refused(&file, "is cut off: its header says 24 bytes of samples, 18 are there");
+        refused(&file, "is cut off: its header says 24 bytes of samples from byte ");
     }
 }
 
 #[test]
 fn samples_are_all_taken_or_the_file_is_refused() {
-    for unknown in [u32::MAX, 0xFFFF_1000, 0x7FFF_FFFF] {
-        let warning = check("a stream's", &WavBytes::plain().saying(unknown)).expect("a warning");
-        assert!(warning.contains("all of its 6 samples to the file's end"), "{warning}");
+    for unknown in [u32::MAX, 0xFFFF_1000, 0x7FFF_FFFF, 0] {
+        let warnings = check("a stream's", &WavBytes::plain().saying(unknown));
+        let expected = format!(
+            "its header says {unknown} bytes of samples, 18 are there: all of its 6 samples to the file's end are taken"
+        );
+        assert_eq!(warnings, [expected]);
     }
-    refused(&WavBytes::plain().saying(6), "12 bytes behind its samples that are no chunk");
-    refused(&WavBytes::plain().saying(0), "18 bytes behind its samples that are no chunk");
-    refused(&WavBytes::plain().saying(36), "is cut off: its header says 36 bytes of samples, 18 are there");
+    refused(&WavBytes::plain().saying(6), "12 bytes behind its samples, from byte 50 on, that are no chunk");
+    refused(
+        &WavBytes::plain().saying(36),
+        "is cut off: its header says 36 bytes of samples from byte 44 on, 18 are there; hint: copy it again",
+    );
     refused(&WavBytes::plain().with(b"data", packed(&NUMBERS, 3, 0)), "a second `data` chunk at byte 62");
-    refused(&WavBytes::new(plain_format(1, 1, 24, 3), vec![0; 20]), "ends within a sample: 20 bytes of samples, 3 for");
-    refused(&WavBytes::new(plain_format(1, 1, 24, 3), Vec::new()), "has no samples");
+    refused(
+        &WavBytes::new(plain_format(1, 1, 24, 3), vec![0; 20]),
+        "ends within a sample: 20 bytes of samples from byte",
+    );
+    let empty = WavBytes::new(plain_format(1, 1, 24, 3), Vec::new());
+    refused(&empty, "has no samples");
+    refused(&empty.with(b"LIST", vec![0; 8]), "has no samples");
     // Chance puts names of chunks among samples.
-    let named = [packed(&NUMBERS, 3, 0), b"LIST".to_vec(), vec![9; 16]].concat();
-    refused(&WavBytes::new(plain_format(1, 1, 24, 3), named).saying(18), "20 bytes behind its samples");
+    let named = [packed(&NUMBERS, 3, 0), b"LIST".to_vec(), vec![9; 14]].concat();
+    let numbers: Vec<i32> = named.chunks(3).map(|b| i32::from_le_bytes([0, b[0], b[1], b[2]]) >> 8).collect();
+    check_bytes("named", &WavBytes::new(plain_format(1, 1, 24, 3), named.clone()).bytes(&[]), &numbers);
+    let named = [named, vec![9; 2]].concat();
+    refused(&WavBytes::new(plain_format(1, 1, 24, 3), named).saying(18), "20 bytes behind its samples, ");
 }
 
 #[test]
 fn other_codings_are_named() {
     let coded = |tag, bits, bytes| WavBytes::new(plain_format(tag, 1, bits, bytes), vec![0; 48]);
-    refused(&coded(3, 64, 8), "has float samples of 64 bits in 8 bytes, expected integers of 16, 24 or 32 bits");
-    refused(&coded(1, 8, 1), "has integer samples of 8 bits in 1 bytes");
+    refused(&coded(3, 16, 2), "has float samples of 16 bits in 2 bytes, expected integers of 8, 16, 24 or 32 bits");
     refused(&coded(1, 32, 3), "has integer samples of 32 bits in 3 bytes");
     refused(&coded(0x55, 16, 2), "is coded by format 0x0055");
     let mut turned = WavBytes::plain();

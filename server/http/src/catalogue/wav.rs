@@ -1,10 +1,9 @@
 //! `GET /api/v1/surfaces/{surface_id}/pairs/{pair_id}/ir.wav`: an audible response, slowed down to full scale.
 
-use std::io::Cursor;
-
 use axum::Extension;
+use echolake_schema::messages::SampleFormat;
+use echolake_schema::samples::encode_wav;
 use echolake_service::RequestFault;
-use hound::{SampleFormat, WavSpec, WavWriter};
 use serde::Deserialize;
 use utoipa::IntoParams;
 
@@ -47,33 +46,9 @@ pub(super) async fn wav(
     let pair = request.parse_pair(&path.pair_id)?;
     let samples = query.signal.read_samples(&request, entry, pair).await?;
     let rate_hz = request.catalogue.lake().rig().sweep.rate_hz.get() / query.slowdown.get() as f64;
-    let file = write_wav(&samples, rate_hz.round() as u32);
+    let bytes: Vec<u8> = samples.iter().flat_map(|sample| sample.to_le_bytes()).collect();
+    let file = encode_wav(SampleFormat::F32le, rate_hz.round() as u32, &[&bytes]);
     let file = file.map_err(RequestFault::defect("a response makes no WAV file"))?;
     let name = format!("{}-{pair}-{}.wav", entry.surface.surface_id, query.signal.name());
     Ok(AnswerContent::new("audio/wav", file).with_name(name))
-}
-
-fn write_wav(samples: &[f32], rate_hz: u32) -> hound::Result<Vec<u8>> {
-    let spec = WavSpec { channels: 1, sample_rate: rate_hz, bits_per_sample: 32, sample_format: SampleFormat::Float };
-    let mut file = Cursor::new(Vec::new());
-    let mut writer = WavWriter::new(&mut file, spec)?;
-    for sample in samples {
-        writer.write_sample(*sample)?;
-    }
-    writer.finalize()?;
-    Ok(file.into_inner())
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_file_has_the_samples_and_their_rate() {
-        let file = write_wav(&[0.5, -0.25], 9600).expect("a file");
-        let mut reader = hound::WavReader::new(&file[..]).expect("a WAV file");
-        assert_eq!((reader.spec().sample_rate, reader.spec().sample_format), (9600, SampleFormat::Float));
-        let samples: Vec<f32> = reader.samples().collect::<Result<_, _>>().expect("samples");
-        assert_eq!(samples, [0.5, -0.25]);
-    }
 }
