@@ -21,6 +21,9 @@ pub const STARTED: Timestamp = Timestamp(1_767_600_000_000_000_000);
 /// Rows of a WAV import, whose recordings are the two channels of one file.
 pub const WAV_MANIFEST: &str = "surface,recording,loopback,microphone,speaker,temperature_c\n\
                                 a,input.wav,input.wav#2,0/0/0,0/1/0,20\n";
+/// Rows of an import of REW's text.
+pub const REW_MANIFEST: &str = "surface,response,microphone,speaker,temperature_c,timing_offset_ms\n\
+                                a,input.txt,0/0/0,0/1/0,20,0.25\n";
 /// The mapping of the HDF5 target.
 pub const MAPPING: &str = "file = \"input.h5\"\nsurfaces = [\"a\"]\ntemperature = 20.0\n\
                            sampling_rate = { dataset = \"ir\", attribute = \"fs\" }\n\

@@ -13,6 +13,9 @@ pub const WAV_MANIFEST: [&str; 10] = [
     "recorded_at",
     "attempt",
 ];
+/// The manifest of responses of REW; the first six are needed.
+pub const REW_MANIFEST: [&str; 8] =
+    ["surface", "response", "microphone", "speaker", "temperature_c", "timing_offset_ms", "start_secs", "recorded_at"];
 /// GIR's `combinations.csv`: the order of the matrix's rows, from 1.
 pub const GIR_COMBINATIONS: [&str; 7] =
     ["combination", "mic_layer", "mic_x", "mic_y", "speaker_layer", "speaker_x", "speaker_y"];

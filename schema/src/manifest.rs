@@ -44,7 +44,7 @@ pub struct RunManifest {
 
 /// The labels of [`Origin`], for people.
 pub(crate) const ORIGINS: &str =
-    "measured, simulated, computed, imported_wav, imported_gir, imported_sofa or imported_hdf5";
+    "measured, simulated, computed, imported_wav, imported_rew, imported_gir, imported_sofa or imported_hdf5";
 
 /// Origin of a run's signals.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -58,6 +58,8 @@ pub enum Origin {
     Computed,
     /// Imported from WAV files of other software.
     ImportedWav,
+    /// Imported from responses that Room EQ Wizard exported.
+    ImportedRew,
     /// Imported from the published GIR data set.
     ImportedGir,
     /// Made of a SOFA file.
@@ -138,6 +140,7 @@ impl Origin {
             Self::Simulated => "simulated",
             Self::Computed => "computed",
             Self::ImportedWav => "imported_wav",
+            Self::ImportedRew => "imported_rew",
             Self::ImportedGir => "imported_gir",
             Self::ImportedSofa => "imported_sofa",
             Self::ImportedHdf5 => "imported_hdf5",
@@ -146,14 +149,12 @@ impl Origin {
 
     /// Returns whether the run was made of data of other software, whose times and rigs may differ from ours.
     pub fn is_imported(self) -> bool {
-        match self {
-            Self::ImportedWav | Self::ImportedGir | Self::ImportedSofa | Self::ImportedHdf5 => true,
-            Self::Measured | Self::Simulated | Self::Computed => false,
-        }
+        !matches!(self, Self::Measured | Self::Simulated | Self::Computed)
     }
 
     fn parse(text: &str) -> Option<Self> {
-        let imported = [Self::ImportedWav, Self::ImportedGir, Self::ImportedSofa, Self::ImportedHdf5];
+        let imported =
+            [Self::ImportedWav, Self::ImportedRew, Self::ImportedGir, Self::ImportedSofa, Self::ImportedHdf5];
         let all = [Self::Measured, Self::Simulated, Self::Computed].into_iter().chain(imported);
         all.into_iter().find(|o| o.label() == text)
     }

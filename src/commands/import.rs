@@ -1,8 +1,8 @@
 //! `echolake import`: existing measurements become runs.
 
 use echolake_import::{
-    Error, GIR_IR_LEN, ImportOptions, ImportedRun, check_hdf5, check_sofa, check_wav, import_gir, import_hdf5,
-    import_sofa, import_wav, sampling_rate_of,
+    Error, GIR_IR_LEN, ImportOptions, ImportedRun, check_hdf5, check_rew, check_sofa, check_wav, import_gir,
+    import_hdf5, import_rew, import_sofa, import_wav, sampling_rate_of,
 };
 use echolake_lake::{Lake, ReferenceSurfaces};
 use echolake_schema::{Celsius, ProjectName, Rig, SpectralDivision, Timestamp};
@@ -24,12 +24,20 @@ pub(crate) struct ImportArgs {
 /// Formats of existing measurements.
 #[derive(Debug, Subcommand)]
 enum ImportCommand {
-    /// Recordings and loopbacks as WAV files, listed in a CSV manifest.
+    /// Recordings and loopbacks, or recordings and their sweep, as WAV files, listed in a CSV manifest.
     Wav {
         /// CSV manifest of the recordings.
         manifest: PathBuf,
         /// Rig of the recordings: sweep range, response length, bands, grid; by default the lake's, or the paper's for
         /// a new lake.
+        #[arg(long)]
+        rig: Option<PathBuf>,
+    },
+    /// Responses that Room EQ Wizard (REW) exported as text or WAV, listed in a CSV manifest; see docs/import.md.
+    Rew {
+        /// CSV manifest of the responses.
+        manifest: PathBuf,
+        /// The rig; by default the lake's, or the paper's for a new lake.
         #[arg(long)]
         rig: Option<PathBuf>,
     },
@@ -83,7 +91,7 @@ pub(crate) async fn run_import(args: &ImportArgs, lake_url: &str) -> anyhow::Res
             given
         }
         ImportCommand::Gir { rig, .. } => super::rig_or(rig.as_deref(), lake_url, gir_rig).await?,
-        ImportCommand::Sofa { rig, .. } | ImportCommand::Hdf5 { rig, .. } => {
+        ImportCommand::Rew { rig, .. } | ImportCommand::Sofa { rig, .. } | ImportCommand::Hdf5 { rig, .. } => {
             super::rig_or(rig.as_deref(), lake_url, Rig::paper).await?
         }
     };
@@ -105,6 +113,7 @@ pub(crate) async fn run_import(args: &ImportArgs, lake_url: &str) -> anyhow::Res
     if existing.is_none() {
         match args {
             ImportCommand::Wav { manifest, .. } => check_wav(manifest, &rig)?,
+            ImportCommand::Rew { manifest, .. } => check_rew(manifest, &rig)?,
             ImportCommand::Sofa { files, .. } => check_sofa(files, &rig, celsius)?,
             ImportCommand::Hdf5 { mapping, .. } => check_hdf5(mapping, &rig, celsius)?,
             ImportCommand::Gir { .. } => {}
@@ -122,6 +131,7 @@ pub(crate) async fn run_import(args: &ImportArgs, lake_url: &str) -> anyhow::Res
         ImportCommand::Wav { manifest, .. } => {
             import_wav(manifest, &rig, options, &mut |d, t| step("recordings", d, t))
         }
+        ImportCommand::Rew { manifest, .. } => import_rew(manifest, &rig, options, &mut |d, t| step("responses", d, t)),
         ImportCommand::Gir { folder, .. } => import_gir(folder, &rig, options, &mut |d, t| step("surfaces", d, t)),
         ImportCommand::Sofa { files, .. } => {
             import_sofa(files, &rig, celsius, options, &mut |d, t| step("surfaces", d, t))

@@ -1,4 +1,4 @@
-//! Import of existing measurements as runs: WAV files listed in a manifest, the published GIR data
+//! Import of existing measurements as runs: WAV files listed in a manifest, responses of REW, the published GIR data
 //! set, SOFA files, and HDF5 files by a mapping.
 
 mod batch;
@@ -8,6 +8,7 @@ mod hdf5_file;
 mod hdf5_mapping;
 mod positions;
 mod response;
+mod rew;
 mod sofa;
 mod wav;
 mod wav_file;
@@ -23,6 +24,7 @@ use echolake_schema::{ErrorCause, ProjectName, Rig, RunId, SurfaceId, SurfaceRec
 
 pub use gir::{GIR_IR_LEN, import_gir};
 pub use hdf5::{check_hdf5, import_hdf5};
+pub use rew::{check_rew, import_rew};
 pub use sofa::{check_sofa, import_sofa};
 pub use wav::{check_wav, import_wav, sampling_rate_of};
 
