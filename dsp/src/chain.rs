@@ -2,6 +2,7 @@
 
 use echolake_schema::SpectralDivision;
 
+use crate::air::AirState;
 use crate::deconvolution::{DeconvolutionParams, TransformLength};
 use crate::energy::{accumulate_energy, energy, tnce_over_band};
 use crate::error::check_len;
@@ -9,7 +10,7 @@ use crate::filter_bank::{FilterBankPlan, FilterBankScratch};
 use crate::foam::subtract_foam;
 use crate::response_deconvolution::{ResponseDeconvolution, ResponseScratch};
 use crate::rise::{CurveShape, curve_shape};
-use crate::temperature::{TemperatureCorrection, resampling_ratio, response_limits_hz};
+use crate::temperature::{ReferenceAir, TemperatureCorrection, response_limits_hz};
 use crate::uncertainty::EnergySensitivity;
 use crate::{Error, RealSample};
 
@@ -32,8 +33,8 @@ pub struct MeasurementParams {
     /// Treatment of frequencies at the limits of that range and beyond them; a taper is as wide as the response
     /// resolves.
     pub division: SpectralDivision,
-    /// Temperature that responses are corrected to, C.
-    pub reference_celsius: f64,
+    /// Air that responses are corrected to.
+    pub reference: ReferenceAir,
 }
 
 /// Recording to response: deconvolve, correct the temperature, crop.
@@ -56,8 +57,8 @@ impl<T: RealSample> MeasurementPlan<T> {
     /// # Errors
     /// As [`ResponseDeconvolution::new`], and [`Error::Setting`] for a reference outside of -60 to 80 C.
     pub fn new(params: &MeasurementParams) -> Result<Self, Error> {
-        check_celsius("the reference temperature (C)", params.reference_celsius)?;
-        let raw_len = raw_len(params.ir_len, params.reference_celsius).min(params.recording_len);
+        check_celsius("the reference temperature (C)", params.reference.celsius)?;
+        let raw_len = raw_len(params.ir_len, &params.reference).min(params.recording_len);
         let deconvolution = ResponseDeconvolution::new(DeconvolutionParams {
             recording_len: params.recording_len,
             output_len: raw_len,
@@ -70,7 +71,7 @@ impl<T: RealSample> MeasurementPlan<T> {
         })?;
         Ok(Self {
             deconvolution,
-            correction: ResponseCorrection::new(params.reference_celsius, params.division),
+            correction: ResponseCorrection::new(params.reference, params.division),
             ir_len: params.ir_len,
             range_hz: [params.low_hz, params.high_hz],
         })
@@ -85,23 +86,24 @@ impl<T: RealSample> MeasurementPlan<T> {
     /// The response of one measurement at the reference temperature.
     ///
     /// # Errors
-    /// As [`ResponseDeconvolution::run_within`], and [`Error::Setting`] for a temperature outside of -60 to 80 C: the
-    /// plan has deconvolved too little for it.
+    /// As [`ResponseDeconvolution::run_within`], and [`Error::Setting`] for air outside of -60 to 80 C, for which the
+    /// plan has deconvolved too little, 0 to 100 % or 300 to 1100 hPa.
     pub fn compute_ir(
         &self,
         recording: &[T],
         loopback: &[T],
-        celsius: f64,
+        air: &AirState,
         ir: &mut [T],
         scratch: &mut MeasurementScratch<T>,
     ) -> Result<(), Error> {
         check_len("the response", ir.len(), self.ir_len)?;
-        check_celsius("the temperature (C)", celsius)?;
-        let limits_hz = response_limits_hz(self.range_hz, self.correction.time_ratio(celsius));
+        check_celsius("the temperature (C)", air.temperature_c)?;
+        air.check_moisture()?;
+        let limits_hz = response_limits_hz(self.range_hz, self.correction.time_ratio(air));
         let raw = &mut scratch.raw;
         let deconvolution = &mut scratch.deconvolution;
         self.deconvolution.run_within(limits_hz, recording, loopback, raw, deconvolution)?;
-        self.correction.correct_response(raw, celsius, ir);
+        self.correction.correct_response(raw, air, ir);
         Ok(())
     }
 }
@@ -113,37 +115,40 @@ impl<T: RealSample> MeasurementPlan<T> {
 /// depend on the air; the other divisions stay what they are elsewhere.
 ///
 /// ```
+/// use echolake_dsp::air::AirState;
 /// use echolake_dsp::chain::ResponseCorrection;
-/// use echolake_schema::SpectralDivision;
+/// use echolake_dsp::temperature::ReferenceAir;
+/// use echolake_schema::{Rig, SpectralDivision};
 ///
-/// let correction = ResponseCorrection::<f64>::new(20.0, SpectralDivision::Tapered);
+/// let reference = ReferenceAir::from_response(&Rig::paper().impulse_response);
+/// let correction = ResponseCorrection::<f64>::new(reference, SpectralDivision::Tapered);
 /// let (raw, mut corrected) = ([0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.0, 0.0], [0.0; 8]);
-/// correction.correct_response(&raw, 26.0, &mut corrected);
+/// correction.correct_response(&raw, &AirState::with_known(26.0, None, None), &mut corrected);
 /// assert!((corrected.iter().sum::<f64>() - 3.0).abs() < 0.01);
 /// ```
 pub struct ResponseCorrection<T: RealSample> {
     correction: TemperatureCorrection<T>,
-    reference_celsius: f64,
+    reference: ReferenceAir,
     keeps_spectrum: bool,
 }
 
 impl<T: RealSample> ResponseCorrection<T> {
-    /// A correction to a temperature in C.
-    pub fn new(reference_celsius: f64, division: SpectralDivision) -> Self {
+    /// A correction to the reference air.
+    pub fn new(reference: ReferenceAir, division: SpectralDivision) -> Self {
         let keeps_spectrum = division == SpectralDivision::Tapered;
-        Self { correction: TemperatureCorrection::new(), reference_celsius, keeps_spectrum }
+        Self { correction: TemperatureCorrection::new(), reference, keeps_spectrum }
     }
 
-    /// Returns the ratio by which times grow, of a response in air of a temperature in C.
-    pub fn time_ratio(&self, celsius: f64) -> f64 {
-        resampling_ratio(celsius, self.reference_celsius)
+    /// Returns the ratio by which times of a response in this air grow.
+    pub fn time_ratio(&self, air: &AirState) -> f64 {
+        self.reference.time_ratio(air)
     }
 
     /// Corrects one response.
     ///
     /// raw `[any]`, corrected `[wanted]`  from the same instant
-    pub fn correct_response(&self, raw: &[T], celsius: f64, corrected: &mut [T]) {
-        let rho = self.time_ratio(celsius);
+    pub fn correct_response(&self, raw: &[T], air: &AirState, corrected: &mut [T]) {
+        let rho = self.time_ratio(air);
         self.correction.correct_response(raw, rho, corrected);
         if self.keeps_spectrum {
             let factor = T::of(rho.recip());
@@ -153,9 +158,9 @@ impl<T: RealSample> ResponseCorrection<T> {
 }
 
 /// Samples before the correction that `ir_len` samples after it can depend on, at any temperature.
-pub fn raw_len(ir_len: usize, reference_celsius: f64) -> usize {
-    let len =
-        |celsius| TemperatureCorrection::<f64>::input_len_for(ir_len, resampling_ratio(celsius, reference_celsius));
+pub fn raw_len(ir_len: usize, reference: &ReferenceAir) -> usize {
+    let air = |temperature_c| AirState { temperature_c, humidity_pct: 0.0, ..reference.air() };
+    let len = |celsius| TemperatureCorrection::<f64>::input_len_for(ir_len, reference.time_ratio(&air(celsius)));
     TEMPERATURES.into_iter().map(len).max().unwrap_or(ir_len)
 }
 
@@ -275,26 +280,30 @@ impl<T: RealSample> DerivationPlan<T> {
         derived: &mut DerivedResponse<T>,
         scratch: &mut DerivationScratch<T>,
     ) -> Result<(), Error> {
+        check_len("the response", ir.len(), self.bank.len())?;
+        check_len("Foam's response", foam.len(), self.bank.len())?;
         self.measure_flat(flat, scratch)?;
-        self.filter_reflected(ir, foam, derived, scratch)?;
+        subtract_foam(ir, foam, &mut derived.reflected);
+        self.bank.split_bands(&derived.reflected, &mut scratch.bands, &mut scratch.bank)?;
         put_over(&scratch.flat, &scratch.bands, derived);
         Ok(())
     }
 
-    /// Derives as [`Self::derive_response`] does, over energies of Flat that are known already.
+    /// Derives what [`Self::derive_response`] does from a response without the direct sound, over energies of Flat that
+    /// are known already.
     ///
     /// # Errors
     /// [`Error::Length`] or [`Error::NotFinite`].
     pub fn run_over(
         &self,
-        ir: &[T],
-        foam: &[T],
+        reflected: &[T],
         flat: &FlatEnergies,
         derived: &mut DerivedResponse<T>,
         scratch: &mut DerivationScratch<T>,
     ) -> Result<(), Error> {
         check_len("Flat's energies", flat.bands.len(), self.bank.band_count())?;
-        self.filter_reflected(ir, foam, derived, scratch)?;
+        self.bank.split_bands(reflected, &mut scratch.bands, &mut scratch.bank)?;
+        derived.reflected.copy_from_slice(reflected);
         put_over(flat, &scratch.bands, derived);
         Ok(())
     }
@@ -305,15 +314,10 @@ impl<T: RealSample> DerivationPlan<T> {
     /// [`Error::Length`] or [`Error::NotFinite`].
     pub fn reflected_energies(
         &self,
-        ir: &[T],
-        direct: &[T],
+        reflected: &[T],
         energies: &mut [f64],
         scratch: &mut DerivationScratch<T>,
     ) -> Result<(), Error> {
-        check_len("the response", ir.len(), self.bank.len())?;
-        check_len("the direct sound", direct.len(), self.bank.len())?;
-        let reflected = &mut scratch.bands[..ir.len()];
-        subtract_foam(ir, direct, reflected);
         self.bank.compute_energies(reflected, energies, &mut scratch.bank)
     }
 
@@ -351,19 +355,6 @@ impl<T: RealSample> DerivationPlan<T> {
         scratch.flat.total = energy(flat);
         self.bank.compute_energies(flat, &mut scratch.flat.bands, &mut scratch.bank)
     }
-
-    fn filter_reflected(
-        &self,
-        ir: &[T],
-        foam: &[T],
-        derived: &mut DerivedResponse<T>,
-        scratch: &mut DerivationScratch<T>,
-    ) -> Result<(), Error> {
-        check_len("the response", ir.len(), self.bank.len())?;
-        check_len("Foam's response", foam.len(), self.bank.len())?;
-        subtract_foam(ir, foam, &mut derived.reflected);
-        self.bank.split_bands(&derived.reflected, &mut scratch.bands, &mut scratch.bank)
-    }
 }
 
 fn put_over<T: RealSample>(flat: &FlatEnergies, bands: &[T], derived: &mut DerivedResponse<T>) {
@@ -387,8 +378,15 @@ fn put_over<T: RealSample>(flat: &FlatEnergies, bands: &[T], derived: &mut Deriv
 mod tests {
     use realfft::num_complex::Complex;
 
+    use echolake_schema::AirTreatment;
+
     use super::*;
     use crate::sweep::LinearSweep;
+    use crate::temperature::resampling_ratio;
+
+    fn air(celsius: f64) -> AirState {
+        AirState::with_known(celsius, None, None)
+    }
 
     fn params() -> MeasurementParams {
         MeasurementParams {
@@ -398,7 +396,7 @@ mod tests {
             low_hz: 2e3,
             high_hz: 40e3,
             division: SpectralDivision::Floored { floor_db: -60.0 },
-            reference_celsius: 20.0,
+            reference: ReferenceAir { celsius: 20.0, treatment: AirTreatment::Paper },
         }
     }
 
@@ -411,12 +409,18 @@ mod tests {
         let plan = MeasurementPlan::<f64>::new(&params()).expect("a plan");
         let (mut ir, mut scratch) = (vec![0.0; 384], plan.make_scratch());
         for bad in [-61.0, 81.0, -273.15, -300.0, 400.0, f64::NAN, f64::INFINITY] {
-            let result = plan.compute_ir(&noise(), &noise(), bad, &mut ir, &mut scratch);
+            let result = plan.compute_ir(&noise(), &noise(), &air(bad), &mut ir, &mut scratch);
             assert!(matches!(result, Err(Error::Setting { .. })), "{bad}: {result:?}");
-            assert!(MeasurementPlan::<f64>::new(&MeasurementParams { reference_celsius: bad, ..params() }).is_err());
+            assert!(
+                MeasurementPlan::<f64>::new(&MeasurementParams {
+                    reference: ReferenceAir { celsius: bad, ..params().reference },
+                    ..params()
+                })
+                .is_err()
+            );
         }
         for good in [-60.0, 80.0] {
-            plan.compute_ir(&noise(), &noise(), good, &mut ir, &mut scratch).expect("a response");
+            plan.compute_ir(&noise(), &noise(), &air(good), &mut ir, &mut scratch).expect("a response");
             assert!(ir.iter().all(|x| x.is_finite()), "{good}");
         }
     }
@@ -436,7 +440,7 @@ mod tests {
         let (plan, bands) = (MeasurementPlan::<f64>::new(&params).expect("a plan"), [2_500.0, 5e3, 10e3, 20e3, 40e3]);
         let response = |reflections: &[(usize, f64)]| {
             let mut ir = vec![0.0; 384];
-            plan.compute_ir(&heard(reflections), &loopback, 21.3, &mut ir, &mut plan.make_scratch())
+            plan.compute_ir(&heard(reflections), &loopback, &air(21.3), &mut ir, &mut plan.make_scratch())
                 .expect("a response");
             ir
         };
@@ -494,7 +498,8 @@ mod tests {
             let response = |reflections: &[(f64, f64)], celsius: f64| {
                 let (mut ir, rho) = (vec![0.0; 384], resampling_ratio(celsius, 20.0));
                 let recording = heard(reflections, rho);
-                plan.compute_ir(&recording, &loopback, celsius, &mut ir, &mut plan.make_scratch()).expect("a response");
+                plan.compute_ir(&recording, &loopback, &air(celsius), &mut ir, &mut plan.make_scratch())
+                    .expect("a response");
                 ir
             };
             let plan = DerivationPlan::new(384, 96e3, &[2_500.0, 5e3, 10e3, 20e3, 40e3]).expect("a plan");
@@ -536,16 +541,18 @@ mod tests {
         for ir in [&noise[100..484], &noise[500..884]] {
             let (mut once, mut again) = (plan.make_derived(), plan.make_derived());
             plan.derive_response(ir, foam, flat, &mut once, &mut plan.make_scratch()).expect("derived");
-            plan.run_over(ir, foam, &energies, &mut again, &mut scratch).expect("derived");
+            let mut reflected = vec![0.0; 384];
+            subtract_foam(ir, foam, &mut reflected);
+            plan.run_over(&reflected, &energies, &mut again, &mut scratch).expect("derived");
             assert_eq!(once, again);
             let mut energies = [f64::NAN; 5];
-            plan.reflected_energies(ir, foam, &mut energies, &mut scratch).expect("energies");
+            plan.reflected_energies(&reflected, &mut energies, &mut scratch).expect("energies");
             // The sum over bins and the sum over samples, in single precision.
             let alike = |(a, b): (&f64, &f64)| (a / b - 1.0).abs() < 1e-5;
             assert!(energies.iter().zip(&once.energies).all(alike), "{energies:?} {:?}", once.energies);
         }
         let short = FlatEnergies { bands: vec![1.0; 4], ..energies };
-        let result = plan.run_over(flat, foam, &short, &mut plan.make_derived(), &mut scratch);
+        let result = plan.run_over(flat, &short, &mut plan.make_derived(), &mut scratch);
         assert!(matches!(result, Err(Error::Length { .. })), "{result:?}");
     }
 

@@ -5,11 +5,12 @@ use std::collections::HashMap;
 use arrow::array::AsArray as _;
 use arrow::datatypes::Float64Type;
 use bytes::Bytes;
-use echolake_schema::{Rig, SpectralDivision, Symmetry};
+use echolake_schema::{AirTreatment, Rig, SpectralDivision, Symmetry};
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 use serde_json::Value;
 
 use crate::RealSample;
+use crate::air::AirState;
 use crate::chain::{DerivationPlan, MeasurementParams, MeasurementPlan};
 use crate::deconvolution::{DeconvolutionParams, DeconvolutionPlan, TransformLength};
 use crate::energy::{cumulative_energy, energy, nce, tnce};
@@ -17,7 +18,7 @@ use crate::filter_bank::{FilterBankPlan, band_gain};
 use crate::foam::subtract_foam;
 use crate::fresnel::{FresnelZone, first_fresnel_zone};
 use crate::level::{p90_mean, power_to_db};
-use crate::temperature::{TemperatureCorrection, resampling_ratio};
+use crate::temperature::{ReferenceAir, TemperatureCorrection, resampling_ratio};
 
 const CENTRES: [f64; 5] = [2_500.0, 5_000.0, 10_000.0, 20_000.0, 40_000.0];
 const LEN: usize = 384;
@@ -77,7 +78,7 @@ fn measurement_params(recording_len: usize) -> MeasurementParams {
         low_hz: 2e3,
         high_hz: 40e3,
         division: SpectralDivision::Floored { floor_db: -60.0 },
-        reference_celsius: 20.0,
+        reference: ReferenceAir { celsius: 20.0, treatment: AirTreatment::Paper },
     }
 }
 
@@ -128,8 +129,14 @@ fn check_responses<T: RealSample>(tolerance: f64) {
             let signal = |what: &str| cast_samples::<T>(&case[&format!("{kind}_{what}")]);
             let mut ir = vec![T::default(); LEN];
             let celsius = case[&format!("{kind}_celsius")][0];
-            plan.compute_ir(&signal("recording"), &signal("loopback"), celsius, &mut ir, &mut scratch)
-                .expect("a response");
+            plan.compute_ir(
+                &signal("recording"),
+                &signal("loopback"),
+                &AirState::with_known(celsius, None, None),
+                &mut ir,
+                &mut scratch,
+            )
+            .expect("a response");
             let off = relative_error(&ir, &case[&format!("{kind}_ir")]);
             assert!(off <= tolerance, "{kind} at {celsius}: {off}");
         }
@@ -226,7 +233,8 @@ fn dirty_scratch_changes_nothing() {
         let mut ir = vec![f32::NAN; LEN];
         let x = cast_samples(&case["panel_recording"]);
         let s = cast_samples(&case["panel_loopback"]);
-        plan.compute_ir(&x, &s, case["panel_celsius"][0], &mut ir, scratch).expect("a response");
+        plan.compute_ir(&x, &s, &AirState::with_known(case["panel_celsius"][0], None, None), &mut ir, scratch)
+            .expect("a response");
         ir
     };
     let mut used = plan.make_scratch();
@@ -263,8 +271,14 @@ fn recordings_to_levels_in_f32() {
             let signal = |what: &str| cast_samples::<f32>(&case[&format!("{kind}_{what}")]);
             let mut ir = vec![0.0; LEN];
             let celsius = case[&format!("{kind}_celsius")][0];
-            plan.compute_ir(&signal("recording"), &signal("loopback"), celsius, &mut ir, &mut plan.make_scratch())
-                .expect("one");
+            plan.compute_ir(
+                &signal("recording"),
+                &signal("loopback"),
+                &AirState::with_known(celsius, None, None),
+                &mut ir,
+                &mut plan.make_scratch(),
+            )
+            .expect("one");
             ir
         });
         let mut flat_reflected = vec![0.0; LEN];

@@ -6,11 +6,13 @@
 //! ```
 //! use echolake_dsp::chain::{MeasurementParams, MeasurementPlan};
 //! use echolake_dsp::sweep::LinearSweep;
-//! use echolake_schema::SpectralDivision;
+//! use echolake_dsp::temperature::ReferenceAir;
+//! use echolake_schema::{Rig, SpectralDivision};
 //!
 //! let sweep = LinearSweep { rate_hz: 96e3, duration_secs: 0.03, low_hz: 2e3, high_hz: 40e3, fade_secs: 0.001 };
 //! let loopback = sweep.samples();
 //! let recording: Vec<f64> = (0..loopback.len()).map(|n| if n < 10 { 0.0 } else { 0.5 * loopback[n - 10] }).collect();
+//! let reference = ReferenceAir::from_response(&Rig::paper().impulse_response);
 //! let plan = MeasurementPlan::new(&MeasurementParams {
 //!     recording_len: loopback.len(),
 //!     ir_len: 384,
@@ -18,10 +20,10 @@
 //!     low_hz: 2e3,
 //!     high_hz: 40e3,
 //!     division: SpectralDivision::Tapered,
-//!     reference_celsius: 20.0,
+//!     reference,
 //! })?;
 //! let mut ir = vec![0.0; 384];
-//! plan.compute_ir(&recording, &loopback, 20.0, &mut ir, &mut plan.make_scratch())?;
+//! plan.compute_ir(&recording, &loopback, &reference.air(), &mut ir, &mut plan.make_scratch())?;
 //! let peak = (0..384).max_by(|a, b| ir[*a].total_cmp(&ir[*b]));
 //! assert_eq!(peak, Some(10));
 //! # Ok::<(), echolake_dsp::Error>(())
@@ -47,6 +49,6 @@ pub use levels::{
     uncertainty,
 };
 pub use real::RealSample;
-pub use reflection::{air, arrival, foam, foam_reflection, fresnel, geometry, kirchhoff};
+pub use reflection::{air, air_correction, arrival, foam, foam_reflection, fresnel, geometry, kirchhoff};
 pub use relief::{height_field, heights};
 pub use similarity::{components, correlation, self_organising_map};

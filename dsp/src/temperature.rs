@@ -3,7 +3,11 @@
 use std::f64::consts::PI;
 use std::sync::{Arc, LazyLock};
 
+use echolake_schema::AirTreatment;
+use echolake_schema::rig::ImpulseResponse;
+
 use crate::RealSample;
+use crate::air::AirState;
 
 /// Speed of sound at 0 C, m/s (Rust et al. 2021, appendix, step 2).
 const C0: f64 = 331.3;
@@ -21,14 +25,63 @@ const CENTRE: usize = TAPS / 2 - 1;
 /// Pieces between two samples: cubics through the kernel at their ends and neighbours are within 5e-8 of it.
 const PIECES: usize = 64;
 
-/// c = c0 sqrt(1 + T / 273.15), m/s.
+/// c = c0 sqrt(1 + T / 273.15), m/s: the paper's formula, of the temperature alone.
 pub fn speed_of_sound(celsius: f64) -> f64 {
     C0 * (1.0 + celsius / ZERO_CELSIUS).sqrt()
 }
 
-/// c(T) / c(T_ref), exactly.
+/// c(T) / c(T_ref), exactly, by the paper's formula.
 pub fn resampling_ratio(celsius: f64, reference_celsius: f64) -> f64 {
     ((ZERO_CELSIUS + celsius) / (ZERO_CELSIUS + reference_celsius)).sqrt()
+}
+
+/// The air that responses are corrected to, and what they are corrected for.
+///
+/// ```
+/// use echolake_dsp::air::AirState;
+/// use echolake_dsp::temperature::ReferenceAir;
+///
+/// let reference = ReferenceAir::from_response(&echolake_schema::Rig::paper().impulse_response);
+/// assert_eq!(reference.time_ratio(&reference.air()), 1.0);
+/// // Damp air is faster.
+/// assert!(reference.time_ratio(&AirState { humidity_pct: 60.0, ..reference.air() }) > 1.0003);
+/// ```
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ReferenceAir {
+    /// Temperature, C; humidity and pressure are those of [`AirState`]'s reference.
+    pub celsius: f64,
+    /// What responses are corrected for, which decides the formula of the speed of sound.
+    pub treatment: AirTreatment,
+}
+
+impl ReferenceAir {
+    /// Takes a rig's settings.
+    pub fn from_response(response: &ImpulseResponse) -> Self {
+        Self { celsius: response.reference_temperature_c.get(), treatment: response.air }
+    }
+
+    /// Its state.
+    pub fn air(&self) -> AirState {
+        AirState::with_known(self.celsius, None, None)
+    }
+
+    /// Speed of sound in it, m/s.
+    pub fn speed_of_sound(&self) -> f64 {
+        self.speed_in(&self.air())
+    }
+
+    /// Speed of sound in other air, m/s, by the same formula.
+    pub fn speed_in(&self, air: &AirState) -> f64 {
+        air.speed_of_sound(self.treatment)
+    }
+
+    /// Ratio by which times grow from other air to the reference: c / c_ref.
+    pub fn time_ratio(&self, air: &AirState) -> f64 {
+        match self.treatment {
+            AirTreatment::Paper => resampling_ratio(air.temperature_c, self.celsius),
+            AirTreatment::Complete => self.speed_in(air) / self.speed_of_sound(),
+        }
+    }
 }
 
 /// Share of its limits by which a response's range is narrower than the sweep's, so that it can be the same in air that

@@ -2,17 +2,16 @@
 
 use std::sync::Arc;
 
-use echolake_dsp::foam::subtract_foam;
 use echolake_dsp::mean::SignalMean;
-use echolake_dsp::temperature::speed_of_sound;
 use echolake_dsp::uncertainty::{EnergySensitivity, LevelUncertainty};
 use echolake_lake::{EncodedFile, FileEncoder, Lake, encode_batches};
+use echolake_schema::AirTreatment;
 use echolake_schema::tables::Table;
 
 use crate::context::IngestContext;
 use crate::derived_values::{DerivedRows, RunResponses, derivation_plan, residual_fit};
 use crate::error::{Error, Result};
-use crate::references::{LoadedReferences, WantedReferences, arrival_times};
+use crate::references::{LoadedReferences, PairPaths, WantedReferences};
 use crate::rows::derived::ReferenceVersions;
 use crate::rows::runs::RunReferences;
 use crate::rows::stats::SurfaceLevels;
@@ -84,7 +83,8 @@ impl ReferenceDerivation {
         let mut errors = vec![Vec::new(); totals.len()];
         let mut curves = vec![SignalMean::default(); rig.bands.centres_hz.len()];
         let mut paired = 0;
-        self.derive_slices(lake, keys, responses, &mut |slice| {
+        let uncertainty = self.level_uncertainty(lake, keys, responses)?;
+        self.derive_slices(lake, keys, responses, uncertainty.as_ref(), &mut |slice| {
             paired += slice.pairs.len();
             totals.iter_mut().zip(slice.tnce_columns()).for_each(|(all, some)| all.extend(some));
             unbiased.iter_mut().zip(slice.unbiased_columns()).for_each(|(all, some)| all.extend(some));
@@ -106,7 +106,8 @@ impl ReferenceDerivation {
         for (table, encoder) in encoders {
             files.push((table, encoder.finish()?));
         }
-        let stats = rows::stats::stats_rows(rig, keys, &SurfaceLevels { tnce: totals, unbiased, errors, curves }, of)?;
+        let levels = SurfaceLevels { tnce: totals, unbiased, errors, uncertainty, curves };
+        let stats = rows::stats::stats_rows(rig, keys, &levels, of)?;
         files.push((
             Table::SurfaceStats,
             encode_batches(Table::SurfaceStats, &Table::SurfaceStats.schema(rig), &[stats])?,
@@ -119,6 +120,7 @@ impl ReferenceDerivation {
         lake: &Lake,
         keys: &RunKeys,
         responses: &RunResponses,
+        uncertainty: Option<&LevelUncertainty>,
         take: &mut dyn FnMut(&mut DerivedRows) -> Result<()>,
     ) -> Result<()> {
         let rig = lake.rig();
@@ -126,34 +128,41 @@ impl ReferenceDerivation {
         let length = rig.impulse_response.length;
         let failed = |cause| Error::Kernel { file: keys.run.to_string(), cause };
         let plan = derivation_plan(rig).map_err(failed)?;
-        let levels = self.level_uncertainty(lake, keys, responses)?;
-        let sound_m_s = speed_of_sound(rig.impulse_response.reference_temperature_c.get());
+        let LoadedReferences { chosen, estimated, .. } = &self.references;
         let mut scratch = plan.make_scratch();
+        let mut air_scratch = chosen.make_scratch();
         let mut derived = plan.make_derived();
+        let mut reflected = vec![0.0; length];
         let mut energies = vec![0.0; bands];
         let mut sensitivities = vec![EnergySensitivity::default(); bands];
         let slices = responses.pairs.chunks(SLICE).zip(responses.irs.chunks(SLICE * length));
-        for ((pairs, irs), temperatures) in slices.zip(responses.celsius.chunks(SLICE)) {
+        for ((pairs, irs), airs) in slices.zip(responses.airs.chunks(SLICE)) {
             let mut slice = DerivedRows::new(bands);
-            for ((pair, ir), celsius) in pairs.iter().zip(irs.chunks_exact(length)).zip(temperatures) {
-                let Some((direct, flat)) = self.references.chosen.of_pair(*pair) else { continue };
-                plan.run_over(ir, direct, &flat.energies, &mut derived, &mut scratch).map_err(failed)?;
+            for ((pair, ir), air) in pairs.iter().zip(irs.chunks_exact(length)).zip(airs) {
+                let (Some((direct, flat)), Some(paths)) = (chosen.of_pair(*pair), PairPaths::new(lake, *pair)) else {
+                    continue;
+                };
+                chosen.subtract_direct(ir, direct, air, &paths, &mut reflected, &mut air_scratch).map_err(failed)?;
+                plan.run_over(&reflected, &flat.energies, &mut derived, &mut scratch).map_err(failed)?;
                 slice.push(*pair, &derived);
-                if let Some(levels) = &levels {
-                    let air = &self.references.chosen.air;
-                    let metres = arrival_times(lake, *pair).map_or(0.0, |[_, reflected]| reflected * sound_m_s);
+                if let Some(uncertainty) = uncertainty {
                     plan.compute_sensitivities(
-                        &derived.reflected,
-                        direct,
-                        |bin| air.per_kelvin(bin, metres),
+                        &reflected,
+                        &direct.ir,
+                        |bin| chosen.energy_per_kelvin(bin, paths.reflected_m),
                         &mut sensitivities,
                         &mut scratch,
                     )
                     .map_err(failed)?;
-                    slice.push_errors(levels, &sensitivities, flat, *celsius);
+                    slice.push_errors(uncertainty, &sensitivities, flat);
                 }
-                if let Some((direct, flat)) = self.references.estimated.as_ref().and_then(|e| e.of_pair(*pair)) {
-                    plan.reflected_energies(ir, direct, &mut energies, &mut scratch).map_err(failed)?;
+                if let Some((references, (direct, flat))) =
+                    estimated.as_ref().and_then(|estimated| Some((estimated, estimated.of_pair(*pair)?)))
+                {
+                    references
+                        .subtract_direct(ir, direct, air, &paths, &mut reflected, &mut air_scratch)
+                        .map_err(failed)?;
+                    plan.reflected_energies(&reflected, &mut energies, &mut scratch).map_err(failed)?;
                     slice.push_unbiased(&energies, &flat.energies);
                 }
             }
@@ -170,20 +179,33 @@ impl ReferenceDerivation {
         responses: &RunResponses,
     ) -> Result<Option<LevelUncertainty>> {
         let failed = |cause| Error::Kernel { file: keys.run.to_string(), cause };
-        let Some(flat) = self.references.chosen.flat_residual else { return Ok(None) };
-        let length = lake.rig().impulse_response.length;
+        let chosen = &self.references.chosen;
+        let Some(flat) = chosen.flat_residual else { return Ok(None) };
+        let response = &lake.rig().impulse_response;
         let mut fit = residual_fit(lake.rig()).map_err(failed)?;
-        let mut reflected = vec![0.0; length];
-        for (pair, ir) in responses.pairs.iter().zip(responses.irs.chunks_exact(length)) {
-            let (Some((direct, _)), Some(arrivals)) =
-                (self.references.chosen.of_pair(*pair), arrival_times(lake, *pair))
-            else {
+        let mut reflected = vec![0.0; response.length];
+        let mut scratch = chosen.make_scratch();
+        let measured = responses.pairs.iter().zip(responses.irs.chunks_exact(response.length)).zip(&responses.airs);
+        let mut warmer = SignalMean::default();
+        for ((pair, ir), air) in measured {
+            let (Some((direct, flat)), Some(paths)) = (chosen.of_pair(*pair), PairPaths::new(lake, *pair)) else {
                 continue;
             };
-            subtract_foam(ir, direct, &mut reflected);
-            fit.add_pair(&reflected, direct, arrivals[0], arrivals[1]).map_err(failed)?;
+            chosen.subtract_direct(ir, direct, air, &paths, &mut reflected, &mut scratch).map_err(failed)?;
+            let [direct_secs, reflected_secs] = paths.arrival_secs(lake.rig());
+            fit.add_pair(&reflected, &direct.ir, direct_secs, reflected_secs).map_err(failed)?;
+            warmer.add_signal(&[(air.temperature_c - flat.air.temperature_c) as f32]).map_err(failed)?;
         }
+        // Where energies are not corrected for the air, its difference to Flat's is part of their uncertainty.
+        let difference_k = match response.air {
+            AirTreatment::Complete => 0.0,
+            AirTreatment::Paper => warmer.mean_values().next().unwrap_or(0.0),
+        };
         let is_flat = self.references.only_flat.as_ref() == Some(&keys.surface);
-        Ok(fit.finish().map(|run| LevelUncertainty { run, flat, is_flat }))
+        Ok(fit.finish().map(|run| LevelUncertainty {
+            run,
+            flat: (!is_flat).then_some(flat),
+            temperature_k: response.temperature_u_k.hypot(difference_k),
+        }))
     }
 }

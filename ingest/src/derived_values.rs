@@ -2,10 +2,13 @@
 
 use std::collections::HashMap;
 
+use echolake_dsp::air::AirState;
+use echolake_dsp::air_correction::{AirCorrection, PathSpectrum};
 use echolake_dsp::chain::{DerivationPlan, DerivedResponse, FlatEnergies};
 use echolake_dsp::mean::SignalMean;
 use echolake_dsp::rise::CurveShape;
-use echolake_dsp::uncertainty::{EnergySensitivity, ErrorMoments, LevelUncertainty, ResidualFit, TemperatureResponse};
+use echolake_dsp::temperature::ReferenceAir;
+use echolake_dsp::uncertainty::{EnergySensitivity, LevelError, LevelUncertainty, ResidualFit};
 use echolake_schema::Rig;
 
 /// Mean impulse response of each pair of a reference.
@@ -15,8 +18,8 @@ pub(crate) type MeanResponses = HashMap<u32, MeanResponse>;
 #[derive(Debug, Clone)]
 pub(crate) struct MeanResponse {
     pub ir: Vec<f32>,
-    /// Mean temperature of the air, C.
-    pub celsius: f64,
+    /// Mean air.
+    pub air: AirState,
 }
 
 /// Values of each pair of Flat.
@@ -28,8 +31,7 @@ pub(crate) struct FlatPair {
     pub energies: FlatEnergies,
     /// `[bands]`.
     pub sensitivities: Vec<EnergySensitivity>,
-    /// Temperature of the air, C.
-    pub celsius: f64,
+    pub air: AirState,
 }
 
 /// Returns the derivation plan for a rig's responses.
@@ -43,16 +45,16 @@ pub(crate) fn residual_fit(rig: &Rig) -> std::result::Result<ResidualFit<f32>, e
     ResidualFit::new(rig.impulse_response.length, rig.sweep.rate_hz.get(), range_hz)
 }
 
-/// Returns the change of a rig's energies with the air's temperature, from the power spectrum of what Flat reflects.
-pub(crate) fn temperature_response(
+/// Returns the correction of a rig's responses for the air, from the mean spectra of the direct sound and of what Flat
+/// reflects.
+pub(crate) fn air_correction(
     rig: &Rig,
-    power: &[f64],
-) -> std::result::Result<TemperatureResponse, echolake_dsp::Error> {
+    paths: [&PathSpectrum; 2],
+) -> std::result::Result<AirCorrection<f32>, echolake_dsp::Error> {
     let response = &rig.impulse_response;
-    let sweep = &rig.sweep;
-    let range_hz = [sweep.low_hz, sweep.high_hz];
-    let celsius = response.reference_temperature_c.get();
-    TemperatureResponse::new(power, response.length, sweep.rate_hz.get(), range_hz, celsius)
+    let range_hz = [rig.sweep.low_hz, rig.sweep.high_hz];
+    let reference = ReferenceAir::from_response(response);
+    AirCorrection::new(response.length, rig.sweep.rate_hz.get(), range_hz, reference, paths)
 }
 
 /// A run's impulse responses.
@@ -61,8 +63,8 @@ pub(crate) struct RunResponses {
     pub pairs: Vec<u32>,
     /// `[pairs x length]`.
     pub irs: Vec<f32>,
-    /// `[pairs]`: temperature of the air, C.
-    pub celsius: Vec<f64>,
+    /// `[pairs]`.
+    pub airs: Vec<AirState>,
 }
 
 /// Values derived from some of a run's measurements.
@@ -83,7 +85,7 @@ pub(crate) struct DerivedRows {
     /// `[pairs x bands]`: TNCE without Foam's reflection; empty if that is not known.
     unbiased: Vec<f64>,
     /// `[pairs x (bands + 1)]`: relative errors of TNCE, the total's last; empty if they are not known.
-    errors: Vec<ErrorMoments>,
+    errors: Vec<LevelError>,
     /// `[pairs x (2 bands + 1)]`: standard uncertainties of levels over Flat's total, of the total, and of levels over
     /// Flat's same band; null without energy; empty if they are not known.
     uncertainties: Vec<Option<f64>>,
@@ -134,16 +136,14 @@ impl DerivedRows {
         self.unbiased.extend(energies.iter().map(|energy| energy / flat.total));
     }
 
-    /// Appends the errors of one measurement, in air of a temperature in C, from its sensitivities and Flat's.
-    pub fn push_errors(&mut self, levels: &LevelUncertainty, of: &[EnergySensitivity], flat: &FlatPair, celsius: f64) {
-        let warmer = celsius - flat.celsius;
+    /// Appends the errors of one measurement from its sensitivities and Flat's.
+    pub fn push_errors(&mut self, levels: &LevelUncertainty, of: &[EnergySensitivity], flat: &FlatPair) {
         let (total, flat_total) =
             (EnergySensitivity::sum_of_bands(of), EnergySensitivity::sum_of_bands(&flat.sensitivities));
         let over_total = || of.iter().chain([&total]);
-        self.errors.extend(over_total().map(|of| levels.relative_error(of, &flat_total, warmer)));
-        self.uncertainties.extend(over_total().map(|of| levels.level_db(of, &flat_total, warmer)));
-        self.uncertainties
-            .extend(of.iter().zip(&flat.sensitivities).map(|(of, flat)| levels.level_db(of, flat, warmer)));
+        self.errors.extend(over_total().map(|of| levels.relative_error(of, &flat_total)));
+        self.uncertainties.extend(over_total().map(|of| levels.level_db(of, &flat_total)));
+        self.uncertainties.extend(of.iter().zip(&flat.sensitivities).map(|(of, flat)| levels.level_db(of, flat)));
     }
 
     /// Moves out the responses and curves, which are empty afterwards.
@@ -199,7 +199,7 @@ impl DerivedRows {
     }
 
     /// Returns the relative errors of `tnce_*` and `tnce_total`; without values if they are not known.
-    pub fn error_columns(&self) -> Vec<Vec<ErrorMoments>> {
+    pub fn error_columns(&self) -> Vec<Vec<LevelError>> {
         let each = self.bands + 1;
         (0..each).map(|at| self.errors.iter().skip(at).step_by(each).copied().collect()).collect()
     }

@@ -5,11 +5,13 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
+use echolake_dsp::air::AirState;
 use echolake_lake::{
     ClaimOutcome, ClaimTimes, CommitOutcome, EncodedFile, Lake, RunRowCounts, VisibleRun, WorkClaims, encode_batches,
     object_sha256,
 };
 use echolake_schema::RunId;
+use echolake_schema::messages::Measurement;
 use echolake_schema::tables::{Source, Table};
 use tracing::{Instrument as _, Span, field};
 
@@ -21,14 +23,14 @@ use crate::error::{Error, Result};
 use crate::inbox::{self, FileVersion, OpenedRun, ReadFile, ReadingMark, RunSource};
 use crate::pipeline::{self, Cores, ReadyJob};
 use crate::read_back;
-use crate::reading::{Measurer, RunContent, RunHead};
+use crate::reading::{Measurer, Response, RunContent, RunHead};
 use crate::references::{ReferenceNames, digest_parts};
 use crate::report::{FileReport, IngestOutcome, IngestedRun};
 use crate::rows::runs::RunReferences;
 use crate::rows::{self, RunKeys};
 
 /// Revision of the responses that follow from recordings: those of another one are derived anew.
-const RESPONSES_REVISION: &str = "2";
+const RESPONSES_REVISION: &str = "3";
 
 /// Time between two looks at other ingests' claims.
 pub(crate) const LOOK_EVERY: Duration = Duration::from_secs(2);
@@ -399,13 +401,19 @@ fn encode_run(lake: &Lake, keys: &RunKeys, content: &RunContent) -> Result<Vec<(
     Ok(encoded)
 }
 
+// As `measurements` has it.
+fn measured_air(measurement: &Measurement, response: &Response) -> AirState {
+    let Measurement { humidity_pct, pressure_hpa, .. } = measurement;
+    AirState::with_known(response.air.temperature_c, Some(*humidity_pct), Some(*pressure_hpa))
+}
+
 impl RunContent {
     /// Returns the responses alone, sorted by pair.
     fn run_responses(&self) -> RunResponses {
         RunResponses {
             pairs: self.accepted.iter().map(|(m, _)| m.pair_id).collect(),
             irs: self.accepted.iter().flat_map(|(_, r)| r.ir.iter().copied()).collect(),
-            celsius: self.accepted.iter().map(|(_, r)| r.temperature_c).collect(),
+            airs: self.accepted.iter().map(|(m, r)| measured_air(m, r)).collect(),
         }
     }
 }

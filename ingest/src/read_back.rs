@@ -4,6 +4,7 @@ use arrow::array::{Array as _, AsArray as _};
 use arrow::compute::concat_batches;
 use arrow::datatypes::{Float32Type, Float64Type, Int32Type};
 use arrow::record_batch::RecordBatch;
+use echolake_dsp::air::AirState;
 use echolake_lake::{DataFile, Lake, LakeSnapshot, add_missing_columns, reader_metadata, wanted_schema};
 use echolake_schema::RunId;
 use echolake_schema::tables::Table;
@@ -15,6 +16,9 @@ use parquet::arrow::arrow_reader::{ArrowReaderMetadata, ArrowReaderOptions, Parq
 use crate::derived_values::RunResponses;
 use crate::error::{Error, Result};
 
+/// Columns of `measurements` that responses are read from.
+const COLUMNS: [&str; 5] = ["pair_id", "temperature_c", "humidity_pct", "pressure_hpa", "ir"];
+
 /// Reads a run's impulse responses from `measurements`.
 pub(crate) async fn read_responses(lake: &Lake, snapshot: &LakeSnapshot, run: &RunId) -> Result<RunResponses> {
     // References without all of their measurements would be others.
@@ -24,11 +28,19 @@ pub(crate) async fn read_responses(lake: &Lake, snapshot: &LakeSnapshot, run: &R
     let mut out = RunResponses::default();
     let files: Vec<_> = snapshot.files_of(Table::Measurements, run).cloned().collect();
     for file in files {
-        for batch in rows_of_run(lake, Table::Measurements, &file, run, &["pair_id", "temperature_c", "ir"]).await? {
+        for batch in rows_of_run(lake, Table::Measurements, &file, run, &COLUMNS).await? {
             let lost = |what: &str| Error::DataFile { file: file.path.to_string(), reason: format!("no `{what}`") };
             let pairs = batch.column_by_name("pair_id").ok_or_else(|| lost("pair_id"))?.as_primitive::<Int32Type>();
-            let celsius = batch.column_by_name("temperature_c").ok_or_else(|| lost("temperature_c"))?;
-            out.celsius.extend(celsius.as_primitive::<Float64Type>().values());
+            let [celsius, humidity, pressure] = ["temperature_c", "humidity_pct", "pressure_hpa"].map(|name| {
+                let column = batch.column_by_name(name).ok_or_else(|| lost(name))?;
+                Ok::<_, Error>(column.as_primitive::<Float64Type>().iter().map(|x| x.unwrap_or(f64::NAN)))
+            });
+            let airs = celsius?.zip(humidity?).zip(pressure?);
+            out.airs.extend(
+                airs.map(|((celsius, humidity), pressure)| {
+                    AirState::with_known(celsius, Some(humidity), Some(pressure))
+                }),
+            );
             let irs = batch.column_by_name("ir").ok_or_else(|| lost("ir"))?.as_list::<i32>();
             let from = irs.value_offsets()[0] as usize;
             let to = irs.value_offsets()[irs.len()] as usize;

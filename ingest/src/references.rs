@@ -3,28 +3,30 @@
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 
+use echolake_dsp::air::AirState;
+use echolake_dsp::air_correction::{AirCorrection, AirScratch, PairAir, PathSpectrum};
 use echolake_dsp::foam::subtract_foam;
 use echolake_dsp::foam_reflection::FoamReflectionFit;
 use echolake_dsp::geometry::{direct_mm, image_mm};
-use echolake_dsp::temperature::speed_of_sound;
-use echolake_dsp::uncertainty::{DirectSoundResidual, EnergySensitivity, TemperatureResponse};
+use echolake_dsp::temperature::ReferenceAir;
+use echolake_dsp::uncertainty::{DirectSoundResidual, EnergySensitivity};
 use echolake_lake::{DataFile, DirectSound, FileName, Lake, LakeSnapshot, ReferenceSurfaces};
 use echolake_schema::tables::Table;
-use echolake_schema::{PairId, SurfaceId, SurfaceRecord};
+use echolake_schema::{AirTreatment, PairId, Rig, SurfaceId, SurfaceRecord};
 use futures::future::try_join_all;
 use sha2::{Digest as _, Sha256};
 use tokio::sync::Mutex;
 
 use crate::CODE_VERSION;
 use crate::derived_values::{
-    FlatPair, FlatPairs, MeanResponse, MeanResponses, derivation_plan, residual_fit, temperature_response,
+    FlatPair, FlatPairs, MeanResponse, MeanResponses, air_correction, derivation_plan, residual_fit,
 };
 use crate::error::{Error, Result};
 use crate::pipeline::Cores;
 use crate::read_back;
 
 /// Revision of the rows that follow from references: those of another one are derived anew.
-const ROWS_REVISION: &str = "5";
+const ROWS_REVISION: &str = "6";
 /// Number of hex digits of a digest in a version.
 const VERSION_DIGITS: usize = 12;
 
@@ -42,18 +44,18 @@ pub(crate) struct ReferenceFinder {
 }
 
 /// The direct sound of each pair of a surface, and Flat's values without it.
-#[derive(Debug, Clone)]
+#[derive(Clone)]
 pub(crate) struct ReferenceResponses {
     direct: Arc<MeanResponses>,
     flat: Arc<FlatPairs>,
     /// Residual of Flat; None if it cannot be measured.
     pub flat_residual: Option<DirectSoundResidual>,
-    /// Change of energies with the temperature of the air.
-    pub air: Arc<TemperatureResponse>,
+    correction: Arc<AirCorrection<f32>>,
+    treatment: AirTreatment,
 }
 
 /// References as the lake subtracts them, and those without Foam's reflection.
-#[derive(Debug, Clone)]
+#[derive(Clone)]
 pub(crate) struct LoadedReferences {
     pub chosen: ReferenceResponses,
     /// None if Foam's reflection cannot be estimated: few pairs, or arrivals that are not apart.
@@ -199,22 +201,24 @@ impl ReferenceFinder {
     }
 
     async fn compute_mean(&self, of: &ReferenceVersion) -> Result<MeanResponses> {
-        // Number of responses, the sum of their temperatures, and that of their samples.
-        let mut sums: HashMap<u32, (u32, f64, Vec<f64>)> = HashMap::new();
+        // Number of responses, the sums of their air's temperature, humidity and pressure, and that of their samples.
+        let mut sums: HashMap<u32, (u32, [f64; 3], Vec<f64>)> = HashMap::new();
         for run in self.snapshot.runs().filter(|r| r.surface == of.surface) {
             let responses = read_back::read_responses(&self.lake, &self.snapshot, &run.run).await?;
             let length = self.lake.rig().impulse_response.length;
-            let measured = responses.pairs.iter().zip(&responses.celsius).zip(responses.irs.chunks_exact(length));
-            for ((pair, celsius), ir) in measured {
-                let (count, warmth, sum) = sums.entry(*pair).or_insert_with(|| (0, 0.0, vec![0.0; length]));
+            let measured = responses.pairs.iter().zip(&responses.airs).zip(responses.irs.chunks_exact(length));
+            for ((pair, air), ir) in measured {
+                let (count, airs, sum) = sums.entry(*pair).or_insert_with(|| (0, [0.0; 3], vec![0.0; length]));
                 *count += 1;
-                *warmth += celsius;
+                let values = [air.temperature_c, air.humidity_pct, air.pressure_hpa];
+                airs.iter_mut().zip(values).for_each(|(sum, value)| *sum += value);
                 sum.iter_mut().zip(ir).for_each(|(s, x)| *s += f64::from(*x));
             }
         }
-        let mean = |(pair, (count, warmth, sum)): (u32, (u32, f64, Vec<f64>))| {
+        let mean = |(pair, (count, airs, sum)): (u32, (u32, [f64; 3], Vec<f64>))| {
             let ir = sum.into_iter().map(|s| (s / f64::from(count)) as f32).collect();
-            (pair, MeanResponse { ir, celsius: warmth / f64::from(count) })
+            let [temperature_c, humidity_pct, pressure_hpa] = airs.map(|sum| sum / f64::from(count));
+            (pair, MeanResponse { ir, air: AirState { temperature_c, humidity_pct, pressure_hpa } })
         };
         Ok(sums.into_iter().map(mean).collect())
     }
@@ -252,53 +256,109 @@ impl ReferenceResponses {
         let plan = derivation_plan(rig).map_err(kernel_error)?;
         let mut scratch = plan.make_scratch();
         let length = rig.impulse_response.length;
-        let mut power = vec![0.0; length / 2 + 1];
-        let reflected: Vec<_> = sorted_means(flat)
+        let measured: Vec<_> = sorted_means(flat)
             .into_iter()
-            .filter_map(|(pair, flat)| {
-                let direct = flat_direct.get(&pair)?;
-                let mut reflected = vec![0.0; length];
-                subtract_foam(&flat.ir, &direct.ir, &mut reflected);
-                Some((pair, reflected, direct, flat.celsius))
-            })
+            .filter_map(|(pair, flat)| Some((pair, flat, flat_direct.get(&pair)?, PairPaths::new(lake, pair)?)))
             .collect();
-        for (_, reflected, ..) in &reflected {
-            plan.add_power(reflected, &mut power, &mut scratch).map_err(kernel_error)?;
+        let mut spectra = [(); 2].map(|()| PathSpectrum { power: vec![0.0; length / 2 + 1], metres: 0.0 });
+        let mut reflected = vec![0.0; length];
+        for (_, flat, direct, paths) in &measured {
+            subtract_foam(&flat.ir, &direct.ir, &mut reflected);
+            let metres = [paths.direct_m, paths.reflected_m];
+            for ((spectrum, signal), metres) in spectra.iter_mut().zip([&direct.ir, &reflected]).zip(metres) {
+                plan.add_power(signal, &mut spectrum.power, &mut scratch).map_err(kernel_error)?;
+                spectrum.metres += metres / measured.len() as f64;
+            }
         }
-        let air = temperature_response(rig, &power).map_err(kernel_error)?;
+        let [direct_spectrum, reflected_spectrum] = &spectra;
+        let correction = air_correction(rig, [direct_spectrum, reflected_spectrum]).map_err(kernel_error)?;
+        let mut references = Self {
+            direct,
+            flat: Arc::default(),
+            flat_residual: None,
+            correction: Arc::new(correction),
+            treatment: rig.impulse_response.air,
+        };
+        let mut air_scratch = references.make_scratch();
         let mut residual = residual_fit(rig).map_err(kernel_error)?;
         let mut pairs = FlatPairs::with_capacity(flat.len());
-        for (pair, reflected, direct, celsius) in reflected {
+        for (pair, flat, direct, paths) in measured {
+            references
+                .subtract_direct(&flat.ir, direct, &flat.air, &paths, &mut reflected, &mut air_scratch)
+                .map_err(kernel_error)?;
             let energies = plan.flat_energies(&reflected, &mut scratch).map_err(kernel_error)?;
             let mut sensitivities = vec![EnergySensitivity::default(); energies.bands.len()];
-            // Flat's air is what temperatures are told from.
-            plan.compute_sensitivities(&reflected, &direct.ir, |_| 0.0, &mut sensitivities, &mut scratch)
+            let per_kelvin = |bin| references.energy_per_kelvin(bin, paths.reflected_m);
+            plan.compute_sensitivities(&reflected, &direct.ir, per_kelvin, &mut sensitivities, &mut scratch)
                 .map_err(kernel_error)?;
-            if let Some([direct_secs, reflected_secs]) = arrival_times(lake, pair) {
-                residual.add_pair(&reflected, &direct.ir, direct_secs, reflected_secs).map_err(kernel_error)?;
-            }
-            pairs.insert(pair, FlatPair { energies, sensitivities, celsius });
+            let [direct_secs, reflected_secs] = paths.arrival_secs(rig);
+            residual.add_pair(&reflected, &direct.ir, direct_secs, reflected_secs).map_err(kernel_error)?;
+            pairs.insert(pair, FlatPair { energies, sensitivities, air: flat.air });
         }
-        Ok(Self { direct, flat: Arc::new(pairs), flat_residual: residual.finish(), air: Arc::new(air) })
+        references.flat = Arc::new(pairs);
+        references.flat_residual = residual.finish();
+        Ok(references)
     }
 
     /// Returns the direct sound of a pair and its values of Flat, if the references have the pair.
-    pub fn of_pair(&self, pair: u32) -> Option<(&[f32], &FlatPair)> {
-        Some((self.direct.get(&pair)?.ir.as_slice(), self.flat.get(&pair)?))
+    pub fn of_pair(&self, pair: u32) -> Option<(&MeanResponse, &FlatPair)> {
+        Some((self.direct.get(&pair)?, self.flat.get(&pair)?))
+    }
+
+    /// Returns buffers for [`Self::subtract_direct`].
+    pub fn make_scratch(&self) -> AirScratch<f32> {
+        self.correction.make_scratch()
+    }
+
+    /// Computes what a surface reflects from a response that was measured in this air.
+    pub fn subtract_direct(
+        &self,
+        ir: &[f32],
+        direct: &MeanResponse,
+        air: &AirState,
+        paths: &PairPaths,
+        reflected: &mut [f32],
+        scratch: &mut AirScratch<f32>,
+    ) -> std::result::Result<(), echolake_dsp::Error> {
+        if self.treatment == AirTreatment::Paper {
+            subtract_foam(ir, &direct.ir, reflected);
+            return Ok(());
+        }
+        let PairPaths { direct_m, reflected_m } = *paths;
+        let pair = PairAir { response: *air, direct: direct.air, direct_m, reflected_m };
+        self.correction.subtract_direct(ir, &direct.ir, &pair, reflected, scratch)
+    }
+
+    /// Returns the relative change of a bin's energy, per kelvin that the air is warmer than its sensor says.
+    pub fn energy_per_kelvin(&self, bin: usize, metres: f64) -> f64 {
+        self.correction.energy_per_kelvin(bin, metres)
     }
 }
 
-/// Returns the arrivals of a pair's direct sound and of its reflection in the panel's plane, s.
-pub(crate) fn arrival_times(lake: &Lake, pair: u32) -> Option<[f64; 2]> {
-    let points = lake.grid().pair(PairId(pair))?;
-    let position = |point| lake.grid().point(point).map(|point| point.position_mm);
-    let microphone = position(points.microphone)?;
-    let speaker = position(points.speaker)?;
-    let reference_c = lake.rig().impulse_response.reference_temperature_c.get();
-    Some(
-        [direct_mm(microphone, speaker), image_mm(microphone, speaker)]
-            .map(|mm| mm / 1e3 / speed_of_sound(reference_c)),
-    )
+/// Lengths of a pair's direct path and of that by the panel's plane, m.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct PairPaths {
+    pub direct_m: f64,
+    pub reflected_m: f64,
+}
+
+impl PairPaths {
+    /// None if the grid has no such pair.
+    pub fn new(lake: &Lake, pair: u32) -> Option<Self> {
+        let points = lake.grid().pair(PairId(pair))?;
+        let position = |point| lake.grid().point(point).map(|point| point.position_mm);
+        let microphone = position(points.microphone)?;
+        let speaker = position(points.speaker)?;
+        let [direct_m, reflected_m] =
+            [direct_mm(microphone, speaker), image_mm(microphone, speaker)].map(|mm| mm / 1e3);
+        Some(Self { direct_m, reflected_m })
+    }
+
+    /// Returns the arrivals of both in a corrected response, s.
+    pub fn arrival_secs(&self, rig: &Rig) -> [f64; 2] {
+        let sound_m_s = ReferenceAir::from_response(&rig.impulse_response).speed_of_sound();
+        [self.direct_m, self.reflected_m].map(|metres| metres / sound_m_s)
+    }
 }
 
 // In one order, so that sums are the same in every process.
@@ -323,10 +383,8 @@ fn estimate_references(
     let rig = lake.rig();
     let mut fit = FoamReflectionFit::new(rig.impulse_response.length, rig.sweep.rate_hz.get()).map_err(kernel_error)?;
     for (pair, flat) in sorted_means(flat) {
-        let (Some(foam), Some([direct_secs, reflected_secs])) = (flat_foam.get(&pair), arrival_times(lake, pair))
-        else {
-            continue;
-        };
+        let (Some(foam), Some(paths)) = (flat_foam.get(&pair), PairPaths::new(lake, pair)) else { continue };
+        let [direct_secs, reflected_secs] = paths.arrival_secs(rig);
         fit.add_pair(&foam.ir, &flat.ir, direct_secs, reflected_secs).map_err(kernel_error)?;
     }
     let Some(reflection) = fit.finish() else { return Ok(None) };
@@ -336,7 +394,7 @@ fn estimate_references(
             let Some(flat) = flat.get(pair) else { continue };
             let mut ir = vec![0.0; foam.ir.len()];
             reflection.direct_sound(&foam.ir, &flat.ir, &mut ir).map_err(kernel_error)?;
-            direct.insert(*pair, MeanResponse { ir, celsius: foam.celsius });
+            direct.insert(*pair, MeanResponse { ir, air: foam.air });
         }
         Ok(direct)
     };

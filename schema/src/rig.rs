@@ -81,6 +81,33 @@ pub struct ImpulseResponse {
     pub reference_temperature_c: Celsius,
     /// Treatment of frequencies at the limits of the sweep's range and beyond them.
     pub division: SpectralDivision,
+    /// What of the air responses are corrected for.
+    pub air: AirTreatment,
+    /// Standard uncertainty of the temperature of a run's air, K.
+    pub temperature_u_k: f64,
+}
+
+/// What of the air responses are corrected for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum AirTreatment {
+    /// The time axis for the speed of sound, which depends on temperature, humidity and pressure (Cramer 1993); energies
+    /// for absorption (ISO 9613-1), and for the frequencies that the time axis moves along the slopes of speaker and
+    /// microphone.
+    #[default]
+    Complete,
+    /// The time axis alone, and for the temperature alone, as the paper prints it: 331.3 sqrt(1 + T / 273.15) m/s.
+    Paper,
+}
+
+impl AirTreatment {
+    /// Its name, as rig files spell it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Complete => "complete",
+            Self::Paper => "paper",
+        }
+    }
 }
 
 /// Division of the recording's spectrum by the loopback's at the limits of the sweep's range and beyond them; in
@@ -123,6 +150,8 @@ struct ImpulseResponseFields {
     division: Option<DivisionName>,
     #[serde(skip_serializing_if = "Option::is_none")]
     floor_db: Option<f64>,
+    air: AirTreatment,
+    temperature_u_k: f64,
 }
 
 #[derive(Clone, Copy, Serialize, Deserialize)]
@@ -135,8 +164,8 @@ enum DivisionName {
 
 impl Default for ImpulseResponseFields {
     fn default() -> Self {
-        let ImpulseResponse { length, reference_temperature_c, .. } = ImpulseResponse::default();
-        Self { length, reference_temperature_c, division: None, floor_db: None }
+        let ImpulseResponse { length, reference_temperature_c, air, temperature_u_k, .. } = ImpulseResponse::default();
+        Self { length, reference_temperature_c, division: None, floor_db: None, air, temperature_u_k }
     }
 }
 
@@ -144,7 +173,8 @@ impl TryFrom<ImpulseResponseFields> for ImpulseResponse {
     type Error = &'static str;
 
     fn try_from(fields: ImpulseResponseFields) -> Result<Self, Self::Error> {
-        let ImpulseResponseFields { length, reference_temperature_c, division, floor_db } = fields;
+        let ImpulseResponseFields { length, reference_temperature_c, division, floor_db, air, temperature_u_k } =
+            fields;
         let division = match (division, floor_db) {
             (None | Some(DivisionName::Tapered), None) => SpectralDivision::Tapered,
             (Some(DivisionName::Literal), None) => SpectralDivision::Literal,
@@ -153,19 +183,22 @@ impl TryFrom<ImpulseResponseFields> for ImpulseResponse {
             }
             (Some(_), Some(_)) => return Err("`floor_db` goes with `division = \"floored\"` only"),
         };
-        Ok(Self { length, reference_temperature_c, division })
+        if !(0.0..=10.0).contains(&temperature_u_k) {
+            return Err("`temperature_u_k` is not from 0 to 10");
+        }
+        Ok(Self { length, reference_temperature_c, division, air, temperature_u_k })
     }
 }
 
 impl From<ImpulseResponse> for ImpulseResponseFields {
     fn from(response: ImpulseResponse) -> Self {
-        let ImpulseResponse { length, reference_temperature_c, division } = response;
+        let ImpulseResponse { length, reference_temperature_c, division, air, temperature_u_k } = response;
         let (name, floor_db) = match division {
             SpectralDivision::Tapered => (DivisionName::Tapered, None),
             SpectralDivision::Floored { floor_db } => (DivisionName::Floored, Some(floor_db)),
             SpectralDivision::Literal => (DivisionName::Literal, None),
         };
-        Self { length, reference_temperature_c, division: Some(name), floor_db }
+        Self { length, reference_temperature_c, division: Some(name), floor_db, air, temperature_u_k }
     }
 }
 
@@ -236,7 +269,13 @@ impl Default for Sweep {
 
 impl Default for ImpulseResponse {
     fn default() -> Self {
-        Self { length: 384, reference_temperature_c: Celsius::PAPER, division: SpectralDivision::Tapered }
+        Self {
+            length: 384,
+            reference_temperature_c: Celsius::PAPER,
+            division: SpectralDivision::Tapered,
+            air: AirTreatment::Complete,
+            temperature_u_k: 0.05,
+        }
     }
 }
 

@@ -31,6 +31,10 @@ pub struct SimulationParams {
     pub directivity: bool,
     /// Speaker and microphone are louder at some frequencies.
     pub transducer_response: bool,
+    /// Mean temperature of the air, C.
+    pub temperature_c: f64,
+    /// Mean relative humidity of the air, %.
+    pub humidity_pct: f64,
     /// Channels and sensors have noise, the air drifts, and now and then something spoils a take.
     pub noise_and_drift: bool,
 }
@@ -47,6 +51,8 @@ impl Default for SimulationParams {
             calibration_mm: 0.17,
             directivity: true,
             transducer_response: true,
+            temperature_c: 21.5,
+            humidity_pct: 45.0,
             noise_and_drift: true,
         }
     }
@@ -61,7 +67,10 @@ impl SimulationParams {
     /// Describes the first contradiction among the settings.
     pub(crate) fn find_contradiction(&self) -> Option<String> {
         let is_plausible = |mm: f64| (0.0..=10.0).contains(&mm);
-        let plausible = is_plausible(self.repeatability_mm) && is_plausible(self.calibration_mm);
-        (!plausible).then(|| "expected repeatability_mm and calibration_mm from 0 to 10".to_owned())
+        if !(is_plausible(self.repeatability_mm) && is_plausible(self.calibration_mm)) {
+            return Some("expected repeatability_mm and calibration_mm from 0 to 10".to_owned());
+        }
+        let is_room = (0.0..=40.0).contains(&self.temperature_c) && (5.0..=95.0).contains(&self.humidity_pct);
+        (!is_room).then(|| "expected temperature_c from 0 to 40 and humidity_pct from 5 to 95".to_owned())
     }
 }

@@ -5,7 +5,7 @@ use echolake_import::{
     import_hdf5, import_rew, import_sofa, import_wav, sampling_rate_of,
 };
 use echolake_lake::{Lake, ReferenceSurfaces};
-use echolake_schema::{Celsius, ProjectName, Rig, SpectralDivision, Timestamp};
+use echolake_schema::{AirTreatment, Celsius, ProjectName, Rig, SpectralDivision, Timestamp};
 
 use crate::CommandOutcome;
 use crate::progress::{CommandProgress, TaskProgress};
@@ -165,5 +165,6 @@ fn gir_rig() -> Rig {
     rig.impulse_response.length = GIR_IR_LEN;
     // As the data set's responses were made.
     rig.impulse_response.division = SpectralDivision::Literal;
+    rig.impulse_response.air = AirTreatment::Paper;
     rig
 }

@@ -11,7 +11,9 @@ use echolake_dsp::filter_bank::FilterBankPlan;
 use echolake_dsp::height_field::HeightField;
 use echolake_dsp::kirchhoff::{KirchhoffPlan, SoundPath, TransducerPose};
 use echolake_dsp::sweep::LinearSweep;
-use echolake_dsp::temperature::{TemperatureCorrection, resampling_ratio};
+use echolake_dsp::air::AirState;
+use echolake_dsp::temperature::{ReferenceAir, TemperatureCorrection};
+use echolake_schema::Rig;
 use echolake_dsp::{Error, RealSample as _};
 use echolake_schema::messages::SampleFormat;
 use echolake_schema::samples::{decode_samples, split_24};
@@ -21,7 +23,6 @@ use rustfft::num_complex::Complex;
 const RATE_HZ: f64 = 96e3;
 const LOW_HZ: f64 = 2e3;
 const HIGH_HZ: f64 = 40e3;
-const REFERENCE_CELSIUS: f64 = 20.0;
 const IR_LEN: usize = 384;
 const CENTRES_HZ: [f64; 5] = [2_500.0, 5_000.0, 10_000.0, 20_000.0, 40_000.0];
 
@@ -104,7 +105,7 @@ fn deconvolution(criterion: &mut Criterion) {
     let n = recording.len();
     let params = |length, division| DeconvolutionParams {
         recording_len: n,
-        output_len: raw_len(IR_LEN, REFERENCE_CELSIUS),
+        output_len: raw_len(IR_LEN, &reference_air()),
         rate_hz: RATE_HZ,
         low_hz: LOW_HZ,
         high_hz: HIGH_HZ,
@@ -129,6 +130,10 @@ fn deconvolution(criterion: &mut Criterion) {
     }
 }
 
+fn reference_air() -> ReferenceAir {
+    ReferenceAir::from_response(&Rig::paper().impulse_response)
+}
+
 fn temperature(criterion: &mut Criterion) {
     let [_, loopback] = recordings();
     let correction = TemperatureCorrection::<f32>::new();
@@ -137,8 +142,8 @@ fn temperature(criterion: &mut Criterion) {
     group.throughput(Throughput::Elements(IR_LEN as u64));
     // Warmer than the reference, outputs gather inputs; colder, inputs scatter.
     for (name, celsius) in [("gather", 23.7), ("scatter", 15.0)] {
-        let rho = resampling_ratio(celsius, REFERENCE_CELSIUS);
-        let raw = &loopback[..raw_len(IR_LEN, REFERENCE_CELSIUS)];
+        let rho = reference_air().time_ratio(&AirState::with_known(celsius, None, None));
+        let raw = &loopback[..raw_len(IR_LEN, &reference_air())];
         group.bench_function(BenchmarkId::new(name, IR_LEN), |bencher| {
             bencher.iter(|| correction.correct_response(black_box(raw), rho, &mut corrected));
         });
@@ -155,15 +160,16 @@ fn measurement(criterion: &mut Criterion) {
         low_hz: LOW_HZ,
         high_hz: HIGH_HZ,
         division: SpectralDivision::Tapered,
-        reference_celsius: REFERENCE_CELSIUS,
+        reference: reference_air(),
     })
     .expect("settings of the paper");
+    let air = AirState::with_known(23.7, None, None);
     let mut scratch = plan.make_scratch();
     let mut ir = vec![0.0; IR_LEN];
     let mut group = criterion.benchmark_group("measurement");
     group.throughput(Throughput::Elements(n as u64));
     group.bench_function(BenchmarkId::new("recording_to_response", n), |bencher| {
-        bencher.iter(|| plan.compute_ir(black_box(&recording), &loopback, 23.7, &mut ir, &mut scratch));
+        bencher.iter(|| plan.compute_ir(black_box(&recording), &loopback, &air, &mut ir, &mut scratch));
     });
 }
 
@@ -211,7 +217,7 @@ fn derivation(criterion: &mut Criterion) {
         bencher.iter(|| -> Result<(), Error> { plan.derive_response(black_box(&ir), &foam, &ir, &mut derived, &mut scratch) });
     });
     group.bench_function(BenchmarkId::new("with_known_flat", IR_LEN), |bencher| {
-        bencher.iter(|| plan.run_over(black_box(&ir), &foam, &energies, &mut derived, &mut scratch));
+        bencher.iter(|| plan.run_over(black_box(&ir), &energies, &mut derived, &mut scratch));
     });
 }
 

@@ -1,7 +1,8 @@
 //! One imported response as a run records it: its pair, time and temperature; everything else is unknown.
 
 use echolake_acquisition::run::recorder::{Error, Recorder};
-use echolake_dsp::temperature::{TemperatureCorrection, resampling_ratio};
+use echolake_dsp::air::AirState;
+use echolake_dsp::temperature::{ReferenceAir, TemperatureCorrection};
 use echolake_schema::messages::{AmbientSample, ImpulseResponse, Measurement, Verdict};
 use echolake_schema::{Celsius, Grid, Pair, Rig, Timestamp};
 
@@ -41,6 +42,7 @@ impl ImportedResponse {
                 samples,
                 temperature_c: celsius,
                 temperature_corrected: is_corrected,
+                ..ImpulseResponse::default()
             },
         )?;
         recorder.measurement(
@@ -68,7 +70,8 @@ impl ImportedResponse {
 
 /// Returns the samples that it takes to bring a response to the reference temperature.
 pub(crate) fn least_length(rig: &Rig, celsius: Celsius, is_corrected: bool) -> usize {
-    let ratio = resampling_ratio(celsius.get(), rig.impulse_response.reference_temperature_c.get());
+    let air = AirState::with_known(celsius.get(), None, None);
+    let ratio = ReferenceAir::from_response(&rig.impulse_response).time_ratio(&air);
     match rig.impulse_response.length {
         length if is_corrected || ratio == 1.0 => length,
         length => TemperatureCorrection::<f64>::input_len_for(length, ratio),

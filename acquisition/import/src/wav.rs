@@ -9,11 +9,12 @@ use std::path::Path;
 use echolake_acquisition::run::assessment::TakeAssessor;
 use echolake_acquisition::run::objection::TakeObjection;
 use echolake_acquisition::run::recorder::{LogLevel, Recorder, RunStart};
+use echolake_dsp::air::AirState;
 use echolake_dsp::chain::raw_len;
 use echolake_dsp::deconvolution::{DeconvolutionParams, TransformLength};
 use echolake_dsp::geometry::direct_mm;
 use echolake_dsp::response_deconvolution::ResponseDeconvolution;
-use echolake_dsp::temperature::{resampling_ratio, response_limits_hz, speed_of_sound};
+use echolake_dsp::temperature::{ReferenceAir, response_limits_hz};
 use echolake_schema::manifest::{Origin, RunEnd};
 use echolake_schema::messages::{AmbientSample, ImpulseResponse, Measurement, SweepRecording, Verdict};
 use echolake_schema::{Grid, Rig, SampleRate, SurfaceId, Timestamp};
@@ -125,8 +126,10 @@ impl WavImport<'_> {
         let unread = |column, what| Error::Row { path: self.manifest.to_owned(), line: row.line, column, what };
         let (rig, celsius) = (self.rig, row.celsius.get());
         let planned = |cause| Error::Plan { rig: rig.name.clone(), cause };
+        let reference = ReferenceAir::from_response(&rig.impulse_response);
+        let air = AirState::with_known(celsius, Some(row.humidity_pct), Some(row.pressure_hpa));
         let [m, s] = [row.pair.microphone, row.pair.speaker].map(|id| self.grid.points()[id.index()].position_mm);
-        let arrival = direct_mm(m, s) / 1e3 / speed_of_sound(celsius);
+        let arrival = direct_mm(m, s) / 1e3 / reference.speed_in(&air);
         let take = if row.is_sweep { self.find_take(row, arrival)? } else { 0..row.recording.layout.samples };
         let taken_secs = take.start as f64 / rig.sweep.rate_hz.get();
         let len = (take.end - take.start) as usize;
@@ -134,8 +137,7 @@ impl WavImport<'_> {
         let microphone = row.recording.read_samples(row.format, take).map_err(|e| unread("recording", e))?;
         let plan = ResponseDeconvolution::<f32>::new(DeconvolutionParams {
             recording_len: len,
-            output_len: raw_len(rig.impulse_response.length, rig.impulse_response.reference_temperature_c.get())
-                .min(len),
+            output_len: raw_len(rig.impulse_response.length, &reference).min(len),
             rate_hz: rig.sweep.rate_hz.get(),
             low_hz: rig.sweep.low_hz,
             high_hz: rig.sweep.high_hz,
@@ -145,8 +147,7 @@ impl WavImport<'_> {
         })
         .map_err(planned)?;
         let mut samples = vec![0.0; plan.output_len()];
-        let rho = resampling_ratio(celsius, rig.impulse_response.reference_temperature_c.get());
-        let limits_hz = response_limits_hz([rig.sweep.low_hz, rig.sweep.high_hz], rho);
+        let limits_hz = response_limits_hz([rig.sweep.low_hz, rig.sweep.high_hz], reference.time_ratio(&air));
         plan.run_within(limits_hz, &microphone.fractions, &loopback.fractions, &mut samples, &mut plan.make_scratch())
             .map_err(|e| unread("loopback", e.to_string()))?;
         let clipped = microphone.clipped + loopback.clipped;
@@ -215,6 +216,8 @@ impl WavImport<'_> {
                 microphone: microphone.bytes.into(),
                 loopback: loopback.bytes.into(),
                 temperature_c: celsius,
+                humidity_pct: Some(air.humidity_pct),
+                pressure_hpa: Some(air.pressure_hpa),
             },
         )?;
         recorder.ir(
@@ -226,6 +229,8 @@ impl WavImport<'_> {
                 samples,
                 temperature_c: celsius,
                 temperature_corrected: false,
+                humidity_pct: Some(air.humidity_pct),
+                pressure_hpa: Some(air.pressure_hpa),
             },
         )?;
         let warning = (!reasons.is_empty()).then(|| format!("line {}: {}", row.line, reasons.join("; ")));

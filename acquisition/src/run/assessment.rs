@@ -2,6 +2,7 @@
 
 use echolake_dsp::deconvolution::{DeconvolutionParams, DeconvolutionPlan, DeconvolutionScratch, TransformLength};
 use echolake_dsp::level::power_to_db;
+use echolake_dsp::temperature::ReferenceAir;
 use echolake_dsp::{Error, chain};
 use echolake_schema::rig::Validation;
 use echolake_schema::{Rig, SpectralDivision};
@@ -154,7 +155,7 @@ impl TakeAssessment {
 
 /// Samples of a rig's responses, before they are corrected to the reference temperature.
 pub(crate) fn response_len(rig: &Rig) -> usize {
-    chain::raw_len(rig.impulse_response.length, rig.impulse_response.reference_temperature_c.get())
+    chain::raw_len(rig.impulse_response.length, &ReferenceAir::from_response(&rig.impulse_response))
 }
 
 /// Samples of a deconvolved recording behind the response that hold noise alone; an empty range if there are none.

@@ -16,6 +16,7 @@ use echolake_dsp::chain::raw_len;
 use echolake_dsp::deconvolution::{DeconvolutionParams, TransformLength};
 use echolake_dsp::response_deconvolution::{ResponseDeconvolution, ResponseScratch};
 use echolake_dsp::sweep::LinearSweep;
+use echolake_dsp::temperature::ReferenceAir;
 use echolake_schema::manifest::{Origin, RunEnd};
 use echolake_schema::messages::{Measurement, Verdict};
 use echolake_schema::{Grid, Pair, Rig, Timestamp};
@@ -134,10 +135,10 @@ impl<'a> RunController<'a> {
         if actual_hz != expected_hz {
             return Err(Error::Rate { rig: rig.name.clone(), expected_hz, actual_hz });
         }
-        let reference = rig.impulse_response.reference_temperature_c.get();
+        let reference = ReferenceAir::from_response(&rig.impulse_response);
         let deconvolution = ResponseDeconvolution::new(DeconvolutionParams {
             recording_len,
-            output_len: raw_len(rig.impulse_response.length, reference).min(recording_len),
+            output_len: raw_len(rig.impulse_response.length, &reference).min(recording_len),
             rate_hz: sweep.rate_hz.get(),
             low_hz: sweep.low_hz,
             high_hz: sweep.high_hz,

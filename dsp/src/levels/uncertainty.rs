@@ -10,7 +10,6 @@ use std::sync::Arc;
 use realfft::num_complex::Complex;
 use realfft::{ComplexToReal, RealToComplex};
 
-use crate::air::AirAbsorption;
 use crate::error::check_len;
 use crate::{Error, RealSample};
 
@@ -21,11 +20,6 @@ const LEAST_SEPARATION_SECS: f64 = 0.35e-3;
 const GATE_SECS: [f64; 2] = [0.3e-3, 0.2e-3];
 /// Time before the direct sound's arrival up to which there is noise alone, s.
 const NOISE_SECS: f64 = 0.4e-3;
-/// 0 C in K.
-const KELVIN: f64 = 273.15;
-/// Air whose absorption is taken: it changes with the temperature by a third less or more in dry or damp air.
-const HUMIDITY_PCT: f64 = 45.0;
-const PRESSURE_HPA: f64 = 1_013.25;
 /// Least number of pairs for an estimate.
 pub const LEAST_PAIRS: usize = 24;
 
@@ -105,16 +99,17 @@ pub struct EnergySensitivity {
     pub temperature: f64,
 }
 
-/// Change of reflected energies with the air's temperature, that of a response at the reference temperature.
-///
-/// The correction moves frequencies, and with them what tweeter and microphone do to each; and warm air absorbs more or
-/// less than cold air.
-#[derive(Debug, Clone, PartialEq)]
-pub struct TemperatureResponse {
-    /// `[bins]`: relative change per kelvin by speaker and microphone.
-    transducers: Vec<f64>,
-    /// `[bins]`: relative change per kelvin and metre by absorption.
-    absorption: Vec<f64>,
+/// Error of a level relative to its energy, by what its measurements share.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct LevelError {
+    /// Common to a run's measurements.
+    pub common: f64,
+    /// Variance of the rest, which differs from measurement to measurement.
+    pub variance: f64,
+    /// Per kelvin that the run's air was warmer than its sensor says; the whole run has the same.
+    pub own_per_kelvin: f64,
+    /// The same of Flat's air.
+    pub flat_per_kelvin: f64,
 }
 
 /// The residuals of a run and of Flat's, whose energies are divided by one another.
@@ -122,10 +117,10 @@ pub struct TemperatureResponse {
 pub struct LevelUncertainty {
     /// Residual of the run.
     pub run: DirectSoundResidual,
-    /// Residual of Flat.
-    pub flat: DirectSoundResidual,
-    /// The run is the one that Flat's energies are from: errors of both are the same.
-    pub is_flat: bool,
+    /// Residual of Flat; None for the run that Flat's energies are from, whose levels have the errors of one side.
+    pub flat: Option<DirectSoundResidual>,
+    /// Standard uncertainty of the temperature of a run's air, K.
+    pub temperature_k: f64,
 }
 
 impl<T: RealSample> ResidualFit<T> {
@@ -286,82 +281,48 @@ impl EnergySensitivity {
     }
 }
 
-impl TemperatureResponse {
-    /// Computes the changes from the mean power spectrum of what Flat reflects, `[len / 2 + 1]`, whose slope is that of
-    /// speaker and microphone, within the sweep's range, Hz, and for air of this temperature in C.
-    ///
-    /// # Errors
-    /// [`Error::Length`].
-    pub fn new(power: &[f64], len: usize, rate_hz: f64, range_hz: [f64; 2], celsius: f64) -> Result<Self, Error> {
-        check_len("Flat's power spectrum", power.len(), len / 2 + 1)?;
-        let [low, high] = range_hz;
-        // The bins whose neighbours are within the range and no part of its tapers.
-        let step_hz = rate_hz / len as f64;
-        let first = (low * 1.02 / step_hz).ceil() as usize + 2;
-        let last = ((high * 0.98 / step_hz).floor() as usize).saturating_sub(2).min(power.len().saturating_sub(2));
-        let slope = |bin: usize| {
-            let bin = bin.clamp(first, last.max(first));
-            let (Some(below), Some(above)) = (power.get(bin - 1), power.get(bin + 1)) else { return 0.0 };
-            let slope = (above / below).ln() / ((bin + 1) as f64 / (bin - 1) as f64).ln();
-            if slope.is_finite() { slope } else { 0.0 }
-        };
-        // The speed of sound grows as the root of the absolute temperature.
-        let per_kelvin = 0.5 / (KELVIN + celsius);
-        let absorption_db =
-            |celsius: f64, hz: f64| AirAbsorption::new(celsius, HUMIDITY_PCT, PRESSURE_HPA).db_per_m(hz);
-        let change = |bin: usize| {
-            let hz = bin as f64 * step_hz;
-            -LN_10 / 10.0 * (absorption_db(celsius + 0.5, hz) - absorption_db(celsius - 0.5, hz))
-        };
-        Ok(Self {
-            transducers: (0..power.len()).map(|bin| slope(bin) * per_kelvin).collect(),
-            absorption: (0..power.len()).map(change).collect(),
-        })
-    }
-
-    /// Returns the relative change per kelvin of a bin's energy that goes so many metres.
-    pub fn per_kelvin(&self, bin: usize, metres: f64) -> f64 {
-        let of = |changes: &[f64]| changes.get(bin).copied().unwrap_or(0.0);
-        of(&self.transducers) + metres * of(&self.absorption)
-    }
-}
-
 impl LevelUncertainty {
-    /// Computes the relative error that a run's measurements have in common, and the variance of the rest, of the
-    /// energy of a measurement over Flat's; the run's air was so many kelvin warmer than Flat's.
-    pub fn relative_error(&self, of: &EnergySensitivity, flat: &EnergySensitivity, warmer: f64) -> ErrorMoments {
-        let per = |s: &EnergySensitivity, change: f64| change / s.energy;
-        let both = |value: fn(&EnergySensitivity) -> f64| [of, flat].map(|s| per(s, value(s)));
-        let kinds = [
-            (self.run.gain, self.flat.gain, both(|s| s.gain), both(|s| s.gain_square)),
-            (self.run.delay, self.flat.delay, both(|s| s.delay), both(|s| s.delay_square)),
+    /// Computes the error of the energy of a measurement over Flat's, relative to it.
+    pub fn relative_error(&self, of: &EnergySensitivity, flat: &EnergySensitivity) -> LevelError {
+        let kinds: [fn(&DirectSoundResidual, &EnergySensitivity) -> (ErrorMoments, f64, f64); 2] = [
+            |r, s| (r.gain, s.gain / s.energy, s.gain_square / s.energy),
+            |r, s| (r.delay, s.delay / s.energy, s.delay_square / s.energy),
         ];
-        let mut error = ErrorMoments { mean: warmer * per(of, of.temperature), variance: 0.0 };
-        for (run, of_flat, [s, s_flat], [square, square_flat]) in kinds {
-            if self.is_flat {
-                error.mean += run.mean * (s - s_flat);
-                error.variance += run.variance * (s - s_flat).powi(2);
-                continue;
-            }
-            error.mean += run.mean * s - of_flat.mean * s_flat;
-            // Whatever its sign, an error adds energy.
-            error.mean += run.variance * square - of_flat.variance * square_flat;
-            // Both have Foam's error in them: half of the smaller variance.
-            let shared = run.variance.min(of_flat.variance);
-            error.variance += run.variance * s * s + of_flat.variance * s_flat * s_flat - shared * s * s_flat;
-            error.variance += 2.0 * (run.variance * square).powi(2);
+        let mut error = LevelError {
+            variance: 4.0 * self.run.noise / of.energy,
+            own_per_kelvin: of.temperature / of.energy,
+            ..LevelError::default()
+        };
+        if let Some(residual) = &self.flat {
+            error.variance += 4.0 * residual.noise / flat.energy;
+            error.flat_per_kelvin = flat.temperature / flat.energy;
         }
-        if !self.is_flat {
-            error.variance += 4.0 * (self.run.noise / of.energy + self.flat.noise / flat.energy);
+        for kind in kinds {
+            let (run, s, square) = kind(&self.run, of);
+            // Whatever its sign, an error adds energy.
+            error.common += run.mean * s + run.variance * square;
+            error.variance += run.variance * s * s + 2.0 * (run.variance * square).powi(2);
+            if let Some(residual) = &self.flat {
+                let (of_flat, s_flat, square_flat) = kind(residual, flat);
+                error.common -= of_flat.mean * s_flat + of_flat.variance * square_flat;
+                // Both have Foam's error in them: half of the smaller variance.
+                let shared = run.variance.min(of_flat.variance);
+                error.variance += of_flat.variance * s_flat * s_flat - shared * s * s_flat;
+            }
         }
         error
     }
 
     /// Computes the standard uncertainty of a level, dB; None without energy.
-    pub fn level_db(&self, of: &EnergySensitivity, flat: &EnergySensitivity, warmer: f64) -> Option<f64> {
-        let error = self.relative_error(of, flat, warmer);
-        let db = 10.0 / LN_10 * (error.mean.powi(2) + error.variance).sqrt();
+    pub fn level_db(&self, of: &EnergySensitivity, flat: &EnergySensitivity) -> Option<f64> {
+        let db = self.combine_db(&self.relative_error(of, flat));
         (of.energy > 0.0 && flat.energy > 0.0 && db.is_finite()).then_some(db)
+    }
+
+    /// Combines the parts of an error to a standard uncertainty, dB.
+    pub fn combine_db(&self, error: &LevelError) -> f64 {
+        let temperature = error.own_per_kelvin.hypot(error.flat_per_kelvin) * self.temperature_k;
+        10.0 / LN_10 * (error.common.powi(2) + error.variance + temperature.powi(2)).sqrt()
     }
 }
 
@@ -460,7 +421,7 @@ mod tests {
     }
 
     #[test]
-    fn flat_over_itself_has_no_uncertainty_and_nothing_over_flat_has_none_to_tell() {
+    fn common_errors_cancel_over_flat_and_stay_in_flat_itself() {
         let residual = DirectSoundResidual {
             gain: ErrorMoments { mean: 0.01, variance: 1e-4 },
             delay: ErrorMoments { mean: 0.01, variance: 1e-4 },
@@ -474,33 +435,14 @@ mod tests {
             delay_square: 1.0,
             temperature: 0.001,
         };
-        let mut levels = LevelUncertainty { run: residual, flat: residual, is_flat: true };
-        assert_eq!(levels.level_db(&flat, &flat, 0.0), Some(0.0));
-        levels.is_flat = false;
-        // The common parts cancel, as both have them; the others do not.
-        let db = levels.level_db(&flat, &flat, 0.0).expect("a level");
+        let mut levels = LevelUncertainty { run: residual, flat: Some(residual), temperature_k: 0.1 };
+        let error = levels.relative_error(&flat, &flat);
+        assert!(error.common.abs() < 1e-15 && error.own_per_kelvin == 0.002, "{error:?}");
+        let db = levels.level_db(&flat, &flat).expect("a level");
         assert!((0.01..0.1).contains(&db), "{db}");
-        assert_eq!(levels.level_db(&EnergySensitivity::default(), &flat, 0.0), None);
-    }
-
-    // A tweeter that gets louder by 12 dB an octave, and air that is warmer by a kelvin.
-    #[test]
-    fn warmer_air_changes_energies_by_the_slope_of_the_spectrum_and_by_absorption() {
-        let power: Vec<f64> = (0..LEN / 2 + 1).map(|bin| (bin as f64).powi(4)).collect();
-        let response = TemperatureResponse::new(&power, LEN, RATE_HZ, RANGE_HZ, 20.0).expect("a response");
-        let ratio = crate::temperature::resampling_ratio(20.5, 20.0) / crate::temperature::resampling_ratio(19.5, 20.0);
-        for bin in [10, 40, 150] {
-            let change = response.per_kelvin(bin, 0.0);
-            assert!((change / (ratio.powi(4) - 1.0) - 1.0).abs() < 0.01, "{bin}: {change}");
-        }
-        let absorbed = |celsius| AirAbsorption::new(celsius, HUMIDITY_PCT, PRESSURE_HPA).db_per_m(40e3);
-        let change = (10f64.powf(-0.2 * (absorbed(20.5) - absorbed(19.5))) - 1.0) / 2.0;
-        let found = (response.per_kelvin(160, 2.0) - response.per_kelvin(160, 0.0)) / 2.0;
-        assert!((found / change - 1.0).abs() < 0.02, "{found} {change}");
-        assert!(TemperatureResponse::new(&power[1..], LEN, RATE_HZ, RANGE_HZ, 20.0).is_err());
-        assert_eq!(
-            TemperatureResponse::new(&[0.0; 5], 8, RATE_HZ, RANGE_HZ, 20.0).expect("silent").per_kelvin(2, 0.0),
-            0.0
-        );
+        assert_eq!(levels.level_db(&EnergySensitivity::default(), &flat), None);
+        levels.flat = None;
+        // Half of the variance: nothing is divided by.
+        assert!((levels.relative_error(&flat, &flat).common - 0.0064).abs() < 1e-12);
     }
 }

@@ -1,6 +1,7 @@
 //! Sound from a speaker to a microphone: direct sound, reflections at a relief and at Foam.
 
 pub mod air;
+pub mod air_correction;
 pub mod arrival;
 pub mod foam;
 pub mod foam_reflection;

@@ -248,6 +248,7 @@ mod tests {
             microphone: vec![1; 6].into(),
             loopback: vec![2; 6].into(),
             temperature_c: 20.0,
+            ..SweepRecording::default()
         };
         assert_eq!(key_of(topics::SWEEP, &sweep.encode_to_vec()), Some((2950, 3)));
         let ir = ImpulseResponse { pair_id: 0, attempt: 1, samples: vec![1.0; 9], ..ImpulseResponse::default() };

@@ -5,7 +5,9 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use bytes::Bytes;
+use echolake_dsp::air::AirState;
 use echolake_dsp::chain::{MeasurementParams, MeasurementPlan, MeasurementScratch, ResponseCorrection};
+use echolake_dsp::temperature::ReferenceAir;
 use echolake_lake::Lake;
 use echolake_recording::{ChunkMessage, DecodedChunk, list_damage};
 use echolake_schema::messages::{
@@ -104,7 +106,7 @@ pub(crate) struct Response {
     pub attempt: u32,
     pub log_time_ns: i64,
     pub chunk_offset: u64,
-    pub temperature_c: f64,
+    pub air: AirState,
     pub source: ResponseSource,
     pub ir: Vec<f32>,
 }
@@ -155,7 +157,7 @@ impl Measurer {
             rig: lake.rig().clone(),
             pairs: lake.grid().pairs().len() as u32,
             plans: Mutex::default(),
-            correction: ResponseCorrection::new(response.reference_temperature_c.get(), response.division),
+            correction: ResponseCorrection::new(ReferenceAir::from_response(response), response.division),
         }
     }
 
@@ -243,7 +245,7 @@ impl Measurer {
     ) -> Result<Option<Response>, String> {
         self.known_pair(sweep.pair_id)?;
         self.known_rate(sweep.sample_rate_hz)?;
-        let celsius = Celsius::new(sweep.temperature_c).map_err(|e| e.to_string())?;
+        let air = checked_air(sweep.temperature_c, sweep.humidity_pct, sweep.pressure_hpa)?;
         let format = SampleFormat::try_from(sweep.format).unwrap_or_default();
         let count = sweep.sample_count as usize;
         check_bytes(format, count, &sweep.microphone)?;
@@ -254,7 +256,7 @@ impl Measurer {
             let MeasurementBuffers { microphone, loopback, scratch } = buffers;
             samples::decode_samples(format, &sweep.microphone, microphone).map_err(|e| e.to_string())?;
             samples::decode_samples(format, &sweep.loopback, loopback).map_err(|e| e.to_string())?;
-            match planned.plan.compute_ir(microphone, loopback, celsius.get(), &mut ir, scratch) {
+            match planned.plan.compute_ir(microphone, loopback, &air, &mut ir, scratch) {
                 Ok(()) => Ok(true),
                 Err(echolake_dsp::Error::NoLoopback) => Ok(false),
                 Err(e) => Err(e.to_string()),
@@ -268,7 +270,7 @@ impl Measurer {
             attempt: sweep.attempt,
             log_time_ns: message.log_time_ns,
             chunk_offset,
-            temperature_c: celsius.get(),
+            air,
             source: ResponseSource::Sweep,
             ir,
         }))
@@ -284,7 +286,7 @@ impl Measurer {
     ) -> Result<Option<Response>, String> {
         self.known_pair(given.pair_id)?;
         self.known_rate(given.sample_rate_hz)?;
-        let celsius = Celsius::new(given.temperature_c).map_err(|e| e.to_string())?;
+        let air = checked_air(given.temperature_c, given.humidity_pct, given.pressure_hpa)?;
         if let Some(at) = given.samples.iter().position(|x| !x.is_finite()) {
             return Err(format!("sample {at} is {}", given.samples[at]));
         }
@@ -300,7 +302,7 @@ impl Measurer {
         } else if swept.contains(&(given.pair_id, given.attempt)) {
             return Ok(None);
         } else {
-            self.correction.correct_response(&given.samples, celsius.get(), &mut ir);
+            self.correction.correct_response(&given.samples, &air, &mut ir);
             ResponseSource::Ir
         };
         Ok(Some(Response {
@@ -308,7 +310,7 @@ impl Measurer {
             attempt: given.attempt,
             log_time_ns: message.log_time_ns,
             chunk_offset,
-            temperature_c: celsius.get(),
+            air,
             source,
             ir,
         }))
@@ -333,7 +335,7 @@ impl Measurer {
             low_hz: self.rig.sweep.low_hz,
             high_hz: self.rig.sweep.high_hz,
             division: self.rig.impulse_response.division,
-            reference_celsius: self.rig.impulse_response.reference_temperature_c.get(),
+            reference: ReferenceAir::from_response(&self.rig.impulse_response),
         });
         let plan = Arc::new(RecordingPlan { plan: plan.map_err(|e| e.to_string())?, idle: Mutex::default() });
         plans.insert(recording_len, plan.clone());
@@ -348,6 +350,18 @@ impl Measurer {
         let expected = self.rig.sweep.rate_hz.get();
         if rate_hz == expected { Ok(()) } else { Err(format!("sampled at {rate_hz} Hz, the lake's rig at {expected}")) }
     }
+}
+
+// Humidity and pressure are those of the reference air if the recorder did not know them.
+fn checked_air(celsius: f64, humidity_pct: Option<f64>, pressure_hpa: Option<f64>) -> Result<AirState, String> {
+    let celsius = Celsius::new(celsius).map_err(|e| e.to_string())?.get();
+    let known = AirState::with_known(celsius, humidity_pct, pressure_hpa);
+    let given = AirState {
+        temperature_c: celsius,
+        humidity_pct: humidity_pct.unwrap_or(known.humidity_pct),
+        pressure_hpa: pressure_hpa.unwrap_or(known.pressure_hpa),
+    };
+    given.check_moisture().map(|()| given).map_err(|e| e.to_string())
 }
 
 // Does not copy the samples: they stay in the chunk.
@@ -382,6 +396,7 @@ mod tests {
             microphone: vec![4; 9].into(),
             loopback: vec![5; 9].into(),
             temperature_c: 6.5,
+            ..SweepRecording::default()
         };
         let chunk = Bytes::from(sent.encode_to_vec());
         let received: SweepRecording =

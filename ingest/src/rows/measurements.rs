@@ -37,7 +37,7 @@ fn measurement_batch(rig: &Rig, grid: &Grid, keys: &RunKeys, rows: &[(Measuremen
         .push_ints("attempt", rows.iter().map(|(m, _)| m.attempt as i32))
         .push_texts("verdict", rows.iter().map(|(m, _)| m.verdict().label()))
         .push_texts("reasons", rows.iter().map(|(m, _)| m.reasons.join("; ")))
-        .push_doubles("temperature_c", rows.iter().map(|(_, r)| r.temperature_c))
+        .push_doubles("temperature_c", rows.iter().map(|(_, r)| r.air.temperature_c))
         .push_doubles("humidity_pct", rows.iter().map(|(m, _)| finite_value(m.humidity_pct)))
         .push_doubles("pressure_hpa", rows.iter().map(|(m, _)| finite_value(m.pressure_hpa)))
         .push_floats("outside_level_db", rows.iter().map(|(m, _)| known(m.outside_level_db)))

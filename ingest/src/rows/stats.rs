@@ -1,11 +1,9 @@
 //! Rows of table `surface_stats`.
 
-use std::f64::consts::LN_10;
-
 use arrow::record_batch::RecordBatch;
 use echolake_dsp::level::{p90_mean, percentile, power_to_db};
 use echolake_dsp::mean::SignalMean;
-use echolake_dsp::uncertainty::ErrorMoments;
+use echolake_dsp::uncertainty::{LevelError, LevelUncertainty};
 use echolake_schema::Rig;
 use echolake_schema::tables::{BandStatistics, Table};
 
@@ -20,7 +18,9 @@ pub(crate) struct SurfaceLevels {
     /// The same without Foam's reflection; none if it is not known.
     pub unbiased: Vec<Vec<f64>>,
     /// Relative errors of TNCE; none if they are not known.
-    pub errors: Vec<Vec<ErrorMoments>>,
+    pub errors: Vec<Vec<LevelError>>,
+    /// Combines them; None if they are not known.
+    pub uncertainty: Option<LevelUncertainty>,
     /// Mean NCE curves of the bands.
     pub curves: Vec<SignalMean>,
 }
@@ -37,8 +37,10 @@ pub(crate) fn stats_rows(
     for (stats, values) in stats.iter_mut().zip(&levels.unbiased) {
         stats.unbiased_p90_mean_db = stats_of(String::new(), values).p90_mean_db;
     }
-    for ((stats, values), errors) in stats.iter_mut().zip(&levels.tnce).zip(&levels.errors) {
-        stats.p90_mean_u_db = p90_mean_uncertainty(values, errors);
+    if let Some(uncertainty) = &levels.uncertainty {
+        for ((stats, values), errors) in stats.iter_mut().zip(&levels.tnce).zip(&levels.errors) {
+            stats.p90_mean_u_db = p90_mean_uncertainty(values, errors, uncertainty);
+        }
     }
     let batch = keys
         .begin_rows(Table::SurfaceStats, rig, stats.len())
@@ -95,19 +97,20 @@ fn stats_of(band: String, values: &[f64]) -> BandStatistics {
 }
 
 // Errors that the pairs have in common add up, the others average out.
-fn p90_mean_uncertainty(values: &[f64], errors: &[ErrorMoments]) -> Option<f64> {
+fn p90_mean_uncertainty(values: &[f64], errors: &[LevelError], uncertainty: &LevelUncertainty) -> Option<f64> {
     let mut sorted: Vec<f64> = values.iter().copied().filter(|x| x.is_finite()).collect();
     sorted.sort_by(f64::total_cmp);
     let limit = percentile(&sorted, 90.0);
     let mut sum = 0.0;
-    let mut common = 0.0;
-    let mut variance = 0.0;
+    let mut mean = LevelError::default();
     for (value, error) in values.iter().zip(errors).filter(|(value, _)| **value > 0.0 && **value <= limit) {
         sum += value;
-        common += value * error.mean;
-        variance += value * value * error.variance;
+        mean.common += value * error.common;
+        mean.variance += value * value * error.variance;
+        mean.own_per_kelvin += value * error.own_per_kelvin;
+        mean.flat_per_kelvin += value * error.flat_per_kelvin;
     }
-    finite_value(10.0 / LN_10 * (common * common + variance).sqrt() / sum)
+    finite_value(uncertainty.combine_db(&mean) / sum)
 }
 
 fn standard_deviation(levels: &[f64]) -> Option<f64> {
@@ -118,6 +121,8 @@ fn standard_deviation(levels: &[f64]) -> Option<f64> {
 
 #[cfg(test)]
 mod tests {
+    use echolake_dsp::uncertainty::DirectSoundResidual;
+
     use super::*;
 
     #[test]
@@ -131,11 +136,14 @@ mod tests {
 
     #[test]
     fn common_errors_stay_in_the_mean_and_others_average_out() {
-        let error = |mean, variance| vec![ErrorMoments { mean, variance }; 100];
-        let u = |errors: &[ErrorMoments]| p90_mean_uncertainty(&[0.5; 100], errors).expect("an uncertainty");
-        assert!((u(&error(0.01, 0.0)) - 0.0434).abs() < 1e-4);
-        assert!((u(&error(0.0, 1e-4)) - 0.00434).abs() < 1e-5);
-        assert_eq!(p90_mean_uncertainty(&[0.5; 100], &[]), None);
+        let uncertainty = LevelUncertainty { run: DirectSoundResidual::default(), flat: None, temperature_k: 0.1 };
+        let u =
+            |error: LevelError| p90_mean_uncertainty(&[0.5; 100], &[error; 100], &uncertainty).expect("an uncertainty");
+        assert!((u(LevelError { common: 0.01, ..LevelError::default() }) - 0.0434).abs() < 1e-4);
+        assert!((u(LevelError { variance: 1e-4, ..LevelError::default() }) - 0.00434).abs() < 1e-5);
+        let slopes = LevelError { own_per_kelvin: 0.03, flat_per_kelvin: 0.04, ..LevelError::default() };
+        assert!((u(slopes) - 0.0217).abs() < 1e-4);
+        assert_eq!(p90_mean_uncertainty(&[0.5; 100], &[], &uncertainty), None);
     }
 
     #[test]

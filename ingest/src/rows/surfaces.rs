@@ -4,7 +4,7 @@ use std::f64::consts::TAU;
 
 use arrow::record_batch::RecordBatch;
 use echolake_dsp::height_field::HeightField;
-use echolake_dsp::temperature::speed_of_sound;
+use echolake_dsp::temperature::ReferenceAir;
 use echolake_lake::ReferenceSurfaces;
 use echolake_schema::tables::Table;
 use echolake_schema::{ProjectName, Rig, SurfaceId, SurfaceRecord};
@@ -66,7 +66,7 @@ fn height_field(heights_mm: &[f32], size_mm: f64) -> Option<HeightField> {
 
 // Of cells as wide as half a wavelength, nothing is known within one.
 fn detail_phase(heights: &HeightField, rig: &Rig, hz: f64) -> Option<f32> {
-    let wavelength_mm = 1e3 * speed_of_sound(rig.impulse_response.reference_temperature_c.get()) / hz;
+    let wavelength_mm = 1e3 * ReferenceAir::from_response(&rig.impulse_response).speed_of_sound() / hz;
     let phase = TAU / wavelength_mm * heights.detail_rms_mm(wavelength_mm);
     (wavelength_mm > 2.0 * heights.pitch_mm()).then_some(phase as f32)
 }

@@ -31,6 +31,11 @@ pub struct ImpulseResponse {
     /// True where the time axis is already that of the reference temperature.
     #[prost(bool, tag = "6")]
     pub temperature_corrected: bool,
+    /// Relative humidity and pressure of the air; absent where nobody measured them.
+    #[prost(double, optional, tag = "7")]
+    pub humidity_pct: ::core::option::Option<f64>,
+    #[prost(double, optional, tag = "8")]
+    pub pressure_hpa: ::core::option::Option<f64>,
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Measurement {
@@ -138,6 +143,11 @@ pub struct SweepRecording {
     /// Temperature of the air at this measurement, degrees Celsius.
     #[prost(double, tag = "8")]
     pub temperature_c: f64,
+    /// Relative humidity and pressure of the air; absent where nobody measured them.
+    #[prost(double, optional, tag = "9")]
+    pub humidity_pct: ::core::option::Option<f64>,
+    #[prost(double, optional, tag = "10")]
+    pub pressure_hpa: ::core::option::Option<f64>,
 }
 /// How the samples of one channel become bytes. All are little-endian.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]

@@ -8,6 +8,7 @@ use axum::extract::State;
 use axum::http::{HeaderMap, header};
 use axum::response::{IntoResponse as _, Response};
 use echolake_dsp::chain::raw_len;
+use echolake_dsp::temperature::ReferenceAir;
 use echolake_schema::Rig;
 use sha2::{Digest as _, Sha256};
 use utoipa_axum::router::OpenApiRouter;
@@ -35,7 +36,7 @@ pub struct ViewerLayout {
 impl ViewerLayout {
     /// The layout for runs of a rig.
     pub fn new(rig: &Rig) -> Self {
-        let length = raw_len(rig.impulse_response.length, rig.impulse_response.reference_temperature_c.get());
+        let length = raw_len(rig.impulse_response.length, &ReferenceAir::from_response(&rig.impulse_response));
         let rate_khz = rig.sweep.rate_hz.get() / 1e3;
         let text = TEMPLATE
             .replace(LAST_SAMPLE, &length.saturating_sub(1).to_string())

@@ -3,9 +3,11 @@
 use std::collections::HashMap;
 
 use anyhow::Context as _;
+use echolake_dsp::air::AirState;
 use echolake_dsp::chain::ResponseCorrection;
 use echolake_dsp::components::PrincipalComponents;
 use echolake_dsp::heights;
+use echolake_dsp::temperature::ReferenceAir;
 use echolake_figures::{
     GridFigure, GridLayer, GridPanel, LevelPalette, MapFigure, NceFigure, NcePanel, ReliefFigure, ReliefPanel,
     ResponseTrace, StepsFigure, StepsRow,
@@ -189,8 +191,10 @@ pub(super) async fn write_steps(source: &FigureSource, args: &StepsArgs) -> anyh
             for celsius in &args.celsius {
                 anyhow::ensure!((-60.0..=80.0).contains(celsius), "`--celsius` is {celsius}; it is -60 to 80");
                 let mut samples = vec![0.0; ir.len()];
+                let reference = ReferenceAir::from_response(&rig.impulse_response);
                 let correction = ResponseCorrection::<f32>::new(reference, rig.impulse_response.division);
-                correction.correct_response(&raw.samples, *celsius, &mut samples);
+                let air = AirState::with_known(*celsius, None, None);
+                correction.correct_response(&raw.samples, &air, &mut samples);
                 traces.push(trace(format!("as if measured at {celsius} °C"), samples, own_step));
             }
             traces

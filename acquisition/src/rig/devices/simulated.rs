@@ -9,11 +9,11 @@ use std::f64::consts::{PI, TAU};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use echolake_dsp::RealSample as _;
-use echolake_dsp::air::AirAbsorption;
+use echolake_dsp::air::{AirAbsorption, AirState};
 use echolake_dsp::deconvolution::fast_length;
 use echolake_dsp::geometry::specular_point;
 use echolake_dsp::kirchhoff::{FacetScattering, KirchhoffPlan, KirchhoffScratch, SoundPath, TransducerPose};
-use echolake_dsp::temperature::speed_of_sound;
+use echolake_dsp::temperature::{ReferenceAir, speed_of_sound};
 use echolake_panel::material::SurfaceMaterial;
 use echolake_panel::relief::HeightField;
 use echolake_schema::manifest::Origin;
@@ -159,6 +159,7 @@ pub fn simulated_rig(simulation: &RigSimulation<'_>) -> Result<RigDevices, Error
         audio: Box::new(SimulatedAudio {
             world: world.clone(),
             rate_hz,
+            reference: ReferenceAir::from_response(&simulation.rig.impulse_response),
             direct,
             reflection,
             scratch: plan.make_scratch(),
@@ -199,11 +200,11 @@ fn lock_world(world: &SharedWorld) -> MutexGuard<'_, SimulatedWorld> {
 impl SimulatedWorld {
     fn temperature_c(&self) -> f64 {
         let drift = 0.8 * (TAU * self.elapsed_hours() / 7.0 + self.air.phase).sin() + self.air.walk;
-        21.5 + if self.effects.noise_and_drift { drift } else { 0.0 }
+        self.effects.temperature_c + if self.effects.noise_and_drift { drift } else { 0.0 }
     }
 
     fn humidity_pct(&self) -> f64 {
-        45.0 + 4.0 * (TAU * self.elapsed_hours() / 9.0).sin()
+        self.effects.humidity_pct + 4.0 * (TAU * self.elapsed_hours() / 9.0).sin()
     }
 
     fn pressure_hpa(&self) -> f64 {
@@ -309,6 +310,7 @@ impl AmbientSensor for SimulatedSensor {
 struct SimulatedAudio {
     world: SharedWorld,
     rate_hz: f64,
+    reference: ReferenceAir,
     /// Spectra of the direct sound and of the reflection.
     direct: Vec<Complex<f32>>,
     reflection: Vec<Complex<f32>>,
@@ -343,13 +345,17 @@ impl AudioInterface for SimulatedAudio {
         let spoiled = world.effects.noise_and_drift && world.rng.random_bool(SPOILED);
         let level = if spoiled { SPOILED_LEVEL_DB } else { 42.0 };
         world.outside_level_db = level + 1.5 * world.draw_normal();
-        let temperature_c = world.temperature_c();
-        let air = AirAbsorption::new(temperature_c, world.humidity_pct(), world.pressure_hpa());
+        let state = AirState {
+            temperature_c: world.temperature_c(),
+            humidity_pct: world.humidity_pct(),
+            pressure_hpa: world.pressure_hpa(),
+        };
+        let air = AirAbsorption::new(&state);
         let absorbs = world.effects.air_absorption;
         let path = SoundPath {
             microphone: world.microphone,
             speaker: world.speaker,
-            speed_of_sound_m_s: speed_of_sound(temperature_c),
+            speed_of_sound_m_s: self.reference.speed_in(&state),
             absorption_db_per_m: &|hz| if absorbs { air.db_per_m(hz) } else { 0.0 },
             direct: &self.direct,
             reflection: &self.reflection,

@@ -1,7 +1,8 @@
 //! One attempt at one pair: made, judged, and recorded.
 
+use echolake_dsp::air::AirState;
 use echolake_dsp::geometry::direct_mm;
-use echolake_dsp::temperature::{resampling_ratio, response_limits_hz, speed_of_sound};
+use echolake_dsp::temperature::{ReferenceAir, response_limits_hz};
 use echolake_schema::messages::{AmbientSample, ImpulseResponse, Measurement, SampleFormat, SweepRecording, Verdict};
 use echolake_schema::samples::split_24;
 use echolake_schema::{Celsius, Pair, Timestamp};
@@ -147,8 +148,10 @@ impl RunController<'_> {
     fn judge_take(&mut self, microphone: [f64; 3], speaker: [f64; 3], reading: &AmbientReading) -> Judged {
         let mut clipped = to_fractions(&self.take.microphone, &mut self.microphone);
         clipped += to_fractions(&self.take.loopback, &mut self.loopback);
-        let arrival = direct_mm(microphone, speaker) / 1e3 / speed_of_sound(reading.temperature_c);
-        match self.deconvolve_and_assess(arrival, clipped, reading.temperature_c) {
+        let reference = ReferenceAir::from_response(&self.rig.impulse_response);
+        let air = measured_air(reading);
+        let arrival = direct_mm(microphone, speaker) / 1e3 / reference.speed_in(&air);
+        match self.deconvolve_and_assess(arrival, clipped, reference.time_ratio(&air)) {
             Ok(assessment) => {
                 let mut objections = assessment.find_objections(&self.rig.validation, reading.outside_level_db);
                 objections.extend(find_unknowns(&assessment, reading));
@@ -166,11 +169,10 @@ impl RunController<'_> {
         &mut self,
         arrival_secs: f64,
         clipped: u32,
-        celsius: f64,
+        time_ratio: f64,
     ) -> Result<TakeAssessment, echolake_dsp::Error> {
         let sweep = &self.rig.sweep;
-        let reference = self.rig.impulse_response.reference_temperature_c.get();
-        let limits_hz = response_limits_hz([sweep.low_hz, sweep.high_hz], resampling_ratio(celsius, reference));
+        let limits_hz = response_limits_hz([sweep.low_hz, sweep.high_hz], time_ratio);
         self.deconvolution.run_within(limits_hz, &self.microphone, &self.loopback, &mut self.ir, &mut self.scratch)?;
         self.assessor.assess_take(&self.microphone, &self.loopback, arrival_secs, clipped)
     }
@@ -200,6 +202,7 @@ impl RunController<'_> {
         }
         // Without a temperature they are useless; the verdict has the sensor's values.
         let is_usable = made.reached.is_some() && Celsius::new(reading.temperature_c).is_ok();
+        let air = measured_air(reading);
         if run.options.keep == RecordingMode::Sweeps && is_usable {
             let recording = SweepRecording {
                 pair_id: m.pair_id,
@@ -210,6 +213,8 @@ impl RunController<'_> {
                 microphone: split_24(&self.take.microphone).into(),
                 loopback: split_24(&self.take.loopback).into(),
                 temperature_c: reading.temperature_c,
+                humidity_pct: Some(air.humidity_pct),
+                pressure_hpa: Some(air.pressure_hpa),
             };
             run.recorder.sweep(at, &recording)?;
         }
@@ -221,6 +226,8 @@ impl RunController<'_> {
                 samples: self.ir.clone(),
                 temperature_c: reading.temperature_c,
                 temperature_corrected: false,
+                humidity_pct: Some(air.humidity_pct),
+                pressure_hpa: Some(air.pressure_hpa),
             };
             run.recorder.ir(at, &ir)?;
         }
@@ -283,6 +290,11 @@ fn to_fractions(samples: &[i32], out: &mut Vec<f32>) -> u32 {
     out.clear();
     out.extend(samples.iter().map(|x| *x as f32 / FULL_SCALE));
     samples.iter().filter(|x| **x <= -(1 << 23) || **x >= (1 << 23) - 1).count() as u32
+}
+
+// Without humidity and pressure from the sensor they are the reference air's.
+fn measured_air(reading: &AmbientReading) -> AirState {
+    AirState::with_known(reading.temperature_c, Some(reading.humidity_pct), Some(reading.pressure_hpa))
 }
 
 fn unknown_assessment(clipped_samples: u32) -> TakeAssessment {

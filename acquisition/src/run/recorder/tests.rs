@@ -36,6 +36,7 @@ fn sweep(samples: usize) -> SweepRecording {
         microphone: channel(1).into(),
         loopback: channel(2).into(),
         temperature_c: 21.25,
+        ..Default::default()
     }
 }
 

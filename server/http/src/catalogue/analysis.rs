@@ -6,7 +6,7 @@ use echolake_dsp::envelope::EnvelopePlan;
 use echolake_dsp::frequency_response::{FrequencyResponse, FrequencyResponsePlan};
 use echolake_dsp::level::plotted_power_to_db;
 use echolake_dsp::spectrogram::SpectrogramPlan;
-use echolake_dsp::temperature::speed_of_sound;
+use echolake_dsp::temperature::ReferenceAir;
 use echolake_service::RequestFault;
 use serde::{Deserialize, Serialize};
 use utoipa::{IntoParams, ToSchema};
@@ -109,7 +109,7 @@ pub(super) async fn analysis(
     );
     let (measurement, [own, flat], geometry) = found?;
     let rig = request.catalogue.lake().rig();
-    let speed_mm_s = 1000.0 * speed_of_sound(rig.impulse_response.reference_temperature_c.get());
+    let speed_mm_s = 1000.0 * ReferenceAir::from_response(&rig.impulse_response).speed_of_sound();
     let direct_s = geometry.direct_mm / speed_mm_s;
     let reflected_s = geometry.image_mm / speed_mm_s;
     let removed_s = match query.delay {

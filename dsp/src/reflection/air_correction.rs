@@ -1,0 +1,324 @@
+//! Correction of reflected responses from the air that they were measured in to the reference air.
+//!
+//! The correction of the time axis moves every frequency, and with it what speaker and microphone do to each: along a
+//! slope of 6 dB an octave 0.6 % is 0.05 dB. And air of another temperature and humidity absorbs more or less.
+
+use std::f64::consts::LN_10;
+use std::sync::Arc;
+
+use realfft::num_complex::Complex;
+use realfft::{ComplexToReal, RealToComplex};
+
+use crate::air::{AirAbsorption, AirState};
+use crate::error::check_len;
+use crate::temperature::ReferenceAir;
+use crate::{Error, RealSample};
+
+/// Natural logarithm of an amplitude ratio per dB.
+const NEPER_PER_DB: f64 = LN_10 / 20.0;
+
+/// Mean power spectrum of sound over a path, `[len / 2 + 1]`, and the path's mean length, m.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PathSpectrum {
+    /// Power of each bin.
+    pub power: Vec<f64>,
+    /// Length, m.
+    pub metres: f64,
+}
+
+/// The air that a pair's response and the direct sound beneath it were measured in, and the lengths of both paths.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PairAir {
+    /// Air of the response.
+    pub response: AirState,
+    /// Air of the direct sound that is subtracted.
+    pub direct: AirState,
+    /// Length of the direct path, m.
+    pub direct_m: f64,
+    /// Length of the path by the panel's plane, m.
+    pub reflected_m: f64,
+}
+
+/// Subtracts the direct sound, and corrects what remains to the reference air.
+///
+/// The direct sound is brought to the response's air first, because it is subtracted there.
+pub struct AirCorrection<T: RealSample> {
+    rate_hz: f64,
+    len: usize,
+    reference: ReferenceAir,
+    /// `[bins]`: d ln power / d ln frequency of speaker and microphone, on the direct and on the reflected path.
+    direct_slopes: Vec<f64>,
+    reflected_slopes: Vec<f64>,
+    /// `[bins]`: absorption by the reference air, neper/m.
+    absorption: Vec<f64>,
+    /// `[bins]`: relative change of an energy per kelvin by speaker and microphone, and by absorption per metre.
+    transducers_per_kelvin: Vec<f64>,
+    absorption_per_kelvin: Vec<f64>,
+    forward: Arc<dyn RealToComplex<T>>,
+    inverse: Arc<dyn ComplexToReal<T>>,
+}
+
+/// Buffers of an [`AirCorrection`].
+pub struct AirScratch<T> {
+    signal: Vec<T>,
+    spectrum: Vec<Complex<T>>,
+    direct: Vec<Complex<T>>,
+    work: Vec<Complex<T>>,
+}
+
+/// Speed of sound in air over that in the reference air, and absorption by bin of a corrected response.
+struct AirEffect {
+    ln_ratio: f64,
+    ratio: f64,
+    absorption: AirAbsorption,
+}
+
+impl AirEffect {
+    fn new(reference: &ReferenceAir, air: &AirState) -> Self {
+        let ratio = reference.time_ratio(air);
+        Self { ln_ratio: ratio.ln(), ratio, absorption: AirAbsorption::new(air) }
+    }
+
+    // At a frequency of the corrected response, neper/m.
+    fn nepers_per_m(&self, hz: f64) -> f64 {
+        NEPER_PER_DB * self.absorption.db_per_m(hz * self.ratio)
+    }
+}
+
+impl<T: RealSample> AirCorrection<T> {
+    /// Plans for responses of `len` samples to sweeps of this range, Hz, from the mean spectra of the direct sound and
+    /// of what Flat reflects, whose slopes are those of speaker and microphone, and absorption's.
+    ///
+    /// # Errors
+    /// [`Error::Length`].
+    pub fn new(
+        len: usize,
+        rate_hz: f64,
+        range_hz: [f64; 2],
+        reference: ReferenceAir,
+        [direct, reflected]: [&PathSpectrum; 2],
+    ) -> Result<Self, Error> {
+        let step_hz = rate_hz / len as f64;
+        let [colder, own, warmer] = [-0.5, 0.0, 0.5].map(|kelvin| {
+            let air = reference.air();
+            AirEffect::new(&reference, &AirState { temperature_c: air.temperature_c + kelvin, ..air })
+        });
+        let by_bin = |effect: &AirEffect| -> Vec<f64> {
+            (0..len / 2 + 1).map(|bin| effect.nepers_per_m(bin as f64 * step_hz)).collect()
+        };
+        let absorption = by_bin(&own);
+        let slopes = |path: &PathSpectrum| {
+            check_len("the mean power spectrum", path.power.len(), len / 2 + 1)?;
+            let bins = path.power.iter().zip(&absorption);
+            let emitted: Vec<f64> = bins.map(|(power, nepers)| power * (2.0 * path.metres * nepers).exp()).collect();
+            Ok::<_, Error>(spectral_slopes(&emitted, step_hz, range_hz))
+        };
+        let reflected_slopes = slopes(reflected)?;
+        let colder_by_bin = by_bin(&colder);
+        let changes = by_bin(&warmer).into_iter().zip(colder_by_bin).map(|(warm, cold)| 2.0 * (cold - warm));
+        Ok(Self {
+            rate_hz,
+            len,
+            reference,
+            direct_slopes: slopes(direct)?,
+            transducers_per_kelvin: reflected_slopes.iter().map(|s| s * (warmer.ln_ratio - colder.ln_ratio)).collect(),
+            absorption_per_kelvin: changes.collect(),
+            reflected_slopes,
+            absorption,
+            forward: T::plan_real_forward(len),
+            inverse: T::plan_real_inverse(len),
+        })
+    }
+
+    /// Buffers; one per thread.
+    pub fn make_scratch(&self) -> AirScratch<T> {
+        let work = self.forward.get_scratch_len().max(self.inverse.get_scratch_len());
+        AirScratch {
+            signal: self.forward.make_input_vec(),
+            spectrum: self.forward.make_output_vec(),
+            direct: self.forward.make_output_vec(),
+            work: vec![Complex::default(); work],
+        }
+    }
+
+    /// Computes what a surface reflects, in the reference air, from a response and the direct sound.
+    ///
+    /// ir, direct, reflected  `[len]`
+    ///
+    /// # Errors
+    /// [`Error::Length`] or [`Error::NotFinite`].
+    pub fn subtract_direct(
+        &self,
+        ir: &[T],
+        direct: &[T],
+        pair: &PairAir,
+        reflected: &mut [T],
+        scratch: &mut AirScratch<T>,
+    ) -> Result<(), Error> {
+        check_len("the reflected response", reflected.len(), self.len)?;
+        let AirScratch { signal, spectrum, direct: direct_spectrum, work } = scratch;
+        self.transform(ir, signal, spectrum, work)?;
+        self.transform(direct, signal, direct_spectrum, work)?;
+        let of_response = AirEffect::new(&self.reference, &pair.response);
+        let of_direct = AirEffect::new(&self.reference, &pair.direct);
+        let step_hz = self.rate_hz / self.len as f64;
+        let count = self.len as f64;
+        for (bin, (x, d)) in spectrum.iter_mut().zip(&*direct_spectrum).enumerate() {
+            let hz = bin as f64 * step_hz;
+            let absorbed = of_response.nepers_per_m(hz);
+            let to_response = self.direct_slopes[bin] / 2.0 * (of_response.ln_ratio - of_direct.ln_ratio)
+                + (of_direct.nepers_per_m(hz) - absorbed) * pair.direct_m;
+            let to_reference = -self.reflected_slopes[bin] / 2.0 * of_response.ln_ratio
+                + (absorbed - self.absorption[bin]) * pair.reflected_m;
+            *x = (*x - d * T::of(to_response.exp())) * T::of(to_reference.exp() / count);
+        }
+        // The ends of a real signal's spectrum are real.
+        spectrum[0].im = T::default();
+        if self.len.is_multiple_of(2) {
+            spectrum[self.len / 2].im = T::default();
+        }
+        let done = self.inverse.process_with_scratch(spectrum, reflected, work);
+        done.map_err(|_| Error::NotFinite { what: "the response" })
+    }
+
+    /// Returns the relative change, per kelvin that the air is warmer than it is thought to be, of a bin's energy after
+    /// a path of so many metres.
+    pub fn energy_per_kelvin(&self, bin: usize, metres: f64) -> f64 {
+        let of = |changes: &[f64]| changes.get(bin).copied().unwrap_or(0.0);
+        of(&self.transducers_per_kelvin) + metres * of(&self.absorption_per_kelvin)
+    }
+
+    fn transform(
+        &self,
+        from: &[T],
+        signal: &mut [T],
+        spectrum: &mut [Complex<T>],
+        work: &mut [Complex<T>],
+    ) -> Result<(), Error> {
+        check_len("the response", from.len(), self.len)?;
+        signal.copy_from_slice(from);
+        let done = self.forward.process_with_scratch(signal, spectrum, work);
+        let is_finite = done.is_ok() && spectrum.first().is_some_and(|dc| dc.re.f64().is_finite());
+        if is_finite { Ok(()) } else { Err(Error::NotFinite { what: "the response" }) }
+    }
+}
+
+// Between neighbours, within the range that the sweep has; beyond it the nearest one's.
+fn spectral_slopes(power: &[f64], step_hz: f64, [low_hz, high_hz]: [f64; 2]) -> Vec<f64> {
+    // The bins whose neighbours are within the range and no part of its tapers.
+    let first = (low_hz * 1.02 / step_hz).ceil() as usize + 2;
+    let last = ((high_hz * 0.98 / step_hz).floor() as usize).saturating_sub(2).min(power.len().saturating_sub(2));
+    let slope = |bin: usize| {
+        let bin = bin.clamp(first, last.max(first));
+        let Some(above) = power.get(bin + 1) else { return 0.0 };
+        let slope = (above / power[bin - 1]).ln() / ((bin + 1) as f64 / (bin - 1) as f64).ln();
+        if slope.is_finite() { slope } else { 0.0 }
+    };
+    (0..power.len()).map(slope).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use echolake_schema::AirTreatment;
+
+    use super::*;
+
+    const LEN: usize = 384;
+    const RATE_HZ: f64 = 96e3;
+    const REFERENCE: ReferenceAir = ReferenceAir { celsius: 20.0, treatment: AirTreatment::Complete };
+    const DIRECT_M: f64 = 0.3;
+    const REFLECTED_M: f64 = 0.7;
+
+    // Power of a tweeter that gets louder by 12 dB an octave, at the frequencies of a corrected response.
+    fn emitted(hz: f64) -> f64 {
+        (hz / 10e3).powi(4)
+    }
+
+    // Both paths' sound in air, on the reference's time axis: their delays are the same in all air.
+    fn response(air: &AirState, reflected: f64) -> Vec<f64> {
+        let effect = AirEffect::new(&REFERENCE, air);
+        let mut spectrum: Vec<_> = (0..LEN / 2 + 1)
+            .map(|bin| {
+                let hz = bin as f64 * RATE_HZ / LEN as f64;
+                if !(2e3..=40e3).contains(&hz) {
+                    return Complex::default();
+                }
+                let path = |metres: f64, samples: f64| {
+                    let level = emitted(hz * effect.ratio).sqrt() * (-metres * effect.nepers_per_m(hz)).exp();
+                    Complex::from_polar(level, -std::f64::consts::TAU * bin as f64 * samples / LEN as f64)
+                };
+                path(DIRECT_M, 84.0) + path(REFLECTED_M, 196.0) * reflected
+            })
+            .collect();
+        let mut signal = vec![0.0; LEN];
+        f64::plan_real_inverse(LEN).process(&mut spectrum, &mut signal).expect("a signal");
+        signal
+    }
+
+    fn correction() -> AirCorrection<f64> {
+        let path = |metres: f64| {
+            let effect = AirEffect::new(&REFERENCE, &REFERENCE.air());
+            let power = (0..LEN / 2 + 1).map(|bin| {
+                let hz = bin as f64 * RATE_HZ / LEN as f64;
+                emitted(hz) * (-2.0 * metres * effect.nepers_per_m(hz)).exp()
+            });
+            PathSpectrum { power: power.collect(), metres }
+        };
+        let paths = [&path(DIRECT_M), &path(REFLECTED_M)];
+        AirCorrection::new(LEN, RATE_HZ, [2e3, 40e3], REFERENCE, paths).expect("a correction")
+    }
+
+    #[test]
+    fn reflections_are_those_of_the_reference_air() {
+        let correction = correction();
+        let mut scratch = correction.make_scratch();
+        let reference = REFERENCE.air();
+        let silent = response(&reference, 0.0);
+        let expected: Vec<f64> = response(&reference, 0.5).iter().zip(&silent).map(|(all, d)| all - d).collect();
+        for (celsius, humidity_pct) in [(18.0, 30.0), (25.0, 60.0), (20.0, 50.0)] {
+            let own = AirState { temperature_c: celsius, humidity_pct, pressure_hpa: 965.0 };
+            let other = AirState { temperature_c: 22.0, humidity_pct: 40.0, pressure_hpa: 980.0 };
+            let pair = PairAir { response: own, direct: other, direct_m: DIRECT_M, reflected_m: REFLECTED_M };
+            let mut reflected = vec![f64::NAN; LEN];
+            correction
+                .subtract_direct(&response(&own, 0.5), &response(&other, 0.0), &pair, &mut reflected, &mut scratch)
+                .expect("a reflection");
+            let energy = |signal: &[f64]| signal.iter().map(|x| x * x).sum::<f64>();
+            let off: Vec<f64> = reflected.iter().zip(&expected).map(|(a, b)| a - b).collect();
+            let off_db = 10.0 * (energy(&off) / energy(&expected)).log10();
+            // The slope between two bins, 500 Hz apart, is not quite that of the power.
+            assert!(off_db < -75.0, "{celsius} C: {off_db} dB");
+        }
+    }
+
+    #[test]
+    fn energies_change_by_the_slope_and_by_absorption() {
+        let correction = correction();
+        let air = |celsius| AirState { temperature_c: celsius, ..REFERENCE.air() };
+        let ratio = REFERENCE.time_ratio(&air(20.5)) / REFERENCE.time_ratio(&air(19.5));
+        for bin in [20, 40, 150] {
+            let change = correction.energy_per_kelvin(bin, 0.0);
+            assert!((change / (ratio.powi(4) - 1.0) - 1.0).abs() < 0.01, "{bin}: {change}");
+        }
+        let absorbed = |celsius| AirAbsorption::new(&air(celsius)).db_per_m(40e3 * REFERENCE.time_ratio(&air(celsius)));
+        let change = (10f64.powf(-0.2 * (absorbed(20.5) - absorbed(19.5))) - 1.0) / 2.0;
+        let found = (correction.energy_per_kelvin(160, 2.0) - correction.energy_per_kelvin(160, 0.0)) / 2.0;
+        assert!((found / change - 1.0).abs() < 0.02, "{found} {change}");
+    }
+
+    #[test]
+    fn wrong_lengths_and_numbers_are_refused() {
+        let correction = correction();
+        let mut scratch = correction.make_scratch();
+        let air = REFERENCE.air();
+        let pair = PairAir { response: air, direct: air, direct_m: DIRECT_M, reflected_m: REFLECTED_M };
+        let mut out = vec![0.0; LEN];
+        let zeros = [0.0; LEN];
+        let mut broken = zeros;
+        broken[3] = f64::NAN;
+        let found = correction.subtract_direct(&zeros[1..], &zeros, &pair, &mut out, &mut scratch);
+        assert!(matches!(found, Err(Error::Length { .. })));
+        let found = correction.subtract_direct(&zeros, &broken, &pair, &mut out, &mut scratch);
+        assert!(matches!(found, Err(Error::NotFinite { .. })));
+    }
+}
