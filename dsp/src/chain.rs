@@ -337,19 +337,6 @@ impl<T: RealSample> DerivationPlan<T> {
         self.bank.compute_sensitivities(reflected, direct, per_kelvin, sensitivities, &mut scratch.bank)
     }
 
-    /// Computes the power spectrum of a response, `[len / 2 + 1]`, and adds it to one.
-    ///
-    /// # Errors
-    /// [`Error::Length`] or [`Error::NotFinite`].
-    pub fn add_power(
-        &self,
-        response: &[T],
-        power: &mut [f64],
-        scratch: &mut DerivationScratch<T>,
-    ) -> Result<(), Error> {
-        self.bank.add_power(response, power, &mut scratch.bank)
-    }
-
     fn measure_flat(&self, flat: &[T], scratch: &mut DerivationScratch<T>) -> Result<(), Error> {
         check_len("Flat's response", flat.len(), self.bank.len())?;
         scratch.flat.total = energy(flat);

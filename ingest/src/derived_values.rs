@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 
 use echolake_dsp::air::AirState;
-use echolake_dsp::air_correction::{AirCorrection, PathSpectrum};
+use echolake_dsp::air_correction::AirCorrectionFit;
 use echolake_dsp::chain::{DerivationPlan, DerivedResponse, FlatEnergies};
 use echolake_dsp::mean::SignalMean;
 use echolake_dsp::rise::CurveShape;
@@ -45,16 +45,11 @@ pub(crate) fn residual_fit(rig: &Rig) -> std::result::Result<ResidualFit<f32>, e
     ResidualFit::new(rig.impulse_response.length, rig.sweep.rate_hz.get(), range_hz)
 }
 
-/// Returns the correction of a rig's responses for the air, from the mean spectra of the direct sound and of what Flat
-/// reflects.
-pub(crate) fn air_correction(
-    rig: &Rig,
-    paths: [&PathSpectrum; 2],
-) -> std::result::Result<AirCorrection<f32>, echolake_dsp::Error> {
+/// Returns a fit of the correction of a rig's responses for the air.
+pub(crate) fn air_correction_fit(rig: &Rig) -> AirCorrectionFit<f32> {
     let response = &rig.impulse_response;
     let range_hz = [rig.sweep.low_hz, rig.sweep.high_hz];
-    let reference = ReferenceAir::from_response(response);
-    AirCorrection::new(response.length, rig.sweep.rate_hz.get(), range_hz, reference, paths)
+    AirCorrectionFit::new(response.length, rig.sweep.rate_hz.get(), range_hz, ReferenceAir::from_response(response))
 }
 
 /// A run's impulse responses.

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 
 use echolake_dsp::air::AirState;
-use echolake_dsp::air_correction::{AirCorrection, AirScratch, PairAir, PathSpectrum};
+use echolake_dsp::air_correction::{AirCorrection, AirScratch, PairAir};
 use echolake_dsp::foam::subtract_foam;
 use echolake_dsp::foam_reflection::FoamReflectionFit;
 use echolake_dsp::geometry::{direct_mm, image_mm};
@@ -19,7 +19,7 @@ use tokio::sync::Mutex;
 
 use crate::CODE_VERSION;
 use crate::derived_values::{
-    FlatPair, FlatPairs, MeanResponse, MeanResponses, air_correction, derivation_plan, residual_fit,
+    FlatPair, FlatPairs, MeanResponse, MeanResponses, air_correction_fit, derivation_plan, residual_fit,
 };
 use crate::error::{Error, Result};
 use crate::pipeline::Cores;
@@ -260,23 +260,17 @@ impl ReferenceResponses {
             .into_iter()
             .filter_map(|(pair, flat)| Some((pair, flat, flat_direct.get(&pair)?, PairPaths::new(lake, pair)?)))
             .collect();
-        let mut spectra = [(); 2].map(|()| PathSpectrum { power: vec![0.0; length / 2 + 1], metres: 0.0 });
+        let mut fit = air_correction_fit(rig);
         let mut reflected = vec![0.0; length];
         for (_, flat, direct, paths) in &measured {
             subtract_foam(&flat.ir, &direct.ir, &mut reflected);
-            let metres = [paths.direct_m, paths.reflected_m];
-            for ((spectrum, signal), metres) in spectra.iter_mut().zip([&direct.ir, &reflected]).zip(metres) {
-                plan.add_power(signal, &mut spectrum.power, &mut scratch).map_err(kernel_error)?;
-                spectrum.metres += metres / measured.len() as f64;
-            }
+            fit.add_pair(&direct.ir, &reflected, [paths.direct_m, paths.reflected_m]).map_err(kernel_error)?;
         }
-        let [direct_spectrum, reflected_spectrum] = &spectra;
-        let correction = air_correction(rig, [direct_spectrum, reflected_spectrum]).map_err(kernel_error)?;
         let mut references = Self {
             direct,
             flat: Arc::default(),
             flat_residual: None,
-            correction: Arc::new(correction),
+            correction: Arc::new(fit.finish()),
             treatment: rig.impulse_response.air,
         };
         let mut air_scratch = references.make_scratch();

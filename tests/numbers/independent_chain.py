@@ -84,6 +84,7 @@ CRAMER_PRODUCT = 0.000486
 VAPOUR = (1.2811805e-5, -1.9509874e-2, 34.04926034, -6.3536311e3)
 ENHANCEMENT = (1.00062, 3.14e-8, 5.6e-7)
 CARBON_DIOXIDE = 0.0004
+SIXTH_OCTAVE = 2 ** (1 / 6)
 # Share of the sweep's limits by which a tapered response's range is narrower.
 MARGIN = 0.015
 
@@ -191,7 +192,7 @@ class IndependentChain:
         self.settings = settings
         self.hz = np.fft.rfftfreq(settings.length, 1 / settings.rate_hz).astype(np.float64)
         self.reference = Air(settings.reference_celsius)
-        self.slopes = np.zeros((2, len(self.hz)))
+        self.slopes = np.zeros((2, len(self.hz)), complex)
         self.gains = self.band_gains(self.hz)
 
     def ratio(self, air: Air) -> float:
@@ -254,21 +255,28 @@ class IndependentChain:
         return np.fft.irfft(self.gains * np.fft.rfft(response), len(response))
 
     def learn_slopes(self, foam: dict[int, Measured], flat: dict[int, Measured]) -> None:
-        """Slopes of the mean spectra of Foam and of what Flat reflects, without absorption by the reference air."""
+        """d ln(spectrum) / d ln(frequency) of speaker and microphone: from the direct sound and from what Flat reflects,
+        each summed over the pairs as if it came at once, without absorption by the reference air."""
         pairs = sorted(foam.keys() & flat.keys())
         signals = [
-            [foam[pair].response for pair in pairs],
-            [flat[pair].response - foam[pair].response for pair in pairs],
+            np.array([foam[pair].response for pair in pairs]),
+            np.array([flat[pair].response - foam[pair].response for pair in pairs]),
         ]
-        metres = np.mean([flat[pair].metres for pair in pairs], axis=0)
+        metres = np.array([flat[pair].metres for pair in pairs])
+        step_hz = self.settings.rate_hz / self.settings.length
+        first = int(np.ceil(self.settings.low_hz * 1.02 / step_hz)) + 2
+        last = min(int(self.settings.high_hz * 0.98 / step_hz) - 2, len(self.hz) - 2)
         for path, of_path in enumerate(signals):
-            power = np.sum(np.abs(np.fft.rfft(of_path, axis=1)) ** 2, axis=0)
-            logs = np.log(power) + np.log(10) / 10 * metres[path] * self.reference.absorption(self.hz)
-            step_hz = self.settings.rate_hz / self.settings.length
-            first = int(np.ceil(self.settings.low_hz * 1.02 / step_hz)) + 2
-            last = min(int(self.settings.high_hz * 0.98 / step_hz) - 2, len(power) - 2)
-            at = np.clip(np.arange(len(power)), first, last)
-            self.slopes[path] = (logs[at + 1] - logs[at - 1]) / np.log((at + 1) / (at - 1))
+            delays = metres[:, path, None] / self.reference.speed_of_sound()
+            aligned = np.fft.rfft(of_path, axis=1) * np.exp(2j * np.pi * self.hz * delays) * metres[:, path, None]
+            emitted = aligned.sum(axis=0) * 10 ** (metres[:, path].mean() / 20 * self.reference.absorption(self.hz))
+            bins = np.arange(first, last + 1)
+            slopes = np.log(emitted[bins + 1] / emitted[bins - 1]) / np.log((bins + 1) / (bins - 1))
+            weights = np.abs(emitted[bins + 1] * emitted[bins - 1])
+            for index in range(len(self.hz)):
+                middle = min(max(index, first), last)
+                near = (bins >= round(middle / SIXTH_OCTAVE)) & (bins <= round(middle * SIXTH_OCTAVE))
+                self.slopes[path, index] = np.average(slopes[near], weights=weights[near])
 
     def reflected(self, of: Measured, foam: Measured) -> Signal:
         """What a surface reflects in the reference air: Foam's direct sound is brought to the surface's air first."""
@@ -277,10 +285,10 @@ class IndependentChain:
         own, other = self.ratio(of.air), self.ratio(foam.air)
         absorbed = of.air.absorption(self.hz * own)
         direct_m, reflected_m = of.metres
-        to_own = (own / other) ** (self.slopes[0] / 2)
-        to_own *= 10 ** (direct_m / 20 * (foam.air.absorption(self.hz * other) - absorbed))
-        to_reference = own ** (-self.slopes[1] / 2)
-        to_reference *= 10 ** (reflected_m / 20 * (absorbed - self.reference.absorption(self.hz)))
+        to_own = (own / other) ** self.slopes[0]
+        to_own = to_own * 10 ** (direct_m / 20 * (foam.air.absorption(self.hz * other) - absorbed))
+        to_reference = own ** -self.slopes[1].real
+        to_reference = to_reference * 10 ** (reflected_m / 20 * (absorbed - self.reference.absorption(self.hz)))
         spectrum = (np.fft.rfft(of.response) - to_own * np.fft.rfft(foam.response)) * to_reference
         return np.fft.irfft(spectrum, len(of.response))
 

@@ -216,17 +216,6 @@ impl<T: RealSample> FilterBankPlan<T> {
         Ok(())
     }
 
-    /// Adds the power of each bin of a signal.
-    ///
-    /// # Errors
-    /// [`Error::Length`] or [`Error::NotFinite`].
-    pub fn add_power(&self, signal: &[T], power: &mut [f64], scratch: &mut FilterBankScratch<T>) -> Result<(), Error> {
-        check_len("the power spectrum", power.len(), self.len / 2 + 1)?;
-        self.compute_spectrum(signal, scratch)?;
-        power.iter_mut().zip(&scratch.spectrum).for_each(|(power, x)| *power += x.norm_sqr().f64());
-        Ok(())
-    }
-
     // A bin counts for its mirror image too, except 0 Hz and, if the length is even, the last one.
     fn bin_weight(&self, bin: usize) -> f64 {
         if bin == 0 || 2 * bin == self.len { 1.0 } else { 2.0 }

@@ -17,13 +17,96 @@ use crate::{Error, RealSample};
 /// Natural logarithm of an amplitude ratio per dB.
 const NEPER_PER_DB: f64 = LN_10 / 20.0;
 
-/// Mean power spectrum of sound over a path, `[len / 2 + 1]`, and the path's mean length, m.
-#[derive(Debug, Clone, PartialEq)]
-pub struct PathSpectrum {
-    /// Power of each bin.
-    pub power: Vec<f64>,
-    /// Length, m.
-    pub metres: f64,
+/// Half of the width that slopes are smoothed over, as a ratio of frequencies: a third of an octave in all.
+const SMOOTHED_RATIO: f64 = 1.122_462_048_309_373;
+
+/// Learns the slopes of speaker and microphone from the direct sound and from what Flat reflects.
+///
+/// Spectra are summed as if all pairs' sound came at once: what else is in a response has other delays in each pair, and
+/// averages out.
+pub struct AirCorrectionFit<T: RealSample> {
+    rate_hz: f64,
+    len: usize,
+    range_hz: [f64; 2],
+    reference: ReferenceAir,
+    forward: Arc<dyn RealToComplex<T>>,
+    pairs: usize,
+    direct: PathSum,
+    reflected: PathSum,
+}
+
+/// Sum of aligned spectra, `[len / 2 + 1]`, and of the lengths of their paths, m.
+struct PathSum {
+    spectrum: Vec<Complex<f64>>,
+    metres: f64,
+}
+
+impl<T: RealSample> AirCorrectionFit<T> {
+    /// Begins with responses of `len` samples to sweeps of this range, Hz.
+    pub fn new(len: usize, rate_hz: f64, range_hz: [f64; 2], reference: ReferenceAir) -> Self {
+        let [direct, reflected] =
+            [(); 2].map(|()| PathSum { spectrum: vec![Complex::default(); len / 2 + 1], metres: 0.0 });
+        let forward = T::plan_real_forward(len);
+        Self { rate_hz, len, range_hz, reference, forward, pairs: 0, direct, reflected }
+    }
+
+    /// Adds a pair: its direct sound and what Flat reflects, `[len]`, and the lengths of both paths, m.
+    ///
+    /// # Errors
+    /// [`Error::Length`] or [`Error::NotFinite`].
+    pub fn add_pair(&mut self, direct: &[T], reflected: &[T], metres: [f64; 2]) -> Result<(), Error> {
+        let sound_m_s = self.reference.speed_of_sound();
+        let mut signal = self.forward.make_input_vec();
+        let mut spectrum = self.forward.make_output_vec();
+        let mut work = self.forward.make_scratch_vec();
+        for ((sum, from), metres) in
+            [&mut self.direct, &mut self.reflected].into_iter().zip([direct, reflected]).zip(metres)
+        {
+            transform(&*self.forward, from, &mut signal, &mut spectrum, &mut work)?;
+            let turn = std::f64::consts::TAU * metres / sound_m_s * self.rate_hz / self.len as f64;
+            for (bin, (sum, x)) in sum.spectrum.iter_mut().zip(&spectrum).enumerate() {
+                // Far pairs count as much as near ones.
+                *sum += Complex::new(x.re.f64(), x.im.f64()) * Complex::from_polar(metres, turn * bin as f64);
+            }
+            sum.metres += metres;
+        }
+        self.pairs += 1;
+        Ok(())
+    }
+
+    /// Plans the correction.
+    pub fn finish(self) -> AirCorrection<T> {
+        let step_hz = self.rate_hz / self.len as f64;
+        let [colder, own, warmer] = [-0.5, 0.0, 0.5].map(|kelvin| {
+            let air = self.reference.air();
+            AirEffect::new(&self.reference, &AirState { temperature_c: air.temperature_c + kelvin, ..air })
+        });
+        let by_bin = |effect: &AirEffect| -> Vec<f64> {
+            (0..self.len / 2 + 1).map(|bin| effect.nepers_per_m(bin as f64 * step_hz)).collect()
+        };
+        let absorption = by_bin(&own);
+        let slopes = |path: &PathSum| {
+            let metres = path.metres / self.pairs.max(1) as f64;
+            let bins = path.spectrum.iter().zip(&absorption);
+            let emitted: Vec<_> = bins.map(|(x, nepers)| x * (metres * nepers).exp()).collect();
+            spectral_slopes(&emitted, step_hz, self.range_hz)
+        };
+        let reflected_slopes: Vec<f64> = slopes(&self.reflected).iter().map(|slope| slope.re).collect();
+        let changes = by_bin(&warmer).into_iter().zip(by_bin(&colder)).map(|(warm, cold)| 2.0 * (cold - warm));
+        let ln_ratio = warmer.ln_ratio - colder.ln_ratio;
+        AirCorrection {
+            rate_hz: self.rate_hz,
+            len: self.len,
+            reference: self.reference,
+            direct_slopes: slopes(&self.direct),
+            transducers_per_kelvin: reflected_slopes.iter().map(|slope| 2.0 * slope * ln_ratio).collect(),
+            absorption_per_kelvin: changes.collect(),
+            reflected_slopes,
+            absorption,
+            forward: self.forward,
+            inverse: T::plan_real_inverse(self.len),
+        }
+    }
 }
 
 /// The air that a pair's response and the direct sound beneath it were measured in, and the lengths of both paths.
@@ -46,8 +129,9 @@ pub struct AirCorrection<T: RealSample> {
     rate_hz: f64,
     len: usize,
     reference: ReferenceAir,
-    /// `[bins]`: d ln power / d ln frequency of speaker and microphone, on the direct and on the reflected path.
-    direct_slopes: Vec<f64>,
+    /// `[bins]`: d ln(spectrum) / d ln(frequency) of speaker and microphone, on the direct path with the phase's, and on
+    /// the reflected path.
+    direct_slopes: Vec<Complex<f64>>,
     reflected_slopes: Vec<f64>,
     /// `[bins]`: absorption by the reference air, neper/m.
     absorption: Vec<f64>,
@@ -86,50 +170,6 @@ impl AirEffect {
 }
 
 impl<T: RealSample> AirCorrection<T> {
-    /// Plans for responses of `len` samples to sweeps of this range, Hz, from the mean spectra of the direct sound and
-    /// of what Flat reflects, whose slopes are those of speaker and microphone, and absorption's.
-    ///
-    /// # Errors
-    /// [`Error::Length`].
-    pub fn new(
-        len: usize,
-        rate_hz: f64,
-        range_hz: [f64; 2],
-        reference: ReferenceAir,
-        [direct, reflected]: [&PathSpectrum; 2],
-    ) -> Result<Self, Error> {
-        let step_hz = rate_hz / len as f64;
-        let [colder, own, warmer] = [-0.5, 0.0, 0.5].map(|kelvin| {
-            let air = reference.air();
-            AirEffect::new(&reference, &AirState { temperature_c: air.temperature_c + kelvin, ..air })
-        });
-        let by_bin = |effect: &AirEffect| -> Vec<f64> {
-            (0..len / 2 + 1).map(|bin| effect.nepers_per_m(bin as f64 * step_hz)).collect()
-        };
-        let absorption = by_bin(&own);
-        let slopes = |path: &PathSpectrum| {
-            check_len("the mean power spectrum", path.power.len(), len / 2 + 1)?;
-            let bins = path.power.iter().zip(&absorption);
-            let emitted: Vec<f64> = bins.map(|(power, nepers)| power * (2.0 * path.metres * nepers).exp()).collect();
-            Ok::<_, Error>(spectral_slopes(&emitted, step_hz, range_hz))
-        };
-        let reflected_slopes = slopes(reflected)?;
-        let colder_by_bin = by_bin(&colder);
-        let changes = by_bin(&warmer).into_iter().zip(colder_by_bin).map(|(warm, cold)| 2.0 * (cold - warm));
-        Ok(Self {
-            rate_hz,
-            len,
-            reference,
-            direct_slopes: slopes(direct)?,
-            transducers_per_kelvin: reflected_slopes.iter().map(|s| s * (warmer.ln_ratio - colder.ln_ratio)).collect(),
-            absorption_per_kelvin: changes.collect(),
-            reflected_slopes,
-            absorption,
-            forward: T::plan_real_forward(len),
-            inverse: T::plan_real_inverse(len),
-        })
-    }
-
     /// Buffers; one per thread.
     pub fn make_scratch(&self) -> AirScratch<T> {
         let work = self.forward.get_scratch_len().max(self.inverse.get_scratch_len());
@@ -157,8 +197,8 @@ impl<T: RealSample> AirCorrection<T> {
     ) -> Result<(), Error> {
         check_len("the reflected response", reflected.len(), self.len)?;
         let AirScratch { signal, spectrum, direct: direct_spectrum, work } = scratch;
-        self.transform(ir, signal, spectrum, work)?;
-        self.transform(direct, signal, direct_spectrum, work)?;
+        transform(&*self.forward, ir, signal, spectrum, work)?;
+        transform(&*self.forward, direct, signal, direct_spectrum, work)?;
         let of_response = AirEffect::new(&self.reference, &pair.response);
         let of_direct = AirEffect::new(&self.reference, &pair.direct);
         let step_hz = self.rate_hz / self.len as f64;
@@ -166,11 +206,13 @@ impl<T: RealSample> AirCorrection<T> {
         for (bin, (x, d)) in spectrum.iter_mut().zip(&*direct_spectrum).enumerate() {
             let hz = bin as f64 * step_hz;
             let absorbed = of_response.nepers_per_m(hz);
-            let to_response = self.direct_slopes[bin] / 2.0 * (of_response.ln_ratio - of_direct.ln_ratio)
+            let to_response = self.direct_slopes[bin] * (of_response.ln_ratio - of_direct.ln_ratio)
                 + (of_direct.nepers_per_m(hz) - absorbed) * pair.direct_m;
-            let to_reference = -self.reflected_slopes[bin] / 2.0 * of_response.ln_ratio
+            let to_response = Complex::from_polar(to_response.re.exp(), to_response.im);
+            let to_response = Complex::new(T::of(to_response.re), T::of(to_response.im));
+            let to_reference = -self.reflected_slopes[bin] * of_response.ln_ratio
                 + (absorbed - self.absorption[bin]) * pair.reflected_m;
-            *x = (*x - d * T::of(to_response.exp())) * T::of(to_reference.exp() / count);
+            *x = (*x - d * to_response) * T::of(to_reference.exp() / count);
         }
         // The ends of a real signal's spectrum are real.
         spectrum[0].im = T::default();
@@ -187,34 +229,47 @@ impl<T: RealSample> AirCorrection<T> {
         let of = |changes: &[f64]| changes.get(bin).copied().unwrap_or(0.0);
         of(&self.transducers_per_kelvin) + metres * of(&self.absorption_per_kelvin)
     }
-
-    fn transform(
-        &self,
-        from: &[T],
-        signal: &mut [T],
-        spectrum: &mut [Complex<T>],
-        work: &mut [Complex<T>],
-    ) -> Result<(), Error> {
-        check_len("the response", from.len(), self.len)?;
-        signal.copy_from_slice(from);
-        let done = self.forward.process_with_scratch(signal, spectrum, work);
-        let is_finite = done.is_ok() && spectrum.first().is_some_and(|dc| dc.re.f64().is_finite());
-        if is_finite { Ok(()) } else { Err(Error::NotFinite { what: "the response" }) }
-    }
 }
 
-// Between neighbours, within the range that the sweep has; beyond it the nearest one's.
-fn spectral_slopes(power: &[f64], step_hz: f64, [low_hz, high_hz]: [f64; 2]) -> Vec<f64> {
+fn transform<T: RealSample>(
+    forward: &dyn RealToComplex<T>,
+    from: &[T],
+    signal: &mut [T],
+    spectrum: &mut [Complex<T>],
+    work: &mut [Complex<T>],
+) -> Result<(), Error> {
+    check_len("the response", from.len(), signal.len())?;
+    signal.copy_from_slice(from);
+    let done = forward.process_with_scratch(signal, spectrum, work);
+    let is_finite = done.is_ok() && spectrum.first().is_some_and(|dc| dc.re.f64().is_finite());
+    if is_finite { Ok(()) } else { Err(Error::NotFinite { what: "the response" }) }
+}
+
+// d ln(spectrum) / d ln(frequency) between neighbours within the range that the sweep has, smoothed; beyond the range the
+// nearest one's.
+fn spectral_slopes(spectrum: &[Complex<f64>], step_hz: f64, [low_hz, high_hz]: [f64; 2]) -> Vec<Complex<f64>> {
     // The bins whose neighbours are within the range and no part of its tapers.
     let first = (low_hz * 1.02 / step_hz).ceil() as usize + 2;
-    let last = ((high_hz * 0.98 / step_hz).floor() as usize).saturating_sub(2).min(power.len().saturating_sub(2));
-    let slope = |bin: usize| {
+    let last = ((high_hz * 0.98 / step_hz).floor() as usize).saturating_sub(2).min(spectrum.len().saturating_sub(2));
+    let smoothed = |bin: usize| {
         let bin = bin.clamp(first, last.max(first));
-        let Some(above) = power.get(bin + 1) else { return 0.0 };
-        let slope = (above / power[bin - 1]).ln() / ((bin + 1) as f64 / (bin - 1) as f64).ln();
-        if slope.is_finite() { slope } else { 0.0 }
+        let lowest = ((bin as f64 / SMOOTHED_RATIO).round() as usize).max(first);
+        let highest = ((bin as f64 * SMOOTHED_RATIO).round() as usize).min(last);
+        let mut sum = Complex::default();
+        let mut weights = 0.0;
+        for (bin, around) in
+            (lowest..).zip(spectrum.windows(3).skip(lowest.saturating_sub(1))).take_while(|(bin, _)| *bin <= highest)
+        {
+            // Where there is next to no sound, there is no slope.
+            let weight = (around[2] * around[0]).norm();
+            if weight > 0.0 {
+                sum += (around[2] / around[0]).ln() / ((bin + 1) as f64 / (bin - 1) as f64).ln() * weight;
+                weights += weight;
+            }
+        }
+        if weights > 0.0 { sum / weights } else { Complex::default() }
     };
-    (0..power.len()).map(slope).collect()
+    (0..spectrum.len()).map(smoothed).collect()
 }
 
 #[cfg(test)]
@@ -229,9 +284,9 @@ mod tests {
     const DIRECT_M: f64 = 0.3;
     const REFLECTED_M: f64 = 0.7;
 
-    // Power of a tweeter that gets louder by 12 dB an octave, at the frequencies of a corrected response.
-    fn emitted(hz: f64) -> f64 {
-        (hz / 10e3).powi(4)
+    // A tweeter that gets louder by 12 dB an octave, and turns the phase by 2 for each factor e.
+    fn emitted(hz: f64) -> Complex<f64> {
+        Complex::from_polar((hz / 10e3).powi(2), 2.0 * (hz / 10e3).ln())
     }
 
     // Both paths' sound in air, on the reference's time axis: their delays are the same in all air.
@@ -243,11 +298,13 @@ mod tests {
                 if !(2e3..=40e3).contains(&hz) {
                     return Complex::default();
                 }
-                let path = |metres: f64, samples: f64| {
-                    let level = emitted(hz * effect.ratio).sqrt() * (-metres * effect.nepers_per_m(hz)).exp();
-                    Complex::from_polar(level, -std::f64::consts::TAU * bin as f64 * samples / LEN as f64)
+                let path = |metres: f64| {
+                    let samples = metres / REFERENCE.speed_of_sound() * RATE_HZ;
+                    let level = (-metres * effect.nepers_per_m(hz)).exp();
+                    emitted(hz * effect.ratio)
+                        * Complex::from_polar(level, -std::f64::consts::TAU * bin as f64 * samples / LEN as f64)
                 };
-                path(DIRECT_M, 84.0) + path(REFLECTED_M, 196.0) * reflected
+                path(DIRECT_M) + path(REFLECTED_M) * reflected
             })
             .collect();
         let mut signal = vec![0.0; LEN];
@@ -256,16 +313,12 @@ mod tests {
     }
 
     fn correction() -> AirCorrection<f64> {
-        let path = |metres: f64| {
-            let effect = AirEffect::new(&REFERENCE, &REFERENCE.air());
-            let power = (0..LEN / 2 + 1).map(|bin| {
-                let hz = bin as f64 * RATE_HZ / LEN as f64;
-                emitted(hz) * (-2.0 * metres * effect.nepers_per_m(hz)).exp()
-            });
-            PathSpectrum { power: power.collect(), metres }
-        };
-        let paths = [&path(DIRECT_M), &path(REFLECTED_M)];
-        AirCorrection::new(LEN, RATE_HZ, [2e3, 40e3], REFERENCE, paths).expect("a correction")
+        let mut fit = AirCorrectionFit::new(LEN, RATE_HZ, [2e3, 40e3], REFERENCE);
+        let air = REFERENCE.air();
+        let silent = response(&air, 0.0);
+        let reflected: Vec<f64> = response(&air, 1.0).iter().zip(&silent).map(|(all, direct)| all - direct).collect();
+        fit.add_pair(&silent, &reflected, [DIRECT_M, REFLECTED_M]).expect("a pair");
+        fit.finish()
     }
 
     #[test]

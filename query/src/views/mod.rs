@@ -7,6 +7,7 @@ mod augmented;
 mod catalogue;
 mod ir;
 mod lazy_view;
+mod levels;
 mod lookup;
 mod pair_join;
 mod sorted_nulls;
@@ -46,6 +47,8 @@ pub(crate) enum LakeView {
     Augmented,
     /// One row per surface: its description and its measurements.
     Catalogue,
+    /// One row per surface and band: level and uncertainty over all of its runs.
+    Levels,
 }
 
 /// Unit of levels over Flat's energy in all bands.
@@ -71,7 +74,7 @@ pub fn table_meaning(name: &str) -> Option<&'static str> {
 
 impl LakeView {
     /// All views.
-    pub const ALL: [Self; 4] = [Self::Ir, Self::TnceDb, Self::Augmented, Self::Catalogue];
+    pub const ALL: [Self; 5] = [Self::Ir, Self::TnceDb, Self::Augmented, Self::Catalogue, Self::Levels];
 
     /// Returns its name in SQL.
     pub fn name(self) -> &'static str {
@@ -80,6 +83,7 @@ impl LakeView {
             Self::TnceDb => "tnce_db",
             Self::Augmented => "augmented",
             Self::Catalogue => "catalogue",
+            Self::Levels => "levels",
         }
     }
 
@@ -89,6 +93,7 @@ impl LakeView {
             Self::TnceDb => "One row per measurement: TNCE in dB by band, with the geometry of the pair.",
             Self::Augmented => "One row per measurement and symmetry: moved geometry, responses, moved height map.",
             Self::Catalogue => "One row per surface: its description, its run and the statistics of its levels.",
+            Self::Levels => "One row per surface and band: level and uncertainty over all of its runs.",
         }
     }
 
@@ -104,6 +109,7 @@ impl LakeView {
             Self::TnceDb => &[Table::Tnce],
             Self::Augmented => &[Table::Measurements, Table::Nce, Table::Heightmaps],
             Self::Catalogue => &[Table::Surfaces, Table::Runs, Table::SurfaceStats],
+            Self::Levels => &[Table::Surfaces, Table::SurfaceStats],
         }
     }
 
@@ -114,6 +120,7 @@ impl LakeView {
             Self::TnceDb => tnce_db::view_sql(lake.rig()),
             Self::Augmented => augmented::view_sql(lake.grid()),
             Self::Catalogue => catalogue::view_sql(lake.rig()),
+            Self::Levels => levels::view_sql(),
         }
     }
 
@@ -124,6 +131,7 @@ impl LakeView {
             Self::TnceDb => notes_of(Table::Pairs, lake).into_iter().chain(tnce_db::column_notes(lake.rig())).collect(),
             Self::Augmented => notes_of(Table::TnceD4, lake),
             Self::Catalogue => catalogue::column_notes(lake.rig()),
+            Self::Levels => levels::column_notes(),
         }
     }
 

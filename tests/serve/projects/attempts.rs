@@ -14,7 +14,7 @@ pub(super) struct ProjectAttempt {
 }
 
 /// Tables and views that have rows of runs.
-const TABLES: [&str; 14] = [
+const TABLES: [&str; 15] = [
     "surfaces",
     "runs",
     "measurements",
@@ -27,6 +27,7 @@ const TABLES: [&str; 14] = [
     "surface_stats",
     "ir",
     "tnce_db",
+    "levels",
     "augmented",
     "catalogue",
 ];
