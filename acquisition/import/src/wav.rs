@@ -110,7 +110,7 @@ impl WavImport<'_> {
         let unread = |column, what| Error::Row { path: self.manifest.to_owned(), line: row.line, column, what };
         let sweep = row.loopback.read_all(row.loopback.sample_format()).map_err(|e| unread("loopback", e))?.fractions;
         let ir = &self.rig.impulse_response;
-        let reach = raw_len(ir.length, ir.reference_temperature_c.get());
+        let reach = raw_len(ir.length, &ReferenceAir::from_response(ir));
         let found = wav_search::find_sweep(&row.recording, &sweep, reach, self.rig);
         let found = found.map_err(|e| unread("recording", e))?;
         let start = found.checked_sub((arrival * self.rig.sweep.rate_hz.get()).round() as u64).ok_or_else(|| {

@@ -281,13 +281,18 @@ impl EnergySensitivity {
     }
 }
 
+// Moments of an error, and the relative change of the energy per error and per its square.
+fn gain_terms(residual: &DirectSoundResidual, s: &EnergySensitivity) -> (ErrorMoments, f64, f64) {
+    (residual.gain, s.gain / s.energy, s.gain_square / s.energy)
+}
+
+fn delay_terms(residual: &DirectSoundResidual, s: &EnergySensitivity) -> (ErrorMoments, f64, f64) {
+    (residual.delay, s.delay / s.energy, s.delay_square / s.energy)
+}
+
 impl LevelUncertainty {
     /// Computes the error of the energy of a measurement over Flat's, relative to it.
     pub fn relative_error(&self, of: &EnergySensitivity, flat: &EnergySensitivity) -> LevelError {
-        let kinds: [fn(&DirectSoundResidual, &EnergySensitivity) -> (ErrorMoments, f64, f64); 2] = [
-            |r, s| (r.gain, s.gain / s.energy, s.gain_square / s.energy),
-            |r, s| (r.delay, s.delay / s.energy, s.delay_square / s.energy),
-        ];
         let mut error = LevelError {
             variance: 4.0 * self.run.noise / of.energy,
             own_per_kelvin: of.temperature / of.energy,
@@ -297,7 +302,7 @@ impl LevelUncertainty {
             error.variance += 4.0 * residual.noise / flat.energy;
             error.flat_per_kelvin = flat.temperature / flat.energy;
         }
-        for kind in kinds {
+        for kind in [gain_terms, delay_terms] {
             let (run, s, square) = kind(&self.run, of);
             // Whatever its sign, an error adds energy.
             error.common += run.mean * s + run.variance * square;

@@ -125,7 +125,8 @@ fn late_take(late: usize) -> [Vec<f32>; 2] {
 fn expected_arrival() -> usize {
     let grid = Rig::paper().build_grid().expect("a grid");
     let [m, s] = ["0/0/0", "0/0/1"].map(|label| grid.parse_point(label).expect("a point").position_mm);
-    (direct_mm(m, s) / 1e3 / speed_of_sound(20.0) * 96e3).round() as usize
+    (direct_mm(m, s) / 1e3 / ReferenceAir::from_response(&Rig::paper().impulse_response).speed_of_sound() * 96e3)
+        .round() as usize
 }
 
 fn import_take(recording: &[f32], loopback: &[f32]) -> Result<(Vec<String>, ImpulseResponse), Error> {
