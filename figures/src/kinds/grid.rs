@@ -18,6 +18,10 @@ const NARROW_LABELS: f32 = 46.0;
 const HEADER: f32 = 22.0;
 const CAPTION: f32 = 52.0;
 const BETWEEN_PANELS: f32 = 24.0;
+/// Greatest side of a cell, which a grid of a few points reaches.
+const MOST_CELL_PX: f32 = 40.0;
+/// Sides of a layer's only cell in the side of its block.
+const SINGLE_CELL: f32 = 3.0;
 
 /// A point of a layer: column along x, row along y.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -63,6 +67,11 @@ impl GridLayer {
         };
         let label = points.first().map_or_else(String::new, |point| format!("{} mm", point.position_mm[2]));
         Self { label, positions: points.iter().map(position).collect() }
+    }
+
+    // The columns or the rows, whichever are more.
+    fn cells_across(&self) -> usize {
+        self.positions.iter().map(|position| position.column.max(position.row) + 1).max().unwrap_or(1)
     }
 }
 
@@ -141,7 +150,9 @@ impl GridFigure {
     fn panel_layout(&self) -> PanelLayout {
         let labels = if self.panel_px < NARROW { NARROW_LABELS } else { LABELS };
         let layers = self.layers.len().max(1) as f32;
-        let side = ((self.panel_px - labels - GAP * (layers - 1.0)) / layers).floor().max(12.0);
+        let widest = self.layers.iter().map(GridLayer::cells_across).max().unwrap_or(1);
+        let most = MOST_CELL_PX * if widest == 1 { SINGLE_CELL } else { widest as f32 };
+        let side = ((self.panel_px - labels - GAP * (layers - 1.0)) / layers).floor().clamp(12.0, most);
         PanelLayout { labels, side, height: HEADER + self.bands.len() as f32 * (side + GAP) }
     }
 
@@ -264,8 +275,8 @@ impl BlockLayout {
     fn new(layer: &GridLayer, side: f32, [x, y]: [f32; 2]) -> Self {
         let columns = layer.positions.iter().map(|p| p.column + 1).max().unwrap_or(1);
         let rows = layer.positions.iter().map(|p| p.row + 1).max().unwrap_or(1);
-        let most = columns.max(rows);
-        let size = if most == 1 { (side / 3.0).floor() } else { ((side - 2.0) / most as f32).floor() };
+        let most = layer.cells_across();
+        let size = if most == 1 { (side / SINGLE_CELL).floor() } else { ((side - 2.0) / most as f32).floor() };
         let size = size.max(1.0);
         let inset = |count: usize| ((side - size * count as f32) / 2.0).floor();
         Self { x: x + inset(columns), y: y + inset(rows), size, columns, rows }
@@ -363,6 +374,13 @@ mod tests {
         assert_eq!(panel.levels_db, [[Some(6.0), None, None]]);
         let itself = GridPanel::new("b", &base, &[0, 1], Some(("b", &base)));
         assert_eq!((itself.title.as_str(), itself.is_difference, &itself.levels_db[..]), ("b", false, &base[..]));
+    }
+
+    // Two columns and two rows of 40 px, though the panel has room for more.
+    #[test]
+    fn few_points_have_small_cells() {
+        let svg = figure(None, LevelPalette::Paper).draw(&FigureNotes::default()).to_svg();
+        assert!(cell(&svg, 1).contains(" width=\"39\""), "{}", cell(&svg, 1));
     }
 
     #[test]
