@@ -221,8 +221,9 @@ async fn check_run(
     if let Ok(surface) = text("surface_id").parse() {
         let missing = ReferenceFinder::new(lake, snapshot.clone()).wanted_references(&surface).missing_names();
         if !missing.is_empty() {
-            let what =
-                format!("waits for reference {missing}; hint: ingest a run of that surface, and it is completed");
+            let what = format!(
+                "waits for reference {missing}, which levels need; hint: ingest a run of that surface, and it is completed"
+            );
             report.add_finding(FindingSeverity::Missing, &run, what);
         } else if text("reference_derivation").is_empty() {
             report.add_finding(

@@ -62,6 +62,9 @@ pub(crate) struct IngestSummary {
     /// Tables lack rows, or may.
     #[serde(skip)]
     lacks_rows: bool,
+    /// Runs were ingested whose references are missing.
+    #[serde(skip)]
+    has_waiting: bool,
 }
 
 /// A file that cannot be taken in.
@@ -143,6 +146,9 @@ pub(crate) async fn run_ingest(args: &IngestArgs, lake_url: &str) -> anyhow::Res
             count => format!("; {count} recordings in the inbox are not finished"),
         };
         eprintln!("nothing to ingest: every closed run of the lake is in its tables{unfinished}");
+    }
+    if summary.has_waiting && !args.json {
+        eprintln!("next: echolake --lake {lake_url} serve, which shows the responses");
     }
     // Files that were named are the whole job; if none of them could be taken in, it failed.
     if !args.runs.is_empty() && summary.taken.is_empty() && !summary.refused.is_empty() {
@@ -288,8 +294,10 @@ async fn ingest_and_complete(
     summary.lacks_rows = !completion.is_whole;
     for (run, missing) in completion.waiting {
         if summary.taken.iter().any(|t| t.run == run) {
+            summary.has_waiting = true;
             progress.print_message(format!(
-                "{run}: waits for reference {missing}; ingest a run of it, and it is completed"
+                "{run}: waits for reference {missing}, which levels need; ingest a run of it, and it is completed. Its \
+                 responses are in the tables"
             ));
         }
     }

@@ -25,6 +25,9 @@ pub(super) struct SelectedSurface {
     pub origin: String,
 }
 
+#[derive(Deserialize)]
+struct SurfaceWithLevels {}
+
 const SURFACES: &str = "select surface_id, run_id, typology, flat_reference, foam_reference, origin from surfaces";
 
 /// The lake, and one session of queries.
@@ -80,6 +83,28 @@ impl FigureSource {
             })
         };
         names.iter().map(surface).collect()
+    }
+
+    /// Checks that there is something to draw: that some of the surfaces have levels.
+    ///
+    /// # Errors
+    /// If none has.
+    pub async fn require_levels(&self, surfaces: &[SelectedSurface]) -> anyhow::Result<()> {
+        let ids: Vec<_> = surfaces.iter().map(|surface| quote_literal(&surface.surface_id)).collect();
+        let list = ids.join(", ");
+        let sql = format!("select surface_id from surface_stats where surface_id in ({list}) limit 1");
+        let found: Vec<SurfaceWithLevels> = self.query_rows(&sql).await?;
+        anyhow::ensure!(
+            !found.is_empty(),
+            "{} no levels; hint: levels need runs of Flat and Foam with the same pairs; `echolake figure steps {}` draws \
+             a response",
+            match surfaces {
+                [one] => format!("surface `{}` has", one.surface_id),
+                _ => "these surfaces have".to_owned(),
+            },
+            surfaces.first().map_or("SURFACE", |surface| &surface.surface_id)
+        );
+        Ok(())
     }
 
     /// Returns the surface whose levels are subtracted from those of the others.

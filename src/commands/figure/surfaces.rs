@@ -28,6 +28,7 @@ const COMPONENTS: usize = 2;
 
 pub(super) async fn write_grid(source: &FigureSource, args: &GridArgs) -> anyhow::Result<()> {
     let surfaces = source.selected_surfaces(&args.selection).await?;
+    source.require_levels(&surfaces).await?;
     let microphone = source.microphone_point(args.microphone.as_deref())?;
     let over = LevelReference::from(args.over);
     let rig = source.lake.rig();
@@ -95,6 +96,7 @@ fn first_query(surfaces: &[SelectedSurface], query: impl Fn(&str) -> String) -> 
 
 pub(super) async fn write_nce(source: &FigureSource, args: &NceArgs) -> anyhow::Result<()> {
     let surfaces = source.selected_surfaces(&args.selection).await?;
+    source.require_levels(&surfaces).await?;
     let rig = source.lake.rig();
     let point = args.microphone.as_ref().map(|named| source.microphone_point(Some(named))).transpose()?;
     let filter = point.map_or_else(String::new, |point| point_filter(&point.id.index().to_string()));
@@ -178,8 +180,6 @@ pub(super) async fn write_steps(source: &FigureSource, args: &StepsArgs) -> anyh
     let missing = || format!("surface `{id}` has no pair {pair}; hint: 0 to {}", source.lake.grid().pairs().len() - 1);
     let raw = source.query_rows::<RecordedResponse>(&recorded).await?.pop().with_context(missing)?;
     let DerivedResponse { ir, reflected_ir } = source.query_rows(&derived).await?.pop().with_context(missing)?;
-    let hint = || format!("surface `{id}` has no reflected responses; hint: its Foam is missing");
-    let reflected = reflected_ir.with_context(hint)?;
     let reference = rig.impulse_response.reference_temperature_c.get();
     let step_ms = 1000.0 / raw.sample_rate_hz;
     let trace = |name: String, samples: Vec<f32>, step_ms| ResponseTrace { name, samples, step_ms };
@@ -205,14 +205,15 @@ pub(super) async fn write_steps(source: &FigureSource, args: &StepsArgs) -> anyh
     } else {
         format!("{:.1} °C", raw.temperature_c)
     };
-    let rows = vec![
+    let mut rows = vec![
         StepsRow { title: "Measured".into(), traces: vec![trace(air, raw.samples, step_ms)] },
         StepsRow { title: format!("Temperature corrected to {reference} °C"), traces: corrected },
-        StepsRow {
-            title: "Direct sound removed".into(),
-            traces: vec![trace(format!("less {}", surfaces[0].foam_reference), reflected, own_step)],
-        },
     ];
+    // Without Foam there are two steps.
+    if let Some(reflected) = reflected_ir {
+        let name = format!("less {}", surfaces[0].foam_reference);
+        rows.push(StepsRow { title: "Direct sound removed".into(), traces: vec![trace(name, reflected, own_step)] });
+    }
     let figure = StepsFigure { rows, from_ms: 0.0, to_ms: own_step * ir.len() as f64, width_px: 720.0 };
     let title = args.output.title_or(|| format!("Response of {id}, pair {pair}"));
     let notes = source.figure_notes(title, format!("{recorded}; {derived}"), &surfaces);
@@ -235,7 +236,7 @@ pub(super) async fn write_map(source: &FigureSource, args: &MapArgs) -> anyhow::
     vectors.rows.retain(|_| placed.next() == Some(&true));
     let surfaces: Vec<_> =
         surfaces.into_iter().zip(has_levels).filter(|(_, has)| *has).map(|(surface, _)| surface).collect();
-    anyhow::ensure!(surfaces.len() > 1, "a map needs two surfaces with energies");
+    anyhow::ensure!(surfaces.len() > 1, "a map needs two surfaces with levels; hint: levels need Flat and Foam");
     let found = PrincipalComponents::from_rows(&mut vectors.rows, COMPONENTS)?;
     let rows = surfaces.iter().enumerate();
     let rows = rows.map(|(i, surface)| (i, surface.surface_id.as_str(), surface.typology.as_str()));

@@ -28,6 +28,7 @@ type QueriedTable = (FigureTable, String);
 
 pub(super) async fn write_table(source: &FigureSource, args: &TableArgs) -> anyhow::Result<()> {
     let surfaces = source.selected_surfaces(&args.selection).await?;
+    source.require_levels(&surfaces).await?;
     let base = source.base_surface(args.less.as_ref()).await?;
     anyhow::ensure!(
         base.is_none() || args.values != ValuesArg::Energies,
