@@ -476,6 +476,26 @@ export interface paths {
         readonly patch?: never;
         readonly trace?: never;
     };
+    readonly "/api/v1/surfaces/{surface_id}/pairs": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        /**
+         * The measured pairs of a surface.
+         * @description Those of its newest run.
+         */
+        readonly get: operations["measured_pairs"];
+        readonly put?: never;
+        readonly post?: never;
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
     readonly "/api/v1/surfaces/{surface_id}/pairs/{pair_id}": {
         readonly parameters: {
             readonly query?: never;
@@ -558,8 +578,9 @@ export interface paths {
             readonly cookie?: never;
         };
         /**
-         * The relief in oblique light, grey, 128 x 128.
-         * @description To scale in depth: one light for all surfaces.
+         * The relief in oblique light, grey, as many pixels as the height map has cells.
+         * @description To scale in depth: one light for all surfaces. Of a surface without a height map, the energy-time curve of its first
+         *     response, 128 x 128: 60 dB from bottom to top. Without a response, paper.
          */
         readonly get: operations["thumbnail"];
         readonly put?: never;
@@ -868,6 +889,8 @@ export interface components {
             readonly direct_sound: string;
             /** @description Division of the spectra at the limits of `low_hz` and `high_hz`: `tapered`, `floored` or `literal`. */
             readonly division: string;
+            /** @description Some surface has levels against its Flat. In a lake of rooms none has. */
+            readonly has_levels: boolean;
             readonly high_hz: number;
             readonly ir_length: number;
             readonly layers: number;
@@ -919,6 +942,25 @@ export interface components {
             readonly columns: number;
             readonly rows: number;
         };
+        /** @description A measured pair. */
+        readonly MeasuredPair: {
+            readonly clipped_samples: number | null;
+            readonly direct_mm: number;
+            /** Format: date-time */
+            readonly log_time: string;
+            readonly microphone: number;
+            readonly pair_id: number;
+            readonly snr_db: number | null;
+            readonly speaker: number;
+        };
+        /** @description The measured pairs of a surface's run. */
+        readonly MeasuredPairs: {
+            /** @description The first 500 of them by number. */
+            readonly items: readonly components["schemas"]["MeasuredPair"][];
+            readonly surface_id: string;
+            /** @description Number of measured pairs. */
+            readonly total: number;
+        };
         /** @description A measurement of a pair. */
         readonly Measurement: {
             readonly arrival_error_us: number | null;
@@ -942,7 +984,7 @@ export interface components {
         /** @description The geometry of a pair. */
         readonly Pair: {
             readonly direct_mm: number;
-            /** @description Those at 2 and 40 kHz. They are no column of the table. */
+            /** @description Those of 2 and 40 kHz that are within the range of the sweep. They are no column of the table. */
             readonly fresnel: readonly components["schemas"]["FresnelEllipse"][];
             readonly image_mm: number;
             readonly incidence_deg: number;
@@ -956,6 +998,12 @@ export interface components {
         };
         /** @description A pair's responses over time and frequency. Levels are re 1, and -200 dB at least. */
         readonly PairAnalysis: {
+            /**
+             * @description Time of the direct sound in the response: `direct_s`, unless the measurement's `arrival_error_us` is over 100 us,
+             *     as it is if the loopback lacks the delay of the audio interface. Then the first sample within 20 dB of the
+             *     greatest.
+             */
+            readonly arrival_s: number;
             /** @description Highest level of the measured response's envelope around the direct sound. */
             readonly direct_db: number;
             /** @description Travel time of the direct sound at the reference temperature. */
@@ -1049,6 +1097,8 @@ export interface components {
         };
         /** @description A response by sample and by frequency. */
         readonly ResponseAnalysis: {
+            /** @description Energy from each sample to the end over all of it (Schroeder), by sample. */
+            readonly decay_db: readonly number[];
             /** @description Of the envelope, by sample: the energy-time curve. */
             readonly envelope_db: readonly number[];
             readonly group_delay_ms: readonly number[];
@@ -1124,7 +1174,10 @@ export interface components {
         readonly Session: {
             readonly token: string;
         };
-        /** @description A response's levels over time and frequency, by Hann windows of half a millisecond. */
+        /**
+         * @description A response's levels over time and frequency, by Hann windows: a hundredth of the response, half a millisecond at
+         *     least.
+         */
         readonly Spectrogram: {
             readonly bin_hz: number;
             /** @description Frequencies, from 0 Hz to half the rate. */
@@ -1134,6 +1187,7 @@ export interface components {
             readonly step_s: number;
             /** @description Windows; the first one's centre is the first sample. */
             readonly times: number;
+            readonly window_s: number;
         };
         /** @description A surface as the pages know it. */
         readonly Surface: {
@@ -2127,6 +2181,37 @@ export interface operations {
                 };
                 content: {
                     readonly "model/gltf-binary": string;
+                };
+            };
+            /** @description Not changed since the ETag of If-None-Match */
+            readonly 304: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content?: never;
+            };
+            readonly default: components["responses"]["Problem"];
+        };
+    };
+    readonly measured_pairs: {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path: {
+                readonly surface_id: string;
+            };
+            readonly cookie?: never;
+        };
+        readonly requestBody?: never;
+        readonly responses: {
+            /** @description OK */
+            readonly 200: {
+                headers: {
+                    readonly ETag?: string;
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/json": components["schemas"]["MeasuredPairs"];
                 };
             };
             /** @description Not changed since the ETag of If-None-Match */

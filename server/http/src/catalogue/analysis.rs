@@ -2,6 +2,8 @@
 //! numbers.
 
 use axum::Extension;
+use echolake_dsp::arrival::first_arrival;
+use echolake_dsp::decay::energy_decay_db;
 use echolake_dsp::envelope::EnvelopePlan;
 use echolake_dsp::frequency_response::{FrequencyResponse, FrequencyResponsePlan};
 use echolake_dsp::level::plotted_power_to_db;
@@ -24,10 +26,16 @@ const MOST_FREQUENCIES: usize = 4096;
 const MOST_WINDOWS: usize = 512;
 /// Distance of a spectrogram's windows, unless that makes too many.
 const LEAST_STEP: usize = 2;
-/// Length of a spectrogram's windows.
+/// Shortest windows of a spectrogram, which suit responses of the paper's rig.
 const WINDOW_SECS: f64 = 0.5e-3;
+/// Length of a spectrogram's windows as a share of a long response.
+const WINDOW_SHARE: f64 = 0.01;
 /// Reach around the direct sound's time in which its highest value is looked for.
 const DIRECT_REACH_SECS: f64 = 0.1e-3;
+/// Level re the greatest sample at which a late response begins (ISO 3382-1).
+const ARRIVAL_DB: f64 = -20.0;
+/// Lowest level of a decay; JSON has no infinity.
+const LEAST_DECAY_DB: f64 = -200.0;
 
 /// A delay that phase and group delay are less.
 #[derive(Clone, Copy, Default, Deserialize, ToSchema)]
@@ -61,6 +69,10 @@ struct PairAnalysis {
     direct_s: f64,
     /// Travel time of the sound that the panel reflects.
     reflected_s: f64,
+    /// Time of the direct sound in the response: `direct_s`, unless the measurement's `arrival_error_us` is over 100 us,
+    /// as it is if the loopback lacks the delay of the audio interface. Then the first sample within 20 dB of the
+    /// greatest.
+    arrival_s: f64,
     /// The delay that phase and group delay are less.
     removed_s: f64,
     /// Highest level of the measured response's envelope around the direct sound.
@@ -80,6 +92,8 @@ struct ResponseAnalysis {
     sample_db: Vec<f32>,
     /// Of the envelope, by sample: the energy-time curve.
     envelope_db: Vec<f32>,
+    /// Energy from each sample to the end over all of it (Schroeder), by sample.
+    decay_db: Vec<f32>,
     level_db: Vec<f32>,
     /// Unwrapped upwards from the lowest frequency; not smoothed.
     phase_deg: Vec<f32>,
@@ -112,21 +126,22 @@ pub(super) async fn analysis(
     let speed_mm_s = 1000.0 * ReferenceAir::from_response(&rig.impulse_response).speed_of_sound();
     let direct_s = geometry.direct_mm / speed_mm_s;
     let reflected_s = geometry.image_mm / speed_mm_s;
+    let rate_hz = rig.sweep.rate_hz.get();
+    let arrival_s = if measurement.is_off_by(DIRECT_REACH_SECS) {
+        first_arrival(&measurement.ir, ARRIVAL_DB).map_or(direct_s, |samples| samples / rate_hz)
+    } else {
+        direct_s
+    };
     let removed_s = match query.delay {
-        RemovedDelay::Direct => direct_s,
-        RemovedDelay::Reflected => reflected_s,
+        RemovedDelay::Direct => arrival_s,
+        RemovedDelay::Reflected => arrival_s + reflected_s - direct_s,
         RemovedDelay::None => 0.0,
     };
     let octaves = match query.octave.get() {
         0 => 0.0,
         part => 1.0 / part as f64,
     };
-    let analyser = ResponseAnalyser {
-        rate_hz: rig.sweep.rate_hz.get(),
-        range_hz: [rig.sweep.low_hz, rig.sweep.high_hz],
-        octaves,
-        removed_s,
-    };
+    let analyser = ResponseAnalyser { rate_hz, range_hz: [rig.sweep.low_hz, rig.sweep.high_hz], octaves, removed_s };
     let surface_id = entry.surface.surface_id.clone();
     let analyse = move || {
         let measured = analyser.analyse_samples(&measurement.ir)?;
@@ -135,8 +150,9 @@ pub(super) async fn analysis(
             pair_id: pair,
             direct_s,
             reflected_s,
+            arrival_s,
             removed_s,
-            direct_db: analyser.highest_around(&measured.envelope_db, direct_s),
+            direct_db: analyser.highest_around(&measured.envelope_db, arrival_s),
             frequency_hz: analyser.frequencies_hz(&measurement.ir)?,
             measured,
             reflected: own.as_deref().map(|samples| analyser.analyse_samples(samples)).transpose()?,
@@ -166,6 +182,8 @@ impl ResponseAnalyser {
         let mut envelope = vec![0.0; samples.len()];
         let plan = EnvelopePlan::new(samples.len())?;
         plan.compute_envelope(&samples, &mut envelope, &mut plan.make_scratch())?;
+        let mut decay = vec![0.0; samples.len()];
+        energy_decay_db(&samples, &mut decay);
         let plan = self.plan_response(samples.len())?;
         let mut response = FrequencyResponse::default();
         plan.compute_response(&samples, self.octaves, self.removed_s, &mut response, &mut plan.make_scratch())?;
@@ -173,6 +191,7 @@ impl ResponseAnalyser {
         Ok(ResponseAnalysis {
             sample_db: samples.iter().map(|x| plotted_power_to_db(x * x) as f32).collect(),
             envelope_db: envelope.iter().map(|x| plotted_power_to_db(x * x) as f32).collect(),
+            decay_db: decay.iter().map(|level| level.max(LEAST_DECAY_DB) as f32).collect(),
             level_db: thin_values(response.level_db.iter().copied()),
             phase_deg: thin_values(response.phase_deg.iter().copied()),
             group_delay_ms: thin_values(delays_ms),
@@ -203,7 +222,8 @@ pub(super) struct SpectrogramQuery {
     signal: ResponseSignal,
 }
 
-/// A response's levels over time and frequency, by Hann windows of half a millisecond.
+/// A response's levels over time and frequency, by Hann windows: a hundredth of the response, half a millisecond at
+/// least.
 #[derive(Serialize, ToSchema)]
 struct Spectrogram {
     /// Windows; the first one's centre is the first sample.
@@ -212,6 +232,7 @@ struct Spectrogram {
     /// Frequencies, from 0 Hz to half the rate.
     bins: usize,
     bin_hz: f64,
+    window_s: f64,
     /// Below the highest, to a tenth; by time, then by frequency.
     level_db: Vec<f32>,
 }
@@ -240,7 +261,8 @@ pub(super) async fn spectrogram(
 
 fn find_spectrogram(samples: &[f32], rate_hz: f64) -> Result<Spectrogram, echolake_dsp::Error> {
     let samples = first_samples(samples);
-    let window = (WINDOW_SECS * rate_hz).round().clamp(2.0, MOST_FREQUENCIES as f64) as usize;
+    let shortest = (WINDOW_SECS * rate_hz).max(WINDOW_SHARE * samples.len() as f64);
+    let window = shortest.round().clamp(2.0, MOST_FREQUENCIES as f64) as usize;
     let step = samples.len().div_ceil(MOST_WINDOWS).max(LEAST_STEP);
     let plan = SpectrogramPlan::new(samples.len(), window, step)?;
     let mut levels = vec![0.0; plan.time_count() * plan.bin_count()];
@@ -251,6 +273,7 @@ fn find_spectrogram(samples: &[f32], rate_hz: f64) -> Result<Spectrogram, echola
         step_s: step as f64 / rate_hz,
         bins: plan.bin_count(),
         bin_hz: plan.bin_hz(rate_hz),
+        window_s: window as f64 / rate_hz,
         level_db: levels.iter().map(|level| ((10.0 * (level - highest)).round() / 10.0) as f32).collect(),
     })
 }
@@ -288,6 +311,7 @@ mod tests {
         assert_eq!([found.level_db.len(), found.phase_deg.len(), found.group_delay_ms.len()], [frequencies.len(); 3]);
         let level = 20.0 * 0.5f32.log10();
         assert!(found.level_db.iter().all(|x| (x - level).abs() < 1e-4));
+        assert_eq!([found.decay_db[100], found.decay_db[101]], [0.0, -200.0]);
         assert!((found.sample_db[100] - level).abs() < 1e-4 && found.sample_db[99] == -200.0);
         for (time_s, expected) in [(100.0 / 96e3, f64::from(level)), (0.0, -200.0), (1.0, -200.0), (-1.0, -200.0)] {
             assert!((ANALYSER.highest_around(&found.sample_db, time_s) - expected).abs() < 1e-4, "{time_s}");

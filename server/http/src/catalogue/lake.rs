@@ -33,6 +33,8 @@ struct LakeDescription<'a> {
     counts: LakeCounts,
     /// Every surface comes from the simulated rig, or is computed for the mesh of one.
     simulated: bool,
+    /// Some surface has levels against its Flat. In a lake of rooms none has.
+    has_levels: bool,
 }
 
 /// A point of the grid.
@@ -110,6 +112,7 @@ pub(super) async fn lake(Extension(request): Extension<CatalogueRequest>) -> End
         counts,
         simulated: !summary.entries.is_empty()
             && summary.entries.iter().all(|e| matches!(e.surface.origin.as_str(), "simulated" | "computed")),
+        has_levels: summary.entries.iter().any(|entry| entry.surface.has_levels()),
     })?)
 }
 

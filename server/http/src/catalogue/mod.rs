@@ -12,6 +12,7 @@ mod facets;
 mod figures;
 mod lake;
 mod map;
+mod measured_pairs;
 mod pair;
 mod relief;
 mod request;
@@ -58,6 +59,7 @@ pub(super) fn table_routes() -> OpenApiRouter {
         .routes(routes!(figures::curves_figure))
         .routes(routes!(relief::heightmap))
         .routes(routes!(relief::thumbnail))
+        .routes(routes!(measured_pairs::measured_pairs))
         .routes(routes!(pair::pair))
         .routes(routes!(analysis::analysis))
         .routes(routes!(analysis::spectrogram))

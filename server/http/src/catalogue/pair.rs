@@ -1,5 +1,6 @@
 //! `GET /api/v1/surfaces/{surface_id}/pairs/{pair_id}`: everything about one impulse response.
 
+use std::ops::RangeInclusive;
 use std::sync::Arc;
 
 use arrow::array::{ArrayRef, Float64Array};
@@ -79,7 +80,7 @@ pub(super) struct PairGeometry {
     incidence_deg: f64,
     /// x, y in the panel's plane.
     specular_mm: [f64; 2],
-    /// Those at 2 and 40 kHz. They are no column of the table.
+    /// Those of 2 and 40 kHz that are within the range of the sweep. They are no column of the table.
     #[serde(default)]
     #[schema(required = true)]
     fresnel: Vec<FresnelEllipse>,
@@ -118,6 +119,13 @@ pub(super) struct PairMeasurement {
     speaker_residual_mm: Option<f32>,
     source: String,
     chunk_offset: i64,
+}
+
+impl PairMeasurement {
+    /// Returns whether the sound arrived so much earlier or later than geometry gives.
+    pub fn is_off_by(&self, secs: f64) -> bool {
+        self.arrival_error_us.is_some_and(|error_us| f64::from(error_us).abs() > secs * 1e6)
+    }
 }
 
 #[derive(Deserialize)]
@@ -193,7 +201,11 @@ impl CatalogueRequest {
 /// Those of its query.
 pub(super) async fn read_geometry(request: &CatalogueRequest, pair: usize) -> Result<PairGeometry, RequestFault> {
     let found = request.read_rows::<PairGeometry>(GEOMETRY, vec![number_value(pair)]).await?.into_iter().next();
-    found.map(PairGeometry::with_fresnel).ok_or_else(|| missing_item(format!("pair {pair}"), "ask for another one"))
+    let sweep = &request.catalogue.lake().rig().sweep;
+    let measured_hz = sweep.low_hz..=sweep.high_hz;
+    found
+        .map(|pair| pair.with_fresnel(&measured_hz))
+        .ok_or_else(|| missing_item(format!("pair {pair}"), "ask for another one"))
 }
 
 /// The newest measurement of a pair.
@@ -343,11 +355,12 @@ pub(super) async fn pair(
 }
 
 impl PairGeometry {
-    fn with_fresnel(mut self) -> Self {
+    fn with_fresnel(mut self, measured_hz: &RangeInclusive<f64>) -> Self {
         let zone = |frequency_hz: f64, [major, minor]: [Option<f64>; 2]| {
             Some(FresnelEllipse { frequency_hz, major_mm: major?, minor_mm: minor? })
         };
-        self.fresnel = [zone(2000.0, self.low_mm), zone(40_000.0, self.high_mm)].into_iter().flatten().collect();
+        let zones = [zone(2000.0, self.low_mm), zone(40_000.0, self.high_mm)].into_iter().flatten();
+        self.fresnel = zones.filter(|zone| measured_hz.contains(&zone.frequency_hz)).collect();
         self
     }
 }

@@ -49,6 +49,11 @@ impl SurfaceSummary {
         self.typology == REFERENCE
     }
 
+    /// Returns whether it has levels, which need its Flat and Foam.
+    pub fn has_levels(&self) -> bool {
+        self.level_db.iter().any(Option::is_some)
+    }
+
     /// Returns whether it is the Foam that is subtracted from it, which leaves nothing.
     pub fn is_foam(&self) -> bool {
         self.surface_id == self.foam_reference
