@@ -24,6 +24,7 @@ mod prompt;
 mod real_data;
 mod recover;
 mod replay;
+mod rooms;
 mod serve;
 mod signals;
 mod sofa;

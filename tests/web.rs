@@ -19,7 +19,7 @@ const NO_SKIP: &str = "ECHOLAKE_NO_SKIP";
 const SCHEMATHESIS: &str = "schemathesis==4.32.5";
 const CLIENTS: [&str; 3] = ["pyarrow==26.0.1", "duckdb-cli==1.5.6", "rerun-sdk==0.41.0"];
 
-fn web() -> PathBuf {
+pub(crate) fn web() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("web")
 }
 
@@ -43,7 +43,7 @@ pub(crate) fn or_skip<T>(test: &str, ready: Result<T, String>) -> Option<T> {
 }
 
 /// The browser; the packages that drive it are installed then, once for all tests.
-fn browser() -> Result<PathBuf, String> {
+pub(crate) fn browser() -> Result<PathBuf, String> {
     static BROWSER: OnceLock<Result<PathBuf, String>> = OnceLock::new();
     BROWSER.get_or_init(install_browser).clone()
 }

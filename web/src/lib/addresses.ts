@@ -42,6 +42,7 @@ export const detailHref = (id: string) => apiHref(surfacePath(id))
 export const curvesHref = (id: string, microphone: number | null = null) =>
   apiHref(`${surfacePath(id)}/curves`, { points: CURVE_POINTS, microphone })
 
+export const measuredPairsHref = (id: string) => apiHref(`${surfacePath(id)}/pairs`)
 export const pairPath = (id: string, pair: number | string) => `${surfacePath(id)}/pairs/${pair}`
 export const pairDetailHref = (id: string, pair: number | string) => apiHref(pairPath(id, pair))
 /** Fractions of an octave that levels and group delays are smoothed over. */

@@ -25,6 +25,9 @@ export const plain = (value: number | bigint, digits = 7) =>
 /** A whole number in groups of three digits. `toLocaleString` loads the browser's tables of languages first. */
 export const count = (value: number) => String(Math.round(value)).replace(/\B(?=(\d{3})+$)/g, '\u202f')
 
+/** A number of things with their name: `1 surface`, `6 surfaces`. */
+export const counted = (value: number, name: string) => `${count(value)} ${name}${value === 1 ? '' : 's'}`
+
 /** `stretcher_bond_bricks` as words. */
 export const words = (name: string | null | undefined) => (name ? name.replaceAll('_', ' ') : '\u2013')
 
@@ -47,6 +50,12 @@ export function duration(from: string, to: string): string {
   const minutes = Math.round((Date.parse(to) - Date.parse(from)) / 60000)
   return minutes < 60 ? `${minutes} min` : `${Math.floor(minutes / 60)} h ${String(minutes % 60).padStart(2, '0')} min`
 }
+
+/** A run's state. One that waits for references has its responses, and no levels. */
+export const stateText = (run: { readonly state: string; readonly missing: string | null }) =>
+  run.state === 'waiting'
+    ? `waiting for ${run.missing ?? 'references'}, for levels`
+    : run.state + (run.missing ? `, missing ${run.missing}` : '')
 
 /** A parameter's name and unit from `joint_depth_mm`. */
 export function parameter(name: string): { label: string; unit: string } {

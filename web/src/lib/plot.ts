@@ -35,6 +35,10 @@ export interface TableData {
 /** An axis as it is written beside it. */
 export const axisTitle = (axis: Axis) => (axis.unit ? `${axis.label}, ${axis.unit}` : axis.label)
 
+/** Whether values make a line that shows something: they change. */
+export const isSeries = (values: readonly (number | null)[]) =>
+  new Set(values.filter((value) => value !== null)).size > 1
+
 /** The plot's numbers as a table. */
 export function tableOf(spec: PlotSpec): TableData {
   return {

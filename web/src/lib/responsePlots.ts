@@ -14,7 +14,12 @@ export interface ResponseTrace {
   readonly dash?: readonly number[]
 }
 
-export const TIME_FORMS = { linear: 'Linear', decibels: 'Decibels', etc: 'Energy-time curve' } as const
+export const TIME_FORMS = {
+  linear: 'Linear',
+  decibels: 'Decibels',
+  etc: 'Energy-time curve',
+  decay: 'Energy decay',
+} as const
 export type TimeForm = keyof typeof TIME_FORMS
 export const LEVEL_REFERENCES = { direct: 'direct sound', maximum: 'maximum' } as const
 export type LevelReference = keyof typeof LEVEL_REFERENCES
@@ -23,6 +28,8 @@ export type LevelReference = keyof typeof LEVEL_REFERENCES
 export const PHASE_FLOOR_DB = -30
 /** What a plot of levels shows below its highest. */
 const LEVELS_SHOWN_DB = 70
+/** Part of a response that is shown before a late arrival. */
+const SHOWN_BEFORE = 0.02
 
 const highest = (values: readonly number[]) => values.reduce((most, value) => Math.max(most, value), -Infinity)
 const lineOf = ({ label, colour, width, dash }: ResponseTrace) => ({ label, colour, width, ...(dash ? { dash } : {}) })
@@ -33,14 +40,25 @@ export function timePlot(
   rate_hz: number,
   form: TimeForm,
   reference: LevelReference,
+  arrival: { readonly arrival_s: number; readonly direct_s: number },
 ): PlotSpec {
   const longest = Math.max(...traces.map((trace) => trace.samples.length))
-  const x = { label: 'Time', unit: 'ms', values: Array.from({ length: longest }, (_, i) => (1000 * i) / rate_hz) }
+  const values = Array.from({ length: longest }, (_, i) => (1000 * i) / rate_hz)
+  // What is before a late arrival is the delay of an audio interface.
+  const low = 1000 * (arrival.arrival_s - SHOWN_BEFORE * (longest / rate_hz))
+  const isLate = arrival.arrival_s > arrival.direct_s && low > 0
+  const x = { label: 'Time', unit: 'ms', values, ...(isLate ? { low } : {}) }
   if (form === 'linear')
     return {
       x,
       y: { label: 'Response', unit: 'ratio' },
       lines: traces.map((trace) => ({ ...lineOf(trace), values: trace.samples })),
+    }
+  if (form === 'decay')
+    return {
+      x,
+      y: { label: 'Energy left', unit: 'dB', low: -LEVELS_SHOWN_DB, high: 0 },
+      lines: traces.map((trace) => ({ ...lineOf(trace), values: trace.analysis.decay_db })),
     }
   const lines = traces.map((trace) => {
     const { envelope_db, sample_db } = trace.analysis

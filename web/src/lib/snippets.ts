@@ -1,26 +1,42 @@
 //! A query as code for other programs.
 import type { Lake } from './api'
 
-export const EXAMPLES: readonly { title: string; query: (lake: Lake) => string }[] = [
+/** A query to begin with. */
+export interface ExampleQuery {
+  readonly title: string
+  readonly query: (lake: Lake) => string
+  /** It has no rows in a lake without Flat and Foam. */
+  readonly needsLevels?: boolean
+}
+
+export const EXAMPLES: readonly ExampleQuery[] = [
   {
     title: 'Quietest surfaces',
+    needsLevels: true,
     query: () =>
       "select surface_id, p90_mean_db, spread_db\nfrom surface_stats\nwhere band = 'total'\norder by p90_mean_db\nlimit 20",
   },
   {
     title: 'Levels against Flat by band',
+    needsLevels: true,
     query: (lake) =>
       `select surface_id,\n${lake.bands.map((b) => `  against_flat_${b.key}_db as "${b.label}"`).join(',\n')}\nfrom catalogue\norder by surface_id`,
   },
   {
     title: 'Incidence and level of one surface',
+    needsLevels: true,
     query: (lake) =>
       `select p.incidence_deg, 10 * log10(t.tnce_band_${lake.bands[Math.min(2, lake.bands.length - 2)].key}) as against_flat_db\nfrom tnce t join pairs p using (pair_id)\nwhere t.surface_id = (select min(surface_id) from surfaces where typology <> 'reference')\norder by p.incidence_deg`,
   },
   {
+    title: 'Signal to noise of each response',
+    query: () =>
+      'select surface_id, pair_id, snr_db, clipped_samples, arrival_error_us\nfrom measurements\norder by snr_db\nlimit 100',
+  },
+  {
     title: 'One impulse response',
     query: () =>
-      "select surface_id, pair_id, temperature_c, snr_db, ir\nfrom measurements\nwhere surface_id = 'flat' and pair_id = 0",
+      'select surface_id, pair_id, temperature_c, snr_db, ir\nfrom measurements\nwhere surface_id = (select max(surface_id) from measurements) and pair_id = 0',
   },
   {
     title: 'Signal to noise by attempt',
@@ -38,10 +54,14 @@ export const EXAMPLES: readonly { title: string; query: (lake: Lake) => string }
   },
   {
     title: 'Flat and Foam of every surface',
+    needsLevels: true,
     query: () =>
       'select flat_reference, foam_reference, count(*) as surfaces\nfrom surfaces\ngroup by 1, 2\norder by 3 desc',
   },
 ]
+
+/** The examples that have rows in a lake. */
+export const lakeExamples = (lake: Lake) => EXAMPLES.filter((one) => lake.has_levels || !one.needsLevels)
 
 export const LANGUAGES = ['curl', 'Python', 'DuckDB', 'Rust'] as const
 export type Language = (typeof LANGUAGES)[number]

@@ -5,7 +5,7 @@ import { plain } from './format'
 import { logTicks, ticks } from './plot'
 
 /** What the colours show below the highest level. */
-const SPECTROGRAM_RANGE_DB = 50
+export const SPECTROGRAM_RANGE_DB = 50
 /** Rows of the picture, lowest frequency first: each has one frequency. */
 export const SPECTROGRAM_ROWS = 129
 export const SPECTROGRAM_PAD = { left: 52, right: 64, top: 10, bottom: 40 } as const

@@ -1,0 +1,153 @@
+//! From WAV files to numbers and pictures without Flat, Foam and meshes: rooms of eight octaves, two pairs each.
+
+use std::process::Command;
+
+use serde_json::Value;
+
+use super::serve::{http::HttpRequest, served};
+use super::{TestFolder, web};
+
+const RATE_HZ: usize = 48_000;
+const HEADER: &str = "surface,recording,loopback,microphone,speaker,temperature_c\n";
+const ROOM_RIG: &str = r#"
+name = "rooms"
+bands.centres_hz = [125, 250, 500, 1000, 2000, 4000, 8000, 16000]
+[sweep]
+rate_hz = 48000
+low_hz = 20
+high_hz = 20000
+[impulse_response]
+length = 24000
+[grid]
+points_mm = [[0, 0, 1000], [2000, 0, 1000], [0, 3000, 1000]]
+"#;
+
+/// An exponential sweep of a second from 20 Hz to 20 kHz, and a second of silence.
+fn sweep() -> Vec<f64> {
+    let octaves = 1000f64.ln();
+    let sample = |n: usize| {
+        let time = n as f64 / RATE_HZ as f64;
+        0.5 * (std::f64::consts::TAU * 20.0 / octaves * ((time * octaves).exp() - 1.0)).sin()
+    };
+    (0..RATE_HZ).map(sample).chain(std::iter::repeat_n(0.0, RATE_HZ)).collect()
+}
+
+/// The sweep in a room: the direct sound, and 60 reflections that lose 60 dB in `decay_secs`.
+fn record_room(sweep: &[f64], decay_secs: f64, direct_mm: f64) -> Vec<f64> {
+    let direct = (direct_mm / 343e3 * RATE_HZ as f64) as usize;
+    let mut recording = vec![0.0; sweep.len()];
+    for reflection in 0..60usize {
+        let delay = direct + reflection * 331 + reflection * reflection * 37 % 211;
+        let sign = if reflection * 7 % 3 == 0 { -1.0 } else { 1.0 };
+        let gain = sign * 0.3 * 10f64.powf(-3.0 * (delay - direct) as f64 / (decay_secs * RATE_HZ as f64));
+        for (out, sample) in recording[delay..].iter_mut().zip(sweep) {
+            *out += gain * sample;
+        }
+    }
+    recording
+}
+
+/// A mono file of 16 bits.
+fn write_wav(place: &TestFolder, name: &str, samples: &[f64]) {
+    let size = 2 * samples.len() as u32;
+    let rate = RATE_HZ as u32;
+    let mut bytes = Vec::new();
+    bytes.extend(b"RIFF");
+    bytes.extend((36 + size).to_le_bytes());
+    bytes.extend(b"WAVEfmt \x10\0\0\0\x01\0\x01\0");
+    bytes.extend(rate.to_le_bytes());
+    bytes.extend((2 * rate).to_le_bytes());
+    bytes.extend(b"\x02\0\x10\0data");
+    bytes.extend(size.to_le_bytes());
+    bytes.extend(samples.iter().flat_map(|x| ((x * 32767.0).round() as i16).to_le_bytes()));
+    std::fs::write(place.path(name), bytes).expect("written");
+}
+
+/// Imports recordings of surfaces with their decay, each of two pairs.
+fn import_rooms(place: &TestFolder, rooms: &[(&str, f64)]) {
+    let sweep = sweep();
+    write_wav(place, "sweep.wav", &sweep);
+    let mut manifest = HEADER.to_owned();
+    for (room, decay_secs) in rooms {
+        for (speaker, direct_mm) in [("2000 0 1000", 2000.0), ("0 3000 1000", 3000.0)] {
+            let name = format!("{room}-{direct_mm}.wav");
+            write_wav(place, &name, &record_room(&sweep, *decay_secs, direct_mm));
+            manifest += &format!("{room},{name},sweep.wav,0 0 1000,{speaker},20\n");
+        }
+    }
+    std::fs::write(place.path("manifest.csv"), manifest).expect("written");
+    std::fs::write(place.path("rooms.toml"), ROOM_RIG).expect("written");
+    place.fails(0, &["import", "wav", "manifest.csv", "--rig", "rooms.toml"], "next: echolake --lake lake ingest");
+}
+
+fn lake() -> TestFolder {
+    let place = TestFolder::new();
+    import_rooms(&place, &[("hall", 1.2), ("living", 0.4)]);
+    place.fails(0, &["ingest"], "next: echolake --lake lake serve");
+    place
+}
+
+#[test]
+fn commands_name_what_a_lake_of_rooms_lacks() {
+    let place = lake();
+    assert!(place.ok(&["doctor"]).contains("waits for reference flat, foam, which levels need"));
+    assert_eq!(place.number("select count(*) from measurements where snr_db > 20"), 4.0);
+    let no_levels = "surface `hall` has no levels; hint: levels need runs of Flat and Foam";
+    for kind in ["grid", "nce"] {
+        place.fails(1, &["figure", kind, "hall", "-o", "out.svg"], no_levels);
+    }
+    place.fails(1, &["figure", "table", "hall", "-o", "out.csv"], no_levels);
+    place.fails(1, &["figure", "map"], "a map needs two surfaces with levels; hint: levels need Flat and Foam");
+    place.fails(1, &["figure", "relief", "hall"], "has no height map; hint: its run came without a mesh");
+    let steps = place.ok(&["figure", "steps", "hall"]);
+    assert!(steps.contains(">Measured<") && !steps.contains(">Direct sound removed<"));
+    for kind in ["filters", "coverage"] {
+        assert!(place.ok(&["figure", kind]).starts_with("<svg"), "{kind}");
+    }
+}
+
+// The direct sound of pair 0 comes after 2 m, that of pair 1 after 3 m of air.
+#[test]
+fn the_catalogue_lists_and_draws_responses_without_levels() {
+    let place = lake();
+    let server = served(&place, &[]);
+    let get = |path: &str| HttpRequest::get(path).send(&server);
+    let json = |path: &str| serde_json::from_str::<Value>(&get(path).text()).expect("JSON");
+    let lake = json("/api/v1/lake");
+    assert_eq!(lake["has_levels"], false);
+    let pairs = json("/api/v1/surfaces/hall/pairs");
+    assert_eq!((&pairs["total"], &pairs["items"][1]["pair_id"]), (&Value::from(2), &Value::from(1)));
+    assert_eq!(get("/api/v1/surfaces/hall/thumbnail.png").body[1..4], *b"PNG");
+    let analysis = json("/api/v1/surfaces/hall/pairs/1/analysis");
+    let number = |name: &str| analysis[name].as_f64().expect("a number");
+    assert!((number("arrival_s") - 3.0 / 343.0).abs() < 1e-4, "{}", number("arrival_s"));
+    let decay = |sample: usize| analysis["measured"]["decay_db"][sample].as_f64().expect("a level");
+    let from = (number("arrival_s") * RATE_HZ as f64) as usize;
+    // Over 0.2 s of a decay of 1.2 s for 60 dB; reflections come in steps of 7 ms, and the end is cut off.
+    let fallen = decay(from + 1000) - decay(from + 1000 + RATE_HZ / 5);
+    assert!((fallen - 10.0).abs() < 1.0, "{fallen} dB");
+    let picture = json("/api/v1/surfaces/hall/pairs/0/spectrogram?signal=measured");
+    assert_eq!(picture["window_s"], 0.005, "a hundredth of the response");
+}
+
+mod slow {
+    use super::*;
+
+    #[test]
+    fn pages_of_rooms_show_no_error() {
+        let Some(browser) = web::or_skip("rooms in a browser", web::browser()) else { return };
+        let place = lake();
+        let server = served(&place, &[]);
+        let look = |folder: &str| {
+            let shots = place.path(folder);
+            let base = format!("http://{}", server.http);
+            let mut command = Command::new("node");
+            command.args(["tests/rooms.mjs", &base]).arg(shots).current_dir(web::web()).env("CHROMIUM", &browser);
+            eprintln!("{}", web::run(&mut command).unwrap_or_else(|why| panic!("{why}")));
+        };
+        look("rooms");
+        import_rooms(&place, &[("flat", 0.3), ("foam", 0.05)]);
+        place.ok(&["ingest"]);
+        look("levels");
+    }
+}
