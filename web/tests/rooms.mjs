@@ -22,6 +22,7 @@ const PAGES = {
   decibels: `${pairs}/0?form=decibels&re=maximum&octave=3&show=group-delay&delay=none&axis=linear`,
   etc: `${pairs}/0?form=etc&show=group-delay&octave=1`,
   decay: `${pairs}/0?form=decay&signal=reflected`,
+  waterfall: `${pairs}/0?as=waterfall`,
   overlaid: `${pairs}/0?with=${ids[1]},${first}/1`,
   compare: '/compare',
   alone: `/compare?s=${first}`,
