@@ -29,6 +29,7 @@ const PAGES = {
   two: `/compare?s=${ids.join(',')}`,
   difference: `/compare?s=${ids.join(',')}&show=difference&band=1000`,
   map: '/map',
+  third: '/map?axes=23',
   som: `/map?axes=som&at=${first}`,
   runs: '/runs',
   run: `/runs/${runs[0].run_id}`,
