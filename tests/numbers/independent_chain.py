@@ -287,7 +287,7 @@ class IndependentChain:
         direct_m, reflected_m = of.metres
         to_own = (own / other) ** self.slopes[0]
         to_own = to_own * 10 ** (direct_m / 20 * (foam.air.absorption(self.hz * other) - absorbed))
-        to_reference = own ** -self.slopes[1].real
+        to_reference = own ** -self.slopes[1]
         to_reference = to_reference * 10 ** (reflected_m / 20 * (absorbed - self.reference.absorption(self.hz)))
         spectrum = (np.fft.rfft(of.response) - to_own * np.fft.rfft(foam.response)) * to_reference
         return np.fft.irfft(spectrum, len(of.response))

@@ -91,7 +91,7 @@ impl<T: RealSample> AirCorrectionFit<T> {
             let emitted: Vec<_> = bins.map(|(x, nepers)| x * (metres * nepers).exp()).collect();
             spectral_slopes(&emitted, step_hz, self.range_hz)
         };
-        let reflected_slopes: Vec<f64> = slopes(&self.reflected).iter().map(|slope| slope.re).collect();
+        let reflected_slopes = slopes(&self.reflected);
         let changes = by_bin(&warmer).into_iter().zip(by_bin(&colder)).map(|(warm, cold)| 2.0 * (cold - warm));
         let ln_ratio = warmer.ln_ratio - colder.ln_ratio;
         AirCorrection {
@@ -99,7 +99,7 @@ impl<T: RealSample> AirCorrectionFit<T> {
             len: self.len,
             reference: self.reference,
             direct_slopes: slopes(&self.direct),
-            transducers_per_kelvin: reflected_slopes.iter().map(|slope| 2.0 * slope * ln_ratio).collect(),
+            transducers_per_kelvin: reflected_slopes.iter().map(|slope| 2.0 * slope.re * ln_ratio).collect(),
             absorption_per_kelvin: changes.collect(),
             reflected_slopes,
             absorption,
@@ -129,10 +129,9 @@ pub struct AirCorrection<T: RealSample> {
     rate_hz: f64,
     len: usize,
     reference: ReferenceAir,
-    /// `[bins]`: d ln(spectrum) / d ln(frequency) of speaker and microphone, on the direct path with the phase's, and on
-    /// the reflected path.
+    /// `[bins]`: d ln(spectrum) / d ln(frequency) of speaker and microphone, on the direct and on the reflected path.
     direct_slopes: Vec<Complex<f64>>,
-    reflected_slopes: Vec<f64>,
+    reflected_slopes: Vec<Complex<f64>>,
     /// `[bins]`: absorption by the reference air, neper/m.
     absorption: Vec<f64>,
     /// `[bins]`: relative change of an energy per kelvin by speaker and microphone, and by absorption per metre.
@@ -202,17 +201,15 @@ impl<T: RealSample> AirCorrection<T> {
         let of_response = AirEffect::new(&self.reference, &pair.response);
         let of_direct = AirEffect::new(&self.reference, &pair.direct);
         let step_hz = self.rate_hz / self.len as f64;
-        let count = self.len as f64;
+        let share = T::of((self.len as f64).recip());
         for (bin, (x, d)) in spectrum.iter_mut().zip(&*direct_spectrum).enumerate() {
             let hz = bin as f64 * step_hz;
             let absorbed = of_response.nepers_per_m(hz);
             let to_response = self.direct_slopes[bin] * (of_response.ln_ratio - of_direct.ln_ratio)
                 + (of_direct.nepers_per_m(hz) - absorbed) * pair.direct_m;
-            let to_response = Complex::from_polar(to_response.re.exp(), to_response.im);
-            let to_response = Complex::new(T::of(to_response.re), T::of(to_response.im));
             let to_reference = -self.reflected_slopes[bin] * of_response.ln_ratio
                 + (absorbed - self.absorption[bin]) * pair.reflected_m;
-            *x = (*x - d * to_response) * T::of(to_reference.exp() / count);
+            *x = (*x - d * gain_of(to_response)) * gain_of(to_reference) * share;
         }
         // The ends of a real signal's spectrum are real.
         spectrum[0].im = T::default();
@@ -229,6 +226,11 @@ impl<T: RealSample> AirCorrection<T> {
         let of = |changes: &[f64]| changes.get(bin).copied().unwrap_or(0.0);
         of(&self.transducers_per_kelvin) + metres * of(&self.absorption_per_kelvin)
     }
+}
+
+fn gain_of<T: RealSample>(nepers: Complex<f64>) -> Complex<T> {
+    let gain = Complex::from_polar(nepers.re.exp(), nepers.im);
+    Complex::new(T::of(gain.re), T::of(gain.im))
 }
 
 fn transform<T: RealSample>(
