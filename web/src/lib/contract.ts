@@ -579,8 +579,8 @@ export interface paths {
         };
         /**
          * The relief in oblique light, grey, as many pixels as the height map has cells.
-         * @description To scale in depth: one light for all surfaces. Of a surface without a height map, the energy-time curve of its first
-         *     response, 128 x 128: 60 dB from bottom to top. Without a response, paper.
+         * @description To scale in depth: one light for all surfaces. Of a surface without a height map, the level of its first response
+         *     over time, 128 x 128: 60 dB from bottom to top. Without a response, paper.
          */
         readonly get: operations["thumbnail"];
         readonly put?: never;

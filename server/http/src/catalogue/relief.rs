@@ -2,7 +2,6 @@
 //! decay of its first response for a picture.
 
 use axum::Extension;
-use echolake_dsp::envelope::EnvelopePlan;
 use echolake_dsp::heights;
 use echolake_dsp::level::plotted_power_to_db;
 use echolake_figures::encode_grey_png;
@@ -43,22 +42,18 @@ struct FirstResponse {
     ir: Vec<f32>,
 }
 
-/// Draws the energy-time curve of a response over the part that is louder than the range below its highest level. Paper
+/// Draws the level of a response's samples over the part that is louder than the range below its highest level. Paper
 /// alone if there is no sound.
 ///
 /// returns  `[DECAY_SIDE x DECAY_SIDE]`  grey, rows from the top
-fn draw_decay(ir: &[f32]) -> Result<Vec<u8>, echolake_dsp::Error> {
+fn draw_decay(ir: &[f32]) -> Vec<u8> {
     let [paper, ink] = DECAY_GREYS;
     let mut pixels = vec![paper; DECAY_SIDE * DECAY_SIDE];
-    if ir.iter().all(|x| *x == 0.0) {
-        return Ok(pixels);
+    let highest = ir.iter().fold(0.0f32, |most, x| most.max(x.abs()));
+    if highest == 0.0 {
+        return pixels;
     }
-    let samples: Vec<f64> = ir.iter().copied().map(f64::from).collect();
-    let mut envelope = vec![0.0; samples.len()];
-    let plan = EnvelopePlan::new(samples.len())?;
-    plan.compute_envelope(&samples, &mut envelope, &mut plan.make_scratch())?;
-    let highest = envelope.iter().copied().fold(0.0, f64::max);
-    let levels: Vec<f64> = envelope.iter().map(|x| plotted_power_to_db((x / highest).powi(2))).collect();
+    let levels: Vec<f64> = ir.iter().map(|x| plotted_power_to_db(f64::from(x / highest).powi(2))).collect();
     let is_loud = |level: &f64| *level > -DECAY_RANGE_DB;
     let first = levels.iter().position(is_loud).unwrap_or(0);
     let last = levels.iter().rposition(is_loud).unwrap_or(first);
@@ -72,7 +67,7 @@ fn draw_decay(ir: &[f32]) -> Result<Vec<u8>, echolake_dsp::Error> {
             pixels[row * DECAY_SIDE + column] = ink;
         }
     }
-    Ok(pixels)
+    pixels
 }
 
 /// Heights in mm as little-endian f32, row by row.
@@ -105,8 +100,8 @@ pub(super) async fn heightmap(
 
 /// The relief in oblique light, grey, as many pixels as the height map has cells.
 ///
-/// To scale in depth: one light for all surfaces. Of a surface without a height map, the energy-time curve of its first
-/// response, 128 x 128: 60 dB from bottom to top. Without a response, paper.
+/// To scale in depth: one light for all surfaces. Of a surface without a height map, the level of its first response
+/// over time, 128 x 128: 60 dB from bottom to top. Without a response, paper.
 #[utoipa::path(
     get,
     path = "/api/v1/surfaces/{surface_id}/thumbnail.png",
@@ -125,7 +120,10 @@ pub(super) async fn thumbnail(
     let surface = &request.find_surface(&path.surface_id).await?.surface;
     let id = &surface.surface_id;
     let (pixels, width) = match (read_heightmap(&request, id).await?, &surface.run_id) {
-        (Some(row), _) => (heights::shade_heights(&row.heights_mm, row.size_mm / row.cells as f32), row.cells),
+        (Some(row), _) => {
+            let pixels = heights::shade_heights(&row.heights_mm, row.size_mm / row.cells as f32);
+            (pixels.map_err(RequestFault::defect("a height map makes no picture"))?, row.cells)
+        }
         (None, Some(run)) => {
             let values = vec![text_value(id), text_value(run)];
             let rows: Vec<FirstResponse> = request.read_rows(FIRST_RESPONSE, values).await?;
@@ -133,7 +131,6 @@ pub(super) async fn thumbnail(
         }
         (None, None) => (draw_decay(&[]), DECAY_SIDE),
     };
-    let pixels = pixels.map_err(RequestFault::defect("a surface has no picture"))?;
     let file = encode_grey_png(&pixels, width).map_err(RequestFault::defect("a surface has no picture"))?;
     Ok(AnswerContent::new("image/png", file))
 }
@@ -178,13 +175,13 @@ mod tests {
     fn a_decay_is_drawn_as_a_slope() {
         let mut ir: Vec<f32> = (0..4000).map(|n| 10f32.powf(-3.0 * n as f32 / 1000.0)).collect();
         ir.iter_mut().skip(1).step_by(2).for_each(|x| *x = -*x);
-        let pixels = draw_decay(&ir).expect("a picture");
+        let pixels = draw_decay(&ir);
         let tall = |column: usize| (0..DECAY_SIDE).filter(|row| pixels[row * DECAY_SIDE + column] == 96).count();
         for (column, expected) in [(0, 128), (32, 96), (64, 64), (96, 32), (127, 1)] {
             assert!(tall(column).abs_diff(expected) <= 2, "{column}: {}", tall(column));
         }
         for silent in [&[][..], &[0.0; 9]] {
-            assert!(draw_decay(silent).expect("paper").iter().all(|grey| *grey == 232));
+            assert!(draw_decay(silent).iter().all(|grey| *grey == 232));
         }
     }
 }
