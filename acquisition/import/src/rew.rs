@@ -11,8 +11,9 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use echolake_acquisition::run::recorder::{LogLevel, RunStart};
+use echolake_dsp::air::AirState;
 use echolake_dsp::geometry::direct_mm;
-use echolake_dsp::temperature::speed_of_sound;
+use echolake_dsp::temperature::ReferenceAir;
 use echolake_schema::interchange::REW_MANIFEST;
 use echolake_schema::manifest::{Origin, RunEnd};
 use echolake_schema::{Celsius, Grid, Pair, Rig, SurfaceId, Timestamp};
@@ -151,7 +152,7 @@ fn parse_row(cells: &ManifestCells<'_>, rig: &Rig, grid: &Grid) -> Result<RewRow
     let peak = check_response(&file.samples, emission, len)
         .map_err(|what| cells.cell_error("response", format!("`{name}` {what}")))?;
     let mut warnings = file.warnings;
-    let expected = geometry_secs(pair, grid, celsius) * rate_hz;
+    let expected = geometry_secs(pair, rig, grid, celsius) * rate_hz;
     if (peak - expected).abs() > PEAK_SECS * rate_hz {
         warnings.push(format!(
             "the peak of `{name}` is {peak:.0} samples after the emission, and geometry gives {expected:.0}: is the \
@@ -163,9 +164,10 @@ fn parse_row(cells: &ManifestCells<'_>, rig: &Rig, grid: &Grid) -> Result<RewRow
     Ok(RewRow { line: cells.line(), recorded_at: cells.parse_time()?, response, warnings })
 }
 
-fn geometry_secs(pair: Pair, grid: &Grid, celsius: Celsius) -> f64 {
+fn geometry_secs(pair: Pair, rig: &Rig, grid: &Grid, celsius: Celsius) -> f64 {
     let [m, s] = [pair.microphone, pair.speaker].map(|id| grid.points()[id.index()].position_mm);
-    direct_mm(m, s) / 1e3 / speed_of_sound(celsius.get())
+    let air = AirState::with_known(celsius.get(), None, None);
+    direct_mm(m, s) / 1e3 / ReferenceAir::from_response(&rig.impulse_response).speed_in(&air)
 }
 
 fn read_response(folder: &Path, name: &str) -> Result<RewResponse, String> {
