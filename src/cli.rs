@@ -142,7 +142,7 @@ pub(crate) enum LakeCommand {
     },
     /// Merge the tables' small files into large ones; ingest and queries may continue meanwhile.
     Optimize(OptimizeArgs),
-    /// Simulate a measured panel's mesh, and report the differences to the measurement by pair and band.
+    /// Simulate a measured panel's heights, and report the differences to the measurement by pair and band.
     Twin(TwinArgs),
     /// Delete files that no table needs any more, and what crashes left behind.
     Vacuum(VacuumArgs),

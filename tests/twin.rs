@@ -1,4 +1,8 @@
-//! `echolake twin`: a run beside the one that is computed for its mesh.
+//! `echolake twin`: a run beside the one that is computed for its heights.
+
+use echolake_panel::paper_panel::PaperPanel;
+use echolake_panel::relief::PanelRelief;
+use echolake_testing::SMALL_RIG;
 
 use super::TestFolder;
 
@@ -56,5 +60,31 @@ mod slow {
         place.fails(1, &["twin", "wood"], "the panel is of `MDF`; hint: twins are computed of `coated print` alone");
         place.fails(1, &["twin", "twin_flat"], "is computed itself");
         place.fails(1, &["twin", "marble"], "there is no run, surface or file `marble`");
+    }
+
+    // Both are simulated alike, without the chances of a measurement: no level may differ.
+    #[test]
+    fn the_twin_of_a_run_without_noise_is_the_run() {
+        let place = TestFolder::new();
+        let quiet = "[simulation]\nnoise_and_drift = false\nrepeatability_mm = 0.0\ncalibration_mm = 0.0\n";
+        let rig = SMALL_RIG.replace("points_per_side = 3", "points_per_side = 2") + quiet;
+        std::fs::write(place.path("rig.toml"), rig).expect("written");
+        let of_paper = PaperPanel::ALL.map(|panel| panel.name);
+        let reliefs = PanelRelief::NAMES.into_iter().chain(of_paper).filter(|name| *name != "wood");
+        let surfaces: Vec<_> = reliefs.collect();
+        surfaces.iter().for_each(|surface| drop(place.acquire(surface, &[])));
+        // A foreign mesh is deeper than our reliefs are, and its zero is elsewhere.
+        place.ok(&["panel", "river_rock", "--cells", "400", "-o", "printed.stl"]);
+        place.acquire("printed", &["--mesh", "printed.stl"]);
+        place.ok(&["ingest"]);
+        for surface in surfaces.into_iter().filter(|name| *name != "foam").chain(["printed"]) {
+            let twin: serde_json::Value = serde_json::from_str(&place.ok(&["twin", surface, "--json"])).expect("JSON");
+            let bands = twin["bands"].as_array().expect("bands");
+            assert_eq!(bands.len(), 6);
+            for band in bands {
+                let off = ["mean_db", "rms_db"].map(|value| band[value].as_f64().expect(surface).abs());
+                assert!(off.iter().all(|db| *db <= 0.02) && band["pairs"] == 10, "{surface}: {band}");
+            }
+        }
     }
 }

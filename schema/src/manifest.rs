@@ -54,7 +54,7 @@ pub enum Origin {
     Measured,
     /// Computed by the simulated rig.
     Simulated,
-    /// Computed by the simulated rig for the mesh of a measured surface, to compare both.
+    /// Computed by the simulated rig for the heights of a measured surface, to compare both.
     Computed,
     /// Imported from WAV files of other software.
     ImportedWav,

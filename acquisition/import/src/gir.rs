@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 
 use echolake_acquisition::rig::devices::simulated::TAKE_SECS;
 use echolake_acquisition::run::recorder::{LogLevel, Relief, RunStart};
-use echolake_panel::mesh::{BACK_MM, MESH_CELLS, Mesh};
+use echolake_panel::mesh::{BACK_MM, FACETS, Mesh};
 use echolake_panel::relief::HeightField;
 use echolake_schema::interchange::{GIR_COMBINATIONS, GIR_PANEL_INFO};
 use echolake_schema::manifest::{MeshFacts, Origin, RunEnd};
@@ -141,7 +141,7 @@ impl GirImport<'_> {
 }
 
 fn smaller(heights: &HeightField) -> HeightField {
-    HeightField::from_fn(heights.size_mm(), MESH_CELLS, |x, y| heights.height_at(x, y))
+    HeightField::from_fn(heights.size_mm(), heights.cells().min(FACETS), |x, y| heights.height_at(x, y))
 }
 
 // One per row of the matrix.

@@ -6,7 +6,7 @@ use echolake_schema::manifest::MeshFacts;
 use echolake_schema::{Rig, SurfaceRecord};
 
 use crate::material::SurfaceMaterial;
-use crate::mesh::{self, BACK_MM, FACETS, MESH_CELLS, Mesh, MeshFormat, PanelSide};
+use crate::mesh::{self, BACK_MM, FACETS, Mesh, MeshFormat, PanelSide};
 use crate::relief::{HeightField, PanelRelief};
 
 /// A panel to be measured.
@@ -75,8 +75,8 @@ fn unknown_surface() -> SurfaceRecord {
 
 fn from_relief(relief: &PanelRelief) -> PreparedPanel {
     let material = relief.material();
-    let mesh = Mesh::from_height_field(&relief.height_field(MESH_CELLS), BACK_MM);
     let heights = relief.height_field(FACETS);
+    let mesh = Mesh::from_height_field(&heights, BACK_MM);
     let facts = MeshFacts {
         file: echolake_schema::topics::MESH_ATTACHMENT.to_owned(),
         triangles: mesh.triangles.len() as u64,

@@ -28,6 +28,14 @@ impl HeightField {
         Self { size_mm, cells, heights_mm }
     }
 
+    /// Heights `[cells x cells]`, row by row along x with y ascending, mm; None if they are no square of two cells a side
+    /// or more, or not all finite.
+    pub fn from_rows(size_mm: f64, heights_mm: Vec<f32>) -> Option<Self> {
+        let cells = heights_mm.len().isqrt();
+        let is_field = cells > 1 && cells * cells == heights_mm.len() && heights_mm.iter().all(|h| h.is_finite());
+        is_field.then_some(Self { size_mm, cells, heights_mm })
+    }
+
     /// The same field, higher by this, mm.
     pub fn raised_by(mut self, mm: f64) -> Self {
         self.heights_mm.iter_mut().for_each(|h| *h = (f64::from(*h) + mm) as f32);

@@ -26,7 +26,7 @@ pub(crate) fn surface_row(
     let known = |i: usize| [relief.map(|r| r[i]).filter(|x| x.is_finite())];
     let flat = surface.flat_reference.as_ref().unwrap_or(&references.flat);
     let foam = surface.foam_reference.as_ref().unwrap_or(&references.foam);
-    let heights = height_field(heights_mm, rig.panel.size_mm);
+    let heights = HeightField::from_rows(rig.panel.size_mm, heights_mm.to_vec());
     let mut row = keys.begin_rows(Table::Surfaces, rig, 1);
     for (band, hz) in rig.band_names().iter().zip(&rig.bands.centres_hz) {
         let phase = heights.as_ref().and_then(|heights| detail_phase(heights, rig, *hz));
@@ -55,13 +55,6 @@ pub(crate) fn surface_row(
         .fill_text("project", surface.project.as_ref().map(ProjectName::as_str))
         .finish()?;
     Ok(row)
-}
-
-fn height_field(heights_mm: &[f32], size_mm: f64) -> Option<HeightField> {
-    let side = heights_mm.len().isqrt();
-    let mut all = heights_mm.iter().copied().map(f64::from);
-    let is_square = side > 1 && side * side == heights_mm.len();
-    is_square.then(|| HeightField::from_fn(size_mm, side, |_, _| all.next().unwrap_or_default()))
 }
 
 // Of cells as wide as half a wavelength, nothing is known within one.
@@ -95,11 +88,11 @@ mod tests {
         let rig = Rig::paper();
         let grooves = |cells: usize| {
             let row = move |i: usize| if i.is_multiple_of(5) { -1.0f32 } else { 0.0 };
-            height_field(&(0..cells * cells).map(|i| row(i % cells)).collect::<Vec<_>>(), 585.0).expect("square")
+            HeightField::from_rows(585.0, (0..cells * cells).map(|i| row(i % cells)).collect()).expect("square")
         };
         let phase = detail_phase(&grooves(260), &rig, 10e3).expect("there");
         assert!((phase - 0.4 * (TAU * 10.0 / 343.2) as f32).abs() < 0.01, "{phase}");
         assert_eq!(detail_phase(&grooves(100), &rig, 40e3), None);
-        assert_eq!(height_field(&[0.0; 6], 585.0), None);
+        assert_eq!(HeightField::from_rows(585.0, vec![0.0; 6]), None);
     }
 }

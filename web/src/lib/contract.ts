@@ -901,7 +901,7 @@ export interface components {
             readonly points: readonly components["schemas"]["Point"][];
             readonly rate_hz: number;
             readonly reference_temperature_c: number;
-            /** @description Every surface comes from the simulated rig, or is computed for the mesh of one. */
+            /** @description Every surface comes from the simulated rig, or is computed for the heights of one. */
             readonly simulated: boolean;
             readonly software: string;
             /** @description Changes with every snapshot; also the ETag of what is computed from it. */

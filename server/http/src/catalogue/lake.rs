@@ -31,7 +31,7 @@ struct LakeDescription<'a> {
     layers: i32,
     points: Vec<GridPoint>,
     counts: LakeCounts,
-    /// Every surface comes from the simulated rig, or is computed for the mesh of one.
+    /// Every surface comes from the simulated rig, or is computed for the heights of one.
     simulated: bool,
     /// Some surface has levels against its Flat. In a lake of rooms none has.
     has_levels: bool,
