@@ -9,8 +9,10 @@ use echolake_schema::{Rig, SpectralDivision};
 
 use crate::run::objection::TakeObjection;
 
-/// Attenuation of the assessed response outside of the sweep's range, dB: only the range counts.
-const OUT_OF_RANGE_DB: f64 = 60.0;
+/// Width of the tapers at the limits of the sweep's range, in periods per time until the part that holds noise alone.
+/// Hard limits ring until there, 46 dB below the response. These take 60 dB off, and as little of the range as that
+/// needs, because the direct sound beside the tweeter's beam is strongest at its lower end.
+const TAPER_PERIODS: f64 = 16.0;
 /// Half width of the search window around the direct sound's expected time, samples: the first echo follows it by nine
 /// samples at least.
 const ARRIVAL_WINDOW: f64 = 5.0;
@@ -22,8 +24,8 @@ const ARRIVAL_SHARE: f32 = 0.3;
 /// Assessment of one recording.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TakeAssessment {
-    /// Mean power of the response's first part over that of its noise, in the sweep's range, dB; NaN if the recording
-    /// is too short to tell.
+    /// Mean power of the response's first part, as long as the rig's responses, over that of the noise far behind it,
+    /// dB. Both are in the sweep's range, which is tapered at its limits. NaN if the recording is too short to tell.
     pub snr_db: f64,
     /// Samples at full scale, both channels.
     pub clipped_samples: u32,
@@ -50,23 +52,19 @@ impl TakeAssessor {
     /// As [`DeconvolutionPlan::new`].
     pub fn new(rig: &Rig, recording_len: usize) -> Result<Self, Error> {
         let rate_hz = rig.sweep.rate_hz.get();
+        let signal_len = response_len(rig).min(recording_len);
+        let quiet = quiet_range(recording_len, signal_len);
         let plan = DeconvolutionPlan::new(DeconvolutionParams {
             recording_len,
             output_len: recording_len,
             rate_hz,
             low_hz: rig.sweep.low_hz,
             high_hz: rig.sweep.high_hz,
-            division: SpectralDivision::Floored { floor_db: OUT_OF_RANGE_DB },
-            taper_hz: 0.0,
+            division: SpectralDivision::Tapered,
+            taper_hz: TAPER_PERIODS * rate_hz / quiet.start.max(1) as f64,
             length: TransformLength::Fast,
         })?;
-        Ok(Self {
-            scratch: plan.make_scratch(),
-            plan,
-            response: vec![0.0; recording_len],
-            signal_len: response_len(rig).min(recording_len),
-            rate_hz,
-        })
+        Ok(Self { scratch: plan.make_scratch(), plan, response: vec![0.0; recording_len], signal_len, rate_hz })
     }
 
     /// Assesses one recording; samples are fractions of full scale.
@@ -170,7 +168,11 @@ fn mean_power(x: &[f32]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use echolake_dsp::deconvolution::fast_length;
     use echolake_dsp::sweep::LinearSweep;
+    use rand::SeedableRng as _;
+    use rand_chacha::ChaCha8Rng;
+    use rand_distr::{Distribution as _, StandardNormal};
 
     // A sweep and its echo-free recording, `delay` samples late, in a little noise.
     fn assessed(delay: usize, expected: f64) -> TakeAssessment {
@@ -188,6 +190,32 @@ mod tests {
         microphone[delay..].iter_mut().zip(&loopback).for_each(|(m, l)| *m += 0.3 * l);
         let mut assessor = TakeAssessor::new(&rig, loopback.len()).expect("a plan");
         assessor.assess_take(&microphone, &loopback, expected / 96e3, 0).expect("assessed")
+    }
+
+    // A sweep of amplitude A, T seconds and B Hz has a power spectrum of (A rate)^2 T / 4 B within its range (stationary
+    // phase; Klauder 1960), and white noise of N samples one of N sigma^2. Fades weigh response and noise alike.
+    #[test]
+    fn the_ratio_of_signal_and_noise_is_the_true_one() {
+        for duration_secs in [0.03, 0.5] {
+            let rig = Rig::from_toml(&format!("sweep.duration_secs = {duration_secs}")).expect("a rig");
+            let sweep = LinearSweep { rate_hz: 96e3, duration_secs, low_hz: 2e3, high_hz: 40e3, fade_secs: 1e-3 };
+            let mut loopback: Vec<f32> = sweep.samples().iter().map(|x| 0.5 * *x as f32).collect();
+            loopback.resize(rig.recording_len(), 0.0);
+            let mut assessor = TakeAssessor::new(&rig, loopback.len()).expect("a plan");
+            let transformed = fast_length(loopback.len()) as f64;
+            let spectrum = (0.5 * 96e3f64).powi(2) * duration_secs / (4.0 * 38e3);
+            let signal = 0.3f64.powi(2) / response_len(&rig) as f64;
+            for true_db in [30.0, 50.0, 70.0, 90.0] {
+                let noise = signal / 10f64.powf(true_db / 10.0);
+                let sigma = (noise * spectrum * transformed / loopback.len() as f64).sqrt();
+                let mut rng = ChaCha8Rng::seed_from_u64(7);
+                let normal = std::iter::repeat_with(|| -> f64 { StandardNormal.sample(&mut rng) });
+                let mut microphone: Vec<f32> = normal.take(loopback.len()).map(|x| (sigma * x) as f32).collect();
+                microphone[60..].iter_mut().zip(&loopback).for_each(|(m, l)| *m += 0.3 * l);
+                let found = assessor.assess_take(&microphone, &loopback, 60.0 / 96e3, 0).expect("assessed");
+                assert!((found.snr_db - true_db).abs() < 1.0, "{duration_secs} s: {true_db}, {}", found.snr_db);
+            }
+        }
     }
 
     #[test]

@@ -177,7 +177,12 @@ pub(super) fn measurement_columns() -> Vec<Column> {
         Column::double("humidity_pct", "%", "Relative humidity").or_null(),
         Column::double("pressure_hpa", "hPa", "Pressure").or_null(),
         Column::float("outside_level_db", "dB re 20 uPa", "Sound pressure level outside").or_null(),
-        Column::float("snr_db", "dB", "Signal-to-noise ratio in the sweep's band").or_null(),
+        Column::float(
+            "snr_db",
+            "dB",
+            "Mean power of the response over that of the noise behind it, in the sweep's band",
+        )
+        .or_null(),
         Column::int("clipped_samples", "1", "Samples at full scale, both channels"),
         Column::float("arrival_error_us", "us", "Direct sound's arrival minus the one geometry gives").or_null(),
         Column::float("microphone_residual_mm", "mm", "Measured minus wanted position of the microphone").or_null(),
