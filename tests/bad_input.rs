@@ -124,7 +124,7 @@ fn panels_and_groups_that_cannot_be_made() {
     assert!(!place.path("x.stl").exists(), "nothing is written where something is refused");
     place.fails(2, &["panel", "river_rock"], "--output");
     place.fails(2, &["panel", "--next", "ranges.toml", "-o", "next.toml"], "--results");
-    let ranges = "relief = \"slated_stone\"\n[ranges]\nprojection_mm = [20, 60]\n";
+    let ranges = "relief = \"slated_stone\"\n[ranges]\nprojection_mm = [20, 60]\n[steps]\nprojection_mm = 5\n";
     std::fs::write(place.path("ranges.toml"), ranges).expect("written");
     std::fs::write(place.path("wide.toml"), ranges.replace("60", "90")).expect("written");
     place.fails(1, &["panel", "--group", "wide.toml", "-o", "group"], "range of `projection_mm` is 20 to 90");
@@ -136,7 +136,7 @@ fn panels_and_groups_that_cannot_be_made() {
     place.fails(1, &next("one.csv"), "two surfaces or more");
     std::fs::write(place.path("two.csv"), "surface_id,band,p90_mean_db\n0001_0,total,-1\n0001_1,total,-1\n")
         .expect("written");
-    assert!(place.ok(&next("two.csv")).contains("projection_mm: 20 to 60 becomes 0 to 80."));
+    assert!(place.ok(&next("two.csv")).contains("projection_mm: steps of 5 become 10, from 30 on within 20 to 60."));
 }
 
 #[test]

@@ -54,14 +54,14 @@ pub(crate) struct PanelArgs {
     /// Print the list as JSON.
     #[arg(long, requires = "list")]
     json: bool,
-    /// Generate a group of surfaces with parameters drawn from the ranges in this TOML file: one JSON file per surface,
-    /// and group.csv, in the folder of -o.
+    /// Generate a group of surfaces, whose parameters go through the ranges in this TOML file in steps: one JSON file per
+    /// surface, and group.csv, in the folder of -o.
     #[arg(long, value_name = "RANGES", conflicts_with_all = ["name", "set", "back", "list", "parameters"])]
     group: Option<PathBuf>,
     /// Number of surfaces in the group; two per panel.
     #[arg(long, value_name = "N", default_value_t = 8, value_parser = clap::value_parser!(u32).range(1..=10_000))]
     count: u32,
-    /// Write the ranges of the next group: wider if the last group's results are alike, else narrower.
+    /// Write the ranges with the steps of the next group: larger if the last group's results are alike, else smaller.
     #[arg(long, value_name = "RANGES", requires = "results", conflicts_with_all = ["name", "set", "back", "list", "group", "parameters"])]
     next: Option<PathBuf>,
     /// Results of the last group: CSV with surface_id, band and p90_mean_db, from `echolake sql` on surface_stats.

@@ -1,4 +1,4 @@
-//! `echolake panel --group` and `--next`: the loop from ranges to panels to results to ranges.
+//! `echolake panel --group` and `--next`: the loop from steps to panels to results to steps.
 
 use std::path::Path;
 
@@ -26,7 +26,7 @@ pub(super) fn make_group(ranges: &Path, count: usize, folder: &Path) -> anyhow::
     Ok(CommandOutcome::Whole)
 }
 
-/// Writes the ranges of the next group, and prints the reasons for them.
+/// Writes the steps of the next group, and prints the reasons for them.
 pub(super) fn write_next_ranges(ranges: &Path, results: &Path, output: &Path) -> anyhow::Result<CommandOutcome> {
     let text = std::fs::read_to_string(results).with_context(|| format!("cannot read `{}`", results.display()))?;
     let rows = csv::Reader::from_reader(text.as_bytes()).deserialize().collect::<Result<Vec<BandLevel>, _>>();
