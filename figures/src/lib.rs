@@ -26,5 +26,6 @@ pub use kinds::grid::{BandLevels, GridFigure, GridLayer, GridPanel, GridPosition
 pub use kinds::map::{MapFigure, MapPosition};
 pub use kinds::nce::{NceFigure, NcePanel};
 pub use kinds::relief::{ReliefFigure, ReliefPanel};
+pub use kinds::setup::{ArmLink, SetupArm, SetupFigure};
 pub use kinds::steps::{ResponseTrace, StepsFigure, StepsRow};
 pub use kinds::table::{FigureTable, TableRow};

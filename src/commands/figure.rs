@@ -33,6 +33,10 @@ pub(crate) enum FigureCommand {
     Map(MapArgs),
     /// Reliefs in oblique light.
     Relief(ReliefArgs),
+    /// The steps in which a wall is generated: flat, subdivided, thickened, with joints and roughness.
+    Generation(GenerationArgs),
+    /// The grid's layers and both arms over the panel.
+    Setup(SetupArgs),
 }
 
 /// The surfaces of a figure, in this order.
@@ -181,6 +185,27 @@ pub(crate) struct ReliefArgs {
     columns: u32,
 }
 
+#[derive(Debug, Args)]
+pub(crate) struct GenerationArgs {
+    /// Kind of wall, or a panel of the paper; `echolake panel --list` prints all.
+    #[arg(value_name = "NAME", default_value = "flemish_bond")]
+    name: String,
+    /// Set a parameter of the wall; repeatable.
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+    #[command(flatten)]
+    output: OutputArgs,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct SetupArgs {
+    #[command(flatten)]
+    output: OutputArgs,
+    /// The pair at which the arms stand.
+    #[arg(long, default_value_t = 0)]
+    pair: u32,
+}
+
 pub(crate) async fn run_figure(command: &FigureCommand, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let source = FigureSource::open(Lake::open(lake_url).await?).await?;
     match command {
@@ -192,6 +217,8 @@ pub(crate) async fn run_figure(command: &FigureCommand, lake_url: &str) -> anyho
         FigureCommand::Steps(args) => surfaces::write_steps(&source, args).await?,
         FigureCommand::Map(args) => surfaces::write_map(&source, args).await?,
         FigureCommand::Relief(args) => surfaces::write_relief(&source, args).await?,
+        FigureCommand::Generation(args) => calculated::write_generation(&source, args)?,
+        FigureCommand::Setup(args) => calculated::write_setup(&source, args)?,
     }
     Ok(CommandOutcome::Whole)
 }

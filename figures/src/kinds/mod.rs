@@ -6,5 +6,6 @@ pub(crate) mod grid;
 pub(crate) mod map;
 pub(crate) mod nce;
 pub(crate) mod relief;
+pub(crate) mod setup;
 pub(crate) mod steps;
 pub(crate) mod table;

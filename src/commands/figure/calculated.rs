@@ -1,12 +1,21 @@
-//! Figures that follow from the rig alone.
+//! Figures that follow from the rig, or from a relief's parameters, alone.
 
+use anyhow::Context as _;
+use echolake_acquisition::rig::robots::{Choreography, Tool};
 use echolake_dsp::fresnel::first_fresnel_zone;
-use echolake_figures::{CoverageFigure, CoverageZone, FilterFigure};
-use echolake_schema::Point;
+use echolake_dsp::heights::shade_heights;
+use echolake_figures::{
+    ArmLink, CoverageFigure, CoverageZone, FilterFigure, ReliefFigure, ReliefPanel, SetupArm, SetupFigure,
+};
+use echolake_panel::mesh::BACK_MM;
+use echolake_panel::relief::{HeightField, PanelRelief};
+use echolake_schema::{PairId, Point};
 
 use super::source::FigureSource;
-use super::{CoverageArgs, FiltersArgs};
+use super::{CoverageArgs, FiltersArgs, GenerationArgs, SetupArgs};
 
+/// Cells along each side of a relief's picture.
+const PICTURE_CELLS: usize = 400;
 /// Speed of sound at 20 C, m/s, as of table `pairs`.
 const SPEED_M_S: f64 = 343.0;
 
@@ -51,4 +60,60 @@ fn coverage_zone(microphone: &Point, speaker: &Point, frequency_hz: f64) -> Cove
         radii_mm: [zone.semi_major_mm, zone.semi_minor_mm],
         angle_deg: (to[1] - from[1]).atan2(to[0] - from[0]).to_degrees(),
     }
+}
+
+pub(super) fn write_generation(source: &FigureSource, args: &GenerationArgs) -> anyhow::Result<()> {
+    let mut relief = PanelRelief::by_name(&args.name)?;
+    super::super::acquire::set_all(&mut relief, &args.set)?;
+    let steps = relief.generation_steps();
+    anyhow::ensure!(!steps.is_empty(), "`{}` has no stones with joints; hint: flemish_bond or river_rock", args.name);
+    let mut panels = Vec::new();
+    for step in steps {
+        let heights = step.relief.height_field(PICTURE_CELLS);
+        panels.push(generation_panel(step.caption, &heights)?);
+    }
+    let columns = panels.len();
+    let figure = ReliefFigure { panels, panel_mm: source.lake.rig().panel.size_mm, panel_px: 200.0, columns };
+    let title = args.output.title_or(|| format!("Generation of {}", args.name));
+    args.output.write_drawing(&figure.draw(&source.figure_notes(title, String::new(), &[])), &[])
+}
+
+fn generation_panel(caption: &str, heights: &HeightField) -> anyhow::Result<ReliefPanel> {
+    Ok(ReliefPanel {
+        title: caption.to_owned(),
+        shaded: shade_heights(heights.heights_mm(), heights.pitch_mm() as f32)?,
+        cells: heights.cells(),
+        extent_mm: heights.extent_mm().map(f64::from),
+    })
+}
+
+pub(super) fn write_setup(source: &FigureSource, args: &SetupArgs) -> anyhow::Result<()> {
+    let rig = source.lake.rig();
+    let points = source.lake.grid().points();
+    let arms = Choreography::new(rig)?;
+    let pair = PairId(args.pair);
+    let pose = arms.pose_at(pair).map_err(|reason| anyhow::anyhow!("{}", reason.reason_text()));
+    let pose = pose.with_context(|| format!("the arms cannot stand at pair {}", args.pair))?;
+    let cell = arms.cell();
+    let layers = points.iter().map(|point| point.layer).max().unwrap_or(0);
+    let layer = |number| points.iter().filter(|p| p.layer == number).map(|p| p.position_mm).collect();
+    let arm = |(tool, joints, name): (Tool, _, &str)| {
+        let links = cell.arm_with_tool(tool).link_capsules(joints).map(|link| ArmLink {
+            from_mm: (1e3 * link.from).to_array(),
+            to_mm: (1e3 * link.to).to_array(),
+            radius_mm: 1e3 * link.radius,
+        });
+        SetupArm { name: name.to_owned(), links: links.to_vec() }
+    };
+    let figure = SetupFigure {
+        panel_mm: rig.panel.size_mm,
+        bottom_mm: f64::from(BACK_MM),
+        layers_mm: (0..=layers).map(layer).collect(),
+        arms: [(Tool::Microphone, &pose.microphone, "microphone"), (Tool::Speaker, &pose.speaker, "speaker")]
+            .map(arm)
+            .to_vec(),
+        width_px: 620.0,
+    };
+    let title = args.output.title_or(|| format!("Grid, arms and panel, pair {}", args.pair));
+    args.output.write_drawing(&figure.draw(&source.figure_notes(title, String::new(), &[])), &[])
 }

@@ -10,11 +10,13 @@ use super::microstructure::{JITTER, JOINT_SHAPE, MicrostructureModel, SKIN};
 use super::parameter::{ParameterDomain, ParameterValue, ReliefParameter};
 use super::settings::{FULL_SCALE, JointShape, MacrostructureShape, WallSettings};
 use super::stones::SEED;
-use super::{Error, HeightField, PANEL_SIZE_MM, RELIEF_MM};
+use super::{Error, GenerationStep, HeightField, PANEL_SIZE_MM, PanelRelief, RELIEF_MM};
 
 /// Heights of a cell are the mean of those this far apart or less, mm: a joint is 1 mm wide.
 const DETAIL_MM: f64 = 0.4;
 
+/// Width and depth of the grooves that mark outlines of stones, full-scale mm.
+const GROOVE_MM: f64 = 15.0;
 /// Greatest depth of a wall, full-scale mm.
 const DEEPEST_MM: f64 = FULL_SCALE * (RELIEF_MM[1] - RELIEF_MM[0]);
 const MACRO_DEPTH: &str = "macro_depth_mm";
@@ -53,6 +55,39 @@ impl LayeredWall {
             *shape = MacrostructureShape::WavyXy;
         }
         wall
+    }
+
+    /// Returns the wall as its layers are added to a plane (Rust et al. 2021, figure "Geometry generation steps"): the
+    /// stones' outlines as grooves, the stones with the large shape, then joints and roughness. None without joints.
+    pub(super) fn generation_steps(&self) -> Vec<GenerationStep> {
+        if self.settings.joint_width_mm == 0.0 {
+            return Vec::new();
+        }
+        let thick = WallSettings {
+            joint_shape: JointShape::Recessed,
+            joint_width_jitter_mm: 0.0,
+            joint_depth_jitter_mm: 0.0,
+            roughness_mm: 0.0,
+            ..(*self.settings).clone()
+        };
+        let outlined = WallSettings {
+            macrostructure: MacrostructureShape::Flat,
+            projection_mm: 0.0,
+            lean_mm: 0.0,
+            bulge_mm: 0.0,
+            joint_width_mm: GROOVE_MM,
+            joint_depth_mm: GROOVE_MM,
+            ..thick.clone()
+        };
+        let wall = |settings: WallSettings| {
+            PanelRelief::Layered(Self { mesostructure: self.mesostructure, settings: Box::new(settings) })
+        };
+        vec![
+            GenerationStep { caption: "Flat", relief: PanelRelief::Flat },
+            GenerationStep { caption: "Subdivided", relief: wall(outlined) },
+            GenerationStep { caption: "Thickened, large shape", relief: wall(thick) },
+            GenerationStep { caption: "Joints and roughness", relief: PanelRelief::Layered(self.clone()) },
+        ]
     }
 
     /// Returns the arrangement of its stones.
@@ -204,7 +239,7 @@ fn centre_heights(heights: HeightField) -> HeightField {
 
 #[cfg(test)]
 mod tests {
-    use super::super::{Error, PanelRelief, ParameterDomain};
+    use super::super::{Error, ParameterDomain};
     use super::*;
 
     fn wall(name: &str, settings: &[(&str, &str)]) -> PanelRelief {
@@ -216,6 +251,18 @@ mod tests {
     fn depth(relief: &PanelRelief) -> f32 {
         let [low, high] = relief.height_field(128).extent_mm();
         high - low
+    }
+
+    #[test]
+    fn generation_adds_layer_to_layer() {
+        let relief = wall("flemish_bond", &[("macrostructure", "convex"), ("macro_depth_mm", "100")]);
+        let steps = relief.generation_steps();
+        let depths: Vec<_> = steps.iter().map(|step| step.relief.height_field(64).extent_mm()).collect();
+        let deep = |step: usize| f64::from(depths[step][1] - depths[step][0]);
+        // Grooves of 1.5 mm at 1:10, a mean over each cell; then a dome of 10 mm and stones that stand out.
+        assert!(deep(0) == 0.0 && (0.3..=1.5).contains(&deep(1)) && deep(2) > 9.0, "{depths:?}");
+        assert_eq!(steps[3].relief, relief);
+        assert!(wall("primitives", &[]).generation_steps().is_empty());
     }
 
     #[test]

@@ -50,6 +50,15 @@ pub enum PanelRelief {
     Layered(LayeredWall),
 }
 
+/// A relief on the way from a plane to a wall.
+#[derive(Debug, Clone, PartialEq)]
+pub struct GenerationStep {
+    /// What was done.
+    pub caption: &'static str,
+    /// The relief after it.
+    pub relief: PanelRelief,
+}
+
 /// An error of making a relief.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum Error {
@@ -311,6 +320,14 @@ impl PanelRelief {
             Self::Flat | Self::Foam | Self::Wood => {}
         }
         Ok(())
+    }
+
+    /// Returns the steps in which a wall of stones is generated; none if it has no joints.
+    pub fn generation_steps(&self) -> Vec<GenerationStep> {
+        match self {
+            Self::Layered(wall) => wall.generation_steps(),
+            _ => Vec::new(),
+        }
     }
 
     /// Its name.
