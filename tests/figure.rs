@@ -109,6 +109,8 @@ fn refusals_say_what_is_there() {
     place.fails(1, &["figure", "table", "wood", "-o", "x.svg"], "hint: tex, csv or md");
     place.fails(1, &["figure", "grid", "wood", "--band", "7"], "there is no band `7`");
     place.fails(1, &["figure", "steps", "wood", "--pair", "99999"], "has no pair 99999");
+    place.fails(1, &["figure", "generation", "primitives"], "`primitives` has no stones with joints");
+    place.fails(1, &["figure", "setup", "--pair", "99999"], "the grid has no pair 99999; hint: 0 to ");
     place.fails(2, &["figure", "grid"], "required");
 }
 
@@ -118,10 +120,16 @@ mod slow {
     #[test]
     fn every_figure_is_a_file() {
         let place = lake();
-        let names = ["filters", "coverage", "map"];
-        for args in
-            [&names[..1], &names[1..2], &names[2..], &["steps", "wood", "--celsius", "30,15"], &["relief", "wood"]]
-        {
+        let names = ["filters", "coverage", "map", "generation", "setup"];
+        for args in [
+            &names[..1],
+            &names[1..2],
+            &names[2..3],
+            &names[3..4],
+            &names[4..],
+            &["steps", "wood", "--celsius", "30,15"],
+            &["relief", "wood"],
+        ] {
             let name = args[0];
             let files = ["svg", "pdf", "png"].map(|extension| format!("{name}.{extension}"));
             let output: Vec<&str> = files.iter().flat_map(|file| ["-o", file]).collect();

@@ -99,7 +99,7 @@ impl SetupFigure {
         let all: Vec<_> = square(self.bottom_mm).into_iter().chain(square(0.0)).chain(points).chain(ends).collect();
         let page = Projection::new(&all, self.width_px);
         let lowest = all.iter().map(|mm| page.place(*mm)[1]).fold(0.0, f32::max);
-        let mut drawing = FigureDrawing::new(self.width_px, lowest + 40.0, notes);
+        let mut drawing = FigureDrawing::new(self.width_px, lowest + 36.0, notes);
         drawing.add_title();
         let outline = StrokeStyle::new(FigureColour::Ink, 1.0);
         // The two sides of the panel that face the viewer, and its top.
@@ -130,13 +130,10 @@ impl SetupFigure {
     }
 
     fn draw_labels(&self, drawing: &mut FigureDrawing, page: &Projection) {
-        for (number, layer) in self.layers_mm.iter().enumerate() {
-            let right = layer.iter().copied().max_by(|a, b| page.place(*a)[0].total_cmp(&page.place(*b)[0]));
-            let Some(point) = right else { continue };
-            let [x, y] = page.place(point);
-            let text = format!("layer {number}: {} points, {:.0} mm", layer.len(), point[2]);
-            drawing.add_shape(sized_label([x + 8.0, y + 3.0], text, TextAnchor::Start, SMALL_PX, FigureColour::Ink));
-        }
+        let heights = self.layers_mm.iter().filter_map(|layer| Some(format!("{} at {:.0} mm", layer.len(), layer.first()?[2])));
+        let text = format!("points: {}", heights.collect::<Vec<_>>().join(", "));
+        let at = [MARGIN, drawing.height_px - 20.0];
+        drawing.add_shape(sized_label(at, text, TextAnchor::Start, SMALL_PX, FigureColour::Ink));
         for arm in &self.arms {
             let Some(foot) = arm.links.first() else { continue };
             let [x, y] = page.place(foot.from_mm);
@@ -165,7 +162,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_higher_is_higher_on_the_page_and_layers_are_counted() {
+    fn what_is_higher_is_higher_on_the_page_and_points_are_counted() {
         let link = ArmLink { from_mm: [-500.0, 0.0, -100.0], to_mm: [-500.0, 0.0, 200.0], radius_mm: 60.0 };
         let figure = SetupFigure {
             panel_mm: 600.0,
@@ -179,6 +176,6 @@ mod tests {
         // Seen from 24 degrees above, 300 mm of height are 300 cos 24 mm.
         assert!((f64::from(foot[1] - head[1]) / page.scale - 274.06).abs() < 0.01 && (foot[0] - head[0]).abs() < 1e-3);
         let svg = figure.draw(&FigureNotes::default()).to_svg();
-        assert!(svg.contains("layer 0: 2 points, 124 mm") && svg.contains("layer 1: 1 points, 474 mm"), "{svg}");
+        assert!(svg.contains("points: 2 at 124 mm, 1 at 474 mm"), "{svg}");
     }
 }

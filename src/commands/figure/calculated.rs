@@ -92,6 +92,8 @@ pub(super) fn write_setup(source: &FigureSource, args: &SetupArgs) -> anyhow::Re
     let points = source.lake.grid().points();
     let arms = Choreography::new(rig)?;
     let pair = PairId(args.pair);
+    let pairs = source.lake.grid().pairs().len();
+    anyhow::ensure!((args.pair as usize) < pairs, "the grid has no pair {}; hint: 0 to {}", args.pair, pairs - 1);
     let pose = arms.pose_at(pair).map_err(|reason| anyhow::anyhow!("{}", reason.reason_text()));
     let pose = pose.with_context(|| format!("the arms cannot stand at pair {}", args.pair))?;
     let cell = arms.cell();
