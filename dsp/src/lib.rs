@@ -51,4 +51,4 @@ pub use levels::{
 pub use real::RealSample;
 pub use reflection::{air, air_correction, arrival, foam, foam_reflection, fresnel, geometry, kirchhoff};
 pub use relief::{height_field, heights};
-pub use similarity::{components, correlation, self_organising_map};
+pub use similarity::{components, correlation, self_organising_map, significance};

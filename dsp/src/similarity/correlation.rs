@@ -46,6 +46,41 @@ pub fn pearson<T: RealSample>(x: &[T], y: &[T]) -> Result<Option<f64>, Error> {
     Ok(Some((xy / xx.sqrt() / yy.sqrt()).clamp(-1.0, 1.0)))
 }
 
+/// Spearman's coefficient of correlation: Pearson's of the ranks, so that it is 1 for any rising relation and one
+/// outlier counts no more than another value. Equal values have their mean rank. None as of [`pearson`].
+///
+/// x, y  `[n]`
+///
+/// ```
+/// let r = echolake_dsp::correlation::spearman(&[1.0, 2.0, 3.0, 4.0], &[1.0, 10.0, 100.0, 1e9])?;
+/// assert!(r.is_some_and(|r| (r - 1.0).abs() < 1e-12));
+/// # Ok::<(), echolake_dsp::Error>(())
+/// ```
+///
+/// # Errors
+/// [`Error::Length`] if they are not equally long.
+pub fn spearman<T: RealSample>(x: &[T], y: &[T]) -> Result<Option<f64>, Error> {
+    check_len("the second signal", y.len(), x.len())?;
+    if x.iter().chain(y).any(|value| !value.f64().is_finite()) {
+        return Ok(None);
+    }
+    pearson(&value_ranks(x), &value_ranks(y))
+}
+
+// Ranks from 0 on; equal values have their mean rank.
+fn value_ranks<T: RealSample>(values: &[T]) -> Vec<f64> {
+    let mut order: Vec<usize> = (0..values.len()).collect();
+    order.sort_by(|i, j| values[*i].f64().total_cmp(&values[*j].f64()));
+    let mut ranks = vec![0.0; values.len()];
+    let mut first = 0;
+    for equal in order.chunk_by(|i, j| values[*i].f64() == values[*j].f64()) {
+        let rank = first as f64 + (equal.len() - 1) as f64 / 2.0;
+        equal.iter().for_each(|i| ranks[*i] = rank);
+        first += equal.len();
+    }
+    ranks
+}
+
 /// Greatest cross-correlation of signals of one length over all shifts.
 ///
 /// Signals are padded so that nothing wraps around.
@@ -161,9 +196,11 @@ mod tests {
     #[test]
     fn what_does_not_vary_has_no_correlation() {
         for (x, y) in [(&[][..], &[][..]), (&[1.0], &[2.0]), (&[0.1, 0.1, 0.1], &[1.0, 2.0, 3.0])] {
-            assert_eq!(pearson(x, y), Ok(None), "{x:?}");
+            assert_eq!((pearson(x, y), spearman(x, y)), (Ok(None), Ok(None)), "{x:?}");
         }
         assert_eq!(pearson(&[1.0, f64::NAN], &[1.0, 2.0]), Ok(None));
+        assert_eq!(spearman(&[1.0, f64::NAN, 2.0], &[1.0, 2.0, 3.0]), Ok(None));
+        assert_eq!(value_ranks(&[3.0, 1.0, 3.0, -0.0, 0.0]), [3.5, 2.0, 3.5, 0.5, 0.5]);
         assert!(matches!(pearson(&[1.0], &[1.0, 2.0]), Err(Error::Length { .. })));
     }
 

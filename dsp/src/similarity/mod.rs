@@ -3,3 +3,4 @@
 pub mod components;
 pub mod correlation;
 pub mod self_organising_map;
+pub mod significance;

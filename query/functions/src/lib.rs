@@ -57,6 +57,8 @@ impl FunctionSet {
             wrap_scalar(decay::EdcFunction),
             wrap_scalar(decay::ArrivalFunction(facts.clone())),
             wrap_scalar(alike::PearsonFunction),
+            wrap_scalar(alike::SpearmanFunction),
+            wrap_scalar(alike::CorrelationPFunction),
             wrap_scalar(alike::SimilarityFunction),
             wrap_scalar(diffusion::DiffusionFunction),
             wrap_scalar(fresnel::FresnelFunction),

@@ -1,10 +1,11 @@
-//! `pearson` and `similarity`: similarity measures of two lists.
+//! `pearson`, `spearman`, `correlation_p` and `similarity`: similarity measures of two lists.
 
 use arrow::array::ArrayRef;
 use arrow::datatypes::DataType;
 use datafusion::error::Result;
 use echolake_dsp::Error;
-use echolake_dsp::correlation::{CorrelationPlan, pearson};
+use echolake_dsp::correlation::{CorrelationPlan, pearson, spearman};
+use echolake_dsp::significance::correlation_p_value;
 
 use crate::adapters::answers::build_numbers;
 use crate::adapters::arguments::{CallArguments, SampleElement};
@@ -14,6 +15,12 @@ use crate::adapters::scalar::ScalarKernel;
 
 /// `pearson`.
 pub(crate) struct PearsonFunction;
+
+/// `spearman`.
+pub(crate) struct SpearmanFunction;
+
+/// `correlation_p`.
+pub(crate) struct CorrelationPFunction;
 
 /// `similarity`.
 pub(crate) struct SimilarityFunction;
@@ -36,7 +43,51 @@ static PEARSON: FunctionDescription = FunctionDescription {
 +-------+----------+
 | 1.0   |          |
 +-------+----------+",
-    related: &["similarity"],
+    related: &["spearman", "correlation_p", "similarity"],
+};
+
+static SPEARMAN: FunctionDescription = FunctionDescription {
+    name: "spearman",
+    family: FunctionFamily::Comparison,
+    about: "Spearman's coefficient of correlation of two equally long lists: Pearson's of their ranks, so that it is 1 \
+            for any rising relation, and an outlier counts no more than another value. Null as of pearson.",
+    parameters: PEARSON.parameters,
+    optional: 0,
+    example: "select round(spearman([1, 2, 3, 4], [1, 10, 100, 1000]), 6) as r",
+    answer: "\
++-----+
+| r   |
++-----+
+| 1.0 |
++-----+",
+    related: &["pearson", "correlation_p"],
+};
+
+static CORRELATION_P: FunctionDescription = FunctionDescription {
+    name: "correlation_p",
+    family: FunctionFamily::Comparison,
+    about: "Probability, two-sided, that chance alone makes a correlation of this size or greater: by Student's t, \
+            exact for Pearson's coefficient of normally distributed values, the usual approximation for Spearman's. \
+            Null of fewer than three pairs of values. Of many correlations some are always small: the smallest of 90 is \
+            about 0.01 by chance. The 95 % interval of r is tanh(atanh(r) - 1.96 / sqrt(n - 3)) to tanh(atanh(r) + 1.96 \
+            / sqrt(n - 3)).",
+    parameters: &[
+        FunctionParameter { name: "r", kind: ArgumentKind::Number, about: "the coefficient, such as corr(x, y)" },
+        FunctionParameter {
+            name: "n",
+            kind: ArgumentKind::Integer,
+            about: "number of pairs of values, such as count(*)",
+        },
+    ],
+    optional: 0,
+    example: "select round(correlation_p(0.632, 10), 4) as p",
+    answer: "\
++------+
+| p    |
++------+
+| 0.05 |
++------+",
+    related: &["pearson", "spearman"],
 };
 
 static SIMILARITY: FunctionDescription = FunctionDescription {
@@ -78,6 +129,43 @@ impl ScalarKernel for PearsonFunction {
         let y = arguments.sample_lists::<T>(1)?;
         build_numbers(arguments, |row| {
             pearson(x.samples_at(row)?, y.samples_at(row)?).map_err(|e| arguments.refused_row(row, &e))
+        })
+    }
+}
+
+impl ScalarKernel for SpearmanFunction {
+    fn description(&self) -> &'static FunctionDescription {
+        &SPEARMAN
+    }
+
+    fn answer_type(&self, _: &[DataType]) -> DataType {
+        DataType::Float64
+    }
+
+    fn compute_answers<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
+        let x = arguments.sample_lists::<T>(0)?;
+        let y = arguments.sample_lists::<T>(1)?;
+        build_numbers(arguments, |row| {
+            spearman(x.samples_at(row)?, y.samples_at(row)?).map_err(|e| arguments.refused_row(row, &e))
+        })
+    }
+}
+
+impl ScalarKernel for CorrelationPFunction {
+    fn description(&self) -> &'static FunctionDescription {
+        &CORRELATION_P
+    }
+
+    fn answer_type(&self, _: &[DataType]) -> DataType {
+        DataType::Float64
+    }
+
+    fn compute_answers<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
+        let coefficients = arguments.number_values(0)?;
+        let counts = arguments.integer_values(1)?;
+        build_numbers(arguments, |row| {
+            let count = usize::try_from(counts.value_at(row)).unwrap_or(0);
+            Ok(correlation_p_value(coefficients.value_at(row), count))
         })
     }
 }
