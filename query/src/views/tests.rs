@@ -179,6 +179,12 @@ async fn augmented_moves_measurements_and_height_maps_alike() {
     let turned = plan(&session, "select ir from augmented where surface_id = '0002_0' and symmetry = 'rot90'").await;
     assert!(!turned.contains("HashJoin") && !turned.contains("heightmaps"), "{turned}");
     assert!(!turned.contains("measurements/0001_0"), "{turned}");
+    // Flat's energy is 1 everywhere; of the three measured pairs only the identity leads to a measured one.
+    let ratios = "select count(flat_ratio_2500), min(flat_ratio_total), max(flat_ratio_40000) from augmented
+        where surface_id = '0001_0'";
+    let answer = rows(&session, ratios).await;
+    assert_eq!(answer.column(0).as_primitive::<Int64Type>().value(0), PAIRS as i64);
+    assert_eq!([1, 2].map(|i| answer.column(i).as_primitive::<Float64Type>().value(0)), [1.0; 2]);
 }
 
 #[tokio::test]
