@@ -2,13 +2,14 @@
 //! figures to files. Values are in the queries as placeholders, or as the literals of [`quote_literal`].
 
 use std::collections::HashMap;
+use std::ops::Range;
 
 use arrow::array::AsArray as _;
 use arrow::datatypes::{Float32Type, Int32Type};
 use arrow::error::ArrowError;
 use arrow::record_batch::RecordBatch;
 use echolake_lake::LakeSnapshot;
-use echolake_schema::Rig;
+use echolake_schema::{Grid, Rig};
 use serde::Deserialize;
 
 use crate::views::{RE_FLAT_BAND, RE_FLAT_TOTAL};
@@ -200,38 +201,53 @@ pub fn total_curve(bands: &[Vec<f32>]) -> Vec<f32> {
     (0..length).map(|i| bands.iter().filter_map(|band| band.get(i)).sum()).collect()
 }
 
-/// Returns the query of levels for [`LevelVectors`]: surface, pair and a level for each band, of the pairs that
-/// `step` divides.
-pub fn level_vectors_query(rig: &Rig, step: &str) -> String {
-    let column = |(i, band): (usize, &String)| format!("cast(10 * log10(tnce_band_{band}) as float) as band_{i}");
+/// Returns the query of energies for [`OrbitEnergies`]: surface, pair and an energy over Flat's for each band.
+pub fn orbit_energies_query(rig: &Rig) -> String {
+    let column = |(i, band): (usize, &String)| format!("cast(tnce_band_{band} as float) as band_{i}");
     let columns: Vec<_> = rig.band_names().iter().enumerate().map(column).collect();
-    format!("select surface_id, pair_id, {} from tnce where pair_id % {step} = 0", columns.join(", "))
+    format!("select surface_id, pair_id, {} from tnce", columns.join(", "))
 }
 
-/// Surfaces' levels, pair by pair and band by band; NaN if there is none.
+/// Surfaces' energies, arranged by orbits of pairs (see [`Grid::pair_orbits`]), so that surfaces can be compared
+/// whichever way their panels lay.
 #[derive(Debug, Clone)]
-pub struct LevelVectors {
+pub struct OrbitEnergies {
     places: HashMap<String, usize>,
-    /// By surface.
-    pub rows: Vec<Vec<f32>>,
-    bands: usize,
-    step: usize,
+    /// By surface: band by band, then by slot; NaN if there is none.
+    rows: Vec<Vec<f32>>,
+    /// By pair: its slot. Pairs of an orbit are side by side; pairs of orbits that are left out have none.
+    slots: Vec<Option<usize>>,
+    /// By orbit: its slots.
+    orbits: Vec<Range<usize>>,
+    /// Number of slots.
+    width: usize,
 }
 
-impl LevelVectors {
-    /// Levels of `names`, of every `step`th pair.
-    pub fn new(names: &[String], pairs: usize, bands: usize, step: usize) -> Self {
+impl OrbitEnergies {
+    /// Energies of `names`, of every `step`th orbit.
+    pub fn new(names: &[String], grid: &Grid, bands: usize, step: usize) -> Self {
+        let mut pairs: Vec<_> = grid.pair_orbits().into_iter().enumerate().collect();
+        let mut slots = vec![None; pairs.len()];
+        pairs.retain(|(_, orbit)| orbit % step == 0);
+        pairs.sort_by_key(|(_, orbit)| *orbit);
+        let mut orbits = Vec::new();
+        for orbit in pairs.chunk_by(|a, b| a.1 == b.1) {
+            let from = orbits.last().map_or(0, |last: &Range<usize>| last.end);
+            orbits.push(from..from + orbit.len());
+            orbit.iter().enumerate().for_each(|(i, (pair, _))| slots[*pair] = Some(from + i));
+        }
+        let width = pairs.len();
         let places = names.iter().enumerate().map(|(i, name)| (name.clone(), i)).collect();
-        Self { places, rows: vec![vec![f32::NAN; pairs.div_ceil(step) * bands]; names.len()], bands, step }
+        Self { places, rows: vec![vec![f32::NAN; width * bands]; names.len()], slots, orbits, width }
     }
 
-    /// Adds rows of [`level_vectors_query`].
+    /// Adds rows of [`orbit_energies_query`].
     ///
     /// # Errors
     /// [`ArrowError::SchemaError`] if the rows are of another query.
     pub fn add_batch(&mut self, batch: &RecordBatch) -> Result<(), ArrowError> {
         let unexpected =
-            || ArrowError::SchemaError(format!("levels of surfaces are not as expected: {}", batch.schema()));
+            || ArrowError::SchemaError(format!("energies of surfaces are not as expected: {}", batch.schema()));
         let columns = batch.columns();
         let (Some(names), Some(pairs)) =
             (columns[0].as_string_opt::<i32>(), columns[1].as_primitive_opt::<Int32Type>())
@@ -239,23 +255,97 @@ impl LevelVectors {
             return Err(unexpected());
         };
         for (band, column) in columns[2..].iter().enumerate() {
-            let levels = column.as_primitive_opt::<Float32Type>().ok_or_else(unexpected)?;
-            for (i, level) in levels.iter().enumerate() {
+            let energies = column.as_primitive_opt::<Float32Type>().ok_or_else(unexpected)?;
+            for (i, energy) in energies.iter().enumerate() {
                 let place = self.places.get(names.value(i)).map(|place| &mut self.rows[*place]);
-                let at = usize::try_from(pairs.value(i)).unwrap_or(0) / self.step * self.bands + band;
+                let slot = usize::try_from(pairs.value(i)).ok().and_then(|pair| *self.slots.get(pair)?);
                 // Of several runs of a surface, the last one that comes counts: they are of the same surface.
-                if let (Some(cell), Some(level)) = (place.and_then(|row| row.get_mut(at)), level) {
-                    *cell = level;
+                if let (Some(row), Some(slot), Some(energy)) = (place, slot, energy) {
+                    row[band * self.width + slot] = energy;
                 }
             }
         }
         Ok(())
     }
+
+    /// Returns levels by surface, dB: for each band and orbit the mean energy of the weaker and of the stronger half of
+    /// its pairs. NaN if the surface has no pair of the orbit.
+    ///
+    /// A symmetry permutes the pairs of an orbit, so that a turned panel has the same levels. Energies are averaged
+    /// before the logarithm, so that a dip of a single pair does not outweigh its orbit.
+    pub fn into_level_rows(self) -> Vec<Vec<f32>> {
+        let Self { rows, orbits, width, .. } = self;
+        let level_row = |mut row: Vec<f32>| -> Vec<f32> {
+            let bands = row.chunks_exact_mut(width.max(1));
+            bands.flat_map(|band| orbits.iter().flat_map(|orbit| half_levels(&mut band[orbit.clone()]))).collect()
+        };
+        rows.into_iter().map(level_row).collect()
+    }
+}
+
+// Sorts the energies, those that are none last.
+fn half_levels(energies: &mut [f32]) -> [f32; 2] {
+    energies.sort_unstable_by(f32::total_cmp);
+    let known = &energies[..energies.iter().filter(|energy| !energy.is_nan()).count()];
+    let half = known.len().div_ceil(2);
+    [&known[..half], &known[known.len() - half..]].map(|half| {
+        let sum: f32 = half.iter().sum();
+        10.0 * (sum / half.len() as f32).log10()
+    })
 }
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+
+    use arrow::array::{ArrayRef, Float32Array, Int32Array, StringArray};
+    use echolake_dsp::components::PrincipalComponents;
+    use echolake_schema::Symmetry;
+
     use super::*;
+
+    // A panel, the same panel in all eight positions, and another one: the first nine are one point.
+    #[test]
+    fn a_panel_is_at_no_distance_from_its_turned_selves() {
+        let grid = Rig::paper().build_grid().expect("the built-in rig is valid");
+        let count = grid.pairs().len();
+        let noise = |pair: usize, band: usize, panel: usize| {
+            let hashed = (pair * 2_654_435_761 + band * 40_503 + panel * 97_531) % 1_000_003;
+            0.01 + (hashed as f32 / 1_000_003.0).powi(4)
+        };
+        let names: Vec<_> = (0..10).map(|i| i.to_string()).collect();
+        let mut energies = OrbitEnergies::new(&names, &grid, 2, 1);
+        for (i, name) in names.iter().enumerate() {
+            let symmetry = Symmetry::ALL[i.saturating_sub(1) % Symmetry::ALL.len()];
+            let pairs = grid.moved_pairs(symmetry).expect("the grid is square");
+            let pairs: Int32Array = pairs.iter().map(|moved| moved.pair.id.index() as i32).collect();
+            let bands = [0, 1].map(|band| -> ArrayRef {
+                Arc::new((0..count).map(|pair| noise(pair, band, i / 9)).collect::<Float32Array>())
+            });
+            let [low, high] = bands;
+            let columns: [(&str, ArrayRef); 4] = [
+                ("surface_id", Arc::new(StringArray::from(vec![name.as_str(); count]))),
+                ("pair_id", Arc::new(pairs)),
+                ("band_0", low),
+                ("band_1", high),
+            ];
+            energies.add_batch(&RecordBatch::try_from_iter(columns).expect("a batch")).expect("the query's columns");
+        }
+        let found = PrincipalComponents::from_rows(&mut energies.into_level_rows(), 2).expect("equally long");
+        assert!((1..9).all(|turned| found.row_distance(0, turned) == 0.0));
+        assert!(found.row_distance(0, 9) > 1.0, "{}", found.row_distance(0, 9));
+    }
+
+    #[test]
+    fn halves_are_means_of_energies() {
+        let tens = |level: f32| 10f32.powf(level / 10.0);
+        assert_eq!(
+            half_levels(&mut [4.0, f32::NAN, 1.0, 2.0, 3.0]).map(tens),
+            [1.5, 3.5].map(|x: f32| tens(10.0 * x.log10()))
+        );
+        assert_eq!(half_levels(&mut [f32::NAN, 10.0]), [10.0; 2]);
+        assert!(half_levels(&mut [f32::NAN; 3]).iter().all(|level| level.is_nan()));
+    }
 
     #[test]
     fn cells_are_by_the_other_point() {

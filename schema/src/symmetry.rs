@@ -105,6 +105,21 @@ impl Grid {
         self.pairs().iter().map(|pair| self.move_pair(*pair, &to)).collect()
     }
 
+    /// Numbers the orbits of the pairs: two pairs have the same number if one of the grid's symmetries moves one to the
+    /// other. `[pairs]`; numbers begin at 0, and no number is left out.
+    pub fn pair_orbits(&self) -> Vec<usize> {
+        let images: Vec<_> = Symmetry::ALL.into_iter().filter_map(|symmetry| self.moved_pairs(symmetry)).collect();
+        let mut orbits: Vec<Option<usize>> = vec![None; self.pairs().len()];
+        let mut count = 0;
+        for pair in 0..orbits.len() {
+            if orbits[pair].is_none() {
+                images.iter().for_each(|moved| orbits[moved[pair].pair.id.index()] = Some(count));
+                count += 1;
+            }
+        }
+        orbits.into_iter().flatten().collect()
+    }
+
     fn move_pair(&self, pair: Pair, to: &[PointId]) -> Option<MovedPair> {
         let microphone = to[pair.microphone.index()];
         let speaker = to[pair.speaker.index()];
@@ -138,6 +153,20 @@ mod tests {
                 _ => assert!((164..=1050).contains(&swapped), "{} {swapped}", symmetry.name()),
             }
         }
+    }
+
+    // Burnside's lemma counts orbits without listing them: the mean number of pairs that a symmetry leaves in place.
+    #[test]
+    fn orbits_are_as_many_as_burnside_counts() {
+        let grid = Rig::paper().build_grid().expect("the built-in rig is valid");
+        let orbits = grid.pair_orbits();
+        let mut fixed = 0;
+        for symmetry in Symmetry::ALL {
+            let moved = grid.moved_pairs(symmetry).expect("the grid is square");
+            assert!(moved.iter().zip(&orbits).all(|(to, orbit)| orbits[to.pair.id.index()] == *orbit));
+            fixed += moved.iter().zip(grid.pairs()).filter(|(to, from)| to.pair.id == from.id).count();
+        }
+        assert_eq!(orbits.iter().max().map(|last| 8 * (last + 1)), Some(fixed));
     }
 
     #[test]

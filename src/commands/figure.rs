@@ -31,6 +31,8 @@ pub(crate) enum FigureCommand {
     Steps(StepsArgs),
     /// Surfaces as points, close together if they reflect alike.
     Map(MapArgs),
+    /// Surfaces on the units of a self-organising map, beside each other if they reflect alike.
+    Som(MapArgs),
     /// Reliefs in oblique light.
     Relief(ReliefArgs),
     /// The steps in which a wall is generated: flat, subdivided, thickened, with joints and roughness.
@@ -174,6 +176,13 @@ pub(crate) struct MapArgs {
     predicate: Option<String>,
 }
 
+/// What surfaces are placed on.
+#[derive(Debug, Clone, Copy)]
+enum MapKind {
+    Components,
+    Units,
+}
+
 #[derive(Debug, Args)]
 pub(crate) struct ReliefArgs {
     #[command(flatten)]
@@ -215,7 +224,8 @@ pub(crate) async fn run_figure(command: &FigureCommand, lake_url: &str) -> anyho
         FigureCommand::Filters(args) => calculated::write_filters(&source, args)?,
         FigureCommand::Coverage(args) => calculated::write_coverage(&source, args)?,
         FigureCommand::Steps(args) => surfaces::write_steps(&source, args).await?,
-        FigureCommand::Map(args) => surfaces::write_map(&source, args).await?,
+        FigureCommand::Map(args) => surfaces::write_map(&source, args, MapKind::Components).await?,
+        FigureCommand::Som(args) => surfaces::write_map(&source, args, MapKind::Units).await?,
         FigureCommand::Relief(args) => surfaces::write_relief(&source, args).await?,
         FigureCommand::Generation(args) => calculated::write_generation(&source, args)?,
         FigureCommand::Setup(args) => calculated::write_setup(&source, args)?,

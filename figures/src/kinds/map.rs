@@ -1,9 +1,14 @@
 //! Surfaces as points, close together if they reflect alike.
 
+use std::collections::HashMap;
+
 use echolake_dsp::components::PrincipalComponents;
+use echolake_dsp::self_organising_map::SelfOrganisingMap;
 
 use crate::canvas::colours::kind_colour;
-use crate::canvas::drawing::{FigureColour, FigureDrawing, SMALL_PX, TextAnchor, filled_ellipse, sized_label};
+use crate::canvas::drawing::{
+    FigureColour, FigureDrawing, SMALL_PX, TextAnchor, filled_ellipse, filled_rect, sized_label,
+};
 use crate::canvas::font::{fitted_text, text_width};
 use crate::canvas::frame::{PlotAxis, PlotFrame, draw_legend, legend_width};
 use crate::canvas::notes::FigureNotes;
@@ -12,6 +17,11 @@ use crate::canvas::notes::FigureNotes;
 const MOST_NAMES: usize = 60;
 /// Width of a map, px.
 const WIDTH_PX: f32 = 720.0;
+/// Opacity of the unit that is farthest from those beside it.
+const DARKEST_UNIT: f64 = 0.35;
+/// Distance of surfaces that share a unit, units, and the golden angle of the spiral that they stand on.
+const SPIRAL_STEP: f64 = 0.09;
+const GOLDEN_ANGLE: f64 = 2.399_96;
 
 /// A surface on the map.
 #[derive(Debug, Clone, PartialEq)]
@@ -20,8 +30,27 @@ pub struct MapPosition {
     pub name: String,
     /// Its kind, which has a colour.
     pub kind: String,
-    /// Coordinates along the two components, dB.
-    pub position_db: [f64; 2],
+    /// Coordinates: along the two components in dB, or in units of a self-organising map.
+    pub position: [f64; 2],
+}
+
+/// What the plane of a map is.
+#[derive(Debug, Clone, PartialEq)]
+pub enum MapPlane {
+    /// Two principal components.
+    Components {
+        /// Those to the right and upwards, 0 the first.
+        indices: [usize; 2],
+        /// Their shares of the variance.
+        explained: [f64; 2],
+    },
+    /// Units of a self-organising map.
+    Units {
+        /// Columns and rows.
+        size: [usize; 2],
+        /// Mean distance of each unit from those beside it, row by row.
+        borders: Vec<f64>,
+    },
 }
 
 /// Surfaces on the map.
@@ -29,10 +58,8 @@ pub struct MapPosition {
 pub struct MapFigure {
     /// The surfaces.
     pub positions: Vec<MapPosition>,
-    /// The components to the right and upwards, 0 the first.
-    pub components: [usize; 2],
-    /// Shares of the variance of both components.
-    pub explained: [f64; 2],
+    /// What they are placed on.
+    pub plane: MapPlane,
     /// Width, px.
     pub width_px: f32,
 }
@@ -48,10 +75,29 @@ impl MapFigure {
         let position = |(row, name, kind): (usize, &str, &str)| MapPosition {
             name: name.to_owned(),
             kind: kind.to_owned(),
-            position_db: of(&found.row_position(row)),
+            position: of(&found.row_position(row)),
         };
         let positions = surfaces.map(position).collect();
-        Self { positions, components, explained: of(&found.explained_shares()), width_px: WIDTH_PX }
+        let plane = MapPlane::Components { indices: components, explained: of(&found.explained_shares()) };
+        Self { positions, plane, width_px: WIDTH_PX }
+    }
+
+    /// Places surfaces on their units. Each is given by its row, its name and its kind; those of one unit stand around
+    /// its middle.
+    pub fn of_units<'a>(map: &SelfOrganisingMap, surfaces: impl Iterator<Item = (usize, &'a str, &'a str)>) -> Self {
+        let mut members: HashMap<[usize; 2], usize> = HashMap::new();
+        let position = |(row, name, kind): (usize, &str, &str)| {
+            let unit = map.units[row];
+            let before = members.entry(unit).or_default();
+            let radius = SPIRAL_STEP * (*before as f64).sqrt();
+            let angle = GOLDEN_ANGLE * *before as f64;
+            *before += 1;
+            let position = [unit[0] as f64 + radius * angle.cos(), unit[1] as f64 + radius * angle.sin()];
+            MapPosition { name: name.to_owned(), kind: kind.to_owned(), position }
+        };
+        let positions = surfaces.map(position).collect();
+        let plane = MapPlane::Units { size: map.size, borders: map.borders.clone() };
+        Self { positions, plane, width_px: WIDTH_PX }
     }
 
     /// Returns the title that a map has if it is given no other.
@@ -72,42 +118,73 @@ impl MapFigure {
             .collect();
         let rows = legend_rows(&entries, room);
         let top = 40.0 + rows.len() as f32 * 16.0;
-        let height = (self.width_px - 80.0) * 0.8;
+        let width = self.width_px - 80.0;
+        let height = match &self.plane {
+            MapPlane::Components { .. } => width * 0.8,
+            MapPlane::Units { size: [columns, rows], .. } => width * *rows as f32 / (*columns).max(1) as f32,
+        };
         let mut drawing = FigureDrawing::new(self.width_px, top + height + 62.0, notes);
         drawing.add_title();
         for (row, entries) in rows.iter().enumerate() {
             draw_legend(&mut drawing, [64.0, 42.0 + row as f32 * 16.0], entries);
         }
         let [x, y] = [0, 1].map(|axis| self.axis_range(axis));
-        let frame = PlotFrame { left: 64.0, top, width: self.width_px - 80.0, height, x, y };
-        frame.draw_grid(&mut drawing, &x.round_ticks(6), &y.round_ticks(6), true);
+        let frame = PlotFrame { left: 64.0, top, width, height, x, y };
+        match &self.plane {
+            MapPlane::Components { .. } => {
+                frame.draw_grid(&mut drawing, &x.round_ticks(6), &y.round_ticks(6), true);
+            }
+            MapPlane::Units { size, borders } => draw_units(&mut drawing, &frame, *size, borders),
+        }
         let mut names = NameLabels::default();
         for surface in &self.positions {
             let kind = kinds.iter().position(|kind| *kind == surface.kind).unwrap_or(0);
-            let at = frame.page_position(surface.position_db[0], surface.position_db[1]);
+            let at = frame.page_position(surface.position[0], surface.position[1]);
             drawing.add_shape(filled_ellipse(at, [4.0, 4.0], 0.0, kind_colour(kind)).with_opacity(0.85));
             if self.positions.len() <= MOST_NAMES {
                 names.draw_name(&mut drawing, at, &surface.name);
             }
         }
         frame.draw_axes(&mut drawing);
-        let [x_title, y_title] = [0, 1].map(|axis| {
-            let number = self.components[axis] + 1;
-            format!("Component {number}, dB ({:.0} % of the variance)", 100.0 * self.explained[axis])
-        });
+        let [x_title, y_title] = match &self.plane {
+            MapPlane::Components { indices, explained } => [0, 1].map(|axis| {
+                let number = indices[axis] + 1;
+                format!("Component {number}, dB ({:.0} % of the variance)", 100.0 * explained[axis])
+            }),
+            MapPlane::Units { .. } => {
+                ["Units of the self-organising map; dark ones are borders between groups".to_owned(), String::new()]
+            }
+        };
         frame.draw_titles(&mut drawing, &x_title, &y_title);
         drawing.add_origin();
         drawing
     }
 
     fn axis_range(&self, axis: usize) -> PlotAxis {
-        let values = self.positions.iter().map(|p| p.position_db[axis]);
+        if let MapPlane::Units { size, .. } = &self.plane {
+            return PlotAxis::linear(-0.5, size[axis] as f64 - 0.5);
+        }
+        let values = self.positions.iter().map(|p| p.position[axis]);
         let (low, high) = values.fold((f64::MAX, f64::MIN), |(low, high), v| (low.min(v), high.max(v)));
         if low > high {
             return PlotAxis::linear(-1.0, 1.0);
         }
         let air = ((high - low) * 0.06).max(0.1);
         PlotAxis::linear(low - air, high + air)
+    }
+}
+
+// A unit is as dark as it is far from those beside it.
+fn draw_units(drawing: &mut FigureDrawing, frame: &PlotFrame, [columns, _]: [usize; 2], borders: &[f64]) {
+    let farthest = borders.iter().copied().fold(f64::MIN_POSITIVE, f64::max);
+    for (unit, border) in borders.iter().enumerate() {
+        let column = (unit % columns) as f64;
+        let row = (unit / columns) as f64;
+        let corner = frame.page_position(column - 0.5, row + 0.5);
+        let opposite = frame.page_position(column + 0.5, row - 0.5);
+        let size = [opposite[0] - corner[0], opposite[1] - corner[1]];
+        let shade = (DARKEST_UNIT * border / farthest) as f32;
+        drawing.add_shape(filled_rect(corner, size, FigureColour::Ink).with_opacity(shade).with_data("unit", unit));
     }
 }
 
@@ -159,9 +236,10 @@ mod tests {
 
     #[test]
     fn names_at_one_place_are_below_each_other() {
-        let position = |name: &str| MapPosition { name: name.into(), kind: "brick".into(), position_db: [1.0, 2.0] };
+        let position = |name: &str| MapPosition { name: name.into(), kind: "brick".into(), position: [1.0, 2.0] };
         let positions = ["0011_1", "0012_1", "0013_1"].map(position).to_vec();
-        let figure = MapFigure { positions, components: [0, 2], explained: [0.7, 0.2], width_px: 400.0 };
+        let plane = MapPlane::Components { indices: [0, 2], explained: [0.7, 0.2] };
+        let figure = MapFigure { positions, plane, width_px: 400.0 };
         let drawing = figure.draw(&FigureNotes::default());
         assert!(drawing.to_svg().contains("Component 3, dB (20 % of the variance)"));
         let baselines: Vec<f32> = drawing
@@ -174,5 +252,19 @@ mod tests {
             .collect();
         assert_eq!(baselines.len(), 3);
         assert!(baselines.windows(2).all(|two| two[1] - two[0] >= SMALL_PX), "{baselines:?}");
+    }
+
+    #[test]
+    fn units_are_as_dark_as_they_are_far() {
+        let units = vec![[0, 0], [2, 1], [2, 1]];
+        let map = SelfOrganisingMap { size: [3, 2], units, borders: vec![0.0, 2.0, 1.0, 0.0, 0.0, 4.0] };
+        let names = ["0011_1", "0012_1", "0013_1"];
+        let figure = MapFigure::of_units(&map, names.iter().enumerate().map(|(row, name)| (row, *name, "brick")));
+        assert_eq!([0, 1].map(|i| figure.positions[i].position), [[0.0, 0.0], [2.0, 1.0]]);
+        assert_ne!(figure.positions[2].position, [2.0, 1.0], "it stands beside the other of its unit");
+        let drawing = figure.draw(&FigureNotes::default());
+        let shades: Vec<f32> =
+            drawing.shapes.iter().filter(|shape| !shape.data.is_empty()).map(|shape| shape.opacity).collect();
+        assert_eq!(shades, [0.0, 0.175, 0.0875, 0.0, 0.0, 0.35]);
     }
 }

@@ -7,19 +7,20 @@ use echolake_dsp::air::AirState;
 use echolake_dsp::chain::ResponseCorrection;
 use echolake_dsp::components::PrincipalComponents;
 use echolake_dsp::heights;
+use echolake_dsp::self_organising_map::SelfOrganisingMap;
 use echolake_dsp::temperature::ReferenceAir;
 use echolake_figures::{
     GridFigure, GridLayer, GridPanel, LevelPalette, MapFigure, NceFigure, NcePanel, ReliefFigure, ReliefPanel,
     ResponseTrace, StepsFigure, StepsRow,
 };
 use echolake_query::figure_rows::{
-    CurveRow, GridCell, GridLevels, LevelReference, LevelVectors, band_keys, band_labels, curves_query, grid_query,
-    level_vectors_query, point_filter, quote_literal, thinned_samples, times_ms, total_curve,
+    CurveRow, GridCell, GridLevels, LevelReference, OrbitEnergies, band_keys, band_labels, curves_query, grid_query,
+    orbit_energies_query, point_filter, quote_literal, thinned_samples, times_ms, total_curve,
 };
 use serde::Deserialize;
 
 use super::source::{FigureSource, SelectedSurface};
-use super::{GridArgs, MapArgs, NceArgs, ReliefArgs, StepsArgs};
+use super::{GridArgs, MapArgs, MapKind, NceArgs, ReliefArgs, StepsArgs};
 
 /// Samples of a curve that are drawn.
 const CURVE_POINTS: usize = 192;
@@ -220,27 +221,31 @@ pub(super) async fn write_steps(source: &FigureSource, args: &StepsArgs) -> anyh
     args.output.write_drawing(&figure.draw(&notes), &surfaces)
 }
 
-pub(super) async fn write_map(source: &FigureSource, args: &MapArgs) -> anyhow::Result<()> {
+pub(super) async fn write_map(source: &FigureSource, args: &MapArgs, kind: MapKind) -> anyhow::Result<()> {
     let predicate = args.predicate.as_deref().unwrap_or("surface_id <> foam_reference");
     let surfaces = source.surfaces_where(predicate).await?;
     let names: Vec<_> = surfaces.iter().map(|surface| surface.surface_id.clone()).collect();
     let rig = source.lake.rig();
-    let mut vectors = LevelVectors::new(&names, source.lake.grid().pairs().len(), rig.bands.centres_hz.len(), 1);
-    let query = level_vectors_query(rig, "1");
+    let mut energies = OrbitEnergies::new(&names, source.lake.grid(), rig.bands.centres_hz.len(), 1);
+    let query = orbit_energies_query(rig);
     let mut answer = source.session().query(&query).await?;
     while let Some(batch) = answer.next().await? {
-        vectors.add_batch(&batch)?;
+        energies.add_batch(&batch)?;
     }
-    let has_levels: Vec<_> = vectors.rows.iter().map(|row| row.iter().any(|level| level.is_finite())).collect();
+    let mut levels = energies.into_level_rows();
+    let has_levels: Vec<_> = levels.iter().map(|row| row.iter().any(|level| level.is_finite())).collect();
     let mut placed = has_levels.iter();
-    vectors.rows.retain(|_| placed.next() == Some(&true));
+    levels.retain(|_| placed.next() == Some(&true));
     let surfaces: Vec<_> =
         surfaces.into_iter().zip(has_levels).filter(|(_, has)| *has).map(|(surface, _)| surface).collect();
     anyhow::ensure!(surfaces.len() > 1, "a map needs two surfaces with levels; hint: levels need Flat and Foam");
-    let found = PrincipalComponents::from_rows(&mut vectors.rows, COMPONENTS)?;
+    let found = PrincipalComponents::from_rows(&mut levels, COMPONENTS)?;
     let rows = surfaces.iter().enumerate();
     let rows = rows.map(|(i, surface)| (i, surface.surface_id.as_str(), surface.typology.as_str()));
-    let figure = MapFigure::of_components(&found, [0, 1], rows);
+    let figure = match kind {
+        MapKind::Components => MapFigure::of_components(&found, [0, 1], rows),
+        MapKind::Units => MapFigure::of_units(&SelfOrganisingMap::from_components(&found), rows),
+    };
     let title = args.output.title_or(|| MapFigure::default_title(surfaces.len(), LevelReference::FlatBand.unit()));
     args.output.write_drawing(&figure.draw(&source.figure_notes(title, query, &surfaces)), &[])
 }

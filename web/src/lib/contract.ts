@@ -11,7 +11,10 @@ export interface paths {
             readonly path?: never;
             readonly cookie?: never;
         };
-        /** Pearson's r of every numeric geometric parameter with every band's level against Flat. */
+        /**
+         * Correlations of every numeric geometric parameter with every band's level against Flat, and what of them chance
+         *     explains: of 15 parameters and 6 bands of 8 surfaces chance alone makes an r of 0.85.
+         */
         readonly get: operations["correlations"];
         readonly put?: never;
         readonly post?: never;
@@ -104,8 +107,9 @@ export interface paths {
         };
         /**
          * Surfaces as points, close together if they reflect alike, and their nearest neighbours.
-         * @description Principal components and a self-organising map of the surfaces' TNCE vectors (all pairs and bands, dB re Flat, same
-         *     band); once per snapshot.
+         * @description Principal components and a self-organising map of levels (dB re Flat, same band) that do not depend on how a panel
+         *     lay: for each band and each orbit of pairs under D4 the mean TNCE of the weaker and of the stronger half of its
+         *     pairs. Once per snapshot.
          */
         readonly get: operations["map"];
         readonly put?: never;
@@ -749,16 +753,34 @@ export interface components {
         };
         /** @description The correlation of a parameter with the level of a band. */
         readonly Correlation: {
+            /** @description `p` adjusted for all correlations of the table, by Benjamini and Hochberg. */
+            readonly adjusted_p: number | null;
             readonly band: string;
+            /** @description Both adjusted p values are at most `false_discovery_rate`: chance does not explain it. */
+            readonly beyond_chance: boolean;
+            /** @description Surfaces that have both. */
             readonly n: number;
+            /** @description Probability that chance makes an `r` of this size or greater. */
+            readonly p: number | null;
             readonly parameter: string;
+            /** @description Pearson's coefficient. */
             readonly r: number | null;
+            readonly r_high: number | null;
+            /** @description 95 % interval of `r`, by Fisher's z. */
+            readonly r_low: number | null;
+            readonly rank_adjusted_p: number | null;
+            readonly rank_p: number | null;
+            /** @description Spearman's coefficient, which is Pearson's of the ranks. */
+            readonly rank_r: number | null;
             readonly unit: string;
         };
         /** @description Correlations of parameters and levels. */
         readonly Correlations: {
+            /** @description Share of chance findings that is accepted among the findings of the table. */
+            readonly false_discovery_rate: number;
             readonly items: readonly components["schemas"]["Correlation"][];
-            readonly method: string;
+            /** @description Correlations of fewer surfaces are null. */
+            readonly least_surfaces: number;
             readonly surfaces: number;
         };
         /** @description Curves of a surface beside those of its Flat. */
@@ -1248,7 +1270,7 @@ export interface components {
         readonly SurfaceMap: {
             /** @description Share of the variance by component. */
             readonly explained: readonly number[];
-            /** @description Pairs times bands that all surfaces have. */
+            /** @description Levels that all surfaces have: two for each band and orbit of pairs. */
             readonly features: number;
             /** @description Surfaces without TNCE, and those beyond the first 2000. */
             readonly left_out: readonly string[];
@@ -1513,8 +1535,8 @@ export interface operations {
     readonly map_figure: {
         readonly parameters: {
             readonly query?: {
-                /** @description Components to the right and upwards. */
-                readonly axes?: "12" | "13" | "23";
+                /** @description Components to the right and upwards, or `som`. */
+                readonly axes?: "12" | "13" | "23" | "som";
                 readonly format?: "svg" | "pdf" | "png";
             };
             readonly header?: never;

@@ -7,7 +7,7 @@ use echolake_figures::{
     FigureDrawing, FigureNotes, GridFigure, GridLayer, GridPanel, LevelPalette, MapFigure, NceFigure, NcePanel,
 };
 use echolake_query::figure_rows::{
-    LevelReference, band_labels, curves_query, grid_query, lake_version, level_vectors_query, point_filter,
+    LevelReference, band_labels, curves_query, grid_query, lake_version, orbit_energies_query, point_filter,
     quote_literal, total_curve,
 };
 use echolake_service::RequestFault;
@@ -259,7 +259,7 @@ pub(super) async fn curves_figure(
     query.format.write_drawing(&request, figure.draw(&notes)).await
 }
 
-/// Two principal components of the map.
+/// Two principal components of the map, or its self-organising map.
 #[derive(Clone, Copy, Default, Deserialize, ToSchema)]
 #[schema(default = "12")]
 enum MapAxes {
@@ -270,14 +270,27 @@ enum MapAxes {
     FirstThird,
     #[serde(rename = "23")]
     SecondThird,
+    #[serde(rename = "som")]
+    Units,
 }
 
 impl MapAxes {
-    fn component_indices(self) -> [usize; 2] {
+    /// The two components; None for the self-organising map.
+    fn component_indices(self) -> Option<[usize; 2]> {
         match self {
-            Self::FirstSecond => [0, 1],
-            Self::FirstThird => [0, 2],
-            Self::SecondThird => [1, 2],
+            Self::FirstSecond => Some([0, 1]),
+            Self::FirstThird => Some([0, 2]),
+            Self::SecondThird => Some([1, 2]),
+            Self::Units => None,
+        }
+    }
+
+    /// The command that writes the same figure to a file; empty if there is none.
+    fn command(self) -> &'static str {
+        match self {
+            Self::FirstSecond => "echolake figure map",
+            Self::Units => "echolake figure som",
+            Self::FirstThird | Self::SecondThird => "",
         }
     }
 }
@@ -287,7 +300,7 @@ impl MapAxes {
 #[serde(default)]
 #[into_params(parameter_in = Query)]
 pub(super) struct MapFigureQuery {
-    /// Components to the right and upwards.
+    /// Components to the right and upwards, or `som`.
     #[param(inline)]
     axes: MapAxes,
     #[param(inline)]
@@ -313,17 +326,19 @@ pub(super) async fn map_figure(
 ) -> EndpointAnswer {
     let summary = request.read_summary().await?;
     let places = surface_positions(&request).await?;
-    let components = query.axes.component_indices();
     let placed: Vec<_> =
         places.names.iter().enumerate().filter_map(|(i, name)| Some((i, summary.find_entry(name)?))).collect();
     let surfaces =
         placed.iter().map(|(i, entry)| (*i, entry.surface.surface_id.as_str(), entry.surface.typology.as_str()));
     let entries: Vec<_> = placed.iter().map(|(_, entry)| *entry).collect();
-    let figure = MapFigure::of_components(&places.components, components, surfaces);
+    let figure = match query.axes.component_indices() {
+        Some(components) => MapFigure::of_components(&places.components, components, surfaces),
+        None => MapFigure::of_units(&places.units, surfaces),
+    };
     let notes = FigureNotes {
         title: MapFigure::default_title(entries.len(), LevelReference::FlatBand.unit()),
-        command: if components == [0, 1] { "echolake figure map".into() } else { String::new() },
-        query: level_vectors_query(request.catalogue.lake().rig(), "1"),
+        command: query.axes.command().to_owned(),
+        query: orbit_energies_query(request.catalogue.lake().rig()),
         ..figure_notes(&request, &entries)
     };
     query.format.write_drawing(&request, figure.draw(&notes)).await

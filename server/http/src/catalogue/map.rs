@@ -1,10 +1,9 @@
 //! `GET /api/v1/map`: surfaces as points, close together if they reflect alike. Computed once per snapshot.
 
 use axum::Extension;
-use datafusion::common::ScalarValue;
 use echolake_dsp::components::PrincipalComponents;
 use echolake_dsp::self_organising_map::SelfOrganisingMap;
-use echolake_query::figure_rows::{LevelVectors, level_vectors_query};
+use echolake_query::figure_rows::{OrbitEnergies, orbit_energies_query};
 use echolake_service::RequestFault;
 use serde::{Deserialize, Serialize};
 use utoipa::{IntoParams, ToSchema};
@@ -18,14 +17,14 @@ use super::snapshot::positions::{SurfaceNeighbour, SurfacePositions};
 const COMPONENTS: usize = 3;
 /// Surfaces that are placed; more are left out.
 const MOST_SURFACES: usize = 2000;
-/// Products of features that the distances may take: beyond, pairs are left out evenly. One core does about a billion
+/// Products of features that the distances may take: beyond, orbits are left out evenly. One core does about a billion
 /// a second.
 const MOST_PRODUCTS: usize = 4_000_000_000;
 
 /// Surfaces on the map.
 #[derive(Serialize, ToSchema)]
 struct SurfaceMap<'a> {
-    /// Pairs times bands that all surfaces have.
+    /// Levels that all surfaces have: two for each band and orbit of pairs.
     features: usize,
     /// Share of the variance by component.
     explained: Vec<f64>,
@@ -67,8 +66,9 @@ pub(super) struct MapQuery {
 
 /// Surfaces as points, close together if they reflect alike, and their nearest neighbours.
 ///
-/// Principal components and a self-organising map of the surfaces' TNCE vectors (all pairs and bands, dB re Flat, same
-/// band); once per snapshot.
+/// Principal components and a self-organising map of levels (dB re Flat, same band) that do not depend on how a panel
+/// lay: for each band and each orbit of pairs under D4 the mean TNCE of the weaker and of the stronger half of its
+/// pairs. Once per snapshot.
 #[utoipa::path(
     get,
     path = "/api/v1/map",
@@ -76,8 +76,8 @@ pub(super) struct MapQuery {
     params(MapQuery),
     responses((status = 200, description = "OK", body = SurfaceMap)),
     extensions(("x-sql" = json!([
-        "select surface_id, pair_id, tnce_band_2500, ..., tnce_band_40000 from tnce; Gram matrix, leading \
-         eigenvectors, batch self-organising map",
+        "select surface_id, pair_id, tnce_band_2500, ..., tnce_band_40000 from tnce; means by orbit of pairs, Gram \
+         matrix, leading eigenvectors, batch self-organising map",
     ])))
 )]
 pub(super) async fn map(
@@ -127,17 +127,17 @@ async fn find_positions(request: &CatalogueRequest) -> Result<SurfacePositions, 
     let known = summary.entries.iter().filter(|e| e.surface.against_flat_db.iter().any(Option::is_some));
     let names: Vec<_> = known.map(|e| e.surface.surface_id.clone()).take(MOST_SURFACES).collect();
     let bands = rig.band_names();
-    let pairs = request.catalogue.lake().grid().pairs().len();
-    let products = names.len() * names.len() / 2 * pairs * bands.len();
+    let grid = request.catalogue.lake().grid();
+    let orbits = grid.pair_orbits().into_iter().max().map_or(0, |last| last + 1);
+    let products = names.len() * names.len() * orbits * bands.len();
     let step = products.div_ceil(MOST_PRODUCTS).max(1);
-    let mut vectors = LevelVectors::new(&names, pairs, bands.len(), step);
-    let sql = level_vectors_query(rig, "$1");
-    let mut rows = request.stream_batches(&sql, vec![ScalarValue::Int32(i32::try_from(step).ok())]).await?;
+    let mut energies = OrbitEnergies::new(&names, grid, bands.len(), step);
+    let mut rows = request.stream_batches(&orbit_energies_query(rig), Vec::new()).await?;
     while let Some(batch) = rows.next_part().await? {
-        vectors.add_batch(&batch).map_err(RequestFault::defect("the map's columns are not as expected"))?;
+        energies.add_batch(&batch).map_err(RequestFault::defect("the map's columns are not as expected"))?;
     }
     let place = move || {
-        let components = PrincipalComponents::from_rows(&mut vectors.rows, COMPONENTS)?;
+        let components = PrincipalComponents::from_rows(&mut energies.into_level_rows(), COMPONENTS)?;
         let units = SelfOrganisingMap::from_components(&components);
         Ok::<_, echolake_dsp::Error>((components, units))
     };
