@@ -57,10 +57,13 @@ fn the_server_draws_the_same() {
     }
     let answer = HttpRequest::get("/api/v1/map.svg").send(&server);
     assert_eq!(drawn(&answer.text()), drawn(&place.ok(&["figure", "map"])));
+    let units = HttpRequest::get("/api/v1/map.svg?axes=som").send(&server).text();
+    assert!(units.contains("data-unit=\"0\"") && units.contains("echolake figure som"), "{units}");
+    assert_eq!(drawn(&units), drawn(&place.ok(&["figure", "som"])));
     for (format, media_type, opening) in
         [("svg", "image/svg+xml", &b"<svg"[..]), ("pdf", "application/pdf", b"%PDF"), ("png", "image/png", b"\x89PNG")]
     {
-        for path in ["surfaces/wood/grid.svg?microphone=3", "surfaces/wood/curves.svg?width=420", "map.svg?axes=23"] {
+        for path in ["surfaces/wood/grid.svg?microphone=3", "surfaces/wood/curves.svg?width=420", "map.svg?axes=som"] {
             let answer = HttpRequest::get(&format!("/api/v1/{path}&format={format}")).send(&server);
             assert_eq!((answer.status, answer.header("content-type")), (200, Some(media_type)), "{path}");
             assert!(answer.body.starts_with(opening), "{path} as {format}");
@@ -94,6 +97,34 @@ fn tables_have_the_numbers_of_the_lake() {
     let energies = place.ok(&["figure", "table", "wood", "--values", "energies"]);
     let flat = energies.lines().find(|line| line.starts_with("| flat")).expect("a row");
     assert!(flat.ends_with("1.000 |"), "Flat is one of Flat: {flat}");
+    let levels = place.ok(&["figure", "table", "flat", "wood"]);
+    for table in [&energies, &levels] {
+        assert!(table.contains("| flat (reference) |") && !table.contains("wood (reference)"), "{table}");
+    }
+}
+
+// The statement that the manual prints for the paper's range of TNCE.
+#[test]
+fn the_papers_range_is_a_statement() {
+    let place = lake();
+    let manual = include_str!("../docs/paper.md");
+    let statement = manual.split("```sql\n").nth(1).and_then(|text| text.split("```").next()).expect("a statement");
+    let statement = statement.replace("typology <> 'reference'", "surface_id = 'wood'");
+    let found = &place.sql(&statement)[0];
+    let bands = ["2500", "5000", "10000", "20000", "40000"];
+    let mut energies: Vec<f64> = Vec::new();
+    for row in place.sql("select * from tnce where surface_id = 'wood'") {
+        energies.extend(bands.map(|band| row[format!("tnce_band_{band}").as_str()].as_f64().expect("an energy")));
+    }
+    energies.sort_by(f64::total_cmp);
+    let at = 0.95 * (energies.len() - 1) as f64;
+    let below = energies[at as usize];
+    let p95 = below + at.fract() * (energies[at as usize + 1] - below);
+    assert_eq!(found["values"], energies.len());
+    for (name, expected) in [("least", energies[0]), ("greatest", energies[energies.len() - 1]), ("p95", p95)] {
+        let value = found[name].as_f64().expect("a number");
+        assert!((value - expected).abs() < 1e-6 * expected, "{name}: {value} instead of {expected}");
+    }
 }
 
 #[test]
@@ -120,13 +151,13 @@ mod slow {
     #[test]
     fn every_figure_is_a_file() {
         let place = lake();
-        let names = ["filters", "coverage", "map", "generation", "setup"];
         for args in [
-            &names[..1],
-            &names[1..2],
-            &names[2..3],
-            &names[3..4],
-            &names[4..],
+            &["filters"][..],
+            &["coverage"],
+            &["map"],
+            &["som"],
+            &["generation"],
+            &["setup"],
             &["steps", "wood", "--celsius", "30,15"],
             &["relief", "wood"],
         ] {

@@ -93,9 +93,11 @@ async fn level_table(
         Some(base) if base != surface => Some(level(surface, band)? - level(base, band)?),
         _ => level(surface, band),
     };
+    let is_flat = |name: &str| surfaces.iter().any(|s| s.surface_id == name && s.flat_reference == name);
     let row = |name: &&str| TableRow {
         name: match base {
             Some(base) if base != *name => format!("{name} less {base}"),
+            _ if is_flat(name) => reference_name(name),
             _ => (*name).to_owned(),
         },
         values: keys.iter().map(|band| value(name, band)).collect(),
@@ -133,7 +135,7 @@ async fn energy_table(source: &FigureSource, surfaces: &[SelectedSurface]) -> an
         let flat = of(&surface.flat_reference)?;
         if !flat_names.contains(&surface.flat_reference.as_str()) {
             flat_names.push(&surface.flat_reference);
-            table_rows.push(energy_row(&surface.flat_reference, flat.means.clone()));
+            table_rows.push(energy_row(&reference_name(&surface.flat_reference), flat.means.clone()));
         }
         if surface.surface_id == surface.flat_reference {
             continue;
@@ -150,6 +152,11 @@ async fn energy_table(source: &FigureSource, surfaces: &[SelectedSurface]) -> an
     }
     let columns = band_labels(rig);
     Ok((FigureTable { corner: "Surface".into(), columns, rows: table_rows, with_extremes: false }, query))
+}
+
+// Flat over itself is 0 dB by definition: no reader is to take it for a measurement.
+fn reference_name(flat: &str) -> String {
+    format!("{flat} (reference)")
 }
 
 fn energy_row(name: &str, values: Vec<Option<f64>>) -> TableRow {

@@ -26,6 +26,9 @@ export function energyChange(d: SurfaceDetail, band: number): number | null {
   return own !== null && flat ? 100 * (own / flat - 1) : null
 }
 
+/** Flat over itself is 0 dB by definition: pages write `reference` in place of a number that looks measured. */
+export const isItsReference = (surface: Surface) => surface.surface_id === surface.flat_reference
+
 /** The class of a difference that is over or under nothing. */
 export const tone = (value: number | null) =>
   value === null || Math.abs(value) < 0.05 ? undefined : value > 0 ? 'over' : 'under'
