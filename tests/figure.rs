@@ -127,6 +127,25 @@ fn the_papers_range_is_a_statement() {
     }
 }
 
+// Flat's energies at the moved pairs are its own times the ratio; Wood, as flat as Flat, is nearly so.
+#[test]
+fn turned_energies_are_corrected_by_flats() {
+    let place = lake();
+    let off_db = |surface: &str, factor: &str| {
+        let level = format!("10 * log10(t.energy_40000 / (m.energy_40000 * {factor}))");
+        place.number(&format!(
+            "select sqrt(avg(power({level}, 2))) from augmented a
+             join tnce m on m.run_id = a.run_id and m.pair_id = a.pair_id
+             join tnce t on t.run_id = a.run_id and t.pair_id = a.d4_pair_id
+             where a.surface_id = '{surface}' and a.symmetry <> 'identity'"
+        ))
+    };
+    assert!(off_db("flat", "a.flat_ratio_40000") < 1e-9);
+    let plain = off_db("wood", "1.0");
+    let normalised = off_db("wood", "a.flat_ratio_40000");
+    assert!(plain > 0.5 && normalised < 0.2 * plain, "{plain} and {normalised} dB");
+}
+
 #[test]
 fn refusals_say_what_is_there() {
     let place = lake();

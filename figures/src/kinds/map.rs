@@ -7,7 +7,7 @@ use echolake_dsp::self_organising_map::SelfOrganisingMap;
 
 use crate::canvas::colours::kind_colour;
 use crate::canvas::drawing::{
-    FigureColour, FigureDrawing, SMALL_PX, TextAnchor, filled_ellipse, filled_rect, sized_label,
+    FigureColour, FigureDrawing, SMALL_PX, TextAnchor, filled_area, filled_ellipse, sized_label,
 };
 use crate::canvas::font::{fitted_text, text_width};
 use crate::canvas::frame::{PlotAxis, PlotFrame, draw_legend, legend_width};
@@ -180,11 +180,10 @@ fn draw_units(drawing: &mut FigureDrawing, frame: &PlotFrame, [columns, _]: [usi
     for (unit, border) in borders.iter().enumerate() {
         let column = (unit % columns) as f64;
         let row = (unit / columns) as f64;
-        let corner = frame.page_position(column - 0.5, row + 0.5);
-        let opposite = frame.page_position(column + 0.5, row - 0.5);
-        let size = [opposite[0] - corner[0], opposite[1] - corner[1]];
+        let corners = [[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]];
+        let outline = corners.map(|[x, y]| frame.page_position(column + x, row + y)).to_vec();
         let shade = (DARKEST_UNIT * border / farthest) as f32;
-        drawing.add_shape(filled_rect(corner, size, FigureColour::Ink).with_opacity(shade).with_data("unit", unit));
+        drawing.add_shape(filled_area(outline, FigureColour::Ink).with_opacity(shade).with_data("unit", unit));
     }
 }
 
