@@ -109,11 +109,11 @@ fn the_papers_range_is_a_statement() {
     let place = lake();
     let manual = include_str!("../docs/paper.md");
     let statement = manual.split("```sql\n").nth(1).and_then(|text| text.split("```").next()).expect("a statement");
-    let statement = statement.replace("typology <> 'reference'", "surface_id = 'wood'");
+    let statement = statement.replace("typology <> 'reference'", "typology = 'reference'");
     let found = &place.sql(&statement)[0];
     let bands = ["2500", "5000", "10000", "20000", "40000"];
     let mut energies: Vec<f64> = Vec::new();
-    for row in place.sql("select * from tnce where surface_id = 'wood'") {
+    for row in place.sql("select * from tnce") {
         energies.extend(bands.map(|band| row[format!("tnce_band_{band}").as_str()].as_f64().expect("an energy")));
     }
     energies.sort_by(f64::total_cmp);
@@ -123,7 +123,7 @@ fn the_papers_range_is_a_statement() {
     assert_eq!(found["values"], energies.len());
     for (name, expected) in [("least", energies[0]), ("greatest", energies[energies.len() - 1]), ("p95", p95)] {
         let value = found[name].as_f64().expect("a number");
-        assert!((value - expected).abs() < 1e-6 * expected, "{name}: {value} instead of {expected}");
+        assert!((value - expected).abs() <= 1e-6 * expected, "{name}: {value} instead of {expected}");
     }
 }
 
@@ -140,7 +140,7 @@ fn turned_energies_are_corrected_by_flats() {
              where a.surface_id = '{surface}' and a.symmetry <> 'identity'"
         ))
     };
-    assert!(off_db("flat", "a.flat_ratio_40000") < 1e-9);
+    assert!(off_db("flat", "a.flat_ratio_40000") < 1e-5, "single precision");
     let plain = off_db("wood", "1.0");
     let normalised = off_db("wood", "a.flat_ratio_40000");
     assert!(plain > 0.5 && normalised < 0.2 * plain, "{plain} and {normalised} dB");
