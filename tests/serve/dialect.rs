@@ -51,7 +51,7 @@ const FAILING: [&str; 24] = [
     "select * from mcap('nothing')",
     "select * from mcap('inbox/bad.mcap')",
     "select * from mcap('inbox/bad.mcap', '/ir')",
-    "select centre_time(1)",
+    "select nce_centre(1)",
     "select avg_list(1)",
     "select interval 'x'",
     "select (select pair_id from pairs)",

@@ -91,7 +91,7 @@ const WRITTEN: &[&str] = &[
     "select timestamp '2026-01-05 08:00:00' as v, date '2026-01-05' as w, time '08:00:01' as x from pairs limit 1",
     "select timestamp '2026-01-05 08:00' as v from pairs limit 1",
     "select age(log_time) as v from measurements limit 1",
-    "select centre_time(ir) as v from measurements limit 1",
+    "select nce_centre(ir) as v from measurements limit 1",
     "select 'NaN'::double as v, 'inf'::double as w, '-inf'::real as x from pairs limit 1",
     "select cast('NaN'::double as int) as v from pairs limit 1",
     "select 9223372036854775807 as v, -9223372036854775808 as w, 18446744073709551615 as x from pairs limit 1",

@@ -22,7 +22,7 @@ use adapters::scalar::wrap_scalar;
 use aggregates::{average, p90_mean, value_counts};
 use comparison::{alike, diffusion};
 use geometry::{fresnel, sound, symmetry};
-use responses::{band_energy, decay, nce, rise, spectrum};
+use responses::{band_energy, decay, nce, octave_band, rise, room_parameters, spectrum};
 pub use standard::octet_length::octet_length_of_bytes;
 pub use standard::time_patterns::pattern_functions;
 
@@ -56,6 +56,8 @@ impl FunctionSet {
             wrap_scalar(spectrum::SpectrumFrequenciesFunction(facts.clone())),
             wrap_scalar(decay::EdcFunction),
             wrap_scalar(decay::ArrivalFunction(facts.clone())),
+            wrap_scalar(octave_band::BandFilterFunction(facts.clone())),
+            wrap_scalar(room_parameters::RoomParametersFunction(facts.clone())),
             wrap_scalar(alike::PearsonFunction),
             wrap_scalar(alike::SpearmanFunction),
             wrap_scalar(alike::CorrelationPFunction),

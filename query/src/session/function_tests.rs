@@ -442,6 +442,9 @@ mod slow {
             "select arrival([1.0, 'inf'::double])",
             "select similarity([1.0], ['nan'::double])",
             "select arrival([1], 3)",
+            "select band_filter([1, 2], 2500)",
+            "select band_filter([1, 2], 63000, 3)",
+            "select room_parameters([1, 2], 1000, 2)",
             "select d4(1, 2, 'rot45')",
             "select d4_point(78, 'rot90')",
             "select d4_pair(-1, 'rot90')",
@@ -508,6 +511,12 @@ mod slow {
                 the query failed: `similarity`, row 1 of its batch: the second signal has samples that are not finite; hint: leave out rows with NaN or infinity, as WHERE list_energy(ir) < 1e300
             select arrival([1], 3)
                 the query failed: `arrival`: `threshold_db` is 3.0 in row 1 of its batch; hint: it is relative to the greatest sample: 0 dB or less
+            select band_filter([1, 2], 2500)
+                the query failed: `band_filter`: `midband_hz` is 2500.0 in row 1 of its batch; hint: octaves are at 500, 1000, 2000, 4000 Hz and so on; thirds of an octave have a third argument, 3
+            select band_filter([1, 2], 63000, 3)
+                the query failed: `band_filter`: `midband_hz` is 63000.0 in row 1 of its batch; hint: the band's upper edge is 70794.6 Hz at a sampling rate of 96000 Hz, expected over 10 Hz and below half of the rate
+            select room_parameters([1, 2], 1000, 2)
+                the query failed: `room_parameters`: `fraction` is 2 in row 1 of its batch; hint: 1 is an octave, 3 a third of an octave
             select d4(1, 2, 'rot45')
                 the query failed: `d4`: `symmetry` is "rot45" in row 1 of its batch; hint: one of identity, rot90, rot180, rot270, mirror_x, mirror_y, mirror_diag, mirror_anti
             select d4_point(78, 'rot90')

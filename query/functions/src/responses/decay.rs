@@ -7,15 +7,13 @@ use arrow::datatypes::DataType;
 use datafusion::error::Result;
 use echolake_dsp::arrival::first_arrival;
 use echolake_dsp::decay::energy_decay_db;
+use echolake_dsp::octave_filter::ARRIVAL_DB;
 
 use crate::adapters::answers::{append_defaults, build_lists, build_numbers};
 use crate::adapters::arguments::{CallArguments, SampleElement, same_list_type};
 use crate::adapters::description::{ArgumentKind, FunctionDescription, FunctionFamily, FunctionParameter};
 use crate::adapters::rig::RigFacts;
 use crate::adapters::scalar::ScalarKernel;
-
-/// Default level of the arrival, dB re the greatest sample; see [`first_arrival`].
-const ARRIVAL_DB: f64 = -20.0;
 
 /// `edc`.
 pub(crate) struct EdcFunction;
@@ -27,8 +25,8 @@ static EDC: FunctionDescription = FunctionDescription {
     name: "edc",
     family: FunctionFamily::Responses,
     about: "Energy decay curve by Schroeder's backward integration: the energy from each sample to the end over all of \
-            it, in dB. It starts at 0 dB; where nothing is left it is minus infinity. Null for a response without \
-            energy.",
+            it, in dB. It starts at 0 dB; where nothing is left it is minus infinity; noise is not \
+            taken out of it. Null for a response without energy.",
     parameters: &[FunctionParameter { name: "ir", kind: ArgumentKind::Samples, about: "the response" }],
     optional: 0,
     example: "select edc([3, 0, 1, 0]) as levels",
@@ -38,7 +36,7 @@ static EDC: FunctionDescription = FunctionDescription {
 +---------------------------+
 | [0.0, -10.0, -10.0, -inf] |
 +---------------------------+",
-    related: &["nce", "arrival"],
+    related: &["room_parameters", "nce", "arrival"],
 };
 
 static ARRIVAL: FunctionDescription = FunctionDescription {

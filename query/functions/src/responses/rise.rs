@@ -1,4 +1,4 @@
-//! `rise_time`, `centre_time` and `nce_slope`: the shape of a cumulative energy curve.
+//! `rise_time`, `nce_centre` and `nce_slope`: the shape of a cumulative energy curve.
 
 use std::sync::Arc;
 
@@ -62,24 +62,24 @@ static RISE: FunctionDescription = FunctionDescription {
 +--------+
 | 0.0833 |
 +--------+",
-    related: &["centre_time", "nce_slope", "nce"],
+    related: &["nce_centre", "nce_slope", "nce"],
 };
 
 static CENTRE: FunctionDescription = FunctionDescription {
-    name: "centre_time",
+    name: "nce_centre",
     family: FunctionFamily::Responses,
-    about: "Centre of gravity of the energy of a cumulative curve, in ms from its first sample; null without energy. \
-            Columns centre_*_ms of table tnce hold it for each band.",
+    about: "Centre of gravity of the energy of a cumulative curve, in ms from its first sample, not from the arrival as \
+            Ts of room_parameters; null without energy. Columns centre_*_ms of table tnce hold it for each band.",
     parameters: CURVE,
     optional: 0,
-    example: "select centre_time([0.0, 1.0, 1.0, 1.0, 2.0]) * 96 as samples",
+    example: "select nce_centre([0.0, 1.0, 1.0, 1.0, 2.0]) * 96 as samples",
     answer: "\
 +---------+
 | samples |
 +---------+
 | 2.5     |
 +---------+",
-    related: &["rise_time", "arrival"],
+    related: &["rise_time", "room_parameters"],
 };
 
 static SLOPE: FunctionDescription = FunctionDescription {
