@@ -17,6 +17,7 @@ use datafusion::error::DataFusionError;
 use datafusion::optimizer::OptimizerRule;
 use datafusion::prelude::SessionContext;
 use datafusion::sql::parser::Statement;
+use echolake_functions::FunctionSet;
 use echolake_lake::{DataFile, Error as LakeError, Lake, LakeMoment, LakeSnapshot, VisibleRun};
 use echolake_lake_tables::{FileReaders, LakeTable};
 use echolake_mcap_tables::{self as mcap_tables, Contents, McapCalls, McapFiles};
@@ -65,8 +66,8 @@ struct CatalogSnapshot {
 impl LakeCatalog {
     /// # Errors
     /// [`Error::Lake`] if the rig cannot be laid out.
-    pub fn new(lake: &Lake, source: FileReaders) -> Result<Self, Error> {
-        let lookups = LookupFunctions::from_lake(lake)?;
+    pub fn new(lake: &Lake, functions: &FunctionSet, source: FileReaders) -> Result<Self, Error> {
+        let lookups = LookupFunctions::from_lake(lake, functions)?;
         let small = source.small.clone();
         Ok(Self {
             lake: lake.clone(),

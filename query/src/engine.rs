@@ -118,7 +118,7 @@ impl QueryEngine {
         let footer_bytes = lake.is_remote().then_some(REMOTE_FOOTER_BYTES);
         let small = Arc::new(SmallTables::new(lake));
         let restricted = lake.is_restricted().then(|| lake.clone());
-        let catalog = LakeCatalog::new(lake, FileReaders { url, reader, footer_bytes, small, restricted })?;
+        let catalog = LakeCatalog::new(lake, &functions, FileReaders { url, reader, footer_bytes, small, restricted })?;
         let inner = EngineState {
             template: build_template(runtime, &functions, catalog.optimizer_rules()),
             catalog,

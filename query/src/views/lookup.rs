@@ -1,5 +1,6 @@
-//! Lookup functions for values that depend on the rig alone, by pair and symmetry: `pair_incidence_deg(pair_id)`,
-//! `d4_pair_id(pair_id, symmetry_id)`. They cost one array access per row and stream; a join would not.
+//! Functions in the views' SQL. Lookup functions for values that depend on the rig alone, by pair and symmetry:
+//! `pair_incidence_deg(pair_id)`, `d4_pair_id(pair_id, symmetry_id)`. They cost one array access per row and stream; a
+//! join would not.
 
 use std::hash::{Hash, Hasher};
 use std::sync::Arc;
@@ -10,16 +11,19 @@ use arrow::datatypes::{DataType, Int32Type};
 use datafusion::error::Result;
 use datafusion::logical_expr::{ColumnarValue, ScalarFunctionArgs, ScalarUDF, ScalarUDFImpl, Signature, Volatility};
 use datafusion::prelude::SessionContext;
+use echolake_functions::FunctionSet;
 use echolake_lake::Lake;
 use echolake_schema::symmetry::MovedPair;
 use echolake_schema::{Grid, Symmetry};
 
-/// The lookup functions of a lake.
+/// The lookup functions of a lake, and those of the field that views call.
 #[derive(Debug, Clone)]
 pub(crate) struct LookupFunctions(Vec<Arc<ScalarUDF>>);
 
 /// Prefix of the lookup functions for columns of `pairs`.
 const OF_PAIR: &str = "pair_";
+/// The function of the field that views call.
+const OF_ROOMS: &str = "room_parameters";
 
 /// Values of all pairs, or of all pairs under each symmetry of D4, one symmetry after the other.
 #[derive(Debug)]
@@ -36,7 +40,7 @@ impl LookupFunctions {
     ///
     /// # Errors
     /// If the rig's pairs cannot be laid out.
-    pub fn from_lake(lake: &Lake) -> echolake_lake::Result<Self> {
+    pub fn from_lake(lake: &Lake, functions: &FunctionSet) -> echolake_lake::Result<Self> {
         let pairs = lake.pair_rows()?;
         let columns = pairs.schema();
         let own = columns.fields().iter().zip(pairs.columns()).skip(1);
@@ -44,7 +48,9 @@ impl LookupFunctions {
             .map(|(field, values)| LookupFunction::new(OF_PAIR, field.name(), values.clone(), pairs.num_rows(), 1))
             .collect();
         all.extend(moved_lookups(lake.grid()));
-        Ok(Self(all.into_iter().map(|lookup| Arc::new(ScalarUDF::from(lookup))).collect()))
+        let lookups = all.into_iter().map(|lookup| Arc::new(ScalarUDF::from(lookup)));
+        let of_rooms = functions.scalar().iter().filter(|function| function.name() == OF_ROOMS).cloned();
+        Ok(Self(lookups.chain(of_rooms).collect()))
     }
 
     /// Returns the lookup function of a column of `pairs`.

@@ -10,6 +10,7 @@ mod lazy_view;
 mod levels;
 mod lookup;
 mod pair_join;
+mod room_parameters;
 mod sorted_nulls;
 mod tnce_db;
 mod unused_join;
@@ -49,6 +50,8 @@ pub(crate) enum LakeView {
     Catalogue,
     /// One row per surface and band: level and uncertainty over all of its runs.
     Levels,
+    /// One row per measurement and octave: reverberation times and energies.
+    RoomParameters,
 }
 
 /// Unit of levels over Flat's energy in all bands.
@@ -74,7 +77,8 @@ pub fn table_meaning(name: &str) -> Option<&'static str> {
 
 impl LakeView {
     /// All views.
-    pub const ALL: [Self; 5] = [Self::Ir, Self::TnceDb, Self::Augmented, Self::Catalogue, Self::Levels];
+    pub const ALL: [Self; 6] =
+        [Self::Ir, Self::TnceDb, Self::Augmented, Self::Catalogue, Self::Levels, Self::RoomParameters];
 
     /// Returns its name in SQL.
     pub fn name(self) -> &'static str {
@@ -84,6 +88,7 @@ impl LakeView {
             Self::Augmented => "augmented",
             Self::Catalogue => "catalogue",
             Self::Levels => "levels",
+            Self::RoomParameters => "room_parameters",
         }
     }
 
@@ -98,6 +103,7 @@ impl LakeView {
             }
             Self::Catalogue => "One row per surface: its description, its run and the statistics of its levels.",
             Self::Levels => "One row per surface and band: level and uncertainty over all of its runs.",
+            Self::RoomParameters => "One row per measurement and octave: reverberation times, clarity, centre time.",
         }
     }
 
@@ -114,6 +120,7 @@ impl LakeView {
             Self::Augmented => &[Table::Measurements, Table::Nce, Table::Tnce, Table::Heightmaps],
             Self::Catalogue => &[Table::Surfaces, Table::Runs, Table::SurfaceStats],
             Self::Levels => &[Table::Surfaces, Table::SurfaceStats],
+            Self::RoomParameters => &[Table::Measurements],
         }
     }
 
@@ -125,6 +132,7 @@ impl LakeView {
             Self::Augmented => augmented::view_sql(lake.grid(), lake.rig()),
             Self::Catalogue => catalogue::view_sql(lake.rig()),
             Self::Levels => levels::view_sql(),
+            Self::RoomParameters => room_parameters::view_sql(lake.rig()),
         }
     }
 
@@ -138,6 +146,7 @@ impl LakeView {
             }
             Self::Catalogue => catalogue::column_notes(lake.rig()),
             Self::Levels => levels::column_notes(),
+            Self::RoomParameters => room_parameters::column_notes(),
         }
     }
 

@@ -188,6 +188,25 @@ async fn augmented_moves_measurements_and_height_maps_alike() {
 }
 
 #[tokio::test]
+async fn room_parameters_have_a_row_an_octave_and_say_what_is_missing() {
+    let (_folder, lake) = lake().await;
+    put(&lake, "0001_0", "r1").await;
+    put(&lake, "0002_0", "r2").await;
+    let session = Session::new(&lake).expect("a session");
+    let one = "select midband_hz, t20_s, d50, reason from room_parameters where surface_id = '0002_0' and pair_id = 2 \
+               order by midband_hz nulls first";
+    let answer = rows(&session, one).await;
+    let bands = answer.column(0).as_primitive::<Float64Type>();
+    assert_eq!(bands.iter().collect::<Vec<_>>(), [None, Some(2e3), Some(4e3), Some(8e3), Some(16e3), Some(31.5e3)]);
+    assert_eq!((answer.column(1).null_count(), answer.column(2).null_count()), (6, 6));
+    let reason = answer.column(3).as_string::<i32>().value(5);
+    assert_eq!(reason, "it is 0.0 ms long after its arrival, of at least 50 ms");
+    let plan = plan(&session, one).await;
+    assert!(plan.contains("measurements/0002_0") && !plan.contains("measurements/0001_0"), "{plan}");
+    assert_eq!(plan.matches("room_parameters(").count(), 2, "once of all frequencies, once of a band: {plan}");
+}
+
+#[tokio::test]
 async fn the_catalogue_has_a_row_a_surface() {
     let (_folder, lake) = lake().await;
     put(&lake, "0001_0", "r1").await;
