@@ -1056,6 +1056,8 @@ export interface components {
             readonly rate_hz: number;
             /** @description After Foam's response was subtracted; null if Foam is missing. */
             readonly reflected: readonly number[] | null;
+            /** @description All frequencies, then octaves; none if the response is too short to be a room's. */
+            readonly room: readonly components["schemas"]["RoomBand"][];
             readonly surface_id: string;
             readonly symmetries: readonly components["schemas"]["SymmetricPair"][];
             /** @description Over Flat's same band, by band as `tnce_db`. */
@@ -1129,6 +1131,20 @@ export interface components {
             readonly phase_deg: readonly number[];
             /** @description By sample. */
             readonly sample_db: readonly number[];
+        };
+        /** @description Parameters of ISO 3382-1 of a response in one band, as in view `room_parameters`; null if `reason` says why not. */
+        readonly RoomBand: {
+            readonly c50_db: number | null;
+            readonly c80_db: number | null;
+            readonly d50: number | null;
+            readonly edt_s: number | null;
+            /** @description Of the octave; null for all frequencies. */
+            readonly midband_hz: number | null;
+            readonly range_db: number | null;
+            readonly reason: string | null;
+            readonly t20_s: number | null;
+            readonly t30_s: number | null;
+            readonly ts_ms: number | null;
         };
         /** @description Rows of a table that are in no file of the manifest. */
         readonly RowsElsewhere: {

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use arrow::array::{ArrayRef, Float64Array};
 use arrow::record_batch::RecordBatch;
 use axum::Extension;
+use echolake_dsp::room_parameters::is_long_enough;
 use echolake_query::figure_rows::{TOTAL_BAND, band_list, levels_db};
 use echolake_service::RequestFault;
 use serde::{Deserialize, Serialize};
@@ -53,6 +54,8 @@ struct PairDetail<'a> {
     tnce_band_u_db: Vec<Option<f64>>,
     curves: Option<CurveSet>,
     symmetries: Vec<SymmetricPair>,
+    /// All frequencies, then octaves; none if the response is too short to be a room's.
+    room: Vec<RoomBand>,
     /// What the controller logged about this pair.
     attempts: Vec<RunLogEntry>,
     environment: AirSeries,
@@ -155,6 +158,22 @@ struct SymmetricPair {
     tnce_db: Vec<Option<f64>>,
 }
 
+/// Parameters of ISO 3382-1 of a response in one band, as in view `room_parameters`; null if `reason` says why not.
+#[derive(Deserialize, Serialize, ToSchema)]
+struct RoomBand {
+    /// Of the octave; null for all frequencies.
+    midband_hz: Option<f64>,
+    edt_s: Option<f64>,
+    t20_s: Option<f64>,
+    t30_s: Option<f64>,
+    c50_db: Option<f64>,
+    c80_db: Option<f64>,
+    d50: Option<f64>,
+    ts_ms: Option<f64>,
+    range_db: Option<f64>,
+    reason: Option<String>,
+}
+
 #[derive(Deserialize)]
 struct SymmetryRow {
     symmetry: String,
@@ -177,6 +196,8 @@ const GEOMETRY: &str = "select pair_id, microphone, speaker, \
     make_array(fresnel_major_40000_mm, fresnel_minor_40000_mm) as high_mm from pairs where pair_id = $1";
 const REFLECTED: &str = "select surface_id, avg_list(reflected_ir) as reflected from nce \
     where surface_id in ($1, $2) and pair_id = $3 group by surface_id";
+const ROOM: &str = "select midband_hz, edt_s, t20_s, t30_s, c50_db, c80_db, d50, ts_ms, range_db, reason \
+    from room_parameters where surface_id = $1 and pair_id = $2 and run_id = $3 order by midband_hz nulls first";
 const ATTEMPTS: &str = "select log_time, level, name, message from events \
     where run_id = $1 and message like $2 order by log_time_ns limit 200";
 const AIR: &str = "select log_time_ns as ns, temperature_c, humidity_pct, pressure_hpa, outside_level_db \
@@ -301,6 +322,7 @@ impl ResponseSignal {
         "select * from pairs where pair_id = $2",
         "select d.symmetry, d.d4_pair_id, d.d4_microphone, d.d4_speaker, d.swapped, t.* from tnce_d4 d join tnce t \
          on t.surface_id = d.surface_id and t.pair_id = d.d4_pair_id where d.surface_id = $1 and d.pair_id = $2",
+        "select * from room_parameters where surface_id = $1 and pair_id = $2",
         "select * from events where run_id = $run and message like 'pair ' || $2 || ',%'",
         "select * from environment where run_id = $run and log_time_ns between $t - 900e9 and $t + 900e9",
     ])))
@@ -316,10 +338,11 @@ pub(super) async fn pair(
     if request.as_arrow {
         return Ok(encode_samples(&request, &measurement.ir, own.as_deref(), flat.as_deref())?);
     }
-    let (geometry, energies, moved, curves, attempts, air) = tokio::try_join!(
+    let (geometry, energies, moved, room, curves, attempts, air) = tokio::try_join!(
         read_geometry(&request, pair),
         read_energies(&request, entry, pair, &measurement.run_id),
         read_symmetries(&request, entry, pair, &measurement.run_id),
+        read_room(&request, entry, pair, &measurement),
         CurveSet::read_curves(&request, entry, PairSelection::Pair(pair), usize::MAX),
         // The controller's messages about a pair begin so.
         request.read_rows::<RunLogEntry>(
@@ -350,6 +373,7 @@ pub(super) async fn pair(
         tnce_band_u_db: energies.band_u_db,
         curves: Some(curves).filter(CurveSet::is_there),
         symmetries: moved,
+        room,
         attempts,
     })?)
 }
@@ -418,6 +442,20 @@ async fn read_symmetries(
         tnce_db: levels_db(&row.energies),
     };
     Ok(rows.into_iter().map(levels).collect())
+}
+
+async fn read_room(
+    request: &CatalogueRequest,
+    entry: &SurfaceEntry,
+    pair: usize,
+    measurement: &PairMeasurement,
+) -> Result<Vec<RoomBand>, RequestFault> {
+    // A rig's responses of some ms would make rows of nulls.
+    if !is_long_enough(measurement.ir.len(), request.catalogue.lake().rig().sweep.rate_hz.get()) {
+        return Ok(Vec::new());
+    }
+    let values = vec![text_value(&entry.surface.surface_id), number_value(pair), text_value(&measurement.run_id)];
+    request.read_rows(ROOM, values).await
 }
 
 fn encode_samples(
