@@ -8,6 +8,7 @@ mod broken_tables;
 mod campaign;
 mod end_to_end;
 mod figure;
+mod foam;
 mod forgetful;
 mod fuzz;
 mod hostile_files;

@@ -79,7 +79,8 @@ impl ReferenceDerivation {
         let mut encoders =
             [Table::Nce, Table::Tnce, Table::TnceD4].map(|table| (table, FileEncoder::new(table, table.schema(rig))));
         let mut totals: Vec<Vec<f64>> = vec![Vec::new(); rig.bands.centres_hz.len() + 1];
-        let mut unbiased = totals.clone();
+        let estimates = self.references.estimated.as_ref().map_or(0, |estimated| estimated.all().count());
+        let mut unbiased = vec![totals.clone(); estimates];
         let mut errors = vec![Vec::new(); totals.len()];
         let mut curves = vec![SignalMean::default(); rig.bands.centres_hz.len()];
         let mut paired = 0;
@@ -87,7 +88,9 @@ impl ReferenceDerivation {
         self.derive_slices(lake, keys, responses, uncertainty.as_ref(), &mut |slice| {
             paired += slice.pairs.len();
             totals.iter_mut().zip(slice.tnce_columns()).for_each(|(all, some)| all.extend(some));
-            unbiased.iter_mut().zip(slice.unbiased_columns()).for_each(|(all, some)| all.extend(some));
+            for (estimate, columns) in unbiased.iter_mut().zip(slice.unbiased_columns()) {
+                estimate.iter_mut().zip(columns).for_each(|(all, some)| all.extend(some));
+            }
             errors.iter_mut().zip(slice.error_columns()).for_each(|(all, some)| all.extend(some));
             let [nce, tnce, tnce_d4] = &mut encoders;
             let lists = slice.take_lists();
@@ -156,14 +159,14 @@ impl ReferenceDerivation {
                     .map_err(failed)?;
                     slice.push_errors(uncertainty, &sensitivities, flat);
                 }
-                if let Some((references, (direct, flat))) =
-                    estimated.as_ref().and_then(|estimated| Some((estimated, estimated.of_pair(*pair)?)))
-                {
+                let Some(estimated) = estimated else { continue };
+                for (number, references) in estimated.all().enumerate() {
+                    let Some((direct, flat)) = references.of_pair(*pair) else { continue };
                     references
                         .subtract_direct(ir, direct, air, &paths, &mut reflected, &mut air_scratch)
                         .map_err(failed)?;
                     plan.reflected_energies(&reflected, &mut energies, &mut scratch).map_err(failed)?;
-                    slice.push_unbiased(&energies, &flat.energies);
+                    slice.push_unbiased(number, &energies, &flat.energies);
                 }
             }
             take(&mut slice)?;

@@ -77,8 +77,9 @@ pub(crate) struct DerivedRows {
     tnce_over_band: Vec<f64>,
     /// `[pairs x bands]`: shapes of the curves.
     shapes: Vec<Option<CurveShape>>,
-    /// `[pairs x bands]`: TNCE without Foam's reflection; empty if that is not known.
-    unbiased: Vec<f64>,
+    /// `[estimates][pairs x bands]`: TNCE without Foam's reflection, by the best estimate and its variants; empty if that
+    /// is not known.
+    unbiased: Vec<Vec<f64>>,
     /// `[pairs x (bands + 1)]`: relative errors of TNCE, the total's last; empty if they are not known.
     errors: Vec<LevelError>,
     /// `[pairs x (2 bands + 1)]`: standard uncertainties of levels over Flat's total, of the total, and of levels over
@@ -126,9 +127,10 @@ impl DerivedRows {
         self.shapes.extend_from_slice(&derived.shapes);
     }
 
-    /// Appends the TNCE of one measurement without Foam's reflection.
-    pub fn push_unbiased(&mut self, energies: &[f64], flat: &FlatEnergies) {
-        self.unbiased.extend(energies.iter().map(|energy| energy / flat.total));
+    /// Appends the TNCE of one measurement without Foam's reflection, by the estimate of this number.
+    pub fn push_unbiased(&mut self, estimate: usize, energies: &[f64], flat: &FlatEnergies) {
+        self.unbiased.resize(self.unbiased.len().max(estimate + 1), Vec::new());
+        self.unbiased[estimate].extend(energies.iter().map(|energy| energy / flat.total));
     }
 
     /// Appends the errors of one measurement from its sensitivities and Flat's.
@@ -204,9 +206,9 @@ impl DerivedRows {
         self.band_columns(&self.tnce)
     }
 
-    /// Returns the same without Foam's reflection; without values if that is not known.
-    pub fn unbiased_columns(&self) -> Vec<Vec<f64>> {
-        self.band_columns(&self.unbiased)
+    /// Returns the same without Foam's reflection by each estimate; empty if that is not known.
+    pub fn unbiased_columns(&self) -> Vec<Vec<Vec<f64>>> {
+        self.unbiased.iter().map(|values| self.band_columns(values)).collect()
     }
 
     fn band_columns(&self, values: &[f64]) -> Vec<Vec<f64>> {

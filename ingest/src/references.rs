@@ -6,8 +6,8 @@ use std::sync::Arc;
 use echolake_dsp::air::AirState;
 use echolake_dsp::air_correction::{AirCorrection, AirScratch, PairAir};
 use echolake_dsp::foam::subtract_foam;
-use echolake_dsp::foam_reflection::FoamReflectionFit;
-use echolake_dsp::geometry::{direct_mm, image_mm};
+use echolake_dsp::foam_reflection::{FoamReflection, FoamReflectionFit, ReflectionPath};
+use echolake_dsp::geometry::{direct_mm, image_mm, incidence_deg};
 use echolake_dsp::temperature::ReferenceAir;
 use echolake_dsp::uncertainty::{DirectSoundResidual, EnergySensitivity};
 use echolake_lake::{DataFile, DirectSound, FileName, Lake, LakeSnapshot, ReferenceSurfaces};
@@ -59,9 +59,23 @@ pub(crate) struct ReferenceResponses {
 pub(crate) struct LoadedReferences {
     pub chosen: ReferenceResponses,
     /// None if Foam's reflection cannot be estimated: few pairs, or arrivals that are not apart.
-    pub estimated: Option<ReferenceResponses>,
+    pub estimated: Option<EstimatedReferences>,
     /// The surface whose only run Flat's energies are from.
     pub only_flat: Option<SurfaceId>,
+}
+
+/// References without Foam's reflection, and variants of them, whose differences show the estimate's error.
+#[derive(Clone)]
+pub(crate) struct EstimatedReferences {
+    pub best: ReferenceResponses,
+    variants: Arc<[ReferenceResponses]>,
+}
+
+impl EstimatedReferences {
+    /// Returns the best estimate, then its variants.
+    pub fn all(&self) -> impl Iterator<Item = &ReferenceResponses> {
+        [&self.best].into_iter().chain(self.variants.iter())
+    }
 }
 
 /// One finder for all workers: they share its cache.
@@ -175,10 +189,10 @@ impl ReferenceFinder {
         let (of_foam, estimated) = cores.compute_on_core(derive).await;
         let of_foam = of_foam?;
         let estimated = estimated?;
-        let chosen = of_foam.or_else(|| estimated.clone()).ok_or_else(|| Error::FoamReflection {
-            foam: wanted.foam.surface.to_string(),
-            flat: wanted.flat.surface.to_string(),
-        })?;
+        let chosen =
+            of_foam.or_else(|| estimated.as_ref().map(|estimated| estimated.best.clone())).ok_or_else(|| {
+                Error::FoamReflection { foam: wanted.foam.surface.to_string(), flat: wanted.flat.surface.to_string() }
+            })?;
         let flat_runs = self.snapshot.runs().filter(|run| run.surface == wanted.flat.surface).count();
         let only_flat = (flat_runs == 1).then(|| wanted.flat.surface.clone());
         let loaded = LoadedReferences { chosen, estimated, only_flat };
@@ -318,7 +332,7 @@ impl ReferenceResponses {
             subtract_foam(ir, &direct.ir, reflected);
             return Ok(());
         }
-        let PairPaths { direct_m, reflected_m } = *paths;
+        let PairPaths { direct_m, reflected_m, .. } = *paths;
         let pair = PairAir { response: *air, direct: direct.air, direct_m, reflected_m };
         self.correction.subtract_direct(ir, &direct.ir, &pair, reflected, scratch)
     }
@@ -329,11 +343,12 @@ impl ReferenceResponses {
     }
 }
 
-/// Lengths of a pair's direct path and of that by the panel's plane, m.
+/// Lengths of a pair's direct path and of that by the panel's plane, m, and the latter's angle of incidence.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct PairPaths {
     pub direct_m: f64,
     pub reflected_m: f64,
+    pub incidence_deg: f64,
 }
 
 impl PairPaths {
@@ -345,7 +360,7 @@ impl PairPaths {
         let speaker = position(points.speaker)?;
         let [direct_m, reflected_m] =
             [direct_mm(microphone, speaker), image_mm(microphone, speaker)].map(|mm| mm / 1e3);
-        Some(Self { direct_m, reflected_m })
+        Some(Self { direct_m, reflected_m, incidence_deg: incidence_deg(microphone, speaker) })
     }
 
     /// Returns the arrivals of both in a corrected response, s.
@@ -373,26 +388,40 @@ fn estimate_references(
     flat: &MeanResponses,
     flat_foam: &MeanResponses,
     foam: &MeanResponses,
-) -> Result<Option<ReferenceResponses>> {
+) -> Result<Option<EstimatedReferences>> {
     let rig = lake.rig();
     let mut fit = FoamReflectionFit::new(rig.impulse_response.length, rig.sweep.rate_hz.get()).map_err(kernel_error)?;
     for (pair, flat) in sorted_means(flat) {
         let (Some(foam), Some(paths)) = (flat_foam.get(&pair), PairPaths::new(lake, pair)) else { continue };
         let [direct_secs, reflected_secs] = paths.arrival_secs(rig);
-        fit.add_pair(&foam.ir, &flat.ir, direct_secs, reflected_secs).map_err(kernel_error)?;
+        let path = ReflectionPath { direct_secs, reflected_secs, incidence_deg: paths.incidence_deg };
+        fit.add_pair(&foam.ir, &flat.ir, path).map_err(kernel_error)?;
     }
-    let Some(reflection) = fit.finish() else { return Ok(None) };
-    let direct_sound = |foam: &MeanResponses| -> Result<MeanResponses> {
-        let mut direct = MeanResponses::with_capacity(foam.len());
-        for (pair, foam) in foam {
-            let Some(flat) = flat.get(pair) else { continue };
-            let mut ir = vec![0.0; foam.ir.len()];
-            reflection.direct_sound(&foam.ir, &flat.ir, &mut ir).map_err(kernel_error)?;
-            direct.insert(*pair, MeanResponse { ir, air: foam.air });
-        }
-        Ok(direct)
+    let Some(estimate) = fit.finish() else { return Ok(None) };
+    let references = |reflection| {
+        let direct = Arc::new(remove_reflection(lake, reflection, foam, flat)?);
+        ReferenceResponses::new(lake, direct, flat, &remove_reflection(lake, reflection, flat_foam, flat)?)
     };
-    ReferenceResponses::new(lake, Arc::new(direct_sound(foam)?), flat, &direct_sound(flat_foam)?).map(Some)
+    let best = references(&estimate.best)?;
+    let variants = estimate.variants.iter().map(references).collect::<Result<_>>()?;
+    Ok(Some(EstimatedReferences { best, variants }))
+}
+
+// The direct sound of each pair that Flat has, too.
+fn remove_reflection(
+    lake: &Lake,
+    reflection: &FoamReflection,
+    foam: &MeanResponses,
+    flat: &MeanResponses,
+) -> Result<MeanResponses> {
+    let mut direct = MeanResponses::with_capacity(foam.len());
+    for (pair, foam) in foam {
+        let (Some(flat), Some(paths)) = (flat.get(pair), PairPaths::new(lake, *pair)) else { continue };
+        let mut ir = vec![0.0; foam.ir.len()];
+        reflection.direct_sound(&foam.ir, &flat.ir, paths.incidence_deg, &mut ir).map_err(kernel_error)?;
+        direct.insert(*pair, MeanResponse { ir, air: foam.air });
+    }
+    Ok(direct)
 }
 
 impl WantedReferences {

@@ -21,6 +21,10 @@ pub struct SimulationParams {
     pub material_spectra: bool,
     /// Foam reflects a little; if off nothing, so that what is left of a panel is its own reflection alone.
     pub foam_reflection: bool,
+    /// Foam's resistance to flow, Pa s/m^2, with which it reflects if `material_spectra` is on.
+    pub foam_flow_resistivity: f64,
+    /// Foam's thickness, mm.
+    pub foam_thickness_mm: f64,
     /// The air absorbs, by its temperature, humidity and pressure.
     pub air_absorption: bool,
     /// Distance of an arm from where it stood before at the same point, root mean square, mm. 0 for none.
@@ -40,12 +44,15 @@ pub struct SimulationParams {
 }
 
 impl Default for SimulationParams {
-    /// All effects, the distances of the arms as Rust et al. 2021 print them.
+    /// All effects, the distances of the arms and the thickness of the foam as Rust et al. 2021 print them. Its
+    /// resistance to flow is an assumption amid the 8 to 20 kPa s/m^2 that are usual for melamine foam.
     fn default() -> Self {
         Self {
             steep_facets: true,
             material_spectra: true,
             foam_reflection: true,
+            foam_flow_resistivity: 10e3,
+            foam_thickness_mm: 50.0,
             air_absorption: true,
             repeatability_mm: 0.02,
             calibration_mm: 0.17,
@@ -69,6 +76,11 @@ impl SimulationParams {
         let is_plausible = |mm: f64| (0.0..=10.0).contains(&mm);
         if !(is_plausible(self.repeatability_mm) && is_plausible(self.calibration_mm)) {
             return Some("expected repeatability_mm and calibration_mm from 0 to 10".to_owned());
+        }
+        if !((100.0..=1e6).contains(&self.foam_flow_resistivity) && (1.0..=500.0).contains(&self.foam_thickness_mm)) {
+            return Some(
+                "expected foam_flow_resistivity from 100 to 1e6 and foam_thickness_mm from 1 to 500".to_owned(),
+            );
         }
         let is_room = (0.0..=40.0).contains(&self.temperature_c) && (5.0..=95.0).contains(&self.humidity_pct);
         (!is_room).then(|| "expected temperature_c from 0 to 40 and humidity_pct from 5 to 95".to_owned())

@@ -11,10 +11,6 @@ const PRINT_ABSORPTION: f64 = 0.048;
 const PRINT_SHELF_HZ: [f64; 2] = [20_000.0, 31_200.0];
 /// Pressure reflection factor of the board.
 const BOARD_FACTOR: f64 = 0.99;
-/// Thickness of the foam (Rust et al. 2021), m, and its resistance to flow, Pa s/m^2: an assumption amid the 8 to 20
-/// kPa s/m^2 that is usual for melamine foam.
-const FOAM_M: f64 = 0.05;
-const FOAM_RESISTIVITY: f64 = 10e3;
 /// Speed of sound at 20 C, m/s.
 const SPEED_M_S: f64 = 343.2;
 /// Below this frequency the foam's model is not evaluated, Hz.
@@ -27,8 +23,17 @@ pub enum SurfaceMaterial {
     CoatedPrint,
     /// A board of wood fibres.
     FibreBoard,
-    /// 50 mm of melamine foam on a hard back.
+    /// Melamine foam on a hard back.
     MelamineFoam,
+}
+
+/// A layer of foam on a hard back.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FoamLayer {
+    /// Resistance to flow, Pa s/m^2.
+    pub flow_resistivity: f64,
+    /// Thickness, mm.
+    pub thickness_mm: f64,
 }
 
 impl SurfaceMaterial {
@@ -50,48 +55,87 @@ impl SurfaceMaterial {
         }
     }
 
-    /// Pressure reflection factor at normal incidence and one frequency.
-    pub fn reflection_at(self, frequency_hz: f64) -> Complex<f64> {
+    /// Pressure reflection factor for plane waves of one frequency; only that of foam depends on the angle of incidence.
+    pub fn reflection_at(self, frequency_hz: f64, incidence_deg: f64, foam: FoamLayer) -> Complex<f64> {
         match self {
             Self::CoatedPrint => {
                 let [falls, ends] = PRINT_SHELF_HZ.map(|corner| Complex::new(1.0, frequency_hz / corner));
                 ends / falls * (1.0 - PRINT_ABSORPTION).sqrt()
             }
             Self::FibreBoard => BOARD_FACTOR.into(),
-            Self::MelamineFoam => foam_reflection(frequency_hz.max(FOAM_LOWEST_HZ)),
+            Self::MelamineFoam => foam.reflection_at(frequency_hz, incidence_deg),
         }
     }
 }
 
-// Impedance and wave number of a fibrous layer by its resistance to flow: Miki 1990, J. Acoust. Soc. Jpn. (E) 11(1),
-// 19-24, who mended Delany's and Bazley's; time goes as e^(i omega t).
-fn foam_reflection(frequency_hz: f64) -> Complex<f64> {
-    let x = 1e3 * frequency_hz / FOAM_RESISTIVITY;
-    let impedance = Complex::new(1.0 + 5.50 * x.powf(-0.632), -8.43 * x.powf(-0.632));
-    let wave_number =
-        Complex::new(1.0 + 7.81 * x.powf(-0.618), -11.41 * x.powf(-0.618)) * (TAU * frequency_hz / SPEED_M_S);
-    let surface = impedance * Complex::new(0.0, -1.0) / (wave_number * FOAM_M).tan();
-    (surface - 1.0) / (surface + 1.0)
+impl FoamLayer {
+    /// Pressure reflection factor for plane waves of one frequency at an angle of incidence. Waves go through the layer
+    /// in the direction that Snell's law gives them (bulk reaction). Time goes as e^(i omega t).
+    ///
+    /// R = (Zs cos(a) - 1)/(Zs cos(a) + 1), Zs = -i Zc (k/kz) cot(kz d), kz^2 = k^2 - (k0 sin(a))^2, impedances over the
+    /// air's: Allard & Atalla 2009, Propagation of Sound in Porous Media, chapter 3. Zc and k by the resistance to flow:
+    /// Miki 1990, J. Acoust. Soc. Jpn. (E) 11(1), 19-24, who mended Delany's and Bazley's.
+    pub fn reflection_at(self, frequency_hz: f64, incidence_deg: f64) -> Complex<f64> {
+        let frequency_hz = frequency_hz.max(FOAM_LOWEST_HZ);
+        let x = 1e3 * frequency_hz / self.flow_resistivity;
+        let impedance = Complex::new(1.0 + 5.50 * x.powf(-0.632), -8.43 * x.powf(-0.632));
+        let index = Complex::new(1.0 + 7.81 * x.powf(-0.618), -11.41 * x.powf(-0.618));
+        let incidence = incidence_deg.to_radians();
+        // k/k0 and kz/k0.
+        let normal_index = (index * index - incidence.sin().powi(2)).sqrt();
+        let turn = normal_index * (TAU * frequency_hz / SPEED_M_S * self.thickness_mm / 1e3);
+        let surface = impedance * index / normal_index * Complex::new(0.0, -1.0) / turn.tan() * incidence.cos();
+        (surface - 1.0) / (surface + 1.0)
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
+    const LAYER: FoamLayer = FoamLayer { flow_resistivity: 10e3, thickness_mm: 50.0 };
+
     #[test]
     fn reflection_is_as_published() {
-        let absorption = |material: SurfaceMaterial, hz| 1.0 - material.reflection_at(hz).norm_sqr();
+        let reflection = |material: SurfaceMaterial, hz| material.reflection_at(hz, 0.0, LAYER).norm();
         for hz in [2e3, 4e3, 6e3] {
-            let print = absorption(SurfaceMaterial::CoatedPrint, hz);
-            assert!((0.04..0.1).contains(&print), "{hz}: {print}");
+            let absorption = 1.0 - reflection(SurfaceMaterial::CoatedPrint, hz).powi(2);
+            assert!((0.04..0.1).contains(&absorption), "{hz}: {absorption}");
         }
-        // Less of the higher frequencies comes back. The foam's back is heard at the lowest alone.
-        let octaves = |material: SurfaceMaterial| {
-            [0, 1, 2, 3, 4].map(|n| material.reflection_at(2_500.0 * f64::from(1 << n)).norm())
-        };
-        let print = octaves(SurfaceMaterial::CoatedPrint);
+        let print = [0, 1, 2, 3, 4].map(|n| reflection(SurfaceMaterial::CoatedPrint, 2_500.0 * f64::from(1 << n)));
         assert!(print.windows(2).all(|pair| pair[1] < pair[0]) && print[4] > 0.6, "{print:?}");
-        let foam = octaves(SurfaceMaterial::MelamineFoam);
-        assert!(foam.iter().all(|factor| *factor < 0.25) && foam[2] > 2.0 * foam[4], "{foam:?}");
+    }
+
+    // By the same formulas in another program (NumPy).
+    #[test]
+    fn foam_reflects_by_the_angle() {
+        for (hz, thickness_mm, levels_db) in [
+            (10e3, 50.0, [-19.0, -36.0, -11.5]),
+            (2_500.0, 50.0, [-12.4, -19.0, -8.5]),
+            (10e3, 25.0, [-15.3, -14.2, -12.9]),
+            (40e3, 75.0, [-31.5, -41.4, -14.9]),
+        ] {
+            for (incidence_deg, expected) in [0.0, 35.0, 70.0].into_iter().zip(levels_db) {
+                let layer = FoamLayer { thickness_mm, ..LAYER };
+                let found = 20.0 * layer.reflection_at(hz, incidence_deg).norm().log10();
+                assert!((found - expected).abs() < 0.06, "{hz} Hz, {thickness_mm} mm, {incidence_deg}: {found}");
+            }
+        }
+    }
+
+    // What resists no flow is air, and its back is all that reflects, at any angle: e^(-2 i k0 d cos(a)). What nothing
+    // flows through is hard, and no layer is the back.
+    #[test]
+    fn limits_of_foam() {
+        for incidence_deg in [0.0, 30.0, 60.0] {
+            let air = FoamLayer { flow_resistivity: 1e-6, ..LAYER }.reflection_at(5e3, incidence_deg);
+            let path = 2.0 * TAU * 5e3 / SPEED_M_S * 0.05 * f64::to_radians(incidence_deg).cos();
+            assert!((air - Complex::from_polar(1.0, -path)).norm() < 1e-3, "{incidence_deg}: {air}");
+            let hard = FoamLayer { flow_resistivity: 1e12, thickness_mm: 0.1 }.reflection_at(5e3, incidence_deg);
+            let none = FoamLayer { thickness_mm: 1e-6, ..LAYER }.reflection_at(5e3, incidence_deg);
+            assert!((hard - 1.0).norm() < 1e-3 && (none - 1.0).norm() < 1e-3, "{incidence_deg}: {hard}, {none}");
+        }
+        // At a right angle nothing enters: all comes back, in the opposite phase.
+        assert!((LAYER.reflection_at(5e3, 90.0) + 1.0).norm() < 1e-9);
     }
 }

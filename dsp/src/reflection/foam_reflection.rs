@@ -5,9 +5,12 @@
 //! arrives at other times, to which it adds energy.
 //!
 //! Flat and Foam lie in the same plane, so both reflect the same waves: for each pair, Foam's reflection is that of
-//! Flat less Foam through a short filter k, which is the same for all pairs. It is fitted where the reflection arrives
-//! well after the direct sound. The direct sound is then Foam's response less k applied to the difference, also for
-//! pairs whose arrivals overlap.
+//! Flat less Foam through a short filter, which depends on the angle of incidence. It is a sum of filters of some angles,
+//! linearly interpolated by the square of the angle's sine. They are fitted by least squares to what arrives about the
+//! reflection and later. The direct sound has low frequencies that last until then: its waveform is the mean over all
+//! pairs, each brought to one distance, and is subtracted first. Filters and waveform are fitted in turn.
+//!
+//! The direct sound of a pair is Foam's response less its filter applied to the difference.
 
 use std::sync::Arc;
 
@@ -17,48 +20,69 @@ use realfft::{ComplexToReal, RealToComplex};
 use crate::error::check_len;
 use crate::{Error, RealSample};
 
-/// Least time between both arrivals of a pair that the filter is fitted to, s. With less, what is left of the direct
-/// sound's low frequencies is mistaken for Foam's reflection; with more, too few pairs are left.
-const LEAST_SEPARATION_SECS: f64 = 0.6e-3;
+/// Least time between both arrivals of a pair that filters are fitted to, s.
+const LEAST_SEPARATION_SECS: f64 = 0.25e-3;
 /// Time before the reflection's arrival at which the fitted part begins to rise, and the length of that rise, s.
-const GATE_SECS: [f64; 2] = [0.3e-3, 0.2e-3];
-/// Times that the filter spans about the reflection by Flat, s: sound that enters 50 mm of foam and comes back from the
+const GATE_SECS: [f64; 2] = [0.2e-3, 0.2e-3];
+/// Times that the filters span about the reflection by Flat, s: sound that enters 50 mm of foam and comes back from the
 /// wall behind it is 0.3 ms late.
 const FILTER_SECS: [f64; 2] = [-0.1e-3, 0.6e-3];
-/// Least number of pairs for an estimate: what is not Foam's reflection averages out over them.
+/// Angles that have filters of their own, by the square of the sine.
+const CLASSES: [f64; 6] = [0.0, 0.15, 0.3, 0.45, 0.6, 0.75];
+/// Least number of pairs for an estimate, and for a class of angles: one with fewer has no filter of its own.
 pub const LEAST_PAIRS: usize = 24;
-/// Power added at all frequencies, relative to the mean: nothing is known of those that the sweep lacks.
-const LOADING: f64 = 1e-4;
+/// Most pairs that are fitted: with more, the estimate is no better.
+const MOST_PAIRS: usize = 1_000;
+/// Parts of the pairs, each of which is left out of one variant of the estimate.
+const PARTS: usize = 4;
+/// Number of fits, each with the direct sound's waveform of the one before.
+const ROUNDS: usize = 3;
+/// Power added to each tap, relative to the mean: nothing is known of frequencies that the sweep lacks.
+const LOADING: f64 = 1e-5;
 
-/// Fits the filter from Foam's and Flat's responses of many pairs.
+/// Path of a pair's sound by the panel's plane.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ReflectionPath {
+    /// Arrival of the direct sound, s.
+    pub direct_secs: f64,
+    /// Arrival of the reflection, s.
+    pub reflected_secs: f64,
+    /// Angle of incidence, degrees.
+    pub incidence_deg: f64,
+}
+
+/// Fits the filters to Foam's and Flat's responses of many pairs.
 ///
 /// ```
-/// use echolake_dsp::foam_reflection::FoamReflectionFit;
+/// use echolake_dsp::foam_reflection::{FoamReflectionFit, ReflectionPath};
 ///
-/// let mut fit = FoamReflectionFit::<f64>::new(384, 96e3)?;
+/// let mut fit = FoamReflectionFit::new(384, 96e3)?;
 /// let response = |reflection: f64| {
 ///     let mut ir = vec![0.0; 384];
 ///     (ir[80], ir[160]) = (1.0, reflection);
 ///     ir
 /// };
+/// let path = ReflectionPath { direct_secs: 80.0 / 96e3, reflected_secs: 160.0 / 96e3, incidence_deg: 30.0 };
 /// for _ in 0..24 {
-///     assert!(fit.add_pair(&response(0.04), &response(0.84), 80.0 / 96e3, 160.0 / 96e3)?);
+///     assert!(fit.add_pair(&response(0.04), &response(0.84), path)?);
 /// }
-/// let reflection = fit.finish().ok_or("24 pairs are enough")?;
+/// let reflection = fit.finish().ok_or("24 pairs are enough")?.best;
 /// let mut direct = vec![0.0; 384];
-/// reflection.direct_sound(&response(0.04), &response(0.84), &mut direct)?;
+/// reflection.direct_sound(&response(0.04), &response(0.84), 30.0, &mut direct)?;
 /// assert!((direct[80] - 1.0).abs() < 1e-3 && direct[160].abs() < 1e-3);
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
-pub struct FoamReflectionFit<T: RealSample> {
+pub struct FoamReflectionFit {
     rate_hz: f64,
     len: usize,
-    forward: Arc<dyn RealToComplex<T>>,
-    inverse: Arc<dyn ComplexToReal<f64>>,
-    /// Sums over pairs, per bin: the cross spectrum of Foam with the difference, and the difference's power.
-    cross: Vec<Complex<f64>>,
-    power: Vec<Complex<f64>>,
-    pairs: usize,
+    pairs: Vec<FittedPair>,
+}
+
+struct FittedPair {
+    path: ReflectionPath,
+    foam: Vec<f64>,
+    /// Flat's response less Foam's.
+    difference: Vec<f64>,
 }
 
 /// Foam's reflection relative to what Flat reflects more.
@@ -66,147 +90,384 @@ pub struct FoamReflectionFit<T: RealSample> {
 pub struct FoamReflection {
     /// Samples by which the first tap comes before the reflection by Flat.
     lead: usize,
-    taps: Vec<f64>,
-    /// Number of pairs that it was fitted to.
-    pub pairs: usize,
+    /// Squares of the sine of the angles, ascending, and the filter of each.
+    classes: Vec<f64>,
+    filters: Vec<Vec<f64>>,
 }
 
-impl<T: RealSample> FoamReflectionFit<T> {
+/// An estimate, and variants of it, whose differences show its error.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FoamReflectionEstimate {
+    /// The estimate.
+    pub best: FoamReflection,
+    /// Variants: without each part of the pairs, by the time between their arrivals; last, with half of the classes.
+    pub variants: Vec<FoamReflection>,
+}
+
+/// Least squares for the filters of some classes: the lower triangle of its matrix, row by row, and its right side.
+#[derive(Clone)]
+struct NormalEquations {
+    classes: Vec<f64>,
+    taps: usize,
+    matrix: Vec<f64>,
+    wanted: Vec<f64>,
+}
+
+/// Delays signals by fractions of a sample, around a circle twice as long as a response.
+struct SignalDelay {
+    forward: Arc<dyn RealToComplex<f64>>,
+    inverse: Arc<dyn ComplexToReal<f64>>,
+}
+
+impl ReflectionPath {
+    fn sine_square(&self) -> f64 {
+        self.incidence_deg.to_radians().sin().powi(2)
+    }
+
+    fn separation_secs(&self) -> f64 {
+        self.reflected_secs - self.direct_secs
+    }
+}
+
+impl FoamReflectionFit {
     /// Begins a fit to responses of `len` samples.
     ///
     /// # Errors
-    /// [`Error::Setting`] for no samples, or a rate at which the filter has no tap.
+    /// [`Error::Setting`] for no samples, or a rate at which the filters have no tap.
     pub fn new(len: usize, rate_hz: f64) -> Result<Self, Error> {
         if len == 0 || !(rate_hz.is_finite() && rate_hz * FILTER_SECS[1] >= 1.0) {
             let actual = format!("{len} samples at {rate_hz} Hz");
             return Err(Error::Setting { what: "the response", actual, expected: "samples at some kHz" });
         }
-        let bins = len + 1;
-        Ok(Self {
-            rate_hz,
-            len,
-            // Twice the length: the circle does not close.
-            forward: T::plan_real_forward(2 * len),
-            inverse: f64::plan_real_inverse(2 * len),
-            cross: vec![Complex::default(); bins],
-            power: vec![Complex::default(); bins],
-            pairs: 0,
-        })
+        Ok(Self { rate_hz, len, pairs: Vec::new() })
     }
 
-    /// Adds a pair: its responses of Foam and Flat, and the arrivals of the direct sound and of the reflection in the
-    /// panel's plane, s. Returns false, and adds nothing, if they arrive too soon after one another.
+    /// Adds a pair by its responses of Foam and Flat. Returns false, and adds nothing, if the reflection arrives too
+    /// soon after the direct sound or too late.
     ///
     /// # Errors
     /// [`Error::Length`] or [`Error::NotFinite`].
-    pub fn add_pair(&mut self, foam: &[T], flat: &[T], direct_secs: f64, reflected_secs: f64) -> Result<bool, Error> {
+    pub fn add_pair<T: RealSample>(&mut self, foam: &[T], flat: &[T], path: ReflectionPath) -> Result<bool, Error> {
         check_len("Foam's response", foam.len(), self.len)?;
         check_len("Flat's response", flat.len(), self.len)?;
-        let inside = (reflected_secs + FILTER_SECS[1]) * self.rate_hz < self.len as f64;
-        if !(inside && reflected_secs - direct_secs >= LEAST_SEPARATION_SECS) {
+        let inside = (path.reflected_secs + FILTER_SECS[1]) * self.rate_hz < self.len as f64;
+        let apart = path.direct_secs > 0.0 && path.separation_secs() >= LEAST_SEPARATION_SECS;
+        if !(inside && apart && path.incidence_deg.is_finite()) {
             return Ok(false);
         }
-        let gate = |n: usize| {
-            let secs = n as f64 / self.rate_hz - (reflected_secs - GATE_SECS[0]);
-            let rise = (secs / GATE_SECS[1]).clamp(0.0, 1.0);
-            T::of(0.5 - 0.5 * (std::f64::consts::PI * rise).cos())
-        };
-        let spectrum = |sample: &dyn Fn(usize) -> T| {
-            let mut signal = self.forward.make_input_vec();
-            signal.iter_mut().take(self.len).enumerate().for_each(|(n, x)| *x = gate(n) * sample(n));
-            let mut spectrum = self.forward.make_output_vec();
-            let done = self.forward.process(&mut signal, &mut spectrum);
-            let finite = done.is_ok() && spectrum.first().is_some_and(|dc| dc.re.f64().is_finite());
-            finite.then_some(spectrum).ok_or(Error::NotFinite { what: "a reference's response" })
-        };
-        let of_foam = spectrum(&|n| foam[n])?;
-        let of_difference = spectrum(&|n| flat[n] - foam[n])?;
-        let wide = |x: &Complex<T>| Complex::new(x.re.f64(), x.im.f64());
-        let sums = self.cross.iter_mut().zip(&mut self.power);
-        for ((cross, power), (foam, difference)) in sums.zip(of_foam.iter().zip(&of_difference)) {
-            let difference = wide(difference);
-            *cross += wide(foam) * difference.conj();
-            *power += difference.norm_sqr();
+        if !foam.iter().chain(flat).all(|x| x.f64().is_finite()) {
+            return Err(Error::NotFinite { what: "a reference's response" });
         }
-        self.pairs += 1;
+        let difference = flat.iter().zip(foam).map(|(flat, foam)| flat.f64() - foam.f64()).collect();
+        self.pairs.push(FittedPair { path, foam: foam.iter().map(|x| x.f64()).collect(), difference });
         Ok(true)
     }
 
-    /// Fits the filter by least squares; None of fewer than [`LEAST_PAIRS`], or if Flat reflects no more than Foam.
-    pub fn finish(mut self) -> Option<FoamReflection> {
-        if self.pairs < LEAST_PAIRS {
+    /// Fits the filters; None of fewer than [`LEAST_PAIRS`], or if Flat reflects no more than Foam.
+    pub fn finish(self) -> Option<FoamReflectionEstimate> {
+        if self.pairs.len() < LEAST_PAIRS {
             return None;
         }
-        let samples = |secs: f64| (secs * self.rate_hz).round() as usize;
-        let lead = samples(-FILTER_SECS[0]);
-        let behind = samples(FILTER_SECS[1]);
-        let correlation = |spectrum: &mut [Complex<f64>]| {
-            let mut out = self.inverse.make_output_vec();
-            // The ends of a real signal's spectrum are real.
-            for end in [0, self.len] {
-                spectrum[end].im = 0.0;
+        let stride = self.pairs.len().div_ceil(MOST_PAIRS);
+        let mut pairs: Vec<_> = self.pairs.iter().step_by(stride).collect();
+        pairs.sort_by(|a, b| a.path.separation_secs().total_cmp(&b.path.separation_secs()));
+        let part_of = |number: usize| number * PARTS / pairs.len();
+        let classes = supported_classes(&self.pairs);
+        let taps = self.lead() + self.samples(FILTER_SECS[1]) + 1;
+        let mut coarse = NormalEquations::new(half_of_classes(&classes), taps);
+        let mut parts = vec![NormalEquations::new(classes, taps); PARTS];
+        for (number, pair) in pairs.iter().enumerate() {
+            let products = self.tap_products(pair, taps);
+            parts[part_of(number)].add_products(pair.path.sine_square(), &products);
+            coarse.add_products(pair.path.sine_square(), &products);
+        }
+        let delay = SignalDelay::new(2 * self.len);
+        let mut waveform = vec![0.0; 2 * self.len];
+        let mut best = None;
+        for _ in 0..ROUNDS {
+            if let Some(best) = &best {
+                waveform = self.direct_waveform(&pairs, best, &delay)?;
             }
-            self.inverse.process(spectrum, &mut out).ok().map(|()| out)
-        };
-        let mut own = correlation(&mut self.power)?;
-        let cross = correlation(&mut self.cross)?;
-        if own.first().is_none_or(|power| *power <= 0.0) {
-            return None;
+            parts.iter_mut().chain([&mut coarse]).for_each(|equations| equations.wanted.fill(0.0));
+            for (number, pair) in pairs.iter().enumerate() {
+                let correlations = self.tap_correlations(pair, &waveform, taps, &delay)?;
+                parts[part_of(number)].add_correlations(pair.path.sine_square(), &correlations);
+                coarse.add_correlations(pair.path.sine_square(), &correlations);
+            }
+            best = Some(self.solve_equations(NormalEquations::sum_without(&parts, None))?);
         }
-        own[0] *= 1.0 + LOADING;
-        let circle = cross.len();
-        let wanted: Vec<f64> = (0..=lead + behind).map(|tap| cross[(circle + tap - lead) % circle]).collect();
-        Some(FoamReflection { lead, taps: solve_toeplitz(&own, &wanted), pairs: self.pairs })
+        let without = (0..PARTS).map(|part| NormalEquations::sum_without(&parts, Some(part)));
+        let variants = without.chain([coarse]).map(|equations| self.solve_equations(equations));
+        Some(FoamReflectionEstimate { variants: variants.collect::<Option<_>>()?, best: best? })
+    }
+
+    fn solve_equations(&self, equations: NormalEquations) -> Option<FoamReflection> {
+        let taps = equations.taps;
+        let classes = equations.classes.clone();
+        let filters = equations.solve()?.chunks_exact(taps).map(<[f64]>::to_vec).collect();
+        Some(FoamReflection { lead: self.lead(), classes, filters })
+    }
+
+    // Sums of products of the gated difference, moved by each tap, with itself moved by each: the lower triangle.
+    fn tap_products(&self, pair: &FittedPair, taps: usize) -> Vec<f64> {
+        let mut products = vec![0.0; taps * taps];
+        let mut moved = vec![0.0; taps];
+        for n in 0..self.len {
+            let gate = self.gate(pair, n);
+            if gate == 0.0 {
+                continue;
+            }
+            for (tap, x) in moved.iter_mut().enumerate() {
+                *x = gate * self.moved_difference(pair, n, tap);
+            }
+            for (tap, row) in products.chunks_exact_mut(taps).enumerate() {
+                row[..=tap].iter_mut().zip(&moved).for_each(|(sum, x)| *sum += moved[tap] * x);
+            }
+        }
+        products
+    }
+
+    // Sums of products of the gated difference, moved by each tap, with the gated response of Foam less the direct
+    // sound's waveform.
+    fn tap_correlations(
+        &self,
+        pair: &FittedPair,
+        waveform: &[f64],
+        taps: usize,
+        delay: &SignalDelay,
+    ) -> Option<Vec<f64>> {
+        let direct = delay.delayed_signal(waveform, pair.path.direct_secs * self.rate_hz)?;
+        let mut correlations = vec![0.0; taps];
+        for (n, (foam, direct)) in pair.foam.iter().zip(&direct).enumerate() {
+            let gate = self.gate(pair, n);
+            if gate == 0.0 {
+                continue;
+            }
+            let reflected = gate * gate * (foam - direct / pair.path.direct_secs);
+            for (tap, sum) in correlations.iter_mut().enumerate() {
+                *sum += reflected * self.moved_difference(pair, n, tap);
+            }
+        }
+        Some(correlations)
+    }
+
+    // The mean of all direct sounds, each from its arrival, at a distance that sound travels in a second. Times before
+    // the arrival are at the end.
+    fn direct_waveform(
+        &self,
+        pairs: &[&FittedPair],
+        reflection: &FoamReflection,
+        delay: &SignalDelay,
+    ) -> Option<Vec<f64>> {
+        let circle = 2 * self.len;
+        let mut sums = vec![(0.0, 0.0); circle];
+        for pair in pairs {
+            let arrival = pair.path.direct_secs * self.rate_hz;
+            let direct = reflection.remove_reflection(&pair.foam, &pair.difference, pair.path.sine_square());
+            let advanced = delay.delayed_signal(&direct, -arrival)?;
+            for (at, (sum, x)) in sums.iter_mut().zip(&advanced).enumerate() {
+                let lag = if at < self.len { at as f64 } else { at as f64 - circle as f64 };
+                if (0.0..self.len as f64).contains(&(lag + arrival)) {
+                    *sum = (sum.0 + x * pair.path.direct_secs, sum.1 + 1.0);
+                }
+            }
+        }
+        Some(sums.into_iter().map(|(sum, count)| if count > 0.0 { sum / count } else { 0.0 }).collect())
+    }
+
+    fn gate(&self, pair: &FittedPair, sample: usize) -> f64 {
+        let secs = sample as f64 / self.rate_hz - (pair.path.reflected_secs - GATE_SECS[0]);
+        let rise = (secs / GATE_SECS[1]).clamp(0.0, 1.0);
+        0.5 - 0.5 * (std::f64::consts::PI * rise).cos()
+    }
+
+    fn moved_difference(&self, pair: &FittedPair, sample: usize, tap: usize) -> f64 {
+        let at = (sample + self.lead()).checked_sub(tap);
+        at.and_then(|at| pair.difference.get(at)).copied().unwrap_or(0.0)
+    }
+
+    fn samples(&self, secs: f64) -> usize {
+        (secs * self.rate_hz).round() as usize
+    }
+
+    fn lead(&self) -> usize {
+        self.samples(-FILTER_SECS[0])
+    }
+}
+
+// Classes that enough pairs are near to, each weighed as interpolation does; if there are none, those that most are
+// near to.
+fn supported_classes(pairs: &[FittedPair]) -> Vec<f64> {
+    let mut counts = [0.0; CLASSES.len()];
+    for pair in pairs {
+        class_weights(&CLASSES, pair.path.sine_square()).iter().for_each(|(class, weight)| counts[*class] += weight);
+    }
+    let most = counts.iter().copied().fold(0.0, f64::max);
+    let supported = CLASSES.iter().zip(counts).filter(|(_, count)| *count >= most.min(LEAST_PAIRS as f64));
+    supported.map(|(class, _)| *class).collect()
+}
+
+// Every second class, and the last of more than two.
+fn half_of_classes(classes: &[f64]) -> Vec<f64> {
+    let last = classes.len() - 1;
+    let kept = classes.iter().enumerate().filter(|(at, _)| at % 2 == 0 || *at == last && last > 1);
+    kept.map(|(_, class)| *class).collect()
+}
+
+// Indices and weights of the classes between which a value lies; beyond them all, the outermost alone.
+fn class_weights(classes: &[f64], value: f64) -> [(usize, f64); 2] {
+    let above = classes.partition_point(|class| *class < value).min(classes.len() - 1);
+    let below = above.saturating_sub(1);
+    let share = (value - classes[below]) / (classes[above] - classes[below]);
+    let share = if above == below { 1.0 } else { share.clamp(0.0, 1.0) };
+    [(below, 1.0 - share), (above, share)]
+}
+
+impl NormalEquations {
+    fn new(classes: Vec<f64>, taps: usize) -> Self {
+        let unknowns = classes.len() * taps;
+        Self { classes, taps, matrix: vec![0.0; unknowns * unknowns], wanted: vec![0.0; unknowns] }
+    }
+
+    fn sum_without(parts: &[Self], omitted: Option<usize>) -> Self {
+        let mut sum = Self::new(parts[0].classes.clone(), parts[0].taps);
+        for (_, part) in parts.iter().enumerate().filter(|(number, _)| Some(*number) != omitted) {
+            sum.matrix.iter_mut().zip(&part.matrix).for_each(|(sum, x)| *sum += x);
+            sum.wanted.iter_mut().zip(&part.wanted).for_each(|(sum, x)| *sum += x);
+        }
+        sum
+    }
+
+    // Adds a pair whose angle has this square of the sine.
+    fn add_products(&mut self, sine_square: f64, products: &[f64]) {
+        let taps = self.taps;
+        let unknowns = self.wanted.len();
+        let [below, above] = class_weights(&self.classes, sine_square);
+        for (rows, columns) in [(below, below), (above, below), (above, above)] {
+            // The only class is both, with weights 0 and 1.
+            let weight = rows.1 * columns.1;
+            for row in 0..taps {
+                let first = (rows.0 * taps + row) * unknowns + columns.0 * taps;
+                let sums = &mut self.matrix[first..first + taps];
+                let of_row = |column: usize| products[row.max(column) * taps + row.min(column)];
+                sums.iter_mut().enumerate().for_each(|(column, sum)| *sum += weight * of_row(column));
+            }
+        }
+    }
+
+    fn add_correlations(&mut self, sine_square: f64, correlations: &[f64]) {
+        for (class, weight) in class_weights(&self.classes, sine_square) {
+            let sums = &mut self.wanted[class * self.taps..(class + 1) * self.taps];
+            sums.iter_mut().zip(correlations).for_each(|(sum, x)| *sum += weight * x);
+        }
+    }
+
+    // By Cholesky's factors; None of a matrix that is not positive definite.
+    fn solve(mut self) -> Option<Vec<f64>> {
+        let unknowns = self.wanted.len();
+        let trace: f64 = (0..unknowns).map(|i| self.matrix[i * unknowns + i]).sum();
+        for i in 0..unknowns {
+            let (above, row) = self.matrix.split_at_mut(i * unknowns);
+            row[i] += LOADING * trace / unknowns as f64;
+            for j in 0..i {
+                let factor = &above[j * unknowns..=j * unknowns + j];
+                row[j] = (row[j] - dot_product(&row[..j], &factor[..j])) / factor[j];
+            }
+            let square = row[i] - dot_product(&row[..i], &row[..i]);
+            if !(square > 0.0) {
+                return None;
+            }
+            row[i] = square.sqrt();
+        }
+        let mut solution = self.wanted;
+        for i in 0..unknowns {
+            let row = &self.matrix[i * unknowns..=i * unknowns + i];
+            solution[i] = (solution[i] - dot_product(&row[..i], &solution[..i])) / row[i];
+        }
+        for i in (0..unknowns).rev() {
+            let row = &self.matrix[i * unknowns..=i * unknowns + i];
+            solution[i] /= row[i];
+            let x = solution[i];
+            solution[..i].iter_mut().zip(row).for_each(|(sum, factor)| *sum -= factor * x);
+        }
+        Some(solution)
+    }
+}
+
+fn dot_product(a: &[f64], b: &[f64]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| a * b).sum()
+}
+
+impl SignalDelay {
+    fn new(circle: usize) -> Self {
+        Self { forward: f64::plan_real_forward(circle), inverse: f64::plan_real_inverse(circle) }
+    }
+
+    // None if the signal is longer than the circle.
+    fn delayed_signal(&self, signal: &[f64], samples: f64) -> Option<Vec<f64>> {
+        let circle = self.forward.len();
+        let mut delayed = vec![0.0; circle];
+        delayed.get_mut(..signal.len())?.copy_from_slice(signal);
+        let mut spectrum = self.forward.make_output_vec();
+        self.forward.process(&mut delayed, &mut spectrum).ok()?;
+        for (bin, x) in spectrum.iter_mut().enumerate() {
+            let angle = -std::f64::consts::TAU * bin as f64 * samples / circle as f64;
+            *x *= Complex::from_polar(1.0 / circle as f64, angle);
+        }
+        // The end of a real signal's spectrum is real.
+        spectrum.last_mut()?.im = 0.0;
+        self.inverse.process(&mut spectrum, &mut delayed).ok()?;
+        Some(delayed)
     }
 }
 
 impl FoamReflection {
-    /// Computes the direct sound of a pair: Foam's response without its reflection.
+    /// Computes the direct sound of a pair with this angle of incidence: Foam's response without its reflection.
     ///
     /// foam, flat, direct  `[n]`
     ///
     /// # Errors
     /// [`Error::Length`].
-    pub fn direct_sound<T: RealSample>(&self, foam: &[T], flat: &[T], direct: &mut [T]) -> Result<(), Error> {
+    pub fn direct_sound<T: RealSample>(
+        &self,
+        foam: &[T],
+        flat: &[T],
+        incidence_deg: f64,
+        direct: &mut [T],
+    ) -> Result<(), Error> {
         check_len("Flat's response", flat.len(), foam.len())?;
         check_len("the direct sound", direct.len(), foam.len())?;
         let difference: Vec<f64> = flat.iter().zip(foam).map(|(flat, foam)| flat.f64() - foam.f64()).collect();
-        for (n, (direct, foam)) in direct.iter_mut().zip(foam).enumerate() {
-            // Sample n + lead - tap of the difference.
-            let first = (n + self.lead + 1).saturating_sub(difference.len());
-            let taps = self.taps.iter().enumerate().skip(first).take_while(|(tap, _)| *tap <= n + self.lead);
-            let reflected: f64 = taps.map(|(tap, k)| k * difference[n + self.lead - tap]).sum();
-            *direct = T::of(foam.f64() - reflected);
-        }
+        let foam: Vec<f64> = foam.iter().map(|x| x.f64()).collect();
+        let sine_square = incidence_deg.to_radians().sin().powi(2);
+        let found = self.remove_reflection(&foam, &difference, sine_square);
+        direct.iter_mut().zip(found).for_each(|(direct, x)| *direct = T::of(x));
         Ok(())
+    }
+
+    fn remove_reflection(&self, foam: &[f64], difference: &[f64], sine_square: f64) -> Vec<f64> {
+        let [below, above] = class_weights(&self.classes, sine_square);
+        let mut direct = foam.to_vec();
+        for (tap, (a, b)) in self.filters[below.0].iter().zip(&self.filters[above.0]).enumerate() {
+            let factor = below.1 * a + above.1 * b;
+            let from = self.lead.saturating_sub(tap).min(difference.len());
+            let to = tap.saturating_sub(self.lead).min(direct.len());
+            direct[to..].iter_mut().zip(&difference[from..]).for_each(|(x, reflected)| *x -= factor * reflected);
+        }
+        direct
     }
 }
 
-// Conjugate gradients: the matrix, with `first` as its first row, is an autocorrelation's and thus positive definite.
-fn solve_toeplitz(first: &[f64], wanted: &[f64]) -> Vec<f64> {
-    let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
-    let times = |x: &[f64]| -> Vec<f64> {
-        (0..x.len()).map(|i: usize| x.iter().enumerate().map(|(j, x)| first[i.abs_diff(j)] * x).sum()).collect()
-    };
-    let mut solution = vec![0.0; wanted.len()];
-    let mut residual = wanted.to_vec();
-    let mut direction = residual.clone();
-    let mut left = dot(&residual, &residual);
-    let least = 1e-20 * dot(wanted, wanted);
-    // Exact arithmetic needs as many steps as there are unknowns.
-    for _ in 0..8 * wanted.len() {
-        if left <= least {
-            break;
-        }
-        let image = times(&direction);
-        let step = left / dot(&direction, &image);
-        solution.iter_mut().zip(&direction).for_each(|(x, d)| *x += step * d);
-        residual.iter_mut().zip(&image).for_each(|(r, i)| *r -= step * i);
-        let now = dot(&residual, &residual);
-        direction.iter_mut().zip(&residual).for_each(|(d, r)| *d = r + now / left * *d);
-        left = now;
-    }
-    solution
+/// Computes the standard error of a value of the best estimate from its values of the variants: that of leaving out
+/// parts (jackknife), and the difference that half of the classes make. NaN without variants.
+///
+/// Source: Efron & Stein 1981, Annals of Statistics 9(3), 586-596, for the jackknife.
+pub fn estimate_error(best: f64, variants: &[f64]) -> f64 {
+    let Some((coarse, parts)) = variants.split_last() else { return f64::NAN };
+    let count = parts.len() as f64;
+    let mean = parts.iter().sum::<f64>() / count;
+    let variance = (count - 1.0) / count * parts.iter().map(|x| (x - mean).powi(2)).sum::<f64>();
+    variance.sqrt().hypot(coarse - best)
 }
 
 #[cfg(test)]
@@ -226,52 +487,83 @@ mod tests {
         (sinc(40e3) - sinc(2e3)) * (-(x / 60.0).powi(2)).exp()
     }
 
-    // Direct sound and a reflection by layers, each with its delay in samples and factor.
+    // Direct sound, which goes as 1/d, and a reflection by layers, each with its delay in samples and factor.
     fn response(direct: f64, reflected: f64, layers: &[(f64, f64)]) -> Vec<f64> {
         let reflection = |n| layers.iter().map(|(delay, r)| 0.7 * r * pulse(n, reflected + delay)).sum::<f64>();
-        (0..LEN).map(|n| pulse(n, direct) + reflection(n)).collect()
+        (0..LEN).map(|n| 60.0 / direct * pulse(n, direct) + reflection(n)).collect()
     }
 
-    fn arrivals() -> impl Iterator<Item = (f64, f64)> {
-        (0..120).map(|i| {
+    fn paths() -> impl Iterator<Item = ReflectionPath> {
+        (0..400).map(|i| {
             let direct = 40.0 + 7.31 * f64::from(i % 12);
-            (direct, direct + 16.0 + 0.83 * f64::from(i))
+            let reflected = direct + 16.0 + 0.23 * f64::from(i);
+            path(direct, reflected, 60.0 - 0.11 * f64::from(i) - 2.0 * f64::from(i % 7))
         })
     }
 
+    fn path(direct: f64, reflected: f64, incidence_deg: f64) -> ReflectionPath {
+        ReflectionPath { direct_secs: direct / RATE_HZ, reflected_secs: reflected / RATE_HZ, incidence_deg }
+    }
+
+    // A surface that reflects by the angle, and the wall behind it.
+    fn foam_layers(path: ReflectionPath) -> [(f64, f64); 2] {
+        [(0.0, 0.04 + 0.1 * path.sine_square()), (27.4 - 2.0 * path.sine_square(), 0.02)]
+    }
+
+    fn responses(path: ReflectionPath, layers: &[(f64, f64)]) -> [Vec<f64>; 2] {
+        let [direct, reflected] = [path.direct_secs, path.reflected_secs].map(|secs| secs * RATE_HZ);
+        [response(direct, reflected, layers), response(direct, reflected, &[(0.0, 0.84)])]
+    }
+
+    fn energy(a: &[f64], b: &[f64]) -> f64 {
+        a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum()
+    }
+
+    // Energies over all pairs of what Flat reflects, of Foam's error and of the estimates' by variant.
+    fn errors(layers: impl Fn(ReflectionPath) -> Vec<(f64, f64)>) -> [f64; 4] {
+        let mut fit = FoamReflectionFit::new(LEN, RATE_HZ).expect("a fit");
+        for path in paths() {
+            let [foam, flat] = responses(path, &layers(path));
+            let apart = path.separation_secs() >= LEAST_SEPARATION_SECS;
+            assert_eq!(fit.add_pair(&foam, &flat, path), Ok(apart));
+        }
+        let estimate = fit.finish().expect("an estimate");
+        let mut sums = [0.0; 4];
+        for path in paths() {
+            let [foam, flat] = responses(path, &layers(path));
+            let [truth, _] = responses(path, &[]);
+            let mut found = vec![f64::NAN; LEN];
+            estimate.best.direct_sound(&foam, &flat, path.incidence_deg, &mut found).expect("lengths");
+            let mut coarse = found.clone();
+            let variant = estimate.variants.last().expect("variants");
+            variant.direct_sound(&foam, &flat, path.incidence_deg, &mut coarse).expect("lengths");
+            let errors =
+                [energy(&flat, &truth), energy(&foam, &truth), energy(&found, &truth), energy(&coarse, &found)];
+            sums.iter_mut().zip(errors).for_each(|(sum, error)| *sum += error);
+        }
+        sums
+    }
+
     #[test]
-    fn the_direct_sound_of_every_pair_is_found_though_foam_reflects_twice() {
-        // A surface that reflects 4 %, and the wall behind it.
-        let (foam, flat) = ([(0.0, 0.04), (27.4, 0.02)], [(0.0, 0.84)]);
-        let mut fit = FoamReflectionFit::<f64>::new(LEN, RATE_HZ).expect("a fit");
-        let mut fitted = 0;
-        for (direct, reflected) in arrivals() {
-            let (foam, flat) = (response(direct, reflected, &foam), response(direct, reflected, &flat));
-            let added = fit.add_pair(&foam, &flat, direct / RATE_HZ, reflected / RATE_HZ).expect("added");
-            fitted += usize::from(added);
-        }
-        let reflection = fit.finish().expect("an estimate");
-        assert!(reflection.pairs == fitted && (LEAST_PAIRS..120).contains(&fitted), "{fitted}");
-        let energy = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f64>();
-        let (mut before, mut after) = (0.0, 0.0);
-        for (direct, reflected) in arrivals() {
-            let (foam, flat) = (response(direct, reflected, &foam), response(direct, reflected, &flat));
-            let (truth, mut found) = (response(direct, reflected, &[]), vec![f64::NAN; LEN]);
-            reflection.direct_sound(&foam, &flat, &mut found).expect("lengths");
-            before += energy(&foam, &truth);
-            after += energy(&found, &truth);
-        }
-        let left_db = 10.0 * (after / before).log10();
-        assert!(left_db < -25.0, "{left_db} dB of Foam's reflection is left");
+    fn the_direct_sound_of_every_pair_is_found_though_foam_reflects_by_the_angle() {
+        let [_, before, after, coarse] = errors(|path| foam_layers(path).to_vec());
+        assert!(after < 2.5e-3 * before, "{} dB of Foam's reflection is left", 10.0 * (after / before).log10());
+        assert!(coarse > 0.0 && coarse < 0.1 * before, "{coarse} of {before}");
+    }
+
+    #[test]
+    fn of_foam_that_reflects_nothing_nothing_is_found() {
+        let [flat, before, after, _] = errors(|_| Vec::new());
+        assert!(before == 0.0 && after < 1e-6 * flat, "{} dB", 10.0 * (after / flat).log10());
     }
 
     #[test]
     fn few_pairs_or_a_flat_that_is_foam_give_no_estimate() {
         let responses = |r| response(60.0, 120.0, &[(0.0, r)]);
         let fit = |pairs: usize, flat: f64| {
-            let mut fit = FoamReflectionFit::<f64>::new(LEN, RATE_HZ).expect("a fit");
+            let mut fit = FoamReflectionFit::new(LEN, RATE_HZ).expect("a fit");
             for _ in 0..pairs {
-                let added = fit.add_pair(&responses(0.05), &responses(flat), 60.0 / RATE_HZ, 120.0 / RATE_HZ);
+                let added = fit.add_pair(&responses(0.05), &responses(flat), path(60.0, 120.0, 30.0));
                 assert_eq!(added, Ok(true));
             }
             fit.finish()
@@ -283,21 +575,27 @@ mod tests {
 
     #[test]
     fn overlapping_arrivals_and_bad_responses_add_nothing() {
-        let mut fit = FoamReflectionFit::<f64>::new(LEN, RATE_HZ).expect("a fit");
-        let (foam, flat) = (response(60.0, 90.0, &[(0.0, 0.1)]), response(60.0, 90.0, &[(0.0, 0.8)]));
-        for [direct, reflected] in [[60.0, 90.0], [60.0, 360.0], [f64::NAN, 120.0]] {
-            assert_eq!(
-                fit.add_pair(&foam, &flat, direct / RATE_HZ, reflected / RATE_HZ),
-                Ok(false),
-                "{direct} {reflected}"
-            );
+        let mut fit = FoamReflectionFit::new(LEN, RATE_HZ).expect("a fit");
+        let (foam, flat) = (response(60.0, 80.0, &[(0.0, 0.1)]), response(60.0, 80.0, &[(0.0, 0.8)]));
+        for [direct, reflected, angle] in
+            [[60.0, 80.0, 30.0], [60.0, 360.0, 30.0], [f64::NAN, 120.0, 30.0], [60.0, 120.0, f64::NAN]]
+        {
+            let added = fit.add_pair(&foam, &flat, path(direct, reflected, angle));
+            assert_eq!(added, Ok(false), "{direct} {reflected} {angle}");
         }
         let mut broken = foam.clone();
         broken[200] = f64::NAN;
-        let result = fit.add_pair(&broken, &flat, 60.0 / RATE_HZ, 120.0 / RATE_HZ);
+        let result = fit.add_pair(&broken, &flat, path(60.0, 120.0, 30.0));
         assert!(matches!(result, Err(Error::NotFinite { .. })), "{result:?}");
-        assert!(matches!(fit.add_pair(&foam[1..], &flat, 0.0, 0.001), Err(Error::Length { .. })));
-        assert_eq!(fit.pairs, 0);
-        assert!(FoamReflectionFit::<f32>::new(0, RATE_HZ).is_err() && FoamReflectionFit::<f32>::new(9, 1e3).is_err());
+        assert!(matches!(fit.add_pair(&foam[1..], &flat, path(60.0, 120.0, 30.0)), Err(Error::Length { .. })));
+        assert!(fit.pairs.is_empty());
+        assert!(FoamReflectionFit::new(0, RATE_HZ).is_err() && FoamReflectionFit::new(9, 1e3).is_err());
+    }
+
+    // Of 1, 2, 3 and 4 the jackknife's variance is 3/4 of the sum of squares about the mean, 5.
+    #[test]
+    fn errors_of_an_estimate_are_those_of_its_variants() {
+        assert!((estimate_error(2.0, &[1.0, 2.0, 3.0, 4.0, 2.0]) - 3.75f64.sqrt()).abs() < 1e-12);
+        assert!((estimate_error(2.0, &[1.0, 1.0, 1.0, 1.0, 2.5]) - 0.5).abs() < 1e-12);
     }
 }

@@ -1,6 +1,7 @@
 //! Rows of table `surface_stats`.
 
 use arrow::record_batch::RecordBatch;
+use echolake_dsp::foam_reflection::estimate_error;
 use echolake_dsp::level::{p90_mean, percentile, power_to_db};
 use echolake_dsp::mean::SignalMean;
 use echolake_dsp::uncertainty::{LevelError, LevelUncertainty};
@@ -15,8 +16,8 @@ use crate::error::Result;
 pub(crate) struct SurfaceLevels {
     /// TNCE.
     pub tnce: Vec<Vec<f64>>,
-    /// The same without Foam's reflection; none if it is not known.
-    pub unbiased: Vec<Vec<f64>>,
+    /// The same without Foam's reflection, by the best estimate and its variants; none if it is not known.
+    pub unbiased: Vec<Vec<Vec<f64>>>,
     /// Relative errors of TNCE; none if they are not known.
     pub errors: Vec<Vec<LevelError>>,
     /// Combines them; None if they are not known.
@@ -34,13 +35,18 @@ pub(crate) fn stats_rows(
 ) -> Result<RecordBatch> {
     let names = rig.band_names().into_iter().chain(["total".to_owned()]);
     let mut stats: Vec<_> = names.zip(&levels.tnce).map(|(band, values)| stats_of(band, values)).collect();
-    for (stats, values) in stats.iter_mut().zip(&levels.unbiased) {
-        stats.unbiased_p90_mean_db = stats_of(String::new(), values).p90_mean_db;
-    }
     if let Some(uncertainty) = &levels.uncertainty {
         for ((stats, values), errors) in stats.iter_mut().zip(&levels.tnce).zip(&levels.errors) {
             stats.p90_mean_u_db = p90_mean_uncertainty(values, errors, uncertainty);
         }
+    }
+    for (band, stats) in stats.iter_mut().enumerate() {
+        let mean_db = |values: &Vec<Vec<f64>>| stats_of(String::new(), &values[band]).p90_mean_db;
+        let estimates: Option<Vec<_>> = levels.unbiased.iter().map(mean_db).collect();
+        let Some((best, variants)) = estimates.as_deref().and_then(<[f64]>::split_first) else { continue };
+        stats.unbiased_p90_mean_db = Some(*best);
+        let level_u_db = stats.p90_mean_u_db;
+        stats.unbiased_p90_mean_u_db = level_u_db.and_then(|u| finite_value(u.hypot(estimate_error(*best, variants))));
     }
     let batch = keys
         .begin_rows(Table::SurfaceStats, rig, stats.len())
@@ -56,6 +62,7 @@ pub(crate) fn stats_rows(
         .push_doubles("spread_db", stats.iter().map(|s| s.spread_db))
         .push_doubles("p90_mean_u_db", stats.iter().map(|s| s.p90_mean_u_db))
         .push_doubles("unbiased_p90_mean_db", stats.iter().map(|s| s.unbiased_p90_mean_db))
+        .push_doubles("unbiased_p90_mean_u_db", stats.iter().map(|s| s.unbiased_p90_mean_u_db))
         .push_lists("mean_nce", mean_curves(&levels.curves))
         .fill_text("flat_version", of.flat)
         .fill_text("foam_version", of.foam)
@@ -93,6 +100,7 @@ fn stats_of(band: String, values: &[f64]) -> BandStatistics {
         spread_db: standard_deviation(&levels),
         p90_mean_u_db: None,
         unbiased_p90_mean_db: None,
+        unbiased_p90_mean_u_db: None,
     }
 }
 

@@ -342,6 +342,13 @@ pub(super) fn surface_stats() -> Vec<Column> {
             "p90_mean_db without Foam's own reflection, which is estimated from Foam and Flat; null if it cannot be",
         )
         .or_null(),
+        Column::double(
+            "unbiased_p90_mean_u_db",
+            "dB",
+            "Standard uncertainty of unbiased_p90_mean_db, from p90_mean_u_db and the estimate's own error; null if \
+            either is not known",
+        )
+        .or_null(),
         Column::floats("mean_nce", "1", "Mean of the NCE curves over the pairs, along time; total is the bands' sum")
             .or_null(),
     ]);

@@ -19,4 +19,6 @@ pub struct BandStatistics {
     pub p90_mean_u_db: Option<f64>,
     #[serde(default)]
     pub unbiased_p90_mean_db: Option<f64>,
+    #[serde(default)]
+    pub unbiased_p90_mean_u_db: Option<f64>,
 }

@@ -11,10 +11,10 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use echolake_dsp::RealSample as _;
 use echolake_dsp::air::{AirAbsorption, AirState};
 use echolake_dsp::deconvolution::fast_length;
-use echolake_dsp::geometry::specular_point;
+use echolake_dsp::geometry::{incidence_deg, specular_point};
 use echolake_dsp::kirchhoff::{FacetScattering, KirchhoffPlan, KirchhoffScratch, SoundPath, TransducerPose};
 use echolake_dsp::temperature::{ReferenceAir, speed_of_sound};
-use echolake_panel::material::SurfaceMaterial;
+use echolake_panel::material::{FoamLayer, SurfaceMaterial};
 use echolake_panel::relief::HeightField;
 use echolake_schema::manifest::Origin;
 use echolake_schema::simulation::SimulationParams;
@@ -133,13 +133,16 @@ pub fn simulated_rig(simulation: &RigSimulation<'_>) -> Result<RigDevices, Error
         plan.spectrum_at_bins(
             |hz| if effects.transducer_response { transducers::on_axis_response(hz) } else { 1.0.into() },
         );
-    let is_silent = simulation.material == SurfaceMaterial::MelamineFoam && !effects.foam_reflection;
+    let material = simulation.material;
+    let foam = FoamLayer { flow_resistivity: effects.foam_flow_resistivity, thickness_mm: effects.foam_thickness_mm };
+    let is_foam = material == SurfaceMaterial::MelamineFoam;
+    let is_silent = is_foam && !effects.foam_reflection;
     let reflection = plan.spectrum_at_bins(|hz| match effects.material_spectra {
         _ if is_silent => 0.0.into(),
-        true => simulation.material.reflection_at(hz),
-        false => simulation.material.reflection_factor().into(),
+        true => material.reflection_at(hz, 0.0, foam),
+        false => material.reflection_factor().into(),
     });
-    let reflection = direct.iter().zip(&reflection).map(|(transducers, relief)| transducers * relief).collect();
+    let foam = (is_foam && !is_silent && effects.material_spectra).then_some(foam);
     let world = Arc::new(Mutex::new(SimulatedWorld {
         calibration_mm: draw_calibration(points.len(), effects.calibration_mm),
         effects,
@@ -160,8 +163,9 @@ pub fn simulated_rig(simulation: &RigSimulation<'_>) -> Result<RigDevices, Error
             world: world.clone(),
             rate_hz,
             reference: ReferenceAir::from_response(&simulation.rig.impulse_response),
+            reflection: multiply_spectra(&direct, &reflection),
             direct,
-            reflection,
+            foam,
             scratch: plan.make_scratch(),
             response: vec![0.0; plan.len()],
             plan,
@@ -170,6 +174,10 @@ pub fn simulated_rig(simulation: &RigSimulation<'_>) -> Result<RigDevices, Error
         sensor: Box::new(SimulatedSensor(world)),
         origin: Origin::Simulated,
     })
+}
+
+fn multiply_spectra(a: &[Complex<f32>], b: &[Complex<f32>]) -> Vec<Complex<f32>> {
+    a.iter().zip(b).map(|(a, b)| a * b).collect()
 }
 
 // Displacements of both arms at each point.
@@ -314,6 +322,8 @@ struct SimulatedAudio {
     /// Spectra of the direct sound and of the reflection.
     direct: Vec<Complex<f32>>,
     reflection: Vec<Complex<f32>>,
+    /// Foam whose reflection depends on the angle at which a path's mirror image meets its plane.
+    foam: Option<FoamLayer>,
     plan: KirchhoffPlan,
     scratch: KirchhoffScratch,
     response: Vec<f32>,
@@ -345,6 +355,11 @@ impl AudioInterface for SimulatedAudio {
         let spoiled = world.effects.noise_and_drift && world.rng.random_bool(SPOILED);
         let level = if spoiled { SPOILED_LEVEL_DB } else { 42.0 };
         world.outside_level_db = level + 1.5 * world.draw_normal();
+        if let Some(foam) = self.foam {
+            let angle_deg = incidence_deg(world.microphone.position_mm, world.speaker.position_mm);
+            let material = self.plan.spectrum_at_bins(|hz| foam.reflection_at(hz, angle_deg));
+            self.reflection = multiply_spectra(&self.direct, &material);
+        }
         let state = AirState {
             temperature_c: world.temperature_c(),
             humidity_pct: world.humidity_pct(),
