@@ -68,6 +68,7 @@ fn manifests_and_wav_files() {
 fn a_clipped_recording_is_kept_and_said() {
     let place = TestFolder::new();
     let mut clipped = noise(4_000);
+    clipped.rotate_right(30);
     clipped[100] = i16::MAX;
     wav(&place.path("clipped.wav"), 96_000, &[&clipped]);
     wav(&place.path("good.wav"), 96_000, &[&noise(4_000)]);

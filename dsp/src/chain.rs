@@ -368,7 +368,7 @@ mod tests {
     use echolake_schema::AirTreatment;
 
     use super::*;
-    use crate::sweep::LinearSweep;
+    use crate::sweep::{SineSweep, SweepShape};
     use crate::temperature::resampling_ratio;
 
     fn air(celsius: f64) -> AirState {
@@ -415,7 +415,14 @@ mod tests {
     // What stands in the tables of a lake whose runs have sweeps of any length, dB: a reflection at 90 samples over
     // Flat's, each band over Flat's total.
     fn levels(division: SpectralDivision, duration_secs: f64) -> Vec<f64> {
-        let sweep = LinearSweep { rate_hz: 96e3, duration_secs, low_hz: 2e3, high_hz: 40e3, fade_secs: 0.001 };
+        let sweep = SineSweep {
+            shape: SweepShape::Linear,
+            rate_hz: 96e3,
+            duration_secs,
+            low_hz: 2e3,
+            high_hz: 40e3,
+            fade_secs: 0.001,
+        };
         let mut loopback = sweep.samples();
         loopback.resize(loopback.len() + 960, 0.0);
         let n = loopback.len();
@@ -457,7 +464,14 @@ mod tests {
 
     #[test]
     fn levels_do_not_depend_on_the_air() {
-        let sweep = LinearSweep { rate_hz: 96e3, duration_secs: 0.05, low_hz: 2e3, high_hz: 40e3, fade_secs: 0.001 };
+        let sweep = SineSweep {
+            shape: SweepShape::Linear,
+            rate_hz: 96e3,
+            duration_secs: 0.05,
+            low_hz: 2e3,
+            high_hz: 40e3,
+            fade_secs: 0.001,
+        };
         let mut loopback = sweep.samples();
         loopback.resize(6_000, 0.0);
         let n = loopback.len();

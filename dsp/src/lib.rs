@@ -5,11 +5,11 @@
 //!
 //! ```
 //! use echolake_dsp::chain::{MeasurementParams, MeasurementPlan};
-//! use echolake_dsp::sweep::LinearSweep;
+//! use echolake_dsp::sweep::{SineSweep, SweepShape};
 //! use echolake_dsp::temperature::ReferenceAir;
 //! use echolake_schema::{Rig, SpectralDivision};
 //!
-//! let sweep = LinearSweep { rate_hz: 96e3, duration_secs: 0.03, low_hz: 2e3, high_hz: 40e3, fade_secs: 0.001 };
+//! let sweep = SineSweep { shape: SweepShape::Linear, rate_hz: 96e3, duration_secs: 0.03, low_hz: 2e3, high_hz: 40e3, fade_secs: 0.001 };
 //! let loopback = sweep.samples();
 //! let recording: Vec<f64> = (0..loopback.len()).map(|n| if n < 10 { 0.0 } else { 0.5 * loopback[n - 10] }).collect();
 //! let reference = ReferenceAir::from_response(&Rig::paper().impulse_response);
@@ -40,12 +40,13 @@ mod reflection;
 mod relief;
 mod similarity;
 pub mod sweep;
+pub mod take_analysis;
 pub mod temperature;
 
 pub use deconvolution::response_deconvolution;
 pub use error::Error;
 pub use levels::{
-    decay, diffusion, energy, envelope, filter_bank, frequency_response, level, mean, octave_filter, rise,
+    decay, diffusion, energy, envelope, filter_bank, frequency_response, level, mean, octave_filter, oversampling, rise,
     room_parameters, spectrogram, spectrum, uncertainty,
 };
 pub use real::RealSample;

@@ -32,6 +32,6 @@ pub use grid::{Grid, Pair, Point};
 pub use ids::{PairId, PointId, ProjectName, RunId, SurfaceId};
 pub use manifest::{RunManifest, SurfaceRecord};
 pub use quantities::{Celsius, SampleRate, Timestamp};
-pub use rig::{AirTreatment, Rig, SpectralDivision};
+pub use rig::{AirTreatment, Rig, SpectralDivision, SweepShape};
 pub use symmetry::Symmetry;
 pub use tables::Table;

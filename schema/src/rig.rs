@@ -55,6 +55,9 @@ pub struct Rig {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Sweep {
+    /// Course of its frequency.
+    #[serde(skip_serializing_if = "SweepShape::is_linear")]
+    pub shape: SweepShape,
     /// Sampling rate, Hz.
     pub rate_hz: SampleRate,
     /// Lowest frequency, Hz.
@@ -69,6 +72,23 @@ pub struct Sweep {
     pub tail_secs: f64,
     /// Peak level, dB re full scale.
     pub level_dbfs: f64,
+}
+
+/// Course of a sweep's frequency.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum SweepShape {
+    /// It rises by equal steps in equal times.
+    #[default]
+    Linear,
+    /// It rises by equal factors in equal times, so that harmonics of distortion arrive apart from the response.
+    Exponential,
+}
+
+impl SweepShape {
+    fn is_linear(&self) -> bool {
+        *self == Self::Linear
+    }
 }
 
 /// Length and corrections of each impulse response.
@@ -228,8 +248,9 @@ pub struct Validation {
     pub attempts: u32,
     /// Least signal-to-noise ratio in the sweep's band, dB.
     pub snr_db: f64,
-    /// Least level of the loopback, dB re full scale.
-    pub loopback_dbfs: f64,
+    /// Read for rig files that have it, and ignored: a loopback is judged by how well it matches the sweep.
+    #[serde(skip_serializing)]
+    pub loopback_dbfs: Option<f64>,
     /// Highest sound pressure level outside, dB re 20 uPa.
     pub outside_level_db: f64,
     /// Largest difference of the direct sound's arrival from the time that geometry gives, us.
@@ -256,6 +277,7 @@ impl Default for Rig {
 impl Default for Sweep {
     fn default() -> Self {
         Self {
+            shape: SweepShape::Linear,
             rate_hz: SampleRate::PAPER,
             low_hz: 2_000.0,
             high_hz: 40_000.0,
@@ -293,7 +315,7 @@ impl Default for Panel {
 
 impl Default for Validation {
     fn default() -> Self {
-        Self { attempts: 3, snr_db: 30.0, loopback_dbfs: -40.0, outside_level_db: 65.0, arrival_us: 20.0 }
+        Self { attempts: 3, snr_db: 30.0, loopback_dbfs: None, outside_level_db: 65.0, arrival_us: 20.0 }
     }
 }
 

@@ -146,6 +146,9 @@ pub(crate) async fn run_import(args: &ImportArgs, lake_url: &str) -> anyhow::Res
         for warning in &run.warnings {
             progress.print_message(format!("{}: warning: {warning}", run.run_id));
         }
+        for note in &run.notes {
+            progress.print_message(format!("{}: {note}", run.run_id));
+        }
         super::print_line(&run.path.display().to_string())?;
     }
     eprintln!("next: echolake --lake {lake_url} ingest");

@@ -10,7 +10,7 @@ use echolake_dsp::energy::{cumulative_energy, nce, tnce};
 use echolake_dsp::filter_bank::FilterBankPlan;
 use echolake_dsp::height_field::HeightField;
 use echolake_dsp::kirchhoff::{KirchhoffPlan, SoundPath, TransducerPose};
-use echolake_dsp::sweep::LinearSweep;
+use echolake_dsp::sweep::{SineSweep, SweepShape};
 use echolake_dsp::air::AirState;
 use echolake_dsp::temperature::{ReferenceAir, TemperatureCorrection};
 use echolake_schema::Rig;
@@ -43,7 +43,7 @@ criterion_main!(kernels);
 /// The sweep, and what a microphone hears of it 90 samples later.
 fn recordings() -> [Vec<f32>; 2] {
     let sweep =
-        LinearSweep { rate_hz: RATE_HZ, duration_secs: 0.5, low_hz: LOW_HZ, high_hz: HIGH_HZ, fade_secs: 0.001 };
+        SineSweep { shape: SweepShape::Linear, rate_hz: RATE_HZ, duration_secs: 0.5, low_hz: LOW_HZ, high_hz: HIGH_HZ, fade_secs: 0.001 };
     let loopback: Vec<f32> = sweep.samples().into_iter().map(|x| x as f32).collect();
     let recording = (0..loopback.len()).map(|n| if n < 90 { 0.0 } else { 0.3 * loopback[n - 90] }).collect();
     [recording, loopback]

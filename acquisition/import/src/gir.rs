@@ -103,7 +103,14 @@ impl GirImport<'_> {
         }
         let count = pairs.len() as u64;
         batch.seal_run(recorder, &RunEnd { ended: at, accepted: count, rejected: 0, attempts: count })?;
-        Ok(ImportedRun { path, run_id: manifest.run_id, surface, measurements: pairs.len(), warnings: Vec::new() })
+        Ok(ImportedRun {
+            path,
+            run_id: manifest.run_id,
+            surface,
+            measurements: pairs.len(),
+            warnings: Vec::new(),
+            notes: Vec::new(),
+        })
     }
 
     fn matrix(&self, file: &Path, rows: usize) -> Result<Array2<f64>, Error> {

@@ -10,6 +10,7 @@ mod positions;
 mod response;
 mod rew;
 mod sofa;
+mod take_summary;
 mod wav;
 mod wav_file;
 mod wav_layout;
@@ -44,6 +45,8 @@ pub struct ImportedRun {
     pub measurements: usize,
     /// Faults of the imported files, as texts; they were imported all the same.
     pub warnings: Vec<String>,
+    /// What the takes have in common: clocks, distortion, number of rejected ones.
+    pub notes: Vec<String>,
 }
 
 /// Settings of an import.

@@ -56,6 +56,7 @@ impl ImportedResponse {
                 snr_db: unknown,
                 loopback_level_dbfs: unknown,
                 arrival_error_us: unknown,
+                clock_ratio_ppm: None,
                 outside_level_db: unknown,
                 temperature_c: celsius,
                 humidity_pct: unknown,

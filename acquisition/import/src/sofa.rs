@@ -191,7 +191,14 @@ impl Sofa {
         let end = RunEnd { ended, accepted: count as u64, rejected: 0, attempts: count as u64 };
         batch.seal_run(recorder, &end)?;
         let (run_id, surface) = (manifest.run_id, manifest.surface_id);
-        Ok(ImportedRun { path, run_id, surface, measurements: count, warnings: self.warnings.clone() })
+        Ok(ImportedRun {
+            path,
+            run_id,
+            surface,
+            measurements: count,
+            warnings: self.warnings.clone(),
+            notes: Vec::new(),
+        })
     }
 
     // Returns the file's times, each later than the one before.

@@ -14,12 +14,14 @@ use echolake_dsp::chain::raw_len;
 use echolake_dsp::deconvolution::{DeconvolutionParams, TransformLength};
 use echolake_dsp::geometry::direct_mm;
 use echolake_dsp::response_deconvolution::ResponseDeconvolution;
+use echolake_dsp::take_analysis::TakeFault;
 use echolake_dsp::temperature::{ReferenceAir, response_limits_hz};
 use echolake_schema::manifest::{Origin, RunEnd};
 use echolake_schema::messages::{AmbientSample, ImpulseResponse, Measurement, SweepRecording, Verdict};
 use echolake_schema::{Grid, Rig, SampleRate, SurfaceId, Timestamp};
 
 use crate::batch::ImportBatch;
+use crate::take_summary::TakeSummary;
 use crate::wav_manifest::{self, ManifestRow};
 use crate::{Error, ImportOptions, ImportedRun, wav_search};
 
@@ -91,14 +93,21 @@ impl WavImport<'_> {
         let mut recorder = batch.create_run(&path, &start)?;
         recorder.log(started, LogLevel::Info, NAME, &format!("{} recordings", rows.len()))?;
         let mut warnings = Vec::new();
+        let mut summary = TakeSummary::new(self.rig.sweep.shape);
         for (at, row) in &timed {
-            warnings.extend(self.row(&mut recorder, row, *at)?);
+            warnings.extend(self.row(&mut recorder, row, *at, &mut summary)?);
             done();
         }
         let count = rows.len() as u64;
+        let rejected = summary.rejected();
+        let notes = summary.describe_takes();
+        let logged_at = timed.last().map_or(started, |(time, _)| *time);
+        for note in &notes {
+            recorder.log(logged_at, LogLevel::Info, NAME, note)?;
+        }
         let ended = timed.last().map_or(started, |(time, _)| *time);
-        batch.seal_run(recorder, &RunEnd { ended, accepted: count, rejected: 0, attempts: count })?;
-        Ok(ImportedRun { path, run_id: manifest.run_id, surface, measurements: rows.len(), warnings })
+        batch.seal_run(recorder, &RunEnd { ended, accepted: count - rejected, rejected, attempts: count })?;
+        Ok(ImportedRun { path, run_id: manifest.run_id, surface, measurements: rows.len(), warnings, notes })
     }
 
     fn time(&self, row: &ManifestRow, index: u32) -> Timestamp {
@@ -121,8 +130,15 @@ impl WavImport<'_> {
         Ok(start..(start + len).min(row.recording.layout.samples))
     }
 
-    // Import keeps all it is given: objections of the rig become warnings, not refusals.
-    fn row(&self, recorder: &mut Recorder, row: &ManifestRow, at: Timestamp) -> Result<Option<String>, Error> {
+    // Import keeps all it is given: objections of the rig become warnings. A take whose response is spoiled is kept, too,
+    // and rejected: `ingest` makes no rows of it.
+    fn row(
+        &self,
+        recorder: &mut Recorder,
+        row: &ManifestRow,
+        at: Timestamp,
+        summary: &mut TakeSummary,
+    ) -> Result<Option<String>, Error> {
         let unread = |column, what| Error::Row { path: self.manifest.to_owned(), line: row.line, column, what };
         let (rig, celsius) = (self.rig, row.celsius.get());
         let planned = |cause| Error::Plan { rig: rig.name.clone(), cause };
@@ -158,7 +174,7 @@ impl WavImport<'_> {
         // The geometry of a foreign rig is known less well than its files say, and the level outside was not recorded:
         // the arrival is recorded, not judged, and so is a signal-to-noise ratio that a long response leaves no room
         // for.
-        let mut judged = assessment;
+        let mut judged = assessment.clone();
         judged.arrival_error_us = 0.0;
         if judged.snr_db.is_nan() {
             judged.snr_db = f64::INFINITY;
@@ -191,9 +207,15 @@ impl WavImport<'_> {
                         format!("{samples} samples clipped in the {column}, {}", wav.label())
                     }));
                 }
+                TakeObjection::Take(fault) => reasons.push(format!("{fault}; hint: {}", fault.hint())),
                 other => reasons.push(other.to_string()),
             }
         }
+        let faults = &assessment.analysis.faults;
+        let distortion = faults.iter().filter(|fault| matches!(fault, TakeFault::Distortion { .. }));
+        reasons.extend(distortion.map(|fault| format!("{fault}; hint: {}", fault.hint())));
+        let verdict = if faults.iter().any(TakeFault::spoils_response) { Verdict::Rejected } else { Verdict::Accepted };
+        summary.add_take(&assessment.analysis, verdict);
         let sample_rate_hz = rig.sweep.rate_hz.get();
         recorder.poses(at, m, s)?;
         recorder.environment(
@@ -233,7 +255,8 @@ impl WavImport<'_> {
                 pressure_hpa: Some(air.pressure_hpa),
             },
         )?;
-        let warning = (!reasons.is_empty()).then(|| format!("line {}: {}", row.line, reasons.join("; ")));
+        let rejected = if verdict == Verdict::Rejected { "rejected: " } else { "" };
+        let warning = (!reasons.is_empty()).then(|| format!("line {}: {rejected}{}", row.line, reasons.join("; ")));
         recorder.measurement(
             at,
             &Measurement {
@@ -241,11 +264,12 @@ impl WavImport<'_> {
                 attempt: row.attempt,
                 microphone: row.pair.microphone.0,
                 speaker: row.pair.speaker.0,
-                verdict: Verdict::Accepted.into(),
+                verdict: verdict.into(),
                 snr_db: assessment.snr_db,
                 clipped_samples: clipped,
                 loopback_level_dbfs: assessment.loopback_dbfs,
                 arrival_error_us: assessment.arrival_error_us,
+                clock_ratio_ppm: Some(assessment.analysis.clock_ratio_ppm).filter(|ppm| ppm.is_finite()),
                 outside_level_db: f64::NAN,
                 temperature_c: celsius,
                 humidity_pct: row.humidity_pct,

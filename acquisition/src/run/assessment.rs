@@ -1,7 +1,10 @@
-//! Quality of a recording: signal-to-noise ratio, clipping, loopback level, and arrival of the direct sound.
+//! Quality of a recording: signal-to-noise ratio, clipping, loopback, clocks, lost samples, and arrival of the direct
+//! sound.
 
 use echolake_dsp::deconvolution::{DeconvolutionParams, DeconvolutionPlan, DeconvolutionScratch, TransformLength};
 use echolake_dsp::level::power_to_db;
+use echolake_dsp::sweep::SineSweep;
+use echolake_dsp::take_analysis::{TakeAnalysis, TakeAnalyzer, TakeFault};
 use echolake_dsp::temperature::ReferenceAir;
 use echolake_dsp::{Error, chain};
 use echolake_schema::rig::Validation;
@@ -22,7 +25,7 @@ const ARRIVAL_WINDOW: f64 = 5.0;
 const ARRIVAL_SHARE: f32 = 0.3;
 
 /// Assessment of one recording.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct TakeAssessment {
     /// Mean power of the response's first part, as long as the rig's responses, over that of the noise far behind it,
     /// dB. Both are in the sweep's range, which is tapered at its limits. NaN if the recording is too short to tell.
@@ -34,10 +37,13 @@ pub struct TakeAssessment {
     /// Direct sound's arrival minus the expected one, us; NaN if the expected one is outside of the response. If there
     /// is no direct sound at the expected time, the arrival is the first strong one, at any time.
     pub arrival_error_us: f64,
+    /// Loopback, clocks, distortion, and lost samples.
+    pub analysis: TakeAnalysis,
 }
 
 /// Assesses recordings of one length.
 pub struct TakeAssessor {
+    analyzer: TakeAnalyzer,
     plan: DeconvolutionPlan<f32>,
     scratch: DeconvolutionScratch<f32>,
     response: Vec<f32>,
@@ -64,7 +70,14 @@ impl TakeAssessor {
             taper_hz: TAPER_PERIODS * rate_hz / quiet.start.max(1) as f64,
             length: TransformLength::Fast,
         })?;
-        Ok(Self { scratch: plan.make_scratch(), plan, response: vec![0.0; recording_len], signal_len, rate_hz })
+        Ok(Self {
+            analyzer: TakeAnalyzer::new(SineSweep::from_rig(&rig.sweep), recording_len)?,
+            scratch: plan.make_scratch(),
+            plan,
+            response: vec![0.0; recording_len],
+            signal_len,
+            rate_hz,
+        })
     }
 
     /// Assesses one recording; samples are fractions of full scale.
@@ -84,6 +97,7 @@ impl TakeAssessor {
             clipped_samples,
             loopback_dbfs: power_to_db(mean_power(loopback)),
             arrival_error_us: self.arrival_error_us(expected_arrival_secs),
+            analysis: self.analyzer.analyze_take(microphone, Some(loopback))?,
         })
     }
 
@@ -135,9 +149,9 @@ impl TakeAssessment {
         if self.clipped_samples > 0 {
             reasons.push(TakeObjection::Clipped { samples: self.clipped_samples });
         }
-        if !(self.loopback_dbfs >= limits.loopback_dbfs) {
-            reasons.push(TakeObjection::Loopback { dbfs: self.loopback_dbfs, least_dbfs: limits.loopback_dbfs });
-        }
+        // Distortion is the rig's own, and no other take would be without it.
+        let faults = self.analysis.faults.iter().filter(|fault| !matches!(fault, TakeFault::Distortion { .. }));
+        reasons.extend(faults.cloned().map(TakeObjection::Take));
         if self.snr_db < limits.snr_db {
             reasons.push(TakeObjection::Noise { snr_db: self.snr_db, least_db: limits.snr_db });
         }
@@ -169,7 +183,7 @@ fn mean_power(x: &[f32]) -> f64 {
 mod tests {
     use super::*;
     use echolake_dsp::deconvolution::fast_length;
-    use echolake_dsp::sweep::LinearSweep;
+    use echolake_dsp::sweep::SweepShape;
     use rand::SeedableRng as _;
     use rand_chacha::ChaCha8Rng;
     use rand_distr::{Distribution as _, StandardNormal};
@@ -177,7 +191,14 @@ mod tests {
     // A sweep and its echo-free recording, `delay` samples late, in a little noise.
     fn assessed(delay: usize, expected: f64) -> TakeAssessment {
         let rig = Rig::from_toml("sweep.duration_secs = 0.03").expect("a rig");
-        let sweep = LinearSweep { rate_hz: 96e3, duration_secs: 0.03, low_hz: 2e3, high_hz: 40e3, fade_secs: 1e-3 };
+        let sweep = SineSweep {
+            shape: SweepShape::Linear,
+            rate_hz: 96e3,
+            duration_secs: 0.03,
+            low_hz: 2e3,
+            high_hz: 40e3,
+            fade_secs: 1e-3,
+        };
         let mut loopback: Vec<f32> = sweep.samples().iter().map(|x| 0.5 * *x as f32).collect();
         loopback.resize(rig.recording_len(), 0.0);
         let mut state = 1u32;

@@ -15,7 +15,7 @@ use std::time::Duration;
 use echolake_dsp::chain::raw_len;
 use echolake_dsp::deconvolution::{DeconvolutionParams, TransformLength};
 use echolake_dsp::response_deconvolution::{ResponseDeconvolution, ResponseScratch};
-use echolake_dsp::sweep::LinearSweep;
+use echolake_dsp::sweep::SineSweep;
 use echolake_dsp::temperature::ReferenceAir;
 use echolake_schema::manifest::{Origin, RunEnd};
 use echolake_schema::messages::{Measurement, Verdict};
@@ -148,14 +148,8 @@ impl<'a> RunController<'a> {
         })
         .map_err(failed)?;
         let gain = 10f64.powf(sweep.level_dbfs / 20.0);
-        let excitation = LinearSweep {
-            rate_hz: sweep.rate_hz.get(),
-            duration_secs: sweep.duration_secs,
-            low_hz: sweep.low_hz,
-            high_hz: sweep.high_hz,
-            fade_secs: sweep.fade_secs,
-        };
-        let mut output: Vec<f32> = excitation.samples().into_iter().map(|x| (gain * x) as f32).collect();
+        let mut output: Vec<f32> =
+            SineSweep::from_rig(sweep).samples().into_iter().map(|x| (gain * x) as f32).collect();
         output.resize(recording_len, 0.0);
         Ok(Self {
             rig,

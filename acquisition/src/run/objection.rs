@@ -1,5 +1,7 @@
 //! Reasons to reject a take, with advice for the rig's operator.
 
+use echolake_dsp::take_analysis::TakeFault;
+
 use crate::rig::AmbientReading;
 
 /// The ratio of signal to noise, as an unknown quantity.
@@ -22,14 +24,9 @@ pub enum TakeObjection {
         /// Number of samples, both channels.
         samples: u32,
     },
-    /// The loopback is too soft.
-    #[error("loopback at {dbfs:.1} dBFS, expected at least {least_dbfs:.1} dBFS")]
-    Loopback {
-        /// Its level, dB re full scale.
-        dbfs: f64,
-        /// The rig's limit.
-        least_dbfs: f64,
-    },
+    /// Loopback, clocks or samples are not as they should be.
+    #[error(transparent)]
+    Take(#[from] TakeFault),
     /// Too little signal over too much noise.
     #[error("signal-to-noise ratio {snr_db:.1} dB, expected at least {least_db:.1} dB")]
     Noise {
@@ -93,9 +90,8 @@ impl TakeObjection {
     pub fn hint(&self) -> &'static str {
         match self {
             Self::Clipped { .. } => "lower the gain, or `sweep.level_dbfs` in the rig file",
-            Self::Loopback { .. } | Self::Broken { .. } => {
-                "is the loopback cable in, from the output to the second input?"
-            }
+            Self::Take(fault) => fault.hint(),
+            Self::Broken { .. } => "is the loopback cable in, from the output to the second input?",
             Self::Noise { .. } => "are amplifier and microphone on, and the drives off?",
             Self::Arrival { .. } => "do microphone and speaker stand where the arms say, and is the temperature right?",
             Self::Outside { .. } => "wait until it is quiet, or raise `validation.outside_level_db` in the rig file",

@@ -98,7 +98,7 @@ impl<T: RealSample> ResponseDeconvolution<T> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::sweep::LinearSweep;
+    use crate::sweep::{SineSweep, SweepShape};
 
     // A length with a large prime factor, so that padding would change it.
     const LEN: usize = 4_898;
@@ -120,7 +120,14 @@ mod tests {
     // The greatest difference between single precision and the definition in double precision, over the greatest
     // sample.
     fn difference(division: SpectralDivision) -> f64 {
-        let sweep = LinearSweep { rate_hz: 96e3, duration_secs: 0.04, low_hz: 2e3, high_hz: 40e3, fade_secs: 0.001 };
+        let sweep = SineSweep {
+            shape: SweepShape::Linear,
+            rate_hz: 96e3,
+            duration_secs: 0.04,
+            low_hz: 2e3,
+            high_hz: 40e3,
+            fade_secs: 0.001,
+        };
         let mut loopback = sweep.samples();
         loopback.resize(LEN, 0.0);
         let noise = |n: usize| ((n * 7919) % 1013) as f64 / 1e6 - 5e-4;

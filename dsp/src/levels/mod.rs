@@ -10,6 +10,7 @@ pub mod level;
 pub mod mean;
 mod noise_crossing;
 pub mod octave_filter;
+pub mod oversampling;
 pub mod rise;
 pub mod room_parameters;
 pub mod spectrogram;

@@ -82,6 +82,9 @@ pub struct Measurement {
     pub microphone_residual_mm: f64,
     #[prost(double, tag = "16")]
     pub speaker_residual_mm: f64,
+    /// Rate of the playing clock over that of the recording one, less 1, ppm; unset if the take does not show it.
+    #[prost(double, optional, tag = "17")]
+    pub clock_ratio_ppm: ::core::option::Option<f64>,
 }
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
 #[repr(i32)]

@@ -185,6 +185,8 @@ pub(super) fn measurement_columns() -> Vec<Column> {
         .or_null(),
         Column::int("clipped_samples", "1", "Samples at full scale, both channels"),
         Column::float("arrival_error_us", "us", "Direct sound's arrival minus the one geometry gives").or_null(),
+        Column::float("clock_ratio_ppm", "ppm", "Rate of the playing clock over that of the recording one, less 1")
+            .or_null(),
         Column::float("microphone_residual_mm", "mm", "Measured minus wanted position of the microphone").or_null(),
         Column::float("speaker_residual_mm", "mm", "Measured minus wanted position of the speaker").or_null(),
         Column::text(

@@ -2,6 +2,7 @@
 
 use echolake_dsp::air::AirState;
 use echolake_dsp::geometry::direct_mm;
+use echolake_dsp::take_analysis::TakeAnalysis;
 use echolake_dsp::temperature::{ReferenceAir, response_limits_hz};
 use echolake_schema::messages::{AmbientSample, ImpulseResponse, Measurement, SampleFormat, SweepRecording, Verdict};
 use echolake_schema::samples::split_24;
@@ -80,6 +81,7 @@ impl RunController<'_> {
             clipped_samples: assessment.clipped_samples,
             loopback_level_dbfs: assessment.loopback_dbfs,
             arrival_error_us: assessment.arrival_error_us,
+            clock_ratio_ppm: Some(assessment.analysis.clock_ratio_ppm).filter(|ppm| ppm.is_finite()),
             microphone_residual_mm: direct_mm(microphone, reached.microphone_mm),
             speaker_residual_mm: direct_mm(speaker, reached.speaker_mm),
             ..verdict_on(pair, number, verdict, &objections, &reading)
@@ -299,5 +301,11 @@ fn measured_air(reading: &AmbientReading) -> AirState {
 
 fn unknown_assessment(clipped_samples: u32) -> TakeAssessment {
     let unknown = f64::NAN;
-    TakeAssessment { snr_db: unknown, clipped_samples, loopback_dbfs: unknown, arrival_error_us: unknown }
+    TakeAssessment {
+        snr_db: unknown,
+        clipped_samples,
+        loopback_dbfs: unknown,
+        arrival_error_us: unknown,
+        analysis: TakeAnalysis::unknown(),
+    }
 }

@@ -200,7 +200,7 @@ fn a_loopback_that_is_missing_is_named() {
         take.loopback.iter_mut().enumerate().for_each(|(i, x)| *x = (i % 7) as i32 - 3);
         Ok(())
     };
-    check(DeviceFault { take: hum, ..NONE }, "loopback at -");
+    check(DeviceFault { take: hum, ..NONE }, "loopback does not match the played sweep");
 }
 
 #[test]

@@ -1,0 +1,409 @@
+//! Judgement of a take: does the loopback match the played sweep, do the clocks agree, is any sample missing?
+//!
+//! Everything follows from two quotients of spectra, loopback over played sweep and recording over loopback, as analytic
+//! responses. A sweep passes each frequency once, so that what is wrong at one time is wrong at one frequency:
+//!
+//! - a response to a sweep played by another clock is a chirp whose phase is known ([`SineSweep::phase_cycles`]);
+//! - behind a lost sample all frequencies arrive earlier, and the step rings before the first arrival;
+//! - distortion of an exponential sweep arrives earlier than the response, by a time per order (Farina 2000). That of a
+//!   linear sweep is spread over all times before it.
+
+mod clock;
+mod dropout;
+mod fault;
+mod harmonics;
+
+use std::sync::Arc;
+
+use realfft::RealToComplex;
+use realfft::num_complex::Complex;
+use rustfft::{Fft, FftDirection};
+
+use crate::deconvolution::fast_length;
+use crate::error::check_len;
+use crate::level::power_to_db;
+use crate::oversampling::oversampled_peak;
+use crate::sweep::SineSweep;
+use crate::{Error, RealSample};
+
+pub use fault::{TakeChannel, TakeFault};
+pub use harmonics::{HARMONIC_ORDERS, TakeDistortion};
+
+/// Greatest clock ratio that is searched, as a fraction: 3000 ppm.
+const MAX_CLOCK_RATIO: f64 = 3e-3;
+/// Width of the sin^4 at both limits of the sweep's range, Hz: it rings for 0.5 ms. At most a quarter of the range.
+const TAPER_HZ: f64 = 4e3;
+/// Time before an arrival that its own ringing fills, s.
+const RINGING_SECS: f64 = 0.5e-3;
+/// Least share of the greatest sample at which a response begins.
+const ONSET_SHARE: f64 = 0.1;
+/// Least energy of a loopback's response at its peak over its energy elsewhere, dB.
+const MATCH_DB: f64 = 20.0;
+/// The same of the two greatest peaks, if the loopback lost samples.
+const TORN_MATCH_DB: f64 = 10.0;
+/// Least energy at the peak over that elsewhere at which two channels are one signal, dB.
+const SAME_SIGNAL_DB: f64 = 30.0;
+/// Least energy behind an arrival over that before it, dB: noise alone has 0.
+const CAUSAL_DB: f64 = 3.0;
+/// Least power of a response's greatest sample over the mean, dB: that of noise is 10 to 12.
+const PEAK_DB: f64 = 15.0;
+/// Allowed drift of two clocks over the sweep, periods of its highest frequency, if the loopback is a digital copy of the
+/// sweep or there is none: 45 ppm for the paper's rig.
+const MAX_DRIFT_CYCLES: f64 = 0.9;
+/// The same if the loopback was recorded: by the same clock, if it comes with the recording. A tweeter whose delay changes
+/// with frequency looks like half a period.
+const MAX_RECORDED_DRIFT_CYCLES: f64 = 2.0;
+/// Least drift that is told from dispersion, periods.
+const LEAST_DRIFT_CYCLES: f64 = 0.1;
+/// Greatest share of a loopback that is no delayed copy of the sweep, if it is a digital one.
+const DIGITAL_COPY_SHARE: f64 = 1e-7;
+
+/// What a take is, apart from its response.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TakeAnalysis {
+    /// Energy of the loopback's response to the played sweep within 0.5 ms of its peak, over that of all the rest, dB;
+    /// NaN without a loopback.
+    pub loopback_match_db: f64,
+    /// Rate of the playing clock over that of the recording one, less 1, ppm: of the loopback against the played sweep,
+    /// and of the recording against the loopback if they drift apart, or if the loopback is a digital copy of the sweep.
+    /// NaN if neither shows the sweep.
+    pub clock_ratio_ppm: f64,
+    /// Distortion of the recording by order; None if the sweep is linear, or not in the recording.
+    pub distortion: Option<TakeDistortion>,
+    /// Faults of the take.
+    pub faults: Vec<TakeFault>,
+}
+
+impl TakeAnalysis {
+    /// Makes the analysis of a take of which nothing is known.
+    pub fn unknown() -> Self {
+        Self { loopback_match_db: f64::NAN, clock_ratio_ppm: f64::NAN, distortion: None, faults: Vec::new() }
+    }
+}
+
+/// Analyses takes of one sweep and one length.
+pub struct TakeAnalyzer {
+    sweep: SineSweep,
+    recording_len: usize,
+    forward: Arc<dyn RealToComplex<f64>>,
+    inverse: Arc<dyn Fft<f64>>,
+    short: ShortTransform,
+    played: Vec<Complex<f64>>,
+    taper: Vec<f64>,
+}
+
+/// Transforms of a response's vicinity, `[len]`, with its onset in the middle.
+struct ShortTransform {
+    len: usize,
+    step_hz: f64,
+    forward: Arc<dyn Fft<f64>>,
+    inverse: Arc<dyn Fft<f64>>,
+}
+
+/// A response to a sweep.
+struct SweepResponse {
+    /// `[n]`: the analytic response, sample 0 without delay, those before it at the end.
+    samples: Vec<Complex<f64>>,
+    /// Energy of all samples.
+    energy: f64,
+    /// Sample of the first arrival, from -n / 2.
+    onset: i64,
+    /// `[short]`: spectrum of the onset's vicinity.
+    vicinity: Vec<Complex<f64>>,
+}
+
+impl TakeAnalyzer {
+    /// Plans for recordings of `recording_len` samples with this sweep in them.
+    ///
+    /// # Errors
+    /// [`Error::Setting`] if there is no sweep or no recording.
+    pub fn new(sweep: SineSweep, recording_len: usize) -> Result<Self, Error> {
+        if sweep.len() < 2 || recording_len < 2 || !(0.0 < sweep.low_hz && sweep.low_hz < sweep.high_hz) {
+            let actual = format!("{} samples in a recording of {recording_len}", sweep.len());
+            return Err(Error::Setting { what: "the sweep", actual, expected: "2 samples or more, and a range" });
+        }
+        let n = fast_length(recording_len);
+        let forward = f64::plan_real_forward(n);
+        let spread = 8.0 * MAX_CLOCK_RATIO * sweep.duration_secs;
+        let short = (sweep.rate_hz * spread.max(0.04)) as usize;
+        let short = short.next_power_of_two().min(n);
+        let mut played = forward.make_output_vec();
+        let mut samples = sweep.samples();
+        samples.resize(n, 0.0);
+        // The lengths are the plan's own.
+        let _ = forward.process(&mut samples, &mut played);
+        let taper = (0..played.len()).map(|k| taper_gain(&sweep, k as f64 * sweep.rate_hz / n as f64)).collect();
+        Ok(Self {
+            short: ShortTransform {
+                len: short,
+                step_hz: sweep.rate_hz / short as f64,
+                forward: f64::plan_fft(short, FftDirection::Forward),
+                inverse: f64::plan_fft(short, FftDirection::Inverse),
+            },
+            inverse: f64::plan_fft(n, FftDirection::Inverse),
+            sweep,
+            recording_len,
+            forward,
+            played,
+            taper,
+        })
+    }
+
+    /// Analyses a take; samples are fractions of full scale.
+    ///
+    /// recording `[recording_len]`, loopback `[recording_len]` if there is one
+    ///
+    /// # Errors
+    /// [`Error::Length`]; [`Error::NotFinite`].
+    pub fn analyze_take(&self, recording: &[f32], loopback: Option<&[f32]>) -> Result<TakeAnalysis, Error> {
+        let recorded = self.transform_signal("the recording", recording)?;
+        let mut analysis = TakeAnalysis::unknown();
+        for (channel, signal) in [(TakeChannel::Recording, Some(recording)), (TakeChannel::Loopback, loopback)] {
+            let peak = signal.map_or(0.0, oversampled_peak);
+            if peak > 1.0 {
+                analysis.faults.push(TakeFault::BetweenSamples { channel, peak_dbfs: power_to_db(peak * peak) });
+            }
+        }
+        let Some(loopback) = loopback else {
+            self.analyze_recording(&mut analysis, &self.divide_spectra(&recorded, &self.played), 0.0, 0, true);
+            return Ok(analysis);
+        };
+        let looped = self.transform_signal("the loopback", loopback)?;
+        let electrical = self.divide_spectra(&looped, &self.played);
+        let loopback_ratio = self.fit_clock_ratio(&electrical);
+        let match_db = self.match_db(&electrical, loopback_ratio);
+        analysis.loopback_match_db = match_db;
+        let response = self.divide_spectra(&recorded, &looped);
+        let direct = self.match_db(&response, 0.0);
+        if direct > SAME_SIGNAL_DB && response.peak() == 0 {
+            let level_db = power_to_db(response.energy) - power_to_db(self.unit_energy());
+            analysis.faults.push(TakeFault::SameSignal { level_db });
+        } else if match_db >= MATCH_DB {
+            if response.onset < -(self.seconds(RINGING_SECS) as i64) && self.is_played_sweep(&recorded) {
+                analysis.faults.push(TakeFault::Swapped { early_secs: -self.secs_of(response.onset) });
+            } else {
+                self.find_cut(&mut analysis, electrical.onset);
+                self.find_dropout(&mut analysis, &electrical, &[loopback_ratio], TakeChannel::Loopback, 0);
+                let is_copy = self.is_digital_copy(&looped, electrical.peak());
+                self.analyze_recording(&mut analysis, &response, loopback_ratio, electrical.onset, is_copy);
+            }
+        } else if self.peaks_db(&electrical, 0.0, 2) > TORN_MATCH_DB
+            && self.find_dropout(&mut analysis, &electrical, &[0.0], TakeChannel::Loopback, 0)
+        {
+            // Its two parts arrive at different times.
+        } else {
+            let acoustical = self.divide_spectra(&recorded, &self.played);
+            let recording_db = self.match_db(&acoustical, self.fit_clock_ratio(&acoustical));
+            analysis.faults.push(if recording_db >= MATCH_DB {
+                TakeFault::Swapped { early_secs: self.secs_of(electrical.onset - acoustical.onset) }
+            } else if self.causal_db(&response) > CAUSAL_DB && response.peak_db() >= PEAK_DB {
+                TakeFault::UnknownSweep { match_db, least_db: MATCH_DB }
+            } else {
+                TakeFault::Loopback { match_db, least_db: MATCH_DB }
+            });
+        }
+        Ok(analysis)
+    }
+
+    // Faults of a recording over a loopback with the sweep in it, or over the played sweep itself; `known` is the
+    // loopback's clock ratio, and `delay` its delay.
+    fn analyze_recording(
+        &self,
+        analysis: &mut TakeAnalysis,
+        response: &SweepResponse,
+        known: f64,
+        delay: i64,
+        is_copy: bool,
+    ) {
+        if !analysis.loopback_match_db.is_nan() {
+            analysis.clock_ratio_ppm = 1e6 * known;
+        }
+        let peak_db = response.peak_db();
+        if !(peak_db >= PEAK_DB) {
+            analysis.faults.push(TakeFault::NoResponse { peak_db, least_db: PEAK_DB });
+            return;
+        }
+        let drift = self.search_clock_ratio(response);
+        let limit = self.drift_ratio(if is_copy { MAX_DRIFT_CYCLES } else { MAX_RECORDED_DRIFT_CYCLES });
+        let is_torn = self.find_dropout(analysis, response, &[0.0, drift], TakeChannel::Recording, delay);
+        let is_drifting = drift.abs() > limit && !is_torn;
+        if is_drifting {
+            analysis.faults.push(TakeFault::Clock { ppm: 1e6 * drift, limit_ppm: 1e6 * limit });
+        }
+        // A copy tells nothing of the clocks.
+        let is_told = is_copy && !is_torn && drift.abs() > self.drift_ratio(LEAST_DRIFT_CYCLES);
+        if is_drifting || is_told || analysis.loopback_match_db.is_nan() {
+            analysis.clock_ratio_ppm = 1e6 * (known + drift);
+        }
+        analysis.distortion = self.measure_distortion(&mut analysis.faults, response);
+    }
+
+    // Whether a channel is the sweep itself, by the playing clock.
+    fn is_played_sweep(&self, spectrum: &[Complex<f64>]) -> bool {
+        let response = self.divide_spectra(spectrum, &self.played);
+        let ratio = self.fit_clock_ratio(&response);
+        self.match_db(&response, ratio) >= MATCH_DB && ratio.abs() <= self.drift_ratio(MAX_DRIFT_CYCLES)
+    }
+
+    // Whether a channel is the sweep at a delay of whole samples, without the response of any converter.
+    fn is_digital_copy(&self, spectrum: &[Complex<f64>], delay: i64) -> bool {
+        let n = self.forward.len() as i64;
+        let mut product = Complex::<f64>::default();
+        let mut energies = [0.0, 0.0];
+        for (k, gain) in self.taper.iter().enumerate().filter(|(_, gain)| **gain > 0.0) {
+            let quotient = spectrum[k] / self.played[k];
+            let turn = (k as i64 * delay).rem_euclid(n) as f64 / n as f64;
+            product += quotient * Complex::from_polar(gain * gain, std::f64::consts::TAU * turn);
+            energies[0] += gain * gain * quotient.norm_sqr();
+            energies[1] += gain * gain;
+        }
+        1.0 - product.norm_sqr() / (energies[0] * energies[1]) < DIGITAL_COPY_SHARE
+    }
+
+    // Clock ratio of a drift, as a fraction.
+    fn drift_ratio(&self, cycles: f64) -> f64 {
+        cycles / (self.sweep.duration_secs * self.sweep.high_hz)
+    }
+
+    fn transform_signal(&self, what: &'static str, signal: &[f32]) -> Result<Vec<Complex<f64>>, Error> {
+        check_len(what, signal.len(), self.recording_len)?;
+        let mut samples = self.forward.make_input_vec();
+        samples.iter_mut().zip(signal).for_each(|(to, from)| *to = f64::from(*from));
+        let mut spectrum = self.forward.make_output_vec();
+        let _ = self.forward.process(&mut samples, &mut spectrum);
+        if spectrum.iter().all(|x| x.re.is_finite() && x.im.is_finite()) {
+            Ok(spectrum)
+        } else {
+            Err(Error::NotFinite { what })
+        }
+    }
+
+    fn divide_spectra(&self, of: &[Complex<f64>], by: &[Complex<f64>]) -> SweepResponse {
+        let n = self.forward.len();
+        let mut samples = vec![Complex::default(); n];
+        for (k, gain) in self.taper.iter().enumerate().filter(|(_, gain)| **gain > 0.0) {
+            // Silence divided by silence is silence.
+            let quotient = of[k] * by[k].conj() / by[k].norm_sqr().max(f64::MIN_POSITIVE);
+            samples[k] = quotient * *gain / n as f64;
+        }
+        self.inverse.process(&mut samples);
+        let energy = samples.iter().map(Complex::norm_sqr).sum();
+        let mut response = SweepResponse { samples, energy, onset: 0, vicinity: Vec::new() };
+        response.onset = response.find_onset((self.short.len / 2) as i64);
+        let middle = (self.short.len / 2) as i64;
+        response.vicinity = (0..self.short.len as i64).map(|i| response.at(response.onset + i - middle)).collect();
+        self.short.forward.process(&mut response.vicinity);
+        response
+    }
+
+    // Energy of a response that is one sample of 1.
+    fn unit_energy(&self) -> f64 {
+        self.taper.iter().map(|gain| gain * gain).sum::<f64>() / self.forward.len() as f64
+    }
+
+    // Energy within 0.5 ms of the peak over that of all other samples, after the clocks are brought together, dB.
+    fn match_db(&self, response: &SweepResponse, ratio: f64) -> f64 {
+        self.peaks_db(response, ratio, 1)
+    }
+
+    // The same of the greatest peaks.
+    fn peaks_db(&self, response: &SweepResponse, ratio: f64, peaks: usize) -> f64 {
+        let vicinity = self.align_clocks(response, ratio);
+        let mut power: Vec<f64> = vicinity.iter().map(Complex::norm_sqr).collect();
+        let reach = self.seconds(RINGING_SECS);
+        let mut near = 0.0;
+        for _ in 0..peaks {
+            let peak = index_of_greatest(&power);
+            let around = &mut power[peak.saturating_sub(reach)..(peak + reach).min(self.short.len)];
+            near += around.iter().sum::<f64>();
+            around.fill(0.0);
+        }
+        // What rounding leaves of nothing.
+        power_to_db(near / (response.energy - near).max(1e-15 * response.energy))
+    }
+
+    // Energy of the half behind the onset over that of the half before it, dB.
+    fn causal_db(&self, response: &SweepResponse) -> f64 {
+        let half = response.samples.len() as i64 / 2;
+        let from = response.onset - self.seconds(RINGING_SECS) as i64;
+        power_to_db(response.energy_of(from..from + half) / response.energy_of(from - half..from))
+    }
+
+    // The onset's vicinity as it would be if the recording's clock ran slower by `ratio`.
+    fn align_clocks(&self, response: &SweepResponse, ratio: f64) -> Vec<Complex<f64>> {
+        let mut vicinity = response.vicinity.clone();
+        let scale = 1.0 / self.short.len as f64;
+        for (k, z) in vicinity.iter_mut().enumerate() {
+            *z *= scale;
+            if ratio != 0.0 {
+                let hz = (k as f64 * self.short.step_hz).clamp(self.sweep.low_hz, self.sweep.high_hz);
+                let cycles = self.sweep.phase_cycles(hz / (1.0 + ratio)) - self.sweep.phase_cycles(hz);
+                *z *= Complex::from_polar(1.0, std::f64::consts::TAU * cycles.fract());
+            }
+        }
+        self.short.inverse.process(&mut vicinity);
+        vicinity
+    }
+
+    fn find_cut(&self, analysis: &mut TakeAnalysis, delay: i64) {
+        let fade = (self.sweep.fade_secs * self.sweep.rate_hz) as i64 + 1;
+        let late = delay + self.sweep.len() as i64 - self.recording_len as i64;
+        if delay < -fade {
+            analysis.faults.push(TakeFault::CutStart { lost_secs: self.secs_of(-delay) });
+        } else if late > fade {
+            analysis.faults.push(TakeFault::CutEnd { lost_secs: self.secs_of(late) });
+        }
+    }
+
+    fn seconds(&self, secs: f64) -> usize {
+        (secs * self.sweep.rate_hz).round() as usize
+    }
+
+    fn secs_of(&self, samples: i64) -> f64 {
+        samples as f64 / self.sweep.rate_hz
+    }
+}
+
+impl SweepResponse {
+    fn at(&self, index: i64) -> Complex<f64> {
+        self.samples[index.rem_euclid(self.samples.len() as i64) as usize]
+    }
+
+    fn energy_of(&self, range: std::ops::Range<i64>) -> f64 {
+        range.map(|index| self.at(index).norm_sqr()).sum()
+    }
+
+    // Power of the greatest sample over the mean, dB.
+    fn peak_db(&self) -> f64 {
+        power_to_db(self.at(self.peak()).norm_sqr() * self.samples.len() as f64 / self.energy)
+    }
+
+    // Sample of the peak, from -n / 2.
+    fn peak(&self) -> i64 {
+        let power: Vec<f64> = self.samples.iter().map(Complex::norm_sqr).collect();
+        let peak = index_of_greatest(&power) as i64;
+        let n = power.len() as i64;
+        if peak > n / 2 { peak - n } else { peak }
+    }
+
+    // The earliest sample, at most `reach` before the peak, of a tenth of it.
+    fn find_onset(&self, reach: i64) -> i64 {
+        let peak = self.peak();
+        let least = (ONSET_SHARE * ONSET_SHARE) * self.at(peak).norm_sqr();
+        (peak - reach..peak).find(|index| self.at(*index).norm_sqr() >= least).unwrap_or(peak)
+    }
+}
+
+// Gain of a frequency: 1 in the sweep's range, falling to 0 at its limits.
+fn taper_gain(sweep: &SineSweep, hz: f64) -> f64 {
+    let width_hz = TAPER_HZ.min((sweep.high_hz - sweep.low_hz) / 4.0);
+    let inside = ((hz - sweep.low_hz).min(sweep.high_hz - hz) / width_hz).clamp(0.0, 1.0);
+    (std::f64::consts::FRAC_PI_2 * inside).sin().powi(4)
+}
+
+fn index_of_greatest(values: &[f64]) -> usize {
+    (0..values.len()).max_by(|a, b| values[*a].total_cmp(&values[*b])).unwrap_or(0)
+}
+
+#[cfg(test)]
+mod tests;
