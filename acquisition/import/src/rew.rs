@@ -76,7 +76,14 @@ pub fn import_rew(
         }
         let count = measurements as u64;
         batch.seal_run(recorder, &RunEnd { ended, accepted: count, rejected: 0, attempts: count })?;
-        runs.push(ImportedRun { path, run_id: run_manifest.run_id, surface, measurements, warnings, notes: Vec::new() });
+        runs.push(ImportedRun {
+            path,
+            run_id: run_manifest.run_id,
+            surface,
+            measurements,
+            warnings,
+            notes: Vec::new(),
+        });
     }
     batch.publish_all()?;
     Ok(runs)

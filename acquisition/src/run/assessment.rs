@@ -219,7 +219,14 @@ mod tests {
     fn the_ratio_of_signal_and_noise_is_the_true_one() {
         for duration_secs in [0.03, 0.5] {
             let rig = Rig::from_toml(&format!("sweep.duration_secs = {duration_secs}")).expect("a rig");
-            let sweep = LinearSweep { rate_hz: 96e3, duration_secs, low_hz: 2e3, high_hz: 40e3, fade_secs: 1e-3 };
+            let sweep = SineSweep {
+                shape: SweepShape::Linear,
+                rate_hz: 96e3,
+                duration_secs,
+                low_hz: 2e3,
+                high_hz: 40e3,
+                fade_secs: 1e-3,
+            };
             let mut loopback: Vec<f32> = sweep.samples().iter().map(|x| 0.5 * *x as f32).collect();
             loopback.resize(rig.recording_len(), 0.0);
             let mut assessor = TakeAssessor::new(&rig, loopback.len()).expect("a plan");

@@ -3,6 +3,9 @@
 use std::f64::consts::{PI, TAU};
 
 use super::*;
+
+/// Name of a take, the take, and whether a fault is the expected one.
+type FaultCase = (&'static str, Take, fn(&TakeFault) -> bool);
 use crate::deconvolution::{DeconvolutionParams, DeconvolutionPlan, SpectralDivision, TransformLength};
 use crate::sweep::SweepShape;
 
@@ -197,7 +200,7 @@ fn the_loopback_is_judged_by_its_match() {
         let summed: Vec<f64> = good.microphone.iter().zip(&good.loopback).map(|(a, b)| 0.5 * (a + b)).collect();
         let summed = Take { loopback: summed.clone(), microphone: summed, ..good.clone() };
         let swapped = Take { loopback: good.microphone.clone(), microphone: good.loopback.clone(), ..good.clone() };
-        let cases: [(&str, Take, fn(&TakeFault) -> bool); 4] = [
+        let cases: [FaultCase; 4] = [
             ("silent", silent, |f| matches!(f, TakeFault::Loopback { match_db, .. } if *match_db < 0.0)),
             (
                 "crosstalk",

@@ -130,7 +130,8 @@ impl SetupFigure {
     }
 
     fn draw_labels(&self, drawing: &mut FigureDrawing, page: &Projection) {
-        let heights = self.layers_mm.iter().filter_map(|layer| Some(format!("{} at {:.0} mm", layer.len(), layer.first()?[2])));
+        let heights =
+            self.layers_mm.iter().filter_map(|layer| Some(format!("{} at {:.0} mm", layer.len(), layer.first()?[2])));
         let text = format!("points: {}", heights.collect::<Vec<_>>().join(", "));
         let at = [MARGIN, drawing.height_px - 20.0];
         drawing.add_shape(sized_label(at, text, TextAnchor::Start, SMALL_PX, FigureColour::Ink));

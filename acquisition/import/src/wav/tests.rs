@@ -113,7 +113,14 @@ fn messages_are_in_the_order_of_time_however_the_rows_are() {
 
 /// Samples of a recording whose direct sound is `late` samples later than geometry gives, and its sweep.
 fn late_take(late: usize) -> [Vec<f32>; 2] {
-    let sweep = SineSweep { shape: SweepShape::Linear, rate_hz: 96e3, duration_secs: 0.03, low_hz: 2e3, high_hz: 40e3, fade_secs: 1e-3 };
+    let sweep = SineSweep {
+        shape: SweepShape::Linear,
+        rate_hz: 96e3,
+        duration_secs: 0.03,
+        low_hz: 2e3,
+        high_hz: 40e3,
+        fade_secs: 1e-3,
+    };
     let sweep: Vec<f32> = sweep.samples().iter().map(|x| 0.5 * *x as f32).collect();
     let mut recording = vec![0.0; late + expected_arrival()];
     recording.extend(&sweep);

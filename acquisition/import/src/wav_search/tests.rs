@@ -13,7 +13,14 @@ const RESPONSE: [(usize, f32); 3] = [(DIRECT, 0.6), (DIRECT + 41, -1.0), (DIRECT
 
 fn search(takes: &[f64], secs: f64, sweep_level: f32, noise_level: f32) -> Result<u64, String> {
     let rig = Rig::paper();
-    let sweep = SineSweep { shape: SweepShape::Linear, rate_hz: 96e3, duration_secs: 0.5, low_hz: 2e3, high_hz: 40e3, fade_secs: 1e-3 };
+    let sweep = SineSweep {
+        shape: SweepShape::Linear,
+        rate_hz: 96e3,
+        duration_secs: 0.5,
+        low_hz: 2e3,
+        high_hz: 40e3,
+        fade_secs: 1e-3,
+    };
     let sweep: Vec<f32> = sweep.samples().iter().map(|x| *x as f32).collect();
     let mut state = 1u32;
     let mut uniform = || {
