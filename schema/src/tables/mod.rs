@@ -240,6 +240,7 @@ mod tests {
             ("_c", "C"),
             ("_pct", "%"),
             ("_hpa", "hPa"),
+            ("_ppm", "ppm"),
             ("_hz", "Hz"),
             ("_deg", "deg"),
             ("_bytes", "B"),

@@ -40,7 +40,9 @@ impl AudioDuplex for LoopbackCable {
             _ => sample(n),
         });
         recorded.loopback = loopback.map(|x| (f64::from(x) * self.gain * 8_388_608.0) as i32).collect();
-        recorded.microphone = recorded.loopback.iter().map(|x| x / 4).collect();
+        // A microphone hears later than a cable.
+        let heard = |n: usize| n.checked_sub(30).map_or(0, |n| recorded.loopback[n] / 4);
+        recorded.microphone = (0..frames).map(heard).collect();
         match fault {
             CableFault::Overrun => Err(TransferError::Transient("overrun".into())),
             CableFault::Unplugged => Err(TransferError::Permanent("no such device".into())),
