@@ -78,7 +78,11 @@ fn a_clipped_recording_is_kept_and_said() {
     place.ok(&["ingest"]);
     assert_eq!(place.number("select clipped_samples from measurements"), 1.0);
     // Of both channels of one file the loopback is the second: it is named, and the recording is not.
-    wav(&place.path("both.wav"), 96_000, &[&noise(4_000), &clipped]);
+    let mut late = noise(4_000);
+    late.rotate_right(30);
+    let mut clipped = noise(4_000);
+    clipped[100] = i16::MAX;
+    wav(&place.path("both.wav"), 96_000, &[&late, &clipped]);
     std::fs::write(place.path("manifest.csv"), format!("{HEADER}b,both.wav,both.wav#2,0/0/0,0/0/1,20\n"))
         .expect("written");
     let expected = "line 2: 1 samples clipped in the loopback, `both.wav`, channel 2";

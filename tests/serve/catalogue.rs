@@ -88,7 +88,7 @@ fn numbers_are_those_of_sql() {
     assert_eq!(placed, 3, "{map}");
     let wav = get(&server, "/api/v1/surfaces/brick/pairs/7/ir.wav?signal=measured");
     assert_eq!(wav.body[..4], *b"RIFF");
-    assert_eq!(wav.body.len(), 68 + 4 * ir.as_array().expect("samples").len());
+    assert_eq!(wav.body.len(), 44 + 4 * ir.as_array().expect("samples").len());
     let png = get(&server, "/api/v1/surfaces/brick/thumbnail.png");
     assert_eq!(png.body[1..4], *b"PNG");
     let glb = get(&server, "/api/v1/surfaces/brick/mesh.glb");
