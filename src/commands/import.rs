@@ -152,7 +152,8 @@ pub(crate) async fn run_import(args: &ImportArgs, lake_url: &str) -> anyhow::Res
         super::print_line(&run.path.display().to_string())?;
     }
     eprintln!("next: echolake --lake {lake_url} ingest");
-    Ok(CommandOutcome::Whole)
+    let is_whole = runs.iter().all(|run| run.rejected == 0);
+    Ok(if is_whole { CommandOutcome::Whole } else { CommandOutcome::WithLoss })
 }
 
 fn finish_task(task: Option<TaskProgress>, runs: &[ImportedRun]) {

@@ -1,8 +1,8 @@
 """Compares levels without Foam's reflection with the truth: `foam_reflection.py --program ECHOLAKE`.
 
-The simulated rig measures panels and their references on the paper's grid, once with Foam that reflects nothing, which is
-the truth, and once with foam of each thickness; seeds are the same, so that noise and places are. Printed are the errors
-of `p90_mean_db` and of `unbiased_p90_mean_db`, and the greatest of the latter over `unbiased_p90_mean_u_db`.
+The simulated rig measures panels and their references on the paper's grid, once with Foam that reflects nothing, which
+is the truth, and once with foam of each thickness; seeds are the same, so that noise and places are. Printed are the
+errors of `p90_mean_db` and of `unbiased_p90_mean_db`, and the greatest of the latter over `unbiased_p90_mean_u_db`.
 
     --folder FOLDER  keeps the lakes there, and uses those that are there already
     --surfaces S...  the panels

@@ -255,8 +255,8 @@ class IndependentChain:
         return np.fft.irfft(self.gains * np.fft.rfft(response), len(response))
 
     def learn_slopes(self, foam: dict[int, Measured], flat: dict[int, Measured]) -> None:
-        """d ln(spectrum) / d ln(frequency) of speaker and microphone: from the direct sound and from what Flat reflects,
-        each summed over the pairs as if it came at once, without absorption by the reference air."""
+        """d ln(spectrum) / d ln(frequency) of speaker and microphone: from the direct sound and from what Flat
+        reflects, each summed over the pairs as if it came at once, without absorption by the reference air."""
         pairs = sorted(foam.keys() & flat.keys())
         signals = [
             np.array([foam[pair].response for pair in pairs]),

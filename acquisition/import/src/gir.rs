@@ -109,6 +109,7 @@ impl GirImport<'_> {
             surface,
             measurements: pairs.len(),
             warnings: Vec::new(),
+            rejected: 0,
             notes: Vec::new(),
         })
     }

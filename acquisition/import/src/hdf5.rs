@@ -183,7 +183,15 @@ impl<'g> ResponseSet<'g> {
         let count = measured as u64;
         batch.seal_run(recorder, &RunEnd { ended: at, accepted: count, rejected: 0, attempts: count })?;
         let (run_id, surface) = (manifest.run_id, manifest.surface_id);
-        Ok(ImportedRun { path, run_id, surface, measurements: measured, warnings: Vec::new(), notes: Vec::new() })
+        Ok(ImportedRun {
+            path,
+            run_id,
+            surface,
+            measurements: measured,
+            rejected: 0,
+            warnings: Vec::new(),
+            notes: Vec::new(),
+        })
     }
 
     // Reads a block of the dataset, and tells its responses apart.

@@ -43,9 +43,11 @@ pub struct ImportedRun {
     pub surface: SurfaceId,
     /// Measurements in it.
     pub measurements: usize,
+    /// Takes that were rejected: they get no rows in the tables.
+    pub rejected: usize,
     /// Faults of the imported files, as texts; they were imported all the same.
     pub warnings: Vec<String>,
-    /// What the takes have in common: clocks, distortion, number of rejected ones.
+    /// What the takes have in common: clocks, distortion.
     pub notes: Vec<String>,
 }
 

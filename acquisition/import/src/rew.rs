@@ -82,6 +82,7 @@ pub fn import_rew(
             surface,
             measurements,
             warnings,
+            rejected: 0,
             notes: Vec::new(),
         });
     }

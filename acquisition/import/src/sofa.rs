@@ -197,6 +197,7 @@ impl Sofa {
             surface,
             measurements: count,
             warnings: self.warnings.clone(),
+            rejected: 0,
             notes: Vec::new(),
         })
     }

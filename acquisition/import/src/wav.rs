@@ -107,7 +107,15 @@ impl WavImport<'_> {
         }
         let ended = timed.last().map_or(started, |(time, _)| *time);
         batch.seal_run(recorder, &RunEnd { ended, accepted: count - rejected, rejected, attempts: count })?;
-        Ok(ImportedRun { path, run_id: manifest.run_id, surface, measurements: rows.len(), warnings, notes })
+        Ok(ImportedRun {
+            path,
+            run_id: manifest.run_id,
+            surface,
+            measurements: rows.len() - rejected as usize,
+            rejected: rejected as usize,
+            warnings,
+            notes,
+        })
     }
 
     fn time(&self, row: &ManifestRow, index: u32) -> Timestamp {
