@@ -122,7 +122,7 @@ mod tests {
         }
         assert!(named.contains("/ir.samples[:]"));
         let response = &layout["configById"]["Plot!response"];
-        assert_eq!(response["maxXValue"], 460, "the rig's, and some more for cold air");
+        assert_eq!(response["maxXValue"], 461, "the rig's, and some more for cold air");
         assert_eq!(response["lichtblickPanelTitle"], "Impulse response by sample, 96 kHz");
     }
 }
