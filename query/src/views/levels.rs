@@ -25,6 +25,7 @@ pub(super) fn view_sql() -> String {
 pub(super) fn column_notes() -> HashMap<String, HashMap<String, String>> {
     let noted = [
         column_note("reference", "", "The surface is its own Flat: its levels are 0 by definition, not measured"),
+        column_note("band_hz", "Hz", "Centre of the band; null for the total"),
         column_note("runs", "1", "Runs of the surface"),
         column_note("level_db", RE_FLAT_TOTAL, "Mean of p90_mean_db over the runs"),
         column_note("u_db", "dB", "Standard uncertainty of a run's level: subtraction, noise, air"),
