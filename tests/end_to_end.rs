@@ -160,8 +160,8 @@ mod slow {
         // The second Foam run lies 25 dB under Flat at least, on the mean over the pairs.
         let foam = place.number("select 10 * log10(avg(tnce_total)) from tnce where surface_id = 'foam_2'");
         assert!(foam < -25.0, "{foam} dB");
-        // Flat reflects 29.3 % less energy than Wood (Rust et al. 2021); the grid, noise, drift and Foam's own reflection
-        // leave less than 2 %.
+        // Flat reflects 29.3 % less energy than Wood (Rust et al. 2021); the grid, noise, drift and Foam's own
+        // reflection leave less than 2 %.
         let wood = place.number("select avg(tnce_total) from tnce where surface_id = 'wood'");
         let expected = 1.0 / (1.0 - 0.293);
         assert!((wood / expected - 1.0).abs() < 0.02, "{wood} {expected}");

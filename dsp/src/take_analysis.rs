@@ -1,7 +1,7 @@
 //! Judgement of a take: does the loopback match the played sweep, do the clocks agree, is any sample missing?
 //!
-//! Everything follows from two quotients of spectra, loopback over played sweep and recording over loopback, as analytic
-//! responses. A sweep passes each frequency once, so that what is wrong at one time is wrong at one frequency:
+//! Everything follows from two quotients of spectra, loopback over played sweep and recording over loopback, as
+//! analytic responses. A sweep passes each frequency once, so that what is wrong at one time is wrong at one frequency:
 //!
 //! - a response to a sweep played by another clock is a chirp whose phase is known ([`SineSweep::phase_cycles`]);
 //! - behind a lost sample all frequencies arrive earlier, and the step rings before the first arrival;
@@ -47,8 +47,8 @@ const SAME_SIGNAL_DB: f64 = 30.0;
 const CAUSAL_DB: f64 = 3.0;
 /// Least power of a response's greatest sample over the mean, dB: that of noise is 10 to 12.
 const PEAK_DB: f64 = 15.0;
-/// Allowed drift of two clocks over the sweep, periods of its highest frequency, if the loopback is a digital copy of the
-/// sweep or there is none: 45 ppm for the paper's rig.
+/// Allowed drift of two clocks over the sweep, periods of its highest frequency, if the loopback is a digital copy of
+/// the sweep or there is none: 45 ppm for the paper's rig.
 const MAX_DRIFT_CYCLES: f64 = 0.9;
 /// Least drift that is told from dispersion, periods.
 const LEAST_DRIFT_CYCLES: f64 = 0.1;
@@ -220,11 +220,12 @@ impl TakeAnalyzer {
             analysis.faults.push(TakeFault::NoResponse { peak_db, least_db: PEAK_DB });
             return;
         }
-        let drift = self.search_clock_ratio(response);
-        let limit = self.drift_ratio(MAX_DRIFT_CYCLES);
-        let is_torn = self.find_dropout(analysis, response, &[0.0, drift], TakeChannel::Recording, delay);
         // A recorded loopback has the recording's clock, and what looks like drift is dispersion by the surface.
-        let is_drifting = is_copy && drift.abs() > limit && !is_torn;
+        let drift = if is_copy { self.search_clock_ratio(response) } else { 0.0 };
+        let ratios: &[f64] = if is_copy { &[0.0, drift] } else { &[0.0] };
+        let limit = self.drift_ratio(MAX_DRIFT_CYCLES);
+        let is_torn = self.find_dropout(analysis, response, ratios, TakeChannel::Recording, delay);
+        let is_drifting = drift.abs() > limit && !is_torn;
         if is_drifting {
             analysis.faults.push(TakeFault::Clock { ppm: 1e6 * drift, limit_ppm: 1e6 * limit });
         }

@@ -77,8 +77,8 @@ pub(crate) struct DerivedRows {
     tnce_over_band: Vec<f64>,
     /// `[pairs x bands]`: shapes of the curves.
     shapes: Vec<Option<CurveShape>>,
-    /// `[estimates][pairs x bands]`: TNCE without Foam's reflection, by the best estimate and its variants; empty if that
-    /// is not known.
+    /// `[estimates][pairs x bands]`: TNCE without Foam's reflection, by the best estimate and its variants; empty if
+    /// that is not known.
     unbiased: Vec<Vec<f64>>,
     /// `[pairs x (bands + 1)]`: relative errors of TNCE, the total's last; empty if they are not known.
     errors: Vec<LevelError>,

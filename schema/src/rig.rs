@@ -111,9 +111,9 @@ pub struct ImpulseResponse {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum AirTreatment {
-    /// The time axis for the speed of sound, which depends on temperature, humidity and pressure (Cramer 1993); energies
-    /// for absorption (ISO 9613-1), and for the frequencies that the time axis moves along the slopes of speaker and
-    /// microphone.
+    /// The time axis for the speed of sound, which depends on temperature, humidity and pressure (Cramer 1993);
+    /// energies for absorption (ISO 9613-1), and for the frequencies that the time axis moves along the slopes of
+    /// speaker and microphone.
     #[default]
     Complete,
     /// The time axis alone, and for the temperature alone, as the paper prints it: 331.3 sqrt(1 + T / 273.15) m/s.

@@ -208,8 +208,8 @@ fn check_response(samples: &[f64], emission: f64, len: usize) -> Result<f64, Str
     Ok(peak)
 }
 
-// The first `len` samples of what begins `delay` samples later, or earlier if it is negative: all frequencies are turned
-// by the delay, so that a part of a sample is exact for what has nothing at half the sampling rate.
+// The first `len` samples of what begins `delay` samples later, or earlier if it is negative: all frequencies are
+// turned by the delay, so that a part of a sample is exact for what has nothing at half the sampling rate.
 fn advance(samples: &[f64], delay: f64, len: usize) -> Vec<f32> {
     let mut signal = samples.to_vec();
     // Room for what moves past the end. What moves past the start is behind the samples that are wanted.

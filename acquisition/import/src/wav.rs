@@ -138,8 +138,8 @@ impl WavImport<'_> {
         Ok(start..(start + len).min(row.recording.layout.samples))
     }
 
-    // Import keeps all it is given: objections of the rig become warnings. A take whose response is spoiled is kept, too,
-    // and rejected: `ingest` makes no rows of it.
+    // Import keeps all it is given: objections of the rig become warnings. A take whose response is spoiled is kept,
+    // too, and rejected: `ingest` makes no rows of it.
     fn row(
         &self,
         recorder: &mut Recorder,

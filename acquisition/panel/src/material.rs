@@ -55,7 +55,8 @@ impl SurfaceMaterial {
         }
     }
 
-    /// Pressure reflection factor for plane waves of one frequency; only that of foam depends on the angle of incidence.
+    /// Pressure reflection factor for plane waves of one frequency; only that of foam depends on the angle of
+    /// incidence.
     pub fn reflection_at(self, frequency_hz: f64, incidence_deg: f64, foam: FoamLayer) -> Complex<f64> {
         match self {
             Self::CoatedPrint => {
@@ -72,9 +73,9 @@ impl FoamLayer {
     /// Pressure reflection factor for plane waves of one frequency at an angle of incidence. Waves go through the layer
     /// in the direction that Snell's law gives them (bulk reaction). Time goes as e^(i omega t).
     ///
-    /// R = (Zs cos(a) - 1)/(Zs cos(a) + 1), Zs = -i Zc (k/kz) cot(kz d), kz^2 = k^2 - (k0 sin(a))^2, impedances over the
-    /// air's: Allard & Atalla 2009, Propagation of Sound in Porous Media, chapter 3. Zc and k by the resistance to flow:
-    /// Miki 1990, J. Acoust. Soc. Jpn. (E) 11(1), 19-24, who mended Delany's and Bazley's.
+    /// R = (Zs cos(a) - 1)/(Zs cos(a) + 1), Zs = -i Zc (k/kz) cot(kz d), kz^2 = k^2 - (k0 sin(a))^2, impedances over
+    /// the air's: Allard & Atalla 2009, Propagation of Sound in Porous Media, chapter 3. Zc and k by the resistance to
+    /// flow: Miki 1990, J. Acoust. Soc. Jpn. (E) 11(1), 19-24, who mended Delany's and Bazley's.
     pub fn reflection_at(self, frequency_hz: f64, incidence_deg: f64) -> Complex<f64> {
         let frequency_hz = frequency_hz.max(FOAM_LOWEST_HZ);
         let x = 1e3 * frequency_hz / self.flow_resistivity;

@@ -213,8 +213,9 @@ mod tests {
         assessor.assess_take(&microphone, &loopback, expected / 96e3, 0).expect("assessed")
     }
 
-    // A sweep of amplitude A, T seconds and B Hz has a power spectrum of (A rate)^2 T / 4 B within its range (stationary
-    // phase; Klauder 1960), and white noise of N samples one of N sigma^2. Fades weigh response and noise alike.
+    // A sweep of amplitude A, T seconds and B Hz has a power spectrum of (A rate)^2 T / 4 B within its range
+    // (stationary phase; Klauder 1960), and white noise of N samples one of N sigma^2. Fades weigh response and noise
+    // alike.
     #[test]
     fn the_ratio_of_signal_and_noise_is_the_true_one() {
         for duration_secs in [0.03, 0.5] {

@@ -84,8 +84,8 @@ pub fn multiply_samples<T: RealSample>(x: &[T], y: &[T], out: &mut [T]) -> Resul
 mod tests {
     use super::*;
 
-    // Takes over 0.3 m, of 40 kHz, whose air differs by `kelvin` (rms): a path's delay goes as T^(-1/2), so 0.1 K turn the
-    // phase by 0.0375, -28.5 dB. The mean loses half of its variance: 0.006 dB at 0.1 K, 0.054 dB at 0.3 K.
+    // Takes over 0.3 m, of 40 kHz, whose air differs by `kelvin` (rms): a path's delay goes as T^(-1/2), so 0.1 K turn
+    // the phase by 0.0375, -28.5 dB. The mean loses half of its variance: 0.006 dB at 0.1 K, 0.054 dB at 0.3 K.
     #[test]
     fn the_mean_of_takes_in_drifting_air_loses_little() {
         for (kelvin, residual_db, loss_db) in [(0.1, -28.5, 0.0061), (0.3, -19.0, 0.0549)] {

@@ -22,8 +22,8 @@ const SMOOTHED_RATIO: f64 = 1.122_462_048_309_373;
 
 /// Learns the slopes of speaker and microphone from the direct sound and from what Flat reflects.
 ///
-/// Spectra are summed as if all pairs' sound came at once: what else is in a response has other delays in each pair, and
-/// averages out.
+/// Spectra are summed as if all pairs' sound came at once: what else is in a response has other delays in each pair,
+/// and averages out.
 pub struct AirCorrectionFit<T: RealSample> {
     rate_hz: f64,
     len: usize,
@@ -247,8 +247,8 @@ fn transform<T: RealSample>(
     if is_finite { Ok(()) } else { Err(Error::NotFinite { what: "the response" }) }
 }
 
-// d ln(spectrum) / d ln(frequency) between neighbours within the range that the sweep has, smoothed; beyond the range the
-// nearest one's.
+// d ln(spectrum) / d ln(frequency) between neighbours within the range that the sweep has, smoothed; beyond the range
+// the nearest one's.
 fn spectral_slopes(spectrum: &[Complex<f64>], step_hz: f64, [low_hz, high_hz]: [f64; 2]) -> Vec<Complex<f64>> {
     // The bins whose neighbours are within the range and no part of its tapers.
     let first = (low_hz * 1.02 / step_hz).ceil() as usize + 2;

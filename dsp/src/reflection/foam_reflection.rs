@@ -5,10 +5,10 @@
 //! arrives at other times, to which it adds energy.
 //!
 //! Flat and Foam lie in the same plane, so both reflect the same waves: for each pair, Foam's reflection is that of
-//! Flat less Foam through a short filter, which depends on the angle of incidence. It is a sum of filters of some angles,
-//! linearly interpolated by the square of the angle's sine. They are fitted by least squares to what arrives about the
-//! reflection and later. The direct sound has low frequencies that last until then: its waveform is the mean over all
-//! pairs, each brought to one distance, and is subtracted first. Filters and waveform are fitted in turn.
+//! Flat less Foam through a short filter, which depends on the angle of incidence. It is a sum of filters of some
+//! angles, linearly interpolated by the square of the angle's sine. They are fitted by least squares to what arrives
+//! about the reflection and later. The direct sound has low frequencies that last until then: its waveform is the mean
+//! over all pairs, each brought to one distance, and is subtracted first. Filters and waveform are fitted in turn.
 //!
 //! The direct sound of a pair is Foam's response less its filter applied to the difference.
 

@@ -28,8 +28,8 @@ impl HeightField {
         Self { size_mm, cells, heights_mm }
     }
 
-    /// Heights `[cells x cells]`, row by row along x with y ascending, mm; None if they are no square of two cells a side
-    /// or more, or not all finite.
+    /// Heights `[cells x cells]`, row by row along x with y ascending, mm; None if they are no square of two cells a
+    /// side or more, or not all finite.
     pub fn from_rows(size_mm: f64, heights_mm: Vec<f32>) -> Option<Self> {
         let cells = heights_mm.len().isqrt();
         let is_field = cells > 1 && cells * cells == heights_mm.len() && heights_mm.iter().all(|h| h.is_finite());

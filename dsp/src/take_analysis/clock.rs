@@ -15,8 +15,8 @@ const SEARCH_HALVINGS: usize = 4;
 impl TakeAnalyzer {
     /// Fits the clock ratio of a loopback to its phase, as a fraction.
     ///
-    /// The phase of amplifiers and converters is an odd function of frequency, that of a drift is not (for a linear sweep
-    /// it is even), so both are told apart: with a pole at 60 kHz and sweeps of 0.5 s the error is under 0.2 ppm.
+    /// The phase of amplifiers and converters is an odd function of frequency, that of a drift is not (for a linear
+    /// sweep it is even), so both are told apart: with a pole at 60 kHz and sweeps of 0.5 s the error is under 0.2 ppm.
     pub(super) fn fit_clock_ratio(&self, response: &SweepResponse) -> f64 {
         let mut ratio = 0.0;
         for _ in 0..FIT_ROUNDS {

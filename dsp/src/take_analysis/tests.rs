@@ -122,7 +122,8 @@ fn a_good_take_has_no_fault_and_one_clock() {
     }
 }
 
-// A pole at 60 kHz and one at 10 Hz, as amplifiers and converters have them, move the delay by 1 us within the sweep, as
+// A pole at 60 kHz and one at 10 Hz, as amplifiers and converters have them, move the delay by 1 us within the sweep,
+// as
 // 2 ppm would.
 #[test]
 fn a_converter_is_no_drift() {
@@ -322,8 +323,8 @@ fn without_a_loopback_the_recording_s_clock_is_that_of_the_sweep() {
     }
 }
 
-// A tone at a quarter of the sampling rate whose samples are 3 dB below its peak is no sweep, so the sweep itself is made
-// louder: every sample is below full scale in the end, the signal between them is not.
+// A tone at a quarter of the sampling rate whose samples are 3 dB below its peak is no sweep, so the sweep itself is
+// made louder: every sample is below full scale in the end, the signal between them is not.
 #[test]
 fn peaks_between_samples_are_named() {
     let mut take = Take::new(SweepShape::Linear);
@@ -377,8 +378,8 @@ fn offset_and_hum_are_harmless() {
     }
 }
 
-// Limits of the sweep inside of its fades: what is divided there is as exact as elsewhere. The response is limited to the
-// sweep's range, and its tapers of 250 Hz ring for 4 ms.
+// Limits of the sweep inside of its fades: what is divided there is as exact as elsewhere. The response is limited to
+// the sweep's range, and its tapers of 250 Hz ring for 4 ms.
 #[test]
 fn a_response_rings_before_its_arrival_as_its_taper_says() {
     for shape in SHAPES {

@@ -32,15 +32,17 @@ fn octaves_hz(rig: &Rig) -> impl Iterator<Item = f64> {
     OCTAVES_HZ.into_iter().filter(move |hz| sweep.contains(hz) && *hz < highest)
 }
 
-// The bands come first: the first side is held in memory, the other side streams.
+// The bands come first: the first side is held in memory, the other side streams. `unnest` keeps the optimizer from
+// computing the struct once for each of its columns.
 pub(super) fn view_sql(rig: &Rig) -> String {
     let octaves: String = octaves_hz(rig).map(|hz| format!(", ({hz:?})")).collect();
-    let columns: Vec<_> = COLUMNS.iter().map(|(name, ..)| format!("room['{name}'] AS {name}")).collect();
+    let columns: Vec<_> = COLUMNS.iter().map(|(name, ..)| format!("\"room.{name}\" AS {name}")).collect();
     format!(
         "SELECT surface_id, run_id, pair_id, microphone, speaker, midband_hz, {} FROM \
+         (SELECT surface_id, run_id, pair_id, microphone, speaker, midband_hz, unnest(room) FROM \
          (SELECT m.surface_id, m.run_id, m.pair_id, m.microphone, m.speaker, b.midband_hz, \
          CASE WHEN b.midband_hz IS NULL THEN room_parameters(m.ir) ELSE room_parameters(m.ir, b.midband_hz) END AS room \
-         FROM (VALUES (CAST(NULL AS DOUBLE)){octaves}) AS b(midband_hz) CROSS JOIN measurements m)",
+         FROM (VALUES (CAST(NULL AS DOUBLE)){octaves}) AS b(midband_hz) CROSS JOIN measurements m))",
         columns.join(", ")
     )
 }

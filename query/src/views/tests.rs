@@ -203,6 +203,8 @@ async fn room_parameters_have_a_row_an_octave_and_say_what_is_missing() {
     assert_eq!(reason, "it is 0.0 ms long after its arrival, of at least 50 ms");
     let plan = plan(&session, one).await;
     assert!(plan.contains("measurements/0002_0") && !plan.contains("measurements/0001_0"), "{plan}");
+    // In the logical plan and in the physical one.
+    assert_eq!(plan.matches("room_parameters(").count(), 4, "once of all frequencies, once of a band: {plan}");
 }
 
 #[tokio::test]

@@ -41,6 +41,23 @@ export function levelAt(data: Spectrogram, time: number, frequency_hz: number): 
   return low + (high - low) * (bin - below)
 }
 
+/** Sizes a canvas to the screen's pixels and fills it with paper; null if it cannot be drawn on. */
+export function beginPicture(
+  canvas: HTMLCanvasElement,
+  width: number,
+  height: number,
+): CanvasRenderingContext2D | null {
+  const context = canvas.getContext('2d')
+  if (!context) return null
+  const ratio = devicePixelRatio || 1
+  canvas.width = Math.round(width * ratio)
+  canvas.height = Math.round(height * ratio)
+  context.setTransform(ratio, 0, 0, ratio, 0, 0)
+  context.fillStyle = token('--paper')
+  context.fillRect(0, 0, width, height)
+  return context
+}
+
 /** Draws levels as colours, axes and colour key. */
 export function drawSpectrogram(
   canvas: HTMLCanvasElement,
@@ -49,14 +66,8 @@ export function drawSpectrogram(
   data: Spectrogram,
   axes: SpectrogramAxes,
 ): void {
-  const context = canvas.getContext('2d')
+  const context = beginPicture(canvas, width, height)
   if (!context) return
-  const ratio = devicePixelRatio || 1
-  canvas.width = Math.round(width * ratio)
-  canvas.height = Math.round(height * ratio)
-  context.setTransform(ratio, 0, 0, ratio, 0, 0)
-  context.fillStyle = token('--paper')
-  context.fillRect(0, 0, width, height)
   const ink = token('--ink')
   const inner = {
     width: Math.max(10, width - SPECTROGRAM_PAD.left - SPECTROGRAM_PAD.right),

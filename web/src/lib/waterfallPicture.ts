@@ -4,8 +4,10 @@ import { css, token, viridis } from './colour'
 import { plain } from './format'
 import { logTicks, ticks } from './plot'
 import {
+  beginPicture,
   frequencyAt,
   levelAt,
+  SPECTROGRAM_PAD,
   SPECTROGRAM_RANGE_DB,
   SPECTROGRAM_ROWS,
   type SpectrogramAxes,
@@ -13,7 +15,7 @@ import {
 
 /** Spectra that are drawn at most. */
 const MOST_SPECTRA = 32
-const PAD = { left: 52, right: 64, top: 10, bottom: 40 } as const
+const PAD = SPECTROGRAM_PAD
 /** Part of the width and of the height that the spectra move by. */
 const SHIFT = { across: 0.16, down: 0.45 } as const
 
@@ -39,14 +41,8 @@ export function drawWaterfall(
   data: Schemas['Spectrogram'],
   axes: SpectrogramAxes,
 ): void {
-  const context = canvas.getContext('2d')
+  const context = beginPicture(canvas, width, height)
   if (!context) return
-  const ratio = devicePixelRatio || 1
-  canvas.width = Math.round(width * ratio)
-  canvas.height = Math.round(height * ratio)
-  context.setTransform(ratio, 0, 0, ratio, 0, 0)
-  context.fillStyle = token('--paper')
-  context.fillRect(0, 0, width, height)
   const across = Math.max(10, width - PAD.left - PAD.right)
   const down = height - PAD.top - PAD.bottom
   const [long, tall] = [across * (1 - SHIFT.across), down * (1 - SHIFT.down)]

@@ -173,8 +173,8 @@ impl GroupRanges {
     }
 
     /// `count` reliefs. Each parameter has `count` values, a step from each other, which begin again at the range's low
-    /// end behind its high one; reliefs have them in any order. The same seed draws the same. If the seed of the wall is
-    /// not given, each relief has its own.
+    /// end behind its high one; reliefs have them in any order. The same seed draws the same. If the seed of the wall
+    /// is not given, each relief has its own.
     ///
     /// # Errors
     /// [`Error`], if a parameter is none of the relief's, or is refused.
