@@ -2,7 +2,9 @@
 
 use std::sync::Arc;
 
+use echolake_dsp::air_correction::SLOPE_UNCERTAINTY;
 use echolake_dsp::mean::SignalMean;
+use echolake_dsp::temperature::ReferenceAir;
 use echolake_dsp::uncertainty::{EnergySensitivity, LevelUncertainty};
 use echolake_lake::{EncodedFile, FileEncoder, Lake, encode_batches};
 use echolake_schema::AirTreatment;
@@ -189,7 +191,10 @@ impl ReferenceDerivation {
         let mut reflected = vec![0.0; response.length];
         let mut scratch = chosen.make_scratch();
         let measured = responses.pairs.iter().zip(responses.irs.chunks_exact(response.length)).zip(&responses.airs);
-        let mut warmer = SignalMean::default();
+        let reference = ReferenceAir::from_response(response);
+        // Of kelvins above Flat's air, and of logarithms of the ratio of speeds of sound by which times were corrected.
+        let mut pairs = 0.0;
+        let [mut warmer_sum, mut ln_ratio_sum] = [0.0; 2];
         for ((pair, ir), air) in measured {
             let (Some((direct, flat)), Some(paths)) = (chosen.of_pair(*pair), PairPaths::new(lake, *pair)) else {
                 continue;
@@ -197,18 +202,21 @@ impl ReferenceDerivation {
             chosen.subtract_direct(ir, direct, air, &paths, &mut reflected, &mut scratch).map_err(failed)?;
             let [direct_secs, reflected_secs] = paths.arrival_secs(lake.rig());
             fit.add_pair(&reflected, &direct.ir, direct_secs, reflected_secs).map_err(failed)?;
-            warmer.add_signal(&[(air.temperature_c - flat.air.temperature_c) as f32]).map_err(failed)?;
+            pairs += 1.0;
+            warmer_sum += air.temperature_c - flat.air.temperature_c;
+            ln_ratio_sum += reference.time_ratio(air).ln();
         }
         // Where energies are not corrected for the air, its difference to Flat's is part of their uncertainty.
-        let difference_k = match response.air {
-            AirTreatment::Complete => 0.0,
-            AirTreatment::Paper => warmer.mean_values().next().unwrap_or(0.0),
+        let [difference_k, correction] = match response.air {
+            AirTreatment::Complete => [0.0, 2.0 * SLOPE_UNCERTAINTY * ln_ratio_sum / pairs],
+            AirTreatment::Paper => [warmer_sum / pairs, 0.0],
         };
         let is_flat = self.references.only_flat.as_ref() == Some(&keys.surface);
         Ok(fit.finish().map(|run| LevelUncertainty {
             run,
             flat: (!is_flat).then_some(flat),
             temperature_k: response.temperature_u_k.hypot(difference_k),
+            correction,
         }))
     }
 }

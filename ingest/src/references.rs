@@ -26,7 +26,7 @@ use crate::pipeline::Cores;
 use crate::read_back;
 
 /// Revision of the rows that follow from references: those of another one are derived anew.
-const ROWS_REVISION: &str = "6";
+const ROWS_REVISION: &str = "7";
 /// Number of hex digits of a digest in a version.
 const VERSION_DIGITS: usize = 12;
 

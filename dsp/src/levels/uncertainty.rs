@@ -121,6 +121,8 @@ pub struct LevelUncertainty {
     pub flat: Option<DirectSoundResidual>,
     /// Standard uncertainty of the temperature of a run's air, K.
     pub temperature_k: f64,
+    /// Standard uncertainty of the run's energies by their correction to the reference air, relative to them.
+    pub correction: f64,
 }
 
 impl<T: RealSample> ResidualFit<T> {
@@ -327,7 +329,8 @@ impl LevelUncertainty {
     /// Combines the parts of an error to a standard uncertainty, dB.
     pub fn combine_db(&self, error: &LevelError) -> f64 {
         let temperature = error.own_per_kelvin.hypot(error.flat_per_kelvin) * self.temperature_k;
-        10.0 / LN_10 * (error.common.powi(2) + error.variance + temperature.powi(2)).sqrt()
+        let squares = error.common.powi(2) + error.variance + temperature.powi(2) + self.correction.powi(2);
+        10.0 / LN_10 * squares.sqrt()
     }
 }
 
@@ -440,7 +443,7 @@ mod tests {
             delay_square: 1.0,
             temperature: 0.001,
         };
-        let mut levels = LevelUncertainty { run: residual, flat: Some(residual), temperature_k: 0.1 };
+        let mut levels = LevelUncertainty { run: residual, flat: Some(residual), temperature_k: 0.1, correction: 0.0 };
         let error = levels.relative_error(&flat, &flat);
         assert!(error.common.abs() < 1e-15 && error.own_per_kelvin == 0.002, "{error:?}");
         let db = levels.level_db(&flat, &flat).expect("a level");

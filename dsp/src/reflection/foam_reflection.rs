@@ -29,6 +29,8 @@ const GATE_SECS: [f64; 2] = [0.2e-3, 0.2e-3];
 const FILTER_SECS: [f64; 2] = [-0.1e-3, 0.6e-3];
 /// Angles that have filters of their own, by the square of the sine.
 const CLASSES: [f64; 6] = [0.0, 0.15, 0.3, 0.45, 0.6, 0.75];
+/// Square of the sine that the last variant adds.
+const ADDED_SINE_SQUARE: f64 = 0.1;
 /// Least number of pairs for an estimate, and for a class of angles: one with fewer has no filter of its own.
 pub const LEAST_PAIRS: usize = 24;
 /// Most pairs that are fitted: with more, the estimate is no better.
@@ -100,7 +102,8 @@ pub struct FoamReflection {
 pub struct FoamReflectionEstimate {
     /// The estimate.
     pub best: FoamReflection,
-    /// Variants: without each part of the pairs, by the time between their arrivals; last, with half of the classes.
+    /// Variants: without each part of the pairs, by the time between their arrivals; last, as if the sound came less
+    /// steeply, because a panel's edges and a relief's faces reflect at other angles than its plane does.
     pub variants: Vec<FoamReflection>,
 }
 
@@ -174,12 +177,10 @@ impl FoamReflectionFit {
         let part_of = |number: usize| number * PARTS / pairs.len();
         let classes = supported_classes(&self.pairs);
         let taps = self.lead() + self.samples(FILTER_SECS[1]) + 1;
-        let mut coarse = NormalEquations::new(half_of_classes(&classes), taps);
         let mut parts = vec![NormalEquations::new(classes, taps); PARTS];
         for (number, pair) in pairs.iter().enumerate() {
             let products = self.tap_products(pair, taps);
             parts[part_of(number)].add_products(pair.path.sine_square(), &products);
-            coarse.add_products(pair.path.sine_square(), &products);
         }
         let delay = SignalDelay::new(2 * self.len);
         let mut waveform = vec![0.0; 2 * self.len];
@@ -188,17 +189,17 @@ impl FoamReflectionFit {
             if let Some(best) = &best {
                 waveform = self.direct_waveform(&pairs, best, &delay)?;
             }
-            parts.iter_mut().chain([&mut coarse]).for_each(|equations| equations.wanted.fill(0.0));
+            parts.iter_mut().for_each(|equations| equations.wanted.fill(0.0));
             for (number, pair) in pairs.iter().enumerate() {
                 let correlations = self.tap_correlations(pair, &waveform, taps, &delay)?;
                 parts[part_of(number)].add_correlations(pair.path.sine_square(), &correlations);
-                coarse.add_correlations(pair.path.sine_square(), &correlations);
             }
             best = Some(self.solve_equations(NormalEquations::sum_without(&parts, None))?);
         }
-        let without = (0..PARTS).map(|part| NormalEquations::sum_without(&parts, Some(part)));
-        let variants = without.chain([coarse]).map(|equations| self.solve_equations(equations));
-        Some(FoamReflectionEstimate { variants: variants.collect::<Option<_>>()?, best: best? })
+        let best = best?;
+        let without = (0..PARTS).map(|part| self.solve_equations(NormalEquations::sum_without(&parts, Some(part))));
+        let variants = without.chain([Some(best.at_higher_angles())]).collect::<Option<_>>()?;
+        Some(FoamReflectionEstimate { best, variants })
     }
 
     fn solve_equations(&self, equations: NormalEquations) -> Option<FoamReflection> {
@@ -305,13 +306,6 @@ fn supported_classes(pairs: &[FittedPair]) -> Vec<f64> {
     let most = counts.iter().copied().fold(0.0, f64::max);
     let supported = CLASSES.iter().zip(counts).filter(|(_, count)| *count >= most.min(LEAST_PAIRS as f64));
     supported.map(|(class, _)| *class).collect()
-}
-
-// Every second class, and the last of more than two.
-fn half_of_classes(classes: &[f64]) -> Vec<f64> {
-    let last = classes.len() - 1;
-    let kept = classes.iter().enumerate().filter(|(at, _)| at % 2 == 0 || *at == last && last > 1);
-    kept.map(|(_, class)| *class).collect()
 }
 
 // Indices and weights of the classes between which a value lies; beyond them all, the outermost alone.
@@ -445,6 +439,12 @@ impl FoamReflection {
         Ok(())
     }
 
+    // Every angle has the filter of a somewhat higher one.
+    fn at_higher_angles(&self) -> Self {
+        let classes = self.classes.iter().map(|sine_square| sine_square - ADDED_SINE_SQUARE).collect();
+        Self { classes, ..self.clone() }
+    }
+
     fn remove_reflection(&self, foam: &[f64], difference: &[f64], sine_square: f64) -> Vec<f64> {
         let [below, above] = class_weights(&self.classes, sine_square);
         let mut direct = foam.to_vec();
@@ -459,15 +459,15 @@ impl FoamReflection {
 }
 
 /// Computes the standard error of a value of the best estimate from its values of the variants: that of leaving out
-/// parts (jackknife), and the difference that half of the classes make. NaN without variants.
+/// parts (jackknife), and the difference that another angle makes. NaN without variants.
 ///
 /// Source: Efron & Stein 1981, Annals of Statistics 9(3), 586-596, for the jackknife.
 pub fn estimate_error(best: f64, variants: &[f64]) -> f64 {
-    let Some((coarse, parts)) = variants.split_last() else { return f64::NAN };
+    let Some((moved, parts)) = variants.split_last() else { return f64::NAN };
     let count = parts.len() as f64;
     let mean = parts.iter().sum::<f64>() / count;
     let variance = (count - 1.0) / count * parts.iter().map(|x| (x - mean).powi(2)).sum::<f64>();
-    variance.sqrt().hypot(coarse - best)
+    variance.sqrt().hypot(moved - best)
 }
 
 #[cfg(test)]
@@ -534,11 +534,11 @@ mod tests {
             let [truth, _] = responses(path, &[]);
             let mut found = vec![f64::NAN; LEN];
             estimate.best.direct_sound(&foam, &flat, path.incidence_deg, &mut found).expect("lengths");
-            let mut coarse = found.clone();
+            let mut moved = found.clone();
             let variant = estimate.variants.last().expect("variants");
-            variant.direct_sound(&foam, &flat, path.incidence_deg, &mut coarse).expect("lengths");
+            variant.direct_sound(&foam, &flat, path.incidence_deg, &mut moved).expect("lengths");
             let errors =
-                [energy(&flat, &truth), energy(&foam, &truth), energy(&found, &truth), energy(&coarse, &found)];
+                [energy(&flat, &truth), energy(&foam, &truth), energy(&found, &truth), energy(&moved, &found)];
             sums.iter_mut().zip(errors).for_each(|(sum, error)| *sum += error);
         }
         sums
@@ -546,9 +546,9 @@ mod tests {
 
     #[test]
     fn the_direct_sound_of_every_pair_is_found_though_foam_reflects_by_the_angle() {
-        let [_, before, after, coarse] = errors(|path| foam_layers(path).to_vec());
+        let [_, before, after, moved] = errors(|path| foam_layers(path).to_vec());
         assert!(after < 2.5e-3 * before, "{} dB of Foam's reflection is left", 10.0 * (after / before).log10());
-        assert!(coarse > 0.0 && coarse < 0.1 * before, "{coarse} of {before}");
+        assert!(moved > after && moved < 0.1 * before, "{moved} of {before}");
     }
 
     #[test]

@@ -109,16 +109,17 @@ fn p90_mean_uncertainty(values: &[f64], errors: &[LevelError], uncertainty: &Lev
     let mut sorted: Vec<f64> = values.iter().copied().filter(|x| x.is_finite()).collect();
     sorted.sort_by(f64::total_cmp);
     let limit = percentile(&sorted, 90.0);
-    let mut sum = 0.0;
+    let counted = values.iter().zip(errors).filter(|(value, _)| **value > 0.0 && **value <= limit);
+    let sum: f64 = counted.clone().map(|(value, _)| value).sum();
     let mut mean = LevelError::default();
-    for (value, error) in values.iter().zip(errors).filter(|(value, _)| **value > 0.0 && **value <= limit) {
-        sum += value;
-        mean.common += value * error.common;
-        mean.variance += value * value * error.variance;
-        mean.own_per_kelvin += value * error.own_per_kelvin;
-        mean.flat_per_kelvin += value * error.flat_per_kelvin;
+    for (value, error) in counted {
+        let share = value / sum;
+        mean.common += share * error.common;
+        mean.variance += share * share * error.variance;
+        mean.own_per_kelvin += share * error.own_per_kelvin;
+        mean.flat_per_kelvin += share * error.flat_per_kelvin;
     }
-    finite_value(uncertainty.combine_db(&mean) / sum)
+    (sum > 0.0).then(|| uncertainty.combine_db(&mean)).and_then(finite_value)
 }
 
 fn standard_deviation(levels: &[f64]) -> Option<f64> {
@@ -144,14 +145,19 @@ mod tests {
 
     #[test]
     fn common_errors_stay_in_the_mean_and_others_average_out() {
-        let uncertainty = LevelUncertainty { run: DirectSoundResidual::default(), flat: None, temperature_k: 0.1 };
-        let u =
-            |error: LevelError| p90_mean_uncertainty(&[0.5; 100], &[error; 100], &uncertainty).expect("an uncertainty");
+        let run = DirectSoundResidual::default();
+        let mut uncertainty = LevelUncertainty { run, flat: None, temperature_k: 0.1, correction: 0.0 };
+        let of = |error: LevelError, uncertainty: &LevelUncertainty| {
+            p90_mean_uncertainty(&[0.5; 100], &[error; 100], uncertainty).expect("an uncertainty")
+        };
+        let u = |error| of(error, &uncertainty);
         assert!((u(LevelError { common: 0.01, ..LevelError::default() }) - 0.0434).abs() < 1e-4);
         assert!((u(LevelError { variance: 1e-4, ..LevelError::default() }) - 0.00434).abs() < 1e-5);
         let slopes = LevelError { own_per_kelvin: 0.03, flat_per_kelvin: 0.04, ..LevelError::default() };
         assert!((u(slopes) - 0.0217).abs() < 1e-4);
         assert_eq!(p90_mean_uncertainty(&[0.5; 100], &[], &uncertainty), None);
+        uncertainty.correction = 0.01;
+        assert!((of(LevelError::default(), &uncertainty) - 0.0434).abs() < 1e-4);
     }
 
     #[test]
