@@ -65,7 +65,11 @@ async fn rig_or(file: Option<&Path>, lake_url: &str, otherwise: impl FnOnce() ->
     if let Some(file) = file {
         let text =
             std::fs::read_to_string(file).with_context(|| format!("cannot read rig file `{}`", file.display()))?;
-        return Rig::from_toml(&text).with_context(|| format!("rig file `{}`", file.display()));
+        let rig = Rig::from_toml(&text).with_context(|| format!("rig file `{}`", file.display()))?;
+        if rig.validation.loopback_dbfs.is_some() {
+            eprintln!("note: rig file `{}`: `validation.loopback_dbfs` is ignored: remove it", file.display());
+        }
+        return Ok(rig);
     }
     match Lake::open(lake_url).await {
         Ok(lake) => Ok(lake.rig().clone()),

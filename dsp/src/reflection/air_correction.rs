@@ -18,8 +18,8 @@ use crate::{Error, RealSample};
 const NEPER_PER_DB: f64 = LN_10 / 20.0;
 
 /// Standard uncertainty of the slope of reflected sound, d ln(amplitude) / d ln(frequency): a relief's sound leaves the
-/// speaker in other directions than Flat's, of which the slope is learned. It is the rms error at 40 kHz of three panels in runs
-/// of the simulated rig at 18 to 25 C (`tests/numbers/repeated_runs.py`), the greatest of all bands; the least is 0.1.
+/// speaker in other directions than Flat's, of which the slope is learned. It is the rms error of three panels in runs
+/// of the simulated rig at 18 to 25 C (`tests/numbers/repeated_runs.py`) at 40 kHz; in other bands that is 0.1 to 0.3.
 pub const SLOPE_UNCERTAINTY: f64 = 0.4;
 
 /// Half of the width that slopes are smoothed over, as a ratio of frequencies: a third of an octave in all.

@@ -30,7 +30,7 @@ const FILTER_SECS: [f64; 2] = [-0.1e-3, 0.6e-3];
 /// Angles that have filters of their own, by the square of the sine.
 const CLASSES: [f64; 6] = [0.0, 0.15, 0.3, 0.45, 0.6, 0.75];
 /// Square of the sine that the last variant adds.
-const ADDED_SINE_SQUARE: f64 = 0.1;
+const ADDED_SINE_SQUARE: f64 = 0.03;
 /// Least number of pairs for an estimate, and for a class of angles: one with fewer has no filter of its own.
 pub const LEAST_PAIRS: usize = 24;
 /// Most pairs that are fitted: with more, the estimate is no better.
