@@ -47,7 +47,7 @@ pub use deconvolution::response_deconvolution;
 pub use error::Error;
 pub use levels::{
     decay, diffusion, energy, envelope, filter_bank, frequency_response, level, mean, octave_filter, oversampling,
-    rise, room_parameters, spectrogram, spectrum, uncertainty,
+    rise, room_parameters, rounding, spectrogram, spectrum, uncertainty,
 };
 pub use real::RealSample;
 pub use reflection::{air, air_correction, arrival, foam, foam_reflection, fresnel, geometry, kirchhoff};

@@ -95,7 +95,7 @@ impl ReferenceDerivation {
             }
             errors.iter_mut().zip(slice.error_columns()).for_each(|(all, some)| all.extend(some));
             let [nce, tnce, tnce_d4] = &mut encoders;
-            let lists = slice.take_lists();
+            let lists = slice.take_lists(lake.config().samples);
             lists.add_curves(rig.impulse_response.length, &mut curves).map_err(failed)?;
             // Lists take most of the time; an idle core can encode the rest meanwhile.
             let (first, second) = rayon::join(

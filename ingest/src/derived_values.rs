@@ -7,8 +7,10 @@ use echolake_dsp::air_correction::AirCorrectionFit;
 use echolake_dsp::chain::{DerivationPlan, DerivedResponse, FlatEnergies};
 use echolake_dsp::mean::SignalMean;
 use echolake_dsp::rise::CurveShape;
+use echolake_dsp::rounding::round_samples;
 use echolake_dsp::temperature::ReferenceAir;
 use echolake_dsp::uncertainty::{EnergySensitivity, LevelError, LevelUncertainty, ResidualFit};
+use echolake_lake::SamplePrecision;
 use echolake_schema::Rig;
 
 /// Mean impulse response of each pair of a reference.
@@ -144,12 +146,19 @@ impl DerivedRows {
     }
 
     /// Moves out the responses and curves, which are empty afterwards.
-    pub fn take_lists(&mut self) -> DerivedLists {
-        DerivedLists {
+    pub fn take_lists(&mut self, precision: SamplePrecision) -> DerivedLists {
+        let mut lists = DerivedLists {
             pairs: self.pairs.clone(),
             reflected: std::mem::take(&mut self.reflected),
             curves: std::mem::take(&mut self.curves),
+        };
+        if precision == SamplePrecision::Rounded {
+            for samples in lists.curves.iter_mut().chain([&mut lists.reflected]) {
+                let length = samples.len() / self.pairs.len().max(1);
+                samples.chunks_exact_mut(length.max(1)).for_each(round_samples);
+            }
         }
+        lists
     }
 
     /// Returns the values of every column from `tnce_*` to `energy_total`, by its name.

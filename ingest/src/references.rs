@@ -10,7 +10,7 @@ use echolake_dsp::foam_reflection::{FoamReflection, FoamReflectionFit, Reflectio
 use echolake_dsp::geometry::{direct_mm, image_mm, incidence_deg};
 use echolake_dsp::temperature::ReferenceAir;
 use echolake_dsp::uncertainty::{DirectSoundResidual, EnergySensitivity};
-use echolake_lake::{DataFile, DirectSound, FileName, Lake, LakeSnapshot, ReferenceSurfaces};
+use echolake_lake::{DataFile, DirectSound, FileName, Lake, LakeSnapshot, ReferenceSurfaces, SamplePrecision};
 use echolake_schema::tables::Table;
 use echolake_schema::{AirTreatment, PairId, Rig, SurfaceId, SurfaceRecord};
 use futures::future::try_join_all;
@@ -26,7 +26,7 @@ use crate::pipeline::Cores;
 use crate::read_back;
 
 /// Revision of the rows that follow from references: those of another one are derived anew.
-const ROWS_REVISION: &str = "7";
+const ROWS_REVISION: &str = "8";
 /// Number of hex digits of a digest in a version.
 const VERSION_DIGITS: usize = 12;
 
@@ -106,6 +106,7 @@ pub(crate) struct WantedReferences {
     /// Flat's own Foam.
     flat_foam: ReferenceVersion,
     direct_sound: DirectSound,
+    samples: SamplePrecision,
 }
 
 /// One reference.
@@ -157,6 +158,7 @@ impl ReferenceFinder {
             foam: self.find_version(foam),
             flat_foam: self.find_version(flat_foam),
             direct_sound: self.lake.config().references.direct_sound,
+            samples: self.lake.config().samples,
         }
     }
 
@@ -435,7 +437,10 @@ impl WantedReferences {
     /// Returns the derivation's name for a run with these references.
     pub fn derivation_name(&self, run_derivation: &str) -> Option<String> {
         let (flat, foam) = self.version_pair()?;
-        Some(digest_parts(&[run_derivation, &flat, &foam, CODE_VERSION, ROWS_REVISION, self.direct_sound.name()]))
+        let settings = [self.direct_sound.name(), self.samples.name()];
+        Some(digest_parts(
+            &[[run_derivation, &flat, &foam, CODE_VERSION, ROWS_REVISION].as_slice(), &settings].concat(),
+        ))
     }
 
     /// Returns the names of the missing references, for messages.

@@ -14,6 +14,9 @@ pub const LAKE_FORMAT: u32 = 1;
 pub struct LakeConfig {
     /// The lake's format.
     pub format: u32,
+    /// Precision of reflected responses and curves.
+    #[serde(default, skip_serializing_if = "SamplePrecision::is_default")]
+    pub samples: SamplePrecision,
     /// References of surfaces that name none of their own.
     pub references: ReferenceSurfaces,
     /// The rig that all of its runs share.
@@ -42,6 +45,31 @@ pub enum DirectSound {
     Foam,
     /// Foam's response without Foam's reflection, which is estimated from Foam and Flat.
     Estimated,
+}
+
+/// Precision of the reflected responses and curves in table `nce`.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum SamplePrecision {
+    /// Rounded, so that they take two thirds of the space.
+    #[default]
+    Rounded,
+    /// As computed.
+    Exact,
+}
+
+impl SamplePrecision {
+    /// Its name, as `lake.toml` spells it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Rounded => "rounded",
+            Self::Exact => "exact",
+        }
+    }
+
+    fn is_default(&self) -> bool {
+        *self == Self::default()
+    }
 }
 
 impl DirectSound {
@@ -97,12 +125,18 @@ mod tests {
 
     #[test]
     fn config_round_trips() {
-        let config = LakeConfig { format: LAKE_FORMAT, references: ReferenceSurfaces::default(), rig: Rig::paper() };
+        let config = LakeConfig {
+            format: LAKE_FORMAT,
+            samples: SamplePrecision::default(),
+            references: ReferenceSurfaces::default(),
+            rig: Rig::paper(),
+        };
         let text = config.to_toml().expect("text");
         assert_eq!(LakeConfig::from_toml(&text, "x").expect("the same"), config);
         let estimated = text.replace("foam = \"foam\"\n", "foam = \"foam\"\ndirect_sound = \"estimated\"\n");
-        let config = LakeConfig::from_toml(&estimated, "x").expect("a choice");
+        let config = LakeConfig::from_toml(&format!("samples = \"exact\"\n{estimated}"), "x").expect("a choice");
         assert_eq!(config.references.direct_sound, DirectSound::Estimated);
+        assert_eq!(config.samples, SamplePrecision::Exact);
         assert_eq!(LakeConfig::from_toml(&config.to_toml().expect("text"), "x").expect("the same"), config);
     }
 

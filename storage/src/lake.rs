@@ -20,7 +20,7 @@ use crate::remote::{BlockCache, BlockFolder, CacheCounters, CacheCounts, CacheFo
 #[cfg(feature = "tables")]
 use crate::tables::{DeltaLog, ProjectLog};
 use crate::unused;
-use crate::{Error, LAKE_FORMAT, LakeConfig, ReferenceSurfaces, Result};
+use crate::{Error, LAKE_FORMAT, LakeConfig, ReferenceSurfaces, Result, SamplePrecision};
 
 /// A lake. Cheap to clone.
 #[derive(Debug, Clone)]
@@ -134,7 +134,8 @@ impl Lake {
     async fn change_rig(&self, rig: &Rig) -> Result<Self> {
         unused::delete_tables(self).await?;
         let references = self.config().references.clone();
-        let config = LakeConfig { format: LAKE_FORMAT, references, rig: rig.clone() };
+        let config =
+            LakeConfig { format: LAKE_FORMAT, samples: SamplePrecision::default(), references, rig: rig.clone() };
         let failed = |e| Error::store_failure("write", object_text(self.location(), CONFIG), e);
         self.store().put(&Path::from(CONFIG), config.to_toml()?.into()).await.map_err(failed)?;
         Self::from_config(self.0.location.clone(), config)
@@ -359,7 +360,12 @@ async fn create_config(location: &LakeLocation, rig: &Rig, references: &Referenc
     }
     #[cfg(feature = "remote")]
     location.ensure_exclusive().await?;
-    let config = LakeConfig { format: LAKE_FORMAT, references: references.clone(), rig: rig.clone() };
+    let config = LakeConfig {
+        format: LAKE_FORMAT,
+        samples: SamplePrecision::default(),
+        references: references.clone(),
+        rig: rig.clone(),
+    };
     let text = config.to_toml()?;
     match location.store.put_opts(&Path::from(CONFIG), text.into(), PutMode::Create.into()).await {
         Ok(_) => Ok(config),

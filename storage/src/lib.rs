@@ -35,7 +35,7 @@ mod unused;
 #[cfg(feature = "remote")]
 mod upload;
 
-pub use config::{DirectSound, LAKE_FORMAT, LakeConfig, ReferenceSurfaces};
+pub use config::{DirectSound, LAKE_FORMAT, LakeConfig, ReferenceSurfaces, SamplePrecision};
 pub use error::{Error, StoreError};
 pub use folder_listing::{FolderListing, UnusableEntry};
 pub use lake::Lake;

@@ -13,6 +13,7 @@ pub mod octave_filter;
 pub mod oversampling;
 pub mod rise;
 pub mod room_parameters;
+pub mod rounding;
 pub mod spectrogram;
 pub mod spectrum;
 pub mod uncertainty;

@@ -537,8 +537,7 @@ mod tests {
             let mut moved = found.clone();
             let variant = estimate.variants.last().expect("variants");
             variant.direct_sound(&foam, &flat, path.incidence_deg, &mut moved).expect("lengths");
-            let errors =
-                [energy(&flat, &truth), energy(&foam, &truth), energy(&found, &truth), energy(&moved, &found)];
+            let errors = [energy(&flat, &truth), energy(&foam, &truth), energy(&found, &truth), energy(&moved, &found)];
             sums.iter_mut().zip(errors).for_each(|(sum, error)| *sum += error);
         }
         sums

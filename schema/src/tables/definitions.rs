@@ -207,9 +207,16 @@ pub(super) fn measurement_columns() -> Vec<Column> {
 
 pub(super) fn nce_columns(bands: &[String]) -> Vec<Column> {
     let mut columns = pair_keys();
-    columns.push(Column::floats("reflected_ir", "1", "Impulse response with Foam's subtracted"));
+    columns.push(Column::floats(
+        "reflected_ir",
+        "1",
+        "Impulse response with Foam's subtracted; rounded to 2^-18 of its greatest sample, unless lake.toml says exact",
+    ));
     columns.extend(bands.iter().map(|band| {
-        let comment = format!("Cumulative energy of the band at {band} Hz over Flat's total energy, along time");
+        let comment = format!(
+            "Cumulative energy of the band at {band} Hz over Flat's total energy, along time; rounded to 2^-18 of its last \
+             value, unless lake.toml says exact"
+        );
         Column::floats(format!("nce_{band}"), "1", comment)
     }));
     columns.extend(reference_columns());
