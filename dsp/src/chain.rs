@@ -1,6 +1,7 @@
 //! The kernels in their order, planned once: recording to response, and response to curves and energies.
 
 use echolake_schema::SpectralDivision;
+use realfft::num_complex::Complex;
 
 use crate::air::AirState;
 use crate::deconvolution::{DeconvolutionParams, TransformLength};
@@ -308,17 +309,11 @@ impl<T: RealSample> DerivationPlan<T> {
         Ok(())
     }
 
-    /// Computes only the energies of what a surface reflected: `energies[band]`.
+    /// Computes only the energies of what a surface reflected from its spectrum, and returns that of all bins.
     ///
-    /// # Errors
-    /// [`Error::Length`] or [`Error::NotFinite`].
-    pub fn reflected_energies(
-        &self,
-        reflected: &[T],
-        energies: &mut [f64],
-        scratch: &mut DerivationScratch<T>,
-    ) -> Result<(), Error> {
-        self.bank.compute_energies(reflected, energies, &mut scratch.bank)
+    /// spectrum  `[ir_len / 2 + 1]`, energies `[bands]`
+    pub fn spectrum_energies(&self, spectrum: &[Complex<T>], energies: &mut [f64]) -> f64 {
+        self.bank.spectrum_energies(spectrum, energies)
     }
 
     /// Computes what errors of the direct sound, and warmer air by its relative change of each bin, do to the energies
@@ -363,8 +358,6 @@ fn put_over<T: RealSample>(flat: &FlatEnergies, bands: &[T], derived: &mut Deriv
 
 #[cfg(test)]
 mod tests {
-    use realfft::num_complex::Complex;
-
     use echolake_schema::AirTreatment;
 
     use super::*;
@@ -547,7 +540,11 @@ mod tests {
             plan.run_over(&reflected, &energies, &mut again, &mut scratch).expect("derived");
             assert_eq!(once, again);
             let mut energies = [f64::NAN; 5];
-            plan.reflected_energies(&reflected, &mut energies, &mut scratch).expect("energies");
+            let forward = f32::plan_real_forward(384);
+            let mut spectrum = forward.make_output_vec();
+            forward.process(&mut reflected.clone(), &mut spectrum).expect("a spectrum");
+            let total = plan.spectrum_energies(&spectrum, &mut energies);
+            assert!((total / energy(&reflected) - 1.0).abs() < 1e-5);
             // The sum over bins and the sum over samples, in single precision.
             let alike = |(a, b): (&f64, &f64)| (a / b - 1.0).abs() < 1e-5;
             assert!(energies.iter().zip(&once.energies).all(alike), "{energies:?} {:?}", once.energies);

@@ -50,6 +50,7 @@ pub use levels::{
     rise, room_parameters, rounding, spectrogram, spectrum, uncertainty,
 };
 pub use real::RealSample;
+pub use realfft::num_complex::Complex;
 pub use reflection::{air, air_correction, arrival, foam, foam_reflection, fresnel, geometry, kirchhoff};
 pub use relief::{height_field, heights};
 pub use similarity::{components, correlation, self_organising_map, significance};

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use echolake_dsp::Complex;
 use echolake_dsp::air_correction::SLOPE_UNCERTAINTY;
 use echolake_dsp::mean::SignalMean;
 use echolake_dsp::temperature::ReferenceAir;
@@ -81,8 +82,7 @@ impl ReferenceDerivation {
         let mut encoders =
             [Table::Nce, Table::Tnce, Table::TnceD4].map(|table| (table, FileEncoder::new(table, table.schema(rig))));
         let mut totals: Vec<Vec<f64>> = vec![Vec::new(); rig.bands.centres_hz.len() + 1];
-        let estimates = self.references.estimated.as_ref().map_or(0, |estimated| estimated.all().count());
-        let mut unbiased = vec![totals.clone(); estimates];
+        let mut unbiased = vec![totals.clone(); self.references.estimate_count()];
         let mut errors = vec![Vec::new(); totals.len()];
         let mut curves = vec![SignalMean::default(); rig.bands.centres_hz.len()];
         let mut paired = 0;
@@ -133,11 +133,12 @@ impl ReferenceDerivation {
         let length = rig.impulse_response.length;
         let failed = |cause| Error::Kernel { file: keys.run.to_string(), cause };
         let plan = derivation_plan(rig).map_err(failed)?;
-        let LoadedReferences { chosen, estimated, .. } = &self.references;
+        let chosen = &self.references.chosen;
         let mut scratch = plan.make_scratch();
         let mut air_scratch = chosen.make_scratch();
         let mut derived = plan.make_derived();
         let mut reflected = vec![0.0; length];
+        let mut spectrum = vec![Complex::default(); length / 2 + 1];
         let mut energies = vec![0.0; bands];
         let mut sensitivities = vec![EnergySensitivity::default(); bands];
         let slices = responses.pairs.chunks(SLICE).zip(responses.irs.chunks(SLICE * length));
@@ -161,14 +162,10 @@ impl ReferenceDerivation {
                     .map_err(failed)?;
                     slice.push_errors(uncertainty, &sensitivities, flat);
                 }
-                let Some(estimated) = estimated else { continue };
-                for (number, references) in estimated.all().enumerate() {
-                    let Some((direct, flat)) = references.of_pair(*pair) else { continue };
-                    references
-                        .subtract_direct(ir, direct, air, &paths, &mut reflected, &mut air_scratch)
-                        .map_err(failed)?;
-                    plan.reflected_energies(&reflected, &mut energies, &mut scratch).map_err(failed)?;
-                    slice.push_unbiased(number, &energies, &flat.energies);
+                for (number, unbiased) in self.references.unbiased_pair(*pair).iter().enumerate() {
+                    chosen.reflected_spectrum(&unbiased.direct, &mut spectrum, &air_scratch);
+                    plan.spectrum_energies(&spectrum, &mut energies);
+                    slice.push_unbiased(number, &energies, unbiased.flat_total);
                 }
             }
             take(&mut slice)?;

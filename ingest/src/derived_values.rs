@@ -130,9 +130,9 @@ impl DerivedRows {
     }
 
     /// Appends the TNCE of one measurement without Foam's reflection, by the estimate of this number.
-    pub fn push_unbiased(&mut self, estimate: usize, energies: &[f64], flat: &FlatEnergies) {
+    pub fn push_unbiased(&mut self, estimate: usize, energies: &[f64], flat_total: f64) {
         self.unbiased.resize(self.unbiased.len().max(estimate + 1), Vec::new());
-        self.unbiased[estimate].extend(energies.iter().map(|energy| energy / flat.total));
+        self.unbiased[estimate].extend(energies.iter().map(|energy| energy / flat_total));
     }
 
     /// Appends the errors of one measurement from its sensitivities and Flat's.

@@ -3,6 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 
+use echolake_dsp::Complex;
 use echolake_dsp::air::AirState;
 use echolake_dsp::air_correction::{AirCorrection, AirScratch, PairAir};
 use echolake_dsp::foam::subtract_foam;
@@ -12,8 +13,9 @@ use echolake_dsp::temperature::ReferenceAir;
 use echolake_dsp::uncertainty::{DirectSoundResidual, EnergySensitivity};
 use echolake_lake::{DataFile, DirectSound, FileName, Lake, LakeSnapshot, ReferenceSurfaces, SamplePrecision};
 use echolake_schema::tables::Table;
-use echolake_schema::{AirTreatment, PairId, Rig, SurfaceId, SurfaceRecord};
+use echolake_schema::{PairId, Rig, SurfaceId, SurfaceRecord};
 use futures::future::try_join_all;
+use rayon::iter::{IntoParallelRefIterator as _, ParallelIterator as _};
 use sha2::{Digest as _, Sha256};
 use tokio::sync::Mutex;
 
@@ -51,30 +53,35 @@ pub(crate) struct ReferenceResponses {
     /// Residual of Flat; None if it cannot be measured.
     pub flat_residual: Option<DirectSoundResidual>,
     correction: Arc<AirCorrection<f32>>,
-    treatment: AirTreatment,
 }
 
 /// References as the lake subtracts them, and those without Foam's reflection.
 #[derive(Clone)]
 pub(crate) struct LoadedReferences {
     pub chosen: ReferenceResponses,
-    /// None if Foam's reflection cannot be estimated: few pairs, or arrivals that are not apart.
-    pub estimated: Option<EstimatedReferences>,
+    /// By pair; empty if Foam's reflection cannot be estimated: few pairs, or arrivals that are not apart.
+    unbiased: Arc<HashMap<u32, Vec<UnbiasedPair>>>,
     /// The surface whose only run Flat's energies are from.
     pub only_flat: Option<SurfaceId>,
 }
 
-/// References without Foam's reflection, and variants of them, whose differences show the estimate's error.
-#[derive(Clone)]
-pub(crate) struct EstimatedReferences {
-    pub best: ReferenceResponses,
-    variants: Arc<[ReferenceResponses]>,
+/// A pair's references without Foam's reflection, by one estimate of it.
+pub(crate) struct UnbiasedPair {
+    /// Spectrum of the direct sound, `[length / 2 + 1]`.
+    pub direct: Vec<Complex<f32>>,
+    /// Energy of what Flat reflects.
+    pub flat_total: f64,
 }
 
-impl EstimatedReferences {
-    /// Returns the best estimate, then its variants.
-    pub fn all(&self) -> impl Iterator<Item = &ReferenceResponses> {
-        [&self.best].into_iter().chain(self.variants.iter())
+impl LoadedReferences {
+    /// Returns a pair's references by the best estimate, then by variants of it, whose differences show its error.
+    pub fn unbiased_pair(&self, pair: u32) -> &[UnbiasedPair] {
+        self.unbiased.get(&pair).map_or(&[], Vec::as_slice)
+    }
+
+    /// Returns the number of estimates, 0 if there is none.
+    pub fn estimate_count(&self) -> usize {
+        self.unbiased.values().next().map_or(0, Vec::len)
     }
 }
 
@@ -182,22 +189,24 @@ impl ReferenceFinder {
         let lake = self.lake.clone();
         let is_foam_chosen = wanted.direct_sound == DirectSound::Foam;
         let derive = move || {
-            let of_foam = || ReferenceResponses::new(&lake, foam.clone(), &flat, &flat_foam);
-            rayon::join(
-                || is_foam_chosen.then(of_foam).transpose(),
-                || estimate_references(&lake, &flat, &flat_foam, &foam),
-            )
+            let reflections = estimate_reflections(&lake, &flat, &flat_foam)?;
+            let chosen = match reflections.first() {
+                _ if is_foam_chosen => ReferenceResponses::new(&lake, foam.clone(), &flat, &flat_foam)?,
+                Some(best) => {
+                    let direct = Arc::new(remove_reflection(&lake, best, &foam, &flat)?);
+                    ReferenceResponses::new(&lake, direct, &flat, &remove_reflection(&lake, best, &flat_foam, &flat)?)?
+                }
+                None => return Ok(None),
+            };
+            let unbiased = chosen.unbiased_pairs(&lake, &reflections, [&foam, &flat_foam], &flat)?;
+            Ok::<_, Error>(Some((chosen, Arc::new(unbiased))))
         };
-        let (of_foam, estimated) = cores.compute_on_core(derive).await;
-        let of_foam = of_foam?;
-        let estimated = estimated?;
-        let chosen =
-            of_foam.or_else(|| estimated.as_ref().map(|estimated| estimated.best.clone())).ok_or_else(|| {
-                Error::FoamReflection { foam: wanted.foam.surface.to_string(), flat: wanted.flat.surface.to_string() }
-            })?;
+        let [foam_name, flat_name] = [&wanted.foam, &wanted.flat].map(|of| of.surface.to_string());
+        let found = cores.compute_on_core(derive).await?;
+        let (chosen, unbiased) = found.ok_or(Error::FoamReflection { foam: foam_name, flat: flat_name })?;
         let flat_runs = self.snapshot.runs().filter(|run| run.surface == wanted.flat.surface).count();
         let only_flat = (flat_runs == 1).then(|| wanted.flat.surface.clone());
-        let loaded = LoadedReferences { chosen, estimated, only_flat };
+        let loaded = LoadedReferences { chosen, unbiased, only_flat };
         self.loaded.insert(versions, loaded.clone());
         Ok(Some(loaded))
     }
@@ -282,13 +291,8 @@ impl ReferenceResponses {
             subtract_foam(&flat.ir, &direct.ir, &mut reflected);
             fit.add_pair(&direct.ir, &reflected, [paths.direct_m, paths.reflected_m]).map_err(kernel_error)?;
         }
-        let mut references = Self {
-            direct,
-            flat: Arc::default(),
-            flat_residual: None,
-            correction: Arc::new(fit.finish()),
-            treatment: rig.impulse_response.air,
-        };
+        let mut references =
+            Self { direct, flat: Arc::default(), flat_residual: None, correction: Arc::new(fit.finish()) };
         let mut air_scratch = references.make_scratch();
         let mut residual = residual_fit(rig).map_err(kernel_error)?;
         let mut pairs = FlatPairs::with_capacity(flat.len());
@@ -330,13 +334,53 @@ impl ReferenceResponses {
         reflected: &mut [f32],
         scratch: &mut AirScratch<f32>,
     ) -> std::result::Result<(), echolake_dsp::Error> {
-        if self.treatment == AirTreatment::Paper {
-            subtract_foam(ir, &direct.ir, reflected);
-            return Ok(());
+        self.correction.subtract_direct(ir, &direct.ir, &paths.in_air(air, &direct.air), reflected, scratch)
+    }
+
+    /// Computes the spectrum of what a surface reflects from the response that [`Self::subtract_direct`] took last.
+    pub fn reflected_spectrum(
+        &self,
+        direct: &[Complex<f32>],
+        reflected: &mut [Complex<f32>],
+        scratch: &AirScratch<f32>,
+    ) {
+        self.correction.reflected_spectrum(direct, reflected, scratch);
+    }
+
+    // For each pair that Flat and both Foams have, its references by each estimate.
+    fn unbiased_pairs(
+        &self,
+        lake: &Lake,
+        reflections: &[FoamReflection],
+        [foam, flat_foam]: [&Arc<MeanResponses>; 2],
+        flat: &MeanResponses,
+    ) -> Result<HashMap<u32, Vec<UnbiasedPair>>> {
+        if reflections.is_empty() {
+            return Ok(HashMap::new());
         }
-        let PairPaths { direct_m, reflected_m, .. } = *paths;
-        let pair = PairAir { response: *air, direct: direct.air, direct_m, reflected_m };
-        self.correction.subtract_direct(ir, &direct.ir, &pair, reflected, scratch)
+        let plan = derivation_plan(lake.rig()).map_err(kernel_error)?;
+        let bands = lake.rig().bands.centres_hz.len();
+        let of_pair = |scratch: &mut AirScratch<f32>, (pair, flat): (&u32, &MeanResponse)| {
+            let (Some(own), Some(flat_foam), Some(paths)) =
+                (foam.get(pair), flat_foam.get(pair), PairPaths::new(lake, *pair))
+            else {
+                return Ok(None);
+            };
+            let mut direct = vec![0.0; flat.ir.len()];
+            let mut reflected = vec![Complex::default(); flat.ir.len() / 2 + 1];
+            self.correction.take_response(&flat.ir, &paths.in_air(&flat.air, &flat_foam.air), scratch)?;
+            let unbiased = reflections.iter().map(|reflection| {
+                reflection.direct_sound(&flat_foam.ir, &flat.ir, paths.incidence_deg, &mut direct)?;
+                let of_flat = self.correction.compute_spectrum(&direct, scratch)?;
+                self.correction.reflected_spectrum(&of_flat, &mut reflected, scratch);
+                let flat_total = plan.spectrum_energies(&reflected, &mut vec![0.0; bands]);
+                reflection.direct_sound(&own.ir, &flat.ir, paths.incidence_deg, &mut direct)?;
+                Ok(UnbiasedPair { direct: self.correction.compute_spectrum(&direct, scratch)?, flat_total })
+            });
+            Ok(Some((*pair, unbiased.collect::<std::result::Result<_, _>>()?)))
+        };
+        let pairs = flat.par_iter().map_init(|| self.make_scratch(), of_pair);
+        pairs.filter_map(std::result::Result::transpose).collect::<std::result::Result<_, _>>().map_err(kernel_error)
     }
 
     /// Returns the relative change of a bin's energy, per kelvin that the air is warmer than its sensor says.
@@ -365,6 +409,11 @@ impl PairPaths {
         Some(Self { direct_m, reflected_m, incidence_deg: incidence_deg(microphone, speaker) })
     }
 
+    fn in_air(&self, response: &AirState, direct: &AirState) -> PairAir {
+        let Self { direct_m, reflected_m, .. } = *self;
+        PairAir { response: *response, direct: *direct, direct_m, reflected_m }
+    }
+
     /// Returns the arrivals of both in a corrected response, s.
     pub fn arrival_secs(&self, rig: &Rig) -> [f64; 2] {
         let sound_m_s = ReferenceAir::from_response(&rig.impulse_response).speed_of_sound();
@@ -383,14 +432,9 @@ fn kernel_error(cause: echolake_dsp::Error) -> Error {
     Error::Kernel { file: "the reference".to_owned(), cause }
 }
 
-// References without Foam's reflection. Flat's Foam may be another one than the surface's: both are of the same
-// material.
-fn estimate_references(
-    lake: &Lake,
-    flat: &MeanResponses,
-    flat_foam: &MeanResponses,
-    foam: &MeanResponses,
-) -> Result<Option<EstimatedReferences>> {
+// Estimates Foam's reflection: the best estimate, then its variants; none if there is no estimate. Flat's Foam may be
+// another one than the surface's: both are of the same material.
+fn estimate_reflections(lake: &Lake, flat: &MeanResponses, flat_foam: &MeanResponses) -> Result<Vec<FoamReflection>> {
     let rig = lake.rig();
     let mut fit = FoamReflectionFit::new(rig.impulse_response.length, rig.sweep.rate_hz.get()).map_err(kernel_error)?;
     for (pair, flat) in sorted_means(flat) {
@@ -399,14 +443,7 @@ fn estimate_references(
         let path = ReflectionPath { direct_secs, reflected_secs, incidence_deg: paths.incidence_deg };
         fit.add_pair(&foam.ir, &flat.ir, path).map_err(kernel_error)?;
     }
-    let Some(estimate) = fit.finish() else { return Ok(None) };
-    let references = |reflection| {
-        let direct = Arc::new(remove_reflection(lake, reflection, foam, flat)?);
-        ReferenceResponses::new(lake, direct, flat, &remove_reflection(lake, reflection, flat_foam, flat)?)
-    };
-    let best = references(&estimate.best)?;
-    let variants = estimate.variants.iter().map(references).collect::<Result<_>>()?;
-    Ok(Some(EstimatedReferences { best, variants }))
+    Ok(fit.finish().map_or_else(Vec::new, |estimate| [vec![estimate.best], estimate.variants].concat()))
 }
 
 // The direct sound of each pair that Flat has, too.

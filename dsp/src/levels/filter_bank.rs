@@ -170,11 +170,24 @@ impl<T: RealSample> FilterBankPlan<T> {
     ) -> Result<(), Error> {
         check_len("the energies", energies.len(), self.bands)?;
         self.compute_spectrum(ir, scratch)?;
-        for (gains, energy) in self.gains.chunks_exact(scratch.spectrum.len()).zip(energies) {
-            let power = |(k, (c, g)): (usize, (&Complex<T>, &T))| self.bin_weight(k) * (*g * *g * c.norm_sqr()).f64();
-            *energy = scratch.spectrum.iter().zip(gains).enumerate().map(power).sum::<f64>() / self.len as f64;
-        }
+        self.spectrum_energies(&scratch.spectrum, energies);
         Ok(())
+    }
+
+    /// Computes the energy of a signal in each band from its spectrum; returns that of all bins.
+    ///
+    /// spectrum  `[len / 2 + 1]`, energies `[bands]`
+    pub fn spectrum_energies(&self, spectrum: &[Complex<T>], energies: &mut [f64]) -> f64 {
+        energies.fill(0.0);
+        let mut total = 0.0;
+        for (k, c) in spectrum.iter().enumerate() {
+            let power = self.bin_weight(k) * c.norm_sqr().f64() / self.len as f64;
+            total += power;
+            for (band, energy) in energies.iter_mut().enumerate() {
+                *energy += power * self.gains[band * spectrum.len() + k].f64().powi(2);
+            }
+        }
+        total
     }
 
     /// Energy of a reflected response in each band, and what errors of the direct sound beneath it do to that energy,
@@ -197,7 +210,8 @@ impl<T: RealSample> FilterBankPlan<T> {
         let direct = &scratch.direct;
         for (gains, sensitivity) in self.gains.chunks_exact(direct.len()).zip(sensitivities) {
             let mut sum = EnergySensitivity::default();
-            for (bin, ((x, d), gain)) in scratch.spectrum.iter().zip(direct).zip(gains).enumerate() {
+            let bins = scratch.spectrum.iter().zip(direct).zip(gains).enumerate();
+            for (bin, ((x, d), gain)) in bins.filter(|(_, (_, gain))| **gain != T::default()) {
                 let (weight, angle) =
                     (self.bin_weight(bin) * gain.f64().powi(2) / self.len as f64, bin_angle(bin, self.len));
                 let product = x.conj() * d;

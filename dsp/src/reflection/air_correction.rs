@@ -6,11 +6,13 @@
 use std::f64::consts::LN_10;
 use std::sync::Arc;
 
+use echolake_schema::AirTreatment;
 use realfft::num_complex::Complex;
 use realfft::{ComplexToReal, RealToComplex};
 
 use crate::air::{AirAbsorption, AirState};
 use crate::error::check_len;
+use crate::foam::subtract_foam;
 use crate::temperature::ReferenceAir;
 use crate::{Error, RealSample};
 
@@ -146,11 +148,16 @@ pub struct AirCorrection<T: RealSample> {
     inverse: Arc<dyn ComplexToReal<T>>,
 }
 
-/// Buffers of an [`AirCorrection`].
+/// Buffers of an [`AirCorrection`], and what it knows of the response that it was given last.
 pub struct AirScratch<T> {
     signal: Vec<T>,
-    spectrum: Vec<Complex<T>>,
+    /// `[bins]`: spectrum of the response.
+    response: Vec<Complex<T>>,
+    /// `[bins]`: gains that bring the direct sound to the response's air, and the response to the reference air.
+    to_response: Vec<Complex<T>>,
+    to_reference: Vec<Complex<T>>,
     direct: Vec<Complex<T>>,
+    reflected: Vec<Complex<T>>,
     work: Vec<Complex<T>>,
 }
 
@@ -177,10 +184,14 @@ impl<T: RealSample> AirCorrection<T> {
     /// Buffers; one per thread.
     pub fn make_scratch(&self) -> AirScratch<T> {
         let work = self.forward.get_scratch_len().max(self.inverse.get_scratch_len());
+        let spectrum = self.forward.make_output_vec();
         AirScratch {
             signal: self.forward.make_input_vec(),
-            spectrum: self.forward.make_output_vec(),
-            direct: self.forward.make_output_vec(),
+            response: spectrum.clone(),
+            to_response: spectrum.clone(),
+            to_reference: spectrum.clone(),
+            direct: spectrum.clone(),
+            reflected: spectrum,
             work: vec![Complex::default(); work],
         }
     }
@@ -200,29 +211,82 @@ impl<T: RealSample> AirCorrection<T> {
         scratch: &mut AirScratch<T>,
     ) -> Result<(), Error> {
         check_len("the reflected response", reflected.len(), self.len)?;
-        let AirScratch { signal, spectrum, direct: direct_spectrum, work } = scratch;
-        transform(&*self.forward, ir, signal, spectrum, work)?;
-        transform(&*self.forward, direct, signal, direct_spectrum, work)?;
+        self.take_response(ir, pair, scratch)?;
+        if self.reference.treatment == AirTreatment::Paper {
+            check_len("the direct sound", direct.len(), self.len)?;
+            subtract_foam(ir, direct, reflected);
+            return Ok(());
+        }
+        transform(&*self.forward, direct, &mut scratch.signal, &mut scratch.direct, &mut scratch.work)?;
+        let mut spectrum = std::mem::take(&mut scratch.reflected);
+        self.reflected_spectrum(&scratch.direct, &mut spectrum, scratch);
+        let share = T::of((self.len as f64).recip());
+        spectrum.iter_mut().for_each(|x| *x = *x * share);
+        let done = self.inverse.process_with_scratch(&mut spectrum, reflected, &mut scratch.work);
+        scratch.reflected = spectrum;
+        done.map_err(|_| Error::NotFinite { what: "the response" })
+    }
+
+    /// Takes a response `[len]` for [`Self::reflected_spectrum`].
+    ///
+    /// # Errors
+    /// [`Error::Length`] or [`Error::NotFinite`].
+    pub fn take_response(&self, ir: &[T], pair: &PairAir, scratch: &mut AirScratch<T>) -> Result<(), Error> {
+        let AirScratch { signal, response, to_response, to_reference, work, .. } = scratch;
+        transform(&*self.forward, ir, signal, response, work)?;
+        if self.reference.treatment == AirTreatment::Paper {
+            let one = Complex::new(T::of(1.0), T::default());
+            to_response.fill(one);
+            to_reference.fill(one);
+            return Ok(());
+        }
         let of_response = AirEffect::new(&self.reference, &pair.response);
         let of_direct = AirEffect::new(&self.reference, &pair.direct);
         let step_hz = self.rate_hz / self.len as f64;
-        let share = T::of((self.len as f64).recip());
-        for (bin, (x, d)) in spectrum.iter_mut().zip(&*direct_spectrum).enumerate() {
+        for (bin, (to_response, to_reference)) in to_response.iter_mut().zip(to_reference).enumerate() {
             let hz = bin as f64 * step_hz;
             let absorbed = of_response.nepers_per_m(hz);
-            let to_response = self.direct_slopes[bin] * (of_response.ln_ratio - of_direct.ln_ratio)
-                + (of_direct.nepers_per_m(hz) - absorbed) * pair.direct_m;
-            let to_reference = -self.reflected_slopes[bin] * of_response.ln_ratio
-                + (absorbed - self.absorption[bin]) * pair.reflected_m;
-            *x = (*x - d * gain_of(to_response)) * gain_of(to_reference) * share;
+            *to_response = gain_of(
+                self.direct_slopes[bin] * (of_response.ln_ratio - of_direct.ln_ratio)
+                    + (of_direct.nepers_per_m(hz) - absorbed) * pair.direct_m,
+            );
+            *to_reference = gain_of(
+                -self.reflected_slopes[bin] * of_response.ln_ratio
+                    + (absorbed - self.absorption[bin]) * pair.reflected_m,
+            );
+        }
+        Ok(())
+    }
+
+    /// Computes the spectrum of what a surface reflects from the response that was taken last, and the direct sound's
+    /// spectrum, [`Self::compute_spectrum`].
+    ///
+    /// direct, reflected  `[len / 2 + 1]`
+    pub fn reflected_spectrum(
+        &self,
+        direct: &[Complex<T>],
+        reflected: &mut [Complex<T>],
+        AirScratch { response, to_response, to_reference, .. }: &AirScratch<T>,
+    ) {
+        let gains = to_response.iter().zip(to_reference);
+        for (((out, x), d), (to_response, to_reference)) in reflected.iter_mut().zip(response).zip(direct).zip(gains) {
+            *out = (*x - d * to_response) * to_reference;
         }
         // The ends of a real signal's spectrum are real.
-        spectrum[0].im = T::default();
+        reflected[0].im = T::default();
         if self.len.is_multiple_of(2) {
-            spectrum[self.len / 2].im = T::default();
+            reflected[self.len / 2].im = T::default();
         }
-        let done = self.inverse.process_with_scratch(spectrum, reflected, work);
-        done.map_err(|_| Error::NotFinite { what: "the response" })
+    }
+
+    /// Computes the spectrum of a signal `[len]`.
+    ///
+    /// # Errors
+    /// [`Error::Length`] or [`Error::NotFinite`].
+    pub fn compute_spectrum(&self, signal: &[T], scratch: &mut AirScratch<T>) -> Result<Vec<Complex<T>>, Error> {
+        let mut spectrum = self.forward.make_output_vec();
+        transform(&*self.forward, signal, &mut scratch.signal, &mut spectrum, &mut scratch.work)?;
+        Ok(spectrum)
     }
 
     /// Returns the relative change, per kelvin that the air is warmer than it is thought to be, of a bin's energy after
@@ -281,8 +345,6 @@ fn spectral_slopes(spectrum: &[Complex<f64>], step_hz: f64, [low_hz, high_hz]: [
 
 #[cfg(test)]
 mod tests {
-    use echolake_schema::AirTreatment;
-
     use super::*;
 
     const LEN: usize = 384;
