@@ -21,6 +21,7 @@ mod syntax_walk;
 #[cfg(test)]
 mod tests;
 mod tree;
+mod using_columns;
 
 use datafusion::execution::context::SQLOptions;
 use datafusion::execution::session_state::SessionState;

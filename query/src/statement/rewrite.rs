@@ -4,6 +4,7 @@
 //! | --- | --- |
 //! | `FROM t` | `SELECT * FROM t` |
 //! | `t VERSION AS OF 12` | `"t@12" AS t` |
+//! | `SELECT c FROM t LEFT JOIN u USING (c) WHERE c = 1` | `SELECT t.c AS c ... WHERE t.c = 1` |
 //! | `t SEMI JOIN u` | `t LEFT SEMI JOIN u` |
 //! | `FETCH FIRST 3 ROWS ONLY` | `LIMIT 3` |
 //! | `ORDER BY ALL` | `ORDER BY 1, 2, ...` |
@@ -33,6 +34,7 @@ use super::columns::{ColumnsExpansion, has_columns, hinted_error};
 use super::summarize::{summarized_query, write_summary};
 use super::syntax_walk::{walk_mut, walk_syntax};
 use super::tree;
+use super::using_columns::name_using_columns;
 use crate::Error;
 
 /// Aggregates that take the first argument at the greatest (true) or least value of the second.
@@ -126,6 +128,7 @@ impl VisitorMut for RewriteVisitor<'_> {
     }
 
     fn post_visit_select(&mut self, select: &mut Select) -> Visit {
+        visit_outcome(name_using_columns(select, &mut |from| self.look_up(from)))?;
         if has_columns(select) { visit_outcome(self.expand_columns(select)) } else { ControlFlow::Continue(()) }
     }
 

@@ -15,6 +15,15 @@ pub(super) fn parse_query(sql: &str) -> Result<Box<Query>, Error> {
     parsed.map_err(|error| Error::from_tokenizer(sql, error))
 }
 
+/// Parses an expression that the rewrite has written.
+///
+/// # Errors
+/// [`Error::Query`] if it is none.
+pub(super) fn parse_expr(sql: &str) -> Result<Expr, Error> {
+    let parsed = Parser::new(&LakeDialect).try_with_sql(sql).and_then(|mut parser| parser.parse_expr());
+    parsed.map_err(|error| Error::from_tokenizer(sql, error))
+}
+
 /// Returns a number.
 pub(super) fn number_literal(number: i64) -> Expr {
     Expr::value(Value::Number(number.to_string(), false))

@@ -1,0 +1,226 @@
+//! Columns of `JOIN ... USING`, of which a result has one.
+//!
+//! DataFusion takes them for ambiguous in WHERE. Of an outer join it takes the column of the table whose name comes
+//! first, which is null where that table has no row. So they are named here: the column of the table that keeps all of
+//! its rows, of a full join whichever is not null.
+
+use std::collections::HashMap;
+use std::ops::ControlFlow;
+
+use datafusion::common::DFSchema;
+use datafusion::sql::sqlparser::ast::{
+    Expr, GroupByExpr, Ident, Join, JoinConstraint, JoinOperator, Query, Select, SelectItem, TableFactor,
+    TableWithJoins, VisitorMut, WildcardAdditionalOptions,
+};
+
+use super::columns::hinted_error;
+use super::syntax_walk::walk_mut;
+use super::tree::{normalized_name, parse_expr, quoted_ident};
+use crate::Error;
+
+/// Tells the columns of a FROM.
+type LookUp<'a> = dyn FnMut(Vec<TableWithJoins>) -> Result<DFSchema, Error> + 'a;
+
+/// Names the columns of USING in a SELECT, outside of its subqueries.
+///
+/// # Errors
+/// [`Error::Query`] of an outer join whose columns cannot be named, and of what `look_up` refuses.
+pub(super) fn name_using_columns(select: &mut Select, look_up: &mut LookUp<'_>) -> Result<(), Error> {
+    let joins = || select.from.iter().flat_map(|from| &from.joins);
+    if joins().any(|join| is_outer(join) && matches!(constraint(join), Some(JoinConstraint::Natural))) {
+        let message = "NATURAL outer joins are not supported".to_owned();
+        return Err(hinted_error(message, "join by USING (column, ...)".to_owned()));
+    }
+    let is_outer = joins().any(is_outer_using);
+    let has_columns = joins().any(|join| !using_columns(join).is_empty());
+    if !has_columns || !is_outer && select.selection.is_none() {
+        return Ok(());
+    }
+    let mut values = HashMap::new();
+    for from in &select.from {
+        add_values(&mut values, from, look_up)?;
+    }
+    let schema = look_up(select.from.clone())?;
+    // DataFusion leaves as many as joins name it. Another one is of a table that is joined otherwise: which is meant is
+    // not known then.
+    values.retain(|column, _| {
+        let named = select.from.iter().flat_map(|from| &from.joins).flat_map(using_columns);
+        let found = schema.fields().iter().filter(|field| field.name() == column).count();
+        found <= named.filter(|name| name == column).count()
+    });
+    let mut namer = ColumnNamer { values, subqueries: 0 };
+    let _ = select.selection.as_mut().map(|condition| walk_mut(condition, &mut namer));
+    if is_outer {
+        name_in_select(select, &schema, &mut namer)?;
+    }
+    Ok(())
+}
+
+fn name_in_select(select: &mut Select, schema: &DFSchema, namer: &mut ColumnNamer) -> Result<(), Error> {
+    let mut projection = Vec::with_capacity(select.projection.len());
+    for item in std::mem::take(&mut select.projection) {
+        match item {
+            SelectItem::Wildcard(options) if options == WildcardAdditionalOptions::default() => {
+                let first = |name| schema.fields().iter().position(|field| field.name() == name);
+                let kept = schema.iter().enumerate().filter(|(at, (_, field))| {
+                    !namer.values.contains_key(field.name()) || first(field.name()) == Some(*at)
+                });
+                projection.extend(kept.map(|(_, (table, field))| {
+                    let column = quoted_ident(field.name());
+                    let named = table.map(|table| vec![quoted_ident(table.table()), column.clone()]);
+                    let otherwise = named.map_or(Expr::Identifier(column.clone()), Expr::CompoundIdentifier);
+                    let expr = namer.values.get(field.name()).cloned().unwrap_or(otherwise);
+                    SelectItem::ExprWithAlias { expr, alias: column }
+                }));
+            }
+            SelectItem::Wildcard(_) => {
+                return Err(hinted_error(
+                    "`*` with options, over an outer join by USING, is not supported".to_owned(),
+                    "name the columns, or join by ON".to_owned(),
+                ));
+            }
+            SelectItem::UnnamedExpr(Expr::Identifier(column)) if namer.value(&column).is_some() => {
+                let expr = namer.value(&column).cloned().unwrap_or(Expr::Identifier(column.clone()));
+                projection.push(SelectItem::ExprWithAlias { expr, alias: column });
+            }
+            mut other => {
+                let _ = walk_mut(&mut other, namer);
+                projection.push(other);
+            }
+        }
+    }
+    select.projection = projection;
+    if let GroupByExpr::Expressions(expressions, _) = &mut select.group_by {
+        let _ = walk_mut(expressions, namer);
+    }
+    let _ = walk_mut(&mut select.having, namer);
+    let _ = walk_mut(&mut select.qualify, namer);
+    Ok(())
+}
+
+// Adds the value of each column that a join of `from` has by USING.
+fn add_values(
+    values: &mut HashMap<String, Expr>,
+    from: &TableWithJoins,
+    look_up: &mut LookUp<'_>,
+) -> Result<(), Error> {
+    for (at, join) in from.joins.iter().enumerate() {
+        let columns = using_columns(join);
+        let right = table_name(&join.relation);
+        if columns.is_empty() {
+            continue;
+        }
+        let before = TableWithJoins { relation: from.relation.clone(), joins: from.joins[..at].to_vec() };
+        let mut schema = None;
+        for column in columns {
+            let left = match values.get(&column) {
+                Some(known) => Some(known.clone()),
+                None => {
+                    let schema = match &schema {
+                        Some(known) => known,
+                        None => schema.insert(look_up(vec![before.clone()])?),
+                    };
+                    let mut found = schema.iter().filter(|(_, field)| *field.name() == column);
+                    let only = found.next().filter(|_| found.next().is_none());
+                    only.and_then(|(table, _)| Some(column_of(&quoted_ident(table?.table()), &column)))
+                }
+            };
+            let right = right.as_ref().map(|table| column_of(table, &column));
+            let value = match (&join.join_operator, left, right) {
+                (JoinOperator::Right(_) | JoinOperator::RightOuter(_), _, right) => right,
+                (JoinOperator::FullOuter(_), Some(left), Some(right)) => {
+                    Some(parse_expr(&format!("coalesce({left}, {right})"))?)
+                }
+                (JoinOperator::FullOuter(_), ..) => None,
+                (_, left, _) => left,
+            };
+            match value {
+                Some(value) => drop(values.insert(column, value)),
+                None if is_outer_using(join) => {
+                    let message = format!("which table has column `{column}` of USING is not known");
+                    return Err(hinted_error(message, "name the tables, or join by ON".to_owned()));
+                }
+                None => {}
+            }
+        }
+    }
+    Ok(())
+}
+
+fn constraint(join: &Join) -> Option<&JoinConstraint> {
+    match &join.join_operator {
+        JoinOperator::Join(constraint)
+        | JoinOperator::Inner(constraint)
+        | JoinOperator::Left(constraint)
+        | JoinOperator::LeftOuter(constraint)
+        | JoinOperator::Right(constraint)
+        | JoinOperator::RightOuter(constraint)
+        | JoinOperator::FullOuter(constraint) => Some(constraint),
+        _ => None,
+    }
+}
+
+fn is_outer(join: &Join) -> bool {
+    constraint(join).is_some() && !matches!(join.join_operator, JoinOperator::Join(_) | JoinOperator::Inner(_))
+}
+
+fn is_outer_using(join: &Join) -> bool {
+    is_outer(join) && matches!(constraint(join), Some(JoinConstraint::Using(_)))
+}
+
+// Normalized names; none of a join that is not by USING, or keeps the columns of one table.
+fn using_columns(join: &Join) -> Vec<String> {
+    let Some(JoinConstraint::Using(columns)) = constraint(join) else { return Vec::new() };
+    columns.iter().filter_map(|column| Some(normalized_name(column.0.last()?.as_ident()?))).collect()
+}
+
+fn table_name(factor: &TableFactor) -> Option<Ident> {
+    match factor {
+        TableFactor::Table { alias: Some(alias), .. } | TableFactor::Derived { alias: Some(alias), .. } => {
+            Some(alias.name.clone())
+        }
+        TableFactor::Table { name, .. } => name.0.last()?.as_ident().cloned(),
+        _ => None,
+    }
+}
+
+fn column_of(table: &Ident, column: &str) -> Expr {
+    Expr::CompoundIdentifier(vec![table.clone(), quoted_ident(column)])
+}
+
+struct ColumnNamer {
+    /// By normalized name.
+    values: HashMap<String, Expr>,
+    /// Number of subqueries around.
+    subqueries: usize,
+}
+
+impl ColumnNamer {
+    fn value(&self, column: &Ident) -> Option<&Expr> {
+        self.values.get(&normalized_name(column))
+    }
+}
+
+impl VisitorMut for ColumnNamer {
+    type Break = ();
+
+    fn pre_visit_query(&mut self, _: &mut Query) -> ControlFlow<()> {
+        self.subqueries += 1;
+        ControlFlow::Continue(())
+    }
+
+    fn post_visit_query(&mut self, _: &mut Query) -> ControlFlow<()> {
+        self.subqueries -= 1;
+        ControlFlow::Continue(())
+    }
+
+    fn post_visit_expr(&mut self, expr: &mut Expr) -> ControlFlow<()> {
+        if let Expr::Identifier(column) = expr
+            && self.subqueries == 0
+            && let Some(value) = self.value(column)
+        {
+            *expr = value.clone();
+        }
+        ControlFlow::Continue(())
+    }
+}
