@@ -13,6 +13,9 @@ mod dropout;
 mod fault;
 mod harmonics;
 
+use std::borrow::Cow;
+use std::f64::consts::TAU;
+use std::ops::Range;
 use std::sync::Arc;
 
 use realfft::RealToComplex;
@@ -22,7 +25,7 @@ use rustfft::{Fft, FftDirection};
 use crate::deconvolution::fast_length;
 use crate::error::check_len;
 use crate::level::power_to_db;
-use crate::oversampling::oversampled_peak;
+use crate::oversampling::{greatest_magnitude, oversampled_peak};
 use crate::sweep::SineSweep;
 use crate::{Error, RealSample};
 
@@ -82,31 +85,49 @@ impl TakeAnalysis {
 pub struct TakeAnalyzer {
     sweep: SineSweep,
     recording_len: usize,
-    forward: Arc<dyn RealToComplex<f64>>,
-    inverse: Arc<dyn Fft<f64>>,
+    forward: Arc<dyn RealToComplex<f32>>,
+    inverse: Arc<dyn Fft<f32>>,
     short: ShortTransform,
-    played: Vec<Complex<f64>>,
-    taper: Vec<f64>,
+    played: Vec<Complex<f32>>,
+    /// Gains of bins, and those bins that have one.
+    taper: Vec<f32>,
+    range: Range<usize>,
 }
 
 /// Transforms of a response's vicinity, `[len]`, with its onset in the middle.
 struct ShortTransform {
     len: usize,
     step_hz: f64,
-    forward: Arc<dyn Fft<f64>>,
-    inverse: Arc<dyn Fft<f64>>,
+    forward: Arc<dyn Fft<f32>>,
+    inverse: Arc<dyn Fft<f32>>,
+    /// Bins whose taper is at least a half, and the weights of their phases in a clock ratio.
+    core: Range<usize>,
+    drift_weights: Vec<f64>,
+    /// Bins of each part of the sweep, and the window before an arrival.
+    parts: Vec<Range<usize>>,
+    window: Vec<f32>,
 }
 
 /// A response to a sweep.
 struct SweepResponse {
     /// `[n]`: the analytic response, sample 0 without delay, those before it at the end.
-    samples: Vec<Complex<f64>>,
-    /// Energy of all samples.
+    samples: Vec<Complex<f32>>,
+    /// `[n]`: their squares, and the sums of all and of those that are not in the vicinity.
+    powers: Vec<f32>,
     energy: f64,
-    /// Sample of the first arrival, from -n / 2.
+    farther_energy: f64,
+    /// Samples of the peak and of the first arrival, from -n / 2.
+    peak: i64,
     onset: i64,
-    /// `[short]`: spectrum of the onset's vicinity.
-    vicinity: Vec<Complex<f64>>,
+    vicinity: OnsetVicinity,
+}
+
+/// Vicinity of an onset, `[short]`.
+#[derive(Clone)]
+struct OnsetVicinity {
+    spectrum: Vec<Complex<f32>>,
+    samples: Vec<Complex<f32>>,
+    powers: Vec<f32>,
 }
 
 impl TakeAnalyzer {
@@ -120,24 +141,23 @@ impl TakeAnalyzer {
             return Err(Error::Setting { what: "the sweep", actual, expected: "2 samples or more, and a range" });
         }
         let n = fast_length(recording_len);
-        let forward = f64::plan_real_forward(n);
+        let forward = f32::plan_real_forward(n);
         let spread = 8.0 * MAX_CLOCK_RATIO * sweep.duration_secs;
         let short = (sweep.rate_hz * spread.max(0.04)) as usize;
         let short = short.next_power_of_two().min(n);
         let mut played = forward.make_output_vec();
-        let mut samples = sweep.samples();
+        let mut samples: Vec<f32> = sweep.samples().into_iter().map(|x| x as f32).collect();
         samples.resize(n, 0.0);
         // The lengths are the plan's own.
         let _ = forward.process(&mut samples, &mut played);
-        let taper = (0..played.len()).map(|k| taper_gain(&sweep, k as f64 * sweep.rate_hz / n as f64)).collect();
+        let taper: Vec<f32> =
+            (0..played.len()).map(|k| taper_gain(&sweep, k as f64 * sweep.rate_hz / n as f64) as f32).collect();
+        let first = taper.iter().position(|gain| *gain > 0.0).unwrap_or(0);
+        let count = taper.iter().filter(|gain| **gain > 0.0).count();
         Ok(Self {
-            short: ShortTransform {
-                len: short,
-                step_hz: sweep.rate_hz / short as f64,
-                forward: f64::plan_fft(short, FftDirection::Forward),
-                inverse: f64::plan_fft(short, FftDirection::Inverse),
-            },
-            inverse: f64::plan_fft(n, FftDirection::Inverse),
+            short: ShortTransform::new(&sweep, short),
+            inverse: f32::plan_fft(n, FftDirection::Inverse),
+            range: first..first + count,
             sweep,
             recording_len,
             forward,
@@ -168,11 +188,12 @@ impl TakeAnalyzer {
         let looped = self.transform_signal("the loopback", loopback)?;
         let electrical = self.divide_spectra(&looped, &self.played);
         let loopback_ratio = self.fit_clock_ratio(&electrical);
-        let match_db = self.match_db(&electrical, loopback_ratio);
+        let aligned = self.align_clocks(&electrical, loopback_ratio);
+        let match_db = self.match_db(&electrical, &aligned, 1);
         analysis.loopback_match_db = match_db;
         let response = self.divide_spectra(&recorded, &looped);
-        let direct = self.match_db(&response, 0.0);
-        if direct > SAME_SIGNAL_DB && response.peak() == 0 {
+        let direct = self.match_db(&response, &response.vicinity, 1);
+        if direct > SAME_SIGNAL_DB && response.peak == 0 {
             let level_db = power_to_db(response.energy) - power_to_db(self.unit_energy());
             analysis.faults.push(TakeFault::SameSignal { level_db });
         } else if match_db >= MATCH_DB {
@@ -180,17 +201,18 @@ impl TakeAnalyzer {
                 analysis.faults.push(TakeFault::Swapped { early_secs: -self.secs_of(response.onset) });
             } else {
                 self.find_cut(&mut analysis, electrical.onset);
-                self.find_dropout(&mut analysis, &electrical, &[loopback_ratio], TakeChannel::Loopback, 0);
-                let is_copy = self.is_digital_copy(&looped, electrical.peak());
+                self.find_dropout(&mut analysis, electrical.onset, &[&aligned], TakeChannel::Loopback);
+                let is_copy = self.is_digital_copy(&looped, electrical.peak);
                 self.analyze_recording(&mut analysis, &response, loopback_ratio, electrical.onset, is_copy);
             }
-        } else if self.peaks_db(&electrical, 0.0, 2) > TORN_MATCH_DB
-            && self.find_dropout(&mut analysis, &electrical, &[0.0], TakeChannel::Loopback, 0)
+        } else if self.match_db(&electrical, &electrical.vicinity, 2) > TORN_MATCH_DB
+            && self.find_dropout(&mut analysis, electrical.onset, &[&electrical.vicinity], TakeChannel::Loopback)
         {
             // Its two parts arrive at different times.
         } else {
             let acoustical = self.divide_spectra(&recorded, &self.played);
-            let recording_db = self.match_db(&acoustical, self.fit_clock_ratio(&acoustical));
+            let aligned = self.align_clocks(&acoustical, self.fit_clock_ratio(&acoustical));
+            let recording_db = self.match_db(&acoustical, &aligned, 1);
             analysis.faults.push(if recording_db >= MATCH_DB {
                 TakeFault::Swapped { early_secs: self.secs_of(electrical.onset - acoustical.onset) }
             } else if self.causal_db(&response) > CAUSAL_DB && response.peak_db() >= PEAK_DB {
@@ -222,9 +244,10 @@ impl TakeAnalyzer {
         }
         // A recorded loopback has the recording's clock, and what looks like drift is dispersion by the surface.
         let drift = if is_copy { self.search_clock_ratio(response) } else { 0.0 };
-        let ratios: &[f64] = if is_copy { &[0.0, drift] } else { &[0.0] };
+        let drifted = self.align_clocks(response, drift);
+        let vicinities = &[&response.vicinity, &*drifted][..if is_copy { 2 } else { 1 }];
         let limit = self.drift_ratio(MAX_DRIFT_CYCLES);
-        let is_torn = self.find_dropout(analysis, response, ratios, TakeChannel::Recording, delay);
+        let is_torn = self.find_dropout(analysis, response.onset + delay, vicinities, TakeChannel::Recording);
         let is_drifting = drift.abs() > limit && !is_torn;
         if is_drifting {
             analysis.faults.push(TakeFault::Clock { ppm: 1e6 * drift, limit_ppm: 1e6 * limit });
@@ -238,23 +261,26 @@ impl TakeAnalyzer {
     }
 
     // Whether a channel is the sweep itself, by the playing clock.
-    fn is_played_sweep(&self, spectrum: &[Complex<f64>]) -> bool {
+    fn is_played_sweep(&self, spectrum: &[Complex<f32>]) -> bool {
         let response = self.divide_spectra(spectrum, &self.played);
         let ratio = self.fit_clock_ratio(&response);
-        self.match_db(&response, ratio) >= MATCH_DB && ratio.abs() <= self.drift_ratio(MAX_DRIFT_CYCLES)
+        self.match_db(&response, &self.align_clocks(&response, ratio), 1) >= MATCH_DB
+            && ratio.abs() <= self.drift_ratio(MAX_DRIFT_CYCLES)
     }
 
     // Whether a channel is the sweep at a delay of whole samples, without the response of any converter.
-    fn is_digital_copy(&self, spectrum: &[Complex<f64>], delay: i64) -> bool {
-        let n = self.forward.len() as i64;
+    fn is_digital_copy(&self, spectrum: &[Complex<f32>], delay: i64) -> bool {
+        let step = Complex::from_polar(1.0, TAU * delay as f64 / self.forward.len() as f64);
+        let mut turn = Complex::new(1.0, 0.0);
         let mut product = Complex::<f64>::default();
         let mut energies = [0.0, 0.0];
-        for (k, gain) in self.taper.iter().enumerate().filter(|(_, gain)| **gain > 0.0) {
-            let quotient = spectrum[k] / self.played[k];
-            let turn = (k as i64 * delay).rem_euclid(n) as f64 / n as f64;
-            product += quotient * Complex::from_polar(gain * gain, std::f64::consts::TAU * turn);
-            energies[0] += gain * gain * quotient.norm_sqr();
-            energies[1] += gain * gain;
+        for k in self.range.clone() {
+            let weight = f64::from(self.taper[k]).powi(2);
+            let quotient = widen(spectrum[k]) * widen(self.played[k]).inv();
+            product += quotient * turn * weight;
+            energies[0] += weight * quotient.norm_sqr();
+            energies[1] += weight;
+            turn *= step;
         }
         1.0 - product.norm_sqr() / (energies[0] * energies[1]) < DIGITAL_COPY_SHARE
     }
@@ -264,10 +290,10 @@ impl TakeAnalyzer {
         cycles / (self.sweep.duration_secs * self.sweep.high_hz)
     }
 
-    fn transform_signal(&self, what: &'static str, signal: &[f32]) -> Result<Vec<Complex<f64>>, Error> {
+    fn transform_signal(&self, what: &'static str, signal: &[f32]) -> Result<Vec<Complex<f32>>, Error> {
         check_len(what, signal.len(), self.recording_len)?;
-        let mut samples = self.forward.make_input_vec();
-        samples.iter_mut().zip(signal).for_each(|(to, from)| *to = f64::from(*from));
+        let mut samples = signal.to_vec();
+        samples.resize(self.forward.len(), 0.0);
         let mut spectrum = self.forward.make_output_vec();
         let _ = self.forward.process(&mut samples, &mut spectrum);
         if spectrum.iter().all(|x| x.re.is_finite() && x.im.is_finite()) {
@@ -277,48 +303,54 @@ impl TakeAnalyzer {
         }
     }
 
-    fn divide_spectra(&self, of: &[Complex<f64>], by: &[Complex<f64>]) -> SweepResponse {
+    fn divide_spectra(&self, of: &[Complex<f32>], by: &[Complex<f32>]) -> SweepResponse {
         let n = self.forward.len();
         let mut samples = vec![Complex::default(); n];
-        for (k, gain) in self.taper.iter().enumerate().filter(|(_, gain)| **gain > 0.0) {
+        let range = self.range.clone();
+        let bins = of[range.clone()].iter().zip(&by[range.clone()]).zip(&self.taper[range.clone()]);
+        for (to, ((of, by), gain)) in samples[range].iter_mut().zip(bins) {
             // Silence divided by silence is silence.
-            let quotient = of[k] * by[k].conj() / by[k].norm_sqr().max(f64::MIN_POSITIVE);
-            samples[k] = quotient * *gain / n as f64;
+            *to = of * by.conj() * (gain / (by.norm_sqr().max(f32::MIN_POSITIVE) * n as f32));
         }
         self.inverse.process(&mut samples);
-        let energy = samples.iter().map(Complex::norm_sqr).sum();
-        let mut response = SweepResponse { samples, energy, onset: 0, vicinity: Vec::new() };
-        response.onset = response.find_onset((self.short.len / 2) as i64);
-        let middle = (self.short.len / 2) as i64;
-        response.vicinity = (0..self.short.len as i64).map(|i| response.at(response.onset + i - middle)).collect();
-        self.short.forward.process(&mut response.vicinity);
+        let powers = powers_of(&samples);
+        let energy = sum_of(&powers);
+        let [peak, middle, n] = [index_of_greatest(&powers), self.short.len / 2, n].map(|index| index as i64);
+        let peak = if peak > n / 2 { peak - n } else { peak };
+        let vicinity = OnsetVicinity { spectrum: Vec::new(), samples: Vec::new(), powers: Vec::new() };
+        let mut response = SweepResponse { samples, powers, energy, farther_energy: 0.0, peak, onset: peak, vicinity };
+        // The earliest sample, not too long before the peak, of a tenth of it.
+        let least = ONSET_SHARE * ONSET_SHARE * response.powers_in(peak..peak + 1).sum::<f64>();
+        let earlier = response.powers_in(peak - middle..peak).position(|power| power >= least);
+        response.onset = earlier.map_or(peak, |index| peak - middle + index as i64);
+        let start = response.onset - middle;
+        let around = response.indices(start..start + self.short.len as i64);
+        let samples: Vec<_> = around.flat_map(|part| response.samples[part].iter().copied()).collect();
+        let mut spectrum = samples.clone();
+        self.short.forward.process(&mut spectrum);
+        response.vicinity = OnsetVicinity { powers: powers_of(&samples), spectrum, samples };
+        response.farther_energy = response.energy_of(start + self.short.len as i64..start + n);
         response
     }
 
     // Energy of a response that is one sample of 1.
     fn unit_energy(&self) -> f64 {
-        self.taper.iter().map(|gain| gain * gain).sum::<f64>() / self.forward.len() as f64
+        crate::energy::energy(&self.taper) / self.forward.len() as f64
     }
 
-    // Energy within 0.5 ms of the peak over that of all other samples, after the clocks are brought together, dB.
-    fn match_db(&self, response: &SweepResponse, ratio: f64) -> f64 {
-        self.peaks_db(response, ratio, 1)
-    }
-
-    // The same of the greatest peaks.
-    fn peaks_db(&self, response: &SweepResponse, ratio: f64, peaks: usize) -> f64 {
-        let vicinity = self.align_clocks(response, ratio);
-        let mut power: Vec<f64> = vicinity.iter().map(Complex::norm_sqr).collect();
+    // Energy within 0.5 ms of the greatest peaks over that of all other samples, dB.
+    fn match_db(&self, response: &SweepResponse, vicinity: &OnsetVicinity, peaks: usize) -> f64 {
+        let mut powers = vicinity.powers.clone();
         let reach = self.seconds(RINGING_SECS);
         let mut near = 0.0;
         for _ in 0..peaks {
-            let peak = index_of_greatest(&power);
-            let around = &mut power[peak.saturating_sub(reach)..(peak + reach).min(self.short.len)];
-            near += around.iter().sum::<f64>();
+            let peak = index_of_greatest(&powers);
+            let around = &mut powers[peak.saturating_sub(reach)..(peak + reach).min(self.short.len)];
+            near += sum_of(around);
             around.fill(0.0);
         }
         // What rounding leaves of nothing.
-        power_to_db(near / (response.energy - near).max(1e-15 * response.energy))
+        power_to_db(near / (response.farther_energy + sum_of(&powers)).max(1e-15 * response.energy))
     }
 
     // Energy of the half behind the onset over that of the half before it, dB.
@@ -329,19 +361,27 @@ impl TakeAnalyzer {
     }
 
     // The onset's vicinity as it would be if the recording's clock ran slower by `ratio`.
-    fn align_clocks(&self, response: &SweepResponse, ratio: f64) -> Vec<Complex<f64>> {
-        let mut vicinity = response.vicinity.clone();
-        let scale = 1.0 / self.short.len as f64;
-        for (k, z) in vicinity.iter_mut().enumerate() {
-            *z *= scale;
-            if ratio != 0.0 {
-                let hz = (k as f64 * self.short.step_hz).clamp(self.sweep.low_hz, self.sweep.high_hz);
-                let cycles = self.sweep.phase_cycles(hz / (1.0 + ratio)) - self.sweep.phase_cycles(hz);
-                *z *= Complex::from_polar(1.0, std::f64::consts::TAU * cycles.fract());
-            }
+    fn align_clocks<'a>(&self, response: &'a SweepResponse, ratio: f64) -> Cow<'a, OnsetVicinity> {
+        if ratio == 0.0 {
+            return Cow::Borrowed(&response.vicinity);
         }
-        self.short.inverse.process(&mut vicinity);
-        vicinity
+        let mut spectrum = response.vicinity.spectrum.clone();
+        let mut last_hz = f64::NAN;
+        let mut turn = Complex::default();
+        for (k, z) in spectrum.iter_mut().enumerate() {
+            let hz = (k as f64 * self.short.step_hz).clamp(self.sweep.low_hz, self.sweep.high_hz);
+            if hz != last_hz {
+                let cycles = self.sweep.phase_cycles(hz / (1.0 + ratio)) - self.sweep.phase_cycles(hz);
+                let (sin, cos) = (TAU * cycles.fract()).sin_cos();
+                turn = Complex::new(cos as f32, sin as f32);
+                last_hz = hz;
+            }
+            *z *= turn;
+        }
+        let scale = 1.0 / self.short.len as f32;
+        let mut samples: Vec<_> = spectrum.iter().map(|z| z * scale).collect();
+        self.short.inverse.process(&mut samples);
+        Cow::Owned(OnsetVicinity { powers: powers_of(&samples), spectrum, samples })
     }
 
     fn find_cut(&self, analysis: &mut TakeAnalysis, delay: i64) {
@@ -363,33 +403,46 @@ impl TakeAnalyzer {
     }
 }
 
+impl ShortTransform {
+    fn new(sweep: &SineSweep, len: usize) -> Self {
+        let step_hz = sweep.rate_hz / len as f64;
+        let gain = |k: &usize| taper_gain(sweep, *k as f64 * step_hz);
+        let bins = 1..len / 2;
+        let first = bins.clone().find(|k| gain(k) >= 0.5).unwrap_or(1);
+        let core = first..bins.clone().rev().find(|k| gain(k) >= 0.5).unwrap_or(first) + 1;
+        Self {
+            len,
+            step_hz,
+            forward: f32::plan_fft(len, FftDirection::Forward),
+            inverse: f32::plan_fft(len, FftDirection::Inverse),
+            drift_weights: clock::drift_weights(sweep, core.clone().map(|k| k as f64 * step_hz)),
+            core,
+            parts: dropout::split_sweep(sweep, bins.filter(|k| gain(k) > 0.0), step_hz),
+            window: dropout::hann_window(((dropout::WINDOW_SECS * sweep.rate_hz).round() as usize).min(len / 8)),
+        }
+    }
+}
+
 impl SweepResponse {
-    fn at(&self, index: i64) -> Complex<f64> {
-        self.samples[index.rem_euclid(self.samples.len() as i64) as usize]
+    // Where samples of a range from -n on are: at most two parts.
+    fn indices(&self, range: Range<i64>) -> impl Iterator<Item = Range<usize>> + use<> {
+        let n = self.powers.len();
+        let start = range.start.rem_euclid(n as i64) as usize;
+        let len = ((range.end - range.start).max(0) as usize).min(n);
+        [start..(start + len).min(n), 0..(start + len).saturating_sub(n)].into_iter()
     }
 
-    fn energy_of(&self, range: std::ops::Range<i64>) -> f64 {
-        range.map(|index| self.at(index).norm_sqr()).sum()
+    fn powers_in(&self, range: Range<i64>) -> impl Iterator<Item = f64> {
+        self.indices(range).flat_map(|part| &self.powers[part]).map(|power| f64::from(*power))
+    }
+
+    fn energy_of(&self, range: Range<i64>) -> f64 {
+        self.indices(range).map(|part| sum_of(&self.powers[part])).sum()
     }
 
     // Power of the greatest sample over the mean, dB.
     fn peak_db(&self) -> f64 {
-        power_to_db(self.at(self.peak()).norm_sqr() * self.samples.len() as f64 / self.energy)
-    }
-
-    // Sample of the peak, from -n / 2.
-    fn peak(&self) -> i64 {
-        let power: Vec<f64> = self.samples.iter().map(Complex::norm_sqr).collect();
-        let peak = index_of_greatest(&power) as i64;
-        let n = power.len() as i64;
-        if peak > n / 2 { peak - n } else { peak }
-    }
-
-    // The earliest sample, at most `reach` before the peak, of a tenth of it.
-    fn find_onset(&self, reach: i64) -> i64 {
-        let peak = self.peak();
-        let least = (ONSET_SHARE * ONSET_SHARE) * self.at(peak).norm_sqr();
-        (peak - reach..peak).find(|index| self.at(*index).norm_sqr() >= least).unwrap_or(peak)
+        power_to_db(self.energy_of(self.peak..self.peak + 1) * self.powers.len() as f64 / self.energy)
     }
 }
 
@@ -400,8 +453,24 @@ fn taper_gain(sweep: &SineSweep, hz: f64) -> f64 {
     (std::f64::consts::FRAC_PI_2 * inside).sin().powi(4)
 }
 
-fn index_of_greatest(values: &[f64]) -> usize {
-    (0..values.len()).max_by(|a, b| values[*a].total_cmp(&values[*b])).unwrap_or(0)
+// Of values that are not negative.
+fn index_of_greatest(values: &[f32]) -> usize {
+    let greatest = greatest_magnitude(values);
+    values.iter().rposition(|x| *x == greatest).unwrap_or(0)
+}
+
+fn powers_of(samples: &[Complex<f32>]) -> Vec<f32> {
+    samples.iter().map(Complex::norm_sqr).collect()
+}
+
+fn sum_of(powers: &[f32]) -> f64 {
+    let mut sums = [0.0; 64];
+    powers.chunks(64).for_each(|chunk| f32::add_to(chunk, &mut sums));
+    sums.iter().sum()
+}
+
+fn widen(z: Complex<f32>) -> Complex<f64> {
+    Complex::new(z.re.into(), z.im.into())
 }
 
 #[cfg(test)]

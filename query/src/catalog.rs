@@ -135,6 +135,19 @@ impl LakeCatalog {
         Ok(snapshot)
     }
 
+    /// Returns the last snapshot if it is still the current one. It reads no log, so that it waits for no threads.
+    ///
+    /// # Errors
+    /// [`Error::Lake`] if the lake cannot be read.
+    pub async fn known_current_snapshot(&self) -> Result<Option<Arc<LakeSnapshot>>, Error> {
+        match self.known_snapshot() {
+            Some(known) if known.snapshot.is_whole() && self.is_fresh(&known).await? => {
+                Ok(Some(known.snapshot.clone()))
+            }
+            _ => Ok(None),
+        }
+    }
+
     /// Returns the contents of a run's file, from its summary and message indexes.
     ///
     /// # Errors
@@ -205,18 +218,13 @@ impl LakeCatalog {
         if self.lake.is_remote() && checked.elapsed() < REMOTE_CHECK_LASTS {
             return Ok(true);
         }
-        if log.has_after(Table::Runs, version).await? {
-            return Ok(false);
-        }
         // In a folder, a look at whether all of it is still there costs nothing.
-        if !self.lake.is_remote() {
-            let is_there = match version.checked_sub(1) {
-                Some(before) => log.has_after(Table::Runs, before).await?,
-                None => self.lake.check_readable().await.is_ok(),
-            };
-            if !is_there {
-                return Ok(false);
-            }
+        let is_newest = match self.lake.is_remote() {
+            true => !log.has_after(Table::Runs, version).await?,
+            false => self.lake.is_newest_version(version).await?,
+        };
+        if !is_newest {
+            return Ok(false);
         }
         *current.checked.lock().unwrap_or_else(PoisonError::into_inner) = Instant::now();
         let due = {

@@ -138,12 +138,14 @@ impl GridLevels {
 /// Returns the query of [`CurveRow`] for surfaces, a list of literals or placeholders; `filter` goes on with `and`, or
 /// is empty.
 pub fn curves_query(rig: &Rig, surfaces: &str, filter: &str) -> String {
+    let columns = curve_columns(rig);
+    format!("select surface_id, {columns} from nce where surface_id in ({surfaces}){filter} group by surface_id")
+}
+
+/// Returns the columns of [`CurveRow`] behind its surface, aggregates over rows of `nce`.
+pub fn curve_columns(rig: &Rig) -> String {
     let means: Vec<_> = rig.band_names().iter().map(|band| format!("avg_list(nce_{band})")).collect();
-    format!(
-        "select surface_id, count(*) as pairs, make_array({}) as bands from nce \
-         where surface_id in ({surfaces}){filter} group by surface_id",
-        means.join(", ")
-    )
+    format!("count(*) as pairs, make_array({}) as bands", means.join(", "))
 }
 
 /// Returns the query of [`CurveRow`] for surfaces' means over all pairs, as ingest keeps them; no row for surfaces of

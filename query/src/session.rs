@@ -393,6 +393,14 @@ impl Session {
         self.engine.catalog().current_snapshot().await
     }
 
+    /// Returns the last snapshot if it is still the current one. It reads no log, so that it waits for no threads.
+    ///
+    /// # Errors
+    /// [`Error::Lake`] if the lake cannot be read.
+    pub async fn known_snapshot(&self) -> Result<Option<Arc<LakeSnapshot>>, Error> {
+        self.engine.catalog().known_current_snapshot().await
+    }
+
     /// Returns the contents of a run's file, from its summary and message indexes.
     ///
     /// # Errors

@@ -212,6 +212,23 @@ impl Lake {
         self.0.location.remote.is_some()
     }
 
+    /// Returns whether this is the newest version of the lake, that of its table `runs`. A lake that is gone has no newer
+    /// version, but does not have this one either.
+    ///
+    /// # Errors
+    /// [`Error::Store`].
+    #[cfg(feature = "tables")]
+    pub async fn is_newest_version(&self, version: u64) -> Result<bool> {
+        let log = self.commit_log();
+        if log.has_after(Table::Runs, version).await? {
+            return Ok(false);
+        }
+        match version.checked_sub(1) {
+            Some(before) => log.has_after(Table::Runs, before).await,
+            None => Ok(self.check_readable().await.is_ok()),
+        }
+    }
+
     /// Returns the lake with a cache of what never changes in it, in memory, and in a folder if there is one. A lake in
     /// a folder needs none and is returned as it is.
     ///

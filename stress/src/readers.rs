@@ -3,6 +3,7 @@
 //! Nothing of it comes out of a browser's cache; what the server keeps, it keeps.
 #![allow(clippy::print_stdout, reason = "its figures are what it is for")]
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -95,31 +96,33 @@ impl CatalogueContents {
         })
     }
 
-    fn path(&self, kind: QuestionKind, random: &mut ChaCha8Rng) -> String {
+    // The kind of page data that is requested, and its path.
+    fn path(&self, kind: QuestionKind, random: &mut ChaCha8Rng) -> (&'static str, String) {
         let surface = &self.surfaces[random.random_range(0..self.surfaces.len())];
         let pair = random.random_range(0..self.pairs.max(1));
         match (kind, random.random_range(0..10)) {
             (QuestionKind::Facets, _) => {
                 let (name, value) = &self.facets[random.random_range(0..self.facets.len())];
                 // A different offset makes an address that was not requested before.
-                format!("/api/v1/surfaces?{name}={value}&sort=level&offset={}", random.random_range(0..100_000))
+                let offset = random.random_range(0..100_000);
+                ("facets", format!("/api/v1/surfaces?{name}={value}&sort=level&offset={offset}"))
             }
-            (QuestionKind::Ir, _) => format!("/api/v1/surfaces/{surface}/pairs/{pair}/ir.wav?signal=measured"),
-            (QuestionKind::All, 0) => "/".to_owned(),
-            (QuestionKind::All, 1) => "/api/v1/surfaces".to_owned(),
-            (QuestionKind::All, 2) => format!("/api/v1/surfaces/{surface}"),
+            (QuestionKind::Ir, _) => ("wav", format!("/api/v1/surfaces/{surface}/pairs/{pair}/ir.wav?signal=measured")),
+            (QuestionKind::All, 0) => ("page", "/".to_owned()),
+            (QuestionKind::All, 1) => ("surfaces", "/api/v1/surfaces".to_owned()),
+            (QuestionKind::All, 2) => ("surface", format!("/api/v1/surfaces/{surface}")),
             (QuestionKind::All, 3) => {
-                format!("/api/v1/surfaces/{surface}/grid?microphone={}", random.random_range(0..10))
+                ("grid", format!("/api/v1/surfaces/{surface}/grid?microphone={}", random.random_range(0..10)))
             }
             (QuestionKind::All, 4) => {
-                format!("/api/v1/surfaces/{surface}/curves?microphone={}", random.random_range(0..10))
+                ("curves", format!("/api/v1/surfaces/{surface}/curves?microphone={}", random.random_range(0..10)))
             }
-            (QuestionKind::All, 5 | 6) => format!("/api/v1/surfaces/{surface}/thumbnail.png"),
-            (QuestionKind::All, 7) => format!("/api/v1/surfaces/{surface}/pairs/{pair}"),
+            (QuestionKind::All, 5 | 6) => ("thumbnail", format!("/api/v1/surfaces/{surface}/thumbnail.png")),
+            (QuestionKind::All, 7) => ("pair", format!("/api/v1/surfaces/{surface}/pairs/{pair}")),
             (QuestionKind::All, 8) => {
-                format!("/api/v1/runs/{}", self.runs[random.random_range(0..self.runs.len())])
+                ("run", format!("/api/v1/runs/{}", self.runs[random.random_range(0..self.runs.len())]))
             }
-            (QuestionKind::All, _) => "/api/v1/map".to_owned(),
+            (QuestionKind::All, _) => ("map", "/api/v1/map".to_owned()),
         }
     }
 }
@@ -136,7 +139,8 @@ struct ReaderLoad {
 
 /// Times of all answers, and the number of requests that failed.
 struct ReaderTimes {
-    answers: Vec<Duration>,
+    /// By kind of page data.
+    answers: BTreeMap<&'static str, Vec<Duration>>,
     errors: u64,
 }
 
@@ -158,19 +162,21 @@ impl ReaderLoad {
             watch();
             std::thread::sleep(Duration::from_millis(200));
         }
-        let mut answers = Vec::new();
+        let mut answers = BTreeMap::<_, Vec<_>>::new();
         for reader in readers {
-            answers.extend(reader.join().map_err(|_| anyhow!("a reader panicked"))?);
+            for (what, time) in reader.join().map_err(|_| anyhow!("a reader panicked"))? {
+                answers.entry(what).or_default().push(time);
+            }
         }
         Ok(ReaderTimes { answers, errors: errors.load(Ordering::Relaxed) })
     }
 
-    fn read(&self, number: u64, end: Instant, errors: &AtomicU64) -> Vec<Duration> {
+    fn read(&self, number: u64, end: Instant, errors: &AtomicU64) -> Vec<(&'static str, Duration)> {
         let mut random = ChaCha8Rng::seed_from_u64(number);
         let mut own = Vec::new();
         let mut connection = None;
         while Instant::now() < end {
-            let path = self.contents.path(self.kind, &mut random);
+            let (what, path) = self.contents.path(self.kind, &mut random);
             let begun = Instant::now();
             let asked = match connection.take() {
                 Some(open) => Ok(open),
@@ -179,7 +185,7 @@ impl ReaderLoad {
             match asked.and_then(|mut open| open.get(&path).map(|answer| (open, answer))) {
                 // Not every surface has every pair.
                 Ok((open, (200 | 404, _))) => {
-                    own.push(begun.elapsed());
+                    own.push((what, begun.elapsed()));
                     connection = Some(open);
                 }
                 Ok((_, (status, body))) => {
@@ -210,11 +216,20 @@ pub(crate) fn run_readers(args: &ReadersArgs) -> Result<()> {
     let mut heaviest = 0;
     let load = ReaderLoad { server, contents, kind: args.kind, readers, time };
     let times = load.measure(|| heaviest = heaviest.max(args.pid.and_then(resident_mib).unwrap_or(0)))?;
-    let at = |share: f64| millis(percentile(&times.answers, share));
+    let all: Vec<_> = times.answers.values().flatten().copied().collect();
     println!("{:?}: {} readers, {} s", args.kind, args.readers, args.seconds);
-    println!("  answers {}, {:.0} a second", times.answers.len(), times.answers.len() as f64 / args.seconds as f64);
+    println!("  answers {}, {:.0} a second", all.len(), all.len() as f64 / args.seconds as f64);
     println!("  errors {}", times.errors);
-    println!("  p50 {:.1} ms, p95 {:.1} ms, p99 {:.1} ms", at(0.5), at(0.95), at(0.99));
+    for (what, answers) in times.answers.iter().chain([(&"all", &all)]) {
+        let at = |share: f64| millis(percentile(answers, share));
+        println!(
+            "  {what:9} {:7} p50 {:.1} ms, p95 {:.1} ms, p99 {:.1} ms",
+            answers.len(),
+            at(0.5),
+            at(0.95),
+            at(0.99)
+        );
+    }
     if heaviest > 0 {
         println!("  the server's memory at most {heaviest} MiB");
     }

@@ -1,5 +1,6 @@
 //! The catalogue over HTTP: the contract, files in ranges, what is kept, sessions, and what must stay data.
 
+use rustix::process::Signal;
 use serde_json::Value;
 
 use super::contract::ApiContract;
@@ -411,6 +412,40 @@ mod slow {
         let after = HttpRequest::get("/api/v1/surfaces").with("if-none-match", &tag).send(&server);
         assert_eq!((after.status, json(&after)["total"].as_u64()), (200, Some(4)));
         assert_ne!(after.header("etag"), Some(tag.as_str()));
+    }
+
+    // An engine that is stopped answers nothing: what comes nevertheless is the door's.
+    #[test]
+    fn cached_answers_need_no_engine_and_come_to_their_client_alone() {
+        let place = lake();
+        let made = place.run(&["token", "ann"]);
+        let token = format!("Bearer {}", crate::stderr(&made).lines().next().expect("a token"));
+        std::fs::write(place.path("tokens.toml"), &made.stdout).expect("written");
+        let server = served(&place, &["--tokens", "tokens.toml"]);
+        let ask = |name: &str, value: &str| {
+            let path = "/api/v1/surfaces?limit=2";
+            HttpRequest::get(path).with("authorization", &token).with(name, value).send(&server)
+        };
+        let first = ask("accept", "*/*");
+        let etag = first.header("etag").expect("a tag").to_owned();
+        server.signal_engines(Signal::STOP);
+        let again = ask("accept", "*/*");
+        let unchanged = ask("if-none-match", &etag).status;
+        let failed = ask("if-match", "\"other\"").status;
+        let unknown = get(&server, "/api/v1/surfaces?limit=2").status;
+        let wrong = HttpRequest::get("/api/v1/surfaces?limit=2").with("authorization", "Bearer x").send(&server).status;
+        server.signal_engines(Signal::CONT);
+        assert_eq!((again.status, &again.body, again.header("etag")), (200, &first.body, Some(&*etag)));
+        assert_eq!((unchanged, failed, unknown, wrong), (304, 412, 401, 401));
+        assert_eq!(first.header("echolake-lasting-version"), None, "that is for the door");
+        // The same address in another form, and what was refused, are answered by the engine.
+        assert_eq!(ask("accept-encoding", "gzip").header("content-encoding"), Some("gzip"));
+        place.acquire("wavy", &["--ir-only"]);
+        place.ok(&["ingest"]);
+        let after = ask("if-none-match", &etag);
+        assert_eq!((after.status, json(&after)["total"].as_u64()), (200, Some(4)));
+        std::fs::write(place.path("tokens.toml"), "").expect("written");
+        crate::serve::wait_until("its token is gone", || ask("accept", "*/*").status == 401);
     }
 
     #[test]

@@ -329,26 +329,11 @@ fn what_is_sent_after_an_error_is_not_kept() {
 }
 
 mod slow {
-    use rustix::process::{Pid, Signal, kill_process};
+    use rustix::process::Signal;
 
     use super::super::http::HttpRequest;
     use super::super::{ENDLESS, lake, refused, running, served, sql, wait_until};
     use super::*;
-
-    // The server's engines, the spare one, too.
-    fn kill_engines(server: &ServedLake) {
-        let all = std::fs::read_dir(format!("/proc/{}/task", server.id())).expect("threads");
-        let lists = all.map(|thread| std::fs::read_to_string(thread.expect("a thread").path().join("children")));
-        let pids: Vec<i32> = lists
-            .filter_map(Result::ok)
-            .flat_map(|list| list.split_whitespace().map(|pid| pid.parse().expect("a number")).collect::<Vec<_>>())
-            .collect();
-        assert!(!pids.is_empty(), "it has engines");
-        for pid in pids {
-            // One may have ended by itself.
-            let _ = kill_process(Pid::from_raw(pid).expect("a process"), Signal::KILL);
-        }
-    }
 
     #[test]
     fn a_connection_ends_with_its_engine_and_nothing_is_run_again() {
@@ -363,7 +348,7 @@ mod slow {
         let mut reading = WireClient::connect(&server, None);
         reading.begin("select repeat('x', 1000) from generate_series(1, 1000000)");
         while reading.message().0 != b'D' {}
-        kill_engines(&server);
+        server.signal_engines(Signal::KILL);
         for client in [&mut idle, &mut busy] {
             assert_eq!(client.end_state(), "58000");
         }
@@ -415,7 +400,7 @@ mod slow {
         let refusal = loop {
             let answer = sql(&server, "select 7");
             match answer.status {
-                200 => kill_engines(&server),
+                200 => server.signal_engines(Signal::KILL),
                 429 => break answer,
                 // It was killed while it answered, or started.
                 _ => {}

@@ -6,6 +6,7 @@ use std::process::Command;
 use std::time::Duration;
 
 use echolake_testing::{ChildProcess, run_command};
+use rustix::process::{Pid, Signal, kill_process};
 
 use super::tunnel::{CERTIFIED_NAME, ServerTunnels, TunnelOpening};
 
@@ -92,6 +93,21 @@ impl ServedLake {
     /// Its process id.
     pub fn id(&self) -> u32 {
         self.child.id()
+    }
+
+    /// Sends a signal to its engines, the spare one, too.
+    pub fn signal_engines(&self, signal: Signal) {
+        let all = std::fs::read_dir(format!("/proc/{}/task", self.id())).expect("threads");
+        let lists = all.map(|thread| std::fs::read_to_string(thread.expect("a thread").path().join("children")));
+        let pids: Vec<i32> = lists
+            .filter_map(Result::ok)
+            .flat_map(|list| list.split_whitespace().map(|pid| pid.parse().expect("a number")).collect::<Vec<_>>())
+            .collect();
+        assert!(!pids.is_empty(), "it has engines");
+        for pid in pids {
+            // One may have ended by itself.
+            let _ = kill_process(Pid::from_raw(pid).expect("a process"), signal);
+        }
     }
 
     /// Returns the lines it wrote to stderr so far.

@@ -21,7 +21,10 @@ pub fn oversampled_peak(signal: &[f32]) -> f64 {
             (PI * v).sin() / (PI * v) * (PI * v / (2.0 * REACH as f64)).cos().powi(2)
         })
     });
-    let mut peak = signal.iter().fold(0.0f64, |most, x| most.max(f64::from(x.abs())));
+    let mut peak = f64::from(greatest_magnitude(signal));
+    if peak < LEAST.into() {
+        return peak;
+    }
     for window in signal.windows(2 * REACH) {
         // The interpolated value stands between the two in the middle.
         if window[REACH - 2..REACH + 2].iter().all(|x| x.abs() < LEAST) {
@@ -33,6 +36,15 @@ pub fn oversampled_peak(signal: &[f32]) -> f64 {
         }
     }
     peak
+}
+
+/// Returns the greatest absolute value of a signal.
+pub(crate) fn greatest_magnitude(signal: &[f32]) -> f32 {
+    let mut most = [0.0f32; 32];
+    for chunk in signal.chunks(most.len()) {
+        most.iter_mut().zip(chunk).for_each(|(most, x)| *most = if x.abs() > *most { x.abs() } else { *most });
+    }
+    most.into_iter().fold(0.0, f32::max)
 }
 
 #[cfg(test)]

@@ -1,12 +1,17 @@
 //! Lost and repeated samples, from the ringing that they make before the first arrival.
 
+use std::ops::Range;
+
 use realfft::num_complex::Complex;
 
-use super::{ONSET_SHARE, RINGING_SECS, SweepResponse, TakeAnalysis, TakeAnalyzer, TakeChannel, TakeFault};
+use super::{
+    ONSET_SHARE, OnsetVicinity, RINGING_SECS, TakeAnalysis, TakeAnalyzer, TakeChannel, TakeFault, greatest_magnitude,
+};
 use crate::level::power_to_db;
+use crate::sweep::SineSweep;
 
 /// Length of the windows before the arrival, s.
-const WINDOW_SECS: f64 = 5e-3;
+pub(super) const WINDOW_SECS: f64 = 5e-3;
 /// Parts of the sweep that are compared.
 const PARTS: usize = 100;
 /// Least power of a part's ringing, re the mean power of the response: a lost sample has -38 dB and more, a clean take
@@ -18,41 +23,38 @@ const OVER_FARTHER: f64 = 3.2;
 const OVER_MEDIAN: f64 = 32.0;
 
 impl TakeAnalyzer {
-    /// Adds a fault if samples are missing or repeated, whichever of the clock ratios is true; returns whether it did.
+    /// Adds a fault if samples are missing or repeated, whichever clock ratio of the vicinities is true; returns whether
+    /// it did.
     pub(super) fn find_dropout(
         &self,
         analysis: &mut TakeAnalysis,
-        response: &SweepResponse,
-        ratios: &[f64],
+        onset: i64,
+        vicinities: &[&OnsetVicinity],
         channel: TakeChannel,
-        delay: i64,
     ) -> bool {
         let mut found = None;
-        for ratio in ratios {
-            found = self.locate_dropout(&self.align_clocks(response, *ratio));
+        for vicinity in vicinities {
+            found = self.locate_dropout(vicinity);
             if found.is_none() {
                 return false;
             }
         }
         if let Some((sweep_secs, ringing_db)) = found {
-            let at_secs = sweep_secs + self.secs_of(response.onset + delay);
+            let at_secs = sweep_secs + self.secs_of(onset);
             analysis.faults.push(TakeFault::Dropout { channel, at_secs, ringing_db });
         }
         found.is_some()
     }
 
     // Time in the sweep, s, and level of the ringing, dB.
-    fn locate_dropout(&self, vicinity: &[Complex<f64>]) -> Option<(f64, f64)> {
-        let power: Vec<f64> = vicinity.iter().map(Complex::norm_sqr).collect();
-        let least = ONSET_SHARE * ONSET_SHARE * power.iter().fold(0.0, |most: f64, x| most.max(*x));
-        let onset = power.iter().position(|x| *x >= least)?;
-        let window = self.seconds(WINDOW_SECS).min(self.short.len / 8);
+    fn locate_dropout(&self, vicinity: &OnsetVicinity) -> Option<(f64, f64)> {
+        let least = (ONSET_SHARE * ONSET_SHARE) as f32 * greatest_magnitude(&vicinity.powers);
+        let onset = vicinity.powers.iter().position(|x| *x >= least)?;
+        let window = self.short.window.len();
         let guard = self.seconds(RINGING_SECS);
-        let mut whole = vicinity.to_vec();
-        self.short.forward.process(&mut whole);
-        let near = self.part_powers(&self.window_spectrum(vicinity, onset, guard, window));
-        let farther = self.part_powers(&self.window_spectrum(vicinity, onset, guard + window * 3 / 2, window));
-        let mean = mean_of(&self.part_powers(&whole));
+        let near = self.part_powers(&self.window_spectrum(&vicinity.samples, onset, guard));
+        let farther = self.part_powers(&self.window_spectrum(&vicinity.samples, onset, guard + window * 3 / 2));
+        let mean = mean_of(&self.part_powers(&vicinity.spectrum));
         let mut sorted: Vec<f64> = near.iter().flatten().copied().collect();
         sorted.sort_by(f64::total_cmp);
         let median = *sorted.get(sorted.len() / 2)?;
@@ -66,38 +68,40 @@ impl TakeAnalyzer {
         is_dropout.then(|| (at_secs, power_to_db(ringing / mean)))
     }
 
-    // Spectrum of a Hann window that ends `before` samples before the onset.
-    fn window_spectrum(
-        &self,
-        vicinity: &[Complex<f64>],
-        onset: usize,
-        before: usize,
-        window: usize,
-    ) -> Vec<Complex<f64>> {
+    // Spectrum of a window that ends `before` samples before the onset.
+    fn window_spectrum(&self, samples: &[Complex<f32>], onset: usize, before: usize) -> Vec<Complex<f32>> {
         let mut windowed = vec![Complex::default(); self.short.len];
-        for i in 0..window {
+        for (i, gain) in self.short.window.iter().enumerate() {
             let index = (onset + 2 * self.short.len - before - i) % self.short.len;
-            let gain = (std::f64::consts::PI * (i as f64 + 0.5) / window as f64).sin().powi(2);
-            windowed[index] = vicinity[index] * gain;
+            windowed[index] = samples[index] * gain;
         }
         self.short.forward.process(&mut windowed);
         windowed
     }
 
     // Mean power of each part of the sweep; None if no bin is in it.
-    fn part_powers(&self, spectrum: &[Complex<f64>]) -> Vec<Option<f64>> {
-        let mut sums = [(0.0, 0usize); PARTS];
-        for (k, z) in spectrum.iter().enumerate().take(self.short.len / 2).skip(1) {
-            let hz = k as f64 * self.short.step_hz;
-            if super::taper_gain(&self.sweep, hz) > 0.0 {
-                let share = self.sweep.time_at(hz) / self.sweep.duration_secs;
-                let (sum, count) = &mut sums[((share * PARTS as f64) as usize).min(PARTS - 1)];
-                *sum += z.norm_sqr();
-                *count += 1;
-            }
-        }
-        sums.map(|(sum, count)| (count > 0).then(|| sum / count as f64)).to_vec()
+    fn part_powers(&self, spectrum: &[Complex<f32>]) -> Vec<Option<f64>> {
+        let mean = |part: &Range<usize>| {
+            spectrum[part.clone()].iter().map(|z| f64::from(z.norm_sqr())).sum::<f64>() / part.len() as f64
+        };
+        self.short.parts.iter().map(|part| (!part.is_empty()).then(|| mean(part))).collect()
     }
+}
+
+/// Bins of each part of a sweep, of ascending ones.
+pub(super) fn split_sweep(sweep: &SineSweep, bins: impl Iterator<Item = usize>, step_hz: f64) -> Vec<Range<usize>> {
+    let mut parts = vec![0..0; PARTS];
+    for k in bins {
+        let share = sweep.time_at(k as f64 * step_hz) / sweep.duration_secs;
+        let part = &mut parts[((share * PARTS as f64) as usize).min(PARTS - 1)];
+        *part = if part.end == 0 { k } else { part.start }..k + 1;
+    }
+    parts
+}
+
+/// Hann's window.
+pub(super) fn hann_window(len: usize) -> Vec<f32> {
+    (0..len).map(|i| (std::f64::consts::PI * (i as f64 + 0.5) / len as f64).sin().powi(2) as f32).collect()
 }
 
 fn mean_of(parts: &[Option<f64>]) -> f64 {

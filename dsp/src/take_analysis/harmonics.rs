@@ -58,7 +58,7 @@ impl TakeAnalyzer {
             let lowest = order as f64 * self.sweep.low_hz;
             let step = self.sweep.rate_hz / response.samples.len() as f64;
             let gains = self.taper.iter().enumerate().filter(|(k, _)| *k as f64 * step >= lowest);
-            let width: f64 = gains.map(|(_, gain)| gain * gain).sum();
+            let width: f64 = gains.map(|(_, gain)| f64::from(*gain).powi(2)).sum();
             let expected_noise = noise * (range.end - range.start) as f64;
             ((response.energy_of(range) - expected_noise) / width, expected_noise / width)
         };
@@ -77,7 +77,7 @@ impl TakeAnalyzer {
     fn noise_power(&self, response: &SweepResponse) -> f64 {
         let n = response.samples.len() as i64;
         let middle = response.onset + n / 2;
-        let mut powers: Vec<f64> = (middle - n / 16..middle + n / 16).map(|i| response.at(i).norm_sqr()).collect();
+        let mut powers: Vec<f64> = response.powers_in(middle - n / 16..middle + n / 16).collect();
         powers.sort_by(f64::total_cmp);
         powers.get(powers.len() / 2).map_or(0.0, |median| median / std::f64::consts::LN_2)
     }

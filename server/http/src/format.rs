@@ -52,7 +52,7 @@ pub(super) fn accepted_format(accept: &str) -> Result<AnswerFormat, RequestFault
 }
 
 /// Returns whether an Arrow stream is preferred to JSON.
-pub(super) fn prefers_arrow(headers: &HeaderMap) -> bool {
+pub fn prefers_arrow(headers: &HeaderMap) -> bool {
     let accept = headers.get(header::ACCEPT).and_then(|v| v.to_str().ok()).unwrap_or_default();
     accepted_format(accept).is_ok_and(|format| format == AnswerFormat::Arrow)
 }

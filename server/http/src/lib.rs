@@ -16,20 +16,26 @@ mod request_protocol;
 mod slices;
 mod sql;
 
+use std::convert::Infallible;
+
 use axum::Router;
 use axum::middleware::{from_fn, from_fn_with_state, map_response};
+use axum::response::Response;
 use echolake_service::request_span::trace_request;
 use echolake_service::{Error, QueryService, RequestFault, ServerProtocol};
+use http_body_util::BodyExt as _;
 use hyper::server::conn::http1;
+use hyper::service::{Service as _, service_fn};
 use hyper_util::rt::TokioIo;
 use hyper_util::service::TowerToHyperService;
 use tokio::net::UnixListener;
 use tower_http::catch_panic::CatchPanicLayer;
 use utoipa::openapi::OpenApi;
 
+pub use catalogue::LASTING_VERSION;
 use catalogue::LakeCatalogue;
 pub use conditions::ConditionOutcome;
-pub use format::accepts_encoding;
+pub use format::{accepts_encoding, prefers_arrow};
 pub use guard::{FORWARDED_PROTO, RequestSite, is_encrypted, is_same_origin, own_pages_only, request_site};
 pub use mcp::MCP;
 pub use problem::{ProblemBody, ProblemResponse};
@@ -40,15 +46,27 @@ use slices::{FOXGLOVE_MANIFEST, LICHTBLICK_SESSION, SLICE, SOFA, SliceService};
 /// Paths that viewers on pages of any origin use.
 pub const VIEWER_PATHS: [&str; 5] = [files::RUN, SLICE, SOFA, FOXGLOVE_MANIFEST, LICHTBLICK_SESSION];
 
-/// Answers HTTP on an engine's socket; a connection is one request.
+/// Answers HTTP on an engine's socket. A request counts until its answer is sent or dropped.
 pub async fn serve_http_socket(service: QueryService, listener: UnixListener) -> Result<(), Error> {
     let router = engine_router(&service);
     loop {
         let (stream, _) = listener.accept().await.map_err(Error::System)?;
-        let answers = TowerToHyperService::new(router.clone());
-        let guard = service.activity().begin_work();
+        let router = TowerToHyperService::new(router.clone());
+        let activity = service.activity().clone();
+        let answers = service_fn(move |request| {
+            let guard = activity.begin_work();
+            let answer = router.call(request);
+            async move {
+                let answer: Response = answer.await?;
+                Ok::<_, Infallible>(answer.map(|body| {
+                    body.map_frame(move |frame| {
+                        let _guard = &guard;
+                        frame
+                    })
+                }))
+            }
+        });
         tokio::spawn(async move {
-            let _guard = guard;
             // A connection that breaks off is the door's matter.
             let _ = http1::Builder::new().serve_connection(TokioIo::new(stream), answers).await;
         });
@@ -78,7 +96,8 @@ fn with_protocol(protocol: ServerProtocol, routes: Router) -> Router {
 /// others.
 pub fn contract_parts() -> [OpenApi; 2] {
     let files = files::viewer_routes().merge(files::own_routes()).merge(manifest::manifest_routes());
-    let mut validated = catalogue::table_routes().merge(catalogue::file_routes()).into_openapi();
+    let catalogue = catalogue::light_routes().merge(catalogue::heavy_routes()).merge(catalogue::file_routes());
+    let mut validated = catalogue.into_openapi();
     validated.merge(layout::layout_routes().into_openapi());
     validated.merge(files.into_openapi());
     let mut others = sql::sql_routes().into_openapi();

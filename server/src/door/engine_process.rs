@@ -13,12 +13,14 @@ use std::time::{Duration, Instant};
 use axum::body::Body;
 use echolake_lake::CacheFolder;
 use echolake_service::{ClientIdentity, DoorMessage, EngineReport, EngineSocket, ServerProtocol, counted_bytes};
-use hyper::client::conn::http2;
+use hyper::client::conn::{http1, http2};
+use hyper_util::rt::TokioIo;
 use rustix::process::{Pid, PidfdFlags, Signal, pidfd_open, pidfd_send_signal};
 use tokio::io::{AsyncBufReadExt as _, AsyncWriteExt as _, BufReader};
 use tokio::net::UnixStream;
 use tokio::process::{Child, ChildStdin, ChildStdout, Command};
 use tokio::sync::SetOnce;
+use tokio::task::JoinSet;
 
 use crate::door::activity::ServerActivity;
 
@@ -27,6 +29,9 @@ use crate::door::activity::ServerActivity;
 const SILENCE: Duration = Duration::from_secs(5);
 /// Time for which a request that lost its engine waits for the reason.
 const REASON_WAIT: Duration = Duration::from_secs(2);
+
+/// Idle connections that are kept to an engine.
+const IDLE_CONNECTIONS: usize = 32;
 
 /// The engines' program and their limits.
 #[derive(Debug, Clone)]
@@ -75,6 +80,14 @@ pub(crate) struct EngineProcess {
     why_killed: OnceLock<EndReason>,
     ended: SetOnce<EndReason>,
     pub flight: tokio::sync::Mutex<Option<http2::SendRequest<Body>>>,
+    /// Connections of HTTP/1.1 whose last answer was received whole.
+    idle_connections: Mutex<Vec<HttpConnection>>,
+}
+
+/// A connection of HTTP/1.1 to an engine. Dropping it ends what was requested on it.
+pub(crate) struct HttpConnection {
+    pub sender: http1::SendRequest<Body>,
+    _driver: JoinSet<()>,
 }
 
 struct EngineUsage {
@@ -163,6 +176,7 @@ impl EngineProcess {
             why_killed: OnceLock::new(),
             ended: SetOnce::new(),
             flight: tokio::sync::Mutex::default(),
+            idle_connections: Mutex::default(),
         });
         tokio::spawn(supervise_engine(engine.clone(), child, stdout, start.spills, activity));
         Ok(engine)
@@ -220,6 +234,35 @@ impl EngineProcess {
     /// The engine is not there any more.
     pub async fn connect_socket(&self, socket: EngineSocket) -> io::Result<UnixStream> {
         UnixStream::connect(socket.path_in(&self.folder)).await
+    }
+
+    /// Returns a connection for one request: an idle one, or a new one.
+    ///
+    /// # Errors
+    /// The engine is not there any more.
+    pub async fn take_connection(&self) -> Result<HttpConnection, String> {
+        while let Some(idle) = self.lock_idle().pop() {
+            if idle.sender.is_ready() {
+                return Ok(idle);
+            }
+        }
+        let stream = self.connect_socket(EngineSocket::Http).await.map_err(|e| e.to_string())?;
+        let (sender, driver) = http1::handshake(TokioIo::new(stream)).await.map_err(|e| e.to_string())?;
+        let mut tasks = JoinSet::new();
+        tasks.spawn(async move { drop(driver.await) });
+        Ok(HttpConnection { sender, _driver: tasks })
+    }
+
+    /// Keeps a connection for the next request; its last answer was received whole.
+    pub fn keep_connection(&self, connection: HttpConnection) {
+        let mut idle = self.lock_idle();
+        if idle.len() < IDLE_CONNECTIONS {
+            idle.push(connection);
+        }
+    }
+
+    fn lock_idle(&self) -> MutexGuard<'_, Vec<HttpConnection>> {
+        self.idle_connections.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Holds it for one request; None if it is ending.

@@ -14,15 +14,14 @@ use echolake_flight::WINDOW_BYTES;
 use echolake_service::{ClientIdentity, EngineSocket, RequestFault};
 use futures::{TryStreamExt as _, stream};
 use hyper::body::{Frame, Incoming, SizeHint};
-use hyper::client::conn::{http1, http2};
+use hyper::client::conn::http2;
 use hyper_util::rt::{TokioExecutor, TokioIo};
-use tokio::task::JoinSet;
 use tokio::time::Instant;
 use tracing::Span;
 
 use super::connection_places::{PlaceWork, WorkingPlace};
 use super::engine_pool::EnginePool;
-use super::engine_process::{EndReason, EngineLease, EngineProcess};
+use super::engine_process::{EndReason, EngineLease, EngineProcess, HttpConnection};
 
 /// Bytes of a request up to which it is kept, so that it can be sent again to a new engine.
 const KEPT_BYTES: usize = 64 << 10;
@@ -44,7 +43,7 @@ const OF_CONNECTION: [HeaderName; 4] =
 /// The protocol to an engine.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum EngineProtocol {
-    /// HTTP/1.1, on a connection for each request.
+    /// HTTP/1.1, on a connection that no other request has.
     Http,
     /// HTTP/2, on one connection for all.
     Grpc,
@@ -237,19 +236,16 @@ impl BodyReader {
 
 struct EngineAnswer {
     response: Response<Incoming>,
-    connection: JoinSet<()>,
+    connection: Option<HttpConnection>,
     wire: EngineProtocol,
 }
 
 impl EngineAnswer {
     async fn fetch_from(engine: &EngineProcess, request: Request<Body>, wire: EngineProtocol) -> Result<Self, String> {
-        let mut connection = JoinSet::new();
+        let mut connection = None;
         let response = match wire {
             EngineProtocol::Http => {
-                let stream = engine.connect_socket(EngineSocket::Http).await.map_err(|e| e.to_string())?;
-                let (mut sender, driver) = http1::handshake(TokioIo::new(stream)).await.map_err(|e| e.to_string())?;
-                connection.spawn(async move { drop(driver.await) });
-                sender.send_request(request).await
+                connection.insert(engine.take_connection().await?).sender.send_request(request).await
             }
             EngineProtocol::Grpc | EngineProtocol::InteractiveGrpc => {
                 engine.flight_sender().await?.send_request(request).await
@@ -264,16 +260,18 @@ impl EngineAnswer {
         lease.set_waiting(true);
         response.map(|incoming| {
             let is_ended = false;
-            EngineBody {
-                incoming,
-                wire,
-                lease,
-                _connection: connection,
-                _working: working,
-                span: Span::current(),
-                is_ended,
-            }
+            EngineBody { incoming, wire, lease, connection, _working: working, span: Span::current(), is_ended }
         })
+    }
+}
+
+impl Drop for EngineBody {
+    fn drop(&mut self) {
+        if hyper::body::Body::is_end_stream(self)
+            && let Some(connection) = self.connection.take()
+        {
+            self.lease.engine().keep_connection(connection);
+        }
     }
 }
 
@@ -306,7 +304,7 @@ pub(crate) struct EngineBody {
     incoming: Incoming,
     wire: EngineProtocol,
     lease: EngineLease,
-    _connection: JoinSet<()>,
+    connection: Option<HttpConnection>,
     _working: Option<WorkingPlace>,
     span: Span,
     is_ended: bool,
@@ -347,7 +345,12 @@ impl hyper::body::Body for EngineBody {
         match polled {
             Poll::Ready(Some(Err(failed))) => {
                 self.is_ended = true;
+                self.connection = None;
                 Poll::Ready(Some(self.failure_frame().ok_or(failed)))
+            }
+            Poll::Ready(None) => {
+                self.is_ended = true;
+                Poll::Ready(None)
             }
             other => other,
         }

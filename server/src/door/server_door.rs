@@ -14,6 +14,7 @@ use super::drain::ServerDrain;
 use super::engine_pool::EnginePool;
 use super::engine_process::EngineSettings;
 use super::failed_logins::FailedLogins;
+use super::http::answer_cache::AnswerCache;
 use super::readiness::ReadinessCheck;
 use crate::door::activity::ServerActivity;
 use crate::metrics::{ServerGauges, ServerMetrics};
@@ -29,6 +30,7 @@ struct DoorState {
     access: Arc<TokenAccess>,
     activity: Arc<ServerActivity>,
     engines: EnginePool,
+    answers: AnswerCache,
     readiness: ReadinessCheck,
     drain: ServerDrain,
     layout: ViewerLayout,
@@ -49,10 +51,11 @@ impl ServerDoor {
         let failed_logins = FailedLogins::new(!access.is_open() && !is_behind_proxy);
         let activity = Arc::new(ServerActivity::new()?);
         let engines = EnginePool::new(lake, settings, activity.clone(), access.clone())?;
+        let answers = AnswerCache::new(lake);
         let layout = ViewerLayout::new(lake.rig());
         let readiness = ReadinessCheck::new(lake);
         let drain = ServerDrain::default();
-        Ok(Self(Arc::new(DoorState { access, activity, engines, readiness, drain, layout, failed_logins })))
+        Ok(Self(Arc::new(DoorState { access, activity, engines, answers, readiness, drain, layout, failed_logins })))
     }
 
     /// Failed logins of the last minute.
@@ -62,6 +65,11 @@ impl ServerDoor {
 
     pub fn access(&self) -> &TokenAccess {
         &self.0.access
+    }
+
+    /// Cached answers of engines.
+    pub fn answers(&self) -> &AnswerCache {
+        &self.0.answers
     }
 
     pub fn metrics(&self) -> &ServerMetrics {

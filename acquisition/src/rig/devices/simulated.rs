@@ -445,8 +445,9 @@ impl Played {
 fn quantise_signal(signal: &[f32], gain: f64, noise: f64, world: &mut SimulatedWorld, out: &mut Vec<i32>) {
     out.clear();
     out.extend(signal.iter().map(|x| {
-        let value = f64::from(*x) * gain + noise * world.draw_normal();
-        (value * FULL_SCALE).round().clamp(-FULL_SCALE, FULL_SCALE - 1.0) as i32
+        let value = FULL_SCALE * (f64::from(*x) * gain + noise * world.draw_normal());
+        // Rounded: the conversion cuts. `round` is a call for each sample, unless the processor is known.
+        (value + 0.5f64.copysign(value)).clamp(-FULL_SCALE, FULL_SCALE - 1.0) as i32
     }));
 }
 

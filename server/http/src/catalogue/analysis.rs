@@ -15,7 +15,7 @@ use utoipa::{IntoParams, ToSchema};
 
 use super::super::extract::{PathParams, QueryParams, WholeNumber};
 use super::content::{AnswerContent, EndpointAnswer};
-use super::pair::{PairPath, ResponseSignal, read_geometry, read_measurement, read_reflected};
+use super::pair::{PairPath, ResponseSignal, find_geometry, read_measurement, read_reflected};
 use super::request::CatalogueRequest;
 
 /// Samples that are analysed; what follows them is left out.
@@ -119,7 +119,7 @@ pub(super) async fn analysis(
     let found = tokio::try_join!(
         read_measurement(&request, entry, pair),
         read_reflected(&request, entry, pair),
-        read_geometry(&request, pair)
+        find_geometry(&request, pair)
     );
     let (measurement, [own, flat], geometry) = found?;
     let rig = request.catalogue.lake().rig();

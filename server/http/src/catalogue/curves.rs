@@ -5,7 +5,6 @@ use std::sync::Arc;
 use arrow::array::{ArrayRef, Float64Array};
 use arrow::record_batch::RecordBatch;
 use axum::Extension;
-use datafusion::common::ScalarValue;
 use echolake_query::figure_rows::{CurveRow, curves_query, kept_curves_query, point_filter, thinned_samples, times_ms};
 use echolake_schema::Rig;
 use echolake_service::RequestFault;
@@ -40,17 +39,6 @@ pub(super) struct SurfaceCurves {
 pub(super) enum PairSelection {
     All,
     Point(usize),
-    Pair(usize),
-}
-
-impl PairSelection {
-    fn sql_filter(&self) -> (String, Option<ScalarValue>) {
-        match self {
-            Self::All => (String::new(), None),
-            Self::Point(point) => (point_filter("$2"), Some(number_value(*point))),
-            Self::Pair(pair) => (" and pair_id = $2".to_owned(), Some(number_value(*pair))),
-        }
-    }
 }
 
 impl CurveSet {
@@ -63,33 +51,35 @@ impl CurveSet {
         points: usize,
     ) -> Result<Self, RequestFault> {
         let rig = request.catalogue.lake().rig();
-        let (filter, value) = over.sql_filter();
-        let sql = curves_query(rig, "$1", &filter);
-        let kept_sql = matches!(over, PairSelection::All).then(|| kept_curves_query(rig, "$1"));
-        let first = async |sql: &str, values| -> Result<Option<CurveRow>, RequestFault> {
-            Ok(request.read_rows(sql, values).await?.into_iter().next())
-        };
-        let read = async |surface: &str| -> Result<Option<CurveRow>, RequestFault> {
-            if let Some(sql) = &kept_sql
-                && let Some(row) = first(sql, vec![text_value(surface)]).await?
-            {
-                return Ok(Some(row));
-            }
-            first(&sql, [text_value(surface)].into_iter().chain(value.clone()).collect()).await
-        };
         let id = &entry.surface.surface_id;
         let flat = &entry.surface.flat_reference;
-        // What is left of Foam without Foam is no energy of a surface.
-        let read_own = async || if entry.surface.is_foam() { Ok(None) } else { read(id).await };
-        let known = request.view.flat_curves(flat);
-        let read_flat = async || match over {
-            PairSelection::All => Ok(known.get_or_try_init(|| read(flat)).await?.clone()),
-            PairSelection::Point(_) | PairSelection::Pair(_) => read(flat).await,
+        let rows = match over {
+            PairSelection::Point(point) => {
+                let values = vec![text_value(id), text_value(flat), number_value(point)];
+                request.read_rows(&curves_query(rig, "$1, $2", &point_filter("$3")), values).await?
+            }
+            PairSelection::All => {
+                let known = request.view.flat_curves(flat);
+                let of_flat = known.get_or_try_init(|| read_mean_curves(request, flat));
+                let (own, flat) = tokio::try_join!(read_mean_curves(request, id), of_flat)?;
+                own.into_iter().chain(flat.clone()).collect()
+            }
         };
-        let (own_row, flat_row) = tokio::try_join!(read_own(), read_flat())?;
+        Ok(Self::from_rows(rig, entry, &rows, points))
+    }
+
+    /// The curves among these rows, decimated to `points`.
+    pub fn from_rows(rig: &Rig, entry: &SurfaceEntry, rows: &[CurveRow], points: usize) -> Self {
+        let surface = &entry.surface;
         let kept = thinned_samples(rig.impulse_response.length, points);
-        let thin = |surface: &str, row: Option<CurveRow>| thinned_curves(surface, row.as_ref(), rig, &kept);
-        Ok(Self { time_ms: times_ms(rig, &kept), surface: thin(id, own_row), flat: thin(flat, flat_row) })
+        let find = |name: &str| rows.iter().find(|row| row.surface_id == name);
+        // What is left of Foam without Foam is no energy of a surface.
+        let own = find(&surface.surface_id).filter(|_| !surface.is_foam());
+        Self {
+            time_ms: times_ms(rig, &kept),
+            surface: thinned_curves(&surface.surface_id, own, rig, &kept),
+            flat: thinned_curves(&surface.flat_reference, find(&surface.flat_reference), rig, &kept),
+        }
     }
 
     /// Returns whether the surface itself has curves.
@@ -113,6 +103,17 @@ impl CurveSet {
         RecordBatch::try_from_iter_with_nullable(columns.into_iter().map(|(name, values)| (name, values, true)))
             .map_err(RequestFault::defect("curves make no batch"))
     }
+}
+
+// Means over all pairs, as ingest keeps them if it does.
+async fn read_mean_curves(request: &CatalogueRequest, surface: &str) -> Result<Option<CurveRow>, RequestFault> {
+    let rig = request.catalogue.lake().rig();
+    for sql in [kept_curves_query(rig, "$1"), curves_query(rig, "$1", "")] {
+        if let Some(row) = request.read_rows(&sql, vec![text_value(surface)]).await?.into_iter().next() {
+            return Ok(Some(row));
+        }
+    }
+    Ok(None)
 }
 
 fn thinned_curves(surface: &str, row: Option<&CurveRow>, rig: &Rig, kept: &[usize]) -> SurfaceCurves {

@@ -1,6 +1,6 @@
 //! The catalogue: the data of the pages, each a query of the lake, answered once per snapshot and cached.
 //!
-//! [`table_routes`] and [`file_routes`] list the endpoints. [`answer_through_cache`] stands before all of them: whether
+//! [`light_routes`], [`heavy_routes`] and [`file_routes`] list the endpoints. [`answer_through_cache`] stands before all of them: whether
 //! the client may ask, whether it has the answer already, and whether the cache does.
 
 mod analysis;
@@ -26,7 +26,7 @@ mod wav;
 use std::sync::Arc;
 
 use axum::extract::{Request, State};
-use axum::http::{HeaderValue, Method, header};
+use axum::http::{HeaderName, HeaderValue, Method, header};
 use axum::middleware::{Next, from_fn_with_state};
 use axum::response::Response;
 use axum::{Extension, Router};
@@ -34,6 +34,7 @@ use echolake_lake::Lake;
 use echolake_schema::tables::Table;
 use echolake_service::{FaultCode, QueryService, RequestFault, TokenScope};
 use serde_json::Value;
+use tokio::sync::Semaphore;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
@@ -47,31 +48,39 @@ use snapshot::view::SnapshotViews;
 pub(super) use snapshot::view::{SnapshotView, VisibleFile};
 pub(super) use tables::{ColumnDescription, find_table};
 
-/// The endpoints that are answered from tables.
-pub(super) fn table_routes() -> OpenApiRouter {
+/// The version of the lake for as long as which an answer is right, for the door, which may give it again until then.
+pub const LASTING_VERSION: HeaderName = HeaderName::from_static("echolake-lasting-version");
+
+/// The endpoints that are answered from tables by few queries.
+pub(super) fn light_routes() -> OpenApiRouter {
     OpenApiRouter::new()
         .routes(routes!(lake::lake))
         .routes(routes!(facets::surfaces))
         .routes(routes!(surface::surface))
         .routes(routes!(surface::grid))
         .routes(routes!(curves::curves))
-        .routes(routes!(figures::grid_figure))
-        .routes(routes!(figures::curves_figure))
         .routes(routes!(relief::heightmap))
         .routes(routes!(relief::thumbnail))
         .routes(routes!(measured_pairs::measured_pairs))
-        .routes(routes!(pair::pair))
-        .routes(routes!(analysis::analysis))
-        .routes(routes!(analysis::spectrogram))
         .routes(routes!(wav::wav))
-        .routes(routes!(map::map))
-        .routes(routes!(figures::map_figure))
-        .routes(routes!(correlations::correlations))
         .routes(routes!(runs::runs))
         .routes(routes!(runs::run))
         .routes(routes!(environment::environment))
         .routes(routes!(tables::tables))
         .routes(routes!(tables::table_files))
+}
+
+/// The endpoints that are answered from tables by many queries or long computations.
+pub(super) fn heavy_routes() -> OpenApiRouter {
+    OpenApiRouter::new()
+        .routes(routes!(figures::grid_figure))
+        .routes(routes!(figures::curves_figure))
+        .routes(routes!(figures::map_figure))
+        .routes(routes!(pair::pair))
+        .routes(routes!(analysis::analysis))
+        .routes(routes!(analysis::spectrogram))
+        .routes(routes!(map::map))
+        .routes(routes!(correlations::correlations))
 }
 
 /// The endpoints that are answered from run files.
@@ -95,10 +104,13 @@ impl LakeCatalogue {
 
     /// Routes of the endpoints.
     pub fn endpoint_router(&self) -> Router {
-        let cached = |routes: OpenApiRouter, scope| {
-            Router::from(routes).route_layer(from_fn_with_state((self.clone(), scope), answer_through_cache))
-        };
-        cached(table_routes(), TokenScope::Sql).merge(cached(file_routes(), TokenScope::Files))
+        let cached =
+            |routes: Router, scope| routes.route_layer(from_fn_with_state((self.clone(), scope), answer_through_cache));
+        // One per core: light endpoints never wait for all the heavy ones that are requested.
+        let places = Arc::new(Semaphore::new(std::thread::available_parallelism().map_or(1, usize::from)));
+        let heavy = Router::from(heavy_routes()).route_layer(from_fn_with_state(places, answer_in_place));
+        cached(Router::from(light_routes()).merge(heavy), TokenScope::Sql)
+            .merge(cached(file_routes().into(), TokenScope::Files))
     }
 
     /// Returns the answer of a surface's endpoint.
@@ -168,13 +180,24 @@ async fn answer_through_cache(
     *request.method_mut() = Method::GET;
     request.extensions_mut().insert(CatalogueRequest::new(&catalogue, &view, as_arrow));
     match view.answers.get_or_make(&key, next.run(request)).await {
-        Ok(answer) => Ok(instead().unwrap_or_else(|| with_validators(answer.to_response(&headers), &etag))),
+        Ok(answer) => Ok(instead().unwrap_or_else(|| {
+            let mut response = with_validators(answer.to_response(&headers), &etag);
+            response.headers_mut().extend(view.lasting_version().map(|version| (LASTING_VERSION, version.into())));
+            response
+        })),
         Err(failed) => {
             let code = failed.extensions().get::<FaultCode>().copied();
             catalogue.service().report_failure(code.unwrap_or(FaultCode::Internal));
             Ok(failed)
         }
     }
+}
+
+/// Answers a request once there is a place.
+async fn answer_in_place(State(places): State<Arc<Semaphore>>, request: Request, next: Next) -> Response {
+    // An error would say that the places are closed, which nobody does.
+    let _place = places.acquire().await;
+    next.run(request).await
 }
 
 fn with_validators(mut response: Response, etag: &str) -> Response {

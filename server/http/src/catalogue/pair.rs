@@ -1,5 +1,6 @@
 //! `GET /api/v1/surfaces/{surface_id}/pairs/{pair_id}`: everything about one impulse response.
 
+use std::iter::repeat;
 use std::ops::RangeInclusive;
 use std::sync::Arc;
 
@@ -7,14 +8,15 @@ use arrow::array::{ArrayRef, Float64Array};
 use arrow::record_batch::RecordBatch;
 use axum::Extension;
 use echolake_dsp::room_parameters::is_long_enough;
-use echolake_query::figure_rows::{TOTAL_BAND, band_list, levels_db};
+use echolake_query::figure_rows::{CurveRow, TOTAL_BAND, band_list, curve_columns, levels_db};
+use echolake_schema::Symmetry;
 use echolake_service::RequestFault;
 use serde::{Deserialize, Serialize};
 use utoipa::{IntoParams, ToSchema};
 
 use super::super::extract::{BinaryContent, PathParams};
 use super::content::{AnswerContent, EndpointAnswer};
-use super::curves::{CurveSet, PairSelection};
+use super::curves::CurveSet;
 use super::environment::{AirReading, AirSeries};
 use super::request::{CatalogueRequest, missing_item, nanos_value, number_value, text_value};
 use super::runs::RunLogEntry;
@@ -36,7 +38,7 @@ pub(super) struct PairPath {
 #[derive(Serialize, ToSchema)]
 struct PairDetail<'a> {
     surface_id: &'a str,
-    pair: PairGeometry,
+    pair: &'a PairGeometry,
     measurement: &'a PairMeasurement,
     rate_hz: f64,
     /// Temperature-corrected, cropped, direct sound still in it; Pa per unit of the sweep's amplitude.
@@ -72,7 +74,7 @@ struct FresnelEllipse {
 /// The geometry of a pair.
 #[derive(Deserialize, Serialize, ToSchema)]
 #[schema(as = Pair)]
-pub(super) struct PairGeometry {
+pub(crate) struct PairGeometry {
     pair_id: i32,
     microphone: i32,
     speaker: i32,
@@ -137,8 +139,18 @@ pub(super) struct ReflectedResponse {
     pub reflected: Option<Vec<f32>>,
 }
 
+/// Responses and curves of a pair on one surface after Foam's response was subtracted.
 #[derive(Deserialize)]
+struct PairResponses {
+    surface_id: String,
+    reflected: Option<Vec<f32>>,
+    pairs: i64,
+    bands: Vec<Option<Vec<f32>>>,
+}
+
+#[derive(Clone, Deserialize)]
 struct PairEnergies {
+    pair_id: i32,
     total: Vec<Option<f64>>,
     band: Vec<Option<f64>>,
     total_u_db: Vec<Option<f64>>,
@@ -148,7 +160,7 @@ struct PairEnergies {
 /// A pair that a symmetry of the grid makes of another.
 #[derive(Serialize, ToSchema)]
 struct SymmetricPair {
-    symmetry: String,
+    symmetry: &'static str,
     pair_id: i64,
     microphone: i64,
     speaker: i64,
@@ -174,16 +186,6 @@ struct RoomBand {
     reason: Option<String>,
 }
 
-#[derive(Deserialize)]
-struct SymmetryRow {
-    symmetry: String,
-    pair_id: i64,
-    microphone: i64,
-    speaker: i64,
-    swapped: bool,
-    energies: Vec<Option<f64>>,
-}
-
 const MEASUREMENT: &str = "select ir, log_time_ns, run_id, log_time, attempt, verdict, reasons, temperature_c, \
     humidity_pct, pressure_hpa, outside_level_db, snr_db, clipped_samples, arrival_error_us, microphone_residual_mm, \
     speaker_residual_mm, source, chunk_offset from measurements \
@@ -193,7 +195,7 @@ const GEOMETRY: &str = "select pair_id, microphone, speaker, \
     make_array(speaker_x_mm, speaker_y_mm, speaker_z_mm) as speaker_mm, direct_mm, image_mm, incidence_deg, \
     make_array(specular_x_mm, specular_y_mm) as specular_mm, \
     make_array(fresnel_major_2000_mm, fresnel_minor_2000_mm) as low_mm, \
-    make_array(fresnel_major_40000_mm, fresnel_minor_40000_mm) as high_mm from pairs where pair_id = $1";
+    make_array(fresnel_major_40000_mm, fresnel_minor_40000_mm) as high_mm from pairs order by pair_id";
 const REFLECTED: &str = "select surface_id, avg_list(reflected_ir) as reflected from nce \
     where surface_id in ($1, $2) and pair_id = $3 group by surface_id";
 const ROOM: &str = "select midband_hz, edt_s, t20_s, t30_s, c50_db, c80_db, d50, ts_ms, range_db, reason \
@@ -216,17 +218,20 @@ impl CatalogueRequest {
     }
 }
 
-/// Reads the geometry of a pair.
+/// Finds the geometry of a pair; that of all is read once per snapshot.
 ///
 /// # Errors
 /// Those of its query.
-pub(super) async fn read_geometry(request: &CatalogueRequest, pair: usize) -> Result<PairGeometry, RequestFault> {
-    let found = request.read_rows::<PairGeometry>(GEOMETRY, vec![number_value(pair)]).await?.into_iter().next();
+pub(super) async fn find_geometry(request: &CatalogueRequest, pair: usize) -> Result<&PairGeometry, RequestFault> {
     let sweep = &request.catalogue.lake().rig().sweep;
     let measured_hz = sweep.low_hz..=sweep.high_hz;
-    found
-        .map(|pair| pair.with_fresnel(&measured_hz))
-        .ok_or_else(|| missing_item(format!("pair {pair}"), "ask for another one"))
+    let read = || async {
+        let rows = request.read_rows::<PairGeometry>(GEOMETRY, Vec::new()).await?;
+        Ok::<Vec<_>, RequestFault>(rows.into_iter().map(|pair| pair.with_fresnel(&measured_hz)).collect())
+    };
+    let all = request.view.pairs.get_or_try_init(read).await?;
+    let found = all.iter().find(|row| usize::try_from(row.pair_id) == Ok(pair));
+    found.ok_or_else(|| missing_item(format!("pair {pair}"), "ask for another one"))
 }
 
 /// The newest measurement of a pair.
@@ -333,17 +338,20 @@ pub(super) async fn pair(
 ) -> EndpointAnswer {
     let entry = request.find_surface(&path.surface_id).await?;
     let pair = request.parse_pair(&path.pair_id)?;
-    let responses = tokio::try_join!(read_measurement(&request, entry, pair), read_reflected(&request, entry, pair));
-    let (measurement, [own, flat]) = responses?;
     if request.as_arrow {
+        let found = tokio::try_join!(read_measurement(&request, entry, pair), read_reflected(&request, entry, pair));
+        let (measurement, [own, flat]) = found?;
         return Ok(encode_samples(&request, &measurement.ir, own.as_deref(), flat.as_deref())?);
     }
-    let (geometry, energies, moved, room, curves, attempts, air) = tokio::try_join!(
-        read_geometry(&request, pair),
-        read_energies(&request, entry, pair, &measurement.run_id),
-        read_symmetries(&request, entry, pair, &measurement.run_id),
+    let (measurement, (responses, curves), geometry) = tokio::try_join!(
+        read_measurement(&request, entry, pair),
+        read_responses(&request, entry, pair),
+        find_geometry(&request, pair),
+    )?;
+    let reflected = |surface: &str| responses.iter().find(|(name, _)| name == surface)?.1.as_deref();
+    let (PairLevels { energies, symmetries }, room, attempts, air) = tokio::try_join!(
+        read_levels(&request, entry, pair, &measurement.run_id),
         read_room(&request, entry, pair, &measurement),
-        CurveSet::read_curves(&request, entry, PairSelection::Pair(pair), usize::MAX),
         // The controller's messages about a pair begin so.
         request.read_rows::<RunLogEntry>(
             ATTEMPTS,
@@ -365,14 +373,14 @@ pub(super) async fn pair(
         measured: &measurement.ir,
         measurement: &measurement,
         rate_hz: request.catalogue.lake().rig().sweep.rate_hz.get(),
-        reflected: own.as_deref(),
-        flat_reflected: flat.as_deref(),
+        reflected: reflected(&entry.surface.surface_id),
+        flat_reflected: reflected(&entry.surface.flat_reference),
         tnce_db: levels_db(&energies.total),
         tnce_band_db: levels_db(&energies.band),
         tnce_u_db: energies.total_u_db,
         tnce_band_u_db: energies.band_u_db,
         curves: Some(curves).filter(CurveSet::is_there),
-        symmetries: moved,
+        symmetries,
         room,
         attempts,
     })?)
@@ -389,59 +397,92 @@ impl PairGeometry {
     }
 }
 
-async fn read_energies(
+/// A response after Foam's was subtracted, by the name of its surface.
+type ReflectedResponses = Vec<(String, Option<Vec<f32>>)>;
+
+// The responses and the curves of a pair on a surface and on its Flat.
+async fn read_responses(
+    request: &CatalogueRequest,
+    entry: &SurfaceEntry,
+    pair: usize,
+) -> Result<(ReflectedResponses, CurveSet), RequestFault> {
+    let rig = request.catalogue.lake().rig();
+    let sql = format!(
+        "select surface_id, avg_list(reflected_ir) as reflected, {} from nce \
+         where surface_id in ($1, $2) and pair_id = $3 group by surface_id",
+        curve_columns(rig)
+    );
+    let surface = &entry.surface;
+    let values = vec![text_value(&surface.surface_id), text_value(&surface.flat_reference), number_value(pair)];
+    let mut responses = Vec::new();
+    let mut curves = Vec::new();
+    for PairResponses { surface_id, reflected, pairs, bands } in request.read_rows(&sql, values).await? {
+        responses.push((surface_id.clone(), reflected));
+        curves.push(CurveRow { surface_id, pairs, bands });
+    }
+    Ok((responses, CurveSet::from_rows(rig, entry, &curves, usize::MAX)))
+}
+
+/// Energies of a pair, and those of the pairs that symmetries make of it.
+struct PairLevels {
+    energies: PairEnergies,
+    symmetries: Vec<SymmetricPair>,
+}
+
+async fn read_levels(
     request: &CatalogueRequest,
     entry: &SurfaceEntry,
     pair: usize,
     run: &str,
-) -> Result<PairEnergies, RequestFault> {
-    let rig = request.catalogue.lake().rig();
+) -> Result<PairLevels, RequestFault> {
+    let lake = request.catalogue.lake();
+    let rig = lake.rig();
+    let moved = request.view.moved_pairs.get_or_init(|| {
+        let images = |symmetry| Some((symmetry, lake.grid().moved_pairs(symmetry)?));
+        let mut all: Vec<_> = Symmetry::ALL.into_iter().filter_map(images).collect();
+        all.sort_by_key(|(symmetry, _)| symmetry.name());
+        all
+    });
+    let moved: Vec<_> = moved.iter().map(|(symmetry, pairs)| (symmetry.name(), pairs[pair])).collect();
     let over_total = |band: &str| format!("tnce_{band}");
     let over_band = |band: &str| if band == TOTAL_BAND { over_total(band) } else { format!("tnce_band_{band}") };
     let total = band_list(rig, over_total);
     let band = band_list(rig, over_band);
     let total_u = band_list(rig, |band| format!("{}_u_db", over_total(band)));
     let band_u = band_list(rig, |band| format!("{}_u_db", over_band(band)));
+    // A placeholder for each symmetry, one of which leaves the pair where it is.
     let sql = format!(
-        "select {total} as total, {band} as band, {total_u} as total_u_db, {band_u} as band_u_db from tnce \
-         where surface_id = $1 and pair_id = $2 and run_id = $3"
+        "select pair_id, {total} as total, {band} as band, {total_u} as total_u_db, {band_u} as band_u_db from tnce \
+         where surface_id = $1 and run_id = $2 and pair_id in ($3, $4, $5, $6, $7, $8, $9, $10)"
     );
-    let values = vec![text_value(&entry.surface.surface_id), number_value(pair), text_value(run)];
+    let pairs = moved.iter().map(|(_, moved)| moved.pair.id.0 as usize).chain(repeat(pair)).take(Symmetry::ALL.len());
+    let values = [text_value(&entry.surface.surface_id), text_value(run)].into_iter().chain(pairs.map(number_value));
+    let rows: Vec<PairEnergies> = request.read_rows(&sql, values.collect()).await?;
+    let find = |pair: usize| rows.iter().find(|row| usize::try_from(row.pair_id) == Ok(pair));
     let nothing = vec![None; rig.band_names().len() + 1];
-    let found = request.read_rows(&sql, values).await?.into_iter().next();
-    Ok(found.unwrap_or_else(|| PairEnergies {
+    let energies = find(pair).cloned().unwrap_or_else(|| PairEnergies {
+        pair_id: 0,
         total: nothing.clone(),
         band: nothing.clone(),
         total_u_db: nothing.clone(),
         band_u_db: nothing,
-    }))
-}
-
-async fn read_symmetries(
-    request: &CatalogueRequest,
-    entry: &SurfaceEntry,
-    pair: usize,
-    run: &str,
-) -> Result<Vec<SymmetricPair>, RequestFault> {
-    let energies = band_list(request.catalogue.lake().rig(), |band| format!("t.tnce_{band}"));
-    let sql = format!(
-        "select d.symmetry, d.d4_pair_id as pair_id, d.d4_microphone as microphone, d.d4_speaker as speaker, \
-         d.swapped, {energies} as energies from tnce_d4 d join tnce t on t.surface_id = d.surface_id and t.run_id = \
-         d.run_id and t.pair_id = d.d4_pair_id where d.surface_id = $1 and d.pair_id = $2 and d.run_id = $3 \
-         and t.surface_id = $1 and t.run_id = $3 order by d.symmetry"
-    );
-    let rows = request
-        .read_rows(&sql, vec![text_value(&entry.surface.surface_id), number_value(pair), text_value(run)])
-        .await?;
-    let levels = |row: SymmetryRow| SymmetricPair {
-        symmetry: row.symmetry,
-        pair_id: row.pair_id,
-        microphone: row.microphone,
-        speaker: row.speaker,
-        swapped: row.swapped,
-        tnce_db: levels_db(&row.energies),
-    };
-    Ok(rows.into_iter().map(levels).collect())
+    });
+    // A pair without energies has no row in `tnce_d4` either.
+    let measured = moved.into_iter().filter(|_| find(pair).is_some());
+    let symmetries = measured.filter_map(|(symmetry, moved)| {
+        let row = find(moved.pair.id.0 as usize)?;
+        let pair = moved.pair;
+        Some(SymmetricPair {
+            symmetry,
+            pair_id: pair.id.0.into(),
+            microphone: pair.microphone.0.into(),
+            speaker: pair.speaker.0.into(),
+            swapped: moved.swapped,
+            tnce_db: levels_db(&row.total),
+        })
+    });
+    let symmetries = symmetries.collect();
+    Ok(PairLevels { energies, symmetries })
 }
 
 async fn read_room(

@@ -1,6 +1,7 @@
 //! HTTP connections of the door: so many at once, each of which must say what it wants in time. An engine answers what
 //! reads the lake; the door answers the rest: pages, sessions, health and figures.
 
+pub(crate) mod answer_cache;
 mod authentication;
 mod health;
 mod openapi;
@@ -36,6 +37,7 @@ use super::encryption::{ProtocolEncryption, agreed_protocol};
 use super::forward::EngineProtocol;
 use super::http_connection::{HTTP_2, drive_connection, http2_builder, restate_as_http1};
 use crate::door::server_door::ServerDoor;
+use answer_cache::AnswerKey;
 use authentication::authenticate_client;
 use router::door_router;
 
@@ -139,13 +141,25 @@ impl ServerDoor {
         let client = self.note_client(&work, ServerProtocol::Http, Ok(client))?;
         let path = request.uri().path().to_owned();
         let method = request.method().clone();
-        let mut response = self.engines().forward_request(&client, request, EngineProtocol::Http, Some(&work)).await?;
+        let key = AnswerKey::from_request(&client, &request);
+        let cached = match &key {
+            Some(key) => self.answers().find_answer(&client, key, request.headers()).await,
+            None => None,
+        };
+        let mut response = match cached {
+            Some(cached) => cached,
+            None => {
+                let engines = self.engines();
+                let answer = engines.forward_request(&client, request, EngineProtocol::Http, Some(&work)).await?;
+                self.answers().keep_answer(client.clone(), key, answer.map(Body::new)).await?
+            }
+        };
         let runs = response.headers_mut().remove(SLICED_RUNS);
         if !self.access().is_open() {
             let runs = runs.as_ref().and_then(|runs| runs.to_str().ok());
             let file = HandedFile { client: &client.name, path: &path, runs };
             audit::record_file(work.peer(), &method, response.status(), &file);
         }
-        Ok(response.map(Body::new))
+        Ok(response)
     }
 }

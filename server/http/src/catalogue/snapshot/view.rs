@@ -1,12 +1,14 @@
 //! The lake as one snapshot shows it, with cached results: a new snapshot begins with an empty cache.
 
 use std::collections::{HashMap, HashSet, VecDeque};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use std::time::Duration;
 
 use echolake_lake::{DataFile, LakeSnapshot};
 use echolake_query::figure_rows::CurveRow;
 use echolake_query::{EngineClient, PreparedQuery, QueryQuota, Session};
+use echolake_schema::Symmetry;
+use echolake_schema::symmetry::MovedPair;
 use echolake_schema::tables::Table;
 use echolake_service::{QueryService, RequestFault};
 use object_store::path::Path as StorePath;
@@ -16,6 +18,7 @@ use tokio::sync::OnceCell;
 use super::answer_cache::AnswerCache;
 use super::positions::SurfacePositions;
 use super::summary::CatalogueSummary;
+use crate::catalogue::pair::PairGeometry;
 
 /// Time limit of the catalogue's own queries: they read a surface at most, and all surfaces once per snapshot.
 const LONGEST: Duration = Duration::from_secs(60);
@@ -33,6 +36,10 @@ pub(crate) struct SnapshotView {
     pub answers: AnswerCache,
     pub summary: OnceCell<CatalogueSummary>,
     pub places: OnceCell<SurfacePositions>,
+    /// The geometry of all pairs, by their numbers.
+    pub pairs: OnceCell<Vec<PairGeometry>>,
+    /// The pairs that the symmetries of the grid make of each pair, by the symmetries' names.
+    pub moved_pairs: OnceLock<Vec<(Symmetry, Vec<MovedPair>)>>,
     /// Mean curves over all pairs of the references that surfaces are beside, by name; there are few.
     flat_curves: Mutex<HashMap<String, Arc<OnceCell<Option<CurveRow>>>>>,
     /// Prepared queries by their text; there are few texts, because values are bound.
@@ -48,6 +55,8 @@ impl SnapshotView {
             answers: AnswerCache::default(),
             summary: OnceCell::new(),
             places: OnceCell::new(),
+            pairs: OnceCell::new(),
+            moved_pairs: OnceLock::new(),
             flat_curves: Mutex::default(),
             prepared: Mutex::default(),
         }
@@ -58,6 +67,12 @@ impl SnapshotView {
     pub fn answer_etag(&self, name: &str) -> String {
         let digest = Sha256::new().chain_update(&self.version).chain_update(name).finalize();
         format!("\"{}\"", hex::encode(&digest[..VERSION_BYTES]))
+    }
+
+    /// The lake's version for as long as which an answer of this snapshot is right; None if a mended table, which has no
+    /// new version, may change it.
+    pub fn lasting_version(&self) -> Option<u64> {
+        self.snapshot.log_version(Table::Runs).filter(|_| self.snapshot.is_whole())
     }
 
     pub fn find_prepared(&self, sql: &str) -> Option<Arc<PreparedQuery>> {
@@ -129,9 +144,13 @@ impl SnapshotViews {
             Some(view) => view.session.clone(),
             None => catalogue_session(service),
         };
-        let asking = session.clone();
-        let snapshot =
-            service.plan_query(session.client(), async move { Ok(asking.current_snapshot().await?) }).await?;
+        let snapshot = match session.known_snapshot().await {
+            Ok(Some(snapshot)) => snapshot,
+            _ => {
+                let asking = session.clone();
+                service.plan_query(session.client(), async move { Ok(asking.current_snapshot().await?) }).await?
+            }
+        };
         let mut seen = self.lock_history();
         match seen.view.as_ref().filter(|view| Arc::ptr_eq(&view.snapshot, &snapshot)) {
             Some(view) => Ok(view.clone()),
