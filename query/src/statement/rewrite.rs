@@ -34,7 +34,7 @@ use super::columns::{ColumnsExpansion, has_columns, hinted_error};
 use super::summarize::{summarized_query, write_summary};
 use super::syntax_walk::{walk_mut, walk_syntax};
 use super::tree;
-use super::using_columns::name_using_columns;
+use super::using_columns::{name_ordering_columns, name_using_columns};
 use crate::Error;
 
 /// Aggregates that take the first argument at the greatest (true) or least value of the second.
@@ -105,6 +105,7 @@ impl VisitorMut for RewriteVisitor<'_> {
     }
 
     fn post_visit_query(&mut self, query: &mut Query) -> Visit {
+        visit_outcome(name_ordering_columns(query, &mut |from| self.look_up(from)))?;
         query.with = self.withs.pop().flatten();
         let own = query.with.as_ref().map_or(0, |with| with.cte_tables.len());
         self.ctes.truncate(self.ctes.len() - own);

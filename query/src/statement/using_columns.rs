@@ -9,7 +9,7 @@ use std::ops::ControlFlow;
 
 use datafusion::common::DFSchema;
 use datafusion::sql::sqlparser::ast::{
-    Expr, GroupByExpr, Ident, Join, JoinConstraint, JoinOperator, Query, Select, SelectItem, TableFactor,
+    Expr, GroupByExpr, Ident, Join, JoinConstraint, JoinOperator, Query, Select, SelectItem, SetExpr, TableFactor,
     TableWithJoins, VisitorMut, WildcardAdditionalOptions,
 };
 
@@ -27,31 +27,56 @@ type LookUp<'a> = dyn FnMut(Vec<TableWithJoins>) -> Result<DFSchema, Error> + 'a
 /// [`Error::Query`] of an outer join whose columns cannot be named, and of what `look_up` refuses.
 pub(super) fn name_using_columns(select: &mut Select, look_up: &mut LookUp<'_>) -> Result<(), Error> {
     let joins = || select.from.iter().flat_map(|from| &from.joins);
-    if joins().any(|join| is_outer(join) && matches!(constraint(join), Some(JoinConstraint::Natural))) {
-        let message = "NATURAL outer joins are not supported".to_owned();
-        return Err(hinted_error(message, "join by USING (column, ...)".to_owned()));
-    }
+    refuse_unnamed(&select.from)?;
     let is_outer = joins().any(is_outer_using);
     let has_columns = joins().any(|join| !using_columns(join).is_empty());
     if !has_columns || !is_outer && select.selection.is_none() {
         return Ok(());
     }
-    let mut values = HashMap::new();
-    for from in &select.from {
-        add_values(&mut values, from, look_up)?;
-    }
-    let schema = look_up(select.from.clone())?;
-    // DataFusion leaves as many as joins name it. Another one is of a table that is joined otherwise: which is meant is
-    // not known then.
-    values.retain(|column, _| {
-        let named = select.from.iter().flat_map(|from| &from.joins).flat_map(using_columns);
-        let found = schema.fields().iter().filter(|field| field.name() == column).count();
-        found <= named.filter(|name| name == column).count()
-    });
-    let mut namer = ColumnNamer { values, subqueries: 0 };
-    let _ = select.selection.as_mut().map(|condition| walk_mut(condition, &mut namer));
+    let (schema, mut namer) = ColumnNamer::of_tables(&mut select.from, look_up)?;
+    let _ = walk_mut(&mut select.selection, &mut namer);
     if is_outer {
         name_in_select(select, &schema, &mut namer)?;
+    }
+    Ok(())
+}
+
+/// Names the columns of outer joins by USING in ORDER BY, as far as the result has none of their names.
+///
+/// # Errors
+/// As [`name_using_columns`].
+pub(super) fn name_ordering_columns(query: &mut Query, look_up: &mut LookUp<'_>) -> Result<(), Error> {
+    let (SetExpr::Select(select), Some(order_by)) = (&mut *query.body, &mut query.order_by) else { return Ok(()) };
+    if select.from.iter().flat_map(|from| &from.joins).any(is_outer_using) {
+        let (_, mut namer) = ColumnNamer::of_tables(&mut select.from, look_up)?;
+        for item in &select.projection {
+            if let SelectItem::ExprWithAlias { alias, .. } = item {
+                namer.values.remove(&normalized_name(alias));
+            }
+        }
+        let _ = walk_mut(order_by, &mut namer);
+    }
+    Ok(())
+}
+
+// Outer joins whose columns are not named here.
+fn refuse_unnamed(from: &[TableWithJoins]) -> Result<(), Error> {
+    for join in from.iter().flat_map(|from| &from.joins) {
+        if is_outer(join) && matches!(constraint(join), Some(JoinConstraint::Natural)) {
+            let message = "NATURAL outer joins are not supported".to_owned();
+            return Err(hinted_error(message, "join by USING (column, ...)".to_owned()));
+        }
+    }
+    let factors =
+        from.iter().flat_map(|from| [&from.relation].into_iter().chain(from.joins.iter().map(|join| &join.relation)));
+    for factor in factors {
+        if let TableFactor::NestedJoin { table_with_joins, .. } = factor {
+            refuse_unnamed(std::slice::from_ref(table_with_joins))?;
+            if table_with_joins.joins.iter().any(is_outer_using) {
+                let message = "an outer join by USING in parentheses is not supported".to_owned();
+                return Err(hinted_error(message, "join by ON, or name it by WITH".to_owned()));
+            }
+        }
     }
     Ok(())
 }
@@ -93,6 +118,8 @@ fn name_in_select(select: &mut Select, schema: &DFSchema, namer: &mut ColumnName
     if let GroupByExpr::Expressions(expressions, _) = &mut select.group_by {
         let _ = walk_mut(expressions, namer);
     }
+    let _ = walk_mut(&mut select.distinct, namer);
+    let _ = walk_mut(&mut select.named_window, namer);
     let _ = walk_mut(&mut select.having, namer);
     let _ = walk_mut(&mut select.qualify, namer);
     Ok(())
@@ -101,10 +128,14 @@ fn name_in_select(select: &mut Select, schema: &DFSchema, namer: &mut ColumnName
 // Adds the value of each column that a join of `from` has by USING.
 fn add_values(
     values: &mut HashMap<String, Expr>,
-    from: &TableWithJoins,
+    from: &mut TableWithJoins,
     look_up: &mut LookUp<'_>,
 ) -> Result<(), Error> {
-    for (at, join) in from.joins.iter().enumerate() {
+    for at in 0..from.joins.len() {
+        if let Some(JoinConstraint::On(condition)) = constraint_mut(&mut from.joins[at]) {
+            let _ = walk_mut(condition, &mut ColumnNamer { values: values.clone(), subqueries: 0 });
+        }
+        let join = &from.joins[at];
         let columns = using_columns(join);
         let right = table_name(&join.relation);
         if columns.is_empty() {
@@ -145,6 +176,19 @@ fn add_values(
         }
     }
     Ok(())
+}
+
+fn constraint_mut(join: &mut Join) -> Option<&mut JoinConstraint> {
+    match &mut join.join_operator {
+        JoinOperator::Join(constraint)
+        | JoinOperator::Inner(constraint)
+        | JoinOperator::Left(constraint)
+        | JoinOperator::LeftOuter(constraint)
+        | JoinOperator::Right(constraint)
+        | JoinOperator::RightOuter(constraint)
+        | JoinOperator::FullOuter(constraint) => Some(constraint),
+        _ => None,
+    }
 }
 
 fn constraint(join: &Join) -> Option<&JoinConstraint> {
@@ -196,6 +240,23 @@ struct ColumnNamer {
 }
 
 impl ColumnNamer {
+    // Returns the columns of `SELECT *`, too.
+    fn of_tables(from: &mut [TableWithJoins], look_up: &mut LookUp<'_>) -> Result<(DFSchema, Self), Error> {
+        let mut values = HashMap::new();
+        for from in &mut *from {
+            add_values(&mut values, from, look_up)?;
+        }
+        let schema = look_up(from.to_vec())?;
+        // DataFusion leaves as many as joins name it. Another one is of a table that is joined otherwise: which is meant
+        // is not known then.
+        values.retain(|column, _| {
+            let named = from.iter().flat_map(|from| &from.joins).flat_map(using_columns);
+            let found = schema.fields().iter().filter(|field| field.name() == column).count();
+            found <= named.filter(|name| name == column).count()
+        });
+        Ok((schema, Self { values, subqueries: 0 }))
+    }
+
     fn value(&self, column: &Ident) -> Option<&Expr> {
         self.values.get(&normalized_name(column))
     }
