@@ -18,8 +18,8 @@ use std::f64::consts::TAU;
 use std::ops::Range;
 use std::sync::Arc;
 
-use realfft::RealToComplex;
 use realfft::num_complex::Complex;
+use realfft::{ComplexToReal, RealToComplex};
 use rustfft::{Fft, FftDirection};
 
 use crate::deconvolution::fast_length;
@@ -87,6 +87,7 @@ pub struct TakeAnalyzer {
     recording_len: usize,
     forward: Arc<dyn RealToComplex<f32>>,
     inverse: Arc<dyn Fft<f32>>,
+    real_inverse: Arc<dyn ComplexToReal<f32>>,
     short: ShortTransform,
     played: Vec<Complex<f32>>,
     /// Gains of bins, and those bins that have one.
@@ -157,6 +158,7 @@ impl TakeAnalyzer {
         Ok(Self {
             short: ShortTransform::new(&sweep, short),
             inverse: f32::plan_fft(n, FftDirection::Inverse),
+            real_inverse: f32::plan_real_inverse(n),
             range: first..first + count,
             sweep,
             recording_len,
@@ -174,35 +176,84 @@ impl TakeAnalyzer {
     /// [`Error::Length`]; [`Error::NotFinite`].
     pub fn analyze_take(&self, recording: &[f32], loopback: Option<&[f32]>) -> Result<TakeAnalysis, Error> {
         let recorded = self.transform_signal("the recording", recording)?;
+        let looped = loopback.map(|signal| self.transform_signal("the loopback", signal)).transpose()?;
+        Ok(self.analyze_spectra([Some(recording), loopback], &recorded, looped.as_deref()))
+    }
+
+    /// Gains of bins for [`Self::deconvolve_take`]: 1 in the sweep's range, with half cosines of this width, Hz, at both
+    /// limits.
+    pub fn taper_gains(&self, width_hz: f64) -> Vec<f32> {
+        let width_hz = width_hz.min((self.sweep.high_hz - self.sweep.low_hz) / 2.0);
+        let step_hz = self.sweep.rate_hz / self.forward.len() as f64;
+        let gain = |k: usize| sine_taper(&self.sweep, k as f64 * step_hz, width_hz).powi(2) as f32;
+        (0..self.played.len()).map(gain).collect()
+    }
+
+    /// Analyses a take, and divides its recording by its loopback with these gains.
+    ///
+    /// recording, loopback `[recording_len]`, gains `[bins]`
+    /// response `[recording_len]`  the whole response
+    ///
+    /// # Errors
+    /// [`Error::Length`]; [`Error::NotFinite`]; [`Error::NoLoopback`] if it has nothing at a frequency.
+    pub fn deconvolve_take(
+        &self,
+        recording: &[f32],
+        loopback: &[f32],
+        gains: &[f32],
+        response: &mut [f32],
+    ) -> Result<TakeAnalysis, Error> {
+        check_len("the response", response.len(), self.recording_len)?;
+        check_len("the gains", gains.len(), self.played.len())?;
+        let recorded = self.transform_signal("the recording", recording)?;
+        let looped = self.transform_signal("the loopback", loopback)?;
+        if looped.iter().zip(gains).any(|(z, gain)| *gain > 0.0 && z.norm_sqr() == 0.0) {
+            return Err(Error::NoLoopback);
+        }
+        let scale = 1.0 / self.forward.len() as f32;
+        let bins = recorded.iter().zip(&looped).zip(gains);
+        let mut quotient: Vec<_> = bins.map(|((of, by), gain)| divide_bin(of, by, gain * scale)).collect();
+        let mut samples = self.real_inverse.make_output_vec();
+        // The sweep's range ends before both real bins.
+        let _ = self.real_inverse.process(&mut quotient, &mut samples);
+        response.copy_from_slice(&samples[..self.recording_len]);
+        Ok(self.analyze_spectra([Some(recording), Some(loopback)], &recorded, Some(&looped)))
+    }
+
+    fn analyze_spectra(
+        &self,
+        [recording, loopback]: [Option<&[f32]>; 2],
+        recorded: &[Complex<f32>],
+        looped: Option<&[Complex<f32>]>,
+    ) -> TakeAnalysis {
         let mut analysis = TakeAnalysis::unknown();
-        for (channel, signal) in [(TakeChannel::Recording, Some(recording)), (TakeChannel::Loopback, loopback)] {
+        for (channel, signal) in [(TakeChannel::Recording, recording), (TakeChannel::Loopback, loopback)] {
             let peak = signal.map_or(0.0, oversampled_peak);
             if peak > 1.0 {
                 analysis.faults.push(TakeFault::BetweenSamples { channel, peak_dbfs: power_to_db(peak * peak) });
             }
         }
-        let Some(loopback) = loopback else {
-            self.analyze_recording(&mut analysis, &self.divide_spectra(&recorded, &self.played), 0.0, 0, true);
-            return Ok(analysis);
+        let Some(looped) = looped else {
+            self.analyze_recording(&mut analysis, &self.divide_spectra(recorded, &self.played), 0.0, 0, true);
+            return analysis;
         };
-        let looped = self.transform_signal("the loopback", loopback)?;
-        let electrical = self.divide_spectra(&looped, &self.played);
+        let electrical = self.divide_spectra(looped, &self.played);
         let loopback_ratio = self.fit_clock_ratio(&electrical);
         let aligned = self.align_clocks(&electrical, loopback_ratio);
         let match_db = self.match_db(&electrical, &aligned, 1);
         analysis.loopback_match_db = match_db;
-        let response = self.divide_spectra(&recorded, &looped);
+        let response = self.divide_spectra(recorded, looped);
         let direct = self.match_db(&response, &response.vicinity, 1);
         if direct > SAME_SIGNAL_DB && response.peak == 0 {
             let level_db = power_to_db(response.energy) - power_to_db(self.unit_energy());
             analysis.faults.push(TakeFault::SameSignal { level_db });
         } else if match_db >= MATCH_DB {
-            if response.onset < -(self.seconds(RINGING_SECS) as i64) && self.is_played_sweep(&recorded) {
+            if response.onset < -(self.seconds(RINGING_SECS) as i64) && self.is_played_sweep(recorded) {
                 analysis.faults.push(TakeFault::Swapped { early_secs: -self.secs_of(response.onset) });
             } else {
                 self.find_cut(&mut analysis, electrical.onset);
                 self.find_dropout(&mut analysis, electrical.onset, &[&aligned], TakeChannel::Loopback);
-                let is_copy = self.is_digital_copy(&looped, electrical.peak);
+                let is_copy = self.is_digital_copy(looped, electrical.peak);
                 self.analyze_recording(&mut analysis, &response, loopback_ratio, electrical.onset, is_copy);
             }
         } else if self.match_db(&electrical, &electrical.vicinity, 2) > TORN_MATCH_DB
@@ -210,7 +261,7 @@ impl TakeAnalyzer {
         {
             // Its two parts arrive at different times.
         } else {
-            let acoustical = self.divide_spectra(&recorded, &self.played);
+            let acoustical = self.divide_spectra(recorded, &self.played);
             let aligned = self.align_clocks(&acoustical, self.fit_clock_ratio(&acoustical));
             let recording_db = self.match_db(&acoustical, &aligned, 1);
             analysis.faults.push(if recording_db >= MATCH_DB {
@@ -221,7 +272,7 @@ impl TakeAnalyzer {
                 TakeFault::Loopback { match_db, least_db: MATCH_DB }
             });
         }
-        Ok(analysis)
+        analysis
     }
 
     // Faults of a recording over a loopback with the sweep in it, or over the played sweep itself; `known` is the
@@ -309,8 +360,7 @@ impl TakeAnalyzer {
         let range = self.range.clone();
         let bins = of[range.clone()].iter().zip(&by[range.clone()]).zip(&self.taper[range.clone()]);
         for (to, ((of, by), gain)) in samples[range].iter_mut().zip(bins) {
-            // Silence divided by silence is silence.
-            *to = of * by.conj() * (gain / (by.norm_sqr().max(f32::MIN_POSITIVE) * n as f32));
+            *to = divide_bin(of, by, gain / n as f32);
         }
         self.inverse.process(&mut samples);
         let powers = powers_of(&samples);
@@ -448,9 +498,17 @@ impl SweepResponse {
 
 // Gain of a frequency: 1 in the sweep's range, falling to 0 at its limits.
 fn taper_gain(sweep: &SineSweep, hz: f64) -> f64 {
-    let width_hz = TAPER_HZ.min((sweep.high_hz - sweep.low_hz) / 4.0);
+    sine_taper(sweep, hz, TAPER_HZ.min((sweep.high_hz - sweep.low_hz) / 4.0)).powi(4)
+}
+
+fn sine_taper(sweep: &SineSweep, hz: f64, width_hz: f64) -> f64 {
     let inside = ((hz - sweep.low_hz).min(sweep.high_hz - hz) / width_hz).clamp(0.0, 1.0);
-    (std::f64::consts::FRAC_PI_2 * inside).sin().powi(4)
+    (std::f64::consts::FRAC_PI_2 * inside).sin()
+}
+
+// Silence divided by silence is silence.
+fn divide_bin(of: &Complex<f32>, by: &Complex<f32>, gain: f32) -> Complex<f32> {
+    of * by.conj() * (gain / by.norm_sqr().max(f32::MIN_POSITIVE))
 }
 
 // Of values that are not negative.

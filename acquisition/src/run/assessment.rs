@@ -1,14 +1,13 @@
 //! Quality of a recording: signal-to-noise ratio, clipping, loopback, clocks, lost samples, and arrival of the direct
 //! sound.
 
-use echolake_dsp::deconvolution::{DeconvolutionParams, DeconvolutionPlan, DeconvolutionScratch, TransformLength};
 use echolake_dsp::level::power_to_db;
 use echolake_dsp::sweep::SineSweep;
 use echolake_dsp::take_analysis::{TakeAnalysis, TakeAnalyzer, TakeFault};
 use echolake_dsp::temperature::ReferenceAir;
 use echolake_dsp::{Error, chain};
+use echolake_schema::Rig;
 use echolake_schema::rig::Validation;
-use echolake_schema::{Rig, SpectralDivision};
 
 use crate::run::objection::TakeObjection;
 
@@ -44,8 +43,8 @@ pub struct TakeAssessment {
 /// Assesses recordings of one length.
 pub struct TakeAssessor {
     analyzer: TakeAnalyzer,
-    plan: DeconvolutionPlan<f32>,
-    scratch: DeconvolutionScratch<f32>,
+    /// Gains of the response's bins.
+    gains: Vec<f32>,
     response: Vec<f32>,
     signal_len: usize,
     rate_hz: f64,
@@ -55,25 +54,15 @@ impl TakeAssessor {
     /// Plans for recordings of `recording_len` samples of this rig.
     ///
     /// # Errors
-    /// As [`DeconvolutionPlan::new`].
+    /// As [`TakeAnalyzer::new`].
     pub fn new(rig: &Rig, recording_len: usize) -> Result<Self, Error> {
         let rate_hz = rig.sweep.rate_hz.get();
         let signal_len = response_len(rig).min(recording_len);
         let quiet = quiet_range(recording_len, signal_len);
-        let plan = DeconvolutionPlan::new(DeconvolutionParams {
-            recording_len,
-            output_len: recording_len,
-            rate_hz,
-            low_hz: rig.sweep.low_hz,
-            high_hz: rig.sweep.high_hz,
-            division: SpectralDivision::Tapered,
-            taper_hz: TAPER_PERIODS * rate_hz / quiet.start.max(1) as f64,
-            length: TransformLength::Fast,
-        })?;
+        let analyzer = TakeAnalyzer::new(SineSweep::from_rig(&rig.sweep), recording_len)?;
         Ok(Self {
-            analyzer: TakeAnalyzer::new(SineSweep::from_rig(&rig.sweep), recording_len)?,
-            scratch: plan.make_scratch(),
-            plan,
+            gains: analyzer.taper_gains(TAPER_PERIODS * rate_hz / quiet.start.max(1) as f64),
+            analyzer,
             response: vec![0.0; recording_len],
             signal_len,
             rate_hz,
@@ -83,7 +72,7 @@ impl TakeAssessor {
     /// Assesses one recording; samples are fractions of full scale.
     ///
     /// # Errors
-    /// As [`DeconvolutionPlan::deconvolve_recording`]: a silent loopback leaves nothing to assess.
+    /// As [`TakeAnalyzer::deconvolve_take`]: a silent loopback leaves nothing to assess.
     pub fn assess_take(
         &mut self,
         microphone: &[f32],
@@ -91,13 +80,13 @@ impl TakeAssessor {
         expected_arrival_secs: f64,
         clipped_samples: u32,
     ) -> Result<TakeAssessment, Error> {
-        self.plan.deconvolve_recording(microphone, loopback, &mut self.response, &mut self.scratch)?;
+        let analysis = self.analyzer.deconvolve_take(microphone, loopback, &self.gains, &mut self.response)?;
         Ok(TakeAssessment {
             snr_db: self.snr_db(),
             clipped_samples,
             loopback_dbfs: power_to_db(mean_power(loopback)),
             arrival_error_us: self.arrival_error_us(expected_arrival_secs),
-            analysis: self.analyzer.analyze_take(microphone, Some(loopback))?,
+            analysis,
         })
     }
 

@@ -23,8 +23,8 @@ const OVER_FARTHER: f64 = 3.2;
 const OVER_MEDIAN: f64 = 32.0;
 
 impl TakeAnalyzer {
-    /// Adds a fault if samples are missing or repeated, whichever clock ratio of the vicinities is true; returns whether
-    /// it did.
+    /// Adds a fault if samples are missing or repeated, whichever vicinity has the true clock ratio; returns whether it
+    /// did.
     pub(super) fn find_dropout(
         &self,
         analysis: &mut TakeAnalysis,
