@@ -180,8 +180,8 @@ impl TakeAnalyzer {
         Ok(self.analyze_spectra([Some(recording), loopback], &recorded, looped.as_deref()))
     }
 
-    /// Gains of bins for [`Self::deconvolve_take`]: 1 in the sweep's range, with half cosines of this width, Hz, at both
-    /// limits.
+    /// Gains of bins for [`Self::deconvolve_take`]: 1 in the sweep's range, with half cosines of this width, Hz, at
+    /// both limits.
     pub fn taper_gains(&self, width_hz: f64) -> Vec<f32> {
         let width_hz = width_hz.min((self.sweep.high_hz - self.sweep.low_hz) / 2.0);
         let step_hz = self.sweep.rate_hz / self.forward.len() as f64;

@@ -54,8 +54,8 @@ pub(crate) struct PanelArgs {
     /// Print the list as JSON.
     #[arg(long, requires = "list")]
     json: bool,
-    /// Generate a group of surfaces, whose parameters go through the ranges in this TOML file in steps: one JSON file per
-    /// surface, and group.csv, in the folder of -o.
+    /// Generate a group of surfaces, whose parameters go through the ranges in this TOML file in steps: one JSON file
+    /// per surface, and group.csv, in the folder of -o.
     #[arg(long, value_name = "RANGES", conflicts_with_all = ["name", "set", "back", "list", "parameters"])]
     group: Option<PathBuf>,
     /// Number of surfaces in the group; two per panel.

@@ -212,8 +212,8 @@ impl Lake {
         self.0.location.remote.is_some()
     }
 
-    /// Returns whether this is the newest version of the lake, that of its table `runs`. A lake that is gone has no newer
-    /// version, but does not have this one either.
+    /// Returns whether this is the newest version of the lake, that of its table `runs`. A lake that is gone has no
+    /// newer version, but does not have this one either.
     ///
     /// # Errors
     /// [`Error::Store`].

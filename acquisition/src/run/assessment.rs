@@ -180,14 +180,7 @@ mod tests {
     // A sweep and its echo-free recording, `delay` samples late, in a little noise.
     fn assessed(delay: usize, expected: f64) -> TakeAssessment {
         let rig = Rig::from_toml("sweep.duration_secs = 0.03").expect("a rig");
-        let sweep = SineSweep {
-            shape: SweepShape::Linear,
-            rate_hz: 96e3,
-            duration_secs: 0.03,
-            low_hz: 2e3,
-            high_hz: 40e3,
-            fade_secs: 1e-3,
-        };
+        let sweep = SineSweep::from_rig(&rig.sweep);
         let mut loopback: Vec<f32> = sweep.samples().iter().map(|x| 0.5 * *x as f32).collect();
         loopback.resize(rig.recording_len(), 0.0);
         let mut state = 1u32;

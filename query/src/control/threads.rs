@@ -54,8 +54,8 @@ impl QueryThreads {
 }
 
 impl Drop for QueryThreads {
-    // A runtime's own drop waits for its threads, which asynchronous code must not. `shutdown_background` detaches threads
-    // that are just ending, at which glibc crashes now and then (its bug 19951).
+    // A runtime's own drop waits for its threads, which asynchronous code must not. `shutdown_background` detaches
+    // threads that are just ending, at which glibc crashes now and then (its bug 19951).
     fn drop(&mut self) {
         if let Some(runtime) = self.0.take() {
             // Its handle is kept, so that it is not detached either.

@@ -104,10 +104,10 @@ fn name_in_select(select: &mut Select, schema: &DFSchema, namer: &mut ColumnName
                     "name the columns, or join by ON".to_owned(),
                 ));
             }
-            SelectItem::UnnamedExpr(Expr::Identifier(column)) if namer.value(&column).is_some() => {
-                let expr = namer.value(&column).cloned().unwrap_or(Expr::Identifier(column.clone()));
-                projection.push(SelectItem::ExprWithAlias { expr, alias: column });
-            }
+            SelectItem::UnnamedExpr(Expr::Identifier(column)) => projection.push(match namer.value(&column).cloned() {
+                Some(expr) => SelectItem::ExprWithAlias { expr, alias: column },
+                None => SelectItem::UnnamedExpr(Expr::Identifier(column)),
+            }),
             mut other => {
                 let _ = walk_mut(&mut other, namer);
                 projection.push(other);
@@ -132,9 +132,8 @@ fn add_values(
     look_up: &mut LookUp<'_>,
 ) -> Result<(), Error> {
     for at in 0..from.joins.len() {
-        if let Some(JoinConstraint::On(condition)) = constraint_mut(&mut from.joins[at]) {
-            let _ = walk_mut(condition, &mut ColumnNamer { values: values.clone(), subqueries: 0 });
-        }
+        let mut namer = ColumnNamer { values: values.clone(), subqueries: 0 };
+        let _ = walk_mut(&mut from.joins[at].join_operator, &mut namer);
         let join = &from.joins[at];
         let columns = using_columns(join);
         let right = table_name(&join.relation);
@@ -176,19 +175,6 @@ fn add_values(
         }
     }
     Ok(())
-}
-
-fn constraint_mut(join: &mut Join) -> Option<&mut JoinConstraint> {
-    match &mut join.join_operator {
-        JoinOperator::Join(constraint)
-        | JoinOperator::Inner(constraint)
-        | JoinOperator::Left(constraint)
-        | JoinOperator::LeftOuter(constraint)
-        | JoinOperator::Right(constraint)
-        | JoinOperator::RightOuter(constraint)
-        | JoinOperator::FullOuter(constraint) => Some(constraint),
-        _ => None,
-    }
 }
 
 fn constraint(join: &Join) -> Option<&JoinConstraint> {
@@ -243,12 +229,22 @@ impl ColumnNamer {
     // Returns the columns of `SELECT *`, too.
     fn of_tables(from: &mut [TableWithJoins], look_up: &mut LookUp<'_>) -> Result<(DFSchema, Self), Error> {
         let mut values = HashMap::new();
+        let mut ambiguous = Vec::new();
         for from in &mut *from {
-            add_values(&mut values, from, look_up)?;
+            let mut own = HashMap::new();
+            add_values(&mut own, from, look_up)?;
+            ambiguous.extend(own.keys().filter(|column| values.contains_key(*column)).cloned());
+            values.extend(own);
         }
+        let is_outer = from.iter().flat_map(|from| &from.joins).any(is_outer_using);
+        if let (Some(column), true) = (ambiguous.first(), is_outer) {
+            let message = format!("two parts of FROM have column `{column}` of USING");
+            return Err(hinted_error(message, "join one of them by ON".to_owned()));
+        }
+        ambiguous.iter().for_each(|column| drop(values.remove(column)));
         let schema = look_up(from.to_vec())?;
-        // DataFusion leaves as many as joins name it. Another one is of a table that is joined otherwise: which is meant
-        // is not known then.
+        // DataFusion leaves as many as joins name it. Another one is of a table that is joined otherwise: which is
+        // meant is not known then.
         values.retain(|column, _| {
             let named = from.iter().flat_map(|from| &from.joins).flat_map(using_columns);
             let found = schema.fields().iter().filter(|field| field.name() == column).count();

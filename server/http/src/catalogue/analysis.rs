@@ -69,8 +69,8 @@ struct PairAnalysis {
     direct_s: f64,
     /// Travel time of the sound that the panel reflects.
     reflected_s: f64,
-    /// Time of the direct sound in the response: `direct_s`, unless the measurement's `arrival_error_us` is over 100 us,
-    /// as it is if the loopback lacks the delay of the audio interface. Then the first sample within 20 dB of the
+    /// Time of the direct sound in the response: `direct_s`, unless the measurement's `arrival_error_us` is over 100
+    /// us, as it is if the loopback lacks the delay of the audio interface. Then the first sample within 20 dB of the
     /// greatest.
     arrival_s: f64,
     /// The delay that phase and group delay are less.

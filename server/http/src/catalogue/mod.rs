@@ -1,7 +1,7 @@
 //! The catalogue: the data of the pages, each a query of the lake, answered once per snapshot and cached.
 //!
-//! [`light_routes`], [`heavy_routes`] and [`file_routes`] list the endpoints. [`answer_through_cache`] stands before all
-//! of them: whether the client may ask, whether it has the answer already, and whether the cache does.
+//! [`light_routes`], [`heavy_routes`] and [`file_routes`] list the endpoints. [`answer_through_cache`] stands before
+//! all of them: whether the client may ask, whether it has the answer already, and whether the cache does.
 
 mod analysis;
 mod content;

@@ -1,8 +1,9 @@
 //! Answers of the catalogue that the door gives again without an engine.
 //!
-//! An answer is given again to the client that received it, with the same rights, for as long as the version of the lake
-//! is the one that the engine named in [`LASTING_VERSION`]. The log is looked at for each request, so that what has been
-//! ingested before a request is in its answer. Engines name a version for whole answers only, never for errors.
+//! An answer is given again to the client that received it, with the same rights, for as long as the version of the
+//! lake is the one that the engine named in [`LASTING_VERSION`]. The log is looked at for each request, so that what
+//! has been ingested before a request is in its answer. Engines name a version for whole answers only, never for
+//! errors.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};

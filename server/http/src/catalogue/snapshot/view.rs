@@ -69,8 +69,8 @@ impl SnapshotView {
         format!("\"{}\"", hex::encode(&digest[..VERSION_BYTES]))
     }
 
-    /// The lake's version for as long as which an answer of this snapshot is right; None if a mended table, which has no
-    /// new version, may change it.
+    /// The lake's version for as long as which an answer of this snapshot is right; None if a mended table, which has
+    /// no new version, may change it.
     pub fn lasting_version(&self) -> Option<u64> {
         self.snapshot.log_version(Table::Runs).filter(|_| self.snapshot.is_whole())
     }
