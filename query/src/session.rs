@@ -49,9 +49,20 @@ pub struct PreparedQuery {
     plan: OpaqueValue<LogicalPlan>,
     snapshot: Arc<LakeSnapshot>,
     sql: String,
+    is_optimized: bool,
 }
 
 impl PreparedQuery {
+    /// Optimizes its logical plan once for all runs, which then need values of the very types of its placeholders. For
+    /// all of them `now()` is the time of this call.
+    ///
+    /// # Errors
+    /// [`Error::Query`] if it cannot be planned.
+    pub fn optimize(self) -> Result<Self, Error> {
+        let plan = self.state.optimize(&self.plan).map_err(|e| Error::from_planning(&self.sql, &e))?;
+        Ok(Self { plan: OpaqueValue::new(plan), is_optimized: true, ..self })
+    }
+
     /// Returns its text.
     pub fn sql(&self) -> &str {
         &self.sql
@@ -210,7 +221,7 @@ impl Session {
         let query = async move {
             let started = self.start_query()?;
             let prepared = self.plan_statement(sql, self.parse_sql(sql)?, &started.ticket).await?;
-            self.run_plan(prepared.state.clone(), &prepared.sql, LogicalPlan::clone(&prepared.plan), started).await
+            self.run_plan(&prepared, prepared.state.clone(), LogicalPlan::clone(&prepared.plan), started).await
         };
         query.boxed()
     }
@@ -269,7 +280,7 @@ impl Session {
             // now() is the time of this run, not that of planning.
             let mut state = SessionState::clone(&prepared.state);
             state.mark_start_execution();
-            self.run_plan(OpaqueValue::new(state), &prepared.sql, plan, self.start_query()?).await
+            self.run_plan(prepared, OpaqueValue::new(state), plan, self.start_query()?).await
         };
         execute.boxed()
     }
@@ -338,23 +349,29 @@ impl Session {
             }
             let state = context.state();
             let plan = OpaqueValue::new(prepare_statement(&sql, statement, &state).await?);
-            Ok(PreparedQuery { state: OpaqueValue::new(state), plan, snapshot, sql })
+            Ok(PreparedQuery { state: OpaqueValue::new(state), plan, snapshot, sql, is_optimized: false })
         };
         self.engine.on_threads(ticket, plan).await
     }
 
     async fn run_plan(
         &self,
+        prepared: &PreparedQuery,
         state: OpaqueValue<SessionState>,
-        sql: &str,
         plan: LogicalPlan,
         started: Started,
     ) -> Result<QueryAnswer, Error> {
         let Started { ticket, place } = started;
         let context = self.task_context(&state, &ticket);
-        let text = sql.to_owned();
-        let planned =
-            async move { state.create_physical_plan(&plan).await.map_err(|error| Error::from_planning(&text, &error)) };
+        let text = prepared.sql.clone();
+        let is_optimized = prepared.is_optimized;
+        let planned = async move {
+            let planned = match is_optimized {
+                true => state.query_planner().create_physical_plan(&plan, &*state).await,
+                false => state.create_physical_plan(&plan).await,
+            };
+            planned.map_err(|error| Error::from_planning(&text, &error))
+        };
         let plan = self.engine.on_threads(&ticket, planned).await?;
         let schema = plan.schema();
         let (send, batches) = mpsc::channel(AHEAD);

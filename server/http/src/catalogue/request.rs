@@ -126,19 +126,30 @@ impl CatalogueRequest {
         encode: impl FnOnce(&arrow::datatypes::SchemaRef) -> Result<E, RequestFault> + Send + 'static,
     ) -> Result<RunningQuery<E::Item>, RequestFault> {
         let service = self.catalogue.service();
-        let prepared = match self.view.find_prepared(sql) {
-            Some(prepared) => prepared,
+        let (prepared, types) = match self.view.find_prepared(sql) {
+            Some(known) => known,
             None => {
                 let session = self.view.session.clone();
                 let text = sql.to_owned();
-                let planned = service
-                    .plan_query(self.view.session.client(), async move { Ok(session.prepare(&text).await?) })
-                    .await?;
-                let planned = Arc::new(planned);
+                let plan = async move {
+                    let prepared = session.prepare(&text).await?;
+                    // A placeholder that stands for several columns has no type of its own: its values come as they are.
+                    Ok(match prepared.parameter_types() {
+                        Ok(types) => (Arc::new(prepared.optimize()?), types.into()),
+                        Err(_) => (Arc::new(prepared), Arc::default()),
+                    })
+                };
+                let planned = service.plan_query(self.view.session.client(), plan).await?;
                 self.view.keep_prepared(sql, planned.clone());
                 planned
             }
         };
+        let typed = values.into_iter().enumerate().map(|(i, value)| match types.get(i) {
+            Some(Some(kind)) => value.cast_to(kind),
+            _ => Ok(value),
+        });
+        let values = typed.collect::<Result<Vec<_>, _>>();
+        let values = values.map_err(RequestFault::defect("a value has another type"))?;
         let job = http_job(self.view.session.clone(), QueryWork::Prepared(prepared, ParamValues::from(values)));
         service.begin_query(job, encode).await
     }

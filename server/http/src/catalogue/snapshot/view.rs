@@ -4,6 +4,7 @@ use std::collections::{HashMap, HashSet, VecDeque};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use std::time::Duration;
 
+use arrow::datatypes::DataType;
 use echolake_lake::{DataFile, LakeSnapshot};
 use echolake_query::figure_rows::CurveRow;
 use echolake_query::{EngineClient, PreparedQuery, QueryQuota, Session};
@@ -27,6 +28,9 @@ const EARLIER: usize = 20_000;
 /// Bytes of a version that tell it from all others.
 const VERSION_BYTES: usize = 8;
 
+/// A prepared query, and the types of its placeholders as far as they are known.
+pub(crate) type TypedQuery = (Arc<PreparedQuery>, Arc<[Option<DataType>]>);
+
 /// One snapshot.
 pub(crate) struct SnapshotView {
     /// Changes with every snapshot, and with the program.
@@ -43,7 +47,7 @@ pub(crate) struct SnapshotView {
     /// Mean curves over all pairs of the references that surfaces are beside, by name; there are few.
     flat_curves: Mutex<HashMap<String, Arc<OnceCell<Option<CurveRow>>>>>,
     /// Prepared queries by their text; there are few texts, because values are bound.
-    prepared: Mutex<HashMap<String, Arc<PreparedQuery>>>,
+    prepared: Mutex<HashMap<String, TypedQuery>>,
 }
 
 impl SnapshotView {
@@ -75,7 +79,7 @@ impl SnapshotView {
         self.snapshot.log_version(Table::Runs).filter(|_| self.snapshot.is_whole())
     }
 
-    pub fn find_prepared(&self, sql: &str) -> Option<Arc<PreparedQuery>> {
+    pub fn find_prepared(&self, sql: &str) -> Option<TypedQuery> {
         self.prepared.lock().unwrap_or_else(PoisonError::into_inner).get(sql).cloned()
     }
 
@@ -85,7 +89,7 @@ impl SnapshotView {
         known.entry(flat.to_owned()).or_default().clone()
     }
 
-    pub fn keep_prepared(&self, sql: &str, prepared: Arc<PreparedQuery>) {
+    pub fn keep_prepared(&self, sql: &str, prepared: TypedQuery) {
         self.prepared.lock().unwrap_or_else(PoisonError::into_inner).insert(sql.to_owned(), prepared);
     }
 }
@@ -193,5 +197,10 @@ fn removed_files(before: &LakeSnapshot, after: &LakeSnapshot) -> Vec<VisibleFile
 // The client was authorised before; the quota of its own queries does not apply to these.
 fn catalogue_session(service: &QueryService) -> Arc<Session> {
     let quota = QueryQuota { time: Some(LONGEST), ..QueryQuota::default() };
-    Arc::new(service.begin_session(&Arc::new(EngineClient::new("catalogue", quota))))
+    let session = service.begin_session(&Arc::new(EngineClient::new("catalogue", quota)));
+    // Most of its queries read a few rows: parts that wait for each other cost more than they save.
+    Arc::new(session.with_extension(Arc::new(|context| {
+        context.state_ref().write().config_mut().options_mut().execution.target_partitions = 1;
+        Ok(())
+    })))
 }
