@@ -7,7 +7,7 @@ use echolake_dsp::air_correction::AirCorrectionFit;
 use echolake_dsp::chain::{DerivationPlan, DerivedResponse, FlatEnergies};
 use echolake_dsp::mean::SignalMean;
 use echolake_dsp::rise::CurveShape;
-use echolake_dsp::rounding::round_samples;
+use echolake_dsp::rounding::{CURVE_BITS, round_samples};
 use echolake_dsp::temperature::ReferenceAir;
 use echolake_dsp::uncertainty::{EnergySensitivity, LevelError, LevelUncertainty, ResidualFit};
 use echolake_lake::SamplePrecision;
@@ -155,7 +155,9 @@ impl DerivedRows {
         if precision == SamplePrecision::Rounded {
             for samples in lists.curves.iter_mut().chain([&mut lists.reflected]) {
                 let length = samples.len() / self.pairs.len().max(1);
-                samples.chunks_exact_mut(length.max(1)).for_each(round_samples);
+                for one in samples.chunks_exact_mut(length.max(1)) {
+                    round_samples(one, CURVE_BITS);
+                }
             }
         }
         lists

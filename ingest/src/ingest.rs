@@ -30,7 +30,7 @@ use crate::rows::runs::RunReferences;
 use crate::rows::{self, RunKeys};
 
 /// Revision of the responses that follow from recordings: those of another one are derived anew.
-const RESPONSES_REVISION: &str = "3";
+const RESPONSES_REVISION: &str = "4";
 
 /// Time between two looks at other ingests' claims.
 pub(crate) const LOOK_EVERY: Duration = Duration::from_secs(2);
@@ -258,7 +258,12 @@ impl IngestWork {
         let span = Span::current();
         span.record("run", field::display(&keys.run)).record("surface", field::display(&keys.surface));
         tracing::debug!(measurements = content.accepted.len(), damages = content.damaged.len(), "the file is read");
-        let derivation = digest_parts(&[content.integrity.sha256.as_str(), CODE_VERSION, RESPONSES_REVISION]);
+        let derivation = digest_parts(&[
+            content.integrity.sha256.as_str(),
+            CODE_VERSION,
+            RESPONSES_REVISION,
+            lake.config().samples.name(),
+        ]);
         let known = snapshot.run(&keys.run);
         let replaced = match known {
             Some(known) => self.has_beginning_only(known, &content, &opened).await?,

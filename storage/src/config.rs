@@ -14,7 +14,7 @@ pub const LAKE_FORMAT: u32 = 1;
 pub struct LakeConfig {
     /// The lake's format.
     pub format: u32,
-    /// Precision of reflected responses and curves.
+    /// Precision of responses and curves.
     #[serde(default, skip_serializing_if = "SamplePrecision::is_default")]
     pub samples: SamplePrecision,
     /// References of surfaces that name none of their own.
@@ -47,11 +47,11 @@ pub enum DirectSound {
     Estimated,
 }
 
-/// Precision of the reflected responses and curves in table `nce`.
+/// Precision of the responses and curves in tables `measurements` and `nce`.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum SamplePrecision {
-    /// Rounded, so that they take two thirds of the space.
+    /// Rounded, so that they take 0.6 of the space.
     #[default]
     Rounded,
     /// As computed.

@@ -1,30 +1,33 @@
 //! Rounding of stored samples, so that they compress.
 
-/// Number of binary digits by which [`round_samples`] keeps samples finer than the greatest of them: a sample of 1 % of
-/// the greatest is off by 0.0008 dB at most, a tenth of the least standard uncertainty of a level.
-pub const KEPT_BITS: u32 = 18;
+/// Binary digits that curves and reflected responses keep below their greatest sample: a sample of 1 % of the greatest
+/// is off by 0.0008 dB at most, a tenth of the least standard uncertainty of a level.
+pub const CURVE_BITS: u32 = 18;
+
+/// Binary digits that responses keep below their greatest sample: the rounding is noise 131 dB below it.
+pub const RESPONSE_BITS: u32 = 20;
 
 /// Digits of a float's fraction, and the mask of its exponent.
 const FRACTION_BITS: i32 = 23;
 const EXPONENT_MASK: u32 = 0x7f80_0000;
 
-/// Rounds samples to multiples of a power of two: 2^-[`KEPT_BITS`] of the greatest power that is not over the greatest
+/// Rounds samples to multiples of a power of two: 2^-`kept_bits` of the greatest power that is not over the greatest
 /// magnitude. The last bits of all samples are 0 then. Samples that are not finite leave all as they are.
 ///
 /// Source: Kloewer et al. 2021, Nature Computational Science 1, 713-724, for rounding before lossless compression.
 ///
 /// ```
-/// use echolake_dsp::rounding::round_samples;
+/// use echolake_dsp::rounding::{CURVE_BITS, round_samples};
 ///
 /// let mut samples = [1.0, 0.3, -0.01, 0.0];
-/// round_samples(&mut samples);
+/// round_samples(&mut samples, CURVE_BITS);
 /// assert_eq!(samples, [1.0, 78_643.0 / 262_144.0, -2_621.0 / 262_144.0, 0.0]);
 /// ```
-pub fn round_samples(samples: &mut [f32]) {
+pub fn round_samples(samples: &mut [f32], kept_bits: u32) {
     let greatest = samples.iter().fold(0.0f32, |greatest, x| greatest.max(x.abs()));
     let power = f32::from_bits(greatest.to_bits() & EXPONENT_MASK);
     // Added to a sample, it leaves no digits below the step.
-    let shift = 1.5 * power * 2f32.powi(FRACTION_BITS - KEPT_BITS as i32);
+    let shift = 1.5 * power * 2f32.powi(FRACTION_BITS - kept_bits as i32);
     if !(shift.is_normal() && samples.iter().all(|x| x.is_finite())) {
         return;
     }
@@ -39,7 +42,7 @@ mod tests {
     fn samples_are_off_by_half_a_step_at_most_and_keep_their_order() {
         let before: Vec<f32> = (0..1_000).map(|i| (i as f32 * 0.37).sin().abs().powi(3) * 0.9e-4).collect();
         let mut after = before.clone();
-        round_samples(&mut after);
+        round_samples(&mut after, CURVE_BITS);
         let step = 2f32.powi(-14 - 18);
         assert!(before.iter().any(|x| *x > 2f32.powi(-14)) && before.iter().all(|x| *x < 2f32.powi(-13)));
         for (a, b) in before.iter().zip(&after) {
@@ -54,11 +57,11 @@ mod tests {
     fn silence_and_what_is_no_number_stay() {
         for samples in [[0.0; 3], [f32::MIN_POSITIVE / 4.0; 3], [f32::MAX, 1.0, 0.3], [1.0, f32::INFINITY, 0.3]] {
             let mut rounded = samples;
-            round_samples(&mut rounded);
+            round_samples(&mut rounded, CURVE_BITS);
             assert_eq!(rounded, samples);
         }
         let mut rounded = [0.3, f32::NAN];
-        round_samples(&mut rounded);
+        round_samples(&mut rounded, CURVE_BITS);
         assert!(rounded[0] == 0.3 && rounded[1].is_nan());
     }
 }

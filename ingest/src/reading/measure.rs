@@ -7,8 +7,9 @@ use std::sync::{Arc, Mutex, PoisonError};
 use bytes::Bytes;
 use echolake_dsp::air::AirState;
 use echolake_dsp::chain::{MeasurementParams, MeasurementPlan, MeasurementScratch, ResponseCorrection};
+use echolake_dsp::rounding::{RESPONSE_BITS, round_samples};
 use echolake_dsp::temperature::ReferenceAir;
-use echolake_lake::Lake;
+use echolake_lake::{Lake, SamplePrecision};
 use echolake_recording::{ChunkMessage, DecodedChunk, list_damage};
 use echolake_schema::messages::{
     AmbientSample, ImpulseResponse, Measurement, Message as RunMessage, SampleFormat, SweepRecording,
@@ -41,6 +42,7 @@ pub(crate) struct Measurer {
     /// Cache of plans by recording length: a run has one length, an import may have several.
     plans: Mutex<HashMap<usize, Arc<RecordingPlan>>>,
     correction: ResponseCorrection<f32>,
+    precision: SamplePrecision,
 }
 
 /// Memory that the messages of one run may still take, bytes: the chunks of a hostile file can decompress to thousands
@@ -158,6 +160,7 @@ impl Measurer {
             pairs: lake.grid().pairs().len() as u32,
             plans: Mutex::default(),
             correction: ResponseCorrection::new(ReferenceAir::from_response(response), response.division),
+            precision: lake.config().samples,
         }
     }
 
@@ -265,6 +268,7 @@ impl Measurer {
         if !measured? {
             return Ok(None);
         }
+        self.round_response(&mut ir);
         Ok(Some(Response {
             pair: sweep.pair_id,
             attempt: sweep.attempt,
@@ -305,6 +309,7 @@ impl Measurer {
             self.correction.correct_response(&given.samples, &air, &mut ir);
             ResponseSource::Ir
         };
+        self.round_response(&mut ir);
         Ok(Some(Response {
             pair: given.pair_id,
             attempt: given.attempt,
@@ -314,6 +319,13 @@ impl Measurer {
             source,
             ir,
         }))
+    }
+
+    // Before anything is derived from it, so that what is derived later from the table is the same.
+    fn round_response(&self, ir: &mut [f32]) {
+        if self.precision == SamplePrecision::Rounded {
+            round_samples(ir, RESPONSE_BITS);
+        }
     }
 
     fn recording_plan(&self, recording_len: usize) -> Result<Arc<RecordingPlan>, String> {

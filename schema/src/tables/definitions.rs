@@ -198,7 +198,8 @@ pub(super) fn measurement_columns() -> Vec<Column> {
         Column::floats(
             "ir",
             "1",
-            "Impulse response over the loopback, at the reference temperature, cropped; direct sound still in it",
+            "Impulse response over the loopback, at the reference temperature, cropped; direct sound still in it; rounded \
+            to 2^-20 of its greatest sample, unless lake.toml says exact",
         ),
         code_version(),
     ]);

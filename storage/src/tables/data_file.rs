@@ -122,8 +122,8 @@ pub fn encode_batches(table: Table, schema: &SchemaRef, batches: &[RecordBatch])
 // Samples do not repeat, so a dictionary only costs; their bytes by significance compress best
 // (measured on dB spectra: 0.74 of raw f32 against 1.00 with the defaults).
 //
-// Single numbers that do not repeat (zstd makes them an eighth smaller) are not compressed: a reader makes a
-// decompressor for each column of each file, which takes longer than reading three thousand of them.
+// Single numbers that do not repeat (zstd makes them an eighth smaller) are stored as they are: a reader copies them,
+// and makes no decompressor for each column of each file, which takes longer than reading three thousand of them.
 fn writer_properties(table: Table, schema: &SchemaRef, first: &RecordBatch) -> WriterProperties {
     let rows = first.num_rows();
     let bytes = first.get_array_memory_size();
@@ -149,15 +149,17 @@ fn writer_properties(table: Table, schema: &SchemaRef, first: &RecordBatch) -> W
                 .set_column_encoding(column, Encoding::DELTA_BINARY_PACKED);
             continue;
         }
-        let column = match kind {
-            DataType::List(_) => ColumnPath::new(vec![name, "list".into(), LIST_CHILD.into()]),
-            DataType::Float32 | DataType::Float64 => ColumnPath::new(vec![name]),
-            _ => continue,
+        let is_list = matches!(kind, DataType::List(_));
+        let column = match is_list {
+            true => ColumnPath::new(vec![name, "list".into(), LIST_CHILD.into()]),
+            false if kind.is_floating() => ColumnPath::new(vec![name]),
+            false => continue,
         };
-        builder = builder
-            .set_column_dictionary_enabled(column.clone(), false)
-            .set_column_encoding(column.clone(), Encoding::BYTE_STREAM_SPLIT);
-        if matches!(kind, DataType::List(_)) {
+        builder = builder.set_column_dictionary_enabled(column.clone(), false);
+        if is_list || repeats {
+            builder = builder.set_column_encoding(column.clone(), Encoding::BYTE_STREAM_SPLIT);
+        }
+        if is_list {
             builder = builder.set_column_statistics_enabled(column, EnabledStatistics::None);
         }
     }

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
 use arrow::array::{
@@ -521,11 +522,16 @@ async fn whoever_looks_while_runs_come_sees_all_rows_of_each() {
     let slow: Arc<dyn ObjectStore> = Arc::new(ThrottledStore::new(store, config));
     let (rig, references) = (Rig::paper(), ReferenceSurfaces::default());
     let reader = Lake::open_or_create_in(slow, "a slow lake", &rig, &references).await.expect("a lake");
+    let finished_looks = Arc::new(AtomicUsize::new(0));
+    let seen_looks = finished_looks.clone();
     let writing = tokio::spawn(async move {
         for number in 0..RUNS {
+            let before = seen_looks.load(Ordering::SeqCst);
             put(&lake, "wood", &format!("r{number}"), "d1", number).await;
             // A look at a lake whose other tables lack rows is repeated while runs come.
-            tokio::time::sleep(Duration::from_millis(20)).await;
+            while seen_looks.load(Ordering::SeqCst) == before {
+                tokio::time::sleep(Duration::from_millis(1)).await;
+            }
         }
     });
     let mut looks = BTreeSet::new();
@@ -535,6 +541,7 @@ async fn whoever_looks_while_runs_come_sees_all_rows_of_each() {
             assert_eq!(snapshot.files_of(TABLE, &run.run).count(), 1, "rows of {} of {looks:?}", run.run);
         }
         looks.insert(snapshot.runs().count());
+        finished_looks.fetch_add(1, Ordering::SeqCst);
     }
     assert!(looks.len() > 2, "it looked while runs came: {looks:?}");
     writing.await.expect("written");
