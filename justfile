@@ -51,9 +51,9 @@ stress NAME *OPTIONS:
 fuzz TARGET *OPTIONS:
     fuzz/run {{ TARGET }} {{ OPTIONS }}
 
-# A benchmark, built as packages are; `kernels` are criterion's.
+# A benchmark, built as packages are, as `just bench all --quick`; `kernels` are criterion's.
 bench NAME *OPTIONS:
-    {{ if NAME == "kernels" { "cargo bench --manifest-path stress/kernels/Cargo.toml --locked --" } else { "cargo run --profile dist --locked -p echolake-stress -- " + NAME } }} {{ OPTIONS }}
+    {{ if NAME == "kernels" { "cargo bench --manifest-path stress/kernels/Cargo.toml --locked --" } else { "cargo build --profile dist --locked -p echolake -p echolake-stress && target/dist/stress bench " + NAME } }} {{ OPTIONS }}
 
 # What a change must pass.
 ci:

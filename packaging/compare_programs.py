@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
 """Times two builds of echolake beside each other: `compare_programs.py NEW OLD [--surfaces N] [--rounds N]`.
 
-Both make a lake by `demo`, ingest the same run files (those of OLD's lake), and answer the queries of query-bench from
-a server over HTTP, each on its own lake. They take turns, and each round begins with the other one. Prints, for each
+Both make a lake by `demo`, ingest the same run files (those of OLD's lake), and answer the twelve queries of `bench
+queries` from a server over HTTP, each on its own lake. They take turns, and each round begins with the other one. Prints, for each
 work, the medians in seconds and the ratio NEW / OLD, as the median of the rounds with its range. Where the answers
 differ in their number of rows, it says so: the ratio then compares different work. Needs nothing but Python.
 """
@@ -22,7 +22,7 @@ import urllib.request
 from collections.abc import Callable
 from pathlib import Path
 
-QUERIES = Path(__file__).resolve().parent.parent / "stress/src/query_bench/queries.sql"
+QUERIES = Path(__file__).resolve().parent.parent / "stress/src/bench/queries/twelve.sql"
 # A query is asked this often in a round; its time is the least, because a busy machine only ever adds to it.
 ASKED = 5
 LONGEST_SECONDS = 1800

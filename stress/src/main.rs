@@ -5,8 +5,8 @@
 #[path = "../../tests/acquire_kills.rs"]
 mod acquire_kills;
 mod attacks;
+mod bench;
 mod cancels;
-mod catalogue_client;
 mod engine_kills;
 #[path = "../../tests/forgetful.rs"]
 mod forgetful;
@@ -17,21 +17,16 @@ mod hostile_clients;
 #[path = "../../tests/hostile_files.rs"]
 mod hostile_files;
 mod hostile_ingest;
-mod ingest_bench;
 mod kill_acquire;
 mod kill_ingest;
 #[path = "../../tests/kills.rs"]
 mod kills;
-mod mcap_bench;
-mod memory;
 mod motion;
 mod observed_server;
 mod operator_rounds;
 #[path = "../../tests/operators/mod.rs"]
 mod operators;
 mod percentile;
-mod query_bench;
-mod readers;
 #[allow(dead_code, reason = "the tests' clients, of which this wants a part")]
 #[path = "../../tests/serve"]
 mod serve {
@@ -39,7 +34,6 @@ mod serve {
     pub(crate) mod server;
     pub(crate) mod tunnel;
 }
-mod slices;
 
 use std::path::PathBuf;
 
@@ -78,16 +72,8 @@ enum CampaignCommand {
     EngineKills(engine_kills::EngineKillsArgs),
     /// Measure how soon the server is idle after a query is ended.
     Cancels(cancels::CancelArgs),
-    /// Measure ingest beside bare transforms, the reference pipeline and the parquet crate alone.
-    IngestBench(ingest_bench::IngestBenchArgs),
-    /// Measure twelve queries beside DuckDB on the same files.
-    QueryBench(query_bench::QueryBenchArgs),
-    /// Measure `mcap()` beside Python's mcap.
-    McapBench(mcap_bench::McapBenchArgs),
-    /// Measure many readers of a served catalogue at once.
-    Readers(readers::ReadersArgs),
-    /// Measure slices of a served run, for one reader and for many.
-    Slices(slices::SlicesArgs),
+    /// Measure ingest, queries, readers and other things beside peers and limits.
+    Bench(bench::BenchArgs),
     /// Compare orders in which the arms visit the grid, and show what they cannot reach.
     Motion(motion::MotionArgs),
 }
@@ -103,11 +89,7 @@ fn main() -> Result<()> {
         CampaignCommand::HostileClients(args) => hostile_clients::run_hostile_clients(&args),
         CampaignCommand::EngineKills(args) => engine_kills::run_engine_kills(&args),
         CampaignCommand::Cancels(args) => cancels::run_cancel_campaign(&args),
-        CampaignCommand::IngestBench(args) => ingest_bench::run_ingest_bench(&args),
-        CampaignCommand::QueryBench(args) => block_on(query_bench::run_query_bench(&args)),
-        CampaignCommand::McapBench(args) => block_on(mcap_bench::run_mcap_bench(&args)),
-        CampaignCommand::Readers(args) => readers::run_readers(&args),
-        CampaignCommand::Slices(args) => slices::run_slices(&args),
+        CampaignCommand::Bench(args) => bench::run_bench(&args),
         CampaignCommand::Motion(args) => motion::run_motion(&args),
     }
 }

@@ -15,7 +15,7 @@ use echolake_panel::collection::{CollectionSurface, collection_surfaces};
 use echolake_schema::manifest::{Origin, RunEnd};
 use echolake_schema::{Rig, Timestamp};
 
-use super::meter::{CostMeter, MeasuredCost, forget_peak, peak_mib};
+use super::super::meter::{CostMeter, MeasuredCost, forget_peak, peak_mib};
 
 /// 2026-01-05 08:00 UTC, and a run every eleven hours.
 const FIRST_START: Timestamp = Timestamp(1_767_600_000_000_000_000);
@@ -56,7 +56,6 @@ pub(crate) struct SimulationOrder<'a> {
 /// A lake that has just taken in runs.
 pub(crate) struct IngestedLake {
     pub lake: Lake,
-    pub folder: PathBuf,
     /// Of all runs.
     pub whole: MeasuredCost,
     /// Of those that are no references, with the references there.
@@ -69,7 +68,6 @@ impl SimulationOrder<'_> {
     pub fn make(&self) -> Result<SimulatedRuns> {
         std::fs::create_dir_all(self.folder)?;
         let members = collection_surfaces(self.seed, self.count)?;
-        let cores = std::thread::available_parallelism().map_or(1, usize::from);
         let next = AtomicUsize::new(0);
         let work = || -> Result<Vec<_>> {
             let mut made = Vec::new();
@@ -79,11 +77,7 @@ impl SimulationOrder<'_> {
                 made.push(self.run(number, member)?);
             }
         };
-        let done: Vec<_> = std::thread::scope(|scope| {
-            let threads: Vec<_> = (0..cores).map(|_| scope.spawn(work)).collect();
-            threads.into_iter().map(|t| t.join().ok().context("a thread panicked").flatten()).collect::<Result<_>>()
-        })?;
-        let mut done: Vec<_> = done.into_iter().flatten().collect();
+        let mut done: Vec<_> = super::super::run_on_cores(work)?.into_iter().flatten().collect();
         // Their names begin with the time of their start.
         done.sort_by(|a, b| a.0.cmp(&b.0));
         let mut runs = SimulatedRuns { files: Vec::new(), all: RunCounts::default(), panels: RunCounts::default() };
@@ -145,7 +139,7 @@ impl SimulatedRuns {
         ensure!(accepted == self.all.accepted, "{accepted} measurements ingested of {}", self.all.accepted);
         let [references, panels] = costs;
         let whole = references.plus(panels);
-        Ok(IngestedLake { lake, folder: folder.to_owned(), whole, panels, peak_mib: peak_mib()? })
+        Ok(IngestedLake { lake, whole, panels, peak_mib: peak_mib()? })
     }
 }
 

@@ -14,9 +14,9 @@ use echolake_schema::{samples, topics};
 use mcap::MessageStream;
 use prost::Message as _;
 
+use super::super::meter::{CostMeter, MeasuredCost};
+use super::super::report::{BenchReport, FigureGoal};
 use super::IngestBenchArgs;
-use super::meter::{CostMeter, MeasuredCost};
-use super::report::{FigureGoal, FigureReport};
 use super::simulated::{SimulatedRuns, SimulationOrder};
 
 /// Runs: Flat, Foam and two others.
@@ -35,7 +35,7 @@ struct SampledRecording {
     loopback: Vec<f32>,
 }
 
-pub(crate) async fn measure_sweeps(args: &IngestBenchArgs, folder: &Path, report: &mut FigureReport) -> Result<()> {
+pub(crate) async fn measure_sweeps(args: &IngestBenchArgs, folder: &Path, report: &mut BenchReport) -> Result<()> {
     let runs = folder.join("sweeps");
     let order = SimulationOrder {
         count: RUNS,
@@ -64,27 +64,32 @@ pub(crate) async fn measure_sweeps(args: &IngestBenchArgs, folder: &Path, report
     let count = runs.panels.attempts as f64;
     let all = runs.all.attempts as f64;
     let each = panels.cpu / count;
-    report.title(&format!(
-        "{RUNS} runs with sweeps, two of them references: {all} recordings of {length} samples, two channels, 24 bit; \
-            {:.0} MB",
+    report.group("Ingest of runs with sweeps");
+    report.note(format!(
+        "{RUNS} runs, two of them references: {all} recordings of {length} samples, two channels, 24 bit; {:.0} MB. \
+         Bare transforms: two of {padded} samples, padded as ingest does.",
         runs.all.bytes as f64 / 1e6
-    ))?;
-    report.figure("ingest, references there, CPU a recording", each * 1e6, "us")?;
-    report.figure("the same, wall time, all cores", panels.wall / count * 1e6, "us")?;
-    report.figure("ingest with the references', CPU a recording", whole.cpu / all * 1e6, "us")?;
-    report.figure(&format!("two bare transforms of {padded} samples (padded as ingest does)"), bare * 1e6, "us")?;
-    report.figure(&format!("two bare transforms of {SWEEP_LEN} samples (the sweep alone)"), unpadded * 1e6, "us")?;
-    report.goal("ingest / bare transforms", each / bare, "x", FigureGoal::AtMost(3.0))?;
-    report.figure("the same with the references'", whole.cpu / all / bare, "x")?;
-    report.figure(&format!("ingest / bare transforms of {SWEEP_LEN}"), each / unpadded, "x")?;
+    ));
+    let transforms = "two bare transforms";
+    report.figure("CPU a recording, references there", each * 1e6, "us").beside(transforms, bare * 1e6);
+    report
+        .figure("CPU a recording, the references among them", whole.cpu / all * 1e6, "us")
+        .beside(transforms, bare * 1e6);
+    report.figure("wall time a recording, references there, all cores", panels.wall / count * 1e6, "us");
+    report.figure("ingest with sweeps / two bare transforms, CPU", each / bare, "x").goal(FigureGoal::AtMost(2.5));
+    report
+        .figure(format!("the same beside transforms of {SWEEP_LEN} samples (the sweep alone)"), each * 1e6, "us")
+        .beside("two bare transforms", unpadded * 1e6);
     match time_reference(args, folder, &recordings) {
         Ok(process) => {
-            report.figure("pipeline.py's process, CPU a recording, one core", process * 1e6, "us")?;
-            report.goal("pipeline.py's process / ingest", process / each, "x", FigureGoal::AtLeast(20.0))?;
+            report
+                .figure("SciPy pipeline on one core / ingest, CPU a recording", process / each, "x")
+                .goal(FigureGoal::AtLeast(30.0));
         }
-        Err(why) => report.line(&format!("pipeline.py skipped: {why:#}"))?,
+        Err(why) => report.note(format!("The SciPy pipeline was skipped: {why:#}.")),
     }
-    report.goal("peak memory of the ingest", peak, "MiB", FigureGoal::AtMost(600.0))
+    report.figure("peak memory, sweeps", peak, "MiB").goal(FigureGoal::AtMost(600.0));
+    Ok(())
 }
 
 // Recordings spread over the last run, because the reference pipeline's cost depends on the temperature.

@@ -31,8 +31,6 @@ pub(crate) struct StoredTableFile {
 
 /// A file's rows, and how they were written.
 pub(crate) struct FileRows {
-    pub table: Table,
-    pub of_reference: bool,
     pub schema: SchemaRef,
     pub batches: Vec<RecordBatch>,
     pub properties: WriterProperties,
@@ -76,7 +74,7 @@ pub(crate) async fn read_table_files(lake: &Lake) -> anyhow::Result<Vec<StoredTa
 }
 
 impl FileRows {
-    pub fn read(&StoredTableFile { table, of_reference, bytes: ref file }: &StoredTableFile) -> anyhow::Result<Self> {
+    pub fn read(StoredTableFile { bytes: file, .. }: &StoredTableFile) -> anyhow::Result<Self> {
         let builder = ParquetRecordBatchReaderBuilder::try_new(file.clone())?.with_batch_size(BATCH_ROWS);
         let properties =
             builder_as(builder.metadata(), NumberEncoding::AsStored).set_data_page_size_limit(PAGE_BYTES).build();
@@ -84,7 +82,7 @@ impl FileRows {
         let reader = builder.build()?;
         let schema = reader.schema();
         let batches = reader.collect::<Result<_, _>>()?;
-        Ok(Self { table, of_reference, schema, batches, properties, bytes: file.len() as u64, raw })
+        Ok(Self { schema, batches, properties, bytes: file.len() as u64, raw })
     }
 
     /// Writes them with the parquet crate and nothing else.

@@ -9,11 +9,11 @@ use parquet::basic::Compression;
 use parquet::file::metadata::{PageIndexPolicy, ParquetMetaDataReader};
 use parquet::file::properties::WriterPropertiesBuilder;
 
+use super::super::report::BenchReport;
 use super::IngestBenchArgs;
 use super::parquet_files::{
     FileRows, LEVEL, NumberEncoding, PAGE_BYTES, StoredTableFile, builder_as, read_all, zstd_compression,
 };
-use super::report::FigureReport;
 
 /// Page sizes that are compared.
 const PAGES: [usize; 4] = [64 << 10, 128 << 10, 256 << 10, 1 << 20];
@@ -28,26 +28,25 @@ struct FileLayout {
 pub(crate) fn measure_layouts(
     args: &IngestBenchArgs,
     files: &[StoredTableFile],
-    rows: &[FileRows],
-    report: &mut FigureReport,
+    report: &mut BenchReport,
 ) -> Result<()> {
     for table in [Table::Measurements, Table::Nce] {
         // Much of what is derived of the references is zero.
         let file = files.iter().rfind(|f| f.table == table && !f.of_reference).context("no file of a table")?;
-        let rows = rows.iter().rfind(|r| r.table == table && !r.of_reference).context("no rows of a table")?;
-        report.title(&format!(
-            "One file of `{}` in other layouts, {:.1} MB of raw numbers; the best of {} repeats on one thread",
-            table.name(),
+        let rows = FileRows::read(file)?;
+        report.group(format!("One file of `{}` in other layouts", table.name()));
+        report.note(format!(
+            "{:.1} MB of raw numbers; the best of {} repeats on one thread.",
             rows.raw as f64 / 1e6,
             args.repeats()
-        ))?;
-        compare_layouts(args, &file.bytes, rows, report)?;
-        compare_page_sizes(&file.bytes, rows, report)?;
+        ));
+        compare_layouts(args, &file.bytes, &rows, report)?;
+        compare_page_sizes(&file.bytes, &rows, report)?;
     }
     Ok(())
 }
 
-fn compare_layouts(args: &IngestBenchArgs, file: &Bytes, rows: &FileRows, report: &mut FigureReport) -> Result<()> {
+fn compare_layouts(args: &IngestBenchArgs, file: &Bytes, rows: &FileRows, report: &mut BenchReport) -> Result<()> {
     let layout = |name, numbers, compression| FileLayout { name, numbers, compression };
     let metadata = ParquetMetaDataReader::new().parse_and_finish(file)?;
     let candidates = [
@@ -58,7 +57,6 @@ fn compare_layouts(args: &IngestBenchArgs, file: &Bytes, rows: &FileRows, report
         layout("plain, zstd 1", NumberEncoding::Plain, zstd_compression(LEVEL)),
         layout("dictionary, zstd 1", NumberEncoding::Dictionary, zstd_compression(LEVEL)),
     ];
-    report.line(&format!("{:<40} {:>10} {:>12} {:>12}", "layout", "of raw", "write MB/s", "read MB/s"))?;
     for FileLayout { name, numbers, compression } in candidates {
         let properties = builder_as(&metadata, numbers).set_data_page_size_limit(PAGE_BYTES);
         let properties = properties.set_compression(compression).build();
@@ -78,24 +76,25 @@ fn compare_layouts(args: &IngestBenchArgs, file: &Bytes, rows: &FileRows, report
         }
         let raw = rows.raw as f64;
         let ratio = 100.0 * size as f64 / raw;
-        let write = raw / 1e6 / write;
-        let read = raw / 1e6 / read;
-        report.line(&format!("{name:<40} {ratio:>8.1} % {write:>12.0} {read:>12.0}"))?;
+        report.figure(format!("{name}: size of raw"), ratio, "%");
+        report.figure(format!("{name}: write"), raw / 1e6 / write, "MB/s");
+        report.figure(format!("{name}: read"), raw / 1e6 / read, "MB/s");
     }
     Ok(())
 }
 
 // What a reader that knows the file's indices fetches for one row of its first list column.
-fn compare_page_sizes(file: &Bytes, rows: &FileRows, report: &mut FigureReport) -> Result<()> {
+fn compare_page_sizes(file: &Bytes, rows: &FileRows, report: &mut BenchReport) -> Result<()> {
     let metadata = ParquetMetaDataReader::new().parse_and_finish(file)?;
-    report.line(&format!("{:<40} {:>10} {:>12} {:>12}", "page size", "of raw", "row fetched", "page index"))?;
     for bytes in PAGES {
         let limit = |builder: WriterPropertiesBuilder| builder.set_data_page_size_limit(bytes).build();
         let written = Bytes::from(rows.write(&limit(builder_as(&metadata, NumberEncoding::AsStored)))?);
         let (page, index) = point_lookup(&written)?;
         let ratio = 100.0 * written.len() as f64 / rows.raw as f64;
-        let name = format!("{} KiB", bytes >> 10);
-        report.line(&format!("{name:<40} {ratio:>8.1} % {:>9.1} KiB {:>9.1} KiB", page / 1024.0, index / 1024.0))?;
+        let name = format!("pages of {} KiB", bytes >> 10);
+        report.figure(format!("{name}: size of raw"), ratio, "%");
+        report.figure(format!("{name}: fetched for one row"), page / 1024.0, "KiB");
+        report.figure(format!("{name}: page index"), index / 1024.0, "KiB");
     }
     Ok(())
 }

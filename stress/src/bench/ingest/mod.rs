@@ -4,47 +4,47 @@
 //! With `--quick` it takes less than a minute. Ratios are of CPU time, the least of a few repeats that take turns, so
 //! that other programs disturb them little.
 
-mod lake_size;
+pub(crate) mod lake_size;
 mod layout;
-mod meter;
 mod parquet_files;
-mod report;
-mod responses;
-mod simulated;
-mod sweeps;
+pub(crate) mod responses;
+pub(crate) mod simulated;
+pub(crate) mod sweeps;
 
 use std::path::PathBuf;
 
 use anyhow::Result;
-use report::FigureReport;
+use echolake_lake::Lake;
 use simulated::REFERENCES;
+
+use super::report::BenchReport;
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct IngestBenchArgs {
     /// Smaller runs and fewer repeats.
     #[arg(long)]
-    quick: bool,
+    pub quick: bool,
     /// Pairs of each of the four runs with sweeps.
     #[arg(long, value_name = "N")]
-    pairs: Option<usize>,
+    pub pairs: Option<usize>,
     /// Runs without sweeps, of all pairs, the references among them.
     #[arg(long, value_name = "K")]
-    runs: Option<usize>,
+    pub runs: Option<usize>,
     /// Repeats, of which the best counts.
     #[arg(long, value_name = "N")]
-    repeats: Option<usize>,
+    pub repeats: Option<usize>,
     /// A Python that has NumPy and SciPy.
     #[arg(long, value_name = "PATH", default_value = "python3")]
-    python: PathBuf,
+    pub python: PathBuf,
     /// Folder of `pipeline.py`.
     #[arg(long, value_name = "DIR", default_value = "../shared/reference")]
-    reference: PathBuf,
+    pub reference: PathBuf,
     /// Parent of the temporary folder; it should be on the disk that the lake would be on.
     #[arg(long, value_name = "DIR")]
-    folder: Option<PathBuf>,
+    pub folder: Option<PathBuf>,
     /// Seed of the simulated rig.
     #[arg(long, default_value_t = 1)]
-    seed: u64,
+    pub seed: u64,
 }
 
 impl IngestBenchArgs {
@@ -61,15 +61,11 @@ impl IngestBenchArgs {
     }
 }
 
-pub(crate) fn run_ingest_bench(args: &IngestBenchArgs) -> Result<()> {
-    let folder = match &args.folder {
-        Some(parent) => tempfile::tempdir_in(parent)?,
-        None => tempfile::tempdir()?,
-    };
-    let mut report = FigureReport::new();
-    super::block_on(async {
-        sweeps::measure_sweeps(args, folder.path(), &mut report).await?;
-        responses::measure_responses(args, folder.path(), &mut report).await
-    })?;
-    report.finish()
+pub(crate) async fn measure_ingest(args: &IngestBenchArgs, report: &mut BenchReport) -> Result<()> {
+    let folder = super::temporary_folder(args.folder.as_deref())?;
+    sweeps::measure_sweeps(args, folder.path(), report).await?;
+    responses::measure_responses(args, folder.path(), report).await?;
+    let lake = Lake::open(&folder.path().join("lake").display().to_string()).await?;
+    lake_size::measure_lake_size(&lake, report).await?;
+    layout::measure_layouts(args, &parquet_files::read_table_files(&lake).await?, report)
 }

@@ -1,14 +1,17 @@
-//! Scans topics of runs with `mcap()` and with Python's `mcap`, side by side, and prints the bytes of each topic.
+//! Scans of topics of runs with `mcap()`, beside Python's `mcap` and beside the decompression of the same chunks.
 //!
 //! The Python of `--python` needs the packages `mcap` and `mcap-protobuf-support`.
 
-use std::io::Write as _;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::Instant;
 
 use anyhow::{Context as _, Result, bail};
 use echolake_lake::Lake;
 use echolake_query::Session;
+
+use super::limits::decompression_speed;
+use super::report::{BenchReport, FigureGoal};
 
 /// Topics from the smallest to the largest.
 const TOPICS: [&str; 5] = ["/environment", "/measurement", "/ir", "/sweep/audio", "/sweep"];
@@ -34,23 +37,23 @@ print(count, sorted(seconds)[1])
 #[derive(Debug, clap::Args)]
 pub(crate) struct McapBenchArgs {
     /// A lake of runs.
-    lake: String,
+    pub lake: String,
     /// Surfaces or runs, with `*` and `?`.
-    pattern: String,
+    pub pattern: String,
     /// A Python that has mcap and mcap-protobuf-support; without one, `mcap()` alone is measured.
     #[arg(long, value_name = "PATH")]
-    python: Option<String>,
+    pub python: Option<PathBuf>,
 }
 
-pub(crate) async fn run_mcap_bench(args: &McapBenchArgs) -> Result<()> {
+pub(crate) async fn measure_mcap(args: &McapBenchArgs, report: &mut BenchReport) -> Result<()> {
     let McapBenchArgs { lake, pattern, python } = args;
     let lake = Lake::open(lake).await?;
     let session = Session::new(&lake)?;
-    let (files, bytes) = find_files(&session, &lake, pattern).await?;
-    let mut out = std::io::stdout();
-    writeln!(out, "{} files, {bytes} bytes", files.len())?;
-    writeln!(out, "| topic | messages | bytes read | MB/s | mcap() ms | Python ms | ratio |")?;
-    writeln!(out, "| --- | --- | --- | --- | --- | --- | --- |")?;
+    let files = find_files(&session, &lake, pattern).await?;
+    report.group("Topics of run files by `mcap()`");
+    report.note(
+        "The median of five scans. Speeds are of bytes in the file, beside the decompression of the same chunks.",
+    );
     for topic in TOPICS {
         let sql = format!("select * from mcap('{pattern}', '{topic}')");
         let Ok((_, rows)) = time_scan(&session, &sql).await else { continue };
@@ -59,12 +62,21 @@ pub(crate) async fn run_mcap_bench(args: &McapBenchArgs) -> Result<()> {
             seconds.push(time_scan(&session, &sql).await?.0);
         }
         seconds.sort_by(f64::total_cmp);
-        let ours = seconds[ROUNDS / 2];
-        let read = bytes_read(&session, &sql).await?;
-        let theirs = python.as_deref().map(|python| time_peer(python, topic, &files, rows)).transpose()?;
-        let compared = theirs.map_or_else(|| "- | -".to_owned(), |t| format!("{:.0} | {:.1}", t * 1e3, t / ours));
-        let speed = read as f64 / ours / 1e6;
-        writeln!(out, "| `{topic}` | {rows} | {read} | {speed:.0} | {:.2} | {compared} |", ours * 1e3)?;
+        let own = seconds[ROUNDS / 2];
+        let peer = python.as_deref().map(|python| time_peer(python, topic, &files, rows)).transpose()?;
+        let figure = report.figure(format!("`{topic}`, {rows} messages"), own * 1e3, "ms");
+        if let Some(peer) = peer {
+            figure.beside("Python's mcap", peer * 1e3);
+        }
+        let limit = decompression_speed(&files, Some(topic))?.packed;
+        report
+            .figure(
+                format!("`{topic}`, bytes of the file"),
+                bytes_read(&session, &sql).await? as f64 / own / 1e6,
+                "MB/s",
+            )
+            .beside("zstd, all cores", limit)
+            .goal(FigureGoal::AtLeast(0.8 * limit));
     }
     Ok(())
 }
@@ -96,21 +108,16 @@ async fn bytes_read(session: &Session, sql: &str) -> Result<u64> {
     Ok(behind.chars().take_while(char::is_ascii_digit).collect::<String>().parse()?)
 }
 
-async fn find_files(session: &Session, lake: &Lake, pattern: &str) -> Result<(Vec<String>, u64)> {
+async fn find_files(session: &Session, lake: &Lake, pattern: &str) -> Result<Vec<PathBuf>> {
     let folder = lake.folder().context("the lake is no folder")?;
     let sql = format!("select distinct file from mcap_topics('{pattern}') order by 1");
     let printed = query_text(session, &sql).await?;
     let names = printed.lines().filter_map(|l| l.strip_prefix('|')).map(|l| l.trim_matches(['|', ' ']));
-    let files: Vec<_> = names.filter(|n| n.ends_with(".mcap")).map(|n| folder.join(n)).collect();
-    let mut bytes = 0;
-    for file in &files {
-        bytes += std::fs::metadata(file)?.len();
-    }
-    Ok((files.iter().map(|f| f.display().to_string()).collect(), bytes))
+    Ok(names.filter(|name| name.ends_with(".mcap")).map(|name| folder.join(name)).collect())
 }
 
 /// Seconds that Python takes for the same messages.
-fn time_peer(python: &str, topic: &str, files: &[String], rows: usize) -> Result<f64> {
+fn time_peer(python: &Path, topic: &str, files: &[PathBuf], rows: usize) -> Result<f64> {
     let done = Command::new(python).args(["-c", SCRIPT, topic]).args(files).output()?;
     if !done.status.success() {
         bail!("{}", String::from_utf8_lossy(&done.stderr));

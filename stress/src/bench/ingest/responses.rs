@@ -4,18 +4,18 @@ use std::fs::{self, File};
 use std::io::Write as _;
 use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::Instant;
 
 use anyhow::{Context as _, Result};
 use echolake_acquisition::run::controller::RecordingMode;
 
+use super::super::meter::{CostMeter, MeasuredCost};
+use super::super::report::{BenchReport, FigureGoal};
 use super::IngestBenchArgs;
-use super::meter::{CostMeter, MeasuredCost};
 use super::parquet_files::{FileRows, read_table_files};
-use super::report::{FigureGoal, FigureReport};
 use super::simulated::{IngestedLake, SimulationOrder};
-use super::{lake_size, layout};
 
-pub(crate) async fn measure_responses(args: &IngestBenchArgs, folder: &Path, report: &mut FigureReport) -> Result<()> {
+pub(crate) async fn measure_responses(args: &IngestBenchArgs, folder: &Path, report: &mut BenchReport) -> Result<()> {
     let runs = folder.join("responses");
     let order = SimulationOrder {
         count: args.runs(),
@@ -24,7 +24,9 @@ pub(crate) async fn measure_responses(args: &IngestBenchArgs, folder: &Path, rep
         seed: args.seed,
         folder: &runs,
     };
+    let begun = Instant::now();
     let runs = order.make()?;
+    let simulated = begun.elapsed().as_secs_f64() / args.runs() as f64;
     let mut whole = MeasuredCost::NONE;
     let mut panels = MeasuredCost::NONE;
     let mut alone = MeasuredCost::NONE;
@@ -38,8 +40,7 @@ pub(crate) async fn measure_responses(args: &IngestBenchArgs, folder: &Path, rep
     }
     let last = last.context("no repeats")?;
     let found = read_table_files(&last.lake).await?;
-    let rows = found.iter().map(FileRows::read).collect::<Result<Vec<_>>>()?;
-    let of_panels: Vec<_> = rows.iter().filter(|r| !r.of_reference).collect();
+    let of_panels = found.iter().filter(|file| !file.of_reference).map(FileRows::read).collect::<Result<Vec<_>>>()?;
     let mut written = 0;
     for _ in 0..args.repeats() {
         let target = folder.join("written");
@@ -53,35 +54,40 @@ pub(crate) async fn measure_responses(args: &IngestBenchArgs, folder: &Path, rep
     let count = runs.panels.accepted as f64;
     let all = runs.all.accepted as f64;
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
-    report.title(&format!(
-        "{} runs without sweeps, two of them references: {all} impulse responses, {:.0} MB",
+    report.group("Simulated rig");
+    let name = format!("a surface of {} pairs, responses only, {cores} cores", runs.all.accepted / args.runs() as u64);
+    report.figure(name, simulated, "s").goal(FigureGoal::AtMost(1.0));
+    report.group("Ingest of runs without sweeps");
+    report.note(format!(
+        "{} runs, two of them references: {all} impulse responses, {:.0} MB. Those that are none: {} Parquet files, \
+         {:.0} MB. The parquet crate writes the same rows; its files have {:.2} of the size.",
         args.runs(),
-        runs.all.bytes as f64 / 1e6
-    ))?;
-    report.line(&format!(
-        "of those that are none: {} Parquet files, {:.0} MB",
+        runs.all.bytes as f64 / 1e6,
         of_panels.len(),
-        stored as f64 / 1e6
-    ))?;
-    report.figure(&format!("ingest, references there, {cores} cores"), count / panels.wall, "IRs a second")?;
-    report.figure(&format!("ingest with the references', {cores} cores"), all / whole.wall, "IRs a second")?;
-    report.figure(&format!("parquet crate alone, {cores} threads"), count / alone.wall, "IRs a second")?;
-    report.figure("ingest, references there, CPU a response", panels.cpu / count * 1e6, "us")?;
-    report.figure("ingest with the references', CPU a response", whole.cpu / all * 1e6, "us")?;
-    report.figure("parquet crate alone, CPU a response", alone.cpu / count * 1e6, "us")?;
-    report.figure("size of what it wrote / of the lake's files", written as f64 / stored as f64, "x")?;
-    report.goal("speed of ingest / of the parquet crate, by CPU time", 100.0 * alone.cpu / panels.cpu, "%", HALF)?;
-    report.figure("the same by wall time", 100.0 * alone.wall / panels.wall, "%")?;
-    report.goal("peak memory of the ingest", peak, "MiB", FigureGoal::AtMost(600.0))?;
-    lake_size::measure_lake_size(&last, &found, report)?;
-    layout::measure_layouts(args, &found, &rows, report)
+        stored as f64 / 1e6,
+        written as f64 / stored as f64
+    ));
+    let alone_by_wall = count / alone.wall;
+    let parquet = "parquet crate alone";
+    report
+        .figure(format!("references there, {cores} cores"), count / panels.wall, "IRs/s")
+        .beside(parquet, alone_by_wall);
+    report.figure(format!("the references among them, {cores} cores"), all / whole.wall, "IRs/s");
+    report
+        .figure("CPU a response, references there", panels.cpu / count * 1e6, "us")
+        .beside(parquet, alone.cpu / count * 1e6);
+    report.figure("CPU a response, the references among them", whole.cpu / all * 1e6, "us");
+    for (name, share) in [("CPU time", alone.cpu / panels.cpu), ("wall time", alone.wall / panels.wall)] {
+        let name = format!("speed of response-only ingest / of the parquet crate, by {name}");
+        report.figure(name, share, "x").goal(FigureGoal::AtLeast(0.75));
+    }
+    report.figure("peak memory, responses", peak, "MiB").goal(FigureGoal::AtMost(600.0));
+    Ok(())
 }
-
-const HALF: FigureGoal = FigureGoal::AtLeast(50.0);
 
 // Each file is encoded in memory, written, synced and renamed, and its folder synced, as the lake does it. Returns how
 // many bytes they are.
-fn write_all(rows: &[&FileRows], folder: &Path) -> Result<usize> {
+fn write_all(rows: &[FileRows], folder: &Path) -> Result<usize> {
     let next = AtomicUsize::new(0);
     let work = || -> Result<usize> {
         let mut bytes = 0;
@@ -99,9 +105,5 @@ fn write_all(rows: &[&FileRows], folder: &Path) -> Result<usize> {
             bytes += encoded.len();
         }
     };
-    let cores = std::thread::available_parallelism().map_or(1, usize::from);
-    std::thread::scope(|scope| {
-        let threads: Vec<_> = (0..cores).map(|_| scope.spawn(work)).collect();
-        threads.into_iter().map(|t| t.join().ok().context("a thread panicked").flatten()).sum()
-    })
+    Ok(super::super::run_on_cores(work)?.into_iter().sum())
 }

@@ -1,7 +1,6 @@
 //! Slices of a run from a server: bytes and times for parts of it, and for many readers at once.
 //!
 //! Bytes are those on the wire, the first byte is the first of the body.
-#![allow(clippy::print_stdout, reason = "its figures are what it is for")]
 
 use std::io::{Read as _, Write as _};
 use std::net::TcpStream;
@@ -12,6 +11,8 @@ use std::time::{Duration, Instant};
 use anyhow::{Result, anyhow, bail};
 
 use super::memory::resident_mib;
+use super::report::BenchReport;
+use crate::percentile::millis;
 
 /// Topics with the poses of microphone and speaker, and the frames.
 const POSES: &str = "&topics=/microphone/pose,/speaker/pose,/tf";
@@ -80,9 +81,9 @@ fn slice_path(run: &str, pairs: std::ops::Range<u64>, more: &str) -> String {
     format!("/api/v1/slices.mcap?run={run}&where=pair_id%20between%20{}%20and%20{}{more}", pairs.start, pairs.end - 1)
 }
 
-pub(crate) fn run_slices(args: &SlicesArgs) -> Result<()> {
+pub(crate) fn measure_slices(args: &SlicesArgs, report: &mut BenchReport) -> Result<()> {
     let args = Arc::new(args.clone());
-    let milliseconds = |time: Duration| time.as_secs_f64() * 1e3;
+    report.group("Slices of a served run");
     for (name, share, more) in [
         ("1 %", 100, ""),
         ("10 %", 10, ""),
@@ -95,13 +96,10 @@ pub(crate) fn run_slices(args: &SlicesArgs) -> Result<()> {
         tries.sort_by_key(|took| took.first);
         let median = &tries[2];
         let slowest = &tries[4];
-        println!(
-            "{name}: {} bytes, first after {:.1} ms (at most {:.1}), all after {:.1} ms",
-            median.bytes,
-            milliseconds(median.first),
-            milliseconds(slowest.first),
-            milliseconds(median.all)
-        );
+        report.figure(format!("{name}: size"), median.bytes as f64, "B");
+        report.figure(format!("{name}: first byte"), millis(median.first), "ms");
+        report.figure(format!("{name}: first byte, slowest of five"), millis(slowest.first), "ms");
+        report.figure(format!("{name}: last byte"), millis(median.all), "ms");
     }
     let before = args.pid.and_then(resident_mib).unwrap_or(0);
     let done = Arc::new(AtomicBool::new(false));
@@ -136,15 +134,14 @@ pub(crate) fn run_slices(args: &SlicesArgs) -> Result<()> {
     let heaviest = watch.join().map_err(|_| anyhow!("the watch panicked"))?;
     all.sort_by_key(|took| took.first);
     let bytes: u64 = all.iter().map(|took| took.bytes).sum();
-    println!(
-        "{} readers of 10 % each: {bytes} bytes in {:.1} s; first after {:.1} ms (median), {:.1} ms (last)",
-        args.readers,
-        took.as_secs_f64(),
-        milliseconds(all[all.len() / 2].first),
-        milliseconds(all[all.len() - 1].first)
-    );
+    report.group(format!("{} readers of slices of 10 % each", args.readers));
+    report.figure("bytes", bytes as f64, "B");
+    report.figure("all of them", took.as_secs_f64(), "s");
+    report.figure("first byte, median", millis(all[all.len() / 2].first), "ms");
+    report.figure("first byte, last reader", millis(all[all.len() - 1].first), "ms");
     if heaviest > 0 {
-        println!("the server's memory: {before} MiB before, at most {heaviest} MiB");
+        report.figure("the server's memory before", before as f64, "MiB");
+        report.figure("the server's memory, at most", heaviest as f64, "MiB");
     }
     Ok(())
 }

@@ -1,4 +1,4 @@
--- The twelve queries of `query-bench`, each below its name; $SURFACE and $PAIR are replaced by a surface of the lake and one
+-- The twelve queries of `bench queries`, each below its name; $SURFACE and $PAIR are replaced by a surface of the lake and one
 -- of its pairs. A name with `@peer` is the same for DuckDB, where it needs other words for the same rows.
 
 -- catalogue_page

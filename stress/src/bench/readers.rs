@@ -1,7 +1,6 @@
 //! Many readers of a served catalogue at once: errors, times, and the server's memory.
 //!
 //! Nothing of it comes out of a browser's cache; what the server keeps, it keeps.
-#![allow(clippy::print_stdout, reason = "its figures are what it is for")]
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -16,8 +15,9 @@ use serde_json::Value;
 
 use super::catalogue_client::CatalogueServer;
 use super::memory::resident_mib;
-use super::observed_server::percent_encoded;
-use super::percentile::{millis, percentile};
+use super::report::{BenchReport, FigureGoal};
+use crate::observed_server::percent_encoded;
+use crate::percentile::{millis, percentile};
 
 /// Kind of requests that a reader sends.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
@@ -33,25 +33,25 @@ pub(crate) enum QuestionKind {
 #[derive(Debug, Clone, clap::Args)]
 pub(crate) struct ReadersArgs {
     /// Address of the served catalogue, as 127.0.0.1:8080.
-    address: String,
+    pub address: String,
     /// Readers at once.
     #[arg(long, value_name = "N", default_value_t = 200)]
-    readers: u64,
+    pub readers: u64,
     /// Duration of reading, in seconds.
     #[arg(long, value_name = "SECS", default_value_t = 60)]
-    seconds: u64,
+    pub seconds: u64,
     /// Kind of requests that they send.
     #[arg(long = "ask", value_name = "KIND", value_enum, default_value_t = QuestionKind::All)]
-    kind: QuestionKind,
+    pub kind: QuestionKind,
     /// The server's certificate; without it, nothing is encrypted.
     #[arg(long, value_name = "FILE")]
-    certificate: Option<PathBuf>,
+    pub certificate: Option<PathBuf>,
     /// A token, if the server wants one.
     #[arg(long)]
-    token: Option<String>,
+    pub token: Option<String>,
     /// The server's process, whose memory is watched then.
     #[arg(long)]
-    pid: Option<u32>,
+    pub pid: Option<u32>,
 }
 
 /// Surfaces, facets, runs and pairs that requests name.
@@ -202,7 +202,7 @@ impl ReaderLoad {
     }
 }
 
-pub(crate) fn run_readers(args: &ReadersArgs) -> Result<()> {
+pub(crate) fn measure_readers(args: &ReadersArgs, report: &mut BenchReport) -> Result<()> {
     let mut server = CatalogueServer::new(&args.address);
     if let Some(token) = &args.token {
         server = server.with_token(token);
@@ -217,21 +217,27 @@ pub(crate) fn run_readers(args: &ReadersArgs) -> Result<()> {
     let load = ReaderLoad { server, contents, kind: args.kind, readers, time };
     let times = load.measure(|| heaviest = heaviest.max(args.pid.and_then(resident_mib).unwrap_or(0)))?;
     let all: Vec<_> = times.answers.values().flatten().copied().collect();
-    println!("{:?}: {} readers, {} s", args.kind, args.readers, args.seconds);
-    println!("  answers {}, {:.0} a second", all.len(), all.len() as f64 / args.seconds as f64);
-    println!("  errors {}", times.errors);
-    for (what, answers) in times.answers.iter().chain([(&"all", &all)]) {
-        let at = |share: f64| millis(percentile(answers, share));
-        println!(
-            "  {what:9} {:7} p50 {:.1} ms, p95 {:.1} ms, p99 {:.1} ms",
-            answers.len(),
-            at(0.5),
-            at(0.95),
-            at(0.99)
-        );
+    report.group(format!("{readers} readers of the catalogue"));
+    report.note(format!("For {} s, each asks again when it has its answer.", args.seconds));
+    let rate = report.figure(format!("answers to {readers} readers"), all.len() as f64 / args.seconds as f64, "/s");
+    // The goals are for this load.
+    let is_goal = readers == 200 && args.kind == QuestionKind::All;
+    if is_goal {
+        rate.goal(FigureGoal::AtLeast(1200.0));
+    }
+    report.figure("errors", times.errors as f64, "");
+    for share in [50, 95, 99] {
+        let time = millis(percentile(&all, f64::from(share) / 100.0));
+        let figure = report.figure(format!("answers to {readers} readers, p{share}"), time, "ms");
+        if is_goal && share == 95 {
+            figure.goal(FigureGoal::AtMost(300.0));
+        }
+    }
+    for (what, answers) in &times.answers {
+        report.figure(format!("{what}, {} answers, p95", answers.len()), millis(percentile(answers, 0.95)), "ms");
     }
     if heaviest > 0 {
-        println!("  the server's memory at most {heaviest} MiB");
+        report.figure("memory of the server's first process, at most", heaviest as f64, "MiB");
     }
     Ok(())
 }

@@ -1,0 +1,177 @@
+//! All benchmarks on one lake, which is made for them.
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::time::Instant;
+
+use anyhow::{Context as _, Result, ensure};
+use echolake_lake::Lake;
+
+use super::FULL_LAKE_RESPONSES;
+use super::ingest::{IngestBenchArgs, lake_size, responses, sweeps};
+use super::limits::measure_limits;
+use super::mcap::{McapBenchArgs, measure_mcap};
+use super::queries::{QueryBenchArgs, measure_queries};
+use super::readers::{QuestionKind, ReadersArgs, measure_readers};
+use super::report::{BenchReport, FigureGoal};
+use crate::serve::server::ServedLake;
+use crate::{block_on, echolake_path};
+
+#[derive(Debug, clap::Args)]
+pub(crate) struct WholeBenchArgs {
+    /// Smaller runs and fewer repeats: a few minutes.
+    #[arg(long)]
+    quick: bool,
+    /// Surfaces of the lake that is made; 350 by default, 6 with `--quick`.
+    #[arg(long, value_name = "N")]
+    surfaces: Option<u32>,
+    /// A lake whose run files are ingested again, instead of simulated ones. It is only read.
+    #[arg(long, value_name = "FOLDER")]
+    lake: Option<PathBuf>,
+    /// A Python that has duckdb, pyarrow, mcap, mcap-protobuf-support, NumPy and SciPy; without one, there are no peers.
+    #[arg(long, value_name = "PATH")]
+    python: Option<PathBuf>,
+    /// Folder of `pipeline.py`.
+    #[arg(long, value_name = "DIR", default_value = "../shared/reference")]
+    reference: PathBuf,
+    /// Generated queries.
+    #[arg(long, value_name = "N", default_value_t = 60)]
+    generated: usize,
+    /// Parent of the temporary folder; it should be on the disk that the lake would be on.
+    #[arg(long, value_name = "DIR")]
+    folder: Option<PathBuf>,
+    /// Seed of the simulated rig and of the generated queries.
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+}
+
+pub(crate) fn measure_whole(args: &WholeBenchArgs, report: &mut BenchReport) -> Result<()> {
+    let folder = super::temporary_folder(args.folder.as_deref())?;
+    // Its results are written, not its progress: a part that fails must not take the others' figures with it.
+    let parts: [(&str, PartMeasurement); 4] = [
+        ("ingest of a lake", measure_lake_ingest),
+        ("queries", measure_lake_queries),
+        ("readers", measure_lake_readers),
+        ("ingest", measure_ingest_cost),
+    ];
+    for (name, measure_part) in parts {
+        if let Err(why) = measure_part(args, folder.path(), report) {
+            report.fail(format!("{name}: {why:#}"));
+        }
+    }
+    Ok(())
+}
+
+type PartMeasurement = fn(&WholeBenchArgs, &Path, &mut BenchReport) -> Result<()>;
+
+// From run files to a lake that has answered a query.
+fn measure_lake_ingest(args: &WholeBenchArgs, folder: &Path, report: &mut BenchReport) -> Result<()> {
+    match &args.lake {
+        Some(lake) => link_runs(lake, &folder.join("lake"))?,
+        None => {
+            let surfaces = args.surfaces.unwrap_or(if args.quick { 6 } else { 350 }).to_string();
+            let seed = args.seed.to_string();
+            run_echolake(
+                folder,
+                &["demo", "--no-serve", "--no-ingest", "--ir-only", "--surfaces", &surfaces, "--seed", &seed],
+            )?;
+        }
+    }
+    let begun = Instant::now();
+    run_echolake(folder, &["ingest"])?;
+    let counted = run_echolake(folder, &["sql", "--format", "csv", "select count(*) from measurements"])?;
+    let seconds = begun.elapsed().as_secs_f64();
+    let responses: f64 = counted.lines().nth(1).context("no count")?.trim().parse()?;
+    report.group("From run files to a lake");
+    report.note(format!(
+        "`echolake ingest` of {responses} responses and a first query took {seconds:.1} s; scaled to {FULL_LAKE_RESPONSES}."
+    ));
+    let name = "a million responses from run files to a queryable lake";
+    report.figure(name, seconds * FULL_LAKE_RESPONSES as f64 / responses, "s").goal(FigureGoal::AtMost(35.0));
+    block_on(async {
+        let lake = Lake::open(&folder.join("lake").display().to_string()).await?;
+        let run =
+            lake.snapshot().await?.runs().next().map(|r| Lake::run_path(&r.surface, &r.run)).context("no runs")?;
+        measure_limits(folder.join("lake").join(run.as_ref()), report)?;
+        lake_size::measure_lake_size(&lake, report).await
+    })
+}
+
+fn measure_lake_queries(args: &WholeBenchArgs, folder: &Path, report: &mut BenchReport) -> Result<()> {
+    let queries = QueryBenchArgs {
+        lake: folder.join("lake").display().to_string(),
+        python: args.python.clone(),
+        generated: args.generated,
+        seed: args.seed,
+        runs: if args.quick { 3 } else { 5 },
+        threads: std::thread::available_parallelism().map_or(1, usize::from),
+        only: String::new(),
+        explain: false,
+    };
+    block_on(measure_queries(&queries, report))
+}
+
+fn measure_lake_readers(args: &WholeBenchArgs, folder: &Path, report: &mut BenchReport) -> Result<()> {
+    let served = ServedLake::start(&echolake_path()?, folder, &[]);
+    for readers in [10, 200] {
+        let load = ReadersArgs {
+            address: served.http.clone(),
+            readers,
+            seconds: if args.quick { 5 } else { 60 },
+            kind: QuestionKind::All,
+            certificate: None,
+            token: None,
+            pid: Some(served.id()),
+        };
+        measure_readers(&load, report)?;
+    }
+    Ok(())
+}
+
+fn measure_ingest_cost(args: &WholeBenchArgs, folder: &Path, report: &mut BenchReport) -> Result<()> {
+    let ingest = IngestBenchArgs {
+        quick: args.quick,
+        pairs: None,
+        runs: None,
+        repeats: None,
+        python: args.python.clone().unwrap_or_else(|| "python3".into()),
+        reference: args.reference.clone(),
+        folder: None,
+        seed: args.seed,
+    };
+    let folder = folder.join("ingest");
+    std::fs::create_dir(&folder)?;
+    block_on(async {
+        sweeps::measure_sweeps(&ingest, &folder, report).await?;
+        let lake = folder.join("lake").display().to_string();
+        measure_mcap(&McapBenchArgs { lake, pattern: "*".to_owned(), python: args.python.clone() }, report).await?;
+        responses::measure_responses(&ingest, &folder, report).await
+    })
+}
+
+// Runs `echolake` on the lake `lake` of a folder, and returns its output.
+fn run_echolake(folder: &Path, args: &[&str]) -> Result<String> {
+    let mut command = Command::new(echolake_path()?);
+    command.args(["--lake", "lake"]).args(args).current_dir(folder).env_remove("ECHOLAKE_LAKE");
+    let output = command.stderr(Stdio::inherit()).output()?;
+    ensure!(output.status.success(), "`echolake {}` failed", args.join(" "));
+    Ok(String::from_utf8(output.stdout)?)
+}
+
+// Makes a new lake whose inbox has the run files of another one.
+fn link_runs(from: &Path, lake: &Path) -> Result<()> {
+    let inbox = lake.join("inbox");
+    std::fs::create_dir_all(&inbox)?;
+    std::fs::copy(from.join("lake.toml"), lake.join("lake.toml"))?;
+    for surface in std::fs::read_dir(from.join("runs"))? {
+        for run in std::fs::read_dir(surface?.path())? {
+            let run = run?;
+            let target = inbox.join(run.file_name());
+            // Another file system has no links into this one.
+            if std::fs::hard_link(run.path(), &target).is_err() {
+                std::fs::copy(run.path(), &target)?;
+            }
+        }
+    }
+    Ok(())
+}
