@@ -120,11 +120,15 @@ pub(crate) fn builder_as(metadata: &ParquetMetaData, numbers: NumberEncoding) ->
     builder = builder.set_max_row_group_row_count(Some(group.num_rows().max(1) as usize));
     for column in group.columns() {
         let path = column.column_path().clone();
+        if column.compression() == Compression::UNCOMPRESSED {
+            builder = builder.set_column_compression(path.clone(), Compression::UNCOMPRESSED);
+        }
         let split = column.encodings().any(|e| e == Encoding::BYTE_STREAM_SPLIT);
-        if split && numbers != NumberEncoding::Dictionary {
-            let encoding = if numbers == NumberEncoding::Plain { Encoding::PLAIN } else { Encoding::BYTE_STREAM_SPLIT };
-            builder =
-                builder.set_column_encoding(path.clone(), encoding).set_column_dictionary_enabled(path.clone(), false);
+        if column.dictionary_page_offset().is_none() && numbers != NumberEncoding::Dictionary {
+            builder = builder.set_column_dictionary_enabled(path.clone(), false);
+        }
+        if split && numbers == NumberEncoding::AsStored {
+            builder = builder.set_column_encoding(path.clone(), Encoding::BYTE_STREAM_SPLIT);
         }
         if column.statistics().is_none() {
             builder = builder.set_column_statistics_enabled(path, EnabledStatistics::None);
