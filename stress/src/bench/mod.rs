@@ -9,6 +9,7 @@ mod meter;
 mod queries;
 mod readers;
 mod report;
+mod scale;
 mod slices;
 mod whole;
 
@@ -43,7 +44,9 @@ enum BenchCommand {
     Readers(readers::ReadersArgs),
     /// Measure slices of a served run, for one reader and for many.
     Slices(slices::SlicesArgs),
-    /// Make a lake, and measure all but slices on it.
+    /// Measure costs against the size of a lake.
+    Scale(scale::ScaleBenchArgs),
+    /// Make lakes, and measure all but slices on them.
     All(whole::WholeBenchArgs),
 }
 
@@ -55,6 +58,7 @@ pub(crate) fn run_bench(args: &BenchArgs) -> Result<()> {
         BenchCommand::Mcap(args) => block_on(mcap::measure_mcap(args, &mut report)),
         BenchCommand::Readers(args) => readers::measure_readers(args, &mut report),
         BenchCommand::Slices(args) => slices::measure_slices(args, &mut report),
+        BenchCommand::Scale(args) => block_on(scale::measure_scale(args, &mut report)),
         BenchCommand::All(args) => whole::measure_whole(args, &mut report),
     }?;
     report.finish(&args.output)

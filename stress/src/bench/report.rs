@@ -36,6 +36,8 @@ pub(crate) struct BenchReport {
 struct FigureGroup {
     title: String,
     notes: Vec<String>,
+    /// Name and SVG.
+    picture: Option<(&'static str, String)>,
     figures: Vec<BenchFigure>,
 }
 
@@ -123,7 +125,7 @@ impl BenchReport {
     pub fn group(&mut self, title: impl Into<String>) {
         let title = title.into();
         eprintln!("{title}");
-        self.groups.push(FigureGroup { title, notes: Vec::new(), figures: Vec::new() });
+        self.groups.push(FigureGroup { title, notes: Vec::new(), picture: None, figures: Vec::new() });
     }
 
     /// Adds a sentence to the group.
@@ -131,6 +133,11 @@ impl BenchReport {
         let text = text.into();
         eprintln!("  {text}");
         self.last_group().notes.push(text);
+    }
+
+    /// Adds a picture to the group, which is written beside the page.
+    pub fn picture(&mut self, name: &'static str, svg: String) {
+        self.last_group().picture = Some((name, svg));
     }
 
     /// Adds a figure to the group, and prints it to stderr, because the whole takes minutes.
@@ -172,6 +179,9 @@ impl BenchReport {
         }
         if let Some(file) = &output.document {
             std::fs::write(file, self.markdown(&machine)).with_context(|| format!("cannot write {file:?}"))?;
+            for (name, svg) in self.groups.iter().filter_map(|group| group.picture.as_ref()) {
+                std::fs::write(file.with_file_name(format!("{name}.svg")), svg)?;
+            }
         }
         ensure!(self.failures.is_empty(), "{}", self.failures.join("\n"));
         Ok(())
@@ -230,6 +240,9 @@ impl BenchReport {
             let _ = writeln!(text, "\n## {}\n", group.title);
             if !group.notes.is_empty() {
                 text += &(group.notes.join("\n") + "\n\n");
+            }
+            if let Some((name, _)) = group.picture {
+                let _ = writeln!(text, "![{}]({name}.svg)\n", group.title);
             }
             if group.figures.is_empty() {
                 continue;

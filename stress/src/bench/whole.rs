@@ -14,6 +14,7 @@ use super::mcap::{McapBenchArgs, measure_mcap};
 use super::queries::{QueryBenchArgs, measure_queries};
 use super::readers::{QuestionKind, ReadersArgs, measure_readers};
 use super::report::{BenchReport, FigureGoal};
+use super::scale::{ScaleBenchArgs, measure_scale};
 use crate::serve::server::ServedLake;
 use crate::{block_on, echolake_path};
 
@@ -47,12 +48,13 @@ pub(crate) struct WholeBenchArgs {
 
 pub(crate) fn measure_whole(args: &WholeBenchArgs, report: &mut BenchReport) -> Result<()> {
     let folder = super::temporary_folder(args.folder.as_deref())?;
-    // Its results are written, not its progress: a part that fails must not take the others' figures with it.
-    let parts: [(&str, PartMeasurement); 4] = [
+    // A part that fails must not take the others' figures with it.
+    let parts: [(&str, PartMeasurement); 5] = [
         ("ingest of a lake", measure_lake_ingest),
         ("queries", measure_lake_queries),
         ("readers", measure_lake_readers),
         ("ingest", measure_ingest_cost),
+        ("cost against size", measure_growth),
     ];
     for (name, measure_part) in parts {
         if let Err(why) = measure_part(args, folder.path(), report) {
@@ -147,6 +149,16 @@ fn measure_ingest_cost(args: &WholeBenchArgs, folder: &Path, report: &mut BenchR
         measure_mcap(&McapBenchArgs { lake, pattern: "*".to_owned(), python: args.python.clone() }, report).await?;
         responses::measure_responses(&ingest, &folder, report).await
     })
+}
+
+fn measure_growth(args: &WholeBenchArgs, folder: &Path, report: &mut BenchReport) -> Result<()> {
+    let scale = ScaleBenchArgs {
+        surfaces: if args.quick { vec![4, 8, 16] } else { vec![10, 35, 100, 350] },
+        pairs: if args.quick { 20 } else { 300 },
+        folder: Some(folder.to_owned()),
+        seed: args.seed,
+    };
+    block_on(measure_scale(&scale, report))
 }
 
 // Runs `echolake` on the lake `lake` of a folder, and returns its output.

@@ -151,7 +151,7 @@ impl RunCounts {
     }
 }
 
-fn put_into_inbox(files: &[PathBuf], lake: &Path) -> Result<()> {
+pub(crate) fn put_into_inbox(files: &[PathBuf], lake: &Path) -> Result<()> {
     let inbox = lake.join("inbox");
     std::fs::create_dir_all(&inbox)?;
     for file in files {

@@ -1,13 +1,11 @@
 //! Queries that a generator makes of the lake's own columns and values: filters, group-bys, joins, top-k, distinct,
 //! windows and scans. The same seed makes the same queries of the same lake. Both engines run the same text.
 
-use anyhow::{Context as _, Result};
-use arrow::array::{Array as _, AsArray as _};
-use arrow::compute::{cast, concat_batches};
-use arrow::datatypes::{DataType, Float64Type, Int64Type};
+use anyhow::{Result, ensure};
+use arrow::datatypes::DataType;
+use arrow::util::display::array_value_to_string;
 use echolake_query::Session;
 use echolake_schema::tables::Table;
-use rand::seq::IndexedRandom as _;
 use rand::{Rng as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 
@@ -39,19 +37,22 @@ struct SampledTable {
 #[derive(Clone)]
 struct SampledColumn {
     name: String,
-    values: SampledValues,
+    kind: ColumnKind,
+    /// As they are written in SQL, ascending, each once; between two of the rows' values if those are floats, so that no
+    /// rounding decides about a row.
+    values: Vec<String>,
     is_nullable: bool,
-    /// Almost every row has a value of its own.
-    is_unique: bool,
 }
 
-/// Sorted, each once.
-#[derive(Clone)]
-enum SampledValues {
-    Floats(Vec<f64>),
-    Integers(Vec<i64>),
-    Texts(Vec<String>),
-    Flags,
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum ColumnKind {
+    /// Floats.
+    Measure,
+    /// Exact values that many rows share.
+    Key,
+    /// Exact values; almost every row has its own.
+    Unique,
+    Flag,
 }
 
 type QueryTemplate = fn(&mut QueryGenerator) -> String;
@@ -97,8 +98,12 @@ impl QueryGenerator {
         kinds.map(query).collect()
     }
 
+    fn pick<T: Clone>(&mut self, options: &[T]) -> T {
+        options[self.random.random_range(0..options.len())].clone()
+    }
+
     fn pick_table(&mut self) -> SampledTable {
-        let table = PAIR_TABLES[self.random.random_range(0..PAIR_TABLES.len())];
+        let table = self.pick(&PAIR_TABLES);
         self.sampled_table(table)
     }
 
@@ -106,61 +111,38 @@ impl QueryGenerator {
         self.tables.iter().find(|t| t.table == table).unwrap_or(&self.tables[0]).clone()
     }
 
-    fn pick_column(&mut self, table: &SampledTable, is_wanted: fn(&SampledColumn) -> bool) -> SampledColumn {
-        let wanted: Vec<_> = table.columns.iter().filter(|column| is_wanted(column)).collect();
-        wanted.choose(&mut self.random).map_or_else(|| table.columns[0].clone(), |column| (*column).clone())
+    fn pick_column(&mut self, table: &SampledTable, kinds: &[ColumnKind]) -> SampledColumn {
+        let wanted: Vec<_> = table.columns.iter().filter(|column| kinds.contains(&column.kind)).collect();
+        self.pick(&wanted).clone()
     }
 
     fn pick_measure(&mut self, table: &SampledTable) -> String {
-        self.pick_column(table, SampledColumn::is_measure).name
+        self.pick_column(table, &[ColumnKind::Measure]).name
     }
 
     fn pick_aggregate(&mut self, table: &SampledTable, prefix: &str) -> String {
         let column = self.pick_measure(table);
-        let function = ["avg", "min", "max", "sum", "count"].choose(&mut self.random).unwrap_or(&"avg");
-        format!("{function}({prefix}{column})")
+        format!("{}({prefix}{column})", self.pick(&["avg", "min", "max", "sum", "count"]))
     }
 
-    // A condition on any column.
+    // A condition on any column: a range, or values if the column's are exact.
     fn pick_condition(&mut self, table: &SampledTable, prefix: &str) -> String {
-        let column = self.pick_column(table, |_| true);
-        let name = format!("{prefix}{}", column.name);
-        if column.is_nullable && self.random.random_ratio(1, 6) {
-            return format!("{name} {}", ["IS NULL", "IS NOT NULL"].choose(&mut self.random).unwrap_or(&"IS NULL"));
+        let SampledColumn { name, kind, values, is_nullable } = self.pick(&table.columns);
+        let name = format!("{prefix}{name}");
+        if is_nullable && self.random.random_ratio(1, 6) {
+            return format!("{name} {}", self.pick(&["IS NULL", "IS NOT NULL"]));
         }
-        match &column.values {
-            SampledValues::Flags => ["", "NOT "].choose(&mut self.random).unwrap_or(&"").to_string() + &name,
-            SampledValues::Floats(values) => {
-                // Between two values, so that no rounding of the text decides about a row.
-                let between: Vec<_> = values.windows(2).map(|pair| round_digits((pair[0] + pair[1]) / 2.0)).collect();
-                self.compare_column(
-                    &name,
-                    &if between.is_empty() { vec![round_digits(values[0])] } else { between },
-                    false,
-                )
-            }
-            SampledValues::Integers(values) => self.compare_column(&name, values, true),
-            SampledValues::Texts(values) => {
-                let quoted: Vec<_> = values.iter().map(|text| format!("'{}'", text.replace('\'', "''"))).collect();
-                self.compare_column(&name, &quoted, true)
-            }
-        }
-    }
-
-    // A range, or values if the column's are exact.
-    fn compare_column<T: ToString>(&mut self, name: &str, values: &[T], is_exact: bool) -> String {
-        let at = |place: usize| values[place].to_string();
         let first = self.random.random_range(0..values.len());
         let last = self.random.random_range(first..values.len());
-        match self.random.random_range(0..if is_exact { 6 } else { 3 }) {
-            0 => format!("{name} BETWEEN {} AND {}", at(first), at(last)),
-            1 => format!("{name} > {}", at(first)),
-            2 => format!("{name} <= {}", at(last)),
-            3 => format!("{name} = {}", at(first)),
-            4 => format!("{name} <> {}", at(first)),
+        match self.random.random_range(0..if kind == ColumnKind::Measure { 3 } else { 6 }) {
+            _ if kind == ColumnKind::Flag => self.pick(&["", "NOT "]).to_owned() + &name,
+            0 => format!("{name} BETWEEN {} AND {}", values[first], values[last]),
+            1 => format!("{name} > {}", values[first]),
+            2 => format!("{name} <= {}", values[last]),
+            3 => format!("{name} = {}", values[first]),
+            4 => format!("{name} <> {}", values[first]),
             _ => {
-                let count = self.random.random_range(2..=8);
-                let listed: Vec<_> = (0..count).map(|_| at(self.random.random_range(0..values.len()))).collect();
+                let listed: Vec<_> = (0..self.random.random_range(2..=8)).map(|_| self.pick(&values)).collect();
                 format!("{name} IN ({})", listed.join(", "))
             }
         }
@@ -177,7 +159,7 @@ impl QueryGenerator {
     fn filter_rows(&mut self, columns: usize) -> String {
         let table = self.pick_table();
         let conditions: Vec<_> = (0..columns).map(|_| self.pick_condition(&table, "")).collect();
-        let link = [" AND ", " AND ", " OR "].choose(&mut self.random).unwrap_or(&" AND ");
+        let link = self.pick(&[" AND ", " AND ", " OR "]);
         let aggregate = self.pick_aggregate(&table, "");
         format!("SELECT count(*) AS n, {aggregate} AS a FROM {} WHERE {}", table.name(), conditions.join(link))
     }
@@ -197,24 +179,23 @@ impl QueryGenerator {
 
     // One column or two by which rows are alike.
     fn pick_keys(&mut self, table: &SampledTable) -> String {
-        let first = self.pick_column(table, SampledColumn::is_key).name;
-        let second = self.pick_column(table, SampledColumn::is_key).name;
+        let first = self.pick_column(table, &[ColumnKind::Key, ColumnKind::Flag]).name;
+        let second = self.pick_column(table, &[ColumnKind::Key, ColumnKind::Flag]).name;
         if first == second || self.random.random_bool(0.5) { first } else { format!("{first}, {second}") }
     }
 
     fn join_pairs(&mut self) -> String {
         let table = self.pick_table();
         let pairs = self.pairs.clone();
-        let column = self.pick_column(&pairs, SampledColumn::is_measure);
-        let SampledValues::Floats(values) = &column.values else { return self.group_rows() };
-        let width = round_digits((values[values.len() - 1] - values[0]) / 12.0).max(1e-3);
+        let SampledColumn { name, values, .. } = self.pick_column(&pairs, &[ColumnKind::Measure]);
+        let range = parse_number(&values[values.len() - 1]) - parse_number(&values[0]);
+        let width = round_digits(range / 12.0).max(1e-3);
         let aggregate = self.pick_aggregate(&table, "t.");
         let filter =
             if self.random.random_bool(0.5) { self.pick_filter(&pairs, "p.") } else { self.pick_filter(&table, "t.") };
         format!(
-            "SELECT CAST(floor(p.{} / {width}) AS INT) AS bin, count(*) AS n, {aggregate} AS a FROM {} t JOIN pairs p ON \
+            "SELECT CAST(floor(p.{name} / {width}) AS INT) AS bin, count(*) AS n, {aggregate} AS a FROM {} t JOIN pairs p ON \
              p.pair_id = t.pair_id{filter} GROUP BY bin ORDER BY bin",
-            column.name,
             table.name()
         )
     }
@@ -222,7 +203,7 @@ impl QueryGenerator {
     fn join_surfaces(&mut self) -> String {
         let table = self.pick_table();
         let surfaces = self.surfaces.clone();
-        let key = self.pick_column(&surfaces, SampledColumn::is_key).name;
+        let key = self.pick_column(&surfaces, &[ColumnKind::Key]).name;
         let aggregate = self.pick_aggregate(&table, "t.");
         let filter = self.pick_filter(&table, "t.");
         format!(
@@ -236,7 +217,7 @@ impl QueryGenerator {
         let table = self.pick_table();
         let measure = self.pick_measure(&table);
         let other = self.pick_measure(&table);
-        let direction = ["DESC", "ASC"].choose(&mut self.random).unwrap_or(&"ASC");
+        let direction = self.pick(&["DESC", "ASC"]);
         let filter = self.pick_filter(&table, "");
         let key = table.row_key();
         let count = self.random.random_range(5..=200);
@@ -251,7 +232,7 @@ impl QueryGenerator {
         let table = self.pick_table();
         let filter = self.pick_filter(&table, "");
         if self.random.random_bool(0.5) {
-            let column = self.pick_column(&table, |_| true).name;
+            let column = self.pick(&table.columns).name;
             return format!("SELECT count(DISTINCT {column}) AS n FROM {}{filter}", table.name());
         }
         let keys = self.pick_keys(&table);
@@ -259,10 +240,10 @@ impl QueryGenerator {
     }
 
     fn rank_rows(&mut self) -> String {
-        let table = *[Table::Tnce, Table::Measurements].choose(&mut self.random).unwrap_or(&Table::Tnce);
+        let table = self.pick(&[Table::Tnce, Table::Measurements]);
         let table = self.sampled_table(table);
         let measure = self.pick_measure(&table);
-        let group = ["surface_id", "pair_id", "microphone", "speaker"].choose(&mut self.random).unwrap_or(&"pair_id");
+        let group = self.pick(&["surface_id", "pair_id", "microphone", "speaker"]);
         let key = table.row_key();
         let filter = self.pick_filter(&table, "");
         format!(
@@ -273,10 +254,10 @@ impl QueryGenerator {
     }
 
     fn compare_neighbours(&mut self) -> String {
-        let table = *[Table::Tnce, Table::Measurements].choose(&mut self.random).unwrap_or(&Table::Tnce);
+        let table = self.pick(&[Table::Tnce, Table::Measurements]);
         let table = self.sampled_table(table);
         let measure = self.pick_measure(&table);
-        let group = ["surface_id", "microphone", "speaker"].choose(&mut self.random).unwrap_or(&"surface_id");
+        let group = self.pick(&["surface_id", "microphone", "speaker"]);
         format!(
             "SELECT {group}, count(step) AS n, avg(step) AS mean, max(step) AS most FROM (SELECT {group}, abs({measure} - \
              lag({measure}) OVER (PARTITION BY surface_id ORDER BY run_id, pair_id)) AS step FROM {}) steps GROUP BY \
@@ -287,8 +268,7 @@ impl QueryGenerator {
 
     fn scan_symmetries(&mut self) -> String {
         let table = self.sampled_table(Table::TnceD4);
-        let keys =
-            ["symmetry, swapped", "symmetry", "swapped", "d4_pair_id"].choose(&mut self.random).unwrap_or(&"symmetry");
+        let keys = self.pick(&["symmetry, swapped", "symmetry", "swapped", "d4_pair_id"]);
         let aggregates: Vec<_> = (0..3).map(|_| self.pick_aggregate(&table, "")).collect();
         let filter = self.pick_filter(&table, "");
         format!(
@@ -300,50 +280,42 @@ impl QueryGenerator {
 
 impl SampledTable {
     async fn read(session: &Session, table: Table) -> Result<Self> {
-        let filter = match table {
-            Table::Surfaces => String::new(),
-            _ => format!("WHERE pair_id % (SELECT max(pair_id) / {SAMPLED_PAIRS} + 1 FROM pairs) = 0"),
-        };
-        let empty = session.query(&format!("SELECT * FROM {} LIMIT 0", table.name())).await?;
-        let is_scalar = |kind: &DataType| kind.is_numeric() || kind.is_string() || *kind == DataType::Boolean;
-        let names: Vec<_> =
-            empty.schema.fields().iter().filter(|f| is_scalar(f.data_type())).map(|f| f.name()).collect();
-        let listed: Vec<_> = names.iter().map(|name| name.as_str()).collect();
-        let batches =
-            collect_batches(session, &format!("SELECT {} FROM {} {filter}", listed.join(", "), table.name())).await?;
-        let first = batches.first().with_context(|| format!("table {} is empty", table.name()))?;
-        let rows = concat_batches(&first.schema(), &batches)?;
-        let mut columns = Vec::new();
-        for (field, column) in rows.schema().fields().iter().zip(rows.columns()) {
-            let values = match column.data_type() {
-                DataType::Boolean => SampledValues::Flags,
-                kind if kind.is_floating() => {
-                    let plain = cast(column, &DataType::Float64)?;
-                    let mut values: Vec<_> = plain.as_primitive::<Float64Type>().iter().flatten().collect();
-                    values.retain(|value| value.is_finite());
-                    values.sort_by(f64::total_cmp);
-                    values.dedup();
-                    SampledValues::Floats(values)
-                }
-                kind if kind.is_integer() => {
-                    let plain = cast(column, &DataType::Int64)?;
-                    SampledValues::Integers(sort_distinct(plain.as_primitive::<Int64Type>().iter().flatten().collect()))
-                }
-                _ => {
-                    let plain = cast(column, &DataType::Utf8)?;
-                    let texts = plain.as_string::<i32>().iter().flatten().map(str::to_owned);
-                    SampledValues::Texts(sort_distinct(texts.collect()))
-                }
-            };
-            let distinct = values.count();
-            if distinct > 0 {
-                columns.push(SampledColumn {
-                    name: field.name().clone(),
-                    is_nullable: field.is_nullable(),
-                    is_unique: distinct > 20 && distinct * 5 > rows.num_rows() * 4,
-                    values,
-                });
+        let name = table.name();
+        let sample = match table {
+            Table::Surfaces => name.to_owned(),
+            _ => {
+                let every = format!("(SELECT max(pair_id) / {SAMPLED_PAIRS} + 1 FROM pairs)");
+                format!("(SELECT * FROM {name} WHERE pair_id % {every} = 0)")
             }
+        };
+        let rows: usize = read_texts(session, &format!("SELECT count(*) FROM {sample} s")).await?.concat().parse()?;
+        let answer = session.query(&format!("SELECT * FROM {name} LIMIT 0")).await?;
+        let is_scalar = |kind: &DataType| kind.is_numeric() || kind.is_string() || *kind == DataType::Boolean;
+        let mut columns = Vec::new();
+        for field in answer.schema.fields().iter().filter(|field| is_scalar(field.data_type())) {
+            let column = field.name();
+            let sql = format!("SELECT DISTINCT {column} FROM {sample} s WHERE {column} IS NOT NULL ORDER BY {column}");
+            let mut values = read_texts(session, &sql).await?;
+            let is_unique = values.len() > 20 && values.len() * 5 > rows * 4;
+            let kind = match field.data_type() {
+                DataType::Boolean => ColumnKind::Flag,
+                kind if kind.is_floating() => ColumnKind::Measure,
+                _ if is_unique => ColumnKind::Unique,
+                _ => ColumnKind::Key,
+            };
+            if field.data_type().is_string() {
+                values = values.iter().map(|text| format!("'{}'", text.replace('\'', "''"))).collect();
+            }
+            if kind == ColumnKind::Measure && values.len() > 1 {
+                let middle = |pair: &[String]| (parse_number(&pair[0]) + parse_number(&pair[1])) / 2.0;
+                values = values.windows(2).map(|pair| round_digits(middle(pair)).to_string()).collect();
+            }
+            if !values.is_empty() {
+                columns.push(SampledColumn { name: column.clone(), kind, values, is_nullable: field.is_nullable() });
+            }
+        }
+        for kind in [ColumnKind::Measure, ColumnKind::Key] {
+            ensure!(columns.iter().any(|column| column.kind == kind), "table `{name}` has not enough rows");
         }
         Ok(Self { table, columns })
     }
@@ -362,34 +334,22 @@ impl SampledTable {
     }
 }
 
-impl SampledColumn {
-    fn is_measure(&self) -> bool {
-        matches!(self.values, SampledValues::Floats(_))
-    }
-
-    fn is_key(&self) -> bool {
-        !self.is_measure() && !self.is_unique
-    }
-}
-
-impl SampledValues {
-    fn count(&self) -> usize {
-        match self {
-            Self::Floats(values) => values.len(),
-            Self::Integers(values) => values.len(),
-            Self::Texts(values) => values.len(),
-            Self::Flags => 2,
+// The first column of an answer.
+async fn read_texts(session: &Session, sql: &str) -> Result<Vec<String>> {
+    let mut texts = Vec::new();
+    for batch in collect_batches(session, sql).await? {
+        for row in 0..batch.num_rows() {
+            texts.push(array_value_to_string(batch.column(0), row)?);
         }
     }
+    Ok(texts)
 }
 
-fn sort_distinct<T: Ord>(mut values: Vec<T>) -> Vec<T> {
-    values.sort_unstable();
-    values.dedup();
-    values
+fn parse_number(text: &str) -> f64 {
+    text.parse().unwrap_or(0.0)
 }
 
 // Seven digits that count, as people write numbers.
 fn round_digits(value: f64) -> f64 {
-    format!("{value:.6e}").parse().unwrap_or(value)
+    parse_number(&format!("{value:.6e}"))
 }

@@ -24,7 +24,9 @@ use super::report::{BenchReport, FigureGoal};
 use answer_rows::find_difference;
 use generated::QueryGenerator;
 use peer::DuckdbPeer;
-use twelve::{BenchQuery, TWELVE, bench_queries};
+use twelve::{BenchQuery, TWELVE};
+
+pub(crate) use twelve::bench_queries;
 
 /// Slow generated queries that are reported by themselves.
 const SHOWN_SLOW: usize = 8;
@@ -190,7 +192,7 @@ async fn compare_engines(
     Ok(QueryTimes { query, own: median(own), peer: (!other.is_empty()).then(|| median(other)), rows })
 }
 
-async fn collect_batches(session: &Session, sql: &str) -> Result<Vec<RecordBatch>> {
+pub(crate) async fn collect_batches(session: &Session, sql: &str) -> Result<Vec<RecordBatch>> {
     let mut answer = session.query(sql).await?;
     let mut batches = Vec::new();
     while let Some(batch) = answer.next().await? {
@@ -207,7 +209,7 @@ async fn explain_query(session: &Session, query: &BenchQuery) -> Result<()> {
     Ok(())
 }
 
-fn median(mut seconds: Vec<f64>) -> f64 {
+pub(crate) fn median(mut seconds: Vec<f64>) -> f64 {
     seconds.sort_by(f64::total_cmp);
     seconds.get(seconds.len() / 2).copied().unwrap_or(f64::NAN)
 }
@@ -226,7 +228,7 @@ async fn visible_files(lake: &Lake) -> Result<Vec<(String, Vec<String>)>> {
     Ok(tables)
 }
 
-async fn middle_surface(lake: &Lake) -> Result<String> {
+pub(crate) async fn middle_surface(lake: &Lake) -> Result<String> {
     let snapshot = lake.snapshot().await?;
     let runs: Vec<_> = snapshot.runs().collect();
     Ok(runs.get(runs.len() / 2).context("the lake has no runs")?.surface.to_string())
