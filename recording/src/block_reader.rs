@@ -22,7 +22,7 @@ const FROM_STORE: u64 = 4 << 20;
 const FROM_DISK: u64 = 16 << 10;
 
 /// One file, in a store or on this machine's disk.
-pub(crate) struct BlockReader {
+pub struct BlockReader {
     /// Where a store has it; None for a file that was opened here.
     #[cfg(feature = "store")]
     stored: Option<(Arc<dyn ObjectStore>, Path)>,

@@ -10,7 +10,7 @@ use mcap::McapError;
 use mcap::records::{ChunkHeader, MessageHeader, Record, op};
 use zstd::bulk::Decompressor;
 
-use crate::limits::LARGEST_CHUNK;
+use crate::limits::{LARGE_RECORD, LARGEST_CHUNK};
 use crate::record_frame::{FRAME_BYTES, RecordFrame};
 
 /// Channel, sequence and two times in front of a message's data.
@@ -82,13 +82,20 @@ impl DecodedChunk {
     /// # Errors
     /// [`ChunkError`]; nothing is allocated for a chunk that is too large.
     pub fn decode(body: &Bytes) -> Result<Self, ChunkError> {
+        Self::decode_into(body, Vec::new())
+    }
+
+    /// Decodes into the memory of an earlier chunk ([`RecordCursor::into_memory`]), which the system need not clear.
+    ///
+    /// # Errors
+    /// As [`Self::decode`].
+    pub fn decode_into(body: &Bytes, memory: Vec<u8>) -> Result<Self, ChunkError> {
         let (header, data) = chunk_parts(body)?;
         let size = header.uncompressed_size as usize;
         let records = match header.compression.as_str() {
             "" => body.slice_ref(data),
-            // Not copied, however much shorter than its claim it is.
-            "zstd" => Bytes::from_owner(decompress_zstd(data, size).map_err(ChunkError::Decompress)?),
-            "lz4" => Bytes::from_owner(decompress_lz4(data, size).map_err(ChunkError::Decompress)?),
+            "zstd" => decompress_zstd(data, size, memory).map_err(ChunkError::Decompress)?,
+            "lz4" => decompress_lz4(data, size, memory).map_err(ChunkError::Decompress)?,
             _ => return Err(ChunkError::Compression { name: header.compression }),
         };
         if records.len() != size {
@@ -184,6 +191,15 @@ impl RecordCursor {
     /// Reads the records that `records` hold, each with its frame.
     pub fn new(records: Bytes) -> Self {
         Self { records, position: 0 }
+    }
+
+    /// Returns the memory of the records for [`DecodedChunk::decode_into`]. It is empty if others share the records or
+    /// they are large.
+    pub fn into_memory(self) -> Vec<u8> {
+        let mut records = self.records.try_into_mut().unwrap_or_default();
+        records.clear();
+        let memory = Vec::from(records);
+        if memory.capacity() as u64 <= LARGE_RECORD { memory } else { Vec::new() }
     }
 
     /// Returns the next record; None behind the last one.
@@ -298,21 +314,23 @@ thread_local! {
 }
 
 // Memory that is allocated for a claim and not written to is never touched, so it costs nothing.
-fn decompress_zstd(data: &[u8], size: usize) -> io::Result<Vec<u8>> {
+fn decompress_zstd(data: &[u8], size: usize, mut records: Vec<u8>) -> io::Result<Bytes> {
+    records.reserve_exact(size);
     DECOMPRESSOR.with_borrow_mut(|kept| {
         let decompressor = match kept.take() {
             Some(decompressor) => decompressor,
             None => Decompressor::new()?,
         };
-        kept.insert(decompressor).decompress(data, size)
+        kept.insert(decompressor).decompress_to_buffer(data, &mut records)?;
+        Ok(records.into())
     })
 }
 
-fn decompress_lz4(data: &[u8], size: usize) -> io::Result<Vec<u8>> {
-    let mut records = Vec::with_capacity(size);
+fn decompress_lz4(data: &[u8], size: usize, mut records: Vec<u8>) -> io::Result<Bytes> {
+    records.reserve_exact(size);
     // One byte more than claimed tells that the claim is wrong.
     lz4::Decoder::new(data)?.take(size as u64 + 1).read_to_end(&mut records)?;
-    Ok(records)
+    Ok(records.into())
 }
 
 #[cfg(test)]

@@ -31,6 +31,7 @@ mod recording_reader;
 mod resync_reader;
 mod summary;
 
+pub use block_reader::BlockReader;
 pub use chunk::{
     ChunkError, ChunkIdentity, ChunkMessage, DecodedChunk, RecordCursor, RecordError, chunk_body, describe_mcap_error,
     parse_record, system_cause,

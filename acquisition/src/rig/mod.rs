@@ -2,7 +2,7 @@
 //! [`conformance`].
 //!
 //! One clock: take and reading carry the time of the same clock, and it never goes backwards. Every call blocks until
-//! it is done; no work continues in the background.
+//! it is done; no work that could be noticed continues in the background.
 
 pub mod conformance;
 pub mod devices;

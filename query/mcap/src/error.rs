@@ -1,7 +1,7 @@
 //! Why messages of an MCAP file cannot be given as rows.
 
 use datafusion::error::DataFusionError;
-use echolake_schema::escape_controls;
+use echolake_schema::{ErrorCause, escape_controls};
 use object_store::path::Path;
 
 use super::encodings::Malformed;
@@ -14,7 +14,7 @@ pub(super) enum Fault {
     Call { what: String, hint: String },
     /// The store does not give the file.
     #[error("cannot read `{file}`: {source}")]
-    Read { file: String, source: object_store::Error },
+    Read { file: String, source: ErrorCause },
     /// A record of the file is damaged.
     #[error("`{file}` is damaged at byte {offset}: {what}")]
     Damaged { file: String, offset: u64, what: String },

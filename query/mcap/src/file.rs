@@ -12,8 +12,8 @@ use bytes::Bytes;
 use echolake_lake::{Lake, LakeSnapshot};
 use echolake_lake_tables::SmallTables;
 use echolake_recording::{
-    ChannelDefinitions, DefinitionDigests, FRAME_BYTES, MAGIC, Record, RecordFrame, RecordSplitter, RunSummary,
-    SplitRecord, describe_mcap_error, find_part, opcode, parse_record, summary_range, tail_range,
+    BlockReader, ChannelDefinitions, DefinitionDigests, FRAME_BYTES, MAGIC, Record, RecordFrame, RecordSplitter,
+    RunSummary, SplitRecord, describe_mcap_error, find_part, opcode, parse_record, summary_range, tail_range,
 };
 use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt as _};
@@ -118,7 +118,7 @@ impl McapFiles {
             Some(bytes) => (bytes, 0),
             None => {
                 let meta = self.store.head(path).await;
-                let meta = meta.map_err(|source| Fault::Read { file: path.to_string(), source })?;
+                let meta = meta.map_err(|e| Fault::Read { file: path.to_string(), source: e.into() })?;
                 (meta.size, meta.last_modified.timestamp_micros())
             }
         };
@@ -130,11 +130,41 @@ impl McapFiles {
     /// Reads a range of a file.
     pub(super) async fn read_range(&self, path: &Path, range: Range<u64>) -> Result<Bytes, Fault> {
         let bytes = self.store.get_range(path, range.clone()).await;
-        let bytes = bytes.map_err(|source| Fault::Read { file: path.to_string(), source })?;
-        match bytes.len() as u64 == range.end - range.start {
-            true => Ok(bytes),
-            false => Err(Fault::damaged(path, range.start, "it became shorter while it was read")),
-        }
+        let bytes = bytes.map_err(|e| Fault::Read { file: path.to_string(), source: e.into() })?;
+        check_length(path, &range, bytes)
+    }
+
+    /// Returns true if the files are in a folder, where a read costs no request.
+    pub(super) fn are_in_folder(&self) -> bool {
+        self.sizes.is_none()
+    }
+
+    /// Opens a file in a folder.
+    pub(super) async fn open_disk(&self, path: &Path) -> DiskFile {
+        let blocks = BlockReader::open(self.store.clone(), path.clone()).await;
+        DiskFile { path: path.clone(), blocks }
+    }
+}
+
+/// A file on this machine's disk, whose ranges are read into the same memory, which the cache then holds.
+pub(super) struct DiskFile {
+    path: Path,
+    blocks: BlockReader,
+}
+
+impl DiskFile {
+    /// Reads a range, on this thread.
+    pub async fn read_range(&mut self, range: Range<u64>) -> Result<Bytes, Fault> {
+        let bytes = self.blocks.read_block(range.clone()).await;
+        let bytes = bytes.map_err(|source| Fault::Read { file: self.path.to_string(), source })?;
+        check_length(&self.path, &range, bytes)
+    }
+}
+
+fn check_length(path: &Path, range: &Range<u64>, bytes: Bytes) -> Result<Bytes, Fault> {
+    match bytes.len() as u64 == range.end - range.start {
+        true => Ok(bytes),
+        false => Err(Fault::damaged(path, range.start, "it became shorter while it was read")),
     }
 }
 

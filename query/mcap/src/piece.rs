@@ -40,6 +40,8 @@ impl Piece {
 pub(super) struct PieceRecords {
     /// The body of a chunk that is not decoded yet.
     chunk: Option<Bytes>,
+    /// Memory that the chunk is decoded into.
+    room: Vec<u8>,
     records: RecordCursor,
     /// Memory that reading may take, in bytes.
     pub memory: usize,
@@ -50,7 +52,9 @@ impl PieceRecords {
     pub fn new(bytes: Bytes, kind: PieceKind) -> Result<Self, String> {
         match kind {
             PieceKind::Chunk => Self::from_chunk(chunk_body(&bytes)?),
-            PieceKind::Loose => Ok(Self { chunk: None, memory: bytes.len(), records: RecordCursor::new(bytes) }),
+            PieceKind::Loose => {
+                Ok(Self { chunk: None, room: Vec::new(), memory: bytes.len(), records: RecordCursor::new(bytes) })
+            }
         }
     }
 
@@ -58,15 +62,27 @@ impl PieceRecords {
     pub fn from_chunk(body: Bytes) -> Result<Self, String> {
         let memory = DecodedChunk::memory_of(&body).map_err(|e| format!("its chunk is damaged: {e}"))?;
         let memory = usize::try_from(memory).map_err(|e| e.to_string())?;
-        Ok(Self { chunk: Some(body), records: RecordCursor::new(Bytes::new()), memory })
+        Ok(Self { chunk: Some(body), room: Vec::new(), records: RecordCursor::new(Bytes::new()), memory })
+    }
+
+    /// Decodes the chunk into the memory of an earlier one, [`Self::into_memory`].
+    pub fn with_memory(mut self, room: Vec<u8>) -> Self {
+        self.room = room;
+        self
     }
 
     /// Returns the next record; None behind the last one. The text of an error is the damage.
     pub fn next_record(&mut self) -> Result<Option<Record<'_>>, String> {
         if let Some(body) = self.chunk.take() {
-            let decoded = DecodedChunk::decode(&body).map_err(|e| format!("its chunk is damaged: {e}"))?;
+            let room = std::mem::take(&mut self.room);
+            let decoded = DecodedChunk::decode_into(&body, room).map_err(|e| format!("its chunk is damaged: {e}"))?;
             self.records = decoded.into_cursor();
         }
         self.records.next_record().map_err(|e| e.to_string())
+    }
+
+    /// Returns the memory of the records for another piece.
+    pub fn into_memory(self) -> Vec<u8> {
+        self.records.into_memory()
     }
 }

@@ -12,8 +12,9 @@ use echolake_recording::MessageHeader;
 use super::column::{Column, time_type};
 use super::encodings::{Malformed, MessageLayout, RowDecoder};
 
-/// Bytes that the rows of a batch take, roughly; a batch of whole sweeps has a few rows.
-const BATCH_BYTES: usize = 8 << 20;
+/// Bytes that the rows of a batch take, roughly. Batches of this size are allocated in the memory of earlier ones; for
+/// larger ones the allocator takes new pages, which the system clears.
+const BATCH_BYTES: usize = 512 << 10;
 
 /// A column that every message has, whatever its schema.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -25,16 +25,24 @@ use futures::stream::{self, BoxStream};
 use futures::{StreamExt as _, TryStreamExt as _};
 
 use super::error::Fault;
-use super::file::{McapFile, McapFiles, undescribed_channel};
+use super::file::{DiskFile, McapFile, McapFiles, undescribed_channel};
 use super::piece::{Piece, PieceRecords};
 use super::rows::{Head, Mapping, Message, Rows};
 
-/// Neighbouring pieces are fetched together up to this size.
-const READ: u64 = 4 << 20;
-/// What stands between two pieces is fetched with them where it is less: a request costs more.
-const GAP: u64 = 128 << 10;
-/// Reads under way while another one is decoded.
+/// Reads from a store, where each is a request.
+const STORE_READS: ReadSizes = ReadSizes { most: 4 << 20, gap: 128 << 10 };
+/// Reads from a disk, which fit a core's cache.
+const DISK_READS: ReadSizes = ReadSizes { most: 512 << 10, gap: 4 << 10 };
+/// Requests under way while what another one fetched is decoded.
 const AHEAD: usize = 2;
+
+/// How much is read at once.
+struct ReadSizes {
+    /// Neighbouring pieces are read together up to this many bytes.
+    most: u64,
+    /// What stands between two pieces is read with them if it has no more bytes.
+    gap: u64,
+}
 
 /// What all partitions of all scans of a table share.
 #[derive(Debug)]
@@ -106,6 +114,7 @@ impl McapExec {
     pub fn new(scan: Scan, pieces: Vec<(usize, Piece)>, all: usize, most: usize) -> Self {
         let count = pieces.len();
         let bytes: u64 = pieces.iter().map(|(_, p)| p.range.end - p.range.start).sum();
+        let sizes = if scan.parts.files.are_in_folder() { DISK_READS } else { STORE_READS };
         let share = bytes.div_ceil(most.max(1) as u64).max(1);
         let mut partitions: Vec<Vec<FileRead>> = vec![Vec::new()];
         let mut taken = 0;
@@ -116,7 +125,7 @@ impl McapExec {
             }
             taken += piece.range.end - piece.range.start;
             if let Some(reads) = partitions.last_mut() {
-                add_piece(reads, source, piece);
+                add_piece(reads, source, piece, &sizes);
             }
         }
         let properties = PlanProperties::new(
@@ -133,10 +142,10 @@ impl McapExec {
 }
 
 // To the last read, where the piece is near enough, or as another one.
-fn add_piece(reads: &mut Vec<FileRead>, source: usize, piece: Piece) {
+fn add_piece(reads: &mut Vec<FileRead>, source: usize, piece: Piece, sizes: &ReadSizes) {
     let near = |r: &&mut FileRead| {
         let gap = piece.range.start.checked_sub(r.range.end);
-        r.source == source && gap.is_some_and(|gap| gap <= GAP) && piece.range.end - r.range.start <= READ
+        r.source == source && gap.is_some_and(|gap| gap <= sizes.gap) && piece.range.end - r.range.start <= sizes.most
     };
     match reads.last_mut().filter(near) {
         Some(read) => {
@@ -206,9 +215,13 @@ impl ExecutionPlan for McapExec {
         let most = context.session_config().batch_size();
         let scanner = Scanner {
             scan: scan.clone(),
-            reads: fetch_reads(scan.parts.clone(), reads, count("bytes_read")),
+            reads: match scan.parts.files.are_in_folder() {
+                true => read_disk(scan.parts.clone(), reads, count("bytes_read")),
+                false => fetch_reads(scan.parts.clone(), reads, count("bytes_read")),
+            },
             fetched: None,
             current: None,
+            room: Vec::new(),
             rows: Rows::new(scan.schema.clone(), &scan.parts.heads, &scan.projection, most),
             left: scan.limit.unwrap_or(usize::MAX),
             memory: MemoryConsumer::new("McapExec").register(context.memory_pool()),
@@ -223,12 +236,29 @@ impl ExecutionPlan for McapExec {
     }
 }
 
+/// Bytes of files, each with the read that they answer.
+type ReadStream = BoxStream<'static, Result<(FileRead, Bytes), Fault>>;
+
+// Each one is read when the one before is decoded, into the same memory.
+fn read_disk(parts: Arc<Parts>, reads: Vec<FileRead>, bytes_read: Count) -> ReadStream {
+    let state = (parts, reads.into_iter(), bytes_read, None::<(usize, DiskFile)>);
+    let batches = stream::try_unfold(state, |(parts, mut reads, bytes_read, open)| async move {
+        let Some(read) = reads.next() else { return Ok(None) };
+        let path = &parts.sources[read.source].file.path;
+        let mut file = match open {
+            Some((source, file)) if source == read.source => file,
+            _ => parts.files.open_disk(path).await,
+        };
+        let bytes = file.read_range(read.range.clone()).await?;
+        bytes_read.add(bytes.len());
+        let open = Some((read.source, file));
+        Ok(Some(((read, bytes), (parts, reads, bytes_read, open))))
+    });
+    batches.boxed()
+}
+
 // The next ones are on their way while one is decoded.
-fn fetch_reads(
-    parts: Arc<Parts>,
-    reads: Vec<FileRead>,
-    bytes_read: Count,
-) -> BoxStream<'static, Result<(FileRead, Bytes), Fault>> {
+fn fetch_reads(parts: Arc<Parts>, reads: Vec<FileRead>, bytes_read: Count) -> ReadStream {
     let one = move |read: FileRead| {
         let parts = parts.clone();
         let bytes_read = bytes_read.clone();
@@ -244,9 +274,11 @@ fn fetch_reads(
 /// One partition on its way.
 struct Scanner {
     scan: Arc<Scan>,
-    reads: BoxStream<'static, Result<(FileRead, Bytes), Fault>>,
+    reads: ReadStream,
     fetched: Option<Fetched>,
     current: Option<Current>,
+    /// Memory of the chunk before.
+    room: Vec<u8>,
     rows: Rows,
     /// Rows until the limit.
     left: usize,
@@ -317,7 +349,9 @@ impl Scanner {
             let bytes =
                 fetched.bytes.slice((offset - fetched.start) as usize..(piece.range.end - fetched.start) as usize);
             let path = &self.scan.parts.sources[source].file.path;
+            let room = std::mem::take(&mut self.room);
             let records = PieceRecords::new(bytes, piece.kind).map_err(|what| Fault::damaged(path, offset, what))?;
+            let records = records.with_memory(room);
             self.memory.try_resize(records.memory)?;
             self.chunks.add(1);
             self.current = Some(Current { source, offset, records });
@@ -362,7 +396,7 @@ impl Scanner {
                 return Ok(());
             }
         }
-        self.current = None;
+        self.room = self.current.take().map(|current| current.records.into_memory()).unwrap_or_default();
         Ok(())
     }
 }

@@ -4,21 +4,26 @@
 //! millimetre; the panel reflects as [`KirchhoffPlan`] and its material say; the direct sound goes as 1/d; tweeter and
 //! microphone have responses and directions; both channels pass the converter; noise is added, and now and then
 //! something outside spoils a take. The same seed gives the same bits. [`SimulationParams`] switches effects off.
+//! While a take is judged and recorded, another thread computes the response at the next pair, which is used if its
+//! inputs are then exactly those that were forecast.
 
+mod room;
+
+use std::collections::HashMap;
 use std::f64::consts::{PI, TAU};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use echolake_dsp::RealSample as _;
-use echolake_dsp::air::{AirAbsorption, AirState};
+use echolake_dsp::air::AirState;
 use echolake_dsp::deconvolution::fast_length;
-use echolake_dsp::geometry::{incidence_deg, specular_point};
-use echolake_dsp::kirchhoff::{FacetScattering, KirchhoffPlan, KirchhoffScratch, SoundPath, TransducerPose};
+use echolake_dsp::geometry::specular_point;
+use echolake_dsp::kirchhoff::{FacetScattering, KirchhoffPlan, KirchhoffScratch, TransducerPose};
 use echolake_dsp::temperature::{ReferenceAir, speed_of_sound};
 use echolake_panel::material::{FoamLayer, SurfaceMaterial};
 use echolake_panel::relief::HeightField;
 use echolake_schema::manifest::Origin;
 use echolake_schema::simulation::SimulationParams;
-use echolake_schema::{Grid, Rig, Timestamp};
+use echolake_schema::{Grid, Pair, PairId, Rig, Timestamp};
 use rand::{Rng as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution as _, StandardNormal};
@@ -31,6 +36,7 @@ use crate::rig::{
     AmbientReading, AmbientSensor, ArmPositions, AudioInterface, AudioTake, DeviceFault, DrivePower, Error, RigDevices,
     RobotArms,
 };
+use room::{ResponseAhead, ResponseInputs, SimulatedRoom};
 
 /// Samples of a response beyond its farthest echo: the band limit rings.
 const RINGING: f64 = 32.0;
@@ -77,15 +83,21 @@ pub struct RigSimulation<'a> {
     pub arms: Option<Arc<Choreography>>,
 }
 
-/// State that the devices share.
+/// State that the devices share. Copies forecast it.
+#[derive(Clone)]
 struct SimulatedWorld {
-    grid: Grid,
+    grid: Arc<Grid>,
+    arms: Option<Arc<Choreography>>,
+    /// The pair after each, in the rig's visiting order.
+    followers: Arc<HashMap<PairId, Pair>>,
+    /// The pair at which the arms are, if the grid has it in these roles.
+    pair: Option<PairId>,
     now: Timestamp,
     start: Timestamp,
     power: DrivePower,
     effects: SimulationParams,
     /// Displacement of the microphone's and the speaker's arm at each point of the grid, mm.
-    calibration_mm: [Vec<[f64; 3]>; 2],
+    calibration_mm: Arc<[Vec<[f64; 3]>; 2]>,
     /// Poses of microphone and speaker.
     microphone: TransducerPose,
     speaker: TransducerPose,
@@ -98,6 +110,7 @@ struct SimulatedWorld {
 }
 
 /// The air's slow drift.
+#[derive(Clone)]
 struct Air {
     phase: f64,
     walk: f64,
@@ -118,10 +131,9 @@ pub fn simulated_rig(simulation: &RigSimulation<'_>) -> Result<RigDevices, Error
         reason: DeviceFault::with_cause(e.to_string(), e),
     };
     let grid = simulation.rig.build_grid().map_err(failed)?;
-    let mut rng = ChaCha8Rng::seed_from_u64(simulation.seed);
     let points: Vec<_> = grid.points().iter().map(|p| p.position_mm).collect();
     let rate_hz = simulation.rig.sweep.rate_hz.get();
-    let effects = simulation.rig.simulation.clone();
+    let effects = &simulation.rig.simulation;
     let mut plan = KirchhoffPlan::new(simulation.relief, rate_hz, response_len(simulation.relief, &points, rate_hz));
     if !effects.steep_facets {
         plan = plan.with_scattering(FacetScattering::FacingTangent);
@@ -142,33 +154,23 @@ pub fn simulated_rig(simulation: &RigSimulation<'_>) -> Result<RigDevices, Error
         true => material.reflection_at(hz, 0.0, foam),
         false => material.reflection_factor().into(),
     });
-    let foam = (is_foam && !is_silent && effects.material_spectra).then_some(foam);
-    let world = Arc::new(Mutex::new(SimulatedWorld {
-        calibration_mm: draw_calibration(points.len(), effects.calibration_mm),
-        effects,
-        grid,
-        now: simulation.start,
-        start: simulation.start,
-        power: DrivePower::Off,
-        microphone: TransducerPose { position_mm: points[0], axis: DOWN },
-        speaker: TransducerPose { position_mm: points[1], axis: DOWN },
-        air: Air { phase: rng.random_range(0.0..TAU), walk: 0.0 },
-        rng,
-        places: ChaCha8Rng::seed_from_u64(simulation.seed ^ PLACES_SEED),
-        outside_level_db: 42.0,
-    }));
+    let room = Arc::new(SimulatedRoom {
+        reference: ReferenceAir::from_response(&simulation.rig.impulse_response),
+        reflection: multiply_spectra(&direct, &reflection),
+        direct,
+        foam: (is_foam && !is_silent && effects.material_spectra).then_some(foam),
+        absorbs: effects.air_absorption,
+        plan,
+    });
+    let world = Arc::new(Mutex::new(SimulatedWorld::new(simulation, grid)));
     Ok(RigDevices {
-        robots: Box::new(SimulatedRobots { world: world.clone(), arms: simulation.arms.clone() }),
+        robots: Box::new(SimulatedRobots(world.clone())),
         audio: Box::new(SimulatedAudio {
             world: world.clone(),
             rate_hz,
-            reference: ReferenceAir::from_response(&simulation.rig.impulse_response),
-            reflection: multiply_spectra(&direct, &reflection),
-            direct,
-            foam,
-            scratch: plan.make_scratch(),
-            response: vec![0.0; plan.len()],
-            plan,
+            scratch: room.plan.make_scratch(),
+            ahead: ResponseAhead::start(room.clone()),
+            room,
             output: None,
         }),
         sensor: Box::new(SimulatedSensor(world)),
@@ -206,6 +208,33 @@ fn lock_world(world: &SharedWorld) -> MutexGuard<'_, SimulatedWorld> {
 }
 
 impl SimulatedWorld {
+    fn new(simulation: &RigSimulation<'_>, grid: Grid) -> Self {
+        let effects = simulation.rig.simulation.clone();
+        let mut rng = ChaCha8Rng::seed_from_u64(simulation.seed);
+        let mut pairs = grid.pairs().to_vec();
+        if let Some(arms) = &simulation.arms {
+            arms.sort_pairs(&mut pairs);
+        }
+        let points = grid.points();
+        Self {
+            calibration_mm: Arc::new(draw_calibration(points.len(), effects.calibration_mm)),
+            effects,
+            arms: simulation.arms.clone(),
+            followers: Arc::new(pairs.windows(2).map(|pair| (pair[0].id, pair[1])).collect()),
+            pair: None,
+            now: simulation.start,
+            start: simulation.start,
+            power: DrivePower::Off,
+            microphone: TransducerPose { position_mm: points[0].position_mm, axis: DOWN },
+            speaker: TransducerPose { position_mm: points[1].position_mm, axis: DOWN },
+            air: Air { phase: rng.random_range(0.0..TAU), walk: 0.0 },
+            rng,
+            places: ChaCha8Rng::seed_from_u64(simulation.seed ^ PLACES_SEED),
+            outside_level_db: 42.0,
+            grid: Arc::new(grid),
+        }
+    }
+
     fn temperature_c(&self) -> f64 {
         let drift = 0.8 * (TAU * self.elapsed_hours() / 7.0 + self.air.phase).sin() + self.air.walk;
         self.effects.temperature_c + if self.effects.noise_and_drift { drift } else { 0.0 }
@@ -237,47 +266,49 @@ impl SimulatedWorld {
     }
 }
 
-struct SimulatedRobots {
-    world: SharedWorld,
-    arms: Option<Arc<Choreography>>,
-}
+struct SimulatedRobots(SharedWorld);
 
 impl RobotArms for SimulatedRobots {
     fn move_to(&mut self, microphone_mm: [f64; 3], speaker_mm: [f64; 3]) -> Result<ArmPositions, Error> {
-        let mut world = lock_world(&self.world);
-        let refuse = |reason| Error::Unreachable { microphone_mm, speaker_mm, reason };
-        if world.power == DrivePower::Off {
-            return Err(refuse("the drives are off"));
-        }
-        let index = |mm| world.grid.point_at(mm).map(|p| p.id.index());
-        let stand = [index(microphone_mm), index(speaker_mm)];
-        let [Some(microphone), Some(speaker)] = stand else {
-            return Err(refuse("the simulated arms know the grid's points only"));
-        };
-        let [a, b] = [microphone, speaker].map(|index| world.grid.points()[index].id);
-        let Some(pair) = world.grid.pair_id(a, b).or_else(|| world.grid.pair_id(b, a)) else {
-            return Err(refuse("the arms would touch"));
-        };
-        // The model knows the roles that the grid gives.
-        let known = self.arms.as_ref().filter(|_| world.grid.pair_id(a, b).is_some());
-        let joints = known.and_then(|arms| arms.pose_at(pair).ok()).map(|stand| [stand.microphone, stand.speaker]);
-        let position_mm =
-            [world.displaced_position(Tool::Microphone, microphone), world.displaced_position(Tool::Speaker, speaker)];
-        let axes = self.transducer_axes(joints.as_ref(), microphone_mm, speaker_mm);
-        world.microphone = TransducerPose { position_mm: position_mm[0], axis: axes[0] };
-        world.speaker = TransducerPose { position_mm: position_mm[1], axis: axes[1] };
-        // The encoders' residual, which the controller knows of; of the displacement it does not.
-        let mut off = |mm: [f64; 3]| mm.map(|x| x + 0.01 * world.draw_normal().clamp(-2.0, 2.0));
-        Ok(ArmPositions { microphone_mm: off(microphone_mm), speaker_mm: off(speaker_mm), joints })
+        lock_world(&self.0).move_arms(microphone_mm, speaker_mm)
     }
 
     fn switch_drives(&mut self, power: DrivePower) -> Result<(), Error> {
-        lock_world(&self.world).power = power;
+        lock_world(&self.0).power = power;
         Ok(())
     }
 }
 
-impl SimulatedRobots {
+impl SimulatedWorld {
+    fn move_arms(&mut self, microphone_mm: [f64; 3], speaker_mm: [f64; 3]) -> Result<ArmPositions, Error> {
+        let refuse = |reason| Error::Unreachable { microphone_mm, speaker_mm, reason };
+        if self.power == DrivePower::Off {
+            return Err(refuse("the drives are off"));
+        }
+        let index = |mm| self.grid.point_at(mm).map(|p| p.id.index());
+        let stand = [index(microphone_mm), index(speaker_mm)];
+        let [Some(microphone), Some(speaker)] = stand else {
+            return Err(refuse("the simulated arms know the grid's points only"));
+        };
+        let [a, b] = [microphone, speaker].map(|index| self.grid.points()[index].id);
+        // The model knows the roles that the grid gives.
+        let known = self.grid.pair_id(a, b);
+        if known.or_else(|| self.grid.pair_id(b, a)).is_none() {
+            return Err(refuse("the arms would touch"));
+        }
+        let stand = self.arms.as_ref().zip(known).and_then(|(arms, pair)| arms.pose_at(pair).ok());
+        let joints = stand.map(|stand| [stand.microphone, stand.speaker]);
+        let position_mm =
+            [self.displaced_position(Tool::Microphone, microphone), self.displaced_position(Tool::Speaker, speaker)];
+        let axes = self.transducer_axes(joints.as_ref(), microphone_mm, speaker_mm);
+        self.pair = known;
+        self.microphone = TransducerPose { position_mm: position_mm[0], axis: axes[0] };
+        self.speaker = TransducerPose { position_mm: position_mm[1], axis: axes[1] };
+        // The encoders' residual, which the controller knows of; of the displacement it does not.
+        let mut off = |mm: [f64; 3]| mm.map(|x| x + 0.01 * self.draw_normal().clamp(-2.0, 2.0));
+        Ok(ArmPositions { microphone_mm: off(microphone_mm), speaker_mm: off(speaker_mm), joints })
+    }
+
     // Axes of microphone and speaker: as the arms hold them, or, without a model of the arms, the microphone straight
     // down and the speaker at the point that mirrors to it.
     fn transducer_axes(
@@ -302,31 +333,62 @@ struct SimulatedSensor(SharedWorld);
 
 impl AmbientSensor for SimulatedSensor {
     fn read_ambient(&mut self) -> Result<AmbientReading, Error> {
-        let mut world = lock_world(&self.0);
+        Ok(lock_world(&self.0).read_air())
+    }
+}
+
+impl SimulatedWorld {
+    fn read_air(&mut self) -> AmbientReading {
         // A resolution of 0.01 C, and as much noise.
-        let temperature_c = ((world.temperature_c() + 0.005 * world.draw_normal()) * 100.0).round() / 100.0;
-        Ok(AmbientReading {
-            at: world.now,
+        let temperature_c = ((self.temperature_c() + 0.005 * self.draw_normal()) * 100.0).round() / 100.0;
+        AmbientReading {
+            at: self.now,
             temperature_c,
-            humidity_pct: world.humidity_pct() + 0.1 * world.draw_normal(),
-            pressure_hpa: world.pressure_hpa() + 0.02 * world.draw_normal(),
-            outside_level_db: world.outside_level_db,
-        })
+            humidity_pct: self.humidity_pct() + 0.1 * self.draw_normal(),
+            pressure_hpa: self.pressure_hpa() + 0.02 * self.draw_normal(),
+            outside_level_db: self.outside_level_db,
+        }
+    }
+
+    // Whether something outside spoils the take.
+    fn begin_take(&mut self) -> bool {
+        self.now = self.now.plus_secs(TAKE_SECS);
+        self.air.walk += 0.002 * self.draw_normal();
+        let is_spoiled = self.effects.noise_and_drift && self.rng.random_bool(SPOILED);
+        let level = if is_spoiled { SPOILED_LEVEL_DB } else { 42.0 };
+        self.outside_level_db = level + 1.5 * self.draw_normal();
+        is_spoiled
+    }
+
+    fn response_inputs(&self) -> ResponseInputs {
+        let air = AirState {
+            temperature_c: self.temperature_c(),
+            humidity_pct: self.humidity_pct(),
+            pressure_hpa: self.pressure_hpa(),
+        };
+        ResponseInputs { microphone: self.microphone, speaker: self.speaker, air }
+    }
+
+    // The inputs of the next take, if this one is accepted: what the controller does until then, in its order.
+    fn forecast_inputs(mut self) -> Option<ResponseInputs> {
+        let next = *self.followers.get(&self.pair?)?;
+        let [microphone_mm, speaker_mm] =
+            [next.microphone, next.speaker].map(|id| self.grid.points()[id.index()].position_mm);
+        self.read_air();
+        self.power = DrivePower::On;
+        self.move_arms(microphone_mm, speaker_mm).ok()?;
+        self.begin_take();
+        Some(self.response_inputs())
     }
 }
 
 struct SimulatedAudio {
     world: SharedWorld,
     rate_hz: f64,
-    reference: ReferenceAir,
-    /// Spectra of the direct sound and of the reflection.
-    direct: Vec<Complex<f32>>,
-    reflection: Vec<Complex<f32>>,
-    /// Foam whose reflection depends on the angle at which a path's mirror image meets its plane.
-    foam: Option<FoamLayer>,
-    plan: KirchhoffPlan,
+    room: Arc<SimulatedRoom>,
     scratch: KirchhoffScratch,
-    response: Vec<f32>,
+    /// None if the system gave no thread.
+    ahead: Option<ResponseAhead>,
     /// Cache for the last output: a run plays one sweep.
     output: Option<Played>,
 }
@@ -350,46 +412,30 @@ impl AudioInterface for SimulatedAudio {
 
     fn play_and_record(&mut self, output: &[f32], take: &mut AudioTake) -> Result<(), Error> {
         let mut world = lock_world(&self.world);
-        world.now = world.now.plus_secs(TAKE_SECS);
-        world.air.walk += 0.002 * world.draw_normal();
-        let spoiled = world.effects.noise_and_drift && world.rng.random_bool(SPOILED);
-        let level = if spoiled { SPOILED_LEVEL_DB } else { 42.0 };
-        world.outside_level_db = level + 1.5 * world.draw_normal();
-        if let Some(foam) = self.foam {
-            let angle_deg = incidence_deg(world.microphone.position_mm, world.speaker.position_mm);
-            let material = self.plan.spectrum_at_bins(|hz| foam.reflection_at(hz, angle_deg));
-            self.reflection = multiply_spectra(&self.direct, &material);
-        }
-        let state = AirState {
-            temperature_c: world.temperature_c(),
-            humidity_pct: world.humidity_pct(),
-            pressure_hpa: world.pressure_hpa(),
-        };
-        let air = AirAbsorption::new(&state);
-        let absorbs = world.effects.air_absorption;
-        let path = SoundPath {
-            microphone: world.microphone,
-            speaker: world.speaker,
-            speed_of_sound_m_s: self.reference.speed_in(&state),
-            absorption_db_per_m: &|hz| if absorbs { air.db_per_m(hz) } else { 0.0 },
-            direct: &self.direct,
-            reflection: &self.reflection,
-        };
+        let is_spoiled = world.begin_take();
+        let inputs = world.response_inputs();
         let failed = |e: echolake_dsp::Error| Error::Device {
             device: "simulated room",
             reason: DeviceFault::with_cause(e.to_string(), e),
         };
-        self.plan.compute_response(&path, &mut self.scratch, &mut self.response).map_err(failed)?;
+        let response = match self.ahead.as_mut().and_then(|ahead| ahead.take_response(&inputs)) {
+            Some(response) => response,
+            None => self.room.compute_response(&inputs, &mut self.scratch).map_err(failed)?,
+        };
         let played = match &mut self.output {
             Some(played) if played.output == output => played,
-            other => other.insert(Played::new(output, self.rate_hz, self.response.len())),
+            other => other.insert(Played::new(output, self.rate_hz, response.len())),
         };
-        played.convolve_with(&self.response);
-        let room = if spoiled { SPOILED_NOISE } else { NOISE[0] };
+        played.convolve_with(&response);
+        let room = if is_spoiled { SPOILED_NOISE } else { NOISE[0] };
         let noise = if world.power == DrivePower::On { room.hypot(DRIVES) } else { room };
         take.started = Some(world.now);
         quantise_signal(&played.signal[..output.len()], MICROPHONE_GAIN, noise, &mut world, &mut take.microphone);
         quantise_signal(&played.loopback, 1.0, NOISE[1], &mut world, &mut take.loopback);
+        if let Some(ahead) = &mut self.ahead {
+            let world = world.clone();
+            ahead.begin_response(Box::new(move || world.forecast_inputs()));
+        }
         Ok(())
     }
 }
@@ -504,6 +550,27 @@ mod tests {
             let echo = 2.0 * 0.7438 / 331.3 * rate_hz;
             let len = response_len(&relief, &points, rate_hz) as f64;
             assert!(len > echo + 30.0 && len < 2.5 * echo, "{rate_hz}: {len}, {echo}");
+        }
+    }
+
+    #[test]
+    fn the_inputs_of_the_next_take_are_forecast_exactly() {
+        let (rig, relief) = (Rig::paper(), PanelRelief::Flat.height_field(40));
+        let start = Timestamp(1_767_600_000_000_000_000);
+        let material = SurfaceMaterial::CoatedPrint;
+        let simulation = RigSimulation { rig: &rig, relief: &relief, material, start, seed: 1, arms: None };
+        let grid = rig.build_grid().expect("a grid");
+        let mut world = SimulatedWorld::new(&simulation, rig.build_grid().expect("a grid"));
+        world.power = DrivePower::On;
+        let mut forecast = None;
+        for (turn, pair) in grid.pairs()[..3].iter().chain(&grid.pairs()[2..3]).enumerate() {
+            let [microphone, speaker] = [pair.microphone, pair.speaker].map(|id| grid.points()[id.index()].position_mm);
+            world.move_arms(microphone, speaker).expect("within reach");
+            world.begin_take();
+            // The third pair is measured again, which nobody expects.
+            assert_eq!(forecast == Some(world.response_inputs()), [1, 2].contains(&turn), "{turn}");
+            forecast = world.clone().forecast_inputs();
+            world.read_air();
         }
     }
 
