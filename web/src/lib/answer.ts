@@ -1,5 +1,5 @@
 //! The rows of a query, from an Arrow stream.
-import { tableFromIPC } from '@uwdata/flechette'
+import { tableFromIPC, type ListType } from '@uwdata/flechette'
 import { ApiError } from './api'
 import { plain } from './format'
 
@@ -8,6 +8,10 @@ export interface Answer {
     readonly name: string
     readonly type: string
     readonly numeric: boolean
+    /** Its unit, or '': what the lake's tables say of it, else what its name ends with. */
+    readonly unit: string
+    /** Whether its values are lists of numbers. */
+    readonly isCurve: boolean
     at(i: number): unknown
   }[]
   readonly rows: number
@@ -38,6 +42,7 @@ const NAMES: Record<number, string> = {
   24: 'text',
 }
 const TIMESTAMP = 10
+const LISTS = new Set([12, 16, 21])
 
 export async function readAnswer(response: Response, stop: () => void): Promise<Answer> {
   const parts: Uint8Array[] = []
@@ -77,10 +82,24 @@ export async function readAnswer(response: Response, stop: () => void): Promise<
         name: field.name,
         type: NAMES[typeId] ?? 'value',
         numeric: NUMERIC.has(typeId) || typeId === TIMESTAMP,
+        unit: unitOf(field.name, field.metadata?.get('unit')),
+        isCurve: LISTS.has(typeId) && NUMERIC.has((field.type as ListType).children[0].type.typeId as number),
         at: (row: number) => (typeId === TIMESTAMP ? when(column.at(row) as number | null) : column.at(row)),
       }
     }),
   }
+}
+
+/** Units that names of columns end with. */
+const UNITS: Record<string, string> = { db: 'dB', deg: '°', c: '°C', pct: '%', hpa: 'hPa', hz: 'Hz', bytes: 'B' }
+/** A column, or a function of it that keeps its unit. */
+const WITH_UNIT = /^(?:(?:min|max|avg|median|sum)\((?:\w+\.)*)?\w+_(db|mm|deg|c|pct|hpa|hz|s|ms|us|ns|ppm|bytes)\)?$/
+
+/** The unit of a column of an answer. What is computed has none of its own: the lake's names end with theirs. */
+function unitOf(name: string, given: string | undefined): string {
+  if (given !== undefined) return given === '1' ? '' : given === 'C' ? '°C' : given === 'deg' ? '°' : given
+  const ending = WITH_UNIT.exec(name)?.[1] ?? ''
+  return UNITS[ending] ?? ending
 }
 
 const when = (ms: number | null) => (ms === null ? null : new Date(ms))
