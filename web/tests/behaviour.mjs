@@ -619,6 +619,13 @@ await check('an answer is sorted and filtered by its header, bands by number, an
   await eventually(async () => assert.deepEqual(await column(1), expected))
   await asked('select pair_id, snr_db from measurements order by snr_db limit 7', '&sort=-snr_db')
   await page.getByText('Of the 7 rows that the query’s limit left.').waitFor()
+  // 48 MB are taken in; a value has 4 B.
+  await asked('select [1, 2, 3, 4, 5, 6, 7, 8, 9, 10] as list from generate_series(1, 2000000)')
+  await page.getByText(/Of the [\d\s]+ rows that the page takes in/).waitFor()
+  const first = Number(
+    /^The first ([\d\s]+) rows,/.exec(await page.locator('.status').innerText())[1].replace(/\s/g, ''),
+  )
+  assert.ok(first > 100_000 && first < 1_200_000, `${first} rows`)
 })
 
 await check('a list in a cell opens as a curve that can be heard, and draws no key', async () => {
