@@ -2,6 +2,7 @@
 import assert from 'node:assert/strict'
 import { contextOf, eventually, launch, LIMIT } from './browser.mjs'
 import './answers.mjs'
+import './sqlText.mjs'
 
 const [base, only = ''] = process.argv.slice(2)
 const get = async (path) => (await fetch(base + path)).json()
@@ -432,7 +433,7 @@ await check('the console shows rows of every table, integers of 64 bits to the l
   await page.locator('.rows tbody td').first().waitFor()
   assert.deepEqual(await page.locator('.rows tbody td').allInnerTexts(), [
     '1767718800000000001',
-    '9007199254740993',
+    '9\u202f007\u202f199\u202f254\u202f740\u202f993',
     '9007199254740993',
     'out of range',
     '{"n":-5}',
@@ -530,6 +531,197 @@ await check(
     assert.equal(await page.evaluate(() => localStorage.getItem('queries')), null)
   },
 )
+
+const asked = (query, more = '') => open(`/sql?q=${encodeURIComponent(query)}${more}`)
+/** The texts of a column of the answer, from 1. */
+const column = (number) => page.locator(`.rows tbody td:nth-child(${number})`).allInnerTexts()
+const typed = () => page.locator('.editor .cm-content').innerText()
+const ids = all.items.map((s) => s.surface_id)
+
+await check('the SQL page opens with an answer and its picture, and what was written stays', async () => {
+  await open('/sql')
+  await page.evaluate(() => localStorage.removeItem('tabs'))
+  await open('/sql')
+  await page.locator('.rows tbody tr').first().waitFor()
+  await page.locator('.chart .drawing svg rect').first().waitFor()
+  await page.locator('.editor .cm-content').click()
+  await page.keyboard.press('Control+End')
+  await page.keyboard.type('\n-- mine')
+  const mine = await typed()
+  assert.ok(mine.endsWith('-- mine'), mine)
+  // A table is shown beside it; a column's name comes to the cursor.
+  await page.locator('aside').getByRole('button', { name: 'points', exact: true }).click()
+  await page.waitForURL(/q=select\+\*\+from\+points/)
+  const tabs = page.getByRole('group', { name: 'Open queries' })
+  assert.equal(await tabs.locator('[aria-current=true]').innerText(), 'points')
+  await tabs.getByRole('button', { name: 'Query 1', exact: true }).click()
+  await eventually(async () => assert.equal(await typed(), mine))
+  await page.getByRole('button', { name: 'Columns of points', exact: true }).click()
+  await page.getByRole('button', { name: 'x_mm', exact: true }).click()
+  await eventually(async () => assert.equal(await typed(), `${mine} x_mm`))
+  await page.keyboard.press('Control+z')
+  assert.equal(await typed(), mine)
+  await page.getByRole('button', { name: 'Summarise x_mm' }).click()
+  const [{ low, high }] = await sql('select min(x_mm) as low, max(x_mm) as high from points')
+  const summary = page.locator('aside .summary')
+  await summary.waitFor()
+  assert.ok(
+    (await summary.innerText()).replaceAll('−', '-').startsWith(`${low} to ${high}; `),
+    await summary.innerText(),
+  )
+  assert.equal(await summary.locator('rect').count(), 12)
+  // It is there after another visit, and by the name that it is saved as.
+  await page.getByRole('button', { name: 'Save query' }).click()
+  await page.keyboard.type('by hand')
+  await page.keyboard.press('Enter')
+  await page.getByText('Saved as by hand').waitFor()
+  await open('/sql')
+  await tabs.getByRole('button', { name: 'by hand', exact: true }).click()
+  await eventually(async () => assert.equal(await typed(), mine))
+  await tabs.getByRole('button', { name: 'Close by hand' }).click()
+  await page.locator('aside').getByRole('button', { name: 'by hand', exact: true }).click()
+  await eventually(async () => assert.equal(await typed(), mine))
+  await page.getByRole('button', { name: 'Delete by hand' }).click()
+  assert.equal(await page.evaluate(() => localStorage.getItem('saved')), null)
+})
+
+await check('an answer is sorted and filtered by its header, bands by number, and a link shows the same', async () => {
+  const query = 'select surface_id, band, p90_mean_db from surface_stats'
+  await asked(query)
+  const head = (name) => page.getByRole('columnheader', { name })
+  assert.match(await head('p90_mean_db').innerText(), /dB re Flat total/)
+  await head('band').getByRole('button').click()
+  await page.waitForURL(/sort=band/)
+  assert.equal(await head('band').getAttribute('aria-sort'), 'ascending')
+  const byNumber = lake.bands.map((band) => band.key)
+  await eventually(async () => assert.deepEqual([...new Set(await column(2))], byNumber))
+  await head('p90_mean_db').getByRole('button').click()
+  await head('p90_mean_db').getByRole('button').click()
+  await page.waitForURL(/sort=-p90_mean_db/)
+  const highest = await sql(`${query} where p90_mean_db is not null order by p90_mean_db desc limit 5`)
+  await eventually(async () =>
+    assert.deepEqual(
+      (await column(1)).slice(0, 5),
+      highest.map((row) => row.surface_id),
+    ),
+  )
+  await page.getByRole('button', { name: 'Filter', exact: true }).click()
+  await page.getByLabel('Filter band').fill('total')
+  await page.getByLabel('Filter p90_mean_db').fill('< -0.1')
+  await page.keyboard.press('Enter')
+  const low = await sql(`${query} where band = 'total' and p90_mean_db < -0.1 order by p90_mean_db desc`)
+  const expected = low.map((row) => row.surface_id)
+  await eventually(async () => assert.deepEqual(await column(1), expected))
+  const told = `${low.length} of ${all.items.length * lake.bands.length} rows.`
+  await page.getByText(told).waitFor()
+  await page.waitForURL(/filter=.*filter=/)
+  await open(page.url().slice(base.length))
+  await eventually(async () => assert.deepEqual(await column(1), expected))
+  await asked('select pair_id, snr_db from measurements order by snr_db limit 7', '&sort=-snr_db')
+  await page.getByText('Of the 7 rows that the query’s limit left.').waitFor()
+  // 48 MB are taken in; a value has 4 B.
+  await asked('select [1, 2, 3, 4, 5, 6, 7, 8, 9, 10] as list from generate_series(1, 2000000)')
+  await page.getByText(/Of the [\d\s]+ rows that the page takes in/).waitFor()
+  const first = Number(
+    /^The first ([\d\s]+) rows,/.exec(await page.locator('.status').innerText())[1].replace(/\s/g, ''),
+  )
+  assert.ok(first > 100_000 && first < 1_200_000, `${first} rows`)
+})
+
+await check('a list in a cell opens as a curve that can be heard, and draws no key', async () => {
+  await asked('select surface_id, pair_id, ir from measurements order by surface_id, pair_id limit 3')
+  const pressed = page.getByRole('group', { name: 'Drawn as' }).locator('[aria-pressed=true]')
+  assert.equal(await pressed.innerText(), 'Curves')
+  const [first] = await sql('select surface_id, ir from measurements order by surface_id, pair_id limit 1')
+  assert.equal(await page.locator('.chart .legend .name').first().innerText(), `${first.surface_id} 0`)
+  await page
+    .getByRole('button', { name: `Curve of ${lake.ir_length} values` })
+    .first()
+    .focus()
+  await page.keyboard.press('Enter')
+  const dialog = page.getByRole('dialog')
+  const plot = dialog.getByRole('application')
+  await plot.focus()
+  await page.keyboard.press('ArrowRight')
+  await page.keyboard.press('ArrowRight')
+  const told = `${(1000 / lake.rate_hz).toFixed(3)} ms: ${first.surface_id} 0 ${first.ir[1].toFixed(4).replace('-', '−')}`
+  await eventually(async () => assert.equal(await dialog.locator('.hidden[aria-live]').innerText(), told))
+  await dialog.getByRole('button', { name: /^Listen/ }).click()
+  await dialog.getByText(/^Played at \d+ Hz/).waitFor()
+  await page.keyboard.press('Escape')
+  await dialog.waitFor({ state: 'detached' })
+})
+
+await check('statements run at the cursor or in turn, \\d among them, and a link has them all', async () => {
+  const text = "select 41 + 1 as answer;\n\\d points\nselect ';' as semicolon"
+  await asked(text)
+  const results = page.getByRole('group', { name: 'Results' }).getByRole('button')
+  await eventually(async () => assert.equal(await results.count(), 3))
+  await eventually(async () => assert.deepEqual(await column(1), [';']))
+  await results.nth(1).click()
+  const { columns } = (await get('/api/v1/tables')).find((table) => table.name === 'points')
+  await eventually(async () =>
+    assert.deepEqual(
+      await column(1),
+      columns.map((one) => one.name),
+    ),
+  )
+  assert.deepEqual(
+    await column(3),
+    columns.map((one) => one.unit ?? ''),
+  )
+  await page.locator('.editor .cm-content').click()
+  await page.keyboard.press('Control+Home')
+  await page.keyboard.press('Control+Enter')
+  await page.waitForURL(/statement=1/)
+  await eventually(async () => assert.deepEqual(await column(1), ['42']))
+  assert.equal(await results.count(), 0, 'one statement was run')
+  await open(page.url().slice(base.length))
+  await eventually(async () => assert.deepEqual(await column(1), ['42']))
+  assert.equal(await typed(), text)
+  await page.locator('.editor .cm-content').click()
+  await page.keyboard.press('Control+Shift+Enter')
+  await eventually(async () => assert.deepEqual(await column(1), [';']))
+  await context.grantPermissions(['clipboard-read', 'clipboard-write'])
+  await page.getByRole('button', { name: 'Copy link' }).click()
+  await page.getByText('Link copied').waitFor()
+  const link = new URL(await page.evaluate(() => navigator.clipboard.readText()))
+  assert.equal(link.searchParams.get('q'), text)
+  // What fails ends the turn; all tables are what SQL lists.
+  await asked('\\d;select nope;select 1')
+  await page.getByRole('alert').waitFor()
+  assert.equal(await results.count(), 2)
+  await results.first().click()
+  const listed = (await get('/api/v1/tables')).map((table) => table.name).sort()
+  await eventually(async () => assert.deepEqual((await column(1)).sort(), listed))
+  forget(/status of 400/)
+})
+
+await check('a chart has a series for each value of a column', async () => {
+  await asked('select surface_id, band, p90_mean_db from surface_stats order by band')
+  const series = page.getByLabel('series by')
+  assert.equal(await series.inputValue(), 'surface_id')
+  const bars = page.locator('.chart .drawing text')
+  const drawn = await bars.allTextContents()
+  assert.deepEqual(
+    drawn.filter((text) => ids.includes(text)),
+    [...ids].sort(),
+  )
+  const keys = lake.bands.map((band) => band.key)
+  assert.deepEqual(
+    drawn.filter((text) => keys.includes(text)),
+    keys,
+    'bands by number',
+  )
+  await series.selectOption('nothing')
+  await page.waitForURL(/series=none/)
+  await asked(
+    "select date_trunc('hour', log_time) as hour, surface_id, avg(temperature_c) as temperature_c from environment group by 1, 2",
+  )
+  const lines = page.locator('.chart .legend .name')
+  await eventually(async () => assert.deepEqual(await lines.allInnerTexts(), [...ids].sort()))
+  assert.equal(await page.getByLabel('series by').inputValue(), 'surface_id')
+})
 
 await check('operations show what SQL says, and a query that runs is cancelled by keyboard', async () => {
   const section = (title) => page.locator(`section[aria-label="${title}"]`)

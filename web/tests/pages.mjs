@@ -42,6 +42,9 @@ const PAGES = {
   help: '/',
   sql: `/sql?q=${encodeURIComponent(query)}`,
   tables: `/sql?q=${encodeURIComponent("select surface_id, p90_mean_db from surface_stats where band = 'total'")}&tables=points&summary=points`,
+  first: '/sql',
+  lists: `/sql?q=${encodeURIComponent('\\d;select surface_id, run_id, band, band_hz, spread_db, mean_nce from surface_stats')}&statement=2&filter=band:0&sort=-band`,
+  series: `/sql?q=${encodeURIComponent('select surface_id, band, p90_mean_db from surface_stats;select 1')}`,
   wrong: '/sql?q=select%20nope',
   operations: '/operations',
 }
@@ -89,7 +92,9 @@ for (const theme of ['light', 'dark']) {
       page.on('pageerror', (error) => said.push(`error: ${error.stack.split('\n').slice(0, 3).join(' ')}`))
       const at = `${name}-${theme}-${width}`
       await page.goto(base + path, { waitUntil: 'networkidle' })
-      await page.waitForTimeout(['surface', 'sql', 'tables', 'wrong'].includes(name) ? 900 : 250)
+      await page.waitForTimeout(
+        ['surface', 'sql', 'tables', 'first', 'lists', 'series', 'wrong'].includes(name) ? 900 : 250,
+      )
       if (name === 'help') await page.keyboard.press('?')
       const jumps = await page.evaluate(() => globalThis.jumps)
       const jumped = jumps.reduce((sum, [value]) => sum + value, 0)

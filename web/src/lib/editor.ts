@@ -11,7 +11,7 @@ import {
 import { defaultKeymap, history, historyKeymap } from '@codemirror/commands'
 import { PostgreSQL, sql, type SQLNamespace } from '@codemirror/lang-sql'
 import { bracketMatching, HighlightStyle, syntaxHighlighting } from '@codemirror/language'
-import { Compartment, EditorState, Prec } from '@codemirror/state'
+import { Compartment, EditorState, Prec, type Extension } from '@codemirror/state'
 import { EditorView, highlightActiveLine, keymap, lineNumbers } from '@codemirror/view'
 import { tags } from '@lezer/highlight'
 import type { Schemas } from './api'
@@ -19,8 +19,12 @@ import type { Schemas } from './api'
 type Table = Schemas['Table']
 
 export interface Editor {
-  text(): string
-  set(text: string): void
+  /** Shows one of several texts, with the cursor and the undoing of each. */
+  show(id: string, text: string): void
+  /** Puts a name where the cursor is. */
+  insert(name: string): void
+  /** Where the cursor is. */
+  position(): number
   complete(tables: readonly Table[], functions: readonly string[]): void
   focus(): void
   destroy(): void
@@ -97,13 +101,15 @@ function names(tables: readonly Table[]): SQLNamespace {
   )
 }
 
-export function editor(
-  host: HTMLElement,
-  text: string,
-  changed: (text: string) => void,
-  run: () => void,
-  stop: () => void,
-): Editor {
+/** What the keys in the editor do. */
+export interface EditorActions {
+  changed(text: string): void
+  run(): void
+  runAll(): void
+  stop(): void
+}
+
+export function editor(host: HTMLElement, actions: EditorActions): Editor {
   const root = host.shadowRoot ?? host.attachShadow({ mode: 'open' })
   root.replaceChildren()
   const parent = document.createElement('div')
@@ -111,11 +117,15 @@ export function editor(
   root.append(parent)
   const language = new Compartment()
   const functions = new Compartment()
-  const view = new EditorView({
-    root,
-    parent,
-    state: EditorState.create({
-      doc: text,
+  let [support, completion] = [sql({ dialect: PostgreSQL }) as Extension, [] as Extension]
+  const runs = (run: () => void) => (target: EditorView) => {
+    closeCompletion(target)
+    run()
+    return true
+  }
+  const stateOf = (doc: string) =>
+    EditorState.create({
+      doc,
       extensions: [
         lineNumbers(),
         history(),
@@ -127,17 +137,13 @@ export function editor(
         EditorView.lineWrapping,
         look,
         syntaxHighlighting(colours),
-        EditorView.contentAttributes.of({ 'aria-label': 'Query. Ctrl Enter runs it, Escape cancels it.' }),
+        EditorView.contentAttributes.of({
+          'aria-label':
+            'Query. Ctrl Enter runs the statement at the cursor, Ctrl Shift Enter all of them, Escape cancels.',
+        }),
         Prec.highest(
           keymap.of([
-            {
-              key: 'Mod-Enter',
-              run: (target) => {
-                closeCompletion(target)
-                run()
-                return true
-              },
-            },
+            { key: 'Mod-Enter', run: runs(actions.run), shift: runs(actions.runAll) },
             { key: 'Tab', run: acceptCompletion },
           ]),
         ),
@@ -146,43 +152,51 @@ export function editor(
           {
             key: 'Escape',
             run: () => {
-              stop()
+              actions.stop()
               return false
             },
           },
           ...defaultKeymap,
           ...historyKeymap,
         ]),
-        language.of(sql({ dialect: PostgreSQL })),
-        functions.of([]),
+        language.of(support),
+        functions.of(completion),
         EditorView.updateListener.of((update) => {
-          if (update.docChanged) changed(update.state.doc.toString())
+          if (update.docChanged) actions.changed(update.state.doc.toString())
         }),
       ],
-    }),
-  })
+    })
+  const view = new EditorView({ root, parent, state: stateOf('') })
+  const states = new Map<string, EditorState>()
+  let shown = ''
+  const reconfigure = () =>
+    view.dispatch({ effects: [language.reconfigure(support), functions.reconfigure(completion)] })
   return {
-    text: () => view.state.doc.toString(),
-    set(next) {
-      closeCompletion(view)
-      view.dispatch({ changes: { from: 0, to: view.state.doc.length, insert: next } })
+    show(id, text) {
+      if (shown) states.set(shown, view.state)
+      shown = id
+      const known = states.get(id)
+      view.setState(known?.doc.toString() === text ? known : stateOf(text))
+      reconfigure()
     },
+    insert(name) {
+      const { to } = view.state.selection.main
+      const isInWord = /[\w"]$/.test(view.state.sliceDoc(0, to))
+      const insert = isInWord ? ` ${name}` : name
+      view.dispatch({ changes: { from: to, insert }, selection: { anchor: to + insert.length }, userEvent: 'input' })
+      view.focus()
+    },
+    position: () => view.state.selection.main.head,
     complete(tables, called) {
-      const support = sql({ dialect: PostgreSQL, schema: names(tables), upperCaseKeywords: false })
+      support = sql({ dialect: PostgreSQL, schema: names(tables), upperCaseKeywords: false })
       const options = words(tables, called)
-      view.dispatch({
-        effects: [
-          language.reconfigure(support),
-          functions.reconfigure(
-            PostgreSQL.language.data.of({
-              autocomplete: (context: CompletionContext) => {
-                const word = context.matchBefore(/\w+/)
-                return word ? { from: word.from, options } : null
-              },
-            }),
-          ),
-        ],
+      completion = PostgreSQL.language.data.of({
+        autocomplete: (context: CompletionContext) => {
+          const word = context.matchBefore(/\w+/)
+          return word ? { from: word.from, options } : null
+        },
       })
+      reconfigure()
     },
     focus: () => view.focus(),
     destroy: () => view.destroy(),

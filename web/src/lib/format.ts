@@ -25,6 +25,13 @@ export const plain = (value: number | bigint, digits = 7) =>
 /** A whole number in groups of three digits. `toLocaleString` loads the browser's tables of languages first. */
 export const count = (value: number) => String(Math.round(value)).replace(/\B(?=(\d{3})+$)/g, '\u202f')
 
+/** A number's text with its thousands apart, from five digits before the point. */
+export const grouped = (text: string) =>
+  text.replace(
+    /^(\D?)(\d{5,})/,
+    (_, sign: string, digits: string) => sign + digits.replace(/\B(?=(\d{3})+$)/g, '\u202f'),
+  )
+
 /** A number of things with their name: `1 surface`, `6 surfaces`. */
 export const counted = (value: number, name: string) => `${count(value)} ${name}${value === 1 ? '' : 's'}`
 

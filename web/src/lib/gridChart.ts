@@ -3,6 +3,7 @@ import { cellText, type Answer } from './answer'
 import { css, inkOn, viridis } from './colour'
 import { plain } from './format'
 import type { TableData } from './plot'
+import { compareNames } from './series'
 import { escape, label, picture, shortened as shortenedTo } from './svg'
 
 /** More names than that across or up are no picture. */
@@ -31,7 +32,7 @@ function namesOf(column: Column, rows: number) {
     if (found.size > MOST_NAMES) return undefined
   }
   const isNumber = column.numeric
-  const names = [...found].sort(([a, x], [b, y]) => (isNumber ? Number(x) - Number(y) : a < b ? -1 : 1))
+  const names = [...found].sort(([a, x], [b, y]) => (isNumber ? Number(x) - Number(y) : compareNames(a, b)))
   const index = new Map(names.map(([name], i) => [name, i]))
   return { names: names.map(([name]) => name), at: (i: number) => index.get(cellText(column.at(i))) ?? 0 }
 }

@@ -26,5 +26,6 @@ export function histogramBars(label: string, values: readonly (number | null)[])
 
 const counted = (label: string, ranges: readonly string[], counts: readonly number[]): BarSpec => ({
   names: { label, values: ranges },
-  bars: { label: 'rows', values: counts },
+  value: 'rows',
+  series: [{ label: 'rows', values: counts }],
 })

@@ -9,7 +9,8 @@ export interface Axis {
 }
 export interface Line {
   readonly label: string
-  readonly values: readonly (number | null)[]
+  /** null leaves a gap; a line goes on over what is undefined. */
+  readonly values: readonly (number | null | undefined)[]
   /** Name of a colour token. */
   readonly colour: string
   readonly width?: number
@@ -43,7 +44,7 @@ export const isSeries = (values: readonly (number | null)[]) =>
 export function tableOf(spec: PlotSpec): TableData {
   return {
     columns: [axisTitle(spec.x), ...spec.lines.map((line) => axisTitle({ label: line.label, unit: spec.y.unit }))],
-    rows: spec.x.values.map((x, i) => [x, ...spec.lines.map((line) => line.parts?.[i] ?? line.values[i])]),
+    rows: spec.x.values.map((x, i) => [x, ...spec.lines.map((line) => line.parts?.[i] ?? line.values[i] ?? null)]),
   }
 }
 
@@ -52,7 +53,7 @@ export function yRange(spec: PlotSpec): [number, number] {
   let [low, high] = [Infinity, -Infinity]
   for (const line of spec.lines) {
     for (const value of line.values) {
-      if (value === null || !Number.isFinite(value)) continue
+      if (value === null || value === undefined || !Number.isFinite(value)) continue
       if (value < low) low = value
       if (value > high) high = value
     }

@@ -29,14 +29,14 @@ export const EXAMPLES: readonly ExampleQuery[] = [
       `select p.incidence_deg, 10 * log10(t.tnce_band_${lake.bands[Math.min(2, lake.bands.length - 2)].key}) as against_flat_db\nfrom tnce t join pairs p using (pair_id)\nwhere t.surface_id = (select min(surface_id) from surfaces where typology <> 'reference')\norder by p.incidence_deg`,
   },
   {
-    title: 'Signal to noise of each response',
-    query: () =>
-      'select surface_id, pair_id, snr_db, clipped_samples, arrival_error_us\nfrom measurements\norder by snr_db\nlimit 100',
-  },
-  {
     title: 'One impulse response',
     query: () =>
       'select surface_id, pair_id, temperature_c, snr_db, ir\nfrom measurements\nwhere surface_id = (select max(surface_id) from measurements) and pair_id = 0',
+  },
+  {
+    title: 'Signal to noise of each response',
+    query: () =>
+      'select surface_id, pair_id, snr_db, clipped_samples, arrival_error_us\nfrom measurements\norder by snr_db\nlimit 100',
   },
   {
     title: 'Signal to noise by attempt',

@@ -106,12 +106,17 @@ export async function loadSummary(table: string, columns: readonly Column[]): Pr
   return summariesOf((await (await sql(query, 'application/json')).json()) as SummaryRow[], columns)
 }
 
-/** Asks how many rows the tables have. */
-export async function loadRowCounts(tables: readonly string[]): Promise<Map<string, number>> {
-  // Those of the schema `system` are not counted: the log of a large lake takes long to read.
-  const counted = tables.filter((name) => !name.includes('.'))
-  if (counted.length === 0) return new Map()
-  const query = counted.map((name) => `select ${literal(name)} as name, count(*) as rows from ${identifier(name)}`)
+/** Asks how many rows the stored tables have. A view may be computed, and the log of a large lake takes long to read. */
+export async function loadRowCounts(): Promise<Map<string, number>> {
+  const stored = "select table_name from information_schema.tables where table_type = 'BASE TABLE'"
+  const tables = (await (await sql(stored, 'application/json')).json()) as { table_name: string }[]
+  return countRows(tables.map((table) => table.table_name))
+}
+
+/** Counts the rows of tables by one query. */
+export async function countRows(tables: readonly string[]): Promise<Map<string, number>> {
+  if (tables.length === 0) return new Map()
+  const query = tables.map((name) => `select ${literal(name)} as name, count(*) as rows from ${tableName(name)}`)
   const rows = (await (await sql(query.join(' union all '), 'application/json')).json()) as {
     name: string
     rows: number
