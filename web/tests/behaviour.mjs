@@ -303,6 +303,89 @@ await check('every heading says that the lake is simulated', async () => {
   }
 })
 
+await check('a run is replayed: cursor, keys, warnings, play, address, few requests', async () => {
+  const runs = (await get('/api/v1/runs?limit=500')).items
+  const { run_id: run } = runs.reduce((most, one) => (one.attempts > most.attempts ? one : most))
+  const measured = await sql(
+    `select pair_id, attempt, temperature_c, (log_time_ns - (select started_ns from runs where run_id = '${run}')) / 1e9 as time_s from measurements where run_id = '${run}' order by log_time_ns`,
+  )
+  const warning = (await get(`/api/v1/runs/${run}`)).events.find((event) => event.level === 'warning')
+  const asked = []
+  const listen = (request) => {
+    if (request.url().endsWith('/api/v1/sql')) asked.push(request.postData())
+  }
+  page.on('request', listen)
+  await open(`/runs/${run}`)
+  const replay = page.locator('section[aria-label="Replay"]')
+  const cursor = replay.getByRole('slider')
+  const isAt = (i) =>
+    eventually(async () => {
+      const text = await cursor.getAttribute('aria-valuetext')
+      assert.ok(text.endsWith(`pair ${measured[i].pair_id}, attempt ${measured[i].attempt}`), text)
+      const facts = await replay.locator('.facts').innerText()
+      assert.ok(facts.includes(`${measured[i].temperature_c.toFixed(2)} °C`), facts)
+      assert.equal(await replay.locator('.legend .name').innerText(), `Pair ${measured[i].pair_id}`)
+    })
+  await isAt(0)
+  await cursor.focus()
+  for (const [key, i] of [
+    ['ArrowRight', 1],
+    ['PageUp', 51],
+    ['ArrowLeft', 50],
+    ['End', measured.length - 1],
+    ['Home', 0],
+  ]) {
+    await page.keyboard.press(key)
+    await isAt(i)
+  }
+  const box = await cursor.boundingBox()
+  await page.mouse.click(box.x + box.width - 30, box.y + 20)
+  await page.waitForURL(/[?&]at=\d/)
+  const text = await cursor.getAttribute('aria-valuetext')
+  await open(page.url().slice(base.length))
+  await eventually(async () => assert.equal(await cursor.getAttribute('aria-valuetext'), text))
+  await cursor.focus()
+  await page.keyboard.press('Home')
+  await replay.getByRole('button', { name: 'Next repeat or break' }).click()
+  await eventually(async () => assert.ok((await replay.innerText()).includes(warning.message), warning.message))
+  await replay.getByLabel('Speed').selectOption('100')
+  await page.waitForURL(/speed=100/)
+  const before = Number(await cursor.getAttribute('aria-valuenow'))
+  await cursor.focus()
+  await page.keyboard.press(' ')
+  await eventually(async () => assert.ok(Number(await cursor.getAttribute('aria-valuenow')) > before + 30))
+  await page.keyboard.press(' ')
+  await replay.getByRole('button', { name: 'Play' }).waitFor()
+  page.off('request', listen)
+  assert.ok(asked.length < 24, `${asked.length} requests`)
+  assert.equal(await page.getByRole('link', { name: 'Open in Lichtblick' }).count(), 0)
+  await page.getByLabel('Lichtblick').fill('http://localhost:8090/')
+  await page.getByLabel('Lichtblick').press('Enter')
+  const opens = await page.getByRole('link', { name: 'Open in Lichtblick' }).getAttribute('href')
+  assert.ok(opens.startsWith('http://localhost:8090/?ds=remote-file&ds.url=http'), opens)
+  await page.getByLabel('Lichtblick').fill('')
+  await page.getByLabel('Lichtblick').press('Enter')
+})
+
+await check('surface, pair and selection have their slices in MCAP and SOFA', async () => {
+  const flat = all.items.find((s) => s.surface_id === id).flat_reference
+  for (const [path, most] of [
+    [`/surfaces/${id}?microphone=14&point=40`, 6],
+    [`/surfaces/${id}/pairs/159`, 2],
+    [`/compare?s=${id},${flat}`, 3],
+  ]) {
+    await open(path)
+    const links = page.locator('a[href*="/slices."]')
+    await eventually(async () => assert.equal(await links.count(), most))
+    for (const href of await links.evaluateAll((found) => found.map((link) => link.getAttribute('href')))) {
+      const answer = await fetch(base + href)
+      const start = Buffer.from((await answer.body.getReader().read()).value.slice(0, 8)).toString('latin1')
+      assert.equal(answer.status, 200, href)
+      assert.ok(start.startsWith(href.includes('.mcap') ? '\x89MCAP0' : '\x89HDF'), href)
+    }
+  }
+})
+
 await check('a WAV, a picture and numbers can be saved', async () => {
   await open(`/surfaces/${id}/pairs/159`)
   const [wav] = await Promise.all([

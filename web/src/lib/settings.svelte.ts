@@ -12,6 +12,14 @@ function stored<T extends string>(name: string, allowed: readonly T[], fallback:
   }
 }
 
+function storedText(name: string): string {
+  try {
+    return localStorage.getItem(name) ?? ''
+  } catch {
+    return ''
+  }
+}
+
 function store(name: string, value: string): void {
   try {
     localStorage.setItem(name, value)
@@ -23,6 +31,7 @@ function store(name: string, value: string): void {
 const dark = matchMedia('(prefers-color-scheme: dark)')
 let theme = $state<Theme>(stored('theme', ['system', 'light', 'dark'], 'system'))
 let palette = $state<Palette>(stored('palette', ['paper', 'safe'], 'paper'))
+let lichtblick = $state(storedText('lichtblick'))
 let systemDark = $state(dark.matches)
 const isDark = () => theme === 'dark' || (theme === 'system' && systemDark)
 function showTheme(): void {
@@ -51,6 +60,14 @@ export const settings = {
     palette = value
     store('palette', value)
     document.documentElement.dataset.palette = value
+  },
+  /** Where the reader's Lichtblick answers; empty if there is none. */
+  get lichtblick() {
+    return lichtblick
+  },
+  set lichtblick(value: string) {
+    lichtblick = value
+    store('lichtblick', value)
   },
   get isDark() {
     return isDark()
