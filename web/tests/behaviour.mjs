@@ -43,9 +43,15 @@ async function check(name, what) {
 }
 
 /** The paper's scale, written out once more so that the pages' own cannot agree with itself. */
-function expected(db) {
+function onPaper(db) {
   if (db >= 0) return [Math.round((255 * Math.min(6, db)) / 6), 0, 0]
   return Array(3).fill(Math.round((255 * Math.min(20, -db)) / 20))
+}
+
+/** The scale that fits: grey at 0 dB, to blue and orange at its ends. */
+function fitted(db, reach) {
+  const share = Math.min(1, Math.abs(db) / reach)
+  return (db < 0 ? [33, 102, 172] : [217, 95, 2]).map((end) => Math.round(236 * (1 - share) + end * share))
 }
 
 await check('the grid plot’s cells have the colours that SQL says', async () => {
@@ -67,31 +73,69 @@ await check('the grid plot’s cells have the colours that SQL says', async () =
         ]),
       ),
     )
-  await eventually(async () => {
-    const colours = await drawn()
-    for (const row of rows)
-      lake.bands.forEach((band, b) => {
-        const what = `point ${row.point}, band ${band.key}, ${row[band.key]} dB`
-        assert.deepEqual(colours[`${b}/${row.point}`], expected(row[band.key]), what)
-      })
-    assert.ok(Object.keys(colours).length > 300, `${Object.keys(colours).length} cells`)
-  })
+  const levels = rows.flatMap((row) => lake.bands.map((band) => Math.abs(row[band.key]))).sort((a, b) => a - b)
+  const hold = (colourOf) =>
+    eventually(async () => {
+      const colours = await drawn()
+      for (const row of rows)
+        lake.bands.forEach((band, b) => {
+          const what = `point ${row.point}, band ${band.key}, ${row[band.key]} dB`
+          colours[`${b}/${row.point}`].forEach((part, i) =>
+            assert.ok(Math.abs(part - colourOf(row[band.key])[i]) <= 1, `${what}: ${colours[`${b}/${row.point}`]}`),
+          )
+        })
+      assert.ok(Object.keys(colours).length > 300, `${Object.keys(colours).length} cells`)
+    })
+  const meaning = await page.locator('svg.scale').getAttribute('aria-label')
+  const reach = Number(/blue −(\d+) dB and below, grey 0 dB, equal to Flat, orange/.exec(meaning)[1])
+  const most = levels[Math.ceil(0.98 * levels.length) - 1]
+  assert.ok(reach >= most && (reach <= 2 * most || reach === 1), `${meaning}; levels to ±${most} dB`)
+  await hold((db) => fitted(db, reach))
+  await page.getByRole('button', { name: 'Show in the paper’s colours' }).click()
+  await hold(onPaper)
+  await page.getByRole('button', { name: 'Centre colours on 0 dB' }).click()
+  await hold((db) => fitted(db, reach))
 })
 
-await check('grid plots of Flat are black, and Compare shows the same as Surface', async () => {
+await check('grid plots of Flat are grey, and Compare shows the same as Surface', async () => {
   const flat = all.items.find((s) => s.surface_id === id).flat_reference
   const fills = () =>
     page.evaluate(() => [...document.querySelectorAll('.cells [data-point]')].map((c) => getComputedStyle(c).fill))
   await open(`/surfaces/${flat}`)
   await eventually(async () => {
-    const black = (await fills()).filter((fill) => /^rgb\([0-2], [0-2], [0-2]\)$/.test(fill)).length
-    assert.ok(black > 300, `${black} black cells`)
+    const grey = (await fills()).filter((fill) => fill === 'rgb(236, 236, 236)').length
+    assert.ok(grey > 300, `${grey} grey cells`)
   })
   await open(`/compare?s=${id}`)
   await eventually(async () => assert.ok((await fills()).length > 50))
   const compared = await fills()
   await open(`/surfaces/${id}`)
   await eventually(async () => assert.deepEqual((await fills()).slice(-compared.length), compared))
+})
+
+await check('the wall names planes, and says what ranges leave out', async () => {
+  await open('/')
+  const flat = all.items.find((s) => s.surface_id === s.flat_reference)
+  const tile = page.locator('.sheet li', { has: page.locator(`[data-id="${flat.surface_id}"]`) })
+  await eventually(async () => assert.match(await tile.innerText(), new RegExp(`Flat: ${flat.material}`)))
+  const pictures = await page.locator('.sheet .plane').allInnerTexts()
+  assert.equal(new Set(pictures).size, pictures.length, pictures.join('; '))
+  const levelled = all.histograms.find((one) => one.name === 'level:total').bins.reduce((n, bin) => n + bin.count, 0)
+  assert.match(await page.locator('.left-out').innerText(), new RegExp(`count ${levelled} of ${all.total} surfaces`))
+  await open('/?level=total:-20..20')
+  await page.locator('.left-out', { hasText: 'leaves out references' }).waitFor()
+})
+
+await check('a table that is wider than the screen fades at its edges', async () => {
+  await page.setViewportSize({ width: 390, height: 844 })
+  await open(`/surfaces/${id}`)
+  const table = page.locator('section[aria-label="Levels of the pairs"] .scroll')
+  const faded = () => table.evaluate((node) => [node.matches('[data-more-left]'), node.matches('[data-more-right]')])
+  await eventually(async () => assert.deepEqual(await faded(), [false, true]))
+  await table.evaluate((node) => node.scrollTo(10000, 0))
+  await eventually(async () => assert.deepEqual(await faded(), [true, false]))
+  await page.setViewportSize({ width: 1280, height: 900 })
+  await eventually(async () => assert.deepEqual(await faded(), [false, false]))
 })
 
 await check('a facet click changes the address and the counts, and a fresh link shows the same', async () => {
@@ -346,7 +390,7 @@ await check('a run is replayed: cursor, keys, warnings, play, address, few reque
   await eventually(async () => assert.equal(await cursor.getAttribute('aria-valuetext'), text))
   await cursor.focus()
   await page.keyboard.press('Home')
-  await replay.getByRole('button', { name: 'Next repeat or break' }).click()
+  await replay.getByRole('button', { name: 'Next warning or break' }).click()
   await eventually(async () => assert.ok((await replay.innerText()).includes(warning.message), warning.message))
   await replay.getByLabel('Speed').selectOption('100')
   await page.waitForURL(/speed=100/)
@@ -427,7 +471,7 @@ await check('figures that the server draws are saved in three formats, what the 
       const [file] = await Promise.all([
         page.waitForEvent('download'),
         menu(title)
-          .getByRole('link', { name: `Picture, ${format}` })
+          .getByRole('link', { name: new RegExp(`^Picture.*, ${format}$`) })
           .click(),
       ])
       assert.ok(file.suggestedFilename().endsWith(`.${format.toLowerCase()}`), file.suggestedFilename())
@@ -435,6 +479,7 @@ await check('figures that the server draws are saved in three formats, what the 
     }
   }
   for (const [path, title] of [
+    [`/surfaces/${id}?microphone=14`, 'TNCE over the grid'],
     [`/surfaces/${id}?microphone=14`, 'Relief'],
     [`/surfaces/${id}/pairs/159`, 'Spectrogram'],
     [`/sql?q=${encodeURIComponent('select surface_id, count(*) as n from tnce group by 1')}&as=bars`, 'Chart'],
@@ -445,7 +490,9 @@ await check('figures that the server draws are saved in three formats, what the 
     await menu(title).locator('summary').click()
     const [file] = await Promise.all([
       page.waitForEvent('download'),
-      menu(title).getByRole('button', { name: 'Picture, PNG' }).click(),
+      menu(title)
+        .getByRole('button', { name: /^Picture.*, PNG$/ })
+        .click(),
     ])
     const picture = await bytesOf(file)
     assert.ok(picture.subarray(1, 4).toString() === 'PNG' && picture.length > 2000, `${title}: ${picture.length} bytes`)
