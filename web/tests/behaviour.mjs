@@ -44,9 +44,15 @@ async function check(name, what) {
 }
 
 /** The paper's scale, written out once more so that the pages' own cannot agree with itself. */
-function expected(db) {
+function onPaper(db) {
   if (db >= 0) return [Math.round((255 * Math.min(6, db)) / 6), 0, 0]
   return Array(3).fill(Math.round((255 * Math.min(20, -db)) / 20))
+}
+
+/** The scale that fits: grey at 0 dB, to blue and orange at its ends. */
+function fitted(db, reach) {
+  const share = Math.min(1, Math.abs(db) / reach)
+  return (db < 0 ? [33, 102, 172] : [217, 95, 2]).map((end) => Math.round(236 * (1 - share) + end * share))
 }
 
 await check('the grid plot’s cells have the colours that SQL says', async () => {
@@ -68,31 +74,69 @@ await check('the grid plot’s cells have the colours that SQL says', async () =
         ]),
       ),
     )
-  await eventually(async () => {
-    const colours = await drawn()
-    for (const row of rows)
-      lake.bands.forEach((band, b) => {
-        const what = `point ${row.point}, band ${band.key}, ${row[band.key]} dB`
-        assert.deepEqual(colours[`${b}/${row.point}`], expected(row[band.key]), what)
-      })
-    assert.ok(Object.keys(colours).length > 300, `${Object.keys(colours).length} cells`)
-  })
+  const levels = rows.flatMap((row) => lake.bands.map((band) => Math.abs(row[band.key]))).sort((a, b) => a - b)
+  const hold = (colourOf) =>
+    eventually(async () => {
+      const colours = await drawn()
+      for (const row of rows)
+        lake.bands.forEach((band, b) => {
+          const what = `point ${row.point}, band ${band.key}, ${row[band.key]} dB`
+          colours[`${b}/${row.point}`].forEach((part, i) =>
+            assert.ok(Math.abs(part - colourOf(row[band.key])[i]) <= 1, `${what}: ${colours[`${b}/${row.point}`]}`),
+          )
+        })
+      assert.ok(Object.keys(colours).length > 300, `${Object.keys(colours).length} cells`)
+    })
+  const meaning = await page.locator('svg.scale').getAttribute('aria-label')
+  const reach = Number(/blue −(\d+) dB and below, grey 0 dB, equal to Flat, orange/.exec(meaning)[1])
+  const most = levels[Math.ceil(0.98 * levels.length) - 1]
+  assert.ok(reach >= most && (reach <= 2 * most || reach === 1), `${meaning}; levels to ±${most} dB`)
+  await hold((db) => fitted(db, reach))
+  await page.getByRole('button', { name: 'Show in the paper’s colours' }).click()
+  await hold(onPaper)
+  await page.getByRole('button', { name: 'Centre colours on 0 dB' }).click()
+  await hold((db) => fitted(db, reach))
 })
 
-await check('grid plots of Flat are black, and Compare shows the same as Surface', async () => {
+await check('grid plots of Flat are grey, and Compare shows the same as Surface', async () => {
   const flat = all.items.find((s) => s.surface_id === id).flat_reference
   const fills = () =>
     page.evaluate(() => [...document.querySelectorAll('.cells [data-point]')].map((c) => getComputedStyle(c).fill))
   await open(`/surfaces/${flat}`)
   await eventually(async () => {
-    const black = (await fills()).filter((fill) => /^rgb\([0-2], [0-2], [0-2]\)$/.test(fill)).length
-    assert.ok(black > 300, `${black} black cells`)
+    const grey = (await fills()).filter((fill) => fill === 'rgb(236, 236, 236)').length
+    assert.ok(grey > 300, `${grey} grey cells`)
   })
   await open(`/compare?s=${id}`)
   await eventually(async () => assert.ok((await fills()).length > 50))
   const compared = await fills()
   await open(`/surfaces/${id}`)
   await eventually(async () => assert.deepEqual((await fills()).slice(-compared.length), compared))
+})
+
+await check('the wall names planes, and says what ranges leave out', async () => {
+  await open('/')
+  const flat = all.items.find((s) => s.surface_id === s.flat_reference)
+  const tile = page.locator('.sheet li', { has: page.locator(`[data-id="${flat.surface_id}"]`) })
+  await eventually(async () => assert.match(await tile.innerText(), new RegExp(`Flat: ${flat.material}`)))
+  const pictures = await page.locator('.sheet .plane').allInnerTexts()
+  assert.equal(new Set(pictures).size, pictures.length, pictures.join('; '))
+  const levelled = all.histograms.find((one) => one.name === 'level:total').bins.reduce((n, bin) => n + bin.count, 0)
+  assert.match(await page.locator('.left-out').innerText(), new RegExp(`count ${levelled} of ${all.total} surfaces`))
+  await open('/?level=total:-20..20')
+  await page.locator('.left-out', { hasText: 'leaves out references' }).waitFor()
+})
+
+await check('a table that is wider than the screen fades at its edges', async () => {
+  await page.setViewportSize({ width: 390, height: 844 })
+  await open(`/surfaces/${id}`)
+  const table = page.locator('section[aria-label="Levels of the pairs"] .scroll')
+  const faded = () => table.evaluate((node) => [node.matches('[data-more-left]'), node.matches('[data-more-right]')])
+  await eventually(async () => assert.deepEqual(await faded(), [false, true]))
+  await table.evaluate((node) => node.scrollTo(10000, 0))
+  await eventually(async () => assert.deepEqual(await faded(), [true, false]))
+  await page.setViewportSize({ width: 1280, height: 900 })
+  await eventually(async () => assert.deepEqual(await faded(), [false, false]))
 })
 
 await check('a facet click changes the address and the counts, and a fresh link shows the same', async () => {
@@ -304,6 +348,89 @@ await check('every heading says that the lake is simulated', async () => {
   }
 })
 
+await check('a run is replayed: cursor, keys, warnings, play, address, few requests', async () => {
+  const runs = (await get('/api/v1/runs?limit=500')).items
+  const { run_id: run } = runs.reduce((most, one) => (one.attempts > most.attempts ? one : most))
+  const measured = await sql(
+    `select pair_id, attempt, temperature_c, (log_time_ns - (select started_ns from runs where run_id = '${run}')) / 1e9 as time_s from measurements where run_id = '${run}' order by log_time_ns`,
+  )
+  const warning = (await get(`/api/v1/runs/${run}`)).events.find((event) => event.level === 'warning')
+  const asked = []
+  const listen = (request) => {
+    if (request.url().endsWith('/api/v1/sql')) asked.push(request.postData())
+  }
+  page.on('request', listen)
+  await open(`/runs/${run}`)
+  const replay = page.locator('section[aria-label="Replay"]')
+  const cursor = replay.getByRole('slider')
+  const isAt = (i) =>
+    eventually(async () => {
+      const text = await cursor.getAttribute('aria-valuetext')
+      assert.ok(text.endsWith(`pair ${measured[i].pair_id}, attempt ${measured[i].attempt}`), text)
+      const facts = await replay.locator('.facts').innerText()
+      assert.ok(facts.includes(`${measured[i].temperature_c.toFixed(2)} °C`), facts)
+      assert.equal(await replay.locator('.legend .name').innerText(), `Pair ${measured[i].pair_id}`)
+    })
+  await isAt(0)
+  await cursor.focus()
+  for (const [key, i] of [
+    ['ArrowRight', 1],
+    ['PageUp', 51],
+    ['ArrowLeft', 50],
+    ['End', measured.length - 1],
+    ['Home', 0],
+  ]) {
+    await page.keyboard.press(key)
+    await isAt(i)
+  }
+  const box = await cursor.boundingBox()
+  await page.mouse.click(box.x + box.width - 30, box.y + 20)
+  await page.waitForURL(/[?&]at=\d/)
+  const text = await cursor.getAttribute('aria-valuetext')
+  await open(page.url().slice(base.length))
+  await eventually(async () => assert.equal(await cursor.getAttribute('aria-valuetext'), text))
+  await cursor.focus()
+  await page.keyboard.press('Home')
+  await replay.getByRole('button', { name: 'Next warning or break' }).click()
+  await eventually(async () => assert.ok((await replay.innerText()).includes(warning.message), warning.message))
+  page.off('request', listen)
+  assert.ok(asked.length <= 20, `${asked.length} requests`)
+  await replay.getByLabel('Speed').selectOption('100')
+  await page.waitForURL(/speed=100/)
+  const before = Number(await cursor.getAttribute('aria-valuenow'))
+  await cursor.focus()
+  await page.keyboard.press(' ')
+  await eventually(async () => assert.ok(Number(await cursor.getAttribute('aria-valuenow')) > before + 30))
+  await page.keyboard.press(' ')
+  await replay.getByRole('button', { name: 'Play' }).waitFor()
+  assert.equal(await page.getByRole('link', { name: 'Open in Lichtblick' }).count(), 0)
+  await page.getByLabel('Lichtblick').fill('http://localhost:8090/')
+  await page.getByLabel('Lichtblick').press('Enter')
+  const opens = await page.getByRole('link', { name: 'Open in Lichtblick' }).getAttribute('href')
+  assert.ok(opens.startsWith('http://localhost:8090/?ds=remote-file&ds.url=http'), opens)
+  await page.getByLabel('Lichtblick').fill('')
+  await page.getByLabel('Lichtblick').press('Enter')
+})
+
+await check('surface, pair and selection have their slices in MCAP and SOFA', async () => {
+  const flat = all.items.find((s) => s.surface_id === id).flat_reference
+  for (const [path, most] of [
+    [`/surfaces/${id}?microphone=14&point=40`, 6],
+    [`/surfaces/${id}/pairs/159`, 2],
+    [`/compare?s=${id},${flat}`, 3],
+  ]) {
+    await open(path)
+    const links = page.locator('a[href*="/slices."]')
+    await eventually(async () => assert.equal(await links.count(), most))
+    for (const href of await links.evaluateAll((found) => found.map((link) => link.getAttribute('href')))) {
+      const answer = await fetch(base + href)
+      const start = Buffer.from((await answer.body.getReader().read()).value.slice(0, 8)).toString('latin1')
+      assert.equal(answer.status, 200, href)
+      assert.ok(start.startsWith(href.includes('.mcap') ? '\x89MCAP0' : '\x89HDF'), href)
+    }
+  }
+})
+
 await check('a WAV, a picture and numbers can be saved', async () => {
   await open(`/surfaces/${id}/pairs/159`)
   const [wav] = await Promise.all([
@@ -345,7 +472,7 @@ await check('figures that the server draws are saved in three formats, what the 
       const [file] = await Promise.all([
         page.waitForEvent('download'),
         menu(title)
-          .getByRole('link', { name: `Picture, ${format}` })
+          .getByRole('link', { name: new RegExp(`^Picture.*, ${format}$`) })
           .click(),
       ])
       assert.ok(file.suggestedFilename().endsWith(`.${format.toLowerCase()}`), file.suggestedFilename())
@@ -353,6 +480,7 @@ await check('figures that the server draws are saved in three formats, what the 
     }
   }
   for (const [path, title] of [
+    [`/surfaces/${id}?microphone=14`, 'TNCE over the grid'],
     [`/surfaces/${id}?microphone=14`, 'Relief'],
     [`/surfaces/${id}/pairs/159`, 'Spectrogram'],
     [`/sql?q=${encodeURIComponent('select surface_id, count(*) as n from tnce group by 1')}&as=bars`, 'Chart'],
@@ -363,7 +491,9 @@ await check('figures that the server draws are saved in three formats, what the 
     await menu(title).locator('summary').click()
     const [file] = await Promise.all([
       page.waitForEvent('download'),
-      menu(title).getByRole('button', { name: 'Picture, PNG' }).click(),
+      menu(title)
+        .getByRole('button', { name: /^Picture.*, PNG$/ })
+        .click(),
     ])
     const picture = await bytesOf(file)
     assert.ok(picture.subarray(1, 4).toString() === 'PNG' && picture.length > 2000, `${title}: ${picture.length} bytes`)
@@ -804,11 +934,51 @@ await check('a malformed address says so, and the next one is shown', async () =
   }
   await open('/nothing/%zz')
   assert.ok((await page.getByRole('alert').innerText()).includes('no page at /nothing/%zz'))
+  assert.equal(await page.title(), 'Nothing to show · echolake')
+  await open(`/surface/${id}`)
+  await page.getByRole('link', { name: `/surfaces/${id}` }).click()
+  await eventually(async () => assert.ok((await heading()).startsWith(id), await heading()))
   // A percent sign that is right is decoded once.
   await open('/surfaces/50%2525')
   await page.getByRole('alert').first().waitFor()
-  assert.ok((await page.getByRole('alert').first().innerText()).includes('surface `50%25`'))
+  assert.ok((await page.getByRole('alert').first().innerText()).includes('surface 50%25 is not there'))
   forget(/404/)
+})
+
+await check('Ctrl K finds surfaces, runs, columns, functions and words by keyboard', async () => {
+  const [{ run_id: run }] = (await get('/api/v1/runs?limit=1')).items
+  await open('/runs')
+  const find = async (text, first, kind) => {
+    await page.keyboard.press('Control+k')
+    await page.keyboard.type(text)
+    await eventually(async () => {
+      const [top] = await page.locator('#found li').allInnerTexts()
+      assert.ok(top.includes(first) && top.startsWith(kind), `${text}: ${top}`)
+    })
+    await page.keyboard.press('Enter')
+  }
+  await find(id, id, 'surface')
+  await page.waitForURL(`**/surfaces/${id}`)
+  await find(run, run, 'run')
+  await page.waitForURL(`**/runs/${run}`)
+  await find('measurements.snr', 'measurements.snr_db', 'column')
+  await page.waitForURL(/sql\?q=select%20snr_db%0Afrom%20measurements/)
+  await page.locator('.rows tbody tr').first().waitFor()
+  await find('rise_time', 'rise_time', 'function')
+  await page.locator('.rows tbody td', { hasText: 'rise_time' }).first().waitFor()
+  await find('TNCE', 'TNCE', 'help')
+  await page.getByRole('heading', { name: 'Words' }).waitFor()
+  await page.keyboard.press('Escape')
+  await page.keyboard.press('Control+k')
+  await page.keyboard.press('ArrowDown')
+  await eventually(async () =>
+    assert.equal(
+      await page.locator('#found [aria-selected=true]').innerText(),
+      await page.locator('#found-1').innerText(),
+    ),
+  )
+  await page.keyboard.press('Escape')
+  await page.locator('#found').waitFor({ state: 'detached' })
 })
 
 await check('a pair without references shows what was measured', async () => {

@@ -1,4 +1,4 @@
-//! Opens every page in both themes at both widths, keeps a screenshot of each, and fails where the console is not
+//! Opens every page in both themes at three widths, keeps a screenshot of each, and fails where the console is not
 //! empty or axe finds a violation: `node tests/pages.mjs http://127.0.0.1:8420 shots [only]`.
 import { mkdir, readFile } from 'node:fs/promises'
 import { createRequire } from 'node:module'
@@ -37,9 +37,11 @@ const PAGES = {
   som: '/map?axes=som&typology=all',
   runs: '/runs',
   run: `/runs/${runs[0].run_id}`,
+  replay: `/runs/${runs[0].run_id}?at=600&speed=100`,
   log: `/runs/${runs[0].run_id}?log=all`,
   lost: '/nowhere',
   help: '/',
+  finder: '/',
   sql: `/sql?q=${encodeURIComponent(query)}`,
   tables: `/sql?q=${encodeURIComponent("select surface_id, p90_mean_db from surface_stats where band = 'total'")}&tables=points&summary=points`,
   first: '/sql',
@@ -60,7 +62,7 @@ const fail = (text) => {
   process.stdout.write(`FAIL ${text}\n`)
 }
 for (const theme of ['light', 'dark']) {
-  for (const width of [1400, 390]) {
+  for (const width of theme === 'light' ? [1400, 1024, 390] : [1400, 390]) {
     const context = await contextOf(browser, {
       viewport: { width, height: width === 390 ? 844 : 900 },
       colorScheme: theme,
@@ -96,6 +98,7 @@ for (const theme of ['light', 'dark']) {
         ['surface', 'sql', 'tables', 'first', 'lists', 'series', 'wrong'].includes(name) ? 900 : 250,
       )
       if (name === 'help') await page.keyboard.press('?')
+      if (name === 'finder') await page.keyboard.press('Control+k')
       const jumps = await page.evaluate(() => globalThis.jumps)
       const jumped = jumps.reduce((sum, [value]) => sum + value, 0)
       if (jumped > MOST_JUMP)

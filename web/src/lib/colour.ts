@@ -1,34 +1,38 @@
 //! Colours that carry numbers.
-import type { Palette } from './settings.svelte'
-
 export type Rgb = readonly [number, number, number]
 
 /** The paper's scale: white at -20 dB, black at 0 dB (equal to Flat), red at +6 dB. */
 export const SCALE_DB = { low: -20, zero: 0, high: 6 } as const
 
-const HIGH: Record<Palette, Rgb> = { paper: [255, 0, 0], safe: [255, 176, 0] }
-
 /** How many dB the small bars reach up and down. */
 export const BAR_REACH_DB = 4
 
-/** A level's colour; beyond the ends it stays at the ends. */
-export function levelColour(level_db: number, palette: Palette): Rgb {
+/** A level's colour on the paper's scale; beyond the ends it stays at the ends. */
+export function paperColour(level_db: number): Rgb {
   const { low, zero, high } = SCALE_DB
-  if (level_db <= zero) {
-    const grey = Math.round(255 * Math.min(1, (zero - level_db) / (zero - low)))
-    return [grey, grey, grey]
-  }
-  const share = Math.min(1, level_db / high)
-  const [r, g, b] = HIGH[palette]
-  return [Math.round(r * share), Math.round(g * share), Math.round(b * share)]
+  if (level_db > zero) return [Math.round(255 * Math.min(1, level_db / high)), 0, 0]
+  const grey = Math.round(255 * Math.min(1, (zero - level_db) / (zero - low)))
+  return [grey, grey, grey]
 }
 
-/** A difference's colour: grey at 0, to both ends at `reach`. Used for differences of two grids. */
-export function differenceColour(value_db: number, reach_db: number): Rgb {
-  const share = Math.max(-1, Math.min(1, value_db / reach_db))
+/** A value's colour: grey at 0, blue and orange at both ends, `reach`, and beyond. */
+export function divergingColour(value: number, reach: number): Rgb {
+  const share = Math.max(-1, Math.min(1, value / reach))
   const end: Rgb = share < 0 ? [33, 102, 172] : [217, 95, 2]
   const mid = 236
   return end.map((c) => Math.round(mid + (c - mid) * Math.abs(share))) as unknown as Rgb
+}
+
+/** Ends of scales, dB. */
+const REACHES_DB = [1, 2, 3, 4, 6, 8, 10, 15, 20, 30, 40]
+/** Share of the values that a scale holds; the others have the colours of its ends. */
+const WITHIN = 0.98
+
+/** The smallest round range around 0 dB that holds nearly all levels. */
+export function fittingReach(levels_db: readonly number[]): number {
+  const sizes = levels_db.map(Math.abs).sort((a, b) => a - b)
+  const most = sizes[Math.ceil(WITHIN * sizes.length) - 1] ?? 0
+  return REACHES_DB.find((reach) => reach >= most) ?? REACHES_DB[REACHES_DB.length - 1]
 }
 
 export const css = ([r, g, b]: Rgb) => `rgb(${r}, ${g}, ${b})`

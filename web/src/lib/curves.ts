@@ -2,6 +2,9 @@
 import type { CurveSet, Lake, Schemas } from './api'
 import type { PlotSpec } from './plot'
 
+/** Colours of bands in the styles; more bands begin anew. */
+const BAND_COLOURS = 12
+
 /** Bands stacked upon each other, lowest first; the top is the whole energy. Flat's whole is a dashed line. */
 export function stacked(lake: Lake, set: CurveSet, which: 'surface' | 'flat' = 'surface', high?: number): PlotSpec {
   const bands = lake.bands.filter((band) => band.centre_hz !== null)
@@ -16,7 +19,7 @@ export function stacked(lake: Lake, set: CurveSet, which: 'surface' | 'flat' = '
       ...bands.map((band, b) => ({
         label: band.label,
         values: sums[b] ?? [],
-        colour: `--band-${b % 5}`,
+        colour: `--band-${b % BAND_COLOURS}`,
         width: 0.5,
         fillTo: b === 0 ? ('zero' as const) : b - 1,
         parts: own.bands[b] ?? [],

@@ -47,7 +47,8 @@ export async function pictureOf(figure: Element, title: string, origin: string):
     name: entry.querySelector('.name')?.textContent ?? '',
     colour: getComputedStyle(entry.querySelector('line') ?? entry).stroke,
   }))
-  const lines = legend.length ? 2 : 1
+  const meaning = figure.querySelector('svg.scale')?.getAttribute('aria-label')
+  const lines = legend.length || meaning ? 2 : 1
   canvas.width = drawing.width
   canvas.height = drawing.height + scale * LINE_PX * (lines + (origin ? 1 : 0))
   context.fillStyle = token('--paper')
@@ -59,6 +60,7 @@ export async function pictureOf(figure: Element, title: string, origin: string):
   context.font = `600 12px ${font}`
   context.fillText(title, MARGIN_PX, 15)
   context.font = `12px ${font}`
+  if (meaning) context.fillText(meaning, MARGIN_PX, LINE_PX + 15)
   let x = MARGIN_PX
   for (const { name, colour } of legend) {
     context.fillStyle = colour

@@ -4,6 +4,15 @@ import type { LevelReference } from './reference'
 
 /** A string as an SQL literal. */
 export const quoted = (text: string) => `'${text.replaceAll("'", "''")}'`
+
+/** The measurements of a surface, of all its pairs, of a microphone's or of one, as a predicate for slices. */
+export const sliceOf = (id: string, of: { readonly microphone?: number; readonly pair?: number } = {}) =>
+  [
+    `surface_id = ${quoted(id)}`,
+    ...(of.microphone === undefined ? [] : [`(microphone = ${of.microphone} or speaker = ${of.microphone})`]),
+    ...(of.pair === undefined ? [] : [`pair_id = ${of.pair}`]),
+  ].join(' and ')
+
 const centres = (lake: Lake) => lake.bands.filter((band) => band.centre_hz !== null).map((band) => band.key)
 
 export const gridQuery = (lake: Lake, ids: readonly string[], microphone: number, over: string) =>

@@ -5,17 +5,20 @@ import {
   BufferGeometry,
   Color,
   ConeGeometry,
+  CylinderGeometry,
   DirectionalLight,
   Line,
   LineBasicMaterial,
   LineDashedMaterial,
   LineLoop,
+  Matrix4,
   Mesh,
   MeshLambertMaterial,
   MeshBasicMaterial,
   Object3D,
   PerspectiveCamera,
   PlaneGeometry,
+  Quaternion,
   Scene,
   SphereGeometry,
   Vector3,
@@ -24,6 +27,7 @@ import {
 } from 'three'
 import { OrbitControls } from 'three/examples/jsm/controls/OrbitControls.js'
 import { fresnelZone, specular, type Vec3 } from './geometry'
+import type { FramePose } from './replay'
 
 export interface ReliefColours {
   paper: string
@@ -32,9 +36,12 @@ export interface ReliefColours {
   speaker: string
   ink: string
   zone: string
+  arm: string
 }
 export interface Relief {
   setPair(microphone: Vec3 | null, speaker: Vec3 | null): void
+  /** Draws links between the frames of both arms; nothing without poses. */
+  setArms(poses: readonly FramePose[]): void
   setColours(colours: ReliefColours): void
   setHeights(heights: Float32Array, size_mm: number): void
   turn(dx: number, dy: number): void
@@ -45,6 +52,25 @@ export interface Relief {
 
 const v = (p: Vec3) => new Vector3(p[0], p[1], p[2])
 const ZONE_LIFT_MM = 1.5
+const ARM_RADIUS_MM = 9
+
+/** Both ends of every link of the arms, mm in the panel's frame. */
+function findLinks(poses: readonly FramePose[]): [Vector3, Vector3][] {
+  const worlds = new Map<string, Matrix4>()
+  for (const { parent_frame_id, child_frame_id, translation: t, rotation: r } of poses) {
+    const own = new Matrix4().compose(
+      new Vector3(t.x, t.y, t.z).multiplyScalar(1000),
+      new Quaternion(r.x, r.y, r.z, r.w),
+      new Vector3(1, 1, 1),
+    )
+    worlds.set(child_frame_id, (worlds.get(parent_frame_id) ?? new Matrix4()).clone().multiply(own))
+  }
+  const toPanel = (worlds.get('panel') ?? new Matrix4()).clone().invert()
+  const originOf = (frame: string) => new Vector3().setFromMatrixPosition(worlds.get(frame)!).applyMatrix4(toPanel)
+  return poses
+    .filter((pose) => worlds.has(pose.parent_frame_id))
+    .map((pose) => [originOf(pose.parent_frame_id), originOf(pose.child_frame_id)])
+}
 
 /** A scene on a canvas; it draws only when something changed. */
 export function relief(
@@ -80,6 +106,8 @@ export function relief(
   scene.add(pair)
   const points = new Group()
   scene.add(points)
+  const arms = new Group()
+  scene.add(arms)
   let shown: [Vec3 | null, Vec3 | null] = [null, null]
   let frame = 0
   const draw = () => {
@@ -159,8 +187,24 @@ export function relief(
       shown = [microphone, speaker]
       rebuild()
     },
+    setArms(poses) {
+      clear(arms)
+      for (const [from, to] of findLinks(poses)) {
+        const length = from.distanceTo(to)
+        if (length < 1) continue
+        const link = new Mesh(
+          new CylinderGeometry(ARM_RADIUS_MM, ARM_RADIUS_MM, length, 12),
+          new MeshLambertMaterial({ color: colours.arm }),
+        )
+        link.position.copy(from).lerp(to, 0.5)
+        link.quaternion.setFromUnitVectors(new Vector3(0, 1, 0), to.clone().sub(from).normalize())
+        arms.add(link)
+      }
+      later()
+    },
     setColours(next) {
       colours = next
+      for (const link of arms.children) ((link as Mesh).material as MeshLambertMaterial).color.set(next.arm)
       scene.background = new Color(next.paper)
       ;(panel.material as MeshLambertMaterial).color.set(next.relief)
       rebuild()
@@ -210,6 +254,7 @@ export function relief(
       if (frame) cancelAnimationFrame(frame)
       clear(pair)
       clear(points)
+      clear(arms)
       free(panel)
       controls.dispose()
       renderer.dispose()

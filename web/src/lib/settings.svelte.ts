@@ -1,7 +1,8 @@
 //! What a reader prefers: theme and colours. Kept in the browser, not in the address.
 
 export type Theme = 'system' | 'light' | 'dark'
-export type Palette = 'paper' | 'safe'
+/** Colours of grid plots: centred on 0 dB with a range that fits, or those of the paper. */
+export type Palette = 'fitted' | 'paper'
 
 function stored<T extends string>(name: string, allowed: readonly T[], fallback: T): T {
   try {
@@ -9,6 +10,14 @@ function stored<T extends string>(name: string, allowed: readonly T[], fallback:
     return value && allowed.includes(value) ? value : fallback
   } catch {
     return fallback
+  }
+}
+
+function storedText(name: string): string {
+  try {
+    return localStorage.getItem(name) ?? ''
+  } catch {
+    return ''
   }
 }
 
@@ -22,7 +31,8 @@ function store(name: string, value: string): void {
 
 const dark = matchMedia('(prefers-color-scheme: dark)')
 let theme = $state<Theme>(stored('theme', ['system', 'light', 'dark'], 'system'))
-let palette = $state<Palette>(stored('palette', ['paper', 'safe'], 'paper'))
+let palette = $state<Palette>(stored('palette', ['fitted', 'paper'], 'fitted'))
+let lichtblick = $state(storedText('lichtblick'))
 let systemDark = $state(dark.matches)
 const isDark = () => theme === 'dark' || (theme === 'system' && systemDark)
 function showTheme(): void {
@@ -32,7 +42,6 @@ dark.addEventListener('change', () => {
   systemDark = dark.matches
   showTheme()
 })
-document.documentElement.dataset.palette = stored('palette', ['paper', 'safe'], 'paper')
 
 export const settings = {
   get theme() {
@@ -43,14 +52,20 @@ export const settings = {
     store('theme', value)
     showTheme()
   },
-  /** Red and green as in the paper, or colours that a colour-blind reader tells apart. */
   get palette() {
     return palette
   },
   set palette(value: Palette) {
     palette = value
     store('palette', value)
-    document.documentElement.dataset.palette = value
+  },
+  /** Where the reader's Lichtblick answers; empty if there is none. */
+  get lichtblick() {
+    return lichtblick
+  },
+  set lichtblick(value: string) {
+    lichtblick = value
+    store('lichtblick', value)
   },
   get isDark() {
     return isDark()
