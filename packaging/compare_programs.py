@@ -1,10 +1,11 @@
 #!/usr/bin/env python3
 """Times two builds of echolake beside each other: `compare_programs.py NEW OLD [--surfaces N] [--rounds N]`.
 
-Both make a lake by `demo`, ingest the same run files (those of OLD's lake), and answer the twelve queries of `bench
-queries` from a server over HTTP, each on its own lake. They take turns, and each round begins with the other one. Prints, for each
-work, the medians in seconds and the ratio NEW / OLD, as the median of the rounds with its range. Where the answers
-differ in their number of rows, it says so: the ratio then compares different work. Needs nothing but Python.
+Both make a lake by `demo`, ingest the same run files (those of OLD's lake), and answer the twelve queries of
+`bench queries` from a server over HTTP, each on its own lake. They take turns, and each round begins with the other
+one. Prints, for each work, the medians in seconds and the ratio NEW / OLD, as the median of the rounds with its range.
+Where the answers differ in their number of rows, it says so: the ratio then compares different work. Needs nothing but
+Python.
 """
 
 from __future__ import annotations
