@@ -1021,8 +1021,8 @@ export interface components {
         /** @description A pair's responses over time and frequency. Levels are re 1, and -200 dB at least. */
         readonly PairAnalysis: {
             /**
-             * @description Time of the direct sound in the response: `direct_s`, unless the measurement's `arrival_error_us` is over 100 us,
-             *     as it is if the loopback lacks the delay of the audio interface. Then the first sample within 20 dB of the
+             * @description Time of the direct sound in the response: `direct_s`, unless the measurement's `arrival_error_us` is over 100
+             *     us, as it is if the loopback lacks the delay of the audio interface. Then the first sample within 20 dB of the
              *     greatest.
              */
             readonly arrival_s: number;
