@@ -14,9 +14,9 @@ const ENTRIES: usize = 3;
 /// Costs of several things over the same sizes.
 #[derive(Debug, Clone, PartialEq)]
 pub struct GrowthFigure {
-    /// What sizes count.
+    /// Title of the axis of sizes.
     pub size_title: String,
-    /// What costs are, with their unit.
+    /// Title of the axis of costs, with their unit.
     pub cost_title: String,
     /// Sizes in ascending order, over 0.
     pub sizes: Vec<f64>,

@@ -36,11 +36,11 @@ const DISK_READS: ReadSizes = ReadSizes { most: 512 << 10, gap: 4 << 10 };
 /// Requests under way while what another one fetched is decoded.
 const AHEAD: usize = 2;
 
-/// How much is read at once.
+/// Limits of one read.
 struct ReadSizes {
     /// Neighbouring pieces are read together up to this many bytes.
     most: u64,
-    /// What stands between two pieces is read with them if it has no more bytes.
+    /// Most bytes between two pieces that are read with them.
     gap: u64,
 }
 

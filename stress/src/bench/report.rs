@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context as _, Result, ensure};
 use serde_json::{Value, json};
 
-/// How figures are printed.
+/// Form in which figures are printed.
 #[derive(Debug, clap::Args)]
 pub(crate) struct ReportOutput {
     /// Print JSON instead of a table.

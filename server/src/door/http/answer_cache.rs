@@ -34,7 +34,7 @@ pub(crate) struct AnswerCache {
     answers: Cache<AnswerKey, Arc<CachedAnswer>, AnswerWeighter>,
 }
 
-/// What an answer depends on beside the rights of its client.
+/// Everything that an answer depends on, the rights of its client apart.
 #[derive(Clone, PartialEq, Eq, Hash)]
 pub(crate) struct AnswerKey {
     client: String,

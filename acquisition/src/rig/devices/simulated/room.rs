@@ -23,7 +23,7 @@ pub(super) struct ResponseInputs {
     pub air: AirState,
 }
 
-/// What stays the same in a run.
+/// Constants of a run.
 pub(super) struct SimulatedRoom {
     pub plan: KirchhoffPlan,
     pub reference: ReferenceAir,
@@ -32,7 +32,7 @@ pub(super) struct SimulatedRoom {
     pub reflection: Vec<Complex<f32>>,
     /// Foam whose reflection depends on the angle at which a path's mirror image meets its plane.
     pub foam: Option<FoamLayer>,
-    /// Whether the air absorbs.
+    /// If true, the air absorbs.
     pub absorbs: bool,
 }
 
