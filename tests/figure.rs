@@ -74,13 +74,19 @@ fn the_server_draws_the_same() {
 #[test]
 fn tables_have_the_numbers_of_the_lake() {
     let place = lake();
-    place.ok(&["figure", "table", "wood", "flat", "-o", "out/levels.csv", "-o", "out/levels.tex"]);
+    place.ok(&["figure", "table", "wood", "flat", "--over", "total", "-o", "out/levels.csv", "-o", "out/levels.tex"]);
     let csv = std::fs::read_to_string(place.path("out/levels.csv")).expect("read");
     assert!(csv.starts_with("# Title: ") && csv.contains("# Lake: runs@") && csv.contains("# Origin: simulated"));
     let wood = csv.lines().find(|line| line.starts_with("wood,")).expect("a row");
-    let total: f64 = wood.rsplit(',').next().expect("a value").parse().expect("a number");
-    let expected = "select p90_mean_db from surface_stats where surface_id = 'wood' and band = 'total'";
-    assert!((total - place.number(expected)).abs() < 1e-9, "{total}");
+    let numbers: Vec<f64> = wood.split(',').skip(1).map(|text| text.parse().expect("a number")).collect();
+    for (at, column) in [(5, "p90_mean_db"), (11, "p90_mean_u_db")] {
+        let expected = format!("select {column} from surface_stats where surface_id = 'wood' and band = 'total'");
+        assert!((numbers[at] - place.number(&expected)).abs() < 1e-9, "{column}: {numbers:?}");
+    }
+    let against = place.ok(&["figure", "table", "wood"]);
+    let level = place.number("select against_flat_2500_db from catalogue where surface_id = 'wood'");
+    let u = place.number("select level_u_2500_db from catalogue where surface_id = 'wood'");
+    assert!(u > 0.005 && against.contains(&format!("| wood | {level:.2} \u{b1} {u:.2} |")), "{against}");
     let tex = std::fs::read_to_string(place.path("out/levels.tex")).expect("read");
     assert!(tex.contains("\\cellcolor") && tex.contains("% Query: select surface_id, band"), "{tex}");
     for (surfaces, base, unit) in [

@@ -143,19 +143,30 @@ fn print_next(lake_url: &str, example: &str) {
 const LEVELS_TITLE: &str =
     "TNCE of the values up to the 90th percentile against Flat, dB re Flat, same band (simulated)";
 
-// The levels against Flat of a table with one column per band.
-fn level_columns(lake: &Lake, aggregate: &str) -> String {
+// A table's column for each band.
+fn level_columns(lake: &Lake, expression: impl Fn(&str) -> String) -> String {
     let bands = lake.rig().band_names();
-    let column = |band: &str, name: &str| format!("round({aggregate}(against_flat_{band}_db), 1) + 0.0 as \"{name}\"");
+    let column = |band: &str, name: &str| format!("{} as \"{name}\"", expression(band));
     let columns: Vec<_> =
         bands.iter().map(|b| column(b, &format!("{b} Hz"))).chain([column("total", "total")]).collect();
     columns.join(", ")
 }
 
+// A level against Flat with its standard uncertainty; Flat over itself is no measurement.
+fn level_text(band: &str) -> String {
+    let level = format!("against_flat_{band}_db");
+    let u = format!("level_u_{band}_db");
+    format!(
+        "case when {level} is null then null when surface_id = flat_reference then 'reference' else \
+         concat(case when {level} > 0 then '+' end, round({level}, 1) + 0.0, case when {u} < 0.005 then ' \u{b1} <0.01' \
+         when {u} is not null then concat(' \u{b1} ', round({u}, 2)) end) end"
+    )
+}
+
 // One row per reference or typology: a large collection has too many surfaces to print. Returns a surface to look at.
 async fn print_typologies(lake: &Lake) -> anyhow::Result<&'static str> {
     let session = Session::new(lake)?;
-    let columns = level_columns(lake, "avg");
+    let columns = level_columns(lake, |band| format!("round(avg(against_flat_{band}_db), 1) + 0.0"));
     super::print_line(&format!("\n{LEVELS_TITLE}, mean over surfaces"))?;
     let sql = format!(
         "select case typology when 'reference' then surface_id else typology end as kind, \
@@ -169,11 +180,14 @@ async fn print_typologies(lake: &Lake) -> anyhow::Result<&'static str> {
 // The paper's two tables. Returns a surface to look at.
 async fn print_tables(lake: &Lake) -> anyhow::Result<&'static str> {
     let session = Session::new(lake)?;
-    let columns = level_columns(lake, "");
-    super::print_line(&format!("\nMean {LEVELS_TITLE}"))?;
+    let columns = level_columns(lake, level_text);
+    super::print_line(&format!("\nMean {LEVELS_TITLE}, \u{b1} standard uncertainty"))?;
     let sql = format!("select surface_id as surface, {columns} from catalogue order by surface_id");
     super::sql::print_table(&session, &sql).await?;
-    super::print_line(&format!("\nMean energy of {COMPARED} and Flat, over Flat's total (simulated)"))?;
+    super::print_line(&format!(
+        "\nMean energy of {COMPARED} and Flat, over Flat's total, linear (simulated): of all pairs, where levels leave \
+         out the loudest tenth"
+    ))?;
     let row = |band: &str| {
         format!(
             "select '{band}' as band, avg(tnce_{band}) filter (where surface_id = 'flat') as flat, \

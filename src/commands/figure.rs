@@ -1,6 +1,7 @@
 //! `echolake figure`: the paper's pictures and tables as files.
 
 mod calculated;
+mod levels;
 mod output;
 mod source;
 mod surfaces;
@@ -61,10 +62,8 @@ pub(crate) struct GridArgs {
     /// Grid point of the microphone: a number, layer/x/y, or x y z in mm. By default that in the middle of layer 0.
     #[arg(long, value_name = "POINT")]
     microphone: Option<String>,
-    /// Reference of the bands' levels: Flat's energy in the same band, as in the paper's grid plots, or in all bands,
-    /// as in its tables.
-    #[arg(long, value_enum, default_value_t = OverArg::Band)]
-    over: OverArg,
+    #[command(flatten)]
+    reference: ReferenceArgs,
     /// Only this band: its centre in Hz, or total.
     #[arg(long)]
     band: Option<String>,
@@ -77,6 +76,15 @@ pub(crate) struct GridArgs {
     /// Number of surfaces per row.
     #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=20))]
     columns: u32,
+}
+
+/// What levels are over.
+#[derive(Debug, Args)]
+struct ReferenceArgs {
+    /// Reference of the bands' levels: Flat's energy in the same band, as on the catalogue's pages and in the paper's
+    /// grid plots, or in all bands, as in the paper's tables.
+    #[arg(long, value_enum, default_value_t = OverArg::Band)]
+    over: OverArg,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -117,19 +125,21 @@ pub(crate) struct TableArgs {
     /// Values of the table.
     #[arg(long, value_enum, default_value_t = ValuesArg::Levels)]
     values: ValuesArg,
-    /// Subtract the levels of this surface from those of the others; those of Flat make levels re Flat, same
-    /// band.
+    #[command(flatten)]
+    reference: ReferenceArgs,
+    /// Subtract the levels of this surface from those of the others.
     #[arg(long, value_name = "SURFACE")]
     less: Option<SurfaceId>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum ValuesArg {
-    /// Mean of the TNCE values up to their 90th percentile, dB re Flat total.
+    /// Mean of the TNCE values up to their 90th percentile, in dB, with its standard uncertainty.
     Levels,
     /// The same without Foam's own reflection, which is estimated.
     UnbiasedLevels,
-    /// Mean TNCE over the pairs, linear, beside Flat's, with the difference in per cent.
+    /// Mean TNCE over all pairs, linear, beside Flat's, with the difference in per cent. A few loud pairs raise it, which
+    /// levels leave out.
     Energies,
 }
 

@@ -130,7 +130,7 @@ await check('the wall names planes, and says what ranges leave out', async () =>
 await check('a table that is wider than the screen fades at its edges', async () => {
   await page.setViewportSize({ width: 390, height: 844 })
   await open(`/surfaces/${id}`)
-  const table = page.locator('section[aria-label="Levels of the pairs"] .scroll')
+  const table = page.locator('section[aria-label="Levels by band"] .scroll')
   const faded = () => table.evaluate((node) => [node.matches('[data-more-left]'), node.matches('[data-more-right]')])
   await eventually(async () => assert.deepEqual(await faded(), [false, true]))
   await table.evaluate((node) => node.scrollTo(10000, 0))
@@ -289,8 +289,13 @@ await check('the keyboard alone finds surfaces in three stops, compares them and
 
 await check('levels against Flat are one number on wall, surface, compare and in SQL', async () => {
   const flat = all.items.find((s) => s.surface_id === id).flat_reference
-  const [{ level }] = await sql(`select against_flat_2500_db as level from catalogue where surface_id = '${id}'`)
-  const text = `${level < 0 ? '−' : '+'}${Math.abs(level).toFixed(1)}`
+  const [{ level, u }] = await sql(
+    `select against_flat_2500_db as level, level_u_2500_db as u from catalogue where surface_id = '${id}'`,
+  )
+  const number = (db, plus = '+') => `${db < 0 ? '−' : plus}${Math.abs(db).toFixed(1)}`
+  const uncertain = u === null ? '' : ` ± ${u < 0.005 ? '<0.01' : u.toFixed(2)}`
+  const text = `${number(level)}${uncertain}`
+  const levels = 'Levels by band'
   const cell = (figure, column) =>
     page.locator(`section[aria-label="${figure}"] tbody tr`).first().locator('td').nth(column)
   await open('/?sort=level&sort_band=2500')
@@ -299,7 +304,7 @@ await check('levels against Flat are one number on wall, surface, compare and in
     assert.ok((await tile.innerText()).includes(`2.5 kHz ${text} dB`), await tile.innerText()),
   )
   await open(`/surfaces/${id}`)
-  await eventually(async () => assert.equal(await cell('Levels of the pairs', 0).innerText(), text))
+  await eventually(async () => assert.equal(await cell(levels, 0).innerText(), text))
   const of = (surface) =>
     sql(
       `select unbiased_p90_mean_db as db from surface_stats join surfaces using (run_id) where surfaces.surface_id = '${surface}' and band = '2500'`,
@@ -307,26 +312,52 @@ await check('levels against Flat are one number on wall, surface, compare and in
   const [[own], [less]] = [await of(id), await of(flat)]
   const without = own.db === null || less.db === null ? null : own.db - less.db
   const shown = without === null ? '–' : `${without < -0.05 ? '−' : ''}${Math.abs(without).toFixed(1)}`
-  assert.equal(
-    await cell('Levels of the pairs', 2).innerText(),
-    shown,
-    'without Foam’s reflection, in Flat’s level too',
-  )
+  assert.equal(await cell(levels, 2).innerText(), shown, 'without Foam’s reflection, in Flat’s level too')
   await open(`/compare?s=${id},${flat}`)
-  const levels = 'Mean levels of the pairs up to the 90th percentile'
-  await eventually(async () => assert.equal((await cell(levels, 1).innerText()).trim(), text))
+  const tight = (text) => text.replace(/\s+/g, '')
+  const compared = async () => tight(await cell(levels, 1).innerText())
+  const arrow = Math.abs(level) <= 1.96 * u ? '≈' : level > 0 ? '▲' : '▼'
+  await eventually(async () => assert.equal(await compared(), tight(`${text}${arrow}`)))
   await page.getByRole('button', { name: 're Flat total' }).first().click()
   await page.waitForURL(/over=flat-total/)
   const [{ total }] = await sql(`select level_2500_db as total from catalogue where surface_id = '${id}'`)
-  await eventually(async () => assert.equal((await cell(levels, 1).innerText()).trim(), `−${(-total).toFixed(1)}`))
+  await eventually(async () =>
+    assert.equal(await compared(), tight(`${number(total)}${uncertain}${arrow}${number(level)}`)),
+  )
+  await open(`/compare?s=${id},${flat}`)
+  await page.getByRole('button', { name: 'All pairs' }).click()
+  await page.waitForURL(/mean=all/)
+  const [{ mean }] = await sql(
+    `select 10 * log10(avg(tnce_2500) filter (where surface_id = '${id}') / avg(tnce_2500) filter (where surface_id = '${flat}')) as mean from tnce`,
+  )
+  await eventually(async () => assert.ok((await compared()).startsWith(number(mean)), await compared()))
+  await page.getByText('which a few pairs to which a relief focuses sound raise').waitFor()
+})
+
+await check('surfaces are compared with Flat, or with the chosen one', async () => {
+  const { flat_reference: flat } = all.items.find((s) => s.surface_id === id)
+  const other = all.items.find((s) => s.typology !== 'reference' && s.surface_id !== id)
+  const chosen = page.getByLabel('Compared with')
+  await open(`/compare?s=${id},${other.surface_id}`)
+  await eventually(async () => assert.equal(await chosen.inputValue(), flat))
+  await page.getByText(`▲ louder than ${flat}`).waitFor()
+  await chosen.selectOption(other.surface_id)
+  await page.waitForURL(new RegExp(`less=${other.surface_id}`))
+  const level = all.items.find((s) => s.surface_id === id).against_flat_db[0] - other.against_flat_db[0]
+  const cell = page.locator('section[aria-label="Levels by band"] tbody tr').first().locator('td').nth(1)
+  const step = `${level < -0.05 ? '▼−' : level >= 0.05 ? '▲+' : ''}${Math.abs(level).toFixed(1)}`
+  await eventually(async () => assert.ok((await cell.innerText()).trim().endsWith(step), await cell.innerText()))
+  await page.getByRole('button', { name: `Minus ${other.surface_id}` }).click()
+  await page.locator('p', { hasText: new RegExp(`^${id} minus ${other.surface_id}$`) }).waitFor()
 })
 
 await check('references are no data, and pages without data lead back', async () => {
   const { foam_reference: foam } = all.items.find((s) => s.surface_id === id)
   await open(`/compare?s=${id},${foam}`)
   await page.getByText(`Not shown (no TNCE): ${foam}.`).waitFor()
-  const row = page.locator('section[aria-label="Mean energy by band"] tbody tr').nth(1)
-  assert.deepEqual(await row.locator('td').allInnerTexts(), Array(lake.bands.length).fill('–'))
+  const row = page.locator('section[aria-label="Levels by band"] tbody tr').nth(1)
+  const cells = (await row.locator('td').allInnerTexts()).slice(1).map((text) => text.trim())
+  assert.deepEqual(cells, Array(lake.bands.length).fill('–'))
   await open('/compare')
   const suggested = await page.locator('main a[href*="/compare?s="]').getAttribute('href')
   const names = new URLSearchParams(suggested.split('?')[1]).get('s').split(',')

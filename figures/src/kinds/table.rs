@@ -4,9 +4,10 @@ use std::fmt::Write as _;
 
 use crate::canvas::notes::FigureNotes;
 
-/// The paper's colours: the loudest value of a column red, the quietest green.
-const LOUDEST: &str = "[rgb]{0.918,0.6,0.6}";
-const QUIETEST: &str = "[rgb]{0.714,0.843,0.659}";
+/// Colours of the loudest and the quietest value of a column, as on the catalogue's pages: amber and blue, which
+/// everybody can tell. The paper has red and green.
+const LOUDEST: &str = "[rgb]{0.992,0.89,0.722}";
+const QUIETEST: &str = "[rgb]{0.827,0.894,0.961}";
 
 /// A row: its name, then a value for each column.
 #[derive(Debug, Clone, PartialEq)]
@@ -15,6 +16,8 @@ pub struct TableRow {
     pub name: String,
     /// A value for each column; none if there is none.
     pub values: Vec<Option<f64>>,
+    /// Standard uncertainties of the values; empty if none is known.
+    pub uncertainties: Vec<Option<f64>>,
     /// Decimals of its values.
     pub decimals: usize,
     /// The values are per cent.
@@ -30,11 +33,27 @@ pub struct FigureTable {
     pub columns: Vec<String>,
     /// The rows.
     pub rows: Vec<TableRow>,
-    /// Colours the extremes of each column, as the paper does.
+    /// Colours the extremes of each column.
     pub with_extremes: bool,
 }
 
 impl TableRow {
+    fn uncertainty(&self, column: usize) -> Option<f64> {
+        self.uncertainties.get(column).copied().flatten().filter(|u| u.is_finite())
+    }
+
+    // An uncertainty that rounds to nothing is under the last decimal, and not nothing.
+    fn cell_text(&self, column: usize, value: Option<f64>) -> String {
+        let text = self.value_text(value);
+        let Some(u) = self.uncertainty(column) else { return text };
+        let least = 10f64.powi(-(self.decimals as i32));
+        let digits = self.decimals;
+        match u < least / 2.0 {
+            true => format!("{text} \u{b1} <{least:.digits$}"),
+            false => format!("{text} \u{b1} {u:.digits$}"),
+        }
+    }
+
     fn value_text(&self, value: Option<f64>) -> String {
         let Some(value) = value.filter(|value| value.is_finite()) else { return "\u{2013}".into() };
         let text = format!("{value:.*}", self.decimals);
@@ -63,7 +82,7 @@ impl FigureTable {
         let _ = writeln!(out, "{} & {} \\\\\n\\hline\\hline", latex_text(&self.corner), heads.join(" & "));
         for row in &self.rows {
             let cells = row.values.iter().enumerate().map(|(column, value)| {
-                let text = latex_text(&row.value_text(*value).replace('-', "\u{2212}"));
+                let text = latex_text(&row.cell_text(column, *value).replace('-', "\u{2212}"));
                 match (self.column_extremes(column), value) {
                     (Some([low, _]), Some(value)) if low == *value => format!("{{\\cellcolor{QUIETEST}}}{text}"),
                     (Some([_, high]), Some(value)) if high == *value => format!("{{\\cellcolor{LOUDEST}}}{text}"),
@@ -77,16 +96,22 @@ impl FigureTable {
         out
     }
 
-    /// Returns the table as CSV, its notes in lines that begin with `#`. Values are not rounded.
+    /// Returns the table as CSV, its notes in lines that begin with `#`. Values are not rounded. Standard uncertainties
+    /// have columns of their own behind those of the values.
     pub fn to_csv(&self, notes: &FigureNotes) -> String {
         let mut out = comment_lines(notes, "# ");
-        let heads: Vec<_> = [&self.corner].into_iter().chain(&self.columns).map(|name| csv_text(name)).collect();
+        let has_uncertainties = self.rows.iter().any(|row| !row.uncertainties.is_empty());
+        let of_uncertainty = |name: &String| format!("standard uncertainty of {name}");
+        let uncertain = self.columns.iter().filter(|_| has_uncertainties).map(of_uncertainty);
+        let heads = [self.corner.clone()].into_iter().chain(self.columns.iter().cloned()).chain(uncertain);
+        let heads: Vec<_> = heads.map(|name| csv_text(&name)).collect();
         let _ = writeln!(out, "{}", heads.join(","));
         for row in &self.rows {
-            let known = row.values.iter().map(|value| value.filter(|value| value.is_finite()));
-            let values = known.map(|value| value.map_or_else(String::new, |v| v.to_string()));
+            let values = row.values.iter().map(|value| value.filter(|value| value.is_finite()));
+            let uncertain = (0..self.columns.len()).filter(|_| has_uncertainties).map(|i| row.uncertainty(i));
+            let numbers = values.chain(uncertain).map(|value| value.map_or_else(String::new, |v| v.to_string()));
             let name = if row.is_percent { format!("{}, %", row.name) } else { row.name.clone() };
-            let cells: Vec<_> = [csv_text(&name)].into_iter().chain(values).collect();
+            let cells: Vec<_> = [csv_text(&name)].into_iter().chain(numbers).collect();
             let _ = writeln!(out, "{}", cells.join(","));
         }
         out
@@ -100,7 +125,7 @@ impl FigureTable {
         let _ = writeln!(out, "| --- |{}", " ---: |".repeat(self.columns.len()));
         for row in &self.rows {
             let cells = row.values.iter().enumerate().map(|(column, value)| {
-                let text = row.value_text(*value).replace('-', "\u{2212}");
+                let text = row.cell_text(column, *value).replace('-', "\u{2212}");
                 match (self.column_extremes(column), value) {
                     (Some([low, _]), Some(value)) if low == *value => format!("*{text}*"),
                     (Some([_, high]), Some(value)) if high == *value => format!("**{text}**"),
@@ -131,6 +156,7 @@ fn latex_text(text: &str) -> String {
             '^' => out.push_str("\\textasciicircum{}"),
             '\u{2013}' => out.push_str("--"),
             '\u{2212}' => out.push_str("$-$"),
+            '\u{b1}' => out.push_str("$\\pm$"),
             other => out.push(other),
         }
     }
@@ -155,6 +181,7 @@ mod tests {
         let row = |name: &str, values: [Option<f64>; 2]| TableRow {
             name: name.into(),
             values: values.to_vec(),
+            uncertainties: Vec::new(),
             decimals: 2,
             is_percent: false,
         };
@@ -173,8 +200,8 @@ mod tests {
             \hline
             Panel & 2.5 kHz & Total \\
             \hline\hline
-            \emph{0015\_1} & {\cellcolor[rgb]{0.918,0.6,0.6}}$-$7.66 & 0.00 \\
-            \emph{0012\_1} & {\cellcolor[rgb]{0.714,0.843,0.659}}$-$7.80 & -- \\
+            \emph{0015\_1} & {\cellcolor[rgb]{0.992,0.89,0.722}}$-$7.66 & 0.00 \\
+            \emph{0012\_1} & {\cellcolor[rgb]{0.827,0.894,0.961}}$-$7.80 & -- \\
             \hline
             \end{tabular}
         "#]]
@@ -197,6 +224,21 @@ mod tests {
         "#]]
         .assert_eq(&table().to_markdown(&FigureNotes::default()));
     }
+
+    #[test]
+    fn uncertainties_are_beside_their_values() {
+        let mut table = table();
+        table.rows[0].uncertainties = vec![Some(0.0123), Some(0.004)];
+        assert!(table.to_markdown(&FigureNotes::default()).contains("| **−7.66 ± 0.01** | 0.00 ± <0.01 |"));
+        assert!(table.to_latex(&FigureNotes::default()).contains("$-$7.66 $\\pm$ 0.01 & 0.00 $\\pm$ \\textless{}0.01"));
+        expect![[r#"
+            Panel,2.5 kHz,Total,standard uncertainty of 2.5 kHz,standard uncertainty of Total
+            0015_1,-7.66,-0.001,0.0123,0.004
+            0012_1,-7.8,,,
+        "#]]
+        .assert_eq(&table.to_csv(&FigureNotes::default()));
+    }
+
     #[test]
     fn notes_stay_in_their_comment() {
         let notes = FigureNotes { title: "a --> b".into(), ..FigureNotes::default() };

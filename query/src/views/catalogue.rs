@@ -7,8 +7,9 @@ use echolake_schema::Rig;
 use super::{RE_FLAT_BAND, RE_FLAT_TOTAL, column_note};
 
 // Column of `surface_stats`, name of its columns here, unit and meaning.
-const STATS: [(&str, &str, &str, &str); 4] = [
+const STATS: [(&str, &str, &str, &str); 5] = [
     ("p90_mean_db", "level", RE_FLAT_TOTAL, "Mean of the TNCE values up to their 90th percentile"),
+    ("p90_mean_u_db", "level_u", "dB", "Standard uncertainty of level_*_db and of against_flat_*_db"),
     ("p5_db", "p5", RE_FLAT_TOTAL, "5th percentile of TNCE"),
     ("p95_db", "p95", RE_FLAT_TOTAL, "95th percentile of TNCE"),
     ("spread_db", "spread", "dB", "Standard deviation of TNCE in dB over the pairs"),

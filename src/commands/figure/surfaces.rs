@@ -31,7 +31,7 @@ pub(super) async fn write_grid(source: &FigureSource, args: &GridArgs) -> anyhow
     let surfaces = source.selected_surfaces(&args.selection).await?;
     source.require_levels(&surfaces).await?;
     let microphone = source.microphone_point(args.microphone.as_deref())?;
-    let over = LevelReference::from(args.over);
+    let over = LevelReference::from(args.reference.over);
     let rig = source.lake.rig();
     let labels = band_labels(rig);
     let keys = band_keys(rig);

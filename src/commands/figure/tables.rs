@@ -1,21 +1,13 @@
 //! The paper's tables.
 
-use std::collections::HashMap;
-
 use anyhow::Context as _;
 use echolake_figures::{FigureTable, TableRow};
-use echolake_query::figure_rows::{LevelReference, band_keys, band_labels, band_list, quote_literal};
+use echolake_query::figure_rows::{band_labels, band_list, quote_literal};
 use serde::Deserialize;
 
+use super::levels::{LevelKind, LevelTable, reference_name};
 use super::source::{FigureSource, SelectedSurface};
 use super::{TableArgs, ValuesArg};
-
-#[derive(Deserialize)]
-struct BandLevel {
-    surface_id: String,
-    band: String,
-    level_db: Option<f64>,
-}
 
 #[derive(Deserialize)]
 struct SurfaceMeans {
@@ -30,88 +22,34 @@ pub(super) async fn write_table(source: &FigureSource, args: &TableArgs) -> anyh
     let surfaces = source.selected_surfaces(&args.selection).await?;
     source.require_levels(&surfaces).await?;
     let base = source.base_surface(args.less.as_ref()).await?;
+    let kind = match args.values {
+        ValuesArg::Levels => Some(LevelKind::Measured),
+        ValuesArg::UnbiasedLevels => Some(LevelKind::Unbiased),
+        ValuesArg::Energies => None,
+    };
     anyhow::ensure!(
-        base.is_none() || args.values != ValuesArg::Energies,
+        base.is_none() || kind.is_some(),
         "--less subtracts levels, and --values energies has none; hint: leave one of them out"
     );
     for group in args.output.group_surfaces(&surfaces)? {
-        let (table, query) = match args.values {
-            ValuesArg::Levels => level_table(source, group, base.as_ref(), "p90_mean_db").await?,
-            ValuesArg::UnbiasedLevels => level_table(source, group, base.as_ref(), "unbiased_p90_mean_db").await?,
-            ValuesArg::Energies => energy_table(source, group).await?,
+        let (table, query, title) = match kind {
+            Some(kind) => {
+                let levels = LevelTable::read(source, group, base.as_ref(), kind, args.reference.over.into()).await?;
+                (levels.to_table(source), levels.query.clone(), levels.default_title())
+            }
+            None => {
+                let (table, query) = energy_table(source, group).await?;
+                (table, query, "Mean TNCE over all pairs, over Flat\u{2019}s total".to_owned())
+            }
         };
-        let title = args.output.title_or(|| default_title(args.values, group, base.as_ref()));
-        let notes = source.figure_notes(title, query, group.iter().chain(&base));
+        let notes = source.figure_notes(args.output.title_or(|| title), query, group.iter().chain(&base));
         args.output.write_table(&table, &notes, group)?;
     }
     Ok(())
 }
 
-fn default_title(values: ValuesArg, surfaces: &[SelectedSurface], base: Option<&SelectedSurface>) -> String {
-    let unit = level_unit(surfaces, base);
-    match values {
-        ValuesArg::Levels => format!("Mean TNCE of the values up to the 90th percentile, {unit}"),
-        ValuesArg::UnbiasedLevels => {
-            format!("Mean TNCE of the values up to the 90th percentile, {unit}, without Foam\u{2019}s reflection")
-        }
-        ValuesArg::Energies => "Mean TNCE over the pairs, over Flat\u{2019}s total".to_owned(),
-    }
-}
-
-// Levels less those of their Flat are over the same band.
-fn level_unit(surfaces: &[SelectedSurface], base: Option<&SelectedSurface>) -> String {
-    let Some(base) = base else { return LevelReference::FlatTotal.unit().to_owned() };
-    let id = &base.surface_id;
-    let is_flat = surfaces.iter().all(|surface| surface.flat_reference == *id && surface.surface_id != *id);
-    if is_flat { LevelReference::FlatBand.unit().to_owned() } else { format!("dB, less {id}") }
-}
-
 fn surface_list(surfaces: &[&str]) -> String {
     surfaces.iter().map(|name| quote_literal(name)).collect::<Vec<_>>().join(", ")
-}
-
-async fn level_table(
-    source: &FigureSource,
-    surfaces: &[SelectedSurface],
-    base: Option<&SelectedSurface>,
-    column: &str,
-) -> anyhow::Result<QueriedTable> {
-    let names: Vec<_> = surfaces.iter().map(|surface| surface.surface_id.as_str()).collect();
-    let base = base.map(|surface| surface.surface_id.as_str());
-    let all: Vec<_> = names.iter().copied().chain(base).collect();
-    let query = format!(
-        "select surface_id, band, {column} as level_db from surface_stats where surface_id in ({}) order by run_id",
-        surface_list(&all)
-    );
-    let rows: Vec<BandLevel> = source.query_rows(&query).await?;
-    // Of several runs of a surface, the newest counts.
-    let levels: HashMap<_, _> =
-        rows.iter().map(|row| ((row.surface_id.as_str(), row.band.as_str()), row.level_db)).collect();
-    let keys = band_keys(source.lake.rig());
-    let level = |surface: &str, band: &str| levels.get(&(surface, band)).copied().flatten();
-    let value = |surface: &str, band: &str| match base {
-        Some(base) if base != surface => Some(level(surface, band)? - level(base, band)?),
-        _ => level(surface, band),
-    };
-    let is_flat = |name: &str| surfaces.iter().any(|s| s.surface_id == name && s.flat_reference == name);
-    let row = |name: &&str| TableRow {
-        name: match base {
-            Some(base) if base != *name => format!("{name} less {base}"),
-            _ if is_flat(name) => reference_name(name),
-            _ => (*name).to_owned(),
-        },
-        values: keys.iter().map(|band| value(name, band)).collect(),
-        decimals: 2,
-        is_percent: false,
-    };
-    let table = FigureTable {
-        corner: "Surface".into(),
-        columns: band_labels(source.lake.rig()),
-        rows: names.iter().map(row).collect(),
-        // Levels and differences are not compared with each other.
-        with_extremes: base.is_none(),
-    };
-    Ok((table, query))
 }
 
 async fn energy_table(source: &FigureSource, surfaces: &[SelectedSurface]) -> anyhow::Result<QueriedTable> {
@@ -146,6 +84,7 @@ async fn energy_table(source: &FigureSource, surfaces: &[SelectedSurface]) -> an
         table_rows.push(TableRow {
             name: format!("{}, difference", surface.surface_id),
             values: own.means.iter().zip(&flat.means).map(change).collect(),
+            uncertainties: Vec::new(),
             decimals: 1,
             is_percent: true,
         });
@@ -154,11 +93,6 @@ async fn energy_table(source: &FigureSource, surfaces: &[SelectedSurface]) -> an
     Ok((FigureTable { corner: "Surface".into(), columns, rows: table_rows, with_extremes: false }, query))
 }
 
-// Flat over itself is 0 dB by definition: no reader is to take it for a measurement.
-fn reference_name(flat: &str) -> String {
-    format!("{flat} (reference)")
-}
-
 fn energy_row(name: &str, values: Vec<Option<f64>>) -> TableRow {
-    TableRow { name: name.to_owned(), values, decimals: 3, is_percent: false }
+    TableRow { name: name.to_owned(), values, uncertainties: Vec::new(), decimals: 3, is_percent: false }
 }

@@ -1238,6 +1238,11 @@ export interface components {
              *     `lake.bands`, the total last; null if there is no value.
              */
             readonly level_db: readonly (number | null)[];
+            /**
+             * @description Standard uncertainty of `level_db` and of `against_flat_db`, dB, by noise, subtraction and air of the run and of
+             *     Flat's; null if it is not known.
+             */
+            readonly level_u_db: readonly (number | null)[];
             readonly macrostructure: string | null;
             readonly material: string;
             readonly mesostructure: string | null;

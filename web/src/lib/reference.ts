@@ -20,14 +20,18 @@ export const unitOf = (over: LevelReference) => REFERENCES.find(({ key }) => key
 export const difference = (level: number | null | undefined, less: number | null | undefined) =>
   level === null || level === undefined || less === null || less === undefined ? null : level - less
 
-/** The difference of a surface's mean energy in a band from Flat's, %. */
-export function energyChange(d: SurfaceDetail, band: number): number | null {
-  const [own, flat] = [d.mean[band], d.flat_mean[band]]
-  return own !== null && flat ? 100 * (own / flat - 1) : null
+/** The level of the mean over all pairs, which a few loud pairs raise. */
+export function plainMeanLevel(over: LevelReference, d: SurfaceDetail, band: number): number | null {
+  const [own, flat] = [d.mean[band], over === 'flat-total' ? 1 : d.flat_mean[band]]
+  return own && flat ? 10 * Math.log10(own / flat) : null
 }
 
 /** Flat over itself is 0 dB by definition: pages write `reference` in place of a number that looks measured. */
 export const isItsReference = (surface: Surface) => surface.surface_id === surface.flat_reference
+
+/** The standard uncertainty of a surface's level in a band. It holds Flat's share; Flat over itself has none. */
+export const uncertaintyOf = (surface: Surface, band: number) =>
+  isItsReference(surface) ? null : surface.level_u_db[band]
 
 /** The class of a difference that is over or under nothing. */
 export const tone = (value: number | null) =>

@@ -313,7 +313,7 @@ fn filter_outcome(filters: &[SurfaceFilter<'_>], entry: &SurfaceEntry) -> Filter
     responses((status = 200, description = "OK", body = SurfacePage)),
     extensions(("x-sql" = json!([
         "select s.*, r.started from surfaces s left join runs r using (run_id)",
-        "select surface_id, band, p90_mean_db, spread_db from surface_stats",
+        "select surface_id, band, p90_mean_db, p90_mean_u_db, spread_db from surface_stats",
     ])))
 )]
 pub(super) async fn surfaces(

@@ -36,9 +36,12 @@ pub(crate) struct SurfaceSummary {
     pub relief_rms_mm: Option<f64>,
     /// Mean TNCE of the values up to the 90th percentile, dB re Flat total. One value per band in the order of
     /// `lake.bands`, the total last; null if there is no value.
-    level_db: Vec<Option<f64>>,
+    pub level_db: Vec<Option<f64>>,
     /// `level_db` less that of the surface's Flat.
     pub against_flat_db: Vec<Option<f64>>,
+    /// Standard uncertainty of `level_db` and of `against_flat_db`, dB, by noise, subtraction and air of the run and of
+    /// Flat's; null if it is not known.
+    pub level_u_db: Vec<Option<f64>>,
     /// Standard deviation of the pairs' TNCE in dB, by band as `level_db`.
     pub spread_db: Vec<Option<f64>>,
 }
@@ -129,11 +132,12 @@ pub(crate) struct BandStatistic {
     surface_id: String,
     band: String,
     p90_mean_db: Option<f64>,
+    p90_mean_u_db: Option<f64>,
     spread_db: Option<f64>,
 }
 
-/// Level and spread of a surface by band.
-type SurfaceLevels = HashMap<String, HashMap<String, (Option<f64>, Option<f64>)>>;
+/// Statistics of a surface by band.
+type SurfaceLevels = HashMap<String, HashMap<String, BandStatistic>>;
 
 /// The query of [`SurfaceRow`].
 pub(crate) const SURFACES: &str = "select s.surface_id, s.run_id, s.panel, s.side, s.typology, s.macrostructure, \
@@ -142,14 +146,14 @@ pub(crate) const SURFACES: &str = "select s.surface_id, s.run_id, s.panel, s.sid
     r.started_ns from surfaces s left join runs r on r.run_id = s.run_id order by s.surface_id, s.run_id";
 /// The query of [`BandStatistic`].
 pub(crate) const BAND_STATISTICS: &str =
-    "select surface_id, band, p90_mean_db, spread_db from surface_stats order by surface_id, run_id";
+    "select surface_id, band, p90_mean_db, p90_mean_u_db, spread_db from surface_stats order by surface_id, run_id";
 
 impl CatalogueSummary {
     /// The surfaces of the rows of [`SURFACES`] with the statistics of [`BAND_STATISTICS`].
     pub fn new(rows: Vec<SurfaceRow>, statistics: Vec<BandStatistic>, bands: Vec<BandDescription>) -> Self {
         let mut levels = SurfaceLevels::new();
         for stat in statistics {
-            levels.entry(stat.surface_id).or_default().insert(stat.band, (stat.p90_mean_db, stat.spread_db));
+            levels.entry(stat.surface_id.clone()).or_default().insert(stat.band.clone(), stat);
         }
         // The newest of several rows counts, as run names sort by time.
         let newest: HashMap<_, _> = rows.into_iter().map(|row| (row.surface_id.clone(), row)).collect();
@@ -166,13 +170,13 @@ impl CatalogueSummary {
 }
 
 fn surface_entry(row: SurfaceRow, levels: &SurfaceLevels, bands: &[BandDescription]) -> SurfaceEntry {
-    let of = |surface: &str| -> Vec<_> {
+    let statistics = |surface: &str| -> Vec<_> {
         let own = levels.get(surface);
-        bands.iter().map(|band| own.and_then(|own| own.get(&band.key)).copied().unwrap_or_default()).collect()
+        bands.iter().map(|band| own.and_then(|own| own.get(&band.key))).collect()
     };
-    let own = of(&row.surface_id);
-    let flat = of(&row.flat_reference);
-    let against = own.iter().zip(&flat).map(|(own, flat)| Some(own.0? - flat.0?)).collect();
+    let own = statistics(&row.surface_id);
+    let flat = statistics(&row.flat_reference);
+    let against = own.iter().zip(&flat).map(|(own, flat)| Some((*own)?.p90_mean_db? - (*flat)?.p90_mean_db?)).collect();
     let parameters = row.parameters.unwrap_or_default();
     let some = |text: &Option<String>| text.clone().unwrap_or_default();
     let words = [
@@ -209,9 +213,10 @@ fn surface_entry(row: SurfaceRow, levels: &SurfaceLevels, bands: &[BandDescripti
             relief_min_mm: row.relief_min_mm,
             relief_max_mm: row.relief_max_mm,
             relief_rms_mm: row.relief_rms_mm,
-            level_db: own.iter().map(|own| own.0).collect(),
+            level_db: own.iter().map(|own| (*own)?.p90_mean_db).collect(),
             against_flat_db: against,
-            spread_db: own.iter().map(|own| own.1).collect(),
+            level_u_db: own.iter().map(|own| (*own)?.p90_mean_u_db).collect(),
+            spread_db: own.iter().map(|own| (*own)?.spread_db).collect(),
         },
     }
 }

@@ -1,0 +1,178 @@
+//! Levels of surfaces by band with their standard uncertainties, as tables and as a chart.
+
+use std::collections::HashMap;
+
+use echolake_figures::{FigureTable, TableRow};
+use echolake_query::figure_rows::{LevelReference, TOTAL_BAND, band_keys, band_labels, quote_literal};
+use serde::Deserialize;
+
+use super::source::{FigureSource, SelectedSurface};
+
+#[derive(Deserialize)]
+struct LevelRow {
+    surface_id: String,
+    band: String,
+    level_db: Option<f64>,
+    u_db: Option<f64>,
+}
+
+/// A level and its standard uncertainty, dB.
+#[derive(Debug, Clone, Copy)]
+struct LevelValue {
+    level_db: f64,
+    u_db: Option<f64>,
+}
+
+/// The mean that stands for a surface's pairs in a band, by its column of `surface_stats`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum LevelKind {
+    /// Of the TNCE values up to their 90th percentile.
+    Measured,
+    /// The same without Foam's own reflection.
+    Unbiased,
+}
+
+impl LevelKind {
+    fn columns(self) -> [&'static str; 2] {
+        match self {
+            Self::Measured => ["p90_mean_db", "p90_mean_u_db"],
+            Self::Unbiased => ["unbiased_p90_mean_db", "unbiased_p90_mean_u_db"],
+        }
+    }
+}
+
+/// Levels of surfaces and of their Flats.
+pub(super) struct LevelTable<'a> {
+    surfaces: &'a [SelectedSurface],
+    base: Option<&'a SelectedSurface>,
+    kind: LevelKind,
+    over: LevelReference,
+    values: HashMap<(String, String), LevelValue>,
+    /// The query that reads them.
+    pub query: String,
+}
+
+impl<'a> LevelTable<'a> {
+    /// Reads the levels of surfaces. If there is a base, its levels are to be subtracted from those of the others.
+    ///
+    /// # Errors
+    /// Those of the query.
+    pub async fn read(
+        source: &FigureSource,
+        surfaces: &'a [SelectedSurface],
+        base: Option<&'a SelectedSurface>,
+        kind: LevelKind,
+        over: LevelReference,
+    ) -> anyhow::Result<Self> {
+        let mut names: Vec<_> = surfaces.iter().chain(base).map(|surface| surface.surface_id.as_str()).collect();
+        if over == LevelReference::FlatBand {
+            names.extend(surfaces.iter().chain(base).map(|surface| surface.flat_reference.as_str()));
+        }
+        let list: Vec<_> = names.iter().enumerate().filter(|(i, name)| !names[..*i].contains(name)).collect();
+        let list: Vec<_> = list.into_iter().map(|(_, name)| quote_literal(name)).collect();
+        let [level, u] = kind.columns();
+        let query = format!(
+            "select surface_id, band, {level} as level_db, {u} as u_db from surface_stats where surface_id in ({}) \
+             order by run_id",
+            list.join(", ")
+        );
+        let rows: Vec<LevelRow> = source.query_rows(&query).await?;
+        // Of several runs of a surface, the newest counts.
+        let mut values = HashMap::new();
+        for row in rows {
+            let value = row.level_db.map(|level_db| LevelValue { level_db, u_db: row.u_db });
+            let key = (row.surface_id, row.band);
+            match value {
+                Some(value) => values.insert(key, value),
+                None => values.remove(&key),
+            };
+        }
+        Ok(Self { surfaces, base, kind, over, values, query })
+    }
+
+    fn stored_value(&self, surface: &str, band: &str) -> Option<LevelValue> {
+        self.values.get(&(surface.to_owned(), band.to_owned())).copied()
+    }
+
+    // The uncertainty of a level holds Flat's share, so that nothing is added for Flat; that of the estimate of Foam's
+    // reflection is each surface's own.
+    fn level_value(&self, surface: &SelectedSurface, band: &str) -> Option<LevelValue> {
+        let own = self.stored_value(&surface.surface_id, band)?;
+        let is_flat = surface.surface_id == surface.flat_reference;
+        match (self.over, is_flat) {
+            (LevelReference::FlatBand, true) => Some(LevelValue { level_db: 0.0, u_db: None }),
+            (LevelReference::FlatTotal, true) if band == TOTAL_BAND => Some(LevelValue { u_db: None, ..own }),
+            (LevelReference::FlatTotal, _) => Some(own),
+            (LevelReference::FlatBand, false) => {
+                let flat = self.stored_value(&surface.flat_reference, band)?;
+                let flat_u = if self.kind == LevelKind::Unbiased { flat.u_db } else { Some(0.0) };
+                Some(LevelValue { level_db: own.level_db - flat.level_db, u_db: Some(own.u_db?.hypot(flat_u?)) })
+            }
+        }
+    }
+
+    // Both uncertainties hold the share of the Flat that the surfaces have in common, so that theirs is an upper bound.
+    fn shown_value(&self, surface: &SelectedSurface, band: &str) -> Option<LevelValue> {
+        let own = self.level_value(surface, band)?;
+        let Some(base) = self.base.filter(|base| base.surface_id != surface.surface_id) else { return Some(own) };
+        let other = self.level_value(base, band)?;
+        let is_flat = base.surface_id == surface.flat_reference && self.kind == LevelKind::Measured;
+        let other_u = if is_flat { Some(0.0) } else { other.u_db.or(Some(0.0)) };
+        let u_db = own.u_db.zip(other_u).map(|(own, other)| own.hypot(other));
+        Some(LevelValue { level_db: own.level_db - other.level_db, u_db })
+    }
+
+    // Flat over itself is 0 dB by definition: no reader is to take it for a measurement.
+    fn row_name(&self, surface: &SelectedSurface) -> String {
+        let name = &surface.surface_id;
+        match self.base {
+            Some(base) if base.surface_id != *name => format!("{name} less {}", base.surface_id),
+            _ if *name == surface.flat_reference => reference_name(name),
+            _ => name.clone(),
+        }
+    }
+
+    /// Returns one row per surface and one column per band.
+    pub fn to_table(&self, source: &FigureSource) -> FigureTable {
+        let keys = band_keys(source.lake.rig());
+        let mut rows = Vec::new();
+        for surface in self.surfaces {
+            let values: Vec<_> = keys.iter().map(|band| self.shown_value(surface, band)).collect();
+            let uncertainties: Vec<_> = values.iter().map(|value| (*value)?.u_db).collect();
+            let is_known = uncertainties.iter().any(Option::is_some);
+            rows.push(TableRow {
+                name: self.row_name(surface),
+                values: values.iter().map(|value| Some((*value)?.level_db)).collect(),
+                uncertainties: if is_known { uncertainties } else { Vec::new() },
+                decimals: 2,
+                is_percent: false,
+            });
+        }
+        FigureTable {
+            corner: "Surface".into(),
+            columns: band_labels(source.lake.rig()),
+            rows,
+            // Levels and differences are not compared with each other.
+            with_extremes: self.base.is_none(),
+        }
+    }
+
+    /// Returns the title of the levels, with their unit.
+    pub fn default_title(&self) -> String {
+        let without = if self.kind == LevelKind::Unbiased { ", without Foam\u{2019}s reflection" } else { "" };
+        format!("Mean TNCE of the values up to the 90th percentile, {}{without}", self.unit())
+    }
+
+    // Levels less those of their Flat are over the same band.
+    fn unit(&self) -> String {
+        let Some(base) = self.base else { return self.over.unit().to_owned() };
+        let id = &base.surface_id;
+        let is_flat = self.surfaces.iter().all(|surface| surface.flat_reference == *id && surface.surface_id != *id);
+        if is_flat { LevelReference::FlatBand.unit().to_owned() } else { format!("dB, less {id}") }
+    }
+}
+
+/// Returns the name of a Flat in a table.
+pub(super) fn reference_name(flat: &str) -> String {
+    format!("{flat} (reference)")
+}
