@@ -186,8 +186,12 @@ impl<T: RealSample> ResidualFit<T> {
         let derivative = self.filtered_signal(&spectrum, |bin| Complex::new(0.0, bin_angle(bin, self.len)))?;
         let gate = |n: usize| {
             let secs = n as f64 / self.rate_hz - (reflected_secs - GATE_SECS[0]);
-            let fall = (secs / (GATE_SECS[0] - GATE_SECS[1])).clamp(0.0, 1.0);
-            0.5 + 0.5 * (std::f64::consts::PI * fall).cos()
+            let fall = secs / (GATE_SECS[0] - GATE_SECS[1]);
+            match fall {
+                ..=0.0 => 1.0,
+                0.0..1.0 => 0.5 + 0.5 * (std::f64::consts::PI * fall).cos(),
+                _ => 0.0,
+            }
         };
         // Least squares of gain x direct - delay x derivative.
         let [mut dd, mut ds, mut ss, mut xd, mut xs] = [0.0; 5];

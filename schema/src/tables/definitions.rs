@@ -211,11 +211,11 @@ pub(super) fn nce_columns(bands: &[String]) -> Vec<Column> {
     columns.push(Column::floats(
         "reflected_ir",
         "1",
-        "Impulse response with Foam's subtracted; rounded to 2^-18 of its greatest sample, unless lake.toml says exact",
+        "Impulse response with Foam's subtracted; rounded to 2^-16 of its greatest sample, unless lake.toml says exact",
     ));
     columns.extend(bands.iter().map(|band| {
         let comment = format!(
-            "Cumulative energy of the band at {band} Hz over Flat's total energy, along time; rounded to 2^-18 of its last \
+            "Cumulative energy of the band at {band} Hz over Flat's total energy, along time; rounded to 2^-16 of its last \
              value, unless lake.toml says exact"
         );
         Column::floats(format!("nce_{band}"), "1", comment)

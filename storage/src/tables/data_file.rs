@@ -122,9 +122,9 @@ pub fn encode_batches(table: Table, schema: &SchemaRef, batches: &[RecordBatch])
 // Samples do not repeat, so a dictionary only costs; their bytes by significance compress best
 // (measured on dB spectra: 0.74 of raw f32 against 1.00 with the defaults).
 //
-// Single numbers are not compressed (zstd makes them an eighth smaller): a reader copies them, and makes no decompressor
-// for each column of each file, which takes longer than reading three thousand of them. Those of `tnce_d4` have a
-// dictionary: a row has most of its numbers from the seven beside it.
+// Single values of measurements are not compressed (zstd makes them an eighth smaller): a reader copies them, and makes
+// no decompressor for each column of each file, which takes longer than reading three thousand of them. Numbers of
+// `tnce_d4` have a dictionary: a row has most of its numbers from the seven beside it.
 fn writer_properties(table: Table, schema: &SchemaRef, first: &RecordBatch) -> WriterProperties {
     let rows = first.num_rows();
     let bytes = first.get_array_memory_size();
@@ -135,10 +135,11 @@ fn writer_properties(table: Table, schema: &SchemaRef, first: &RecordBatch) -> W
         .set_data_page_size_limit(PAGE_BYTES)
         .set_max_row_group_row_count(Some(rows_a_group))
         .set_statistics_enabled(EnabledStatistics::Page);
+    let of_measurements = matches!(table, Table::Measurements | Table::Nce | Table::Tnce | Table::TnceD4);
     for field in schema.fields() {
         let name = field.name().clone();
         let kind = field.data_type();
-        if kind.is_numeric() {
+        if kind.is_numeric() || (of_measurements && !kind.is_nested()) {
             builder = builder.set_column_compression(ColumnPath::from(name.as_str()), Compression::UNCOMPRESSED);
         }
         if name == PAIR {
