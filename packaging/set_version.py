@@ -22,6 +22,7 @@ def main() -> None:
     replace(folder / "Cargo.lock", rf'(^name = "echolake(?:-[a-z-]+)?"\nversion = "){old}"', version + '"')
     replace(folder / "web/package.json", rf'(^  "version": "){old}"', version + '"', times=1)
     replace(folder / "web/package-lock.json", rf'(^ +"name": "echolake-web",\n +"version": "){old}"', version + '"')
+    replace(folder / "CITATION.cff", rf"(^version: ){old}$", version, times=1)
     cut_changelog(folder / "CHANGELOG.md", version)
 
 

@@ -47,9 +47,15 @@ use crate::commands::upkeep::vacuum::{self, VacuumArgs};
 use crate::commands::upload::{self, UploadArgs};
 use crate::logging::{FORMAT_VARIABLE, LogFormat};
 
+/// What to try first, in the help of the program, which a call without a command prints.
+#[cfg(feature = "lake")]
+const FIRST: &str = "Try first: `echolake demo` measures six surfaces with the simulated rig and serves the catalogue \
+                     of them; then `echolake sql` and `echolake doctor`.";
+
 /// A data lake and catalogue for sweep measurements.
 #[derive(Debug, Parser)]
 #[command(version, max_term_width = 100)]
+#[cfg_attr(feature = "lake", command(after_help = FIRST))]
 pub(crate) struct CliArguments {
     /// The lake: a folder, a file:// URL or s3://bucket/prefix.
     #[arg(long, global = true, env = "ECHOLAKE_LAKE", default_value = "lake", value_name = "URL")]

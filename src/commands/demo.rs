@@ -92,7 +92,7 @@ pub(crate) async fn run_demo(args: &DemoArgs, lake_url: &str) -> anyhow::Result<
         None => print_tables(&lake).await?,
     };
     eprintln!("\ndone in {:.0} s. Next:", begun.elapsed().as_secs_f64());
-    print_next(lake_url, example);
+    print_next(lake_url, example, args.no_serve);
     if args.no_serve {
         return Ok(CommandOutcome::Whole);
     }
@@ -123,18 +123,20 @@ fn lake_flag(lake_url: &str) -> String {
     if lake_url == "lake" { String::new() } else { format!("--lake {lake_url} ") }
 }
 
-fn print_next(lake_url: &str, example: &str) {
+fn print_next(lake_url: &str, example: &str, with_serve: bool) {
     let flag = lake_flag(lake_url);
     let measurements = format!(
         "sql \"select pair_id, snr_db, array_max(ir) from measurements where surface_id = '{example}' limit 5\""
     );
-    for next in [
+    let serve = with_serve.then_some("serve");
+    let others = [
         "sql \"select surface_id, p90_mean_db, spread_db from surface_stats where band = 'total'\"",
         &measurements,
         "acquire --surface foam_2 --panel foam --seed 2",
         "ingest",
         "doctor",
-    ] {
+    ];
+    for next in serve.into_iter().chain(others) {
         eprintln!("  {} {flag}{next}", program_command());
     }
 }

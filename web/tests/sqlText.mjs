@@ -3,7 +3,9 @@ import assert from 'node:assert/strict'
 import { createServer } from 'vite'
 
 const vite = await createServer({ server: { middlewareMode: true, ws: false }, appType: 'custom', logLevel: 'error' })
-const { queryOf, splitStatements, statementAt } = await vite.ssrLoadModule('/src/lib/statements.ts')
+const { placedError, queryOf, splitStatements, statementAt } = await vite.ssrLoadModule('/src/lib/statements.ts')
+const { ApiError } = await vite.ssrLoadModule('/src/lib/api.ts')
+const { nearestNames } = await vite.ssrLoadModule('/src/lib/suggest.ts')
 const { chooseRows, numberFormat } = await vite.ssrLoadModule('/src/lib/resultRows.ts')
 const { compareNames, seriesOf } = await vite.ssrLoadModule('/src/lib/series.ts')
 
@@ -24,6 +26,15 @@ for (const [text, expected] of [
     expected,
     text,
   )
+assert.deepEqual(nearestNames('/nowhere', ['/compare', '/operations']), [])
+assert.deepEqual(nearestNames('/compair', ['/compare', '/operations']), ['/compare'])
+const wrong = 'select 1;\nselect 2; select\nx'
+const placeOf = (index, place) =>
+  placedError(new ApiError(400, 'query_invalid', `no column ${place}`, ''), wrong, splitStatements(wrong)[index])
+    .message
+assert.equal(placeOf(0, '(line 1, column 8)'), 'no column (line 1, column 8)')
+assert.equal(placeOf(2, '(line 1, column 8)'), 'no column (line 2, column 18)')
+assert.equal(placeOf(2, '(line 2, column 1)'), 'no column (line 3, column 1)')
 const two = splitStatements('select 1;\nselect 2;\n')
 assert.deepEqual(
   [0, 8, 9, 10, 18, 19, 20].map((position) => statementAt(two, position)),

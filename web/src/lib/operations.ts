@@ -81,6 +81,15 @@ where ${QUERY_FILTERS[filter]} and coalesce(statement, '') not like '${MARK}%'
 order by outcome <> 'running', started desc
 limit ${most}`
 
+export interface RunningQueries {
+  readonly running: number
+}
+
+/** What the list counts, which the figure of the server does not: it has this page's own queries in it. */
+export const RUNNING_QUERY = `select count(*) as running
+from system.queries
+where ${QUERY_FILTERS.running} and coalesce(statement, '') not like '${MARK}%'`
+
 export const CONNECTIONS_QUERY = `select id, client, protocol, peer, started, requests, is_working
 from system.connections
 order by is_working desc, started`

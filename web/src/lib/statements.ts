@@ -41,6 +41,16 @@ export function splitStatements(text: string): Statement[] {
   return found
 }
 
+/** An error of a statement, its place counted from the beginning of the text that the statement is in. */
+export function placedError(error: ApiError, text: string, { from, text: own }: Statement): ApiError {
+  const before = text.slice(0, text.indexOf(own, from)).split('\n')
+  const message = error.message.replace(/\(line (\d+), column (\d+)\)/, (_, line: string, column: string) => {
+    const first = line === '1' ? [...before[before.length - 1]].length : 0
+    return `(line ${Number(line) + before.length - 1}, column ${Number(column) + first})`
+  })
+  return new ApiError(error.status, error.code, message, error.hint)
+}
+
 /** The index of the statement that a cursor is in, or behind. */
 export function statementAt(statements: readonly Statement[], position: number): number {
   const at = statements.findIndex(({ to }) => position <= to)

@@ -14,7 +14,7 @@ function distance(a: string, b: string): number {
 
 const MOST = 3
 
-/** The names nearest to what was asked for, at most half of which is edited. */
+/** The names nearest to what was asked for, at most a third of which is edited. */
 export function nearestNames(wanted: string, names: readonly string[]): string[] {
   const asked = wanted.toLowerCase()
   return names
@@ -22,7 +22,7 @@ export function nearestNames(wanted: string, names: readonly string[]): string[]
       const own = name.toLowerCase()
       return { name, far: own.includes(asked) ? 0 : distance(asked, own) }
     })
-    .filter(({ far }) => far <= Math.max(1, asked.length / 2))
+    .filter(({ far }) => far <= Math.max(1, asked.length / 3))
     .sort((a, b) => a.far - b.far)
     .slice(0, MOST)
     .map(({ name }) => name)
