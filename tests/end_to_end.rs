@@ -225,8 +225,20 @@ mod slow {
         let columns = place.ok(&["sql", "\\d surface_stats"]);
         let level = columns.lines().find(|line| line.starts_with("p90_mean_db ")).expect("a line per column");
         assert!(level.contains("dB re Flat total"), "{level}");
+        let script = "\\d surface_stats\nselect ';' as a; -- two in a line\nselect x; select 3 as b;\n";
+        std::fs::write(place.path("script.sql"), script.replace("select x", "select 2 as c") + "\\q\nselect x")
+            .expect("written");
+        let answers = place.ok(&["sql", "-f", "script.sql"]);
+        assert!(answers.starts_with(&columns), "{answers}");
+        let values = ["| ; |", "| 2 |", "| 3 |"].map(|value| answers.find(value).expect(value));
+        assert!(values.is_sorted(), "{answers}");
+        let failed = place.run(&["sql", "--format", "csv", &script.replace("\\d surface_stats", "")]);
+        assert_eq!((failed.status.code(), failed.stdout.as_slice()), (Some(1), "a\n;\n".as_bytes()));
+        let place_of_error = "statement 2 of 3: no column `x` (line 3, column 8)\n  select x\n         ^";
+        assert!(crate::stderr(&failed).contains(place_of_error), "{}", crate::stderr(&failed));
+        place.fails(1, &["sql", "-o", "answer", "select 1; select 2"], "the script has 2");
         place.fails(1, &["sql", "\\d nothing"], "no table `nothing`");
-        place.fails(1, &["sql", "\\timing"], "prompt");
+        place.fails(1, &["sql", "\\z"], "no command `\\z`");
         place.fails(1, &["sql", "--json", "\\d"], "--json");
     }
 }

@@ -4,6 +4,13 @@
 #[path = "../src/commands/sql/prompt/command.rs"]
 #[allow(dead_code, reason = "the prompt's, which wants more of it than its tests")]
 mod command;
+#[path = "../src/commands/sql/script.rs"]
+#[allow(dead_code, reason = "the prompt's, which wants more of it than its tests")]
+mod script;
 #[path = "../src/commands/sql/prompt/words.rs"]
 #[allow(dead_code, reason = "the prompt's, which wants more of it than its tests")]
 mod words;
+#[expect(clippy::module_inception, reason = "the script names its place in the command")]
+mod prompt {
+    pub(super) use super::command;
+}

@@ -349,11 +349,11 @@ fn find_mcap_calls(statement: &mut Statement, calls: &mut McapCalls) {
 fn mcap_failed(error: DataFusionError) -> Error {
     match error {
         DataFusionError::Plan(_) => Error::from_planning("", &error),
-        DataFusionError::Execution(message) => Error::Execution { message },
+        DataFusionError::Execution(message) => Error::failed_query(&message),
         other => execution_error(other),
     }
 }
 
 fn execution_error(error: DataFusionError) -> Error {
-    Error::from_execution(&error)
+    Error::from_execution("", &error)
 }

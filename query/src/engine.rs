@@ -14,11 +14,12 @@ use datafusion::execution::memory_pool::GreedyMemoryPool;
 use datafusion::execution::object_store::{DefaultObjectStoreRegistry, ObjectStoreRegistry as _, ObjectStoreUrl};
 use datafusion::execution::runtime_env::{RuntimeEnv, RuntimeEnvBuilder};
 use datafusion::execution::session_state::{SessionState, SessionStateBuilder};
+use datafusion::functions_nested::min_max::array_min_udf;
 use datafusion::logical_expr::Documentation;
 use datafusion::optimizer::OptimizerRule;
 use datafusion::physical_plan::ExecutionPlan;
 use datafusion::prelude::{SessionConfig, SessionContext};
-use echolake_functions::{FunctionSet, octet_length_of_bytes, pattern_functions};
+use echolake_functions::{FunctionSet, octet_length_of_bytes, pattern_functions, whole_number_ranges};
 use echolake_lake::Lake;
 use echolake_lake_tables::{FileReaders, LakeReaderFactory, SmallTables};
 use futures::FutureExt as _;
@@ -110,13 +111,13 @@ impl QueryEngine {
     /// # Errors
     /// [`Error::Execution`] if DataFusion cannot be set up.
     pub fn new(lake: &Lake, memory: Option<usize>) -> Result<Self, Error> {
-        let failed = |e: DataFusionError| Error::from_execution(&e);
+        let failed = |e: DataFusionError| Error::from_execution("", &e);
         let url = ObjectStoreUrl::parse(STORE).map_err(failed)?;
         let runtime = build_runtime(lake, &url, memory).map_err(failed)?;
         let metadata = runtime.cache_manager.get_file_metadata_cache();
         let reader = Arc::new(LakeReaderFactory::new(lake, metadata));
-        let functions = FunctionSet::all(lake.rig()).map_err(|e| Error::Execution { message: e.to_string() })?;
-        let threads = |e: std::io::Error| Error::Execution { message: format!("no threads for queries: {e}") };
+        let functions = FunctionSet::all(lake.rig()).map_err(|e| Error::failed_query(&e.to_string()))?;
+        let threads = |e: std::io::Error| Error::failed_query(&format!("no threads for queries: {e}"));
         let footer_bytes = lake.is_remote().then_some(REMOTE_FOOTER_BYTES);
         let small = Arc::new(SmallTables::new(lake));
         let restricted = lake.is_restricted().then(|| lake.clone());
@@ -284,6 +285,11 @@ fn build_template(
         SessionStateBuilder::new().with_config(session_config()).with_runtime_env(runtime).with_default_features();
     let mut state = rules.into_iter().fold(builder, SessionStateBuilder::with_optimizer_rule).build();
     let _ = state.register_udf(Arc::new(octet_length_of_bytes()));
+    for function in whole_number_ranges() {
+        let _ = state.register_udf(Arc::new(function));
+    }
+    // DuckDB's name, as `list_max`, which DataFusion has.
+    let _ = state.register_udf(Arc::new(array_min_udf().as_ref().clone().with_aliases(["list_min"])));
     for function in pattern_functions(state.config_options()) {
         let _ = state.register_udf(Arc::new(function));
     }
@@ -344,12 +350,12 @@ impl Drop for StopOnDrop {
 
 /// Returns the error for an engine that has ended.
 pub(crate) fn ended_error() -> Error {
-    Error::Execution { message: "the query service has ended".to_owned() }
+    Error::failed_query("the query service has ended")
 }
 
 /// Returns the error for a panic.
 pub(crate) fn defect_error() -> Error {
-    Error::Execution { message: "a defect ended it".to_owned() }
+    Error::failed_query("a defect ended it")
 }
 
 #[cfg(test)]

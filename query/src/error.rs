@@ -16,7 +16,7 @@ use echolake_schema::tables::Table;
 use echolake_schema::{ErrorCause, escape_controls};
 
 use crate::control::StopReason;
-use crate::statement::hints;
+use crate::statement::{find_cast, hints};
 
 /// Minimum similarity of a suggested name: half of the letters, as in DataFusion's own suggestions.
 const ALIKE: f64 = 0.5;
@@ -64,10 +64,14 @@ pub enum Error {
         statement: String,
     },
     /// The query is valid, and failed while it ran.
-    #[error("the query failed: {message}")]
+    #[error("the query failed: {message}{}", place_and_hint(place.as_ref(), hint.as_deref()))]
     Execution {
         /// The cause.
         message: String,
+        /// The place in the query, if it is known.
+        place: Option<QueryPlace>,
+        /// A suggestion.
+        hint: Option<String>,
     },
     /// The client cancelled it.
     #[error("the query was cancelled")]
@@ -125,11 +129,14 @@ impl Error {
         if let DataFusionError::SchemaError(schema, _) = error.find_root()
             && let SchemaError::FieldNotFound { field, .. } = schema.as_ref()
         {
-            hint = hints::of_alias(sql, &field.name).or(hint);
+            let similar = hint.take_if(|hint| hint.starts_with("did you mean"));
+            let own = hints::of_alias(sql, &field.name).or(similar).or_else(|| hints::of_quoted_name(sql, &field.name));
+            hint = own.or(hint);
         }
         let span = error.diagnostic().and_then(|d| d.span).map(|s| (s.start.line, s.start.column));
         let (message, parsed) = without_place(sql, &message);
         let place = span.or(parsed).and_then(|(line, column)| query_place(sql, line, column));
+        let place = place.or_else(|| cast_place(sql, &message));
         let (message, hint) = match message.split_once("; hint: ") {
             Some((message, own)) => (message.to_owned(), own.to_owned()),
             None => {
@@ -167,16 +174,29 @@ impl Error {
         Self::Query { message: format!("not supported: {clause}"), place, hint: Some(hint) }
     }
 
-    /// Converts an error of running a query.
-    pub(crate) fn from_execution(error: &DataFusionError) -> Self {
+    /// Converts an error of running `sql`, which is empty if the error is not of a statement.
+    pub(crate) fn from_execution(sql: &str, error: &DataFusionError) -> Self {
         Self::from_root_cause(error).unwrap_or_else(|| {
             let message = explain_error(error).0;
             if let Some(damaged) = damaged_file(&message) {
                 return damaged.into();
             }
-            let message = store_fault(&message).unwrap_or_else(|| hints::with_hint(message));
-            Self::Execution { message: escape_controls(&message) }
+            let place = cast_place(sql, &message);
+            Self::failed_at(&store_fault(&message).unwrap_or(message), place)
         })
+    }
+
+    /// Returns the error of a query that failed while it ran, with the hint of the message, or one that is known.
+    pub(crate) fn failed_query(message: &str) -> Self {
+        Self::failed_at(message, None)
+    }
+
+    fn failed_at(message: &str, place: Option<QueryPlace>) -> Self {
+        let (cause, hint) = match message.split_once("; hint: ") {
+            Some((cause, hint)) => (cause, Some(hint)),
+            None => (message, hints::of_run(message)),
+        };
+        Self::Execution { message: escape_controls(cause), place, hint: hint.map(escape_controls) }
     }
 
     // An error about a limit or the lake, not about the query.
@@ -202,6 +222,14 @@ impl Error {
             StopReason::Cancelled => Self::Cancelled,
             StopReason::Time(limit) => Self::TimeLimit { limit: *limit },
         }
+    }
+}
+
+// Without a place the error is one line.
+fn place_and_hint(place: Option<&QueryPlace>, hint: Option<&str>) -> String {
+    match place {
+        Some(place) => format!("{place}{}", hint_line(hint)),
+        None => hint.map_or_else(String::new, |hint| format!("; hint: {hint}")),
     }
 }
 
@@ -326,6 +354,11 @@ fn end_of(sql: &str) -> Option<(u64, u64)> {
     let text = sql.trim_end();
     let last = text.lines().last()?;
     Some((text.lines().count() as u64, last.chars().count() as u64 + 1))
+}
+
+fn cast_place(sql: &str, message: &str) -> Option<QueryPlace> {
+    let cast = find_cast(sql, message)?;
+    query_place(sql, cast.line, cast.column)
 }
 
 /// Characters of a line shown before and after a marked place.

@@ -42,6 +42,8 @@ pub use engine::{QueryEngine, SqlFunction};
 pub use error::{Error, QueryPlace};
 pub use opaque::OpaqueValue;
 pub use session::{CancelHandle, ContextExtension, PreparedQuery, QueryAnswer, Session};
-pub use statement::{PredicateForm, check_statement_bounds, walk_expr, walk_statement};
+pub use statement::{
+    PredicateForm, check_statement_bounds, is_blank_statement, split_statement, walk_expr, walk_statement,
+};
 pub use system::{SYSTEM_SCHEMA, SystemSource};
 pub use views::table_meaning;

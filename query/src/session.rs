@@ -102,6 +102,8 @@ pub struct QueryAnswer {
     batches: mpsc::Receiver<Result<RecordBatch, DataFusionError>>,
     query: Option<JoinHandle<Option<()>>>,
     ticket: Arc<QueryTicket>,
+    /// The text, for places of errors.
+    sql: String,
     rows: u64,
     limit: Option<u64>,
     // Keeps the query's threads alive while the answer is read, even if the session is dropped.
@@ -139,7 +141,7 @@ impl QueryAnswer {
             why = self.ticket.wait_for_stop() => return Err(Error::from_stop(&why)),
         };
         let Some(batch) = batch else { return self.end_query().await };
-        let batch = batch.map_err(|e| Error::from_execution(&e))?;
+        let batch = batch.map_err(|e| Error::from_execution(&self.sql, &e))?;
         self.rows += batch.num_rows() as u64;
         if let Some(limit) = self.limit.filter(|limit| self.rows > *limit) {
             self.ticket.stop(StopReason::Cancelled);
@@ -345,7 +347,7 @@ impl Session {
             let system = session.engine.system_tables();
             let snapshot = session.engine.catalog().register_tables(&context, system, &mut statement).await?;
             if let Some(extend) = &session.extend {
-                extend(&context).map_err(|e| Error::from_execution(&e))?;
+                extend(&context).map_err(|e| Error::from_execution("", &e))?;
             }
             let state = context.state();
             let plan = OpaqueValue::new(prepare_statement(&sql, statement, &state).await?);
@@ -384,6 +386,7 @@ impl Session {
             batches,
             query: None,
             ticket,
+            sql: prepared.sql.clone(),
             rows: 0,
             limit: self.client.quota().rows,
             _engine: self.engine.clone(),

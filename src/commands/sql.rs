@@ -1,24 +1,33 @@
-//! `echolake sql`: one query, or a prompt.
+//! `echolake sql`: queries, a script of them, or a prompt.
 
 mod prompt;
+mod script;
 
 use std::fs::{File, OpenOptions};
 use std::io::{BufWriter, IsTerminal as _, Read as _, Write};
 use std::path::{Path, PathBuf};
+use std::time::Instant;
 
 use anyhow::Context as _;
 use clap::ValueEnum;
 use echolake_query::output::{AnswerFormat, AnswerWriter, TABLE_ROWS};
-use echolake_query::{QueryAnswer, Session};
+use echolake_query::{Error, QueryAnswer, Session};
 use serde::de::DeserializeOwned;
 
 use super::cache::CacheArgs;
+use prompt::PromptSettings;
+use prompt::command::PromptCommand;
+use script::{ScriptStep, read_script};
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct SqlArgs {
-    /// The query, or `-` for standard input; by default a prompt, or standard input if that is no terminal. `\d` lists
-    /// tables, `\d TABLE` columns with units, `\df` functions.
+    /// The query, several with `;` between them, or `-` for standard input; by default a prompt, or standard input if
+    /// that is no terminal. The first error ends a script. `\d` lists tables, `\d TABLE` columns with units, `\df`
+    /// functions; a command has a line of its own.
     query: Option<String>,
+    /// Script of queries and commands.
+    #[arg(short, long, conflicts_with = "query")]
+    file: Option<PathBuf>,
     /// Format of the answer.
     #[arg(long, value_enum, default_value_t = FormatArg::Table)]
     format: FormatArg,
@@ -60,35 +69,91 @@ impl From<FormatArg> for AnswerFormat {
 pub(crate) async fn run_sql(args: &SqlArgs, lake_url: &str) -> anyhow::Result<()> {
     let lake = args.cache.open_lake(lake_url).await?;
     let session = Session::new(&lake)?;
-    let query = match args.query.as_deref() {
-        Some("-") => from_stdin()?,
-        Some(query) => query.to_owned(),
-        None if std::io::stdin().is_terminal() => return prompt::run_prompt(&session, &lake).await,
-        None => from_stdin()?,
+    let script = match (args.query.as_deref(), &args.file) {
+        (_, Some(file)) => {
+            std::fs::read_to_string(file).with_context(|| format!("cannot read `{}`", file.display()))?
+        }
+        (Some("-"), None) => from_stdin()?,
+        (Some(query), None) => query.to_owned(),
+        (None, None) if std::io::stdin().is_terminal() => return prompt::run_prompt(&session, &lake).await,
+        (None, None) => from_stdin()?,
     };
-    if let Some(text) = prompt::command_answer(&session, &query) {
-        let is_plain = args.output.is_none() && !args.json && args.format == FormatArg::Table;
-        anyhow::ensure!(is_plain, "`{query}` answers as text; hint: leave --format, --json and -o out");
-        return Ok(super::print_line(&text?)?);
-    }
     let format = match (args.json, args.format, args.escape_formulas) {
         (true, ..) => AnswerFormat::Json,
         (false, FormatArg::Csv, true) => AnswerFormat::SpreadsheetCsv,
         (false, _, true) => anyhow::bail!("--escape-formulas is for CSV; hint: --format csv"),
         (false, format, false) => format.into(),
     };
-    let answer = session.query(&query).await?;
-    match &args.output {
-        Some(path) => to_file(answer, format, path).await.map(drop),
-        None => {
-            anyhow::ensure!(
-                !(format.is_binary() && std::io::stdout().is_terminal()),
-                "{} is not for a terminal; hint: -o FILE",
-                format.name()
-            );
-            write_answer(answer, format, BufWriter::new(std::io::stdout())).await.map(drop)
+    let settings = PromptSettings { format, output: args.output.clone(), timing: false, pager: false };
+    run_script(&session, read_script(&script), settings).await
+}
+
+async fn run_script(session: &Session, steps: Vec<ScriptStep>, mut settings: PromptSettings) -> anyhow::Result<()> {
+    let is_one = matches!(steps.as_slice(), [ScriptStep::Statement { .. }]);
+    let statements = steps.iter().filter(|step| matches!(step, ScriptStep::Statement { .. })).count();
+    anyhow::ensure!(!steps.is_empty(), "no statement; hint: select * from surfaces");
+    anyhow::ensure!(
+        statements < 2 || settings.output.is_none() && !settings.format.is_binary(),
+        "one answer fits into a file of {}, and the script has {statements}; hint: \\f FORMAT and \\o FILE in lines of \
+         their own before each statement",
+        settings.format.name()
+    );
+    let is_plain = settings.output.is_none() && settings.format == AnswerFormat::Table;
+    let mut number = 0;
+    for step in steps {
+        match step {
+            ScriptStep::Command(Ok(PromptCommand::Quit)) => break,
+            ScriptStep::Command(command) => {
+                let command = command.map_err(anyhow::Error::msg)?;
+                anyhow::ensure!(
+                    is_plain || !command.prints_text(),
+                    "\\d and \\df answer as text; hint: leave --format, --json and -o out"
+                );
+                prompt::obey_command(command, session, &mut settings)?;
+            }
+            ScriptStep::Statement { sql, lines_before } => {
+                number += 1;
+                let answered = answer_statement(session, &sql, lines_before, &mut settings).await;
+                let place = || format!("statement {number} of {statements}");
+                if is_one { answered? } else { answered.with_context(place)? }
+            }
         }
     }
+    Ok(())
+}
+
+// Places of errors count the lines of the whole script.
+async fn start_query(session: &Session, sql: &str, lines_before: u64) -> anyhow::Result<QueryAnswer> {
+    let mut answered = session.query(sql).await;
+    if let Err(Error::Query { place: Some(place), .. }) = &mut answered {
+        place.line += lines_before;
+    }
+    Ok(answered?)
+}
+
+async fn answer_statement(
+    session: &Session,
+    sql: &str,
+    lines_before: u64,
+    settings: &mut PromptSettings,
+) -> anyhow::Result<()> {
+    let begun = Instant::now();
+    let rows = match settings.output.take() {
+        Some(path) => to_file(start_query(session, sql, lines_before).await?, settings.format, &path).await?,
+        None => {
+            anyhow::ensure!(
+                !(settings.format.is_binary() && std::io::stdout().is_terminal()),
+                "{} is not for a terminal; hint: -o FILE",
+                settings.format.name()
+            );
+            let answer = start_query(session, sql, lines_before).await?;
+            write_answer(answer, settings.format, BufWriter::new(std::io::stdout())).await?
+        }
+    };
+    if settings.timing {
+        eprintln!("{rows} rows, {:.3} s", begun.elapsed().as_secs_f64());
+    }
+    Ok(())
 }
 
 fn from_stdin() -> anyhow::Result<String> {

@@ -251,6 +251,11 @@ fn the_catalogue_is_as_in_postgres() {
             "select col_description('pairs'::regclass, 1) is not null, obj_description('pairs'::regclass)",
             "t,One row per pair of grid points: distances and angles.",
         ),
+        (
+            "select d.description from pg_description d join pg_attribute a on attrelid = objoid and attnum = objsubid \
+                where objoid = 'surface_stats'::regclass and attname in ('band', 'band_hz') order by attname",
+            "Centre of the band in Hz, or total;Centre of the band; null for the total [Hz]",
+        ),
         ("select has_table_privilege('pairs', 'SELECT'), has_table_privilege('pairs', 'INSERT')", "t,f"),
         ("select count(*) from information_schema.table_constraints", "0"),
         ("select p.proname from pg_type t join pg_proc p on p.oid = t.typinput where t.typname = 'bool'", "boolin"),

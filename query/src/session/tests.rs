@@ -329,6 +329,24 @@ async fn errors_point_at_the_place() {
     )
     .await;
     check(
+        "select pair_id from pairs where 'a' = \"prd\"",
+        expect![[r#"
+            no column `prd` (line 1, column 39)
+              select pair_id from pairs where 'a' = "prd"
+                                                    ^
+            hint: did you mean the text 'prd'? Texts have single quotes, names of columns double ones"#]],
+    )
+    .await;
+    check(
+        "select\n'1.5 dB'::double",
+        expect![[r#"
+            Cannot cast string '1.5 dB' to value of Float64 type (line 2, column 1)
+              '1.5 dB'::double
+              ^
+            hint: TRY_CAST(x AS type) is null for what does not fit"#]],
+    )
+    .await;
+    check(
         "selec 1",
         expect![[r#"
             Expected: an SQL statement, found: selec (line 1, column 1)
@@ -350,7 +368,7 @@ async fn errors_point_at_the_place() {
         "select 1; select 2",
         expect![[r#"
         one statement at a time
-        hint: the prompt takes several, each ended by ;"#]],
+        hint: `echolake sql` takes several, each ended by ;"#]],
     )
     .await;
     check(

@@ -1,5 +1,6 @@
 //! Hints for syntax that is not read, and for plans that are not made: what to write instead.
 
+use datafusion::common::utils::datafusion_strsim::normalized_levenshtein;
 use datafusion::sql::sqlparser::keywords::Keyword;
 use datafusion::sql::sqlparser::tokenizer::{Token, Tokenizer};
 
@@ -54,10 +55,75 @@ const SYNTAX: [(&str, &str); 30] = [
     (": #", NAMED),
     (": ", NAMED),
 ];
-/// Functions of other databases, and what to write instead.
-const FUNCTIONS: [(&str, &str); 1] = [("struct_pack", "{'x': 1}, or named_struct('x', 1)")];
+/// Minimum similarity of a suggested function: the planner suggests the nearest, however far it is.
+const ALIKE_FUNCTION: f64 = 0.75;
+/// Functions of Postgres and DuckDB that are not here, and what to write instead.
+const FUNCTIONS: [(&str, &str); 59] = [
+    ("struct_pack", "{'x': 1}, or named_struct('x', 1)"),
+    ("struct_extract", "s.x, or s['x']"),
+    ("width_bucket", "floor((x - low) / (high - low) * n) + 1 is the bucket of x"),
+    ("percentile_disc", "percentile_cont(0.5) WITHIN GROUP (ORDER BY x), which interpolates"),
+    ("quantile", "quantile_cont(x, 0.5), which interpolates"),
+    ("quantile_disc", "quantile_cont(x, 0.5), which interpolates"),
+    ("list_aggregate", "list_sum(list), list_avg(list), list_min(list) or list_max(list)"),
+    ("array_aggregate", "list_sum(list), list_avg(list), list_min(list) or list_max(list)"),
+    ("list_apply", "list_transform(list, x -> x * 2)"),
+    ("list_value", "[1, 2]"),
+    ("list_unique", "array_length(list_distinct(list))"),
+    ("list_reverse_sort", "list_sort(list, 'DESC')"),
+    ("list_cosine_similarity", "dot_product(a, b) / sqrt(dot_product(a, a) * dot_product(b, b))"),
+    ("len", "length(text), or array_length(list)"),
+    ("array_upper", "array_length(list)"),
+    ("array_lower", "1: lists begin at 1"),
+    ("array_fill", "array_repeat(value, n)"),
+    ("generate_subscripts", "unnest(range(1, array_length(list) + 1))"),
+    ("group_concat", "string_agg(x, ', ')"),
+    ("listagg", "string_agg(x, ', ')"),
+    ("count_if", "count(*) FILTER (WHERE condition)"),
+    ("sum_if", "sum(x) FILTER (WHERE condition)"),
+    ("avg_if", "avg(x) FILTER (WHERE condition)"),
+    ("every", "bool_and(x)"),
+    ("product", "exp(sum(ln(x))), of numbers above 0"),
+    ("geomean", "exp(avg(ln(x))), of numbers above 0"),
+    ("geometric_mean", "exp(avg(ln(x))), of numbers above 0"),
+    ("variance", "var_samp(x)"),
+    ("sem", "stddev(x) / sqrt(count(x))"),
+    ("mad", "median(abs(x - m)), with m the median from a subquery"),
+    ("mod", "a % b"),
+    ("fmod", "a % b"),
+    ("div", "trunc(a / b)"),
+    ("sign", "signum(x)"),
+    ("ceiling", "ceil(x)"),
+    ("isinf", "abs(x) = 'inf'::double"),
+    ("isfinite", "abs(x) < 'inf'::double"),
+    ("iff", "CASE WHEN condition THEN a ELSE b END"),
+    ("age", "a - b, of two times"),
+    ("date_diff", "a - b, of two times; date_part('epoch', a) - date_part('epoch', b) in seconds"),
+    ("datediff", "a - b, of two times; date_part('epoch', a) - date_part('epoch', b) in seconds"),
+    ("date_add", "t + INTERVAL '1 day'"),
+    ("dateadd", "t + INTERVAL '1 day'"),
+    ("date_sub", "t - INTERVAL '1 day'"),
+    ("time_bucket", "date_bin(INTERVAL '5 minutes', t)"),
+    ("strftime", "to_char(t, '%Y-%m-%d')"),
+    ("strptime", "to_timestamp(text, '%Y-%m-%d')"),
+    ("epoch", "date_part('epoch', t)"),
+    ("epoch_ms", "date_part('epoch', t) * 1000"),
+    ("string_split", "string_to_array(text, ',')"),
+    ("str_split", "string_to_array(text, ',')"),
+    ("regexp_extract", "regexp_match(text, pattern)[1]"),
+    ("regexp_matches", "regexp_match(text, pattern), or text ~ pattern"),
+    ("regexp_full_match", "text ~ '^(?:pattern)$'"),
+    ("prefix", "starts_with(text, 'x')"),
+    ("suffix", "ends_with(text, 'x')"),
+    ("typeof", "arrow_typeof(x)"),
+    ("pg_typeof", "arrow_typeof(x)"),
+    ("gen_random_uuid", "uuid()"),
+];
+/// Parts of a time that DuckDB has as functions.
+const TIME_PARTS: [&str; 8] = ["year", "quarter", "month", "week", "day", "hour", "minute", "second"];
 /// Parts of messages of the planner, and what to write instead.
-const PLANS: [(&str, &str); 15] = [
+const PLANS: [(&str, &str); 16] = [
+    ("Cannot cast string", "TRY_CAST(x AS type) is null for what does not fit"),
     ("min/max was called with", "array_agg(x ORDER BY x DESC)[1:3] for several values, greatest(x, y) of one row"),
     ("QUALIFY clause requires", "WHERE, or HAVING for aggregates; QUALIFY is for window functions"),
     ("unique expression names", "give one of them another name with AS"),
@@ -105,11 +171,15 @@ pub(crate) fn of_plan(message: &str) -> String {
         if let Some((_, hint)) = FUNCTIONS.into_iter().find(|(other, _)| *other == name) {
             return hint.to_owned();
         }
+        if TIME_PARTS.contains(&name) {
+            return format!("extract({name} from t)");
+        }
         if let Some((column, function)) = name.rsplit_once('.') {
             return format!("{function}({column}): the column is an argument");
         }
-        let similar = message.split_once("Did you mean ").map(|(_, similar)| similar.trim_end_matches('?'));
-        let similar = similar.map_or_else(String::new, |similar| format!("did you mean {similar}? "));
+        let nearest = message.split_once("Did you mean '").map(|(_, nearest)| nearest.trim_end_matches(['\'', '?']));
+        let similar = nearest.filter(|nearest| normalized_levenshtein(name, nearest) >= ALIKE_FUNCTION);
+        let similar = similar.map_or_else(String::new, |similar| format!("did you mean `{similar}`? "));
         return format!("{similar}SHOW FUNCTIONS lists all");
     }
     let known = PLANS.into_iter().find(|(part, _)| message.contains(part)).map(|(_, hint)| hint);
@@ -129,10 +199,15 @@ pub(crate) fn of_alias(sql: &str, name: &str) -> Option<String> {
     None
 }
 
-/// Returns the message of a query that failed while it ran, with a hint if one is known.
-pub(crate) fn with_hint(message: String) -> String {
-    let known = RUNS.into_iter().find(|(part, _)| message.contains(part) && !message.contains("hint: "));
-    known.map_or(message.clone(), |(_, hint)| format!("{message}; hint: {hint}"))
+/// Returns the hint for a column that is not there, if the statement has its name in double quotes.
+pub(crate) fn of_quoted_name(sql: &str, name: &str) -> Option<String> {
+    let is_quoted = sql.contains(&format!("\"{name}\""));
+    is_quoted.then(|| format!("did you mean the text '{name}'? Texts have single quotes, names of columns double ones"))
+}
+
+/// Returns the hint for the message of a query that failed while it ran.
+pub(crate) fn of_run(message: &str) -> Option<&'static str> {
+    RUNS.into_iter().find(|(part, _)| message.contains(part)).map(|(_, hint)| hint)
 }
 
 /// Returns a message without the suggestion, which is in the hint, and without the planner's own structures.
@@ -157,5 +232,21 @@ fn word_of(token: &Token) -> Option<String> {
         Token::SingleQuotedString(_) => Some(String::new()),
         Token::Word(word) if word.quote_style.is_some() => Some(String::new()),
         other => Some(other.to_string().to_uppercase()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn functions_of_other_databases_have_a_hint_and_others_only_near_names() {
+        let check = |name: &str, nearest: &str, expected: &str| {
+            assert_eq!(of_plan(&format!("Invalid function '{name}'.\nDid you mean '{nearest}'?")), expected);
+        };
+        check("width_bucket", "list_except", "floor((x - low) / (high - low) * n) + 1 is the bucket of x");
+        check("month", "sinh", "extract(month from t)");
+        check("xyz", "exp", "SHOW FUNCTIONS lists all");
+        check("initcapp", "initcap", "did you mean `initcap`? SHOW FUNCTIONS lists all");
     }
 }

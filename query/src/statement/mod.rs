@@ -7,6 +7,7 @@
 
 mod as_of;
 mod bounds;
+mod cast_place;
 mod clauses;
 mod columns;
 mod dialect;
@@ -16,6 +17,7 @@ mod integer_casts;
 mod placeholders;
 mod predicate;
 mod rewrite;
+mod script;
 mod summarize;
 mod syntax_walk;
 #[cfg(test)]
@@ -31,8 +33,10 @@ use datafusion::sql::sqlparser::tokenizer::Tokenizer;
 
 pub(crate) use as_of::{PastTableName, find_past_tables};
 pub use bounds::check_statement_bounds;
+pub(crate) use cast_place::find_cast;
 pub use predicate::PredicateForm;
 pub(crate) use predicate::append_predicate;
+pub use script::{is_blank_statement, split_statement};
 pub use syntax_walk::{walk_expr, walk_statement};
 
 use crate::Error;
@@ -54,7 +58,7 @@ pub(crate) fn parse_statement(sql: &str, recursion_limit: usize) -> Result<State
             Err(columns::hinted_error("no statement".into(), "select * from surfaces".into()))
         }
         Err(_) => {
-            let hint = "the prompt takes several, each ended by ;";
+            let hint = "`echolake sql` takes several, each ended by ;";
             Err(columns::hinted_error("one statement at a time".into(), hint.into()))
         }
     }

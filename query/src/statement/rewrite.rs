@@ -196,7 +196,7 @@ impl RewriteVisitor<'_> {
         }
         let planned = self.state.statement_to_plan(Statement::Statement(Box::new(Sql::Query(query)))).now_or_never();
         // The tables of a query's context are in memory, so that planning never waits.
-        let waits = || Error::Execution { message: "the columns of a table are not known at once".to_owned() };
+        let waits = || Error::failed_query("the columns of a table are not known at once");
         let plan = planned.ok_or_else(waits)?.map_err(|e| Error::from_planning(self.sql, &e))?;
         Ok(DFSchema::clone(plan.schema()))
     }

@@ -10,7 +10,7 @@ use arrow::datatypes::{DataType, Field, IntervalUnit, Schema, SchemaRef, TimeUni
 use arrow_pg::datatypes::{PG_CHAR_KEY, PG_OID_ALIAS_KEY, field_into_pg_type};
 use datafusion::error::Result;
 use echolake_query::{SYSTEM_SCHEMA, table_meaning};
-use echolake_schema::tables::{COMMENT, Table};
+use echolake_schema::tables::{COMMENT, Table, UNIT};
 use echolake_service::{CATALOG, QueryService, SCHEMA};
 use pgwire::api::Type;
 
@@ -264,7 +264,7 @@ impl CatalogRelations {
             let name = if of.namespace.0 == PUBLIC { of.name.clone() } else { format!("{SYSTEM_SCHEMA}.{}", of.name) };
             comments.extend(table_meaning(&name).map(|meaning| ((of.number, 0), meaning.to_owned())));
             for (position, field) in (1..).zip(of.schema.fields()) {
-                comments.extend(field.metadata().get(COMMENT).map(|text| ((of.number, position), text.clone())));
+                comments.extend(column_comment(field).map(|text| ((of.number, position), text)));
             }
         }
         comments
@@ -293,6 +293,13 @@ impl CatalogRelations {
         };
         definition.make_rows(&sources)
     }
+}
+
+// psql has no column for units, so that they are in the description.
+fn column_comment(field: &Field) -> Option<String> {
+    let comment = field.metadata().get(COMMENT)?;
+    let unit = field.metadata().get(UNIT).filter(|unit| !matches!(unit.as_str(), "" | "1"));
+    Some(unit.map_or_else(|| comment.clone(), |unit| format!("{comment} [{unit}]")))
 }
 
 fn comment_values(((number, position), comment): ((i32, i32), String)) -> RowValues {

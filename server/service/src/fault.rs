@@ -316,6 +316,10 @@ pub struct FaultParts {
 impl RequestFault {
     /// Returns the parts of its text.
     pub fn text_parts(&self) -> FaultParts {
+        if let Self::Query(QueryError::Execution { message, place, hint }) = self {
+            let message = format!("the query failed: {message}");
+            return FaultParts { message, place: place.clone(), hint: hint.clone() };
+        }
         if let Self::Query(QueryError::Query { message, place, hint }) = self {
             return FaultParts { message: message.clone(), place: place.clone(), hint: hint.clone() };
         }

@@ -1,6 +1,6 @@
 //! The prompt: lines become queries at `;`, with history, completion, commands, timing and a pager.
 
-mod command;
+pub(super) mod command;
 mod pager;
 mod words;
 
@@ -18,6 +18,7 @@ use rustyline::error::ReadlineError;
 use rustyline::history::DefaultHistory;
 use rustyline::{CompletionType, Editor};
 
+use super::script::{ScriptReader, ScriptStep};
 use crate::error_text::describe_error;
 use crate::signals::interrupt_signal;
 use command::{HELP, PromptCommand};
@@ -27,12 +28,12 @@ use words::WordCompleter;
 const HISTORY: usize = 10_000;
 
 /// The form of answers.
-struct PromptSettings {
-    format: AnswerFormat,
+pub(super) struct PromptSettings {
+    pub format: AnswerFormat,
     /// File for the next answer alone, instead of the terminal.
-    output: Option<PathBuf>,
-    timing: bool,
-    pager: bool,
+    pub output: Option<PathBuf>,
+    pub timing: bool,
+    pub pager: bool,
 }
 
 pub(super) async fn run_prompt(session: &Session, lake: &Lake) -> anyhow::Result<()> {
@@ -50,36 +51,33 @@ pub(super) async fn run_prompt(session: &Session, lake: &Lake) -> anyhow::Result
     let _interrupts = interrupt_signal()?;
     eprintln!("lake {}; \\? for help", lake.location());
     let mut settings = PromptSettings { format: AnswerFormat::Table, output: None, timing: false, pager: true };
-    let mut begun = String::new();
+    let mut script = ScriptReader::default();
     loop {
-        let line = match editor.readline(if begun.is_empty() { "echolake> " } else { "      ..> " }) {
+        let line = match editor.readline(if script.is_blank() { "echolake> " } else { "      ..> " }) {
             Ok(line) => line,
             Err(ReadlineError::Interrupted) => {
-                begun.clear();
+                script.clear();
                 continue;
             }
             Err(ReadlineError::Eof) => break,
             Err(e) => return Err(e.into()),
         };
-        if begun.is_empty()
-            && let Some(command) = command::parse_command(&line)
-        {
-            editor.add_history_entry(line.trim_end())?;
-            match command {
-                Ok(PromptCommand::Quit) => break,
-                Ok(command) => obey_command(command, session, &mut settings)?,
-                Err(message) => eprintln!("error: {message}"),
+        for step in script.push_line(&line) {
+            match step {
+                ScriptStep::Command(Ok(PromptCommand::Quit)) => return Ok(()),
+                ScriptStep::Command(command) => {
+                    editor.add_history_entry(line.trim_end())?;
+                    let obeyed = command.map_err(anyhow::Error::msg);
+                    if let Err(e) = obeyed.and_then(|command| obey_command(command, session, &mut settings)) {
+                        eprintln!("error: {}", describe_error(&e));
+                    }
+                }
+                ScriptStep::Statement { sql, .. } => {
+                    editor.add_history_entry(format!("{};", sql.trim()))?;
+                    answer_query(session, &sql, &mut settings).await;
+                }
             }
-            continue;
         }
-        begun.push_str(&line);
-        begun.push('\n');
-        if !line.trim_end().ends_with(';') {
-            continue;
-        }
-        let sql = std::mem::take(&mut begun);
-        editor.add_history_entry(sql.trim_end())?;
-        answer_query(session, sql.trim_end().trim_end_matches(';'), &mut settings).await;
         // Kept at once: a closed terminal must not cost the history of a day.
         if let Some(file) = &history
             && let Err(e) = editor.append_history(file)
@@ -90,7 +88,12 @@ pub(super) async fn run_prompt(session: &Session, lake: &Lake) -> anyhow::Result
     Ok(())
 }
 
-fn obey_command(command: PromptCommand, session: &Session, settings: &mut PromptSettings) -> anyhow::Result<()> {
+/// Changes the settings, or prints what a command asks for.
+pub(super) fn obey_command(
+    command: PromptCommand,
+    session: &Session,
+    settings: &mut PromptSettings,
+) -> anyhow::Result<()> {
     match command {
         PromptCommand::Quit => {}
         PromptCommand::Help => eprintln!("{HELP}"),
@@ -107,36 +110,13 @@ fn obey_command(command: PromptCommand, session: &Session, settings: &mut Prompt
             eprintln!("answers are {}", format.name());
         }
         PromptCommand::Output(path) => settings.output = path,
-        PromptCommand::Tables | PromptCommand::Columns(_) | PromptCommand::Functions(_) => {
-            match command_description(session, &command) {
-                Ok(text) => pager::show_text(settings.pager, &text)?,
-                Err(e) => eprintln!("error: {e}"),
-            }
+        PromptCommand::Tables => pager::show_text(settings.pager, &list_tables(session))?,
+        PromptCommand::Columns(table) => pager::show_text(settings.pager, &list_columns(session, &table)?)?,
+        PromptCommand::Functions(part) => {
+            pager::show_text(settings.pager, &list_functions(session, part.as_deref())?)?;
         }
     }
     Ok(())
-}
-
-/// Returns what `\d` and `\df` print, for a query that is such a command; None if it is SQL.
-pub(super) fn command_answer(session: &Session, query: &str) -> Option<anyhow::Result<String>> {
-    if !query.trim_start().starts_with('\\') {
-        return None;
-    }
-    let answer =
-        |command: Result<PromptCommand, String>| command_description(session, &command.map_err(anyhow::Error::msg)?);
-    command::parse_command(query).map(answer)
-}
-
-// Of tables, columns and functions; the other commands change the prompt.
-fn command_description(session: &Session, command: &PromptCommand) -> anyhow::Result<String> {
-    match command {
-        PromptCommand::Tables => Ok(list_tables(session)),
-        PromptCommand::Columns(table) => list_columns(session, table),
-        PromptCommand::Functions(part) => list_functions(session, part.as_deref()),
-        _ => anyhow::bail!(
-            "a command of the prompt alone; hint: `echolake sql` without a query, or \\d, \\d TABLE, \\df"
-        ),
-    }
 }
 
 fn on_or_off(is_on: bool) -> &'static str {

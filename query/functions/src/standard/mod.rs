@@ -1,4 +1,5 @@
 //! DataFusion's own functions, for more kinds of arguments.
 
+pub(crate) mod number_ranges;
 pub(crate) mod octet_length;
 pub(crate) mod time_patterns;

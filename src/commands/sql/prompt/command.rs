@@ -17,7 +17,7 @@ Tab completes; Ctrl-R searches the history; Ctrl-C stops a query or clears the l
 
 /// An order to the prompt.
 #[derive(Debug, PartialEq, Eq)]
-pub(super) enum PromptCommand {
+pub(in super::super) enum PromptCommand {
     /// Leave.
     Quit,
     /// Print the help.
@@ -38,8 +38,15 @@ pub(super) enum PromptCommand {
     Functions(Option<String>),
 }
 
+impl PromptCommand {
+    /// Returns whether it prints a text to standard output.
+    pub fn prints_text(&self) -> bool {
+        matches!(self, Self::Tables | Self::Columns(_) | Self::Functions(_))
+    }
+}
+
 /// Parses the command of a line; None if it is SQL.
-pub(super) fn parse_command(line: &str) -> Option<Result<PromptCommand, String>> {
+pub(in super::super) fn parse_command(line: &str) -> Option<Result<PromptCommand, String>> {
     let line = line.trim();
     let (word, rest) = line.split_once(char::is_whitespace).unwrap_or((line, ""));
     let rest = rest.trim().trim_end_matches(';').trim_end();
