@@ -17,7 +17,14 @@ use super::{TestFolder, stderr};
 
 const NO_SKIP: &str = "ECHOLAKE_NO_SKIP";
 const SCHEMATHESIS: &str = "schemathesis==4.32.5";
-const CLIENTS: [&str; 3] = ["pyarrow==26.0.1", "duckdb-cli==1.5.6", "rerun-sdk==0.41.0"];
+const CLIENTS: [&str; 6] = [
+    "pyarrow==26.0.1",
+    "polars==2.1.0",
+    "duckdb-cli==1.5.6",
+    "rerun-sdk==0.41.0",
+    "mcap==1.6.0",
+    "mcap-protobuf-support==0.6.0",
+];
 
 pub(crate) fn web() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("web")
@@ -84,10 +91,11 @@ fn schemathesis() -> Result<PathBuf, String> {
 /// A folder whose programs the pages' code for other programs needs.
 fn clients() -> Result<PathBuf, String> {
     let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("page-clients");
-    if !folder.join("installed").exists() {
+    let mark = folder.join("installed");
+    if fs::read_to_string(&mark).ok() != Some(CLIENTS.join(" ")) {
         run(Command::new("python3").args(["-m", "venv", "--clear"]).arg(&folder))?;
         run(Command::new(folder.join("bin/pip")).args(["install", "--quiet"]).args(CLIENTS))?;
-        fs::write(folder.join("installed"), "").map_err(|e| e.to_string())?;
+        fs::write(mark, CLIENTS.join(" ")).map_err(|e| e.to_string())?;
     }
     Ok(folder)
 }

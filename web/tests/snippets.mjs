@@ -1,11 +1,11 @@
 //! The pages' code for other programs, run as it is against a server:
-//! `node tests/snippets.mjs http://127.0.0.1:8420 FOLDER`. FOLDER/bin has `python` with pyarrow and duckdb, `duckdb` and
-//! `rerun`. Rust's is not compiled: its request is sent as it stands there.
+//! `node tests/snippets.mjs http://127.0.0.1:8420 FOLDER`. FOLDER/bin has `python` with pyarrow, polars, and what
+//! `echolake.rerun` needs, and `duckdb`.
 import assert from 'node:assert/strict'
 import { execFile } from 'node:child_process'
 import { mkdtemp, readFile, stat, writeFile } from 'node:fs/promises'
 import { tmpdir } from 'node:os'
-import { join } from 'node:path'
+import { join, resolve } from 'node:path'
 import { promisify } from 'node:util'
 import { createServer } from 'vite'
 
@@ -20,7 +20,7 @@ const run = async (program, ...args) =>
       cwd: folder,
       timeout: LIMIT_MS,
       maxBuffer: 1 << 28,
-      env: { ...process.env, PATH: `${join(tools, 'bin')}:${process.env.PATH}` },
+      env: { ...process.env, PATH: `${join(tools, 'bin')}:${process.env.PATH}`, PYTHONPATH: resolve('../python/src') },
     })
   ).stdout
 const get = async (path) => (await fetch(base + path)).json()
@@ -42,26 +42,20 @@ const queries = [
   `select '""' as """"`,
   `select count(*) as n -- a comment\nfrom system.versions`,
 ]
+/** Rows of the table that a snippet in Python has read. */
+const rowsOfScript = async (text, count) => {
+  await writeFile(join(folder, 'snippet.py'), `${text}\nprint("rows:", ${count})\n`)
+  return Number(/rows: (\d+)/.exec(await run('python', 'snippet.py'))[1])
+}
 const ways = {
   // Lines of an answer without line breaks in its texts, and the header.
   curl: async (text) => (await run('sh', '-c', text)).trimEnd().split('\n').length - 1,
-  Python: async (text) => {
-    await writeFile(join(folder, 'snippet.py'), `${text}\nprint("rows:", table.num_rows)\n`)
-    return Number(/rows: (\d+)/.exec(await run('python', 'snippet.py'))[1])
-  },
+  Python: (text) => rowsOfScript(text, 'table.num_rows'),
+  polars: (text) => rowsOfScript(text, 'table.height'),
   DuckDB: async (text) => {
     await run('sh', '-c', text)
     const count = ['duckdb', '-csv', '-noheader', '-c', "select count(*) from 'answer.parquet'"]
     return Number((await run(...count)).trim())
-  },
-  Rust: async (text) => {
-    const [, , query] = /let query = r(#+)"([^]*)"\1;/.exec(text)
-    const format = /"format": "(\w+)"/.exec(text)[1]
-    const answer = await sql({ query, format })
-    assert.equal(answer.headers.get('content-type'), 'application/vnd.apache.arrow.stream')
-    await writeFile(join(folder, 'answer.arrow'), Buffer.from(await answer.arrayBuffer()))
-    const count = "import pyarrow.ipc as i; print(i.open_stream('answer.arrow').read_all().num_rows)"
-    return Number(await run('python', '-c', count))
   },
 }
 assert.deepEqual(Object.keys(ways), [...LANGUAGES])

@@ -6,6 +6,7 @@ played ten times slower because the rig is at a scale of 1:10.
 
 from __future__ import annotations
 
+import argparse
 import io
 import os
 import urllib.request
@@ -263,3 +264,16 @@ def _wav(samples: NDArray[np.int16], rate_hz: int) -> bytes:
         to.setframerate(rate_hz)
         to.writeframes(samples.astype("<i2").tobytes())
     return content.getvalue()
+
+
+def main() -> None:
+    """Shows a file or a URL: ``python -m echolake.rerun 'http://localhost:8080/api/v1/runs/RUN/file.mcap'``."""
+    parser = argparse.ArgumentParser(prog="python -m echolake.rerun", description="Show a run or a slice in rerun.")
+    parser.add_argument("source", help="MCAP file or its URL")
+    parser.add_argument("--save", metavar="FILE", help="write an .rrd file instead of starting a viewer")
+    arguments = parser.parse_args()
+    view(arguments.source, save=arguments.save)
+
+
+if __name__ == "__main__":
+    main()

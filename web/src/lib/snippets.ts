@@ -63,21 +63,31 @@ export const EXAMPLES: readonly ExampleQuery[] = [
 /** The examples that have rows in a lake. */
 export const lakeExamples = (lake: Lake) => EXAMPLES.filter((one) => lake.has_levels || !one.needsLevels)
 
-export const LANGUAGES = ['curl', 'Python', 'DuckDB', 'Rust'] as const
+export const LANGUAGES = ['curl', 'Python', 'polars', 'DuckDB'] as const
 export type Language = (typeof LANGUAGES)[number]
 
 const shellText = (text: string) => `'${text.replaceAll("'", "'\\''")}'`
 /** Three quotes in a row, and one at the end, would close the text. */
 const pythonText = (text: string) => `"""${text.replaceAll('\\', '\\\\').replace(/"(?="|$)/g, '\\"')}"""`
-/** The text in as many `#` as it needs. */
-function rustText(text: string): string {
-  const longest = Math.max(0, ...Array.from(text.matchAll(/"(#*)/g), (found) => found[1].length + 1))
-  const hashes = '#'.repeat(Math.max(2, longest))
-  return `r${hashes}"${text}"${hashes}`
-}
-
 const curl = (url: string, query: string, accept: string) =>
   `curl --fail-with-body ${url} \\\n  -H 'content-type: application/json' -H 'accept: ${accept}' \\\n  -d ${shellText(JSON.stringify({ query }))}`
+
+const pythonRequest = (library: string, imported: string, format: string, url: string, query: string, read: string) =>
+  `# pip install ${library}; a server with tokens: "authorization": "Bearer TOKEN" among the headers
+import json
+import urllib.request
+
+${imported}
+
+query = ${pythonText(query)}
+request = urllib.request.Request(
+    "${url}",
+    data=json.dumps({"query": query, "format": "${format}"}).encode(),
+    headers={"content-type": "application/json"},
+)
+with urllib.request.urlopen(request) as answer:
+    ${read}
+print(table)`
 
 /** A query as code that asks the server of this page; every one runs as it is if the server has no tokens. */
 export function snippet(language: Language, query: string, origin: string): string {
@@ -86,42 +96,27 @@ export function snippet(language: Language, query: string, origin: string): stri
     case 'curl':
       return `# A server with tokens: -H 'authorization: Bearer TOKEN'\n${curl(url, query, 'text/csv')}`
     case 'Python':
-      return `# pip install pyarrow; a server with tokens: "authorization": "Bearer TOKEN" among the headers
-import json
-import urllib.request
-
-import pyarrow.ipc
-
-query = ${pythonText(query)}
-request = urllib.request.Request(
-    "${url}",
-    data=json.dumps({"query": query, "format": "arrow"}).encode(),
-    headers={"content-type": "application/json"},
-)
-with urllib.request.urlopen(request) as answer:
-    table = pyarrow.ipc.open_stream(answer).read_all()
-print(table)`
+      return pythonRequest(
+        'pyarrow',
+        'import pyarrow.ipc',
+        'arrow',
+        url,
+        query,
+        'table = pyarrow.ipc.open_stream(answer).read_all()',
+      )
+    case 'polars':
+      return pythonRequest(
+        'polars',
+        'import polars',
+        'parquet',
+        url,
+        query,
+        'table = polars.read_parquet(answer.read())',
+      )
     case 'DuckDB':
       return `# The server answers in its own SQL, DuckDB reads the answer; a server with tokens: -H 'authorization: Bearer TOKEN'\n${curl(url, query, 'application/vnd.apache.parquet')} -o answer.parquet\nduckdb -c "from 'answer.parquet'"`
-    case 'Rust':
-      return `// arrow = "59", reqwest = { version = "0.12", features = ["blocking", "json"] }, serde_json = "1"
-// A server with tokens: .bearer_auth("TOKEN")
-use arrow::ipc::reader::StreamReader;
-
-fn main() -> Result<(), Box<dyn std::error::Error>> {
-    let query = ${rustText(query)};
-    let answer = reqwest::blocking::Client::new()
-        .post("${url}")
-        .json(&serde_json::json!({ "query": query, "format": "arrow" }))
-        .send()?
-        .error_for_status()?;
-    for batch in StreamReader::try_new(answer, None)? {
-        println!("{} rows", batch?.num_rows());
-    }
-    Ok(())
-}`
   }
 }
 
-/** The command that opens a run's file in rerun on this machine. */
-export const rerunCommand = (url: string) => `rerun ${shellText(url)}`
+/** The command that opens a run's file in rerun on this machine, with the rig's views. */
+export const rerunCommand = (url: string) => `python -m echolake.rerun ${shellText(url)}`
