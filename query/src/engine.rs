@@ -6,7 +6,6 @@ use std::time::Duration;
 
 use datafusion::catalog::{CatalogProvider as _, CatalogProviderList as _, TableProvider};
 use datafusion::catalog::{MemoryCatalogProvider, MemoryCatalogProviderList, MemorySchemaProvider};
-use datafusion::common::tree_node::TreeNode as _;
 use datafusion::error::DataFusionError;
 use datafusion::execution::FunctionRegistry as _;
 use datafusion::execution::disk_manager::DiskManagerBuilder;
@@ -17,7 +16,6 @@ use datafusion::execution::session_state::{SessionState, SessionStateBuilder};
 use datafusion::functions_nested::min_max::array_min_udf;
 use datafusion::logical_expr::Documentation;
 use datafusion::optimizer::OptimizerRule;
-use datafusion::physical_plan::ExecutionPlan;
 use datafusion::prelude::{SessionConfig, SessionContext};
 use echolake_functions::{FunctionSet, octet_length_of_bytes, pattern_functions, whole_number_ranges};
 use echolake_lake::Lake;
@@ -35,8 +33,8 @@ use crate::{Error, OpaqueValue};
 const STORE: &str = "echolake://lake/";
 /// URL of the store that DataFusion registers by default: the whole machine.
 const MACHINE: &str = "file:///";
-/// Rows per batch where there are lists: at 384 samples each, 3 MB of responses.
-const LIST_BATCH_ROWS: usize = 2048;
+/// Rows per batch: at 384 samples each, 3 MB of responses.
+const BATCH_ROWS: usize = 2048;
 /// Cache size for the files' footers and page indexes, bytes. Queries read the same files again and again, and a
 /// thousand runs need more than DataFusion's default of 50 MiB.
 const METADATA_BYTES: usize = 256 << 20;
@@ -305,18 +303,12 @@ fn build_template(
 
 // DataFusion's defaults already use all cores and prune by row group and page.
 fn session_config() -> SessionConfig {
-    let mut config = SessionConfig::new().with_information_schema(true);
+    let mut config = SessionConfig::new().with_information_schema(true).with_batch_size(BATCH_ROWS);
     let options = config.options_mut();
     options.sql_parser.collect_spans = true;
     // Files contain plain strings, and so do the output formats of answers.
     options.execution.parquet.schema_force_view_types = false;
     config
-}
-
-/// Returns the rows per batch for a plan: DataFusion's default, and fewer if any step has lists.
-pub(crate) fn batch_rows(plan: &Arc<dyn ExecutionPlan>) -> usize {
-    let has_lists = plan.exists(|step| Ok(step.schema().fields().iter().any(|field| field.data_type().is_nested())));
-    if has_lists.unwrap_or(true) { LIST_BATCH_ROWS } else { SessionConfig::new().batch_size() }
 }
 
 fn build_runtime(lake: &Lake, url: &ObjectStoreUrl, memory: Option<usize>) -> Result<Arc<RuntimeEnv>, DataFusionError> {

@@ -365,7 +365,6 @@ impl Session {
     ) -> Result<QueryAnswer, Error> {
         let Started { ticket, place } = started;
         let context = self.task_context(&state, &ticket);
-        let config = state.config().clone();
         let text = prepared.sql.clone();
         let is_optimized = prepared.is_optimized;
         let planned = async move {
@@ -376,7 +375,6 @@ impl Session {
             planned.map_err(|error| Error::from_planning(&text, &error))
         };
         let plan = self.engine.on_threads(&ticket, planned).await?;
-        let context = Arc::new(context.with_session_config(config.with_batch_size(engine::batch_rows(&plan))));
         let schema = plan.schema();
         let (send, batches) = mpsc::channel(AHEAD);
         let query = drive_query(plan, context, send, ticket.clone(), place).boxed();
@@ -399,12 +397,12 @@ impl Session {
     }
 
     // As DataFusion builds it, except for the memory pool.
-    fn task_context(&self, state: &SessionState, ticket: &Arc<QueryTicket>) -> TaskContext {
+    fn task_context(&self, state: &SessionState, ticket: &Arc<QueryTicket>) -> Arc<TaskContext> {
         let mut runtime = state.runtime_env().as_ref().clone();
         let limit = self.engine.memory_limit(self.client.quota());
         let pool = self.client.memory_pool(runtime.memory_pool);
         runtime.memory_pool = Arc::new(PartialPool::new(pool, "the query holds", limit, ticket.held_memory().clone()));
-        TaskContext::from(state).with_runtime(Arc::new(runtime))
+        Arc::new(TaskContext::from(state).with_runtime(Arc::new(runtime)))
     }
 
     /// Returns the current snapshot of the lake, which a query started now would see; cached until something changes.
