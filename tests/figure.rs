@@ -20,9 +20,9 @@ fn fills(svg: &str) -> Vec<&str> {
 }
 
 #[test]
-fn flat_is_black_and_wood_is_louder() {
+fn flat_is_0_db_and_wood_is_louder() {
     let place = lake();
-    let svg = place.ok(&["figure", "grid", "flat"]);
+    let svg = place.ok(&["figure", "grid", "flat", "--paper-colours"]);
     let cells = fills(&svg);
     // The blue cell of each band is the microphone's; pairs with it that are not measured are grey.
     let black = cells.iter().filter(|fill| **fill == "#000000").count();
@@ -30,10 +30,14 @@ fn flat_is_black_and_wood_is_louder() {
     assert!(black > 20 && others == 0, "{cells:?}");
     assert!(svg.contains(">simulated · lake runs@"), "the picture says it");
     let notes = svg.split("<metadata>").nth(1).expect("notes");
-    for said in ["echolake figure grid flat", "from tnce where surface_id = 'flat'", "runs@", "simulated"] {
+    for said in
+        ["echolake figure grid flat --paper-colours", "from tnce where surface_id = 'flat'", "runs@", "simulated"]
+    {
         assert!(notes.contains(said), "{said}");
     }
-    let wood = place.ok(&["figure", "grid", "wood", "--over", "band"]);
+    let grey = fills(&place.ok(&["figure", "grid", "flat"])).into_iter().filter(|fill| *fill == "#ececec").count();
+    assert_eq!(grey, black, "0 dB");
+    let wood = place.ok(&["figure", "grid", "wood", "--over", "band", "--paper-colours"]);
     let red = fills(&wood).into_iter().filter(|fill| fill.ends_with("0000") && *fill != "#000000").count();
     assert!(red > 20, "{red} cells over 0 dB");
 }
@@ -48,7 +52,10 @@ fn the_server_draws_the_same() {
         (&["grid", "wood", "--microphone", "3"][..], "grid.svg?microphone=3&width=440"),
         (&["grid", "wood", "--microphone", "3", "--over", "total"], "grid.svg?microphone=3&width=440&over=flat-total"),
         (&["grid", "wood", "--less", "flat", "--microphone", "3"], "grid.svg?microphone=3&width=440&less=flat"),
+        (&["grid", "wood", "--paper-colours", "--microphone", "3"], "grid.svg?microphone=3&width=440&palette=paper"),
         (&["nce", "wood"], "curves.svg?width=420"),
+        (&["levels", "wood", "flat"], "levels.svg?beside=flat"),
+        (&["levels", "wood", "flat", "--over", "total"], "levels.svg?beside=flat&over=flat-total"),
     ] {
         let answer = HttpRequest::get(&format!("/api/v1/surfaces/wood/{path}")).send(&server);
         assert_eq!((answer.status, answer.header("content-type")), (200, Some("image/svg+xml")), "{path}");
@@ -83,6 +90,9 @@ fn tables_have_the_numbers_of_the_lake() {
         let expected = format!("select {column} from surface_stats where surface_id = 'wood' and band = 'total'");
         assert!((numbers[at] - place.number(&expected)).abs() < 1e-9, "{column}: {numbers:?}");
     }
+    place.ok(&["figure", "levels", "wood", "flat", "--over", "total", "-o", "out/chart.csv", "-o", "out/chart.svg"]);
+    let chart = std::fs::read_to_string(place.path("out/chart.csv")).expect("read");
+    assert_eq!(chart.lines().find(|line| line.starts_with("wood,")), Some(wood), "the chart has the table's numbers");
     let against = place.ok(&["figure", "table", "wood"]);
     let level = place.number("select against_flat_2500_db from catalogue where surface_id = 'wood'");
     let u = place.number("select level_u_2500_db from catalogue where surface_id = 'wood'");
@@ -158,6 +168,7 @@ fn refusals_say_what_is_there() {
     place.fails(1, &["figure", "grid", "brick"], "surface `brick` is not in the lake");
     place.fails(1, &["figure", "grid", "--where", "surface_id = 'x'"], "selects no surface");
     place.fails(1, &["figure", "grid", "wood", "-o", "x.gif"], "hint: svg, pdf or png");
+    place.fails(1, &["figure", "levels", "wood", "-o", "x.tex"], "hint: svg, pdf, png or csv");
     place.fails(1, &["figure", "filters", "-o", "{surface}.svg"], "the figure is of none");
     place.fails(1, &["figure", "table", "wood", "--less", "brick"], "surface `brick` is not in the lake");
     place.fails(1, &["figure", "table", "wood", "--less", "flat", "--values", "energies"], "leave one of them out");
@@ -178,6 +189,7 @@ mod slow {
         let place = lake();
         for args in [
             &["filters"][..],
+            &["levels", "wood", "flat"],
             &["coverage"],
             &["map"],
             &["som"],

@@ -24,6 +24,7 @@ pub use kinds::coverage::{CoverageFigure, CoverageZone};
 pub use kinds::filters::FilterFigure;
 pub use kinds::grid::{BandLevels, GridFigure, GridLayer, GridPanel, GridPosition, GridScale};
 pub use kinds::growth::GrowthFigure;
+pub use kinds::levels::LevelsFigure;
 pub use kinds::map::{MapFigure, MapPlane, MapPosition};
 pub use kinds::nce::{NceFigure, NcePanel};
 pub use kinds::relief::{ReliefFigure, ReliefPanel};

@@ -24,6 +24,8 @@ pub(crate) enum FigureCommand {
     Nce(NceArgs),
     /// A table of surfaces by band.
     Table(TableArgs),
+    /// Levels by band with error bars, a series for each surface.
+    Levels(LevelsArgs),
     /// The filter bank.
     Filters(FiltersArgs),
     /// First Fresnel zones of a layer's pairs on the panel.
@@ -70,9 +72,10 @@ pub(crate) struct GridArgs {
     /// Subtract the levels of this surface from those of the others.
     #[arg(long, value_name = "SURFACE")]
     less: Option<SurfaceId>,
-    /// Amber in place of red, and a square in each cell over 0 dB.
+    /// The paper's colours: white at -20 dB, black at 0 dB, red at +6 dB. By default grey is 0 dB, blue below, orange
+    /// above, and the range fits.
     #[arg(long)]
-    safe_colours: bool,
+    paper_colours: bool,
     /// Number of surfaces per row.
     #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=20))]
     columns: u32,
@@ -141,6 +144,19 @@ enum ValuesArg {
     /// Mean TNCE over all pairs, linear, beside Flat's, with the difference in per cent. A few loud pairs raise it, which
     /// levels leave out.
     Energies,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct LevelsArgs {
+    #[command(flatten)]
+    selection: SelectionArgs,
+    #[command(flatten)]
+    output: OutputArgs,
+    #[command(flatten)]
+    reference: ReferenceArgs,
+    /// Subtract the levels of this surface from those of the others.
+    #[arg(long, value_name = "SURFACE")]
+    less: Option<SurfaceId>,
 }
 
 #[derive(Debug, Args)]
@@ -231,6 +247,7 @@ pub(crate) async fn run_figure(command: &FigureCommand, lake_url: &str) -> anyho
         FigureCommand::Grid(args) => surfaces::write_grid(&source, args).await?,
         FigureCommand::Nce(args) => surfaces::write_nce(&source, args).await?,
         FigureCommand::Table(args) => tables::write_table(&source, args).await?,
+        FigureCommand::Levels(args) => levels::write_levels(&source, args).await?,
         FigureCommand::Filters(args) => calculated::write_filters(&source, args)?,
         FigureCommand::Coverage(args) => calculated::write_coverage(&source, args)?,
         FigureCommand::Steps(args) => surfaces::write_steps(&source, args).await?,

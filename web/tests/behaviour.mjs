@@ -92,6 +92,19 @@ await check('the grid plot’s cells have the colours that SQL says', async () =
   const most = levels[Math.ceil(0.98 * levels.length) - 1]
   assert.ok(reach >= most && (reach <= 2 * most || reach === 1), `${meaning}; levels to ±${most} dB`)
   await hold((db) => fitted(db, reach))
+  const file = async (more) =>
+    (await fetch(`${base}/api/v1/surfaces/${id}/grid.svg?microphone=${microphone}${more}`)).text()
+  const served = async (more, colourOf) => {
+    const svg = await file(more)
+    for (const row of rows) {
+      const cell = svg.split('\n').find((line) => line.includes(`data-row="0" data-point="${row.point}"`))
+      const hex = /fill="#(..)(..)(..)"/.exec(cell).slice(1)
+      const off = hex.map((part, i) => Math.abs(parseInt(part, 16) - colourOf(row[lake.bands[0].key])[i]))
+      assert.ok(Math.max(...off) <= 1, `point ${row.point}: ${cell}`)
+    }
+  }
+  await served('', (db) => fitted(db, reach))
+  await served('&palette=paper', onPaper)
   await page.getByRole('button', { name: 'Show in the paper’s colours' }).click()
   await hold(onPaper)
   await page.getByRole('button', { name: 'Centre colours on 0 dB' }).click()
@@ -334,6 +347,30 @@ await check('levels against Flat are one number on wall, surface, compare and in
   await page.getByText('which a few pairs to which a relief focuses sound raise').waitFor()
 })
 
+await check('the chart of levels on Compare has the levels that SQL says', async () => {
+  const ids = all.items.filter((s) => s.typology !== 'reference').map((s) => s.surface_id)
+  await open(`/compare?s=${ids.slice(0, 2).join(',')}`)
+  const chart = page.locator('section[aria-label="Levels with their uncertainty"] .chart')
+  await chart.locator('[data-series]').first().waitFor()
+  const heights = await chart
+    .locator('[data-series]')
+    .evaluateAll((dots) => dots.map((dot) => [dot.dataset.series, dot.dataset.band, dot.getBoundingClientRect().y]))
+  const levels = await Promise.all(
+    ids.slice(0, 2).map(async (one) => {
+      const columns = lake.bands.map((band) => `against_flat_${band.key}_db`).join(', ')
+      const [row] = await sql(`select ${columns} from catalogue where surface_id = '${one}'`)
+      return lake.bands.map((band) => row[`against_flat_${band.key}_db`])
+    }),
+  )
+  assert.equal(heights.length, 2 * lake.bands.length)
+  const dots = heights.map(([series, band, y]) => [levels[series][band], y]).sort(([a], [b]) => a - b)
+  const [[low, bottom], [high, top]] = [dots[0], dots.at(-1)]
+  for (const [level, y] of dots) {
+    const expected = bottom + ((level - low) / (high - low)) * (top - bottom)
+    assert.ok(Math.abs(y - expected) < 0.5, `${level} dB at ${y} px, not ${expected}`)
+  }
+})
+
 await check('surfaces are compared with Flat, or with the chosen one', async () => {
   const { flat_reference: flat } = all.items.find((s) => s.surface_id === id)
   const other = all.items.find((s) => s.typology !== 'reference' && s.surface_id !== id)
@@ -495,6 +532,7 @@ await check('figures that the server draws are saved in three formats, what the 
   for (const [path, title] of [
     [`/surfaces/${id}?microphone=14`, 'TNCE over the grid'],
     [`/surfaces/${id}?microphone=14`, 'NCE, stacked by band'],
+    [`/compare?s=${id}`, 'Levels with their uncertainty'],
     ['/map?axes=13', 'Surfaces by what they reflect'],
   ]) {
     await open(path)
@@ -515,7 +553,6 @@ await check('figures that the server draws are saved in three formats, what the 
     }
   }
   for (const [path, title] of [
-    [`/surfaces/${id}?microphone=14`, 'TNCE over the grid'],
     [`/surfaces/${id}?microphone=14`, 'Relief'],
     [`/surfaces/${id}/pairs/159`, 'Spectrogram'],
     [`/sql?q=${encodeURIComponent('select surface_id, count(*) as n from tnce group by 1')}&as=bars`, 'Chart'],

@@ -2,7 +2,7 @@
 
 use echolake_schema::{Grid, Point};
 
-use crate::canvas::colours::{DIFFERENCE_DB, HIGH_DB, LOW_DB, LevelPalette, difference_colour, ink_on, level_colour};
+use crate::canvas::colours::{HIGH_DB, LOW_DB, LevelPalette, centred_colour, fitting_reach, paper_colour};
 use crate::canvas::drawing::{
     FigureColour, FigureDrawing, SMALL_PX, StrokeStyle, TEXT_PX, TextAnchor, filled_rect, framed_rect, ink_label,
     sized_label,
@@ -105,12 +105,15 @@ impl GridPanel {
 }
 
 /// The colours of a grid plot.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub enum GridScale {
     /// The paper's, from -20 to 6 dB.
-    Levels(LevelPalette),
-    /// From -6 to 6 dB.
-    Differences,
+    Paper,
+    /// From -reach to reach.
+    Centred {
+        /// The end of the scale, dB.
+        reach_db: f64,
+    },
 }
 
 /// Grid plots of one or more surfaces side by side.
@@ -124,7 +127,7 @@ pub struct GridFigure {
     pub microphone: usize,
     /// The surfaces.
     pub panels: Vec<GridPanel>,
-    /// Colours of levels over 0 dB.
+    /// Colours of levels. Differences, which the paper has none of, are always centred.
     pub palette: LevelPalette,
     /// Width of a panel, px.
     pub panel_px: f32,
@@ -190,8 +193,15 @@ impl GridFigure {
         drawing
     }
 
+    // All panels in the same colours have the same scale.
     fn panel_scale(&self, panel: &GridPanel) -> GridScale {
-        if panel.is_difference { GridScale::Differences } else { GridScale::Levels(self.palette) }
+        let is_paper = |panel: &GridPanel| self.palette == LevelPalette::Paper && !panel.is_difference;
+        if is_paper(panel) {
+            return GridScale::Paper;
+        }
+        let centred = self.panels.iter().filter(|panel| !is_paper(panel));
+        let values = centred.flat_map(|panel| panel.levels_db.iter().flatten().copied().flatten());
+        GridScale::Centred { reach_db: fitting_reach(values) }
     }
 
     fn draw_panel(&self, drawing: &mut FigureDrawing, panel: &GridPanel, layout: &PanelLayout, [left, top]: [f32; 2]) {
@@ -252,12 +262,6 @@ impl GridFigure {
         if let Some((text, colour)) = mark {
             let at = [x + size / 2.0, y + size / 2.0 + text_px * 0.36];
             drawing.add_shape(sized_label(at, text, TextAnchor::Middle, text_px, colour));
-        } else if let (Some(rgb), GridScale::Levels(LevelPalette::Safe), Some(level)) = (colour, scale, level)
-            && level > 0.0
-        {
-            let inset = (size / 4.0).floor().max(2.0);
-            let stroke = StrokeStyle::new(FigureColour::Rgb(ink_on(rgb)), 1.0);
-            drawing.add_shape(framed_rect([x + inset, y + inset], [size - 2.0 * inset, size - 2.0 * inset], stroke));
         }
     }
 }
@@ -292,8 +296,8 @@ impl BlockLayout {
 impl GridScale {
     fn level_rgb(self, level_db: f64) -> [u8; 3] {
         match self {
-            Self::Levels(palette) => level_colour(level_db, palette),
-            Self::Differences => difference_colour(level_db),
+            Self::Paper => paper_colour(level_db),
+            Self::Centred { reach_db } => centred_colour(level_db, reach_db),
         }
     }
 }
@@ -301,9 +305,11 @@ impl GridScale {
 fn draw_scale(drawing: &mut FigureDrawing, [x, y]: [f32; 2], scale: GridScale) {
     const STEPS: usize = 52;
     const STEP_PX: f32 = 5.0;
-    let (low, high, ticks): (f64, f64, &[f64]) = match scale {
-        GridScale::Levels(_) => (LOW_DB, HIGH_DB, &[-20.0, -10.0, 0.0, 6.0]),
-        GridScale::Differences => (-DIFFERENCE_DB, DIFFERENCE_DB, &[-6.0, -3.0, 0.0, 3.0, 6.0]),
+    let (low, high, ticks) = match scale {
+        GridScale::Paper => (LOW_DB, HIGH_DB, vec![-20.0, -10.0, 0.0, 6.0]),
+        GridScale::Centred { reach_db } => {
+            (-reach_db, reach_db, [-1.0, -0.5, 0.0, 0.5, 1.0].map(|share| share * reach_db).to_vec())
+        }
     };
     for step in 0..STEPS {
         let value = low + (high - low) * step as f64 / (STEPS - 1) as f64;
@@ -313,8 +319,8 @@ fn draw_scale(drawing: &mut FigureDrawing, [x, y]: [f32; 2], scale: GridScale) {
     let width = STEPS as f32 * STEP_PX;
     drawing.add_shape(framed_rect([x, y], [width, 11.0], StrokeStyle::new(FigureColour::Quiet, 1.0)));
     for tick in ticks {
-        let sign = if *tick > 0.0 { "+" } else { "" };
-        let text = format!("{sign}{}", number_text(*tick));
+        let sign = if tick > 0.0 { "+" } else { "" };
+        let text = format!("{sign}{}", number_text(tick));
         let at = [x + width * ((tick - low) / (high - low)) as f32, y + 24.0];
         drawing.add_shape(sized_label(at, &text, TextAnchor::Middle, SMALL_PX, FigureColour::Ink));
     }
@@ -384,10 +390,15 @@ mod tests {
     }
 
     #[test]
-    fn the_safe_palette_marks_cells_by_shape() {
-        let frames = |svg: String| svg.matches("fill=\"none\"").count();
-        let paper = frames(figure(Some(3.0), LevelPalette::Paper).draw(&FigureNotes::default()).to_svg());
-        let safe = frames(figure(Some(3.0), LevelPalette::Safe).draw(&FigureNotes::default()).to_svg());
-        assert_eq!(safe, paper + 1, "3 dB");
+    fn all_panels_have_one_scale() {
+        let mut figure = figure(Some(2.0), LevelPalette::Centred);
+        let svg = figure.draw(&FigureNotes::default()).to_svg();
+        // -20 dB is the end of the scale, 0 dB grey, 2 dB a tenth of the way to orange.
+        for (point, colour) in [(1, "#ececec"), (2, "#2166ac"), (3, "#eaded5")] {
+            assert!(cell(&svg, point).contains(&format!("fill=\"{colour}\"")), "{}", cell(&svg, point));
+        }
+        figure.panels.push(GridPanel { levels_db: vec![vec![Some(40.0); 4]], ..figure.panels[0].clone() });
+        let svg = figure.draw(&FigureNotes::default()).to_svg();
+        assert!(cell(&svg, 2).contains("fill=\"#87a9cc\""), "half of the way to blue: {}", cell(&svg, 2));
     }
 }

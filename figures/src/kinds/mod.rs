@@ -4,6 +4,7 @@ pub(crate) mod coverage;
 pub(crate) mod filters;
 pub(crate) mod grid;
 pub(crate) mod growth;
+pub(crate) mod levels;
 pub(crate) mod map;
 pub(crate) mod nce;
 pub(crate) mod relief;

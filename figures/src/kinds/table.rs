@@ -38,7 +38,7 @@ pub struct FigureTable {
 }
 
 impl TableRow {
-    fn uncertainty(&self, column: usize) -> Option<f64> {
+    pub(crate) fn uncertainty(&self, column: usize) -> Option<f64> {
         self.uncertainties.get(column).copied().flatten().filter(|u| u.is_finite())
     }
 

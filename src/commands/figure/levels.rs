@@ -2,11 +2,15 @@
 
 use std::collections::HashMap;
 
-use echolake_figures::{FigureTable, TableRow};
+use echolake_figures::{FigureTable, LevelsFigure, TableRow};
 use echolake_query::figure_rows::{LevelReference, TOTAL_BAND, band_keys, band_labels, quote_literal};
 use serde::Deserialize;
 
+use super::LevelsArgs;
 use super::source::{FigureSource, SelectedSurface};
+
+/// Width of a chart, px.
+const WIDTH_PX: f32 = 720.0;
 
 #[derive(Deserialize)]
 struct LevelRow {
@@ -160,7 +164,7 @@ impl<'a> LevelTable<'a> {
     /// Returns the title of the levels, with their unit.
     pub fn default_title(&self) -> String {
         let without = if self.kind == LevelKind::Unbiased { ", without Foam\u{2019}s reflection" } else { "" };
-        format!("Mean TNCE of the values up to the 90th percentile, {}{without}", self.unit())
+        LevelsFigure::default_title(&self.unit()) + without
     }
 
     // Levels less those of their Flat are over the same band.
@@ -170,6 +174,22 @@ impl<'a> LevelTable<'a> {
         let is_flat = self.surfaces.iter().all(|surface| surface.flat_reference == *id && surface.surface_id != *id);
         if is_flat { LevelReference::FlatBand.unit().to_owned() } else { format!("dB, less {id}") }
     }
+}
+
+pub(super) async fn write_levels(source: &FigureSource, args: &LevelsArgs) -> anyhow::Result<()> {
+    let surfaces = source.selected_surfaces(&args.selection).await?;
+    source.require_levels(&surfaces).await?;
+    let base = source.base_surface(args.less.as_ref()).await?;
+    for group in args.output.group_surfaces(&surfaces)? {
+        let over = args.reference.over.into();
+        let levels = LevelTable::read(source, group, base.as_ref(), LevelKind::Measured, over).await?;
+        let table = levels.to_table(source);
+        let figure = LevelsFigure { table, unit: levels.unit(), width_px: WIDTH_PX, with_caption: true };
+        let title = args.output.title_or(|| levels.default_title());
+        let notes = source.figure_notes(title, levels.query.clone(), group.iter().chain(&base));
+        args.output.write_chart(&figure.draw(&notes), &figure.table, &notes, group)?;
+    }
+    Ok(())
 }
 
 /// Returns the name of a Flat in a table.

@@ -14,7 +14,7 @@ const PLACEHOLDER: &str = "{surface}";
 
 #[derive(Debug, Args)]
 pub(crate) struct OutputArgs {
-    /// A file to write, as often as wanted: svg, pdf or png; tex, csv or md of a table. With {surface} in its name, one
+    /// A file to write, as often as wanted: svg, pdf or png; tex, csv or md of a table; csv of levels, too. With {surface} in its name, one
     /// file for each surface. Without it SVG, or Markdown of a table, goes to stdout.
     #[arg(short, long, value_name = "FILE")]
     output: Vec<PathBuf>,
@@ -48,12 +48,32 @@ impl OutputArgs {
             return Ok(std::io::stdout().write_all(drawing.to_svg().as_bytes())?);
         }
         for path in self.output_paths(surfaces)? {
-            match path_extension(&path) {
-                "svg" => write_file(&path, drawing.to_svg().as_bytes())?,
-                "pdf" => write_file(&path, &drawing.to_pdf()?)?,
-                "png" => write_file(&path, &drawing.to_png()?)?,
-                _ => bail!("`{}` has another extension; hint: svg, pdf or png", path.display()),
-            }
+            let Some(bytes) = drawing_bytes(drawing, &path)? else {
+                bail!("`{}` has another extension; hint: svg, pdf or png", path.display())
+            };
+            write_file(&path, &bytes)?;
+        }
+        Ok(())
+    }
+
+    /// Writes a chart to its files, and its numbers to those that are tables.
+    pub fn write_chart(
+        &self,
+        drawing: &FigureDrawing,
+        table: &FigureTable,
+        notes: &FigureNotes,
+        surfaces: &[SelectedSurface],
+    ) -> anyhow::Result<()> {
+        if self.output.is_empty() {
+            return self.write_drawing(drawing, surfaces);
+        }
+        for path in self.output_paths(surfaces)? {
+            let bytes = match drawing_bytes(drawing, &path)? {
+                Some(bytes) => bytes,
+                None if path_extension(&path) == "csv" => table.to_csv(notes).into_bytes(),
+                None => bail!("`{}` has another extension; hint: svg, pdf, png or csv", path.display()),
+            };
+            write_file(&path, &bytes)?;
         }
         Ok(())
     }
@@ -90,6 +110,16 @@ impl OutputArgs {
         };
         self.output.iter().map(path).collect()
     }
+}
+
+// The drawing in the format of a file; none if the file is none of a drawing.
+fn drawing_bytes(drawing: &FigureDrawing, path: &Path) -> anyhow::Result<Option<Vec<u8>>> {
+    Ok(match path_extension(path) {
+        "svg" => Some(drawing.to_svg().into_bytes()),
+        "pdf" => Some(drawing.to_pdf()?),
+        "png" => Some(drawing.to_png()?),
+        _ => None,
+    })
 }
 
 fn path_extension(path: &Path) -> &str {

@@ -62,7 +62,7 @@ pub(super) async fn write_grid(source: &FigureSource, args: &GridArgs) -> anyhow
             layers: GridLayer::from_grid(source.lake.grid()),
             microphone: microphone.id.index(),
             panels,
-            palette: if args.safe_colours { LevelPalette::Safe } else { LevelPalette::Paper },
+            palette: if args.paper_colours { LevelPalette::Paper } else { LevelPalette::Centred },
             panel_px: 440.0,
             columns: args.columns as usize,
             with_caption: true,

@@ -432,7 +432,7 @@ export interface paths {
         };
         /**
          * TNCE over the grid for one microphone point, drawn.
-         * @description White is -20 dB, black 0 dB, red 6 dB. Cells have `data-row` (band) and `data-point`.
+         * @description Grey is 0 dB, blue below, orange above, unless the palette is the paper's. Cells have `data-row` (band) and `data-point`.
          */
         readonly get: operations["grid_figure"];
         readonly put?: never;
@@ -455,6 +455,26 @@ export interface paths {
          * @description A side has as many cells as the square root of their number. y ascends.
          */
         readonly get: operations["heightmap"];
+        readonly put?: never;
+        readonly post?: never;
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
+    readonly "/api/v1/surfaces/{surface_id}/levels.svg": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        /**
+         * Levels by band with error bars, a series for each surface; drawn.
+         * @description Bars are 1.96 times the standard uncertainty. Dots have `data-series` and `data-band`.
+         */
+        readonly get: operations["levels_figure"];
         readonly put?: never;
         readonly post?: never;
         readonly delete?: never;
@@ -2138,7 +2158,7 @@ export interface operations {
                 readonly less?: string;
                 /** @description Key of the only band, as in `lake.bands`; all if there is none. */
                 readonly band?: string;
-                readonly palette?: "paper" | "safe";
+                readonly palette?: "centred" | "paper";
                 readonly frame?: "caption" | "bare";
                 /** @description Width of a surface's plot, px. */
                 readonly width?: number;
@@ -2193,6 +2213,48 @@ export interface operations {
                 };
                 content: {
                     readonly "application/octet-stream": string;
+                };
+            };
+            /** @description Not changed since the ETag of If-None-Match */
+            readonly 304: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content?: never;
+            };
+            readonly default: components["responses"]["Problem"];
+        };
+    };
+    readonly levels_figure: {
+        readonly parameters: {
+            readonly query?: {
+                /** @description As of grid. */
+                readonly over?: "flat-total" | "flat-band";
+                /** @description Surfaces beside this one. */
+                readonly beside?: readonly string[];
+                readonly frame?: "caption" | "bare";
+                /** @description Width, px. */
+                readonly width?: number;
+                readonly format?: "svg" | "pdf" | "png";
+            };
+            readonly header?: never;
+            readonly path: {
+                readonly surface_id: string;
+            };
+            readonly cookie?: never;
+        };
+        readonly requestBody?: never;
+        readonly responses: {
+            /** @description OK */
+            readonly 200: {
+                headers: {
+                    readonly ETag?: string;
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/pdf": string;
+                    readonly "image/png": string;
+                    readonly "image/svg+xml": string;
                 };
             };
             /** @description Not changed since the ETag of If-None-Match */

@@ -4,7 +4,8 @@ use std::io;
 
 use axum::Extension;
 use echolake_figures::{
-    FigureDrawing, FigureNotes, GridFigure, GridLayer, GridPanel, LevelPalette, MapFigure, NceFigure, NcePanel,
+    FigureDrawing, FigureNotes, FigureTable, GridFigure, GridLayer, GridPanel, LevelPalette, LevelsFigure, MapFigure,
+    NceFigure, NcePanel, TableRow,
 };
 use echolake_query::figure_rows::{
     LevelReference, band_labels, curves_query, grid_query, lake_version, orbit_energies_query, point_filter,
@@ -19,7 +20,7 @@ use super::content::{AnswerContent, EndpointAnswer};
 use super::curves::{CurveSet, PairSelection};
 use super::map::surface_positions;
 use super::request::{CatalogueRequest, SurfacePath};
-use super::snapshot::summary::SurfaceEntry;
+use super::snapshot::summary::{BAND_STATISTICS, SurfaceEntry};
 use super::surface::{GridNormalisation, read_grid, required_microphone};
 
 /// Surfaces of one figure.
@@ -68,14 +69,16 @@ enum FigureFrame {
     Bare,
 }
 
-/// The colour of levels over 0 dB.
+/// The colours of levels.
 #[derive(Clone, Copy, Default, Deserialize, ToSchema)]
 #[serde(rename_all = "lowercase")]
-#[schema(default = "paper")]
+#[schema(default = "centred")]
 enum FigurePalette {
+    /// Grey is 0 dB, blue below, orange above; the range fits.
     #[default]
+    Centred,
+    /// White is -20 dB, black 0 dB, red 6 dB.
     Paper,
-    Safe,
 }
 
 /// The contents of a grid plot.
@@ -117,7 +120,7 @@ pub(super) struct GridFigureQuery {
 
 /// TNCE over the grid for one microphone point, drawn.
 ///
-/// White is -20 dB, black 0 dB, red 6 dB. Cells have `data-row` (band) and `data-point`.
+/// Grey is 0 dB, blue below, orange above, unless the palette is the paper's. Cells have `data-row` (band) and `data-point`.
 #[utoipa::path(
     get,
     path = "/api/v1/surfaces/{surface_id}/grid.svg",
@@ -168,8 +171,8 @@ pub(super) async fn grid_figure(
         microphone,
         panels,
         palette: match query.palette {
+            FigurePalette::Centred => LevelPalette::Centred,
             FigurePalette::Paper => LevelPalette::Paper,
-            FigurePalette::Safe => LevelPalette::Safe,
         },
         panel_px: query.width.get() as f32,
         columns: COLUMNS,
@@ -179,7 +182,7 @@ pub(super) async fn grid_figure(
     options.extend((over == LevelReference::FlatTotal).then(|| "--over total".to_owned()));
     options.extend(query.band.iter().map(|band| format!("--band {band}")));
     options.extend(base.iter().map(|(base, _)| format!("--less {}", base.surface.surface_id)));
-    options.extend((figure.palette == LevelPalette::Safe).then(|| "--safe-colours".to_owned()));
+    options.extend((figure.palette == LevelPalette::Paper).then(|| "--paper-colours".to_owned()));
     let used: Vec<_> = entries.iter().copied().chain(base.iter().map(|(base, _)| *base)).collect();
     let notes = FigureNotes {
         title: GridFigure::default_title(&point, over.unit()),
@@ -188,6 +191,84 @@ pub(super) async fn grid_figure(
         ..figure_notes(&request, &used)
     };
     query.format.write_drawing(&request, figure.draw(&notes)).await
+}
+
+/// The contents of a chart of levels.
+#[derive(Default, Deserialize, IntoParams)]
+#[serde(default, deny_unknown_fields)]
+#[into_params(parameter_in = Query)]
+pub(super) struct LevelsFigureQuery {
+    /// As of grid.
+    #[param(inline)]
+    over: GridNormalisation,
+    /// Surfaces beside this one.
+    beside: Vec<String>,
+    #[param(inline)]
+    frame: FigureFrame,
+    /// Width, px.
+    #[param(inline)]
+    width: WholeNumber<160, 1200, 720>,
+    #[param(inline)]
+    format: FigureFormat,
+}
+
+/// Levels by band with error bars, a series for each surface; drawn.
+///
+/// Bars are 1.96 times the standard uncertainty. Dots have `data-series` and `data-band`.
+#[utoipa::path(
+    get,
+    path = "/api/v1/surfaces/{surface_id}/levels.svg",
+    tag = "catalogue",
+    params(SurfacePath, LevelsFigureQuery),
+    responses((status = 200, description = "OK", content(
+        (inline(BinaryContent) = "image/svg+xml"),
+        (inline(BinaryContent) = "application/pdf"),
+        (inline(BinaryContent) = "image/png")
+    ))),
+    extensions(("x-sql" = json!(["the summary of /surfaces"])))
+)]
+pub(super) async fn levels_figure(
+    Extension(request): Extension<CatalogueRequest>,
+    PathParams(path): PathParams<SurfacePath>,
+    QueryParams(query): QueryParams<LevelsFigureQuery>,
+) -> EndpointAnswer {
+    let entries = find_surfaces(&request, &path.surface_id, &query.beside).await?;
+    let over = LevelReference::from(query.over);
+    let table = FigureTable {
+        corner: "Surface".into(),
+        columns: band_labels(request.catalogue.lake().rig()),
+        rows: entries.iter().map(|entry| level_row(entry, over)).collect(),
+        with_extremes: true,
+    };
+    let with_caption = query.frame == FigureFrame::Caption;
+    let figure = LevelsFigure { table, unit: over.unit().to_owned(), width_px: query.width.get() as f32, with_caption };
+    let options: Vec<_> = (over == LevelReference::FlatTotal).then(|| "--over total".to_owned()).into_iter().collect();
+    let notes = FigureNotes {
+        title: LevelsFigure::default_title(over.unit()),
+        command: figure_command("levels", &entries, &options),
+        query: BAND_STATISTICS.to_owned(),
+        ..figure_notes(&request, &entries)
+    };
+    query.format.write_drawing(&request, figure.draw(&notes)).await
+}
+
+// Flat over itself is 0 dB by definition, and has no uncertainty.
+fn level_row(entry: &SurfaceEntry, over: LevelReference) -> TableRow {
+    let surface = &entry.surface;
+    let is_flat = surface.surface_id == surface.flat_reference;
+    let total = surface.level_u_db.len().saturating_sub(1);
+    let is_defined = |band: usize| is_flat && (over == LevelReference::FlatBand || band == total);
+    let uncertainties = surface.level_u_db.iter().enumerate();
+    TableRow {
+        name: if is_flat { format!("{} (reference)", surface.surface_id) } else { surface.surface_id.clone() },
+        values: match over {
+            LevelReference::FlatBand => surface.against_flat_db.clone(),
+            LevelReference::FlatTotal => surface.level_db.clone(),
+        },
+        uncertainties: uncertainties.map(|(band, u)| u.filter(|_| !is_defined(band))).collect(),
+        decimals: 2,
+        is_percent: false,
+    }
 }
 
 /// The contents of a plot of NCE curves.

@@ -75,6 +75,7 @@ pub(super) fn heavy_routes() -> OpenApiRouter {
     OpenApiRouter::new()
         .routes(routes!(figures::grid_figure))
         .routes(routes!(figures::curves_figure))
+        .routes(routes!(figures::levels_figure))
         .routes(routes!(figures::map_figure))
         .routes(routes!(pair::pair))
         .routes(routes!(analysis::analysis))
