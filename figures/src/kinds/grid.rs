@@ -15,6 +15,8 @@ const GAP: f32 = 10.0;
 const LABELS: f32 = 54.0;
 const NARROW: f32 = 420.0;
 const NARROW_LABELS: f32 = 46.0;
+/// Space between the name of a band and its cells.
+const LABEL_GAP: f32 = 6.0;
 const HEADER: f32 = 22.0;
 const CAPTION: f32 = 52.0;
 const BETWEEN_PANELS: f32 = 24.0;
@@ -151,7 +153,9 @@ impl GridFigure {
     }
 
     fn panel_layout(&self) -> PanelLayout {
-        let labels = if self.panel_px < NARROW { NARROW_LABELS } else { LABELS };
+        let least = if self.panel_px < NARROW { NARROW_LABELS } else { LABELS };
+        let widest_name = self.bands.iter().map(|name| text_width(name, TEXT_PX)).fold(0.0, f32::max);
+        let labels = least.max((widest_name + LABEL_GAP).ceil());
         let layers = self.layers.len().max(1) as f32;
         let widest = self.layers.iter().map(GridLayer::cells_across).max().unwrap_or(1);
         let most = MOST_CELL_PX * if widest == 1 { SINGLE_CELL } else { widest as f32 };
@@ -387,6 +391,15 @@ mod tests {
     fn few_points_have_small_cells() {
         let svg = figure(None, LevelPalette::Paper).draw(&FigureNotes::default()).to_svg();
         assert!(cell(&svg, 1).contains(" width=\"39\""), "{}", cell(&svg, 1));
+    }
+
+    #[test]
+    fn names_of_bands_end_before_their_cells() {
+        let mut figure = figure(None, LevelPalette::Centred);
+        figure.bands = vec!["32.768 kHz".into()];
+        let svg = figure.draw(&FigureNotes::default()).to_svg();
+        let x: f32 = cell(&svg, 0).split(" x=\"").nth(1).expect("x").split('"').next().expect("x").parse().expect("x");
+        assert!(x > 12.0 + text_width("32.768 kHz", TEXT_PX), "{x}");
     }
 
     #[test]

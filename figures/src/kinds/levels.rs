@@ -21,6 +21,8 @@ const COVERAGE_FACTOR: f64 = 1.96;
 /// Share of a band's width that its series stand in, and the most that one of them takes.
 const SERIES_SHARE: f64 = 0.7;
 const MOST_SERIES_SHARE: f64 = 0.12;
+/// Half of the longest bar that the axis makes room for, dB: a band without energy has an uncertainty beyond all bounds.
+const MOST_BAR_DB: f64 = 6.0;
 /// Room above and below the values, as a share of their range.
 const MARGIN: f64 = 0.06;
 
@@ -100,11 +102,15 @@ impl LevelsFigure {
         lines
     }
 
-    // All levels with their bars, and 0 dB.
+    // All levels with their bars, and 0 dB. Longer bars end at the ends of the axis.
     fn level_axis(&self) -> PlotAxis {
         let bands = 0..self.table.columns.len();
         let ends = self.table.rows.iter().flat_map(|row| bands.clone().filter_map(|band| bar_ends(row, band)));
-        let [low, high] = ends.fold([0.0f64, 0.0], |[low, high], [least, most]| [low.min(least), high.max(most)]);
+        let held = ends.map(|[least, most]| {
+            let excess = ((most - least) / 2.0 - MOST_BAR_DB).max(0.0);
+            [least + excess, most - excess]
+        });
+        let [low, high] = held.fold([0.0f64, 0.0], |[low, high], [least, most]| [low.min(least), high.max(most)]);
         let margin = MARGIN * (high - low).max(0.5);
         PlotAxis::linear(low - margin, high + margin)
     }
@@ -218,6 +224,15 @@ mod tests {
         let drawing = figure(&[None, Some(f64::NAN), None], &[]).draw(&FigureNotes::default());
         assert_eq!(drawn_heights(&drawing), (vec![], vec![]));
         assert!(!drawing.to_svg().contains("NaN"));
+    }
+
+    #[test]
+    fn a_bar_beyond_all_bounds_leaves_room_for_levels() {
+        let drawing =
+            figure(&[Some(0.0), Some(-2.0), Some(1.0)], &[None, Some(1e6), None]).draw(&FigureNotes::default());
+        let (dots, bars) = drawn_heights(&drawing);
+        assert!(dots[1] - dots[0] > 30.0, "{dots:?}");
+        assert!(bars[0][0] - bars[0][1] > 279.0, "{bars:?}");
     }
 
     #[test]

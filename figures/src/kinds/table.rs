@@ -9,6 +9,9 @@ use crate::canvas::notes::FigureNotes;
 const LOUDEST: &str = "[rgb]{0.992,0.89,0.722}";
 const QUIETEST: &str = "[rgb]{0.827,0.894,0.961}";
 
+/// The greatest uncertainty that is written as a number.
+const MOST_UNCERTAINTY: f64 = 99.0;
+
 /// A row: its name, then a value for each column.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TableRow {
@@ -42,16 +45,20 @@ impl TableRow {
         self.uncertainties.get(column).copied().flatten().filter(|u| u.is_finite())
     }
 
-    // An uncertainty that rounds to nothing is under the last decimal, and not nothing.
+    // An uncertainty that rounds to nothing is under the last decimal, and not nothing. A band without energy has one
+    // beyond all bounds.
     fn cell_text(&self, column: usize, value: Option<f64>) -> String {
         let text = self.value_text(value);
         let Some(u) = self.uncertainty(column) else { return text };
         let least = 10f64.powi(-(self.decimals as i32));
         let digits = self.decimals;
-        match u < least / 2.0 {
-            true => format!("{text} \u{b1} <{least:.digits$}"),
-            false => format!("{text} \u{b1} {u:.digits$}"),
+        if u < least / 2.0 {
+            return format!("{text} \u{b1} <{least:.digits$}");
         }
+        if u > MOST_UNCERTAINTY {
+            return format!("{text} \u{b1} >{MOST_UNCERTAINTY}");
+        }
+        format!("{text} \u{b1} {u:.digits$}")
     }
 
     fn value_text(&self, value: Option<f64>) -> String {
@@ -229,7 +236,10 @@ mod tests {
     fn uncertainties_are_beside_their_values() {
         let mut table = table();
         table.rows[0].uncertainties = vec![Some(0.0123), Some(0.004)];
-        assert!(table.to_markdown(&FigureNotes::default()).contains("| **−7.66 ± 0.01** | 0.00 ± <0.01 |"));
+        table.rows[1].uncertainties = vec![Some(1.2e31)];
+        let markdown = table.to_markdown(&FigureNotes::default());
+        assert!(markdown.contains("| **−7.66 ± 0.01** | 0.00 ± <0.01 |") && markdown.contains("| *−7.80 ± >99* |"));
+        table.rows[1].uncertainties.clear();
         assert!(table.to_latex(&FigureNotes::default()).contains("$-$7.66 $\\pm$ 0.01 & 0.00 $\\pm$ \\textless{}0.01"));
         expect![[r#"
             Panel,2.5 kHz,Total,standard uncertainty of 2.5 kHz,standard uncertainty of Total

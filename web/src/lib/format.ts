@@ -15,9 +15,10 @@ export function signed(value: number | null | undefined, digits = 1): string {
   return typeof value === 'number' && value > 0 && Number(value.toFixed(digits)) > 0 ? `+${text}` : text
 }
 
-/** A standard uncertainty behind its value. One that rounds to nothing is under the last decimal, and not nothing. */
+/** A standard uncertainty behind its value, dB. One that rounds to nothing is under the last decimal, and not nothing; a
+band without energy has one beyond all bounds. */
 export const plusMinus = (u: number | null | undefined) =>
-  u === null || u === undefined ? '' : ` ± ${u < 0.005 ? '<0.01' : u.toFixed(2)}`
+  u === null || u === undefined ? '' : ` ± ${u < 0.005 ? '<0.01' : u > 99 ? '>99' : u.toFixed(2)}`
 
 /** A number with as many digits as it needs, up to some; every minus is a true one, also an exponent's. */
 export const plain = (value: number | bigint, digits = 7) =>
