@@ -21,7 +21,8 @@ const COVERAGE_FACTOR: f64 = 1.96;
 /// Share of a band's width that its series stand in, and the most that one of them takes.
 const SERIES_SHARE: f64 = 0.7;
 const MOST_SERIES_SHARE: f64 = 0.12;
-/// Half of the longest bar that the axis makes room for, dB: a band without energy has an uncertainty beyond all bounds.
+/// Half of the longest bar that the axis makes room for, dB: a band without energy has an uncertainty beyond all
+/// bounds.
 const MOST_BAR_DB: f64 = 6.0;
 /// Room above and below the values, as a share of their range.
 const MARGIN: f64 = 0.06;
@@ -124,7 +125,7 @@ impl LevelsFigure {
         let every = (widest(size_px) / step).ceil().max(1.0) as usize;
         let last = names.len().saturating_sub(1);
         let bottom = frame.top + frame.height;
-        for (band, name) in names.iter().enumerate().filter(|(band, _)| (last - band) % every == 0) {
+        for (band, name) in names.iter().enumerate().filter(|(band, _)| (last - band).is_multiple_of(every)) {
             let [x, _] = frame.page_position(band as f64, 0.0);
             drawing.add_shape(sized_label([x, bottom + 16.0], name, TextAnchor::Middle, size_px, FigureColour::Ink));
         }
