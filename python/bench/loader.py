@@ -1,6 +1,6 @@
 """How fast ``echolake.torch`` is, beside pyarrow's bare read of the same columns of the same files.
 
-    python bench/loader.py TRAINING_SET [--workers 1] [--rounds 5]
+    python bench/loader.py TRAINING_SET [--workers 1] [--rounds 5] [--memory 256]
 
 Takes turns, so that whatever else the machine does slows all of them, and compares medians.
 """
@@ -61,19 +61,22 @@ def main() -> None:
     parser.add_argument("path", type=Path, metavar="TRAINING_SET")
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--memory", type=int, default=256, help="MiB of decoded surfaces that a process keeps")
     given = parser.parse_args()
     dataset = Measurements(given.path)
     columns = [*dataset.columns, "surface_id", "symmetry"]
+    files = [given.path / name for name in dataset.source.files]
     bare = {
-        "pyarrow, whole files": partial(tables, dataset.files, columns),
-        "pyarrow, row groups": partial(row_groups, dataset.files, columns),
-        "pyarrow, 1024 rows at a time": partial(streamed, dataset.files, columns),
+        "pyarrow, whole files": partial(tables, files, columns),
+        "pyarrow, row groups": partial(row_groups, files, columns),
+        "pyarrow, 1024 rows at a time": partial(streamed, files, columns),
     }
+    load = partial(loaded, given.path, given.workers, memory=given.memory << 20)
     loaders = {
-        "echolake.torch": partial(loaded, given.path, given.workers),
-        "echolake.torch, turned, heights": partial(
-            loaded, given.path, given.workers, symmetries="random", heights=True
-        ),
+        "echolake.torch": load,
+        "echolake.torch, turned, heights": partial(load, symmetries="random", heights=True),
+        "echolake.torch, clump 256": partial(load, clump=256),
+        "echolake.torch, clump 1": partial(load, clump=1),
     }
     rates: dict[str, list[float]] = {name: [] for name in [*bare, *loaders]}
     for run in bare.values():
@@ -82,7 +85,7 @@ def main() -> None:
         for name, run in (bare | loaders).items():
             rates[name].append(rate(run))
     middle = {name: statistics.median(values) for name, values in rates.items()}
-    samples = sum(pq.read_metadata(file).num_rows for file in dataset.files)
+    samples = dataset.rows()
     print(f"{samples} samples, workers: {given.workers}, rounds: {given.rounds}, load: {os.getloadavg()[0]:.1f}")
     for name, values in rates.items():
         shares = "".join(f"  {middle[name] / middle[other]:5.0%}" for other in bare) if name in loaders else ""

@@ -10,6 +10,7 @@ import subprocess
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -123,3 +124,42 @@ def a_slice(echolake: str, lake: Path, tmp_path_factory: pytest.TempPathFactory)
     path = tmp_path_factory.mktemp("slices") / "five.mcap"
     export(echolake, lake, "mcap", "--where", "surface_id = 'flat' and pair_id < 5", "-o", str(path))
     return path
+
+
+@pytest.fixture(scope="session")
+def small_set(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A training set whose numbers tell the row: 13 surfaces of 40 to 52 pairs in four files, made without a lake."""
+    pa, pq = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    path = tmp_path_factory.mktemp("small") / "set"
+    (path / "data").mkdir(parents=True)
+    (path / "heightmaps").mkdir()
+    for file in range(4):
+        tables = [rows_of_surface(surface) for surface in range(file, 13, 4)]
+        with pq.ParquetWriter(path / "data" / f"train-{file}.parquet", tables[0].schema) as writer:
+            for table in tables:
+                writer.write_table(table)
+    names = [f"{surface:04}_0" for surface in range(13)]
+    heights = pa.array([[surface, 1.0, 2.0, 3.0] for surface in range(13)], pa.list_(pa.float32(), 4))
+    maps = pa.table({"surface_id": names, "symmetry": ["identity"] * 13, "heights_mm": heights})
+    pq.write_table(maps, path / "heightmaps" / "train.parquet")
+    return path
+
+
+def rows_of_surface(surface: int) -> Any:
+    """Pair p of surface s: response [s, p, 0, 0], missing for pair 3, and samples 1000 s + p, missing for pair 5."""
+    import pyarrow as pa
+
+    count = 40 + surface
+    pairs = range(count)
+    position = pa.list_(pa.field("element", pa.float32(), nullable=False), 3)
+    response = pa.list_(pa.field("element", pa.float32(), nullable=False), 4)
+    columns = {
+        "surface_id": pa.array([f"{surface:04}_0"] * count),
+        "symmetry": pa.array(["identity"] * count),
+        "pair_id": pa.array(pairs, pa.int32()),
+        "microphone_mm": pa.array([[surface, p, 7.0] for p in pairs], position),
+        "ir": pa.array([None if p == 3 else [surface, p, 0, 0] for p in pairs], response),
+        "samples": pa.array([None if p == 5 else 1000 * surface + p for p in pairs], pa.int64()),
+    }
+    fields = [pa.field(name, values.type, nullable=name in ("ir", "samples")) for name, values in columns.items()]
+    return pa.table(columns, schema=pa.schema(fields))

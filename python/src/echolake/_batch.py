@@ -17,6 +17,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from echolake.training import Kind
+
 __all__ = ["Batch", "Memory"]
 
 _ALIGNMENT = 64
@@ -111,34 +113,21 @@ class Memory:
         self._reuses = _parent_can_open()
         self._layouts: dict[Any, tuple[_Layout, int]] = {}
 
-    def batch(
-        self, columns: Mapping[str, NDArray[Any]], chosen: NDArray[np.int64], whole: Mapping[str, NDArray[Any]]
-    ) -> Batch:
-        """The ``chosen`` rows of columns, and all of what is ``whole``."""
-        layout, size = self._layout(columns, len(chosen), whole)
+    def allocate_batch(self, kinds: Mapping[str, Kind]) -> Batch:
+        """A batch of uninitialised tensors, by type and shape."""
+        layout, size = self._layout(kinds)
         slab = self._slab(size) if self._reuses else None
         memory = slab.take(size) if slab else torch.empty(size, dtype=torch.uint8)
-        filled = memory.numpy()
-        places = {place.name: np.ndarray(place.shape, place.dtype, filled, place.start) for place in layout}
-        for name, values in columns.items():
-            # Any mode but the default lets numpy write to the place itself.
-            values.take(chosen, axis=0, out=places[name], mode="clip")
-        for name, values in whole.items():
-            np.copyto(places[name], values)
         views = _views(memory, layout)
         batch = Batch(views)
         batch._packed = _Packed(memory, slab, layout, views)
         return batch
 
     # The same for almost all batches of a dataset.
-    def _layout(
-        self, columns: Mapping[str, NDArray[Any]], rows: int, whole: Mapping[str, NDArray[Any]]
-    ) -> tuple[_Layout, int]:
-        key = rows, *(values.shape for values in whole.values())
+    def _layout(self, kinds: Mapping[str, Kind]) -> tuple[_Layout, int]:
+        key = tuple(kinds.items())
         if key not in self._layouts:
-            shapes = {name: (rows, *values.shape[1:]) for name, values in columns.items()}
-            shapes |= {name: values.shape for name, values in whole.items()}
-            self._layouts[key] = _laid_out(shapes, {**columns, **whole})
+            self._layouts[key] = _laid_out(kinds)
         return self._layouts[key]
 
     def _slab(self, size: int) -> _Slab | None:
@@ -150,10 +139,9 @@ class Memory:
         return found
 
 
-def _laid_out(shapes: Mapping[str, tuple[int, ...]], of: Mapping[str, NDArray[Any]]) -> tuple[_Layout, int]:
+def _laid_out(kinds: Mapping[str, Kind]) -> tuple[_Layout, int]:
     layout, end = [], 0
-    for name, shape in shapes.items():
-        dtype = of[name].dtype
+    for name, (dtype, shape) in kinds.items():
         strides = tuple(math.prod(shape[axis + 1 :]) for axis in range(len(shape)))
         layout.append(_Place(name, dtype.name, shape, strides, end))
         end += -(-math.prod(shape) * dtype.itemsize // _ALIGNMENT) * _ALIGNMENT
