@@ -1,6 +1,6 @@
 """How fast ``echolake.torch`` is, beside pyarrow's bare read of the same columns of the same files.
 
-    python bench/loader.py TRAINING_SET [--workers 1] [--rounds 5] [--memory 256]
+    python bench/loader.py TRAINING_SET [--workers 1] [--rounds 5] [--memory 1024]
 
 Takes turns, so that whatever else the machine does slows all of them, and compares medians.
 """
@@ -61,7 +61,7 @@ def main() -> None:
     parser.add_argument("path", type=Path, metavar="TRAINING_SET")
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--memory", type=int, default=256, help="MiB of decoded surfaces that a process keeps")
+    parser.add_argument("--memory", type=int, default=1024, help="MiB of decoded surfaces that a process keeps")
     given = parser.parse_args()
     dataset = Measurements(given.path)
     columns = [*dataset.columns, "surface_id", "symmetry"]

@@ -276,5 +276,7 @@ def test_mistakes_are_named(small_set: Path, tmp_path: Path) -> None:
         MeasurementBatches(small_set, columns=["pair_id"], symmetries="random")
     with pytest.raises(ValueError, match="clump 0"):
         MeasurementBatches(small_set, clump=0)
+    with pytest.warns(UserWarning, match="all of them take 1 MiB, memory has 0 MiB"):
+        MeasurementBatches(small_set, clump=8, memory=1 << 10)
     with pytest.raises(TypeError, match="clumps"):
         MeasurementBatches(small_set, clumps=3)

@@ -10,6 +10,7 @@ import hashlib
 import json
 import os
 import time
+import warnings
 import weakref
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -258,8 +259,9 @@ class MeasurementRows:
         self.columns = _numeric_columns(schema, columns, () if symmetries == "none" else _MEASURED)
         self._kinds = {name: _column_kind(schema.field(name)) for name in self.columns}
         row_bytes = sum(dtype.itemsize * int(np.prod(shape)) for dtype, shape in self._kinds.values()) + 8
-        #: Decoded surfaces that a process keeps.
-        self.capacity = max(1, memory // max(1, row_bytes * int(self.sizes.max(initial=0))))
+        surface_bytes = row_bytes * int(self.sizes.max())
+        #: Decoded surfaces that a process keeps, and the bytes of all.
+        self.capacity, self.all_bytes = max(1, memory // surface_bytes), surface_bytes * len(self._groups)
         self._heights: dict[str, NDArray[np.float32]] | None = None
 
     def __len__(self) -> int:
@@ -449,6 +451,13 @@ class MeasurementBatches:
             order["shuffle"] = split == "train"
         self.settings = OrderSettings(**order)
         self.source = MeasurementRows(path, split, columns, heights=heights, symmetries=symmetries, memory=memory)
+        if self.settings.shuffle and self.settings.clump != "surface" and self.source.all_bytes > memory:
+            warnings.warn(
+                f"clump={self.settings.clump} decodes surfaces again and again: all of them take "
+                f"{-(-self.source.all_bytes >> 20)} MiB, memory has {memory >> 20} MiB a process; hint: give more "
+                'memory, or clump="surface" with a larger mix',
+                stacklevel=2,
+            )
         self.columns, self.rank, self.world_size = self.source.columns, rank, world_size
         # Epoch, and the batch that iteration begins with.
         self._place: Any = np.zeros(2, np.int64)
