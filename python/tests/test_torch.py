@@ -118,6 +118,15 @@ def test_workers_that_stay_see_the_next_epoch(small_set: Path, start: str) -> No
         assert [digest(batch) for batch in loader] == undisturbed(small_set, epoch)
 
 
+def test_a_state_of_workers_needs_the_batch(small_set: Path) -> None:
+    dataset = of_rank(small_set, 0, 1)
+    assert dataset.state_dict()["batch"] == 0
+    batch = next(iter(DataLoader(dataset, batch_size=None, num_workers=1)))
+    with pytest.raises(ValueError, match="after=batch"):
+        dataset.state_dict()
+    assert dataset.state_dict(after=batch)["batch"] == 1
+
+
 def test_samplers_choose_rows(small_set: Path) -> None:
     rows = MeasurementRows(small_set, columns=["pair_id", "ir"], heights=True)
     sampler = torch.utils.data.WeightedRandomSampler(torch.arange(len(rows)) == 41, 64)

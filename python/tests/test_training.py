@@ -57,7 +57,7 @@ def test_an_epoch_is_a_permutation_that_seed_and_epoch_decide() -> None:
 
     def order(epoch: int, **settings: Any) -> list[int]:
         made = EpochOrder(sizes, OrderSettings(batch_size=16, **settings), epoch)
-        return [int(row) for batch in range(made.batches) for row in made.rows_of(batch)]
+        return [int(row) for batch in range(made.batches) for row in made.compute_rows(batch)]
 
     for settings in ({}, {"clump": 1}, {"clump": 8, "mix": 1}, {"lanes": 64}, {"lanes": 1}):
         assert sorted(order(2, **settings)) == list(range(348))
@@ -69,7 +69,7 @@ def test_an_epoch_is_a_permutation_that_seed_and_epoch_decide() -> None:
 # Written down once: a state that was saved must continue after an update of echolake, NumPy or the machine, too.
 def test_the_order_stays_as_it_was() -> None:
     order = EpochOrder(np.array([40, 1, 300, 7]), OrderSettings(batch_size=8, clump=32, mix=2, seed=5), epoch=3)
-    assert order.rows_of(0).tolist() == [255, 94, 86, 248, 91, 261, 246, 75]
+    assert order.compute_rows(0).tolist() == [255, 94, 86, 248, 91, 261, 246, 75]
 
 
 def test_a_symmetry_is_drawn_for_each_surface_and_epoch_and_turns_positions_and_maps(small_set: Path) -> None:
@@ -172,7 +172,7 @@ def test_eight_million_rows_continue_within_a_second() -> None:
     for clump in (1, 256, "surface"):
         start = time.perf_counter()
         order = EpochOrder(sizes, OrderSettings(clump=clump), 7)
-        assert len(order.rows_of(order.batches // 2)) == 512
+        assert len(order.compute_rows(order.batches // 2)) == 512
         # 0.3 s where nothing else runs.
         assert time.perf_counter() - start < 5
 

@@ -42,8 +42,8 @@ class Measurements(MeasurementBatches, IterableDataset[Batch]):
         if world_size is None:
             world_size = torch.distributed.get_world_size() if distributed else 1
         super().__init__(path, split, columns, rank=rank, world_size=world_size, **settings)
-        # Workers that outlive an epoch see where the next one begins.
-        self._place = torch.zeros(2, dtype=torch.int64).share_memory_()
+        # Workers that outlive an epoch see where the next one begins; this process sees how many there are.
+        self._place = torch.zeros(3, dtype=torch.int64).share_memory_()
         self._memory: Memory | None = None
 
     def __iter__(self) -> Iterator[Batch]:
@@ -51,8 +51,14 @@ class Measurements(MeasurementBatches, IterableDataset[Batch]):
         # What a worker gave away is in use until the training process drops it; a forked copy knows nothing of that.
         if info is None or self._memory is None:
             self._memory = Memory()
+        self._place[2] = info.num_workers if info else 0
         share = self.iterate_share(info.id, info.num_workers) if info else self.iterate_share(0, 1)
         return cast(Iterator[Batch], share)
+
+    def state_dict(self, after: Mapping[str, Any] | None = None) -> dict[str, Any]:
+        if after is None and get_worker_info() is None and self._place[2] > 0:
+            raise ValueError("workers make the batches, and are ahead of training; hint: state_dict(after=batch)")
+        return super().state_dict(after)
 
     def _allocate(self, kinds: Mapping[str, Kind]) -> tuple[BatchDict, dict[str, NDArray[Any]]]:
         assert self._memory is not None

@@ -38,7 +38,7 @@ Allocate = Callable[[Mapping[str, Kind]], tuple[BatchDict, dict[str, NDArray[Any
 _Result = TypeVar("_Result")
 
 _READERS = 2
-_BATCHES_AHEAD = 8
+_BATCHES_AHEAD = 32
 _ROWS_AT_ONCE = 1024
 """Rows to decode at once: few enough to be copied before they leave the processor's cache."""
 _RETRY_SECS = (0.1, 0.2, 0.4, 0.8, 1.6)
@@ -83,17 +83,17 @@ class EpochOrder:
         self._epoch = epoch
         self._windows: dict[int, Numbers] = {}
         if settings.shuffle and settings.clump == 1:
-            self._firsts = self._random(0).permutation(rows)
+            self._firsts = self._make_generator(0).permutation(rows)
         elif settings.shuffle:
             firsts, counts = _cut_clumps(sizes, settings.clump)
-            order = self._random(0).permutation(len(firsts))
+            order = self._make_generator(0).permutation(len(firsts))
             self._firsts, self._counts = firsts[order], counts[order]
             self._ends = np.cumsum(self._counts)
             self._window_ends = np.append(self._ends[settings.mix - 1 : -1 : settings.mix], self._ends[-1:])
 
-    def rows_of(self, batch: int) -> Numbers:
+    def compute_rows(self, batch: int) -> Numbers:
         """Numbers of the rows of a batch, ``[batch_size]``; the sequence's last batch may be short."""
-        start = self._place_of(batch) * self.settings.batch_size
+        start = self._locate_batch(batch) * self.settings.batch_size
         places = np.arange(start, min(start + self.settings.batch_size, self.rows))
         if not self.settings.shuffle:
             return places
@@ -106,10 +106,10 @@ class EpochOrder:
 
     def draw_symmetries(self, surfaces: int) -> Numbers:
         """A symmetry for each surface, as its place in ``NAMES``."""
-        return self._random(1).randint(len(NAMES), size=surfaces)
+        return self._make_generator(1).randint(len(NAMES), size=surfaces)
 
     # The stretch of lane i begins at its share of the batches; the first lanes have one more where shares are unequal.
-    def _place_of(self, batch: int) -> int:
+    def _locate_batch(self, batch: int) -> int:
         lanes = self.settings.lanes if self.settings.shuffle else 1
         share, more = divmod(self.batches, lanes)
         lane = batch % lanes
@@ -128,11 +128,11 @@ class EpochOrder:
         if window not in self._windows:
             if len(self._windows) > 2 * self.settings.lanes:
                 self._windows.clear()
-            self._windows[window] = self._random(2, window).permutation(int(self._window_ends[window]) - start)
+            self._windows[window] = self._make_generator(2, window).permutation(int(self._window_ends[window]) - start)
         return self._windows[window]
 
     # NumPy promises for this class alone that its numbers stay the same in later versions.
-    def _random(self, *purpose: int) -> np.random.RandomState:
+    def _make_generator(self, *purpose: int) -> np.random.RandomState:
         return np.random.RandomState(
             np.random.MT19937(np.random.SeedSequence([self.settings.seed, self._epoch, *purpose]))
         )
@@ -166,7 +166,7 @@ class _SurfaceRows:
     of_row: Numbers
 
 
-def _new_arrays(kinds: Mapping[str, Kind]) -> tuple[BatchDict, dict[str, NDArray[Any]]]:
+def _allocate_arrays(kinds: Mapping[str, Kind]) -> tuple[BatchDict, dict[str, NDArray[Any]]]:
     arrays = {name: np.empty(shape, dtype) for name, (dtype, shape) in kinds.items()}
     return dict(arrays), arrays
 
@@ -252,7 +252,7 @@ class MeasurementRows:
         #: Rows of each surface, ``[surfaces]``, each of its symmetries for itself.
         self.sizes = np.repeat(np.array([group.rows for group in self._groups], np.int64), self._copies)
         self._ends = np.cumsum(self.sizes)
-        self._is_turned = self._has_symmetries(state)
+        self._is_turned = self._check_symmetries(state)
         if self._is_turned and symmetries != "none":
             raise ValueError('the training set has its symmetries already; take symmetries="none"')
         schema = footers[0].schema.to_arrow_schema()
@@ -288,7 +288,7 @@ class MeasurementRows:
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_state": None}
 
-    def surfaces_of(self, numbers: Numbers) -> set[int]:
+    def find_surfaces(self, numbers: Numbers) -> set[int]:
         """The surfaces that rows are of."""
         return set((np.unique(np.searchsorted(self._ends, numbers, side="right")) // self._copies).tolist())
 
@@ -305,7 +305,9 @@ class MeasurementRows:
                 state.surfaces.popitem(last=False)[1].cancel()
         return coming
 
-    def read_rows(self, numbers: Numbers, drawn: Numbers | None = None, allocate: Allocate = _new_arrays) -> BatchDict:
+    def read_rows(
+        self, numbers: Numbers, drawn: Numbers | None = None, allocate: Allocate = _allocate_arrays
+    ) -> BatchDict:
         """Rows by number, under the symmetries ``drawn`` for surfaces; those of a surface stand together.
 
         Columns have shape ``[rows, ...]``; ``surface`` points into ``surface_ids`` and ``symmetries``; ``heights`` on
@@ -314,7 +316,7 @@ class MeasurementRows:
         numbers = np.sort(numbers)
         items, firsts = np.unique(np.searchsorted(self._ends, numbers, side="right"), return_index=True)
         # A set that was exported under all symmetries has each of them in a row group.
-        named = [NAMES if self._is_turned else (self._symmetry_of(item, drawn),) for item in items.tolist()]
+        named = [NAMES if self._is_turned else (self._select_symmetry(item, drawn),) for item in items.tolist()]
         kinds = {name: (dtype, (len(numbers), *shape)) for name, (dtype, shape) in self._kinds.items()}
         kinds["surface"] = np.dtype(np.int64), (len(numbers),)
         if self.with_heights:
@@ -339,10 +341,10 @@ class MeasurementRows:
         batch["surface_ids"], batch["symmetries"] = surface_ids, [name for names in named for name in names]
         return batch
 
-    def _symmetry_of(self, item: int, drawn: Numbers | None) -> str:
+    def _select_symmetry(self, item: int, drawn: Numbers | None) -> str:
         return NAMES[item % self._copies if drawn is None else int(drawn[item])]
 
-    def _has_symmetries(self, state: _ProcessState) -> bool:
+    def _check_symmetries(self, state: _ProcessState) -> bool:
         first = self._groups[0]
 
         def read_names(file: Any) -> set[str]:
@@ -482,9 +484,9 @@ class MeasurementBatches:
 
     def rows(self) -> int:
         """Rows of an epoch, over all ranks, none twice."""
-        return self.epoch_order().rows
+        return self.current_order().rows
 
-    def epoch_order(self) -> EpochOrder:
+    def current_order(self) -> EpochOrder:
         """The order of the current epoch."""
         if self._order is None or self._order[0] != self.epoch:
             self._order = self.epoch, EpochOrder(self.source.sizes, self.settings, self.epoch)
@@ -495,7 +497,7 @@ class MeasurementBatches:
 
     def iterate_share(self, worker: int, workers: int) -> Iterator[BatchDict]:
         """The batches of one of a rank's workers; surfaces of the next ones are being read meanwhile."""
-        order, start = self.epoch_order(), int(self._place[1])
+        order, start = self.current_order(), int(self._place[1])
         drawn = order.draw_symmetries(len(self.source.sizes)) if self.source.symmetries == "random" else None
         self._given, self._workers = 0, workers
         if self._resumed and self._resumed[0] == self.epoch:
@@ -508,8 +510,8 @@ class MeasurementBatches:
         planned: deque[tuple[int, Numbers, set[int]]] = deque()
         for share in range(worker + self._given * workers, self._shared_batches(start), workers):
             number = start + share * self.world_size + self.rank
-            rows = order.rows_of(number % order.batches)
-            surfaces = self.source.surfaces_of(rows)
+            rows = order.compute_rows(number % order.batches)
+            surfaces = self.source.find_surfaces(rows)
             while planned and (
                 len(planned) == _BATCHES_AHEAD
                 or len(surfaces.union(*(others for _, _, others in planned))) > self.source.capacity
@@ -532,7 +534,7 @@ class MeasurementBatches:
             start = after["batch"] - self.rank + self.world_size
         elif self._workers == 1:
             start += self._given * self.world_size
-        if start >= self.epoch_order().batches and (after is not None or self._workers == 1):
+        if start >= self.current_order().batches and (after is not None or self._workers == 1):
             epoch, start = epoch + 1, 0
         state = self._describe_set() | {"epoch": epoch, "batch": start}
         return (
@@ -560,7 +562,7 @@ class MeasurementBatches:
 
     # Batches of each rank from batch `start` of the epoch on.
     def _shared_batches(self, start: int) -> int:
-        left = self.epoch_order().batches - start
+        left = self.current_order().batches - start
         return max(0, left // self.world_size if self.settings.drop_last else -(-left // self.world_size))
 
     def _read_batch(self, number: int, rows: Numbers, drawn: Numbers | None) -> BatchDict:
@@ -570,7 +572,7 @@ class MeasurementBatches:
         return batch
 
     def _allocate(self, kinds: Mapping[str, Kind]) -> tuple[BatchDict, dict[str, NDArray[Any]]]:
-        return _new_arrays(kinds)
+        return _allocate_arrays(kinds)
 
 
 def _retry_read(read: Callable[[], _Result], waits: Sequence[float]) -> _Result:
