@@ -302,7 +302,7 @@ class MeasurementRows:
                 state.surfaces.move_to_end(surface)
             coming = [state.surfaces[surface] for surface in sorted(surfaces)]
             while len(state.surfaces) > max(self.capacity, len(surfaces)):
-                state.surfaces.popitem(last=False)[1].cancel()
+                state.surfaces.popitem(last=False)
         return coming
 
     def read_rows(
@@ -369,7 +369,6 @@ class MeasurementRows:
     def _read_surface(self, state: _ProcessState, surface: int) -> _SurfaceRows:
         group = self._groups[surface]
         names = [*self.columns, "surface_id", "symmetry"]
-
         try:
             columns = state.spare.pop()
         except IndexError:
@@ -529,23 +528,18 @@ class MeasurementBatches:
         ``after`` is the batch that this rank took last. Without it the state is that of this process; torch's
         ``StatefulDataLoader`` asks each of several workers for one, which is good for as many workers only.
         """
-        epoch, start = self.epoch, int(self._place[1])
+        epoch = self.epoch
+        start = int(self._place[1])
+        if after is None and self._workers > 1:
+            share = {"given": self._given, "workers": self._workers}
+            return self._describe_set() | {"epoch": epoch, "batch": start} | share
         if after is not None:
             start = after["batch"] - self.rank + self.world_size
-        elif self._workers == 1:
+        else:
             start += self._given * self.world_size
-        if start >= self.current_order().batches and (after is not None or self._workers == 1):
+        if start >= self.current_order().batches:
             epoch, start = epoch + 1, 0
-        state = self._describe_set() | {"epoch": epoch, "batch": start}
-        return (
-            state
-            if after is not None or self._workers == 1
-            else state
-            | {
-                "given": self._given,
-                "workers": self._workers,
-            }
-        )
+        return self._describe_set() | {"epoch": epoch, "batch": start}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continues where a state was made, with other ranks and workers, too."""
