@@ -61,7 +61,9 @@ def main() -> None:
     parser.add_argument("path", type=Path, metavar="TRAINING_SET")
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--memory", type=int, default=1024, help="MiB of decoded surfaces that a process keeps")
+    parser.add_argument(
+        "--memory", type=int, default=1024, help="MiB of decoded surfaces that a process keeps for small clumps"
+    )
     given = parser.parse_args()
     dataset = Measurements(given.path)
     columns = [*dataset.columns, "surface_id", "symmetry"]
@@ -71,12 +73,13 @@ def main() -> None:
         "pyarrow, row groups": partial(row_groups, files, columns),
         "pyarrow, 1024 rows at a time": partial(streamed, files, columns),
     }
-    load = partial(loaded, given.path, given.workers, memory=given.memory << 20)
+    load = partial(loaded, given.path, given.workers)
+    mixed = partial(load, memory=given.memory << 20)
     loaders = {
         "echolake.torch": load,
         "echolake.torch, turned, heights": partial(load, symmetries="random", heights=True),
-        "echolake.torch, clump 256": partial(load, clump=256),
-        "echolake.torch, clump 1": partial(load, clump=1),
+        "echolake.torch, clump 256": partial(mixed, clump=256),
+        "echolake.torch, clump 1": partial(mixed, clump=1),
     }
     rates: dict[str, list[float]] = {name: [] for name in [*bare, *loaders]}
     for run in bare.values():
