@@ -42,6 +42,7 @@ use crate::commands::upkeep::rebuild::{self, RebuildArgs};
 #[cfg(feature = "lake")]
 use crate::commands::upkeep::remove::{self, RemoveArgs};
 #[cfg(feature = "lake")]
+use crate::commands::upkeep::tag::{self, TagArgs};
 use crate::commands::upkeep::vacuum::{self, VacuumArgs};
 #[cfg(feature = "upload")]
 use crate::commands::upload::{self, UploadArgs};
@@ -148,6 +149,8 @@ pub(crate) enum LakeCommand {
     },
     /// Merge the tables' small files into large ones; ingest and queries may continue meanwhile.
     Optimize(OptimizeArgs),
+    /// Name a version of the lake, for `AS OF`, and keep its files; without a name, list the tags.
+    Tag(TagArgs),
     /// Simulate a measured panel's heights, and report the differences to the measurement by pair and band.
     Twin(TwinArgs),
     /// Delete files that no table needs any more, and what crashes left behind.
@@ -217,6 +220,7 @@ impl LakeCommand {
             Self::Token { name, days, project, scopes } => serve::print_token(name, *days, project, scopes),
             Self::Optimize(args) => optimize::run_optimize(args, lake).await,
             Self::Twin(args) => twin::run_twin(args, lake).await,
+            Self::Tag(args) => tag::run_tag(args, lake).await,
             Self::Vacuum(args) => vacuum::run_vacuum(args, lake).await,
         }
     }

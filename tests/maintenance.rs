@@ -106,6 +106,37 @@ mod slow {
     }
 
     #[test]
+    fn a_tag_keeps_its_version() {
+        let place = TestFolder::new();
+        for (surface, seed) in [("flat", "1"), ("foam", "2"), ("wood", "4")] {
+            place.acquire(surface, &["--seed", seed, "--ir-only"]);
+        }
+        place.ok(&["ingest"]);
+        let levels = "select pair_id, tnce_total from tnce timestamp as of 'first.1' where surface_id = 'wood' order by 1";
+        place.fails(1, &["sql", levels], "no tag `first.1`: it has none");
+        assert!(place.ok(&["tag", "first.1"]).starts_with("first.1  version "));
+        place.fails(1, &["tag", "first.1"], "has a tag `first.1`");
+        place.fails(2, &["tag", "1st"], "beginning with a letter");
+        let before = place.sql(levels);
+        // Wood's levels are derived with two Flats from now on.
+        place.acquire("flat", &["--seed", "9", "--ir-only"]);
+        place.ok(&["ingest"]);
+        assert_eq!(place.ok(&["vacuum", "--keep-hours", "0"]), "0 files, 0 B freed\n");
+        assert_eq!(place.sql(levels), before);
+        assert_ne!(place.sql(&levels.replace(" timestamp as of 'first.1'", "")), before);
+        place.fails(1, &["tag", "second", "--at", "third"], "there are `first.1`");
+
+        place.fails(0, &["tag", "--delete", "first.1"], "is deleted");
+        let freed = place.ok(&["vacuum", "--keep-hours", "0"]);
+        assert!(!freed.starts_with("0 files"), "{freed}");
+        place.ok(&["tag", "second"]);
+        std::fs::remove_dir_all(place.path("lake/tables")).expect("removed");
+        place.ok(&["ingest"]);
+        assert!(place.ok(&["tag"]).contains("second  version") && place.ok(&["tag"]).contains("gone"));
+        place.fails(1, &["sql", &levels.replace("first.1", "second")], "tables that are made again");
+    }
+
+    #[test]
     fn vacuum_takes_what_crashes_left_and_nothing_else() {
         let place = TestFolder::new();
         place.acquire("flat", &["--ir-only"]);

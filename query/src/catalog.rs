@@ -300,7 +300,7 @@ impl LakeCatalog {
         }
         let version = match versions.get(&moment) {
             Some(version) => *version,
-            None => self.lake.version_at(moment).await.map_err(moment_error)?,
+            None => self.lake.version_at(&moment).await.map_err(moment_error)?,
         };
         versions.insert(moment, version);
         if let Some(table) = table {
@@ -326,7 +326,7 @@ impl LakeCatalog {
 // A moment that never was is the query's fault.
 fn moment_error(error: LakeError) -> Error {
     match error {
-        LakeError::NoMoment { .. } => {
+        LakeError::NoMoment { .. } | LakeError::NoTag { .. } => {
             let text = error.to_string();
             let (message, hint) = text.split_once("; hint: ").unwrap_or((&text, ""));
             Error::Query { message: message.to_owned(), place: None, hint: Some(hint.to_owned()) }

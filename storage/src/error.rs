@@ -176,7 +176,8 @@ pub enum Error {
         location: String,
     },
     /// The log does not hold the lake at that moment.
-    #[error("the lake has no {moment}: {held}; hint: older versions are forgotten with the log's own clean-up")]
+    #[error("the lake has no {moment}: {held}; hint: the log's own clean-up forgets old versions, and tables that are made again \
+         count anew")]
     NoMoment {
         /// The moment.
         moment: String,
@@ -197,6 +198,34 @@ pub enum Error {
         missing: usize,
         /// Files that it had.
         files: usize,
+    },
+    /// A text that is no name of a tag.
+    #[error("`{text}` is no name of a tag: up to 63 of A-Z a-z 0-9 . _ -, beginning with a letter")]
+    TagName {
+        /// The text.
+        text: String,
+    },
+    /// A tag of that name is there.
+    #[error("the lake has a tag `{name}`; hint: `echolake tag --delete {name}` deletes it")]
+    TagTaken {
+        /// The name.
+        name: String,
+    },
+    /// There is no tag of that name.
+    #[error("the lake has no tag `{name}`: {known}; hint: `echolake tag` lists them")]
+    NoTag {
+        /// The name.
+        name: String,
+        /// The names of those that are there.
+        known: String,
+    },
+    /// A tag's file cannot be read.
+    #[error("tag `{path}` cannot be read: {reason}; hint: restore it from a backup, or delete the file")]
+    DamagedTag {
+        /// Path in the lake.
+        path: String,
+        /// The cause.
+        reason: String,
     },
     /// The log has forgotten rows of that moment.
     #[error(
@@ -299,6 +328,11 @@ impl std::error::Error for StoreError {
 impl Error {
     pub(crate) fn store_failure(action: &'static str, path: impl ToString, source: object_store::Error) -> Self {
         Self::Store { action, path: path.to_string(), source: StoreError(source) }
+    }
+
+    #[cfg(feature = "tables")]
+    pub(crate) fn damaged_tag(path: &object_store::path::Path, cause: &serde_json::Error) -> Self {
+        Self::DamagedTag { path: path.to_string(), reason: cause.to_string() }
     }
 
     /// Returns the error of a store that was asked for an object again and again in vain; any other fault is given

@@ -17,7 +17,7 @@ use crate::Error;
 /// Separator between a table's name and the moment.
 const MARK: char = '@';
 /// The forms of `AS OF`.
-const FORMS: &str = "VERSION AS OF 12, or TIMESTAMP AS OF '2026-11-21T10:00:00Z'; without a zone it is UTC";
+const FORMS: &str = "VERSION AS OF 12, or TIMESTAMP AS OF '2026-11-21T10:00:00Z' (without a zone it is UTC) or 'tag'";
 
 /// A table or view at a moment.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
@@ -50,7 +50,7 @@ impl PastTableName {
     /// Parses the moment.
     ///
     /// # Errors
-    /// [`Error::Query`] if it is neither a version nor a time.
+    /// [`Error::Query`] if it is neither a version, a time, nor the name of a tag.
     pub fn parse_moment(&self) -> Result<LakeMoment, Error> {
         self.at.parse().map_err(|_| not_a_moment(&self.at))
     }
@@ -131,6 +131,6 @@ fn version_text(version: &TableVersion) -> Option<&str> {
 }
 
 fn not_a_moment(text: &str) -> Error {
-    let message = format!("`{text}` is neither a version nor a time");
+    let message = format!("`{text}` is neither a version, a time, nor the name of a tag");
     Error::Query { message, place: None, hint: Some(FORMS.to_owned()) }
 }

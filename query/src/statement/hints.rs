@@ -33,7 +33,7 @@ const SYNTAX: [(&str, &str); 30] = [
     ("FOR VERSION", "t VERSION AS OF 12"),
     ("FOR TIMESTAMP", "t TIMESTAMP AS OF '2026-11-21T10:00:00Z'"),
     ("SYSTEM_VERSION", "t VERSION AS OF 12"),
-    ("VERSION AS OF", "VERSION AS OF 12, a number without quotes"),
+    ("VERSION AS OF", "VERSION AS OF 12, a number without quotes; TIMESTAMP AS OF 'tag'"),
     ("* COLUMNS", "write the columns out: coalesce(a, b)"),
     ("* *", "power(a, b)"),
     ("GLOB", "x LIKE 'a%', or x ~ '^a' for a regular expression"),

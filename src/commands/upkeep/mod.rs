@@ -3,4 +3,5 @@
 pub(crate) mod optimize;
 pub(crate) mod rebuild;
 pub(crate) mod remove;
+pub(crate) mod tag;
 pub(crate) mod vacuum;

@@ -10,6 +10,7 @@ mod rows;
 mod run_parts;
 mod snapshot;
 mod table_fault;
+mod tags;
 mod versions;
 
 pub use batch_builder::BatchBuilder;
@@ -27,6 +28,7 @@ pub use maintenance::{
 pub use rows::{add_missing_columns, reader_metadata, wanted_schema};
 pub use snapshot::LakeSnapshot;
 pub use table_fault::LackingRows;
+pub use tags::{LakeTag, TagName};
 pub use versions::{LakeMoment, NoMoment};
 
 use arrow::record_batch::RecordBatch;

@@ -13,7 +13,7 @@ use echolake_schema::tables::{Source, Table};
 use object_store::path::Path;
 
 use crate::tables::file_name::table_folder;
-use crate::{DataFile, Error, Lake, LakeSnapshot, Result, TableVersion};
+use crate::{DataFile, Error, Lake, LakeSnapshot, Result, TableVersion, TagName};
 
 /// Formats of times beside RFC 3339.
 const TIMES: [&str; 4] = ["%Y-%m-%dT%H:%M:%S%.f", "%Y-%m-%d %H:%M:%S%.f", "%Y-%m-%dT%H:%M", "%Y-%m-%d %H:%M"];
@@ -25,29 +25,33 @@ const TIMES: [&str; 4] = ["%Y-%m-%dT%H:%M:%S%.f", "%Y-%m-%d %H:%M:%S%.f", "%Y-%m
 ///
 /// assert_eq!("12".parse(), Ok(LakeMoment::Version(12)));
 /// assert_eq!("2026-01-05 08:00".parse::<LakeMoment>()?.to_string(), "2026-01-05T08:00:00Z");
-/// assert!("yesterday".parse::<LakeMoment>().is_err());
+/// assert_eq!("baseline".parse::<LakeMoment>()?.to_string(), "tag `baseline`");
+/// assert!("2026-13-01".parse::<LakeMoment>().is_err());
 /// # Ok::<(), echolake_lake::NoMoment>(())
 /// ```
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub enum LakeMoment {
     /// A version of the lake, that of its table `runs`.
     Version(u64),
     /// The newest version at a time.
     Time(DateTime<Utc>),
+    /// The version of a tag.
+    Tag(TagName),
 }
 
 impl std::fmt::Display for LakeMoment {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
             Self::Version(version) => write!(f, "version {version}"),
-            Self::Time(time) => f.write_str(&time.to_rfc3339_opts(SecondsFormat::AutoSi, true)),
+            Self::Time(time) => f.write_str(&time_text(time)),
+            Self::Tag(name) => write!(f, "tag `{name}`"),
         }
     }
 }
 
 /// A text that is no moment.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("`{text}` is neither a version nor a time")]
+#[error("`{text}` is neither a version, a time, nor the name of a tag")]
 pub struct NoMoment {
     /// The text.
     pub text: String,
@@ -56,7 +60,8 @@ pub struct NoMoment {
 impl FromStr for LakeMoment {
     type Err = NoMoment;
 
-    /// Reads a version, or a time as in RFC 3339; without a zone it is UTC, without a time of day midnight.
+    /// Reads a version, a time as in RFC 3339 (without a zone it is UTC, without a time of day midnight), or the name of
+    /// a tag.
     fn from_str(text: &str) -> std::result::Result<Self, NoMoment> {
         let text = text.trim();
         if let Ok(version) = text.parse() {
@@ -66,7 +71,8 @@ impl FromStr for LakeMoment {
         let naive = || TIMES.iter().find_map(|format| NaiveDateTime::parse_from_str(text, format).ok());
         let day = || NaiveDate::parse_from_str(text, "%Y-%m-%d").ok()?.and_hms_opt(0, 0, 0);
         let time = zoned.or_else(|| naive().or_else(day).map(|t| t.and_utc()));
-        time.map(Self::Time).ok_or_else(|| NoMoment { text: text.to_owned() })
+        let tag = || text.parse().ok().map(Self::Tag);
+        time.map(Self::Time).or_else(tag).ok_or_else(|| NoMoment { text: text.to_owned() })
     }
 }
 
@@ -82,14 +88,28 @@ impl Lake {
     /// The lake's version at a moment: for a time, the newest that was committed by then.
     ///
     /// # Errors
-    /// [`Error::NoMoment`] if the log does not hold it.
-    pub async fn version_at(&self, moment: LakeMoment) -> Result<u64> {
+    /// [`Error::NoMoment`] if the log does not hold it; [`Error::NoTag`].
+    pub async fn version_at(&self, moment: &LakeMoment) -> Result<u64> {
+        Ok(self.find_version(moment).await?.version)
+    }
+
+    /// Finds the version at a moment.
+    pub(super) async fn find_version(&self, moment: &LakeMoment) -> Result<TableVersion> {
+        let tag = match moment {
+            LakeMoment::Tag(name) => Some(self.find_tag(name).await?),
+            LakeMoment::Version(_) | LakeMoment::Time(_) => None,
+        };
         let versions = self.list_versions().await?;
         let found = match moment {
-            LakeMoment::Version(number) => versions.iter().find(|v| v.version == number),
-            LakeMoment::Time(time) => versions.iter().rfind(|v| v.committed <= time),
+            LakeMoment::Version(number) => versions.iter().find(|v| v.version == *number),
+            LakeMoment::Time(time) => versions.iter().rfind(|v| v.committed <= *time),
+            // Tables that were made anew count their versions anew.
+            LakeMoment::Tag(_) => versions.iter().find(|v| tag.as_ref().is_some_and(|tag| tag.is_of(v))),
         };
-        found.map(|v| v.version).ok_or_else(|| no_moment(moment, &versions))
+        found.cloned().ok_or_else(|| {
+            let named = tag.map(|tag| format!("{moment}, version {} of {}", tag.version, time_text(&tag.committed)));
+            no_moment(named.unwrap_or_else(|| moment.to_string()), &versions)
+        })
     }
 
     /// One table as readers saw it at a version of the lake. Rows that come from the rig are as they are now.
@@ -139,15 +159,17 @@ fn shows_all(pointers: &[DataFile], table: Table, files: &[DataFile]) -> bool {
     snapshot.shown_runs(table).len() == snapshot.runs().count()
 }
 
-fn no_moment(moment: LakeMoment, versions: &[TableVersion]) -> Error {
-    let text = |v: &TableVersion| {
-        format!("version {} of {}", v.version, v.committed.to_rfc3339_opts(SecondsFormat::AutoSi, true))
-    };
+fn time_text(time: &DateTime<Utc>) -> String {
+    time.to_rfc3339_opts(SecondsFormat::AutoSi, true)
+}
+
+fn no_moment(moment: String, versions: &[TableVersion]) -> Error {
+    let text = |v: &TableVersion| format!("version {} of {}", v.version, time_text(&v.committed));
     let held = match (versions.first(), versions.last()) {
         (Some(first), Some(last)) => format!("its log holds {} to {}", text(first), text(last)),
         _ => "its log holds no version".to_owned(),
     };
-    Error::NoMoment { moment: moment.to_string(), held }
+    Error::NoMoment { moment, held }
 }
 
 #[cfg(test)]
@@ -214,7 +236,7 @@ mod tests {
             let versions = lake.list_versions().await.expect("versions");
             for (version, names) in &expected {
                 let committed = versions.iter().find(|v| v.version == *version).expect("held").committed;
-                let at = lake.version_at(LakeMoment::Time(committed)).await.expect("a version");
+                let at = lake.version_at(&LakeMoment::Time(committed)).await.expect("a version");
                 let snapshot = lake.snapshot_at(at, Table::Nce).await.expect("seen");
                 let seen: Vec<_> = snapshot.files(Table::Nce).iter().filter_map(|f| f.path.filename()).collect();
                 assert_eq!((at, &seen), (*version, names), "{table:?} {hours} h");
@@ -236,7 +258,7 @@ mod tests {
             assert_eq!(text.parse(), Ok(LakeMoment::Time(ten)), "{text}");
         }
         assert_eq!("12".parse(), Ok(LakeMoment::Version(12)));
-        for text in ["yesterday", "-1", "", "2026-13-01"] {
+        for text in ["last week", "-1", "", "2026-13-01"] {
             assert!(text.parse::<LakeMoment>().is_err(), "{text}");
         }
     }

@@ -63,7 +63,7 @@ enum FileAccess {
 
 impl Lake {
     /// Deletes, under the maintenance lease, files that left their table longer ago than `keep`, and temporary and
-    /// uncommitted files that crashes left behind. Files in `runs/` are not touched.
+    /// uncommitted files that crashes left behind. Files in `runs/` and those of tagged versions are not touched.
     ///
     /// # Errors
     /// [`Error::Maintained`] if another process holds the lease, [`Error::LeaseLost`], [`Error::Log`] if a log is
@@ -121,13 +121,16 @@ impl Lake {
         let now = Utc::now();
         let mut files = Vec::new();
         let old = |modified| is_over(modified, None, now, keep);
+        let tags = self.list_tags().await?;
         for table in Table::ALL {
             let there = self.store().list_with_delimiter(Some(&table_folder(table))).await;
             let there = there.map_err(|e| Error::store_failure("list", table_folder(table), e))?;
             // Without a log, nothing says what the files are.
             let Some(history) = self.commit_log().file_history(table).await? else { continue };
+            let tagged = self.tagged_files(table, &tags).await?;
             for meta in there.objects {
-                if is_left_over(&history, &meta.location, |gone| is_over(meta.last_modified, gone, now, keep)) {
+                if !tagged.contains(&meta.location)
+                    && is_left_over(&history, &meta.location, |gone| is_over(meta.last_modified, gone, now, keep)) {
                     files.push(DeletedFile::from_object(meta.location, meta.size));
                 }
             }

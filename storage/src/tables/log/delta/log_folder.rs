@@ -17,6 +17,7 @@ use super::checkpoint::{decode_checkpoint, encode_checkpoint};
 use super::commit_files::{commit_name, commit_number, list_versions};
 use super::table_state::{TableState, is_own_commit};
 use crate::tables::file_name::table_folder;
+use crate::tables::tags::has_tags;
 use crate::{Error, Result, TableChange, TableVersion};
 
 /// The newest version of the protocol that this reads.
@@ -242,8 +243,11 @@ impl<'a> LogFolder<'a> {
         Ok(())
     }
 
-    // Deletes everything before the newest checkpoint that is itself older than the retention.
+    // Deletes everything before the newest checkpoint that is itself older than the retention, if no tag may need it.
     async fn delete_expired(&self, now: DateTime<Utc>) -> Result<()> {
+        if has_tags(self.store).await? {
+            return Ok(());
+        }
         let listing = self.list_log().await?;
         let is_old = |version: &&u64| {
             let path = self.path.clone().join(checkpoint_name(**version));
