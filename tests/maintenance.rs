@@ -112,7 +112,8 @@ mod slow {
             place.acquire(surface, &["--seed", seed, "--ir-only"]);
         }
         place.ok(&["ingest"]);
-        let levels = "select pair_id, tnce_total from tnce timestamp as of 'first.1' where surface_id = 'wood' order by 1";
+        let levels =
+            "select pair_id, tnce_total from tnce timestamp as of 'first.1' where surface_id = 'wood' order by 1";
         place.fails(1, &["sql", levels], "no tag `first.1`: it has none");
         assert!(place.ok(&["tag", "first.1"]).starts_with("first.1  version "));
         place.fails(1, &["tag", "first.1"], "has a tag `first.1`");

@@ -176,8 +176,10 @@ pub enum Error {
         location: String,
     },
     /// The log does not hold the lake at that moment.
-    #[error("the lake has no {moment}: {held}; hint: the log's own clean-up forgets old versions, and tables that are made again \
-         count anew")]
+    #[error(
+        "the lake has no {moment}: {held}; hint: the log's own clean-up forgets old versions, and tables that are made again \
+         count anew"
+    )]
     NoMoment {
         /// The moment.
         moment: String,

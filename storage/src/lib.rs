@@ -50,10 +50,10 @@ pub use run_digest::{digest_record, digest_record_path, file_sha256, object_sha2
 #[cfg(feature = "tables")]
 pub use tables::{
     BatchBuilder, CommitEffect, CommitLog, CommitOutcome, DataFile, DeletedFile, DeletionMode, EncodedFile,
-    FileEncoder, FileHistory, FileName, FileStats, KEEP_HOURS, LackingRows, LakeMoment, LakeSnapshot, LakeTag, LoggedFile,
-    MergeProgress, NewFile, NoMoment, OptimizeReport, RemovalRecord, ReplacedFiles, RunPart, RunRowCounts, StagedFile,
-    TARGET_BYTES, TableChange, TagName, TableCommit, TableOptimizeReport, TableVersion, TableView, VacuumReport, VisibleRun,
-    add_missing_columns, encode_batches, reader_metadata, wanted_schema,
+    FileEncoder, FileHistory, FileName, FileStats, KEEP_HOURS, LackingRows, LakeMoment, LakeSnapshot, LakeTag,
+    LoggedFile, MergeProgress, NewFile, NoMoment, OptimizeReport, RemovalRecord, ReplacedFiles, RunPart, RunRowCounts,
+    StagedFile, TARGET_BYTES, TableChange, TableCommit, TableOptimizeReport, TableVersion, TableView, TagName,
+    VacuumReport, VisibleRun, add_missing_columns, encode_batches, reader_metadata, wanted_schema,
 };
 #[cfg(feature = "remote")]
 pub use upload::{RunUpload, UploadOutcome, UploadStep};

@@ -183,11 +183,8 @@ pub(super) async fn has_tags(store: &dyn ObjectStore) -> Result<bool> {
 
 async fn tag_files(store: &dyn ObjectStore) -> Result<Vec<Path>> {
     let folder = Path::from(FOLDER);
-    let files: Vec<_> = store
-        .list(Some(&folder))
-        .try_collect()
-        .await
-        .map_err(|e| Error::store_failure("list", &folder, e))?;
+    let files: Vec<_> =
+        store.list(Some(&folder)).try_collect().await.map_err(|e| Error::store_failure("list", &folder, e))?;
     Ok(files.into_iter().map(|meta| meta.location).filter(|path| path.extension() == Some("json")).collect())
 }
 

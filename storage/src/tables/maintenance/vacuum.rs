@@ -130,7 +130,8 @@ impl Lake {
             let tagged = self.tagged_files(table, &tags).await?;
             for meta in there.objects {
                 if !tagged.contains(&meta.location)
-                    && is_left_over(&history, &meta.location, |gone| is_over(meta.last_modified, gone, now, keep)) {
+                    && is_left_over(&history, &meta.location, |gone| is_over(meta.last_modified, gone, now, keep))
+                {
                     files.push(DeletedFile::from_object(meta.location, meta.size));
                 }
             }
