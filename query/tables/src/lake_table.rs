@@ -14,7 +14,7 @@ use datafusion::datasource::TableType;
 use datafusion::datasource::listing::PartitionedFile;
 use datafusion::datasource::memory::MemorySourceConfig;
 use datafusion::datasource::physical_plan::{
-    FileGroup, FileScanConfigBuilder, ParquetFileReaderFactory, ParquetSource,
+    FileGroup, FileScanConfigBuilder, FileSource, ParquetFileReaderFactory, ParquetSource,
 };
 use datafusion::datasource::source::DataSourceExec;
 use datafusion::error::{DataFusionError, Result};
@@ -38,6 +38,7 @@ use tokio::sync::OnceCell;
 use crate::boxed_scan;
 use crate::part_rows::visible_rows_scan;
 use crate::small_tables::SmallTables;
+use crate::unfiltered_source::UnfilteredSource;
 
 /// Delta writers truncate texts in statistics to 32 characters; a shorter text is complete.
 const WHOLE_TEXT: usize = 32;
@@ -48,6 +49,8 @@ const SURFACE: &str = "surface_id";
 const FEW: usize = 8;
 /// Rows per batch of a scan without lists: the engine's kernels are fastest with it.
 const NARROW_BATCH_ROWS: usize = 8192;
+/// Rows below which a file without wanted lists is read as a whole, whatever filters there are.
+const SMALL_FILE_ROWS: u64 = 65_536;
 
 /// Files of one table in one snapshot.
 #[derive(Debug)]
@@ -151,7 +154,12 @@ impl LakeTable {
         if let Some(bytes) = self.source.footer_bytes {
             source = source.with_metadata_size_hint(bytes);
         }
-        let config = FileScanConfigBuilder::new(self.source.url.clone(), Arc::new(source))
+        let rows: u64 = files.iter().map(|file| file.file.rows).sum();
+        let source: Arc<dyn FileSource> = match !lists && rows < files.len() as u64 * SMALL_FILE_ROWS {
+            true => Arc::new(UnfilteredSource(Arc::new(source))),
+            false => Arc::new(source),
+        };
+        let config = FileScanConfigBuilder::new(self.source.url.clone(), source)
             .with_file_groups(file_groups(files, state.config().target_partitions()))
             .with_statistics(self.known_statistics(files)?)
             .with_batch_size((!lists).then_some(NARROW_BATCH_ROWS))

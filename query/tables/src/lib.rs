@@ -5,6 +5,7 @@ mod lake_table;
 mod part_rows;
 mod readers;
 mod small_tables;
+mod unfiltered_source;
 
 pub use lake_table::{FileReaders, LakeTable};
 pub use readers::LakeReaderFactory;
