@@ -1,5 +1,7 @@
 //! `echolake figure`: files that say where they come from, and the same picture as the server's.
 
+use std::collections::BTreeMap;
+
 use super::serve::http::HttpRequest;
 use super::serve::served;
 use super::{TestFolder, TestFolderTemplate};
@@ -119,6 +121,36 @@ fn tables_have_the_numbers_of_the_lake() {
     }
 }
 
+// The coefficient of ISO 17497-2 of each point's pairs, written out.
+#[test]
+fn diffusion_is_the_mean_over_points() {
+    let place = lake();
+    let mut energies: BTreeMap<i64, Vec<f64>> = BTreeMap::new();
+    for row in place.sql("select microphone, speaker, energy_5000 from tnce where surface_id = 'wood'") {
+        for point in ["microphone", "speaker"] {
+            let energy = row["energy_5000"].as_f64().expect("an energy");
+            energies.entry(row[point].as_i64().expect("a point")).or_default().push(energy);
+        }
+    }
+    let coefficient = |energies: &Vec<f64>| {
+        let sum: f64 = energies.iter().sum();
+        let squares: f64 = energies.iter().map(|energy| energy * energy).sum();
+        (sum * sum - squares) / ((energies.len() - 1) as f64 * squares)
+    };
+    let expected = energies.values().map(coefficient).sum::<f64>() / energies.len() as f64;
+    place.ok(&["figure", "table", "wood", "--values", "diffusion", "-o", "diffusion.csv"]);
+    let csv = std::fs::read_to_string(place.path("diffusion.csv")).expect("read");
+    let row = csv.lines().find(|line| line.starts_with("wood,")).expect("a row");
+    let value: f64 = row.split(',').nth(2).expect("5 kHz").parse().expect("a number");
+    assert!(energies.len() > 8 && (value - expected).abs() < 1e-9, "{value} instead of {expected}");
+    let server = served(&place, &[]);
+    let answer = HttpRequest::get("/api/v1/diffusion").send(&server);
+    let answer: serde_json::Value = serde_json::from_slice(&answer.body).expect("JSON");
+    let items = answer["items"].as_array().expect("items");
+    let wood = items.iter().find(|item| item["surface_id"] == "wood").expect("wood");
+    assert!((wood["diffusion"][1].as_f64().expect("a number") - expected).abs() < 1e-9, "{wood}");
+}
+
 // The statement that the manual prints for the paper's range of TNCE.
 #[test]
 fn the_papers_range_is_a_statement() {
@@ -172,6 +204,7 @@ fn refusals_say_what_is_there() {
     place.fails(1, &["figure", "filters", "-o", "{surface}.svg"], "the figure is of none");
     place.fails(1, &["figure", "table", "wood", "--less", "brick"], "surface `brick` is not in the lake");
     place.fails(1, &["figure", "table", "wood", "--less", "flat", "--values", "energies"], "leave one of them out");
+    place.fails(1, &["figure", "table", "wood", "--less", "flat", "--values", "diffusion"], "leave one of them out");
     place.fails(1, &["figure", "grid", "--where", "surface = 'x'"], "no column `surface`");
     place.fails(1, &["figure", "table", "wood", "-o", "x.svg"], "hint: tex, csv or md");
     place.fails(1, &["figure", "grid", "wood", "--band", "7"], "there is no band `7`");

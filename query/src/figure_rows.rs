@@ -135,6 +135,34 @@ impl GridLevels {
     }
 }
 
+/// Returns the query of [`DiffusionRow`] for the rows of `tnce` that a condition selects, which begins with `where`, or
+/// is empty.
+///
+/// Each grid point in turn is the source, and the points that it was measured with are the receivers, by reciprocity.
+/// The coefficients of all points are averaged.
+pub fn diffusion_query(rig: &Rig, condition: &str) -> String {
+    let energies: Vec<_> = band_keys(rig).iter().map(|band| format!("energy_{band}")).collect();
+    let coefficient = |band| format!("diffusion_coefficient(10 * log10(energy_{band})) as d_{band}");
+    let coefficients: Vec<_> = band_keys(rig).iter().map(coefficient).collect();
+    let means = band_list(rig, |band| format!("avg(d_{band})"));
+    format!(
+        "select surface_id, {means} as diffusion from (select surface_id, run_id, point, {} from (select surface_id, \
+         run_id, unnest([microphone, speaker]) as point, {} from tnce {condition}) group by surface_id, run_id, point) \
+         group by surface_id",
+        coefficients.join(", "),
+        energies.join(", ")
+    )
+}
+
+/// Diffusion coefficients of a surface.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+pub struct DiffusionRow {
+    /// The surface.
+    pub surface_id: String,
+    /// By band, the total last.
+    pub diffusion: Vec<Option<f64>>,
+}
+
 /// Returns the query of [`CurveRow`] for surfaces, a list of literals or placeholders; `filter` goes on with `and`, or
 /// is empty.
 pub fn curves_query(rig: &Rig, surfaces: &str, filter: &str) -> String {

@@ -141,9 +141,12 @@ enum ValuesArg {
     Levels,
     /// The same without Foam's own reflection, which is estimated.
     UnbiasedLevels,
-    /// Mean TNCE over all pairs, linear, beside Flat's, with the difference in per cent. A few loud pairs raise it, which
-    /// levels leave out.
+    /// Mean TNCE over all pairs, linear, beside Flat's, with the difference in per cent. A few loud pairs raise it,
+    /// which levels leave out.
     Energies,
+    /// Diffusion coefficient, the mean over grid points: how evenly a point's pairs share the reflected energy. The
+    /// grid is in the near field, where Flat is even, too: compare surfaces with each other alone.
+    Diffusion,
 }
 
 #[derive(Debug, Args)]

@@ -347,6 +347,39 @@ await check('levels against Flat are one number on wall, surface, compare and in
   await page.getByText('which a few pairs to which a relief focuses sound raise').waitFor()
 })
 
+await check(
+  'the wall sorts designs by diffusion and says what it is not; Compare has the number that SQL says',
+  async () => {
+    const coefficient = `select avg(d) as d from (select diffusion_coefficient(10 * log10(energy_10000)) as d from (select energy_10000, unnest([microphone, speaker]) as point from tnce where surface_id = '`
+    const designs = all.items.filter((s) => s.typology !== 'reference').map((s) => s.surface_id)
+    const values = await Promise.all(
+      designs.map(async (one) => [one, (await sql(`${coefficient}${one}') group by point)`))[0].d]),
+    )
+    const sorted = values.sort(([, a], [, b]) => b - a)
+    await open('/')
+    await page.getByLabel('Sort').selectOption('diffusion')
+    await page.waitForURL(/sort=diffusion&order=desc/)
+    await page.getByLabel('of band').selectOption('10000')
+    await page.waitForURL(/sort_band=10000/)
+    const tiles = page.locator('.sheet a.surface')
+    await eventually(async () =>
+      assert.deepEqual(
+        (await tiles.evaluateAll((links) => links.map((link) => link.dataset.id))).slice(0, designs.length),
+        sorted.map(([one]) => one),
+      ),
+    )
+    await page
+      .locator('.sheet li', { hasText: `Diffusion ${sorted[0][1].toFixed(2)}` })
+      .first()
+      .waitFor()
+    await page.getByText('the grid is in the near field, where a plane is even, too').waitFor()
+    await open(`/compare?s=${sorted[0][0]}`)
+    const at = lake.bands.findIndex((band) => band.key === '10000')
+    const cell = page.locator('section[aria-label="Diffusion by band"] tbody tr').first().locator('td').nth(at)
+    await eventually(async () => assert.equal((await cell.innerText()).trim(), sorted[0][1].toFixed(2)))
+  },
+)
+
 await check('the chart of levels on Compare has the levels that SQL says', async () => {
   const ids = all.items.filter((s) => s.typology !== 'reference').map((s) => s.surface_id)
   await open(`/compare?s=${ids.slice(0, 2).join(',')}`)

@@ -14,8 +14,8 @@ const PLACEHOLDER: &str = "{surface}";
 
 #[derive(Debug, Args)]
 pub(crate) struct OutputArgs {
-    /// A file to write, as often as wanted: svg, pdf or png; tex, csv or md of a table; csv of levels, too. With {surface} in its name, one
-    /// file for each surface. Without it SVG, or Markdown of a table, goes to stdout.
+    /// A file to write, as often as wanted: svg, pdf or png; tex, csv or md of a table; csv of levels, too. With
+    /// {surface} in its name, one file for each surface. Without it SVG, or Markdown of a table, goes to stdout.
     #[arg(short, long, value_name = "FILE")]
     output: Vec<PathBuf>,
     /// Title of the figure.

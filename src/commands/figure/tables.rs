@@ -2,7 +2,7 @@
 
 use anyhow::Context as _;
 use echolake_figures::{FigureTable, TableRow};
-use echolake_query::figure_rows::{band_labels, band_list, quote_literal};
+use echolake_query::figure_rows::{DiffusionRow, band_labels, band_list, diffusion_query, quote_literal};
 use serde::Deserialize;
 
 use super::levels::{LevelKind, LevelTable, reference_name};
@@ -25,17 +25,21 @@ pub(super) async fn write_table(source: &FigureSource, args: &TableArgs) -> anyh
     let kind = match args.values {
         ValuesArg::Levels => Some(LevelKind::Measured),
         ValuesArg::UnbiasedLevels => Some(LevelKind::Unbiased),
-        ValuesArg::Energies => None,
+        ValuesArg::Energies | ValuesArg::Diffusion => None,
     };
     anyhow::ensure!(
         base.is_none() || kind.is_some(),
-        "--less subtracts levels, and --values energies has none; hint: leave one of them out"
+        "--less subtracts levels, which `--values` selects none of; hint: leave one of them out"
     );
     for group in args.output.group_surfaces(&surfaces)? {
         let (table, query, title) = match kind {
             Some(kind) => {
                 let levels = LevelTable::read(source, group, base.as_ref(), kind, args.reference.over.into()).await?;
                 (levels.to_table(source), levels.query.clone(), levels.default_title())
+            }
+            None if args.values == ValuesArg::Diffusion => {
+                let (table, query) = diffusion_table(source, group).await?;
+                (table, query, "Diffusion coefficient in the near field, mean over grid points".to_owned())
             }
             None => {
                 let (table, query) = energy_table(source, group).await?;
@@ -91,6 +95,22 @@ async fn energy_table(source: &FigureSource, surfaces: &[SelectedSurface]) -> an
     }
     let columns = band_labels(rig);
     Ok((FigureTable { corner: "Surface".into(), columns, rows: table_rows, with_extremes: false }, query))
+}
+
+async fn diffusion_table(source: &FigureSource, surfaces: &[SelectedSurface]) -> anyhow::Result<QueriedTable> {
+    let names: Vec<_> = surfaces.iter().map(|surface| surface.surface_id.as_str()).collect();
+    let query = diffusion_query(source.lake.rig(), &format!("where surface_id in ({})", surface_list(&names)));
+    let rows: Vec<DiffusionRow> = source.query_rows(&query).await?;
+    let row = |name: &&str| TableRow {
+        name: (*name).to_owned(),
+        values: rows.iter().find(|row| row.surface_id == **name).map(|row| row.diffusion.clone()).unwrap_or_default(),
+        uncertainties: Vec::new(),
+        decimals: 3,
+        is_percent: false,
+    };
+    let rows = names.iter().map(row).collect();
+    let columns = band_labels(source.lake.rig());
+    Ok((FigureTable { corner: "Surface".into(), columns, rows, with_extremes: true }, query))
 }
 
 fn energy_row(name: &str, values: Vec<Option<f64>>) -> TableRow {

@@ -19,6 +19,7 @@ const CURVE_POINTS = 192
 const MOST = 500
 
 export const allSurfacesHref = apiHref('/surfaces', { limit: MOST })
+export const diffusionHref = apiHref('/diffusion')
 export const mapHref = apiHref('/map', { neighbours: 6 })
 
 const copied = (params: URLSearchParams, names: readonly string[]) =>

@@ -19,6 +19,7 @@ export type Run = Schemas['Run']
 export type RunDetail = Schemas['RunDetail']
 export type SurfaceMap = Schemas['SurfaceMap']
 export type Correlations = Schemas['Correlations']
+export type DiffusionTable = Schemas['DiffusionTable']
 export type EnvironmentSeries = Schemas['EnvironmentSeries']
 export type Point = Schemas['Point']
 

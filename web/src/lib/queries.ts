@@ -29,6 +29,14 @@ export const gridQuery = (lake: Lake, ids: readonly string[], microphone: number
 export const meanQuery = (lake: Lake, ids: readonly string[]) =>
   `select surface_id, count(*) as pairs,\n${lake.bands.map((band) => `  avg(tnce_${band.key}) as tnce_${band.key}`).join(',\n')}\nfrom tnce\nwhere surface_id in (${ids.map(quoted).join(', ')})\ngroup by surface_id order by surface_id`
 
+/** Diffusion coefficients: a mean over the points, each of which is a source with the points that it makes pairs with. */
+export const diffusionQuery = (lake: Lake, ids: readonly string[]) =>
+  `select surface_id,\n${lake.bands.map((band) => `  avg(d_${band.key}) as diffusion_${band.key}`).join(',\n')}\nfrom (\n  select surface_id, run_id, point,\n${lake.bands
+    .map((band) => `    diffusion_coefficient(10 * log10(energy_${band.key})) as d_${band.key}`)
+    .join(',\n')}\n  from (select *, unnest([microphone, speaker]) as point from tnce where surface_id in (${ids
+    .map(quoted)
+    .join(', ')}))\n  group by surface_id, run_id, point\n)\ngroup by surface_id order by surface_id`
+
 /** Levels re Flat total, or less Flat's level in the same band. */
 export function statisticsQuery(ids: readonly string[], over: LevelReference): string {
   const ofFlat = (name: string) => (name === 'unbiased_p90_mean_db' ? name : 'p90_mean_db')

@@ -14,6 +14,7 @@ use utoipa::{IntoParams, PartialSchema, ToSchema};
 
 use super::super::extract::{NumberRange, QueryParams, RANGE_PATTERN, WholeNumber};
 use super::content::{AnswerContent, EndpointAnswer};
+use super::diffusion::{DiffusionCoefficients, read_diffusion};
 use super::request::CatalogueRequest;
 use super::snapshot::summary::{CatalogueSummary, SurfaceEntry, SurfaceSummary};
 
@@ -106,6 +107,8 @@ enum SurfaceSort {
     Relief,
     Spread,
     Level,
+    /// As of /diffusion; references come last.
+    Diffusion,
 }
 
 #[derive(Clone, Copy, Default, PartialEq, Eq, Deserialize, ToSchema)]
@@ -322,7 +325,11 @@ pub(super) async fn surfaces(
 ) -> EndpointAnswer {
     let summary = request.read_summary().await?;
     let filters = surface_filters(&query, summary)?;
-    let order = surface_order(&query, summary)?;
+    let diffusion = match query.sort {
+        SurfaceSort::Diffusion => Some(read_diffusion(&request).await?),
+        _ => None,
+    };
+    let order = surface_order(&query, summary, diffusion)?;
     let all: Vec<_> = summary.entries.iter().map(|entry| (entry, filter_outcome(&filters, entry))).collect();
     let mut left: Vec<_> =
         all.iter().filter(|(_, standing)| *standing == FilterOutcome::In).map(|(entry, _)| *entry).collect();
@@ -416,18 +423,23 @@ fn histogram_bins(values: &[(f64, bool)]) -> Option<Vec<HistogramBin>> {
 }
 
 /// In which order surfaces come.
-struct SurfaceOrder {
-    by: Option<SortKey>,
+struct SurfaceOrder<'a> {
+    by: Option<SortKey<'a>>,
     descends: bool,
 }
 
 /// The sort key of surfaces, if it is not their name.
-enum SortKey {
+enum SortKey<'a> {
     Measure(SurfaceMeasure),
     Spread(usize),
+    Diffusion(&'a DiffusionCoefficients, usize),
 }
 
-fn surface_order(query: &SurfacesQuery, summary: &CatalogueSummary) -> Result<SurfaceOrder, RequestFault> {
+fn surface_order<'a>(
+    query: &SurfacesQuery,
+    summary: &CatalogueSummary,
+    diffusion: Option<&'a DiffusionCoefficients>,
+) -> Result<SurfaceOrder<'a>, RequestFault> {
     let band = match &query.sort_band {
         Some(key) => find_band(summary, "sort_band", key)?,
         None => summary.bands.len() - 1,
@@ -438,16 +450,19 @@ fn surface_order(query: &SurfacesQuery, summary: &CatalogueSummary) -> Result<Su
         SurfaceSort::Relief => Some(SortKey::Measure(SurfaceMeasure::Relief)),
         SurfaceSort::Spread => Some(SortKey::Spread(band)),
         SurfaceSort::Level => Some(SortKey::Measure(SurfaceMeasure::Level(band))),
+        SurfaceSort::Diffusion => diffusion.map(|found| SortKey::Diffusion(found, band)),
     };
     Ok(SurfaceOrder { by, descends: query.order == SurfaceDirection::Desc })
 }
 
-impl SurfaceOrder {
+impl SurfaceOrder<'_> {
     fn compare_entries(&self, a: &SurfaceEntry, b: &SurfaceEntry) -> Ordering {
         let turned = |ordering: Ordering| if self.descends { ordering.reverse() } else { ordering };
         let value = |entry: &SurfaceEntry| match self.by.as_ref()? {
             SortKey::Measure(measure) => measure.value_of(entry),
             SortKey::Spread(band) => entry.surface.spread_db[*band],
+            SortKey::Diffusion(_, _) if entry.surface.is_reference() => None,
+            SortKey::Diffusion(found, band) => found.get(&entry.surface.surface_id)?.get(*band).copied().flatten(),
         };
         let names = || natural_order(&a.surface.surface_id, &b.surface.surface_id);
         match (self.by.is_some(), value(a), value(b)) {

@@ -120,7 +120,8 @@ pub(super) struct GridFigureQuery {
 
 /// TNCE over the grid for one microphone point, drawn.
 ///
-/// Grey is 0 dB, blue below, orange above, unless the palette is the paper's. Cells have `data-row` (band) and `data-point`.
+/// Grey is 0 dB, blue below, orange above, unless the palette is the paper's. Cells have `data-row` (band) and
+/// `data-point`.
 #[utoipa::path(
     get,
     path = "/api/v1/surfaces/{surface_id}/grid.svg",

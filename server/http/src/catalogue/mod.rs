@@ -7,6 +7,7 @@ mod analysis;
 mod content;
 mod correlations;
 mod curves;
+mod diffusion;
 mod environment;
 mod facets;
 mod figures;
@@ -82,6 +83,7 @@ pub(super) fn heavy_routes() -> OpenApiRouter {
         .routes(routes!(analysis::spectrogram))
         .routes(routes!(map::map))
         .routes(routes!(correlations::correlations))
+        .routes(routes!(diffusion::diffusion))
 }
 
 /// The endpoints that are answered from run files.

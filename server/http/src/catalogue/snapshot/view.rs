@@ -19,6 +19,7 @@ use tokio::sync::OnceCell;
 use super::answer_cache::AnswerCache;
 use super::positions::SurfacePositions;
 use super::summary::CatalogueSummary;
+use crate::catalogue::diffusion::DiffusionCoefficients;
 use crate::catalogue::pair::PairGeometry;
 
 /// Time limit of the catalogue's own queries: they read a surface at most, and all surfaces once per snapshot.
@@ -40,6 +41,7 @@ pub(crate) struct SnapshotView {
     pub answers: AnswerCache,
     pub summary: OnceCell<CatalogueSummary>,
     pub places: OnceCell<SurfacePositions>,
+    pub diffusion: OnceCell<DiffusionCoefficients>,
     /// The geometry of all pairs, by their numbers.
     pub pairs: OnceCell<Vec<PairGeometry>>,
     /// The pairs that the symmetries of the grid make of each pair, by the symmetries' names.
@@ -59,6 +61,7 @@ impl SnapshotView {
             answers: AnswerCache::default(),
             summary: OnceCell::new(),
             places: OnceCell::new(),
+            diffusion: OnceCell::new(),
             pairs: OnceCell::new(),
             moved_pairs: OnceLock::new(),
             flat_curves: Mutex::default(),
