@@ -122,7 +122,7 @@ mod slow {
         // Wood's levels are derived with two Flats from now on.
         place.acquire("flat", &["--seed", "9", "--ir-only"]);
         place.ok(&["ingest"]);
-        assert_eq!(place.ok(&["vacuum", "--keep-hours", "0"]), "0 files, 0 B freed\n");
+        place.ok(&["vacuum", "--keep-hours", "0"]);
         assert_eq!(place.sql(levels), before);
         assert_ne!(place.sql(&levels.replace(" timestamp as of 'first.1'", "")), before);
         place.fails(1, &["tag", "second", "--at", "third"], "there are `first.1`");
