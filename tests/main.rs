@@ -18,6 +18,7 @@ mod kills;
 mod large_chunk;
 mod load;
 mod maintenance;
+mod notices;
 mod object_stores;
 mod operator;
 mod operators;

@@ -111,6 +111,9 @@ pub(crate) struct AcquireArgs {
     #[cfg(feature = "upload")]
     #[arg(long, value_name = "URL")]
     pub upload: Option<String>,
+    #[cfg(feature = "upload")]
+    #[command(flatten)]
+    pub notify: super::notify::NotifyArgs,
 }
 
 impl AcquireArgs {
@@ -244,10 +247,23 @@ async fn acquire_run(args: &AcquireArgs, lake_url: &str) -> anyhow::Result<Comma
             Ok(outcome)
         }
         Err(error) => {
+            let error = anyhow::Error::from(error);
             if partial.exists() {
                 tell_resume(&partial, lake_url);
+                #[cfg(feature = "upload")]
+                args.notify
+                    .post_notice(&serde_json::json!({
+                        "event": "run_broken_off",
+                        "surface": surface,
+                        "simulated": clock == LiveClock::Simulated,
+                        "file": partial,
+                        "pairs": planned,
+                        "accepted": Held::from_file(&partial).ok().map(|held| held.accepted_count()),
+                        "error": describe_error(&error),
+                    }))
+                    .await;
             }
-            Err(error.into())
+            Err(error)
         }
     }
 }

@@ -20,8 +20,10 @@ use echolake_schema::{Rig, RunId, SurfaceId};
 use serde::Deserialize;
 
 use super::acquire::check_mesh;
+use super::notify::NotifyArgs;
 use super::simulated_runs::{PlannedRun, SimulationPlan, start_time};
 use crate::CommandOutcome;
+use crate::error_text::describe_error;
 use crate::progress::CommandProgress;
 use crate::signals::StopRequest;
 use definition::{CampaignDefinition, CampaignSurface, UnnamedGeometry};
@@ -53,6 +55,8 @@ pub(crate) struct CampaignRunArgs {
     /// Print the tables as JSON.
     #[arg(long)]
     json: bool,
+    #[command(flatten)]
+    notify: NotifyArgs,
 }
 
 pub(crate) async fn run_campaign(command: &CampaignSubcommand, lake_url: &str) -> anyhow::Result<CommandOutcome> {
@@ -78,7 +82,19 @@ pub(crate) async fn run_campaign(command: &CampaignSubcommand, lake_url: &str) -
     check(&ReferenceSurfaces::default()).with_context(|| format!("campaign `{file}`"))?;
     let lake = Lake::open_or_create(lake_url, &rig, &ReferenceSurfaces::default()).await?;
     let surfaces = check(&lake.config().references).with_context(|| format!("campaign `{file}`"))?;
-    let outcome = measure_missing_runs(args, &campaign, &surfaces, &lake, &rig, &stop).await?;
+    let measured = measure_missing_runs(args, &campaign, &surfaces, &lake, &rig, &stop).await;
+    if let Err(error) = &measured
+        && !stop.is_made()
+    {
+        let notice = serde_json::json!({
+            "event": "campaign_broken_off",
+            "campaign": campaign.name,
+            "simulated": rig.devices.are_simulated(),
+            "error": describe_error(error),
+        });
+        args.notify.post_notice(&notice).await;
+    }
+    let outcome = measured?;
     super::ensure_wanted(&stop)?;
     let levels = read_levels(&Session::new(&lake)?).await?;
     let named: Vec<_> = surfaces.iter().map(|surface| (&surface.surface, surface.macro_reference.as_ref())).collect();

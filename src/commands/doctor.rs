@@ -15,6 +15,10 @@ pub(crate) struct DoctorArgs {
     /// Print the report as JSON.
     #[arg(long)]
     pub json: bool,
+    /// Write the numbers of findings to this file for Prometheus, as the textfile collector of node_exporter reads it.
+    #[cfg(feature = "lake")]
+    #[arg(long, value_name = "FILE", conflicts_with = "installation")]
+    pub prometheus: Option<std::path::PathBuf>,
 }
 
 pub(crate) async fn run_doctor(args: &DoctorArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
@@ -22,7 +26,7 @@ pub(crate) async fn run_doctor(args: &DoctorArgs, lake_url: &str) -> anyhow::Res
         return installation::report_installation(args.json, lake_url).await;
     }
     #[cfg(feature = "lake")]
-    return lake::report_lake(args.json, lake_url).await;
+    return lake::report_lake(args, lake_url).await;
     #[cfg(not(feature = "lake"))]
     anyhow::bail!("this program has no tables to look into; hint: `echolake doctor --self` looks at the program itself")
 }

@@ -18,6 +18,8 @@ pub(crate) mod import;
 pub(crate) mod ingest;
 #[cfg(feature = "lake")]
 pub(crate) mod mcp;
+#[cfg(feature = "upload")]
+mod notify;
 pub(crate) mod panel;
 pub(crate) mod recover;
 pub(crate) mod replay;

@@ -2,6 +2,7 @@
 
 use std::process::Command;
 
+use echolake_acquisition::run::metrics::RunMetrics;
 use echolake_testing::run_command;
 use serde_json::Value;
 
@@ -113,6 +114,7 @@ fn figures_are_as_prometheus_wants_them() {
     let text = text();
     for line in [
         "echolake_lake_surfaces 1",
+        "echolake_damaged_runs 0",
         "echolake_inbox_runs 0",
         "echolake_ready 1",
         "echolake_engines 1",
@@ -122,6 +124,12 @@ fn figures_are_as_prometheus_wants_them() {
         assert!(has(&text, line), "{line} in {text}");
     }
     let rules = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/grafana/alerts.yaml");
+    place.ok(&["doctor", "--prometheus", "doctor.prom"]);
+    let checked = std::fs::read_to_string(place.path("doctor.prom")).expect("written");
+    assert!(has(&checked, "echolake_doctor_findings{severity=\"damaged\"} 0"), "{checked}");
+    let run = RunMetrics::new("flat", 45, 0);
+    run.disk_free(1);
+    let figures = [text.clone(), run.prometheus(), checked].join("\n");
     let expressions = std::fs::read_to_string(&rules).expect("the rules");
     let expressions = expressions.lines().filter_map(|line| line.trim().strip_prefix("expr: "));
     let mut named = 0;
@@ -130,12 +138,12 @@ fn figures_are_as_prometheus_wants_them() {
         let names: Vec<_> = names.filter(|name| name.starts_with("echolake_")).collect();
         assert!(!names.is_empty(), "an alert over no figure of a server: {expression}");
         for name in names {
-            let found = text.lines().any(|line| line.split(['{', ' ']).next() == Some(name));
-            assert!(found, "there is no {name}, which an alert reads, in {text}");
+            let found = figures.lines().any(|line| line.split(['{', ' ']).next() == Some(name));
+            assert!(found, "there is no {name}, which an alert reads, in {figures}");
             named += 1;
         }
     }
-    assert_eq!(named, 8);
+    assert_eq!(named, 15);
     // Debian's package prometheus has it.
     std::fs::write(place.path("metrics.txt"), &text).expect("written");
     let metrics = format!("promtool check metrics < '{}'", place.path("metrics.txt").display());

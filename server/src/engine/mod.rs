@@ -11,7 +11,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use echolake_lake::Lake;
-use echolake_query::{EngineClient, QueryEngine, QueryQuota};
+use echolake_query::{EngineClient, QueryEngine, QueryQuota, Session};
 use echolake_schema::tables::Table;
 use echolake_service::{ClientIdentity, DoorMessage, EngineReport, EngineSocket, Error, LakeFigures, QueryService};
 use futures::FutureExt as _;
@@ -100,18 +100,33 @@ async fn next_client(messages: &mut mpsc::UnboundedReceiver<DoorMessage>) -> Opt
 // Reports the lake's figures again and again: an engine that waits for a client has nothing else to do.
 async fn report_lake(lake: &Lake, engine: &QueryEngine) -> Infallible {
     let session = engine.open_session(&Arc::new(EngineClient::new("lake figures", QueryQuota::default())));
+    // Counted once for each version of `runs`.
+    let mut damaged = (None, 0);
     loop {
-        let figures = match session.current_snapshot().await {
-            Ok(snapshot) => match Table::ALL.into_iter().try_for_each(|table| snapshot.check_table(table)) {
-                Ok(()) => LakeFigures::from_lake(lake, &snapshot).await.map_err(|e| e.to_string()),
-                Err(fault) => Err(fault.to_string()),
-            },
-            Err(e) => Err(e.to_string()),
-        };
+        let figures = look_at_lake(lake, &session, &mut damaged).await;
         let figures = figures.inspect_err(|error| tracing::warn!(error, "the lake cannot be read")).ok();
         EngineReport::Lake(figures).send_line();
         tokio::time::sleep(if lake.is_remote() { REMOTE_LAKE_LOOK } else { LAKE_LOOK }).await;
     }
+}
+
+async fn look_at_lake(lake: &Lake, session: &Session, damaged: &mut (Option<u64>, u64)) -> Result<LakeFigures, String> {
+    let snapshot = session.current_snapshot().await.map_err(|e| e.to_string())?;
+    Table::ALL.into_iter().try_for_each(|table| snapshot.check_table(table)).map_err(|e| e.to_string())?;
+    let version = snapshot.log_version(Table::Runs);
+    if damaged.0 != version {
+        *damaged = (version, count_damaged_runs(session).await.map_err(|e| e.to_string())?);
+    }
+    LakeFigures::from_lake(lake, &snapshot, damaged.1).await.map_err(|e| e.to_string())
+}
+
+async fn count_damaged_runs(session: &Session) -> Result<u64, echolake_query::Error> {
+    let mut answer = session.query("select run_id from runs where damaged > 0").await?;
+    let mut runs = 0;
+    while let Some(batch) = answer.next().await? {
+        runs += batch.num_rows() as u64;
+    }
+    Ok(runs)
 }
 
 async fn warm_up(engine: &QueryEngine) -> Result<(), Error> {

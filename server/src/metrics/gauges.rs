@@ -101,6 +101,11 @@ impl ServerGauges {
         moment.register_gauge("echolake_lake_version", "Version of the lake.", lake.version as f64)?;
         moment.register_gauge("echolake_lake_surfaces", "Surfaces of the lake.", lake.surfaces as f64)?;
         moment.register_gauge("echolake_lake_runs", "Runs of the lake.", lake.runs as f64)?;
+        moment.register_gauge(
+            "echolake_damaged_runs",
+            "Runs with messages that ingest could not read.",
+            lake.damaged_runs as f64,
+        )?;
         moment.register_gauge("echolake_lake_table_bytes", "Bytes of the tables' files.", lake.table_bytes as f64)?;
         moment.register_gauge(
             "echolake_lake_look_age_seconds",
@@ -182,7 +187,7 @@ mod tests {
 
     #[test]
     fn gauges_are_those_of_the_moment() {
-        let lake = LakeFigures { runs: 7, ..LakeFigures::default() };
+        let lake = LakeFigures { runs: 7, damaged_runs: 1, ..LakeFigures::default() };
         let gauges = ServerGauges {
             connections: vec![(ServerProtocol::Http, 2, 512), (ServerProtocol::Postgres, 1, 128)],
             disks: vec![
@@ -201,6 +206,7 @@ mod tests {
             "echolake_disk_bytes{folder=\"temp\"} 2",
             "echolake_lake_runs 7",
             "echolake_lake_look_age_seconds 3",
+            "echolake_damaged_runs 1",
             "echolake_quarantine_runs 0",
             "echolake_ready 1",
             concat!("echolake_build_info{version=\"", env!("CARGO_PKG_VERSION"), "\"} 1"),

@@ -13,6 +13,8 @@ pub struct LakeFigures {
     pub surfaces: u64,
     /// Runs.
     pub runs: u64,
+    /// Runs with messages that `ingest` could not read.
+    pub damaged_runs: u64,
     /// Bytes of the tables' files.
     pub table_bytes: u64,
     /// Run files that wait for ingest.
@@ -31,16 +33,17 @@ pub struct FolderFigures {
 }
 
 impl LakeFigures {
-    /// Counts what a snapshot and the two folders hold.
+    /// Counts what a snapshot and the two folders hold, besides the damaged runs, which a query has counted.
     ///
     /// # Errors
     /// The store does not list a folder.
-    pub async fn from_lake(lake: &Lake, snapshot: &LakeSnapshot) -> echolake_lake::Result<Self> {
+    pub async fn from_lake(lake: &Lake, snapshot: &LakeSnapshot, damaged_runs: u64) -> echolake_lake::Result<Self> {
         let bytes = |table: Table| snapshot.files(table).iter().map(|file| file.bytes).sum::<u64>();
         Ok(Self {
             version: snapshot.log_version(Table::Runs).unwrap_or(0),
             surfaces: snapshot.files(Table::Surfaces).iter().map(echolake_lake::DataFile::visible_rows).sum(),
             runs: snapshot.runs().count() as u64,
+            damaged_runs,
             table_bytes: Table::ALL.into_iter().map(bytes).sum(),
             inbox: FolderFigures::from_folder(lake, "inbox").await?,
             quarantine: FolderFigures::from_folder(lake, "quarantine").await?,
