@@ -24,6 +24,27 @@ export interface paths {
         readonly patch?: never;
         readonly trace?: never;
     };
+    readonly "/api/v1/diffusion": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        /**
+         * How evenly surfaces spread what they reflect.
+         * @description The coefficient has the form of ISO 17497-2, which asks for receivers in the far field. A rig's grid is in the near
+         *     field, where a plane is even, too: only surfaces that were measured alike can be compared. Once per snapshot.
+         */
+        readonly get: operations["diffusion"];
+        readonly put?: never;
+        readonly post?: never;
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
     readonly "/api/v1/files": {
         readonly parameters: {
             readonly query?: never;
@@ -432,7 +453,8 @@ export interface paths {
         };
         /**
          * TNCE over the grid for one microphone point, drawn.
-         * @description Grey is 0 dB, blue below, orange above, unless the palette is the paper's. Cells have `data-row` (band) and `data-point`.
+         * @description Grey is 0 dB, blue below, orange above, unless the palette is the paper's. Cells have `data-row` (band) and
+         *     `data-point`.
          */
         readonly get: operations["grid_figure"];
         readonly put?: never;
@@ -816,6 +838,10 @@ export interface components {
             /** @description Measurements that the mean is over. */
             readonly pairs: number;
             readonly surface_id: string;
+        };
+        /** @description Diffusion coefficients of all surfaces. */
+        readonly DiffusionTable: {
+            readonly items: readonly components["schemas"]["SurfaceDiffusion"][];
         };
         /** @description Readings over the time since `start`. */
         readonly EnvironmentSeries: {
@@ -1307,6 +1333,15 @@ export interface components {
             readonly statistics: readonly components["schemas"]["BandStatistics"][];
             readonly surface: components["schemas"]["Surface"];
         };
+        /** @description Diffusion coefficients of a surface. */
+        readonly SurfaceDiffusion: {
+            /**
+             * @description Mean over the grid's points of the coefficient of a point's pairs: 1 if their energies are equal. By band in the
+             *     order of `lake.bands`, the total last; null of the Foam that is subtracted.
+             */
+            readonly diffusion: readonly (number | null)[];
+            readonly surface_id: string;
+        };
         /** @description Surfaces on the map. */
         readonly SurfaceMap: {
             /** @description Share of the variance by component. */
@@ -1403,6 +1438,35 @@ export interface operations {
                 };
                 content: {
                     readonly "application/json": components["schemas"]["Correlations"];
+                };
+            };
+            /** @description Not changed since the ETag of If-None-Match */
+            readonly 304: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content?: never;
+            };
+            readonly default: components["responses"]["Problem"];
+        };
+    };
+    readonly diffusion: {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        readonly requestBody?: never;
+        readonly responses: {
+            /** @description OK */
+            readonly 200: {
+                headers: {
+                    readonly ETag?: string;
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/json": components["schemas"]["DiffusionTable"];
                 };
             };
             /** @description Not changed since the ETag of If-None-Match */
@@ -1966,7 +2030,7 @@ export interface operations {
                 readonly relief?: string;
                 /** @description `band:lo..hi`, dB against Flat of the same band. References have none. */
                 readonly level?: readonly string[];
-                readonly sort?: "surface_id" | "started" | "relief" | "spread" | "level";
+                readonly sort?: "surface_id" | "started" | "relief" | "spread" | "level" | "diffusion";
                 /** @description A band's key, as in `lake.bands`. */
                 readonly sort_band?: string;
                 readonly order?: "asc" | "desc";
