@@ -43,6 +43,7 @@ use crate::commands::upkeep::rebuild::{self, RebuildArgs};
 use crate::commands::upkeep::remove::{self, RemoveArgs};
 #[cfg(feature = "lake")]
 use crate::commands::upkeep::tag::{self, TagArgs};
+#[cfg(feature = "lake")]
 use crate::commands::upkeep::vacuum::{self, VacuumArgs};
 #[cfg(feature = "upload")]
 use crate::commands::upload::{self, UploadArgs};
