@@ -420,6 +420,22 @@ async fn put_events(lake: &Lake, surface: &str, run: &str, derivation: &str, lin
     lake.commit_staged(&staged).await.expect("committed");
 }
 
+// Names of runs are longer than what the log's statistics are trusted with.
+#[tokio::test]
+async fn a_query_of_one_run_opens_its_files_alone() {
+    let (_folder, lake) = lake().await;
+    let runs = [1, 2, 3].map(|day| format!("2026010{day}T080000Z-flat-911a348a2ed4d04{day}"));
+    for (surface, (run, lines)) in ["flat", "foam", "wood"].into_iter().zip(runs.iter().zip([20_000, 20_000, 0])) {
+        put_events(&lake, surface, run, "old", lines).await;
+    }
+    let session = Session::new(&lake).expect("a session");
+    let text = |batches: &[RecordBatch]| format!("{:?}", batches[0].column(batches[0].num_columns() - 1));
+    let plan = text(&rows(&session, &format!("explain select message from events where run_id = '{}'", runs[1])).await);
+    assert!(plan.contains(&runs[1]) && !plan.contains(&format!("tables/events/flat.{}", runs[0])), "{plan}");
+    let last = text(&rows(&session, "select max(run_id) from events").await);
+    assert!(last.contains(&runs[1]), "the third has no lines: {last}");
+}
+
 async fn check_replaced_rows(others: usize) {
     let (_folder, lake) = lake().await;
     for (surface, run, lines) in [("flat", "r1", 3), ("foam", "r2", 5), ("wood", "r3", 7), ("prd", "r4", others)] {

@@ -254,7 +254,7 @@ async fn the_past_is_seen_until_it_is_vacuumed() {
     let error = refused("nce version as of 99", "the lake has no version 99").await;
     assert!(matches!(error, Error::Query { .. }));
     refused("nce timestamp as of '2001-01-01'", "the lake has no 2001-01-01").await;
-    let error = refused("nce timestamp as of 'yesterday'", "neither a version nor a time").await;
+    let error = refused("nce timestamp as of 'yesterday'", "the lake has no tag `yesterday`: it has none").await;
     assert!(matches!(error, Error::Query { .. }));
     refused("nope version as of 1", "no table `nope`").await;
     let snapshot = lake.snapshot().await.expect("a view");

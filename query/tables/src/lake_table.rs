@@ -28,8 +28,9 @@ use datafusion::physical_plan::ExecutionPlan;
 use datafusion::physical_plan::empty::EmptyExec;
 use datafusion::physical_plan::filter::{FilterExec, FilterExecBuilder};
 use datafusion::physical_plan::union::UnionExec;
-use echolake_lake::{DataFile, Lake, LakeSnapshot};
+use echolake_lake::{DataFile, FileName, Lake, LakeSnapshot, VisibleRun};
 use echolake_schema::tables::Table;
+use echolake_schema::{RunId, SurfaceId};
 use futures::FutureExt as _;
 use futures::future::BoxFuture;
 use object_store::ObjectMeta;
@@ -128,14 +129,15 @@ impl LakeTable {
     // Prunes files by their statistics in the log. DataFusion would prune them, too, but only after opening each; a
     // query for one surface should not open the files of others.
     fn kept_files(&self, state: &dyn Session, filters: &[Expr]) -> Result<Vec<&ScanFile>> {
-        let all = || self.files.iter().collect();
-        let Some(filter) = conjunction(filters.iter().cloned()) else { return Ok(all()) };
+        // A file without rows has no extremes, and one without extremes keeps all others.
+        let files: Vec<_> = self.files.iter().filter(|file| file.file.rows > 0).collect();
+        let Some(filter) = conjunction(filters.iter().cloned()) else { return Ok(files) };
         let filter = state.create_physical_expr(filter, &self.columns)?;
         let predicate = PruningPredicateBuilder::new().with_file_schema(self.schema.clone()).build(filter);
-        let Some(predicate) = predicate else { return Ok(all()) };
-        let known = self.files.iter().map(|f| f.known.clone()).collect();
+        let Some(predicate) = predicate else { return Ok(files) };
+        let known = files.iter().map(|f| f.known.clone()).collect();
         let may = predicate.prune(&PrunableStatistics::new(known, self.schema.clone()))?;
-        Ok(self.files.iter().zip(may).filter(|(_, may)| *may).map(|(file, _)| file).collect())
+        Ok(files.into_iter().zip(may).filter(|(_, may)| *may).map(|(file, _)| file).collect())
     }
 
     // A plain scan of files, in groups of about the same size; DataFusion splits files further if that pays.
@@ -272,22 +274,54 @@ fn file_statistics(file: &DataFile, schema: &SchemaRef) -> Statistics {
             column.max_value = Precision::Exact(greatest);
         }
     }
+    // Names of runs are too long for the log's extremes.
+    let named = if file.hidden.is_empty() { named_runs(file) } else { Vec::new() };
+    let surfaces = named.iter().map(|(surface, _)| surface.as_str());
+    let runs = named.iter().map(|(_, run)| run.as_str());
+    for (name, extremes) in [(SURFACE, text_range(surfaces)), (RUN, text_range(runs))] {
+        let Some((column, (least, greatest))) = schema.index_of(name).ok().zip(extremes) else { continue };
+        let column = &mut known.column_statistics[column];
+        if column.min_value == Precision::Absent {
+            column.min_value = Precision::Exact(least);
+            column.max_value = Precision::Exact(greatest);
+        }
+    }
     known
+}
+
+// The surfaces and runs with rows, as a file's name or its parts tell.
+fn named_runs(file: &DataFile) -> Vec<(SurfaceId, RunId)> {
+    match FileName::parse(&file.path) {
+        Some(FileName::Rows { surface, run, .. } | FileName::Pointer(VisibleRun { surface, run, .. }))
+            if file.rows > 0 =>
+        {
+            vec![(surface, run)]
+        }
+        Some(FileName::Merged { .. }) => {
+            let parts = file.visible_parts().map(|(part, _)| part).filter(|part| part.rows > 0);
+            parts.map(|part| (part.surface.clone(), part.run.clone())).collect()
+        }
+        _ => Vec::new(),
+    }
+}
+
+fn text_range<'a>(texts: impl Iterator<Item = &'a str>) -> Option<(ScalarValue, ScalarValue)> {
+    let texts: BTreeSet<_> = texts.collect();
+    Some((ScalarValue::from(*texts.first()?), ScalarValue::from(*texts.last()?)))
 }
 
 // The log's extremes are those of hidden rows, too; of the rows that are seen, the parts tell surfaces and runs.
 fn known_of_parts(file: &DataFile, schema: &SchemaRef) -> Statistics {
     let mut known = Statistics::new_unknown(schema);
     known.num_rows = Precision::Exact(file.visible_rows() as usize);
-    let surfaces: BTreeSet<_> = file.visible_parts().map(|(part, _)| part.surface.as_str()).collect();
-    let runs: BTreeSet<_> = file.visible_parts().map(|(part, _)| part.run.as_str()).collect();
-    for (name, texts) in [(SURFACE, surfaces), (RUN, runs)] {
-        let extremes = texts.first().zip(texts.last());
+    let surfaces = file.visible_parts().map(|(part, _)| part.surface.as_str());
+    let runs = file.visible_parts().map(|(part, _)| part.run.as_str());
+    for (name, extremes) in [(SURFACE, text_range(surfaces)), (RUN, text_range(runs))] {
         let Some((column, (least, greatest))) = schema.index_of(name).ok().zip(extremes) else { continue };
         let column = &mut known.column_statistics[column];
         column.null_count = Precision::Exact(0);
-        column.min_value = Precision::Exact(ScalarValue::from(*least));
-        column.max_value = Precision::Exact(ScalarValue::from(*greatest));
+        column.min_value = Precision::Exact(least);
+        column.max_value = Precision::Exact(greatest);
     }
     known
 }
