@@ -49,7 +49,7 @@ use crate::commands::upkeep::vacuum::{self, VacuumArgs};
 use crate::commands::upload::{self, UploadArgs};
 use crate::logging::{FORMAT_VARIABLE, LogFormat};
 
-/// What to try first, in the help of the program, which a call without a command prints.
+/// The commands to try first, in the help of the program, which a call without a command prints.
 #[cfg(feature = "lake")]
 const FIRST: &str = "Try first: `echolake demo` measures six surfaces with the simulated rig and serves the catalogue \
                      of them; then `echolake sql` and `echolake doctor`.";

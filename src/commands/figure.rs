@@ -81,7 +81,7 @@ pub(crate) struct GridArgs {
     columns: u32,
 }
 
-/// What levels are over.
+/// Reference of levels.
 #[derive(Debug, Args)]
 struct ReferenceArgs {
     /// Reference of the bands' levels: Flat's energy in the same band, as on the catalogue's pages and in the paper's

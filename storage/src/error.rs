@@ -177,8 +177,8 @@ pub enum Error {
     },
     /// The log does not hold the lake at that moment.
     #[error(
-        "the lake has no {moment}: {held}; hint: the log's own clean-up forgets old versions, and tables that are made again \
-         count anew"
+        "the lake has no {moment}: {held}; hint: the log's own clean-up forgets old versions, and tables that are made \
+         again count from 0 again"
     )]
     NoMoment {
         /// The moment.

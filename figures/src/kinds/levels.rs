@@ -32,7 +32,7 @@ const MARGIN: f64 = 0.06;
 pub struct LevelsFigure {
     /// Levels and their standard uncertainties, dB.
     pub table: FigureTable,
-    /// What the levels are in, such as "dB re Flat total".
+    /// Unit of the levels, such as "dB re Flat total".
     pub unit: String,
     /// Width, px.
     pub width_px: f32,

@@ -4,7 +4,7 @@ use echolake_query::{is_blank_statement, split_statement};
 
 use super::prompt::command::{PromptCommand, parse_command};
 
-/// What a line completes.
+/// The statement or command that a line completes.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum ScriptStep {
     /// A command, or what is wrong with it.

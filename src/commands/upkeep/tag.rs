@@ -1,7 +1,7 @@
 //! `echolake tag`: names for versions of the lake.
 
 use clap::Args;
-use echolake_lake::{Error, Lake, LakeMoment, TagName};
+use echolake_lake::{Lake, LakeMoment, TagName};
 
 use crate::CommandOutcome;
 
@@ -44,12 +44,11 @@ pub(crate) async fn run_tag(args: &TagArgs, lake_url: &str) -> anyhow::Result<Co
     if tags.is_empty() {
         eprintln!("no tags; hint: `echolake tag NAME` names the newest version");
     }
+    let versions = lake.list_versions().await?;
     for tag in &tags {
         let committed = tag.committed.format("%Y-%m-%d %H:%M:%S UTC");
-        let gone = match lake.version_at(&LakeMoment::Tag(tag.name.clone())).await {
-            Err(Error::NoMoment { .. }) => ", gone: the tables were made anew since",
-            version => version.map(|_| "")?,
-        };
+        let is_there = versions.iter().any(|version| tag.is_of(version));
+        let gone = if is_there { "" } else { ", gone: the tables were made again since" };
         crate::commands::print_line(&format!("{}  version {} of {committed}{gone}", tag.name, tag.version))?;
     }
     Ok(CommandOutcome::Whole)

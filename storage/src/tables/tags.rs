@@ -48,7 +48,7 @@ pub struct LakeTag {
 
 impl LakeTag {
     /// Returns whether it names a version of the log as it is now.
-    pub(super) fn is_of(&self, version: &TableVersion) -> bool {
+    pub fn is_of(&self, version: &TableVersion) -> bool {
         (self.version, self.committed) == (version.version, version.committed)
     }
 }
@@ -152,18 +152,22 @@ impl Lake {
         self.store().delete(&name.path()).await.map_err(|e| Error::store_failure("delete", name.path(), e))
     }
 
-    /// The files of a table that tags keep; none of tags whose version is gone.
-    pub(crate) async fn tagged_files(&self, table: Table, tags: &[LakeTag]) -> Result<HashSet<Path>> {
-        let mut kept = HashSet::new();
-        for tag in tags {
-            let version = match self.version_at(&LakeMoment::Tag(tag.name.clone())).await {
-                Err(Error::NoMoment { .. }) => continue,
-                version => version?,
-            };
-            let snapshot = self.snapshot_at(version, table).await?;
-            kept.extend(snapshot.files(table).iter().map(|file| file.path.clone()));
+    /// The tagged versions that the log has; a tag of tables that are gone keeps nothing.
+    pub(crate) async fn tagged_versions(&self) -> Result<Vec<u64>> {
+        let tags = self.list_tags().await?;
+        let versions = if tags.is_empty() { Vec::new() } else { self.list_versions().await? };
+        let tagged = versions.iter().filter(|version| tags.iter().any(|tag| tag.is_of(version)));
+        Ok(tagged.map(|version| version.version).collect())
+    }
+
+    /// The files of a table at some versions.
+    pub(crate) async fn files_at_versions(&self, table: Table, versions: &[u64]) -> Result<HashSet<Path>> {
+        let mut files = HashSet::new();
+        for version in versions {
+            let snapshot = self.snapshot_at(*version, table).await?;
+            files.extend(snapshot.files(table).iter().map(|file| file.path.clone()));
         }
-        Ok(kept)
+        Ok(files)
     }
 
     async fn read_tag(&self, path: &Path) -> Result<Option<LakeTag>> {

@@ -60,8 +60,8 @@ pub struct NoMoment {
 impl FromStr for LakeMoment {
     type Err = NoMoment;
 
-    /// Reads a version, a time as in RFC 3339 (without a zone it is UTC, without a time of day midnight), or the name of
-    /// a tag.
+    /// Reads a version, a time as in RFC 3339 (without a zone it is UTC, without a time of day midnight), or a tag's
+    /// name.
     fn from_str(text: &str) -> std::result::Result<Self, NoMoment> {
         let text = text.trim();
         if let Ok(version) = text.parse() {
@@ -103,7 +103,7 @@ impl Lake {
         let found = match moment {
             LakeMoment::Version(number) => versions.iter().find(|v| v.version == *number),
             LakeMoment::Time(time) => versions.iter().rfind(|v| v.committed <= *time),
-            // Tables that were made anew count their versions anew.
+            // Tables that were made again count their versions from 0 again.
             LakeMoment::Tag(_) => versions.iter().find(|v| tag.as_ref().is_some_and(|tag| tag.is_of(v))),
         };
         found.cloned().ok_or_else(|| {

@@ -1,4 +1,4 @@
-//! What the machine can do at most: copies of memory, and decompression of the chunks of run files.
+//! Limits of the machine: copies of memory, and decompression of the chunks of run files.
 
 use std::hint::black_box;
 use std::path::PathBuf;

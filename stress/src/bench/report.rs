@@ -278,7 +278,7 @@ fn facts_line(machine: &[(&str, String)]) -> String {
     machine.iter().map(|(name, text)| format!("{name} {text}")).collect::<Vec<_>>().join(", ")
 }
 
-// What was measured, and where.
+// The program and the machine that were measured.
 fn machine_facts() -> [(&'static str, String); 5] {
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     let read_value = |file: &str, key: &str| {

@@ -29,7 +29,7 @@ pub(crate) struct WholeBenchArgs {
     /// A lake whose run files are ingested again, instead of simulated ones. It is only read.
     #[arg(long, value_name = "FOLDER")]
     lake: Option<PathBuf>,
-    /// A Python that has duckdb, pyarrow, mcap, mcap-protobuf-support, NumPy and SciPy; without one, there are no peers.
+    /// A Python that has duckdb, pyarrow, mcap, mcap-protobuf-support, NumPy and SciPy; without one, no peers.
     #[arg(long, value_name = "PATH")]
     python: Option<PathBuf>,
     /// Folder of `pipeline.py`.

@@ -32,7 +32,7 @@ export interface paths {
             readonly cookie?: never;
         };
         /**
-         * How evenly surfaces spread what they reflect.
+         * Evenness with which surfaces spread what they reflect.
          * @description The coefficient has the form of ISO 17497-2, which asks for receivers in the far field. A rig's grid is in the near
          *     field, where a plane is even, too: only surfaces that were measured alike can be compared. Once per snapshot.
          */

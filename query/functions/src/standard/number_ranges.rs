@@ -1,5 +1,5 @@
-//! `range` and `generate_series` to `array_length(x) + 1`: lengths are unsigned, and the sum of an unsigned and a signed
-//! integer is a decimal without places, which DataFusion's own functions refuse.
+//! `range` and `generate_series` to `array_length(x) + 1`: lengths are unsigned, and the sum of an unsigned and a
+//! signed integer is a decimal without places, which DataFusion's own functions refuse.
 
 use std::sync::Arc;
 

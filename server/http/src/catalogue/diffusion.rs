@@ -29,7 +29,7 @@ struct SurfaceDiffusion<'a> {
     diffusion: &'a [Option<f64>],
 }
 
-/// How evenly surfaces spread what they reflect.
+/// Evenness with which surfaces spread what they reflect.
 ///
 /// The coefficient has the form of ISO 17497-2, which asks for receivers in the far field. A rig's grid is in the near
 /// field, where a plane is even, too: only surfaces that were measured alike can be compared. Once per snapshot.

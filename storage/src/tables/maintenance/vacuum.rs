@@ -121,13 +121,13 @@ impl Lake {
         let now = Utc::now();
         let mut files = Vec::new();
         let old = |modified| is_over(modified, None, now, keep);
-        let tags = self.list_tags().await?;
+        let tagged_versions = self.tagged_versions().await?;
         for table in Table::ALL {
             let there = self.store().list_with_delimiter(Some(&table_folder(table))).await;
             let there = there.map_err(|e| Error::store_failure("list", table_folder(table), e))?;
             // Without a log, nothing says what the files are.
             let Some(history) = self.commit_log().file_history(table).await? else { continue };
-            let tagged = self.tagged_files(table, &tags).await?;
+            let tagged = self.files_at_versions(table, &tagged_versions).await?;
             for meta in there.objects {
                 if !tagged.contains(&meta.location)
                     && is_left_over(&history, &meta.location, |gone| is_over(meta.last_modified, gone, now, keep))

@@ -38,8 +38,8 @@ struct SampledTable {
 struct SampledColumn {
     name: String,
     kind: ColumnKind,
-    /// As they are written in SQL, ascending, each once; between two of the rows' values if those are floats, so that no
-    /// rounding decides about a row.
+    /// As they are written in SQL, ascending, each once; between two of the rows' values if those are floats, so that
+    /// no rounding decides about a row.
     values: Vec<String>,
     is_nullable: bool,
 }
@@ -324,7 +324,7 @@ impl SampledTable {
         self.table.name()
     }
 
-    // What orders rows that are alike otherwise.
+    // Columns that order rows that are alike otherwise.
     fn row_key(&self) -> &'static str {
         if self.table == Table::TnceD4 {
             "surface_id, run_id, pair_id, symmetry"
