@@ -2,6 +2,7 @@
 #![allow(clippy::print_stderr, reason = "a test that cannot run says so")]
 
 mod acquire_kills;
+mod annotation_kills;
 mod architecture;
 mod bad_input;
 mod broken_tables;

@@ -4,6 +4,7 @@ mod agents;
 mod attacks;
 pub(crate) mod catalogue;
 mod contract;
+mod contributions;
 mod dialect;
 mod differences;
 mod drain;

@@ -14,17 +14,20 @@ use bytes::Bytes;
 use datafusion::common::TableReference;
 use datafusion::datasource::TableProvider;
 use datafusion::error::DataFusionError;
+use datafusion::logical_expr::ScalarUDF;
 use datafusion::optimizer::OptimizerRule;
 use datafusion::prelude::SessionContext;
 use datafusion::sql::parser::Statement;
 use echolake_functions::FunctionSet;
-use echolake_lake::{DataFile, Error as LakeError, Lake, LakeMoment, LakeSnapshot, VisibleRun};
+use echolake_lake::{ContributionLog, DataFile, Error as LakeError, Lake, LakeMoment, LakeSnapshot, VisibleRun};
 use echolake_lake_tables::{FileReaders, LakeTable};
 use echolake_mcap_tables::{self as mcap_tables, Contents, McapCalls, McapFiles};
-use echolake_schema::tables::Table;
+use echolake_schema::annotations::Annotation;
+use echolake_schema::tables::{Table, annotation_schema, prediction_schema};
 use futures::future::try_join_all;
 use quick_cache::sync::Cache;
 
+use crate::contributions::{AnnotationCache, SeenContributions, without_rejected};
 use crate::statement::{PastTableName, find_past_tables, walk_statement};
 use crate::system;
 use crate::views::{LakeView, LazyView, LookupFunctions, PairJoin, SortedNulls, UnusedJoin};
@@ -51,6 +54,7 @@ pub(crate) struct LakeCatalog {
     /// Cache of tables as of versions of the lake, which do not change.
     past: Cache<(u64, Table), Arc<LakeTable>>,
     runs: Arc<McapFiles>,
+    annotations: AnnotationCache,
 }
 
 /// One snapshot of the lake with its tables and views.
@@ -58,6 +62,7 @@ struct CatalogSnapshot {
     snapshot: Arc<LakeSnapshot>,
     tables: HashMap<Table, Arc<LakeTable>>,
     providers: Vec<(TableReference, Arc<dyn TableProvider>)>,
+    rejection: ScalarUDF,
     looked: Mutex<Instant>,
     /// The last look at the log of `runs`.
     checked: Mutex<Instant>,
@@ -78,6 +83,7 @@ impl LakeCatalog {
             taking: tokio::sync::Mutex::default(),
             past: Cache::new(PAST_TABLES),
             runs: Arc::new(McapFiles::new(lake, &small)),
+            annotations: AnnotationCache::default(),
         })
     }
 
@@ -104,6 +110,7 @@ impl LakeCatalog {
         for (name, provider) in &current.providers {
             context.register_table(name.clone(), provider.clone()).map_err(execution_error)?;
         }
+        context.register_udf(current.rejection.clone());
         for (name, provider) in system {
             context
                 .register_table(TableReference::partial(system::SYSTEM_SCHEMA, name), provider)
@@ -165,6 +172,16 @@ impl LakeCatalog {
         mcap_tables::read_attachment(run, snapshot, ending, &self.runs).await.map_err(mcap_failed)
     }
 
+    /// Returns all annotations of the lake, with those that no version shows yet, and the highest number.
+    ///
+    /// # Errors
+    /// [`Error::Lake`].
+    pub async fn all_annotations(&self) -> Result<(u64, Arc<Vec<Arc<Annotation>>>), Error> {
+        let files = self.lake.list_contributions(ContributionLog::Annotations, u64::MAX).await?;
+        let last = files.last().map_or(0, |file| file.number);
+        Ok((last, self.annotations.read_up_to(&self.lake, last).await?))
+    }
+
     /// Returns the views with their definitions.
     pub fn view_definitions(&self) -> impl Iterator<Item = (&'static str, String)> {
         LakeView::ALL.into_iter().map(|view| (view.name(), view.definition_sql(&self.lake)))
@@ -179,7 +196,13 @@ impl LakeCatalog {
     pub fn table_schemas(&self) -> impl Iterator<Item = (&'static str, SchemaRef)> {
         let tables = || Table::ALL.into_iter().map(|table| (table.name(), table.schema(self.lake.rig())));
         let views = || LakeView::ALL.into_iter().map(|view| (view.name(), view.schema(&self.lake, &self.lookups)));
-        self.names.get_or_init(|| tables().chain(views()).collect()).iter().cloned()
+        let contributed = || {
+            [
+                (ContributionLog::Annotations.name(), annotation_schema()),
+                (ContributionLog::Predictions.name(), prediction_schema(self.lake.rig())),
+            ]
+        };
+        self.names.get_or_init(|| tables().chain(views()).chain(contributed()).collect()).iter().cloned()
     }
 
     async fn fresh_snapshot(&self) -> Result<Arc<CatalogSnapshot>, Error> {
@@ -266,12 +289,21 @@ impl LakeCatalog {
             .iter()
             .map(|(table, provider)| (TableReference::bare(table.name()), provider.clone() as _))
             .collect();
+        let counts = snapshot.contributions();
+        let contributed =
+            SeenContributions::read_from(&self.lake, &self.annotations, &snapshot, counts, &self.source).await?;
+        let rejection = contributed.rejection_function();
         for view in LakeView::ALL {
-            let of = |table: &Table| Some((*table, tables.get(table)?.clone() as Arc<dyn TableProvider>));
-            let beneath = view.source_tables().iter().filter_map(of).collect();
+            let mut beneath = HashMap::new();
+            for (table, provider) in view.source_tables().iter().filter_map(|t| tables.get(t).map(|found| (*t, found)))
+            {
+                let kept = without_rejected(table, provider.clone(), &contributed.rejected, &snapshot);
+                beneath.insert(table, kept.map_err(execution_error)?);
+            }
             let view_table = LazyView::new(view, &self.lake, &self.lookups, beneath);
             providers.push((TableReference::bare(view.name()), Arc::new(view_table)));
         }
+        providers.extend(contributed.tables.into_iter().map(|(name, table)| (TableReference::bare(name), table)));
         if let Some(runs) = tables.get(&Table::Runs) {
             let of_lake = system::lake_tables(&self.lake, &snapshot, runs.clone());
             let named =
@@ -279,7 +311,7 @@ impl LakeCatalog {
             providers.extend(named);
         }
         let [looked, checked] = [taken, taken].map(Mutex::new);
-        Ok(CatalogSnapshot { snapshot, tables, providers, looked, checked })
+        Ok(CatalogSnapshot { snapshot, tables, providers, rejection, looked, checked })
     }
 
     fn open_table(&self, table: Table, files: &[DataFile]) -> Result<LakeTable, Error> {
@@ -295,7 +327,8 @@ impl LakeCatalog {
         let moment = past.parse_moment()?;
         let table = Table::by_name(&past.table);
         let view = LakeView::by_name(&past.table);
-        if table.is_none() && view.is_none() {
+        let log = ContributionLog::by_name(&past.table);
+        if table.is_none() && view.is_none() && log.is_none() {
             return Err(error::unknown_table(&past.table));
         }
         let version = match versions.get(&moment) {
@@ -306,10 +339,20 @@ impl LakeCatalog {
         if let Some(table) = table {
             return Ok(self.table_at(version, table).await?);
         }
+        let runs = self.lake.snapshot_at(version, Table::Runs).await?;
+        let counts = self.lake.contributions_at(version).await?;
+        let contributed =
+            SeenContributions::read_from(&self.lake, &self.annotations, &runs, counts, &self.source).await?;
+        if let Some(log) = log {
+            let [annotated, predicted] = contributed.tables;
+            return Ok(if log == ContributionLog::Annotations { annotated.1 } else { predicted.1 });
+        }
         let Some(view) = view else { return Err(error::unknown_table(&past.table)) };
         let mut beneath = HashMap::new();
         for table in view.source_tables() {
-            beneath.insert(*table, self.table_at(version, *table).await? as Arc<dyn TableProvider>);
+            let provider = self.table_at(version, *table).await? as Arc<dyn TableProvider>;
+            let kept = without_rejected(*table, provider, &contributed.rejected, &runs).map_err(execution_error)?;
+            beneath.insert(*table, kept);
         }
         Ok(Arc::new(view.plan_over(&self.lake, &self.lookups, &beneath).map_err(execution_error)?))
     }

@@ -24,6 +24,7 @@
 
 mod catalog;
 mod client;
+mod contributions;
 mod control;
 mod engine;
 mod error;

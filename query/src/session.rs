@@ -15,6 +15,7 @@ use datafusion::prelude::SessionContext;
 use datafusion::sql::parser::Statement;
 use echolake_lake::{Lake, LakeSnapshot, VisibleRun};
 use echolake_mcap_tables::Contents;
+use echolake_schema::annotations::Annotation;
 use futures::future::BoxFuture;
 use futures::{FutureExt as _, StreamExt as _};
 use tokio::sync::mpsc;
@@ -435,6 +436,14 @@ impl Session {
     /// As [`Session::read_contents`].
     pub async fn read_attachment(&self, run: &VisibleRun, ending: &str) -> Result<Option<Bytes>, Error> {
         self.engine.catalog().read_attachment(run, ending).await
+    }
+
+    /// Returns all annotations of the lake, with those that no version shows yet, and the highest number.
+    ///
+    /// # Errors
+    /// [`Error::Lake`] if they cannot be read.
+    pub async fn all_annotations(&self) -> Result<(u64, Arc<Vec<Arc<Annotation>>>), Error> {
+        self.engine.catalog().all_annotations().await
     }
 
     /// Returns the functions, sorted by name.

@@ -11,6 +11,7 @@
 //! # Ok::<(), echolake_schema::Error>(())
 //! ```
 
+pub mod annotations;
 pub mod devices;
 mod error;
 pub mod grid;

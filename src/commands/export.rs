@@ -206,6 +206,9 @@ fn in_words(exported: &ExportSummary) -> String {
         let count = exported.left_out.len();
         lines.push(format!("{count} surfaces left out: another side of their panel is held out"));
     }
+    if exported.rejected > 0 {
+        lines.push(format!("{} measurements left out: the last verdict rejects them", exported.rejected));
+    }
     if exported.waiting > 0 {
         lines.push(format!("{} runs left out: they wait for their references", exported.waiting));
     }
@@ -229,6 +232,7 @@ fn in_json(exported: &ExportSummary) -> serde_json::Result<String> {
         "left_out": exported.left_out,
         "references_left_out": exported.references,
         "waiting": exported.waiting,
+        "rejected": exported.rejected,
         "files": exported.files.iter().map(file).collect::<Vec<_>>(),
     }))
 }

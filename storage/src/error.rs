@@ -229,6 +229,20 @@ pub enum Error {
         /// The cause.
         reason: String,
     },
+    /// A contribution that a version of the lake shows is gone.
+    #[error("`{path}` is missing, which the lake's log names; hint: bring it back from a copy of the lake")]
+    LostContribution {
+        /// Path in the lake.
+        path: String,
+    },
+    /// A contribution cannot be read.
+    #[error("`{path}` is damaged: {reason}; hint: bring it back from a copy of the lake")]
+    DamagedContribution {
+        /// Path in the lake.
+        path: String,
+        /// The cause.
+        reason: String,
+    },
     /// The log has forgotten rows of that moment.
     #[error(
         "table `{table}` cannot be seen at {moment}: of the rows of then, its log does not have all: {lacking}; hint: \

@@ -39,6 +39,8 @@ struct OpenLake {
 }
 
 const CONFIG: &str = "lake.toml";
+/// Folders that a lake whose configuration is lost may have.
+const OWN_FOLDERS: [&str; 7] = ["annotations", "inbox", "predictions", "quarantine", "runs", "tables", "tags"];
 
 impl Lake {
     /// Opens an existing lake.
@@ -371,7 +373,7 @@ async fn read_config(location: &LakeLocation) -> Result<Option<LakeConfig>> {
 async fn create_config(location: &LakeLocation, rig: &Rig, references: &ReferenceSurfaces) -> Result<LakeConfig> {
     let failed = |e| Error::store_failure("write", object_text(&location.text, CONFIG), e);
     let there = location.store.list_with_delimiter(None).await.map_err(failed)?;
-    let ours = |p: &Path| p.filename().is_some_and(|n| matches!(n, "runs" | "inbox" | "quarantine" | "tables"));
+    let ours = |p: &Path| p.filename().is_some_and(|n| OWN_FOLDERS.contains(&n));
     if !there.objects.is_empty() || !there.common_prefixes.iter().all(ours) {
         return Err(Error::Occupied { location: location.text.clone() });
     }

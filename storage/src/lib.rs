@@ -17,6 +17,8 @@
 //! ```
 
 mod config;
+#[cfg(feature = "tables")]
+mod contributions;
 mod durable;
 mod error;
 mod folder_listing;
@@ -36,6 +38,8 @@ mod unused;
 mod upload;
 
 pub use config::{DirectSound, LAKE_FORMAT, LakeConfig, ReferenceSurfaces, SamplePrecision};
+#[cfg(feature = "tables")]
+pub use contributions::{ContributionCounts, ContributionFile, ContributionLog};
 pub use error::{Error, StoreError};
 pub use folder_listing::{FolderListing, UnusableEntry};
 pub use lake::Lake;

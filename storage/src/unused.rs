@@ -22,7 +22,7 @@ pub(crate) async fn is_unused(lake: &Lake) -> Result<bool> {
     let used = |meta: &ObjectMeta| {
         let parts: Vec<_> = meta.location.parts().collect();
         match parts.iter().map(AsRef::as_ref).collect::<Vec<_>>().as_slice() {
-            ["runs" | "inbox", ..] => true,
+            ["runs" | "inbox" | "annotations" | "predictions", ..] => true,
             [TABLES, table, ..] => meta.location.extension() == Some("parquet") && !RIG_TABLES.contains(table),
             _ => false,
         }

@@ -4,6 +4,8 @@
 
 #[path = "../../tests/acquire_kills.rs"]
 mod acquire_kills;
+#[path = "../../tests/annotation_kills.rs"]
+mod annotation_kills;
 mod attacks;
 mod bench;
 mod cancels;
@@ -18,6 +20,7 @@ mod hostile_clients;
 mod hostile_files;
 mod hostile_ingest;
 mod kill_acquire;
+mod kill_annotations;
 mod kill_ingest;
 #[path = "../../tests/kills.rs"]
 mod kills;
@@ -60,6 +63,8 @@ enum CampaignCommand {
     HostileFiles(hostile_ingest::HostileFilesArgs),
     /// Kill `acquire`, with or without the power, recover and resume; nothing acknowledged may be lost.
     AcquireKills(kill_acquire::KillAcquireArgs),
+    /// Kill `serve` while a client annotates; nothing acknowledged may be lost or stored twice.
+    AnnotationKills(kill_annotations::KillAnnotationsArgs),
     /// Do what people do to a lake, in random sequences; an answer is whole, or an exit code says that it is not.
     Operators(operator_rounds::OperatorArgs),
     /// Throw changed SQL, bytes of each protocol or run files at `serve`.
@@ -83,6 +88,7 @@ fn main() -> Result<()> {
         CampaignCommand::Kills(args) => kill_ingest::run_kill_ingest(&args),
         CampaignCommand::HostileFiles(args) => hostile_ingest::run_hostile_ingest(&args),
         CampaignCommand::AcquireKills(args) => kill_acquire::run_kill_acquire(&args),
+        CampaignCommand::AnnotationKills(args) => kill_annotations::run_kill_annotations(&args),
         CampaignCommand::Operators(args) => operator_rounds::run_operator_rounds(&args),
         CampaignCommand::Fuzz(args) => fuzz_server::run_fuzz_server(&args),
         CampaignCommand::Attacks(args) => attacks::run_attacks(&args),

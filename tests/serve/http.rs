@@ -12,7 +12,7 @@ pub(crate) struct HttpRequest {
     path: String,
     host: Option<String>,
     headers: String,
-    body: String,
+    body: Vec<u8>,
     is_chunked: bool,
 }
 
@@ -28,7 +28,8 @@ pub(crate) struct HttpResponse {
 
 impl HttpRequest {
     pub fn get(path: &str) -> Self {
-        let (headers, body) = (String::new(), String::new());
+        let headers = String::new();
+        let body = Vec::new();
         Self { method: "GET", path: path.to_owned(), host: None, headers, body, is_chunked: false }
     }
 
@@ -41,7 +42,11 @@ impl HttpRequest {
     }
 
     pub fn post(path: &str, body: &str) -> Self {
-        Self { method: "POST", body: body.to_owned(), ..Self::get(path) }
+        Self::post_bytes(path, body.into())
+    }
+
+    pub fn post_bytes(path: &str, body: Vec<u8>) -> Self {
+        Self { method: "POST", body, ..Self::get(path) }
     }
 
     pub fn with(mut self, name: &str, value: &str) -> Self {
@@ -56,7 +61,8 @@ impl HttpRequest {
 
     /// Sends the body as one chunk, so that its length is not known before its end.
     pub fn chunked(mut self) -> Self {
-        self.body = format!("{:x}\r\n{}\r\n0\r\n\r\n", self.body.len(), self.body);
+        let length = format!("{:x}\r\n", self.body.len());
+        self.body = [length.as_bytes(), &self.body, b"\r\n0\r\n\r\n"].concat();
         self.is_chunked = true;
         self
     }
@@ -85,7 +91,7 @@ impl HttpRequest {
             self.host.as_deref().unwrap_or(address),
             self.headers
         );
-        [head.as_bytes(), self.body.as_bytes()].concat()
+        [head.as_bytes(), &self.body].concat()
     }
 
     pub fn send(self, server: &ServedLake) -> HttpResponse {

@@ -31,7 +31,7 @@ struct ProjectScene {
     all: String,
 }
 
-fn new_token(place: &TestFolder, args: &[&str]) -> (String, String) {
+pub(super) fn new_token(place: &TestFolder, args: &[&str]) -> (String, String) {
     let made = place.run(&[&["token"], args].concat());
     let token = stderr(&made).lines().next().expect("a token").to_owned();
     (token, String::from_utf8_lossy(&made.stdout).into_owned())

@@ -20,11 +20,19 @@ pub(super) struct CardContents<'a> {
     pub lake: &'a Lake,
     /// The version of table `runs` that the rows are of, as `AS OF` takes it.
     pub lake_version: u64,
+    /// Names of the version.
+    pub tags: Vec<String>,
     pub plan: &'a Plan,
     pub exported: &'a ExportSummary,
 }
 
 impl CardContents<'_> {
+    /// Returns the lake's version as `AS OF` takes it, and its names.
+    pub fn version_text(&self) -> String {
+        let tags: String = self.tags.iter().map(|tag| format!(", tag `{tag}`")).collect();
+        format!("`runs@{}`{tags}", self.lake_version)
+    }
+
     /// Returns a summary of one sentence.
     pub fn summary(&self) -> String {
         let rows: u64 = self.exported.parts.iter().map(|p| p.rows).sum();
@@ -99,6 +107,10 @@ pub(super) fn card_text(about: &CardContents<'_>) -> String {
             about.exported.left_out.len(),
             listed_names(&about.exported.left_out)
         );
+    }
+    if about.exported.rejected > 0 {
+        let rejected = about.exported.rejected;
+        let _ = writeln!(text, "\n{rejected} measurements are left out, because the last verdict rejects them.");
     }
     if about.exported.waiting > 0 {
         let _ = writeln!(text, "\n{} runs that wait for their references are left out.", about.exported.waiting);
@@ -197,10 +209,10 @@ fn add_files_section(text: &mut String, about: &CardContents<'_>) {
     );
     let _ = writeln!(
         text,
-        "Made by echolake {} of the lake as `runs@{}` has it; the same lake, arguments and version give the same \
+        "Made by echolake {} of the lake as {} has it; the same lake, arguments and version give the same \
          bytes.",
         env!("CARGO_PKG_VERSION"),
-        about.lake_version
+        about.version_text()
     );
 }
 

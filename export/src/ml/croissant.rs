@@ -53,10 +53,10 @@ pub(super) fn croissant_json(about: &CardContents<'_>) -> Result<String> {
         "@type": "sc:Dataset",
         "name": "relief-reflections",
         "description": format!(
-            "{} Origin: {}. Lake: runs@{}, echolake {}.",
+            "{} Origin: {}. Lake: {}, echolake {}.",
             about.summary(),
             about.origins().join(", "),
-            about.lake_version,
+            about.version_text().replace('`', ""),
             env!("CARGO_PKG_VERSION"),
         ),
         "conformsTo": "http://mlcommons.org/croissant/1.1",

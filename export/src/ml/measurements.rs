@@ -11,6 +11,7 @@ use arrow::compute::{cast, take};
 use arrow::datatypes::{DataType, FieldRef, Int32Type};
 use arrow::record_batch::RecordBatch;
 use echolake_lake::{Lake, LakeSnapshot};
+use echolake_schema::annotations::RejectedMeasurements;
 use echolake_schema::symmetry::MovedPair;
 use echolake_schema::tables::Table;
 use echolake_schema::{Grid, PointId, Symmetry};
@@ -46,12 +47,16 @@ pub(super) struct RowBuilder<'a> {
     pub snapshot: &'a LakeSnapshot,
     pub columns: &'a TrainingColumns,
     pub moves: &'a SymmetryMoves,
+    /// Measurements that are left out.
+    pub rejected: &'a RejectedMeasurements,
 }
 
 /// Rows of a run before any symmetry, in the order of their pairs.
 pub(super) struct RunRows {
     pairs: Vec<u32>,
     values: Vec<ArrayRef>,
+    /// Measurements that are left out because they are rejected.
+    pub rejected: u64,
 }
 
 impl RowBuilder<'_> {
@@ -76,7 +81,10 @@ impl RowBuilder<'_> {
             pairs = Some(known);
             tables.insert(table, (batch, places));
         }
-        let pairs = pairs.unwrap_or_default();
+        let mut pairs = pairs.unwrap_or_default();
+        let measured = pairs.len();
+        pairs.retain(|pair| !self.rejected.is_rejected(run.visible.run.as_str(), *pair));
+        let rejected = (measured - pairs.len()) as u64;
         let mut values = Vec::new();
         for (table, field) in self.columns.chosen() {
             let (batch, places) = &tables[table];
@@ -86,7 +94,7 @@ impl RowBuilder<'_> {
                     .map_err(|e| Error::damaged(format!("{}, {}", table.name(), run.visible.run), e))?,
             );
         }
-        Ok(RunRows { pairs, values })
+        Ok(RunRows { pairs, values, rejected })
     }
 
     /// Returns the rows under each symmetry, one batch per symmetry.

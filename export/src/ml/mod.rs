@@ -16,6 +16,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use arrow::datatypes::SchemaRef;
 use echolake_lake::{Lake, LakeSnapshot};
 use echolake_schema::SurfaceId;
+use echolake_schema::annotations::RejectedMeasurements;
 use futures::StreamExt as _;
 
 use crate::error::{Error, Result};
@@ -77,6 +78,8 @@ pub struct ExportSummary {
     pub references: Vec<SurfaceId>,
     /// Runs that are left out because they wait for references.
     pub waiting: usize,
+    /// Measurements that are left out because the last verdict on them is a rejection.
+    pub rejected: u64,
     /// All files with their checksums, by name.
     pub files: Vec<WrittenFile>,
 }
@@ -107,6 +110,7 @@ struct Plan {
     left_out: Vec<SurfaceId>,
     references: Vec<SurfaceId>,
     waiting: usize,
+    rejected: RejectedMeasurements,
 }
 
 /// A file of measurements.
@@ -143,7 +147,9 @@ impl Plan {
             .flat_map(|(part, of)| deal_shards(part, of, set.split.seed))
             .collect();
         let moves = SymmetryMoves::from_grid(lake.grid(), set.symmetries);
-        Ok(Self { set: set.clone(), columns, moves, shards, left_out, references, waiting })
+        let annotations = lake.read_annotations(0, snapshot.contributions().annotations).await?;
+        let rejected = RejectedMeasurements::from_annotations(&annotations);
+        Ok(Self { set: set.clone(), columns, moves, shards, left_out, references, waiting, rejected })
     }
 
     fn of_part(&self, part: SplitPart) -> impl Iterator<Item = &TrainingSurface> {
@@ -197,7 +203,9 @@ pub async fn write_training_set(
     let written = shards_of(&job, progress).await?;
     let ExportJob { plan, folder: pending, snapshot, .. } = &*job;
     let mut sources = Vec::new();
-    for (one, (file, rows)) in plan.shards.iter().zip(written) {
+    let mut rejected = 0;
+    for (one, shard::WrittenShard { file, rows, rejected: of_shard }) in plan.shards.iter().zip(written) {
+        rejected += of_shard;
         if let Some(counts) = parts.iter_mut().find(|p| p.part == one.part) {
             counts.rows += rows.iter().sum::<u64>();
         }
@@ -207,9 +215,10 @@ pub async fn write_training_set(
     files.push(pending.write_file("surfaces.csv", card::sources_csv(&sources)?.as_bytes())?);
     let left_out = plan.left_out.clone();
     let references = plan.references.clone();
-    let mut exported = ExportSummary { parts, left_out, references, waiting: plan.waiting, files };
+    let mut exported = ExportSummary { parts, left_out, references, waiting: plan.waiting, rejected, files };
     let lake_version = snapshot.lake_version().unwrap_or(0);
-    let about = card::CardContents { lake, lake_version, plan, exported: &exported };
+    let tags = tags_of_version(lake, lake_version).await?;
+    let about = card::CardContents { lake, lake_version, tags, plan, exported: &exported };
     let croissant = croissant::croissant_json(&about)?;
     let readme = card::card_text(&about);
     exported.files.push(pending.write_file("croissant.json", croissant.as_bytes())?);
@@ -222,6 +231,14 @@ pub async fn write_training_set(
     Ok(exported)
 }
 
+// Names of the version, as the card and the description have them.
+async fn tags_of_version(lake: &Lake, version: u64) -> Result<Vec<String>> {
+    let versions = lake.list_versions().await?;
+    let tags = lake.list_tags().await?.into_iter();
+    let named = tags.filter(|tag| versions.iter().any(|known| known.version == version && tag.is_of(known)));
+    Ok(named.map(|tag| tag.name.to_string()).collect())
+}
+
 /// State shared by the tasks that write files.
 struct ExportJob {
     lake: Lake,
@@ -230,11 +247,8 @@ struct ExportJob {
     folder: PendingFolder,
 }
 
-// One file per core at a time; returns each written file with the rows of each of its surfaces.
-async fn shards_of(
-    job: &Arc<ExportJob>,
-    progress: &mut dyn FnMut(usize, usize),
-) -> Result<Vec<(WrittenFile, Vec<u64>)>> {
+// One file per core at a time.
+async fn shards_of(job: &Arc<ExportJob>, progress: &mut dyn FnMut(usize, usize)) -> Result<Vec<shard::WrittenShard>> {
     let surfaces = |of: &Shard| of.surfaces.len();
     let mut done = 0;
     let total = job.plan.shards.iter().map(surfaces).sum();

@@ -48,16 +48,27 @@ impl<'a> ShardWriter<'a> {
     }
 }
 
-/// Writes a file of measurements; returns it, and the rows of each surface.
-pub(super) async fn write_shard(job: &ExportJob, shard: &Shard) -> Result<(WrittenFile, Vec<u64>)> {
+/// A file of measurements that is written.
+pub(super) struct WrittenShard {
+    pub file: WrittenFile,
+    /// Rows of each surface.
+    pub rows: Vec<u64>,
+    /// Measurements that are left out because they are rejected.
+    pub rejected: u64,
+}
+
+/// Writes a file of measurements.
+pub(super) async fn write_shard(job: &ExportJob, shard: &Shard) -> Result<WrittenShard> {
     let ExportJob { lake, snapshot, plan, folder } = job;
     let mut writer = ShardWriter::create(folder, &shard.name, plan.schema())?;
-    let maker = RowBuilder { lake, snapshot, columns: &plan.columns, moves: &plan.moves };
+    let maker = RowBuilder { lake, snapshot, columns: &plan.columns, moves: &plan.moves, rejected: &plan.rejected };
     let mut counts = Vec::with_capacity(shard.surfaces.len());
+    let mut rejected = 0;
     for surface in &shard.surfaces {
         let mut rows = 0;
         for run in &surface.runs {
             let of_run = maker.read_rows(run).await?;
+            rejected += of_run.rejected;
             for batch in maker.row_batches(surface, run, shard.part, &of_run)? {
                 rows += batch.num_rows() as u64;
                 writer.write(&batch)?;
@@ -66,7 +77,7 @@ pub(super) async fn write_shard(job: &ExportJob, shard: &Shard) -> Result<(Writt
         writer.end_row_group()?;
         counts.push(rows);
     }
-    Ok((writer.finish()?, counts))
+    Ok(WrittenShard { file: writer.finish()?, rows: counts, rejected })
 }
 
 /// Writes the height maps of a part; returns the file, if there are any, and the number of surfaces that have them.

@@ -22,7 +22,7 @@ pub(super) struct Column {
 }
 
 impl Column {
-    fn new(name: impl Into<String>, data_type: DataType, unit: &'static str, comment: impl Into<String>) -> Self {
+    pub fn new(name: impl Into<String>, data_type: DataType, unit: &'static str, comment: impl Into<String>) -> Self {
         Self { name: name.into(), data_type, nullable: false, unit, comment: comment.into() }
     }
 

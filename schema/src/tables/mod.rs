@@ -4,6 +4,7 @@
 //! the child `element`; times are microseconds beside a `BIGINT` of nanoseconds, which Delta cannot hold.
 
 mod column;
+mod contributions;
 mod definitions;
 mod rows;
 
@@ -12,6 +13,7 @@ use std::sync::Arc;
 use arrow_schema::{Schema, SchemaRef};
 
 pub use column::{COMMENT, LIST_CHILD, UNIT};
+pub use contributions::{annotation_schema, predicted_columns, prediction_schema};
 pub use rows::BandStatistics;
 
 use self::column::Column;

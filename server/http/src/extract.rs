@@ -154,7 +154,7 @@ impl PartialSchema for NumberRange {
 impl ToSchema for NumberRange {}
 
 /// Bytes, for the contract.
-pub(super) enum BinaryContent {}
+pub enum BinaryContent {}
 
 impl PartialSchema for BinaryContent {
     fn schema() -> RefOr<Schema> {

@@ -3,6 +3,7 @@
 
 mod catalogue;
 mod conditions;
+mod contributions;
 mod extract;
 mod files;
 mod format;
@@ -35,6 +36,8 @@ use utoipa::openapi::OpenApi;
 pub use catalogue::LASTING_VERSION;
 use catalogue::LakeCatalogue;
 pub use conditions::ConditionOutcome;
+pub use contributions::{AddedContribution, AnnotationsRequest, PredictionParams};
+pub use extract::BinaryContent;
 pub use format::{accepts_encoding, prefers_arrow};
 pub use guard::{FORWARDED_PROTO, RequestSite, is_encrypted, is_same_origin, own_pages_only, request_site};
 pub use mcp::MCP;
@@ -80,6 +83,7 @@ fn engine_router(service: &QueryService) -> Router {
     let own = Router::from(sql::sql_routes())
         .with_state(service.clone())
         .merge(catalogue.endpoint_router())
+        .merge(contributions::draft_routes(&catalogue))
         .merge(Router::from(files).with_state(catalogue.clone()))
         .merge(with_protocol(ServerProtocol::Mcp, mcp::agent_routes(&catalogue, &slices)))
         .layer(from_fn_with_state(service.is_open(), guard::own_pages_only));

@@ -116,6 +116,8 @@ fn status_and_title(code: FaultCode) -> (StatusCode, &'static str) {
         FaultCode::Unsupported => (StatusCode::NOT_IMPLEMENTED, "Not supported"),
         FaultCode::NotFound => (StatusCode::NOT_FOUND, "Not there"),
         FaultCode::Gone => (StatusCode::GONE, "No longer there"),
+        FaultCode::Taken => (StatusCode::CONFLICT, "The name is taken"),
+        FaultCode::Unwritable => (StatusCode::SERVICE_UNAVAILABLE, "The lake cannot be written"),
         FaultCode::Changed => (StatusCode::CONFLICT, "A run's file has changed"),
         FaultCode::NoData => (StatusCode::NOT_FOUND, "There are no such data"),
         FaultCode::Method => (StatusCode::METHOD_NOT_ALLOWED, "Not for this method"),

@@ -10,7 +10,7 @@ use arrow::datatypes::{DataType, Field, IntervalUnit, Schema, SchemaRef, TimeUni
 use arrow_pg::datatypes::{PG_CHAR_KEY, PG_OID_ALIAS_KEY, field_into_pg_type};
 use datafusion::error::Result;
 use echolake_query::{SYSTEM_SCHEMA, table_meaning};
-use echolake_schema::tables::{COMMENT, Table, UNIT};
+use echolake_schema::tables::{COMMENT, UNIT};
 use echolake_service::{CATALOG, QueryService, SCHEMA};
 use pgwire::api::Type;
 
@@ -216,7 +216,7 @@ impl CatalogRelations {
         for (number, (name, schema)) in (FIRST_TABLE..).zip(service.lake_tables()) {
             let table = CatalogRelation::new(number, SCHEMA, name.to_owned(), schema);
             relations.push(CatalogRelation {
-                is_view: Table::by_name(name).is_none(),
+                is_view: views.contains_key(name),
                 definition: views.remove(name),
                 ..table
             });

@@ -51,7 +51,7 @@ pub struct ClientIdentity {
 impl ClientIdentity {
     /// A client of a server without tokens.
     pub fn local_client(name: impl Into<String>) -> Self {
-        let scopes = vec![TokenScope::Sql, TokenScope::Files, TokenScope::Metrics];
+        let scopes = TokenScope::NAMED.into_iter().map(|(_, scope)| scope).collect();
         Self {
             name: name.into(),
             is_open: true,

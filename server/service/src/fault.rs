@@ -74,6 +74,17 @@ pub enum RequestFault {
         /// A remedy for the client.
         hint: &'static str,
     },
+    /// The name is another item's.
+    #[error("{what} is there already; hint: {hint}")]
+    Taken {
+        /// The item.
+        what: String,
+        /// A remedy for the client.
+        hint: &'static str,
+    },
+    /// The lake's store does not take a contribution. The cause is in the server's log.
+    #[error("the lake's store does not take it; hint: the server's log has the cause, and sending it again is safe")]
+    Unwritable,
     /// The lake's store does not give a file. The cause is in the server's log.
     #[error("the lake's store does not give the file; hint: ask again")]
     Unreadable,
@@ -201,6 +212,10 @@ pub enum FaultCode {
     Gone,
     /// A file changed while it was read.
     Changed,
+    /// The name is taken.
+    Taken,
+    /// The lake cannot be written.
+    Unwritable,
     /// It has no such data.
     NoData,
     /// The path is not for this method.
@@ -239,7 +254,7 @@ pub enum FaultCode {
 
 impl FaultCode {
     /// All of them.
-    pub const ALL: [Self; 27] = [
+    pub const ALL: [Self; 29] = [
         Self::Query,
         Self::ReadOnly,
         Self::Execution,
@@ -250,6 +265,8 @@ impl FaultCode {
         Self::NotFound,
         Self::Gone,
         Self::Changed,
+        Self::Taken,
+        Self::Unwritable,
         Self::NoData,
         Self::Method,
         Self::Precondition,
@@ -282,6 +299,8 @@ impl FaultCode {
             Self::NotFound => "not_found",
             Self::Gone => "gone",
             Self::Changed => "file_changed",
+            Self::Taken => "taken",
+            Self::Unwritable => "lake_unwritable",
             Self::NoData => "no_data",
             Self::Method => "method_not_allowed",
             Self::Precondition => "precondition_failed",
@@ -384,6 +403,8 @@ impl RequestFault {
             Self::NoRoom { .. } => FaultCode::MemoryLimit,
             Self::NoData { .. } => FaultCode::NoData,
             Self::Unreadable => FaultCode::Lake,
+            Self::Taken { .. } => FaultCode::Taken,
+            Self::Unwritable => FaultCode::Unwritable,
             Self::Method => FaultCode::Method,
             Self::Precondition { .. } => FaultCode::Precondition,
             Self::Range { .. } => FaultCode::Range,

@@ -4,6 +4,7 @@
 mod activity;
 pub mod authorization;
 mod client_identity;
+mod contribution_draft;
 mod door_message;
 mod door_rows;
 mod engine_report;
@@ -24,6 +25,7 @@ pub use activity::{
     ActivityRows, ActivityTable, FolderFigures, LakeFigures, LoggedQuery, OpenConnection, QueryEnd, QueryStart,
 };
 pub use client_identity::{ClientIdentity, counted_bytes};
+pub use contribution_draft::{ContributionDraft, contribution_path};
 pub use door_message::DoorMessage;
 pub use engine_report::EngineReport;
 pub use engine_socket::EngineSocket;

@@ -183,6 +183,11 @@ impl QueryService {
         }
     }
 
+    /// The client's name.
+    pub fn client_name(&self) -> &str {
+        &self.0.identity.name
+    }
+
     /// Begins a session: one per connection, or one per request if the protocol has no connections.
     pub fn begin_session(&self, client: &Arc<EngineClient>) -> Session {
         self.0.engine.open_session(client)

@@ -15,12 +15,14 @@ pub enum TokenScope {
     Files,
     /// The server's own figures.
     Metrics,
+    /// Adding annotations and predictions.
+    Annotate,
 }
 
 impl TokenScope {
     /// The scopes, by their names in the file of tokens.
-    pub const NAMED: [(&'static str, Self); 3] =
-        [("sql", Self::Sql), ("files", Self::Files), ("metrics", Self::Metrics)];
+    pub const NAMED: [(&'static str, Self); 4] =
+        [("sql", Self::Sql), ("files", Self::Files), ("metrics", Self::Metrics), ("annotate", Self::Annotate)];
 }
 
 impl FromStr for TokenScope {
@@ -28,7 +30,7 @@ impl FromStr for TokenScope {
 
     fn from_str(name: &str) -> Result<Self, String> {
         let found = Self::NAMED.into_iter().find(|(known, _)| *known == name);
-        found.map(|(_, scope)| scope).ok_or_else(|| format!("no scope `{name}`; hint: sql, files or metrics"))
+        found.map(|(_, scope)| scope).ok_or_else(|| format!("no scope `{name}`; hint: sql, files, metrics or annotate"))
     }
 }
 
@@ -38,6 +40,7 @@ impl fmt::Display for TokenScope {
             Self::Sql => "SQL",
             Self::Files => "files",
             Self::Metrics => "metrics",
+            Self::Annotate => "annotations",
         })
     }
 }

@@ -27,6 +27,7 @@ const LOOK_EVERY: Duration = Duration::from_secs(1);
 pub(crate) struct ServerDoor(Arc<DoorState>);
 
 struct DoorState {
+    lake: Lake,
     access: Arc<TokenAccess>,
     activity: Arc<ServerActivity>,
     engines: EnginePool,
@@ -55,7 +56,23 @@ impl ServerDoor {
         let layout = ViewerLayout::new(lake.rig());
         let readiness = ReadinessCheck::new(lake);
         let drain = ServerDrain::default();
-        Ok(Self(Arc::new(DoorState { access, activity, engines, answers, readiness, drain, layout, failed_logins })))
+        let lake = lake.clone();
+        Ok(Self(Arc::new(DoorState {
+            lake,
+            access,
+            activity,
+            engines,
+            answers,
+            readiness,
+            drain,
+            layout,
+            failed_logins,
+        })))
+    }
+
+    /// The lake, all of it.
+    pub fn lake(&self) -> &Lake {
+        &self.0.lake
     }
 
     /// Failed logins of the last minute.

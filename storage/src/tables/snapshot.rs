@@ -13,7 +13,7 @@ use object_store::path::Path;
 use crate::tables::file_name::{FileName, VisibleRun};
 use crate::tables::run_parts::{RunPointer, list_pointers, run_of_file};
 use crate::tables::table_fault::{LackingRows, TableFault};
-use crate::{CommitLog, DataFile, Error, Result, RunRowCounts, TableView};
+use crate::{CommitLog, ContributionCounts, DataFile, Error, Result, RunRowCounts, TableView};
 
 /// A frozen view of all tables.
 #[derive(Debug, Clone, Default)]
@@ -27,6 +27,7 @@ pub struct LakeSnapshot {
     lacking: HashMap<Table, Vec<LackingRows>>,
     faults: HashMap<Table, TableFault>,
     versions: HashMap<Table, u64>,
+    contributions: ContributionCounts,
     is_restricted: bool,
 }
 
@@ -101,6 +102,7 @@ impl LakeSnapshot {
         }
         let mut snapshot = Self::from_pointers(pointers.as_ref().map_or(&[], |view| view.files.as_slice()));
         let is_rebuilding = pointers.as_ref().is_some_and(|view| view.is_rebuilding);
+        snapshot.contributions = pointers.as_ref().map(|view| view.contributions).unwrap_or_default();
         for (table, view) in views.into_iter().chain([(Table::Runs, Ok(pointers))]) {
             match view {
                 Ok(view) => {
@@ -201,6 +203,11 @@ impl LakeSnapshot {
     /// table, and for views of the past.
     pub fn log_version(&self, table: Table) -> Option<u64> {
         self.versions.get(&table).copied()
+    }
+
+    /// The contributions that readers see.
+    pub fn contributions(&self) -> ContributionCounts {
+        self.contributions
     }
 
     /// The files of a table that readers see.

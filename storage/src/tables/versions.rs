@@ -13,7 +13,7 @@ use echolake_schema::tables::{Source, Table};
 use object_store::path::Path;
 
 use crate::tables::file_name::table_folder;
-use crate::{DataFile, Error, Lake, LakeSnapshot, Result, TableVersion, TagName};
+use crate::{ContributionCounts, DataFile, Error, Lake, LakeSnapshot, Result, TableVersion, TagName};
 
 /// Formats of times beside RFC 3339.
 const TIMES: [&str; 4] = ["%Y-%m-%dT%H:%M:%S%.f", "%Y-%m-%d %H:%M:%S%.f", "%Y-%m-%dT%H:%M", "%Y-%m-%d %H:%M"];
@@ -143,6 +143,14 @@ impl Lake {
         let moment = LakeMoment::Version(version).to_string();
         let files = wanted.files(table).len();
         Err(Error::Vacuumed { moment, table: table.name(), missing, files })
+    }
+
+    /// The contributions that readers saw at a version of the lake.
+    ///
+    /// # Errors
+    /// What the store says.
+    pub async fn contributions_at(&self, version: u64) -> Result<ContributionCounts> {
+        self.commit_log().contributions_at(version).await
     }
 
     async fn list_files(&self, table: Table) -> Result<HashSet<Path>> {

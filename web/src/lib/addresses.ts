@@ -46,6 +46,10 @@ export const curvesHref = (id: string, microphone: number | null = null) =>
 export const measuredPairsHref = (id: string) => apiHref(`${surfacePath(id)}/pairs`)
 export const pairPath = (id: string, pair: number | string) => `${surfacePath(id)}/pairs/${pair}`
 export const pairDetailHref = (id: string, pair: number | string) => apiHref(pairPath(id, pair))
+export const pairPredictionsHref = (id: string, pair: number | string) => apiHref(`${pairPath(id, pair)}/predictions`)
+export const surfacePredictionsHref = (id: string) => apiHref(`${surfacePath(id)}/predictions`)
+/** Annotations on a run, or on one of its measurements. */
+export const annotationsHref = (run: string, pair?: number) => apiHref(`/runs/${encodeURIComponent(run)}/annotations`, { pair })
 /** Fractions of an octave that levels and group delays are smoothed over. */
 export const SMOOTHINGS = ['12', '6', '3', '1'] as const
 /** What phase and group delay are less. */

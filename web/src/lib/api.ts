@@ -94,6 +94,9 @@ function remember<T>(href: string, make: () => Promise<T>): Promise<T> {
   return answer
 }
 
+/** Forgets all answers: the lake has changed by what this page sent. */
+export const forgetAnswers = (): void => kept.clear()
+
 /** A JSON answer. */
 export const get = <T>(href: string): Promise<T> => remember(href, async () => (await ask(href)).json() as Promise<T>)
 
@@ -122,6 +125,14 @@ export const figures = async (): Promise<string> => (await ask('/metrics')).text
 
 /** Ends a query that runs, by its number in `system.queries`. */
 export const cancelQuery = (id: number): Promise<Response> => ask(`/api/v1/queries/${id}/cancel`, { method: 'POST' })
+
+/** Stores an annotation; it is seen by the next request. */
+export const annotate = (annotation: Schemas['NewAnnotation']): Promise<Response> =>
+  ask('/api/v1/annotations', {
+    method: 'POST',
+    headers: { 'content-type': 'application/json' },
+    body: JSON.stringify({ annotations: [annotation] }),
+  })
 
 /** Shows the server a token; it answers with a cookie, which pictures and downloads send too. */
 export const login = (token: string): Promise<Response> =>

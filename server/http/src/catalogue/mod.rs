@@ -5,6 +5,7 @@
 
 mod analysis;
 mod content;
+mod contributed;
 mod correlations;
 mod curves;
 mod diffusion;
@@ -66,6 +67,9 @@ pub(super) fn light_routes() -> OpenApiRouter {
         .routes(routes!(wav::wav))
         .routes(routes!(runs::runs))
         .routes(routes!(runs::run))
+        .routes(routes!(contributed::run_annotations))
+        .routes(routes!(contributed::pair_predictions))
+        .routes(routes!(contributed::surface_predictions))
         .routes(routes!(environment::environment))
         .routes(routes!(tables::tables))
         .routes(routes!(tables::table_files))

@@ -3,6 +3,7 @@
 
 pub(crate) mod answer_cache;
 mod authentication;
+mod contributions;
 mod health;
 mod openapi;
 #[cfg(feature = "web")]

@@ -9,7 +9,7 @@ use utoipa_axum::routes;
 
 #[cfg(feature = "web")]
 use super::pages;
-use super::{health, openapi, queries, session};
+use super::{contributions, health, openapi, queries, session};
 use crate::door::server_door::ServerDoor;
 
 /// The paths of the server: those of the door, and those that it forwards to the client's engine.
@@ -37,6 +37,8 @@ pub(super) fn door_routes() -> OpenApiRouter<ServerDoor> {
     OpenApiRouter::new()
         .routes(routes!(session::post_session))
         .routes(routes!(queries::post_cancellation))
+        .routes(routes!(contributions::post_annotations))
+        .routes(routes!(contributions::post_predictions))
         .routes(routes!(openapi::get_openapi))
         .routes(routes!(health::metrics))
         .routes(routes!(health::health))

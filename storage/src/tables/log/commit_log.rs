@@ -11,7 +11,7 @@ use object_store::path::Path;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
-use crate::Result;
+use crate::{ContributionCounts, ContributionLog, Result};
 
 /// A Parquet file of a table.
 #[derive(Debug, Clone, PartialEq)]
@@ -127,6 +127,8 @@ pub struct TableView {
     pub version: u64,
     /// Its files, by path.
     pub files: Vec<DataFile>,
+    /// Of `runs`: the contributions that the version shows.
+    pub contributions: ContributionCounts,
     /// Of `runs`: rows may be missing, because it is being made again or another program has changed it.
     pub is_rebuilding: bool,
 }
@@ -288,12 +290,16 @@ pub trait CommitLog: Send + Sync + std::fmt::Debug {
     async fn list_changes(&self, table: Table) -> Result<Vec<TableChange>>;
     /// The table's files as of a version that the log still holds.
     async fn files_at(&self, table: Table, version: u64) -> Result<Vec<DataFile>>;
+    /// The contributions that a version of `runs` shows.
+    async fn contributions_at(&self, version: u64) -> Result<ContributionCounts>;
     /// The files of all versions that the log still holds; none if there is no table.
     async fn files_of_all_versions(&self, table: Table) -> Result<Vec<DataFile>>;
     /// Returns whether a file of this name is in the log.
     async fn has_file(&self, table: Table, name: &str) -> Result<bool>;
     /// Names of the current and the removed files; None if there is no log.
     async fn file_history(&self, table: Table) -> Result<Option<FileHistory>>;
+    /// Shows the contributions of a log up to a number, by a version of `runs`; returns the version.
+    async fn commit_contributions(&self, log: ContributionLog, number: u64) -> Result<u64>;
     /// Makes a change; returns the outcome of each new file, in order. Repeating the same change adds nothing.
     async fn commit_change(&self, table: Table, commit: &TableCommit) -> Result<Vec<CommitOutcome>>;
 }

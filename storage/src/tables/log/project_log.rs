@@ -14,8 +14,8 @@ use echolake_schema::{ProjectName, RunId, SurfaceId};
 use super::delta::DeltaLog;
 use crate::tables::run_parts::list_pointers;
 use crate::{
-    CommitLog, CommitOutcome, DataFile, Error, FileHistory, LakeSnapshot, Result, TableChange, TableCommit,
-    TableVersion, TableView,
+    CommitLog, CommitOutcome, ContributionCounts, ContributionLog, DataFile, Error, FileHistory, LakeSnapshot, Result,
+    TableChange, TableCommit, TableVersion, TableView,
 };
 
 /// A log without the runs of other projects.
@@ -117,6 +117,11 @@ impl CommitLog for ProjectLog {
         Ok(files)
     }
 
+    // Readers keep those on the runs that they see.
+    async fn contributions_at(&self, version: u64) -> Result<ContributionCounts> {
+        self.log.contributions_at(version).await
+    }
+
     async fn files_of_all_versions(&self, table: Table) -> Result<Vec<DataFile>> {
         let mut files = self.log.files_of_all_versions(table).await?;
         self.keep_visible(table, &mut files);
@@ -129,6 +134,10 @@ impl CommitLog for ProjectLog {
 
     async fn file_history(&self, table: Table) -> Result<Option<FileHistory>> {
         Self::refuse_action(table, "searched for names")
+    }
+
+    async fn commit_contributions(&self, _: ContributionLog, _: u64) -> Result<u64> {
+        Self::refuse_action(Table::Runs, "written")
     }
 
     async fn commit_change(&self, table: Table, _: &TableCommit) -> Result<Vec<CommitOutcome>> {

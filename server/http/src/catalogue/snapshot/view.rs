@@ -107,6 +107,9 @@ fn snapshot_version(snapshot: &LakeSnapshot) -> String {
             digest.update(file.visible_rows().to_le_bytes());
         }
     }
+    let contributions = snapshot.contributions();
+    digest.update(contributions.annotations.to_le_bytes());
+    digest.update(contributions.predictions.to_le_bytes());
     hex::encode(&digest.finalize()[..VERSION_BYTES])
 }
 

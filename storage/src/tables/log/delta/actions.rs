@@ -24,7 +24,7 @@ pub(super) struct LogLine {
     /// Schema and settings.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub meta_data: Option<TableMetadata>,
-    /// Another application's transaction; echolake writes none, and keeps those of others in checkpoints.
+    /// An application's progress: the number of a log of contributions, or that of another program.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub txn: Option<ApplicationTransaction>,
     /// A file that comes.

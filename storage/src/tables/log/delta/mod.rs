@@ -24,7 +24,7 @@ use serde_json::{Map, Value, json};
 use tokio::sync::Mutex;
 use uuid::Uuid;
 
-use self::actions::{AddFile, FileFormat, LogLine, TableMetadata};
+use self::actions::{AddFile, ApplicationTransaction, FileFormat, LogLine, TableMetadata};
 use self::log_folder::{CommitAttempt, LogFolder, own_protocol, rebuild_hint};
 use self::table_state::{ENGINE, TableState, mark_rebuild};
 use crate::location::LakeLocation;
@@ -32,8 +32,9 @@ use crate::remote::backoff_time;
 use crate::tables::file_name::{is_merged, table_folder};
 use crate::tables::run_parts::{decode_parts, encode_parts};
 use crate::{
-    CommitEffect, CommitLog, CommitOutcome, DataFile, Error, FileHistory, FileStats, LoggedFile, NewFile,
-    RemovalRecord, ReplacedFiles, Result, RunPart, RunRowCounts, TableChange, TableCommit, TableVersion, TableView,
+    CommitEffect, CommitLog, CommitOutcome, ContributionCounts, ContributionLog, DataFile, Error, FileHistory,
+    FileStats, LoggedFile, NewFile, RemovalRecord, ReplacedFiles, Result, RunPart, RunRowCounts, TableChange,
+    TableCommit, TableVersion, TableView,
 };
 
 /// Tries of one commit against other writers; each loses to a commit that went through.
@@ -192,10 +193,19 @@ impl DeltaLog {
         state: &Arc<TableState>,
         change: &PendingChange<'_>,
     ) -> Result<CommitAttempt> {
+        let now = Utc::now();
+        self.write_version(table, state, change.log_lines(state, now.timestamp_millis()), now).await
+    }
+
+    async fn write_version(
+        &self,
+        table: Table,
+        state: &Arc<TableState>,
+        lines: Vec<LogLine>,
+        now: DateTime<Utc>,
+    ) -> Result<CommitAttempt> {
         let log = self.log_folder(table);
         log.check_writable(state)?;
-        let now = Utc::now();
-        let lines = change.log_lines(state, now.timestamp_millis());
         let attempt = log.write_commit(state.version + 1, &lines).await?;
         if attempt == CommitAttempt::Written {
             let mut state = TableState::clone(state);
@@ -333,11 +343,17 @@ impl CommitLog for DeltaLog {
         };
         // The log is lost, unless this is the lake's first ingest: until its end, the table lacks runs.
         mark_rebuild(&mut metadata, table == Table::Runs && has_run_files(self.store.as_ref()).await?);
-        let lines = [
+        let mut lines = vec![
             commit_info("CREATE TABLE", json!({ "mode": "ErrorIfExists" }), now_millis),
             LogLine { protocol: Some(own_protocol()), ..LogLine::default() },
             LogLine { meta_data: Some(metadata), ..LogLine::default() },
         ];
+        if table == Table::Runs {
+            for log in ContributionLog::ALL {
+                let last = log.list_files(self.store.as_ref()).await?.last().map(|file| file.number);
+                lines.extend(last.map(|number| contribution_line(log, number, now_millis)));
+            }
+        }
         // If the number is taken, another process made the table at the same moment.
         self.log_folder(table).write_commit(0, &lines).await.map(drop)
     }
@@ -345,7 +361,8 @@ impl CommitLog for DeltaLog {
     async fn view_table(&self, table: Table) -> Result<Option<TableView>> {
         let Some(state) = self.load_table(table).await? else { return Ok(None) };
         let is_rebuilding = table == Table::Runs && state.is_rebuilding();
-        Ok(Some(TableView { version: state.version, files: data_files(table, &state)?, is_rebuilding }))
+        let files = data_files(table, &state)?;
+        Ok(Some(TableView { version: state.version, files, contributions: state.contributions(), is_rebuilding }))
     }
 
     async fn known_version(&self, table: Table) -> Option<u64> {
@@ -375,6 +392,11 @@ impl CommitLog for DeltaLog {
         }
     }
 
+    async fn contributions_at(&self, version: u64) -> Result<ContributionCounts> {
+        let state = self.log_folder(Table::Runs).load_state(Some(version)).await?;
+        Ok(state.map(|state| state.contributions()).unwrap_or_default())
+    }
+
     async fn files_of_all_versions(&self, table: Table) -> Result<Vec<DataFile>> {
         match self.log_folder(table).load_all_versions().await? {
             Some(state) => data_files(table, &state),
@@ -400,6 +422,28 @@ impl CommitLog for DeltaLog {
         Ok(Some(FileHistory { current, removed: removed.collect() }))
     }
 
+    async fn commit_contributions(&self, log: ContributionLog, number: u64) -> Result<u64> {
+        let table = Table::Runs;
+        for losses in 1..=COMMIT_TRIES {
+            let state = self.require_table(table).await?;
+            if state.contributions().of_log(log) >= number {
+                return Ok(state.version);
+            }
+            let now = Utc::now();
+            let operation = match log {
+                ContributionLog::Annotations => "ANNOTATE",
+                ContributionLog::Predictions => "PREDICT",
+            };
+            let info = commit_info(operation, json!({ "number": number.to_string() }), now.timestamp_millis());
+            let lines = vec![info, contribution_line(log, number, now.timestamp_millis())];
+            if self.write_version(table, &state, lines, now).await? == CommitAttempt::Written {
+                return Ok(state.version + 1);
+            }
+            self.wait_after_loss(losses).await;
+        }
+        Err(lost_to_others(table))
+    }
+
     async fn commit_change(&self, table: Table, commit: &TableCommit) -> Result<Vec<CommitOutcome>> {
         let mut known = self.known_state(table).await;
         for losses in 1..=COMMIT_TRIES {
@@ -422,6 +466,13 @@ impl CommitLog for DeltaLog {
         }
         Err(lost_to_others(table))
     }
+}
+
+fn contribution_line(log: ContributionLog, number: u64, now_millis: i64) -> LogLine {
+    let app_id = log.application();
+    let version = i64::try_from(number).unwrap_or(i64::MAX);
+    let txn = ApplicationTransaction { app_id, version, last_updated: Some(now_millis) };
+    LogLine { txn: Some(txn), ..LogLine::default() }
 }
 
 fn lost_to_others(table: Table) -> Error {

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use serde_json::Value;
 
 use super::actions::{AddFile, ApplicationTransaction, LogLine, ProtocolVersions, RemoveFile, TableMetadata};
+use crate::{ContributionCounts, ContributionLog};
 
 /// Time for which a checkpoint keeps a removed file's tombstone: Delta's default, a week.
 const TOMBSTONE_MILLIS: i64 = 7 * 24 * 3600 * 1000;
@@ -62,6 +63,18 @@ impl TableState {
     pub fn is_own_checkpoint(&self, version: u64) -> bool {
         let checked = self.metadata.as_ref().and_then(|metadata| metadata.configuration.get(CHECKED)?.as_ref());
         checked.is_some_and(|checked| *checked == version.to_string())
+    }
+
+    /// The contributions that readers see.
+    pub fn contributions(&self) -> ContributionCounts {
+        let number = |log: ContributionLog| {
+            let known = self.transactions.get(&log.application());
+            known.and_then(|transaction| u64::try_from(transaction.version).ok()).unwrap_or(0)
+        };
+        ContributionCounts {
+            annotations: number(ContributionLog::Annotations),
+            predictions: number(ContributionLog::Predictions),
+        }
     }
 
     /// Returns whether rows may be missing: the table is being made again, or another program has changed its files.

@@ -1,0 +1,151 @@
+//! What users add to a lake: annotations, which views honour and `AS OF` sees as they were, and predictions.
+
+use std::sync::Arc;
+
+use arrow::array::{Float64Array, Int32Array, RecordBatch, StringArray};
+use arrow::datatypes::{DataType, Field, Schema};
+use arrow::ipc::writer::StreamWriter;
+use serde_json::json;
+
+use super::http::{HttpRequest, HttpResponse};
+use super::projects::new_token;
+use super::server::ServedLake;
+use super::{get, json, lake, refused, served};
+
+fn annotate(server: &ServedLake, annotation: &serde_json::Value) -> HttpResponse {
+    let body = json!({ "annotations": [annotation] }).to_string();
+    HttpRequest::post("/api/v1/annotations", &body).with("content-type", "application/json").send(server)
+}
+
+fn predict(server: &ServedLake, version: &str, surface: &str, columns: &[(&str, Vec<f64>)]) -> HttpResponse {
+    let rows = columns[0].1.len();
+    let values = columns.iter().map(|(name, _)| Field::new(*name, DataType::Float64, true));
+    let keys = [Field::new("surface_id", DataType::Utf8, false), Field::new("pair_id", DataType::Int32, false)];
+    let schema = Arc::new(Schema::new(keys.into_iter().chain(values).collect::<Vec<_>>()));
+    let mut arrays: Vec<Arc<dyn arrow::array::Array>> =
+        vec![Arc::new(StringArray::from(vec![surface; rows])), Arc::new(Int32Array::from_iter_values(0..rows as i32))];
+    arrays.extend(columns.iter().map(|(_, values)| Arc::new(Float64Array::from(values.clone())) as _));
+    let batch = RecordBatch::try_new(schema.clone(), arrays).expect("rows");
+    let mut body = Vec::new();
+    let mut writer = StreamWriter::try_new(&mut body, &schema).expect("a stream");
+    writer.write(&batch).expect("written");
+    writer.finish().expect("ended");
+    HttpRequest::post_bytes(&format!("/api/v1/predictions?model=cnn&version={version}"), body)
+        .with("content-type", "application/vnd.apache.arrow.stream")
+        .send(server)
+}
+
+#[test]
+fn views_leave_out_what_the_last_verdict_rejects_and_as_of_sees_it_as_it_was() {
+    let place = lake();
+    let run = place.sql("select run_id from runs")[0]["run_id"].as_str().expect("a name").to_owned();
+    let pairs = place.number("select count(*) from measurements");
+    let server = served(&place, &[]);
+    let count = |of: &str| place.number(&format!("select count(*) from {of}"));
+    assert_eq!((count("annotations"), count("tnce_db"), count("ir")), (0.0, pairs, pairs));
+    let bad = json!({
+        "annotation_id": "bad-1", "run_id": run, "pair_ids": [1, 0, 1], "kind": "verdict", "value": "rejected",
+        "comment": "the microphone was knocked",
+    });
+    let stored = json(&annotate(&server, &bad));
+    let version = stored["lake_version"].as_u64().expect("a version");
+    assert_eq!((stored["is_new"].as_bool(), &stored["annotation_ids"]), (Some(true), &json!(["bad-1"])));
+    assert_eq!(json(&annotate(&server, &bad))["is_new"].as_bool(), Some(false), "sent again");
+    let path = format!("/api/v1/runs/{run}/annotations");
+    let shown = json(&get(&server, &path));
+    assert_eq!((shown["rejected"].as_i64(), shown["total"].as_i64()), (Some(2), Some(1)), "{shown}");
+    assert_eq!(json(&get(&server, &format!("{path}?pair=2")))["total"].as_i64(), Some(0));
+    assert_eq!((count("tnce_db"), count("ir"), count("augmented")), (pairs - 2.0, pairs - 2.0, 8.0 * (pairs - 2.0)));
+    assert_eq!((count("measurements"), count("tnce")), (pairs, pairs), "tables keep all");
+    assert_eq!(count("measurements where not is_rejected(run_id, pair_id)"), pairs - 2.0);
+    // The region of a microphone, accepted again: the last verdict counts.
+    let good = json!({ "run_id": run, "microphones": [0], "kind": "verdict", "value": "accepted" });
+    let accepted = json(&annotate(&server, &good))["lake_version"].as_u64().expect("a version");
+    assert_eq!((accepted, count("tnce_db")), (version + 1, pairs));
+    let whole = json!({ "run_id": run, "kind": "verdict", "value": "rejected", "comment": "the wrong panel" });
+    assert_eq!(annotate(&server, &whole).status, 200);
+    assert_eq!((count("tnce_db"), count("levels"), count("annotations")), (0.0, 0.0, 3.0));
+    let as_of = |version: u64| count(&format!("tnce_db version as of {version}"));
+    assert_eq!([version - 1, version, accepted].map(as_of), [pairs, pairs - 2.0, pairs]);
+    assert_eq!(count(&format!("annotations version as of {version}")), 1.0);
+    // What another annotation of this name says, and what is none, is refused; nothing of a request is stored then.
+    let changed = json!({ "annotation_id": "bad-1", "run_id": run, "kind": "note", "comment": "other" });
+    refused(&annotate(&server, &changed), 409, "taken");
+    for wrong in [
+        json!({ "run_id": "none", "kind": "note", "comment": "x" }),
+        json!({ "run_id": run, "kind": "verdict", "value": "bad" }),
+        json!({ "run_id": run, "pair_ids": [999_999], "kind": "note", "comment": "x" }),
+        json!({ "run_id": run, "pair_ids": [1], "microphones": [0], "kind": "note", "comment": "x" }),
+        json!({ "run_id": run, "kind": "label", "value": "x", "colour": "red" }),
+    ] {
+        refused(&annotate(&server, &wrong), 400, "request_invalid");
+    }
+    assert_eq!(count("annotations"), 3.0);
+    drop(server);
+    // The tables can be deleted and made again; annotations stay.
+    std::fs::remove_dir_all(place.path("lake/tables")).expect("removed");
+    place.ok(&["ingest"]);
+    assert_eq!((count("annotations"), count("tnce_db"), count("tnce")), (3.0, 0.0, pairs));
+}
+
+#[test]
+fn predictions_of_a_model_stand_beside_the_measurements() {
+    let place = lake();
+    let server = served(&place, &[]);
+    let measured: Vec<f64> = place
+        .sql("select tnce_10000 as e from tnce where pair_id < 2 order by pair_id")
+        .iter()
+        .map(|row| row["e"].as_f64().expect("a number"))
+        .collect();
+    // 3 dB too much, and 1 dB too little.
+    let values = vec![measured[0] * 10f64.powf(0.3), measured[1] * 10f64.powf(-0.1)];
+    let predicted = [("tnce_10000", values)];
+    let stored = json(&predict(&server, "1", "flat", &predicted));
+    assert_eq!(stored["is_new"].as_bool(), Some(true), "{stored}");
+    assert_eq!(json(&predict(&server, "1", "flat", &predicted))["is_new"].as_bool(), Some(false), "sent again");
+    let errors = json(&get(&server, "/api/v1/surfaces/flat/predictions"));
+    let rms = errors[0]["rms_db"][2].as_f64().expect("an error");
+    assert!((rms - 5f64.sqrt()).abs() < 1e-6 && errors[0]["pairs"] == 2, "{errors}");
+    let pair = json(&get(&server, "/api/v1/surfaces/flat/pairs/1/predictions"));
+    let level = pair[0]["tnce_db"][2].as_f64().expect("a level");
+    assert!((level - (10.0 * measured[1].log10() - 1.0)).abs() < 1e-6, "{pair}");
+    let rows = place.sql("select model, model_version, tnce_2500, author from predictions where pair_id = 0");
+    assert_eq!(rows.len(), 1, "{rows:?}");
+    assert_eq!((rows[0]["model"].as_str(), rows[0]["model_version"].as_str()), (Some("cnn"), Some("1")));
+    assert!(rows[0]["tnce_2500"].is_null() && rows[0]["author"] == "programs");
+    refused(&predict(&server, "1", "flat", &[("tnce_10000", vec![0.5])]), 409, "taken");
+    for (surface, columns) in [
+        ("none", ("tnce_10000", vec![0.5])),
+        ("flat", ("tnce_db", vec![0.5])),
+        ("flat", ("tnce_10000", vec![-3.0])),
+        ("flat", ("tnce_10000", vec![f64::NAN])),
+        ("flat", ("tnce_10000", vec![0.5; 5_000])),
+    ] {
+        refused(&predict(&server, "2", surface, &[columns]), 400, "request_invalid");
+    }
+    let text = HttpRequest::post("/api/v1/predictions?model=cnn&version=2", "no stream").send(&server);
+    refused(&text, 400, "request_invalid");
+    assert_eq!(place.number("select count(*) from predictions"), 2.0);
+}
+
+#[test]
+fn adding_needs_its_scope() {
+    let place = lake();
+    let run = place.sql("select run_id from runs")[0]["run_id"].as_str().expect("a name").to_owned();
+    let (reader, reader_lines) = new_token(&place, &["ann"]);
+    let (author, author_lines) = new_token(&place, &["bob", "--scopes", "sql,annotate"]);
+    std::fs::write(place.path("tokens.toml"), reader_lines + &author_lines).expect("written");
+    let server = served(&place, &["--tokens", "tokens.toml"]);
+    let note = json!({ "run_id": run, "kind": "note", "comment": "seen" });
+    let send = |token: &str, body: serde_json::Value| {
+        let request = HttpRequest::post("/api/v1/annotations", &body.to_string());
+        let request = request.with("content-type", "application/json");
+        request.with("authorization", &format!("Bearer {token}")).send(&server)
+    };
+    refused(&send("echolake_none", json!({ "annotations": [note] })), 401, "unauthenticated");
+    refused(&send(&reader, json!({ "annotations": [note] })), 403, "forbidden");
+    refused(&send(&author, json!({ "annotations": [note], "author": "ann" })), 400, "request_invalid");
+    assert_eq!(send(&author, json!({ "annotations": [note] })).status, 200);
+    let rows = place.sql("select author, comment from annotations");
+    assert_eq!((rows.len(), rows[0]["author"].as_str()), (1, Some("bob")), "{rows:?}");
+}
