@@ -4,6 +4,27 @@
  */
 
 export interface paths {
+    readonly "/api/v1/annotations": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        readonly get?: never;
+        readonly put?: never;
+        /**
+         * Adds labels, verdicts and notes on runs, measurements or regions of the grid.
+         * @description All of a request is stored, or nothing. An answer means that it is on disk and that queries see it. An annotation
+         *     that is sent again with its `annotation_id` is stored once. Needs the scope `annotate`.
+         */
+        readonly post: operations["annotate"];
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
     readonly "/api/v1/correlations": {
         readonly parameters: {
             readonly query?: never;
@@ -175,6 +196,28 @@ export interface paths {
         readonly patch?: never;
         readonly trace?: never;
     };
+    readonly "/api/v1/predictions": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        readonly get?: never;
+        readonly put?: never;
+        /**
+         * Adds TNCE that a model predicts.
+         * @description The rows are an Arrow stream with `surface_id`, `pair_id` and columns of table `tnce`, linear; 2 MiB at most. All of
+         *     a request is stored, or nothing. Rows that are sent again are stored once; others for the same model, version and
+         *     surface are refused. Needs the scope `annotate`.
+         */
+        readonly post: operations["predict"];
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
     readonly "/api/v1/queries/{id}/cancel": {
         readonly parameters: {
             readonly query?: never;
@@ -221,6 +264,23 @@ export interface paths {
         };
         /** One run: topics and sizes from the file's summary, quality flags, repeats, log. */
         readonly get: operations["run"];
+        readonly put?: never;
+        readonly post?: never;
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
+    readonly "/api/v1/runs/{run_id}/annotations": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        /** Annotations of users on a run, and how many of its measurements are rejected. */
+        readonly get: operations["run_annotations"];
         readonly put?: never;
         readonly post?: never;
         readonly delete?: never;
@@ -599,6 +659,23 @@ export interface paths {
         readonly patch?: never;
         readonly trace?: never;
     };
+    readonly "/api/v1/surfaces/{surface_id}/pairs/{pair_id}/predictions": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        /** Predictions of models for one pair of a surface. */
+        readonly get: operations["pair_predictions"];
+        readonly put?: never;
+        readonly post?: never;
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
     readonly "/api/v1/surfaces/{surface_id}/pairs/{pair_id}/spectrogram": {
         readonly parameters: {
             readonly query?: never;
@@ -608,6 +685,23 @@ export interface paths {
         };
         /** A response's levels over time and frequency. */
         readonly get: operations["spectrogram"];
+        readonly put?: never;
+        readonly post?: never;
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
+    readonly "/api/v1/surfaces/{surface_id}/predictions": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        /** Models that predict a surface, with their errors. */
+        readonly get: operations["surface_predictions"];
         readonly put?: never;
         readonly post?: never;
         readonly delete?: never;
@@ -749,6 +843,21 @@ export interface paths {
 export type webhooks = Record<string, never>;
 export interface components {
     schemas: {
+        /** @description What was stored. */
+        readonly AddedContribution: {
+            /** @description Names of the annotations, in the order of the request; none for predictions. */
+            readonly annotation_ids: readonly string[];
+            /** @description False if all of it was there before. */
+            readonly is_new: boolean;
+            /** @description The version of the lake that shows it; null for tokens of projects. */
+            readonly lake_version: number | null;
+        };
+        /** @description Annotations of one request: all of them are stored, or none. */
+        readonly AnnotationsRequest: {
+            readonly annotations: readonly components["schemas"]["NewAnnotation"][];
+            /** @description Only without tokens; the token's name otherwise. */
+            readonly author?: string;
+        };
         /** @description Measurements that took this attempt. */
         readonly AttemptCount: {
             readonly attempt: number;
@@ -1049,6 +1158,26 @@ export interface components {
             readonly temperature_c: number | null;
             readonly verdict: string;
         };
+        /** @description One annotation. */
+        readonly NewAnnotation: {
+            /**
+             * @description Name that the author chooses, 1 to 64 of `A-Z a-z 0-9 _ - .`: the same annotation sent again is stored once.
+             *     The server makes one up if there is none, and a request that is sent again is stored again.
+             */
+            readonly annotation_id?: string;
+            /** @description The reason, or the note. */
+            readonly comment?: string;
+            readonly kind: string;
+            /** @description A region of the grid: the pairs with one of these microphone points. */
+            readonly microphones?: readonly number[];
+            /** @description Pairs whose measurements are meant. Without pairs and points the whole run is. */
+            readonly pair_ids?: readonly number[];
+            readonly run_id: string;
+            /** @description A region of the grid: the pairs with one of these speaker points. */
+            readonly speakers?: readonly number[];
+            /** @description The label; `accepted` or `rejected` for a verdict; nothing for a note. */
+            readonly value?: string;
+        };
         /** @description The geometry of a pair. */
         readonly Pair: {
             readonly direct_mm: number;
@@ -1115,6 +1244,18 @@ export interface components {
             /** @description Standard uncertainties of `tnce_db`; null if they are not known. */
             readonly tnce_u_db: readonly (number | null)[];
         };
+        /** @description Predictions of models for a pair. */
+        readonly PairPrediction: {
+            readonly author: string;
+            readonly model: string;
+            readonly model_version: string;
+            /** Format: date-time */
+            readonly predicted: string;
+            /** @description dB re Flat, same band. */
+            readonly tnce_band_db: readonly (number | null)[];
+            /** @description dB re Flat total. One value per band in the order of `lake.bands`, the total last; null if it was not predicted. */
+            readonly tnce_db: readonly (number | null)[];
+        };
         /** @description A point of the grid. */
         readonly Point: {
             readonly gridx: number;
@@ -1128,7 +1269,7 @@ export interface components {
         /** @description RFC 9457; `code` is stable and made for programs. */
         readonly Problem: {
             /** @enum {string} */
-            readonly code: "query_invalid" | "read_only" | "query_failed" | "format_impossible" | "lake_unreadable" | "request_invalid" | "unsupported" | "not_found" | "gone" | "file_changed" | "no_data" | "method_not_allowed" | "precondition_failed" | "range_not_satisfiable" | "request_too_large" | "unauthenticated" | "forbidden" | "foreign_origin" | "cancelled" | "time_limit" | "memory_limit" | "row_limit" | "too_many" | "query_ended_engine" | "internal" | "server_stopping" | "not_ready";
+            readonly code: "query_invalid" | "read_only" | "query_failed" | "format_impossible" | "lake_unreadable" | "request_invalid" | "unsupported" | "not_found" | "gone" | "file_changed" | "taken" | "lake_unwritable" | "no_data" | "method_not_allowed" | "precondition_failed" | "range_not_satisfiable" | "request_too_large" | "unauthenticated" | "forbidden" | "foreign_origin" | "cancelled" | "time_limit" | "memory_limit" | "row_limit" | "too_many" | "query_ended_engine" | "internal" | "server_stopping" | "not_ready";
             /** @description What is wrong, where, and what to do: the text that all protocols and the prompt have. */
             readonly detail?: string;
             /** @description What to do. */
@@ -1227,6 +1368,14 @@ export interface components {
             readonly temperature_max_c: number | null;
             readonly temperature_min_c: number | null;
         };
+        /** @description Annotations on a run, the newest first, 200 at most. */
+        readonly RunAnnotations: {
+            readonly annotations: readonly components["schemas"]["ShownAnnotation"][];
+            /** @description Measurements of the run, or of the pair, that the last verdict rejects. Views leave them out. */
+            readonly rejected: number;
+            /** @description All annotations on the run, or on the pair. */
+            readonly total: number;
+        };
         /** @description A file within a run's file. */
         readonly RunAttachment: {
             readonly bytes: number;
@@ -1257,6 +1406,20 @@ export interface components {
         /** @description A token. */
         readonly Session: {
             readonly token: string;
+        };
+        /** @description An annotation. */
+        readonly ShownAnnotation: {
+            /** Format: date-time */
+            readonly annotated: string;
+            readonly annotation_id: string;
+            readonly author: string;
+            readonly comment: string;
+            /** @description label, verdict or note. */
+            readonly kind: string;
+            readonly lake_version: number | null;
+            /** @description Pairs that are meant; null for the whole run. */
+            readonly pairs: number | null;
+            readonly value: string;
         };
         /**
          * @description A response's levels over time and frequency, by Hann windows: a hundredth of the response, half a millisecond at
@@ -1369,6 +1532,20 @@ export interface components {
             readonly offset: number;
             readonly total: number;
         };
+        /** @description The error of a model's predictions over the pairs of a surface, against its newest run. */
+        readonly SurfacePrediction: {
+            readonly author: string;
+            readonly model: string;
+            readonly model_version: string;
+            readonly pairs: number;
+            /** @description The same of levels over Flat's same band. */
+            readonly rms_band_db: readonly (number | null)[];
+            /**
+             * @description Root mean square of predicted less measured level, dB re Flat total, by band as `tnce_db` of a pair; null if it
+             *     was not predicted.
+             */
+            readonly rms_db: readonly (number | null)[];
+        };
         /** @description A pair that a symmetry of the grid makes of another. */
         readonly SymmetricPair: {
             readonly microphone: number;
@@ -1419,6 +1596,31 @@ export interface components {
 }
 export type $defs = Record<string, never>;
 export interface operations {
+    readonly annotate: {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        readonly requestBody: {
+            readonly content: {
+                readonly "application/json": components["schemas"]["AnnotationsRequest"];
+            };
+        };
+        readonly responses: {
+            /** @description Stored */
+            readonly 200: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/json": components["schemas"]["AddedContribution"];
+                };
+            };
+            readonly default: components["responses"]["Problem"];
+        };
+    };
     readonly correlations: {
         readonly parameters: {
             readonly query?: {
@@ -1695,6 +1897,38 @@ export interface operations {
             readonly default: components["responses"]["Problem"];
         };
     };
+    readonly predict: {
+        readonly parameters: {
+            readonly query: {
+                /** @description Name of the model, 1 to 64 of `A-Z a-z 0-9 _ - .`. */
+                readonly model: string;
+                /** @description Version of the model, as its name. */
+                readonly version: string;
+                /** @description Only without tokens; the token's name otherwise. */
+                readonly author?: string;
+            };
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        readonly requestBody: {
+            readonly content: {
+                readonly "application/vnd.apache.arrow.stream": string;
+            };
+        };
+        readonly responses: {
+            /** @description Stored */
+            readonly 200: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/json": components["schemas"]["AddedContribution"];
+                };
+            };
+            readonly default: components["responses"]["Problem"];
+        };
+    };
     readonly cancel_query: {
         readonly parameters: {
             readonly query?: never;
@@ -1774,6 +2008,40 @@ export interface operations {
                 };
                 content: {
                     readonly "application/json": components["schemas"]["RunDetail"];
+                };
+            };
+            /** @description Not changed since the ETag of If-None-Match */
+            readonly 304: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content?: never;
+            };
+            readonly default: components["responses"]["Problem"];
+        };
+    };
+    readonly run_annotations: {
+        readonly parameters: {
+            readonly query?: {
+                /** @description Leaves out annotations on other pairs. */
+                readonly pair?: number;
+            };
+            readonly header?: never;
+            readonly path: {
+                readonly run_id: string;
+            };
+            readonly cookie?: never;
+        };
+        readonly requestBody?: never;
+        readonly responses: {
+            /** @description OK */
+            readonly 200: {
+                headers: {
+                    readonly ETag?: string;
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/json": components["schemas"]["RunAnnotations"];
                 };
             };
             /** @description Not changed since the ETag of If-None-Match */
@@ -2497,6 +2765,38 @@ export interface operations {
             readonly default: components["responses"]["Problem"];
         };
     };
+    readonly pair_predictions: {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path: {
+                readonly surface_id: string;
+                readonly pair_id: number;
+            };
+            readonly cookie?: never;
+        };
+        readonly requestBody?: never;
+        readonly responses: {
+            /** @description OK */
+            readonly 200: {
+                headers: {
+                    readonly ETag?: string;
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/json": readonly components["schemas"]["PairPrediction"][];
+                };
+            };
+            /** @description Not changed since the ETag of If-None-Match */
+            readonly 304: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content?: never;
+            };
+            readonly default: components["responses"]["Problem"];
+        };
+    };
     readonly spectrogram: {
         readonly parameters: {
             readonly query?: {
@@ -2519,6 +2819,37 @@ export interface operations {
                 };
                 content: {
                     readonly "application/json": components["schemas"]["Spectrogram"];
+                };
+            };
+            /** @description Not changed since the ETag of If-None-Match */
+            readonly 304: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content?: never;
+            };
+            readonly default: components["responses"]["Problem"];
+        };
+    };
+    readonly surface_predictions: {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path: {
+                readonly surface_id: string;
+            };
+            readonly cookie?: never;
+        };
+        readonly requestBody?: never;
+        readonly responses: {
+            /** @description OK */
+            readonly 200: {
+                headers: {
+                    readonly ETag?: string;
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/json": readonly components["schemas"]["SurfacePrediction"][];
                 };
             };
             /** @description Not changed since the ETag of If-None-Match */
