@@ -47,4 +47,29 @@ export const nearestSurfacesHref = (id: string) => apiHref(`${surfacePath(id)}/n
 export const measuredPairsHref = (id: string) => apiHref(`${surfacePath(id)}/pairs`)
 export const pairPath = (id: string, pair: number | string) => `${surfacePath(id)}/pairs/${pair}`
 export const pairDetailHref = (id: string, pair: number | string) => apiHref(pairPath(id, pair))
+export const pairPredictionsHref = (id: string, pair: number | string) => apiHref(`${pairPath(id, pair)}/predictions`)
+export const surfacePredictionsHref = (id: string) => apiHref(`${surfacePath(id)}/predictions`)
+/** Annotations on a run, or on one of its measurements. */
+export const annotationsHref = (run: string, pair?: number) => apiHref(`/runs/${encodeURIComponent(run)}/annotations`, { pair })
 export const nearestResponsesHref = (id: string, pair: number | string) => apiHref(`${pairPath(id, pair)}/neighbours`)
+/** Fractions of an octave that levels and group delays are smoothed over. */
+export const SMOOTHINGS = ['12', '6', '3', '1'] as const
+/** What phase and group delay are less. */
+export const DELAYS = { direct: 'direct sound', reflected: 'reflected path', none: 'nothing' } as const
+export const smoothingOf = (params: URLSearchParams) => SMOOTHINGS.find((one) => one === params.get('octave')) ?? null
+export const delayOf = (params: URLSearchParams) =>
+  (Object.keys(DELAYS) as (keyof typeof DELAYS)[]).find((one) => one === params.get('delay')) ?? 'direct'
+/** A pair's analysis as the page's parameters ask for it. */
+export const analysisHref = (id: string, pair: number | string, params: URLSearchParams) =>
+  apiHref(`${pairPath(id, pair)}/analysis`, { octave: smoothingOf(params), delay: delayOf(params) })
+export const spectrogramHref = (id: string, pair: number | string, signal: string) =>
+  apiHref(`${pairPath(id, pair)}/spectrogram`, { signal })
+
+export const runPath = (id: string) => `/runs/${encodeURIComponent(id)}`
+export const runDetailHref = (id: string) => apiHref(runPath(id))
+export const environmentHref = (id: string) => apiHref(`${runPath(id)}/environment`, { points: 300 })
+
+/** The surfaces that Compare shows. */
+export const MOST_COMPARED = 8
+export const comparedSurfaces = (params: URLSearchParams): string[] =>
+  [...new Set((params.get('s') ?? '').split(',').filter(Boolean))].slice(0, MOST_COMPARED)
