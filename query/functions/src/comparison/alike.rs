@@ -130,10 +130,15 @@ static RMS_DIFFERENCE: FunctionDescription = FunctionDescription {
         FunctionParameter { name: "y", kind: ArgumentKind::Samples, about: "the second list, as long as the first" },
     ],
     optional: 0,
-    example: "select surface, rms_difference(curve, [0, 0.5, 0.8]) as apart from (values ('a', [0, 0.5, 0.9]), ('b', \
-              [0, 0.1, 0.2])) as curves(surface, curve) order by apart",
+    example: "select surface, round(rms_difference(curve, [0, 0.5, 0.8]), 4) as apart from (values ('a', [0, 0.5, 0.9]), \
+              ('b', [0, 0.1, 0.2])) as curves(surface, curve) order by apart",
     answer: "\
-",
++---------+--------+
+| surface | apart  |
++---------+--------+
+| a       | 0.0577 |
+| b       | 0.4163 |
++---------+--------+",
     related: &["pearson", "similarity", "list_rms"],
 };
 
