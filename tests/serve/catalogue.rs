@@ -148,6 +148,42 @@ fn responses_are_analysed() {
 }
 
 #[test]
+fn neighbours_are_those_of_the_map_and_of_plain_sums() {
+    let place = lake();
+    let server = served(&place, &[]);
+    let map = json(&get(&server, "/api/v1/map?neighbours=8"));
+    let points = map["points"].as_array().expect("points");
+    let brick = points.iter().find(|point| point["surface_id"] == "brick").expect("brick is on the map");
+    let surfaces = json(&get(&server, "/api/v1/surfaces/brick/neighbours"));
+    assert_eq!(surfaces["items"], brick["neighbours"]);
+    assert_eq!(surfaces["items"][0]["surface_id"], "flat", "{surfaces}");
+    assert_eq!(json(&get(&server, "/api/v1/surfaces/foam/neighbours"))["items"], Value::Array(Vec::new()));
+    let found = json(&get(&server, "/api/v1/surfaces/brick/pairs/7/neighbours"));
+    let samples = |surface: &str| -> Vec<f64> {
+        let sql = format!("select unnest(reflected_ir) as x from nce where surface_id = '{surface}' and pair_id = 7");
+        place.sql(&sql).iter().map(|row| row["x"].as_f64().expect("a sample")).collect()
+    };
+    let own = samples("brick");
+    let flat = samples("flat");
+    let mean = |x: &[f64]| x.iter().sum::<f64>() / x.len() as f64;
+    let product = |x: &[f64], y: &[f64]| x.iter().zip(y).map(|(a, b)| (a - mean(x)) * (b - mean(y))).sum::<f64>();
+    let energy = |x: &[f64]| x.iter().map(|x| x * x).sum::<f64>();
+    let items = found["items"].as_array().expect("items");
+    // Nothing is left of Foam's response.
+    assert_eq!((items.len(), &items[0]["surface_id"]), (1, &Value::from("flat")), "{found}");
+    for (name, expected) in [
+        ("correlation", product(&own, &flat) / (product(&own, &own) * product(&flat, &flat)).sqrt()),
+        ("level_db", 10.0 * (energy(&flat) / energy(&own)).log10()),
+    ] {
+        let given = items[0][name].as_f64().expect("a number");
+        assert!((given - expected).abs() < 1e-6, "{name}: {given} {expected}");
+    }
+    let foam = json(&get(&server, "/api/v1/surfaces/foam/pairs/7/neighbours"));
+    assert_eq!(foam["items"], Value::Array(Vec::new()), "nothing is like silence");
+    refused(&get(&server, "/api/v1/surfaces/brick/pairs/99999/neighbours"), 404, "not_found");
+}
+
+#[test]
 fn facets_leave_their_own_filter_out() {
     let place = lake();
     let server = served(&place, &[]);

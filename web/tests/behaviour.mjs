@@ -404,6 +404,28 @@ await check('the chart of levels on Compare has the levels that SQL says', async
   }
 })
 
+await check('nearest surfaces and responses lead to them', async () => {
+  const { points } = await (await fetch(`${base}/api/v1/map?neighbours=8`)).json()
+  const { neighbours } = points.find((point) => point.surface_id === id)
+  const rows = (figure) => page.locator(`section[aria-label="${figure}"] tbody tr`)
+  await open(`/surfaces/${id}`)
+  const near = rows('Nearest surfaces')
+  const texts = neighbours.map((one) => `${one.surface_id}\t${one.distance_db.toFixed(2)}`)
+  await eventually(async () => assert.deepEqual(await near.allInnerTexts(), texts))
+  await near.first().getByRole('link').click()
+  await page.waitForURL(`**/surfaces/${neighbours[0].surface_id}`)
+  const of = (surface, name) =>
+    `(select unnest(reflected_ir) as ${name}, unnest(range(array_length(reflected_ir))) as n from nce where surface_id = '${surface}' and pair_id = 159)`
+  await open(`/surfaces/${id}/pairs/159`)
+  const alike = rows('Nearest responses')
+  await alike.first().waitFor()
+  const other = await alike.first().getByRole('link').innerText()
+  const [{ r }] = await sql(`select corr(a, b) as r from ${of(id, 'a')} join ${of(other, 'b')} using (n)`)
+  assert.equal(await alike.first().locator('td').first().innerText(), r.toFixed(3))
+  await alike.first().getByRole('link').click()
+  await page.waitForURL(`**/surfaces/${other}/pairs/159`)
+})
+
 await check('surfaces are compared with Flat, or with the chosen one', async () => {
   const { flat_reference: flat } = all.items.find((s) => s.surface_id === id)
   const other = all.items.find((s) => s.typology !== 'reference' && s.surface_id !== id)

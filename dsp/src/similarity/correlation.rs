@@ -9,6 +9,9 @@ use crate::energy::energy;
 use crate::error::check_len;
 use crate::{Error, RealSample};
 
+/// Sums that are computed side by side.
+const LANES: usize = 8;
+
 /// Pearson's coefficient of correlation, -1 to 1. None if one does not vary, if there are fewer than two values, or if
 /// one is not finite.
 ///
@@ -25,25 +28,49 @@ use crate::{Error, RealSample};
 pub fn pearson<T: RealSample>(x: &[T], y: &[T]) -> Result<Option<f64>, Error> {
     check_len("the second signal", y.len(), x.len())?;
     let count = x.len() as f64;
-    let mean = |x: &[T]| x.iter().map(|x| x.f64()).sum::<f64>() / count;
-    let mean_x = mean(x);
-    let mean_y = mean(y);
-    let mut xx = 0.0;
-    let mut yy = 0.0;
-    let mut xy = 0.0;
-    for (x, y) in x.iter().zip(y) {
-        let dx = x.f64() - mean_x;
-        let dy = y.f64() - mean_y;
-        xx += dx * dx;
-        yy += dy * dy;
-        xy += dx * dy;
-    }
+    let mean_x = sum_terms(x, x, |x, _| x) / count;
+    let mean_y = sum_terms(y, y, |y, _| y) / count;
+    let xx = sum_terms(x, x, |x, _| (x - mean_x) * (x - mean_x));
+    let yy = sum_terms(y, y, |y, _| (y - mean_y) * (y - mean_y));
+    let xy = sum_terms(x, y, |x, y| (x - mean_x) * (y - mean_y));
     // Of equal values, the rounding of their sum alone is left, up to count times that of one.
     let varies = |sum: f64, mean: f64| sum.is_finite() && sum > count * (count * f64::EPSILON * mean).powi(2);
     if !(varies(xx, mean_x) && varies(yy, mean_y)) {
         return Ok(None);
     }
     Ok(Some((xy / xx.sqrt() / yy.sqrt()).clamp(-1.0, 1.0)))
+}
+
+/// Root mean square of the differences of two signals, in their unit. None of no samples, or if it is not finite.
+///
+/// x, y  `[n]`
+///
+/// ```
+/// let difference = echolake_dsp::correlation::rms_difference(&[1.0, 2.0], &[4.0, -2.0])?;
+/// assert!(difference.is_some_and(|rms| (rms - 12.5f64.sqrt()).abs() < 1e-12));
+/// # Ok::<(), echolake_dsp::Error>(())
+/// ```
+///
+/// # Errors
+/// [`Error::Length`] if they are not equally long.
+pub fn rms_difference<T: RealSample>(x: &[T], y: &[T]) -> Result<Option<f64>, Error> {
+    check_len("the second signal", y.len(), x.len())?;
+    let square = sum_terms(x, y, |x, y| (x - y) * (x - y));
+    Ok(Some((square / x.len() as f64).sqrt()).filter(|rms| rms.is_finite()))
+}
+
+// Sums a term of each pair of samples, in several sums that do not wait for each other.
+fn sum_terms<T: RealSample>(x: &[T], y: &[T], term: impl Fn(f64, f64) -> f64) -> f64 {
+    let mut sums = [0.0; LANES];
+    let (x_blocks, x_rest) = x.as_chunks::<LANES>();
+    let (y_blocks, y_rest) = y.as_chunks::<LANES>();
+    for (x, y) in x_blocks.iter().zip(y_blocks) {
+        for k in 0..LANES {
+            sums[k] += term(x[k].f64(), y[k].f64());
+        }
+    }
+    let rest: f64 = x_rest.iter().zip(y_rest).map(|(x, y)| term(x.f64(), y.f64())).sum();
+    sums.iter().sum::<f64>() + rest
 }
 
 /// Spearman's coefficient of correlation: Pearson's of the ranks, so that it is 1 for any rising relation and one
@@ -202,6 +229,36 @@ mod tests {
         assert_eq!(spearman(&[1.0, f64::NAN, 2.0], &[1.0, 2.0, 3.0]), Ok(None));
         assert_eq!(value_ranks(&[3.0, 1.0, 3.0, -0.0, 0.0]), [3.5, 2.0, 3.5, 0.5, 0.5]);
         assert!(matches!(pearson(&[1.0], &[1.0, 2.0]), Err(Error::Length { .. })));
+    }
+
+    // Against the plain sums, at lengths around whole blocks.
+    #[test]
+    fn sums_side_by_side_are_the_plain_ones() {
+        for len in (2..=3 * LANES + 1).chain([383, 384, 385]) {
+            let x: Vec<f32> = (0..len).map(|n| ((n * n * 7 + 3 * n) % 31) as f32 - 12.0).collect();
+            let y: Vec<f32> = (0..len).map(|n| ((n * 13 + 5) % 23) as f32 * 0.37).collect();
+            let count = len as f64;
+            let pairs = || x.iter().zip(&y).map(|(x, y)| (f64::from(*x), f64::from(*y)));
+            let square: f64 = pairs().map(|(x, y)| (x - y).powi(2)).sum();
+            let found = rms_difference(&x, &y).expect("equally long").expect("finite");
+            assert!((found - (square / count).sqrt()).abs() < 1e-12 * found, "{len}: {found}");
+            let [sum_x, sum_y, sum_xx, sum_yy, sum_xy] =
+                pairs().fold([0.0; 5], |[a, b, c, d, e], (x, y)| [a + x, b + y, c + x * x, d + y * y, e + x * y]);
+            let r = (count * sum_xy - sum_x * sum_y)
+                / ((count * sum_xx - sum_x * sum_x) * (count * sum_yy - sum_y * sum_y)).sqrt();
+            let found = pearson(&x, &y).expect("equally long").expect("both vary");
+            assert!((found - r).abs() < 1e-12, "{len}: {found} {r}");
+        }
+    }
+
+    #[test]
+    fn differences_are_numbers_or_none() {
+        assert_eq!(rms_difference(&[0.0f32; 3], &[0.0; 3]), Ok(Some(0.0)));
+        assert_eq!(rms_difference(&[f32::MAX; 9], &[-f32::MAX; 9]), Ok(Some(2.0 * f64::from(f32::MAX))));
+        for (x, y) in [(&[][..], &[][..]), (&[1.0, f64::NAN], &[1.0, 2.0]), (&[f64::INFINITY], &[f64::INFINITY])] {
+            assert_eq!(rms_difference(x, y), Ok(None), "{x:?}");
+        }
+        assert!(matches!(rms_difference(&[1.0], &[1.0, 2.0]), Err(Error::Length { actual: 2, expected: 1, .. })));
     }
 
     #[test]

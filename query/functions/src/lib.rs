@@ -63,6 +63,7 @@ impl FunctionSet {
             wrap_scalar(alike::SpearmanFunction),
             wrap_scalar(alike::CorrelationPFunction),
             wrap_scalar(alike::SimilarityFunction),
+            wrap_scalar(alike::RmsDifferenceFunction),
             wrap_scalar(diffusion::DiffusionFunction),
             wrap_scalar(fresnel::FresnelFunction),
             wrap_scalar(sound::SpeedOfSoundFunction),

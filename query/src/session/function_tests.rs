@@ -247,6 +247,38 @@ async fn a_decay_a_spectrum_and_an_arrival_that_are_known() {
     assert!((small.number("select speed_of_sound(20)").await - 343.2).abs() < 0.05);
 }
 
+// What is nearest to a measurement, by a constant list and by a column, against plain sums.
+#[tokio::test]
+async fn distances_of_lists_are_the_plain_ones() {
+    let small = SmallLake::new().await;
+    let responses = small.golden("reflected_ir");
+    let wanted = &responses[2 * LEN..][..LEN];
+    let mean = |x: &[f64]| x.iter().sum::<f64>() / LEN as f64;
+    let product = |x: &[f64], y: &[f64]| -> f64 { x.iter().zip(y).map(|(a, b)| (a - mean(x)) * (b - mean(y))).sum() };
+    let rms = |x: &[f64]| (x.iter().zip(wanted).map(|(a, b)| (a - b).powi(2)).sum::<f64>() / LEN as f64).sqrt();
+    let unlike = |x: &[f64]| 1.0 - product(x, wanted) / (product(x, x) * product(wanted, wanted)).sqrt();
+    let own = "select reflected_ir from nce where surface_id = '0015_0' and pair_id = 2";
+    let check = async |function: &str, expected: Vec<f64>| {
+        for (list, from) in [
+            (format!("({own})"), "nce n".to_owned()),
+            ("o.reflected_ir".to_owned(), format!("nce n cross join ({own}) o")),
+        ] {
+            let distance = function.replace("LIST", &list);
+            let sql = format!("select {distance} as d from {from} where n.surface_id = '0015_0' order by d limit 3");
+            let given = small.numbers(&sql).await;
+            let close = |(a, b): (&f64, &f64)| (a - b).abs() < 1e-5 * expected[2].abs();
+            assert!(given.len() == 3 && given.iter().zip(&expected).all(close), "{sql}: {given:?} {expected:?}");
+        }
+    };
+    let nearest = |distance: &dyn Fn(&[f64]) -> f64| {
+        let mut all: Vec<_> = responses.chunks_exact(LEN).map(distance).collect();
+        all.sort_by(f64::total_cmp);
+        all
+    };
+    check("rms_difference(n.reflected_ir, LIST)", nearest(&rms)).await;
+    check("1 - pearson(n.reflected_ir, LIST)", nearest(&unlike)).await;
+}
+
 #[tokio::test]
 async fn fresnel_zones_are_those_of_table_pairs() {
     let small = SmallLake::new().await;
@@ -389,6 +421,7 @@ mod slow {
                 (format!("list_energy({list})"), 50.0),
                 (format!("array_sum(list_multiply({list}, {list}))"), 50.0),
                 (format!("pearson({list}, [2, 4, 6, 12])"), 1.0),
+                (format!("rms_difference({list}, [2, 4, 6, 12])"), 12.5f64.sqrt()),
                 (format!("round(similarity({list}, {list}), 5)"), 1.0),
                 (format!("array_element(nce({list}, 50), -1)"), 1.0),
                 (format!("array_element(edc({list}), 1)"), 0.0),
@@ -434,6 +467,8 @@ mod slow {
             "select avg_list(x) from (values ([1]), ([1, null])) as t(x)",
             "select avg_list(x) from (values ([1]), ([1, 2])) as t(x)",
             "select pearson([1, 2], [1])",
+            "select rms_difference([1, 2], [1])",
+            "select rms_difference([1, null], [1, 2])",
             "select similarity([1, 2], [1])",
             "select list_multiply([1, 2], [1])",
             "select spectrum(['nan'::double])",
@@ -495,6 +530,10 @@ mod slow {
                 the query failed: `avg_list`, row 2 of its batch: a list has 2 samples, expected 1; hint: the lists of a row must be equally long
             select pearson([1, 2], [1])
                 the query failed: `pearson`, row 1 of its batch: the second signal has 1 samples, expected 2; hint: the lists of a row must be equally long
+            select rms_difference([1, 2], [1])
+                the query failed: `rms_difference`, row 1 of its batch: the second signal has 1 samples, expected 2; hint: the lists of a row must be equally long
+            select rms_difference([1, null], [1, 2])
+                the query failed: `rms_difference`: element 2 of `x` is null in row 1 of its batch; hint: array_compact() takes nulls out, or leave such rows out
             select similarity([1, 2], [1])
                 the query failed: `similarity`, row 1 of its batch: the second response has 1 samples, expected 2; hint: the lists of a row must be equally long
             select list_multiply([1, 2], [1])
@@ -565,6 +604,10 @@ mod slow {
             "pearson([], [])",
             "pearson([1], [1])",
             "pearson(null, [1])",
+            "pearson([0, 0], [1, 2])",
+            "rms_difference([], [])",
+            "rms_difference(null, [1])",
+            "rms_difference([1], ['nan'::double])",
             "similarity([], [])",
             "similarity([0], [1])",
             "diffusion([])",
@@ -590,6 +633,7 @@ mod slow {
         for (call, expected) in [
             ("list_energy([])", 0.0),
             ("list_rms([])", 0.0),
+            ("rms_difference([0, 0], [0, 0])", 0.0),
             ("array_length(spectrum([1]))", 1.0),
             ("coalesce(array_length(spectrum([])), 0)", 0.0),
             ("coalesce(array_length(d4_heightmap([], 'rot90')), 0)", 0.0),

@@ -43,6 +43,7 @@ export const detailHref = (id: string) => apiHref(surfacePath(id))
 export const curvesHref = (id: string, microphone: number | null = null) =>
   apiHref(`${surfacePath(id)}/curves`, { points: CURVE_POINTS, microphone })
 
+export const nearestSurfacesHref = (id: string) => apiHref(`${surfacePath(id)}/neighbours`)
 export const measuredPairsHref = (id: string) => apiHref(`${surfacePath(id)}/pairs`)
 export const pairPath = (id: string, pair: number | string) => `${surfacePath(id)}/pairs/${pair}`
 export const pairDetailHref = (id: string, pair: number | string) => apiHref(pairPath(id, pair))
@@ -51,6 +52,7 @@ export const surfacePredictionsHref = (id: string) => apiHref(`${surfacePath(id)
 /** Annotations on a run, or on one of its measurements. */
 export const annotationsHref = (run: string, pair?: number) =>
   apiHref(`/runs/${encodeURIComponent(run)}/annotations`, { pair })
+export const nearestResponsesHref = (id: string, pair: number | string) => apiHref(`${pairPath(id, pair)}/neighbours`)
 /** Fractions of an octave that levels and group delays are smoothed over. */
 export const SMOOTHINGS = ['12', '6', '3', '1'] as const
 /** What phase and group delay are less. */

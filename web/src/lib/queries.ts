@@ -59,6 +59,10 @@ export const responseQuery = (measurements: readonly { readonly id: string; read
     .map(({ id, pair }) => `m.surface_id = ${quoted(id)} and m.pair_id = ${pair}`)
     .join('\n  or ')}`
 
+/** Responses of a pair on other surfaces, those first that are most like this one. */
+export const nearestResponsesQuery = (id: string, pair: number) =>
+  `select surface_id, run_id, pearson(reflected_ir, (\n  select avg_list(reflected_ir) from nce where surface_id = ${quoted(id)} and pair_id = ${pair}\n)) as correlation\nfrom nce where pair_id = ${pair} and surface_id <> ${quoted(id)}\norder by correlation desc nulls last limit 10`
+
 export const heightsQuery = (id: string) =>
   `select cells, size_mm, heights_mm from heightmaps where surface_id = ${quoted(id)} and symmetry = 'identity'`
 

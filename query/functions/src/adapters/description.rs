@@ -64,7 +64,7 @@ impl FunctionFamily {
         match self {
             Self::Levels => "Levels",
             Self::Responses => "Impulse responses",
-            Self::Comparison => "Correlation and diffusion",
+            Self::Comparison => "Comparison and diffusion",
             Self::Geometry => "Geometry and symmetry",
             Self::Lists => "Lists",
             Self::Aggregates => "Aggregates",

@@ -1,10 +1,10 @@
-//! `pearson`, `spearman`, `correlation_p` and `similarity`: similarity measures of two lists.
+//! `pearson`, `spearman`, `correlation_p`, `similarity` and `rms_difference`: how alike two lists are.
 
 use arrow::array::ArrayRef;
 use arrow::datatypes::DataType;
 use datafusion::error::Result;
 use echolake_dsp::Error;
-use echolake_dsp::correlation::{CorrelationPlan, pearson, spearman};
+use echolake_dsp::correlation::{CorrelationPlan, pearson, rms_difference, spearman};
 use echolake_dsp::significance::correlation_p_value;
 
 use crate::adapters::answers::build_numbers;
@@ -25,6 +25,9 @@ pub(crate) struct CorrelationPFunction;
 /// `similarity`.
 pub(crate) struct SimilarityFunction;
 
+/// `rms_difference`.
+pub(crate) struct RmsDifferenceFunction;
+
 static PEARSON: FunctionDescription = FunctionDescription {
     name: "pearson",
     family: FunctionFamily::Comparison,
@@ -43,7 +46,7 @@ static PEARSON: FunctionDescription = FunctionDescription {
 +-------+----------+
 | 1.0   |          |
 +-------+----------+",
-    related: &["spearman", "correlation_p", "similarity"],
+    related: &["spearman", "correlation_p", "similarity", "rms_difference"],
 };
 
 static SPEARMAN: FunctionDescription = FunctionDescription {
@@ -115,6 +118,30 @@ static SIMILARITY: FunctionDescription = FunctionDescription {
     related: &["pearson", "arrival"],
 };
 
+static RMS_DIFFERENCE: FunctionDescription = FunctionDescription {
+    name: "rms_difference",
+    family: FunctionFamily::Comparison,
+    about: "Distance of two equally long lists, in their unit: the root mean square of their differences, which is the \
+            Euclidean distance over the root of their length. For curves and for levels. Of responses with little in \
+            common it finds the quietest nearest: pearson() compares their shapes. Null of no elements, or if an \
+            element is not finite.",
+    parameters: &[
+        FunctionParameter { name: "x", kind: ArgumentKind::Samples, about: "the first list, as nce_10000" },
+        FunctionParameter { name: "y", kind: ArgumentKind::Samples, about: "the second list, as long as the first" },
+    ],
+    optional: 0,
+    example: "select surface, round(rms_difference(curve, [0, 0.5, 0.8]), 4) as apart from (values ('a', [0, 0.5, 0.9]), \
+              ('b', [0, 0.1, 0.2])) as curves(surface, curve) order by apart",
+    answer: "\
++---------+--------+
+| surface | apart  |
++---------+--------+
+| a       | 0.0577 |
+| b       | 0.4163 |
++---------+--------+",
+    related: &["pearson", "similarity", "list_rms"],
+};
+
 impl ScalarKernel for PearsonFunction {
     fn description(&self) -> &'static FunctionDescription {
         &PEARSON
@@ -166,6 +193,24 @@ impl ScalarKernel for CorrelationPFunction {
         build_numbers(arguments, |row| {
             let count = usize::try_from(counts.value_at(row)).unwrap_or(0);
             Ok(correlation_p_value(coefficients.value_at(row), count))
+        })
+    }
+}
+
+impl ScalarKernel for RmsDifferenceFunction {
+    fn description(&self) -> &'static FunctionDescription {
+        &RMS_DIFFERENCE
+    }
+
+    fn answer_type(&self, _: &[DataType]) -> DataType {
+        DataType::Float64
+    }
+
+    fn compute_answers<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
+        let x = arguments.sample_lists::<T>(0)?;
+        let y = arguments.sample_lists::<T>(1)?;
+        build_numbers(arguments, |row| {
+            rms_difference(x.samples_at(row)?, y.samples_at(row)?).map_err(|e| arguments.refused_row(row, &e))
         })
     }
 }

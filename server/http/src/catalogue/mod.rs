@@ -15,6 +15,7 @@ mod figures;
 mod lake;
 mod map;
 mod measured_pairs;
+mod neighbours;
 mod pair;
 mod relief;
 mod request;
@@ -86,6 +87,8 @@ pub(super) fn heavy_routes() -> OpenApiRouter {
         .routes(routes!(analysis::analysis))
         .routes(routes!(analysis::spectrogram))
         .routes(routes!(map::map))
+        .routes(routes!(neighbours::nearest_surfaces))
+        .routes(routes!(neighbours::nearest_responses))
         .routes(routes!(correlations::correlations))
         .routes(routes!(diffusion::diffusion))
 }
