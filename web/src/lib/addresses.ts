@@ -50,7 +50,8 @@ export const pairDetailHref = (id: string, pair: number | string) => apiHref(pai
 export const pairPredictionsHref = (id: string, pair: number | string) => apiHref(`${pairPath(id, pair)}/predictions`)
 export const surfacePredictionsHref = (id: string) => apiHref(`${surfacePath(id)}/predictions`)
 /** Annotations on a run, or on one of its measurements. */
-export const annotationsHref = (run: string, pair?: number) => apiHref(`/runs/${encodeURIComponent(run)}/annotations`, { pair })
+export const annotationsHref = (run: string, pair?: number) =>
+  apiHref(`/runs/${encodeURIComponent(run)}/annotations`, { pair })
 export const nearestResponsesHref = (id: string, pair: number | string) => apiHref(`${pairPath(id, pair)}/neighbours`)
 /** Fractions of an octave that levels and group delays are smoothed over. */
 export const SMOOTHINGS = ['12', '6', '3', '1'] as const

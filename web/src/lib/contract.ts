@@ -522,6 +522,23 @@ export interface paths {
         readonly patch?: never;
         readonly trace?: never;
     };
+    readonly "/api/v1/surfaces/{surface_id}/neighbours": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        /** The surfaces that are most like one: distances of the map. */
+        readonly get: operations["nearest_surfaces"];
+        readonly put?: never;
+        readonly post?: never;
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
     readonly "/api/v1/surfaces/{surface_id}/pairs": {
         readonly parameters: {
             readonly query?: never;
@@ -591,6 +608,26 @@ export interface paths {
          * @description The rate in its header is the rig's divided by `slowdown`: 10 gives full scale.
          */
         readonly get: operations["wav"];
+        readonly put?: never;
+        readonly post?: never;
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
+    readonly "/api/v1/surfaces/{surface_id}/pairs/{pair_id}/neighbours": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        /**
+         * The responses of the same pair on other surfaces that are most like one's, after Foam's were subtracted.
+         * @description Of another pair the sound arrives at other times, so that its samples cannot be compared one by one.
+         */
+        readonly get: operations["nearest_responses"];
         readonly put?: never;
         readonly post?: never;
         readonly delete?: never;
@@ -749,6 +786,14 @@ export interface paths {
 export type webhooks = Record<string, never>;
 export interface components {
     schemas: {
+        /** @description The response of the same pair on another surface. */
+        readonly AlikeResponse: {
+            /** @description Pearson's coefficient of both responses, at the same times: 1 if they differ by a factor. */
+            readonly correlation: number;
+            /** @description Energy of the other response over that of this one, dB. */
+            readonly level_db: number;
+            readonly surface_id: string;
+        };
         /** @description Measurements that took this attempt. */
         readonly AttemptCount: {
             readonly attempt: number;
@@ -1048,6 +1093,19 @@ export interface components {
             readonly speaker_residual_mm: number | null;
             readonly temperature_c: number | null;
             readonly verdict: string;
+        };
+        /** @description The responses that are most like one. */
+        readonly NearestResponses: {
+            /** @description Most alike first, up to 10. */
+            readonly items: readonly components["schemas"]["AlikeResponse"][];
+            readonly pair_id: number;
+            readonly surface_id: string;
+        };
+        /** @description The surfaces that are most like one. */
+        readonly NearestSurfaces: {
+            /** @description Nearest first, up to 8; none if the surface is not on the map. */
+            readonly items: readonly components["schemas"]["SurfaceNeighbour"][];
+            readonly surface_id: string;
         };
         /** @description The geometry of a pair. */
         readonly Pair: {
@@ -2362,6 +2420,37 @@ export interface operations {
             readonly default: components["responses"]["Problem"];
         };
     };
+    readonly nearest_surfaces: {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path: {
+                readonly surface_id: string;
+            };
+            readonly cookie?: never;
+        };
+        readonly requestBody?: never;
+        readonly responses: {
+            /** @description OK */
+            readonly 200: {
+                headers: {
+                    readonly ETag?: string;
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/json": components["schemas"]["NearestSurfaces"];
+                };
+            };
+            /** @description Not changed since the ETag of If-None-Match */
+            readonly 304: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content?: never;
+            };
+            readonly default: components["responses"]["Problem"];
+        };
+    };
     readonly measured_pairs: {
         readonly parameters: {
             readonly query?: never;
@@ -2485,6 +2574,38 @@ export interface operations {
                 };
                 content: {
                     readonly "audio/wav": string;
+                };
+            };
+            /** @description Not changed since the ETag of If-None-Match */
+            readonly 304: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content?: never;
+            };
+            readonly default: components["responses"]["Problem"];
+        };
+    };
+    readonly nearest_responses: {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path: {
+                readonly surface_id: string;
+                readonly pair_id: number;
+            };
+            readonly cookie?: never;
+        };
+        readonly requestBody?: never;
+        readonly responses: {
+            /** @description OK */
+            readonly 200: {
+                headers: {
+                    readonly ETag?: string;
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/json": components["schemas"]["NearestResponses"];
                 };
             };
             /** @description Not changed since the ETag of If-None-Match */
