@@ -582,6 +582,23 @@ export interface paths {
         readonly patch?: never;
         readonly trace?: never;
     };
+    readonly "/api/v1/surfaces/{surface_id}/neighbours": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        /** The surfaces that are most like one: distances of the map. */
+        readonly get: operations["nearest_surfaces"];
+        readonly put?: never;
+        readonly post?: never;
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
     readonly "/api/v1/surfaces/{surface_id}/pairs": {
         readonly parameters: {
             readonly query?: never;
@@ -651,6 +668,26 @@ export interface paths {
          * @description The rate in its header is the rig's divided by `slowdown`: 10 gives full scale.
          */
         readonly get: operations["wav"];
+        readonly put?: never;
+        readonly post?: never;
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
+    readonly "/api/v1/surfaces/{surface_id}/pairs/{pair_id}/neighbours": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        /**
+         * The responses of the same pair on other surfaces that are most like one's, after Foam's were subtracted.
+         * @description Of another pair the sound arrives at other times, so that its samples cannot be compared one by one.
+         */
+        readonly get: operations["nearest_responses"];
         readonly put?: never;
         readonly post?: never;
         readonly delete?: never;
@@ -851,6 +888,14 @@ export interface components {
             readonly is_new: boolean;
             /** @description The version of the lake that shows it; null for tokens of projects. */
             readonly lake_version: number | null;
+        };
+        /** @description The response of the same pair on another surface. */
+        readonly AlikeResponse: {
+            /** @description Pearson's coefficient of both responses, at the same times: 1 if they differ by a factor. */
+            readonly correlation: number;
+            /** @description Energy of the other response over that of this one, dB. */
+            readonly level_db: number;
+            readonly surface_id: string;
         };
         /** @description Annotations of one request: all of them are stored, or none. */
         readonly AnnotationsRequest: {
@@ -1157,6 +1202,19 @@ export interface components {
             readonly speaker_residual_mm: number | null;
             readonly temperature_c: number | null;
             readonly verdict: string;
+        };
+        /** @description The responses that are most like one. */
+        readonly NearestResponses: {
+            /** @description Most alike first, up to 10. */
+            readonly items: readonly components["schemas"]["AlikeResponse"][];
+            readonly pair_id: number;
+            readonly surface_id: string;
+        };
+        /** @description The surfaces that are most like one. */
+        readonly NearestSurfaces: {
+            /** @description Nearest first, up to 8; none if the surface is not on the map. */
+            readonly items: readonly components["schemas"]["SurfaceNeighbour"][];
+            readonly surface_id: string;
         };
         /** @description One annotation. */
         readonly NewAnnotation: {
@@ -2630,6 +2688,37 @@ export interface operations {
             readonly default: components["responses"]["Problem"];
         };
     };
+    readonly nearest_surfaces: {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path: {
+                readonly surface_id: string;
+            };
+            readonly cookie?: never;
+        };
+        readonly requestBody?: never;
+        readonly responses: {
+            /** @description OK */
+            readonly 200: {
+                headers: {
+                    readonly ETag?: string;
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/json": components["schemas"]["NearestSurfaces"];
+                };
+            };
+            /** @description Not changed since the ETag of If-None-Match */
+            readonly 304: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content?: never;
+            };
+            readonly default: components["responses"]["Problem"];
+        };
+    };
     readonly measured_pairs: {
         readonly parameters: {
             readonly query?: never;
@@ -2753,6 +2842,38 @@ export interface operations {
                 };
                 content: {
                     readonly "audio/wav": string;
+                };
+            };
+            /** @description Not changed since the ETag of If-None-Match */
+            readonly 304: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content?: never;
+            };
+            readonly default: components["responses"]["Problem"];
+        };
+    };
+    readonly nearest_responses: {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path: {
+                readonly surface_id: string;
+                readonly pair_id: number;
+            };
+            readonly cookie?: never;
+        };
+        readonly requestBody?: never;
+        readonly responses: {
+            /** @description OK */
+            readonly 200: {
+                headers: {
+                    readonly ETag?: string;
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/json": components["schemas"]["NearestResponses"];
                 };
             };
             /** @description Not changed since the ETag of If-None-Match */
