@@ -184,7 +184,8 @@ fn add_files_section(text: &mut String, about: &CardContents<'_>) {
         "\n## Files\n\n- `data/<split>-*.parquet`: measurements. Whole surfaces in a file, one row group a surface, in \
          a drawn order.\n- `heightmaps/<split>.parquet`: the surfaces' heights, joined by `surface_id` and \
          `symmetry`.\n- `surfaces.csv`: every surface and run, its file, rows, and the digests of what its rows were \
-         derived from.\n- `croissant.json`: the same as Croissant metadata. `SHA256SUMS`: `sha256sum -c SHA256SUMS` \
+         derived from.\n- `statistics.json`: mean and standard deviation of each column over split train, of positions by \
+         axis.\n- `croissant.json`: the same as Croissant metadata. `SHA256SUMS`: `sha256sum -c SHA256SUMS` \
          checks all files.\n\n",
     );
     text.push_str(match about.plan.set.symmetries {

@@ -7,6 +7,7 @@ mod heights;
 mod measurements;
 mod shard;
 mod split;
+mod statistics;
 mod surfaces;
 
 use std::path::Path;
@@ -23,7 +24,9 @@ use crate::error::{Error, Result};
 use crate::output::{PendingFolder, WrittenFile};
 use columns::TrainingColumns;
 use measurements::SymmetryMoves;
+use shard::WrittenShard;
 pub use split::{SplitBy, SplitParams, SplitPart};
+use statistics::ColumnStatistics;
 use surfaces::TrainingSurface;
 
 /// Minimum number of files per split, if it has that many surfaces: loaders give whole files to their workers.
@@ -192,26 +195,40 @@ pub async fn write_training_set(
     let pending = PendingFolder::create(folder)?;
     let mut parts = Vec::new();
     let mut files = Vec::new();
+    let mut statistics = ColumnStatistics::default();
     for part in SplitPart::ALL {
         if plan.of_part(part).next().is_some() {
-            let (written, height_maps) = shard::write_height_maps(lake, &snapshot, &plan, part, &pending).await?;
+            let mut of_part = ColumnStatistics::default();
+            let (written, height_maps) =
+                shard::write_height_maps(lake, &snapshot, &plan, part, &pending, &mut of_part).await?;
             files.extend(written);
             parts.push(part_counts(&plan, part, height_maps));
+            if part == SplitPart::Train {
+                statistics = of_part;
+            }
         }
     }
     let job = Arc::new(ExportJob { lake: lake.clone(), snapshot, plan, folder: pending });
     let written = shards_of(&job, progress).await?;
     let ExportJob { plan, folder: pending, snapshot, .. } = &*job;
     let mut sources = Vec::new();
+<<<<<<< HEAD
     let mut rejected = 0;
     for (one, shard::WrittenShard { file, rows, rejected: of_shard }) in plan.shards.iter().zip(written) {
         rejected += of_shard;
+=======
+    for (one, written) in plan.shards.iter().zip(written) {
+>>>>>>> 22c2510b (Loader: coarser height maps with their size, spectra, normalisation by statistics of the set; a new baseline (untrained))
         if let Some(counts) = parts.iter_mut().find(|p| p.part == one.part) {
-            counts.rows += rows.iter().sum::<u64>();
+            counts.rows += written.surface_rows.iter().sum::<u64>();
         }
-        sources.push((one, rows));
-        files.push(file);
+        if one.part == SplitPart::Train {
+            statistics.merge_sums(written.statistics);
+        }
+        sources.push((one, written.surface_rows));
+        files.push(written.file);
     }
+    files.push(pending.write_file("statistics.json", statistics.to_json().as_bytes())?);
     files.push(pending.write_file("surfaces.csv", card::sources_csv(&sources)?.as_bytes())?);
     let left_out = plan.left_out.clone();
     let references = plan.references.clone();
@@ -248,7 +265,11 @@ struct ExportJob {
 }
 
 // One file per core at a time.
+<<<<<<< HEAD
 async fn shards_of(job: &Arc<ExportJob>, progress: &mut dyn FnMut(usize, usize)) -> Result<Vec<shard::WrittenShard>> {
+=======
+async fn shards_of(job: &Arc<ExportJob>, progress: &mut dyn FnMut(usize, usize)) -> Result<Vec<WrittenShard>> {
+>>>>>>> 22c2510b (Loader: coarser height maps with their size, spectra, normalisation by statistics of the set; a new baseline (untrained))
     let surfaces = |of: &Shard| of.surfaces.len();
     let mut done = 0;
     let total = job.plan.shards.iter().map(surfaces).sum();
