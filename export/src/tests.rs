@@ -193,7 +193,8 @@ mod slow {
         assert_eq!(exported[0].parts.iter().map(|p| p.surfaces).sum::<usize>(), SURFACES.len() - 2);
         assert_eq!(exported[0].references.iter().map(|s| s.as_str()).collect::<Vec<_>>(), ["flat", "foam"]);
         let statistics: serde_json::Value = serde_json::from_slice(&files["statistics.json"]).expect("JSON");
-        let train = files.keys().filter(|name| name.starts_with("data/train-")).flat_map(|name| rows(&folders[0].join(name)));
+        let train =
+            files.keys().filter(|name| name.starts_with("data/train-")).flat_map(|name| rows(&folders[0].join(name)));
         let levels: Vec<f64> = train
             .flat_map(|batch| {
                 let column = batch.column_by_name("tnce_total").expect("a column");
@@ -256,6 +257,15 @@ mod slow {
         assert!(read("README.md").contains("References are among the rows"));
         assert!(read("croissant.json").contains("\"license\": \"cc-by-4.0\""));
         assert!(read("surfaces.csv").lines().filter(|l| l.contains("foam")).all(|l| l.contains(",train,")));
+        let selected = ["0001_0", "0001_1"].map(|name| name.parse().expect("an id")).into();
+        let selection = SurfaceSelection { predicate: "surface_id like '0001%'".into(), surfaces: selected };
+        let split = SplitParams { by: SplitBy::Nothing, ..SplitParams::default() };
+        let asked = TrainingSet { selection: Some(selection), split, ..TrainingSet::default() };
+        let folder = home.path().join("selected");
+        let some = write_training_set(&lake, &folder, &asked, &mut |_, _| {}).await.expect("written");
+        assert_eq!(some.parts.iter().map(|p| p.surfaces).sum::<usize>(), 2);
+        let card = std::fs::read_to_string(folder.join("README.md")).expect("a card");
+        assert!(card.contains("Surfaces were selected by `surface_id like '0001%'`."), "{card}");
         let sums = String::from_utf8(files["SHA256SUMS"].clone()).expect("text");
         assert_eq!(sums.lines().count(), files.len() - 1);
     }

@@ -73,6 +73,9 @@ pub(super) fn card_text(about: &CardContents<'_>) -> String {
     if about.origins().iter().any(|o| o == "simulated") {
         text.push_str("Simulated surfaces come from a Kirchhoff model of single reflections, not from a rig.\n");
     }
+    if let Some(selection) = &about.plan.set.selection {
+        let _ = writeln!(text, "Surfaces were selected by `{}`.", selection.predicate);
+    }
     let _ = writeln!(text, "\n## Splits\n\n{} (`{}`, seed {})", about.split_words(), split.by.name(), split.seed);
     text.push_str(
         "No physical panel (column `group`) is in two splits: neither a side of it, nor a repeated run, nor a \

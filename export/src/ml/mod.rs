@@ -10,6 +10,7 @@ mod split;
 mod statistics;
 mod surfaces;
 
+use std::collections::HashSet;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -43,6 +44,15 @@ pub enum RowSymmetries {
     All,
 }
 
+/// Surfaces that a predicate selects.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SurfaceSelection {
+    /// The predicate, for the card.
+    pub predicate: String,
+    /// The surfaces.
+    pub surfaces: HashSet<SurfaceId>,
+}
+
 /// Parameters of a training set.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrainingSet {
@@ -50,6 +60,8 @@ pub struct TrainingSet {
     pub symmetries: RowSymmetries,
     /// Its split into parts.
     pub split: SplitParams,
+    /// Surfaces that it has; None for all.
+    pub selection: Option<SurfaceSelection>,
     /// Columns of `measurements`, `nce` and `tnce`; the default columns if empty.
     pub columns: Vec<String>,
     /// True if surfaces that normalise others, and others of typology `reference`, are training rows, too.
@@ -63,6 +75,7 @@ impl Default for TrainingSet {
         Self {
             symmetries: RowSymmetries::None,
             split: SplitParams::default(),
+            selection: None,
             columns: Vec::new(),
             references: false,
             license: None,
@@ -128,6 +141,9 @@ impl Plan {
     async fn new(lake: &Lake, snapshot: &LakeSnapshot, set: &TrainingSet) -> Result<Self> {
         let columns = TrainingColumns::choose(lake.rig(), &set.columns)?;
         let (mut surfaces, waiting) = surfaces::read_surfaces(lake, snapshot).await?;
+        if let Some(selection) = &set.selection {
+            surfaces.retain(|surface| selection.surfaces.contains(&surface.id));
+        }
         let references: Vec<_> =
             surfaces.extract_if(.., |s| s.reference && !set.references).map(|reference| reference.id).collect();
         if surfaces.is_empty() {
@@ -302,7 +318,7 @@ async fn shards_of(job: &Arc<ExportJob>, progress: &mut dyn FnMut(usize, usize))
 }
 
 fn part_counts(plan: &Plan, part: SplitPart, height_maps: usize) -> PartCounts {
-    let panels: std::collections::HashSet<_> = plan.of_part(part).map(|s| s.id.panel().to_owned()).collect();
+    let panels: HashSet<_> = plan.of_part(part).map(|s| s.id.panel().to_owned()).collect();
     let files = plan.shards.iter().filter(|s| s.part == part).count();
     PartCounts { part, files, panels: panels.len(), surfaces: plan.of_part(part).count(), rows: 0, height_maps }
 }
