@@ -228,13 +228,9 @@ pub async fn write_training_set(
     let written = shards_of(&job, progress).await?;
     let ExportJob { plan, folder: pending, snapshot, .. } = &*job;
     let mut sources = Vec::new();
-<<<<<<< HEAD
     let mut rejected = 0;
-    for (one, shard::WrittenShard { file, rows, rejected: of_shard }) in plan.shards.iter().zip(written) {
-        rejected += of_shard;
-=======
     for (one, written) in plan.shards.iter().zip(written) {
->>>>>>> 22c2510b (Loader: coarser height maps with their size, spectra, normalisation by statistics of the set; a new baseline (untrained))
+        rejected += written.rejected;
         if let Some(counts) = parts.iter_mut().find(|p| p.part == one.part) {
             counts.rows += written.surface_rows.iter().sum::<u64>();
         }
@@ -281,11 +277,7 @@ struct ExportJob {
 }
 
 // One file per core at a time.
-<<<<<<< HEAD
-async fn shards_of(job: &Arc<ExportJob>, progress: &mut dyn FnMut(usize, usize)) -> Result<Vec<shard::WrittenShard>> {
-=======
 async fn shards_of(job: &Arc<ExportJob>, progress: &mut dyn FnMut(usize, usize)) -> Result<Vec<WrittenShard>> {
->>>>>>> 22c2510b (Loader: coarser height maps with their size, spectra, normalisation by statistics of the set; a new baseline (untrained))
     let surfaces = |of: &Shard| of.surfaces.len();
     let mut done = 0;
     let total = job.plan.shards.iter().map(surfaces).sum();

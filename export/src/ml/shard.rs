@@ -49,36 +49,23 @@ impl<'a> ShardWriter<'a> {
     }
 }
 
-<<<<<<< HEAD
-/// A file of measurements that is written.
-pub(super) struct WrittenShard {
-    pub file: WrittenFile,
-    /// Rows of each surface.
-    pub rows: Vec<u64>,
-    /// Measurements that are left out because they are rejected.
-    pub rejected: u64,
-=======
 /// A file of measurements, the rows of each of its surfaces, and the statistics of all.
 pub(super) struct WrittenShard {
     pub file: WrittenFile,
     pub surface_rows: Vec<u64>,
     pub statistics: ColumnStatistics,
->>>>>>> 22c2510b (Loader: coarser height maps with their size, spectra, normalisation by statistics of the set; a new baseline (untrained))
+    /// Measurements that are left out because they are rejected.
+    pub rejected: u64,
 }
 
 /// Writes a file of measurements.
 pub(super) async fn write_shard(job: &ExportJob, shard: &Shard) -> Result<WrittenShard> {
     let ExportJob { lake, snapshot, plan, folder } = job;
     let mut writer = ShardWriter::create(folder, &shard.name, plan.schema())?;
-<<<<<<< HEAD
     let maker = RowBuilder { lake, snapshot, columns: &plan.columns, moves: &plan.moves, rejected: &plan.rejected };
-    let mut counts = Vec::with_capacity(shard.surfaces.len());
-    let mut rejected = 0;
-=======
-    let maker = RowBuilder { lake, snapshot, columns: &plan.columns, moves: &plan.moves };
     let mut surface_rows = Vec::with_capacity(shard.surfaces.len());
     let mut statistics = ColumnStatistics::default();
->>>>>>> 22c2510b (Loader: coarser height maps with their size, spectra, normalisation by statistics of the set; a new baseline (untrained))
+    let mut rejected = 0;
     for surface in &shard.surfaces {
         let mut rows = 0;
         for run in &surface.runs {
@@ -93,11 +80,7 @@ pub(super) async fn write_shard(job: &ExportJob, shard: &Shard) -> Result<Writte
         writer.end_row_group()?;
         surface_rows.push(rows);
     }
-<<<<<<< HEAD
-    Ok(WrittenShard { file: writer.finish()?, rows: counts, rejected })
-=======
-    Ok(WrittenShard { file: writer.finish()?, surface_rows, statistics })
->>>>>>> 22c2510b (Loader: coarser height maps with their size, spectra, normalisation by statistics of the set; a new baseline (untrained))
+    Ok(WrittenShard { file: writer.finish()?, surface_rows, statistics, rejected })
 }
 
 /// Writes the height maps of a part; returns the file, if there are any, and the number of surfaces that have them.
