@@ -141,8 +141,8 @@ def integrate_relief(heights: Tensor, size_mm: float, microphone: Tensor, speake
     for beam_hz in BEAMS_HZ:
         # A piston's gain up to its first null is about a Gaussian.
         exponent = (2 * math.pi * beam_hz / SPEED_MM_S * TWEETER_RADIUS_MM) ** 2 / 8
-        beam = (weights * torch.exp(exponent * (along.square() - 1))).flatten(1)
-        pulse = torch.zeros(len(heights), samples).scatter_add_(1, arrivals, beam)
+        beam = weights * torch.exp(exponent * (along.square() - 1)) if beam_hz > 0 else weights
+        pulse = torch.zeros(len(heights), samples).scatter_add_(1, arrivals, beam.flatten(1))
         energies = torch.view_as_real(torch.fft.rfft(pulse)).square().sum(2) @ octaves
         levels.append(10 * torch.log10(energies + 1e-30))
     return torch.stack(levels, 1)
@@ -155,24 +155,22 @@ def find_mirror(microphone: Tensor, speaker: Tensor) -> Tensor:
 
 
 class RidgeRegression:
-    """Levels as a linear function of inputs and their products, from the rows that the network learns from."""
+    """Levels as a linear function of inputs, from the rows that the network learns from."""
 
     def __init__(self, inputs: int, bands: int) -> None:
-        self.upper = torch.triu_indices(inputs + 1, inputs + 1)
-        self.sums = torch.zeros(self.upper.shape[1], self.upper.shape[1] + bands, dtype=torch.float64)
-
-    def expand_inputs(self, inputs: Tensor) -> Tensor:
-        """Constant, inputs and products."""
-        factors = torch.cat([torch.ones(len(inputs), 1), inputs], 1).double()
-        return factors[:, self.upper[0]] * factors[:, self.upper[1]]
+        self.sums = torch.zeros(inputs + 1, inputs + 1 + bands, dtype=torch.float64)
 
     def add_rows(self, inputs: Tensor, levels: Tensor) -> None:
         """Takes rows into account."""
-        expanded = self.expand_inputs(inputs)
-        self.sums += expanded.T @ torch.cat([expanded, levels.double()], 1)
+        factors = self.add_constant(inputs)
+        self.sums += factors.T @ torch.cat([factors, levels.double()], 1)
+
+    def add_constant(self, inputs: Tensor) -> Tensor:
+        """Inputs and a column of ones."""
+        return torch.cat([inputs, torch.ones(len(inputs), 1)], 1).double()
 
     def solve_weights(self) -> Tensor:
-        """The weights of the expanded inputs."""
+        """The weights ``[inputs + 1, bands]``."""
         squares, products = self.sums[:, : len(self.sums)], self.sums[:, len(self.sums) :]
         return torch.linalg.solve(squares + RIDGE_WEIGHT * torch.diag(squares.diagonal() + 1e-9), products)
 
@@ -324,7 +322,7 @@ def main() -> None:
     predictors: dict[str, Predictor] = {
         "mean": lambda batch: means.mean.expand(len(batch["pair_id"]), -1),
         "pair mean": lambda batch: means.of_pair[batch["pair_id"].long()],
-        "ridge": lambda batch: (ridge.expand_inputs(batch["inputs"]) @ weights).float(),
+        "ridge": lambda batch: (ridge.add_constant(batch["inputs"]) @ weights).float(),
         "integral": lambda batch: batch["integral"],
         "network": lambda batch: batch["integral"] + network(batch["inputs"]),
     }
