@@ -32,6 +32,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
+from echolake.contributions import ContributionClient
 from echolake.torch import Batch, MeasurementRows, Measurements
 
 FLOOR_DB = -40.0
@@ -286,11 +287,12 @@ def main() -> None:
     """Trains, predicts and reports."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("folder", help="a training set of `echolake export ml --columns tnce_band_2500,...`")
-    parser.add_argument("--steps", type=int, default=500)
+    parser.add_argument("--steps", type=int, default=400)
     parser.add_argument("--batch-size", type=int, default=256)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--checkpoint", type=Path, default=Path("baseline.pt"), help="written often, and continued")
     parser.add_argument("--predict", type=Path, metavar="PARQUET", help="writes predictions for the held-out panels")
+    parser.add_argument("--send", metavar="URL", help="stores these in the lake that is served there")
     parser.add_argument("--few", action="store_true", help=f"learns from fewer than {LEAST_RELIEFS} reliefs, too")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
@@ -344,10 +346,13 @@ def main() -> None:
         "weights_sha256": digest_weights(network),
         "trained_on": trained_on,
     }
+    version = report["weights_sha256"][:16]
     if arguments.predict:
-        # The lake takes this file as predictions of a model by name and version.
-        about = {"model": "baseline", "version": report["weights_sha256"][:16], "trained_on": json.dumps(trained_on)}
+        about = {"model": "baseline", "version": version, "trained_on": json.dumps(trained_on)}
         pq.write_table(predicted.replace_schema_metadata(about), arguments.predict)
+    if arguments.send:
+        client = ContributionClient(arguments.send, os.environ.get("ECHOLAKE_TOKEN"))
+        client.predict("baseline", version, predicted)
     print(json.dumps(report, indent=2) if arguments.json else format_report(report))
 
 

@@ -69,7 +69,7 @@ def rows_of_plate(name: str, height: float, microphones: Any, speakers: Any) -> 
 
 
 def command(folder: Path, checkpoint: Path, *more: str) -> list[str]:
-    steps = ["--steps", "200", "--batch-size", "32", "--json"]
+    steps = ["--steps", "100", "--batch-size", "32", "--json"]
     return [sys.executable, str(BASELINE), str(folder), "--checkpoint", str(checkpoint), *steps, *more]
 
 

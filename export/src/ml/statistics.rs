@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use arrow::array::{Array as _, AsArray as _};
+use arrow::array::AsArray as _;
 use arrow::datatypes::{DataType, Float32Type};
 use arrow::record_batch::RecordBatch;
 use serde_json::{Value, json};
