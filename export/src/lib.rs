@@ -23,7 +23,8 @@ mod tests;
 pub use acoustics::{ResponseFormat, SOFA_COLUMNS, write_responses, write_sofa_file, write_wav};
 pub use error::{Error, Result};
 pub use ml::{
-    ExportSummary, PartCounts, RowSymmetries, SHARDS, SplitBy, SplitParams, SplitPart, TrainingSet, write_training_set,
+    ExportSummary, PartCounts, RowSymmetries, SHARDS, SplitBy, SplitParams, SplitPart, SurfaceSelection, TrainingSet,
+    write_training_set,
 };
 pub use output::{PendingFile, WrittenFile};
 pub use slice::{Check, Layout, Outline, OutlineSchema, OutlineTopic, Slice, SliceParams, Taken, outline_slice};

@@ -5,7 +5,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use arrow::array::AsArray as _;
-use arrow::datatypes::{Int32Type, Int64Type};
+use arrow::datatypes::{Float32Type, Int32Type, Int64Type};
 use arrow::record_batch::RecordBatch;
 use echolake_acquisition::run::controller::RecordingMode;
 use echolake_import::{ImportOptions, import_gir, import_wav};
@@ -192,6 +192,23 @@ mod slow {
         assert!(files == again, "the same lake gives the same bytes");
         assert_eq!(exported[0].parts.iter().map(|p| p.surfaces).sum::<usize>(), SURFACES.len() - 2);
         assert_eq!(exported[0].references.iter().map(|s| s.as_str()).collect::<Vec<_>>(), ["flat", "foam"]);
+        let statistics: serde_json::Value = serde_json::from_slice(&files["statistics.json"]).expect("JSON");
+        let train =
+            files.keys().filter(|name| name.starts_with("data/train-")).flat_map(|name| rows(&folders[0].join(name)));
+        let levels: Vec<f64> = train
+            .flat_map(|batch| {
+                let column = batch.column_by_name("tnce_total").expect("a column");
+                column.as_primitive::<Float32Type>().values().iter().map(|x| f64::from(*x)).collect::<Vec<_>>()
+            })
+            .collect();
+        let mean = levels.iter().sum::<f64>() / levels.len() as f64;
+        let variance = levels.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / levels.len() as f64;
+        let told = &statistics["columns"]["tnce_total"];
+        assert_eq!(told["values"], levels.len());
+        assert!((told["mean"].as_f64().expect("a number") - mean).abs() < 1e-9, "{told} {mean}");
+        assert!((told["standard_deviation"].as_f64().expect("a number") - variance.sqrt()).abs() < 1e-9, "{told}");
+        assert_eq!(statistics["columns"]["microphone_mm"]["mean"].as_array().map(Vec::len), Some(3));
+        assert!(statistics["columns"]["heights_mm"]["standard_deviation"].as_f64() > Some(0.0));
         let mut split_of: HashMap<String, HashSet<String>> = HashMap::new();
         let mut counted: HashMap<String, u64> = HashMap::new();
         let mut maps: HashSet<(String, String)> = HashSet::new();
@@ -240,6 +257,15 @@ mod slow {
         assert!(read("README.md").contains("References are among the rows"));
         assert!(read("croissant.json").contains("\"license\": \"cc-by-4.0\""));
         assert!(read("surfaces.csv").lines().filter(|l| l.contains("foam")).all(|l| l.contains(",train,")));
+        let selected = ["0001_0", "0001_1"].map(|name| name.parse().expect("an id")).into();
+        let selection = SurfaceSelection { predicate: "surface_id like '0001%'".into(), surfaces: selected };
+        let split = SplitParams { by: SplitBy::Nothing, ..SplitParams::default() };
+        let asked = TrainingSet { selection: Some(selection), split, ..TrainingSet::default() };
+        let folder = home.path().join("selected");
+        let some = write_training_set(&lake, &folder, &asked, &mut |_, _| {}).await.expect("written");
+        assert_eq!(some.parts.iter().map(|p| p.surfaces).sum::<usize>(), 2);
+        let card = std::fs::read_to_string(folder.join("README.md")).expect("a card");
+        assert!(card.contains("Surfaces were selected by `surface_id like '0001%'`."), "{card}");
         let sums = String::from_utf8(files["SHA256SUMS"].clone()).expect("text");
         assert_eq!(sums.lines().count(), files.len() - 1);
     }

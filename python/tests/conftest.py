@@ -140,7 +140,8 @@ def small_set(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 writer.write_table(table)
     names = [f"{surface:04}_0" for surface in range(13)]
     heights = pa.array([[surface, 1.0, 2.0, 3.0] for surface in range(13)], pa.list_(pa.float32(), 4))
-    maps = pa.table({"surface_id": names, "symmetry": ["identity"] * 13, "heights_mm": heights})
+    sizes = pa.array([100.0] * 13, pa.float32())
+    maps = pa.table({"surface_id": names, "symmetry": ["identity"] * 13, "size_mm": sizes, "heights_mm": heights})
     pq.write_table(maps, path / "heightmaps" / "train.parquet")
     return path
 

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 pa = pytest.importorskip("pyarrow")
+pytest.importorskip("pyarrow.parquet")
 
 from echolake.symmetry import turn_heights, turn_positions  # noqa: E402
 from echolake.training import EpochOrder, MeasurementBatches, MeasurementRows, OrderSettings  # noqa: E402
@@ -280,3 +281,70 @@ def test_mistakes_are_named(small_set: Path, tmp_path: Path) -> None:
         MeasurementBatches(small_set, clump=8, memory=1 << 10)
     with pytest.raises(TypeError, match="clumps"):
         MeasurementBatches(small_set, clumps=3)
+
+
+def test_heights_come_in_coarser_cells_with_their_size(small_set: Path) -> None:
+    rows = MeasurementRows(small_set, columns=["pair_id"], heights=1)
+    row = rows[0]
+    assert row["heights"].tolist() == [[1.5]]
+    assert row["size_mm"] == 100
+    with pytest.raises(ValueError, match="heights=3, expected a divisor of the 2 cells"):
+        MeasurementRows(small_set, columns=["pair_id"], heights=3)[0]
+
+
+def test_spectra_have_the_energy_of_responses(training_set: Path) -> None:
+    batch = next(iter(MeasurementBatches(training_set, columns=["ir"], spectra=["ir"], batch_size=16)))
+    spectrum, response = batch["ir_spectrum"], batch["ir"].astype(np.float64)
+    # Parseval, with the bins between first and last standing for their mirror images, too.
+    power = np.abs(spectrum.astype(np.complex128)) ** 2
+    energy = (power[:, 0] + 2 * power[:, 1:-1].sum(1) + power[:, -1]) / response.shape[1]
+    assert np.allclose(energy, (response**2).sum(1), rtol=1e-5)
+    rows = MeasurementRows(training_set, columns=["ir"], spectra=["ir"])
+    assert rows.frequencies_hz("ir")[[0, 1, -1]].tolist() == [0, 250, 48_000]
+    assert rows[0]["ir_spectrum"].shape == (193,)
+    with pytest.raises(KeyError, match="no columns of responses"):
+        MeasurementRows(training_set, columns=["ir", "snr_db"], spectra=["snr_db"])
+
+
+def test_normalised_columns_have_mean_0_and_deviation_1_over_split_train(training_set: Path) -> None:
+    columns = ["pair_id", "ir", "tnce_total", "microphone_mm"]
+    batches = list(MeasurementBatches(training_set, columns=columns, heights=True, normalise=True, shuffle=False))
+    for name in ("ir", "tnce_total"):
+        values = np.concatenate([batch[name].astype(np.float64).ravel() for batch in batches])
+        assert abs(values.mean()) < 1e-5
+        assert abs(values.std() - 1) < 1e-5
+    positions = np.concatenate([batch["microphone_mm"].astype(np.float64) for batch in batches])
+    assert np.allclose([positions.mean(0), positions.std(0)], [[0] * 3, [1] * 3], atol=1e-5)
+    plain = list(MeasurementBatches(training_set, columns=["pair_id"], heights=True, shuffle=False))
+    assert all(np.array_equal(one["pair_id"], other["pair_id"]) for one, other in zip(batches, plain, strict=True))
+    maps = {
+        name: height for batch in batches for name, height in zip(batch["surface_ids"], batch["heights"], strict=True)
+    }
+    heights = np.stack(list(maps.values())).astype(np.float64)
+    assert abs(heights.mean()) < 1e-4
+    assert abs(heights.std() - 1) < 1e-4
+
+
+def test_units_and_rates_are_in_the_schema(training_set: Path) -> None:
+    schema = pa.parquet.read_schema(next((training_set / "data").glob("train-*.parquet")))
+    units = {name: schema.field(name).metadata[b"unit"] for name in ("ir", "tnce_total", "temperature_c", "speaker_mm")}
+    assert units == {"ir": b"1", "tnce_total": b"1", "temperature_c": b"C", "speaker_mm": b"mm"}
+    assert schema.field("ir").metadata[b"rate_hz"] == b"96000"
+
+
+@pytest.mark.parametrize("program", ["pyarrow", "polars", "datasets"])
+def test_missing_lists_do_not_move_the_rows_behind_them(small_set: Path, program: str, tmp_path: Path) -> None:
+    read = pytest.importorskip(program)
+    file = str(small_set / "data" / "train-1.parquet")
+    found: list[dict[str, Any]]
+    if program == "pyarrow":
+        found = pa.parquet.read_table(file).to_pylist()
+    elif program == "polars":
+        found = read.read_parquet(file).to_dicts()
+    else:
+        found = list(read.load_dataset("parquet", data_files=file, split="train", cache_dir=str(tmp_path)))
+    assert len(found) == 41 + 45 + 49
+    for row in found:
+        surface, pair = int(row["surface_id"][:4]), row["pair_id"]
+        assert row["ir"] == (None if pair == 3 else [surface, pair, 0, 0])
+        assert row["microphone_mm"] == [surface, pair, 7]

@@ -2,15 +2,18 @@
 
 mod export_target;
 
+use std::collections::HashSet;
+
 use anyhow::Context as _;
 use clap::{Args, Subcommand, ValueEnum};
 use echolake_export::{
     Check, ExportSummary, Layout, PendingFile, ResponseFormat, RowSymmetries, Slice, SliceParams, SplitBy, SplitParams,
-    Taken, TrainingSet, WrittenFile, write_responses, write_training_set, write_wav,
+    SurfaceSelection, Taken, TrainingSet, WrittenFile, write_responses, write_training_set, write_wav,
 };
 use echolake_lake::Lake;
 use echolake_query::{PredicateForm, Session};
 use echolake_schema::SurfaceId;
+use serde::Deserialize;
 use serde_json::json;
 
 use export_target::{ExportTarget, PendingExport};
@@ -43,6 +46,9 @@ pub(crate) struct MlArgs {
     /// Unit that the validation and test sets hold out.
     #[arg(long, value_enum, default_value_t = SplitArg::ByPanel)]
     split: SplitArg,
+    /// Surfaces: an SQL predicate over the columns of view catalogue; by default all.
+    #[arg(long = "where", value_name = "PREDICATE")]
+    predicate: Option<String>,
     /// Columns of measurements, nce and tnce, separated by commas; by default ir, temperature_c, snr_db and tnce_*.
     #[arg(long, value_delimiter = ',')]
     columns: Vec<String>,
@@ -172,6 +178,10 @@ async fn export_ml(lake: &Lake, args: &MlArgs) -> anyhow::Result<()> {
     let set = TrainingSet {
         symmetries,
         split,
+        selection: match &args.predicate {
+            Some(predicate) => Some(select_surfaces(lake, predicate).await?),
+            None => None,
+        },
         columns: args.columns.clone(),
         references: args.references,
         license: args.license.clone(),
@@ -307,6 +317,21 @@ fn finish_task(task: Option<TaskProgress>, what: String) {
 
 fn wanted_check(selection: &SelectionArgs) -> Check {
     if selection.quick { Check::Ends } else { Check::Whole }
+}
+
+#[derive(Deserialize)]
+struct SelectedSurface {
+    surface_id: SurfaceId,
+}
+
+async fn select_surfaces(lake: &Lake, predicate: &str) -> anyhow::Result<SurfaceSelection> {
+    let session = Session::new(lake)?;
+    let select = "select surface_id from catalogue where";
+    let sql = session.append_predicate(select, predicate, PredicateForm::AnyExpression).context("--where")?;
+    let rows: Vec<SelectedSurface> = super::sql::query_rows(&session, &sql).await.context("--where")?;
+    let surfaces: HashSet<_> = rows.into_iter().map(|row| row.surface_id).collect();
+    anyhow::ensure!(!surfaces.is_empty(), "`{predicate}` selects no surface; hint: `echolake sql` tries predicates");
+    Ok(SurfaceSelection { predicate: predicate.to_owned(), surfaces })
 }
 
 async fn select_measurements(lake: &Lake, selection: &SelectionArgs) -> anyhow::Result<Vec<Taken>> {

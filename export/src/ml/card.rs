@@ -73,6 +73,9 @@ pub(super) fn card_text(about: &CardContents<'_>) -> String {
     if about.origins().iter().any(|o| o == "simulated") {
         text.push_str("Simulated surfaces come from a Kirchhoff model of single reflections, not from a rig.\n");
     }
+    if let Some(selection) = &about.plan.set.selection {
+        let _ = writeln!(text, "Surfaces were selected by `{}`.", selection.predicate);
+    }
     let _ = writeln!(text, "\n## Splits\n\n{} (`{}`, seed {})", about.split_words(), split.by.name(), split.seed);
     text.push_str(
         "No physical panel (column `group`) is in two splits: neither a side of it, nor a repeated run, nor a \
@@ -184,7 +187,8 @@ fn add_files_section(text: &mut String, about: &CardContents<'_>) {
         "\n## Files\n\n- `data/<split>-*.parquet`: measurements. Whole surfaces in a file, one row group a surface, in \
          a drawn order.\n- `heightmaps/<split>.parquet`: the surfaces' heights, joined by `surface_id` and \
          `symmetry`.\n- `surfaces.csv`: every surface and run, its file, rows, and the digests of what its rows were \
-         derived from.\n- `croissant.json`: the same as Croissant metadata. `SHA256SUMS`: `sha256sum -c SHA256SUMS` \
+         derived from.\n- `statistics.json`: mean and standard deviation of each column over split train, of positions by \
+         axis.\n- `croissant.json`: the same as Croissant metadata. `SHA256SUMS`: `sha256sum -c SHA256SUMS` \
          checks all files.\n\n",
     );
     text.push_str(match about.plan.set.symmetries {

@@ -11,6 +11,8 @@ use crate::error::{Error, Result};
 
 /// Tables whose columns can be chosen; the first one that has a name provides the column.
 const TABLES: [Table; 3] = [Table::Measurements, Table::Nce, Table::Tnce];
+/// Key of a response's sampling rate in its column's metadata.
+const RATE_HZ: &str = "rate_hz";
 /// Columns that are keys here already, or repeat `surfaces.csv`.
 const NOT_CHOSEN: [&str; 10] = [
     "surface_id",
@@ -86,14 +88,18 @@ fn unknown_column(name: &str, tables: &[(Table, SchemaRef)]) -> Error {
     Error::Unknown { kind: "column", name: name.to_owned(), known: known.join(", ") }
 }
 
-// Numbers in single precision, as networks take them; lists of the rig's fixed length.
+// Numbers in single precision, as networks take them; lists of the rig's fixed length, with their rate.
 fn narrowed_field(field: &Field, rig: &Rig) -> Result<Field> {
-    let data_type = match field.data_type() {
-        DataType::Float64 => DataType::Float32,
-        DataType::List(_) => list_type(rig.impulse_response.length)?,
-        other => other.clone(),
-    };
-    Ok(field.clone().with_data_type(data_type))
+    let mut narrowed = field.clone();
+    match field.data_type() {
+        DataType::Float64 => narrowed.set_data_type(DataType::Float32),
+        DataType::List(_) => {
+            narrowed.set_data_type(list_type(rig.impulse_response.length)?);
+            narrowed.metadata_mut().insert(RATE_HZ.to_owned(), rig.sweep.rate_hz.get().to_string());
+        }
+        _ => {}
+    }
+    Ok(narrowed)
 }
 
 /// Returns the type of a list of `length` f32.
@@ -164,6 +170,7 @@ mod tests {
         assert_eq!(usual.of_table(Table::Tnce).len(), 6);
         let length = |name: &str| usual.schema().field_with_name(name).map(|f| f.data_type().clone()).expect(name);
         assert_eq!(length("ir"), list_type(384).expect("a list"));
+        assert_eq!(usual.schema().field_with_name("ir").expect("ir").metadata()[RATE_HZ], "96000");
         let some =
             TrainingColumns::choose(&rig, &["nce_2500".into(), "tnce_total".into(), "nce_2500".into()]).expect("some");
         assert_eq!(some.chosen().len(), 2);

@@ -44,7 +44,11 @@ pub(super) fn croissant_json(about: &CardContents<'_>) -> Result<String> {
             "name": file.name,
             "contentUrl": file.name,
             "contentSize": format!("{} B", file.bytes),
-            "encodingFormat": if file.name.ends_with(".csv") { "text/csv" } else { PARQUET },
+            "encodingFormat": match file.name.rsplit('.').next() {
+                Some("csv") => "text/csv",
+                Some("json") => "application/json",
+                _ => PARQUET,
+            },
             "sha256": file.sha256,
         })
     }));

@@ -7,8 +7,10 @@ mod heights;
 mod measurements;
 mod shard;
 mod split;
+mod statistics;
 mod surfaces;
 
+use std::collections::HashSet;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -23,7 +25,9 @@ use crate::error::{Error, Result};
 use crate::output::{PendingFolder, WrittenFile};
 use columns::TrainingColumns;
 use measurements::SymmetryMoves;
+use shard::WrittenShard;
 pub use split::{SplitBy, SplitParams, SplitPart};
+use statistics::ColumnStatistics;
 use surfaces::TrainingSurface;
 
 /// Minimum number of files per split, if it has that many surfaces: loaders give whole files to their workers.
@@ -40,6 +44,15 @@ pub enum RowSymmetries {
     All,
 }
 
+/// Surfaces that a predicate selects.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SurfaceSelection {
+    /// The predicate, for the card.
+    pub predicate: String,
+    /// The surfaces.
+    pub surfaces: HashSet<SurfaceId>,
+}
+
 /// Parameters of a training set.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrainingSet {
@@ -47,6 +60,8 @@ pub struct TrainingSet {
     pub symmetries: RowSymmetries,
     /// Its split into parts.
     pub split: SplitParams,
+    /// Surfaces that it has; None for all.
+    pub selection: Option<SurfaceSelection>,
     /// Columns of `measurements`, `nce` and `tnce`; the default columns if empty.
     pub columns: Vec<String>,
     /// True if surfaces that normalise others, and others of typology `reference`, are training rows, too.
@@ -60,6 +75,7 @@ impl Default for TrainingSet {
         Self {
             symmetries: RowSymmetries::None,
             split: SplitParams::default(),
+            selection: None,
             columns: Vec::new(),
             references: false,
             license: None,
@@ -125,6 +141,9 @@ impl Plan {
     async fn new(lake: &Lake, snapshot: &LakeSnapshot, set: &TrainingSet) -> Result<Self> {
         let columns = TrainingColumns::choose(lake.rig(), &set.columns)?;
         let (mut surfaces, waiting) = surfaces::read_surfaces(lake, snapshot).await?;
+        if let Some(selection) = &set.selection {
+            surfaces.retain(|surface| selection.surfaces.contains(&surface.id));
+        }
         let references: Vec<_> =
             surfaces.extract_if(.., |s| s.reference && !set.references).map(|reference| reference.id).collect();
         if surfaces.is_empty() {
@@ -192,11 +211,17 @@ pub async fn write_training_set(
     let pending = PendingFolder::create(folder)?;
     let mut parts = Vec::new();
     let mut files = Vec::new();
+    let mut statistics = ColumnStatistics::default();
     for part in SplitPart::ALL {
         if plan.of_part(part).next().is_some() {
-            let (written, height_maps) = shard::write_height_maps(lake, &snapshot, &plan, part, &pending).await?;
+            let mut of_part = ColumnStatistics::default();
+            let (written, height_maps) =
+                shard::write_height_maps(lake, &snapshot, &plan, part, &pending, &mut of_part).await?;
             files.extend(written);
             parts.push(part_counts(&plan, part, height_maps));
+            if part == SplitPart::Train {
+                statistics = of_part;
+            }
         }
     }
     let job = Arc::new(ExportJob { lake: lake.clone(), snapshot, plan, folder: pending });
@@ -204,14 +229,18 @@ pub async fn write_training_set(
     let ExportJob { plan, folder: pending, snapshot, .. } = &*job;
     let mut sources = Vec::new();
     let mut rejected = 0;
-    for (one, shard::WrittenShard { file, rows, rejected: of_shard }) in plan.shards.iter().zip(written) {
-        rejected += of_shard;
+    for (one, written) in plan.shards.iter().zip(written) {
+        rejected += written.rejected;
         if let Some(counts) = parts.iter_mut().find(|p| p.part == one.part) {
-            counts.rows += rows.iter().sum::<u64>();
+            counts.rows += written.surface_rows.iter().sum::<u64>();
         }
-        sources.push((one, rows));
-        files.push(file);
+        if one.part == SplitPart::Train {
+            statistics.merge_sums(written.statistics);
+        }
+        sources.push((one, written.surface_rows));
+        files.push(written.file);
     }
+    files.push(pending.write_file("statistics.json", statistics.to_json().as_bytes())?);
     files.push(pending.write_file("surfaces.csv", card::sources_csv(&sources)?.as_bytes())?);
     let left_out = plan.left_out.clone();
     let references = plan.references.clone();
@@ -248,7 +277,7 @@ struct ExportJob {
 }
 
 // One file per core at a time.
-async fn shards_of(job: &Arc<ExportJob>, progress: &mut dyn FnMut(usize, usize)) -> Result<Vec<shard::WrittenShard>> {
+async fn shards_of(job: &Arc<ExportJob>, progress: &mut dyn FnMut(usize, usize)) -> Result<Vec<WrittenShard>> {
     let surfaces = |of: &Shard| of.surfaces.len();
     let mut done = 0;
     let total = job.plan.shards.iter().map(surfaces).sum();
@@ -281,7 +310,7 @@ async fn shards_of(job: &Arc<ExportJob>, progress: &mut dyn FnMut(usize, usize))
 }
 
 fn part_counts(plan: &Plan, part: SplitPart, height_maps: usize) -> PartCounts {
-    let panels: std::collections::HashSet<_> = plan.of_part(part).map(|s| s.id.panel().to_owned()).collect();
+    let panels: HashSet<_> = plan.of_part(part).map(|s| s.id.panel().to_owned()).collect();
     let files = plan.shards.iter().filter(|s| s.part == part).count();
     PartCounts { part, files, panels: panels.len(), surfaces: plan.of_part(part).count(), rows: 0, height_maps }
 }

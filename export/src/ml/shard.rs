@@ -11,6 +11,7 @@ use parquet::schema::types::ColumnPath;
 
 use super::measurements::RowBuilder;
 use super::split::SplitPart;
+use super::statistics::ColumnStatistics;
 use super::{ExportJob, Plan, Shard, heights};
 use crate::error::{Error, Result};
 use crate::output::{HashedFile, PendingFolder, WrittenFile};
@@ -48,11 +49,11 @@ impl<'a> ShardWriter<'a> {
     }
 }
 
-/// A file of measurements that is written.
+/// A file of measurements, the rows of each of its surfaces, and the statistics of all.
 pub(super) struct WrittenShard {
     pub file: WrittenFile,
-    /// Rows of each surface.
-    pub rows: Vec<u64>,
+    pub surface_rows: Vec<u64>,
+    pub statistics: ColumnStatistics,
     /// Measurements that are left out because they are rejected.
     pub rejected: u64,
 }
@@ -62,7 +63,8 @@ pub(super) async fn write_shard(job: &ExportJob, shard: &Shard) -> Result<Writte
     let ExportJob { lake, snapshot, plan, folder } = job;
     let mut writer = ShardWriter::create(folder, &shard.name, plan.schema())?;
     let maker = RowBuilder { lake, snapshot, columns: &plan.columns, moves: &plan.moves, rejected: &plan.rejected };
-    let mut counts = Vec::with_capacity(shard.surfaces.len());
+    let mut surface_rows = Vec::with_capacity(shard.surfaces.len());
+    let mut statistics = ColumnStatistics::default();
     let mut rejected = 0;
     for surface in &shard.surfaces {
         let mut rows = 0;
@@ -71,22 +73,25 @@ pub(super) async fn write_shard(job: &ExportJob, shard: &Shard) -> Result<Writte
             rejected += of_run.rejected;
             for batch in maker.row_batches(surface, run, shard.part, &of_run)? {
                 rows += batch.num_rows() as u64;
+                statistics.add_batch(&batch);
                 writer.write(&batch)?;
             }
         }
         writer.end_row_group()?;
-        counts.push(rows);
+        surface_rows.push(rows);
     }
-    Ok(WrittenShard { file: writer.finish()?, rows: counts, rejected })
+    Ok(WrittenShard { file: writer.finish()?, surface_rows, statistics, rejected })
 }
 
 /// Writes the height maps of a part; returns the file, if there are any, and the number of surfaces that have them.
+/// Adds the maps to `statistics`.
 pub(super) async fn write_height_maps(
     lake: &Lake,
     snapshot: &LakeSnapshot,
     plan: &Plan,
     part: SplitPart,
     folder: &PendingFolder,
+    statistics: &mut ColumnStatistics,
 ) -> Result<(Option<WrittenFile>, usize)> {
     let name = format!("heightmaps/{}.parquet", part.name());
     let symmetries = plan.moves.symmetry_names();
@@ -96,6 +101,7 @@ pub(super) async fn write_height_maps(
         let Some(batch) = heights::read_height_maps(lake, snapshot, surface, part, &symmetries).await? else {
             continue;
         };
+        statistics.add_batch(&batch);
         if writer.is_none() {
             writer = Some(ShardWriter::create(folder, &name, &heights::height_map_schema()?)?);
         }

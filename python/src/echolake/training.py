@@ -218,6 +218,11 @@ class MeasurementRows:
     ``path`` is a folder, an address ``http://`` of one (needs fsspec and aiohttp), or a bucket's URI that pyarrow
     reads, as ``s3://bucket/prefix?endpoint_override=...``. A process keeps decoded surfaces up to ``memory`` bytes.
     With ``symmetries="all"`` each surface comes under all eight, one after the other. Rows are dicts of NumPy values.
+
+    ``heights=64`` gives maps of 64 x 64 cells, each the mean of those beneath it. ``normalise`` subtracts the mean of
+    split train from columns of floats and from heights, and divides by its standard deviation. ``spectra=["ir"]`` adds
+    ``ir_spectrum``, ``[samples / 2 + 1]`` complex: the sum of x[n] exp(-2 pi i k n / samples) at ``frequencies_hz``, in
+    the response's unit, never normalised.
     """
 
     def __init__(
@@ -226,11 +231,13 @@ class MeasurementRows:
         split: Literal["train", "validation", "test"] = "train",
         columns: Sequence[str] | None = None,
         *,
-        heights: bool = False,
+        heights: bool | int = False,
         symmetries: Literal["none", "random", "all"] = "none",
+        spectra: Sequence[str] = (),
+        normalise: bool = False,
         memory: int = 256 << 20,
     ) -> None:
-        self.path, self.split, self.symmetries, self.with_heights = str(path), split, symmetries, heights
+        self.path, self.split, self.symmetries, self.heights = str(path), split, symmetries, heights
         self._state: _ProcessState | None = None
         state = self._process_state()
         try:
@@ -258,11 +265,17 @@ class MeasurementRows:
         schema = footers[0].schema.to_arrow_schema()
         self.columns = _numeric_columns(schema, columns, () if symmetries == "none" else _MEASURED)
         self._kinds = {name: _column_kind(schema.field(name)) for name in self.columns}
+        self.spectra = {f"{name}_spectrum": name for name in spectra}
+        if missing := [name for name in spectra if not self._kinds.get(name, (None, ()))[1]]:
+            raise KeyError(f"no spectra of {json.dumps(missing)}, which are no columns of responses")
+        self._rates_hz = {name: (schema.field(name).metadata or {}).get(b"rate_hz") for name in spectra}
+        #: Mean and standard deviation of the columns that are normalised.
+        self.statistics = self._read_statistics(state) if normalise else {}
         row_bytes = sum(dtype.itemsize * int(np.prod(shape)) for dtype, shape in self._kinds.values()) + 8
         surface_bytes = row_bytes * int(self.sizes.max())
         #: Decoded surfaces that a process keeps, and the bytes of all.
         self.capacity, self.all_bytes = max(1, memory // surface_bytes), surface_bytes * len(self._groups)
-        self._heights: dict[str, NDArray[np.float32]] | None = None
+        self._heights: dict[str, tuple[NDArray[np.float32], float]] | None = None
 
     def __len__(self) -> int:
         return int(self.sizes.sum())
@@ -280,13 +293,19 @@ class MeasurementRows:
         found = []
         for row in np.searchsorted(np.sort(wanted), wanted).tolist():
             place = batch["surface"][row]
-            values = {name: batch[name][row] for name in self.columns}
+            values = {name: batch[name][row] for name in (*self.columns, *self.spectra)}
             values |= {"surface_id": batch["surface_ids"][place], "symmetry": batch["symmetries"][place]}
-            found.append(values | ({"heights": batch["heights"][place]} if self.with_heights else {}))
+            found.append(values | {name: batch[name][place] for name in ("heights", "size_mm") if self.heights})
         return found
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_state": None}
+
+    def frequencies_hz(self, response: str) -> NDArray[Any]:
+        """Frequencies of the bins of a response's spectrum."""
+        if not (rate_hz := self._rates_hz.get(response)):
+            raise KeyError(f"no rate of `{response}`; hint: name it in spectra; a set that is older, export again")
+        return np.fft.rfftfreq(self._kinds[response][1][0], 1 / float(rate_hz))
 
     def find_surfaces(self, numbers: Numbers) -> set[int]:
         """The surfaces that rows are of."""
@@ -311,17 +330,20 @@ class MeasurementRows:
         """Rows by number, under the symmetries ``drawn`` for surfaces; those of a surface stand together.
 
         Columns have shape ``[rows, ...]``; ``surface`` points into ``surface_ids`` and ``symmetries``; ``heights`` on
-        request are ``[len(surface_ids), cells, cells]`` in mm.
+        request are ``[len(surface_ids), cells, cells]`` in mm, of panels whose edges are ``size_mm``.
         """
         numbers = np.sort(numbers)
         items, firsts = np.unique(np.searchsorted(self._ends, numbers, side="right"), return_index=True)
         # A set that was exported under all symmetries has each of them in a row group.
         named = [NAMES if self._is_turned else (self._select_symmetry(item, drawn),) for item in items.tolist()]
         kinds = {name: (dtype, (len(numbers), *shape)) for name, (dtype, shape) in self._kinds.items()}
+        for name, of in self.spectra.items():
+            kinds[name] = np.dtype(np.complex64), (len(numbers), self._kinds[of][1][0] // 2 + 1)
         kinds["surface"] = np.dtype(np.int64), (len(numbers),)
-        if self.with_heights:
-            cells = next(iter(self._known_heights().values())).shape
-            kinds["heights"] = np.dtype(np.float32), (sum(len(names) for names in named), *cells)
+        if self.heights:
+            maps = sum(len(names) for names in named)
+            cells = next(iter(self._known_heights().values()))[0].shape
+            kinds["heights"], kinds["size_mm"] = (np.dtype(np.float32), (maps, *cells)), (np.dtype(np.float32), (maps,))
         batch, arrays = allocate(kinds)
         surface_ids: list[str] = []
         stops = [*firsts[1:].tolist(), len(numbers)]
@@ -334,10 +356,17 @@ class MeasurementRows:
                 if name in _POSITIONS and not self._is_turned and names != ("identity",):
                     arrays[name][first:stop] = turn_positions(arrays[name][first:stop], names[0])
             arrays["surface"][first:stop] = len(surface_ids) + read.of_row[rows] * self._is_turned
-            for name in names if self.with_heights else ():
-                height = self._known_heights()[read.surface_id]
-                arrays["heights"][len(surface_ids) + names.index(name)] = turn_heights(height, name)
+            for name in names if self.heights else ():
+                place = len(surface_ids) + names.index(name)
+                height, arrays["size_mm"][place] = self._known_heights()[read.surface_id]
+                arrays["heights"][place] = turn_heights(height, name)
             surface_ids += [read.surface_id] * len(names)
+        for name, of in self.spectra.items():
+            arrays[name][...] = np.fft.rfft(arrays[of])
+        for name in arrays.keys() & self.statistics.keys():
+            mean, deviation = self.statistics[name]
+            arrays[name] -= mean
+            arrays[name] /= deviation
         batch["surface_ids"], batch["symmetries"] = surface_ids, [name for names in named for name in names]
         return batch
 
@@ -351,6 +380,19 @@ class MeasurementRows:
             return set(pq.ParquetFile(file).read_row_group(first.number, ["symmetry"]).column(0).to_pylist())
 
         return state.read(first.file, read_names) != {"identity"}
+
+    def _read_statistics(self, state: _ProcessState) -> dict[str, tuple[NDArray[np.float32], NDArray[np.float32]]]:
+        try:
+            columns = state.read("statistics.json", json.load)["columns"]
+        except FileNotFoundError as missing:
+            raise FileNotFoundError(f"no statistics.json in `{self.path}`; hint: export the set again") from missing
+        found = {}
+        for name, stored in [*((name, name) for name in self.columns), ("heights", "heights_mm")]:
+            if column := columns.get(stored):
+                mean, deviation = (np.array(column[key], np.float32) for key in ("mean", "standard_deviation"))
+                # A column of one value is 0.
+                found[name] = mean, np.where(deviation > 0, deviation, np.float32(1))
+        return found
 
     def _process_state(self) -> _ProcessState:
         if self._state is None or self._state.process != os.getpid():
@@ -393,10 +435,10 @@ class MeasurementRows:
         weakref.finalize(read, state.spare.append, columns)
         return read
 
-    def _known_heights(self) -> dict[str, NDArray[np.float32]]:
+    def _known_heights(self) -> dict[str, tuple[NDArray[np.float32], float]]:
         if self._heights is None:
             name = f"heightmaps/{self.split}.parquet"
-            columns = ["surface_id", "heights_mm"]
+            columns = ["surface_id", "size_mm", "heights_mm"]
 
             def read_maps(file: Any) -> pa.Table:
                 return pq.read_table(file, columns=columns, filters=[("symmetry", "=", "identity")])
@@ -407,8 +449,13 @@ class MeasurementRows:
                 raise FileNotFoundError(f"`{self.path}/{name}` is not there: the lake has no height maps") from missing
             values = _column_values(table.column("heights_mm").combine_chunks())
             cells = round(values.shape[1] ** 0.5)
-            maps = values.reshape(-1, cells, cells)
-            self._heights = dict(zip(table.column("surface_id").to_pylist(), maps, strict=True))
+            wanted = cells if self.heights is True else self.heights
+            if wanted < 1 or cells % wanted > 0:
+                raise ValueError(f"heights={wanted}, expected a divisor of the {cells} cells of the set's maps")
+            maps = values.reshape(-1, wanted, cells // wanted, wanted, cells // wanted).mean((2, 4))
+            sizes = table.column("size_mm").to_pylist()
+            maps_of_sizes = zip(maps, sizes, strict=True)
+            self._heights = dict(zip(table.column("surface_id").to_pylist(), maps_of_sizes, strict=True))
         return self._heights
 
 
@@ -435,8 +482,10 @@ class MeasurementBatches:
         split: Literal["train", "validation", "test"] = "train",
         columns: Sequence[str] | None = None,
         *,
-        heights: bool = False,
+        heights: bool | int = False,
         symmetries: Literal["none", "random", "all"] = "none",
+        spectra: Sequence[str] = (),
+        normalise: bool = False,
         memory: int = 256 << 20,
         rank: int = 0,
         world_size: int = 1,
@@ -451,7 +500,8 @@ class MeasurementBatches:
         if order.get("shuffle") is None:
             order["shuffle"] = split == "train"
         self.settings = OrderSettings(**order)
-        self.source = MeasurementRows(path, split, columns, heights=heights, symmetries=symmetries, memory=memory)
+        inputs: dict[str, Any] = {"heights": heights, "symmetries": symmetries, "spectra": spectra}
+        self.source = MeasurementRows(path, split, columns, **inputs, normalise=normalise, memory=memory)
         if self.settings.shuffle and self.settings.clump != "surface" and self.source.all_bytes > memory:
             warnings.warn(
                 f"clump={self.settings.clump} decodes surfaces again and again: all of them take "
