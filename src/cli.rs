@@ -144,7 +144,8 @@ pub(crate) enum LakeCommand {
         /// Project that the token may see, and no other; repeatable. By default it sees all.
         #[arg(long, value_name = "NAME")]
         project: Vec<ProjectName>,
-        /// What it is for: sql (queries), files (run files, Parquet files, meshes), metrics (the server's own figures).
+        /// What it is for: sql (queries), files (run files, Parquet files, meshes), metrics (the server's own figures),
+        /// annotate (adding annotations and predictions).
         #[arg(long, value_name = "SCOPE,...", value_delimiter = ',', default_value = "sql,files")]
         scopes: Vec<TokenScope>,
     },

@@ -81,7 +81,9 @@ impl SeenContributions {
         let failed = |e| crate::Error::from_execution("", &e);
         let rejected = RejectedMeasurements::from_annotations(annotations.iter().map(AsRef::as_ref));
         let annotated = annotation_table(lake, &annotations, snapshot).map_err(failed)?;
-        let files = lake.list_contributions(ContributionLog::Predictions, counts.predictions).await?;
+        let mut files = lake.list_contributions(ContributionLog::Predictions, counts.predictions).await?;
+        // One that was lost may have an empty file in its place.
+        files.retain(|file| file.bytes > 0);
         let schema = prediction_schema(lake.rig());
         let predicted: Arc<dyn TableProvider> = match lake.is_restricted() {
             false => {

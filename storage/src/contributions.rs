@@ -234,7 +234,8 @@ mod tests {
         std::fs::remove_dir_all(folder.path().join("lake/tables")).expect("removed");
         let again = open(&url).await;
         assert_eq!(again.snapshot().await.expect("a view").contributions(), counts(45));
-        std::fs::remove_file(folder.path().join("lake").join(log.path(7).as_ref())).expect("removed");
+        let path = folder.path().join("lake").join(log.path(7).as_ref());
+        std::fs::remove_file(&path).expect("removed");
         let lost = again.list_contributions(log, 45).await.expect_err("lost").to_string();
         assert!(lost.contains("annotations/00000000000000000007.ndjson"), "{lost}");
     }

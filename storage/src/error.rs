@@ -230,7 +230,10 @@ pub enum Error {
         reason: String,
     },
     /// A contribution that a version of the lake shows is gone.
-    #[error("`{path}` is missing, which the lake's log names; hint: bring it back from a copy of the lake")]
+    #[error(
+        "`{path}` is missing, which the lake's log names; hint: bring it back from a copy of the lake, or put an empty \
+            file in its place to give it up"
+    )]
     LostContribution {
         /// Path in the lake.
         path: String,

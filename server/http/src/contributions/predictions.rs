@@ -111,7 +111,7 @@ async fn draft_rows(
     let log = ContributionLog::Predictions;
     let unreadable = |e: echolake_lake::Error| RequestFault::from(echolake_query::Error::from(e));
     let files = lake.list_contributions(log, u64::MAX).await.map_err(unreadable)?;
-    for file in &files {
+    for file in files.iter().filter(|file| file.bytes > 0) {
         let bytes = lake.read_contribution(log, file.number).await.map_err(unreadable)?;
         let Some(known) = read_record(bytes)? else { continue };
         if known == record {
