@@ -420,7 +420,7 @@ await check('nearest surfaces and responses lead to them', async () => {
   const alike = rows('Nearest responses')
   await alike.first().waitFor()
   const other = await alike.first().getByRole('link').innerText()
-  const [{ r }] = await sql(`select corr(a, b) as r from ${of(id, 'a')} join ${of(other, 'b')} using (n)`)
+  const [{ r }] = await sql(`select corr(a, b) as r from ${of(id, 'a')} own join ${of(other, 'b')} other using (n)`)
   assert.equal(await alike.first().locator('td').first().innerText(), r.toFixed(3))
   await alike.first().getByRole('link').click()
   await page.waitForURL(`**/surfaces/${other}/pairs/159`)
