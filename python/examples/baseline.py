@@ -180,7 +180,8 @@ def make_network(inputs: int, bands: int) -> nn.Sequential:
     """The network that corrects the integral."""
     width = 96
     hidden = [nn.Linear(inputs, width), nn.GELU(), nn.Linear(width, width), nn.GELU()]
-    return nn.Sequential(*hidden, nn.Linear(width, bands))
+    # Normalises inputs by their mean and deviation over all batches of training.
+    return nn.Sequential(nn.BatchNorm1d(inputs, momentum=None, affine=False), *hidden, nn.Linear(width, bands))
 
 
 def train_network(
@@ -320,6 +321,7 @@ def main() -> None:
     describe = ReliefInputs(arguments.folder, bands, means)
     network, ridge = make_network(describe.inputs, len(bands)), RidgeRegression(describe.inputs, len(bands))
     trained_on = train_network(network, ridge, describe, arguments)
+    network.eval()
     weights = ridge.solve_weights()
     predictors: dict[str, Predictor] = {
         "mean": lambda batch: means.mean.expand(len(batch["pair_id"]), -1),
