@@ -5,7 +5,7 @@
 >>> lake.annotate(run_id, "verdict", "rejected", pair_ids=[7], comment="knocked")  # doctest: +SKIP
 >>> lake.predict("cnn", "3", table)  # doctest: +SKIP
 
-What a call stored is on disk when it returns. A call repeats a request whose answer was lost; the server stores it once.
+What a call stored is on disk when it returns. A call repeats a request whose answer was lost; it is stored once.
 """
 
 from __future__ import annotations
@@ -89,10 +89,10 @@ class ContributionClient:
         return names
 
     def predict(self, model: str, version: str, table: pa.Table) -> int | None:
-        """Stores predictions: ``surface_id``, ``pair_id`` and linear columns of table ``tnce``; returns the lake's version
-        (None for tokens of projects).
+        """Stores predictions: ``surface_id``, ``pair_id`` and linear columns of table ``tnce``.
 
-        They are sent by surfaces, in requests of which each is stored as a whole.
+        They are sent by surfaces, in requests of which each is stored as a whole. Returns the version of the lake that
+        shows them, None for tokens of projects.
         """
         import pyarrow.compute as pc
 
@@ -141,4 +141,4 @@ def _arrow_stream(table: pa.Table) -> bytes:
     sink = pa.BufferOutputStream()
     with pa.ipc.new_stream(sink, table.schema) as writer:
         writer.write_table(table)
-    return sink.getvalue().to_pybytes()
+    return bytes(sink.getvalue().to_pybytes())
