@@ -16,8 +16,9 @@ use serde_json::{Map, Value, json};
 use super::serve::http::{HttpRequest, HttpResponse};
 use super::serve::server::ServedLake;
 
-/// Longest time from a server's start to its end.
-const LONGEST: Duration = Duration::from_millis(400);
+/// Most annotations that a server stores before its end begins, and the longest time until then.
+const MOST_STORED: usize = 6;
+const LONGEST: Duration = Duration::from_millis(30);
 
 /// Counts of a campaign.
 #[derive(Debug, Default)]
@@ -61,16 +62,22 @@ impl AnnotationKillCampaign {
         let mut is_repeated = false;
         for _ in 0..kills {
             let mut server = ServedLake::start(&self.binary, self.folder.path(), &[]);
+            let last = counts.acknowledged + self.random.random_range(1..=MOST_STORED);
+            while counts.acknowledged < last {
+                let is_new =
+                    annotate(&server.http, &run, counts.acknowledged).expect("an answer of a server that runs");
+                counts.known += usize::from(is_repeated && !is_new);
+                counts.acknowledged += 1;
+                is_repeated = false;
+            }
             let moment = LONGEST.mul_f64(self.random.random());
             let pid = Pid::from_raw(server.id() as i32).expect("a process");
             let killer = std::thread::spawn(move || {
                 std::thread::sleep(moment);
                 kill_process(pid, Signal::KILL).expect("it runs");
             });
-            while let Some(is_new) = annotate(&server.http, &run, counts.acknowledged) {
-                counts.known += usize::from(is_repeated && !is_new);
+            while annotate(&server.http, &run, counts.acknowledged).is_some() {
                 counts.acknowledged += 1;
-                is_repeated = false;
             }
             is_repeated = true;
             counts.repeated += 1;

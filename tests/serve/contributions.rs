@@ -7,10 +7,17 @@ use arrow::datatypes::{DataType, Field, Schema};
 use arrow::ipc::writer::StreamWriter;
 use serde_json::json;
 
+use super::catalogue::lake;
 use super::http::{HttpRequest, HttpResponse};
 use super::projects::new_token;
 use super::server::ServedLake;
-use super::{get, json, lake, refused, served};
+use super::{get, json, refused, served};
+use crate::TestFolder;
+
+fn find_run(place: &TestFolder) -> String {
+    let runs = place.sql("select run_id from runs where surface_id = 'brick'");
+    runs[0]["run_id"].as_str().expect("a name").to_owned()
+}
 
 fn annotate(server: &ServedLake, annotation: &serde_json::Value) -> HttpResponse {
     let body = json!({ "annotations": [annotation] }).to_string();
@@ -38,10 +45,10 @@ fn predict(server: &ServedLake, version: &str, surface: &str, columns: &[(&str, 
 #[test]
 fn views_leave_out_what_the_last_verdict_rejects_and_as_of_sees_it_as_it_was() {
     let place = lake();
-    let run = place.sql("select run_id from runs")[0]["run_id"].as_str().expect("a name").to_owned();
-    let pairs = place.number("select count(*) from measurements");
+    let run = find_run(&place);
     let server = served(&place, &[]);
-    let count = |of: &str| place.number(&format!("select count(*) from {of}"));
+    let count = |of: &str| place.number(&format!("select count(*) from {of} where surface_id = 'brick'"));
+    let pairs = count("measurements");
     assert_eq!((count("annotations"), count("tnce_db"), count("ir")), (0.0, pairs, pairs));
     let bad = json!({
         "annotation_id": "bad-1", "run_id": run, "pair_ids": [1, 0, 1], "kind": "verdict", "value": "rejected",
@@ -57,7 +64,8 @@ fn views_leave_out_what_the_last_verdict_rejects_and_as_of_sees_it_as_it_was() {
     assert_eq!(json(&get(&server, &format!("{path}?pair=2")))["total"].as_i64(), Some(0));
     assert_eq!((count("tnce_db"), count("ir"), count("augmented")), (pairs - 2.0, pairs - 2.0, 8.0 * (pairs - 2.0)));
     assert_eq!((count("measurements"), count("tnce")), (pairs, pairs), "tables keep all");
-    assert_eq!(count("measurements where not is_rejected(run_id, pair_id)"), pairs - 2.0);
+    let kept = "select count(*) from measurements where surface_id = 'brick' and not is_rejected(run_id, pair_id)";
+    assert_eq!(place.number(kept), pairs - 2.0);
     // The region of a microphone, accepted again: the last verdict counts.
     let good = json!({ "run_id": run, "microphones": [0], "kind": "verdict", "value": "accepted" });
     let accepted = json(&annotate(&server, &good))["lake_version"].as_u64().expect("a version");
@@ -93,33 +101,33 @@ fn predictions_of_a_model_stand_beside_the_measurements() {
     let place = lake();
     let server = served(&place, &[]);
     let measured: Vec<f64> = place
-        .sql("select tnce_10000 as e from tnce where pair_id < 2 order by pair_id")
+        .sql("select tnce_10000 as e from tnce where surface_id = 'brick' and pair_id < 2 order by pair_id")
         .iter()
         .map(|row| row["e"].as_f64().expect("a number"))
         .collect();
     // 3 dB too much, and 1 dB too little.
     let values = vec![measured[0] * 10f64.powf(0.3), measured[1] * 10f64.powf(-0.1)];
     let predicted = [("tnce_10000", values)];
-    let stored = json(&predict(&server, "1", "flat", &predicted));
+    let stored = json(&predict(&server, "1", "brick", &predicted));
     assert_eq!(stored["is_new"].as_bool(), Some(true), "{stored}");
-    assert_eq!(json(&predict(&server, "1", "flat", &predicted))["is_new"].as_bool(), Some(false), "sent again");
-    let errors = json(&get(&server, "/api/v1/surfaces/flat/predictions"));
+    assert_eq!(json(&predict(&server, "1", "brick", &predicted))["is_new"].as_bool(), Some(false), "sent again");
+    let errors = json(&get(&server, "/api/v1/surfaces/brick/predictions"));
     let rms = errors[0]["rms_db"][2].as_f64().expect("an error");
     assert!((rms - 5f64.sqrt()).abs() < 1e-6 && errors[0]["pairs"] == 2, "{errors}");
-    let pair = json(&get(&server, "/api/v1/surfaces/flat/pairs/1/predictions"));
+    let pair = json(&get(&server, "/api/v1/surfaces/brick/pairs/1/predictions"));
     let level = pair[0]["tnce_db"][2].as_f64().expect("a level");
     assert!((level - (10.0 * measured[1].log10() - 1.0)).abs() < 1e-6, "{pair}");
     let rows = place.sql("select model, model_version, tnce_2500, author from predictions where pair_id = 0");
     assert_eq!(rows.len(), 1, "{rows:?}");
     assert_eq!((rows[0]["model"].as_str(), rows[0]["model_version"].as_str()), (Some("cnn"), Some("1")));
     assert!(rows[0]["tnce_2500"].is_null() && rows[0]["author"] == "programs");
-    refused(&predict(&server, "1", "flat", &[("tnce_10000", vec![0.5])]), 409, "taken");
+    refused(&predict(&server, "1", "brick", &[("tnce_10000", vec![0.5])]), 409, "taken");
     for (surface, columns) in [
         ("none", ("tnce_10000", vec![0.5])),
-        ("flat", ("tnce_db", vec![0.5])),
-        ("flat", ("tnce_10000", vec![-3.0])),
-        ("flat", ("tnce_10000", vec![f64::NAN])),
-        ("flat", ("tnce_10000", vec![0.5; 5_000])),
+        ("brick", ("tnce_db", vec![0.5])),
+        ("brick", ("tnce_10000", vec![-3.0])),
+        ("brick", ("tnce_10000", vec![f64::NAN])),
+        ("brick", ("tnce_10000", vec![0.5; 5_000])),
     ] {
         refused(&predict(&server, "2", surface, &[columns]), 400, "request_invalid");
     }
@@ -131,7 +139,7 @@ fn predictions_of_a_model_stand_beside_the_measurements() {
 #[test]
 fn adding_needs_its_scope() {
     let place = lake();
-    let run = place.sql("select run_id from runs")[0]["run_id"].as_str().expect("a name").to_owned();
+    let run = find_run(&place);
     let (reader, reader_lines) = new_token(&place, &["ann"]);
     let (author, author_lines) = new_token(&place, &["bob", "--scopes", "sql,annotate"]);
     std::fs::write(place.path("tokens.toml"), reader_lines + &author_lines).expect("written");
