@@ -139,15 +139,3 @@ fn annotate(address: &str, run: &str, number: usize) -> Option<bool> {
     }
     Some(stored["is_new"].as_bool().expect("a flag"))
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn acknowledged_annotations_are_stored_once() {
-        let mut campaign = AnnotationKillCampaign::new(Path::new(crate::ECHOLAKE), 7);
-        let counts = campaign.kills(8, &mut |_| {});
-        assert!(counts.killed == 8 && counts.acknowledged > 8, "{counts:?}");
-    }
-}

@@ -1,5 +1,6 @@
 //! What users add to a lake: annotations, which views honour and `AS OF` sees as they were, and predictions.
 
+use std::path::Path;
 use std::sync::Arc;
 
 use arrow::array::{Float64Array, Int32Array, RecordBatch, StringArray};
@@ -13,6 +14,7 @@ use super::projects::new_token;
 use super::server::ServedLake;
 use super::{get, json, refused, served};
 use crate::TestFolder;
+use crate::annotation_kills::AnnotationKillCampaign;
 
 fn find_run(place: &TestFolder) -> String {
     let runs = place.sql("select run_id from runs where surface_id = 'brick'");
@@ -156,4 +158,11 @@ fn adding_needs_its_scope() {
     assert_eq!(send(&author, json!({ "annotations": [note] })).status, 200);
     let rows = place.sql("select author, comment from annotations");
     assert_eq!((rows.len(), rows[0]["author"].as_str()), (1, Some("bob")), "{rows:?}");
+}
+
+#[test]
+fn acknowledged_annotations_are_stored_once() {
+    let mut campaign = AnnotationKillCampaign::new(Path::new(crate::ECHOLAKE), 7);
+    let counts = campaign.kills(8, &mut |_| {});
+    assert!(counts.killed == 8 && counts.acknowledged > 8, "{counts:?}");
 }

@@ -150,8 +150,8 @@ pub(super) async fn pair_predictions(
     let sql = format!(
         "select model, model_version, author, predicted, {} as total, {} as band from predictions \
          where surface_id = $1 and pair_id = $2 order by model, predicted",
-        band_list(rig, |band| over_total(band)),
-        band_list(rig, |band| over_band(band))
+        band_list(rig, over_total),
+        band_list(rig, over_band)
     );
     let rows: Vec<PredictedPair> = request.read_rows(&sql, vec![surface, pair]).await?;
     let predictions = rows.into_iter().map(|row| PairPrediction {
