@@ -1,4 +1,4 @@
-//! Requests of users to add to the lake. An engine checks them and turns them into a [`ContributionDraft`]; the door
+//! Requests of users to add to the lake. An engine checks them and turns them into a draft; the door
 //! stores it.
 
 mod annotations;
