@@ -207,7 +207,7 @@ export interface paths {
         readonly put?: never;
         /**
          * Adds TNCE that a model predicts.
-         * @description The rows are an Arrow stream with `surface_id`, `pair_id` and columns of table `tnce`, linear; 2 MiB at most. All of
+         * @description The rows are an Arrow stream with `surface_id`, `pair_id` and columns of table `tnce`, linear; 1 MiB at most. All of
          *     a request is stored, or nothing. Rows that are sent again are stored once; others for the same model, version and
          *     surface are refused. Needs the scope `annotate`.
          */

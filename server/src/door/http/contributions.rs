@@ -21,7 +21,7 @@ use crate::door::forward::EngineProtocol;
 use crate::door::server_door::ServerDoor;
 
 /// Bytes of a request.
-const LARGEST: usize = 2 << 20;
+const LARGEST: usize = 1 << 20;
 /// Bytes of a draft: base 64 of an object that is about as large as its request.
 const LARGEST_DRAFT: usize = 8 << 20;
 /// Tries against other writers of the same number.
@@ -45,7 +45,7 @@ pub(super) async fn post_annotations(State(door): State<ServerDoor>, request: Re
 
 /// Adds TNCE that a model predicts.
 ///
-/// The rows are an Arrow stream with `surface_id`, `pair_id` and columns of table `tnce`, linear; 2 MiB at most. All of
+/// The rows are an Arrow stream with `surface_id`, `pair_id` and columns of table `tnce`, linear; 1 MiB at most. All of
 /// a request is stored, or nothing. Rows that are sent again are stored once; others for the same model, version and
 /// surface are refused. Needs the scope `annotate`.
 #[utoipa::path(
