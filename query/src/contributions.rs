@@ -1,4 +1,4 @@
-//! What users add to the lake, in SQL: the tables `annotations` and `predictions`, and the views without the
+//! Contributions of users in SQL: the tables `annotations` and `predictions`, and the views without the
 //! measurements that the last verdict rejects.
 
 use std::collections::HashSet;
@@ -69,7 +69,7 @@ impl SeenContributions {
     /// Reads those of these numbers, on the runs and surfaces that it shows.
     ///
     /// # Errors
-    /// What the store reports, and [`echolake_lake::Error::LostContribution`].
+    /// Those of the store, and [`echolake_lake::Error::LostContribution`].
     pub async fn read_from(
         lake: &Lake,
         cache: &AnnotationCache,

@@ -44,7 +44,7 @@ pub struct Annotation {
 pub enum AnnotationKind {
     /// A word to find measurements by.
     Label,
-    /// Whether measurements are good: the last verdict on a measurement counts.
+    /// A judgement of measurements, good or bad: the last verdict on a measurement counts.
     Verdict,
     /// A comment alone.
     Note,

@@ -1,4 +1,4 @@
-//! What users add to a lake: annotations, which views honour and `AS OF` sees as they were, and predictions.
+//! Contributions of users: annotations, which views honour and `AS OF` sees as they were, and predictions.
 
 use std::path::Path;
 use std::sync::Arc;

@@ -1,4 +1,4 @@
-//! What users added about a run or a pair: annotations, and predictions of models beside the measurements.
+//! Contributions of users about a run or a pair: annotations, and predictions of models beside the measurements.
 
 use axum::Extension;
 use datafusion::scalar::ScalarValue;

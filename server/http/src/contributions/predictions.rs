@@ -56,7 +56,7 @@ pub struct PredictionParams {
     author: Option<String>,
 }
 
-/// What a stored file has of a model.
+/// Contents of a stored file: model, surfaces and a digest.
 #[derive(Debug, PartialEq, Eq, Serialize, Deserialize)]
 struct PredictionRecord {
     model: String,

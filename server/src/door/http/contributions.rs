@@ -8,13 +8,10 @@ use axum::http::{Method, StatusCode, header};
 use axum::response::{IntoResponse as _, Response};
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
-use echolake_http::{
-    AddedContribution, AnnotationsRequest, BinaryContent, PredictionParams, ProblemResponse, RequestSite, request_site,
-};
+use echolake_http::{AddedContribution, AnnotationsRequest, BinaryContent, PredictionParams, ProblemResponse};
 use echolake_lake::ContributionLog;
-use echolake_service::{ClientIdentity, ContributionDraft, RequestFault, ServerProtocol, TokenScope};
+use echolake_service::{ClientIdentity, ContributionDraft, RequestFault, TokenScope};
 
-use super::authentication::authenticate_client;
 use crate::door::audit;
 use crate::door::connection_places::PlaceWork;
 use crate::door::forward::EngineProtocol;
@@ -70,17 +67,10 @@ async fn answer_request(door: &ServerDoor, log: ContributionLog, request: Reques
 
 async fn add_contribution(door: &ServerDoor, log: ContributionLog, request: Request) -> Result<Response, RequestFault> {
     let work = request.extensions().get::<PlaceWork>().cloned().ok_or(RequestFault::Internal)?;
-    let site = request_site(request.uri(), request.headers());
-    let local = || match site {
-        RequestSite::Foreign => ClientIdentity::foreign_pages(),
-        RequestSite::OwnPage => ClientIdentity::own_pages(),
-        RequestSite::Program => ClientIdentity::local_programs(),
-    };
-    let client = authenticate_client(door.access(), request.headers(), local)?;
-    let client = door.note_client(&work, ServerProtocol::Http, Ok(client))?;
+    let client = door.identify_client(&work, &request)?;
     client.require_scope(TokenScope::Annotate)?;
     let (mut parts, body) = request.into_parts();
-    // The body is sent anew, whole.
+    // The body is sent again, whole.
     parts.headers.remove(header::CONTENT_LENGTH);
     let body = to_bytes(body, LARGEST).await.map_err(|_| RequestFault::TooLarge { limit: LARGEST })?;
     for _ in 0..TRIES {

@@ -12,6 +12,7 @@ mod queries;
 mod router;
 mod session;
 
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use axum::Router;
@@ -129,8 +130,8 @@ impl ServerDoor {
         response
     }
 
-    async fn answer_http(&self, request: Request) -> Result<Response, RequestFault> {
-        let work = request.extensions().get::<PlaceWork>().cloned().ok_or(RequestFault::Internal)?;
+    /// Authenticates who sends a request, and takes note of it.
+    fn identify_client(&self, work: &PlaceWork, request: &Request) -> Result<Arc<ClientIdentity>, RequestFault> {
         let site = request_site(request.uri(), request.headers());
         let local = || match site {
             RequestSite::Foreign => ClientIdentity::foreign_pages(),
@@ -139,7 +140,12 @@ impl ServerDoor {
         };
         // A refusal is noted with those of the other routes.
         let client = authenticate_client(self.access(), request.headers(), local)?;
-        let client = self.note_client(&work, ServerProtocol::Http, Ok(client))?;
+        self.note_client(work, ServerProtocol::Http, Ok(client))
+    }
+
+    async fn answer_http(&self, request: Request) -> Result<Response, RequestFault> {
+        let work = request.extensions().get::<PlaceWork>().cloned().ok_or(RequestFault::Internal)?;
+        let client = self.identify_client(&work, &request)?;
         let path = request.uri().path().to_owned();
         let method = request.method().clone();
         let key = AnswerKey::from_request(&client, &request);
