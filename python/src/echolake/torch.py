@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from torch.utils.data import IterableDataset, get_worker_info
 
 from echolake._batch import Batch, Memory
-from echolake.training import BatchDict, Kind, MeasurementBatches, MeasurementRows
+from echolake.training import BatchDict, Kind, LakeQuery, MeasurementBatches, MeasurementRows
 
-__all__ = ["Batch", "MeasurementRows", "Measurements"]
+__all__ = ["Batch", "LakeQuery", "MeasurementRows", "Measurements"]
 
 
 class Measurements(MeasurementBatches, IterableDataset[Batch]):
@@ -28,7 +28,7 @@ class Measurements(MeasurementBatches, IterableDataset[Batch]):
 
     def __init__(
         self,
-        path: str | Path,
+        path: str | Path | LakeQuery,
         split: Literal["train", "validation", "test"] = "train",
         columns: Sequence[str] | None = None,
         *,

@@ -6,10 +6,8 @@ workers, and a run that stopped continues at batch ``k`` without reading what ca
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
-import time
 import warnings
 import weakref
 from collections import OrderedDict, deque
@@ -18,30 +16,25 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from threading import Lock
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.fs as pa_fs
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from echolake._sets import SetFiles
+from echolake.lake_query import LakeQuery, QueriedSet
 from echolake.symmetry import NAMES, turn_heights, turn_positions
 
-__all__ = ["BatchDict", "EpochOrder", "MeasurementBatches", "MeasurementRows", "OrderSettings"]
+__all__ = ["BatchDict", "EpochOrder", "LakeQuery", "MeasurementBatches", "MeasurementRows", "OrderSettings"]
 
 BatchDict = dict[str, Any]
 Kind = tuple[np.dtype[Any], tuple[int, ...]]
 Numbers = NDArray[np.int64]
 Allocate = Callable[[Mapping[str, Kind]], tuple[BatchDict, dict[str, NDArray[Any]]]]
 """Makes a batch of the given types and shapes, and the arrays to fill."""
-_Result = TypeVar("_Result")
-
 _READERS = 2
 _BATCHES_AHEAD = 32
-_ROWS_AT_ONCE = 1024
-"""Rows to decode at once: few enough to be copied before they leave the processor's cache."""
-_RETRY_SECS = (0.1, 0.2, 0.4, 0.8, 1.6)
 _POSITIONS = ("microphone_mm", "speaker_mm")
 _MEASURED = ("pair_id", "microphone", "speaker", "swapped")
 """Columns that name points and pairs of the grid: a row turned while loading has positions only."""
@@ -148,15 +141,6 @@ def _cut_clumps(sizes: Numbers, clump: int | str) -> tuple[Numbers, Numbers]:
     return np.repeat(starts, pieces) + within * clump, np.minimum(clump, np.repeat(sizes, pieces) - within * clump)
 
 
-@dataclass(frozen=True)
-class _RowGroup:
-    """A row group of a file: the rows of a surface."""
-
-    file: str
-    number: int
-    rows: int
-
-
 @dataclass
 class _SurfaceRows:
     """Decoded rows of a row group; ``of_row`` points into ``NAMES``."""
@@ -172,51 +156,24 @@ def _allocate_arrays(kinds: Mapping[str, Kind]) -> tuple[BatchDict, dict[str, ND
 
 
 class _ProcessState:
-    """Files, threads and decoded rows of one process; a forked one makes its own."""
+    """Threads and decoded rows of one process; a forked one makes its own."""
 
-    def __init__(self, path: str) -> None:
+    def __init__(self, path: str | LakeQuery) -> None:
         self.process = os.getpid()
-        self.is_local = "://" not in path
-        self.root = path.rstrip("/")
-        self.filesystem: pa_fs.FileSystem | None = None
-        if path.startswith(("http://", "https://")):
-            import fsspec
-
-            # pyarrow asks for the ranges of a row group in few pieces itself.
-            self.open: Callable[[str], Any] = fsspec.filesystem("http", cache_type="none").open
-        else:
-            if self.is_local:
-                self.filesystem, self.root = pa_fs.LocalFileSystem(use_mmap=True), str(Path(path).absolute())
-            else:
-                self.filesystem, self.root = pa_fs.FileSystem.from_uri(self.root)
-            self.open = self.filesystem.open_input_file
+        self.set: SetFiles | QueriedSet = QueriedSet(path) if isinstance(path, LakeQuery) else SetFiles(path)
         self.threads = ThreadPoolExecutor(_READERS)
         self.lock = Lock()
         self.surfaces: OrderedDict[int, Future[_SurfaceRows]] = OrderedDict()
         # Arrays of surfaces that nothing uses any more: new memory would take as long as decoding into it.
         self.spare: deque[dict[str, NDArray[Any]]] = deque()
 
-    def read(self, name: str, read: Callable[[Any], _Result]) -> _Result:
-        """What ``read`` makes of an opened file; remote reads are repeated."""
-
-        def read_once() -> _Result:
-            with self.open(f"{self.root}/{name}") as file:
-                return read(file)
-
-        return _retry_read(read_once, () if self.is_local else _RETRY_SECS)
-
-    def list_folder(self, name: str) -> list[str]:
-        if self.filesystem is None:
-            return []
-        found = self.filesystem.get_file_info(pa_fs.FileSelector(f"{self.root}/{name}", allow_not_found=True))
-        return [f"{name}/{file.base_name}" for file in found]
-
 
 class MeasurementRows:
     """Rows of a split by number, in the order of its files: a source for samplers of torch and for grain.
 
-    ``path`` is a folder, an address ``http://`` of one (needs fsspec and aiohttp), or a bucket's URI that pyarrow
-    reads, as ``s3://bucket/prefix?endpoint_override=...``. A process keeps decoded surfaces up to ``memory`` bytes.
+    ``path`` is a folder, an address ``http://`` of one (needs fsspec and aiohttp), a bucket's URI that pyarrow
+    reads, as ``s3://bucket/prefix?endpoint_override=...``, or a :class:`LakeQuery` of a served lake. A process keeps
+    decoded surfaces up to ``memory`` bytes.
     With ``symmetries="all"`` each surface comes under all eight, one after the other. Rows are dicts of NumPy values.
 
     ``heights=64`` gives maps of 64 x 64 cells, each the mean of those beneath it. ``normalise`` subtracts the mean of
@@ -227,7 +184,7 @@ class MeasurementRows:
 
     def __init__(
         self,
-        path: str | Path,
+        path: str | Path | LakeQuery,
         split: Literal["train", "validation", "test"] = "train",
         columns: Sequence[str] | None = None,
         *,
@@ -237,40 +194,32 @@ class MeasurementRows:
         normalise: bool = False,
         memory: int = 256 << 20,
     ) -> None:
-        self.path, self.split, self.symmetries, self.heights = str(path), split, symmetries, heights
+        self.path: str | LakeQuery = path.pin_version() if isinstance(path, LakeQuery) else str(path)
+        self.split, self.symmetries, self.heights = split, symmetries, heights
         self._state: _ProcessState | None = None
-        state = self._process_state()
-        try:
-            sums = state.read("SHA256SUMS", lambda file: file.read().decode())
-        except FileNotFoundError:
-            sums = ""
-        names = [line.split(maxsplit=1)[1].lstrip("*") for line in sums.splitlines()] or state.list_folder("data")
-        self.files = sorted(name for name in names if name.startswith(f"data/{split}-") and name.endswith(".parquet"))
-        if not self.files:
-            raise FileNotFoundError(f"no data/{split}-*.parquet in `{path}`; is it made by `echolake export ml`?")
-        read_footer = pq.read_metadata
-        footers = list(state.threads.map(lambda name: state.read(name, read_footer), self.files))
-        self._footers = dict(zip(self.files, footers, strict=True))
-        counts = {name: [f.row_group(i).num_rows for i in range(f.num_row_groups)] for name, f in self._footers.items()}
+        source = self._process_state().set
+        contents = source.describe_split(split)
+        self._groups, self._is_turned = contents.groups, contents.is_turned
         #: Digest of the set: of its checksums, else of its files' names and rows.
-        self.digest = hashlib.sha256((sums or json.dumps(counts)).encode()).hexdigest()[:16]
-        self._groups = [_RowGroup(file, i, n) for file in self.files for i, n in enumerate(counts[file]) if n > 0]
+        self.digest = contents.digest
+        #: Names of the files, in a set that has files.
+        self.files = list(dict.fromkeys(group.file for group in self._groups))
         self._copies = len(NAMES) if symmetries == "all" else 1
         #: Rows of each surface, ``[surfaces]``, each of its symmetries for itself.
         self.sizes = np.repeat(np.array([group.rows for group in self._groups], np.int64), self._copies)
         self._ends = np.cumsum(self.sizes)
-        self._is_turned = self._check_symmetries(state)
         if self._is_turned and symmetries != "none":
             raise ValueError('the training set has its symmetries already; take symmetries="none"')
-        schema = footers[0].schema.to_arrow_schema()
-        self.columns = _numeric_columns(schema, columns, () if symmetries == "none" else _MEASURED)
+        schema = contents.schema
+        without = () if symmetries == "none" else _MEASURED
+        self.columns = _numeric_columns(schema, contents.defaults, columns, without)
         self._kinds = {name: _column_kind(schema.field(name)) for name in self.columns}
         self.spectra = {f"{name}_spectrum": name for name in spectra}
         if missing := [name for name in spectra if not self._kinds.get(name, (None, ()))[1]]:
             raise KeyError(f"no spectra of {json.dumps(missing)}, which are no columns of responses")
         self._rates_hz = {name: (schema.field(name).metadata or {}).get(b"rate_hz") for name in spectra}
         #: Mean and standard deviation of the columns that are normalised.
-        self.statistics = self._read_statistics(state) if normalise else {}
+        self.statistics = self._read_statistics(source.read_statistics()) if normalise else {}
         row_bytes = sum(dtype.itemsize * int(np.prod(shape)) for dtype, shape in self._kinds.values()) + 8
         surface_bytes = row_bytes * int(self.sizes.max())
         #: Decoded surfaces that a process keeps, and the bytes of all.
@@ -373,19 +322,7 @@ class MeasurementRows:
     def _select_symmetry(self, item: int, drawn: Numbers | None) -> str:
         return NAMES[item % self._copies if drawn is None else int(drawn[item])]
 
-    def _check_symmetries(self, state: _ProcessState) -> bool:
-        first = self._groups[0]
-
-        def read_names(file: Any) -> set[str]:
-            return set(pq.ParquetFile(file).read_row_group(first.number, ["symmetry"]).column(0).to_pylist())
-
-        return state.read(first.file, read_names) != {"identity"}
-
-    def _read_statistics(self, state: _ProcessState) -> dict[str, tuple[NDArray[np.float32], NDArray[np.float32]]]:
-        try:
-            columns = state.read("statistics.json", json.load)["columns"]
-        except FileNotFoundError as missing:
-            raise FileNotFoundError(f"no statistics.json in `{self.path}`; hint: export the set again") from missing
+    def _read_statistics(self, columns: dict[str, Any]) -> dict[str, tuple[NDArray[np.float32], NDArray[np.float32]]]:
         found = {}
         for name, stored in [*((name, name) for name in self.columns), ("heights", "heights_mm")]:
             if column := columns.get(stored):
@@ -417,18 +354,17 @@ class MeasurementRows:
             rows = int(self.sizes.max())
             columns = {name: np.empty((rows, *shape), dtype) for name, (dtype, shape) in self._kinds.items()}
 
-        def read_group(file: Any) -> pa.Table:
-            opened = pq.ParquetFile(file, metadata=self._footers[group.file], pre_buffer=not state.is_local)
+        def copy_batches(batches: Iterator[pa.RecordBatch]) -> pa.Table:
             told = []
             start = 0
-            for rows in opened.iter_batches(_ROWS_AT_ONCE, [group.number], names, use_threads=False):
+            for rows in batches:
                 for name in self.columns:
                     columns[name][start : start + rows.num_rows] = _column_values(rows.column(name))
                 told.append(rows.select(["surface_id", "symmetry"]))
                 start += rows.num_rows
             return pa.Table.from_batches(told)
 
-        table = state.read(group.file, read_group)
+        table = state.set.read_group(group, names, copy_batches)
         coded = table.column("symmetry").combine_chunks().dictionary_encode()
         places = np.array([NAMES.index(name) for name in coded.dictionary.to_pylist()])
         read = _SurfaceRows(columns, table.column("surface_id")[0].as_py(), places[coded.indices.to_numpy()])
@@ -437,16 +373,7 @@ class MeasurementRows:
 
     def _known_heights(self) -> dict[str, tuple[NDArray[np.float32], float]]:
         if self._heights is None:
-            name = f"heightmaps/{self.split}.parquet"
-            columns = ["surface_id", "size_mm", "heights_mm"]
-
-            def read_maps(file: Any) -> pa.Table:
-                return pq.read_table(file, columns=columns, filters=[("symmetry", "=", "identity")])
-
-            try:
-                table = self._process_state().read(name, read_maps)
-            except FileNotFoundError as missing:
-                raise FileNotFoundError(f"`{self.path}/{name}` is not there: the lake has no height maps") from missing
+            table = self._process_state().set.read_height_maps(self.split)
             values = _column_values(table.column("heights_mm").combine_chunks())
             cells = round(values.shape[1] ** 0.5)
             wanted = cells if self.heights is True else self.heights
@@ -478,7 +405,7 @@ class MeasurementBatches:
 
     def __init__(
         self,
-        path: str | Path,
+        path: str | Path | LakeQuery,
         split: Literal["train", "validation", "test"] = "train",
         columns: Sequence[str] | None = None,
         *,
@@ -619,18 +546,6 @@ class MeasurementBatches:
         return _allocate_arrays(kinds)
 
 
-def _retry_read(read: Callable[[], _Result], waits: Sequence[float]) -> _Result:
-    try:
-        return read()
-    except FileNotFoundError:
-        raise
-    except Exception:
-        if not waits:
-            raise
-    time.sleep(waits[0])
-    return _retry_read(read, waits[1:])
-
-
 # Type and shape of a row; where a number may be missing, it has to be one that can be NaN.
 def _column_kind(field: pa.Field) -> Kind:
     if pa.types.is_fixed_size_list(field.type):
@@ -639,10 +554,12 @@ def _column_kind(field: pa.Field) -> Kind:
     return (np.dtype(np.float64) if field.nullable and dtype.kind != "f" else dtype), ()
 
 
-def _numeric_columns(schema: pa.Schema, columns: Sequence[str] | None, without: Sequence[str]) -> list[str]:
+def _numeric_columns(
+    schema: pa.Schema, defaults: Sequence[str], columns: Sequence[str] | None, without: Sequence[str]
+) -> list[str]:
     known = [field.name for field in schema if not pa.types.is_string(field.type) and field.name not in without]
     if columns is None:
-        return known
+        return [name for name in known if name in defaults]
     unknown = [name for name in columns if name not in known]
     if unknown:
         raise KeyError(f"no columns {json.dumps(unknown)}; there are {json.dumps(known)}")
