@@ -31,7 +31,7 @@ class LakeQuery:
 
     ``where`` selects surfaces, a predicate over view ``catalogue``. ``as_of`` is a version of the lake, a tag or a
     time; without it, the newest version when the set is opened. References and rejected measurements are left out.
-    ``seed`` draws the panels that are held out. ``token`` needs the scope ``query``.
+    ``seed`` draws the panels that are held out. ``token`` needs the scope ``sql``.
     """
 
     url: str
