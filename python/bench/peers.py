@@ -35,7 +35,7 @@ from echolake.torch import Measurements
 
 COLUMNS = ["microphone_mm", "speaker_mm", "ir", "tnce_total"]
 BATCH_ROWS, BUFFER_ROWS = 1024, 10_000
-# Batches, and what tells the state after the batch that was taken last; how to start them, at a state or at the beginning (None).
+# Batches, and what tells the state after the batch that was taken last; how to start them, at a state or without one.
 Started = tuple[Iterator[Any], Callable[[], Any] | None]
 Start = Callable[[Any], Started]
 

@@ -121,7 +121,7 @@ class ContributionClient:
                     return dict(json.load(answer))
             except urllib.error.HTTPError as refusal:
                 if wait is None or refusal.code not in _RETRIED:
-                    raise _refusal(refusal) from None
+                    raise read_refusal(refusal) from None
             except (urllib.error.URLError, ConnectionError, TimeoutError):
                 if wait is None:
                     raise
@@ -129,7 +129,8 @@ class ContributionClient:
         raise AssertionError("the last try returns or raises")
 
 
-def _refusal(error: urllib.error.HTTPError) -> ContributionError:
+def read_refusal(error: urllib.error.HTTPError) -> ContributionError:
+    """The problem that a server answered; its text is the detail."""
     text = error.read().decode(errors="replace")
     try:
         problem = json.loads(text)

@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 import pyarrow as pa
 
 from echolake._sets import RETRY_SECS, RowGroup, SplitContents, retry_read
+from echolake.contributions import read_refusal
 
 __all__ = ["LakeQuery"]
 
@@ -192,19 +193,12 @@ def _request_answer(query: LakeQuery, path: str, sql: str | None, read: Callable
             with urllib.request.urlopen(request, timeout=_TIMEOUT_SECS) as answer:
                 return read(answer)
         except urllib.error.HTTPError as refusal:
-            text = refusal.read().decode(errors="replace")
+            told = f"{query.url} answered {refusal.code}: {read_refusal(refusal)}"
             if refusal.code == 429 or refusal.code >= 500:
-                raise ConnectionError(f"{query.url} answered {refusal.code}: {text}") from refusal
-            raise LookupError(f"{query.url} answered {refusal.code}: {_read_detail(text)}") from refusal
+                raise ConnectionError(told) from refusal
+            raise LookupError(told) from refusal
 
     return retry_read(read_once, RETRY_SECS)
-
-
-def _read_detail(problem: str) -> str:
-    try:
-        return str(json.loads(problem)["detail"])
-    except (ValueError, KeyError, TypeError):
-        return problem
 
 
 def _draw_parts(panels: Sequence[str], seed: int) -> dict[str, str]:

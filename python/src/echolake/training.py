@@ -173,8 +173,8 @@ class MeasurementRows:
 
     ``path`` is a folder, an address ``http://`` of one (needs fsspec and aiohttp), a bucket's URI that pyarrow
     reads, as ``s3://bucket/prefix?endpoint_override=...``, or a :class:`LakeQuery` of a served lake. A process keeps
-    decoded surfaces up to ``memory`` bytes.
-    With ``symmetries="all"`` each surface comes under all eight, one after the other. Rows are dicts of NumPy values.
+    decoded surfaces up to ``memory`` bytes. With ``symmetries="all"`` each surface comes under all eight, one after the
+    other. Rows are dicts of NumPy values.
 
     ``heights=64`` gives maps of 64 x 64 cells, each the mean of those beneath it. ``normalise`` subtracts the mean of
     split train from columns of floats and from heights, and divides by its standard deviation. ``spectra=["ir"]`` adds
