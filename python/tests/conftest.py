@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -41,9 +42,9 @@ def lake(echolake: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.fixture(scope="session")
-def addresses(echolake: str, lake: Path) -> Iterator[dict[str, str]]:
-    """Where it is served, by scheme."""
+@contextmanager
+def serve_lake(echolake: str, lake: Path) -> Iterator[dict[str, str]]:
+    """Where a lake is served, by scheme."""
     anywhere = "127.0.0.1:0"
     command = [
         echolake,
@@ -83,6 +84,13 @@ def addresses(echolake: str, lake: Path) -> Iterator[dict[str, str]]:
             server.kill()
             server.wait(timeout=60)
             raise
+
+
+@pytest.fixture(scope="session")
+def addresses(echolake: str, lake: Path) -> Iterator[dict[str, str]]:
+    """Where it is served, by scheme."""
+    with serve_lake(echolake, lake) as found:
+        yield found
 
 
 @pytest.fixture(scope="session")

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import pickle
+import shutil
 import subprocess
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,6 +13,8 @@ import numpy as np
 import pytest
 
 pytest.importorskip("pyarrow.parquet")
+
+from conftest import serve_lake
 
 from echolake.contributions import ContributionClient
 from echolake.lake_query import QueriedSet
@@ -27,6 +31,15 @@ def exported(echolake: str, lake: Path, tmp_path_factory: pytest.TempPathFactory
     command = [echolake, "--lake", str(lake), "export", "ml", "-o", str(path), "--where", PREDICATE, *columns]
     subprocess.run(command, check=True, capture_output=True)
     return path
+
+
+@pytest.fixture(scope="module")
+def own_http(echolake: str, lake: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """A copy of the lake: what is annotated here is seen by no other test."""
+    copy = tmp_path_factory.mktemp("own") / "lake"
+    shutil.copytree(lake, copy)
+    with serve_lake(echolake, copy) as addresses:
+        yield addresses["http"]
 
 
 def read_surfaces(source: MeasurementRows) -> dict[str, dict[str, Any]]:
@@ -54,12 +67,12 @@ def test_a_query_has_the_rows_of_an_export(
             assert np.array_equal(queried_rows[surface][name], rows[name]), (surface, name)
 
 
-def test_a_query_stays_at_its_version_and_resumes(served_http: str, lake: Path) -> None:
-    before = MeasurementBatches(LakeQuery(served_http), columns=["pair_id", "tnce_total"])
+def test_a_query_stays_at_its_version_and_resumes(own_http: str) -> None:
+    before = MeasurementBatches(LakeQuery(own_http), columns=["pair_id", "tnce_total"])
     surface = before.source.files[0]
-    query = LakeQuery(served_http)
+    query = LakeQuery(own_http)
     asked = QueriedSet(query.pin_version())._ask(f"select run_id from runs where surface_id = '{surface}'")
-    ContributionClient(served_http, author="pytest").annotate(
+    ContributionClient(own_http, author="pytest").annotate(
         asked.column("run_id")[0].as_py(), "verdict", "rejected", pair_ids=[7], comment="test"
     )
     try:
@@ -76,7 +89,7 @@ def test_a_query_stays_at_its_version_and_resumes(served_http: str, lake: Path) 
         with pytest.raises(ValueError, match="the state is of a set with set"):
             after.load_state_dict(before.state_dict())
     finally:
-        ContributionClient(served_http, author="pytest").annotate(
+        ContributionClient(own_http, author="pytest").annotate(
             asked.column("run_id")[0].as_py(), "verdict", "accepted", pair_ids=[7], comment="test"
         )
 
