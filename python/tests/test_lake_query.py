@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import shutil
+import socket
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -109,3 +110,10 @@ def test_a_query_stays_at_its_version_and_resumes(own_http: str) -> None:
 def test_what_is_wrong_is_told(served_http: str, query: dict[str, Any], settings: dict[str, Any], told: str) -> None:
     with pytest.raises((LookupError, ValueError), match=told):
         MeasurementRows(LakeQuery(served_http, **query), **settings)
+
+
+def test_a_server_that_is_not_there_is_named() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        url = f"http://127.0.0.1:{free.getsockname()[1]}"
+    with pytest.raises(ConnectionError, match=f"{url} does not answer: .*refused"):
+        MeasurementRows(LakeQuery(url))

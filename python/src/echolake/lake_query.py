@@ -197,6 +197,8 @@ def _request_answer(query: LakeQuery, path: str, sql: str | None, read: Callable
             if refusal.code == 429 or refusal.code >= 500:
                 raise ConnectionError(told) from refusal
             raise LookupError(told) from refusal
+        except urllib.error.URLError as failed:
+            raise ConnectionError(f"{query.url} does not answer: {failed.reason}") from failed
 
     return retry_read(read_once, RETRY_SECS)
 
