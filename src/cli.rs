@@ -25,6 +25,8 @@ use crate::commands::import::{self, ImportArgs};
 #[cfg(feature = "lake")]
 use crate::commands::ingest::{self, IngestArgs};
 #[cfg(feature = "lake")]
+use crate::commands::listen::{self, ListenArgs};
+#[cfg(feature = "lake")]
 use crate::commands::mcp::{self, McpArgs};
 use crate::commands::panel::{self, PanelArgs};
 use crate::commands::recover::{self, RecoverArgs};
@@ -122,6 +124,8 @@ pub(crate) enum LakeCommand {
     /// Export data: training sets, slices of runs, SOFA, WAV, npz.
     #[command(subcommand)]
     Export(ExportCommand),
+    /// Hear a recording as a surface and its Flat would reflect it at full scale.
+    Listen(ListenArgs),
     /// Draw the paper's pictures and tables of surfaces, as SVG, PDF, PNG, LaTeX, CSV or Markdown.
     #[command(subcommand)]
     Figure(FigureCommand),
@@ -214,6 +218,7 @@ impl LakeCommand {
             Self::Rebuild(args) => rebuild::run_rebuild(args, lake).await,
             Self::Sql(args) => sql::run_sql(args, lake).await.map(|()| CommandOutcome::Whole),
             Self::Export(args) => export::run_export(args, lake).await,
+            Self::Listen(args) => listen::run_listen(args, lake).await,
             Self::Figure(args) => figure::run_figure(args, lake).await,
             Self::Serve(args) => serve::run_serve(args, lake).await,
             Self::Mcp(args) => mcp::run_mcp(args, lake).await,

@@ -19,6 +19,7 @@ mod kills;
 mod large_chunk;
 mod load;
 mod maintenance;
+mod materials;
 mod notices;
 mod object_stores;
 mod operator;

@@ -47,8 +47,8 @@ fn record_room(sweep: &[f64], decay_secs: f64, direct_mm: f64) -> Vec<f64> {
     recording
 }
 
-/// A mono file of 16 bits.
-fn write_wav(place: &TestFolder, name: &str, samples: &[f64]) {
+/// A mono file of 16 bits at 48 kHz.
+pub(crate) fn write_wav(place: &TestFolder, name: &str, samples: &[f64]) {
     let size = 2 * samples.len() as u32;
     let rate = RATE_HZ as u32;
     let mut bytes = Vec::new();

@@ -46,11 +46,13 @@ pub mod temperature;
 pub use deconvolution::response_deconvolution;
 pub use error::Error;
 pub use levels::{
-    decay, diffusion, energy, envelope, filter_bank, frequency_response, level, mean, octave_filter, oversampling,
-    rise, room_parameters, rounding, spectrogram, spectrum, uncertainty,
+    auralization, decay, diffusion, energy, envelope, filter_bank, frequency_response, level, mean, octave_filter,
+    oversampling, rise, room_parameters, rounding, spectrogram, spectrum, uncertainty,
 };
 pub use real::RealSample;
 pub use realfft::num_complex::Complex;
-pub use reflection::{air, air_correction, arrival, foam, foam_reflection, fresnel, geometry, kirchhoff};
+pub use reflection::{
+    air, air_correction, arrival, far_field, foam, foam_reflection, fresnel, geometry, kirchhoff, scattering,
+};
 pub use relief::{height_field, heights};
 pub use similarity::{components, correlation, self_organising_map, significance};

@@ -20,7 +20,10 @@ mod slice;
 #[cfg(test)]
 mod tests;
 
-pub use acoustics::{ResponseFormat, SOFA_COLUMNS, write_responses, write_sofa_file, write_wav};
+pub use acoustics::{
+    DryRecording, ListenedResponse, MaterialBand, MaterialFormat, ResponseFormat, SOFA_COLUMNS, SoundLevel,
+    format_materials, write_responses, write_sofa_file, write_sounds, write_wav,
+};
 pub use error::{Error, Result};
 pub use ml::{
     ExportSummary, PartCounts, RowSymmetries, SHARDS, SplitBy, SplitParams, SplitPart, SurfaceSelection, TrainingSet,

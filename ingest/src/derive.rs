@@ -4,7 +4,9 @@ use std::sync::Arc;
 
 use echolake_dsp::Complex;
 use echolake_dsp::air_correction::SLOPE_UNCERTAINTY;
+use echolake_dsp::filter_bank::FilterBankPlan;
 use echolake_dsp::mean::SignalMean;
+use echolake_dsp::scattering::{ScatteringPath, ScatteringSums};
 use echolake_dsp::temperature::ReferenceAir;
 use echolake_dsp::uncertainty::{EnergySensitivity, LevelUncertainty};
 use echolake_lake::{EncodedFile, FileEncoder, Lake, encode_batches};
@@ -85,9 +87,10 @@ impl ReferenceDerivation {
         let mut unbiased = vec![totals.clone(); self.references.estimate_count()];
         let mut errors = vec![Vec::new(); totals.len()];
         let mut curves = vec![SignalMean::default(); rig.bands.centres_hz.len()];
+        let mut scattering = ScatteringSums::default();
         let mut paired = 0;
         let uncertainty = self.level_uncertainty(lake, keys, responses)?;
-        self.derive_slices(lake, keys, responses, uncertainty.as_ref(), &mut |slice| {
+        self.derive_slices(lake, keys, responses, uncertainty.as_ref(), &mut scattering, &mut |slice| {
             paired += slice.pairs.len();
             totals.iter_mut().zip(slice.tnce_columns()).for_each(|(all, some)| all.extend(some));
             for (estimate, columns) in unbiased.iter_mut().zip(slice.unbiased_columns()) {
@@ -111,7 +114,9 @@ impl ReferenceDerivation {
         for (table, encoder) in encoders {
             files.push((table, encoder.finish()?));
         }
-        let levels = SurfaceLevels { tnce: totals, unbiased, errors, uncertainty, curves };
+        let bank = FilterBankPlan::new(rig.impulse_response.length, rig.sweep.rate_hz.get(), &rig.bands.centres_hz);
+        let scattering = scattering.band_coefficients(&bank.map_err(failed)?).unwrap_or_default();
+        let levels = SurfaceLevels { tnce: totals, unbiased, errors, uncertainty, curves, scattering };
         let stats = rows::stats::stats_rows(rig, keys, &levels, of)?;
         files.push((
             Table::SurfaceStats,
@@ -126,6 +131,7 @@ impl ReferenceDerivation {
         keys: &RunKeys,
         responses: &RunResponses,
         uncertainty: Option<&LevelUncertainty>,
+        scattering: &mut ScatteringSums,
         take: &mut dyn FnMut(&mut DerivedRows) -> Result<()>,
     ) -> Result<()> {
         let rig = lake.rig();
@@ -141,6 +147,8 @@ impl ReferenceDerivation {
         let mut spectrum = vec![Complex::default(); length / 2 + 1];
         let mut energies = vec![0.0; bands];
         let mut sensitivities = vec![EnergySensitivity::default(); bands];
+        let sides = lake.grid().points().iter().flat_map(|point| [point.position_mm[0], point.position_mm[1]]);
+        let widest_mm = sides.map(f64::abs).fold(1.0, f64::max);
         let slices = responses.pairs.chunks(SLICE).zip(responses.irs.chunks(SLICE * length));
         for ((pairs, irs), airs) in slices.zip(responses.airs.chunks(SLICE)) {
             let mut slice = DerivedRows::new(bands);
@@ -166,6 +174,11 @@ impl ReferenceDerivation {
                     chosen.reflected_spectrum(&unbiased.direct, &mut spectrum, &air_scratch);
                     plan.spectrum_energies(&spectrum, &mut energies);
                     slice.push_unbiased(number, &energies, unbiased.flat_total);
+                    if number == 0 {
+                        let specular = paths.specular_mm.map(|mm| mm / widest_mm);
+                        let path = ScatteringPath { incidence_deg: paths.incidence_deg, specular };
+                        scattering.add_pair(&spectrum, &unbiased.flat, path).map_err(failed)?;
+                    }
                 }
             }
             take(&mut slice)?;

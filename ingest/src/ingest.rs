@@ -30,7 +30,7 @@ use crate::rows::runs::RunReferences;
 use crate::rows::{self, RunKeys};
 
 /// Revision of the responses that follow from recordings: those of another one are derived anew.
-const RESPONSES_REVISION: &str = "5";
+const RESPONSES_REVISION: &str = "6";
 
 /// Time between two looks at other ingests' claims.
 pub(crate) const LOOK_EVERY: Duration = Duration::from_secs(2);

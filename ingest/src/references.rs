@@ -8,7 +8,7 @@ use echolake_dsp::air::AirState;
 use echolake_dsp::air_correction::{AirCorrection, AirScratch, PairAir};
 use echolake_dsp::foam::subtract_foam;
 use echolake_dsp::foam_reflection::{FoamReflection, FoamReflectionFit, ReflectionPath};
-use echolake_dsp::geometry::{direct_mm, image_mm, incidence_deg};
+use echolake_dsp::geometry::{direct_mm, image_mm, incidence_deg, specular_point};
 use echolake_dsp::temperature::ReferenceAir;
 use echolake_dsp::uncertainty::{DirectSoundResidual, EnergySensitivity};
 use echolake_lake::{DataFile, DirectSound, FileName, Lake, LakeSnapshot, ReferenceSurfaces, SamplePrecision};
@@ -28,7 +28,7 @@ use crate::pipeline::Cores;
 use crate::read_back;
 
 /// Revision of the rows that follow from references: those of another one are derived anew.
-const ROWS_REVISION: &str = "8";
+const ROWS_REVISION: &str = "9";
 /// Number of hex digits of a digest in a version.
 const VERSION_DIGITS: usize = 12;
 
@@ -71,6 +71,8 @@ pub(crate) struct UnbiasedPair {
     pub direct: Vec<Complex<f32>>,
     /// Energy of what Flat reflects.
     pub flat_total: f64,
+    /// Spectrum of what Flat reflects; empty in variants.
+    pub flat: Vec<Complex<f32>>,
 }
 
 impl LoadedReferences {
@@ -369,13 +371,15 @@ impl ReferenceResponses {
             let mut direct = vec![0.0; flat.ir.len()];
             let mut reflected = vec![Complex::default(); flat.ir.len() / 2 + 1];
             self.correction.take_response(&flat.ir, &paths.in_air(&flat.air, &flat_foam.air), scratch)?;
-            let unbiased = reflections.iter().map(|reflection| {
+            let unbiased = reflections.iter().enumerate().map(|(number, reflection)| {
                 reflection.direct_sound(&flat_foam.ir, &flat.ir, paths.incidence_deg, &mut direct)?;
                 let of_flat = self.correction.compute_spectrum(&direct, scratch)?;
                 self.correction.reflected_spectrum(&of_flat, &mut reflected, scratch);
                 let flat_total = plan.spectrum_energies(&reflected, &mut vec![0.0; bands]);
+                let of_best = if number == 0 { reflected.clone() } else { Vec::new() };
                 reflection.direct_sound(&own.ir, &flat.ir, paths.incidence_deg, &mut direct)?;
-                Ok(UnbiasedPair { direct: self.correction.compute_spectrum(&direct, scratch)?, flat_total })
+                let direct = self.correction.compute_spectrum(&direct, scratch)?;
+                Ok(UnbiasedPair { direct, flat_total, flat: of_best })
             });
             Ok(Some((*pair, unbiased.collect::<std::result::Result<_, _>>()?)))
         };
@@ -389,12 +393,14 @@ impl ReferenceResponses {
     }
 }
 
-/// Lengths of a pair's direct path and of that by the panel's plane, m, and the latter's angle of incidence.
+/// Lengths of a pair's direct path and of that by the panel's plane, m, and the latter's angle and point of reflection.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct PairPaths {
     pub direct_m: f64,
     pub reflected_m: f64,
     pub incidence_deg: f64,
+    /// Point of reflection.
+    pub specular_mm: [f64; 2],
 }
 
 impl PairPaths {
@@ -406,7 +412,8 @@ impl PairPaths {
         let speaker = position(points.speaker)?;
         let [direct_m, reflected_m] =
             [direct_mm(microphone, speaker), image_mm(microphone, speaker)].map(|mm| mm / 1e3);
-        Some(Self { direct_m, reflected_m, incidence_deg: incidence_deg(microphone, speaker) })
+        let incidence_deg = incidence_deg(microphone, speaker);
+        Some(Self { direct_m, reflected_m, incidence_deg, specular_mm: specular_point(microphone, speaker) })
     }
 
     fn in_air(&self, response: &AirState, direct: &AirState) -> PairAir {

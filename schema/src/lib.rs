@@ -32,7 +32,7 @@ pub use error::{Error, ErrorCause, escape_controls};
 pub use grid::{Grid, Pair, Point};
 pub use ids::{PairId, PointId, ProjectName, RunId, SurfaceId};
 pub use manifest::{RunManifest, SurfaceRecord};
-pub use quantities::{Celsius, SampleRate, Timestamp};
+pub use quantities::{Celsius, MODEL_SCALE, SampleRate, Timestamp};
 pub use rig::{AirTreatment, Rig, SpectralDivision, SweepShape};
 pub use symmetry::Symmetry;
 pub use tables::Table;

@@ -7,6 +7,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::Error;
 
+/// Scale of the panels: models of walls at a tenth of their size, whose wavelengths are a tenth, too.
+pub const MODEL_SCALE: f64 = 10.0;
+
 /// Temperature of air in degrees Celsius, -60 to 80: the range of a sensor in a room or a cold store.
 ///
 /// ```

@@ -7,8 +7,9 @@ use std::collections::HashSet;
 use anyhow::Context as _;
 use clap::{Args, Subcommand, ValueEnum};
 use echolake_export::{
-    Check, ExportSummary, Layout, PendingFile, ResponseFormat, RowSymmetries, Slice, SliceParams, SplitBy, SplitParams,
-    SurfaceSelection, Taken, TrainingSet, WrittenFile, write_responses, write_training_set, write_wav,
+    Check, ExportSummary, Layout, MaterialBand, MaterialFormat, PendingFile, ResponseFormat, RowSymmetries, Slice,
+    SliceParams, SplitBy, SplitParams, SurfaceSelection, Taken, TrainingSet, WrittenFile, format_materials,
+    write_responses, write_training_set, write_wav,
 };
 use echolake_lake::Lake;
 use echolake_query::{PredicateForm, Session};
@@ -33,6 +34,8 @@ pub(crate) enum ExportCommand {
     Npz(ResponseArgs),
     /// The recordings of some measurements as WAV files with a manifest; `import wav` reads them.
     Wav(WavArgs),
+    /// Absorption and scattering of surfaces at full scale, for programs that simulate rooms: view `materials`.
+    Materials(MaterialArgs),
 }
 
 #[derive(Debug, Args)]
@@ -151,6 +154,29 @@ pub(crate) struct WavArgs {
     output: ExportTarget,
 }
 
+#[derive(Debug, Args)]
+pub(crate) struct MaterialArgs {
+    /// Surfaces, separated by commas; by default all.
+    #[arg(long, value_delimiter = ',')]
+    surfaces: Vec<SurfaceId>,
+    /// Program that reads the file.
+    #[arg(long, value_enum)]
+    format: MaterialFormatArg,
+    /// The new file, on this machine or as s3://bucket/name.
+    #[arg(short, long, value_name = "FILE", value_parser = ExportTarget::parse)]
+    output: ExportTarget,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum MaterialFormatArg {
+    /// JSON with the arguments of pyroomacoustics' Material by surface.
+    Pyroomacoustics,
+    /// JSON with absorption_coefficients and frequencies, as CHORAS' input has them.
+    Choras,
+    /// A row per surface and band, with uncertainties and reasons.
+    Csv,
+}
+
 pub(crate) async fn run_export(command: &ExportCommand, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let lake = Lake::open(lake_url).await?;
     match command {
@@ -159,6 +185,7 @@ pub(crate) async fn run_export(command: &ExportCommand, lake_url: &str) -> anyho
         ExportCommand::Sofa(args) => export_responses(&lake, args, ResponseFormat::Sofa).await?,
         ExportCommand::Npz(args) => export_responses(&lake, args, ResponseFormat::Npz).await?,
         ExportCommand::Wav(args) => export_wav(&lake, args).await?,
+        ExportCommand::Materials(args) => export_materials(&lake, args).await?,
     }
     Ok(CommandOutcome::Whole)
 }
@@ -296,6 +323,40 @@ async fn export_wav(lake: &Lake, args: &WavArgs) -> anyhow::Result<()> {
     if let ExportTarget::Local(folder) = &args.output {
         eprintln!("next: echolake --lake NEW import wav {}", folder.join("manifest.csv").display());
     }
+    Ok(())
+}
+
+async fn export_materials(lake: &Lake, args: &MaterialArgs) -> anyhow::Result<()> {
+    let pending = PendingExport::prepare_file(&args.output).await?;
+    let mut file = PendingFile::create(pending.path())?;
+    let session = Session::new(lake)?;
+    let sql = "select * from materials order by surface_id, full_scale_hz";
+    let mut rows = super::sql::query_rows::<MaterialBand>(&session, sql).await?;
+    if let Some(unknown) =
+        args.surfaces.iter().find(|surface| rows.iter().all(|row| row.surface_id != surface.as_str()))
+    {
+        anyhow::bail!("surface `{unknown}` has no levels; hint: `echolake doctor` says which references are missing");
+    }
+    rows.retain(|row| {
+        args.surfaces.is_empty() || args.surfaces.iter().any(|surface| surface.as_str() == row.surface_id)
+    });
+    let format = match args.format {
+        MaterialFormatArg::Pyroomacoustics => MaterialFormat::Pyroomacoustics,
+        MaterialFormatArg::Choras => MaterialFormat::Choras,
+        MaterialFormatArg::Csv => MaterialFormat::Csv,
+    };
+    let (text, omitted) = format_materials(&rows, format)?;
+    file.write(&text)?;
+    file.publish()?;
+    pending.publish().await?;
+    let surfaces = rows.chunk_by(|a, b| a.surface_id == b.surface_id).count() - omitted.len();
+    for surface in omitted {
+        let lacks = |row: &MaterialBand| row.absorption.is_none() || row.scattering.is_none();
+        let row = rows.iter().find(|row| row.surface_id == surface && lacks(row));
+        let reason = row.and_then(|row| row.absorption_reason.as_ref().or(row.scattering_reason.as_ref()));
+        eprintln!("{surface} left out: {}", reason.map_or("a band has no value", String::as_str));
+    }
+    eprintln!("{}: {surfaces} surfaces", args.output);
     Ok(())
 }
 

@@ -17,6 +17,8 @@ pub(crate) mod import;
 #[cfg(feature = "lake")]
 pub(crate) mod ingest;
 #[cfg(feature = "lake")]
+pub(crate) mod listen;
+#[cfg(feature = "lake")]
 pub(crate) mod mcp;
 #[cfg(feature = "upload")]
 mod notify;

@@ -14,6 +14,13 @@ is columns `detail_phase_*` of table `surfaces`: the phase of its details that a
     python tests/simulation/compare_bem.py waves joint1.2  # these reliefs
     python tests/simulation/compare_bem.py --write FILE    # and puts the table between the markers in FILE
     python tests/simulation/compare_bem.py --cylinder
+    python tests/simulation/compare_bem.py --far-field --write docs/materials.md  # five minutes
+
+With `--far-field` the table has coefficients by band, of 3 frequencies each: diffusion by ISO 17497-2, normalised by the
+flat bar, and scattering by Mommertz's correlation with the flat bar; the program's is 1 less the share that is mirrored. The far field has plane waves from 0, 30 and 60
+degrees to both sides, with weights for random incidence, and 37 receivers, by the boundary-element method and as
+`echolake_dsp::far_field` has it. The last row is what the lake's function `scattering` makes of the boundary elements'
+pressures at the 120 pairs of the grid.
 """
 
 import argparse
@@ -34,6 +41,10 @@ PLACES = np.array([((i - (n - 1) / 2) * pitch, z) for n, pitch, z in LAYERS for 
 PAIRS = [(i, j) for i in range(16) for j in range(i)]
 FEW = np.polynomial.legendre.leggauss(2)
 MANY = np.polynomial.legendre.leggauss(8)
+# Receivers and sources of ISO 17497-2, and the sources' weights for random incidence.
+RECEIVER_ANGLES = np.radians(np.arange(-90, 91, 5))
+SOURCE_ANGLES = np.radians([0, -30, 30, -60, 60])
+SOURCE_WEIGHTS = np.array([1, 3, 3, 3, 3]) / 13
 # Rows of the table: energies over Flat, and root mean square differences of the pairs from the boundary-element method.
 LEVELS = ("boundary elements, mean, dB", "`steep_facets = false`, mean, dB", "`steep_facets = true`, mean, dB")
 DIFFERENCES = ("`steep_facets = false`, rms a pair, dB", "`steep_facets = true`, rms a pair, dB")
@@ -97,18 +108,30 @@ class BoundaryMesh:
 
     def scattered(self, k, sources, receivers):
         """Scattered pressure `[receivers, sources]` of line sources i/4 H0(k r)."""
+        near, _ = self.all_scattered(k, sources, receivers)
+        return near
+
+    def all_scattered(self, k, sources, receivers):
+        """The same, and that of plane waves far away, `[37, 5]`, but for a common factor."""
         d = self.middle[:, None] - sources[None]
         r = np.hypot(d[..., 0], d[..., 1])
         h0, h1 = hankel(k * r)
         incident = 0.25j * h0 + 0.25 * h1 * (d * self.normal[:, None]).sum(-1) / r
-        pressure = solve(self.matrix(k), incident, overwrite_a=True, overwrite_b=True, check_finite=False)
-        out = 0
+        to_source = np.stack([np.sin(SOURCE_ANGLES), np.cos(SOURCE_ANGLES)])
+        waves = np.exp(-1j * k * self.middle @ to_source) * (1 + self.normal @ to_source)
+        both = np.hstack([incident, waves])
+        both = solve(self.matrix(k), both, overwrite_a=True, overwrite_b=True, check_finite=False)
+        pressure, of_waves = both[:, : len(sources)], both[:, len(sources) :]
+        to_receiver = np.stack([np.sin(RECEIVER_ANGLES), np.cos(RECEIVER_ANGLES)])
+        out, far = 0, 0
         for t, w in zip(*FEW, strict=True):
             d = receivers[:, None] - (self.middle + self.half * t)[None]
             r = np.hypot(d[..., 0], d[..., 1])
             double = 0.25j * k * hankel(k * r)[1] * (d * self.normal[None]).sum(-1) / r
             out = out + (double * (w * self.length / 2)) @ pressure
-        return out
+            turns = np.exp(-1j * k * (self.middle + self.half * t) @ to_receiver)
+            far = far + (self.normal @ to_receiver * turns).T * (w * self.length / 2) @ of_waves
+        return out, far
 
 
 def stairs(edges, heights):
@@ -163,6 +186,8 @@ def relief(name):
         "rubble": rubble,
         "wells45": lambda: wells(0.045, 0.038, 1),
         "wells15": lambda: wells(0.015, 0.020, 2),
+        "sine": lambda: [(x, 0.008 * np.cos(2 * np.pi * x / 0.1)) for x in along],
+        "prd": lambda: stairs(np.linspace(-WIDTH / 2, WIDTH / 2, 13), [-0.038 * pow(2, k, 13) / 13 for k in range(12)]),
     }[name]()
 
 
@@ -175,22 +200,31 @@ RELIEFS = {
     "wells45": "wells 45 mm, <= 38 deep",
     "wells15": "wells 15 mm, <= 20 deep",
 }
+FAR_RELIEFS = {
+    "sine": "sine 16 mm / 100 mm",
+    "prd": "primitive root diffuser, 12 wells, 38 mm",
+    **RELIEFS,
+}
+
+
+def boundary_meshes(name, frequencies):
+    """A mesh of the bar for each frequency."""
+    top = relief(name)
+    corners = np.array([(-WIDTH / 2, -0.075), *top, (WIDTH / 2, -0.075)])
+    lengths = np.hypot(*(np.roll(corners, -1, axis=0) - corners).T)
+    is_detail = (lengths < 0.003) & (name not in ("waves", "sine"))
+    for hz in frequencies:
+        sizes = np.full(len(corners), min(SPEED / hz / 8, 0.003))
+        sizes[is_detail] = np.minimum(sizes[is_detail], np.maximum(lengths[is_detail] / 3, 0.00035))
+        yield hz, BoundaryMesh(corners, sizes)
+        print(f"\r{name} {hz:6.0f} Hz", end="", file=sys.stderr, flush=True)
+    print(file=sys.stderr)
 
 
 def exact(name):
     """Scattered pressure by the boundary-element method, `[frequencies, receivers, sources]`."""
-    top = relief(name)
-    corners = np.array([(-WIDTH / 2, -0.075), *top, (WIDTH / 2, -0.075)])
-    lengths = np.hypot(*(np.roll(corners, -1, axis=0) - corners).T)
-    is_detail = (lengths < 0.003) & (name != "waves")
-    fields = []
-    for hz in FREQUENCIES:
-        sizes = np.full(len(corners), min(SPEED / hz / 8, 0.003))
-        sizes[is_detail] = np.minimum(sizes[is_detail], np.maximum(lengths[is_detail] / 3, 0.00035))
-        fields.append(BoundaryMesh(corners, sizes).scattered(2 * np.pi * hz / SPEED, PLACES, PLACES))
-        print(f"\r{name} {hz:6.0f} Hz", end="", file=sys.stderr, flush=True)
-    print(file=sys.stderr)
-    return np.array(fields)
+    meshes = boundary_meshes(name, FREQUENCIES)
+    return np.array([mesh.scattered(2 * np.pi * hz / SPEED, PLACES, PLACES) for hz, mesh in meshes])
 
 
 def cell_heights(name):
@@ -282,25 +316,113 @@ def table(names):
             yield f"| {RELIEFS[name] if n == 0 else ''} | {label} | {cells} |"
 
 
+def far_frequencies():
+    """Frequencies of the bands, 3 each: thirds of an octave, as far as the sweep has them."""
+    low = np.maximum(CENTRES / np.sqrt(2), 2000)[:, None]
+    high = np.minimum(CENTRES * np.sqrt(2), 40000)[:, None]
+    return (low * (high / low) ** ((np.arange(3) + 0.5) / 3)).ravel()
+
+
+def far_kirchhoff(name, hz):
+    """Pressures far away, `[37, 5]`, as the program has them."""
+    height, x = cell_heights(name)
+    height, step, k = height - height.mean(), WIDTH / FACETS, 2 * np.pi * hz / SPEED
+    out = np.empty((len(RECEIVER_ANGLES), len(SOURCE_ANGLES)), complex)
+    for j, source in enumerate(SOURCE_ANGLES):
+        for i, receiver in enumerate(RECEIVER_ANGLES):
+            along, up = np.sin(source) + np.sin(receiver), np.cos(source) + np.cos(receiver)
+            phase = np.exp(1j * k * up * height)
+            level = (up + 4 * (1 + np.sin(source) * np.sin(receiver)) / up) / 2
+            sloped = along / 2 * np.gradient(phase, step) / (1j * k * up)
+            out[i, j] = ((level * phase - sloped) * np.exp(1j * k * along * x)).sum()
+    return out
+
+
+def far_coefficients(fields, flat):
+    """Normalised diffusion and scattering of a band, from pressures `[frequencies, 37, 5]`."""
+
+    def diffusion(pressures):
+        energy = (np.abs(pressures) ** 2).sum(0)
+        square = (energy**2).sum(0)
+        return (energy.sum(0) ** 2 - square) / (len(energy) - 1) / square
+
+    d, flat_d = diffusion(fields), diffusion(flat)
+    coherent = (np.abs((fields * flat.conj()).sum(1)) ** 2 / (np.abs(flat) ** 2).sum(1)).sum(0)
+    scattering = 1 - coherent / (np.abs(fields) ** 2).sum((0, 1))
+    return ((d - flat_d) / (1 - flat_d)) @ SOURCE_WEIGHTS, scattering @ SOURCE_WEIGHTS
+
+
+def mirrored_share(name, hz):
+    """Share of the energy that is mirrored, as the program has it, for random incidence."""
+    height, _ = cell_heights(name)
+    turns = 4j * np.pi * hz / SPEED * np.cos(SOURCE_ANGLES)[:, None] * (height - height.mean())
+    return (np.abs(np.exp(turns).mean(1)) ** 2) @ SOURCE_WEIGHTS
+
+
+def grid_scattering(fields, flat):
+    """Scattering of a band by correlation over the pairs of the grid, from pressures `[frequencies, 16, 16]`."""
+    pairs = np.array(PAIRS)
+    fields, flat = (f[:, pairs[:, 0], pairs[:, 1]] for f in (fields, flat))
+    d = PLACES[pairs[:, 0]] - PLACES[pairs[:, 1]] * [1, -1]
+    classes = np.minimum(np.floor(10 * d[:, 1] / np.hypot(*d.T)), 9)
+    coherent = 0
+    for c in np.unique(classes):
+        x, x0 = fields[:, classes == c], flat[:, classes == c]
+        coherent += (np.abs((x * x0.conj()).sum(1)) ** 2 / (np.abs(x0) ** 2).sum(1)).sum()
+    return 1 - coherent / (np.abs(fields) ** 2).sum()
+
+
+def far_table(names):
+    """Lines of the table of the far field, in Markdown."""
+    frequencies = far_frequencies()
+
+    def fields(name):
+        meshes = boundary_meshes(name, frequencies)
+        both = [mesh.all_scattered(2 * np.pi * hz / SPEED, PLACES, PLACES) for hz, mesh in meshes]
+        near, far = (np.array(part) for part in zip(*both, strict=True))
+        return near, far, np.array([far_kirchhoff(name, hz) for hz in frequencies])
+
+    near_flat, far_flat, kirchhoff_flat = fields("flat")
+    bands = [slice(3 * b, 3 * b + 3) for b in range(len(CENTRES))]
+    yield "| relief | | " + " | ".join(f"{hz:.0f} Hz" for hz in CENTRES) + " |"
+    yield "| --- | --- |" + " ---: |" * len(CENTRES)
+    for name in names:
+        near, far, by_kirchhoff = fields(name)
+        exact_values = np.array([far_coefficients(far[b], far_flat[b]) for b in bands]).T
+        program = np.array([far_coefficients(by_kirchhoff[b], kirchhoff_flat[b]) for b in bands]).T
+        rows = [
+            ("diffusion, boundary elements", exact_values[0]),
+            ("`diffusion_normalised_*`", program[0]),
+            ("scattering, boundary elements", exact_values[1]),
+            ("`far_scattering_*`", [np.mean([1 - mirrored_share(name, hz) for hz in frequencies[b]]) for b in bands]),
+            ("`scattering` of the grid's pairs", [grid_scattering(near[b], near_flat[b]) for b in bands]),
+        ]
+        for n, (label, values) in enumerate(rows):
+            cells = " | ".join(f"{x:.2f}".replace("-0.00", "0.00") for x in values)
+            yield f"| {FAR_RELIEFS[name] if n == 0 else ''} | {label} | {cells} |"
+
+
 def main():
     """Prints the table, or checks the method."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("reliefs", nargs="*", metavar="RELIEF", help=" ".join(RELIEFS))
+    parser.add_argument("reliefs", nargs="*", metavar="RELIEF", help=" ".join(FAR_RELIEFS))
     parser.add_argument("--cylinder", action="store_true")
+    parser.add_argument("--far-field", action="store_true")
     parser.add_argument("--write", type=pathlib.Path, metavar="FILE")
     args = parser.parse_args()
     if args.cylinder:
         check_cylinder()
         return
+    marker = f"{MARKER} --far-field" if args.far_field else MARKER
     lines = []
-    for line in table(args.reliefs or RELIEFS):
+    for line in far_table(args.reliefs or FAR_RELIEFS) if args.far_field else table(args.reliefs or RELIEFS):
         print(line, flush=True)
         lines.append(line)
     if args.write:
-        before, rest = args.write.read_text().split(f"<!-- {MARKER} -->\n")
-        after = rest.split(f"<!-- end of {MARKER} -->\n")[1]
+        before, rest = args.write.read_text().split(f"<!-- {marker} -->\n")
+        after = rest.split(f"<!-- end of {marker} -->\n")[1]
         body = "\n".join(lines)
-        args.write.write_text(f"{before}<!-- {MARKER} -->\n\n{body}\n\n<!-- end of {MARKER} -->\n{after}")
+        args.write.write_text(f"{before}<!-- {marker} -->\n\n{body}\n\n<!-- end of {marker} -->\n{after}")
 
 
 if __name__ == "__main__":

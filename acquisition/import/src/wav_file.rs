@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use echolake_schema::messages::SampleFormat;
 use echolake_schema::samples::split_24;
 
+use crate::Error;
 use crate::wav_layout::{SampleCoding, WavLayout};
 
 /// A channel of a file.
@@ -21,6 +22,28 @@ pub(crate) struct ChannelSamples {
     pub bytes: Vec<u8>,
     pub fractions: Vec<f32>,
     pub clipped: u32,
+}
+
+/// A recording that is no measurement.
+#[derive(Debug, Clone, PartialEq)]
+pub struct DryWav {
+    /// Fractions of full scale.
+    pub samples: Vec<f32>,
+    /// Sampling rate.
+    pub rate_hz: u32,
+}
+
+/// Reads a channel of a WAV file: `file.wav`, or `file.wav#2` for its second one.
+///
+/// # Errors
+/// [`Error::WavFile`].
+pub fn read_wav_channel(path: &Path) -> Result<DryWav, Error> {
+    let read = || {
+        let channel = WavChannel::open(Path::new(""), &path.to_string_lossy())?;
+        let samples = channel.read_all(channel.sample_format())?.fractions;
+        Ok(DryWav { samples, rate_hz: channel.layout.rate_hz })
+    };
+    read().map_err(|fault| Error::WavFile { fault })
 }
 
 impl WavChannel {

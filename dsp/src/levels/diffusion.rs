@@ -86,6 +86,14 @@ pub fn diffusion_of_levels<T: crate::RealSample>(levels_db: &[T]) -> Option<f64>
     sums.coefficient()
 }
 
+/// Diffusion coefficient normalised by that of a flat panel of the same size: (d - d_flat) / (1 - d_flat). None if the
+/// flat panel is as even as can be.
+///
+/// Source: ISO 17497-2:2012, formula 7.
+pub fn normalise_diffusion(coefficient: f64, flat: f64) -> Option<f64> {
+    (flat < 1.0).then(|| (coefficient - flat) / (1.0 - flat))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -119,6 +127,48 @@ mod tests {
         first.merge(&DiffusionSums::from_parts(second.parts()));
         first.merge(&DiffusionSums::default());
         assert!((first.coefficient().expect("one") - expected).abs() < 1e-12);
+    }
+
+    // 6 periods of the sequence n^2 mod 7, 0.2 m deep and 3.6 m wide, at 1 kHz. Cox and D'Antonio 2017, Acoustic
+    // Absorbers and Diffusers, equations 5.8 and 9.32: wells change the phase, Fraunhofer's far field of their sum.
+    fn fraunhofer_level(angle_deg: f64, deepest_m: f64) -> f64 {
+        let wave_number = std::f64::consts::TAU * 1e3 / 343.0;
+        let (sine, cosine) = angle_deg.to_radians().sin_cos();
+        let well = |n: i32| {
+            let depth = f64::from(n * n % 7) / 4.0 * deepest_m;
+            let place = (f64::from(n) - 20.5) * 0.6 / 7.0;
+            crate::Complex::cis(wave_number * (place * sine - 2.0 * depth))
+        };
+        let half = wave_number * 0.3 / 7.0 * sine;
+        let aperture = if half == 0.0 { 1.0 } else { half.sin() / half };
+        let pressure = (0..42).map(well).sum::<crate::Complex<f64>>().norm() * aperture * (1.0 + cosine) / 2.0;
+        20.0 * pressure.max(1e-10).log10()
+    }
+
+    // The levels by another program: tests/fixtures/diffusion/README.md. They are over the loudest.
+    #[test]
+    fn a_published_diffuser() {
+        let file = include_str!("../../../tests/fixtures/diffusion/qrd7_1000hz.csv");
+        let column = |at: usize| -> Vec<f64> {
+            file.lines().skip(1).map(|line| line.split(',').nth(at).expect("three").parse().expect("number")).collect()
+        };
+        let angles = column(0);
+        assert_eq!(angles.len(), 37);
+        let [diffuser, flat] = [(1, 0.2), (2, 0.0)].map(|(other, deepest_m)| {
+            let levels: Vec<f64> = angles.iter().map(|angle| fraunhofer_level(*angle, deepest_m)).collect();
+            let loudest = levels.iter().copied().fold(f64::MIN, f64::max);
+            for (level, other) in levels.iter().zip(column(other)) {
+                assert!((level - loudest - other).abs() < 1e-5, "{level} {other}");
+            }
+            diffusion_of_levels(&levels).expect("one")
+        });
+        let found = [diffuser, flat, normalise_diffusion(diffuser, flat).expect("one")];
+        for (found, [published, computed]) in
+            found.into_iter().zip([[0.1099, 0.109_853], [0.0049, 0.004_872], [0.1055, 0.105_495]])
+        {
+            assert!((found - published).abs() < 1e-4 && (found - computed).abs() < 1e-6, "{found}");
+        }
+        assert_eq!(normalise_diffusion(1.0, 1.0), None);
     }
 
     #[test]

@@ -1,5 +1,6 @@
 //! Energies and levels: of bands, along time, over frequency, of several measurements.
 
+pub mod auralization;
 pub mod decay;
 pub mod diffusion;
 pub mod energy;

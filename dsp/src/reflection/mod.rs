@@ -3,8 +3,10 @@
 pub mod air;
 pub mod air_correction;
 pub mod arrival;
+pub mod far_field;
 pub mod foam;
 pub mod foam_reflection;
 pub mod fresnel;
 pub mod geometry;
 pub mod kirchhoff;
+pub mod scattering;

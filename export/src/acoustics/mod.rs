@@ -1,5 +1,7 @@
-//! Formats that acousticians exchange: SOFA and npz of a surface's responses, WAV of its recordings.
+//! Formats that acousticians exchange: SOFA and npz of a surface's responses, WAV of its recordings, materials.
 
+mod listening;
+mod materials;
 mod npz;
 mod sofa;
 mod wav;
@@ -16,6 +18,8 @@ use echolake_schema::tables::Table;
 use crate::error::{Error, Result};
 use crate::output::{PendingFolder, WrittenFile};
 use crate::rows;
+pub use listening::{DryRecording, ListenedResponse, SoundLevel, write_sounds};
+pub use materials::{MaterialBand, MaterialFormat, format_materials};
 pub use wav::write_wav;
 
 /// The responses of one run, in the order of their pairs.

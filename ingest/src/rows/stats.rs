@@ -4,6 +4,7 @@ use arrow::record_batch::RecordBatch;
 use echolake_dsp::foam_reflection::estimate_error;
 use echolake_dsp::level::{p90_mean, percentile, power_to_db};
 use echolake_dsp::mean::SignalMean;
+use echolake_dsp::scattering::BandScattering;
 use echolake_dsp::uncertainty::{LevelError, LevelUncertainty};
 use echolake_schema::Rig;
 use echolake_schema::tables::{BandStatistics, Table};
@@ -24,6 +25,8 @@ pub(crate) struct SurfaceLevels {
     pub uncertainty: Option<LevelUncertainty>,
     /// Mean NCE curves of the bands.
     pub curves: Vec<SignalMean>,
+    /// Coefficients of the bands; none without an estimate of Foam's reflection.
+    pub scattering: Vec<BandScattering>,
 }
 
 /// Builds one row per band and one for the total.
@@ -48,6 +51,10 @@ pub(crate) fn stats_rows(
         let level_u_db = stats.p90_mean_u_db;
         stats.unbiased_p90_mean_u_db = level_u_db.and_then(|u| finite_value(u.hypot(estimate_error(*best, variants))));
     }
+    // The total has none.
+    let numbers = |of: fn(&BandScattering) -> Option<f64>| -> Vec<Option<f64>> {
+        (0..stats.len()).map(|band| levels.scattering.get(band).and_then(of).and_then(finite_value)).collect()
+    };
     let batch = keys
         .begin_rows(Table::SurfaceStats, rig, stats.len())
         .push_texts("band", stats.iter().map(|s| &s.band))
@@ -63,6 +70,12 @@ pub(crate) fn stats_rows(
         .push_doubles("p90_mean_u_db", stats.iter().map(|s| s.p90_mean_u_db))
         .push_doubles("unbiased_p90_mean_db", stats.iter().map(|s| s.unbiased_p90_mean_db))
         .push_doubles("unbiased_p90_mean_u_db", stats.iter().map(|s| s.unbiased_p90_mean_u_db))
+        .push_doubles("energy_over_flat", numbers(|band| Some(band.energy.value)))
+        .push_doubles("energy_over_flat_u", numbers(|band| band.energy.uncertainty))
+        .push_doubles("scattering", numbers(|band| Some(band.scattering.value)))
+        .push_doubles("scattering_u", numbers(|band| band.scattering.uncertainty))
+        .push_doubles("specular_loss", numbers(|band| Some(band.specular_loss.value)))
+        .push_doubles("specular_loss_u", numbers(|band| band.specular_loss.uncertainty))
         .push_lists("mean_nce", mean_curves(&levels.curves))
         .fill_text("flat_version", of.flat)
         .fill_text("foam_version", of.foam)

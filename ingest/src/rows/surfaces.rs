@@ -1,8 +1,9 @@
 //! The row of table `surfaces`.
 
-use std::f64::consts::TAU;
+use std::f64::consts::{FRAC_1_SQRT_2, SQRT_2, TAU};
 
 use arrow::record_batch::RecordBatch;
+use echolake_dsp::far_field::{FarFieldCoefficients, far_field_coefficients};
 use echolake_dsp::height_field::HeightField;
 use echolake_dsp::temperature::ReferenceAir;
 use echolake_lake::ReferenceSurfaces;
@@ -11,6 +12,9 @@ use echolake_schema::{ProjectName, Rig, SurfaceId, SurfaceRecord};
 
 use super::RunKeys;
 use crate::error::Result;
+
+/// Frequencies of a band at which the far field is computed: of thirds of an octave.
+const FAR_FIELD_FREQUENCIES: usize = 3;
 
 /// Builds the row of a run's surface; references that it does not name default to the lake's.
 pub(crate) fn surface_row(
@@ -31,6 +35,9 @@ pub(crate) fn surface_row(
     for (band, hz) in rig.band_names().iter().zip(&rig.bands.centres_hz) {
         let phase = heights.as_ref().and_then(|heights| detail_phase(heights, rig, *hz));
         row.push_floats(&format!("detail_phase_{band}"), [phase]);
+        let far = heights.as_ref().and_then(|heights| far_field(heights, rig, *hz));
+        row.push_floats(&format!("diffusion_normalised_{band}"), [far.map(|far| far.diffusion_normalised as f32)]);
+        row.push_floats(&format!("far_scattering_{band}"), [far.map(|far| far.scattering as f32)]);
     }
     let row = row
         .fill_text("panel", keys.surface.panel())
@@ -64,6 +71,17 @@ fn detail_phase(heights: &HeightField, rig: &Rig, hz: f64) -> Option<f32> {
     (wavelength_mm > 2.0 * heights.pitch_mm()).then_some(phase as f32)
 }
 
+// Over the part of the band's octave that the sweep has.
+fn far_field(heights: &HeightField, rig: &Rig, hz: f64) -> Option<FarFieldCoefficients> {
+    let speed_m_s = ReferenceAir::from_response(&rig.impulse_response).speed_of_sound();
+    let low_hz = rig.sweep.low_hz.max(hz * FRAC_1_SQRT_2);
+    let high_hz = rig.sweep.high_hz.min(hz * SQRT_2);
+    let at = |i: usize| low_hz * (high_hz / low_hz).powf((i as f64 + 0.5) / FAR_FIELD_FREQUENCIES as f64);
+    let wave_numbers: Vec<f64> = (0..FAR_FIELD_FREQUENCIES).map(|i| TAU * at(i) / speed_m_s).collect();
+    let is_fine = 1e3 * speed_m_s / high_hz > 2.0 * heights.pitch_mm();
+    (low_hz < high_hz && is_fine).then(|| far_field_coefficients(heights, &wave_numbers))
+}
+
 // Minimum, maximum and root mean square height about the mean.
 fn relief_stats(heights_mm: &[f32]) -> Option<[f32; 3]> {
     if heights_mm.is_empty() {
@@ -94,5 +112,7 @@ mod tests {
         assert!((phase - 0.4 * (TAU * 10.0 / 343.2) as f32).abs() < 0.01, "{phase}");
         assert_eq!(detail_phase(&grooves(100), &rig, 40e3), None);
         assert_eq!(HeightField::from_rows(585.0, vec![0.0; 6]), None);
+        let far = |cells: usize, hz| far_field(&grooves(cells), &rig, hz);
+        assert!(far(100, 2_500.0).is_some_and(|far| far.scattering.abs() < 0.01) && far(100, 40e3).is_none());
     }
 }

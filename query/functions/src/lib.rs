@@ -65,6 +65,7 @@ impl FunctionSet {
             wrap_scalar(alike::SimilarityFunction),
             wrap_scalar(alike::RmsDifferenceFunction),
             wrap_scalar(diffusion::DiffusionFunction),
+            wrap_scalar(diffusion::DiffusionNormalisedFunction),
             wrap_scalar(fresnel::FresnelFunction),
             wrap_scalar(sound::SpeedOfSoundFunction),
             wrap_scalar(symmetry::D4PositionFunction),

@@ -612,6 +612,7 @@ mod slow {
             "similarity([0], [1])",
             "diffusion([])",
             "diffusion([1])",
+            "diffusion_normalised([1, 2], [0, 0])",
             "d4(1, null, 'rot90')",
             "d4(1, 2, null)",
             "d4_point(null, 'rot90')",

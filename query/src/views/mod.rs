@@ -9,6 +9,7 @@ mod ir;
 mod lazy_view;
 mod levels;
 mod lookup;
+mod materials;
 mod pair_join;
 mod room_parameters;
 mod sorted_nulls;
@@ -52,6 +53,8 @@ pub(crate) enum LakeView {
     Levels,
     /// One row per measurement and octave: reverberation times and energies.
     RoomParameters,
+    /// One row per surface and band: absorption and scattering at full scale.
+    Materials,
 }
 
 /// Unit of levels over Flat's energy in all bands.
@@ -85,8 +88,8 @@ pub fn table_meaning(name: &str) -> Option<&'static str> {
 
 impl LakeView {
     /// All views.
-    pub const ALL: [Self; 6] =
-        [Self::Ir, Self::TnceDb, Self::Augmented, Self::Catalogue, Self::Levels, Self::RoomParameters];
+    pub const ALL: [Self; 7] =
+        [Self::Ir, Self::TnceDb, Self::Augmented, Self::Catalogue, Self::Levels, Self::RoomParameters, Self::Materials];
 
     /// Returns its name in SQL.
     pub fn name(self) -> &'static str {
@@ -97,6 +100,7 @@ impl LakeView {
             Self::Catalogue => "catalogue",
             Self::Levels => "levels",
             Self::RoomParameters => "room_parameters",
+            Self::Materials => "materials",
         }
     }
 
@@ -112,6 +116,10 @@ impl LakeView {
             Self::Catalogue => "One row per surface: its description, its run and the statistics of its levels.",
             Self::Levels => "One row per surface and band: level and uncertainty over all of its runs.",
             Self::RoomParameters => "One row per measurement and octave: reverberation times, clarity, centre time.",
+            Self::Materials => {
+                "One row per surface and band, of its newest run: absorption and scattering for simulations of rooms at \
+                 full scale (1:10), with standard uncertainties, and reasons for what is missing."
+            }
         }
     }
 
@@ -127,7 +135,7 @@ impl LakeView {
             Self::TnceDb => &[Table::Tnce],
             Self::Augmented => &[Table::Measurements, Table::Nce, Table::Tnce, Table::Heightmaps],
             Self::Catalogue => &[Table::Surfaces, Table::Runs, Table::SurfaceStats],
-            Self::Levels => &[Table::Surfaces, Table::SurfaceStats],
+            Self::Levels | Self::Materials => &[Table::Surfaces, Table::SurfaceStats],
             Self::RoomParameters => &[Table::Measurements],
         }
     }
@@ -141,6 +149,7 @@ impl LakeView {
             Self::Catalogue => catalogue::view_sql(lake.rig()),
             Self::Levels => levels::view_sql(),
             Self::RoomParameters => room_parameters::view_sql(lake.rig()),
+            Self::Materials => materials::view_sql(lake.rig()),
         }
     }
 
@@ -155,6 +164,7 @@ impl LakeView {
             Self::Catalogue => catalogue::column_notes(lake.rig()),
             Self::Levels => levels::column_notes(),
             Self::RoomParameters => room_parameters::column_notes(),
+            Self::Materials => materials::column_notes(),
         }
     }
 

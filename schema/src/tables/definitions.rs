@@ -74,6 +74,22 @@ pub(super) fn surface_columns(bands: &[String]) -> Vec<Column> {
                        simulated levels of single pairs are off by about 1 dB and more";
         Column::float(format!("detail_phase_{band}"), "1", format!("{comment}, band at {band} Hz")).or_null()
     }));
+    let far_field = [
+        (
+            "diffusion_normalised",
+            "Directional diffusion coefficient normalised by that of a flat panel, as ISO 17497-2",
+        ),
+        ("far_scattering", "Scattering coefficient: share of the energy that is not mirrored"),
+    ];
+    for (name, coefficient) in far_field {
+        columns.extend(bands.iter().map(|band| {
+            let comment = format!(
+                "{coefficient}, random incidence, far field, band at {band} Hz; computed from the relief by Kirchhoff's \
+                 approximation, not measured; null without heights, or if their cells are too wide"
+            );
+            Column::float(format!("{name}_{band}"), "1", comment).or_null()
+        }));
+    }
     columns.extend([Column::text("origin", ORIGINS), project_column(), code_version()]);
     columns
 }
@@ -359,6 +375,30 @@ pub(super) fn surface_stats() -> Vec<Column> {
             either is not known",
         )
         .or_null(),
+        Column::double(
+            "energy_over_flat",
+            "1",
+            "Reflected energy over Flat's of the same band, sums over the pairs, without Foam's own reflection",
+        )
+        .or_null(),
+        Column::double("energy_over_flat_u", "1", "Its standard uncertainty, the jackknife over ninths of the panel")
+            .or_null(),
+        Column::double(
+            "scattering",
+            "1",
+            "Share of the reflected energy that is not mirrored: 1 less the coherence with Flat over the places, after \
+             Mommertz (2000)",
+        )
+        .or_null(),
+        Column::double("scattering_u", "1", "Its standard uncertainty, the jackknife over ninths of the panel").or_null(),
+        Column::double(
+            "specular_loss",
+            "1",
+            "Share of Flat's energy that is not mirrored: the scattering of ISO 17497-1 of a surface that absorbs as Flat",
+        )
+        .or_null(),
+        Column::double("specular_loss_u", "1", "Its standard uncertainty, the jackknife over ninths of the panel")
+            .or_null(),
         Column::floats("mean_nce", "1", "Mean of the NCE curves over the pairs, along time; total is the bands' sum")
             .or_null(),
     ]);

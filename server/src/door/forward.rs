@@ -364,3 +364,24 @@ impl hyper::body::Body for EngineBody {
         hyper::body::Body::size_hint(&self.incoming)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use axum::body::to_bytes;
+
+    use super::*;
+
+    async fn forwarded_length(bytes: usize, limit: usize) -> Option<usize> {
+        let body = read_body(Body::from(vec![7; bytes]), &HeaderMap::new(), limit).await.ok()?;
+        let (sent, ..) = body.into_parts();
+        to_bytes(sent, usize::MAX).await.ok().map(|sent| sent.len())
+    }
+
+    #[tokio::test]
+    async fn a_body_in_one_piece_is_counted_once() {
+        for bytes in [0, KEPT_BYTES - 1, KEPT_BYTES, LARGEST_HTTP / 2 + 1, LARGEST_HTTP] {
+            assert_eq!(forwarded_length(bytes, LARGEST_HTTP).await, Some(bytes));
+        }
+        assert_eq!(forwarded_length(LARGEST_HTTP + 1, LARGEST_HTTP).await, None);
+    }
+}

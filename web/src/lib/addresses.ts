@@ -43,6 +43,7 @@ export const detailHref = (id: string) => apiHref(surfacePath(id))
 export const curvesHref = (id: string, microphone: number | null = null) =>
   apiHref(`${surfacePath(id)}/curves`, { points: CURVE_POINTS, microphone })
 
+export const materialsHref = (id: string) => apiHref(`${surfacePath(id)}/materials`)
 export const nearestSurfacesHref = (id: string) => apiHref(`${surfacePath(id)}/neighbours`)
 export const measuredPairsHref = (id: string) => apiHref(`${surfacePath(id)}/pairs`)
 export const pairPath = (id: string, pair: number | string) => `${surfacePath(id)}/pairs/${pair}`

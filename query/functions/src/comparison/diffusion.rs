@@ -1,11 +1,12 @@
-//! `diffusion` of a list of levels and `diffusion_coefficient` of many rows.
+//! `diffusion` of a list of levels, `diffusion_normalised` of two, and `diffusion_coefficient` of many rows.
 
 use std::sync::Arc;
 
 use arrow::array::{ArrayRef, AsArray as _, Float64Array, UInt64Array};
 use arrow::datatypes::{DataType, Float64Type, UInt64Type};
 use datafusion::error::Result;
-use echolake_dsp::diffusion::{DiffusionSums, diffusion_of_levels};
+use echolake_dsp::Error;
+use echolake_dsp::diffusion::{DiffusionSums, diffusion_of_levels, normalise_diffusion};
 
 use crate::adapters::aggregate::{AggregateKernel, GroupStates};
 use crate::adapters::answers::build_numbers;
@@ -15,6 +16,9 @@ use crate::adapters::scalar::ScalarKernel;
 
 /// `diffusion`.
 pub(crate) struct DiffusionFunction;
+
+/// `diffusion_normalised`.
+pub(crate) struct DiffusionNormalisedFunction;
 
 /// `diffusion_coefficient`.
 #[derive(Clone)]
@@ -41,7 +45,33 @@ static LIST: FunctionDescription = FunctionDescription {
 +------+---------+
 | 1.0  | 0.002   |
 +------+---------+",
-    related: &["diffusion_coefficient"],
+    related: &["diffusion_normalised", "diffusion_coefficient"],
+};
+
+static NORMALISED: FunctionDescription = FunctionDescription {
+    name: "diffusion_normalised",
+    family: FunctionFamily::Comparison,
+    about: "Diffusion coefficient d of a surface, normalised by that of a flat panel of the same size, without unit: (d \
+            - d_flat) / (1 - d_flat), each by diffusion(), as ISO 17497-2 defines it for receivers in the far field. \
+            0 is as even as the flat panel, negative less even. Null where one of them is null, or the flat panel's \
+            is 1. Columns diffusion_normalised_* of surfaces have it for reliefs, computed.",
+    parameters: &[
+        FunctionParameter { name: "levels_db", kind: ArgumentKind::Samples, about: "levels over the surface, dB" },
+        FunctionParameter {
+            name: "flat_levels_db",
+            kind: ArgumentKind::Samples,
+            about: "levels at the same receivers over the flat panel, dB",
+        },
+    ],
+    optional: 0,
+    example: "select round(diffusion_normalised([60, 57, 63], [60, 45, 40]), 4) as d",
+    answer: "\
++--------+
+| d      |
++--------+
+| 0.6537 |
++--------+",
+    related: &["diffusion"],
 };
 
 static ROWS: FunctionDescription = FunctionDescription {
@@ -79,6 +109,31 @@ impl ScalarKernel for DiffusionFunction {
     fn compute_answers<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
         let levels = arguments.sample_lists::<T>(0)?;
         build_numbers(arguments, |row| Ok(diffusion_of_levels(levels.samples_at(row)?)))
+    }
+}
+
+impl ScalarKernel for DiffusionNormalisedFunction {
+    fn description(&self) -> &'static FunctionDescription {
+        &NORMALISED
+    }
+
+    fn answer_type(&self, _: &[DataType]) -> DataType {
+        DataType::Float64
+    }
+
+    fn compute_answers<T: SampleElement>(&self, arguments: &CallArguments<'_>) -> Result<ArrayRef> {
+        let levels = arguments.sample_lists::<T>(0)?;
+        let flat_levels = arguments.sample_lists::<T>(1)?;
+        build_numbers(arguments, |row| {
+            let levels = levels.samples_at(row)?;
+            let flat_levels = flat_levels.samples_at(row)?;
+            if levels.len() != flat_levels.len() {
+                let error = Error::Length { what: "flat_levels_db", actual: flat_levels.len(), expected: levels.len() };
+                return Err(arguments.refused_row(row, &error));
+            }
+            let both = diffusion_of_levels(levels).zip(diffusion_of_levels(flat_levels));
+            Ok(both.and_then(|(relief, flat)| normalise_diffusion(relief, flat)))
+        })
     }
 }
 

@@ -14,6 +14,7 @@ mod facets;
 mod figures;
 mod lake;
 mod map;
+mod materials;
 mod measured_pairs;
 mod neighbours;
 mod pair;
@@ -91,6 +92,7 @@ pub(super) fn heavy_routes() -> OpenApiRouter {
         .routes(routes!(neighbours::nearest_responses))
         .routes(routes!(correlations::correlations))
         .routes(routes!(diffusion::diffusion))
+        .routes(routes!(materials::materials))
 }
 
 /// The endpoints that are answered from run files.

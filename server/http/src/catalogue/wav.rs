@@ -1,6 +1,7 @@
 //! `GET /api/v1/surfaces/{surface_id}/pairs/{pair_id}/ir.wav`: an audible response, slowed down to full scale.
 
 use axum::Extension;
+use echolake_schema::MODEL_SCALE;
 use echolake_schema::messages::SampleFormat;
 use echolake_schema::samples::encode_wav;
 use echolake_service::RequestFault;
@@ -12,8 +13,8 @@ use super::content::{AnswerContent, EndpointAnswer};
 use super::pair::{PairPath, ResponseSignal};
 use super::request::CatalogueRequest;
 
-/// The panels are models of walls at a tenth of their size: the wavelengths are a tenth, too.
-const SCALE: usize = 10;
+/// The slowdown to full scale.
+const SCALE: usize = MODEL_SCALE as usize;
 
 /// The signal and the pitch of a response that is heard.
 #[derive(Default, Deserialize, IntoParams)]

@@ -1,0 +1,116 @@
+//! `echolake listen`: a recording as a surface would reflect it at full scale, and as Flat would.
+
+use std::path::PathBuf;
+
+use anyhow::Context as _;
+use clap::{Args, ValueEnum};
+use echolake_export::{DryRecording, ListenedResponse, write_sounds};
+use echolake_lake::Lake;
+use echolake_query::Session;
+use echolake_query::figure_rows::quote_literal;
+use echolake_schema::{MODEL_SCALE, SurfaceId};
+use serde::Deserialize;
+
+use crate::CommandOutcome;
+
+#[derive(Debug, Args)]
+pub(crate) struct ListenArgs {
+    /// The surface; its Flat is written beside it.
+    surface: SurfaceId,
+    /// Number of the pair of microphone and speaker.
+    pair: u32,
+    /// A recording without a room, as WAV; FILE#2 is its second channel.
+    #[arg(long, value_name = "FILE")]
+    dry: PathBuf,
+    /// The response that the recording is convolved with.
+    #[arg(long, value_enum, default_value_t = ListenedSignal::Reflected)]
+    signal: ListenedSignal,
+    /// Give Flat's sound the energy of the surface's; by default both have one gain.
+    #[arg(long)]
+    match_levels: bool,
+    /// Print JSON.
+    #[arg(long)]
+    json: bool,
+    /// The new folder.
+    #[arg(short, long, value_name = "FOLDER")]
+    output: PathBuf,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum ListenedSignal {
+    /// Without the direct sound, as the tables' levels are of.
+    Reflected,
+    /// With the direct sound.
+    Measured,
+}
+
+#[derive(Deserialize)]
+struct ResponseRow {
+    surface_id: String,
+    origin: String,
+    flat_reference: Option<String>,
+    samples: Option<Vec<f32>>,
+}
+
+pub(crate) async fn run_listen(args: &ListenArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
+    let lake = Lake::open(lake_url).await?;
+    let dry = echolake_import::read_wav_channel(&args.dry).map_err(anyhow::Error::msg).context("--dry")?;
+    let session = Session::new(&lake)?;
+    let surface = newest_response(&session, args, args.surface.as_str()).await?;
+    let flat = surface.flat_reference.clone().with_context(|| format!("{} has no Flat", args.surface))?;
+    let mut rows = vec![surface];
+    if flat != args.surface.as_str() {
+        rows.push(newest_response(&session, args, &flat).await?);
+    }
+    // The models are smaller than what they stand for, and sound is as fast: all takes longer at full scale.
+    let rate_hz = (lake.rig().sweep.rate_hz.get() / MODEL_SCALE).round() as u32;
+    let names: Vec<String> =
+        rows.iter().map(|row| format!("{}-{}-{}", row.surface_id, args.pair, row.origin)).collect();
+    let responses: Vec<_> = rows
+        .iter()
+        .zip(&names)
+        .map(|(row, name)| ListenedResponse { name, samples: row.samples.as_deref().unwrap_or_default(), rate_hz })
+        .collect();
+    let recording = DryRecording { samples: &dry.samples, rate_hz: dry.rate_hz };
+    let levels = write_sounds(&args.output, recording, &responses, args.match_levels)?;
+    if args.json {
+        super::print_line(&serde_json::to_string_pretty(&levels)?)?;
+    } else {
+        super::print_line("response dB  sound dB  gain dB  file")?;
+        for level in &levels {
+            let [response, sound, gain] = [level.response_db, level.sound_db, level.gain_db];
+            super::print_line(&format!("{response:11.2}  {sound:8.2}  {gain:7.2}  {}", level.file))?;
+        }
+    }
+    let [low_hz, high_hz] = [lake.rig().sweep.low_hz, lake.rig().sweep.high_hz].map(|hz| hz / MODEL_SCALE);
+    eprintln!(
+        "{}: {} files of {low_hz:.0} to {high_hz:.0} Hz at full scale, which the sweep had",
+        args.output.display(),
+        levels.len()
+    );
+    Ok(CommandOutcome::Whole)
+}
+
+async fn newest_response(session: &Session, args: &ListenArgs, surface: &str) -> anyhow::Result<ResponseRow> {
+    let samples = match args.signal {
+        ListenedSignal::Reflected => "reflected_ir",
+        ListenedSignal::Measured => "ir",
+    };
+    let sql = format!(
+        "select s.surface_id, s.origin, s.flat_reference, i.{samples} as samples from surfaces s \
+         left join (select surface_id, {samples} from ir where surface_id = {name} and pair_id = {pair} \
+         order by log_time desc limit 1) i on i.surface_id = s.surface_id where s.surface_id = {name}",
+        name = quote_literal(surface),
+        pair = args.pair
+    );
+    let row: Option<ResponseRow> = super::sql::query_rows(session, &sql).await?.pop();
+    let row = row.with_context(|| format!("no surface `{surface}`; hint: echolake sql \"select * from surfaces\""))?;
+    if row.samples.is_none() {
+        anyhow::bail!(
+            "surface `{surface}` has no {samples} of pair {}; hint: echolake sql \"select pair_id from ir where \
+             surface_id = '{surface}'\"",
+            args.pair
+        );
+    }
+    Ok(row)
+}

@@ -1,0 +1,144 @@
+//! View `materials`, `export materials` and `listen`, on simulated lakes.
+
+use serde_json::Value;
+
+use super::{TestFolder, rooms};
+
+const MATERIALS: &str = "select * from materials order by surface_id, band_hz";
+/// What the print of Flat absorbs at the bands' centres, `acquisition/panel/src/material.rs`.
+const PRINT_ABSORPTION: [f64; 5] = [0.06, 0.08, 0.16, 0.33, 0.50];
+
+fn material_rows(place: &TestFolder) -> Vec<Value> {
+    place.sql(MATERIALS).into_iter().map(Value::Object).collect()
+}
+
+fn number(row: &Value, column: &str) -> f64 {
+    row[column].as_f64().unwrap_or_else(|| panic!("{column}: {row}"))
+}
+
+mod slow {
+    use super::*;
+
+    #[test]
+    fn materials_are_near_to_what_is_simulated_and_leave_the_lake() {
+        let place = TestFolder::new();
+        for (surface, seed) in [("flat", "1"), ("foam", "2"), ("stretcher_bond", "3")] {
+            place.acquire(surface, &["--seed", seed, "--ir-only"]);
+        }
+        place.ok(&["ingest"]);
+        for row in material_rows(&place) {
+            assert_eq!(row["absorption"], Value::Null, "{row}");
+            let reason = match row["surface_id"].as_str() {
+                Some("foam") => "the surface is its own Foam, which is estimated",
+                _ => "no board of MDF was measured over the same Flat",
+            };
+            assert_eq!(row["absorption_reason"], reason);
+        }
+        place.fails(
+            1,
+            &["export", "materials", "--format", "choras", "-o", "none.json"],
+            "nothing to export: no surface has an absorption and a scattering",
+        );
+        assert!(!place.path("none.json").exists());
+
+        place.acquire("wood", &["--seed", "4", "--ir-only"]);
+        place.ok(&["ingest"]);
+        let rows = material_rows(&place);
+        assert_eq!(rows.len(), 4 * 5);
+        let of = |surface: &str| rows.iter().filter(|row| row["surface_id"] == surface).collect::<Vec<_>>();
+        for (row, expected) in of("flat").into_iter().zip(PRINT_ABSORPTION) {
+            assert!((number(row, "absorption") - expected).abs() < 0.06, "{row} {expected}");
+            assert!((1e-4..0.02).contains(&number(row, "absorption_u")), "{row}");
+            assert!(number(row, "scattering") == 0.0 && number(row, "far_scattering").abs() < 1e-6, "{row}");
+            assert!((number(row, "full_scale_hz") - number(row, "band_hz") / 10.0).abs() < 1e-9);
+        }
+        for row in of("wood") {
+            assert!((number(row, "absorption") - 0.02).abs() < 1e-3, "{row}");
+            assert!(number(row, "scattering") < 0.02 && row["specular_loss"] == Value::Null, "{row}");
+        }
+        // A wall of bricks scatters more the shorter the wave is.
+        let bricks: Vec<f64> = of("stretcher_bond").into_iter().map(|row| number(row, "far_scattering")).collect();
+        assert!(bricks.is_sorted() && bricks[0] < 0.05, "{bricks:?}");
+        for (row, flat) in of("stretcher_bond").into_iter().zip(of("flat")) {
+            assert_eq!(row["absorption"], flat["absorption"]);
+            assert_eq!(row["absorption_reason"], "that of Flat, which is of the same material");
+        }
+
+        place.ok(&["export", "materials", "--format", "pyroomacoustics", "--surfaces", "flat", "-o", "flat.json"]);
+        let file = std::fs::read(place.path("flat.json")).expect("written");
+        let file: Value = serde_json::from_slice(&file).expect("JSON");
+        let frequencies = serde_json::json!([250.0, 500.0, 1000.0, 2000.0, 4000.0]);
+        assert_eq!(file["flat"]["energy_absorption"]["center_freqs"], frequencies);
+        assert_eq!(file["flat"]["scattering"]["coeffs"], serde_json::json!([0.0, 0.0, 0.0, 0.0, 0.0]));
+        assert_eq!(file["flat"]["energy_absorption"]["coeffs"][2], of("flat")[2]["absorption"]);
+        place.ok(&["export", "materials", "--format", "csv", "-o", "all.csv"]);
+        assert_eq!(std::fs::read_to_string(place.path("all.csv")).expect("written").lines().count(), 1 + 4 * 5);
+        place.fails(
+            1,
+            &["export", "materials", "--format", "csv", "--surfaces", "marble", "-o", "marble.csv"],
+            "surface `marble` has no levels",
+        );
+    }
+    #[test]
+    fn sounds_are_the_dry_recording_by_the_responses_at_full_scale() {
+        let place = TestFolder::new();
+        for (surface, seed) in [("flat", "1"), ("foam", "2"), ("stretcher_bond", "3")] {
+            place.acquire(surface, &["--seed", seed, "--ir-only"]);
+        }
+        place.ok(&["ingest"]);
+        // A click, so that the sound is the response: 9.6 kHz at full scale, of which each sample is every fifth here.
+        rooms::write_wav(&place, "click.wav", &[&[0.5][..], &[0.0; 99]].concat());
+        let listen = ["listen", "stretcher_bond", "7", "--dry", "click.wav", "--json"];
+        for more in [&["-o", "sounds"][..], &["-o", "matched", "--match-levels"]] {
+            let levels: Vec<Value> = serde_json::from_str(&place.ok(&[&listen[..], more].concat())).expect("JSON");
+            assert_eq!(levels.len(), 2);
+            let mut peak = 0.0f64;
+            let mut energies = Vec::new();
+            for (level, surface) in levels.iter().zip(["stretcher_bond", "flat"]) {
+                let file = level["file"].as_str().expect("a name");
+                assert_eq!(file, format!("{surface}-7-simulated.wav"));
+                let sound = read_floats(&place, &format!("{}/{file}", more[1]));
+                let row = place.sql(&format!(
+                    "select reflected_ir from ir where surface_id = '{surface}' and pair_id = 7"
+                ));
+                let response: Vec<f64> = serde_json::from_value(row[0]["reflected_ir"].clone()).expect("numbers");
+                assert_eq!(sound.len(), 99 + 5 * response.len());
+                // 0.5 of a file of 16 bits, and a response of another rate with the same spectrum.
+                let gain = 0.5 * 32767.0 / 32768.0 / 5.0 * 10f64.powf(number(level, "gain_db") / 20.0);
+                let greatest = response.iter().fold(0.0f64, |most, x| most.max(x.abs()));
+                for (sample, response) in sound.iter().step_by(5).zip(&response) {
+                    assert!((sample - gain * response).abs() < 1e-4 * gain * greatest, "{sample} {response}");
+                }
+                let response_db = 10.0 * response.iter().map(|x| x * x).sum::<f64>().log10();
+                assert!((number(level, "response_db") - response_db).abs() < 1e-4, "{level}");
+                peak = sound.iter().fold(peak, |most, x| most.max(x.abs()));
+                energies.push(sound.iter().map(|x| x * x).sum::<f64>());
+            }
+            assert!((peak - 0.891).abs() < 1e-5, "{peak}");
+            let difference_db = 10.0 * (energies[0] / energies[1]).log10();
+            let expected_db = match more.len() {
+                2 => number(&levels[0], "sound_db") - number(&levels[1], "sound_db"),
+                _ => 0.0,
+            };
+            assert!((difference_db - expected_db).abs() < 1e-4, "{difference_db} {expected_db}");
+        }
+        place.fails(1, &[&listen[..], &["-o", "sounds"]].concat(), "sounds");
+        for (args, expected) in [
+            (["marble", "7", "click.wav"], "no surface `marble`"),
+            (["flat", "99999", "click.wav"], "surface `flat` has no reflected_ir of pair 99999"),
+            (["flat", "7", "none.wav"], "none.wav"),
+            (["flat", "7", "click.wav#2"], "click.wav"),
+        ] {
+            let [surface, pair, dry] = args;
+            place.fails(1, &["listen", surface, pair, "--dry", dry, "-o", "bad"], expected);
+            assert!(!place.path("bad").exists(), "{args:?}");
+        }
+    }
+
+    /// Samples of a file of 32-bit floats.
+    fn read_floats(place: &TestFolder, name: &str) -> Vec<f64> {
+        let bytes = std::fs::read(place.path(name)).expect("written");
+        let data = bytes.windows(4).position(|name| name == b"data").expect("a chunk of samples") + 8;
+        bytes[data..].chunks_exact(4).map(|x| f64::from(f32::from_le_bytes(x.try_into().expect("4 bytes")))).collect()
+    }
+}
