@@ -565,6 +565,23 @@ export interface paths {
         readonly patch?: never;
         readonly trace?: never;
     };
+    readonly "/api/v1/surfaces/{surface_id}/materials": {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path?: never;
+            readonly cookie?: never;
+        };
+        /** Absorption and scattering of a surface by octave at full scale, for simulations of rooms. */
+        readonly get: operations["materials"];
+        readonly put?: never;
+        readonly post?: never;
+        readonly delete?: never;
+        readonly options?: never;
+        readonly head?: never;
+        readonly patch?: never;
+        readonly trace?: never;
+    };
     readonly "/api/v1/surfaces/{surface_id}/mesh.glb": {
         readonly parameters: {
             readonly query?: never;
@@ -1163,6 +1180,25 @@ export interface components {
             readonly borders_db: readonly number[];
             readonly columns: number;
             readonly rows: number;
+        };
+        /** @description Coefficients of a surface in one octave at full scale; a standard uncertainty ends in `_u`. */
+        readonly MaterialBand: {
+            readonly absorption: number | null;
+            /** @description Why there is no absorption, or whose it is. */
+            readonly absorption_reason: string | null;
+            readonly absorption_u: number | null;
+            /** @description Computed from the relief by Kirchhoff's approximation. */
+            readonly diffusion_normalised: number | null;
+            /** @description Computed from the relief by Kirchhoff's approximation. */
+            readonly far_scattering: number | null;
+            /** @description Centre of the octave, a tenth of the model's frequency. */
+            readonly full_scale_hz: number;
+            readonly scattering: number | null;
+            /** @description Why there is no scattering, or that it differs from the specular loss. */
+            readonly scattering_reason: string | null;
+            readonly scattering_u: number | null;
+            readonly specular_loss: number | null;
+            readonly specular_loss_u: number | null;
         };
         /** @description A measured pair. */
         readonly MeasuredPair: {
@@ -2645,6 +2681,37 @@ export interface operations {
                     readonly "application/pdf": string;
                     readonly "image/png": string;
                     readonly "image/svg+xml": string;
+                };
+            };
+            /** @description Not changed since the ETag of If-None-Match */
+            readonly 304: {
+                headers: {
+                    readonly [name: string]: unknown;
+                };
+                content?: never;
+            };
+            readonly default: components["responses"]["Problem"];
+        };
+    };
+    readonly materials: {
+        readonly parameters: {
+            readonly query?: never;
+            readonly header?: never;
+            readonly path: {
+                readonly surface_id: string;
+            };
+            readonly cookie?: never;
+        };
+        readonly requestBody?: never;
+        readonly responses: {
+            /** @description OK */
+            readonly 200: {
+                headers: {
+                    readonly ETag?: string;
+                    readonly [name: string]: unknown;
+                };
+                content: {
+                    readonly "application/json": readonly components["schemas"]["MaterialBand"][];
                 };
             };
             /** @description Not changed since the ETag of If-None-Match */
