@@ -1,9 +1,9 @@
 """Compares view `materials` with what is known of simulated panels: `materials.py --program ECHOLAKE`.
 
-Absorption: the simulated rig measures Flat, Foam and a board (`wood`) again and again, each run with other noise and other
-air. Flat's print has a reflection factor R(f) that is known (`acquisition/panel/src/material.rs`); the truth is 1 - |R|^2
-with the weights of the board's spectrum in the band. Printed are the greatest error and the share of values that are no
-farther from the truth than 1.96 times their standard uncertainty.
+Absorption: the simulated rig measures Flat, Foam and a board (`wood`) again and again, each run with other noise and
+other air. Flat's print has a reflection factor R(f) that is known (`acquisition/panel/src/material.rs`); the truth is
+1 - |R|^2 with the weights of the board's spectrum in the band. Printed are the greatest error and the share of values
+that are no farther from the truth than 1.96 times their standard uncertainty.
 
 Scattering: panels on the paper's grid, without noise. Printed are both methods with their uncertainties, and what is
 computed of the relief's far field. `tests/simulation/compare_bem.py --far-field` compares them with boundary elements.
@@ -21,6 +21,7 @@ import pathlib
 import subprocess
 import sys
 import tempfile
+from typing import Any
 
 import numpy as np
 from independent_chain import QUIET, SMALL_GRID, MeasuredLake, print_table, rig_text
@@ -31,9 +32,10 @@ BANDS = np.array([2500.0, 5000.0, 10000.0, 20000.0, 40000.0])
 RATE_HZ = 96e3
 
 
-def rows(program: str, lake: MeasuredLake, query: str) -> list[dict]:
+def rows(program: str, lake: MeasuredLake, query: str) -> list[dict[str, Any]]:
     run = [program, "--lake", str(lake.folder), "sql", query, "--format", "json"]
-    return json.loads(subprocess.run(run, check=True, capture_output=True, text=True).stdout)
+    found: list[dict[str, Any]] = json.loads(subprocess.run(run, check=True, capture_output=True, text=True).stdout)
+    return found
 
 
 def repeated_lake(program: str, folder: pathlib.Path, run: int) -> MeasuredLake:
@@ -46,7 +48,9 @@ def repeated_lake(program: str, folder: pathlib.Path, run: int) -> MeasuredLake:
         acquire.append(
             ["acquire", "--rig", str(rig), "--ir-only", "--seed", str(3 * run + number + 1), "--surface", surface]
         )
-    return MeasuredLake.make(program, folder / f"run-{run}", rig_text(SMALL_GRID, SECS, "tapered"), [*acquire, ["ingest"]])
+    return MeasuredLake.make(
+        program, folder / f"run-{run}", rig_text(SMALL_GRID, SECS, "tapered"), [*acquire, ["ingest"]]
+    )
 
 
 def true_absorption(program: str, lake: MeasuredLake) -> np.ndarray:
@@ -58,7 +62,8 @@ def true_absorption(program: str, lake: MeasuredLake) -> np.ndarray:
     octaves = np.clip(np.log2(np.maximum(hz, 1) / BANDS[0]), 0, len(BANDS) - 1)[None] - np.arange(len(BANDS))[:, None]
     windows = np.where(np.abs(octaves) <= 1, np.sin(np.pi / 2 * np.cos(np.pi / 2 * octaves) ** 2) ** 2, 0.0)
     weights = windows * spectra.sum(0)
-    return 1 - (weights * reflected).sum(1) / weights.sum(1)
+    absorption: np.ndarray = 1 - (weights * reflected).sum(1) / weights.sum(1)
+    return absorption
 
 
 def check_absorption(options: argparse.Namespace, folder: pathlib.Path) -> bool:
@@ -75,9 +80,7 @@ def check_absorption(options: argparse.Namespace, folder: pathlib.Path) -> bool:
     held = np.abs(deviations) <= COVERAGE_FACTOR
     cells = [
         [f"{hz:.0f}", f"{t:.3f}", f"{m:+.4f}", f"{s:.4f}", f"{100 * h:.0f}"]
-        for hz, t, m, s, h in zip(
-            BANDS, truth, np.mean(errors, 0), np.abs(errors).max(0), held.mean(0), strict=True
-        )
+        for hz, t, m, s, h in zip(BANDS, truth, np.mean(errors, 0), np.abs(errors).max(0), held.mean(0), strict=True)
     ]
     cells.append(["all", "", "", "", f"{100 * held.mean():.1f}"])
     print_table("Absorption of Flat", ["band", "true", "mean error", "greatest", "within 1.96 u, %"], cells)
@@ -108,8 +111,9 @@ def print_scattering(options: argparse.Namespace, folder: pathlib.Path) -> None:
                 for row in found
             ]  # fmt: skip
             cells.append([surface, label, *values])
-        for kind in ("absorption_reason", "scattering_reason"):
-            cells.append([surface, kind, *[row[kind] or "" for row in found]])
+        cells.extend(
+            [surface, kind, *[row[kind] or "" for row in found]] for kind in ("absorption_reason", "scattering_reason")
+        )
     print_table("Materials", ["surface", "", *[f"{hz:.0f} Hz" for hz in BANDS]], cells)
 
 

@@ -16,11 +16,11 @@ is columns `detail_phase_*` of table `surfaces`: the phase of its details that a
     python tests/simulation/compare_bem.py --cylinder
     python tests/simulation/compare_bem.py --far-field --write docs/materials.md  # five minutes
 
-With `--far-field` the table has coefficients by band, of 3 frequencies each: diffusion by ISO 17497-2, normalised by the
-flat bar, and scattering by Mommertz's correlation with the flat bar; the program's is 1 less the share that is mirrored. The far field has plane waves from 0, 30 and 60
-degrees to both sides, with weights for random incidence, and 37 receivers, by the boundary-element method and as
-`echolake_dsp::far_field` has it. The last row is what the lake's function `scattering` makes of the boundary elements'
-pressures at the 120 pairs of the grid.
+With `--far-field` the table has coefficients by band, of 3 frequencies each: diffusion by ISO 17497-2, normalised by
+the flat bar, and scattering by Mommertz's correlation with the flat bar; the program's is 1 less the share that is
+mirrored. The far field has plane waves from 0, 30 and 60 degrees to both sides, with weights for random incidence, and
+37 receivers, by the boundary-element method and as `echolake_dsp::far_field` has it. The last row is what the lake's
+function `scattering` makes of the boundary elements' pressures at the 120 pairs of the grid.
 """
 
 import argparse
