@@ -24,7 +24,6 @@ mod notices;
 mod object_stores;
 mod operator;
 mod operators;
-mod prompt;
 mod real_data;
 mod recover;
 mod replay;
