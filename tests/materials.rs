@@ -98,9 +98,8 @@ mod slow {
                 let file = level["file"].as_str().expect("a name");
                 assert_eq!(file, format!("{surface}-7-simulated.wav"));
                 let sound = read_floats(&place, &format!("{}/{file}", more[1]));
-                let row = place.sql(&format!(
-                    "select reflected_ir from ir where surface_id = '{surface}' and pair_id = 7"
-                ));
+                let row =
+                    place.sql(&format!("select reflected_ir from ir where surface_id = '{surface}' and pair_id = 7"));
                 let response: Vec<f64> = serde_json::from_value(row[0]["reflected_ir"].clone()).expect("numbers");
                 assert_eq!(sound.len(), 99 + 5 * response.len());
                 // 0.5 of a file of 16 bits, and a response of another rate with the same spectrum.
