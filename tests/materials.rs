@@ -2,11 +2,22 @@
 
 use serde_json::Value;
 
-use super::{TestFolder, rooms};
+use super::{TestFolder, TestFolderTemplate, rooms};
 
 const MATERIALS: &str = "select * from materials order by surface_id, band_hz";
-/// What the print of Flat absorbs at the bands' centres, `acquisition/panel/src/material.rs`.
+/// Absorption of Flat's print at the bands' centres, `acquisition/panel/src/material.rs`.
 const PRINT_ABSORPTION: [f64; 5] = [0.06, 0.08, 0.16, 0.33, 0.50];
+
+/// A lake of Flat, Foam and a wall of bricks.
+fn brick_lake() -> TestFolder {
+    static LAKE: TestFolderTemplate = TestFolderTemplate::new();
+    LAKE.place(|place| {
+        for (surface, seed) in [("flat", "1"), ("foam", "2"), ("stretcher_bond", "3")] {
+            place.acquire(surface, &["--seed", seed, "--ir-only"]);
+        }
+        place.ok(&["ingest"]);
+    })
+}
 
 fn material_rows(place: &TestFolder) -> Vec<Value> {
     place.sql(MATERIALS).into_iter().map(Value::Object).collect()
@@ -21,11 +32,7 @@ mod slow {
 
     #[test]
     fn materials_are_near_to_what_is_simulated_and_leave_the_lake() {
-        let place = TestFolder::new();
-        for (surface, seed) in [("flat", "1"), ("foam", "2"), ("stretcher_bond", "3")] {
-            place.acquire(surface, &["--seed", seed, "--ir-only"]);
-        }
-        place.ok(&["ingest"]);
+        let place = brick_lake();
         for row in material_rows(&place) {
             assert_eq!(row["absorption"], Value::Null, "{row}");
             let reason = match row["surface_id"].as_str() {
@@ -81,11 +88,7 @@ mod slow {
     }
     #[test]
     fn sounds_are_the_dry_recording_by_the_responses_at_full_scale() {
-        let place = TestFolder::new();
-        for (surface, seed) in [("flat", "1"), ("foam", "2"), ("stretcher_bond", "3")] {
-            place.acquire(surface, &["--seed", seed, "--ir-only"]);
-        }
-        place.ok(&["ingest"]);
+        let place = brick_lake();
         // A click, so that the sound is the response: 9.6 kHz at full scale, of which each sample is every fifth here.
         rooms::write_wav(&place, "click.wav", &[&[0.5][..], &[0.0; 99]].concat());
         let listen = ["listen", "stretcher_bond", "7", "--dry", "click.wav", "--json"];

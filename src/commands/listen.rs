@@ -54,7 +54,7 @@ struct ResponseRow {
 
 pub(crate) async fn run_listen(args: &ListenArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let lake = Lake::open(lake_url).await?;
-    let dry = echolake_import::read_wav_channel(&args.dry).map_err(anyhow::Error::msg).context("--dry")?;
+    let dry = echolake_import::read_wav_channel(&args.dry).context("--dry")?;
     let session = Session::new(&lake)?;
     let surface = newest_response(&session, args, args.surface.as_str()).await?;
     let flat = surface.flat_reference.clone().with_context(|| format!("{} has no Flat", args.surface))?;

@@ -8,8 +8,8 @@ const BLOCK_RESPONSES: usize = 4;
 
 /// Returns a response at another sampling rate, for convolution: its spectrum keeps its values, and is 0 above.
 ///
-/// response `[n]` at `from_hz`; returns `[m]` at `to_hz`, m = n `to_hz` / `from_hz`, for n with zeros behind it up to the
-/// next for which m is whole.
+/// response `[n]` at `from_hz`; returns `[m]` at `to_hz`, m = n `to_hz` / `from_hz`, for n with zeros behind it up to
+/// the next for which m is whole.
 pub fn resample_response(response: &[f32], from_hz: u32, to_hz: u32) -> Vec<f64> {
     let step = from_hz / greatest_common_divisor(from_hz, to_hz);
     let padded = response.len().next_multiple_of(step as usize);

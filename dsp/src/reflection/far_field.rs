@@ -33,8 +33,8 @@ pub struct FarFieldCoefficients {
     ///
     /// Source: ISO 17497-2:2012, formulas 5 and 7.
     pub diffusion_normalised: f64,
-    /// Share of the energy that a flat panel reflects as a mirror and the relief does not: 1 - |m|^2, with m the mean of
-    /// e^(2 i k h cos(a)) over the panel, a the angle of incidence.
+    /// Share of the energy that a flat panel reflects as a mirror and the relief does not: 1 - |m|^2, with m the mean
+    /// of e^(2 i k h cos(a)) over the panel, a the angle of incidence.
     pub scattering: f64,
 }
 

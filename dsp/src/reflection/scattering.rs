@@ -1,10 +1,10 @@
 //! Scattering of a surface by the coherence of its reflections with Flat's over many places.
 //!
-//! What a surface reflects as a mirror does is, at every place over it, what Flat reflects times one factor, which
-//! depends on frequency and angle of incidence. What it scatters has another phase at each place. So the mean over the
-//! places of the product of both spectra leaves the mirrored part alone: Mommertz's correlation over receivers, and the
-//! mean over positions of the sample in ISO 17497-1. Places are pairs of one class of incidence; each class has its own
-//! mean.
+//! The mirrored part of a reflection is, at every place over a surface, what Flat reflects times one factor, which
+//! depends on frequency and angle of incidence. The scattered part has another phase at each place. So the mean over
+//! the places of the product of both spectra leaves the mirrored part alone: Mommertz's correlation over receivers, and
+//! the mean over positions of the sample in ISO 17497-1. Places are pairs of one class of incidence; each class has its
+//! own mean.
 
 use std::collections::BTreeMap;
 
@@ -44,7 +44,8 @@ pub struct BandScattering {
     pub energy: UncertainNumber,
     /// Share of the reflected energy that is not mirrored.
     pub scattering: UncertainNumber,
-    /// Share of Flat's energy that is not mirrored: the scattering of ISO 17497-1 if the surface absorbs what Flat does.
+    /// Share of Flat's energy that is not mirrored: the scattering of ISO 17497-1 if the surface absorbs what Flat
+    /// does.
     pub specular_loss: UncertainNumber,
 }
 

@@ -47,8 +47,8 @@ pub struct SoundLevel {
     pub gain_db: f64,
 }
 
-/// Writes a WAV file of 32-bit floats for each response into a new folder, at the recording's rate. All have one gain, by
-/// which the greatest sample is -1 dB of full scale; with `match_levels` all have the energy of the first.
+/// Writes a WAV file of 32-bit floats for each response into a new folder, at the recording's rate. All have one gain,
+/// by which the greatest sample is -1 dB of full scale; with `match_levels` all have the energy of the first.
 ///
 /// # Errors
 /// [`Error::Nothing`] if a sound is silent, and others; nothing is left behind.

@@ -35,8 +35,8 @@ pub(super) fn view_sql(rig: &Rig) -> String {
         |share: &str| format!("power({NEAR_FIELD_SCATTERING_U}, 2) * greatest({share} * (1 - {share}), 0)");
     // The loss has Flat's absorption in the place of the surface's.
     let of_flats_material = "CASE WHEN s.material = flat.material AND s.surface_id <> s.flat_reference THEN";
-    // What a relief absorbs cannot be told from what it sends elsewhere, but it absorbs as Flat does if it is of the same
-    // material.
+    // Energy that a relief absorbs cannot be distinguished from energy that it sends elsewhere, but it absorbs as Flat
+    // does if it is of the same material.
     let is_level = format!("coalesce(s.surface_id = s.flat_reference OR s.relief_rms_mm < {FLAT_RMS_MM}, false)");
     let energy = format!(
         "CASE WHEN {is_level} THEN t.energy_over_flat WHEN s.material = flat.material THEN \
@@ -47,8 +47,8 @@ pub(super) fn view_sql(rig: &Rig) -> String {
          s.surface_id = s.foam_reference AS is_foam, t.band, t.band_hz, t.measurements, t.energy_over_flat, h.boards, \
          {is_level} AS is_level, 1 - h.reflection * ({energy}) / h.energy AS absorption, \
          h.reflection * ({energy}) / h.energy * sqrt(power(h.energy_u / h.energy, 2) + power(h.reflection_u, 2) + \
-         CASE WHEN {is_level} AND s.surface_id <> s.flat_reference THEN power({LEVEL_U}, 2) ELSE 0 END) AS absorption_u, \
-         least(greatest(t.scattering, 0), 1) AS scattering, \
+         CASE WHEN {is_level} AND s.surface_id <> s.flat_reference THEN power({LEVEL_U}, 2) ELSE 0 END) \
+         AS absorption_u, least(greatest(t.scattering, 0), 1) AS scattering, \
          sqrt(power(t.scattering_u, 2) + {near_scattering}) AS scattering_u, \
          {of_flats_material} t.specular_loss END AS specular_loss, {of_flats_material} \
          sqrt(power(t.specular_loss_u, 2) + {near_loss}) END AS specular_loss_u, \
@@ -87,8 +87,8 @@ pub(super) fn view_sql(rig: &Rig) -> String {
     )
 }
 
-/// Relative standard uncertainty of an energy over Flat's by that of its level. The error of the estimate of Foam is not
-/// in it: board and surface have it alike.
+/// Relative standard uncertainty of an energy over Flat's by that of its level. The error of the estimate of Foam is
+/// not in it: board and surface have it alike.
 const LEVEL_U: &str = "coalesce(t.p90_mean_u_db, 0) * 0.2302585092994046";
 
 pub(super) fn column_notes() -> HashMap<String, HashMap<String, String>> {
@@ -97,8 +97,8 @@ pub(super) fn column_notes() -> HashMap<String, HashMap<String, String>> {
         column_note(
             "absorption",
             "1",
-            "1 less the reflected energy over an ideal reflector's, by a board of MDF over the same Flat; of the model's \
-             material and at the grid's angles; Flat's for a relief; null if absorption_reason says why",
+            "1 less the reflected energy over an ideal reflector's, by a board of MDF over the same Flat; of the \
+             model's material and at the grid's angles; Flat's for a relief; null if absorption_reason says why",
         ),
         column_note("absorption_u", "1", "Its standard uncertainty: noise, subtraction and air of surface and board"),
         column_note("absorption_reason", "", "Why there is no absorption; or whose it is"),
@@ -116,13 +116,14 @@ pub(super) fn column_notes() -> HashMap<String, HashMap<String, String>> {
         column_note(
             "scattering_reason",
             "",
-            "Why there is no scattering; or that it differs from specular_loss by more than 1.96 times their uncertainty",
+            "Why there is no scattering; or that it differs from specular_loss by more than 1.96 times their \
+             uncertainty",
         ),
         column_note(
             "specular_loss",
             "1",
-            "The same by another method: the share of Flat's energy that is not mirrored, as in ISO 17497-1; null if the \
-             surface's material is not Flat's, whose absorption it takes",
+            "The same by another method: the share of Flat's energy that is not mirrored, as in ISO 17497-1; null if \
+             the surface's material is not Flat's, whose absorption it takes",
         ),
         column_note("specular_loss_u", "1", "Its standard uncertainty, from the same as scattering_u"),
         column_note(

@@ -117,8 +117,8 @@ impl LakeView {
             Self::Levels => "One row per surface and band: level and uncertainty over all of its runs.",
             Self::RoomParameters => "One row per measurement and octave: reverberation times, clarity, centre time.",
             Self::Materials => {
-                "One row per surface and band, of its newest run: absorption and scattering for simulations of rooms at \
-                 full scale (1:10), with standard uncertainties, and reasons for what is missing."
+                "One row per surface and band, of its newest run: absorption and scattering for simulations of rooms \
+                 at full scale (1:10), with standard uncertainties, and reasons for what is missing."
             }
         }
     }

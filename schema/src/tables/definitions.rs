@@ -84,8 +84,8 @@ pub(super) fn surface_columns(bands: &[String]) -> Vec<Column> {
     for (name, coefficient) in far_field {
         columns.extend(bands.iter().map(|band| {
             let comment = format!(
-                "{coefficient}, random incidence, far field, band at {band} Hz; computed from the relief by Kirchhoff's \
-                 approximation, not measured; null without heights, or if their cells are too wide"
+                "{coefficient}, random incidence, far field, band at {band} Hz; computed from the relief by \
+                 Kirchhoff's approximation, not measured; null without heights, or if their cells are too wide"
             );
             Column::float(format!("{name}_{band}"), "1", comment).or_null()
         }));
@@ -390,11 +390,13 @@ pub(super) fn surface_stats() -> Vec<Column> {
              Mommertz (2000)",
         )
         .or_null(),
-        Column::double("scattering_u", "1", "Its standard uncertainty, the jackknife over ninths of the panel").or_null(),
+        Column::double("scattering_u", "1", "Its standard uncertainty, the jackknife over ninths of the panel")
+            .or_null(),
         Column::double(
             "specular_loss",
             "1",
-            "Share of Flat's energy that is not mirrored: the scattering of ISO 17497-1 of a surface that absorbs as Flat",
+            "Share of Flat's energy that is not mirrored: the scattering of ISO 17497-1 of a surface that absorbs as \
+             Flat",
         )
         .or_null(),
         Column::double("specular_loss_u", "1", "Its standard uncertainty, the jackknife over ninths of the panel")

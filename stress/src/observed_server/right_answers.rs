@@ -22,7 +22,8 @@ pub(crate) fn take_right_answers(client: &QueryClient, queries: &[&'static str])
             let answer = client.query(protocol, sql);
             let name = protocol.name();
             ensure!(matches!(answer, QueryOutcome::Answer(_)), "{sql} over {name}: {answer}");
-            ensure!(answer == client.query(protocol, sql), "{sql} over {name} has two answers");
+            let again = client.query(protocol, sql);
+            ensure!(answer == again, "{sql} over {name} has two answers: {answer}, and {again}");
             right.insert((protocol, *sql), answer);
         }
     }

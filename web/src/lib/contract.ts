@@ -1184,7 +1184,7 @@ export interface components {
         /** @description Coefficients of a surface in one octave at full scale; a standard uncertainty ends in `_u`. */
         readonly MaterialBand: {
             readonly absorption: number | null;
-            /** @description Why there is no absorption, or whose it is. */
+            /** @description The reason if there is no absorption, or whose it is. */
             readonly absorption_reason: string | null;
             readonly absorption_u: number | null;
             /** @description Computed from the relief by Kirchhoff's approximation. */
@@ -1194,7 +1194,7 @@ export interface components {
             /** @description Centre of the octave, a tenth of the model's frequency. */
             readonly full_scale_hz: number;
             readonly scattering: number | null;
-            /** @description Why there is no scattering, or that it differs from the specular loss. */
+            /** @description The reason if there is no scattering, or that it differs from the specular loss. */
             readonly scattering_reason: string | null;
             readonly scattering_u: number | null;
             readonly specular_loss: number | null;

@@ -15,11 +15,11 @@ struct MaterialBand {
     full_scale_hz: f64,
     absorption: Option<f64>,
     absorption_u: Option<f64>,
-    /// Why there is no absorption, or whose it is.
+    /// The reason if there is no absorption, or whose it is.
     absorption_reason: Option<String>,
     scattering: Option<f64>,
     scattering_u: Option<f64>,
-    /// Why there is no scattering, or that it differs from the specular loss.
+    /// The reason if there is no scattering, or that it differs from the specular loss.
     scattering_reason: Option<String>,
     specular_loss: Option<f64>,
     specular_loss_u: Option<f64>,
