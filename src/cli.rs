@@ -15,6 +15,8 @@ use crate::commands::acquire::{self, AcquireArgs};
 use crate::commands::campaign::{self, CampaignSubcommand};
 #[cfg(feature = "lake")]
 use crate::commands::demo::{self, DemoArgs};
+#[cfg(feature = "lake")]
+use crate::commands::design::{self, DesignArgs};
 use crate::commands::doctor::{self, DoctorArgs};
 #[cfg(feature = "lake")]
 use crate::commands::export::{self, ExportCommand};
@@ -111,6 +113,8 @@ pub(crate) enum LakeCommand {
     /// Measure the surfaces of a file with the simulated rig, and print the paper's tables beside the expected levels.
     #[command(subcommand)]
     Campaign(CampaignSubcommand),
+    /// Find panels for a target by simulating candidates: their meshes, expected levels, and a campaign for them.
+    Design(DesignArgs),
     /// Turn existing measurements into runs.
     Import(ImportArgs),
     /// Turn runs into rows.
@@ -212,6 +216,7 @@ impl LakeCommand {
         match self {
             Self::Demo(args) => demo::run_demo(args, lake).await,
             Self::Campaign(command) => campaign::run_campaign(command, lake).await,
+            Self::Design(args) => design::run_design(args, lake).await,
             Self::Import(args) => import::run_import(args, lake).await,
             Self::Ingest(args) => ingest::run_ingest(args, lake).await,
             Self::Remove(args) => remove::run_remove(args, lake).await,

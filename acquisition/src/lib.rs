@@ -1,5 +1,6 @@
 //! Acquisition: from a rig to a run's MCAP file.
 
+pub mod design;
 pub mod disk;
 pub mod recovery;
 pub mod replay;

@@ -248,6 +248,14 @@ impl Grid {
         self.by_points.get(&(microphone, speaker)).copied()
     }
 
+    /// The point of the lowest layer that is nearest to the panel's middle, the first of those that are equally near;
+    /// None if the grid has no points.
+    pub fn central_point(&self) -> Option<&Point> {
+        let lowest = self.points.iter().filter(|point| point.layer == 0);
+        let distance = |point: &Point| point.position_mm[0].hypot(point.position_mm[1]);
+        lowest.reduce(|best, point| if distance(point) < distance(best) - 1e-6 { point } else { best })
+    }
+
     /// The point at a position, mm, within half a millimetre.
     pub fn point_at(&self, position_mm: [f64; 3]) -> Option<&Point> {
         self.nearest_point(position_mm).filter(|p| distance_between(p.position_mm, position_mm) < SAME_POINT_MM)

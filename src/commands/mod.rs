@@ -7,6 +7,8 @@ mod cache;
 pub(crate) mod campaign;
 #[cfg(feature = "lake")]
 pub(crate) mod demo;
+#[cfg(feature = "lake")]
+pub(crate) mod design;
 pub(crate) mod doctor;
 #[cfg(feature = "lake")]
 pub(crate) mod export;

@@ -161,7 +161,8 @@ fn write_one(
     Ok(())
 }
 
-fn mesh_cells(relief: &PanelRelief) -> usize {
+/// Cells along each side of a relief's mesh.
+pub(super) fn mesh_cells(relief: &PanelRelief) -> usize {
     if matches!(relief, PanelRelief::Layered(_)) { FINE_CELLS } else { CELLS }
 }
 

@@ -1,5 +1,7 @@
 //! A square field of heights, its picture and its NumPy file.
 
+use std::f64::consts::TAU;
+
 mod picture;
 
 /// Heights in mm over a square, at the centres of its cells; origin at the square's centre.
@@ -128,6 +130,13 @@ impl HeightField {
             }
         }
         (squares / (cells * cells) as f64).sqrt()
+    }
+
+    /// Phase of the details that are narrower than a wavelength: their root mean square times 2 pi over the wavelength,
+    /// rad. None if cells are half a wavelength wide, which show nothing within one.
+    pub fn detail_phase(&self, wavelength_mm: f64) -> Option<f64> {
+        let phase = TAU / wavelength_mm * self.detail_rms_mm(wavelength_mm);
+        (wavelength_mm > 2.0 * self.pitch_mm()).then_some(phase)
     }
 
     /// A NumPy file of the heights, `[cells x cells]` f32, mm, rows along x with y ascending.

@@ -7,7 +7,8 @@ use echolake_dsp::self_organising_map::SelfOrganisingMap;
 
 use crate::canvas::colours::kind_colour;
 use crate::canvas::drawing::{
-    FigureColour, FigureDrawing, SMALL_PX, TextAnchor, filled_area, filled_ellipse, sized_label,
+    FigureColour, FigureDrawing, SMALL_PX, StrokeStyle, TextAnchor, filled_area, filled_ellipse, sized_label,
+    stroked_line,
 };
 use crate::canvas::font::{fitted_text, text_width};
 use crate::canvas::frame::{PlotAxis, PlotFrame, draw_legend, legend_width};
@@ -26,11 +27,11 @@ const GOLDEN_ANGLE: f64 = 2.399_96;
 /// A surface on the map.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MapPosition {
-    /// Its name.
+    /// Its name; none if it is empty.
     pub name: String,
     /// Its kind, which has a colour.
     pub kind: String,
-    /// Coordinates: along the two components in dB, or in units of a self-organising map.
+    /// Coordinates: along the two components in dB, in units of a self-organising map, or two figures.
     pub position: [f64; 2],
 }
 
@@ -50,6 +51,13 @@ pub enum MapPlane {
         size: [usize; 2],
         /// Mean distance of each unit from those beside it, row by row.
         borders: Vec<f64>,
+    },
+    /// Two figures of panels.
+    Figures {
+        /// Titles of the axes.
+        titles: [String; 2],
+        /// Points that no other is better than in both, in the order of the first.
+        front: Vec<[f64; 2]>,
     },
 }
 
@@ -120,7 +128,7 @@ impl MapFigure {
         let top = 40.0 + rows.len() as f32 * 16.0;
         let width = self.width_px - 80.0;
         let height = match &self.plane {
-            MapPlane::Components { .. } => width * 0.8,
+            MapPlane::Components { .. } | MapPlane::Figures { .. } => width * 0.8,
             MapPlane::Units { size: [columns, rows], .. } => width * *rows as f32 / (*columns).max(1) as f32,
         };
         let mut drawing = FigureDrawing::new(self.width_px, top + height + 62.0, notes);
@@ -131,17 +139,22 @@ impl MapFigure {
         let [x, y] = [0, 1].map(|axis| self.axis_range(axis));
         let frame = PlotFrame { left: 64.0, top, width, height, x, y };
         match &self.plane {
-            MapPlane::Components { .. } => {
+            MapPlane::Units { size, borders } => draw_units(&mut drawing, &frame, *size, borders),
+            MapPlane::Components { .. } | MapPlane::Figures { .. } => {
                 frame.draw_grid(&mut drawing, &x.round_ticks(6), &y.round_ticks(6), true);
             }
-            MapPlane::Units { size, borders } => draw_units(&mut drawing, &frame, *size, borders),
         }
+        if let MapPlane::Figures { front, .. } = &self.plane {
+            let line = front.iter().map(|[x, y]| frame.page_position(*x, *y)).collect();
+            drawing.add_shape(stroked_line(line, StrokeStyle::new(FigureColour::Ink, 1.0)));
+        }
+        let named = self.positions.iter().filter(|position| !position.name.is_empty()).count();
         let mut names = NameLabels::default();
         for surface in &self.positions {
             let kind = kinds.iter().position(|kind| *kind == surface.kind).unwrap_or(0);
             let at = frame.page_position(surface.position[0], surface.position[1]);
             drawing.add_shape(filled_ellipse(at, [4.0, 4.0], 0.0, kind_colour(kind)).with_opacity(0.85));
-            if self.positions.len() <= MOST_NAMES {
+            if named <= MOST_NAMES && !surface.name.is_empty() {
                 names.draw_name(&mut drawing, at, &surface.name);
             }
         }
@@ -154,6 +167,7 @@ impl MapFigure {
             MapPlane::Units { .. } => {
                 ["Units of the self-organising map; dark ones are borders between groups".to_owned(), String::new()]
             }
+            MapPlane::Figures { titles, .. } => titles.clone(),
         };
         frame.draw_titles(&mut drawing, &x_title, &y_title);
         drawing.add_origin();
@@ -251,6 +265,18 @@ mod tests {
             .collect();
         assert_eq!(baselines.len(), 3);
         assert!(baselines.windows(2).all(|two| two[1] - two[0] >= SMALL_PX), "{baselines:?}");
+    }
+
+    #[test]
+    fn points_without_names_have_none() {
+        let position =
+            |name: &str, x: f64| MapPosition { name: name.into(), kind: "candidate".into(), position: [x, 0.0] };
+        let positions = (0..100).map(|n| position("", f64::from(n))).chain([position("best_1", 3.0)]).collect();
+        let titles = ["level".to_owned(), "scattering".to_owned()];
+        let plane = MapPlane::Figures { titles, front: vec![[0.0, 0.0], [3.0, 0.0]] };
+        let svg = MapFigure { positions, plane, width_px: 400.0 }.draw(&FigureNotes::default()).to_svg();
+        assert_eq!(svg.matches("best_1").count(), 1);
+        assert!(svg.contains("scattering"));
     }
 
     #[test]

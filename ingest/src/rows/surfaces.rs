@@ -64,11 +64,9 @@ pub(crate) fn surface_row(
     Ok(row)
 }
 
-// Of cells as wide as half a wavelength, nothing is known within one.
 fn detail_phase(heights: &HeightField, rig: &Rig, hz: f64) -> Option<f32> {
     let wavelength_mm = 1e3 * ReferenceAir::from_response(&rig.impulse_response).speed_of_sound() / hz;
-    let phase = TAU / wavelength_mm * heights.detail_rms_mm(wavelength_mm);
-    (wavelength_mm > 2.0 * heights.pitch_mm()).then_some(phase as f32)
+    heights.detail_phase(wavelength_mm).map(|phase| phase as f32)
 }
 
 // Over the part of the band's octave that the sweep has.

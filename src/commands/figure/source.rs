@@ -139,11 +139,7 @@ impl FigureSource {
                 None => Ok(grid.parse_point(text)?),
             };
         }
-        let lowest = grid.points().iter().filter(|point| point.layer == 0);
-        let distance = |point: &Point| point.position_mm[0].hypot(point.position_mm[1]);
-        // The first of those that are equally near, as on the pages.
-        let nearest = lowest.reduce(|best, point| if distance(point) < distance(best) - 1e-6 { point } else { best });
-        nearest.context("the grid has no points")
+        grid.central_point().context("the grid has no points")
     }
 
     /// Returns what a figure of these surfaces says of itself.

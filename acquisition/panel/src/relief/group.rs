@@ -265,6 +265,18 @@ impl ParameterRange {
         }
     }
 
+    /// Returns the value at a share of the range, from 0 to 1: a rounded number, or one of the words.
+    ///
+    /// # Errors
+    /// [`Error::Range`] if the range is empty, or not within the parameter's domain.
+    pub fn value_at_share(&self, key: &str, known: &[ReliefParameter], share: f64) -> Result<String, Error> {
+        let place = match self {
+            Self::Words(words) => (share * words.len() as f64).min(words.len() as f64 - 1.0) as usize,
+            Self::Numbers(_) => 0,
+        };
+        self.value_at(key, known, share * self.width(), place)
+    }
+
     /// Returns the value so far over the low end of the range, or the `place`-th word.
     fn value_at(&self, key: &str, known: &[ReliefParameter], along: f64, place: usize) -> Result<String, Error> {
         match self {

@@ -7,6 +7,7 @@
 //! While a take is judged and recorded, another thread computes the response at the next pair, which is used if its
 //! inputs are then exactly those that were forecast.
 
+mod panel_reflections;
 mod room;
 
 use std::collections::HashMap;
@@ -17,9 +18,8 @@ use echolake_dsp::RealSample as _;
 use echolake_dsp::air::AirState;
 use echolake_dsp::deconvolution::fast_length;
 use echolake_dsp::geometry::specular_point;
-use echolake_dsp::kirchhoff::{FacetScattering, KirchhoffPlan, KirchhoffScratch, TransducerPose};
-use echolake_dsp::temperature::{ReferenceAir, speed_of_sound};
-use echolake_panel::material::{FoamLayer, SurfaceMaterial};
+use echolake_dsp::kirchhoff::{KirchhoffScratch, TransducerPose};
+use echolake_panel::material::SurfaceMaterial;
 use echolake_panel::relief::HeightField;
 use echolake_schema::manifest::Origin;
 use echolake_schema::simulation::SimulationParams;
@@ -30,16 +30,14 @@ use rand_distr::{Distribution as _, StandardNormal};
 use realfft::num_complex::Complex;
 use realfft::{ComplexToReal, RealToComplex};
 
-use super::transducers;
 use crate::rig::robots::{Choreography, Joints, Tool};
 use crate::rig::{
     AmbientReading, AmbientSensor, ArmPositions, AudioInterface, AudioTake, DeviceFault, DrivePower, Error, RigDevices,
     RobotArms,
 };
+pub use panel_reflections::{PairPoses, PanelReflections};
 use room::{ResponseAhead, ResponseInputs, SimulatedRoom};
 
-/// Samples of a response beyond its farthest echo: the band limit rings.
-const RINGING: f64 = 32.0;
 /// Time of one measurement (Rust et al. 2021): moving, settling, sweep.
 pub const TAKE_SECS: f64 = 12.3;
 /// Gain from pressure at 1 m to full scale: the direct sound at 75 mm stays 9 dB under it.
@@ -131,37 +129,8 @@ pub fn simulated_rig(simulation: &RigSimulation<'_>) -> Result<RigDevices, Error
         reason: DeviceFault::with_cause(e.to_string(), e),
     };
     let grid = simulation.rig.build_grid().map_err(failed)?;
-    let points: Vec<_> = grid.points().iter().map(|p| p.position_mm).collect();
     let rate_hz = simulation.rig.sweep.rate_hz.get();
-    let effects = &simulation.rig.simulation;
-    let mut plan = KirchhoffPlan::new(simulation.relief, rate_hz, response_len(simulation.relief, &points, rate_hz));
-    if !effects.steep_facets {
-        plan = plan.with_scattering(FacetScattering::FacingTangent);
-    }
-    if effects.directivity {
-        plan = plan.with_directivity(transducers::microphone_directivity, transducers::speaker_directivity);
-    }
-    let direct =
-        plan.spectrum_at_bins(
-            |hz| if effects.transducer_response { transducers::on_axis_response(hz) } else { 1.0.into() },
-        );
-    let material = simulation.material;
-    let foam = FoamLayer { flow_resistivity: effects.foam_flow_resistivity, thickness_mm: effects.foam_thickness_mm };
-    let is_foam = material == SurfaceMaterial::MelamineFoam;
-    let is_silent = is_foam && !effects.foam_reflection;
-    let reflection = plan.spectrum_at_bins(|hz| match effects.material_spectra {
-        _ if is_silent => 0.0.into(),
-        true => material.reflection_at(hz, 0.0, foam),
-        false => material.reflection_factor().into(),
-    });
-    let room = Arc::new(SimulatedRoom {
-        reference: ReferenceAir::from_response(&simulation.rig.impulse_response),
-        reflection: multiply_spectra(&direct, &reflection),
-        direct,
-        foam: (is_foam && !is_silent && effects.material_spectra).then_some(foam),
-        absorbs: effects.air_absorption,
-        plan,
-    });
+    let room = Arc::new(SimulatedRoom::new(simulation.rig, &grid, simulation.relief, simulation.material));
     let world = Arc::new(Mutex::new(SimulatedWorld::new(simulation, grid)));
     Ok(RigDevices {
         robots: Box::new(SimulatedRobots(world.clone())),
@@ -178,10 +147,6 @@ pub fn simulated_rig(simulation: &RigSimulation<'_>) -> Result<RigDevices, Error
     })
 }
 
-fn multiply_spectra(a: &[Complex<f32>], b: &[Complex<f32>]) -> Vec<Complex<f32>> {
-    a.iter().zip(b).map(|(a, b)| a * b).collect()
-}
-
 // Displacements of both arms at each point.
 fn draw_calibration(points: usize, mean_mm: f64) -> [Vec<[f64; 3]>; 2] {
     let mut rng = ChaCha8Rng::seed_from_u64(CALIBRATION_SEED);
@@ -190,17 +155,6 @@ fn draw_calibration(points: usize, mean_mm: f64) -> [Vec<[f64; 3]>; 2] {
         AXIS_PER_MEAN * mean_mm * normal
     };
     [(); 2].map(|()| (0..points).map(|_| [axis(), axis(), axis()]).collect())
-}
-
-// The farthest echo comes by a corner of the panel, between the two points that are farthest from theirs, in air of
-// 0 C at the coldest.
-fn response_len(relief: &HeightField, points: &[[f64; 3]], rate_hz: f64) -> usize {
-    let half = relief.size_mm() / 2.0;
-    let lowest = f64::from(relief.extent_mm()[0]);
-    let to_corner = |[x, y, z]: [f64; 3]| (x.abs() + half).hypot(y.abs() + half).hypot(z - lowest);
-    let farthest = points.iter().map(|p| to_corner(*p)).fold(0.0, f64::max);
-    let samples = 2.0 * farthest / 1e3 / speed_of_sound(0.0) * rate_hz + RINGING;
-    (samples as usize).next_power_of_two()
 }
 
 fn lock_world(world: &SharedWorld) -> MutexGuard<'_, SimulatedWorld> {
@@ -300,7 +254,8 @@ impl SimulatedWorld {
         let joints = stand.map(|stand| [stand.microphone, stand.speaker]);
         let position_mm =
             [self.displaced_position(Tool::Microphone, microphone), self.displaced_position(Tool::Speaker, speaker)];
-        let axes = self.transducer_axes(joints.as_ref(), microphone_mm, speaker_mm);
+        let arms = self.arms.as_deref().zip(joints.as_ref());
+        let axes = transducer_axes(arms, microphone_mm, speaker_mm);
         self.pair = known;
         self.microphone = TransducerPose { position_mm: position_mm[0], axis: axes[0] };
         self.speaker = TransducerPose { position_mm: position_mm[1], axis: axes[1] };
@@ -308,25 +263,24 @@ impl SimulatedWorld {
         let mut off = |mm: [f64; 3]| mm.map(|x| x + 0.01 * self.draw_normal().clamp(-2.0, 2.0));
         Ok(ArmPositions { microphone_mm: off(microphone_mm), speaker_mm: off(speaker_mm), joints })
     }
+}
 
-    // Axes of microphone and speaker: as the arms hold them, or, without a model of the arms, the microphone straight
-    // down and the speaker at the point that mirrors to it.
-    fn transducer_axes(
-        &self,
-        joints: Option<&[Joints; 2]>,
-        microphone_mm: [f64; 3],
-        speaker_mm: [f64; 3],
-    ) -> [[f64; 3]; 2] {
-        if let (Some(arms), Some([microphone, speaker])) = (&self.arms, joints) {
-            let cell = arms.cell();
-            return [(Tool::Microphone, microphone), (Tool::Speaker, speaker)]
-                .map(|(tool, joints)| cell.arm_with_tool(tool).tool_axis(joints));
-        }
-        let [x, y] = specular_point(microphone_mm, speaker_mm);
-        let aim = [x - speaker_mm[0], y - speaker_mm[1], -speaker_mm[2]];
-        let length = aim.iter().map(|x| x * x).sum::<f64>().sqrt();
-        [DOWN, aim.map(|x| x / length)]
+// Axes of microphone and speaker: as the arms hold them, or, without a model of the arms, the microphone straight
+// down and the speaker at the point that mirrors to it.
+fn transducer_axes(
+    arms: Option<(&Choreography, &[Joints; 2])>,
+    microphone_mm: [f64; 3],
+    speaker_mm: [f64; 3],
+) -> [[f64; 3]; 2] {
+    if let Some((arms, [microphone, speaker])) = arms {
+        let cell = arms.cell();
+        return [(Tool::Microphone, microphone), (Tool::Speaker, speaker)]
+            .map(|(tool, joints)| cell.arm_with_tool(tool).tool_axis(joints));
     }
+    let [x, y] = specular_point(microphone_mm, speaker_mm);
+    let aim = [x - speaker_mm[0], y - speaker_mm[1], -speaker_mm[2]];
+    let length = aim.iter().map(|x| x * x).sum::<f64>().sqrt();
+    [DOWN, aim.map(|x| x / length)]
 }
 
 struct SimulatedSensor(SharedWorld);
@@ -501,6 +455,7 @@ fn quantise_signal(signal: &[f32], gain: f64, noise: f64, world: &mut SimulatedW
 mod tests {
     use echolake_panel::relief::PanelRelief;
 
+    use super::room::response_len;
     use super::*;
     use crate::rig::conformance;
 

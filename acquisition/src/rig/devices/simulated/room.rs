@@ -8,12 +8,17 @@ use std::thread;
 use echolake_dsp::Error;
 use echolake_dsp::air::{AirAbsorption, AirState};
 use echolake_dsp::geometry::incidence_deg;
-use echolake_dsp::kirchhoff::{KirchhoffPlan, KirchhoffScratch, SoundPath, TransducerPose};
-use echolake_dsp::temperature::ReferenceAir;
-use echolake_panel::material::FoamLayer;
+use echolake_dsp::kirchhoff::{FacetScattering, KirchhoffPlan, KirchhoffScratch, SoundPath, TransducerPose};
+use echolake_dsp::temperature::{ReferenceAir, speed_of_sound};
+use echolake_panel::material::{FoamLayer, SurfaceMaterial};
+use echolake_panel::relief::HeightField;
+use echolake_schema::{Grid, Rig};
 use realfft::num_complex::Complex;
 
-use super::multiply_spectra;
+use crate::rig::devices::transducers;
+
+/// Samples of a response beyond its farthest echo: the band limit rings.
+const RINGING: f64 = 32.0;
 
 /// All that a response depends on, apart from the room.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -37,6 +42,40 @@ pub(super) struct SimulatedRoom {
 }
 
 impl SimulatedRoom {
+    /// The room of a rig with a panel.
+    pub fn new(rig: &Rig, grid: &Grid, relief: &HeightField, material: SurfaceMaterial) -> Self {
+        let points: Vec<_> = grid.points().iter().map(|p| p.position_mm).collect();
+        let rate_hz = rig.sweep.rate_hz.get();
+        let effects = &rig.simulation;
+        let mut plan = KirchhoffPlan::new(relief, rate_hz, response_len(relief, &points, rate_hz));
+        if !effects.steep_facets {
+            plan = plan.with_scattering(FacetScattering::FacingTangent);
+        }
+        if effects.directivity {
+            plan = plan.with_directivity(transducers::microphone_directivity, transducers::speaker_directivity);
+        }
+        let direct = plan.spectrum_at_bins(|hz| {
+            if effects.transducer_response { transducers::on_axis_response(hz) } else { 1.0.into() }
+        });
+        let foam =
+            FoamLayer { flow_resistivity: effects.foam_flow_resistivity, thickness_mm: effects.foam_thickness_mm };
+        let is_foam = material == SurfaceMaterial::MelamineFoam;
+        let is_silent = is_foam && !effects.foam_reflection;
+        let reflection = plan.spectrum_at_bins(|hz| match effects.material_spectra {
+            _ if is_silent => 0.0.into(),
+            true => material.reflection_at(hz, 0.0, foam),
+            false => material.reflection_factor().into(),
+        });
+        Self {
+            reference: ReferenceAir::from_response(&rig.impulse_response),
+            reflection: multiply_spectra(&direct, &reflection),
+            direct,
+            foam: (is_foam && !is_silent && effects.material_spectra).then_some(foam),
+            absorbs: effects.air_absorption,
+            plan,
+        }
+    }
+
     /// Computes a response.
     ///
     /// # Errors
@@ -60,6 +99,21 @@ impl SimulatedRoom {
         self.plan.compute_response(&path, scratch, &mut response)?;
         Ok(response)
     }
+}
+
+fn multiply_spectra(a: &[Complex<f32>], b: &[Complex<f32>]) -> Vec<Complex<f32>> {
+    a.iter().zip(b).map(|(a, b)| a * b).collect()
+}
+
+/// Samples of the longest response. The farthest echo comes by a corner of the panel, between the two points that are
+/// farthest from theirs, in air of 0 C at the coldest.
+pub(super) fn response_len(relief: &HeightField, points: &[[f64; 3]], rate_hz: f64) -> usize {
+    let half = relief.size_mm() / 2.0;
+    let lowest = f64::from(relief.extent_mm()[0]);
+    let to_corner = |[x, y, z]: [f64; 3]| (x.abs() + half).hypot(y.abs() + half).hypot(z - lowest);
+    let farthest = points.iter().map(|p| to_corner(*p)).fold(0.0, f64::max);
+    let samples = 2.0 * farthest / 1e3 / speed_of_sound(0.0) * rate_hz + RINGING;
+    (samples as usize).next_power_of_two()
 }
 
 /// A forecast of the next take's inputs; None if there is no next take.

@@ -1,0 +1,131 @@
+//! `echolake design`: panels for a target, found by a search on the simulation.
+
+mod measured;
+mod report;
+mod search;
+mod target;
+
+use std::path::PathBuf;
+use std::time::Instant;
+
+use anyhow::{Context as _, bail};
+use clap::Args;
+use echolake_acquisition::design::DesignSimulation;
+use echolake_acquisition::rig::robots::Choreography;
+use echolake_schema::Rig;
+use serde_json::json;
+
+use crate::CommandOutcome;
+use crate::progress::CommandProgress;
+use report::PanelReport;
+use search::DesignSearch;
+use target::DesignTarget;
+
+#[derive(Debug, Args)]
+pub(crate) struct DesignArgs {
+    /// The target, a TOML file: a relief, ranges of its parameters, and levels, spreads or scattering by band.
+    target: PathBuf,
+    /// The folder of the results; a search that was stopped goes on there.
+    #[arg(short, long, value_name = "FOLDER")]
+    output: PathBuf,
+    /// Print JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+pub(crate) async fn run_design(args: &DesignArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
+    let stop = super::stop_request()?;
+    let rig = super::rig_or(None, lake_url, Rig::paper).await?;
+    let bands = rig.band_names();
+    let text = target::read_target(&args.target)?;
+    let within = || format!("target `{}`", args.target.display());
+    let mut target = DesignTarget::from_toml(&text, &bands).with_context(within)?;
+    let measured = measured::read_measured(lake_url, &bands).await?;
+    if let Some(surface) = target.levels_of.clone() {
+        target.add_levels(&measured::levels_of(&measured, &surface).with_context(within)?);
+    }
+    prepare_folder(args, &text)?;
+
+    let arms = Choreography::for_rig(&rig)?;
+    let grid = rig.build_grid()?;
+    let simulation = DesignSimulation::new(&rig, grid.clone(), arms.as_deref(), Some(target.pairs))?;
+    let progress = CommandProgress::new();
+    let task = progress.start_task("search", target.candidates as u64, "candidates");
+    let path = args.output.join("candidates.csv");
+    let search = DesignSearch::open(&path, &target, &simulation, &bands, &stop, task)?;
+    let begun = Instant::now();
+    let known = search.known_count();
+    let candidates = tokio::task::block_in_place(|| search.run())?;
+    let secs = begun.elapsed().as_secs_f64() / (candidates.len() - known).max(1) as f64;
+
+    eprintln!("simulating the best panels at all pairs");
+    let whole = DesignSimulation::new(&rig, grid.clone(), arms.as_deref(), None)?;
+    let panels = tokio::task::block_in_place(|| report::find_panels(&target, &candidates, &whole, &rig))?;
+    for panel in &panels {
+        report::write_panel(&args.output, panel, &whole, &rig, &grid)?;
+    }
+    report::write_search(&args.output, &target, &candidates, &panels, &measured, &bands)?;
+    report::write_campaign(&args.output, &target, &panels, &bands)?;
+    let reports: Vec<PanelReport> = panels.iter().map(|panel| panel.report(&target, &bands)).collect();
+    let summary = json!({
+        "origin": "simulated",
+        "candidates": candidates.len(),
+        "pairs": simulation.pairs().count(),
+        "secs_per_candidate": (candidates.len() > known).then_some(secs),
+        "panels": reports,
+    });
+    let summary = serde_json::to_string_pretty(&summary)?;
+    report::write_file(&args.output.join("best.json"), summary.as_bytes())?;
+    if args.json {
+        super::print_line(&summary)?;
+    } else {
+        print_reports(&reports, &panels, &target)?;
+    }
+    if candidates.len() > known {
+        eprintln!("{secs:.2} s per candidate at {} pairs", simulation.pairs().count());
+    }
+    let folder = args.output.display();
+    eprintln!("{folder}: meshes, parameters and grid plots of {} panels; all numbers are simulated", panels.len());
+    eprintln!("next: echolake campaign run {}", args.output.join("campaign.toml").display());
+    Ok(CommandOutcome::Whole)
+}
+
+// The folder keeps the target, so that two searches are not mixed.
+fn prepare_folder(args: &DesignArgs, text: &str) -> anyhow::Result<()> {
+    let folder = &args.output;
+    std::fs::create_dir_all(folder).with_context(|| format!("cannot make `{}`", folder.display()))?;
+    let kept = folder.join("target.toml");
+    match std::fs::read_to_string(&kept) {
+        Ok(before) if before == text => Ok(()),
+        Ok(_) => bail!("`{}` is the target of another search; hint: another folder for -o", kept.display()),
+        Err(e) if e.kind() == std::io::ErrorKind::NotFound => report::write_file(&kept, text.as_bytes()),
+        Err(e) => Err(e).with_context(|| format!("cannot read `{}`", kept.display())),
+    }
+}
+
+fn print_reports(reports: &[PanelReport], panels: &[report::FoundPanel], target: &DesignTarget) -> anyhow::Result<()> {
+    for (report, panel) in reports.iter().zip(panels) {
+        let values = target.ranges.iter().zip(&panel.searched.values).map(|((key, _), value)| format!("{key}={value}"));
+        super::print_line(&format!(
+            "{} (simulated): misfit {:.2} at all pairs, {:.2} in the search; {}",
+            report.name,
+            report.misfit,
+            report.misfit_of_search,
+            values.collect::<Vec<_>>().join(", ")
+        ))?;
+        if let Some(deviation) = report.level_deviation_db {
+            super::print_line(&format!(
+                "  levels {deviation:.2} dB rms from the target where the simulation is trusted"
+            ))?;
+        }
+        super::print_line("   target     found  deviation  error of the simulation")?;
+        for goal in &report.goals {
+            let doubt = if goal.is_trusted { "" } else { ", single pairs not to be trusted" };
+            super::print_line(&format!(
+                "{:9.2} {:9.2}  {:9.2}  {:.2} dB{doubt}  {}",
+                goal.target, goal.found, goal.deviation, goal.simulation_error_db, goal.figure
+            ))?;
+        }
+    }
+    Ok(())
+}

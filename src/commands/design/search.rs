@@ -1,0 +1,247 @@
+//! The search for a design's parameters: CMA-ES on the simulation, and the file of its candidates, from which a search
+//! that was stopped goes on.
+
+use std::collections::HashMap;
+use std::fs::File;
+use std::io::Write as _;
+use std::path::Path;
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+use anyhow::{Context as _, bail, ensure};
+use cmaes::{CMAESOptions, DVector};
+use echolake_acquisition::design::{BandFigures, DesignSimulation};
+use echolake_dsp::scattering::UncertainNumber;
+use echolake_panel::mesh::FACETS;
+
+use super::target::DesignTarget;
+use crate::progress::TaskProgress;
+use crate::signals::StopRequest;
+
+/// First step of a search, and the step under which it begins again elsewhere, as shares of a range.
+const FIRST_STEP: f64 = 0.3;
+const LAST_STEP: f64 = 2e-3;
+/// Ratio of the golden section: multiples of it spread over the ranges.
+const GOLDEN_RATIO: f64 = 0.618_033_988_749_894_9;
+/// Misfit of a panel that cannot be printed, to which the distance to the ranges is added.
+const UNPRINTABLE: f64 = 100.0;
+/// Values per band in the file of candidates.
+const COLUMNS_PER_BAND: usize = 3;
+
+/// A panel that was simulated.
+#[derive(Debug, Clone)]
+pub(super) struct DesignCandidate {
+    /// Values of the searched parameters.
+    pub values: Vec<String>,
+    pub misfit: f64,
+    pub bands: Vec<BandFigures>,
+}
+
+/// A search, which threads share.
+pub(super) struct DesignSearch<'a> {
+    target: &'a DesignTarget,
+    simulation: &'a DesignSimulation,
+    stop: &'a StopRequest,
+    state: Mutex<SearchState>,
+}
+
+struct SearchState {
+    candidates: Vec<DesignCandidate>,
+    by_values: HashMap<Vec<String>, usize>,
+    file: File,
+    progress: TaskProgress,
+    evaluations: usize,
+    best: f64,
+    /// The first error; the search ends with it.
+    failed: Option<anyhow::Error>,
+}
+
+impl<'a> DesignSearch<'a> {
+    /// Opens the file of candidates, with those of before.
+    pub fn open(
+        path: &Path,
+        target: &'a DesignTarget,
+        simulation: &'a DesignSimulation,
+        bands: &[String],
+        stop: &'a StopRequest,
+        mut progress: TaskProgress,
+    ) -> anyhow::Result<Self> {
+        let header = candidate_header(target, bands);
+        let mut candidates = Vec::new();
+        match std::fs::read_to_string(path) {
+            Ok(text) => {
+                candidates = parse_candidates(&text, &header, target, bands.len())
+                    .with_context(|| format!("candidates `{}`", path.display()))?;
+                // A line that was cut off is written again.
+                let whole = text.rfind('\n').map_or(0, |end| end + 1);
+                let file = File::options().write(true).open(path)?;
+                file.set_len(whole as u64)?;
+            }
+            Err(e) if e.kind() == std::io::ErrorKind::NotFound => {
+                std::fs::write(path, format!("{header}\n"))
+                    .with_context(|| format!("cannot write `{}`", path.display()))?;
+            }
+            Err(e) => return Err(e).with_context(|| format!("cannot read `{}`", path.display())),
+        }
+        let file = File::options().append(true).open(path)?;
+        progress.begin_at(candidates.len() as u64);
+        let by_values = candidates.iter().enumerate().map(|(at, c)| (c.values.clone(), at)).collect();
+        let state =
+            SearchState { candidates, by_values, file, progress, evaluations: 0, best: f64::INFINITY, failed: None };
+        Ok(Self { target, simulation, stop, state: Mutex::new(state) })
+    }
+
+    /// Returns how many candidates were simulated before.
+    pub fn known_count(&self) -> usize {
+        self.lock_state().candidates.len()
+    }
+
+    /// Tries as many candidates as the target says; those of before count and cost nothing. Returns all, the best
+    /// first.
+    pub fn run(self) -> anyhow::Result<Vec<DesignCandidate>> {
+        for attempt in 0u64.. {
+            let done = self.lock_state().evaluations;
+            if done >= self.target.candidates {
+                break;
+            }
+            // Where the last one has converged, another part of the ranges may be better.
+            let along = |number: usize| (0.5 + GOLDEN_RATIO * attempt as f64 * (number + 1) as f64).fract();
+            let middle: Vec<f64> = (0..self.target.ranges.len()).map(along).collect();
+            let mut search = CMAESOptions::new(middle, FIRST_STEP)
+                .max_function_evals(self.target.candidates - done)
+                .tol_x(LAST_STEP)
+                .seed(self.target.seed.wrapping_add(attempt))
+                .build(|point: &DVector<f64>| self.evaluate_point(point.as_slice()))
+                .map_err(|e| anyhow::anyhow!("the search cannot begin: {e:?}"))?;
+            search.run_parallel();
+            drop(search);
+            if let Some(error) = self.lock_state().failed.take() {
+                return Err(error);
+            }
+        }
+        let state = self.state.into_inner().unwrap_or_else(PoisonError::into_inner);
+        let simulated = state.candidates.len();
+        state.progress.finish_with(format!("{simulated} panels simulated, best misfit {:.2}", state.best));
+        let mut candidates = state.candidates;
+        candidates.sort_by(|a, b| a.misfit.total_cmp(&b.misfit));
+        ensure!(
+            !candidates.is_empty(),
+            "none of {} candidates can be printed; hint: ranges of less depth, or a larger greatest_depth_mm",
+            state.evaluations
+        );
+        Ok(candidates)
+    }
+
+    fn lock_state(&self) -> MutexGuard<'_, SearchState> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    // NaN ends the search.
+    fn evaluate_point(&self, point: &[f64]) -> f64 {
+        let outside: f64 = point.iter().map(|x| (x - x.clamp(0.0, 1.0)).powi(2)).sum::<f64>().sqrt();
+        let misfit = self.evaluate_inside(point);
+        let mut state = self.lock_state();
+        state.evaluations += 1;
+        match misfit {
+            Ok(misfit) => {
+                state.best = state.best.min(misfit);
+                let note = format!("best so far: {:.2}", state.best);
+                let done = state.evaluations as u64;
+                state.progress.set_note(note);
+                state.progress.set_done(done);
+                misfit + outside * UNPRINTABLE.sqrt()
+            }
+            Err(error) => {
+                state.failed.get_or_insert(error);
+                f64::NAN
+            }
+        }
+    }
+
+    fn evaluate_inside(&self, point: &[f64]) -> anyhow::Result<f64> {
+        super::super::ensure_wanted(self.stop)?;
+        let values = self.target.values_at(point)?;
+        if let Some(known) = self.lock_state().misfit_of(&values) {
+            return Ok(known);
+        }
+        let relief = self.target.relief_of(&values)?;
+        let heights = relief.height_field(FACETS);
+        if !self.target.is_printable(&relief, &heights) {
+            let [low, high] = heights.extent_mm().map(f64::from);
+            return Ok(UNPRINTABLE + high - low);
+        }
+        let figures = self.simulation.compute_figures(&heights, relief.material())?;
+        let misfit = self.target.misfit(&figures.bands);
+        self.lock_state().add_candidate(DesignCandidate { values, misfit, bands: figures.bands })?;
+        Ok(misfit)
+    }
+}
+
+impl SearchState {
+    fn misfit_of(&self, values: &[String]) -> Option<f64> {
+        self.by_values.get(values).map(|at| self.candidates[*at].misfit)
+    }
+
+    // Another thread may have tried the same values meanwhile.
+    fn add_candidate(&mut self, candidate: DesignCandidate) -> anyhow::Result<()> {
+        if self.by_values.contains_key(&candidate.values) {
+            return Ok(());
+        }
+        let line = candidate_line(self.candidates.len() + 1, &candidate);
+        self.file.write_all(line.as_bytes()).context("cannot write candidates.csv")?;
+        self.by_values.insert(candidate.values.clone(), self.candidates.len());
+        self.candidates.push(candidate);
+        Ok(())
+    }
+}
+
+fn candidate_header(target: &DesignTarget, bands: &[String]) -> String {
+    let parameters = target.ranges.iter().map(|(key, _)| key.clone());
+    let figures =
+        bands.iter().flat_map(|band| ["level_db", "spread_db", "scattering"].map(|name| format!("{name}_{band}")));
+    let columns = ["candidate".to_owned()].into_iter().chain(parameters).chain(["misfit".to_owned()]);
+    columns.chain(figures).chain(["origin".to_owned()]).collect::<Vec<_>>().join(",")
+}
+
+// The shortest numbers that are read back exactly.
+fn candidate_line(number: usize, candidate: &DesignCandidate) -> String {
+    let figures = candidate
+        .bands
+        .iter()
+        .flat_map(|band| [band.level_db, band.spread_db, band.scattering.value])
+        .map(|x| x.to_string());
+    let fields = [number.to_string()].into_iter().chain(candidate.values.clone()).chain([candidate.misfit.to_string()]);
+    fields.chain(figures).chain(["simulated".to_owned()]).collect::<Vec<_>>().join(",") + "\n"
+}
+
+// Whole lines alone.
+fn parse_candidates(
+    text: &str,
+    header: &str,
+    target: &DesignTarget,
+    bands: usize,
+) -> anyhow::Result<Vec<DesignCandidate>> {
+    let whole = text.rfind('\n').map_or("", |end| &text[..end]);
+    let mut lines = whole.lines();
+    if lines.next().is_some_and(|first| first != header) {
+        bail!("its columns are another search's, expected {header}; hint: another folder");
+    }
+    let parameters = target.ranges.len();
+    let parse = |(line, number): (&str, usize)| {
+        let fields: Vec<&str> = line.split(',').collect();
+        let expected = parameters + COLUMNS_PER_BAND * bands + 3;
+        ensure!(fields.len() == expected, "line {number} has {} fields, expected {expected}", fields.len());
+        let values = fields[1..=parameters].iter().map(|value| (*value).to_owned()).collect();
+        let numbers = fields[parameters + 2..expected - 1].iter().map(|field| field.parse::<f64>());
+        let numbers: Vec<f64> = numbers
+            .collect::<Result<_, _>>()
+            .with_context(|| format!("line {number} has a field that is no number"))?;
+        let figures = |of: &[f64]| BandFigures {
+            level_db: of[0],
+            spread_db: of[1],
+            scattering: UncertainNumber { value: of[2], uncertainty: None },
+        };
+        let bands: Vec<BandFigures> = numbers.chunks(COLUMNS_PER_BAND).map(figures).collect();
+        Ok(DesignCandidate { values, misfit: target.misfit(&bands), bands })
+    };
+    lines.zip(2..).map(parse).collect()
+}

@@ -1,0 +1,335 @@
+//! The file of a design: a relief, ranges of its parameters, and what is wanted of it by band.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use anyhow::{Context as _, bail, ensure};
+use echolake_acquisition::design::{BandFigures, PanelFigures};
+use echolake_panel::relief::group::ParameterRange;
+use echolake_panel::relief::{HeightField, PanelRelief, ReliefParameter};
+use echolake_schema::SurfaceId;
+use serde::Deserialize;
+
+/// Deviations that count as much as one of a level by 1 dB.
+const SPREAD_UNIT_DB: f64 = 1.0;
+const SCATTERING_UNIT: f64 = 0.1;
+
+/// A target, as its TOML file has it.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct TargetFile {
+    #[serde(default)]
+    about: String,
+    relief: String,
+    /// The surface whose levels over Flat are wanted in every band that `bands` give no level for.
+    levels_of: Option<SurfaceId>,
+    #[serde(default = "default_pairs")]
+    pairs: usize,
+    #[serde(default = "default_candidates")]
+    candidates: usize,
+    #[serde(default = "default_best")]
+    best: usize,
+    #[serde(default = "default_seed")]
+    seed: u64,
+    /// Greatest depth of the printed panel, mm.
+    greatest_depth_mm: Option<f64>,
+    #[serde(default)]
+    fixed: BTreeMap<String, toml::Value>,
+    ranges: BTreeMap<String, ParameterRange>,
+    #[serde(default)]
+    bands: BTreeMap<String, BandTarget>,
+}
+
+/// The wanted figures of one band.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct BandTarget {
+    level_db: Option<f64>,
+    spread_db: Option<f64>,
+    scattering: Option<f64>,
+    #[serde(default = "default_weight")]
+    weight: f64,
+}
+
+/// A figure of a panel in a band.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum FigureKind {
+    Level,
+    Spread,
+    Scattering,
+}
+
+/// A wanted figure.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct DesignGoal {
+    pub band: usize,
+    pub kind: FigureKind,
+    pub value: f64,
+    pub weight: f64,
+}
+
+/// A target that has been checked.
+#[derive(Debug)]
+pub(super) struct DesignTarget {
+    pub about: String,
+    pub levels_of: Option<SurfaceId>,
+    pub pairs: usize,
+    pub candidates: usize,
+    pub best: usize,
+    pub seed: u64,
+    pub goals: Vec<DesignGoal>,
+    /// Names and ranges of the parameters that are searched.
+    pub ranges: Vec<(String, ParameterRange)>,
+    greatest_depth_mm: f64,
+    start: PanelRelief,
+    known: Vec<ReliefParameter>,
+}
+
+fn default_pairs() -> usize {
+    120
+}
+
+fn default_candidates() -> usize {
+    400
+}
+
+fn default_best() -> usize {
+    3
+}
+
+fn default_seed() -> u64 {
+    1
+}
+
+fn default_weight() -> f64 {
+    1.0
+}
+
+impl DesignTarget {
+    /// Parses a target and checks it against the names of the rig's bands.
+    pub fn from_toml(text: &str, bands: &[String]) -> anyhow::Result<Self> {
+        let file: TargetFile = toml::from_str(text).map_err(|e| {
+            anyhow::anyhow!("{e}hint: relief = \"NAME\", [ranges] with key = [low, high], [bands.2500] with level_db")
+        })?;
+        for (key, number, most) in
+            [("pairs", file.pairs, 100_000), ("candidates", file.candidates, 100_000), ("best", file.best, 20)]
+        {
+            ensure!((1..=most).contains(&number), "`{key}` is {number}, expected 1 to {most}");
+        }
+        ensure!(
+            !file.ranges.is_empty(),
+            "`ranges` is empty, expected a parameter; hint: echolake panel {0} --list",
+            file.relief
+        );
+        let depth_mm = file.greatest_depth_mm.unwrap_or(f64::INFINITY);
+        ensure!(depth_mm > 0.0, "`greatest_depth_mm` is {depth_mm}, expected above 0");
+        let mut start = PanelRelief::by_name(&file.relief)?;
+        for (key, value) in &file.fixed {
+            ensure!(!file.ranges.contains_key(key), "`{key}` is in [fixed] and in [ranges]; hint: one of them");
+            start.set_parameter(key, value.as_str().unwrap_or(&value.to_string()))?;
+        }
+        let goals = read_goals(&file, bands)?;
+        let known = start.describe_parameters();
+        let target = Self {
+            about: file.about,
+            levels_of: file.levels_of,
+            pairs: file.pairs,
+            candidates: file.candidates,
+            best: file.best,
+            seed: file.seed,
+            goals,
+            ranges: file.ranges.into_iter().collect(),
+            greatest_depth_mm: depth_mm,
+            start,
+            known,
+        };
+        // Every word is tried by itself, and both ends of the numbers.
+        for (number, (_, range)) in target.ranges.iter().enumerate() {
+            let tried = match range {
+                ParameterRange::Words(words) => words.len().max(2),
+                ParameterRange::Numbers(_) => 2,
+            };
+            for step in 0..tried {
+                let mut shares = vec![0.5; target.ranges.len()];
+                shares[number] = step as f64 / (tried - 1) as f64;
+                target.relief_of(&target.values_at(&shares)?)?;
+            }
+        }
+        Ok(target)
+    }
+
+    /// Adds the levels of the measured surface that the file names, by band.
+    pub fn add_levels(&mut self, levels_db: &[Option<f64>]) {
+        for (band, level) in levels_db.iter().enumerate() {
+            let is_given = self.goals.iter().any(|goal| goal.band == band && goal.kind == FigureKind::Level);
+            if let Some(value) = level.filter(|_| !is_given) {
+                self.goals.push(DesignGoal { band, kind: FigureKind::Level, value, weight: 1.0 });
+            }
+        }
+        self.goals.sort_by_key(|goal| goal.band);
+    }
+
+    /// Returns the parameters' values at shares of their ranges, 0 to 1.
+    pub fn values_at(&self, shares: &[f64]) -> anyhow::Result<Vec<String>> {
+        let pairs = self.ranges.iter().zip(shares);
+        let values = pairs.map(|((key, range), share)| range.value_at_share(key, &self.known, share.clamp(0.0, 1.0)));
+        Ok(values.collect::<Result<_, _>>()?)
+    }
+
+    /// Returns how far two panels are from each other: the greatest share of a range, 1 for other words.
+    pub fn distance(&self, values: &[String], others: &[String]) -> f64 {
+        let parts = self.ranges.iter().zip(values.iter().zip(others)).map(|((_, range), (value, other))| match range {
+            ParameterRange::Words(_) => f64::from(u8::from(value != other)),
+            ParameterRange::Numbers([low, high]) => {
+                let number = |text: &String| text.parse().unwrap_or(*low);
+                (number(value) - number(other)).abs() / (high - low)
+            }
+        });
+        parts.fold(0.0, f64::max)
+    }
+
+    /// Makes the relief of some values; they may be too deep together.
+    pub fn relief_of(&self, values: &[String]) -> anyhow::Result<PanelRelief> {
+        let mut relief = self.start.clone();
+        for ((key, _), value) in self.ranges.iter().zip(values) {
+            relief.set_parameter(key, value)?;
+        }
+        Ok(relief)
+    }
+
+    /// Returns whether a relief can be printed: a panel has room for it, and it is no deeper than the file says.
+    pub fn is_printable(&self, relief: &PanelRelief, heights: &HeightField) -> bool {
+        let [low, high] = heights.extent_mm().map(f64::from);
+        relief.check_depth().is_ok() && high - low <= self.greatest_depth_mm
+    }
+
+    /// Returns how far figures are from the target: weighted root mean square of the deviations, 1 dB of a level each.
+    pub fn misfit(&self, bands: &[BandFigures]) -> f64 {
+        let weights: f64 = self.goals.iter().map(|goal| goal.weight).sum();
+        let sum: f64 = self.goals.iter().map(|goal| goal.weight * goal.deviation(bands).powi(2)).sum();
+        (sum / weights).sqrt()
+    }
+
+    /// Returns the root mean square of the levels' deviations over bands that `is_counted`, dB; None if there is none.
+    pub fn level_misfit_db(&self, figures: &PanelFigures, is_counted: impl Fn(usize) -> bool) -> Option<f64> {
+        let levels = self.goals.iter().filter(|goal| goal.kind == FigureKind::Level && is_counted(goal.band));
+        let squares: Vec<f64> = levels.map(|goal| goal.deviation(&figures.bands).powi(2)).collect();
+        (!squares.is_empty()).then(|| (squares.iter().sum::<f64>() / squares.len() as f64).sqrt())
+    }
+}
+
+fn read_goals(file: &TargetFile, bands: &[String]) -> anyhow::Result<Vec<DesignGoal>> {
+    let mut goals = Vec::new();
+    for (name, target) in &file.bands {
+        let Some(band) = bands.iter().position(|band| band == name) else {
+            bail!("there is no band `{name}`; hint: {}", bands.join(", "));
+        };
+        let BandTarget { level_db, spread_db, scattering, weight } = *target;
+        ensure!(weight > 0.0 && weight.is_finite(), "`weight` of band `{name}` is {weight}, expected above 0");
+        let is_share = scattering.is_none_or(|share| (0.0..=1.0).contains(&share));
+        ensure!(is_share, "`scattering` of band `{name}` is not from 0 to 1");
+        let is_spread = spread_db.is_none_or(|spread| spread >= 0.0);
+        ensure!(is_spread, "`spread_db` of band `{name}` is not 0 or more");
+        let wanted =
+            [(FigureKind::Level, level_db), (FigureKind::Spread, spread_db), (FigureKind::Scattering, scattering)];
+        for (kind, value) in wanted {
+            let Some(value) = value else { continue };
+            ensure!(value.is_finite(), "band `{name}` has the target {value}, expected a number");
+            goals.push(DesignGoal { band, kind, value, weight });
+        }
+    }
+    ensure!(
+        !goals.is_empty() || file.levels_of.is_some(),
+        "there is no target; hint: [bands.{}] with level_db, spread_db or scattering, or levels_of = \"SURFACE\"",
+        bands.first().map_or("2500", String::as_str)
+    );
+    goals.sort_by_key(|goal| goal.band);
+    Ok(goals)
+}
+
+impl DesignGoal {
+    /// Returns its figure of a panel.
+    pub fn figure_of(&self, bands: &[BandFigures]) -> f64 {
+        let figures = &bands[self.band];
+        match self.kind {
+            FigureKind::Level => figures.level_db,
+            FigureKind::Spread => figures.spread_db,
+            FigureKind::Scattering => figures.scattering.value,
+        }
+    }
+
+    /// Returns the deviation of a panel, in units that count as much as 1 dB of a level.
+    pub fn deviation(&self, bands: &[BandFigures]) -> f64 {
+        let unit = match self.kind {
+            FigureKind::Level => 1.0,
+            FigureKind::Spread => SPREAD_UNIT_DB,
+            FigureKind::Scattering => SCATTERING_UNIT,
+        };
+        (self.figure_of(bands) - self.value) / unit
+    }
+
+    /// Returns its name, for a table or an axis.
+    pub fn describe(&self, bands: &[String]) -> String {
+        let band = &bands[self.band];
+        match self.kind {
+            FigureKind::Level => format!("level over Flat, {band} Hz, dB"),
+            FigureKind::Spread => format!("spread, {band} Hz, dB"),
+            FigureKind::Scattering => format!("scattering, {band} Hz"),
+        }
+    }
+}
+
+/// Reads a target's text.
+pub(super) fn read_target(path: &Path) -> anyhow::Result<String> {
+    std::fs::read_to_string(path).with_context(|| format!("cannot read target `{}`", path.display()))
+}
+
+#[cfg(test)]
+mod tests {
+    use echolake_dsp::scattering::UncertainNumber;
+
+    use super::*;
+
+    fn parse(text: &str) -> anyhow::Result<DesignTarget> {
+        DesignTarget::from_toml(text, &["2500", "5000"].map(str::to_owned))
+    }
+
+    const WAVES: &str = "relief = \"macrostructure\"\n[ranges]\nmacro_depth_mm = [20, 100]\n";
+
+    #[test]
+    fn misfit_weighs_deviations() {
+        let text = format!("{WAVES}[bands.2500]\nlevel_db = -1\n[bands.5000]\nscattering = 0.5\nweight = 3\n");
+        let target = parse(&text).expect("a target");
+        let figures = |level_db, scattering| BandFigures {
+            level_db,
+            spread_db: 0.0,
+            scattering: UncertainNumber { value: scattering, uncertainty: None },
+        };
+        assert_eq!(target.misfit(&[figures(-1.0, 0.0), figures(9.0, 0.5)]), 0.0);
+        // 2 dB once, and 0.1 thrice.
+        let misfit = target.misfit(&[figures(1.0, 0.0), figures(0.0, 0.6)]);
+        assert!((misfit - (7.0f64 / 4.0).sqrt()).abs() < 1e-9, "{misfit}");
+        assert_eq!(target.values_at(&[0.5]).expect("values"), ["60"]);
+        assert_eq!(target.values_at(&[7.0]).expect("values"), ["100"]);
+    }
+
+    #[test]
+    fn wrong_targets_are_refused_by_what_is_wrong() {
+        let with_band = |band: &str| format!("{WAVES}{band}");
+        for (text, expected) in [
+            ("relief = \"macrostructure\"\n[ranges]\n[bands.2500]\nlevel_db = 1\n".to_owned(), "`ranges` is empty"),
+            (with_band(""), "there is no target"),
+            (with_band("[bands.2501]\nlevel_db = 1\n"), "there is no band `2501`"),
+            (with_band("[bands.2500]\nlevel_db = nan\n"), "expected a number"),
+            (with_band("[bands.2500]\nscattering = 2\n"), "not from 0 to 1"),
+            (with_band("[bands.2500]\nlevel_db = 1\nweight = 0\n"), "`weight` of band `2500`"),
+            (with_band("[bands.2500]\nlevel = 1\n"), "unknown field"),
+            (with_band("[bands.2500]\nlevel_db = 1\n").replace("100", "1e6"), "macro_depth_mm"),
+            (with_band("[bands.2500]\nlevel_db = 1\n").replace("macro_depth", "makro"), "makro"),
+            (format!("candidates = 0\n{}", with_band("[bands.2500]\nlevel_db = 1\n")), "`candidates` is 0"),
+        ] {
+            let refused = format!("{:#}", parse(&text).expect_err("wrong"));
+            assert!(refused.contains(expected), "{refused}");
+        }
+    }
+}
