@@ -1,6 +1,8 @@
 //! `echolake design`: panels for a target, found by a search on the simulation.
 
+mod gaussian_process;
 mod measured;
+mod next;
 mod report;
 mod search;
 mod target;
@@ -17,6 +19,7 @@ use serde_json::json;
 
 use crate::CommandOutcome;
 use crate::progress::CommandProgress;
+use next::NextPanel;
 use report::PanelReport;
 use search::DesignSearch;
 use target::DesignTarget;
@@ -28,6 +31,10 @@ pub(crate) struct DesignArgs {
     /// The folder of the results; a search that was stopped goes on there.
     #[arg(short, long, value_name = "FOLDER")]
     output: PathBuf,
+    /// Propose so many panels to measure next instead: those whose measurement tells the most, because neither a surface
+    /// of the lake nor a candidate of the folder is near. Their parameters go to next_1.json and so on.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=50))]
+    next: Option<u32>,
     /// Print JSON.
     #[arg(long)]
     json: bool,
@@ -46,20 +53,25 @@ pub(crate) async fn run_design(args: &DesignArgs, lake_url: &str) -> anyhow::Res
     }
     prepare_folder(args, &text)?;
 
+    let path = args.output.join("candidates.csv");
+    if let Some(count) = args.next {
+        let candidates = search::read_candidates(&path, &target, &bands)?;
+        let panels = next::propose_panels(&target, &candidates, &measured, bands.len(), count as usize)?;
+        return write_next(args, &panels, &bands);
+    }
     let arms = Choreography::for_rig(&rig)?;
     let grid = rig.build_grid()?;
     let simulation = DesignSimulation::new(&rig, grid.clone(), arms.as_deref(), Some(target.pairs))?;
     let progress = CommandProgress::new();
     let task = progress.start_task("search", target.candidates as u64, "candidates");
-    let path = args.output.join("candidates.csv");
     let search = DesignSearch::open(&path, &target, &simulation, &bands, &stop, task)?;
     let begun = Instant::now();
     let known = search.known_count();
-    let candidates = tokio::task::block_in_place(|| search.run())?;
+    let whole = DesignSimulation::new(&rig, grid.clone(), arms.as_deref(), None)?;
+    let candidates = tokio::task::block_in_place(|| search.run(&whole))?;
     let secs = begun.elapsed().as_secs_f64() / (candidates.len() - known).max(1) as f64;
 
     eprintln!("simulating the best panels at all pairs");
-    let whole = DesignSimulation::new(&rig, grid.clone(), arms.as_deref(), None)?;
     let panels = tokio::task::block_in_place(|| report::find_panels(&target, &candidates, &whole, &rig))?;
     for panel in &panels {
         report::write_panel(&args.output, panel, &whole, &rig, &grid)?;
@@ -87,6 +99,29 @@ pub(crate) async fn run_design(args: &DesignArgs, lake_url: &str) -> anyhow::Res
     let folder = args.output.display();
     eprintln!("{folder}: meshes, parameters and grid plots of {} panels; all numbers are simulated", panels.len());
     eprintln!("next: echolake campaign run {}", args.output.join("campaign.toml").display());
+    Ok(CommandOutcome::Whole)
+}
+
+fn write_next(args: &DesignArgs, panels: &[NextPanel], bands: &[String]) -> anyhow::Result<CommandOutcome> {
+    for (panel, number) in panels.iter().zip(1..) {
+        let path = args.output.join(format!("next_{number}.json"));
+        report::write_file(&path, &serde_json::to_vec_pretty(&panel.parameters)?)?;
+        if !args.json {
+            let expected = bands.iter().zip(&panel.expected_db);
+            let expected = expected.map(|(band, [level, s])| format!("{band} Hz {level:.1} ± {s:.1}"));
+            super::print_line(&format!("{}: {:.1} bits", path.display(), panel.information_bits))?;
+            super::print_line(&format!(
+                "  expected levels over Flat, dB, computed from the others: {}",
+                expected.collect::<Vec<_>>().join(", ")
+            ))?;
+            super::print_line(&format!("  {}", panel.parameters["parameters"]))?;
+        }
+    }
+    if args.json {
+        super::print_line(&serde_json::to_string_pretty(panels)?)?;
+    }
+    let first = args.output.join("next_1.json");
+    eprintln!("next: echolake panel --parameters {} -o panel.stl", first.display());
     Ok(CommandOutcome::Whole)
 }
 

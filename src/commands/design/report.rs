@@ -9,7 +9,7 @@ use echolake_dsp::temperature::ReferenceAir;
 use echolake_figures::{FigureNotes, GridFigure, GridLayer, GridPanel, LevelPalette, MapFigure, MapPlane, MapPosition};
 use echolake_lake::ReferenceSurfaces;
 use echolake_panel::mesh::{BACK_MM, FACETS, Mesh, MeshFormat};
-use echolake_panel::relief::{HeightField, PanelRelief};
+use echolake_panel::relief::PanelRelief;
 use echolake_query::figure_rows::band_labels;
 use echolake_schema::{Grid, Rig, SurfaceId};
 use serde::Serialize;
@@ -33,13 +33,12 @@ const LEAST_DISTANCE: f64 = 0.05;
 pub(super) struct FoundPanel {
     pub name: String,
     pub relief: PanelRelief,
-    pub heights: HeightField,
     /// At the pairs of the search.
     pub searched: DesignCandidate,
     /// At all pairs.
     pub figures: PanelFigures,
     pub misfit: f64,
-    /// By band; see [`HeightField::detail_phase`].
+    /// Phase of its details by band, rad.
     pub detail_phases: Vec<Option<f64>>,
 }
 
@@ -107,7 +106,7 @@ impl FoundPanel {
             origin: "simulated",
             relief: self.relief.to_json(),
             misfit: self.misfit,
-            misfit_of_search: self.searched.misfit,
+            misfit_of_search: target.misfit(&self.searched.bands),
             level_deviation_db: target.level_misfit_db(&self.figures, |band| self.is_trusted(band)),
             goals: target.goals.iter().map(goal_row).collect(),
             bands: self.figures.bands.iter().enumerate().map(band_row).collect(),
@@ -161,7 +160,6 @@ fn simulate_panel(
         detail_phases: rig.bands.centres_hz.iter().map(|hz| heights.detail_phase(sound_mm_s / hz)).collect(),
         searched: candidate.clone(),
         relief,
-        heights,
         figures,
     })
 }
@@ -189,21 +187,22 @@ pub(super) fn write_panel(
             levels[ends[1 - end]] = Some(panel.figures.levels_db[band][at]);
         }
     }
-    let labels = band_labels(rig);
-    let label = |band: usize| format!("{} ±{} dB", labels[band], panel.mean_error_db(band));
+    let mut bands = band_labels(rig);
+    bands.truncate(levels_db.len());
+    let errors: Vec<_> = (0..bands.len()).map(|band| panel.mean_error_db(band).to_string()).collect();
+    let title = format!("{name}; error of the bands' means: {} dB", errors.join(", "));
     let figure = GridFigure {
-        bands: (0..levels_db.len()).map(label).collect(),
+        bands,
         layers: GridLayer::from_grid(grid),
         microphone,
-        panels: vec![GridPanel { title: name.clone(), levels_db, is_difference: false }],
+        panels: vec![GridPanel { title, levels_db, is_difference: false }],
         palette: LevelPalette::Centred,
         panel_px: 520.0,
         columns: 1,
         with_caption: true,
     };
     let at = grid.points()[microphone].label();
-    let title =
-        format!("Simulated levels over Flat in the same band, dB, microphone at {at}; ± is the simulation's error");
+    let title = format!("Simulated levels over Flat in the same band, dB, microphone at {at}");
     write_file(&folder.join(format!("{name}.svg")), figure.draw(&simulated_notes(title)).to_svg().as_bytes())
 }
 

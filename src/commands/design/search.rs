@@ -17,8 +17,10 @@ use super::target::DesignTarget;
 use crate::progress::TaskProgress;
 use crate::signals::StopRequest;
 
-/// First step of a search, and the step under which it begins again elsewhere, as shares of a range.
-const FIRST_STEP: f64 = 0.3;
+/// First steps of a search over the whole ranges and beside a candidate that is good, and the step under which it begins
+/// again elsewhere, as shares of a range.
+const WIDE_STEP: f64 = 0.3;
+const NARROW_STEP: f64 = 0.1;
 const LAST_STEP: f64 = 2e-3;
 /// Ratio of the golden section: multiples of it spread over the ranges.
 const GOLDEN_RATIO: f64 = 0.618_033_988_749_894_9;
@@ -32,7 +34,7 @@ const COLUMNS_PER_BAND: usize = 3;
 pub(super) struct DesignCandidate {
     /// Values of the searched parameters.
     pub values: Vec<String>,
-    pub misfit: f64,
+    /// At the pairs of the search; what [`DesignSearch::run`] returns is corrected for all pairs.
     pub bands: Vec<BandFigures>,
 }
 
@@ -47,6 +49,8 @@ pub(super) struct DesignSearch<'a> {
 struct SearchState {
     candidates: Vec<DesignCandidate>,
     by_values: HashMap<Vec<String>, usize>,
+    /// What all pairs add to the figures of those of the search, by band; nothing before a panel was simulated at all.
+    corrections: Vec<BandFigures>,
     file: File,
     progress: TaskProgress,
     evaluations: usize,
@@ -65,28 +69,30 @@ impl<'a> DesignSearch<'a> {
         stop: &'a StopRequest,
         mut progress: TaskProgress,
     ) -> anyhow::Result<Self> {
-        let header = candidate_header(target, bands);
-        let mut candidates = Vec::new();
-        match std::fs::read_to_string(path) {
-            Ok(text) => {
-                candidates = parse_candidates(&text, &header, target, bands.len())
-                    .with_context(|| format!("candidates `{}`", path.display()))?;
-                // A line that was cut off is written again.
-                let whole = text.rfind('\n').map_or(0, |end| end + 1);
-                let file = File::options().write(true).open(path)?;
-                file.set_len(whole as u64)?;
-            }
-            Err(e) if e.kind() == std::io::ErrorKind::NotFound => {
-                std::fs::write(path, format!("{header}\n"))
-                    .with_context(|| format!("cannot write `{}`", path.display()))?;
-            }
-            Err(e) => return Err(e).with_context(|| format!("cannot read `{}`", path.display())),
+        let candidates = read_candidates(path, target, bands)?;
+        if path.exists() {
+            // A line that was cut off is written again.
+            let text = std::fs::read(path)?;
+            let whole = text.iter().rposition(|byte| *byte == b'\n').map_or(0, |end| end + 1);
+            File::options().write(true).open(path)?.set_len(whole as u64)?;
         }
-        let file = File::options().append(true).open(path)?;
+        let file = File::options().append(true).create(true).open(path);
+        let mut file = file.with_context(|| format!("cannot write `{}`", path.display()))?;
+        if file.metadata()?.len() == 0 {
+            file.write_all(format!("{}\n", candidate_header(target, bands)).as_bytes())?;
+        }
         progress.begin_at(candidates.len() as u64);
         let by_values = candidates.iter().enumerate().map(|(at, c)| (c.values.clone(), at)).collect();
-        let state =
-            SearchState { candidates, by_values, file, progress, evaluations: 0, best: f64::INFINITY, failed: None };
+        let state = SearchState {
+            candidates,
+            by_values,
+            corrections: Vec::new(),
+            file,
+            progress,
+            evaluations: 0,
+            best: f64::INFINITY,
+            failed: None,
+        };
         Ok(Self { target, simulation, stop, state: Mutex::new(state) })
     }
 
@@ -95,19 +101,38 @@ impl<'a> DesignSearch<'a> {
         self.lock_state().candidates.len()
     }
 
-    /// Tries as many candidates as the target says; those of before count and cost nothing. Returns all, the best
-    /// first.
-    pub fn run(self) -> anyhow::Result<Vec<DesignCandidate>> {
-        for attempt in 0u64.. {
+    /// Tries as many candidates as the target says; those of before count and cost nothing. After half of them, the best
+    /// is simulated at all pairs, and what these add to its figures is added to all. Returns all, the best first.
+    pub fn run(self, whole: &DesignSimulation) -> anyhow::Result<Vec<DesignCandidate>> {
+        self.search_ranges(vec![0.5; self.target.ranges.len()], WIDE_STEP, self.target.candidates / 2)?;
+        if let Some(best) = self.correct_by(whole)? {
+            self.search_ranges(self.target.shares_of(&best.values), NARROW_STEP, self.target.candidates)?;
+        }
+        let state = self.state.into_inner().unwrap_or_else(PoisonError::into_inner);
+        ensure!(
+            !state.candidates.is_empty(),
+            "none of {} candidates can be printed; hint: ranges of less depth, or a larger greatest_depth_mm",
+            state.evaluations
+        );
+        let mut candidates = state.candidates;
+        candidates.iter_mut().for_each(|candidate| add_figures(&mut candidate.bands, &state.corrections));
+        candidates.sort_by(|a, b| self.target.misfit(&a.bands).total_cmp(&self.target.misfit(&b.bands)));
+        let simulated = candidates.len();
+        state.progress.finish_with(format!("{simulated} panels simulated, best misfit {:.2}", state.best));
+        Ok(candidates)
+    }
+
+    // Searches from a middle with a first step, and elsewhere where it converges, up to so many evaluations in all.
+    fn search_ranges(&self, middle: Vec<f64>, step: f64, most: usize) -> anyhow::Result<()> {
+        let mut start = (middle, step);
+        for attempt in 1u64.. {
             let done = self.lock_state().evaluations;
-            if done >= self.target.candidates {
+            if done >= most {
                 break;
             }
-            // Where the last one has converged, another part of the ranges may be better.
-            let along = |number: usize| (0.5 + GOLDEN_RATIO * attempt as f64 * (number + 1) as f64).fract();
-            let middle: Vec<f64> = (0..self.target.ranges.len()).map(along).collect();
-            let mut search = CMAESOptions::new(middle, FIRST_STEP)
-                .max_function_evals(self.target.candidates - done)
+            let (middle, step) = start;
+            let mut search = CMAESOptions::new(middle, step)
+                .max_function_evals(most - done)
                 .tol_x(LAST_STEP)
                 .seed(self.target.seed.wrapping_add(attempt))
                 .build(|point: &DVector<f64>| self.evaluate_point(point.as_slice()))
@@ -117,18 +142,28 @@ impl<'a> DesignSearch<'a> {
             if let Some(error) = self.lock_state().failed.take() {
                 return Err(error);
             }
+            let along = |number: usize| (0.5 + GOLDEN_RATIO * attempt as f64 * (number + 1) as f64).fract();
+            start = ((0..self.target.ranges.len()).map(along).collect(), WIDE_STEP);
         }
-        let state = self.state.into_inner().unwrap_or_else(PoisonError::into_inner);
-        let simulated = state.candidates.len();
-        state.progress.finish_with(format!("{simulated} panels simulated, best misfit {:.2}", state.best));
-        let mut candidates = state.candidates;
-        candidates.sort_by(|a, b| a.misfit.total_cmp(&b.misfit));
-        ensure!(
-            !candidates.is_empty(),
-            "none of {} candidates can be printed; hint: ranges of less depth, or a larger greatest_depth_mm",
-            state.evaluations
-        );
-        Ok(candidates)
+        Ok(())
+    }
+
+    // Returns the best so far; None if nothing could be printed.
+    fn correct_by(&self, whole: &DesignSimulation) -> anyhow::Result<Option<DesignCandidate>> {
+        let mut state = self.lock_state();
+        let misfit = |candidate: &&DesignCandidate| self.target.misfit(&candidate.bands);
+        let best = state.candidates.iter().min_by(|a, b| misfit(a).total_cmp(&misfit(b)));
+        let Some(best) = best.cloned() else { return Ok(None) };
+        let relief = self.target.relief_of(&best.values)?;
+        let mut figures = whole.compute_figures(&relief.height_field(FACETS), relief.material())?.bands;
+        for (all, some) in figures.iter_mut().zip(&best.bands) {
+            all.level_db -= some.level_db;
+            all.spread_db -= some.spread_db;
+            all.scattering.value -= some.scattering.value;
+        }
+        state.corrections = figures;
+        state.best = f64::INFINITY;
+        Ok(Some(best))
     }
 
     fn lock_state(&self) -> MutexGuard<'_, SearchState> {
@@ -160,8 +195,8 @@ impl<'a> DesignSearch<'a> {
     fn evaluate_inside(&self, point: &[f64]) -> anyhow::Result<f64> {
         super::super::ensure_wanted(self.stop)?;
         let values = self.target.values_at(point)?;
-        if let Some(known) = self.lock_state().misfit_of(&values) {
-            return Ok(known);
+        if let Some(known) = self.lock_state().figures_of(&values) {
+            return Ok(self.target.misfit(&known));
         }
         let relief = self.target.relief_of(&values)?;
         let heights = relief.height_field(FACETS);
@@ -170,36 +205,62 @@ impl<'a> DesignSearch<'a> {
             return Ok(UNPRINTABLE + high - low);
         }
         let figures = self.simulation.compute_figures(&heights, relief.material())?;
-        let misfit = self.target.misfit(&figures.bands);
-        self.lock_state().add_candidate(DesignCandidate { values, misfit, bands: figures.bands })?;
-        Ok(misfit)
+        let candidate = DesignCandidate { values, bands: figures.bands };
+        let corrected = self.lock_state().add_candidate(candidate)?;
+        Ok(self.target.misfit(&corrected))
     }
 }
 
 impl SearchState {
-    fn misfit_of(&self, values: &[String]) -> Option<f64> {
-        self.by_values.get(values).map(|at| self.candidates[*at].misfit)
+    // Corrected.
+    fn figures_of(&self, values: &[String]) -> Option<Vec<BandFigures>> {
+        let mut bands = self.candidates[*self.by_values.get(values)?].bands.clone();
+        add_figures(&mut bands, &self.corrections);
+        Some(bands)
     }
 
-    // Another thread may have tried the same values meanwhile.
-    fn add_candidate(&mut self, candidate: DesignCandidate) -> anyhow::Result<()> {
-        if self.by_values.contains_key(&candidate.values) {
-            return Ok(());
+    // Another thread may have tried the same values meanwhile. Returns the corrected figures.
+    fn add_candidate(&mut self, candidate: DesignCandidate) -> anyhow::Result<Vec<BandFigures>> {
+        let mut bands = candidate.bands.clone();
+        add_figures(&mut bands, &self.corrections);
+        if !self.by_values.contains_key(&candidate.values) {
+            let line = candidate_line(self.candidates.len() + 1, &candidate);
+            self.file.write_all(line.as_bytes()).context("cannot write candidates.csv")?;
+            self.by_values.insert(candidate.values.clone(), self.candidates.len());
+            self.candidates.push(candidate);
         }
-        let line = candidate_line(self.candidates.len() + 1, &candidate);
-        self.file.write_all(line.as_bytes()).context("cannot write candidates.csv")?;
-        self.by_values.insert(candidate.values.clone(), self.candidates.len());
-        self.candidates.push(candidate);
-        Ok(())
+        Ok(bands)
     }
+}
+
+fn add_figures(bands: &mut [BandFigures], corrections: &[BandFigures]) {
+    for (band, correction) in bands.iter_mut().zip(corrections) {
+        band.level_db += correction.level_db;
+        band.spread_db += correction.spread_db;
+        band.scattering.value += correction.scattering.value;
+    }
+}
+
+/// Reads the candidates of a folder; none if it has no search.
+pub(super) fn read_candidates(
+    path: &Path,
+    target: &DesignTarget,
+    bands: &[String],
+) -> anyhow::Result<Vec<DesignCandidate>> {
+    let text = match std::fs::read_to_string(path) {
+        Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(Vec::new()),
+        text => text.with_context(|| format!("cannot read `{}`", path.display()))?,
+    };
+    let parsed = parse_candidates(&text, &candidate_header(target, bands), target, bands.len());
+    parsed.with_context(|| format!("candidates `{}`", path.display()))
 }
 
 fn candidate_header(target: &DesignTarget, bands: &[String]) -> String {
     let parameters = target.ranges.iter().map(|(key, _)| key.clone());
     let figures =
         bands.iter().flat_map(|band| ["level_db", "spread_db", "scattering"].map(|name| format!("{name}_{band}")));
-    let columns = ["candidate".to_owned()].into_iter().chain(parameters).chain(["misfit".to_owned()]);
-    columns.chain(figures).chain(["origin".to_owned()]).collect::<Vec<_>>().join(",")
+    let columns = ["candidate".to_owned()].into_iter().chain(parameters).chain(figures);
+    columns.chain(["origin".to_owned()]).collect::<Vec<_>>().join(",")
 }
 
 // The shortest numbers that are read back exactly.
@@ -209,8 +270,8 @@ fn candidate_line(number: usize, candidate: &DesignCandidate) -> String {
         .iter()
         .flat_map(|band| [band.level_db, band.spread_db, band.scattering.value])
         .map(|x| x.to_string());
-    let fields = [number.to_string()].into_iter().chain(candidate.values.clone()).chain([candidate.misfit.to_string()]);
-    fields.chain(figures).chain(["simulated".to_owned()]).collect::<Vec<_>>().join(",") + "\n"
+    let fields = [number.to_string()].into_iter().chain(candidate.values.clone()).chain(figures);
+    fields.chain(["simulated".to_owned()]).collect::<Vec<_>>().join(",") + "\n"
 }
 
 // Whole lines alone.
@@ -228,10 +289,10 @@ fn parse_candidates(
     let parameters = target.ranges.len();
     let parse = |(line, number): (&str, usize)| {
         let fields: Vec<&str> = line.split(',').collect();
-        let expected = parameters + COLUMNS_PER_BAND * bands + 3;
+        let expected = parameters + COLUMNS_PER_BAND * bands + 2;
         ensure!(fields.len() == expected, "line {number} has {} fields, expected {expected}", fields.len());
         let values = fields[1..=parameters].iter().map(|value| (*value).to_owned()).collect();
-        let numbers = fields[parameters + 2..expected - 1].iter().map(|field| field.parse::<f64>());
+        let numbers = fields[parameters + 1..expected - 1].iter().map(|field| field.parse::<f64>());
         let numbers: Vec<f64> = numbers
             .collect::<Result<_, _>>()
             .with_context(|| format!("line {number} has a field that is no number"))?;
@@ -241,7 +302,7 @@ fn parse_candidates(
             scattering: UncertainNumber { value: of[2], uncertainty: None },
         };
         let bands: Vec<BandFigures> = numbers.chunks(COLUMNS_PER_BAND).map(figures).collect();
-        Ok(DesignCandidate { values, misfit: target.misfit(&bands), bands })
+        Ok(DesignCandidate { values, bands })
     };
     lines.zip(2..).map(parse).collect()
 }

@@ -176,14 +176,27 @@ impl DesignTarget {
         Ok(values.collect::<Result<_, _>>()?)
     }
 
+    /// Returns the shares of their ranges at which some values are.
+    pub fn shares_of(&self, values: &[String]) -> Vec<f64> {
+        let share = |((_, range), value): (&(String, ParameterRange), &String)| match range {
+            ParameterRange::Numbers([low, high]) => {
+                value.parse().map_or(0.5, |value: f64| (value - low) / (high - low))
+            }
+            ParameterRange::Words(words) => {
+                let place = words.iter().position(|word| word == value).unwrap_or(0);
+                (place as f64 + 0.5) / words.len() as f64
+            }
+        };
+        self.ranges.iter().zip(values).map(share).collect()
+    }
+
     /// Returns how far two panels are from each other: the greatest share of a range, 1 for other words.
     pub fn distance(&self, values: &[String], others: &[String]) -> f64 {
-        let parts = self.ranges.iter().zip(values.iter().zip(others)).map(|((_, range), (value, other))| match range {
-            ParameterRange::Words(_) => f64::from(u8::from(value != other)),
-            ParameterRange::Numbers([low, high]) => {
-                let number = |text: &String| text.parse().unwrap_or(*low);
-                (number(value) - number(other)).abs() / (high - low)
-            }
+        let shares = [values, others].map(|values| self.shares_of(values));
+        let parts = self.ranges.iter().zip(shares[0].iter().zip(&shares[1]));
+        let parts = parts.map(|((_, range), (share, other))| match range {
+            ParameterRange::Words(_) => f64::from(u8::from(share != other)),
+            ParameterRange::Numbers(_) => (share - other).abs(),
         });
         parts.fold(0.0, f64::max)
     }
@@ -201,6 +214,28 @@ impl DesignTarget {
     pub fn is_printable(&self, relief: &PanelRelief, heights: &HeightField) -> bool {
         let [low, high] = heights.extent_mm().map(f64::from);
         relief.check_depth().is_ok() && high - low <= self.greatest_depth_mm
+    }
+
+    /// Returns whether the file limits the depth.
+    pub fn limits_depth(&self) -> bool {
+        self.greatest_depth_mm.is_finite()
+    }
+
+    /// Returns where a surface is in the ranges; None if it is another relief, not within them, or differs in what is
+    /// fixed. Of reliefs that are drawn by chance, the seed tells nothing.
+    pub fn place_of(&self, relief: &str, parameters: &str) -> Option<Vec<f64>> {
+        let parameters: serde_json::Map<String, serde_json::Value> = serde_json::from_str(parameters).ok()?;
+        let is_searched = |key: &String| self.ranges.iter().any(|(searched, _)| searched == key);
+        let same = |(key, value): (String, serde_json::Value)| {
+            key == "seed" || is_searched(&key) || parameters.get(&key) == Some(&value)
+        };
+        if relief != self.start.name() || !self.start.parameters().into_iter().all(same) {
+            return None;
+        }
+        let text = |value: &serde_json::Value| value.as_str().map_or_else(|| value.to_string(), str::to_owned);
+        let values = self.ranges.iter().map(|(key, _)| parameters.get(key).map(text));
+        let shares = self.shares_of(&values.collect::<Option<Vec<_>>>()?);
+        shares.iter().all(|share| (0.0..=1.0).contains(share)).then_some(shares)
     }
 
     /// Returns how far figures are from the target: weighted root mean square of the deviations, 1 dB of a level each.

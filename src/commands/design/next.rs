@@ -1,0 +1,105 @@
+//! `echolake design --next`: panels whose measurement tells the most, because neither a measurement nor a simulation
+//! has been near.
+
+use anyhow::{Context as _, ensure};
+use echolake_panel::mesh::FACETS;
+use serde::Serialize;
+
+use super::gaussian_process::{GaussianProcess, KnownFigure};
+use super::measured::MeasuredPanel;
+use super::search::DesignCandidate;
+use super::target::DesignTarget;
+
+/// Standard uncertainty of a level over Flat that is measured, dB, and of one that is simulated: see `MEAN_ERROR_DB`.
+const MEASURED_U_DB: f64 = 0.1;
+const SIMULATED_U_DB: f64 = 0.58;
+/// Places that are compared.
+const PLACES: usize = 1_000;
+/// The real root of x^(d+1) = x + 1 gives even steps along d axes (Roberts 2018, R sequence).
+const ROOT_STEPS: usize = 60;
+
+/// A panel to measure next.
+#[derive(Debug, Serialize)]
+pub(super) struct NextPanel {
+    pub parameters: serde_json::Value,
+    /// What its measurement tells of the levels of all bands, bits.
+    pub information_bits: f64,
+    /// Level over Flat that is expected in each band, dB, and its standard deviation.
+    pub expected_db: Vec<[f64; 2]>,
+}
+
+/// Returns so many panels, each the one that tells the most once those before it are measured.
+pub(super) fn propose_panels(
+    target: &DesignTarget,
+    candidates: &[DesignCandidate],
+    measured: &[MeasuredPanel],
+    bands: usize,
+    count: usize,
+) -> anyhow::Result<Vec<NextPanel>> {
+    let measured: Vec<_> =
+        measured.iter().filter_map(|panel| Some((target.place_of(&panel.relief, &panel.parameters)?, panel))).collect();
+    eprintln!(
+        "{} surfaces of the lake and {} simulated panels are within the ranges",
+        measured.len(),
+        candidates.len()
+    );
+    let fit = |band: usize| {
+        let simulated = candidates.iter().map(|candidate| KnownFigure {
+            place: target.shares_of(&candidate.values),
+            value: candidate.bands[band].level_db,
+            uncertainty: SIMULATED_U_DB,
+        });
+        let found = measured.iter().filter_map(|(place, panel)| {
+            let value = panel.levels_db()[band]?;
+            Some(KnownFigure { place: place.clone(), value, uncertainty: MEASURED_U_DB })
+        });
+        let known: Vec<_> = simulated.chain(found).collect();
+        GaussianProcess::fit(&known).with_context(|| {
+            format!(
+                "{} panels tell nothing of the gaps between them, expected three that differ; hint: run the search",
+                known.len()
+            )
+        })
+    };
+    let mut processes = (0..bands).map(fit).collect::<anyhow::Result<Vec<_>>>()?;
+    let places = printable_places(target)?;
+    let mut found = Vec::new();
+    for _ in 0..count {
+        let information = |place: &[f64]| -> f64 {
+            let bits = |process: &GaussianProcess| (process.predict(place).1 / MEASURED_U_DB).powi(2).ln_1p() / 2.0;
+            processes.iter().map(bits).sum::<f64>() / std::f64::consts::LN_2
+        };
+        let best = places.iter().map(|place| (information(place), place)).max_by(|(a, _), (b, _)| a.total_cmp(b));
+        let (information_bits, place) = best.context("no place is left")?;
+        let relief = target.relief_of(&target.values_at(place)?)?;
+        found.push(NextPanel {
+            parameters: relief.to_json(),
+            information_bits,
+            expected_db: processes.iter().map(|process| process.predict(place)).map(|(mean, s)| [mean, s]).collect(),
+        });
+        processes = processes
+            .into_iter()
+            .map(|process| process.expect_at(place, MEASURED_U_DB).context("two panels are one"))
+            .collect::<anyhow::Result<Vec<_>>>()?;
+    }
+    Ok(found)
+}
+
+// Even in the ranges. The depth is judged by coarse heights first.
+fn printable_places(target: &DesignTarget) -> anyhow::Result<Vec<Vec<f64>>> {
+    let dimensions = target.ranges.len();
+    let root = (0..ROOT_STEPS).fold(1.5f64, |x, _| (1.0 + x).powf(1.0 / (dimensions as f64 + 1.0)));
+    let steps: Vec<f64> = (1..=dimensions).map(|axis| root.powi(-(axis as i32))).collect();
+    let mut places = Vec::new();
+    for number in 0..PLACES {
+        let place: Vec<f64> = steps.iter().map(|step| (0.5 + step * number as f64).fract()).collect();
+        let relief = target.relief_of(&target.values_at(&place)?)?;
+        if relief.check_depth().is_ok()
+            && (!target.limits_depth() || target.is_printable(&relief, &relief.height_field(FACETS / 4)))
+        {
+            places.push(place);
+        }
+    }
+    ensure!(!places.is_empty(), "nothing within the ranges can be printed; hint: ranges of less depth");
+    Ok(places)
+}
