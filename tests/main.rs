@@ -7,6 +7,7 @@ mod architecture;
 mod bad_input;
 mod broken_tables;
 mod campaign;
+mod design;
 mod end_to_end;
 mod figure;
 mod foam;

@@ -6,7 +6,7 @@ use crate::devices::DeviceParams;
 use crate::grid::{Grid, GridParams, Layer};
 use crate::robots::RobotCell;
 use crate::simulation::SimulationParams;
-use crate::{Celsius, Error, SampleRate};
+use crate::{Celsius, Error, MODEL_SCALE, SampleRate};
 
 /// Number of single points that a difference names.
 const SHOWN_POINTS: usize = 4;
@@ -384,6 +384,12 @@ impl Rig {
     pub fn recording_len(&self) -> usize {
         let rate = self.sweep.rate_hz.get();
         (self.sweep.duration_secs * rate).round() as usize + (self.sweep.tail_secs * rate).round() as usize
+    }
+
+    /// Full scale over that of what is measured: [`MODEL_SCALE`] if the sweep goes over 20 kHz, which people do not
+    /// hear, else 1.
+    pub fn model_scale(&self) -> f64 {
+        if self.sweep.high_hz > 20e3 { MODEL_SCALE } else { 1.0 }
     }
 
     /// Suffix of each band's columns: its centre in Hz.

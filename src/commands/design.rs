@@ -14,6 +14,7 @@ use anyhow::{Context as _, bail};
 use clap::Args;
 use echolake_acquisition::design::DesignSimulation;
 use echolake_acquisition::rig::robots::Choreography;
+use echolake_lake::{Error as LakeError, Lake, ReferenceSurfaces};
 use echolake_schema::Rig;
 use serde_json::json;
 
@@ -31,8 +32,8 @@ pub(crate) struct DesignArgs {
     /// The folder of the results; a search that was stopped goes on there.
     #[arg(short, long, value_name = "FOLDER")]
     output: PathBuf,
-    /// Propose so many panels to measure next instead: those whose measurement tells the most, because neither a surface
-    /// of the lake nor a candidate of the folder is near. Their parameters go to next_1.json and so on.
+    /// Propose so many panels to measure next instead: those whose measurement tells the most, because neither a
+    /// surface of the lake nor a candidate of the folder is near. Their parameters go to next_1.json and so on.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=50))]
     next: Option<u32>,
     /// Print JSON.
@@ -42,12 +43,19 @@ pub(crate) struct DesignArgs {
 
 pub(crate) async fn run_design(args: &DesignArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let stop = super::stop_request()?;
-    let rig = super::rig_or(None, lake_url, Rig::paper).await?;
+    let lake = match Lake::open(lake_url).await {
+        Err(LakeError::NoLake { .. }) => None,
+        lake => Some(lake?),
+    };
+    let rig = lake.as_ref().map_or_else(Rig::paper, |lake| lake.rig().clone());
     let bands = rig.band_names();
     let text = target::read_target(&args.target)?;
     let within = || format!("target `{}`", args.target.display());
     let mut target = DesignTarget::from_toml(&text, &bands).with_context(within)?;
-    let measured = measured::read_measured(lake_url, &bands).await?;
+    let (measured, references) = match &lake {
+        Some(lake) => (measured::read_measured(lake, &bands).await?, lake.config().references.clone()),
+        None => (Vec::new(), ReferenceSurfaces::default()),
+    };
     if let Some(surface) = target.levels_of.clone() {
         target.add_levels(&measured::levels_of(&measured, &surface).with_context(within)?);
     }
@@ -77,7 +85,7 @@ pub(crate) async fn run_design(args: &DesignArgs, lake_url: &str) -> anyhow::Res
         report::write_panel(&args.output, panel, &whole, &rig, &grid)?;
     }
     report::write_search(&args.output, &target, &candidates, &panels, &measured, &bands)?;
-    report::write_campaign(&args.output, &target, &panels, &bands)?;
+    report::write_campaign(&args.output, &target, &panels, &references.flat, &bands)?;
     let reports: Vec<PanelReport> = panels.iter().map(|panel| panel.report(&target, &bands)).collect();
     let summary = json!({
         "origin": "simulated",
@@ -149,16 +157,18 @@ fn print_reports(reports: &[PanelReport], panels: &[report::FoundPanel], target:
             values.collect::<Vec<_>>().join(", ")
         ))?;
         if let Some(deviation) = report.level_deviation_db {
-            super::print_line(&format!(
-                "  levels {deviation:.2} dB rms from the target where the simulation is trusted"
-            ))?;
+            let trusted = match report.trusted_level_deviation_db {
+                Some(trusted) => format!("{trusted:.2} dB in the bands in which the simulation is trusted"),
+                None => "the simulation is trusted in none of the bands".to_owned(),
+            };
+            super::print_line(&format!("  levels {deviation:.2} dB rms from the target; {trusted}"))?;
         }
-        super::print_line("   target     found  deviation  error of the simulation")?;
+        super::print_line("   target     found  deviation  figure, and error of the simulation")?;
         for goal in &report.goals {
-            let doubt = if goal.is_trusted { "" } else { ", single pairs not to be trusted" };
+            let doubt = if goal.is_trusted { "" } else { ", single pairs 0.9 dB or more" };
             super::print_line(&format!(
-                "{:9.2} {:9.2}  {:9.2}  {:.2} dB{doubt}  {}",
-                goal.target, goal.found, goal.deviation, goal.simulation_error_db, goal.figure
+                "{:9.2} {:9.2}  {:9.2}  {}: means {:.2} dB{doubt}",
+                goal.target, goal.found, goal.deviation, goal.figure, goal.simulation_error_db
             ))?;
         }
     }

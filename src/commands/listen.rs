@@ -8,7 +8,7 @@ use echolake_export::{DryRecording, ListenedResponse, write_sounds};
 use echolake_lake::Lake;
 use echolake_query::Session;
 use echolake_query::figure_rows::quote_literal;
-use echolake_schema::{MODEL_SCALE, SurfaceId};
+use echolake_schema::SurfaceId;
 use serde::Deserialize;
 
 use crate::CommandOutcome;
@@ -62,8 +62,9 @@ pub(crate) async fn run_listen(args: &ListenArgs, lake_url: &str) -> anyhow::Res
     if flat != args.surface.as_str() {
         rows.push(newest_response(&session, args, &flat).await?);
     }
-    // The models are smaller than what they stand for, and sound is as fast: all takes longer at full scale.
-    let rate_hz = (lake.rig().sweep.rate_hz.get() / MODEL_SCALE).round() as u32;
+    // Models are smaller than what they stand for, and sound is as fast: all takes longer at full scale.
+    let scale = lake.rig().model_scale();
+    let rate_hz = (lake.rig().sweep.rate_hz.get() / scale).round() as u32;
     let names: Vec<String> =
         rows.iter().map(|row| format!("{}-{}-{}", row.surface_id, args.pair, row.origin)).collect();
     let responses: Vec<_> = rows
@@ -82,7 +83,7 @@ pub(crate) async fn run_listen(args: &ListenArgs, lake_url: &str) -> anyhow::Res
             super::print_line(&format!("{response:11.2}  {sound:8.2}  {gain:7.2}  {}", level.file))?;
         }
     }
-    let [low_hz, high_hz] = [lake.rig().sweep.low_hz, lake.rig().sweep.high_hz].map(|hz| hz / MODEL_SCALE);
+    let [low_hz, high_hz] = [lake.rig().sweep.low_hz, lake.rig().sweep.high_hz].map(|hz| hz / scale);
     eprintln!(
         "{}: {} files of {low_hz:.0} to {high_hz:.0} Hz at full scale, which the sweep had",
         args.output.display(),

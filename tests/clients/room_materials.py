@@ -1,16 +1,17 @@
-"""Reverberation of a room whose wall is of a measured surface: `room_materials.py MATERIALS.json`.
+"""Reverberation of a room whose wall is of a measured surface: `room_materials.py MATERIALS.json [PLOT]`.
 
 MATERIALS.json is written by `echolake export materials --format pyroomacoustics`. The room is 6 x 5 x 3 m; one wall of
 6 x 3 m is of each surface in turn, the others are of plaster. Printed is T30 by band with the scattering of the file, and
-with 0.05 for all bands. Image sources and rays are pyroomacoustics'.
+with 0.05 for all bands; PLOT is a picture of both. Image sources and rays are pyroomacoustics'.
 
-    pip install pyroomacoustics
+    pip install pyroomacoustics matplotlib
 """
 
 import json
 import pathlib
 import sys
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pyroomacoustics as pra
 
@@ -42,13 +43,23 @@ def main() -> None:
     materials = json.loads(pathlib.Path(sys.argv[1]).read_text())
     print("| surface | scattering | " + " | ".join(f"{hz} Hz" for hz in BANDS) + " |")
     print("| --- | --- |" + " ---: |" * len(BANDS))
+    _, axes = plt.subplots()
     for name, values in materials.items():
         absorption = values["energy_absorption"]
-        for label, wall in (
-            ("of the file", pra.Material(**values)),
-            ("0.05", pra.Material(absorption, 0.05)),
+        for label, wall, style in (
+            ("of the file", pra.Material(**values), "-o"),
+            ("0.05", pra.Material(absorption, 0.05), "--s"),
         ):
-            print(f"| {name} | {label} | " + " | ".join(f"{t:.2f} s" for t in decay_secs(wall)) + " |")
+            secs = decay_secs(wall)
+            print(f"| {name} | {label} | " + " | ".join(f"{t:.2f} s" for t in secs) + " |")
+            axes.semilogx(BANDS, secs, style, label=f"{name}, scattering {label}")
+    if len(sys.argv) > 2:
+        origins = {values["scattering"]["description"] for values in materials.values()}
+        axes.set(title="\n".join(sorted(origins)), xlabel="Hz", ylabel="T30, s, computed by pyroomacoustics")
+        axes.set_xticks(BANDS, BANDS)
+        axes.set_xticks([], minor=True)
+        axes.legend()
+        plt.savefig(sys.argv[2])
 
 
 if __name__ == "__main__":

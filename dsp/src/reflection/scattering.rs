@@ -16,7 +16,7 @@ use crate::{Error, RealSample};
 
 /// Classes of the cosine of the angle of incidence, each a tenth wide.
 const CLASSES_PER_COSINE: f64 = 10.0;
-/// Strips of the panel along each side; without one of their fields each, coefficients show their uncertainty.
+/// Strips of the grid along each side; without one of their fields each, coefficients show their uncertainty.
 const STRIPS: f64 = 3.0;
 
 /// Path of a pair's reflection.
@@ -24,7 +24,7 @@ const STRIPS: f64 = 3.0;
 pub struct ScatteringPath {
     /// Angle of incidence, degrees.
     pub incidence_deg: f64,
-    /// Point of reflection over half the width that points of reflection have, -1 to 1.
+    /// Point of reflection over the grid's greatest coordinate along x or y, -1 to 1.
     pub specular: [f64; 2],
 }
 

@@ -72,9 +72,18 @@ pub fn format_materials(rows: &[MaterialBand], format: MaterialFormat) -> Result
         .map(|band| band.full_scale_hz)
         .collect();
     let file = match format {
-        // Its absorption has no field for frequencies; they are those of its results.
+        // Its absorption has no field for frequencies; they are those of its results. Origins are a field of ours.
         MaterialFormat::Choras => {
-            json!({ "absorption_coefficients": materials, "results": [{ "frequencies": frequencies }] })
+            let origins: Map<_, _> = rows
+                .iter()
+                .filter(|band| materials.contains_key(&band.surface_id))
+                .map(|band| (band.surface_id.clone(), band.origin.as_str().into()))
+                .collect();
+            json!({
+                "absorption_coefficients": materials,
+                "results": [{ "frequencies": frequencies }],
+                "origins": origins,
+            })
         }
         _ => Value::Object(materials),
     };
@@ -149,6 +158,7 @@ mod tests {
         assert_eq!(omitted, ["a", "c"]);
         assert_eq!(choras["absorption_coefficients"], json!({ "b": "0.200, 0.300" }));
         assert_eq!(choras["results"][0]["frequencies"], json!([250.0, 500.0]));
+        assert_eq!(choras["origins"], json!({ "b": "simulated" }));
         let (csv, _) = format_materials(&rows, MaterialFormat::Csv).expect("materials");
         let text = String::from_utf8(csv).expect("text");
         assert!(text.contains("\na,500.0,,,no board,0.5,0.05,,0.5,,,,simulated\n"), "{text}");

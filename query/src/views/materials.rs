@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 
-use echolake_schema::{MODEL_SCALE, Rig};
+use echolake_schema::Rig;
 
 use super::column_note;
 
@@ -62,10 +62,11 @@ pub(super) fn view_sql(rig: &Rig) -> String {
         diffusion = per_band("diffusion_normalised"),
         far = per_band("far_scattering"),
     );
+    let scale = format!("{:?}", rig.model_scale());
     let has_absorption = "NOT is_foam AND absorption >= -1.96 * absorption_u";
     let has_scattering = format!("NOT is_flat AND NOT is_foam AND scattering_u <= {GREATEST_SCATTERING_U}");
     format!(
-        "SELECT surface_id, run_id, band, band_hz, band_hz / {MODEL_SCALE} AS full_scale_hz, \
+        "SELECT surface_id, run_id, band, band_hz, band_hz / {scale} AS full_scale_hz, \
          CASE WHEN {has_absorption} THEN greatest(absorption, 0) END AS absorption, \
          CASE WHEN {has_absorption} THEN absorption_u END AS absorption_u, \
          CASE WHEN is_foam THEN 'the surface is its own Foam, which is estimated' \
@@ -93,7 +94,12 @@ const LEVEL_U: &str = "coalesce(t.p90_mean_u_db, 0) * 0.2302585092994046";
 
 pub(super) fn column_notes() -> HashMap<String, HashMap<String, String>> {
     let noted = [
-        column_note("full_scale_hz", "Hz", "Centre of the octave at full scale, a tenth of the model's frequency"),
+        column_note(
+            "full_scale_hz",
+            "Hz",
+            "Centre of the octave at full scale: a tenth of the model's frequency, or the same if the sweep ends at 20 \
+             kHz or below",
+        ),
         column_note(
             "absorption",
             "1",

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use anyhow::Context as _;
-use echolake_lake::{Error as LakeError, Lake};
+use echolake_lake::Lake;
 use echolake_query::Session;
 use echolake_schema::SurfaceId;
 use serde::Deserialize;
@@ -51,14 +51,9 @@ impl MeasuredPanel {
     }
 }
 
-/// Reads the figures of the surfaces of a lake, their own references apart; none if there is no lake.
-pub(super) async fn read_measured(lake_url: &str, bands: &[String]) -> anyhow::Result<Vec<MeasuredPanel>> {
-    let lake = match Lake::open(lake_url).await {
-        Ok(lake) => lake,
-        Err(LakeError::NoLake { .. }) => return Ok(Vec::new()),
-        Err(e) => return Err(e.into()),
-    };
-    let session = Session::new(&lake)?;
+/// Reads the figures of the surfaces of a lake, their own references apart.
+pub(super) async fn read_measured(lake: &Lake, bands: &[String]) -> anyhow::Result<Vec<MeasuredPanel>> {
+    let session = Session::new(lake)?;
     // Foam's own reflection is taken away from both or from none.
     let sql = "select s.surface_id, s.origin, s.mesostructure as relief, s.parameters, t.band, \
                coalesce(t.unbiased_p90_mean_db - f.unbiased_p90_mean_db, t.p90_mean_db - f.p90_mean_db) as level_db, \

@@ -7,15 +7,16 @@ use serde::Serialize;
 
 use super::gaussian_process::{GaussianProcess, KnownFigure};
 use super::measured::MeasuredPanel;
+use super::report::MEAN_ERROR_DB;
 use super::search::DesignCandidate;
 use super::target::DesignTarget;
 
-/// Standard uncertainty of a level over Flat that is measured, dB, and of one that is simulated: see `MEAN_ERROR_DB`.
+/// Standard uncertainty of a level over Flat that is measured, dB.
 const MEASURED_U_DB: f64 = 0.1;
-const SIMULATED_U_DB: f64 = 0.58;
 /// Places that are compared.
 const PLACES: usize = 1_000;
-/// The real root of x^(d+1) = x + 1 gives even steps along d axes (Roberts 2018, R sequence).
+/// Steps of the iteration to the root of x^(d+1) = x + 1, whose powers are even steps along d axes (Roberts 2018, R
+/// sequence).
 const ROOT_STEPS: usize = 60;
 
 /// A panel to measure next.
@@ -47,7 +48,7 @@ pub(super) fn propose_panels(
         let simulated = candidates.iter().map(|candidate| KnownFigure {
             place: target.shares_of(&candidate.values),
             value: candidate.bands[band].level_db,
-            uncertainty: SIMULATED_U_DB,
+            uncertainty: MEAN_ERROR_DB[1],
         });
         let found = measured.iter().filter_map(|(place, panel)| {
             let value = panel.levels_db()[band]?;
@@ -85,7 +86,7 @@ pub(super) fn propose_panels(
     Ok(found)
 }
 
-// Even in the ranges. The depth is judged by coarse heights first.
+// Evenly from the ranges. Coarse heights tell a depth well enough.
 fn printable_places(target: &DesignTarget) -> anyhow::Result<Vec<Vec<f64>>> {
     let dimensions = target.ranges.len();
     let root = (0..ROOT_STEPS).fold(1.5f64, |x, _| (1.0 + x).powf(1.0 / (dimensions as f64 + 1.0)));

@@ -7,7 +7,6 @@ use anyhow::{Context as _, bail};
 use echolake_acquisition::design::{DesignSimulation, PanelFigures};
 use echolake_dsp::temperature::ReferenceAir;
 use echolake_figures::{FigureNotes, GridFigure, GridLayer, GridPanel, LevelPalette, MapFigure, MapPlane, MapPosition};
-use echolake_lake::ReferenceSurfaces;
 use echolake_panel::mesh::{BACK_MM, FACETS, Mesh, MeshFormat};
 use echolake_panel::relief::PanelRelief;
 use echolake_query::figure_rows::band_labels;
@@ -25,7 +24,7 @@ use super::target::{DesignGoal, DesignTarget};
 const TRUSTED_PHASE: f64 = 0.18;
 /// Error of a band's mean level under that phase and over it, dB: root mean square over the reliefs of that table; at
 /// most it is 0.31 and 1.2 dB.
-const MEAN_ERROR_DB: [f64; 2] = [0.12, 0.58];
+pub(super) const MEAN_ERROR_DB: [f64; 2] = [0.12, 0.58];
 /// Distance of panels of one search from each other, as a share of a parameter's range.
 const LEAST_DISTANCE: f64 = 0.05;
 
@@ -63,8 +62,9 @@ pub(super) struct PanelReport {
     /// At all pairs, and at those of the search.
     pub misfit: f64,
     pub misfit_of_search: f64,
-    /// Root mean square of the levels' deviations in bands that the simulation is trusted in, dB.
+    /// Root mean square of the levels' deviations, dB: in all bands, and in those that the simulation is trusted in.
     pub level_deviation_db: Option<f64>,
+    pub trusted_level_deviation_db: Option<f64>,
     pub goals: Vec<GoalRow>,
     pub bands: Vec<serde_json::Value>,
 }
@@ -107,7 +107,8 @@ impl FoundPanel {
             relief: self.relief.to_json(),
             misfit: self.misfit,
             misfit_of_search: target.misfit(&self.searched.bands),
-            level_deviation_db: target.level_misfit_db(&self.figures, |band| self.is_trusted(band)),
+            level_deviation_db: target.level_misfit_db(&self.figures, |_| true),
+            trusted_level_deviation_db: target.level_misfit_db(&self.figures, |band| self.is_trusted(band)),
             goals: target.goals.iter().map(goal_row).collect(),
             bands: self.figures.bands.iter().enumerate().map(band_row).collect(),
         }
@@ -288,27 +289,23 @@ pub(super) fn write_campaign(
     folder: &Path,
     target: &DesignTarget,
     panels: &[FoundPanel],
+    flat: &SurfaceId,
     bands: &[String],
 ) -> anyhow::Result<()> {
-    let flat = ReferenceSurfaces::default().flat;
-    let stem = folder.file_name().map_or_else(String::new, |name| name.to_string_lossy().into_owned());
-    let names = panels.iter().map(|panel| format!("{stem}-{}", panel.name.replace('_', "-")));
-    let names: Vec<String> = names
-        .zip(panels)
-        .map(|(name, panel)| if name.parse::<SurfaceId>().is_ok() { name } else { panel.name.clone() })
-        .collect();
-    let surfaces: Vec<_> = names
-        .iter()
-        .zip(panels)
-        .map(|(name, panel)| json!({"name": name, "relief": panel.relief.name(), "parameters": panel.relief.parameters()}))
-        .collect();
-    let expected = names.iter().zip(panels).map(|(name, panel)| {
+    let name = folder.file_name().map_or_else(String::new, |name| name.to_string_lossy().into_owned());
+    let stem = if name.parse::<SurfaceId>().is_ok() { name } else { "design".to_owned() };
+    let surface = |panel: &FoundPanel| format!("{stem}-{}", panel.name.replace('_', "-"));
+    let surfaces = panels.iter().map(|panel| {
+        let parameters = panel.relief.parameters();
+        json!({ "name": surface(panel), "relief": panel.relief.name(), "parameters": parameters })
+    });
+    let expected = panels.iter().map(|panel| {
         let levels = bands
             .iter()
             .zip(&panel.figures.bands)
             .map(|(band, figures)| (band.clone(), json!(round_level(figures.level_db))));
         json!({
-            "surface": name,
+            "surface": surface(panel),
             "relative_to": flat,
             "levels_db": levels.collect::<serde_json::Map<_, _>>(),
             "source": "simulated by `echolake design` at all pairs",
@@ -317,7 +314,7 @@ pub(super) fn write_campaign(
     let campaign = json!({
         "name": format!("Design {stem}"),
         "about": target.about,
-        "surfaces": surfaces,
+        "surfaces": surfaces.collect::<Vec<_>>(),
         "expected": expected.collect::<Vec<_>>(),
     });
     let text = toml::to_string(&campaign)?;
@@ -331,4 +328,16 @@ fn round_level(level_db: f64) -> f64 {
 
 pub(super) fn write_file(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     std::fs::write(path, bytes).with_context(|| format!("cannot write `{}`", path.display()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_front_holds_what_nothing_is_better_than_in_both() {
+        let points =
+            [[[3.0, 0.0], [9.0, 5.0]], [[1.0, 1.0], [4.0, 2.0]], [[2.0, 2.0], [5.0, 3.0]], [[7.0, 4.0], [0.0, 0.0]]];
+        assert_eq!(pareto_front(points.into_iter()), [[1.0, 4.0], [3.0, 9.0], [7.0, 0.0]]);
+    }
 }

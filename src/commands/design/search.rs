@@ -17,8 +17,8 @@ use super::target::DesignTarget;
 use crate::progress::TaskProgress;
 use crate::signals::StopRequest;
 
-/// First steps of a search over the whole ranges and beside a candidate that is good, and the step under which it begins
-/// again elsewhere, as shares of a range.
+/// First steps of a search over the whole ranges and beside a good candidate, and the step under which it begins again
+/// elsewhere, as shares of a range.
 const WIDE_STEP: f64 = 0.3;
 const NARROW_STEP: f64 = 0.1;
 const LAST_STEP: f64 = 2e-3;
@@ -54,7 +54,8 @@ struct SearchState {
     file: File,
     progress: TaskProgress,
     evaluations: usize,
-    best: f64,
+    /// The best of these evaluations, and its misfit.
+    best: Option<(f64, Vec<String>)>,
     /// The first error; the search ends with it.
     failed: Option<anyhow::Error>,
 }
@@ -90,7 +91,7 @@ impl<'a> DesignSearch<'a> {
             file,
             progress,
             evaluations: 0,
-            best: f64::INFINITY,
+            best: None,
             failed: None,
         };
         Ok(Self { target, simulation, stop, state: Mutex::new(state) })
@@ -101,8 +102,8 @@ impl<'a> DesignSearch<'a> {
         self.lock_state().candidates.len()
     }
 
-    /// Tries as many candidates as the target says; those of before count and cost nothing. After half of them, the best
-    /// is simulated at all pairs, and what these add to its figures is added to all. Returns all, the best first.
+    /// Tries as many candidates as the target says; those of before count and cost nothing. After half of them, the
+    /// best is simulated at all pairs, and what these add to its figures is added to all. Returns all, the best first.
     pub fn run(self, whole: &DesignSimulation) -> anyhow::Result<Vec<DesignCandidate>> {
         self.search_ranges(vec![0.5; self.target.ranges.len()], WIDE_STEP, self.target.candidates / 2)?;
         if let Some(best) = self.correct_by(whole)? {
@@ -117,8 +118,7 @@ impl<'a> DesignSearch<'a> {
         let mut candidates = state.candidates;
         candidates.iter_mut().for_each(|candidate| add_figures(&mut candidate.bands, &state.corrections));
         candidates.sort_by(|a, b| self.target.misfit(&a.bands).total_cmp(&self.target.misfit(&b.bands)));
-        let simulated = candidates.len();
-        state.progress.finish_with(format!("{simulated} panels simulated, best misfit {:.2}", state.best));
+        state.progress.finish_with(format!("{} panels simulated", candidates.len()));
         Ok(candidates)
     }
 
@@ -151,10 +151,9 @@ impl<'a> DesignSearch<'a> {
     // Returns the best so far; None if nothing could be printed.
     fn correct_by(&self, whole: &DesignSimulation) -> anyhow::Result<Option<DesignCandidate>> {
         let mut state = self.lock_state();
-        let misfit = |candidate: &&DesignCandidate| self.target.misfit(&candidate.bands);
-        let best = state.candidates.iter().min_by(|a, b| misfit(a).total_cmp(&misfit(b)));
-        let Some(best) = best.cloned() else { return Ok(None) };
-        let relief = self.target.relief_of(&best.values)?;
+        let Some((_, values)) = state.best.take() else { return Ok(None) };
+        let best = state.candidates[state.by_values[&values]].clone();
+        let relief = self.target.relief_of(&values)?;
         let mut figures = whole.compute_figures(&relief.height_field(FACETS), relief.material())?.bands;
         for (all, some) in figures.iter_mut().zip(&best.bands) {
             all.level_db -= some.level_db;
@@ -162,7 +161,6 @@ impl<'a> DesignSearch<'a> {
             all.scattering.value -= some.scattering.value;
         }
         state.corrections = figures;
-        state.best = f64::INFINITY;
         Ok(Some(best))
     }
 
@@ -173,15 +171,16 @@ impl<'a> DesignSearch<'a> {
     // NaN ends the search.
     fn evaluate_point(&self, point: &[f64]) -> f64 {
         let outside: f64 = point.iter().map(|x| (x - x.clamp(0.0, 1.0)).powi(2)).sum::<f64>().sqrt();
-        let misfit = self.evaluate_inside(point);
+        let evaluated = self.evaluate_inside(point);
         let mut state = self.lock_state();
         state.evaluations += 1;
-        match misfit {
+        match evaluated {
             Ok(misfit) => {
-                state.best = state.best.min(misfit);
-                let note = format!("best so far: {:.2}", state.best);
+                if let Some((best, _)) = &state.best {
+                    let note = format!("best so far: {best:.2}");
+                    state.progress.set_note(note);
+                }
                 let done = state.evaluations as u64;
-                state.progress.set_note(note);
                 state.progress.set_done(done);
                 misfit + outside * UNPRINTABLE.sqrt()
             }
@@ -195,19 +194,26 @@ impl<'a> DesignSearch<'a> {
     fn evaluate_inside(&self, point: &[f64]) -> anyhow::Result<f64> {
         super::super::ensure_wanted(self.stop)?;
         let values = self.target.values_at(point)?;
-        if let Some(known) = self.lock_state().figures_of(&values) {
-            return Ok(self.target.misfit(&known));
+        let known = self.lock_state().figures_of(&values);
+        let figures = match known {
+            Some(figures) => figures,
+            None => {
+                let relief = self.target.relief_of(&values)?;
+                let heights = relief.height_field(FACETS);
+                if !self.target.is_printable(&relief, &heights) {
+                    let [low, high] = heights.extent_mm().map(f64::from);
+                    return Ok(UNPRINTABLE + high - low);
+                }
+                let figures = self.simulation.compute_figures(&heights, relief.material())?;
+                self.lock_state().add_candidate(DesignCandidate { values: values.clone(), bands: figures.bands })?
+            }
+        };
+        let misfit = self.target.misfit(&figures);
+        let mut state = self.lock_state();
+        if state.best.as_ref().is_none_or(|(best, _)| misfit < *best) {
+            state.best = Some((misfit, values));
         }
-        let relief = self.target.relief_of(&values)?;
-        let heights = relief.height_field(FACETS);
-        if !self.target.is_printable(&relief, &heights) {
-            let [low, high] = heights.extent_mm().map(f64::from);
-            return Ok(UNPRINTABLE + high - low);
-        }
-        let figures = self.simulation.compute_figures(&heights, relief.material())?;
-        let candidate = DesignCandidate { values, bands: figures.bands };
-        let corrected = self.lock_state().add_candidate(candidate)?;
-        Ok(self.target.misfit(&corrected))
+        Ok(misfit)
     }
 }
 
