@@ -59,7 +59,7 @@ mod slow {
         place.fails(1, &["design", "waves.toml", "-o", "waves"], "its columns are another search's");
         let worn = whole.replacen(",simulated", ",x,simulated", 1);
         std::fs::write(place.path("waves/candidates.csv"), worn).expect("written");
-        place.fails(1, &["design", "waves.toml", "-o", "waves"], "line 2 has 18 fields, expected 17");
+        place.fails(1, &["design", "waves.toml", "-o", "waves"], "line 2 has 19 fields, expected 18");
     }
 
     #[test]

@@ -105,9 +105,13 @@ impl<'a> DesignSearch<'a> {
     /// Tries as many candidates as the target says; those of before count and cost nothing. After half of them, the
     /// best is simulated at all pairs, and what these add to its figures is added to all. Returns all, the best first.
     pub fn run(self, whole: &DesignSimulation) -> anyhow::Result<Vec<DesignCandidate>> {
-        self.search_ranges(vec![0.5; self.target.ranges.len()], WIDE_STEP, self.target.candidates / 2)?;
-        if let Some(best) = self.correct_by(whole)? {
-            self.search_ranges(self.target.shares_of(&best.values), NARROW_STEP, self.target.candidates)?;
+        let middle = vec![0.5; self.target.ranges.len()];
+        self.search_ranges(middle.clone(), WIDE_STEP, self.target.candidates / 2)?;
+        match self.correct_by(whole)? {
+            Some(best) => {
+                self.search_ranges(self.target.shares_of(&best.values), NARROW_STEP, self.target.candidates)?;
+            }
+            None => self.search_ranges(middle, WIDE_STEP, self.target.candidates)?,
         }
         let state = self.state.into_inner().unwrap_or_else(PoisonError::into_inner);
         ensure!(
@@ -134,7 +138,7 @@ impl<'a> DesignSearch<'a> {
             let mut search = CMAESOptions::new(middle, step)
                 .max_function_evals(most - done)
                 .tol_x(LAST_STEP)
-                .seed(self.target.seed.wrapping_add(attempt))
+                .seed(self.target.seed.wrapping_add(done as u64 + attempt))
                 .build(|point: &DVector<f64>| self.evaluate_point(point.as_slice()))
                 .map_err(|e| anyhow::anyhow!("the search cannot begin: {e:?}"))?;
             search.run_parallel();
