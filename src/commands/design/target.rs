@@ -349,6 +349,15 @@ mod tests {
     }
 
     #[test]
+    fn examples_are_right() {
+        let bands = echolake_schema::Rig::paper().band_names();
+        let files = std::fs::read_dir(concat!(env!("CARGO_MANIFEST_DIR"), "/examples/designs")).expect("a folder");
+        let texts = files.map(|file| std::fs::read_to_string(file.expect("a file").path()).expect("text"));
+        let count = texts.map(|text| DesignTarget::from_toml(&text, &bands).expect("a target")).count();
+        assert_eq!(count, 3);
+    }
+
+    #[test]
     fn wrong_targets_are_refused_by_what_is_wrong() {
         let with_band = |band: &str| format!("{WAVES}{band}");
         for (text, expected) in [
