@@ -1,5 +1,7 @@
 //! Stones around scattered points, each of the places nearest to its own: polygonal rubble and river rock.
 
+use std::ops::Range;
+
 use super::PANEL_SIZE_MM;
 use super::chance::SeededRandom;
 use super::microstructure::{JOINT_SHAPE, joint_depth, joint_width};
@@ -13,6 +15,10 @@ const MESO: ParameterLayer = ParameterLayer::Mesostructure;
 const CORNERS: f64 = 0.2;
 /// Stones further away than this many lengths of the lattice border on no other.
 const REACH: i64 = 2;
+/// Stones that a place looks at are at most this many lengths of the lattice from each other, and a table of all around
+/// a stone is so wide.
+const SPAN: usize = 2 * REACH as usize;
+const TABLE_WIDTH: usize = 2 * SPAN + 1;
 /// Bulging rubble is level from this distance to its edges on, as a share of the way to its middle.
 const PILLOW: f64 = 0.5;
 
@@ -82,6 +88,9 @@ struct Stone {
     middle: [f64; 2],
     /// From its middle to its border, mm, as its outline measures it.
     radius: f64,
+    /// How fast the difference of the squared distances to it and to each stone around grows across their border,
+    /// per mm.
+    slopes: [f64; TABLE_WIDTH * TABLE_WIDTH],
 }
 
 impl StoneCells {
@@ -98,43 +107,80 @@ impl StoneCells {
             // Odd rows are shifted by half a stone, so that stones without irregularity are hexagons.
             let shift = 0.5 * iy.rem_euclid(2) as f64;
             let off = |n| 0.45 * settings.irregularity * chance.at_place(ix, iy).signed_number(n);
-            Stone { middle: [ix as f64 + shift + off(8), iy as f64 + off(9)], radius: 0.0 }
+            let middle = [ix as f64 + shift + off(8), iy as f64 + off(9)];
+            Stone { middle, radius: 0.0, slopes: [0.0; TABLE_WIDTH * TABLE_WIDTH] }
         };
         let stones = (0..counts[0] * counts[1]).map(stone).collect();
         let mut cells =
             Self { scale, first, row: counts[0], stones, outline, faces: StoneFaces::from_settings(settings), chance };
+        let slopes: Vec<_> = (0..cells.stones.len()).map(|own| cells.slopes_around(own)).collect();
+        cells.stones.iter_mut().zip(slopes).for_each(|(stone, slopes)| stone.slopes = slopes);
         let radius = |n: usize| cells.to_border(cells.stones[n].middle, n);
         let radii: Vec<f64> = (0..cells.stones.len()).map(radius).collect();
         cells.stones.iter_mut().zip(radii).for_each(|(stone, radius)| stone.radius = radius);
         cells
     }
 
-    /// Numbers of the stones around a place.
-    fn stones_around(&self, place: [f64; 2]) -> impl Iterator<Item = usize> + '_ {
-        let rows = self.stones.len() / self.row;
-        let range = move |i: usize, count: usize| {
+    /// Columns and rows of the stones around a place.
+    fn lattice_around(&self, place: [f64; 2]) -> [Range<usize>; 2] {
+        let counts = [self.row, self.stones.len() / self.row];
+        [0, 1].map(|i| {
             let at = place[i].round() as i64 - self.first[i];
-            (at - REACH).clamp(0, count as i64) as usize..(at + REACH + 1).clamp(0, count as i64) as usize
-        };
-        range(1, rows).flat_map(move |y| range(0, self.row).map(move |x| y * self.row + x))
+            (at - REACH).clamp(0, counts[i] as i64) as usize..(at + REACH + 1).clamp(0, counts[i] as i64) as usize
+        })
+    }
+
+    fn slopes_around(&self, own: usize) -> [f64; TABLE_WIDTH * TABLE_WIDTH] {
+        let middle = self.stones[own].middle;
+        std::array::from_fn(|at| {
+            let column = (own % self.row + at % TABLE_WIDTH).checked_sub(SPAN).filter(|column| *column < self.row);
+            let row = (own / self.row + at / TABLE_WIDTH).checked_sub(SPAN);
+            let other = column.zip(row).and_then(|(column, row)| self.stones.get(row * self.row + column));
+            let slope = |i: usize| other.map_or(0.0, |other| 2.0 * (other.middle[i] - middle[i]) / self.scale[i]);
+            (slope(0) * slope(0) + slope(1) * slope(1)).sqrt()
+        })
     }
 
     /// From a place within a stone to the stone's border, mm.
     fn to_border(&self, place: [f64; 2], own: usize) -> f64 {
-        let middle = self.stones[own].middle;
-        let distance = |other: usize| {
-            let other = self.stones[other].middle;
-            // The border between two is straight in the stretched lattice too.
-            let gap = squared_distance(place, other) - squared_distance(place, middle);
-            let slope = [0, 1].map(|i| 2.0 * (other[i] - middle[i]) / self.scale[i]);
-            (gap / (slope[0] * slope[0] + slope[1] * slope[1]).sqrt()).max(1e-6)
-        };
-        let distances = self.stones_around(place).filter(|n| *n != own).map(distance);
-        match self.outline {
-            StoneOutline::Polygons => distances.fold(f64::INFINITY, f64::min),
-            // Like the least of them, but smooth if two are alike.
-            StoneOutline::Round => 1.0 / distances.map(|d| 1.0 / (d * d)).sum::<f64>().sqrt(),
+        let Stone { middle, slopes, .. } = &self.stones[own];
+        let to_middle = squared_distance(place, *middle);
+        let [columns, rows] = self.lattice_around(place);
+        let mut least = f64::INFINITY;
+        let mut inverse_squares = 0.0;
+        for row in rows {
+            let from = (row + SPAN - own / self.row) * TABLE_WIDTH + SPAN;
+            for column in columns.clone() {
+                let other = row * self.row + column;
+                if other != own {
+                    // The border between two is straight in the stretched lattice too.
+                    let gap = squared_distance(place, self.stones[other].middle) - to_middle;
+                    let distance = (gap / slopes[from + column - own % self.row]).max(1e-6);
+                    least = least.min(distance);
+                    inverse_squares += 1.0 / (distance * distance);
+                }
+            }
         }
+        match self.outline {
+            StoneOutline::Polygons => least,
+            // Like the least of them, but smooth if two are alike.
+            StoneOutline::Round => 1.0 / inverse_squares.sqrt(),
+        }
+    }
+
+    /// The stone whose middle is nearest.
+    fn nearest_stone(&self, place: [f64; 2]) -> usize {
+        let [columns, rows] = self.lattice_around(place);
+        let mut nearest = (0, f64::INFINITY);
+        for row in rows {
+            for n in row * self.row + columns.start..row * self.row + columns.end {
+                let distance = squared_distance(place, self.stones[n].middle);
+                if distance < nearest.1 {
+                    nearest = (n, distance);
+                }
+            }
+        }
+        nearest.0
     }
 }
 
@@ -146,12 +192,8 @@ fn squared_distance(a: [f64; 2], b: [f64; 2]) -> f64 {
 impl StoneLayout for StoneCells {
     fn spot_at(&self, x: f64, y: f64, half_joint: f64) -> StoneSpot {
         let place = [x / self.scale[0], y / self.scale[1]];
-        let nearest = |(best, least): (usize, f64), n: usize| {
-            let distance = squared_distance(place, self.stones[n].middle);
-            if distance < least { (n, distance) } else { (best, least) }
-        };
-        let (own, _) = self.stones_around(place).fold((0, f64::INFINITY), nearest);
-        let Stone { middle, radius } = &self.stones[own];
+        let own = self.nearest_stone(place);
+        let Stone { middle, radius, .. } = &self.stones[own];
         let to_border = self.to_border(place, own);
         let (to_joint, rise) = match self.outline {
             StoneOutline::Polygons => {
