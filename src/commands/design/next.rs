@@ -7,12 +7,14 @@ use serde::Serialize;
 
 use super::gaussian_process::{GaussianProcess, KnownFigure};
 use super::measured::MeasuredPanel;
-use super::report::MEAN_ERROR_DB;
+use super::report::{LEAST_DISTANCE, MEAN_ERROR_DB};
 use super::search::DesignCandidate;
 use super::target::DesignTarget;
 
 /// Standard uncertainty of a level over Flat that is measured, dB.
 const MEASURED_U_DB: f64 = 0.1;
+/// Simulated panels that are counted at most.
+const MOST_SIMULATED: usize = 400;
 /// Places that are compared.
 const PLACES: usize = 1_000;
 /// Steps of the iteration to the root of x^(d+1) = x + 1, whose powers are even steps along d axes (Roberts 2018, R
@@ -39,13 +41,14 @@ pub(super) fn propose_panels(
 ) -> anyhow::Result<Vec<NextPanel>> {
     let measured: Vec<_> =
         measured.iter().filter_map(|panel| Some((target.place_of(&panel.relief, &panel.parameters)?, panel))).collect();
+    let simulated = thin_candidates(target, candidates);
     eprintln!(
-        "{} surfaces of the lake and {} simulated panels are within the ranges",
+        "within the ranges: {} surfaces of the lake, {} simulated panels that differ",
         measured.len(),
-        candidates.len()
+        simulated.len()
     );
     let fit = |band: usize| {
-        let simulated = candidates.iter().map(|candidate| KnownFigure {
+        let simulated = simulated.iter().map(|candidate| KnownFigure {
             place: target.shares_of(&candidate.values),
             value: candidate.bands[band].level_db,
             uncertainty: MEAN_ERROR_DB[1],
@@ -84,6 +87,18 @@ pub(super) fn propose_panels(
             .collect::<anyhow::Result<Vec<_>>>()?;
     }
     Ok(found)
+}
+
+// Those that are apart: the simulation has the same error for panels that are alike, so two of them tell what one does.
+fn thin_candidates<'a>(target: &DesignTarget, candidates: &'a [DesignCandidate]) -> Vec<&'a DesignCandidate> {
+    let mut kept: Vec<&DesignCandidate> = Vec::new();
+    for candidate in candidates {
+        let is_apart = kept.iter().all(|other| target.distance(&other.values, &candidate.values) >= LEAST_DISTANCE);
+        if is_apart && kept.len() < MOST_SIMULATED {
+            kept.push(candidate);
+        }
+    }
+    kept
 }
 
 // Evenly from the ranges. Coarse heights tell a depth well enough.

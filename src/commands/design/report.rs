@@ -25,8 +25,8 @@ const TRUSTED_PHASE: f64 = 0.18;
 /// Error of a band's mean level under that phase and over it, dB: root mean square over the reliefs of that table; at
 /// most it is 0.31 and 1.2 dB.
 pub(super) const MEAN_ERROR_DB: [f64; 2] = [0.12, 0.58];
-/// Distance of panels of one search from each other, as a share of a parameter's range.
-const LEAST_DISTANCE: f64 = 0.05;
+/// Distance of panels that count as different, as a share of a parameter's range.
+pub(super) const LEAST_DISTANCE: f64 = 0.05;
 
 /// A panel that the search found.
 pub(super) struct FoundPanel {
