@@ -53,8 +53,7 @@ mod slow {
 
         place.fails(1, &["design", "waves.toml", "-o", "rig.toml"], "cannot make `rig.toml`");
         std::fs::write(place.path("waves.toml"), WAVES.replace("0.8", "0.7")).expect("written");
-        place.fails(1, &["design", "waves.toml", "-o", "waves"], "is the target of another search");
-        std::fs::write(place.path("waves/target.toml"), WAVES.replace("0.8", "0.7")).expect("written");
+        place.fails(1, &["design", "waves.toml", "-o", "waves"], "has candidates of another target, levels or rig");
         std::fs::write(place.path("waves/candidates.csv"), "a,b\n1,2\n").expect("written");
         place.fails(1, &["design", "waves.toml", "-o", "waves"], "its columns are another search's");
         let worn = whole.replacen(",simulated", ",x,simulated", 1);

@@ -16,7 +16,7 @@ use echolake_acquisition::design::DesignSimulation;
 use echolake_acquisition::rig::robots::Choreography;
 use echolake_lake::{Error as LakeError, Lake, ReferenceSurfaces};
 use echolake_schema::Rig;
-use serde_json::json;
+use serde_json::{Value, json};
 
 use crate::CommandOutcome;
 use crate::progress::CommandProgress;
@@ -44,7 +44,10 @@ pub(crate) struct DesignArgs {
 pub(crate) async fn run_design(args: &DesignArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let stop = super::stop_request()?;
     let lake = match Lake::open(lake_url).await {
-        Err(LakeError::NoLake { .. }) => None,
+        Err(LakeError::NoLake { .. }) => {
+            eprintln!("no lake `{lake_url}`: the rig is the paper's");
+            None
+        }
         lake => Some(lake?),
     };
     let rig = lake.as_ref().map_or_else(Rig::paper, |lake| lake.rig().clone());
@@ -59,11 +62,10 @@ pub(crate) async fn run_design(args: &DesignArgs, lake_url: &str) -> anyhow::Res
     if let Some(surface) = target.levels_of.clone() {
         target.add_levels(&measured::levels_of(&measured, &surface).with_context(within)?);
     }
-    prepare_folder(args, &text)?;
-
     let path = args.output.join("candidates.csv");
+    let candidates = search::read_candidates(&path, &target, &bands)?;
+    prepare_folder(args, &json!({ "target": text, "goals": target.goals, "rig": rig }), !candidates.is_empty())?;
     if let Some(count) = args.next {
-        let candidates = search::read_candidates(&path, &target, &bands)?;
         let panels = next::propose_panels(&target, &candidates, &measured, bands.len(), count as usize)?;
         return write_next(args, &panels, &bands);
     }
@@ -72,15 +74,19 @@ pub(crate) async fn run_design(args: &DesignArgs, lake_url: &str) -> anyhow::Res
     let simulation = DesignSimulation::new(&rig, grid.clone(), arms.as_deref(), Some(target.pairs))?;
     let progress = CommandProgress::new();
     let task = progress.start_task("search", target.candidates as u64, "candidates");
-    let search = DesignSearch::open(&path, &target, &simulation, &bands, &stop, task)?;
+    let known = candidates.len();
+    let header = search::candidate_header(&target, &bands);
+    let search = DesignSearch::open(&path, &header, candidates, &target, &simulation, &stop, task)?;
     let begun = Instant::now();
-    let known = search.known_count();
     let whole = DesignSimulation::new(&rig, grid.clone(), arms.as_deref(), None)?;
     let candidates = tokio::task::block_in_place(|| search.run(&whole))?;
     let secs = begun.elapsed().as_secs_f64() / (candidates.len() - known).max(1) as f64;
 
     eprintln!("simulating the best panels at all pairs");
     let panels = tokio::task::block_in_place(|| report::find_panels(&target, &candidates, &whole, &rig))?;
+    if panels.len() < target.best {
+        eprintln!("{} panels differ from each other, expected {}", panels.len(), target.best);
+    }
     for panel in &panels {
         report::write_panel(&args.output, panel, &whole, &rig, &grid)?;
     }
@@ -133,17 +139,17 @@ fn write_next(args: &DesignArgs, panels: &[NextPanel], bands: &[String]) -> anyh
     Ok(CommandOutcome::Whole)
 }
 
-// The folder keeps the target, so that two searches are not mixed.
-fn prepare_folder(args: &DesignArgs, text: &str) -> anyhow::Result<()> {
+// The folder keeps what its candidates are of, so that two searches are not mixed.
+fn prepare_folder(args: &DesignArgs, inputs: &Value, has_candidates: bool) -> anyhow::Result<()> {
     let folder = &args.output;
     std::fs::create_dir_all(folder).with_context(|| format!("cannot make `{}`", folder.display()))?;
-    let kept = folder.join("target.toml");
-    match std::fs::read_to_string(&kept) {
-        Ok(before) if before == text => Ok(()),
-        Ok(_) => bail!("`{}` is the target of another search; hint: another folder for -o", kept.display()),
-        Err(e) if e.kind() == std::io::ErrorKind::NotFound => report::write_file(&kept, text.as_bytes()),
-        Err(e) => Err(e).with_context(|| format!("cannot read `{}`", kept.display())),
+    let kept = folder.join("search.json");
+    let text = serde_json::to_string_pretty(inputs)?;
+    if has_candidates && std::fs::read_to_string(&kept).ok().as_ref() != Some(&text) {
+        let folder = folder.display();
+        bail!("`{folder}` has candidates of another target, levels or rig; hint: another folder for -o");
     }
+    report::write_file(&kept, text.as_bytes())
 }
 
 fn print_reports(reports: &[PanelReport], panels: &[report::FoundPanel], target: &DesignTarget) -> anyhow::Result<()> {
@@ -165,10 +171,14 @@ fn print_reports(reports: &[PanelReport], panels: &[report::FoundPanel], target:
         }
         super::print_line("   target     found  deviation  figure, and error of the simulation")?;
         for goal in &report.goals {
-            let doubt = if goal.is_trusted { "" } else { ", single pairs 0.9 dB or more" };
+            let error = match goal.simulation_error_db {
+                Some(error) if goal.is_trusted => format!("means {error:.2} dB"),
+                Some(error) => format!("means {error:.2} dB, single pairs 0.9 dB or more"),
+                None => "not known".to_owned(),
+            };
             super::print_line(&format!(
-                "{:9.2} {:9.2}  {:9.2}  {}: means {:.2} dB{doubt}",
-                goal.target, goal.found, goal.deviation, goal.figure, goal.simulation_error_db
+                "{:9.2} {:9.2}  {:9.2}  {}: {error}",
+                goal.target, goal.found, goal.deviation, goal.figure
             ))?;
         }
     }

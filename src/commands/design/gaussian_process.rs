@@ -1,27 +1,34 @@
 //! A Gaussian process over the unit cube: what is known of a figure between panels whose figure is known.
 
+use std::cmp::Ordering;
+
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
 
 /// Length scales that are tried, as shares of the ranges.
 const LENGTH_SCALES: [f64; 6] = [0.1, 0.2, 0.3, 0.5, 0.8, 1.3];
 
+/// Variances that are tried, over that of the figures.
+const VARIANCES: [f64; 4] = [0.25, 1.0, 4.0, 16.0];
+
 /// A figure that is known at a place.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct KnownFigure {
-    /// Coordinates, 0 to 1.
     pub place: Vec<f64>,
     pub value: f64,
-    /// Its standard uncertainty.
+    /// Its own standard uncertainty.
     pub uncertainty: f64,
+    /// Standard uncertainty that figures have in common if their places are near: of a simulation, which is wrong in
+    /// the same way for panels that are alike.
+    pub common_uncertainty: f64,
 }
 
-/// A process with the length scale under which its figures are most likely.
+/// A process with the length scale and the variance under which its figures are most likely.
 pub(super) struct GaussianProcess {
     known: Vec<KnownFigure>,
-    mean: f64,
     variance: f64,
     length_scale: f64,
     factor: Cholesky<f64, Dyn>,
+    mean: f64,
     weights: DVector<f64>,
 }
 
@@ -31,26 +38,31 @@ impl GaussianProcess {
         let count = known.len() as f64;
         let mean = known.iter().map(|figure| figure.value).sum::<f64>() / count;
         let variance = known.iter().map(|figure| (figure.value - mean).powi(2)).sum::<f64>() / count;
-        if known.len() < 3 || variance.partial_cmp(&0.0) != Some(std::cmp::Ordering::Greater) {
+        if known.len() < 3 || variance.partial_cmp(&0.0) != Some(Ordering::Greater) {
             return None;
         }
-        let fits = LENGTH_SCALES.iter().filter_map(|scale| {
-            let process = Self::with_scale(known.to_vec(), mean, variance, *scale)?;
+        let tried = LENGTH_SCALES.iter().flat_map(|scale| VARIANCES.map(|factor| (*scale, factor * variance)));
+        let fits = tried.filter_map(|(scale, variance)| {
+            let process = Self::with_scale(known.to_vec(), variance, scale)?;
             Some((process.log_likelihood(), process))
         });
         fits.max_by(|(a, _), (b, _)| a.total_cmp(b)).map(|(_, process)| process)
     }
 
-    fn with_scale(known: Vec<KnownFigure>, mean: f64, variance: f64, length_scale: f64) -> Option<Self> {
+    fn with_scale(known: Vec<KnownFigure>, variance: f64, length_scale: f64) -> Option<Self> {
         let covariance = |i: usize, j: usize| {
-            let shared = variance * similarity(&known[i].place, &known[j].place, length_scale);
+            let common = known[i].common_uncertainty * known[j].common_uncertainty;
+            let shared = (variance + common) * similarity(&known[i].place, &known[j].place, length_scale);
             // The last term keeps places that are nearly one from being singular.
-            if i == j { shared + known[i].uncertainty.powi(2) + 1e-9 * variance } else { shared }
+            if i == j { shared + known[i].uncertainty.powi(2) + 1e-6 * variance } else { shared }
         };
         let factor = DMatrix::from_fn(known.len(), known.len(), covariance).cholesky()?;
-        let residuals = DVector::from_iterator(known.len(), known.iter().map(|figure| figure.value - mean));
-        let weights = factor.solve(&residuals);
-        Some(Self { known, mean, variance, length_scale, factor, weights })
+        let values = DVector::from_iterator(known.len(), known.iter().map(|figure| figure.value));
+        // The mean by generalised least squares: places that are near each other count less.
+        let shares = factor.solve(&DVector::from_element(known.len(), 1.0));
+        let mean = shares.dot(&values) / shares.sum();
+        let weights = factor.solve(&values.add_scalar(-mean));
+        Some(Self { known, variance, length_scale, factor, mean, weights })
     }
 
     fn log_likelihood(&self) -> f64 {
@@ -72,8 +84,8 @@ impl GaussianProcess {
     pub fn expect_at(self, place: &[f64], uncertainty: f64) -> Option<Self> {
         let (value, _) = self.predict(place);
         let mut known = self.known;
-        known.push(KnownFigure { place: place.to_vec(), value, uncertainty });
-        Self::with_scale(known, self.mean, self.variance, self.length_scale)
+        known.push(KnownFigure { place: place.to_vec(), value, uncertainty, common_uncertainty: 0.0 });
+        Self::with_scale(known, self.variance, self.length_scale)
     }
 }
 
@@ -88,7 +100,7 @@ mod tests {
     use super::*;
 
     fn known(place: f64, uncertainty: f64) -> KnownFigure {
-        KnownFigure { place: vec![place], value: (6.0 * place).sin(), uncertainty }
+        KnownFigure { place: vec![place], value: (6.0 * place).sin(), uncertainty, common_uncertainty: 0.0 }
     }
 
     #[test]
@@ -101,6 +113,15 @@ mod tests {
         assert!(within_gap > 10.0 * deviation, "{within_gap}");
         let filled = process.expect_at(&[0.6], 1e-3).expect("a fit");
         assert!(filled.predict(&[0.6]).1 < 0.1 * within_gap);
+    }
+
+    // However many simulated panels lie there, their common error stays; what is expected is what they say.
+    #[test]
+    fn common_errors_do_not_average_out() {
+        let simulated = |n: usize| KnownFigure { common_uncertainty: 0.3, ..known(n as f64 / 40.0, 0.05) };
+        let process = GaussianProcess::fit(&(0..40).map(simulated).collect::<Vec<_>>()).expect("a fit");
+        let (value, deviation) = process.predict(&[0.5]);
+        assert!((value - 3.0f64.sin()).abs() < 0.1 && deviation > 0.2, "{value} {deviation}");
     }
 
     #[test]

@@ -1,6 +1,8 @@
 //! `echolake design --next`: panels whose measurement tells the most, because neither a measurement nor a simulation
 //! has been near.
 
+use std::collections::BTreeSet;
+
 use anyhow::{Context as _, ensure};
 use echolake_panel::mesh::FACETS;
 use serde::Serialize;
@@ -13,6 +15,8 @@ use super::target::DesignTarget;
 
 /// Standard uncertainty of a level over Flat that is measured, dB.
 const MEASURED_U_DB: f64 = 0.1;
+/// Standard uncertainty of a simulated level at the pairs of a search, dB, beside the simulation's own error.
+const FEW_PAIRS_U_DB: f64 = 0.1;
 /// Simulated panels that are counted at most.
 const MOST_SIMULATED: usize = 400;
 /// Places that are compared.
@@ -49,13 +53,14 @@ pub(super) fn propose_panels(
     );
     let fit = |band: usize| {
         let simulated = simulated.iter().map(|candidate| KnownFigure {
-            place: target.shares_of(&candidate.values),
+            place: target.coordinates_of(&candidate.values),
             value: candidate.bands[band].level_db,
-            uncertainty: MEAN_ERROR_DB[1],
+            uncertainty: FEW_PAIRS_U_DB,
+            common_uncertainty: MEAN_ERROR_DB[1],
         });
         let found = measured.iter().filter_map(|(place, panel)| {
             let value = panel.levels_db()[band]?;
-            Some(KnownFigure { place: place.clone(), value, uncertainty: MEASURED_U_DB })
+            Some(KnownFigure { place: place.clone(), value, uncertainty: MEASURED_U_DB, common_uncertainty: 0.0 })
         });
         let known: Vec<_> = simulated.chain(found).collect();
         GaussianProcess::fit(&known).with_context(|| {
@@ -66,16 +71,20 @@ pub(super) fn propose_panels(
         })
     };
     let mut processes = (0..bands).map(fit).collect::<anyhow::Result<Vec<_>>>()?;
-    let places = printable_places(target)?;
+    let mut places = printable_places(target)?;
+    ensure!(places.len() >= count, "the ranges have {} panels, {count} are wanted; hint: --next", places.len());
     let mut found = Vec::new();
     for _ in 0..count {
         let information = |place: &[f64]| -> f64 {
             let bits = |process: &GaussianProcess| (process.predict(place).1 / MEASURED_U_DB).powi(2).ln_1p() / 2.0;
             processes.iter().map(bits).sum::<f64>() / std::f64::consts::LN_2
         };
-        let best = places.iter().map(|place| (information(place), place)).max_by(|(a, _), (b, _)| a.total_cmp(b));
-        let (information_bits, place) = best.context("no place is left")?;
-        let relief = target.relief_of(&target.values_at(place)?)?;
+        let told = places.iter().map(|values| information(&target.coordinates_of(values)));
+        let best = told.enumerate().max_by(|(_, a), (_, b)| a.total_cmp(b));
+        let (at, information_bits) = best.context("no place is left")?;
+        let values = places.swap_remove(at);
+        let place = &target.coordinates_of(&values)[..];
+        let relief = target.relief_of(&values)?;
         found.push(NextPanel {
             parameters: relief.to_json(),
             information_bits,
@@ -102,20 +111,21 @@ fn thin_candidates<'a>(target: &DesignTarget, candidates: &'a [DesignCandidate])
 }
 
 // Evenly from the ranges. Coarse heights tell a depth well enough.
-fn printable_places(target: &DesignTarget) -> anyhow::Result<Vec<Vec<f64>>> {
+fn printable_places(target: &DesignTarget) -> anyhow::Result<Vec<Vec<String>>> {
     let dimensions = target.ranges.len();
     let root = (0..ROOT_STEPS).fold(1.5f64, |x, _| (1.0 + x).powf(1.0 / (dimensions as f64 + 1.0)));
     let steps: Vec<f64> = (1..=dimensions).map(|axis| root.powi(-(axis as i32))).collect();
-    let mut places = Vec::new();
+    let mut places = BTreeSet::new();
     for number in 0..PLACES {
         let place: Vec<f64> = steps.iter().map(|step| (0.5 + step * number as f64).fract()).collect();
-        let relief = target.relief_of(&target.values_at(&place)?)?;
+        let values = target.values_at(&place)?;
+        let relief = target.relief_of(&values)?;
         if relief.check_depth().is_ok()
             && (!target.limits_depth() || target.is_printable(&relief, &relief.height_field(FACETS / 4)))
         {
-            places.push(place);
+            places.insert(values);
         }
     }
     ensure!(!places.is_empty(), "nothing within the ranges can be printed; hint: ranges of less depth");
-    Ok(places)
+    Ok(places.into_iter().collect())
 }

@@ -1,5 +1,6 @@
 //! What a design found: panels that were simulated at all pairs, and the files of them.
 
+use std::hash::{DefaultHasher, Hash as _, Hasher as _};
 use std::path::Path;
 use std::thread;
 
@@ -16,7 +17,7 @@ use serde_json::json;
 
 use super::measured::MeasuredPanel;
 use super::search::DesignCandidate;
-use super::target::{DesignGoal, DesignTarget};
+use super::target::{DesignGoal, DesignTarget, FigureKind};
 
 /// Phase of a relief's details, rad, over which single pairs of the simulation are off by 0.9 dB or more.
 ///
@@ -27,6 +28,9 @@ const TRUSTED_PHASE: f64 = 0.18;
 pub(super) const MEAN_ERROR_DB: [f64; 2] = [0.12, 0.58];
 /// Distance of panels that count as different, as a share of a parameter's range.
 pub(super) const LEAST_DISTANCE: f64 = 0.05;
+
+/// Candidates that are simulated at all pairs, if fewer panels are kept: at few pairs their order is uncertain.
+const FINALISTS: usize = 10;
 
 /// A panel that the search found.
 pub(super) struct FoundPanel {
@@ -39,6 +43,8 @@ pub(super) struct FoundPanel {
     pub misfit: f64,
     /// Phase of its details by band, rad.
     pub detail_phases: Vec<Option<f64>>,
+    /// The errors are known of simulations with steep facets.
+    has_steep_facets: bool,
 }
 
 /// A figure of a found panel beside its target.
@@ -48,8 +54,8 @@ pub(super) struct GoalRow {
     pub target: f64,
     pub found: f64,
     pub deviation: f64,
-    /// Error of the simulation's mean levels, dB.
-    pub simulation_error_db: f64,
+    /// Error of the simulation's mean levels, dB; None for other figures, whose error is not known.
+    pub simulation_error_db: Option<f64>,
     pub is_trusted: bool,
 }
 
@@ -72,7 +78,7 @@ pub(super) struct PanelReport {
 impl FoundPanel {
     /// Returns whether the simulation of a band is trusted.
     pub fn is_trusted(&self, band: usize) -> bool {
-        self.detail_phases[band].is_some_and(|phase| phase <= TRUSTED_PHASE)
+        self.has_steep_facets && self.detail_phases[band].is_some_and(|phase| phase <= TRUSTED_PHASE)
     }
 
     fn mean_error_db(&self, band: usize) -> f64 {
@@ -86,7 +92,7 @@ impl FoundPanel {
             target: goal.value,
             found: goal.figure_of(&self.figures.bands),
             deviation: goal.deviation(&self.figures.bands),
-            simulation_error_db: self.mean_error_db(goal.band),
+            simulation_error_db: (goal.kind == FigureKind::Level).then(|| self.mean_error_db(goal.band)),
             is_trusted: self.is_trusted(goal.band),
         };
         let band_row = |(band, figures): (usize, &echolake_acquisition::design::BandFigures)| {
@@ -127,7 +133,7 @@ pub(super) fn find_panels(
         if chosen.iter().all(|other| target.distance(&other.values, &candidate.values) >= LEAST_DISTANCE) {
             chosen.push(candidate);
         }
-        if chosen.len() == target.best {
+        if chosen.len() == target.best.max(FINALISTS) {
             break;
         }
     }
@@ -139,6 +145,7 @@ pub(super) fn find_panels(
     });
     let mut panels = simulated.into_iter().collect::<anyhow::Result<Vec<_>>>()?;
     panels.sort_by(|a, b| a.misfit.total_cmp(&b.misfit));
+    panels.truncate(target.best);
     for (panel, rank) in panels.iter_mut().zip(1..) {
         panel.name = format!("best_{rank}");
     }
@@ -159,6 +166,7 @@ fn simulate_panel(
         name: String::new(),
         misfit: target.misfit(&figures.bands),
         detail_phases: rig.bands.centres_hz.iter().map(|hz| heights.detail_phase(sound_mm_s / hz)).collect(),
+        has_steep_facets: rig.simulation.steep_facets,
         searched: candidate.clone(),
         relief,
         figures,
@@ -223,7 +231,7 @@ pub(super) fn write_search(
     measured: &[MeasuredPanel],
     bands: &[String],
 ) -> anyhow::Result<()> {
-    let [x, y] = shown_goals(target, bands.len());
+    let [x, y] = shown_goals(target);
     let front = pareto_front(candidates.iter().map(|candidate| {
         [&x, &y].map(|goal| [goal.figure_of(&candidate.bands), goal.deviation(&candidate.bands).abs()])
     }));
@@ -245,7 +253,9 @@ pub(super) fn write_search(
         let position = [&x, &y].map(|goal| goal.figure_of(&panel.figures.bands));
         positions.push(point(&panel.name, "found, simulated at all pairs", position));
     }
-    positions.push(point("target", "target", [x.value, y.value]));
+    if y.value.is_finite() {
+        positions.push(point("target", "target", [x.value, y.value]));
+    }
     let origins = measured.iter().map(|panel| panel.origin.clone()).chain(["simulated".to_owned()]);
     let notes = FigureNotes {
         title: format!("Search of {} candidates; the line is the Pareto front of both deviations", candidates.len()),
@@ -257,15 +267,13 @@ pub(super) fn write_search(
     write_file(&folder.join("search.svg"), figure.draw(&notes).to_svg().as_bytes())
 }
 
-// The two goals of the greatest weights; beside a single one, the same figure of another band, at 0.
-fn shown_goals(target: &DesignTarget, bands: usize) -> [DesignGoal; 2] {
+// The two goals of the greatest weights; beside a single one, another figure of its band, without a target.
+fn shown_goals(target: &DesignTarget) -> [DesignGoal; 2] {
     let mut goals = target.goals.clone();
     goals.sort_by(|a, b| b.weight.total_cmp(&a.weight));
     let first = goals[0].clone();
-    let second = goals.into_iter().nth(1).unwrap_or_else(|| {
-        let band = (first.band + 1) % bands;
-        DesignGoal { band, value: 0.0, ..first.clone() }
-    });
+    let kind = if first.kind == FigureKind::Scattering { FigureKind::Level } else { FigureKind::Scattering };
+    let second = goals.into_iter().nth(1).unwrap_or_else(|| DesignGoal { kind, value: f64::NAN, ..first.clone() });
     [first, second]
 }
 
@@ -294,7 +302,12 @@ pub(super) fn write_campaign(
 ) -> anyhow::Result<()> {
     let name = folder.file_name().map_or_else(String::new, |name| name.to_string_lossy().into_owned());
     let stem = if name.parse::<SurfaceId>().is_ok() { name } else { "design".to_owned() };
-    let surface = |panel: &FoundPanel| format!("{stem}-{}", panel.name.replace('_', "-"));
+    // A lake may have panels of other searches under the name of the folder.
+    let surface = |panel: &FoundPanel| {
+        let mut hasher = DefaultHasher::new();
+        panel.relief.to_json().to_string().hash(&mut hasher);
+        format!("{stem}-{}-{:08x}", panel.name.replace('_', "-"), hasher.finish() as u32)
+    };
     let surfaces = panels.iter().map(|panel| {
         let parameters = panel.relief.parameters();
         json!({ "name": surface(panel), "relief": panel.relief.name(), "parameters": parameters })

@@ -3,7 +3,7 @@
 
 use std::collections::HashMap;
 use std::fs::File;
-use std::io::Write as _;
+use std::io::{Read as _, Write as _};
 use std::path::Path;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
@@ -61,26 +61,26 @@ struct SearchState {
 }
 
 impl<'a> DesignSearch<'a> {
-    /// Opens the file of candidates, with those of before.
+    /// Opens the file of candidates, behind those of before.
     pub fn open(
         path: &Path,
+        header: &str,
+        candidates: Vec<DesignCandidate>,
         target: &'a DesignTarget,
         simulation: &'a DesignSimulation,
-        bands: &[String],
         stop: &'a StopRequest,
         mut progress: TaskProgress,
     ) -> anyhow::Result<Self> {
-        let candidates = read_candidates(path, target, bands)?;
-        if path.exists() {
-            // A line that was cut off is written again.
-            let text = std::fs::read(path)?;
-            let whole = text.iter().rposition(|byte| *byte == b'\n').map_or(0, |end| end + 1);
-            File::options().write(true).open(path)?.set_len(whole as u64)?;
-        }
-        let file = File::options().append(true).create(true).open(path);
-        let mut file = file.with_context(|| format!("cannot write `{}`", path.display()))?;
-        if file.metadata()?.len() == 0 {
-            file.write_all(format!("{}\n", candidate_header(target, bands)).as_bytes())?;
+        let failed = || format!("cannot write `{}`", path.display());
+        let mut file = File::options().append(true).read(true).create(true).open(path).with_context(failed)?;
+        file.try_lock().with_context(|| format!("another search writes `{}`", path.display()))?;
+        // A line that was cut off is written again.
+        let mut text = Vec::new();
+        file.read_to_end(&mut text).with_context(failed)?;
+        let whole = text.iter().rposition(|byte| *byte == b'\n').map_or(0, |end| end + 1);
+        file.set_len(whole as u64).with_context(failed)?;
+        if whole == 0 {
+            file.write_all(format!("{header}\n").as_bytes()).with_context(failed)?;
         }
         progress.begin_at(candidates.len() as u64);
         let by_values = candidates.iter().enumerate().map(|(at, c)| (c.values.clone(), at)).collect();
@@ -95,11 +95,6 @@ impl<'a> DesignSearch<'a> {
             failed: None,
         };
         Ok(Self { target, simulation, stop, state: Mutex::new(state) })
-    }
-
-    /// Returns how many candidates were simulated before.
-    pub fn known_count(&self) -> usize {
-        self.lock_state().candidates.len()
     }
 
     /// Tries as many candidates as the target says; those of before count and cost nothing. After half of them, the
@@ -121,7 +116,9 @@ impl<'a> DesignSearch<'a> {
         );
         let mut candidates = state.candidates;
         candidates.iter_mut().for_each(|candidate| add_figures(&mut candidate.bands, &state.corrections));
-        candidates.sort_by(|a, b| self.target.misfit(&a.bands).total_cmp(&self.target.misfit(&b.bands)));
+        let misfit = |candidate: &DesignCandidate| self.target.misfit(&candidate.bands);
+        // Threads end in any order; values decide among those that fit alike.
+        candidates.sort_by(|a, b| misfit(a).total_cmp(&misfit(b)).then_with(|| a.values.cmp(&b.values)));
         state.progress.finish_with(format!("{} panels simulated", candidates.len()));
         Ok(candidates)
     }
@@ -214,7 +211,8 @@ impl<'a> DesignSearch<'a> {
         };
         let misfit = self.target.misfit(&figures);
         let mut state = self.lock_state();
-        if state.best.as_ref().is_none_or(|(best, _)| misfit < *best) {
+        let is_better = |(best, of): &(f64, Vec<String>)| misfit < *best || (misfit == *best && values < *of);
+        if state.best.as_ref().is_none_or(is_better) {
             state.best = Some((misfit, values));
         }
         Ok(misfit)
@@ -265,7 +263,8 @@ pub(super) fn read_candidates(
     parsed.with_context(|| format!("candidates `{}`", path.display()))
 }
 
-fn candidate_header(target: &DesignTarget, bands: &[String]) -> String {
+/// Returns the names of the columns of the file of candidates.
+pub(super) fn candidate_header(target: &DesignTarget, bands: &[String]) -> String {
     let parameters = target.ranges.iter().map(|(key, _)| key.clone());
     let figures =
         bands.iter().flat_map(|band| ["level_db", "spread_db", "scattering"].map(|name| format!("{name}_{band}")));
@@ -301,7 +300,8 @@ fn parse_candidates(
         let fields: Vec<&str> = line.split(',').collect();
         let expected = parameters + COLUMNS_PER_BAND * bands + 2;
         ensure!(fields.len() == expected, "line {number} has {} fields, expected {expected}", fields.len());
-        let values = fields[1..=parameters].iter().map(|value| (*value).to_owned()).collect();
+        let values: Vec<String> = fields[1..=parameters].iter().map(|value| (*value).to_owned()).collect();
+        target.relief_of(&values).with_context(|| format!("line {number}"))?;
         let numbers = fields[parameters + 1..expected - 1].iter().map(|field| field.parse::<f64>());
         let numbers: Vec<f64> = numbers
             .collect::<Result<_, _>>()

@@ -1,18 +1,24 @@
 //! The file of a design: a relief, ranges of its parameters, and what is wanted of it by band.
 
 use std::collections::BTreeMap;
+use std::f64::consts::FRAC_1_SQRT_2;
 use std::path::Path;
 
 use anyhow::{Context as _, bail, ensure};
 use echolake_acquisition::design::{BandFigures, PanelFigures};
 use echolake_panel::relief::group::ParameterRange;
-use echolake_panel::relief::{HeightField, PanelRelief, ReliefParameter};
+use echolake_panel::relief::{HeightField, PanelRelief, ParameterDomain, ReliefParameter};
 use echolake_schema::SurfaceId;
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 /// Deviations that count as much as one of a level by 1 dB.
 const SPREAD_UNIT_DB: f64 = 1.0;
 const SCATTERING_UNIT: f64 = 0.1;
+/// Targets and weights are no larger.
+const MOST_DB: f64 = 200.0;
+const MOST_WEIGHT: f64 = 1e6;
+/// Distance of one seed from the next, in ranges: what one makes tells nothing of another.
+const FAR_APART: f64 = 10.0;
 
 /// A target, as its TOML file has it.
 #[derive(Debug, Deserialize)]
@@ -52,7 +58,7 @@ struct BandTarget {
 }
 
 /// A figure of a panel in a band.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 pub(super) enum FigureKind {
     Level,
     Spread,
@@ -60,7 +66,7 @@ pub(super) enum FigureKind {
 }
 
 /// A wanted figure.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub(super) struct DesignGoal {
     pub band: usize,
     pub kind: FigureKind,
@@ -78,6 +84,8 @@ pub(super) struct DesignTarget {
     pub best: usize,
     pub seed: u64,
     pub goals: Vec<DesignGoal>,
+    /// Of each band, for the levels of a surface.
+    weights: Vec<f64>,
     /// Names and ranges of the parameters that are searched.
     pub ranges: Vec<(String, ParameterRange)>,
     greatest_depth_mm: f64,
@@ -130,6 +138,17 @@ impl DesignTarget {
         }
         let goals = read_goals(&file, bands)?;
         let known = start.describe_parameters();
+        for parameter in &known {
+            let is_choice = matches!(parameter.domain, ParameterDomain::Choice { .. });
+            if let (true, Some(ParameterRange::Numbers(_))) = (is_choice, file.ranges.get(parameter.key)) {
+                bail!(
+                    "range of `{0}` is of numbers, expected words; hint: {0} = [\"{1}\"]",
+                    parameter.key,
+                    parameter.domain
+                );
+            }
+        }
+        let weights = bands.iter().map(|band| file.bands.get(band).map_or(1.0, |target| target.weight)).collect();
         let target = Self {
             about: file.about,
             levels_of: file.levels_of,
@@ -138,16 +157,17 @@ impl DesignTarget {
             best: file.best,
             seed: file.seed,
             goals,
+            weights,
             ranges: file.ranges.into_iter().collect(),
             greatest_depth_mm: depth_mm,
             start,
             known,
         };
-        // Every word is tried by itself, and both ends of the numbers.
+        // Every word is tried by itself, and five of the numbers.
         for (number, (_, range)) in target.ranges.iter().enumerate() {
             let tried = match range {
                 ParameterRange::Words(words) => words.len().max(2),
-                ParameterRange::Numbers(_) => 2,
+                ParameterRange::Numbers(_) => 5,
             };
             for step in 0..tried {
                 let mut shares = vec![0.5; target.ranges.len()];
@@ -163,7 +183,7 @@ impl DesignTarget {
         for (band, level) in levels_db.iter().enumerate() {
             let is_given = self.goals.iter().any(|goal| goal.band == band && goal.kind == FigureKind::Level);
             if let Some(value) = level.filter(|_| !is_given) {
-                self.goals.push(DesignGoal { band, kind: FigureKind::Level, value, weight: 1.0 });
+                self.goals.push(DesignGoal { band, kind: FigureKind::Level, value, weight: self.weights[band] });
             }
         }
         self.goals.sort_by_key(|goal| goal.band);
@@ -188,6 +208,21 @@ impl DesignTarget {
             }
         };
         self.ranges.iter().zip(values).map(share).collect()
+    }
+
+    /// Returns coordinates of some values, as far from each other as the shares of their ranges; words are all 1 apart.
+    pub fn coordinates_of(&self, values: &[String]) -> Vec<f64> {
+        let shares = self.shares_of(values);
+        let of_range = |((key, range), share): (&(String, ParameterRange), f64)| match range {
+            // A seed is a name, not a quantity.
+            ParameterRange::Numbers(_) if key != "seed" => vec![share],
+            ParameterRange::Numbers([low, high]) => vec![share * (high - low) * FAR_APART],
+            ParameterRange::Words(words) => {
+                let place = (share * words.len() as f64) as usize;
+                (0..words.len()).map(|word| if word == place { FRAC_1_SQRT_2 } else { 0.0 }).collect()
+            }
+        };
+        self.ranges.iter().zip(shares).flat_map(of_range).collect()
     }
 
     /// Returns how far two panels are from each other: the greatest share of a range, 1 for other words.
@@ -221,7 +256,7 @@ impl DesignTarget {
         self.greatest_depth_mm.is_finite()
     }
 
-    /// Returns where a surface is in the ranges; None if it is another relief, not within them, or differs in what is
+    /// Returns the coordinates of a surface in the ranges; None if it is another relief, not within them, or differs in what is
     /// fixed. Of reliefs that are drawn by chance, the seed tells nothing.
     pub fn place_of(&self, relief: &str, parameters: &str) -> Option<Vec<f64>> {
         let parameters: serde_json::Map<String, serde_json::Value> = serde_json::from_str(parameters).ok()?;
@@ -234,8 +269,12 @@ impl DesignTarget {
         }
         let text = |value: &serde_json::Value| value.as_str().map_or_else(|| value.to_string(), str::to_owned);
         let values = self.ranges.iter().map(|(key, _)| parameters.get(key).map(text));
-        let shares = self.shares_of(&values.collect::<Option<Vec<_>>>()?);
-        shares.iter().all(|share| (0.0..=1.0).contains(share)).then_some(shares)
+        let values = values.collect::<Option<Vec<_>>>()?;
+        let is_within = self.ranges.iter().zip(&values).all(|((_, range), value)| match range {
+            ParameterRange::Words(words) => words.contains(value),
+            ParameterRange::Numbers([low, high]) => value.parse().is_ok_and(|value| (low..=high).contains(&&value)),
+        });
+        is_within.then(|| self.coordinates_of(&values))
     }
 
     /// Returns how far figures are from the target: weighted root mean square of the deviations, 1 dB of a level each.
@@ -260,7 +299,9 @@ fn read_goals(file: &TargetFile, bands: &[String]) -> anyhow::Result<Vec<DesignG
             bail!("there is no band `{name}`; hint: {}", bands.join(", "));
         };
         let BandTarget { level_db, spread_db, scattering, weight } = *target;
-        ensure!(weight > 0.0 && weight.is_finite(), "`weight` of band `{name}` is {weight}, expected above 0");
+        ensure!(weight > 0.0 && weight <= MOST_WEIGHT, "`weight` of band `{name}` is {weight}, expected above 0");
+        let is_wanted = level_db.or(spread_db).or(scattering).is_some() || file.levels_of.is_some();
+        ensure!(is_wanted, "band `{name}` has no target; hint: level_db, spread_db, scattering, or levels_of");
         let is_share = scattering.is_none_or(|share| (0.0..=1.0).contains(&share));
         ensure!(is_share, "`scattering` of band `{name}` is not from 0 to 1");
         let is_spread = spread_db.is_none_or(|spread| spread >= 0.0);
@@ -269,7 +310,7 @@ fn read_goals(file: &TargetFile, bands: &[String]) -> anyhow::Result<Vec<DesignG
             [(FigureKind::Level, level_db), (FigureKind::Spread, spread_db), (FigureKind::Scattering, scattering)];
         for (kind, value) in wanted {
             let Some(value) = value else { continue };
-            ensure!(value.is_finite(), "band `{name}` has the target {value}, expected a number");
+            ensure!(value.abs() <= MOST_DB, "band `{name}` has the target {value}, expected a number up to {MOST_DB}");
             goals.push(DesignGoal { band, kind, value, weight });
         }
     }
@@ -353,8 +394,8 @@ mod tests {
         let bands = echolake_schema::Rig::paper().band_names();
         let files = std::fs::read_dir(concat!(env!("CARGO_MANIFEST_DIR"), "/examples/designs")).expect("a folder");
         let texts = files.map(|file| std::fs::read_to_string(file.expect("a file").path()).expect("text"));
-        let count = texts.map(|text| DesignTarget::from_toml(&text, &bands).expect("a target")).count();
-        assert_eq!(count, 3);
+        let targets: Vec<_> = texts.map(|text| DesignTarget::from_toml(&text, &bands).expect("a target")).collect();
+        assert_eq!(targets.len(), 3);
     }
 
     #[test]
@@ -368,6 +409,9 @@ mod tests {
             (with_band("[bands.2500]\nscattering = 2\n"), "not from 0 to 1"),
             (with_band("[bands.2500]\nlevel_db = 1\nweight = 0\n"), "`weight` of band `2500`"),
             (with_band("[bands.2500]\nlevel = 1\n"), "unknown field"),
+            (with_band("[bands.2500]\nweight = 2\n"), "band `2500` has no target"),
+            (with_band("macrostructure = [1, 2]\n[bands.2500]\nlevel_db = 1\n"), "`macrostructure` is of numbers"),
+            ("relief = \"prd\"\n[ranges]\nprime = [31, 157]\n[bands.2500]\nlevel_db = 1\n".to_owned(), "prime"),
             (with_band("[bands.2500]\nlevel_db = 1\n").replace("100", "1e6"), "macro_depth_mm"),
             (with_band("[bands.2500]\nlevel_db = 1\n").replace("macro_depth", "makro"), "makro"),
             (format!("candidates = 0\n{}", with_band("[bands.2500]\nlevel_db = 1\n")), "`candidates` is 0"),
