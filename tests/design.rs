@@ -51,7 +51,7 @@ mod slow {
         assert!(bits.len() == 2 && bits[0] >= bits[1] && bits[1] > 0.0, "{bits:?}");
         place.ok(&["panel", "--parameters", "waves/next_1.json", "-o", "next.json"]);
 
-        place.fails(1, &["design", "waves.toml", "-o", "rig.toml"], "cannot make `rig.toml`");
+        place.fails(1, &["design", "waves.toml", "-o", "rig.toml"], "cannot read `rig.toml/candidates.csv`");
         std::fs::write(place.path("waves.toml"), WAVES.replace("0.8", "0.7")).expect("written");
         place.fails(1, &["design", "waves.toml", "-o", "waves"], "has candidates of another target, levels or rig");
         std::fs::write(place.path("waves/candidates.csv"), "a,b\n1,2\n").expect("written");
@@ -67,7 +67,7 @@ mod slow {
         let levels_of = WAVES.replace("[ranges]", "levels_of = \"prd\"\n[ranges]");
         let flat = WAVES.replace("[ranges]", "greatest_depth_mm = 0.5\n[ranges]");
         for (text, expected) in [
-            (levels_of.as_str(), "`levels_of` names surface `prd`, which the lake has no levels of"),
+            (levels_of.as_str(), "`levels_of` names surface `prd`, which the lake has no levels over Flat of"),
             (&flat, "none of 16 candidates can be printed"),
             ("relief = \"macrostructure\"", "missing field `ranges`"),
             (&WAVES.replace("macrostructure", "sand"), "`sand` is no relief"),

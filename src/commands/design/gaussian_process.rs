@@ -1,4 +1,7 @@
-//! A Gaussian process over the unit cube: what is known of a figure between panels whose figure is known.
+//! A Gaussian process over ranges of parameters: what is known of a figure between panels whose figure is known.
+//!
+//! A figure is what a simulation would say and a difference from it, which has a process of its own: the simulation is
+//! wrong in the same way for panels that are alike (Kennedy and O'Hagan 2000, Biometrika 87, 1-13).
 
 use std::cmp::Ordering;
 
@@ -17,15 +20,16 @@ pub(super) struct KnownFigure {
     pub value: f64,
     /// Its own standard uncertainty.
     pub uncertainty: f64,
-    /// Standard uncertainty that figures have in common if their places are near: of a simulation, which is wrong in
-    /// the same way for panels that are alike.
-    pub common_uncertainty: f64,
+    /// False if it is simulated.
+    pub is_measured: bool,
 }
 
-/// A process with the length scale and the variance under which its figures are most likely.
+/// A process of measured figures with the length scale and the variance under which its figures are most likely.
 pub(super) struct GaussianProcess {
     known: Vec<KnownFigure>,
+    /// Of what simulations say, and of the difference.
     variance: f64,
+    difference_variance: f64,
     length_scale: f64,
     factor: Cholesky<f64, Dyn>,
     mean: f64,
@@ -33,8 +37,9 @@ pub(super) struct GaussianProcess {
 }
 
 impl GaussianProcess {
-    /// Fits figures; None if there are fewer than three, or all are alike.
-    pub fn fit(known: &[KnownFigure]) -> Option<Self> {
+    /// Fits figures, of which simulated ones differ from measured ones by so much; None if there are fewer than three, or
+    /// all are alike.
+    pub fn fit(known: &[KnownFigure], difference: f64) -> Option<Self> {
         let count = known.len() as f64;
         let mean = known.iter().map(|figure| figure.value).sum::<f64>() / count;
         let variance = known.iter().map(|figure| (figure.value - mean).powi(2)).sum::<f64>() / count;
@@ -43,16 +48,17 @@ impl GaussianProcess {
         }
         let tried = LENGTH_SCALES.iter().flat_map(|scale| VARIANCES.map(|factor| (*scale, factor * variance)));
         let fits = tried.filter_map(|(scale, variance)| {
-            let process = Self::with_scale(known.to_vec(), variance, scale)?;
+            let process = Self::with_scale(known.to_vec(), [variance, difference.powi(2)], scale)?;
             Some((process.log_likelihood(), process))
         });
         fits.max_by(|(a, _), (b, _)| a.total_cmp(b)).map(|(_, process)| process)
     }
 
-    fn with_scale(known: Vec<KnownFigure>, variance: f64, length_scale: f64) -> Option<Self> {
+    fn with_scale(known: Vec<KnownFigure>, variances: [f64; 2], length_scale: f64) -> Option<Self> {
+        let [variance, difference_variance] = variances;
         let covariance = |i: usize, j: usize| {
-            let common = known[i].common_uncertainty * known[j].common_uncertainty;
-            let shared = (variance + common) * similarity(&known[i].place, &known[j].place, length_scale);
+            let both = if known[i].is_measured && known[j].is_measured { difference_variance } else { 0.0 };
+            let shared = (variance + both) * similarity(&known[i].place, &known[j].place, length_scale);
             // The last term keeps places that are nearly one from being singular.
             if i == j { shared + known[i].uncertainty.powi(2) + 1e-6 * variance } else { shared }
         };
@@ -62,7 +68,7 @@ impl GaussianProcess {
         let shares = factor.solve(&DVector::from_element(known.len(), 1.0));
         let mean = shares.dot(&values) / shares.sum();
         let weights = factor.solve(&values.add_scalar(-mean));
-        Some(Self { known, variance, length_scale, factor, mean, weights })
+        Some(Self { known, variance, difference_variance, length_scale, factor, mean, weights })
     }
 
     fn log_likelihood(&self) -> f64 {
@@ -72,20 +78,23 @@ impl GaussianProcess {
         -0.5 * fit - volume
     }
 
-    /// Returns the expected figure at a place, and its standard deviation.
+    /// Returns the figure that a measurement at a place is expected to give, and its standard deviation.
     pub fn predict(&self, place: &[f64]) -> (f64, f64) {
-        let shared = |figure: &KnownFigure| self.variance * similarity(&figure.place, place, self.length_scale);
+        let shared = |figure: &KnownFigure| {
+            let both = if figure.is_measured { self.difference_variance } else { 0.0 };
+            (self.variance + both) * similarity(&figure.place, place, self.length_scale)
+        };
         let shared = DVector::from_iterator(self.known.len(), self.known.iter().map(shared));
         let explained = shared.dot(&self.factor.solve(&shared));
-        (self.mean + shared.dot(&self.weights), (self.variance - explained).max(0.0).sqrt())
+        (self.mean + shared.dot(&self.weights), (self.variance + self.difference_variance - explained).max(0.0).sqrt())
     }
 
     /// Adds a figure as expected at a place that is to be measured.
     pub fn expect_at(self, place: &[f64], uncertainty: f64) -> Option<Self> {
         let (value, _) = self.predict(place);
         let mut known = self.known;
-        known.push(KnownFigure { place: place.to_vec(), value, uncertainty, common_uncertainty: 0.0 });
-        Self::with_scale(known, self.variance, self.length_scale)
+        known.push(KnownFigure { place: place.to_vec(), value, uncertainty, is_measured: true });
+        Self::with_scale(known, [self.variance, self.difference_variance], self.length_scale)
     }
 }
 
@@ -100,13 +109,13 @@ mod tests {
     use super::*;
 
     fn known(place: f64, uncertainty: f64) -> KnownFigure {
-        KnownFigure { place: vec![place], value: (6.0 * place).sin(), uncertainty, common_uncertainty: 0.0 }
+        KnownFigure { place: vec![place], value: (6.0 * place).sin(), uncertainty, is_measured: true }
     }
 
     #[test]
     fn figures_are_known_where_they_are_and_unknown_in_gaps() {
         let all: Vec<_> = [0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.9, 0.95, 1.0].map(|at| known(at, 1e-3)).to_vec();
-        let process = GaussianProcess::fit(&all).expect("a fit");
+        let process = GaussianProcess::fit(&all, 0.0).expect("a fit");
         let (value, deviation) = process.predict(&[0.2]);
         assert!((value - 1.2f64.sin()).abs() < 0.01 && deviation < 0.01, "{value} {deviation}");
         let (_, within_gap) = process.predict(&[0.6]);
@@ -115,19 +124,25 @@ mod tests {
         assert!(filled.predict(&[0.6]).1 < 0.1 * within_gap);
     }
 
-    // However many simulated panels lie there, their common error stays; what is expected is what they say.
+    // However many simulated panels lie there, their common error stays; what is expected is what they say, until a
+    // measurement says how wrong they are.
     #[test]
-    fn common_errors_do_not_average_out() {
-        let simulated = |n: usize| KnownFigure { common_uncertainty: 0.3, ..known(n as f64 / 40.0, 0.05) };
-        let process = GaussianProcess::fit(&(0..40).map(simulated).collect::<Vec<_>>()).expect("a fit");
+    fn errors_of_simulations_do_not_average_out() {
+        let simulated = |n: usize| KnownFigure { is_measured: false, ..known(n as f64 / 40.0, 0.05) };
+        let mut all: Vec<_> = (0..40).map(simulated).collect();
+        let process = GaussianProcess::fit(&all, 0.3).expect("a fit");
         let (value, deviation) = process.predict(&[0.5]);
-        assert!((value - 3.0f64.sin()).abs() < 0.1 && deviation > 0.2, "{value} {deviation}");
+        assert!((value - 3.0f64.sin()).abs() < 0.05 && (0.29..0.32).contains(&deviation), "{value} {deviation}");
+        let measured = known(0.5, 0.05);
+        all.push(KnownFigure { value: measured.value - 0.4, ..measured });
+        let (value, deviation) = GaussianProcess::fit(&all, 0.3).expect("a fit").predict(&[0.5]);
+        assert!((value - 3.0f64.sin() + 0.4).abs() < 0.05 && deviation < 0.06, "{value} {deviation}");
     }
 
     #[test]
     fn too_little_gives_no_process() {
-        assert!(GaussianProcess::fit(&[known(0.1, 0.1), known(0.5, 0.1)]).is_none());
+        assert!(GaussianProcess::fit(&[known(0.1, 0.1), known(0.5, 0.1)], 0.0).is_none());
         let same = KnownFigure { value: 1.0, ..known(0.2, 0.1) };
-        assert!(GaussianProcess::fit(&[same.clone(), same.clone(), same]).is_none());
+        assert!(GaussianProcess::fit(&[same.clone(), same.clone(), same], 0.0).is_none());
     }
 }

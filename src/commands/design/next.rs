@@ -56,16 +56,17 @@ pub(super) fn propose_panels(
             place: target.coordinates_of(&candidate.values),
             value: candidate.bands[band].level_db,
             uncertainty: FEW_PAIRS_U_DB,
-            common_uncertainty: MEAN_ERROR_DB[1],
+            is_measured: false,
         });
         let found = measured.iter().filter_map(|(place, panel)| {
             let value = panel.levels_db()[band]?;
-            Some(KnownFigure { place: place.clone(), value, uncertainty: MEASURED_U_DB, common_uncertainty: 0.0 })
+            Some(KnownFigure { place: place.clone(), value, uncertainty: MEASURED_U_DB, is_measured: true })
         });
         let known: Vec<_> = simulated.chain(found).collect();
-        GaussianProcess::fit(&known).with_context(|| {
+        GaussianProcess::fit(&known, MEAN_ERROR_DB[1]).with_context(|| {
             format!(
-                "{} panels tell nothing of the gaps between them, expected three that differ; hint: run the search",
+                "{} panels tell nothing of the gaps between them, expected three that differ; hint: run the \
+                 search, with more candidates or wider ranges",
                 known.len()
             )
         })
