@@ -37,8 +37,8 @@ pub(super) struct GaussianProcess {
 }
 
 impl GaussianProcess {
-    /// Fits figures, of which simulated ones differ from measured ones by so much; None if there are fewer than three, or
-    /// all are alike.
+    /// Fits figures, of which simulated ones differ from measured ones by so much; None if there are fewer than three,
+    /// or all are alike.
     pub fn fit(known: &[KnownFigure], difference: f64) -> Option<Self> {
         let count = known.len() as f64;
         let mean = known.iter().map(|figure| figure.value).sum::<f64>() / count;

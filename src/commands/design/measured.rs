@@ -84,8 +84,10 @@ pub(super) async fn read_measured(lake: &Lake, bands: &[String]) -> anyhow::Resu
 pub(super) fn levels_of(measured: &[MeasuredPanel], surface: &SurfaceId) -> anyhow::Result<Vec<Option<f64>>> {
     let panel = measured.iter().find(|panel| panel.surface_id == surface.as_str());
     let panel = panel.with_context(|| {
-        format!("`levels_of` names surface `{surface}`, which the lake has no levels over Flat of; hint: --lake, echolake ingest; Flat and \
-             Foam have none")
+        format!(
+            "`levels_of` names surface `{surface}`, which the lake has no levels over Flat of; hint: --lake, echolake \
+             ingest; Flat and Foam have none"
+        )
     })?;
     Ok(panel.levels_db())
 }

@@ -15,8 +15,10 @@ use super::target::DesignTarget;
 
 /// Standard uncertainty of a level over Flat that is measured, dB.
 const MEASURED_U_DB: f64 = 0.1;
-/// Standard uncertainty of a simulated level at the pairs of a search, dB, beside the simulation's own error.
-const FEW_PAIRS_U_DB: f64 = 0.1;
+/// Standard uncertainty of the difference of two simulated levels at the same few pairs, dB.
+const SIMULATED_U_DB: f64 = 0.1;
+/// Standard deviation of the levels of pairs, dB: over the root of their number it is the uncertainty of a mean.
+const PAIR_SPREAD_DB: f64 = 2.0;
 /// Simulated panels that are counted at most.
 const MOST_SIMULATED: usize = 400;
 /// Places that are compared.
@@ -51,11 +53,12 @@ pub(super) fn propose_panels(
         measured.len(),
         simulated.len()
     );
+    let difference_db = MEAN_ERROR_DB[1].hypot(PAIR_SPREAD_DB / (target.pairs as f64).sqrt());
     let fit = |band: usize| {
         let simulated = simulated.iter().map(|candidate| KnownFigure {
             place: target.coordinates_of(&candidate.values),
             value: candidate.bands[band].level_db,
-            uncertainty: FEW_PAIRS_U_DB,
+            uncertainty: SIMULATED_U_DB,
             is_measured: false,
         });
         let found = measured.iter().filter_map(|(place, panel)| {
@@ -63,7 +66,7 @@ pub(super) fn propose_panels(
             Some(KnownFigure { place: place.clone(), value, uncertainty: MEASURED_U_DB, is_measured: true })
         });
         let known: Vec<_> = simulated.chain(found).collect();
-        GaussianProcess::fit(&known, MEAN_ERROR_DB[1]).with_context(|| {
+        GaussianProcess::fit(&known, difference_db).with_context(|| {
             format!(
                 "{} panels tell nothing of the gaps between them, expected three that differ; hint: run the \
                  search, with more candidates or wider ranges",

@@ -256,8 +256,8 @@ impl DesignTarget {
         self.greatest_depth_mm.is_finite()
     }
 
-    /// Returns the coordinates of a surface in the ranges; None if it is another relief, not within them, or differs in what is
-    /// fixed. Of reliefs that are drawn by chance, the seed tells nothing.
+    /// Returns the coordinates of a surface in the ranges; None if it is another relief, not within them, or differs in
+    /// what is fixed. Of reliefs that are drawn by chance, the seed tells nothing.
     pub fn place_of(&self, relief: &str, parameters: &str) -> Option<Vec<f64>> {
         let parameters: serde_json::Map<String, serde_json::Value> = serde_json::from_str(parameters).ok()?;
         let is_searched = |key: &String| self.ranges.iter().any(|(searched, _)| searched == key);

@@ -1,8 +1,8 @@
 //! The simulated rig: computed, never measured, and marked as such in every run it makes ([`Origin::Simulated`]).
 //!
 //! The room's air drifts over the simulated hours and absorbs; the arms stand beside the points by some hundredths of a
-//! millimetre; the panel reflects as [`KirchhoffPlan`] and its material say; the direct sound goes as 1/d; tweeter and
-//! microphone have responses and directions; both channels pass the converter; noise is added, and now and then
+//! millimetre; the panel reflects by Kirchhoff's approximation and its material; the direct sound goes as 1/d; tweeter
+//! and microphone have responses and directions; both channels pass the converter; noise is added, and now and then
 //! something outside spoils a take. The same seed gives the same bits. [`SimulationParams`] switches effects off.
 //! While a take is judged and recorded, another thread computes the response at the next pair, which is used if its
 //! inputs are then exactly those that were forecast.

@@ -56,7 +56,7 @@ impl PanelReflections {
     /// Computes the reflection at a pair; samples at the rig's rate, from the time of the emission on.
     ///
     /// # Errors
-    /// [`Error::Length`] if `scratch` is another panel's.
+    /// As [`echolake_dsp::kirchhoff::KirchhoffPlan::compute_response`]: `scratch` is of another panel.
     pub fn compute_reflection(&self, poses: &PairPoses, scratch: &mut KirchhoffScratch) -> Result<Vec<f32>, Error> {
         let PairPoses { microphone, speaker } = *poses;
         self.room.compute_response(&ResponseInputs { microphone, speaker, air: self.air }, scratch)
