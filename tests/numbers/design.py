@@ -25,7 +25,7 @@ def main() -> None:
     args = parser.parse_args()
     designs = pathlib.Path(__file__).parents[2] / "examples" / "designs"
     lines = [
-        "| target | parameters found | levels, rms, dB | the same in trusted bands | misfit | candidates | s a candidate | s |",
+        "| target | parameters found | levels, rms, dB | in trusted bands | misfit | candidates | s each | s |",
         "| --- | --- | ---: | ---: | ---: | ---: | ---: | ---: |",
     ]
     worst = 0.0
