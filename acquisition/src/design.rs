@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use echolake_dsp::filter_bank::FilterBankPlan;
 use echolake_dsp::geometry::{incidence_deg, specular_point};
-use echolake_dsp::level::{p90_mean, power_to_db};
+use echolake_dsp::level::{p90_mean, power_to_db, standard_deviation};
 use echolake_dsp::scattering::{ScatteringPath, ScatteringSums, UncertainNumber};
 use echolake_dsp::{Complex, Error, RealSample as _};
 use echolake_panel::material::SurfaceMaterial;
@@ -96,7 +96,7 @@ impl DesignSimulation {
     }
 
     /// The pairs, in the order of the figures' levels.
-    pub fn pairs(&self) -> impl Iterator<Item = &Pair> {
+    pub fn chosen_pairs(&self) -> impl Iterator<Item = &Pair> {
         self.pairs.iter().map(|pair| &pair.pair)
     }
 
@@ -114,9 +114,10 @@ impl DesignSimulation {
         let bands = scattering.iter().enumerate().map(|(band, scattering)| {
             let energies = self.band_energies(&reflections, band);
             let mean = p90_mean(&energies, &mut Vec::new()).unwrap_or(f64::NAN);
+            let levels: Vec<f64> = energies.into_iter().map(power_to_db).filter(|level| level.is_finite()).collect();
             BandFigures {
                 level_db: power_to_db(mean / self.flat_means[band]),
-                spread_db: standard_deviation(energies.into_iter().map(power_to_db)),
+                spread_db: standard_deviation(&levels),
                 scattering: scattering.scattering,
             }
         });
@@ -177,13 +178,6 @@ fn choose_evenly(all: usize, count: usize) -> Vec<usize> {
     (0..count).map(|n| ((n as f64 + (n as f64 * GOLDEN).fract()) * part) as usize).collect()
 }
 
-fn standard_deviation(levels: impl Iterator<Item = f64>) -> f64 {
-    let levels: Vec<f64> = levels.filter(|level| level.is_finite()).collect();
-    let count = levels.len() as f64;
-    let mean = levels.iter().sum::<f64>() / count;
-    (levels.iter().map(|level| (level - mean).powi(2)).sum::<f64>() / count).sqrt()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -197,7 +191,7 @@ mod tests {
     #[test]
     fn flat_is_as_loud_as_flat_and_scatters_nothing() {
         let simulation = simulation(30);
-        assert_eq!(simulation.pairs().count(), 30);
+        assert_eq!(simulation.chosen_pairs().count(), 30);
         let flat = PanelRelief::Flat;
         let heights = flat.height_field(echolake_panel::mesh::FACETS);
         let figures = simulation.compute_figures(&heights, flat.material()).expect("figures");

@@ -76,7 +76,7 @@ pub(crate) async fn run_design(args: &DesignArgs, lake_url: &str) -> anyhow::Res
     let task = progress.start_task("search", target.candidates as u64, "candidates");
     let known = candidates.len();
     let header = search::candidate_header(&target, &bands);
-    let search = DesignSearch::open(&path, &header, candidates, &target, &simulation, &stop, task)?;
+    let search = DesignSearch::open_file(&path, &header, candidates, &target, &simulation, &stop, task)?;
     let begun = Instant::now();
     let whole = DesignSimulation::new(&rig, grid.clone(), arms.as_deref(), None)?;
     let candidates = tokio::task::block_in_place(|| search.run(&whole))?;
@@ -92,23 +92,23 @@ pub(crate) async fn run_design(args: &DesignArgs, lake_url: &str) -> anyhow::Res
     }
     report::write_search(&args.output, &target, &candidates, &panels, &measured, &bands)?;
     report::write_campaign(&args.output, &target, &panels, &references.flat, &bands)?;
-    let reports: Vec<PanelReport> = panels.iter().map(|panel| panel.report(&target, &bands)).collect();
+    let reports: Vec<PanelReport> = panels.iter().map(|panel| panel.make_report(&target, &bands)).collect();
     let summary = json!({
         "origin": "simulated",
         "candidates": candidates.len(),
-        "pairs": simulation.pairs().count(),
+        "pairs": simulation.chosen_pairs().count(),
         "secs_per_candidate": (candidates.len() > known).then_some(secs),
         "panels": reports,
     });
     let summary = serde_json::to_string_pretty(&summary)?;
-    report::write_file(&args.output.join("best.json"), summary.as_bytes())?;
+    super::write_whole_file(&args.output.join("best.json"), summary.as_bytes())?;
     if args.json {
         super::print_line(&summary)?;
     } else {
         print_reports(&reports, &panels, &target)?;
     }
     if candidates.len() > known {
-        eprintln!("{secs:.2} s per candidate at {} pairs", simulation.pairs().count());
+        eprintln!("{secs:.2} s per candidate at {} pairs", simulation.chosen_pairs().count());
     }
     let folder = args.output.display();
     eprintln!("{folder}: meshes, parameters and grid plots of {} panels; all numbers are simulated", panels.len());
@@ -119,7 +119,7 @@ pub(crate) async fn run_design(args: &DesignArgs, lake_url: &str) -> anyhow::Res
 fn write_next(args: &DesignArgs, panels: &[NextPanel], bands: &[String]) -> anyhow::Result<CommandOutcome> {
     for (panel, number) in panels.iter().zip(1..) {
         let path = args.output.join(format!("next_{number}.json"));
-        report::write_file(&path, &serde_json::to_vec_pretty(&panel.parameters)?)?;
+        super::write_whole_file(&path, &serde_json::to_vec_pretty(&panel.parameters)?)?;
         if !args.json {
             let expected = bands.iter().zip(&panel.expected_db);
             let expected = expected.map(|(band, [level, s])| format!("{band} Hz {level:.1} ± {s:.1}"));
@@ -149,7 +149,7 @@ fn prepare_folder(args: &DesignArgs, inputs: &Value, has_candidates: bool) -> an
         let folder = folder.display();
         bail!("`{folder}` has candidates of another target, levels or rig; hint: another folder for -o");
     }
-    report::write_file(&kept, text.as_bytes())
+    super::write_whole_file(&kept, text.as_bytes())
 }
 
 fn print_reports(reports: &[PanelReport], panels: &[report::FoundPanel], target: &DesignTarget) -> anyhow::Result<()> {

@@ -57,6 +57,16 @@ fn print_line(text: &str) -> std::io::Result<()> {
     writeln!(std::io::stdout().lock(), "{text}")
 }
 
+/// Writes a file beside its path first, so that it is whole or not there.
+#[cfg(feature = "lake")]
+fn write_whole_file(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
+    let failed = || format!("cannot write `{}`", path.display());
+    let mut partial = path.as_os_str().to_owned();
+    partial.push(".partial");
+    std::fs::write(&partial, bytes).with_context(failed)?;
+    std::fs::rename(&partial, path).with_context(failed)
+}
+
 /// A size for people.
 fn format_size(bytes: u64) -> String {
     match bytes {

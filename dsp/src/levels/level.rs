@@ -34,6 +34,13 @@ pub fn percentile(sorted: &[f64], percent: f64) -> f64 {
     sorted[below] + (sorted[above] - sorted[below]) * (position - below as f64)
 }
 
+/// Standard deviation about the mean, by the number of values; NaN of none.
+pub fn standard_deviation(values: &[f64]) -> f64 {
+    let count = values.len() as f64;
+    let mean = values.iter().sum::<f64>() / count;
+    (values.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / count).sqrt()
+}
+
 /// Mean of the values up to their 90th percentile, as in the paper's tables; None of none, NaN if one is.
 ///
 /// ```

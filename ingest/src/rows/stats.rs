@@ -2,7 +2,7 @@
 
 use arrow::record_batch::RecordBatch;
 use echolake_dsp::foam_reflection::estimate_error;
-use echolake_dsp::level::{p90_mean, percentile, power_to_db};
+use echolake_dsp::level::{p90_mean, percentile, power_to_db, standard_deviation};
 use echolake_dsp::mean::SignalMean;
 use echolake_dsp::scattering::BandScattering;
 use echolake_dsp::uncertainty::{LevelError, LevelUncertainty};
@@ -110,7 +110,7 @@ fn stats_of(band: String, values: &[f64]) -> BandStatistics {
         p95_db: db(percentile(&sorted, 95.0)),
         min_db: db(sorted[0]),
         max_db: db(sorted[sorted.len() - 1]),
-        spread_db: standard_deviation(&levels),
+        spread_db: finite_value(standard_deviation(&levels)),
         p90_mean_u_db: None,
         unbiased_p90_mean_db: None,
         unbiased_p90_mean_u_db: None,
@@ -133,12 +133,6 @@ fn p90_mean_uncertainty(values: &[f64], errors: &[LevelError], uncertainty: &Lev
         mean.flat_per_kelvin += share * error.flat_per_kelvin;
     }
     (sum > 0.0).then(|| uncertainty.combine_db(&mean)).and_then(finite_value)
-}
-
-fn standard_deviation(levels: &[f64]) -> Option<f64> {
-    let count = levels.len() as f64;
-    let mean = levels.iter().sum::<f64>() / count;
-    finite_value((levels.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / count).sqrt())
 }
 
 #[cfg(test)]

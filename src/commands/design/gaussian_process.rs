@@ -39,7 +39,7 @@ pub(super) struct GaussianProcess {
 impl GaussianProcess {
     /// Fits figures, of which simulated ones differ from measured ones by so much; None if there are fewer than three,
     /// or all are alike.
-    pub fn fit(known: &[KnownFigure], difference: f64) -> Option<Self> {
+    pub fn fit_figures(known: &[KnownFigure], difference: f64) -> Option<Self> {
         let count = known.len() as f64;
         let mean = known.iter().map(|figure| figure.value).sum::<f64>() / count;
         let variance = known.iter().map(|figure| (figure.value - mean).powi(2)).sum::<f64>() / count;
@@ -79,7 +79,7 @@ impl GaussianProcess {
     }
 
     /// Returns the figure that a measurement at a place is expected to give, and its standard deviation.
-    pub fn predict(&self, place: &[f64]) -> (f64, f64) {
+    pub fn predict_figure(&self, place: &[f64]) -> (f64, f64) {
         let shared = |figure: &KnownFigure| {
             let both = if figure.is_measured { self.difference_variance } else { 0.0 };
             (self.variance + both) * similarity(&figure.place, place, self.length_scale)
@@ -91,7 +91,7 @@ impl GaussianProcess {
 
     /// Adds a figure as expected at a place that is to be measured.
     pub fn expect_at(self, place: &[f64], uncertainty: f64) -> Option<Self> {
-        let (value, _) = self.predict(place);
+        let (value, _) = self.predict_figure(place);
         let mut known = self.known;
         known.push(KnownFigure { place: place.to_vec(), value, uncertainty, is_measured: true });
         Self::with_scale(known, [self.variance, self.difference_variance], self.length_scale)
@@ -115,13 +115,13 @@ mod tests {
     #[test]
     fn figures_are_known_where_they_are_and_unknown_in_gaps() {
         let all: Vec<_> = [0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.9, 0.95, 1.0].map(|at| known(at, 1e-3)).to_vec();
-        let process = GaussianProcess::fit(&all, 0.0).expect("a fit");
-        let (value, deviation) = process.predict(&[0.2]);
+        let process = GaussianProcess::fit_figures(&all, 0.0).expect("a fit");
+        let (value, deviation) = process.predict_figure(&[0.2]);
         assert!((value - 1.2f64.sin()).abs() < 0.01 && deviation < 0.01, "{value} {deviation}");
-        let (_, within_gap) = process.predict(&[0.6]);
+        let (_, within_gap) = process.predict_figure(&[0.6]);
         assert!(within_gap > 10.0 * deviation, "{within_gap}");
         let filled = process.expect_at(&[0.6], 1e-3).expect("a fit");
-        assert!(filled.predict(&[0.6]).1 < 0.1 * within_gap);
+        assert!(filled.predict_figure(&[0.6]).1 < 0.1 * within_gap);
     }
 
     // However many simulated panels lie there, their common error stays; what is expected is what they say, until a
@@ -130,19 +130,19 @@ mod tests {
     fn errors_of_simulations_do_not_average_out() {
         let simulated = |n: usize| KnownFigure { is_measured: false, ..known(n as f64 / 40.0, 0.05) };
         let mut all: Vec<_> = (0..40).map(simulated).collect();
-        let process = GaussianProcess::fit(&all, 0.3).expect("a fit");
-        let (value, deviation) = process.predict(&[0.5]);
+        let process = GaussianProcess::fit_figures(&all, 0.3).expect("a fit");
+        let (value, deviation) = process.predict_figure(&[0.5]);
         assert!((value - 3.0f64.sin()).abs() < 0.05 && (0.29..0.32).contains(&deviation), "{value} {deviation}");
         let measured = known(0.5, 0.05);
         all.push(KnownFigure { value: measured.value - 0.4, ..measured });
-        let (value, deviation) = GaussianProcess::fit(&all, 0.3).expect("a fit").predict(&[0.5]);
+        let (value, deviation) = GaussianProcess::fit_figures(&all, 0.3).expect("a fit").predict_figure(&[0.5]);
         assert!((value - 3.0f64.sin() + 0.4).abs() < 0.05 && deviation < 0.06, "{value} {deviation}");
     }
 
     #[test]
     fn too_little_gives_no_process() {
-        assert!(GaussianProcess::fit(&[known(0.1, 0.1), known(0.5, 0.1)], 0.0).is_none());
+        assert!(GaussianProcess::fit_figures(&[known(0.1, 0.1), known(0.5, 0.1)], 0.0).is_none());
         let same = KnownFigure { value: 1.0, ..known(0.2, 0.1) };
-        assert!(GaussianProcess::fit(&[same.clone(), same.clone(), same], 0.0).is_none());
+        assert!(GaussianProcess::fit_figures(&[same.clone(), same.clone(), same], 0.0).is_none());
     }
 }

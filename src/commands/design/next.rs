@@ -9,8 +9,8 @@ use serde::Serialize;
 
 use super::gaussian_process::{GaussianProcess, KnownFigure};
 use super::measured::MeasuredPanel;
-use super::report::{LEAST_DISTANCE, MEAN_ERROR_DB};
-use super::search::DesignCandidate;
+use super::report::MEAN_ERROR_DB;
+use super::search::{DesignCandidate, differing_candidates};
 use super::target::DesignTarget;
 
 /// Standard uncertainty of a level over Flat that is measured, dB.
@@ -31,7 +31,7 @@ const ROOT_STEPS: usize = 60;
 #[derive(Debug, Serialize)]
 pub(super) struct NextPanel {
     pub parameters: serde_json::Value,
-    /// What its measurement tells of the levels of all bands, bits.
+    /// Information that its measurement gives of the levels of all bands, bits.
     pub information_bits: f64,
     /// Level over Flat that is expected in each band, dB, and its standard deviation.
     pub expected_db: Vec<[f64; 2]>,
@@ -47,7 +47,8 @@ pub(super) fn propose_panels(
 ) -> anyhow::Result<Vec<NextPanel>> {
     let measured: Vec<_> =
         measured.iter().filter_map(|panel| Some((target.place_of(&panel.relief, &panel.parameters)?, panel))).collect();
-    let simulated = thin_candidates(target, candidates);
+    // The simulation has the same error for panels that are alike, so two of them tell no more than one does.
+    let simulated = differing_candidates(target, candidates, MOST_SIMULATED);
     eprintln!(
         "within the ranges: {} surfaces of the lake, {} simulated panels that differ",
         measured.len(),
@@ -66,7 +67,7 @@ pub(super) fn propose_panels(
             Some(KnownFigure { place: place.clone(), value, uncertainty: MEASURED_U_DB, is_measured: true })
         });
         let known: Vec<_> = simulated.chain(found).collect();
-        GaussianProcess::fit(&known, difference_db).with_context(|| {
+        GaussianProcess::fit_figures(&known, difference_db).with_context(|| {
             format!(
                 "{} panels tell nothing of the gaps between them, expected three that differ; hint: run the \
                  search, with more candidates or wider ranges",
@@ -80,7 +81,8 @@ pub(super) fn propose_panels(
     let mut found = Vec::new();
     for _ in 0..count {
         let information = |place: &[f64]| -> f64 {
-            let bits = |process: &GaussianProcess| (process.predict(place).1 / MEASURED_U_DB).powi(2).ln_1p() / 2.0;
+            let bits =
+                |process: &GaussianProcess| (process.predict_figure(place).1 / MEASURED_U_DB).powi(2).ln_1p() / 2.0;
             processes.iter().map(bits).sum::<f64>() / std::f64::consts::LN_2
         };
         let told = places.iter().map(|values| information(&target.coordinates_of(values)));
@@ -92,7 +94,11 @@ pub(super) fn propose_panels(
         found.push(NextPanel {
             parameters: relief.to_json(),
             information_bits,
-            expected_db: processes.iter().map(|process| process.predict(place)).map(|(mean, s)| [mean, s]).collect(),
+            expected_db: processes
+                .iter()
+                .map(|process| process.predict_figure(place))
+                .map(|(mean, s)| [mean, s])
+                .collect(),
         });
         processes = processes
             .into_iter()
@@ -100,18 +106,6 @@ pub(super) fn propose_panels(
             .collect::<anyhow::Result<Vec<_>>>()?;
     }
     Ok(found)
-}
-
-// Those that are apart: the simulation has the same error for panels that are alike, so two of them tell what one does.
-fn thin_candidates<'a>(target: &DesignTarget, candidates: &'a [DesignCandidate]) -> Vec<&'a DesignCandidate> {
-    let mut kept: Vec<&DesignCandidate> = Vec::new();
-    for candidate in candidates {
-        let is_apart = kept.iter().all(|other| target.distance(&other.values, &candidate.values) >= LEAST_DISTANCE);
-        if is_apart && kept.len() < MOST_SIMULATED {
-            kept.push(candidate);
-        }
-    }
-    kept
 }
 
 // Evenly from the ranges. Coarse heights tell a depth well enough.

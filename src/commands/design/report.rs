@@ -1,4 +1,4 @@
-//! What a design found: panels that were simulated at all pairs, and the files of them.
+//! Panels that a design found, which were simulated at all pairs, and their files.
 
 use std::hash::{DefaultHasher, Hash as _, Hasher as _};
 use std::path::Path;
@@ -15,8 +15,9 @@ use echolake_schema::{Grid, Rig, SurfaceId};
 use serde::Serialize;
 use serde_json::json;
 
+use super::super::write_whole_file;
 use super::measured::MeasuredPanel;
-use super::search::DesignCandidate;
+use super::search::{DesignCandidate, differing_candidates};
 use super::target::{DesignGoal, DesignTarget, FigureKind};
 
 /// Phase of a relief's details, rad, over which single pairs of the simulation are off by 0.9 dB or more.
@@ -26,9 +27,6 @@ const TRUSTED_PHASE: f64 = 0.18;
 /// Error of a band's mean level under that phase and over it, dB: root mean square over the reliefs of that table; at
 /// most it is 0.31 and 1.2 dB.
 pub(super) const MEAN_ERROR_DB: [f64; 2] = [0.12, 0.58];
-/// Distance of panels that count as different, as a share of a parameter's range.
-pub(super) const LEAST_DISTANCE: f64 = 0.05;
-
 /// Candidates that are simulated at all pairs, if fewer panels are kept: at few pairs their order is uncertain.
 const FINALISTS: usize = 10;
 
@@ -86,12 +84,12 @@ impl FoundPanel {
     }
 
     /// Returns what is said of it.
-    pub fn report(&self, target: &DesignTarget, bands: &[String]) -> PanelReport {
+    pub fn make_report(&self, target: &DesignTarget, bands: &[String]) -> PanelReport {
         let goal_row = |goal: &DesignGoal| GoalRow {
-            figure: goal.describe(bands),
+            figure: goal.describe_goal(bands),
             target: goal.value,
             found: goal.figure_of(&self.figures.bands),
-            deviation: goal.deviation(&self.figures.bands),
+            deviation: goal.figure_deviation(&self.figures.bands),
             simulation_error_db: (goal.kind == FigureKind::Level).then(|| self.mean_error_db(goal.band)),
             is_trusted: self.is_trusted(goal.band),
         };
@@ -112,7 +110,7 @@ impl FoundPanel {
             origin: "simulated",
             relief: self.relief.to_json(),
             misfit: self.misfit,
-            misfit_of_search: target.misfit(&self.searched.bands),
+            misfit_of_search: target.figures_misfit(&self.searched.bands),
             level_deviation_db: target.level_misfit_db(&self.figures, |_| true),
             trusted_level_deviation_db: target.level_misfit_db(&self.figures, |band| self.is_trusted(band)),
             goals: target.goals.iter().map(goal_row).collect(),
@@ -128,15 +126,7 @@ pub(super) fn find_panels(
     whole: &DesignSimulation,
     rig: &Rig,
 ) -> anyhow::Result<Vec<FoundPanel>> {
-    let mut chosen: Vec<&DesignCandidate> = Vec::new();
-    for candidate in candidates {
-        if chosen.iter().all(|other| target.distance(&other.values, &candidate.values) >= LEAST_DISTANCE) {
-            chosen.push(candidate);
-        }
-        if chosen.len() == target.best.max(FINALISTS) {
-            break;
-        }
-    }
+    let chosen = differing_candidates(target, candidates, target.best.max(FINALISTS));
     let simulated: Vec<anyhow::Result<FoundPanel>> = thread::scope(|scope| {
         let threads: Vec<_> =
             chosen.iter().map(|candidate| scope.spawn(|| simulate_panel(target, candidate, whole, rig))).collect();
@@ -164,7 +154,7 @@ fn simulate_panel(
     let sound_mm_s = 1e3 * ReferenceAir::from_response(&rig.impulse_response).speed_of_sound();
     Ok(FoundPanel {
         name: String::new(),
-        misfit: target.misfit(&figures.bands),
+        misfit: target.figures_misfit(&figures.bands),
         detail_phases: rig.bands.centres_hz.iter().map(|hz| heights.detail_phase(sound_mm_s / hz)).collect(),
         has_steep_facets: rig.simulation.steep_facets,
         searched: candidate.clone(),
@@ -182,13 +172,13 @@ pub(super) fn write_panel(
     grid: &Grid,
 ) -> anyhow::Result<()> {
     let name = &panel.name;
-    write_file(&folder.join(format!("{name}.json")), &serde_json::to_vec_pretty(&panel.relief.to_json())?)?;
+    write_whole_file(&folder.join(format!("{name}.json")), &serde_json::to_vec_pretty(&panel.relief.to_json())?)?;
     let cells = super::super::panel::mesh_cells(&panel.relief);
     let mesh = Mesh::from_height_field(&panel.relief.height_field(cells), BACK_MM);
-    write_file(&folder.join(format!("{name}.stl")), &mesh.to_bytes(MeshFormat::Stl))?;
+    write_whole_file(&folder.join(format!("{name}.stl")), &mesh.to_bytes(MeshFormat::Stl))?;
     let microphone = grid.central_point().context("the grid has no points")?.id.index();
     let mut levels_db = vec![vec![None; grid.points().len()]; panel.figures.levels_db.len()];
-    for (at, pair) in whole.pairs().enumerate() {
+    for (at, pair) in whole.chosen_pairs().enumerate() {
         let ends = [pair.microphone.index(), pair.speaker.index()];
         // By reciprocity, a pair counts in both directions.
         let Some(end) = ends.iter().position(|end| *end == microphone) else { continue };
@@ -212,7 +202,7 @@ pub(super) fn write_panel(
     };
     let at = grid.points()[microphone].label();
     let title = format!("Simulated levels over Flat in the same band, dB, microphone at {at}");
-    write_file(&folder.join(format!("{name}.svg")), figure.draw(&simulated_notes(title)).to_svg().as_bytes())
+    write_whole_file(&folder.join(format!("{name}.svg")), figure.draw(&simulated_notes(title)).to_svg().as_bytes())
 }
 
 /// Notes of a figure of simulated numbers alone.
@@ -233,7 +223,7 @@ pub(super) fn write_search(
 ) -> anyhow::Result<()> {
     let [x, y] = shown_goals(target);
     let front = pareto_front(candidates.iter().map(|candidate| {
-        [&x, &y].map(|goal| [goal.figure_of(&candidate.bands), goal.deviation(&candidate.bands).abs()])
+        [&x, &y].map(|goal| [goal.figure_of(&candidate.bands), goal.figure_deviation(&candidate.bands).abs()])
     }));
     let point = |name: &str, kind: &str, position: [f64; 2]| MapPosition {
         name: name.to_owned(),
@@ -262,9 +252,9 @@ pub(super) fn write_search(
         command: "echolake design".to_owned(),
         ..FigureNotes::of_lake(String::new(), origins)
     };
-    let plane = MapPlane::Figures { titles: [x.describe(bands), y.describe(bands)], front };
+    let plane = MapPlane::Figures { titles: [x.describe_goal(bands), y.describe_goal(bands)], front };
     let figure = MapFigure { positions, plane, width_px: 720.0 };
-    write_file(&folder.join("search.svg"), figure.draw(&notes).to_svg().as_bytes())
+    write_whole_file(&folder.join("search.svg"), figure.draw(&notes).to_svg().as_bytes())
 }
 
 // The two goals of the greatest weights; beside a single one, another figure of its band, without a target.
@@ -332,15 +322,11 @@ pub(super) fn write_campaign(
     });
     let text = toml::to_string(&campaign)?;
     let head = "# Written by `echolake design`: measures the panels that it found. What it expects is simulated.\n";
-    write_file(&folder.join("campaign.toml"), format!("{head}{text}").as_bytes())
+    write_whole_file(&folder.join("campaign.toml"), format!("{head}{text}").as_bytes())
 }
 
 fn round_level(level_db: f64) -> f64 {
     (100.0 * level_db).round() / 100.0
-}
-
-pub(super) fn write_file(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
-    std::fs::write(path, bytes).with_context(|| format!("cannot write `{}`", path.display()))
 }
 
 #[cfg(test)]

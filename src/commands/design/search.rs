@@ -22,6 +22,8 @@ use crate::signals::StopRequest;
 const WIDE_STEP: f64 = 0.3;
 const NARROW_STEP: f64 = 0.1;
 const LAST_STEP: f64 = 2e-3;
+/// Distance of panels that count as different, as a share of a parameter's range.
+const LEAST_DISTANCE: f64 = 0.05;
 /// Ratio of the golden section: multiples of it spread over the ranges.
 const GOLDEN_RATIO: f64 = 0.618_033_988_749_894_9;
 /// Misfit of a panel that cannot be printed, to which the distance to the ranges is added.
@@ -49,7 +51,8 @@ pub(super) struct DesignSearch<'a> {
 struct SearchState {
     candidates: Vec<DesignCandidate>,
     by_values: HashMap<Vec<String>, usize>,
-    /// What all pairs add to the figures of those of the search, by band; nothing before a panel was simulated at all.
+    /// Difference of the figures at all pairs from those at the pairs of the search, by band; nothing before a panel
+    /// was simulated at all pairs.
     corrections: Vec<BandFigures>,
     file: File,
     progress: TaskProgress,
@@ -62,7 +65,7 @@ struct SearchState {
 
 impl<'a> DesignSearch<'a> {
     /// Opens the file of candidates, behind those of before.
-    pub fn open(
+    pub fn open_file(
         path: &Path,
         header: &str,
         candidates: Vec<DesignCandidate>,
@@ -116,7 +119,7 @@ impl<'a> DesignSearch<'a> {
         );
         let mut candidates = state.candidates;
         candidates.iter_mut().for_each(|candidate| add_figures(&mut candidate.bands, &state.corrections));
-        let misfit = |candidate: &DesignCandidate| self.target.misfit(&candidate.bands);
+        let misfit = |candidate: &DesignCandidate| self.target.figures_misfit(&candidate.bands);
         // Threads end in any order; values decide among those that fit alike.
         candidates.sort_by(|a, b| misfit(a).total_cmp(&misfit(b)).then_with(|| a.values.cmp(&b.values)));
         state.progress.finish_with(format!("{} panels simulated", candidates.len()));
@@ -209,7 +212,7 @@ impl<'a> DesignSearch<'a> {
                 self.lock_state().add_candidate(DesignCandidate { values: values.clone(), bands: figures.bands })?
             }
         };
-        let misfit = self.target.misfit(&figures);
+        let misfit = self.target.figures_misfit(&figures);
         let mut state = self.lock_state();
         let is_better = |(best, of): &(f64, Vec<String>)| misfit < *best || (misfit == *best && values < *of);
         if state.best.as_ref().is_none_or(is_better) {
@@ -247,6 +250,24 @@ fn add_figures(bands: &mut [BandFigures], corrections: &[BandFigures]) {
         band.spread_db += correction.spread_db;
         band.scattering.value += correction.scattering.value;
     }
+}
+
+/// Returns the first candidates that differ from each other, in their order and at most so many.
+pub(super) fn differing_candidates<'a>(
+    target: &DesignTarget,
+    candidates: &'a [DesignCandidate],
+    most: usize,
+) -> Vec<&'a DesignCandidate> {
+    let mut chosen: Vec<&DesignCandidate> = Vec::new();
+    for candidate in candidates {
+        if chosen.len() == most {
+            break;
+        }
+        if chosen.iter().all(|other| target.panel_distance(&other.values, &candidate.values) >= LEAST_DISTANCE) {
+            chosen.push(candidate);
+        }
+    }
+    chosen
 }
 
 /// Reads the candidates of a folder; none if it has no search.

@@ -226,7 +226,7 @@ impl DesignTarget {
     }
 
     /// Returns how far two panels are from each other: the greatest share of a range, 1 for other words.
-    pub fn distance(&self, values: &[String], others: &[String]) -> f64 {
+    pub fn panel_distance(&self, values: &[String], others: &[String]) -> f64 {
         let shares = [values, others].map(|values| self.shares_of(values));
         let parts = self.ranges.iter().zip(shares[0].iter().zip(&shares[1]));
         let parts = parts.map(|((_, range), (share, other))| match range {
@@ -278,16 +278,16 @@ impl DesignTarget {
     }
 
     /// Returns how far figures are from the target: weighted root mean square of the deviations, 1 dB of a level each.
-    pub fn misfit(&self, bands: &[BandFigures]) -> f64 {
+    pub fn figures_misfit(&self, bands: &[BandFigures]) -> f64 {
         let weights: f64 = self.goals.iter().map(|goal| goal.weight).sum();
-        let sum: f64 = self.goals.iter().map(|goal| goal.weight * goal.deviation(bands).powi(2)).sum();
+        let sum: f64 = self.goals.iter().map(|goal| goal.weight * goal.figure_deviation(bands).powi(2)).sum();
         (sum / weights).sqrt()
     }
 
     /// Returns the root mean square of the levels' deviations over bands that `is_counted`, dB; None if there is none.
     pub fn level_misfit_db(&self, figures: &PanelFigures, is_counted: impl Fn(usize) -> bool) -> Option<f64> {
         let levels = self.goals.iter().filter(|goal| goal.kind == FigureKind::Level && is_counted(goal.band));
-        let squares: Vec<f64> = levels.map(|goal| goal.deviation(&figures.bands).powi(2)).collect();
+        let squares: Vec<f64> = levels.map(|goal| goal.figure_deviation(&figures.bands).powi(2)).collect();
         (!squares.is_empty()).then(|| (squares.iter().sum::<f64>() / squares.len() as f64).sqrt())
     }
 }
@@ -335,7 +335,7 @@ impl DesignGoal {
     }
 
     /// Returns the deviation of a panel, in units that count as much as 1 dB of a level.
-    pub fn deviation(&self, bands: &[BandFigures]) -> f64 {
+    pub fn figure_deviation(&self, bands: &[BandFigures]) -> f64 {
         let unit = match self.kind {
             FigureKind::Level => 1.0,
             FigureKind::Spread => SPREAD_UNIT_DB,
@@ -345,7 +345,7 @@ impl DesignGoal {
     }
 
     /// Returns its name, for a table or an axis.
-    pub fn describe(&self, bands: &[String]) -> String {
+    pub fn describe_goal(&self, bands: &[String]) -> String {
         let band = &bands[self.band];
         match self.kind {
             FigureKind::Level => format!("level over Flat, {band} Hz, dB"),
@@ -381,9 +381,9 @@ mod tests {
             spread_db: 0.0,
             scattering: UncertainNumber { value: scattering, uncertainty: None },
         };
-        assert_eq!(target.misfit(&[figures(-1.0, 0.0), figures(9.0, 0.5)]), 0.0);
+        assert_eq!(target.figures_misfit(&[figures(-1.0, 0.0), figures(9.0, 0.5)]), 0.0);
         // 2 dB once, and 0.1 thrice.
-        let misfit = target.misfit(&[figures(1.0, 0.0), figures(0.0, 0.6)]);
+        let misfit = target.figures_misfit(&[figures(1.0, 0.0), figures(0.0, 0.6)]);
         assert!((misfit - (7.0f64 / 4.0).sqrt()).abs() < 1e-9, "{misfit}");
         assert_eq!(target.values_at(&[0.5]).expect("values"), ["60"]);
         assert_eq!(target.values_at(&[7.0]).expect("values"), ["100"]);

@@ -126,16 +126,11 @@ fn path_extension(path: &Path) -> &str {
     path.extension().and_then(|extension| extension.to_str()).unwrap_or("")
 }
 
-// Written beside its path first, so that a file is whole or not there.
 fn write_file(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
-    let failed = || format!("cannot write `{}`", path.display());
     if let Some(folder) = path.parent() {
-        std::fs::create_dir_all(folder).with_context(failed)?;
+        std::fs::create_dir_all(folder).with_context(|| format!("cannot write `{}`", path.display()))?;
     }
-    let mut partial = path.as_os_str().to_owned();
-    partial.push(".partial");
-    std::fs::write(&partial, bytes).with_context(failed)?;
-    std::fs::rename(&partial, path).with_context(failed)?;
+    super::super::write_whole_file(path, bytes)?;
     eprintln!("{}: {}", path.display(), super::super::format_size(bytes.len() as u64));
     Ok(())
 }

@@ -88,8 +88,7 @@ struct Stone {
     middle: [f64; 2],
     /// From its middle to its border, mm, as its outline measures it.
     radius: f64,
-    /// How fast the difference of the squared distances to it and to each stone around grows across their border,
-    /// per mm.
+    /// Growth of the difference of the squared distances to it and to each stone around, across their border, per mm.
     slopes: [f64; TABLE_WIDTH * TABLE_WIDTH],
 }
 

@@ -53,8 +53,8 @@ static NORMALISED: FunctionDescription = FunctionDescription {
     family: FunctionFamily::Comparison,
     about: "Diffusion coefficient d of a surface, normalised by that of a flat panel of the same size, without unit: \
             (d - d_flat) / (1 - d_flat), each by diffusion(), as ISO 17497-2 defines it for receivers in the far \
-            field. 0 is as even as the flat panel, negative less even. Null where one of them is null, or the flat panel's \
-            is 1. Columns diffusion_normalised_* of surfaces have it for reliefs, computed.",
+            field. 0 is as even as the flat panel, negative less even. Null where one of them is null, or the flat \
+            panel's is 1. Columns diffusion_normalised_* of surfaces have it for reliefs, computed.",
     parameters: &[
         FunctionParameter { name: "levels_db", kind: ArgumentKind::Samples, about: "levels over the surface, dB" },
         FunctionParameter {
