@@ -31,6 +31,7 @@ mod error;
 pub mod figure_rows;
 mod opaque;
 pub mod output;
+mod request_memory;
 mod session;
 mod statement;
 mod system;
@@ -42,6 +43,7 @@ pub use echolake_mcap_tables::{Attachment, Contents, Topic};
 pub use engine::{QueryEngine, SqlFunction};
 pub use error::{Error, QueryPlace};
 pub use opaque::OpaqueValue;
+pub use request_memory::RequestMemory;
 pub use session::{CancelHandle, ContextExtension, PreparedQuery, QueryAnswer, Session};
 pub use statement::{
     PredicateForm, check_statement_bounds, is_blank_statement, split_statement, walk_expr, walk_statement,

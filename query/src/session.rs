@@ -8,6 +8,7 @@ use bytes::Bytes;
 use datafusion::common::ParamValues;
 use datafusion::error::DataFusionError;
 use datafusion::execution::TaskContext;
+use datafusion::execution::memory_pool::MemoryPool;
 use datafusion::execution::session_state::SessionState;
 use datafusion::logical_expr::LogicalPlan;
 use datafusion::physical_plan::{ExecutionPlan, execute_stream};
@@ -25,6 +26,7 @@ use crate::client::{EngineClient, QueryPermit, QueryQuota};
 use crate::control::pool::PartialPool;
 use crate::control::{QueryTicket, StopReason};
 use crate::engine::{self, QueryEngine, SqlFunction};
+use crate::request_memory::RequestMemory;
 use crate::statement::{PredicateForm, append_predicate, parse_statement, prepare_statement};
 use crate::system::SYSTEM_SCHEMA;
 use crate::{Error, OpaqueValue};
@@ -329,6 +331,53 @@ impl Session {
     pub fn append_predicate(&self, select: &str, predicate: &str, form: PredicateForm) -> Result<String, Error> {
         append_predicate(select, predicate, form, |sql| self.parse_sql(sql))
     }
+
+    /// Runs other work of a client's request as a query runs: with one of the client's permits, within its time, on the
+    /// threads of queries, and with a share of its memory. Dropping it ends the work at its next await.
+    ///
+    /// ```
+    /// use echolake_lake::{Lake, ReferenceSurfaces};
+    /// use echolake_query::{EngineClient, Error, QueryEngine, QueryQuota};
+    /// use echolake_schema::Rig;
+    ///
+    /// # tokio::runtime::Runtime::new()?.block_on(async {
+    /// let lake = Lake::open_or_create("memory://", &Rig::paper(), &ReferenceSurfaces::default()).await?;
+    /// let client = EngineClient::new("guest", QueryQuota { memory: Some(1000), ..QueryQuota::default() });
+    /// let session = QueryEngine::new(&lake, None)?.open_session(&client.into());
+    /// let sum = session.run_request(|memory| async move { memory.reserve(900).map(|()| 1 + 1) }).await?;
+    /// assert_eq!(sum, 2);
+    /// let more = session.run_request(|memory| async move { memory.reserve(1001) }).await;
+    /// assert!(matches!(more, Err(Error::MemoryLimit { .. })));
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// # })?;
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
+    ///
+    /// # Errors
+    /// Those of `work`; [`Error::Busy`] if the client has no permit left, [`Error::TimeLimit`].
+    pub fn run_request<'a, T, E, F>(
+        &'a self,
+        work: impl FnOnce(RequestMemory) -> F + Send + 'a,
+    ) -> BoxFuture<'a, Result<T, E>>
+    where
+        T: Send + 'static,
+        E: From<Error> + Send + 'static,
+        F: Future<Output = Result<T, E>> + Send + 'static,
+    {
+        let run = async move {
+            let Started { ticket, place } = self.start_query()?;
+            let all = self.engine.template_state().runtime_env().memory_pool.clone();
+            let work = work(RequestMemory::new(&self.query_pool(all, &ticket)));
+            // The permit is released when the work has ended, even if the caller has left.
+            let work = async move {
+                let _place = place;
+                work.await
+            };
+            self.engine.on_threads(&ticket, work).await
+        };
+        run.boxed()
+    }
+
     // The query's timeout starts here and includes waiting.
     fn start_query(&self) -> Result<Started, Error> {
         let place = self.client.acquire_place()?;
@@ -400,10 +449,15 @@ impl Session {
     // As DataFusion builds it, except for the memory pool.
     fn task_context(&self, state: &SessionState, ticket: &Arc<QueryTicket>) -> Arc<TaskContext> {
         let mut runtime = state.runtime_env().as_ref().clone();
-        let limit = self.engine.memory_limit(self.client.quota());
-        let pool = self.client.memory_pool(runtime.memory_pool);
-        runtime.memory_pool = Arc::new(PartialPool::new(pool, "the query holds", limit, ticket.held_memory().clone()));
+        runtime.memory_pool = self.query_pool(runtime.memory_pool, ticket);
         Arc::new(TaskContext::from(state).with_runtime(Arc::new(runtime)))
+    }
+
+    // The share of all memory that one query of the client may use.
+    fn query_pool(&self, all: Arc<dyn MemoryPool>, ticket: &QueryTicket) -> Arc<dyn MemoryPool> {
+        let limit = self.engine.memory_limit(self.client.quota());
+        let pool = self.client.memory_pool(all);
+        Arc::new(PartialPool::new(pool, "the query holds", limit, ticket.held_memory().clone()))
     }
 
     /// Returns the current snapshot of the lake, which a query started now would see; cached until something changes.

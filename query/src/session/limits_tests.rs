@@ -75,6 +75,46 @@ async fn time_rows_and_places_are_limited() {
     }
 }
 
+/// E3: work that is no query has the limits of one.
+#[tokio::test]
+async fn a_request_is_limited_as_a_query() {
+    let (_folder, engine) = engine(Some(32 << 20)).await;
+    let quota = QueryQuota { time: Some(Duration::from_millis(100)), concurrent: Some(1), ..QueryQuota::default() };
+    let brief = session(&engine, quota);
+    let ended = brief.run_request(|_| std::future::pending::<Result<(), Error>>()).await;
+    assert!(matches!(ended, Err(Error::TimeLimit { .. })), "{ended:?}");
+    let alone = session(&engine, QueryQuota { concurrent: Some(1), ..QueryQuota::default() });
+    let (begin, mut begun) = mpsc::channel(1);
+    let (end, mut ended) = mpsc::channel::<()>(1);
+    let work = move |memory: RequestMemory| async move {
+        memory.reserve(20 << 20)?;
+        begin.send(()).await.expect("somebody waits");
+        let _end = end;
+        std::future::pending::<Result<(), Error>>().await
+    };
+    let other = session(&engine, QueryQuota::default());
+    {
+        let running = alone.run_request(work);
+        tokio::pin!(running);
+        tokio::select! {
+            done = &mut running => panic!("it does not end: {done:?}"),
+            _ = begun.recv() => {}
+        }
+        assert_eq!(engine.count_running(), 1);
+        assert!(matches!(alone.query("select 1").await, Err(Error::Busy { limit: 1, .. })));
+        let held = other.run_request(|memory| async move { memory.reserve(20 << 20) }).await;
+        assert!(matches!(held, Err(Error::MemoryLimit { .. })), "{held:?}");
+    }
+    // Its client left: the work is dropped, and with it what it held.
+    assert_eq!(tokio::time::timeout(END_LIMIT, ended.recv()).await.expect("in time"), None);
+    other.run_request(|memory| async move { memory.reserve(20 << 20) }).await.expect("it is free");
+    let begun = Instant::now();
+    while alone.query("select 1").await.is_err() {
+        assert!(begun.elapsed() < END_LIMIT, "the place of a dropped request never came back");
+        tokio::time::sleep(Duration::from_millis(10)).await;
+    }
+}
+
 #[tokio::test]
 async fn memory_is_limited() {
     let (_folder, engine) = engine(Some(32 << 20)).await;

@@ -109,6 +109,14 @@ pub enum RequestFault {
         /// Maximal size in bytes.
         limit: usize,
     },
+    /// The request has more of something than is taken at once.
+    #[error("the request has more than {limit} {what}; hint: send it in several requests")]
+    TooMuch {
+        /// Of what.
+        what: &'static str,
+        /// The limit.
+        limit: usize,
+    },
     /// No token, or a wrong one.
     #[error("a valid token is needed; hint: `Authorization: Bearer TOKEN`, or the token as password")]
     Unauthenticated,
@@ -408,7 +416,7 @@ impl RequestFault {
             Self::Method => FaultCode::Method,
             Self::Precondition { .. } => FaultCode::Precondition,
             Self::Range { .. } => FaultCode::Range,
-            Self::TooLarge { .. } => FaultCode::TooLarge,
+            Self::TooLarge { .. } | Self::TooMuch { .. } => FaultCode::TooLarge,
             Self::Unauthenticated => FaultCode::Unauthenticated,
             Self::Forbidden { .. } => FaultCode::Forbidden,
             Self::Foreign { .. } => FaultCode::Foreign,

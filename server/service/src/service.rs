@@ -8,7 +8,7 @@ use std::time::Duration;
 use arrow::datatypes::SchemaRef;
 use datafusion::common::ParamValues;
 use echolake_lake::Lake;
-use echolake_query::{EngineClient, PreparedQuery, QueryEngine, QueryThreads, Session, SqlFunction};
+use echolake_query::{EngineClient, PreparedQuery, QueryEngine, QueryThreads, RequestMemory, Session, SqlFunction};
 use futures::future::BoxFuture;
 use futures::{FutureExt as _, TryFutureExt as _};
 use tokio::sync::{mpsc, oneshot};
@@ -254,6 +254,40 @@ impl QueryService {
         let work = work.in_current_span();
         let planned = async move { self.0.engine.supervise_work(time, work).await };
         planned.inspect_err(EngineReport::record_failure).boxed()
+    }
+
+    /// Does the work of a request that is no query as a query is run: with one of the client's permits, within its time
+    /// and memory, listed in `system.queries` as `listed_as` and cancelled by its number there, or by dropping this.
+    /// Boxed as [`QueryService::plan_query`].
+    ///
+    /// # Errors
+    /// Those of `work`, and what ended it.
+    pub fn run_request<T: Send + 'static, F>(
+        &self,
+        protocol: ServerProtocol,
+        client: &Arc<EngineClient>,
+        listed_as: &'static str,
+        work: impl FnOnce(RequestMemory) -> F + Send + 'static,
+    ) -> BoxFuture<'static, Result<T, RequestFault>>
+    where
+        F: Future<Output = Result<T, RequestFault>> + Send + 'static,
+    {
+        let service = self.clone();
+        let session = self.begin_session(client);
+        let span = tracing::error_span!("query", protocol = protocol.name(), client = self.0.identity.name);
+        let run = async move {
+            let _guard = service.0.activity.begin_work();
+            let stop = StopSignal::new();
+            let timer = service.watch_query(protocol, listed_as, &stop);
+            let done = tokio::select! {
+                biased;
+                () = stop.wait_for_stop() => Err(RequestFault::Cancelled),
+                done = session.run_request(|memory| work(memory).in_current_span()) => done,
+            };
+            timer.watch().record_outcome(done.as_ref().err());
+            done.inspect_err(EngineReport::record_failure)
+        };
+        run.instrument(span).boxed()
     }
 
     /// Computes something long, which waits for nothing.
