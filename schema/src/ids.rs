@@ -68,6 +68,9 @@ pub struct PairId(pub u32);
 pub struct PointId(pub u32);
 
 impl SurfaceId {
+    /// Characters of the longest name, each of one byte.
+    pub const LONGEST: usize = SURFACE_MAX;
+
     /// The physical panel that the surface is a side of: `0016` for `panel_0016_r180_0`, else the whole name.
     pub fn panel(&self) -> &str {
         self.split_name().map_or(&self.0, |(panel, _)| panel)

@@ -1,6 +1,6 @@
 //! `POST /api/v1/annotations`: labels, verdicts and notes.
 
-use std::collections::{BTreeSet, HashMap};
+use std::collections::{BTreeSet, HashMap, HashSet};
 
 use axum::Json;
 use axum::extract::State;
@@ -9,17 +9,22 @@ use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use bytes::Bytes;
 use chrono::Utc;
-use echolake_schema::RunId;
+use echolake_query::RequestMemory;
 use echolake_schema::annotations::{Annotation, AnnotationKind};
-use echolake_service::{ContributionDraft, RequestFault, TokenScope};
+use echolake_schema::{Grid, RunId};
+use echolake_service::{ContributionDraft, RequestFault};
 use serde::Deserialize;
 use utoipa::ToSchema;
 use uuid::Uuid;
 
 use super::super::catalogue::LakeCatalogue;
 use super::super::problem::ProblemResponse;
-use super::super::sql::whole_body;
-use super::choose_author;
+use super::{choose_author, with_request_ticket};
+
+/// Most pairs of all annotations of a request, of which a region may have all of the grid's.
+const MOST_PAIRS: usize = 500_000;
+/// Bytes of a pair while it is expanded and encoded.
+const BYTES_PER_PAIR: usize = 32;
 
 /// Annotations of one request: all of them are stored, or none.
 #[derive(Deserialize, ToSchema)]
@@ -66,19 +71,26 @@ pub(super) async fn draft_annotations(
     State(catalogue): State<LakeCatalogue>,
     body: Result<Bytes, BytesRejection>,
 ) -> Result<Json<ContributionDraft>, ProblemResponse> {
-    catalogue.service().authorised_client(TokenScope::Annotate)?;
-    let request: AnnotationsRequest = serde_json::from_slice(&whole_body(body)?).map_err(|e| {
-        RequestFault::bad_request(format!(
-            "the body is not as expected: {e}; hint: {{\"annotations\": [{{\"run_id\": \"...\", \"pair_ids\": [7], \
-             \"kind\": \"verdict\", \"value\": \"rejected\", \"comment\": \"...\"}}]}}"
-        ))
-    })?;
-    Ok(Json(draft_request(&catalogue, request).await?))
+    let of = catalogue.clone();
+    let drafted = with_request_ticket(&catalogue, "(annotations that are sent)", body, move |body| async move {
+        let request: AnnotationsRequest = serde_json::from_slice(&body.bytes).map_err(|e| {
+            RequestFault::bad_request(format!(
+                "the body is not as expected: {e}; hint: {{\"annotations\": [{{\"run_id\": \"...\", \"pair_ids\": [7], \
+                 \"kind\": \"verdict\", \"value\": \"rejected\", \"comment\": \"...\"}}]}}"
+            ))
+        })?;
+        if request.annotations.len() > body.most_rows {
+            return Err(RequestFault::TooMuch { what: "annotations", limit: body.most_rows });
+        }
+        draft_request(&of, request, &body.memory).await
+    });
+    Ok(Json(drafted.await?))
 }
 
 async fn draft_request(
     catalogue: &LakeCatalogue,
     request: AnnotationsRequest,
+    memory: &RequestMemory,
 ) -> Result<ContributionDraft, RequestFault> {
     if request.annotations.is_empty() {
         return Err(RequestFault::bad_request("`annotations` is empty, expected one at least"));
@@ -91,15 +103,17 @@ async fn draft_request(
     let time = Utc::now();
     let lake_version = view.snapshot.lake_version().unwrap_or(0);
     let mut annotations = Vec::with_capacity(request.annotations.len());
-    for (i, new) in request.annotations.into_iter().enumerate() {
-        let failed = |defect: String| RequestFault::bad_request(format!("annotation {}: {defect}", i + 1));
+    let meant = meant_pairs(catalogue.lake().grid(), &request.annotations).await?;
+    memory.reserve(meant.iter().flatten().map(Vec::len).sum::<usize>() * BYTES_PER_PAIR)?;
+    for (i, (new, pair_ids)) in request.annotations.into_iter().zip(meant).enumerate() {
+        let failed = |defect: String| annotation_fault(i, &defect);
         let run_id = view.snapshot.run(&new.run_id.parse::<RunId>().map_err(|e| failed(e.to_string()))?);
         let run_id = run_id.map(|run| run.run.clone()).ok_or_else(|| {
             failed(format!("run `{}` is not there; hint: GET /api/v1/runs lists what there is", new.run_id))
         })?;
         let annotation = Annotation {
             number: last + 1,
-            pair_ids: meant_pairs(catalogue, &new).map_err(failed)?,
+            pair_ids,
             annotation_id: new.annotation_id.unwrap_or_else(|| Uuid::new_v4().to_string()),
             run_id,
             kind: new.kind,
@@ -142,8 +156,32 @@ fn annotation_key(annotation: &Annotation) -> (&str, &str) {
     (annotation.run_id.as_str(), &annotation.annotation_id)
 }
 
-// The pairs of the request, or of its region, ascending; None for the whole run.
-fn meant_pairs(catalogue: &LakeCatalogue, new: &NewAnnotation) -> Result<Option<Vec<u32>>, String> {
+fn annotation_fault(index: usize, defect: &str) -> RequestFault {
+    RequestFault::bad_request(format!("annotation {}: {defect}", index + 1))
+}
+
+// The pairs of each annotation. A small request can mean all pairs of the grid hundreds of times.
+async fn meant_pairs(grid: &Grid, annotations: &[NewAnnotation]) -> Result<Vec<Option<Vec<u32>>>, RequestFault> {
+    let mut meant = Vec::with_capacity(annotations.len());
+    let mut total = 0;
+    for (i, new) in annotations.iter().enumerate() {
+        let pairs = pairs_of_one(grid, new).map_err(|defect| annotation_fault(i, &defect))?;
+        total += pairs.as_ref().map_or(0, Vec::len);
+        if total > MOST_PAIRS {
+            return Err(RequestFault::TooMuch {
+                what: "pairs in its annotations and their regions",
+                limit: MOST_PAIRS,
+            });
+        }
+        meant.push(pairs);
+        // The request's time may end here: each region is compared with all pairs of the grid.
+        tokio::task::yield_now().await;
+    }
+    Ok(meant)
+}
+
+// The pairs of an annotation, or of its region, ascending; None for the whole run.
+fn pairs_of_one(grid: &Grid, new: &NewAnnotation) -> Result<Option<Vec<u32>>, String> {
     if new.microphones.is_none() && new.speakers.is_none() {
         let ids = new.pair_ids.as_ref().map(|ids| ids.iter().copied().collect::<BTreeSet<_>>());
         return Ok(ids.map(|ids| ids.into_iter().collect()));
@@ -151,7 +189,6 @@ fn meant_pairs(catalogue: &LakeCatalogue, new: &NewAnnotation) -> Result<Option<
     if new.pair_ids.is_some() {
         return Err("it has `pair_ids` and a region; hint: give one of them".to_owned());
     }
-    let grid = catalogue.lake().grid();
     for point in new.microphones.iter().chain(&new.speakers).flatten() {
         if *point as usize >= grid.points().len() {
             return Err(format!(
@@ -160,8 +197,48 @@ fn meant_pairs(catalogue: &LakeCatalogue, new: &NewAnnotation) -> Result<Option<
             ));
         }
     }
-    let is_of = |points: &Option<Vec<u32>>, point: u32| points.as_ref().is_none_or(|points| points.contains(&point));
+    let region = |points: &Option<Vec<u32>>| points.as_ref().map(|points| points.iter().copied().collect());
+    let [microphones, speakers]: [Option<HashSet<u32>>; 2] = [region(&new.microphones), region(&new.speakers)];
+    let is_of =
+        |points: &Option<HashSet<u32>>, point: u32| points.as_ref().is_none_or(|points| points.contains(&point));
     let pairs = grid.pairs().iter();
-    let meant = pairs.filter(|pair| is_of(&new.microphones, pair.microphone.0) && is_of(&new.speakers, pair.speaker.0));
-    Ok(Some(meant.map(|pair| pair.id.0).collect()))
+    let meant = pairs.filter(|pair| is_of(&microphones, pair.microphone.0) && is_of(&speakers, pair.speaker.0));
+    // One more than may be stored says enough.
+    Ok(Some(meant.map(|pair| pair.id.0).take(MOST_PAIRS + 1).collect()))
+}
+
+#[cfg(test)]
+mod tests {
+    use echolake_schema::Rig;
+    use echolake_service::FaultCode;
+    use serde_json::json;
+
+    use super::*;
+
+    async fn meant(region: &serde_json::Value, count: usize) -> Result<Vec<Option<Vec<u32>>>, RequestFault> {
+        let annotations = vec![region; count];
+        let request = json!({ "annotations": annotations }).to_string();
+        assert!(request.len() < 1 << 20, "it comes to an engine");
+        let request: AnnotationsRequest = serde_json::from_str(&request).expect("annotations");
+        meant_pairs(&Rig::paper().build_grid().expect("a grid"), &request.annotations).await
+    }
+
+    /// E8: a small request with many regions is stored, or refused with the limit before all of them are expanded.
+    #[tokio::test]
+    async fn the_pairs_of_all_regions_are_limited() {
+        let all = json!({ "run_id": "r", "kind": "note", "comment": "x", "microphones": (0..600).collect::<Vec<_>>() });
+        let one = json!({ "run_id": "r", "kind": "note", "comment": "x", "speakers": [0] });
+        let grid = Rig::paper().build_grid().expect("a grid");
+        let pairs: Vec<u32> = (0..2951).filter(|pair| grid.pairs()[*pair as usize].speaker.0 == 0).collect();
+        assert_eq!(meant(&one, 600).await.expect("stored"), vec![Some(pairs); 600]);
+        let points = grid.points().len();
+        let whole =
+            json!({ "run_id": "r", "kind": "note", "comment": "x", "speakers": (0..points).collect::<Vec<_>>() });
+        assert_eq!(meant(&whole, 1).await.expect("stored"), [Some((0..2951).collect())]);
+        let fault = meant(&whole, 600).await.expect_err("1.8 million pairs");
+        assert_eq!(fault.code(), FaultCode::TooLarge);
+        assert!(fault.to_string().contains("more than 500000 pairs in its annotations"), "{fault}");
+        let fault = meant(&all, 1).await.expect_err("no such points").to_string();
+        assert!(fault.contains("annotation 1: point"), "{fault}");
+    }
 }

@@ -2,21 +2,32 @@
 //! stores it.
 
 mod annotations;
+mod arrow_body;
+mod new_rows;
 mod predictions;
 
 use axum::Router;
+use axum::extract::rejection::BytesRejection;
 use axum::routing::post;
+use bytes::Bytes;
 use echolake_lake::ContributionLog;
-use echolake_service::{RequestFault, contribution_path};
+use echolake_query::RequestMemory;
+use echolake_service::{RequestFault, TokenScope, contribution_path};
 use serde::Serialize;
 use utoipa::ToSchema;
 
 use super::catalogue::LakeCatalogue;
+use super::request_protocol::request_protocol;
+use super::sql::whole_body;
 pub use annotations::AnnotationsRequest;
 pub use predictions::PredictionParams;
 
 /// Longest name of an author, in characters.
 const LONGEST_AUTHOR: usize = 100;
+
+/// Bytes that are reserved per byte of a request: its rows, read, sorted, compared with those that are stored, and
+/// encoded with the texts that all of them share.
+const MEMORY_PER_BYTE: usize = 64;
 
 /// What was stored.
 #[derive(Debug, Serialize, ToSchema)]
@@ -35,6 +46,36 @@ pub(super) fn draft_routes(catalogue: &LakeCatalogue) -> Router {
         .route(contribution_path(ContributionLog::Annotations), post(annotations::draft_annotations))
         .route(contribution_path(ContributionLog::Predictions), post(predictions::draft_predictions))
         .with_state(catalogue.clone())
+}
+
+/// A request's body, and what its work may have.
+struct RequestBody {
+    bytes: Bytes,
+    /// Most rows of a request of this client.
+    most_rows: usize,
+    /// What this holds is the request's until it is dropped.
+    memory: RequestMemory,
+}
+
+// Checks what a client sends under the limits of its queries: its permits, time, memory and rows. Leaving ends it.
+async fn with_request_ticket<T: Send + 'static, F>(
+    catalogue: &LakeCatalogue,
+    listed_as: &'static str,
+    body: Result<Bytes, BytesRejection>,
+    work: impl FnOnce(RequestBody) -> F + Send + 'static,
+) -> Result<T, RequestFault>
+where
+    F: Future<Output = Result<T, RequestFault>> + Send + 'static,
+{
+    let service = catalogue.service();
+    let client = service.authorised_client(TokenScope::Annotate)?;
+    let bytes = whole_body(body)?;
+    let most_rows = client.quota().rows.map_or(usize::MAX, |rows| usize::try_from(rows).unwrap_or(usize::MAX));
+    let run = move |memory: RequestMemory| async move {
+        memory.reserve(bytes.len().saturating_mul(MEMORY_PER_BYTE))?;
+        work(RequestBody { bytes, most_rows, memory }).await
+    };
+    service.run_request(request_protocol(), &client, listed_as, run).await
 }
 
 // With tokens the author is the token's name; without, who asks may say who they are.

@@ -4,7 +4,7 @@ use std::collections::HashMap;
 
 use arrow::array::{Array as _, AsArray as _, BooleanArray, Float64Array, Int32Array, StringArray};
 use arrow::compute::filter_record_batch;
-use arrow::datatypes::{DataType, Float64Type, Int32Type};
+use arrow::datatypes::{DataType, Int32Type};
 use arrow::record_batch::RecordBatch;
 use echolake_service::RequestFault;
 

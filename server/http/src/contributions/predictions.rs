@@ -7,9 +7,8 @@ use arrow::array::{
     Array as _, ArrayRef, AsArray as _, Float64Array, Int32Array, Int64Array, StringArray, TimestampMicrosecondArray,
     UInt32Array,
 };
-use arrow::compute::{SortColumn, cast, concat_batches, lexsort_to_indices, take};
-use arrow::datatypes::{DataType, Float64Type, Int32Type};
-use arrow::ipc::reader::StreamReader;
+use arrow::compute::{SortColumn, lexsort_to_indices, take};
+use arrow::datatypes::{Float64Type, Int32Type};
 use arrow::record_batch::RecordBatch;
 use axum::Json;
 use axum::extract::State;
@@ -21,26 +20,28 @@ use chrono::Utc;
 use echolake_lake::ContributionLog;
 use echolake_schema::SurfaceId;
 use echolake_schema::tables::{predicted_columns, prediction_schema};
-use echolake_service::{ContributionDraft, RequestFault, TokenScope};
+use echolake_service::{ContributionDraft, RequestFault};
 use parquet::arrow::ArrowWriter;
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 use parquet::basic::{Compression, ZstdLevel};
 use parquet::file::metadata::KeyValue;
 use parquet::file::properties::WriterProperties;
 use serde::{Deserialize, Serialize};
-use sha2::{Digest as _, Sha256};
 use utoipa::IntoParams;
 
 use super::super::catalogue::LakeCatalogue;
 use super::super::extract::QueryParams;
 use super::super::problem::ProblemResponse;
-use super::super::sql::whole_body;
-use super::choose_author;
+use super::arrow_body::{ColumnContent, ExpectedColumn, decode_arrow_body};
+use super::new_rows::select_new_rows;
+use super::{RequestBody, choose_author, with_request_ticket};
 
 /// Key of the file's metadata that holds its [`PredictionRecord`].
 const RECORD: &str = "echolake.predictions";
 /// Longest name of a model or a version, in characters.
 const LONGEST: usize = 64;
+/// Most rows of a request: more than 1 MiB holds with values in double precision.
+const MOST_ROWS: usize = 100_000;
 
 /// The parameters after the path's `?`.
 #[derive(Deserialize, IntoParams)]
@@ -56,14 +57,12 @@ pub struct PredictionParams {
     author: Option<String>,
 }
 
-/// Contents of a stored file: model, surfaces and a digest.
+/// What a stored file has: model, version and surfaces.
 #[derive(Debug, PartialEq, Eq, Serialize, Deserialize)]
 struct PredictionRecord {
     model: String,
     version: String,
     surfaces: BTreeSet<String>,
-    /// SHA-256 of keys and values.
-    digest: String,
 }
 
 /// Checks the predictions of a request.
@@ -72,17 +71,25 @@ pub(super) async fn draft_predictions(
     QueryParams(params): QueryParams<PredictionParams>,
     body: Result<Bytes, BytesRejection>,
 ) -> Result<Json<ContributionDraft>, ProblemResponse> {
-    catalogue.service().authorised_client(TokenScope::Annotate)?;
-    let author = choose_author(&catalogue, params.author.as_deref())?;
+    let of = catalogue.clone();
+    let drafted = with_request_ticket(&catalogue, "(predictions that are sent)", body, move |body| async move {
+        let author = choose_author(&of, params.author.as_deref())?;
+        check_model(&params)?;
+        let rows = PredictedRows::from_stream(&of, &body)?;
+        draft_rows(&of, &params, author, rows).await
+    });
+    Ok(Json(drafted.await?))
+}
+
+fn check_model(params: &PredictionParams) -> Result<(), RequestFault> {
     for (name, text) in [("model", &params.model), ("version", &params.version)] {
         let is_name = |c: char| c.is_ascii_alphanumeric() || "_-.".contains(c);
         if text.is_empty() || text.len() > LONGEST || !text.chars().all(is_name) {
             let message = format!("`{name}` is `{text}`, expected 1 to {LONGEST} of A-Z a-z 0-9 _ - .");
-            return Err(RequestFault::bad_request(message).into());
+            return Err(RequestFault::bad_request(message));
         }
     }
-    let rows = PredictedRows::from_stream(&catalogue, &whole_body(body)?)?;
-    Ok(Json(draft_rows(&catalogue, &params, author, rows).await?))
+    Ok(())
 }
 
 async fn draft_rows(
@@ -101,45 +108,45 @@ async fn draft_rows(
             )));
         }
     }
-    let record = PredictionRecord {
-        model: params.model.clone(),
-        version: params.version.clone(),
-        surfaces,
-        digest: rows.digest(),
-    };
+    let record = PredictionRecord { model: params.model.clone(), version: params.version.clone(), surfaces };
     let lake = catalogue.lake();
     let log = ContributionLog::Predictions;
     let unreadable = |e: echolake_lake::Error| RequestFault::from(echolake_query::Error::from(e));
     let files = lake.list_contributions(log, u64::MAX).await.map_err(unreadable)?;
+    let mut known = Vec::new();
+    let mut last_known = 0;
     for file in files.iter().filter(|file| file.bytes > 0) {
         let bytes = lake.read_contribution(log, file.number).await.map_err(unreadable)?;
-        let Some(known) = read_record(bytes)? else { continue };
-        if known == record {
-            return Ok(ContributionDraft { number: file.number, object: None, annotation_ids: Vec::new() });
-        }
-        let is_same_model = known.model == record.model && known.version == record.version;
-        if is_same_model && let Some(surface) = record.surfaces.iter().find(|id| known.surfaces.contains(*id)) {
-            return Err(RequestFault::Taken {
-                what: format!(
-                    "a prediction of `{}`, version `{}`, for surface `{surface}`",
-                    record.model, record.version
-                ),
-                hint: "stored predictions never change; send them with another version",
-            });
+        if let Some(batches) = read_known_rows(bytes, &record)? {
+            known.extend(batches);
+            last_known = file.number;
         }
     }
-    let number = files.last().map_or(0, |file| file.number) + 1;
     let version = view.snapshot.lake_version().unwrap_or(0);
-    let object = rows.encode_parquet(catalogue, &record, &author, version)?;
+    let rows = select_new_rows(&known, &rows.to_batch(catalogue, &record, &author, version)?)?;
+    if rows.num_rows() == 0 {
+        return Ok(ContributionDraft { number: last_known, object: None, annotation_ids: Vec::new() });
+    }
+    let number = files.last().map_or(0, |file| file.number) + 1;
+    let object = encode_parquet(&rows, &record)?;
     Ok(ContributionDraft { number, object: Some(STANDARD.encode(object)), annotation_ids: Vec::new() })
 }
 
-fn read_record(bytes: Bytes) -> Result<Option<PredictionRecord>, RequestFault> {
-    let reader = ParquetRecordBatchReaderBuilder::try_new(bytes)
-        .map_err(RequestFault::defect("a file of predictions cannot be read"))?;
+// The rows of a file of the same model, version and a surface; None if it is another's.
+fn read_known_rows(bytes: Bytes, record: &PredictionRecord) -> Result<Option<Vec<RecordBatch>>, RequestFault> {
+    let failed = RequestFault::defect("a file of predictions cannot be read");
+    let reader = ParquetRecordBatchReaderBuilder::try_new(bytes).map_err(failed)?;
     let metadata = reader.metadata().file_metadata().key_value_metadata();
     let text = metadata.and_then(|all| all.iter().find(|entry| entry.key == RECORD)?.value.as_ref());
-    Ok(text.and_then(|text| serde_json::from_str(text).ok()))
+    let known: Option<PredictionRecord> = text.and_then(|text| serde_json::from_str(text).ok());
+    let is_same = |known: &PredictionRecord| {
+        known.model == record.model && known.version == record.version && !known.surfaces.is_disjoint(&record.surfaces)
+    };
+    if !known.as_ref().is_some_and(is_same) {
+        return Ok(None);
+    }
+    let rows = reader.build().map_err(failed)?.collect::<Result<_, _>>();
+    rows.map(Some).map_err(RequestFault::defect("rows of predictions cannot be read"))
 }
 
 /// The rows of a request, sorted by surface and pair.
@@ -151,33 +158,17 @@ struct PredictedRows {
 }
 
 impl PredictedRows {
-    fn from_stream(catalogue: &LakeCatalogue, body: &[u8]) -> Result<Self, RequestFault> {
-        let unreadable = |e: arrow::error::ArrowError| {
-            RequestFault::bad_request(format!(
-                "the body is no Arrow stream: {e}; hint: pyarrow.ipc.new_stream writes one"
-            ))
-        };
-        let reader = StreamReader::try_new(body, None).map_err(unreadable)?;
-        let schema = reader.schema();
-        let batches = reader.collect::<Result<Vec<_>, _>>().map_err(unreadable)?;
-        let rows = concat_batches(&schema, &batches).map_err(unreadable)?;
-        Self::from_batch(catalogue, &rows)
-    }
-
-    fn from_batch(catalogue: &LakeCatalogue, rows: &RecordBatch) -> Result<Self, RequestFault> {
-        let names = predicted_columns(catalogue.lake().rig());
-        for field in rows.schema().fields() {
-            let name = field.name();
-            if !names.contains(name) && name != "surface_id" && name != "pair_id" {
-                let known = names.join(", ");
-                return Err(RequestFault::bad_request(format!(
-                    "column `{name}` is not one of predictions; hint: surface_id, pair_id, and some of {known}"
-                )));
-            }
-        }
-        let surfaces = read_column(rows, "surface_id", &DataType::Utf8)?;
-        let pairs = read_column(rows, "pair_id", &DataType::Int32)?;
-        let (Some(surfaces), Some(pairs)) = (surfaces, pairs) else {
+    fn from_stream(catalogue: &LakeCatalogue, body: &RequestBody) -> Result<Self, RequestFault> {
+        let rig = catalogue.lake().rig();
+        let names = predicted_columns(rig);
+        let values = names.iter().map(|name| ExpectedColumn { name: name.clone(), content: ColumnContent::Numbers });
+        let keys =
+            [("surface_id", ColumnContent::Name { longest: SurfaceId::LONGEST }), ("pair_id", ColumnContent::Integers)];
+        let keys = keys.map(|(name, content)| ExpectedColumn { name: name.to_owned(), content });
+        let expected: Vec<_> = keys.into_iter().chain(values).collect();
+        let rows = decode_arrow_body(&body.bytes, &expected, body.most_rows.min(MOST_ROWS))?;
+        let column = |name: &str| rows.column_by_name(name).cloned();
+        let (Some(surfaces), Some(pairs)) = (column("surface_id"), column("pair_id")) else {
             return Err(RequestFault::bad_request("the rows need the columns `surface_id` and `pair_id`"));
         };
         let keys = [&surfaces, &pairs].map(|values| SortColumn { values: values.clone(), options: None });
@@ -186,8 +177,7 @@ impl PredictedRows {
         let pairs = sort_column(&pairs, &order)?;
         let mut values = Vec::with_capacity(names.len());
         for name in &names {
-            let column = read_column(rows, name, &DataType::Float64)?;
-            let column = column.map(|column| sort_column(&column, &order)).transpose()?;
+            let column = column(name).map(|column| sort_column(&column, &order)).transpose()?;
             values.push(column.map(|column| column.as_primitive::<Float64Type>().clone()));
         }
         let sorted = Self {
@@ -233,31 +223,14 @@ impl PredictedRows {
         Ok(())
     }
 
-    fn digest(&self) -> String {
-        let mut digest = Sha256::new();
-        for (surface, pair) in self.surface_ids.iter().zip(self.pair_ids.values()) {
-            digest.update(surface.unwrap_or_default());
-            digest.update([0]);
-            digest.update(pair.to_le_bytes());
-        }
-        for (i, values) in self.values.iter().enumerate() {
-            let Some(values) = values else { continue };
-            digest.update((i as u64).to_le_bytes());
-            for value in values {
-                digest.update(value.unwrap_or(f64::NAN).to_bits().to_le_bytes());
-            }
-        }
-        hex::encode(digest.finalize())
-    }
-
-    fn encode_parquet(
+    // The rows of table `predictions`.
+    fn to_batch(
         &self,
         catalogue: &LakeCatalogue,
         record: &PredictionRecord,
         author: &str,
         lake_version: u64,
-    ) -> Result<Vec<u8>, RequestFault> {
-        let failed = RequestFault::defect("predictions are not written as Parquet");
+    ) -> Result<RecordBatch, RequestFault> {
         let schema = prediction_schema(catalogue.lake().rig());
         let rows = self.pair_ids.len();
         let text =
@@ -278,31 +251,22 @@ impl PredictedRows {
         columns.push(text(author));
         columns.push(Arc::new(time));
         columns.push(Arc::new(Int64Array::from_value(lake_version as i64, rows)));
-        let batch =
-            RecordBatch::try_new(schema.clone(), columns).map_err(RequestFault::defect("columns do not fit"))?;
-        let entry = serde_json::to_string(record).map_err(RequestFault::defect("a record is not written as JSON"))?;
-        let properties = WriterProperties::builder()
-            .set_compression(Compression::ZSTD(ZstdLevel::default()))
-            .set_key_value_metadata(Some(vec![KeyValue::new(RECORD.to_owned(), entry)]))
-            .build();
-        let mut bytes = Vec::new();
-        let mut writer = ArrowWriter::try_new(&mut bytes, schema, Some(properties)).map_err(failed)?;
-        writer.write(&batch).map_err(failed)?;
-        writer.close().map_err(failed)?;
-        Ok(bytes)
+        RecordBatch::try_new(schema, columns).map_err(RequestFault::defect("columns do not fit"))
     }
 }
 
-fn read_column(rows: &RecordBatch, name: &str, kind: &DataType) -> Result<Option<ArrayRef>, RequestFault> {
-    let Some(column) = rows.column_by_name(name) else { return Ok(None) };
-    let failed =
-        |e| RequestFault::bad_request(format!("column `{name}` is {}, expected {kind}: {e}", column.data_type()));
-    let read = cast(column, kind).map_err(failed)?;
-    // A cast makes null of what does not fit.
-    match read.null_count() == column.null_count() {
-        true => Ok(Some(read)),
-        false => Err(RequestFault::bad_request(format!("column `{name}` has values that are no {kind}"))),
-    }
+fn encode_parquet(rows: &RecordBatch, record: &PredictionRecord) -> Result<Vec<u8>, RequestFault> {
+    let failed = RequestFault::defect("predictions are not written as Parquet");
+    let entry = serde_json::to_string(record).map_err(RequestFault::defect("a record is not written as JSON"))?;
+    let properties = WriterProperties::builder()
+        .set_compression(Compression::ZSTD(ZstdLevel::default()))
+        .set_key_value_metadata(Some(vec![KeyValue::new(RECORD.to_owned(), entry)]))
+        .build();
+    let mut bytes = Vec::new();
+    let mut writer = ArrowWriter::try_new(&mut bytes, rows.schema(), Some(properties)).map_err(failed)?;
+    writer.write(rows).map_err(failed)?;
+    writer.close().map_err(failed)?;
+    Ok(bytes)
 }
 
 fn sort_column(column: &ArrayRef, order: &UInt32Array) -> Result<ArrayRef, RequestFault> {
