@@ -77,6 +77,7 @@ fn http_seeds() -> Vec<Vec<u8>> {
         r#"{"jsonrpc":"2.0","id":1,"method":"tools/call","params":{"name":"query","arguments":{"sql":"select 1"}}}"#;
     [
         post("/api/v1/sql", json, &format!(r#"{{"query": "{QUERY}", "format": "arrow"}}"#)),
+        post("/api/v1/annotations", json, r#"{"annotations": [{"run_id": "a", "pair_ids": [1], "kind": "note"}]}"#),
         post("/api/v1/sql?format=parquet", "application/sql", QUERY),
         format!(
             "POST /api/v1/sql HTTP/1.1\r\n{head}content-type: text/plain\r\ntransfer-encoding: chunked\r\n\r\n{chunked}"

@@ -1,5 +1,5 @@
-//! Throws changed SQL, changed bytes of each protocol, or changed run files at `echolake serve`, and ends with an error
-//! at the first that harms it.
+//! Throws changed SQL, changed bytes of each protocol, changed run files or changed bodies at `echolake serve`, and ends
+//! with an error at the first that harms it.
 
 use std::io::Write as _;
 use std::time::{Duration, Instant};
@@ -14,7 +14,7 @@ const TELL_EVERY: Duration = Duration::from_secs(30);
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct FuzzArgs {
-    /// Kind of input that is changed: sql, wire or mcap.
+    /// Kind of input that is changed: sql, wire, mcap or bodies.
     #[arg(value_parser = parse_target)]
     target: FuzzTarget,
     /// Duration in seconds.
@@ -27,7 +27,7 @@ pub(crate) struct FuzzArgs {
 
 fn parse_target(name: &str) -> Result<FuzzTarget, String> {
     let known = FuzzTarget::ALL.into_iter().find(|target| target.name() == name);
-    known.ok_or_else(|| "hint: sql, wire or mcap".to_owned())
+    known.ok_or_else(|| "hint: sql, wire, mcap or bodies".to_owned())
 }
 
 pub(crate) fn run_fuzz_server(args: &FuzzArgs) -> Result<()> {
@@ -45,14 +45,15 @@ pub(crate) fn run_fuzz_server(args: &FuzzArgs) -> Result<()> {
     });
     writeln!(
         std::io::stdout(),
-        "{}, seed {seed}: {} rounds in {:.0?}, {} answered, {} broke their own connection's decoder, at most {} MiB; \
-         the server is well",
+        "{}, seed {seed}: {} rounds in {:.0?}, {} answered, {} broke their own connection's decoder, at most {} MiB, \
+         an engine {} MiB; the server is well",
         target.name(),
         outcome.rounds,
         begun.elapsed(),
         outcome.answered,
         outcome.broken,
-        outcome.resident_kib >> 10
+        outcome.resident_kib >> 10,
+        outcome.engine_kib >> 10
     )?;
     Ok(())
 }

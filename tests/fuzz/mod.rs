@@ -1,6 +1,6 @@
-//! Hostile input against a server: changed SQL, changed bytes of each protocol, changed run files. Whatever comes, the
-//! process lives and answers the next client, and nothing in it panics but pgwire's decoder, which ends the connection
-//! that it decodes for.
+//! Hostile input against a server: changed SQL, changed bytes of each protocol, changed run files, changed bodies.
+//! Whatever comes, the process lives and answers the next client, and nothing in it panics but pgwire's decoder, which
+//! ends the connection that it decodes for.
 
 use std::path::Path;
 use std::time::Duration;
@@ -12,11 +12,14 @@ use rand_chacha::ChaCha8Rng;
 use super::serve::http::HttpRequest;
 use super::serve::server::ServedLake;
 
+mod bodies;
 mod bytes;
 mod sql;
 
 /// Limits of a query: time, memory, and rows.
 const LIMITS: &str = "seconds = 2\nmemory_mb = 200\nrows = 100000\n";
+/// Memory that bodies may need, the token's.
+const BODY_KIB: u64 = 200 << 10;
 /// Time to wait for more of an answer to changed bytes: many are the beginning of a request, and get none.
 const PATIENCE: Duration = Duration::from_secs(1);
 /// Time to wait for the rest of a backtrace.
@@ -33,11 +36,13 @@ pub(crate) enum FuzzTarget {
     Wire,
     /// A run's file, which queries then read in place.
     Mcap,
+    /// Arrow streams and JSON that users would add to the lake.
+    Bodies,
 }
 
 impl FuzzTarget {
     /// All targets.
-    pub const ALL: [Self; 3] = [Self::Sql, Self::Wire, Self::Mcap];
+    pub const ALL: [Self; 4] = [Self::Sql, Self::Wire, Self::Mcap, Self::Bodies];
 
     /// Its name on a command line.
     pub fn name(self) -> &'static str {
@@ -45,6 +50,7 @@ impl FuzzTarget {
             Self::Sql => "sql",
             Self::Wire => "wire",
             Self::Mcap => "mcap",
+            Self::Bodies => "bodies",
         }
     }
 }
@@ -59,6 +65,8 @@ pub(crate) struct FuzzCounts {
     pub broken: usize,
     /// The most that the server's process held in memory after a round, KiB.
     pub resident_kib: u64,
+    /// The most that one of its engines held at a time, KiB.
+    pub engine_kib: u64,
 }
 
 /// A server and what is thrown at it.
@@ -68,6 +76,7 @@ pub(crate) struct FuzzCampaign {
     token: String,
     random: ChaCha8Rng,
     run: Vec<u8>,
+    bodies: Vec<bodies::SentBody>,
 }
 
 impl FuzzCampaign {
@@ -85,15 +94,17 @@ impl FuzzCampaign {
         };
         run(&["acquire", "--surface", "flat", "--rig", "rig.toml"]);
         run(&["ingest"]);
-        let made = run(&["token", "fuzz"]);
+        let made = run(&["token", "fuzz", "--scopes", "sql,files,annotate"]);
         let token = String::from_utf8_lossy(&made.stderr).lines().next().expect("a token").to_owned();
         let entry = String::from_utf8(made.stdout).expect("text");
         let named = entry.split("seconds").next().expect("who it is");
         std::fs::write(path("tokens.toml"), format!("{named}{LIMITS}")).expect("written");
         let server = serve(binary, folder.path(), &["--tokens", "tokens.toml", "--memory", "1000"]);
         let file = run_file(&path("lake/runs/flat"));
-        let bytes = std::fs::read(file).expect("a run");
-        Self { server, token, random: ChaCha8Rng::seed_from_u64(seed), run: bytes, folder }
+        let name = file.file_stem().and_then(|name| name.to_str()).expect("a run's name");
+        let bodies = bodies::bodies(name);
+        let bytes = std::fs::read(&file).expect("a run");
+        Self { server, token, random: ChaCha8Rng::seed_from_u64(seed), run: bytes, bodies, folder }
     }
 
     /// Throws one thing after the other for as long as `go_on` says.
@@ -102,16 +113,22 @@ impl FuzzCampaign {
     /// The server is harmed; the text names the cause.
     pub fn throw(&mut self, target: FuzzTarget, go_on: &mut dyn FnMut(&FuzzCounts) -> bool) -> FuzzCounts {
         let mut outcome = FuzzCounts::default();
+        self.is_well("nothing");
+        let before_kib = self.server.engine_kib();
         while go_on(&outcome) {
             let (thrown, answered) = match target {
                 FuzzTarget::Sql => self.sql(),
                 FuzzTarget::Wire => self.wire(),
                 FuzzTarget::Mcap => self.mcap(),
+                FuzzTarget::Bodies => self.body(),
             };
             outcome.rounds += 1;
             outcome.answered += usize::from(answered);
             outcome.broken = self.is_well(&thrown);
             outcome.resident_kib = outcome.resident_kib.max(self.server.resident_kib());
+            outcome.engine_kib = outcome.engine_kib.max(self.server.engine_kib());
+            let more_kib = outcome.engine_kib.saturating_sub(before_kib);
+            assert!(target != FuzzTarget::Bodies || more_kib < BODY_KIB, "{more_kib} KiB more by: {thrown}");
         }
         outcome
     }
@@ -184,6 +201,21 @@ impl FuzzCampaign {
         let answered = self.asked(&format!("select * from {function} limit 100"));
         std::fs::write(&file, &self.run).expect("written");
         (format!("{function} with {changes}"), answered)
+    }
+
+    // A changed body is refused as one, or is another good one: the engine reads the next.
+    fn body(&mut self) -> (String, bool) {
+        let sent = &self.bodies[self.random.random_range(0..self.bodies.len())];
+        let mut changed = sent.bytes.clone();
+        let changes = bytes::change(&mut self.random, &mut changed);
+        let thrown = format!("{} with {changes}", sent.name);
+        let answer = HttpRequest::post_bytes(sent.path, changed)
+            .with("authorization", &format!("Bearer {}", self.token))
+            .attempt(&self.server);
+        let answer = answer.unwrap_or_else(|| panic!("{thrown}: no answer; {:?}", self.server.said()));
+        let text = String::from_utf8_lossy(&answer.body);
+        assert!(matches!(answer.status, 200 | 400 | 409 | 413), "{} by {thrown}: {text}", answer.status);
+        (thrown, answer.status == 200)
     }
 }
 

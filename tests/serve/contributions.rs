@@ -3,8 +3,8 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use arrow::array::{Float64Array, Int32Array, RecordBatch, StringArray};
-use arrow::datatypes::{DataType, Field, Schema};
+use arrow::array::{ArrayRef, Float64Array, Int32Array, RecordBatch, RunArray, StringArray};
+use arrow::datatypes::Int32Type;
 use arrow::ipc::writer::StreamWriter;
 use serde_json::json;
 
@@ -12,7 +12,7 @@ use super::catalogue::lake;
 use super::http::{HttpRequest, HttpResponse};
 use super::projects::new_token;
 use super::server::ServedLake;
-use super::{get, json, refused, served};
+use super::{get, json, refused, served, wait_until};
 use crate::TestFolder;
 use crate::annotation_kills::AnnotationKillCampaign;
 
@@ -28,20 +28,21 @@ fn annotate(server: &ServedLake, annotation: &serde_json::Value) -> HttpResponse
 
 fn predict(server: &ServedLake, version: &str, surface: &str, columns: &[(&str, Vec<f64>)]) -> HttpResponse {
     let rows = columns[0].1.len();
-    let values = columns.iter().map(|(name, _)| Field::new(*name, DataType::Float64, true));
-    let keys = [Field::new("surface_id", DataType::Utf8, false), Field::new("pair_id", DataType::Int32, false)];
-    let schema = Arc::new(Schema::new(keys.into_iter().chain(values).collect::<Vec<_>>()));
-    let mut arrays: Vec<Arc<dyn arrow::array::Array>> =
-        vec![Arc::new(StringArray::from(vec![surface; rows])), Arc::new(Int32Array::from_iter_values(0..rows as i32))];
-    arrays.extend(columns.iter().map(|(_, values)| Arc::new(Float64Array::from(values.clone())) as _));
-    let batch = RecordBatch::try_new(schema.clone(), arrays).expect("rows");
-    let mut body = Vec::new();
-    let mut writer = StreamWriter::try_new(&mut body, &schema).expect("a stream");
+    let surfaces: ArrayRef = Arc::new(StringArray::from(vec![surface; rows]));
+    let pairs: ArrayRef = Arc::new(Int32Array::from_iter_values(0..rows as i32));
+    let values = columns.iter().map(|(name, values)| (*name, Arc::new(Float64Array::from(values.clone())) as ArrayRef));
+    let keys = [("surface_id", surfaces), ("pair_id", pairs)];
+    predictions(version, &keys.into_iter().chain(values).collect::<Vec<_>>()).send(server)
+}
+
+fn predictions(version: &str, columns: &[(&str, ArrayRef)]) -> HttpRequest {
+    let batch = RecordBatch::try_from_iter(columns.iter().map(|(name, array)| (*name, array.clone()))).expect("rows");
+    let mut writer = StreamWriter::try_new(Vec::new(), &batch.schema()).expect("a stream");
     writer.write(&batch).expect("written");
     writer.finish().expect("ended");
+    let body = writer.into_inner().expect("bytes");
     HttpRequest::post_bytes(&format!("/api/v1/predictions?model=cnn&version={version}"), body)
         .with("content-type", "application/vnd.apache.arrow.stream")
-        .send(server)
 }
 
 #[test]
@@ -136,6 +137,94 @@ fn predictions_of_a_model_stand_beside_the_measurements() {
     let text = HttpRequest::post("/api/v1/predictions?model=cnn&version=2", "no stream").send(&server);
     refused(&text, 400, "request_invalid");
     assert_eq!(place.number("select count(*) from predictions"), 2.0);
+}
+
+/// E9: rows that are sent again in another grouping are stored once, and others beside them are added.
+#[test]
+fn predictions_that_are_sent_again_are_stored_once() {
+    let place = lake();
+    let server = served(&place, &[]);
+    let send = |rows: &[(&str, i32, f64)]| {
+        let surfaces: ArrayRef = Arc::new(StringArray::from_iter_values(rows.iter().map(|row| row.0)));
+        let pairs: ArrayRef = Arc::new(Int32Array::from_iter_values(rows.iter().map(|row| row.1)));
+        let values: ArrayRef = Arc::new(Float64Array::from_iter_values(rows.iter().map(|row| row.2)));
+        predictions("1", &[("surface_id", surfaces), ("pair_id", pairs), ("tnce_10000", values)]).send(&server)
+    };
+    let is_new = |rows: &[(&str, i32, f64)]| json(&send(rows))["is_new"].as_bool();
+    let [flat, foam, brick] = [("flat", 0, 0.5), ("foam", 0, 0.25), ("brick", 0, 0.125)];
+    assert_eq!(is_new(&[flat, foam]), Some(true));
+    assert_eq!([is_new(&[flat]), is_new(&[foam, flat]), is_new(&[foam])], [Some(false); 3]);
+    assert_eq!(is_new(&[brick, flat]), Some(true), "brick is");
+    assert_eq!(is_new(&[("flat", 1, 0.5), brick]), Some(true), "another pair is");
+    refused(&send(&[("brick", 1, 0.5), ("flat", 0, 0.75)]), 409, "taken");
+    let stored = place.sql("select surface_id, pair_id, tnce_10000 as e from predictions order by 1, 2");
+    let stored: Vec<_> =
+        stored.iter().map(|row| (row["surface_id"].as_str(), row["pair_id"].as_i64(), row["e"].as_f64())).collect();
+    let expected = [brick, flat, ("flat", 1, 0.5), foam];
+    assert_eq!(stored, expected.map(|(surface, pair, e)| (Some(surface), Some(i64::from(pair)), Some(e))));
+}
+
+/// E3: what is sent has the limits of its token's queries, and is listed among them.
+#[test]
+fn what_is_sent_has_the_ticket_of_a_query() {
+    let place = lake();
+    let limited = |name: &str, limit: &str| {
+        let (token, lines) = new_token(&place, &[name, "--scopes", "sql,annotate"]);
+        let named = lines.split("seconds").next().expect("who it is");
+        (token, format!("{named}{limit}\n"))
+    };
+    let (few, few_lines) = limited("ann", "rows = 3");
+    let (small, small_lines) = limited("bob", "memory_mb = 1");
+    std::fs::write(place.path("tokens.toml"), few_lines + &small_lines).expect("written");
+    let server = served(&place, &["--tokens", "tokens.toml"]);
+    let send_as =
+        |token: &str, request: HttpRequest| request.with("authorization", &format!("Bearer {token}")).send(&server);
+    let send = |request: HttpRequest| send_as(&few, request);
+    let rows = |surface: &str, count: usize| {
+        let surfaces: ArrayRef = Arc::new(StringArray::from(vec![surface; count]));
+        let pairs: ArrayRef = Arc::new(Int32Array::from_iter_values(0..count as i32));
+        let values: ArrayRef = Arc::new(Float64Array::from(vec![0.5; count]));
+        predictions("1", &[("surface_id", surfaces), ("pair_id", pairs), ("tnce_10000", values)])
+    };
+    assert_eq!(send(rows("brick", 3)).status, 200);
+    let many = send(rows("brick", 4));
+    refused(&many, 413, "request_too_large");
+    assert!(many.text().contains("more than 3 rows"), "{}", many.text());
+    assert_eq!(send_as(&small, rows("foam", 3)).status, 200);
+    refused(&send_as(&small, rows(&"x".repeat(20_000), 1)), 507, "memory_limit");
+    // 1.9 GB in a kilobyte, if it were decoded.
+    let ends = Int32Array::from(vec![i32::MAX]);
+    let runs = RunArray::<Int32Type>::try_new(&ends, &StringArray::from(vec!["brick"])).expect("runs");
+    let runs = send(predictions("1", &[("surface_id", Arc::new(runs))]));
+    refused(&runs, 400, "request_invalid");
+    assert!(runs.text().contains("`surface_id` is RunEndEncoded, expected string"), "{}", runs.text());
+    let note = json!({ "run_id": find_run(&place), "kind": "note", "comment": "x" });
+    let notes = |count: usize| {
+        let body = json!({ "annotations": vec![&note; count] }).to_string();
+        HttpRequest::post("/api/v1/annotations", &body).with("content-type", "application/json")
+    };
+    assert_eq!(send(notes(3)).status, 200);
+    refused(&send(notes(4)), 413, "request_too_large");
+    for (outcome, count) in [("answered", 2), ("request_invalid", 1), ("request_too_large", 2)] {
+        let listed = format!(
+            "select count(*) as n from system.queries where statement like '%are sent)' and outcome = '{outcome}'"
+        );
+        let listed = || send(HttpRequest::post("/api/v1/sql", &listed).with("content-type", "text/plain"));
+        wait_until("they are listed", || json(&listed())[0]["n"].as_i64() == Some(count));
+    }
+}
+
+/// E8: regions whose pairs are more than their request's bytes are stored.
+#[test]
+fn many_regions_of_a_request_are_stored() {
+    let place = lake();
+    let run = find_run(&place);
+    let server = served(&place, &[]);
+    let region = json!({ "run_id": run, "kind": "note", "comment": "seen", "microphones": [0, 1, 2, 3, 4, 5] });
+    let body = json!({ "annotations": vec![region; 600] }).to_string();
+    let sent = HttpRequest::post("/api/v1/annotations", &body).with("content-type", "application/json").send(&server);
+    assert_eq!(json(&sent)["annotation_ids"].as_array().map(Vec::len), Some(600));
+    assert_eq!(place.number("select count(*) from annotations"), 600.0);
 }
 
 #[test]

@@ -97,17 +97,25 @@ impl ServedLake {
 
     /// Sends a signal to its engines, the spare one, too.
     pub fn signal_engines(&self, signal: Signal) {
-        let all = std::fs::read_dir(format!("/proc/{}/task", self.id())).expect("threads");
-        let lists = all.map(|thread| std::fs::read_to_string(thread.expect("a thread").path().join("children")));
-        let pids: Vec<i32> = lists
-            .filter_map(Result::ok)
-            .flat_map(|list| list.split_whitespace().map(|pid| pid.parse().expect("a number")).collect::<Vec<_>>())
-            .collect();
+        let pids = self.engine_ids();
         assert!(!pids.is_empty(), "it has engines");
         for pid in pids {
             // One may have ended by itself.
             let _ = kill_process(Pid::from_raw(pid).expect("a process"), signal);
         }
+    }
+
+    /// Returns the most memory that one of its engines had at a time, in KiB.
+    pub fn engine_kib(&self) -> u64 {
+        self.engine_ids().into_iter().map(|pid| memory_kib(pid as u32, "VmHWM:")).max().unwrap_or(0)
+    }
+
+    fn engine_ids(&self) -> Vec<i32> {
+        let all = std::fs::read_dir(format!("/proc/{}/task", self.id())).expect("threads");
+        let lists = all.map(|thread| std::fs::read_to_string(thread.expect("a thread").path().join("children")));
+        let split =
+            |list: String| list.split_whitespace().map(|pid| pid.parse().expect("a number")).collect::<Vec<_>>();
+        lists.filter_map(Result::ok).flat_map(split).collect()
     }
 
     /// Returns the lines it wrote to stderr so far.
@@ -122,9 +130,7 @@ impl ServedLake {
 
     /// Returns the resident memory of its process, in KiB.
     pub fn resident_kib(&self) -> u64 {
-        let status = std::fs::read_to_string(format!("/proc/{}/status", self.id())).unwrap_or_default();
-        let line = status.lines().find_map(|l| l.strip_prefix("VmRSS:"));
-        line.and_then(|l| l.trim().split(' ').next()).and_then(|n| n.parse().ok()).unwrap_or(0)
+        memory_kib(self.id(), "VmRSS:")
     }
 
     /// Stops it; returns its exit code.
@@ -147,4 +153,10 @@ impl ServedLake {
     pub fn wait(&mut self) -> Option<i32> {
         self.child.wait().status.code()
     }
+}
+
+fn memory_kib(pid: u32, line: &str) -> u64 {
+    let status = std::fs::read_to_string(format!("/proc/{pid}/status")).unwrap_or_default();
+    let found = status.lines().find_map(|l| l.strip_prefix(line));
+    found.and_then(|l| l.trim().split(' ').next()).and_then(|n| n.parse().ok()).unwrap_or(0)
 }
