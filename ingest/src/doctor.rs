@@ -7,8 +7,6 @@ use arrow::record_batch::RecordBatch;
 use echolake_lake::{DataFile, Error as LakeError, FileName, FolderListing, Lake, LakeSnapshot};
 use echolake_recording::{DecodedChunk, ResyncItem, ResyncReader};
 use echolake_schema::tables::Table;
-use futures::TryStreamExt as _;
-use object_store::ObjectStoreExt as _;
 use object_store::path::Path;
 use serde::Serialize;
 
@@ -117,9 +115,13 @@ pub async fn examine_lake(lake: &Lake, progress: &mut dyn FnMut(CheckStep<'_>)) 
         for file in files {
             progress(CheckStep { subject: file.path.as_ref(), done, total });
             done += 1;
-            if let Err(error) = check_table_file(lake, table, file).await {
+            if let Err(error) = lake.check_file(table, file).await {
                 report.add_finding(FindingSeverity::Damaged, &file.path, error.to_string());
             }
+        }
+        // What the lake's earlier form has and the table not yet.
+        if let Err(error) = lake.read_pending_rows(&snapshot, table).await {
+            report.find_in(table, error);
         }
         report.tables.push(TableReport {
             table: table.name(),
@@ -172,25 +174,6 @@ async fn find_faults(lake: &Lake, snapshot: &LakeSnapshot, report: &mut LakeRepo
         }
     }
     Ok(())
-}
-
-// A batch at a time: a merged file has more rows than memory should hold.
-async fn check_table_file(lake: &Lake, table: Table, file: &DataFile) -> Result<()> {
-    let size = lake.store().head(&file.path).await.map_err(|e| LakeError::unread_file(&file.path, e))?.size;
-    if size != file.bytes {
-        let reason = format!("it has {size} bytes, its log says {}", file.bytes);
-        return Err(LakeError::DataFile { file: file.path.to_string(), source: reason.into() }.into());
-    }
-    let mut batches = lake.read_rows(table, file, &[], 0..file.rows).await?;
-    let mut rows = 0;
-    while let Some(batch) = batches.try_next().await? {
-        rows += batch.num_rows() as u64;
-    }
-    if rows == file.rows {
-        return Ok(());
-    }
-    let reason = format!("it has {rows} rows, its log says {}", file.rows);
-    Err(LakeError::DataFile { file: file.path.to_string(), source: reason.into() }.into())
 }
 
 async fn check_run(

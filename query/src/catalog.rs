@@ -1,11 +1,11 @@
 //! The catalogue of one query: tables and views of one snapshot of the lake, and the past tables and run files that the
 //! query names.
 //!
-//! Taking a snapshot reads twelve logs, so the last one is cached until `runs` has a newer version: a run's rows become
+//! Taking a snapshot reads fourteen logs, so the last one is cached until `runs` has a newer version: a run's rows become
 //! visible together with its row in `runs`. That check does not detect commits of `optimize`. They are not urgent,
 //! because `vacuum` keeps replaced files for a while; so all logs are checked periodically.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -19,15 +19,16 @@ use datafusion::optimizer::OptimizerRule;
 use datafusion::prelude::SessionContext;
 use datafusion::sql::parser::Statement;
 use echolake_functions::FunctionSet;
-use echolake_lake::{ContributionLog, DataFile, Error as LakeError, Lake, LakeMoment, LakeSnapshot, VisibleRun};
+use echolake_lake::{DataFile, Error as LakeError, Lake, LakeMoment, LakeSnapshot, VisibleRun};
 use echolake_lake_tables::{FileReaders, LakeTable};
 use echolake_mcap_tables::{self as mcap_tables, Contents, McapCalls, McapFiles};
+use echolake_schema::RunId;
 use echolake_schema::annotations::Annotation;
-use echolake_schema::tables::{Table, annotation_schema, prediction_schema};
+use echolake_schema::tables::{Source, Table};
 use futures::future::try_join_all;
 use quick_cache::sync::Cache;
 
-use crate::contributions::{AnnotationCache, SeenContributions, without_rejected};
+use crate::contributions::{AnnotationCache, KnownVerdicts, with_pending_rows, without_rejected};
 use crate::statement::{PastTableName, find_past_tables, walk_statement};
 use crate::system;
 use crate::views::{LakeView, LazyView, LookupFunctions, PairJoin, SortedNulls, UnusedJoin};
@@ -52,7 +53,7 @@ pub(crate) struct LakeCatalog {
     /// Held while one query takes a new snapshot; the others wait for it.
     taking: tokio::sync::Mutex<()>,
     /// Cache of tables as of versions of the lake, which do not change.
-    past: Cache<(u64, Table), Arc<LakeTable>>,
+    past: Cache<(String, u64, Table), Arc<LakeTable>>,
     runs: Arc<McapFiles>,
     annotations: AnnotationCache,
 }
@@ -63,9 +64,10 @@ struct CatalogSnapshot {
     tables: HashMap<Table, Arc<LakeTable>>,
     providers: Vec<(TableReference, Arc<dyn TableProvider>)>,
     rejection: ScalarUDF,
+    verdicts: KnownVerdicts,
     looked: Mutex<Instant>,
-    /// The last look at the log of `runs`.
-    checked: Mutex<Instant>,
+    /// The last look at the log of `runs`; None if the next query must look.
+    checked: Mutex<Option<Instant>>,
 }
 
 impl LakeCatalog {
@@ -121,7 +123,7 @@ impl LakeCatalog {
         for past in past {
             // Without all of its log, a version may seem never to have been.
             current.snapshot.check_table(Table::Runs)?;
-            let provider = self.past_provider(&past, &mut versions).await?;
+            let provider = self.past_provider(&past, current.snapshot.tables_id(), &mut versions).await?;
             context.register_table(TableReference::bare(past.name), provider).map_err(execution_error)?;
         }
         let mut calls = McapCalls::default();
@@ -140,6 +142,21 @@ impl LakeCatalog {
         let snapshot = self.fresh_snapshot().await?.snapshot.clone();
         snapshot.check_table(Table::Runs)?;
         Ok(snapshot)
+    }
+
+    /// Makes the next query look at the log, however short ago the last look was.
+    pub fn expire_check(&self) {
+        if let Some(known) = self.known_snapshot() {
+            *known.checked.lock().unwrap_or_else(PoisonError::into_inner) = None;
+        }
+    }
+
+    /// Returns the annotations on some runs that a snapshot shows.
+    ///
+    /// # Errors
+    /// [`Error::Lake`] if they cannot be read.
+    pub async fn annotations_on(&self, snapshot: &LakeSnapshot, runs: &HashSet<RunId>) -> Result<Vec<Annotation>, Error> {
+        Ok(self.annotations.read_annotations(&self.lake, snapshot, runs).await?)
     }
 
     /// Returns the last snapshot if it is still the current one. It reads no log, so that it waits for no threads.
@@ -172,16 +189,6 @@ impl LakeCatalog {
         mcap_tables::read_attachment(run, snapshot, ending, &self.runs).await.map_err(mcap_failed)
     }
 
-    /// Returns all annotations of the lake, with those that no version shows yet, and the highest number.
-    ///
-    /// # Errors
-    /// [`Error::Lake`].
-    pub async fn all_annotations(&self) -> Result<(u64, Arc<Vec<Arc<Annotation>>>), Error> {
-        let files = self.lake.list_contributions(ContributionLog::Annotations, u64::MAX).await?;
-        let last = files.last().map_or(0, |file| file.number);
-        Ok((last, self.annotations.read_up_to(&self.lake, last).await?))
-    }
-
     /// Returns the views with their definitions.
     pub fn view_definitions(&self) -> impl Iterator<Item = (&'static str, String)> {
         LakeView::ALL.into_iter().map(|view| (view.name(), view.definition_sql(&self.lake)))
@@ -196,13 +203,7 @@ impl LakeCatalog {
     pub fn table_schemas(&self) -> impl Iterator<Item = (&'static str, SchemaRef)> {
         let tables = || Table::ALL.into_iter().map(|table| (table.name(), table.schema(self.lake.rig())));
         let views = || LakeView::ALL.into_iter().map(|view| (view.name(), view.schema(&self.lake, &self.lookups)));
-        let contributed = || {
-            [
-                (ContributionLog::Annotations.name(), annotation_schema()),
-                (ContributionLog::Predictions.name(), prediction_schema(self.lake.rig())),
-            ]
-        };
-        self.names.get_or_init(|| tables().chain(views()).chain(contributed()).collect()).iter().cloned()
+        self.names.get_or_init(|| tables().chain(views()).collect()).iter().cloned()
     }
 
     async fn fresh_snapshot(&self) -> Result<Arc<CatalogSnapshot>, Error> {
@@ -234,11 +235,11 @@ impl LakeCatalog {
         let log = self.lake.commit_log();
         let Some(version) = current.snapshot.log_version(Table::Runs) else { return Ok(false) };
         // What mends another table changes no version of `runs`.
-        if !current.snapshot.is_whole() {
+        if !current.snapshot.is_whole() || current.verdicts.is_faulty() {
             return Ok(false);
         }
         let checked = *current.checked.lock().unwrap_or_else(PoisonError::into_inner);
-        if self.lake.is_remote() && checked.elapsed() < REMOTE_CHECK_LASTS {
+        if self.lake.is_remote() && checked.is_some_and(|checked| checked.elapsed() < REMOTE_CHECK_LASTS) {
             return Ok(true);
         }
         // In a folder, a look at whether all of it is still there costs nothing.
@@ -249,7 +250,7 @@ impl LakeCatalog {
         if !is_newest {
             return Ok(false);
         }
-        *current.checked.lock().unwrap_or_else(PoisonError::into_inner) = Instant::now();
+        *current.checked.lock().unwrap_or_else(PoisonError::into_inner) = Some(Instant::now());
         let due = {
             let mut looked = current.looked.lock().unwrap_or_else(PoisonError::into_inner);
             let due = looked.elapsed() > LAYOUT_SEEN;
@@ -285,33 +286,44 @@ impl LakeCatalog {
             };
             tables.insert(table, provider);
         }
-        let mut providers: Vec<(TableReference, Arc<dyn TableProvider>)> = tables
-            .iter()
-            .map(|(table, provider)| (TableReference::bare(table.name()), provider.clone() as _))
-            .collect();
-        let counts = snapshot.contributions();
-        let contributed =
-            SeenContributions::read_from(&self.lake, &self.annotations, &snapshot, counts, &self.source).await?;
-        let rejection = contributed.rejection_function();
+        let mut providers: Vec<(TableReference, Arc<dyn TableProvider>)> = Vec::new();
+        for (table, provider) in &tables {
+            let provider = self.with_pending(*table, provider.clone(), &snapshot).await?;
+            providers.push((TableReference::bare(table.name()), provider));
+        }
+        let verdicts = self.annotations.find_verdicts(&self.lake, &snapshot).await?;
+        let rejection = verdicts.rejection_function();
         for view in LakeView::ALL {
             let mut beneath = HashMap::new();
             for (table, provider) in view.source_tables().iter().filter_map(|t| tables.get(t).map(|found| (*t, found)))
             {
-                let kept = without_rejected(table, provider.clone(), &contributed.rejected, &snapshot);
+                let kept = without_rejected(table, provider.clone(), &verdicts, &snapshot);
                 beneath.insert(table, kept.map_err(execution_error)?);
             }
             let view_table = LazyView::new(view, &self.lake, &self.lookups, beneath);
             providers.push((TableReference::bare(view.name()), Arc::new(view_table)));
         }
-        providers.extend(contributed.tables.into_iter().map(|(name, table)| (TableReference::bare(name), table)));
         if let Some(runs) = tables.get(&Table::Runs) {
             let of_lake = system::lake_tables(&self.lake, &snapshot, runs.clone());
             let named =
                 of_lake.into_iter().map(|(name, table)| (TableReference::partial(system::SYSTEM_SCHEMA, name), table));
             providers.extend(named);
         }
-        let [looked, checked] = [taken, taken].map(Mutex::new);
-        Ok(CatalogSnapshot { snapshot, tables, providers, rejection, looked, checked })
+        let looked = Mutex::new(taken);
+        let checked = Mutex::new(Some(taken));
+        Ok(CatalogSnapshot { snapshot, tables, providers, rejection, verdicts, looked, checked })
+    }
+
+    async fn with_pending(
+        &self,
+        table: Table,
+        provider: Arc<dyn TableProvider>,
+        snapshot: &LakeSnapshot,
+    ) -> Result<Arc<dyn TableProvider>, Error> {
+        match table.source() {
+            Source::Users => with_pending_rows(&self.lake, snapshot, table, provider).await,
+            _ => Ok(provider),
+        }
     }
 
     fn open_table(&self, table: Table, files: &[DataFile]) -> Result<LakeTable, Error> {
@@ -322,13 +334,13 @@ impl LakeCatalog {
     async fn past_provider(
         &self,
         past: &PastTableName,
+        tables_id: &str,
         versions: &mut HashMap<LakeMoment, u64>,
     ) -> Result<Arc<dyn TableProvider>, Error> {
         let moment = past.parse_moment()?;
         let table = Table::by_name(&past.table);
         let view = LakeView::by_name(&past.table);
-        let log = ContributionLog::by_name(&past.table);
-        if table.is_none() && view.is_none() && log.is_none() {
+        if table.is_none() && view.is_none() {
             return Err(error::unknown_table(&past.table));
         }
         let version = match versions.get(&moment) {
@@ -337,32 +349,31 @@ impl LakeCatalog {
         };
         versions.insert(moment, version);
         if let Some(table) = table {
-            return Ok(self.table_at(version, table).await?);
+            let provider = self.table_at(tables_id, version, table).await?;
+            if table.source() == Source::Users {
+                let snapshot = self.lake.snapshot_at(version, table).await?;
+                return with_pending_rows(&self.lake, &snapshot, table, provider).await;
+            }
+            return Ok(provider);
         }
-        let runs = self.lake.snapshot_at(version, Table::Runs).await?;
-        let counts = self.lake.contributions_at(version).await?;
-        let contributed =
-            SeenContributions::read_from(&self.lake, &self.annotations, &runs, counts, &self.source).await?;
-        if let Some(log) = log {
-            let [annotated, predicted] = contributed.tables;
-            return Ok(if log == ContributionLog::Annotations { annotated.1 } else { predicted.1 });
-        }
+        let annotated = self.lake.snapshot_at(version, Table::Annotations).await?;
+        let verdicts = self.annotations.find_verdicts(&self.lake, &annotated).await?;
         let Some(view) = view else { return Err(error::unknown_table(&past.table)) };
         let mut beneath = HashMap::new();
         for table in view.source_tables() {
-            let provider = self.table_at(version, *table).await? as Arc<dyn TableProvider>;
-            let kept = without_rejected(*table, provider, &contributed.rejected, &runs).map_err(execution_error)?;
+            let provider = self.table_at(tables_id, version, *table).await? as Arc<dyn TableProvider>;
+            let kept = without_rejected(*table, provider, &verdicts, &annotated).map_err(execution_error)?;
             beneath.insert(*table, kept);
         }
         Ok(Arc::new(view.plan_over(&self.lake, &self.lookups, &beneath).map_err(execution_error)?))
     }
 
-    async fn table_at(&self, version: u64, table: Table) -> Result<Arc<LakeTable>, Error> {
+    async fn table_at(&self, tables_id: &str, version: u64, table: Table) -> Result<Arc<LakeTable>, Error> {
         let read = async {
             let snapshot = self.lake.snapshot_at(version, table).await?;
             Ok(Arc::new(self.open_table(table, snapshot.files(table))?))
         };
-        self.past.get_or_insert_async(&(version, table), read).await
+        self.past.get_or_insert_async(&(tables_id.to_owned(), version, table), read).await
     }
 }
 

@@ -1,186 +1,221 @@
-//! Contributions of users in SQL: the tables `annotations` and `predictions`, and the views without the
-//! measurements that the last verdict rejects.
+//! What follows from annotations of users in SQL: the function `is_rejected`, and views without the measurements that
+//! the last verdict rejects. Rows of users that are still objects of the lake's earlier form stand beside their table's.
 
-use std::collections::HashSet;
+use std::collections::{HashMap, HashSet};
 use std::hash::{Hash, Hasher};
 use std::sync::Arc;
 
-use arrow::array::{
-    AsArray as _, BooleanArray, BooleanBuilder, Int32Builder, Int64Array, ListBuilder, RecordBatch, StringArray,
-    TimestampMicrosecondArray,
-};
-use arrow::compute::filter_record_batch;
-use arrow::datatypes::{DataType, Field, Int32Type, SchemaRef};
-use bytes::Bytes;
-use datafusion::datasource::{MemTable, TableProvider, ViewTable, provider_as_source};
-use datafusion::error::Result;
+use arrow::array::{AsArray as _, BooleanArray};
+use arrow::datatypes::{DataType, Int32Type, SchemaRef};
+use async_trait::async_trait;
+use datafusion::catalog::Session;
+use datafusion::datasource::{MemTable, TableProvider, TableType, ViewTable, provider_as_source};
+use datafusion::error::{DataFusionError, Result};
 use datafusion::logical_expr::{
-    ColumnarValue, LogicalPlanBuilder, ScalarFunctionArgs, ScalarUDF, ScalarUDFImpl, Signature, Volatility, lit, not,
+    ColumnarValue, Expr, LogicalPlanBuilder, ScalarFunctionArgs, ScalarUDF, ScalarUDFImpl, Signature, Volatility, lit,
+    not,
 };
+use datafusion::physical_plan::ExecutionPlan;
+use datafusion::physical_plan::empty::EmptyExec;
 use datafusion::prelude::col;
-use echolake_lake::{ContributionCounts, ContributionLog, Lake, LakeSnapshot};
-use echolake_lake_tables::{FileReaders, ParquetFiles};
+use echolake_lake::{DataFile, Error as LakeError, Lake, LakeSnapshot};
+use echolake_schema::RunId;
 use echolake_schema::annotations::{Annotation, RejectedMeasurements};
-use echolake_schema::tables::{LIST_CHILD, Table, annotation_schema, prediction_schema};
-use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
+use echolake_schema::tables::Table;
+use object_store::path::Path;
 use tokio::sync::Mutex;
 
 /// The function that tells whether a measurement is rejected.
 const IS_REJECTED: &str = "is_rejected";
 
-/// Annotations of a lake, read once: objects of the log never change.
-#[derive(Debug, Default)]
-pub(crate) struct AnnotationCache(Mutex<KnownAnnotations>);
+/// Cached files of annotations beyond twice those of a snapshot.
+const UNUSED_FILES: usize = 64;
 
-#[derive(Debug, Default, Clone)]
-struct KnownAnnotations {
-    /// The highest number that was read.
-    up_to: u64,
-    all: Arc<Vec<Arc<Annotation>>>,
-}
+/// A file of annotations, and the runs whose rows are hidden from the reader.
+type AnnotationFile = (Path, Vec<RunId>);
+/// Annotations in the order of a file, each with the version of the table that added it.
+type VersionedAnnotations = Arc<Vec<(u64, Annotation)>>;
+
+/// Annotations by file: files never change, so each is read once.
+#[derive(Debug, Default)]
+pub(crate) struct AnnotationCache(Mutex<HashMap<AnnotationFile, VersionedAnnotations>>);
 
 impl AnnotationCache {
-    /// The annotations up to a number, by number.
-    pub async fn read_up_to(&self, lake: &Lake, number: u64) -> echolake_lake::Result<Arc<Vec<Arc<Annotation>>>> {
+    /// The verdicts of a snapshot. A fault of the table is kept, for whatever needs them.
+    ///
+    /// # Errors
+    /// What the store says.
+    pub async fn find_verdicts(&self, lake: &Lake, snapshot: &LakeSnapshot) -> Result<KnownVerdicts, LakeError> {
+        match self.find_rejected(lake, snapshot).await {
+            Ok(rejected) => Ok(KnownVerdicts { rejected: Arc::new(rejected), fault: None }),
+            Err(fault) if fault.is_table_fault() => {
+                Ok(KnownVerdicts { rejected: Arc::default(), fault: Some(Arc::new(fault)) })
+            }
+            Err(error) => Err(error),
+        }
+    }
+
+    /// The annotations on some runs that a snapshot shows, in the order in which they were added.
+    ///
+    /// # Errors
+    /// The table's fault, or what the store says.
+    pub async fn read_annotations(
+        &self,
+        lake: &Lake,
+        snapshot: &LakeSnapshot,
+        runs: &HashSet<RunId>,
+    ) -> Result<Vec<Annotation>, LakeError> {
+        let files = self.read_files(lake, snapshot, |file| file.shown_runs().iter().any(|run| runs.contains(run)));
+        let files = files.await?;
+        let pending = lake.pending_annotations(snapshot).await?;
+        let all = versioned_annotations(&files).chain(&pending);
+        Ok(all.filter(|annotation| runs.contains(&annotation.run_id)).cloned().collect())
+    }
+
+    async fn find_rejected(&self, lake: &Lake, snapshot: &LakeSnapshot) -> Result<RejectedMeasurements, LakeError> {
+        let files = self.read_files(lake, snapshot, |_| true).await?;
+        let pending = lake.pending_annotations(snapshot).await?;
+        Ok(RejectedMeasurements::from_annotations(versioned_annotations(&files).chain(&pending)))
+    }
+
+    async fn read_files(
+        &self,
+        lake: &Lake,
+        snapshot: &LakeSnapshot,
+        is_wanted: impl Fn(&DataFile) -> bool,
+    ) -> Result<Vec<VersionedAnnotations>, LakeError> {
+        snapshot.check_table(Table::Annotations)?;
         let mut known = self.0.lock().await;
-        if number > known.up_to {
-            let new = lake.read_annotations(known.up_to, number).await?;
-            let mut all = known.all.as_ref().clone();
-            all.extend(new.into_iter().map(Arc::new));
-            *known = KnownAnnotations { up_to: number, all: Arc::new(all) };
+        let mut read = HashMap::new();
+        for file in snapshot.files(Table::Annotations).iter().filter(|file| is_wanted(file)) {
+            let key = (file.path.clone(), file.hidden.clone());
+            let annotations = match known.get(&key) {
+                Some(known) => known.clone(),
+                None => Arc::new(lake.read_annotation_file(file).await?),
+            };
+            read.insert(key, annotations);
         }
-        if number == known.up_to {
-            return Ok(known.all.clone());
+        let files = read.values().cloned().collect();
+        // Snapshots of the past are read beside the present one.
+        if known.len() > 2 * snapshot.files(Table::Annotations).len() + UNUSED_FILES {
+            known.clear();
         }
-        let end = known.all.partition_point(|annotation| annotation.number <= number);
-        Ok(Arc::new(known.all[..end].to_vec()))
+        known.extend(read);
+        Ok(files)
     }
 }
 
-/// The contributions of one snapshot.
-pub(crate) struct SeenContributions {
-    /// Measurements that are rejected.
-    pub rejected: Arc<RejectedMeasurements>,
-    /// The tables by name.
-    pub tables: [(&'static str, Arc<dyn TableProvider>); 2],
+// The annotations of files in the order in which they were added.
+fn versioned_annotations(files: &[VersionedAnnotations]) -> impl Iterator<Item = &Annotation> {
+    let mut all: Vec<_> = files.iter().flat_map(|annotations| annotations.iter()).collect();
+    all.sort_by_key(|(version, _)| *version);
+    all.into_iter().map(|(_, annotation)| annotation)
 }
 
-impl SeenContributions {
-    /// Reads those of these numbers, on the runs and surfaces that it shows.
-    ///
-    /// # Errors
-    /// Those of the store, and [`echolake_lake::Error::LostContribution`].
-    pub async fn read_from(
-        lake: &Lake,
-        cache: &AnnotationCache,
-        snapshot: &LakeSnapshot,
-        counts: ContributionCounts,
-        source: &FileReaders,
-    ) -> std::result::Result<Self, crate::Error> {
-        let annotations = cache.read_up_to(lake, counts.annotations).await?;
-        let failed = |e| crate::Error::from_execution("", &e);
-        let rejected = RejectedMeasurements::from_annotations(annotations.iter().map(AsRef::as_ref));
-        let annotated = annotation_table(lake, &annotations, snapshot).map_err(failed)?;
-        let mut files = lake.list_contributions(ContributionLog::Predictions, counts.predictions).await?;
-        // One that was lost may have an empty file in its place.
-        files.retain(|file| file.bytes > 0);
-        let schema = prediction_schema(lake.rig());
-        let predicted: Arc<dyn TableProvider> = match lake.is_restricted() {
-            false => {
-                let files = files.into_iter().map(|file| (file.path, file.bytes));
-                Arc::new(ParquetFiles::new(schema, files, source.clone()))
+/// The verdicts of a snapshot.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct KnownVerdicts {
+    rejected: Arc<RejectedMeasurements>,
+    /// Rows of annotations are lost or cannot be read: nobody knows what is rejected.
+    fault: Option<Arc<LakeError>>,
+}
+
+impl KnownVerdicts {
+    /// Returns whether they cannot be known.
+    pub fn is_faulty(&self) -> bool {
+        self.fault.is_some()
+    }
+
+    fn check_fault(&self) -> Result<()> {
+        let Some(fault) = &self.fault else { return Ok(()) };
+        let fault = match fault.as_ref() {
+            LakeError::Incomplete { table, found } => LakeError::Incomplete { table, found: found.clone() },
+            LakeError::Log { table, action, source } => {
+                LakeError::Log { table, action, source: source.to_string().into() }
             }
-            true => {
-                let mut rows = Vec::new();
-                for file in files {
-                    let bytes = lake.read_contribution(ContributionLog::Predictions, file.number).await?;
-                    rows.extend(visible_predictions(bytes, &schema, snapshot).map_err(failed)?);
-                }
-                Arc::new(MemTable::try_new(schema, vec![rows]).map_err(failed)?)
+            LakeError::DataFile { file, source } => {
+                LakeError::DataFile { file: file.clone(), source: source.to_string().into() }
             }
+            other => LakeError::Incomplete { table: Table::Annotations.name(), found: other.to_string() },
         };
-        let tables =
-            [(ContributionLog::Annotations.name(), annotated), (ContributionLog::Predictions.name(), predicted)];
-        Ok(Self { rejected: Arc::new(rejected), tables })
+        Err(DataFusionError::External(fault.into()))
     }
 
     /// Returns the function that tells whether a measurement is rejected.
     pub fn rejection_function(&self) -> ScalarUDF {
-        rejection_function(&self.rejected)
+        let signature = Signature::exact(vec![DataType::Utf8, DataType::Int32], Volatility::Immutable);
+        ScalarUDF::from(IsRejected { verdicts: self.clone(), signature })
     }
 }
 
-fn annotation_table(
+/// A table whose rows cannot be given, because it is not known which of them are rejected.
+#[derive(Debug)]
+struct RefusedTable {
+    schema: SchemaRef,
+    verdicts: KnownVerdicts,
+}
+
+#[async_trait]
+impl TableProvider for RefusedTable {
+    fn schema(&self) -> SchemaRef {
+        self.schema.clone()
+    }
+
+    fn table_type(&self) -> TableType {
+        TableType::Base
+    }
+
+    async fn scan(
+        &self,
+        _: &dyn Session,
+        _: Option<&Vec<usize>>,
+        _: &[Expr],
+        _: Option<usize>,
+    ) -> Result<Arc<dyn ExecutionPlan>> {
+        self.verdicts.check_fault()?;
+        Ok(Arc::new(EmptyExec::new(self.schema.clone())))
+    }
+}
+
+/// A table of users with its rows that are still objects of the lake's earlier form.
+///
+/// # Errors
+/// [`echolake_lake::Error::DataFile`] if an object is missing or damaged.
+pub(crate) async fn with_pending_rows(
     lake: &Lake,
-    annotations: &[Arc<Annotation>],
     snapshot: &LakeSnapshot,
-) -> Result<Arc<dyn TableProvider>> {
-    let seen: Vec<_> = annotations.iter().filter_map(|a| Some((a, snapshot.run(&a.run_id)?))).collect();
-    let mut pairs = ListBuilder::new(Int32Builder::new()).with_field(Field::new(LIST_CHILD, DataType::Int32, false));
-    for (annotation, _) in &seen {
-        match &annotation.pair_ids {
-            Some(ids) => {
-                pairs.values().append_slice(&ids.iter().map(|id| *id as i32).collect::<Vec<_>>());
-                pairs.append(true);
-            }
-            None => pairs.append(false),
-        }
-    }
-    let times = TimestampMicrosecondArray::from_iter_values(seen.iter().map(|(a, _)| a.time.timestamp_micros()));
-    let texts = |text: fn(&Annotation) -> &str| {
-        Arc::new(StringArray::from_iter_values(seen.iter().map(|(annotation, _)| text(annotation))))
+    table: Table,
+    provider: Arc<dyn TableProvider>,
+) -> std::result::Result<Arc<dyn TableProvider>, crate::Error> {
+    let Some(rows) = lake.read_pending_rows(snapshot, table).await? else { return Ok(provider) };
+    let union = || {
+        let pending: Arc<dyn TableProvider> = Arc::new(MemTable::try_new(rows.schema(), vec![vec![rows.clone()]])?);
+        let scan = |provider| LogicalPlanBuilder::scan(table.name(), provider_as_source(provider), None);
+        scan(provider)?.union(scan(pending)?.build()?)?.build()
     };
-    // How many versions others add is none of the business of a reader of some projects.
-    let version = |a: &Annotation| (!lake.is_restricted()).then_some(a.lake_version as i64);
-    let versions: Int64Array = seen.iter().map(|(annotation, _)| version(annotation)).collect();
-    let schema = annotation_schema();
-    let batch = RecordBatch::try_new(
-        schema.clone(),
-        vec![
-            Arc::new(StringArray::from_iter_values(seen.iter().map(|(_, run)| run.surface.as_str()))),
-            texts(|annotation| annotation.run_id.as_str()),
-            Arc::new(pairs.finish()),
-            texts(|annotation| annotation.kind.name()),
-            texts(|annotation| &annotation.value),
-            texts(|annotation| &annotation.comment),
-            texts(|annotation| &annotation.author),
-            Arc::new(times.with_timezone("UTC")),
-            Arc::new(versions),
-            texts(|annotation| &annotation.annotation_id),
-        ],
-    )?;
-    Ok(Arc::new(MemTable::try_new(schema, vec![vec![batch]])?))
-}
-
-// A reader of some projects sees predictions of their surfaces alone, and no plan that counts others.
-fn visible_predictions(bytes: Bytes, schema: &SchemaRef, snapshot: &LakeSnapshot) -> Result<Vec<RecordBatch>> {
-    let surfaces: HashSet<&str> = snapshot.runs().map(|run| run.surface.as_str()).collect();
-    let column = schema.index_of("surface_id")?;
-    let mut visible = Vec::new();
-    for batch in ParquetRecordBatchReaderBuilder::try_new(bytes)?.build()? {
-        let batch = batch?.with_schema(schema.clone())?;
-        let mut is_visible = BooleanBuilder::new();
-        let named = batch.column(column).as_string::<i32>().iter();
-        named.for_each(|surface| is_visible.append_value(surface.is_some_and(|id| surfaces.contains(id))));
-        let rows = filter_record_batch(&batch, &is_visible.finish())?;
-        visible.push(rows);
-    }
-    Ok(visible)
+    let plan = union().map_err(|e| crate::Error::from_execution("", &e))?;
+    Ok(Arc::new(ViewTable::new(plan, None)))
 }
 
 /// Leaves the rows of rejected measurements out of a table, and rejected runs out of those with a row per run.
 pub(crate) fn without_rejected(
     table: Table,
     provider: Arc<dyn TableProvider>,
-    rejected: &Arc<RejectedMeasurements>,
+    verdicts: &KnownVerdicts,
     snapshot: &LakeSnapshot,
 ) -> Result<Arc<dyn TableProvider>> {
-    if rejected.is_empty() {
+    let rejected = &verdicts.rejected;
+    if rejected.is_empty() && !verdicts.is_faulty() {
         return Ok(provider);
     }
     let keep = match table {
+        Table::Measurements | Table::Nce | Table::Tnce | Table::TnceD4 | Table::Runs | Table::SurfaceStats
+            if verdicts.is_faulty() =>
+        {
+            return Ok(Arc::new(RefusedTable { schema: provider.schema(), verdicts: verdicts.clone() }));
+        }
         Table::Measurements | Table::Nce | Table::Tnce | Table::TnceD4 => {
-            not(rejection_function(rejected).call(vec![col("run_id"), col("pair_id")]))
+            not(verdicts.rejection_function().call(vec![col("run_id"), col("pair_id")]))
         }
         Table::Runs | Table::SurfaceStats => {
             let runs = snapshot.runs().filter(|run| rejected.is_run_rejected(run.run.as_str()));
@@ -200,22 +235,17 @@ fn filter_table(
     Ok(Arc::new(ViewTable::new(plan, None)))
 }
 
-fn rejection_function(rejected: &Arc<RejectedMeasurements>) -> ScalarUDF {
-    let signature = Signature::exact(vec![DataType::Utf8, DataType::Int32], Volatility::Immutable);
-    ScalarUDF::from(IsRejected { rejected: rejected.clone(), signature })
-}
-
 /// `is_rejected(run_id, pair_id)`.
 #[derive(Debug)]
 struct IsRejected {
-    rejected: Arc<RejectedMeasurements>,
+    verdicts: KnownVerdicts,
     signature: Signature,
 }
 
 // The same name with other verdicts belongs to another snapshot.
 impl PartialEq for IsRejected {
     fn eq(&self, other: &Self) -> bool {
-        Arc::ptr_eq(&self.rejected, &other.rejected)
+        Arc::ptr_eq(&self.verdicts.rejected, &other.verdicts.rejected)
     }
 }
 
@@ -241,10 +271,11 @@ impl ScalarUDFImpl for IsRejected {
     }
 
     fn invoke_with_args(&self, args: ScalarFunctionArgs) -> Result<ColumnarValue> {
+        self.verdicts.check_fault()?;
         let columns = args.args.iter().map(|a| a.to_array(args.number_rows)).collect::<Result<Vec<_>>>()?;
         let pairs = columns[1].as_primitive::<Int32Type>();
         let is_rejected = |(run, pair): (Option<&str>, Option<i32>)| {
-            Some(self.rejected.is_rejected(run?, u32::try_from(pair?).ok()?))
+            Some(self.verdicts.rejected.is_rejected(run?, u32::try_from(pair?).ok()?))
         };
         let rows: BooleanArray = columns[0].as_string::<i32>().iter().zip(pairs).map(is_rejected).collect();
         Ok(ColumnarValue::Array(Arc::new(rows)))

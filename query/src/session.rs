@@ -1,5 +1,6 @@
 //! A session: every query sees one snapshot of the lake and may only read.
 
+use std::collections::HashSet;
 use std::sync::Arc;
 
 use arrow::datatypes::{DataType, SchemaRef};
@@ -16,6 +17,7 @@ use datafusion::prelude::SessionContext;
 use datafusion::sql::parser::Statement;
 use echolake_lake::{Lake, LakeSnapshot, VisibleRun};
 use echolake_mcap_tables::Contents;
+use echolake_schema::RunId;
 use echolake_schema::annotations::Annotation;
 use futures::future::BoxFuture;
 use futures::{FutureExt as _, StreamExt as _};
@@ -476,6 +478,19 @@ impl Session {
         self.engine.catalog().known_current_snapshot().await
     }
 
+    /// Makes the next query look for a newer version of the lake, however short ago the last look was.
+    pub fn expire_snapshot(&self) {
+        self.engine.catalog().expire_check();
+    }
+
+    /// Returns the annotations on some runs that a snapshot shows, in the order in which they were added.
+    ///
+    /// # Errors
+    /// [`Error::Lake`] if they cannot be read.
+    pub async fn annotations_on(&self, snapshot: &LakeSnapshot, runs: &HashSet<RunId>) -> Result<Vec<Annotation>, Error> {
+        self.engine.catalog().annotations_on(snapshot, runs).await
+    }
+
     /// Returns the contents of a run's file, from its summary and message indexes.
     ///
     /// # Errors
@@ -490,14 +505,6 @@ impl Session {
     /// As [`Session::read_contents`].
     pub async fn read_attachment(&self, run: &VisibleRun, ending: &str) -> Result<Option<Bytes>, Error> {
         self.engine.catalog().read_attachment(run, ending).await
-    }
-
-    /// Returns all annotations of the lake, with those that no version shows yet, and the highest number.
-    ///
-    /// # Errors
-    /// [`Error::Lake`] if they cannot be read.
-    pub async fn all_annotations(&self) -> Result<(u64, Arc<Vec<Arc<Annotation>>>), Error> {
-        self.engine.catalog().all_annotations().await
     }
 
     /// Returns the functions, sorted by name.

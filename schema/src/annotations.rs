@@ -13,11 +13,9 @@ const LONGEST_COMMENT: usize = 2_000;
 /// Longest id, in characters.
 const LONGEST_ID: usize = 64;
 
-/// One annotation, as it is stored: a JSON object per line.
+/// One annotation.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Annotation {
-    /// Number of the object that holds it, which is its place in time.
-    pub number: u64,
     /// Its name, which its author may choose: the same annotation sent again is stored once.
     pub annotation_id: String,
     /// The run.
@@ -34,8 +32,8 @@ pub struct Annotation {
     pub author: String,
     /// Time at which the server took it.
     pub time: DateTime<Utc>,
-    /// Version of the lake that the author saw.
-    pub lake_version: u64,
+    /// Version of the lake that the author saw; None if it is not told.
+    pub lake_version: Option<u64>,
 }
 
 /// The kind of an annotation.
@@ -51,6 +49,11 @@ pub enum AnnotationKind {
 }
 
 impl AnnotationKind {
+    /// The kind of a name.
+    pub fn by_name(name: &str) -> Option<Self> {
+        [Self::Label, Self::Verdict, Self::Note].into_iter().find(|kind| kind.name() == name)
+    }
+
     /// Its name.
     pub fn name(self) -> &'static str {
         match self {
@@ -190,7 +193,6 @@ mod tests {
 
     fn annotation(run: &str, pairs: Option<&[u32]>, kind: AnnotationKind, value: &str) -> Annotation {
         Annotation {
-            number: 1,
             annotation_id: "a-1".to_owned(),
             run_id: run.parse().expect("an id"),
             pair_ids: pairs.map(<[u32]>::to_vec),
@@ -199,7 +201,7 @@ mod tests {
             comment: "because".to_owned(),
             author: "ann".to_owned(),
             time: DateTime::UNIX_EPOCH,
-            lake_version: 3,
+            lake_version: Some(3),
         }
     }
 

@@ -117,6 +117,12 @@ impl RunId {
         self.0.rsplit_once('-').map_or(&self.0, |(untagged, _)| untagged)
     }
 
+    /// The surface as the name tells it; the whole name if it has another form.
+    pub fn surface_name(&self) -> &str {
+        let untagged = self.untagged_name();
+        untagged.split_once('-').map_or(untagged, |(_, surface)| surface)
+    }
+
     /// The name as text.
     pub fn as_str(&self) -> &str {
         &self.0

@@ -1,242 +1,389 @@
-//! Contributions: what users add to a lake, annotations and predictions. Each accepted request is a numbered object
-//! that never changes, in a folder beside `tables/`, so that tables which are deleted and made again lose none.
+//! What users add to a lake: annotations and predictions, in tables of their own, to which rows are only added.
 //!
-//! 1. A writer creates the object of the next number. Of several writers of a number, the store lets one succeed.
-//! 2. A commit of `runs` names the highest number that readers see, as Delta's action `txn`. From then on readers see
-//!    it, and every version of the lake has its own contributions.
+//! 1. A writer puts a file of rows into the store and adds it to the table as the version after the one that it looked
+//!    at. Of several writers of a version one succeeds; the others look again.
+//! 2. A commit of `runs` names the table's version that readers see, as Delta's action `txn`. So one number names the
+//!    state of everything.
 //!
-//! An object whose commit is missing, because its writer ended between the two steps, is seen with the next commit.
+//! Rows whose second commit is missing, because their writer ended between the two, are seen with the next one.
 
-use bytes::Bytes;
-use echolake_schema::annotations::Annotation;
-use futures::{StreamExt as _, TryStreamExt as _};
-use object_store::path::Path;
-use object_store::{ObjectStore, ObjectStoreExt as _, PutMode};
+use std::ops::Range;
+use std::sync::Arc;
 
-use crate::{Error, Lake, Result};
+use arrow::array::{
+    Array as _, AsArray as _, Int32Builder, ListBuilder, StringArray, TimestampMicrosecondArray, UInt32Array,
+};
+use arrow::compute::{SortColumn, lexsort_to_indices, take_record_batch};
+use arrow::datatypes::{DataType, Field, Int32Type, Int64Type, TimestampMicrosecondType};
+use arrow::record_batch::RecordBatch;
+use chrono::DateTime;
+use echolake_schema::annotations::{Annotation, AnnotationKind};
+use echolake_schema::tables::{LIST_CHILD, Table};
+use echolake_schema::{RunId, SurfaceId};
+use futures::TryStreamExt as _;
+use sha2::{Digest as _, Sha256};
 
-/// Objects that are read concurrently.
-const TOGETHER: usize = 16;
+use crate::contribution_objects::last_object;
+use crate::{
+    BatchBuilder, DataFile, EncodedFile, Error, FileName, Lake, LakeSnapshot, NewFile, Result, RunPart, encode_batches,
+};
 
-/// A sequence of contributions.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum ContributionLog {
-    /// Labels, verdicts and notes: JSON objects, one per line.
-    Annotations,
-    /// Predictions of models: Parquet.
-    Predictions,
-}
+/// Derivation in the names of parts: nothing else has such rows.
+const ADDED: &str = "added";
+/// Hex digits that a file's name keeps of its digest.
+const DIGEST_DIGITS: usize = 32;
+/// Tries to copy objects beside other writers.
+const COPY_TRIES: usize = 50;
 
-/// The highest numbers that readers see at a version of the lake; 0 if there are none.
+/// What a version of `runs` shows of the tables of users.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct ContributionCounts {
-    /// Of annotations.
-    pub annotations: u64,
-    /// Of predictions.
-    pub predictions: u64,
+pub struct ShownVersions {
+    pub(crate) annotations: ShownVersion,
+    pub(crate) predictions: ShownVersion,
 }
 
-/// A numbered object of a log.
+/// What a version of `runs` shows of one table of users.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub(crate) struct ShownVersion {
+    /// The version of the table.
+    pub table: u64,
+    /// The highest number of an object of the lake's earlier form; 0 if there are none.
+    pub objects: u64,
+}
+
+impl ShownVersions {
+    /// What it shows of a table; nothing of tables that users do not add to.
+    pub(crate) fn of_table(self, table: Table) -> ShownVersion {
+        match table {
+            Table::Annotations => self.annotations,
+            Table::Predictions => self.predictions,
+            _ => ShownVersion::default(),
+        }
+    }
+}
+
+/// A file of rows that a user adds, of runs of one project.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct ContributionFile {
-    /// Its number, from 1.
-    pub number: u64,
-    /// Path in the lake.
-    pub path: Path,
-    /// Size.
-    pub bytes: u64,
+pub struct ContributedFile {
+    /// Its parts, in the order of its rows.
+    pub parts: Vec<ContributedPart>,
+    /// Delta's statistics, JSON.
+    pub stats: String,
+    /// Its Parquet.
+    pub bytes: bytes::Bytes,
 }
 
-impl ContributionLog {
-    /// All logs.
-    pub const ALL: [Self; 2] = [Self::Annotations, Self::Predictions];
+/// The rows of one run in a file that a user adds.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ContributedPart {
+    /// The run's surface.
+    pub surface: SurfaceId,
+    /// The run that is meant; of predictions the surface's newest.
+    pub run: RunId,
+    /// Number of its rows.
+    pub rows: u64,
+}
 
-    /// Its name: that of its folder and of its table in SQL.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Annotations => "annotations",
-            Self::Predictions => "predictions",
+impl ContributedFile {
+    /// Makes files of rows of a table of users: one for each project, with the rows of each run side by side, otherwise
+    /// in their order.
+    ///
+    /// # Errors
+    /// [`Error::Encode`] if the rows are not the table's.
+    pub fn encode_rows(lake: &Lake, table: Table, rows: &RecordBatch) -> Result<Vec<Self>> {
+        let schema = table.schema(lake.rig());
+        let failed = |reason: String| Error::Encode { table: table.name(), reason };
+        let column = |name: &str| {
+            let values = rows.column_by_name(name).cloned();
+            values.ok_or_else(|| failed(format!("column `{name}` is missing")))
+        };
+        let numbers = UInt32Array::from_iter_values(0..rows.num_rows() as u32);
+        let keys = ["project", "surface_id", "run_id"].map(column).into_iter().chain([Ok(Arc::new(numbers) as _)]);
+        let keys: Vec<_> =
+            keys.map(|values| Ok(SortColumn { values: values?, options: None })).collect::<Result<_>>()?;
+        let order = lexsort_to_indices(&keys, None).map_err(|e| failed(e.to_string()))?;
+        let rows = take_record_batch(rows, &order).map_err(|e| failed(e.to_string()))?;
+        let text = |name: &str, row: usize| {
+            let values = rows.column_by_name(name).and_then(|values| values.as_string_opt::<i32>());
+            values.filter(|values| values.is_valid(row)).map(|values| values.value(row).to_owned())
+        };
+        let mut files = Vec::new();
+        let mut first = 0;
+        while first < rows.num_rows() {
+            let project = text("project", first);
+            let end = (first..rows.num_rows()).find(|row| text("project", *row) != project).unwrap_or(rows.num_rows());
+            let mut parts: Vec<ContributedPart> = Vec::new();
+            for row in first..end {
+                let id = |name| text(name, row).ok_or_else(|| failed(format!("column `{name}` has a null")));
+                let [surface, run] = [id("surface_id")?, id("run_id")?];
+                match parts.last_mut().filter(|part| (part.surface.as_str(), part.run.as_str()) == (&surface, &run)) {
+                    Some(part) => part.rows += 1,
+                    None => parts.push(ContributedPart {
+                        surface: surface.parse().map_err(|e| failed(format!("{e}")))?,
+                        run: run.parse().map_err(|e| failed(format!("{e}")))?,
+                        rows: 1,
+                    }),
+                }
+            }
+            let EncodedFile { bytes, stats, .. } = encode_batches(table, &schema, &[rows.slice(first, end - first)])?;
+            files.push(Self { parts, stats, bytes });
+            first = end;
         }
-    }
-
-    /// The log of this name.
-    pub fn by_name(name: &str) -> Option<Self> {
-        Self::ALL.into_iter().find(|log| log.name() == name)
-    }
-
-    fn extension(self) -> &'static str {
-        match self {
-            Self::Annotations => "ndjson",
-            Self::Predictions => "parquet",
-        }
-    }
-
-    /// The application of Delta's action `txn`.
-    pub(crate) fn application(self) -> String {
-        format!("echolake.{}", self.name())
-    }
-
-    fn path(self, number: u64) -> Path {
-        Path::from(self.name()).join(format!("{number:020}.{}", self.extension()))
-    }
-
-    fn number_of(self, path: &Path) -> Option<u64> {
-        let digits = path.filename()?.strip_suffix(self.extension())?.strip_suffix('.')?;
-        (digits.len() == 20).then(|| digits.parse().ok()).flatten()
-    }
-
-    /// The files in the folder by number.
-    pub(crate) async fn list_files(self, store: &dyn ObjectStore) -> Result<Vec<ContributionFile>> {
-        let folder = Path::from(self.name());
-        let listed: Vec<_> =
-            store.list(Some(&folder)).try_collect().await.map_err(|e| Error::store_failure("list", &folder, e))?;
-        let numbered = listed.into_iter().filter_map(|meta| {
-            let number = self.number_of(&meta.location)?;
-            Some(ContributionFile { number, path: meta.location, bytes: meta.size })
-        });
-        let mut files: Vec<_> = numbered.collect();
-        files.sort_by_key(|file| file.number);
         Ok(files)
     }
-}
 
-impl ContributionCounts {
-    /// The number of a log.
-    pub fn of_log(self, log: ContributionLog) -> u64 {
-        match log {
-            ContributionLog::Annotations => self.annotations,
-            ContributionLog::Predictions => self.predictions,
-        }
+    fn name(&self) -> FileName {
+        let digest = hex::encode(Sha256::digest(&self.bytes));
+        FileName::Merged { digest: digest[..DIGEST_DIGITS].to_owned() }
+    }
+
+    fn rows(&self) -> u64 {
+        self.parts.iter().map(|part| part.rows).sum()
     }
 }
 
 impl Lake {
-    /// The files of a log up to a number, by number; those that no version of the lake shows yet are among them if
-    /// `up_to` is `u64::MAX`.
+    /// Makes a table of users ready for [`Lake::add_contribution`]: it is made if it is missing, what the lake's earlier
+    /// form has of it is copied into it, and all that is in it is shown to readers.
     ///
     /// # Errors
-    /// [`Error::LostContribution`] if one is missing, or what the store says.
-    pub async fn list_contributions(&self, log: ContributionLog, up_to: u64) -> Result<Vec<ContributionFile>> {
-        if up_to == 0 {
-            return Ok(Vec::new());
+    /// [`Error::Incomplete`] or [`Error::Log`] if rows of it are lost, or what the store says.
+    pub async fn prepare_contributions(&self, table: Table) -> Result<()> {
+        self.ensure_exclusive().await?;
+        self.commit_log().ensure_table(table).await?;
+        self.copy_objects(table).await?;
+        let newest = self.commit_log().newest_version(table).await?.unwrap_or(0);
+        let snapshot = self.snapshot().await?;
+        snapshot.check_table(table)?;
+        if snapshot.shown_versions().of_table(table).table < newest {
+            self.commit_log().show_version(table, newest).await?;
         }
-        let mut files = log.list_files(self.store().as_ref()).await?;
-        files.retain(|file| file.number <= up_to);
-        let last = if up_to == u64::MAX { files.last().map_or(0, |file| file.number) } else { up_to };
-        let lost = (1..=last).zip(files.iter().map(|file| Some(file.number)).chain([None]));
-        match lost.into_iter().find(|(number, there)| *there != Some(*number)) {
-            Some((number, _)) => Err(Error::LostContribution { path: log.path(number).to_string() }),
-            None => Ok(files),
+        Ok(())
+    }
+
+    /// Adds files to a table of users as the version after `seen`, and shows them to readers; returns the lake's
+    /// version. None if another writer has added to the table since, or `seen` is no version of it.
+    ///
+    /// # Errors
+    /// What the store says. Files that were added before are seen with the next commit.
+    pub async fn add_contribution(&self, table: Table, seen: u64, files: Vec<ContributedFile>) -> Result<Option<u64>> {
+        if self.commit_log().newest_version(table).await? != Some(seen) {
+            return Ok(None);
+        }
+        let staged = self.stage_contribution(table, files).await?;
+        match self.commit_log().append_files(table, seen, &staged, None).await? {
+            true => self.commit_log().show_version(table, seen + 1).await.map(Some),
+            false => Ok(None),
         }
     }
 
-    /// The bytes of a contribution.
-    ///
-    /// # Errors
-    /// [`Error::LostContribution`], or what the store says.
-    pub async fn read_contribution(&self, log: ContributionLog, number: u64) -> Result<Bytes> {
-        let path = log.path(number);
-        match self.store().get(&path).await {
-            Ok(found) => found.bytes().await.map_err(|e| Error::store_failure("read", &path, e)),
-            Err(object_store::Error::NotFound { .. }) => Err(Error::LostContribution { path: path.to_string() }),
-            Err(e) => Err(Error::store_failure("read", &path, e)),
+    async fn stage_contribution(&self, table: Table, files: Vec<ContributedFile>) -> Result<Vec<NewFile>> {
+        let mut staged = Vec::with_capacity(files.len());
+        for contributed in files {
+            let name = contributed.name();
+            let rows = contributed.rows();
+            let part = |part: ContributedPart| {
+                let ContributedPart { surface, run, rows } = part;
+                RunPart { surface, run, derivation: ADDED.to_owned(), rows, row_version: None, row_counts: None }
+            };
+            let file = EncodedFile { bytes: contributed.bytes, stats: contributed.stats, rows };
+            let mut one = self.stage_file(table, &name, file).await?;
+            one.file.parts = contributed.parts.into_iter().map(part).collect();
+            staged.push(one.file);
         }
+        Ok(staged)
     }
 
-    /// The annotations of numbers after `after` up to `up_to`, in their order.
-    ///
-    /// # Errors
-    /// [`Error::LostContribution`], [`Error::DamagedContribution`], or what the store says.
-    pub async fn read_annotations(&self, after: u64, up_to: u64) -> Result<Vec<Annotation>> {
-        let log = ContributionLog::Annotations;
-        let read = futures::stream::iter(after + 1..=up_to).map(|number| async move {
-            let bytes = self.read_contribution(log, number).await?;
-            parse_annotations(number, &bytes).map_err(|reason| {
-                let path = log.path(number).to_string();
-                Error::DamagedContribution { path, reason }
-            })
-        });
-        read.buffered(TOGETHER).try_concat().await
+    // By idempotent commits: the commit that adds the rows tells, by Delta's action `txn`, which objects they are from.
+    async fn copy_objects(&self, table: Table) -> Result<()> {
+        for _ in 0..COPY_TRIES {
+            let Some(view) = self.commit_log().view_table(table).await? else { return Ok(()) };
+            let shown = self.commit_log().view_table(Table::Runs).await?.unwrap_or_default().shown;
+            // A new table's objects are listed, those that no version shows yet among them.
+            if view.version > 0 && shown.of_table(table).objects <= view.copied {
+                return Ok(());
+            }
+            let last = last_object(self.store().as_ref(), table).await?;
+            if last <= view.copied {
+                return Ok(());
+            }
+            let snapshot = self.snapshot().await?;
+            let rows = self.read_objects(table, view.copied..last, &snapshot).await?;
+            let files = rows.map(|rows| ContributedFile::encode_rows(self, table, &rows)).transpose()?;
+            let staged = self.stage_contribution(table, files.unwrap_or_default()).await?;
+            if self.commit_log().append_files(table, view.version, &staged, Some(last)).await? {
+                return Ok(());
+            }
+        }
+        let source = format!("{COPY_TRIES} tries lost to other writers; hint: run the command again").into();
+        Err(Error::Log { table: table.name(), action: "written", source })
     }
 
-    /// Creates the object of a number; false if the number is taken. Readers do not see it before
-    /// [`Lake::commit_contributions`].
+    /// Brings the tables of users to one state: what is in them is shown to readers, and what the lake's earlier form
+    /// has is in them. A table with a fault is left as it is.
     ///
     /// # Errors
     /// What the store says.
-    pub async fn create_contribution(&self, log: ContributionLog, number: u64, bytes: Bytes) -> Result<bool> {
-        let path = log.path(number);
-        match self.store().put_opts(&path, bytes.into(), PutMode::Create.into()).await {
-            Ok(_) => Ok(true),
-            Err(object_store::Error::AlreadyExists { .. }) => Ok(false),
-            Err(e) => Err(Error::store_failure("write", &path, e)),
+    pub async fn settle_contributions(&self) -> Result<()> {
+        for table in Table::OF_USERS {
+            self.prepare_contributions(table).await.or_else(pass_table_fault)?;
         }
+        Ok(())
     }
 
-    /// Shows the contributions up to a number to readers; returns the version of the lake that shows them.
+    /// The annotations on the runs that a snapshot shows, in the order in which they were added.
     ///
     /// # Errors
-    /// [`Error::Log`] if the log of `runs` is damaged, or what the store says.
-    pub async fn commit_contributions(&self, log: ContributionLog, number: u64) -> Result<u64> {
-        self.commit_log().commit_contributions(log, number).await
+    /// As [`LakeSnapshot::check_table`]; [`Error::DataFile`], or what the store says.
+    pub async fn read_annotations(&self, snapshot: &LakeSnapshot) -> Result<Vec<Annotation>> {
+        snapshot.check_table(Table::Annotations)?;
+        let mut all = Vec::new();
+        for file in snapshot.files(Table::Annotations) {
+            all.extend(self.read_annotation_file(file).await?);
+        }
+        all.sort_by_key(|(version, _)| *version);
+        let mut annotations: Vec<_> = all.into_iter().map(|(_, annotation)| annotation).collect();
+        annotations.extend(self.pending_annotations(snapshot).await?);
+        Ok(annotations)
+    }
+
+    /// The annotations of a file on the runs that it shows, each with the version that added it.
+    ///
+    /// # Errors
+    /// [`Error::DataFile`], or what the store says.
+    pub async fn read_annotation_file(&self, file: &DataFile) -> Result<Vec<(u64, Annotation)>> {
+        let mut annotations = Vec::new();
+        for (part, rows) in file.visible_parts() {
+            let mut batches = self.read_rows(Table::Annotations, file, &[], rows).await?;
+            while let Some(batch) = batches.try_next().await? {
+                let decoded = decode_annotations(&batch)
+                    .map_err(|reason| Error::DataFile { file: file.path.to_string(), source: reason.into() })?;
+                let version = part.row_version.unwrap_or(file.log_version);
+                annotations.extend(decoded.into_iter().map(|annotation| (version, annotation)));
+            }
+        }
+        Ok(annotations)
+    }
+
+    /// Those annotations that are still objects of the lake's earlier form, on the runs that a snapshot shows.
+    ///
+    /// # Errors
+    /// As [`Lake::read_pending_rows`].
+    pub async fn pending_annotations(&self, snapshot: &LakeSnapshot) -> Result<Vec<Annotation>> {
+        let rows = self.read_pending_rows(snapshot, Table::Annotations).await?;
+        let damaged = |reason: String| Error::DataFile { file: Table::Annotations.name().to_owned(), source: reason.into() };
+        rows.map_or(Ok(Vec::new()), |rows| decode_annotations(&rows).map_err(damaged))
+    }
+
+    /// Rows of a table of users that a snapshot shows and that are still objects of the lake's earlier form; None if
+    /// there are none.
+    ///
+    /// # Errors
+    /// [`Error::DataFile`] if an object is missing or damaged, or what the store says.
+    pub async fn read_pending_rows(&self, snapshot: &LakeSnapshot, table: Table) -> Result<Option<RecordBatch>> {
+        let objects = snapshot.pending_objects(table);
+        if objects.is_empty() {
+            return Ok(None);
+        }
+        self.read_objects(table, objects, snapshot).await
     }
 }
 
-fn parse_annotations(number: u64, bytes: &[u8]) -> std::result::Result<Vec<Annotation>, String> {
-    let lines = bytes.split(|byte| *byte == b'\n').filter(|line| !line.is_empty());
-    let parsed = lines.enumerate().map(|(i, line)| match serde_json::from_slice::<Annotation>(line) {
-        Ok(annotation) if annotation.number == number => Ok(annotation),
-        Ok(annotation) => Err(format!("line {}: its number is {}", i + 1, annotation.number)),
-        Err(e) => Err(format!("line {}: {e}", i + 1)),
-    });
-    parsed.collect()
+impl LakeSnapshot {
+    /// The objects of the lake's earlier form that are not in their table yet: those after the first `start`, up to
+    /// number `end`.
+    pub fn pending_objects(&self, table: Table) -> Range<u64> {
+        let copied = self.copied_objects(table);
+        copied..self.shown_versions().of_table(table).objects.max(copied)
+    }
+
+    /// The version of the lake that the author of a row on a run saw, as all its readers may know it: in a lake with
+    /// projects the one that added the run's row, because how many came since is a matter of other projects.
+    pub fn seen_version(&self, run: &RunId) -> Option<u64> {
+        match self.runs().any(|run| self.project_of(&run.run).is_some()) || self.is_restricted() {
+            true => self.row_version(run),
+            false => self.lake_version(),
+        }
+    }
+}
+
+/// Passes over a table's fault, which readers of the table meet, but no others.
+pub(crate) fn pass_table_fault(error: Error) -> Result<()> {
+    if error.is_table_fault() { Ok(()) } else { Err(error) }
+}
+
+/// Makes rows of table `annotations`. Surface and project are those of the run in the snapshot.
+///
+/// # Errors
+/// [`Error::Encode`], which is a mistake in this crate.
+pub fn annotation_rows(lake: &Lake, snapshot: &LakeSnapshot, annotations: &[Annotation]) -> Result<RecordBatch> {
+    let mut pairs = ListBuilder::new(Int32Builder::new()).with_field(Field::new(LIST_CHILD, DataType::Int32, false));
+    for annotation in annotations {
+        if let Some(ids) = &annotation.pair_ids {
+            ids.iter().for_each(|id| pairs.values().append_value(*id as i32));
+        }
+        pairs.append(annotation.pair_ids.is_some());
+    }
+    let surface = |a: &Annotation| match snapshot.run(&a.run_id) {
+        Some(run) => run.surface.to_string(),
+        None => a.run_id.surface_name().to_owned(),
+    };
+    let project = |a: &Annotation| snapshot.project_of(&a.run_id).map(|project| project.as_str());
+    let times = TimestampMicrosecondArray::from_iter_values(annotations.iter().map(|a| a.time.timestamp_micros()));
+    BatchBuilder::new(Table::Annotations, lake.rig(), annotations.len())
+        .push_texts("surface_id", annotations.iter().map(surface))
+        .push_texts("run_id", annotations.iter().map(|a| a.run_id.as_str()))
+        .push_column("project", Arc::new(annotations.iter().map(project).collect::<StringArray>()))
+        .push_column("pair_ids", Arc::new(pairs.finish()))
+        .push_texts("kind", annotations.iter().map(|a| a.kind.name()))
+        .push_texts("value", annotations.iter().map(|a| &a.value))
+        .push_texts("comment", annotations.iter().map(|a| &a.comment))
+        .push_texts("author", annotations.iter().map(|a| &a.author))
+        .push_column("annotated", Arc::new(times.with_timezone("UTC")))
+        .push_longs("lake_version", annotations.iter().map(|a| a.lake_version.map(|version| version as i64)))
+        .push_texts("annotation_id", annotations.iter().map(|a| &a.annotation_id))
+        .finish()
+}
+
+// The annotations of rows of table `annotations`.
+fn decode_annotations(rows: &RecordBatch) -> std::result::Result<Vec<Annotation>, String> {
+    let column = |name: &str| rows.column_by_name(name).ok_or_else(|| format!("column `{name}` is missing"));
+    let text = |name: &str| {
+        let values = column(name)?.as_string_opt::<i32>();
+        values.ok_or_else(|| format!("column `{name}` is no text"))
+    };
+    let typed = |name: &str| format!("column `{name}` has another type than the table's");
+    let [runs, kinds, values, comments, authors, ids] = [
+        text("run_id")?,
+        text("kind")?,
+        text("value")?,
+        text("comment")?,
+        text("author")?,
+        text("annotation_id")?,
+    ];
+    let pairs = column("pair_ids")?.as_list_opt::<i32>().ok_or_else(|| typed("pair_ids"))?;
+    let times = column("annotated")?.as_primitive_opt::<TimestampMicrosecondType>().ok_or_else(|| typed("annotated"))?;
+    let versions = column("lake_version")?.as_primitive_opt::<Int64Type>().ok_or_else(|| typed("lake_version"))?;
+    let one = |row: usize| {
+        let pair_ids = pairs.is_valid(row).then(|| {
+            let list = pairs.value(row);
+            list.as_primitive_opt::<Int32Type>().map(|ids| ids.values().iter().map(|id| *id as u32).collect())
+        });
+        let kind = kinds.value(row);
+        Ok(Annotation {
+            annotation_id: ids.value(row).to_owned(),
+            run_id: runs.value(row).parse().map_err(|e| format!("row {row}: {e}"))?,
+            pair_ids: pair_ids.flatten(),
+            kind: AnnotationKind::by_name(kind).ok_or_else(|| format!("row {row}: `{kind}` is no kind of annotation"))?,
+            value: values.value(row).to_owned(),
+            comment: comments.value(row).to_owned(),
+            author: authors.value(row).to_owned(),
+            time: DateTime::from_timestamp_micros(times.value(row)).unwrap_or_default(),
+            lake_version: versions.is_valid(row).then(|| versions.value(row) as u64),
+        })
+    };
+    (0..rows.num_rows()).map(one).collect()
 }
 
 #[cfg(test)]
-mod tests {
-    use echolake_schema::Rig;
-
-    use super::*;
-    use crate::{LakeMoment, ReferenceSurfaces};
-
-    async fn open(url: &str) -> Lake {
-        Lake::open_or_create(url, &Rig::paper(), &ReferenceSurfaces::default()).await.expect("a lake")
-    }
-
-    async fn add(lake: &Lake, number: u64) -> u64 {
-        let log = ContributionLog::Annotations;
-        assert!(lake.create_contribution(log, number, format!("{number}").into()).await.expect("written"));
-        lake.commit_contributions(log, number).await.expect("committed")
-    }
-
-    #[tokio::test]
-    async fn versions_have_their_contributions_and_tables_made_again_lose_none() {
-        let folder = tempfile::tempdir().expect("a folder");
-        let url = folder.path().join("lake").display().to_string();
-        let lake = open(&url).await;
-        let log = ContributionLog::Annotations;
-        let before = lake.version_at(&LakeMoment::Version(0)).await.expect("a version");
-        let first = add(&lake, 1).await;
-        assert!(!lake.create_contribution(log, 1, "other".into()).await.expect("looked at"), "the number is taken");
-        let mut last = first;
-        // Past a checkpoint, which keeps the number.
-        for number in 2..=45 {
-            last = add(&lake, number).await;
-        }
-        assert_eq!(lake.commit_contributions(log, 45).await.expect("there"), last, "nothing is committed twice");
-        let reader = open(&url).await;
-        let counts = |n| ContributionCounts { annotations: n, predictions: 0 };
-        assert_eq!(reader.snapshot().await.expect("a view").contributions(), counts(45));
-        for (version, expected) in [(before, 0), (first, 1), (last, 45)] {
-            assert_eq!(reader.contributions_at(version).await.expect("known"), counts(expected), "{version}");
-        }
-        assert_eq!(reader.read_contribution(log, 7).await.expect("bytes"), "7");
-        std::fs::remove_dir_all(folder.path().join("lake/tables")).expect("removed");
-        let again = open(&url).await;
-        assert_eq!(again.snapshot().await.expect("a view").contributions(), counts(45));
-        let path = folder.path().join("lake").join(log.path(7).as_ref());
-        std::fs::remove_file(&path).expect("removed");
-        let lost = again.list_contributions(log, 45).await.expect_err("lost").to_string();
-        assert!(lost.contains("annotations/00000000000000000007.ndjson"), "{lost}");
-    }
-}
+mod tests;

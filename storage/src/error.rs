@@ -115,7 +115,7 @@ pub enum Error {
         source: ErrorCause,
     },
     /// A table does not have the rows that `runs` names, or has others besides.
-    #[error("table `{table}` is not whole: {found}; hint: `echolake ingest` derives it again from the runs")]
+    #[error("table `{table}` is not whole: {found}; hint: {}", rows_hint(table))]
     Incomplete {
         /// The table.
         table: &'static str,
@@ -139,7 +139,7 @@ pub enum Error {
         reason: String,
     },
     /// A file of a table cannot be read.
-    #[error("`{file}` is damaged: {source}; hint: `echolake rebuild {}` makes it again from the runs", table_of(file))]
+    #[error("`{file}` is damaged: {source}; {}", file_hint(file))]
     DataFile {
         /// The file.
         file: String,
@@ -224,23 +224,6 @@ pub enum Error {
     /// A tag's file cannot be read.
     #[error("tag `{path}` cannot be read: {reason}; hint: restore it from a backup, or delete the file")]
     DamagedTag {
-        /// Path in the lake.
-        path: String,
-        /// The cause.
-        reason: String,
-    },
-    /// A contribution that a version of the lake shows is gone.
-    #[error(
-        "`{path}` is missing, which the lake's log names; hint: bring it back from a copy of the lake, or put an empty \
-            file in its place to give it up"
-    )]
-    LostContribution {
-        /// Path in the lake.
-        path: String,
-    },
-    /// A contribution cannot be read.
-    #[error("`{path}` is damaged: {reason}; hint: bring it back from a copy of the lake")]
-    DamagedContribution {
         /// Path in the lake.
         path: String,
         /// The cause.
@@ -345,6 +328,11 @@ impl std::error::Error for StoreError {
 }
 
 impl Error {
+    /// Returns whether a table is at fault, which stops no reader of the others.
+    pub fn is_table_fault(&self) -> bool {
+        matches!(self, Self::Incomplete { .. } | Self::Log { .. } | Self::DataFile { .. })
+    }
+
     pub(crate) fn store_failure(action: &'static str, path: impl ToString, source: object_store::Error) -> Self {
         Self::Store { action, path: path.to_string(), source: StoreError(source) }
     }
@@ -379,8 +367,34 @@ impl Error {
 }
 
 // The table of a file in `tables/`.
-fn table_of(file: &str) -> &str {
-    file.strip_prefix("tables/").and_then(|within| within.split('/').next()).unwrap_or_default()
+/// Tables whose rows users added, so that no run has them.
+const OF_USERS: [&str; 2] = ["annotations", "predictions"];
+
+fn rows_hint(table: &str) -> String {
+    match OF_USERS.contains(&table) {
+        true => lost_rows_hint(table),
+        false => "`echolake ingest` derives it again from the runs".to_owned(),
+    }
+}
+
+/// Returns the ways out for rows of users, which nothing makes again.
+fn lost_rows_hint(table: &str) -> String {
+    format!("bring `tables/{table}` back from a backup; `echolake rebuild {table}` gives up what is lost of it")
+}
+
+/// Returns the way out of a table whose log or files cannot be read.
+pub(crate) fn rebuild_hint(table: &str) -> String {
+    match OF_USERS.contains(&table) {
+        true => format!("hint: {}", lost_rows_hint(table)),
+        false => format!("hint: `echolake rebuild {table}` makes it again from the runs"),
+    }
+}
+
+fn file_hint(file: &str) -> String {
+    match file.strip_prefix("tables/").and_then(|within| within.split('/').next()) {
+        Some(table) => rebuild_hint(table),
+        None => "hint: bring it back from a backup, or put an empty file in its place to give it up".to_owned(),
+    }
 }
 
 impl StoreError {

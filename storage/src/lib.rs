@@ -18,6 +18,8 @@
 
 mod config;
 #[cfg(feature = "tables")]
+mod contribution_objects;
+#[cfg(feature = "tables")]
 mod contributions;
 mod durable;
 mod error;
@@ -39,7 +41,7 @@ mod upload;
 
 pub use config::{DirectSound, LAKE_FORMAT, LakeConfig, ReferenceSurfaces, SamplePrecision};
 #[cfg(feature = "tables")]
-pub use contributions::{ContributionCounts, ContributionFile, ContributionLog};
+pub use contributions::{ContributedFile, ContributedPart, annotation_rows};
 pub use error::{Error, StoreError};
 pub use folder_listing::{FolderListing, UnusableEntry};
 pub use lake::Lake;
@@ -54,7 +56,7 @@ pub use run_digest::{digest_record, digest_record_path, file_sha256, object_sha2
 #[cfg(feature = "tables")]
 pub use tables::{
     BatchBuilder, CommitEffect, CommitLog, CommitOutcome, DataFile, DeletedFile, DeletionMode, EncodedFile,
-    FileEncoder, FileHistory, FileName, FileStats, KEEP_HOURS, LackingRows, LakeMoment, LakeSnapshot, LakeTag,
+    FileEncoder, FileHistory, FileName, FileStats, GivenUpRows, KEEP_HOURS, LackingRows, LakeMoment, LakeSnapshot, LakeTag,
     LoggedFile, MergeProgress, NewFile, NoMoment, OptimizeReport, RemovalRecord, ReplacedFiles, RunPart, RunRowCounts,
     StagedFile, TARGET_BYTES, TableChange, TableCommit, TableOptimizeReport, TableVersion, TableView, TagName,
     VacuumReport, VisibleRun, add_missing_columns, encode_batches, reader_metadata, wanted_schema,

@@ -1,11 +1,14 @@
 //! Contributions of users: annotations, which views honour and `AS OF` sees as they were, and predictions.
 
+mod rooms;
+
 use std::path::Path;
 use std::sync::Arc;
 
 use arrow::array::{ArrayRef, Float64Array, Int32Array, RecordBatch, RunArray, StringArray};
 use arrow::datatypes::Int32Type;
 use arrow::ipc::writer::StreamWriter;
+use echolake_schema::tables::{Source, Table};
 use serde_json::json;
 
 use super::catalogue::lake;
@@ -27,22 +30,32 @@ fn annotate(server: &ServedLake, annotation: &serde_json::Value) -> HttpResponse
 }
 
 fn predict(server: &ServedLake, version: &str, surface: &str, columns: &[(&str, Vec<f64>)]) -> HttpResponse {
+    let request = format!("/api/v1/predictions?model=cnn&version={version}");
+    HttpRequest::post_bytes(&request, arrow_stream(surface, columns))
+        .with("content-type", "application/vnd.apache.arrow.stream")
+        .send(server)
+}
+
+fn arrow_stream(surface: &str, columns: &[(&str, Vec<f64>)]) -> Vec<u8> {
     let rows = columns[0].1.len();
     let surfaces: ArrayRef = Arc::new(StringArray::from(vec![surface; rows]));
     let pairs: ArrayRef = Arc::new(Int32Array::from_iter_values(0..rows as i32));
     let values = columns.iter().map(|(name, values)| (*name, Arc::new(Float64Array::from(values.clone())) as ArrayRef));
     let keys = [("surface_id", surfaces), ("pair_id", pairs)];
-    predictions(version, &keys.into_iter().chain(values).collect::<Vec<_>>()).send(server)
+    encode_stream(&keys.into_iter().chain(values).collect::<Vec<_>>())
 }
 
 fn predictions(version: &str, columns: &[(&str, ArrayRef)]) -> HttpRequest {
+    HttpRequest::post_bytes(&format!("/api/v1/predictions?model=cnn&version={version}"), encode_stream(columns))
+        .with("content-type", "application/vnd.apache.arrow.stream")
+}
+
+fn encode_stream(columns: &[(&str, ArrayRef)]) -> Vec<u8> {
     let batch = RecordBatch::try_from_iter(columns.iter().map(|(name, array)| (*name, array.clone()))).expect("rows");
     let mut writer = StreamWriter::try_new(Vec::new(), &batch.schema()).expect("a stream");
     writer.write(&batch).expect("written");
     writer.finish().expect("ended");
-    let body = writer.into_inner().expect("bytes");
-    HttpRequest::post_bytes(&format!("/api/v1/predictions?model=cnn&version={version}"), body)
-        .with("content-type", "application/vnd.apache.arrow.stream")
+    writer.into_inner().expect("bytes")
 }
 
 #[test]
@@ -93,9 +106,13 @@ fn views_leave_out_what_the_last_verdict_rejects_and_as_of_sees_it_as_it_was() {
     }
     assert_eq!(count("annotations"), 3.0);
     drop(server);
-    // The tables can be deleted and made again; annotations stay.
-    std::fs::remove_dir_all(place.path("lake/tables")).expect("removed");
+    // The other tables can be deleted and made again; annotations stay.
+    for table in Table::ALL.into_iter().filter(|table| table.source() != Source::Users) {
+        std::fs::remove_dir_all(place.path(&format!("lake/tables/{}", table.name()))).expect("removed");
+    }
     place.ok(&["ingest"]);
+    assert_eq!((count("annotations"), count("tnce_db"), count("tnce")), (3.0, 0.0, pairs));
+    place.ok(&["rebuild"]);
     assert_eq!((count("annotations"), count("tnce_db"), count("tnce")), (3.0, 0.0, pairs));
 }
 

@@ -88,15 +88,17 @@ class ContributionClient:
             names.extend(answer["annotation_ids"])
         return names
 
-    def predict(self, model: str, version: str, table: pa.Table) -> int | None:
+    def predict(self, model: str, version: str, table: pa.Table, project: str | None = None) -> int | None:
         """Stores predictions: ``surface_id``, ``pair_id`` and linear columns of table ``tnce``.
 
-        They are sent by surfaces, in requests of which each is stored as a whole. Returns the version of the lake that
-        shows them, None for tokens of projects.
+        They are sent by surfaces, in requests of which each is stored as a whole. ``project`` is that of the surfaces'
+        runs, ``""`` for runs without one; it is needed if runs of two projects have one of the surfaces. Returns the
+        version of the lake that shows them, None for tokens of projects.
         """
         import pyarrow.compute as pc
 
-        params = {"model": model, "version": version} | ({"author": self._author} if self._author else {})
+        named = {"author": self._author or None, "project": project}
+        params = {"model": model, "version": version} | {name: text for name, text in named.items() if text is not None}
         path = "/api/v1/predictions?" + urllib.parse.urlencode(params)
         version_of_lake: int | None = None
         waiting = pc.unique(table.column("surface_id")).to_pylist()

@@ -26,7 +26,7 @@ use datafusion::datasource::{TableProvider, ViewTable};
 use datafusion::error::{DataFusionError, Result};
 use datafusion::logical_expr::{LogicalPlan, LogicalPlanBuilder};
 use datafusion::prelude::{SessionContext, ident};
-use echolake_lake::{ContributionLog, Lake};
+use echolake_lake::Lake;
 use echolake_schema::tables::{COMMENT, Table, UNIT};
 use futures::FutureExt as _;
 
@@ -75,15 +75,7 @@ pub fn table_meaning(name: &str) -> Option<&'static str> {
     if let Some((SYSTEM_SCHEMA, name)) = name.split_once('.') {
         return system::system_meaning(name);
     }
-    match ContributionLog::by_name(name) {
-        Some(ContributionLog::Annotations) => {
-            Some("One row per annotation of users: labels, verdicts and notes on runs and measurements.")
-        }
-        Some(ContributionLog::Predictions) => {
-            Some("One row per model, surface and pair: TNCE that a model predicts, linear.")
-        }
-        None => Table::by_name(name).map(Table::meaning).or_else(|| LakeView::by_name(name).map(LakeView::meaning)),
-    }
+    Table::by_name(name).map(Table::meaning).or_else(|| LakeView::by_name(name).map(LakeView::meaning))
 }
 
 impl LakeView {

@@ -2,13 +2,11 @@
 
 mod boxed_scan;
 mod lake_table;
-mod parquet_files;
 mod part_rows;
 mod readers;
 mod small_tables;
 mod unfiltered_source;
 
 pub use lake_table::{FileReaders, LakeTable};
-pub use parquet_files::ParquetFiles;
 pub use readers::LakeReaderFactory;
 pub use small_tables::SmallTables;

@@ -13,7 +13,7 @@ use std::sync::Arc;
 use arrow_schema::{Schema, SchemaRef};
 
 pub use column::{COMMENT, LIST_CHILD, UNIT};
-pub use contributions::{annotation_schema, predicted_columns, prediction_schema};
+pub use contributions::predicted_columns;
 pub use rows::BandStatistics;
 
 use self::column::Column;
@@ -56,11 +56,15 @@ pub enum Table {
     Events,
     /// One row per surface and band.
     SurfaceStats,
+    /// One row per label, verdict or note of a user.
+    Annotations,
+    /// One row per prediction of a model.
+    Predictions,
 }
 
 impl Table {
     /// All tables.
-    pub const ALL: [Self; 12] = [
+    pub const ALL: [Self; 14] = [
         Self::Surfaces,
         Self::Runs,
         Self::Points,
@@ -73,7 +77,12 @@ impl Table {
         Self::Environment,
         Self::Events,
         Self::SurfaceStats,
+        Self::Annotations,
+        Self::Predictions,
     ];
+
+    /// The tables of what users add, which no other source has.
+    pub const OF_USERS: [Self; 2] = [Self::Annotations, Self::Predictions];
 
     /// Its name in SQL and its folder.
     pub fn name(self) -> &'static str {
@@ -95,6 +104,8 @@ impl Table {
             Self::Environment => "One row per reading of the ambient sensor.",
             Self::Events => "One row per line of a run's log.",
             Self::SurfaceStats => "One row per surface and band: statistics of its levels.",
+            Self::Annotations => "One row per annotation: a label, verdict or note of a user on a run or some pairs.",
+            Self::Predictions => "One row per model, its version, surface and pair: TNCE as a model predicts them.",
         }
     }
 
@@ -145,6 +156,10 @@ impl Table {
             Self::SurfaceStats => {
                 define_table("surface_stats", Source::References, &["run_id", "band"], |_| definitions::surface_stats())
             }
+            Self::Annotations => {
+                define_table("annotations", Source::Users, &[], |_| contributions::annotation_columns())
+            }
+            Self::Predictions => define_table("predictions", Source::Users, &[], contributions::prediction_columns),
         }
     }
 }
@@ -180,6 +195,8 @@ pub enum Source {
     References,
     /// The table that decides which rows of the others are visible.
     Pointer,
+    /// Users, who add rows that no other source has: nothing makes them again.
+    Users,
 }
 
 #[cfg(test)]
@@ -219,7 +236,7 @@ mod tests {
         for table in Table::ALL {
             let schema = table.schema(&Rig::paper());
             let mut names: Vec<_> = schema.fields().iter().map(|f| f.name().clone()).collect();
-            if matches!(table.source(), Source::Run | Source::References | Source::Pointer) {
+            if table.source() != Source::Rig {
                 assert_eq!(names[..2], ["surface_id", "run_id"], "{}", table.name());
             }
             assert!(table.key().iter().all(|key| names.iter().any(|name| name == key)), "{}", table.name());

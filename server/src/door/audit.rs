@@ -5,7 +5,7 @@ use std::net::SocketAddr;
 
 use axum::http::{Method, StatusCode};
 use echolake_http::AddedContribution;
-use echolake_lake::ContributionLog;
+use echolake_schema::tables::Table;
 use echolake_service::{FaultCode, ServerProtocol};
 
 /// The target of its lines, by which a log's levels leave them out.
@@ -42,9 +42,9 @@ pub(super) fn record_file(peer: SocketAddr, method: &Method, status: StatusCode,
 }
 
 /// Writes a line about what a client added to the lake.
-pub(super) fn record_contribution(peer: SocketAddr, client: &str, log: ContributionLog, added: &AddedContribution) {
+pub(super) fn record_contribution(peer: SocketAddr, client: &str, table: Table, added: &AddedContribution) {
     let AddedContribution { lake_version, is_new, .. } = added;
-    tracing::info!(target: TARGET, %peer, client, log = log.name(), lake_version, is_new, "a contribution is stored");
+    tracing::info!(target: TARGET, %peer, client, table = table.name(), lake_version, is_new, "a contribution is stored");
 }
 
 fn is_file(path: &str) -> bool {

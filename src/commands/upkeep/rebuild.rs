@@ -4,7 +4,7 @@ use std::collections::HashSet;
 
 use clap::Args;
 use clap::builder::PossibleValuesParser;
-use echolake_lake::{Error as LakeError, Lake};
+use echolake_lake::{Error as LakeError, GivenUpRows, Lake};
 use echolake_schema::tables::{Source, Table};
 use futures::TryStreamExt as _;
 use object_store::ObjectStore as _;
@@ -14,7 +14,8 @@ use crate::commands::ingest::{self, IngestArgs};
 
 #[derive(Debug, Args)]
 pub(crate) struct RebuildArgs {
-    /// The table; by default all. Until its rows are there again, queries of it are refused.
+    /// The table; by default all but annotations and predictions. Until its rows are there again, queries of it are
+    /// refused. Of annotations and predictions, which are in no run, the rows of lost and damaged files are given up.
     #[arg(value_parser = PossibleValuesParser::new(Table::ALL.map(Table::name)))]
     pub table: Option<String>,
 }
@@ -22,13 +23,32 @@ pub(crate) struct RebuildArgs {
 pub(crate) async fn run_rebuild(args: &RebuildArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let lake = Lake::open(lake_url).await?;
     let named = args.table.as_deref().and_then(Table::by_name);
-    let tables = named.map_or_else(|| Table::ALL.to_vec(), |table| vec![table]);
+    if let Some(table) = named.filter(|table| table.source() == Source::Users) {
+        return give_up_rows(&lake, table).await;
+    }
+    let of_runs = Table::ALL.into_iter().filter(|table| table.source() != Source::Users);
+    let tables = named.map_or_else(|| of_runs.collect(), |table| vec![table]);
     if tables.iter().any(|table| matches!(table.source(), Source::Run | Source::Pointer)) {
         ensure_run_files(&lake).await?;
     }
     lake.begin_rebuild(&tables).await?;
     let args = IngestArgs { runs: Vec::new(), watch: false, json: false, suspect: None };
     ingest::run_ingest(&args, lake_url).await
+}
+
+// What users added is in no run file.
+async fn give_up_rows(lake: &Lake, table: Table) -> anyhow::Result<CommandOutcome> {
+    let given_up = lake.give_up_lost(table).await?;
+    let name = table.name();
+    for file in &given_up.files {
+        eprintln!("{file}: gave up its rows");
+    }
+    match (given_up.is_whole_log, given_up.files.len()) {
+        (true, _) => eprintln!("the log of table `{name}` was lost: it begins again, without rows"),
+        (false, 0) => eprintln!("table `{name}` is whole: nothing is given up, and nothing can make its rows again"),
+        (false, files) => eprintln!("gave up {} rows of table `{name}` in {files} files", given_up.rows),
+    }
+    Ok(if given_up == GivenUpRows::default() { CommandOutcome::Whole } else { CommandOutcome::WithLoss })
 }
 
 // What has no run file is in the tables alone.

@@ -149,7 +149,7 @@ fn writer_properties(table: Table, schema: &SchemaRef, first: &RecordBatch) -> W
                 .set_column_encoding(column, Encoding::DELTA_BINARY_PACKED);
             continue;
         }
-        let is_list = matches!(kind, DataType::List(_));
+        let is_list = matches!(kind, DataType::List(child) if child.data_type().is_floating());
         let column = match is_list {
             true => ColumnPath::new(vec![name, "list".into(), LIST_CHILD.into()]),
             false if kind.is_floating() => ColumnPath::new(vec![name]),

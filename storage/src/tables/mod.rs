@@ -22,7 +22,7 @@ pub use log::{
 };
 pub(crate) use log::{DeltaLog, ProjectLog};
 pub use maintenance::{
-    DeletedFile, DeletionMode, KEEP_HOURS, MergeProgress, OptimizeReport, TARGET_BYTES, TableOptimizeReport,
+    DeletedFile, DeletionMode, GivenUpRows, KEEP_HOURS, MergeProgress, OptimizeReport, TARGET_BYTES, TableOptimizeReport,
     VacuumReport,
 };
 pub use rows::{add_missing_columns, reader_metadata, wanted_schema};
@@ -39,6 +39,7 @@ use object_store::ObjectStoreExt as _;
 use self::file_name::table_folder;
 use self::log::has_run_files;
 use self::table_fault::TableFault;
+use crate::contributions::pass_table_fault;
 use crate::{Error, LAKE_FORMAT, Lake, Result};
 
 /// A file in the store that no commit names yet.
@@ -103,7 +104,13 @@ impl Lake {
             self.append_rows(table, &derivation(), &[rows]).await
         });
         try_join_all(of_rig).await?;
-        snapshot
+        let snapshot = snapshot?;
+        for table in Table::OF_USERS {
+            if !snapshot.pending_objects(table).is_empty() {
+                self.prepare_contributions(table).await.or_else(pass_table_fault)?;
+            }
+        }
+        Ok(snapshot)
     }
 
     /// The rows of table `pairs`, which follow from the rig: row i is pair i.
@@ -144,13 +151,13 @@ impl Lake {
         Ok(snapshot)
     }
 
-    /// The same of a lake all of whose tables are whole.
+    /// The same of a lake all of whose tables are whole, but for those of users.
     ///
     /// # Errors
     /// [`Error::Incomplete`] if one lacks rows; as [`Lake::snapshot`].
     pub async fn whole_snapshot(&self) -> Result<LakeSnapshot> {
         let snapshot = self.snapshot().await?;
-        Table::ALL.into_iter().try_for_each(|table| snapshot.check_table(table))?;
+        snapshot.check_run_tables()?;
         Ok(snapshot)
     }
 

@@ -66,13 +66,13 @@ impl DataFile {
     }
 }
 
-/// A part in the log: the name that it had as a file of its own, and its rows; in `runs` also the version that added
-/// it.
+/// A part in the log: the name that it had as a file of its own, and its rows; in `runs`, and of rows that users add,
+/// also the version that added it.
 #[derive(Deserialize)]
 #[serde(untagged)]
 enum LoggedPart {
     Rows(String, u64),
-    Pointer(String, u64, u64),
+    Versioned(String, u64, u64),
 }
 
 /// Parts as text.
@@ -89,7 +89,7 @@ pub(crate) fn decode_parts(text: &str) -> Option<Vec<RunPart>> {
     let parts: Vec<LoggedPart> = serde_json::from_str(text).ok()?;
     let one = |part: LoggedPart| match part {
         LoggedPart::Rows(name, rows) => RunPart::from_path(&name.into(), rows, None),
-        LoggedPart::Pointer(name, rows, version) => RunPart::from_path(&name.into(), rows, Some(version)),
+        LoggedPart::Versioned(name, rows, version) => RunPart::from_path(&name.into(), rows, Some(version)),
     };
     parts.into_iter().map(one).collect::<Option<Vec<_>>>().filter(|parts| !parts.is_empty())
 }
@@ -97,14 +97,15 @@ pub(crate) fn decode_parts(text: &str) -> Option<Vec<RunPart>> {
 impl RunPart {
     /// The only part of a file of one run; None if the file has another name.
     pub(crate) fn of_file(file: &DataFile) -> Option<Self> {
-        let part = Self::from_path(&file.path, file.rows, Some(file.log_version))?;
+        let is_pointer = matches!(FileName::parse(&file.path), Some(FileName::Pointer(_)));
+        let part = Self::from_path(&file.path, file.rows, is_pointer.then_some(file.log_version))?;
         Some(Self { row_counts: file.row_counts.clone(), ..part })
     }
 
     fn from_path(path: &Path, rows: u64, row_version: Option<u64>) -> Option<Self> {
         match FileName::parse(path)? {
             FileName::Rows { surface, run, derivation } => {
-                Some(Self { surface, run, derivation, rows, row_version: None, row_counts: None })
+                Some(Self { surface, run, derivation, rows, row_version, row_counts: None })
             }
             FileName::Pointer(pointer) => {
                 let derivation = pointer.joined_derivations();

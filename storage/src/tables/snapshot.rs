@@ -13,7 +13,8 @@ use object_store::path::Path;
 use crate::tables::file_name::{FileName, VisibleRun};
 use crate::tables::run_parts::{RunPointer, list_pointers, run_of_file};
 use crate::tables::table_fault::{LackingRows, TableFault};
-use crate::{CommitLog, ContributionCounts, DataFile, Error, Result, RunRowCounts, TableView};
+use crate::contributions::ShownVersions;
+use crate::{CommitLog, DataFile, Error, Result, RunRowCounts, TableView};
 
 /// A frozen view of all tables.
 #[derive(Debug, Clone, Default)]
@@ -27,7 +28,9 @@ pub struct LakeSnapshot {
     lacking: HashMap<Table, Vec<LackingRows>>,
     faults: HashMap<Table, TableFault>,
     versions: HashMap<Table, u64>,
-    contributions: ContributionCounts,
+    tables_id: String,
+    shown: ShownVersions,
+    copied: HashMap<Table, u64>,
     is_restricted: bool,
 }
 
@@ -64,7 +67,7 @@ impl NewestRuns {
 const TAKE_TRIES: usize = 10;
 
 /// A table's view, or the fault of its log.
-type ReadView = std::result::Result<Option<TableView>, TableFault>;
+pub(crate) type ReadView = std::result::Result<Option<TableView>, TableFault>;
 
 async fn views_of_others(log: &dyn CommitLog) -> Result<Vec<(Table, ReadView)>> {
     let others = Table::ALL.into_iter().filter(|table| *table != Table::Runs);
@@ -75,6 +78,18 @@ async fn views_of_others(log: &dyn CommitLog) -> Result<Vec<(Table, ReadView)>> 
         }
     });
     try_join_all(read).await
+}
+
+/// A table of users as its readers see it: of the version that `runs` shows.
+pub(crate) async fn shown_view(log: &dyn CommitLog, table: Table, view: ReadView, shown: u64) -> Result<ReadView> {
+    match view {
+        // Another writer adds rows at this moment, or ended before they were shown.
+        Ok(Some(view)) if view.version > shown => Ok(Ok(log.view_at(table, shown).await?)),
+        Ok(found) if found.as_ref().map_or(0, |view| view.version) < shown => {
+            Ok(Err(TableFault::lost_version(table, shown, found.map(|view| view.version))))
+        }
+        view => Ok(view),
+    }
 }
 
 impl LakeSnapshot {
@@ -102,12 +117,16 @@ impl LakeSnapshot {
         }
         let mut snapshot = Self::from_pointers(pointers.as_ref().map_or(&[], |view| view.files.as_slice()));
         let is_rebuilding = pointers.as_ref().is_some_and(|view| view.is_rebuilding);
-        snapshot.contributions = pointers.as_ref().map(|view| view.contributions).unwrap_or_default();
-        for (table, view) in views.into_iter().chain([(Table::Runs, Ok(pointers))]) {
+        snapshot.tables_id = pointers.as_ref().map(|view| view.id.clone()).unwrap_or_default();
+        snapshot.shown = pointers.as_ref().map(|view| view.shown).unwrap_or_default();
+        for (table, mut view) in views.into_iter().chain([(Table::Runs, Ok(pointers))]) {
+            if table.source() == Source::Users {
+                view = shown_view(log, table, view, snapshot.shown.of_table(table).table).await?;
+            }
             match view {
                 Ok(view) => {
                     snapshot.versions.extend(view.as_ref().map(|view| (table, view.version)));
-                    snapshot.sort_in(table, view.unwrap_or_default().files);
+                    snapshot.take_view(table, view.unwrap_or_default());
                 }
                 Err(fault) => snapshot.set_fault(fault),
             }
@@ -122,6 +141,21 @@ impl LakeSnapshot {
     fn from_pointers(pointers: &[DataFile]) -> Self {
         let runs = current_runs(pointers);
         Self { newest: NewestRuns::from_runs(&runs), runs, ..Self::default() }
+    }
+
+    fn take_view(&mut self, table: Table, view: TableView) {
+        self.copied.insert(table, view.copied);
+        self.sort_in(table, view.files);
+    }
+
+    /// The view of a table of users that a version of `runs` gives.
+    pub(crate) fn from_user_view(pointers: &TableView, table: Table, view: ReadView) -> Self {
+        let mut snapshot = Self { shown: pointers.shown, ..Self::from_pointers(&pointers.files) };
+        match view {
+            Ok(view) => snapshot.take_view(table, view.unwrap_or_default()),
+            Err(fault) => snapshot.set_fault(fault),
+        }
+        snapshot
     }
 
     /// The view of one table that a version of `runs` gives, its files as the log had them then.
@@ -141,6 +175,15 @@ impl LakeSnapshot {
             Some(fault) => Err(fault.to_error()),
             None => Ok(()),
         }
+    }
+
+    /// Checks all tables but those of users, on which no other rests.
+    ///
+    /// # Errors
+    /// As [`LakeSnapshot::check_table`].
+    pub fn check_run_tables(&self) -> Result<()> {
+        let mut of_runs = Table::ALL.into_iter().filter(|table| table.source() != Source::Users);
+        of_runs.try_for_each(|table| self.check_table(table))
     }
 
     /// Returns whether no table has a fault.
@@ -205,9 +248,19 @@ impl LakeSnapshot {
         self.versions.get(&table).copied()
     }
 
-    /// The contributions that readers see.
-    pub fn contributions(&self) -> ContributionCounts {
-        self.contributions
+    /// The id of `runs`: tables that were made again count their versions from 0 again, under another one.
+    pub fn tables_id(&self) -> &str {
+        &self.tables_id
+    }
+
+    /// What it shows of the tables of users.
+    pub(crate) fn shown_versions(&self) -> ShownVersions {
+        self.shown
+    }
+
+    /// The highest number of an object of the lake's earlier form that is in a table of users.
+    pub(crate) fn copied_objects(&self, table: Table) -> u64 {
+        self.copied.get(&table).copied().unwrap_or(0)
     }
 
     /// The files of a table that readers see.
@@ -266,6 +319,9 @@ impl LakeSnapshot {
     }
 
     fn sort_in(&mut self, table: Table, files: Vec<DataFile>) {
+        if table.source() == Source::Users {
+            return self.sort_in_users(table, files);
+        }
         let (merged, single): (Vec<_>, Vec<_>) = files.into_iter().partition(|f| !f.parts.is_empty());
         let mut sorted = SortedFiles::default();
         for file in single {
@@ -298,10 +354,30 @@ impl LakeSnapshot {
         self.lacking.insert(table, lacking);
     }
 
+    // Rows of users are seen with their run, predictions with any run of their surface: those of removed runs stay.
+    fn sort_in_users(&mut self, table: Table, files: Vec<DataFile>) {
+        let (mut seen, foreign): (Vec<_>, Vec<_>) = files.into_iter().partition(|file| !file.parts.is_empty());
+        for file in &mut seen {
+            let is_seen = |surface: &SurfaceId, run: &RunId| match table {
+                Table::Predictions => self.newest.of_surface.contains_key(surface),
+                _ => self.runs.contains_key(run),
+            };
+            let unseen = file.parts.iter().filter(|part| !is_seen(&part.surface, &part.run));
+            let unseen: Vec<_> = unseen.map(|part| part.run.clone()).collect();
+            file.hidden.extend(unseen);
+            file.hidden.sort();
+            file.hidden.dedup();
+        }
+        seen.retain(|file| file.visible_parts().next().is_some());
+        foreign.first().into_iter().for_each(|file| self.set_fault(TableFault::from_foreign(table, file)));
+        self.files.insert(table, seen);
+        self.foreign.insert(table, foreign);
+    }
+
     // What each run's row says that the table has of it, against what its log has.
     fn compare_rows(&self, table: Table, logged: &HashMap<RunId, u64>) -> Vec<LackingRows> {
         let named = self.runs.values().filter(|current| match table.source() {
-            Source::Rig | Source::Pointer => false,
+            Source::Rig | Source::Pointer | Source::Users => false,
             Source::Run => true,
             Source::References => current.run.reference_derivation.is_some(),
         });

@@ -54,6 +54,15 @@ impl TableFault {
         Self { is_of_foreign_files: true, ..Self::new(table, found) }
     }
 
+    /// A version that `runs` shows and the log no longer has.
+    pub fn lost_version(table: Table, shown: u64, newest: Option<u64>) -> Self {
+        let found = match newest {
+            Some(newest) => format!("its log ends at version {newest}, and `runs` names version {shown}"),
+            None => format!("it has no log, and `runs` names version {shown}"),
+        };
+        Self::new(table, found)
+    }
+
     pub fn without_rig(table: Table) -> Self {
         Self::new(table, "it has none of the rig's rows")
     }

@@ -13,7 +13,8 @@ use echolake_schema::tables::{Source, Table};
 use object_store::path::Path;
 
 use crate::tables::file_name::table_folder;
-use crate::{ContributionCounts, DataFile, Error, Lake, LakeSnapshot, Result, TableVersion, TagName};
+use crate::tables::snapshot::shown_view;
+use crate::{DataFile, Error, Lake, LakeSnapshot, Result, TableVersion, TagName};
 
 /// Formats of times beside RFC 3339.
 const TIMES: [&str; 4] = ["%Y-%m-%dT%H:%M:%S%.f", "%Y-%m-%d %H:%M:%S%.f", "%Y-%m-%dT%H:%M", "%Y-%m-%d %H:%M"];
@@ -117,6 +118,9 @@ impl Lake {
     /// # Errors
     /// [`Error::Vacuumed`] if files of it are deleted, or what the store says.
     pub async fn snapshot_at(&self, version: u64, table: Table) -> Result<LakeSnapshot> {
+        if table.source() == Source::Users {
+            return self.user_snapshot_at(version, table).await;
+        }
         let pointers = self.commit_log().files_at(Table::Runs, version).await?;
         let mut files = self.commit_log().list_files(table).await?;
         if table.source() != Source::Rig && !shows_all(&pointers, table, &files) {
@@ -145,12 +149,24 @@ impl Lake {
         Err(Error::Vacuumed { moment, table: table.name(), missing, files })
     }
 
-    /// The contributions that readers saw at a version of the lake.
-    ///
-    /// # Errors
-    /// What the store says.
-    pub async fn contributions_at(&self, version: u64) -> Result<ContributionCounts> {
-        self.commit_log().contributions_at(version).await
+    // The version of `runs` names that of the table, whose files of then are there until `vacuum` deletes those that
+    // were merged since.
+    async fn user_snapshot_at(&self, version: u64, table: Table) -> Result<LakeSnapshot> {
+        let log = self.commit_log();
+        let pointers = log.view_at(Table::Runs, version).await?.unwrap_or_default();
+        let shown = pointers.shown.of_table(table).table;
+        let view = shown_view(log, table, Ok(log.view_at(table, shown).await?), shown).await?;
+        let snapshot = LakeSnapshot::from_user_view(&pointers, table, view).with_restriction(self.is_restricted());
+        snapshot.check_table(table)?;
+        let files = snapshot.files(table);
+        let there = self.list_files(table).await?;
+        match files.iter().filter(|file| !there.contains(&file.path)).count() {
+            0 => Ok(snapshot),
+            missing => {
+                let moment = LakeMoment::Version(version).to_string();
+                Err(Error::Vacuumed { moment, table: table.name(), missing, files: files.len() })
+            }
+        }
     }
 
     async fn list_files(&self, table: Table) -> Result<HashSet<Path>> {

@@ -138,22 +138,25 @@ pub(super) async fn run_annotations(
     tag = "catalogue",
     params(PairPath),
     responses((status = 200, description = "OK", body = Vec<PairPrediction>)),
-    extensions(("x-sql" = json!(["select * from predictions where surface_id = $1 and pair_id = $2"])))
+    extensions(("x-sql" = json!(["select * from predictions where surface_id = $1 and pair_id = $2 and project is not distinct from $project"])))
 )]
 pub(super) async fn pair_predictions(
     Extension(request): Extension<CatalogueRequest>,
     PathParams(path): PathParams<PairPath>,
 ) -> EndpointAnswer {
-    let surface = text_value(&request.find_surface(&path.surface_id).await?.surface.surface_id);
+    let surface = &request.find_surface(&path.surface_id).await?.surface;
+    let project = project_value(&request, surface.run_id.as_deref());
+    let surface = text_value(&surface.surface_id);
     let pair = number_value(request.parse_pair(&path.pair_id)?);
     let rig = request.catalogue.lake().rig();
     let sql = format!(
         "select model, model_version, author, predicted, {} as total, {} as band from predictions \
-         where surface_id = $1 and pair_id = $2 order by model, predicted",
+         where surface_id = $1 and pair_id = $2 and project is not distinct from $3 \
+         order by model, predicted",
         band_list(rig, over_total),
         band_list(rig, over_band)
     );
-    let rows: Vec<PredictedPair> = request.read_rows(&sql, vec![surface, pair]).await?;
+    let rows: Vec<PredictedPair> = request.read_rows(&sql, vec![surface, pair, project]).await?;
     let predictions = rows.into_iter().map(|row| PairPrediction {
         tnce_db: levels_db(&row.total),
         tnce_band_db: levels_db(&row.band),
@@ -174,8 +177,8 @@ pub(super) async fn pair_predictions(
     responses((status = 200, description = "OK", body = Vec<SurfacePrediction>)),
     extensions(("x-sql" = json!([
         "select p.model, p.model_version, sqrt(avg(power(10 * log10(p.tnce_band_2500 / t.tnce_band_2500), 2))), ... \
-         from predictions p join tnce t using (surface_id, pair_id) where p.surface_id = $1 and t.run_id = $newest \
-         and not is_rejected(t.run_id, t.pair_id) group by p.model, p.model_version"
+         from predictions p join tnce t using (surface_id, pair_id) where p.surface_id = $1 and p.project is not \
+         distinct from $project and t.run_id = $newest and not is_rejected(t.run_id, t.pair_id) group by p.model, p.model_version"
     ])))
 )]
 pub(super) async fn surface_predictions(
@@ -184,9 +187,17 @@ pub(super) async fn surface_predictions(
 ) -> EndpointAnswer {
     let surface = &request.find_surface(&path.surface_id).await?.surface;
     let sql = error_sql(request.catalogue.lake().rig());
+    let project = project_value(&request, surface.run_id.as_deref());
     let run = ScalarValue::Utf8(surface.run_id.clone());
-    let rows: Vec<SurfacePrediction> = request.read_rows(&sql, vec![text_value(&surface.surface_id), run]).await?;
+    let values = vec![text_value(&surface.surface_id), run, project];
+    let rows: Vec<SurfacePrediction> = request.read_rows(&sql, values).await?;
     Ok(AnswerContent::encode_json(&rows)?)
+}
+
+// The project of the surface's run: another project may have a surface of the same name.
+fn project_value(request: &CatalogueRequest, run: Option<&str>) -> ScalarValue {
+    let run = run.and_then(|run| run.parse().ok());
+    ScalarValue::Utf8(run.and_then(|run| request.view.snapshot.project_of(&run)).map(ToString::to_string))
 }
 
 // No energy has no level, and no error.
@@ -196,7 +207,7 @@ fn error_sql(rig: &Rig) -> String {
     format!(
         "select p.model as model, p.model_version as model_version, max(p.author) as author, count(*) as pairs, \
          {} as rms_db, {} as rms_band_db from predictions p join tnce t on t.surface_id = p.surface_id and \
-         t.pair_id = p.pair_id where p.surface_id = $1 and t.run_id = $2 and not is_rejected(t.run_id, t.pair_id) \
+         t.pair_id = p.pair_id where p.surface_id = $1 and p.project is not distinct from $3 and t.run_id = $2 and not is_rejected(t.run_id, t.pair_id) \
          group by p.model, p.model_version order by p.model, p.model_version",
         band_list(rig, |band| rms(over_total(band))),
         band_list(rig, |band| rms(over_band(band)))

@@ -60,5 +60,5 @@ pub(super) async fn read_diffusion(request: &CatalogueRequest) -> Result<&Diffus
         let rows: Vec<DiffusionRow> = request.read_rows(&sql, Vec::new()).await?;
         Ok(rows.into_iter().map(|row| (row.surface_id, row.diffusion)).collect())
     };
-    request.view.diffusion.get_or_try_init(compute).await
+    request.view.results.diffusion.get_or_try_init(compute).await
 }

@@ -4,6 +4,7 @@ use axum::Extension;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
+use super::AnswerContents;
 use super::content::{AnswerContent, EndpointAnswer};
 use super::request::CatalogueRequest;
 use super::snapshot::bands::{BandDescription, describe_bands};
@@ -95,7 +96,7 @@ pub(super) async fn lake(Extension(request): Extension<CatalogueRequest>) -> End
     };
     Ok(AnswerContent::encode_json(&LakeDescription {
         name: lake_name(lake.location()),
-        version: &request.view.version,
+        version: &request.view.content_version(AnswerContents::Contributions),
         software: concat!("echolake ", env!("CARGO_PKG_VERSION")),
         bands: describe_bands(rig),
         rate_hz: rig.sweep.rate_hz.get(),

@@ -114,7 +114,7 @@ pub(super) async fn map(
 /// # Errors
 /// Those of its query.
 pub(super) async fn surface_positions(request: &CatalogueRequest) -> Result<&SurfacePositions, RequestFault> {
-    request.view.places.get_or_try_init(|| find_positions(request)).await
+    request.view.results.places.get_or_try_init(|| find_positions(request)).await
 }
 
 /// Finds the surfaces' positions by their TNCE.

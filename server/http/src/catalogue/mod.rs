@@ -48,6 +48,7 @@ use super::format;
 use super::problem::ProblemResponse;
 use request::SurfacePath;
 pub(super) use request::{CatalogueRequest, RunPath, find_run, text_value};
+pub(super) use snapshot::view::AnswerContents;
 use snapshot::view::SnapshotViews;
 pub(super) use snapshot::view::{SnapshotView, VisibleFile};
 pub(super) use tables::{ColumnDescription, find_table};
@@ -58,7 +59,6 @@ pub const LASTING_VERSION: HeaderName = HeaderName::from_static("echolake-lastin
 /// The endpoints that are answered from tables by few queries.
 pub(super) fn light_routes() -> OpenApiRouter {
     OpenApiRouter::new()
-        .routes(routes!(lake::lake))
         .routes(routes!(facets::surfaces))
         .routes(routes!(surface::surface))
         .routes(routes!(surface::grid))
@@ -69,10 +69,16 @@ pub(super) fn light_routes() -> OpenApiRouter {
         .routes(routes!(wav::wav))
         .routes(routes!(runs::runs))
         .routes(routes!(runs::run))
+        .routes(routes!(environment::environment))
+}
+
+/// The endpoints that are answered from tables, those of users among them.
+pub(super) fn contribution_routes() -> OpenApiRouter {
+    OpenApiRouter::new()
+        .routes(routes!(lake::lake))
         .routes(routes!(contributed::run_annotations))
         .routes(routes!(contributed::pair_predictions))
         .routes(routes!(contributed::surface_predictions))
-        .routes(routes!(environment::environment))
         .routes(routes!(tables::tables))
         .routes(routes!(tables::table_files))
 }
@@ -116,13 +122,15 @@ impl LakeCatalogue {
 
     /// Routes of the endpoints.
     pub fn endpoint_router(&self) -> Router {
-        let cached =
-            |routes: Router, scope| routes.route_layer(from_fn_with_state((self.clone(), scope), answer_through_cache));
+        let cached = |routes: Router, scope, contents| {
+            routes.route_layer(from_fn_with_state((self.clone(), scope, contents), answer_through_cache))
+        };
         // One per core: light endpoints never wait for all the heavy ones that are requested.
         let places = Arc::new(Semaphore::new(std::thread::available_parallelism().map_or(1, usize::from)));
         let heavy = Router::from(heavy_routes()).route_layer(from_fn_with_state(places, answer_in_place));
-        cached(Router::from(light_routes()).merge(heavy), TokenScope::Sql)
-            .merge(cached(file_routes().into(), TokenScope::Files))
+        cached(Router::from(light_routes()).merge(heavy), TokenScope::Sql, AnswerContents::Runs)
+            .merge(cached(contribution_routes().into(), TokenScope::Sql, AnswerContents::Contributions))
+            .merge(cached(file_routes().into(), TokenScope::Files, AnswerContents::Runs))
     }
 
     /// Returns the answer of a surface's endpoint.
@@ -166,7 +174,7 @@ impl LakeCatalogue {
 
 /// Answers a request from the cache, or by its endpoint.
 async fn answer_through_cache(
-    State((catalogue, scope)): State<(LakeCatalogue, TokenScope)>,
+    State((catalogue, scope, contents)): State<(LakeCatalogue, TokenScope, AnswerContents)>,
     mut request: Request,
     next: Next,
 ) -> Result<Response, ProblemResponse> {
@@ -178,7 +186,7 @@ async fn answer_through_cache(
     let headers = request.headers().clone();
     let as_arrow = format::prefers_arrow(&headers);
     let address = request.uri().path_and_query().map_or_else(String::new, ToString::to_string);
-    let etag = view.answer_etag(&format!("{address} {as_arrow}"));
+    let etag = view.answer_etag(contents, &format!("{address} {as_arrow}"));
     let outcome = ConditionOutcome::new(&headers, &etag);
     let instead = || outcome.early_response(&etag, [(header::ETAG, &etag)]);
     // Only an answer has this tag: a client that names it had the answer, which need not be made again.
@@ -187,11 +195,11 @@ async fn answer_through_cache(
     {
         return Ok(unchanged);
     }
-    let key = (address, as_arrow);
+    let key = (address, as_arrow, view.content_version(contents));
     // One answer is for both methods: HEAD's body is left out behind this.
     *request.method_mut() = Method::GET;
     request.extensions_mut().insert(CatalogueRequest::new(&catalogue, &view, as_arrow));
-    match view.answers.get_or_make(&key, next.run(request)).await {
+    match view.results.answers.get_or_make(&key, next.run(request)).await {
         Ok(answer) => Ok(instead().unwrap_or_else(|| {
             let mut response = with_validators(answer.to_response(&headers), &etag);
             response.headers_mut().extend(view.lasting_version().map(|version| (LASTING_VERSION, version.into())));

@@ -229,7 +229,7 @@ pub(super) async fn find_geometry(request: &CatalogueRequest, pair: usize) -> Re
         let rows = request.read_rows::<PairGeometry>(GEOMETRY, Vec::new()).await?;
         Ok::<Vec<_>, RequestFault>(rows.into_iter().map(|pair| pair.with_fresnel(&measured_hz)).collect())
     };
-    let all = request.view.pairs.get_or_try_init(read).await?;
+    let all = request.view.results.pairs.get_or_try_init(read).await?;
     let found = all.iter().find(|row| usize::try_from(row.pair_id) == Ok(pair));
     found.ok_or_else(|| missing_item(format!("pair {pair}"), "ask for another one"))
 }
@@ -437,7 +437,7 @@ async fn read_levels(
 ) -> Result<PairLevels, RequestFault> {
     let lake = request.catalogue.lake();
     let rig = lake.rig();
-    let moved = request.view.moved_pairs.get_or_init(|| {
+    let moved = request.view.results.moved_pairs.get_or_init(|| {
         let images = |symmetry| Some((symmetry, lake.grid().moved_pairs(symmetry)?));
         let mut all: Vec<_> = Symmetry::ALL.into_iter().filter_map(images).collect();
         all.sort_by_key(|(symmetry, _)| symmetry.name());

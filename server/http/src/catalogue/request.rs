@@ -71,7 +71,7 @@ impl CatalogueRequest {
                 tokio::try_join!(self.read_rows(SURFACES, Vec::new()), self.read_rows(BAND_STATISTICS, Vec::new()))?;
             Ok(CatalogueSummary::new(surfaces, statistics, describe_bands(self.catalogue.lake().rig())))
         };
-        self.view.summary.get_or_try_init(read).await
+        self.view.results.summary.get_or_try_init(read).await
     }
 
     /// The surface of this name.

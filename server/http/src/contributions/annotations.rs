@@ -2,15 +2,15 @@
 
 use std::collections::{BTreeSet, HashMap, HashSet};
 
-use axum::Json;
 use axum::extract::State;
 use axum::extract::rejection::BytesRejection;
-use base64::Engine as _;
-use base64::engine::general_purpose::STANDARD;
+use axum::response::Response;
 use bytes::Bytes;
 use chrono::Utc;
+use echolake_lake::{ContributedFile, annotation_rows};
 use echolake_query::RequestMemory;
 use echolake_schema::annotations::{Annotation, AnnotationKind};
+use echolake_schema::tables::Table;
 use echolake_schema::{Grid, RunId};
 use echolake_service::{ContributionDraft, RequestFault};
 use serde::Deserialize;
@@ -19,7 +19,7 @@ use uuid::Uuid;
 
 use super::super::catalogue::LakeCatalogue;
 use super::super::problem::ProblemResponse;
-use super::{choose_author, with_request_ticket};
+use super::{choose_author, encode_draft, newest_view, refuse_encoding, with_request_ticket};
 
 /// Most pairs of all annotations of a request, of which a region may have all of the grid's.
 const MOST_PAIRS: usize = 500_000;
@@ -70,7 +70,7 @@ struct NewAnnotation {
 pub(super) async fn draft_annotations(
     State(catalogue): State<LakeCatalogue>,
     body: Result<Bytes, BytesRejection>,
-) -> Result<Json<ContributionDraft>, ProblemResponse> {
+) -> Result<Response, ProblemResponse> {
     let of = catalogue.clone();
     let drafted = with_request_ticket(&catalogue, "(annotations that are sent)", body, move |body| async move {
         let request: AnnotationsRequest = serde_json::from_slice(&body.bytes).map_err(|e| {
@@ -84,7 +84,7 @@ pub(super) async fn draft_annotations(
         }
         draft_request(&of, request, &body.memory).await
     });
-    Ok(Json(drafted.await?))
+    Ok(encode_draft(&drafted.await?))
 }
 
 async fn draft_request(
@@ -96,12 +96,8 @@ async fn draft_request(
         return Err(RequestFault::bad_request("`annotations` is empty, expected one at least"));
     }
     let author = choose_author(catalogue, request.author.as_deref())?;
-    let view = catalogue.current_view().await?;
-    let (last, known) = view.session.all_annotations().await?;
-    // Names are those of a run, so that nobody learns of annotations on runs of other projects.
-    let by_name: HashMap<_, &Annotation> = known.iter().map(|known| (annotation_key(known), known.as_ref())).collect();
+    let (view, seen) = newest_view(catalogue, Table::Annotations).await?;
     let time = Utc::now();
-    let lake_version = view.snapshot.lake_version().unwrap_or(0);
     let mut annotations = Vec::with_capacity(request.annotations.len());
     let meant = meant_pairs(catalogue.lake().grid(), &request.annotations).await?;
     memory.reserve(meant.iter().flatten().map(Vec::len).sum::<usize>() * BYTES_PER_PAIR)?;
@@ -112,8 +108,8 @@ async fn draft_request(
             failed(format!("run `{}` is not there; hint: GET /api/v1/runs lists what there is", new.run_id))
         })?;
         let annotation = Annotation {
-            number: last + 1,
             pair_ids,
+            lake_version: view.snapshot.seen_version(&run_id),
             annotation_id: new.annotation_id.unwrap_or_else(|| Uuid::new_v4().to_string()),
             run_id,
             kind: new.kind,
@@ -121,7 +117,6 @@ async fn draft_request(
             comment: new.comment,
             author: author.clone(),
             time,
-            lake_version,
         };
         annotation.check_texts(catalogue.lake().grid().pairs().len()).map_err(failed)?;
         annotations.push(annotation);
@@ -130,26 +125,23 @@ async fn draft_request(
     if annotations.iter().map(annotation_key).collect::<BTreeSet<_>>().len() < annotations.len() {
         return Err(RequestFault::bad_request("two annotations on a run have the same `annotation_id`"));
     }
-    let there: Vec<_> = annotations.iter().filter_map(|new| Some((new, *by_name.get(&annotation_key(new))?))).collect();
-    match there.first() {
-        None => {
-            let mut object = Vec::new();
-            for annotation in &annotations {
-                serde_json::to_writer(&mut object, annotation)
-                    .map_err(RequestFault::defect("an annotation is not written as JSON"))?;
-                object.push(b'\n');
-            }
-            let object = Some(STANDARD.encode(object));
-            Ok(ContributionDraft { number: last + 1, object, annotation_ids })
-        }
-        Some((_, known)) if there.len() == annotations.len() && there.iter().all(|(new, known)| new.is_same(known)) => {
-            Ok(ContributionDraft { number: known.number, object: None, annotation_ids })
-        }
-        Some((new, _)) => Err(RequestFault::Taken {
+    // Names are those of a run, so that nobody learns of annotations on runs of other projects.
+    let runs = annotations.iter().map(|annotation| annotation.run_id.clone()).collect();
+    let known = view.session.annotations_on(&view.snapshot, &runs).await?;
+    let by_name: HashMap<_, &Annotation> = known.iter().map(|known| (annotation_key(known), known)).collect();
+    let known = |new: &Annotation| by_name.get(&annotation_key(new)).copied();
+    if let Some(new) = annotations.iter().find(|new| known(new).is_some_and(|known| !new.is_same(known))) {
+        return Err(RequestFault::Taken {
             what: format!("annotation `{}`", new.annotation_id),
             hint: "a stored annotation never changes; add another with a new `annotation_id`",
-        }),
+        });
     }
+    let new: Vec<_> = annotations.iter().filter(|new| known(new).is_none()).cloned().collect();
+    let lake = catalogue.lake();
+    let files = annotation_rows(lake, &view.snapshot, &new)
+        .and_then(|rows| ContributedFile::encode_rows(lake, Table::Annotations, &rows));
+    let files = files.map_err(refuse_encoding)?;
+    Ok(ContributionDraft { table: Table::Annotations, seen, files, annotation_ids })
 }
 
 fn annotation_key(annotation: &Annotation) -> (&str, &str) {

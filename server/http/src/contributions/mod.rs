@@ -6,17 +6,21 @@ mod arrow_body;
 mod new_rows;
 mod predictions;
 
+use std::sync::Arc;
+
 use axum::Router;
 use axum::extract::rejection::BytesRejection;
+use axum::http::header;
+use axum::response::{IntoResponse as _, Response};
 use axum::routing::post;
 use bytes::Bytes;
-use echolake_lake::ContributionLog;
+use echolake_schema::tables::Table;
 use echolake_query::RequestMemory;
-use echolake_service::{RequestFault, TokenScope, contribution_path};
+use echolake_service::{ContributionDraft, RequestFault, TokenScope, contribution_path};
 use serde::Serialize;
 use utoipa::ToSchema;
 
-use super::catalogue::LakeCatalogue;
+use super::catalogue::{LakeCatalogue, SnapshotView};
 use super::request_protocol::request_protocol;
 use super::sql::whole_body;
 pub use annotations::AnnotationsRequest;
@@ -43,8 +47,8 @@ pub struct AddedContribution {
 /// Routes of an engine. They change nothing, so the contract has the door's.
 pub(super) fn draft_routes(catalogue: &LakeCatalogue) -> Router {
     Router::new()
-        .route(contribution_path(ContributionLog::Annotations), post(annotations::draft_annotations))
-        .route(contribution_path(ContributionLog::Predictions), post(predictions::draft_predictions))
+        .route(contribution_path(Table::Annotations), post(annotations::draft_annotations))
+        .route(contribution_path(Table::Predictions), post(predictions::draft_predictions))
         .with_state(catalogue.clone())
 }
 
@@ -76,6 +80,26 @@ where
         work(RequestBody { bytes, most_rows, memory }).await
     };
     service.run_request(request_protocol(), &client, listed_as, run).await
+}
+
+// The lake as it is at this moment, and the version of a table of users in it: rows are added to no other.
+async fn newest_view(catalogue: &LakeCatalogue, table: Table) -> Result<(Arc<SnapshotView>, u64), RequestFault> {
+    if let Ok(view) = catalogue.current_view().await {
+        view.session.expire_snapshot();
+    }
+    let view = catalogue.current_view().await?;
+    let fault = |error: echolake_lake::Error| RequestFault::from(echolake_query::Error::from(error));
+    view.snapshot.check_table(table).map_err(fault)?;
+    let version = view.snapshot.log_version(table).unwrap_or(0);
+    Ok((view, version))
+}
+
+fn encode_draft(draft: &ContributionDraft) -> Response {
+    ([(header::CONTENT_TYPE, ContributionDraft::MEDIA_TYPE)], draft.encode()).into_response()
+}
+
+fn refuse_encoding(error: echolake_lake::Error) -> RequestFault {
+    RequestFault::defect("rows that were checked are not encoded")(error)
 }
 
 // With tokens the author is the token's name; without, who asks may say who they are.

@@ -1,43 +1,34 @@
 //! `POST /api/v1/predictions`: TNCE that a model predicts.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use arrow::array::{
-    Array as _, ArrayRef, AsArray as _, Float64Array, Int32Array, Int64Array, StringArray, TimestampMicrosecondArray,
-    UInt32Array,
+    Array as _, ArrayRef, AsArray as _, Float64Array, Int32Array, StringArray, TimestampMicrosecondArray, UInt32Array,
 };
 use arrow::compute::{SortColumn, lexsort_to_indices, take};
 use arrow::datatypes::{Float64Type, Int32Type};
 use arrow::record_batch::RecordBatch;
-use axum::Json;
 use axum::extract::State;
 use axum::extract::rejection::BytesRejection;
-use base64::Engine as _;
-use base64::engine::general_purpose::STANDARD;
+use axum::response::Response;
 use bytes::Bytes;
 use chrono::Utc;
-use echolake_lake::ContributionLog;
-use echolake_schema::SurfaceId;
-use echolake_schema::tables::{predicted_columns, prediction_schema};
+use datafusion::scalar::ScalarValue;
+use echolake_lake::{BatchBuilder, ContributedFile, Lake, LakeSnapshot};
+use echolake_schema::tables::{Table, predicted_columns};
+use echolake_schema::{ProjectName, RunId, SurfaceId};
 use echolake_service::{ContributionDraft, RequestFault};
-use parquet::arrow::ArrowWriter;
-use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
-use parquet::basic::{Compression, ZstdLevel};
-use parquet::file::metadata::KeyValue;
-use parquet::file::properties::WriterProperties;
-use serde::{Deserialize, Serialize};
+use serde::Deserialize;
 use utoipa::IntoParams;
 
-use super::super::catalogue::LakeCatalogue;
+use super::super::catalogue::{CatalogueRequest, LakeCatalogue, SnapshotView, text_value};
 use super::super::extract::QueryParams;
 use super::super::problem::ProblemResponse;
 use super::arrow_body::{ColumnContent, ExpectedColumn, decode_arrow_body};
 use super::new_rows::select_new_rows;
-use super::{RequestBody, choose_author, with_request_ticket};
+use super::{RequestBody, choose_author, encode_draft, newest_view, refuse_encoding, with_request_ticket};
 
-/// Key of the file's metadata that holds its [`PredictionRecord`].
-const RECORD: &str = "echolake.predictions";
 /// Longest name of a model or a version, in characters.
 const LONGEST: usize = 64;
 /// Most rows of a request: more than 1 MiB holds with values in double precision.
@@ -52,17 +43,19 @@ pub struct PredictionParams {
     model: String,
     /// Version of the model, as its name.
     version: String,
+    /// Project of the surfaces' runs, empty for runs without one: only if runs of two projects have a surface of the
+    /// request.
+    #[serde(default)]
+    project: Option<String>,
     /// Only without tokens; the token's name otherwise.
     #[serde(default, deserialize_with = "crate::extract::read_present")]
     author: Option<String>,
 }
 
-/// What a stored file has: model, version and surfaces.
-#[derive(Debug, PartialEq, Eq, Serialize, Deserialize)]
-struct PredictionRecord {
-    model: String,
-    version: String,
-    surfaces: BTreeSet<String>,
+/// The newest run of a surface of the request, and its project.
+struct MeantRun {
+    run: RunId,
+    project: Option<ProjectName>,
 }
 
 /// Checks the predictions of a request.
@@ -70,7 +63,7 @@ pub(super) async fn draft_predictions(
     State(catalogue): State<LakeCatalogue>,
     QueryParams(params): QueryParams<PredictionParams>,
     body: Result<Bytes, BytesRejection>,
-) -> Result<Json<ContributionDraft>, ProblemResponse> {
+) -> Result<Response, ProblemResponse> {
     let of = catalogue.clone();
     let drafted = with_request_ticket(&catalogue, "(predictions that are sent)", body, move |body| async move {
         let author = choose_author(&of, params.author.as_deref())?;
@@ -78,7 +71,7 @@ pub(super) async fn draft_predictions(
         let rows = PredictedRows::from_stream(&of, &body)?;
         draft_rows(&of, &params, author, rows).await
     });
-    Ok(Json(drafted.await?))
+    Ok(encode_draft(&drafted.await?))
 }
 
 fn check_model(params: &PredictionParams) -> Result<(), RequestFault> {
@@ -98,55 +91,81 @@ async fn draft_rows(
     author: String,
     rows: PredictedRows,
 ) -> Result<ContributionDraft, RequestFault> {
-    let view = catalogue.current_view().await?;
-    let surfaces: BTreeSet<String> = rows.surface_ids.iter().flatten().map(str::to_owned).collect();
-    for surface in &surfaces {
-        let is_there = surface.parse::<SurfaceId>().is_ok_and(|id| view.snapshot.runs().any(|run| run.surface == id));
-        if !is_there {
-            return Err(RequestFault::bad_request(format!(
-                "surface `{surface}` is not there; hint: GET /api/v1/surfaces lists what there is"
-            )));
-        }
+    let (view, seen) = newest_view(catalogue, Table::Predictions).await?;
+    let surfaces: BTreeSet<&str> = rows.surface_ids.iter().flatten().collect();
+    let mut meant = BTreeMap::new();
+    for surface in surfaces {
+        meant.insert(surface, find_meant_run(&view.snapshot, surface, params.project.as_deref())?);
     }
-    let record = PredictionRecord { model: params.model.clone(), version: params.version.clone(), surfaces };
-    let lake = catalogue.lake();
-    let log = ContributionLog::Predictions;
-    let unreadable = |e: echolake_lake::Error| RequestFault::from(echolake_query::Error::from(e));
-    let files = lake.list_contributions(log, u64::MAX).await.map_err(unreadable)?;
-    let mut known = Vec::new();
-    let mut last_known = 0;
-    for file in files.iter().filter(|file| file.bytes > 0) {
-        let bytes = lake.read_contribution(log, file.number).await.map_err(unreadable)?;
-        if let Some(batches) = read_known_rows(bytes, &record)? {
-            known.extend(batches);
-            last_known = file.number;
-        }
-    }
-    let version = view.snapshot.lake_version().unwrap_or(0);
-    let rows = select_new_rows(&known, &rows.to_batch(catalogue, &record, &author, version)?)?;
-    if rows.num_rows() == 0 {
-        return Ok(ContributionDraft { number: last_known, object: None, annotation_ids: Vec::new() });
-    }
-    let number = files.last().map_or(0, |file| file.number) + 1;
-    let object = encode_parquet(&rows, &record)?;
-    Ok(ContributionDraft { number, object: Some(STANDARD.encode(object)), annotation_ids: Vec::new() })
+    let known = read_known_rows(catalogue, &view, params, &meant).await?;
+    let rows = rows.to_batch(catalogue.lake(), &view.snapshot, params, &author, &meant)?;
+    let rows = select_new_rows(&known, &rows)?;
+    let files = ContributedFile::encode_rows(catalogue.lake(), Table::Predictions, &rows).map_err(refuse_encoding)?;
+    Ok(ContributionDraft { table: Table::Predictions, seen, files, annotation_ids: Vec::new() })
 }
 
-// The rows of a file of the same model, version and a surface; None if it is another's.
-fn read_known_rows(bytes: Bytes, record: &PredictionRecord) -> Result<Option<Vec<RecordBatch>>, RequestFault> {
-    let failed = RequestFault::defect("a file of predictions cannot be read");
-    let reader = ParquetRecordBatchReaderBuilder::try_new(bytes).map_err(failed)?;
-    let metadata = reader.metadata().file_metadata().key_value_metadata();
-    let text = metadata.and_then(|all| all.iter().find(|entry| entry.key == RECORD)?.value.as_ref());
-    let known: Option<PredictionRecord> = text.and_then(|text| serde_json::from_str(text).ok());
-    let is_same = |known: &PredictionRecord| {
-        known.model == record.model && known.version == record.version && !known.surfaces.is_disjoint(&record.surfaces)
-    };
-    if !known.as_ref().is_some_and(is_same) {
-        return Ok(None);
+// A prediction is of the project of the surface's runs that its author sees. Of two projects the request names one.
+fn find_meant_run(snapshot: &LakeSnapshot, surface: &str, project: Option<&str>) -> Result<MeantRun, RequestFault> {
+    let named = project.map(|name| name.trim()).map(|name| (!name.is_empty()).then_some(name));
+    let of_surface = snapshot.runs().filter(|run| run.surface.as_str() == surface);
+    let mut newest = BTreeMap::new();
+    for run in of_surface {
+        newest.insert(snapshot.project_of(&run.run).cloned(), run.run.clone());
     }
-    let rows = reader.build().map_err(failed)?.collect::<Result<_, _>>();
-    rows.map(Some).map_err(RequestFault::defect("rows of predictions cannot be read"))
+    let quoted = |project: &Option<ProjectName>| match project {
+        Some(project) => format!("`{project}`"),
+        None => "none (`project=`)".to_owned(),
+    };
+    let known = newest.keys().map(quoted).collect::<Vec<_>>().join(", ");
+    let is_meant = |project: &Option<ProjectName>| {
+        named.is_none_or(|named| project.as_ref().map(ProjectName::as_str) == named)
+    };
+    let mut meant: Vec<_> = newest.into_iter().filter(|(project, _)| is_meant(project)).collect();
+    match (meant.len(), known.is_empty()) {
+        (1, _) => {
+            let (project, run) = meant.remove(0);
+            Ok(MeantRun { run, project })
+        }
+        (0, true) => Err(RequestFault::bad_request(format!(
+            "surface `{surface}` is not there; hint: GET /api/v1/surfaces lists what there is"
+        ))),
+        (0, false) => Err(RequestFault::bad_request(format!(
+            "surface `{surface}` has no run of project `{:.64}`, expected one of {known}",
+            project.unwrap_or_default()
+        ))),
+        _ => Err(RequestFault::bad_request(format!(
+            "surface `{surface}` has runs of several projects, {known}; hint: `project` names the one that is meant"
+        ))),
+    }
+}
+
+// The stored rows of the same model and version on these surfaces and their projects.
+async fn read_known_rows(
+    catalogue: &LakeCatalogue,
+    view: &Arc<SnapshotView>,
+    params: &PredictionParams,
+    meant: &BTreeMap<&str, MeantRun>,
+) -> Result<Vec<RecordBatch>, RequestFault> {
+    let mut values = vec![text_value(&params.model), text_value(&params.version)];
+    let mut places = Vec::new();
+    for (surface, MeantRun { project, .. }) in meant {
+        values.push(text_value(surface));
+        values.push(ScalarValue::Utf8(project.as_ref().map(ToString::to_string)));
+        let last = values.len();
+        places.push(format!("(surface_id = ${} and project is not distinct from ${last})", last - 1));
+    }
+    let names = predicted_columns(catalogue.lake().rig()).join(", ");
+    let sql = format!(
+        "select model, model_version, surface_id, pair_id, {names} from predictions \
+         where model = $1 and model_version = $2 and ({})",
+        places.join(" or ")
+    );
+    let mut running = CatalogueRequest::new(catalogue, view, true).stream_batches(&sql, values).await?;
+    let mut batches = Vec::new();
+    while let Some(batch) = running.next_part().await? {
+        batches.push(batch);
+    }
+    Ok(batches)
 }
 
 /// The rows of a request, sorted by surface and pair.
@@ -226,47 +245,35 @@ impl PredictedRows {
     // The rows of table `predictions`.
     fn to_batch(
         &self,
-        catalogue: &LakeCatalogue,
-        record: &PredictionRecord,
+        lake: &Lake,
+        snapshot: &LakeSnapshot,
+        params: &PredictionParams,
         author: &str,
-        lake_version: u64,
+        meant: &BTreeMap<&str, MeantRun>,
     ) -> Result<RecordBatch, RequestFault> {
-        let schema = prediction_schema(catalogue.lake().rig());
         let rows = self.pair_ids.len();
-        let text =
-            |text: &str| -> ArrayRef { Arc::new(StringArray::from_iter_values(std::iter::repeat_n(text, rows))) };
-        let mut columns = vec![
-            text(&record.model),
-            text(&record.version),
-            Arc::new(self.surface_ids.clone()) as ArrayRef,
-            Arc::new(self.pair_ids.clone()),
-        ];
-        for values in &self.values {
-            columns.push(match values {
-                Some(values) => Arc::new(values.clone()),
-                None => Arc::new(Float64Array::new_null(rows)),
-            });
-        }
+        let run = |surface: Option<&str>| meant.get(surface?);
+        let meant: Vec<_> = self.surface_ids.iter().map(run).collect();
+        let projects = meant.iter().map(|meant| Some(meant.as_ref()?.project.as_ref()?.as_str()));
+        let versions = meant.iter().map(|meant| Some(snapshot.seen_version(&meant.as_ref()?.run)? as i64));
         let time = TimestampMicrosecondArray::from_value(Utc::now().timestamp_micros(), rows).with_timezone("UTC");
-        columns.push(text(author));
-        columns.push(Arc::new(time));
-        columns.push(Arc::new(Int64Array::from_value(lake_version as i64, rows)));
-        RecordBatch::try_new(schema, columns).map_err(RequestFault::defect("columns do not fit"))
+        let mut batch = BatchBuilder::new(Table::Predictions, lake.rig(), rows);
+        batch
+            .push_column("surface_id", Arc::new(self.surface_ids.clone()))
+            .push_column("run_id", Arc::new(meant.iter().map(|m| Some(m.as_ref()?.run.as_str())).collect::<StringArray>()))
+            .push_column("project", Arc::new(projects.collect::<StringArray>()))
+            .fill_text("model", params.model.as_str())
+            .fill_text("model_version", params.version.as_str())
+            .push_column("pair_id", Arc::new(self.pair_ids.clone()))
+            .fill_text("author", author)
+            .push_column("predicted", Arc::new(time))
+            .push_longs("lake_version", versions);
+        for (name, values) in predicted_columns(lake.rig()).iter().zip(&self.values) {
+            let values = values.clone().unwrap_or_else(|| Float64Array::new_null(rows));
+            batch.push_column(name, Arc::new(values));
+        }
+        batch.finish().map_err(refuse_encoding)
     }
-}
-
-fn encode_parquet(rows: &RecordBatch, record: &PredictionRecord) -> Result<Vec<u8>, RequestFault> {
-    let failed = RequestFault::defect("predictions are not written as Parquet");
-    let entry = serde_json::to_string(record).map_err(RequestFault::defect("a record is not written as JSON"))?;
-    let properties = WriterProperties::builder()
-        .set_compression(Compression::ZSTD(ZstdLevel::default()))
-        .set_key_value_metadata(Some(vec![KeyValue::new(RECORD.to_owned(), entry)]))
-        .build();
-    let mut bytes = Vec::new();
-    let mut writer = ArrowWriter::try_new(&mut bytes, rows.schema(), Some(properties)).map_err(failed)?;
-    writer.write(rows).map_err(failed)?;
-    writer.close().map_err(failed)?;
-    Ok(bytes)
 }
 
 fn sort_column(column: &ArrayRef, order: &UInt32Array) -> Result<ArrayRef, RequestFault> {

@@ -10,7 +10,7 @@ use quick_cache::Weighter;
 use quick_cache::sync::Cache;
 use sha2::{Digest as _, Sha256};
 
-use super::super::catalogue::{LakeCatalogue, SnapshotView};
+use super::super::catalogue::{AnswerContents, LakeCatalogue, SnapshotView};
 use super::{SliceQuery, SliceRequest};
 use crate::request_protocol::http_job;
 
@@ -67,7 +67,7 @@ impl SelectionCache {
         let SliceRequest { client, view, question } = request;
         let asked = format!("{:?} {} {}", question.form, question.select_clause(), question.predicate());
         let described = format!("{} {} {asked}", question.layout_name(), question.topics.join(","));
-        let key = (client.name().to_owned(), view.version.clone(), described);
+        let key = (client.name().to_owned(), view.content_version(AnswerContents::Contributions), described);
         let select = async {
             let mut taken = select_measurements(catalogue, request).await?;
             taken.sort_by(|a, b| (&a.run, a.log_time_ns, a.pair).cmp(&(&b.run, b.log_time_ns, b.pair)));

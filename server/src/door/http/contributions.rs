@@ -1,15 +1,14 @@
 //! `POST /api/v1/annotations` and `POST /api/v1/predictions`: what users add to the lake. The client's engine checks a
-//! request and drafts the object; the door, which alone may write, creates it under the next number and commits it.
+//! request and encodes rows; the door, which alone may write, adds them to their table.
 
 use axum::Json;
-use axum::body::{Body, Bytes, to_bytes};
+use axum::body::{Body, to_bytes};
 use axum::extract::{Request, State};
 use axum::http::{Method, StatusCode, header};
 use axum::response::{IntoResponse as _, Response};
-use base64::Engine as _;
-use base64::engine::general_purpose::STANDARD;
 use echolake_http::{AddedContribution, AnnotationsRequest, BinaryContent, PredictionParams, ProblemResponse};
-use echolake_lake::ContributionLog;
+use echolake_lake::ContributedPart;
+use echolake_schema::tables::Table;
 use echolake_service::{ClientIdentity, ContributionDraft, RequestFault, TokenScope};
 
 use crate::door::audit;
@@ -19,7 +18,7 @@ use crate::door::server_door::ServerDoor;
 
 /// Bytes of a request.
 const LARGEST: usize = 1 << 20;
-/// Bytes of a draft: base 64 of an object that is about as large as its request.
+/// Bytes of a draft: its rows are about as large as their request, and a region of the grid is many pairs.
 const LARGEST_DRAFT: usize = 8 << 20;
 /// Tries against other writers of the same number.
 const TRIES: usize = 50;
@@ -37,7 +36,7 @@ const TRIES: usize = 50;
     responses((status = 200, description = "Stored", body = AddedContribution))
 )]
 pub(super) async fn post_annotations(State(door): State<ServerDoor>, request: Request) -> Response {
-    answer_request(&door, ContributionLog::Annotations, request).await
+    answer_request(&door, Table::Annotations, request).await
 }
 
 /// Adds TNCE that a model predicts.
@@ -55,17 +54,17 @@ pub(super) async fn post_annotations(State(door): State<ServerDoor>, request: Re
     responses((status = 200, description = "Stored", body = AddedContribution))
 )]
 pub(super) async fn post_predictions(State(door): State<ServerDoor>, request: Request) -> Response {
-    answer_request(&door, ContributionLog::Predictions, request).await
+    answer_request(&door, Table::Predictions, request).await
 }
 
-async fn answer_request(door: &ServerDoor, log: ContributionLog, request: Request) -> Response {
-    add_contribution(door, log, request).await.unwrap_or_else(|fault| {
+async fn answer_request(door: &ServerDoor, table: Table, request: Request) -> Response {
+    add_contribution(door, table, request).await.unwrap_or_else(|fault| {
         door.metrics().record_failure(&fault);
         ProblemResponse(fault).into_response()
     })
 }
 
-async fn add_contribution(door: &ServerDoor, log: ContributionLog, request: Request) -> Result<Response, RequestFault> {
+async fn add_contribution(door: &ServerDoor, table: Table, request: Request) -> Result<Response, RequestFault> {
     let work = request.extensions().get::<PlaceWork>().cloned().ok_or(RequestFault::Internal)?;
     let client = door.identify_client(&work, &request)?;
     client.require_scope(TokenScope::Annotate)?;
@@ -74,6 +73,7 @@ async fn add_contribution(door: &ServerDoor, log: ContributionLog, request: Requ
     parts.headers.remove(header::CONTENT_LENGTH);
     let body = to_bytes(body, LARGEST).await.map_err(|_| RequestFault::TooLarge { limit: LARGEST })?;
     for _ in 0..TRIES {
+        door.lake().prepare_contributions(table).await.map_err(refuse_write)?;
         let mut again = Request::new(Body::from(body.clone()));
         *again.method_mut() = Method::POST;
         *again.uri_mut() = parts.uri.clone();
@@ -85,37 +85,52 @@ async fn add_contribution(door: &ServerDoor, log: ContributionLog, request: Requ
         }
         let draft = to_bytes(answer.into_body(), LARGEST_DRAFT).await;
         let draft = draft.map_err(RequestFault::defect("an engine broke off a draft"))?;
-        let draft: ContributionDraft =
-            serde_json::from_slice(&draft).map_err(RequestFault::defect("a draft is not as expected"))?;
-        let Some(added) = store_draft(door, &client, log, draft).await? else { continue };
-        audit::record_contribution(work.peer(), &client.name, log, &added);
+        let draft = ContributionDraft::decode(draft).map_err(refuse_draft)?;
+        let Some(added) = store_draft(door, &client, table, draft).await? else { continue };
+        audit::record_contribution(work.peer(), &client.name, table, &added);
         return Ok(Json(added).into_response());
     }
     Err(RequestFault::TooMany { what: "writers at once", limit: TRIES })
 }
 
-// None if another writer took the number.
+// None if another writer has added to the table meanwhile.
 async fn store_draft(
     door: &ServerDoor,
     client: &ClientIdentity,
-    log: ContributionLog,
+    table: Table,
     draft: ContributionDraft,
 ) -> Result<Option<AddedContribution>, RequestFault> {
-    let ContributionDraft { number, object, annotation_ids } = draft;
-    let is_new = object.is_some();
-    if let Some(object) = object {
-        let object = STANDARD.decode(object).map_err(RequestFault::defect("a draft is no base 64"))?;
-        if !door.lake().create_contribution(log, number, Bytes::from(object)).await.map_err(refuse_write)? {
-            return Ok(None);
-        }
+    let ContributionDraft { table: drafted, seen, files, annotation_ids } = draft;
+    let seen_lake = match &client.projects {
+        Some(projects) => door.lake().restricted_to(projects.clone()),
+        None => door.lake().clone(),
+    };
+    let snapshot = seen_lake.snapshot().await.map_err(refuse_write)?;
+    let parts = files.iter().flat_map(|file| &file.parts);
+    let is_visible = |part: &ContributedPart| snapshot.run(&part.run).is_some_and(|run| run.surface == part.surface);
+    if drafted != table || !parts.into_iter().all(is_visible) {
+        return Err(refuse_draft("it is of another table or of runs that the client does not see".to_owned()));
     }
-    let lake_version = door.lake().commit_contributions(log, number).await.map_err(refuse_write)?;
+    let is_new = !files.is_empty();
+    let lake_version = match is_new {
+        true => door.lake().add_contribution(table, seen, files).await.map_err(refuse_write)?,
+        false => Some(snapshot.lake_version().unwrap_or(0)),
+    };
+    let Some(lake_version) = lake_version else { return Ok(None) };
     // How many versions others add is none of the business of a token of some projects.
     let lake_version = client.projects.is_none().then_some(lake_version);
     Ok(Some(AddedContribution { lake_version, is_new, annotation_ids }))
 }
 
+fn refuse_draft(reason: String) -> RequestFault {
+    tracing::error!(reason, "a draft of an engine is refused");
+    RequestFault::Internal
+}
+
 fn refuse_write(error: echolake_lake::Error) -> RequestFault {
+    if error.is_table_fault() {
+        return RequestFault::from(echolake_query::Error::from(error));
+    }
     tracing::warn!(error = &error as &dyn std::error::Error, "a contribution cannot be written");
     RequestFault::Unwritable
 }

@@ -11,7 +11,8 @@ use object_store::path::Path;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
-use crate::{ContributionCounts, ContributionLog, Result};
+use crate::contributions::ShownVersions;
+use crate::Result;
 
 /// A Parquet file of a table.
 #[derive(Debug, Clone, PartialEq)]
@@ -66,7 +67,8 @@ pub struct RunPart {
     pub derivation: String,
     /// Number of its rows.
     pub rows: u64,
-    /// Of a row of `runs`: the version of `runs` that added it, whichever file it was in then.
+    /// Of a row of `runs`, and of rows that users add: the version of the table that added it, whichever file it was in
+    /// then.
     pub row_version: Option<u64>,
     /// Of a row of `runs`: as [`DataFile::row_counts`].
     pub row_counts: Option<RunRowCounts>,
@@ -125,10 +127,14 @@ pub struct LoggedFile {
 pub struct TableView {
     /// The version.
     pub version: u64,
+    /// The id that the table was given when it was made.
+    pub id: String,
     /// Its files, by path.
     pub files: Vec<DataFile>,
-    /// Of `runs`: the contributions that the version shows.
-    pub contributions: ContributionCounts,
+    /// Of `runs`: what the version shows of the tables of users.
+    pub shown: ShownVersions,
+    /// Of a table of users: the highest number of an object of the lake's earlier form that is in it.
+    pub copied: u64,
     /// Of `runs`: rows may be missing, because it is being made again or another program has changed it.
     pub is_rebuilding: bool,
 }
@@ -288,18 +294,23 @@ pub trait CommitLog: Send + Sync + std::fmt::Debug {
     async fn list_versions(&self, table: Table) -> Result<Vec<TableVersion>>;
     /// The versions that the log still holds with their changes, oldest first: a request to the store for each.
     async fn list_changes(&self, table: Table) -> Result<Vec<TableChange>>;
+    /// The table as of a version that the log still holds, or its newest if that is older; None if there is no table.
+    async fn view_at(&self, table: Table, version: u64) -> Result<Option<TableView>>;
     /// The table's files as of a version that the log still holds.
-    async fn files_at(&self, table: Table, version: u64) -> Result<Vec<DataFile>>;
-    /// The contributions that a version of `runs` shows.
-    async fn contributions_at(&self, version: u64) -> Result<ContributionCounts>;
+    async fn files_at(&self, table: Table, version: u64) -> Result<Vec<DataFile>> {
+        Ok(self.view_at(table, version).await?.unwrap_or_default().files)
+    }
     /// The files of all versions that the log still holds; none if there is no table.
     async fn files_of_all_versions(&self, table: Table) -> Result<Vec<DataFile>>;
     /// Returns whether a file of this name is in the log.
     async fn has_file(&self, table: Table, name: &str) -> Result<bool>;
     /// Names of the current and the removed files; None if there is no log.
     async fn file_history(&self, table: Table) -> Result<Option<FileHistory>>;
-    /// Shows the contributions of a log up to a number, by a version of `runs`; returns the version.
-    async fn commit_contributions(&self, log: ContributionLog, number: u64) -> Result<u64>;
+    /// Adds files to a table as the version after `seen`; false if another writer has taken it. `copied` is the highest
+    /// number of an object of the lake's earlier form whose rows are among them.
+    async fn append_files(&self, table: Table, seen: u64, files: &[NewFile], copied: Option<u64>) -> Result<bool>;
+    /// Shows a version of a table of users to readers, by a version of `runs`, which is returned.
+    async fn show_version(&self, table: Table, version: u64) -> Result<u64>;
     /// Makes a change; returns the outcome of each new file, in order. Repeating the same change adds nothing.
     async fn commit_change(&self, table: Table, commit: &TableCommit) -> Result<Vec<CommitOutcome>>;
 }

@@ -14,8 +14,8 @@ use echolake_schema::{ProjectName, RunId, SurfaceId};
 use super::delta::DeltaLog;
 use crate::tables::run_parts::list_pointers;
 use crate::{
-    CommitLog, CommitOutcome, ContributionCounts, ContributionLog, DataFile, Error, FileHistory, LakeSnapshot, Result,
-    TableChange, TableCommit, TableVersion, TableView,
+    CommitLog, CommitOutcome, DataFile, Error, FileHistory, LakeSnapshot, NewFile, Result, TableChange, TableCommit,
+    TableVersion, TableView,
 };
 
 /// A log without the runs of other projects.
@@ -32,22 +32,29 @@ impl ProjectLog {
         Self { log, projects, common }
     }
 
-    // Files of the other tables are seen if a run's row names them.
+    // Files of the other tables are seen if a run's row names them. Predictions are of a surface, whose name other
+    // projects may use, too.
     fn keep_visible(&self, table: Table, files: &mut Vec<DataFile>) {
-        if table == Table::Runs {
-            files.retain_mut(|file| {
+        files.retain_mut(|file| match table {
+            Table::Runs => {
                 file.hidden = self.hidden_runs(file);
                 !list_pointers(file).is_empty()
-            });
-        }
+            }
+            Table::Predictions => {
+                file.hidden = self.hidden_runs(file);
+                file.visible_parts().next().is_some()
+            }
+            _ => true,
+        });
     }
 
     fn hidden_runs(&self, file: &DataFile) -> Vec<RunId> {
         if file.project().is_some_and(|project| self.projects.contains(&project)) {
             return Vec::new();
         }
-        let runs = list_pointers(file).into_iter().map(|row| row.run);
-        runs.filter(|run| !self.common.contains(&run.surface)).map(|run| run.run).collect()
+        let runs = list_pointers(file).into_iter().map(|row| (row.run.surface, row.run.run));
+        let parts = file.parts.iter().map(|part| (part.surface.clone(), part.run.clone()));
+        runs.chain(parts).filter(|(surface, _)| !self.common.contains(surface)).map(|(_, run)| run).collect()
     }
 
     fn refuse_action<T>(table: Table, action: &'static str) -> Result<T> {
@@ -111,15 +118,12 @@ impl CommitLog for ProjectLog {
         Ok(seen.collect())
     }
 
-    async fn files_at(&self, table: Table, version: u64) -> Result<Vec<DataFile>> {
-        let mut files = self.log.files_at(table, version).await?;
-        self.keep_visible(table, &mut files);
-        Ok(files)
-    }
-
-    // Readers keep those on the runs that they see.
-    async fn contributions_at(&self, version: u64) -> Result<ContributionCounts> {
-        self.log.contributions_at(version).await
+    async fn view_at(&self, table: Table, version: u64) -> Result<Option<TableView>> {
+        let mut view = self.log.view_at(table, version).await?;
+        if let Some(view) = &mut view {
+            self.keep_visible(table, &mut view.files);
+        }
+        Ok(view)
     }
 
     async fn files_of_all_versions(&self, table: Table) -> Result<Vec<DataFile>> {
@@ -136,8 +140,12 @@ impl CommitLog for ProjectLog {
         Self::refuse_action(table, "searched for names")
     }
 
-    async fn commit_contributions(&self, _: ContributionLog, _: u64) -> Result<u64> {
-        Self::refuse_action(Table::Runs, "written")
+    async fn append_files(&self, table: Table, _: u64, _: &[NewFile], _: Option<u64>) -> Result<bool> {
+        Self::refuse_action(table, "written")
+    }
+
+    async fn show_version(&self, table: Table, _: u64) -> Result<u64> {
+        Self::refuse_action(table, "written")
     }
 
     async fn commit_change(&self, table: Table, _: &TableCommit) -> Result<Vec<CommitOutcome>> {

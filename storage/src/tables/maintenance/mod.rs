@@ -6,4 +6,5 @@ mod removal;
 mod vacuum;
 
 pub use optimize::{MergeProgress, OptimizeReport, TARGET_BYTES, TableOptimizeReport};
+pub use rebuild::GivenUpRows;
 pub use vacuum::{DeletedFile, DeletionMode, KEEP_HOURS, VacuumReport};

@@ -87,6 +87,7 @@ impl Lake {
         progress: &mut (dyn FnMut(MergeProgress) + Send),
         lease: &mut MaintenanceLease,
     ) -> Result<OptimizeReport> {
+        self.settle_contributions().await?;
         self.remove_superseded().await?;
         let snapshot = self.snapshot().await?;
         let readers = FileReaders::from_snapshot(self, &snapshot);
@@ -117,6 +118,12 @@ impl Lake {
                     }
                 }
                 done += group.len();
+            }
+            // The same rows, so readers see the version at once.
+            if table.source() == Source::Users
+                && let Some(version) = self.commit_log().newest_version(table).await?
+            {
+                self.commit_log().show_version(table, version).await?;
             }
             report.tables.push(of);
         }
@@ -195,8 +202,8 @@ fn run_slices(file: &DataFile) -> Vec<RunSlice<'_>> {
     file.visible_parts().map(|(part, rows)| RunSlice { file, part: part.clone(), rows }).collect()
 }
 
-fn part_key(part: &RunPart) -> (&str, &str) {
-    (part.surface.as_str(), part.run.as_str())
+fn part_key(part: &RunPart) -> (&str, &str, Option<u64>) {
+    (part.surface.as_str(), part.run.as_str(), part.row_version)
 }
 
 fn merged_name(parts: &[RunPart]) -> FileName {
@@ -238,6 +245,9 @@ impl<'a> FileReaders<'a> {
     }
 
     fn audience_of(&self, table: Table, file: &DataFile) -> RunAudience {
+        if table.source() == Source::Users && self.has_projects {
+            return RunAudience::Project(file.project());
+        }
         let of = |slice: &RunSlice<'_>| {
             let project = self.snapshot.project_of(&slice.part.run).cloned();
             match [&self.references.flat, &self.references.foam].contains(&&slice.part.surface) {

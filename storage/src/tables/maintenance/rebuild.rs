@@ -1,8 +1,21 @@
 //! Empties tables that are damaged, so that ingest derives their rows again from the run files.
 
 use echolake_schema::tables::Table;
+use futures::TryStreamExt as _;
+use object_store::ObjectStoreExt as _;
 
 use crate::{DataFile, Error, Lake, Result, TableCommit};
+
+/// The rows of users that were given up.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct GivenUpRows {
+    /// Their number in these files.
+    pub rows: u64,
+    /// Paths of the files.
+    pub files: Vec<String>,
+    /// The table's log was lost, and with it all its rows.
+    pub is_whole_log: bool,
+}
 
 impl Lake {
     /// Removes all rows of these tables, or their logs if these cannot be read or written. Until ingest has derived the
@@ -24,6 +37,60 @@ impl Lake {
             }
         }
         Ok(())
+    }
+
+    /// Gives up the rows of a table of users that are lost: those of files that cannot be read, or all of them if its log
+    /// is lost. What can be read stays.
+    ///
+    /// # Errors
+    /// What the store says.
+    pub async fn give_up_lost(&self, table: Table) -> Result<GivenUpRows> {
+        let snapshot = self.snapshot().await?;
+        let newest = match self.commit_log().view_table(table).await {
+            Err(Error::Log { .. }) => None,
+            view => view?.filter(|view| view.version >= snapshot.shown_versions().of_table(table).table),
+        };
+        let Some(view) = newest else {
+            self.delta_log().begin_log_again(table).await?;
+            return Ok(GivenUpRows { is_whole_log: true, ..GivenUpRows::default() });
+        };
+        let mut given_up = GivenUpRows::default();
+        let mut remove = Vec::new();
+        for file in &view.files {
+            match self.check_file(table, file).await {
+                Err(Error::DataFile { .. }) => {
+                    given_up.rows += file.rows;
+                    given_up.files.push(file.path.to_string());
+                    remove.push(file.logged_file());
+                }
+                checked => checked?,
+            }
+        }
+        self.commit_log().commit_change(table, &TableCommit { remove, ..TableCommit::default() }).await?;
+        self.settle_contributions().await?;
+        Ok(given_up)
+    }
+
+    /// Checks that a file of a table can be read as a whole and is as its log says.
+    ///
+    /// # Errors
+    /// [`Error::DataFile`] if it is not, or what the store says.
+    pub async fn check_file(&self, table: Table, file: &DataFile) -> Result<()> {
+        let size = self.store().head(&file.path).await.map_err(|e| Error::unread_file(&file.path, e))?.size;
+        let damaged = |reason: String| Error::DataFile { file: file.path.to_string(), source: reason.into() };
+        if size != file.bytes {
+            return Err(damaged(format!("it has {size} bytes, its log says {}", file.bytes)));
+        }
+        let mut batches = self.read_rows(table, file, &[], 0..file.rows).await?;
+        let mut rows = 0;
+        // A batch at a time: a merged file has more rows than memory should hold.
+        while let Some(batch) = batches.try_next().await? {
+            rows += batch.num_rows() as u64;
+        }
+        match rows == file.rows {
+            true => Ok(()),
+            false => Err(damaged(format!("it has {rows} rows, its log says {}", file.rows))),
+        }
     }
 
     async fn empty_table(&self, table: Table) -> Result<()> {

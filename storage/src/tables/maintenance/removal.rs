@@ -6,7 +6,7 @@
 use std::collections::BTreeSet;
 
 use echolake_schema::RunId;
-use echolake_schema::tables::Table;
+use echolake_schema::tables::{Source, Table};
 
 use crate::tables::run_parts::run_of_file;
 use crate::{DataFile, Error, Lake, RemovalRecord, Result, TableCommit};
@@ -22,7 +22,7 @@ impl Lake {
     /// What the store says. Tables that were changed before stay so.
     pub async fn remove_runs(&self, removal: &RemovalRecord) -> Result<usize> {
         let mut count = self.remove_rows(Table::Runs, removal).await?;
-        for table in Table::ALL.into_iter().filter(|table| *table != Table::Runs) {
+        for table in Table::ALL.into_iter().filter(|table| is_of_runs(*table) && *table != Table::Runs) {
             count += self.remove_rows(table, removal).await?;
         }
         Ok(count)
@@ -34,7 +34,7 @@ impl Lake {
     /// [`Error::Log`] if a log is damaged.
     pub async fn has_rows_of(&self, run: &RunId) -> Result<bool> {
         let runs = BTreeSet::from([run.clone()]);
-        for table in Table::ALL {
+        for table in Table::ALL.into_iter().filter(|table| is_of_runs(*table)) {
             if self.commit_log().list_files(table).await?.iter().any(|file| !parts_of(file, &runs).is_empty()) {
                 return Ok(true);
             }
@@ -71,6 +71,11 @@ impl Lake {
         let source = format!("other writers changed its files in {ROUNDS} tries; hint: run the command again").into();
         Err(Error::Log { table: table.name(), action: "written", source })
     }
+}
+
+// What users added stays: it cannot be made again, and is not seen without its run.
+fn is_of_runs(table: Table) -> bool {
+    table.source() != Source::Users
 }
 
 // The runs among these whose rows a file has.

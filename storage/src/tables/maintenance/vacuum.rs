@@ -151,9 +151,7 @@ impl Lake {
         files.extend(unfinished.chain(claims).map(|meta| DeletedFile::from_object(meta.location, meta.size)));
         if let Some(lake) = self.folder() {
             let mut temporaries = Vec::new();
-            ["annotations", "predictions", "tables", INBOX]
-                .iter()
-                .for_each(|name| find_temporaries(&lake.join(name), &mut temporaries));
+            ["tables", INBOX].iter().for_each(|name| find_temporaries(&lake.join(name), &mut temporaries));
             let old = temporaries.into_iter().filter(|(_, modified, _)| old(DateTime::<Utc>::from(*modified)));
             files.extend(old.map(|(path, _, bytes)| {
                 let within = path.strip_prefix(lake).unwrap_or(&path).display().to_string();

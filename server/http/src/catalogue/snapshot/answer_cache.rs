@@ -18,17 +18,17 @@ use crate::catalogue::content::ARROW;
 use crate::format::accepts_encoding;
 use crate::problem::ProblemResponse;
 
-/// Maximum size of the cached answers of one snapshot, bytes.
+/// Maximum size of the cached answers of snapshots of one version, bytes.
 const CACHED_BYTES: u64 = 96 << 20;
 /// Shorter answers fit a packet or two as they are.
 const WORTH_PACKING: usize = 2000;
 /// Of zlib's levels: a tenth larger than with 6, in a third of the time.
 const LEVEL: Compression = Compression::new(3);
 
-/// An address with its parameters, and whether the answer is an Arrow stream.
-pub(crate) type AnswerKey = (String, bool);
+/// An address with its parameters, whether the answer is an Arrow stream, and the version of what it rests on.
+pub(crate) type AnswerKey = (String, bool, String);
 
-/// Cache of answers of one snapshot.
+/// Cache of answers of snapshots of one version.
 pub(crate) struct AnswerCache(Cache<AnswerKey, Arc<CachedAnswer>, AnswerWeighter>);
 
 /// Weighs answers by their bytes, with those that they will have once they are packed, too.
@@ -36,7 +36,7 @@ pub(crate) struct AnswerCache(Cache<AnswerKey, Arc<CachedAnswer>, AnswerWeighter
 struct AnswerWeighter;
 
 impl Weighter<AnswerKey, Arc<CachedAnswer>> for AnswerWeighter {
-    fn weight(&self, (address, _): &AnswerKey, answer: &Arc<CachedAnswer>) -> u64 {
+    fn weight(&self, (address, ..): &AnswerKey, answer: &Arc<CachedAnswer>) -> u64 {
         (answer.bytes.len() * 3 / 2 + address.len() + 1000) as u64
     }
 }
@@ -117,7 +117,7 @@ mod tests {
     use crate::catalogue::content::AnswerContent;
 
     fn key(name: &str) -> AnswerKey {
-        (name.to_owned(), false)
+        (name.to_owned(), false, String::new())
     }
 
     fn answer(bytes: impl Into<Bytes>) -> Response {

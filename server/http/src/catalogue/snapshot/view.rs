@@ -1,4 +1,5 @@
-//! The lake as one snapshot shows it, with cached results: a new snapshot begins with an empty cache.
+//! The lake as one snapshot shows it, with cached results: a snapshot with other runs, or with other verdicts, begins
+//! with an empty cache. What else users add changes only the answers that read it.
 
 use std::collections::{HashMap, HashSet, VecDeque};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
@@ -10,7 +11,7 @@ use echolake_query::figure_rows::CurveRow;
 use echolake_query::{EngineClient, PreparedQuery, QueryQuota, Session};
 use echolake_schema::Symmetry;
 use echolake_schema::symmetry::MovedPair;
-use echolake_schema::tables::Table;
+use echolake_schema::tables::{Source, Table};
 use echolake_service::{QueryService, RequestFault};
 use object_store::path::Path as StorePath;
 use sha2::{Digest as _, Sha256};
@@ -34,10 +35,20 @@ pub(crate) type TypedQuery = (Arc<PreparedQuery>, Arc<[Option<DataType>]>);
 
 /// One snapshot.
 pub(crate) struct SnapshotView {
-    /// Changes with every snapshot, and with the program.
-    pub version: String,
+    /// Changes with all but the contributions that no other table's answer rests on, and with the program.
+    version: String,
+    /// Changes with what users add.
+    users_version: String,
     pub snapshot: Arc<LakeSnapshot>,
     pub session: Arc<Session>,
+    pub results: Arc<SharedResults>,
+    /// Prepared queries by their text; there are few texts, because values are bound.
+    prepared: Mutex<HashMap<String, TypedQuery>>,
+}
+
+/// Results of all snapshots of one version.
+#[derive(Default)]
+pub(crate) struct SharedResults {
     pub answers: AnswerCache,
     pub summary: OnceCell<CatalogueSummary>,
     pub places: OnceCell<SurfacePositions>,
@@ -48,31 +59,29 @@ pub(crate) struct SnapshotView {
     pub moved_pairs: OnceLock<Vec<(Symmetry, Vec<MovedPair>)>>,
     /// Mean curves over all pairs of the references that surfaces are beside, by name; there are few.
     flat_curves: Mutex<HashMap<String, Arc<OnceCell<Option<CurveRow>>>>>,
-    /// Prepared queries by their text; there are few texts, because values are bound.
-    prepared: Mutex<HashMap<String, TypedQuery>>,
 }
 
 impl SnapshotView {
-    fn new(snapshot: Arc<LakeSnapshot>, session: Arc<Session>) -> Self {
-        Self {
-            version: snapshot_version(&snapshot),
-            snapshot,
-            session,
-            answers: AnswerCache::default(),
-            summary: OnceCell::new(),
-            places: OnceCell::new(),
-            diffusion: OnceCell::new(),
-            pairs: OnceCell::new(),
-            moved_pairs: OnceLock::new(),
-            flat_curves: Mutex::default(),
-            prepared: Mutex::default(),
+    fn new(snapshot: Arc<LakeSnapshot>, session: Arc<Session>, before: Option<&Self>) -> Self {
+        let version = snapshot_version(&snapshot);
+        let same = before.filter(|before| before.version == version && snapshot.is_whole());
+        let results = same.map(|before| before.results.clone()).unwrap_or_default();
+        let users_version = users_version(&snapshot);
+        Self { version, users_version, snapshot, session, results, prepared: Mutex::default() }
+    }
+
+    /// Returns the version of what an answer rests on.
+    pub fn content_version(&self, content: AnswerContents) -> String {
+        match content {
+            AnswerContents::Runs => self.version.clone(),
+            AnswerContents::Contributions => format!("{} {}", self.version, self.users_version),
         }
     }
 
-    /// Returns the tag of an answer of this snapshot: a digest of the version and of the answer's `name`, which no
+    /// Returns the tag of an answer of this version: a digest of the version and of the answer's `name`, which no
     /// other answer has.
-    pub fn answer_etag(&self, name: &str) -> String {
-        let digest = Sha256::new().chain_update(&self.version).chain_update(name).finalize();
+    pub fn answer_etag(&self, content: AnswerContents, name: &str) -> String {
+        let digest = Sha256::new().chain_update(self.content_version(content)).chain_update(name).finalize();
         format!("\"{}\"", hex::encode(&digest[..VERSION_BYTES]))
     }
 
@@ -82,14 +91,14 @@ impl SnapshotView {
         self.snapshot.log_version(Table::Runs).filter(|_| self.snapshot.is_whole())
     }
 
-    pub fn find_prepared(&self, sql: &str) -> Option<TypedQuery> {
-        self.prepared.lock().unwrap_or_else(PoisonError::into_inner).get(sql).cloned()
-    }
-
     /// The place of a reference's mean curves over all pairs.
     pub fn flat_curves(&self, flat: &str) -> Arc<OnceCell<Option<CurveRow>>> {
-        let mut known = self.flat_curves.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut known = self.results.flat_curves.lock().unwrap_or_else(PoisonError::into_inner);
         known.entry(flat.to_owned()).or_default().clone()
+    }
+
+    pub fn find_prepared(&self, sql: &str) -> Option<TypedQuery> {
+        self.prepared.lock().unwrap_or_else(PoisonError::into_inner).get(sql).cloned()
     }
 
     pub fn keep_prepared(&self, sql: &str, prepared: TypedQuery) {
@@ -97,19 +106,44 @@ impl SnapshotView {
     }
 }
 
-// The version of a snapshot: a digest of its files' names and visible rows.
+/// What an answer rests on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum AnswerContents {
+    /// Runs, and the verdicts on them.
+    Runs,
+    /// All that users add, too.
+    Contributions,
+}
+
+/// The greatest kind of annotation, in the order of texts: a file whose greatest it is holds one.
+const VERDICT: &str = "verdict";
+
+// The version of a snapshot: a digest of its files' names and visible rows. Of files of users it has those with
+// verdicts.
 fn snapshot_version(snapshot: &LakeSnapshot) -> String {
+    let of_runs = Table::ALL.into_iter().filter(|table| table.source() != Source::Users);
+    let files = of_runs.flat_map(|table| snapshot.files(table));
+    let has_verdicts = |file: &&DataFile| {
+        let greatest = file.stats.as_ref().and_then(|stats| stats.max.get("kind")?.as_str());
+        greatest.is_none_or(|kind| kind == VERDICT)
+    };
+    files_version(files.chain(snapshot.files(Table::Annotations).iter().filter(has_verdicts)), snapshot)
+}
+
+fn users_version(snapshot: &LakeSnapshot) -> String {
+    files_version(Table::OF_USERS.into_iter().flat_map(|table| snapshot.files(table)), snapshot)
+}
+
+fn files_version<'a>(files: impl Iterator<Item = &'a DataFile>, snapshot: &LakeSnapshot) -> String {
     let mut digest = Sha256::new();
     digest.update(env!("CARGO_PKG_VERSION"));
-    for table in Table::ALL {
-        for file in snapshot.files(table) {
-            digest.update(file.path.as_ref());
-            digest.update(file.visible_rows().to_le_bytes());
-        }
+    for file in files {
+        digest.update(file.path.as_ref());
+        digest.update(file.visible_rows().to_le_bytes());
     }
-    let contributions = snapshot.contributions();
-    digest.update(contributions.annotations.to_le_bytes());
-    digest.update(contributions.predictions.to_le_bytes());
+    for table in Table::OF_USERS {
+        digest.update(snapshot.pending_objects(table).end.to_le_bytes());
+    }
     hex::encode(&digest.finalize()[..VERSION_BYTES])
 }
 
@@ -165,7 +199,7 @@ impl SnapshotViews {
         match seen.view.as_ref().filter(|view| Arc::ptr_eq(&view.snapshot, &snapshot)) {
             Some(view) => Ok(view.clone()),
             None => {
-                let view = Arc::new(SnapshotView::new(snapshot, session));
+                let view = Arc::new(SnapshotView::new(snapshot, session, seen.view.as_deref()));
                 let before = seen.view.replace(view.clone());
                 let gone = before.map(|before| removed_files(&before.snapshot, &view.snapshot)).unwrap_or_default();
                 seen.earlier.extend(gone);

@@ -16,6 +16,7 @@ use super::actions::LogLine;
 use super::checkpoint::{decode_checkpoint, encode_checkpoint};
 use super::commit_files::{commit_name, commit_number, list_versions};
 use super::table_state::{TableState, is_own_commit};
+use crate::error::rebuild_hint;
 use crate::tables::file_name::table_folder;
 use crate::tables::tags::has_tags;
 use crate::{Error, Result, TableChange, TableVersion};
@@ -34,11 +35,6 @@ const CONCURRENT_READS: usize = 16;
 const LINES: &str = "echolakeLines";
 /// The file that names the newest checkpoint for readers.
 const LAST_CHECKPOINT: &str = "_last_checkpoint";
-
-/// Returns the way out of a log that cannot be read: all tables can be derived again.
-pub(super) fn rebuild_hint(table: Table) -> String {
-    format!("hint: `echolake rebuild {}` makes it again from the runs", table.name())
-}
 
 /// One table's log folder.
 pub(super) struct LogFolder<'a> {
@@ -375,13 +371,13 @@ impl<'a> LogFolder<'a> {
         }
         let reason = format!(
             "another program has raised it to Delta's {role} version {needed}, echolake {verb} version {supported}; {}",
-            rebuild_hint(self.table)
+            rebuild_hint(self.table.name())
         );
         Err(self.log_error(action, reason))
     }
 
     fn damage_error(&self, what: &str) -> Error {
-        self.log_error("read", format!("{what}; {}", rebuild_hint(self.table)))
+        self.log_error("read", format!("{what}; {}", rebuild_hint(self.table.name())))
     }
 
     fn log_error(&self, action: &'static str, source: impl Into<ErrorCause>) -> Error {

@@ -15,7 +15,7 @@ use arrow::datatypes::{DataType as ArrowType, Field, SchemaRef};
 use async_trait::async_trait;
 use chrono::{DateTime, Utc};
 use echolake_schema::Rig;
-use echolake_schema::tables::Table;
+use echolake_schema::tables::{Source, Table};
 use futures::TryStreamExt as _;
 use object_store::ObjectStore;
 use object_store::path::Path;
@@ -25,16 +25,17 @@ use tokio::sync::Mutex;
 use uuid::Uuid;
 
 use self::actions::{AddFile, ApplicationTransaction, FileFormat, LogLine, TableMetadata};
-use self::log_folder::{CommitAttempt, LogFolder, own_protocol, rebuild_hint};
-use self::table_state::{ENGINE, TableState, mark_rebuild};
+use self::log_folder::{CommitAttempt, LogFolder, own_protocol};
+use self::table_state::{COPIED, ENGINE, TableState, mark_rebuild, objects_application, shown_application};
+use crate::contribution_objects::last_object;
+use crate::error::rebuild_hint;
 use crate::location::LakeLocation;
 use crate::remote::backoff_time;
 use crate::tables::file_name::{is_merged, table_folder};
 use crate::tables::run_parts::{decode_parts, encode_parts};
 use crate::{
-    CommitEffect, CommitLog, CommitOutcome, ContributionCounts, ContributionLog, DataFile, Error, FileHistory,
-    FileStats, LoggedFile, NewFile, RemovalRecord, ReplacedFiles, Result, RunPart, RunRowCounts, TableChange,
-    TableCommit, TableVersion, TableView,
+    CommitEffect, CommitLog, CommitOutcome, DataFile, Error, FileHistory, FileStats, LoggedFile, NewFile,
+    RemovalRecord, ReplacedFiles, Result, RunPart, RunRowCounts, TableChange, TableCommit, TableVersion, TableView,
 };
 
 /// Tries of one commit against other writers; each loses to a commit that went through.
@@ -154,6 +155,12 @@ impl DeltaLog {
         Err(lost_to_others(table))
     }
 
+    /// The version of a table of users that readers see.
+    async fn shown_version(&self, table: Table) -> Result<u64> {
+        let runs = self.load_table(Table::Runs).await?;
+        Ok(runs.map_or(0, |state| state.shown_versions().of_table(table).table))
+    }
+
     /// Marks `runs` as being made again, or as whole.
     pub async fn set_rebuilding(&self, is_rebuilding: bool) -> Result<()> {
         let table = Table::Runs;
@@ -180,6 +187,74 @@ impl DeltaLog {
         self.log_folder(table).delete_log().await?;
         self.loaded.lock().await.remove(&table);
         Ok(())
+    }
+
+    async fn create_table(&self, table: Table) -> Result<()> {
+        let now_millis = Utc::now().timestamp_millis();
+        let mut metadata = TableMetadata {
+            id: Uuid::new_v4().to_string(),
+            name: Some(table.name().to_owned()),
+            description: None,
+            format: FileFormat { provider: "parquet".to_owned(), options: actions::TextMap::new() },
+            schema_string: delta_schema(&table.schema(&self.rig)).to_string(),
+            partition_columns: Vec::new(),
+            configuration: actions::TextMap::new(),
+            created_time: Some(now_millis),
+        };
+        // The log is lost, unless this is the lake's first ingest: until its end, the table lacks runs.
+        mark_rebuild(&mut metadata, table == Table::Runs && has_run_files(self.store.as_ref()).await?);
+        let mut lines = vec![
+            commit_info("CREATE TABLE", json!({ "mode": "ErrorIfExists" }), now_millis),
+            LogLine { protocol: Some(own_protocol()), ..LogLine::default() },
+            LogLine { meta_data: Some(metadata), ..LogLine::default() },
+        ];
+        if table == Table::Runs {
+            for table in Table::OF_USERS {
+                let objects = last_object(self.store.as_ref(), table).await?;
+                let newest = self.load_table(table).await?.map_or(0, |state| state.version);
+                let known = [(objects_application(table), objects), (shown_application(table), newest)];
+                let known = known.into_iter().filter(|(_, number)| *number > 0);
+                lines.extend(known.map(|(application, number)| transaction_line(application, number, now_millis)));
+            }
+        }
+        // If the number is taken, another process made the table at the same moment.
+        self.log_folder(table).write_commit(0, &lines).await.map(drop)
+    }
+
+    /// Begins the log of a table of users again, of which its readers see what is in it from then on: nothing.
+    pub async fn begin_log_again(&self, table: Table) -> Result<()> {
+        self.delete_log(table).await?;
+        self.create_table(table).await?;
+        self.write_shown(table, 0, |shown| shown == 0).await.map(drop)
+    }
+
+    /// Shows objects of the lake's earlier form, as earlier versions of the program did.
+    #[cfg(test)]
+    pub async fn show_objects(&self, table: Table, number: u64) -> Result<()> {
+        let state = self.require_table(Table::Runs).await?;
+        let now = Utc::now();
+        let line = transaction_line(objects_application(table), number, now.timestamp_millis());
+        let lines = vec![commit_info("ANNOTATE", json!({}), now.timestamp_millis()), line];
+        self.write_version(Table::Runs, &state, lines, now).await.map(drop)
+    }
+
+    // Names the version of a table of users that readers see, unless the one that they see will do.
+    async fn write_shown(&self, table: Table, version: u64, is_done: impl Fn(u64) -> bool) -> Result<u64> {
+        for losses in 1..=COMMIT_TRIES {
+            let state = self.require_table(Table::Runs).await?;
+            if is_done(state.shown_versions().of_table(table).table) {
+                return Ok(state.version);
+            }
+            let now = Utc::now();
+            let operation = if table == Table::Annotations { "ANNOTATE" } else { "PREDICT" };
+            let info = commit_info(operation, json!({ "version": version.to_string() }), now.timestamp_millis());
+            let lines = vec![info, transaction_line(shown_application(table), version, now.timestamp_millis())];
+            if self.write_version(Table::Runs, &state, lines, now).await? == CommitAttempt::Written {
+                return Ok(state.version + 1);
+            }
+            self.wait_after_loss(losses).await;
+        }
+        Err(lost_to_others(Table::Runs))
     }
 
     pub async fn overdue_checkpoint(&self, table: Table) -> Result<Option<u64>> {
@@ -330,39 +405,16 @@ impl CommitLog for DeltaLog {
         if let Some(state) = known {
             return self.add_columns(table, state).await;
         }
-        let now_millis = Utc::now().timestamp_millis();
-        let mut metadata = TableMetadata {
-            id: Uuid::new_v4().to_string(),
-            name: Some(table.name().to_owned()),
-            description: None,
-            format: FileFormat { provider: "parquet".to_owned(), options: actions::TextMap::new() },
-            schema_string: delta_schema(&table.schema(&self.rig)).to_string(),
-            partition_columns: Vec::new(),
-            configuration: actions::TextMap::new(),
-            created_time: Some(now_millis),
-        };
-        // The log is lost, unless this is the lake's first ingest: until its end, the table lacks runs.
-        mark_rebuild(&mut metadata, table == Table::Runs && has_run_files(self.store.as_ref()).await?);
-        let mut lines = vec![
-            commit_info("CREATE TABLE", json!({ "mode": "ErrorIfExists" }), now_millis),
-            LogLine { protocol: Some(own_protocol()), ..LogLine::default() },
-            LogLine { meta_data: Some(metadata), ..LogLine::default() },
-        ];
-        if table == Table::Runs {
-            for log in ContributionLog::ALL {
-                let last = log.list_files(self.store.as_ref()).await?.last().map(|file| file.number);
-                lines.extend(last.map(|number| contribution_line(log, number, now_millis)));
-            }
+        // Rows of users that are lost stay a fault until somebody gives them up.
+        if table.source() == Source::Users && self.shown_version(table).await? > 0 {
+            return Ok(());
         }
-        // If the number is taken, another process made the table at the same moment.
-        self.log_folder(table).write_commit(0, &lines).await.map(drop)
+        self.create_table(table).await
     }
 
     async fn view_table(&self, table: Table) -> Result<Option<TableView>> {
         let Some(state) = self.load_table(table).await? else { return Ok(None) };
-        let is_rebuilding = table == Table::Runs && state.is_rebuilding();
-        let files = data_files(table, &state)?;
-        Ok(Some(TableView { version: state.version, files, contributions: state.contributions(), is_rebuilding }))
+        table_view(table, &state).map(Some)
     }
 
     async fn known_version(&self, table: Table) -> Option<u64> {
@@ -385,16 +437,9 @@ impl CommitLog for DeltaLog {
         self.log_folder(table).list_changes().await
     }
 
-    async fn files_at(&self, table: Table, version: u64) -> Result<Vec<DataFile>> {
-        match self.log_folder(table).load_state(Some(version)).await? {
-            Some(state) => data_files(table, &state),
-            None => Ok(Vec::new()),
-        }
-    }
-
-    async fn contributions_at(&self, version: u64) -> Result<ContributionCounts> {
-        let state = self.log_folder(Table::Runs).load_state(Some(version)).await?;
-        Ok(state.map(|state| state.contributions()).unwrap_or_default())
+    async fn view_at(&self, table: Table, version: u64) -> Result<Option<TableView>> {
+        let state = self.log_folder(table).load_state(Some(version)).await?;
+        state.map(|state| table_view(table, &state)).transpose()
     }
 
     async fn files_of_all_versions(&self, table: Table) -> Result<Vec<DataFile>> {
@@ -422,26 +467,21 @@ impl CommitLog for DeltaLog {
         Ok(Some(FileHistory { current, removed: removed.collect() }))
     }
 
-    async fn commit_contributions(&self, log: ContributionLog, number: u64) -> Result<u64> {
-        let table = Table::Runs;
-        for losses in 1..=COMMIT_TRIES {
-            let state = self.require_table(table).await?;
-            if state.contributions().of_log(log) >= number {
-                return Ok(state.version);
-            }
-            let now = Utc::now();
-            let operation = match log {
-                ContributionLog::Annotations => "ANNOTATE",
-                ContributionLog::Predictions => "PREDICT",
-            };
-            let info = commit_info(operation, json!({ "number": number.to_string() }), now.timestamp_millis());
-            let lines = vec![info, contribution_line(log, number, now.timestamp_millis())];
-            if self.write_version(table, &state, lines, now).await? == CommitAttempt::Written {
-                return Ok(state.version + 1);
-            }
-            self.wait_after_loss(losses).await;
+    async fn append_files(&self, table: Table, seen: u64, files: &[NewFile], copied: Option<u64>) -> Result<bool> {
+        let state = self.require_table(table).await?;
+        if state.version != seen {
+            return Ok(false);
         }
-        Err(lost_to_others(table))
+        let commit = TableCommit { add: files.to_vec(), ..TableCommit::default() };
+        let change = PendingChange::from_commit(&commit, known_files(&state));
+        let now = Utc::now();
+        let mut lines = change.log_lines(&state, now.timestamp_millis());
+        lines.extend(copied.map(|number| transaction_line(COPIED.to_owned(), number, now.timestamp_millis())));
+        Ok(self.write_version(table, &state, lines, now).await? == CommitAttempt::Written)
+    }
+
+    async fn show_version(&self, table: Table, version: u64) -> Result<u64> {
+        self.write_shown(table, version, |shown| shown >= version).await
     }
 
     async fn commit_change(&self, table: Table, commit: &TableCommit) -> Result<Vec<CommitOutcome>> {
@@ -468,8 +508,7 @@ impl CommitLog for DeltaLog {
     }
 }
 
-fn contribution_line(log: ContributionLog, number: u64, now_millis: i64) -> LogLine {
-    let app_id = log.application();
+fn transaction_line(app_id: String, number: u64, now_millis: i64) -> LogLine {
     let version = i64::try_from(number).unwrap_or(i64::MAX);
     let txn = ApplicationTransaction { app_id, version, last_updated: Some(now_millis) };
     LogLine { txn: Some(txn), ..LogLine::default() }
@@ -484,11 +523,11 @@ fn lost_to_others(table: Table) -> Error {
 fn grown_metadata(table: Table, state: &TableState, schema: &SchemaRef) -> Result<Option<(TableMetadata, String)>> {
     let damaged = |source: String| Error::Log { table: table.name(), action: "read", source: source.into() };
     let mut metadata =
-        state.metadata.clone().ok_or_else(|| damaged(format!("it has no metadata; {}", rebuild_hint(table))))?;
+        state.metadata.clone().ok_or_else(|| damaged(format!("it has no metadata; {}", rebuild_hint(table.name()))))?;
     let mut known: Value = serde_json::from_str(&metadata.schema_string)
-        .map_err(|e| damaged(format!("its schema is no JSON: {e}; {}", rebuild_hint(table))))?;
+        .map_err(|e| damaged(format!("its schema is no JSON: {e}; {}", rebuild_hint(table.name()))))?;
     let Some(fields) = known.get_mut("fields").and_then(Value::as_array_mut) else {
-        return Err(damaged(format!("its schema has no fields; {}", rebuild_hint(table))));
+        return Err(damaged(format!("its schema has no fields; {}", rebuild_hint(table.name()))));
     };
     let has = |field: &&Arc<Field>| fields.iter().any(|column| column["name"].as_str() == Some(field.name().as_str()));
     let lacking: Vec<_> = schema.fields().iter().filter(|field| !has(field)).map(|f| delta_column(f)).collect();
@@ -499,6 +538,15 @@ fn grown_metadata(table: Table, state: &TableState, schema: &SchemaRef) -> Resul
     fields.extend(lacking);
     metadata.schema_string = known.to_string();
     Ok(Some((metadata, added)))
+}
+
+fn table_view(table: Table, state: &TableState) -> Result<TableView> {
+    let files = data_files(table, state)?;
+    let is_rebuilding = table == Table::Runs && state.is_rebuilding();
+    let shown = state.shown_versions();
+    let copied = state.copied_objects();
+    let id = state.metadata.as_ref().map(|metadata| metadata.id.clone()).unwrap_or_default();
+    Ok(TableView { version: state.version, id, files, shown, copied, is_rebuilding })
 }
 
 fn data_files(table: Table, state: &TableState) -> Result<Vec<DataFile>> {
@@ -552,9 +600,13 @@ fn parts_of_file(table: Table, add: &AddFile) -> Result<Vec<RunPart>> {
     let counts = find_tag(add, ROWS).and_then(|text| serde_json::from_str::<Vec<Option<RunRowCounts>>>(text).ok());
     let mut counts = counts.unwrap_or_default().into_iter();
     let counted = |part| RunPart { row_counts: counts.next().flatten(), ..part };
-    let parts = find_tag(add, PARTS).and_then(decode_parts).map(|parts| parts.into_iter().map(counted).collect());
+    // Rows of users that were not merged yet came with their file.
+    let own_version = (table.source() == Source::Users).then(|| number_tag(add, LOG_VERSION));
+    let versioned = |part: RunPart| RunPart { row_version: part.row_version.or(own_version), ..part };
+    let parts = find_tag(add, PARTS).and_then(decode_parts);
+    let parts = parts.map(|parts| parts.into_iter().map(counted).map(versioned).collect());
     parts.ok_or_else(|| {
-        let source = format!("`{}` has lost the list of its parts; {}", add.path, rebuild_hint(table)).into();
+        let source = format!("`{}` has lost the list of its parts; {}", add.path, rebuild_hint(table.name())).into();
         Error::Log { table: table.name(), action: "read", source }
     })
 }

@@ -3,10 +3,11 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use echolake_schema::tables::Table;
 use serde_json::Value;
 
 use super::actions::{AddFile, ApplicationTransaction, LogLine, ProtocolVersions, RemoveFile, TableMetadata};
-use crate::{ContributionCounts, ContributionLog};
+use crate::contributions::{ShownVersion, ShownVersions};
 
 /// Time for which a checkpoint keeps a removed file's tombstone: Delta's default, a week.
 const TOMBSTONE_MILLIS: i64 = 7 * 24 * 3600 * 1000;
@@ -30,8 +31,21 @@ const REBUILD: &str = "echolake.rebuild";
 /// The setting that this program's checkpoints have: their version. Those of others repeat an earlier one, or have
 /// none.
 const CHECKED: &str = "echolake.checkpoint";
+/// The application of Delta's action `txn` in a table of users whose version is the highest number of an object of the
+/// lake's earlier form that is in the table.
+pub(super) const COPIED: &str = "echolake.copied";
 /// The beginning of `engineInfo` in commits of this program.
 pub(super) const ENGINE: &str = "echolake/";
+
+/// The application of Delta's action `txn` in `runs` whose version is the table's version that readers see.
+pub(super) fn shown_application(table: Table) -> String {
+    format!("echolake.shown.{}", table.name())
+}
+
+/// The same of the highest number of an object of the lake's earlier form.
+pub(super) fn objects_application(table: Table) -> String {
+    format!("echolake.{}", table.name())
+}
 
 impl TableState {
     /// Applies the actions of a version, or of a checkpoint.
@@ -65,16 +79,23 @@ impl TableState {
         checked.is_some_and(|checked| *checked == version.to_string())
     }
 
-    /// The contributions that readers see.
-    pub fn contributions(&self) -> ContributionCounts {
-        let number = |log: ContributionLog| {
-            let known = self.transactions.get(&log.application());
-            known.and_then(|transaction| u64::try_from(transaction.version).ok()).unwrap_or(0)
+    /// Of `runs`: what readers see of the tables of users.
+    pub fn shown_versions(&self) -> ShownVersions {
+        let shown = |table: Table| ShownVersion {
+            table: self.transaction(&shown_application(table)),
+            objects: self.transaction(&objects_application(table)),
         };
-        ContributionCounts {
-            annotations: number(ContributionLog::Annotations),
-            predictions: number(ContributionLog::Predictions),
-        }
+        ShownVersions { annotations: shown(Table::Annotations), predictions: shown(Table::Predictions) }
+    }
+
+    /// Of a table of users: the highest number of an object of the lake's earlier form that is in it.
+    pub fn copied_objects(&self) -> u64 {
+        self.transaction(COPIED)
+    }
+
+    fn transaction(&self, application: &str) -> u64 {
+        let known = self.transactions.get(application);
+        known.and_then(|transaction| u64::try_from(transaction.version).ok()).unwrap_or(0)
     }
 
     /// Returns whether rows may be missing: the table is being made again, or another program has changed its files.
