@@ -34,7 +34,7 @@ use super::super::extract::QueryParams;
 use super::super::problem::ProblemResponse;
 use super::arrow_body::{ColumnContent, ExpectedColumn, decode_arrow_body};
 use super::new_rows::select_new_rows;
-use super::{RequestBody, choose_author, with_request_ticket};
+use super::{ContributionBody, choose_author, with_request_ticket};
 
 /// Key of the file's metadata that holds its [`PredictionRecord`].
 const RECORD: &str = "echolake.predictions";
@@ -158,7 +158,7 @@ struct PredictedRows {
 }
 
 impl PredictedRows {
-    fn from_stream(catalogue: &LakeCatalogue, body: &RequestBody) -> Result<Self, RequestFault> {
+    fn from_stream(catalogue: &LakeCatalogue, body: &ContributionBody) -> Result<Self, RequestFault> {
         let rig = catalogue.lake().rig();
         let names = predicted_columns(rig);
         let values = names.iter().map(|name| ExpectedColumn { name: name.clone(), content: ColumnContent::Numbers });
