@@ -1,5 +1,5 @@
-//! Throws changed SQL, changed bytes of each protocol, changed run files or changed bodies at `echolake serve`, and ends
-//! with an error at the first that harms it.
+//! Throws changed SQL, changed bytes of each protocol, changed run files or changed bodies at `echolake serve`, and
+//! ends with an error at the first that harms it.
 
 use std::io::Write as _;
 use std::time::{Duration, Instant};

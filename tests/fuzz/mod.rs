@@ -214,7 +214,8 @@ impl FuzzCampaign {
             .attempt(&self.server);
         let answer = answer.unwrap_or_else(|| panic!("{thrown}: no answer; {:?}", self.server.said()));
         let text = String::from_utf8_lossy(&answer.body);
-        assert!(matches!(answer.status, 200 | 400 | 409 | 413), "{} by {thrown}: {text}", answer.status);
+        // 408 is the limit of time, on a busy machine.
+        assert!(matches!(answer.status, 200 | 400 | 408 | 409 | 413), "{} by {thrown}: {text}", answer.status);
         (thrown, answer.status == 200)
     }
 }

@@ -87,9 +87,11 @@ async fn a_request_is_limited_as_a_query() {
     let (begin, mut begun) = mpsc::channel(1);
     let (end, mut ended) = mpsc::channel::<()>(1);
     let work = move |memory: RequestMemory| async move {
+        // Dropped in reverse order: when the end is seen, the memory is free.
+        let _end = end;
+        let memory = memory;
         memory.reserve(20 << 20)?;
         begin.send(()).await.expect("somebody waits");
-        let _end = end;
         std::future::pending::<Result<(), Error>>().await
     };
     let other = session(&engine, QueryQuota::default());

@@ -53,7 +53,7 @@ pub(super) fn draft_routes(catalogue: &LakeCatalogue) -> Router {
 }
 
 /// A request's body, and what its work may have.
-struct RequestBody {
+struct ContributionBody {
     bytes: Bytes,
     /// Most rows of a request of this client.
     most_rows: usize,
@@ -66,7 +66,7 @@ async fn with_request_ticket<T: Send + 'static, F>(
     catalogue: &LakeCatalogue,
     listed_as: &'static str,
     body: Result<Bytes, BytesRejection>,
-    work: impl FnOnce(RequestBody) -> F + Send + 'static,
+    work: impl FnOnce(ContributionBody) -> F + Send + 'static,
 ) -> Result<T, RequestFault>
 where
     F: Future<Output = Result<T, RequestFault>> + Send + 'static,
@@ -77,7 +77,7 @@ where
     let most_rows = client.quota().rows.map_or(usize::MAX, |rows| usize::try_from(rows).unwrap_or(usize::MAX));
     let run = move |memory: RequestMemory| async move {
         memory.reserve(bytes.len().saturating_mul(MEMORY_PER_BYTE))?;
-        work(RequestBody { bytes, most_rows, memory }).await
+        work(ContributionBody { bytes, most_rows, memory }).await
     };
     service.run_request(request_protocol(), &client, listed_as, run).await
 }

@@ -27,7 +27,7 @@ use super::super::extract::QueryParams;
 use super::super::problem::ProblemResponse;
 use super::arrow_body::{ColumnContent, ExpectedColumn, decode_arrow_body};
 use super::new_rows::select_new_rows;
-use super::{RequestBody, choose_author, encode_draft, newest_view, refuse_encoding, with_request_ticket};
+use super::{ContributionBody, choose_author, encode_draft, newest_view, refuse_encoding, with_request_ticket};
 
 /// Longest name of a model or a version, in characters.
 const LONGEST: usize = 64;
@@ -177,7 +177,7 @@ struct PredictedRows {
 }
 
 impl PredictedRows {
-    fn from_stream(catalogue: &LakeCatalogue, body: &RequestBody) -> Result<Self, RequestFault> {
+    fn from_stream(catalogue: &LakeCatalogue, body: &ContributionBody) -> Result<Self, RequestFault> {
         let rig = catalogue.lake().rig();
         let names = predicted_columns(rig);
         let values = names.iter().map(|name| ExpectedColumn { name: name.clone(), content: ColumnContent::Numbers });
