@@ -46,6 +46,52 @@ fn a_copy_that_is_not_whole_stays_until_it_is() {
     assert_eq!(place.sql("select state, missing from runs")[0]["state"], "waiting");
 }
 
+/// E34: a copy that fills out of order waits wherever its hole is; a damaged file is taken in, and a whole one
+/// replaces it.
+#[test]
+fn a_copy_with_a_hole_waits_and_a_whole_file_replaces_a_damaged_one() {
+    let place = TestFolder::new();
+    let run = place.acquire("flat", &["--ir-only"]);
+    let whole = std::fs::read(&run).expect("read");
+    // The summary begins where the footer says; the data end before it, with their CRC.
+    let summary = whole.len() - 28;
+    let summary = u64::from_le_bytes(whole[summary..summary + 8].try_into().expect("eight")) as usize;
+    let last = (summary - 13) / 4096 * 4096;
+    for hole in [0..4096, 4096..8192, 8192..last, last - 4096..last] {
+        let mut copy = whole.clone();
+        copy[hole.clone()].fill(0);
+        std::fs::write(&run, &copy).expect("written");
+        place.fails(3, &["ingest"], "as in a copy that is not made in order; it stays where it is");
+        assert!(std::fs::read(&run).expect("where it was") == copy, "{hole:?}");
+        assert_eq!(place.number("select count(*) from runs"), 0.0, "{hole:?}");
+    }
+    let outside = place.path("outside.mcap");
+    std::fs::rename(&run, &outside).expect("moved");
+    place.fails(1, &["ingest", "outside.mcap"], "as in a copy that is not made in order");
+
+    let in_place = place.path("lake/runs/flat").join(name(&run));
+    let mut damaged = whole.clone();
+    damaged[whole.len() / 2] ^= 0x55;
+    std::fs::write(&run, &damaged).expect("written");
+    place.fails(3, &["ingest"], "warning:");
+    assert!(place.number("select damaged from runs") > 0.0);
+    assert!(std::fs::read(&in_place).expect("in its place") == damaged);
+    // The second time, the ingest before it ended after its commit, and left the damaged file in its place.
+    for _ in 0..2 {
+        std::fs::write(&in_place, &damaged).expect("written");
+        std::fs::write(&run, &whole).expect("written");
+        place.ok(&["ingest"]);
+        assert!(!run.exists() && std::fs::read(&in_place).expect("in its place") == whole);
+        let row = place.sql("select damaged, measurements, state from runs");
+        let row = (&row[0]["damaged"], &row[0]["measurements"], &row[0]["state"]);
+        assert_eq!(row, (&0.into(), &45.into(), &"waiting".into()));
+    }
+    // A damaged file does not replace a whole one.
+    std::fs::write(&run, &damaged).expect("written");
+    place.fails(3, &["ingest"], "is already in the lake with other content");
+    assert!(std::fs::read(&in_place).expect("in its place") == whole);
+}
+
 #[test]
 fn a_watch_waits_for_a_copy_without_a_word() {
     let place = TestFolder::new();

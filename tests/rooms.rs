@@ -106,6 +106,45 @@ fn commands_name_what_a_lake_of_rooms_lacks() {
     }
 }
 
+/// E21: `listen` takes the response from the surface's newest run, as `twin`, `replay` and `catalogue` do, also if an
+/// older run measured the pair later, or has pairs that the newest lacks.
+#[test]
+fn listen_takes_the_newest_run_of_a_surface() {
+    let place = TestFolder::new();
+    std::fs::write(place.path("rooms.toml"), ROOM_RIG).expect("written");
+    write_wav(&place, "click.wav", &[&[0.5][..], &[0.0; 99]].concat());
+    // 2 m and 3 m of air.
+    for (name, gain) in [("old.wav", 0.5), ("new.wav", 0.25)] {
+        let mut response = vec![0.0; 30_000];
+        response[280] = gain;
+        response[419] = gain / 8.0;
+        write_wav(&place, name, &response);
+    }
+    let header = "surface,response,microphone,speaker,temperature_c,timing_offset_ms,start_secs,recorded_at\n";
+    let row = |name: &str, speaker: &str, day: u32| {
+        format!("flat,{name},0 0 1000,{speaker},20,0,0,2026-01-{day:02}T09:00:00Z\n")
+    };
+    let first = [row("old.wav", "0 3000 1000", 5), row("old.wav", "2000 0 1000", 7)].concat();
+    for (name, rows) in [("first.csv", first), ("second.csv", row("new.wav", "2000 0 1000", 6))] {
+        std::fs::write(place.path(name), format!("{header}{rows}")).expect("written");
+        place.ok(&["import", "rew", name, "--rig", "rooms.toml"]);
+        place.ok(&["ingest"]);
+    }
+    assert_eq!(place.number("select count(*) from runs"), 2.0);
+    let pairs = place.sql("select pair_id, count(*) as runs from measurements group by pair_id order by runs desc");
+    assert_eq!((&pairs[0]["runs"], &pairs[1]["runs"]), (&2.into(), &1.into()));
+    let [both, one] = [0, 1].map(|at: usize| pairs[at]["pair_id"].to_string());
+    let dry = ["--dry", "click.wav", "--signal", "measured", "--json", "-o"];
+    let levels = place.ok(&[&["listen", "flat", &both][..], &dry, &["sounds"]].concat());
+    let levels: Value = serde_json::from_str(&levels).expect("JSON");
+    let response_db = levels[0]["response_db"].as_f64().expect("a level");
+    let expected_db = 10.0 * (0.25f64.powi(2) * (1.0 + 1.0 / 64.0)).log10();
+    assert!((response_db - expected_db).abs() < 2.0, "{response_db} dB, expected {expected_db} dB");
+    let newest = &place.sql("select run_id from catalogue")[0]["run_id"];
+    let expected = format!("of pair {one} in its newest run, {}", newest.as_str().expect("a name"));
+    place.fails(1, &[&["listen", "flat", &one][..], &dry, &["none"]].concat(), &expected);
+}
+
 // The direct sound of pair 0 comes after 2 m, that of pair 1 after 3 m of air.
 #[test]
 fn the_catalogue_lists_and_draws_responses_without_levels() {

@@ -117,7 +117,7 @@ struct SweepResponse {
     powers: Vec<f32>,
     energy: f64,
     farther_energy: f64,
-    /// Samples of the peak and of the first arrival, from -n / 2.
+    /// Samples of the peak and of the first arrival; negative if the recording began later.
     peak: i64,
     onset: i64,
     vicinity: OnsetVicinity,
@@ -234,15 +234,15 @@ impl TakeAnalyzer {
             }
         }
         let Some(looped) = looped else {
-            self.analyze_recording(&mut analysis, &self.divide_spectra(recorded, &self.played), 0.0, 0, true);
+            self.analyze_recording(&mut analysis, &self.divide_by_sweep(recorded), 0.0, 0, true);
             return analysis;
         };
-        let electrical = self.divide_spectra(looped, &self.played);
+        let electrical = self.divide_by_sweep(looped);
         let loopback_ratio = self.fit_clock_ratio(&electrical);
         let aligned = self.align_clocks(&electrical, loopback_ratio);
         let match_db = self.match_db(&electrical, &aligned, 1);
         analysis.loopback_match_db = match_db;
-        let response = self.divide_spectra(recorded, looped);
+        let response = self.divide_spectra(recorded, looped, self.forward.len() / 2);
         let direct = self.match_db(&response, &response.vicinity, 1);
         if direct > SAME_SIGNAL_DB && response.peak == 0 {
             let level_db = power_to_db(response.energy) - power_to_db(self.unit_energy());
@@ -261,7 +261,7 @@ impl TakeAnalyzer {
         {
             // Its two parts arrive at different times.
         } else {
-            let acoustical = self.divide_spectra(recorded, &self.played);
+            let acoustical = self.divide_by_sweep(recorded);
             let aligned = self.align_clocks(&acoustical, self.fit_clock_ratio(&acoustical));
             let recording_db = self.match_db(&acoustical, &aligned, 1);
             analysis.faults.push(if recording_db >= MATCH_DB {
@@ -313,7 +313,7 @@ impl TakeAnalyzer {
 
     // Whether a channel is the sweep itself, by the playing clock.
     fn is_played_sweep(&self, spectrum: &[Complex<f32>]) -> bool {
-        let response = self.divide_spectra(spectrum, &self.played);
+        let response = self.divide_by_sweep(spectrum);
         let ratio = self.fit_clock_ratio(&response);
         self.match_db(&response, &self.align_clocks(&response, ratio), 1) >= MATCH_DB
             && ratio.abs() <= self.drift_ratio(MAX_DRIFT_CYCLES)
@@ -354,7 +354,15 @@ impl TakeAnalyzer {
         }
     }
 
-    fn divide_spectra(&self, of: &[Complex<f32>], by: &[Complex<f32>]) -> SweepResponse {
+    // A channel over the played sweep. Of the two places that a lag in a circle has, early and late, the sweep is where
+    // the recording lost less of it: a sweep that is in it as a whole may begin at any sample.
+    fn divide_by_sweep(&self, of: &[Complex<f32>]) -> SweepResponse {
+        let latest = (self.forward.len() + self.recording_len).saturating_sub(self.sweep.len()) / 2;
+        self.divide_spectra(of, &self.played, latest)
+    }
+
+    // Lags over `latest` are negative.
+    fn divide_spectra(&self, of: &[Complex<f32>], by: &[Complex<f32>], latest: usize) -> SweepResponse {
         let n = self.forward.len();
         let mut samples = vec![Complex::default(); n];
         let range = self.range.clone();
@@ -365,8 +373,10 @@ impl TakeAnalyzer {
         self.inverse.process(&mut samples);
         let powers = powers_of(&samples);
         let energy = sum_of(&powers);
-        let [peak, middle, n] = [index_of_greatest(&powers), self.short.len / 2, n].map(|index| index as i64);
-        let peak = if peak > n / 2 { peak - n } else { peak };
+        let peak = index_of_greatest(&powers);
+        let is_early = peak > latest;
+        let [peak, middle, n] = [peak, self.short.len / 2, n].map(|index| index as i64);
+        let peak = if is_early { peak - n } else { peak };
         let vicinity = OnsetVicinity { spectrum: Vec::new(), samples: Vec::new(), powers: Vec::new() };
         let mut response = SweepResponse { samples, powers, energy, farther_energy: 0.0, peak, onset: peak, vicinity };
         // The earliest sample, not too long before the peak, of a tenth of it.

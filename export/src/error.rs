@@ -32,6 +32,12 @@ pub enum Error {
         /// The reason, and advice for the user.
         reason: String,
     },
+    /// A dry recording is none of sound, or cannot be read.
+    #[error("the dry recording: {source}")]
+    Dry {
+        /// The reason, and advice for the user.
+        source: ErrorCause,
+    },
     /// A name that the lake does not have.
     #[error("there is no {kind} `{name}`; hint: there are {known}")]
     Unknown {

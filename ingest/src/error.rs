@@ -1,5 +1,7 @@
 //! Errors between a run's file and the tables.
 
+use std::ops::Range;
+
 use echolake_dsp::foam_reflection::LEAST_PAIRS;
 use echolake_recording::{FILE_END_BYTES, ResyncError};
 use echolake_schema::ErrorCause;
@@ -103,6 +105,20 @@ pub enum Error {
         file: String,
         /// Its size.
         bytes: u64,
+    },
+    /// The file ends as a closed file does, and is not filled: it is still being copied.
+    #[error(
+        "`{file}` is not whole: the CRC of its data is not the one behind them, and its bytes {} to {} are zeros, as \
+         in a copy that is not made in order; it stays where it is. hint: once its copy has ended, ingest it again; if \
+         nothing copies it, `echolake recover` makes a run of what it holds",
+        hole.start,
+        hole.end
+    )]
+    Unfilled {
+        /// The file.
+        file: String,
+        /// The first zeros that were found.
+        hole: Range<u64>,
     },
     /// A recording whose recorder died, and which cannot be resumed.
     #[error(
@@ -238,6 +254,7 @@ impl Error {
             Self::Read { .. } | Self::NotMcap { .. } | Self::Foreign { .. } | Self::Manifest { .. } => true,
             Self::Attachment { .. } | Self::OtherContent { .. } | Self::NoRun { .. } | Self::Gone { .. } => true,
             Self::Claimed { .. } | Self::OtherDigest { .. } => true,
+            Self::Unfilled { .. } => true,
             Self::Unfinished { .. } | Self::CutOff { .. } | Self::Changed { .. } | Self::Unusable { .. } => true,
             Self::Deadly { .. }
             | Self::Doubtful { .. }
@@ -258,6 +275,7 @@ impl Error {
             self,
             Self::Read { .. }
                 | Self::Unfinished { .. }
+                | Self::Unfilled { .. }
                 | Self::CutOff { .. }
                 | Self::Changed { .. }
                 | Self::Gone { .. }

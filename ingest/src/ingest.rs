@@ -23,7 +23,7 @@ use crate::error::{Error, Result};
 use crate::inbox::{self, FileVersion, OpenedRun, ReadFile, ReadingMark, RunSource};
 use crate::pipeline::{self, Cores, ReadyJob};
 use crate::read_back;
-use crate::reading::{Measurer, Response, RunContent, RunHead};
+use crate::reading::{Measurer, Response, RunContent, RunHead, check_filled};
 use crate::references::{ReferenceNames, digest_parts};
 use crate::report::{FileReport, IngestOutcome, IngestedRun};
 use crate::rows::runs::RunReferences;
@@ -253,7 +253,11 @@ impl IngestWork {
         let mark = ReadingMark::new(lake, source);
         let opened = source.open_run(lake)?;
         let version = FileVersion::from_source(lake, source).await?;
-        let content = Arc::new(RunContent::read_from(lake, &self.measurer, cores, &opened).await?);
+        let read = RunContent::read_from(lake, &self.measurer, cores, &opened).await;
+        if source.may_be_copied(lake) {
+            check_filled(&opened, &read).await?;
+        }
+        let content = Arc::new(read?);
         let keys = RunKeys { surface: content.manifest.surface_id.clone(), run: content.manifest.run_id.clone() };
         let span = Span::current();
         span.record("run", field::display(&keys.run)).record("surface", field::display(&keys.surface));
@@ -266,13 +270,13 @@ impl IngestWork {
         ]);
         let known = snapshot.run(&keys.run);
         let replaced = match known {
-            Some(known) => self.has_beginning_only(known, &content, &opened).await?,
+            Some(known) => self.has_lesser_file(known, &content, &opened).await?,
             None => false,
         };
         let place = Lake::run_path(&keys.surface, &keys.run);
         let file = ReadFile::check_digest(lake, source, version, &content.integrity).await?;
         let kept = async {
-            // The shorter file keeps its place until the rows of the longer one are committed.
+            // The lesser file keeps its place until the rows of this one are committed.
             if replaced {
                 inbox::check_unchanged(lake, source, &file)?;
                 return Ok(mark);
@@ -358,13 +362,18 @@ impl IngestWork {
         if rows.iter().any(|row| row.shown_runs().contains(&run)) { Err(Error::Gone { file }) } else { Ok(()) }
     }
 
-    // Returns whether the lake has no more than the beginning of this file, as of a copy that was cut off.
-    async fn has_beginning_only(&self, known: &VisibleRun, content: &RunContent, opened: &OpenedRun) -> Result<bool> {
+    // Returns whether the lake has no more than the beginning of this file, as of a copy that was cut off, or a damaged
+    // one, and this one is whole.
+    async fn has_lesser_file(&self, known: &VisibleRun, content: &RunContent, opened: &OpenedRun) -> Result<bool> {
         let Some(row) = self.context.snapshot.files_of(Table::Runs, &known.run).next() else { return Ok(false) };
         let row = read_back::run_row(&self.context.lake, row, &known.run).await?;
         let there = rows::runs::text_of(&row, "file_sha256").unwrap_or_default();
         if there == content.integrity.sha256 {
             return Ok(false);
+        }
+        let is_damaged = rows::runs::number_of(&row, "damaged").is_some_and(|count| count > 0);
+        if is_damaged && content.is_whole() && content.damaged.is_empty() {
+            return Ok(true);
         }
         let shorter = rows::runs::number_of(&row, "file_bytes").and_then(|bytes| u64::try_from(bytes).ok());
         if let Some(bytes) = shorter.filter(|bytes| (1..content.integrity.bytes).contains(bytes)) {

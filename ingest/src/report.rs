@@ -31,7 +31,7 @@ pub struct IngestedRun {
     pub whole: bool,
     /// True if the run was stopped before its end and nothing that was recorded is lost.
     pub stopped: bool,
-    /// True if the lake had a shorter file of the run, with the same beginning and without an end.
+    /// True if the lake had a shorter file of the run, with the same beginning and without an end, or a damaged one.
     #[serde(default)]
     pub replaced: bool,
     /// True if it was in the lake before and rows of it were missing, which are derived again.

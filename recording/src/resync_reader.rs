@@ -137,6 +137,8 @@ pub struct FileIntegrity {
     pub lost: Vec<Range<u64>>,
     /// Nothing but the summary is damaged.
     pub is_data_whole: bool,
+    /// The data have another CRC than the one behind them.
+    pub has_wrong_crc: bool,
 }
 
 /// Reads one file from its first byte to its last.
@@ -172,6 +174,8 @@ pub struct ResyncReader {
     lost: Vec<Range<u64>>,
     /// Behind the record that ends the data, if its CRC is right.
     data_end: Option<u64>,
+    /// A CRC behind the data is not theirs.
+    has_wrong_crc: bool,
     /// What is damaged behind that.
     summary_damage: Vec<String>,
     /// Where something begins that is none of this file.
@@ -227,6 +231,7 @@ impl ResyncReader {
             whole_end: MAGIC.len() as u64,
             lost: Vec::new(),
             data_end: None,
+            has_wrong_crc: false,
             summary_damage: Vec::new(),
             foreign: None,
             manifest: None,
@@ -281,6 +286,7 @@ impl ResyncReader {
             damage: self.damage,
             lost: self.lost,
             is_data_whole,
+            has_wrong_crc: self.has_wrong_crc,
         })
     }
 
@@ -571,6 +577,7 @@ impl ResyncReader {
         if stored == sum {
             self.data_end = Some(self.offset);
         } else if stored != 0 {
+            self.has_wrong_crc = true;
             self.note_damage(|| format!("data section up to byte {at}: CRC is {sum:08x}, expected {stored:08x}"));
         }
         self.in_summary = true;

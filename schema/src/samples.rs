@@ -85,16 +85,8 @@ pub fn encode_wav(format: SampleFormat, rate_hz: u32, channels: &[&[u8]]) -> Res
     if let Some(wrong) = channels.iter().find(|channel| channel.len() != samples * width) {
         return Err(Error::SampleBytes { actual: wrong.len(), samples, width });
     }
-    let frame = width * channels.len();
-    let [riff_bytes, data_bytes] =
-        [36 + samples * frame, samples * frame].map(|bytes| u32::try_from(bytes).unwrap_or(u32::MAX).to_le_bytes());
-    let tag = if format == SampleFormat::F32le { 3 } else { 1 };
-    let [tag, channel_count, frame_bytes, bits] =
-        [tag, channels.len(), frame, 8 * width].map(|field| (field as u16).to_le_bytes());
-    let [rate, byte_rate] = [rate_hz, rate_hz.saturating_mul(frame as u32)].map(u32::to_le_bytes);
-    let mut file = [*b"RIFF", riff_bytes, *b"WAVE", *b"fmt ", 16u32.to_le_bytes()].concat();
-    file.extend([&tag[..], &channel_count, &rate, &byte_rate, &frame_bytes, &bits, b"data", &data_bytes].concat());
-    file.reserve(samples * frame);
+    let mut file = encode_wav_header(format, rate_hz, channels.len(), samples)?;
+    file.reserve(samples * width * channels.len());
     for i in 0..samples {
         for channel in channels {
             match format {
@@ -106,6 +98,29 @@ pub fn encode_wav(format: SampleFormat, rate_hz: u32, channels: &[&[u8]]) -> Res
             }
         }
     }
+    Ok(file)
+}
+
+/// Encodes what precedes the samples of a WAV file, `samples` of each of `channels`.
+///
+/// # Errors
+/// [`Error::SampleFormat`] if the format is unknown.
+pub fn encode_wav_header(
+    format: SampleFormat,
+    rate_hz: u32,
+    channels: usize,
+    samples: usize,
+) -> Result<Vec<u8>, Error> {
+    let width = format.sample_bytes().ok_or(Error::SampleFormat)?;
+    let frame = width * channels;
+    let [riff_bytes, data_bytes] =
+        [36 + samples * frame, samples * frame].map(|bytes| u32::try_from(bytes).unwrap_or(u32::MAX).to_le_bytes());
+    let tag = if format == SampleFormat::F32le { 3 } else { 1 };
+    let [tag, channel_count, frame_bytes, bits] =
+        [tag, channels, frame, 8 * width].map(|field| (field as u16).to_le_bytes());
+    let [rate, byte_rate] = [rate_hz, rate_hz.saturating_mul(frame as u32)].map(u32::to_le_bytes);
+    let mut file = [*b"RIFF", riff_bytes, *b"WAVE", *b"fmt ", 16u32.to_le_bytes()].concat();
+    file.extend([&tag[..], &channel_count, &rate, &byte_rate, &frame_bytes, &bits, b"data", &data_bytes].concat());
     Ok(file)
 }
 

@@ -1,5 +1,6 @@
 //! `echolake import`: existing measurements become runs.
 
+use echolake_acquisition::disk::read_text_file;
 use echolake_import::{
     Error, GIR_IR_LEN, ImportOptions, ImportedRun, check_hdf5, check_rew, check_sofa, check_wav, import_gir,
     import_hdf5, import_rew, import_sofa, import_wav, sampling_rate_of,
@@ -83,7 +84,7 @@ pub(crate) async fn run_import(args: &ImportArgs, lake_url: &str) -> anyhow::Res
             let mut given = super::rig_or(rig.as_deref(), lake_url, Rig::paper).await?;
             // A rig file that says nothing of the rate takes that of the recordings.
             let says_rate = |text: String| text.contains("rate_hz");
-            let silent = rig.as_deref().is_some_and(|f| !std::fs::read_to_string(f).is_ok_and(says_rate));
+            let silent = rig.as_deref().is_some_and(|f| !read_text_file(f).is_ok_and(says_rate));
             if silent {
                 given.sweep.rate_hz = rate;
                 given.check_consistency()?;

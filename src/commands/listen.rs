@@ -5,10 +5,11 @@ use std::path::PathBuf;
 use anyhow::Context as _;
 use clap::{Args, ValueEnum};
 use echolake_export::{DryRecording, ListenedResponse, write_sounds};
+use echolake_import::DryWav;
 use echolake_lake::Lake;
 use echolake_query::Session;
 use echolake_query::figure_rows::quote_literal;
-use echolake_schema::SurfaceId;
+use echolake_schema::{ErrorCause, SurfaceId};
 use serde::Deserialize;
 
 use crate::CommandOutcome;
@@ -47,6 +48,7 @@ enum ListenedSignal {
 #[derive(Deserialize)]
 struct ResponseRow {
     surface_id: String,
+    run_id: String,
     origin: String,
     flat_reference: Option<String>,
     samples: Option<Vec<f32>>,
@@ -54,7 +56,7 @@ struct ResponseRow {
 
 pub(crate) async fn run_listen(args: &ListenArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let lake = Lake::open(lake_url).await?;
-    let dry = echolake_import::read_wav_channel(&args.dry).context("--dry")?;
+    let dry = DryWav::open(&args.dry).context("--dry")?;
     let session = Session::new(&lake)?;
     let surface = newest_response(&session, args, args.surface.as_str()).await?;
     let flat = surface.flat_reference.clone().with_context(|| format!("{} has no Flat", args.surface))?;
@@ -72,8 +74,10 @@ pub(crate) async fn run_listen(args: &ListenArgs, lake_url: &str) -> anyhow::Res
         .zip(&names)
         .map(|(row, name)| ListenedResponse { name, samples: row.samples.as_deref().unwrap_or_default(), rate_hz })
         .collect();
-    let recording = DryRecording { samples: &dry.samples, rate_hz: dry.rate_hz };
-    let levels = write_sounds(&args.output, recording, &responses, args.match_levels)?;
+    let read_block = |range| dry.read_block(range).map_err(ErrorCause::from);
+    let recording = DryRecording { read_block: &read_block, sample_count: dry.sample_count(), rate_hz: dry.rate_hz() };
+    let written = tokio::task::block_in_place(|| write_sounds(&args.output, recording, &responses, args.match_levels));
+    let levels = written?;
     if args.json {
         super::print_line(&serde_json::to_string_pretty(&levels)?)?;
     } else {
@@ -92,15 +96,16 @@ pub(crate) async fn run_listen(args: &ListenArgs, lake_url: &str) -> anyhow::Res
     Ok(CommandOutcome::Whole)
 }
 
+// Of the surface's newest run, as its row in `surfaces` names it.
 async fn newest_response(session: &Session, args: &ListenArgs, surface: &str) -> anyhow::Result<ResponseRow> {
     let samples = match args.signal {
         ListenedSignal::Reflected => "reflected_ir",
         ListenedSignal::Measured => "ir",
     };
     let sql = format!(
-        "select s.surface_id, s.origin, s.flat_reference, i.{samples} as samples from surfaces s \
-         left join (select surface_id, {samples} from ir where surface_id = {name} and pair_id = {pair} \
-         order by log_time desc limit 1) i on i.surface_id = s.surface_id where s.surface_id = {name}",
+        "select s.surface_id, s.run_id, s.origin, s.flat_reference, i.{samples} as samples from surfaces s \
+         left join (select run_id, {samples} from ir where surface_id = {name} and pair_id = {pair}) i \
+         on i.run_id = s.run_id where s.surface_id = {name}",
         name = quote_literal(surface),
         pair = args.pair
     );
@@ -108,9 +113,10 @@ async fn newest_response(session: &Session, args: &ListenArgs, surface: &str) ->
     let row = row.with_context(|| format!("no surface `{surface}`; hint: echolake sql \"select * from surfaces\""))?;
     if row.samples.is_none() {
         anyhow::bail!(
-            "surface `{surface}` has no {samples} of pair {}; hint: echolake sql \"select pair_id from ir where \
-             surface_id = '{surface}'\"",
-            args.pair
+            "surface `{surface}` has no {samples} of pair {} in its newest run, {run}; hint: echolake sql \"select \
+             pair_id from ir where run_id = '{run}'\"",
+            args.pair,
+            run = row.run_id
         );
     }
     Ok(row)

@@ -44,6 +44,7 @@ use std::net::SocketAddr;
 use std::path::Path;
 
 use anyhow::Context as _;
+use echolake_acquisition::disk::read_text_file;
 use echolake_lake::{Error as LakeError, Lake};
 use echolake_schema::Rig;
 
@@ -79,8 +80,7 @@ fn format_size(bytes: u64) -> String {
 /// The rig of a file; else the lake's; else `otherwise`.
 async fn rig_or(file: Option<&Path>, lake_url: &str, otherwise: impl FnOnce() -> Rig) -> anyhow::Result<Rig> {
     if let Some(file) = file {
-        let text =
-            std::fs::read_to_string(file).with_context(|| format!("cannot read rig file `{}`", file.display()))?;
+        let text = read_text_file(file).with_context(|| format!("cannot read rig file `{}`", file.display()))?;
         let rig = Rig::from_toml(&text).with_context(|| format!("rig file `{}`", file.display()))?;
         if rig.validation.loopback_dbfs.is_some() {
             eprintln!("note: rig file `{}`: `validation.loopback_dbfs` is ignored: remove it", file.display());

@@ -132,6 +132,7 @@ fn open_recordings(paths: &[PathBuf], progress: &CommandProgress) -> (Vec<Record
 #[derive(Default)]
 struct ShownState {
     damages: usize,
+    notes: usize,
     /// Position and remark.
     progress: Option<(u64, String)>,
 }
@@ -143,6 +144,10 @@ impl ShownState {
             task.print_message(&format!("warning: {damage}"));
         }
         self.damages = standing.damages.len();
+        for note in &standing.notes[self.notes..] {
+            task.print_message(&format!("note: {note}"));
+        }
+        self.notes = standing.notes.len();
         let now = (standing.shown_secs as u64, describe_state(standing));
         if task.is_due() && self.progress.as_ref() != Some(&now) {
             task.set_note(now.1.clone());
@@ -188,7 +193,7 @@ pub(in crate::commands) async fn run_file(lake: &Lake, name: &str) -> anyhow::Re
     let run = name.parse::<RunId>().ok();
     let surface = name.parse::<SurfaceId>().ok();
     let of_run = run.and_then(|run| snapshot.run(&run).cloned());
-    let found = of_run.or_else(|| snapshot.runs().rfind(|r| Some(&r.surface) == surface.as_ref()).cloned());
+    let found = of_run.or_else(|| snapshot.newest_run(&surface?).cloned());
     let found = found.with_context(|| {
         let mut known: Vec<_> = snapshot.runs().map(|run| run.surface.to_string()).collect();
         known.dedup();

@@ -10,6 +10,7 @@ use std::time::Instant;
 
 use anyhow::Context as _;
 use clap::ValueEnum;
+use echolake_acquisition::disk::read_text_file;
 use echolake_query::output::{AnswerFormat, AnswerWriter, TABLE_ROWS};
 use echolake_query::{Error, QueryAnswer, Session};
 use serde::de::DeserializeOwned;
@@ -70,9 +71,7 @@ pub(crate) async fn run_sql(args: &SqlArgs, lake_url: &str) -> anyhow::Result<()
     let lake = args.cache.open_lake(lake_url).await?;
     let session = Session::new(&lake)?;
     let script = match (args.query.as_deref(), &args.file) {
-        (_, Some(file)) => {
-            std::fs::read_to_string(file).with_context(|| format!("cannot read `{}`", file.display()))?
-        }
+        (_, Some(file)) => read_text_file(file).with_context(|| format!("cannot read `{}`", file.display()))?,
         (Some("-"), None) => from_stdin()?,
         (Some(query), None) => query.to_owned(),
         (None, None) if std::io::stdin().is_terminal() => return prompt::run_prompt(&session, &lake).await,

@@ -105,12 +105,13 @@ pub(crate) async fn run_twin(args: &TwinArgs, lake_url: &str) -> anyhow::Result<
     progress.print_message("simulated rig: the twin is computed, not measured");
     let path = super::replay::run_file(&lake, surface.as_str()).await?;
     let computing = TwinComputation::new(&lake, surface, &path).await?;
+    let runs = computing.compared.clone();
     let flag = stop.clone();
     tokio::task::spawn_blocking(move || computing.compute_missing(flag.flag(), &progress)).await??;
     anyhow::ensure!(!stop.is_made(), "stopped; hint: run the same command again to resume");
     super::ingest::ingest_runs(&lake, pending_runs(&lake).await?, stop.flag(), &CommandProgress::new()).await?;
     anyhow::ensure!(!stop.is_made(), "stopped; hint: run the same command again to resume");
-    let differences = TwinDifferences::read_from_lake(&lake, surface, args.pairs).await?;
+    let differences = TwinDifferences::read_from_lake(&lake, surface, &runs, args.pairs).await?;
     match args.json {
         true => super::print_line(&serde_json::to_string_pretty(&differences)?)?,
         false => differences.print_differences()?,
@@ -125,6 +126,14 @@ struct TwinComputation {
     /// The mesh, as long as runs are computed for it.
     _mesh: TempDir,
     runs: Vec<ComputedRun>,
+    compared: ComparedRuns,
+}
+
+/// The surface's newest run, and the one that is computed for its heights.
+#[derive(Clone)]
+struct ComparedRuns {
+    measured: RunId,
+    twin: RunId,
 }
 
 /// A run that is to be computed.
@@ -151,6 +160,7 @@ impl TwinComputation {
         let name = path.file_stem().unwrap_or_default().to_string_lossy();
         let tag = name.rsplit_once('-').and_then(|(_, tag)| u64::from_str_radix(tag, 16).ok());
         let tag = tag.with_context(|| format!("`{}` is not named as a run", path.display()))?;
+        let measured = name.parse()?;
         let references = [(FLAT, PanelRelief::Flat), (FOAM, PanelRelief::Foam)];
         let mut runs = Vec::new();
         for (name, relief) in references {
@@ -164,8 +174,10 @@ impl TwinComputation {
         let twin = format!("{TWIN}{surface}").parse()?;
         if runs.iter().all(|run| run.surface != twin) {
             let specimen = PanelSpecimen::Mesh(file, PanelSide::Front);
-            runs.push(ComputedRun { surface: twin, project: taken.project, specimen, tag });
+            runs.push(ComputedRun { surface: twin.clone(), project: taken.project, specimen, tag });
         }
+        let own = runs.iter().find(|run| run.surface == twin).with_context(|| format!("`{twin}` has no run"))?;
+        let compared = ComparedRuns { measured, twin: own.id()? };
         let snapshot = lake.whole_snapshot().await?;
         let known: HashSet<RunId> = snapshot.runs().map(|run| run.run.clone()).collect();
         runs.retain(|run| run.id().is_ok_and(|id| !known.contains(&id)));
@@ -174,7 +186,7 @@ impl TwinComputation {
         rig.simulation.noise_and_drift = false;
         rig.simulation.repeatability_mm = 0.0;
         rig.simulation.calibration_mm = 0.0;
-        Ok(Self { rig, folder: super::prepare_inbox(lake)?, _mesh: mesh, runs })
+        Ok(Self { rig, folder: super::prepare_inbox(lake)?, _mesh: mesh, runs, compared })
     }
 
     fn compute_missing(&self, stop: &AtomicBool, progress: &CommandProgress) -> anyhow::Result<()> {
@@ -259,8 +271,14 @@ fn take_heights(run: &Path) -> anyhow::Result<MeasuredPanel> {
 }
 
 impl TwinDifferences {
-    async fn read_from_lake(lake: &Lake, surface: &SurfaceId, pairs: usize) -> anyhow::Result<Self> {
+    async fn read_from_lake(
+        lake: &Lake,
+        surface: &SurfaceId,
+        runs: &ComparedRuns,
+        pairs: usize,
+    ) -> anyhow::Result<Self> {
         let session = Session::new(lake)?;
+        let ComparedRuns { measured: measured_run, twin: twin_run } = runs;
         let twin = format!("{TWIN}{surface}");
         let bands = lake.rig().band_names();
         let sql = format!("select max(origin) as origin from surfaces where surface_id = '{surface}'");
@@ -281,9 +299,7 @@ impl TwinDifferences {
                 "select m.pair_id, m.microphone, m.speaker, '{band}' as band, {} as surface_db, {} as twin_db, \
                  {} - {} as difference_db from tnce m join tnce c on c.pair_id = m.pair_id \
                  where m.surface_id = '{surface}' and c.surface_id = '{twin}' \
-                 and m.run_id = (select max(run_id) from tnce where surface_id = '{surface}') \
-                 and c.run_id = (select max(run_id) from tnce where surface_id = '{twin}') \
-                 and m.{column} > 0 and c.{column} > 0",
+                 and m.run_id = '{measured_run}' and c.run_id = '{twin_run}' and m.{column} > 0 and c.{column} > 0",
                 levels("m"),
                 levels("c"),
                 levels("m"),
@@ -296,7 +312,7 @@ impl TwinDifferences {
                  sqrt(avg(difference_db * difference_db)) as rms_db, \
                  percentile_cont(0.05) within group (order by difference_db) as p5_db, \
                  percentile_cont(0.95) within group (order by difference_db) as p95_db, \
-                 cast((select max({phase}) from surfaces where surface_id = '{twin}') as double) as detail_phase \
+                 cast((select max({phase}) from surfaces where surface_id = '{surface}') as double) as detail_phase \
                  from ({joined})"
             );
             found.bands.extend(super::sql::query_rows::<BandDifference>(&session, &summary).await?);

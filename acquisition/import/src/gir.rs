@@ -5,9 +5,9 @@
 mod tests;
 
 use std::collections::{HashMap, HashSet};
-use std::fs::File;
 use std::path::{Path, PathBuf};
 
+use echolake_acquisition::disk::{BoundedFile, open_plain_file};
 use echolake_acquisition::rig::devices::simulated::TAKE_SECS;
 use echolake_acquisition::run::recorder::{LogLevel, Relief, RunStart};
 use echolake_panel::mesh::{BACK_MM, FACETS, Mesh};
@@ -196,7 +196,7 @@ fn array<D: ndarray::Dimension>(path: &Path, name: &str) -> Result<ndarray::Arra
 }
 
 fn typed<T: ReadableElement, D: ndarray::Dimension>(path: &Path, name: &str) -> Result<ndarray::Array<T, D>, String> {
-    let file = File::open(path).map_err(|e| e.to_string())?;
+    let file = open_plain_file(path).map_err(|e| e.to_string())?;
     let mut npz = NpzReader::new(file).map_err(|e| e.to_string())?;
     npz.by_name::<ndarray::OwnedRepr<T>, D>(name).map_err(|e| e.to_string())
 }
@@ -263,9 +263,13 @@ fn panel_info(path: &Path) -> Result<HashMap<SurfaceId, SurfaceRecord>, Error> {
 // The named columns of a CSV file, with the number of each line.
 fn table(path: &Path, names: &[&str]) -> Result<Vec<(u64, Vec<String>)>, Error> {
     let unreadable = |e: csv::Error| Error::Read { path: path.to_owned(), source: e.into() };
-    let mut reader = csv::Reader::from_path(path).map_err(unreadable)?;
+    let file = BoundedFile::open(path).map_err(|e| unreadable(e.into()))?;
+    let mut reader = csv::Reader::from_reader(file);
     let header = reader.headers().map_err(unreadable)?.clone();
     let place = |name: &&str| {
+        if header.iter().filter(|h| h == name).count() > 1 {
+            return Err(content_error(path, "its header", format!("column `{name}` twice"), "one of each"));
+        }
         let found = header.iter().position(|h| h == *name);
         found.ok_or_else(|| content_error(path, "its header", format!("no column `{name}`"), names.join(", ")))
     };

@@ -7,6 +7,7 @@ mod tests;
 use std::collections::HashMap;
 use std::path::Path;
 
+use echolake_acquisition::disk::open_plain_file;
 use echolake_acquisition::run::recorder::{LogLevel, RunStart};
 use echolake_schema::manifest::{Origin, RunEnd};
 use echolake_schema::{Celsius, ErrorCause, Grid, Pair, PairId, Point, Rig, SurfaceId};
@@ -105,7 +106,7 @@ impl<'g> ResponseSet<'g> {
     fn open(path: &Path, rig: &Rig, grid: &'g Grid, celsius: Option<Celsius>) -> Result<Self, Error> {
         let mapping = Hdf5Mapping::from_file(path)?;
         let unread = |source: ErrorCause| Error::Read { path: mapping.file.clone(), source };
-        std::fs::File::open(&mapping.file).map_err(|e| unread(e.into()))?;
+        open_plain_file(&mapping.file).map_err(|e| unread(e.into()))?;
         let opened = Hdf5File::open(&mapping.file);
         let file = opened.map_err(|reason| unread(format!("it is no HDF5 file: {reason}").into()))?;
         let mapped = MappedFile { path: &mapping.file, file: &file };

@@ -2,7 +2,10 @@
 
 use std::path::Path;
 
-use hdf5_pure::{AttrValue, Dataset, Error as Hdf5Error, File, FormatError, Group, Layout};
+use hdf5_pure::{
+    AttrValue, Dataset, Datatype, DatatypeByteOrder, Error as Hdf5Error, File, FloatingPointLayout, FormatError, Group,
+    Layout,
+};
 
 /// Most numbers that are returned at once: 4 GB of them.
 const MOST: usize = 1 << 29;
@@ -35,6 +38,15 @@ pub(crate) struct Hdf5Dataset {
     pub shape: Vec<usize>,
     /// Rows that are stored together.
     pub chunk_rows: usize,
+    packing: NumberPacking,
+}
+
+/// How numbers are stored, by the attributes that netCDF gives a variable.
+struct NumberPacking {
+    factor: f64,
+    offset: f64,
+    /// Stored numbers that stand for none.
+    missing: Vec<f64>,
 }
 
 impl Hdf5File {
@@ -59,8 +71,7 @@ impl Hdf5File {
     /// Returns a number that is an attribute of a variable.
     pub fn number_of(&self, variable: &str, name: &str) -> Result<f64, String> {
         let found = self.read_attribute(variable, name).map_err(describe_error)?.ok_or("it is missing")?;
-        let number = found.as_f64().or_else(|| found.as_i64().map(|integer| integer as f64));
-        number.ok_or_else(|| format!("{} and not one number", found.type_name()))
+        attribute_number(&found)
     }
 
     fn read_attribute(&self, variable: &str, name: &str) -> Result<Option<AttrValue>, Hdf5Error> {
@@ -91,6 +102,8 @@ impl Hdf5File {
         };
         let sizes = |sizes: Vec<u64>| sizes.into_iter().map(|n| usize::try_from(n).unwrap_or(usize::MAX)).collect();
         let shape: Vec<usize> = sizes(dataset.shape().map_err(describe_error)?);
+        check_datatype(&dataset.datatype().map_err(describe_error)?)?;
+        let packing = NumberPacking::from_attributes(&dataset)?;
         let width = dataset.element_size().map_err(describe_error)?;
         let has_room = |shape: &[usize]| {
             let size = shape.iter().try_fold(width, |size, n| size.checked_mul(*n as u64));
@@ -109,7 +122,7 @@ impl Hdf5File {
             }
             chunk_rows = chunk.first().copied().unwrap_or(1).max(1);
         }
-        Ok(Some(Hdf5Dataset { dataset, shape, chunk_rows }))
+        Ok(Some(Hdf5Dataset { dataset, shape, chunk_rows, packing }))
     }
 
     /// Reads a variable; None if it is missing.
@@ -127,7 +140,9 @@ impl Hdf5Dataset {
         let count = count.ok_or_else(|| format!("{counts:?} numbers, more than {MOST}"))?;
         let (&[start, ref starts @ ..], &[rows, ref counts @ ..], [_, within @ ..]) = (starts, counts, &self.shape[..])
         else {
-            return self.dataset.read_f64().map_err(describe_error);
+            let mut values = self.dataset.read_f64().map_err(describe_error)?;
+            self.packing.unpack_numbers(&mut values);
+            return Ok(values);
         };
         let row: usize = within.iter().product();
         if row > MOST_ROW_NUMBERS {
@@ -154,8 +169,72 @@ impl Hdf5Dataset {
             window.chunks_exact(row).for_each(|row| append_block(row, within, starts, counts, &mut values));
             at = next;
         }
+        self.packing.unpack_numbers(&mut values);
         Ok(values)
     }
+}
+
+impl NumberPacking {
+    fn from_attributes(dataset: &Dataset) -> Result<Self, String> {
+        let attributes = dataset.attrs().map_err(describe_error)?;
+        let number = |name: &str| {
+            let number = attributes.get(name).map(attribute_number).transpose();
+            number.map_err(|fault| format!("its attribute `{name}` is {fault}"))
+        };
+        let missing = [number("_FillValue")?, number("missing_value")?].into_iter().flatten().collect();
+        Ok(Self {
+            factor: number("scale_factor")?.unwrap_or(1.0),
+            offset: number("add_offset")?.unwrap_or(0.0),
+            missing,
+        })
+    }
+
+    // A missing number becomes NaN, which no reader takes for a sample or a position.
+    fn unpack_numbers(&self, values: &mut [f64]) {
+        if self.factor == 1.0 && self.offset == 0.0 && self.missing.is_empty() {
+            return;
+        }
+        for x in values {
+            *x = if self.missing.contains(x) { f64::NAN } else { *x * self.factor + self.offset };
+        }
+    }
+}
+
+fn attribute_number(found: &AttrValue) -> Result<f64, String> {
+    let number = found.as_f64().or_else(|| found.as_i64().map(|integer| integer as f64));
+    number.ok_or_else(|| format!("{} and not one number", found.type_name()))
+}
+
+// The library returns no numbers of other types, and no error.
+fn check_datatype(datatype: &Datatype) -> Result<(), String> {
+    let is_read = match datatype {
+        Datatype::Enumeration { base_type, .. } => return check_datatype(base_type),
+        Datatype::FixedPoint { size, byte_order, layout } => {
+            matches!(size, 1 | 2 | 4 | 8)
+                && *byte_order != DatatypeByteOrder::Vax
+                && layout.bit_offset == 0
+                && u32::from(layout.bit_precision) == 8 * size
+        }
+        Datatype::FloatingPoint { size, byte_order, layout } => {
+            let standard = [(4, FloatingPointLayout::IEEE754_BINARY32), (8, FloatingPointLayout::IEEE754_BINARY64)];
+            *byte_order != DatatypeByteOrder::Vax && standard.contains(&(*size, *layout))
+        }
+        _ => false,
+    };
+    if is_read {
+        return Ok(());
+    }
+    let layout = match datatype {
+        Datatype::FloatingPoint { layout, .. } => format!(
+            " ({} bits of exponent, of bias {}, and {} of mantissa)",
+            layout.exponent_size, layout.exponent_bias, layout.mantissa_size
+        ),
+        _ => String::new(),
+    };
+    Err(format!(
+        "numbers of type {datatype}{layout}; integers of 8, 16, 32 and 64 bits and IEEE floats of 32 and 64 are read; \
+         hint: `astype` of h5py makes one of the other"
+    ))
 }
 
 // Appends the block of `counts` numbers that begins at `starts`.
@@ -238,6 +317,70 @@ mod tests {
         }
         assert!(file.open_dataset("missing").expect("no fault").is_none());
         assert_eq!(file.variable_names(), ["integers", "packed", "plain"]);
+    }
+
+    /// E27: a type that is not read is named; the library would return no number of it.
+    #[test]
+    fn other_types_of_numbers_are_named() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("set.h5");
+        let float = |size: u32, exponent_size: u8, exponent_bias: u32| Datatype::FloatingPoint {
+            size,
+            byte_order: DatatypeByteOrder::LittleEndian,
+            layout: FloatingPointLayout {
+                bit_offset: 0,
+                bit_precision: 8 * size as u16,
+                exponent_location: 8 * size as u8 - 1 - exponent_size,
+                exponent_size,
+                mantissa_location: 0,
+                mantissa_size: 8 * size as u8 - 1 - exponent_size,
+                exponent_bias,
+            },
+        };
+        let integer = |size: u32, bit_precision: u16| Datatype::FixedPoint {
+            size,
+            byte_order: DatatypeByteOrder::BigEndian,
+            layout: hdf5_pure::FixedPointLayout { signed: true, bit_offset: 0, bit_precision },
+        };
+        let types = [
+            ("half", 2, float(2, 5, 15), "f16"),
+            ("odd", 4, float(4, 8, 120), "(8 bits of exponent, of bias 120, and 23 of mantissa)"),
+            ("narrow", 4, integer(4, 20), "i32"),
+            ("three", 3, integer(3, 24), "i24"),
+        ];
+        let mut builder = FileBuilder::new();
+        for (name, size, datatype, _) in &types {
+            builder.create_dataset(name).with_raw_data(datatype.clone(), vec![1; 3 * size], 3);
+        }
+        builder.create_dataset("plain").with_raw_data(integer(2, 16), vec![1, 0, 255, 255], 2);
+        builder.write(&path).expect("written");
+        let file = Hdf5File::open(&path).expect("opened");
+        for (name, _, _, expected) in types {
+            let fault = file.read_variable(name).expect_err(name);
+            assert!(fault.starts_with("numbers of type ") && fault.contains(expected), "{name}: {fault}");
+        }
+        assert_eq!(file.read_variable("plain").expect("read").expect("there").values, [256.0, -1.0]);
+    }
+
+    /// E27: numbers are those that netCDF's attributes say, a missing one is none.
+    #[test]
+    fn packed_numbers_are_unpacked() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("set.h5");
+        let mut builder = FileBuilder::new();
+        let packed = builder.create_dataset("packed").with_i16_data(&[-5_000, 0, 5_000, -32_768]).with_shape(&[2, 2]);
+        packed.set_attr("scale_factor", AttrValue::F64(1e-4)).set_attr("add_offset", AttrValue::F32Array(vec![0.25]));
+        packed.set_attr("_FillValue", AttrValue::I16(-32_768));
+        let odd = builder.create_dataset("odd").with_i16_data(&[1]);
+        odd.set_attr("scale_factor", AttrValue::String("0.1".to_owned()));
+        builder.write(&path).expect("written");
+        let file = Hdf5File::open(&path).expect("opened");
+        let values = file.read_variable("packed").expect("read").expect("there").values;
+        let expected = [-0.25, 0.25, 0.75];
+        assert!(values.iter().zip(expected).all(|(x, expected)| (x - expected).abs() < 1e-12), "{values:?}");
+        assert!(values.len() == 4 && values[3].is_nan(), "{values:?}");
+        let fault = file.read_variable("odd").expect_err("a text");
+        assert!(fault.starts_with("its attribute `scale_factor` is ") && fault.ends_with("not one number"), "{fault}");
     }
 
     #[test]

@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use echolake_acquisition::disk::read_text_file;
 use echolake_schema::SurfaceId;
 use serde::Deserialize;
 
@@ -100,7 +101,7 @@ impl Hdf5Mapping {
     /// Reads a mapping file.
     pub fn from_file(path: &Path) -> Result<Self, Error> {
         let unread = |e: std::io::Error| Error::Read { path: path.to_owned(), source: e.into() };
-        let text = std::fs::read_to_string(path).map_err(unread)?;
+        let text = read_text_file(path).map_err(unread)?;
         let mut mapping: Self = toml::from_str(&text).map_err(|e| {
             let line = e.span().map_or(0, |span| text[..span.start].lines().count().max(1));
             content_error(path, format!("line {line}"), e.message(), "a mapping; hint: docs/export.md has an example")

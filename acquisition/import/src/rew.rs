@@ -23,7 +23,7 @@ use realfft::num_complex::Complex;
 use self::rew_text::RewText;
 use crate::batch::ImportBatch;
 use crate::response::{ImportedResponse, least_length};
-use crate::wav_file::WavChannel;
+use crate::wav_file::{WavChannel, split_reference};
 use crate::wav_manifest::{ManifestCells, next_record, no_rows, open_manifest};
 use crate::{Error, ImportOptions, ImportedRun};
 
@@ -168,6 +168,9 @@ fn parse_row(cells: &ManifestCells<'_>, rig: &Rig, grid: &Grid) -> Result<RewRow
         ));
     }
     let samples = advance(&file.samples, emission, len);
+    if let Some(x) = samples.iter().find(|x| !x.is_finite()) {
+        return Err(cells.cell_error("response", format!("`{name}` has a sample that is {x}, expected a finite f32")));
+    }
     let response = ImportedResponse { pair, at: Timestamp(0), celsius, samples, is_corrected: false };
     Ok(RewRow { line: cells.line(), recorded_at: cells.parse_time()?, response, warnings })
 }
@@ -179,9 +182,9 @@ fn geometry_secs(pair: Pair, rig: &Rig, grid: &Grid, celsius: Celsius) -> f64 {
 }
 
 fn read_response(folder: &Path, name: &str) -> Result<RewResponse, String> {
-    let path = folder.join(name);
-    let is_wav = name.split('#').next().is_some_and(|file| file.to_lowercase().ends_with(".wav"));
-    if !is_wav {
+    let (file, _) = split_reference(folder, name)?;
+    if !file.to_lowercase().ends_with(".wav") {
+        let path = folder.join(name);
         return RewText::read(&path).map_err(|fault| format!("`{}` {fault}", path.display()));
     }
     let wav = WavChannel::open(folder, name)?;

@@ -10,6 +10,7 @@ mod tests;
 use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 
+use echolake_acquisition::disk::open_plain_file;
 use echolake_acquisition::rig::devices::simulated::TAKE_SECS;
 use echolake_acquisition::run::recorder::{LogLevel, RunStart};
 use echolake_schema::manifest::{Origin, RunEnd};
@@ -29,12 +30,15 @@ const OURS: &str = "echolake";
 const STEP_NANOS: i64 = 1_000;
 const KELVIN: f64 = 273.15;
 /// Conventions that have responses between points, with their data types. The others have filters, audio or
-/// spherical harmonics, or are of headphones.
-const CONVENTIONS: [(&str, &str); 5] = [
+/// spherical harmonics, or are of headphones, or are superseded.
+const CONVENTIONS: [(&str, &str); 8] = [
     ("SingleRoomSRIR", "FIR"),
     ("SingleRoomMIMOSRIR", "FIR-E"),
     ("GeneralFIR", "FIR"),
+    ("GeneralFIR-E", "FIR-E"),
+    ("GeneralTF", "TF"),
     ("SimpleFreeFieldHRIR", "FIR"),
+    ("SimpleFreeFieldHRTF", "TF"),
     ("FreeFieldDirectivityTF", "TF"),
 ];
 /// Greatest delay that is none, in samples.
@@ -129,7 +133,7 @@ struct SofaResponses {
 impl Sofa {
     fn read(path: &Path, rig: &Rig, grid: &Grid, celsius: Option<Celsius>) -> Result<Self, Error> {
         let unread = |source: ErrorCause| Error::Read { path: path.to_owned(), source };
-        std::fs::File::open(path).map_err(|e| unread(e.into()))?;
+        open_plain_file(path).map_err(|e| unread(e.into()))?;
         let file = Hdf5File::open(path).map_err(|reason| unread(format!("it is no HDF5 file: {reason}").into()))?;
         let mut reader = SofaReader { path, convention: file.root_text("SOFAConventions"), file, warnings: Vec::new() };
         let is_ours = reader.file.root_text("APIName") == OURS;
@@ -252,7 +256,7 @@ impl SofaReader<'_> {
     }
 
     fn data_name(&self) -> &'static str {
-        if self.convention == "FreeFieldDirectivityTF" { "Data.Real" } else { "Data.IR" }
+        if self.file.root_text("DataType") == "TF" { "Data.Real" } else { "Data.IR" }
     }
 
     fn read_responses(&self, has_emitters: bool, rig: &Rig) -> Result<SofaResponses, Error> {

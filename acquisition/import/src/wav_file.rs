@@ -3,6 +3,7 @@
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
+use echolake_acquisition::disk::open_plain_file;
 use echolake_schema::messages::SampleFormat;
 use echolake_schema::samples::split_24;
 
@@ -24,41 +25,63 @@ pub(crate) struct ChannelSamples {
     pub clipped: u32,
 }
 
-/// A recording that is no measurement.
+/// A recording that is no measurement, of which blocks are read.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DryWav {
-    /// Fractions of full scale.
-    pub samples: Vec<f32>,
-    /// Sampling rate.
-    pub rate_hz: u32,
+    channel: WavChannel,
 }
 
-/// Reads a channel of a WAV file: `file.wav`, or `file.wav#2` for its second one.
-///
-/// # Errors
-/// [`Error::WavFile`].
-pub fn read_wav_channel(path: &Path) -> Result<DryWav, Error> {
-    let read = || {
-        let channel = WavChannel::open(Path::new(""), &path.to_string_lossy())?;
-        let samples = channel.read_all(channel.sample_format())?.fractions;
-        Ok(DryWav { samples, rate_hz: channel.layout.rate_hz })
-    };
-    read().map_err(|fault| Error::WavFile { fault })
+impl DryWav {
+    /// Opens a channel of a WAV file: `file.wav`, or `file.wav#2` for its second one.
+    ///
+    /// # Errors
+    /// [`Error::WavFile`].
+    pub fn open(path: &Path) -> Result<Self, Error> {
+        let opened = WavChannel::open(Path::new(""), &path.to_string_lossy());
+        Ok(Self { channel: opened.map_err(|fault| Error::WavFile { fault })? })
+    }
+
+    /// Sampling rate.
+    pub fn rate_hz(&self) -> u32 {
+        self.channel.layout.rate_hz
+    }
+
+    /// Samples in it.
+    pub fn sample_count(&self) -> u64 {
+        self.channel.layout.samples
+    }
+
+    /// Reads a range of its samples, fractions of full scale.
+    ///
+    /// # Errors
+    /// [`Error::WavFile`].
+    pub fn read_block(&self, range: Range<u64>) -> Result<Vec<f32>, Error> {
+        let read = self.channel.read_samples(self.channel.sample_format(), range);
+        Ok(read.map_err(|fault| Error::WavFile { fault })?.fractions)
+    }
+}
+
+/// Splits `file.wav#2` into file and channel. A file of that very name comes first, and `#` without a number behind
+/// it belongs to the name.
+pub(crate) fn split_reference<'a>(folder: &Path, reference: &'a str) -> Result<(&'a str, u16), String> {
+    let is_number = |text: &str| !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_digit());
+    match reference.rsplit_once('#').filter(|(_, number)| is_number(number)) {
+        Some((name, number)) if !folder.join(reference).exists() => {
+            let channel = number.parse().map_err(|_| format!("`#{number}` is no channel number"))?;
+            Ok((name, channel))
+        }
+        _ => Ok((reference, 1)),
+    }
 }
 
 impl WavChannel {
     /// Opens `file.wav`, or `file.wav#2` for its second channel. The text of an error names the fault.
     pub fn open(folder: &Path, reference: &str) -> Result<Self, String> {
-        let (name, channel) = match reference.rsplit_once('#') {
-            Some((name, number)) => {
-                let number: u16 = number.parse().map_err(|_| format!("`#{number}` is no channel number"))?;
-                (name, number)
-            }
-            None => (reference, 1),
-        };
+        let (name, channel) = split_reference(folder, reference)?;
         let path = folder.join(name);
         let shown = path.display();
-        let size = std::fs::metadata(&path).map_err(|e| format!("cannot read `{shown}`: {e}"))?.len();
+        let size = open_plain_file(&path).and_then(|file| file.metadata());
+        let size = size.map_err(|e| format!("cannot read `{shown}`: {e}"))?.len();
         if size == 0 {
             return Err(format!("`{shown}` is empty"));
         }
@@ -150,6 +173,32 @@ mod tests {
         let name = format!("{bits}.wav");
         std::fs::write(folder.join(&name), encode_wav(format, 96_000, &[&bytes]).expect("a file")).expect("written");
         WavChannel::open(folder, &name).expect("a channel")
+    }
+
+    /// E25: a file that is there is read, whatever its name; a channel is what stands behind the last `#` if it is
+    /// digits.
+    #[test]
+    fn a_number_sign_belongs_to_a_name_unless_a_channel_follows_it() {
+        let folder = tempfile::tempdir().expect("a folder");
+        std::fs::create_dir(folder.path().join("C# takes")).expect("made");
+        let frames: [&[u8]; 2] = [&[1, 0], &[2, 0]];
+        let wav = encode_wav(SampleFormat::S16le, 96_000, &frames).expect("a file");
+        let names = ["TrumpetF#2.wav", "take #1.WAV", "C# takes/voice.wav", "odd#2", "A#.wav", "B#"];
+        for name in names {
+            std::fs::write(folder.path().join(name), &wav).expect("written");
+        }
+        for name in names {
+            for (reference, channel) in [(name.to_owned(), 1), (format!("{name}#1"), 1), (format!("{name}#2"), 2)] {
+                let samples = WavChannel::open(folder.path(), &reference).expect(&reference);
+                let samples = samples.read_all(SampleFormat::S16le).expect("samples");
+                assert_eq!(samples.bytes, [channel, 0], "{reference}");
+            }
+        }
+        let refused = |reference: &str| WavChannel::open(folder.path(), reference).expect_err(reference);
+        assert!(refused("A#.wav#3").contains("has 2 channels, expected one with number 3"));
+        assert!(refused("A#.wav#0").contains("has 2 channels, expected one with number 0"));
+        assert_eq!(refused("A#.wav#70000"), "`#70000` is no channel number");
+        assert!(refused("A#.wav#two").contains("A#.wav#two`: No such file"), "{}", refused("A#.wav#two"));
     }
 
     // What is stored is read back as the fractions that import itself computed with.

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use csv::StringRecord;
+use echolake_acquisition::disk::BoundedFile;
 use echolake_schema::interchange::WAV_MANIFEST;
 use echolake_schema::messages::SampleFormat;
 use echolake_schema::{Celsius, Grid, Pair, PairId, Rig, SurfaceId, Timestamp};
@@ -34,14 +35,15 @@ pub(crate) struct ManifestRow {
 /// Columns that a manifest may have.
 pub(crate) type ManifestColumns = &'static [&'static str];
 /// A manifest's rows, and the place of each column.
-type OpenManifest = (csv::Reader<std::fs::File>, Vec<Option<usize>>);
+type OpenManifest = (csv::Reader<BoundedFile>, Vec<Option<usize>>);
 /// A manifest's rows by surface.
 pub(crate) type WavManifest = BTreeMap<SurfaceId, Vec<ManifestRow>>;
 
 /// Opens a manifest and checks its header; returns the place of each column.
 pub(crate) fn open_manifest(path: &Path, columns: ManifestColumns) -> Result<OpenManifest, Error> {
     let unreadable = |e: csv::Error| Error::Read { path: path.to_owned(), source: e.into() };
-    let mut reader = csv::ReaderBuilder::new().trim(csv::Trim::All).from_path(path).map_err(unreadable)?;
+    let file = BoundedFile::open(path).map_err(|e| unreadable(e.into()))?;
+    let mut reader = csv::ReaderBuilder::new().trim(csv::Trim::All).from_reader(file);
     let header = reader.headers().map_err(unreadable)?.clone();
     let wrong = |what| Error::Header { path: path.to_owned(), what, columns };
     if header.is_empty() {
@@ -49,6 +51,9 @@ pub(crate) fn open_manifest(path: &Path, columns: ManifestColumns) -> Result<Ope
     }
     if let Some(unknown) = header.iter().find(|h| !columns.contains(h)) {
         return Err(wrong(format!("unknown column `{unknown}`")));
+    }
+    if let Some(twice) = columns.iter().find(|c| header.iter().filter(|h| h == *c).count() > 1) {
+        return Err(wrong(format!("column `{twice}` is there twice")));
     }
     let places: Vec<_> = columns.iter().map(|c| header.iter().position(|h| h == *c)).collect();
     match places[..NEEDED].iter().position(Option::is_none) {
@@ -86,7 +91,7 @@ pub(crate) fn read_manifest(path: &Path, rig: &Rig, grid: &Grid) -> Result<WavMa
     if manifest.is_empty() { Err(no_rows(path, &WAV_MANIFEST)) } else { Ok(manifest) }
 }
 
-pub(crate) fn next_record(path: &Path, reader: &mut csv::Reader<std::fs::File>) -> Result<Option<StringRecord>, Error> {
+pub(crate) fn next_record(path: &Path, reader: &mut csv::Reader<BoundedFile>) -> Result<Option<StringRecord>, Error> {
     let mut record = StringRecord::new();
     match reader.read_record(&mut record) {
         Ok(true) => Ok(Some(record)),

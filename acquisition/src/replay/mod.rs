@@ -1,9 +1,9 @@
 //! Replay of recordings: a WebSocket server that Foxglove controls (play, pause, speed, seek) and Lichtblick shows.
 //!
-//! Several recordings are shown one after the other; the time between them is left out, and if one begins before the
-//! other ends, time goes back. Only chunks with subscribed topics are read, one after the other. Playback stops while
-//! there is no viewer, and waits while all viewers have enough to read; if one is slower than another, it loses its
-//! oldest messages.
+//! Several recordings are shown one after the other; the time between them is left out, and so are gaps within one of
+//! more than 10 minutes without a message. If a recording begins before the other ends, time goes back. Only chunks with
+//! subscribed topics are read, one after the other. Playback stops while there is no viewer, and waits while all viewers
+//! have enough to read; if one is slower than another, it loses its oldest messages.
 
 mod clock;
 mod cursor;
@@ -54,6 +54,8 @@ pub struct ReplayState {
     pub lost: u64,
     /// Damage found so far, as texts that name file and place.
     pub damages: Vec<String>,
+    /// Gaps that were passed over so far, as texts that name file and times.
+    pub notes: Vec<String>,
 }
 
 /// A server that replays recordings. Dropped, it disconnects its clients.
@@ -96,6 +98,7 @@ impl ReplayServer {
             viewers: 0,
             lost: 0,
             damages: Vec::new(),
+            notes: Vec::new(),
         }));
         let player = ReplayPlayer::new(recordings, topics, options, server.shared_state().clone(), standing.clone());
         let thread = PlayerThread(Some(std::thread::spawn(move || player.run_player(&obeyed))));

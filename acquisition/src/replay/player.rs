@@ -5,6 +5,8 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
+use echolake_schema::Timestamp;
+
 use super::clock::ReplayClock;
 use super::cursor::{ChunkDamage, MessageCursor, latest_messages};
 use super::recording::{Key, Recording};
@@ -20,6 +22,10 @@ const TICK: Duration = Duration::from_millis(33);
 const BREATH: Duration = Duration::from_millis(3);
 /// Messages between two checks for commands.
 const STRIDE: usize = 256;
+/// Longest time without any message that is waited for, ns: 10 minutes.
+const LONGEST_GAP: u64 = 600_000_000_000;
+/// Most gaps that are named.
+const MOST_NOTES: usize = 100;
 
 /// Length of a recording, s.
 pub(super) fn recording_secs(recording: &Recording) -> f64 {
@@ -74,6 +80,8 @@ pub(super) struct ReplayPlayer {
     wishes: u64,
     /// Damage that was reported already.
     damaged: BTreeSet<(usize, u64)>,
+    /// Time before which no gap is searched for again: a search reads a chunk.
+    next_search: u64,
 }
 
 impl ReplayPlayer {
@@ -97,6 +105,7 @@ impl ReplayPlayer {
             cursor: MessageCursor::starting_behind(at_all_of(start), BTreeSet::new()),
             wishes: 0,
             damaged: BTreeSet::new(),
+            next_search: 0,
         }
     }
 
@@ -171,6 +180,9 @@ impl ReplayPlayer {
 
     // Nothing is due before a time.
     fn wait_for(&mut self, next: u64) -> Duration {
+        if let Some(end) = self.find_gap_end(next) {
+            return self.pass_gap(end);
+        }
         // New subscribers get the state at the current time.
         let now = self.clock.now().min(next.saturating_sub(1));
         self.cursor.skip_to(at_all_of(now));
@@ -178,7 +190,42 @@ impl ReplayPlayer {
         self.clock.time_until(next).min(TICK)
     }
 
+    // The end of a gap at the current time, if there is one. Clients may have subscribed to some topics alone, and a
+    // gap is one of all topics.
+    fn find_gap_end(&mut self, next: u64) -> Option<u64> {
+        let now = self.clock.now();
+        if next.saturating_sub(now) <= LONGEST_GAP || now < self.next_search {
+            return None;
+        }
+        let recording = &self.recordings[self.number];
+        let mut all = MessageCursor::starting_behind(at_all_of(now), recording.topics.keys().copied().collect());
+        let mut damages = Vec::new();
+        let end = all.peek_time(recording, &mut damages).map_or(next, |time| time.min(next));
+        self.note_damages(damages);
+        self.next_search = now.saturating_add(LONGEST_GAP / 2);
+        (end.saturating_sub(now) > LONGEST_GAP).then_some(end)
+    }
+
+    fn pass_gap(&mut self, end: u64) -> Duration {
+        let start = self.current_time();
+        let path = self.recordings[self.number].path().display().to_string();
+        let time = |nanos: u64| Timestamp(i64::try_from(nanos).unwrap_or(i64::MAX));
+        let secs = end.saturating_sub(start) / 1_000_000_000;
+        let line = format!("`{path}` has no message for {secs} s, from {} to {}: passed over", time(start), time(end));
+        {
+            let mut told = self.told.lock().unwrap_or_else(PoisonError::into_inner);
+            if told.notes.len() < MOST_NOTES {
+                told.notes.push(line);
+            }
+        }
+        self.move_to_time(end.saturating_sub(1));
+        self.tell_state(true, String::new());
+        self.show_to(&self.shared.clients());
+        Duration::ZERO
+    }
+
     fn move_to_time(&mut self, time: u64) {
+        self.next_search = 0;
         self.clock.set_time(time);
         self.wishes = self.shared.wish_counter();
         self.cursor = MessageCursor::starting_behind(at_all_of(time), self.wanted_channels());

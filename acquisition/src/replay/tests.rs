@@ -292,6 +292,47 @@ fn recordings_of_the_same_time_are_shown_one_after_the_other() {
     assert!(by_content(seen) == expected && by_content(second) == expected);
 }
 
+/// Writes a file of messages: topic and time, ms.
+fn write_times(path: &Path, times: &[(&str, u64)]) {
+    let mut writer = mcap::Writer::new(std::fs::File::create(path).expect("created")).expect("a writer");
+    for (topic, millis) in times {
+        let channel_id = writer.add_channel(0, topic, "json", &std::collections::BTreeMap::new()).expect("a channel");
+        let log_time = millis * 1_000_000;
+        let header = mcap::records::MessageHeader { channel_id, sequence: 0, log_time, publish_time: log_time };
+        writer.write_to_known_channel(&header, b"{}").expect("written");
+    }
+    writer.finish().expect("finished");
+}
+
+/// E29: a gap of all topics is passed over and named; a topic of few messages is not a gap.
+#[test]
+fn gaps_are_passed_over_and_named() {
+    let home = tempfile::tempdir().expect("a folder");
+    let path = home.path().join("gap.mcap");
+    write_times(&path, &[("/a", 0), ("/b", 20), ("/a", 1_700_000_000_000), ("/b", 1_700_000_000_020)]);
+    for topics in [&[][..], &["/b"]] {
+        let server = replay(&[&path], ReplayOptions { speed: 1.0, paused: false });
+        let mut client = ReplayClient::connect(&server);
+        client.subscribe(topics);
+        let mut last = 0;
+        while last < 1_700_000_000_020_000_000 {
+            let (_, time, _) = client.collect(1).remove(0);
+            assert!(time >= last || time <= 20_000_000, "{time} after {last}");
+            last = time;
+        }
+        let notes = server.standing().notes;
+        assert!(notes.len() == 1 && notes[0].contains("gap.mcap` has no message for 1699999999 s, from 1970-01-01T"));
+    }
+    let path = home.path().join("sparse.mcap");
+    let dense = (1..20).map(|n| ("/dense", 300_000 * n));
+    write_times(&path, &[("/sparse", 0)].into_iter().chain(dense).chain([("/sparse", 6_000_000)]).collect::<Vec<_>>());
+    let server = replay(&[&path], FAST);
+    let mut client = ReplayClient::connect(&server);
+    client.subscribe(&["/sparse"]);
+    assert_eq!(client.collect(2)[1].1, 6_000_000_000_000);
+    assert_eq!(server.standing().notes, Vec::<String>::new());
+}
+
 #[test]
 fn what_cannot_be_shown_is_refused() {
     let home = tempfile::tempdir().expect("a folder");

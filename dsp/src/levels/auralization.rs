@@ -1,7 +1,9 @@
 //! Auralization: a dry recording as it sounds by a response that was measured at another sampling rate.
 
-use realfft::RealFftPlanner;
+use std::sync::Arc;
+
 use realfft::num_complex::Complex;
+use realfft::{ComplexToReal, RealFftPlanner, RealToComplex};
 
 /// Length of a block over that of the response, when both are convolved.
 const BLOCK_RESPONSES: usize = 4;
@@ -30,25 +32,59 @@ pub fn resample_response(response: &[f32], from_hz: u32, to_hz: u32) -> Vec<f64>
     invert_spectrum(&mut planner, &mut to, length)
 }
 
-/// Returns a recording convolved with a response of the same sampling rate.
-///
-/// dry `[n]`, response `[m]`; returns `[n + m - 1]`, or nothing if one of both is empty
-pub fn convolve_recording(dry: &[f32], response: &[f64]) -> Vec<f32> {
-    if dry.is_empty() || response.is_empty() {
-        return Vec::new();
+/// The convolution of a recording, block by block, with a response of the same sampling rate: of n samples and m they
+/// are n + m - 1.
+pub struct RecordingConvolution {
+    forward: Arc<dyn RealToComplex<f64>>,
+    inverse: Arc<dyn ComplexToReal<f64>>,
+    of_response: Vec<Complex<f64>>,
+    spectrum: Vec<Complex<f64>>,
+    /// `[size]`: a block and zeros, then what it becomes.
+    signal: Vec<f64>,
+    /// `[m - 1]`: what the blocks before add to the next one.
+    tail: Vec<f64>,
+}
+
+impl RecordingConvolution {
+    /// Plans the convolution; None if the response, `[m]`, is empty.
+    pub fn new(response: &[f64]) -> Option<Self> {
+        let tail = vec![0.0; response.len().checked_sub(1)?];
+        let size = (response.len() * BLOCK_RESPONSES).next_power_of_two();
+        let mut planner = RealFftPlanner::new();
+        let of_response = compute_spectrum(&mut planner, response.iter().copied(), size);
+        let (forward, inverse) = (planner.plan_fft_forward(size), planner.plan_fft_inverse(size));
+        let spectrum = forward.make_output_vec();
+        Some(Self { forward, inverse, of_response, spectrum, signal: vec![0.0; size], tail })
     }
-    let size = (response.len() * BLOCK_RESPONSES).next_power_of_two();
-    let block = size + 1 - response.len();
-    let mut planner = RealFftPlanner::new();
-    let of_response = compute_spectrum(&mut planner, response.iter().copied(), size);
-    let mut sound = vec![0.0; dry.len() + response.len() - 1];
-    for (number, part) in dry.chunks(block).enumerate() {
-        let mut spectrum = compute_spectrum(&mut planner, part.iter().map(|x| f64::from(*x)), size);
-        spectrum.iter_mut().zip(&of_response).for_each(|(part, response)| *part *= response);
-        let convolved = invert_spectrum(&mut planner, &mut spectrum, size);
-        sound[number * block..].iter_mut().zip(convolved).for_each(|(sum, x)| *sum += x);
+
+    /// Samples of the longest block.
+    pub fn block_len(&self) -> usize {
+        self.signal.len() - self.tail.len()
     }
-    sound.into_iter().map(|x| x as f32).collect()
+
+    /// Convolves the next block.
+    ///
+    /// dry `[n]`, n up to [`Self::block_len`], of which the rest is left out
+    /// sound: `[n]` are appended
+    pub fn convolve_block(&mut self, dry: &[f32], sound: &mut Vec<f32>) {
+        let dry = &dry[..dry.len().min(self.block_len())];
+        self.signal.iter_mut().zip(dry).for_each(|(to, x)| *to = f64::from(*x));
+        self.signal[dry.len()..].fill(0.0);
+        // The lengths are the plans' own.
+        let _ = self.forward.process(&mut self.signal, &mut self.spectrum);
+        self.spectrum.iter_mut().zip(&self.of_response).for_each(|(part, response)| *part *= response);
+        let _ = self.inverse.process(&mut self.spectrum, &mut self.signal);
+        let scale = self.signal.len() as f64;
+        self.signal.iter_mut().for_each(|x| *x /= scale);
+        self.signal.iter_mut().zip(&self.tail).for_each(|(sum, x)| *sum += x);
+        sound.extend(self.signal[..dry.len()].iter().map(|x| *x as f32));
+        self.tail.iter_mut().zip(&self.signal[dry.len()..]).for_each(|(to, x)| *to = *x);
+    }
+
+    /// Returns what sounds after the last block, `[m - 1]`.
+    pub fn finish(self) -> Vec<f32> {
+        self.tail.into_iter().map(|x| x as f32).collect()
+    }
 }
 
 fn compute_spectrum(
@@ -81,19 +117,30 @@ fn greatest_common_divisor(a: u32, b: u32) -> u32 {
 mod tests {
     use super::*;
 
-    // By definition, in the time domain; over several blocks.
+    fn convolve(dry: &[f32], response: &[f64], block: usize) -> Vec<f32> {
+        let mut convolution = RecordingConvolution::new(response).expect("a response");
+        let mut sound = Vec::new();
+        dry.chunks(block.min(convolution.block_len())).for_each(|part| convolution.convolve_block(part, &mut sound));
+        sound.extend(convolution.finish());
+        sound
+    }
+
+    // By definition, in the time domain; over several blocks, of which some are shorter than the response.
     #[test]
     fn convolution_is_the_sum_of_delayed_copies() {
         let dry: Vec<f32> = (0..1000).map(|n| ((n * n) % 17) as f32 - 8.0).collect();
         let response: Vec<f64> = (0..31).map(|n| f64::from((n * 7) % 11) - 5.0).collect();
-        let sound = convolve_recording(&dry, &response);
-        assert_eq!(sound.len(), 1030);
-        for (n, found) in sound.iter().enumerate() {
-            let expected: f64 =
-                (0..31).filter_map(|k| Some(response[k] * f64::from(*dry.get(n.checked_sub(k)?)?))).sum();
-            assert!((f64::from(*found) - expected).abs() < 1e-3, "{n}: {found} {expected}");
+        for block in [1000, 13, 1] {
+            let sound = convolve(&dry, &response, block);
+            assert_eq!(sound.len(), 1030);
+            for (n, found) in sound.iter().enumerate() {
+                let expected: f64 =
+                    (0..31).filter_map(|k| Some(response[k] * f64::from(*dry.get(n.checked_sub(k)?)?))).sum();
+                assert!((f64::from(*found) - expected).abs() < 1e-3, "{block}, {n}: {found} {expected}");
+            }
         }
-        assert!(convolve_recording(&[], &response).is_empty() && convolve_recording(&dry, &[]).is_empty());
+        assert_eq!(convolve(&dry, &[2.0], 1000), dry.iter().map(|x| 2.0 * x).collect::<Vec<_>>());
+        assert!(RecordingConvolution::new(&[]).is_none());
     }
 
     // scipy.signal.resample([1, -2, 3, 0.5], n) * 4 / n by SciPy 1.17.1.

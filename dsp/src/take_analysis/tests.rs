@@ -250,6 +250,35 @@ fn other_recordings_are_named() {
     }
 }
 
+/// E24: the sweep may be at any place of a recording: only what is cut off is a fault, and by its length.
+#[test]
+fn a_sweep_is_found_after_any_silence() {
+    for shape in SHAPES {
+        let sweep = sweep(shape);
+        // An exponential sweep without its end lacks too much of its range to be told from a torn one.
+        let cuts = if shape == SweepShape::Linear { &[(0.5, -0.025), (-0.025, 0.5)][..] } else { &[] };
+        for (before_secs, after_secs) in [(0.0, 0.02), (1.0, 0.2), (3.0, 0.2)].iter().chain(cuts).copied() {
+            let samples = |secs: f64| (secs * RATE_HZ).round() as i64;
+            let start = samples(before_secs);
+            let played = sweep.samples();
+            let len = (start + samples(after_secs)) as usize + played.len();
+            let sample = |n: usize| usize::try_from(n as i64 - start).ok().and_then(|at| played.get(at));
+            let loopback: Vec<f64> = (0..len).map(|n| 0.5 * sample(n).unwrap_or(&0.0)).collect();
+            let analyzer = TakeAnalyzer::new(sweep, len).expect("a plan");
+            let [microphone, loopback] = [single(&reflect(&loopback), 1e-4, 1), single(&loopback, 1e-5, 2)];
+            let faults = analyzer.analyze_take(&microphone, Some(&loopback)).expect("an analysis").faults;
+            let lost = match faults[..] {
+                [] => 0.0,
+                [TakeFault::CutStart { lost_secs }, ..] if before_secs < 0.0 => lost_secs,
+                [TakeFault::CutEnd { lost_secs }, ..] if after_secs < 0.0 => lost_secs,
+                _ => panic!("{shape:?}, {before_secs} s before, {after_secs} s after: {faults:?}"),
+            };
+            let expected = (-before_secs.min(after_secs)).max(0.0);
+            assert!((lost - expected).abs() < 1e-3, "{shape:?}, {before_secs} s: {lost} s, expected {expected} s");
+        }
+    }
+}
+
 // Starts that differ by up to 10 ms, fractions of a sample included.
 #[test]
 fn a_start_s_jitter_leaves_the_response() {

@@ -87,8 +87,8 @@ pub const SOFA_COLUMNS: [&str; 4] = ["pair_id", "log_time_ns", "temperature_c", 
 
 // The newest run of each surface, sorted by surface id.
 fn newest_runs(snapshot: &LakeSnapshot, surfaces: &[SurfaceId]) -> Result<Vec<VisibleRun>> {
-    let mut newest: std::collections::BTreeMap<&SurfaceId, &VisibleRun> = std::collections::BTreeMap::new();
-    newest.extend(snapshot.runs().map(|run| (&run.surface, run)));
+    let all = snapshot.runs().filter_map(|run| Some((&run.surface, snapshot.newest_run(&run.surface)?)));
+    let mut newest: std::collections::BTreeMap<&SurfaceId, &VisibleRun> = all.collect();
     if let Some(unknown) = surfaces.iter().find(|s| !newest.contains_key(s)) {
         let known = newest.keys().take(20).map(|s| s.as_str()).collect::<Vec<_>>().join(", ");
         return Err(Error::Unknown { kind: "surface", name: unknown.to_string(), known });

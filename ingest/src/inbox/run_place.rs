@@ -50,7 +50,7 @@ pub(crate) async fn move_to_place(
         Err(Error::Gone { .. }) => {}
         checked => checked?,
     }
-    let there = look_at_place(lake, to, file.integrity, is_known).await?;
+    let there = look_at_place(lake, to, file.integrity).await?;
     if let PlaceContent::Other(there) = &there {
         // A folder's file may be what a power cut left of a copy.
         let is_left_over = matches!(source, RunSource::File(_)) && !lake.is_remote();
@@ -90,8 +90,8 @@ pub(crate) async fn move_to_place(
     }
 }
 
-/// Puts a file into the place of a shorter one that has its beginning, after the commit of its rows: if the process
-/// ends before, the next ingest finds the file and its rows, and does the same.
+/// Puts a file into the place of a shorter one that has its beginning, or of a damaged one, after the commit of its
+/// rows: if the process ends before, the next ingest finds the file and its rows, and does the same.
 ///
 /// # Errors
 /// An error of the lake.
@@ -110,7 +110,7 @@ pub(crate) async fn replace_partial(lake: &Lake, source: &RunSource, to: &Path) 
     move_object(lake, from, to, bytes, None).await.map_err(|fault| fault.into_error(to))
 }
 
-async fn look_at_place(lake: &Lake, to: &Path, file: &FileIntegrity, is_known: bool) -> Result<PlaceContent> {
+async fn look_at_place(lake: &Lake, to: &Path, file: &FileIntegrity) -> Result<PlaceContent> {
     let store = lake.store();
     let bytes = match store.head(to).await {
         Ok(meta) => meta.size,
@@ -119,10 +119,6 @@ async fn look_at_place(lake: &Lake, to: &Path, file: &FileIntegrity, is_known: b
     };
     if bytes != file.bytes {
         return Ok(PlaceContent::Other(format!("{bytes} bytes")));
-    }
-    // The digest was compared when the rows were made.
-    if is_known {
-        return Ok(PlaceContent::Same);
     }
     let sha256 = object_sha256(store.as_ref(), to, bytes, &mut |_| {}).await.map_err(|e| Error::read_failure(to, e))?;
     Ok(if sha256 == file.sha256 { PlaceContent::Same } else { PlaceContent::Other(sha256) })
@@ -311,8 +307,9 @@ mod tests {
             [(RunSource::Lake(Path::from("inbox/x.mcap")), &inside), (RunSource::File(outside.clone()), &outside)]
         {
             let sha256 = "7".repeat(64);
-            let (damage, lost, is_data_whole) = (Vec::new(), Vec::new(), true);
-            let integrity = FileIntegrity { bytes: 5, sha256, closed: true, damage, lost, is_data_whole };
+            let (damage, lost) = (Vec::new(), Vec::new());
+            let (closed, is_data_whole, has_wrong_crc) = (true, true, false);
+            let integrity = FileIntegrity { bytes: 5, sha256, closed, damage, lost, is_data_whole, has_wrong_crc };
             fs::write(file, "12345").expect("written");
             let version = FileVersion::from_source(&lake, &source).await.expect("there");
             let read = ReadFile::check_digest(&lake, &source, version, &integrity).await.expect("read");

@@ -69,6 +69,14 @@ impl RunSource {
         path.filename()?.strip_suffix(".mcap")?.parse().ok().filter(|_| !self.is_in_inbox())
     }
 
+    /// Whether another program may still be copying it: an object appears as a whole, and ingest itself fills `runs/`.
+    pub(crate) fn may_be_copied(&self, lake: &Lake) -> bool {
+        match self {
+            Self::Lake(_) => self.is_in_inbox() && !lake.is_remote(),
+            Self::File(_) => true,
+        }
+    }
+
     pub(super) fn is_in_inbox(&self) -> bool {
         matches!(self, Self::Lake(path) if path.parts().next().is_some_and(|p| p.as_ref() == INBOX))
     }

@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use anyhow::Context as _;
+use echolake_acquisition::disk::read_text_file;
 use echolake_panel::PanelSpecimen;
 use echolake_panel::mesh::{Mesh, PanelSide};
 use echolake_panel::paper_panel::PaperPanel;
@@ -91,6 +92,6 @@ pub(in crate::commands) fn set_all(relief: &mut PanelRelief, set: &[String]) -> 
 
 /// The relief of a file of parameters.
 pub(in crate::commands) fn relief_of_file(path: &Path) -> anyhow::Result<PanelRelief> {
-    let text = std::fs::read_to_string(path).with_context(|| format!("cannot read parameters `{}`", path.display()))?;
+    let text = read_text_file(path).with_context(|| format!("cannot read parameters `{}`", path.display()))?;
     PanelRelief::from_json(&text).with_context(|| format!("parameters `{}`", path.display()))
 }

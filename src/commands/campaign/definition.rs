@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, bail, ensure};
+use echolake_acquisition::disk::read_text_file;
 use echolake_lake::ReferenceSurfaces;
 use echolake_panel::PanelSpecimen;
 use echolake_panel::collection::CollectionSurface;
@@ -114,8 +115,7 @@ fn default_runs() -> usize {
 impl CampaignDefinition {
     /// Reads a campaign's file.
     pub fn from_file(path: &Path) -> anyhow::Result<Self> {
-        let text =
-            std::fs::read_to_string(path).with_context(|| format!("cannot read campaign `{}`", path.display()))?;
+        let text = read_text_file(path).with_context(|| format!("cannot read campaign `{}`", path.display()))?;
         let parsed: Result<Self, _> = toml::from_str(&text);
         let mut campaign = parsed.map_err(|e| {
             anyhow::anyhow!("campaign `{}`: {e}hint: examples/campaigns has some that are right", path.display())

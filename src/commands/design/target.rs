@@ -6,6 +6,7 @@ use std::path::Path;
 
 use anyhow::{Context as _, bail, ensure};
 use echolake_acquisition::design::{BandFigures, PanelFigures};
+use echolake_acquisition::disk::read_text_file;
 use echolake_panel::relief::group::ParameterRange;
 use echolake_panel::relief::{HeightField, PanelRelief, ParameterDomain, ReliefParameter};
 use echolake_schema::SurfaceId;
@@ -357,7 +358,7 @@ impl DesignGoal {
 
 /// Reads a target's text.
 pub(super) fn read_target(path: &Path) -> anyhow::Result<String> {
-    std::fs::read_to_string(path).with_context(|| format!("cannot read target `{}`", path.display()))
+    read_text_file(path).with_context(|| format!("cannot read target `{}`", path.display()))
 }
 
 #[cfg(test)]

@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use anyhow::Context as _;
+use echolake_acquisition::disk::read_text_file;
 use echolake_panel::relief::PanelRelief;
 use echolake_panel::relief::group::{BandLevel, GroupRanges};
 
@@ -28,7 +29,7 @@ pub(super) fn make_group(ranges: &Path, count: usize, folder: &Path) -> anyhow::
 
 /// Writes the steps of the next group, and prints the reasons for them.
 pub(super) fn write_next_ranges(ranges: &Path, results: &Path, output: &Path) -> anyhow::Result<CommandOutcome> {
-    let text = std::fs::read_to_string(results).with_context(|| format!("cannot read `{}`", results.display()))?;
+    let text = read_text_file(results).with_context(|| format!("cannot read `{}`", results.display()))?;
     let rows = csv::Reader::from_reader(text.as_bytes()).deserialize().collect::<Result<Vec<BandLevel>, _>>();
     let rows = rows.with_context(|| {
         format!("results `{}`, expected surface_id, band and p90_mean_db in every row", results.display())
@@ -41,6 +42,6 @@ pub(super) fn write_next_ranges(ranges: &Path, results: &Path, output: &Path) ->
 }
 
 fn read_ranges(path: &Path) -> anyhow::Result<GroupRanges> {
-    let text = std::fs::read_to_string(path).with_context(|| format!("cannot read ranges `{}`", path.display()))?;
+    let text = read_text_file(path).with_context(|| format!("cannot read ranges `{}`", path.display()))?;
     GroupRanges::from_toml(&text).with_context(|| format!("ranges `{}`", path.display()))
 }

@@ -295,6 +295,11 @@ impl LakeSnapshot {
         self.runs.get(run).map(|current| &current.run)
     }
 
+    /// The newest run of a surface, which describes it: that of its row in `surfaces`.
+    pub fn newest_run(&self, surface: &SurfaceId) -> Option<&VisibleRun> {
+        self.run(self.newest.of_surface.get(surface)?)
+    }
+
     /// The project of a run; None if it was given none.
     pub fn project_of(&self, run: &RunId) -> Option<&ProjectName> {
         self.runs.get(run)?.project.as_ref()

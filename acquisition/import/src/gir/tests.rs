@@ -1,5 +1,7 @@
 //! Folders of the data set's form, of three pairs: whole ones are read back, damaged ones leave nothing.
 
+use std::fs::File;
+
 use echolake_schema::messages::ImpulseResponse;
 use echolake_schema::{Timestamp, topics};
 use mcap::MessageStream;

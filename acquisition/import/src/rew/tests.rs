@@ -128,6 +128,54 @@ fn what_is_not_known_is_asked_for_and_what_is_odd_is_named() {
     assert!(warning.contains("names no loopback"), "{warning}");
 }
 
+/// E26: prose may have `//` in it; no number is passed over that is none or has no row; a device is not read.
+#[test]
+fn odd_texts_are_prose_or_refused_by_line() {
+    let place = RewFolder::new();
+    let edit = |from: &str, to: &str| {
+        let text = export(0.0);
+        assert!(text.contains(from), "{from}");
+        place.write("edited.txt", text.replace(from, to).as_bytes());
+    };
+    let notes = "* Notes: see https://example.org/a\n* 3 // Start time (seconds)\nnotes: C:// room\n";
+    edit("* Measurement", &format!("{notes}* Measurement"));
+    check_arrival(&place.row("edited.txt", "0,").expect("prose"));
+    let refused = |from: &str, to: &str, expected: &str| {
+        edit(from, to);
+        place.refused("edited.txt", "0,", expected);
+    };
+    refused("0.5 // Peak", "half // Peak", "line 9: `half`, expected a number");
+    refused("0.5 // Peak", "NaN // Peak", "line 9: `NaN`, expected a number");
+    let second = "4800 // Peak index\n1 // Sample interval (s)\n";
+    refused("4800 // Peak index\n", second, "line 13: a second sample interval, expected that of line 11 alone");
+    for (text, line) in [("* Data start\nNaN\n", 15), ("* Data start\n\n-1.#IND\n", 16), ("inf\n* Data start\n", 14)] {
+        let expected = format!("line {line}: `{}`, expected a", text.replace("* Data start\n", "").trim());
+        refused("* Data start\n", text, &expected);
+    }
+    refused("* Data start\n", "* Data start\n1e39\n", "line 15: `1e39`, expected a finite f32");
+    let normalised = export(0.0).replace("IR is not normalised", "IR is normalised");
+    place.write("edited.txt", normalised.replace("0.5 //", "1e300 //").as_bytes());
+    place.refused("edited.txt", "0,", "line 9: a peak value of 1e300, expected one of finite f32");
+    for device in ["/dev/zero", "/"] {
+        place.refused(device, "0,", "it is no plain file");
+    }
+    std::os::unix::fs::symlink("/dev/zero", place.0.path().join("zero.wav")).expect("linked");
+    place.refused("zero.wav", "0,0", "it is no plain file");
+}
+
+/// E26: a column that is given twice is refused, and a manifest that never ends.
+#[test]
+fn a_column_is_given_once() {
+    let place = RewFolder::new();
+    let rig = Rig::from_toml(RIG).expect("a rig");
+    let header = format!("{},surface\n", REW_MANIFEST[..7].join(","));
+    let manifest = place.write("manifest.csv", format!("{header}room,a.txt,0/0/0,0/1/0,20,0,,hall\n").as_bytes());
+    let error = check_rew(&manifest, &rig).expect_err("two surfaces").to_string();
+    assert!(error.contains("manifest.csv`: column `surface` is there twice; hint: the columns are"), "{error}");
+    let error = check_rew(Path::new("/dev/zero"), &rig).expect_err("endless").to_string();
+    assert!(error.contains("does not end within 67108864 bytes"), "{error}");
+}
+
 #[test]
 fn a_manifest_becomes_a_run_of_its_origin() {
     let place = RewFolder::new();

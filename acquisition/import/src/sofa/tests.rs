@@ -200,6 +200,7 @@ fn units_of_positions_are_honoured() {
 }
 
 // Receivers and emitters turn with their listener and source, and come in the file's order.
+/// E28: GeneralFIR-E has the layout of SingleRoomMIMOSRIR.
 #[test]
 fn responses_of_several_receivers_and_emitters() {
     let place = SofaFolder::new();
@@ -207,24 +208,29 @@ fn responses_of_several_receivers_and_emitters() {
     // In the file, samples lie between receivers and emitters.
     let value = |receiver: usize, emitter: usize, sample: usize| (receiver * 2 + emitter) as f64 + sample as f64 / 1e3;
     let of_receiver = |r: usize| (0..LENGTH).flat_map(move |n| (0..2).map(move |e| value(r, e, n)));
-    let mimo = SofaContent::new()
-        .text("SOFAConventions", "SingleRoomMIMOSRIR")
-        .text("DataType", "FIR-E")
-        .put(("Data.IR", vec![1, 1, LENGTH, 2], of_receiver(0).collect(), vec![]))
-        .put(("Data.Delay", vec![1, 1, 1], vec![0.0], vec![]))
-        .put(("SourcePosition", vec![1, 3], vec![0.0, 0.0, 0.124], metres()))
-        // To the left and up of a source that looks along y: its left is -x.
-        .put(("SourceView", vec![1, 3], vec![0.0, 2.0, 0.0], metres()))
-        .put(("SourceUp", vec![1, 3], vec![0.0, 0.5, 3.0], vec![]))
-        .put(("EmitterPosition", vec![2, 3, 1], vec![0.15, 0.0, 0.18, 0.0, -0.15, 0.0], metres()))
-        .without("MeasurementDate");
-    let runs = place.import(&[("a.sofa", mimo)], None).expect("imported");
-    let found = irs(&runs[0]);
+    let mimo = |convention| {
+        SofaContent::new()
+            .text("SOFAConventions", convention)
+            .text("DataType", "FIR-E")
+            .put(("Data.IR", vec![1, 1, LENGTH, 2], of_receiver(0).collect(), vec![]))
+            .put(("Data.Delay", vec![1, 1, 1], vec![0.0], vec![]))
+            .put(("SourcePosition", vec![1, 3], vec![0.0, 0.0, 0.124], metres()))
+            // To the left and up of a source that looks along y: its left is -x.
+            .put(("SourceView", vec![1, 3], vec![0.0, 2.0, 0.0], metres()))
+            .put(("SourceUp", vec![1, 3], vec![0.0, 0.5, 3.0], vec![]))
+            .put(("EmitterPosition", vec![2, 3, 1], vec![0.15, 0.0, 0.18, 0.0, -0.15, 0.0], metres()))
+            .without("MeasurementDate")
+    };
+    let files = [("a.sofa", mimo("SingleRoomMIMOSRIR")), ("b.sofa", mimo("GeneralFIR-E"))];
+    let runs = place.import(&files, None).expect("imported");
     let grid = rig().build_grid().expect("a grid");
     let pair = |speaker: usize| grid.parse_pair(&grid.points()[0], &grid.points()[speaker]).expect("a pair").0;
-    assert_eq!(found.iter().map(|(_, ir)| ir.pair_id).collect::<Vec<_>>(), [pair(2), pair(1)]);
-    for (emitter, (_, ir)) in found.iter().enumerate() {
-        assert!(ir.samples.iter().enumerate().all(|(n, x)| *x == value(0, emitter, n) as f32), "{emitter}");
+    assert_eq!(runs.len(), 2);
+    for found in runs.iter().map(irs) {
+        assert_eq!(found.iter().map(|(_, ir)| ir.pair_id).collect::<Vec<_>>(), [pair(2), pair(1)]);
+        for (emitter, (_, ir)) in found.iter().enumerate() {
+            assert!(ir.samples.iter().enumerate().all(|(n, x)| *x == value(0, emitter, n) as f32), "{emitter}");
+        }
     }
 }
 
@@ -236,9 +242,9 @@ fn spectra_become_responses() {
     let phase = |k: usize| -std::f64::consts::TAU * (3 * k) as f64 / LENGTH as f64;
     let spectrum = |part: fn(f64) -> f64| (0..bins).map(|k| part(phase(k))).collect::<Vec<_>>();
     let frequencies = |highest: f64| (0..bins).map(|k| highest * k as f64 / (bins - 1) as f64).collect::<Vec<_>>();
-    let made = |highest: f64| {
+    let of_convention = |convention, highest: f64| {
         SofaContent::new()
-            .text("SOFAConventions", "FreeFieldDirectivityTF")
+            .text("SOFAConventions", convention)
             .text("DataType", "TF")
             .without("Data.IR")
             .without("Data.SamplingRate")
@@ -249,9 +255,16 @@ fn spectra_become_responses() {
             .put(("N", vec![bins], frequencies(highest), vec![("Units", "hertz")]))
             .put(("SourcePosition", vec![1, 3], vec![0.0, 0.15, 0.304], vec![]))
     };
-    let runs = place.import(&[("a.sofa", made(48e3))], None).expect("imported");
-    let samples = &irs(&runs[0])[0].1.samples;
-    assert!(samples.iter().enumerate().all(|(n, x)| (x - if n == 3 { 1.0 } else { 0.0 }).abs() < 1e-6));
+    let made = |highest: f64| of_convention("FreeFieldDirectivityTF", highest);
+    let names = ["d.sofa", "e.sofa"];
+    let others = ["GeneralTF", "SimpleFreeFieldHRTF"].map(|convention| of_convention(convention, 48e3));
+    let files: Vec<_> = [("a.sofa", made(48e3))].into_iter().chain(names.into_iter().zip(others)).collect();
+    let runs = place.import(&files, None).expect("imported");
+    assert_eq!(runs.len(), 3);
+    for run in &runs {
+        let samples = &irs(run)[0].1.samples;
+        assert!(samples.iter().enumerate().all(|(n, x)| (x - if n == 3 { 1.0 } else { 0.0 }).abs() < 1e-6));
+    }
     let error = place.import(&[("b.sofa", made(24e3))], None).expect_err("another rate").to_string();
     assert!(error.contains("b.sofa") && error.contains("N: frequencies up to 24000 Hz"), "{error}");
     let imaginary = made(48e3).put(("Data.Imag", vec![1, 1, bins], vec![0.5; bins], vec![]));

@@ -91,7 +91,11 @@ impl Mesh {
     pub fn from_file(path: &Path) -> Result<Self, Error> {
         let format = MeshFormat::from_path(path)?;
         let failed = |source| Error::Read { path: path.to_owned(), source };
-        let size = std::fs::metadata(path).map_err(failed)?.len();
+        let meta = std::fs::metadata(path).map_err(failed)?;
+        if !meta.is_file() {
+            return Err(failed(std::io::Error::new(std::io::ErrorKind::InvalidInput, "it is no plain file")));
+        }
+        let size = meta.len();
         if size > LARGEST_FILE {
             let place = "the file".to_owned();
             let actual = format!("{size} bytes");
