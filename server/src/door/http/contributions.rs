@@ -13,6 +13,7 @@ use echolake_lake::ContributionLog;
 use echolake_service::{ClientIdentity, ContributionDraft, RequestFault, TokenScope};
 
 use crate::door::audit;
+use crate::door::body_reader::read_whole_body;
 use crate::door::connection_places::PlaceWork;
 use crate::door::forward::EngineProtocol;
 use crate::door::server_door::ServerDoor;
@@ -72,7 +73,7 @@ async fn add_contribution(door: &ServerDoor, log: ContributionLog, request: Requ
     let (mut parts, body) = request.into_parts();
     // The body is sent again, whole.
     parts.headers.remove(header::CONTENT_LENGTH);
-    let body = to_bytes(body, LARGEST).await.map_err(|_| RequestFault::TooLarge { limit: LARGEST })?;
+    let body = read_whole_body(body, &parts.headers, LARGEST).await?;
     for _ in 0..TRIES {
         let mut again = Request::new(Body::from(body.clone()));
         *again.method_mut() = Method::POST;
