@@ -19,8 +19,8 @@ use base64::engine::general_purpose::STANDARD;
 use bytes::Bytes;
 use chrono::Utc;
 use echolake_lake::ContributionLog;
-use echolake_schema::SurfaceId;
 use echolake_schema::tables::{predicted_columns, prediction_schema};
+use echolake_schema::{SurfaceId, quoted_text};
 use echolake_service::{ContributionDraft, RequestFault, TokenScope};
 use parquet::arrow::ArrowWriter;
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
@@ -97,7 +97,8 @@ async fn draft_rows(
         let is_there = surface.parse::<SurfaceId>().is_ok_and(|id| view.snapshot.runs().any(|run| run.surface == id));
         if !is_there {
             return Err(RequestFault::bad_request(format!(
-                "surface `{surface}` is not there; hint: GET /api/v1/surfaces lists what there is"
+                "surface `{}` is not there; hint: GET /api/v1/surfaces lists what there is",
+                quoted_text(surface)
             )));
         }
     }
@@ -210,7 +211,7 @@ impl PredictedRows {
         let pairs = catalogue.lake().grid().pairs().len();
         let keys: Vec<_> = self.surface_ids.iter().zip(self.pair_ids.values().iter().copied()).collect();
         for (i, (surface, pair)) in keys.iter().enumerate() {
-            let place = || format!("surface `{}`, pair {pair}", surface.unwrap_or_default());
+            let place = || format!("surface `{}`, pair {pair}", quoted_text(surface.unwrap_or_default()));
             if usize::try_from(*pair).ok().is_none_or(|pair| pair >= pairs) {
                 let last = pairs.saturating_sub(1);
                 return Err(RequestFault::bad_request(format!("{}: the pair is not one of 0 to {last}", place())));
