@@ -140,6 +140,22 @@ fn the_catalogue_lists_and_draws_responses_without_levels() {
 mod slow {
     use super::*;
 
+    /// Bug 3: rooms without a pair in common are compared all the same.
+    #[test]
+    fn rooms_are_compared_by_pairs_of_their_own() {
+        let Some(browser) = web::or_skip("rooms without a common pair in a browser", web::browser()) else { return };
+        let place = TestFolder::new();
+        let [first, second] = SPEAKERS;
+        let [attic, cellar, hall] = [("attic", 0.6), ("cellar", 0.9), ("hall", 1.2)];
+        import_pairs(&place, &[(attic, first), (cellar, second), (hall, first), (hall, second)]);
+        place.ok(&["ingest"]);
+        let server = served(&place, &[]);
+        let mut command = Command::new("node");
+        command.args(["tests/apart.mjs", &format!("http://{}", server.http)]);
+        command.current_dir(web::web()).env("CHROMIUM", &browser);
+        eprintln!("{}", web::run(&mut command).unwrap_or_else(|why| panic!("{why}")));
+    }
+
     #[test]
     fn pages_of_rooms_show_no_error() {
         let Some(browser) = web::or_skip("rooms in a browser", web::browser()) else { return };
@@ -153,10 +169,6 @@ mod slow {
             eprintln!("{}", web::run(&mut command).unwrap_or_else(|why| panic!("{why}")));
         };
         look("rooms");
-        // Bug 3: two rooms without a pair in common.
-        import_pairs(&place, &[(("attic", 0.6), SPEAKERS[0]), (("cellar", 0.9), SPEAKERS[1])]);
-        place.ok(&["ingest"]);
-        look("apart");
         import_rooms(&place, &[("flat", 0.3), ("foam", 0.05)]);
         place.ok(&["ingest"]);
         look("levels");

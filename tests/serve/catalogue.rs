@@ -359,7 +359,7 @@ fn the_lake_says_whether_a_token_may_annotate() {
         (json(&answer)["may_annotate"].clone(), answer.header("etag").expect("a tag").to_owned())
     };
     let (readers, authors) = (ask(&reader), ask(&author));
-    assert_eq!((&readers.0, &authors.0), (&false.into(), &true.into()));
+    assert_eq!((&readers.0, &authors.0), (&Value::from(false), &Value::from(true)));
     assert_ne!(readers.1, authors.1, "a browser keeps no answer to another token");
 }
 

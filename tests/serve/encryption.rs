@@ -231,7 +231,7 @@ async fn pages_and_queries_share_a_connection_of_http_2() {
 fn write_frame(client: &mut TlsClient, kind: u8, flags: u8, stream: u32, payload: &[u8]) {
     let length = (payload.len() as u32).to_be_bytes();
     let head = [&length[1..], &[kind, flags], &stream.to_be_bytes()].concat();
-    client.write_all(&[&head, payload].concat()).expect("sent");
+    client.write_all(&[&head[..], payload].concat()).expect("sent");
     client.flush().expect("sent");
 }
 
@@ -286,7 +286,7 @@ fn a_refused_body_of_http_2_is_read_to_its_end() {
             (":scheme", "https"),
             (":authority", "localhost"),
             (":path", path),
-            ("authorization", &bearer),
+            ("authorization", bearer.as_str()),
             ("content-type", "application/json"),
             ("content-length", bytes),
         ];

@@ -36,13 +36,6 @@ const PAGES = {
   sql: '/sql',
   query: `/sql?q=${encodeURIComponent('select surface_id, pair_id, snr_db from measurements order by 1, 2')}`,
   operations: '/operations',
-  ...(ids.includes('attic') ? { apart: '/compare?s=attic,cellar', chosen: `/compare?s=attic,${first}&pairs=,1` } : {}),
-}
-
-/** Texts of a page, and the number of its plots with the lines of each. */
-const EXPECTED = {
-  apart: { texts: ['No pair is measured on all of them', 'attic 0', 'cellar 1'], plots: 3 },
-  chosen: { texts: ['attic 0', `${first} 1`], plots: 3 },
 }
 
 /** What is wrong with the page as it is now. */
@@ -96,11 +89,6 @@ for (const width of [1400, 390]) {
       return faults
     })
     await page.screenshot({ path: `${folder}/${name}-${width}.png`, fullPage: true })
-    const { texts = [], plots = 0 } = EXPECTED[name] ?? {}
-    const shown = await page.evaluate(() => document.querySelector('main').innerText)
-    for (const text of texts) if (!shown.includes(text)) found.push(`does not show “${text}”`)
-    const drawn = await page.locator('main canvas').count()
-    if (drawn < plots) found.push(`has ${drawn} plots of ${plots}`)
     for (const fault of [...found, ...heard]) {
       failures += 1
       process.stdout.write(`FAIL ${name} at ${width} px: ${fault}\n`)
