@@ -11,6 +11,7 @@ mod progress;
 mod signals;
 #[cfg(feature = "otlp")]
 mod span_export;
+mod terminal_text;
 
 use std::process::ExitCode;
 

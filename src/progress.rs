@@ -6,6 +6,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use chrono::{DateTime, Local, TimeDelta};
+use echolake_schema::escape_controls;
 use indicatif::{MultiProgress, ProgressBar, ProgressState, ProgressStyle};
 
 /// Time between two plain lines.
@@ -56,8 +57,8 @@ impl CommandProgress {
     /// Prints a line among the bars.
     pub fn print_message(&self, line: impl AsRef<str>) {
         match &self.bars {
-            Some(bars) => bars.suspend(|| eprintln!("{}", line.as_ref())),
-            None => eprintln!("{}", line.as_ref()),
+            Some(bars) => bars.suspend(|| eprintln!("{}", escape_controls(line.as_ref()))),
+            None => eprintln!("{}", escape_controls(line.as_ref())),
         }
     }
 }
@@ -99,13 +100,14 @@ impl TaskProgress {
     /// Prints a line that stays.
     pub fn print_message(&self, line: &str) {
         match &self.bar {
-            Some(bar) => bar.suspend(|| eprintln!("{line}")),
-            None => eprintln!("{}: {line}", self.name),
+            Some(bar) => bar.suspend(|| eprintln!("{}", escape_controls(line))),
+            None => eprintln!("{}: {}", self.name, escape_controls(line)),
         }
     }
 
     /// Shows a remark below the bar, or in the line.
     pub fn set_note(&mut self, note: String) {
+        let note = escape_controls(&note);
         if let Some(bar) = &self.bar {
             if self.note.is_empty() {
                 bar.set_style(bar_style(self.unit, BarLines::Two, &self.pace));
@@ -135,7 +137,8 @@ impl TaskProgress {
         if let Some(bar) = &self.bar {
             bar.finish_and_clear();
         }
-        let line = format!("{}: {} ({:.1} s)", self.name, what.as_ref(), self.begun.elapsed().as_secs_f64());
+        let what = escape_controls(what.as_ref());
+        let line = format!("{}: {what} ({:.1} s)", self.name, self.begun.elapsed().as_secs_f64());
         match &self.bar {
             Some(bar) => bar.suspend(|| eprintln!("{line}")),
             None => eprintln!("{line}"),

@@ -21,12 +21,9 @@ fn acquire_into_a_small_file(place: &TestFolder, url: &str) -> (Option<i32>, Str
     (output.status.code(), stderr(&output))
 }
 
-#[test]
-fn a_run_that_breaks_off_posts_a_notice() {
-    let place = TestFolder::new();
-    let listener = TcpListener::bind("127.0.0.1:0").expect("a port");
-    let url = format!("http://{}/hook?secret=7", listener.local_addr().expect("an address"));
-    let receiver = thread::spawn(move || {
+// Answers one request, and returns its body.
+fn receive_notice(listener: TcpListener, answer: String) -> thread::JoinHandle<Vec<u8>> {
+    thread::spawn(move || {
         let (mut stream, _) = listener.accept().expect("a notice");
         let mut reader = BufReader::new(stream.try_clone().expect("a stream"));
         let mut length = 0;
@@ -39,9 +36,36 @@ fn a_run_that_breaks_off_posts_a_notice() {
         }
         let mut body = vec![0; length];
         reader.read_exact(&mut body).expect("a body");
-        stream.write_all(b"HTTP/1.1 204 No Content\r\n\r\n").expect("answered");
+        stream.write_all(format!("HTTP/1.1 {answer}\r\n\r\n").as_bytes()).expect("answered");
         body
-    });
+    })
+}
+
+/// E23: a notice is for the host that the user named.
+#[test]
+fn a_notice_follows_no_redirect_to_another_host() {
+    let place = TestFolder::new();
+    let [named, other] = [(); 2].map(|()| TcpListener::bind("127.0.0.1:0").expect("a port"));
+    let url = format!("http://{}/hook?secret=7", named.local_addr().expect("an address"));
+    let port = other.local_addr().expect("an address").port();
+    let redirect = format!("307 Temporary Redirect\r\nLocation: http://localhost:{port}/hook\r\nContent-Length: 0");
+    let receiver = receive_notice(named, redirect);
+    let (code, said) = acquire_into_a_small_file(&place, &url);
+    assert_eq!(code, Some(1), "{said}");
+    receiver.join().expect("a notice");
+    let expected = "warning: the notice was not sent to 127.0.0.1: ";
+    assert!(said.contains(expected) && said.contains("it is redirected to localhost"), "{said}");
+    assert!(!said.contains("secret"), "{said}");
+    other.set_nonblocking(true).expect("a listener");
+    assert!(other.accept().is_err(), "nobody connects to the other host");
+}
+
+#[test]
+fn a_run_that_breaks_off_posts_a_notice() {
+    let place = TestFolder::new();
+    let listener = TcpListener::bind("127.0.0.1:0").expect("a port");
+    let url = format!("http://{}/hook?secret=7", listener.local_addr().expect("an address"));
+    let receiver = receive_notice(listener, "204 No Content".to_owned());
     let (code, said) = acquire_into_a_small_file(&place, &url);
     assert_eq!(code, Some(1), "{said}");
     assert!(said.contains("aborted") && !said.contains("warning: the notice"), "{said}");

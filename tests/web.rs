@@ -129,6 +129,40 @@ mod slow {
         assert!(pictures >= 7 * 2, "{pictures} pictures of seven pages in two themes");
     }
 
+    /// E20: behind a proxy that serves them below a path. Bug 6: on paper.
+    #[test]
+    fn the_pages_stand_below_a_proxys_path_and_on_paper() {
+        let Some(browser) = or_skip("pages behind a proxy in a browser", browser()) else { return };
+        let place = lake();
+        let server = served(&place, &[]);
+        let base = format!("http://{}", server.http);
+        let folder = place.path("print");
+        let folder = folder.to_str().expect("a path");
+        for script in [&["tests/prefix.mjs", &base][..], &["tests/print.mjs", &base, folder]] {
+            let done = run(Command::new("node").args(script).current_dir(web()).env("CHROMIUM", &browser));
+            eprintln!("{}", done.unwrap_or_else(|why| panic!("{why}")));
+        }
+    }
+
+    /// B14: the form for annotations is for tokens that may annotate.
+    #[test]
+    fn a_page_offers_what_its_token_may_do() {
+        let Some(browser) = or_skip("pages with a token in a browser", browser()) else { return };
+        let place = lake();
+        let mut lines = Vec::new();
+        let tokens = [["reader", "sql,files"], ["writer", "sql,files,annotate"]].map(|[name, scopes]| {
+            let made = place.run(&["token", name, "--scopes", scopes]);
+            lines.extend(&made.stdout);
+            stderr(&made).lines().next().expect("a token").to_owned()
+        });
+        fs::write(place.path("tokens.toml"), lines).expect("written");
+        let server = served(&place, &["--tokens", "tokens.toml"]);
+        let base = format!("http://{}", server.http);
+        let mut command = Command::new("node");
+        command.args(["tests/scopes.mjs", &base]).args(&tokens).current_dir(web()).env("CHROMIUM", &browser);
+        eprintln!("{}", run(&mut command).unwrap_or_else(|why| panic!("{why}")));
+    }
+
     #[test]
     fn code_of_the_pages_runs_in_other_programs() {
         let ready = browser().and_then(|_| clients());

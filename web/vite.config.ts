@@ -63,6 +63,8 @@ const toServer: ProxyOptions = {
 export default defineConfig({
   plugins: [svelte(), packed()],
   server: { proxy: { '/api': toServer, '/health': toServer, '/metrics': toServer } },
+  // Addresses in the document are relative, so that a proxy may serve the pages below a path of its own.
+  base: './',
   build: {
     target: 'es2022',
     assetsInlineLimit: 0,

@@ -280,7 +280,11 @@ fn store_fault(message: &str) -> Option<String> {
     let path = url.split_once('/').map_or(url, |(_, path)| path);
     let (_, cause) = outcome.split_once(" - ")?;
     let cause = cause.split(": <?xml").next().unwrap_or(cause).trim();
-    Some(format!("cannot read `{path}` of the lake's store: {cause}; hint: run the query again when the store answers"))
+    let hint = match ["status code: 401", "status code: 403"].iter().any(|status| cause.contains(status)) {
+        true => "look at the credentials of the store in the environment, and at what they allow",
+        false => "run the query again when the store answers",
+    };
+    Some(format!("cannot read `{path}` of the lake's store: {cause}; hint: {hint}"))
 }
 
 fn arrow_message(error: &ArrowError) -> String {
@@ -419,6 +423,11 @@ mod tests {
                         hint: run the query again when the store answers";
         assert_eq!(store_fault(fault).as_deref(), Some(expected));
         assert_eq!(store_fault("division by zero"), None);
+        // B3: credentials that a store refuses do not become right when it answers.
+        let (request, _) = fault.split_once(", after").expect("tries");
+        let refused = format!("{request} - Server returned non-2xx status code: 403 Forbidden: <?xml?><Error/>");
+        let refused = store_fault(&refused).expect("a fault of the store");
+        assert!(refused.contains("403 Forbidden; hint: look at the credentials of the store"), "{refused}");
         assert!(damaged_file(&fault.replace(" x.parquet", " tables/nce/x.parquet")).is_none());
     }
 

@@ -11,6 +11,7 @@ use arrow::datatypes::{DataType, Field, Schema, SchemaRef};
 use arrow::error::ArrowError;
 use arrow::util::display::{ArrayFormatter, FormatOptions};
 use arrow::util::pretty::pretty_format_batches;
+use echolake_schema::escape_controls;
 use parquet::arrow::ArrowWriter;
 use parquet::basic::{Compression, ZstdLevel};
 use parquet::errors::ParquetError;
@@ -29,7 +30,8 @@ const ROW_GROUP_BYTES: usize = 16 << 20;
 /// A format of answers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum AnswerFormat {
-    /// Text for people: lists are shortened, and rows after [`TABLE_ROWS`] are only counted.
+    /// Text for people: lists are shortened, rows after [`TABLE_ROWS`] are only counted, and characters that would
+    /// drive a terminal are escaped.
     Table,
     /// Comma-separated, lists as JSON.
     Csv,
@@ -151,7 +153,8 @@ impl<W: Write + Send> AnswerWriter<W> {
         let failed = |e| arrow_error(self.format, e);
         match &mut self.inner {
             FormatWriter::Table(_, batches) if room > 0 => {
-                batches.push(flatten_columns(&batch.slice(0, room), short_list).map_err(failed)?);
+                let shown = flatten_columns(&batch.slice(0, room), short_list);
+                batches.push(shown.and_then(|shown| map_texts(&shown, escape_controls)).map_err(failed)?);
             }
             FormatWriter::Table(..) => {}
             FormatWriter::Csv(to, text) => {
@@ -176,8 +179,11 @@ impl<W: Write + Send> AnswerWriter<W> {
         let failed = |e| arrow_error(self.format, e);
         match self.inner {
             FormatWriter::Table(mut to, batches) => {
-                let batches =
-                    if batches.is_empty() { vec![RecordBatch::new_empty(flat_schema(&self.schema))] } else { batches };
+                let batches = match batches.is_empty() {
+                    true => vec![map_texts(&RecordBatch::new_empty(flat_schema(&self.schema)), escape_controls)],
+                    false => batches.into_iter().map(Ok).collect(),
+                };
+                let batches = batches.into_iter().collect::<Result<Vec<_>, _>>().map_err(failed)?;
                 writeln!(to, "{}", pretty_format_batches(&batches).map_err(failed)?)?;
                 to.flush()?;
             }
@@ -209,10 +215,14 @@ fn write_csv(to: &mut impl Write, text: &mut Vec<u8>, batch: &RecordBatch, heade
 
 // Texts and names as `AnswerFormat::SpreadsheetCsv` has them.
 fn escape_formulas(batch: &RecordBatch) -> Result<RecordBatch, ArrowError> {
-    let escaped = |text: &str| match text.starts_with(['=', '+', '-', '@', '\t', '\r']) {
+    map_texts(batch, |text| match text.starts_with(['=', '+', '-', '@', '\t', '\r']) {
         true => format!("'{text}"),
         false => text.to_owned(),
-    };
+    })
+}
+
+// Changes the texts and the names of columns.
+fn map_texts(batch: &RecordBatch, escaped: impl Fn(&str) -> String) -> Result<RecordBatch, ArrowError> {
     let schema = batch.schema();
     let mut fields = Vec::with_capacity(batch.num_columns());
     let mut columns = Vec::with_capacity(batch.num_columns());
@@ -225,7 +235,7 @@ fn escape_formulas(batch: &RecordBatch) -> Result<RecordBatch, ArrowError> {
         let column = match is_text {
             true => {
                 let texts = cast(column, &DataType::Utf8)?;
-                let texts: StringArray = texts.as_string::<i32>().iter().map(|text| text.map(escaped)).collect();
+                let texts: StringArray = texts.as_string::<i32>().iter().map(|text| text.map(&escaped)).collect();
                 Arc::new(texts) as ArrayRef
             }
             false => column.clone(),
@@ -387,6 +397,27 @@ mod tests {
         expect![[r#"
             [{"id":1,"name":"a,\"b\"","ir":[0.5,-1.0,2.0,3.0],"at":"2026-01-05T08:00:00Z"},{"id":null,"name":null,"ir":[1.0e-9],"at":null}]
         "#]].assert_eq(&text(AnswerFormat::Json));
+    }
+
+    /// E12: texts and names of columns do not drive the terminal that shows them.
+    #[test]
+    fn a_table_has_no_control_characters() {
+        let texts: ArrayRef = Arc::new(StringArray::from(vec![Some("a\u{1b}[31m\u{9b}2J"), None]));
+        let coded = cast(&texts, &DataType::Dictionary(Box::new(DataType::Int8), Box::new(DataType::Utf8)));
+        let field = Arc::new(Field::new("element", DataType::Utf8, true));
+        let lists = ListArray::new(field, OffsetBuffer::from_lengths([1, 1]), texts.clone(), None);
+        let columns =
+            [("\u{1b}[1m", texts.clone()), ("coded", coded.expect("coded")), ("lists", Arc::new(lists) as ArrayRef)];
+        let batch = RecordBatch::try_from_iter(columns).expect("a batch");
+        for rows in [2, 0] {
+            let mut out = Vec::new();
+            let mut writer = AnswerWriter::new(AnswerFormat::Table, &batch.schema(), &mut out).expect("begun");
+            writer.write(&batch.slice(0, rows)).expect("written");
+            writer.finish().expect("finished");
+            let text = String::from_utf8(out).expect("text");
+            assert!(text.chars().all(|character| character == '\n' || !character.is_control()), "{text:?}");
+            assert_eq!(text.matches("a\\u{1b}[31m\\u{9b}2J").count(), if rows == 0 { 0 } else { 3 }, "{text}");
+        }
     }
 
     #[test]

@@ -1,5 +1,7 @@
 //! Errors for values from outside: names, numbers, rig descriptions, points, pairs and samples.
 
+use std::borrow::Cow;
+
 /// The cause of another member's error: an error of a library or the system, or a text.
 pub type ErrorCause = Box<dyn std::error::Error + Send + Sync>;
 
@@ -19,6 +21,18 @@ pub fn escape_controls(text: &str) -> String {
         }
     }
     safe
+}
+
+/// Characters of a text that an error quotes: as long as the longest name that is right, and more.
+const QUOTED_CHARS: usize = 80;
+
+/// Returns a text that an error quotes, such as a name that a client sent: cut if it is long, because nobody reads it
+/// and it may be as large as the request.
+pub fn quoted_text(text: &str) -> Cow<'_, str> {
+    match text.char_indices().nth(QUOTED_CHARS) {
+        Some((end, _)) => format!("{}...", &text[..end]).into(),
+        None => text.into(),
+    }
 }
 
 /// A value that is not what its type promises.
@@ -116,5 +130,14 @@ mod tests {
     fn texts_for_a_terminal_control_none() {
         let text = "`/a\u{1b}]0;title\u{7}\r\u{9b}31m`\n\tgrün \u{202e}";
         assert_eq!(escape_controls(text), "`/a\\u{1b}]0;title\\u{7}\\r\\u{9b}31m`\n\tgrün \\u{202e}");
+    }
+
+    /// E12: an error does not grow with what it is about.
+    #[test]
+    fn quoted_texts_are_cut() {
+        assert_eq!(quoted_text(&"ü".repeat(80)), "ü".repeat(80));
+        assert_eq!(quoted_text(&"ü".repeat(81)), format!("{}...", "ü".repeat(80)));
+        let error = "x ".repeat(10_000_000).parse::<crate::SurfaceId>().expect_err("no name");
+        assert!(error.to_string().len() < 200, "{error}");
     }
 }

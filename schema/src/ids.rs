@@ -5,7 +5,7 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
-use crate::Error;
+use crate::{Error, quoted_text};
 
 const SURFACE_MAX: usize = 64;
 const RUN_MAX: usize = 128;
@@ -162,7 +162,7 @@ fn check_id(kind: &'static str, value: &str, max: usize) -> Result<(), Error> {
     } else {
         return Ok(());
     };
-    Err(Error::Id { kind, value: value.chars().take(80).collect(), reason })
+    Err(Error::Id { kind, value: quoted_text(value).into_owned(), reason })
 }
 
 macro_rules! checked_name {

@@ -28,7 +28,7 @@ pub mod symmetry;
 pub mod tables;
 pub mod topics;
 
-pub use error::{Error, ErrorCause, escape_controls};
+pub use error::{Error, ErrorCause, escape_controls, quoted_text};
 pub use grid::{Grid, Pair, Point};
 pub use ids::{PairId, PointId, ProjectName, RunId, SurfaceId};
 pub use manifest::{RunManifest, SurfaceRecord};

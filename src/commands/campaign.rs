@@ -6,7 +6,7 @@ mod real_runs;
 mod tables;
 
 use std::collections::{BTreeMap, HashSet};
-use std::io::IsTerminal as _;
+use std::io::{IsTerminal as _, Write as _};
 use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
@@ -123,7 +123,8 @@ fn print_tables(
         super::print_line(campaign.about.trim_end())?;
     }
     for table in tables {
-        super::print_line(&format!("\n{}", table.to_text(bands, colours)))?;
+        // Its colours are control characters; the names in it are the campaign's own.
+        writeln!(std::io::stdout().lock(), "\n{}", table.to_text(bands, colours))?;
     }
     Ok(())
 }

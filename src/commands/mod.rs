@@ -50,12 +50,13 @@ use echolake_schema::Rig;
 
 use crate::progress::CommandProgress;
 use crate::signals::StopRequest;
+use crate::terminal_text::text_output;
 use replay::ViewerArgs;
 
 /// Writes text and a line break to stdout; a closed pipe is an error that `main` takes for success.
 fn print_line(text: &str) -> std::io::Result<()> {
     use std::io::Write as _;
-    writeln!(std::io::stdout().lock(), "{text}")
+    writeln!(text_output(), "{text}")
 }
 
 /// Writes a file beside its path first, so that it is whole or not there.

@@ -4,12 +4,15 @@ use std::time::Duration;
 
 use clap::Args;
 use reqwest::Url;
+use reqwest::redirect::{Action, Attempt, Policy};
 use serde_json::Value;
 
 use crate::error_text::describe_error;
 
 /// Maximum time of a notice: it holds up the end of a command.
 const TIMEOUT: Duration = Duration::from_secs(10);
+/// Maximum number of redirects that a notice follows.
+const MOST_REDIRECTS: usize = 5;
 
 #[derive(Debug, Args)]
 pub(crate) struct NotifyArgs {
@@ -32,10 +35,21 @@ impl NotifyArgs {
 }
 
 async fn send_notice(url: &Url, notice: &Value) -> reqwest::Result<()> {
-    let client = reqwest::Client::builder().timeout(TIMEOUT).build()?;
+    let client = reqwest::Client::builder().timeout(TIMEOUT).redirect(Policy::custom(follow_redirect)).build()?;
     let request = client.post(url.clone()).header(reqwest::header::CONTENT_TYPE, "application/json");
     request.body(notice.to_string()).send().await?.error_for_status()?;
     Ok(())
+}
+
+// The notice is for the host that the user named, and so is what its path may have of a secret.
+fn follow_redirect(attempt: Attempt<'_>) -> Action {
+    let to = attempt.url();
+    let is_allowed = |from: &Url| to.host() == from.host() && [from.scheme(), "https"].contains(&to.scheme());
+    if attempt.previous().len() <= MOST_REDIRECTS && attempt.previous().last().is_some_and(is_allowed) {
+        return attempt.follow();
+    }
+    let host = to.host_str().unwrap_or_default().to_owned();
+    attempt.error(format!("it is redirected to {host}, which is not followed; hint: name the last address"))
 }
 
 fn parse_url(text: &str) -> Result<Url, String> {

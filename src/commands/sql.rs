@@ -16,6 +16,7 @@ use echolake_query::{Error, QueryAnswer, Session};
 use serde::de::DeserializeOwned;
 
 use super::cache::CacheArgs;
+use crate::terminal_text::text_output;
 use prompt::PromptSettings;
 use prompt::command::PromptCommand;
 use script::{ScriptStep, read_script};
@@ -146,7 +147,7 @@ async fn answer_statement(
                 settings.format.name()
             );
             let answer = start_query(session, sql, lines_before).await?;
-            write_answer(answer, settings.format, BufWriter::new(std::io::stdout())).await?
+            write_answer(answer, settings.format, BufWriter::new(text_output())).await?
         }
     };
     if settings.timing {
@@ -163,7 +164,7 @@ fn from_stdin() -> anyhow::Result<String> {
 
 /// Prints an answer for people.
 pub(super) async fn print_table(session: &Session, sql: &str) -> anyhow::Result<()> {
-    write_answer(session.query(sql).await?, AnswerFormat::Table, std::io::stdout()).await.map(drop)
+    write_answer(session.query(sql).await?, AnswerFormat::Table, text_output()).await.map(drop)
 }
 
 /// Returns the rows of a query.

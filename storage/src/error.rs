@@ -422,12 +422,11 @@ impl StoreError {
         if is_unanswered(&self.0) {
             return "; hint: run the same command again when the store answers; what was done stays";
         }
-        match self.0 {
-            object_store::Error::PermissionDenied { .. } | object_store::Error::Unauthenticated { .. } => {
-                "; hint: look at the store's credentials in the environment, and at what they allow"
-            }
-            _ => "",
+        #[cfg(feature = "remote")]
+        if crate::remote::is_forbidden(&self.0) {
+            return "; hint: look at the store's credentials in the environment, and at what they allow";
         }
+        ""
     }
 }
 
@@ -444,21 +443,22 @@ fn answer_text(text: &str) -> Option<String> {
     Some(format!("{status}, {}{message}", element("Code")?))
 }
 
-// The client of object_store says in its text alone how often it repeated a request.
 fn tries_text(error: &object_store::Error) -> String {
-    let mut tries = 1;
-    let mut source = Some(error as &dyn std::error::Error);
-    while let Some(cause) = source {
-        #[cfg(feature = "remote")]
-        if let Some(retried) = cause.downcast_ref::<crate::remote::RetriedError>() {
-            tries = tries.max(retried.tries);
-        }
-        let text = cause.to_string();
-        let repeated = text.split_once(", after ").and_then(|(_, from)| from.split_once(" retries, max_retries"));
-        tries = tries.max(repeated.and_then(|(number, _)| number.parse::<u32>().ok()).map_or(1, |retries| retries + 1));
-        source = cause.source();
-    }
+    let tries = count_tries(error);
     if tries > 1 { format!(" (tried {tries} times)") } else { String::new() }
+}
+
+#[cfg(feature = "remote")]
+fn count_tries(error: &object_store::Error) -> u32 {
+    let causes = crate::remote::list_causes(error);
+    let retried = causes.filter_map(|cause| cause.downcast_ref::<crate::remote::RetriedError>());
+    retried.map(|retried| retried.tries).max().unwrap_or(0).max(crate::remote::count_requests(error))
+}
+
+// A disk is asked once.
+#[cfg(not(feature = "remote"))]
+fn count_tries(_: &object_store::Error) -> u32 {
+    1
 }
 
 // Returns whether the request was repeated in vain, and not because it is wrong.

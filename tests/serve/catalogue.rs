@@ -5,6 +5,7 @@ use serde_json::Value;
 
 use super::contract::ApiContract;
 use super::http::HttpRequest;
+use super::projects::new_token;
 use super::server::ServedLake;
 use super::{get, json, refused, served};
 use crate::{TestFolder, TestFolderTemplate};
@@ -323,15 +324,43 @@ fn pages_are_part_of_the_program() {
         assert!(policy.contains("script-src 'self'") && !policy.contains("unsafe"), "{policy}");
     }
     let page = get(&server, "/").text();
-    let script = page.split('"').find(|part| part.starts_with("/assets/") && part.ends_with(".js")).expect("a script");
+    let script = page.split('"').find(|part| part.starts_with("./assets/") && part.ends_with(".js"));
+    let script = script.and_then(|part| part.strip_prefix('.')).expect("a script");
     let packed = HttpRequest::get(script).with("accept-encoding", "gzip, br").send(&server);
     assert_eq!(packed.header("content-encoding"), Some("br"));
     assert!(packed.header("cache-control").is_some_and(|c| c.contains("immutable")));
     assert!(packed.body.len() < get(&server, script).body.len());
     let tag = packed.header("etag").expect("a tag").to_owned();
-    assert_eq!(HttpRequest::get(script).with("if-none-match", &tag).send(&server).status, 304);
+    let again = |encoding| HttpRequest::get(script).with("accept-encoding", encoding).with("if-none-match", &tag);
+    assert_eq!(again("gzip, br").send(&server).status, 304);
+    // E23: the same address in another encoding is other bytes.
+    assert_eq!(again("identity").send(&server).status, 200);
+    let tag_of = |encoding| {
+        let answer = HttpRequest::get("/api/v1/surfaces").with("accept-encoding", encoding).send(&server);
+        answer.header("etag").expect("a tag").to_owned()
+    };
+    assert_ne!(tag_of("gzip"), tag_of("identity"));
     assert_eq!(get(&server, "/assets/none.js").status, 404);
     assert_eq!(get(&server, "/favicon.ico").status, 404);
+}
+
+/// B14: pages offer a token what it may do.
+#[test]
+fn the_lake_says_whether_a_token_may_annotate() {
+    let place = lake();
+    assert_eq!(json(&get(&served(&place, &[]), "/api/v1/lake"))["may_annotate"], true, "without tokens");
+    let (reader, reader_lines) = new_token(&place, &["ann"]);
+    let (author, author_lines) = new_token(&place, &["bob", "--scopes", "sql,annotate"]);
+    std::fs::write(place.path("tokens.toml"), reader_lines + &author_lines).expect("written");
+    let server = served(&place, &["--tokens", "tokens.toml"]);
+    let ask = |token: &str| {
+        let request = HttpRequest::get("/api/v1/lake").with("authorization", &format!("Bearer {token}"));
+        let answer = request.send(&server);
+        (json(&answer)["may_annotate"].clone(), answer.header("etag").expect("a tag").to_owned())
+    };
+    let (readers, authors) = (ask(&reader), ask(&author));
+    assert_eq!((&readers.0, &authors.0), (&Value::from(false), &Value::from(true)));
+    assert_ne!(readers.1, authors.1, "a browser keeps no answer to another token");
 }
 
 mod slow {

@@ -227,6 +227,93 @@ async fn pages_and_queries_share_a_connection_of_http_2() {
     assert!(refused.headers().contains_key("x-request-id"));
 }
 
+/// A frame of HTTP/2: type, flags, stream and payload.
+fn write_frame(client: &mut TlsClient, kind: u8, flags: u8, stream: u32, payload: &[u8]) {
+    let length = (payload.len() as u32).to_be_bytes();
+    let head = [&length[1..], &[kind, flags], &stream.to_be_bytes()].concat();
+    client.write_all(&[&head[..], payload].concat()).expect("sent");
+    client.flush().expect("sent");
+}
+
+/// Reads frames up to one of a type that has a flag; returns the types of all, and the payloads of data.
+fn read_frames(client: &mut TlsClient, last: (u8, u8)) -> (Vec<u8>, Vec<u8>) {
+    let mut kinds = Vec::new();
+    let mut data = Vec::new();
+    loop {
+        let mut head = [0; 9];
+        client.read_exact(&mut head).expect("a frame");
+        let mut payload = vec![0; u32::from_be_bytes([0, head[0], head[1], head[2]]) as usize];
+        client.read_exact(&mut payload).expect("its payload");
+        kinds.push(head[3]);
+        if head[3] == DATA {
+            data.extend(payload);
+        }
+        if head[3] == last.0 && head[4] & last.1 != 0 {
+            return (kinds, data);
+        }
+    }
+}
+
+const DATA: u8 = 0;
+const HEADERS: u8 = 1;
+const RST_STREAM: u8 = 3;
+const SETTINGS: u8 = 4;
+const PING: u8 = 6;
+/// Ends a stream, or says that a ping was heard.
+const END_OR_ACK: u8 = 1;
+const END_HEADERS: u8 = 4;
+
+/// B1: the stream of a refused request with a body is not reset while its client sends, so that it reads the answer.
+#[test]
+fn a_refused_body_of_http_2_is_read_to_its_end() {
+    let place = certified();
+    let made = place.run(&["token", "ana", "--scopes", "sql"]);
+    std::fs::write(place.path("tokens.toml"), &made.stdout).expect("written");
+    let token = super::super::stderr(&made).lines().next().expect("a token").to_owned();
+    let server = served(&place, &[&FILES[..], &["--tokens", "tokens.toml"]].concat());
+    let certificate = place.path("tls/certificate.pem");
+    for (path, bearer, bytes, status) in [
+        ("/api/v1/annotations", format!("Bearer {token}"), "12", 403),
+        ("/api/v1/predictions?model=a&version=1", format!("Bearer {token}"), "12", 403),
+        ("/api/v1/sql", "Bearer wrong".to_owned(), "12", 401),
+        ("/api/v1/sql", format!("Bearer {token}"), "99999999", 413),
+    ] {
+        let mut client = shake(ServedLake::connect(&server.http), &certificate, "h2").expect("a handshake");
+        client.write_all(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n").expect("sent");
+        write_frame(&mut client, SETTINGS, 0, 0, &[]);
+        let headers = [
+            (":method", "POST"),
+            (":scheme", "https"),
+            (":authority", "localhost"),
+            (":path", path),
+            ("authorization", bearer.as_str()),
+            ("content-type", "application/json"),
+            ("content-length", bytes),
+        ];
+        // Literal fields without an index (RFC 7541, section 6.2.2).
+        let field = |(name, value): (&str, &str)| {
+            [&[0, name.len() as u8][..], name.as_bytes(), &[value.len() as u8], value.as_bytes()].concat()
+        };
+        write_frame(&mut client, HEADERS, END_HEADERS, 1, &headers.map(field).concat());
+        write_frame(&mut client, DATA, 0, 1, b"{\"a\"");
+        let (kinds, problem) = read_frames(&mut client, (DATA, END_OR_ACK));
+        assert!(!kinds.contains(&RST_STREAM), "{path}: {kinds:?}");
+        let problem: serde_json::Value = serde_json::from_slice(&problem).expect("JSON");
+        assert_eq!(problem["status"], status, "{problem}");
+        // The client sends on, and ends.
+        write_frame(&mut client, DATA, 0, 1, b": 1, ");
+        write_frame(&mut client, PING, 0, 0, &[7; 8]);
+        let (kinds, _) = read_frames(&mut client, (PING, END_OR_ACK));
+        assert!(!kinds.contains(&RST_STREAM), "{path}: {kinds:?}");
+        if bytes == "12" {
+            write_frame(&mut client, DATA, END_OR_ACK, 1, b"\"\"}");
+            write_frame(&mut client, PING, 0, 0, &[8; 8]);
+            let (kinds, _) = read_frames(&mut client, (PING, END_OR_ACK));
+            assert!(!kinds.contains(&RST_STREAM), "{path}: {kinds:?}");
+        }
+    }
+}
+
 mod slow {
     use super::*;
 

@@ -269,6 +269,14 @@ fn the_catalogue_is_as_in_postgres() {
         ("select 'integer'::regtype::int", "23"),
         ("select typinput, typinput::text from pg_type where typname = 'bool'", "boolin,boolin"),
         ("select pg_table_is_visible('information_schema.tables'::regclass)", "f"),
+        // E19: the first statements of pgAdmin 4.
+        (
+            "SET DateStyle=ISO; SET client_min_messages=notice; SELECT set_config('bytea_output','hex',false) FROM \
+                pg_show_all_settings() WHERE name = 'bytea_output'; SET client_encoding='utf-8';",
+            "hex",
+        ),
+        ("select s.setting from pg_catalog.pg_show_all_settings() s where s.name = 'bytea_output'", "hex"),
+        ("select count(*) = (select count(*) from pg_settings) from pg_show_all_settings()", "t"),
     ] {
         let rows = client.query(sql).unwrap_or_else(|state| panic!("{sql}: {state}"));
         let text = |row: &Vec<Option<String>>| {

@@ -5,13 +5,13 @@ use std::collections::HashMap;
 use echolake_dsp::components::PrincipalComponents;
 use echolake_dsp::self_organising_map::SelfOrganisingMap;
 
-use crate::canvas::colours::kind_colour;
+use crate::canvas::colours::{KIND_COUNT, kind_colour};
 use crate::canvas::drawing::{
-    FigureColour, FigureDrawing, SMALL_PX, StrokeStyle, TextAnchor, filled_area, filled_ellipse, sized_label,
-    stroked_line,
+    DrawnShape, FigureColour, FigureDrawing, SMALL_PX, StrokeStyle, TextAnchor, filled_area, filled_ellipse,
+    sized_label, stroked_line,
 };
 use crate::canvas::font::{fitted_text, text_width};
-use crate::canvas::frame::{PlotAxis, PlotFrame, draw_legend, legend_width};
+use crate::canvas::frame::{PlotAxis, PlotFrame, legend_width};
 use crate::canvas::notes::FigureNotes;
 
 /// More points than these have no names.
@@ -122,7 +122,7 @@ impl MapFigure {
         let entries: Vec<_> = kinds
             .iter()
             .enumerate()
-            .map(|(i, kind)| (kind_colour(i), fitted_text(&kind.replace('_', " "), SMALL_PX, room - 26.0)))
+            .map(|(i, kind)| (i, fitted_text(&kind.replace('_', " "), SMALL_PX, room - 26.0)))
             .collect();
         let rows = legend_rows(&entries, room);
         let top = 40.0 + rows.len() as f32 * 16.0;
@@ -134,7 +134,13 @@ impl MapFigure {
         let mut drawing = FigureDrawing::new(self.width_px, top + height + 62.0, notes);
         drawing.add_title();
         for (row, entries) in rows.iter().enumerate() {
-            draw_legend(&mut drawing, [64.0, 42.0 + row as f32 * 16.0], entries);
+            let mut x = 64.0;
+            let y = 42.0 + row as f32 * 16.0;
+            for (kind, name) in entries {
+                drawing.add_shape(kind_mark(*kind, [x + 5.0, y - 4.0]));
+                drawing.add_shape(sized_label([x + 14.0, y], name, TextAnchor::Start, SMALL_PX, FigureColour::Ink));
+                x += legend_width(name);
+            }
         }
         let [x, y] = [0, 1].map(|axis| self.axis_range(axis));
         let frame = PlotFrame { left: 64.0, top, width, height, x, y };
@@ -153,7 +159,7 @@ impl MapFigure {
         for surface in &self.positions {
             let kind = kinds.iter().position(|kind| *kind == surface.kind).unwrap_or(0);
             let at = frame.page_position(surface.position[0], surface.position[1]);
-            drawing.add_shape(filled_ellipse(at, [4.0, 4.0], 0.0, kind_colour(kind)).with_opacity(0.85));
+            drawing.add_shape(kind_mark(kind, at).with_opacity(0.85));
             if named <= MOST_NAMES && !surface.name.is_empty() {
                 names.draw_name(&mut drawing, at, &surface.name);
             }
@@ -225,7 +231,19 @@ impl NameLabels {
     }
 }
 
-fn legend_rows(entries: &[(FigureColour, String)], width: f32) -> Vec<Vec<(FigureColour, String)>> {
+// Colours begin again after some kinds, with another form.
+fn kind_mark(kind: usize, [x, y]: [f32; 2]) -> DrawnShape {
+    let corners = |corners: &[[f32; 2]]| {
+        filled_area(corners.iter().map(|[right, down]| [x + right, y + down]).collect(), kind_colour(kind))
+    };
+    match kind / KIND_COUNT % 3 {
+        0 => filled_ellipse([x, y], [4.0, 4.0], 0.0, kind_colour(kind)),
+        1 => corners(&[[-3.5, -3.5], [3.5, -3.5], [3.5, 3.5], [-3.5, 3.5]]),
+        _ => corners(&[[0.0, -4.5], [4.5, 3.5], [-4.5, 3.5]]),
+    }
+}
+
+fn legend_rows(entries: &[(usize, String)], width: f32) -> Vec<Vec<(usize, String)>> {
     let mut rows: Vec<Vec<_>> = vec![Vec::new()];
     let mut used = 0.0;
     for entry in entries {
@@ -265,6 +283,15 @@ mod tests {
             .collect();
         assert_eq!(baselines.len(), 3);
         assert!(baselines.windows(2).all(|two| two[1] - two[0] >= SMALL_PX), "{baselines:?}");
+    }
+
+    /// Bug 7: as many kinds as the paper's typologies can be told apart.
+    #[test]
+    fn twelve_kinds_have_twelve_marks() {
+        let marks: Vec<_> = (0..12).map(|kind| format!("{:?}", kind_mark(kind, [0.0, 0.0]))).collect();
+        for (i, mark) in marks.iter().enumerate() {
+            assert!(!marks[..i].contains(mark), "{mark}");
+        }
     }
 
     #[test]

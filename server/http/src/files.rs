@@ -9,6 +9,7 @@ use axum::extract::State;
 use axum::http::HeaderMap;
 use axum::response::Response;
 use echolake_lake::Lake;
+use echolake_schema::quoted_text;
 use echolake_service::{RequestFault, TokenScope};
 use futures::TryStreamExt as _;
 use object_store::path::Path as StorePath;
@@ -104,8 +105,10 @@ async fn table_file(
     let view = catalogue.current_view().await?;
     let hint = "GET /api/v1/tables/{table} lists what there is";
     let file = catalogue.find_file(&view, table, name);
-    let file = file
-        .ok_or_else(|| RequestFault::NotFound { what: format!("file `{name}` of table `{}`", table.name()), hint })?;
+    let file = file.ok_or_else(|| RequestFault::NotFound {
+        what: format!("file `{}` of table `{}`", quoted_text(name), table.name()),
+        hint,
+    })?;
     let described = FileDescription {
         // Its name is a digest of what it was made of.
         etag: format!("\"{name}-{}\"", file.bytes),

@@ -94,16 +94,23 @@ pub(super) fn is_own(uri: &Uri, headers: &HeaderMap) -> Result<(), RequestFault>
 /// [`RequestFault::Foreign`] if it is.
 pub fn is_same_origin(headers: &HeaderMap) -> Result<(), RequestFault> {
     let host = header_text(headers, &header::HOST).unwrap_or_default();
-    if let Some(origin) = header_text(headers, &header::ORIGIN)
-        && !ORIGIN_SCHEMES.iter().any(|scheme| origin.strip_prefix(scheme) == Some(&host))
-    {
-        return Err(RequestFault::Foreign { what: "origin", found: origin });
-    }
-    match header_text(headers, &FETCH_SITE) {
-        Some(site) if site != "same-origin" && site != "none" => {
-            Err(RequestFault::Foreign { what: "site", found: site })
-        }
-        _ => Ok(()),
+    let is_own_origin = |origin: &str| ORIGIN_SCHEMES.iter().any(|scheme| origin.strip_prefix(scheme) == Some(&host));
+    check_single_header(headers, &header::ORIGIN, "origin", is_own_origin)?;
+    check_single_header(headers, &FETCH_SITE, "site", |site| site == "same-origin" || site == "none")
+}
+
+// A browser sends each of these once; of two, another program could read the other one.
+fn check_single_header(
+    headers: &HeaderMap,
+    name: &HeaderName,
+    what: &'static str,
+    is_right: impl Fn(&str) -> bool,
+) -> Result<(), RequestFault> {
+    let values: Vec<_> = headers.get_all(name).iter().map(|v| String::from_utf8_lossy(v.as_bytes())).collect();
+    match values.as_slice() {
+        [] => Ok(()),
+        [one] if is_right(one) => Ok(()),
+        _ => Err(RequestFault::Foreign { what, found: values.join(", ") }),
     }
 }
 
@@ -121,7 +128,9 @@ fn is_local(host: &str) -> bool {
         return false;
     }
     let address = name.strip_prefix('[').and_then(|name| name.strip_suffix(']')).unwrap_or(name);
-    name.eq_ignore_ascii_case("localhost") || address.parse::<IpAddr>().is_ok_and(|ip| ip.is_loopback())
+    // With a dot at its end a name is complete, which browsers send as it was typed.
+    let full_name = name.strip_suffix('.').unwrap_or(name);
+    full_name.eq_ignore_ascii_case("localhost") || address.parse::<IpAddr>().is_ok_and(|ip| ip.is_loopback())
 }
 
 /// Adds the security headers that every answer has, unless its route set its own.
@@ -155,6 +164,12 @@ mod tests {
             ("127.9.9.9", true),
             ("[::1]:8080", true),
             ("[::1]", true),
+            // E23: the same name.
+            ("localhost.", true),
+            ("localhost.:8080", true),
+            ("localhost..", false),
+            (".localhost", false),
+            ("localhost.evil.example.", false),
             ("evil.example", false),
             ("localhost.evil.example", false),
             ("127.0.0.1.evil.example:8080", false),
@@ -194,6 +209,10 @@ mod tests {
             &[own, ("origin", "http://localhost:9090")],
             &[own, ("origin", "null")],
             &[own, ("sec-fetch-site", "cross-site")],
+            // E23: neither counts if there are two.
+            &[own, ("origin", "http://localhost:8080"), ("origin", "http://evil.example")],
+            &[own, ("origin", "http://localhost:8080"), ("origin", "http://localhost:8080")],
+            &[own, ("sec-fetch-site", "same-origin"), ("sec-fetch-site", "cross-site")],
             &[own, ("sec-fetch-site", "same-site")],
         ] {
             assert!(!check(foreign), "{foreign:?}");

@@ -18,6 +18,9 @@ use super::extract::QueryParams;
 use super::guard::is_encrypted;
 use super::problem::ProblemResponse;
 
+/// The path that a proxy takes off before it forwards a request.
+const FORWARDED_PREFIX: HeaderName = HeaderName::from_static("x-forwarded-prefix");
+
 /// The tables that files are listed of.
 #[derive(Default, Deserialize, IntoParams)]
 #[serde(default, deny_unknown_fields)]
@@ -89,7 +92,7 @@ async fn files(
     let validators = [
         (header::ETAG, etag.as_str()),
         (header::CACHE_CONTROL, "private, no-cache"),
-        (header::VARY, "Host, X-Forwarded-Proto"),
+        (header::VARY, "Host, X-Forwarded-Proto, X-Forwarded-Prefix"),
     ];
     if let Some(instead) = ConditionOutcome::new(&headers, &etag).early_response(&etag, validators.clone()) {
         return Ok(instead);
@@ -109,11 +112,20 @@ async fn files(
     Ok((validators, axum::Json(manifest)).into_response())
 }
 
-/// The origin of this server's URLs as the client sees it: behind a proxy with TLS, `https`.
+/// The beginning of this server's URLs as the client sees it: behind a proxy with TLS `https`, and the path that it
+/// serves below.
 pub(super) fn server_origin(headers: &HeaderMap) -> String {
     let text = |name: HeaderName| headers.get(name).and_then(|v| v.to_str().ok());
     let scheme = if is_encrypted(headers) { "https" } else { "http" };
-    format!("{scheme}://{}", text(header::HOST).unwrap_or_default())
+    format!("{scheme}://{}{}", text(header::HOST).unwrap_or_default(), forwarded_prefix(headers))
+}
+
+/// The path below which a proxy serves, if it names one: empty, or as `/lake`.
+pub(super) fn forwarded_prefix(headers: &HeaderMap) -> &str {
+    let is_path =
+        |path: &&str| path.starts_with('/') && path.bytes().all(|b| b.is_ascii_alphanumeric() || b"/-_.~".contains(&b));
+    let named = headers.get(FORWARDED_PREFIX).and_then(|v| v.to_str().ok());
+    named.filter(is_path).unwrap_or_default().trim_end_matches('/')
 }
 
 impl RowsElsewhere {

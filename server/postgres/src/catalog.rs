@@ -37,6 +37,9 @@ const OWN_NUMBERS: i32 = 1_000_000;
 const LIKE: &str = "upper";
 /// A function that gives rows, which is read as a table.
 const KEYWORDS: &str = "pg_get_keywords";
+/// The function that gives the rows of [`SETTINGS`], which is read as that table.
+const SETTINGS_CALL: &str = "pg_show_all_settings";
+const SETTINGS: &str = "pg_settings";
 
 /// Tables by name.
 type NamedTables = BTreeMap<String, Arc<dyn TableProvider>>;
@@ -73,7 +76,7 @@ impl PgCatalog {
         let relations = CatalogRelations::new(service, &definitions, fixed);
         batches.insert(KEYWORDS.to_owned(), library.pg_get_keywords.data().to_vec());
         let mut empty = EmptyRelations::default();
-        empty.calls.insert(KEYWORDS.to_owned());
+        empty.calls.extend([KEYWORDS, SETTINGS_CALL].map(str::to_owned));
         let mut information = NamedTables::new();
         for made in definitions.iter().filter(|made| !made.is_of_session()) {
             let rows = relations.make_rows(made)?;
@@ -182,6 +185,7 @@ impl SchemaProvider for CatalogSchema {
     }
 
     async fn table(&self, name: &str) -> Result<Option<Arc<dyn TableProvider>>> {
+        let name = if name == SETTINGS_CALL { SETTINGS } else { name };
         if let Some(table) = self.session_tables.iter().find(|table| table.name == name) {
             return memory_table(vec![table.make_session_rows(self.pid, &self.settings.all_values())?]).map(Some);
         }
@@ -189,7 +193,9 @@ impl SchemaProvider for CatalogSchema {
     }
 
     fn table_exist(&self, name: &str) -> bool {
-        self.tables.contains_key(name) || self.session_tables.iter().any(|table| table.name == name)
+        name == SETTINGS_CALL
+            || self.tables.contains_key(name)
+            || self.session_tables.iter().any(|table| table.name == name)
     }
 }
 

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
+use echolake_schema::quoted_text;
 use echolake_service::RequestFault;
 
 /// The server's version as shown to clients, which compare the first word.
@@ -86,7 +87,7 @@ impl SessionSettings {
             AllowedChange::Time => parse_duration(value).is_some(),
         };
         if !allowed {
-            return Err(RequestFault::bad_request(format!("`{name}` cannot be set to `{value}` here")));
+            return Err(RequestFault::bad_request(format!("`{name}` cannot be set to `{}` here", quoted_text(value))));
         }
         // What is kept to stays as it is shown; times and words are shown as they were set.
         if matches!(may, AllowedChange::Set | AllowedChange::Time) {
@@ -131,7 +132,7 @@ fn find_setting(name: &str) -> Result<(&'static str, &'static str, AllowedChange
     let lower = name.to_ascii_lowercase();
     let found = KNOWN.iter().find(|(known, ..)| *known == lower);
     found.copied().ok_or_else(|| RequestFault::NotFound {
-        what: format!("the setting `{}`", name.chars().take(LONGEST).collect::<String>()),
+        what: format!("the setting `{}`", quoted_text(name)),
         hint: "SHOW ALL lists them",
     })
 }

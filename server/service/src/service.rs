@@ -156,6 +156,11 @@ impl QueryService {
         Ok(self.0.client.clone())
     }
 
+    /// Returns whether the client's token is for something.
+    pub fn has_scope(&self, scope: TokenScope) -> bool {
+        self.0.identity.require_scope(scope).is_ok()
+    }
+
     /// Requests that are being answered.
     pub fn activity(&self) -> &ActivityCounter {
         &self.0.activity

@@ -4,21 +4,20 @@ use std::io;
 use std::pin::Pin;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::task::{Context, Poll};
-use std::time::Duration;
 
-use axum::body::{Body, BodyDataStream};
+use axum::body::Body;
 use axum::http::request::Parts;
 use axum::http::{HeaderMap, HeaderName, Request, Response, header};
-use bytes::{Bytes, BytesMut};
+use bytes::Bytes;
 use echolake_flight::WINDOW_BYTES;
 use echolake_service::{ClientIdentity, EngineSocket, RequestFault};
-use futures::{TryStreamExt as _, stream};
+use futures::stream;
 use hyper::body::{Frame, Incoming, SizeHint};
 use hyper::client::conn::http2;
 use hyper_util::rt::{TokioExecutor, TokioIo};
-use tokio::time::Instant;
 use tracing::Span;
 
+use super::body_reader::{BodyReader, check_declared_size};
 use super::connection_places::{PlaceWork, WorkingPlace};
 use super::engine_pool::EnginePool;
 use super::engine_process::{EndReason, EngineLease, EngineProcess, HttpConnection};
@@ -29,11 +28,6 @@ const KEPT_BYTES: usize = 64 << 10;
 /// message with its length.
 const LARGEST_HTTP: usize = 2 << 20;
 const LARGEST_GRPC: usize = (4 << 20) + 5;
-/// Parts of a body beyond which they must have so many bytes on average: each costs as much as one that says something.
-const FREE_PARTS: usize = 4_096;
-const LEAST_PART_BYTES: usize = 16;
-/// Time limit for the body of a request.
-const BODY_LIMIT: Duration = Duration::from_secs(30);
 /// Bytes of a frame of HTTP/2 between an engine and the door; the default of 16 KiB costs a wake-up each.
 const FRAME_BYTES: u32 = 256 << 10;
 /// Headers of one connection, not of the request (RFC 9110, section 7.6.1).
@@ -175,62 +169,12 @@ async fn find_engine_fault(lease: &EngineLease, failed: &str) -> RequestFault {
 
 // Reads a short body to its end; of a long one, what is read goes before the rest.
 async fn read_body(body: Body, headers: &HeaderMap, limit: usize) -> Result<RequestBody, RequestFault> {
-    let declared = headers.get(header::CONTENT_LENGTH).and_then(|v| v.to_str().ok()?.parse::<usize>().ok());
-    if declared.is_some_and(|bytes| bytes > limit) {
-        return Err(RequestFault::TooLarge { limit });
-    }
+    check_declared_size(headers, limit)?;
     let mut rest = BodyReader::new(body, KEPT_BYTES);
     let read = rest.next_piece().await?;
-    match rest.is_ended {
+    match rest.is_ended() {
         true => Ok(RequestBody::Whole(read)),
         false => Ok(RequestBody::from_reader(read, rest, limit)),
-    }
-}
-
-/// A client's body, which may come a byte at a time and has to come in time.
-struct BodyReader {
-    parts: BodyDataStream,
-    end: Instant,
-    piece_bytes: usize,
-    part_count: usize,
-    bytes: usize,
-    is_ended: bool,
-}
-
-impl BodyReader {
-    /// Reads pieces of at least so many bytes, but for the last.
-    fn new(body: Body, piece_bytes: usize) -> Self {
-        let parts = body.into_data_stream();
-        let end = Instant::now() + BODY_LIMIT;
-        Self { parts, end, piece_bytes, part_count: 0, bytes: 0, is_ended: false }
-    }
-
-    // Empty at the end.
-    async fn next_piece(&mut self) -> Result<Bytes, RequestFault> {
-        let mut piece = BytesMut::new();
-        let filled = tokio::time::timeout_at(self.end, self.fill_piece(&mut piece)).await;
-        filled.map_err(|_| RequestFault::bad_request(format!("the body took longer than {BODY_LIMIT:?}")))??;
-        Ok(piece.freeze())
-    }
-
-    async fn fill_piece(&mut self, piece: &mut BytesMut) -> Result<(), RequestFault> {
-        while !self.is_ended && piece.len() < self.piece_bytes {
-            let part = self.parts.try_next().await;
-            match part.map_err(|_| RequestFault::bad_request("the request's body did not come whole"))? {
-                Some(part) => {
-                    self.part_count += 1;
-                    self.bytes += part.len();
-                    piece.extend_from_slice(&part);
-                }
-                None => self.is_ended = true,
-            }
-            if self.part_count > FREE_PARTS && self.bytes < self.part_count * LEAST_PART_BYTES {
-                return Err(RequestFault::bad_request(format!(
-                    "the body comes in parts of less than {LEAST_PART_BYTES} bytes"
-                )));
-            }
-        }
-        Ok(())
     }
 }
 

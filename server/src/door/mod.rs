@@ -4,6 +4,7 @@
 pub(crate) mod activity;
 mod agent;
 mod audit;
+mod body_reader;
 #[cfg(feature = "postgres")]
 mod certificate_hash;
 pub(crate) mod connection_places;

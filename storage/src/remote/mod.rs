@@ -33,7 +33,7 @@ pub use object_folder::ObjectFolder;
 pub(crate) use part_store::PartStore;
 #[cfg(feature = "tables")]
 pub(crate) use retrying::backoff_time;
-pub(crate) use retrying::{RetriedError, RetryingStore};
+pub(crate) use retrying::{RetriedError, RetryingStore, count_requests, is_forbidden, list_causes};
 
 /// Abilities of an object store beyond reads and writes of whole objects.
 #[derive(Debug, Default)]
@@ -58,8 +58,9 @@ pub(crate) fn open_store(url: &Url) -> Result<(Arc<dyn ObjectStore>, PartStore),
     }
     let prefix = ObjectPath::from_url_path(url.path())?;
     let (store, parts) = settings::build_store(url.scheme(), bucket)?;
-    let parts = PartStore::new(parts, prefix.clone());
-    let store: Arc<dyn ObjectStore> = Arc::new(RetryingStore::new(store));
+    let limit = settings::max_attempts()?.unwrap_or(retrying::RETRY_LIMIT);
+    let parts = PartStore::new(parts, prefix.clone(), limit);
+    let store: Arc<dyn ObjectStore> = Arc::new(RetryingStore::new(store, limit));
     let has_prefix = !prefix.as_ref().is_empty();
     Ok((if has_prefix { Arc::new(PrefixStore::new(store, prefix)) } else { store }, parts))
 }

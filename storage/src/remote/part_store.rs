@@ -13,6 +13,8 @@ use super::retrying::retry_operation;
 pub(crate) struct PartStore {
     store: Arc<dyn MultipartStore>,
     prefix: Path,
+    /// Tries of one operation.
+    limit: u32,
 }
 
 impl fmt::Debug for PartStore {
@@ -22,8 +24,8 @@ impl fmt::Debug for PartStore {
 }
 
 impl PartStore {
-    pub fn new(store: Arc<dyn MultipartStore>, prefix: Path) -> Self {
-        Self { store, prefix }
+    pub fn new(store: Arc<dyn MultipartStore>, prefix: Path, limit: u32) -> Self {
+        Self { store, prefix, limit }
     }
 
     fn path_in_bucket(&self, path: &Path) -> Path {
@@ -33,14 +35,14 @@ impl PartStore {
     /// Begins an upload; returns its id. An id whose answer was lost is never used: the bucket's rule aborts it.
     pub async fn begin_upload(&self, path: &Path) -> StoreResult<String> {
         let path = self.path_in_bucket(path);
-        retry_operation(|| self.store.create_multipart(&path)).await
+        retry_operation(self.limit, || self.store.create_multipart(&path)).await
     }
 
     /// Uploads a part; parts count from 0. Returns its id.
     pub async fn put_part(&self, path: &Path, upload: &str, number: usize, part: PutPayload) -> StoreResult<String> {
         let path = self.path_in_bucket(path);
         let upload = upload.to_owned();
-        let part_id = retry_operation(|| self.store.put_part(&path, &upload, number, part.clone())).await?;
+        let part_id = retry_operation(self.limit, || self.store.put_part(&path, &upload, number, part.clone())).await?;
         Ok(part_id.content_id)
     }
 
@@ -49,6 +51,6 @@ impl PartStore {
         let path = self.path_in_bucket(path);
         let upload = upload.to_owned();
         let parts: Vec<_> = parts.into_iter().map(|content_id| PartId { content_id }).collect();
-        retry_operation(|| self.store.complete_multipart(&path, &upload, parts.clone())).await.map(drop)
+        retry_operation(self.limit, || self.store.complete_multipart(&path, &upload, parts.clone())).await.map(drop)
     }
 }

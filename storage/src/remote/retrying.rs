@@ -6,7 +6,9 @@
 //! repeated. A creation without an answer is looked up: if the object is there with the same content, it was made. What
 //! is created must therefore be unlike what others create under its name, or its author must not care who made it.
 
+use std::error::Error;
 use std::fmt;
+use std::iter;
 use std::ops::Range;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -22,8 +24,9 @@ use object_store::{
 };
 use uuid::Uuid;
 
-/// Tries of one operation whose outcome is unknown.
-const RETRY_LIMIT: u32 = 8;
+/// Tries of one operation whose outcome is unknown, those of the client below among them, unless the environment says
+/// another number.
+pub(super) const RETRY_LIMIT: u32 = 11;
 /// Time after which no further try begins: what failed so late was repeated by the client below.
 const RETRY_FOR: Duration = Duration::from_secs(20);
 /// Time after the first failure; it doubles with each further one.
@@ -49,34 +52,69 @@ pub(crate) fn backoff_time(failures: u32) -> Duration {
 
 /// Returns whether an error leaves open if the operation was done, and if it would succeed another time.
 fn may_have_happened(error: &StoreError) -> bool {
-    matches!(error, StoreError::Generic { .. } | StoreError::JoinError { .. })
+    matches!(error, StoreError::Generic { .. } | StoreError::JoinError { .. }) && !is_forbidden(error)
+}
+
+/// Returns whether the store refused the client's credentials: the same request is refused again. Of some requests the
+/// client below says so in its text alone.
+pub(crate) fn is_forbidden(error: &StoreError) -> bool {
+    if matches!(error, StoreError::PermissionDenied { .. } | StoreError::Unauthenticated { .. }) {
+        return true;
+    }
+    let is_refusal = |text: &str| ["status code: 401", "status code: 403"].iter().any(|status| text.contains(status));
+    list_causes(error).any(|cause| is_refusal(&cause.to_string()))
+}
+
+/// Returns the number of requests that an error stands for: the client below says in its text how often it retried.
+pub(crate) fn count_requests(error: &StoreError) -> u32 {
+    let retries =
+        |text: &str| text.split_once(", after ")?.1.split_once(" retries, max_retries")?.0.parse::<u32>().ok();
+    list_causes(error).filter_map(|cause| retries(&cause.to_string())).max().unwrap_or(0) + 1
+}
+
+/// Returns an error and its causes.
+pub(crate) fn list_causes(error: &StoreError) -> impl Iterator<Item = &(dyn Error + 'static)> {
+    let mut next: Option<&(dyn Error + 'static)> = Some(error);
+    iter::from_fn(move || {
+        let cause = next?;
+        next = cause.source();
+        Some(cause)
+    })
 }
 
 /// A store over another one, as described above.
 #[derive(Debug)]
 pub(crate) struct RetryingStore {
     inner: Arc<dyn ObjectStore>,
+    /// Tries of one operation.
+    limit: u32,
 }
 
 impl RetryingStore {
-    pub fn new(inner: Arc<dyn ObjectStore>) -> Self {
-        Self { inner }
+    pub fn new(inner: Arc<dyn ObjectStore>, limit: u32) -> Self {
+        Self { inner, limit }
     }
 }
 
 /// Repeats an operation that may be repeated until it succeeds, fails for good, or was tried too often.
-pub(super) async fn retry_operation<T, F: Future<Output = StoreResult<T>>>(work: impl Fn() -> F) -> StoreResult<T> {
+pub(super) async fn retry_operation<T, F: Future<Output = StoreResult<T>>>(
+    limit: u32,
+    work: impl Fn() -> F,
+) -> StoreResult<T> {
     let begun = Instant::now();
-    let mut tries = 1;
+    let mut failures = 0;
+    let mut tries = 0;
     loop {
-        match work().await {
-            Err(error) if may_have_happened(&error) && tries < RETRY_LIMIT && begun.elapsed() < RETRY_FOR => {
-                tokio::time::sleep(backoff_time(tries)).await;
-                tries += 1;
-            }
-            Err(source) if tries > 1 && may_have_happened(&source) => return Err(given_up(tries, source)),
+        let error = match work().await {
+            Err(error) if may_have_happened(&error) => error,
             done => return done,
+        };
+        failures += 1;
+        tries += count_requests(&error);
+        if tries >= limit || begun.elapsed() >= RETRY_FOR {
+            return Err(given_up(tries, error));
         }
+        tokio::time::sleep(backoff_time(failures)).await;
     }
 }
 
@@ -91,6 +129,7 @@ async fn put_new(
     location: &Path,
     payload: &PutPayload,
     opts: &PutOptions,
+    limit: u32,
 ) -> StoreResult<PutResult> {
     let begun = Instant::now();
     let mut tries = 1;
@@ -99,11 +138,11 @@ async fn put_new(
             Err(error) if may_have_happened(&error) || matches!(error, StoreError::AlreadyExists { .. }) => error,
             done => return done,
         };
-        let there = retry_operation(|| async { inner.get_opts(location, GetOptions::default()).await?.bytes().await });
-        match there.await {
+        let there = || async { inner.get_opts(location, GetOptions::default()).await?.bytes().await };
+        match retry_operation(limit, there).await {
             Ok(there) if there == Bytes::from(payload.clone()) => return Ok(PutResult { e_tag: None, version: None }),
             Ok(_) => return Err(StoreError::AlreadyExists { path: location.to_string(), source: Box::new(error) }),
-            Err(StoreError::NotFound { .. }) if tries < RETRY_LIMIT && begun.elapsed() < RETRY_FOR => {
+            Err(StoreError::NotFound { .. }) if tries < limit && begun.elapsed() < RETRY_FOR => {
                 tokio::time::sleep(backoff_time(tries)).await;
             }
             Err(_) => return Err(given_up(tries, error)),
@@ -151,9 +190,9 @@ impl ObjectStore for RetryingStore {
     async fn put_opts(&self, location: &Path, payload: PutPayload, opts: PutOptions) -> StoreResult<PutResult> {
         match opts.mode {
             PutMode::Overwrite => {
-                retry_operation(|| self.inner.put_opts(location, payload.clone(), opts.clone())).await
+                retry_operation(self.limit, || self.inner.put_opts(location, payload.clone(), opts.clone())).await
             }
-            PutMode::Create => put_new(self.inner.as_ref(), location, &payload, &opts).await,
+            PutMode::Create => put_new(self.inner.as_ref(), location, &payload, &opts, self.limit).await,
             PutMode::Update(_) => self.inner.put_opts(location, payload, opts).await,
         }
     }
@@ -163,19 +202,20 @@ impl ObjectStore for RetryingStore {
         location: &Path,
         opts: PutMultipartOptions,
     ) -> StoreResult<Box<dyn MultipartUpload>> {
-        retry_operation(|| self.inner.put_multipart_opts(location, opts.clone())).await
+        retry_operation(self.limit, || self.inner.put_multipart_opts(location, opts.clone())).await
     }
 
     async fn get_opts(&self, location: &Path, options: GetOptions) -> StoreResult<GetResult> {
-        retry_operation(|| get_whole(self.inner.as_ref(), location, options.clone())).await
+        retry_operation(self.limit, || get_whole(self.inner.as_ref(), location, options.clone())).await
     }
 
     async fn get_ranges(&self, location: &Path, ranges: &[Range<u64>]) -> StoreResult<Vec<Bytes>> {
-        retry_operation(|| self.inner.get_ranges(location, ranges)).await
+        retry_operation(self.limit, || self.inner.get_ranges(location, ranges)).await
     }
 
     fn delete_stream(&self, locations: BoxStream<'static, StoreResult<Path>>) -> BoxStream<'static, StoreResult<Path>> {
         let inner = self.inner.clone();
+        let limit = self.limit;
         let delete = async move {
             let locations: Vec<Path> = locations.try_collect().await?;
             // One that is gone already counts as deleted: the answer to its deletion may have been lost.
@@ -190,33 +230,37 @@ impl ObjectStore for RetryingStore {
                 }
                 Ok(())
             };
-            retry_operation(all).await.map(|()| locations)
+            retry_operation(limit, all).await.map(|()| locations)
         };
         stream_of(delete)
     }
 
     fn list(&self, prefix: Option<&Path>) -> BoxStream<'static, StoreResult<ObjectMeta>> {
         let inner = self.inner.clone();
+        let limit = self.limit;
         let prefix = prefix.cloned();
-        stream_of(async move { retry_operation(|| inner.list(prefix.as_ref()).try_collect()).await })
+        stream_of(async move { retry_operation(limit, || inner.list(prefix.as_ref()).try_collect()).await })
     }
 
     fn list_with_offset(&self, prefix: Option<&Path>, offset: &Path) -> BoxStream<'static, StoreResult<ObjectMeta>> {
         let inner = self.inner.clone();
+        let limit = self.limit;
         let prefix = prefix.cloned();
         let offset = offset.clone();
-        stream_of(
-            async move { retry_operation(|| inner.list_with_offset(prefix.as_ref(), &offset).try_collect()).await },
-        )
+        stream_of(async move {
+            retry_operation(limit, || inner.list_with_offset(prefix.as_ref(), &offset).try_collect()).await
+        })
     }
 
     async fn list_with_delimiter(&self, prefix: Option<&Path>) -> StoreResult<ListResult> {
-        retry_operation(|| self.inner.list_with_delimiter(prefix)).await
+        retry_operation(self.limit, || self.inner.list_with_delimiter(prefix)).await
     }
 
     async fn copy_opts(&self, from: &Path, to: &Path, options: CopyOptions) -> StoreResult<()> {
         match options.mode {
-            CopyMode::Overwrite => retry_operation(|| self.inner.copy_opts(from, to, options.clone())).await,
+            CopyMode::Overwrite => {
+                retry_operation(self.limit, || self.inner.copy_opts(from, to, options.clone())).await
+            }
             CopyMode::Create => self.inner.copy_opts(from, to, options).await,
         }
     }

@@ -118,10 +118,18 @@ fn bucket_store<S: ObjectStore + MultipartStore>(store: S) -> BucketStore {
     (store.clone(), store)
 }
 
+/// Returns how often a request is tried, if the environment says it.
+///
+/// # Errors
+/// If what it says is no number.
+pub(super) fn max_attempts() -> Result<Option<u32>, ErrorCause> {
+    let Some(text) = read_variable(&MAX_ATTEMPTS) else { return Ok(None) };
+    Ok(Some(text.parse().map_err(|_| format!("{MAX_ATTEMPTS} is `{text}`, expected a number"))?))
+}
+
 fn retry_config() -> Result<RetryConfig, ErrorCause> {
-    let Some(text) = read_variable(&MAX_ATTEMPTS) else { return Ok(RetryConfig::default()) };
-    let attempts: usize = text.parse().map_err(|_| format!("{MAX_ATTEMPTS} is `{text}`, expected a number"))?;
-    Ok(RetryConfig { max_retries: attempts.saturating_sub(1), ..RetryConfig::default() })
+    let Some(attempts) = max_attempts()? else { return Ok(RetryConfig::default()) };
+    Ok(RetryConfig { max_retries: attempts.saturating_sub(1) as usize, ..RetryConfig::default() })
 }
 
 fn read_variable(name: &&str) -> Option<String> {

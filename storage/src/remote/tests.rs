@@ -13,6 +13,7 @@ use object_store::memory::InMemory;
 use object_store::path::Path;
 use object_store::{Error as StoreError, ObjectStore, ObjectStoreExt as _, PutMode, PutOptions, PutPayload};
 
+use super::retrying::RETRY_LIMIT;
 use super::{ExclusionFault, RetryingStore, probe_exclusion};
 use crate::{CommitOutcome, Error, FileName, Lake, ReferenceSurfaces, encode_batches};
 
@@ -26,6 +27,9 @@ enum StoreFault {
     /// Of ten commits two are made and not answered, one is lost, and one is said to conflict with nothing; of ten
     /// listings two are cut off; of twenty reads one fails.
     Unreliable,
+    /// Every read fails: the store does not answer, or does not allow it.
+    Unanswered,
+    Forbidden,
     None,
 }
 
@@ -63,8 +67,24 @@ impl StoreFaults {
 #[async_trait]
 impl StoreBehaviour for StoreFaults {
     fn decide_fate(&self, kind: RequestKind, path: Option<&Path>) -> RequestFate {
-        if self.fault != StoreFault::Unreliable {
-            return RequestFate::Done;
+        let refused = |text: &str| {
+            self.count.fetch_add(1, Ordering::SeqCst);
+            RequestFate::Refused(StoreError::Generic { store: "faulty", source: text.to_owned().into() })
+        };
+        match self.fault {
+            // As the client of object_store says that it sent a request twice.
+            StoreFault::Unanswered if kind == RequestKind::Get => {
+                return refused("Error performing GET x in 1s, after 1 retries, max_retries: 1 - connection refused");
+            }
+            StoreFault::Unanswered => return RequestFate::Refused(self.lost()),
+            StoreFault::Forbidden => {
+                return refused(
+                    "Error performing GET x in 1s - Server returned non-2xx status code: 403 Forbidden: <?xml?>\
+                     <Error><Code>AccessDenied</Code></Error>",
+                );
+            }
+            StoreFault::Unreliable => {}
+            _ => return RequestFate::Done,
         }
         let one_in = |count| self.draw(count) == 0;
         match kind {
@@ -87,7 +107,7 @@ impl StoreBehaviour for StoreFaults {
         let overwrites = match self.fault {
             StoreFault::Overwrites => true,
             StoreFault::OverwritesInRaces => path.as_ref().ends_with(".race"),
-            StoreFault::Unreliable | StoreFault::None => false,
+            StoreFault::Unreliable | StoreFault::Unanswered | StoreFault::Forbidden | StoreFault::None => false,
         };
         if overwrites {
             options.mode = PutMode::Overwrite;
@@ -97,7 +117,7 @@ impl StoreBehaviour for StoreFaults {
 }
 
 async fn lake(store: Arc<FaultyStore>) -> crate::Result<Lake> {
-    let store = Arc::new(RetryingStore::new(store));
+    let store = Arc::new(RetryingStore::new(store, RETRY_LIMIT));
     Lake::open_or_create_in(store, "s3://bucket/lake", &Rig::paper(), &ReferenceSurfaces::default()).await
 }
 
@@ -125,7 +145,7 @@ async fn a_store_that_overwrites_is_refused_before_anything_is_written() {
 #[tokio::test]
 async fn what_is_cut_off_is_fetched_again_and_what_never_comes_says_how_often_it_was_tried() {
     let faulty = StoreFaults::in_memory(StoreFault::Unreliable, 5);
-    let store = RetryingStore::new(faulty.clone());
+    let store = RetryingStore::new(faulty.clone(), RETRY_LIMIT);
     let paths: Vec<_> = (0..10).map(|number| Path::from(format!("{number}"))).collect();
     for path in &paths {
         store.put(path, "x".into()).await.expect("written");
@@ -151,6 +171,33 @@ async fn what_is_cut_off_is_fetched_again_and_what_never_comes_says_how_often_it
     let expected = "cannot read `x`: connection reset by peer (tried 8 times); hint: run the same command again when \
                     the store answers; what was done stays";
     assert_eq!(gone.to_string(), expected);
+}
+
+/// B3: the environment's number of tries is that of reads, too, and a refusal is not retried.
+#[tokio::test]
+async fn a_read_is_tried_as_often_as_the_environment_says() {
+    for (fault, limit, requests, expected) in [
+        (
+            StoreFault::Unanswered,
+            1,
+            1,
+            "connection reset by peer; hint: run the same command again when the store answers",
+        ),
+        (StoreFault::Unanswered, 3, 3, "(tried 3 times); hint: run the same command again when the store answers"),
+        (StoreFault::Forbidden, 3, 1, "403 Forbidden, AccessDenied; hint: look at the store's credentials"),
+    ] {
+        let faulty = StoreFaults::in_memory(fault, 1);
+        let store = RetryingStore::new(faulty.clone(), limit);
+        let listed: Result<Vec<_>, _> = store.list(None).try_collect().await;
+        let error = Error::store_failure("list", "x", listed.expect_err("refused")).to_string();
+        assert!(error.contains(expected), "{error}");
+        assert_eq!(faulty.behaviour.count.load(Ordering::SeqCst), requests, "{fault:?} {limit}");
+    }
+    // The client below has sent each of these twice.
+    let faulty = StoreFaults::in_memory(StoreFault::Unanswered, 1);
+    let error = RetryingStore::new(faulty.clone(), 4).get(&Path::from("x")).await.expect_err("refused");
+    assert_eq!(faulty.behaviour.count.load(Ordering::SeqCst), 2);
+    assert!(Error::store_failure("read", "x", error).to_string().contains("(tried 4 times)"));
 }
 
 #[tokio::test]

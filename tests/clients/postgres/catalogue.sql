@@ -180,6 +180,8 @@ select oid::int8, typname, typelem::int8 from pg_catalog.pg_type where oid = 102
 select not attnotnull from pg_catalog.pg_attribute where attrelid = {table}::int8 and attnum = 1
 -- FDW: columns +
 select relname, attname, format_type(atttypid, atttypmod), attnotnull, pg_get_expr(adbin, adrelid), attgenerated, collname, collnsp.nspname from pg_class c join pg_namespace n on relnamespace = n.oid left join pg_attribute a on attrelid = c.oid and attnum > 0 and not attisdropped left join pg_attrdef ad on adrelid = c.oid and adnum = attnum left join pg_collation coll on coll.oid = attcollation left join pg_namespace collnsp on collnsp.oid = collnamespace where c.relkind in ('r', 'v', 'f', 'm', 'p') and n.nspname = 'public' and (not c.relispartition or c.relkind = 'p') order by c.relname, attnum
+-- pgAdmin: first statement +
+SELECT set_config('bytea_output','hex',false) FROM pg_show_all_settings() WHERE name = 'bytea_output'
 -- pgAdmin: session +
 select db.oid as did, db.datname, db.datallowconn, pg_catalog.pg_encoding_to_char(db.encoding) as serverencoding, has_database_privilege(db.oid, 'CREATE') as cancreate, datistemplate from pg_catalog.pg_database db where db.datname = current_database()
 -- pgAdmin: role +

@@ -29,12 +29,12 @@ export function wallHref(params: URLSearchParams): string {
   const repeated = [...WALL_FILTERS, 'level'].map((name) => [name, params.getAll(name)] as const)
   const limit = Math.min(MOST, Number(params.get('show') ?? WALL_PAGE))
   const single = copied(params, ['q', 'started', 'relief', 'sort', 'order', 'sort_band'])
-  return changeSearch('/api/v1/surfaces', '', { ...single, ...Object.fromEntries(repeated), limit })
+  return changeSearch(apiHref('/surfaces'), '', { ...single, ...Object.fromEntries(repeated), limit })
 }
 
 export function runsHref(params: URLSearchParams): string {
   const limit = Math.min(MOST, Number(params.get('show') ?? 100))
-  return changeSearch('/api/v1/runs', '', { ...copied(params, ['q', 'sort', 'order']), limit })
+  return changeSearch(apiHref('/runs'), '', { ...copied(params, ['q', 'sort', 'order']), limit })
 }
 
 export const surfacePath = (id: string) => `/surfaces/${encodeURIComponent(id)}`

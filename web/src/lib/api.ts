@@ -1,4 +1,5 @@
 //! The API's client: types from the contract, one kept answer an address.
+import { siteHref } from './base'
 import type { components } from './contract'
 
 export type Schemas = components['schemas']
@@ -50,7 +51,7 @@ export function apiHref(path: string, params: Record<string, Param | readonly st
     for (const one of Array.isArray(value) ? (value as readonly string[]) : [value as Param])
       if (one !== null && one !== undefined) search.append(name, String(one))
   const text = search.toString()
-  return `/api/v1${path}${text ? `?${text}` : ''}`
+  return siteHref(`/api/v1${path}${text ? `?${text}` : ''}`)
 }
 
 async function refusal(response: Response): Promise<ApiError> {
@@ -113,7 +114,7 @@ export const heightmap = (id: string): Promise<Float32Array> =>
 
 /** Runs a query; closing by `signal` cancels it. */
 export const sql = (query: string, accept: string, signal?: AbortSignal): Promise<Response> =>
-  ask('/api/v1/sql', {
+  ask(apiHref('/sql'), {
     method: 'POST',
     headers: { 'content-type': 'application/json', accept },
     body: JSON.stringify({ query }),
@@ -121,14 +122,14 @@ export const sql = (query: string, accept: string, signal?: AbortSignal): Promis
   })
 
 /** The server's figures in Prometheus' format, as they are now. */
-export const figures = async (): Promise<string> => (await ask('/metrics')).text()
+export const figures = async (): Promise<string> => (await ask(siteHref('/metrics'))).text()
 
 /** Ends a query that runs, by its number in `system.queries`. */
-export const cancelQuery = (id: number): Promise<Response> => ask(`/api/v1/queries/${id}/cancel`, { method: 'POST' })
+export const cancelQuery = (id: number): Promise<Response> => ask(apiHref(`/queries/${id}/cancel`), { method: 'POST' })
 
 /** Stores an annotation; it is seen by the next request. */
 export const annotate = (annotation: Schemas['NewAnnotation']): Promise<Response> =>
-  ask('/api/v1/annotations', {
+  ask(apiHref('/annotations'), {
     method: 'POST',
     headers: { 'content-type': 'application/json' },
     body: JSON.stringify({ annotations: [annotation] }),
@@ -136,7 +137,7 @@ export const annotate = (annotation: Schemas['NewAnnotation']): Promise<Response
 
 /** Shows the server a token; it answers with a cookie, which pictures and downloads send too. */
 export const login = (token: string): Promise<Response> =>
-  ask('/api/v1/session', {
+  ask(apiHref('/session'), {
     method: 'POST',
     headers: { 'content-type': 'application/json' },
     body: JSON.stringify({ token }),

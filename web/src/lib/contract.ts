@@ -1134,6 +1134,8 @@ export interface components {
             readonly ir_length: number;
             readonly layers: number;
             readonly low_hz: number;
+            /** @description The client's token is for adding annotations. */
+            readonly may_annotate: boolean;
             readonly name: string;
             readonly panel_depth_mm: number;
             readonly panel_size_mm: number;

@@ -42,7 +42,8 @@ export interface Relief {
   setPair(microphone: Vec3 | null, speaker: Vec3 | null): void
   /** Draws links between the frames of both arms; nothing without poses. */
   setArms(poses: readonly FramePose[]): void
-  setColours(colours: ReliefColours): void
+  /** `isNow`: before the next frame, for a printer takes what is drawn. */
+  setColours(colours: ReliefColours, isNow: boolean): void
   setHeights(heights: Float32Array, size_mm: number): void
   turn(dx: number, dy: number): void
   zoom(factor: number): void
@@ -202,12 +203,13 @@ export function relief(
       }
       later()
     },
-    setColours(next) {
+    setColours(next, isNow) {
       colours = next
       for (const link of arms.children) ((link as Mesh).material as MeshLambertMaterial).color.set(next.arm)
       scene.background = new Color(next.paper)
       ;(panel.material as MeshLambertMaterial).color.set(next.relief)
       rebuild()
+      if (isNow) draw()
     },
     setHeights(heights, size_mm) {
       const cells = Math.round(Math.sqrt(heights.length))

@@ -1,7 +1,10 @@
 //! Where the reader is. All of a view's state is in the address, so that every view is a link.
+import { BASE, siteHref } from './base'
 import { changeSearch, parseSearch, type SearchChanges } from './search'
 
-const read = () => ({ path: location.pathname, search: location.search })
+/** The path of an address of this site, from the root of its pages. */
+const pathOf = (pathname: string) => pathname.slice(BASE.length) || '/'
+const read = () => ({ path: pathOf(location.pathname), search: location.search })
 
 let here = $state(read())
 
@@ -36,9 +39,9 @@ export function go(href: string, replace = false): void {
   here = read()
 }
 
-/** The address with some parameters changed; null or '' removes one, a list repeats it. */
-export function withParams(changes: SearchChanges, path = location.pathname): string {
-  return changeSearch(path, path === location.pathname ? here.search : '', changes)
+/** The address of a page with some parameters changed; null or '' removes one, a list repeats it. */
+export function withParams(changes: SearchChanges, path = pathOf(location.pathname)): string {
+  return changeSearch(siteHref(path), path === pathOf(location.pathname) ? here.search : '', changes)
 }
 
 /** Changes parameters in place; `push` makes it a step that Back undoes. */
@@ -47,9 +50,13 @@ export function setParams(changes: SearchChanges, push = false): void {
 }
 
 /** The address of a surface, of one of its pairs, of a run. */
-export const surfaceHref = (id: string) => `/surfaces/${encodeURIComponent(id)}`
+export const surfaceHref = (id: string) => siteHref(`/surfaces/${encodeURIComponent(id)}`)
 export const pairHref = (id: string, pair: number) => `${surfaceHref(id)}/pairs/${pair}`
-export const runHref = (id: string) => `/runs/${encodeURIComponent(id)}`
+export const runHref = (id: string) => siteHref(`/runs/${encodeURIComponent(id)}`)
+
+/** The address of a comparison, and of the map at a surface. */
+export const compareHref = (ids: readonly string[]) => siteHref(`/compare?s=${ids.map(encodeURIComponent).join(',')}`)
+export const mapAtHref = (id: string) => siteHref(`/map?at=${encodeURIComponent(id)}`)
 
 /** Plain clicks on this site's links stay in the page. */
 export function follow(): void {
@@ -68,7 +75,7 @@ export function follow(): void {
       return
     const link = (event.target as Element | null)?.closest?.('a')
     if (!link || link.target || link.hasAttribute('download') || link.origin !== location.origin) return
-    if (/^\/(api|health|metrics)/.test(link.pathname)) return
+    if (!link.pathname.startsWith(`${BASE}/`) || /^\/(api|health|metrics)/.test(pathOf(link.pathname))) return
     event.preventDefault()
     // A place within the page; its address stays, because that names the view.
     if (link.hash && link.pathname === location.pathname) {

@@ -1,5 +1,7 @@
 //! What a reader prefers: theme and colours. Kept in the browser, not in the address.
 
+import { flushSync } from 'svelte'
+
 export type Theme = 'system' | 'light' | 'dark'
 /** Colours of grid plots: centred on 0 dB with a range that fits, or those of the paper. */
 export type Palette = 'fitted' | 'paper'
@@ -34,7 +36,9 @@ let theme = $state<Theme>(stored('theme', ['system', 'light', 'dark'], 'system')
 let palette = $state<Palette>(stored('palette', ['fitted', 'paper'], 'fitted'))
 let lichtblick = $state(storedText('lichtblick'))
 let systemDark = $state(dark.matches)
-const isDark = () => theme === 'dark' || (theme === 'system' && systemDark)
+let isPrinting = $state(false)
+/** Paper is light. */
+const isDark = () => !isPrinting && (theme === 'dark' || (theme === 'system' && systemDark))
 function showTheme(): void {
   document.documentElement.dataset.theme = isDark() ? 'dark' : 'light'
 }
@@ -42,6 +46,16 @@ dark.addEventListener('change', () => {
   systemDark = dark.matches
   showTheme()
 })
+
+/** What draws on a canvas draws again before the page is printed. */
+const setPrinting = (value: boolean) => {
+  flushSync(() => {
+    isPrinting = value
+    showTheme()
+  })
+}
+addEventListener('beforeprint', () => setPrinting(true))
+addEventListener('afterprint', () => setPrinting(false))
 
 export const settings = {
   get theme() {
@@ -66,6 +80,9 @@ export const settings = {
   set lichtblick(value: string) {
     lichtblick = value
     store('lichtblick', value)
+  },
+  get isPrinting() {
+    return isPrinting
   },
   get isDark() {
     return isDark()

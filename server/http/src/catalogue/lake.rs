@@ -1,6 +1,7 @@
 //! `GET /api/v1/lake`: what the lake holds, its rig, bands and grid.
 
 use axum::Extension;
+use echolake_service::TokenScope;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
@@ -36,6 +37,8 @@ struct LakeDescription<'a> {
     simulated: bool,
     /// Some surface has levels against its Flat. In a lake of rooms none has.
     has_levels: bool,
+    /// The client's token is for adding annotations.
+    may_annotate: bool,
 }
 
 /// A point of the grid.
@@ -114,6 +117,7 @@ pub(super) async fn lake(Extension(request): Extension<CatalogueRequest>) -> End
         simulated: !summary.entries.is_empty()
             && summary.entries.iter().all(|e| matches!(e.surface.origin.as_str(), "simulated" | "computed")),
         has_levels: summary.entries.iter().any(|entry| entry.surface.has_levels()),
+        may_annotate: request.catalogue.service().has_scope(TokenScope::Annotate),
     })?)
 }
 

@@ -186,7 +186,11 @@ async fn answer_through_cache(
     let headers = request.headers().clone();
     let as_arrow = format::prefers_arrow(&headers);
     let address = request.uri().path_and_query().map_or_else(String::new, ToString::to_string);
-    let etag = view.answer_etag(contents, &format!("{address} {as_arrow}"));
+    // A strong tag is for bytes as they are sent: packed ones are others.
+    let as_gzip = format::accepts_encoding(&headers, "gzip");
+    // What the client may do is in the lake's answer.
+    let may_annotate = catalogue.service().has_scope(TokenScope::Annotate);
+    let etag = view.answer_etag(contents, &format!("{address} {as_arrow} {as_gzip} {may_annotate}"));
     let outcome = ConditionOutcome::new(&headers, &etag);
     let instead = || outcome.early_response(&etag, [(header::ETAG, &etag)]);
     // Only an answer has this tag: a client that names it had the answer, which need not be made again.

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use arrow::record_batch::RecordBatch;
 use datafusion::common::{ParamValues, ScalarValue};
 use echolake_lake::VisibleRun;
-use echolake_schema::{RunId, SurfaceId};
+use echolake_schema::{RunId, SurfaceId, quoted_text};
 use echolake_service::running::{AnswerEncoder, BatchEncoder, RunningQuery};
 use echolake_service::{QueryWork, RequestFault};
 use serde::Deserialize;
@@ -81,7 +81,9 @@ impl CatalogueRequest {
             Some(id) => self.read_summary().await?.find_entry(id.as_str()),
             None => None,
         };
-        found.ok_or_else(|| missing_item(format!("surface `{name}`"), "GET /api/v1/surfaces lists what there is"))
+        found.ok_or_else(|| {
+            missing_item(format!("surface `{}`", quoted_text(name)), "GET /api/v1/surfaces lists what there is")
+        })
     }
 
     /// The run of this name, as the snapshot shows it.

@@ -1,6 +1,7 @@
 //! `list_tables`, `describe_table`, `list_functions`: what can be asked.
 
 use echolake_query::{SqlFunction, table_meaning};
+use echolake_schema::quoted_text;
 use echolake_service::RequestFault;
 use serde_json::{Value, json};
 
@@ -33,7 +34,7 @@ impl ToolCall<'_> {
         let found = service.all_tables().into_iter().find(|(known, _)| known == name);
         let Some((_, schema)) = found else {
             let hint = "list_tables names all";
-            return Err(RequestFault::NotFound { what: format!("table `{name}`"), hint });
+            return Err(RequestFault::NotFound { what: format!("table `{}`", quoted_text(name)), hint });
         };
         let columns: Vec<_> = schema.fields().iter().map(|field| ColumnDescription::from_field(field)).collect();
         let mut table = json!({ "name": name, "meaning": table_meaning(name), "columns": columns });

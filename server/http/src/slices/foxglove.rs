@@ -16,6 +16,7 @@ use utoipa::ToSchema;
 
 use super::super::extract::QueryParams;
 use super::super::files::RUN;
+use super::super::manifest::forwarded_prefix;
 use super::super::problem::ProblemResponse;
 use super::query::{MOST_RUNS, SliceParameters};
 use super::selection::slice_digest;
@@ -92,10 +93,14 @@ pub(super) async fn get_manifest(
     headers: HeaderMap,
 ) -> Result<Response, ProblemResponse> {
     let request = slices.read_request(params, &uri, &headers).await?;
-    let manifest = match request.question.is_of_whole_runs() {
+    let mut manifest = match request.question.is_of_whole_runs() {
         true => whole_runs(&request.question),
         false => streamed_manifest(&slices, request).await?,
     };
+    for source in &mut manifest.sources {
+        let (FoxgloveSource::Static { url, .. } | FoxgloveSource::Streamed { url, .. }) = source;
+        url.insert_str(0, forwarded_prefix(&headers));
+    }
     Ok(axum::Json(manifest).into_response())
 }
 

@@ -2,7 +2,7 @@
 
 use echolake_export::{Layout, Taken};
 use echolake_query::PredicateForm;
-use echolake_schema::RunId;
+use echolake_schema::{RunId, quoted_text};
 use echolake_service::RequestFault;
 use percent_encoding::{AsciiSet, NON_ALPHANUMERIC, utf8_percent_encode};
 use serde::Deserialize;
@@ -76,7 +76,10 @@ impl SliceQuery {
         let mut runs = Vec::new();
         for name in &params.run {
             let hint = "GET /api/v1/runs lists what there is";
-            runs.push(name.parse().map_err(|_| RequestFault::NotFound { what: format!("run `{name}`"), hint })?);
+            runs.push(
+                name.parse()
+                    .map_err(|_| RequestFault::NotFound { what: format!("run `{}`", quoted_text(name)), hint })?,
+            );
         }
         let mut topics: Vec<_> = params.topics.iter().flat_map(|t| t.split(',')).map(str::to_owned).collect();
         topics.retain(|topic| !topic.is_empty());

@@ -12,6 +12,7 @@ use echolake_schema::tables::Table;
 use echolake_service::{ClientIdentity, ContributionDraft, RequestFault, TokenScope};
 
 use crate::door::audit;
+use crate::door::body_reader::read_whole_body;
 use crate::door::connection_places::PlaceWork;
 use crate::door::forward::EngineProtocol;
 use crate::door::server_door::ServerDoor;
@@ -71,7 +72,7 @@ async fn add_contribution(door: &ServerDoor, table: Table, request: Request) -> 
     let (mut parts, body) = request.into_parts();
     // The body is sent again, whole.
     parts.headers.remove(header::CONTENT_LENGTH);
-    let body = to_bytes(body, LARGEST).await.map_err(|_| RequestFault::TooLarge { limit: LARGEST })?;
+    let body = read_whole_body(body, &parts.headers, LARGEST).await?;
     for _ in 0..TRIES {
         door.lake().prepare_contributions(table).await.map_err(refuse_write)?;
         let mut again = Request::new(Body::from(body.clone()));

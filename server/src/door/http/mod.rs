@@ -33,6 +33,7 @@ use tokio::net::TcpListener;
 use tracing::Instrument as _;
 
 use super::audit::{self, HandedFile};
+use super::body_reader::ReadThroughBody;
 use super::connection_places::{ConnectionPlaces, PlaceWork, PlacedStream};
 use super::drain::ServerDrain;
 use super::encryption::{ProtocolEncryption, agreed_protocol};
@@ -73,8 +74,13 @@ async fn answer_http_connection(
     let is_http2 = agreed_protocol(&stream) == Some(HTTP_2);
     let place = work.clone();
     let answers = TowerToHyperService::new(router);
-    let service = service_fn(move |mut request: hyper::Request<Incoming>| {
+    let service = service_fn(move |request: hyper::Request<Incoming>| {
         work.hear_request();
+        // HTTP/1.1 ends the connection after such an answer, which clients read all the same.
+        let mut request = match is_http2 {
+            true => request.map(|body| Body::new(ReadThroughBody::new(body))),
+            false => request.map(Body::new),
+        };
         restate_as_http1(&mut request);
         if encryption.is_on() {
             request.headers_mut().insert(FORWARDED_PROTO, HeaderValue::from_static("https"));

@@ -1,6 +1,7 @@
 //! The catalogue's pages and the manual, which are part of the program. They hold no data, so they need no token.
 
 use std::collections::BTreeSet;
+use std::fmt;
 use std::io::Read as _;
 use std::sync::LazyLock;
 
@@ -22,9 +23,11 @@ const INDEX: &str = "/index.html";
 const ASSETS: &str = "/assets/";
 /// Paths that are no page's.
 const OTHERS: [&str; 5] = ["/api", "/assets", "/health", "/mcp", "/metrics"];
-/// The manual's path and its first page.
+/// The manual's path.
 const MANUAL_PATH: &str = "/docs";
-const MANUAL_INDEX: &str = "/docs/index.html";
+/// Its first page, relative to that path without and with a slash: a proxy may serve both below a path of its own.
+const MANUAL_INDEX: &str = "docs/index.html";
+const MANUAL_PAGE: &str = "index.html";
 
 /// A file of the pages; `build.rs` lists them.
 struct PageFile {
@@ -74,7 +77,7 @@ static MANUAL_POLICY: LazyLock<String> = LazyLock::new(|| {
 });
 
 fn tag_files(files: &'static [PageFile]) -> Vec<(&'static PageFile, String)> {
-    files.iter().map(|file| (file, format!("\"{}\"", hex::encode(&Sha256::digest(file.bytes)[..8])))).collect()
+    files.iter().map(|file| (file, hex::encode(&Sha256::digest(file.bytes)[..8]))).collect()
 }
 
 // The texts between `<script>` and `</script>`.
@@ -87,30 +90,33 @@ fn inline_scripts(page: &str) -> impl Iterator<Item = &str> {
 pub(super) async fn serve_page(method: Method, uri: Uri, headers: HeaderMap) -> Response {
     let manual_path = uri.path().strip_prefix(MANUAL_PATH).filter(|rest| rest.is_empty() || rest.starts_with('/'));
     let (found, policy) = match manual_path {
-        Some("" | "/") if !MANUAL.is_empty() => return Redirect::permanent(MANUAL_INDEX).into_response(),
+        Some("") if !MANUAL.is_empty() => return Redirect::permanent(MANUAL_INDEX).into_response(),
+        Some("/") if !MANUAL.is_empty() => return Redirect::permanent(MANUAL_PAGE).into_response(),
         Some(path) => (find_manual_file(path), MANUAL_POLICY.as_str()),
         None => (find_page(uri.path()), POLICY),
     };
-    let Some((page, tag)) = found else { return missing_page(manual_path.is_some()).await };
+    let Some((page, digest)) = found else { return missing_page(manual_path.is_some()).await };
     if method != Method::GET && method != Method::HEAD {
         let mut response = ProblemResponse(RequestFault::Method).into_response();
         response.headers_mut().insert(header::ALLOW, HeaderValue::from_static("GET,HEAD"));
         return response;
     }
+    let form = PageForm::choose(page, uri.path(), &headers);
+    // A strong tag is for bytes as they are sent: packed ones are others.
+    let tag = format!("\"{digest}-{form}\"");
     let caching = if page.path.starts_with(ASSETS) { "public, max-age=31536000, immutable" } else { "no-cache" };
     let common = [
         (header::CONTENT_TYPE, page.media_type),
         (header::CACHE_CONTROL, caching),
         (header::CONTENT_SECURITY_POLICY, policy),
         (header::VARY, "Accept-Encoding"),
-        (header::ETAG, tag),
+        (header::ETAG, tag.as_str()),
     ];
-    if let Some(instead) = ConditionOutcome::new(&headers, tag).early_response(tag, common.clone()) {
+    if let Some(instead) = ConditionOutcome::new(&headers, &tag).early_response(&tag, common.clone()) {
         return instead;
     }
-    let (body, encoding) = page.choose_body(&headers);
-    let encoding = encoding.map(|encoding| [(header::CONTENT_ENCODING, encoding)]);
-    (common, encoding, body).into_response()
+    let encoding = form.encoding().map(|encoding| [(header::CONTENT_ENCODING, encoding)]);
+    (common, encoding, page.body_as(form)).into_response()
 }
 
 async fn missing_page(is_of_manual: bool) -> Response {
@@ -137,14 +143,61 @@ fn find_page(path: &str) -> Option<&'static (&'static PageFile, String)> {
     of_path(path).or_else(|| if is_other || is_file { None } else { of_path(INDEX) })
 }
 
-impl PageFile {
-    fn choose_body(&self, headers: &HeaderMap) -> (Bytes, Option<&'static str>) {
-        match self.brotli.filter(|_| accepts_encoding(headers, "br")) {
-            Some(packed) => (Bytes::from_static(packed), Some("br")),
-            None if self.is_gzip && accepts_encoding(headers, "gzip") => (Bytes::from_static(self.bytes), Some("gzip")),
-            None if self.is_gzip => (self.unpack_gzip().into(), None),
-            None => (Bytes::from_static(self.bytes), None),
+/// The form in which a file is sent.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum PageForm {
+    Brotli,
+    Gzip,
+    Plain,
+    /// The pages' document at an address so many folders below their root.
+    Below(usize),
+}
+
+impl PageForm {
+    fn choose(page: &PageFile, path: &str, headers: &HeaderMap) -> Self {
+        let depth = path.matches('/').count().saturating_sub(1);
+        match page.path == INDEX && depth > 0 {
+            true => Self::Below(depth),
+            false if page.brotli.is_some() && accepts_encoding(headers, "br") => Self::Brotli,
+            false if page.is_gzip && accepts_encoding(headers, "gzip") => Self::Gzip,
+            false => Self::Plain,
         }
+    }
+
+    fn encoding(self) -> Option<&'static str> {
+        match self {
+            Self::Brotli => Some("br"),
+            Self::Gzip => Some("gzip"),
+            Self::Plain | Self::Below(_) => None,
+        }
+    }
+}
+
+impl fmt::Display for PageForm {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Below(depth) => write!(f, "below-{depth}"),
+            form => f.write_str(form.encoding().unwrap_or("plain")),
+        }
+    }
+}
+
+impl PageFile {
+    fn body_as(&self, form: PageForm) -> Bytes {
+        match (form, self.brotli) {
+            (PageForm::Brotli, Some(packed)) => Bytes::from_static(packed),
+            (PageForm::Gzip, _) => Bytes::from_static(self.bytes),
+            // Its addresses are relative, so that a proxy may serve the pages below a path of its own.
+            (PageForm::Below(depth), _) => {
+                let document = String::from_utf8_lossy(&self.plain_bytes()).into_owned();
+                document.replace("\"./", &format!("\"{}", "../".repeat(depth))).into()
+            }
+            _ => self.plain_bytes(),
+        }
+    }
+
+    fn plain_bytes(&self) -> Bytes {
+        if self.is_gzip { self.unpack_gzip().into() } else { Bytes::from_static(self.bytes) }
     }
 
     fn unpack_gzip(&self) -> Vec<u8> {
@@ -205,6 +258,41 @@ mod tests {
         serve_page(Method::GET, uri, HeaderMap::new()).await.status()
     }
 
+    /// E20: the document's addresses lead to the root of the pages from wherever it stands, below a proxy's path, too.
+    #[cfg(not(pages_not_built))]
+    #[tokio::test]
+    async fn the_document_names_nothing_by_a_path_from_the_root() {
+        for (path, root) in
+            [("/", "./"), ("/sql", "./"), ("/surfaces/flat", "../"), ("/surfaces/flat/pairs/7", "../../../")]
+        {
+            let response = serve_page(Method::GET, Uri::from_static(path), HeaderMap::new()).await;
+            let page = axum::body::to_bytes(response.into_body(), usize::MAX).await.expect("a page");
+            let page = String::from_utf8_lossy(&page).into_owned();
+            let named: Vec<_> =
+                page.split(['"', '\'']).filter(|part| part.contains('/') && !part.contains(' ')).collect();
+            let addresses: Vec<_> =
+                named.iter().filter(|part| part.ends_with(".js") || part.contains("api/")).collect();
+            assert!(addresses.len() >= 3, "{page}");
+            assert!(addresses.iter().all(|address| address.starts_with(root)), "{path}: {addresses:?}");
+            assert!(!page.contains("=\"/"), "{page}");
+        }
+    }
+
+    /// E23: packed bytes have a tag of their own.
+    #[cfg(not(pages_not_built))]
+    #[tokio::test]
+    async fn each_encoding_has_its_own_tag() {
+        let script =
+            PAGES.iter().find(|p| p.path.starts_with("/assets/") && p.path.ends_with(".js")).expect("a script");
+        let mut tags = BTreeSet::new();
+        for accepted in ["identity", "gzip", "br"] {
+            let headers = HeaderMap::from_iter([(header::ACCEPT_ENCODING, HeaderValue::from_static(accepted))]);
+            let response = serve_page(Method::GET, Uri::from_static(script.path), headers).await;
+            tags.insert(response.headers()[header::ETAG].to_str().expect("a tag").to_owned());
+        }
+        assert_eq!(tags.len(), 3, "{tags:?}");
+    }
+
     #[cfg(not(pages_not_built))]
     #[test]
     fn scripts_are_there_and_packed() {
@@ -213,10 +301,10 @@ mod tests {
         let script = PAGES.iter().find(|p| p.path.starts_with("/assets/index-") && p.path.ends_with(".js"));
         let script = script.expect("a script");
         let packed = HeaderMap::from_iter([(header::ACCEPT_ENCODING, HeaderValue::from_static("gzip"))]);
-        let (gzip, named) = script.choose_body(&packed);
-        assert_eq!(named, Some("gzip"));
-        let (plain, named) = script.choose_body(&HeaderMap::new());
-        assert_eq!(named, None);
+        assert_eq!(PageForm::choose(script, script.path, &packed), PageForm::Gzip);
+        assert_eq!(PageForm::choose(script, script.path, &HeaderMap::new()), PageForm::Plain);
+        let gzip = script.body_as(PageForm::Gzip);
+        let plain = script.body_as(PageForm::Plain);
         // gzip ends with the length of what it packed.
         let length = gzip.last_chunk().map(|length| u32::from_le_bytes(*length));
         assert_eq!(length, u32::try_from(plain.len()).ok());

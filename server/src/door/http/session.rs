@@ -1,10 +1,9 @@
 //! `POST /api/v1/session`: a token becomes a cookie, because pictures and downloads of a page can send no header.
 
+use axum::body::Body;
 use axum::extract::State;
-use axum::extract::rejection::BytesRejection;
 use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::IntoResponse;
-use bytes::Bytes;
 use echolake_access::LIFETIME;
 use echolake_http::{ProblemResponse, is_encrypted};
 use echolake_service::RequestFault;
@@ -12,6 +11,7 @@ use serde::Deserialize;
 use utoipa::ToSchema;
 
 use super::authentication::COOKIE;
+use crate::door::body_reader::read_whole_body;
 use crate::door::server_door::ServerDoor;
 
 /// Bytes of a request.
@@ -39,9 +39,9 @@ struct SessionRequest {
 pub(super) async fn post_session(
     State(door): State<ServerDoor>,
     headers: HeaderMap,
-    body: Result<Bytes, BytesRejection>,
+    body: Body,
 ) -> Result<impl IntoResponse, ProblemResponse> {
-    let body = body.ok().filter(|b| b.len() <= LARGEST).ok_or(RequestFault::TooLarge { limit: LARGEST })?;
+    let body = read_whole_body(body, &headers, LARGEST).await?;
     let SessionRequest { token } = serde_json::from_slice(&body)
         .map_err(|_| RequestFault::bad_request("the body is not as expected; hint: {\"token\": \"echolake_...\"}"))?;
     let secret = door.access().begin_session(&token).inspect_err(|f| door.metrics().count_failure(f.code()))?;

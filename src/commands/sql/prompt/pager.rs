@@ -3,6 +3,8 @@
 use std::io::{IsTerminal as _, Write};
 use std::process::{Child, Command, Stdio};
 
+use crate::terminal_text::{TextOutput, text_output};
+
 /// Exits at once if all fits on the screen, and leaves the text there; long lines are not folded.
 const PAGER: &str = "less -FRSX";
 
@@ -11,14 +13,14 @@ pub(super) enum PageOutput {
     /// The pager.
     Pager(Child),
     /// The terminal itself.
-    Terminal(std::io::Stdout),
+    Terminal(TextOutput<std::io::Stdout>),
 }
 
 impl PageOutput {
     /// The pager if one is wanted and available, else the terminal.
     pub fn open(is_wanted: bool) -> Self {
-        let terminal = std::io::stdout();
-        if !is_wanted || !terminal.is_terminal() {
+        let terminal = text_output();
+        if !is_wanted || !std::io::stdout().is_terminal() {
             return Self::Terminal(terminal);
         }
         let command = std::env::var("PAGER").unwrap_or_else(|_| PAGER.to_owned());
