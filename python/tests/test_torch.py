@@ -118,6 +118,18 @@ def test_workers_that_stay_see_the_next_epoch(small_set: Path, start: str) -> No
         assert [digest(batch) for batch in loader] == undisturbed(small_set, epoch)
 
 
+# E30: without `set_epoch` the first iteration after a state was loaded is the epoch's rest, and later ones are whole.
+@pytest.mark.parametrize(("workers", "persistent"), [(0, False), (2, False), (2, True)])
+def test_an_epoch_is_whole_again_after_its_rest(small_set: Path, workers: int, persistent: bool) -> None:
+    whole = undisturbed(small_set, 2)
+    dataset = of_rank(small_set, 0, 1)
+    dataset.load_state_dict(dataset.state_dict() | {"epoch": 2, "batch": 7})
+    loader = DataLoader(dataset, batch_size=None, num_workers=workers, persistent_workers=persistent)
+    assert [[digest(batch) for batch in loader] for _ in range(3)] == [whole[7:], whole, whole]
+    more = DataLoader(dataset, batch_size=None, num_workers=4)
+    assert [digest(batch) for batch in more] == whole
+
+
 def test_a_state_of_workers_needs_the_batch(small_set: Path) -> None:
     dataset = of_rank(small_set, 0, 1)
     assert dataset.state_dict()["batch"] == 0
@@ -201,7 +213,7 @@ def test_what_a_collate_function_does_arrives(small_set: Path) -> None:
     dataset = Measurements(small_set, columns=["ir", "samples"])
     plain = next(iter(dataset))
     batch = next(iter(DataLoader(dataset, batch_size=None, num_workers=1, collate_fn=scaled)))
-    assert list(batch) == ["ir", "samples", "surface", "symmetries", "batch", "peak"]
+    assert list(batch) == ["ir", "samples", "microphone_mm", "surface", "symmetries", "batch", "peak"]
     assert np.array_equal(batch["ir"], plain["ir"] * 2, equal_nan=True)
     assert np.array_equal(batch["samples"], plain["samples"], equal_nan=True)
 

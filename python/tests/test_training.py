@@ -160,6 +160,59 @@ def in_turns(batches: MeasurementBatches, workers: int, stop: int) -> Iterator[d
         yield batch
 
 
+# E30: 17 batches of two ranks, the last of which is left out.
+def test_the_state_after_the_last_batch_of_all_ranks_is_the_next_epoch(small_set: Path) -> None:
+    def of(rank: int, world_size: int) -> MeasurementBatches:
+        order = {"batch_size": 35, "drop_last": True, "rank": rank, "world_size": world_size}
+        return MeasurementBatches(small_set, columns=["pair_id"], **order)
+
+    for rank in (0, 1):
+        batches = of(rank, 2)
+        given = list(batches)
+        assert len(given) == 8
+        after = batches.state_dict(after=given[-1])
+        assert (after["epoch"], after["batch"]) == (1, 0)
+        assert batches.state_dict() == after
+        batches.load_state_dict(after)
+        assert (batches.epoch, len(list(batches))) == (1, 8)
+    # One rank has a batch left there, which two leave out.
+    alone = of(0, 1)
+    state = alone.state_dict() | {"batch": 16}
+    alone.load_state_dict(state)
+    assert [batch["batch"] for batch in alone] == [16]
+    pair = of(0, 2)
+    pair.load_state_dict(state)
+    assert (pair.epoch, len(list(pair))) == (1, 8)
+
+
+# E30: also if the iteration after the state was left early, by whom has more workers then.
+def test_iterations_after_the_rest_of_an_epoch_are_whole(small_set: Path) -> None:
+    batches = MeasurementBatches(small_set, columns=["pair_id"], batch_size=32)
+    whole = [batch["batch"] for batch in batches]
+    state = batches.state_dict() | {"epoch": 0, "batch": 12}
+    for workers in (1, 3):
+        batches.load_state_dict(state)
+        assert batches.state_dict() == state
+        assert [batch["batch"] for batch in in_turns(batches, workers, 4)] == whole[12:16]
+        for others in (1, 2, 4):
+            assert [batch["batch"] for batch in in_turns(batches, others, 99)] == whole
+    # The epoch after it was never begun in the middle.
+    batches.load_state_dict(state)
+    batches.set_epoch(1)
+    assert len(list(batches)) == len(whole)
+
+
+# B6
+@pytest.mark.parametrize("symmetries", ["none", "all"])
+def test_positions_are_there_whatever_columns_are_named(small_set: Path, symmetries: Any) -> None:
+    named = MeasurementBatches(small_set, columns=["samples"], symmetries=symmetries, shuffle=False)
+    every = MeasurementBatches(small_set, symmetries=symmetries, shuffle=False)
+    assert named.columns == ["samples", "microphone_mm"]
+    for one, other in zip(named, every, strict=True):
+        assert np.array_equal(one["microphone_mm"], other["microphone_mm"])
+    assert MeasurementRows(small_set, columns=["samples"])[0]["microphone_mm"].tolist() == [0, 0, 7]
+
+
 def test_a_state_of_another_set_is_refused(small_set: Path) -> None:
     state = MeasurementBatches(small_set, batch_size=16).state_dict()
     with pytest.raises(ValueError, match="batch_size 16, this one has 32"):

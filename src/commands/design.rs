@@ -7,7 +7,7 @@ mod report;
 mod search;
 mod target;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::{Context as _, bail};
@@ -16,14 +16,17 @@ use echolake_acquisition::design::DesignSimulation;
 use echolake_acquisition::rig::robots::Choreography;
 use echolake_lake::{Error as LakeError, Lake, ReferenceSurfaces};
 use echolake_schema::Rig;
-use serde_json::{Value, json};
+use serde_json::json;
 
 use crate::CommandOutcome;
 use crate::progress::CommandProgress;
 use next::NextPanel;
 use report::PanelReport;
-use search::DesignSearch;
+use search::{CandidateColumns, DesignSearch};
 use target::DesignTarget;
+
+/// The file of a folder that has the inputs of its search.
+const INPUTS_FILE: &str = "search.json";
 
 #[derive(Debug, Args)]
 pub(crate) struct DesignArgs {
@@ -62,21 +65,28 @@ pub(crate) async fn run_design(args: &DesignArgs, lake_url: &str) -> anyhow::Res
     if let Some(surface) = target.levels_of.clone() {
         target.add_levels(&measured::levels_of(&measured, &surface).with_context(within)?);
     }
+    std::fs::create_dir_all(&args.output).with_context(|| format!("cannot make `{}`", args.output.display()))?;
     let path = args.output.join("candidates.csv");
-    let candidates = search::read_candidates(&path, &target, &bands)?;
-    prepare_folder(args, &json!({ "target": text, "goals": target.goals, "rig": rig }), !candidates.is_empty())?;
+    let inputs = serde_json::to_string_pretty(&json!({ "target": text, "goals": target.goals, "rig": rig }))?;
+    let columns = CandidateColumns::new(&target, &bands, &inputs);
     if let Some(count) = args.next {
+        let candidates = columns.read_candidates(&path, &target)?;
+        check_inputs(&args.output, &inputs, !candidates.is_empty())?;
         let panels = next::propose_panels(&target, &candidates, &measured, bands.len(), count as usize)?;
         return write_next(args, &panels, &bands);
     }
+    // The lock comes before the folder is read: another search may be writing its first candidates.
+    let file = columns.lock_file(&path)?;
+    let candidates = columns.read_candidates(&path, &target)?;
+    check_inputs(&args.output, &inputs, !candidates.is_empty())?;
+    super::write_whole_file(&args.output.join(INPUTS_FILE), inputs.as_bytes())?;
     let arms = Choreography::for_rig(&rig)?;
     let grid = rig.build_grid()?;
     let simulation = DesignSimulation::new(&rig, grid.clone(), arms.as_deref(), Some(target.pairs))?;
     let progress = CommandProgress::new();
     let task = progress.start_task("search", target.candidates as u64, "candidates");
     let known = candidates.len();
-    let header = search::candidate_header(&target, &bands);
-    let search = DesignSearch::open_file(&path, &header, candidates, &target, &simulation, &stop, task)?;
+    let search = DesignSearch::from_candidates(file, candidates, &target, &simulation, &stop, task);
     let begun = Instant::now();
     let whole = DesignSimulation::new(&rig, grid.clone(), arms.as_deref(), None)?;
     let candidates = tokio::task::block_in_place(|| search.run(&whole))?;
@@ -139,17 +149,14 @@ fn write_next(args: &DesignArgs, panels: &[NextPanel], bands: &[String]) -> anyh
     Ok(CommandOutcome::Whole)
 }
 
-// The folder keeps what its candidates are of, so that two searches are not mixed.
-fn prepare_folder(args: &DesignArgs, inputs: &Value, has_candidates: bool) -> anyhow::Result<()> {
-    let folder = &args.output;
-    std::fs::create_dir_all(folder).with_context(|| format!("cannot make `{}`", folder.display()))?;
-    let kept = folder.join("search.json");
-    let text = serde_json::to_string_pretty(inputs)?;
-    if has_candidates && std::fs::read_to_string(&kept).ok().as_ref() != Some(&text) {
+// The folder has the inputs of its candidates, so that two searches are not mixed.
+fn check_inputs(folder: &Path, inputs: &str, has_candidates: bool) -> anyhow::Result<()> {
+    let kept = std::fs::read_to_string(folder.join(INPUTS_FILE)).ok();
+    if has_candidates && kept.as_deref() != Some(inputs) {
         let folder = folder.display();
         bail!("`{folder}` has candidates of another target, levels or rig; hint: another folder for -o");
     }
-    super::write_whole_file(&kept, text.as_bytes())
+    Ok(())
 }
 
 fn print_reports(reports: &[PanelReport], panels: &[report::FoundPanel], target: &DesignTarget) -> anyhow::Result<()> {

@@ -332,10 +332,16 @@ async fn export_materials(lake: &Lake, args: &MaterialArgs) -> anyhow::Result<()
     let session = Session::new(lake)?;
     let sql = "select * from materials order by surface_id, full_scale_hz";
     let mut rows = super::sql::query_rows::<MaterialBand>(&session, sql).await?;
-    if let Some(unknown) =
+    if let Some(missing) =
         args.surfaces.iter().find(|surface| rows.iter().all(|row| row.surface_id != surface.as_str()))
     {
-        anyhow::bail!("surface `{unknown}` has no levels; hint: `echolake doctor` says which references are missing");
+        let sql = format!("select surface_id from surfaces where surface_id = '{missing}'");
+        let is_there = !super::sql::query_rows::<SelectedSurface>(&session, &sql).await?.is_empty();
+        anyhow::ensure!(
+            is_there,
+            "surface `{missing}` is not in the lake; hint: echolake sql \"select surface_id from surfaces\""
+        );
+        anyhow::bail!("surface `{missing}` has no levels; hint: `echolake doctor` says which references are missing");
     }
     rows.retain(|row| {
         args.surfaces.is_empty() || args.surfaces.iter().any(|surface| surface.as_str() == row.surface_id)

@@ -13,7 +13,7 @@ use echolake_query::figure_rows::LevelReference;
 use echolake_schema::SurfaceId;
 
 use crate::CommandOutcome;
-use output::OutputArgs;
+use output::{FigureFormats, OutputArgs};
 use source::FigureSource;
 
 #[derive(Debug, Subcommand)]
@@ -244,7 +244,28 @@ pub(crate) struct SetupArgs {
     pair: u32,
 }
 
+impl FigureCommand {
+    fn check_extensions(&self) -> anyhow::Result<()> {
+        let (output, formats) = match self {
+            Self::Table(args) => (&args.output, FigureFormats::Table),
+            Self::Levels(args) => (&args.output, FigureFormats::Chart),
+            Self::Grid(GridArgs { output, .. })
+            | Self::Nce(NceArgs { output, .. })
+            | Self::Filters(FiltersArgs { output, .. })
+            | Self::Coverage(CoverageArgs { output, .. })
+            | Self::Steps(StepsArgs { output, .. })
+            | Self::Map(MapArgs { output, .. })
+            | Self::Som(MapArgs { output, .. })
+            | Self::Relief(ReliefArgs { output, .. })
+            | Self::Generation(GenerationArgs { output, .. })
+            | Self::Setup(SetupArgs { output, .. }) => (output, FigureFormats::Drawing),
+        };
+        output.check_extensions(formats)
+    }
+}
+
 pub(crate) async fn run_figure(command: &FigureCommand, lake_url: &str) -> anyhow::Result<CommandOutcome> {
+    command.check_extensions()?;
     let source = FigureSource::open(Lake::open(lake_url).await?).await?;
     match command {
         FigureCommand::Grid(args) => surfaces::write_grid(&source, args).await?,

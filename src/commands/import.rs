@@ -63,7 +63,7 @@ enum ImportCommand {
         #[arg(long, value_name = "C", allow_negative_numbers = true)]
         temperature_c: Option<f64>,
     },
-    /// Responses of an HDF5 file, by a mapping of its datasets; see docs/export.md.
+    /// Responses of an HDF5 file, by a mapping of its datasets; see docs/import.md.
     Hdf5 {
         /// Mapping of the datasets, a TOML file.
         mapping: PathBuf,
@@ -152,7 +152,12 @@ pub(crate) async fn run_import(args: &ImportArgs, lake_url: &str) -> anyhow::Res
         }
         super::print_line(&run.path.display().to_string())?;
     }
-    eprintln!("next: echolake --lake {lake_url} ingest");
+    match runs.iter().map(|run| run.measurements).sum::<usize>() {
+        0 => eprintln!(
+            "no take was accepted, so there is nothing to ingest; hint: mend what is said above, import again"
+        ),
+        _ => eprintln!("next: echolake --lake {lake_url} ingest"),
+    }
     let is_whole = runs.iter().all(|run| run.rejected == 0);
     Ok(if is_whole { CommandOutcome::Whole } else { CommandOutcome::WithLoss })
 }

@@ -4,7 +4,7 @@ use std::fs::OpenOptions;
 use std::io::Write as _;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::os::unix::fs::OpenOptionsExt as _;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use std::time::Duration;
 
@@ -194,9 +194,20 @@ pub(crate) async fn run_serve(args: &ServeArgs, lake_url: &str) -> anyhow::Resul
         drain: args.drain,
         engines: args.queries.engine_settings(&lake, args.engines)?,
     };
+    let addresses = [
+        args.listen,
+        args.flight_sql,
+        #[cfg(feature = "postgres")]
+        args.postgres,
+    ];
+    let listens_everywhere =
+        addresses.into_iter().filter_map(ListenAddress::socket_address).any(|one| one.ip().is_unspecified());
     let server = LakeServer::bind(&lake, settings)?;
     anyhow::ensure!(!server.listening_urls().is_empty(), "nothing to listen on; hint: all three are off");
     eprintln!("lake {}", lake.location());
+    if listens_everywhere {
+        eprintln!("note: other machines reach it at all addresses and names of this one");
+    }
     if let Some(missing) = confinement::missing_support() {
         eprintln!("note: {missing}");
     }
@@ -277,6 +288,13 @@ pub(crate) fn write_certificate(args: &CertificateArgs) -> anyhow::Result<Comman
     Ok(CommandOutcome::Whole)
 }
 
+// What the file has so far that stdout is appended to; None if stdout is no file.
+fn read_stdout_file() -> Option<String> {
+    let stdout = Path::new("/dev/stdout");
+    std::fs::metadata(stdout).ok().filter(std::fs::Metadata::is_file)?;
+    std::fs::read_to_string(stdout).ok()
+}
+
 /// Prints a new token to stderr, once, and its lines for the file of tokens to stdout.
 pub(crate) fn print_token(
     name: &str,
@@ -290,6 +308,12 @@ pub(crate) fn print_token(
     );
     let fresh = tokens::generate_token(name, days, projects, scopes)?;
     eprintln!("{}\nthis token is kept nowhere: only its hash is, in the lines for the file of --tokens", fresh.token);
+    if let Some(line) = read_stdout_file().and_then(|text| tokens::find_name_lines(&text, name).first().copied()) {
+        eprintln!(
+            "warning: line {line} of this file has the name `{name}` already, and `serve` refuses a name that is there \
+             twice; hint: remove the [[token]] of one"
+        );
+    }
     super::print_line(fresh.lines.trim_end())?;
     Ok(CommandOutcome::Whole)
 }

@@ -41,7 +41,7 @@ def main() -> None:
             secs = time.monotonic() - begun
             best = found["panels"][0]
             header, first = pathlib.Path(folder, target, "candidates.csv").read_text().split("\n")[:2]
-            searched = header.split(",")[1 : len(first.split(",")) - 16]
+            searched = header.split(",")[1 : len(first.split(",")) - 17]
             parameters = ", ".join(f"{key} {best['relief']['parameters'][key]}" for key in searched)
             deviation, trusted = best["level_deviation_db"], best["trusted_level_deviation_db"]
             worst = max(worst, deviation)

@@ -44,6 +44,7 @@ class Measurements(MeasurementBatches, IterableDataset[Batch]):
         super().__init__(path, split, columns, rank=rank, world_size=world_size, **settings)
         # Workers that outlive an epoch see where the next one begins; this process sees how many there are.
         self._place = torch.zeros(3, dtype=torch.int64).share_memory_()
+        self._pending = torch.zeros(len(self._pending), dtype=torch.int8).share_memory_()
         self._memory: Memory | None = None
 
     def __iter__(self) -> Iterator[Batch]:
@@ -59,6 +60,11 @@ class Measurements(MeasurementBatches, IterableDataset[Batch]):
         if after is None and get_worker_info() is None and self._place[2] > 0:
             raise ValueError("workers make the batches, and are ahead of training; hint: state_dict(after=batch)")
         return super().state_dict(after)
+
+    # A worker's state is its own: the others may have begun already.
+    def _own_workers(self) -> int | slice:
+        info = get_worker_info()
+        return slice(None) if info is None else info.id
 
     def _allocate(self, kinds: Mapping[str, Kind]) -> tuple[BatchDict, dict[str, NDArray[Any]]]:
         assert self._memory is not None

@@ -35,6 +35,8 @@ Allocate = Callable[[Mapping[str, Kind]], tuple[BatchDict, dict[str, NDArray[Any
 """Makes a batch of the given types and shapes, and the arrays to fill."""
 _READERS = 2
 _BATCHES_AHEAD = 32
+_MOST_WORKERS = 1024
+"""Workers that can be told apart when an iteration begins where a state was made."""
 _POSITIONS = ("microphone_mm", "speaker_mm")
 _MEASURED = ("pair_id", "microphone", "speaker", "swapped")
 """Columns that name points and pairs of the grid: a row turned while loading has positions only."""
@@ -174,7 +176,7 @@ class MeasurementRows:
     ``path`` is a folder, an address ``http://`` of one (needs fsspec and aiohttp), a bucket's URI that pyarrow
     reads, as ``s3://bucket/prefix?endpoint_override=...``, or a :class:`LakeQuery` of a served lake. A process keeps
     decoded surfaces up to ``memory`` bytes. With ``symmetries="all"`` each surface comes under all eight, one after the
-    other. Rows are dicts of NumPy values.
+    other. Rows are dicts of NumPy values, of the ``columns`` and of the positions, which every set has.
 
     ``heights=64`` gives maps of 64 x 64 cells, each the mean of those beneath it. ``normalise`` subtracts the mean of
     split train from columns of floats and from heights, and divides by its standard deviation. ``spectra=["ir"]`` adds
@@ -437,11 +439,13 @@ class MeasurementBatches:
                 stacklevel=2,
             )
         self.columns, self.rank, self.world_size = self.source.columns, rank, world_size
-        # Epoch, and the batch that iteration begins with.
+        # Epoch, and the batch that a loaded state continues with.
         self._place: Any = np.zeros(2, np.int64)
+        # 1 for each worker whose next iteration begins there: only the first one after a state was loaded does.
+        self._pending: Any = np.zeros(_MOST_WORKERS, np.int8)
         self._order: tuple[int, EpochOrder] | None = None
-        # Batches given since the iteration began, and among how many workers.
-        self._given, self._workers = 0, 1
+        # Where the iteration began, batches given since then, and among how many workers.
+        self._start, self._given, self._workers = 0, 0, 1
         self._resumed: tuple[int, int, int] | None = None
 
     @property
@@ -453,7 +457,7 @@ class MeasurementBatches:
         """Shuffles and turns anew; an epoch that a state was loaded for continues where it was."""
         if epoch != self.epoch:
             self._place[0], self._place[1] = epoch, 0
-            self._given = 0
+            self._start, self._given = 0, 0
 
     def __len__(self) -> int:
         return self._shared_batches(0)
@@ -472,17 +476,26 @@ class MeasurementBatches:
         return self.iterate_share(0, 1)
 
     def iterate_share(self, worker: int, workers: int) -> Iterator[BatchDict]:
-        """The batches of one of a rank's workers; surfaces of the next ones are being read meanwhile."""
-        order, start = self.current_order(), int(self._place[1])
+        """The batches of one of a rank's workers; surfaces of the next ones are being read meanwhile.
+
+        The first iteration after a state was loaded has the rest of its epoch, later ones have whole epochs.
+        """
+        if workers > _MOST_WORKERS:
+            raise ValueError(f"{workers} workers, expected {_MOST_WORKERS} at most")
+        order, start = self.current_order(), int(self._place[1]) * int(self._pending[worker])
+        # Nor does a later iteration with more workers, or one whose first was left before all of them began.
+        self._pending[worker if start else slice(None)] = 0
+        self._pending[workers:] = 0
         drawn = order.draw_symmetries(len(self.source.sizes)) if self.source.symmetries == "random" else None
-        self._given, self._workers = 0, workers
-        if self._resumed and self._resumed[0] == self.epoch:
-            if self._resumed[2] != workers:
+        self._start, self._given, self._workers = start, 0, workers
+        resumed, self._resumed = self._resumed, None
+        if resumed and resumed[0] == self.epoch:
+            if resumed[2] != workers:
                 raise ValueError(
-                    f"the state is of a worker among {self._resumed[2]}, there are {workers}; hint: "
+                    f"the state is of a worker among {resumed[2]}, there are {workers}; hint: "
                     "state_dict(after=batch) in the training process is good for any number"
                 )
-            self._given = self._resumed[1]
+            self._given = resumed[1]
         planned: deque[tuple[int, Numbers, set[int]]] = deque()
         for share in range(worker + self._given * workers, self._shared_batches(start), workers):
             number = start + share * self.world_size + self.rank
@@ -505,8 +518,7 @@ class MeasurementBatches:
         ``after`` is the batch that this rank took last. Without it the state is that of this process; torch's
         ``StatefulDataLoader`` asks each of several workers for one, which is good for as many workers only.
         """
-        epoch = self.epoch
-        start = int(self._place[1])
+        epoch, start = self.epoch, self._start
         if after is None and self._workers > 1:
             share = {"given": self._given, "workers": self._workers}
             return self._describe_set() | {"epoch": epoch, "batch": start} | share
@@ -514,18 +526,30 @@ class MeasurementBatches:
             start = after["batch"] - self.rank + self.world_size
         else:
             start += self._given * self.world_size
-        if start >= self.current_order().batches:
+        if self._shared_batches(start) == 0:
             epoch, start = epoch + 1, 0
         return self._describe_set() | {"epoch": epoch, "batch": start}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continues where a state was made, with other ranks and workers, too."""
+        """Continues where a state was made, with other ranks and workers, too.
+
+        The next iteration has the rest of the state's epoch. If that is less than a batch for each rank, and
+        ``drop_last`` leaves it out, it is the epoch after that.
+        """
         for name, value in self._describe_set().items():
             if state.get(name) != value:
                 raise ValueError(f"the state is of a set with {name} {state.get(name)!r}, this one has {value!r}")
         self._place[0], self._place[1] = state["epoch"], state["batch"]
-        self._given, self._workers = 0, 1
         self._resumed = (state["epoch"], state["given"], state["workers"]) if "workers" in state else None
+        if self._resumed is None and self._shared_batches(state["batch"]) == 0:
+            self._place[0], self._place[1] = state["epoch"] + 1, 0
+        self._start = int(self._place[1])
+        self._given, self._workers = self._resumed[1:] if self._resumed else (0, 1)
+        self._pending[self._own_workers()] = 1
+
+    # The workers that a state which is loaded in this process is for.
+    def _own_workers(self) -> int | slice:
+        return slice(None)
 
     def _describe_set(self) -> dict[str, Any]:
         named = {"set": self.source.digest, "split": self.source.split, "symmetries": self.source.symmetries}
@@ -563,7 +587,8 @@ def _numeric_columns(
     unknown = [name for name in columns if name not in known]
     if unknown:
         raise KeyError(f"no columns {json.dumps(unknown)}; there are {json.dumps(known)}")
-    return list(columns)
+    # A response means nothing without the places that it was measured at.
+    return [*columns, *(name for name in _POSITIONS if name in known and name not in columns)]
 
 
 # Numbers of a column, without a copy where Arrow has them in one piece; a missing list is NaN.

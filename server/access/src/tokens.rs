@@ -10,6 +10,7 @@ use echolake_service::{ClientIdentity, Error};
 use serde::Deserialize;
 use sha2::{Digest as _, Sha256};
 use subtle::{Choice, ConstantTimeEq as _};
+use toml::Spanned;
 
 use crate::scram_verifier::ScramVerifier;
 pub use echolake_service::TokenScope;
@@ -49,7 +50,7 @@ struct TokenList {
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Line {
-    name: String,
+    name: Spanned<String>,
     sha256: String,
     scram: Option<String>,
     #[serde(default = "reading")]
@@ -70,7 +71,7 @@ fn reading() -> Vec<TokenScope> {
 
 impl Line {
     fn to_entry(&self) -> Result<TokenEntry, String> {
-        let name = &self.name;
+        let name = self.name.get_ref();
         let mut hash = [0; 32];
         hex::decode_to_slice(&self.sha256, &mut hash)
             .map_err(|_| format!("the sha256 of `{name}` is not 64 hexadecimal digits"))?;
@@ -87,7 +88,7 @@ impl Line {
     }
 
     fn to_identity(&self, token: Option<u64>) -> Result<ClientIdentity, String> {
-        let name = &self.name;
+        let name = self.name.get_ref();
         let at_least_one = |what: &str, value: Option<u64>| match value {
             Some(0) => Err(format!("{what} of `{name}` is 0; hint: leave it out where there is no limit")),
             _ => Ok(()),
@@ -112,7 +113,7 @@ impl Line {
 
     fn check_projects(&self) -> Result<(), String> {
         let Some(projects) = &self.projects else { return Ok(()) };
-        let name = &self.name;
+        let name = self.name.get_ref();
         if projects.is_empty() {
             return Err(format!("projects of `{name}` are none; hint: leave them out where it may see all"));
         }
@@ -157,10 +158,17 @@ impl TokenFile {
     pub(crate) fn parse(path: &Path, text: &str) -> Result<Self, String> {
         let file: TokenList = toml::from_str(text).map_err(|e| e.to_string())?;
         let entries = file.token.iter().map(Line::to_entry).collect::<Result<Vec<_>, _>>()?;
+        let line_of = |at: usize| line_number(text, file.token[at].name.span().start);
         for (i, entry) in entries.iter().enumerate() {
             let is_same = |e: &TokenEntry| e.client.name == entry.client.name || e.hash == entry.hash;
-            if entries[..i].iter().any(is_same) {
-                return Err(format!("`{}` is there twice", entry.client.name));
+            if let Some(earlier) = entries[..i].iter().position(is_same) {
+                let names = [earlier, i].map(|at| &entries[at].client.name);
+                let what = if names[0] == names[1] { "the name" } else { "the sha256 of" };
+                let lines = [earlier, i].map(line_of);
+                return Err(format!(
+                    "{what} `{}` is there twice, in lines {} and {}; hint: remove the [[token]] of one",
+                    names[1], lines[0], lines[1]
+                ));
             }
         }
         Ok(Self { path: path.to_owned(), entries })
@@ -193,6 +201,17 @@ impl TokenFile {
     pub(crate) fn find_name(&self, name: &str) -> Option<&TokenEntry> {
         self.entries.iter().find(|entry| entry.client.name == name && entry.is_valid())
     }
+}
+
+/// Returns the lines of a file of tokens that have a name; none if the text is no such file.
+pub fn find_name_lines(text: &str, name: &str) -> Vec<usize> {
+    let file: TokenList = toml::from_str(text).unwrap_or(TokenList { token: Vec::new() });
+    let named = file.token.iter().filter(|line| line.name.get_ref() == name);
+    named.map(|line| line_number(text, line.name.span().start)).collect()
+}
+
+fn line_number(text: &str, byte: usize) -> usize {
+    1 + text.as_bytes()[..byte.min(text.len())].iter().filter(|byte| **byte == b'\n').count()
 }
 
 /// A new token, and the lines that let it in.
@@ -256,7 +275,15 @@ mod tests {
                 format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\nscopes = ['metrics']\nprojects = ['x']"),
                 "has projects and the scope metrics",
             ),
-            (format!("[[token]]\nname = 'a'\nsha256 = '{hash}'\n").repeat(2), "twice"),
+            // B13
+            (
+                format!("# Ana\n[[token]]\nname = 'a'\nsha256 = '{hash}'\n").repeat(2),
+                "the name `a` is there twice, in lines 3 and 7; hint: remove",
+            ),
+            (
+                ["a", "b"].map(|name| format!("[[token]]\nname = '{name}'\nsha256 = '{hash}'\n")).concat(),
+                "the sha256 of `b` is there twice, in lines 2 and 5",
+            ),
             ("[[group]]\nname = 'a'".to_owned(), "unknown field `group`"),
         ] {
             let error = TokenFile::parse(Path::new("tokens.toml"), &text).map(|_| ()).expect_err(&text);

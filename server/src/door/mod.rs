@@ -26,7 +26,7 @@ mod readiness;
 pub(crate) mod server_door;
 mod temp_folder;
 
-use std::net::SocketAddr;
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, UdpSocket};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -112,11 +112,12 @@ impl LakeServer {
         })
     }
 
-    /// Returns the listening addresses, as URLs.
+    /// Returns the listening addresses, as URLs that a client can use: instead of `0.0.0.0`, which stands for all
+    /// addresses of this machine, one of these.
     pub fn listening_urls(&self) -> Vec<String> {
         let is_encrypted = self.encryption.is_some();
         let url = |schemes: [&str; 2], listener: &Option<TcpListener>, path: &str| {
-            let address = listener.as_ref()?.local_addr().ok()?;
+            let address = reachable_address(listener.as_ref()?.local_addr().ok()?);
             Some(format!("{}://{address}{path}", schemes[usize::from(is_encrypted)]))
         };
         #[cfg(feature = "postgres")]
@@ -183,6 +184,29 @@ fn optional_listener(address: Option<SocketAddr>) -> Result<Option<TcpListener>,
     }
 }
 
+// Another machine's address, to which nothing is sent: the system tells which of its own it would send from.
+fn reachable_address(listening: SocketAddr) -> SocketAddr {
+    if !listening.ip().is_unspecified() {
+        return listening;
+    }
+    let (any, far) = match listening {
+        SocketAddr::V4(_) => (IpAddr::V4(Ipv4Addr::UNSPECIFIED), IpAddr::V4(Ipv4Addr::new(192, 0, 2, 1))),
+        SocketAddr::V6(_) => {
+            (IpAddr::V6(Ipv6Addr::UNSPECIFIED), IpAddr::V6(Ipv6Addr::new(0x2001, 0xdb8, 0, 0, 0, 0, 0, 1)))
+        }
+    };
+    let own = UdpSocket::bind((any, 0)).and_then(|socket| {
+        socket.connect((far, 9))?;
+        socket.local_addr()
+    });
+    let loopback = match listening {
+        SocketAddr::V4(_) => IpAddr::V4(Ipv4Addr::LOCALHOST),
+        SocketAddr::V6(_) => IpAddr::V6(Ipv6Addr::LOCALHOST),
+    };
+    let own = own.map(|address| address.ip()).ok().filter(|ip| !ip.is_unspecified());
+    SocketAddr::new(own.unwrap_or(loopback), listening.port())
+}
+
 fn bind_listener(address: SocketAddr) -> std::io::Result<TcpListener> {
     let socket = if address.is_ipv4() { TcpSocket::new_v4() } else { TcpSocket::new_v6() }?;
     socket.set_reuseaddr(true)?;
@@ -190,4 +214,23 @@ fn bind_listener(address: SocketAddr) -> std::io::Result<TcpListener> {
     socket.set_recv_buffer_size(RECEIVED_BYTES)?;
     socket.bind(address)?;
     socket.listen(BACKLOG)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    // B11: whoever reads the line on this machine reaches the server by it.
+    #[test]
+    fn addresses_of_everywhere_are_printed_as_one_that_can_be_reached() {
+        let known: SocketAddr = "127.0.0.1:8080".parse().expect("an address");
+        assert_eq!(reachable_address(known), known);
+        let listener = std::net::TcpListener::bind("0.0.0.0:0").expect("a port");
+        let listening = listener.local_addr().expect("an address");
+        let printed = reachable_address(listening);
+        assert!(!printed.ip().is_unspecified() && printed.port() == listening.port(), "{printed}");
+        std::net::TcpStream::connect(printed).expect("it is reached");
+        let printed = reachable_address("[::]:8080".parse().expect("an address"));
+        assert!(printed.is_ipv6() && !printed.ip().is_unspecified(), "{printed}");
+    }
 }

@@ -28,6 +28,8 @@ const LEAST_DISTANCE: f64 = 0.05;
 const GOLDEN_RATIO: f64 = 0.618_033_988_749_894_9;
 /// Misfit of a panel that cannot be printed, to which the distance to the ranges is added.
 const UNPRINTABLE: f64 = 100.0;
+/// Column of the digest of a search's inputs in the file of candidates.
+const INPUTS: &str = "inputs";
 /// Values per band in the file of candidates.
 const COLUMNS_PER_BAND: usize = 3;
 
@@ -54,7 +56,7 @@ struct SearchState {
     /// Difference of the figures at all pairs from those at the pairs of the search, by band; nothing before a panel
     /// was simulated at all pairs.
     corrections: Vec<BandFigures>,
-    file: File,
+    file: CandidateFile,
     progress: TaskProgress,
     evaluations: usize,
     /// The best of these evaluations, and its misfit.
@@ -64,27 +66,15 @@ struct SearchState {
 }
 
 impl<'a> DesignSearch<'a> {
-    /// Opens the file of candidates, behind those of before.
-    pub fn open_file(
-        path: &Path,
-        header: &str,
+    /// Continues a search behind the candidates of its file.
+    pub fn from_candidates(
+        file: CandidateFile,
         candidates: Vec<DesignCandidate>,
         target: &'a DesignTarget,
         simulation: &'a DesignSimulation,
         stop: &'a StopRequest,
         mut progress: TaskProgress,
-    ) -> anyhow::Result<Self> {
-        let failed = || format!("cannot write `{}`", path.display());
-        let mut file = File::options().append(true).read(true).create(true).open(path).with_context(failed)?;
-        file.try_lock().with_context(|| format!("another search writes `{}`", path.display()))?;
-        // A line that was cut off is written again.
-        let mut text = Vec::new();
-        file.read_to_end(&mut text).with_context(failed)?;
-        let whole = text.iter().rposition(|byte| *byte == b'\n').map_or(0, |end| end + 1);
-        file.set_len(whole as u64).with_context(failed)?;
-        if whole == 0 {
-            file.write_all(format!("{header}\n").as_bytes()).with_context(failed)?;
-        }
+    ) -> Self {
         progress.begin_at(candidates.len() as u64);
         let by_values = candidates.iter().enumerate().map(|(at, c)| (c.values.clone(), at)).collect();
         let state = SearchState {
@@ -97,7 +87,7 @@ impl<'a> DesignSearch<'a> {
             best: None,
             failed: None,
         };
-        Ok(Self { target, simulation, stop, state: Mutex::new(state) })
+        Self { target, simulation, stop, state: Mutex::new(state) }
     }
 
     /// Tries as many candidates as the target says; those of before count and cost nothing. After half of them, the
@@ -235,8 +225,7 @@ impl SearchState {
         let mut bands = candidate.bands.clone();
         add_figures(&mut bands, &self.corrections);
         if !self.by_values.contains_key(&candidate.values) {
-            let line = candidate_line(self.candidates.len() + 1, &candidate);
-            self.file.write_all(line.as_bytes()).context("cannot write candidates.csv")?;
+            self.file.append_candidate(self.candidates.len() + 1, &candidate)?;
             self.by_values.insert(candidate.values.clone(), self.candidates.len());
             self.candidates.push(candidate);
         }
@@ -270,70 +259,212 @@ pub(super) fn differing_candidates<'a>(
     chosen
 }
 
-/// Reads the candidates of a folder; none if it has no search.
-pub(super) fn read_candidates(
-    path: &Path,
-    target: &DesignTarget,
-    bands: &[String],
-) -> anyhow::Result<Vec<DesignCandidate>> {
-    let text = match std::fs::read_to_string(path) {
-        Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(Vec::new()),
-        text => text.with_context(|| format!("cannot read `{}`", path.display()))?,
-    };
-    let parsed = parse_candidates(&text, &candidate_header(target, bands), target, bands.len());
-    parsed.with_context(|| format!("candidates `{}`", path.display()))
-}
-
-/// Returns the names of the columns of the file of candidates.
-pub(super) fn candidate_header(target: &DesignTarget, bands: &[String]) -> String {
-    let parameters = target.ranges.iter().map(|(key, _)| key.clone());
-    let figures =
-        bands.iter().flat_map(|band| ["level_db", "spread_db", "scattering"].map(|name| format!("{name}_{band}")));
-    let columns = ["candidate".to_owned()].into_iter().chain(parameters).chain(figures);
-    columns.chain(["origin".to_owned()]).collect::<Vec<_>>().join(",")
-}
-
-// The shortest numbers that are read back exactly.
-fn candidate_line(number: usize, candidate: &DesignCandidate) -> String {
-    let figures = candidate
-        .bands
-        .iter()
-        .flat_map(|band| [band.level_db, band.spread_db, band.scattering.value])
-        .map(|x| x.to_string());
-    let fields = [number.to_string()].into_iter().chain(candidate.values.clone()).chain(figures);
-    fields.chain(["simulated".to_owned()]).collect::<Vec<_>>().join(",") + "\n"
-}
-
-// Whole lines alone.
-fn parse_candidates(
-    text: &str,
-    header: &str,
-    target: &DesignTarget,
+/// The columns of a search's file of candidates, and the digest of its inputs, which each line has: a file may have
+/// been copied, or written by two searches.
+pub(super) struct CandidateColumns {
+    header: String,
+    inputs: String,
     bands: usize,
-) -> anyhow::Result<Vec<DesignCandidate>> {
-    let whole = text.rfind('\n').map_or("", |end| &text[..end]);
-    let mut lines = whole.lines();
-    if lines.next().is_some_and(|first| first != header) {
-        bail!("its columns are another search's, expected {header}; hint: another folder");
+}
+
+/// The file of candidates, which is locked.
+pub(super) struct CandidateFile {
+    file: File,
+    /// The digest of each line; None in a file of an earlier version.
+    inputs: Option<String>,
+}
+
+impl CandidateColumns {
+    /// Returns the columns of a search for `target` with such inputs.
+    pub fn new(target: &DesignTarget, bands: &[String], inputs: &str) -> Self {
+        let parameters = target.ranges.iter().map(|(key, _)| key.clone());
+        let figures =
+            bands.iter().flat_map(|band| ["level_db", "spread_db", "scattering"].map(|name| format!("{name}_{band}")));
+        let columns = ["candidate".to_owned()].into_iter().chain(parameters).chain(figures);
+        let header = columns.chain(["origin".to_owned()]).collect::<Vec<_>>().join(",");
+        Self { header, inputs: digest_inputs(inputs), bands: bands.len() }
     }
-    let parameters = target.ranges.len();
-    let parse = |(line, number): (&str, usize)| {
+
+    /// Opens the file for this search alone.
+    ///
+    /// # Errors
+    /// If another search has it.
+    pub fn lock_file(&self, path: &Path) -> anyhow::Result<CandidateFile> {
+        let failed = || format!("cannot write `{}`", path.display());
+        let mut file = File::options().append(true).read(true).create(true).open(path).with_context(failed)?;
+        file.try_lock().with_context(|| format!("another search writes `{}`", path.display()))?;
+        // A line that was cut off is written again.
+        let mut text = Vec::new();
+        file.read_to_end(&mut text).with_context(failed)?;
+        let whole = text.iter().rposition(|byte| *byte == b'\n').map_or(0, |end| end + 1);
+        file.set_len(whole as u64).with_context(failed)?;
+        if whole == 0 {
+            file.write_all(format!("{},{INPUTS}\n", self.header).as_bytes()).with_context(failed)?;
+        }
+        let is_earlier = text[..whole].starts_with(format!("{}\n", self.header).as_bytes());
+        Ok(CandidateFile { file, inputs: (!is_earlier).then(|| self.inputs.clone()) })
+    }
+
+    /// Reads the candidates of a file; none if it is not there.
+    ///
+    /// # Errors
+    /// If a line is of another search, or has no numbers.
+    pub fn read_candidates(&self, path: &Path, target: &DesignTarget) -> anyhow::Result<Vec<DesignCandidate>> {
+        let text = match std::fs::read_to_string(path) {
+            Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(Vec::new()),
+            text => text.with_context(|| format!("cannot read `{}`", path.display()))?,
+        };
+        self.parse_candidates(&text, target).with_context(|| format!("candidates `{}`", path.display()))
+    }
+
+    // Whole lines alone.
+    fn parse_candidates(&self, text: &str, target: &DesignTarget) -> anyhow::Result<Vec<DesignCandidate>> {
+        let whole = text.rfind('\n').map_or("", |end| &text[..end]);
+        let mut lines = whole.lines();
+        let Some(first) = lines.next() else { return Ok(Vec::new()) };
+        let has_inputs = first.strip_prefix(&self.header).map(|more| more.strip_prefix(',') == Some(INPUTS));
+        let Some(has_inputs) = has_inputs.filter(|has_inputs| *has_inputs || first == self.header) else {
+            bail!("its columns are another search's, expected {}; hint: another folder for -o", self.header);
+        };
+        lines.zip(2..).map(|(line, number)| self.parse_line(line, number, has_inputs, target)).collect()
+    }
+
+    fn parse_line(
+        &self,
+        line: &str,
+        number: usize,
+        has_inputs: bool,
+        target: &DesignTarget,
+    ) -> anyhow::Result<DesignCandidate> {
         let fields: Vec<&str> = line.split(',').collect();
-        let expected = parameters + COLUMNS_PER_BAND * bands + 2;
+        let parameters = target.ranges.len();
+        let figures = 1 + parameters..1 + parameters + COLUMNS_PER_BAND * self.bands;
+        let expected = figures.end + 1 + usize::from(has_inputs);
         ensure!(fields.len() == expected, "line {number} has {} fields, expected {expected}", fields.len());
+        if let Some(inputs) = fields.get(figures.end + 1) {
+            ensure!(
+                *inputs == self.inputs,
+                "line {number} is of another target, levels or rig: its {INPUTS} are {inputs}, expected {}; hint: \
+                 another folder for -o",
+                self.inputs
+            );
+        }
         let values: Vec<String> = fields[1..=parameters].iter().map(|value| (*value).to_owned()).collect();
         target.relief_of(&values).with_context(|| format!("line {number}"))?;
-        let numbers = fields[parameters + 1..expected - 1].iter().map(|field| field.parse::<f64>());
-        let numbers: Vec<f64> = numbers
-            .collect::<Result<_, _>>()
-            .with_context(|| format!("line {number} has a field that is no number"))?;
-        let figures = |of: &[f64]| BandFigures {
+        let figure = |at: usize| {
+            let value = fields[at].parse::<f64>().ok().filter(|value| value.is_finite());
+            value.with_context(|| {
+                let column = self.header.split(',').nth(at).unwrap_or_default();
+                format!("line {number}: `{column}` is {}, expected a number; hint: remove the line", fields[at])
+            })
+        };
+        let numbers = figures.map(figure).collect::<anyhow::Result<Vec<f64>>>()?;
+        let band = |of: &[f64]| BandFigures {
             level_db: of[0],
             spread_db: of[1],
             scattering: UncertainNumber { value: of[2], uncertainty: None },
         };
-        let bands: Vec<BandFigures> = numbers.chunks(COLUMNS_PER_BAND).map(figures).collect();
-        Ok(DesignCandidate { values, bands })
-    };
-    lines.zip(2..).map(parse).collect()
+        Ok(DesignCandidate { values, bands: numbers.chunks(COLUMNS_PER_BAND).map(band).collect() })
+    }
+}
+
+impl CandidateFile {
+    // The shortest numbers that are read back exactly.
+    fn append_candidate(&mut self, number: usize, candidate: &DesignCandidate) -> anyhow::Result<()> {
+        let figures = candidate.bands.iter().flat_map(|band| [band.level_db, band.spread_db, band.scattering.value]);
+        let figures: Vec<f64> = figures.collect();
+        ensure!(
+            figures.iter().all(|figure| figure.is_finite()),
+            "the simulation has no level, spread or scattering of a band for {}; hint: more `pairs`",
+            candidate.values.join(", ")
+        );
+        let fields = [number.to_string()].into_iter().chain(candidate.values.clone());
+        let fields = fields.chain(figures.iter().map(f64::to_string)).chain(["simulated".to_owned()]);
+        let line = fields.chain(self.inputs.clone()).collect::<Vec<_>>().join(",") + "\n";
+        self.file.write_all(line.as_bytes()).context("cannot write candidates.csv")
+    }
+}
+
+// FNV-1a: the same in every version of the program, and no secret.
+fn digest_inputs(inputs: &str) -> String {
+    let mix = |hash: u64, byte: u8| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3);
+    format!("{:016x}", inputs.bytes().fold(0xcbf2_9ce4_8422_2325, mix))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const WAVES: &str =
+        "relief = \"macrostructure\"\n[ranges]\nmacro_depth_mm = [20, 100]\n[bands.2500]\nlevel_db = 1\n";
+
+    fn columns_of(inputs: &str) -> (CandidateColumns, DesignTarget) {
+        let bands = ["2500".to_owned()];
+        let target = DesignTarget::from_toml(WAVES, &bands).expect("a target");
+        (CandidateColumns::new(&target, &bands, inputs), target)
+    }
+
+    fn candidate(depth_mm: &str) -> DesignCandidate {
+        let scattering = UncertainNumber { value: 0.5, uncertainty: None };
+        DesignCandidate {
+            values: vec![depth_mm.to_owned()],
+            bands: vec![BandFigures { level_db: -1.5, spread_db: 0.25, scattering }],
+        }
+    }
+
+    // E32: a search of other inputs neither has the folder meanwhile, nor goes on with its candidates later.
+    #[test]
+    fn candidates_of_another_search_are_refused_by_line() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("candidates.csv");
+        let (own, target) = columns_of("fixed = 1");
+        let (other, _) = columns_of("fixed = 2");
+        let mut file = own.lock_file(&path).expect("a file");
+        file.append_candidate(1, &candidate("20")).expect("written");
+        let refused = format!("{:#}", other.lock_file(&path).err().expect("it is locked"));
+        assert!(refused.contains("another search writes"), "{refused}");
+        drop(file);
+        let mut file = other.lock_file(&path).expect("unlocked");
+        file.append_candidate(2, &candidate("30")).expect("written");
+        let refused = format!("{:#}", own.read_candidates(&path, &target).expect_err("of two searches"));
+        assert!(
+            refused.contains("line 3 is of another target, levels or rig") && refused.contains("hint: another folder"),
+            "{refused}"
+        );
+        let refused = format!("{:#}", other.read_candidates(&path, &target).expect_err("of two searches"));
+        assert!(refused.contains("line 2 is of another target, levels or rig"), "{refused}");
+    }
+
+    // E32: NaN fitted no target, so another panel won.
+    #[test]
+    fn numbers_that_are_none_are_refused_by_line_and_column() {
+        let (columns, target) = columns_of("inputs");
+        let line =
+            |level: &str| format!("{},{INPUTS}\n1,20,{level},0.25,0.5,simulated,{}\n", columns.header, columns.inputs);
+        let read = columns.parse_candidates(&line("-1.5"), &target).expect("a candidate");
+        assert_eq!((read[0].values.as_slice(), read[0].bands[0].level_db), (&["20".to_owned()][..], -1.5));
+        for wrong in ["NaN", "inf", "1e999", "", "x"] {
+            let refused = format!("{:#}", columns.parse_candidates(&line(wrong), &target).expect_err("no number"));
+            assert!(refused.contains(&format!("line 2: `level_db_2500` is {wrong}, expected a number")), "{refused}");
+        }
+        let folder = tempfile::tempdir().expect("a folder");
+        let mut file = columns.lock_file(&folder.path().join("candidates.csv")).expect("a file");
+        let mut worn = candidate("20");
+        worn.bands[0].spread_db = f64::NAN;
+        assert!(file.append_candidate(1, &worn).is_err());
+    }
+
+    // Files of 0.1.0 have no inputs in their lines.
+    #[test]
+    fn a_search_of_an_earlier_version_goes_on_in_its_columns() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("candidates.csv");
+        let (columns, target) = columns_of("inputs");
+        std::fs::write(&path, format!("{}\n1,20,-1.5,0.25,0.5,simulated\n2,3", columns.header)).expect("written");
+        columns.lock_file(&path).expect("a file").append_candidate(2, &candidate("30")).expect("written");
+        let read = columns.read_candidates(&path, &target).expect("candidates");
+        assert_eq!(read.iter().map(|candidate| candidate.values[0].as_str()).collect::<Vec<_>>(), ["20", "30"]);
+        let text = std::fs::read_to_string(&path).expect("text");
+        assert!(text.lines().skip(1).all(|line| line.ends_with(",simulated")), "{text}");
+    }
 }

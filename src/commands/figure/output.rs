@@ -9,6 +9,40 @@ use echolake_figures::{FigureDrawing, FigureNotes, FigureTable};
 
 use super::source::SelectedSurface;
 
+/// Extensions of files that a figure can be written to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum FigureFormats {
+    Drawing,
+    /// A drawing whose numbers can be written, too.
+    Chart,
+    Table,
+}
+
+impl FigureFormats {
+    fn extensions(self) -> &'static [&'static str] {
+        match self {
+            Self::Drawing => &["svg", "pdf", "png"],
+            Self::Chart => &["svg", "pdf", "png", "csv"],
+            Self::Table => &["tex", "csv", "md"],
+        }
+    }
+
+    /// Checks that a file has one of the extensions.
+    fn check_extension(self, path: &Path) -> anyhow::Result<()> {
+        let known = self.extensions();
+        anyhow::ensure!(
+            known.contains(&path_extension(path)),
+            "`{}` has another extension; hint: {}",
+            path.display(),
+            match known {
+                [first @ .., last] => format!("{} or {last}", first.join(", ")),
+                [] => String::new(),
+            }
+        );
+        Ok(())
+    }
+}
+
 /// The part of a file's name that stands for a surface.
 const PLACEHOLDER: &str = "{surface}";
 
@@ -24,6 +58,14 @@ pub(crate) struct OutputArgs {
 }
 
 impl OutputArgs {
+    /// Checks the extensions of all files, before the first is written.
+    ///
+    /// # Errors
+    /// If a file has none of the figure's formats.
+    pub fn check_extensions(&self, formats: FigureFormats) -> anyhow::Result<()> {
+        self.output.iter().try_for_each(|path| formats.check_extension(path))
+    }
+
     /// Returns the surfaces of each figure: each alone if files are named by them, else all together.
     ///
     /// # Errors
@@ -48,10 +90,7 @@ impl OutputArgs {
             return Ok(std::io::stdout().write_all(drawing.to_svg().as_bytes())?);
         }
         for path in self.output_paths(surfaces)? {
-            let Some(bytes) = drawing_bytes(drawing, &path)? else {
-                bail!("`{}` has another extension; hint: svg, pdf or png", path.display())
-            };
-            write_file(&path, &bytes)?;
+            write_file(&path, &drawing_bytes(drawing, &path, FigureFormats::Drawing)?)?;
         }
         Ok(())
     }
@@ -68,10 +107,9 @@ impl OutputArgs {
             return self.write_drawing(drawing, surfaces);
         }
         for path in self.output_paths(surfaces)? {
-            let bytes = match drawing_bytes(drawing, &path)? {
-                Some(bytes) => bytes,
-                None if path_extension(&path) == "csv" => table.to_csv(notes).into_bytes(),
-                None => bail!("`{}` has another extension; hint: svg, pdf, png or csv", path.display()),
+            let bytes = match path_extension(&path) {
+                "csv" => table.to_csv(notes).into_bytes(),
+                _ => drawing_bytes(drawing, &path, FigureFormats::Chart)?,
             };
             write_file(&path, &bytes)?;
         }
@@ -89,11 +127,11 @@ impl OutputArgs {
             return Ok(super::super::print_line(table.to_markdown(&FigureNotes::default()).trim_end())?);
         }
         for path in self.output_paths(surfaces)? {
+            FigureFormats::Table.check_extension(&path)?;
             let text = match path_extension(&path) {
                 "tex" => table.to_latex(notes),
                 "csv" => table.to_csv(notes),
-                "md" => table.to_markdown(notes),
-                _ => bail!("`{}` has another extension; hint: tex, csv or md", path.display()),
+                _ => table.to_markdown(notes),
             };
             write_file(&path, text.as_bytes())?;
         }
@@ -112,13 +150,13 @@ impl OutputArgs {
     }
 }
 
-// The drawing in the format of a file; none if the file is none of a drawing.
-fn drawing_bytes(drawing: &FigureDrawing, path: &Path) -> anyhow::Result<Option<Vec<u8>>> {
+// The drawing in the format of a file.
+fn drawing_bytes(drawing: &FigureDrawing, path: &Path, formats: FigureFormats) -> anyhow::Result<Vec<u8>> {
+    formats.check_extension(path)?;
     Ok(match path_extension(path) {
-        "svg" => Some(drawing.to_svg().into_bytes()),
-        "pdf" => Some(drawing.to_pdf()?),
-        "png" => Some(drawing.to_png()?),
-        _ => None,
+        "pdf" => drawing.to_pdf()?,
+        "png" => drawing.to_png()?,
+        _ => drawing.to_svg().into_bytes(),
     })
 }
 

@@ -255,14 +255,18 @@ struct HeightmapRow {
     cells: usize,
     size_mm: f32,
     heights_mm: Vec<f32>,
+    /// Those of the mesh, which the cells' means do not reach.
+    relief_min_mm: Option<f32>,
+    relief_max_mm: Option<f32>,
 }
 
 pub(super) async fn write_relief(source: &FigureSource, args: &ReliefArgs) -> anyhow::Result<()> {
     let surfaces = source.selected_surfaces(&args.selection).await?;
     let query = |id: &str| {
         format!(
-            "select cells, size_mm, heights_mm from heightmaps where surface_id = {id} and symmetry = 'identity' \
-             order by run_id desc limit 1"
+            "select cells, size_mm, heights_mm, relief_min_mm, relief_max_mm from heightmaps h left join surfaces s on \
+             s.surface_id = h.surface_id where h.surface_id = {id} and symmetry = 'identity' order by h.run_id desc \
+             limit 1"
         )
     };
     for group in args.output.group_surfaces(&surfaces)? {
@@ -274,12 +278,12 @@ pub(super) async fn write_relief(source: &FigureSource, args: &ReliefArgs) -> an
                 || format!("surface `{}` has no height map; hint: its run came without a mesh", surface.surface_id);
             let row = row.with_context(missing)?;
             let heights = row.heights_mm.iter().map(|height| f64::from(*height));
-            let extent = heights.fold([f64::MAX, f64::MIN], |[low, high], h| [low.min(h), high.max(h)]);
+            let [low, high] = heights.fold([f64::MAX, f64::MIN], |[low, high], h| [low.min(h), high.max(h)]);
             panels.push(ReliefPanel {
                 title: surface.surface_id.clone(),
                 shaded: heights::shade_heights(&row.heights_mm, row.size_mm / row.cells as f32)?,
                 cells: row.cells,
-                extent_mm: extent,
+                extent_mm: [row.relief_min_mm.map_or(low, f64::from), row.relief_max_mm.map_or(high, f64::from)],
             });
         }
         let panel_mm = source.lake.rig().panel.size_mm;

@@ -6,7 +6,7 @@ use std::io::Read as _;
 use std::sync::LazyLock;
 
 use axum::body::Bytes;
-use axum::http::{HeaderMap, HeaderValue, Method, Uri, header};
+use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, Uri, header};
 use axum::response::{IntoResponse as _, Redirect, Response};
 use base64::Engine as _;
 use base64::prelude::BASE64_STANDARD;
@@ -50,6 +50,9 @@ static PAGES: &[PageFile] = &[PageFile {
     is_gzip: false,
     brotli: None,
 }];
+
+/// Words in place of a page of the manual, with `HINT` for what helps.
+const MISSING_MANUAL_PAGE: &str = include_str!("missing_manual_page.html");
 
 /// The files of the manual; none if the program was built without it.
 static MANUAL: &[PageFile] = include!(concat!(env!("OUT_DIR"), "/manual.rs"));
@@ -95,7 +98,12 @@ pub(super) async fn serve_page(method: Method, uri: Uri, headers: HeaderMap) -> 
         Some(path) => (find_manual_file(path), MANUAL_POLICY.as_str()),
         None => (find_page(uri.path()), POLICY),
     };
-    let Some((page, digest)) = found else { return missing_page(manual_path.is_some()).await };
+    let Some((page, digest)) = found else {
+        return match manual_path {
+            Some(_) => missing_manual_page(&headers),
+            None => refuse_unknown_path().await.into_response(),
+        };
+    };
     if method != Method::GET && method != Method::HEAD {
         let mut response = ProblemResponse(RequestFault::Method).into_response();
         response.headers_mut().insert(header::ALLOW, HeaderValue::from_static("GET,HEAD"));
@@ -119,14 +127,22 @@ pub(super) async fn serve_page(method: Method, uri: Uri, headers: HeaderMap) -> 
     (common, encoding, page.body_as(form)).into_response()
 }
 
-async fn missing_page(is_of_manual: bool) -> Response {
-    if !is_of_manual {
-        return refuse_unknown_path().await.into_response();
-    }
+// Words for a person whose browser followed a link, and the usual problem for a program.
+fn missing_manual_page(headers: &HeaderMap) -> Response {
     let hint = match MANUAL {
         [] => "this program was built without its manual; docs/build.sh makes it for the next build",
         _ => "/docs/index.html lists the manual's pages",
     };
+    let accepted = headers.get(header::ACCEPT).and_then(|accepted| accepted.to_str().ok());
+    if accepted.is_some_and(|accepted| accepted.contains("text/html")) {
+        let common = [
+            (header::CONTENT_TYPE, "text/html; charset=utf-8"),
+            (header::CACHE_CONTROL, "no-cache"),
+            (header::CONTENT_SECURITY_POLICY, POLICY),
+            (header::VARY, "Accept"),
+        ];
+        return (StatusCode::NOT_FOUND, common, MISSING_MANUAL_PAGE.replace("HINT", hint)).into_response();
+    }
     ProblemResponse(RequestFault::NotFound { what: "this page of the manual".to_owned(), hint }).into_response()
 }
 
@@ -210,9 +226,25 @@ impl PageFile {
 
 #[cfg(test)]
 mod tests {
-    use axum::http::StatusCode;
-
     use super::*;
+
+    // A browser names text/html in what it accepts, and got raw JSON.
+    #[tokio::test]
+    async fn a_missing_page_of_the_manual_is_words_for_a_browser_and_a_problem_for_a_program() {
+        for (accepted, media_type) in [
+            ("text/html,application/xhtml+xml,*/*;q=0.8", "text/html; charset=utf-8"),
+            ("*/*", "application/problem+json"),
+        ] {
+            let headers = HeaderMap::from_iter([(header::ACCEPT, HeaderValue::from_static(accepted))]);
+            let response = serve_page(Method::GET, Uri::from_static("/docs/none.html"), headers).await;
+            assert_eq!(response.status(), StatusCode::NOT_FOUND);
+            assert_eq!(response.headers()[header::CONTENT_TYPE], media_type);
+            let body = axum::body::to_bytes(response.into_body(), 1 << 16).await.expect("a body");
+            let text = String::from_utf8_lossy(&body);
+            assert!(text.contains("docs/build.sh") || text.contains("/docs/index.html lists"), "{text}");
+            assert_eq!(text.starts_with("<!doctype html>"), media_type.starts_with("text/html"), "{text}");
+        }
+    }
 
     #[test]
     fn addresses_are_pages_and_files_are_themselves() {
