@@ -9,13 +9,14 @@ use arrow::array::{
     AsArray as _, BooleanArray, BooleanBuilder, Int32Builder, Int64Array, ListBuilder, RecordBatch, StringArray,
     TimestampMicrosecondArray,
 };
-use arrow::compute::filter_record_batch;
+use arrow::compute::{cast, filter_record_batch};
 use arrow::datatypes::{DataType, Field, Int32Type, SchemaRef};
 use bytes::Bytes;
 use datafusion::datasource::{MemTable, TableProvider, ViewTable, provider_as_source};
 use datafusion::error::Result;
 use datafusion::logical_expr::{
-    ColumnarValue, LogicalPlanBuilder, ScalarFunctionArgs, ScalarUDF, ScalarUDFImpl, Signature, Volatility, lit, not,
+    ColumnarValue, LogicalPlanBuilder, ScalarFunctionArgs, ScalarUDF, ScalarUDFImpl, Signature, TypeSignature,
+    Volatility, lit, not,
 };
 use datafusion::prelude::col;
 use echolake_lake::{ContributionCounts, ContributionLog, Lake, LakeSnapshot};
@@ -201,7 +202,9 @@ fn filter_table(
 }
 
 fn rejection_function(rejected: &Arc<RejectedMeasurements>) -> ScalarUDF {
-    let signature = Signature::exact(vec![DataType::Utf8, DataType::Int32], Volatility::Immutable);
+    let pair_types = [DataType::Int32, DataType::Int64];
+    let exact = pair_types.map(|pair| TypeSignature::Exact(vec![DataType::Utf8, pair]));
+    let signature = Signature::one_of(exact.to_vec(), Volatility::Immutable);
     ScalarUDF::from(IsRejected { rejected: rejected.clone(), signature })
 }
 
@@ -242,7 +245,8 @@ impl ScalarUDFImpl for IsRejected {
 
     fn invoke_with_args(&self, args: ScalarFunctionArgs) -> Result<ColumnarValue> {
         let columns = args.args.iter().map(|a| a.to_array(args.number_rows)).collect::<Result<Vec<_>>>()?;
-        let pairs = columns[1].as_primitive::<Int32Type>();
+        let pairs = cast(&columns[1], &DataType::Int32)?;
+        let pairs = pairs.as_primitive::<Int32Type>();
         let is_rejected = |(run, pair): (Option<&str>, Option<i32>)| {
             Some(self.rejected.is_rejected(run?, u32::try_from(pair?).ok()?))
         };
