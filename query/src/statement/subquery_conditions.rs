@@ -218,14 +218,17 @@ impl SubqueryComparison {
         }
     }
 
-    // Returns the comparison as IN or NOT IN, if it is one.
-    fn into_membership(self) -> std::result::Result<Expr, Self> {
-        let negated = match (self.operator, self.quantifier) {
-            (Operator::Eq, SetQuantifier::Any) => false,
-            (Operator::NotEq, SetQuantifier::All) => true,
-            _ => return Err(self),
-        };
-        Ok(Expr::InSubquery(InSubquery { expr: Box::new(self.left), subquery: self.subquery, negated }))
+    // Returns whether the comparison is IN (false) or NOT IN (true); None if it is neither.
+    fn membership(&self) -> Option<bool> {
+        match (self.operator, self.quantifier) {
+            (Operator::Eq, SetQuantifier::Any) => Some(false),
+            (Operator::NotEq, SetQuantifier::All) => Some(true),
+            _ => None,
+        }
+    }
+
+    fn into_membership(self, negated: bool) -> Expr {
+        Expr::InSubquery(InSubquery { expr: Box::new(self.left), subquery: self.subquery, negated })
     }
 
     fn is_correlated(&self) -> bool {
@@ -233,11 +236,12 @@ impl SubqueryComparison {
     }
 
     // An aggregate without groups has one row, whatever its rows depend on.
-    fn compare_only_row(self) -> std::result::Result<Expr, Self> {
-        match self.is_correlated() && has_one_row(&self.subquery.subquery) {
-            true => Ok(binary_expr(self.left, self.operator, Expr::ScalarSubquery(self.subquery))),
-            false => Err(self),
-        }
+    fn has_only_row(&self) -> bool {
+        self.is_correlated() && has_one_row(&self.subquery.subquery)
+    }
+
+    fn into_row_comparison(self) -> Expr {
+        binary_expr(self.left, self.operator, Expr::ScalarSubquery(self.subquery))
     }
 }
 
@@ -270,20 +274,17 @@ impl ConditionScope<'_> {
     }
 
     fn compared_condition(&self, comparison: SubqueryComparison, is_top: bool) -> Result<Expr> {
-        let comparison = match comparison.compare_only_row() {
-            Ok(expr) => return Ok(expr),
-            Err(comparison) => comparison,
-        };
+        if comparison.has_only_row() {
+            return Ok(comparison.into_row_comparison());
+        }
         let (left_null, right_null) = self.may_be_null(&comparison)?;
         let has_null_join = is_top && !comparison.is_correlated() && comparison.left.any_column_refs();
         let is_any = comparison.quantifier == SetQuantifier::Any;
-        let comparison = match is_any || !left_null && !right_null || has_null_join {
-            true => match comparison.into_membership() {
-                Ok(membership) => return Ok(membership),
-                Err(comparison) => comparison,
-            },
-            false => comparison,
-        };
+        if let Some(negated) = comparison.membership()
+            && (is_any || !left_null && !right_null || has_null_join)
+        {
+            return Ok(comparison.into_membership(negated));
+        }
         if is_any {
             return self.some_row(&comparison, comparison.operator, false);
         }
@@ -314,18 +315,16 @@ impl ConditionScope<'_> {
     }
 
     fn compared_value(&self, comparison: SubqueryComparison) -> Result<Expr> {
-        let comparison = match comparison.compare_only_row() {
-            Ok(expr) => return Ok(expr),
-            Err(comparison) => comparison,
-        };
+        if comparison.has_only_row() {
+            return Ok(comparison.into_row_comparison());
+        }
         let (left_null, right_null) = self.may_be_null(&comparison)?;
-        let comparison = match !left_null && !right_null {
-            true => match comparison.into_membership() {
-                Ok(membership) => return Ok(membership),
-                Err(comparison) => comparison,
-            },
-            false => comparison,
-        };
+        if let Some(negated) = comparison.membership()
+            && !left_null
+            && !right_null
+        {
+            return Ok(comparison.into_membership(negated));
+        }
         let is_any = comparison.quantifier == SetQuantifier::Any;
         let operator = if is_any { Some(comparison.operator) } else { comparison.operator.negate() };
         let Some(operator) = operator else { return plan_err!("{UNPLANNED}") };
