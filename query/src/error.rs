@@ -338,7 +338,7 @@ pub(crate) fn unknown_table(name: &str) -> Error {
 // DataFusion adds the catalogue and schema, which the query does not contain.
 fn missing_table(qualified: &str) -> (String, Option<String>) {
     let name = qualified.strip_prefix("datafusion.public.").unwrap_or(qualified);
-    if FILE_ENDINGS.iter().any(|ending| name.to_ascii_lowercase().ends_with(ending)) || name.contains("://") {
+    if FILE_ENDINGS.iter().any(|ending| name.to_ascii_lowercase().ends_with(ending)) || name.contains('/') {
         return (format!("no table `{name}`{NO_FILES}"), Some(OWN_ROWS.to_owned()));
     }
     let tables = Table::ALL.map(Table::name);
