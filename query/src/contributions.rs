@@ -6,14 +6,15 @@ use std::hash::{Hash, Hasher};
 use std::sync::Arc;
 
 use arrow::array::{AsArray as _, BooleanArray};
+use arrow::compute::cast;
 use arrow::datatypes::{DataType, Int32Type, SchemaRef};
 use async_trait::async_trait;
 use datafusion::catalog::Session;
 use datafusion::datasource::{MemTable, TableProvider, TableType, ViewTable, provider_as_source};
 use datafusion::error::{DataFusionError, Result};
 use datafusion::logical_expr::{
-    ColumnarValue, Expr, LogicalPlanBuilder, ScalarFunctionArgs, ScalarUDF, ScalarUDFImpl, Signature, Volatility, lit,
-    not,
+    ColumnarValue, Expr, LogicalPlanBuilder, ScalarFunctionArgs, ScalarUDF, ScalarUDFImpl, Signature, TypeSignature,
+    Volatility, lit, not,
 };
 use datafusion::physical_plan::ExecutionPlan;
 use datafusion::physical_plan::empty::EmptyExec;
@@ -143,7 +144,9 @@ impl KnownVerdicts {
 
     /// Returns the function that tells whether a measurement is rejected.
     pub fn rejection_function(&self) -> ScalarUDF {
-        let signature = Signature::exact(vec![DataType::Utf8, DataType::Int32], Volatility::Immutable);
+        let pair_types = [DataType::Int32, DataType::Int64];
+        let exact = pair_types.map(|pair| TypeSignature::Exact(vec![DataType::Utf8, pair]));
+        let signature = Signature::one_of(exact.to_vec(), Volatility::Immutable);
         ScalarUDF::from(IsRejected { verdicts: self.clone(), signature })
     }
 }
@@ -273,7 +276,8 @@ impl ScalarUDFImpl for IsRejected {
     fn invoke_with_args(&self, args: ScalarFunctionArgs) -> Result<ColumnarValue> {
         self.verdicts.check_fault()?;
         let columns = args.args.iter().map(|a| a.to_array(args.number_rows)).collect::<Result<Vec<_>>>()?;
-        let pairs = columns[1].as_primitive::<Int32Type>();
+        let pairs = cast(&columns[1], &DataType::Int32)?;
+        let pairs = pairs.as_primitive::<Int32Type>();
         let is_rejected = |(run, pair): (Option<&str>, Option<i32>)| {
             Some(self.verdicts.rejected.is_rejected(run?, u32::try_from(pair?).ok()?))
         };

@@ -15,9 +15,11 @@ use datafusion::execution::runtime_env::{RuntimeEnv, RuntimeEnvBuilder};
 use datafusion::execution::session_state::{SessionState, SessionStateBuilder};
 use datafusion::functions_nested::min_max::array_min_udf;
 use datafusion::logical_expr::Documentation;
-use datafusion::optimizer::OptimizerRule;
+use datafusion::optimizer::{Optimizer, OptimizerRule};
 use datafusion::prelude::{SessionConfig, SessionContext};
-use echolake_functions::{FunctionSet, octet_length_of_bytes, pattern_functions, whole_number_ranges};
+use echolake_functions::{
+    FunctionSet, exact_aggregates, octet_length_of_bytes, pattern_functions, whole_number_ranges, zone_time,
+};
 use echolake_lake::Lake;
 use echolake_lake_tables::{FileReaders, LakeReaderFactory, SmallTables};
 use futures::FutureExt as _;
@@ -26,6 +28,7 @@ use crate::catalog::LakeCatalog;
 use crate::client::QueryQuota;
 use crate::control::threads::{QueryThreadGroups, QueryThreads};
 use crate::control::{QueryTicket, RunningQueries, StopReason};
+use crate::statement::{IntegerArithmetic, SubqueryConditions};
 use crate::system::{self, SystemSource};
 use crate::{Error, OpaqueValue};
 
@@ -279,12 +282,21 @@ fn build_template(
     functions: &FunctionSet,
     rules: impl IntoIterator<Item = Arc<dyn OptimizerRule + Send + Sync>>,
 ) -> SessionState {
-    let builder =
-        SessionStateBuilder::new().with_config(session_config()).with_runtime_env(runtime).with_default_features();
+    let conditions: Arc<dyn OptimizerRule + Send + Sync> = Arc::new(SubqueryConditions);
+    let builder = SessionStateBuilder::new()
+        .with_config(session_config())
+        .with_runtime_env(runtime)
+        .with_default_features()
+        .with_analyzer_rule(Arc::new(IntegerArithmetic))
+        .with_optimizer_rules(std::iter::once(conditions).chain(Optimizer::new().rules).collect());
     let mut state = rules.into_iter().fold(builder, SessionStateBuilder::with_optimizer_rule).build();
     let _ = state.register_udf(Arc::new(octet_length_of_bytes()));
     for function in whole_number_ranges() {
         let _ = state.register_udf(Arc::new(function));
+    }
+    let _ = state.register_udf(Arc::new(zone_time()));
+    for function in exact_aggregates() {
+        let _ = state.register_udaf(Arc::new(function));
     }
     // DuckDB's name, as `list_max`, which DataFusion has.
     let _ = state.register_udf(Arc::new(array_min_udf().as_ref().clone().with_aliases(["list_min"])));
@@ -306,6 +318,8 @@ fn session_config() -> SessionConfig {
     let mut config = SessionConfig::new().with_information_schema(true).with_batch_size(BATCH_ROWS);
     let options = config.options_mut();
     options.sql_parser.collect_spans = true;
+    // As in Postgres' protocol, a TIMESTAMPTZ is of UTC.
+    options.execution.time_zone = Some("UTC".to_owned());
     // Files contain plain strings, and so do the output formats of answers.
     options.execution.parquet.schema_force_view_types = false;
     config

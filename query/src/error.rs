@@ -16,7 +16,7 @@ use echolake_schema::tables::Table;
 use echolake_schema::{ErrorCause, escape_controls};
 
 use crate::control::StopReason;
-use crate::statement::{find_cast, hints};
+use crate::statement::{UNPLANNED, find_cast, hints};
 
 /// Minimum similarity of a suggested name: half of the letters, as in DataFusion's own suggestions.
 const ALIKE: f64 = 0.5;
@@ -24,6 +24,26 @@ const ALIKE: f64 = 0.5;
 const SUGGESTED: usize = 3;
 /// Maximum number of columns in a hint if no name is similar.
 const LISTED: usize = 12;
+
+/// Begins the message of a calculation whose result its type cannot hold.
+pub const OUT_OF_RANGE: &str = "out of range: ";
+/// Table functions of other databases that read files.
+const FILE_FUNCTIONS: [&str; 9] = [
+    "read_csv",
+    "read_csv_auto",
+    "read_json",
+    "read_json_auto",
+    "read_parquet",
+    "parquet_scan",
+    "read_text",
+    "read_blob",
+    "glob",
+];
+/// Endings of names that are no tables but files.
+const FILE_ENDINGS: [&str; 8] = [".csv", ".tsv", ".txt", ".json", ".parquet", ".arrow", ".feather", ".xlsx"];
+const NO_FILES: &str = ": a query reads the lake and no other files";
+const OWN_ROWS: &str = "WITH mine(a, b) AS (VALUES (1, 2), (3, 4)) for a few rows; for a file, DuckDB or polars, which \
+    read the lake's tables, too";
 
 /// A place in a query's text. Lines, columns and positions count from 1.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -251,13 +271,23 @@ fn explain_error(error: &DataFusionError) -> (String, Option<String>) {
             ParserError::RecursionLimitExceeded => ("the query is nested too deeply".to_owned(), None),
         },
         DataFusionError::ArrowError(arrow, _) => (arrow_message(arrow), None),
-        DataFusionError::Plan(text) => match text.strip_prefix("table '").and_then(|t| t.strip_suffix("' not found")) {
-            Some(name) => missing_table(name),
-            None => (text.clone(), None),
+        DataFusionError::Plan(text) => match text.strip_suffix("' not found").and_then(|text| text.split_once(" '")) {
+            Some(("table", name)) => missing_table(name),
+            Some(("table function", name)) if FILE_FUNCTIONS.contains(&name) => {
+                (format!("no table function `{name}`{NO_FILES}"), Some(OWN_ROWS.to_owned()))
+            }
+            _ => (text.clone(), None),
         },
+        // The message prints the expression as the library's own structure.
+        DataFusionError::NotImplemented(text) if is_unplanned_subquery(text) => (UNPLANNED.to_owned(), None),
         DataFusionError::Execution(text) => (text.clone(), None),
         other => (other.strip_backtrace(), None),
     }
+}
+
+fn is_unplanned_subquery(message: &str) -> bool {
+    message.starts_with("Physical plan does not support logical expression")
+        && ["ubquery", "Exists", "OuterReference"].iter().any(|kind| message.contains(kind))
 }
 
 // Returns the error of a table's file that is gone or damaged. The readers of files keep such faults as texts alone.
@@ -290,9 +320,11 @@ fn store_fault(message: &str) -> Option<String> {
 fn arrow_message(error: &ArrowError) -> String {
     match error {
         ArrowError::DivideByZero => "division by zero".to_owned(),
-        ArrowError::CastError(text) | ArrowError::ComputeError(text) | ArrowError::ArithmeticOverflow(text) => {
-            text.clone()
-        }
+        ArrowError::ArithmeticOverflow(text) => match text.strip_prefix("Overflow happened on: ") {
+            Some(calculation) => format!("{OUT_OF_RANGE}{calculation}"),
+            None => text.clone(),
+        },
+        ArrowError::CastError(text) | ArrowError::ComputeError(text) => text.clone(),
         ArrowError::ExternalError(source) => match source.downcast_ref::<DataFusionError>() {
             Some(inner) => explain_error(inner).0,
             None => source.to_string(),
@@ -310,6 +342,9 @@ pub(crate) fn unknown_table(name: &str) -> Error {
 // DataFusion adds the catalogue and schema, which the query does not contain.
 fn missing_table(qualified: &str) -> (String, Option<String>) {
     let name = qualified.strip_prefix("datafusion.public.").unwrap_or(qualified);
+    if FILE_ENDINGS.iter().any(|ending| name.to_ascii_lowercase().ends_with(ending)) || name.contains('/') {
+        return (format!("no table `{name}`{NO_FILES}"), Some(OWN_ROWS.to_owned()));
+    }
     let tables = Table::ALL.map(Table::name);
     let hint = did_you_mean(name, &tables).unwrap_or_else(|| format!("the tables are {}", tables.join(", ")));
     (format!("no table `{name}`"), Some(hint))

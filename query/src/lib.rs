@@ -41,7 +41,7 @@ pub use client::{EngineClient, QueryPermit, QueryQuota};
 pub use control::threads::QueryThreads;
 pub use echolake_mcap_tables::{Attachment, Contents, Topic};
 pub use engine::{QueryEngine, SqlFunction};
-pub use error::{Error, QueryPlace};
+pub use error::{Error, OUT_OF_RANGE, QueryPlace};
 pub use opaque::OpaqueValue;
 pub use request_memory::RequestMemory;
 pub use session::{CancelHandle, ContextExtension, PreparedQuery, QueryAnswer, Session};

@@ -594,3 +594,6 @@ pub(crate) mod function_tests;
 
 #[cfg(test)]
 mod request_tests;
+
+#[cfg(test)]
+mod right_answers_tests;

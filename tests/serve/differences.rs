@@ -91,6 +91,13 @@ const WRITTEN: &[&str] = &[
     "select timestamp '2026-01-05 08:00:00' as v, date '2026-01-05' as w, time '08:00:01' as x from pairs limit 1",
     "select timestamp '2026-01-05 08:00' as v from pairs limit 1",
     "select age(log_time) as v from measurements limit 1",
+    // E18: one meaning of zones.
+    "select timestamptz '2026-07-14 22:30:00+00' at time zone 'Europe/Berlin' as v",
+    "select (to_timestamp(1784068200) at time zone 'Europe/Berlin')::date as v from pairs limit 1",
+    "select timestamp '2026-07-15 00:30' at time zone 'Europe/Berlin' as v from pairs limit 1",
+    // W1, W2.
+    "select sum(log_time_ns) as v, sum(pair_id) over () as w from measurements group by pair_id order by pair_id",
+    "select count(*) as v from pairs where pair_id > any (select pair_id from pairs where pair_id < 5)",
     "select nce_centre(ir) as v from measurements limit 1",
     "select 'NaN'::double as v, 'inf'::double as w, '-inf'::real as x from pairs limit 1",
     "select cast('NaN'::double as int) as v from pairs limit 1",

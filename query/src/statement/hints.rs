@@ -141,7 +141,8 @@ const PLANS: [(&str, &str); 16] = [
     ("No function matches", "CAST(x AS type) or x::type, and SHOW FUNCTIONS LIKE 'name' for its arguments"),
 ];
 /// Parts of messages of queries that fail while they run, and what to write instead.
-const RUNS: [(&str, &str); 4] = [
+const RUNS: [(&str, &str); 5] = [
+    ("out of range: ", "CAST(x AS bigint), decimal(38, 0) or double before it"),
     ("division by zero", "a / nullif(b, 0) is null there"),
     ("Cannot cast", "TRY_CAST(x AS type) is null for what does not fit"),
     ("verflow", "CAST(x AS double) or a wider type"),

@@ -10,15 +10,21 @@ use datafusion::logical_expr::expr_rewriter::NamePreserver;
 use datafusion::logical_expr::utils::merge_schema;
 use datafusion::logical_expr::{Expr, ExprSchemable as _, LogicalPlan};
 
-/// Has the casts that a statement writes round to the nearest integer, ties away from zero. It is called before
-/// DataFusion adds casts of its own.
+use super::literals::read_literals;
+
+/// Has the casts that a statement writes round to the nearest integer, ties away from zero, and reads its literals as
+/// [`read_literals`] says. It is called before DataFusion adds casts of its own.
 pub(crate) fn round_casts(plan: LogicalPlan) -> Result<LogicalPlan> {
     let round_node = |node: LogicalPlan| {
         let schema = merge_schema(&node.inputs());
         let names = NamePreserver::new(&node);
         node.map_expressions(|expr| {
             let name = names.save(&expr);
-            let rounded = expr.transform_up(|expr| Ok(round_cast(expr, &schema)))?;
+            let rounded = expr.transform_up(|expr| {
+                let read = read_literals(expr, &schema);
+                let rounded = round_cast(read.data, &schema);
+                Ok(Transformed { transformed: rounded.transformed || read.transformed, ..rounded })
+            })?;
             Ok(rounded.update_data(|expr| name.restore(expr)))
         })
     };

@@ -3,21 +3,28 @@
 //! [`parse_statement`] checks the bounds of a text ([`bounds`]) and parses it in the [`dialect`] of HTTP, Flight SQL
 //! and the prompt; Postgres' protocol checks the same bounds and has a parser of its own. [`prepare_statement`] then
 //! takes the steps that are the same for all protocols, in this order: the one [`rewrite`] of the tree, the [`gate`]
-//! and the check of [`clauses`], the planner, and two passes over its plan. The text itself is never rewritten.
+//! and the check of [`clauses`], the planner, and three passes over its plan. The text itself is never rewritten.
 
 mod as_of;
 mod bounds;
 mod cast_place;
 mod clauses;
 mod columns;
+mod declared_types;
 mod dialect;
 mod gate;
 pub(crate) mod hints;
+mod integer_arithmetic;
 mod integer_casts;
+mod literals;
 mod placeholders;
 mod predicate;
+mod result_names;
 mod rewrite;
+mod row_values;
 mod script;
+mod set_operations;
+mod subquery_conditions;
 mod summarize;
 mod syntax_walk;
 #[cfg(test)]
@@ -34,9 +41,11 @@ use datafusion::sql::sqlparser::tokenizer::Tokenizer;
 pub(crate) use as_of::{PastTableName, find_past_tables};
 pub use bounds::check_statement_bounds;
 pub(crate) use cast_place::find_cast;
+pub(crate) use integer_arithmetic::IntegerArithmetic;
 pub use predicate::PredicateForm;
 pub(crate) use predicate::append_predicate;
 pub use script::{is_blank_statement, split_statement};
+pub(crate) use subquery_conditions::{SubqueryConditions, UNPLANNED};
 pub use syntax_walk::{walk_expr, walk_statement};
 
 use crate::Error;
@@ -78,6 +87,7 @@ pub(crate) async fn prepare_statement(
     clauses::check_clauses(&statement, sql, state)?;
     let plan = state.statement_to_plan(statement).await;
     let plan = plan.and_then(placeholders::infer_types).and_then(integer_casts::round_casts);
+    let plan = plan.and_then(|plan| declared_types::settle_types(plan, state.config_options()));
     let plan = plan.map_err(|e| Error::from_planning(sql, &e))?;
     // `SELECT INTO` reads by its first word and makes a table by its plan.
     let reading = SQLOptions::new().with_allow_ddl(false).with_allow_dml(false).with_allow_statements(false);

@@ -12,8 +12,12 @@
 //! | `list(x)`, `if(c, x, y)`, `arg_max(x, y)` | `array_agg(x)`, `CASE ...`, `first_value(x ORDER BY y DESC) ...` |
 //! | `COLUMNS('x.*')` | the columns of FROM, see [`columns`](super::columns) |
 //! | `SUMMARIZE t` | a row per column, see [`summarize`](super::summarize) |
+//! | `q EXCEPT ALL r` | rows with numbers, see [`set_operations`](super::set_operations) |
+//! | `(a, b) IN (q)` | `EXISTS`, see [`row_values`](super::row_values) |
+//! | `t AT TIME ZONE 'zone'` | a call of a function |
+//! | `t(a, b) AS (SELECT 1, 1)`, `ROLLUP(1, 2)` | names and positions, see [`result_names`](super::result_names) |
 //!
-//! The last two depend on the columns of FROM, which the planner tells. So queries are rewritten from the inside out.
+//! Some depend on the columns of FROM, which the planner tells. So queries are rewritten from the inside out.
 
 use std::ops::ControlFlow;
 
@@ -23,14 +27,18 @@ use datafusion::sql::parser::Statement;
 use datafusion::sql::sqlparser::ast::helpers::attached_token::AttachedToken;
 use datafusion::sql::sqlparser::ast::{
     AccessExpr, CaseWhen, Cte, Expr, Fetch, Function, FunctionArg, FunctionArgExpr, FunctionArgumentClause,
-    FunctionArguments, Ident, JoinOperator, LimitClause, ObjectName, OrderBy, OrderByExpr, OrderByKind, OrderByOptions,
-    Query, Select, SelectFlavor, SelectItem, SetExpr, Statement as Sql, Subscript, TableFactor, TableWithJoins, Value,
-    ValueWithSpan, Visitor, VisitorMut, WildcardAdditionalOptions, With,
+    FunctionArgumentList, FunctionArguments, Ident, JoinOperator, LimitClause, ObjectName, OrderBy, OrderByExpr,
+    OrderByKind, OrderByOptions, Query, Select, SelectFlavor, SelectItem, SetExpr, Statement as Sql, Subscript,
+    TableFactor, TableWithJoins, Value, ValueWithSpan, Visitor, VisitorMut, WildcardAdditionalOptions, With,
 };
+use echolake_functions::AT_TIME_ZONE;
 use futures::FutureExt as _;
 
 use super::as_of::rewrite_as_of;
 use super::columns::{ColumnsExpansion, has_columns, hinted_error};
+use super::result_names::{expand_grouping_positions, name_listed_columns};
+use super::row_values::{rewrite_row_conditions, rewrite_row_value};
+use super::set_operations::count_set_rows;
 use super::summarize::{summarized_query, write_summary};
 use super::syntax_walk::{walk_mut, walk_syntax};
 use super::tree;
@@ -97,6 +105,7 @@ impl VisitorMut for RewriteVisitor<'_> {
         limit_fetched_rows(query);
         let mut with = query.with.take();
         for cte in with.iter_mut().flat_map(|with| &mut with.cte_tables) {
+            name_listed_columns(&mut cte.query.body, &cte.alias);
             walk_mut(&mut *cte.query, self)?;
             self.ctes.push(cte.clone());
         }
@@ -106,6 +115,7 @@ impl VisitorMut for RewriteVisitor<'_> {
 
     fn post_visit_query(&mut self, query: &mut Query) -> Visit {
         visit_outcome(name_ordering_columns(query, &mut |from| self.look_up(from)))?;
+        visit_outcome(count_set_rows(&mut query.body, &mut |from| self.look_up(from)))?;
         query.with = self.withs.pop().flatten();
         let own = query.with.as_ref().map_or(0, |with| with.cte_tables.len());
         self.ctes.truncate(self.ctes.len() - own);
@@ -125,7 +135,8 @@ impl VisitorMut for RewriteVisitor<'_> {
                 other => other,
             };
         }
-        ControlFlow::Continue(())
+        expand_grouping_positions(select);
+        visit_outcome(select.selection.as_mut().map_or(Ok(()), rewrite_row_conditions))
     }
 
     fn post_visit_select(&mut self, select: &mut Select) -> Visit {
@@ -134,6 +145,9 @@ impl VisitorMut for RewriteVisitor<'_> {
     }
 
     fn pre_visit_table_factor(&mut self, factor: &mut TableFactor) -> Visit {
+        if let TableFactor::Derived { subquery, alias: Some(alias), .. } = factor {
+            name_listed_columns(&mut subquery.body, alias);
+        }
         visit_outcome(rewrite_as_of(factor))
     }
 
@@ -156,9 +170,10 @@ impl VisitorMut for RewriteVisitor<'_> {
                 Ok(None) => {}
                 Err(error) => return ControlFlow::Break(Box::new(error)),
             },
+            Expr::AtTimeZone { timestamp, time_zone } => *expr = zone_call(timestamp, time_zone),
             _ => {}
         }
-        ControlFlow::Continue(())
+        visit_outcome(rewrite_row_value(expr))
     }
 }
 
@@ -247,6 +262,24 @@ fn close_slice(access: &mut AccessExpr) {
         lower_bound.get_or_insert_with(|| tree::number_literal(1));
         upper_bound.get_or_insert_with(|| tree::number_literal(-1));
     }
+}
+
+fn zone_call(time: &Expr, zone: &Expr) -> Expr {
+    let argument = |expr: &Expr| FunctionArg::Unnamed(FunctionArgExpr::Expr(expr.clone()));
+    Expr::Function(Function {
+        name: ObjectName::from(vec![Ident::new(AT_TIME_ZONE)]),
+        uses_odbc_syntax: false,
+        parameters: FunctionArguments::None,
+        args: FunctionArguments::List(FunctionArgumentList {
+            duplicate_treatment: None,
+            args: vec![argument(time), argument(zone)],
+            clauses: Vec::new(),
+        }),
+        filter: None,
+        null_treatment: None,
+        over: None,
+        within_group: Vec::new(),
+    })
 }
 
 // Returns what replaces a call as a whole; None if it stays a call.

@@ -75,7 +75,7 @@ pub(super) fn view_sql(rig: &Rig) -> String {
          WHEN absorption IS NULL THEN 'what a relief of another material than Flat''s absorbs is not known' \
          WHEN NOT {has_absorption} THEN 'more energy than a board reflects' \
          WHEN NOT is_level THEN 'that of Flat, which is of the same material' END AS absorption_reason, \
-         CASE WHEN is_flat THEN 0 WHEN {has_scattering} THEN scattering END AS scattering, \
+         CASE WHEN is_flat THEN 0.0 WHEN {has_scattering} THEN scattering END AS scattering, \
          CASE WHEN {has_scattering} THEN scattering_u END AS scattering_u, \
          CASE WHEN is_flat THEN 'the surface is its own Flat: 0 by definition' \
          WHEN is_foam THEN 'the surface is its own Foam, which is estimated' \

@@ -1,7 +1,7 @@
 //! Failures as Postgres says them, with its five-letter states.
 
 use bytes::BytesMut;
-use echolake_query::Error as QueryError;
+use echolake_query::{Error as QueryError, OUT_OF_RANGE};
 use echolake_service::{FaultCode, FaultParts, RequestFault};
 use pgwire::error::{ErrorInfo, PgWireError};
 use pgwire::messages::PgWireBackendMessage;
@@ -38,6 +38,7 @@ fn fault_sqlstate(fault: &RequestFault) -> &'static str {
     match fault {
         RequestFault::Query(QueryError::Query { message, .. }) if message.starts_with("no table ") => "42P01",
         RequestFault::Query(QueryError::Query { message, .. }) if message.starts_with("no column ") => "42703",
+        RequestFault::Query(QueryError::Execution { message, .. }) if message.starts_with(OUT_OF_RANGE) => "22003",
         RequestFault::TooMany { what: "connections", .. } => "53300",
         RequestFault::NotFound { what, .. } if what.starts_with("cursor ") => "34000",
         RequestFault::Disconnected | RequestFault::Displaced => "57P01",
@@ -62,5 +63,20 @@ fn fault_sqlstate(fault: &RequestFault) -> &'static str {
             FaultCode::Internal => "XX000",
             FaultCode::Stopping | FaultCode::NotReady => "57P03",
         },
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// W2: A sum that its type cannot hold has Postgres' own state.
+    #[test]
+    fn an_overflow_is_out_of_range() {
+        let message = format!("{OUT_OF_RANGE}9223372036854775807 + 1");
+        let overflow = QueryError::Execution { message, place: None, hint: None };
+        assert_eq!(fault_sqlstate(&RequestFault::Query(overflow)), "22003");
+        let other = QueryError::Execution { message: "division by zero".to_owned(), place: None, hint: None };
+        assert_eq!(fault_sqlstate(&RequestFault::Query(other)), "22000");
     }
 }

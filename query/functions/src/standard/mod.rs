@@ -1,5 +1,7 @@
 //! DataFusion's own functions, for more kinds of arguments.
 
+pub(crate) mod exact_aggregates;
 pub(crate) mod number_ranges;
 pub(crate) mod octet_length;
 pub(crate) mod time_patterns;
+pub(crate) mod zone_times;

@@ -88,8 +88,9 @@ pub(super) async fn lake(Extension(request): Extension<CatalogueRequest>) -> End
     let points: Vec<GridPoint> = request
         .read_rows("select point_id, layer, gridx, gridy, x_mm, y_mm, z_mm from points order by point_id", Vec::new())
         .await?;
-    let runs: Vec<RunTotals> =
-        request.read_rows("select count(*) as runs, sum(measurements) as measurements from runs", Vec::new()).await?;
+    let runs: Vec<RunTotals> = request
+        .read_rows("select count(*) as runs, cast(sum(measurements) as bigint) as measurements from runs", Vec::new())
+        .await?;
     let summary = request.read_summary().await?;
     let counts = LakeCounts {
         surfaces: summary.entries.len(),
