@@ -8,6 +8,8 @@ mod bad_input;
 mod broken_tables;
 mod campaign;
 mod design;
+#[allow(dead_code, unused_imports, reason = "`stress` wants more of it")]
+mod differences;
 mod end_to_end;
 mod figure;
 mod foam;

@@ -9,6 +9,8 @@ mod annotation_kills;
 mod attacks;
 mod bench;
 mod cancels;
+#[path = "../../tests/differences/mod.rs"]
+mod differences;
 mod engine_kills;
 #[path = "../../tests/forgetful.rs"]
 mod forgetful;
@@ -37,6 +39,7 @@ mod serve {
     pub(crate) mod server;
     pub(crate) mod tunnel;
 }
+mod sql_differences;
 
 use std::path::PathBuf;
 
@@ -75,6 +78,8 @@ enum CampaignCommand {
     HostileClients(hostile_clients::HostileClientsArgs),
     /// Kill engines of `serve` while they answer; no short answer may look whole.
     EngineKills(engine_kills::EngineKillsArgs),
+    /// Compare generated SQL with DuckDB, and shrink what differs.
+    SqlDifferences(sql_differences::SqlDifferenceArgs),
     /// Measure how soon the server is idle after a query is ended.
     Cancels(cancels::CancelArgs),
     /// Measure ingest, queries, readers and other things beside peers and limits.
@@ -94,6 +99,7 @@ fn main() -> Result<()> {
         CampaignCommand::Attacks(args) => attacks::run_attacks(&args),
         CampaignCommand::HostileClients(args) => hostile_clients::run_hostile_clients(&args),
         CampaignCommand::EngineKills(args) => engine_kills::run_engine_kills(&args),
+        CampaignCommand::SqlDifferences(args) => sql_differences::compare_with_duckdb(&args),
         CampaignCommand::Cancels(args) => cancels::run_cancel_campaign(&args),
         CampaignCommand::Bench(args) => bench::run_bench(&args),
         CampaignCommand::Motion(args) => motion::run_motion(&args),

@@ -16,8 +16,9 @@ use echolake_schema::Rig;
 
 use super::ingest::simulated::{SimulationOrder, put_into_inbox};
 use super::meter::{forget_peak, peak_mib};
-use super::queries::{bench_queries, collect_batches, median, middle_surface};
+use super::queries::{bench_queries, median, middle_surface};
 use super::report::{BenchReport, FigureGoal};
+use crate::differences::collect_batches;
 
 /// Timed repeats of queries.
 const REPEATS: usize = 5;

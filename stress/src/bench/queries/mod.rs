@@ -4,9 +4,6 @@
 //! The Python of `--python` has the packages duckdb and pyarrow. The engines take turns, so that other programs disturb
 //! both alike. Answers are compared value by value.
 
-mod answer_rows;
-mod generated;
-mod peer;
 mod twelve;
 
 use std::collections::BTreeMap;
@@ -18,12 +15,9 @@ use anyhow::{Context as _, Result};
 use arrow::record_batch::RecordBatch;
 use echolake_lake::Lake;
 use echolake_query::Session;
-use echolake_schema::tables::Table;
 
 use super::report::{BenchReport, FigureGoal};
-use answer_rows::find_difference;
-use generated::QueryGenerator;
-use peer::DuckdbPeer;
+use crate::differences::{DuckdbPeer, PeerTables, QueryGenerator, collect_batches, find_difference, visible_files};
 use twelve::{BenchQuery, TWELVE};
 
 pub(crate) use twelve::bench_queries;
@@ -78,7 +72,13 @@ pub(crate) async fn measure_queries(args: &QueryBenchArgs, report: &mut BenchRep
     let session = Session::new(&lake)?;
     let mut queries = bench_queries(&middle_surface(&lake).await?, 1234);
     if args.generated > 0 {
-        queries.extend(QueryGenerator::new(&session, args.seed).await?.generate_queries(args.generated));
+        let generated = QueryGenerator::new(&session, args.seed).await?.generate_queries(args.generated);
+        queries.extend(generated.into_iter().enumerate().map(|(number, (kind, sql))| BenchQuery {
+            name: format!("{kind} #{number}"),
+            kind,
+            sql,
+            peer: None,
+        }));
     }
     queries.retain(|query| query.name.contains(&args.only));
     if args.explain {
@@ -88,7 +88,10 @@ pub(crate) async fn measure_queries(args: &QueryBenchArgs, report: &mut BenchRep
         return Ok(());
     }
     let mut peer = match &args.python {
-        Some(python) => Some(DuckdbPeer::start(python, &visible_files(&lake).await?, args.threads)?),
+        Some(python) => {
+            let files = visible_files(&lake).await?;
+            Some(DuckdbPeer::start(python, &PeerTables { files, threads: args.threads, ..PeerTables::default() })?)
+        }
         None => None,
     };
     let mut times = Vec::new();
@@ -173,7 +176,7 @@ async fn compare_engines(
     let peer_sql = query.peer.as_ref().unwrap_or(&query.sql);
     let answer = collect_batches(session, &query.sql).await?;
     if let Some(peer) = &mut peer
-        && let Some(difference) = find_difference(&answer, &peer.read_rows(peer_sql)?)?
+        && let Some(difference) = find_difference(&answer, &peer.ask_rows(peer_sql)?.map_err(anyhow::Error::msg)?)?
     {
         report.fail(format!("{}: answers differ, {difference}; {}", query.name, query.sql));
     }
@@ -192,15 +195,6 @@ async fn compare_engines(
     Ok(QueryTimes { query, own: median(own), peer: (!other.is_empty()).then(|| median(other)), rows })
 }
 
-pub(crate) async fn collect_batches(session: &Session, sql: &str) -> Result<Vec<RecordBatch>> {
-    let mut answer = session.query(sql).await?;
-    let mut batches = Vec::new();
-    while let Some(batch) = answer.next().await? {
-        batches.push(batch);
-    }
-    Ok(batches)
-}
-
 async fn explain_query(session: &Session, query: &BenchQuery) -> Result<()> {
     collect_batches(session, &query.sql).await?;
     let batches = collect_batches(session, &format!("EXPLAIN ANALYZE {}", query.sql)).await?;
@@ -212,20 +206,6 @@ async fn explain_query(session: &Session, query: &BenchQuery) -> Result<()> {
 pub(crate) fn median(mut seconds: Vec<f64>) -> f64 {
     seconds.sort_by(f64::total_cmp);
     seconds.get(seconds.len() / 2).copied().unwrap_or(f64::NAN)
-}
-
-// Just what readers see, so that both engines read the same rows.
-async fn visible_files(lake: &Lake) -> Result<Vec<(String, Vec<String>)>> {
-    let folder = lake.folder().context("the peer reads lakes in folders")?;
-    let snapshot = lake.snapshot().await?;
-    let mut tables = Vec::new();
-    for table in Table::ALL {
-        let files = snapshot.files(table).iter();
-        anyhow::ensure!(files.clone().all(|f| f.hidden.is_empty()), "the lake is being cleaned up; run this again");
-        let paths = files.map(|f| folder.join(f.path.as_ref()).display().to_string());
-        tables.push((table.name().to_owned(), paths.collect()));
-    }
-    Ok(tables)
 }
 
 pub(crate) async fn middle_surface(lake: &Lake) -> Result<String> {

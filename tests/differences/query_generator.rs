@@ -10,7 +10,6 @@ use rand::{Rng as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 
 use super::collect_batches;
-use super::twelve::BenchQuery;
 
 /// Tables with rows of pairs, and how many queries of ten read them.
 const PAIR_TABLES: [Table; 5] = [Table::Tnce, Table::Tnce, Table::Measurements, Table::Measurements, Table::TnceD4];
@@ -35,12 +34,14 @@ struct SampledTable {
 
 /// A column, and values of it.
 #[derive(Clone)]
-struct SampledColumn {
-    name: String,
+pub(crate) struct SampledColumn {
+    pub name: String,
+    /// Its type.
+    pub data_type: DataType,
     kind: ColumnKind,
     /// As they are written in SQL, ascending, each once; between two of the rows' values if those are floats, so that
     /// no rounding decides about a row.
-    values: Vec<String>,
+    pub values: Vec<String>,
     is_nullable: bool,
 }
 
@@ -86,16 +87,23 @@ impl QueryGenerator {
         Ok(Self { random: ChaCha8Rng::seed_from_u64(seed), tables, pairs, surfaces })
     }
 
-    /// Makes so many, of all kinds in turn.
-    pub fn generate_queries(mut self, count: usize) -> Vec<BenchQuery> {
-        let kinds = TEMPLATES.iter().cycle().take(count).enumerate();
-        let query = |(number, (kind, template)): (usize, &(&'static str, QueryTemplate))| BenchQuery {
-            name: format!("{kind} #{number}"),
-            kind,
-            sql: template(&mut self),
-            peer: None,
-        };
-        kinds.map(query).collect()
+    /// Makes so many, of all kinds in turn: the kind and the text of each.
+    pub fn generate_queries(&mut self, count: usize) -> Vec<(&'static str, String)> {
+        TEMPLATES.iter().cycle().take(count).map(|(kind, template)| (*kind, template(self))).collect()
+    }
+
+    /// Makes one, which depends on its number and on the seed alone.
+    pub fn generate_query(&mut self, seed: u64, number: u64) -> (&'static str, String) {
+        self.random = ChaCha8Rng::seed_from_u64(seed);
+        self.random.set_stream(number);
+        let (kind, template) = self.pick(&TEMPLATES);
+        (kind, template(self))
+    }
+
+    /// Returns the scalar columns of a table that was sampled.
+    pub fn sampled_columns(&self, table: Table) -> &[SampledColumn] {
+        let all = self.tables.iter().chain([&self.pairs, &self.surfaces]);
+        all.into_iter().find(|sampled| sampled.table == table).map_or(&[], |sampled| &sampled.columns)
     }
 
     fn pick<T: Clone>(&mut self, options: &[T]) -> T {
@@ -127,7 +135,7 @@ impl QueryGenerator {
 
     // A condition on any column: a range, or values if the column's are exact.
     fn pick_condition(&mut self, table: &SampledTable, prefix: &str) -> String {
-        let SampledColumn { name, kind, values, is_nullable } = self.pick(&table.columns);
+        let SampledColumn { name, kind, values, is_nullable, .. } = self.pick(&table.columns);
         let name = format!("{prefix}{name}");
         if is_nullable && self.random.random_ratio(1, 6) {
             return format!("{name} {}", self.pick(&["IS NULL", "IS NOT NULL"]));
@@ -311,7 +319,14 @@ impl SampledTable {
                 values = values.windows(2).map(|pair| round_digits(middle(pair)).to_string()).collect();
             }
             if !values.is_empty() {
-                columns.push(SampledColumn { name: column.clone(), kind, values, is_nullable: field.is_nullable() });
+                let data_type = field.data_type().clone();
+                columns.push(SampledColumn {
+                    name: column.clone(),
+                    data_type,
+                    kind,
+                    values,
+                    is_nullable: field.is_nullable(),
+                });
             }
         }
         for kind in [ColumnKind::Measure, ColumnKind::Key] {
