@@ -1,6 +1,6 @@
 //! `POST /api/v1/annotations`: labels, verdicts and notes.
 
-use std::collections::{BTreeSet, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 use axum::Json;
 use axum::extract::State;
@@ -9,8 +9,10 @@ use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use bytes::Bytes;
 use chrono::Utc;
+use echolake_lake::{LakeSnapshot, SurfaceReferences, VisibleRun};
 use echolake_schema::RunId;
 use echolake_schema::annotations::{Annotation, AnnotationKind};
+use echolake_schema::tables::{Source, Table};
 use echolake_service::{ContributionDraft, RequestFault, TokenScope};
 use serde::Deserialize;
 use utoipa::ToSchema;
@@ -29,6 +31,11 @@ pub struct AnnotationsRequest {
     /// Only without tokens; the token's name otherwise.
     #[schema(required = false, nullable = false)]
     author: Option<String>,
+    /// Needed for verdicts on runs that levels of other surfaces rest on, as those of Flat and Foam: without it the
+    /// answer is 409, and tells how many surfaces and rows the next ingest derives again.
+    #[serde(default)]
+    #[schema(required = false)]
+    confirm_rederivation: bool,
 }
 
 /// One annotation.
@@ -119,6 +126,7 @@ async fn draft_request(
     let there: Vec<_> = annotations.iter().filter_map(|new| Some((new, *by_name.get(&annotation_key(new))?))).collect();
     match there.first() {
         None => {
+            check_reference_verdicts(catalogue, &view.snapshot, &annotations, request.confirm_rederivation)?;
             let mut object = Vec::new();
             for annotation in &annotations {
                 serde_json::to_writer(&mut object, annotation)
@@ -136,6 +144,43 @@ async fn draft_request(
             hint: "a stored annotation never changes; add another with a new `annotation_id`",
         }),
     }
+}
+
+// A verdict on a run changes the levels of all surfaces that rest on it, of other projects, too: it needs a right of its
+// own, and the client is told first what is derived again.
+fn check_reference_verdicts(
+    catalogue: &LakeCatalogue,
+    snapshot: &LakeSnapshot,
+    annotations: &[Annotation],
+    is_confirmed: bool,
+) -> Result<(), RequestFault> {
+    let references = SurfaceReferences::from_snapshot(snapshot, &catalogue.lake().config().references);
+    let mut resting = BTreeMap::new();
+    let mut first = None;
+    for annotation in annotations.iter().filter(|annotation| annotation.kind == AnnotationKind::Verdict) {
+        let Some(run) = snapshot.run(&annotation.run_id) else { continue };
+        let dependent: Vec<_> = references.dependent_runs(snapshot, &run.surface).collect();
+        // Surfaces that this client does not see may rest on the lake's own references.
+        if !dependent.is_empty() || references.is_default(&run.surface) {
+            resting.extend(dependent.into_iter().chain([run]).map(|run| (&run.run, run)));
+            first = first.or(Some(run));
+        }
+    }
+    let Some(run) = first else { return Ok(()) };
+    catalogue.service().authorised_client(TokenScope::AnnotateReferences)?;
+    if is_confirmed {
+        return Ok(());
+    }
+    let derived = || Table::ALL.into_iter().filter(|table| table.source() == Source::References);
+    let rows = |run: &VisibleRun| {
+        let counts = snapshot.row_counts(&run.run);
+        derived().filter_map(|table| counts?.rows_of(table)).sum::<u64>()
+    };
+    Err(RequestFault::Unconfirmed {
+        run: run.run.to_string(),
+        surfaces: resting.values().map(|run| &run.surface).collect::<BTreeSet<_>>().len(),
+        rows: resting.values().map(|run| rows(run)).sum(),
+    })
 }
 
 fn annotation_key(annotation: &Annotation) -> (&str, &str) {

@@ -9,6 +9,7 @@ use echolake_lake::{DataFile, LakeSnapshot};
 use echolake_query::figure_rows::CurveRow;
 use echolake_query::{EngineClient, PreparedQuery, QueryQuota, Session};
 use echolake_schema::Symmetry;
+use echolake_schema::annotations::RejectedMeasurements;
 use echolake_schema::symmetry::MovedPair;
 use echolake_schema::tables::Table;
 use echolake_service::{QueryService, RequestFault};
@@ -40,6 +41,7 @@ pub(crate) struct SnapshotView {
     pub session: Arc<Session>,
     pub answers: AnswerCache,
     pub summary: OnceCell<CatalogueSummary>,
+    pub rejected: OnceCell<RejectedMeasurements>,
     pub places: OnceCell<SurfacePositions>,
     pub diffusion: OnceCell<DiffusionCoefficients>,
     /// The geometry of all pairs, by their numbers.
@@ -60,6 +62,7 @@ impl SnapshotView {
             session,
             answers: AnswerCache::default(),
             summary: OnceCell::new(),
+            rejected: OnceCell::new(),
             places: OnceCell::new(),
             diffusion: OnceCell::new(),
             pairs: OnceCell::new(),
