@@ -1,10 +1,11 @@
-//! Derives the rows that need references, for every run whose references exist and differ from those its rows used.
+//! Derives the rows that need references, for every run whose references exist and differ from those its rows used, or
+//! on which a verdict came since.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
-use echolake_lake::{ClaimOutcome, CommitOutcome, DataFile, Lake, LakeSnapshot, VisibleRun, WorkClaims};
+use echolake_lake::{ClaimOutcome, CommitOutcome, DataFile, LakeSnapshot, VisibleRun, WorkClaims, verdict_mark};
 use echolake_schema::tables::{Source, Table};
 use echolake_schema::{RunId, SurfaceId};
 use tracing::Instrument as _;
@@ -15,7 +16,7 @@ use crate::error::{Error, Result};
 use crate::ingest::{LOOK_EVERY, LakeIngest};
 use crate::pipeline::{self, Cores, ReadyJob};
 use crate::read_back;
-use crate::references::{ReferenceFinder, WantedReferences};
+use crate::references::WantedReferences;
 use crate::rows::runs::RunReferences;
 use crate::rows::{self, RunKeys};
 
@@ -31,6 +32,8 @@ pub struct CompletedRun {
     pub surface: SurfaceId,
     /// Measurements of the run.
     pub measurements: usize,
+    /// Whether a verdict on the run or on a reference is the reason.
+    pub by_verdicts: bool,
 }
 
 /// A completion, as long as it goes on: a run, and the number of runs to complete.
@@ -43,6 +46,8 @@ pub struct CompletionSummary {
     pub changed: usize,
     /// The runs that wait for references, with the names of the missing references.
     pub waiting: Vec<(RunId, String)>,
+    /// The runs that should describe their surfaces instead of rejected ones, and whose files are refused.
+    pub unrestored: Vec<(RunId, Error)>,
     /// True if no table lacked rows before superseded ones were removed.
     pub is_whole: bool,
 }
@@ -54,38 +59,45 @@ impl LakeIngest<'_> {
     /// # Errors
     /// [`crate::Error`]; runs completed before stay so, and the same call resumes with the rest.
     pub async fn complete_runs(&self, done: &mut CompletionReport<'_>) -> Result<CompletionSummary> {
-        let (changed, snapshot) = self.complete_in_rounds(done).await?;
+        let cores = Cores::all()?;
+        let (changed, unrestored, snapshot) = self.complete_in_rounds(&cores, done).await?;
         self.lake.remove_superseded_in(&snapshot).await?;
         let is_whole = snapshot.is_whole();
-        Ok(CompletionSummary { changed, waiting: waiting_runs(self.lake, snapshot), is_whole })
+        let waiting = waiting_runs(&IngestContext::read_from(self.lake, &cores, snapshot).await?).await;
+        Ok(CompletionSummary { changed, waiting, unrestored, is_whole })
     }
 
-    // Returns the number of changed runs, and the lake's snapshot thereafter.
-    async fn complete_in_rounds(&self, done: &mut CompletionReport<'_>) -> Result<(usize, Arc<LakeSnapshot>)> {
-        let cores = Cores::all()?;
+    // Returns the number of changed runs, those that are not restored, and the lake's snapshot thereafter.
+    async fn complete_in_rounds(
+        &self,
+        cores: &Cores,
+        done: &mut CompletionReport<'_>,
+    ) -> Result<(usize, Vec<(RunId, Error)>, Arc<LakeSnapshot>)> {
         let mut count = 0;
         let mut rounds = 0;
+        let mut unrestored = Vec::new();
         while rounds < ROUNDS {
-            let round = do_round(self, &cores, done).await?;
+            let mut round = do_round(self, cores, done).await?;
             count += round.changed;
+            unrestored = std::mem::take(&mut round.unrestored);
             match round {
-                CompletionRound { unchanged: Some(snapshot), .. } => return Ok((count, snapshot)),
+                CompletionRound { unchanged: Some(snapshot), .. } => return Ok((count, unrestored, snapshot)),
                 CompletionRound { claimed: true, .. } if self.stop.load(Ordering::Relaxed) => {
                     return Err(Error::Stopped);
                 }
                 CompletionRound { claimed: true, .. } => tokio::time::sleep(LOOK_EVERY).await,
-                CompletionRound { overtaken: true, .. } => rounds += 1,
+                CompletionRound { overtaken: true, .. } | CompletionRound { turned: true, .. } => rounds += 1,
                 _ => break,
             }
         }
-        Ok((count, Arc::new(self.lake.snapshot().await?)))
+        Ok((count, unrestored, Arc::new(self.lake.snapshot().await?)))
     }
 }
 
-fn waiting_runs(lake: &Lake, snapshot: Arc<LakeSnapshot>) -> Vec<(RunId, String)> {
-    let finder = ReferenceFinder::new(lake, snapshot.clone());
+async fn waiting_runs(context: &IngestContext) -> Vec<(RunId, String)> {
+    let finder = context.finder.lock().await;
     let missing = |run: &VisibleRun| (run.run.clone(), finder.wanted_references(&run.surface).missing_names());
-    snapshot.runs().map(missing).filter(|(_, missing)| !missing.is_empty()).collect()
+    context.snapshot.runs().map(missing).filter(|(_, missing)| !missing.is_empty()).collect()
 }
 
 /// Result of a look at all runs.
@@ -97,44 +109,81 @@ struct CompletionRound {
     overtaken: bool,
     /// Another ingest is completing one of them.
     claimed: bool,
+    /// Other runs describe surfaces, whose references may be others.
+    turned: bool,
+    /// Runs that should describe their surfaces, and whose files are refused.
+    unrestored: Vec<(RunId, Error)>,
     /// The snapshot, if nothing was to be done.
     unchanged: Option<Arc<LakeSnapshot>>,
 }
 
+/// A run whose derived rows, or the verdicts that they follow, are not as they should be.
+#[derive(Clone)]
+struct CompletionJob {
+    run: VisibleRun,
+    wanted: WantedReferences,
+    /// Mark of the verdicts on the run.
+    verdicts: Option<String>,
+    by_verdicts: bool,
+}
+
+impl CompletionJob {
+    // Returns whether another run may describe the surface thereafter.
+    fn is_turn(&self) -> bool {
+        self.run.is_rejected() != self.completed_run(None).is_rejected()
+    }
+
+    fn completed_run(&self, reference_derivation: Option<String>) -> VisibleRun {
+        VisibleRun { reference_derivation, verdicts: self.verdicts.clone(), ..self.run.clone() }
+    }
+}
+
+// The runs that are to be completed, apart from those that lack rows: which others are.
+async fn find_jobs(context: &IngestContext, lacking: &BTreeSet<RunId>) -> Vec<CompletionJob> {
+    let snapshot = &context.snapshot;
+    let changed: BTreeSet<_> = snapshot.unfollowed_runs(&context.rejected).map(|run| &run.surface).collect();
+    let mut jobs = Vec::new();
+    for run in snapshot.runs() {
+        let wanted = context.finder.lock().await.wanted_references(&run.surface);
+        let verdicts = verdict_mark(&context.rejected, &run.run);
+        // Without its references, a run has no rows that follow from them.
+        let derivation = wanted.derivation_name(&run.run_derivation, verdicts.as_deref());
+        if derivation != run.reference_derivation || verdicts != run.verdicts || lacking.contains(&run.run) {
+            let of_references = wanted.surfaces().into_iter().any(|surface| changed.contains(surface));
+            let by_verdicts = of_references || verdicts != run.verdicts;
+            jobs.push(CompletionJob { run: run.clone(), wanted, verdicts, by_verdicts });
+        }
+    }
+    jobs
+}
+
 async fn do_round(ingest: &LakeIngest<'_>, cores: &Cores, done: &mut CompletionReport<'_>) -> Result<CompletionRound> {
     let LakeIngest { lake, stop, claims, .. } = ingest;
-    let context = IngestContext::new(lake, cores, lake.snapshot().await?);
-    let mut jobs = Vec::new();
+    let context = IngestContext::read_from(lake, cores, Arc::new(lake.snapshot().await?)).await?;
     let derived = Table::ALL.into_iter().filter(|table| table.source() == Source::References);
     let lacking: BTreeSet<_> =
         derived.flat_map(|table| context.snapshot.lacking_rows(table)).map(|lacking| lacking.run.clone()).collect();
-    for run in context.snapshot.runs() {
-        let wanted = context.finder.lock().await.wanted_references(&run.surface);
-        let derivation = wanted.derivation_name(&run.run_derivation);
-        // Without its references, a run has no rows that follow from them.
-        if derivation != run.reference_derivation || lacking.contains(&run.run) {
-            jobs.push((run.clone(), wanted));
-        }
-    }
-    if jobs.is_empty() {
+    let (turns, jobs): (Vec<_>, Vec<_>) =
+        find_jobs(&context, &lacking).await.into_iter().partition(CompletionJob::is_turn);
+    let total = jobs.len() + turns.len();
+    if total == 0 {
         return Ok(CompletionRound { unchanged: Some(context.snapshot), ..CompletionRound::default() });
     }
-    let total = jobs.len();
     let mut round = CompletionRound::default();
     let shared = claims.clone();
-    let do_one = move |(run, wanted): (VisibleRun, WantedReferences)| {
+    let do_one = move |job: CompletionJob| {
         let context = context.clone();
         let claims = shared.clone();
-        let span = tracing::error_span!("complete", run = %run.run, surface = %run.surface);
+        let span = tracing::error_span!("complete", run = %job.run.run, surface = %job.run.surface);
         let work = async move {
             if let Some(claims) = &claims {
-                claim_run(&context, claims, &run).await?;
+                claim_run(&context, claims, &job.run).await?;
             }
-            complete_run(&context, &run, &wanted).await
+            complete_run(&context, &job).await
         };
         work.instrument(span)
     };
-    let ended = &mut |((run, _), result): pipeline::JobOutcome<(VisibleRun, WantedReferences), CompletedRun>| {
+    let ended = &mut |(CompletionJob { run, .. }, result): pipeline::JobOutcome<CompletionJob, CompletedRun>| {
         match result {
             Err(Error::Claimed { .. }) => {
                 round.claimed = true;
@@ -154,7 +203,88 @@ async fn do_round(ingest: &LakeIngest<'_>, cores: &Cores, done: &mut CompletionR
         Ok(())
     };
     pipeline::run_jobs(lake, cores, jobs, stop, do_one, ended).await?;
+    if !turns.is_empty() && !round.claimed {
+        turn_surfaces(ingest, cores, total, &mut round, done).await?;
+    }
     Ok(round)
+}
+
+// Follows verdicts that reject runs as a whole, or accept them again. Other runs describe their surfaces from then on:
+// the rows of these are written first, and one commit of `runs` names all of them, so that no reader misses a row.
+async fn turn_surfaces(
+    ingest: &LakeIngest<'_>,
+    cores: &Cores,
+    total: usize,
+    round: &mut CompletionRound,
+    done: &mut CompletionReport<'_>,
+) -> Result<()> {
+    let lake = ingest.lake;
+    // Derivations have changed meanwhile.
+    let context = IngestContext::read_from(lake, cores, Arc::new(lake.snapshot().await?)).await?;
+    let mut blocked = BTreeSet::new();
+    for run in context.snapshot.succeeding_runs(&context.rejected) {
+        let Some(run) = context.snapshot.run(&run) else { continue };
+        match ingest.restore_rows(&context.snapshot, &BTreeSet::from([run.run.clone()])).await {
+            Err(why) if why.is_refusal() => {
+                blocked.insert(run.surface.clone());
+                round.unrestored.push((run.run.clone(), why));
+            }
+            restored => {
+                restored?;
+                restore_statistics(&context, run).await?;
+            }
+        }
+    }
+    let mut staged = Vec::new();
+    let mut completed = Vec::new();
+    for job in find_jobs(&context, &BTreeSet::new()).await {
+        if !job.is_turn() || blocked.contains(&job.run.surface) {
+            continue;
+        }
+        if let Some(claims) = &ingest.claims {
+            match claim_run(&context, claims, &job.run).await {
+                Err(Error::Claimed { .. }) => {
+                    round.claimed = true;
+                    continue;
+                }
+                Err(Error::Gone { .. }) => {
+                    round.overtaken = true;
+                    continue;
+                }
+                claimed => claimed?,
+            }
+        }
+        let ready = complete_run(&context, &job).await?;
+        staged.extend(ready.staged);
+        completed.push((job.run, ready.report));
+    }
+    let outcomes = lake.commit_staged(&staged).await?;
+    round.turned = outcomes.contains(&CommitOutcome::Now);
+    round.overtaken |= outcomes.contains(&CommitOutcome::Outdated);
+    for (run, report) in completed {
+        round.changed += 1;
+        done(&report, total);
+        ingest.claims.iter().for_each(|claims| claims.release_work(&work_name(&run)));
+    }
+    Ok(())
+}
+
+// Writes the derived rows of a run that is to describe its surface: the log may have lost them. If its derivation is to
+// become another one, its new rows come with that.
+async fn restore_statistics(context: &IngestContext, run: &VisibleRun) -> Result<()> {
+    let wanted = context.finder.lock().await.wanted_references(&run.surface);
+    let derivation = ReferenceDerivation::new(context, &run.run, &run.run_derivation, &wanted).await?;
+    let Some(derivation) = derivation.filter(|of| run.reference_derivation.as_ref() == Some(&of.name)) else {
+        return Ok(());
+    };
+    let keys = RunKeys { surface: run.surface.clone(), run: run.run.clone() };
+    let name = derivation.name.clone();
+    let responses = read_back::read_responses(&context.lake, &context.snapshot, &run.run).await?;
+    let (mut files, _) = derivation.derive_run(context, &keys, responses).await?;
+    files.retain(|(table, _)| table.key().contains(&"surface_id"));
+    let staged = context.stage_rows(&keys, &name, files).await?;
+    context.lake.commit_staged(&staged).await?;
+    Ok(())
 }
 
 fn work_name(run: &VisibleRun) -> String {
@@ -175,22 +305,20 @@ async fn claim_run(context: &IngestContext, claims: &WorkClaims, run: &VisibleRu
     }
 }
 
-async fn complete_run(
-    context: &IngestContext,
-    run: &VisibleRun,
-    wanted: &WantedReferences,
-) -> Result<ReadyJob<CompletedRun>> {
+async fn complete_run(context: &IngestContext, job: &CompletionJob) -> Result<ReadyJob<CompletedRun>> {
+    let CompletionJob { run, wanted, by_verdicts, .. } = job;
     let lake = &context.lake;
     let keys = RunKeys { surface: run.surface.clone(), run: run.run.clone() };
-    let mut report = CompletedRun { run: run.run.clone(), surface: run.surface.clone(), measurements: 0 };
-    let (files, references) = match ReferenceDerivation::new(context, &run.run_derivation, wanted).await? {
+    let by_verdicts = *by_verdicts;
+    let mut report = CompletedRun { run: run.run.clone(), surface: run.surface.clone(), measurements: 0, by_verdicts };
+    let (files, references) = match ReferenceDerivation::new(context, &run.run, &run.run_derivation, wanted).await? {
         Some(derivation) => {
             let responses = read_back::read_responses(lake, &context.snapshot, &run.run).await?;
             report.measurements = responses.pairs.len();
             derivation.derive_run(context, &keys, responses).await?
         }
-        // A reference was removed.
-        None if wanted.derivation_name(&run.run_derivation).is_none() => {
+        // A reference was removed or rejected, or never there.
+        None if wanted.version_pair().is_none() => {
             (Vec::new(), RunReferences { missing: wanted.missing_names(), ..RunReferences::default() })
         }
         None => return Ok(ReadyJob { staged: Vec::new(), report }),
@@ -200,7 +328,7 @@ async fn complete_run(
         let before = read_back::run_row(lake, file, &run.run).await?;
         row.push(rows::runs::with_references(lake.rig(), &keys, &before, &references)?);
     }
-    let pointer = VisibleRun { reference_derivation: references.derivation.clone(), ..run.clone() };
+    let pointer = job.completed_run(references.derivation.clone());
     let mut staged = context.stage_derived(pointer, &row, files).await?;
     // A row of an earlier version of the program does not count the others.
     if let Some(counts) = context.snapshot.row_counts(&run.run).cloned()

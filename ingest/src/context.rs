@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use arrow::record_batch::RecordBatch;
 use echolake_lake::{EncodedFile, FileName, Lake, LakeSnapshot, StagedFile, VisibleRun, encode_batches};
+use echolake_schema::annotations::RejectedMeasurements;
 use echolake_schema::tables::Table;
 use futures::future::{join_all, try_join};
 
@@ -18,14 +19,17 @@ pub(crate) struct IngestContext {
     pub lake: Lake,
     pub cores: Cores,
     pub snapshot: Arc<LakeSnapshot>,
+    /// The verdicts of the snapshot: what is computed from several measurements leaves these out.
+    pub rejected: Arc<RejectedMeasurements>,
     pub finder: SharedFinder,
 }
 
 impl IngestContext {
-    pub fn new(lake: &Lake, cores: &Cores, snapshot: LakeSnapshot) -> Self {
-        let snapshot = Arc::new(snapshot);
-        let finder = ReferenceFinder::new_shared(lake, snapshot.clone());
-        Self { lake: lake.clone(), cores: cores.clone(), snapshot, finder }
+    /// Reads the snapshot's verdicts.
+    pub async fn read_from(lake: &Lake, cores: &Cores, snapshot: Arc<LakeSnapshot>) -> Result<Self> {
+        let rejected = Arc::new(lake.read_rejections(&snapshot).await?);
+        let finder = ReferenceFinder::new_shared(lake, snapshot.clone(), rejected.clone());
+        Ok(Self { lake: lake.clone(), cores: cores.clone(), snapshot, rejected, finder })
     }
 
     /// Stages a run's files of one derivation.

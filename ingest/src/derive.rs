@@ -9,9 +9,10 @@ use echolake_dsp::mean::SignalMean;
 use echolake_dsp::scattering::{ScatteringPath, ScatteringSums};
 use echolake_dsp::temperature::ReferenceAir;
 use echolake_dsp::uncertainty::{EnergySensitivity, LevelUncertainty};
-use echolake_lake::{EncodedFile, FileEncoder, Lake, encode_batches};
-use echolake_schema::AirTreatment;
+use echolake_lake::{EncodedFile, FileEncoder, Lake, encode_batches, verdict_mark};
+use echolake_schema::annotations::RejectedMeasurements;
 use echolake_schema::tables::Table;
+use echolake_schema::{AirTreatment, RunId};
 
 use crate::context::IngestContext;
 use crate::derived_values::{DerivedRows, RunResponses, derivation_plan, residual_fit};
@@ -31,20 +32,29 @@ pub(crate) struct ReferenceDerivation {
     flat_version: String,
     foam_version: String,
     references: LoadedReferences,
+    /// Measurements that have rows, and that statistics leave out.
+    rejected: Arc<RejectedMeasurements>,
 }
 
 impl ReferenceDerivation {
-    /// Loads the wanted references; None if one is missing.
-    pub async fn new(context: &IngestContext, run_derivation: &str, wanted: &WantedReferences) -> Result<Option<Self>> {
+    /// Loads the references wanted for a run; None if one is missing.
+    pub async fn new(
+        context: &IngestContext,
+        run: &RunId,
+        run_derivation: &str,
+        wanted: &WantedReferences,
+    ) -> Result<Option<Self>> {
+        let mark = verdict_mark(&context.rejected, run);
         let (Some((flat_version, foam_version)), Some(name)) =
-            (wanted.version_pair(), wanted.derivation_name(run_derivation))
+            (wanted.version_pair(), wanted.derivation_name(run_derivation, mark.as_deref()))
         else {
             return Ok(None);
         };
         let Some(references) = context.finder.lock().await.load_references(wanted, &context.cores).await? else {
             return Ok(None);
         };
-        Ok(Some(Self { name, flat_version, foam_version, references }))
+        let rejected = context.rejected.clone();
+        Ok(Some(Self { name, flat_version, foam_version, references, rejected }))
     }
 
     /// Derives every pair that both references have. Returns the files, and the run row's references.
@@ -92,14 +102,15 @@ impl ReferenceDerivation {
         let uncertainty = self.level_uncertainty(lake, keys, responses)?;
         self.derive_slices(lake, keys, responses, uncertainty.as_ref(), &mut scattering, &mut |slice| {
             paired += slice.pairs.len();
-            totals.iter_mut().zip(slice.tnce_columns()).for_each(|(all, some)| all.extend(some));
+            let counted: Vec<bool> = slice.pairs.iter().map(|pair| self.is_counted(keys, *pair)).collect();
+            extend_columns(&mut totals, slice.tnce_columns(), &counted);
             for (estimate, columns) in unbiased.iter_mut().zip(slice.unbiased_columns()) {
-                estimate.iter_mut().zip(columns).for_each(|(all, some)| all.extend(some));
+                extend_columns(estimate, columns, &counted);
             }
-            errors.iter_mut().zip(slice.error_columns()).for_each(|(all, some)| all.extend(some));
+            extend_columns(&mut errors, slice.error_columns(), &counted);
             let [nce, tnce, tnce_d4] = &mut encoders;
             let lists = slice.take_lists(lake.config().samples);
-            lists.add_curves(rig.impulse_response.length, &mut curves).map_err(failed)?;
+            lists.add_curves(rig.impulse_response.length, &counted, &mut curves).map_err(failed)?;
             // Lists take most of the time; an idle core can encode the rest meanwhile.
             let (first, second) = rayon::join(
                 || Ok(nce.1.write_batch(&rows::derived::nce_rows(rig, grid, keys, lists, of)?)?),
@@ -174,7 +185,7 @@ impl ReferenceDerivation {
                     chosen.reflected_spectrum(&unbiased.direct, &mut spectrum, &air_scratch);
                     plan.spectrum_energies(&spectrum, &mut energies);
                     slice.push_unbiased(number, &energies, unbiased.flat_total);
-                    if number == 0 {
+                    if number == 0 && self.is_counted(keys, *pair) {
                         let specular = paths.specular_mm.map(|mm| mm / widest_mm);
                         let path = ScatteringPath { incidence_deg: paths.incidence_deg, specular };
                         scattering.add_pair(&spectrum, &unbiased.flat, path).map_err(failed)?;
@@ -184,6 +195,11 @@ impl ReferenceDerivation {
             take(&mut slice)?;
         }
         Ok(())
+    }
+
+    // Returns whether a run's statistics count a pair.
+    fn is_counted(&self, keys: &RunKeys, pair: u32) -> bool {
+        !self.rejected.is_rejected(keys.run.as_str(), pair)
     }
 
     // None if what the direct sound's subtraction leaves cannot be measured.
@@ -209,6 +225,9 @@ impl ReferenceDerivation {
             let (Some((direct, flat)), Some(paths)) = (chosen.of_pair(*pair), PairPaths::new(lake, *pair)) else {
                 continue;
             };
+            if !self.is_counted(keys, *pair) {
+                continue;
+            }
             chosen.subtract_direct(ir, direct, air, &paths, &mut reflected, &mut scratch).map_err(failed)?;
             let [direct_secs, reflected_secs] = paths.arrival_secs(lake.rig());
             fit.add_pair(&reflected, &direct.ir, direct_secs, reflected_secs).map_err(failed)?;
@@ -228,5 +247,12 @@ impl ReferenceDerivation {
             temperature_k: response.temperature_u_k.hypot(difference_k),
             correction,
         }))
+    }
+}
+
+// Adds the counted rows of each column.
+fn extend_columns<T>(all: &mut [Vec<T>], columns: Vec<Vec<T>>, counted: &[bool]) {
+    for (all, column) in all.iter_mut().zip(columns) {
+        all.extend(column.into_iter().zip(counted).filter(|(_, is_counted)| **is_counted).map(|(value, _)| value));
     }
 }

@@ -100,10 +100,16 @@ pub(crate) struct DerivedLists {
 }
 
 impl DerivedLists {
-    /// Adds the curves, `length` samples each, to the means of their bands.
-    pub fn add_curves(&self, length: usize, means: &mut [SignalMean]) -> Result<(), echolake_dsp::Error> {
+    /// Adds the curves of the counted pairs, `length` samples each, to the means of their bands.
+    pub fn add_curves(
+        &self,
+        length: usize,
+        counted: &[bool],
+        means: &mut [SignalMean],
+    ) -> Result<(), echolake_dsp::Error> {
         for (mean, curves) in means.iter_mut().zip(&self.curves) {
-            curves.chunks_exact(length).try_for_each(|curve| mean.add_signal(curve))?;
+            let curves = curves.chunks_exact(length).zip(counted).filter(|(_, is_counted)| **is_counted);
+            curves.map(|(curve, _)| curve).try_for_each(|curve| mean.add_signal(curve))?;
         }
         Ok(())
     }

@@ -130,12 +130,19 @@ pub async fn examine_lake(lake: &Lake, progress: &mut dyn FnMut(CheckStep<'_>)) 
             bytes: files.iter().map(|f| f.bytes).sum(),
         });
     }
+    // A table of annotations that cannot be read has a finding of its own.
+    let rejected = Arc::new(lake.read_rejections(&snapshot).await.unwrap_or_default());
+    for run in snapshot.unfollowed_runs(&rejected) {
+        let what = "verdicts on it came after the last ingest; hint: `echolake ingest` derives again what rests on it";
+        report.add_finding(FindingSeverity::Note, &run.run, what);
+    }
+    let finder = ReferenceFinder::new(lake, snapshot.clone(), rejected);
     for run in snapshot.runs() {
         for file in snapshot.files_of(Table::Runs, &run.run) {
             progress(CheckStep { subject: file.path.as_ref(), done, total });
             done += 1;
             match read_back::run_row(lake, file, &run.run).await {
-                Ok(row) => check_run(lake, &snapshot, &row, &mut report).await?,
+                Ok(row) => check_run(lake, &finder, &row, &mut report).await?,
                 // Reported above, when the table's files were decoded.
                 Err(_) => continue,
             }
@@ -176,12 +183,7 @@ async fn find_faults(lake: &Lake, snapshot: &LakeSnapshot, report: &mut LakeRepo
     Ok(())
 }
 
-async fn check_run(
-    lake: &Lake,
-    snapshot: &Arc<LakeSnapshot>,
-    row: &RecordBatch,
-    report: &mut LakeReport,
-) -> Result<()> {
+async fn check_run(lake: &Lake, finder: &ReferenceFinder, row: &RecordBatch, report: &mut LakeReport) -> Result<()> {
     let text = |column| text_of(row, column).unwrap_or_default();
     let run = text("run_id");
     let path = text("file");
@@ -202,7 +204,7 @@ async fn check_run(
         );
     }
     if let Ok(surface) = text("surface_id").parse() {
-        let missing = ReferenceFinder::new(lake, snapshot.clone()).wanted_references(&surface).missing_names();
+        let missing = finder.wanted_references(&surface).missing_names();
         if !missing.is_empty() {
             let what = format!(
                 "waits for reference {missing}, which levels need; hint: ingest a run of that surface, and it is completed"

@@ -7,8 +7,8 @@ use std::time::Duration;
 
 use echolake_dsp::air::AirState;
 use echolake_lake::{
-    ClaimOutcome, ClaimTimes, CommitOutcome, EncodedFile, Lake, RunRowCounts, VisibleRun, WorkClaims, encode_batches,
-    object_sha256,
+    ClaimOutcome, ClaimTimes, CommitOutcome, EncodedFile, Lake, ReferenceNames, RunRowCounts, VisibleRun, WorkClaims,
+    encode_batches, object_sha256, verdict_mark,
 };
 use echolake_schema::RunId;
 use echolake_schema::messages::Measurement;
@@ -24,7 +24,7 @@ use crate::inbox::{self, FileVersion, OpenedRun, ReadFile, ReadingMark, RunSourc
 use crate::pipeline::{self, Cores, ReadyJob};
 use crate::read_back;
 use crate::reading::{Measurer, Response, RunContent, RunHead, check_filled};
-use crate::references::{ReferenceNames, digest_parts};
+use crate::references::digest_parts;
 use crate::report::{FileReport, IngestOutcome, IngestedRun};
 use crate::rows::runs::RunReferences;
 use crate::rows::{self, RunKeys};
@@ -118,7 +118,7 @@ impl<'a> LakeIngest<'a> {
                     Some(first) => first,
                     None => self.lake.snapshot().await?,
                 };
-                let context = IngestContext::new(self.lake, &cores, snapshot);
+                let context = IngestContext::read_from(self.lake, &cores, Arc::new(snapshot)).await?;
                 let runs = || Arc::new(context.snapshot.runs().map(|run| run.run.clone()).collect());
                 let known = known.get_or_insert_with(runs).clone();
                 let shared = self.claims.clone().map(|claims| SharedWork { claims, known });
@@ -138,7 +138,8 @@ impl<'a> LakeIngest<'a> {
     /// Ingests a file as versions before this one did, whether it has an end or not.
     #[cfg(test)]
     pub(crate) async fn ingest_without_end(&self, source: &RunSource) -> Result<IngestedRun> {
-        let context = IngestContext::new(self.lake, &Cores::all()?, self.lake.ensure_tables().await?);
+        let snapshot = Arc::new(self.lake.ensure_tables().await?);
+        let context = IngestContext::read_from(self.lake, &Cores::all()?, snapshot).await?;
         let measurer = Arc::new(Measurer::new(self.lake));
         let work = IngestWork { again: false, context, measurer, shared: None };
         let job = work.read_and_stage(source).await?;
@@ -249,7 +250,7 @@ impl IngestWork {
     }
 
     async fn read_and_stage(&self, source: &RunSource) -> Result<ReadyJob<IngestedRun>> {
-        let IngestContext { lake, cores, snapshot, finder } = &self.context;
+        let IngestContext { lake, cores, snapshot, rejected, finder } = &self.context;
         let mark = ReadingMark::new(lake, source);
         let opened = source.open_run(lake)?;
         let version = FileVersion::from_source(lake, source).await?;
@@ -321,15 +322,17 @@ impl IngestWork {
             return Ok(ReadyJob { staged, report: taken });
         }
         let of_references = async {
-            let (files, references) = match ReferenceDerivation::new(&self.context, &derivation, &wanted).await? {
-                Some(derived) => derived.derive_run(&self.context, &keys, content.run_responses()).await?,
-                None => (Vec::new(), RunReferences { missing: wanted.missing_names(), ..RunReferences::default() }),
-            };
+            let (files, references) =
+                match ReferenceDerivation::new(&self.context, &keys.run, &derivation, &wanted).await? {
+                    Some(derived) => derived.derive_run(&self.context, &keys, content.run_responses()).await?,
+                    None => (Vec::new(), RunReferences { missing: wanted.missing_names(), ..RunReferences::default() }),
+                };
             let run = VisibleRun {
                 surface: keys.surface.clone(),
                 run: keys.run.clone(),
                 run_derivation: derivation.clone(),
                 reference_derivation: references.derivation.clone(),
+                verdicts: verdict_mark(rejected, &keys.run),
             };
             let row = rows::runs::new_run_row(lake, &keys, &content, &derivation, &references)?;
             Ok((self.context.stage_derived(run, &[row], files).await?, references))

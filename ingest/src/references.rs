@@ -11,9 +11,11 @@ use echolake_dsp::foam_reflection::{FoamReflection, FoamReflectionFit, Reflectio
 use echolake_dsp::geometry::{direct_mm, image_mm, incidence_deg, specular_point};
 use echolake_dsp::temperature::ReferenceAir;
 use echolake_dsp::uncertainty::{DirectSoundResidual, EnergySensitivity};
-use echolake_lake::{DataFile, DirectSound, FileName, Lake, LakeSnapshot, ReferenceSurfaces, SamplePrecision};
-use echolake_schema::tables::Table;
-use echolake_schema::{PairId, Rig, SurfaceId, SurfaceRecord};
+use echolake_lake::{
+    DirectSound, Lake, LakeSnapshot, ReferenceNames, SamplePrecision, SurfaceReferences, VisibleRun, verdict_mark,
+};
+use echolake_schema::annotations::RejectedMeasurements;
+use echolake_schema::{PairId, Rig, SurfaceId};
 use futures::future::try_join_all;
 use rayon::iter::{IntoParallelRefIterator as _, ParallelIterator as _};
 use sha2::{Digest as _, Sha256};
@@ -36,8 +38,10 @@ const VERSION_DIGITS: usize = 12;
 pub(crate) struct ReferenceFinder {
     lake: Lake,
     snapshot: Arc<LakeSnapshot>,
+    /// Measurements that no mean is made of.
+    rejected: Arc<RejectedMeasurements>,
     /// The references that each surface's row names.
-    names: HashMap<SurfaceId, ReferenceNames>,
+    names: SurfaceReferences,
     versions: HashMap<SurfaceId, String>,
     /// Keyed by version: the means change with the runs, and so does the version.
     means: HashMap<String, Arc<MeanResponses>>,
@@ -90,23 +94,6 @@ impl LoadedReferences {
 /// One finder for all workers: they share its cache.
 pub(crate) type SharedFinder = Arc<Mutex<ReferenceFinder>>;
 
-/// The surfaces that a surface names as its references.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct ReferenceNames {
-    pub flat: SurfaceId,
-    pub foam: SurfaceId,
-}
-
-impl ReferenceNames {
-    /// Returns the names that a run's surface gives, else the lake's.
-    pub fn from_surface(surface: &SurfaceRecord, references: &ReferenceSurfaces) -> Self {
-        Self {
-            flat: surface.flat_reference.clone().unwrap_or_else(|| references.flat.clone()),
-            foam: surface.foam_reference.clone().unwrap_or_else(|| references.foam.clone()),
-        }
-    }
-}
-
 /// The references of a surface, as far as the lake has them.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct WantedReferences {
@@ -134,34 +121,35 @@ impl ReferenceVersion {
 }
 
 impl ReferenceFinder {
-    pub fn new(lake: &Lake, snapshot: Arc<LakeSnapshot>) -> Self {
+    pub fn new(lake: &Lake, snapshot: Arc<LakeSnapshot>, rejected: Arc<RejectedMeasurements>) -> Self {
         let mut runs: HashMap<_, Vec<_>> = HashMap::new();
-        for run in snapshot.runs() {
-            runs.entry(run.surface.clone()).or_default().push(format!("{}.{}", run.run, run.run_derivation));
+        for run in accepted_runs(&snapshot, &rejected) {
+            let mark = verdict_mark(&rejected, &run.run).map(|mark| format!("-{mark}")).unwrap_or_default();
+            runs.entry(run.surface.clone()).or_default().push(format!("{}.{}{mark}", run.run, run.run_derivation));
         }
-        // `flat:2:1f00ab...`: the surface, the number of runs, and a digest of their derivations.
+        // `flat:2:1f00ab...`: the surface, the number of runs, and a digest of their derivations and verdicts.
         let version = |(surface, runs): (SurfaceId, Vec<String>)| {
             let version = format!("{surface}:{}:{}", runs.len(), digest_parts(&runs));
             (surface, version)
         };
         let versions = runs.into_iter().map(version).collect();
-        let names =
-            snapshot.files(Table::Surfaces).iter().flat_map(|f| names_of_file(f, &lake.config().references)).collect();
-        Self { lake: lake.clone(), snapshot, names, versions, means: HashMap::new(), loaded: HashMap::new() }
+        let names = SurfaceReferences::from_snapshot(&snapshot, &lake.config().references);
+        let lake = lake.clone();
+        Self { lake, snapshot, rejected, names, versions, means: HashMap::new(), loaded: HashMap::new() }
     }
 
-    pub fn new_shared(lake: &Lake, snapshot: Arc<LakeSnapshot>) -> SharedFinder {
-        Arc::new(Mutex::new(Self::new(lake, snapshot)))
+    pub fn new_shared(lake: &Lake, snapshot: Arc<LakeSnapshot>, rejected: Arc<RejectedMeasurements>) -> SharedFinder {
+        Arc::new(Mutex::new(Self::new(lake, snapshot, rejected)))
     }
 
     /// Returns the references with which the surface's rows must be derived.
     pub fn wanted_references(&self, surface: &SurfaceId) -> WantedReferences {
-        self.wanted_by(self.reference_names(surface))
+        self.wanted_by(self.names.names_of(surface))
     }
 
     /// The same for a surface with these names.
     pub fn wanted_by(&self, ReferenceNames { flat, foam }: ReferenceNames) -> WantedReferences {
-        let flat_foam = self.reference_names(&flat).foam;
+        let flat_foam = self.names.names_of(&flat).foam;
         WantedReferences {
             flat: self.find_version(flat),
             foam: self.find_version(foam),
@@ -206,7 +194,8 @@ impl ReferenceFinder {
         let [foam_name, flat_name] = [&wanted.foam, &wanted.flat].map(|of| of.surface.to_string());
         let found = cores.compute_on_core(derive).await?;
         let (chosen, unbiased) = found.ok_or(Error::FoamReflection { foam: foam_name, flat: flat_name })?;
-        let flat_runs = self.snapshot.runs().filter(|run| run.surface == wanted.flat.surface).count();
+        let accepted = accepted_runs(&self.snapshot, &self.rejected);
+        let flat_runs = accepted.filter(|run| run.surface == wanted.flat.surface).count();
         let only_flat = (flat_runs == 1).then(|| wanted.flat.surface.clone());
         let loaded = LoadedReferences { chosen, unbiased, only_flat };
         self.loaded.insert(versions, loaded.clone());
@@ -230,11 +219,14 @@ impl ReferenceFinder {
     async fn compute_mean(&self, of: &ReferenceVersion) -> Result<MeanResponses> {
         // Number of responses, the sums of their air's temperature, humidity and pressure, and that of their samples.
         let mut sums: HashMap<u32, (u32, [f64; 3], Vec<f64>)> = HashMap::new();
-        for run in self.snapshot.runs().filter(|r| r.surface == of.surface) {
+        for run in accepted_runs(&self.snapshot, &self.rejected).filter(|r| r.surface == of.surface) {
             let responses = read_back::read_responses(&self.lake, &self.snapshot, &run.run).await?;
             let length = self.lake.rig().impulse_response.length;
             let measured = responses.pairs.iter().zip(&responses.airs).zip(responses.irs.chunks_exact(length));
             for ((pair, air), ir) in measured {
+                if self.rejected.is_rejected(run.run.as_str(), *pair) {
+                    continue;
+                }
                 let (count, airs, sum) = sums.entry(*pair).or_insert_with(|| (0, [0.0; 3], vec![0.0; length]));
                 *count += 1;
                 let values = [air.temperature_c, air.humidity_pct, air.pressure_hpa];
@@ -253,27 +245,14 @@ impl ReferenceFinder {
     fn find_version(&self, surface: SurfaceId) -> ReferenceVersion {
         ReferenceVersion { version: self.versions.get(&surface).cloned(), surface }
     }
-
-    // The lake's defaults for an unknown surface.
-    fn reference_names(&self, surface: &SurfaceId) -> ReferenceNames {
-        let references = &self.lake.config().references;
-        let defaults = || ReferenceNames { flat: references.flat.clone(), foam: references.foam.clone() };
-        self.names.get(surface).cloned().unwrap_or_else(defaults)
-    }
 }
 
-// The names in the rows of a file's surfaces, which are the same in all of them, taken from the file's statistics.
-fn names_of_file(file: &DataFile, references: &ReferenceSurfaces) -> Vec<(SurfaceId, ReferenceNames)> {
-    let surfaces = match FileName::parse(&file.path) {
-        Some(FileName::Rows { surface, .. }) => vec![surface],
-        _ => file.visible_parts().map(|(part, _)| part.surface.clone()).collect(),
-    };
-    let text = |column: &str| file.stats.as_ref()?.min.get(column)?.as_str()?.parse().ok();
-    let names = ReferenceNames {
-        flat: text("flat_reference").unwrap_or_else(|| references.flat.clone()),
-        foam: text("foam_reference").unwrap_or_else(|| references.foam.clone()),
-    };
-    surfaces.into_iter().map(|surface| (surface, names.clone())).collect()
+// Runs whose rejection is of some measurements are among them.
+fn accepted_runs<'a>(
+    snapshot: &'a LakeSnapshot,
+    rejected: &'a RejectedMeasurements,
+) -> impl Iterator<Item = &'a VisibleRun> + 'a {
+    snapshot.runs().filter(|run| !rejected.is_run_rejected(run.run.as_str()))
 }
 
 impl ReferenceResponses {
@@ -478,13 +457,18 @@ impl WantedReferences {
         Some((format!("{flat}-{}", digest_parts(&[flat_foam])), self.foam.version.clone()?))
     }
 
-    /// Returns the derivation's name for a run with these references.
-    pub fn derivation_name(&self, run_derivation: &str) -> Option<String> {
+    /// Returns the derivation's name for a run with these references, and this mark of the verdicts on it.
+    pub fn derivation_name(&self, run_derivation: &str, verdicts: Option<&str>) -> Option<String> {
         let (flat, foam) = self.version_pair()?;
-        let settings = [self.direct_sound.name(), self.samples.name()];
-        Some(digest_parts(
-            &[[run_derivation, &flat, &foam, CODE_VERSION, ROWS_REVISION].as_slice(), &settings].concat(),
-        ))
+        let mut parts = vec![run_derivation, &flat, &foam, CODE_VERSION, ROWS_REVISION];
+        parts.extend([self.direct_sound.name(), self.samples.name()]);
+        parts.extend(verdicts);
+        Some(digest_parts(&parts))
+    }
+
+    /// The surfaces.
+    pub fn surfaces(&self) -> [&SurfaceId; 3] {
+        [&self.flat, &self.foam, &self.flat_foam].map(|reference| &reference.surface)
     }
 
     /// Returns the names of the missing references, for messages.

@@ -3,9 +3,9 @@
 //! The order makes a removal that was cut off one that can be resumed: without its file, no ingest brings a run back.
 //! Its row in `runs` goes before its other rows, so that readers see all of it or nothing.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 
-use echolake_lake::{Lake, LakeSnapshot, RemovalRecord};
+use echolake_lake::{Lake, LakeSnapshot, RemovalRecord, VisibleRun};
 use echolake_schema::tables::Table;
 use echolake_schema::{RunId, SurfaceId};
 use object_store::path::Path;
@@ -133,24 +133,26 @@ impl LakeIngest<'_> {
     // the newest ones are gone is therefore written before.
     async fn restore_surfaces(&self, removed: &BTreeSet<RunId>) -> Result<()> {
         let snapshot = self.lake.snapshot().await?;
-        let mut newest: BTreeMap<_, RunId> = BTreeMap::new();
-        for run in snapshot.runs().filter(|run| !removed.contains(&run.run)) {
-            let is_older = |of: &&RunId| **of > run.run && snapshot.run(of).is_some_and(|of| of.surface == run.surface);
-            if removed.iter().any(|of| is_older(&of)) {
-                let project = snapshot.project_of(&run.run).map(ToString::to_string);
-                newest.insert((run.surface.clone(), project), run.run.clone());
-            }
-        }
-        let source = |((surface, _), run): (&(SurfaceId, _), &RunId)| RunSource::Lake(Lake::run_path(surface, run));
-        let sources: Vec<_> = newest.iter().map(source).collect();
+        let later = snapshot.describing_runs(|run| !removed.contains(&run.run), VisibleRun::is_rejected);
+        let present = snapshot.describing_runs(|_| true, VisibleRun::is_rejected);
+        self.restore_rows(&snapshot, &(&later - &present)).await
+    }
+
+    /// Writes the own rows of runs that are to describe their surfaces: the log may have lost them.
+    ///
+    /// # Errors
+    /// The refusal of a run's file.
+    pub(crate) async fn restore_rows(&self, snapshot: &LakeSnapshot, runs: &BTreeSet<RunId>) -> Result<()> {
+        let source = |run: &VisibleRun| RunSource::Lake(Lake::run_path(&run.surface, &run.run));
+        let sources: Vec<_> = runs.iter().filter_map(|run| snapshot.run(run)).map(source).collect();
         if sources.is_empty() {
             return Ok(());
         }
         let mut refused = None;
-        let mut report = |report: FileReport| {
-            if let FileReport::Refused { why, .. } = report {
-                refused = Some(why);
-            }
+        let mut report = |report: FileReport| match report {
+            FileReport::Refused { why, .. } => refused = Some(why),
+            FileReport::Gone(file) => refused = Some(Error::Gone { file: file.to_string() }),
+            FileReport::Ingested(_) | FileReport::Claimed(_) => {}
         };
         self.clone().writing_again().ingest_runs(sources, &mut report).await?;
         refused.map_or(Ok(()), Err)

@@ -84,7 +84,8 @@ pub fn grid_query(rig: &Rig, over: LevelReference, surface: &str, microphone: &s
     let filter = point_filter(microphone);
     format!(
         "select pair_id, microphone, speaker, {energies} as energies from tnce \
-         where surface_id = {surface}{filter} group by pair_id, microphone, speaker"
+         where surface_id = {surface}{filter} and not is_rejected(run_id, pair_id) \
+         group by pair_id, microphone, speaker"
     )
 }
 
@@ -147,8 +148,8 @@ pub fn diffusion_query(rig: &Rig, condition: &str) -> String {
     let means = band_list(rig, |band| format!("avg(d_{band})"));
     format!(
         "select surface_id, {means} as diffusion from (select surface_id, run_id, point, {} from (select surface_id, \
-         run_id, unnest([microphone, speaker]) as point, {} from tnce {condition}) group by surface_id, run_id, point) \
-         group by surface_id",
+         run_id, unnest([microphone, speaker]) as point, {} from (select * from tnce where not is_rejected(run_id, \
+         pair_id)) as tnce {condition}) group by surface_id, run_id, point) group by surface_id",
         coefficients.join(", "),
         energies.join(", ")
     )
@@ -167,7 +168,10 @@ pub struct DiffusionRow {
 /// is empty.
 pub fn curves_query(rig: &Rig, surfaces: &str, filter: &str) -> String {
     let columns = curve_columns(rig);
-    format!("select surface_id, {columns} from nce where surface_id in ({surfaces}){filter} group by surface_id")
+    format!(
+        "select surface_id, {columns} from nce where surface_id in ({surfaces}) and not is_rejected(run_id, \
+         pair_id){filter} group by surface_id"
+    )
 }
 
 /// Returns the columns of [`CurveRow`] behind its surface, aggregates over rows of `nce`.
@@ -235,7 +239,7 @@ pub fn total_curve(bands: &[Vec<f32>]) -> Vec<f32> {
 pub fn orbit_energies_query(rig: &Rig) -> String {
     let column = |(i, band): (usize, &String)| format!("cast(tnce_band_{band} as float) as band_{i}");
     let columns: Vec<_> = rig.band_names().iter().enumerate().map(column).collect();
-    format!("select surface_id, pair_id, {} from tnce", columns.join(", "))
+    format!("select surface_id, pair_id, {} from tnce where not is_rejected(run_id, pair_id)", columns.join(", "))
 }
 
 /// Surfaces' energies, arranged by orbits of pairs (see [`Grid::pair_orbits`]), so that surfaces can be compared

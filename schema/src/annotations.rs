@@ -168,6 +168,20 @@ impl RejectedMeasurements {
         self.runs.get(run).is_some_and(|verdicts| verdicts.is_rejected && verdicts.others.is_empty())
     }
 
+    /// Describes the rejections of a run, in one way for the same measurements: `all`, `all but 3 7`, or `3 7`. None if
+    /// none is rejected.
+    pub fn rejection_text(&self, run: &str) -> Option<String> {
+        let RunVerdicts { is_rejected, others } = self.runs.get(run)?;
+        let mut pairs: Vec<u32> = others.iter().copied().collect();
+        pairs.sort_unstable();
+        let pairs = pairs.iter().map(u32::to_string).collect::<Vec<_>>().join(" ");
+        Some(match (is_rejected, pairs.as_str()) {
+            (true, "") => "all".to_owned(),
+            (true, pairs) => format!("all but {pairs}"),
+            (false, pairs) => pairs.to_owned(),
+        })
+    }
+
     /// Returns whether some measurement of a run is rejected.
     pub fn has_run(&self, run: &str) -> bool {
         self.runs.contains_key(run)
@@ -231,6 +245,11 @@ mod tests {
         check(&[annotation("r", all, AnnotationKind::Label, "rejected")], &[], false);
         let undone = [verdict("r", one, "rejected"), verdict("r", one, "accepted")];
         assert!(RejectedMeasurements::from_annotations(&undone).is_empty());
+        let text = |verdicts: &[Annotation]| RejectedMeasurements::from_annotations(verdicts).rejection_text("r");
+        assert_eq!(text(&undone), None);
+        assert_eq!(text(&[verdict("r", one, "rejected"), verdict("r", some, "rejected")]).as_deref(), Some("1 2"));
+        assert_eq!(text(&[verdict("r", all, "rejected")]).as_deref(), Some("all"));
+        assert_eq!(text(&[verdict("r", all, "rejected"), verdict("r", one, "accepted")]).as_deref(), Some("all but 2"));
     }
 
     #[test]

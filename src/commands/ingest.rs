@@ -282,14 +282,33 @@ async fn ingest_and_complete(
     let mut task = None;
     let mut rows = 0;
     let mut runs = 0;
+    let mut judged_surfaces = HashSet::new();
+    let mut judged_rows = 0;
     let completed = &mut |completed: &CompletedRun, total: usize| {
         rows += completed.measurements;
         runs += 1;
+        if completed.by_verdicts {
+            judged_surfaces.insert(completed.surface.clone());
+            judged_rows += completed.measurements;
+        }
         task.get_or_insert_with(|| progress.start_task("complete", total as u64, "runs")).set_done(runs);
     };
     let completion = ingest.complete_runs(completed).await?;
     if let Some(task) = task {
         task.finish_with(format!("{runs} runs, {rows} measurements derived"));
+    }
+    if !judged_surfaces.is_empty() {
+        progress.print_message(format!(
+            "verdicts: {} surfaces with {judged_rows} measurements were derived again, because verdicts on their runs \
+             or references came since the last ingest",
+            judged_surfaces.len()
+        ));
+    }
+    for (run, why) in completion.unrestored {
+        progress.print_message(format!(
+            "warning: the verdict on a newer run of its surface is not followed, because run `{run}`, which is to \
+             describe the surface instead, cannot be read: {why}"
+        ));
     }
     summary.lacks_rows = !completion.is_whole;
     for (run, missing) in completion.waiting {

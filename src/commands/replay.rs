@@ -193,7 +193,7 @@ pub(in crate::commands) async fn run_file(lake: &Lake, name: &str) -> anyhow::Re
     let run = name.parse::<RunId>().ok();
     let surface = name.parse::<SurfaceId>().ok();
     let of_run = run.and_then(|run| snapshot.run(&run).cloned());
-    let found = of_run.or_else(|| snapshot.newest_run(&surface?).cloned());
+    let found = of_run.or_else(|| snapshot.newest_run(surface.as_ref()?).cloned());
     let found = found.with_context(|| {
         let mut known: Vec<_> = snapshot.runs().map(|run| run.surface.to_string()).collect();
         known.dedup();

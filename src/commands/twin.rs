@@ -299,7 +299,8 @@ impl TwinDifferences {
                 "select m.pair_id, m.microphone, m.speaker, '{band}' as band, {} as surface_db, {} as twin_db, \
                  {} - {} as difference_db from tnce m join tnce c on c.pair_id = m.pair_id \
                  where m.surface_id = '{surface}' and c.surface_id = '{twin}' \
-                 and m.run_id = '{measured_run}' and c.run_id = '{twin_run}' and m.{column} > 0 and c.{column} > 0",
+                 and m.run_id = '{measured_run}' and c.run_id = '{twin_run}' and not is_rejected(m.run_id, m.pair_id) \
+                 and m.{column} > 0 and c.{column} > 0",
                 levels("m"),
                 levels("c"),
                 levels("m"),

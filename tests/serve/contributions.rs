@@ -266,6 +266,59 @@ fn adding_needs_its_scope() {
     assert_eq!((rows.len(), rows[0]["author"].as_str()), (1, Some("bob")), "{rows:?}");
 }
 
+/// E2: a verdict on a run of Flat, on which all levels rest, needs a right of its own and a confirmation, and what it
+/// changes is told before. E13: pages say that levels do not follow it yet, until an ingest, which tells what it does.
+#[test]
+fn a_verdict_on_a_reference_needs_its_right_and_a_confirmation() {
+    let place = lake();
+    let runs = place.sql("select run_id from runs where surface_id = 'flat'");
+    let flat = runs[0]["run_id"].as_str().expect("a name").to_owned();
+    let (author, author_lines) = new_token(&place, &["bob", "--scopes", "sql,annotate"]);
+    let (judge, judge_lines) = new_token(&place, &["eve", "--scopes", "sql,annotate,annotate-references"]);
+    std::fs::write(place.path("tokens.toml"), author_lines + &judge_lines).expect("written");
+    let server = served(&place, &["--tokens", "tokens.toml"]);
+    let send = |server: &ServedLake, token: Option<&str>, annotation: &serde_json::Value, is_confirmed: bool| {
+        let body = json!({ "annotations": [annotation], "confirm_rederivation": is_confirmed }).to_string();
+        let request = HttpRequest::post("/api/v1/annotations", &body).with("content-type", "application/json");
+        let authorization = token.map(|token| format!("Bearer {token}"));
+        authorization.iter().fold(request, |request, value| request.with("authorization", value)).send(server)
+    };
+    let bad = json!({ "run_id": flat, "pair_ids": [7], "kind": "verdict", "value": "rejected", "comment": "knocked" });
+    let label = json!({ "run_id": flat, "kind": "label", "value": "odd" });
+    let of_brick = json!({ "run_id": find_run(&place), "kind": "verdict", "value": "accepted" });
+    for is_confirmed in [false, true] {
+        refused(&send(&server, Some(&author), &bad, is_confirmed), 403, "forbidden");
+    }
+    assert_eq!([&label, &of_brick].map(|other| send(&server, Some(&author), other, false).status), [200, 200]);
+    let told = |answer: &HttpResponse| {
+        refused(answer, 409, "unconfirmed");
+        let tables = ["nce", "tnce", "tnce_d4", "surface_stats"];
+        let rows: f64 = tables.map(|table| place.number(&format!("select count(*) from {table}"))).iter().sum();
+        let detail = json(answer)["detail"].as_str().expect("a text").to_owned();
+        assert!(detail.contains(&format!("derives {rows} rows of 3 surfaces again")), "{detail}");
+    };
+    told(&send(&server, Some(&judge), &bad, false));
+    assert_eq!(place.number("select count(*) from annotations"), 2.0, "nothing is stored");
+    drop(server);
+    // Without tokens, the owner confirms, too.
+    let server = served(&place, &[]);
+    told(&send(&server, None, &bad, false));
+    assert_eq!(send(&server, None, &bad, true).status, 200);
+    let unfollowed = || {
+        let surface = json(&get(&server, "/api/v1/surfaces/brick"));
+        let measured = surface["statistics"][0]["measurements"].as_i64().expect("a number");
+        let lake = json(&get(&server, "/api/v1/lake"));
+        (surface["unfollowed_runs"].clone(), lake["unfollowed_runs"].as_u64().expect("a number"), measured)
+    };
+    let (runs, of_lake, before) = unfollowed();
+    assert_eq!((runs, of_lake), (json!([flat]), 1));
+    let ingested = place.run(&["ingest"]);
+    let printed = crate::stderr(&ingested);
+    assert!(printed.contains("verdicts: 3 surfaces with"), "{printed}");
+    assert_eq!(unfollowed(), (json!([]), 0, before - 1), "Flat lacks a pair");
+    assert!(!crate::stderr(&place.run(&["ingest"])).contains("verdicts:"), "once");
+}
+
 #[test]
 fn acknowledged_annotations_are_stored_once() {
     let mut campaign = AnnotationKillCampaign::new(Path::new(crate::ECHOLAKE), 7);

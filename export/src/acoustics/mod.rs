@@ -8,11 +8,14 @@ mod wav;
 
 use std::path::Path;
 
-use arrow::array::AsArray as _;
+use arrow::array::{AsArray as _, BooleanArray};
+use arrow::compute::filter_record_batch;
 use arrow::datatypes::{Float32Type, Float64Type, Int32Type, Int64Type};
+use arrow::error::ArrowError;
 use arrow::record_batch::RecordBatch;
 use echolake_lake::{Lake, LakeSnapshot, VisibleRun};
 use echolake_schema::SurfaceId;
+use echolake_schema::annotations::RejectedMeasurements;
 use echolake_schema::tables::Table;
 
 use crate::error::{Error, Result};
@@ -43,6 +46,7 @@ pub enum ResponseFormat {
 }
 
 /// Writes the responses of each surface's newest run into a new folder; an empty list of surfaces means all of them.
+/// Measurements that the last verdict rejects are left out.
 /// `progress` is called with the number of surfaces done and their total.
 ///
 /// # Errors
@@ -55,11 +59,12 @@ pub async fn write_responses(
     progress: &mut (dyn FnMut(usize, usize) + Send),
 ) -> Result<Vec<WrittenFile>> {
     let snapshot = lake.whole_snapshot().await?;
-    let runs = newest_runs(&snapshot, surfaces)?;
+    let rejected = lake.read_rejections(&snapshot).await?;
+    let runs = newest_runs(&snapshot, surfaces, &rejected)?;
     let pending = PendingFolder::create(folder)?;
     let mut files = Vec::new();
     for (done, run) in runs.iter().enumerate() {
-        let responses = SurfaceResponses::read_run(lake, &snapshot, run).await?;
+        let responses = SurfaceResponses::read_run(lake, &snapshot, run, &rejected).await?;
         match format {
             ResponseFormat::Sofa => files.push(sofa::write_sofa(lake, &responses, &pending)?),
             ResponseFormat::Npz => files.extend(npz::write_npz(lake, &snapshot, &responses, &pending).await?),
@@ -85,25 +90,39 @@ pub fn write_sofa_file(lake: &Lake, run: &VisibleRun, rows: &RecordBatch, path: 
 /// The columns of `measurements` that a SOFA file is made of.
 pub const SOFA_COLUMNS: [&str; 4] = ["pair_id", "log_time_ns", "temperature_c", "ir"];
 
-// The newest run of each surface, sorted by surface id.
-fn newest_runs(snapshot: &LakeSnapshot, surfaces: &[SurfaceId]) -> Result<Vec<VisibleRun>> {
-    let all = snapshot.runs().filter_map(|run| Some((&run.surface, snapshot.newest_run(&run.surface)?)));
-    let mut newest: std::collections::BTreeMap<&SurfaceId, &VisibleRun> = all.collect();
+// The newest run of each surface that is not rejected, sorted by surface id.
+fn newest_runs(
+    snapshot: &LakeSnapshot,
+    surfaces: &[SurfaceId],
+    rejected: &RejectedMeasurements,
+) -> Result<Vec<VisibleRun>> {
+    let mut newest: std::collections::BTreeMap<&SurfaceId, &VisibleRun> = std::collections::BTreeMap::new();
+    let accepted = snapshot.runs().filter(|run| !rejected.is_run_rejected(run.run.as_str()));
+    newest.extend(accepted.map(|run| (&run.surface, run)));
     if let Some(unknown) = surfaces.iter().find(|s| !newest.contains_key(s)) {
         let known = newest.keys().take(20).map(|s| s.as_str()).collect::<Vec<_>>().join(", ");
         return Err(Error::Unknown { kind: "surface", name: unknown.to_string(), known });
     }
     if newest.is_empty() {
-        return Err(Error::Nothing { reason: "the lake has no runs; hint: `echolake ingest`".into() });
+        return Err(Error::Nothing { reason: "the lake has no accepted runs; hint: `echolake ingest`".into() });
     }
     newest.retain(|surface, _| surfaces.is_empty() || surfaces.contains(surface));
     Ok(newest.into_values().cloned().collect())
 }
 
 impl SurfaceResponses {
-    async fn read_run(lake: &Lake, snapshot: &LakeSnapshot, run: &VisibleRun) -> Result<Self> {
+    async fn read_run(
+        lake: &Lake,
+        snapshot: &LakeSnapshot,
+        run: &VisibleRun,
+        rejected: &RejectedMeasurements,
+    ) -> Result<Self> {
         let batch = rows::of_run(lake, snapshot, Table::Measurements, &run.run, &SOFA_COLUMNS).await?;
-        Self::from_rows(lake, run, &batch)
+        let pairs = rows::number_column::<Int32Type>(&batch, "pair_id")?.iter();
+        let is_kept = |pair: &i32| !rejected.is_rejected(run.run.as_str(), pair.cast_unsigned());
+        let kept: BooleanArray = pairs.map(|pair| Some(is_kept(pair))).collect();
+        let damaged = |e: ArrowError| Error::damaged(format!("measurements, run {}", run.run), e);
+        Self::from_rows(lake, run, &filter_record_batch(&batch, &kept).map_err(damaged)?)
     }
 
     fn from_rows(lake: &Lake, run: &VisibleRun, batch: &RecordBatch) -> Result<Self> {

@@ -166,8 +166,7 @@ impl Plan {
             .flat_map(|(part, of)| deal_shards(part, of, set.split.seed))
             .collect();
         let moves = SymmetryMoves::from_grid(lake.grid(), set.symmetries);
-        let annotations = lake.read_annotations(&snapshot).await?;
-        let rejected = RejectedMeasurements::from_annotations(&annotations);
+        let rejected = lake.read_rejections(snapshot).await?;
         Ok(Self { set: set.clone(), columns, moves, shards, left_out, references, waiting, rejected })
     }
 

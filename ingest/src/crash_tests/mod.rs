@@ -2,6 +2,7 @@
 
 mod mortal;
 mod skewed;
+mod verdicts;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;

@@ -59,8 +59,14 @@ class ContributionClient:
         microphones: Sequence[int] | None = None,
         speakers: Sequence[int] | None = None,
         annotation_id: str | None = None,
+        confirm_rederivation: bool = False,
     ) -> str:
-        """Annotates a run, some of its pairs, or a region of its grid; returns the annotation's name."""
+        """Annotates a run, some of its pairs, or a region of its grid; returns the annotation's name.
+
+        A verdict on a run that levels of other surfaces rest on, as those of Flat and Foam, is refused with the code
+        ``unconfirmed`` and the number of surfaces and rows that the next ``echolake ingest`` derives again;
+        ``confirm_rederivation`` stores it.
+        """
         new = {
             "annotation_id": annotation_id,
             "run_id": run_id,
@@ -71,9 +77,12 @@ class ContributionClient:
             "microphones": microphones,
             "speakers": speakers,
         }
-        return self.annotate_all([{name: given for name, given in new.items() if given is not None}])[0]
+        given = {name: value for name, value in new.items() if value is not None}
+        return self.annotate_all([given], confirm_rederivation=confirm_rederivation)[0]
 
-    def annotate_all(self, annotations: Iterable[Mapping[str, Any]]) -> list[str]:
+    def annotate_all(
+        self, annotations: Iterable[Mapping[str, Any]], *, confirm_rederivation: bool = False
+    ) -> list[str]:
         """Stores many annotations, the fields of each as in :meth:`annotate`; returns their names.
 
         They are sent in requests of 1,000, each of which is stored as a whole.
@@ -84,6 +93,8 @@ class ContributionClient:
             body: dict[str, Any] = {"annotations": named[start : start + _MOST_ANNOTATIONS]}
             if self._author is not None:
                 body["author"] = self._author
+            if confirm_rederivation:
+                body["confirm_rederivation"] = True
             answer = self._post("/api/v1/annotations", json.dumps(body).encode(), "application/json")
             names.extend(answer["annotation_ids"])
         return names

@@ -128,7 +128,7 @@ async fn put_run(lake: &TestLake, surface: &str, run: &str, file: Vec<u8>) {
     use arrow::array::{ArrayRef, Int64Array, StringArray};
     let (surface, run) = (surface.parse().expect("an id"), run.parse().expect("an id"));
     put(lake, Lake::run_path(&surface, &run).as_ref(), file).await;
-    let pointer = VisibleRun { surface, run, run_derivation: "d".into(), reference_derivation: None };
+    let pointer = VisibleRun { surface, run, run_derivation: "d".into(), reference_derivation: None, verdicts: None };
     let schema = Table::Runs.schema(lake.lake.rig());
     let column = |field: &Arc<arrow::datatypes::Field>| -> ArrayRef {
         let text = match field.name().as_str() {

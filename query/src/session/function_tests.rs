@@ -102,6 +102,7 @@ async fn put(lake: &Lake, surface: &str, golden: &[RecordBatch], ir: &str, refle
         run: format!("r-{surface}").parse().expect("an id"),
         run_derivation: "a".into(),
         reference_derivation: Some("b".into()),
+        verdicts: None,
     };
     let part = |derivation: &str| FileName::Rows {
         surface: pointer.surface.clone(),

@@ -72,6 +72,7 @@ async fn put_run(lake: &Lake, number: usize) {
         run: format!("r{number}").parse().expect("an id"),
         run_derivation: "ab".into(),
         reference_derivation: Some("ab".into()),
+        verdicts: None,
     };
     let recording = run_file();
     let file_bytes = recording.len();

@@ -389,6 +389,7 @@ async fn put_events(lake: &Lake, surface: &str, run: &str, derivation: &str, lin
         run: run.parse().expect("an id"),
         run_derivation: derivation.into(),
         reference_derivation: None,
+        verdicts: None,
     };
     let part = FileName::Rows {
         surface: pointer.surface.clone(),

@@ -63,6 +63,7 @@ async fn put(lake: &Lake, surface: &str, run: &str) {
         run: run.parse().expect("an id"),
         run_derivation: "ab".into(),
         reference_derivation: Some("ab".into()),
+        verdicts: None,
     };
     let rows = FileName::Rows { surface: pointer.surface.clone(), run: pointer.run.clone(), derivation: "ab".into() };
     let mut staged = Vec::new();

@@ -28,9 +28,8 @@ fn grpc_code(code: FaultCode) -> Grpc {
     match code {
         FaultCode::Query | FaultCode::Request | FaultCode::Format | FaultCode::Method => Grpc::InvalidArgument,
         FaultCode::ReadOnly | FaultCode::Forbidden | FaultCode::Foreign => Grpc::PermissionDenied,
-        FaultCode::Execution | FaultCode::Changed | FaultCode::Precondition | FaultCode::Taken => {
-            Grpc::FailedPrecondition
-        }
+        FaultCode::Execution | FaultCode::Changed | FaultCode::Precondition => Grpc::FailedPrecondition,
+        FaultCode::Taken | FaultCode::Unconfirmed => Grpc::FailedPrecondition,
         FaultCode::Lake | FaultCode::Unwritable | FaultCode::Stopping | FaultCode::NotReady => Grpc::Unavailable,
         FaultCode::Unsupported => Grpc::Unimplemented,
         FaultCode::NotFound | FaultCode::Gone | FaultCode::NoData => Grpc::NotFound,

@@ -117,6 +117,7 @@ fn status_and_title(code: FaultCode) -> (StatusCode, &'static str) {
         FaultCode::NotFound => (StatusCode::NOT_FOUND, "Not there"),
         FaultCode::Gone => (StatusCode::GONE, "No longer there"),
         FaultCode::Taken => (StatusCode::CONFLICT, "The name is taken"),
+        FaultCode::Unconfirmed => (StatusCode::CONFLICT, "It needs a confirmation"),
         FaultCode::Unwritable => (StatusCode::SERVICE_UNAVAILABLE, "The lake cannot be written"),
         FaultCode::Changed => (StatusCode::CONFLICT, "A run's file has changed"),
         FaultCode::NoData => (StatusCode::NOT_FOUND, "There are no such data"),

@@ -48,9 +48,8 @@ fn fault_sqlstate(fault: &RequestFault) -> &'static str {
             FaultCode::Execution => "22000",
             FaultCode::Format => "0A000",
             FaultCode::Lake | FaultCode::Changed | FaultCode::Unwritable => "58030",
-            FaultCode::Request | FaultCode::Method | FaultCode::Range | FaultCode::Precondition | FaultCode::Taken => {
-                "22023"
-            }
+            FaultCode::Request | FaultCode::Method | FaultCode::Range | FaultCode::Precondition => "22023",
+            FaultCode::Taken | FaultCode::Unconfirmed => "22023",
             FaultCode::Unsupported => "0A000",
             FaultCode::NotFound | FaultCode::Gone | FaultCode::NoData => "42704",
             FaultCode::MemoryLimit => "53200",

@@ -82,6 +82,19 @@ pub enum RequestFault {
         /// A remedy for the client.
         hint: &'static str,
     },
+    /// A verdict on a run that levels of other surfaces rest on, without a confirmation.
+    #[error(
+        "the next `echolake ingest` derives {rows} rows of {surfaces} surfaces again after a verdict on run `{run}`, \
+         which their levels rest on; hint: send it again with \"confirm_rederivation\": true"
+    )]
+    Unconfirmed {
+        /// The run.
+        run: String,
+        /// Surfaces that the client sees.
+        surfaces: usize,
+        /// Their rows.
+        rows: u64,
+    },
     /// The lake's store does not take a contribution. The cause is in the server's log.
     #[error("the lake's store does not take it; hint: the server's log has the cause, and sending it again is safe")]
     Unwritable,
@@ -222,6 +235,8 @@ pub enum FaultCode {
     Changed,
     /// The name is taken.
     Taken,
+    /// It changes more than the request shows, and needs a confirmation.
+    Unconfirmed,
     /// The lake cannot be written.
     Unwritable,
     /// It has no such data.
@@ -262,7 +277,7 @@ pub enum FaultCode {
 
 impl FaultCode {
     /// All of them.
-    pub const ALL: [Self; 29] = [
+    pub const ALL: [Self; 30] = [
         Self::Query,
         Self::ReadOnly,
         Self::Execution,
@@ -274,6 +289,7 @@ impl FaultCode {
         Self::Gone,
         Self::Changed,
         Self::Taken,
+        Self::Unconfirmed,
         Self::Unwritable,
         Self::NoData,
         Self::Method,
@@ -308,6 +324,7 @@ impl FaultCode {
             Self::Gone => "gone",
             Self::Changed => "file_changed",
             Self::Taken => "taken",
+            Self::Unconfirmed => "unconfirmed",
             Self::Unwritable => "lake_unwritable",
             Self::NoData => "no_data",
             Self::Method => "method_not_allowed",
@@ -412,6 +429,7 @@ impl RequestFault {
             Self::NoData { .. } => FaultCode::NoData,
             Self::Unreadable => FaultCode::Lake,
             Self::Taken { .. } => FaultCode::Taken,
+            Self::Unconfirmed { .. } => FaultCode::Unconfirmed,
             Self::Unwritable => FaultCode::Unwritable,
             Self::Method => FaultCode::Method,
             Self::Precondition { .. } => FaultCode::Precondition,

@@ -17,12 +17,20 @@ pub enum TokenScope {
     Metrics,
     /// Adding annotations and predictions.
     Annotate,
+    /// Verdicts on runs that levels of other surfaces rest on, beside [`Self::Annotate`].
+    #[serde(rename = "annotate-references")]
+    AnnotateReferences,
 }
 
 impl TokenScope {
     /// The scopes, by their names in the file of tokens.
-    pub const NAMED: [(&'static str, Self); 4] =
-        [("sql", Self::Sql), ("files", Self::Files), ("metrics", Self::Metrics), ("annotate", Self::Annotate)];
+    pub const NAMED: [(&'static str, Self); 5] = [
+        ("sql", Self::Sql),
+        ("files", Self::Files),
+        ("metrics", Self::Metrics),
+        ("annotate", Self::Annotate),
+        ("annotate-references", Self::AnnotateReferences),
+    ];
 }
 
 impl FromStr for TokenScope {
@@ -30,7 +38,9 @@ impl FromStr for TokenScope {
 
     fn from_str(name: &str) -> Result<Self, String> {
         let found = Self::NAMED.into_iter().find(|(known, _)| *known == name);
-        found.map(|(_, scope)| scope).ok_or_else(|| format!("no scope `{name}`; hint: sql, files, metrics or annotate"))
+        found
+            .map(|(_, scope)| scope)
+            .ok_or_else(|| format!("no scope `{name}`; hint: sql, files, metrics, annotate or annotate-references"))
     }
 }
 
@@ -41,6 +51,7 @@ impl fmt::Display for TokenScope {
             Self::Files => "files",
             Self::Metrics => "metrics",
             Self::Annotate => "annotations",
+            Self::AnnotateReferences => "verdicts on references, which need the scope `annotate-references`",
         })
     }
 }

@@ -50,6 +50,8 @@ pub struct VisibleRun {
     pub run_derivation: String,
     /// Derivation of the rows that need references; None while they are missing.
     pub reference_derivation: Option<String>,
+    /// Mark of the verdicts that its rows follow; None if they reject none of its measurements.
+    pub verdicts: Option<String>,
 }
 
 impl VisibleRun {
@@ -58,15 +60,18 @@ impl VisibleRun {
         format!("{}.{}.", self.surface, self.run)
     }
 
-    /// Both derivations, as the name of the run's row has them.
+    /// Both derivations and the mark of the verdicts, as the name of the run's row has them.
     pub(crate) fn joined_derivations(&self) -> String {
-        format!("{}.{}", self.run_derivation, self.reference_derivation.as_deref().unwrap_or(WITHOUT))
+        let mark = self.verdicts.iter().map(|mark| format!("{MARKED}{mark}")).collect::<String>();
+        format!("{}.{}{mark}", self.run_derivation, self.reference_derivation.as_deref().unwrap_or(WITHOUT))
     }
 }
 
 /// Extension of all files of tables.
 pub(crate) const EXTENSION: &str = ".parquet";
 const WITHOUT: &str = "none";
+/// What precedes the mark of verdicts.
+const MARKED: &str = "-";
 const MERGED: &str = "merged";
 
 impl FileName {
@@ -91,12 +96,19 @@ impl FileName {
                 run: run.parse().ok()?,
                 derivation: derivation.into(),
             }),
-            [surface, run, run_derivation, references] => Some(Self::Pointer(VisibleRun {
-                surface: surface.parse().ok()?,
-                run: run.parse().ok()?,
-                run_derivation: run_derivation.into(),
-                reference_derivation: (references != WITHOUT).then(|| references.into()),
-            })),
+            [surface, run, run_derivation, references] => {
+                let (references, verdicts) = match references.split_once(MARKED) {
+                    Some((references, mark)) => (references, Some(mark.to_owned())),
+                    None => (references, None),
+                };
+                Some(Self::Pointer(VisibleRun {
+                    surface: surface.parse().ok()?,
+                    run: run.parse().ok()?,
+                    run_derivation: run_derivation.into(),
+                    reference_derivation: (references != WITHOUT).then(|| references.into()),
+                    verdicts,
+                }))
+            }
             _ => None,
         }
     }
@@ -123,6 +135,8 @@ mod tests {
             "0015_0.20260105T080000Z-0015_0-7c1e.ab.parquet",
             "flat.r.ab.none.parquet",
             "flat.r.ab.cd.parquet",
+            "flat.r.ab.cd-ef.parquet",
+            "flat.r.ab.none-rejected.parquet",
             "merged.ab.parquet",
         ] {
             let parsed = FileName::parse(&Path::from(name)).expect(name);

@@ -5,12 +5,14 @@ mod data_file;
 mod file_name;
 mod log;
 mod maintenance;
+mod references;
 mod rig_tables;
 mod rows;
 mod run_parts;
 mod snapshot;
 mod table_fault;
 mod tags;
+mod verdicts;
 mod versions;
 
 pub use batch_builder::BatchBuilder;
@@ -25,10 +27,12 @@ pub use maintenance::{
     DeletedFile, DeletionMode, GivenUpRows, KEEP_HOURS, MergeProgress, OptimizeReport, TARGET_BYTES, TableOptimizeReport,
     VacuumReport,
 };
+pub use references::{ReferenceNames, SurfaceReferences};
 pub use rows::{add_missing_columns, reader_metadata, wanted_schema};
 pub use snapshot::LakeSnapshot;
 pub use table_fault::LackingRows;
 pub use tags::{LakeTag, TagName};
+pub use verdicts::verdict_mark;
 pub use versions::{LakeMoment, NoMoment};
 
 use arrow::record_batch::RecordBatch;

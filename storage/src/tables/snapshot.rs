@@ -3,7 +3,7 @@
 //! Delta commits one table at a time, so a run's rows are committed before its `runs` row. The file of that
 //! row carries in its name the derivations that are current; files of other derivations are not seen.
 
-use std::collections::{BTreeMap, HashMap, HashSet};
+use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 
 use echolake_schema::tables::{Source, Table};
 use echolake_schema::{ProjectName, RunId, SurfaceId};
@@ -43,7 +43,7 @@ struct CurrentRun {
     row_counts: Option<RunRowCounts>,
 }
 
-/// The newest run of each surface: of all its runs, and of those of a project.
+/// The run that describes each surface: of all its runs, and of those of a project.
 #[derive(Debug, Clone, Default)]
 struct NewestRuns {
     of_surface: HashMap<SurfaceId, RunId>,
@@ -51,9 +51,11 @@ struct NewestRuns {
 }
 
 impl NewestRuns {
-    fn from_runs(runs: &BTreeMap<RunId, CurrentRun>) -> Self {
+    /// Of several runs the newest counts that is not rejected as a whole; if all of them are, the newest.
+    fn from_runs<'a>(runs: impl Iterator<Item = &'a CurrentRun>, is_rejected: impl Fn(&VisibleRun) -> bool) -> Self {
         let mut newest = Self::default();
-        for CurrentRun { run, project, .. } in runs.values() {
+        let (rejected, others): (Vec<_>, Vec<_>) = runs.partition(|current| is_rejected(&current.run));
+        for CurrentRun { run, project, .. } in rejected.into_iter().chain(others) {
             newest.of_surface.insert(run.surface.clone(), run.run.clone());
             if let Some(project) = project {
                 newest.of_project.insert((run.surface.clone(), project.clone()), run.run.clone());
@@ -140,7 +142,7 @@ impl LakeSnapshot {
     // Without the files of any table.
     fn from_pointers(pointers: &[DataFile]) -> Self {
         let runs = current_runs(pointers);
-        Self { newest: NewestRuns::from_runs(&runs), runs, ..Self::default() }
+        Self { newest: NewestRuns::from_runs(runs.values(), VisibleRun::is_rejected), runs, ..Self::default() }
     }
 
     fn take_view(&mut self, table: Table, view: TableView) {
@@ -295,9 +297,21 @@ impl LakeSnapshot {
         self.runs.get(run).map(|current| &current.run)
     }
 
-    /// The newest run of a surface, which describes it: that of its row in `surfaces`.
+    /// The run that describes a surface: its newest that is not rejected as a whole, or its newest.
     pub fn newest_run(&self, surface: &SurfaceId) -> Option<&VisibleRun> {
         self.run(self.newest.of_surface.get(surface)?)
+    }
+
+    /// The runs that describe a surface, to all readers or to those of one project, if these were all runs and the
+    /// rejected ones.
+    pub fn describing_runs(
+        &self,
+        is_there: impl Fn(&VisibleRun) -> bool,
+        is_rejected: impl Fn(&VisibleRun) -> bool,
+    ) -> BTreeSet<RunId> {
+        let there = self.runs.values().filter(|current| is_there(&current.run));
+        let NewestRuns { of_surface, of_project } = NewestRuns::from_runs(there, is_rejected);
+        of_surface.into_values().chain(of_project.into_values()).collect()
     }
 
     /// The project of a run; None if it was given none.
@@ -337,7 +351,7 @@ impl LakeSnapshot {
                     sorted.seen.push(file);
                 }
                 RowsPlace::OfProject => sorted.logged.extend(run_of_file(&file).map(|run| (run, file.rows))),
-                RowsPlace::Superseded if self.is_superseded(&file) => sorted.hidden.push(file),
+                RowsPlace::Superseded if self.is_superseded(table, &file) => sorted.hidden.push(file),
                 RowsPlace::Foreign => sorted.foreign.push(file),
                 RowsPlace::Superseded | RowsPlace::Unseen => {}
             }
@@ -444,18 +458,14 @@ impl LakeSnapshot {
 
     fn rows_place(&self, table: Table, run: &RunId, derivation: &str) -> RowsPlace {
         let Some(current) = self.runs.get(run) else { return RowsPlace::Unseen };
-        let is_named = match table.source() {
-            Source::References => current.run.reference_derivation.as_deref() == Some(derivation),
-            Source::Pointer => current.run.joined_derivations() == derivation,
-            _ => current.run.run_derivation == derivation,
-        };
-        match is_named {
+        match is_named(table, &current.run, derivation) {
             true => self.run_place(table, current),
             false => RowsPlace::Superseded,
         }
     }
 
-    // A surface that was measured twice is still one surface: of the runs that a reader sees, the newest describes it.
+    // A surface that was measured twice is still one surface: of the runs that a reader sees, the newest describes it
+    // that no verdict rejects.
     fn run_place(&self, table: Table, current: &CurrentRun) -> RowsPlace {
         let VisibleRun { surface, run, .. } = &current.run;
         if !table.key().contains(&"surface_id") || self.newest.of_surface.get(surface) == Some(run) {
@@ -469,11 +479,17 @@ impl LakeSnapshot {
     }
 
     // An author that had not seen the run's present row cannot replace it, so that no row will ever name its file as
-    // the log has it now. No clock is asked.
-    fn is_superseded(&self, file: &DataFile) -> bool {
-        run_of_file(file)
-            .and_then(|run| self.runs.get(&run))
-            .is_some_and(|current| file.seen_runs < current.log_version)
+    // the log has it now. Rows that are named and describe no surface: an author that had seen the row of the run that
+    // does describe it is about to remove or to reject that one. No clock is asked.
+    fn is_superseded(&self, table: Table, file: &DataFile) -> bool {
+        let Some(FileName::Rows { run, derivation, .. }) = FileName::parse(&file.path) else {
+            let current = run_of_file(file).and_then(|run| self.runs.get(&run));
+            return current.is_some_and(|current| file.seen_runs < current.log_version);
+        };
+        let Some(current) = self.runs.get(&run) else { return false };
+        let describing = self.newest.of_surface.get(&current.run.surface).and_then(|run| self.runs.get(run));
+        let other = describing.filter(|_| is_named(table, &current.run, &derivation));
+        file.seen_runs < other.map_or(0, |other| other.log_version).max(current.log_version)
     }
 
     /// The version of `runs` that added the row of a file's run; 0 if the name is no run's rows, or the run is not
@@ -483,6 +499,15 @@ impl LakeSnapshot {
             Some(FileName::Rows { run, .. }) => self.runs.get(&run).map_or(0, |current| current.log_version),
             _ => 0,
         }
+    }
+}
+
+// Returns whether a run's row names this derivation of its rows in a table.
+fn is_named(table: Table, run: &VisibleRun, derivation: &str) -> bool {
+    match table.source() {
+        Source::References => run.reference_derivation.as_deref() == Some(derivation),
+        Source::Pointer => run.joined_derivations() == derivation,
+        _ => run.run_derivation == derivation,
     }
 }
 
@@ -630,6 +655,29 @@ mod tests {
         // A row that does not count the others still has some of each.
         assert_eq!(lacking(&of(Table::Events, Vec::new()), Table::Events), [("r2".to_owned(), None, 0)]);
         assert!(of(Table::Heightmaps, Vec::new()).check_table(Table::Heightmaps).is_ok());
+    }
+
+    /// E13: a run that is rejected as a whole describes its surface if no other run can.
+    #[test]
+    fn the_newest_run_that_is_not_rejected_describes_a_surface() {
+        let check = |marks: [&str; 3], expected: &str| {
+            let rows = ["r1", "r2", "r3"].iter().zip(marks);
+            let pointers: Vec<_> = rows.map(|(run, mark)| format!("wood.{run}.ab.none{mark}.parquet")).collect();
+            let mut files: Vec<_> = pointers.iter().map(|name| (Table::Runs, name.as_str(), 5)).collect();
+            let described = ["wood.r1.ab.parquet", "wood.r2.ab.parquet", "wood.r3.ab.parquet"];
+            files.extend(described.map(|name| (Table::Surfaces, name, 1)));
+            let snapshot = view(&files);
+            assert_eq!(names(snapshot.files(Table::Surfaces)), [format!("wood.{expected}.ab.parquet")], "{marks:?}");
+            assert_eq!(snapshot.superseded_files(Table::Surfaces).len(), 2, "{marks:?}");
+            let wood = "wood".parse().expect("an id");
+            assert_eq!(snapshot.newest_run(&wood).expect("a run").run.as_str(), expected, "{marks:?}");
+        };
+        let [none, some, all] = ["", "-1f00ab", "-rejected"];
+        check([none, none, none], "r3");
+        check([none, none, some], "r3");
+        check([none, some, all], "r2");
+        check([none, all, all], "r1");
+        check([all, all, all], "r3");
     }
 
     #[test]

@@ -215,6 +215,7 @@ mod tests {
             run: RunId::from_str(run).expect("an id"),
             run_derivation: "run".to_owned(),
             reference_derivation: Some(derivation.to_owned()),
+            verdicts: None,
         };
         let VisibleRun { surface, run, .. } = visible.clone();
         let rows = FileName::Rows { surface, run, derivation: derivation.to_owned() };

@@ -128,11 +128,11 @@ export const figures = async (): Promise<string> => (await ask(siteHref('/metric
 export const cancelQuery = (id: number): Promise<Response> => ask(apiHref(`/queries/${id}/cancel`), { method: 'POST' })
 
 /** Stores an annotation; it is seen by the next request. */
-export const annotate = (annotation: Schemas['NewAnnotation']): Promise<Response> =>
+export const annotate = (annotation: Schemas['NewAnnotation'], isConfirmed: boolean): Promise<Response> =>
   ask(apiHref('/annotations'), {
     method: 'POST',
     headers: { 'content-type': 'application/json' },
-    body: JSON.stringify({ annotations: [annotation] }),
+    body: JSON.stringify({ annotations: [annotation], confirm_rederivation: isConfirmed }),
   })
 
 /** Shows the server a token; it answers with a cookie, which pictures and downloads send too. */

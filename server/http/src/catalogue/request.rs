@@ -1,10 +1,12 @@
 //! A request to an endpoint, and its queries of the lake: values are bound or validated, never part of a text.
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use arrow::record_batch::RecordBatch;
 use datafusion::common::{ParamValues, ScalarValue};
 use echolake_lake::VisibleRun;
+use echolake_query::Error as QueryError;
 use echolake_schema::{RunId, SurfaceId, quoted_text};
 use echolake_service::running::{AnswerEncoder, BatchEncoder, RunningQuery};
 use echolake_service::{QueryWork, RequestFault};
@@ -72,6 +74,19 @@ impl CatalogueRequest {
             Ok(CatalogueSummary::new(surfaces, statistics, describe_bands(self.catalogue.lake().rig())))
         };
         self.view.results.summary.get_or_try_init(read).await
+    }
+
+    /// The runs, of these surfaces or of all, on which verdicts came since the last ingest: statistics do not follow
+    /// them yet.
+    pub async fn unfollowed_runs(
+        &self,
+        surfaces: Option<&BTreeSet<SurfaceId>>,
+    ) -> Result<Vec<&VisibleRun>, RequestFault> {
+        let snapshot = &self.view.snapshot;
+        let read = || async { self.catalogue.lake().read_rejections(snapshot).await };
+        let rejected = self.view.results.rejected.get_or_try_init(read).await.map_err(QueryError::from)?;
+        let is_wanted = |run: &&VisibleRun| surfaces.is_none_or(|surfaces| surfaces.contains(&run.surface));
+        Ok(snapshot.unfollowed_runs(rejected).filter(is_wanted).collect())
     }
 
     /// The surface of this name.

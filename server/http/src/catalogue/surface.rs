@@ -3,7 +3,9 @@
 use std::collections::HashMap;
 
 use axum::Extension;
+use echolake_lake::SurfaceReferences;
 use echolake_query::figure_rows::{GridCell, GridLevels, LevelReference, band_list, grid_query};
+use echolake_schema::SurfaceId;
 use echolake_service::RequestFault;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
@@ -24,6 +26,9 @@ struct SurfaceDetail<'a> {
     mesh_watertight: Option<bool>,
     reflection_factor: Option<f64>,
     runs: Vec<String>,
+    /// Runs of the surface and of its references on which verdicts came since the last ingest: its statistics do not
+    /// follow them yet.
+    unfollowed_runs: Vec<String>,
     statistics: Vec<BandStatistics>,
     /// Phase of the relief's details that are narrower than a wavelength, rad, by band without the total. Over 0.18 a
     /// simulated relief is off by 1 dB and more in single pairs; null if it is not known.
@@ -84,8 +89,8 @@ const STATISTICS: &str = "select band, measurements, p90_mean_db, p5_db, p50_db,
     extensions(("x-sql" = json!([
         "the summary of /surfaces",
         "select * from surface_stats where surface_id in ($1, $flat)",
-        "select surface_id, avg(tnce_2500), ..., avg(tnce_total) from tnce where surface_id in ($1, $flat) group by \
-         surface_id",
+        "select surface_id, avg(tnce_2500), ..., avg(tnce_total) from tnce where surface_id in ($1, $flat) and not \
+         is_rejected(run_id, pair_id) group by surface_id",
     ])))
 )]
 pub(super) async fn surface(
@@ -96,8 +101,10 @@ pub(super) async fn surface(
     let id = &entry.surface.surface_id;
     let flat = &entry.surface.flat_reference;
     let means = band_list(request.catalogue.lake().rig(), |band| format!("avg(tnce_{band})"));
-    let means =
-        format!("select surface_id, {means} as means from tnce where surface_id in ($1, $2) group by surface_id");
+    let means = format!(
+        "select surface_id, {means} as means from tnce where surface_id in ($1, $2) and not is_rejected(run_id, \
+             pair_id) group by surface_id"
+    );
     let names = request.catalogue.lake().rig().band_names();
     let phases: Vec<_> = names.iter().map(|band| format!("cast(detail_phase_{band} as double)")).collect();
     let phases = format!(
@@ -114,6 +121,10 @@ pub(super) async fn surface(
             vec![text_value(id)]
         ),
     )?;
+    let references =
+        SurfaceReferences::from_snapshot(&request.view.snapshot, &request.catalogue.lake().config().references);
+    let supporting = id.parse::<SurfaceId>().ok().map(|id| references.supporting_surfaces(&id));
+    let unfollowed = request.unfollowed_runs(supporting.as_ref()).await?;
     let bands = &request.read_summary().await?.bands;
     let mean = |surface: &str| {
         let own = rows.iter().find(|row| row.surface_id == surface);
@@ -129,6 +140,7 @@ pub(super) async fn surface(
         mesh_watertight: entry.mesh_watertight,
         reflection_factor: entry.reflection_factor,
         runs: runs.into_iter().map(|run| run.run_id).collect(),
+        unfollowed_runs: unfollowed.into_iter().map(|run| run.run.to_string()).collect(),
         statistics: bands.iter().filter_map(|band| by_band.remove(&band.key)).collect(),
         detail_phase: phases.into_iter().next().map_or_else(|| vec![None; names.len()], |row| row.phases),
         flat_mean: mean(flat),

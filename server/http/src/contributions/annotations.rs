@@ -1,18 +1,18 @@
 //! `POST /api/v1/annotations`: labels, verdicts and notes.
 
-use std::collections::{BTreeSet, HashMap, HashSet};
+use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 
 use axum::extract::State;
 use axum::extract::rejection::BytesRejection;
 use axum::response::Response;
 use bytes::Bytes;
 use chrono::Utc;
-use echolake_lake::{ContributedFile, annotation_rows};
+use echolake_lake::{ContributedFile, LakeSnapshot, SurfaceReferences, VisibleRun, annotation_rows};
 use echolake_query::RequestMemory;
 use echolake_schema::annotations::{Annotation, AnnotationKind};
-use echolake_schema::tables::Table;
+use echolake_schema::tables::{Source, Table};
 use echolake_schema::{Grid, RunId};
-use echolake_service::{ContributionDraft, RequestFault};
+use echolake_service::{ContributionDraft, RequestFault, TokenScope};
 use serde::Deserialize;
 use utoipa::ToSchema;
 use uuid::Uuid;
@@ -34,6 +34,11 @@ pub struct AnnotationsRequest {
     /// Only without tokens; the token's name otherwise.
     #[schema(required = false, nullable = false)]
     author: Option<String>,
+    /// Needed for verdicts on runs that levels of other surfaces rest on, as those of Flat and Foam: without it the
+    /// answer is 409, and tells how many surfaces and rows the next ingest derives again.
+    #[serde(default)]
+    #[schema(required = false)]
+    confirm_rederivation: bool,
 }
 
 /// One annotation.
@@ -137,11 +142,49 @@ async fn draft_request(
         });
     }
     let new: Vec<_> = annotations.iter().filter(|new| known(new).is_none()).cloned().collect();
+    check_reference_verdicts(catalogue, &view.snapshot, &new, request.confirm_rederivation)?;
     let lake = catalogue.lake();
     let files = annotation_rows(lake, &view.snapshot, &new)
         .and_then(|rows| ContributedFile::encode_rows(lake, Table::Annotations, &rows));
     let files = files.map_err(refuse_encoding)?;
     Ok(ContributionDraft { table: Table::Annotations, seen, files, annotation_ids })
+}
+
+// A verdict on a run changes the levels of all surfaces that rest on it, of other projects, too: it needs a right of its
+// own, and the client is told first what is derived again.
+fn check_reference_verdicts(
+    catalogue: &LakeCatalogue,
+    snapshot: &LakeSnapshot,
+    annotations: &[Annotation],
+    is_confirmed: bool,
+) -> Result<(), RequestFault> {
+    let references = SurfaceReferences::from_snapshot(snapshot, &catalogue.lake().config().references);
+    let mut resting = BTreeMap::new();
+    let mut first = None;
+    for annotation in annotations.iter().filter(|annotation| annotation.kind == AnnotationKind::Verdict) {
+        let Some(run) = snapshot.run(&annotation.run_id) else { continue };
+        let dependent: Vec<_> = references.dependent_runs(snapshot, &run.surface).collect();
+        // Surfaces that this client does not see may rest on the lake's own references.
+        if !dependent.is_empty() || references.is_default(&run.surface) {
+            resting.extend(dependent.into_iter().chain([run]).map(|run| (&run.run, run)));
+            first = first.or(Some(run));
+        }
+    }
+    let Some(run) = first else { return Ok(()) };
+    catalogue.service().authorised_client(TokenScope::AnnotateReferences)?;
+    if is_confirmed {
+        return Ok(());
+    }
+    let derived = || Table::ALL.into_iter().filter(|table| table.source() == Source::References);
+    let rows = |run: &VisibleRun| {
+        let counts = snapshot.row_counts(&run.run);
+        derived().filter_map(|table| counts?.rows_of(table)).sum::<u64>()
+    };
+    Err(RequestFault::Unconfirmed {
+        run: run.run.to_string(),
+        surfaces: resting.values().map(|run| &run.surface).collect::<BTreeSet<_>>().len(),
+        rows: resting.values().map(|run| rows(run)).sum(),
+    })
 }
 
 fn annotation_key(annotation: &Annotation) -> (&str, &str) {

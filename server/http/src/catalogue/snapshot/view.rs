@@ -10,6 +10,7 @@ use echolake_lake::{DataFile, LakeSnapshot};
 use echolake_query::figure_rows::CurveRow;
 use echolake_query::{EngineClient, PreparedQuery, QueryQuota, Session};
 use echolake_schema::Symmetry;
+use echolake_schema::annotations::RejectedMeasurements;
 use echolake_schema::symmetry::MovedPair;
 use echolake_schema::tables::{Source, Table};
 use echolake_service::{QueryService, RequestFault};
@@ -51,6 +52,7 @@ pub(crate) struct SnapshotView {
 pub(crate) struct SharedResults {
     pub answers: AnswerCache,
     pub summary: OnceCell<CatalogueSummary>,
+    pub rejected: OnceCell<RejectedMeasurements>,
     pub places: OnceCell<SurfacePositions>,
     pub diffusion: OnceCell<DiffusionCoefficients>,
     /// The geometry of all pairs, by their numbers.

@@ -67,6 +67,7 @@ fn visible(surface: &str, run: &str, derivation: &str) -> VisibleRun {
         run: run.parse().expect("an id"),
         run_derivation: "ab".into(),
         reference_derivation: Some(derivation.into()),
+        verdicts: None,
     }
 }
 
