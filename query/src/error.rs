@@ -26,7 +26,7 @@ const SUGGESTED: usize = 3;
 const LISTED: usize = 12;
 
 /// Begins the message of a calculation whose result its type cannot hold.
-pub const OUT_OF_RANGE: &str = "out of range: ";
+pub const OUT_OF_RANGE: &str = "overflow, out of range: ";
 /// Table functions of other databases that read files.
 const FILE_FUNCTIONS: [&str; 9] = [
     "read_csv",
