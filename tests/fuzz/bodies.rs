@@ -41,7 +41,7 @@ pub(super) fn bodies(run: &str) -> Vec<SentBody> {
     let runs: ArrayRef = Arc::new(runs);
     let nothing: ArrayRef = Arc::new(NullArray::new(3));
     let json = json!({ "annotations": [
-        { "annotation_id": "a-1", "run_id": run, "pair_ids": [1, 2], "kind": "verdict", "value": "rejected" },
+        { "annotation_id": "a-1", "run_id": run, "pair_ids": [1, 2], "kind": "label", "value": "odd" },
         { "annotation_id": "a-2", "run_id": run, "microphones": [0], "speakers": [1], "kind": "note", "comment": "x" },
     ] });
     vec![
