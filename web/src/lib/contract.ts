@@ -1148,8 +1148,11 @@ export interface components {
             /** @description Every surface comes from the simulated rig, or is computed for the heights of one. */
             readonly simulated: boolean;
             readonly software: string;
-            /** @description Runs on which verdicts came since the last ingest: levels do not follow them yet. */
-            readonly unfollowed_runs: number;
+            /**
+             * @description Runs on which verdicts came since the last ingest: levels do not follow them yet. Null if annotations cannot be
+             *     read.
+             */
+            readonly unfollowed_runs: number | null;
             /** @description Changes with every snapshot; also the ETag of what is computed from it. */
             readonly version: string;
         };

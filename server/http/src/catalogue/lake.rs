@@ -35,8 +35,9 @@ struct LakeDescription<'a> {
     simulated: bool,
     /// Some surface has levels against its Flat. In a lake of rooms none has.
     has_levels: bool,
-    /// Runs on which verdicts came since the last ingest: levels do not follow them yet.
-    unfollowed_runs: usize,
+    /// Runs on which verdicts came since the last ingest: levels do not follow them yet. Null if annotations cannot be
+    /// read.
+    unfollowed_runs: Option<usize>,
 }
 
 /// A point of the grid.
@@ -115,7 +116,8 @@ pub(super) async fn lake(Extension(request): Extension<CatalogueRequest>) -> End
         simulated: !summary.entries.is_empty()
             && summary.entries.iter().all(|e| matches!(e.surface.origin.as_str(), "simulated" | "computed")),
         has_levels: summary.entries.iter().any(|entry| entry.surface.has_levels()),
-        unfollowed_runs: request.unfollowed_runs(None).await?.len(),
+        // What needs verdicts is refused with the fault; the lake's description is not.
+        unfollowed_runs: request.unfollowed_runs(None).await.ok().map(|runs| runs.len()),
     })?)
 }
 
