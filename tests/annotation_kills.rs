@@ -121,7 +121,7 @@ fn annotate(address: &str, run: &str, number: usize) -> Option<bool> {
         "annotation_id": annotation_id(number), "run_id": run, "pair_ids": [number % 2], "kind": "verdict",
         "value": if number.is_multiple_of(3) { "accepted" } else { "rejected" }, "comment": format!("number {number}"),
     });
-    let body = json!({ "annotations": [annotation] }).to_string();
+    let body = json!({ "annotations": [annotation], "confirm_rederivation": true }).to_string();
     let request = HttpRequest::post("/api/v1/annotations", &body).with("content-type", "application/json");
     let mut stream = TcpStream::connect(address).ok()?;
     stream.set_read_timeout(Some(Duration::from_secs(60))).expect("a limit");

@@ -86,7 +86,7 @@ impl LakeIngest<'_> {
                     return Err(Error::Stopped);
                 }
                 CompletionRound { claimed: true, .. } => tokio::time::sleep(LOOK_EVERY).await,
-                CompletionRound { overtaken: true, .. } | CompletionRound { turned: true, .. } => rounds += 1,
+                CompletionRound { overtaken, turned, .. } if overtaken || turned => rounds += 1,
                 _ => break,
             }
         }

@@ -131,12 +131,12 @@ pub async fn examine_lake(lake: &Lake, progress: &mut dyn FnMut(CheckStep<'_>)) 
         });
     }
     // A table of annotations that cannot be read has a finding of its own.
-    let rejected = Arc::new(lake.read_rejections(&snapshot).await.unwrap_or_default());
-    for run in snapshot.unfollowed_runs(&rejected) {
+    let rejected = lake.read_rejections(&snapshot).await.ok();
+    for run in rejected.iter().flat_map(|rejected| snapshot.unfollowed_runs(rejected)) {
         let what = "verdicts on it came after the last ingest; hint: `echolake ingest` derives again what rests on it";
         report.add_finding(FindingSeverity::Note, &run.run, what);
     }
-    let finder = ReferenceFinder::new(lake, snapshot.clone(), rejected);
+    let finder = ReferenceFinder::new(lake, snapshot.clone(), Arc::new(rejected.unwrap_or_default()));
     for run in snapshot.runs() {
         for file in snapshot.files_of(Table::Runs, &run.run) {
             progress(CheckStep { subject: file.path.as_ref(), done, total });

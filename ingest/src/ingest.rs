@@ -327,12 +327,18 @@ impl IngestWork {
                     Some(derived) => derived.derive_run(&self.context, &keys, content.run_responses()).await?,
                     None => (Vec::new(), RunReferences { missing: wanted.missing_names(), ..RunReferences::default() }),
                 };
+            // Which run describes the surface is left to the completion: it writes the rows of the other one first.
+            let is_rejected = rejected.is_run_rejected(keys.run.as_str());
+            let verdicts = match known.filter(|known| known.is_rejected() != is_rejected) {
+                Some(known) => known.verdicts.clone(),
+                None => verdict_mark(rejected, &keys.run),
+            };
             let run = VisibleRun {
                 surface: keys.surface.clone(),
                 run: keys.run.clone(),
                 run_derivation: derivation.clone(),
                 reference_derivation: references.derivation.clone(),
-                verdicts: verdict_mark(rejected, &keys.run),
+                verdicts,
             };
             let row = rows::runs::new_run_row(lake, &keys, &content, &derivation, &references)?;
             Ok((self.context.stage_derived(run, &[row], files).await?, references))

@@ -252,7 +252,7 @@ fn accepted_runs<'a>(
     snapshot: &'a LakeSnapshot,
     rejected: &'a RejectedMeasurements,
 ) -> impl Iterator<Item = &'a VisibleRun> + 'a {
-    snapshot.runs().filter(|run| !rejected.is_run_rejected(run.run.as_str()))
+    snapshot.runs().filter(move |run| !rejected.is_run_rejected(run.run.as_str()))
 }
 
 impl ReferenceResponses {

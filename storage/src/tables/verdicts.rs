@@ -58,7 +58,7 @@ impl LakeSnapshot {
         &'a self,
         rejected: &'a RejectedMeasurements,
     ) -> impl Iterator<Item = &'a VisibleRun> + 'a {
-        self.runs().filter(|run| run.verdicts != verdict_mark(rejected, &run.run))
+        self.runs().filter(move |run| run.verdicts != verdict_mark(rejected, &run.run))
     }
 
     /// The runs that will describe a surface if these are the rejected ones, and do not now.

@@ -919,6 +919,11 @@ export interface components {
             readonly annotations: readonly components["schemas"]["NewAnnotation"][];
             /** @description Only without tokens; the token's name otherwise. */
             readonly author?: string;
+            /**
+             * @description Needed for verdicts on runs that levels of other surfaces rest on, as those of Flat and Foam: without it the
+             *     answer is 409, and tells how many surfaces and rows the next ingest derives again.
+             */
+            readonly confirm_rederivation?: boolean;
         };
         /** @description Measurements that took this attempt. */
         readonly AttemptCount: {
@@ -1145,6 +1150,11 @@ export interface components {
             /** @description Every surface comes from the simulated rig, or is computed for the heights of one. */
             readonly simulated: boolean;
             readonly software: string;
+            /**
+             * @description Runs on which verdicts came since the last ingest: levels do not follow them yet. Null if annotations cannot be
+             *     read.
+             */
+            readonly unfollowed_runs: number | null;
             /** @description Changes with every snapshot; also the ETag of what is computed from it. */
             readonly version: string;
         };
@@ -1365,7 +1375,7 @@ export interface components {
         /** @description RFC 9457; `code` is stable and made for programs. */
         readonly Problem: {
             /** @enum {string} */
-            readonly code: "query_invalid" | "read_only" | "query_failed" | "format_impossible" | "lake_unreadable" | "request_invalid" | "unsupported" | "not_found" | "gone" | "file_changed" | "taken" | "lake_unwritable" | "no_data" | "method_not_allowed" | "precondition_failed" | "range_not_satisfiable" | "request_too_large" | "unauthenticated" | "forbidden" | "foreign_origin" | "cancelled" | "time_limit" | "memory_limit" | "row_limit" | "too_many" | "query_ended_engine" | "internal" | "server_stopping" | "not_ready";
+            readonly code: "query_invalid" | "read_only" | "query_failed" | "format_impossible" | "lake_unreadable" | "request_invalid" | "unsupported" | "not_found" | "gone" | "file_changed" | "taken" | "unconfirmed" | "lake_unwritable" | "no_data" | "method_not_allowed" | "precondition_failed" | "range_not_satisfiable" | "request_too_large" | "unauthenticated" | "forbidden" | "foreign_origin" | "cancelled" | "time_limit" | "memory_limit" | "row_limit" | "too_many" | "query_ended_engine" | "internal" | "server_stopping" | "not_ready";
             /** @description What is wrong, where, and what to do: the text that all protocols and the prompt have. */
             readonly detail?: string;
             /** @description What to do. */
@@ -1591,6 +1601,11 @@ export interface components {
             readonly runs: readonly string[];
             readonly statistics: readonly components["schemas"]["BandStatistics"][];
             readonly surface: components["schemas"]["Surface"];
+            /**
+             * @description Runs of the surface and of its references on which verdicts came since the last ingest: its statistics do not
+             *     follow them yet.
+             */
+            readonly unfollowed_runs: readonly string[];
         };
         /** @description Diffusion coefficients of a surface. */
         readonly SurfaceDiffusion: {

@@ -39,7 +39,8 @@ struct LakeDescription<'a> {
     has_levels: bool,
     /// The client's token is for adding annotations.
     may_annotate: bool,
-    /// Runs on which verdicts came since the last ingest: levels do not follow them yet; null if annotations cannot be read.
+    /// Runs on which verdicts came since the last ingest: levels do not follow them yet. Null if annotations cannot be
+    /// read.
     unfollowed_runs: Option<usize>,
 }
 
@@ -121,6 +122,7 @@ pub(super) async fn lake(Extension(request): Extension<CatalogueRequest>) -> End
             && summary.entries.iter().all(|e| matches!(e.surface.origin.as_str(), "simulated" | "computed")),
         has_levels: summary.entries.iter().any(|entry| entry.surface.has_levels()),
         may_annotate: request.catalogue.service().has_scope(TokenScope::Annotate),
+        // What needs verdicts is refused with the fault; the lake's description is not.
         unfollowed_runs: request.unfollowed_runs(None).await.ok().map(|runs| runs.len()),
     })?)
 }
