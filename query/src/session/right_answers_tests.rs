@@ -155,6 +155,7 @@ async fn not_in_is_null_beside_nulls() {
         ("select t.n from T where t.m not in (select u.m from U where u.n = t.n)", "null"),
         ("select t.n from T where t.m not in (select u.m from U where u.n < t.n)", "1;null"),
         ("select t.n from T where t.m not in (select u.m from U where u.n > 5)", "1;2;null"),
+        ("select t.n from T where t.n not in (select u.n from U where u.n > t.n)", "1;2;null"),
         ("select t.n from T where t.m not in (select u.m from U)", ""),
         ("select t.n from T where not (t.m in (select u.m from U))", ""),
         ("select t.n from T where t.n + 1 not in (select u.n from U)", ""),
@@ -278,6 +279,9 @@ async fn a_query_declares_the_types_of_its_answer() {
         };
         assert_eq!(types(&declared), types(&answered), "{sql}");
     }
+    let sql = "describe select case when pair_id > 1 then 0 else direct_mm end as x from pairs";
+    let described = answer(&session, sql).await.expect("described");
+    assert!(described.starts_with("x|Float64|"), "{described}");
 }
 
 /// E18: `AT TIME ZONE` has PostgreSQL's meaning: of a moment the clock's time, of a clock's time the moment.

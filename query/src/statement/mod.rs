@@ -32,10 +32,13 @@ mod tests;
 mod tree;
 mod using_columns;
 
+use std::sync::Arc;
+
 use datafusion::execution::context::SQLOptions;
 use datafusion::execution::session_state::SessionState;
-use datafusion::logical_expr::LogicalPlan;
+use datafusion::logical_expr::{DescribeTable, LogicalPlan};
 use datafusion::sql::parser::{DFParserBuilder, Statement};
+use datafusion::sql::sqlparser::ast::{DescribeAlias, Statement as Sql};
 use datafusion::sql::sqlparser::tokenizer::Tokenizer;
 
 pub(crate) use as_of::{PastTableName, find_past_tables};
@@ -85,12 +88,38 @@ pub(crate) async fn prepare_statement(
     rewrite::rewrite_statement(&mut statement, state, sql)?;
     gate::check_reading(&statement)?;
     clauses::check_clauses(&statement, sql, state)?;
-    let plan = state.statement_to_plan(statement).await;
-    let plan = plan.and_then(placeholders::infer_types).and_then(integer_casts::round_casts);
-    let plan = plan.and_then(|plan| declared_types::settle_types(plan, state.config_options()));
-    let plan = plan.map_err(|e| Error::from_planning(sql, &e))?;
+    let described = match described_query(&statement) {
+        Some(query) => Some(Arc::new(plan_statement(sql, query, state).await?.schema().as_arrow().clone())),
+        None => None,
+    };
+    let plan = match (plan_statement(sql, statement, state).await?, described) {
+        (LogicalPlan::DescribeTable(table), Some(schema)) => {
+            LogicalPlan::DescribeTable(DescribeTable { schema, ..table })
+        }
+        (plan, _) => plan,
+    };
     // `SELECT INTO` reads by its first word and makes a table by its plan.
     let reading = SQLOptions::new().with_allow_ddl(false).with_allow_dml(false).with_allow_statements(false);
     reading.verify_plan(&plan).map_err(|_| Error::NotReading { statement: plan.display().to_string() })?;
     Ok(plan)
+}
+
+async fn plan_statement(sql: &str, statement: Statement, state: &SessionState) -> Result<LogicalPlan, Error> {
+    let plan = state.statement_to_plan(statement).await;
+    let plan = plan.and_then(placeholders::infer_types).and_then(integer_casts::round_casts);
+    let plan = plan.and_then(|plan| declared_types::settle_types(plan, state.config_options()));
+    plan.map_err(|e| Error::from_planning(sql, &e))
+}
+
+// Returns the query of DESCRIBE, whose types the planner takes before they are settled.
+fn described_query(statement: &Statement) -> Option<Statement> {
+    let Statement::Statement(parsed) = statement else { return None };
+    match parsed.as_ref() {
+        Sql::Explain { describe_alias: DescribeAlias::Describe | DescribeAlias::Desc, statement, .. }
+            if matches!(**statement, Sql::Query(_)) =>
+        {
+            Some(Statement::Statement(statement.clone()))
+        }
+        _ => None,
+    }
 }
