@@ -36,9 +36,7 @@ use tokio::runtime::Runtime;
 use answer_rows::AnswerRows;
 pub(crate) use answer_rows::{RowOrder, find_difference};
 use documented::PEER_SETTINGS;
-pub(crate) use documented::find_documented;
-#[cfg(test)]
-use documented::{DOCUMENTED, DocumentedDifference};
+pub(crate) use documented::{DOCUMENTED, DocumentedDifference, find_documented};
 #[cfg(test)]
 use hand_written::{ExpectedAnswer, hand_written_statements};
 pub(crate) use peer::{DuckdbPeer, PeerTables, install_duckdb};

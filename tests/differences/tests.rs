@@ -12,9 +12,8 @@ const PAGE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/docs/duckdb.md");
 const RENEW: &str = "ECHOLAKE_RENEW";
 const PAGE_HEAD: &str = "# Beside DuckDB
 
-DuckDB reads the lake's files, and knows most of the same SQL. These statements it answers otherwise, by design. All
-other statements of the kinds that `stress sql-differences` makes have the same answer, or one side refuses them:
-[Tests](testing.md#stress).
+DuckDB reads the lake's files, and knows most of the same SQL. These statements it answers otherwise, by design. What
+`stress sql-differences` finds beyond them is a defect: [Tests](testing.md#stress).
 
 This page is generated from the answers of both; `ECHOLAKE_RENEW=1 cargo test --profile quick --workspace differences`
 writes it.
