@@ -209,12 +209,6 @@ impl DifferenceCampaign {
         Ok(Self { runtime, session, peer, python, tables, _folder: folder })
     }
 
-    /// Returns whether there is a DuckDB.
-    #[cfg(test)]
-    pub fn has_peer(&self) -> bool {
-        self.peer.is_some()
-    }
-
     /// Starts a DuckDB as it is by default.
     ///
     /// # Errors
