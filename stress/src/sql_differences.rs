@@ -8,7 +8,8 @@ use std::time::{Duration, Instant};
 use anyhow::{Result, ensure};
 
 use super::differences::{
-    ComparisonOutcome, DifferenceCampaign, DifferenceCounts, RowOrder, find_documented, install_duckdb,
+    ComparisonOutcome, DOCUMENTED, DifferenceCampaign, DifferenceCounts, DocumentedDifference, RowOrder,
+    find_documented, install_duckdb,
 };
 
 /// Between two lines about how far it is.
@@ -90,8 +91,9 @@ fn report_counts(counts: &DifferenceCounts, statements: u64, took: Duration) {
         println!("{kind}: {}", outcomes.join(", "));
     }
     println!("\nall: {}", sums.iter().map(|(name, count)| format!("{count} {name}")).collect::<Vec<_>>().join(", "));
-    for (name, count) in &counts.documented {
-        println!("documented, {name}: {count}");
+    for DocumentedDifference { name, sql, reason, .. } in &DOCUMENTED {
+        let count = counts.documented.get(name).copied().unwrap_or(0);
+        println!("documented, {name}: {count}, as `{sql}`: {reason}");
     }
     let mut findings: Vec<_> = counts.findings.values().collect();
     findings.sort_by_key(|finding| (finding.outcome.name(), std::cmp::Reverse(finding.count)));

@@ -130,10 +130,9 @@ impl AnswerRows {
 
     /// Returns the first column that the two sides give other types: a whole number here, a float there.
     pub fn find_type_difference(&self, peer: &Self) -> Option<String> {
-        let known = |kind: &str| kind != "null";
-        let pairs = self.types.iter().zip(&peer.types);
-        let differs = |(own, peer): &(&&str, &&str)| own != peer && known(own) && known(peer);
-        pairs.clone().find(differs).map(|(own, peer)| format!("{own} and {peer}"))
+        let mut pairs = self.types.iter().zip(&peer.types);
+        let (own, peer) = pairs.find(|(own, peer)| own != peer && **own != "null" && **peer != "null")?;
+        Some(format!("{own} and {peer}"))
     }
 
     /// Returns its rows as text, a line each, with commas between the values.
@@ -277,7 +276,7 @@ fn read_cells(array: &ArrayRef) -> Result<Vec<CellValue>> {
         TimeUnit::Microsecond => 1_000,
         TimeUnit::Nanosecond => 1,
     };
-    let times = |factor: i128| {
+    let times = |factor: i128| -> Result<Vec<CellValue>> {
         let array = to(&DataType::Int64)?;
         let value = |row| CellValue::Time(i128::from(array.as_primitive::<Int64Type>().value(row)) * factor);
         Ok(fill_cells(&array, value))

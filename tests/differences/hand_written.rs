@@ -22,8 +22,6 @@ pub(crate) struct HandWrittenStatement {
 pub(crate) enum ExpectedAnswer {
     /// These rows, a line each.
     Rows(Vec<&'static str>),
-    /// These rows, or a refusal that has this in it.
-    RowsOrRefusal(Vec<&'static str>, &'static str),
     /// A refusal that has this in it.
     Refusal(&'static str),
 }
@@ -41,11 +39,9 @@ fn read_statement(part: &'static str) -> Result<HandWrittenStatement> {
     let (title, rest) = part.split_once('\n').context("no statement")?;
     let (sql, answer) = rest.split_once("\n----").context("no answer")?;
     let rows: Vec<_> = answer.trim_matches('\n').lines().filter(|line| !line.is_empty()).collect();
-    let refusal = rows.last().and_then(|line| line.strip_prefix("refused: "));
-    let expected = match (refusal, rows.len()) {
-        (None, _) => ExpectedAnswer::Rows(rows),
-        (Some(refusal), 1) => ExpectedAnswer::Refusal(refusal),
-        (Some(refusal), count) => ExpectedAnswer::RowsOrRefusal(rows[..count - 1].to_vec(), refusal),
+    let expected = match rows.first().and_then(|line| line.strip_prefix("refused: ")) {
+        Some(refusal) => ExpectedAnswer::Refusal(refusal),
+        None => ExpectedAnswer::Rows(rows),
     };
     let order = if title.ends_with(", in order") { RowOrder::Total } else { RowOrder::Free };
     Ok(HandWrittenStatement { title, sql, expected, order })

@@ -36,9 +36,7 @@ use tokio::runtime::Runtime;
 use answer_rows::AnswerRows;
 pub(crate) use answer_rows::{RowOrder, find_difference};
 use documented::PEER_SETTINGS;
-pub(crate) use documented::find_documented;
-#[cfg(test)]
-use documented::{DOCUMENTED, DocumentedDifference};
+pub(crate) use documented::{DOCUMENTED, DocumentedDifference, find_documented};
 #[cfg(test)]
 use hand_written::{ExpectedAnswer, hand_written_statements};
 pub(crate) use peer::{DuckdbPeer, PeerTables, install_duckdb};
@@ -209,12 +207,6 @@ impl DifferenceCampaign {
         let tables = PeerTables { files, threads: 1, is_copied: true, settings: PEER_SETTINGS.to_vec() };
         let peer = python.as_ref().map(|python| DuckdbPeer::start(python, &tables)).transpose()?;
         Ok(Self { runtime, session, peer, python, tables, _folder: folder })
-    }
-
-    /// Returns whether there is a DuckDB.
-    #[cfg(test)]
-    pub fn has_peer(&self) -> bool {
-        self.peer.is_some()
     }
 
     /// Starts a DuckDB as it is by default.

@@ -122,6 +122,13 @@ const TEMPLATES: [(&str, StatementTemplate); 22] = [
     ("unnest", StatementGenerator::unnest_lists),
 ];
 
+/// Tables that statements read, and the columns that are another in each row.
+const TABLES: [(Table, &[&str]); 4] = [
+    (Table::Surfaces, &["surface_id"]),
+    (Table::Pairs, &["pair_id"]),
+    (Table::Tnce, &["run_id", "pair_id"]),
+    (Table::Measurements, &["run_id", "pair_id"]),
+];
 /// Views that statements read, and the columns that are another in each row.
 pub(crate) const VIEWS: [(&str, &[&str]); 3] =
     [("tnce_db", &["run_id", "pair_id"]), ("levels", &["surface_id", "band"]), ("catalogue", &["surface_id"])];
@@ -223,13 +230,7 @@ impl StatementGenerator {
     /// A query fails, or a table is empty.
     pub async fn new(session: &Session, seed: u64) -> Result<Self> {
         let queries = QueryGenerator::new(session, seed).await?;
-        let tables = [
-            (Table::Surfaces, "surfaces", &["surface_id"][..]),
-            (Table::Pairs, "pairs", &["pair_id"]),
-            (Table::Tnce, "tnce", &["run_id", "pair_id"]),
-            (Table::Measurements, "measurements", &["run_id", "pair_id"]),
-        ];
-        let tables = tables.map(|(table, name, key)| {
+        let tables = TABLES.map(|(table, key)| {
             let column = |column: &super::query_generator::SampledColumn| {
                 let kind = ValueKind::from_type(&column.data_type).unwrap_or(ValueKind::Float);
                 SourceColumn { name: column.name.clone(), kind, values: column.values.clone() }
@@ -238,7 +239,7 @@ impl StatementGenerator {
             if table == Table::Measurements {
                 columns.push(SourceColumn { name: "log_time".to_owned(), kind: ValueKind::Time, values: Vec::new() });
             }
-            SourceTable { name, key, columns }
+            SourceTable { name: table.name(), key, columns }
         });
         let mut tables = Vec::from(tables);
         for (name, key) in VIEWS {
