@@ -68,6 +68,12 @@ def test_a_query_has_the_rows_of_an_export(
             assert np.array_equal(queried_rows[surface][name], rows[name]), (surface, name)
 
 
+# B6
+def test_queries_have_positions_whatever_columns_are_named(served_http: str) -> None:
+    row = MeasurementRows(LakeQuery(served_http), "train", ["tnce_total"])[0]
+    assert row["microphone_mm"].shape == row["speaker_mm"].shape == (3,)
+
+
 def test_a_query_stays_at_its_version_and_resumes(own_http: str) -> None:
     before = MeasurementBatches(LakeQuery(own_http), columns=["pair_id", "tnce_total"])
     surface = before.source.files[0]

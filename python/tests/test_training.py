@@ -163,7 +163,7 @@ def in_turns(batches: MeasurementBatches, workers: int, stop: int) -> Iterator[d
 # E30: 17 batches of two ranks, the last of which is left out.
 def test_the_state_after_the_last_batch_of_all_ranks_is_the_next_epoch(small_set: Path) -> None:
     def of(rank: int, world_size: int) -> MeasurementBatches:
-        order = {"batch_size": 35, "drop_last": True, "rank": rank, "world_size": world_size}
+        order: dict[str, Any] = {"batch_size": 35, "drop_last": True, "rank": rank, "world_size": world_size}
         return MeasurementBatches(small_set, columns=["pair_id"], **order)
 
     for rank in (0, 1):
