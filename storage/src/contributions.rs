@@ -231,12 +231,14 @@ impl Lake {
         Ok(())
     }
 
-    /// The annotations on the runs that a snapshot shows, in the order in which they were added.
+    /// The annotations on the runs that a snapshot shows, in the order in which they were added. While `runs` is made
+    /// again, these are not all runs.
     ///
     /// # Errors
-    /// As [`LakeSnapshot::check_table`]; [`Error::DataFile`], or what the store says.
+    /// [`Error::Incomplete`] or [`Error::Log`] if their table has a fault of its own; [`Error::DataFile`], or what the
+    /// store says.
     pub async fn read_annotations(&self, snapshot: &LakeSnapshot) -> Result<Vec<Annotation>> {
-        snapshot.check_table(Table::Annotations)?;
+        snapshot.check_own_fault(Table::Annotations)?;
         let mut all = Vec::new();
         for file in snapshot.files(Table::Annotations) {
             all.extend(self.read_annotation_file(file).await?);

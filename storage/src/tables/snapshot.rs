@@ -172,11 +172,14 @@ impl LakeSnapshot {
     /// # Errors
     /// [`Error::Incomplete`], or [`Error::Log`] if its log is damaged.
     pub fn check_table(&self, table: Table) -> Result<()> {
-        let of_runs = || self.faults.get(&Table::Runs).filter(|_| table.source() != Source::Rig);
-        match self.faults.get(&table).or_else(of_runs) {
-            Some(fault) => Err(fault.to_error()),
-            None => Ok(()),
-        }
+        self.check_own_fault(table)?;
+        let of_runs = self.faults.get(&Table::Runs).filter(|_| table.source() != Source::Rig);
+        of_runs.map_or(Ok(()), |fault| Err(fault.to_error()))
+    }
+
+    // Checks a table but not `runs`, on which it rests.
+    pub(crate) fn check_own_fault(&self, table: Table) -> Result<()> {
+        self.faults.get(&table).map_or(Ok(()), |fault| Err(fault.to_error()))
     }
 
     /// Checks all tables but those of users, on which no other rests.

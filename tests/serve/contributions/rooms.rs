@@ -45,7 +45,7 @@ fn predictions_of_one_project_are_nothing_to_another() {
     assert_eq!((stored["is_new"].as_bool(), stored["lake_version"].is_null()), (Some(true), true), "{stored}");
     let sql = |token: &str, statement: &str| {
         let request = HttpRequest::post("/api/v1/sql", statement).with("content-type", "text/plain");
-        request.with("authorization", &format!("Bearer {token}")).send(&server).text()
+        request.with("authorization", &format!("Bearer {token}")).send(&server).text().trim_end().to_owned()
     };
     let rows = "select author, project, tnce_10000 as value from predictions order by project";
     assert_eq!(sql(&alpha, rows), r#"[{"author":"ann","project":"alpha","value":0.25}]"#);
