@@ -35,8 +35,8 @@ use tokio::runtime::Runtime;
 
 use answer_rows::AnswerRows;
 pub(crate) use answer_rows::{RowOrder, find_difference};
-use documented::PEER_SETTINGS;
 pub(crate) use documented::{DOCUMENTED, DocumentedDifference, find_documented};
+use documented::{PEER_SETTINGS, peer_text};
 #[cfg(test)]
 use hand_written::{ExpectedAnswer, hand_written_statements};
 pub(crate) use peer::{DuckdbPeer, PeerTables, install_duckdb};
@@ -237,7 +237,7 @@ impl DifferenceCampaign {
     /// The peer has ended, or values cannot be read.
     pub fn peer_answer(&mut self, sql: &str) -> Result<Option<Result<AnswerRows, String>>> {
         let Some(peer) = &mut self.peer else { return Ok(None) };
-        Ok(Some(match peer.ask_rows(sql)? {
+        Ok(Some(match peer.ask_rows(&peer_text(sql))? {
             Ok(batches) => Ok(AnswerRows::read(&batches)?),
             Err(message) => Err(message),
         }))
@@ -345,9 +345,9 @@ impl DifferenceCampaign {
         let has = |sql: &str, words: &str| sql.to_lowercase().contains(words);
         let whole = &statement.sql;
         let is_wrong = &mut |sql: &str| {
-            // Without its order it answers by chance.
-            let is_loose =
-                has(whole, "order by") && !has(sql, "order by") && (has(sql, "distinct on") || has(sql, "limit"));
+            // Without its order it answers by chance, or in another order.
+            let needs_order = statement.order == RowOrder::Total || has(sql, "distinct on") || has(sql, "limit");
+            let is_loose = needs_order && has(whole, "order by") && !has(sql, "order by");
             if is_loose || self.session.parse_sql(sql).is_err() {
                 return false;
             }
