@@ -12,6 +12,7 @@ mod clauses;
 mod columns;
 mod declared_types;
 mod dialect;
+mod distinct_operands;
 mod gate;
 pub(crate) mod hints;
 mod integer_arithmetic;

@@ -13,6 +13,7 @@
 //! | `COLUMNS('x.*')` | the columns of FROM, see [`columns`](super::columns) |
 //! | `SUMMARIZE t` | a row per column, see [`summarize`](super::summarize) |
 //! | `q EXCEPT ALL r` | rows with numbers, see [`set_operations`](super::set_operations) |
+//! | `a IS DISTINCT FROM b AND c` | `(a IS DISTINCT FROM b) AND c`, see [`distinct_operands`](super::distinct_operands) |
 //! | `(a, b) IN (q)` | `EXISTS`, see [`row_values`](super::row_values) |
 //! | `t AT TIME ZONE 'zone'` | a call of a function |
 //! | `t(a, b) AS (SELECT 1, 1)`, `ROLLUP(1, 2)` | names and positions, see [`result_names`](super::result_names) |
@@ -36,6 +37,7 @@ use futures::FutureExt as _;
 
 use super::as_of::rewrite_as_of;
 use super::columns::{ColumnsExpansion, has_columns, hinted_error};
+use super::distinct_operands::order_distinct_operands;
 use super::result_names::{expand_grouping_positions, name_listed_columns};
 use super::row_values::{rewrite_row_conditions, rewrite_row_value};
 use super::set_operations::count_set_rows;
@@ -69,6 +71,7 @@ type Visit = ControlFlow<Box<Error>>;
 pub(super) fn rewrite_statement(statement: &mut Statement, state: &SessionState, sql: &str) -> Result<(), Error> {
     match statement {
         Statement::Statement(parsed) => {
+            order_distinct_operands(parsed);
             let mut visitor = RewriteVisitor {
                 state,
                 sql,
