@@ -2015,6 +2015,11 @@ export interface operations {
                 readonly model: string;
                 /** @description Version of the model, as its name. */
                 readonly version: string;
+                /**
+                 * @description Project of the surfaces' runs, empty for runs without one: only if runs of two projects have a surface of the
+                 *     request.
+                 */
+                readonly project?: string;
                 /** @description Only without tokens; the token's name otherwise. */
                 readonly author?: string;
             };

@@ -207,8 +207,8 @@ fn error_sql(rig: &Rig) -> String {
     format!(
         "select p.model as model, p.model_version as model_version, max(p.author) as author, count(*) as pairs, \
          {} as rms_db, {} as rms_band_db from predictions p join tnce t on t.surface_id = p.surface_id and \
-         t.pair_id = p.pair_id where p.surface_id = $1 and p.project is not distinct from $3 and t.run_id = $2 and not is_rejected(t.run_id, t.pair_id) \
-         group by p.model, p.model_version order by p.model, p.model_version",
+         t.pair_id = p.pair_id where p.surface_id = $1 and t.run_id = $2 and not is_rejected(t.run_id, t.pair_id) \
+         and (p.project is not distinct from $3) group by p.model, p.model_version order by p.model, p.model_version",
         band_list(rig, |band| rms(over_total(band))),
         band_list(rig, |band| rms(over_band(band)))
     )
