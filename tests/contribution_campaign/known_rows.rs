@@ -1,4 +1,4 @@
-//! Rows as the test knows them, and as a reader of Delta's protocol finds them that is no part of the program.
+//! Rows as the test knows them, and tables' folders, which are read and damaged without the program.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -7,6 +7,8 @@ use std::path::{Path, PathBuf};
 use arrow::json::ArrayWriter;
 use parquet::arrow::ProjectionMask;
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
+use rand::Rng as _;
+use rand_chacha::ChaCha8Rng;
 use serde_json::Value;
 
 use super::requests::{CLIENTS, SentRows, TABLES, is_visible, row_text};
@@ -60,9 +62,18 @@ impl KnownRows {
     }
 }
 
-/// A table's folder, read without the program.
-pub(super) struct DeltaFolder {
+/// A file that was lost or damaged.
+pub(super) struct DamagedFile {
     pub path: PathBuf,
+    /// Its bytes before.
+    pub bytes: Vec<u8>,
+    /// The name by which the fault must be told.
+    pub named: String,
+}
+
+/// A table's folder, as any reader of Delta's protocol reads it.
+pub(super) struct DeltaFolder {
+    path: PathBuf,
     table: usize,
 }
 
@@ -74,7 +85,7 @@ impl DeltaFolder {
 
     /// The rows of the newest version.
     pub fn read_rows(&self) -> Value {
-        let mut writer = ArrayWriter::new(Vec::new());
+        let mut writer = ArrayWriter::new(Vec::<u8>::new());
         for name in self.list_files() {
             let file = fs::File::open(self.path.join(name)).expect("it is there");
             let reader = ParquetRecordBatchReaderBuilder::try_new(file).expect("Parquet");
@@ -87,8 +98,8 @@ impl DeltaFolder {
         serde_json::from_slice(&writer.into_inner()).expect("JSON")
     }
 
-    /// The files of the newest version.
-    pub fn list_files(&self) -> Vec<String> {
+    // The files of the newest version.
+    fn list_files(&self) -> Vec<String> {
         let mut files = Vec::new();
         for commit in self.list_log(".json") {
             let text = fs::read_to_string(self.log_file(&commit, ".json")).expect("read");
@@ -102,8 +113,29 @@ impl DeltaFolder {
         files
     }
 
-    /// The commits that readers need: those after the last checkpoint.
-    pub fn needed_commits(&self) -> Vec<PathBuf> {
+    /// Cuts, overwrites with zeros, empties or removes a file of the newest version, or removes a commit.
+    pub fn damage_file(&self, sort: usize, random: &mut ChaCha8Rng) -> DamagedFile {
+        let mut files = self.list_files();
+        let mut commits = if sort == 4 { self.needed_commits() } else { Vec::new() };
+        let (path, named) = if commits.is_empty() {
+            let file = files.swap_remove(random.random_range(0..files.len()));
+            (self.path.join(&file), file)
+        } else {
+            (commits.swap_remove(random.random_range(0..commits.len())), TABLES[self.table].0.to_owned())
+        };
+        let bytes = fs::read(&path).expect("read");
+        let damaged = match sort {
+            0 => fs::write(&path, &bytes[..random.random_range(1..bytes.len())]),
+            1 => fs::write(&path, vec![0_u8; bytes.len()]),
+            2 => fs::write(&path, ""),
+            _ => fs::remove_file(&path),
+        };
+        damaged.expect("written");
+        DamagedFile { path, bytes, named }
+    }
+
+    // The commits that readers need: those after the last checkpoint.
+    fn needed_commits(&self) -> Vec<PathBuf> {
         let checkpoint = self.list_log(".checkpoint.parquet").pop();
         let commits = self.list_log(".json").into_iter().filter(|commit| Some(commit) > checkpoint.as_ref());
         commits.map(|commit| self.log_file(&commit, ".json")).collect()

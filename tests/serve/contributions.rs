@@ -331,6 +331,6 @@ fn acknowledged_annotations_are_stored_once() {
 #[test]
 fn nothing_crosses_projects_or_is_lost_and_faults_stop_only_their_readers() {
     let mut campaign = ContributionCampaign::new(Path::new(crate::ECHOLAKE), 2);
-    let counts = campaign.sequences(3, &mut |_| {});
-    assert!(counts.sequences == 3 && counts.refused >= 12 && counts.unanswered >= 3, "{counts:?}");
+    let counts = campaign.sequences(2, &mut |_| {});
+    assert!(counts.sequences == 2 && counts.refused >= 8 && counts.unanswered == 2, "{counts:?}");
 }
