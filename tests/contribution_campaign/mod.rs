@@ -3,7 +3,7 @@
 //! Nothing crosses to the other project, and nothing acknowledged is lost, for an independent reader, too. At the end of
 //! each sequence a file is lost or damaged: `doctor` names it, and only what reads its table stops until it is back.
 
-mod known_rows;
+mod expected_rows;
 mod requests;
 
 use std::fs;
@@ -20,7 +20,7 @@ use serde_json::Value;
 
 use super::serve::http::HttpRequest;
 use super::serve::server::ServedLake;
-use known_rows::{DamagedFile, DeltaFolder, KnownRows};
+use expected_rows::{DamagedFile, DeltaFolder, ExpectedRows};
 use requests::{
     ANNOTATIONS, CLIENTS, EVE, PREDICTIONS, PredictedValues, RUNS, RequestSource, SentRows, TABLES, send_request,
 };
@@ -57,7 +57,7 @@ pub(crate) struct ContributionCampaign {
     tokens: Vec<String>,
     servers: Vec<ServedLake>,
     source: RequestSource,
-    known: KnownRows,
+    expected: ExpectedRows,
     /// Each with the numbers of rows of then, by table.
     tags: Vec<(String, [usize; TABLES.len()])>,
     annotated: Option<SentRows>,
@@ -77,7 +77,7 @@ impl ContributionCampaign {
             tokens: Vec::new(),
             servers: Vec::new(),
             source: RequestSource::new(seed, Vec::new()),
-            known: KnownRows::default(),
+            expected: ExpectedRows::default(),
             tags: Vec::new(),
             annotated: None,
             predicted: Vec::new(),
@@ -155,7 +155,7 @@ impl ContributionCampaign {
             6 => {
                 let name = format!("t{}", self.tags.len());
                 self.run(&["tag", &name]);
-                self.tags.push((name, self.known.counts()));
+                self.tags.push((name, self.expected.counts()));
             }
             7 => drop(self.run(&["optimize"])),
             _ => self.kill_server(server, client),
@@ -270,7 +270,7 @@ impl ContributionCampaign {
             repeat(self, server);
         }
         if !is_repeated {
-            self.known.add_rows(&unanswered, false);
+            self.expected.add_rows(&unanswered, false);
         }
     }
 
@@ -301,7 +301,7 @@ impl ContributionCampaign {
         let (status, answer) = self.select_rows(server, client, table, "order by run_id");
         // A file without rows that the client sees is nothing to it.
         match status == 200 && client != EVE {
-            true => self.known.check_rows(&place, client, table, &answer, usize::MAX),
+            true => self.expected.check_rows(&place, client, table, &answer, usize::MAX),
             false => assert!(status >= 500 && answer.to_string().contains(named), "{place}: {status} {answer}"),
         }
         if client == EVE {
@@ -322,7 +322,7 @@ impl ContributionCampaign {
         let older = self.source.random.random_range(0..self.tags.len());
         for table in [ANNOTATIONS, PREDICTIONS] {
             let check = |client: usize, rows: &Value, before: usize| {
-                self.known.check_rows(&self.place, client, table, rows, before);
+                self.expected.check_rows(&self.place, client, table, rows, before);
             };
             check(EVE, &DeltaFolder::new(self.folder.path(), table).read_rows(), usize::MAX);
             for (server, client) in READERS {
@@ -360,7 +360,7 @@ impl ContributionCampaign {
         assert_eq!(status, 200, "{place}");
         let is_stored = stored["is_new"].as_bool().expect("a flag");
         assert_eq!(is_stored, is_new.unwrap_or(is_stored), "{place}");
-        self.known.add_rows(sent, true);
+        self.expected.add_rows(sent, true);
         self.counts.acknowledged += 1;
     }
 

@@ -14,7 +14,7 @@ use serde_json::Value;
 use super::requests::{CLIENTS, SentRows, TABLES, is_visible, row_text};
 
 /// A row that was sent.
-struct KnownRow {
+struct ExpectedRow {
     /// Place in the order in which rows were sent.
     number: usize,
     project: Option<&'static str>,
@@ -24,14 +24,14 @@ struct KnownRow {
 
 /// The rows of the tables, by their text.
 #[derive(Default)]
-pub(super) struct KnownRows([BTreeMap<String, KnownRow>; TABLES.len()]);
+pub(super) struct ExpectedRows([BTreeMap<String, ExpectedRow>; TABLES.len()]);
 
-impl KnownRows {
+impl ExpectedRows {
     /// Adds the rows of a request.
     pub fn add_rows(&mut self, sent: &SentRows, is_acknowledged: bool) {
         let rows = &mut self.0[sent.table];
         for (project, text) in &sent.rows {
-            let row = KnownRow { number: rows.len(), project: *project, is_acknowledged };
+            let row = ExpectedRow { number: rows.len(), project: *project, is_acknowledged };
             rows.entry(text.clone()).or_insert(row);
         }
     }
@@ -47,7 +47,7 @@ impl KnownRows {
     /// One is missing, there twice or not one of them.
     pub fn check_rows(&self, place: &str, client: usize, table: usize, answer: &Value, before: usize) {
         let place = format!("{place}: {} as {} sees them", TABLES[table].0, CLIENTS[client].0);
-        let is_seen = |row: &KnownRow| row.number < before && is_visible(client, row.project);
+        let is_seen = |row: &ExpectedRow| row.number < before && is_visible(client, row.project);
         let mut found = BTreeMap::<String, usize>::new();
         for row in answer.as_array().expect("rows") {
             *found.entry(row_text(table, row)).or_default() += 1;
