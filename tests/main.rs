@@ -7,6 +7,7 @@ mod architecture;
 mod bad_input;
 mod broken_tables;
 mod campaign;
+mod contribution_campaign;
 mod design;
 #[allow(dead_code, unused_imports, reason = "`stress` wants more of it")]
 mod differences;

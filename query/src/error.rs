@@ -230,6 +230,9 @@ impl Error {
                 Some(LakeError::Log { table, action, source }) => {
                     Some(LakeError::Log { table, action, source: source.to_string().into() }.into())
                 }
+                Some(LakeError::DataFile { file, source }) => {
+                    Some(LakeError::DataFile { file: file.clone(), source: source.to_string().into() }.into())
+                }
                 _ => None,
             },
             _ => None,

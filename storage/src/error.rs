@@ -360,7 +360,10 @@ impl Error {
     #[cfg(feature = "tables")]
     pub fn unread_file(file: &object_store::path::Path, source: object_store::Error) -> Self {
         match source {
-            object_store::Error::NotFound { .. } => Self::DataFile { file: file.to_string(), source: source.into() },
+            // The store's text names the place on the server's disk.
+            object_store::Error::NotFound { .. } => {
+                Self::DataFile { file: file.to_string(), source: "it is not there".into() }
+            }
             source => Self::store_failure("read", file, source),
         }
     }

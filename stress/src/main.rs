@@ -9,6 +9,9 @@ mod annotation_kills;
 mod attacks;
 mod bench;
 mod cancels;
+#[path = "../../tests/contribution_campaign/mod.rs"]
+mod contribution_campaign;
+mod contribution_sequences;
 #[path = "../../tests/differences/mod.rs"]
 mod differences;
 mod engine_kills;
@@ -68,6 +71,8 @@ enum CampaignCommand {
     AcquireKills(kill_acquire::KillAcquireArgs),
     /// Kill `serve` while a client annotates; nothing acknowledged may be lost or stored twice.
     AnnotationKills(kill_annotations::KillAnnotationsArgs),
+    /// Let users of two projects add by two servers, kill these and damage files; nothing may cross or be lost.
+    Contributions(contribution_sequences::ContributionSequencesArgs),
     /// Do what people do to a lake, in random sequences; an answer is whole, or an exit code says that it is not.
     Operators(operator_rounds::OperatorArgs),
     /// Throw changed SQL, bytes of each protocol or run files at `serve`.
@@ -94,6 +99,7 @@ fn main() -> Result<()> {
         CampaignCommand::HostileFiles(args) => hostile_ingest::run_hostile_ingest(&args),
         CampaignCommand::AcquireKills(args) => kill_acquire::run_kill_acquire(&args),
         CampaignCommand::AnnotationKills(args) => kill_annotations::run_kill_annotations(&args),
+        CampaignCommand::Contributions(args) => contribution_sequences::run_contribution_sequences(&args),
         CampaignCommand::Operators(args) => operator_rounds::run_operator_rounds(&args),
         CampaignCommand::Fuzz(args) => fuzz_server::run_fuzz_server(&args),
         CampaignCommand::Attacks(args) => attacks::run_attacks(&args),

@@ -18,6 +18,7 @@ use super::server::ServedLake;
 use super::{get, json, refused, served, wait_until};
 use crate::TestFolder;
 use crate::annotation_kills::AnnotationKillCampaign;
+use crate::contribution_campaign::ContributionCampaign;
 
 fn find_run(place: &TestFolder) -> String {
     let runs = place.sql("select run_id from runs where surface_id = 'brick'");
@@ -324,4 +325,12 @@ fn acknowledged_annotations_are_stored_once() {
     let mut campaign = AnnotationKillCampaign::new(Path::new(crate::ECHOLAKE), 7);
     let counts = campaign.kills(8, &mut |_| {});
     assert!(counts.killed == 8 && counts.acknowledged > 8, "{counts:?}");
+}
+
+/// E1, E4, E5: users of two projects, two servers, kills and faults, in random sequences.
+#[test]
+fn nothing_crosses_projects_or_is_lost_and_faults_stop_only_their_readers() {
+    let mut campaign = ContributionCampaign::new(Path::new(crate::ECHOLAKE), 2);
+    let counts = campaign.sequences(2, &mut |_| {});
+    assert!(counts.sequences == 2 && counts.refused >= 8 && counts.unanswered == 2, "{counts:?}");
 }

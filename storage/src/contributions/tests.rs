@@ -176,6 +176,21 @@ async fn rows_of_one_project_are_not_seen_by_another() {
     }
 }
 
+/// E5: an emptied file, of which a store gives no byte, is a fault of its table, not of the store.
+#[tokio::test]
+async fn an_emptied_file_of_annotations_is_a_fault_of_their_table() {
+    let store = Arc::new(InMemory::new());
+    let lake = open(&store).await;
+    lake.ensure_tables().await.expect("made");
+    add_run(&lake, "flat", "r1", None).await;
+    annotate(&lake, &[verdict("r1", "lost", "rejected")]).await;
+    let snapshot = lake.snapshot().await.expect("a view");
+    let emptied = &snapshot.files(Table::Annotations)[0].path;
+    store.put(emptied, "".into()).await.expect("emptied");
+    let error = lake.read_annotations(&snapshot).await.expect_err("damaged");
+    assert!(error.is_table_fault() && error.to_string().contains("it has 0 bytes, its log says"), "{error}");
+}
+
 /// E4: a file or the log of annotations that is lost is a fault of that table alone, until somebody gives it up.
 #[tokio::test]
 async fn lost_annotations_are_a_fault_of_their_table_alone_until_they_are_given_up() {

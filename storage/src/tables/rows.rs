@@ -90,7 +90,14 @@ impl Lake {
         let damaged = move |e: ParquetError| unread_error(&path, e);
         let mut reader = StoredFile { store: self.store(), path: file.path.clone(), bytes: file.bytes };
         let options = ArrowReaderOptions::new().with_page_index_policy(PageIndexPolicy::Optional);
-        let metadata = reader.get_metadata(Some(&options)).await.map_err(damaged.clone())?;
+        let metadata = match reader.get_metadata(Some(&options)).await {
+            Ok(metadata) => metadata,
+            Err(error) => {
+                // A store refuses to read behind a file's end, which is damage to the lake.
+                self.check_size(file).await?;
+                return Err(damaged(error));
+            }
+        };
         let schema = table.schema(self.rig());
         let metadata = reader_metadata(metadata, &schema).map_err(damaged.clone())?;
         let mut builder = ParquetRecordBatchStreamBuilder::new_with_metadata(reader, metadata);
@@ -113,6 +120,19 @@ impl Lake {
         let wanted = wanted_schema(&schema, columns);
         let complete = move |batch: RecordBatch| add_missing_columns(&batch, &wanted).map_err(ParquetError::from);
         Ok(stream.map(move |batch| batch.and_then(&complete)).map_err(damaged).boxed())
+    }
+
+    /// Checks that a file has as many bytes as its log says.
+    ///
+    /// # Errors
+    /// [`Error::DataFile`] if it has not, or is not there; or what the store says.
+    pub(crate) async fn check_size(&self, file: &DataFile) -> Result<()> {
+        let size = self.store().head(&file.path).await.map_err(|e| Error::unread_file(&file.path, e))?.size;
+        if size == file.bytes {
+            return Ok(());
+        }
+        let source = format!("it has {size} bytes, its log says {}", file.bytes).into();
+        Err(Error::DataFile { file: file.path.to_string(), source })
     }
 }
 
@@ -178,7 +198,7 @@ mod tests {
         let away = fault(StoreError::Generic { store: "S3", source });
         assert_eq!(away.to_string(), "cannot read `tables/nce/x.parquet`: connection reset");
         let absent = fault(StoreError::NotFound { path: path.to_string(), source: "404".into() });
-        assert!(matches!(absent, Error::DataFile { .. }), "{absent}");
+        assert!(absent.to_string().starts_with("`tables/nce/x.parquet` is damaged: it is not there; "), "{absent}");
         let damaged = unread_error(&path, ParquetError::EOF("too short".into()));
         assert!(matches!(damaged, Error::DataFile { .. }), "{damaged}");
     }

@@ -2,7 +2,6 @@
 
 use echolake_schema::tables::Table;
 use futures::TryStreamExt as _;
-use object_store::ObjectStoreExt as _;
 
 use crate::{DataFile, Error, Lake, Result, TableCommit};
 
@@ -76,11 +75,7 @@ impl Lake {
     /// # Errors
     /// [`Error::DataFile`] if it is not, or what the store says.
     pub async fn check_file(&self, table: Table, file: &DataFile) -> Result<()> {
-        let size = self.store().head(&file.path).await.map_err(|e| Error::unread_file(&file.path, e))?.size;
-        let damaged = |reason: String| Error::DataFile { file: file.path.to_string(), source: reason.into() };
-        if size != file.bytes {
-            return Err(damaged(format!("it has {size} bytes, its log says {}", file.bytes)));
-        }
+        self.check_size(file).await?;
         let mut batches = self.read_rows(table, file, &[], 0..file.rows).await?;
         let mut rows = 0;
         // A batch at a time: a merged file has more rows than memory should hold.
@@ -89,7 +84,10 @@ impl Lake {
         }
         match rows == file.rows {
             true => Ok(()),
-            false => Err(damaged(format!("it has {rows} rows, its log says {}", file.rows))),
+            false => {
+                let source = format!("it has {rows} rows, its log says {}", file.rows).into();
+                Err(Error::DataFile { file: file.path.to_string(), source })
+            }
         }
     }
 
