@@ -155,7 +155,11 @@ impl LakeCatalog {
     ///
     /// # Errors
     /// [`Error::Lake`] if they cannot be read.
-    pub async fn annotations_on(&self, snapshot: &LakeSnapshot, runs: &HashSet<RunId>) -> Result<Vec<Annotation>, Error> {
+    pub async fn annotations_on(
+        &self,
+        snapshot: &LakeSnapshot,
+        runs: &HashSet<RunId>,
+    ) -> Result<Vec<Annotation>, Error> {
         Ok(self.annotations.read_annotations(&self.lake, snapshot, runs).await?)
     }
 

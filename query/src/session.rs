@@ -487,7 +487,11 @@ impl Session {
     ///
     /// # Errors
     /// [`Error::Lake`] if they cannot be read.
-    pub async fn annotations_on(&self, snapshot: &LakeSnapshot, runs: &HashSet<RunId>) -> Result<Vec<Annotation>, Error> {
+    pub async fn annotations_on(
+        &self,
+        snapshot: &LakeSnapshot,
+        runs: &HashSet<RunId>,
+    ) -> Result<Vec<Annotation>, Error> {
         self.engine.catalog().annotations_on(snapshot, runs).await
     }
 

@@ -15,8 +15,8 @@ use echolake_schema::annotations::{Annotation, AnnotationKind};
 use echolake_schema::tables::Table;
 use echolake_schema::{ProjectName, RunId};
 use futures::{StreamExt as _, TryStreamExt as _};
-use object_store::{ObjectStore, ObjectStoreExt as _};
 use object_store::path::Path;
+use object_store::{ObjectStore, ObjectStoreExt as _};
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 use serde::Deserialize;
 

@@ -273,7 +273,8 @@ impl Lake {
     /// As [`Lake::read_pending_rows`].
     pub async fn pending_annotations(&self, snapshot: &LakeSnapshot) -> Result<Vec<Annotation>> {
         let rows = self.read_pending_rows(snapshot, Table::Annotations).await?;
-        let damaged = |reason: String| Error::DataFile { file: Table::Annotations.name().to_owned(), source: reason.into() };
+        let damaged =
+            |reason: String| Error::DataFile { file: Table::Annotations.name().to_owned(), source: reason.into() };
         rows.map_or(Ok(Vec::new()), |rows| decode_annotations(&rows).map_err(damaged))
     }
 
@@ -355,16 +356,11 @@ fn decode_annotations(rows: &RecordBatch) -> std::result::Result<Vec<Annotation>
         values.ok_or_else(|| format!("column `{name}` is no text"))
     };
     let typed = |name: &str| format!("column `{name}` has another type than the table's");
-    let [runs, kinds, values, comments, authors, ids] = [
-        text("run_id")?,
-        text("kind")?,
-        text("value")?,
-        text("comment")?,
-        text("author")?,
-        text("annotation_id")?,
-    ];
+    let [runs, kinds, values, comments, authors, ids] =
+        [text("run_id")?, text("kind")?, text("value")?, text("comment")?, text("author")?, text("annotation_id")?];
     let pairs = column("pair_ids")?.as_list_opt::<i32>().ok_or_else(|| typed("pair_ids"))?;
-    let times = column("annotated")?.as_primitive_opt::<TimestampMicrosecondType>().ok_or_else(|| typed("annotated"))?;
+    let times =
+        column("annotated")?.as_primitive_opt::<TimestampMicrosecondType>().ok_or_else(|| typed("annotated"))?;
     let versions = column("lake_version")?.as_primitive_opt::<Int64Type>().ok_or_else(|| typed("lake_version"))?;
     let one = |row: usize| {
         let pair_ids = pairs.is_valid(row).then(|| {
@@ -376,7 +372,8 @@ fn decode_annotations(rows: &RecordBatch) -> std::result::Result<Vec<Annotation>
             annotation_id: ids.value(row).to_owned(),
             run_id: runs.value(row).parse().map_err(|e| format!("row {row}: {e}"))?,
             pair_ids: pair_ids.flatten(),
-            kind: AnnotationKind::by_name(kind).ok_or_else(|| format!("row {row}: `{kind}` is no kind of annotation"))?,
+            kind: AnnotationKind::by_name(kind)
+                .ok_or_else(|| format!("row {row}: `{kind}` is no kind of annotation"))?,
             value: values.value(row).to_owned(),
             comment: comments.value(row).to_owned(),
             author: authors.value(row).to_owned(),

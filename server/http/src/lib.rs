@@ -100,7 +100,10 @@ fn with_protocol(protocol: ServerProtocol, routes: Router) -> Router {
 /// others.
 pub fn contract_parts() -> [OpenApi; 2] {
     let files = files::viewer_routes().merge(files::own_routes()).merge(manifest::manifest_routes());
-    let catalogue = catalogue::light_routes().merge(catalogue::contribution_routes()).merge(catalogue::heavy_routes()).merge(catalogue::file_routes());
+    let catalogue = catalogue::light_routes()
+        .merge(catalogue::contribution_routes())
+        .merge(catalogue::heavy_routes())
+        .merge(catalogue::file_routes());
     let mut validated = catalogue.into_openapi();
     validated.merge(layout::layout_routes().into_openapi());
     validated.merge(files.into_openapi());

@@ -115,7 +115,8 @@ mod tests {
             stats: r#"{"numRecords":1,"minValues":{"value":"a b"}}"#.to_owned(),
             bytes: bytes.into(),
         };
-        let files = vec![file(vec![part("flat", 1), part("wood", 2)], "PAR1\n\nPAR1"), file(vec![part("brick", 1)], "x")];
+        let files =
+            vec![file(vec![part("flat", 1), part("wood", 2)], "PAR1\n\nPAR1"), file(vec![part("brick", 1)], "x")];
         let draft =
             ContributionDraft { table: Table::Annotations, seen: 7, files, annotation_ids: vec!["a-1".to_owned()] };
         assert_eq!(ContributionDraft::decode(draft.encode()), Ok(draft.clone()));
@@ -125,7 +126,9 @@ mod tests {
         for cut in 0..encoded.len() {
             assert!(ContributionDraft::decode(encoded.slice(..cut)).is_err(), "cut at {cut}");
         }
-        for bad in ["runs 1\n\n", "annotations x\n\n", "annotations 1\nrows flat r 1\n\n", "annotations 1\nfile 9 {}\n\nx"] {
+        for bad in
+            ["runs 1\n\n", "annotations x\n\n", "annotations 1\nrows flat r 1\n\n", "annotations 1\nfile 9 {}\n\nx"]
+        {
             assert!(ContributionDraft::decode(bad.into()).is_err(), "{bad}");
         }
     }

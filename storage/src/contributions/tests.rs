@@ -117,7 +117,8 @@ async fn each_version_has_its_annotations_in_their_order_however_they_are_merged
     // Past a checkpoint, and merged twice on the way.
     for number in 0..45 {
         let run = ["r2", "r1"][number % 2];
-        let both = [verdict(run, &format!("b{number:02}"), "rejected"), verdict(run, &format!("a{number:02}"), "accepted")];
+        let both =
+            [verdict(run, &format!("b{number:02}"), "rejected"), verdict(run, &format!("a{number:02}"), "accepted")];
         names.extend(both.iter().map(|annotation| annotation.annotation_id.clone()));
         expected.push((annotate(&lake, &both).await, names.clone()));
         if number % 20 == 10 {
@@ -141,12 +142,9 @@ async fn rows_of_one_project_are_not_seen_by_another() {
     let store = Arc::new(InMemory::new());
     let lake = open(&store).await;
     lake.ensure_tables().await.expect("made");
-    for (surface, run, project) in [
-        ("wall", "r1", Some("alpha")),
-        ("wall", "r2", Some("beta")),
-        ("flat", "r3", Some("beta")),
-        ("own", "r4", None),
-    ] {
+    for (surface, run, project) in
+        [("wall", "r1", Some("alpha")), ("wall", "r2", Some("beta")), ("flat", "r3", Some("beta")), ("own", "r4", None)]
+    {
         add_run(&lake, surface, run, project).await;
     }
     let alpha = lake.restricted_to(["alpha".parse().expect("a name")].into());
@@ -165,7 +163,8 @@ async fn rows_of_one_project_are_not_seen_by_another() {
         assert_eq!(models(&lake).await, ["of-alpha", "of-beta", "of-flat", "of-none"]);
         assert_eq!(models(&alpha).await, ["of-alpha", "of-flat"]);
         assert_eq!(models(&beta).await, ["of-beta", "of-flat"]);
-        for (reader, expected) in [(&lake, &["r1", "r2", "r3", "r4"][..]), (&alpha, &["r1", "r3"]), (&beta, &["r2", "r3"])]
+        for (reader, expected) in
+            [(&lake, &["r1", "r2", "r3", "r4"][..]), (&alpha, &["r1", "r3"]), (&beta, &["r2", "r3"])]
         {
             let snapshot = reader.snapshot().await.expect("a view");
             let seen = reader.read_annotations(&snapshot).await.expect("read");

@@ -24,8 +24,8 @@ pub use log::{
 };
 pub(crate) use log::{DeltaLog, ProjectLog};
 pub use maintenance::{
-    DeletedFile, DeletionMode, GivenUpRows, KEEP_HOURS, MergeProgress, OptimizeReport, TARGET_BYTES, TableOptimizeReport,
-    VacuumReport,
+    DeletedFile, DeletionMode, GivenUpRows, KEEP_HOURS, MergeProgress, OptimizeReport, TARGET_BYTES,
+    TableOptimizeReport, VacuumReport,
 };
 pub use references::{ReferenceNames, SurfaceReferences};
 pub use rows::{add_missing_columns, reader_metadata, wanted_schema};

@@ -10,10 +10,10 @@ use echolake_schema::{ProjectName, RunId, SurfaceId};
 use futures::future::{try_join, try_join_all};
 use object_store::path::Path;
 
+use crate::contributions::ShownVersions;
 use crate::tables::file_name::{FileName, VisibleRun};
 use crate::tables::run_parts::{RunPointer, list_pointers, run_of_file};
 use crate::tables::table_fault::{LackingRows, TableFault};
-use crate::contributions::ShownVersions;
 use crate::{CommitLog, DataFile, Error, Result, RunRowCounts, TableView};
 
 /// A frozen view of all tables.

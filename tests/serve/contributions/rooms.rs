@@ -34,7 +34,8 @@ fn send_prediction(server: &ServedLake, token: &str, model: &str, value: f64, mo
 #[test]
 fn predictions_of_one_project_are_nothing_to_another() {
     let place = two_projects();
-    let new = |name: &str, project: &[&str]| new_token(&place, &[&[name, "--scopes", "sql,annotate"], project].concat());
+    let new =
+        |name: &str, project: &[&str]| new_token(&place, &[&[name, "--scopes", "sql,annotate"], project].concat());
     let (alpha, alpha_lines) = new("ann", &["--project", "alpha"]);
     let (beta, beta_lines) = new("bob", &["--project", "beta"]);
     let (all, all_lines) = new("eve", &[]);
@@ -103,7 +104,8 @@ fn a_lost_file_of_annotations_stops_only_what_reads_it() {
         let place = lake();
         let run = find_run(&place);
         let server = served(&place, &[]);
-        let verdict = json!({ "run_id": run, "pair_ids": [1], "kind": "verdict", "value": "rejected", "comment": "bad" });
+        let verdict =
+            json!({ "run_id": run, "pair_ids": [1], "kind": "verdict", "value": "rejected", "comment": "bad" });
         assert_eq!(annotate(&server, &verdict).status, 200);
         assert_eq!(predict(&server, "1", "brick", &[("tnce_10000", vec![0.5])]).status, 200);
         let folder = place.path(&format!("lake/tables/{table}"));

@@ -117,9 +117,8 @@ fn find_meant_run(snapshot: &LakeSnapshot, surface: &str, project: Option<&str>)
         None => "none (`project=`)".to_owned(),
     };
     let known = newest.keys().map(quoted).collect::<Vec<_>>().join(", ");
-    let is_meant = |project: &Option<ProjectName>| {
-        named.is_none_or(|named| project.as_ref().map(ProjectName::as_str) == named)
-    };
+    let is_meant =
+        |project: &Option<ProjectName>| named.is_none_or(|named| project.as_ref().map(ProjectName::as_str) == named);
     let mut meant: Vec<_> = newest.into_iter().filter(|(project, _)| is_meant(project)).collect();
     match (meant.len(), known.is_empty()) {
         (1, _) => {
@@ -260,7 +259,10 @@ impl PredictedRows {
         let mut batch = BatchBuilder::new(Table::Predictions, lake.rig(), rows);
         batch
             .push_column("surface_id", Arc::new(self.surface_ids.clone()))
-            .push_column("run_id", Arc::new(meant.iter().map(|m| Some(m.as_ref()?.run.as_str())).collect::<StringArray>()))
+            .push_column(
+                "run_id",
+                Arc::new(meant.iter().map(|m| Some(m.as_ref()?.run.as_str())).collect::<StringArray>()),
+            )
             .push_column("project", Arc::new(projects.collect::<StringArray>()))
             .fill_text("model", params.model.as_str())
             .fill_text("model_version", params.version.as_str())

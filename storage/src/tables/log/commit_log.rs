@@ -11,8 +11,8 @@ use object_store::path::Path;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
-use crate::contributions::ShownVersions;
 use crate::Result;
+use crate::contributions::ShownVersions;
 
 /// A Parquet file of a table.
 #[derive(Debug, Clone, PartialEq)]
