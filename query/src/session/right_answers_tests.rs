@@ -348,6 +348,22 @@ async fn subqueries_of_conditions_are_values() {
     check(&cases.iter().map(|(sql, expected)| (sql.as_str(), *expected)).collect::<Vec<_>>()).await;
 }
 
+/// A subquery without a row is null, also if its column has no nulls.
+#[tokio::test]
+async fn a_subquery_without_a_row_is_null() {
+    let none = "(select y from (values (1)) u(y) where y > 5)";
+    check(&[
+        (&format!("select x, {none} as a from (values (1)) t(x)"), "1|null"),
+        (&format!("select 1 as a where {none} is null"), "1"),
+        (&format!("select coalesce({none}, 7) as a"), "7"),
+        (&format!("select count({none}) as a from pairs where pair_id < 3"), "0"),
+        (&format!("select 1 as a where 1 not in (select {none})"), ""),
+        ("select (select pair_id from pairs where pair_id = 3) as a, (select 5) as b", "3|5"),
+        ("select pair_id from pairs where pair_id = (select pair_id from pairs where pair_id = 3)", "3"),
+    ])
+    .await;
+}
+
 /// R2: The first row of a correlated subquery is a value; several are refused with the form that works.
 #[tokio::test]
 async fn the_first_row_of_a_correlated_subquery_is_a_value() {

@@ -1,14 +1,22 @@
 //! The types that a statement declares before it runs: those of its answer.
 //!
 //! DataFusion takes the type of the first branch of a CASE, and of the first query of a UNION, until it coerces types.
-//! Clients of Postgres' protocol read an answer by the types that were declared.
+//! Clients of Postgres' protocol read an answer by the types that were declared. It also takes a subquery for a value
+//! that is never null if its column is none, although a subquery without a row is null.
 
+use std::sync::Arc;
+
+use datafusion::common::Column;
 use datafusion::common::config::ConfigOptions;
-use datafusion::common::tree_node::{TreeNode as _, TreeNodeRecursion};
+use datafusion::common::tree_node::{Transformed, TreeNode as _, TreeNodeRecursion};
 use datafusion::error::Result;
-use datafusion::logical_expr::{Expr, LogicalPlan};
+use datafusion::functions::core::nullif;
+use datafusion::logical_expr::{EmptyRelation, Expr, LogicalPlan, LogicalPlanBuilder};
 use datafusion::optimizer::AnalyzerRule as _;
 use datafusion::optimizer::analyzer::type_coercion::TypeCoercion;
+use datafusion::scalar::ScalarValue;
+
+use super::subquery_conditions::has_one_row;
 
 /// Coerces the types of a plan whose declared ones may not be those of its answer.
 pub(super) fn settle_types(plan: LogicalPlan, options: &ConfigOptions) -> Result<LogicalPlan> {
@@ -25,4 +33,26 @@ pub(super) fn settle_types(plan: LogicalPlan, options: &ConfigOptions) -> Result
         true => Ok(TypeCoercion::new().analyze(plan.clone(), options).unwrap_or(plan)),
         false => Ok(plan),
     }
+}
+
+/// Lets a subquery that is a value be null if it may have no row.
+pub(super) fn allow_null(mut expr: Expr) -> Result<Transformed<Expr>> {
+    let Expr::ScalarSubquery(subquery) = &mut expr else { return Ok(Transformed::no(expr)) };
+    let plan = &subquery.subquery;
+    let is_right = plan.schema().field(0).is_nullable() || always_has_row(plan);
+    // What depends on the row around it becomes an outer join, whose columns may be null.
+    if is_right || !subquery.outer_ref_columns.is_empty() {
+        return Ok(Transformed::no(expr));
+    }
+    let column = Column::from(plan.schema().qualified_field(0));
+    let name = column.name.clone();
+    let value = nullif().call(vec![Expr::Column(column), Expr::Literal(ScalarValue::Null, None)]).alias(name);
+    subquery.subquery = Arc::new(LogicalPlanBuilder::from(Arc::clone(plan)).project([value])?.build()?);
+    Ok(Transformed::yes(expr))
+}
+
+fn always_has_row(plan: &LogicalPlan) -> bool {
+    let is_constant =
+        |plan: &LogicalPlan| matches!(plan, LogicalPlan::EmptyRelation(EmptyRelation { produce_one_row: true, .. }));
+    has_one_row(plan) || matches!(plan, LogicalPlan::Projection(projection) if is_constant(&projection.input))
 }

@@ -10,10 +10,11 @@ use datafusion::logical_expr::expr_rewriter::NamePreserver;
 use datafusion::logical_expr::utils::merge_schema;
 use datafusion::logical_expr::{Expr, ExprSchemable as _, LogicalPlan};
 
+use super::declared_types::allow_null;
 use super::literals::read_literals;
 
-/// Has the casts that a statement writes round to the nearest integer, ties away from zero, and reads its literals as
-/// [`read_literals`] says. It is called before DataFusion adds casts of its own.
+/// Has the casts that a statement writes round to the nearest integer, ties away from zero, and treats its literals and
+/// subqueries as [`read_literals`] and [`allow_null`] say. It is called before DataFusion adds casts of its own.
 pub(crate) fn round_casts(plan: LogicalPlan) -> Result<LogicalPlan> {
     let round_node = |node: LogicalPlan| {
         let schema = merge_schema(&node.inputs());
@@ -21,9 +22,11 @@ pub(crate) fn round_casts(plan: LogicalPlan) -> Result<LogicalPlan> {
         node.map_expressions(|expr| {
             let name = names.save(&expr);
             let rounded = expr.transform_up(|expr| {
-                let read = read_literals(expr, &schema);
+                let null = allow_null(expr)?;
+                let read = read_literals(null.data, &schema);
                 let rounded = round_cast(read.data, &schema);
-                Ok(Transformed { transformed: rounded.transformed || read.transformed, ..rounded })
+                let transformed = null.transformed || read.transformed || rounded.transformed;
+                Ok(Transformed { transformed, ..rounded })
             })?;
             Ok(rounded.update_data(|expr| name.restore(expr)))
         })
