@@ -23,7 +23,6 @@ mod predicate;
 mod result_names;
 mod rewrite;
 mod row_values;
-mod scalar_subqueries;
 mod script;
 mod set_operations;
 mod subquery_conditions;
@@ -109,7 +108,6 @@ pub(crate) async fn prepare_statement(
 async fn plan_statement(sql: &str, statement: Statement, state: &SessionState) -> Result<LogicalPlan, Error> {
     let plan = state.statement_to_plan(statement).await;
     let plan = plan.and_then(placeholders::infer_types).and_then(integer_casts::round_casts);
-    let plan = plan.and_then(scalar_subqueries::allow_missing_rows);
     let plan = plan.and_then(|plan| declared_types::settle_types(plan, state.config_options()));
     plan.map_err(|e| Error::from_planning(sql, &e))
 }
