@@ -83,7 +83,7 @@ mod slow {
         place.fails(
             1,
             &["export", "materials", "--format", "csv", "--surfaces", "marble", "-o", "marble.csv"],
-            "surface `marble` has no levels",
+            "surface `marble` is not in the lake",
         );
     }
     #[test]
