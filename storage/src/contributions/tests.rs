@@ -25,6 +25,7 @@ async fn add_run(lake: &Lake, surface: &str, run: &str, project: Option<&str>) {
         run: run.parse().expect("an id"),
         run_derivation: "ab".to_owned(),
         reference_derivation: None,
+        verdicts: None,
     };
     let schema = Table::Runs.schema(lake.rig());
     let file = encode_batches(Table::Runs, &schema, &[]).expect("encoded");
