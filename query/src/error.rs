@@ -279,6 +279,10 @@ fn explain_error(error: &DataFusionError) -> (String, Option<String>) {
             Some(("table function", name)) if FILE_FUNCTIONS.contains(&name) => {
                 (format!("no table function `{name}`{NO_FILES}"), Some(OWN_ROWS.to_owned()))
             }
+            _ if text.starts_with("Too many columns!") => (
+                "a subquery has several columns, expected one for a single value".to_owned(),
+                Some("(a, b) IN (SELECT ...) compares several values".to_owned()),
+            ),
             _ => (text.clone(), None),
         },
         // The message prints the expression as the library's own structure.
