@@ -358,6 +358,8 @@ async fn a_subquery_without_a_row_is_null() {
         (&format!("select coalesce({none}, 7) as a"), "7"),
         (&format!("select count({none}) as a from pairs where pair_id < 3"), "0"),
         (&format!("select 1 as a where 1 not in (select {none})"), ""),
+        ("select (select 1 from pairs where pair_id < 0) as a", "null"),
+        ("select 1 as a where (select 'x' from pairs where pair_id < 0) is null", "1"),
         ("select (select pair_id from pairs where pair_id = 3) as a, (select 5) as b", "3|5"),
         ("select pair_id from pairs where pair_id = (select pair_id from pairs where pair_id = 3)", "3"),
     ])

@@ -10,11 +10,10 @@ use datafusion::common::Column;
 use datafusion::common::config::ConfigOptions;
 use datafusion::common::tree_node::{Transformed, TreeNode as _, TreeNodeRecursion};
 use datafusion::error::Result;
-use datafusion::functions::core::nullif;
-use datafusion::logical_expr::{EmptyRelation, Expr, LogicalPlan, LogicalPlanBuilder};
+use datafusion::functions::math::random;
+use datafusion::logical_expr::{EmptyRelation, Expr, LogicalPlan, LogicalPlanBuilder, lit, when};
 use datafusion::optimizer::AnalyzerRule as _;
 use datafusion::optimizer::analyzer::type_coercion::TypeCoercion;
-use datafusion::scalar::ScalarValue;
 
 use super::subquery_conditions::has_one_row;
 
@@ -46,7 +45,9 @@ pub(super) fn allow_null(mut expr: Expr) -> Result<Transformed<Expr>> {
     }
     let column = Column::from(plan.schema().qualified_field(0));
     let name = column.name.clone();
-    let value = nullif().call(vec![Expr::Column(column), Expr::Literal(ScalarValue::Null, None)]).alias(name);
+    // A condition that is always true, and that no optimizer folds: CASE without ELSE may be null.
+    let always = random().call(Vec::new()).gt_eq(lit(0.0));
+    let value = when(always, Expr::Column(column)).end()?.alias(name);
     subquery.subquery = Arc::new(LogicalPlanBuilder::from(Arc::clone(plan)).project([value])?.build()?);
     Ok(Transformed::yes(expr))
 }
