@@ -253,11 +253,13 @@ fn a_backup_copies_what_a_lake_is_made_from_or_says_why_not() {
     fs::write(lake.join("lake.toml"), "").expect("written");
     let (is_done, asked) = backup(Some(&lake), Some("host:/backup of lakes"));
     let asked = String::from_utf8(asked).expect("text");
+    // What users add, and of the other tables nothing.
     let expected = format!(
-        "-a\n--exclude\n*.partial\n--exclude\n/tables\n--exclude\n/temp\n{}/\nhost:/backup of lakes/\n",
+        "-a\n--exclude\n*.partial\n--exclude\n/temp\n--include\n/tables/\n--include\n/tables/annotations/***\n\
+         --include\n/tables/predictions/***\n--exclude\n/tables/*\n{}/\nhost:/backup of lakes/\n",
         lake.display()
     );
-    assert!(is_done && asked == expected, "{asked}");
+    assert!(is_done && asked == expected.repeat(2), "{asked}");
 }
 
 #[test]
