@@ -477,7 +477,7 @@ impl StatementGenerator {
             12 => format!("(- {a})"),
             13 => format!("({a} & {b})"),
             14 => format!("({a} | {b})"),
-            15 => format!("array_length({})", self.value(ValueKind::List, scope, depth)),
+            15 => format!("cast(array_length({}) as int)", self.value(ValueKind::List, scope, depth)),
             _ => format!("({})[{}]", self.value(ValueKind::List, scope, depth), self.pick(&["1", "2", "-1", "4", "0"])),
         }
     }
@@ -1197,7 +1197,7 @@ impl StatementGenerator {
             ),
             3 => format!("select {key}, array_to_string({list}, '-') as v from {from}"),
             4 => format!("select {key}, array_sort({list}) as v from {from}"),
-            5 => format!("select {key}, array_distinct({list}) = [1, 2] as v from {from}"),
+            5 => format!("select {key}, array_length(array_distinct({list})) as v from {from}"),
             _ => format!(
                 "select {key}, array_concat({list}, {}) as v, ({list})[1:2] as w from {from}",
                 self.pick(&LISTS)

@@ -20,6 +20,7 @@ use datafusion::logical_expr::{
 };
 use datafusion::optimizer::AnalyzerRule;
 use datafusion::physical_expr_common::datum::apply;
+use datafusion::scalar::ScalarValue;
 
 /// The rule; it follows the coercion of types.
 #[derive(Debug)]
@@ -44,7 +45,11 @@ impl AnalyzerRule for IntegerArithmetic {
 }
 
 fn is_arithmetic(expr: &Expr) -> bool {
-    matches!(expr, Expr::BinaryExpr(BinaryExpr { op: Operator::Plus | Operator::Minus | Operator::Multiply, .. }))
+    matches!(
+        expr,
+        Expr::Negative(_)
+            | Expr::BinaryExpr(BinaryExpr { op: Operator::Plus | Operator::Minus | Operator::Multiply, .. })
+    )
 }
 
 fn has_arithmetic(node: &LogicalPlan) -> Result<bool> {
@@ -70,6 +75,9 @@ fn check_node(node: LogicalPlan) -> Result<Transformed<LogicalPlan>> {
 }
 
 fn check_operator(expr: Expr, schema: &DFSchema) -> Result<Transformed<Expr>> {
+    if let Expr::Negative(operand) = expr {
+        return check_negation(operand, schema);
+    }
     let Expr::BinaryExpr(BinaryExpr { left, op, right }) = expr else { return Ok(Transformed::no(expr)) };
     let restored = |left, right| Ok(Transformed::no(Expr::BinaryExpr(BinaryExpr { left, op, right })));
     if !matches!(op, Operator::Plus | Operator::Minus | Operator::Multiply) {
@@ -79,9 +87,22 @@ fn check_operator(expr: Expr, schema: &DFSchema) -> Result<Transformed<Expr>> {
     if !kind.is_integer() || operand_type(&right, schema)? != kind {
         return restored(left, right);
     }
-    let function = CheckedOperator { operator: op, kind, signature: Signature::any(2, Volatility::Immutable) };
-    let call = ScalarFunction::new_udf(ScalarUDF::new_from_impl(function).into(), vec![*left, *right]);
-    Ok(Transformed::yes(Expr::ScalarFunction(call)))
+    Ok(Transformed::yes(checked_call(op, kind, [*left, *right])))
+}
+
+// `-x` is 0 - x.
+fn check_negation(operand: Box<Expr>, schema: &DFSchema) -> Result<Transformed<Expr>> {
+    let kind = operand_type(&operand, schema)?;
+    if !kind.is_signed_integer() {
+        return Ok(Transformed::no(Expr::Negative(operand)));
+    }
+    let zero = Expr::Literal(ScalarValue::new_zero(&kind)?, None);
+    Ok(Transformed::yes(checked_call(Operator::Minus, kind, [zero, *operand])))
+}
+
+fn checked_call(operator: Operator, kind: DataType, operands: [Expr; 2]) -> Expr {
+    let function = CheckedOperator { operator, kind, signature: Signature::any(2, Volatility::Immutable) };
+    Expr::ScalarFunction(ScalarFunction::new_udf(ScalarUDF::new_from_impl(function).into(), operands.into()))
 }
 
 // The type of a long sum is not asked for from its beginning at each of its parts.

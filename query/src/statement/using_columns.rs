@@ -67,6 +67,9 @@ fn refuse_unnamed(from: &[TableWithJoins]) -> Result<(), Error> {
             return Err(hinted_error(message, "join by USING (column, ...)".to_owned()));
         }
     }
+    for from in from {
+        refuse_repeated(&from.joins)?;
+    }
     let factors =
         from.iter().flat_map(|from| [&from.relation].into_iter().chain(from.joins.iter().map(|join| &join.relation)));
     for factor in factors {
@@ -76,6 +79,22 @@ fn refuse_unnamed(from: &[TableWithJoins]) -> Result<(), Error> {
                 let message = "an outer join by USING in parentheses is not supported".to_owned();
                 return Err(hinted_error(message, "join by ON, or name it by WITH".to_owned()));
             }
+        }
+    }
+    Ok(())
+}
+
+// After a right or full join the next join by USING would compare the column of a table that does not keep all rows.
+fn refuse_repeated(joins: &[Join]) -> Result<(), Error> {
+    let mut merged: Vec<String> = Vec::new();
+    for join in joins {
+        let columns = using_columns(join);
+        if let Some(column) = columns.iter().find(|column| merged.contains(*column)) {
+            let message = format!("`{column}` is joined by USING again after a RIGHT or FULL JOIN");
+            return Err(hinted_error(message, "join by ON, after a FULL JOIN with coalesce(a.x, b.x)".to_owned()));
+        }
+        if is_outer(join) && !matches!(join.join_operator, JoinOperator::Left(_) | JoinOperator::LeftOuter(_)) {
+            merged.extend(columns);
         }
     }
     Ok(())
