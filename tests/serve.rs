@@ -368,7 +368,11 @@ mod slow {
         let watcher = place.run(&["token", "prometheus", "--scopes", "metrics"]);
         let watcher = String::from_utf8_lossy(&watcher.stdout).into_owned();
         assert!(watcher.contains("\nscopes = [\"metrics\"]\n"), "{watcher}");
-        place.fails(2, &["token", "x", "--scopes", "sql,all"], "no scope `all`; hint: sql, files, metrics, annotate or annotate-references");
+        place.fails(
+            2,
+            &["token", "x", "--scopes", "sql,all"],
+            "no scope `all`; hint: sql, files, metrics, annotate or annotate-references",
+        );
         place.fails(1, &["token", "x", "--scopes", "metrics", "--project", "brick"], "of all projects");
         let token = super::super::stderr(&made).lines().next().expect("a token").to_owned();
         assert!(!lines.contains(&token), "only its hash is printed to be kept");
