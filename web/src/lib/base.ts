@@ -1,7 +1,8 @@
 //! The path below which the server's pages stand: a proxy may serve them below one of its own, such as `/lake`. The
 //! document has it, because its addresses are relative.
 
-const icon = document.querySelector<HTMLLinkElement>('link[rel=icon]')
+// Node has no document, which checks of the pages' parts run in.
+const icon = typeof document === 'undefined' ? null : document.querySelector<HTMLLinkElement>('link[rel=icon]')
 
 // Its address stays when that of the document changes.
 if (icon) icon.setAttribute('href', icon.href)
