@@ -34,11 +34,15 @@ pub(super) fn read_literals(mut expr: Expr, schema: &DFSchema) -> Transformed<Ex
 
 fn read_beside(expr: &Expr, values: &mut [&mut Expr], schema: &DFSchema) -> bool {
     let is_literal = |value: &&mut Expr| matches!(value, Expr::Literal(..));
-    if matches!(expr, Expr::Literal(..)) || !values.iter().any(|value| is_literal(value)) {
+    if matches!(expr, Expr::Literal(..)) || !values.iter().any(is_literal) {
         return false;
     }
     let Ok(kind @ (DataType::Float32 | DataType::Timestamp(..))) = expr.get_type(schema) else { return false };
-    values.iter_mut().fold(false, |is_changed, value| read_as(value, &kind) || is_changed)
+    let mut is_changed = false;
+    for value in values {
+        is_changed |= read_as(value, &kind);
+    }
+    is_changed
 }
 
 fn read_as(value: &mut Expr, kind: &DataType) -> bool {
