@@ -258,7 +258,8 @@ async fn a_record_that_is_too_large_is_passed_over_and_told() {
     file.extend((16 + 4 + 4 + 8 + claimed + 4).to_le_bytes());
     file.extend([0; 24]);
     file.extend(claimed.to_le_bytes());
-    file.resize(file.len() + claimed as usize + 4, 0);
+    // Zeros would be a hole of a copy that is not whole yet.
+    file.resize(file.len() + claimed as usize + 4, 0x55);
     file.extend(&whole[header..]);
     runs[0].1 = file.into();
     let reports = ingest_pending(with_inbox(&runs).await).await.expect("ingested");
