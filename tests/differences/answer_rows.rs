@@ -137,7 +137,7 @@ impl AnswerRows {
     }
 
     /// Returns its rows as text, a line each, with commas between the values.
-    #[cfg(test)]
+    #[cfg(all(test, feature = "lake"))]
     pub fn show_rows(&self, order: RowOrder) -> Vec<String> {
         let mut lines: Vec<_> = self.rows.iter().map(|row| show_row(row)).collect();
         if order == RowOrder::Free {

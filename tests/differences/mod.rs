@@ -6,13 +6,13 @@
 
 mod answer_rows;
 mod documented;
-#[cfg(test)]
+#[cfg(all(test, feature = "lake"))]
 mod hand_written;
 mod peer;
 mod query_generator;
 mod shrinker;
 mod statement_generator;
-#[cfg(test)]
+#[cfg(all(test, feature = "lake"))]
 mod tests;
 
 use std::collections::BTreeMap;
@@ -37,7 +37,7 @@ use answer_rows::AnswerRows;
 pub(crate) use answer_rows::{RowOrder, find_difference};
 pub(crate) use documented::{DOCUMENTED, DocumentedDifference, find_documented};
 use documented::{PEER_SETTINGS, peer_text};
-#[cfg(test)]
+#[cfg(all(test, feature = "lake"))]
 use hand_written::{ExpectedAnswer, hand_written_statements};
 pub(crate) use peer::{DuckdbPeer, PeerTables, install_duckdb};
 pub(crate) use query_generator::QueryGenerator;
@@ -215,7 +215,7 @@ impl DifferenceCampaign {
     ///
     /// # Errors
     /// It does not start.
-    #[cfg(test)]
+    #[cfg(all(test, feature = "lake"))]
     pub fn start_plain_peer(&self) -> Result<Option<DuckdbPeer>> {
         let tables = PeerTables { settings: vec![("TimeZone", "UTC")], ..self.tables.clone() };
         self.python.as_ref().map(|python| DuckdbPeer::start(python, &tables)).transpose()
@@ -225,7 +225,7 @@ impl DifferenceCampaign {
     ///
     /// # Errors
     /// Values cannot be read.
-    #[cfg(test)]
+    #[cfg(all(test, feature = "lake"))]
     pub fn own_answer(&self, sql: &str) -> Result<Result<AnswerRows, String>> {
         match self.collect_rows(sql) {
             Ok(batches) => Ok(Ok(AnswerRows::read(&batches)?)),
