@@ -72,8 +72,11 @@ fn import_rooms(place: &TestFolder, rooms: &[(&str, f64)]) {
     import_pairs(place, &both.collect::<Vec<_>>());
 }
 
+/// A recording: surface with its decay in seconds, speaker with the length of the direct path in millimetres.
+type RoomRecording<'a> = ((&'a str, f64), (&'a str, f64));
+
 /// Imports a recording of each surface, with its decay, at one pair.
-fn import_pairs(place: &TestFolder, recordings: &[((&str, f64), (&str, f64))]) {
+fn import_pairs(place: &TestFolder, recordings: &[RoomRecording<'_>]) {
     let sweep = sweep();
     write_wav(place, "sweep.wav", &sweep);
     let mut manifest = HEADER.to_owned();
