@@ -229,10 +229,7 @@ async fn turn_surfaces(
                 blocked.insert(run.surface.clone());
                 round.unrestored.push((run.run.clone(), why));
             }
-            restored => {
-                restored?;
-                restore_statistics(&context, run).await?;
-            }
+            restored => restored?,
         }
     }
     let mut staged = Vec::new();
@@ -266,24 +263,6 @@ async fn turn_surfaces(
         done(&report, total);
         ingest.claims.iter().for_each(|claims| claims.release_work(&work_name(&run)));
     }
-    Ok(())
-}
-
-// Writes the derived rows of a run that is to describe its surface: the log may have lost them. If its derivation is to
-// become another one, its new rows come with that.
-async fn restore_statistics(context: &IngestContext, run: &VisibleRun) -> Result<()> {
-    let wanted = context.finder.lock().await.wanted_references(&run.surface);
-    let derivation = ReferenceDerivation::new(context, &run.run, &run.run_derivation, &wanted).await?;
-    let Some(derivation) = derivation.filter(|of| run.reference_derivation.as_ref() == Some(&of.name)) else {
-        return Ok(());
-    };
-    let keys = RunKeys { surface: run.surface.clone(), run: run.run.clone() };
-    let name = derivation.name.clone();
-    let responses = read_back::read_responses(&context.lake, &context.snapshot, &run.run).await?;
-    let (mut files, _) = derivation.derive_run(context, &keys, responses).await?;
-    files.retain(|(table, _)| table.key().contains(&"surface_id"));
-    let staged = context.stage_rows(&keys, &name, files).await?;
-    context.lake.commit_staged(&staged).await?;
     Ok(())
 }
 

@@ -128,11 +128,13 @@ impl ReferenceDerivation {
         let bank = FilterBankPlan::new(rig.impulse_response.length, rig.sweep.rate_hz.get(), &rig.bands.centres_hz);
         let scattering = scattering.band_coefficients(&bank.map_err(failed)?).unwrap_or_default();
         let levels = SurfaceLevels { tnce: totals, unbiased, errors, uncertainty, curves, scattering };
-        let stats = rows::stats::stats_rows(rig, keys, &levels, of)?;
-        files.push((
-            Table::SurfaceStats,
-            encode_batches(Table::SurfaceStats, &Table::SurfaceStats.schema(rig), &[stats])?,
-        ));
+        // Of a rejected run there are none: they would be those of the surface's newest run.
+        let mut stats = Vec::new();
+        if !self.rejected.is_run_rejected(keys.run.as_str()) {
+            stats.push(rows::stats::stats_rows(rig, keys, &levels, of)?);
+        }
+        let schema = Table::SurfaceStats.schema(rig);
+        files.push((Table::SurfaceStats, encode_batches(Table::SurfaceStats, &schema, &stats)?));
         Ok((files, responses.pairs.len() - paired))
     }
 
