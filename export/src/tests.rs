@@ -22,14 +22,19 @@ use crate::*;
 const SURFACES: [&str; 6] = ["flat", "foam", "0001_0", "0001_1", "0002_0", "0003_0"];
 
 async fn lake(home: &TempDir, keep: RecordingMode) -> Lake {
+    let relief = |surface: &'static str| if surface.starts_with('f') { surface } else { "macrostructure" };
+    lake_of(home, keep, &SURFACES.map(|surface| (surface, relief(surface)))).await
+}
+
+/// A lake of surfaces with the reliefs that they have.
+async fn lake_of(home: &TempDir, keep: RecordingMode, surfaces: &[(&str, &str)]) -> Lake {
     let rig = Rig::from_toml(SMALL_RIG).expect("a rig");
     let url = home.path().join("lake").display().to_string();
     let lake = Lake::open_or_create(&url, &rig, &ReferenceSurfaces::default()).await.expect("a lake");
     let inbox = home.path().join("lake/inbox");
     std::fs::create_dir_all(&inbox).expect("a folder");
-    for (number, surface) in SURFACES.into_iter().enumerate() {
-        let name = if number < 2 { surface } else { "macrostructure" };
-        simulate_run(&inbox, number, surface, name, keep);
+    for (number, (surface, relief)) in surfaces.iter().enumerate() {
+        simulate_run(&inbox, number, surface, relief, keep);
     }
     let ingest = LakeIngest::new(&lake, Arc::default());
     ingest.ingest_runs(pending_runs(&lake).await.expect("runs"), &mut |_| {}).await.expect("ingested");
@@ -268,6 +273,26 @@ mod slow {
         assert!(card.contains("Surfaces were selected by `surface_id like '0001%'`."), "{card}");
         let sums = String::from_utf8(files["SHA256SUMS"].clone()).expect("text");
         assert_eq!(sums.lines().count(), files.len() - 1);
+    }
+
+    /// E31: a panel with a reference is trained on, whether or not the reference is a row.
+    #[tokio::test(flavor = "multi_thread")]
+    async fn a_panel_has_one_part_with_references_and_without() {
+        let home = tempfile::tempdir().expect("a folder");
+        let reliefs = [("flat", "flat"), ("foam", "foam"), ("0003_1", "flat")];
+        let others = ["0001_0", "0002_0", "0003_0"].map(|surface| (surface, "macrostructure"));
+        let lake = lake_of(&home, RecordingMode::ResponsesOnly, &[reliefs, others].concat()).await;
+        for references in [false, true] {
+            // Of this seed the digest of 0003 is the first.
+            let split = SplitParams { seed: 4, ..SplitParams::default() };
+            let set = TrainingSet { references, split, ..TrainingSet::default() };
+            let folder = home.path().join(references.to_string());
+            write_training_set(&lake, &folder, &set, &mut |_, _| {}).await.expect("written");
+            let sources = std::fs::read_to_string(folder.join("surfaces.csv")).expect("a document");
+            let of = |surface: &str| sources.lines().find(|line| line.starts_with(surface)).map(str::to_owned);
+            assert!(of("0003_0").is_some_and(|line| line.contains(",0003,train,")), "{sources}");
+            assert_eq!(of("0003_1").is_some(), references, "{sources}");
+        }
     }
 
     #[tokio::test(flavor = "multi_thread")]

@@ -24,6 +24,7 @@ pub mod rig;
 pub mod robots;
 pub mod samples;
 pub mod simulation;
+pub mod splits;
 pub mod symmetry;
 pub mod tables;
 pub mod topics;

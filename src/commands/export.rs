@@ -241,7 +241,7 @@ fn in_words(exported: &ExportSummary) -> String {
     }
     if !exported.left_out.is_empty() {
         let count = exported.left_out.len();
-        lines.push(format!("{count} surfaces left out: another side of their panel is held out"));
+        lines.push(format!("{count} surfaces left out: another side of their panel is in another split"));
     }
     if exported.rejected > 0 {
         lines.push(format!("{} measurements left out: the last verdict rejects them", exported.rejected));

@@ -7,8 +7,7 @@ use echolake_lake::Lake;
 use echolake_schema::SurfaceId;
 use echolake_schema::tables::{COMMENT, UNIT};
 
-use super::split::{SplitBy, SplitPart};
-use super::{ExportSummary, Plan, RowSymmetries, Shard, heights};
+use super::{ExportSummary, Plan, RowSymmetries, Shard, SplitBy, SplitPart, heights};
 use crate::error::{Error, Result};
 
 /// The paper that the rig, the bands and TNCE are of.
@@ -106,7 +105,7 @@ pub(super) fn card_text(about: &CardContents<'_>) -> String {
     if !about.exported.left_out.is_empty() {
         let _ = writeln!(
             text,
-            "\n{} surfaces are left out, because another side of their panel is held out: {}.",
+            "\n{} surfaces are left out, because another side of their panel is in another split: {}.",
             about.exported.left_out.len(),
             listed_names(&about.exported.left_out)
         );

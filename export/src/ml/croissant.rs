@@ -5,8 +5,7 @@ use echolake_schema::tables::{COMMENT, UNIT};
 use serde_json::{Value, json};
 
 use super::card::{CardContents, PAPER};
-use super::heights;
-use super::split::SplitPart;
+use super::{SplitPart, heights};
 use crate::error::{Error, Result};
 
 const PARQUET: &str = "application/x-parquet";

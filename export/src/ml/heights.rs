@@ -9,9 +9,9 @@ use arrow::record_batch::RecordBatch;
 use echolake_lake::{Lake, LakeSnapshot};
 use echolake_schema::tables::Table;
 
+use super::SplitPart;
 use super::columns::{described_field, list_type};
 use super::measurements::fixed_lists;
-use super::split::SplitPart;
 use super::surfaces::TrainingSurface;
 use crate::error::{Error, Result};
 use crate::rows;

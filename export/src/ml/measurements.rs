@@ -16,8 +16,8 @@ use echolake_schema::symmetry::MovedPair;
 use echolake_schema::tables::Table;
 use echolake_schema::{Grid, PointId, Symmetry};
 
+use super::SplitPart;
 use super::columns::TrainingColumns;
-use super::split::SplitPart;
 use super::surfaces::{TrainingRun, TrainingSurface};
 use crate::error::{Error, Result};
 use crate::rows;

@@ -19,6 +19,8 @@ use arrow::datatypes::SchemaRef;
 use echolake_lake::{Lake, LakeSnapshot};
 use echolake_schema::SurfaceId;
 use echolake_schema::annotations::RejectedMeasurements;
+use echolake_schema::splits::order_digest;
+pub use echolake_schema::splits::{SplitBy, SplitParams, SplitPart};
 use futures::StreamExt as _;
 
 use crate::error::{Error, Result};
@@ -26,7 +28,6 @@ use crate::output::{PendingFolder, WrittenFile};
 use columns::TrainingColumns;
 use measurements::SymmetryMoves;
 use shard::WrittenShard;
-pub use split::{SplitBy, SplitParams, SplitPart};
 use statistics::ColumnStatistics;
 use surfaces::TrainingSurface;
 
@@ -88,7 +89,7 @@ impl Default for TrainingSet {
 pub struct ExportSummary {
     /// The parts, training first.
     pub parts: Vec<PartCounts>,
-    /// Surfaces that are left out because another side of their panel is held out.
+    /// Surfaces that are left out because another side of their panel is in another part.
     pub left_out: Vec<SurfaceId>,
     /// References that are left out, because only reliefs were asked for.
     pub references: Vec<SurfaceId>,
@@ -144,17 +145,18 @@ impl Plan {
         if let Some(selection) = &set.selection {
             surfaces.retain(|surface| selection.surfaces.contains(&surface.id));
         }
-        let references: Vec<_> =
-            surfaces.extract_if(.., |s| s.reference && !set.references).map(|reference| reference.id).collect();
-        if surfaces.is_empty() {
+        let is_omitted = |surface: &TrainingSurface| surface.reference && !set.references;
+        let references: Vec<_> = surfaces.iter().filter(|s| is_omitted(s)).map(|s| s.id.clone()).collect();
+        if references.len() == surfaces.len() {
             let reason =
                 format!("the lake has references only ({}); hint: --references", card::listed_names(&references));
             return Err(Error::Nothing { reason });
         }
+        // Of all, so that a panel has the same part whether or not its reference is a row.
         let parts = split::assign_parts(&surfaces, set.split)?;
         let mut left_out = Vec::new();
         let mut of_part: [Vec<TrainingSurface>; 3] = Default::default();
-        for (surface, part) in surfaces.into_iter().zip(parts) {
+        for (surface, part) in surfaces.into_iter().zip(parts).filter(|(surface, _)| !is_omitted(surface)) {
             match part.and_then(|part| SplitPart::ALL.iter().position(|p| *p == part)) {
                 Some(at) => of_part[at].push(surface),
                 None => left_out.push(surface.id),
@@ -181,7 +183,7 @@ impl Plan {
 
 // Dealt like cards in a drawn order, so that every file has surfaces of every kind.
 fn deal_shards(part: SplitPart, mut surfaces: Vec<TrainingSurface>, seed: u64) -> Vec<Shard> {
-    surfaces.sort_by_cached_key(|s| split::order_digest(seed, s.id.as_str()));
+    surfaces.sort_by_cached_key(|s| order_digest(seed, s.id.as_str()));
     let count = SHARDS.max(surfaces.len().div_ceil(SURFACES_A_SHARD)).min(surfaces.len());
     let mut shards: Vec<_> = (0..count)
         .map(|i| Shard {

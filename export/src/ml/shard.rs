@@ -10,9 +10,8 @@ use parquet::file::properties::{EnabledStatistics, WriterProperties};
 use parquet::schema::types::ColumnPath;
 
 use super::measurements::RowBuilder;
-use super::split::SplitPart;
 use super::statistics::ColumnStatistics;
-use super::{ExportJob, Plan, Shard, heights};
+use super::{ExportJob, Plan, Shard, SplitPart, heights};
 use crate::error::{Error, Result};
 use crate::output::{HashedFile, PendingFolder, WrittenFile};
 

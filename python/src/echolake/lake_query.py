@@ -20,8 +20,6 @@ __all__ = ["LakeQuery"]
 
 _Result = TypeVar("_Result")
 _TIMEOUT_SECS = 120
-_HELD_OUT = 0.1
-"""Share of the surfaces for the test, and for validation, as ``echolake export ml`` has it."""
 _KEYS = ("surface_id", "run_id", "pair_id", "microphone", "speaker")
 _NOT_CHOSEN = (*_KEYS, "log_time_ns", "chunk_offset")
 
@@ -60,31 +58,35 @@ class QueriedSet:
         self.query = query
 
     def describe_split(self, split: str) -> SplitContents:
-        """Asks for the surfaces, draws the split, and counts rows."""
-        surfaces = self._ask(
-            "select listed.surface_id, panel, typology, flat_reference, foam_reference, is_selected, rows "
+        """Asks for the surfaces, their splits and numbers of rows."""
+        listed = (
+            "select listed.surface_id, panel, typology = 'reference' or named.surface_id is not null as is_reference "
             f"from {self._relation('surfaces')} listed "
             f"join (select distinct surface_id from {self._relation('tnce')}) derived "
             "on derived.surface_id = listed.surface_id "
-            f"left join (select surface_id, true as is_selected from {self._relation('catalogue')} "
-            f"where (\n{self.query.where}\n)) selected on selected.surface_id = listed.surface_id "
+            f"join (select surface_id from {self._relation('catalogue')} where (\n{self.query.where}\n)) selected "
+            "on selected.surface_id = listed.surface_id "
+            f"left join (select flat_reference as surface_id from {self._relation('surfaces')} "
+            f"union select foam_reference from {self._relation('surfaces')}) named "
+            "on named.surface_id = listed.surface_id"
+        )
+        surfaces = self._ask(
+            f"select listed.*, rows from ({listed}) listed "
             f"left join (select surface_id, count(*) as rows from {self._relation('tnce_db')} group by surface_id) "
             "counted on counted.surface_id = listed.surface_id order by listed.surface_id"
         ).to_pylist()
-        references = {surface[of] for surface in surfaces for of in ("flat_reference", "foam_reference")}
-        reliefs = [
-            surface
-            for surface in surfaces
-            if surface["is_selected"] and surface["typology"] != "reference" and surface["surface_id"] not in references
-        ]
-        parts = _draw_parts([surface["panel"] for surface in reliefs], self.query.seed)
+        # SQL has signed numbers; a seed of export ml has as many bits.
+        seed = int.from_bytes(self.query.seed.to_bytes(8, "little"), "little", signed=True)
+        drawn = self._ask(f"select panel_splits(surface_id, is_reference, {seed}) as splits from ({listed}) listed")
+        splits = dict(drawn.column("splits")[0].as_py() or ())
+        reliefs = [surface for surface in surfaces if not surface["is_reference"]]
         groups = [
             RowGroup(surface["surface_id"], 0, surface["rows"])
             for surface in reliefs
-            if parts[surface["panel"]] == split and surface["rows"]
+            if splits[surface["surface_id"]] == split and surface["rows"]
         ]
         if not groups:
-            counts = f"{len(reliefs)} surfaces of {len(parts)} panels"
+            counts = f"{len(reliefs)} surfaces of {len({surface['panel'] for surface in reliefs})} panels"
             raise LookupError(f"{counts} in {self.query!r}, none in split {split}")
         named = [self.query.as_of, self.query.seed, [(group.file, group.rows) for group in groups]]
         digest = hashlib.sha256(json.dumps(named).encode()).hexdigest()[:16]
@@ -201,20 +203,3 @@ def _request_answer(query: LakeQuery, path: str, sql: str | None, read: Callable
             raise ConnectionError(f"{query.url} does not answer: {failed.reason}") from failed
 
     return retry_read(read_once, RETRY_SECS)
-
-
-def _draw_parts(panels: Sequence[str], seed: int) -> dict[str, str]:
-    """The split of each panel: sorted by digest, the first fill the test, the next validation."""
-    counts: dict[str, int] = {}
-    for panel in panels:
-        counts[panel] = counts.get(panel, 0) + 1
-    order = sorted(counts, key=lambda panel: hashlib.sha256(seed.to_bytes(8, "little") + panel.encode()).digest())
-    parts = dict.fromkeys(order, "train")
-    drawn = iter(order)
-    left = len(order)
-    for part, later in (("test", 2), ("validation", 1)):
-        have = 0
-        while have < _HELD_OUT * len(panels) and left > later:
-            panel = next(drawn)
-            parts[panel], have, left = part, have + counts[panel], left - 1
-    return parts

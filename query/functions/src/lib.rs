@@ -19,7 +19,7 @@ use echolake_schema::Rig;
 use adapters::aggregate::wrap_aggregate;
 use adapters::rig::RigFacts;
 use adapters::scalar::wrap_scalar;
-use aggregates::{average, p90_mean, value_counts};
+use aggregates::{average, p90_mean, panel_splits, value_counts};
 use comparison::{alike, diffusion};
 use geometry::{fresnel, sound, symmetry};
 use responses::{band_energy, decay, nce, octave_band, rise, room_parameters, spectrum};
@@ -83,6 +83,7 @@ impl FunctionSet {
             wrap_aggregate(p90_mean::P90MeanFunction),
             wrap_aggregate(diffusion::DiffusionCoefficientFunction),
             wrap_aggregate(average::AvgListFunction),
+            wrap_aggregate(panel_splits::PanelSplitsFunction),
             AggregateUDF::new_from_impl(value_counts::ValueCountFunction::mode()),
             AggregateUDF::new_from_impl(value_counts::ValueCountFunction::histogram()),
         ];

@@ -1,5 +1,6 @@
 //! Every function through SQL on a small lake: its example, golden cases, laws that must hold, and hostile input.
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use arrow::array::{Array as _, ArrayRef, AsArray as _, BooleanArray, Float64Array, StringArray};
@@ -10,8 +11,9 @@ use arrow::util::pretty::pretty_format_batches;
 use bytes::Bytes;
 use echolake_functions::FunctionSet;
 use echolake_lake::{FileName, Lake, ReferenceSurfaces, VisibleRun, encode_batches};
+use echolake_schema::splits::{SplitParams, SplitSurface, assign_parts};
 use echolake_schema::tables::Table;
-use echolake_schema::{Rig, Symmetry};
+use echolake_schema::{Rig, SurfaceId, Symmetry};
 use expect_test::expect;
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 
@@ -368,6 +370,38 @@ async fn aggregates_are_the_same_however_rows_are_divided() {
     for empty in ["p90_mean(1.0)", "diffusion_coefficient(1.0)", "avg_list([1])"] {
         let batch = small.rows(&format!("select {empty} from points where point_id < 0")).await;
         assert!(batch.column(0).is_null(0), "{empty}");
+    }
+}
+
+/// E31: loaders that ask for splits have those of an export, also of a panel whose other side is a reference.
+#[tokio::test]
+async fn panel_splits_are_those_of_an_export() {
+    let small = SmallLake::new().await;
+    let sides = (0..120).map(|side| format!("{:04}_{}", side / 2, side % 2)).chain(["flat".to_owned()]);
+    let ids: Vec<SurfaceId> = sides.map(|id| id.parse().expect("an id")).collect();
+    let is_reference = |id: &SurfaceId| id.as_str() == "flat" || id.as_str().ends_with("5_1");
+    for seed in [1, 7, u64::MAX] {
+        let surface = |id| SplitSurface { id, typology: "brick", macrostructure: None, is_reference: is_reference(id) };
+        let surfaces: Vec<_> = ids.iter().map(surface).collect();
+        let parts = assign_parts(&surfaces, SplitParams { seed, ..SplitParams::default() });
+        let named = ids.iter().zip(parts).map(|(id, part)| (id.as_str(), part.expect("a part").name()));
+        let expected: BTreeMap<_, _> = named.collect();
+        let rows: Vec<_> = ids.iter().map(|id| format!("('{id}', {})", is_reference(id))).collect();
+        let from = format!("from (values {}) as t(id, is_reference)", rows.join(", "));
+        let batch = small.rows(&format!("select panel_splits(id, is_reference, {}) {from}", seed.cast_signed())).await;
+        let splits = batch.column(0).as_map();
+        let names = splits.keys().as_string::<i32>().iter().flatten();
+        let given: BTreeMap<_, _> = names.zip(splits.values().as_string::<i32>().iter().flatten()).collect();
+        assert_eq!(given, expected);
+        assert_eq!(given.values().collect::<BTreeSet<_>>().len(), 3, "{seed}");
+    }
+    let none = small.rows("select panel_splits(surface_id, true, 1) from surfaces where false").await;
+    assert!(none.column(0).is_null(0));
+    let refused =
+        [("'../x', false, 1", "is \"../x\""), ("'a', 0, 1", "not a boolean"), ("'a', true, n", "have one seed")];
+    for (arguments, told) in refused {
+        let refusal = small.refusal(&format!("select panel_splits({arguments}) from (values (1), (2)) as t(n)")).await;
+        assert!(refusal.contains(told), "{refusal}");
     }
 }
 

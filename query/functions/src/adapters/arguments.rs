@@ -3,7 +3,7 @@
 use std::fmt::Debug;
 use std::sync::Arc;
 
-use arrow::array::{Array, ArrayRef, ArrowPrimitiveType, AsArray as _, ListArray, StringArray};
+use arrow::array::{Array, ArrayRef, ArrowPrimitiveType, AsArray as _, BooleanArray, ListArray, StringArray};
 use arrow::buffer::NullBuffer;
 use arrow::datatypes::{ArrowNativeType, DataType, Field, Float32Type, Float64Type, Int64Type};
 use datafusion::error::{DataFusionError, Result};
@@ -78,6 +78,7 @@ pub(crate) fn coerced_types(description: &FunctionDescription, types: &[DataType
         Some(ArgumentKind::Number) if is_number(given) => DataType::Float64,
         Some(ArgumentKind::Integer) if given.is_integer() || given.is_null() => DataType::Int64,
         Some(ArgumentKind::Text) if is_text(given) => DataType::Utf8,
+        Some(ArgumentKind::Flag) if given.is_null() => DataType::Boolean,
         _ => given.clone(),
     };
     types.iter().enumerate().map(coerce).collect()
@@ -102,6 +103,7 @@ pub(crate) fn check_arguments(description: &FunctionDescription, types: &[DataTy
             ArgumentKind::Number => *given == DataType::Float64,
             ArgumentKind::Integer => *given == DataType::Int64,
             ArgumentKind::Text => *given == DataType::Utf8,
+            ArgumentKind::Flag => *given == DataType::Boolean,
             ArgumentKind::Value => true,
         };
         if !fits {
@@ -223,6 +225,11 @@ impl<'a> CallArguments<'a> {
         let ArgumentColumn { array, constant } = &self.columns[argument];
         let values = array.as_string_opt::<i32>().ok_or_else(|| self.other_type(argument))?;
         Ok(TextValues { values, constant: *constant })
+    }
+
+    /// Returns an argument as flags, one per row of a batch.
+    pub fn flag_values(&self, argument: usize) -> Result<&BooleanArray> {
+        self.columns[argument].array.as_boolean_opt().ok_or_else(|| self.other_type(argument))
     }
 
     /// Returns the error for an invalid argument of a row, with a hint.

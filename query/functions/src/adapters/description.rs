@@ -50,6 +50,8 @@ pub(crate) enum ArgumentKind {
     Integer,
     /// Text.
     Text,
+    /// True or false.
+    Flag,
     /// A value of any type.
     Value,
 }
@@ -80,6 +82,7 @@ impl ArgumentKind {
             Self::Number => "a number",
             Self::Integer => "a whole number",
             Self::Text => "text",
+            Self::Flag => "a boolean",
             Self::Value => "a value",
         }
     }
