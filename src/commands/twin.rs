@@ -18,6 +18,7 @@ use echolake_panel::relief::{HeightField, PanelRelief};
 use echolake_query::Session;
 use echolake_recording::{RecordingItem, RecordingReader};
 use echolake_schema::manifest::Origin;
+use echolake_schema::simulation::TRUSTED_PHASE;
 use echolake_schema::{ProjectName, Rig, RunId, SurfaceId, SurfaceRecord, Timestamp, topics};
 use serde::{Deserialize, Serialize};
 use tempfile::TempDir;
@@ -44,8 +45,6 @@ const FOAM: &str = "twin_foam";
 /// 2026-01-05 09:00 UTC: a computed run has no time of its own. Twins of 08:00 were computed of coarser meshes, and are
 /// superseded.
 const COMPUTED_AT: Timestamp = Timestamp(1_767_603_600_000_000_000);
-/// Phase of details, rad, beyond which pairs of a simulated relief are off by 1 dB (docs/devices.md).
-const GREATEST_DETAIL_PHASE: f64 = 0.18;
 
 /// Differences of a band over the pairs, the surface less its twin.
 #[derive(Debug, Serialize, Deserialize)]
@@ -341,7 +340,7 @@ impl TwinDifferences {
         for band in &self.bands {
             // The same simulation on both sides is off by the same.
             let doubted = self.origin != Origin::Simulated.label()
-                && band.detail_phase.is_some_and(|phase| phase > GREATEST_DETAIL_PHASE);
+                && band.detail_phase.is_some_and(|phase| phase > TRUSTED_PHASE);
             super::print_line(&format!(
                 "{:>6} {:>6} {:>9} {:>9} {:>6} {:>6} {:>6} {:>6}{}",
                 band.band,

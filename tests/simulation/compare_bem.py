@@ -7,7 +7,8 @@ wavelength, 0.35 mm in joints); `--cylinder` compares it with the series of a ri
 heights that are means over the cells, as the program has them. Microphones and speakers are at the 16 places of the
 paper's grid over the middle of the panel, all pairs of them. Energies are summed over 36 frequencies from 2 to 40 kHz
 with weights of the bands an octave apart, and are over those of a flat bar by the same method. The last row of a relief
-is columns `detail_phase_*` of table `surfaces`: the phase of its details that are narrower than a wavelength.
+is columns `detail_phase_*` of table `surfaces`: the phase of its details that are narrower than a wavelength. A test in
+`schema/src/simulation/` compares the table with the constants that say how far the simulation is trusted.
 
     pip install numpy scipy
     python tests/simulation/compare_bem.py                 # half an hour on one core

@@ -2,6 +2,7 @@
 
 use super::column::Column;
 use crate::manifest::ORIGINS;
+use crate::simulation::TRUSTED_PHASE;
 
 fn run_keys() -> Vec<Column> {
     vec![
@@ -70,9 +71,11 @@ pub(super) fn surface_columns(bands: &[String]) -> Vec<Column> {
         Column::float("relief_rms_mm", "mm", "Root mean square height of the relief about its mean").or_null(),
     ]);
     columns.extend(bands.iter().map(|band| {
-        let comment = "Phase, rad, of the relief's details narrower than a wavelength, root mean square; over 0.18 \
-                       simulated levels of single pairs are off by about 1 dB and more";
-        Column::float(format!("detail_phase_{band}"), "1", format!("{comment}, band at {band} Hz")).or_null()
+        let comment = format!(
+            "Phase, rad, of the relief's details narrower than a wavelength, root mean square; over {TRUSTED_PHASE} \
+             simulated levels of single pairs are off by about 1 dB and more, band at {band} Hz"
+        );
+        Column::float(format!("detail_phase_{band}"), "1", comment).or_null()
     }));
     let far_field = [
         (

@@ -5,11 +5,11 @@ use std::collections::BTreeSet;
 
 use anyhow::{Context as _, ensure};
 use echolake_panel::mesh::FACETS;
+use echolake_schema::simulation::UNTRUSTED_ERROR_DB;
 use serde::Serialize;
 
 use super::gaussian_process::{GaussianProcess, KnownFigure};
 use super::measured::MeasuredPanel;
-use super::report::MEAN_ERROR_DB;
 use super::search::{DesignCandidate, differing_candidates};
 use super::target::DesignTarget;
 
@@ -54,7 +54,7 @@ pub(super) fn propose_panels(
         measured.len(),
         simulated.len()
     );
-    let difference_db = MEAN_ERROR_DB[1].hypot(PAIR_SPREAD_DB / (target.pairs as f64).sqrt());
+    let difference_db = UNTRUSTED_ERROR_DB.hypot(PAIR_SPREAD_DB / (target.pairs as f64).sqrt());
     let fit = |band: usize| {
         let simulated = simulated.iter().map(|candidate| KnownFigure {
             place: target.coordinates_of(&candidate.values),

@@ -11,6 +11,7 @@ use echolake_figures::{FigureNotes, GridFigure, GridLayer, GridPanel, LevelPalet
 use echolake_panel::mesh::{BACK_MM, FACETS, Mesh, MeshFormat};
 use echolake_panel::relief::PanelRelief;
 use echolake_query::figure_rows::band_labels;
+use echolake_schema::simulation::{TRUSTED_ERROR_DB, TRUSTED_PHASE, UNTRUSTED_ERROR_DB};
 use echolake_schema::{Grid, Rig, SurfaceId};
 use serde::Serialize;
 use serde_json::json;
@@ -20,13 +21,6 @@ use super::measured::MeasuredPanel;
 use super::search::{DesignCandidate, differing_candidates};
 use super::target::{DesignGoal, DesignTarget, FigureKind};
 
-/// Phase of a relief's details, rad, over which single pairs of the simulation are off by 0.9 dB or more.
-///
-/// Source: docs/devices.md, the table of the boundary-element method.
-const TRUSTED_PHASE: f64 = 0.18;
-/// Error of a band's mean level under that phase and over it, dB: root mean square over the reliefs of that table; at
-/// most it is 0.31 and 1.2 dB.
-pub(super) const MEAN_ERROR_DB: [f64; 2] = [0.12, 0.58];
 /// Candidates that are simulated at all pairs, if fewer panels are kept: at few pairs their order is uncertain.
 const FINALISTS: usize = 10;
 
@@ -80,7 +74,7 @@ impl FoundPanel {
     }
 
     fn mean_error_db(&self, band: usize) -> f64 {
-        MEAN_ERROR_DB[usize::from(!self.is_trusted(band))]
+        if self.is_trusted(band) { TRUSTED_ERROR_DB } else { UNTRUSTED_ERROR_DB }
     }
 
     /// Returns what is said of it.
