@@ -1,8 +1,9 @@
 //! `echolake twin`: a run beside the one that is computed for its heights.
 
+use echolake_acquisition::run::controller::RecordingMode;
 use echolake_panel::paper_panel::PaperPanel;
 use echolake_panel::relief::PanelRelief;
-use echolake_testing::SMALL_RIG;
+use echolake_testing::{SMALL_RIG, simulate_run};
 
 use super::TestFolder;
 
@@ -15,7 +16,10 @@ mod slow {
         for (surface, seed) in [("flat", "1"), ("foam", "2"), ("stretcher_bond", "3"), ("wood", "4")] {
             place.acquire(surface, &["--seed", seed]);
         }
+        // E33: a reference that an earlier revision computed, at 08:00, is removed, not averaged with the present one.
+        simulate_run(&place.path("lake/inbox"), 0, "twin_flat", "flat", RecordingMode::ResponsesOnly);
         place.ok(&["ingest"]);
+        assert_eq!(place.number("select count(*) from runs where surface_id = 'twin_flat'"), 1.0);
         // Levels have uncertainties; Flat's are those of the energy that the others are over.
         let uncertain = |surface: &str| {
             place.number(&format!("select max(tnce_band_10000_u_db) from tnce where surface_id = '{surface}'"))
@@ -36,6 +40,10 @@ mod slow {
         let pairs = twin["pairs"].as_array().expect("pairs");
         let apart = |pair: &serde_json::Value| pair["difference_db"].as_f64().expect("a difference").abs();
         assert!(pairs.len() == 10 && apart(&pairs[0]) >= apart(&pairs[9]), "{pairs:?}");
+        let flats = place.sql("select run_id from runs where surface_id = 'twin_flat'");
+        assert_eq!(flats.len(), 1, "{flats:?}");
+        let id = flats[0]["run_id"].as_str().expect("a name");
+        assert!(id.ends_with("-twin_flat-0000000000000000"), "{id}");
         let origins =
             place.sql("select surface_id, origin from surfaces where origin = 'computed' order by surface_id");
         let names: Vec<_> = origins.iter().map(|row| row["surface_id"].as_str().expect("a name")).collect();

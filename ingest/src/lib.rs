@@ -37,6 +37,8 @@ mod reading;
 mod references;
 mod remove;
 mod report;
+#[cfg(test)]
+mod revision_tests;
 mod rows;
 
 pub use complete::{CompletedRun, CompletionReport, CompletionSummary};

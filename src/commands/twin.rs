@@ -2,6 +2,7 @@
 
 use std::collections::HashSet;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use anyhow::Context as _;
@@ -9,7 +10,7 @@ use clap::Args;
 use echolake_acquisition::run::RunRequest;
 use echolake_acquisition::run::controller::RecordingMode;
 use echolake_acquisition::run::simulate::run_simulation;
-use echolake_ingest::pending_runs;
+use echolake_ingest::{LakeIngest, RemovedFile, find_removals, pending_runs};
 use echolake_lake::Lake;
 use echolake_panel::PanelSpecimen;
 use echolake_panel::material::SurfaceMaterial;
@@ -42,9 +43,16 @@ pub(crate) struct TwinArgs {
 const TWIN: &str = "twin_";
 const FLAT: &str = "twin_flat";
 const FOAM: &str = "twin_foam";
-/// 2026-01-05 09:00 UTC: a computed run has no time of its own. Twins of 08:00 were computed of coarser meshes, and are
-/// superseded.
-const COMPUTED_AT: Timestamp = Timestamp(1_767_603_600_000_000_000);
+/// Revision of the computed runs: those of another one are computed again. A test fails if their numbers change and it
+/// does not. Revision 1 had coarser meshes.
+const TWIN_REVISION: u32 = 2;
+/// Time that the runs' names have: a computed run has no time of its own.
+const COMPUTED_AT: Timestamp = revision_time(TWIN_REVISION);
+
+// An hour per revision from 2026-01-05 07:00 UTC.
+const fn revision_time(revision: u32) -> Timestamp {
+    Timestamp(1_767_596_400_000_000_000 + revision as i64 * 3_600_000_000_000)
+}
 
 /// Differences of a band over the pairs, the surface less its twin.
 #[derive(Debug, Serialize, Deserialize)]
@@ -110,12 +118,39 @@ pub(crate) async fn run_twin(args: &TwinArgs, lake_url: &str) -> anyhow::Result<
     anyhow::ensure!(!stop.is_made(), "stopped; hint: run the same command again to resume");
     super::ingest::ingest_runs(&lake, pending_runs(&lake).await?, stop.flag(), &CommandProgress::new()).await?;
     anyhow::ensure!(!stop.is_made(), "stopped; hint: run the same command again to resume");
+    remove_superseded_runs(&lake, stop.flag()).await?;
     let differences = TwinDifferences::read_from_lake(&lake, surface, &runs, args.pairs).await?;
     match args.json {
         true => super::print_line(&serde_json::to_string_pretty(&differences)?)?,
         false => differences.print_differences()?,
     }
     Ok(CommandOutcome::Whole)
+}
+
+/// Removes the computed runs of earlier revisions, whichever surface they are twins of. References would be means over
+/// both revisions, and the remaining twins of the earlier one would be over references of the later one.
+async fn remove_superseded_runs(lake: &Lake, stop: &Arc<AtomicBool>) -> anyhow::Result<()> {
+    let snapshot = lake.snapshot().await?;
+    let superseded = snapshot.runs().map(|visible| &visible.run).filter(|run| is_superseded(run));
+    let names: Vec<_> = superseded.map(ToString::to_string).collect();
+    if names.is_empty() {
+        return Ok(());
+    }
+    let mut removals = find_removals(lake, &names).await?;
+    let ingest = LakeIngest::new(lake, stop.clone());
+    let removed = async {
+        ingest.remove_runs(&mut removals, RemovedFile::Deleted, "echolake twin").await?;
+        ingest.complete_runs(&mut |_, _| {}).await
+    };
+    let removed = removed.await;
+    ingest.release_claims().await;
+    removed?;
+    Ok(())
+}
+
+fn is_superseded(run: &RunId) -> bool {
+    let is_of = |revision| run.as_str().starts_with(&format!("{}-", revision_time(revision).compact_text()));
+    run.surface_name().starts_with(TWIN) && (1..TWIN_REVISION).any(is_of)
 }
 
 /// The runs that are to be computed.
@@ -148,28 +183,17 @@ impl TwinComputation {
     /// Plans the runs that the lake lacks: the references', and that of the heights in the measured run's file.
     async fn new(lake: &Lake, surface: &SurfaceId, path: &Path) -> anyhow::Result<Self> {
         let mesh = tempfile::tempdir().context("cannot make a temporary folder")?;
-        let file = mesh.path().join(topics::MESH_ATTACHMENT);
         let measured = path.to_owned();
         let taken = tokio::task::spawn_blocking(move || take_heights(&measured)).await??;
         let heights = HeightField::from_rows(lake.rig().panel.size_mm, taken.heights_mm)
             .with_context(|| format!("`{}`: {} is no square of numbers", path.display(), topics::HEIGHTS_ATTACHMENT))?;
-        let mesh_bytes = Mesh::from_height_field(&heights, BACK_MM).to_bytes(MeshFormat::Glb);
-        std::fs::write(&file, mesh_bytes).with_context(|| format!("cannot write `{}`", file.display()))?;
+        let file = write_mesh(mesh.path(), &heights)?;
         // The tag of the measured run tells whose twin it is.
         let name = path.file_stem().unwrap_or_default().to_string_lossy();
         let tag = name.rsplit_once('-').and_then(|(_, tag)| u64::from_str_radix(tag, 16).ok());
         let tag = tag.with_context(|| format!("`{}` is not named as a run", path.display()))?;
         let measured = name.parse()?;
-        let references = [(FLAT, PanelRelief::Flat), (FOAM, PanelRelief::Foam)];
-        let mut runs = Vec::new();
-        for (name, relief) in references {
-            runs.push(ComputedRun {
-                surface: name.parse()?,
-                project: None,
-                specimen: PanelSpecimen::Relief(relief),
-                tag: 0,
-            });
-        }
+        let mut runs = ComputedRun::list_references()?;
         let twin = format!("{TWIN}{surface}").parse()?;
         if runs.iter().all(|run| run.surface != twin) {
             let specimen = PanelSpecimen::Mesh(file, PanelSide::Front);
@@ -180,12 +204,7 @@ impl TwinComputation {
         let snapshot = lake.whole_snapshot().await?;
         let known: HashSet<RunId> = snapshot.runs().map(|run| run.run.clone()).collect();
         runs.retain(|run| run.id().is_ok_and(|id| !known.contains(&id)));
-        let mut rig = lake.rig().clone();
-        // What a model says of a panel, without the chances of a measurement.
-        rig.simulation.noise_and_drift = false;
-        rig.simulation.repeatability_mm = 0.0;
-        rig.simulation.calibration_mm = 0.0;
-        Ok(Self { rig, folder: super::prepare_inbox(lake)?, _mesh: mesh, runs, compared })
+        Ok(Self { rig: quiet_rig(lake.rig()), folder: super::prepare_inbox(lake)?, _mesh: mesh, runs, compared })
     }
 
     fn compute_missing(&self, stop: &AtomicBool, progress: &CommandProgress) -> anyhow::Result<()> {
@@ -230,7 +249,32 @@ impl TwinComputation {
     }
 }
 
+/// The rig without the chances of a measurement: what a model computes of a panel.
+fn quiet_rig(rig: &Rig) -> Rig {
+    let mut rig = rig.clone();
+    rig.simulation.noise_and_drift = false;
+    rig.simulation.repeatability_mm = 0.0;
+    rig.simulation.calibration_mm = 0.0;
+    rig
+}
+
+fn write_mesh(folder: &Path, heights: &HeightField) -> anyhow::Result<PathBuf> {
+    let file = folder.join(topics::MESH_ATTACHMENT);
+    let bytes = Mesh::from_height_field(heights, BACK_MM).to_bytes(MeshFormat::Glb);
+    std::fs::write(&file, bytes).with_context(|| format!("cannot write `{}`", file.display()))?;
+    Ok(file)
+}
+
 impl ComputedRun {
+    fn list_references() -> anyhow::Result<Vec<Self>> {
+        let references = [(FLAT, PanelRelief::Flat), (FOAM, PanelRelief::Foam)];
+        let reference = |(name, relief): (&str, PanelRelief)| {
+            let specimen = PanelSpecimen::Relief(relief);
+            anyhow::Ok(Self { surface: name.parse()?, project: None, specimen, tag: 0 })
+        };
+        references.into_iter().map(reference).collect()
+    }
+
     fn id(&self) -> anyhow::Result<RunId> {
         Ok(RunId::compose(COMPUTED_AT, &self.surface, self.tag)?)
     }
@@ -371,5 +415,80 @@ impl TwinDifferences {
             ))?;
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use echolake_dsp::filter_bank::FilterBankPlan;
+    use echolake_dsp::level::power_to_db;
+    use echolake_panel::mesh::FACETS;
+    use echolake_schema::messages::ImpulseResponse;
+    use echolake_testing::{NumberLine, RevisionFixture, SMALL_RIG, read_messages};
+
+    use super::*;
+
+    /// Difference of a level, dB, that is no change.
+    const LEVEL_TOLERANCE_DB: f64 = 2e-3;
+
+    // Levels of a run's responses over 1, band by band, in the order of the pairs.
+    fn level_lines(rig: &Rig, surface: &str, file: &Path) -> Vec<NumberLine> {
+        let mut responses: Vec<ImpulseResponse> = read_messages(file, topics::IR);
+        responses.sort_by_key(|response| response.pair_id);
+        let length = responses.first().expect("a response").samples.len();
+        let bank = FilterBankPlan::<f64>::new(length, rig.sweep.rate_hz.get(), &rig.bands.centres_hz).expect("a plan");
+        let mut scratch = bank.make_scratch();
+        let mut levels_db = vec![Vec::new(); bank.band_count()];
+        for response in &responses {
+            let samples: Vec<f64> = response.samples.iter().map(|sample| f64::from(*sample)).collect();
+            let mut energies = vec![0.0; bank.band_count()];
+            bank.compute_energies(&samples, &mut energies, &mut scratch).expect("energies");
+            levels_db.iter_mut().zip(energies).for_each(|(band, energy)| band.push(power_to_db(energy)));
+        }
+        let line = |(band, levels): (String, Vec<f64>)| {
+            NumberLine::from_values(format!("{surface}.level_{band}"), levels, LEVEL_TOLERANCE_DB)
+        };
+        rig.band_names().into_iter().zip(levels_db).map(line).collect()
+    }
+
+    /// E33: a lake computes its twins again only if the revision is raised.
+    #[test]
+    fn changed_twins_need_a_raised_revision() {
+        let rig = Rig::from_toml(&SMALL_RIG.replace("points_per_side = 3", "points_per_side = 2")).expect("a rig");
+        let folder = tempfile::tempdir().expect("a folder");
+        let mesh = tempfile::tempdir().expect("a folder");
+        let relief = PanelRelief::by_name("stretcher_bond").expect("a relief");
+        let file = write_mesh(mesh.path(), &relief.height_field(FACETS)).expect("written");
+        let surface: SurfaceId = format!("{TWIN}relief").parse().expect("a name");
+        let specimen = PanelSpecimen::Mesh(file, PanelSide::Front);
+        let mut runs = ComputedRun::list_references().expect("references");
+        runs.push(ComputedRun { surface, project: None, specimen, tag: 1 });
+        let ids: Vec<RunId> = runs.iter().map(|run| run.id().expect("a name")).collect();
+        let compared = ComparedRuns { measured: ids[2].clone(), twin: ids[2].clone() };
+        let inbox = folder.path().to_owned();
+        let computation = TwinComputation { rig: quiet_rig(&rig), folder: inbox, _mesh: mesh, runs, compared };
+        computation.compute_missing(&AtomicBool::new(false), &CommandProgress::new()).expect("computed");
+        let lines = |id: &RunId| level_lines(&rig, id.surface_name(), &folder.path().join(format!("{id}.mcap")));
+        let fixture = RevisionFixture {
+            path: "tests/fixtures/twins.txt",
+            constant: "TWIN_REVISION",
+            revision: TWIN_REVISION,
+            test: "changed_twins_need_a_raised_revision",
+        };
+        fixture.check_numbers(&ids.iter().flat_map(lines).collect::<Vec<_>>());
+    }
+
+    /// E33: revisions have times of their own, and lakes of earlier programs have the times of revisions 1 and 2.
+    #[test]
+    fn a_raised_revision_makes_other_runs() {
+        let times = [1, 2, 3].map(|revision| revision_time(revision).compact_text());
+        assert_eq!(times, ["20260105T080000Z", "20260105T090000Z", "20260105T100000Z"]);
+        let twin_of = |revision| {
+            let surface = FLAT.parse().expect("a name");
+            RunId::compose(revision_time(revision), &surface, 0).expect("a name")
+        };
+        assert!(is_superseded(&twin_of(TWIN_REVISION - 1)) && !is_superseded(&twin_of(TWIN_REVISION)));
+        let measured = RunId::compose(revision_time(1), &"flat".parse().expect("a name"), 0).expect("a name");
+        assert!(!is_superseded(&measured));
     }
 }

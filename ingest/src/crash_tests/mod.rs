@@ -46,12 +46,12 @@ fn simulate_runs(surfaces: &[&str]) -> Vec<(String, Bytes)> {
     surfaces.iter().enumerate().map(one).collect()
 }
 
-async fn open_lake(store: Arc<dyn ObjectStore>) -> echolake_lake::Result<Lake> {
+pub(crate) async fn open_lake(store: Arc<dyn ObjectStore>) -> echolake_lake::Result<Lake> {
     Lake::open_or_create_in(store, "a lake under test", &small_rig(), &ReferenceSurfaces::default()).await
 }
 
 /// A lake with these runs in its inbox.
-async fn with_inbox(runs: &[(String, Bytes)]) -> Arc<InMemory> {
+pub(crate) async fn with_inbox(runs: &[(String, Bytes)]) -> Arc<InMemory> {
     let store = Arc::new(InMemory::new());
     open_lake(store.clone()).await.expect("a lake");
     for (name, bytes) in runs {
@@ -60,7 +60,7 @@ async fn with_inbox(runs: &[(String, Bytes)]) -> Arc<InMemory> {
     store
 }
 
-async fn ingest_pending(store: Arc<dyn ObjectStore>) -> crate::Result<Vec<FileReport>> {
+pub(crate) async fn ingest_pending(store: Arc<dyn ObjectStore>) -> crate::Result<Vec<FileReport>> {
     let lake = open_lake(store).await?;
     let mut reports = Vec::new();
     let ingest = LakeIngest::new(&lake, Arc::default());
