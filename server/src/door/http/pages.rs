@@ -100,7 +100,7 @@ pub(super) async fn serve_page(method: Method, uri: Uri, headers: HeaderMap) -> 
     };
     let Some((page, digest)) = found else {
         return match manual_path {
-            Some(_) => missing_manual_page(&headers),
+            Some(_) => missing_manual_page(uri.path(), &headers),
             None => refuse_unknown_path().await.into_response(),
         };
     };
@@ -128,7 +128,7 @@ pub(super) async fn serve_page(method: Method, uri: Uri, headers: HeaderMap) -> 
 }
 
 // Words for a person whose browser followed a link, and the usual problem for a program.
-fn missing_manual_page(headers: &HeaderMap) -> Response {
+fn missing_manual_page(path: &str, headers: &HeaderMap) -> Response {
     let hint = match MANUAL {
         [] => "this program was built without its manual; docs/build.sh makes it for the next build",
         _ => "/docs/index.html lists the manual's pages",
@@ -141,9 +141,20 @@ fn missing_manual_page(headers: &HeaderMap) -> Response {
             (header::CONTENT_SECURITY_POLICY, POLICY),
             (header::VARY, "Accept"),
         ];
-        return (StatusCode::NOT_FOUND, common, MISSING_MANUAL_PAGE.replace("HINT", hint)).into_response();
+        let page = lead_to_root(&MISSING_MANUAL_PAGE.replace("HINT", hint), folder_depth(path));
+        return (StatusCode::NOT_FOUND, common, page).into_response();
     }
     ProblemResponse(RequestFault::NotFound { what: "this page of the manual".to_owned(), hint }).into_response()
+}
+
+// The addresses of a document are relative, so that a proxy may serve the pages below a path of its own.
+fn lead_to_root(document: &str, depth: usize) -> String {
+    let root = if depth == 0 { "./".to_owned() } else { "../".repeat(depth) };
+    document.replace("\"./", &format!("\"{root}"))
+}
+
+fn folder_depth(path: &str) -> usize {
+    path.matches('/').count().saturating_sub(1)
 }
 
 fn find_manual_file(path: &str) -> Option<&'static (&'static PageFile, String)> {
@@ -171,7 +182,7 @@ enum PageForm {
 
 impl PageForm {
     fn choose(page: &PageFile, path: &str, headers: &HeaderMap) -> Self {
-        let depth = path.matches('/').count().saturating_sub(1);
+        let depth = folder_depth(path);
         match page.path == INDEX && depth > 0 {
             true => Self::Below(depth),
             false if page.brotli.is_some() && accepts_encoding(headers, "br") => Self::Brotli,
@@ -203,11 +214,7 @@ impl PageFile {
         match (form, self.brotli) {
             (PageForm::Brotli, Some(packed)) => Bytes::from_static(packed),
             (PageForm::Gzip, _) => Bytes::from_static(self.bytes),
-            // Its addresses are relative, so that a proxy may serve the pages below a path of its own.
-            (PageForm::Below(depth), _) => {
-                let document = String::from_utf8_lossy(&self.plain_bytes()).into_owned();
-                document.replace("\"./", &format!("\"{}", "../".repeat(depth))).into()
-            }
+            (PageForm::Below(depth), _) => lead_to_root(&String::from_utf8_lossy(&self.plain_bytes()), depth).into(),
             _ => self.plain_bytes(),
         }
     }
@@ -243,6 +250,18 @@ mod tests {
             let text = String::from_utf8_lossy(&body);
             assert!(text.contains("docs/build.sh") || text.contains("/docs/index.html lists"), "{text}");
             assert_eq!(text.starts_with("<!doctype html>"), media_type.starts_with("text/html"), "{text}");
+        }
+    }
+
+    // A proxy may serve the pages below a path of its own, which a link to `/` leaves.
+    #[tokio::test]
+    async fn a_missing_page_of_the_manual_leads_to_the_catalogue_below_a_proxys_path() {
+        for (path, root) in [("/docs/none.html", "../"), ("/docs/decisions/none.html", "../../")] {
+            let headers = HeaderMap::from_iter([(header::ACCEPT, HeaderValue::from_static("text/html"))]);
+            let response = serve_page(Method::GET, Uri::from_static(path), headers).await;
+            let body = axum::body::to_bytes(response.into_body(), 1 << 16).await.expect("a body");
+            let text = String::from_utf8_lossy(&body);
+            assert!(text.contains(&format!("<a href=\"{root}\">The catalogue</a>")), "{path}: {text}");
         }
     }
 
