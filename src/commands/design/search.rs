@@ -10,6 +10,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use anyhow::{Context as _, bail, ensure};
 use cmaes::{CMAESOptions, DVector};
 use echolake_acquisition::design::{BandFigures, DesignSimulation};
+use echolake_acquisition::disk::read_text_file;
 use echolake_dsp::scattering::UncertainNumber;
 use echolake_panel::mesh::FACETS;
 
@@ -292,6 +293,7 @@ impl CandidateColumns {
     pub fn lock_file(&self, path: &Path) -> anyhow::Result<CandidateFile> {
         let failed = || format!("cannot write `{}`", path.display());
         let mut file = File::options().append(true).read(true).create(true).open(path).with_context(failed)?;
+        ensure!(file.metadata().with_context(failed)?.is_file(), "{}: it is no plain file", failed());
         file.try_lock().with_context(|| format!("another search writes `{}`", path.display()))?;
         // A line that was cut off is written again.
         let mut text = Vec::new();
@@ -310,7 +312,7 @@ impl CandidateColumns {
     /// # Errors
     /// If a line is of another search, or has no numbers.
     pub fn read_candidates(&self, path: &Path, target: &DesignTarget) -> anyhow::Result<Vec<DesignCandidate>> {
-        let text = match std::fs::read_to_string(path) {
+        let text = match read_text_file(path) {
             Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(Vec::new()),
             text => text.with_context(|| format!("cannot read `{}`", path.display()))?,
         };
@@ -452,6 +454,16 @@ mod tests {
         let mut worn = candidate("20");
         worn.bands[0].spread_db = f64::NAN;
         assert!(file.append_candidate(1, &worn).is_err());
+    }
+
+    #[test]
+    fn a_file_of_candidates_that_never_ends_is_refused() {
+        let (columns, target) = columns_of("inputs");
+        let device = Path::new("/dev/zero");
+        let refused = format!("{:#}", columns.read_candidates(device, &target).expect_err("endless"));
+        assert!(refused.contains("does not end within"), "{refused}");
+        let refused = format!("{:#}", columns.lock_file(device).err().expect("no file"));
+        assert!(refused.contains("`/dev/zero`: it is no plain file"), "{refused}");
     }
 
     // Files of 0.1.0 have no inputs in their lines.
