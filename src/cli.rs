@@ -153,8 +153,8 @@ pub(crate) enum LakeCommand {
         #[arg(long, value_name = "NAME")]
         project: Vec<ProjectName>,
         /// What it is for: sql (queries), files (run files, Parquet files, meshes), metrics (the server's own figures),
-        /// annotate (adding annotations and predictions), annotate-references (beside it: verdicts on runs of Flat, Foam
-        /// and others that levels of other surfaces rest on).
+        /// annotate (adding annotations and predictions), annotate-references (beside it: verdicts on runs of Flat,
+        /// Foam and others that levels of other surfaces rest on).
         #[arg(long, value_name = "SCOPE,...", value_delimiter = ',', default_value = "sql,files")]
         scopes: Vec<TokenScope>,
     },

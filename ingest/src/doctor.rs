@@ -207,7 +207,8 @@ async fn check_run(lake: &Lake, finder: &ReferenceFinder, row: &RecordBatch, rep
         let missing = finder.wanted_references(&surface).missing_names();
         if !missing.is_empty() {
             let what = format!(
-                "waits for reference {missing}, which levels need; hint: ingest a run of that surface, and it is completed"
+                "waits for reference {missing}, which levels need; hint: ingest a run of that surface, and it is \
+                 completed"
             );
             report.add_finding(FindingSeverity::Missing, &run, what);
         } else if text("reference_derivation").is_empty() {

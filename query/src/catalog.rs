@@ -1,9 +1,9 @@
 //! The catalogue of one query: tables and views of one snapshot of the lake, and the past tables and run files that the
 //! query names.
 //!
-//! Taking a snapshot reads fourteen logs, so the last one is cached until `runs` has a newer version: a run's rows become
-//! visible together with its row in `runs`. That check does not detect commits of `optimize`. They are not urgent,
-//! because `vacuum` keeps replaced files for a while; so all logs are checked periodically.
+//! Taking a snapshot reads fourteen logs, so the last one is cached until `runs` has a newer version: a run's rows
+//! become visible together with its row in `runs`. That check does not detect commits of `optimize`. They are not
+//! urgent, because `vacuum` keeps replaced files for a while; so all logs are checked periodically.
 
 use std::collections::{HashMap, HashSet};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};

@@ -1,5 +1,6 @@
 //! What follows from annotations of users in SQL: the function `is_rejected`, and views without the measurements that
-//! the last verdict rejects. Rows of users that are still objects of the lake's earlier form stand beside their table's.
+//! the last verdict rejects. Rows of users that are still objects of the lake's earlier form stand beside their
+//! table's.
 
 use std::collections::{HashMap, HashSet};
 use std::hash::{Hash, Hasher};

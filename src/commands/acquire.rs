@@ -39,7 +39,10 @@ pub(crate) struct AcquireArgs {
     pub surface: Option<SurfaceId>,
     /// Resume a run that was stopped or cut off: its `.mcap.partial`. Measurements that are safe in it are not
     /// repeated.
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["surface", "panel", "parameters", "set", "mesh", "side", "no_geometry", "rig", "flat", "foam", "macro_reference", "project", "seed", "ir_only"])]
+    #[arg(long, value_name = "FILE", conflicts_with_all = [
+        "surface", "panel", "parameters", "set", "mesh", "side", "no_geometry", "rig", "flat", "foam",
+        "macro_reference", "project", "seed", "ir_only",
+    ])]
     pub resume: Option<PathBuf>,
     /// Relief by a name of `echolake panel --list`; by default, on the simulated rig, the one that the surface's name
     /// begins with.

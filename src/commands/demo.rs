@@ -160,8 +160,8 @@ fn level_text(band: &str) -> String {
     let u = format!("level_u_{band}_db");
     format!(
         "case when {level} is null then null when surface_id = flat_reference then 'reference' else \
-         concat(case when {level} > 0 then '+' end, round({level}, 1) + 0.0, case when {u} < 0.005 then ' \u{b1} <0.01' \
-         when {u} > 99 then ' \u{b1} >99' when {u} is not null then concat(' \u{b1} ', round({u}, 2)) end) end"
+         concat(case when {level} > 0 then '+' end, round({level}, 1) + 0.0, case when {u} < 0.005 then ' \u{b1} \
+         <0.01' when {u} > 99 then ' \u{b1} >99' when {u} is not null then concat(' \u{b1} ', round({u}, 2)) end) end"
     )
 }
 

@@ -62,7 +62,10 @@ pub(crate) struct PanelArgs {
     #[arg(long, value_name = "N", default_value_t = 8, value_parser = clap::value_parser!(u32).range(1..=10_000))]
     count: u32,
     /// Write the ranges with the steps of the next group: larger if the last group's results are alike, else smaller.
-    #[arg(long, value_name = "RANGES", requires = "results", conflicts_with_all = ["name", "set", "back", "list", "group", "parameters"])]
+    #[arg(
+        long, value_name = "RANGES", requires = "results",
+        conflicts_with_all = ["name", "set", "back", "list", "group", "parameters"]
+    )]
     next: Option<PathBuf>,
     /// Results of the last group: CSV with surface_id, band and p90_mean_db, from `echolake sql` on surface_stats.
     #[arg(long, value_name = "CSV", requires = "next")]

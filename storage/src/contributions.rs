@@ -143,8 +143,8 @@ impl ContributedFile {
 }
 
 impl Lake {
-    /// Makes a table of users ready for [`Lake::add_contribution`]: it is made if it is missing, what the lake's earlier
-    /// form has of it is copied into it, and all that is in it is shown to readers.
+    /// Makes a table of users ready for [`Lake::add_contribution`]: it is made if it is missing, what the lake's
+    /// earlier form has of it is copied into it, and all that is in it is shown to readers.
     ///
     /// # Errors
     /// [`Error::Incomplete`] or [`Error::Log`] if rows of it are lost, or what the store says.

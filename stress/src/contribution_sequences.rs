@@ -23,8 +23,8 @@ pub(crate) fn run_contribution_sequences(args: &ContributionSequencesArgs) -> Re
         }
     });
     println!(
-        "{} sequences, seed {}: {} requests acknowledged, 0 of their rows lost or seen by the other project; {} refused; \
-         {} without an answer, of which {} were sent again",
+        "{} sequences, seed {}: {} requests acknowledged, 0 of their rows lost or seen by the other project; {} \
+         refused; {} without an answer, of which {} were sent again",
         counts.sequences, args.seed, counts.acknowledged, counts.refused, counts.unanswered, counts.repeated
     );
     Ok(())

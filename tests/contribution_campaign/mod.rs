@@ -1,7 +1,7 @@
 //! Random sequences of what users of two projects with a surface of the same name add by two servers: annotations,
 //! predictions and verdicts, among them what a client must not add, with tags, merges and killed servers in between.
-//! Nothing crosses to the other project, and nothing acknowledged is lost, for an independent reader, too. At the end of
-//! each sequence a file is lost or damaged: `doctor` names it, and only what reads its table stops until it is back.
+//! Nothing crosses to the other project, and nothing acknowledged is lost, for an independent reader, too. At the end
+//! of each sequence a file is lost or damaged: `doctor` names it, and only what reads its table stops until it is back.
 
 mod expected_rows;
 mod requests;

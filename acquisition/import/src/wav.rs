@@ -309,8 +309,8 @@ fn check_response(response: &[f32], kept: usize, arrival: f64, rig: &Rig) -> Res
     let rate_hz = rig.sweep.rate_hz.get();
     let late_us = (peak as f64 / rate_hz - arrival) * 1e6;
     Err(format!(
-        "{}; the response of {} samples would be silence; hint: record a loopback, or name the file of the sweep alone, \
-         shorter than the recording, as the loopback, and import finds it in the recording",
+        "{}; the response of {} samples would be silence; hint: record a loopback, or name the file of the sweep \
+         alone, shorter than the recording, as the loopback, and import finds it in the recording",
         describe_arrival(late_us, rig),
         rig.impulse_response.length
     ))

@@ -1,9 +1,9 @@
 //! Replay of recordings: a WebSocket server that Foxglove controls (play, pause, speed, seek) and Lichtblick shows.
 //!
 //! Several recordings are shown one after the other; the time between them is left out, and so are gaps within one of
-//! more than 10 minutes without a message. If a recording begins before the other ends, time goes back. Only chunks with
-//! subscribed topics are read, one after the other. Playback stops while there is no viewer, and waits while all viewers
-//! have enough to read; if one is slower than another, it loses its oldest messages.
+//! more than 10 minutes without a message. If a recording begins before the other ends, time goes back. Only chunks
+//! with subscribed topics are read, one after the other. Playback stops while there is no viewer, and waits while all
+//! viewers have enough to read; if one is slower than another, it loses its oldest messages.
 
 mod clock;
 mod cursor;

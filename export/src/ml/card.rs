@@ -186,8 +186,8 @@ fn add_files_section(text: &mut String, about: &CardContents<'_>) {
         "\n## Files\n\n- `data/<split>-*.parquet`: measurements. Whole surfaces in a file, one row group a surface, in \
          a drawn order.\n- `heightmaps/<split>.parquet`: the surfaces' heights, joined by `surface_id` and \
          `symmetry`.\n- `surfaces.csv`: every surface and run, its file, rows, and the digests of what its rows were \
-         derived from.\n- `statistics.json`: mean and standard deviation of each column over split train, of positions by \
-         axis.\n- `croissant.json`: the same as Croissant metadata. `SHA256SUMS`: `sha256sum -c SHA256SUMS` \
+         derived from.\n- `statistics.json`: mean and standard deviation of each column over split train, of positions \
+         by axis.\n- `croissant.json`: the same as Croissant metadata. `SHA256SUMS`: `sha256sum -c SHA256SUMS` \
          checks all files.\n\n",
     );
     text.push_str(match about.plan.set.symmetries {
@@ -205,10 +205,10 @@ fn add_files_section(text: &mut String, about: &CardContents<'_>) {
     });
     text.push_str(
         "Turned rows are not exactly what a turned panel gives, because the rig's aim and directivity do not turn with \
-         it. Energies of Flat, which is the same in every position, differ from those of their images by 0.04, 0.03, 0.1, \
-         0.5 and 0.95 dB rms at 2.5 to 40 kHz (simulated), and so do responses. Of levels over Flat's total (`tnce_*`) 0.1 \
-         to 0.6 dB stay, of levels over Flat's same band (`tnce_band_*`) up to 0.2 dB. View `augmented` has the ratio \
-         of Flat's energies (`flat_ratio_*`) for every row.\n",
+         it. Energies of Flat, which is the same in every position, differ from those of their images by 0.04, 0.03, \
+         0.1, 0.5 and 0.95 dB rms at 2.5 to 40 kHz (simulated), and so do responses. Of levels over Flat's total \
+         (`tnce_*`) 0.1 to 0.6 dB stay, of levels over Flat's same band (`tnce_band_*`) up to 0.2 dB. View `augmented` has \
+         the ratio of Flat's energies (`flat_ratio_*`) for every row.\n",
     );
     let _ = writeln!(
         text,

@@ -50,8 +50,8 @@ pub(super) fn column_notes(rig: &Rig) -> impl Iterator<Item = (String, HashMap<S
     band_keys(rig).into_iter().map(|band| {
         let bands = if band == TOTAL_BAND { "all bands".to_owned() } else { format!("band at {band} Hz") };
         let comment = format!(
-            "Flat's energy at d4_pair_id over its energy at pair_id, {bands}: an energy of this row times this ratio is about \
-             what the turned panel has there"
+            "Flat's energy at d4_pair_id over its energy at pair_id, {bands}: an energy of this row times this ratio \
+             is about what the turned panel has there"
         );
         column_note(format!("flat_ratio_{band}"), "1", comment)
     })

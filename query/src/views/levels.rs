@@ -32,8 +32,8 @@ pub(super) fn column_notes() -> HashMap<String, HashMap<String, String>> {
         column_note(
             "repositioning_u_db",
             "dB",
-            "Standard uncertainty from putting panel and Flat into the rig, by the spread of their runs over the root of \
-             their number; null unless both have two runs",
+            "Standard uncertainty from putting panel and Flat into the rig, by the spread of their runs over the root \
+             of their number; null unless both have two runs",
         ),
         column_note("combined_u_db", "dB", "Both together; null if one is not known"),
     ];

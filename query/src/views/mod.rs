@@ -102,8 +102,8 @@ impl LakeView {
             Self::TnceDb => "One row per measurement: TNCE in dB by band, with the geometry of the pair.",
             Self::Augmented => {
                 "One row per measurement and symmetry: moved geometry and height map, and responses as they were \
-                 measured. The rig's aim and directivity do not turn with the panel, so that energies are off by 0.5 dB \
-                 rms at 20 kHz and 1 dB at 40 kHz; flat_ratio_* corrects them."
+                 measured. The rig's aim and directivity do not turn with the panel, so that energies are off by 0.5 \
+                 dB rms at 20 kHz and 1 dB at 40 kHz; flat_ratio_* corrects them."
             }
             Self::Catalogue => "One row per surface: its description, its run and the statistics of its levels.",
             Self::Levels => "One row per surface and band: level and uncertainty over all of its runs.",

@@ -217,8 +217,8 @@ pub(super) fn measurement_columns() -> Vec<Column> {
         Column::floats(
             "ir",
             "1",
-            "Impulse response over the loopback, at the reference temperature, cropped; direct sound still in it; rounded \
-            to 2^-20 of its greatest sample, unless lake.toml says exact",
+            "Impulse response over the loopback, at the reference temperature, cropped; direct sound still in it; \
+            rounded to 2^-20 of its greatest sample, unless lake.toml says exact",
         ),
         code_version(),
     ]);
@@ -234,8 +234,8 @@ pub(super) fn nce_columns(bands: &[String]) -> Vec<Column> {
     ));
     columns.extend(bands.iter().map(|band| {
         let comment = format!(
-            "Cumulative energy of the band at {band} Hz over Flat's total energy, along time; rounded to 2^-16 of its last \
-             value, unless lake.toml says exact"
+            "Cumulative energy of the band at {band} Hz over Flat's total energy, along time; rounded to 2^-16 of its \
+             last value, unless lake.toml says exact"
         );
         Column::floats(format!("nce_{band}"), "1", comment)
     }));

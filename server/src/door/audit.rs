@@ -44,7 +44,8 @@ pub(super) fn record_file(peer: SocketAddr, method: &Method, status: StatusCode,
 /// Writes a line about what a client added to the lake.
 pub(super) fn record_contribution(peer: SocketAddr, client: &str, table: Table, added: &AddedContribution) {
     let AddedContribution { lake_version, is_new, .. } = added;
-    tracing::info!(target: TARGET, %peer, client, table = table.name(), lake_version, is_new, "a contribution is stored");
+    let table = table.name();
+    tracing::info!(target: TARGET, %peer, client, table, lake_version, is_new, "a contribution is stored");
 }
 
 fn is_file(path: &str) -> bool {

@@ -96,8 +96,8 @@ impl FigureSource {
         let found: Vec<SurfaceWithLevels> = self.query_rows(&sql).await?;
         anyhow::ensure!(
             !found.is_empty(),
-            "{} no levels; hint: levels need runs of Flat and Foam with the same pairs; `echolake figure steps {}` draws \
-             a response",
+            "{} no levels; hint: levels need runs of Flat and Foam with the same pairs; `echolake figure steps {}` \
+             draws a response",
             match surfaces {
                 [one] => format!("surface `{}` has", one.surface_id),
                 _ => "these surfaces have".to_owned(),

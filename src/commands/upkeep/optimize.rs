@@ -10,7 +10,10 @@ use echolake_lake::TARGET_BYTES;
 #[derive(Debug, Args)]
 pub(crate) struct OptimizeArgs {
     /// Size of the merged files in MB; files of half of it and more are left alone.
-    #[arg(long, value_name = "MB", default_value_t = TARGET_BYTES >> 20, value_parser = clap::value_parser!(u64).range(1..=1024))]
+    #[arg(
+        long, value_name = "MB", default_value_t = TARGET_BYTES >> 20,
+        value_parser = clap::value_parser!(u64).range(1..=1024)
+    )]
     pub target_mb: u64,
     /// Print what was done as JSON.
     #[arg(long)]

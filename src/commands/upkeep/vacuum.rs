@@ -12,7 +12,10 @@ use echolake_lake::KEEP_HOURS;
 pub(crate) struct VacuumArgs {
     /// Keep files that were removed from their table less than this many hours ago; must exceed the longest query. At
     /// most 168: table logs drop the time of removal after a week.
-    #[arg(long, value_name = "HOURS", default_value_t = KEEP_HOURS, value_parser = clap::value_parser!(u32).range(0..=KEEP_HOURS as i64))]
+    #[arg(
+        long, value_name = "HOURS", default_value_t = KEEP_HOURS,
+        value_parser = clap::value_parser!(u32).range(0..=KEEP_HOURS as i64)
+    )]
     pub keep_hours: u32,
     /// List what would be deleted, and delete nothing.
     #[arg(long)]

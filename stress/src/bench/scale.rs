@@ -49,8 +49,8 @@ pub(crate) async fn measure_scale(args: &ScaleBenchArgs, report: &mut BenchRepor
     ensure!(args.surfaces.is_sorted() && args.surfaces[0] > 2, "--surfaces: not ascending, or not more than 2");
     report.group("Cost against size");
     report.note(format!(
-        "Runs of {} pairs of the simulated rig, without sweeps. Files are not merged; `optimize` merges those of a copy. A \
-         cost that grows in proportion to the surfaces has power 1.",
+        "Runs of {} pairs of the simulated rig, without sweeps. Files are not merged; `optimize` merges those of a \
+         copy. A cost that grows in proportion to the surfaces has power 1.",
         args.pairs
     ));
     let runs = folder.path().join("runs");

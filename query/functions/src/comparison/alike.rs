@@ -71,9 +71,9 @@ static CORRELATION_P: FunctionDescription = FunctionDescription {
     family: FunctionFamily::Comparison,
     about: "Probability, two-sided, that chance alone makes a correlation of this size or greater: by Student's t, \
             exact for Pearson's coefficient of normally distributed values, the usual approximation for Spearman's. \
-            Null of fewer than three pairs of values. Of many correlations some are always small: the smallest of 90 is \
-            about 0.01 by chance. The 95 % interval of r is tanh(atanh(r) - 1.96 / sqrt(n - 3)) to tanh(atanh(r) + 1.96 \
-            / sqrt(n - 3)).",
+            Null of fewer than three pairs of values. Of many correlations some are always small: the smallest of 90 \
+            is about 0.01 by chance. The 95 % interval of r is tanh(atanh(r) - 1.96 / sqrt(n - 3)) to tanh(atanh(r) + \
+            1.96 / sqrt(n - 3)).",
     parameters: &[
         FunctionParameter { name: "r", kind: ArgumentKind::Number, about: "the coefficient, such as corr(x, y)" },
         FunctionParameter {
@@ -130,8 +130,8 @@ static RMS_DIFFERENCE: FunctionDescription = FunctionDescription {
         FunctionParameter { name: "y", kind: ArgumentKind::Samples, about: "the second list, as long as the first" },
     ],
     optional: 0,
-    example: "select surface, round(rms_difference(curve, [0, 0.5, 0.8]), 4) as apart from (values ('a', [0, 0.5, 0.9]), \
-              ('b', [0, 0.1, 0.2])) as curves(surface, curve) order by apart",
+    example: "select surface, round(rms_difference(curve, [0, 0.5, 0.8]), 4) as apart from (values ('a', [0, 0.5, \
+              0.9]), ('b', [0, 0.1, 0.2])) as curves(surface, curve) order by apart",
     answer: "\
 +---------+--------+
 | surface | apart  |

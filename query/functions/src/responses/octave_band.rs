@@ -44,18 +44,18 @@ pub(crate) struct BandFilters<'a> {
 static DESCRIPTION: FunctionDescription = FunctionDescription {
     name: "band_filter",
     family: FunctionFamily::Responses,
-    about: "Samples of a response in one octave or third of an octave, in its unit: Butterworth of 6 sections, class 1 of \
-            IEC 61260-1:2014, with its exact frequencies, at the lake's sampling rate. The filter has minimum phase, and \
-            its samples are advanced so that the arrival, 20 dB below the greatest sample, stays where it was within one \
-            sample.",
+    about: "Samples of a response in one octave or third of an octave, in its unit: Butterworth of 6 sections, class 1 \
+            of IEC 61260-1:2014, with its exact frequencies, at the lake's sampling rate. The filter has minimum \
+            phase, and its samples are advanced so that the arrival, 20 dB below the greatest sample, stays where it was \
+            within one sample.",
     parameters: &[
         FunctionParameter { name: "ir", kind: ArgumentKind::Samples, about: "the response" },
         MIDBAND,
         FRACTION,
     ],
     optional: 1,
-    example: "select round(arrival(list) * 96, 1) as before, round(arrival(band_filter(list, 4000)) * 96, 1) as after from \
-              (select array_concat(array_repeat(0, 100), [1], array_repeat(0, 100)) as list)",
+    example: "select round(arrival(list) * 96, 1) as before, round(arrival(band_filter(list, 4000)) * 96, 1) as after \
+              from (select array_concat(array_repeat(0, 100), [1], array_repeat(0, 100)) as list)",
     answer: "\
 +--------+-------+
 | before | after |

@@ -68,8 +68,8 @@ static RISE: FunctionDescription = FunctionDescription {
 static CENTRE: FunctionDescription = FunctionDescription {
     name: "nce_centre",
     family: FunctionFamily::Responses,
-    about: "Centre of gravity of the energy of a cumulative curve, in ms from its first sample, not from the arrival as \
-            Ts of room_parameters; null without energy. Columns centre_*_ms of table tnce hold it for each band.",
+    about: "Centre of gravity of the energy of a cumulative curve, in ms from its first sample, not from the arrival \
+            as Ts of room_parameters; null without energy. Columns centre_*_ms of table tnce hold it for each band.",
     parameters: CURVE,
     optional: 0,
     example: "select nce_centre([0.0, 1.0, 1.0, 1.0, 2.0]) * 96 as samples",

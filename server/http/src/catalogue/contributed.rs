@@ -138,7 +138,9 @@ pub(super) async fn run_annotations(
     tag = "catalogue",
     params(PairPath),
     responses((status = 200, description = "OK", body = Vec<PairPrediction>)),
-    extensions(("x-sql" = json!(["select * from predictions where surface_id = $1 and pair_id = $2 and project is not distinct from $project"])))
+    extensions(("x-sql" = json!([
+        "select * from predictions where surface_id = $1 and pair_id = $2 and project is not distinct from $project",
+    ])))
 )]
 pub(super) async fn pair_predictions(
     Extension(request): Extension<CatalogueRequest>,
@@ -178,7 +180,8 @@ pub(super) async fn pair_predictions(
     extensions(("x-sql" = json!([
         "select p.model, p.model_version, sqrt(avg(power(10 * log10(p.tnce_band_2500 / t.tnce_band_2500), 2))), ... \
          from predictions p join tnce t using (surface_id, pair_id) where p.surface_id = $1 and p.project is not \
-         distinct from $project and t.run_id = $newest and not is_rejected(t.run_id, t.pair_id) group by p.model, p.model_version"
+         distinct from $project and t.run_id = $newest and not is_rejected(t.run_id, t.pair_id) group by p.model, \
+         p.model_version"
     ])))
 )]
 pub(super) async fn surface_predictions(

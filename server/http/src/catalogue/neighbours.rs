@@ -47,7 +47,8 @@ const ALIKE: &str = "select surface_id, correlation, level_db from (select surfa
     pearson(reflected, cast($3 as float[])) as correlation, \
     10 * log10(list_energy(reflected) / list_energy(cast($3 as float[]))) as level_db \
     from (select surface_id, avg_list(reflected_ir) as reflected from nce where pair_id = $2 and surface_id <> $1 \
-    and not is_rejected(run_id, pair_id) group by surface_id)) where correlation is not null order by correlation desc, surface_id limit 10";
+    and not is_rejected(run_id, pair_id) group by surface_id)) where correlation is not null \
+    order by correlation desc, surface_id limit 10";
 
 /// The surfaces that are most like one: distances of the map.
 #[utoipa::path(

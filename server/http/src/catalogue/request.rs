@@ -150,7 +150,8 @@ impl CatalogueRequest {
                 let text = sql.to_owned();
                 let plan = async move {
                     let prepared = session.prepare(&text).await?;
-                    // A placeholder that stands for several columns has no type of its own: its values come as they are.
+                    // A placeholder that stands for several columns has no type of its own: its values come as they
+                    // are.
                     Ok(match prepared.parameter_types() {
                         Ok(types) => (Arc::new(prepared.optimize()?), types.into()),
                         Err(_) => (Arc::new(prepared), Arc::default()),

@@ -231,8 +231,8 @@ impl PredictedRows {
                 let value = values.value(i);
                 if !value.is_finite() || value < 0.0 {
                     return Err(RequestFault::bad_request(format!(
-                        "{}: `{name}` is {value}, expected a number that is not negative; hint: values are linear, as in \
-                         tnce, not dB",
+                        "{}: `{name}` is {value}, expected a number that is not negative; hint: values are linear, as \
+                         in tnce, not dB",
                         place()
                     )));
                 }

@@ -29,9 +29,9 @@ static DOCUMENT: LazyLock<String> = LazyLock::new(|| {
     info(
         title = "echolake",
         version = "1",
-        description = "The lake over HTTP. Everything but annotations and predictions is read-only. `x-sql` says which query over the lake's tables \
-                       answers an endpoint. Numbers that do not exist (energies over nothing, missing references) are \
-                       null, never NaN. Errors are application/problem+json.",
+        description = "The lake over HTTP. Everything but annotations and predictions is read-only. `x-sql` says which \
+                       query over the lake's tables answers an endpoint. Numbers that do not exist (energies over \
+                       nothing, missing references) are null, never NaN. Errors are application/problem+json.",
         license(name = "Apache-2.0 OR MIT", identifier = "Apache-2.0 OR MIT")
     ),
     servers((url = "/")),

@@ -38,8 +38,8 @@ impl Lake {
         Ok(())
     }
 
-    /// Gives up the rows of a table of users that are lost: those of files that cannot be read, or all of them if its log
-    /// is lost. What can be read stays.
+    /// Gives up the rows of a table of users that are lost: those of files that cannot be read, or all of them if its
+    /// log is lost. What can be read stays.
     ///
     /// # Errors
     /// What the store says.
