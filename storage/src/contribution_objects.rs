@@ -6,39 +6,24 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
 use std::sync::Arc;
 
-use arrow::array::{AsArray as _, StringArray};
+use arrow::array::{ArrayRef, AsArray as _, StringArray, new_null_array};
 use arrow::compute::concat_batches;
+use arrow::datatypes::FieldRef;
 use arrow::record_batch::RecordBatch;
 use bytes::Bytes;
-use chrono::{DateTime, Utc};
-use echolake_schema::annotations::{Annotation, AnnotationKind};
+use echolake_schema::annotations::Annotation;
 use echolake_schema::tables::Table;
 use echolake_schema::{ProjectName, RunId};
 use futures::{StreamExt as _, TryStreamExt as _};
 use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt as _};
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
-use serde::Deserialize;
 
 use crate::contributions::annotation_rows;
-use crate::{Error, Lake, LakeSnapshot, Result, add_missing_columns};
+use crate::{Error, Lake, LakeSnapshot, Result};
 
 /// Objects that are read concurrently.
 const CONCURRENT_READS: usize = 16;
-
-/// An annotation as an object has it.
-#[derive(Deserialize)]
-struct AnnotationLine {
-    annotation_id: String,
-    run_id: RunId,
-    pair_ids: Option<Vec<u32>>,
-    kind: AnnotationKind,
-    value: String,
-    comment: String,
-    author: String,
-    time: DateTime<Utc>,
-    lake_version: u64,
-}
 
 fn object_extension(table: Table) -> &'static str {
     if table == Table::Annotations { "ndjson" } else { "parquet" }
@@ -85,7 +70,7 @@ impl Lake {
         let objects: Vec<(Path, Bytes)> = read.buffered(CONCURRENT_READS).try_collect().await?;
         // A reader of some projects does not see who else has a surface of the same name.
         let whole = match self.is_restricted() && table == Table::Predictions {
-            true => &LakeSnapshot::take_from(self.delta_log()).await?,
+            true => &LakeSnapshot::take_from(self.delta_log(), &[]).await?,
             false => snapshot,
         };
         let mut batches = Vec::new();
@@ -139,19 +124,16 @@ impl Lake {
                 Some((_, projects)) if projects.len() == 1 => projects.first().copied().flatten().map(|p| p.as_str()),
                 _ => None,
             };
-            let added = [
-                ("run_id", surfaces.iter().map(run).map(Some).collect::<StringArray>()),
-                ("project", surfaces.iter().map(project).collect()),
-            ];
-            let mut columns: Vec<_> =
-                batch.schema().fields().iter().cloned().zip(batch.columns().iter().cloned()).collect();
-            for (name, values) in added {
-                let field = schema.field_with_name(name).map_err(|e| e.to_string())?.clone();
-                columns.push((Arc::new(field), Arc::new(values) as _));
-            }
-            let (fields, columns): (Vec<_>, Vec<_>) = columns.into_iter().unzip();
-            let whole = RecordBatch::try_new(Arc::new(arrow::datatypes::Schema::new(fields)), columns);
-            let whole = whole.and_then(|whole| add_missing_columns(&whole, &schema)).map_err(|e| e.to_string())?;
+            let column = |field: &FieldRef| -> ArrayRef {
+                match (field.name().as_str(), batch.column_by_name(field.name())) {
+                    ("run_id", _) => Arc::new(surfaces.iter().map(run).map(Some).collect::<StringArray>()),
+                    ("project", _) => Arc::new(surfaces.iter().map(project).collect::<StringArray>()),
+                    (_, Some(values)) => values.clone(),
+                    (_, None) => new_null_array(field.data_type(), batch.num_rows()),
+                }
+            };
+            let whole = RecordBatch::try_new(schema.clone(), schema.fields().iter().map(column).collect());
+            let whole = whole.map_err(|e| e.to_string())?;
             let is_own = |(run, projects): &(&RunId, BTreeSet<_>)| projects.len() == 1 && snapshot.run(run).is_some();
             let visible = surfaces.iter().map(|surface| Some(!self.is_restricted() || is_own(anchor(surface)?)));
             let visible = arrow::compute::filter_record_batch(&whole, &visible.collect());
@@ -162,21 +144,6 @@ impl Lake {
 }
 
 fn parse_annotations(bytes: &[u8]) -> std::result::Result<Vec<Annotation>, String> {
-    let lines = bytes.split(|byte| *byte == b'\n').filter(|line| !line.is_empty());
-    let parsed = lines.enumerate().map(|(i, line)| match serde_json::from_slice::<AnnotationLine>(line) {
-        Ok(line) => Ok(line),
-        Err(e) => Err(format!("line {}: {e}", i + 1)),
-    });
-    let annotation = |line: AnnotationLine| Annotation {
-        annotation_id: line.annotation_id,
-        run_id: line.run_id,
-        pair_ids: line.pair_ids,
-        kind: line.kind,
-        value: line.value,
-        comment: line.comment,
-        author: line.author,
-        time: line.time,
-        lake_version: Some(line.lake_version),
-    };
-    parsed.map(|line| line.map(annotation)).collect()
+    let lines = bytes.split(|byte| *byte == b'\n').filter(|line| !line.is_empty()).enumerate();
+    lines.map(|(i, line)| serde_json::from_slice(line).map_err(|e| format!("line {}: {e}", i + 1))).collect()
 }

@@ -11,16 +11,18 @@ use std::ops::Range;
 use std::sync::Arc;
 
 use arrow::array::{
-    Array as _, AsArray as _, Int32Builder, ListBuilder, StringArray, TimestampMicrosecondArray, UInt32Array,
+    Array as _, ArrayRef, AsArray as _, Int32Builder, Int64Array, ListArray, ListBuilder, StringArray,
+    TimestampMicrosecondArray, UInt32Array,
 };
-use arrow::compute::{SortColumn, lexsort_to_indices, take_record_batch};
-use arrow::datatypes::{DataType, Field, Int32Type, Int64Type, TimestampMicrosecondType};
+use arrow::compute::{SortColumn, lexsort_to_indices, partition, take_record_batch};
+use arrow::datatypes::{DataType, Field, Int32Type};
 use arrow::record_batch::RecordBatch;
 use chrono::DateTime;
 use echolake_schema::annotations::{Annotation, AnnotationKind};
 use echolake_schema::tables::{LIST_CHILD, Table};
 use echolake_schema::{RunId, SurfaceId};
 use futures::TryStreamExt as _;
+use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
 
 use crate::contribution_objects::last_object;
@@ -63,18 +65,19 @@ impl ShownVersions {
 }
 
 /// A file of rows that a user adds, of runs of one project.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ContributedFile {
     /// Its parts, in the order of its rows.
     pub parts: Vec<ContributedPart>,
     /// Delta's statistics, JSON.
     pub stats: String,
-    /// Its Parquet.
+    /// Its Parquet, which is sent apart.
+    #[serde(skip)]
     pub bytes: bytes::Bytes,
 }
 
 /// The rows of one run in a file that a user adds.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ContributedPart {
     /// The run's surface.
     pub surface: SurfaceId,
@@ -93,41 +96,34 @@ impl ContributedFile {
     pub fn encode_rows(lake: &Lake, table: Table, rows: &RecordBatch) -> Result<Vec<Self>> {
         let schema = table.schema(lake.rig());
         let failed = |reason: String| Error::Encode { table: table.name(), reason };
-        let column = |name: &str| {
-            let values = rows.column_by_name(name).cloned();
-            values.ok_or_else(|| failed(format!("column `{name}` is missing")))
-        };
+        if *rows.schema_ref() != schema {
+            return Err(failed("its columns are not the table's".to_owned()));
+        }
         let numbers = UInt32Array::from_iter_values(0..rows.num_rows() as u32);
-        let keys = ["project", "surface_id", "run_id"].map(column).into_iter().chain([Ok(Arc::new(numbers) as _)]);
-        let keys: Vec<_> =
-            keys.map(|values| Ok(SortColumn { values: values?, options: None })).collect::<Result<_>>()?;
-        let order = lexsort_to_indices(&keys, None).map_err(|e| failed(e.to_string()))?;
-        let rows = take_record_batch(rows, &order).map_err(|e| failed(e.to_string()))?;
-        let text = |name: &str, row: usize| {
-            let values = rows.column_by_name(name).and_then(|values| values.as_string_opt::<i32>());
-            values.filter(|values| values.is_valid(row)).map(|values| values.value(row).to_owned())
+        let keys = ["project", "surface_id", "run_id"].map(|name| rows[name].clone()).into_iter();
+        let keys = keys.chain([Arc::new(numbers) as ArrayRef]).map(|values| SortColumn { values, options: None });
+        let order = lexsort_to_indices(&keys.collect::<Vec<_>>(), None);
+        let sorted = order.and_then(|order| take_record_batch(rows, &order));
+        let rows = sorted.map_err(|e| failed(e.to_string()))?;
+        let equal_ranges = |columns: &[ArrayRef]| match partition(columns) {
+            Ok(partitions) => Ok(partitions.ranges()),
+            Err(e) => Err(failed(e.to_string())),
         };
         let mut files = Vec::new();
-        let mut first = 0;
-        while first < rows.num_rows() {
-            let project = text("project", first);
-            let end = (first..rows.num_rows()).find(|row| text("project", *row) != project).unwrap_or(rows.num_rows());
-            let mut parts: Vec<ContributedPart> = Vec::new();
-            for row in first..end {
-                let id = |name| text(name, row).ok_or_else(|| failed(format!("column `{name}` has a null")));
-                let [surface, run] = [id("surface_id")?, id("run_id")?];
-                match parts.last_mut().filter(|part| (part.surface.as_str(), part.run.as_str()) == (&surface, &run)) {
-                    Some(part) => part.rows += 1,
-                    None => parts.push(ContributedPart {
-                        surface: surface.parse().map_err(|e| failed(format!("{e}")))?,
-                        run: run.parse().map_err(|e| failed(format!("{e}")))?,
-                        rows: 1,
-                    }),
-                }
+        for range in equal_ranges(&[rows["project"].clone()])? {
+            let rows = rows.slice(range.start, range.len());
+            let [surfaces, runs] = [&rows["surface_id"], &rows["run_id"]];
+            let mut parts = Vec::new();
+            for range in equal_ranges(&[surfaces.clone(), runs.clone()])? {
+                let [surface, run] = [surfaces, runs].map(|ids| ids.as_string::<i32>().value(range.start));
+                parts.push(ContributedPart {
+                    surface: surface.parse().map_err(|e| failed(format!("{e}")))?,
+                    run: run.parse().map_err(|e| failed(format!("{e}")))?,
+                    rows: range.len() as u64,
+                });
             }
-            let EncodedFile { bytes, stats, .. } = encode_batches(table, &schema, &[rows.slice(first, end - first)])?;
+            let EncodedFile { bytes, stats, .. } = encode_batches(table, &schema, &[rows])?;
             files.push(Self { parts, stats, bytes });
-            first = end;
         }
         Ok(files)
     }
@@ -153,7 +149,7 @@ impl Lake {
         self.commit_log().ensure_table(table).await?;
         self.copy_objects(table).await?;
         let newest = self.commit_log().newest_version(table).await?.unwrap_or(0);
-        let snapshot = self.snapshot().await?;
+        let snapshot = self.snapshot_of(&[table]).await?;
         snapshot.check_table(table)?;
         if snapshot.shown_versions().of_table(table).table < newest {
             self.commit_log().show_version(table, newest).await?;
@@ -207,7 +203,7 @@ impl Lake {
             if last <= view.copied {
                 return Ok(());
             }
-            let snapshot = self.snapshot().await?;
+            let snapshot = self.snapshot_of(&[]).await?;
             let rows = self.read_objects(table, view.copied..last, &snapshot).await?;
             let files = rows.map(|rows| ContributedFile::encode_rows(self, table, &rows)).transpose()?;
             let staged = self.stage_contribution(table, files.unwrap_or_default()).await?;
@@ -350,18 +346,12 @@ pub fn annotation_rows(lake: &Lake, snapshot: &LakeSnapshot, annotations: &[Anno
 
 // The annotations of rows of table `annotations`.
 fn decode_annotations(rows: &RecordBatch) -> std::result::Result<Vec<Annotation>, String> {
-    let column = |name: &str| rows.column_by_name(name).ok_or_else(|| format!("column `{name}` is missing"));
-    let text = |name: &str| {
-        let values = column(name)?.as_string_opt::<i32>();
-        values.ok_or_else(|| format!("column `{name}` is no text"))
-    };
-    let typed = |name: &str| format!("column `{name}` has another type than the table's");
+    let text = |name| typed_column::<StringArray>(rows, name);
     let [runs, kinds, values, comments, authors, ids] =
         [text("run_id")?, text("kind")?, text("value")?, text("comment")?, text("author")?, text("annotation_id")?];
-    let pairs = column("pair_ids")?.as_list_opt::<i32>().ok_or_else(|| typed("pair_ids"))?;
-    let times =
-        column("annotated")?.as_primitive_opt::<TimestampMicrosecondType>().ok_or_else(|| typed("annotated"))?;
-    let versions = column("lake_version")?.as_primitive_opt::<Int64Type>().ok_or_else(|| typed("lake_version"))?;
+    let pairs = typed_column::<ListArray>(rows, "pair_ids")?;
+    let times = typed_column::<TimestampMicrosecondArray>(rows, "annotated")?;
+    let versions = typed_column::<Int64Array>(rows, "lake_version")?;
     let one = |row: usize| {
         let pair_ids = pairs.is_valid(row).then(|| {
             let list = pairs.value(row);
@@ -382,6 +372,11 @@ fn decode_annotations(rows: &RecordBatch) -> std::result::Result<Vec<Annotation>
         })
     };
     (0..rows.num_rows()).map(one).collect()
+}
+
+fn typed_column<'a, A: 'static>(rows: &'a RecordBatch, name: &str) -> std::result::Result<&'a A, String> {
+    let column = rows.column_by_name(name).ok_or_else(|| format!("column `{name}` is missing"))?;
+    column.as_any().downcast_ref().ok_or_else(|| format!("column `{name}` has another type than the table's"))
 }
 
 #[cfg(test)]

@@ -15,6 +15,7 @@ use arrow_schema::{Schema, SchemaRef};
 pub use column::{COMMENT, LIST_CHILD, UNIT};
 pub use contributions::predicted_columns;
 pub use rows::BandStatistics;
+use serde::{Deserialize, Serialize};
 
 use self::column::Column;
 use crate::Rig;
@@ -30,7 +31,8 @@ use crate::Rig;
 /// assert_eq!(schema.field_with_name("direct_mm").map(|field| field.metadata()[UNIT].as_str()).ok(), Some("mm"));
 /// assert_eq!(Table::by_name("tnce_d4"), Some(Table::TnceD4));
 /// ```
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Table {
     /// One row per run, with its record of the surface.
     Surfaces,

@@ -176,6 +176,27 @@ async fn rows_of_one_project_are_not_seen_by_another() {
     }
 }
 
+/// E11: a number that the table does not have is not written, whoever names it, and readers see what they saw.
+#[tokio::test]
+async fn a_version_that_the_table_does_not_have_is_not_written() {
+    let store = Arc::new(InMemory::new());
+    let lake = open(&store).await;
+    lake.ensure_tables().await.expect("made");
+    add_run(&lake, "flat", "r1", None).await;
+    annotate(&lake, &[verdict("r1", "own", "rejected")]).await;
+    let snapshot = lake.snapshot().await.expect("a view");
+    let rows = annotation_rows(&lake, &snapshot, &[verdict("r1", "other", "accepted")]).expect("rows");
+    let files = ContributedFile::encode_rows(&lake, Table::Annotations, &rows).expect("files");
+    for seen in [0, 2, 1 << 62, (1 << 63) - 1, 1 << 63, u64::MAX] {
+        let added = lake.add_contribution(Table::Annotations, seen, files.clone()).await.expect("looked at");
+        assert_eq!(added, None, "{seen}");
+    }
+    let reader = open(&store).await;
+    let found = reader.read_annotations(&reader.snapshot().await.expect("a view")).await.expect("read");
+    assert_eq!(found, [verdict("r1", "own", "rejected")]);
+    assert_eq!(reader.commit_log().newest_version(Table::Annotations).await.expect("a log"), Some(1));
+}
+
 /// E5: an emptied file, of which a store gives no byte, is a fault of its table, not of the store.
 #[tokio::test]
 async fn an_emptied_file_of_annotations_is_a_fault_of_their_table() {

@@ -145,7 +145,16 @@ impl Lake {
     /// # Errors
     /// [`Error::Log`] if the log of `runs` is damaged, [`Error::NoLake`] if the lake is gone.
     pub async fn snapshot(&self) -> Result<LakeSnapshot> {
-        let mut snapshot = LakeSnapshot::take_from(self.commit_log()).await?.with_restriction(self.is_restricted());
+        self.snapshot_of(&Table::ALL).await
+    }
+
+    /// The same of `runs` and these tables alone: of the others it has neither files nor faults.
+    ///
+    /// # Errors
+    /// As [`Lake::snapshot`].
+    pub async fn snapshot_of(&self, tables: &[Table]) -> Result<LakeSnapshot> {
+        let snapshot = LakeSnapshot::take_from(self.commit_log(), tables).await?;
+        let mut snapshot = snapshot.with_restriction(self.is_restricted());
         if snapshot.log_version(Table::Runs).is_none() {
             self.check_readable().await?;
             if has_run_files(self.store().as_ref()).await? {

@@ -71,8 +71,8 @@ const TAKE_TRIES: usize = 10;
 /// A table's view, or the fault of its log.
 pub(crate) type ReadView = std::result::Result<Option<TableView>, TableFault>;
 
-async fn views_of_others(log: &dyn CommitLog) -> Result<Vec<(Table, ReadView)>> {
-    let others = Table::ALL.into_iter().filter(|table| *table != Table::Runs);
+async fn views_of_others(log: &dyn CommitLog, tables: &[Table]) -> Result<Vec<(Table, ReadView)>> {
+    let others = tables.iter().copied().filter(|table| *table != Table::Runs);
     let read = others.map(|table| async move {
         match log.view_table(table).await {
             Err(Error::Log { source, .. }) => Ok((table, Err(TableFault::unreadable(table, source.to_string())))),
@@ -95,27 +95,27 @@ pub(crate) async fn shown_view(log: &dyn CommitLog, table: Table, view: ReadView
 }
 
 impl LakeSnapshot {
-    /// Takes a view. The other tables are read after the version of `runs` was there, so that they hold whatever it
-    /// names: all at once if it is still the version of the last look.
+    /// Takes a view of `runs` and these tables. They are read after the version of `runs` was there, so that they hold
+    /// whatever it names: all at once if it is still the version of the last look.
     ///
     /// If `runs` has a newer version than a view that lacks rows, ingest has replaced them meanwhile: the view is taken
     /// again.
-    pub(crate) async fn take_from(log: &dyn CommitLog) -> Result<Self> {
+    pub(crate) async fn take_from(log: &dyn CommitLog, tables: &[Table]) -> Result<Self> {
         for _ in 0..TAKE_TRIES {
-            let snapshot = Self::take_once(log).await?;
+            let snapshot = Self::take_once(log, tables).await?;
             if snapshot.faults.is_empty() || log.newest_version(Table::Runs).await? == snapshot.log_version(Table::Runs)
             {
                 return Ok(snapshot);
             }
         }
-        Self::take_once(log).await
+        Self::take_once(log, tables).await
     }
 
-    async fn take_once(log: &dyn CommitLog) -> Result<Self> {
+    async fn take_once(log: &dyn CommitLog, tables: &[Table]) -> Result<Self> {
         let known = log.known_version(Table::Runs).await;
-        let (pointers, mut views) = try_join(log.view_table(Table::Runs), views_of_others(log)).await?;
+        let (pointers, mut views) = try_join(log.view_table(Table::Runs), views_of_others(log, tables)).await?;
         if known.is_none() || pointers.as_ref().map(|view| view.version) != known {
-            views = views_of_others(log).await?;
+            views = views_of_others(log, tables).await?;
         }
         let mut snapshot = Self::from_pointers(pointers.as_ref().map_or(&[], |view| view.files.as_slice()));
         let is_rebuilding = pointers.as_ref().is_some_and(|view| view.is_rebuilding);

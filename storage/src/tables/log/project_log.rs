@@ -100,7 +100,7 @@ impl CommitLog for ProjectLog {
 
     // The versions that added what is seen now. A commit may change files of several projects.
     async fn list_changes(&self, table: Table) -> Result<Vec<TableChange>> {
-        let snapshot = LakeSnapshot::take_from(self).await?;
+        let snapshot = LakeSnapshot::take_from(self, &Table::ALL).await?;
         let mut added = BTreeMap::<u64, (u64, u64)>::new();
         for file in snapshot.files(table) {
             let (files, rows) = added.entry(file.log_version).or_default();
