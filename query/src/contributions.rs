@@ -3,22 +3,19 @@
 //! table's.
 
 use std::collections::{HashMap, HashSet};
-use std::hash::{Hash, Hasher};
 use std::sync::Arc;
 
-use arrow::array::{AsArray as _, BooleanArray};
+use arrow::array::{ArrayRef, AsArray as _, BooleanArray};
 use arrow::compute::cast;
 use arrow::datatypes::{DataType, Int32Type, SchemaRef};
+use arrow::record_batch::RecordBatch;
 use async_trait::async_trait;
 use datafusion::catalog::Session;
-use datafusion::datasource::{MemTable, TableProvider, TableType, ViewTable, provider_as_source};
+use datafusion::datasource::{MemTable, TableProvider, ViewTable, provider_as_source};
 use datafusion::error::{DataFusionError, Result};
-use datafusion::logical_expr::{
-    ColumnarValue, Expr, LogicalPlanBuilder, ScalarFunctionArgs, ScalarUDF, ScalarUDFImpl, Signature, TypeSignature,
-    Volatility, lit, not,
-};
-use datafusion::physical_plan::ExecutionPlan;
-use datafusion::physical_plan::empty::EmptyExec;
+use datafusion::functions::utils::make_scalar_function;
+use datafusion::logical_expr::expr_fn::SimpleScalarUDF;
+use datafusion::logical_expr::{LogicalPlanBuilder, ScalarUDF, Signature, TypeSignature, Volatility, lit, not};
 use datafusion::prelude::col;
 use echolake_lake::{DataFile, Error as LakeError, Lake, LakeSnapshot};
 use echolake_schema::RunId;
@@ -26,6 +23,9 @@ use echolake_schema::annotations::{Annotation, RejectedMeasurements};
 use echolake_schema::tables::Table;
 use object_store::path::Path;
 use tokio::sync::Mutex;
+
+use crate::error::repeat_table_fault;
+use crate::system::{SystemRows, SystemTable};
 
 /// The function that tells whether a measurement is rejected.
 const IS_REJECTED: &str = "is_rejected";
@@ -48,8 +48,11 @@ impl AnnotationCache {
     /// # Errors
     /// What the store says.
     pub async fn find_verdicts(&self, lake: &Lake, snapshot: &LakeSnapshot) -> Result<KnownVerdicts, LakeError> {
-        match self.find_rejected(lake, snapshot).await {
-            Ok(rejected) => Ok(KnownVerdicts { rejected: Arc::new(rejected), fault: None }),
+        match self.read_files(lake, snapshot, |_| true).await {
+            Ok(files) => {
+                let rejected = RejectedMeasurements::from_annotations(sorted_annotations(&files));
+                Ok(KnownVerdicts { rejected: Arc::new(rejected), fault: None })
+            }
             Err(fault) if fault.is_table_fault() => {
                 Ok(KnownVerdicts { rejected: Arc::default(), fault: Some(Arc::new(fault)) })
             }
@@ -69,17 +72,11 @@ impl AnnotationCache {
     ) -> Result<Vec<Annotation>, LakeError> {
         let files = self.read_files(lake, snapshot, |file| file.shown_runs().iter().any(|run| runs.contains(run)));
         let files = files.await?;
-        let pending = lake.pending_annotations(snapshot).await?;
-        let all = versioned_annotations(&files).chain(&pending);
-        Ok(all.filter(|annotation| runs.contains(&annotation.run_id)).cloned().collect())
+        let wanted = sorted_annotations(&files).filter(|annotation| runs.contains(&annotation.run_id));
+        Ok(wanted.cloned().collect())
     }
 
-    async fn find_rejected(&self, lake: &Lake, snapshot: &LakeSnapshot) -> Result<RejectedMeasurements, LakeError> {
-        let files = self.read_files(lake, snapshot, |_| true).await?;
-        let pending = lake.pending_annotations(snapshot).await?;
-        Ok(RejectedMeasurements::from_annotations(versioned_annotations(&files).chain(&pending)))
-    }
-
+    // Those of the lake's earlier form that are no file yet come last.
     async fn read_files(
         &self,
         lake: &Lake,
@@ -97,7 +94,9 @@ impl AnnotationCache {
             };
             read.insert(key, annotations);
         }
-        let files = read.values().cloned().collect();
+        let pending = lake.pending_annotations(snapshot).await?.into_iter();
+        let pending = Arc::new(pending.map(|annotation| (u64::MAX, annotation)).collect());
+        let files = read.values().cloned().chain([pending]).collect();
         // Snapshots of the past are read beside the present one.
         if known.len() > 2 * snapshot.files(Table::Annotations).len() + UNUSED_FILES {
             known.clear();
@@ -108,7 +107,7 @@ impl AnnotationCache {
 }
 
 // The annotations of files in the order in which they were added.
-fn versioned_annotations(files: &[VersionedAnnotations]) -> impl Iterator<Item = &Annotation> {
+fn sorted_annotations(files: &[VersionedAnnotations]) -> impl Iterator<Item = &Annotation> {
     let mut all: Vec<_> = files.iter().flat_map(|annotations| annotations.iter()).collect();
     all.sort_by_key(|(version, _)| *version);
     all.into_iter().map(|(_, annotation)| annotation)
@@ -129,55 +128,51 @@ impl KnownVerdicts {
     }
 
     fn check_fault(&self) -> Result<()> {
-        let Some(fault) = &self.fault else { return Ok(()) };
-        let fault = match fault.as_ref() {
-            LakeError::Incomplete { table, found } => LakeError::Incomplete { table, found: found.clone() },
-            LakeError::Log { table, action, source } => {
-                LakeError::Log { table, action, source: source.to_string().into() }
-            }
-            LakeError::DataFile { file, source } => {
-                LakeError::DataFile { file: file.clone(), source: source.to_string().into() }
-            }
-            other => LakeError::Incomplete { table: Table::Annotations.name(), found: other.to_string() },
-        };
-        Err(DataFusionError::External(fault.into()))
+        match self.fault.as_deref().and_then(repeat_table_fault) {
+            Some(fault) => Err(DataFusionError::External(fault.into())),
+            None => Ok(()),
+        }
     }
 
-    /// Returns the function that tells whether a measurement is rejected.
+    /// Returns the function that tells whether a measurement is rejected. That of another snapshot is another one.
     pub fn rejection_function(&self) -> ScalarUDF {
         let pair_types = [DataType::Int32, DataType::Int64];
         let exact = pair_types.map(|pair| TypeSignature::Exact(vec![DataType::Utf8, pair]));
         let signature = Signature::one_of(exact.to_vec(), Volatility::Immutable);
-        ScalarUDF::from(IsRejected { verdicts: self.clone(), signature })
+        let verdicts = self.clone();
+        let judge = make_scalar_function(move |columns| verdicts.judge_measurements(columns), Vec::new());
+        let function = SimpleScalarUDF::new_with_signature(IS_REJECTED, signature, DataType::Boolean, Arc::new(judge));
+        ScalarUDF::from(function)
+    }
+
+    // Runs and pairs.
+    fn judge_measurements(&self, columns: &[ArrayRef]) -> Result<ArrayRef> {
+        self.check_fault()?;
+        let pairs = cast(&columns[1], &DataType::Int32)?;
+        let is_rejected = |(run, pair): (Option<&str>, Option<i32>)| {
+            Some(self.rejected.is_rejected(run?, u32::try_from(pair?).ok()?))
+        };
+        let rows = columns[0].as_string::<i32>().iter().zip(pairs.as_primitive::<Int32Type>()).map(is_rejected);
+        Ok(Arc::new(rows.collect::<BooleanArray>()))
     }
 }
 
 /// A table whose rows cannot be given, because it is not known which of them are rejected.
 #[derive(Debug)]
-struct RefusedTable {
+struct RefusedRows {
     schema: SchemaRef,
     verdicts: KnownVerdicts,
 }
 
 #[async_trait]
-impl TableProvider for RefusedTable {
+impl SystemRows for RefusedRows {
     fn schema(&self) -> SchemaRef {
         self.schema.clone()
     }
 
-    fn table_type(&self) -> TableType {
-        TableType::Base
-    }
-
-    async fn scan(
-        &self,
-        _: &dyn Session,
-        _: Option<&Vec<usize>>,
-        _: &[Expr],
-        _: Option<usize>,
-    ) -> Result<Arc<dyn ExecutionPlan>> {
+    async fn read_rows(&self, _: &dyn Session) -> Result<RecordBatch> {
         self.verdicts.check_fault()?;
-        Ok(Arc::new(EmptyExec::new(self.schema.clone())))
+        Ok(RecordBatch::new_empty(self.schema.clone()))
     }
 }
 
@@ -216,7 +211,8 @@ pub(crate) fn without_rejected(
         Table::Measurements | Table::Nce | Table::Tnce | Table::TnceD4 | Table::Runs | Table::SurfaceStats
             if verdicts.is_faulty() =>
         {
-            return Ok(Arc::new(RefusedTable { schema: provider.schema(), verdicts: verdicts.clone() }));
+            let refused = RefusedRows { schema: provider.schema(), verdicts: verdicts.clone() };
+            return Ok(Arc::new(SystemTable(Box::new(refused))));
         }
         Table::Measurements | Table::Nce | Table::Tnce | Table::TnceD4 => {
             not(verdicts.rejection_function().call(vec![col("run_id"), col("pair_id")]))
@@ -227,62 +223,6 @@ pub(crate) fn without_rejected(
         }
         _ => return Ok(provider),
     };
-    filter_table(table.name(), provider, |plan| plan.filter(keep))
-}
-
-fn filter_table(
-    name: &str,
-    provider: Arc<dyn TableProvider>,
-    filter: impl FnOnce(LogicalPlanBuilder) -> Result<LogicalPlanBuilder>,
-) -> Result<Arc<dyn TableProvider>> {
-    let plan = filter(LogicalPlanBuilder::scan(name, provider_as_source(provider), None)?)?.build()?;
+    let plan = LogicalPlanBuilder::scan(table.name(), provider_as_source(provider), None)?.filter(keep)?.build()?;
     Ok(Arc::new(ViewTable::new(plan, None)))
-}
-
-/// `is_rejected(run_id, pair_id)`.
-#[derive(Debug)]
-struct IsRejected {
-    verdicts: KnownVerdicts,
-    signature: Signature,
-}
-
-// The same name with other verdicts belongs to another snapshot.
-impl PartialEq for IsRejected {
-    fn eq(&self, other: &Self) -> bool {
-        Arc::ptr_eq(&self.verdicts.rejected, &other.verdicts.rejected)
-    }
-}
-
-impl Eq for IsRejected {}
-
-impl Hash for IsRejected {
-    fn hash<H: Hasher>(&self, state: &mut H) {
-        IS_REJECTED.hash(state);
-    }
-}
-
-impl ScalarUDFImpl for IsRejected {
-    fn name(&self) -> &str {
-        IS_REJECTED
-    }
-
-    fn signature(&self) -> &Signature {
-        &self.signature
-    }
-
-    fn return_type(&self, _arguments: &[DataType]) -> Result<DataType> {
-        Ok(DataType::Boolean)
-    }
-
-    fn invoke_with_args(&self, args: ScalarFunctionArgs) -> Result<ColumnarValue> {
-        self.verdicts.check_fault()?;
-        let columns = args.args.iter().map(|a| a.to_array(args.number_rows)).collect::<Result<Vec<_>>>()?;
-        let pairs = cast(&columns[1], &DataType::Int32)?;
-        let pairs = pairs.as_primitive::<Int32Type>();
-        let is_rejected = |(run, pair): (Option<&str>, Option<i32>)| {
-            Some(self.verdicts.rejected.is_rejected(run?, u32::try_from(pair?).ok()?))
-        };
-        let rows: BooleanArray = columns[0].as_string::<i32>().iter().zip(pairs).map(is_rejected).collect();
-        Ok(ColumnarValue::Array(Arc::new(rows)))
-    }
 }

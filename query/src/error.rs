@@ -223,18 +223,9 @@ impl Error {
     fn from_root_cause(error: &DataFusionError) -> Option<Self> {
         match error.find_root() {
             DataFusionError::ResourcesExhausted(text) => Some(Self::MemoryLimit { message: text.clone() }),
-            DataFusionError::External(cause) => match cause.downcast_ref::<LakeError>() {
-                Some(LakeError::Incomplete { table, found }) => {
-                    Some(LakeError::Incomplete { table, found: found.clone() }.into())
-                }
-                Some(LakeError::Log { table, action, source }) => {
-                    Some(LakeError::Log { table, action, source: source.to_string().into() }.into())
-                }
-                Some(LakeError::DataFile { file, source }) => {
-                    Some(LakeError::DataFile { file: file.clone(), source: source.to_string().into() }.into())
-                }
-                _ => None,
-            },
+            DataFusionError::External(cause) => {
+                cause.downcast_ref::<LakeError>().and_then(repeat_table_fault).map(Self::from)
+            }
             _ => None,
         }
     }
@@ -246,6 +237,18 @@ impl Error {
             StopReason::Time(limit) => Self::TimeLimit { limit: *limit },
         }
     }
+}
+
+/// Repeats a table's fault; None if the error is another one.
+pub(crate) fn repeat_table_fault(error: &LakeError) -> Option<LakeError> {
+    Some(match error {
+        LakeError::Incomplete { table, found } => LakeError::Incomplete { table, found: found.clone() },
+        LakeError::Log { table, action, source } => LakeError::Log { table, action, source: source.to_string().into() },
+        LakeError::DataFile { file, source } => {
+            LakeError::DataFile { file: file.clone(), source: source.to_string().into() }
+        }
+        _ => return None,
+    })
 }
 
 // Without a place the error is one line.

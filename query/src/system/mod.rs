@@ -36,7 +36,7 @@ pub const SYSTEM_SCHEMA: &str = "system";
 
 /// Computes the rows of a table when it is scanned.
 #[async_trait]
-trait SystemRows: std::fmt::Debug + Send + Sync {
+pub(crate) trait SystemRows: std::fmt::Debug + Send + Sync {
     /// Returns its columns.
     fn schema(&self) -> SchemaRef;
 
@@ -46,7 +46,7 @@ trait SystemRows: std::fmt::Debug + Send + Sync {
 
 /// A table whose rows are computed when it is scanned.
 #[derive(Debug)]
-struct SystemTable(Box<dyn SystemRows>);
+pub(crate) struct SystemTable(pub Box<dyn SystemRows>);
 
 #[async_trait]
 impl TableProvider for SystemTable {
