@@ -264,6 +264,28 @@ async fn the_past_is_seen_until_it_is_vacuumed() {
     refused(&format!("tnce version as of {number}"), "1 of its 1 files then are deleted").await;
 }
 
+/// E22: tables that are made again count their versions from 0 again, and a session that has read one of before reads
+/// the present one.
+#[tokio::test]
+async fn a_past_version_is_that_of_the_tables_that_are_there() {
+    let (folder, lake) = lake().await;
+    let session = Session::new(&lake).expect("a session");
+    put(&lake, "0001_0", "r1").await;
+    let version = lake.list_versions().await.expect("versions").pop().expect("a version").version;
+    let past = format!("select run_id from runs version as of {version}");
+    let run = async || rows(&session, &past).await.column(0).as_string::<i32>().value(0).to_owned();
+    put(&lake, "0002_0", "r2").await;
+    assert_eq!(number(&session, "select count(*) from runs").await, 2);
+    assert_eq!(run().await, "r1");
+    let url = folder.path().join("lake");
+    std::fs::remove_dir_all(url.join("tables")).expect("removed");
+    let again = Lake::open(&url.display().to_string()).await.expect("opened");
+    again.ensure_tables().await.expect("made again");
+    put(&again, "0003_0", "r3").await;
+    assert_eq!(again.list_versions().await.expect("versions").pop().expect("a version").version, version);
+    assert_eq!(run().await, "r3");
+}
+
 #[tokio::test]
 async fn pairs_are_looked_up_where_a_measurement_names_them() {
     let (_folder, lake) = lake().await;
