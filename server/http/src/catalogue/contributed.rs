@@ -55,7 +55,7 @@ struct TotalCount {
 }
 
 /// Predictions of models for a pair.
-#[derive(Serialize, ToSchema)]
+#[derive(Deserialize, Serialize, ToSchema)]
 struct PairPrediction {
     model: String,
     model_version: String,
@@ -66,16 +66,6 @@ struct PairPrediction {
     tnce_db: Vec<Option<f64>>,
     /// dB re Flat, same band.
     tnce_band_db: Vec<Option<f64>>,
-}
-
-#[derive(Deserialize)]
-struct PredictedPair {
-    model: String,
-    model_version: String,
-    author: String,
-    predicted: String,
-    total: Vec<Option<f64>>,
-    band: Vec<Option<f64>>,
 }
 
 /// The error of a model's predictions over the pairs of a surface, against its newest run.
@@ -152,22 +142,19 @@ pub(super) async fn pair_predictions(
     let pair = number_value(request.parse_pair(&path.pair_id)?);
     let rig = request.catalogue.lake().rig();
     let sql = format!(
-        "select model, model_version, author, predicted, {} as total, {} as band from predictions \
+        "select model, model_version, author, predicted, {} as tnce_db, {} as tnce_band_db from predictions \
          where surface_id = $1 and pair_id = $2 and project is not distinct from $3 \
          order by model, predicted",
         band_list(rig, over_total),
         band_list(rig, over_band)
     );
-    let rows: Vec<PredictedPair> = request.read_rows(&sql, vec![surface, pair, project]).await?;
-    let predictions = rows.into_iter().map(|row| PairPrediction {
-        tnce_db: levels_db(&row.total),
-        tnce_band_db: levels_db(&row.band),
-        model: row.model,
-        model_version: row.model_version,
-        author: row.author,
-        predicted: row.predicted,
-    });
-    Ok(AnswerContent::encode_json(&predictions.collect::<Vec<_>>())?)
+    let mut predictions: Vec<PairPrediction> = request.read_rows(&sql, vec![surface, pair, project]).await?;
+    for prediction in &mut predictions {
+        // They are stored as ratios.
+        prediction.tnce_db = levels_db(&prediction.tnce_db);
+        prediction.tnce_band_db = levels_db(&prediction.tnce_band_db);
+    }
+    Ok(AnswerContent::encode_json(&predictions)?)
 }
 
 /// Models that predict a surface, with their errors.

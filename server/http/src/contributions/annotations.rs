@@ -19,7 +19,7 @@ use uuid::Uuid;
 
 use super::super::catalogue::LakeCatalogue;
 use super::super::problem::ProblemResponse;
-use super::{choose_author, encode_draft, newest_view, refuse_encoding, with_request_ticket};
+use super::{ContributionBody, answer_draft, choose_author, newest_view, refuse_encoding};
 
 /// Most pairs of all annotations of a request, of which a region may have all of the grid's.
 const MOST_PAIRS: usize = 500_000;
@@ -77,7 +77,7 @@ pub(super) async fn draft_annotations(
     body: Result<Bytes, BytesRejection>,
 ) -> Result<Response, ProblemResponse> {
     let of = catalogue.clone();
-    let drafted = with_request_ticket(&catalogue, "(annotations that are sent)", body, move |body| async move {
+    let draft = move |body: ContributionBody| async move {
         let request: AnnotationsRequest = serde_json::from_slice(&body.bytes).map_err(|e| {
             RequestFault::bad_request(format!(
                 "the body is not as expected: {e}; hint: {{\"annotations\": [{{\"run_id\": \"...\", \"pair_ids\": [7], \
@@ -88,8 +88,8 @@ pub(super) async fn draft_annotations(
             return Err(RequestFault::TooMuch { what: "annotations", limit: body.most_rows });
         }
         draft_request(&of, request, &body.memory).await
-    });
-    Ok(encode_draft(&drafted.await?))
+    };
+    answer_draft(&catalogue, "(annotations that are sent)", body, draft).await
 }
 
 async fn draft_request(

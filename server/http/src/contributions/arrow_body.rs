@@ -3,6 +3,7 @@
 //! its table can store. The library's own reader panics, or allocates what a stream claims.
 
 use std::sync::Arc;
+use std::vec;
 
 use arrow::array::{Array as _, ArrayData, ArrayRef, AsArray as _, make_array};
 use arrow::buffer::Buffer;
@@ -195,16 +196,15 @@ impl StreamSchema {
             return Err(RequestFault::bad_request(message));
         }
         let mut parts = BatchParts {
-            messages,
             data,
-            nodes: batch.nodes().into_iter().flatten(),
-            buffers: batch.buffers().into_iter().flatten(),
-            counts: batch.variadicBufferCounts().into_iter().flatten(),
+            nodes: batch.nodes().into_iter().flatten().copied().collect::<Vec<_>>().into_iter(),
+            buffers: batch.buffers().into_iter().flatten().copied().collect::<Vec<_>>().into_iter(),
+            counts: batch.variadicBufferCounts().into_iter().flatten().collect::<Vec<_>>().into_iter(),
         };
         let mut columns = Vec::with_capacity(self.sent.len());
         for (column, kind) in &self.sent {
-            let failed = |defect: String| messages.broken(format!("column `{}`: {defect}", column.name));
-            let array = parts.next_array(kind, rows, &failed)?;
+            let array = parts.next_array(kind, rows);
+            let array = array.map_err(|defect| messages.broken(format!("column `{}`: {defect}", column.name)))?;
             columns.push(column.read_array(&array)?);
         }
         if parts.nodes.next().is_some() || parts.buffers.next().is_some() || parts.counts.next().is_some() {
@@ -217,41 +217,25 @@ impl StreamSchema {
 }
 
 /// The parts of a batch that are not read yet.
-struct BatchParts<'a, N, B, C> {
-    messages: &'a MessageReader,
+struct BatchParts<'a> {
     data: &'a Buffer,
-    nodes: N,
-    buffers: B,
-    counts: C,
+    nodes: vec::IntoIter<ipc::FieldNode>,
+    buffers: vec::IntoIter<ipc::Buffer>,
+    counts: vec::IntoIter<i64>,
 }
 
-impl<'a, N, B, C> BatchParts<'_, N, B, C>
-where
-    N: Iterator<Item = &'a ipc::FieldNode>,
-    B: Iterator<Item = &'a ipc::Buffer>,
-    C: Iterator<Item = i64>,
-{
-    fn next_array(
-        &mut self,
-        kind: &DataType,
-        rows: usize,
-        failed: &impl Fn(String) -> RequestFault,
-    ) -> Result<ArrayRef, RequestFault> {
-        let node = self.nodes.next().ok_or_else(|| failed("it is missing".to_owned()))?;
-        let nulls = self.messages.checked_length(node.null_count(), "nulls")?;
-        if usize::try_from(node.length()) != Ok(rows) || nulls > rows {
-            let found = node.length();
-            return Err(failed(format!("it has {found} rows, {nulls} of them null, expected {rows} rows")));
+impl BatchParts<'_> {
+    fn next_array(&mut self, kind: &DataType, rows: usize) -> Result<ArrayRef, String> {
+        let node = self.nodes.next().ok_or("it is missing")?;
+        let [length, nulls] = [node.length(), node.null_count()];
+        if usize::try_from(length) != Ok(rows) || !(0..=length).contains(&nulls) {
+            return Err(format!("it has {length} rows, {nulls} of them null, expected {rows} rows"));
         }
-        let has_nulls = nulls > 0;
-        let bitmap = self.next_buffer(if has_nulls { rows.div_ceil(8) } else { 0 }, failed)?;
+        let bitmap = self.next_buffer(if nulls > 0 { rows.div_ceil(8) } else { 0 })?;
         let (width, more_buffers) = match kind {
             DataType::Utf8 => (size_of::<i32>(), 1),
             DataType::LargeUtf8 => (size_of::<i64>(), 1),
-            DataType::Utf8View => {
-                let count = self.messages.checked_length(self.counts.next().unwrap_or(-1), "buffers")?;
-                (size_of::<u128>(), count)
-            }
+            DataType::Utf8View => (size_of::<u128>(), self.counts.next().ok_or("it names no buffers")?),
             numbers => (numbers.primitive_width().unwrap_or_default(), 0),
         };
         let numbers = match kind {
@@ -261,37 +245,34 @@ where
         };
         // The library takes whole numbers only: what is behind them is cut off.
         let bytes = numbers.saturating_mul(width);
-        let first = self.next_buffer(bytes, failed)?.slice_with_length(0, bytes);
-        let mut buffers = vec![first];
+        let mut buffers = vec![self.next_buffer(bytes)?.slice_with_length(0, bytes)];
         for _ in 0..more_buffers {
-            buffers.push(self.next_buffer(0, failed)?);
+            buffers.push(self.next_buffer(0)?);
         }
         // Validated by the library: lengths, offsets, texts and the number of nulls.
         let array = ArrayData::builder(kind.clone())
             .len(rows)
-            .null_count(nulls)
-            .null_bit_buffer(has_nulls.then_some(bitmap))
+            .null_count(nulls as usize)
+            .null_bit_buffer((nulls > 0).then_some(bitmap))
             .buffers(buffers)
             .align_buffers(true)
             .build();
-        Ok(make_array(array.map_err(|e| failed(e.to_string()))?))
+        array.map(make_array).map_err(|e| e.to_string())
     }
 
     // The next buffer, which has so many bytes at least.
-    fn next_buffer(&mut self, bytes: usize, failed: &impl Fn(String) -> RequestFault) -> Result<Buffer, RequestFault> {
-        let place = self.buffers.next().ok_or_else(|| failed("a buffer is missing".to_owned()))?;
+    fn next_buffer(&mut self, bytes: usize) -> Result<Buffer, String> {
+        let place = self.buffers.next().ok_or("a buffer is missing")?;
         let (offset, length) = (place.offset(), place.length());
-        let within = || {
-            let (offset, length) = (usize::try_from(offset).ok()?, usize::try_from(length).ok()?);
-            let is_within = length >= bytes && offset.checked_add(length)? <= self.data.len();
-            is_within.then(|| self.data.slice_with_length(offset, length))
-        };
-        within().ok_or_else(|| {
-            let end = self.data.len();
-            failed(format!(
+        let end = self.data.len();
+        match (usize::try_from(offset), usize::try_from(length)) {
+            (Ok(from), Ok(size)) if size >= bytes && from.checked_add(size).is_some_and(|to| to <= end) => {
+                Ok(self.data.slice_with_length(from, size))
+            }
+            _ => Err(format!(
                 "a buffer has {length} bytes from byte {offset} on, expected {bytes} at least, within {end}"
-            ))
-        })
+            )),
+        }
     }
 }
 
@@ -310,7 +291,7 @@ impl ExpectedColumn {
         }
         let options = CastOptions { safe: false, ..CastOptions::default() };
         cast_with_options(array, &self.content.read_type(), &options).map_err(|e: ArrowError| {
-            let expected = self.content.expected_types();
+            let (expected, _) = self.content.expected_types();
             RequestFault::bad_request(format!(
                 "column `{name}` has a value that does not fit, expected {expected}: {e}"
             ))
@@ -327,73 +308,42 @@ impl ColumnContent {
         }
     }
 
-    fn expected_types(self) -> &'static str {
+    // The types that fit, and the one of them to which pyarrow casts.
+    fn expected_types(self) -> (&'static str, &'static str) {
         match self {
-            Self::Name { .. } => "string",
-            Self::Integers => "an integer type of 32 bits",
-            Self::Numbers => "double, or another type of numbers",
-        }
-    }
-
-    fn cast_name(self) -> &'static str {
-        match self {
-            Self::Name { .. } => "string",
-            Self::Integers => "int32",
-            Self::Numbers => "float64",
+            Self::Name { .. } => ("string", "string"),
+            Self::Integers => ("an integer type of 32 bits", "int32"),
+            Self::Numbers => ("double, or another type of numbers", "float64"),
         }
     }
 
     // The type of a field of the stream, if this content may come in it.
     fn sent_type(self, field: ipc::Field<'_>, quoted: &str) -> Result<DataType, RequestFault> {
-        let sent = match field.dictionary() {
-            Some(_) => None,
-            None => plain_type(field),
+        let is_fit = |kind: &DataType| match self {
+            Self::Name { .. } => !kind.is_numeric(),
+            Self::Integers => kind.is_integer(),
+            Self::Numbers => kind.is_numeric(),
         };
-        let is_fit = match (self, &sent) {
-            (Self::Name { .. }, Some(DataType::Utf8 | DataType::LargeUtf8 | DataType::Utf8View)) => true,
-            (Self::Integers, Some(kind)) => kind.is_integer(),
-            (Self::Numbers, Some(kind)) => kind.is_integer() || kind.is_floating(),
-            _ => false,
-        };
-        match sent.filter(|_| is_fit) {
-            Some(kind) => Ok(kind),
-            None => Err(RequestFault::bad_request(format!(
-                "column {quoted} is {}, expected {}; hint: pyarrow's `column.cast(\"{}\")`",
-                type_name(field),
-                self.expected_types(),
-                self.cast_name()
-            ))),
-        }
+        plain_type(field).filter(is_fit).ok_or_else(|| {
+            let (expected, cast) = self.expected_types();
+            RequestFault::bad_request(format!(
+                "column {quoted} is {}, expected {expected}; hint: pyarrow's `column.cast(\"{cast}\")`",
+                type_name(field)
+            ))
+        })
     }
 }
 
+// A text or a number: the only types that any column may have. The library panics at those that it does not know.
 fn plain_type(field: ipc::Field<'_>) -> Option<DataType> {
-    Some(match field.type_type() {
-        ipc::Type::Utf8 => DataType::Utf8,
-        ipc::Type::LargeUtf8 => DataType::LargeUtf8,
-        ipc::Type::Utf8View => DataType::Utf8View,
-        ipc::Type::Int => {
-            let kind = field.type_as_int()?;
-            match (kind.bitWidth(), kind.is_signed()) {
-                (8, true) => DataType::Int8,
-                (16, true) => DataType::Int16,
-                (32, true) => DataType::Int32,
-                (64, true) => DataType::Int64,
-                (8, false) => DataType::UInt8,
-                (16, false) => DataType::UInt16,
-                (32, false) => DataType::UInt32,
-                (64, false) => DataType::UInt64,
-                _ => return None,
-            }
-        }
-        ipc::Type::FloatingPoint => match field.type_as_floating_point()?.precision() {
-            ipc::Precision::HALF => DataType::Float16,
-            ipc::Precision::SINGLE => DataType::Float32,
-            ipc::Precision::DOUBLE => DataType::Float64,
-            _ => return None,
-        },
-        _ => return None,
-    })
+    let is_plain = match field.type_type() {
+        _ if field.dictionary().is_some() => false,
+        ipc::Type::Utf8 | ipc::Type::LargeUtf8 | ipc::Type::Utf8View => true,
+        ipc::Type::Int => [8, 16, 32, 64].contains(&field.type_as_int()?.bitWidth()),
+        ipc::Type::FloatingPoint => field.type_as_floating_point()?.precision().variant_name().is_some(),
+        _ => false,
+    };
+    is_plain.then(|| Field::from(field).data_type().clone())
 }
 
 fn type_name(field: ipc::Field<'_>) -> String {

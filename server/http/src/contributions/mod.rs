@@ -16,11 +16,12 @@ use axum::routing::post;
 use bytes::Bytes;
 use echolake_query::RequestMemory;
 use echolake_schema::tables::Table;
-use echolake_service::{ContributionDraft, RequestFault, TokenScope, contribution_path};
+use echolake_service::{ContributionDraft, RequestFault, TokenScope};
 use serde::Serialize;
 use utoipa::ToSchema;
 
 use super::catalogue::{LakeCatalogue, SnapshotView};
+use super::problem::ProblemResponse;
 use super::request_protocol::request_protocol;
 use super::sql::whole_body;
 pub use annotations::AnnotationsRequest;
@@ -47,8 +48,8 @@ pub struct AddedContribution {
 /// Routes of an engine. They change nothing, so the contract has the door's.
 pub(super) fn draft_routes(catalogue: &LakeCatalogue) -> Router {
     Router::new()
-        .route(contribution_path(Table::Annotations), post(annotations::draft_annotations))
-        .route(contribution_path(Table::Predictions), post(predictions::draft_predictions))
+        .route("/api/v1/annotations", post(annotations::draft_annotations))
+        .route("/api/v1/predictions", post(predictions::draft_predictions))
         .with_state(catalogue.clone())
 }
 
@@ -62,14 +63,14 @@ struct ContributionBody {
 }
 
 // Checks what a client sends under the limits of its queries: its permits, time, memory and rows. Leaving ends it.
-async fn with_request_ticket<T: Send + 'static, F>(
+async fn answer_draft<F>(
     catalogue: &LakeCatalogue,
     listed_as: &'static str,
     body: Result<Bytes, BytesRejection>,
-    work: impl FnOnce(ContributionBody) -> F + Send + 'static,
-) -> Result<T, RequestFault>
+    draft: impl FnOnce(ContributionBody) -> F + Send + 'static,
+) -> Result<Response, ProblemResponse>
 where
-    F: Future<Output = Result<T, RequestFault>> + Send + 'static,
+    F: Future<Output = Result<ContributionDraft, RequestFault>> + Send + 'static,
 {
     let service = catalogue.service();
     let client = service.authorised_client(TokenScope::Annotate)?;
@@ -77,9 +78,10 @@ where
     let most_rows = client.quota().rows.map_or(usize::MAX, |rows| usize::try_from(rows).unwrap_or(usize::MAX));
     let run = move |memory: RequestMemory| async move {
         memory.reserve(bytes.len().saturating_mul(MEMORY_PER_BYTE))?;
-        work(ContributionBody { bytes, most_rows, memory }).await
+        draft(ContributionBody { bytes, most_rows, memory }).await
     };
-    service.run_request(request_protocol(), &client, listed_as, run).await
+    let drafted = service.run_request(request_protocol(), &client, listed_as, run).await?;
+    Ok(([(header::CONTENT_TYPE, ContributionDraft::MEDIA_TYPE)], drafted.encode()).into_response())
 }
 
 // The lake as it is at this moment, and the version of a table of users in it: rows are added to no other.
@@ -92,10 +94,6 @@ async fn newest_view(catalogue: &LakeCatalogue, table: Table) -> Result<(Arc<Sna
     view.snapshot.check_table(table).map_err(fault)?;
     let version = view.snapshot.log_version(table).unwrap_or(0);
     Ok((view, version))
-}
-
-fn encode_draft(draft: &ContributionDraft) -> Response {
-    ([(header::CONTENT_TYPE, ContributionDraft::MEDIA_TYPE)], draft.encode()).into_response()
 }
 
 fn refuse_encoding(error: echolake_lake::Error) -> RequestFault {

@@ -2,9 +2,9 @@
 
 use std::collections::HashMap;
 
-use arrow::array::{Array as _, AsArray as _, BooleanArray, Float64Array, Int32Array, StringArray};
+use arrow::array::{Array as _, AsArray as _, BooleanArray};
 use arrow::compute::filter_record_batch;
-use arrow::datatypes::{DataType, Int32Type};
+use arrow::datatypes::{DataType, Float64Type, Int32Type};
 use arrow::record_batch::RecordBatch;
 use echolake_service::RequestFault;
 
@@ -18,84 +18,55 @@ type PredictionKey<'a> = (&'a str, &'a str, &'a str, i32);
 /// # Errors
 /// [`RequestFault::Taken`] if a row is known with other values.
 pub(super) fn select_new_rows(known: &[RecordBatch], rows: &RecordBatch) -> Result<RecordBatch, RequestFault> {
-    let mut places = HashMap::new();
-    let known = known.iter().map(KeyedRows::from_batch).collect::<Result<Vec<_>, _>>()?;
-    for batch in &known {
-        places.extend((0..batch.len()).map(|row| (batch.key(row), (batch, row))));
+    let numbers = rows.schema_ref().fields().iter().filter(|field| *field.data_type() == DataType::Float64);
+    let names: Vec<&str> = numbers.map(|field| field.name().as_str()).collect();
+    let mut stored = HashMap::new();
+    for batch in known {
+        stored.extend(read_keyed_values(batch, &names)?);
     }
-    let sent = KeyedRows::from_batch(rows)?;
-    let mut is_new = Vec::with_capacity(sent.len());
-    for row in 0..sent.len() {
-        let key = sent.key(row);
-        let stored = places.get(&key);
-        if let Some((batch, place)) = stored
-            && !sent.has_same_values(row, batch, *place)
-        {
+    let mut is_new = Vec::with_capacity(rows.num_rows());
+    for (key, values) in read_keyed_values(rows, &names)? {
+        let known = stored.get(&key);
+        if known.is_some_and(|known| *known != values) {
             let (model, version, surface, pair) = key;
             return Err(RequestFault::Taken {
                 what: format!("a prediction of `{model}`, version `{version}`, for surface `{surface}`, pair {pair}"),
                 hint: "stored predictions never change; send them with another version",
             });
         }
-        is_new.push(stored.is_none());
+        is_new.push(known.is_none());
     }
     filter_record_batch(rows, &BooleanArray::from(is_new)).map_err(RequestFault::defect("rows are not filtered"))
 }
 
-/// Rows by their keys.
-struct KeyedRows<'a> {
-    models: &'a StringArray,
-    versions: &'a StringArray,
-    surfaces: &'a StringArray,
-    pairs: &'a Int32Array,
-    values: HashMap<&'a str, &'a Float64Array>,
-}
-
-impl<'a> KeyedRows<'a> {
-    fn from_batch(rows: &'a RecordBatch) -> Result<Self, RequestFault> {
-        let text = |name: &str| rows.column_by_name(name)?.as_string_opt::<i32>();
-        let schema = rows.schema_ref().fields().iter().zip(rows.columns());
-        let numbers = schema.filter(|(field, _)| *field.data_type() == DataType::Float64);
-        let read = || {
-            Some(Self {
-                models: text("model")?,
-                versions: text("model_version")?,
-                surfaces: text("surface_id")?,
-                pairs: rows.column_by_name("pair_id")?.as_primitive_opt::<Int32Type>()?,
-                values: numbers.map(|(field, column)| (field.name().as_str(), column.as_primitive())).collect(),
-            })
-        };
-        read().ok_or_else(|| {
-            tracing::error!("predictions have no keys of the expected types");
-            RequestFault::Internal
-        })
-    }
-
-    fn len(&self) -> usize {
-        self.pairs.len()
-    }
-
-    fn key(&self, row: usize) -> PredictionKey<'a> {
-        (self.models.value(row), self.versions.value(row), self.surfaces.value(row), self.pairs.value(row))
-    }
-
-    fn value(&self, name: &str, row: usize) -> Option<f64> {
-        let column = self.values.get(name).filter(|column| column.is_valid(row))?;
-        Some(column.value(row))
-    }
-
-    // A column that is missing is one of nulls.
-    fn has_same_values(&self, row: usize, other: &Self, place: usize) -> bool {
-        let mut names = self.values.keys().chain(other.values.keys());
-        names.all(|name| self.value(name, row) == other.value(name, place))
-    }
+// The key of each row, and its values in the columns of these names.
+fn read_keyed_values<'a>(
+    rows: &'a RecordBatch,
+    names: &[&str],
+) -> Result<Vec<(PredictionKey<'a>, Vec<Option<f64>>)>, RequestFault> {
+    let text = |name: &str| rows.column_by_name(name)?.as_string_opt::<i32>();
+    let read = || {
+        let [models, versions, surfaces] = [text("model")?, text("model_version")?, text("surface_id")?];
+        let pairs = rows.column_by_name("pair_id")?.as_primitive_opt::<Int32Type>()?;
+        let numbers = names.iter().map(|name| rows.column_by_name(name)?.as_primitive_opt::<Float64Type>());
+        let numbers: Vec<_> = numbers.collect::<Option<_>>()?;
+        let keyed = (0..rows.num_rows()).map(|row| {
+            let values = numbers.iter().map(|column| column.is_valid(row).then(|| column.value(row)));
+            ((models.value(row), versions.value(row), surfaces.value(row), pairs.value(row)), values.collect())
+        });
+        Some(keyed.collect())
+    };
+    read().ok_or_else(|| {
+        tracing::error!("predictions have not the columns of their table");
+        RequestFault::Internal
+    })
 }
 
 #[cfg(test)]
 mod tests {
     use std::sync::Arc;
 
-    use arrow::array::ArrayRef;
+    use arrow::array::{ArrayRef, Float64Array, Int32Array, StringArray};
 
     use super::*;
 

@@ -3,10 +3,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-use arrow::array::{
-    Array as _, ArrayRef, AsArray as _, Float64Array, Int32Array, StringArray, TimestampMicrosecondArray, UInt32Array,
-};
-use arrow::compute::{SortColumn, lexsort_to_indices, take};
+use arrow::array::{Array as _, AsArray as _, Float64Array, Int32Array, StringArray, TimestampMicrosecondArray};
+use arrow::compute::{SortColumn, lexsort_to_indices, take_record_batch};
 use arrow::datatypes::{Float64Type, Int32Type};
 use arrow::record_batch::RecordBatch;
 use axum::extract::State;
@@ -27,7 +25,7 @@ use super::super::extract::QueryParams;
 use super::super::problem::ProblemResponse;
 use super::arrow_body::{ColumnContent, ExpectedColumn, decode_arrow_body};
 use super::new_rows::select_new_rows;
-use super::{ContributionBody, choose_author, encode_draft, newest_view, refuse_encoding, with_request_ticket};
+use super::{ContributionBody, answer_draft, choose_author, newest_view, refuse_encoding};
 
 /// Longest name of a model or a version, in characters.
 const LONGEST: usize = 64;
@@ -65,13 +63,13 @@ pub(super) async fn draft_predictions(
     body: Result<Bytes, BytesRejection>,
 ) -> Result<Response, ProblemResponse> {
     let of = catalogue.clone();
-    let drafted = with_request_ticket(&catalogue, "(predictions that are sent)", body, move |body| async move {
+    let draft = move |body: ContributionBody| async move {
         let author = choose_author(&of, params.author.as_deref())?;
         check_model(&params)?;
         let rows = PredictedRows::from_stream(&of, &body)?;
         draft_rows(&of, &params, author, rows).await
-    });
-    Ok(encode_draft(&drafted.await?))
+    };
+    answer_draft(&catalogue, "(predictions that are sent)", body, draft).await
 }
 
 fn check_model(params: &PredictionParams) -> Result<(), RequestFault> {
@@ -185,23 +183,17 @@ impl PredictedRows {
         let keys = keys.map(|(name, content)| ExpectedColumn { name: name.to_owned(), content });
         let expected: Vec<_> = keys.into_iter().chain(values).collect();
         let rows = decode_arrow_body(&body.bytes, &expected, body.most_rows.min(MOST_ROWS))?;
-        let column = |name: &str| rows.column_by_name(name).cloned();
-        let (Some(surfaces), Some(pairs)) = (column("surface_id"), column("pair_id")) else {
+        let (Some(surfaces), Some(pairs)) = (rows.column_by_name("surface_id"), rows.column_by_name("pair_id")) else {
             return Err(RequestFault::bad_request("the rows need the columns `surface_id` and `pair_id`"));
         };
-        let keys = [&surfaces, &pairs].map(|values| SortColumn { values: values.clone(), options: None });
-        let order = lexsort_to_indices(&keys, None).map_err(RequestFault::defect("rows are not sorted"))?;
-        let surfaces = sort_column(&surfaces, &order)?;
-        let pairs = sort_column(&pairs, &order)?;
-        let mut values = Vec::with_capacity(names.len());
-        for name in &names {
-            let column = column(name).map(|column| sort_column(&column, &order)).transpose()?;
-            values.push(column.map(|column| column.as_primitive::<Float64Type>().clone()));
-        }
+        let keys = [surfaces, pairs].map(|values| SortColumn { values: values.clone(), options: None });
+        let sorted = lexsort_to_indices(&keys, None).and_then(|order| take_record_batch(&rows, &order));
+        let rows = sorted.map_err(RequestFault::defect("rows are not sorted"))?;
+        let values = |name: &String| Some(rows.column_by_name(name)?.as_primitive::<Float64Type>().clone());
         let sorted = Self {
-            surface_ids: surfaces.as_string().clone(),
-            pair_ids: pairs.as_primitive::<Int32Type>().clone(),
-            values,
+            surface_ids: rows["surface_id"].as_string().clone(),
+            pair_ids: rows["pair_id"].as_primitive::<Int32Type>().clone(),
+            values: names.iter().map(values).collect(),
         };
         sorted.check_rows(catalogue, &names)?;
         Ok(sorted)
@@ -276,8 +268,4 @@ impl PredictedRows {
         }
         batch.finish().map_err(refuse_encoding)
     }
-}
-
-fn sort_column(column: &ArrayRef, order: &UInt32Array) -> Result<ArrayRef, RequestFault> {
-    take(column, order, None).map_err(RequestFault::defect("rows are not sorted"))
 }
