@@ -25,7 +25,7 @@ pub use activity::{
     ActivityRows, ActivityTable, FolderFigures, LakeFigures, LoggedQuery, OpenConnection, QueryEnd, QueryStart,
 };
 pub use client_identity::{ClientIdentity, counted_bytes};
-pub use contribution_draft::{ContributionDraft, contribution_path};
+pub use contribution_draft::ContributionDraft;
 pub use door_message::DoorMessage;
 pub use engine_report::EngineReport;
 pub use engine_socket::EngineSocket;

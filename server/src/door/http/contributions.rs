@@ -7,7 +7,7 @@ use axum::extract::{Request, State};
 use axum::http::{Method, StatusCode, header};
 use axum::response::{IntoResponse as _, Response};
 use echolake_http::{AddedContribution, AnnotationsRequest, BinaryContent, PredictionParams, ProblemResponse};
-use echolake_lake::ContributedPart;
+use echolake_lake::{ContributedPart, LakeSnapshot};
 use echolake_schema::tables::Table;
 use echolake_service::{ClientIdentity, ContributionDraft, RequestFault, TokenScope};
 
@@ -101,17 +101,9 @@ async fn store_draft(
     table: Table,
     draft: ContributionDraft,
 ) -> Result<Option<AddedContribution>, RequestFault> {
-    let ContributionDraft { table: drafted, seen, files, annotation_ids } = draft;
-    let seen_lake = match &client.projects {
-        Some(projects) => door.lake().restricted_to(projects.clone()),
-        None => door.lake().clone(),
-    };
-    let snapshot = seen_lake.snapshot().await.map_err(refuse_write)?;
-    let parts = files.iter().flat_map(|file| &file.parts);
-    let is_visible = |part: &ContributedPart| snapshot.run(&part.run).is_some_and(|run| run.surface == part.surface);
-    if drafted != table || !parts.into_iter().all(is_visible) {
-        return Err(refuse_draft("it is of another table or of runs that the client does not see".to_owned()));
-    }
+    let snapshot = client.visible_lake(door.lake()).snapshot_of(&[]).await.map_err(refuse_write)?;
+    check_draft(&draft, table, &snapshot)?;
+    let ContributionDraft { seen, files, annotation_ids, .. } = draft;
     let is_new = !files.is_empty();
     let lake_version = match is_new {
         true => door.lake().add_contribution(table, seen, files).await.map_err(refuse_write)?,
@@ -121,6 +113,15 @@ async fn store_draft(
     // How many versions others add is none of the business of a token of some projects.
     let lake_version = client.projects.is_none().then_some(lake_version);
     Ok(Some(AddedContribution { lake_version, is_new, annotation_ids }))
+}
+
+// A draft is of the table of the request, and of runs that the client sees.
+fn check_draft(draft: &ContributionDraft, table: Table, seen: &LakeSnapshot) -> Result<(), RequestFault> {
+    let is_visible = |part: &ContributedPart| seen.run(&part.run).is_some_and(|run| run.surface == part.surface);
+    match draft.table == table && draft.files.iter().flat_map(|file| &file.parts).all(is_visible) {
+        true => Ok(()),
+        false => Err(refuse_draft("it is of another table or of runs that the client does not see".to_owned())),
+    }
 }
 
 fn refuse_draft(reason: String) -> RequestFault {
@@ -134,4 +135,29 @@ fn refuse_write(error: echolake_lake::Error) -> RequestFault {
     }
     tracing::warn!(error = &error as &dyn std::error::Error, "a contribution cannot be written");
     RequestFault::Unwritable
+}
+
+#[cfg(test)]
+mod tests {
+    use echolake_lake::{ContributedFile, Lake, ReferenceSurfaces};
+    use echolake_schema::Rig;
+
+    use super::*;
+
+    /// E11: an engine names a table and runs, and the door stores what the request and its client may.
+    #[tokio::test]
+    async fn a_draft_of_another_table_or_of_other_runs_is_refused() {
+        let lake = Lake::open_or_create("memory://", &Rig::paper(), &ReferenceSurfaces::default()).await;
+        let snapshot = lake.expect("a lake").snapshot_of(&[]).await.expect("a view");
+        let part = ContributedPart {
+            surface: "flat".parse().expect("an id"),
+            run: "20260105T080000Z-flat-7c1e".parse().expect("an id"),
+            rows: 1,
+        };
+        let file = ContributedFile { parts: vec![part], stats: String::new(), bytes: "x".into() };
+        let draft = |files| ContributionDraft { table: Table::Annotations, seen: 1, files, annotation_ids: Vec::new() };
+        assert!(check_draft(&draft(Vec::new()), Table::Annotations, &snapshot).is_ok());
+        assert!(check_draft(&draft(Vec::new()), Table::Predictions, &snapshot).is_err(), "another table");
+        assert!(check_draft(&draft(vec![file]), Table::Annotations, &snapshot).is_err(), "a run that nobody sees");
+    }
 }
