@@ -275,7 +275,7 @@ fn a_verdict_on_a_reference_needs_its_right_and_a_confirmation() {
     let runs = place.sql("select run_id from runs where surface_id = 'flat'");
     let flat = runs[0]["run_id"].as_str().expect("a name").to_owned();
     let (author, author_lines) = new_token(&place, &["bob", "--scopes", "sql,annotate"]);
-    let (judge, judge_lines) = new_token(&place, &["eve", "--scopes", "sql,annotate,annotate-references"]);
+    let (judge, judge_lines) = new_token(&place, &["eve", "--scopes", "sql,metrics,annotate,annotate-references"]);
     std::fs::write(place.path("tokens.toml"), author_lines + &judge_lines).expect("written");
     let server = served(&place, &["--tokens", "tokens.toml"]);
     let send = |server: &ServedLake, token: Option<&str>, annotation: &serde_json::Value, is_confirmed: bool| {
@@ -290,6 +290,16 @@ fn a_verdict_on_a_reference_needs_its_right_and_a_confirmation() {
     for is_confirmed in [false, true] {
         refused(&send(&server, Some(&author), &bad, is_confirmed), 403, "forbidden");
     }
+    let failures = |code: &str| {
+        let metrics = HttpRequest::get("/metrics").with("authorization", &format!("Bearer {judge}")).send(&server);
+        let start = format!("echolake_failures_total{{code=\"{code}\"}} ");
+        metrics.text().lines().find_map(|line| line.strip_prefix(start.as_str()).map(str::to_owned))
+    };
+    // Counted after them.
+    let of_none = json!({ "run_id": "none", "kind": "note", "comment": "seen" });
+    refused(&send(&server, Some(&author), &of_none, false), 400, "request_invalid");
+    wait_until("failures are counted", || failures("request_invalid").is_some());
+    assert_eq!(failures("forbidden").as_deref(), Some("2"), "each once");
     assert_eq!([&label, &of_brick].map(|other| send(&server, Some(&author), other, false).status), [200, 200]);
     let told = |answer: &HttpResponse| {
         refused(answer, 409, "unconfirmed");
