@@ -9,7 +9,9 @@
 //! use echolake_dsp::temperature::ReferenceAir;
 //! use echolake_schema::{Rig, SpectralDivision};
 //!
-//! let sweep = SineSweep { shape: SweepShape::Linear, rate_hz: 96e3, duration_secs: 0.03, low_hz: 2e3, high_hz: 40e3, fade_secs: 0.001 };
+//! let shape = SweepShape::Linear;
+//! let sweep =
+//!     SineSweep { shape, rate_hz: 96e3, duration_secs: 0.03, low_hz: 2e3, high_hz: 40e3, fade_secs: 0.001 };
 //! let loopback = sweep.samples();
 //! let recording: Vec<f64> = (0..loopback.len()).map(|n| if n < 10 { 0.0 } else { 0.5 * loopback[n - 10] }).collect();
 //! let reference = ReferenceAir::from_response(&Rig::paper().impulse_response);

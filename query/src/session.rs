@@ -442,7 +442,9 @@ impl Session {
             _engine: self.engine.clone(),
         };
         tokio::select! {
-            begun = self.engine.threads().begin_work(query) => answer.query = Some(begun.ok_or_else(engine::ended_error)?),
+            begun = self.engine.threads().begin_work(query) => {
+                answer.query = Some(begun.ok_or_else(engine::ended_error)?);
+            }
             why = answer.ticket.wait_for_stop() => return Err(Error::from_stop(&why)),
         }
         Ok(answer)

@@ -49,7 +49,8 @@ impl Lake {
     /// use echolake_lake::{Lake, ReferenceSurfaces};
     ///
     /// let folder = place.path().join("lake");
-    /// let lake = Lake::open_or_create(&folder.to_string_lossy(), &Default::default(), &ReferenceSurfaces::default()).await?;
+    /// let url = folder.to_string_lossy();
+    /// let lake = Lake::open_or_create(&url, &Default::default(), &ReferenceSurfaces::default()).await?;
     /// std::fs::create_dir(folder.join("inbox"))?;
     /// std::fs::write(folder.join("inbox/a.mcap"), "a run")?;
     /// std::os::unix::fs::symlink("..", folder.join("inbox/up"))?;

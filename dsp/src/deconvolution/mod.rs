@@ -69,7 +69,9 @@ const PIECE: usize = 64;
 /// use echolake_dsp::sweep::{SineSweep, SweepShape};
 /// use echolake_schema::SpectralDivision;
 ///
-/// let sweep = SineSweep { shape: SweepShape::Linear, rate_hz: 8e3, duration_secs: 0.064, low_hz: 100.0, high_hz: 3_900.0, fade_secs: 0.001 };
+/// let shape = SweepShape::Linear;
+/// let sweep =
+///     SineSweep { shape, rate_hz: 8e3, duration_secs: 0.064, low_hz: 100.0, high_hz: 3_900.0, fade_secs: 0.001 };
 /// let loopback = sweep.samples();
 /// let recording: Vec<f64> = (0..512).map(|n| if n < 3 { 0.0 } else { 0.5 * loopback[n - 3] }).collect();
 /// let plan = DeconvolutionPlan::new(DeconvolutionParams {

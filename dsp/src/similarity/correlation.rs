@@ -114,7 +114,8 @@ fn value_ranks<T: RealSample>(values: &[T]) -> Vec<f64> {
 ///
 /// ```
 /// let plan = echolake_dsp::correlation::CorrelationPlan::new(4)?;
-/// let later_and_louder = plan.compute_similarity(&[1.0, 2.0, 0.0, 0.0], &[0.0, 0.0, 3.0, 6.0], &mut plan.make_scratch())?;
+/// let mut scratch = plan.make_scratch();
+/// let later_and_louder = plan.compute_similarity(&[1.0, 2.0, 0.0, 0.0], &[0.0, 0.0, 3.0, 6.0], &mut scratch)?;
 /// assert!(later_and_louder.is_some_and(|x| (x - 1.0).abs() < 1e-9));
 /// # Ok::<(), echolake_dsp::Error>(())
 /// ```

@@ -207,8 +207,8 @@ fn add_files_section(text: &mut String, about: &CardContents<'_>) {
         "Turned rows are not exactly what a turned panel gives, because the rig's aim and directivity do not turn with \
          it. Energies of Flat, which is the same in every position, differ from those of their images by 0.04, 0.03, \
          0.1, 0.5 and 0.95 dB rms at 2.5 to 40 kHz (simulated), and so do responses. Of levels over Flat's total \
-         (`tnce_*`) 0.1 to 0.6 dB stay, of levels over Flat's same band (`tnce_band_*`) up to 0.2 dB. View `augmented` has \
-         the ratio of Flat's energies (`flat_ratio_*`) for every row.\n",
+         (`tnce_*`) 0.1 to 0.6 dB stay, of levels over Flat's same band (`tnce_band_*`) up to 0.2 dB. View `augmented` \
+         has the ratio of Flat's energies (`flat_ratio_*`) for every row.\n",
     );
     let _ = writeln!(
         text,

@@ -41,8 +41,8 @@ pub(super) fn view_sql(rig: &Rig) -> String {
         "SELECT surface_id, run_id, pair_id, microphone, speaker, midband_hz, {} FROM \
          (SELECT surface_id, run_id, pair_id, microphone, speaker, midband_hz, unnest(room) FROM \
          (SELECT m.surface_id, m.run_id, m.pair_id, m.microphone, m.speaker, b.midband_hz, \
-         CASE WHEN b.midband_hz IS NULL THEN room_parameters(m.ir) ELSE room_parameters(m.ir, b.midband_hz) END AS room \
-         FROM (VALUES (CAST(NULL AS DOUBLE)){octaves}) AS b(midband_hz) CROSS JOIN measurements m))",
+         CASE WHEN b.midband_hz IS NULL THEN room_parameters(m.ir) ELSE room_parameters(m.ir, b.midband_hz) END \
+         AS room FROM (VALUES (CAST(NULL AS DOUBLE)){octaves}) AS b(midband_hz) CROSS JOIN measurements m))",
         columns.join(", ")
     )
 }

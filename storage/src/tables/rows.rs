@@ -69,7 +69,8 @@ impl Lake {
     /// # tokio::runtime::Runtime::new()?.block_on(async {
     /// let lake = Lake::open_or_create("memory://", &Rig::paper(), &ReferenceSurfaces::default()).await?;
     /// let snapshot = lake.snapshot().await?;
-    /// let rows = lake.read_rows(Table::Pairs, &snapshot.files(Table::Pairs)[0], &["pair_id", "direct_mm"], 10..13).await?;
+    /// let file = &snapshot.files(Table::Pairs)[0];
+    /// let rows = lake.read_rows(Table::Pairs, file, &["pair_id", "direct_mm"], 10..13).await?;
     /// let batches: Vec<_> = rows.try_collect().await?;
     /// assert_eq!((batches[0].num_rows(), batches[0].num_columns()), (3, 2));
     /// # Ok::<(), echolake_lake::Error>(())

@@ -86,7 +86,8 @@ fn measure_lake_ingest(args: &WholeBenchArgs, folder: &Path, report: &mut BenchR
     let responses: f64 = counted.lines().nth(1).context("no count")?.trim().parse()?;
     report.group("From run files to a lake");
     report.note(format!(
-        "`echolake ingest` of {responses} responses and a first query took {seconds:.1} s; scaled to {FULL_LAKE_RESPONSES}."
+        "`echolake ingest` of {responses} responses and a first query took {seconds:.1} s; scaled to \
+         {FULL_LAKE_RESPONSES}."
     ));
     let name = "a million responses from run files to a queryable lake";
     report.figure(name, seconds * FULL_LAKE_RESPONSES as f64 / responses, "s").goal(FigureGoal::AtMost(35.0));

@@ -208,8 +208,8 @@ export interface paths {
         /**
          * Adds TNCE that a model predicts.
          * @description The rows are an Arrow stream with `surface_id`, `pair_id` and columns of table `tnce`, linear; 1 MiB at most. All of
-         *     a request is stored, or nothing. Rows that are sent again are stored once; other values for a model, version, surface
-         *     and pair that are stored are refused. Needs the scope `annotate`.
+         *     a request is stored, or nothing. Rows that are sent again are stored once; other values for a model, version,
+         *     surface and pair that are stored are refused. Needs the scope `annotate`.
          */
         readonly post: operations["predict"];
         readonly delete?: never;

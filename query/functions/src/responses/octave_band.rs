@@ -46,8 +46,8 @@ static DESCRIPTION: FunctionDescription = FunctionDescription {
     family: FunctionFamily::Responses,
     about: "Samples of a response in one octave or third of an octave, in its unit: Butterworth of 6 sections, class 1 \
             of IEC 61260-1:2014, with its exact frequencies, at the lake's sampling rate. The filter has minimum \
-            phase, and its samples are advanced so that the arrival, 20 dB below the greatest sample, stays where it was \
-            within one sample.",
+            phase, and its samples are advanced so that the arrival, 20 dB below the greatest sample, stays where it \
+            was within one sample.",
     parameters: &[
         FunctionParameter { name: "ir", kind: ArgumentKind::Samples, about: "the response" },
         MIDBAND,

@@ -41,8 +41,8 @@ static DESCRIPTION: FunctionDescription = FunctionDescription {
             from its start to where the decay meets the noise (Lundeby's method). The noise's power is subtracted, and \
             the energy after that point is added as the late decay's. Null where the range is too short (25 dB for EDT \
             and the energies, 35 dB for T20, 45 dB for T30), where the response is shorter than 50 ms, and for times \
-            of less than 16 over the bandwidth, which are the filter's own; `reason` has the cause. Of all frequencies, \
-            or of the band of band_filter if its midband frequency is given.",
+            of less than 16 over the bandwidth, which are the filter's own; `reason` has the cause. Of all \
+            frequencies, or of the band of band_filter if its midband frequency is given.",
     parameters: &[
         FunctionParameter {
             name: "ir",

@@ -78,7 +78,9 @@ fn draw_decay(ir: &[f32]) -> Vec<u8> {
     path = "/api/v1/surfaces/{surface_id}/heightmap",
     tag = "catalogue",
     params(SurfacePath),
-    responses((status = 200, description = "OK", body = inline(BinaryContent), content_type = "application/octet-stream")),
+    responses(
+        (status = 200, description = "OK", body = inline(BinaryContent), content_type = "application/octet-stream")
+    ),
     extensions(("x-sql" = json!([
         "select cells, heights_mm from heightmaps where surface_id = $1 and symmetry = 'identity'",
     ])))

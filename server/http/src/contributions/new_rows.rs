@@ -10,6 +10,8 @@ use echolake_service::RequestFault;
 
 /// Model, version, surface and pair.
 type PredictionKey<'a> = (&'a str, &'a str, &'a str, i32);
+/// A row's key, and its values in some columns.
+type KeyedValues<'a> = (PredictionKey<'a>, Vec<Option<f64>>);
 
 /// Returns those of `rows` that are not among the `known` ones. Both have the columns of table `predictions`: a row is
 /// named by model, version, surface and pair, and its values are the columns of numbers. Who sent it, when, and in
@@ -39,11 +41,8 @@ pub(super) fn select_new_rows(known: &[RecordBatch], rows: &RecordBatch) -> Resu
     filter_record_batch(rows, &BooleanArray::from(is_new)).map_err(RequestFault::defect("rows are not filtered"))
 }
 
-// The key of each row, and its values in the columns of these names.
-fn read_keyed_values<'a>(
-    rows: &'a RecordBatch,
-    names: &[&str],
-) -> Result<Vec<(PredictionKey<'a>, Vec<Option<f64>>)>, RequestFault> {
+// All rows, with their values in the columns of these names.
+fn read_keyed_values<'a>(rows: &'a RecordBatch, names: &[&str]) -> Result<Vec<KeyedValues<'a>>, RequestFault> {
     let text = |name: &str| rows.column_by_name(name)?.as_string_opt::<i32>();
     let read = || {
         let [models, versions, surfaces] = [text("model")?, text("model_version")?, text("surface_id")?];

@@ -43,8 +43,8 @@ pub(super) async fn post_annotations(State(door): State<ServerDoor>, request: Re
 /// Adds TNCE that a model predicts.
 ///
 /// The rows are an Arrow stream with `surface_id`, `pair_id` and columns of table `tnce`, linear; 1 MiB at most. All of
-/// a request is stored, or nothing. Rows that are sent again are stored once; other values for a model, version, surface
-/// and pair that are stored are refused. Needs the scope `annotate`.
+/// a request is stored, or nothing. Rows that are sent again are stored once; other values for a model, version,
+/// surface and pair that are stored are refused. Needs the scope `annotate`.
 #[utoipa::path(
     post,
     path = "/api/v1/predictions",

@@ -38,7 +38,8 @@ pub(crate) async fn measure_lake_size(lake: &Lake, report: &mut BenchReport) -> 
     }
     report.group("Size of the lake");
     report.note(format!(
-        "`tables/` of {responses} responses, logs included; scaled to the {FULL_LAKE_RESPONSES} responses of 350 surfaces."
+        "`tables/` of {responses} responses, logs included; scaled to the {FULL_LAKE_RESPONSES} responses of 350 \
+         surfaces."
     ));
     let scale = FULL_LAKE_RESPONSES as f64 / responses.max(1.0) / 1e9;
     let raw: u64 = sizes.iter().map(|(.., raw)| raw).sum();
