@@ -61,6 +61,8 @@ pub(crate) struct LakeCatalog {
 /// One snapshot of the lake with its tables and views.
 struct CatalogSnapshot {
     snapshot: Arc<LakeSnapshot>,
+    /// The tag of its version of `runs`.
+    tag: Option<String>,
     tables: HashMap<Table, Arc<LakeTable>>,
     providers: Vec<(TableReference, Arc<dyn TableProvider>)>,
     rejection: ScalarUDF,
@@ -249,7 +251,7 @@ impl LakeCatalog {
         // In a folder, a look at whether all of it is still there costs nothing.
         let is_newest = match self.lake.is_remote() {
             true => !log.has_after(Table::Runs, version).await?,
-            false => self.lake.is_newest_version(version).await?,
+            false => self.lake.newest_tag(version).await?.is_some_and(|tag| Some(tag) == current.tag),
         };
         if !is_newest {
             return Ok(false);
@@ -269,7 +271,7 @@ impl LakeCatalog {
             let is_same = |versions: Vec<_>| {
                 Table::ALL.into_iter().zip(versions).all(|(table, now)| now == current.snapshot.log_version(table))
             };
-            if !versions.is_ok_and(is_same) {
+            if !versions.is_ok_and(is_same) || log.commit_tag(Table::Runs, version).await? != current.tag {
                 return Ok(false);
             }
         }
@@ -279,6 +281,10 @@ impl LakeCatalog {
     async fn take_snapshot(&self, before: Option<&CatalogSnapshot>) -> Result<CatalogSnapshot, Error> {
         let taken = Instant::now();
         let snapshot = Arc::new(self.lake.snapshot().await?);
+        let tag = match snapshot.log_version(Table::Runs) {
+            Some(version) => self.lake.commit_log().commit_tag(Table::Runs, version).await?,
+            None => None,
+        };
         let mut tables = HashMap::new();
         for table in Table::ALL {
             let files = snapshot.files(table);
@@ -315,7 +321,7 @@ impl LakeCatalog {
         }
         let looked = Mutex::new(taken);
         let checked = Mutex::new(Some(taken));
-        Ok(CatalogSnapshot { snapshot, tables, providers, rejection, verdicts, looked, checked })
+        Ok(CatalogSnapshot { snapshot, tag, tables, providers, rejection, verdicts, looked, checked })
     }
 
     async fn with_pending(

@@ -214,21 +214,18 @@ impl Lake {
         self.0.location.remote.is_some()
     }
 
-    /// Returns whether this is the newest version of the lake, that of its table `runs`. A lake that is gone has no
-    /// newer version, but does not have this one either.
+    /// Returns the tag of this version of the lake, that of its table `runs`, if it is the newest one. Tables that are made
+    /// again have the same versions with other tags. A lake that is gone has no newest version.
     ///
     /// # Errors
     /// [`Error::Store`].
     #[cfg(feature = "tables")]
-    pub async fn is_newest_version(&self, version: u64) -> Result<bool> {
+    pub async fn newest_tag(&self, version: u64) -> Result<Option<String>> {
         let log = self.commit_log();
         if log.has_after(Table::Runs, version).await? {
-            return Ok(false);
+            return Ok(None);
         }
-        match version.checked_sub(1) {
-            Some(before) => log.has_after(Table::Runs, before).await,
-            None => Ok(self.check_readable().await.is_ok()),
-        }
+        log.commit_tag(Table::Runs, version).await
     }
 
     /// Returns the lake with a cache of what never changes in it, in memory, and in a folder if there is one. A lake in

@@ -284,6 +284,18 @@ async fn a_past_version_is_that_of_the_tables_that_are_there() {
     put(&again, "0003_0", "r3").await;
     assert_eq!(again.list_versions().await.expect("versions").pop().expect("a version").version, version);
     assert_eq!(run().await, "r3");
+    // As many versions as before, and more: present tables are those that are there, too.
+    for surfaces in [&["0004_0"][..], &["0005_0", "0006_0", "0007_0"]] {
+        std::fs::remove_dir_all(url.join("tables")).expect("removed");
+        let again = Lake::open(&url.display().to_string()).await.expect("opened");
+        again.ensure_tables().await.expect("made again");
+        for surface in surfaces {
+            put(&again, surface, &format!("run_{surface}")).await;
+        }
+        let seen = rows(&session, "select surface_id from runs order by surface_id").await;
+        assert!(seen.column(0).as_string::<i32>().iter().flatten().eq(surfaces.iter().copied()), "{seen:?}");
+        assert_eq!(run().await, format!("run_{}", surfaces[0]));
+    }
 }
 
 #[tokio::test]

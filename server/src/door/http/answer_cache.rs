@@ -46,6 +46,8 @@ pub(crate) struct AnswerKey {
 struct CachedAnswer {
     client: Arc<ClientIdentity>,
     version: u64,
+    /// The tag of that version of the lake.
+    tag: String,
     since: Instant,
     headers: HeaderMap,
     bytes: Bytes,
@@ -84,7 +86,7 @@ impl AnswerCache {
         let cached = self.answers.get(key)?;
         let is_right = *cached.client == *client
             && cached.since.elapsed() < LONGEST
-            && self.lake.is_newest_version(cached.version).await.is_ok_and(|is_newest| is_newest);
+            && self.lake.newest_tag(cached.version).await.is_ok_and(|tag| tag.as_ref() == Some(&cached.tag));
         if !is_right {
             self.answers.remove(key);
             return None;
@@ -109,6 +111,7 @@ impl AnswerCache {
         let version = version.filter(|_| !self.lake.is_remote());
         let is_short = response.body().size_hint().upper().is_some_and(|bytes| bytes <= LARGEST_ANSWER);
         let (Some(version), Some(key), true) = (version, key, is_short) else { return Ok(response) };
+        let Ok(Some(tag)) = self.lake.newest_tag(version).await else { return Ok(response) };
         let (mut parts, body) = response.into_parts();
         // The time of each answer is its own.
         parts.headers.remove(header::DATE);
@@ -117,7 +120,7 @@ impl AnswerCache {
         let headers = parts.headers.clone();
         self.answers.insert(
             key,
-            Arc::new(CachedAnswer { client, version, since: Instant::now(), headers, bytes: bytes.clone() }),
+            Arc::new(CachedAnswer { client, version, tag, since: Instant::now(), headers, bytes: bytes.clone() }),
         );
         Ok(Response::from_parts(parts, Body::from(bytes)))
     }
@@ -134,6 +137,7 @@ mod tests {
     async fn an_answer_is_its_clients_while_the_lake_stays_as_it_is() {
         let rig = Rig::paper();
         let lake = Lake::open_or_create("memory://", &rig, &ReferenceSurfaces::default()).await.expect("a lake");
+        lake.ensure_tables().await.expect("tables");
         let cache = AnswerCache::new(&lake);
         let ann = ClientIdentity::local_client("ann");
         let bob = ClientIdentity::local_client("bob");

@@ -290,6 +290,13 @@ pub trait CommitLog: Send + Sync + std::fmt::Debug {
     /// Returns whether there is a version after this one, in one request to the store; if the log was cleaned up since,
     /// it may not see what [`CommitLog::newest_version`] sees.
     async fn has_after(&self, table: Table, version: u64) -> Result<bool>;
+
+    /// Returns what tells a version's commit from one of the same number in a table that was made again; None if it is
+    /// not there.
+    ///
+    /// # Errors
+    /// [`Error::Store`].
+    async fn commit_tag(&self, table: Table, version: u64) -> Result<Option<String>>;
     /// The versions that the log still holds, oldest first.
     async fn list_versions(&self, table: Table) -> Result<Vec<TableVersion>>;
     /// The versions that the log still holds with their changes, oldest first: a request to the store for each.

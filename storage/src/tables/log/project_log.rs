@@ -88,6 +88,10 @@ impl CommitLog for ProjectLog {
         self.log.has_after(table, version).await
     }
 
+    async fn commit_tag(&self, table: Table, version: u64) -> Result<Option<String>> {
+        self.log.commit_tag(table, version).await
+    }
+
     // Up to the one that added the newest row that is seen: how many came after it is a matter of other projects.
     async fn list_versions(&self, table: Table) -> Result<Vec<TableVersion>> {
         let newest = self.list_files(Table::Runs).await?.iter().flat_map(list_pointers).map(|row| row.version).max();

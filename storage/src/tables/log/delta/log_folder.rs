@@ -151,23 +151,14 @@ impl<'a> LogFolder<'a> {
         Ok(())
     }
 
-    /// Brings a state up to the newest version. Returns None if the log was cleaned up beyond it, so that it must be
-    /// loaded again; that costs a request, and is looked at only on demand.
-    pub async fn advance_state(
-        &self,
-        mut state: Arc<TableState>,
-        is_in_doubt: bool,
-    ) -> Result<Option<Arc<TableState>>> {
-        let from = state.version;
+    /// Brings a state of this log up to the newest version.
+    pub async fn advance_state(&self, mut state: Arc<TableState>) -> Result<Arc<TableState>> {
         while let Some(lines) = self.read_commit(state.version + 1).await? {
             let next = state.version + 1;
             Arc::make_mut(&mut state).apply_commit(next, lines);
         }
-        if is_in_doubt && state.version == from && !self.has_version(from).await? {
-            return Ok(None);
-        }
         self.check_readable(&state)?;
-        Ok(Some(state))
+        Ok(state)
     }
 
     /// Lists its versions, oldest first.
@@ -191,10 +182,15 @@ impl<'a> LogFolder<'a> {
     }
 
     pub async fn has_version(&self, version: u64) -> Result<bool> {
+        Ok(self.commit_tag(version).await?.is_some())
+    }
+
+    /// Returns what tells a version's commit from that of another log with this number; None if it is not there.
+    pub async fn commit_tag(&self, version: u64) -> Result<Option<String>> {
         let path = self.path.clone().join(commit_name(version));
         match self.store.head(&path).await {
-            Ok(_) => Ok(true),
-            Err(object_store::Error::NotFound { .. }) => Ok(false),
+            Ok(found) => Ok(Some(found.e_tag.unwrap_or_else(|| found.last_modified.to_string()))),
+            Err(object_store::Error::NotFound { .. }) => Ok(None),
             Err(e) => Err(Error::store_failure("read", path, e)),
         }
     }
@@ -509,19 +505,19 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_number_is_written_once_and_a_state_follows_the_log_or_says_that_it_cannot() {
+    async fn a_number_is_written_once_and_a_state_follows_the_log() {
         let store = InMemory::new();
         let state = Arc::new(write_log(&store, 3).await);
         let log = LogFolder::new(Table::Nce, &store);
         assert_eq!(log.write_commit(2, &[add("late")]).await.expect("tried"), CommitAttempt::Taken);
         log.write_commit(3, &[add("new")]).await.expect("written");
-        let advanced = log.advance_state(state.clone(), true).await.expect("read").expect("followed");
+        let advanced = log.advance_state(state).await.expect("read");
         assert_eq!((advanced.version, advanced.files.len()), (3, 4));
-        // A log that was cleaned up beyond what is known has neither that version nor the next.
-        for version in 0..4 {
-            store.delete(&path(&commit_name(version))).await.expect("deleted");
-        }
-        assert!(log.advance_state(state, true).await.expect("read").is_none());
+        let tag = log.commit_tag(3).await.expect("looked").expect("it is there");
+        store.delete(&path(&commit_name(3))).await.expect("deleted");
+        assert_eq!(log.commit_tag(3).await.expect("looked"), None);
+        log.write_commit(3, &[add("new")]).await.expect("written");
+        assert_ne!(log.commit_tag(3).await.expect("looked").expect("it is there"), tag, "equal, but another");
     }
 
     #[tokio::test]

@@ -68,6 +68,8 @@ pub(crate) struct DeltaLog {
 #[derive(Debug, Clone)]
 struct LoadedTable {
     state: Arc<TableState>,
+    /// The tag of its version's commit.
+    tag: Option<String>,
     /// The last look that found its version in the log.
     found: Instant,
 }
@@ -93,23 +95,34 @@ impl DeltaLog {
     async fn load_table(&self, table: Table) -> Result<Option<Arc<TableState>>> {
         let log = self.log_folder(table);
         let known = self.loaded.lock().await.get(&table).cloned();
-        let mut found = Instant::now();
-        let mut state = match known {
-            Some(known) => {
-                let is_in_doubt = !self.is_remote || known.found.elapsed() > LOG_LASTS;
-                if !is_in_doubt {
-                    found = known.found;
-                }
-                log.advance_state(known.state, is_in_doubt).await?
+        let mut followed = None;
+        if let Some(mut known) = known {
+            // A log that was cleaned up beyond what is known, or made again, is loaded again. That costs a request.
+            let is_in_doubt = !self.is_remote || known.found.elapsed() > LOG_LASTS;
+            let mut is_same = true;
+            if is_in_doubt {
+                known.found = Instant::now();
+                is_same = known.tag.is_some() && log.commit_tag(known.state.version).await? == known.tag;
             }
-            None => None,
-        };
-        if state.is_none() {
-            state = log.load_state(None).await?.map(Arc::new);
+            if is_same {
+                let version = known.state.version;
+                known.state = log.advance_state(known.state).await?;
+                if known.state.version != version {
+                    known.tag = log.commit_tag(known.state.version).await?;
+                }
+                followed = Some(known);
+            }
         }
+        if followed.is_none()
+            && let Some(state) = log.load_state(None).await?
+        {
+            let tag = log.commit_tag(state.version).await?;
+            followed = Some(LoadedTable { state: Arc::new(state), tag, found: Instant::now() });
+        }
+        let state = followed.as_ref().map(|table| table.state.clone());
         let mut loaded = self.loaded.lock().await;
-        match &state {
-            Some(state) => drop(loaded.insert(table, LoadedTable { state: state.clone(), found })),
+        match followed {
+            Some(followed) => drop(loaded.insert(table, followed)),
             None => drop(loaded.remove(&table)),
         }
         Ok(state)
@@ -291,7 +304,9 @@ impl DeltaLog {
                 let error = &error as &dyn std::error::Error;
                 tracing::warn!(table, error, "the log's checkpoint cannot be written, or old versions not be deleted");
             }
-            let written = LoadedTable { state: Arc::new(state), found: Instant::now() };
+            // Without it, the next look loads the table again.
+            let tag = log.commit_tag(state.version).await.unwrap_or_default();
+            let written = LoadedTable { state: Arc::new(state), tag, found: Instant::now() };
             self.loaded.lock().await.insert(table, written);
         }
         Ok(attempt)
@@ -427,6 +442,10 @@ impl CommitLog for DeltaLog {
 
     async fn has_after(&self, table: Table, version: u64) -> Result<bool> {
         self.log_folder(table).has_version(version + 1).await
+    }
+
+    async fn commit_tag(&self, table: Table, version: u64) -> Result<Option<String>> {
+        self.log_folder(table).commit_tag(version).await
     }
 
     async fn list_versions(&self, table: Table) -> Result<Vec<TableVersion>> {
