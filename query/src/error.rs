@@ -41,6 +41,22 @@ const FILE_FUNCTIONS: [&str; 9] = [
 ];
 /// Endings of names that are no tables but files.
 const FILE_ENDINGS: [&str; 8] = [".csv", ".tsv", ".txt", ".json", ".parquet", ".arrow", ".feather", ".xlsx"];
+/// Parts of messages that name what DataFusion makes of a subquery.
+const SUBQUERY_STATE: [&str; 4] = ["__common_expr", "__correlated", "__scalar_sq", "outer_ref("];
+/// Parts of messages about other state of DataFusion.
+const ENGINE_STATE: [&str; 6] = [
+    "Internal error",
+    "panicked",
+    "Physical input schema",
+    "Optimizer rule",
+    "likely caused by a bug",
+    "GroupsAccumulator",
+];
+/// Begins what DataFusion prints of a call that it has no function for, behind an error of its own.
+const NO_MATCH: &str = "No function matches";
+/// What is printed of a statement that makes DataFusion fail.
+const UNSUPPORTED: &str = "this statement is not supported in this form; hint: take it apart, with WITH or subqueries in \
+    FROM; EXPLAIN of each part shows which one is not supported";
 const NO_FILES: &str = ": a query reads the lake and no other files";
 const OWN_ROWS: &str = "WITH mine(a, b) AS (VALUES (1, 2), (3, 4)) for a few rows; for a file, DuckDB or polars, which \
     read the lake's tables, too";
@@ -169,6 +185,16 @@ impl Error {
         Self::Query { message: escape_controls(&message), place, hint: Some(escape_controls(&hint)) }
     }
 
+    /// Converts an error of optimizing the plan of `sql`, whose names are resolved: a missing column is DataFusion's own.
+    pub(crate) fn from_optimizing(sql: &str, error: &DataFusionError) -> Self {
+        match error.find_root() {
+            DataFusionError::SchemaError(..) => {
+                Self::from_planning(sql, &DataFusionError::NotImplemented(UNPLANNED.to_owned()))
+            }
+            _ => Self::from_planning(sql, error),
+        }
+    }
+
     /// Converts an error of the tokenizer.
     pub(crate) fn from_tokenizer(sql: &str, error: ParserError) -> Self {
         Self::from_planning(sql, &DataFusionError::from(error))
@@ -263,8 +289,22 @@ fn hint_line(hint: Option<&str>) -> String {
     hint.map_or_else(String::new, |hint| format!("\nhint: {hint}"))
 }
 
-// Returns the message without the name of the layer that raised it, and a hint.
+// Returns the message without the name of the layer that raised it, and a hint. What names DataFusion's own state is
+// no help to a client, and a defect of it or of this crate.
 fn explain_error(error: &DataFusionError) -> (String, Option<String>) {
+    let (message, hint) = describe_error(error);
+    let message = message.replace("[return_type] ", "");
+    if SUBQUERY_STATE.iter().any(|part| message.contains(part)) {
+        return (UNPLANNED.to_owned(), None);
+    }
+    match (ENGINE_STATE.iter().any(|part| message.contains(part)), message.find(NO_MATCH)) {
+        (false, _) => (message, hint),
+        (true, Some(at)) => (message[at..].to_owned(), hint),
+        (true, None) => (UNSUPPORTED.to_owned(), None),
+    }
+}
+
+fn describe_error(error: &DataFusionError) -> (String, Option<String>) {
     match error.find_root() {
         DataFusionError::SchemaError(schema, _) => match schema.as_ref() {
             SchemaError::FieldNotFound { field, valid_fields } => {
@@ -289,14 +329,16 @@ fn explain_error(error: &DataFusionError) -> (String, Option<String>) {
             _ => (text.clone(), None),
         },
         // The message prints the expression as the library's own structure.
-        DataFusionError::NotImplemented(text) if is_unplanned_subquery(text) => (UNPLANNED.to_owned(), None),
+        DataFusionError::NotImplemented(text) if text == UNPLANNED || is_unplanned_subquery(text) => {
+            (UNPLANNED.to_owned(), None)
+        }
         DataFusionError::Execution(text) => (text.clone(), None),
         other => (other.strip_backtrace(), None),
     }
 }
 
 fn is_unplanned_subquery(message: &str) -> bool {
-    message.starts_with("Physical plan does not support logical expression")
+    message.starts_with("Physical plan does not support")
         && ["ubquery", "Exists", "OuterReference"].iter().any(|kind| message.contains(kind))
 }
 

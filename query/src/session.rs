@@ -64,7 +64,7 @@ impl PreparedQuery {
     /// # Errors
     /// [`Error::Query`] if it cannot be planned.
     pub fn optimize(self) -> Result<Self, Error> {
-        let plan = self.state.optimize(&self.plan).map_err(|e| Error::from_planning(&self.sql, &e))?;
+        let plan = self.state.optimize(&self.plan).map_err(|e| Error::from_optimizing(&self.sql, &e))?;
         Ok(Self { plan: OpaqueValue::new(plan), is_optimized: true, ..self })
     }
 
@@ -424,7 +424,7 @@ impl Session {
                 true => state.query_planner().create_physical_plan(&plan, &*state).await,
                 false => state.create_physical_plan(&plan).await,
             };
-            planned.map_err(|error| Error::from_planning(&text, &error))
+            planned.map_err(|error| Error::from_optimizing(&text, &error))
         };
         let plan = self.engine.on_threads(&ticket, planned).await?;
         let schema = plan.schema();

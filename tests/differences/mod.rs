@@ -56,7 +56,7 @@ const MEMORY: usize = 1 << 30;
 /// Surfaces of the lake and their reliefs.
 const SURFACES: [(&str, &str); 3] = [("flat", "flat"), ("foam", "foam"), ("0001_0", "macrostructure")];
 /// What is Rust's or DataFusion's, and no word of SQL.
-const DEBUG_TEXTS: [&str; 14] = [
+const DEBUG_TEXTS: [&str; 18] = [
     "Field {",
     "<subquery>",
     "Exists(",
@@ -71,6 +71,10 @@ const DEBUG_TEXTS: [&str; 14] = [
     "LogicalPlan",
     "Internal error",
     "not implemented",
+    "panicked",
+    "Physical input schema",
+    "__common_expr",
+    "__correlated",
 ];
 
 /// How two engines answered a statement.

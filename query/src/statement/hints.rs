@@ -122,7 +122,7 @@ const FUNCTIONS: [(&str, &str); 59] = [
 /// Parts of a time that DuckDB has as functions.
 const TIME_PARTS: [&str; 8] = ["year", "quarter", "month", "week", "day", "hour", "minute", "second"];
 /// Parts of messages of the planner, and what to write instead.
-const PLANS: [(&str, &str); 16] = [
+const PLANS: [(&str, &str); 17] = [
     ("Cannot cast string", "TRY_CAST(x AS type) is null for what does not fit"),
     ("min/max was called with", "array_agg(x ORDER BY x DESC)[1:3] for several values, greatest(x, y) of one row"),
     ("QUALIFY clause requires", "WHERE, or HAVING for aggregates; QUALIFY is for window functions"),
@@ -138,6 +138,7 @@ const PLANS: [(&str, &str); 16] = [
     ("GROUP BY", "GROUP BY ALL groups by all columns that are no aggregates"),
     ("WHERE clause cannot contain", "HAVING for aggregates, QUALIFY for window functions"),
     ("Cannot infer common argument type", "CAST(x AS type) or x::type makes the types equal"),
+    ("not supported for", "CAST(x AS double) makes a number of a text or of a NULL without a type"),
     ("No function matches", "CAST(x AS type) or x::type, and SHOW FUNCTIONS LIKE 'name' for its arguments"),
 ];
 /// Parts of messages of queries that fail while they run, and what to write instead.

@@ -18,6 +18,7 @@ pub(crate) mod hints;
 mod integer_arithmetic;
 mod integer_casts;
 mod literals;
+mod null_operands;
 mod placeholders;
 mod predicate;
 mod result_names;

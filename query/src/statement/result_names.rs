@@ -7,6 +7,9 @@ use datafusion::sql::sqlparser::ast::{
     Expr, GroupByExpr, Ident, Select, SelectItem, SetExpr, TableAlias, Value, ValueWithSpan,
 };
 
+use super::columns::hinted_error;
+use crate::Error;
+
 /// Gives names of their own to the results of a subquery that are written alike, and that the list of names behind its
 /// alias renames: `t(a, b) AS (SELECT 1, 1)`.
 pub(super) fn name_listed_columns(body: &mut SetExpr, alias: &TableAlias) {
@@ -39,13 +42,28 @@ fn name_equal_items(items: &mut [SelectItem]) {
 }
 
 /// Writes out the positions of the select list in ROLLUP, CUBE and GROUPING SETS.
-pub(super) fn expand_grouping_positions(select: &mut Select) {
-    let Select { group_by: GroupByExpr::Expressions(groups, _), projection, .. } = select else { return };
+///
+/// # Errors
+/// [`Error::Query`] if a column is there twice: for PostgreSQL and DuckDB it is two columns, which are not planned.
+pub(super) fn expand_grouping_positions(select: &mut Select) -> Result<(), Error> {
+    let Select { group_by: GroupByExpr::Expressions(groups, _), projection, .. } = select else {
+        return Ok(());
+    };
     for group in groups {
         if let Expr::Rollup(sets) | Expr::Cube(sets) | Expr::GroupingSets(sets) = group {
             sets.iter_mut().flatten().for_each(|expr| expand_position(expr, projection));
         }
+        if matches!(group, Expr::Rollup(sets) | Expr::Cube(sets) if has_equal(sets)) {
+            let hint = "FROM (SELECT a, a AS b FROM t) GROUP BY ROLLUP(a, b)";
+            return Err(hinted_error("a column is in ROLLUP or CUBE twice".into(), hint.into()));
+        }
     }
+    Ok(())
+}
+
+fn has_equal(parts: &[Vec<Expr>]) -> bool {
+    let mut seen = HashSet::new();
+    !parts.iter().flatten().all(|expr| seen.insert(expr.to_string()))
 }
 
 fn expand_position(expr: &mut Expr, items: &[SelectItem]) {

@@ -15,6 +15,7 @@
 //! | `q EXCEPT ALL r` | rows with numbers, see [`set_operations`](super::set_operations) |
 //! | `a IS DISTINCT FROM b AND c` | `(a IS DISTINCT FROM b) AND c`, see [`distinct_operands`](super::distinct_operands) |
 //! | `(a, b) IN (q)` | `EXISTS`, see [`row_values`](super::row_values) |
+//! | `NULL & NULL`, `sum(NULL)` | `NULL`, `sum(NULL::bigint)` |
 //! | `t AT TIME ZONE 'zone'` | a call of a function |
 //! | `t(a, b) AS (SELECT 1, 1)`, `ROLLUP(1, 2)` | names and positions, see [`result_names`](super::result_names) |
 //!
@@ -28,9 +29,9 @@ use datafusion::sql::parser::Statement;
 use datafusion::sql::sqlparser::ast::helpers::attached_token::AttachedToken;
 use datafusion::sql::sqlparser::ast::{
     AccessExpr, CaseWhen, Cte, Expr, Fetch, Function, FunctionArg, FunctionArgExpr, FunctionArgumentClause,
-    FunctionArgumentList, FunctionArguments, Ident, JoinOperator, LimitClause, ObjectName, OrderBy, OrderByExpr,
-    OrderByKind, OrderByOptions, Query, Select, SelectFlavor, SelectItem, SetExpr, Statement as Sql, Subscript,
-    TableFactor, TableWithJoins, Value, ValueWithSpan, Visitor, VisitorMut, WildcardAdditionalOptions, With,
+    FunctionArguments, Ident, JoinOperator, LimitClause, ObjectName, OrderBy, OrderByExpr, OrderByKind, OrderByOptions,
+    Query, Select, SelectFlavor, SelectItem, SetExpr, Statement as Sql, Subscript, TableFactor, TableWithJoins, Value,
+    ValueWithSpan, Visitor, VisitorMut, WildcardAdditionalOptions, With,
 };
 use echolake_functions::AT_TIME_ZONE;
 use futures::FutureExt as _;
@@ -38,6 +39,7 @@ use futures::FutureExt as _;
 use super::as_of::rewrite_as_of;
 use super::columns::{ColumnsExpansion, has_columns, hinted_error};
 use super::distinct_operands::order_distinct_operands;
+use super::null_operands::settle_null;
 use super::result_names::{expand_grouping_positions, name_listed_columns};
 use super::row_values::{rewrite_row_conditions, rewrite_row_value};
 use super::set_operations::count_set_rows;
@@ -138,7 +140,7 @@ impl VisitorMut for RewriteVisitor<'_> {
                 other => other,
             };
         }
-        expand_grouping_positions(select);
+        visit_outcome(expand_grouping_positions(select))?;
         visit_outcome(select.selection.as_mut().map_or(Ok(()), rewrite_row_conditions))
     }
 
@@ -173,10 +175,18 @@ impl VisitorMut for RewriteVisitor<'_> {
                 Ok(None) => {}
                 Err(error) => return ControlFlow::Break(Box::new(error)),
             },
-            Expr::AtTimeZone { timestamp, time_zone } => *expr = zone_call(timestamp, time_zone),
+            Expr::AtTimeZone { timestamp, time_zone } => {
+                *expr = tree::function_call(AT_TIME_ZONE, [timestamp, time_zone])
+            }
             _ => {}
         }
-        visit_outcome(rewrite_row_value(expr))
+        let is_aggregate = |name: &str| self.state.aggregate_functions().contains_key(name);
+        visit_outcome(rewrite_row_value(expr, &is_aggregate))
+    }
+
+    fn post_visit_expr(&mut self, expr: &mut Expr) -> Visit {
+        settle_null(expr);
+        ControlFlow::Continue(())
     }
 }
 
@@ -265,24 +275,6 @@ fn close_slice(access: &mut AccessExpr) {
         lower_bound.get_or_insert_with(|| tree::number_literal(1));
         upper_bound.get_or_insert_with(|| tree::number_literal(-1));
     }
-}
-
-fn zone_call(time: &Expr, zone: &Expr) -> Expr {
-    let argument = |expr: &Expr| FunctionArg::Unnamed(FunctionArgExpr::Expr(expr.clone()));
-    Expr::Function(Function {
-        name: ObjectName::from(vec![Ident::new(AT_TIME_ZONE)]),
-        uses_odbc_syntax: false,
-        parameters: FunctionArguments::None,
-        args: FunctionArguments::List(FunctionArgumentList {
-            duplicate_treatment: None,
-            args: vec![argument(time), argument(zone)],
-            clauses: Vec::new(),
-        }),
-        filter: None,
-        null_treatment: None,
-        over: None,
-        within_group: Vec::new(),
-    })
 }
 
 // Returns what replaces a call as a whole; None if it stays a call.

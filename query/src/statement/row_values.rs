@@ -4,9 +4,10 @@
 
 use std::ops::ControlFlow;
 
-use datafusion::sql::sqlparser::ast::{BinaryOperator, Expr, Query, Select, SetExpr, TableFactor};
+use datafusion::sql::sqlparser::ast::{BinaryOperator, Expr, Query, Select, SetExpr, TableFactor, Visitor};
 
 use super::columns::hinted_error;
+use super::syntax_walk::walk_syntax;
 use super::tree;
 use crate::Error;
 
@@ -35,10 +36,15 @@ pub(super) fn rewrite_row_conditions(condition: &mut Expr) -> Result<(), Error> 
 /// Rewrites a comparison of rows that is a value.
 ///
 /// # Errors
-/// [`Error::Query`] if both sides differ in their number of columns.
-pub(super) fn rewrite_row_value(expr: &mut Expr) -> Result<(), Error> {
+/// [`Error::Query`] if both sides differ in their number of columns, or the row has an aggregate.
+pub(super) fn rewrite_row_value(expr: &mut Expr, is_aggregate: &dyn Fn(&str) -> bool) -> Result<(), Error> {
     let Expr::InSubquery { expr: row, subquery, negated } = expr else { return Ok(()) };
     let Some(row) = row_columns(row) else { return Ok(()) };
+    let has_aggregate = |value| walk_syntax(value, &mut AggregateVisitor { is_aggregate, depth: 0 }).is_break();
+    if row.iter().any(has_aggregate) {
+        let hint = "SELECT ... FROM (SELECT x, count(*) AS n FROM t GROUP BY x) WHERE (x, n) IN (...)";
+        return Err(hinted_error("a row with an aggregate is not compared with a subquery".into(), hint.into()));
+    }
     let comparison = RowComparison { row, subquery };
     let mut value = tree::parse_expr(&format!(
         "CASE WHEN a THEN {} WHEN b THEN NULL ELSE {} END",
@@ -53,6 +59,38 @@ pub(super) fn rewrite_row_value(expr: &mut Expr) -> Result<(), Error> {
     }
     *expr = value;
     Ok(())
+}
+
+/// Ends at a call of an aggregate outside of subqueries.
+struct AggregateVisitor<'a> {
+    is_aggregate: &'a dyn Fn(&str) -> bool,
+    depth: usize,
+}
+
+impl Visitor for AggregateVisitor<'_> {
+    type Break = ();
+
+    fn pre_visit_query(&mut self, _: &Query) -> ControlFlow<()> {
+        self.depth += 1;
+        ControlFlow::Continue(())
+    }
+
+    fn post_visit_query(&mut self, _: &Query) -> ControlFlow<()> {
+        self.depth -= 1;
+        ControlFlow::Continue(())
+    }
+
+    fn pre_visit_expr(&mut self, expr: &Expr) -> ControlFlow<()> {
+        match expr {
+            Expr::Function(function)
+                if self.depth == 0
+                    && tree::plain_name(&function.name).is_some_and(|name| (self.is_aggregate)(&name)) =>
+            {
+                ControlFlow::Break(())
+            }
+            _ => ControlFlow::Continue(()),
+        }
+    }
 }
 
 /// A row and the subquery in which it may be.

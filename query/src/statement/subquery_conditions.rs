@@ -38,8 +38,8 @@ use datafusion::scalar::ScalarValue;
 const COMPARED: &str = "__compared";
 /// What is printed of a subquery that is not planned, and what to write instead.
 pub(crate) const UNPLANNED: &str = "a subquery that depends on the row around it is not planned in this form; hint: \
-    JOIN ... ON, an aggregate in the subquery, or QUALIFY row_number() OVER (PARTITION BY ... ORDER BY ...) <= 1 for \
-    the first rows";
+    JOIN ... ON, with GROUP BY for aggregates; an aggregate in the subquery; or QUALIFY row_number() OVER (PARTITION BY \
+    ... ORDER BY ...) <= 1 for the first rows";
 
 /// The rule; it is the first one.
 #[derive(Debug)]

@@ -1,6 +1,9 @@
 //! Parts of syntax trees that the rewrite builds and reads.
 
-use datafusion::sql::sqlparser::ast::{BinaryOperator, Expr, Ident, ObjectName, Query, SelectItem, Value};
+use datafusion::sql::sqlparser::ast::{
+    BinaryOperator, Expr, Function, FunctionArg, FunctionArgExpr, FunctionArgumentList, FunctionArguments, Ident,
+    ObjectName, Query, SelectItem, Value,
+};
 use datafusion::sql::sqlparser::parser::Parser;
 
 use super::dialect::LakeDialect;
@@ -27,6 +30,21 @@ pub(super) fn parse_expr(sql: &str) -> Result<Expr, Error> {
 /// Returns a number.
 pub(super) fn number_literal(number: i64) -> Expr {
     Expr::value(Value::Number(number.to_string(), false))
+}
+
+/// Returns a call of a function with copies of the arguments.
+pub(super) fn function_call(name: &str, args: [&Expr; 2]) -> Expr {
+    let args = args.map(|arg| FunctionArg::Unnamed(FunctionArgExpr::Expr(arg.clone()))).into();
+    Expr::Function(Function {
+        name: ObjectName::from(vec![Ident::new(name)]),
+        uses_odbc_syntax: false,
+        parameters: FunctionArguments::None,
+        args: FunctionArguments::List(FunctionArgumentList { duplicate_treatment: None, args, clauses: Vec::new() }),
+        filter: None,
+        null_treatment: None,
+        over: None,
+        within_group: Vec::new(),
+    })
 }
 
 /// Returns a name as it is, whatever its letters.
