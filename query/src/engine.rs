@@ -18,7 +18,7 @@ use datafusion::logical_expr::Documentation;
 use datafusion::optimizer::{Optimizer, OptimizerRule};
 use datafusion::prelude::{SessionConfig, SessionContext};
 use echolake_functions::{
-    FunctionSet, exact_aggregates, octet_length_of_bytes, pattern_functions, whole_number_ranges,
+    FunctionSet, exact_aggregates, list_membership, octet_length_of_bytes, pattern_functions, whole_number_ranges,
     zone_time,
 };
 use echolake_lake::Lake;
@@ -29,7 +29,7 @@ use crate::catalog::LakeCatalog;
 use crate::client::QueryQuota;
 use crate::control::threads::{QueryThreadGroups, QueryThreads};
 use crate::control::{QueryTicket, RunningQueries, StopReason};
-use crate::statement::{IntegerArithmetic, SubqueryConditions};
+use crate::statement::{FloatForms, IntegerArithmetic, SubqueryConditions};
 use crate::system::{self, SystemSource};
 use crate::{Error, OpaqueValue};
 
@@ -289,6 +289,7 @@ fn build_template(
         .with_runtime_env(runtime)
         .with_default_features()
         .with_analyzer_rule(Arc::new(IntegerArithmetic))
+        .with_analyzer_rule(Arc::new(FloatForms))
         .with_optimizer_rules(std::iter::once(conditions).chain(Optimizer::new().rules).collect());
     let mut state = rules.into_iter().fold(builder, SessionStateBuilder::with_optimizer_rule).build();
     let _ = state.register_udf(Arc::new(octet_length_of_bytes()));
@@ -296,6 +297,9 @@ fn build_template(
         let _ = state.register_udf(Arc::new(function));
     }
     let _ = state.register_udf(Arc::new(zone_time()));
+    for function in list_membership() {
+        let _ = state.register_udf(Arc::new(function));
+    }
     for function in exact_aggregates() {
         let _ = state.register_udaf(Arc::new(function));
     }

@@ -24,9 +24,11 @@ use comparison::{alike, diffusion};
 use geometry::{fresnel, sound, symmetry};
 use responses::{band_energy, decay, nce, octave_band, rise, room_parameters, spectrum};
 pub use standard::exact_aggregates::exact_aggregates;
+pub use standard::list_members::{ANY_EQUAL, list_membership};
 pub use standard::number_ranges::whole_number_ranges;
 pub use standard::octet_length::octet_length_of_bytes;
 pub use standard::time_patterns::pattern_functions;
+pub use standard::unified_floats::{FloatForm, UnifiedFloat};
 pub use standard::zone_times::{AT_TIME_ZONE, zone_time};
 
 /// All functions of a lake, made once for all its sessions.

@@ -263,8 +263,15 @@ impl Column {
             Self::U16(c) => Arc::new(c.finish()),
             Self::U32(c) => Arc::new(c.finish()),
             Self::U64(c) => Arc::new(c.finish()),
-            Self::F32(c) => Arc::new(c.finish()),
-            Self::F64(c) => Arc::new(c.finish()),
+            // One NaN, as in results of queries: the sign that a file's NaN has depends on the recorder's processor.
+            Self::F32(c) => {
+                c.values.iter_mut().filter(|x| x.is_nan()).for_each(|x| *x = f32::NAN);
+                Arc::new(c.finish())
+            }
+            Self::F64(c) => {
+                c.values.iter_mut().filter(|x| x.is_nan()).for_each(|x| *x = f64::NAN);
+                Arc::new(c.finish())
+            }
             Self::Decimal(c) => Arc::new(c.finish().with_precision_and_scale(INTEGER_DIGITS, 0)?),
             Self::Time(c) => Arc::new(c.finish().with_timezone(UTC)),
             Self::Duration(c) => Arc::new(c.finish()),

@@ -195,6 +195,7 @@ mod slow {
         for (again, end) in [
             ("1 + ", "1"),
             ("x + ", "1"),
+            ("1.5 / x - ", "x"),
             ("x = 1 and ", "true"),
             ("x > 7 or ", "true"),
             ("'a' || ", "x"),

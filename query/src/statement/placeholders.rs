@@ -10,9 +10,10 @@ use datafusion::error::Result;
 use datafusion::logical_expr::expr::{Cast, Placeholder, ScalarFunction};
 use datafusion::logical_expr::utils::merge_schema;
 use datafusion::logical_expr::{Expr, ExprSchemable as _, LogicalPlan};
+use echolake_functions::ANY_EQUAL;
 
-/// The function that `x = ANY(list)` becomes.
-const SEARCH: &str = "array_has";
+/// Functions whose arguments are a list and one of its values.
+const SEARCHES: [&str; 2] = ["array_has", ANY_EQUAL];
 
 /// Functions whose arguments have one type.
 const ALIKE: [&str; 4] = ["coalesce", "greatest", "least", "nullif"];
@@ -33,7 +34,7 @@ fn infer_of_expression(mut expr: Expr, counts_rows: bool, schema: &DFSchema) -> 
             let kind = field.data_type().clone();
             settle_type(expr, || Some(kind))
         }
-        Expr::ScalarFunction(ScalarFunction { func, args }) if func.name() == SEARCH => match &mut args[..] {
+        Expr::ScalarFunction(ScalarFunction { func, args }) if SEARCHES.contains(&func.name()) => match &mut args[..] {
             [list @ Expr::Placeholder(_), element] => settle_type(list, || {
                 let kind = element.get_type(schema).ok().filter(|kind| *kind != DataType::Null)?;
                 Some(DataType::new_list(kind, true))

@@ -16,6 +16,7 @@
 //! | `a IS DISTINCT FROM b AND c` | `(a IS DISTINCT FROM b) AND c`, see [`distinct_operands`](super::distinct_operands) |
 //! | `(a, b) IN (q)` | `EXISTS`, see [`row_values`](super::row_values) |
 //! | `NULL & NULL`, `sum(NULL)` | `NULL`, `sum(NULL::bigint)` |
+//! | `x > ANY (list)` | `NOT (x <= ALL (list))`, see [`list_comparisons`](super::list_comparisons) |
 //! | `t AT TIME ZONE 'zone'` | a call of a function |
 //! | `t(a, b) AS (SELECT 1, 1)`, `ROLLUP(1, 2)` | names and positions, see [`result_names`](super::result_names) |
 //!
@@ -39,6 +40,7 @@ use futures::FutureExt as _;
 use super::as_of::rewrite_as_of;
 use super::columns::{ColumnsExpansion, has_columns, hinted_error};
 use super::distinct_operands::order_distinct_operands;
+use super::list_comparisons::rewrite_list_comparison;
 use super::null_operands::settle_null;
 use super::result_names::{expand_grouping_positions, name_listed_columns};
 use super::row_values::{rewrite_row_conditions, rewrite_row_value};
@@ -178,7 +180,7 @@ impl VisitorMut for RewriteVisitor<'_> {
             Expr::AtTimeZone { timestamp, time_zone } => {
                 *expr = tree::function_call(AT_TIME_ZONE, [timestamp, time_zone])
             }
-            _ => {}
+            _ => rewrite_list_comparison(expr),
         }
         let is_aggregate = |name: &str| self.state.aggregate_functions().contains_key(name);
         visit_outcome(rewrite_row_value(expr, &is_aggregate))

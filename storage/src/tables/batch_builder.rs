@@ -3,11 +3,11 @@
 use std::sync::Arc;
 
 use arrow::array::{
-    Array as _, ArrayRef, BooleanArray, Float32Array, Float64Array, Int32Array, Int64Array, ListArray, StringArray,
-    TimestampMicrosecondArray,
+    Array as _, ArrayRef, AsArray as _, BooleanArray, Float32Array, Float64Array, Int32Array, Int64Array, ListArray,
+    StringArray, TimestampMicrosecondArray,
 };
 use arrow::buffer::OffsetBuffer;
-use arrow::datatypes::{DataType, Field, SchemaRef};
+use arrow::datatypes::{DataType, Field, Float32Type, Float64Type, SchemaRef};
 use arrow::record_batch::RecordBatch;
 use echolake_schema::tables::{LIST_CHILD, Table};
 use echolake_schema::{Grid, Pair, PointId, Rig, Timestamp};
@@ -161,10 +161,19 @@ impl BatchBuilder {
         if !field.is_nullable() && array.null_count() > 0 {
             return Err(format!("column `{name}` has {} nulls, expected none", array.null_count()));
         }
-        match self.columns[index].replace(array) {
+        match self.columns[index].replace(without_negative_zero(array)) {
             Some(_) => Err(format!("column `{name}` is given twice, expected once")),
             None => Ok(()),
         }
+    }
+}
+
+// Arrow's order of floats is that of their bits, in which -0.0 is not 0.0. Orders of a table's columns rely on it.
+fn without_negative_zero(array: ArrayRef) -> ArrayRef {
+    match array.data_type() {
+        DataType::Float32 => Arc::new(array.as_primitive::<Float32Type>().unary::<_, Float32Type>(|x| x + 0.0)),
+        DataType::Float64 => Arc::new(array.as_primitive::<Float64Type>().unary::<_, Float64Type>(|x| x + 0.0)),
+        _ => array,
     }
 }
 
@@ -182,6 +191,13 @@ mod tests {
                 .push_lists("heights_mm", vec![0.0; 2]),
         );
         columns.finish().map_err(|e| e.to_string())
+    }
+
+    #[test]
+    fn zeros_have_no_sign() {
+        let batch = heights(|columns| columns.push_floats("size_mm", [-0.0, 600.0])).expect("complete");
+        let sizes = batch.column_by_name("size_mm").expect("there");
+        assert!(sizes.as_primitive::<Float32Type>().value(0).is_sign_positive());
     }
 
     #[test]

@@ -20,6 +20,8 @@ use datafusion::logical_expr::{
 };
 use datafusion::scalar::ScalarValue;
 
+use super::unified_floats::unify_nans;
+
 /// Type of a sum of whole numbers: 2^63 rows of the greatest number are within it.
 const WHOLE_SUM: DataType = DataType::Decimal128(38, 0);
 
@@ -56,7 +58,9 @@ impl ExactAggregate {
     fn value_map(&self, returned: &DataType) -> Option<ArrayMap> {
         match (self.difference, returned) {
             (AggregateDifference::WholeSum, returned) if *returned == WHOLE_SUM => Some(decimals_from_whole_numbers),
-            (AggregateDifference::GreatestNan, DataType::Float32 | DataType::Float64) => Some(unify_nans),
+            (AggregateDifference::GreatestNan, DataType::Float32 | DataType::Float64) => {
+                Some(|values| Ok(unify_nans(values)))
+            }
             _ => None,
         }
     }
@@ -308,24 +312,9 @@ fn decimals_from_whole_numbers(values: &ArrayRef) -> Result<ArrayRef> {
     Ok(Arc::new(decimals.with_data_type(WHOLE_SUM)))
 }
 
-// The sign of a NaN depends on the processor.
-fn unify_nans(values: &ArrayRef) -> Result<ArrayRef> {
-    Ok(match values.data_type() {
-        DataType::Float32 => {
-            let unified = |x: f32| if x.is_nan() { f32::NAN } else { x };
-            Arc::new(values.as_primitive::<Float32Type>().unary::<_, Float32Type>(unified))
-        }
-        DataType::Float64 => {
-            let unified = |x: f64| if x.is_nan() { f64::NAN } else { x };
-            Arc::new(values.as_primitive::<Float64Type>().unary::<_, Float64Type>(unified))
-        }
-        _ => values.clone(),
-    })
-}
-
 // The order of the integers is that of the floats: all bits but the sign of a negative float are turned round.
 fn keys_from_floats(values: &ArrayRef) -> Result<ArrayRef> {
-    let values = unify_nans(values)?;
+    let values = unify_nans(values);
     Ok(match values.data_type() {
         DataType::Float32 => {
             let keys: PrimitiveArray<Int32Type> =

@@ -1,0 +1,117 @@
+//! Floats of one bit pattern for all that are equal: one NaN, and zero without a sign.
+
+use std::sync::Arc;
+
+use arrow::array::{Array as _, ArrayRef, AsArray as _};
+use arrow::datatypes::{DataType, Field, FieldRef, Float32Type, Float64Type};
+use datafusion::common::utils::{normalize_float_zero, take_function_args};
+use datafusion::error::Result;
+use datafusion::logical_expr::{
+    ColumnarValue, Expr, ReturnFieldArgs, ScalarFunctionArgs, ScalarUDF, ScalarUDFImpl, Signature, Volatility,
+};
+use datafusion::scalar::ScalarValue;
+
+/// Which of the equal floats are made the same.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum FloatForm {
+    /// All NaNs are the positive one, which is the greatest float in Arrow's order, as in PostgreSQL.
+    OneNan,
+    /// -0.0 is 0.0, and NaNs are one, too.
+    OneZero,
+}
+
+/// A function that returns its argument, a float, in a form. In results it has the name of its argument.
+#[derive(Debug, PartialEq, Eq, Hash)]
+pub struct UnifiedFloat {
+    form: FloatForm,
+    kind: DataType,
+    signature: Signature,
+}
+
+impl UnifiedFloat {
+    /// Returns the function for floats of a type.
+    pub fn new_function(form: FloatForm, kind: DataType) -> ScalarUDF {
+        ScalarUDF::new_from_impl(Self { form, kind, signature: Signature::any(1, Volatility::Immutable) })
+    }
+
+    /// Returns its form.
+    pub fn form(&self) -> FloatForm {
+        self.form
+    }
+
+    /// Returns the type of its argument and result.
+    pub fn kind(&self) -> &DataType {
+        &self.kind
+    }
+
+    fn unify_array(&self, values: &ArrayRef) -> ArrayRef {
+        let unified = unify_nans(values);
+        if self.form == FloatForm::OneZero { normalize_float_zero(&unified) } else { unified }
+    }
+}
+
+impl ScalarUDFImpl for UnifiedFloat {
+    fn name(&self) -> &str {
+        match self.form {
+            FloatForm::OneNan => "one_nan",
+            FloatForm::OneZero => "one_zero",
+        }
+    }
+
+    fn schema_name(&self, args: &[Expr]) -> Result<String> {
+        let [value] = take_function_args(self.name(), args)?;
+        Ok(value.schema_name().to_string())
+    }
+
+    fn signature(&self) -> &Signature {
+        &self.signature
+    }
+
+    fn return_type(&self, _: &[DataType]) -> Result<DataType> {
+        Ok(self.kind.clone())
+    }
+
+    fn return_field_from_args(&self, args: ReturnFieldArgs) -> Result<FieldRef> {
+        let is_nullable = args.arg_fields.iter().any(|field| field.is_nullable());
+        Ok(Arc::new(Field::new(self.name(), self.kind.clone(), is_nullable)))
+    }
+
+    fn is_strict(&self) -> bool {
+        true
+    }
+
+    fn invoke_with_args(&self, args: ScalarFunctionArgs) -> Result<ColumnarValue> {
+        let [value] = take_function_args(self.name(), args.args)?;
+        Ok(match value {
+            ColumnarValue::Array(values) => ColumnarValue::Array(self.unify_array(&values)),
+            ColumnarValue::Scalar(value) => {
+                let unified = self.unify_array(&value.to_array()?);
+                ColumnarValue::Scalar(ScalarValue::try_from_array(&unified, 0)?)
+            }
+        })
+    }
+}
+
+/// Returns floats with one NaN, whose sign depends on the processor else. Values without a NaN are not copied: that
+/// costs one pass over them.
+pub(super) fn unify_nans(values: &ArrayRef) -> ArrayRef {
+    match values.data_type() {
+        DataType::Float32 => {
+            let floats = values.as_primitive::<Float32Type>();
+            let unified = |x: f32| if x.is_nan() { f32::NAN } else { x };
+            match floats.values().iter().fold(false, |found, x| found | x.is_nan()) {
+                true => Arc::new(floats.unary::<_, Float32Type>(unified)),
+                false => values.clone(),
+            }
+        }
+        DataType::Float64 => {
+            let floats = values.as_primitive::<Float64Type>();
+            let unified = |x: f64| if x.is_nan() { f64::NAN } else { x };
+            match floats.values().iter().fold(false, |found, x| found | x.is_nan()) {
+                true => Arc::new(floats.unary::<_, Float64Type>(unified)),
+                false => values.clone(),
+            }
+        }
+        _ => values.clone(),
+    }
+}
