@@ -42,7 +42,8 @@ const FILE_FUNCTIONS: [&str; 9] = [
 /// Endings of names that are no tables but files.
 const FILE_ENDINGS: [&str; 8] = [".csv", ".tsv", ".txt", ".json", ".parquet", ".arrow", ".feather", ".xlsx"];
 /// Parts of messages that name what DataFusion makes of a subquery.
-const SUBQUERY_STATE: [&str; 4] = ["__common_expr", "__correlated", "__scalar_sq", "outer_ref("];
+const SUBQUERY_STATE: [&str; 5] =
+    ["__common_expr", "__correlated", "__scalar_sq", "outer_ref(", "Correlated scalar subquery can only"];
 /// Parts of messages about other state of DataFusion.
 const ENGINE_STATE: [&str; 6] = [
     "Internal error",

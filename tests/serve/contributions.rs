@@ -298,7 +298,7 @@ fn a_verdict_on_a_reference_needs_its_right_and_a_confirmation() {
     // Counted after them.
     let of_none = json!({ "run_id": "none", "kind": "note", "comment": "seen" });
     refused(&send(&server, Some(&author), &of_none, false), 400, "request_invalid");
-    wait_until("failures are counted", || failures("request_invalid").is_some());
+    wait_until("failures are counted", || failures("request_invalid").as_deref() == Some("1"));
     assert_eq!(failures("forbidden").as_deref(), Some("2"), "each once");
     assert_eq!([&label, &of_brick].map(|other| send(&server, Some(&author), other, false).status), [200, 200]);
     let told = |answer: &HttpResponse| {

@@ -651,6 +651,7 @@ async fn what_is_not_planned_is_refused_in_plain_words() {
         ("select x, v from (values (1), (2)) t(x), lateral (select x + 1 as v from (values (1)) u(y) where 1 = 1) l", &later),
         ("select x, v from (values (1)) t(x), lateral (select count(*) as v from (values (1)) u(y) where x = x) l", &later),
         ("select x from (values (1)) t(x) left join lateral (select max(y) as v from (values (1)) u(y) where y <= x) l on true", &later),
+        ("select x from (values (1), (2)) t(x) order by (select max(y) from (values (1)) u(y) where y = x)", &later),
         ("select sum(x) from (values ('a')) t(x)", &["'sum(Utf8)'", "hint: CAST(x AS type)"]),
         ("select sum(x) from (select null as x) t", &["SUM not supported for Null", "hint: CAST(x AS double)"]),
         ("select layer from points group by layer having (count(*), 3) in (select 1, 3)", &["a row with an aggregate", "FROM (SELECT"]),
