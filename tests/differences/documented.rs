@@ -83,7 +83,9 @@ pub(crate) const DOCUMENTED: [DocumentedDifference; 20] = [
         sql: "select array_distinct([1, null]) as x",
         reason: "it is a value, which is there once",
         applies: Some(|sql, outcome| {
-            sql.contains("array_distinct(") && sql.contains("null") && matches!(outcome, ComparisonOutcome::Different(_))
+            sql.contains("array_distinct(")
+                && sql.contains("null")
+                && matches!(outcome, ComparisonOutcome::Different(_))
         }),
     },
     DocumentedDifference {
