@@ -187,7 +187,7 @@ impl FloatScope {
             },
             Expr::Negative(operand) => match self.float_type(operand) {
                 Some(kind) if !self.is_stored(operand) => {
-                    *operand = Box::new(strip_nan_form(std::mem::take(operand.as_mut())));
+                    **operand = strip_nan_form(std::mem::take(operand.as_mut()));
                     expr = call(FloatForm::OneNan, kind, expr);
                 }
                 _ => return Transformed::no(expr),

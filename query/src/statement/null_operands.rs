@@ -12,10 +12,8 @@ const AGGREGATES: [&str; 4] = ["sum", "bit_and", "bit_or", "bit_xor"];
 /// Gives a NULL a type where the planner needs one. The operands of the expression are done.
 pub(super) fn settle_null(expr: &mut Expr) {
     match expr {
-        Expr::BinaryOp { left, op, right } if is_null(left) && is_null(right) => {
-            if is_typeless(op) {
-                *expr = Expr::value(Value::Null);
-            }
+        Expr::BinaryOp { left, op, right } if is_null(left) && is_null(right) && is_typeless(op) => {
+            *expr = Expr::value(Value::Null);
         }
         Expr::Function(function)
             if tree::plain_name(&function.name).is_some_and(|n| AGGREGATES.contains(&n.as_str())) =>

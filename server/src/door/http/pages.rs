@@ -287,7 +287,7 @@ mod tests {
         }
         assert_eq!(ask("/docs").await.headers()[header::LOCATION], MANUAL_INDEX);
         assert_eq!(ask("/docs/none.html").await.status(), StatusCode::NOT_FOUND);
-        let response = ask(MANUAL_INDEX).await;
+        let response = ask("/docs/index.html").await;
         assert_eq!(response.status(), StatusCode::OK);
         assert_eq!(response.headers()[header::CONTENT_TYPE], "text/html; charset=utf-8");
         let policy = response.headers()[header::CONTENT_SECURITY_POLICY].to_str().expect("text").to_owned();
