@@ -136,6 +136,8 @@ async fn remove_superseded_runs(lake: &Lake, stop: &Arc<AtomicBool>) -> anyhow::
     if names.is_empty() {
         return Ok(());
     }
+    let told = format!("computed runs of an earlier revision of the simulation are removed: {}", names.join(", "));
+    CommandProgress::new().print_message(&told);
     let mut removals = find_removals(lake, &names).await?;
     let ingest = LakeIngest::new(lake, stop.clone());
     let removed = async {
