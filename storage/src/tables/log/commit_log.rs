@@ -295,7 +295,7 @@ pub trait CommitLog: Send + Sync + std::fmt::Debug {
     /// not there.
     ///
     /// # Errors
-    /// [`Error::Store`].
+    /// [`crate::Error::Store`].
     async fn commit_tag(&self, table: Table, version: u64) -> Result<Option<String>>;
     /// The versions that the log still holds, oldest first.
     async fn list_versions(&self, table: Table) -> Result<Vec<TableVersion>>;
