@@ -55,7 +55,7 @@ const ENGINE_STATE: [&str; 6] = [
 ];
 /// Begins what DataFusion prints of a call that it has no function for, behind an error of its own.
 const NO_MATCH: &str = "No function matches";
-/// What is printed of a statement that makes DataFusion fail.
+/// The message for a statement that makes DataFusion fail.
 const UNSUPPORTED: &str = "this statement is not supported in this form; hint: take it apart, with WITH or subqueries in \
     FROM; EXPLAIN of each part shows which one is not supported";
 const NO_FILES: &str = ": a query reads the lake and no other files";

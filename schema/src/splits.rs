@@ -91,7 +91,7 @@ pub struct SplitSurface<'a> {
 
 impl<'a> SplitSurface<'a> {
     /// Returns the group that is held out or trained on as a whole.
-    pub fn category(&self, by: SplitBy) -> &'a str {
+    pub fn split_category(&self, by: SplitBy) -> &'a str {
         match by {
             SplitBy::Panel | SplitBy::Nothing => self.id.panel(),
             SplitBy::Typology => self.typology,
@@ -107,7 +107,7 @@ impl<'a> SplitSurface<'a> {
 /// is in the rarest part of its sides. If there are too few categories, the test set is empty first, then validation.
 pub fn assign_parts(surfaces: &[SplitSurface<'_>], split: SplitParams) -> Vec<Option<SplitPart>> {
     let drawn = draw_parts(surfaces, split);
-    let own = |surface: &SplitSurface<'_>| match drawn.get(surface.category(split.by)) {
+    let own = |surface: &SplitSurface<'_>| match drawn.get(surface.split_category(split.by)) {
         Some(part) if !surface.is_reference => *part,
         _ => SplitPart::Train,
     };
@@ -128,7 +128,10 @@ pub fn assign_parts(surfaces: &[SplitSurface<'_>], split: SplitParams) -> Vec<Op
 // Draws a part for each category: sorted by digest, the first fill the test set, the next the validation set.
 fn draw_parts<'a>(surfaces: &[SplitSurface<'a>], split: SplitParams) -> BTreeMap<&'a str, SplitPart> {
     let mut counts: BTreeMap<&str, usize> = BTreeMap::new();
-    surfaces.iter().filter(|s| !s.is_reference).for_each(|s| *counts.entry(s.category(split.by)).or_default() += 1);
+    surfaces
+        .iter()
+        .filter(|s| !s.is_reference)
+        .for_each(|s| *counts.entry(s.split_category(split.by)).or_default() += 1);
     if split.by == SplitBy::Nothing {
         return counts.into_keys().map(|category| (category, SplitPart::Train)).collect();
     }

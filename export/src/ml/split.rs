@@ -33,7 +33,7 @@ fn check_split(surfaces: &[SplitSurface<'_>], split: SplitParams) -> Result<()> 
         return Err(Error::Split { by: split.by.name(), reason });
     }
     let reliefs = surfaces.iter().filter(|surface| !surface.is_reference);
-    let categories = reliefs.map(|surface| surface.category(split.by)).collect::<BTreeSet<_>>().len();
+    let categories = reliefs.map(|surface| surface.split_category(split.by)).collect::<BTreeSet<_>>().len();
     let needed = 1 + [split.test, split.validation].into_iter().filter(|share| *share > 0.0).count();
     if categories < needed {
         let reason =

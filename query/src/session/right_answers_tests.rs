@@ -642,7 +642,7 @@ async fn null_alone_is_null() {
     .await;
 }
 
-/// What DataFusion cannot plan is refused without its own words, with a form that works.
+/// Statements that DataFusion cannot plan are refused without its own words, with a form that works.
 #[tokio::test]
 async fn what_is_not_planned_is_refused_in_plain_words() {
     let later = ["is not planned in this form", "JOIN ... ON, with GROUP BY"];

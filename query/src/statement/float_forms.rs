@@ -155,14 +155,12 @@ fn unified_float(expr: &Expr) -> Option<&UnifiedFloat> {
 
 // The operand of `one_nan`, for an operator that is within another one.
 fn strip_nan_form(mut expr: Expr) -> Expr {
-    match &mut expr {
-        Expr::ScalarFunction(function)
-            if function.func.inner().downcast_ref::<UnifiedFloat>().is_some_and(|f| f.form() == FloatForm::OneNan) =>
-        {
-            function.args.pop().unwrap_or_default()
-        }
-        _ => expr,
+    if unified_float(&expr).is_some_and(|unified| unified.float_form() == FloatForm::OneNan)
+        && let Expr::ScalarFunction(function) = &mut expr
+    {
+        return function.args.pop().unwrap_or_default();
     }
+    expr
 }
 
 /// The columns of a node's inputs.
@@ -229,7 +227,7 @@ impl FloatScope {
 
     fn float_type(&self, expr: &Expr) -> Option<DataType> {
         let kind = match unified_float(expr) {
-            Some(unified) => unified.kind().clone(),
+            Some(unified) => unified.float_type().clone(),
             // A type that is not known yet is an error when the statement runs.
             None => expr.get_type(&self.schema).ok()?,
         };
@@ -296,7 +294,7 @@ fn literal_zero(expr: &Expr) -> Option<ScalarValue> {
 }
 
 fn unified_zero(expr: &Expr) -> bool {
-    unified_float(expr).is_some_and(|unified| unified.form() == FloatForm::OneZero)
+    unified_float(expr).is_some_and(|unified| unified.float_form() == FloatForm::OneZero)
 }
 
 // A finite number, not zero or, if `zero`, also zero.

@@ -57,7 +57,7 @@ static DESCRIPTION: FunctionDescription = FunctionDescription {
 pub(crate) struct DrawnSurfaces {
     /// None if there are no surfaces.
     seed: Option<i64>,
-    /// Whether each is a reference.
+    /// Each with true if it is a reference.
     surfaces: BTreeMap<SurfaceId, bool>,
 }
 

@@ -24,7 +24,7 @@ struct ListMembership {
     meaning: NullMeaning,
 }
 
-/// What a null in the list is.
+/// The meaning of a null in the list.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 enum NullMeaning {
     /// No value that is equal.
@@ -78,13 +78,13 @@ impl ScalarUDFImpl for ListMembership {
         }
         let found = found.into_array(rows)?;
         let lists = lists.into_array(rows)?;
-        let has_null: Vec<bool> = match lists.data_type() {
+        let nulls: Vec<bool> = match lists.data_type() {
             DataType::List(_) => lists.as_list::<i32>().iter().map(|list| list.is_some_and(has_null)).collect(),
             DataType::LargeList(_) => lists.as_list::<i64>().iter().map(|list| list.is_some_and(has_null)).collect(),
             _ => vec![false; rows],
         };
-        let unknown = |(found, has_null): (Option<bool>, bool)| found.filter(|found| *found || !has_null);
-        let known: BooleanArray = found.as_boolean().iter().zip(has_null).map(unknown).collect();
+        let known = |(found, has_null): (Option<bool>, bool)| found.filter(|found| *found || !has_null);
+        let known: BooleanArray = found.as_boolean().iter().zip(nulls).map(known).collect();
         Ok(ColumnarValue::Array(Arc::new(known)))
     }
 

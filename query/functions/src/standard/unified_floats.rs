@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use arrow::array::{Array as _, ArrayRef, AsArray as _};
-use arrow::datatypes::{DataType, Field, FieldRef, Float32Type, Float64Type};
+use arrow::datatypes::{ArrowPrimitiveType, DataType, Field, FieldRef, Float32Type, Float64Type};
 use datafusion::common::utils::{normalize_float_zero, take_function_args};
 use datafusion::error::Result;
 use datafusion::logical_expr::{
@@ -11,7 +11,7 @@ use datafusion::logical_expr::{
 };
 use datafusion::scalar::ScalarValue;
 
-/// Which of the equal floats are made the same.
+/// The equal floats that are made the same.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum FloatForm {
     /// All NaNs are the positive one, which is the greatest float in Arrow's order, as in PostgreSQL.
@@ -35,12 +35,12 @@ impl UnifiedFloat {
     }
 
     /// Returns its form.
-    pub fn form(&self) -> FloatForm {
+    pub fn float_form(&self) -> FloatForm {
         self.form
     }
 
     /// Returns the type of its argument and result.
-    pub fn kind(&self) -> &DataType {
+    pub fn float_type(&self) -> &DataType {
         &self.kind
     }
 
@@ -96,22 +96,20 @@ impl ScalarUDFImpl for UnifiedFloat {
 /// costs one pass over them.
 pub(super) fn unify_nans(values: &ArrayRef) -> ArrayRef {
     match values.data_type() {
-        DataType::Float32 => {
-            let floats = values.as_primitive::<Float32Type>();
-            let unified = |x: f32| if x.is_nan() { f32::NAN } else { x };
-            match floats.values().iter().fold(false, |found, x| found | x.is_nan()) {
-                true => Arc::new(floats.unary::<_, Float32Type>(unified)),
-                false => values.clone(),
-            }
-        }
-        DataType::Float64 => {
-            let floats = values.as_primitive::<Float64Type>();
-            let unified = |x: f64| if x.is_nan() { f64::NAN } else { x };
-            match floats.values().iter().fold(false, |found, x| found | x.is_nan()) {
-                true => Arc::new(floats.unary::<_, Float64Type>(unified)),
-                false => values.clone(),
-            }
-        }
+        DataType::Float32 => replace_nans::<Float32Type>(values, f32::is_nan, f32::NAN),
+        DataType::Float64 => replace_nans::<Float64Type>(values, f64::is_nan, f64::NAN),
         _ => values.clone(),
+    }
+}
+
+fn replace_nans<T: ArrowPrimitiveType>(
+    values: &ArrayRef,
+    is_nan: impl Fn(T::Native) -> bool,
+    nan: T::Native,
+) -> ArrayRef {
+    let floats = values.as_primitive::<T>();
+    match floats.values().iter().fold(false, |found, x| found | is_nan(*x)) {
+        true => Arc::new(floats.unary::<_, T>(|x| if is_nan(x) { nan } else { x })),
+        false => values.clone(),
     }
 }

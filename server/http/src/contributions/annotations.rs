@@ -151,7 +151,7 @@ async fn draft_request(
 }
 
 // A verdict on a run changes the levels of all surfaces that rest on it, of other projects, too: it needs a right of
-// its own, and the client is told first what is derived again.
+// its own, and the client first receives what is derived again.
 fn check_reference_verdicts(
     catalogue: &LakeCatalogue,
     snapshot: &LakeSnapshot,
