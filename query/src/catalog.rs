@@ -18,7 +18,6 @@ use datafusion::logical_expr::ScalarUDF;
 use datafusion::optimizer::OptimizerRule;
 use datafusion::prelude::SessionContext;
 use datafusion::sql::parser::Statement;
-use echolake_functions::FunctionSet;
 use echolake_lake::{DataFile, Error as LakeError, Lake, LakeMoment, LakeSnapshot, VisibleRun};
 use echolake_lake_tables::{FileReaders, LakeTable};
 use echolake_mcap_tables::{self as mcap_tables, Contents, McapCalls, McapFiles};
@@ -42,7 +41,13 @@ const REMOTE_CHECK_LASTS: Duration = Duration::from_secs(1);
 /// Maximum number of cached past tables.
 const PAST_TABLES: usize = 32;
 
-/// Registers the tables of a lake in a query's context.
+/// Returns the optimizer rules for plans over tables and views: the same for every snapshot and every reader.
+pub(crate) fn optimizer_rules(lookups: &LookupFunctions) -> [Arc<dyn OptimizerRule + Send + Sync>; 3] {
+    [Arc::new(UnusedJoin), Arc::new(PairJoin::new(lookups)), Arc::new(SortedNulls)]
+}
+
+/// Registers the tables of a lake in a query's context. It is what a right has: the lake as readers with this right see
+/// it, and all that is cached for them.
 pub(crate) struct LakeCatalog {
     lake: Lake,
     source: FileReaders,
@@ -73,12 +78,11 @@ struct CatalogSnapshot {
 }
 
 impl LakeCatalog {
-    /// # Errors
-    /// [`Error::Lake`] if the rig cannot be laid out.
-    pub fn new(lake: &Lake, functions: &FunctionSet, source: FileReaders) -> Result<Self, Error> {
-        let lookups = LookupFunctions::from_lake(lake, functions)?;
+    /// Creates the catalogue of a lake as its reader sees it. `source` caches nothing for another reader but what all
+    /// may see.
+    pub fn new(lake: &Lake, lookups: LookupFunctions, source: FileReaders) -> Self {
         let small = source.small.clone();
-        Ok(Self {
+        Self {
             lake: lake.clone(),
             source,
             lookups,
@@ -88,12 +92,12 @@ impl LakeCatalog {
             past: Cache::new(PAST_TABLES),
             runs: Arc::new(McapFiles::new(lake, &small)),
             annotations: AnnotationCache::default(),
-        })
+        }
     }
 
-    /// Returns the optimizer rules for plans over these tables and views, the same for every snapshot.
-    pub fn optimizer_rules(&self) -> [Arc<dyn OptimizerRule + Send + Sync>; 3] {
-        [Arc::new(UnusedJoin), Arc::new(PairJoin::new(&self.lookups)), Arc::new(SortedNulls)]
+    /// Returns the lake as its reader sees it.
+    pub fn lake(&self) -> &Lake {
+        &self.lake
     }
 
     /// Registers everything that `statement` may name, all of one snapshot of the lake, and the program's own tables in

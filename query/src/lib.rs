@@ -40,7 +40,7 @@ mod views;
 pub use client::{EngineClient, QueryPermit, QueryQuota};
 pub use control::threads::QueryThreads;
 pub use echolake_mcap_tables::{Attachment, Contents, Topic};
-pub use engine::{QueryEngine, SqlFunction};
+pub use engine::{EngineLimits, QueryEngine, SqlFunction};
 pub use error::{Error, OUT_OF_RANGE, QueryPlace};
 pub use opaque::OpaqueValue;
 pub use request_memory::RequestMemory;

@@ -17,6 +17,13 @@ impl<T: Send + Sync + 'static> OpaqueValue<T> {
     }
 }
 
+impl<T: ?Sized> OpaqueValue<T> {
+    /// Returns whether nobody else shares the value.
+    pub(crate) fn is_unshared(&self) -> bool {
+        Arc::strong_count(&self.0) == 1
+    }
+}
+
 impl<T: ?Sized> Clone for OpaqueValue<T> {
     fn clone(&self) -> Self {
         Self(self.0.clone())

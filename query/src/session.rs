@@ -584,7 +584,7 @@ async fn send_batches(
 }
 
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 
 #[cfg(test)]
 mod limits_tests;

@@ -283,6 +283,18 @@ impl Lake {
         self.0.projects.is_some()
     }
 
+    /// Returns the projects whose runs this reader sees; None if it sees all runs.
+    #[cfg(feature = "tables")]
+    pub fn visible_projects(&self) -> Option<&BTreeSet<ProjectName>> {
+        self.0.projects.as_ref().map(ProjectLog::visible_projects)
+    }
+
+    /// Returns whether both are one open lake, as readers with the same or with other rights see it.
+    #[cfg(feature = "tables")]
+    pub fn is_same_lake(&self, other: &Self) -> bool {
+        Arc::ptr_eq(&self.0.log, &other.0.log)
+    }
+
     /// Returns what the cache has counted since it was made; None if there is no cache.
     #[cfg(feature = "tables")]
     pub fn cache_counts(&self) -> Option<CacheCounts> {

@@ -382,8 +382,8 @@ async fn errors_point_at_the_place() {
     .await;
 }
 
-/// Adds a run's log lines, or others in their place, as ingest does.
-async fn put_events(lake: &Lake, surface: &str, run: &str, derivation: &str, lines: usize) {
+/// Adds a run's log lines, or others in their place, as ingest does. A surface `a-wall` is of the project `a`.
+pub(crate) async fn put_events(lake: &Lake, surface: &str, run: &str, derivation: &str, lines: usize) {
     let pointer = VisibleRun {
         surface: surface.parse().expect("an id"),
         run: run.parse().expect("an id"),
@@ -407,7 +407,10 @@ async fn put_events(lake: &Lake, surface: &str, run: &str, derivation: &str, lin
                 _ => derivation,
             };
             match field.data_type() {
-                kind if field.name() == "project" => new_null_array(kind, count),
+                kind if field.name() == "project" => match surface.split_once('-') {
+                    Some((project, _)) => Arc::new(StringArray::from(vec![project; count])),
+                    None => new_null_array(kind, count),
+                },
                 DataType::Utf8 => Arc::new(StringArray::from(vec![text; count])),
                 kind => cast(&(0..count as i64).collect::<Int64Array>(), kind).expect("numbers"),
             }

@@ -32,6 +32,11 @@ impl ProjectLog {
         Self { log, projects, common }
     }
 
+    /// The projects whose runs are seen.
+    pub fn visible_projects(&self) -> &BTreeSet<ProjectName> {
+        &self.projects
+    }
+
     // Files of the other tables are seen if a run's row names them. Predictions are of a surface, whose name other
     // projects may use, too.
     fn keep_visible(&self, table: Table, files: &mut Vec<DataFile>) {

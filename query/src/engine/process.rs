@@ -1,0 +1,218 @@
+//! What a process has of an engine, whoever reads: memory, disk, footers of files, functions, threads, running queries.
+
+use std::collections::{BTreeSet, VecDeque};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
+
+use datafusion::error::DataFusionError;
+use datafusion::execution::FunctionRegistry as _;
+use datafusion::execution::disk_manager::DiskManagerBuilder;
+use datafusion::execution::memory_pool::GreedyMemoryPool;
+use datafusion::execution::object_store::{DefaultObjectStoreRegistry, ObjectStoreRegistry as _, ObjectStoreUrl};
+use datafusion::execution::runtime_env::{RuntimeEnv, RuntimeEnvBuilder};
+use datafusion::execution::session_state::{SessionState, SessionStateBuilder};
+use datafusion::functions_nested::min_max::array_min_udf;
+use datafusion::optimizer::{Optimizer, OptimizerRule};
+use datafusion::prelude::SessionConfig;
+use echolake_functions::{
+    FunctionSet, exact_aggregates, list_membership, octet_length_of_bytes, pattern_functions, whole_number_ranges,
+    zone_time,
+};
+use echolake_lake::Lake;
+use echolake_lake_tables::{FileReaders, LakeReaderFactory, SmallTables};
+use echolake_schema::ProjectName;
+
+use super::EngineLimits;
+use crate::catalog::{LakeCatalog, optimizer_rules};
+use crate::control::RunningQueries;
+use crate::control::threads::{QueryThreadGroups, QueryThreads};
+use crate::statement::{FloatForms, IntegerArithmetic, SubqueryConditions};
+use crate::system::SystemSource;
+use crate::views::LookupFunctions;
+use crate::{Error, OpaqueValue};
+
+/// URL of the lake's store. No other store is registered, so no query can reach a file outside of the lake.
+const STORE: &str = "echolake://lake/";
+/// URL of the store that DataFusion registers by default: the whole machine.
+const MACHINE: &str = "file:///";
+/// Rows per batch: at 384 samples each, 3 MB of responses.
+const BATCH_ROWS: usize = 2048;
+/// Cache size for the files' footers and page indexes, bytes. Queries read the same files again and again, and a
+/// thousand runs need more than DataFusion's default of 50 MiB.
+const METADATA_BYTES: usize = 256 << 20;
+/// Bytes that are fetched of a file's end on an object store: footer and page index of nearly all files in one request.
+const REMOTE_FOOTER_BYTES: usize = 128 << 10;
+/// Disk space that sorts and aggregations of all queries may use, bytes.
+const SPILL_BYTES: u64 = 16 << 30;
+/// Rights whose catalogues are cached, besides those in use.
+const CACHED_RIGHTS: usize = 16;
+
+/// What a process has of an engine.
+pub(crate) struct EngineProcess {
+    /// The lake as the engine was created on it.
+    lake: Lake,
+    /// Functions and optimizer rules, without tables.
+    pub template: SessionState,
+    lookups: LookupFunctions,
+    url: ObjectStoreUrl,
+    reader: Arc<LakeReaderFactory>,
+    pub threads: QueryThreadGroups,
+    pub running: RunningQueries,
+    /// Bytes that queries may hold; None for no limit.
+    pub memory: Option<usize>,
+    /// Names of echolake's own functions.
+    pub own: BTreeSet<String>,
+    /// A thread for timeouts, which busy query threads cannot delay.
+    pub watch: QueryThreads,
+    pub system: OnceLock<Arc<dyn SystemSource>>,
+    rights: CatalogCache,
+}
+
+impl EngineProcess {
+    /// # Errors
+    /// [`Error::Execution`] if DataFusion cannot be set up.
+    pub fn new(lake: &Lake, limits: &EngineLimits) -> Result<Self, Error> {
+        let failed = |e: DataFusionError| Error::from_execution("", &e);
+        let url = ObjectStoreUrl::parse(STORE).map_err(failed)?;
+        let runtime = build_runtime(lake, &url, limits.memory).map_err(failed)?;
+        let metadata = runtime.cache_manager.get_file_metadata_cache();
+        let reader = Arc::new(LakeReaderFactory::new(lake, metadata));
+        let functions = FunctionSet::all(lake.rig()).map_err(|e| Error::failed_query(&e.to_string()))?;
+        let threads = |e: std::io::Error| Error::failed_query(&format!("no threads for queries: {e}"));
+        let lookups = LookupFunctions::from_lake(lake, &functions)?;
+        Ok(Self {
+            lake: lake.clone(),
+            template: build_template(runtime, &functions, optimizer_rules(&lookups)),
+            lookups,
+            url,
+            reader,
+            threads: QueryThreadGroups::per_core("query").map_err(threads)?,
+            running: RunningQueries::default(),
+            memory: limits.memory,
+            own: functions.names().map(str::to_owned).collect(),
+            watch: QueryThreads::new("query-watch", 1).map_err(threads)?,
+            system: OnceLock::new(),
+            rights: CatalogCache::default(),
+        })
+    }
+
+    /// Returns the catalogue of the lake as its reader sees it: the cached one of the same right, if there is one.
+    ///
+    /// # Errors
+    /// [`Error::Execution`] if it is another lake than the engine's.
+    pub fn catalog_of(&self, lake: &Lake) -> Result<OpaqueValue<LakeCatalog>, Error> {
+        if !self.lake.is_same_lake(lake) {
+            return Err(Error::failed_query("the engine is another lake's"));
+        }
+        Ok(self.rights.get_or_insert(lake.visible_projects(), || self.open_catalog(lake)))
+    }
+
+    // Rows of small tables are cached by right. Footers are cached by file: what a reader may not see of a file is not
+    // read by its footer.
+    fn open_catalog(&self, lake: &Lake) -> LakeCatalog {
+        let source = FileReaders {
+            url: self.url.clone(),
+            reader: self.reader.clone(),
+            footer_bytes: lake.is_remote().then_some(REMOTE_FOOTER_BYTES),
+            small: Arc::new(SmallTables::new(lake)),
+            restricted: lake.is_restricted().then(|| lake.clone()),
+        };
+        LakeCatalog::new(lake, self.lookups.clone(), source)
+    }
+}
+
+/// The projects that a reader sees; None for all.
+type VisibleProjects = Option<BTreeSet<ProjectName>>;
+
+/// Catalogues by right, the one that was used last in front. A catalogue in use stays.
+#[derive(Default)]
+struct CatalogCache(Mutex<VecDeque<(VisibleProjects, OpaqueValue<LakeCatalog>)>>);
+
+impl CatalogCache {
+    fn get_or_insert(
+        &self,
+        right: Option<&BTreeSet<ProjectName>>,
+        open: impl FnOnce() -> LakeCatalog,
+    ) -> OpaqueValue<LakeCatalog> {
+        let mut known = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let at = known.iter().position(|(of, _)| of.as_ref() == right);
+        let (of, catalog) = match at.and_then(|at| known.remove(at)) {
+            Some(known) => known,
+            None => (right.cloned(), OpaqueValue::new(open())),
+        };
+        known.push_front((of, catalog.clone()));
+        while known.len() > CACHED_RIGHTS {
+            let Some(unused) = known.iter().rposition(|(_, catalog)| catalog.is_unshared()) else { break };
+            known.remove(unused);
+        }
+        catalog
+    }
+}
+
+fn build_template(
+    runtime: Arc<RuntimeEnv>,
+    functions: &FunctionSet,
+    rules: impl IntoIterator<Item = Arc<dyn OptimizerRule + Send + Sync>>,
+) -> SessionState {
+    let conditions: Arc<dyn OptimizerRule + Send + Sync> = Arc::new(SubqueryConditions);
+    let builder = SessionStateBuilder::new()
+        .with_config(session_config())
+        .with_runtime_env(runtime)
+        .with_default_features()
+        .with_analyzer_rule(Arc::new(IntegerArithmetic))
+        .with_analyzer_rule(Arc::new(FloatForms))
+        .with_optimizer_rules(std::iter::once(conditions).chain(Optimizer::new().rules).collect());
+    let mut state = rules.into_iter().fold(builder, SessionStateBuilder::with_optimizer_rule).build();
+    let _ = state.register_udf(Arc::new(octet_length_of_bytes()));
+    for function in whole_number_ranges() {
+        let _ = state.register_udf(Arc::new(function));
+    }
+    let _ = state.register_udf(Arc::new(zone_time()));
+    for function in list_membership() {
+        let _ = state.register_udf(Arc::new(function));
+    }
+    for function in exact_aggregates() {
+        let _ = state.register_udaf(Arc::new(function));
+    }
+    // DuckDB's name, as `list_max`, which DataFusion has.
+    let _ = state.register_udf(Arc::new(array_min_udf().as_ref().clone().with_aliases(["list_min"])));
+    for function in pattern_functions(state.config_options()) {
+        let _ = state.register_udf(Arc::new(function));
+    }
+    // They replace functions with the same names and aliases; only a closed registry would refuse.
+    for function in functions.scalar() {
+        let _ = state.register_udf(function.clone());
+    }
+    for function in functions.aggregate() {
+        let _ = state.register_udaf(function.clone());
+    }
+    state
+}
+
+// DataFusion's defaults already use all cores and prune by row group and page.
+fn session_config() -> SessionConfig {
+    let mut config = SessionConfig::new().with_information_schema(true).with_batch_size(BATCH_ROWS);
+    let options = config.options_mut();
+    options.sql_parser.collect_spans = true;
+    // As in Postgres' protocol, a TIMESTAMPTZ is of UTC.
+    options.execution.time_zone = Some("UTC".to_owned());
+    // DataFusion compares the comments on columns, too, of which a union of unions takes the first or the last.
+    options.execution.skip_physical_aggregate_schema_check = true;
+    // Files contain plain strings, and so do the output formats of answers.
+    options.execution.parquet.schema_force_view_types = false;
+    config
+}
+
+fn build_runtime(lake: &Lake, url: &ObjectStoreUrl, memory: Option<usize>) -> Result<Arc<RuntimeEnv>, DataFusionError> {
+    let stores = DefaultObjectStoreRegistry::new();
+    stores.deregister_store(ObjectStoreUrl::parse(MACHINE)?.as_ref())?;
+    stores.register_store(url.as_ref(), lake.store());
+    let mut builder = RuntimeEnvBuilder::new();
+    if let Some(memory) = memory {
+        builder = builder.with_memory_pool(Arc::new(GreedyMemoryPool::new(memory)));
+    }
+    builder
+        .with_disk_manager_builder(DiskManagerBuilder::default().with_max_temp_directory_size(SPILL_BYTES))
+        .with_object_store_registry(Arc::new(stores))
+        .with_metadata_cache_limit(METADATA_BYTES)
+        .build_arc()
+}
