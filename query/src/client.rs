@@ -23,7 +23,7 @@ use crate::control::pool::{HeldMemory, PartialPool};
 /// ```
 #[derive(Debug)]
 pub struct EngineClient {
-    name: String,
+    name: Arc<str>,
     quota: QueryQuota,
     places: Option<Arc<Semaphore>>,
     /// Bytes that operators of its queries have reserved.
@@ -32,7 +32,7 @@ pub struct EngineClient {
 
 impl EngineClient {
     /// Creates a client.
-    pub fn new(name: impl Into<String>, quota: QueryQuota) -> Self {
+    pub fn new(name: impl Into<Arc<str>>, quota: QueryQuota) -> Self {
         let places = quota.concurrent.map(|places| Arc::new(Semaphore::new(places)));
         Self { name: name.into(), quota, places, held: Arc::default() }
     }
@@ -40,6 +40,11 @@ impl EngineClient {
     /// Returns the name for logs and error messages.
     pub fn name(&self) -> &str {
         &self.name
+    }
+
+    /// Returns the name to be shared.
+    pub(crate) fn shared_name(&self) -> Arc<str> {
+        self.name.clone()
     }
 
     /// Returns the limits on the client's queries.
@@ -80,7 +85,7 @@ impl EngineClient {
     }
 
     fn busy_error(&self) -> Error {
-        Error::Busy { client: self.name.clone(), limit: self.quota.concurrent.unwrap_or(0) }
+        Error::Busy { client: self.name.to_string(), limit: self.quota.concurrent.unwrap_or(0) }
     }
 }
 

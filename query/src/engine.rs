@@ -12,10 +12,11 @@ use datafusion::logical_expr::Documentation;
 use datafusion::prelude::SessionContext;
 use echolake_lake::Lake;
 use futures::FutureExt as _;
+use tokio::runtime::Handle;
 
 use crate::catalog::LakeCatalog;
 use crate::client::QueryQuota;
-use crate::control::threads::QueryThreadGroups;
+use crate::control::blame::StatementBlame;
 use crate::control::{QueryTicket, StopReason};
 use crate::system::{self, SystemSource};
 use crate::{Error, OpaqueValue};
@@ -53,6 +54,12 @@ pub struct QueryEngine {
 pub struct EngineLimits {
     /// Bytes that they may hold; None for no limit.
     pub memory: Option<usize>,
+    /// Statements that compute at once, while others wait; None for twice the cores, four at least. Statements whose
+    /// readers fetch nothing do not count.
+    pub computing: Option<usize>,
+    /// Niceness of the threads that plan and run statements, -20 to 19; None for that of the process. Without a system
+    /// that lets threads differ, as Linux does, it is the whole process's.
+    pub niceness: Option<i32>,
 }
 
 /// A function that queries may call.
@@ -84,7 +91,7 @@ impl QueryEngine {
     /// # Errors
     /// [`Error::Execution`] if DataFusion cannot be set up.
     pub fn new(lake: &Lake, memory: Option<usize>) -> Result<Self, Error> {
-        Self::with_limits(lake, EngineLimits { memory })
+        Self::with_limits(lake, EngineLimits { memory, ..EngineLimits::default() })
     }
 
     /// Creates an engine on a lake with limits on all of its queries together.
@@ -126,9 +133,23 @@ impl QueryEngine {
         self.process.running.count_running()
     }
 
-    /// Returns the longest time for which work has continued after its query was ended; None if there is none.
-    pub fn longest_overdue(&self) -> Option<Duration> {
-        self.process.running.longest_overdue()
+    /// Returns a statement that was ended (cancelled, out of time, its reader gone) or has ended, and of whose threads
+    /// one has computed for more than `grace` since. It is found by regular calls: the first one after its end notes
+    /// what its threads had computed. Processor time counts, so that nothing is blamed for waiting on a busy machine.
+    pub fn find_runaway(&self, grace: Duration) -> Option<StatementBlame> {
+        let running = self.process.running.find_runaway(grace);
+        running.or_else(|| self.process.seats.find_runaway(grace))
+    }
+
+    /// Stops the statement that holds the most memory, with an error that says so; returns whose it was, and None if no
+    /// statement holds any.
+    pub fn cancel_largest(&self) -> Option<StatementBlame> {
+        self.process.running.cancel_largest()
+    }
+
+    /// Cancels all that the clients of this name run.
+    pub fn cancel_client(&self, name: &str) {
+        self.process.running.cancel_client(name);
     }
 
     /// Returns the functions, sorted by name.
@@ -154,22 +175,9 @@ impl QueryEngine {
         }
     }
 
-    /// Runs other work of a client's request, such as parsing, in the same way as queries: on the same threads and with
-    /// a timeout of `time`. If the caller drops it, the work is ended or reported by [`QueryEngine::longest_overdue`].
-    ///
-    /// # Errors
-    /// Those of `work`; [`Error::TimeLimit`].
-    pub async fn supervise_work<T: Send + 'static, E: From<Error> + Send + 'static>(
-        &self,
-        time: Option<Duration>,
-        work: impl Future<Output = Result<T, E>> + Send + 'static,
-    ) -> Result<T, E> {
-        self.on_threads(&self.create_ticket(time), work).await
-    }
-
-    /// Creates a ticket with a timeout of `time`.
-    pub(crate) fn create_ticket(&self, time: Option<Duration>) -> Arc<QueryTicket> {
-        let ticket = Arc::new(QueryTicket::new());
+    /// Registers a ticket, which is stopped after `time`.
+    pub(crate) fn start_ticket(&self, ticket: QueryTicket, time: Option<Duration>) -> Arc<QueryTicket> {
+        let ticket = Arc::new(ticket);
         self.process.running.add_ticket(&ticket);
         if let (Some(time), Some(threads)) = (time, self.process.watch.handle()) {
             let watched = Arc::downgrade(&ticket);
@@ -184,16 +192,17 @@ impl QueryEngine {
         ticket
     }
 
+    /// Runs `work` on the ticket's seat, once it has a turn. Dropping this stops it.
     // Constants are computed while a query is planned, so planning must not block the caller's threads.
-    pub(crate) async fn on_threads<T: Send + 'static, E: From<Error> + Send + 'static>(
+    pub(crate) async fn on_seat<T: Send + 'static, E: From<Error> + Send + 'static>(
         &self,
         ticket: &Arc<QueryTicket>,
         work: impl Future<Output = Result<T, E>> + Send + 'static,
     ) -> Result<T, E> {
         let mut stop = StopOnDrop { ticket: ticket.clone(), is_done: false };
         let begun = ticket.clone();
+        let work = ticket.scope_work(work);
         let guarded = async move {
-            let _guard = begun.begin_work();
             tokio::select! {
                 biased;
                 why = begun.wait_for_stop() => Err(Error::from_stop(&why).into()),
@@ -202,9 +211,8 @@ impl QueryEngine {
         };
         let guarded = guarded.boxed();
         let work = async {
-            let Some(task) = self.process.threads.begin_work(guarded).await else { return Err(ended_error().into()) };
-            let done = task.await.unwrap_or_else(|_| Some(Err(defect_error().into())));
-            done.unwrap_or_else(|| Err(ended_error().into()))
+            let threads = self.begin_computing(ticket).await?;
+            threads.spawn(guarded).await.unwrap_or_else(|_| Err(defect_error().into()))
         };
         let done = tokio::select! {
             done = work => done,
@@ -214,14 +222,21 @@ impl QueryEngine {
         done
     }
 
+    /// Waits for a turn of the ticket, and takes its seat; returns the seat's threads.
+    pub(crate) async fn begin_computing(&self, ticket: &QueryTicket) -> Result<Handle, Error> {
+        let threads = ticket.begin_computing(&self.process.turns, &self.process.seats).await;
+        let failed = |e| Error::failed_query(&format!("the system gives no threads for the query: {e}"));
+        threads.map_err(failed)?.ok_or_else(ended_error)
+    }
+
+    /// Waits for a turn of the ticket, which has a seat.
+    pub(crate) async fn resume_computing(&self, ticket: &QueryTicket) {
+        ticket.resume_computing(&self.process.turns).await;
+    }
+
     /// Returns the catalogue of tables and views.
     pub(crate) fn catalog(&self) -> &LakeCatalog {
         &self.catalog
-    }
-
-    /// Returns the threads that plan and run queries.
-    pub(crate) fn threads(&self) -> &QueryThreadGroups {
-        &self.process.threads
     }
 
     /// Returns the memory limit of one query, bytes; `usize::MAX` if there is none.
@@ -266,8 +281,8 @@ impl Drop for StopOnDrop {
     }
 }
 
-/// Returns the error for an engine that has ended.
-pub(crate) fn ended_error() -> Error {
+// The error for an engine that has ended.
+fn ended_error() -> Error {
     Error::failed_query("the query service has ended")
 }
 

@@ -25,6 +25,9 @@ const SUGGESTED: usize = 3;
 /// Maximum number of columns in a hint if no name is similar.
 const LISTED: usize = 12;
 
+/// The message for the query that is ended to get memory back.
+const EXHAUSTED: &str = "the server's memory is exhausted, and this query holds the most of it";
+
 /// Begins the message of a calculation whose result its type cannot hold.
 pub const OUT_OF_RANGE: &str = "overflow, out of range: ";
 /// Table functions of other databases that read files.
@@ -262,6 +265,7 @@ impl Error {
         match why {
             StopReason::Cancelled => Self::Cancelled,
             StopReason::Time(limit) => Self::TimeLimit { limit: *limit },
+            StopReason::Memory => Self::MemoryLimit { message: EXHAUSTED.to_owned() },
         }
     }
 }

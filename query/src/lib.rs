@@ -38,6 +38,8 @@ mod system;
 mod views;
 
 pub use client::{EngineClient, QueryPermit, QueryQuota};
+pub use control::blame::StatementBlame;
+pub use control::continue_request;
 pub use control::threads::QueryThreads;
 pub use echolake_mcap_tables::{Attachment, Contents, Topic};
 pub use engine::{EngineLimits, QueryEngine, SqlFunction};

@@ -1,10 +1,11 @@
 //! A session: every query sees one snapshot of the lake and may only read.
 
+mod answer;
+
 use std::collections::HashSet;
 use std::sync::Arc;
 
 use arrow::datatypes::{DataType, SchemaRef};
-use arrow::record_batch::RecordBatch;
 use bytes::Bytes;
 use datafusion::common::ParamValues;
 use datafusion::error::DataFusionError;
@@ -12,26 +13,26 @@ use datafusion::execution::TaskContext;
 use datafusion::execution::memory_pool::MemoryPool;
 use datafusion::execution::session_state::SessionState;
 use datafusion::logical_expr::LogicalPlan;
-use datafusion::physical_plan::{ExecutionPlan, execute_stream};
 use datafusion::prelude::SessionContext;
 use datafusion::sql::parser::Statement;
 use echolake_lake::{Lake, LakeSnapshot, VisibleRun};
 use echolake_mcap_tables::Contents;
 use echolake_schema::RunId;
 use echolake_schema::annotations::Annotation;
+use futures::FutureExt as _;
 use futures::future::BoxFuture;
-use futures::{FutureExt as _, StreamExt as _};
 use tokio::sync::mpsc;
-use tokio::task::JoinHandle;
 
 use crate::client::{EngineClient, QueryPermit, QueryQuota};
+use crate::control::QueryTicket;
 use crate::control::pool::PartialPool;
-use crate::control::{QueryTicket, StopReason};
-use crate::engine::{self, QueryEngine, SqlFunction};
+use crate::engine::{QueryEngine, SqlFunction};
 use crate::request_memory::RequestMemory;
 use crate::statement::{PredicateForm, append_predicate, parse_statement, prepare_statement};
 use crate::system::SYSTEM_SCHEMA;
 use crate::{Error, OpaqueValue};
+use answer::drive_query;
+pub use answer::{CancelHandle, QueryAnswer};
 
 /// Capacity of the queue of batches to a slow reader.
 const AHEAD: usize = 2;
@@ -41,6 +42,7 @@ const AHEAD: usize = 2;
 pub struct Session {
     engine: QueryEngine,
     client: Arc<EngineClient>,
+    request: Option<u64>,
     extend: Option<ContextExtension>,
 }
 
@@ -100,84 +102,10 @@ impl PreparedQuery {
     }
 }
 
-/// A stream of answer batches. Dropping it cancels the query.
-pub struct QueryAnswer {
-    /// Its columns.
-    pub schema: SchemaRef,
-    batches: mpsc::Receiver<Result<RecordBatch, DataFusionError>>,
-    query: Option<JoinHandle<Option<()>>>,
-    ticket: Arc<QueryTicket>,
-    /// The text, for places of errors.
-    sql: String,
-    rows: u64,
-    limit: Option<u64>,
-    // Keeps the query's threads alive while the answer is read, even if the session is dropped.
-    _engine: QueryEngine,
-}
-
-/// Cancels a query from another task.
-#[derive(Clone)]
-pub struct CancelHandle(Arc<QueryTicket>);
-
-impl CancelHandle {
-    /// Cancels the query; its answer fails with [`Error::Cancelled`]. Has no effect on a finished query.
-    pub fn cancel(&self) {
-        self.0.stop(StopReason::Cancelled);
-    }
-}
-
 impl QueryEngine {
     /// Creates a session of a client, one per connection.
     pub fn open_session(&self, client: &Arc<EngineClient>) -> Session {
-        Session { engine: self.clone(), client: client.clone(), extend: None }
-    }
-}
-
-impl QueryAnswer {
-    /// Returns the next rows; None after the last.
-    ///
-    /// # Errors
-    /// [`Error::Execution`] if the query fails while it runs; [`Error::Cancelled`], [`Error::TimeLimit`],
-    /// [`Error::MemoryLimit`] or [`Error::RowLimit`] if it may not continue.
-    pub async fn next(&mut self) -> Result<Option<RecordBatch>, Error> {
-        let batch = tokio::select! {
-            biased;
-            batch = self.batches.recv() => batch,
-            why = self.ticket.wait_for_stop() => return Err(Error::from_stop(&why)),
-        };
-        let Some(batch) = batch else { return self.end_query().await };
-        let batch = batch.map_err(|e| Error::from_execution(&self.sql, &e))?;
-        self.rows += batch.num_rows() as u64;
-        if let Some(limit) = self.limit.filter(|limit| self.rows > *limit) {
-            self.ticket.stop(StopReason::Cancelled);
-            return Err(Error::RowLimit { limit });
-        }
-        Ok(Some(batch))
-    }
-
-    /// Returns the most memory that its operators have held, bytes.
-    pub fn peak_memory(&self) -> usize {
-        self.ticket.held_memory().peak_bytes()
-    }
-
-    /// Returns a handle that cancels this answer's query.
-    pub fn cancel_handle(&self) -> CancelHandle {
-        CancelHandle(self.ticket.clone())
-    }
-
-    // Without this, an answer whose query panicked would look complete.
-    async fn end_query(&mut self) -> Result<Option<RecordBatch>, Error> {
-        let Some(query) = self.query.take() else { return Ok(None) };
-        match query.await {
-            Ok(_) => self.ticket.stop_reason().map_or(Ok(None), |why| Err(Error::from_stop(why))),
-            Err(_) => Err(engine::defect_error()),
-        }
-    }
-}
-
-impl Drop for QueryAnswer {
-    fn drop(&mut self) {
-        self.ticket.stop(StopReason::Cancelled);
+        Session { engine: self.clone(), client: client.clone(), request: None, extend: None }
     }
 }
 
@@ -195,6 +123,15 @@ impl Session {
     #[must_use]
     pub fn with_extension(mut self, extend: ContextExtension) -> Self {
         self.extend = Some(extend);
+        self
+    }
+
+    /// Sets the number of the request that the session's queries are for, see [`StatementBlame::request`].
+    ///
+    /// [`StatementBlame::request`]: crate::StatementBlame::request
+    #[must_use]
+    pub fn of_request(mut self, request: Option<u64>) -> Self {
+        self.request = request;
         self
     }
 
@@ -375,15 +312,33 @@ impl Session {
                 let _place = place;
                 work.await
             };
-            self.engine.on_threads(&ticket, work).await
+            self.engine.on_seat(&ticket, work).await
         };
         run.boxed()
+    }
+
+    /// Runs other work of a client's request, such as parsing, in the same way as queries: within the client's time, in
+    /// one of its turns, on a seat. It needs no permit. Dropping it ends the work at its next await; then it is reported
+    /// by [`QueryEngine::find_runaway`] if it goes on.
+    ///
+    /// # Errors
+    /// Those of `work`; [`Error::TimeLimit`].
+    pub async fn supervise_work<T: Send + 'static, E: From<Error> + Send + 'static>(
+        &self,
+        work: impl Future<Output = Result<T, E>> + Send + 'static,
+    ) -> Result<T, E> {
+        self.engine.on_seat(&self.start_ticket(), work).await
     }
 
     // The query's timeout starts here and includes waiting.
     fn start_query(&self) -> Result<Started, Error> {
         let place = self.client.acquire_place()?;
-        Ok(Started { ticket: self.engine.create_ticket(self.client.quota().time), place })
+        Ok(Started { ticket: self.start_ticket(), place })
+    }
+
+    fn start_ticket(&self) -> Arc<QueryTicket> {
+        let ticket = QueryTicket::new(self.client.shared_name(), self.request);
+        self.engine.start_ticket(ticket, self.client.quota().time)
     }
 
     async fn plan_statement(
@@ -392,6 +347,7 @@ impl Session {
         mut statement: Statement,
         ticket: &Arc<QueryTicket>,
     ) -> Result<PreparedQuery, Error> {
+        ticket.set_statement(sql);
         let session = self.clone();
         let sql = sql.to_owned();
         let plan = async move {
@@ -405,7 +361,7 @@ impl Session {
             let plan = OpaqueValue::new(prepare_statement(&sql, statement, &state).await?);
             Ok(PreparedQuery { state: OpaqueValue::new(state), plan, snapshot, sql, is_optimized: false })
         };
-        self.engine.on_threads(ticket, plan).await
+        self.engine.on_seat(ticket, plan).await
     }
 
     async fn run_plan(
@@ -416,6 +372,7 @@ impl Session {
         started: Started,
     ) -> Result<QueryAnswer, Error> {
         let Started { ticket, place } = started;
+        ticket.set_statement(&prepared.sql);
         let context = self.task_context(&state, &ticket);
         let text = prepared.sql.clone();
         let is_optimized = prepared.is_optimized;
@@ -426,10 +383,10 @@ impl Session {
             };
             planned.map_err(|error| Error::from_optimizing(&text, &error))
         };
-        let plan = self.engine.on_threads(&ticket, planned).await?;
+        let plan = self.engine.on_seat(&ticket, planned).await?;
         let schema = plan.schema();
         let (send, batches) = mpsc::channel(AHEAD);
-        let query = drive_query(plan, context, send, ticket.clone(), place).boxed();
+        let query = drive_query(plan, context, send, self.engine.clone(), ticket.clone(), place).boxed();
         // Dropped, it stops the query, which may have begun.
         let mut answer = QueryAnswer {
             schema,
@@ -442,9 +399,7 @@ impl Session {
             _engine: self.engine.clone(),
         };
         tokio::select! {
-            begun = self.engine.threads().begin_work(query) => {
-                answer.query = Some(begun.ok_or_else(engine::ended_error)?);
-            }
+            threads = self.engine.begin_computing(&answer.ticket) => answer.query = Some(threads?.spawn(query)),
             why = answer.ticket.wait_for_stop() => return Err(Error::from_stop(&why)),
         }
         Ok(answer)
@@ -549,45 +504,17 @@ struct Started {
     place: QueryPermit,
 }
 
-// Runs a query. It holds its permit until its operators are dropped, even if the reader is gone.
-async fn drive_query(
-    plan: Arc<dyn ExecutionPlan>,
-    context: Arc<TaskContext>,
-    send: mpsc::Sender<Result<RecordBatch, DataFusionError>>,
-    ticket: Arc<QueryTicket>,
-    _place: QueryPermit,
-) {
-    let _work = ticket.begin_work();
-    tokio::select! {
-        biased;
-        _ = ticket.wait_for_stop() => {}
-        () = send_batches(plan, context, &send) => {}
-    }
-}
-
-// An error of `send` means that the answer was dropped.
-async fn send_batches(
-    plan: Arc<dyn ExecutionPlan>,
-    context: Arc<TaskContext>,
-    send: &mpsc::Sender<Result<RecordBatch, DataFusionError>>,
-) {
-    let mut batches = match execute_stream(plan, context) {
-        Ok(batches) => batches,
-        Err(error) => return drop(send.send(Err(error)).await),
-    };
-    while let Some(batch) = batches.next().await {
-        let has_failed = batch.is_err();
-        if send.send(batch).await.is_err() || has_failed {
-            return;
-        }
-    }
-}
-
 #[cfg(test)]
 pub(crate) mod tests;
 
 #[cfg(test)]
+mod call_limits_tests;
+
+#[cfg(test)]
 mod limits_tests;
+
+#[cfg(test)]
+mod turns_tests;
 
 #[cfg(test)]
 mod attempts;

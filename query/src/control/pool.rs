@@ -31,6 +31,11 @@ impl HeldMemory {
         self.peak.load(Ordering::Relaxed)
     }
 
+    /// Returns what is held now, bytes.
+    pub fn current_bytes(&self) -> usize {
+        self.now.load(Ordering::Relaxed)
+    }
+
     fn grow(&self, additional: usize) {
         let before = self.now.fetch_add(additional, Ordering::Relaxed);
         self.peak.fetch_max(before.saturating_add(additional), Ordering::Relaxed);
@@ -103,7 +108,7 @@ impl MemoryPool for PartialPool {
     }
 
     fn reserved(&self) -> usize {
-        self.held.now.load(Ordering::Relaxed)
+        self.held.current_bytes()
     }
 
     fn memory_limit(&self) -> MemoryLimit {
@@ -137,6 +142,6 @@ mod tests {
         first.free();
         second.try_grow(6).expect("what is given back is free");
         assert_eq!(all.reserved(), 14);
-        assert_eq!((client_held.now.load(Ordering::Relaxed), client_held.peak_bytes()), (6, 6));
+        assert_eq!((client_held.current_bytes(), client_held.peak_bytes()), (6, 6));
     }
 }

@@ -14,8 +14,8 @@ use datafusion::functions_nested::min_max::array_min_udf;
 use datafusion::optimizer::{Optimizer, OptimizerRule};
 use datafusion::prelude::SessionConfig;
 use echolake_functions::{
-    FunctionSet, exact_aggregates, list_membership, octet_length_of_bytes, pattern_functions, whole_number_ranges,
-    zone_time,
+    FunctionSet, exact_aggregates, limited_functions, list_membership, octet_length_of_bytes, pattern_functions,
+    whole_number_ranges, zone_time,
 };
 use echolake_lake::Lake;
 use echolake_lake_tables::{FileReaders, LakeReaderFactory, SmallTables};
@@ -24,8 +24,10 @@ use echolake_schema::ProjectName;
 use super::EngineLimits;
 use crate::catalog::{LakeCatalog, optimizer_rules};
 use crate::control::RunningQueries;
-use crate::control::threads::{QueryThreadGroups, QueryThreads};
-use crate::statement::{FloatForms, IntegerArithmetic, SubqueryConditions};
+use crate::control::seats::SeatPool;
+use crate::control::threads::{QueryThreads, count_cores};
+use crate::control::turns::TurnQueue;
+use crate::statement::{EndingRule, FloatForms, IntegerArithmetic, LimitedOperators, SubqueryConditions};
 use crate::system::SystemSource;
 use crate::views::LookupFunctions;
 use crate::{Error, OpaqueValue};
@@ -43,6 +45,8 @@ const METADATA_BYTES: usize = 256 << 20;
 const REMOTE_FOOTER_BYTES: usize = 128 << 10;
 /// Disk space that sorts and aggregations of all queries may use, bytes.
 const SPILL_BYTES: u64 = 16 << 30;
+/// Statements that may compute at once on a machine with one core or two.
+const LEAST_COMPUTING: usize = 4;
 /// Rights whose catalogues are cached, besides those in use.
 const CACHED_RIGHTS: usize = 16;
 
@@ -55,7 +59,8 @@ pub(crate) struct EngineProcess {
     lookups: LookupFunctions,
     url: ObjectStoreUrl,
     reader: Arc<LakeReaderFactory>,
-    pub threads: QueryThreadGroups,
+    pub turns: Arc<TurnQueue>,
+    pub seats: Arc<SeatPool>,
     pub running: RunningQueries,
     /// Bytes that queries may hold; None for no limit.
     pub memory: Option<usize>,
@@ -81,11 +86,12 @@ impl EngineProcess {
         let lookups = LookupFunctions::from_lake(lake, &functions)?;
         Ok(Self {
             lake: lake.clone(),
-            template: build_template(runtime, &functions, optimizer_rules(&lookups)),
+            template: build_template(runtime, &functions, optimizer_rules(&lookups), limits),
             lookups,
             url,
             reader,
-            threads: QueryThreadGroups::per_core("query").map_err(threads)?,
+            turns: TurnQueue::new(limits.computing.unwrap_or_else(default_computing)),
+            seats: SeatPool::new(limits.niceness),
             running: RunningQueries::default(),
             memory: limits.memory,
             own: functions.names().map(str::to_owned).collect(),
@@ -120,6 +126,11 @@ impl EngineProcess {
     }
 }
 
+// Statements wait for the store now and then; more at once would hold memory, and not end sooner.
+fn default_computing() -> usize {
+    (2 * count_cores()).max(LEAST_COMPUTING)
+}
+
 /// The projects that a reader sees; None for all.
 type VisibleProjects = Option<BTreeSet<ProjectName>>;
 
@@ -152,16 +163,19 @@ fn build_template(
     runtime: Arc<RuntimeEnv>,
     functions: &FunctionSet,
     rules: impl IntoIterator<Item = Arc<dyn OptimizerRule + Send + Sync>>,
+    limits: &EngineLimits,
 ) -> SessionState {
     let conditions: Arc<dyn OptimizerRule + Send + Sync> = Arc::new(SubqueryConditions);
-    let builder = SessionStateBuilder::new()
+    let rules = std::iter::once(conditions).chain(Optimizer::new().rules).chain(rules);
+    let ending = |rule| -> Arc<dyn OptimizerRule + Send + Sync> { Arc::new(EndingRule(rule)) };
+    let mut state = SessionStateBuilder::new()
         .with_config(session_config())
         .with_runtime_env(runtime)
         .with_default_features()
         .with_analyzer_rule(Arc::new(IntegerArithmetic))
         .with_analyzer_rule(Arc::new(FloatForms))
-        .with_optimizer_rules(std::iter::once(conditions).chain(Optimizer::new().rules).collect());
-    let mut state = rules.into_iter().fold(builder, SessionStateBuilder::with_optimizer_rule).build();
+        .with_optimizer_rules(rules.map(ending).collect())
+        .build();
     let _ = state.register_udf(Arc::new(octet_length_of_bytes()));
     for function in whole_number_ranges() {
         let _ = state.register_udf(Arc::new(function));
@@ -185,7 +199,20 @@ fn build_template(
     for function in functions.aggregate() {
         let _ = state.register_udaf(function.clone());
     }
-    state
+    match limits.memory {
+        Some(_) => limit_calls(state),
+        None => state,
+    }
+}
+
+fn limit_calls(mut state: SessionState) -> SessionState {
+    let limited: Vec<_> = limited_functions(|name| state.scalar_functions().get(name).cloned());
+    let limited: Vec<_> = limited.into_iter().map(Arc::new).collect();
+    for function in &limited {
+        let _ = state.register_udf(function.clone());
+    }
+    let rule = LimitedOperators::new(&limited);
+    SessionStateBuilder::new_from_existing(state).with_analyzer_rule(Arc::new(rule)).build()
 }
 
 // DataFusion's defaults already use all cores and prune by row group and page.

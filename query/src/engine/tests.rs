@@ -44,7 +44,8 @@ async fn a_timer_ends_with_its_query() {
     let engine = QueryEngine::new(&lake, None).expect("an engine");
     let tasks = engine.process.watch.handle().expect("threads").metrics();
     let before = tasks.num_alive_tasks();
-    let tickets: Vec<_> = (0..100).map(|_| engine.create_ticket(Some(Duration::from_secs(3600)))).collect();
+    let ticket = || engine.start_ticket(QueryTicket::new("test".into(), None), Some(Duration::from_secs(3600)));
+    let tickets: Vec<_> = (0..100).map(|_| ticket()).collect();
     assert_eq!(tasks.num_alive_tasks(), before + 100);
     drop(tickets);
     let ended = async {

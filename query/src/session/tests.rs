@@ -5,6 +5,7 @@ use std::sync::atomic::AtomicBool;
 use arrow::array::{ArrayRef, AsArray as _, Int64Array, StringArray, new_null_array};
 use arrow::compute::cast;
 use arrow::datatypes::{DataType, Field, Float64Type, Int64Type};
+use arrow::record_batch::RecordBatch;
 use datafusion::execution::object_store::ObjectStoreUrl;
 use echolake_lake::{FileName, ReferenceSurfaces, VisibleRun, encode_batches};
 use echolake_schema::Rig;
@@ -21,7 +22,7 @@ async fn lake() -> (tempfile::TempDir, Lake) {
     (folder, lake)
 }
 
-async fn rows(session: &Session, sql: &str) -> Vec<arrow::record_batch::RecordBatch> {
+async fn rows(session: &Session, sql: &str) -> Vec<RecordBatch> {
     let mut answer = session.query(sql).await.unwrap_or_else(|e| panic!("{sql}: {e}"));
     let mut batches = Vec::new();
     while let Some(batch) = answer.next().await.unwrap_or_else(|e| panic!("{sql}: {e}")) {

@@ -23,6 +23,7 @@ use datafusion::logical_expr::{
 use datafusion::optimizer::AnalyzerRule;
 use datafusion::physical_expr_common::datum::apply;
 use datafusion::scalar::ScalarValue;
+use echolake_functions::check_stop;
 
 /// The rule; it follows the coercion of types.
 #[derive(Debug)]
@@ -158,6 +159,7 @@ impl ScalarUDFImpl for CheckedOperator {
     }
 
     fn invoke_with_args(&self, args: ScalarFunctionArgs) -> Result<ColumnarValue> {
+        check_stop()?;
         let [left, right] = take_function_args(self.name(), args.args)?;
         match self.operator {
             Operator::Plus => apply(&left, &right, add),

@@ -4,6 +4,7 @@
 use std::collections::HashMap;
 use std::ops::Range;
 use std::sync::{Arc, Mutex, PoisonError, Weak};
+use std::time::Duration;
 
 use bytes::Bytes;
 use datafusion::datasource::listing::PartitionedFile;
@@ -21,6 +22,10 @@ use parquet::arrow::async_reader::AsyncFileReader;
 use parquet::errors::Result as ParquetResult;
 use parquet::file::metadata::ParquetMetaData;
 use tokio::sync::Mutex as AsyncMutex;
+use tokio::time::timeout;
+
+/// Time for which a reader waits for another one, which is about to read the same footer.
+const FOOTER_WAIT: Duration = Duration::from_secs(1);
 
 /// Makes readers of a lake's data files, which share the files' footers.
 #[derive(Debug)]
@@ -84,7 +89,8 @@ impl FooterReads {
     }
 }
 
-/// A reader that waits while another one reads the file's footer.
+/// A reader that waits while another one reads the file's footer, but not for long: nobody polls a query whose reader
+/// fetches no rows.
 struct FooterReader {
     reader: Box<dyn AsyncFileReader + Send>,
     footer_read: Arc<AsyncMutex<()>>,
@@ -104,7 +110,7 @@ impl AsyncFileReader for FooterReader {
         options: Option<&'a ArrowReaderOptions>,
     ) -> BoxFuture<'a, ParquetResult<Arc<ParquetMetaData>>> {
         async move {
-            let _reading = self.footer_read.lock().await;
+            let _reading = timeout(FOOTER_WAIT, self.footer_read.lock()).await;
             self.reader.get_metadata(options).await
         }
         .boxed()

@@ -8,7 +8,9 @@ use std::time::Duration;
 use arrow::datatypes::SchemaRef;
 use datafusion::common::ParamValues;
 use echolake_lake::Lake;
-use echolake_query::{EngineClient, PreparedQuery, QueryEngine, QueryThreads, RequestMemory, Session, SqlFunction};
+use echolake_query::{
+    EngineClient, PreparedQuery, QueryEngine, QueryThreads, RequestMemory, Session, SqlFunction, continue_request,
+};
 use futures::future::BoxFuture;
 use futures::{FutureExt as _, TryFutureExt as _};
 use tokio::sync::{mpsc, oneshot};
@@ -238,7 +240,7 @@ impl QueryService {
                 let _guard = guard;
                 work.await
             };
-            task.spawn_on(work, threads);
+            task.spawn_on(continue_request(work), threads);
         }
         task
     }
@@ -247,17 +249,17 @@ impl QueryService {
     /// [`echolake_query::OpaqueValue`].
     pub fn plan_query<T: Send + 'static>(
         &self,
-        client: &EngineClient,
+        client: &Arc<EngineClient>,
         work: impl Future<Output = Result<T, RequestFault>> + Send + 'static,
     ) -> BoxFuture<'_, Result<T, RequestFault>> {
         let guard = self.0.activity.begin_work();
-        let time = client.quota().time;
+        let session = self.begin_session(client);
         let work = async move {
             let _guard = guard;
             work.await
         };
         let work = work.in_current_span();
-        let planned = async move { self.0.engine.supervise_work(time, work).await };
+        let planned = async move { session.supervise_work(work).await };
         planned.inspect_err(EngineReport::record_failure).boxed()
     }
 

@@ -30,7 +30,7 @@ fn watch_service(service: &QueryService) {
     loop {
         std::thread::sleep(INTERVAL);
         EngineReport::send_queued();
-        if service.engine().longest_overdue().is_some_and(|time| time > GRACE) {
+        if service.engine().find_runaway(GRACE).is_some() {
             end_process("a query that was ended did not stop");
         }
         if idle.measure_busy_time(service.activity().count() == 0) > GRACE {

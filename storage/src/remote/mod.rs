@@ -11,6 +11,7 @@ mod object_folder;
 mod part_store;
 mod retrying;
 mod settings;
+mod store_threads;
 #[cfg(test)]
 mod tests;
 

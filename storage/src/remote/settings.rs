@@ -11,6 +11,7 @@ use object_store::multipart::MultipartStore;
 use object_store::{ClientConfigKey, ObjectStore, RetryConfig};
 use url::Url;
 
+use super::store_threads::store_connector;
 use crate::location_text::without_secrets;
 
 /// Time for one request with its body: a part of an upload over a slow line takes long.
@@ -86,7 +87,10 @@ pub(super) fn build_store(scheme: &str, bucket: &str) -> Result<BucketStore, Err
     let key = ClientConfigKey::Timeout;
     Ok(match scheme {
         "s3" => {
-            let builder = AmazonS3Builder::from_env().with_bucket_name(bucket).with_retry(retry_config()?);
+            let builder = AmazonS3Builder::from_env()
+                .with_bucket_name(bucket)
+                .with_retry(retry_config()?)
+                .with_http_connector(store_connector()?);
             let endpoint = [AmazonS3ConfigKey::S3Endpoint, AmazonS3ConfigKey::Endpoint];
             let endpoint = endpoint.iter().find_map(|key| builder.get_config_value(key));
             let allows_http = builder.get_config_value(&AmazonS3ConfigKey::Client(ClientConfigKey::AllowHttp));
@@ -102,11 +106,17 @@ pub(super) fn build_store(scheme: &str, bucket: &str) -> Result<BucketStore, Err
             bucket_store(builder.with_config(AmazonS3ConfigKey::Client(key), timeout).build()?)
         }
         "gs" => {
-            let builder = GoogleCloudStorageBuilder::from_env().with_bucket_name(bucket).with_retry(retry_config()?);
+            let builder = GoogleCloudStorageBuilder::from_env()
+                .with_bucket_name(bucket)
+                .with_retry(retry_config()?)
+                .with_http_connector(store_connector()?);
             bucket_store(builder.with_config(GoogleConfigKey::Client(key), timeout).build()?)
         }
         "az" => {
-            let builder = MicrosoftAzureBuilder::from_env().with_container_name(bucket).with_retry(retry_config()?);
+            let builder = MicrosoftAzureBuilder::from_env()
+                .with_container_name(bucket)
+                .with_retry(retry_config()?)
+                .with_http_connector(store_connector()?);
             bucket_store(builder.with_config(AzureConfigKey::Client(key), timeout).build()?)
         }
         scheme => return Err(format!("this build does not reach `{scheme}://`").into()),

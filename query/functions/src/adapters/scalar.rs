@@ -10,6 +10,7 @@ use datafusion::logical_expr::{
 
 use super::arguments::{CallArguments, SampleElement, check_arguments, coerced_types, element_type};
 use super::description::FunctionDescription;
+use crate::standard::call_stop::check_stop;
 
 /// A function of the values of one row. A null argument makes the answer null.
 pub(crate) trait ScalarKernel: Send + Sync + 'static {
@@ -66,6 +67,7 @@ impl<F: ScalarKernel> ScalarUDFImpl for ScalarAdapter<F> {
     }
 
     fn invoke_with_args(&self, args: ScalarFunctionArgs) -> Result<ColumnarValue> {
+        check_stop()?;
         let constant = args.args.iter().all(|value| matches!(value, ColumnarValue::Scalar(_)));
         let rows = if constant { 1 } else { args.number_rows };
         let arguments = CallArguments::new(self.function.description(), &args.args, rows)?;

@@ -1,6 +1,6 @@
 //! A store that reads immutable objects through a cache.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::ops::Range;
 use std::sync::Arc;
@@ -11,11 +11,14 @@ use futures::stream::{self, BoxStream};
 use futures::{FutureExt as _, StreamExt as _};
 use object_store::path::Path;
 use object_store::{
-    Attributes, CopyOptions, GetOptions, GetRange, GetResult, GetResultPayload, ListResult, MultipartUpload,
-    ObjectMeta, ObjectStore, PutMultipartOptions, PutOptions, PutPayload, PutResult, Result as StoreResult,
+    Attributes, CopyOptions, Error as StoreError, GetOptions, GetRange, GetResult, GetResultPayload, ListResult,
+    MultipartUpload, ObjectMeta, ObjectStore, PutMultipartOptions, PutOptions, PutPayload, PutResult,
+    Result as StoreResult,
 };
+use tokio::task::JoinSet;
 
 use super::block_cache::{BLOCK_BYTES, join_blocks};
+use super::block_folder::CachedBlock;
 use super::{BlockCache, CacheCounters};
 use crate::FileName;
 
@@ -45,6 +48,20 @@ impl CachedStore {
         &self.cache
     }
 
+    // As a task of its own, which ends with this: other readers wait for the blocks that this one fetches, and a query
+    // whose reader fetches no rows is not polled.
+    async fn read_blocks(&self, path: &Path, numbers: BTreeSet<u64>) -> StoreResult<BTreeMap<u64, CachedBlock>> {
+        let Self { inner, cache, scan } = self.clone();
+        let path = path.clone();
+        let mut task = JoinSet::new();
+        task.spawn(async move { cache.read_blocks(inner.as_ref(), &path, numbers, scan.as_deref()).await }.boxed());
+        match task.join_next().await {
+            Some(Ok(read)) => read,
+            Some(Err(source)) => Err(StoreError::JoinError { source }),
+            None => Ok(BTreeMap::new()),
+        }
+    }
+
     // Returns None if the cache has no answer: the store says why.
     async fn read_ranges(&self, path: &Path, ranges: &[Range<u64>]) -> StoreResult<Option<CachedRead>> {
         let total: u64 = ranges.iter().map(|range| range.end.saturating_sub(range.start)).sum();
@@ -54,8 +71,7 @@ impl CachedStore {
         }
         let numbers: BTreeSet<u64> =
             ranges.iter().flat_map(|range| range.start / BLOCK_BYTES..range.end.div_ceil(BLOCK_BYTES)).collect();
-        let read = self.cache.read_blocks(self.inner.as_ref(), path, numbers, self.scan.as_deref()).boxed();
-        let blocks = read.await?;
+        let blocks = self.read_blocks(path, numbers).await?;
         let Some(block) = blocks.values().next() else { return Ok(None) };
         let object_bytes = block.object_bytes;
         if ranges.iter().any(|range| range.start >= object_bytes) {
