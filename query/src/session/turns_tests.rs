@@ -14,6 +14,8 @@ const END_LIMIT: Duration = Duration::from_secs(120);
 /// A join that computes for hours without a row.
 const BARREN: &str = "select count(*) from generate_series(1, 1000000) a(x) join generate_series(1, 1000000) b(y) \
                       on a.x > b.y + 2000000";
+/// Never ends by itself, and looks often whether it must.
+const ENDLESS: &str = "with recursive r as (select 1 n union all select n + 1 from r) select count(*) from r";
 /// More batches than wait for a reader.
 const LONG: &str = "select x from generate_series(1, 200000) t(x)";
 const LONG_ROWS: u64 = 200_000;
@@ -101,7 +103,7 @@ async fn what_nobody_reads_holds_no_turn() {
 async fn waiting_for_a_turn_takes_of_the_time_and_can_be_cancelled() {
     let engine = engine(1).await;
     let busy = session(&engine, "busy");
-    let computing = busy.query(BARREN).await.expect("it begins");
+    let computing = busy.query(ENDLESS).await.expect("it begins");
     let quota = QueryQuota { time: Some(Duration::from_millis(100)), ..QueryQuota::default() };
     let brief = engine.open_session(&Arc::new(EngineClient::new("brief", quota)));
     assert!(matches!(outcome(&brief, "select 1").await, Err(Error::TimeLimit { .. })));

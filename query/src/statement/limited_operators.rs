@@ -1,5 +1,5 @@
 //! Operators and casts that make much of little, for processes whose memory is limited: `a || b` of texts becomes a
-//! function with a limit, functions that stand for operators on lists get theirs, and no cast makes a value of a huge
+//! function with a limit, and so does `a ~ b`; functions that stand for operators on lists get theirs, and no cast makes a value of a huge
 //! fixed size. See [`limited_functions`].
 //!
 //! [`limited_functions`]: echolake_functions::limited_functions
@@ -18,6 +18,9 @@ use datafusion::logical_expr::utils::merge_schema;
 use datafusion::logical_expr::{BinaryExpr, Expr, ExprSchemable as _, LogicalPlan, Operator, ScalarUDF};
 use datafusion::optimizer::AnalyzerRule;
 use echolake_functions::{check_fixed_type, text_concatenation};
+
+/// The function of the operator `~`.
+const REGEXP_LIKE: &str = "regexp_like";
 
 /// The rule; it follows the coercion of types.
 #[derive(Debug)]
@@ -41,7 +44,9 @@ impl LimitedOperators {
 
     fn is_unlimited(&self, expr: &Expr) -> bool {
         match expr {
-            Expr::BinaryExpr(BinaryExpr { op: Operator::StringConcat, .. }) => true,
+            Expr::BinaryExpr(BinaryExpr { op, right, .. }) => {
+                *op == Operator::StringConcat || (*op == Operator::RegexMatch && !matches!(**right, Expr::Literal(..)))
+            }
             Expr::ScalarFunction(call) => self.limited_form(call).is_some(),
             _ => false,
         }
@@ -87,6 +92,13 @@ impl LimitedOperators {
     fn limit_operator(&self, expr: Expr, schema: &DFSchema) -> Result<Transformed<Expr>> {
         let (left, right) = match expr {
             Expr::BinaryExpr(BinaryExpr { left, op: Operator::StringConcat, right }) => (left, right),
+            Expr::BinaryExpr(BinaryExpr { left, op: Operator::RegexMatch, right })
+                if !matches!(*right, Expr::Literal(..)) && self.functions.contains_key(REGEXP_LIKE) =>
+            {
+                let function = self.functions[REGEXP_LIKE].clone();
+                let call = ScalarFunction::new_udf(function, vec![*left, *right]);
+                return Ok(Transformed::yes(Expr::ScalarFunction(call)));
+            }
             Expr::ScalarFunction(call) => {
                 return Ok(match self.limited_form(&call).cloned() {
                     Some(limited) => {

@@ -318,8 +318,12 @@ impl ScalarUDFImpl for LimitedFunction {
         self.own.invoke_with_args(args)
     }
 
-    // DataFusion's own form of the call has this limit, too.
+    // DataFusion's own form of the call has this limit, too. An operator has none, so that a call with many regular
+    // expressions does not become one.
     fn simplify(&self, args: Vec<Expr>, info: &SimplifyContext) -> Result<ExprSimplifyResult> {
+        if self.limit == CallLimit::Pattern && !matches!(args.get(1), Some(Expr::Literal(..))) {
+            return Ok(ExprSimplifyResult::Original(args));
+        }
         Ok(match self.inner().simplify(args, info)? {
             ExprSimplifyResult::Simplified(Expr::ScalarFunction(call)) if call.func.name() == self.name() => {
                 let own = ScalarUDF::new_from_impl(self.clone());
