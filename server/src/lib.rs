@@ -25,4 +25,4 @@ mod random_id;
 pub use catalogue_pages::CataloguePages;
 pub use door::{AgentDoor, CertificateFiles, EngineSettings, LakeServer, ServerSettings};
 pub use echolake_access::tokens;
-pub use echolake_service::Error;
+pub use echolake_service::{EngineRole, Error};

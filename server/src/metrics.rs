@@ -9,7 +9,7 @@ use prometheus::{
     HistogramOpts, HistogramVec, IntCounter, IntCounterVec, IntGauge, Opts, Registry, Result, TextEncoder,
 };
 
-pub(crate) use gauges::{DiskSpace, PoolGauges, ServerGauges};
+pub(crate) use gauges::{DiskSpace, EngineGauges, ServerGauges};
 
 /// Upper bounds of the buckets of a query's time, in seconds.
 const BUCKETS: [f64; 7] = [0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 10.0];

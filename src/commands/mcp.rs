@@ -19,7 +19,7 @@ pub(crate) struct McpArgs {
 pub(crate) async fn run_mcp(args: &McpArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let stop = StopRequest::listen("stopping")?;
     let lake = args.queries.open_lake(lake_url).await?;
-    let settings = args.queries.engine_settings(&lake, 1)?;
+    let settings = args.queries.engine_settings(&lake)?;
     AgentDoor::new(&lake, settings, &args.pages)?.answer_until(stop.wait_until_made()).await?;
     Ok(CommandOutcome::Whole)
 }

@@ -12,9 +12,11 @@ use anyhow::Context as _;
 use echolake_lake::{Lake, remote_access};
 use echolake_schema::ProjectName;
 use echolake_server::certificate::self_signed;
-use echolake_server::engine::{confinement, run_engine};
+use echolake_server::engine::{EngineOptions, confinement, run_engine};
 use echolake_server::tokens::{self, TokenFile, TokenScope};
-use echolake_server::{CataloguePages, CertificateFiles, EngineSettings, Error, LakeServer, ServerSettings};
+use echolake_server::{
+    CataloguePages, CertificateFiles, EngineRole, EngineSettings, Error, LakeServer, ServerSettings,
+};
 use tokio::signal::unix::{SignalKind, signal};
 
 use super::cache::CacheArgs;
@@ -23,9 +25,8 @@ use crate::duration::parse_duration;
 use crate::logging::child_variable;
 use crate::signals::StopRequest;
 
-/// Memory for queries, and engines at once, by default.
+/// Memory for queries by default.
 const MEMORY_MIB: u32 = 4096;
-const ENGINES: u32 = 16;
 /// Time for which the demo's answers may go on after Ctrl-C.
 const CATALOGUE_DRAIN: Duration = Duration::from_secs(5);
 
@@ -54,10 +55,9 @@ pub(crate) struct ServeArgs {
     /// Listen without encryption beyond this machine, because a proxy encrypts.
     #[arg(long, conflicts_with = "certificate")]
     plain_text_behind_a_proxy: bool,
-    /// Limit of concurrent clients. Each client's queries run in an engine, a process of its own; idle engines make
-    /// room.
-    #[arg(long, value_name = "N", default_value_t = ENGINES, value_parser = clap::value_parser!(u32).range(1..=256))]
-    engines: u32,
+    /// Without effect: all clients share two engines. Kept for scripts that have it.
+    #[arg(long, value_name = "N", hide = true)]
+    engines: Option<u32>,
     /// Time for which answers may go on after SIGTERM or Ctrl-C, as 30s or 5m; nothing new is taken meanwhile.
     #[arg(long, value_name = "TIME", default_value = "30s", value_parser = parse_duration)]
     drain: Duration,
@@ -68,7 +68,7 @@ pub(crate) struct ServeArgs {
 /// Options of commands that start engines.
 #[derive(Debug, clap::Args)]
 pub(super) struct QueryArgs {
-    /// Memory limit of all queries together, MiB; if it is exceeded, the queries of the largest client are ended.
+    /// Memory limit of all queries together, MiB; if it is exceeded, the largest query is ended.
     #[arg(long, value_name = "MIB", default_value_t = MEMORY_MIB, value_parser = clap::value_parser!(u32).range(64..))]
     memory: u32,
     /// Log queries that take this long or longer, with their statements, as 1s or 500ms.
@@ -87,13 +87,13 @@ impl QueryArgs {
         self.cache.open_lake(url).await
     }
 
-    /// Returns the settings of `count` engines of a lake.
-    pub fn engine_settings(&self, lake: &Lake, count: u32) -> anyhow::Result<EngineSettings> {
+    /// Returns the settings of a lake's engines.
+    pub fn engine_settings(&self, lake: &Lake) -> anyhow::Result<EngineSettings> {
         Ok(EngineSettings {
             temp: self.temp.clone(),
             slow: self.log_slow,
             cache: self.cache.cache_folder().filter(|_| lake.is_remote()),
-            ..default_engine_settings(self.memory, count)?
+            ..default_engine_settings(self.memory)?
         })
     }
 }
@@ -107,6 +107,9 @@ pub(crate) struct EngineArgs {
     /// The lake's folder, where it is one: the system keeps the engine from all other files.
     #[arg(long)]
     confine_to: Option<PathBuf>,
+    /// What it answers: pages or statements.
+    #[arg(long)]
+    role: EngineRole,
     /// Bytes that its queries may hold.
     #[arg(long)]
     memory_bytes: usize,
@@ -135,13 +138,14 @@ impl EngineArgs {
     }
 }
 
-/// Answers one client's queries, until the door that started it ends.
+/// Answers queries of all clients, until the door that started it ends.
 pub(crate) async fn serve_engine(args: &EngineArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     // A service manager may signal all processes of a service: an engine ends with its door.
     let _ignored = signal(SignalKind::terminate()).context("cannot listen to SIGTERM")?;
     let lake = args.cache.open_lake(lake_url).await?;
     let slow = args.log_slow_ms.map(Duration::from_millis);
-    run_engine(&lake, &args.sockets, args.memory_bytes, slow).await?;
+    let options = EngineOptions { role: args.role, sockets: &args.sockets, memory: args.memory_bytes, slow };
+    run_engine(&lake, options).await?;
     Ok(CommandOutcome::Whole)
 }
 
@@ -192,7 +196,7 @@ pub(crate) async fn run_serve(args: &ServeArgs, lake_url: &str) -> anyhow::Resul
             .map(|(certificate, key)| CertificateFiles { certificate, key }),
         is_behind_proxy: args.plain_text_behind_a_proxy,
         drain: args.drain,
-        engines: args.queries.engine_settings(&lake, args.engines)?,
+        engines: args.queries.engine_settings(&lake)?,
     };
     let addresses = [
         args.listen,
@@ -202,6 +206,9 @@ pub(crate) async fn run_serve(args: &ServeArgs, lake_url: &str) -> anyhow::Resul
     ];
     let listens_everywhere =
         addresses.into_iter().filter_map(ListenAddress::socket_address).any(|one| one.ip().is_unspecified());
+    if args.engines.is_some() {
+        eprintln!("warning: --engines has no effect: all clients share two engines");
+    }
     let server = LakeServer::bind(&lake, settings)?;
     anyhow::ensure!(!server.listening_urls().is_empty(), "nothing to listen on; hint: all three are off");
     eprintln!("lake {}", lake.location());
@@ -216,7 +223,7 @@ pub(crate) async fn run_serve(args: &ServeArgs, lake_url: &str) -> anyhow::Resul
 
 /// Serves the catalogue alone, at the default address or, if that is taken, on any free port.
 pub(crate) async fn serve_catalogue(lake: &Lake, stop: &StopRequest) -> anyhow::Result<CommandOutcome> {
-    let engines = default_engine_settings(MEMORY_MIB, ENGINES)?;
+    let engines = default_engine_settings(MEMORY_MIB)?;
     let settings = |http| ServerSettings {
         http: Some(http),
         flight_sql: None,
@@ -236,14 +243,13 @@ pub(crate) async fn serve_catalogue(lake: &Lake, stop: &StopRequest) -> anyhow::
     run_server(server, stop).await
 }
 
-fn default_engine_settings(memory_mib: u32, count: u32) -> anyhow::Result<EngineSettings> {
+fn default_engine_settings(memory_mib: u32) -> anyhow::Result<EngineSettings> {
     let program = std::env::current_exe().context("this program does not know its own path")?;
     let (name, value) = child_variable();
     Ok(EngineSettings {
         program,
         environment: vec![(name.to_owned(), value.to_owned())],
         memory: (memory_mib as usize) << 20,
-        count: count as usize,
         temp: None,
         slow: None,
         cache: None,

@@ -1,4 +1,4 @@
-//! HTTP of an engine, which reads the lake: queries, the catalogue, files and slices. Of what it has for the door, a
+//! HTTP of the engines, which read the lake: queries, the catalogue, files and slices. Of what it has for the door, a
 //! server builds the rest.
 
 mod catalogue;
@@ -18,23 +18,31 @@ mod slices;
 mod sql;
 
 use std::convert::Infallible;
+use std::sync::Arc;
 
 use axum::Router;
+use axum::http::Method;
 use axum::middleware::{from_fn, from_fn_with_state, map_response};
-use axum::response::Response;
-use echolake_service::request_span::trace_request;
-use echolake_service::{Error, QueryService, RequestFault, ServerProtocol};
+use axum::response::{IntoResponse as _, Response};
+use echolake_schema::ProjectName;
+use echolake_service::request_span::{self, trace_request};
+use echolake_service::{
+    EngineRole, EngineServices, Error, QueryService, RequestFault, ServerProtocol, answer_numbered,
+};
 use http_body_util::BodyExt as _;
+use hyper::body::Incoming;
 use hyper::server::conn::http1;
 use hyper::service::{Service as _, service_fn};
 use hyper_util::rt::TokioIo;
 use hyper_util::service::TowerToHyperService;
+use quick_cache::sync::Cache;
 use tokio::net::UnixListener;
+use tokio::sync::Semaphore;
 use tower_http::catch_panic::CatchPanicLayer;
 use utoipa::openapi::OpenApi;
 
 pub use catalogue::LASTING_VERSION;
-use catalogue::LakeCatalogue;
+use catalogue::{LakeCatalogue, SnapshotViews};
 pub use conditions::ConditionOutcome;
 pub use contributions::{AddedContribution, AnnotationsRequest, PredictionParams};
 pub use extract::BinaryContent;
@@ -49,18 +57,44 @@ use slices::{FOXGLOVE_MANIFEST, LICHTBLICK_SESSION, SLICE, SOFA, SliceService};
 /// Paths that viewers on pages of any origin use.
 pub const VIEWER_PATHS: [&str; 5] = [files::RUN, SLICE, SOFA, FOXGLOVE_MANIFEST, LICHTBLICK_SESSION];
 
+/// What an engine of HTTP keeps for each right: the lake as readers with that right see it, with what was computed of it.
+type RightViews = Cache<Option<Vec<ProjectName>>, Arc<SnapshotViews>>;
+
+/// Rights of which views are kept.
+const KEPT_RIGHTS: usize = 16;
+
+/// HTTP of an engine that all clients share.
+#[derive(Clone)]
+struct HttpEngine(Arc<HttpEngineState>);
+
+struct HttpEngineState {
+    services: EngineServices,
+    role: EngineRole,
+    views: RightViews,
+    /// Places of heavy endpoints, one per core: light ones never wait for all the heavy ones that are requested.
+    heavy_places: Arc<Semaphore>,
+}
+
 /// Answers HTTP on an engine's socket. A request counts until its answer is sent or dropped.
-pub async fn serve_http_socket(service: QueryService, listener: UnixListener) -> Result<(), Error> {
-    let router = engine_router(&service);
+///
+/// # Errors
+/// [`Error::System`] if the socket accepts no connection.
+pub async fn serve_http_socket(
+    services: EngineServices,
+    role: EngineRole,
+    listener: UnixListener,
+) -> Result<(), Error> {
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    let heavy_places = Arc::new(Semaphore::new(cores));
+    let engine = HttpEngine(Arc::new(HttpEngineState { services, role, views: Cache::new(KEPT_RIGHTS), heavy_places }));
     loop {
         let (stream, _) = listener.accept().await.map_err(Error::System)?;
-        let router = TowerToHyperService::new(router.clone());
-        let activity = service.activity().clone();
-        let answers = service_fn(move |request| {
-            let guard = activity.begin_work();
-            let answer = router.call(request);
+        let engine = engine.clone();
+        let answers = service_fn(move |request: hyper::Request<Incoming>| {
+            let engine = engine.clone();
             async move {
-                let answer: Response = answer.await?;
+                let guard = engine.0.services.activity().begin_work();
+                let answer = engine.answer_request(request).await;
                 Ok::<_, Infallible>(answer.map(|body| {
                     body.map_frame(move |frame| {
                         let _guard = &guard;
@@ -76,20 +110,64 @@ pub async fn serve_http_socket(service: QueryService, listener: UnixListener) ->
     }
 }
 
-fn engine_router(service: &QueryService) -> Router {
-    let catalogue = LakeCatalogue::new(service.clone());
-    let slices = SliceService::new(&catalogue);
+impl HttpEngine {
+    // Answers a request of the client that the door has named, by routes that are that client's alone.
+    async fn answer_request(&self, request: hyper::Request<Incoming>) -> Response {
+        let router = self.0.services.client_of_request(request.headers()).and_then(|client| {
+            // Which engine answers what is decided by one function; the door asks it, too.
+            match engine_role(request.method(), request.uri().path()) == self.0.role {
+                true => client.protocol_state(|service| Ok(self.client_router(service))),
+                false => Err(RequestFault::Internal),
+            }
+        });
+        let number = request_span::request_number(request.headers());
+        match router {
+            // A router's own failures are answers.
+            Ok(router) => {
+                let answer = TowerToHyperService::new(Router::clone(&router)).call(request);
+                answer_numbered(number, answer).await.unwrap_or_else(|never| match never {})
+            }
+            Err(fault) => ProblemResponse(fault).into_response(),
+        }
+    }
+
+    fn client_router(&self, service: &QueryService) -> Router {
+        let right = service.lake().visible_projects().map(|projects| projects.iter().cloned().collect());
+        // Never fails to make them.
+        let views = self.0.views.get_or_insert_with(&right, || Ok::<_, Infallible>(Arc::default()));
+        let views = views.unwrap_or_else(|never| match never {});
+        engine_router(&LakeCatalogue::new(service.clone(), views), &self.0.heavy_places)
+    }
+}
+
+fn engine_router(catalogue: &LakeCatalogue, heavy_places: &Arc<Semaphore>) -> Router {
+    let service = catalogue.service();
+    let slices = SliceService::new(catalogue);
     let files = files::own_routes().merge(manifest::manifest_routes());
     let own = Router::from(sql::sql_routes())
         .with_state(service.clone())
-        .merge(catalogue.endpoint_router())
-        .merge(contributions::draft_routes(&catalogue))
+        .merge(catalogue.endpoint_router(heavy_places))
+        .merge(contributions::draft_routes(catalogue))
         .merge(Router::from(files).with_state(catalogue.clone()))
-        .merge(with_protocol(ServerProtocol::Mcp, mcp::agent_routes(&catalogue, &slices)))
+        .merge(with_protocol(ServerProtocol::Mcp, mcp::agent_routes(catalogue, &slices)))
         .layer(from_fn_with_state(service.is_open(), guard::own_pages_only));
     let viewers = Router::from(files::viewer_routes()).with_state(catalogue.clone());
     let all = own.merge(viewers).merge(slices::for_viewers(slices)).fallback(refuse_unknown_path);
     with_refusals(all).layer(from_fn(trace_request))
+}
+
+/// Returns the engine that answers a request, by its method and path alone.
+///
+/// Statements and predicates from outside, bodies, and what decodes run files or uploads go to the engine of
+/// statements. The engine of pages answers the rest: the program's own statements with bound values, and files as they
+/// are.
+pub fn engine_role(method: &Method, path: &str) -> EngineRole {
+    let reads = matches!(*method, Method::GET | Method::HEAD);
+    let is_slice = [SLICE, SOFA, FOXGLOVE_MANIFEST, LICHTBLICK_SESSION].contains(&path);
+    match reads && !is_slice && !catalogue::reads_run_file(path) {
+        true => EngineRole::Pages,
+        false => EngineRole::Statements,
+    }
 }
 
 fn with_protocol(protocol: ServerProtocol, routes: Router) -> Router {

@@ -26,22 +26,25 @@ const CURSORS: usize = 16;
 const LARGEST: usize = 2 << 20;
 
 /// The key by which a client cancels: the process's number and the secret that it was given.
-type BackendKey = (i32, Bytes);
+pub(super) type BackendKey = (i32, Bytes);
 
-/// State shared by all connections.
+/// The connections of all clients, by their keys, with what runs on them.
+pub(super) type RunningCommands = Arc<Mutex<HashMap<BackendKey, Arc<Mutex<StopSignal>>>>>;
+
+/// State shared by all connections of a client.
 pub(super) struct PostgresState {
     pub service: QueryService,
     pub parser: PostgresCompatibilityParser,
     pub catalog: PgCatalog,
     next_pid: AtomicI32,
-    running: Mutex<HashMap<BackendKey, Arc<Mutex<StopSignal>>>>,
+    running: RunningCommands,
 }
 
 impl PostgresState {
-    pub fn new(service: QueryService) -> Result<Self, Error> {
+    pub fn new(service: QueryService, running: RunningCommands) -> Result<Self, Error> {
         let catalog = PgCatalog::new(&service)?;
         let parser = PostgresCompatibilityParser::new();
-        Ok(Self { service, parser, catalog, next_pid: AtomicI32::new(1), running: Mutex::default() })
+        Ok(Self { service, parser, catalog, next_pid: AtomicI32::new(1), running })
     }
 
     /// Cancels the query on the connection of this key.

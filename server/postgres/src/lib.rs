@@ -24,7 +24,7 @@ use std::sync::Arc;
 
 use async_trait::async_trait;
 use echolake_service::request_span::continue_connection;
-use echolake_service::{Error, QueryService};
+use echolake_service::{ConnectionOpening, EngineServices, Error, RequestFault, answer_numbered};
 use pgwire::api::PgWireServerHandlers;
 use pgwire::api::auth::StartupHandler;
 use pgwire::api::cancel::CancelHandler;
@@ -35,20 +35,39 @@ use tokio::io::Interest;
 use tokio::net::{UnixListener, UnixStream};
 use tracing::Instrument as _;
 
-use connection::PostgresConnection;
+use connection::{PostgresConnection, PostgresState, RunningCommands};
 pub use sqlstate::fatal_message;
 use startup::LoginHandler;
 
 /// Parameter of a startup packet from the door: the number that the client knows its connection by.
 pub const PID_PARAMETER: &str = "echolake.pid";
 
-/// Answers Postgres' protocol on an engine's socket.
-pub async fn serve_postgres_socket(service: QueryService, listener: UnixListener) -> Result<(), Error> {
-    let shared = Arc::new(connection::PostgresState::new(service)?);
+/// Answers Postgres' protocol on an engine's socket that all clients share. The door begins each connection with a
+/// [`ConnectionOpening`], which names its client.
+///
+/// # Errors
+/// [`Error::System`] if the socket accepts no connection.
+pub async fn serve_postgres_socket(services: EngineServices, listener: UnixListener) -> Result<(), Error> {
+    let running = RunningCommands::default();
     loop {
         let (socket, _) = listener.accept().await.map_err(Error::System)?;
-        let connection = Arc::new(PostgresConnection::new(shared.clone()));
-        tokio::spawn(attend_socket(socket, connection).instrument(continue_connection()));
+        let services = services.clone();
+        let running = running.clone();
+        let attend = async move {
+            // A connection that the door breaks off at its beginning wants nothing.
+            let Ok((socket, opening)) = ConnectionOpening::read_from(socket).await else { return };
+            let shared = services.find_client(&opening.client).and_then(|client| {
+                client.protocol_state(|service| {
+                    let state = PostgresState::new(service.clone(), running);
+                    state.map_err(RequestFault::defect("Postgres' catalogue cannot be laid out"))
+                })
+            });
+            // Logged already; the door sees the connection end.
+            let Ok(shared) = shared else { return };
+            let connection = Arc::new(PostgresConnection::new(shared));
+            answer_numbered(opening.number, attend_socket(socket, connection)).await;
+        };
+        tokio::spawn(attend.instrument(continue_connection()));
     }
 }
 

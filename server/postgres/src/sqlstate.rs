@@ -41,7 +41,7 @@ fn fault_sqlstate(fault: &RequestFault) -> &'static str {
         RequestFault::Query(QueryError::Execution { message, .. }) if message.starts_with(OUT_OF_RANGE) => "22003",
         RequestFault::TooMany { what: "connections", .. } => "53300",
         RequestFault::NotFound { what, .. } if what.starts_with("cursor ") => "34000",
-        RequestFault::Disconnected | RequestFault::Displaced => "57P01",
+        RequestFault::Disconnected => "57P01",
         _ => match fault.code() {
             FaultCode::Query => "42601",
             FaultCode::ReadOnly => "25006",

@@ -1,4 +1,4 @@
-//! The identity of a client: the door determines it and passes it to the client's engine.
+//! The identity of a client: the door determines it and names it to an engine with each request.
 
 use std::collections::BTreeSet;
 use std::time::Duration;
@@ -28,7 +28,7 @@ pub fn counted_bytes(memory: usize) -> usize {
 /// A client.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ClientIdentity {
-    /// Name for logs and refusals; each has an engine of its own.
+    /// Name for logs and refusals.
     pub name: String,
     /// True if the server has no tokens, so that requests of foreign pages must be distinguished from others.
     pub is_open: bool,
@@ -83,6 +83,20 @@ impl ClientIdentity {
     /// Pages of other origins.
     pub fn foreign_pages() -> Self {
         Self::local_client(FOREIGN)
+    }
+
+    /// The text by which the door names it to an engine.
+    pub(crate) fn to_text(&self) -> String {
+        // Its fields are texts and numbers, which always have a form in JSON.
+        serde_json::to_string(self).unwrap_or_default()
+    }
+
+    /// Reads what [`ClientIdentity::to_text`] has written.
+    ///
+    /// # Errors
+    /// [`RequestFault::Internal`].
+    pub(crate) fn parse_text(text: &str) -> Result<Self, RequestFault> {
+        serde_json::from_str(text).map_err(RequestFault::defect("the door names a client otherwise"))
     }
 
     /// Limits of its queries.

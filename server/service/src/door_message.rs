@@ -3,16 +3,15 @@
 use serde::{Deserialize, Serialize};
 
 use crate::activity::ActivityRows;
-use crate::client_identity::ClientIdentity;
 
 /// A line.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum DoorMessage {
-    /// The client of the engine; the first line.
-    Client(ClientIdentity),
     /// Cancel the query with this number.
     Cancel(u64),
+    /// End all that the client of this name does: it may no longer, or may do other things now.
+    EndClient(String),
     /// Rows that the engine asked for.
     Rows {
         /// Number of the answer.

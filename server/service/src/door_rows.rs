@@ -38,11 +38,11 @@ impl DoorRows {
         }
     }
 
-    async fn ask_door(&self, table: ActivityTable) -> Result<ActivityRows, String> {
+    async fn ask_door(&self, table: ActivityTable, client: String, sees_all: bool) -> Result<ActivityRows, String> {
         let number = self.last.fetch_add(1, Ordering::Relaxed);
         let (send, answer) = oneshot::channel();
         self.lock_waiting().insert(number, send);
-        EngineReport::Ask { number, table }.send_line();
+        EngineReport::Ask { number, table, client, sees_all }.send_line();
         let rows = tokio::time::timeout(ANSWER_LIMIT, answer).await;
         self.lock_waiting().remove(&number);
         rows.ok().and_then(Result::ok).ok_or_else(|| "the server did not list its activity".to_owned())
@@ -53,8 +53,18 @@ impl DoorRows {
     }
 }
 
+/// The rows that one client sees.
+#[derive(Debug)]
+pub(crate) struct ClientRows {
+    pub door: Arc<DoorRows>,
+    /// Name of the client.
+    pub client: String,
+    /// Whether it sees other clients' rows, too.
+    pub sees_all: bool,
+}
+
 #[async_trait]
-impl SystemSource for DoorRows {
+impl SystemSource for ClientRows {
     fn table_schemas(&self) -> Vec<(&'static str, SchemaRef)> {
         TABLES.map(|(name, table)| (name, activity_schema(table))).to_vec()
     }
@@ -63,7 +73,7 @@ impl SystemSource for DoorRows {
         let Some((_, table)) = TABLES.into_iter().find(|(name, _)| *name == table) else {
             return Err(format!("there is no table system.{table}"));
         };
-        match self.ask_door(table).await? {
+        match self.door.ask_door(table, self.client.clone(), self.sees_all).await? {
             ActivityRows::Queries(queries) => row_batch(table, &queries),
             ActivityRows::Connections(connections) => row_batch(table, &connections),
         }

@@ -13,10 +13,10 @@ use crate::fault::{FaultCode, RequestFault};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum EngineReport {
-    /// It has read the lake and can be assigned to a client.
+    /// It has read the lake and can be asked.
     Ready,
-    /// It ends itself, for this reason.
-    Ending(String),
+    /// It ends itself.
+    Ending(EngineEnd),
     /// A query begins.
     Started(QueryStart),
     /// A query has ended.
@@ -27,13 +27,35 @@ pub enum EngineReport {
     Lake(Option<LakeFigures>),
     /// Counts of its cache of an object store since the last such line.
     Cache(CacheCounts),
-    /// It asks for its client's rows of a table of the server's activity.
+    /// It asks for rows of a table of the server's activity.
     Ask {
         /// Number of the answer.
         number: u64,
         /// The table.
         table: ActivityTable,
+        /// Name of the client whose rows they are.
+        client: String,
+        /// Whether the client may see other clients' rows, without their texts.
+        sees_all: bool,
     },
+}
+
+/// Why an engine ends itself.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct EngineEnd {
+    /// The reason, for people.
+    pub reason: String,
+    /// Whose statement it ends for.
+    pub culprit: Option<EngineCulprit>,
+}
+
+/// Whose statement has ended an engine.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct EngineCulprit {
+    /// Name of its client.
+    pub client: String,
+    /// The door's number of its request or connection.
+    pub request: Option<u64>,
 }
 
 /// Lines that wait to be written.

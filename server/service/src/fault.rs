@@ -181,9 +181,6 @@ pub enum RequestFault {
     /// The server is stopping, and ends an idle connection.
     #[error("the server is stopping and ends this connection; hint: connect again in a moment")]
     Disconnected,
-    /// The connection was idle, and another client needed its engine's place.
-    #[error("this connection was idle, and its place was needed; hint: connect again, or serve with more --engines")]
-    Displaced,
     /// Engines of the client have ended one after the other.
     #[error("queries of this client ended {ends} engines in a row; hint: ask again in {} s", whole_secs(*wait))]
     Backoff {
@@ -440,9 +437,7 @@ impl RequestFault {
             Self::Foreign { .. } => FaultCode::Foreign,
             Self::Cancelled => FaultCode::Cancelled,
             Self::Timeout { .. } => FaultCode::TimeLimit,
-            Self::TooMany { .. } | Self::FailedLogins { .. } | Self::Backoff { .. } | Self::Displaced => {
-                FaultCode::TooMany
-            }
+            Self::TooMany { .. } | Self::FailedLogins { .. } | Self::Backoff { .. } => FaultCode::TooMany,
             Self::EngineEnded { .. } => FaultCode::EngineEnded,
             Self::Internal => FaultCode::Internal,
             Self::Draining | Self::Disconnected => FaultCode::Stopping,

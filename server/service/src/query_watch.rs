@@ -53,8 +53,14 @@ impl RunningWatches {
         Self { slow, ..Self::default() }
     }
 
-    /// Watches a query that begins, until the timer is dropped.
-    pub fn begin_watch(self: &Arc<Self>, protocol: ServerProtocol, statement: &str, stop: &StopSignal) -> QueryTimer {
+    /// Watches a query of a client that begins, until the timer is dropped.
+    pub fn begin_watch(
+        self: &Arc<Self>,
+        protocol: ServerProtocol,
+        client: &str,
+        statement: &str,
+        stop: &StopSignal,
+    ) -> QueryTimer {
         let number = self.last.fetch_add(1, Ordering::Relaxed);
         self.lock_running().insert(number, stop.clone());
         let watch = QueryWatch {
@@ -70,7 +76,8 @@ impl RunningWatches {
         };
         let statement = watch.statement.clone();
         let started = Utc::now().timestamp_micros();
-        EngineReport::Started(QueryStart { number, protocol, statement, started }).queue_line();
+        let client = client.to_owned();
+        EngineReport::Started(QueryStart { number, client, protocol, statement, started }).queue_line();
         QueryTimer { watch: Arc::new(watch), watches: self.clone() }
     }
 
@@ -162,7 +169,7 @@ mod tests {
     #[test]
     fn an_abandoned_query_was_cancelled() {
         let watches = Arc::new(RunningWatches::default());
-        let timer = watches.begin_watch(ServerProtocol::Http, "select 1", &StopSignal::new());
+        let timer = watches.begin_watch(ServerProtocol::Http, "ann", "select 1", &StopSignal::new());
         assert_eq!(timer.watch().query_end().failure, Some(FaultCode::Cancelled));
         timer.watch().record_outcome(None);
         timer.watch().record_outcome(Some(&RequestFault::Internal));
@@ -173,7 +180,7 @@ mod tests {
     fn a_query_is_cancelled_by_its_number() {
         let watches = Arc::new(RunningWatches::default());
         let stop = StopSignal::new();
-        let timer = watches.begin_watch(ServerProtocol::Http, "select 1", &stop);
+        let timer = watches.begin_watch(ServerProtocol::Http, "ann", "select 1", &stop);
         watches.cancel_query(timer.watch().number + 1);
         assert!(stop.wait_for_stop().now_or_never().is_none());
         watches.cancel_query(timer.watch().number);

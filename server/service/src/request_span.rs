@@ -70,11 +70,11 @@ fn trace_id(headers: &HeaderMap) -> Option<&str> {
 }
 
 /// Begins the span of a connection of Postgres' protocol that the door forwards, and marks its startup packet unless
-/// that would be larger than `limit`.
-pub fn begin_connection(startup: &mut BytesMut, client: &str, limit: usize) -> Span {
+/// that would be larger than `limit`. Returns the connection's number, too.
+pub fn begin_connection(startup: &mut BytesMut, client: &str, limit: usize) -> (Span, u64) {
     let number = next_number();
     mark_startup(startup, PARAMETER, &number.to_string(), limit);
-    tracing::error_span!("connection", number, protocol = ServerProtocol::Postgres.name(), client)
+    (tracing::error_span!("connection", number, protocol = ServerProtocol::Postgres.name(), client), number)
 }
 
 /// Adds a parameter to a startup packet of Postgres' protocol, unless that would be larger than `limit`.
@@ -99,10 +99,15 @@ pub fn continue_request(headers: &HeaderMap) -> Span {
     if let Some(trace) = trace_id(headers) {
         span.record("trace", trace);
     }
-    if let Some(number) = headers.get(HEADER).and_then(|number| number.to_str().ok()?.parse::<u64>().ok()) {
+    if let Some(number) = request_number(headers) {
         span.record("number", number);
     }
     span
+}
+
+/// Returns the door's number of a request.
+pub fn request_number(headers: &HeaderMap) -> Option<u64> {
+    headers.get(HEADER)?.to_str().ok()?.parse().ok()
 }
 
 /// Continues, in an engine, the span of a connection; [`record_connection`] adds its number once it is known.

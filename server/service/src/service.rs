@@ -1,15 +1,16 @@
-//! State shared by the three protocols: the query engine, its client, encoder threads, and metrics.
+//! The service of one client, as the three protocols share it: the shared engine with the client's rights, its quota,
+//! encoder threads, and metrics.
 
 use std::collections::HashMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::time::Duration;
 
 use arrow::datatypes::SchemaRef;
 use datafusion::common::ParamValues;
 use echolake_lake::Lake;
 use echolake_query::{
-    EngineClient, PreparedQuery, QueryEngine, QueryThreads, RequestMemory, Session, SqlFunction, continue_request,
+    EngineClient, PreparedQuery, QueryEngine, QueryThreads, RequestMemory, Session, SqlFunction, SystemSource,
+    continue_request,
 };
 use futures::future::BoxFuture;
 use futures::{FutureExt as _, TryFutureExt as _};
@@ -19,11 +20,11 @@ use tracing::Instrument as _;
 
 use crate::Error;
 use crate::client_identity::ClientIdentity;
-use crate::door_message::DoorMessage;
-use crate::door_rows::DoorRows;
+use crate::door_rows::{ClientRows, DoorRows};
 use crate::engine_report::EngineReport;
 use crate::fault::{FaultCode, RequestFault};
 use crate::query_watch::{QueryTimer, QueryWatch, RunningWatches};
+use crate::request_number::current_request;
 use crate::running::{
     AnswerEncoder, RunningQuery, SessionTimeLimit, WAITING, finish_task, split_batch, wait_for_fault,
 };
@@ -36,20 +37,31 @@ pub const CATALOG: &str = "datafusion";
 /// Their schema, as DataFusion calls it.
 pub const SCHEMA: &str = "public";
 
-/// State shared by the three protocols.
+/// The service of one client. Clones are the same.
 #[derive(Clone)]
 pub struct QueryService(Arc<ServiceState>);
 
 struct ServiceState {
+    shared: Arc<SharedService>,
+    /// The lake as the client sees it.
     lake: Lake,
+    /// The shared engine with the client's rights.
     engine: QueryEngine,
     identity: ClientIdentity,
     client: Arc<EngineClient>,
-    activity: ActivityCounter,
-    watches: Arc<RunningWatches>,
-    door_rows: Arc<DoorRows>,
+}
+
+/// What all clients of an engine share.
+pub(crate) struct SharedService {
+    /// The lake, all of it.
+    pub lake: Lake,
+    /// The engine with the rights of a reader of all projects.
+    pub engine: QueryEngine,
+    pub activity: ActivityCounter,
+    pub watches: Arc<RunningWatches>,
+    pub door_rows: Arc<DoorRows>,
     // Answers are encoded on threads of their own: connections are answered, and queries cancelled, while all are busy.
-    encoders: QueryThreads,
+    pub encoders: QueryThreads,
 }
 
 /// The query text or plan to run.
@@ -110,28 +122,18 @@ impl ActivityCounter {
 }
 
 impl QueryService {
-    /// The state of an engine of this client; queries that take as long as `slow` are logged.
+    /// The service of one client, whose queries count against the quota of `client`.
     ///
     /// # Errors
-    /// [`Error::System`].
-    pub fn new(
-        lake: &Lake,
-        engine: QueryEngine,
+    /// [`RequestFault`] if the lake's tables cannot be laid out for its rights.
+    pub(crate) fn new(
+        shared: &Arc<SharedService>,
         identity: ClientIdentity,
-        slow: Option<Duration>,
-    ) -> Result<Self, Error> {
-        let door_rows = Arc::new(DoorRows::default());
-        engine.add_system_tables(door_rows.clone());
-        Ok(Self(Arc::new(ServiceState {
-            lake: lake.clone(),
-            engine,
-            client: Arc::new(EngineClient::new(identity.name.clone(), identity.quota())),
-            identity,
-            activity: ActivityCounter::default(),
-            watches: Arc::new(RunningWatches::new(slow)),
-            door_rows,
-            encoders: QueryThreads::per_core("encode").map_err(Error::System)?,
-        })))
+        client: Arc<EngineClient>,
+    ) -> Result<Self, RequestFault> {
+        let lake = identity.visible_lake(&shared.lake);
+        let engine = shared.engine.of_lake(&lake)?;
+        Ok(Self(Arc::new(ServiceState { shared: shared.clone(), lake, engine, identity, client })))
     }
 
     /// The lake, as the client sees it.
@@ -163,9 +165,9 @@ impl QueryService {
         self.0.identity.require_scope(scope).is_ok()
     }
 
-    /// Requests that are being answered.
+    /// Requests of all clients that are being answered.
     pub fn activity(&self) -> &ActivityCounter {
-        &self.0.activity
+        &self.0.shared.activity
     }
 
     /// Reports a failed request to the door, which counts them.
@@ -175,19 +177,7 @@ impl QueryService {
 
     /// Watches a query, or other work that is listed among queries, until the timer is dropped.
     pub fn watch_query(&self, protocol: ServerProtocol, statement: &str, stop: &StopSignal) -> QueryTimer {
-        self.0.watches.begin_watch(protocol, statement, stop)
-    }
-
-    /// Does what the door says; ends with the door.
-    pub async fn obey_door(&self, mut messages: mpsc::UnboundedReceiver<DoorMessage>) {
-        while let Some(message) = messages.recv().await {
-            match message {
-                DoorMessage::Cancel(number) => self.0.watches.cancel_query(number),
-                DoorMessage::Rows { number, rows } => self.0.door_rows.take_answer(number, rows),
-                // An engine has one client.
-                DoorMessage::Client(_) => {}
-            }
-        }
+        self.0.shared.watches.begin_watch(protocol, &self.0.identity.name, statement, stop)
     }
 
     /// The client's name.
@@ -197,7 +187,12 @@ impl QueryService {
 
     /// Begins a session: one per connection, or one per request if the protocol has no connections.
     pub fn begin_session(&self, client: &Arc<EngineClient>) -> Session {
-        self.0.engine.open_session(client)
+        let rows: Arc<dyn SystemSource> = Arc::new(ClientRows {
+            door: self.0.shared.door_rows.clone(),
+            client: self.0.identity.name.clone(),
+            sees_all: self.has_scope(TokenScope::Metrics),
+        });
+        self.0.engine.open_session(client).with_system(rows).of_request(current_request())
     }
 
     /// The tables and their schemas.
@@ -234,8 +229,8 @@ impl QueryService {
     /// Spawns work on the encoder threads; dropping the returned task aborts it.
     pub fn spawn_work<T: Send + 'static>(&self, work: impl Future<Output = T> + Send + 'static) -> JoinSet<T> {
         let mut task = JoinSet::new();
-        let guard = self.0.activity.begin_work();
-        if let Some(threads) = self.0.encoders.handle() {
+        let guard = self.0.shared.activity.begin_work();
+        if let Some(threads) = self.0.shared.encoders.handle() {
             let work = async move {
                 let _guard = guard;
                 work.await
@@ -252,7 +247,7 @@ impl QueryService {
         client: &Arc<EngineClient>,
         work: impl Future<Output = Result<T, RequestFault>> + Send + 'static,
     ) -> BoxFuture<'_, Result<T, RequestFault>> {
-        let guard = self.0.activity.begin_work();
+        let guard = self.0.shared.activity.begin_work();
         let session = self.begin_session(client);
         let work = async move {
             let _guard = guard;
@@ -283,7 +278,7 @@ impl QueryService {
         let session = self.begin_session(client);
         let span = tracing::error_span!("query", protocol = protocol.name(), client = self.0.identity.name);
         let run = async move {
-            let _guard = service.0.activity.begin_work();
+            let _guard = service.0.shared.activity.begin_work();
             let stop = StopSignal::new();
             let timer = service.watch_query(protocol, listed_as, &stop);
             let done = tokio::select! {
@@ -302,12 +297,12 @@ impl QueryService {
         &self,
         work: impl FnOnce() -> T + Send + 'static,
     ) -> Result<T, RequestFault> {
-        let guard = self.0.activity.begin_work();
+        let guard = self.0.shared.activity.begin_work();
         let work = move || {
             let _guard = guard;
             work()
         };
-        let handle = self.0.encoders.handle().map(|threads| threads.spawn_blocking(work));
+        let handle = self.0.shared.encoders.handle().map(|threads| threads.spawn_blocking(work));
         let Some(handle) = handle else { return Err(RequestFault::Internal) };
         handle.await.map_err(RequestFault::defect("computing ended its task"))
     }
@@ -321,6 +316,11 @@ impl QueryService {
         job: QueryJob,
         encode: impl FnOnce(&SchemaRef) -> Result<E, RequestFault> + Send + 'static,
     ) -> BoxFuture<'_, Result<RunningQuery<E::Item>, RequestFault>> {
+        let mut job = job;
+        // A statement that an earlier request has planned runs for this one.
+        if let Some(number) = current_request() {
+            job.session = Arc::new(Session::clone(&job.session).of_request(Some(number)));
+        }
         let begun = async move {
             let (columns, known) = oneshot::channel();
             let (to, items) = mpsc::channel(WAITING);

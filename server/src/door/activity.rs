@@ -5,7 +5,7 @@ use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
 use chrono::{DateTime, Utc};
-use echolake_service::{ActivityRows, ActivityTable, ClientIdentity, Error, LakeFigures, TokenScope};
+use echolake_service::{ActivityRows, ActivityTable, Error, LakeFigures};
 
 use super::connection_places::OpenConnections;
 use super::query_log::QueryLog;
@@ -57,14 +57,11 @@ impl ServerActivity {
         matches!(*self.lake.lock().unwrap_or_else(PoisonError::into_inner), Some((_, None)))
     }
 
-    /// The rows of a table that a client may see: its own, or all if it may see the server's figures.
-    pub fn visible_rows(&self, table: ActivityTable, client: &ClientIdentity) -> ActivityRows {
-        let all = client.require_scope(TokenScope::Metrics).is_ok();
+    /// The rows of a table that the client of this name may see: its own, or all if it may see the server's figures.
+    pub fn visible_rows(&self, table: ActivityTable, client: &str, sees_all: bool) -> ActivityRows {
         match table {
-            ActivityTable::Queries => ActivityRows::Queries(self.queries.query_rows(&client.name, all)),
-            ActivityTable::Connections => {
-                ActivityRows::Connections(self.connections.connection_rows(&client.name, all))
-            }
+            ActivityTable::Queries => ActivityRows::Queries(self.queries.query_rows(client, sees_all)),
+            ActivityTable::Connections => ActivityRows::Connections(self.connections.connection_rows(client, sees_all)),
         }
     }
 }

@@ -12,15 +12,15 @@ use echolake_access::TokenAccess;
 use echolake_http::{FORWARDED_PROTO, MCP};
 use echolake_lake::Lake;
 use echolake_service::request_span::begin_request;
-use echolake_service::{ClientIdentity, Error, RequestFault, ServerProtocol};
+use echolake_service::{ClientIdentity, EngineRole, Error, RequestFault, ServerProtocol};
 use serde_json::{Value, json};
 use tokio::sync::{Semaphore, mpsc};
 use tokio::task::{AbortHandle, JoinSet};
 use tracing::Instrument as _;
 
-use super::engine_pool::EnginePool;
 use super::engine_process::EngineSettings;
 use super::forward::EngineProtocol;
+use super::server_engines::ServerEngines;
 use crate::door::activity::ServerActivity;
 
 /// Name of the client.
@@ -43,7 +43,7 @@ pub struct AgentDoor {
 
 /// The way of messages to the engine.
 struct AgentRoute {
-    engines: EnginePool,
+    engines: ServerEngines,
     client: ClientIdentity,
     host: HeaderValue,
     scheme: HeaderValue,
@@ -64,7 +64,7 @@ impl AgentDoor {
     pub fn new(lake: &Lake, engines: EngineSettings, pages: &str) -> Result<Self, Error> {
         let (scheme, host) = origin_headers(pages).ok_or_else(|| Error::Pages { found: pages.to_owned() })?;
         let activity = Arc::new(ServerActivity::new()?);
-        let engines = EnginePool::new(lake, engines, activity, Arc::new(TokenAccess::new(None)))?;
+        let engines = ServerEngines::new(lake, engines, activity, Arc::new(TokenAccess::new(None)))?;
         // No page of elsewhere reaches standard input.
         let client = ClientIdentity { is_open: false, ..ClientIdentity::local_client(AGENT) };
         Ok(Self { route: Arc::new(AgentRoute { engines, client, host, scheme }) })
@@ -75,8 +75,6 @@ impl AgentDoor {
     /// # Errors
     /// [`Error::System`].
     pub async fn answer_until(self, stop: impl Future<Output = ()>) -> Result<(), Error> {
-        let mut upkeep = JoinSet::new();
-        upkeep.spawn(self.route.engines.clone().retire_idle());
         tokio::select! {
             () = answer_lines(&self.route, read_lines()) => {}
             () = stop => {}
@@ -135,7 +133,9 @@ impl AgentRoute {
         headers.insert(FORWARDED_PROTO, self.scheme.clone());
         let (span, _) = begin_request(headers, ServerProtocol::Mcp);
         let work = async {
-            let response = self.engines.forward_request(&self.client, request, EngineProtocol::Http, None).await?;
+            let role = EngineRole::Statements;
+            let response =
+                self.engines.forward_request(role, &self.client, request, EngineProtocol::Http, None).await?;
             if response.status() == StatusCode::ACCEPTED {
                 return Ok(None);
             }

@@ -6,13 +6,12 @@ use std::io;
 use std::os::fd::OwnedFd;
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
-use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use axum::body::Body;
 use echolake_lake::CacheFolder;
-use echolake_service::{ClientIdentity, DoorMessage, EngineReport, EngineSocket, ServerProtocol, counted_bytes};
+use echolake_service::{DoorMessage, EngineEnd, EngineReport, EngineRole, EngineSocket, ServerProtocol, counted_bytes};
 use hyper::client::conn::{http1, http2};
 use hyper_util::rt::TokioIo;
 use rustix::process::{Pid, PidfdFlags, Signal, pidfd_open, pidfd_send_signal};
@@ -24,9 +23,6 @@ use tokio::task::JoinSet;
 
 use crate::door::activity::ServerActivity;
 
-/// Time for which a client has to ask nothing on its open connections and read nothing of its answers until its engine
-/// counts as idle. It is shorter than others wait for a place.
-const SILENCE: Duration = Duration::from_secs(5);
 /// Time for which a request that lost its engine waits for the reason.
 const REASON_WAIT: Duration = Duration::from_secs(2);
 
@@ -38,11 +34,8 @@ const IDLE_CONNECTIONS: usize = 32;
 pub struct EngineSettings {
     /// The program that has the command `engine`.
     pub program: PathBuf,
-    /// Bytes of memory that queries may hold, those of one client as those of all together; if they hold more, the
-    /// largest engine ends.
+    /// Bytes of memory that queries may hold, all of them together.
     pub memory: usize,
-    /// Engines at once, which is clients at once.
-    pub count: usize,
     /// Variables of their environment beside the server's own.
     pub environment: Vec<(String, String)>,
     /// The folder for temporary files; None for one in the lake.
@@ -58,8 +51,18 @@ pub struct EngineSettings {
 pub(crate) enum EndReason {
     /// The door needed it no more.
     Retired,
-    /// A query, or a defect.
-    Failed(String),
+    /// A query, or a defect; the engine itself may have named whose.
+    Failed(EngineEnd),
+}
+
+impl EndReason {
+    /// The reason for people.
+    pub fn text(&self) -> String {
+        match self {
+            Self::Retired => "the server is ending".to_owned(),
+            Self::Failed(end) => end.reason.clone(),
+        }
+    }
 }
 
 /// An engine.
@@ -67,13 +70,6 @@ pub(crate) struct EngineProcess {
     pid: u32,
     folder: PathBuf,
     stdin: tokio::sync::Mutex<ChildStdin>,
-    usage: Mutex<EngineUsage>,
-    /// Queries that run, or wait for their rows to be fetched.
-    queries: AtomicUsize,
-    base_bytes: OnceLock<usize>,
-    /// Memory limit of its client's queries.
-    memory_limit: OnceLock<usize>,
-    client: OnceLock<ClientIdentity>,
     ready: SetOnce<()>,
     /// Its process, even if another has its number after its end.
     process: OwnedFd,
@@ -90,28 +86,10 @@ pub(crate) struct HttpConnection {
     _driver: JoinSet<()>,
 }
 
-struct EngineUsage {
-    /// Open requests by number: since when the engine has waited for the client, or None if the client waits for it.
-    requests: HashMap<u64, Option<Instant>>,
-    last_request: u64,
-    last_used: Instant,
-    is_ending: bool,
-}
-
-impl EngineUsage {
-    // Time for which no client has waited for the engine; None if one does, or was silent for a moment only.
-    fn idle_time(&self) -> Option<Duration> {
-        let mut since = self.last_used;
-        for waiting in self.requests.values() {
-            since = since.max((*waiting)?);
-        }
-        Some(since.elapsed()).filter(|time| self.requests.is_empty() || *time >= SILENCE)
-    }
-}
-
 /// Parameters with which an engine is started.
 pub(crate) struct EngineStart<'a> {
     pub settings: &'a EngineSettings,
+    pub role: EngineRole,
     pub lake: &'a str,
     /// The lake's folder, if it is in one.
     pub lake_folder: Option<&'a Path>,
@@ -125,7 +103,7 @@ fn cache_arguments(cache: &CacheFolder) -> [OsString; 4] {
 }
 
 impl EngineProcess {
-    /// Starts a process that reads the lake and waits for its client.
+    /// Starts a process that reads the lake and waits for requests.
     ///
     /// # Errors
     /// The system gives no folder or process.
@@ -136,7 +114,7 @@ impl EngineProcess {
             .args(["--lake", start.lake, "engine", "--sockets"])
             .arg(&start.sockets)
             .args(start.lake_folder.iter().flat_map(|folder| [OsStr::new("--confine-to"), folder.as_os_str()]))
-            .arg("--memory-bytes")
+            .args(["--role", start.role.name(), "--memory-bytes"])
             .arg(counted_bytes(start.settings.memory).to_string())
             .args(
                 start.settings.slow.iter().flat_map(|slow| ["--log-slow-ms".to_owned(), slow.as_millis().to_string()]),
@@ -161,16 +139,6 @@ impl EngineProcess {
             pid,
             folder: start.sockets,
             stdin: tokio::sync::Mutex::new(stdin),
-            usage: Mutex::new(EngineUsage {
-                requests: HashMap::new(),
-                last_request: 0,
-                last_used: Instant::now(),
-                is_ending: false,
-            }),
-            queries: AtomicUsize::new(0),
-            base_bytes: OnceLock::new(),
-            memory_limit: OnceLock::new(),
-            client: OnceLock::new(),
             ready: SetOnce::new(),
             process,
             why_killed: OnceLock::new(),
@@ -191,26 +159,6 @@ impl EngineProcess {
             _ = self.ready.wait() => Ok(()),
             reason = self.ended.wait() => Err(reason.clone()),
         }
-    }
-
-    /// Waits until it is ready, and assigns it to a client.
-    ///
-    /// # Errors
-    /// It ended before that.
-    pub async fn assign_client(&self, client: &ClientIdentity) -> Result<(), EndReason> {
-        let failed = |e: io::Error| EndReason::Failed(format!("it could not be told whose it is: {e}"));
-        self.wait_until_ready().await?;
-        let _ = self.base_bytes.set(private_bytes(self.pid).unwrap_or(0));
-        if let Some(limit) = client.memory_bytes {
-            let _ = self.memory_limit.set(limit);
-        }
-        let _ = self.client.set(client.clone());
-        self.send_message(&DoorMessage::Client(client.clone())).await.map_err(failed)
-    }
-
-    /// Returns whether it is the engine of a client who may do just this.
-    pub fn is_of(&self, client: &ClientIdentity) -> bool {
-        self.client.get().is_some_and(|own| own == client)
     }
 
     /// Sends it a message.
@@ -265,46 +213,16 @@ impl EngineProcess {
         self.idle_connections.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Holds it for one request; None if it is ending.
-    pub fn hold_for_request(self: &Arc<Self>) -> Option<EngineLease> {
-        let mut usage = self.lock_usage();
-        if usage.is_ending || self.has_ended() {
-            return None;
-        }
-        usage.last_request += 1;
-        let number = usage.last_request;
-        usage.requests.insert(number, None);
-        drop(usage);
-        Some(EngineLease { engine: self.clone(), number })
-    }
-
     /// Kills it; the first reason counts.
     pub fn kill_process(&self, why: EndReason) {
-        self.lock_usage().is_ending = true;
         let _ = self.why_killed.set(why);
         // One that is gone already needs no kill.
         let _ = pidfd_send_signal(&self.process, Signal::KILL);
     }
 
-    /// Kills it if nobody has waited for it for longer than `time`.
-    pub fn retire_after(&self, time: Duration) -> bool {
-        let mut usage = self.lock_usage();
-        if usage.idle_time().is_none_or(|idle| idle < time) {
-            return false;
-        }
-        usage.is_ending = true;
-        drop(usage);
-        self.kill_process(EndReason::Retired);
-        true
-    }
-
     /// Returns whether its process has ended.
     pub fn has_ended(&self) -> bool {
         self.ended.get().is_some()
-    }
-
-    fn lock_usage(&self) -> MutexGuard<'_, EngineUsage> {
-        self.usage.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Returns the reason of its end, if it has ended.
@@ -317,70 +235,28 @@ impl EngineProcess {
         tokio::time::timeout(REASON_WAIT, self.ended.wait()).await.ok().cloned()
     }
 
-    /// Waits until it has ended.
-    pub async fn wait_for_end(&self) {
-        self.ended.wait().await;
+    /// Waits until it has ended; returns why.
+    pub async fn wait_for_end(&self) -> EndReason {
+        self.ended.wait().await.clone()
     }
 
-    /// Returns whether requests are open, such as connections of Postgres' protocol.
-    pub fn has_requests(&self) -> bool {
-        !self.lock_usage().requests.is_empty()
+    /// Returns whether it takes no more requests: it has ended, or is being killed.
+    pub fn is_ending(&self) -> bool {
+        self.why_killed.get().is_some() || self.has_ended()
     }
 
-    /// Returns whether queries run, or wait for their rows to be fetched.
-    pub fn has_queries(&self) -> bool {
-        self.queries.load(Ordering::Relaxed) > 0
-    }
-
-    /// Time for which no client has waited for it; None if one does, or was silent for a moment only.
-    pub fn idle_time(&self) -> Option<Duration> {
-        self.lock_usage().idle_time()
-    }
-
-    /// Bytes that its client's queries may occupy; None if they have no limit of their own.
-    pub fn memory_limit(&self) -> Option<usize> {
-        self.memory_limit.get().copied()
-    }
-
-    /// Bytes of memory that it occupies over what it did when it was assigned to its client.
-    pub fn grown_bytes(&self) -> usize {
-        let base = self.base_bytes.get().copied().unwrap_or(0);
-        private_bytes(self.pid).unwrap_or(0).saturating_sub(base)
+    /// Bytes of memory that it occupies: resident pages without those of files, which all engines share.
+    pub fn private_bytes(&self) -> usize {
+        private_bytes(self.pid).unwrap_or(0)
     }
 }
 
-// Resident pages without those of files, which all engines share.
 fn private_bytes(pid: u32) -> Option<usize> {
     let text = std::fs::read_to_string(Path::new("/proc").join(pid.to_string()).join("statm")).ok()?;
     let mut pages = text.split(' ').skip(1).map_while(|n| n.parse::<usize>().ok());
     let resident = pages.next()?;
     let shared = pages.next()?;
     Some(resident.saturating_sub(shared) * rustix::param::page_size())
-}
-
-/// A request's hold on its engine.
-pub(crate) struct EngineLease {
-    engine: Arc<EngineProcess>,
-    number: u64,
-}
-
-impl EngineLease {
-    pub fn engine(&self) -> &Arc<EngineProcess> {
-        &self.engine
-    }
-
-    /// Records whether the engine waits, from now on, for the client to ask or to read; else the client waits for it.
-    pub fn set_waiting(&self, is_waiting: bool) {
-        self.engine.lock_usage().requests.insert(self.number, is_waiting.then(Instant::now));
-    }
-}
-
-impl Drop for EngineLease {
-    fn drop(&mut self) {
-        let mut usage = self.engine.lock_usage();
-        usage.requests.remove(&self.number);
-        usage.last_used = Instant::now();
-    }
 }
 
 // Reads what the engine reports until it ends, and says then how.
@@ -391,7 +267,7 @@ async fn supervise_engine(
     spills: PathBuf,
     activity: Arc<ServerActivity>,
 ) {
-    let mut reports = EngineReports { activity, protocols: HashMap::new(), why: None };
+    let mut reports = EngineReports { activity, protocols: HashMap::new(), end: None };
     let mut lines = BufReader::new(stdout).lines();
     while let Ok(Some(line)) = lines.next_line().await {
         reports.take_report(&line, &engine);
@@ -400,8 +276,10 @@ async fn supervise_engine(
     let _ = child.start_kill();
     let status = child.wait().await;
     reports.activity.metrics.count_lost(reports.activity.queries.end_engine(engine.pid));
-    let found =
-        || reports.why.clone().unwrap_or_else(|| status.map_or_else(|e| e.to_string(), |s| format!("it ended by {s}")));
+    let found = || {
+        let reason = || status.map_or_else(|e| e.to_string(), |status| format!("it ended by {status}"));
+        reports.end.clone().unwrap_or_else(|| EngineEnd { reason: reason(), culprit: None })
+    };
     let why = engine.why_killed.get().cloned().unwrap_or_else(|| EndReason::Failed(found()));
     for folder in [&engine.folder, &spills] {
         // The server's folder is removed at its end.
@@ -414,7 +292,8 @@ struct EngineReports {
     activity: Arc<ServerActivity>,
     /// Protocols of the queries that run.
     protocols: HashMap<u64, ServerProtocol>,
-    why: Option<String>,
+    /// What the engine has said of its end.
+    end: Option<EngineEnd>,
 }
 
 impl EngineReports {
@@ -422,17 +301,14 @@ impl EngineReports {
         let activity = &self.activity;
         match serde_json::from_str(line) {
             Ok(EngineReport::Ready) => drop(engine.ready.set(())),
-            Ok(EngineReport::Ending(why)) => self.why = Some(why),
+            Ok(EngineReport::Ending(end)) => self.end = Some(end),
             Ok(EngineReport::Started(start)) => {
                 activity.metrics.count_begin(start.protocol);
                 self.protocols.insert(start.number, start.protocol);
-                engine.queries.store(self.protocols.len(), Ordering::Relaxed);
-                let client = engine.client.get().map_or("", |client| client.name.as_str());
-                activity.queries.log_begin(client, engine.pid, start);
+                activity.queries.log_begin(engine.pid, start);
             }
             Ok(EngineReport::Ended(end)) => {
                 if let Some(protocol) = self.protocols.remove(&end.number) {
-                    engine.queries.store(self.protocols.len(), Ordering::Relaxed);
                     activity.metrics.count_end(protocol, &end);
                     activity.queries.log_end(engine.pid, &end);
                 }
@@ -440,9 +316,8 @@ impl EngineReports {
             Ok(EngineReport::Failure(code)) => activity.metrics.count_failure(code),
             Ok(EngineReport::Lake(figures)) => activity.set_lake(figures),
             Ok(EngineReport::Cache(counts)) => activity.metrics.count_cached(&counts),
-            Ok(EngineReport::Ask { number, table }) => {
-                let Some(client) = engine.client.get() else { return };
-                let message = DoorMessage::Rows { number, rows: activity.visible_rows(table, client) };
+            Ok(EngineReport::Ask { number, table, client, sees_all }) => {
+                let message = DoorMessage::Rows { number, rows: activity.visible_rows(table, &client, sees_all) };
                 let engine = engine.clone();
                 // Beside this: an engine that does not read must not keep its reports from being read.
                 tokio::spawn(async move { drop(engine.send_message(&message).await) });

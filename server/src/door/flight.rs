@@ -1,4 +1,4 @@
-//! Flight SQL connections of the door: HTTP/2, whose requests are forwarded to the client's engine.
+//! Flight SQL connections of the door: HTTP/2, whose requests are forwarded to the engine of statements.
 
 use std::convert::Infallible;
 
@@ -7,7 +7,7 @@ use axum::http::{Request, Response, header};
 use echolake_flight::{WINDOW_BYTES, grpc_status};
 use echolake_service::authorization::of_header;
 use echolake_service::request_span::{REQUEST_ID, begin_request};
-use echolake_service::{ClientIdentity, RequestFault, ServerProtocol};
+use echolake_service::{ClientIdentity, EngineRole, RequestFault, ServerProtocol};
 use hyper::body::Incoming;
 use hyper::service::service_fn;
 use hyper_util::rt::TokioIo;
@@ -76,7 +76,9 @@ impl ServerDoor {
         let client = self.note_client(work, ServerProtocol::FlightSql, found)?;
         let is_interactive = INTERACTIVE.iter().any(|method| request.uri().path().ends_with(method));
         let wire = if is_interactive { EngineProtocol::InteractiveGrpc } else { EngineProtocol::Grpc };
-        let response = self.engines().forward_request(&client, request.map(Body::new), wire, Some(work)).await?;
+        let engines = self.engines();
+        let role = EngineRole::Statements;
+        let response = engines.forward_request(role, &client, request.map(Body::new), wire, Some(work)).await?;
         Ok(response.map(Body::new))
     }
 }

@@ -10,17 +10,19 @@ use axum::http::request::Parts;
 use axum::http::{HeaderMap, HeaderName, Request, Response, header};
 use bytes::Bytes;
 use echolake_flight::WINDOW_BYTES;
-use echolake_service::{ClientIdentity, EngineSocket, RequestFault};
+use echolake_service::request_span::request_number;
+use echolake_service::{ClientIdentity, EngineRole, EngineSocket, RequestFault, mark_client};
 use futures::stream;
 use hyper::body::{Frame, Incoming, SizeHint};
 use hyper::client::conn::http2;
 use hyper_util::rt::{TokioExecutor, TokioIo};
+use tokio_util::sync::WaitForCancellationFutureOwned;
 use tracing::Span;
 
 use super::body_reader::{BodyReader, check_declared_size};
 use super::connection_places::{PlaceWork, WorkingPlace};
-use super::engine_pool::EnginePool;
-use super::engine_process::{EndReason, EngineLease, EngineProcess, HttpConnection};
+use super::engine_process::{EndReason, EngineProcess, HttpConnection};
+use super::server_engines::ServerEngines;
 
 /// Bytes of a request up to which it is kept, so that it can be sent again to a new engine.
 const KEPT_BYTES: usize = 64 << 10;
@@ -55,14 +57,15 @@ enum RequestBody {
 /// The fault of a streamed body, once it is known.
 type BodyFault = Arc<Mutex<Option<RequestFault>>>;
 
-impl EnginePool {
-    /// Answers a request by the engine of `client`; `work` marks its connection, if it came on one. If the engine ends
-    /// before its answer begins, a new one is asked once.
+impl ServerEngines {
+    /// Answers a request of `client` by the engine of a role; `work` marks its connection, if it came on one. If the
+    /// engine ends before its answer begins, the next one is asked once, unless the request itself ended it.
     ///
     /// # Errors
-    /// [`RequestFault::EngineEnded`], [`RequestFault::TooMany`], [`RequestFault::TooLarge`], [`RequestFault::Request`].
+    /// [`RequestFault::EngineEnded`], [`RequestFault::Backoff`], [`RequestFault::TooLarge`], [`RequestFault::Request`].
     pub async fn forward_request(
         &self,
+        role: EngineRole,
         client: &ClientIdentity,
         request: Request<Body>,
         wire: EngineProtocol,
@@ -73,6 +76,8 @@ impl EnginePool {
         for name in OF_CONNECTION {
             parts.headers.remove(name);
         }
+        mark_client(&mut parts.headers, client)?;
+        let number = request_number(&parts.headers);
         let mut body = match wire {
             EngineProtocol::InteractiveGrpc => {
                 RequestBody::from_reader(Bytes::new(), BodyReader::new(body, 1), usize::MAX)
@@ -82,29 +87,38 @@ impl EnginePool {
         };
         let working = work.map(PlaceWork::begin_work);
         let mut ended = None;
+        // Held by a request that is repeated and may be what ended the engine.
+        let mut alone = None;
         loop {
-            let lease = match self.lease_for(client).await {
+            let engine = match self.engine_for(role, client).await {
                 // The cause is what ended the first engine.
                 Err(RequestFault::Backoff { ends, wait }) => {
                     return Err(ended.unwrap_or(RequestFault::Backoff { ends, wait }));
                 }
-                leased => leased?,
+                found => found?,
             };
             let (sent, fault, again) = body.into_parts();
-            let answer = EngineAnswer::fetch_from(lease.engine(), request_of(&parts, sent), wire).await;
-            match (answer, again) {
-                (Ok(answer), _) => return Ok(answer.into_engine_response(lease, working)),
-                (Err(failed), Some(again)) => {
+            let answer = EngineAnswer::fetch_from(&engine, request_of(&parts, sent), wire).await;
+            let failed = match answer {
+                Ok(answer) => {
+                    let end = self.client_end(&client.name).cancelled_owned();
+                    return Ok(answer.into_engine_response(engine, working, end));
+                }
+                Err(failed) => failed,
+            };
+            let why = engine.why_ended().await;
+            let is_culprit = why.as_ref().is_some_and(|why| self.note_end(why, client, number, alone.is_some()));
+            let found = find_engine_fault(why.as_ref(), &failed);
+            let known = fault.lock().unwrap_or_else(PoisonError::into_inner).take();
+            match again {
+                Some(again) if ended.is_none() && !is_culprit => {
                     body = again;
-                    ended = Some(find_engine_fault(&lease, &failed).await);
+                    ended = Some(found);
+                    if matches!(&why, Some(EndReason::Failed(end)) if end.culprit.is_none()) {
+                        alone = Some(self.suspect_turn().await);
+                    }
                 }
-                (Err(failed), None) => {
-                    let fault = fault.lock().unwrap_or_else(PoisonError::into_inner).take();
-                    return Err(match fault {
-                        Some(fault) => fault,
-                        None => find_engine_fault(&lease, &failed).await,
-                    });
-                }
+                _ => return Err(known.unwrap_or(found)),
             }
         }
     }
@@ -156,10 +170,9 @@ fn request_of(parts: &Parts, body: Body) -> Request<Body> {
     request
 }
 
-async fn find_engine_fault(lease: &EngineLease, failed: &str) -> RequestFault {
-    match lease.engine().why_ended().await {
-        Some(EndReason::Failed(reason)) => RequestFault::EngineEnded { reason },
-        Some(EndReason::Retired) => RequestFault::EngineEnded { reason: "the server needed its place".to_owned() },
+fn find_engine_fault(why: Option<&EndReason>, failed: &str) -> RequestFault {
+    match why {
+        Some(why) => RequestFault::EngineEnded { reason: why.text() },
         None => {
             tracing::error!(error = failed, "an engine does not answer");
             RequestFault::Internal
@@ -199,12 +212,18 @@ impl EngineAnswer {
         Ok(Self { response, connection, wire })
     }
 
-    fn into_engine_response(self, lease: EngineLease, working: Option<WorkingPlace>) -> Response<EngineBody> {
+    fn into_engine_response(
+        self,
+        engine: Arc<EngineProcess>,
+        working: Option<WorkingPlace>,
+        client_end: WaitForCancellationFutureOwned,
+    ) -> Response<EngineBody> {
         let Self { response, connection, wire } = self;
-        lease.set_waiting(true);
         response.map(|incoming| {
             let is_ended = false;
-            EngineBody { incoming, wire, lease, connection, _working: working, span: Span::current(), is_ended }
+            let client_end = Box::pin(client_end);
+            let span = Span::current();
+            EngineBody { incoming, wire, engine, connection, client_end, _working: working, span, is_ended }
         })
     }
 }
@@ -214,7 +233,7 @@ impl Drop for EngineBody {
         if hyper::body::Body::is_end_stream(self)
             && let Some(connection) = self.connection.take()
         {
-            self.lease.engine().keep_connection(connection);
+            self.engine.keep_connection(connection);
         }
     }
 }
@@ -247,8 +266,10 @@ impl EngineProcess {
 pub(crate) struct EngineBody {
     incoming: Incoming,
     wire: EngineProtocol,
-    lease: EngineLease,
+    engine: Arc<EngineProcess>,
     connection: Option<HttpConnection>,
+    /// The end of its client's rights, which ends the answer, too.
+    client_end: Pin<Box<WaitForCancellationFutureOwned>>,
     _working: Option<WorkingPlace>,
     span: Span,
     is_ended: bool,
@@ -258,45 +279,85 @@ impl EngineBody {
     // gRPC reports a failure in trailers behind the answer, so that the client sees it; HTTP/1.1 breaks the connection
     // off.
     fn failure_frame(&self) -> Option<Frame<Bytes>> {
-        let reason = match self.lease.engine().end_reason() {
-            Some(EndReason::Failed(reason)) => reason.clone(),
-            Some(EndReason::Retired) => "the server needed its place, and nobody read its answer".to_owned(),
-            None => "it stopped answering".to_owned(),
-        };
+        let reason = self.engine.end_reason().map_or_else(|| "it stopped answering".to_owned(), EndReason::text);
         self.span.in_scope(|| tracing::info!(reason, "an answer broke off"));
+        self.fault_trailers(&RequestFault::EngineEnded { reason })
+    }
+
+    fn refusal_frame(&self) -> Option<Frame<Bytes>> {
+        self.span.in_scope(|| tracing::info!("an answer to a client that may no longer ask is broken off"));
+        self.fault_trailers(&RequestFault::Unauthenticated)
+    }
+
+    fn fault_trailers(&self, fault: &RequestFault) -> Option<Frame<Bytes>> {
         if self.wire == EngineProtocol::Http {
             return None;
         }
         let mut trailers = HeaderMap::new();
-        echolake_flight::grpc_status(&RequestFault::EngineEnded { reason }).add_header(&mut trailers).ok()?;
+        echolake_flight::grpc_status(fault).add_header(&mut trailers).ok()?;
         Some(Frame::trailers(trailers))
+    }
+}
+
+/// Why an answer breaks off.
+#[derive(Debug)]
+pub(crate) enum EngineBodyError {
+    /// Its engine ended, or the connection to it.
+    Broken(hyper::Error),
+    /// Its client may no longer ask, or may do other things now.
+    ClientEnded,
+}
+
+impl std::fmt::Display for EngineBodyError {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Broken(failed) => failed.fmt(f),
+            Self::ClientEnded => f.write_str("the client may no longer ask"),
+        }
+    }
+}
+
+impl std::error::Error for EngineBodyError {
+    fn source(&self) -> Option<&(dyn std::error::Error + 'static)> {
+        match self {
+            Self::Broken(failed) => Some(failed),
+            Self::ClientEnded => None,
+        }
     }
 }
 
 impl hyper::body::Body for EngineBody {
     type Data = Bytes;
-    type Error = hyper::Error;
+    type Error = EngineBodyError;
 
     fn poll_frame(
         mut self: Pin<&mut Self>,
         context: &mut Context<'_>,
-    ) -> Poll<Option<Result<Frame<Bytes>, hyper::Error>>> {
+    ) -> Poll<Option<Result<Frame<Bytes>, EngineBodyError>>> {
         if self.is_ended {
             return Poll::Ready(None);
         }
+        if self.client_end.as_mut().poll(context).is_ready() {
+            self.is_ended = true;
+            self.connection = None;
+            return match self.refusal_frame() {
+                Some(refusal) => Poll::Ready(Some(Ok(refusal))),
+                None => Poll::Ready(Some(Err(EngineBodyError::ClientEnded))),
+            };
+        }
         let polled = Pin::new(&mut self.incoming).poll_frame(context);
-        self.lease.set_waiting(polled.is_ready());
         match polled {
             Poll::Ready(Some(Err(failed))) => {
                 self.is_ended = true;
                 self.connection = None;
-                Poll::Ready(Some(self.failure_frame().ok_or(failed)))
+                Poll::Ready(Some(self.failure_frame().ok_or(EngineBodyError::Broken(failed))))
             }
             Poll::Ready(None) => {
                 self.is_ended = true;
                 Poll::Ready(None)
             }
-            other => other,
+            Poll::Ready(Some(Ok(frame))) => Poll::Ready(Some(Ok(frame))),
+            Poll::Pending => Poll::Pending,
         }
     }
 

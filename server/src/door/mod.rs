@@ -1,5 +1,5 @@
-//! The door: the process that clients reach. It holds connections, finds out who asks, and forwards requests to the
-//! engine of that client. It parses no SQL and decodes no file, so that no request can end it.
+//! The door: the process that clients reach. It holds connections, finds out who asks, and forwards requests to one of
+//! two engines, with the name of their client. It parses no SQL and decodes no file, so that no request can end it.
 
 pub(crate) mod activity;
 mod agent;
@@ -12,7 +12,7 @@ pub(crate) mod connection_places;
 mod der_element;
 pub(crate) mod drain;
 mod encryption;
-mod engine_pool;
+mod engine_ends;
 mod engine_process;
 mod failed_logins;
 mod flight;
@@ -24,6 +24,7 @@ mod postgres;
 mod query_log;
 mod readiness;
 pub(crate) mod server_door;
+mod server_engines;
 mod temp_folder;
 
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, UdpSocket};

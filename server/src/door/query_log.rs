@@ -32,11 +32,11 @@ pub(crate) struct RunningPlace {
 
 impl QueryLog {
     /// Takes note of a query that begins in an engine.
-    pub fn log_begin(&self, client: &str, engine: u32, start: QueryStart) {
+    pub fn log_begin(&self, engine: u32, start: QueryStart) {
         let mut queries = self.lock_queries();
         let query = LoggedQuery {
             id: random_id(),
-            client: client.to_owned(),
+            client: start.client,
             protocol: start.protocol.name().to_owned(),
             statement: Some(start.statement),
             outcome: "running".to_owned(),
@@ -119,7 +119,8 @@ mod tests {
     fn begin(log: &QueryLog, client: &str, engine: u32, number: u64) {
         let statement = format!("select {number}");
         let started = log.query_rows(client, true).len() as i64;
-        log.log_begin(client, engine, QueryStart { number, protocol: ServerProtocol::Http, statement, started });
+        let client = client.to_owned();
+        log.log_begin(engine, QueryStart { number, client, protocol: ServerProtocol::Http, statement, started });
     }
 
     fn end(number: u64, failure: Option<FaultCode>) -> QueryEnd {

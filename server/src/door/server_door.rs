@@ -11,11 +11,11 @@ use echolake_service::{ClientIdentity, Error, RequestFault, ServerProtocol, Toke
 use super::audit;
 use super::connection_places::PlaceWork;
 use super::drain::ServerDrain;
-use super::engine_pool::EnginePool;
 use super::engine_process::EngineSettings;
 use super::failed_logins::FailedLogins;
 use super::http::answer_cache::AnswerCache;
 use super::readiness::ReadinessCheck;
+use super::server_engines::ServerEngines;
 use crate::door::activity::ServerActivity;
 use crate::metrics::{ServerGauges, ServerMetrics};
 
@@ -30,7 +30,7 @@ struct DoorState {
     lake: Lake,
     access: Arc<TokenAccess>,
     activity: Arc<ServerActivity>,
-    engines: EnginePool,
+    engines: ServerEngines,
     answers: AnswerCache,
     readiness: ReadinessCheck,
     drain: ServerDrain,
@@ -51,7 +51,7 @@ impl ServerDoor {
     ) -> Result<Self, Error> {
         let failed_logins = FailedLogins::new(!access.is_open() && !is_behind_proxy);
         let activity = Arc::new(ServerActivity::new()?);
-        let engines = EnginePool::new(lake, settings, activity.clone(), access.clone())?;
+        let engines = ServerEngines::new(lake, settings, activity.clone(), access.clone())?;
         let answers = AnswerCache::new(lake);
         let layout = ViewerLayout::new(lake.rig());
         let readiness = ReadinessCheck::new(lake);
@@ -106,7 +106,7 @@ impl ServerDoor {
         let activity = self.activity();
         let is_ready = self.check_ready().await.is_ok();
         let gauges = ServerGauges {
-            pool: self.0.engines.pool_gauges(),
+            engines: self.0.engines.engine_gauges(),
             connections: activity.connections.protocol_counts(),
             // A lake that does not answer may be on a disk that does not answer either.
             disks: if is_ready { self.0.engines.disk_spaces() } else { Vec::new() },
@@ -120,12 +120,14 @@ impl ServerDoor {
     /// Reads the file of tokens again when it changes, and ends what clients without a token were doing; never ends.
     pub async fn watch_tokens(self) {
         let mut known = TokenFileState::default();
-        let mut ended = Vec::new();
+        let mut ended: Vec<String> = Vec::new();
         loop {
             let gone = self.0.access.reload_changed(&mut known);
             gone.iter().for_each(|client| tracing::warn!(client, "it may no longer ask, or may do other things now"));
             // Those of the last look again: a request may have begun between its check and its engine's end.
-            ended.iter().chain(&gone).for_each(|client: &String| self.0.engines.end_client(client));
+            for client in ended.iter().chain(&gone) {
+                self.0.engines.end_client(client).await;
+            }
             ended = gone;
             tokio::time::sleep(LOOK_EVERY).await;
         }
@@ -189,7 +191,7 @@ impl ServerDoor {
     }
 
     /// The engines.
-    pub fn engines(&self) -> &EnginePool {
+    pub fn engines(&self) -> &ServerEngines {
         &self.0.engines
     }
 }

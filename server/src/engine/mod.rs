@@ -1,5 +1,6 @@
-//! An engine: the queries of one client, in a process of their own. It answers the three protocols on Unix sockets in a
-//! folder that only its user may enter; the door, which started it, is its only peer and has authenticated the client.
+//! An engine: queries of all clients, in a process that reads the lake and writes nothing. It answers the three protocols
+//! on Unix sockets in a folder that only its user may enter; the door, which started it, is its only peer, has
+//! authenticated the clients, and names the client of each request.
 
 pub mod confinement;
 mod watchdog;
@@ -11,9 +12,9 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use echolake_lake::Lake;
-use echolake_query::{EngineClient, QueryEngine, QueryQuota, Session};
+use echolake_query::{EngineClient, EngineLimits, QueryEngine, QueryQuota, Session};
 use echolake_schema::tables::Table;
-use echolake_service::{ClientIdentity, DoorMessage, EngineReport, EngineSocket, Error, LakeFigures, QueryService};
+use echolake_service::{DoorMessage, EngineReport, EngineRole, EngineServices, EngineSocket, Error, LakeFigures};
 use futures::FutureExt as _;
 use tokio::sync::mpsc;
 
@@ -23,53 +24,61 @@ const WARM_UP: &str = "select count(*) from runs";
 /// money.
 const LAKE_LOOK: Duration = Duration::from_secs(15);
 const REMOTE_LAKE_LOOK: Duration = Duration::from_secs(60);
+/// Niceness of threads that run statements from outside: a page, which is computed beside them, has the processors
+/// first.
+const STATEMENT_NICENESS: i32 = 10;
 
-/// Answers one client's requests until standard input ends, which the door holds. Its queries may hold `memory` bytes;
-/// those that take as long as `slow` are logged.
-///
-/// It is a spare at first: it reads the lake, reports that it is ready, and learns whose engine it is by the first line
-/// of standard input.
+/// What an engine is started with.
+#[derive(Debug, Clone, Copy)]
+pub struct EngineOptions<'a> {
+    /// What it answers.
+    pub role: EngineRole,
+    /// The folder of its sockets.
+    pub sockets: &'a Path,
+    /// Bytes that its queries may hold.
+    pub memory: usize,
+    /// Time from which a query is logged as slow; None for never.
+    pub slow: Option<Duration>,
+}
+
+/// Answers requests until standard input ends, which the door holds. It reads the lake first, and reports that it is
+/// ready.
 ///
 /// # Errors
 /// [`Error::System`], [`Error::Query`], [`Error::Transport`].
-pub async fn run_engine(lake: &Lake, sockets: &Path, memory: usize, slow: Option<Duration>) -> Result<(), Error> {
-    let mut messages = read_messages();
+pub async fn run_engine(lake: &Lake, options: EngineOptions<'_>) -> Result<(), Error> {
+    let EngineOptions { role, sockets, memory, slow } = options;
+    let messages = read_messages();
     let http = EngineSocket::Http.listen_in(sockets)?;
     let flight_sql = EngineSocket::FlightSql.listen_in(sockets)?;
     #[cfg(feature = "postgres")]
     let postgres = EngineSocket::Postgres.listen_in(sockets)?;
-    let engine = QueryEngine::new(lake, Some(memory))?;
+    let niceness = (role == EngineRole::Statements).then_some(STATEMENT_NICENESS);
+    let limits = EngineLimits { memory: Some(memory), niceness, ..EngineLimits::default() };
+    let engine = QueryEngine::with_limits(lake, limits)?;
     warm_up(&engine).await?;
-    EngineReport::Ready.send_line();
-    let identity = tokio::select! {
-        identity = next_client(&mut messages) => identity,
-        never = report_lake(lake, &engine) => match never {},
-    };
-    // The door went away before it had a use for this engine.
-    let Some(identity) = identity else { return Ok(()) };
-    let limit = identity.memory_bytes.map_or(memory, |own| own.min(memory));
-    let lake = &identity.visible_lake(lake);
-    // Whatever the spare engine has read of the lake, it read as a reader of all projects.
-    let engine = match lake.is_restricted() {
-        true => QueryEngine::new(lake, Some(memory))?,
-        false => engine,
-    };
-    let service = QueryService::new(lake, engine, identity, slow)?;
-    // If the engine is new, this plans all views, which the watchdog would take for work that nobody waits for.
-    drop(service.lake_tables());
+    let services = EngineServices::new(lake, engine, slow)?;
     // Behind the start of its threads, whose stacks count.
-    confinement::limit_memory(limit).map_err(Error::System)?;
-    watchdog::start_watchdog(&service).map_err(Error::System)?;
-    let obeying = service.clone();
+    confinement::limit_memory(memory).map_err(Error::System)?;
+    watchdog::start_watchdog(&services, role, memory).map_err(Error::System)?;
+    EngineReport::Ready.send_line();
     #[cfg(feature = "postgres")]
-    let postgres = echolake_postgres::serve_postgres_socket(service.clone(), postgres);
+    let postgres = echolake_postgres::serve_postgres_socket(services.clone(), postgres);
     #[cfg(not(feature = "postgres"))]
     let postgres = std::future::pending();
+    let of_statements = async {
+        match role {
+            EngineRole::Pages => match report_lake(lake, services.engine()).await {},
+            EngineRole::Statements => tokio::select! {
+                failed = echolake_flight::serve_flight_socket(services.clone(), flight_sql) => failed,
+                failed = postgres => failed,
+            },
+        }
+    };
     tokio::select! {
-        () = obeying.obey_door(messages) => Ok(()),
-        failed = echolake_http::serve_http_socket(service.clone(), http) => failed,
-        failed = echolake_flight::serve_flight_socket(service.clone(), flight_sql) => failed,
-        failed = postgres => failed,
+        () = services.obey_door(messages) => Ok(()),
+        failed = echolake_http::serve_http_socket(services.clone(), role, http) => failed,
+        failed = of_statements => failed,
     }
 }
 
@@ -89,15 +98,7 @@ fn read_messages() -> mpsc::UnboundedReceiver<DoorMessage> {
     receive
 }
 
-async fn next_client(messages: &mut mpsc::UnboundedReceiver<DoorMessage>) -> Option<ClientIdentity> {
-    loop {
-        if let DoorMessage::Client(identity) = messages.recv().await? {
-            return Some(identity);
-        }
-    }
-}
-
-// Reports the lake's figures again and again: an engine that waits for a client has nothing else to do.
+// Reports the lake's figures again and again.
 async fn report_lake(lake: &Lake, engine: &QueryEngine) -> Infallible {
     let session = engine.open_session(&Arc::new(EngineClient::new("lake figures", QueryQuota::default())));
     // Counted once for each version of `runs`.

@@ -1,42 +1,60 @@
-//! Ends its own process if work continues after its query has ended: planning, a call of a function, an operator that
-//! does not return. The library cannot be interrupted there; the process is one client's, and its door starts another.
+//! Watches an engine from within: ends the process if a statement goes on computing after its end, which the library
+//! cannot interrupt, or if memory stays over its limit. Its door repeats what the others asked on the next engine.
 
 use std::time::{Duration, Instant};
 
-use echolake_lake::CacheCounts;
-use echolake_service::{EngineReport, QueryService};
-use rustix::time::{ClockId, clock_gettime};
+use echolake_lake::{CACHE_MEMORY_BYTES, CacheCounts};
+use echolake_query::StatementBlame;
+use echolake_service::{EngineCulprit, EngineEnd, EngineReport, EngineRole, EngineServices};
 
 /// Time between two looks; what was reported meanwhile is sent as often.
 const INTERVAL: Duration = Duration::from_millis(50);
-/// Time for which work may continue after its query was cancelled, ran out of time, or lost its client.
+/// Time between two looks at memory while statements run.
+const MEMORY_LOOK: Duration = Duration::from_millis(10);
+/// Time of the processors that a statement may use after it was cancelled, ran out of time, or lost its client.
 const GRACE: Duration = Duration::from_millis(250);
-/// Part of one processor from which an engine without requests is not idle.
-const BUSY: f64 = 0.5;
+/// Memory of an engine that is not of its queries: footers of files, small tables, what the allocator keeps.
+const CACHE_BYTES: usize = 192 << 20;
+/// Part of its memory by which an engine may be over it after its largest statement was cancelled.
+const TOLERANCE: f64 = 1.2;
+/// Time that a cancelled statement has to give its memory back.
+const RELEASE: Duration = Duration::from_millis(500);
 
 /// Starts a thread that looks on until the process ends.
 ///
 /// # Errors
-/// The system gives no thread.
-pub(super) fn start_watchdog(service: &QueryService) -> std::io::Result<()> {
-    let service = service.clone();
-    std::thread::Builder::new().name("watchdog".to_owned()).spawn(move || watch_service(&service))?;
+/// The system gives no thread, or does not tell the process's memory.
+pub(super) fn start_watchdog(services: &EngineServices, role: EngineRole, memory: usize) -> std::io::Result<()> {
+    let services = services.clone();
+    let blocks = if services.lake().is_remote() { CACHE_MEMORY_BYTES as usize } else { 0 };
+    let base = private_bytes().ok_or_else(|| std::io::Error::other("/proc/self/statm cannot be read"))?;
+    let limit = (memory as f64 * TOLERANCE) as usize + base + CACHE_BYTES + blocks;
+    let memory = MemoryWatch { limit, cancelled: None };
+    std::thread::Builder::new().name("watchdog".to_owned()).spawn(move || watch_engine(&services, role, memory))?;
     Ok(())
 }
 
-fn watch_service(service: &QueryService) {
-    let mut idle = IdleWork::default();
+fn watch_engine(services: &EngineServices, role: EngineRole, mut memory: MemoryWatch) {
     let mut cached = CacheCounts::default();
+    let mut looked = Instant::now();
     loop {
-        std::thread::sleep(INTERVAL);
+        let is_busy = services.engine().count_running() > 0 || memory.cancelled.is_some();
+        std::thread::sleep(if is_busy { MEMORY_LOOK } else { INTERVAL });
+        // Its own statements are not ended: pages answer on while those from outside go wrong.
+        if role == EngineRole::Statements {
+            memory.check_memory(services);
+        }
+        if looked.elapsed() < INTERVAL {
+            continue;
+        }
+        looked = Instant::now();
         EngineReport::send_queued();
-        if service.engine().find_runaway(GRACE).is_some() {
-            end_process("a query that was ended did not stop");
+        if role == EngineRole::Statements
+            && let Some(blame) = services.engine().find_runaway(GRACE)
+        {
+            end_process("a query that was ended did not stop", Some(blame));
         }
-        if idle.measure_busy_time(service.activity().count() == 0) > GRACE {
-            end_process("work that nobody waits for did not stop");
-        }
-        if let Some(counts) = service.lake().cache_counts()
+        if let Some(counts) = services.lake().cache_counts()
             && counts != cached
         {
             EngineReport::Cache(counts.since(&cached)).send_line();
@@ -45,36 +63,41 @@ fn watch_service(service: &QueryService) {
     }
 }
 
-fn end_process(why: &str) -> ! {
-    EngineReport::Ending(why.to_owned()).send_line();
+fn end_process(reason: &str, blame: Option<StatementBlame>) -> ! {
+    let culprit = blame.map(|blame| EngineCulprit { client: blame.client, request: blame.request });
+    EngineReport::Ending(EngineEnd { reason: reason.to_owned(), culprit }).send_line();
     std::process::abort()
 }
 
-/// Time for which the process has computed without a request.
-#[derive(Default)]
-struct IdleWork {
-    last: Option<(Instant, Duration)>,
-    time: Duration,
+/// Memory over the limit: the largest statement is cancelled first.
+struct MemoryWatch {
+    /// Bytes that the process may occupy.
+    limit: usize,
+    /// The statement that was cancelled for it, and when.
+    cancelled: Option<(Instant, Option<StatementBlame>)>,
 }
 
-impl IdleWork {
-    fn measure_busy_time(&mut self, is_idle: bool) -> Duration {
-        let now = Instant::now();
-        let cpu = cpu_time();
-        if let (Some((then, before)), true) = (self.last, is_idle)
-            && cpu.saturating_sub(before).as_secs_f64() > BUSY * (now - then).as_secs_f64()
-        {
-            self.time += now - then;
-        } else {
-            self.time = Duration::ZERO;
+impl MemoryWatch {
+    fn check_memory(&mut self, services: &EngineServices) {
+        if private_bytes().unwrap_or(0) <= self.limit {
+            self.cancelled = None;
+            return;
         }
-        self.last = Some((now, cpu));
-        self.time
+        match &self.cancelled {
+            None => self.cancelled = Some((Instant::now(), services.engine().cancel_largest())),
+            Some((at, blame)) if at.elapsed() > RELEASE => {
+                end_process("queries took more memory than --memory", blame.clone());
+            }
+            Some(_) => {}
+        }
     }
 }
 
-// Of all threads of the process.
-fn cpu_time() -> Duration {
-    let time = clock_gettime(ClockId::ProcessCPUTime);
-    Duration::new(time.tv_sec.unsigned_abs(), time.tv_nsec as u32)
+/// Returns the bytes that this process occupies: resident pages without those of files.
+fn private_bytes() -> Option<usize> {
+    let text = std::fs::read_to_string("/proc/self/statm").ok()?;
+    let mut pages = text.split(' ').skip(1).map_while(|n| n.parse::<usize>().ok());
+    let resident = pages.next()?;
+    let shared = pages.next()?;
+    Some(resident.saturating_sub(shared) * rustix::param::page_size())
 }

@@ -11,7 +11,7 @@ use rustix::time::{ClockId, clock_gettime};
 /// Gauges of one moment.
 #[derive(Default)]
 pub(crate) struct ServerGauges {
-    pub pool: PoolGauges,
+    pub engines: EngineGauges,
     /// Open connections of each protocol that is served, and their limit.
     pub connections: Vec<(ServerProtocol, usize, usize)>,
     /// Space on the disks of `lake` and `temp`.
@@ -33,14 +33,14 @@ pub(crate) struct DiskSpace {
 
 /// Gauges of the engines.
 #[derive(Default)]
-pub(crate) struct PoolGauges {
-    /// Engines that have a client, and their limit.
+pub(crate) struct EngineGauges {
+    /// Engines that run, and their limit.
     pub engines: usize,
     pub most_engines: usize,
     /// Bytes that their queries occupy, and their limit.
     pub bytes: usize,
     pub most_bytes: usize,
-    /// Engines since the start: those that were started, and those that ended while they had a client.
+    /// Engines since the start: those that were started, and those that ended by themselves.
     pub started: usize,
     pub failed: u64,
 }
@@ -55,7 +55,7 @@ impl ServerGauges {
             "1 if requests are answered, as /ready says.",
             f64::from(u8::from(self.is_ready)),
         )?;
-        self.register_pool(&moment)?;
+        self.register_engines(&moment)?;
         for (protocol, open, most) in &self.connections {
             let label = ("protocol", protocol.name());
             moment.register_labelled("echolake_connections", "Open connections.", label, *open as f64)?;
@@ -80,7 +80,7 @@ impl ServerGauges {
         self.register_process(&moment)
     }
 
-    fn register_pool(&self, moment: &MomentRegistry<'_>) -> Result<()> {
+    fn register_engines(&self, moment: &MomentRegistry<'_>) -> Result<()> {
         let pool = &self.pool;
         moment.register_gauge("echolake_engines", "Engines that have a client.", pool.engines as f64)?;
         moment.register_gauge("echolake_engines_limit", "Engines that may have a client.", pool.most_engines as f64)?;

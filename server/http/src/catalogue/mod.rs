@@ -49,7 +49,7 @@ use super::problem::ProblemResponse;
 use request::SurfacePath;
 pub(super) use request::{CatalogueRequest, RunPath, find_run, text_value};
 pub(super) use snapshot::view::AnswerContents;
-use snapshot::view::SnapshotViews;
+pub(super) use snapshot::view::SnapshotViews;
 pub(super) use snapshot::view::{SnapshotView, VisibleFile};
 pub(super) use tables::{ColumnDescription, find_table};
 
@@ -106,28 +106,35 @@ pub(super) fn file_routes() -> OpenApiRouter {
     OpenApiRouter::new().routes(routes!(relief::mesh))
 }
 
+/// Returns whether the endpoint of a path reads a run's file: its mesh, or its contents.
+pub(super) fn reads_run_file(path: &str) -> bool {
+    let of_surface = path.starts_with("/api/v1/surfaces/") && path.ends_with("/mesh.glb");
+    let of_run = path.strip_prefix("/api/v1/runs/").is_some_and(|run| !run.is_empty() && !run.contains('/'));
+    of_surface || of_run
+}
+
 /// State shared by the endpoints.
 #[derive(Clone)]
 pub(super) struct LakeCatalogue(Arc<CatalogueState>);
 
 struct CatalogueState {
     service: QueryService,
-    views: SnapshotViews,
+    /// Of all clients with the same rights.
+    views: Arc<SnapshotViews>,
 }
 
 impl LakeCatalogue {
-    pub fn new(service: QueryService) -> Self {
-        Self(Arc::new(CatalogueState { service, views: SnapshotViews::default() }))
+    /// The catalogue of one client; `views` are those of all clients with its rights.
+    pub fn new(service: QueryService, views: Arc<SnapshotViews>) -> Self {
+        Self(Arc::new(CatalogueState { service, views }))
     }
 
-    /// Routes of the endpoints.
-    pub fn endpoint_router(&self) -> Router {
+    /// Routes of the endpoints. Heavy ones wait for one of `heavy_places`.
+    pub fn endpoint_router(&self, heavy_places: &Arc<Semaphore>) -> Router {
         let cached = |routes: Router, scope, contents| {
             routes.route_layer(from_fn_with_state((self.clone(), scope, contents), answer_through_cache))
         };
-        // One per core: light endpoints never wait for all the heavy ones that are requested.
-        let places = Arc::new(Semaphore::new(std::thread::available_parallelism().map_or(1, usize::from)));
-        let heavy = Router::from(heavy_routes()).route_layer(from_fn_with_state(places, answer_in_place));
+        let heavy = Router::from(heavy_routes()).route_layer(from_fn_with_state(heavy_places.clone(), answer_in_place));
         cached(Router::from(light_routes()).merge(heavy), TokenScope::Sql, AnswerContents::Runs)
             .merge(cached(contribution_routes().into(), TokenScope::Sql, AnswerContents::Contributions))
             .merge(cached(file_routes().into(), TokenScope::Files, AnswerContents::Runs))
@@ -199,7 +206,7 @@ async fn answer_through_cache(
     {
         return Ok(unchanged);
     }
-    let key = (address, as_arrow, view.content_version(contents));
+    let key = (address, as_arrow, may_annotate, view.content_version(contents));
     // One answer is for both methods: HEAD's body is left out behind this.
     *request.method_mut() = Method::GET;
     request.extensions_mut().insert(CatalogueRequest::new(&catalogue, &view, as_arrow));

@@ -10,6 +10,8 @@ use crate::server_protocol::ServerProtocol;
 pub struct QueryStart {
     /// Number, counted by its engine.
     pub number: u64,
+    /// Name of its client.
+    pub client: String,
     /// Its protocol.
     pub protocol: ServerProtocol,
     /// Its text, or the beginning of a long one.

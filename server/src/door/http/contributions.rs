@@ -1,5 +1,5 @@
-//! `POST /api/v1/annotations` and `POST /api/v1/predictions`: what users add to the lake. The client's engine checks a
-//! request and encodes rows; the door, which alone may write, adds them to their table.
+//! `POST /api/v1/annotations` and `POST /api/v1/predictions`: what users add to the lake. The engine of statements
+//! checks a request and encodes rows; the door, which alone may write, adds them to their table.
 
 use axum::Json;
 use axum::body::{Body, to_bytes};
@@ -9,7 +9,7 @@ use axum::response::{IntoResponse as _, Response};
 use echolake_http::{AddedContribution, AnnotationsRequest, BinaryContent, PredictionParams, ProblemResponse};
 use echolake_lake::{ContributedPart, LakeSnapshot};
 use echolake_schema::tables::Table;
-use echolake_service::{ClientIdentity, ContributionDraft, RequestFault, TokenScope};
+use echolake_service::{ClientIdentity, ContributionDraft, EngineRole, RequestFault, TokenScope};
 
 use crate::door::audit;
 use crate::door::body_reader::read_whole_body;
@@ -80,7 +80,9 @@ async fn add_contribution(door: &ServerDoor, table: Table, request: Request) -> 
         *again.uri_mut() = parts.uri.clone();
         *again.headers_mut() = parts.headers.clone();
         let engines = door.engines();
-        let answer = engines.forward_request(&client, again, EngineProtocol::Http, Some(&work)).await?.map(Body::new);
+        let role = EngineRole::Statements;
+        let answer = engines.forward_request(role, &client, again, EngineProtocol::Http, Some(&work)).await?;
+        let answer = answer.map(Body::new);
         if answer.status() != StatusCode::OK {
             return Ok(answer);
         }

@@ -21,7 +21,7 @@ use axum::extract::{Request, State};
 use axum::http::{HeaderValue, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse as _, Response};
-use echolake_http::{FORWARDED_PROTO, ProblemResponse, RequestSite, SLICED_RUNS, request_site};
+use echolake_http::{FORWARDED_PROTO, ProblemResponse, RequestSite, SLICED_RUNS, engine_role, request_site};
 use echolake_service::request_span::{REQUEST_ID, begin_request};
 use echolake_service::{ClientIdentity, FaultCode, RequestFault, ServerProtocol};
 use hyper::body::Incoming;
@@ -104,7 +104,7 @@ fn shows_token(request: &Request) -> bool {
 }
 
 impl ServerDoor {
-    /// Forwards a request to the client's engine.
+    /// Forwards a request to the engine that answers it.
     pub async fn forward_http(State(door): State<Self>, request: Request) -> Response {
         door.answer_http(request).await.unwrap_or_else(|fault| {
             door.metrics().record_failure(&fault);
@@ -163,7 +163,8 @@ impl ServerDoor {
             Some(cached) => cached,
             None => {
                 let engines = self.engines();
-                let answer = engines.forward_request(&client, request, EngineProtocol::Http, Some(&work)).await?;
+                let role = engine_role(&method, &path);
+                let answer = engines.forward_request(role, &client, request, EngineProtocol::Http, Some(&work)).await?;
                 self.answers().keep_answer(client.clone(), key, answer.map(Body::new)).await?
             }
         };

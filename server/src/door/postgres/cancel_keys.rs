@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use echolake_service::EngineSocket;
+use echolake_service::{ClientIdentity, ConnectionOpening, EngineSocket};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 
 use super::frames::cancel_message;
@@ -13,6 +13,7 @@ use crate::door::engine_process::EngineProcess;
 #[derive(Clone)]
 pub(super) struct CancelTarget {
     pub engine: Arc<EngineProcess>,
+    pub client: Arc<ClientIdentity>,
     pub pid: i32,
     pub secret: Vec<u8>,
 }
@@ -61,6 +62,7 @@ impl CancelKeys {
         let Some(target) = found else { return false };
         // An engine that is gone runs nothing.
         if let Ok(mut stream) = target.engine.connect_socket(EngineSocket::Postgres).await
+            && ConnectionOpening::new(&target.client, None).write_to(&mut stream).await.is_ok()
             && stream.write_all(&cancel_message(target.pid, &target.secret)).await.is_ok()
         {
             // The engine closes the connection behind it.

@@ -78,7 +78,8 @@ async fn attend_client(stream: PlacedStream, place: LoginPlace) {
     work.hear_request();
     mark_startup(&mut session.startup, PID_PARAMETER, &session.pid.to_string(), STARTUP);
     let _working = work.begin_work();
-    let span = begin_connection(&mut session.startup, &session.client.name, STARTUP);
+    let (span, number) = begin_connection(&mut session.startup, &session.client.name, STARTUP);
+    session.number = number;
     MessageRelay::new(stream, place.door, place.keys, session).answer_client().instrument(span).await;
 }
 
@@ -89,6 +90,8 @@ struct PostgresLogin {
     startup: BytesMut,
     /// The number of its connection there, and in its cancel key.
     pid: i32,
+    /// The door's number of the connection.
+    number: u64,
 }
 
 impl LoginPlace {
@@ -169,7 +172,7 @@ impl LoginPlace {
                 let found = found.and_then(|client| client.require_scope(TokenScope::Sql).map(|()| client));
                 let client = self.door.note_client(&self.work, ServerProtocol::Postgres, found)?;
                 let pid = CancelKeys::make_pid().map_err(RequestFault::defect("no random bytes"))?;
-                Ok(LoginStep::Done(PostgresLogin { client, startup, pid }))
+                Ok(LoginStep::Done(PostgresLogin { client, startup, pid, number: 0 }))
             }
         }
     }

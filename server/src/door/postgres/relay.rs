@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use bytes::{Buf as _, BytesMut};
 use echolake_postgres::fatal_message;
-use echolake_service::{EngineSocket, RequestFault};
+use echolake_service::{ConnectionOpening, EngineRole, EngineSocket, RequestFault};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _, ReadHalf, WriteHalf};
 use tokio::net::unix::{OwnedReadHalf, OwnedWriteHalf};
 
@@ -14,7 +14,7 @@ use super::PostgresLogin;
 use super::cancel_keys::{CancelKey, CancelKeys, CancelTarget};
 use super::frames::{FrameHeader, HEADER, key_message};
 use crate::door::encryption::DoorStream;
-use crate::door::engine_process::{EndReason, EngineLease, EngineProcess};
+use crate::door::engine_process::EngineProcess;
 use crate::door::server_door::ServerDoor;
 
 /// Bytes that are read at once, and of an engine's message from which it is passed on before it is whole.
@@ -87,7 +87,7 @@ impl AwaitedAnswers {
 
 /// A connection to an engine.
 struct EngineLink {
-    lease: EngineLease,
+    engine: Arc<EngineProcess>,
     read: OwnedReadHalf,
     write: OwnedWriteHalf,
     incoming: BytesMut,
@@ -152,19 +152,20 @@ impl MessageRelay {
             // A message that was passed on in part can be followed by nothing: the client sees it broken off.
             _ if link.rest > 0 => Err(None),
             RelayEnd::Broken(fault) => Err(Some(*fault)),
-            RelayEnd::Engine => Err(Some(self.find_fault(link.lease.engine()).await)),
+            RelayEnd::Engine => Err(Some(self.find_fault(&link.engine).await)),
         }
     }
 
     async fn pass_on(&mut self, link: &mut EngineLink) -> RelayEnd {
         let drain = self.door.drain().clone();
+        let client_end = self.door.engines().client_end(&self.login.client.name);
         loop {
             if let Err(end) = self.take_messages(link).and_then(|()| self.take_answers(link)) {
                 return end;
             }
             let is_unread = !self.outgoing.is_empty();
-            link.lease.set_waiting(is_unread || !self.awaited.is_any());
             tokio::select! {
+                () = client_end.cancelled() => return broken_relay(RequestFault::Unauthenticated),
                 () = drain.wait_until_begun(), if !is_unread && !self.awaited.is_any() => {
                     self.outgoing = fatal_message(&RequestFault::Disconnected);
                     return RelayEnd::Client;
@@ -251,16 +252,15 @@ impl MessageRelay {
         Ok(())
     }
 
-    // Begins a session on the client's engine, or, if that ended before the session began, on the next one.
+    // Begins a session on the engine of statements, or, if that ended before the session began, on the next one.
     async fn connect_engine(&mut self) -> Result<EngineLink, Option<RequestFault>> {
         let mut ended = None;
         loop {
-            let lease = match self.door.engines().lease_for(&self.login.client).await {
-                Ok(lease) => lease,
+            let engine = match self.door.engines().engine_for(EngineRole::Statements, &self.login.client).await {
+                Ok(engine) => engine,
                 Err(fault) => return Err(ended.or(Some(fault))),
             };
-            let engine = lease.engine().clone();
-            match self.start_session(lease).await {
+            match self.start_session(engine.clone()).await {
                 Ok(link) => return link.ok_or(None),
                 Err(_) if ended.is_some() => return Err(ended),
                 Err(_) => {
@@ -272,11 +272,13 @@ impl MessageRelay {
     }
 
     // None if the engine refuses the session; its error message is passed on to the client.
-    async fn start_session(&mut self, lease: EngineLease) -> io::Result<Option<EngineLink>> {
-        let (read, write) = lease.engine().connect_socket(EngineSocket::Postgres).await?.into_split();
+    async fn start_session(&mut self, engine: Arc<EngineProcess>) -> io::Result<Option<EngineLink>> {
+        let mut socket = engine.connect_socket(EngineSocket::Postgres).await?;
+        ConnectionOpening::new(&self.login.client, Some(self.login.number)).write_to(&mut socket).await?;
+        let (read, write) = socket.into_split();
         let incoming = BytesMut::with_capacity(READ_BYTES);
         let outgoing = BytesMut::new();
-        let mut link = EngineLink { lease, read, write, incoming, outgoing, rest: 0 };
+        let mut link = EngineLink { engine, read, write, incoming, outgoing, rest: 0 };
         link.write.write_all(&self.login.startup).await?;
         loop {
             let (kind, message) = link.next_message().await?;
@@ -300,7 +302,8 @@ impl MessageRelay {
         let pid = engine_key.try_get_i32().unwrap_or(0);
         self.key = CancelKeys::make_key(self.login.pid, engine_key.len());
         let Some(key) = &self.key else { return BytesMut::new() };
-        let target = CancelTarget { engine: link.lease.engine().clone(), pid, secret: engine_key.to_vec() };
+        let client = self.login.client.clone();
+        let target = CancelTarget { engine: link.engine.clone(), client, pid, secret: engine_key.to_vec() };
         self.keys.set_target(key, target);
         key_message(key.pid, &key.secret)
     }
@@ -311,8 +314,7 @@ impl MessageRelay {
             return refused;
         }
         match engine.why_ended().await {
-            Some(EndReason::Failed(reason)) => RequestFault::EngineEnded { reason },
-            Some(EndReason::Retired) => RequestFault::Displaced,
+            Some(why) => RequestFault::EngineEnded { reason: why.text() },
             None => RequestFault::EngineEnded { reason: "it closed the connection".to_owned() },
         }
     }

@@ -25,8 +25,9 @@ const WORTH_PACKING: usize = 2000;
 /// Of zlib's levels: a tenth larger than with 6, in a third of the time.
 const LEVEL: Compression = Compression::new(3);
 
-/// An address with its parameters, whether the answer is an Arrow stream, and the version of what it rests on.
-pub(crate) type AnswerKey = (String, bool, String);
+/// An address with its parameters, whether the answer is an Arrow stream, whether its client may annotate, and the
+/// version of what the answer rests on. The cache is of clients with the same rights to see runs.
+pub(crate) type AnswerKey = (String, bool, bool, String);
 
 /// Cache of answers of snapshots of one version.
 pub(crate) struct AnswerCache(Cache<AnswerKey, Arc<CachedAnswer>, AnswerWeighter>);
@@ -117,7 +118,7 @@ mod tests {
     use crate::catalogue::content::AnswerContent;
 
     fn key(name: &str) -> AnswerKey {
-        (name.to_owned(), false, String::new())
+        (name.to_owned(), false, false, String::new())
     }
 
     fn answer(bytes: impl Into<Bytes>) -> Response {
