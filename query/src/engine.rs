@@ -5,7 +5,7 @@ mod process;
 use std::sync::Arc;
 use std::time::Duration;
 
-use datafusion::catalog::{CatalogProvider as _, CatalogProviderList as _, TableProvider};
+use datafusion::catalog::{CatalogProvider as _, CatalogProviderList as _};
 use datafusion::catalog::{MemoryCatalogProvider, MemoryCatalogProviderList, MemorySchemaProvider};
 use datafusion::execution::session_state::{SessionState, SessionStateBuilder};
 use datafusion::logical_expr::Documentation;
@@ -18,7 +18,7 @@ use crate::catalog::LakeCatalog;
 use crate::client::QueryQuota;
 use crate::control::blame::StatementBlame;
 use crate::control::{QueryTicket, StopReason};
-use crate::system::{self, SystemSource};
+use crate::system;
 use crate::{Error, OpaqueValue};
 use process::EngineProcess;
 
@@ -116,16 +116,6 @@ impl QueryEngine {
     /// Returns the lake as the engine's readers see it.
     pub fn lake(&self) -> &Lake {
         self.catalog.lake()
-    }
-
-    /// Adds tables to the schema `system`; to be called once.
-    pub fn add_system_tables(&self, source: Arc<dyn SystemSource>) {
-        let _ = self.process.system.set(source);
-    }
-
-    /// Returns the tables of the schema `system` that are not the lake's; none without a program around that has some.
-    pub(crate) fn system_tables(&self) -> Vec<(&'static str, Arc<dyn TableProvider>)> {
-        self.process.system.get().map_or_else(Vec::new, system::engine_tables)
     }
 
     /// Returns the number of queries that run or wait now.

@@ -7,6 +7,7 @@ use std::sync::Arc;
 
 use arrow::datatypes::{DataType, SchemaRef};
 use bytes::Bytes;
+use datafusion::catalog::TableProvider;
 use datafusion::common::ParamValues;
 use datafusion::error::DataFusionError;
 use datafusion::execution::TaskContext;
@@ -29,7 +30,7 @@ use crate::control::pool::PartialPool;
 use crate::engine::{QueryEngine, SqlFunction};
 use crate::request_memory::RequestMemory;
 use crate::statement::{PredicateForm, append_predicate, parse_statement, prepare_statement};
-use crate::system::SYSTEM_SCHEMA;
+use crate::system::{self, SYSTEM_SCHEMA, SystemSource};
 use crate::{Error, OpaqueValue};
 use answer::drive_query;
 pub use answer::{CancelHandle, QueryAnswer};
@@ -44,6 +45,7 @@ pub struct Session {
     client: Arc<EngineClient>,
     request: Option<u64>,
     extend: Option<ContextExtension>,
+    system: Option<Arc<dyn SystemSource>>,
 }
 
 /// Adds a protocol's own tables and functions to the context of every query.
@@ -105,7 +107,7 @@ impl PreparedQuery {
 impl QueryEngine {
     /// Creates a session of a client, one per connection.
     pub fn open_session(&self, client: &Arc<EngineClient>) -> Session {
-        Session { engine: self.clone(), client: client.clone(), request: None, extend: None }
+        Session { engine: self.clone(), client: client.clone(), request: None, extend: None, system: None }
     }
 }
 
@@ -352,7 +354,7 @@ impl Session {
         let sql = sql.to_owned();
         let plan = async move {
             let context = session.engine.create_context();
-            let system = session.engine.system_tables();
+            let system = session.source_tables();
             let snapshot = session.engine.catalog().register_tables(&context, system, &mut statement).await?;
             if let Some(extend) = &session.extend {
                 extend(&context).map_err(|e| Error::from_execution("", &e))?;
@@ -480,7 +482,7 @@ impl Session {
 
     /// Returns the tables of the schema `system` with their schemas.
     pub fn system_tables(&self) -> Vec<(&'static str, SchemaRef)> {
-        let of_engine = self.engine.system_tables().into_iter().map(|(name, table)| (name, table.schema()));
+        let of_engine = self.source_tables().into_iter().map(|(name, table)| (name, table.schema()));
         self.engine.catalog().system_tables().into_iter().chain(of_engine).collect()
     }
 

@@ -1,7 +1,7 @@
 //! What a process has of an engine, whoever reads: memory, disk, footers of files, functions, threads, running queries.
 
 use std::collections::{BTreeSet, VecDeque};
-use std::sync::{Arc, Mutex, OnceLock, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError};
 
 use datafusion::error::DataFusionError;
 use datafusion::execution::FunctionRegistry as _;
@@ -28,7 +28,6 @@ use crate::control::seats::SeatPool;
 use crate::control::threads::{QueryThreads, count_cores};
 use crate::control::turns::TurnQueue;
 use crate::statement::{EndingRule, FloatForms, IntegerArithmetic, LimitedOperators, SubqueryConditions};
-use crate::system::SystemSource;
 use crate::views::LookupFunctions;
 use crate::{Error, OpaqueValue};
 
@@ -68,7 +67,6 @@ pub(crate) struct EngineProcess {
     pub own: BTreeSet<String>,
     /// A thread for timeouts, which busy query threads cannot delay.
     pub watch: QueryThreads,
-    pub system: OnceLock<Arc<dyn SystemSource>>,
     rights: CatalogCache,
 }
 
@@ -96,7 +94,6 @@ impl EngineProcess {
             memory: limits.memory,
             own: functions.names().map(str::to_owned).collect(),
             watch: QueryThreads::new("query-watch", 1).map_err(threads)?,
-            system: OnceLock::new(),
             rights: CatalogCache::default(),
         })
     }

@@ -40,10 +40,11 @@ async fn session(source: Option<Arc<dyn SystemSource>>) -> Session {
 
 fn session_of(lake: &Lake, source: Option<Arc<dyn SystemSource>>) -> Session {
     let engine = QueryEngine::new(lake, None).expect("an engine");
-    if let Some(source) = source {
-        engine.add_system_tables(source);
+    let session = engine.open_session(&Arc::new(EngineClient::new("test", QueryQuota::default())));
+    match source {
+        Some(source) => session.with_system(source),
+        None => session,
     }
-    engine.open_session(&Arc::new(EngineClient::new("test", QueryQuota::default())))
 }
 
 async fn number(session: &Session, sql: &str) -> i64 {
