@@ -113,7 +113,6 @@ fn engine_settings(program: PathBuf, sockets: &str) -> EngineSettings {
     EngineSettings {
         program,
         memory: MEMORY,
-        count: 16,
         environment: vec![("FUZZED_ENGINE".to_owned(), sockets.to_owned())],
         temp: None,
         slow: None,

@@ -69,19 +69,20 @@ struct HttpEngine(Arc<HttpEngineState>);
 
 struct HttpEngineState {
     services: EngineServices,
-    role: EngineRole,
+    /// What it answers; None for all.
+    role: Option<EngineRole>,
     views: RightViews,
     /// Places of heavy endpoints, one per core: light ones never wait for all the heavy ones that are requested.
     heavy_places: Arc<Semaphore>,
 }
 
-/// Answers HTTP on an engine's socket. A request counts until its answer is sent or dropped.
+/// Answers HTTP on the socket of an engine with this role; None for both. A request counts until its answer is sent or dropped.
 ///
 /// # Errors
 /// [`Error::System`] if the socket accepts no connection.
 pub async fn serve_http_socket(
     services: EngineServices,
-    role: EngineRole,
+    role: Option<EngineRole>,
     listener: UnixListener,
 ) -> Result<(), Error> {
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
@@ -115,7 +116,8 @@ impl HttpEngine {
     async fn answer_request(&self, request: hyper::Request<Incoming>) -> Response {
         let router = self.0.services.client_of_request(request.headers()).and_then(|client| {
             // Which engine answers what is decided by one function; the door asks it, too.
-            match engine_role(request.method(), request.uri().path()) == self.0.role {
+            let role = engine_role(request.method(), request.uri().path());
+            match self.0.role.is_none_or(|own| own == role) {
                 true => client.protocol_state(|service| Ok(self.client_router(service))),
                 false => Err(RequestFault::Internal),
             }

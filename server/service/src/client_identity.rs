@@ -101,11 +101,17 @@ impl ClientIdentity {
 
     /// Limits of its queries.
     pub fn quota(&self) -> QueryQuota {
+        #[cfg(fuzzing)]
+        let fuzzed = Self { seconds: Some(2), rows: Some(10_000), ..self.clone() };
+        #[cfg(fuzzing)]
+        let this = &fuzzed;
+        #[cfg(not(fuzzing))]
+        let this = self;
         QueryQuota {
-            time: self.seconds.map(Duration::from_secs),
-            memory: self.memory_bytes.map(counted_bytes),
-            rows: self.rows,
-            concurrent: self.concurrent,
+            time: this.seconds.map(Duration::from_secs),
+            memory: this.memory_bytes.map(counted_bytes),
+            rows: this.rows,
+            concurrent: this.concurrent,
         }
     }
 

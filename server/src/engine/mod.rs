@@ -77,7 +77,7 @@ pub async fn run_engine(lake: &Lake, options: EngineOptions<'_>) -> Result<(), E
     };
     tokio::select! {
         () = services.obey_door(messages) => Ok(()),
-        failed = echolake_http::serve_http_socket(services.clone(), role, http) => failed,
+        failed = echolake_http::serve_http_socket(services.clone(), Some(role), http) => failed,
         failed = of_statements => failed,
     }
 }

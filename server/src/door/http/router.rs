@@ -1,4 +1,4 @@
-//! The paths of the server: what the door answers itself, and what it forwards to the client's engine.
+//! The paths of the server: what the door answers itself, and what it forwards to an engine.
 
 use axum::Router;
 use axum::middleware::from_fn_with_state;
@@ -12,7 +12,7 @@ use super::pages;
 use super::{contributions, health, openapi, queries, session};
 use crate::door::server_door::ServerDoor;
 
-/// The paths of the server: those of the door, and those that it forwards to the client's engine.
+/// The paths of the server: those of the door, and those that it forwards to an engine.
 pub(super) fn door_router(door: &ServerDoor) -> Router {
     let own = Router::from(door_routes()).layer(from_fn_with_state(door.access().is_open(), own_pages_only));
     // Here and not for all routes: a preflight must come to the layer.
