@@ -1,5 +1,6 @@
-//! Twenty clients of one server, of which some attack it: the others must get the right answers, about as soon as on a
-//! quiet server.
+//! Twenty clients of one server, of which some attack it, and five that read pages: pages are answered about as soon as on
+//! a quiet server; statements have the right answers, or an error that may be retried, at most one for each engine that
+//! ended.
 #![allow(clippy::print_stdout, reason = "figures are what it is for")]
 
 use std::collections::BTreeMap;
@@ -16,7 +17,8 @@ use rand_chacha::ChaCha8Rng;
 
 use super::attacks::{AttackCase, all_cases};
 use super::observed_server::{
-    AnswerTally, ClientGroup, MemoryWatch, ObservedServer, QueryClient, RightAnswers, take_right_answers,
+    AnswerTally, ClientGroup, MemoryWatch, ObservedServer, QueryClient, QueryOutcome, QueryProtocol, RightAnswers,
+    take_right_answers,
 };
 use super::percentile::{millis, percentile};
 
@@ -40,14 +42,19 @@ const QUERIES: [&str; 8] = [
     "select v % 1000 as k, count(*) as n from generate_series(1, 300000) t(v) group by 1 order by 1",
     "select v from generate_series(1, 200000) t(v) order by v % 1000, v limit 10",
 ];
+/// Data of pages that readers ask for.
+const PAGES: [&str; 4] =
+    ["/api/v1/surfaces", "/api/v1/surfaces/flat", "/api/v1/surfaces/flat/measured-pairs", "/api/v1/runs"];
+/// Clients that read pages.
+const PAGE_READERS: usize = 5;
 /// Between two queries of a worker, at most.
 const LONGEST_PAUSE: Duration = Duration::from_secs(2);
 /// Duration of an attack.
 const ATTACK_LIMIT: Duration = Duration::from_secs(15);
 /// A query that takes longer is lost.
 const QUERY_LIMIT: Duration = Duration::from_secs(60);
-/// Largest ratio of a query's time under attack to its time without: p99.
-const SLOWDOWN_GOAL: f64 = 3.0;
+/// Largest ratio of a page's time under attack to its time without: p95.
+const SLOWDOWN_GOAL: f64 = 1.5;
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct HostileClientsArgs {
@@ -67,6 +74,10 @@ pub(crate) struct HostileClientsArgs {
 pub(crate) struct HostileReport {
     pub quiet: AnswerTally,
     pub attacked: AnswerTally,
+    pub quiet_pages: AnswerTally,
+    pub attacked_pages: AnswerTally,
+    /// Engines that ended by themselves under attack.
+    engine_ends: usize,
     attacks: BTreeMap<String, usize>,
     restarts: usize,
 }
@@ -75,7 +86,7 @@ pub(crate) fn run_hostile_clients(args: &HostileClientsArgs) -> Result<()> {
     let quiet = Duration::from_secs(args.quiet_seconds);
     let report = run_clients(&super::echolake_path()?, quiet, Duration::from_secs(args.seconds), args.seed)?;
     print_report(&report);
-    ensure!(report.is_goal_reached(), "goals are missed: 0 wrong, 0 errors, p99 within {SLOWDOWN_GOAL} x quiet");
+    ensure!(report.is_goal_reached(), "goals are missed: 0 wrong, p95 of pages within {SLOWDOWN_GOAL} x quiet");
     Ok(())
 }
 
@@ -86,9 +97,18 @@ pub(crate) fn run_hostile_clients(args: &HostileClientsArgs) -> Result<()> {
 pub(crate) fn run_clients(binary: &Path, quiet: Duration, attacked: Duration, seed: u64) -> Result<HostileReport> {
     let mut server = ObservedServer::start(binary, &[ATTACKERS, WORKERS])?;
     let right = take_right_answers(&server.client(WORKERS.name, 0), &QUERIES)?;
-    let quiet = run_phase(&mut server, &right, quiet, seed, &[]).0;
-    let (attacked, attacks) = run_phase(&mut server, &right, attacked, seed, &all_cases());
-    Ok(HostileReport { quiet, attacked, attacks, restarts: server.restarts })
+    let quiet = run_phase(&mut server, &right, quiet, seed, &[]);
+    let ends_before = server.count_engine_ends();
+    let attacked = run_phase(&mut server, &right, attacked, seed, &all_cases());
+    Ok(HostileReport {
+        quiet: quiet.answers,
+        quiet_pages: quiet.pages,
+        attacked: attacked.answers,
+        attacked_pages: attacked.pages,
+        engine_ends: server.count_engine_ends().saturating_sub(ends_before),
+        attacks: attacked.attacks,
+        restarts: server.restarts,
+    })
 }
 
 impl HostileReport {
@@ -96,55 +116,84 @@ impl HostileReport {
         self.is_right() && self.slowdown() <= SLOWDOWN_GOAL
     }
 
-    /// Returns whether every answer was right and the server lives.
+    /// Returns whether every page was answered, every other answer was right or an error that may be retried, at most one
+    /// for each worker and engine that ended, and the server lives.
     pub fn is_right(&self) -> bool {
-        self.attacked.is_right() && self.restarts == 0
+        let AnswerTally { wrong, lost, broken_off, .. } = &self.attacked;
+        let failed = self.attacked.count_engine_ends() + broken_off;
+        self.attacked_pages.is_right()
+            && (*wrong, lost.is_empty(), self.restarts) == (0, true, 0)
+            && !self.attacked.has_other_errors()
+            && failed <= self.engine_ends * WORKERS.count
     }
 
     fn slowdown(&self) -> f64 {
-        let quiet = percentile(&self.quiet.times, 0.99).as_secs_f64();
-        percentile(&self.attacked.times, 0.99).as_secs_f64() / quiet.max(f64::MIN_POSITIVE)
+        let quiet = percentile(&self.quiet_pages.times, 0.95).as_secs_f64();
+        percentile(&self.attacked_pages.times, 0.95).as_secs_f64() / quiet.max(f64::MIN_POSITIVE)
     }
 }
 
 fn print_report(report: &HostileReport) {
-    for (name, phase) in [("quiet", &report.quiet), ("attacked", &report.attacked)] {
+    let phases = [
+        ("quiet", &report.quiet),
+        ("attacked", &report.attacked),
+        ("quiet, pages", &report.quiet_pages),
+        ("attacked, pages", &report.attacked_pages),
+    ];
+    for (name, phase) in phases {
         println!(
-            "{name:8} {} answers, {} wrong, {} broken off, p50 {:.1} ms, p99 {:.1} ms, errors {:?} {:?}",
+            "{name:16} {} answers, {} wrong, {} broken off, p50 {:.1} ms, p95 {:.1} ms, errors {:?} {:?}",
             phase.times.len(),
             phase.wrong,
             phase.broken_off,
             millis(percentile(&phase.times, 0.5)),
-            millis(percentile(&phase.times, 0.99)),
+            millis(percentile(&phase.times, 0.95)),
             phase.refused,
             phase.lost,
         );
     }
-    println!("p99 under attack is {:.1} x quiet; the server died {} times", report.slowdown(), report.restarts);
+    println!(
+        "p95 of pages under attack is {:.1} x quiet; the server died {} times",
+        report.slowdown(),
+        report.restarts
+    );
+    println!("{} engines ended", report.engine_ends);
     println!("attacks: {:?}", report.attacks);
 }
 
-// Restarts the server if it dies. Returns what workers got and how attacks ended; without attacks, only workers run.
+/// What a phase has found.
+struct PhaseResult {
+    answers: AnswerTally,
+    pages: AnswerTally,
+    /// How attacks ended.
+    attacks: BTreeMap<String, usize>,
+}
+
+// Restarts the server if it dies. Without attacks, only workers run.
 fn run_phase(
     server: &mut ObservedServer,
     right: &RightAnswers,
     time: Duration,
     seed: u64,
     attacks: &[AttackCase],
-) -> (AnswerTally, BTreeMap<String, usize>) {
+) -> PhaseResult {
     let phase = ClientPhase {
         right,
         attacks,
         end: Instant::now() + time,
         server_died: AtomicBool::new(false),
         report: Mutex::default(),
+        pages: Mutex::default(),
         outcomes: Mutex::default(),
     };
     while Instant::now() < phase.end {
         phase.run_until_death(server, seed + 100 * server.restarts as u64);
     }
-    let report = phase.report.into_inner().unwrap_or_else(PoisonError::into_inner);
-    (report, phase.outcomes.into_inner().unwrap_or_else(PoisonError::into_inner))
+    PhaseResult {
+        answers: phase.report.into_inner().unwrap_or_else(PoisonError::into_inner),
+        pages: phase.pages.into_inner().unwrap_or_else(PoisonError::into_inner),
+        attacks: phase.outcomes.into_inner().unwrap_or_else(PoisonError::into_inner),
+    }
 }
 
 /// Clients at work, with or without attackers.
@@ -154,6 +203,7 @@ struct ClientPhase<'a> {
     end: Instant,
     server_died: AtomicBool,
     report: Mutex<AnswerTally>,
+    pages: Mutex<AnswerTally>,
     outcomes: Mutex<BTreeMap<String, usize>>,
 }
 
@@ -167,6 +217,11 @@ impl ClientPhase<'_> {
                 let client = numbered_client(server, WORKERS, number);
                 let random = ChaCha8Rng::seed_from_u64(seed + number as u64);
                 scope.spawn(move || self.work(&client, random));
+            }
+            for number in 0..PAGE_READERS {
+                let client = numbered_client(server, WORKERS, number);
+                let random = ChaCha8Rng::seed_from_u64(seed + 70 + number as u64);
+                scope.spawn(move || self.read_pages(&client, random));
             }
             for number in (0..ATTACKERS.count).filter(|_| !self.attacks.is_empty()) {
                 let client = numbered_client(server, ATTACKERS, number);
@@ -199,6 +254,24 @@ impl ClientPhase<'_> {
             tally.add(*protocol, answer, expected, begun.elapsed());
             drop(tally);
             std::thread::sleep(LONGEST_PAUSE.mul_f64(random.random()));
+        }
+    }
+
+    fn read_pages(&self, client: &QueryClient, mut random: ChaCha8Rng) {
+        while !self.is_over() {
+            let Some(path) = PAGES.choose(&mut random) else { return };
+            let one = client.clone().with_source(client.connections.source());
+            let begun = Instant::now();
+            let answer = one.connections.close_after(QUERY_LIMIT, || one.get_page(path));
+            // Any whole answer is right: pages are compared elsewhere.
+            let expected = match &answer {
+                QueryOutcome::Answer(_) => answer.clone(),
+                _ => QueryOutcome::Abandoned,
+            };
+            let mut tally = self.pages.lock().unwrap_or_else(PoisonError::into_inner);
+            tally.add(QueryProtocol::Http, answer, &expected, begun.elapsed());
+            drop(tally);
+            std::thread::sleep(LONGEST_PAUSE.mul_f64(random.random::<f64>() / 4.0));
         }
     }
 

@@ -31,6 +31,7 @@ impl<'a> AttackTrial<'a> {
     pub fn run(mut self, case: &AttackCase, seconds: f64) -> AttackRow {
         let idle_mib = self.server.process_tree().memory().total_kib >> 10;
         let watch = MemoryWatch::start(self.server.process_tree());
+        let ends_before = self.server.count_engine_ends();
         let light = LightLoad::start(self.server);
         let begun = Instant::now();
         let connections = &self.attacker.connections;
@@ -44,6 +45,7 @@ impl<'a> AttackTrial<'a> {
         let light = light.stop();
         let fate = self.find_fate(&watch);
         let peak = watch.peak();
+        let engine_ends = self.server.count_engine_ends() - ends_before;
         drop(watch);
         if fate != ServerFate::Alive {
             self.server.restart();
@@ -54,6 +56,7 @@ impl<'a> AttackTrial<'a> {
             outcomes,
             took,
             light,
+            engine_ends,
             peak,
             idle_mib,
             limit_mib: (HOSTILE_MEMORY_MB * 1_000_000) >> 20,

@@ -10,15 +10,18 @@ mod sql;
 mod wire;
 
 use std::path::Path;
+use std::time::Duration;
 
 use anyhow::{Result, ensure};
 
-use super::observed_server::{ClientGroup, ObservedServer};
+use super::observed_server::{ClientGroup, LightLoad, ObservedServer};
 pub(crate) use attack_case::{AttackCase, all_cases, quick_cases};
 pub(crate) use attack_report::AttackRow;
-use attack_report::{print_row, print_summary};
+use attack_report::{print_quiet, print_row, print_summary};
 use attack_trial::AttackTrial;
 
+/// Time for which the server is watched before it is attacked.
+const QUIET_TIME: Duration = Duration::from_secs(5);
 /// Megabytes that a hostile client's queries may hold; those of its limits below.
 const HOSTILE_MEMORY_MB: u64 = 1000;
 /// The attacking clients. There are many, so that the server's memory of one does not weaken the next attack.
@@ -29,7 +32,7 @@ pub(crate) const HOSTILE_CLIENTS: ClientGroup = ClientGroup {
 };
 /// The clients that must not notice the attacks.
 pub(crate) const LIGHT_CLIENTS: ClientGroup =
-    ClientGroup { name: "light", count: 3, limits: "seconds = 30\nmemory_mb = 200\nconcurrent = 4\n" };
+    ClientGroup { name: "light", count: 4, limits: "seconds = 30\nmemory_mb = 200\nconcurrent = 4\n" };
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct AttackArgs {
@@ -64,6 +67,9 @@ pub(crate) fn run_cases(
     progress: &mut dyn FnMut(&AttackRow),
 ) -> Result<Vec<AttackRow>> {
     let mut server = ObservedServer::start(binary, &[HOSTILE_CLIENTS, LIGHT_CLIENTS])?;
+    let quiet = LightLoad::start(&server);
+    std::thread::sleep(QUIET_TIME);
+    print_quiet(&quiet.stop());
     let mut rows = Vec::new();
     for (number, case) in cases.iter().enumerate() {
         let row = AttackTrial::new(&mut server, number).run(case, seconds);

@@ -31,6 +31,13 @@ pub(super) fn query_slice(client: &QueryClient, filter: &str) -> QueryOutcome {
     send_request(client, HttpRequest::get(&path))
 }
 
+impl QueryClient {
+    /// Asks for the data of a page.
+    pub fn get_page(&self, path: &str) -> QueryOutcome {
+        send_request(self, HttpRequest::get(path))
+    }
+}
+
 /// Sends a request with the client's token and reads the answer.
 pub(super) fn send_request(client: &QueryClient, request: HttpRequest) -> QueryOutcome {
     let address = &client.addresses.http;

@@ -135,6 +135,11 @@ impl ObservedServer {
         said[said.len().saturating_sub(3)..].join(" / ")
     }
 
+    /// Returns how many engines have ended by themselves so far, as its log says.
+    pub fn count_engine_ends(&self) -> usize {
+        self.served.said().iter().filter(|line| line.contains("an engine ended")).count()
+    }
+
     /// Kills it with its engines and starts another on the same lake.
     pub fn restart(&mut self) {
         self.process_tree().kill();

@@ -50,6 +50,13 @@ pub(crate) enum QueryOutcome {
     Abandoned,
 }
 
+impl QueryOutcome {
+    /// Returns whether the query failed because its engine ended, by the codes of HTTP, Flight SQL and Postgres.
+    pub fn is_engine_end(&self) -> bool {
+        matches!(self, Self::Refused(code) if code == "query_ended_engine" || code == "58000")
+    }
+}
+
 /// Digest that distinguishes answers: size and hash.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default)]
 pub(crate) struct AnswerDigest {

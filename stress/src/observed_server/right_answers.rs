@@ -56,6 +56,17 @@ impl AnswerTally {
         self.is_honest() && self.refused.is_empty() && self.broken_off == 0
     }
 
+    /// Returns how many queries failed because their engine ended.
+    pub fn count_engine_ends(&self) -> usize {
+        let counts = self.refused.iter().filter(|(error, _)| is_engine_end(error)).map(|(_, count)| count);
+        counts.sum()
+    }
+
+    /// Returns whether there is an error that says something else than that an engine ended.
+    pub fn has_other_errors(&self) -> bool {
+        self.refused.keys().any(|error| !is_engine_end(error))
+    }
+
     /// Counts the outcome of a query.
     pub fn add(&mut self, protocol: QueryProtocol, outcome: QueryOutcome, right: &QueryOutcome, took: Duration) {
         let name = || format!("{}: {outcome}", protocol.name());
@@ -67,4 +78,8 @@ impl AnswerTally {
             _ => *self.lost.entry(name()).or_default() += 1,
         }
     }
+}
+
+fn is_engine_end(error: &str) -> bool {
+    error.ends_with(": query_ended_engine") || error.ends_with(": 58000")
 }
