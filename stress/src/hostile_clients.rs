@@ -262,7 +262,9 @@ impl ClientPhase<'_> {
             let Some(path) = PAGES.choose(&mut random) else { return };
             let one = client.clone().with_source(client.connections.source());
             let begun = Instant::now();
-            let answer = one.connections.close_after(QUERY_LIMIT, || one.get_page(path));
+            let answer = one
+                .connections
+                .close_after(QUERY_LIMIT, || one.get_page(&format!("{path}{}", random.random_range(1..=100))));
             // Any whole answer is right: pages are compared elsewhere.
             let expected = match &answer {
                 QueryOutcome::Answer(_) => answer.clone(),

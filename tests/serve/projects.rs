@@ -2,6 +2,7 @@
 //! over all protocols. What such a token is answered is what it would be answered if these runs did not exist.
 
 mod attempts;
+mod shared_engines;
 mod timings;
 mod tools;
 

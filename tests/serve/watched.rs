@@ -110,6 +110,7 @@ fn figures_are_as_prometheus_wants_them() {
     let has = |text: &str, line: &str| text.lines().any(|l| l == line);
     let text = || get(&server, "/metrics").text();
     wait_until("an engine has looked at the lake", || has(&text(), "echolake_lake_runs 1"));
+    wait_until("both engines and the spare run", || has(&text(), "echolake_engines 3"));
     wait_until("the query is counted", || has(&text(), "echolake_rows_total 2951"));
     let text = text();
     for line in [
@@ -117,7 +118,7 @@ fn figures_are_as_prometheus_wants_them() {
         "echolake_damaged_runs 0",
         "echolake_inbox_runs 0",
         "echolake_ready 1",
-        "echolake_engines 1",
+        "echolake_engines 3",
         "echolake_connections{protocol=\"postgres\"} 0",
         "echolake_query_seconds_count{outcome=\"answered\",protocol=\"http\"} 1",
     ] {

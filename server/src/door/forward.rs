@@ -1,9 +1,10 @@
 //! Requests over HTTP on their way to an engine and back, for both versions of HTTP.
 
 use std::io;
-use std::pin::Pin;
+use std::pin::{Pin, pin};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::task::{Context, Poll};
+use std::time::Duration;
 
 use axum::body::Body;
 use axum::http::request::Parts;
@@ -16,6 +17,7 @@ use futures::stream;
 use hyper::body::{Frame, Incoming, SizeHint};
 use hyper::client::conn::http2;
 use hyper_util::rt::{TokioExecutor, TokioIo};
+use tokio::sync::MutexGuard;
 use tokio_util::sync::WaitForCancellationFutureOwned;
 use tracing::Span;
 
@@ -30,6 +32,8 @@ const KEPT_BYTES: usize = 64 << 10;
 /// message with its length.
 const LARGEST_HTTP: usize = 2 << 20;
 const LARGEST_GRPC: usize = (4 << 20) + 5;
+/// Time for which a request that may have ended an engine is repeated without the others.
+const SUSPECT_TURN: Duration = Duration::from_secs(3);
 /// Bytes of a frame of HTTP/2 between an engine and the door; the default of 16 KiB costs a wake-up each.
 const FRAME_BYTES: u32 = 256 << 10;
 /// Headers of one connection, not of the request (RFC 9110, section 7.6.1).
@@ -98,8 +102,8 @@ impl ServerEngines {
                 found => found?,
             };
             let (sent, fault, again) = body.into_parts();
-            let answer = EngineAnswer::fetch_from(&engine, request_of(&parts, sent), wire).await;
-            let failed = match answer {
+            let fetched = EngineAnswer::fetch_from(&engine, request_of(&parts, sent), wire);
+            let failed = match await_in_turn(fetched, &mut alone).await {
                 Ok(answer) => {
                     let end = self.client_end(&client.name).cancelled_owned();
                     return Ok(answer.into_engine_response(engine, working, end));
@@ -122,6 +126,18 @@ impl ServerEngines {
             }
         }
     }
+}
+
+// Waits for an answer, and gives up the turn of a suspect if it takes long.
+async fn await_in_turn<T>(answer: impl Future<Output = T>, turn: &mut Option<MutexGuard<'_, ()>>) -> T {
+    let mut answer = pin!(answer);
+    if turn.is_some() {
+        if let Ok(answer) = tokio::time::timeout(SUSPECT_TURN, &mut answer).await {
+            return answer;
+        }
+        turn.take();
+    }
+    answer.await
 }
 
 impl RequestBody {

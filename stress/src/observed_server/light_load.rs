@@ -18,9 +18,9 @@ const PROBE_LIMIT: Duration = Duration::from_secs(30);
 /// Other clients than the attackers come from another address.
 const LIGHT_SOURCE: Ipv4Addr = Ipv4Addr::new(127, 0, 0, 2);
 const LIGHT_QUERY: &str = "select count(*) from runs";
-/// Data of pages: a wall of surfaces, and a surface with its levels. They are asked for with another number each time,
+/// Data of pages: a wall of surfaces, and runs. They are asked for with another number each time,
 /// so that they are computed and not remembered.
-const PAGE_PATHS: [&str; 2] = ["/api/v1/surfaces?limit=", "/api/v1/surfaces/flat/measured-pairs?limit="];
+const PAGE_PATHS: [&str; 2] = ["/api/v1/surfaces?limit=", "/api/v1/runs?limit="];
 
 /// A request that must be answered soon.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
