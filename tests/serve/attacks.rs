@@ -36,8 +36,14 @@ mod slow {
     use super::cancels::{QueryEnd, run_cancels};
     use super::engine_kills::run_kills;
     use super::hostile_clients::run_clients;
-    use super::observed_server::QueryProtocol;
+    use super::observed_server::{ClientGroup, ObservedServer, QueryOutcome, QueryProtocol};
     use crate::ECHOLAKE;
+
+    /// Clients of whom each asks one query.
+    const MANY_CLIENTS: ClientGroup =
+        ClientGroup { name: "light", count: 50, limits: "seconds = 60\nmemory_mb = 400\nconcurrent = 4\n" };
+    /// Memory of the server with all of its engines then, KiB.
+    const MANY_CLIENTS_KIB: u64 = 1 << 20;
 
     /// Attacks that end a process or take its memory, each another way.
     const ATTACKS: [&str; 6] = [
@@ -51,6 +57,21 @@ mod slow {
 
     /// Goals that a busy machine may miss.
     const MACHINE_GOALS: [&str; 3] = ["light queries within 300 ms", "/health within 100 ms", "idle again"];
+
+    #[test]
+    fn fifty_clients_share_two_engines_and_a_spare() {
+        let server = ObservedServer::start(Path::new(ECHOLAKE), &[MANY_CLIENTS]).expect("a lake");
+        for number in 0..MANY_CLIENTS.count {
+            let client = server.client(MANY_CLIENTS.name, number);
+            let answer = client.query(QueryProtocol::ALL[number % 4], "select avg(tnce_total) from tnce");
+            assert!(matches!(answer, QueryOutcome::Answer(_)), "{answer}");
+            assert!(matches!(client.get_page("/api/v1/runs"), QueryOutcome::Answer(_)));
+        }
+        let processes = server.process_tree();
+        assert_eq!(processes.children().len(), 3);
+        let memory = processes.memory();
+        assert!(memory.total_kib <= MANY_CLIENTS_KIB, "{memory:?}");
+    }
 
     #[test]
     fn attacks_harm_nobody_else() {

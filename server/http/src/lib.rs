@@ -52,7 +52,7 @@ pub use mcp::MCP;
 pub use problem::{ProblemBody, ProblemResponse};
 pub use ranges::cors_layer;
 pub use slices::SLICED_RUNS;
-use slices::{FOXGLOVE_MANIFEST, LICHTBLICK_SESSION, SLICE, SOFA, SliceService};
+use slices::{FOXGLOVE_MANIFEST, LICHTBLICK_SESSION, SLICE, SOFA, SliceRoom, SliceService};
 
 /// Paths that viewers on pages of any origin use.
 pub const VIEWER_PATHS: [&str; 5] = [files::RUN, SLICE, SOFA, FOXGLOVE_MANIFEST, LICHTBLICK_SESSION];
@@ -74,6 +74,7 @@ struct HttpEngineState {
     views: RightViews,
     /// Places of heavy endpoints, one per core: light ones never wait for all the heavy ones that are requested.
     heavy_places: Arc<Semaphore>,
+    slices: SliceRoom,
 }
 
 /// Answers HTTP on the socket of an engine with this role; None for both. A request counts until its answer is sent or dropped.
@@ -87,7 +88,13 @@ pub async fn serve_http_socket(
 ) -> Result<(), Error> {
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     let heavy_places = Arc::new(Semaphore::new(cores));
-    let engine = HttpEngine(Arc::new(HttpEngineState { services, role, views: Cache::new(KEPT_RIGHTS), heavy_places }));
+    let engine = HttpEngine(Arc::new(HttpEngineState {
+        services,
+        role,
+        views: Cache::new(KEPT_RIGHTS),
+        heavy_places,
+        slices: SliceRoom::default(),
+    }));
     loop {
         let (stream, _) = listener.accept().await.map_err(Error::System)?;
         let engine = engine.clone();
@@ -138,17 +145,17 @@ impl HttpEngine {
         // Never fails to make them.
         let views = self.0.views.get_or_insert_with(&right, || Ok::<_, Infallible>(Arc::default()));
         let views = views.unwrap_or_else(|never| match never {});
-        engine_router(&LakeCatalogue::new(service.clone(), views), &self.0.heavy_places)
+        engine_router(&LakeCatalogue::new(service.clone(), views), &self.0)
     }
 }
 
-fn engine_router(catalogue: &LakeCatalogue, heavy_places: &Arc<Semaphore>) -> Router {
+fn engine_router(catalogue: &LakeCatalogue, shared: &HttpEngineState) -> Router {
     let service = catalogue.service();
-    let slices = SliceService::new(catalogue);
+    let slices = SliceService::new(catalogue, &shared.slices);
     let files = files::own_routes().merge(manifest::manifest_routes());
     let own = Router::from(sql::sql_routes())
         .with_state(service.clone())
-        .merge(catalogue.endpoint_router(heavy_places))
+        .merge(catalogue.endpoint_router(&shared.heavy_places))
         .merge(contributions::draft_routes(catalogue))
         .merge(Router::from(files).with_state(catalogue.clone()))
         .merge(with_protocol(ServerProtocol::Mcp, mcp::agent_routes(catalogue, &slices)))

@@ -52,7 +52,7 @@ pub(crate) const SLICE: &str = "/api/v1/slices.mcap";
 pub const SLICED_RUNS: HeaderName = HeaderName::from_static("echolake-sliced-runs");
 /// Bytes of that header's names.
 const NAMED_BYTES: usize = 8 << 10;
-/// Slices that are open at once: each holds some 8 MB.
+/// Slices of all clients that are open at once: each holds some 8 MB.
 const MOST: usize = 128;
 /// Slices that are worked at, at any moment, beside those that begin: a few a thread, so that one that begins does not
 /// wait for all that have.
@@ -66,8 +66,20 @@ struct SlicesState {
     catalogue: LakeCatalogue,
     selections: SelectionCache,
     spool: SliceSpool,
+    room: SliceRoom,
+}
+
+/// What the slices of all clients share.
+#[derive(Clone)]
+pub(super) struct SliceRoom {
     places: Arc<Semaphore>,
     turns: Arc<Semaphore>,
+}
+
+impl Default for SliceRoom {
+    fn default() -> Self {
+        Self { places: Arc::new(Semaphore::new(MOST)), turns: Arc::new(Semaphore::new(TURNS)) }
+    }
 }
 
 /// Routes of slices and of their manifest.
@@ -97,14 +109,13 @@ pub(super) struct SliceAddress {
 }
 
 impl SliceService {
-    /// Slices of a lake.
-    pub fn new(catalogue: &LakeCatalogue) -> Self {
+    /// Slices of a lake for one client, in the room of all clients.
+    pub fn new(catalogue: &LakeCatalogue, room: &SliceRoom) -> Self {
         Self(Arc::new(SlicesState {
             catalogue: catalogue.clone(),
             selections: SelectionCache::default(),
             spool: SliceSpool::default(),
-            places: Arc::new(Semaphore::new(MOST)),
-            turns: Arc::new(Semaphore::new(TURNS)),
+            room: room.clone(),
         }))
     }
 
@@ -211,9 +222,9 @@ impl SliceService {
 
     fn start_cutting(&self, request: &SliceRequest, selection: &SliceSelection) -> Result<SliceTask, RequestFault> {
         let params = Self::slice_params(request, selection.taken.clone());
-        let places = self.0.places.clone();
+        let places = self.0.room.places.clone();
         let place = places.try_acquire_owned().map_err(|_| RequestFault::TooMany { what: "slices", limit: MOST })?;
-        let room = SliceResources { place, turns: self.0.turns.clone() };
+        let room = SliceResources { place, turns: self.0.room.turns.clone() };
         Ok(SliceTask::begin_cutting(
             self.0.catalogue.service(),
             &request.client,
