@@ -99,6 +99,13 @@ impl ClientIdentity {
         serde_json::from_str(text).map_err(RequestFault::defect("the door names a client otherwise"))
     }
 
+    /// What it may see and do, in a text that is equal for clients with equal rights. Without tokens, who asks from where
+    /// is a right of its own: a page of elsewhere may not what the server's own page may.
+    pub fn rights_text(&self) -> String {
+        let name = self.is_open.then_some(&self.name);
+        serde_json::json!([name, self.scopes, self.projects]).to_string()
+    }
+
     /// Limits of its queries.
     pub fn quota(&self) -> QueryQuota {
         #[cfg(fuzzing)]

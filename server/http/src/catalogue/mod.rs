@@ -1,7 +1,7 @@
-//! The catalogue: the data of the pages, each a query of the lake, answered once per snapshot and cached.
+//! The catalogue: the data of the pages, each a query of the lake.
 //!
-//! [`light_routes`], [`heavy_routes`] and [`file_routes`] list the endpoints. [`answer_through_cache`] stands before
-//! all of them: whether the client may ask, whether it has the answer already, and whether the cache does.
+//! [`light_routes`], [`heavy_routes`] and [`file_routes`] list the endpoints. [`answer_validated`] stands before all of
+//! them: whether the client may ask, and whether it has the answer already.
 
 mod analysis;
 mod content;
@@ -17,6 +17,7 @@ mod map;
 mod materials;
 mod measured_pairs;
 mod neighbours;
+mod packing;
 mod pair;
 mod relief;
 mod request;
@@ -30,7 +31,7 @@ mod wav;
 use std::sync::Arc;
 
 use axum::extract::{Request, State};
-use axum::http::{HeaderName, HeaderValue, Method, header};
+use axum::http::{HeaderName, HeaderValue, Method, StatusCode, header};
 use axum::middleware::{Next, from_fn_with_state};
 use axum::response::Response;
 use axum::{Extension, Router};
@@ -132,7 +133,7 @@ impl LakeCatalogue {
     /// Routes of the endpoints. Heavy ones wait for one of `heavy_places`.
     pub fn endpoint_router(&self, heavy_places: &Arc<Semaphore>) -> Router {
         let cached = |routes: Router, scope, contents| {
-            routes.route_layer(from_fn_with_state((self.clone(), scope, contents), answer_through_cache))
+            routes.route_layer(from_fn_with_state((self.clone(), scope, contents), answer_validated))
         };
         let heavy = Router::from(heavy_routes()).route_layer(from_fn_with_state(heavy_places.clone(), answer_in_place));
         cached(Router::from(light_routes()).merge(heavy), TokenScope::Sql, AnswerContents::Runs)
@@ -179,8 +180,8 @@ impl LakeCatalogue {
     }
 }
 
-/// Answers a request from the cache, or by its endpoint.
-async fn answer_through_cache(
+/// Answers a request by its endpoint, unless its client has the answer already. The door remembers answers.
+async fn answer_validated(
     State((catalogue, scope, contents)): State<(LakeCatalogue, TokenScope, AnswerContents)>,
     mut request: Request,
     next: Next,
@@ -198,30 +199,34 @@ async fn answer_through_cache(
     // What the client may do is in the lake's answer.
     let may_annotate = catalogue.service().has_scope(TokenScope::Annotate);
     let etag = view.answer_etag(contents, &format!("{address} {as_arrow} {as_gzip} {may_annotate}"));
+    let lasting = || view.lasting_version().map(|version| (LASTING_VERSION, HeaderValue::from(version)));
     let outcome = ConditionOutcome::new(&headers, &etag);
-    let instead = || outcome.early_response(&etag, [(header::ETAG, &etag)]);
+    let instead = || {
+        let mut early = outcome.early_response(&etag, [(header::ETAG, &etag)])?;
+        early.headers_mut().extend(lasting().filter(|_| outcome == ConditionOutcome::NotModified));
+        Some(early)
+    };
     // Only an answer has this tag: a client that names it had the answer, which need not be made again.
     if is_named(&headers, &etag)
         && let (ConditionOutcome::NotModified, Some(unchanged)) = (outcome, instead())
     {
         return Ok(unchanged);
     }
-    let key = (address, as_arrow, may_annotate, view.content_version(contents));
     // One answer is for both methods: HEAD's body is left out behind this.
     *request.method_mut() = Method::GET;
     request.extensions_mut().insert(CatalogueRequest::new(&catalogue, &view, as_arrow));
-    match view.results.answers.get_or_make(&key, next.run(request)).await {
-        Ok(answer) => Ok(instead().unwrap_or_else(|| {
-            let mut response = with_validators(answer.to_response(&headers), &etag);
-            response.headers_mut().extend(view.lasting_version().map(|version| (LASTING_VERSION, version.into())));
-            response
-        })),
-        Err(failed) => {
-            let code = failed.extensions().get::<FaultCode>().copied();
-            catalogue.service().report_failure(code.unwrap_or(FaultCode::Internal));
-            Ok(failed)
-        }
+    let answer = next.run(request).await;
+    if answer.status() != StatusCode::OK {
+        let code = answer.extensions().get::<FaultCode>().copied();
+        catalogue.service().report_failure(code.unwrap_or(FaultCode::Internal));
+        return Ok(answer);
     }
+    if let Some(instead) = instead() {
+        return Ok(instead);
+    }
+    let mut response = with_validators(packing::pack_answer(answer, as_gzip).await?, &etag);
+    response.headers_mut().extend(lasting());
+    Ok(response)
 }
 
 /// Answers a request once there is a place.

@@ -90,6 +90,7 @@ async fn add_contribution(door: &ServerDoor, table: Table, request: Request) -> 
         let draft = draft.map_err(RequestFault::defect("an engine broke off a draft"))?;
         let draft = ContributionDraft::decode(draft).map_err(refuse_draft)?;
         let Some(added) = store_draft(door, &client, table, draft).await? else { continue };
+        door.answers().expire_check();
         audit::record_contribution(work.peer(), &client.name, table, &added);
         return Ok(Json(added).into_response());
     }

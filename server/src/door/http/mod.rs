@@ -18,12 +18,12 @@ use std::time::{Duration, Instant};
 use axum::Router;
 use axum::body::Body;
 use axum::extract::{Request, State};
-use axum::http::{HeaderValue, header};
+use axum::http::{HeaderMap, HeaderValue, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse as _, Response};
 use echolake_http::{FORWARDED_PROTO, ProblemResponse, RequestSite, SLICED_RUNS, engine_role, request_site};
 use echolake_service::request_span::{REQUEST_ID, begin_request};
-use echolake_service::{ClientIdentity, FaultCode, RequestFault, ServerProtocol};
+use echolake_service::{ClientIdentity, EngineRole, FaultCode, RequestFault, ServerProtocol};
 use hyper::body::Incoming;
 use hyper::server::conn::http1;
 use hyper::service::{Service as _, service_fn};
@@ -40,7 +40,7 @@ use super::encryption::{ProtocolEncryption, agreed_protocol};
 use super::forward::EngineProtocol;
 use super::http_connection::{HTTP_2, drive_connection, http2_builder, restate_as_http1};
 use crate::door::server_door::ServerDoor;
-use answer_cache::AnswerKey;
+use answer_cache::{AnswerKey, CachedOutcome};
 use authentication::authenticate_client;
 use router::door_router;
 
@@ -154,20 +154,9 @@ impl ServerDoor {
         let client = self.identify_client(&work, &request)?;
         let path = request.uri().path().to_owned();
         let method = request.method().clone();
-        let key = AnswerKey::from_request(&client, &request);
-        let cached = match &key {
-            Some(key) => self.answers().find_answer(&client, key, request.headers()).await,
-            None => None,
-        };
-        let mut response = match cached {
-            Some(cached) => cached,
-            None => {
-                let engines = self.engines();
-                let role = engine_role(&method, &path);
-                let answer = engines.forward_request(role, &client, request, EngineProtocol::Http, Some(&work)).await?;
-                self.answers().keep_answer(client.clone(), key, answer.map(Body::new)).await?
-            }
-        };
+        let role = engine_role(&method, &path);
+        let key = AnswerKey::from_request(&client, &request).filter(|_| role == EngineRole::Pages);
+        let mut response = self.answer_or_forward(role, &client, request, key, &work).await?;
         let runs = response.headers_mut().remove(SLICED_RUNS);
         if !self.access().is_open() {
             let runs = runs.as_ref().and_then(|runs| runs.to_str().ok());
@@ -176,4 +165,41 @@ impl ServerDoor {
         }
         Ok(response)
     }
+
+    // The cached answer to a request, or that of an engine, which many who ask the same have computed once.
+    async fn answer_or_forward(
+        &self,
+        role: EngineRole,
+        client: &ClientIdentity,
+        mut request: Request,
+        key: Option<AnswerKey>,
+        work: &PlaceWork,
+    ) -> Result<Response, RequestFault> {
+        let headers = request.headers().clone();
+        let mut turn = None;
+        if let Some(key) = &key {
+            let mut found = self.answers().find_answer(key, &headers).await;
+            if !matches!(found, CachedOutcome::Answer(_)) {
+                turn = Some(self.answers().computing_turn(key).await);
+                found = self.answers().find_answer(key, &headers).await;
+            }
+            match found {
+                CachedOutcome::Answer(answer) => return Ok(answer),
+                // The client's own conditions come first.
+                CachedOutcome::Outdated(etag) if !has_conditions(&headers) => {
+                    request.headers_mut().insert(header::IF_NONE_MATCH, etag);
+                }
+                CachedOutcome::Outdated(_) | CachedOutcome::Nothing => {}
+            }
+        }
+        let engines = self.engines();
+        let answer = engines.forward_request(role, client, request, EngineProtocol::Http, Some(work)).await?;
+        let answer = self.answers().keep_answer(key.as_ref(), &headers, answer.map(Body::new)).await;
+        drop(turn);
+        answer
+    }
+}
+
+fn has_conditions(headers: &HeaderMap) -> bool {
+    headers.contains_key(header::IF_NONE_MATCH) || headers.contains_key(header::IF_MATCH)
 }

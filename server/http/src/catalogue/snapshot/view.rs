@@ -18,7 +18,6 @@ use object_store::path::Path as StorePath;
 use sha2::{Digest as _, Sha256};
 use tokio::sync::OnceCell;
 
-use super::answer_cache::AnswerCache;
 use super::positions::SurfacePositions;
 use super::summary::CatalogueSummary;
 use crate::catalogue::diffusion::DiffusionCoefficients;
@@ -50,7 +49,6 @@ pub(crate) struct SnapshotView {
 /// Results of all snapshots of one version.
 #[derive(Default)]
 pub(crate) struct SharedResults {
-    pub answers: AnswerCache,
     pub summary: OnceCell<CatalogueSummary>,
     pub rejected: OnceCell<RejectedMeasurements>,
     pub places: OnceCell<SurfacePositions>,
