@@ -18,7 +18,6 @@ use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinSet;
 use tracing::Instrument as _;
 
-use crate::Error;
 use crate::client_identity::ClientIdentity;
 use crate::door_rows::{ClientRows, DoorRows};
 use crate::engine_report::EngineReport;
