@@ -128,6 +128,18 @@ impl Session {
         self
     }
 
+    /// Adds tables to the schema `system`, as this session's client sees them.
+    #[must_use]
+    pub fn with_system(mut self, source: Arc<dyn SystemSource>) -> Self {
+        self.system = Some(source);
+        self
+    }
+
+    // The tables of the schema `system` that are not the lake's; none without a program around that has some.
+    fn source_tables(&self) -> Vec<(&'static str, Arc<dyn TableProvider>)> {
+        self.system.as_ref().map_or_else(Vec::new, system::engine_tables)
+    }
+
     /// Sets the number of the request that the session's queries are for, see [`StatementBlame::request`].
     ///
     /// [`StatementBlame::request`]: crate::StatementBlame::request
