@@ -110,22 +110,38 @@ impl ServerEngines {
         if role == EngineRole::Statements {
             self.0.ends.wait_for_turn(&client.name).await?;
         }
-        let place = self.place_of(role);
-        if let Some(engine) = place.live_engine() {
-            return Ok(engine);
-        }
-        let _starting = place.starting.lock().await;
-        // Another request that held the lock may have started one.
-        if let Some(engine) = place.live_engine() {
-            return Ok(engine);
-        }
-        let engine = self.take_or_start(role).map_err(RequestFault::defect("no engine can be started"))?;
-        // Set at once: a request that is dropped while the engine starts leaves it to the next, and to the server's end.
-        *lock_mutex(&place.current) = Some(engine.clone());
-        self.wait_for_start(&engine).await?;
+        // An engine that was killed while it started is started once more.
+        let engine = match self.started_engine(role).await {
+            Err(RequestFault::EngineEnded { .. }) => self.started_engine(role).await?,
+            started => started?,
+        };
         // The file of tokens may have changed while the engine started.
         self.0.access.check_current(client)?;
         Ok(engine)
+    }
+
+    async fn started_engine(&self, role: EngineRole) -> Result<Arc<EngineProcess>, RequestFault> {
+        let place = self.place_of(role);
+        let live = match place.live_engine() {
+            Some(engine) => engine,
+            None => {
+                let _starting = place.starting.lock().await;
+                // Another request that held the lock may have started one.
+                match place.live_engine() {
+                    Some(engine) => engine,
+                    None => {
+                        let failed = RequestFault::defect("no engine can be started");
+                        let engine = self.take_or_start(role).map_err(failed)?;
+                        // Set at once: a request that is dropped while the engine starts leaves it to the next, and to
+                        // the server's end.
+                        *lock_mutex(&place.current) = Some(engine.clone());
+                        engine
+                    }
+                }
+            }
+        };
+        self.wait_for_start(&live).await?;
+        Ok(live)
     }
 
     // Waits until an engine of the place is ready; it is in its place already.

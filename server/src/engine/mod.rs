@@ -24,6 +24,8 @@ const WARM_UP: &str = "select count(*) from runs";
 /// money.
 const LAKE_LOOK: Duration = Duration::from_secs(15);
 const REMOTE_LAKE_LOOK: Duration = Duration::from_secs(60);
+/// Statements of pages that compute at once, for each core: they are short, and of one client.
+const PAGES_PER_CORE: usize = 8;
 /// Niceness of threads that run statements from outside: a page, which is computed beside them, has the processors
 /// first.
 const STATEMENT_NICENESS: i32 = 10;
@@ -54,7 +56,9 @@ pub async fn run_engine(lake: &Lake, options: EngineOptions<'_>) -> Result<(), E
     #[cfg(feature = "postgres")]
     let postgres = EngineSocket::Postgres.listen_in(sockets)?;
     let niceness = (role == EngineRole::Statements).then_some(STATEMENT_NICENESS);
-    let limits = EngineLimits { memory: Some(memory), niceness, ..EngineLimits::default() };
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    let computing = (role == EngineRole::Pages).then_some(cores * PAGES_PER_CORE);
+    let limits = EngineLimits { memory: Some(memory), computing, niceness };
     let engine = QueryEngine::with_limits(lake, limits)?;
     warm_up(&engine).await?;
     let services = EngineServices::new(lake, engine, slow)?;

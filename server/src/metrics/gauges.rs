@@ -81,10 +81,10 @@ impl ServerGauges {
     }
 
     fn register_engines(&self, moment: &MomentRegistry<'_>) -> Result<()> {
-        let pool = &self.pool;
-        moment.register_gauge("echolake_engines", "Engines that have a client.", pool.engines as f64)?;
-        moment.register_gauge("echolake_engines_limit", "Engines that may have a client.", pool.most_engines as f64)?;
-        moment.register_gauge("echolake_engine_memory_bytes", "Memory that queries occupy.", pool.bytes as f64)?;
+        let pool = &self.engines;
+        moment.register_gauge("echolake_engines", "Engines that run, the spare among them.", pool.engines as f64)?;
+        moment.register_gauge("echolake_engines_limit", "Engines that may run.", pool.most_engines as f64)?;
+        moment.register_gauge("echolake_engine_memory_bytes", "Memory that engines occupy.", pool.bytes as f64)?;
         moment.register_gauge(
             "echolake_engine_memory_limit_bytes",
             "Memory that queries may occupy.",
@@ -92,7 +92,7 @@ impl ServerGauges {
         )?;
         moment.register_counter("echolake_engine_starts_total", "Engines that were started.", pool.started as f64)?;
         let failed = pool.failed as f64;
-        moment.register_counter("echolake_engine_failures_total", "Engines that ended while they had a client.", failed)
+        moment.register_counter("echolake_engine_failures_total", "Engines that ended by themselves.", failed)
     }
 
     // Left out while they are unknown: 0 runs would be a claim.
