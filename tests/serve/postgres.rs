@@ -345,7 +345,7 @@ mod slow {
     use rustix::process::Signal;
 
     use super::super::http::HttpRequest;
-    use super::super::{ENDLESS, lake, refused, running, served, sql, wait_until};
+    use super::super::{ENDLESS, RUNAWAY, lake, refused, running, served, sql, wait_until};
     use super::*;
 
     #[test]
@@ -410,19 +410,31 @@ mod slow {
     }
 
     #[test]
-    fn a_client_whose_engines_ended_is_answered_after_a_while_whatever_it_asks_meanwhile() {
+    fn a_client_whose_statements_end_engines_waits_and_no_other_does() {
         let place = lake();
         let server = served(&place, &[]);
+        let mut other = WireClient::connect(&server, None);
         let refusal = loop {
             let answer = sql(&server, "select 7");
             match answer.status {
-                200 => server.signal_engines(Signal::KILL),
+                200 => {
+                    let asked = HttpRequest::post("/api/v1/sql", RUNAWAY).with("content-type", "text/plain");
+                    let asked = asked.begin(&server);
+                    wait_until("it runs", || running(&server) > 0.0);
+                    let ends = || server.said().iter().filter(|line| line.contains("did not stop")).count();
+                    let before = ends();
+                    drop(asked);
+                    wait_until("its engine ends", || ends() > before);
+                }
                 429 => break answer,
-                // It was killed while it answered, or started.
-                _ => {}
+                status => panic!("{status}: {}", answer.text()),
             }
         };
         refused(&refusal, 429, "too_many");
+        // Its connection was to the first engine.
+        assert_eq!(other.end_state(), "58000");
+        let mut other = WireClient::connect(&server, None);
+        assert_eq!(other.query("select 7"), Ok(vec![vec![Some("7".to_owned())]]));
         let wait: u64 = refusal.header("retry-after").and_then(|secs| secs.parse().ok()).expect("seconds");
         assert!((1..=31).contains(&wait), "{wait}");
         let begun = std::time::Instant::now();

@@ -195,9 +195,15 @@ pub enum RequestFault {
         /// The missing part.
         reason: &'static str,
     },
-    /// The engine process that ran the query ended. Queries of other clients continue.
+    /// The engine that ran the query ended for it.
     #[error("the query ended the engine that ran it: {reason}; hint: ask for less at a time, or for fewer rows")]
     EngineEnded {
+        /// The cause of its end.
+        reason: String,
+    },
+    /// The engine that ran the query ended for another one, or for a reason that nobody knows.
+    #[error("the engine that ran the query ended, as far as is known not for it: {reason}; hint: ask again")]
+    EngineLost {
         /// The cause of its end.
         reason: String,
     },
@@ -438,7 +444,7 @@ impl RequestFault {
             Self::Cancelled => FaultCode::Cancelled,
             Self::Timeout { .. } => FaultCode::TimeLimit,
             Self::TooMany { .. } | Self::FailedLogins { .. } | Self::Backoff { .. } => FaultCode::TooMany,
-            Self::EngineEnded { .. } => FaultCode::EngineEnded,
+            Self::EngineEnded { .. } | Self::EngineLost { .. } => FaultCode::EngineEnded,
             Self::Internal => FaultCode::Internal,
             Self::Draining | Self::Disconnected => FaultCode::Stopping,
             Self::NotReady { .. } => FaultCode::NotReady,

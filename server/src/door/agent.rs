@@ -140,7 +140,7 @@ impl AgentRoute {
                 return Ok(None);
             }
             let body = to_bytes(Body::new(response.into_body()), LARGEST_ANSWER).await;
-            body.map(Some).map_err(|_| RequestFault::EngineEnded { reason: "it stopped answering".to_owned() })
+            body.map(Some).map_err(|_| RequestFault::EngineLost { reason: "it stopped answering".to_owned() })
         };
         work.instrument(span).await
     }

@@ -11,7 +11,9 @@ use std::time::Duration;
 
 use axum::body::Body;
 use echolake_lake::CacheFolder;
-use echolake_service::{DoorMessage, EngineEnd, EngineReport, EngineRole, EngineSocket, ServerProtocol, counted_bytes};
+use echolake_service::{
+    DoorMessage, EngineEnd, EngineReport, EngineRole, EngineSocket, RequestFault, ServerProtocol, counted_bytes,
+};
 use hyper::client::conn::{http1, http2};
 use hyper_util::rt::TokioIo;
 use rustix::process::{Pid, PidfdFlags, Signal, pidfd_open, pidfd_send_signal};
@@ -62,6 +64,29 @@ impl EndReason {
             Self::Retired => "the server is ending".to_owned(),
             Self::Failed(end) => end.reason.clone(),
         }
+    }
+
+    /// The fault of a request that the engine had.
+    pub fn fault(&self, request: Option<u64>) -> RequestFault {
+        let reason = self.text();
+        match self.is_for(request) {
+            true => RequestFault::EngineEnded { reason },
+            false => RequestFault::EngineLost { reason },
+        }
+    }
+
+    /// Returns whether the engine says that it ended for this request.
+    pub fn is_for(&self, request: Option<u64>) -> bool {
+        let culprit = match self {
+            Self::Retired => None,
+            Self::Failed(end) => end.culprit.as_ref().and_then(|culprit| culprit.request),
+        };
+        culprit.is_some() && culprit == request
+    }
+
+    /// Returns whether the engine failed without saying for whom.
+    pub fn is_unknown(&self) -> bool {
+        matches!(self, Self::Failed(end) if end.culprit.is_none())
     }
 }
 

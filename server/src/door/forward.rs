@@ -66,7 +66,7 @@ impl ServerEngines {
     /// engine ends before its answer begins, the next one is asked once, unless the request itself ended it.
     ///
     /// # Errors
-    /// [`RequestFault::EngineEnded`], [`RequestFault::Backoff`], [`RequestFault::TooLarge`], [`RequestFault::Request`].
+    /// [`RequestFault::EngineEnded`], [`RequestFault::EngineLost`], [`RequestFault::Backoff`], [`RequestFault::TooLarge`], [`RequestFault::Request`].
     pub async fn forward_request(
         &self,
         role: EngineRole,
@@ -106,19 +106,23 @@ impl ServerEngines {
             let failed = match await_in_turn(fetched, &mut alone).await {
                 Ok(answer) => {
                     let end = self.client_end(&client.name).cancelled_owned();
-                    return Ok(answer.into_engine_response(engine, working, end));
+                    return Ok(answer.into_engine_response(engine, number, working, end));
                 }
                 Err(failed) => failed,
             };
             let why = engine.why_ended().await;
-            let is_culprit = why.as_ref().is_some_and(|why| self.note_end(why, client, number, alone.is_some()));
-            let found = find_engine_fault(why.as_ref(), &failed);
+            let is_unknown = why.as_ref().is_some_and(EndReason::is_unknown);
+            let is_culprit = why.as_ref().is_some_and(|why| why.is_for(number)) || is_unknown && alone.is_some();
+            if is_unknown && alone.is_some() {
+                self.count_lone_end(client);
+            }
+            let found = find_engine_fault(why.as_ref(), number, &failed);
             let known = fault.lock().unwrap_or_else(PoisonError::into_inner).take();
             match again {
                 Some(again) if ended.is_none() && !is_culprit => {
                     body = again;
                     ended = Some(found);
-                    if matches!(&why, Some(EndReason::Failed(end)) if end.culprit.is_none()) {
+                    if is_unknown {
                         alone = Some(self.suspect_turn().await);
                     }
                 }
@@ -186,9 +190,9 @@ fn request_of(parts: &Parts, body: Body) -> Request<Body> {
     request
 }
 
-fn find_engine_fault(why: Option<&EndReason>, failed: &str) -> RequestFault {
+fn find_engine_fault(why: Option<&EndReason>, request: Option<u64>, failed: &str) -> RequestFault {
     match why {
-        Some(why) => RequestFault::EngineEnded { reason: why.text() },
+        Some(why) => why.fault(request),
         None => {
             tracing::error!(error = failed, "an engine does not answer");
             RequestFault::Internal
@@ -231,6 +235,7 @@ impl EngineAnswer {
     fn into_engine_response(
         self,
         engine: Arc<EngineProcess>,
+        number: Option<u64>,
         working: Option<WorkingPlace>,
         client_end: WaitForCancellationFutureOwned,
     ) -> Response<EngineBody> {
@@ -239,7 +244,7 @@ impl EngineAnswer {
             let is_ended = false;
             let client_end = Box::pin(client_end);
             let span = Span::current();
-            EngineBody { incoming, wire, engine, connection, client_end, _working: working, span, is_ended }
+            EngineBody { incoming, wire, engine, connection, number, client_end, _working: working, span, is_ended }
         })
     }
 }
@@ -284,6 +289,8 @@ pub(crate) struct EngineBody {
     wire: EngineProtocol,
     engine: Arc<EngineProcess>,
     connection: Option<HttpConnection>,
+    /// The door's number of its request.
+    number: Option<u64>,
     /// The end of its client's rights, which ends the answer, too.
     client_end: Pin<Box<WaitForCancellationFutureOwned>>,
     _working: Option<WorkingPlace>,
@@ -295,9 +302,10 @@ impl EngineBody {
     // gRPC reports a failure in trailers behind the answer, so that the client sees it; HTTP/1.1 breaks the connection
     // off.
     fn failure_frame(&self) -> Option<Frame<Bytes>> {
-        let reason = self.engine.end_reason().map_or_else(|| "it stopped answering".to_owned(), EndReason::text);
-        self.span.in_scope(|| tracing::info!(reason, "an answer broke off"));
-        self.fault_trailers(&RequestFault::EngineEnded { reason })
+        let stopped = || RequestFault::EngineLost { reason: "it stopped answering".to_owned() };
+        let fault = self.engine.end_reason().map_or_else(stopped, |why| why.fault(self.number));
+        self.span.in_scope(|| tracing::info!(reason = fault.to_string(), "an answer broke off"));
+        self.fault_trailers(&fault)
     }
 
     fn refusal_frame(&self) -> Option<Frame<Bytes>> {

@@ -100,7 +100,7 @@ impl ServerEngines {
     ///
     /// # Errors
     /// [`RequestFault::Unauthenticated`] if the client's token is no longer one; [`RequestFault::Backoff`];
-    /// [`RequestFault::EngineEnded`].
+    /// [`RequestFault::EngineLost`].
     pub async fn engine_for(
         &self,
         role: EngineRole,
@@ -112,7 +112,7 @@ impl ServerEngines {
         }
         // An engine that was killed while it started is started once more.
         let engine = match self.started_engine(role).await {
-            Err(RequestFault::EngineEnded { .. }) => self.started_engine(role).await?,
+            Err(RequestFault::EngineLost { .. }) => self.started_engine(role).await?,
             started => started?,
         };
         // The file of tokens may have changed while the engine started.
@@ -151,22 +151,13 @@ impl ServerEngines {
         started.map_err(|why| {
             let reason = why.text();
             tracing::error!(reason, "an engine did not start");
-            RequestFault::EngineEnded { reason }
+            RequestFault::EngineLost { reason }
         })
     }
 
-    /// Takes note that a request was lost with its engine; returns whether the request itself ended it. An end that
-    /// names no culprit is counted against nobody, unless the request was asked alone.
-    pub fn note_end(&self, why: &EndReason, client: &ClientIdentity, request: Option<u64>, is_alone: bool) -> bool {
-        let EndReason::Failed(end) = why else { return false };
-        match &end.culprit {
-            Some(culprit) => culprit.request.is_some() && culprit.request == request,
-            None if is_alone => {
-                self.0.ends.count_end(&client.name);
-                true
-            }
-            None => false,
-        }
+    /// Counts an engine that ended without naming a culprit against a client whose request it had alone.
+    pub fn count_lone_end(&self, client: &ClientIdentity) {
+        self.0.ends.count_end(&client.name);
     }
 
     /// The turn of a request that is repeated because an engine ended without naming a culprit.

@@ -314,8 +314,8 @@ impl MessageRelay {
             return refused;
         }
         match engine.why_ended().await {
-            Some(why) => RequestFault::EngineEnded { reason: why.text() },
-            None => RequestFault::EngineEnded { reason: "it closed the connection".to_owned() },
+            Some(why) => why.fault(Some(self.login.number)),
+            None => RequestFault::EngineLost { reason: "it closed the connection".to_owned() },
         }
     }
 }
