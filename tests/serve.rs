@@ -36,9 +36,6 @@ use server::ServedLake;
 /// Runs for hours unless it is ended.
 const ENDLESS: &str = "select count(*) from generate_series(1, 1000000) a cross join generate_series(1, 1000000) b \
                        where a.value + b.value = 7";
-/// A statement that goes on computing after its end: it makes a regular expression for each row of a batch.
-const RUNAWAY: &str = "select count(*) from generate_series(1, 10000000) t(v) \
-                       where regexp_like('aaaa', '(' || v || '|a{1,200}){1,9}')";
 /// Time to wait for an action of the server; a busy machine may be slow.
 const EVENT_LIMIT: Duration = Duration::from_secs(60);
 
