@@ -43,8 +43,7 @@ const QUERIES: [&str; 8] = [
     "select v from generate_series(1, 200000) t(v) order by v % 1000, v limit 10",
 ];
 /// Data of pages that readers ask for.
-const PAGES: [&str; 4] =
-    ["/api/v1/surfaces", "/api/v1/surfaces/flat", "/api/v1/surfaces/flat/measured-pairs", "/api/v1/runs"];
+const PAGES: [&str; 2] = ["/api/v1/surfaces?limit=", "/api/v1/runs?limit="];
 /// Clients that read pages.
 const PAGE_READERS: usize = 5;
 /// Between two queries of a worker, at most.

@@ -105,6 +105,13 @@ impl ServedLake {
         }
     }
 
+    /// Kills one of its two engines of statements, of which one is a spare.
+    pub fn kill_statement_engine(&self) {
+        let arguments = |pid: &i32| std::fs::read_to_string(format!("/proc/{pid}/cmdline")).unwrap_or_default();
+        let found = self.engine_ids().into_iter().find(|pid| arguments(pid).contains("statements"));
+        kill_process(Pid::from_raw(found.expect("an engine")).expect("a process"), Signal::KILL).expect("it runs");
+    }
+
     /// Returns the most memory that one of its engines had at a time, in KiB.
     pub fn engine_kib(&self) -> u64 {
         self.engine_ids().into_iter().map(|pid| memory_kib(pid as u32, "VmHWM:")).max().unwrap_or(0)

@@ -263,13 +263,16 @@ impl ServerEngines {
             let spare = match self.spare_or_start() {
                 Ok(spare) => spare,
                 Err(failed) => {
+                    self.record_start(false);
                     tracing::error!(error = &failed as &dyn std::error::Error, "no spare engine can be started");
                     tokio::time::sleep(START_AGAIN).await;
                     continue;
                 }
             };
             let watch = async {
-                if spare.wait_until_ready().await.is_err() {
+                let is_ready = spare.wait_until_ready().await.is_ok();
+                self.record_start(is_ready);
+                if !is_ready {
                     tracing::error!("a spare engine did not start");
                     tokio::time::sleep(START_AGAIN).await;
                     return;
