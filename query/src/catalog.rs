@@ -16,10 +16,12 @@ use datafusion::datasource::TableProvider;
 use datafusion::error::DataFusionError;
 use datafusion::logical_expr::ScalarUDF;
 use datafusion::optimizer::OptimizerRule;
+use datafusion::physical_plan::ExecutionPlan;
 use datafusion::prelude::SessionContext;
 use datafusion::sql::parser::Statement;
+use echolake_functions::unified_floats;
 use echolake_lake::{DataFile, Error as LakeError, Lake, LakeMoment, LakeSnapshot, VisibleRun};
-use echolake_lake_tables::{FileReaders, LakeTable};
+use echolake_lake_tables::{FileReaders, LakeTable, rewrite_local_scans};
 use echolake_mcap_tables::{self as mcap_tables, Contents, McapCalls, McapFiles};
 use echolake_schema::RunId;
 use echolake_schema::annotations::Annotation;
@@ -28,7 +30,9 @@ use futures::future::try_join_all;
 use quick_cache::sync::Cache;
 
 use crate::contributions::{AnnotationCache, KnownVerdicts, with_pending_rows, without_rejected};
-use crate::statement::{PastTableName, find_past_tables, walk_statement};
+use crate::listed_verdicts::listed_rejection;
+use crate::overlay_schema::{NamedTables, OverlaySchema};
+use crate::statement::{PastTableName, checked_operators, find_past_tables, walk_statement};
 use crate::system;
 use crate::views::{LakeView, LazyView, LookupFunctions, PairJoin, SortedNulls, UnusedJoin};
 use crate::{Error, error};
@@ -69,7 +73,9 @@ struct CatalogSnapshot {
     /// The tag of its version of `runs`.
     tag: Option<String>,
     tables: HashMap<Table, Arc<LakeTable>>,
-    providers: Vec<(TableReference, Arc<dyn TableProvider>)>,
+    /// Tables and views, and the lake's tables of the schema `system`, as all queries see them.
+    public_tables: Arc<NamedTables>,
+    system_tables: Arc<NamedTables>,
     rejection: ScalarUDF,
     verdicts: KnownVerdicts,
     looked: Mutex<Instant>,
@@ -100,6 +106,21 @@ impl LakeCatalog {
         &self.lake
     }
 
+    /// Returns the functions that plans have and statements do not name; what a plan of another process has is known by
+    /// their names.
+    pub fn plan_functions(&self) -> impl Iterator<Item = Arc<ScalarUDF>> {
+        let own = unified_floats().into_iter().chain(checked_operators()).chain([listed_rejection()]);
+        self.lookups.functions().iter().cloned().chain(own.map(Arc::new))
+    }
+
+    /// Replaces the scans of a plan by what this process holds of the files, just before it runs here.
+    ///
+    /// # Errors
+    /// If a scan does not fit its table.
+    pub fn rewrite_local_scans(&self, plan: Arc<dyn ExecutionPlan>) -> Result<Arc<dyn ExecutionPlan>, DataFusionError> {
+        rewrite_local_scans(plan, &self.source)
+    }
+
     /// Registers everything that `statement` may name, all of one snapshot of the lake, and the program's own tables in
     /// `system`. It is called before planning,
     /// because the lookup of these names is asynchronous and planning is not. Returns the snapshot.
@@ -115,8 +136,12 @@ impl LakeCatalog {
     ) -> Result<Arc<LakeSnapshot>, Error> {
         let past = find_past_tables(statement)?;
         let current = self.fresh_snapshot().await?;
-        for (name, provider) in &current.providers {
-            context.register_table(name.clone(), provider.clone()).map_err(execution_error)?;
+        let names = context.copied_config().options().catalog.clone();
+        let catalog = context.catalog(&names.default_catalog).ok_or_else(|| Error::failed_query("no catalogue"))?;
+        for (schema, tables) in
+            [(names.default_schema.as_str(), &current.public_tables), (system::SYSTEM_SCHEMA, &current.system_tables)]
+        {
+            catalog.register_schema(schema, Arc::new(OverlaySchema::new(tables))).map_err(execution_error)?;
         }
         context.register_udf(current.rejection.clone());
         for (name, provider) in system {
@@ -300,10 +325,10 @@ impl LakeCatalog {
             };
             tables.insert(table, provider);
         }
-        let mut providers: Vec<(TableReference, Arc<dyn TableProvider>)> = Vec::new();
+        let mut public_tables = NamedTables::new();
         for (table, provider) in &tables {
             let provider = self.with_pending(*table, provider.clone(), &snapshot).await?;
-            providers.push((TableReference::bare(table.name()), provider));
+            public_tables.insert(table.name().to_owned(), provider);
         }
         let verdicts = self.annotations.find_verdicts(&self.lake, &snapshot).await?;
         let rejection = verdicts.rejection_function();
@@ -315,17 +340,28 @@ impl LakeCatalog {
                 beneath.insert(table, kept.map_err(execution_error)?);
             }
             let view_table = LazyView::new(view, &self.lake, &self.lookups, beneath);
-            providers.push((TableReference::bare(view.name()), Arc::new(view_table)));
+            public_tables.insert(view.name().to_owned(), Arc::new(view_table));
         }
+        let mut system_tables = NamedTables::new();
         if let Some(runs) = tables.get(&Table::Runs) {
-            let of_lake = system::lake_tables(&self.lake, &snapshot, runs.clone());
-            let named =
-                of_lake.into_iter().map(|(name, table)| (TableReference::partial(system::SYSTEM_SCHEMA, name), table));
-            providers.extend(named);
+            let of_lake = system::lake_tables(&self.lake, &snapshot, runs.clone(), &self.source);
+            system_tables.extend(of_lake.into_iter().map(|(name, table)| (name.to_owned(), table)));
         }
+        let public_tables = Arc::new(public_tables);
+        let system_tables = Arc::new(system_tables);
         let looked = Mutex::new(taken);
         let checked = Mutex::new(Some(taken));
-        Ok(CatalogSnapshot { snapshot, tag, tables, providers, rejection, verdicts, looked, checked })
+        Ok(CatalogSnapshot {
+            snapshot,
+            tag,
+            tables,
+            public_tables,
+            system_tables,
+            rejection,
+            verdicts,
+            looked,
+            checked,
+        })
     }
 
     async fn with_pending(

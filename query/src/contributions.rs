@@ -2,20 +2,22 @@
 //! the last verdict rejects. Rows of users that are still objects of the lake's earlier form stand beside their
 //! table's.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::{BTreeSet, HashMap, HashSet};
+use std::hash::{Hash, Hasher};
 use std::sync::Arc;
 
-use arrow::array::{ArrayRef, AsArray as _, BooleanArray};
-use arrow::compute::cast;
-use arrow::datatypes::{DataType, Int32Type, SchemaRef};
+use arrow::datatypes::{DataType, SchemaRef};
 use arrow::record_batch::RecordBatch;
 use async_trait::async_trait;
 use datafusion::catalog::Session;
+use datafusion::common::utils::take_function_args;
 use datafusion::datasource::{MemTable, TableProvider, ViewTable, provider_as_source};
 use datafusion::error::{DataFusionError, Result};
-use datafusion::functions::utils::make_scalar_function;
-use datafusion::logical_expr::expr_fn::SimpleScalarUDF;
-use datafusion::logical_expr::{LogicalPlanBuilder, ScalarUDF, Signature, TypeSignature, Volatility, lit, not};
+use datafusion::logical_expr::simplify::{ExprSimplifyResult, SimplifyContext};
+use datafusion::logical_expr::{
+    ColumnarValue, Expr, LogicalPlanBuilder, ScalarFunctionArgs, ScalarUDF, ScalarUDFImpl, Signature, TypeSignature,
+    Volatility, lit, not,
+};
 use datafusion::prelude::col;
 use echolake_lake::{DataFile, Error as LakeError, Lake, LakeSnapshot};
 use echolake_schema::RunId;
@@ -25,6 +27,7 @@ use object_store::path::Path;
 use tokio::sync::Mutex;
 
 use crate::error::repeat_table_fault;
+use crate::listed_verdicts::ListedVerdicts;
 use crate::system::{SystemRows, SystemTable};
 
 /// The function that tells whether a measurement is rejected.
@@ -49,12 +52,9 @@ impl AnnotationCache {
     /// What the store says.
     pub async fn find_verdicts(&self, lake: &Lake, snapshot: &LakeSnapshot) -> Result<KnownVerdicts, LakeError> {
         match self.read_files(lake, snapshot, |_| true).await {
-            Ok(files) => {
-                let rejected = RejectedMeasurements::from_annotations(sorted_annotations(&files));
-                Ok(KnownVerdicts { rejected: Arc::new(rejected), fault: None })
-            }
+            Ok(files) => Ok(KnownVerdicts::from_annotations(&sorted_annotations(&files).collect::<Vec<_>>())),
             Err(fault) if fault.is_table_fault() => {
-                Ok(KnownVerdicts { rejected: Arc::default(), fault: Some(Arc::new(fault)) })
+                Ok(KnownVerdicts { fault: Some(Arc::new(fault)), ..KnownVerdicts::from_annotations(&[]) })
             }
             Err(error) => Err(error),
         }
@@ -114,14 +114,23 @@ fn sorted_annotations(files: &[VersionedAnnotations]) -> impl Iterator<Item = &A
 }
 
 /// The verdicts of a snapshot.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone)]
 pub(crate) struct KnownVerdicts {
     rejected: Arc<RejectedMeasurements>,
+    listed: Arc<ListedVerdicts>,
     /// Rows of annotations are lost or cannot be read: nobody knows what is rejected.
     fault: Option<Arc<LakeError>>,
 }
 
 impl KnownVerdicts {
+    fn from_annotations(annotations: &[&Annotation]) -> Self {
+        let rejected = RejectedMeasurements::from_annotations(annotations.iter().copied());
+        let runs: BTreeSet<_> = annotations.iter().map(|annotation| annotation.run_id.as_str()).collect();
+        let rejection = |run: &str| Some((run.to_owned(), rejected.rejection_text(run)?));
+        let listed = ListedVerdicts::from_rejections(runs.into_iter().filter_map(rejection));
+        Self { rejected: Arc::new(rejected), listed: Arc::new(listed), fault: None }
+    }
+
     /// Returns whether they cannot be known.
     pub fn is_faulty(&self) -> bool {
         self.fault.is_some()
@@ -139,21 +148,62 @@ impl KnownVerdicts {
         let pair_types = [DataType::Int32, DataType::Int64];
         let exact = pair_types.map(|pair| TypeSignature::Exact(vec![DataType::Utf8, pair]));
         let signature = Signature::one_of(exact.to_vec(), Volatility::Immutable);
-        let verdicts = self.clone();
-        let judge = make_scalar_function(move |columns| verdicts.judge_measurements(columns), Vec::new());
-        let function = SimpleScalarUDF::new_with_signature(IS_REJECTED, signature, DataType::Boolean, Arc::new(judge));
-        ScalarUDF::from(function)
+        ScalarUDF::new_from_impl(RejectionFunction { verdicts: self.clone(), signature })
+    }
+}
+
+/// `is_rejected(run_id, pair_id)`, as statements name it. The optimizer puts a function in its place whose arguments
+/// are the verdicts, or that nothing is rejected, so that no physical plan has it.
+#[derive(Debug)]
+struct RejectionFunction {
+    verdicts: KnownVerdicts,
+    signature: Signature,
+}
+
+// The same name with other verdicts belongs to another snapshot.
+impl PartialEq for RejectionFunction {
+    fn eq(&self, other: &Self) -> bool {
+        Arc::ptr_eq(&self.verdicts.listed, &other.verdicts.listed)
+    }
+}
+
+impl Eq for RejectionFunction {}
+
+impl Hash for RejectionFunction {
+    fn hash<H: Hasher>(&self, state: &mut H) {
+        IS_REJECTED.hash(state);
+    }
+}
+
+impl ScalarUDFImpl for RejectionFunction {
+    fn name(&self) -> &str {
+        IS_REJECTED
     }
 
-    // Runs and pairs.
-    fn judge_measurements(&self, columns: &[ArrayRef]) -> Result<ArrayRef> {
-        self.check_fault()?;
-        let pairs = cast(&columns[1], &DataType::Int32)?;
-        let is_rejected = |(run, pair): (Option<&str>, Option<i32>)| {
-            Some(self.rejected.is_rejected(run?, u32::try_from(pair?).ok()?))
-        };
-        let rows = columns[0].as_string::<i32>().iter().zip(pairs.as_primitive::<Int32Type>()).map(is_rejected);
-        Ok(Arc::new(rows.collect::<BooleanArray>()))
+    fn signature(&self) -> &Signature {
+        &self.signature
+    }
+
+    fn return_type(&self, _: &[DataType]) -> Result<DataType> {
+        Ok(DataType::Boolean)
+    }
+
+    fn simplify(&self, args: Vec<Expr>, context: &SimplifyContext) -> Result<ExprSimplifyResult> {
+        self.verdicts.check_fault()?;
+        let [run, pair] = take_function_args(IS_REJECTED, args)?;
+        let is_null = context.nullable(&run)? || context.nullable(&pair)?;
+        Ok(ExprSimplifyResult::Simplified(match self.verdicts.listed.is_empty() && !is_null {
+            true => lit(false),
+            false => self.verdicts.listed.rejection_expr(run, pair),
+        }))
+    }
+
+    fn invoke_with_args(&self, args: ScalarFunctionArgs) -> Result<ColumnarValue> {
+        self.verdicts.check_fault()?;
+        let rows = args.number_rows;
+        let [run, pair] = take_function_args(IS_REJECTED, args.args)?;
+        let judged = self.verdicts.listed.judge_measurements(&run.into_array(rows)?, &pair.into_array(rows)?)?;
+        Ok(ColumnarValue::Array(Arc::new(judged)))
     }
 }
 
@@ -215,7 +265,7 @@ pub(crate) fn without_rejected(
             return Ok(Arc::new(SystemTable(Box::new(refused))));
         }
         Table::Measurements | Table::Nce | Table::Tnce | Table::TnceD4 => {
-            not(verdicts.rejection_function().call(vec![col("run_id"), col("pair_id")]))
+            not(verdicts.listed.rejection_expr(col("run_id"), col("pair_id")))
         }
         Table::Runs | Table::SurfaceStats => {
             let runs = snapshot.runs().filter(|run| rejected.is_run_rejected(run.run.as_str()));

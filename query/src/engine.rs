@@ -5,9 +5,8 @@ mod process;
 use std::sync::Arc;
 use std::time::Duration;
 
-use datafusion::catalog::{CatalogProvider as _, CatalogProviderList as _};
-use datafusion::catalog::{MemoryCatalogProvider, MemoryCatalogProviderList, MemorySchemaProvider};
-use datafusion::execution::session_state::{SessionState, SessionStateBuilder};
+use datafusion::catalog::{CatalogProviderList as _, MemoryCatalogProvider, MemoryCatalogProviderList};
+use datafusion::execution::session_state::SessionState;
 use datafusion::logical_expr::Documentation;
 use datafusion::prelude::SessionContext;
 use echolake_lake::Lake;
@@ -18,7 +17,6 @@ use crate::catalog::LakeCatalog;
 use crate::client::QueryQuota;
 use crate::control::blame::StatementBlame;
 use crate::control::{QueryTicket, StopReason};
-use crate::system;
 use crate::{Error, OpaqueValue};
 use process::EngineProcess;
 
@@ -242,17 +240,11 @@ impl QueryEngine {
     // One new context per query: its tables are of one snapshot, and nothing a query does outlives it. Functions and
     // optimizer rules are those of the template.
     pub(crate) fn create_context(&self) -> SessionContext {
-        let names = &self.process.template.config_options().catalog;
-        let catalog = MemoryCatalogProvider::new();
-        // A new catalogue accepts any name.
-        for schema in [&names.default_schema, system::SYSTEM_SCHEMA] {
-            let _ = catalog.register_schema(schema, Arc::new(MemorySchemaProvider::new()));
-        }
+        let mut state = self.process.template.clone();
         let catalogs = MemoryCatalogProviderList::new();
-        catalogs.register_catalog(names.default_catalog.clone(), Arc::new(catalog));
-        let state = SessionStateBuilder::new_from_existing(self.process.template.clone())
-            .with_catalog_list(Arc::new(catalogs))
-            .build();
+        let name = state.config_options().catalog.default_catalog.clone();
+        catalogs.register_catalog(name, Arc::new(MemoryCatalogProvider::new()));
+        state.register_catalog_list(Arc::new(catalogs));
         SessionContext::new_with_state(state)
     }
 }

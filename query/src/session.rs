@@ -390,11 +390,13 @@ impl Session {
         let context = self.task_context(&state, &ticket);
         let text = prepared.sql.clone();
         let is_optimized = prepared.is_optimized;
+        let engine = self.engine.clone();
         let planned = async move {
             let planned = match is_optimized {
                 true => state.query_planner().create_physical_plan(&plan, &*state).await,
                 false => state.create_physical_plan(&plan).await,
             };
+            let planned = planned.and_then(|plan| engine.catalog().rewrite_local_scans(plan));
             planned.map_err(|error| Error::from_optimizing(&text, &error))
         };
         let plan = self.engine.on_seat(&ticket, planned).await?;
@@ -538,6 +540,9 @@ mod escape_tests;
 
 #[cfg(test)]
 pub(crate) mod function_tests;
+
+#[cfg(test)]
+mod plan_tests;
 
 #[cfg(test)]
 mod request_tests;

@@ -31,7 +31,7 @@ pub use standard::number_ranges::whole_number_ranges;
 pub use standard::octet_length::octet_length_of_bytes;
 pub use standard::text_concatenation::text_concatenation;
 pub use standard::time_patterns::pattern_functions;
-pub use standard::unified_floats::{FloatForm, UnifiedFloat};
+pub use standard::unified_floats::{FloatForm, UnifiedFloat, unified_floats};
 pub use standard::zone_times::{AT_TIME_ZONE, zone_time};
 
 /// All functions of a lake, made once for all its sessions.

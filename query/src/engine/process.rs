@@ -117,7 +117,7 @@ impl EngineProcess {
             reader: self.reader.clone(),
             footer_bytes: lake.is_remote().then_some(REMOTE_FOOTER_BYTES),
             small: Arc::new(SmallTables::new(lake)),
-            restricted: lake.is_restricted().then(|| lake.clone()),
+            is_restricted: lake.is_restricted(),
         };
         LakeCatalog::new(lake, self.lookups.clone(), source)
     }

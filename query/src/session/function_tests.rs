@@ -25,6 +25,7 @@ const BANDS: [&str; 5] = ["2500", "5000", "10000", "20000", "40000"];
 /// A lake with two runs in it, made of the golden cases: surface `0015_0`, and its Flat.
 pub(crate) struct SmallLake {
     _folder: tempfile::TempDir,
+    pub lake: Lake,
     session: Session,
     golden: Vec<RecordBatch>,
 }
@@ -38,7 +39,7 @@ impl SmallLake {
         put(&lake, "0015_0", &golden, "panel_ir", "reflected_ir").await;
         put(&lake, "flat", &golden, "flat_ir", "flat_reflected_ir").await;
         let session = Session::new(&lake).expect("a session");
-        Self { _folder: folder, session, golden }
+        Self { _folder: folder, lake, session, golden }
     }
 
     pub async fn batches(&self, sql: &str) -> Result<Vec<RecordBatch>, Error> {
@@ -175,7 +176,7 @@ fn example(documentation: &datafusion::logical_expr::Documentation) -> (String, 
 }
 
 // The documented examples: the function's name, the query and its answer.
-fn examples() -> Vec<(String, String, String)> {
+pub(super) fn examples() -> Vec<(String, String, String)> {
     let functions = FunctionSet::all(&Rig::paper()).expect("the built-in rig is valid");
     let scalar = functions.scalar().iter().map(|f| (f.name(), f.documentation()));
     let all = scalar.chain(functions.aggregate().iter().map(|f| (f.name(), f.documentation())));

@@ -15,14 +15,14 @@ use expect_test::{Expect, expect};
 use super::*;
 use crate::PredicateForm;
 
-async fn lake() -> (tempfile::TempDir, Lake) {
+pub(super) async fn lake() -> (tempfile::TempDir, Lake) {
     let folder = tempfile::tempdir().expect("a folder");
     let url = folder.path().join("lake").display().to_string();
     let lake = Lake::open_or_create(&url, &Rig::paper(), &ReferenceSurfaces::default()).await.expect("a lake");
     (folder, lake)
 }
 
-async fn rows(session: &Session, sql: &str) -> Vec<RecordBatch> {
+pub(super) async fn rows(session: &Session, sql: &str) -> Vec<RecordBatch> {
     let mut answer = session.query(sql).await.unwrap_or_else(|e| panic!("{sql}: {e}"));
     let mut batches = Vec::new();
     while let Some(batch) = answer.next().await.unwrap_or_else(|e| panic!("{sql}: {e}")) {

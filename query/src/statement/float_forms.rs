@@ -226,8 +226,8 @@ impl FloatScope {
     }
 
     fn float_type(&self, expr: &Expr) -> Option<DataType> {
-        let kind = match unified_float(expr) {
-            Some(unified) => unified.float_type().clone(),
+        let kind = match unified_float(expr).and_then(UnifiedFloat::float_type) {
+            Some(kind) => kind.clone(),
             // A type that is not known yet is an error when the statement runs.
             None => expr.get_type(&self.schema).ok()?,
         };

@@ -104,16 +104,22 @@ fn check_negation(operand: Box<Expr>, schema: &DFSchema) -> Result<Transformed<E
 }
 
 fn checked_call(operator: Operator, kind: DataType, operands: [Expr; 2]) -> Expr {
-    let function = CheckedOperator { operator, kind, signature: Signature::any(2, Volatility::Immutable) };
-    Expr::ScalarFunction(ScalarFunction::new_udf(ScalarUDF::new_from_impl(function).into(), operands.into()))
+    let function = CheckedOperator::new_function(operator, Some(kind));
+    Expr::ScalarFunction(ScalarFunction::new_udf(function.into(), operands.into()))
+}
+
+/// Returns the functions for integers of any type, by whose names a plan of another process is understood.
+pub(crate) fn checked_operators() -> [ScalarUDF; 3] {
+    [Operator::Plus, Operator::Minus, Operator::Multiply].map(|operator| CheckedOperator::new_function(operator, None))
 }
 
 // The type of a long sum is not asked for from its beginning at each of its parts.
 fn operand_type(expr: &Expr, schema: &DFSchema) -> Result<DataType> {
     if let Expr::ScalarFunction(function) = expr
         && let Some(checked) = function.func.inner().downcast_ref::<CheckedOperator>()
+        && let Some(kind) = &checked.kind
     {
-        return Ok(checked.kind.clone());
+        return Ok(kind.clone());
     }
     expr.get_type(schema)
 }
@@ -122,8 +128,15 @@ fn operand_type(expr: &Expr, schema: &DFSchema) -> Result<DataType> {
 #[derive(Debug, PartialEq, Eq, Hash)]
 struct CheckedOperator {
     operator: Operator,
-    kind: DataType,
+    /// Type of its operands and result, if it is known beforehand.
+    kind: Option<DataType>,
     signature: Signature,
+}
+
+impl CheckedOperator {
+    fn new_function(operator: Operator, kind: Option<DataType>) -> ScalarUDF {
+        ScalarUDF::new_from_impl(Self { operator, kind, signature: Signature::any(2, Volatility::Immutable) })
+    }
 }
 
 impl ScalarUDFImpl for CheckedOperator {
@@ -144,14 +157,16 @@ impl ScalarUDFImpl for CheckedOperator {
         &self.signature
     }
 
-    fn return_type(&self, _: &[DataType]) -> Result<DataType> {
-        Ok(self.kind.clone())
+    fn return_type(&self, types: &[DataType]) -> Result<DataType> {
+        let [left, _] = take_function_args(self.name(), types)?;
+        Ok(self.kind.as_ref().unwrap_or(left).clone())
     }
 
     // As the operator's: a union that has it declares no nulls that are not there.
     fn return_field_from_args(&self, args: ReturnFieldArgs) -> Result<FieldRef> {
-        let is_nullable = args.arg_fields.iter().any(|field| field.is_nullable());
-        Ok(Arc::new(Field::new(self.name(), self.kind.clone(), is_nullable)))
+        let [left, right] = take_function_args(self.name(), args.arg_fields)?;
+        let kind = self.kind.as_ref().unwrap_or(left.data_type());
+        Ok(Arc::new(Field::new(self.name(), kind.clone(), left.is_nullable() || right.is_nullable())))
     }
 
     fn is_strict(&self) -> bool {

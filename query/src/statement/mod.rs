@@ -52,7 +52,7 @@ pub use bounds::check_statement_bounds;
 pub(crate) use cast_place::find_cast;
 pub(crate) use ending_rules::EndingRule;
 pub(crate) use float_forms::FloatForms;
-pub(crate) use integer_arithmetic::IntegerArithmetic;
+pub(crate) use integer_arithmetic::{IntegerArithmetic, checked_operators};
 pub(crate) use limited_operators::LimitedOperators;
 pub use predicate::PredicateForm;
 pub(crate) use predicate::append_predicate;

@@ -13,6 +13,7 @@ use datafusion::datasource::TableProvider;
 use datafusion::error::{DataFusionError, Result};
 use datafusion::physical_plan::collect;
 use echolake_lake::{Lake, LakeSnapshot};
+use echolake_lake_tables::{FileReaders, rewrite_local_scans};
 use echolake_schema::tables::Table;
 
 use super::{SystemRows, build_batch, build_schema, column_field, time_type};
@@ -26,6 +27,7 @@ pub(super) struct LakeIngests {
     pub lake: Lake,
     pub snapshot: Arc<LakeSnapshot>,
     pub runs: Arc<dyn TableProvider>,
+    pub readers: FileReaders,
 }
 
 /// The columns of the table, by those of `runs`.
@@ -55,6 +57,7 @@ impl SystemRows for LakeIngests {
         let columns = OF_RUNS.iter().map(|name| Ok(runs.index_of(name)?)).collect::<Result<Vec<_>>>()?;
         let plan = self.runs.scan(session, Some(&columns), &[], None).await?;
         let schema = plan.schema();
+        let plan = rewrite_local_scans(plan, &self.readers)?;
         let rows = concat_batches(&schema, &collect(plan, session.task_ctx()).await?)?;
         let failed = |e: echolake_lake::Error| DataFusionError::External(Box::new(e));
         let times = self.lake.commit_log().list_versions(Table::Runs).await.map_err(failed)?;

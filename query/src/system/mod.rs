@@ -22,6 +22,7 @@ use datafusion::error::Result;
 use datafusion::logical_expr::Expr;
 use datafusion::physical_plan::ExecutionPlan;
 use echolake_lake::{Lake, LakeSnapshot};
+use echolake_lake_tables::FileReaders;
 use echolake_schema::tables::{COMMENT, UNIT};
 
 use files::LakeFiles;
@@ -70,18 +71,20 @@ impl TableProvider for SystemTable {
     }
 }
 
-/// The tables of one snapshot; `runs` is its table of that name.
+/// The tables of one snapshot; `runs` is its table of that name, whose files `readers` read.
 pub(crate) fn lake_tables(
     lake: &Lake,
     snapshot: &Arc<LakeSnapshot>,
     runs: Arc<dyn TableProvider>,
+    readers: &FileReaders,
 ) -> [(&'static str, Arc<dyn TableProvider>); 4] {
+    let ingests = LakeIngests { lake: lake.clone(), snapshot: snapshot.clone(), runs, readers: readers.clone() };
     let table = |rows: Box<dyn SystemRows>| Arc::new(SystemTable(rows)) as Arc<dyn TableProvider>;
     [
         ("versions", table(Box::new(LakeVersions { lake: lake.clone() }))),
         ("files", table(Box::new(LakeFiles { snapshot: snapshot.clone() }))),
         ("inbox", table(Box::new(LakeInbox { lake: lake.clone() }))),
-        ("ingests", table(Box::new(LakeIngests { lake: lake.clone(), snapshot: snapshot.clone(), runs }))),
+        ("ingests", table(Box::new(ingests))),
     ]
 }
 

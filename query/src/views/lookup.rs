@@ -58,6 +58,11 @@ impl LookupFunctions {
         self.0.iter().find(|function| function.name().strip_prefix(OF_PAIR) == Some(column))
     }
 
+    /// Returns the functions.
+    pub fn functions(&self) -> &[Arc<ScalarUDF>] {
+        &self.0
+    }
+
     pub fn register_functions(&self, context: &SessionContext) {
         for function in &self.0 {
             context.register_udf(function.as_ref().clone());

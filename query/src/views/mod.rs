@@ -26,6 +26,7 @@ use datafusion::datasource::{TableProvider, ViewTable};
 use datafusion::error::{DataFusionError, Result};
 use datafusion::logical_expr::{LogicalPlan, LogicalPlanBuilder};
 use datafusion::prelude::{SessionContext, ident};
+use echolake_functions::exact_aggregates;
 use echolake_lake::Lake;
 use echolake_schema::tables::{COMMENT, Table, UNIT};
 use futures::FutureExt as _;
@@ -175,6 +176,8 @@ impl LakeView {
             context.register_table(table.name(), provider.clone())?;
         }
         lookups.register_functions(&context);
+        // Aggregates are those of statements, as which a plan of another process understands their names.
+        exact_aggregates().into_iter().for_each(|function| context.register_udaf(function));
         let sql = self.definition_sql(lake);
         // Planning only needs tables in memory, so it does not wait.
         let plan = context.state().create_logical_plan(&sql).now_or_never().ok_or_else(|| {
@@ -211,4 +214,4 @@ fn notes_of(table: Table, lake: &Lake) -> ColumnNotes {
 }
 
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;

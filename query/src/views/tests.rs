@@ -57,7 +57,7 @@ fn column(table: Table, field: &Field, surface: &str, run: &str) -> ArrayRef {
 }
 
 /// Adds a run to a lake, as ingest does.
-async fn put(lake: &Lake, surface: &str, run: &str) {
+pub(crate) async fn put(lake: &Lake, surface: &str, run: &str) {
     let pointer = VisibleRun {
         surface: surface.parse().expect("an id"),
         run: run.parse().expect("an id"),

@@ -1,22 +1,23 @@
-//! A table of the lake for DataFusion: a plain Parquet scan over the files of one snapshot.
+//! A table of the lake for DataFusion: a plain Parquet scan over the files of one snapshot, which any process with the
+//! same lake can run.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::SystemTime;
 
 use arrow::datatypes::{DataType, SchemaRef};
-use arrow::record_batch::RecordBatch;
 use datafusion::catalog::{Session, TableProvider};
 use datafusion::common::pruning::PrunableStatistics;
 use datafusion::common::stats::Precision;
 use datafusion::common::{DFSchema, ScalarValue, Statistics};
 use datafusion::datasource::TableType;
 use datafusion::datasource::listing::PartitionedFile;
-use datafusion::datasource::memory::MemorySourceConfig;
+use datafusion::datasource::physical_plan::parquet::ParquetRowSelection;
 use datafusion::datasource::physical_plan::{
-    FileGroup, FileScanConfigBuilder, FileSource, ParquetFileReaderFactory, ParquetSource,
+    FileGroup, FileScanConfigBuilder, ParquetFileReaderFactory, ParquetSource,
 };
 use datafusion::datasource::source::DataSourceExec;
+use datafusion::datasource::table_schema::TableSchema;
 use datafusion::error::{DataFusionError, Result};
 use datafusion::execution::object_store::ObjectStoreUrl;
 use datafusion::logical_expr::utils::conjunction;
@@ -28,18 +29,17 @@ use datafusion::physical_plan::ExecutionPlan;
 use datafusion::physical_plan::empty::EmptyExec;
 use datafusion::physical_plan::filter::{FilterExec, FilterExecBuilder};
 use datafusion::physical_plan::union::UnionExec;
-use echolake_lake::{DataFile, FileName, Lake, LakeSnapshot, VisibleRun};
+use echolake_lake::{DataFile, FileName, LakeSnapshot, VisibleRun};
 use echolake_schema::tables::Table;
 use echolake_schema::{RunId, SurfaceId};
 use futures::FutureExt as _;
 use futures::future::BoxFuture;
 use object_store::ObjectMeta;
-use tokio::sync::OnceCell;
+use parquet::arrow::arrow_reader::{RowSelection, RowSelector};
 
 use crate::boxed_scan;
-use crate::part_rows::visible_rows_scan;
+use crate::held_table::HeldTable;
 use crate::small_tables::SmallTables;
-use crate::unfiltered_source::UnfilteredSource;
 
 /// Delta writers truncate texts in statistics to 32 characters; a shorter text is complete.
 const WHOLE_TEXT: usize = 32;
@@ -50,8 +50,6 @@ const SURFACE: &str = "surface_id";
 const FEW: usize = 8;
 /// Rows per batch of a scan without lists: the engine's kernels are fastest with it.
 const NARROW_BATCH_ROWS: usize = 8192;
-/// Rows below which a file without wanted lists is read as a whole, whatever filters there are.
-const SMALL_FILE_ROWS: u64 = 65_536;
 
 /// Files of one table in one snapshot.
 #[derive(Debug)]
@@ -62,8 +60,8 @@ pub struct LakeTable {
     files: Vec<ScanFile>,
     all: Statistics,
     source: FileReaders,
-    /// The cached columns of all rows, if the table is small and was queried.
-    rows: OnceCell<RecordBatch>,
+    /// What the process holds of its rows, if the table is small.
+    held: Option<Arc<HeldTable>>,
     /// The snapshot, if it has a fault in this table: it is refused.
     faulty: Option<Arc<LakeSnapshot>>,
 }
@@ -87,9 +85,20 @@ pub struct FileReaders {
     pub footer_bytes: Option<usize>,
     /// Caches the rows of small tables.
     pub small: Arc<SmallTables>,
-    /// The lake as its reader sees it, if files may hold rows that are none of its business: of such files, only the
-    /// rows that it may see are read.
-    pub restricted: Option<Lake>,
+    /// True if files may hold rows that are none of the reader's business: plans name what it may see of such files, and
+    /// neither what it may not see nor how much that is.
+    pub is_restricted: bool,
+}
+
+impl FileReaders {
+    /// Makes a source of Parquet files with these columns.
+    pub(crate) fn parquet_source(&self, schema: impl Into<TableSchema>) -> ParquetSource {
+        let source = ParquetSource::new(schema).with_parquet_file_reader_factory(self.reader.clone());
+        match self.footer_bytes {
+            Some(bytes) => source.with_metadata_size_hint(bytes),
+            None => source,
+        }
+    }
 }
 
 impl LakeTable {
@@ -99,10 +108,11 @@ impl LakeTable {
     /// If the schema names a column twice.
     pub fn new(table: Table, schema: SchemaRef, files: Vec<DataFile>, source: FileReaders) -> Result<Self> {
         let columns = DFSchema::try_from(schema.clone())?;
-        let is_restricted = source.restricted.is_some();
-        let files: Vec<_> = files.into_iter().map(|file| ScanFile::new(file, &schema, is_restricted)).collect();
+        let held = HeldTable::from_files(table, &schema, &files)?.map(Arc::new);
+        held.iter().for_each(|held| source.small.add_table(held));
+        let files: Vec<_> = files.into_iter().map(|file| ScanFile::new(file, &schema, source.is_restricted)).collect();
         let all = Statistics::try_merge_iter(files.iter().map(|f| f.known.as_ref()), &schema)?;
-        Ok(Self { table, schema, columns, files, all, source, rows: OnceCell::new(), faulty: None })
+        Ok(Self { table, schema, columns, files, all, source, held, faulty: None })
     }
 
     /// Makes it the table of this snapshot, which is refused if the snapshot has a fault in it.
@@ -140,53 +150,35 @@ impl LakeTable {
         Ok(files.into_iter().zip(may).filter(|(_, may)| *may).map(|(file, _)| file).collect())
     }
 
-    // A plain scan of files, in groups of about the same size; DataFusion splits files further if that pays.
+    // A plain scan of files, in groups of about the same size; DataFusion splits files further if that pays. The scan
+    // itself applies the predicate, before any other.
     fn scan_files(
         &self,
         files: &[&ScanFile],
         state: &dyn Session,
         projection: Option<Vec<usize>>,
         limit: Option<usize>,
+        predicate: Option<Arc<dyn PhysicalExpr>>,
     ) -> Result<Arc<dyn ExecutionPlan>> {
         let lists = self.reads_lists(projection.as_ref());
-        let mut source = ParquetSource::new(self.schema.clone())
+        let mut source = self
+            .source
+            .parquet_source(self.schema.clone())
             .with_table_parquet_options(state.table_options().parquet.clone())
-            .with_parquet_file_reader_factory(self.source.reader.clone())
-            .with_pushdown_filters(lists);
-        if let Some(bytes) = self.source.footer_bytes {
-            source = source.with_metadata_size_hint(bytes);
+            .with_pushdown_filters(lists || predicate.is_some());
+        if let Some(predicate) = predicate {
+            source = source.with_predicate(predicate);
         }
-        let rows: u64 = files.iter().map(|file| file.file.rows).sum();
-        let source: Arc<dyn FileSource> = match !lists && rows < files.len() as u64 * SMALL_FILE_ROWS {
-            true => Arc::new(UnfilteredSource(Arc::new(source))),
-            false => Arc::new(source),
-        };
-        let config = FileScanConfigBuilder::new(self.source.url.clone(), source)
-            .with_file_groups(file_groups(files, state.config().target_partitions()))
+        // More partitions than one would cost a small table more than it takes to read it.
+        let groups = if self.held.is_some() { 1 } else { state.config().target_partitions() };
+        let config = FileScanConfigBuilder::new(self.source.url.clone(), Arc::new(source))
+            .with_file_groups(file_groups(files, groups))
             .with_statistics(self.known_statistics(files)?)
             .with_batch_size((!lists).then_some(NARROW_BATCH_ROWS))
             .with_projection_indices(projection)?
             .with_limit(limit)
             .build();
         Ok(DataSourceExec::from_data_source(config))
-    }
-
-    // The columns in memory, if the table is small and the wanted ones are among them: each one's place in the cache.
-    async fn cached_rows(&self, projection: Option<&Vec<usize>>) -> Result<Option<(RecordBatch, Vec<usize>)>> {
-        let files = || self.files.iter().map(|f| &f.file);
-        let Some(columns) = SmallTables::cached_columns(self.table, &self.schema, files()) else { return Ok(None) };
-        let place = |column: usize| columns.iter().position(|cached| *cached == column);
-        let wanted = match projection {
-            Some(wanted) => wanted.iter().map(|column| place(*column)).collect(),
-            None => (0..self.schema.fields().len()).map(place).collect::<Option<Vec<_>>>(),
-        };
-        let Some(wanted) = wanted else { return Ok(None) };
-        let read = async || {
-            let schema = Arc::new(self.schema.project(&columns)?);
-            self.source.small.read_rows(self.table, &schema, &files().collect::<Vec<_>>()).await
-        };
-        let rows = self.rows.get_or_try_init(read).await?;
-        Ok(Some((rows.clone(), wanted)))
     }
 
     fn known_statistics(&self, files: &[&ScanFile]) -> Result<Statistics> {
@@ -201,28 +193,28 @@ impl LakeTable {
         Ok(known)
     }
 
-    // A scan of merged files without the rows of runs that have been replaced since. The limit counts the remaining
-    // rows, so it is not passed to the scan.
+    // A scan of merged files without the rows of runs that have been replaced since, or are of other projects. The limit
+    // counts the remaining rows, so it is not passed to the scan.
     fn partly_hidden(
         &self,
-        files: &[&ScanFile],
+        parts: &PartlyHidden<'_>,
         state: &dyn Session,
         projection: Option<&Vec<usize>>,
     ) -> Result<Arc<dyn ExecutionPlan>> {
-        if let Some(lake) = &self.source.restricted {
-            let files = files.iter().map(|file| file.file.clone());
-            return visible_rows_scan(lake, self.table, &self.schema, files, projection);
+        let run = self.schema.index_of(RUN)?;
+        if self.source.is_restricted {
+            let shown: Vec<Arc<dyn PhysicalExpr>> = parts.shown.iter().map(|run| lit(*run)).collect();
+            let shown = in_list(Arc::new(Column::new(RUN, run)), shown, &false, &self.schema)?;
+            return self.scan_files(&parts.files, state, projection.cloned(), None, Some(shown));
         }
         let mut columns = projection.cloned().unwrap_or_else(|| (0..self.schema.fields().len()).collect());
         let wanted: Vec<_> = (0..columns.len()).collect();
-        let run = self.schema.index_of(RUN)?;
         let at = columns.iter().position(|c| *c == run).unwrap_or_else(|| {
             columns.push(run);
             columns.len() - 1
         });
-        let scan = self.scan_files(files, state, Some(columns), None)?;
-        let hidden: BTreeSet<_> = files.iter().flat_map(|f| f.file.hidden.iter().map(|r| r.as_str())).collect();
-        let hidden: Vec<Arc<dyn PhysicalExpr>> = hidden.into_iter().map(lit).collect();
+        let scan = self.scan_files(&parts.files, state, Some(columns), None, None)?;
+        let hidden: Vec<Arc<dyn PhysicalExpr>> = parts.hidden.iter().map(|run| lit(*run)).collect();
         let shown = in_list(Arc::new(Column::new(RUN, at)), hidden, &true, &scan.schema())?;
         let filter: FilterExec = FilterExecBuilder::new(shown, scan).apply_projection(Some(wanted))?.build()?;
         Ok(Arc::new(filter))
@@ -249,12 +241,61 @@ impl ScanFile {
             e_tag: None,
             version: None,
         };
-        // A restricted lake's scan does not read hidden rows; other scans filter them out.
-        let only_visible = is_restricted && !file.hidden.is_empty();
-        let known = Arc::new(if only_visible { known_of_parts(&file, schema) } else { file_statistics(&file, schema) });
-        let part = PartitionedFile::new_from_meta(meta).with_statistics(known.clone());
-        Self { file, part, known }
+        let part = PartitionedFile::new_from_meta(meta);
+        if !is_restricted || file.hidden.is_empty() {
+            let known = Arc::new(file_statistics(&file, schema));
+            let part = part.with_statistics(known.clone());
+            return Self { file, part, known };
+        }
+        // The scan's predicate leaves out the hidden rows. Here they are not even read, so that no other predicate meets
+        // them and nothing counts them. The selection does not cross the wire. Exact statistics would be taken for
+        // those of all rows: a column with one value is not read.
+        let known = known_of_parts(&file, schema);
+        let part = part.with_statistics(Arc::new(known.clone().to_inexact()));
+        let part = part.with_extension(ParquetRowSelection::from(visible_selection(&file)));
+        Self { file, part, known: Arc::new(known) }
     }
+}
+
+/// Merged files that one filter on runs can read: none of them shows a run that another one hides.
+#[derive(Default)]
+struct PartlyHidden<'a> {
+    files: Vec<&'a ScanFile>,
+    shown: BTreeSet<&'a str>,
+    hidden: BTreeSet<&'a str>,
+}
+
+impl<'a> PartlyHidden<'a> {
+    // As few as possible: mostly one.
+    fn from_files(files: Vec<&'a ScanFile>) -> Vec<Self> {
+        let mut all: Vec<Self> = Vec::new();
+        for file in files {
+            let shown: BTreeSet<_> = file.file.visible_parts().map(|(part, _)| part.run.as_str()).collect();
+            let hidden: BTreeSet<_> = file.file.hidden.iter().map(|run| run.as_str()).collect();
+            let fits = |parts: &Self| parts.shown.is_disjoint(&hidden) && parts.hidden.is_disjoint(&shown);
+            let place = all.iter().position(fits).unwrap_or_else(|| {
+                all.push(Self::default());
+                all.len() - 1
+            });
+            let parts = &mut all[place];
+            parts.files.push(file);
+            parts.shown.extend(shown);
+            parts.hidden.extend(hidden);
+        }
+        all
+    }
+}
+
+fn visible_selection(file: &DataFile) -> RowSelection {
+    let mut selectors = Vec::new();
+    let mut end = 0;
+    for range in file.visible_ranges() {
+        selectors.push(RowSelector::skip(range.start.saturating_sub(end) as usize));
+        selectors.push(RowSelector::select(range.end.saturating_sub(range.start) as usize));
+        end = range.end;
+    }
+    selectors.push(RowSelector::skip(file.rows.saturating_sub(end) as usize));
+    RowSelection::from(selectors)
 }
 
 // Statistics of a file from the log, so that a query for one surface does not open the files of others.
@@ -391,14 +432,7 @@ impl LakeTable {
             if let Some(snapshot) = &self.faulty {
                 snapshot.check_table(self.table).map_err(|fault| DataFusionError::External(fault.into()))?;
             }
-            match self.cached_rows(projection).await? {
-                Some((rows, wanted)) => {
-                    let schema = rows.schema();
-                    let rows = MemorySourceConfig::try_new_exec(&[vec![rows]], schema, Some(wanted))?;
-                    Ok(rows as Arc<dyn ExecutionPlan>)
-                }
-                None => self.files_rows(state, projection, filters, limit),
-            }
+            self.files_rows(state, projection, filters, limit)
         };
         rows.boxed()
     }
@@ -413,20 +447,80 @@ impl LakeTable {
     ) -> Result<Arc<dyn ExecutionPlan>> {
         let kept = self.kept_files(state, filters)?;
         let (whole, partial): (Vec<_>, Vec<_>) = kept.into_iter().partition(|f| f.file.hidden.is_empty());
-        match (whole.is_empty(), partial.is_empty()) {
-            (true, true) => {
+        let mut scans = Vec::new();
+        if !whole.is_empty() {
+            scans.push(self.scan_files(&whole, state, projection.cloned(), limit, None)?);
+        }
+        for parts in PartlyHidden::from_files(partial) {
+            scans.push(self.partly_hidden(&parts, state, projection)?);
+        }
+        match scans.len() {
+            0 => {
                 let schema = match projection {
                     Some(columns) => Arc::new(self.schema.project(columns)?),
                     None => self.schema.clone(),
                 };
                 Ok(Arc::new(EmptyExec::new(schema)))
             }
-            (false, true) => self.scan_files(&whole, state, projection.cloned(), limit),
-            (true, false) => self.partly_hidden(&partial, state, projection),
-            (false, false) => UnionExec::try_new(vec![
-                self.scan_files(&whole, state, projection.cloned(), limit)?,
-                self.partly_hidden(&partial, state, projection)?,
-            ]),
+            1 => Ok(scans.remove(0)),
+            _ => UnionExec::try_new(scans),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use echolake_lake::RunPart;
+    use object_store::path::Path;
+
+    use super::*;
+
+    // A file of one row for each of these runs.
+    fn merged_file(runs: &[&str], hidden: &[&str]) -> ScanFile {
+        let id = |run: &&str| -> RunId { run.parse().expect("an id") };
+        let part = |run: &&str| RunPart {
+            surface: "flat".parse().expect("an id"),
+            run: id(run),
+            derivation: "ab".to_owned(),
+            rows: 1,
+            row_version: None,
+            row_counts: None,
+        };
+        let file = DataFile {
+            path: Path::from("tables/events/merged.ab.parquet"),
+            bytes: 1,
+            rows: runs.len() as u64,
+            log_version: 0,
+            seen_runs: 0,
+            stats: None,
+            parts: runs.iter().map(part).collect(),
+            hidden: hidden.iter().map(id).collect(),
+            row_counts: None,
+        };
+        ScanFile::new(file, &Arc::new(arrow::datatypes::Schema::empty()), true)
+    }
+
+    #[test]
+    fn one_filter_reads_files_that_agree_on_what_is_hidden() {
+        let files = [
+            merged_file(&["a", "b", "c"], &["b"]),
+            merged_file(&["d", "e"], &["e"]),
+            merged_file(&["b", "f"], &["f"]),
+            merged_file(&["g", "b"], &["b"]),
+        ];
+        let groups = PartlyHidden::from_files(files.iter().collect());
+        let runs: Vec<_> = groups.iter().map(|parts| parts.shown.iter().copied().collect::<String>()).collect();
+        assert_eq!(runs, ["acdg", "b"]);
+        assert_eq!(groups.iter().map(|parts| parts.files.len()).collect::<Vec<_>>(), [3, 1]);
+    }
+
+    #[test]
+    fn hidden_rows_are_neither_selected_nor_known() {
+        let file = merged_file(&["a", "b", "c", "d"], &["a", "c"]);
+        let selectors: Vec<RowSelector> = visible_selection(&file.file).into();
+        let rows: Vec<_> = selectors.iter().map(|s| (s.skip, s.row_count)).collect();
+        assert_eq!(rows, [(true, 1), (false, 1), (true, 1), (false, 1)]);
+        assert!(file.part.extension::<ParquetRowSelection>().is_some());
+        assert_eq!(file.part.statistics.expect("known").num_rows, Precision::Inexact(2));
     }
 }

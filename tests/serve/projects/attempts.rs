@@ -31,14 +31,11 @@ const TABLES: [&str; 14] = [
     "catalogue",
 ];
 
-/// Tables whose plans name files: others are in memory.
-const SCANNED: [&str; 5] = ["measurements", "nce", "heightmaps", "ir", "augmented"];
-
 /// All statements; `version` is a version of the lake that has the hidden run.
 pub(super) fn statements(hidden: &HiddenRun, version: u64) -> Vec<ProjectAttempt> {
     let exact = TABLES.iter().flat_map(|table| of_table(table, hidden)).chain(across_tables(hidden));
     let exact = exact.map(|sql| ProjectAttempt { sql, is_exact: true });
-    let plans = SCANNED.iter().flat_map(|table| plans(table, hidden)).chain(system(hidden));
+    let plans = TABLES.iter().flat_map(|table| plans(table, hidden)).chain(system(hidden));
     let past = TABLES.iter().flat_map(|table| past(table, version));
     let others = plans.chain(past).chain(files(hidden)).map(|sql| ProjectAttempt { sql, is_exact: false });
     exact.chain(others).collect()

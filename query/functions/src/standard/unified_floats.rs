@@ -24,13 +24,24 @@ pub enum FloatForm {
 #[derive(Debug, PartialEq, Eq, Hash)]
 pub struct UnifiedFloat {
     form: FloatForm,
-    kind: DataType,
+    /// Type of its argument and result, if it is known beforehand: that of a long sum is not asked for from its
+    /// beginning at each of its parts.
+    kind: Option<DataType>,
     signature: Signature,
+}
+
+/// Returns the functions for floats of any type, by whose names a plan of another process is understood.
+pub fn unified_floats() -> [ScalarUDF; 2] {
+    [FloatForm::OneNan, FloatForm::OneZero].map(|form| UnifiedFloat::from_form(form, None))
 }
 
 impl UnifiedFloat {
     /// Returns the function for floats of a type.
     pub fn new_function(form: FloatForm, kind: DataType) -> ScalarUDF {
+        Self::from_form(form, Some(kind))
+    }
+
+    fn from_form(form: FloatForm, kind: Option<DataType>) -> ScalarUDF {
         ScalarUDF::new_from_impl(Self { form, kind, signature: Signature::any(1, Volatility::Immutable) })
     }
 
@@ -39,9 +50,9 @@ impl UnifiedFloat {
         self.form
     }
 
-    /// Returns the type of its argument and result.
-    pub fn float_type(&self) -> &DataType {
-        &self.kind
+    /// Returns the type of its argument and result, if it was made for one.
+    pub fn float_type(&self) -> Option<&DataType> {
+        self.kind.as_ref()
     }
 
     fn unify_array(&self, values: &ArrayRef) -> ArrayRef {
@@ -67,13 +78,15 @@ impl ScalarUDFImpl for UnifiedFloat {
         &self.signature
     }
 
-    fn return_type(&self, _: &[DataType]) -> Result<DataType> {
-        Ok(self.kind.clone())
+    fn return_type(&self, types: &[DataType]) -> Result<DataType> {
+        let [kind] = take_function_args(self.name(), types)?;
+        Ok(self.kind.as_ref().unwrap_or(kind).clone())
     }
 
     fn return_field_from_args(&self, args: ReturnFieldArgs) -> Result<FieldRef> {
-        let is_nullable = args.arg_fields.iter().any(|field| field.is_nullable());
-        Ok(Arc::new(Field::new(self.name(), self.kind.clone(), is_nullable)))
+        let [value] = take_function_args(self.name(), args.arg_fields)?;
+        let kind = self.kind.as_ref().unwrap_or(value.data_type());
+        Ok(Arc::new(Field::new(self.name(), kind.clone(), value.is_nullable())))
     }
 
     fn is_strict(&self) -> bool {

@@ -1,0 +1,346 @@
+//! Plans that another engine on the same lake runs: encoded, decoded, and run there as they are and with what it holds.
+
+use std::collections::BTreeSet;
+use std::sync::atomic::AtomicBool;
+
+use arrow::util::display::{ArrayFormatter, FormatOptions};
+use datafusion::datasource::physical_plan::{FileScanConfig, ParquetSource};
+use datafusion::datasource::source::DataSourceExec;
+use datafusion::logical_expr::{ColumnarValue, Volatility, create_udf};
+use datafusion::physical_plan::{collect, displayable};
+use datafusion::scalar::ScalarValue;
+use datafusion_proto::bytes::{
+    physical_plan_from_bytes_with_proto_converter, physical_plan_to_bytes_with_proto_converter,
+};
+use datafusion_proto::physical_plan::{
+    DeduplicatingProtoConverter, DefaultPhysicalExtensionCodec, DefaultPhysicalProtoConverter,
+    PhysicalProtoConverterExtension,
+};
+use echolake_lake::{ContributedFile, annotation_rows};
+use echolake_schema::annotations::{Annotation, AnnotationKind};
+use echolake_schema::tables::Table;
+
+use super::function_tests::{SmallLake, examples};
+use super::tests::{lake, put_events};
+use super::*;
+use crate::check_transport;
+use crate::views::LakeView;
+use crate::views::tests::put;
+
+/// Plans a query as a session does, without running it.
+async fn physical_plan(engine: &QueryEngine, sql: &str) -> Result<(SessionState, Arc<dyn ExecutionPlan>), Error> {
+    plan_in(&engine.create_context(), engine, sql).await
+}
+
+async fn plan_in(
+    context: &SessionContext,
+    engine: &QueryEngine,
+    sql: &str,
+) -> Result<(SessionState, Arc<dyn ExecutionPlan>), Error> {
+    let mut statement = parse_statement(sql, 50)?;
+    engine.catalog().register_tables(context, Vec::new(), &mut statement).await?;
+    let state = context.state();
+    let plan = prepare_statement(sql, statement, &state).await?;
+    let plan = state.create_physical_plan(&plan).await.map_err(|e| Error::from_optimizing(sql, &e))?;
+    Ok((state, plan))
+}
+
+/// The rows as texts, in the order of texts.
+async fn row_texts(plan: Arc<dyn ExecutionPlan>, state: &SessionState) -> Vec<String> {
+    let text = displayable(plan.as_ref()).indent(false).to_string();
+    let batches = collect(plan, state.task_ctx()).await.unwrap_or_else(|e| panic!("{e}: {text}"));
+    let options = FormatOptions::new().with_null("null");
+    let mut rows = Vec::new();
+    for batch in &batches {
+        let columns: Vec<_> =
+            batch.columns().iter().map(|c| ArrayFormatter::try_new(c, &options).expect("texts")).collect();
+        rows.extend(
+            (0..batch.num_rows())
+                .map(|row| columns.iter().map(|column| column.value(row).to_string()).collect::<Vec<_>>().join(" | ")),
+        );
+    }
+    rows.sort();
+    rows
+}
+
+// Sums of floats differ in their last digits with the order of rows.
+fn is_same_text(left: &str, right: &str) -> bool {
+    let parts = |text: &str| text.split([' ', ',', '[', ']', '{', '}']).map(str::to_owned).collect::<Vec<_>>();
+    let is_same = |left: &String, right: &String| {
+        let numbers = left.parse::<f64>().ok().zip(right.parse::<f64>().ok());
+        left == right || numbers.is_some_and(|(x, y)| (x - y).abs() <= 1e-6 * x.abs().max(y.abs()))
+    };
+    let (left, right) = (parts(left), parts(right));
+    left.len() == right.len() && left.iter().zip(&right).all(|(left, right)| is_same(left, right))
+}
+
+fn check_same(sql: &str, how: &str, expected: &[String], rows: &[String]) {
+    let is_same = expected.len() == rows.len() && expected.iter().zip(rows).all(|(a, b)| is_same_text(a, b));
+    assert!(is_same, "{how}: {sql}\n{expected:#?}\n{rows:#?}");
+}
+
+// As `datafusion-distributed` does; each with a codec that knows no nodes and no functions.
+fn sent_plan(plan: &Arc<dyn ExecutionPlan>, worker: &SessionState) -> Result<Arc<dyn ExecutionPlan>, DataFusionError> {
+    check_transport(plan, worker)?;
+    let codec = DefaultPhysicalExtensionCodec {};
+    let mut sent = None;
+    let converters: [&dyn PhysicalProtoConverterExtension; 2] =
+        [&DefaultPhysicalProtoConverter {}, &DeduplicatingProtoConverter::default()];
+    for converter in converters {
+        let bytes = physical_plan_to_bytes_with_proto_converter(plan.clone(), &codec, converter)?;
+        let task = worker.task_ctx();
+        sent = Some(physical_plan_from_bytes_with_proto_converter(&bytes, &task, &codec, converter)?);
+    }
+    Ok(sent.expect("two converters"))
+}
+
+/// Runs a query here and on the worker, with and without what they hold; returns its rows.
+async fn check_sent(engine: &QueryEngine, worker: &QueryEngine, sql: &str) -> Vec<String> {
+    let (state, plan) = physical_plan(engine, sql).await.unwrap_or_else(|e| panic!("{sql}: {e}"));
+    let at_worker = worker.worker_state();
+    let sent = sent_plan(&plan, &at_worker).unwrap_or_else(|e| panic!("{sql}: {e}"));
+    // A plan that has run keeps what it has learned of its rows, so each runs once.
+    let again = sent_plan(&plan, &at_worker).expect("sent as before");
+    let rows = row_texts(plan, &state).await;
+    let (state, plan) = physical_plan(engine, sql).await.expect("planned as before");
+    let local = engine.rewrite_local_scans(plan).expect("rewritten");
+    check_same(sql, "rewritten", &rows, &row_texts(local, &state).await);
+    let held = worker.rewrite_local_scans(again).expect("rewritten");
+    check_same(sql, "sent", &rows, &row_texts(sent, &at_worker).await);
+    check_same(sql, "sent and rewritten", &rows, &row_texts(held, &at_worker).await);
+    rows
+}
+
+// Whether all of a plan's tables are standard scans.
+fn check_standard(sql: &str, plan: &Arc<dyn ExecutionPlan>) {
+    if let Some(source) = plan.downcast_ref::<DataSourceExec>() {
+        let scan = source.data_source().downcast_ref::<FileScanConfig>();
+        let is_parquet = scan.is_some_and(|scan| scan.file_source().downcast_ref::<ParquetSource>().is_some());
+        assert!(is_parquet, "{sql}: {}", displayable(plan.as_ref()).indent(true));
+        assert_eq!(scan.map(|scan| scan.object_store_url.as_str()), Some("echolake://lake/"), "{sql}");
+    }
+    plan.children().into_iter().for_each(|child| check_standard(sql, child));
+}
+
+async fn reject(lake: &Lake, id: &str, run: &str, pairs: Option<Vec<u32>>, value: &str) {
+    let annotation = Annotation {
+        annotation_id: id.to_owned(),
+        run_id: run.parse().expect("an id"),
+        pair_ids: pairs,
+        kind: AnnotationKind::Verdict,
+        value: value.to_owned(),
+        comment: "because".to_owned(),
+        author: "ann".to_owned(),
+        time: std::time::SystemTime::UNIX_EPOCH.into(),
+        lake_version: None,
+    };
+    lake.prepare_contributions(Table::Annotations).await.expect("prepared");
+    let snapshot = lake.snapshot().await.expect("a view");
+    let seen = snapshot.log_version(Table::Annotations).expect("a log");
+    let rows = annotation_rows(lake, &snapshot, &[annotation]).expect("rows");
+    let files = ContributedFile::encode_rows(lake, Table::Annotations, &rows).expect("files");
+    lake.add_contribution(Table::Annotations, seen, files).await.expect("added").expect("the newest");
+}
+
+/// Queries with every kind of node and function that statements of clients have.
+const QUERIES: [&str; 35] = [
+    "select count(*) from pairs",
+    "select min(pair_id), max(direct_mm), sum(pair_id), avg(direct_mm) from pairs where incidence_deg < 30",
+    "select microphone, count(*) as n, sum(direct_mm) as d from pairs group by microphone having count(*) > 5",
+    "select p.pair_id, q.z_mm from pairs p join points q on q.point_id = p.speaker where p.pair_id < 40",
+    "select * from pairs order by direct_mm desc, pair_id limit 7",
+    "select pair_id, row_number() over (partition by speaker order by pair_id) as nth from pairs where pair_id < 99",
+    "select sum(pair_id) over (order by pair_id rows between 2 preceding and current row) from pairs where pair_id < 9",
+    "select pair_id + 1, pair_id - 2, pair_id * 3, -pair_id, pair_id / 2 from pairs where pair_id < 9",
+    "select sqrt(direct_mm), direct_mm * 0 / 0, nullif(direct_mm, -0.0) from pairs where pair_id < 9",
+    "select count(distinct direct_mm * 0) from pairs",
+    "select pair_id from pairs where pair_id = any([3, null, 7])",
+    "select pair_id in (1, 2), array_has([1, 2], pair_id) from pairs where pair_id < 4",
+    "select pair_id from pairs where pair_id not in (select point_id from points) order by 1 limit 3",
+    "select pair_id from pairs p where exists (select 1 from points q where q.point_id = p.pair_id) and pair_id > 60",
+    "select (select max(z_mm) from points) as most, pair_id from pairs where pair_id < 3",
+    "select pair_id from pairs where pair_id < 9 except select point_id from points where point_id < 4",
+    "select pair_id from pairs where pair_id < 3 union all select point_id from points where point_id < 3",
+    "select point_id from points intersect all select pair_id from pairs",
+    "select m.pair_id, p.incidence_deg from measurements m join pairs p using (pair_id)",
+    "select surface_id, pair_id, ir[1], list_energy(ir) from measurements where pair_id > 1",
+    "select surface_id, avg_list(reflected_ir) from nce group by surface_id",
+    "select surface_id, run_id, pair_id, incidence_deg from ir where pair_id = 1",
+    "select ir from ir order by surface_id, pair_id limit 1",
+    "select count(*) from augmented where symmetry = 'rot90'",
+    "select d4_pair_id, swapped, flat_ratio_total from augmented where pair_id = 2",
+    "select range(1, 4), generate_series(1, 3)",
+    "select octet_length('x'), to_char(to_timestamp('2026-01-05T08:00:00Z'), 'YYYY-MM-DD')",
+    "select timestamp '2026-01-05T08:00:00' at time zone 'Europe/Berlin', to_date('05.01.2026', 'DD.MM.YYYY')",
+    "select list(pair_id order by pair_id), approx_median(direct_mm), mode(speaker) from pairs where pair_id < 9",
+    "select arg_max(speaker, pair_id), first_value(pair_id order by direct_mm desc, pair_id) from pairs",
+    "select coalesce(null, surface_id), case surface_id when 'flat' then 1 else 2 end from runs",
+    "select unnest([1, 2, 3]) as x, {a: 1, b: 'x'} as s",
+    "select surface_id, is_rejected(run_id, pair_id) from measurements",
+    "select count(*) from measurements where is_rejected(run_id, pair_id)",
+    "select surface_id, count(*) from tnce_db group by rollup(surface_id)",
+];
+
+#[tokio::test(flavor = "multi_thread")]
+async fn plans_run_on_another_engine_of_the_lake() {
+    let (_folder, lake) = measured_lake().await;
+    let lake = &lake;
+    let engines = [(); 2].map(|()| QueryEngine::new(lake, None).expect("an engine"));
+    let [engine, worker] = &engines;
+    worker.catalog().current_snapshot().await.expect("its snapshot: what the worker holds follows from it");
+    let tables = Table::ALL.map(Table::name).into_iter().chain(LakeView::ALL.map(LakeView::name));
+    let tables = tables.flat_map(|table| {
+        let whole = format!("select * from {table}");
+        [format!("select count(*) from {table}"), whole]
+    });
+    for sql in tables.chain(QUERIES.map(str::to_owned)) {
+        check_sent(engine, worker, &sql).await;
+    }
+    reject(lake, "one", "r1", Some(vec![1]), "rejected").await;
+    reject(lake, "two", "r2", None, "rejected").await;
+    reject(lake, "three", "r2", Some(vec![0]), "accepted").await;
+    let [before, after] = [QueryEngine::new(lake, None), QueryEngine::new(lake, None)].map(|e| e.expect("an engine"));
+    for view in LakeView::ALL.map(LakeView::name) {
+        check_sent(&before, &after, &format!("select * from {view}")).await;
+    }
+    for sql in QUERIES {
+        check_sent(&before, &after, sql).await;
+    }
+    let pairs = check_sent(&before, &after, "select surface_id, pair_id from ir").await;
+    assert_eq!(pairs, ["0001_0 | 0", "0001_0 | 2", "flat | 0"]);
+}
+
+// What cannot be sent is named, and stays where it is.
+#[tokio::test]
+async fn what_only_one_process_knows_is_not_sent() {
+    let (_folder, lake) = lake().await;
+    let engine = QueryEngine::new(&lake, None).expect("an engine");
+    let worker = engine.worker_state();
+    let recursive = "with recursive n(i) as (select 1 union all select i + 1 from n where i < 5) select max(i) from n";
+    let (_, plan) = physical_plan(&engine, recursive).await.expect("planned");
+    let error = check_transport(&plan, &worker).expect_err("a recursive query").to_string();
+    assert!(error.contains("WorkTableExec of this process"), "{error}");
+    let context = engine.create_context();
+    let answer = |_: &[ColumnarValue]| Ok(ColumnarValue::Scalar(ScalarValue::Int32(Some(1))));
+    let function =
+        create_udf("own_number", vec![DataType::Int32], DataType::Int32, Volatility::Volatile, Arc::new(answer));
+    context.register_udf(function);
+    let sql = "select pair_id from pairs where pair_id > 3 and own_number(pair_id) + 1 = 2";
+    let (_, plan) = plan_in(&context, &engine, sql).await.expect("planned");
+    let error = check_transport(&plan, &worker).expect_err("a function of the session").to_string();
+    assert!(error.contains("function own_number of this session"), "{error}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn functions_run_on_another_engine_of_the_lake() {
+    let small = SmallLake::new().await;
+    let [engine, worker] = [(); 2].map(|()| QueryEngine::new(&small.lake, None).expect("an engine"));
+    for (_, sql, _) in examples() {
+        check_sent(&engine, &worker, &sql).await;
+    }
+}
+
+/// A lake with rows of two runs in the tables that views read.
+async fn measured_lake() -> (tempfile::TempDir, Lake) {
+    let (folder, lake) = lake().await;
+    put(&lake, "0001_0", "r1").await;
+    put(&lake, "flat", "r2").await;
+    (folder, lake)
+}
+
+#[tokio::test]
+async fn tables_are_read_by_standard_scans_alone() {
+    let (_folder, lake) = measured_lake().await;
+    reject(&lake, "one", "r1", Some(vec![1]), "rejected").await;
+    let engine = QueryEngine::new(&lake, None).expect("an engine");
+    let views =
+        LakeView::ALL.into_iter().filter(|view| !matches!(view, LakeView::RoomParameters | LakeView::Augmented));
+    let names = Table::ALL.map(Table::name).into_iter().chain(views.map(LakeView::name));
+    for sql in names.map(|name| format!("select * from {name}")) {
+        let (_, plan) = physical_plan(&engine, &sql).await.expect(&sql);
+        check_standard(&sql, &plan);
+    }
+}
+
+/// A lake whose events are in one merged file: of three runs, one of which has newer rows elsewhere, and one of another
+/// project; beside it files of one run. `lines` of the last make the table a small one, or not.
+async fn merged_lake(lines: usize) -> (tempfile::TempDir, Lake) {
+    let (folder, lake) = lake().await;
+    for (surface, run, lines) in [("flat", "r1", 3), ("foam", "r2", 5), ("wood_secret", "r3", 7), ("foam", "r4", lines)]
+    {
+        put_events(&lake, surface, run, "old", lines).await;
+    }
+    lake.optimize(128 << 20, &AtomicBool::new(false), &mut |_| {}).await.expect("merged");
+    put_events(&lake, "foam", "r2", "new", 2).await;
+    put_events(&lake, "foam", "r5", "old", 4).await;
+    (folder, lake)
+}
+
+async fn check_hidden_parts(others: usize) {
+    let (_folder, lake) = merged_lake(others).await;
+    let restricted = lake.restricted_to(["ours".parse().expect("a name")].into());
+    let of_all = vec![("r1", 3), ("r2", 2), ("r3", 7), ("r4", others), ("r5", 4)];
+    let of_ours: Vec<_> = of_all.iter().copied().filter(|(run, _)| *run != "r3").collect();
+    for (lake, runs) in [(&lake, of_all), (&restricted, of_ours)] {
+        let engines = [(); 2].map(|()| QueryEngine::new(lake, None).expect("an engine"));
+        let [engine, worker] = &engines;
+        worker.catalog().current_snapshot().await.expect("its snapshot");
+        let view = lake.snapshot().await.expect("a view");
+        let hidden = view.files(Table::Events).iter().filter(|file| !file.hidden.is_empty());
+        assert_eq!(hidden.count(), 1, "a file has hidden rows");
+        let total = runs.iter().map(|(_, rows)| rows).sum::<usize>();
+        let expected = runs.iter().filter(|(_, rows)| *rows > 0).map(|(run, rows)| format!("{run} | {rows}"));
+        let expected: Vec<_> = expected.collect();
+        let counted = check_sent(engine, worker, "select run_id, count(*) from events group by run_id").await;
+        assert_eq!(counted, expected);
+        for (sql, expected) in [
+            ("select count(*) from events", total.to_string()),
+            ("select count(message) from events", total.to_string()),
+            (
+                "select count(*) from events where surface_id >= 'wood'",
+                runs.iter().find(|(run, _)| *run == "r3").map_or(0, |(_, rows)| *rows).to_string(),
+            ),
+            ("select count(*) from events where message = 'old' and run_id = 'r2'", "0".to_owned()),
+            ("select max(run_id) from events where run_id < 'r4'", runs[runs.len() - 3].0.to_owned()),
+            ("select count(*) from (select message from events limit 4)", "4".to_owned()),
+        ] {
+            assert_eq!(check_sent(engine, worker, sql).await, [expected], "{sql}");
+        }
+        let all = check_sent(engine, worker, "select * from events").await;
+        assert_eq!(all.len(), total);
+    }
+    let session = Session::new(&restricted).expect("a session");
+    for sql in [
+        "explain verbose select * from events",
+        "explain verbose select count(*) from events where surface_id >= 'wood'",
+        "explain analyze select run_id, count(*) from events where message <> 'x' group by run_id",
+        "explain analyze verbose select message from events where log_time_ns >= 0",
+    ] {
+        let text: String = super::tests::rows(&session, sql).await.iter().map(|batch| format!("{batch:?}")).collect();
+        for hidden in ["r3", "secret"] {
+            assert!(!text.contains(hidden), "{sql}: {hidden}: {text}");
+        }
+        // All rows of the file, and those of the reader's projects that have been replaced.
+        let counts: BTreeSet<usize> =
+            text.split(|c: char| !c.is_ascii_digit()).filter_map(|n| n.parse().ok()).collect();
+        for count in [others + 15, others + 8].into_iter().filter(|count| *count > 1000) {
+            assert!(!counts.contains(&count), "{sql}: {count}: {text}");
+        }
+    }
+    // What another one computes of a hidden row would be seen by its error.
+    let divided = "select count(*) from events where 1 / (length(surface_id) - 11) < 5";
+    let counted = super::tests::rows(&session, divided).await;
+    assert_eq!(counted.iter().map(RecordBatch::num_rows).sum::<usize>(), 1);
+}
+
+mod slow {
+    use super::*;
+
+    // A small table is in memory, a larger one is scanned.
+    #[tokio::test(flavor = "multi_thread")]
+    async fn hidden_rows_stay_hidden_on_another_engine() {
+        for others in [0, 30_000] {
+            check_hidden_parts(others).await;
+        }
+    }
+}

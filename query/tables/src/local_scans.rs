@@ -1,0 +1,98 @@
+//! The last rewrite of a plan, on the process that runs it: scans of what the process holds read that.
+//!
+//! A plan is optimised, explained and sent to other machines with DataFusion's own scans of Parquet files. Just before it
+//! runs,
+//!
+//! - a scan of a small table reads the rows that this process has of its files ([`HeldScan`]);
+//! - a scan of small files without lists reads all their rows. For each file that it opens, DataFusion's Parquet source
+//!   adapts the query's filters to the file, and plans by them which row groups and pages to read: for a file of a few
+//!   thousand rows that takes longer than reading them. The filters stand above the scan, too;
+//! - other scans read through this process' cache and its footers, also those of a plan that came over the wire.
+//!
+//! The plan's nodes keep their partitions, orders, statistics and rows, so that nodes above need not be planned again.
+
+use std::sync::Arc;
+
+use datafusion::common::stats::Precision;
+use datafusion::datasource::physical_plan::{FileScanConfig, FileScanConfigBuilder, FileSource, ParquetSource};
+use datafusion::datasource::source::DataSourceExec;
+use datafusion::error::Result;
+use datafusion::physical_plan::ExecutionPlan;
+use datafusion::physical_plan::execution_plan::{ChildrenPropertiesMode, ReplaceChildrenOptions};
+
+use crate::held_scan::HeldScan;
+use crate::lake_table::FileReaders;
+
+/// Rows below which a file without wanted lists is read as a whole, whatever filters there are.
+const SMALL_FILE_ROWS: usize = 65_536;
+
+/// Replaces scans of the lake's files by what this process holds of them. No plan crosses the wire after it.
+///
+/// # Errors
+/// If a scan's expressions do not fit its columns.
+pub fn rewrite_local_scans(plan: Arc<dyn ExecutionPlan>, readers: &FileReaders) -> Result<Arc<dyn ExecutionPlan>> {
+    if plan.children().is_empty() {
+        let scan = plan.downcast_ref::<DataSourceExec>().and_then(|scan| scan.data_source().downcast_ref());
+        return Ok(scan.map_or(Ok(None), |scan| local_scan(scan, readers))?.unwrap_or(plan));
+    }
+    let mut is_changed = false;
+    let mut children = Vec::with_capacity(plan.children().len());
+    for child in plan.children() {
+        let rewritten = rewrite_local_scans(child.clone(), readers)?;
+        is_changed |= !Arc::ptr_eq(child, &rewritten);
+        children.push(rewritten);
+    }
+    match is_changed {
+        true => plan.replace_children(children, ReplaceChildrenOptions::new(ChildrenPropertiesMode::Keep)),
+        false => Ok(plan),
+    }
+}
+
+// What this process reads for a scan; None if that is what the scan reads.
+fn local_scan(scan: &FileScanConfig, readers: &FileReaders) -> Result<Option<Arc<dyn ExecutionPlan>>> {
+    let Some(source) = scan.file_source().downcast_ref::<ParquetSource>() else { return Ok(None) };
+    if scan.object_store_url != readers.url {
+        return Ok(None);
+    }
+    if let Some(held) = HeldScan::try_from_scan(scan, source, &readers.small)? {
+        return Ok(Some(Arc::new(DataSourceExec::new(Arc::new(held)))));
+    }
+    let source: Arc<dyn FileSource> = if has_spare_filters(scan, source)? {
+        let unfiltered = readers.parquet_source(scan.file_source().table_schema().clone());
+        let unfiltered = unfiltered.with_table_parquet_options(source.table_parquet_options().clone());
+        let projected = source.projection().map(|projection| unfiltered.try_pushdown_projection(projection));
+        match projected.transpose()?.flatten() {
+            Some(projected) => projected,
+            None => return Ok(None),
+        }
+    } else if source.parquet_file_reader_factory().is_some_and(|own| Arc::ptr_eq(own, &readers.reader)) {
+        return Ok(None);
+    } else {
+        let source = source.clone().with_parquet_file_reader_factory(readers.reader.clone());
+        match readers.footer_bytes {
+            Some(bytes) => Arc::new(source.with_metadata_size_hint(bytes)),
+            None => Arc::new(source),
+        }
+    };
+    let local = FileScanConfigBuilder::from(scan.clone()).with_source(source).build();
+    Ok(Some(DataSourceExec::from_data_source(local)))
+}
+
+// Whether reading the whole files and filtering the rows above is faster.
+fn has_spare_filters(scan: &FileScanConfig, source: &ParquetSource) -> Result<bool> {
+    if source.filter().is_none() || source.table_parquet_options().global.pushdown_filters {
+        return Ok(false);
+    }
+    if scan.projected_schema()?.fields().iter().any(|field| field.data_type().is_nested()) {
+        return Ok(false);
+    }
+    let mut files = 0;
+    let mut rows = 0;
+    for file in scan.file_groups.iter().flat_map(|group| group.files()) {
+        let known = file.statistics.as_ref().map_or(Precision::Absent, |known| known.num_rows);
+        let Some(known) = known.get_value() else { return Ok(false) };
+        files += 1;
+        rows += known;
+    }
+    Ok(rows < files * SMALL_FILE_ROWS)
+}
