@@ -70,7 +70,8 @@ fn is_same_text(left: &str, right: &str) -> bool {
         let numbers = left.parse::<f64>().ok().zip(right.parse::<f64>().ok());
         left == right || numbers.is_some_and(|(x, y)| (x - y).abs() <= 1e-6 * x.abs().max(y.abs()))
     };
-    let (left, right) = (parts(left), parts(right));
+    let left = parts(left);
+    let right = parts(right);
     left.len() == right.len() && left.iter().zip(&right).all(|(left, right)| is_same(left, right))
 }
 
