@@ -212,6 +212,21 @@ async fn plans_run_on_another_engine_of_the_lake() {
     assert_eq!(pairs, ["0001_0 | 0", "0001_0 | 2", "flat | 0"]);
 }
 
+// However large its files are: a range of a file may be read by another process, which does not hold it.
+#[tokio::test]
+async fn a_small_table_is_not_divided() {
+    let (_folder, lake) = lake().await;
+    let engine = QueryEngine::new(&lake, None).expect("an engine");
+    let context = engine.create_context();
+    context.state_ref().write().config_mut().options_mut().optimizer.repartition_file_min_size = 0;
+    let sql = "select pair_id, direct_mm from pairs where direct_mm > 100";
+    let (state, plan) = plan_in(&context, &engine, sql).await.expect("planned");
+    let local = engine.rewrite_local_scans(plan).expect("rewritten");
+    let text = displayable(local.as_ref()).indent(false).to_string();
+    assert!(text.contains("rows in memory"), "{text}");
+    assert!(!row_texts(local, &state).await.is_empty());
+}
+
 // What cannot be sent is named, and stays where it is.
 #[tokio::test]
 async fn what_only_one_process_knows_is_not_sent() {

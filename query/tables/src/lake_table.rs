@@ -22,8 +22,8 @@ use datafusion::error::{DataFusionError, Result};
 use datafusion::execution::object_store::ObjectStoreUrl;
 use datafusion::logical_expr::utils::conjunction;
 use datafusion::logical_expr::{Expr, TableProviderFilterPushDown};
-use datafusion::physical_expr::PhysicalExpr;
 use datafusion::physical_expr::expressions::{Column, in_list, lit};
+use datafusion::physical_expr::{Partitioning, PhysicalExpr};
 use datafusion::physical_optimizer::pruning::PruningPredicateBuilder;
 use datafusion::physical_plan::ExecutionPlan;
 use datafusion::physical_plan::empty::EmptyExec;
@@ -169,14 +169,17 @@ impl LakeTable {
         if let Some(predicate) = predicate {
             source = source.with_predicate(predicate);
         }
-        // More partitions than one would cost a small table more than it takes to read it.
-        let groups = if self.held.is_some() { 1 } else { state.config().target_partitions() };
+        // More partitions than one would cost a small table more than it takes to read it. What is declared is not
+        // divided by the optimizer, neither here nor for other processes.
+        let declared = self.held.is_some().then_some(Partitioning::UnknownPartitioning(1));
+        let groups = declared.as_ref().map_or(state.config().target_partitions(), Partitioning::partition_count);
         let config = FileScanConfigBuilder::new(self.source.url.clone(), Arc::new(source))
             .with_file_groups(file_groups(files, groups))
             .with_statistics(self.known_statistics(files)?)
             .with_batch_size((!lists).then_some(NARROW_BATCH_ROWS))
             .with_projection_indices(projection)?
             .with_limit(limit)
+            .with_output_partitioning(declared)
             .build();
         Ok(DataSourceExec::from_data_source(config))
     }
