@@ -342,6 +342,8 @@ fn what_is_sent_after_an_error_is_not_kept() {
 }
 
 mod slow {
+    use std::time::Duration;
+
     use rustix::process::Signal;
 
     use super::super::http::HttpRequest;
@@ -409,6 +411,9 @@ mod slow {
         }
     }
 
+    /// Processor time of engines after which a join has read both of its inputs.
+    const JOINING: Duration = Duration::from_secs(2);
+
     #[test]
     fn a_client_whose_statements_end_engines_waits_and_no_other_does() {
         let place = lake();
@@ -420,8 +425,9 @@ mod slow {
                 200 => {
                     // A join whose conditions no row fulfils goes on computing after its end.
                     let asked = HttpRequest::post("/api/v1/sql", ENDLESS).with("content-type", "text/plain");
+                    let idle = server.engine_time();
                     let asked = asked.begin(&server);
-                    wait_until("it runs", || running(&server) > 0.0);
+                    wait_until("it joins", || server.engine_time() >= idle + JOINING);
                     let ends = || server.said().iter().filter(|line| line.contains("did not stop")).count();
                     let before = ends();
                     drop(asked);
