@@ -342,12 +342,9 @@ fn what_is_sent_after_an_error_is_not_kept() {
 }
 
 mod slow {
-    use std::time::Duration;
-
     use rustix::process::Signal;
 
-    use super::super::http::HttpRequest;
-    use super::super::{ENDLESS, lake, refused, running, served, sql, wait_until};
+    use super::super::{ENDLESS, lake, running, served, wait_until};
     use super::*;
 
     #[test]
@@ -409,47 +406,5 @@ mod slow {
         for mut client in unread.drain(..2) {
             assert_eq!(client.rows().map(|rows| rows.len()), Ok(100_000));
         }
-    }
-
-    /// Processor time of engines after which a long expression is being planned, which takes many times as long.
-    const PLANNING: Duration = Duration::from_secs(1);
-
-    #[test]
-    fn a_client_whose_statements_end_engines_waits_and_no_other_does() {
-        let place = lake();
-        let server = served(&place, &[]);
-        let mut other = WireClient::connect(&server, None);
-        // It is planned without a pause, so that its engine goes on after its end.
-        let arms: Vec<_> = (0..60_000).map(|number| format!("when {number} then {number}")).collect();
-        let runaway = format!("select case pair_id {} end from pairs", arms.join(" "));
-        let refusal = loop {
-            let answer = sql(&server, "select 7");
-            match answer.status {
-                200 => {
-                    let asked = HttpRequest::post("/api/v1/sql", &runaway).with("content-type", "text/plain");
-                    let idle = server.engine_time();
-                    let asked = asked.begin(&server);
-                    wait_until("it plans", || server.engine_time() >= idle + PLANNING);
-                    let ends = || server.said().iter().filter(|line| line.contains("did not stop")).count();
-                    let before = ends();
-                    drop(asked);
-                    wait_until("its engine ends", || ends() > before);
-                }
-                429 => break answer,
-                status => panic!("{status}: {}", answer.text()),
-            }
-        };
-        refused(&refusal, 429, "too_many");
-        // Its connection was to the first engine.
-        assert_eq!(other.end_state(), "58000");
-        let mut other = WireClient::connect(&server, None);
-        assert_eq!(other.query("select 7"), Ok(vec![vec![Some("7".to_owned())]]));
-        let wait: u64 = refusal.header("retry-after").and_then(|secs| secs.parse().ok()).expect("seconds");
-        assert!((1..=31).contains(&wait), "{wait}");
-        let begun = std::time::Instant::now();
-        wait_until("it is answered", || sql(&server, "select 7").status == 200);
-        // A busy machine takes some seconds for an engine's start.
-        assert!(begun.elapsed().as_secs() <= wait + 10, "{:?}", begun.elapsed());
-        assert_eq!(HttpRequest::get("/health").send(&server).status, 200);
     }
 }

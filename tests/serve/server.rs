@@ -105,17 +105,6 @@ impl ServedLake {
         }
     }
 
-    /// Returns the processor time that its engines have used.
-    pub fn engine_time(&self) -> Duration {
-        // A tick is a hundredth of a second on every machine.
-        let ticks = |pid: i32| {
-            let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).unwrap_or_default();
-            let fields = stat.rsplit_once(')').map_or("", |(_, fields)| fields).split_whitespace().skip(11).take(2);
-            fields.filter_map(|field| field.parse::<u64>().ok()).sum::<u64>()
-        };
-        Duration::from_millis(10 * self.engine_ids().into_iter().map(ticks).sum::<u64>())
-    }
-
     /// Kills one of its two engines of statements, of which one is a spare.
     pub fn kill_statement_engine(&self) {
         let arguments = |pid: &i32| std::fs::read_to_string(format!("/proc/{pid}/cmdline")).unwrap_or_default();
