@@ -20,6 +20,7 @@ pub mod engine;
 #[cfg(all(fuzzing, feature = "postgres"))]
 pub mod fuzzing;
 mod metrics;
+mod process_memory;
 mod random_id;
 
 pub use catalogue_pages::CataloguePages;

@@ -29,7 +29,6 @@ use echolake_service::request_span::{self, trace_request};
 use echolake_service::{
     EngineRole, EngineServices, Error, QueryService, RequestFault, ServerProtocol, answer_numbered,
 };
-use http_body_util::BodyExt as _;
 use hyper::body::Incoming;
 use hyper::server::conn::http1;
 use hyper::service::{Service as _, service_fn};
@@ -57,7 +56,7 @@ use slices::{FOXGLOVE_MANIFEST, LICHTBLICK_SESSION, SLICE, SOFA, SliceRoom, Slic
 /// Paths that viewers on pages of any origin use.
 pub const VIEWER_PATHS: [&str; 5] = [files::RUN, SLICE, SOFA, FOXGLOVE_MANIFEST, LICHTBLICK_SESSION];
 
-/// What an engine of HTTP keeps for each right: the lake as readers with that right see it, with what was computed of it.
+/// The lake as readers with each right see it, with what was computed of it.
 type RightViews = Cache<Option<Vec<ProjectName>>, Arc<SnapshotViews>>;
 
 /// Rights of which views are kept.
@@ -77,7 +76,7 @@ struct HttpEngineState {
     slices: SliceRoom,
 }
 
-/// Answers HTTP on the socket of an engine with this role; None for both. A request counts until its answer is sent or dropped.
+/// Answers HTTP on the socket of an engine with this role; None for both.
 ///
 /// # Errors
 /// [`Error::System`] if the socket accepts no connection.
@@ -100,16 +99,7 @@ pub async fn serve_http_socket(
         let engine = engine.clone();
         let answers = service_fn(move |request: hyper::Request<Incoming>| {
             let engine = engine.clone();
-            async move {
-                let guard = engine.0.services.activity().begin_work();
-                let answer = engine.answer_request(request).await;
-                Ok::<_, Infallible>(answer.map(|body| {
-                    body.map_frame(move |frame| {
-                        let _guard = &guard;
-                        frame
-                    })
-                }))
-            }
+            async move { Ok::<_, Infallible>(engine.answer_request(request).await) }
         });
         tokio::spawn(async move {
             // A connection that breaks off is the door's matter.

@@ -18,7 +18,7 @@ use crate::door_message::DoorMessage;
 use crate::door_rows::DoorRows;
 use crate::fault::RequestFault;
 use crate::query_watch::RunningWatches;
-use crate::service::{ActivityCounter, QueryService, SharedService};
+use crate::service::{QueryService, SharedService};
 
 /// Header of a request from the door to an engine: its client, as [`ClientIdentity::to_text`] writes it.
 const CLIENT: HeaderName = HeaderName::from_static("echolake-client");
@@ -61,7 +61,6 @@ impl EngineServices {
         let shared = SharedService {
             lake: lake.clone(),
             engine,
-            activity: ActivityCounter::default(),
             watches: Arc::new(RunningWatches::new(slow)),
             door_rows: Arc::new(DoorRows::default()),
             encoders: QueryThreads::per_core("encode").map_err(Error::System)?,
@@ -124,11 +123,6 @@ impl EngineServices {
     /// The lake, all of it.
     pub fn lake(&self) -> &Lake {
         &self.0.shared.lake
-    }
-
-    /// Requests of all clients that are being answered.
-    pub fn activity(&self) -> &ActivityCounter {
-        &self.0.shared.activity
     }
 }
 

@@ -41,6 +41,6 @@ pub use fault::{FaultCode, FaultParts, RequestFault};
 pub use query_watch::{QueryTimer, QueryWatch};
 pub use request_number::answer_numbered;
 pub use server_protocol::ServerProtocol;
-pub use service::{ActivityCounter, ActivityGuard, CATALOG, QueryJob, QueryService, QueryWork, SCHEMA};
+pub use service::{CATALOG, QueryJob, QueryService, QueryWork, SCHEMA};
 pub use stop_signal::StopSignal;
 pub use token_scope::TokenScope;

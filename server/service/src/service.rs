@@ -3,7 +3,6 @@
 
 use std::collections::HashMap;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicUsize, Ordering};
 
 use arrow::datatypes::SchemaRef;
 use datafusion::common::ParamValues;
@@ -56,7 +55,6 @@ pub(crate) struct SharedService {
     pub lake: Lake,
     /// The engine with the rights of a reader of all projects.
     pub engine: QueryEngine,
-    pub activity: ActivityCounter,
     pub watches: Arc<RunningWatches>,
     pub door_rows: Arc<DoorRows>,
     // Answers are encoded on threads of their own: connections are answered, and queries cancelled, while all are busy.
@@ -92,32 +90,6 @@ pub struct QueryJob {
     pub limit: Option<SessionTimeLimit>,
     /// Stops it from another task.
     pub stop: StopSignal,
-}
-
-/// Counts requests, and work for them.
-#[derive(Clone, Default)]
-pub struct ActivityCounter(Arc<AtomicUsize>);
-
-/// One that is counted, until this is dropped.
-pub struct ActivityGuard(ActivityCounter);
-
-impl Drop for ActivityGuard {
-    fn drop(&mut self) {
-        self.0.0.fetch_sub(1, Ordering::Relaxed);
-    }
-}
-
-impl ActivityCounter {
-    /// Counts one more, until the guard is dropped.
-    pub fn begin_work(&self) -> ActivityGuard {
-        self.0.fetch_add(1, Ordering::Relaxed);
-        ActivityGuard(self.clone())
-    }
-
-    /// How many there are.
-    pub fn count(&self) -> usize {
-        self.0.load(Ordering::Relaxed)
-    }
 }
 
 impl QueryService {
@@ -162,11 +134,6 @@ impl QueryService {
     /// Returns whether the client's token is for something.
     pub fn has_scope(&self, scope: TokenScope) -> bool {
         self.0.identity.require_scope(scope).is_ok()
-    }
-
-    /// Requests of all clients that are being answered.
-    pub fn activity(&self) -> &ActivityCounter {
-        &self.0.shared.activity
     }
 
     /// Reports a failed request to the door, which counts them.
@@ -228,12 +195,7 @@ impl QueryService {
     /// Spawns work on the encoder threads; dropping the returned task aborts it.
     pub fn spawn_work<T: Send + 'static>(&self, work: impl Future<Output = T> + Send + 'static) -> JoinSet<T> {
         let mut task = JoinSet::new();
-        let guard = self.0.shared.activity.begin_work();
         if let Some(threads) = self.0.shared.encoders.handle() {
-            let work = async move {
-                let _guard = guard;
-                work.await
-            };
             task.spawn_on(continue_request(work), threads);
         }
         task
@@ -246,12 +208,7 @@ impl QueryService {
         client: &Arc<EngineClient>,
         work: impl Future<Output = Result<T, RequestFault>> + Send + 'static,
     ) -> BoxFuture<'_, Result<T, RequestFault>> {
-        let guard = self.0.shared.activity.begin_work();
         let session = self.begin_session(client);
-        let work = async move {
-            let _guard = guard;
-            work.await
-        };
         let work = work.in_current_span();
         let planned = async move { session.supervise_work(work).await };
         planned.inspect_err(EngineReport::record_failure).boxed()
@@ -277,7 +234,6 @@ impl QueryService {
         let session = self.begin_session(client);
         let span = tracing::error_span!("query", protocol = protocol.name(), client = self.0.identity.name);
         let run = async move {
-            let _guard = service.0.shared.activity.begin_work();
             let stop = StopSignal::new();
             let timer = service.watch_query(protocol, listed_as, &stop);
             let done = tokio::select! {
@@ -296,11 +252,6 @@ impl QueryService {
         &self,
         work: impl FnOnce() -> T + Send + 'static,
     ) -> Result<T, RequestFault> {
-        let guard = self.0.shared.activity.begin_work();
-        let work = move || {
-            let _guard = guard;
-            work()
-        };
         let handle = self.0.shared.encoders.handle().map(|threads| threads.spawn_blocking(work));
         let Some(handle) = handle else { return Err(RequestFault::Internal) };
         handle.await.map_err(RequestFault::defect("computing ended its task"))

@@ -24,6 +24,7 @@ use tokio::sync::SetOnce;
 use tokio::task::JoinSet;
 
 use crate::door::activity::ServerActivity;
+use crate::process_memory::private_bytes;
 
 /// Time for which a request that lost its engine waits for the reason.
 const REASON_WAIT: Duration = Duration::from_secs(2);
@@ -272,16 +273,8 @@ impl EngineProcess {
 
     /// Bytes of memory that it occupies: resident pages without those of files, which all engines share.
     pub fn private_bytes(&self) -> usize {
-        private_bytes(self.pid).unwrap_or(0)
+        private_bytes(&self.pid.to_string()).unwrap_or(0)
     }
-}
-
-fn private_bytes(pid: u32) -> Option<usize> {
-    let text = std::fs::read_to_string(Path::new("/proc").join(pid.to_string()).join("statm")).ok()?;
-    let mut pages = text.split(' ').skip(1).map_while(|n| n.parse::<usize>().ok());
-    let resident = pages.next()?;
-    let shared = pages.next()?;
-    Some(resident.saturating_sub(shared) * rustix::param::page_size())
 }
 
 // Reads what the engine reports until it ends, and says then how.

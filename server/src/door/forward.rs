@@ -66,7 +66,8 @@ impl ServerEngines {
     /// engine ends before its answer begins, the next one is asked once, unless the request itself ended it.
     ///
     /// # Errors
-    /// [`RequestFault::EngineEnded`], [`RequestFault::EngineLost`], [`RequestFault::Backoff`], [`RequestFault::TooLarge`], [`RequestFault::Request`].
+    /// [`RequestFault::EngineEnded`], [`RequestFault::EngineLost`], [`RequestFault::Backoff`],
+    /// [`RequestFault::TooLarge`], [`RequestFault::Request`].
     pub async fn forward_request(
         &self,
         role: EngineRole,

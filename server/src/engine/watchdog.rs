@@ -7,6 +7,8 @@ use echolake_lake::{CACHE_MEMORY_BYTES, CacheCounts};
 use echolake_query::StatementBlame;
 use echolake_service::{EngineCulprit, EngineEnd, EngineReport, EngineRole, EngineServices};
 
+use crate::process_memory::private_bytes;
+
 /// Time between two looks; what was reported meanwhile is sent as often.
 const INTERVAL: Duration = Duration::from_millis(50);
 /// Time between two looks at memory while statements run.
@@ -27,7 +29,7 @@ const RELEASE: Duration = Duration::from_millis(500);
 pub(super) fn start_watchdog(services: &EngineServices, role: EngineRole, memory: usize) -> std::io::Result<()> {
     let services = services.clone();
     let blocks = if services.lake().is_remote() { CACHE_MEMORY_BYTES as usize } else { 0 };
-    let base = private_bytes().ok_or_else(|| std::io::Error::other("/proc/self/statm cannot be read"))?;
+    let base = private_bytes("self").ok_or_else(|| std::io::Error::other("/proc/self/statm cannot be read"))?;
     let limit = (memory as f64 * TOLERANCE) as usize + base + CACHE_BYTES + blocks;
     let memory = MemoryWatch { limit, cancelled: None };
     std::thread::Builder::new().name("watchdog".to_owned()).spawn(move || watch_engine(&services, role, memory))?;
@@ -79,7 +81,7 @@ struct MemoryWatch {
 
 impl MemoryWatch {
     fn check_memory(&mut self, services: &EngineServices) {
-        if private_bytes().unwrap_or(0) <= self.limit {
+        if private_bytes("self").unwrap_or(0) <= self.limit {
             self.cancelled = None;
             return;
         }
@@ -91,13 +93,4 @@ impl MemoryWatch {
             Some(_) => {}
         }
     }
-}
-
-/// Returns the bytes that this process occupies: resident pages without those of files.
-fn private_bytes() -> Option<usize> {
-    let text = std::fs::read_to_string("/proc/self/statm").ok()?;
-    let mut pages = text.split(' ').skip(1).map_while(|n| n.parse::<usize>().ok());
-    let resident = pages.next()?;
-    let shared = pages.next()?;
-    Some(resident.saturating_sub(shared) * rustix::param::page_size())
 }
