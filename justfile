@@ -55,6 +55,10 @@ fuzz TARGET *OPTIONS:
 bench NAME *OPTIONS:
     {{ if NAME == "kernels" { "cargo bench --manifest-path stress/kernels/Cargo.toml --locked --" } else { "cargo build --profile dist --locked -p echolake -p echolake-stress && target/dist/stress bench " + NAME } }} {{ OPTIONS }}
 
+# A server with so many workers on this machine, on the lake of $ECHOLAKE_LAKE or ./lake; all end with Ctrl-C.
+cluster WORKERS="3" *OPTIONS:
+    packaging/cluster.sh {{ WORKERS }} {{ OPTIONS }}
+
 # What a change must pass.
 ci:
     .ci/run

@@ -137,7 +137,7 @@ pub(crate) enum LakeCommand {
     Serve(Box<ServeArgs>),
     /// Let an agent on this machine ask the lake, by the Model Context Protocol on standard input and output.
     Mcp(McpArgs),
-    /// Answer one client's queries, as a child of `serve`.
+    /// Answer queries of all clients, as a child of `serve`.
     #[command(hide = true)]
     Engine(EngineArgs),
     /// Make a self-signed certificate for `serve --certificate`, for a lab without a certificate authority.
@@ -174,6 +174,8 @@ impl CliArguments {
         match &self.command {
             #[cfg(feature = "lake")]
             CliCommand::Lake(LakeCommand::Engine(args)) => args.confine_process(&self.lake),
+            #[cfg(feature = "lake")]
+            CliCommand::Lake(LakeCommand::Serve(args)) => args.confine_process(&self.lake),
             _ => Ok(()),
         }
     }
@@ -181,7 +183,7 @@ impl CliArguments {
     /// Returns whether the command has clients of its own, whose requests are spans.
     #[cfg(feature = "otlp")]
     pub fn answers_clients(&self) -> bool {
-        matches!(&self.command, CliCommand::Lake(LakeCommand::Serve(_)))
+        matches!(&self.command, CliCommand::Lake(LakeCommand::Serve(args)) if !args.is_worker())
     }
 
     /// Runs the command.

@@ -18,6 +18,19 @@ const RENEW: &str = "ECHOLAKE_RENEW";
 const MARKERS: [&str; 2] = ["<!-- members: begin, generated -->\n", "<!-- members: end -->\n"];
 /// Members for tests alone, which would clutter the diagram.
 const LEFT_OUT: [&str; 2] = ["stress", "testing"];
+/// The packages that the program is made of; the project promises to build on them.
+const MANDATORY: [&str; 10] = [
+    "mcap",
+    "arrow",
+    "parquet",
+    "datafusion",
+    "datafusion-distributed",
+    "rustfft",
+    "serde_json",
+    "zstd",
+    "clap",
+    "axum",
+];
 /// The root package, which is the command.
 const ROOT: &str = "echolake";
 
@@ -35,6 +48,7 @@ struct PackageMetadata {
 
 #[derive(Deserialize)]
 struct DependencyMetadata {
+    name: String,
     /// None for a normal dependency.
     kind: Option<String>,
     /// Folder of a dependency within the workspace.
@@ -70,13 +84,17 @@ fn member_name(folder: &Path) -> String {
     if name.is_empty() { ROOT.to_owned() } else { name }
 }
 
-fn read_members() -> MemberGraph {
+fn read_packages() -> Vec<PackageMetadata> {
     let mut cargo = Command::new(env!("CARGO"));
     cargo.args(["metadata", "--no-deps", "--format-version", "1", "--offline"]).current_dir(root());
     let output = run_command(&mut cargo).expect("cargo starts");
     assert!(output.status.success(), "{}", super::stderr(&output));
     let metadata: WorkspaceMetadata = serde_json::from_slice(&output.stdout).expect("metadata of a workspace");
-    let members = metadata.packages.into_iter().map(|package| {
+    metadata.packages
+}
+
+fn read_members() -> MemberGraph {
+    let members = read_packages().into_iter().map(|package| {
         let name = member_name(package.manifest_path.parent().expect("a folder"));
         let normal = package.dependencies.into_iter().filter(|dependency| dependency.kind.is_none());
         (name, normal.filter_map(|dependency| dependency.path).map(|path| member_name(&path)).collect())
@@ -156,6 +174,36 @@ fn files_and_tests_that_are_named_exist() {
         }
     }
     assert!(missing.is_empty(), "named and not there:\n{}", missing.join("\n"));
+}
+
+fn names_crate(folder: &Path, package: &str) -> bool {
+    let path = format!("{}::", package.replace('-', "_"));
+    super::files_below(folder).into_iter().any(|(name, bytes)| {
+        let is_source = name.extension().is_some_and(|extension| extension == "rs");
+        is_source
+            && String::from_utf8_lossy(&bytes)
+                .lines()
+                .any(|line| !line.trim().starts_with("//") && line.contains(&path))
+    })
+}
+
+/// Members whose manifests have a package among their normal dependencies, and that use it in their sources.
+fn users_of(package: &str, packages: &[PackageMetadata]) -> Vec<String> {
+    let has = |member: &&PackageMetadata| {
+        member.dependencies.iter().any(|dependency| dependency.kind.is_none() && dependency.name == package)
+    };
+    let folders = packages.iter().filter(has).filter_map(|member| member.manifest_path.parent());
+    let uses = |folder: &&Path| names_crate(&folder.join("src"), package);
+    let users = folders.filter(uses).map(member_name);
+    users.filter(|name| !LEFT_OUT.contains(&name.as_str())).collect()
+}
+
+#[test]
+fn no_mandatory_package_is_lost() {
+    let packages = read_packages();
+    let lost: Vec<_> = MANDATORY.into_iter().filter(|package| users_of(package, &packages).is_empty()).collect();
+    assert!(lost.is_empty(), "no member has them and uses them: {lost:?}");
+    assert_eq!(users_of("datafusion-nowhere", &packages), Vec::<String>::new());
 }
 
 #[test]

@@ -21,6 +21,7 @@ mod slices;
 #[allow(dead_code, reason = "campaigns want the rest")]
 pub(crate) mod tunnel;
 mod watched;
+mod workers;
 
 use std::io::{self, Read as _};
 use std::net::TcpStream;

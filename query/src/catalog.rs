@@ -113,6 +113,11 @@ impl LakeCatalog {
         self.lookups.functions().iter().cloned().chain(own.map(Arc::new))
     }
 
+    /// Returns the run files of the lake, for scans that other processes send.
+    pub fn run_files(&self) -> &Arc<McapFiles> {
+        &self.runs
+    }
+
     /// Replaces the scans of a plan by what this process holds of the files, just before it runs here.
     ///
     /// # Errors

@@ -17,8 +17,10 @@ use crate::catalog::LakeCatalog;
 use crate::client::QueryQuota;
 use crate::control::blame::StatementBlame;
 use crate::control::{QueryTicket, StopReason};
+use crate::spread::WorkerCluster;
 use crate::{Error, OpaqueValue};
 use process::EngineProcess;
+pub(crate) use process::STORE;
 
 /// Answers the queries of many sessions on one lake.
 ///
@@ -114,6 +116,16 @@ impl QueryEngine {
     /// Returns the lake as the engine's readers see it.
     pub fn lake(&self) -> &Lake {
         self.catalog.lake()
+    }
+
+    /// Spreads heavy queries of all rights over workers; to be called once.
+    pub fn spread_over(&self, cluster: Arc<WorkerCluster>) {
+        let _ = self.process.cluster.set(cluster);
+    }
+
+    /// Returns the workers over which heavy queries are spread.
+    pub fn cluster(&self) -> Option<&Arc<WorkerCluster>> {
+        self.process.cluster.get()
     }
 
     /// Returns the number of queries that run or wait now.

@@ -16,6 +16,7 @@ use echolake_schema::tables::Table;
 use echolake_schema::{ErrorCause, escape_controls};
 
 use crate::control::StopReason;
+use crate::spread::WorkerLoss;
 use crate::statement::{UNPLANNED, find_cast, hints};
 
 /// Minimum similarity of a suggested name: half of the letters, as in DataFusion's own suggestions.
@@ -122,6 +123,12 @@ pub enum Error {
     TimeLimit {
         /// The client's time for a query.
         limit: Duration,
+    },
+    /// A worker that ran a part of it was lost after rows had been sent.
+    #[error("a worker was lost while the query ran: {message}; hint: ask again, the others go on")]
+    WorkerLost {
+        /// The cause.
+        message: String,
     },
     /// It needed more memory than there is for it.
     #[error("the query needs more memory than it may have: {message}; hint: ask for less, or for fewer columns")]
@@ -249,13 +256,14 @@ impl Error {
         Self::Execution { message: escape_controls(cause), place, hint: hint.map(escape_controls) }
     }
 
-    // An error about a limit or the lake, not about the query.
+    // An error about a limit, a worker or the lake, not about the query.
     fn from_root_cause(error: &DataFusionError) -> Option<Self> {
         match error.find_root() {
             DataFusionError::ResourcesExhausted(text) => Some(Self::MemoryLimit { message: text.clone() }),
-            DataFusionError::External(cause) => {
-                cause.downcast_ref::<LakeError>().and_then(repeat_table_fault).map(Self::from)
-            }
+            DataFusionError::External(cause) => match cause.downcast_ref::<WorkerLoss>() {
+                Some(loss) => Some(Self::WorkerLost { message: loss.message().to_owned() }),
+                None => cause.downcast_ref::<LakeError>().and_then(repeat_table_fault).map(Self::from),
+            },
             _ => None,
         }
     }

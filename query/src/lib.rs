@@ -30,12 +30,14 @@ mod engine;
 mod error;
 pub mod figure_rows;
 mod listed_verdicts;
+mod literal_batches;
 mod opaque;
 pub mod output;
 mod overlay_schema;
 mod plan_transport;
 mod request_memory;
 mod session;
+mod spread;
 mod statement;
 mod system;
 mod views;
@@ -51,6 +53,10 @@ pub use opaque::OpaqueValue;
 pub use plan_transport::check_transport;
 pub use request_memory::RequestMemory;
 pub use session::{CancelHandle, ContextExtension, PreparedQuery, QueryAnswer, Session};
+pub use spread::{
+    ClusterSettings, SpreadCounts, WorkerCluster, WorkerFault, WorkerFigures, WorkerLink, WorkerService, WorkerState,
+    WorkerToken,
+};
 pub use statement::{
     PredicateForm, check_statement_bounds, is_blank_statement, split_statement, walk_expr, walk_statement,
 };

@@ -13,13 +13,47 @@ use std::sync::Arc;
 use datafusion::common::tree_node::{TreeNode as _, TreeNodeRecursion};
 use datafusion::error::{DataFusionError, Result};
 use datafusion::execution::FunctionRegistry as _;
+use datafusion::execution::TaskContext;
 use datafusion::execution::session_state::SessionState;
 use datafusion::physical_expr::ScalarFunctionExpr;
 use datafusion::physical_plan::ExecutionPlan;
 use datafusion_proto::bytes::physical_plan_to_bytes_with_extension_codec;
-use datafusion_proto::physical_plan::DefaultPhysicalExtensionCodec;
+use datafusion_proto::physical_plan::{PhysicalExtensionCodec, PhysicalProtoConverterExtension};
+use echolake_mcap_tables::{McapFiles, decode_mcap_scan, encode_mcap_scan};
 
 use crate::QueryEngine;
+
+/// Encodes the scans of run files, and decodes them where their files can be read.
+#[derive(Debug, Default)]
+pub(crate) struct McapCodec {
+    /// None in an engine, which sends scans and receives none.
+    pub files: Option<Arc<McapFiles>>,
+}
+
+impl PhysicalExtensionCodec for McapCodec {
+    fn try_decode(
+        &self,
+        bytes: &[u8],
+        _: &[Arc<dyn ExecutionPlan>],
+        _: &TaskContext,
+        _: &dyn PhysicalProtoConverterExtension,
+    ) -> Result<Arc<dyn ExecutionPlan>> {
+        let files = self.files.as_ref().ok_or_else(|| DataFusionError::Plan("scans are not read here".to_owned()))?;
+        decode_mcap_scan(bytes, files)
+    }
+
+    fn try_encode(
+        &self,
+        node: Arc<dyn ExecutionPlan>,
+        buffer: &mut Vec<u8>,
+        _: &dyn PhysicalProtoConverterExtension,
+    ) -> Result<()> {
+        let scan = encode_mcap_scan(node.as_ref())?;
+        let local = || DataFusionError::NotImplemented(format!("`{}` is not sent to workers", node.name()));
+        buffer.extend(scan.ok_or_else(local)?);
+        Ok(())
+    }
+}
 
 impl QueryEngine {
     /// Returns the state in which plans of other processes are decoded: that of statements, with the functions that only
@@ -69,7 +103,7 @@ pub fn check_transport(plan: &Arc<dyn ExecutionPlan>, worker: &SessionState) -> 
 }
 
 fn is_encoded(plan: &Arc<dyn ExecutionPlan>) -> bool {
-    physical_plan_to_bytes_with_extension_codec(plan.clone(), &DefaultPhysicalExtensionCodec {}).is_ok()
+    physical_plan_to_bytes_with_extension_codec(plan.clone(), &McapCodec::default()).is_ok()
 }
 
 // The lowest node of a plan that is not encoded.

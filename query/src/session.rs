@@ -16,6 +16,7 @@ use datafusion::execution::session_state::SessionState;
 use datafusion::logical_expr::LogicalPlan;
 use datafusion::prelude::SessionContext;
 use datafusion::sql::parser::Statement;
+use echolake_functions::set_planning;
 use echolake_lake::{Lake, LakeSnapshot, VisibleRun};
 use echolake_mcap_tables::Contents;
 use echolake_schema::RunId;
@@ -28,7 +29,9 @@ use crate::client::{EngineClient, QueryPermit, QueryQuota};
 use crate::control::QueryTicket;
 use crate::control::pool::PartialPool;
 use crate::engine::{QueryEngine, SqlFunction};
+use crate::literal_batches::limit_batch_rows;
 use crate::request_memory::RequestMemory;
+use crate::spread::attempts::{QueryAttempts, SpreadQuery};
 use crate::statement::{PredicateForm, append_predicate, parse_statement, prepare_statement};
 use crate::system::{self, SYSTEM_SCHEMA, SystemSource};
 use crate::{Error, OpaqueValue};
@@ -135,9 +138,9 @@ impl Session {
         self
     }
 
-    // The tables of the schema `system` that are not the lake's; none without a program around that has some.
+    // The tables of the schema `system` that are not the lake's; none without workers and a program around that has some.
     fn source_tables(&self) -> Vec<(&'static str, Arc<dyn TableProvider>)> {
-        self.system.as_ref().map_or_else(Vec::new, system::engine_tables)
+        system::engine_tables(self.system.as_ref(), self.engine.cluster())
     }
 
     /// Sets the number of the request that the session's queries are for, see [`StatementBlame::request`].
@@ -387,22 +390,34 @@ impl Session {
     ) -> Result<QueryAnswer, Error> {
         let Started { ticket, place } = started;
         ticket.set_statement(&prepared.sql);
-        let context = self.task_context(&state, &ticket);
+        if let Some(cluster) = self.engine.cluster() {
+            cluster.follow_lake(prepared.snapshot.tables_id());
+        }
         let text = prepared.sql.clone();
         let is_optimized = prepared.is_optimized;
+        let session = self.clone();
         let engine = self.engine.clone();
+        let of_query = ticket.clone();
         let planned = async move {
-            let planned = match is_optimized {
-                true => state.query_planner().create_physical_plan(&plan, &*state).await,
-                false => state.create_physical_plan(&plan).await,
+            set_planning(true);
+            let planned = async {
+                let optimized = if is_optimized { plan.clone() } else { state.optimize(&plan)? };
+                let state = limit_batch_rows(state, &optimized)?;
+                let physical = state.query_planner().create_physical_plan(&optimized, &*state).await?;
+                let context = session.task_context(&state, &of_query);
+                let spread = session.spread_query(&state, plan, is_optimized, of_query);
+                let mut attempts = QueryAttempts::plan_query(physical, context, spread).await?;
+                attempts.rewrite_local(|plan| engine.rewrite_local_scans(plan))?;
+                Ok::<_, DataFusionError>(attempts)
             };
-            let planned = planned.and_then(|plan| engine.catalog().rewrite_local_scans(plan));
+            let planned = planned.await;
+            set_planning(false);
             planned.map_err(|error| Error::from_optimizing(&text, &error))
         };
-        let plan = self.engine.on_seat(&ticket, planned).await?;
-        let schema = plan.schema();
+        let attempts = self.engine.on_seat(&ticket, planned).await?;
+        let schema = attempts.schema().clone();
         let (send, batches) = mpsc::channel(AHEAD);
-        let query = drive_query(plan, context, send, self.engine.clone(), ticket.clone(), place).boxed();
+        let query = drive_query(attempts, send, self.engine.clone(), ticket.clone(), place).boxed();
         // Dropped, it stops the query, which may have begun.
         let mut answer = QueryAnswer {
             schema,
@@ -419,6 +434,22 @@ impl Session {
             why = answer.ticket.wait_for_stop() => return Err(Error::from_stop(&why)),
         }
         Ok(answer)
+    }
+
+    // All that a query is spread by, if there are workers.
+    fn spread_query(
+        self,
+        state: &SessionState,
+        logical: LogicalPlan,
+        is_optimized: bool,
+        ticket: Arc<QueryTicket>,
+    ) -> Option<SpreadQuery> {
+        let cluster = self.engine.cluster()?.clone();
+        let engine = self.engine.clone();
+        let memory = Some(self.engine.memory_limit(self.client.quota())).filter(|limit| *limit < usize::MAX);
+        let state = state.clone();
+        let contexts = Box::new(move |state: &SessionState| self.task_context(state, &ticket));
+        Some(SpreadQuery { cluster, engine, state, logical, is_optimized, memory, contexts })
     }
 
     // As DataFusion builds it, except for the memory pool.
@@ -511,6 +542,15 @@ impl Session {
     /// Returns the views with their definitions, SQL over the tables.
     pub fn view_definitions(&self) -> impl Iterator<Item = (&'static str, String)> {
         self.engine.catalog().view_definitions()
+    }
+}
+
+#[cfg(test)]
+impl Session {
+    /// Plans a query for this process.
+    pub(crate) async fn plan_locally(&self, sql: &str) -> Arc<dyn datafusion::physical_plan::ExecutionPlan> {
+        let prepared = self.prepare(sql).await.unwrap_or_else(|e| panic!("{sql}: {e}"));
+        prepared.state.create_physical_plan(&prepared.plan).await.unwrap_or_else(|e| panic!("{sql}: {e}"))
     }
 }
 

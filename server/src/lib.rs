@@ -1,5 +1,5 @@
 //! The lake over HTTP, Arrow Flight SQL and Postgres wire, reading only. A server is a door, which clients reach, and
-//! an engine process for each client, which parses and runs what it asks.
+//! two engine processes, which parse and run what clients ask. Heavy queries may run on workers of other machines.
 //!
 //! ```no_run,standalone_crate
 //! # async fn example(settings: echolake_server::ServerSettings) -> Result<(), Box<dyn std::error::Error>> {
@@ -22,8 +22,10 @@ pub mod fuzzing;
 mod metrics;
 mod process_memory;
 mod random_id;
+mod worker;
 
 pub use catalogue_pages::CataloguePages;
 pub use door::{AgentDoor, CertificateFiles, EngineSettings, LakeServer, ServerSettings};
 pub use echolake_access::tokens;
 pub use echolake_service::{EngineRole, Error};
+pub use worker::{LakeWorker, WorkerSettings, program_build};

@@ -2,14 +2,17 @@
 //! their part to the door, which alone has figures.
 
 mod gauges;
+mod workers;
 
 use echolake_lake::CacheCounts;
+use echolake_query::{SpreadCounts, WorkerState};
 use echolake_service::{FaultCode, QueryEnd, RequestFault, ServerProtocol};
 use prometheus::{
     HistogramOpts, HistogramVec, IntCounter, IntCounterVec, IntGauge, Opts, Registry, Result, TextEncoder,
 };
 
 pub(crate) use gauges::{DiskSpace, EngineGauges, ServerGauges};
+use workers::WorkerMetrics;
 
 /// Upper bounds of the buckets of a query's time, in seconds.
 const BUCKETS: [f64; 7] = [0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 10.0];
@@ -29,6 +32,7 @@ pub(crate) struct ServerMetrics {
     cache_blocks: IntCounterVec,
     cache_requests: IntCounter,
     cache_bytes: IntCounter,
+    workers: WorkerMetrics,
 }
 
 impl ServerMetrics {
@@ -42,6 +46,7 @@ impl ServerMetrics {
         let request_time = histogram("echolake_http_request_seconds", "Time of a request, to the head of its answer.");
         let registry = Registry::new();
         let metrics = Self {
+            workers: WorkerMetrics::register_new(&registry)?,
             registry,
             queries: IntCounterVec::new(
                 Opts::new("echolake_queries_total", "Queries that were begun."),
@@ -129,6 +134,12 @@ impl ServerMetrics {
         }
         self.cache_requests.inc_by(requests);
         self.cache_bytes.inc_by(fetched_bytes);
+    }
+
+    /// Takes what an engine has spread over workers, and what it was told by them.
+    pub fn set_workers(&self, counts: &SpreadCounts, workers: &[WorkerState]) {
+        self.workers.count_spread(counts);
+        self.workers.set_workers(workers);
     }
 
     /// Counts a failed request.

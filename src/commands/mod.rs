@@ -39,6 +39,8 @@ pub(crate) mod twin;
 pub(crate) mod upkeep;
 #[cfg(feature = "upload")]
 pub(crate) mod upload;
+#[cfg(feature = "lake")]
+mod workers;
 
 use std::net::SocketAddr;
 use std::path::Path;

@@ -10,6 +10,7 @@ use std::time::Duration;
 
 use anyhow::Context as _;
 use echolake_lake::{Lake, remote_access};
+use echolake_query::ClusterSettings;
 use echolake_schema::ProjectName;
 use echolake_server::certificate::self_signed;
 use echolake_server::engine::{EngineOptions, confinement, run_engine};
@@ -20,6 +21,7 @@ use echolake_server::{
 use tokio::signal::unix::{SignalKind, signal};
 
 use super::cache::CacheArgs;
+use super::workers::{WorkerArgs, read_engine_workers};
 use crate::CommandOutcome;
 use crate::duration::parse_duration;
 use crate::logging::child_variable;
@@ -45,8 +47,8 @@ pub(crate) struct ServeArgs {
     /// File of tokens; without it only this machine has access. `echolake token` makes its lines.
     #[arg(long, value_name = "FILE")]
     tokens: Option<PathBuf>,
-    /// Certificate of the server (PEM), with which all connections to it are encrypted; renewed files are taken while
-    /// it runs.
+    /// Certificate of the server or worker (PEM), with which all connections to it are encrypted; renewed files are
+    /// taken while it runs.
     #[arg(long, value_name = "FILE", requires = "key")]
     certificate: Option<PathBuf>,
     /// Private key of the certificate (PEM).
@@ -61,6 +63,8 @@ pub(crate) struct ServeArgs {
     /// Time for which answers may go on after SIGTERM or Ctrl-C, as 30s or 5m; nothing new is taken meanwhile.
     #[arg(long, value_name = "TIME", default_value = "30s", value_parser = parse_duration)]
     drain: Duration,
+    #[command(flatten)]
+    workers: WorkerArgs,
     #[command(flatten)]
     queries: QueryArgs,
 }
@@ -129,12 +133,21 @@ impl EngineArgs {
             .into_iter()
             .chain(cache.as_ref().map(|cache| cache.path.as_path()))
             .collect();
+        let workers = self.read_workers()?.map_or_else(Vec::new, |workers| workers.ports());
         let confined = match (&self.confine_to, remote_access(lake_url)) {
-            (Some(lake), _) => confinement::confine_files(lake, &own),
-            (None, Some(store)) => confinement::confine_to_store(&store, &own),
+            (Some(lake), _) => confinement::confine_files(lake, &own, &workers),
+            (None, Some(store)) => confinement::confine_to_store(&store, &own, &workers),
             (None, None) => Ok(()),
         };
         confined.context("the engine cannot be confined")
+    }
+
+    // The program's own statements are light, so that the engine of pages connects to no workers.
+    fn read_workers(&self) -> anyhow::Result<Option<ClusterSettings>> {
+        match self.role {
+            EngineRole::Pages => Ok(None),
+            EngineRole::Statements => read_engine_workers(),
+        }
     }
 }
 
@@ -144,7 +157,8 @@ pub(crate) async fn serve_engine(args: &EngineArgs, lake_url: &str) -> anyhow::R
     let _ignored = signal(SignalKind::terminate()).context("cannot listen to SIGTERM")?;
     let lake = args.cache.open_lake(lake_url).await?;
     let slow = args.log_slow_ms.map(Duration::from_millis);
-    let options = EngineOptions { role: args.role, sockets: &args.sockets, memory: args.memory_bytes, slow };
+    let workers = args.read_workers()?;
+    let options = EngineOptions { role: args.role, sockets: &args.sockets, memory: args.memory_bytes, slow, workers };
     run_engine(&lake, options).await?;
     Ok(CommandOutcome::Whole)
 }
@@ -179,24 +193,48 @@ impl ListenAddress {
 /// The default address of HTTP.
 const HTTP: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 8080);
 
+impl ServeArgs {
+    /// Gives up what a worker does not need; a server's engines do so themselves. To be called before there are threads.
+    pub fn confine_process(&self, lake_url: &str) -> anyhow::Result<()> {
+        match self.workers.worker_address() {
+            Some(_) => self.workers.confine_worker(lake_url, &self.queries.cache, self.certificate_files().as_ref()),
+            None => Ok(()),
+        }
+    }
+
+    /// Returns whether it has no clients but servers.
+    #[cfg(feature = "otlp")]
+    pub fn is_worker(&self) -> bool {
+        self.workers.worker_address().is_some()
+    }
+
+    fn certificate_files(&self) -> Option<CertificateFiles> {
+        let (certificate, key) = self.certificate.clone().zip(self.key.clone())?;
+        Some(CertificateFiles { certificate, key })
+    }
+}
+
 pub(crate) async fn run_serve(args: &ServeArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
+    if let Some(address) = args.workers.worker_address() {
+        let memory = (args.queries.memory as usize) << 20;
+        let worker = args.workers.run_worker(address, lake_url, &args.queries.cache, args.certificate_files(), memory);
+        return worker.await;
+    }
     let reply = format!("stopping: answers may go on for {:?}; Ctrl-C again stops at once", args.drain);
     let stop = StopRequest::listen(reply)?;
     let lake = args.queries.open_lake(lake_url).await?;
+    let mut engines = args.queries.engine_settings(&lake)?;
+    engines.statement_environment.extend(args.workers.engine_variable()?);
     let settings = ServerSettings {
         http: args.listen.socket_address(),
         flight_sql: args.flight_sql.socket_address(),
         #[cfg(feature = "postgres")]
         postgres: args.postgres.socket_address(),
         tokens: args.tokens.as_deref().map(TokenFile::read_from).transpose()?,
-        certificate: args
-            .certificate
-            .clone()
-            .zip(args.key.clone())
-            .map(|(certificate, key)| CertificateFiles { certificate, key }),
+        certificate: args.certificate_files(),
         is_behind_proxy: args.plain_text_behind_a_proxy,
         drain: args.drain,
-        engines: args.queries.engine_settings(&lake)?,
+        engines,
     };
     let addresses = [
         args.listen,
@@ -249,6 +287,7 @@ fn default_engine_settings(memory_mib: u32) -> anyhow::Result<EngineSettings> {
     Ok(EngineSettings {
         program,
         environment: vec![(name.to_owned(), value.to_owned())],
+        statement_environment: Vec::new(),
         memory: (memory_mib as usize) << 20,
         temp: None,
         slow: None,

@@ -43,6 +43,7 @@ mod serve {
     pub(crate) mod tunnel;
 }
 mod sql_differences;
+mod workers;
 
 use std::path::PathBuf;
 
@@ -85,6 +86,8 @@ enum CampaignCommand {
     EngineKills(engine_kills::EngineKillsArgs),
     /// Compare generated SQL with DuckDB, and shrink what differs.
     SqlDifferences(sql_differences::SqlDifferenceArgs),
+    /// Compare answers over workers with those of one process, also while workers are killed.
+    Workers(workers::WorkersArgs),
     /// Measure how soon the server is idle after a query is ended.
     Cancels(cancels::CancelArgs),
     /// Measure ingest, queries, readers and other things beside peers and limits.
@@ -106,6 +109,7 @@ fn main() -> Result<()> {
         CampaignCommand::HostileClients(args) => hostile_clients::run_hostile_clients(&args),
         CampaignCommand::EngineKills(args) => engine_kills::run_engine_kills(&args),
         CampaignCommand::SqlDifferences(args) => sql_differences::compare_with_duckdb(&args),
+        CampaignCommand::Workers(args) => workers::run_workers(&args),
         CampaignCommand::Cancels(args) => cancels::run_cancel_campaign(&args),
         CampaignCommand::Bench(args) => bench::run_bench(&args),
         CampaignCommand::Motion(args) => motion::run_motion(&args),

@@ -59,6 +59,8 @@ pub(crate) struct AnswerRows {
     /// Whether a column is of floats of 32 bits.
     is_single: Vec<bool>,
     rows: Vec<Vec<CellValue>>,
+    /// Relative tolerance of floats of 64 bits.
+    tolerance: f64,
 }
 
 /// Returns the first difference between two answers, whatever the order of their rows, if there is one.
@@ -76,7 +78,7 @@ impl AnswerRows {
     /// A column has a type that is not known here.
     pub fn read(batches: &[RecordBatch]) -> Result<Self> {
         let Some(first) = batches.first() else {
-            return Ok(Self { types: Vec::new(), is_single: Vec::new(), rows: Vec::new() });
+            return Ok(Self { types: Vec::new(), is_single: Vec::new(), rows: Vec::new(), tolerance: TOLERANCE });
         };
         let schema = first.schema();
         let kinds = || schema.fields().iter().map(|field| field.data_type());
@@ -89,7 +91,14 @@ impl AnswerRows {
             types: kinds().map(name_type).collect(),
             is_single: kinds().map(|kind| matches!(kind, DataType::Float32)).collect(),
             rows,
+            tolerance: TOLERANCE,
         })
+    }
+
+    /// Sets the relative tolerance of floats of 64 bits.
+    pub fn with_tolerance(mut self, tolerance: f64) -> Self {
+        self.tolerance = tolerance;
+        self
     }
 
     /// Returns the first difference to another answer.
@@ -104,7 +113,7 @@ impl AnswerRows {
             return Some(format!("{} columns and {}", self.types.len(), peer.types.len()));
         }
         let single = self.is_single.iter().zip(&peer.is_single).map(|(a, b)| *a || *b);
-        let tolerances: Vec<_> = single.map(|s| if s { SINGLE_TOLERANCE } else { TOLERANCE }).collect();
+        let tolerances: Vec<_> = single.map(|s| if s { SINGLE_TOLERANCE } else { self.tolerance }).collect();
         let is_same = |a: &[CellValue], b: &[CellValue]| {
             a.iter().zip(b).zip(&tolerances).all(|((a, b), tolerance)| a.is_same(b, *tolerance))
         };

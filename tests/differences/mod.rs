@@ -33,8 +33,7 @@ use echolake_testing::{SMALL_RIG, simulate_run};
 use parquet::arrow::ArrowWriter;
 use tokio::runtime::Runtime;
 
-use answer_rows::AnswerRows;
-pub(crate) use answer_rows::{RowOrder, find_difference};
+pub(crate) use answer_rows::{AnswerRows, RowOrder, find_difference};
 pub(crate) use documented::{DOCUMENTED, DocumentedDifference, find_documented};
 use documented::{PEER_SETTINGS, peer_text};
 #[cfg(all(test, feature = "lake"))]

@@ -186,7 +186,7 @@ async fn system_tables_are_listed_over_flight_sql() {
     let info = client.get_tables(wanted).await.expect("a list");
     let ticket = info.endpoint.into_iter().find_map(|endpoint| endpoint.ticket).expect("a ticket");
     let batches: Vec<_> = client.do_get(ticket).await.expect("rows").try_collect().await.expect("rows");
-    assert_eq!(batches.iter().map(|batch| batch.num_rows()).sum::<usize>(), 6);
+    assert_eq!(batches.iter().map(|batch| batch.num_rows()).sum::<usize>(), 7);
 }
 
 pub(super) async fn connect(server: &ServedLake) -> FlightSqlServiceClient<Channel> {

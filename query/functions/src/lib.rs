@@ -24,7 +24,7 @@ use comparison::{alike, diffusion};
 use geometry::{fresnel, sound, symmetry};
 use responses::{band_energy, decay, nce, octave_band, rise, room_parameters, spectrum};
 pub use standard::call_limits::{check_fixed_type, limited_functions};
-pub use standard::call_stop::{StopFlag, check_stop};
+pub use standard::call_stop::{StopFlag, check_stop, set_planning};
 pub use standard::exact_aggregates::exact_aggregates;
 pub use standard::list_members::{ANY_EQUAL, list_membership};
 pub use standard::number_ranges::whole_number_ranges;

@@ -14,6 +14,7 @@ mod piece;
 mod rows;
 mod run_sizes;
 mod scan;
+mod sent_scan;
 mod table;
 mod target;
 #[cfg(test)]
@@ -41,6 +42,8 @@ use error::Fault;
 pub use file::{Attachment, McapFiles};
 #[cfg(fuzzing)]
 pub use fuzzing::EncodedMessage;
+pub use scan::{McapExec, ScanPiece};
+pub use sent_scan::{decode_mcap_scan, encode_mcap_scan};
 use target::Target;
 
 /// What one of the functions may be called with, for whoever calls it otherwise.

@@ -47,8 +47,8 @@ struct ReadSizes {
 /// What all partitions of all scans of a table share.
 #[derive(Debug)]
 pub(super) struct Parts {
-    /// What it is called in plans.
-    pub name: String,
+    /// None for all topics.
+    pub topic: Option<String>,
     pub files: Arc<McapFiles>,
     pub heads: Vec<Head>,
     pub sources: Vec<Source>,
@@ -92,11 +92,9 @@ pub(super) struct Scan {
 
 /// The plan of a scan.
 #[derive(Debug)]
-pub(super) struct McapExec {
+pub struct McapExec {
     scan: Arc<Scan>,
     partitions: Vec<Vec<FileRead>>,
-    /// Pieces of all its files, also those that are not read.
-    all: usize,
     properties: Arc<PlanProperties>,
     metrics: ExecutionPlanMetricsSet,
 }
@@ -109,40 +107,116 @@ struct FileRead {
     pieces: Vec<Piece>,
 }
 
+/// A piece of one of the files of a scan, which can be read on its own.
+#[derive(Debug, Clone)]
+pub struct ScanPiece {
+    pub(super) source: usize,
+    pub(super) piece: Piece,
+}
+
+impl ScanPiece {
+    /// Returns the offset of its first byte in its file.
+    pub fn start(&self) -> u64 {
+        self.piece.range.start
+    }
+
+    /// Returns its size in bytes.
+    pub fn size(&self) -> u64 {
+        self.piece.range.end - self.piece.range.start
+    }
+}
+
 impl McapExec {
-    /// A plan that reads `pieces`, each with its source, in up to `most` partitions of about the same size.
-    pub fn new(scan: Scan, pieces: Vec<(usize, Piece)>, all: usize, most: usize) -> Self {
-        let count = pieces.len();
-        let bytes: u64 = pieces.iter().map(|(_, p)| p.range.end - p.range.start).sum();
-        let sizes = if scan.parts.files.are_in_folder() { DISK_READS } else { STORE_READS };
+    /// A plan that reads `pieces` in up to `most` partitions of about the same size.
+    pub(super) fn new(scan: Scan, pieces: Vec<ScanPiece>, most: usize) -> Self {
+        let bytes: u64 = pieces.iter().map(ScanPiece::size).sum();
         let share = bytes.div_ceil(most.max(1) as u64).max(1);
-        let mut partitions: Vec<Vec<FileRead>> = vec![Vec::new()];
+        let mut partitions = vec![Vec::new()];
         let mut taken = 0;
-        for (source, piece) in pieces {
+        for piece in pieces {
             if taken >= share {
                 partitions.push(Vec::new());
                 taken = 0;
             }
-            taken += piece.range.end - piece.range.start;
-            if let Some(reads) = partitions.last_mut() {
-                add_piece(reads, source, piece, &sizes);
+            taken += piece.size();
+            if let Some(pieces) = partitions.last_mut() {
+                pieces.push(piece);
             }
         }
-        let properties = PlanProperties::new(
-            EquivalenceProperties::new(scan.schema.clone()),
-            Partitioning::UnknownPartitioning(partitions.len()),
-            EmissionType::Incremental,
-            Boundedness::Bounded,
-        );
-        let properties = Arc::new(properties.with_scheduling_type(SchedulingType::Cooperative));
-        let metrics = ExecutionPlanMetricsSet::new();
-        MetricBuilder::new(&metrics).global_counter("chunks_pruned").add(all - count);
-        Self { scan: Arc::new(scan), partitions, all, properties, metrics }
+        let plan = Self::from_partitions(Arc::new(scan), partitions);
+        let read: usize = plan.partitions.iter().flatten().map(|read| read.pieces.len()).sum();
+        MetricBuilder::new(&plan.metrics).global_counter("chunks_pruned").add(plan.count_pieces() - read);
+        plan
+    }
+
+    // Pieces of all its files, also those that are not read.
+    fn count_pieces(&self) -> usize {
+        self.scan.parts.sources.iter().map(|source| source.file.pieces.len()).sum()
+    }
+
+    /// A plan of these partitions.
+    pub(super) fn from_partitions(scan: Arc<Scan>, partitions: Vec<Vec<ScanPiece>>) -> Self {
+        let sizes = if scan.parts.files.are_in_folder() { DISK_READS } else { STORE_READS };
+        let join = |mut pieces: Vec<ScanPiece>| {
+            pieces.sort_by_key(|piece| (piece.source, piece.piece.range.start));
+            let mut reads = Vec::new();
+            pieces.into_iter().for_each(|piece| add_piece(&mut reads, piece, &sizes));
+            reads
+        };
+        let partitions: Vec<_> = partitions.into_iter().map(join).collect();
+        let properties = plan_properties(&scan.schema, partitions.len());
+        Self { scan, partitions, properties, metrics: ExecutionPlanMetricsSet::new() }
+    }
+
+    /// Counts into the metrics of another plan, too.
+    pub(super) fn with_metrics(self, metrics: ExecutionPlanMetricsSet) -> Self {
+        Self { metrics, ..self }
+    }
+
+    pub(super) fn scan(&self) -> &Scan {
+        &self.scan
+    }
+
+    /// Returns the bytes of files that it fetches. One with a limit ends early, and fetches few.
+    pub fn fetched_bytes(&self) -> u64 {
+        let reads = self.partitions.iter().flatten().filter(|_| self.scan.limit.is_none());
+        reads.map(|read| read.range.end - read.range.start).sum()
+    }
+
+    /// Returns the path of a piece's file.
+    pub fn piece_path(&self, piece: &ScanPiece) -> &str {
+        self.scan.parts.sources[piece.source].file.path.as_ref()
+    }
+
+    /// Returns the pieces that each partition reads.
+    pub fn partition_pieces(&self) -> Vec<Vec<ScanPiece>> {
+        let of_read = |read: &FileRead| {
+            let source = read.source;
+            read.pieces.clone().into_iter().map(move |piece| ScanPiece { source, piece })
+        };
+        self.partitions.iter().map(|reads| reads.iter().flat_map(of_read).collect()).collect()
+    }
+
+    /// Returns a plan that reads these pieces of it, in these partitions.
+    pub fn with_partitions(&self, partitions: Vec<Vec<ScanPiece>>) -> Self {
+        Self::from_partitions(self.scan.clone(), partitions)
     }
 }
 
+/// Returns what operators above a scan may rely on.
+pub(super) fn plan_properties(schema: &SchemaRef, partitions: usize) -> Arc<PlanProperties> {
+    let properties = PlanProperties::new(
+        EquivalenceProperties::new(schema.clone()),
+        Partitioning::UnknownPartitioning(partitions),
+        EmissionType::Incremental,
+        Boundedness::Bounded,
+    );
+    Arc::new(properties.with_scheduling_type(SchedulingType::Cooperative))
+}
+
 // To the last read, where the piece is near enough, or as another one.
-fn add_piece(reads: &mut Vec<FileRead>, source: usize, piece: Piece, sizes: &ReadSizes) {
+fn add_piece(reads: &mut Vec<FileRead>, piece: ScanPiece, sizes: &ReadSizes) {
+    let ScanPiece { source, piece } = piece;
     let near = |r: &&mut FileRead| {
         let gap = piece.range.start.checked_sub(r.range.end);
         r.source == source && gap.is_some_and(|gap| gap <= sizes.gap) && piece.range.end - r.range.start <= sizes.most
@@ -160,10 +234,13 @@ impl DisplayAs for McapExec {
     fn fmt_as(&self, _: DisplayFormatType, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let chosen: usize = self.partitions.iter().flatten().map(|read| read.pieces.len()).sum();
         let bytes: u64 = self.partitions.iter().flatten().map(|read| read.range.end - read.range.start).sum();
-        let parts = &self.scan.parts;
         let fields = self.scan.schema.fields();
         let columns: Vec<_> = fields.iter().map(|f| f.name().as_str()).collect();
-        write!(f, "McapExec: {}, files={}, chunks={chosen} of {}", parts.name, parts.sources.len(), self.all)?;
+        match &self.scan.parts.topic {
+            Some(topic) => write!(f, "McapExec: topic={topic}")?,
+            None => write!(f, "McapExec: all topics")?,
+        }
+        write!(f, ", files={}, chunks={chosen} of {}", self.scan.parts.sources.len(), self.count_pieces())?;
         write!(f, ", bytes={bytes}, columns=[{}]", columns.join(", "))?;
         match self.scan.limit {
             Some(limit) => write!(f, ", limit={limit}"),

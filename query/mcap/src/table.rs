@@ -21,7 +21,7 @@ use super::encodings::{MessageLayout, RawSchema, is_supported};
 use super::error::Fault;
 use super::file::{Channel, McapFile, McapFiles};
 use super::rows::{Head, Mapping};
-use super::scan::{McapExec, Parts, Scan, Source};
+use super::scan::{McapExec, Parts, Scan, ScanPiece, Source};
 use super::target::Target;
 
 /// Topics that a hint lists.
@@ -34,8 +34,8 @@ const PREFIX: &str = "message_";
 /// Messages of some files.
 #[derive(Debug)]
 pub(super) struct McapTable {
-    schema: SchemaRef,
-    parts: Arc<Parts>,
+    pub schema: SchemaRef,
+    pub parts: Arc<Parts>,
 }
 
 /// The table of a topic's messages, a column a field.
@@ -57,8 +57,7 @@ pub(super) fn decoded_table(targets: Vec<Target>, topic: &str, files: &Arc<McapF
     let sources = targets.iter().map(source).collect();
     let heads = Head::OF_COLUMNS.to_vec();
     let (schema, mappings) = layouts.into_schema(&heads, topic)?;
-    let name = format!("topic={topic}");
-    let parts = Parts { name, files: files.clone(), heads, sources, mappings: Some(mappings) };
+    let parts = Parts { topic: Some(topic.to_owned()), files: files.clone(), heads, sources, mappings: Some(mappings) };
     Ok(McapTable { schema, parts: Arc::new(parts) })
 }
 
@@ -79,9 +78,9 @@ pub(super) fn message_table(
     };
     let heads = Head::OF_MESSAGES.to_vec();
     let schema = Arc::new(Schema::new(heads.iter().map(|h| h.column_field()).collect::<Vec<_>>()));
-    let name = topic.map_or_else(|| "all topics".to_owned(), |topic| format!("topic={topic}"));
     let sources = targets.into_iter().map(source).collect();
-    let parts = Parts { name, files: files.clone(), heads, sources, mappings: None };
+    let topic = topic.map(str::to_owned);
+    let parts = Parts { topic, files: files.clone(), heads, sources, mappings: None };
     Ok(McapTable { schema, parts: Arc::new(parts) })
 }
 
@@ -255,15 +254,15 @@ impl McapTable {
         let times = filters.iter().filter_map(times_of).reduce(intersect_ranges);
         let shown = self.shown_sources(filters.iter().filter(|f| is_of_runs(f)), state)?;
         let sources = &self.parts.sources;
-        let all = sources.iter().map(|source| source.file.pieces.len()).sum();
-        let pieces = sources.iter().enumerate().filter(|(i, _)| shown[*i]);
-        let pieces = pieces
-            .flat_map(|(i, source)| source.pieces_within(times.as_ref()).map(move |piece| (i, piece.clone())))
-            .collect();
+        let shown = sources.iter().enumerate().filter(|(source, _)| shown[*source]);
+        let pieces = shown.flat_map(|(source, of)| {
+            of.pieces_within(times.as_ref()).map(move |piece| ScanPiece { source, piece: piece.clone() })
+        });
+        let pieces = pieces.collect();
         let projection = projection.cloned().unwrap_or_else(|| (0..self.schema.fields().len()).collect());
         let schema = Arc::new(self.schema.project(&projection)?);
         let scan = Scan { parts: self.parts.clone(), schema, projection, times, limit };
-        Ok(Arc::new(McapExec::new(scan, pieces, all, state.config().target_partitions())))
+        Ok(Arc::new(McapExec::new(scan, pieces, state.config().target_partitions())))
     }
 
     // Which files pass the filters of surface and run.

@@ -77,7 +77,7 @@ fn matching_runs(pattern: &str, snapshot: &LakeSnapshot) -> Result<Vec<Meant>, F
 }
 
 // Only files that are named as recordings are, by the very place that they have in the lake's store.
-fn parse_path(text: &str) -> Result<Path, Fault> {
+pub(super) fn parse_path(text: &str) -> Result<Path, Fault> {
     let wrong = |why: &str| {
         Fault::invalid_call(format!("`{text}` is no file in the lake: {why}"), format!("it may be {FORMS}"))
     };

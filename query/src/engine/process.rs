@@ -1,7 +1,7 @@
 //! What a process has of an engine, whoever reads: memory, disk, footers of files, functions, threads, running queries.
 
 use std::collections::{BTreeSet, VecDeque};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 use datafusion::error::DataFusionError;
 use datafusion::execution::FunctionRegistry as _;
@@ -27,12 +27,13 @@ use crate::control::RunningQueries;
 use crate::control::seats::SeatPool;
 use crate::control::threads::{QueryThreads, count_cores};
 use crate::control::turns::TurnQueue;
+use crate::spread::{ReadOnlyStore, WorkerCluster};
 use crate::statement::{EndingRule, FloatForms, IntegerArithmetic, LimitedOperators, SubqueryConditions};
 use crate::views::LookupFunctions;
 use crate::{Error, OpaqueValue};
 
 /// URL of the lake's store. No other store is registered, so no query can reach a file outside of the lake.
-const STORE: &str = "echolake://lake/";
+pub(crate) const STORE: &str = "echolake://lake/";
 /// URL of the store that DataFusion registers by default: the whole machine.
 const MACHINE: &str = "file:///";
 /// Rows per batch: at 384 samples each, 3 MB of responses.
@@ -67,6 +68,8 @@ pub(crate) struct EngineProcess {
     pub own: BTreeSet<String>,
     /// A thread for timeouts, which busy query threads cannot delay.
     pub watch: QueryThreads,
+    /// Workers for heavy queries; none without `--workers`.
+    pub cluster: OnceLock<Arc<WorkerCluster>>,
     rights: CatalogCache,
 }
 
@@ -94,6 +97,7 @@ impl EngineProcess {
             memory: limits.memory,
             own: functions.names().map(str::to_owned).collect(),
             watch: QueryThreads::new("query-watch", 1).map_err(threads)?,
+            cluster: OnceLock::new(),
             rights: CatalogCache::default(),
         })
     }
@@ -229,7 +233,7 @@ fn session_config() -> SessionConfig {
 fn build_runtime(lake: &Lake, url: &ObjectStoreUrl, memory: Option<usize>) -> Result<Arc<RuntimeEnv>, DataFusionError> {
     let stores = DefaultObjectStoreRegistry::new();
     stores.deregister_store(ObjectStoreUrl::parse(MACHINE)?.as_ref())?;
-    stores.register_store(url.as_ref(), lake.store());
+    stores.register_store(url.as_ref(), Arc::new(ReadOnlyStore::new(lake.store())));
     let mut builder = RuntimeEnvBuilder::new();
     if let Some(memory) = memory {
         builder = builder.with_memory_pool(Arc::new(GreedyMemoryPool::new(memory)));

@@ -5,8 +5,6 @@ use std::sync::{Arc, Weak};
 use arrow::datatypes::SchemaRef;
 use arrow::record_batch::RecordBatch;
 use datafusion::error::DataFusionError;
-use datafusion::execution::TaskContext;
-use datafusion::physical_plan::{ExecutionPlan, execute_stream};
 use futures::StreamExt as _;
 use tokio::sync::mpsc;
 use tokio::sync::mpsc::error::TrySendError;
@@ -16,6 +14,7 @@ use crate::Error;
 use crate::client::QueryPermit;
 use crate::control::{QueryTicket, StopReason};
 use crate::engine::{self, QueryEngine};
+use crate::spread::attempts::QueryAttempts;
 
 /// A stream of answer batches. Dropping it cancels the query.
 pub struct QueryAnswer {
@@ -96,8 +95,7 @@ impl Drop for QueryAnswer {
 // Runs a query. It holds its permit until its operators are dropped, even if the reader is gone; then turn and seat are
 // free, even if the reader has rows to fetch.
 pub(super) async fn drive_query(
-    plan: Arc<dyn ExecutionPlan>,
-    context: Arc<TaskContext>,
+    attempts: QueryAttempts,
     send: mpsc::Sender<Result<RecordBatch, DataFusionError>>,
     engine: QueryEngine,
     ticket: Arc<QueryTicket>,
@@ -106,23 +104,19 @@ pub(super) async fn drive_query(
     tokio::select! {
         biased;
         _ = ticket.wait_for_stop() => {}
-        () = send_batches(plan, context, &send, &engine, &ticket) => {}
+        () = send_batches(attempts, &send, &engine, &ticket) => {}
     }
     ticket.end_computing();
 }
 
 // An error of `send` means that the answer was dropped. While the reader does not fetch, others have the turn.
 async fn send_batches(
-    plan: Arc<dyn ExecutionPlan>,
-    context: Arc<TaskContext>,
+    attempts: QueryAttempts,
     send: &mpsc::Sender<Result<RecordBatch, DataFusionError>>,
     engine: &QueryEngine,
     ticket: &QueryTicket,
 ) {
-    let mut batches = match execute_stream(plan, context) {
-        Ok(batches) => batches,
-        Err(error) => return drop(send.send(Err(error)).await),
-    };
+    let mut batches = std::pin::pin!(attempts.into_batches());
     while let Some(batch) = batches.next().await {
         let has_failed = batch.is_err();
         match send.try_send(batch) {

@@ -111,6 +111,35 @@ async fn calls_within_the_limits_answer_as_without() {
     }
 }
 
+/// Large constants are repeated for the rows of small batches, and an aggregate counts what it keeps of them.
+#[tokio::test]
+async fn large_constants_are_rows_of_small_batches() {
+    let limited = session(Some(1 << 30)).await;
+    for (sql, expected) in [
+        ("select length(string_agg(repeat('x', 1000000), ',')) from generate_series(1,20) t(v)", "20000019"),
+        ("select cardinality(array_agg(range(0,100000))) from generate_series(1,100) t(v)", "10000000"),
+        (
+            "select max(length(s['a'])) from (select named_struct('a', repeat('x', 1000000 + v * 0)) s, v \
+          from generate_series(1,30) t(v))",
+            "1000000",
+        ),
+    ] {
+        let given = answered(&limited, sql).await.unwrap_or_else(|error| panic!("{sql}: {error}"));
+        assert!(given.contains(expected), "{sql}: {given}");
+    }
+    for sql in [
+        "select length(string_agg(repeat('x', 1000000), ',')) from generate_series(1,100000) t(v)",
+        "select cardinality(array_agg(range(0,100000))) from generate_series(1,100000) t(v)",
+    ] {
+        let refused = answered(&limited, sql).await.expect_err(sql);
+        assert!(matches!(refused, Error::MemoryLimit { .. }), "{sql}: {refused}");
+    }
+    // What the plan has no room for is computed when it runs.
+    let calls: Vec<_> = (0..10).map(|n| format!("length(repeat('x', 20000000 + {n})) c{n}")).collect();
+    let given = answered(&limited, &format!("select {}", calls.join(", "))).await.expect("lengths");
+    assert!(given.contains("20000000") && given.contains("20000009"), "{given}");
+}
+
 mod slow {
     use std::time::Instant;
 

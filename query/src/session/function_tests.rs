@@ -175,8 +175,8 @@ fn example(documentation: &datafusion::logical_expr::Documentation) -> (String, 
     (query.to_owned(), answer.to_owned())
 }
 
-// The documented examples: the function's name, the query and its answer.
-pub(super) fn examples() -> Vec<(String, String, String)> {
+/// Returns the documented examples: the function's name, the query and its answer.
+pub(crate) fn examples() -> Vec<(String, String, String)> {
     let functions = FunctionSet::all(&Rig::paper()).expect("the built-in rig is valid");
     let scalar = functions.scalar().iter().map(|f| (f.name(), f.documentation()));
     let all = scalar.chain(functions.aggregate().iter().map(|f| (f.name(), f.documentation())));

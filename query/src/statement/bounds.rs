@@ -16,6 +16,8 @@ const MOST_NESTED: usize = 100;
 /// Maximum number of operators and suffixes of one expression; also of set operators and joins of one query. Twice as
 /// many are still harmless.
 const MOST_CHAINED: usize = 1_000;
+/// Maximum number of arms of one CASE: the planner looks at each of them many times.
+const MOST_ARMS: usize = 10_000;
 /// Maximum number of statements in one text.
 const MOST_STATEMENTS: usize = 1_000;
 /// Maximum doublings of the parser's time: 2^14 tries take a few hundredths of a second.
@@ -67,6 +69,8 @@ const BRANCH_WORDS: [&str; 3] = ["WHEN", "THEN", "ELSE"];
 struct OpenBracket {
     is_case: bool,
     has_with: bool,
+    /// Arms of a CASE.
+    arms: usize,
     /// Operators since the last comma, or the last word between branches.
     operators: usize,
     /// Set operators and joins.
@@ -142,7 +146,13 @@ pub fn check_statement_bounds(sql: &str, dialect: &dyn Dialect) -> Result<(), Er
             Token::Word(word) if is_one_of(word, &["CASE"]) => {
                 open.push(OpenBracket { is_case: true, ..OpenBracket::default() });
             }
-            Token::Word(word) if innermost.is_case && is_one_of(word, &BRANCH_WORDS) => innermost.operators = 0,
+            Token::Word(word) if innermost.is_case && is_one_of(word, &BRANCH_WORDS) => {
+                innermost.operators = 0;
+                innermost.arms += usize::from(is_one_of(word, &["WHEN"]));
+                if innermost.arms > MOST_ARMS {
+                    return refuse_excess("arms in one CASE", MOST_ARMS, "a join with VALUES takes long lists");
+                }
+            }
             Token::Word(word) if innermost.is_case && is_one_of(word, &["END"]) => drop(open.pop()),
             Token::Word(word) if is_one_of(word, &QUERY_OPERATORS) => innermost.query_operators += 1,
             Token::Word(word) if is_one_of(word, &["WITH"]) => {

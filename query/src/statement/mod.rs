@@ -14,6 +14,7 @@ mod declared_types;
 mod dialect;
 mod distinct_operands;
 mod ending_rules;
+mod expansion;
 mod float_forms;
 mod gate;
 pub(crate) mod hints;
@@ -96,6 +97,7 @@ pub(crate) async fn prepare_statement(
 ) -> Result<LogicalPlan, Error> {
     rewrite::rewrite_statement(&mut statement, state, sql)?;
     gate::check_reading(&statement)?;
+    expansion::check_expansion(&statement)?;
     clauses::check_clauses(&statement, sql, state)?;
     let described = match described_query(&statement) {
         Some(query) => Some(Arc::new(plan_statement(sql, query, state).await?.schema().as_arrow().clone())),

@@ -1,12 +1,13 @@
 //! Tables of the schema `system`: versions and files of the lake and how its runs came into it, all as the query's
-//! snapshot has them; run files that are not in it yet; and those that the program around the engine has of
-//! itself ([`SystemSource`]).
+//! snapshot has them; run files that are not in it yet; those that the program around the engine has of itself
+//! ([`SystemSource`]), and its workers.
 
 mod files;
 mod inbox;
 mod ingests;
 mod source;
 mod versions;
+mod workers;
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -31,6 +32,9 @@ use ingests::LakeIngests;
 use source::SourceRows;
 pub use source::SystemSource;
 use versions::LakeVersions;
+use workers::ClusterWorkers;
+
+use crate::spread::WorkerCluster;
 
 /// The schema of the system tables.
 pub const SYSTEM_SCHEMA: &str = "system";
@@ -109,16 +113,26 @@ pub(crate) fn system_meaning(name: &str) -> Option<&'static str> {
         }
         "queries" => "One row per query of the server that runs, or ran lately: client, statement, times, outcome.",
         "connections" => "One row per open connection to the server: client, protocol, address.",
+        "workers" => "One row per worker over which heavy queries are spread: address, state, figures.",
         _ => return None,
     })
 }
 
-/// Returns the tables that the program around the engine has of itself.
-pub(crate) fn engine_tables(source: &Arc<dyn SystemSource>) -> Vec<(&'static str, Arc<dyn TableProvider>)> {
+/// Returns the tables that the program around the engine has of itself, and that of the engine's workers. A server has
+/// the latter even without workers, so that its tables are the same in all of its engines.
+pub(crate) fn engine_tables(
+    source: Option<&Arc<dyn SystemSource>>,
+    cluster: Option<&Arc<WorkerCluster>>,
+) -> Vec<(&'static str, Arc<dyn TableProvider>)> {
+    let make_table = |rows: Box<dyn SystemRows>| Arc::new(SystemTable(rows)) as Arc<dyn TableProvider>;
     let mut tables = Vec::new();
-    for (name, schema) in source.table_schemas() {
-        let rows = SourceRows { source: source.clone(), name, schema };
-        tables.push((name, Arc::new(SystemTable(Box::new(rows))) as Arc<dyn TableProvider>));
+    if source.is_some() || cluster.is_some() {
+        tables.push(("workers", make_table(Box::new(ClusterWorkers { cluster: cluster.cloned() }))));
+    }
+    if let Some(source) = source {
+        for (name, schema) in source.table_schemas() {
+            tables.push((name, make_table(Box::new(SourceRows { source: source.clone(), name, schema }))));
+        }
     }
     tables
 }

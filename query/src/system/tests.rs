@@ -12,7 +12,7 @@ use object_store::ObjectStoreExt as _;
 use object_store::path::Path;
 
 use super::SystemSource;
-use crate::{EngineClient, Error, QueryEngine, QueryQuota, Session};
+use crate::{ClusterSettings, EngineClient, Error, QueryEngine, QueryQuota, Session, WorkerCluster};
 
 #[derive(Debug)]
 struct Numbers;
@@ -105,5 +105,28 @@ async fn a_source_adds_tables() {
     let with = session(Some(Arc::new(Numbers))).await;
     assert_eq!(number(&with, "select cast(sum(n) as bigint) from system.numbers where n > 1").await, 2);
     let listed = "select count(*) from information_schema.tables where table_schema = 'system'";
-    assert_eq!(number(&with, listed).await, 5);
+    assert_eq!(number(&with, listed).await, 6);
+    assert_eq!(number(&with, "select count(*) from system.workers").await, 0);
+}
+
+#[tokio::test]
+async fn a_cluster_adds_its_workers() {
+    let lake = empty_lake().await;
+    let without = session_of(&lake, None);
+    assert!(matches!(without.query("select * from system.workers").await, Err(Error::Query { .. })));
+    let engine = QueryEngine::new(&lake, None).expect("an engine");
+    let settings = ClusterSettings {
+        workers: vec!["http://127.0.0.1:1".to_owned(), "http://127.0.0.1:2".to_owned()],
+        token: None,
+        authorities: None,
+        least_bytes: 0,
+        build: "0.1.0-test".to_owned(),
+    };
+    engine.spread_over(Arc::new(WorkerCluster::new(&settings, "a lake").expect("a cluster")));
+    // For readers with any right.
+    let restricted = lake.restricted_to(["ours".parse().expect("a name")].into());
+    for engine in [engine.of_lake(&restricted).expect("the same lake"), engine] {
+        let session = engine.open_session(&Arc::new(EngineClient::new("test", QueryQuota::default())));
+        assert_eq!(number(&session, "select count(*) from system.workers where state = 'not used'").await, 2);
+    }
 }

@@ -31,6 +31,7 @@ fn grpc_code(code: FaultCode) -> Grpc {
         FaultCode::Execution | FaultCode::Changed | FaultCode::Precondition => Grpc::FailedPrecondition,
         FaultCode::Taken | FaultCode::Unconfirmed => Grpc::FailedPrecondition,
         FaultCode::Lake | FaultCode::Unwritable | FaultCode::Stopping | FaultCode::NotReady => Grpc::Unavailable,
+        FaultCode::WorkerLost => Grpc::Unavailable,
         FaultCode::Unsupported => Grpc::Unimplemented,
         FaultCode::NotFound | FaultCode::Gone | FaultCode::NoData => Grpc::NotFound,
         FaultCode::Range => Grpc::OutOfRange,

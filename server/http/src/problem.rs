@@ -134,6 +134,7 @@ fn status_and_title(code: FaultCode) -> (StatusCode, &'static str) {
         FaultCode::RowLimit => (StatusCode::UNPROCESSABLE_ENTITY, "The answer is too long"),
         FaultCode::TooMany => (StatusCode::TOO_MANY_REQUESTS, "Too much at once"),
         FaultCode::EngineEnded => (StatusCode::INTERNAL_SERVER_ERROR, "The query ended its engine"),
+        FaultCode::WorkerLost => (StatusCode::SERVICE_UNAVAILABLE, "A worker was lost"),
         FaultCode::Internal => (StatusCode::INTERNAL_SERVER_ERROR, "The server failed"),
         FaultCode::Stopping => (StatusCode::SERVICE_UNAVAILABLE, "The server is stopping"),
         FaultCode::NotReady => (StatusCode::SERVICE_UNAVAILABLE, "The server is not ready"),

@@ -47,7 +47,7 @@ fn fault_sqlstate(fault: &RequestFault) -> &'static str {
             FaultCode::ReadOnly => "25006",
             FaultCode::Execution => "22000",
             FaultCode::Format => "0A000",
-            FaultCode::Lake | FaultCode::Changed | FaultCode::Unwritable => "58030",
+            FaultCode::Lake | FaultCode::Changed | FaultCode::Unwritable | FaultCode::WorkerLost => "58030",
             FaultCode::Request | FaultCode::Method | FaultCode::Range | FaultCode::Precondition => "22023",
             FaultCode::Taken | FaultCode::Unconfirmed => "22023",
             FaultCode::Unsupported => "0A000",

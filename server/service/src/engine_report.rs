@@ -4,6 +4,7 @@ use std::io::Write as _;
 use std::sync::{Mutex, PoisonError};
 
 use echolake_lake::CacheCounts;
+use echolake_query::{SpreadCounts, WorkerState};
 use serde::{Deserialize, Serialize};
 
 use crate::activity::{ActivityTable, LakeFigures, QueryEnd, QueryStart};
@@ -27,6 +28,13 @@ pub enum EngineReport {
     Lake(Option<LakeFigures>),
     /// Counts of its cache of an object store since the last such line.
     Cache(CacheCounts),
+    /// Queries over workers since the last such line, and the workers as they were when it last asked them.
+    Workers {
+        /// The queries.
+        counts: SpreadCounts,
+        /// The workers.
+        workers: Vec<WorkerState>,
+    },
     /// It asks for rows of a table of the server's activity.
     Ask {
         /// Number of the answer.

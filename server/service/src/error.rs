@@ -95,6 +95,9 @@ pub enum Error {
     /// The `pg_catalog` tables for Postgres clients cannot be built.
     #[error("the tables of `pg_catalog` cannot be made")]
     Catalog(#[from] datafusion::error::DataFusionError),
+    /// A worker cannot be used or started so.
+    #[error(transparent)]
+    Worker(#[from] echolake_query::WorkerFault),
     /// The engine cannot be set up.
     #[error(transparent)]
     Query(#[from] echolake_query::Error),

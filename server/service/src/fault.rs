@@ -270,6 +270,8 @@ pub enum FaultCode {
     TooMany,
     /// The engine ended with the query.
     EngineEnded,
+    /// A worker was lost after rows of the query had been sent.
+    WorkerLost,
     /// A defect.
     Internal,
     /// The server is stopping.
@@ -280,7 +282,7 @@ pub enum FaultCode {
 
 impl FaultCode {
     /// All of them.
-    pub const ALL: [Self; 30] = [
+    pub const ALL: [Self; 31] = [
         Self::Query,
         Self::ReadOnly,
         Self::Execution,
@@ -308,6 +310,7 @@ impl FaultCode {
         Self::RowLimit,
         Self::TooMany,
         Self::EngineEnded,
+        Self::WorkerLost,
         Self::Internal,
         Self::Stopping,
         Self::NotReady,
@@ -343,6 +346,7 @@ impl FaultCode {
             Self::RowLimit => "row_limit",
             Self::TooMany => "too_many",
             Self::EngineEnded => "query_ended_engine",
+            Self::WorkerLost => "worker_lost",
             Self::Internal => "internal",
             Self::Stopping => "server_stopping",
             Self::NotReady => "not_ready",
@@ -403,7 +407,11 @@ impl RequestFault {
         let code = self.code();
         let text = self.to_string();
         match code {
-            FaultCode::Internal | FaultCode::Lake | FaultCode::Changed | FaultCode::EngineEnded => {
+            FaultCode::Internal
+            | FaultCode::Lake
+            | FaultCode::Changed
+            | FaultCode::EngineEnded
+            | FaultCode::WorkerLost => {
                 tracing::warn!(code = code.name(), text, "a request failed");
             }
             _ => tracing::debug!(code = code.name(), text, "a request failed"),
@@ -476,6 +484,7 @@ fn query_code(error: &QueryError) -> FaultCode {
         QueryError::MemoryLimit { .. } => FaultCode::MemoryLimit,
         QueryError::RowLimit { .. } => FaultCode::RowLimit,
         QueryError::Busy { .. } => FaultCode::TooMany,
+        QueryError::WorkerLost { .. } => FaultCode::WorkerLost,
         QueryError::Format { .. } => FaultCode::Format,
         QueryError::Write(_) | QueryError::Lake(_) => FaultCode::Lake,
     }

@@ -35,7 +35,7 @@ const STALL: Duration = Duration::from_secs(300);
 const QUIET: Duration = Duration::from_secs(1);
 
 /// An address, and its places.
-pub(super) struct ConnectionPlaces {
+pub(crate) struct ConnectionPlaces {
     listener: TcpListener,
     most: usize,
     taken: Arc<TakenPlaces>,
@@ -218,7 +218,7 @@ impl TakenPlaces {
 }
 
 /// A connection in its place. Writing fails if its client reads nothing for five minutes.
-pub(super) struct PlacedStream {
+pub(crate) struct PlacedStream {
     stream: TcpStream,
     state: Arc<PlaceState>,
     taken: Arc<TakenPlaces>,

@@ -25,7 +25,7 @@ const HANDSHAKE: Duration = Duration::from_secs(10);
 const LOOK_EVERY: Duration = Duration::from_secs(2);
 
 /// A connection, encrypted or not.
-pub(super) type DoorStream = Either<PlacedStream, Box<TlsStream<PlacedStream>>>;
+pub(crate) type DoorStream = Either<PlacedStream, Box<TlsStream<PlacedStream>>>;
 
 /// A server's certificate and key, as PEM files.
 #[derive(Debug, Clone)]
@@ -40,6 +40,18 @@ pub struct CertificateFiles {
 type FileStates = Vec<Option<(SystemTime, u64)>>;
 
 impl CertificateFiles {
+    /// Returns the folders that a confined process reads to take renewed files: those of the files, and of what they link
+    /// to.
+    pub fn folders(&self) -> Vec<PathBuf> {
+        let files = [&self.certificate, &self.key];
+        let targets = files.into_iter().filter_map(|path| path.canonicalize().ok());
+        let folder = |path: PathBuf| match path.parent() {
+            Some(parent) if !parent.as_os_str().is_empty() => parent.to_owned(),
+            _ => PathBuf::from("."),
+        };
+        files.into_iter().cloned().chain(targets).map(folder).collect()
+    }
+
     fn file_states(&self) -> FileStates {
         let state = |path: &PathBuf| {
             let about = std::fs::metadata(path).ok()?;
@@ -74,7 +86,7 @@ fn read_certificates(path: &Path) -> Result<Vec<CertificateDer<'static>>, Error>
 }
 
 /// Encryption of a server.
-pub(super) struct ServerEncryption {
+pub(crate) struct ServerEncryption {
     files: CertificateFiles,
     loaded: Arc<CertifiedKey>,
     protocols: Vec<Arc<RwLock<ProtocolTls>>>,
@@ -156,7 +168,7 @@ impl ProtocolTls {
 
 /// Encryption of one protocol's connections, or none.
 #[derive(Clone, Default)]
-pub(super) struct ProtocolEncryption(Option<Arc<RwLock<ProtocolTls>>>);
+pub(crate) struct ProtocolEncryption(Option<Arc<RwLock<ProtocolTls>>>);
 
 impl ProtocolEncryption {
     /// Returns whether connections are encrypted.

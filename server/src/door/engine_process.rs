@@ -41,6 +41,8 @@ pub struct EngineSettings {
     pub memory: usize,
     /// Variables of their environment beside the server's own.
     pub environment: Vec<(String, String)>,
+    /// Variables of the engine of statements alone, such as the token of workers.
+    pub statement_environment: Vec<(String, String)>,
     /// The folder for temporary files; None for one in the lake.
     pub temp: Option<PathBuf>,
     /// Time from which a query is logged as slow; None for never.
@@ -134,6 +136,11 @@ impl EngineProcess {
     /// # Errors
     /// The system gives no folder or process.
     pub fn spawn_process(start: EngineStart<'_>, activity: Arc<ServerActivity>) -> io::Result<Arc<Self>> {
+        let of_role = match start.role {
+            EngineRole::Pages => &[][..],
+            EngineRole::Statements => &start.settings.statement_environment,
+        };
+        let environment = start.settings.environment.iter().chain(of_role);
         std::fs::create_dir(&start.sockets)?;
         std::fs::create_dir(&start.spills)?;
         let mut child = Command::new(&start.settings.program)
@@ -146,7 +153,7 @@ impl EngineProcess {
                 start.settings.slow.iter().flat_map(|slow| ["--log-slow-ms".to_owned(), slow.as_millis().to_string()]),
             )
             .args(start.settings.cache.iter().flat_map(cache_arguments))
-            .envs(start.settings.environment.iter().map(|(name, value)| (name, value)))
+            .envs(environment.map(|(name, value)| (name, value)))
             .env("TMPDIR", &start.spills)
             // Memory that is reserved and not used would count against the limit.
             .env("MIMALLOC_ARENA_EAGER_COMMIT", "0")
@@ -334,6 +341,7 @@ impl EngineReports {
             Ok(EngineReport::Failure(code)) => activity.metrics.count_failure(code),
             Ok(EngineReport::Lake(figures)) => activity.set_lake(figures),
             Ok(EngineReport::Cache(counts)) => activity.metrics.count_cached(&counts),
+            Ok(EngineReport::Workers { counts, workers }) => activity.metrics.set_workers(&counts, &workers),
             Ok(EngineReport::Ask { number, table, client, sees_all }) => {
                 let message = DoorMessage::Rows { number, rows: activity.visible_rows(table, &client, sees_all) };
                 let engine = engine.clone();

@@ -11,14 +11,14 @@ use super::connection_places::PlaceWork;
 use super::drain::ServerDrain;
 
 /// The name of HTTP/2 in a handshake.
-pub(super) const HTTP_2: &[u8] = b"h2";
+pub(crate) const HTTP_2: &[u8] = b"h2";
 /// Silence after which a client is asked whether it still lives; its queries end when it does not.
 const KEEPALIVE: Duration = Duration::from_secs(20);
 /// Requests of one connection at once.
 const STREAMS: u32 = 64;
 
 /// Makes connections of HTTP/2.
-pub(super) fn http2_builder() -> http2::Builder<TokioExecutor> {
+pub(crate) fn http2_builder() -> http2::Builder<TokioExecutor> {
     let mut builder = http2::Builder::new(TokioExecutor::new());
     builder.timer(TokioTimer::new()).keep_alive_interval(KEEPALIVE).max_concurrent_streams(STREAMS);
     builder

@@ -11,14 +11,14 @@ pub(crate) mod connection_places;
 #[cfg(feature = "postgres")]
 mod der_element;
 pub(crate) mod drain;
-mod encryption;
+pub(crate) mod encryption;
 mod engine_ends;
 mod engine_process;
 mod failed_logins;
 mod flight;
 mod forward;
 mod http;
-mod http_connection;
+pub(crate) mod http_connection;
 #[cfg(feature = "postgres")]
 mod postgres;
 mod query_log;

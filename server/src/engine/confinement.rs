@@ -15,6 +15,9 @@ use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 const LANDLOCK: ABI = ABI::V5;
 /// The process's own figures, those of the processors, and random bytes.
 const SYSTEM: [&str; 4] = ["/proc", "/sys/fs/cgroup", "/sys/devices/system/cpu", "/dev/urandom"];
+/// Files with which names of other machines are looked up.
+const NAMES: [&str; 5] =
+    ["/etc/resolv.conf", "/etc/hosts", "/etc/nsswitch.conf", "/etc/host.conf", "/run/systemd/resolve"];
 /// Address space over what queries may hold, for a process that is running: stacks of threads that are still to come,
 /// caches, what the allocator keeps. The door looks at what is really used; this limit ends one huge allocation at
 /// once.
@@ -34,35 +37,52 @@ pub fn missing_support() -> Option<&'static str> {
     )
 }
 
-/// Lets the process read `lake` and its own program, read and write `own` folders, and nothing else, and connect to no
-/// other machine. To be called before there are threads. A kernel without Landlock leaves the process as it is.
+/// Lets the process read `lake` and its own program, read and write `own` folders, and nothing else; connect over TCP to
+/// the ports of `workers` alone. To be called before there are threads. A kernel without Landlock leaves the process as
+/// it is.
 ///
 /// # Errors
 /// The system refuses.
-pub fn confine_files(lake: &Path, own: &[&Path]) -> io::Result<()> {
-    let mut readable = linked_folders(lake);
-    readable.push(lake.to_owned());
-    confine_process(&readable, own, &[])
+pub fn confine_files(lake: &Path, own: &[&Path], workers: &[u16]) -> io::Result<()> {
+    confine_process(with_names(lake_folders(lake), !workers.is_empty()), own, Some(workers))
 }
 
 /// Lets the process read what it needs to reach the lake's object store, read and write `own` folders, and nothing
-/// else; connect over TCP to the store's ports alone. Otherwise as [`confine_files`].
+/// else; connect over TCP to the ports of the store and of `workers` alone. Otherwise as [`confine_files`].
 ///
 /// # Errors
 /// The system refuses.
-pub fn confine_to_store(store: &RemoteAccess, own: &[&Path]) -> io::Result<()> {
-    confine_process(&store.files, own, &store.ports)
+pub fn confine_to_store(store: &RemoteAccess, own: &[&Path], workers: &[u16]) -> io::Result<()> {
+    let ports = [store.ports.as_slice(), workers].concat();
+    confine_process(with_names(store.files.clone(), !workers.is_empty()), own, Some(&ports))
 }
 
-fn confine_process(readable: &[PathBuf], own: &[&Path], ports: &[u16]) -> io::Result<()> {
-    let connections = ports.iter().map(|port| Ok::<_, RulesetError>(NetPort::new(*port, AccessNet::ConnectTcp)));
+/// Confines a worker to files as an engine; it listens, and connects to other workers, wherever they are.
+///
+/// # Errors
+/// The system refuses.
+pub fn confine_worker(readable: Vec<PathBuf>, own: &[&Path]) -> io::Result<()> {
+    confine_process(with_names(readable, true), own, None)
+}
+
+fn with_names(mut readable: Vec<PathBuf>, has_peers: bool) -> Vec<PathBuf> {
+    readable.extend(NAMES.map(PathBuf::from).into_iter().filter(|_| has_peers));
+    readable
+}
+
+// Without ports, TCP is not confined.
+fn confine_process(readable: Vec<PathBuf>, own: &[&Path], ports: Option<&[u16]>) -> io::Result<()> {
+    let connect = |port: &u16| Ok::<_, RulesetError>(NetPort::new(*port, AccessNet::ConnectTcp));
+    let connections = ports.unwrap_or_default().iter().map(connect);
     // The place of a panic in the log has the names of its functions.
     let program = std::env::current_exe();
     let ruleset = || -> Result<RulesetCreated, RulesetError> {
         let read = AccessFs::from_read(LANDLOCK) & !AccessFs::Execute;
-        Ruleset::default()
-            .handle_access(AccessFs::from_all(LANDLOCK))?
-            .handle_access(AccessNet::from_all(LANDLOCK))?
+        let mut ruleset = Ruleset::default().handle_access(AccessFs::from_all(LANDLOCK))?;
+        if ports.is_some() {
+            ruleset = ruleset.handle_access(AccessNet::from_all(LANDLOCK))?;
+        }
+        ruleset
             .create()?
             .add_rules(path_beneath_rules(readable, read))?
             .add_rules(path_beneath_rules(SYSTEM, read))?
@@ -75,10 +95,11 @@ fn confine_process(readable: &[PathBuf], own: &[&Path], ports: &[u16]) -> io::Re
     set_limit(Resource::Core, 0)
 }
 
-// Folders of a lake may be links to other disks.
-fn linked_folders(lake: &Path) -> Vec<PathBuf> {
+/// Returns the folders that a lake in a folder is in: its own may be links to other disks.
+pub fn lake_folders(lake: &Path) -> Vec<PathBuf> {
     let entries = std::fs::read_dir(lake).into_iter().flatten().flatten();
-    entries.filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_symlink())).map(|entry| entry.path()).collect()
+    let links = entries.filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_symlink()));
+    [lake.to_owned()].into_iter().chain(links.map(|entry| entry.path())).collect()
 }
 
 /// Limits what the process can allocate from now on to the `memory` bytes that its queries may hold, and a little

@@ -12,7 +12,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use echolake_lake::Lake;
-use echolake_query::{EngineClient, EngineLimits, QueryEngine, QueryQuota, Session};
+use echolake_query::{ClusterSettings, EngineClient, EngineLimits, QueryEngine, QueryQuota, Session, WorkerCluster};
 use echolake_schema::tables::Table;
 use echolake_service::{DoorMessage, EngineReport, EngineRole, EngineServices, EngineSocket, Error, LakeFigures};
 use futures::FutureExt as _;
@@ -31,7 +31,7 @@ const PAGES_PER_CORE: usize = 8;
 const STATEMENT_NICENESS: i32 = 10;
 
 /// What an engine is started with.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 pub struct EngineOptions<'a> {
     /// What it answers.
     pub role: EngineRole,
@@ -41,6 +41,8 @@ pub struct EngineOptions<'a> {
     pub memory: usize,
     /// Time from which a query is logged as slow; None for never.
     pub slow: Option<Duration>,
+    /// Workers over which heavy queries are spread; None for no workers.
+    pub workers: Option<ClusterSettings>,
 }
 
 /// Answers requests until standard input ends, which the door holds. It reads the lake first, and reports that it is
@@ -49,7 +51,7 @@ pub struct EngineOptions<'a> {
 /// # Errors
 /// [`Error::System`], [`Error::Query`], [`Error::Transport`].
 pub async fn run_engine(lake: &Lake, options: EngineOptions<'_>) -> Result<(), Error> {
-    let EngineOptions { role, sockets, memory, slow } = options;
+    let EngineOptions { role, sockets, memory, slow, workers } = options;
     let messages = read_messages();
     let http = EngineSocket::Http.listen_in(sockets)?;
     let flight_sql = EngineSocket::FlightSql.listen_in(sockets)?;
@@ -61,6 +63,9 @@ pub async fn run_engine(lake: &Lake, options: EngineOptions<'_>) -> Result<(), E
     let limits = EngineLimits { memory: Some(memory), computing, niceness };
     let engine = QueryEngine::with_limits(lake, limits)?;
     warm_up(&engine).await?;
+    if let Some(workers) = &workers {
+        spread_queries(&engine, workers).await;
+    }
     let services = EngineServices::new(lake, engine, slow)?;
     // Behind the start of its threads, whose stacks count.
     confinement::limit_memory(memory).map_err(Error::System)?;
@@ -83,6 +88,17 @@ pub async fn run_engine(lake: &Lake, options: EngineOptions<'_>) -> Result<(), E
         () = services.obey_door(messages) => Ok(()),
         failed = echolake_http::serve_http_socket(services.clone(), Some(role), http) => failed,
         failed = of_statements => failed,
+    }
+}
+
+// Without workers, an engine runs all queries itself.
+async fn spread_queries(engine: &QueryEngine, workers: &ClusterSettings) {
+    let session = engine.open_session(&Arc::new(EngineClient::new("workers", QueryQuota::default())));
+    // If the lake cannot be read now, the first query finds its id.
+    let lake_id = session.current_snapshot().await.map_or_else(|_| String::new(), |lake| lake.tables_id().to_owned());
+    match WorkerCluster::new(workers, &lake_id) {
+        Ok(cluster) => engine.spread_over(Arc::new(cluster)),
+        Err(error) => tracing::warn!(error = &error as &dyn std::error::Error, "queries run without workers"),
     }
 }
 

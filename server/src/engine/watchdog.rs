@@ -4,7 +4,7 @@
 use std::time::{Duration, Instant};
 
 use echolake_lake::{CACHE_MEMORY_BYTES, CacheCounts};
-use echolake_query::StatementBlame;
+use echolake_query::{SpreadCounts, StatementBlame, WorkerCluster, WorkerState};
 use echolake_service::{EngineCulprit, EngineEnd, EngineReport, EngineRole, EngineServices};
 
 use crate::process_memory::private_bytes;
@@ -38,6 +38,7 @@ pub(super) fn start_watchdog(services: &EngineServices, role: EngineRole, memory
 
 fn watch_engine(services: &EngineServices, role: EngineRole, mut memory: MemoryWatch) {
     let mut cached = CacheCounts::default();
+    let mut spread = ReportedCluster::default();
     let mut looked = Instant::now();
     loop {
         let is_busy = services.engine().count_running() > 0 || memory.cancelled.is_some();
@@ -61,6 +62,28 @@ fn watch_engine(services: &EngineServices, role: EngineRole, mut memory: MemoryW
         {
             EngineReport::Cache(counts.since(&cached)).send_line();
             cached = counts;
+        }
+        if let Some(cluster) = services.engine().cluster() {
+            spread.report_changes(cluster);
+        }
+    }
+}
+
+/// The door's knowledge of workers.
+#[derive(Default)]
+struct ReportedCluster {
+    counts: SpreadCounts,
+    workers: Vec<WorkerState>,
+}
+
+impl ReportedCluster {
+    fn report_changes(&mut self, cluster: &WorkerCluster) {
+        let counts = cluster.spread_counts();
+        // A spare, which has asked none, leaves the door what it was told by the engine in use.
+        let workers: Vec<_> = cluster.worker_states().into_iter().filter(WorkerState::was_asked).collect();
+        if counts != self.counts || workers != self.workers {
+            EngineReport::Workers { counts: counts.since(&self.counts), workers: workers.clone() }.send_line();
+            *self = Self { counts, workers };
         }
     }
 }

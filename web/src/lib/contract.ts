@@ -1375,7 +1375,7 @@ export interface components {
         /** @description RFC 9457; `code` is stable and made for programs. */
         readonly Problem: {
             /** @enum {string} */
-            readonly code: "query_invalid" | "read_only" | "query_failed" | "format_impossible" | "lake_unreadable" | "request_invalid" | "unsupported" | "not_found" | "gone" | "file_changed" | "taken" | "unconfirmed" | "lake_unwritable" | "no_data" | "method_not_allowed" | "precondition_failed" | "range_not_satisfiable" | "request_too_large" | "unauthenticated" | "forbidden" | "foreign_origin" | "cancelled" | "time_limit" | "memory_limit" | "row_limit" | "too_many" | "query_ended_engine" | "internal" | "server_stopping" | "not_ready";
+            readonly code: "query_invalid" | "read_only" | "query_failed" | "format_impossible" | "lake_unreadable" | "request_invalid" | "unsupported" | "not_found" | "gone" | "file_changed" | "taken" | "unconfirmed" | "lake_unwritable" | "no_data" | "method_not_allowed" | "precondition_failed" | "range_not_satisfiable" | "request_too_large" | "unauthenticated" | "forbidden" | "foreign_origin" | "cancelled" | "time_limit" | "memory_limit" | "row_limit" | "too_many" | "query_ended_engine" | "worker_lost" | "internal" | "server_stopping" | "not_ready";
             /** @description What is wrong, where, and what to do: the text that all protocols and the prompt have. */
             readonly detail?: string;
             /** @description What to do. */

@@ -17,7 +17,7 @@ use datafusion::logical_expr::{
 };
 
 use super::call_size::CallSize;
-use super::call_stop::check_stop;
+use super::call_stop::{check_stop, count_planned_bytes};
 
 /// Bytes that a call may return for a batch of rows.
 const MOST_BYTES: f64 = (32 << 20) as f64;
@@ -315,7 +315,11 @@ impl ScalarUDFImpl for LimitedFunction {
 
     fn invoke_with_args(&self, args: ScalarFunctionArgs) -> Result<ColumnarValue> {
         self.check_call(&args)?;
-        self.own.invoke_with_args(args)
+        let returned = self.own.invoke_with_args(args)?;
+        if let ColumnarValue::Scalar(value) = &returned {
+            count_planned_bytes(value.size())?;
+        }
+        Ok(returned)
     }
 
     // DataFusion's own form of the call has this limit, too. An operator has none, so that a call with many regular
