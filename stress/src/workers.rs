@@ -1,7 +1,7 @@
 //! Queries over workers, as processes on this machine, beside the same queries in this process: the answers, how many
 //! are spread, what each worker reads, and answers while workers are killed. With `--shares`, how much sooner machines
 //! with a part of a core are done if there are more of them.
-#![allow(clippy::print_stdout, reason = "figures are what it is for")]
+#![allow(clippy::print_stdout, clippy::print_stderr, reason = "figures are what it is for; progress goes to stderr")]
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -24,7 +24,7 @@ use crate::differences::{AnswerRows, QueryGenerator, RowOrder};
 
 /// Queries that read lists, by which answers are compared while workers are killed.
 const HEAVY: [&str; 5] = [
-    "select surface_id, pair_id, ir from measurements where pair_id % 3 = 1",
+    "select surface_id, pair_id, ir from measurements where pair_id % 29 = 1",
     "select surface_id, count(*) as n, max(ir[7]) as most, sum(list_energy(ir)) as e from measurements group by 1",
     "select m.surface_id, m.pair_id, n.nce_5000[100] as x from measurements m join nce n using (surface_id, pair_id)",
     "select count(distinct pair_id) as n from measurements where ir[20] <> 0",
@@ -211,7 +211,9 @@ impl WorkerMachines {
         let texts = HEAVY.iter().map(|sql| (*sql).to_owned()).chain(generated.into_iter().map(|(_, sql)| sql));
         let texts: Vec<_> = texts.chain(examples.filter_map(|function| example_query(&function.example?))).collect();
         let mut report = ComparisonReport::default();
+        let count = texts.len();
         for sql in texts {
+            eprintln!("query {} of {count}", report.compared + 1);
             let before = cluster.spread_counts();
             let expected = collect_rows(&local, &sql).await.with_context(|| sql.clone())?;
             let given = collect_rows(&spread, &sql).await.with_context(|| format!("over workers: {sql}"))?;
@@ -274,6 +276,7 @@ impl WorkerMachines {
         let mut random = ChaCha8Rng::seed_from_u64(seed);
         let mut report = KillReport::default();
         for round in 0..rounds {
+            eprintln!("kill {} of {rounds}", round + 1);
             let (sql, expected) = right.choose(&mut random).context("a query")?;
             let victim = random.random_range(0..self.workers.len());
             let moment = KILL_WITHIN.mul_f64(random.random());
