@@ -309,11 +309,16 @@ impl<T: RealSample> DerivationPlan<T> {
         Ok(())
     }
 
-    /// Computes only the energies of what a surface reflected from its spectrum, and returns that of all bins.
+    /// Computes only the energies of what a surface reflected from its spectrum.
     ///
     /// spectrum  `[ir_len / 2 + 1]`, energies `[bands]`
-    pub fn spectrum_energies(&self, spectrum: &[Complex<T>], energies: &mut [f64]) -> f64 {
-        self.bank.spectrum_energies(spectrum, energies)
+    pub fn spectrum_energies(&self, spectrum: &[Complex<T>], energies: &mut [f64]) {
+        self.bank.spectrum_energies(spectrum, energies);
+    }
+
+    /// Computes the energy of all bins of a spectrum `[ir_len / 2 + 1]`.
+    pub fn spectrum_energy(&self, spectrum: &[Complex<T>]) -> f64 {
+        self.bank.spectrum_energy(spectrum)
     }
 
     /// Computes what errors of the direct sound, and warmer air by its relative change of each bin, do to the energies
@@ -543,7 +548,8 @@ mod tests {
             let forward = f32::plan_real_forward(384);
             let mut spectrum = forward.make_output_vec();
             forward.process(&mut reflected.clone(), &mut spectrum).expect("a spectrum");
-            let total = plan.spectrum_energies(&spectrum, &mut energies);
+            plan.spectrum_energies(&spectrum, &mut energies);
+            let total = plan.spectrum_energy(&spectrum);
             assert!((total / energy(&reflected) - 1.0).abs() < 1e-5);
             // The sum over bins and the sum over samples, in single precision.
             let alike = |(a, b): (&f64, &f64)| (a / b - 1.0).abs() < 1e-5;

@@ -341,7 +341,6 @@ impl ReferenceResponses {
             return Ok(HashMap::new());
         }
         let plan = derivation_plan(lake.rig()).map_err(kernel_error)?;
-        let bands = lake.rig().bands.centres_hz.len();
         let of_pair = |scratch: &mut AirScratch<f32>, (pair, flat): (&u32, &MeanResponse)| {
             let (Some(own), Some(flat_foam), Some(paths)) =
                 (foam.get(pair), flat_foam.get(pair), PairPaths::new(lake, *pair))
@@ -355,7 +354,7 @@ impl ReferenceResponses {
                 reflection.direct_sound(&flat_foam.ir, &flat.ir, paths.incidence_deg, &mut direct)?;
                 let of_flat = self.correction.compute_spectrum(&direct, scratch)?;
                 self.correction.reflected_spectrum(&of_flat, &mut reflected, scratch);
-                let flat_total = plan.spectrum_energies(&reflected, &mut vec![0.0; bands]);
+                let flat_total = plan.spectrum_energy(&reflected);
                 let of_best = if number == 0 { reflected.clone() } else { Vec::new() };
                 reflection.direct_sound(&own.ir, &flat.ir, paths.incidence_deg, &mut direct)?;
                 let direct = self.correction.compute_spectrum(&direct, scratch)?;

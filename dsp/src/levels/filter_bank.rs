@@ -50,13 +50,22 @@ pub fn band_gain(centres_hz: &[f64], band: usize, frequency_hz: f64) -> f64 {
 /// ```
 pub struct FilterBankPlan<T: RealSample> {
     len: usize,
-    bands: usize,
-    /// `[bands x (len/2 + 1)]`.
-    gains: Vec<T>,
+    bands: Vec<BandWeights>,
     couples: Vec<BandCouple<T>>,
     forward: Arc<dyn RealToComplex<T>>,
     inverse: Arc<dyn Fft<T>>,
 }
+
+/// What a band takes of the power of a spectrum.
+struct BandWeights {
+    /// Bins in which it has a gain, up to half of the rate.
+    bins: Range<usize>,
+    /// `[bins]`: square of the gain, over the number of samples; twice that for a bin with a mirror image.
+    weights: Vec<f64>,
+}
+
+/// Bins that are summed side by side.
+const LANES: usize = 8;
 
 /// Two bands that are transformed as one; the second is empty if the number of bands is odd.
 struct BandCouple<T> {
@@ -96,19 +105,19 @@ impl<T: RealSample> FilterBankPlan<T> {
             return Err(Error::Setting { what: "the signal's length", actual: "0".into(), expected: "1 or more" });
         }
         let frequency = |k: usize| k as f64 * rate_hz / len as f64;
-        let gains = |band| (0..len / 2 + 1).map(move |k| T::of(band_gain(centres_hz, band, frequency(k))));
+        let bins = len / 2 + 1;
+        let weights = |band| BandWeights::new(len, |k| T::of(band_gain(centres_hz, band, frequency(k))).f64());
         let bands: Vec<usize> = (0..centres_hz.len()).collect();
         let couple = |bands: &[usize]| {
             let scaled = |band: Option<&usize>, k| {
                 T::of(band.map_or(0.0, |band| band_gain(centres_hz, *band, frequency(k)) / len as f64))
             };
             let at = |k: usize| Complex::new(scaled(bands.first(), k), scaled(bands.get(1), k));
-            BandCouple::new((0..len / 2 + 1).map(at).collect())
+            BandCouple::new((0..bins).map(at).collect())
         };
         Ok(Self {
             len,
-            bands: bands.len(),
-            gains: bands.iter().copied().flat_map(gains).collect(),
+            bands: bands.iter().copied().map(weights).collect(),
             couples: bands.chunks(2).map(couple).collect(),
             forward: T::plan_real_forward(len),
             inverse: T::plan_fft(len, FftDirection::Inverse),
@@ -117,7 +126,7 @@ impl<T: RealSample> FilterBankPlan<T> {
 
     /// Number of bands.
     pub fn band_count(&self) -> usize {
-        self.bands
+        self.bands.len()
     }
 
     /// Samples of a signal.
@@ -143,7 +152,7 @@ impl<T: RealSample> FilterBankPlan<T> {
     /// # Errors
     /// [`Error::Length`] or [`Error::NotFinite`].
     pub fn split_bands(&self, ir: &[T], bands: &mut [T], scratch: &mut FilterBankScratch<T>) -> Result<(), Error> {
-        check_len("the bands", bands.len(), self.bands * self.len)?;
+        check_len("the bands", bands.len(), self.bands.len() * self.len)?;
         self.compute_spectrum(ir, scratch)?;
         let FilterBankScratch { spectrum, coupled, work, .. } = scratch;
         for (couple, coupled) in self.couples.iter().zip(coupled.chunks_exact_mut(self.len)) {
@@ -168,26 +177,25 @@ impl<T: RealSample> FilterBankPlan<T> {
         energies: &mut [f64],
         scratch: &mut FilterBankScratch<T>,
     ) -> Result<(), Error> {
-        check_len("the energies", energies.len(), self.bands)?;
+        check_len("the energies", energies.len(), self.bands.len())?;
         self.compute_spectrum(ir, scratch)?;
         self.spectrum_energies(&scratch.spectrum, energies);
         Ok(())
     }
 
-    /// Computes the energy of a signal in each band from its spectrum; returns that of all bins.
+    /// Computes the energy of a signal in each band from its spectrum.
     ///
     /// spectrum  `[len / 2 + 1]`, energies `[bands]`
-    pub fn spectrum_energies(&self, spectrum: &[Complex<T>], energies: &mut [f64]) -> f64 {
-        energies.fill(0.0);
-        let mut total = 0.0;
-        for (k, c) in spectrum.iter().enumerate() {
-            let power = self.bin_weight(k) * c.norm_sqr().f64() / self.len as f64;
-            total += power;
-            for (band, energy) in energies.iter_mut().enumerate() {
-                *energy += power * self.gains[band * spectrum.len() + k].f64().powi(2);
-            }
+    pub fn spectrum_energies(&self, spectrum: &[Complex<T>], energies: &mut [f64]) {
+        for (band, energy) in self.bands.iter().zip(energies) {
+            *energy = sum_powers(&spectrum[band.bins.clone()], &band.weights);
         }
-        total
+    }
+
+    /// Computes the energy of a signal in all bins from its spectrum `[len / 2 + 1]`.
+    pub fn spectrum_energy(&self, spectrum: &[Complex<T>]) -> f64 {
+        let power = |(bin, x): (usize, &Complex<T>)| bin_weight(bin, self.len) * x.norm_sqr().f64();
+        spectrum.iter().enumerate().map(power).sum()
     }
 
     /// Energy of a reflected response in each band, and what errors of the direct sound beneath it do to that energy,
@@ -203,17 +211,15 @@ impl<T: RealSample> FilterBankPlan<T> {
         sensitivities: &mut [EnergySensitivity],
         scratch: &mut FilterBankScratch<T>,
     ) -> Result<(), Error> {
-        check_len("the sensitivities", sensitivities.len(), self.bands)?;
+        check_len("the sensitivities", sensitivities.len(), self.bands.len())?;
         self.compute_spectrum(direct, scratch)?;
         std::mem::swap(&mut scratch.spectrum, &mut scratch.direct);
         self.compute_spectrum(reflected, scratch)?;
-        let direct = &scratch.direct;
-        for (gains, sensitivity) in self.gains.chunks_exact(direct.len()).zip(sensitivities) {
+        for (band, sensitivity) in self.bands.iter().zip(sensitivities) {
             let mut sum = EnergySensitivity::default();
-            let bins = scratch.spectrum.iter().zip(direct).zip(gains).enumerate();
-            for (bin, ((x, d), gain)) in bins.filter(|(_, (_, gain))| **gain != T::default()) {
-                let (weight, angle) =
-                    (self.bin_weight(bin) * gain.f64().powi(2) / self.len as f64, bin_angle(bin, self.len));
+            let bins = scratch.spectrum.iter().zip(&scratch.direct).enumerate().skip(band.bins.start);
+            for ((bin, (x, d)), weight) in bins.zip(&band.weights) {
+                let angle = bin_angle(bin, self.len);
                 let product = x.conj() * d;
                 let power = d.norm_sqr().f64();
                 let energy = weight * x.norm_sqr().f64();
@@ -230,11 +236,6 @@ impl<T: RealSample> FilterBankPlan<T> {
         Ok(())
     }
 
-    // A bin counts for its mirror image too, except 0 Hz and, if the length is even, the last one.
-    fn bin_weight(&self, bin: usize) -> f64 {
-        if bin == 0 || 2 * bin == self.len { 1.0 } else { 2.0 }
-    }
-
     fn compute_spectrum(&self, ir: &[T], scratch: &mut FilterBankScratch<T>) -> Result<(), Error> {
         check_len("the response", ir.len(), self.len)?;
         let FilterBankScratch { signal, spectrum, work, .. } = scratch;
@@ -246,6 +247,37 @@ impl<T: RealSample> FilterBankPlan<T> {
         // The first bin is the sum of all samples, and one that is not finite spoils it.
         if spectrum.first().is_some_and(|dc| dc.re.f64().is_finite()) { Ok(()) } else { Err(not_finite) }
     }
+}
+
+impl BandWeights {
+    fn new(len: usize, gain: impl Fn(usize) -> f64) -> Self {
+        let weight = |bin| gain(bin).powi(2) * bin_weight(bin, len);
+        let mut weights: Vec<f64> = (0..len / 2 + 1).map(weight).collect();
+        let first = weights.iter().position(|weight| *weight > 0.0).unwrap_or(0);
+        let end = weights.iter().rposition(|weight| *weight > 0.0).map_or(first, |last| last + 1);
+        weights.truncate(end);
+        Self { bins: first..end, weights: weights.split_off(first) }
+    }
+}
+
+// Share of a bin's power in a signal's energy. A bin counts for its mirror image too, except 0 Hz and, if the length is
+// even, the last one.
+fn bin_weight(bin: usize, len: usize) -> f64 {
+    let images = if bin == 0 || 2 * bin == len { 1.0 } else { 2.0 };
+    images / len as f64
+}
+
+fn sum_powers<T: RealSample>(spectrum: &[Complex<T>], weights: &[f64]) -> f64 {
+    let mut sums = [0.0; LANES];
+    let (bins, last_bins) = spectrum.as_chunks::<LANES>();
+    let (bin_weights, last_weights) = weights.as_chunks::<LANES>();
+    for (bins, weights) in bins.iter().zip(bin_weights) {
+        for ((sum, x), weight) in sums.iter_mut().zip(bins).zip(weights) {
+            *sum += weight * x.norm_sqr().f64();
+        }
+    }
+    let last = last_bins.iter().zip(last_weights).map(|(x, weight)| weight * x.norm_sqr().f64());
+    sums.iter().sum::<f64>() + last.sum::<f64>()
 }
 
 impl<T: RealSample> BandCouple<T> {
@@ -309,6 +341,17 @@ mod tests {
             for (band, energy) in bands.chunks_exact(len).zip(&energies) {
                 let direct: f64 = band.iter().map(|x| x * x).sum();
                 assert!((direct - energy).abs() <= 1e-12 * whole, "{len}: {direct} {energy}");
+            }
+            plan.compute_spectrum(&ir, &mut scratch).expect("a spectrum");
+            let spectrum = &scratch.spectrum;
+            assert!((plan.spectrum_energy(spectrum) / whole - 1.0).abs() < 1e-12, "{len}");
+            // Bin by bin, in their order.
+            for (number, energy) in energies.iter().enumerate() {
+                let gain = |k: usize| band_gain(&PAPER, number, k as f64 * 96e3 / len as f64);
+                let images = |k: usize| if k == 0 || 2 * k == len { 1.0 } else { 2.0 };
+                let power = |(k, x): (usize, &Complex<f64>)| images(k) * (gain(k) * x.norm()).powi(2) / len as f64;
+                let summed: f64 = spectrum.iter().enumerate().map(power).sum();
+                assert!((summed - energy).abs() <= 1e-13 * whole, "{len}: {summed} {energy}");
             }
         }
     }
