@@ -4,8 +4,9 @@ use echolake_schema::SpectralDivision;
 use realfft::num_complex::Complex;
 
 use crate::air::AirState;
+use crate::air_correction::TransformedResponse;
 use crate::deconvolution::{DeconvolutionParams, TransformLength};
-use crate::energy::{accumulate_energy, energy, tnce_over_band};
+use crate::energy::{energy, tnce_over_band};
 use crate::error::check_len;
 use crate::filter_bank::{FilterBankPlan, FilterBankScratch};
 use crate::foam::subtract_foam;
@@ -220,7 +221,6 @@ pub struct DerivationPlan<T: RealSample> {
 /// Buffers of a [`DerivationPlan`].
 pub struct DerivationScratch<T> {
     bank: FilterBankScratch<T>,
-    bands: Vec<T>,
     flat: FlatEnergies,
 }
 
@@ -235,13 +235,8 @@ impl<T: RealSample> DerivationPlan<T> {
 
     /// Buffers for [`Self::derive_response`]; one per thread.
     pub fn make_scratch(&self) -> DerivationScratch<T> {
-        let bands = self.bank.band_count();
-        let len = self.bank.len();
-        DerivationScratch {
-            bank: self.bank.make_scratch(),
-            bands: vec![T::default(); bands * len],
-            flat: FlatEnergies { total: 0.0, bands: vec![0.0; bands] },
-        }
+        let flat = FlatEnergies { total: 0.0, bands: vec![0.0; self.bank.band_count()] };
+        DerivationScratch { bank: self.bank.make_scratch(), flat }
     }
 
     /// A place for results, which runs fill again and again.
@@ -285,8 +280,10 @@ impl<T: RealSample> DerivationPlan<T> {
         check_len("Foam's response", foam.len(), self.bank.len())?;
         self.measure_flat(flat, scratch)?;
         subtract_foam(ir, foam, &mut derived.reflected);
-        self.bank.split_bands(&derived.reflected, &mut scratch.bands, &mut scratch.bank)?;
-        put_over(&scratch.flat, &scratch.bands, derived);
+        let DerivedResponse { reflected, curves, energies, .. } = derived;
+        let factor = scratch.flat.total.recip();
+        self.bank.accumulate_signal(reflected, factor, curves, energies, &mut scratch.bank)?;
+        put_over(&scratch.flat, derived);
         Ok(())
     }
 
@@ -297,15 +294,17 @@ impl<T: RealSample> DerivationPlan<T> {
     /// [`Error::Length`] or [`Error::NotFinite`].
     pub fn run_over(
         &self,
-        reflected: &[T],
+        reflected: &TransformedResponse<T>,
         flat: &FlatEnergies,
         derived: &mut DerivedResponse<T>,
         scratch: &mut DerivationScratch<T>,
     ) -> Result<(), Error> {
         check_len("Flat's energies", flat.bands.len(), self.bank.band_count())?;
-        self.bank.split_bands(reflected, &mut scratch.bands, &mut scratch.bank)?;
-        derived.reflected.copy_from_slice(reflected);
-        put_over(flat, &scratch.bands, derived);
+        check_len("the reflected response", reflected.samples.len(), self.bank.len())?;
+        let DerivedResponse { curves, energies, .. } = derived;
+        self.bank.accumulate_bands(&reflected.spectrum, flat.total.recip(), curves, energies, &mut scratch.bank)?;
+        derived.reflected.copy_from_slice(&reflected.samples);
+        put_over(flat, derived);
         Ok(())
     }
 
@@ -324,12 +323,14 @@ impl<T: RealSample> DerivationPlan<T> {
     /// Computes what errors of the direct sound, and warmer air by its relative change of each bin, do to the energies
     /// of a reflected response: `sensitivities[band]`.
     ///
+    /// reflected, direct  `[ir_len / 2 + 1]`: their spectra
+    ///
     /// # Errors
     /// [`Error::Length`] or [`Error::NotFinite`].
     pub fn compute_sensitivities(
         &self,
-        reflected: &[T],
-        direct: &[T],
+        reflected: &[Complex<T>],
+        direct: &[Complex<T>],
         per_kelvin: impl Fn(usize) -> f64,
         sensitivities: &mut [EnergySensitivity],
         scratch: &mut DerivationScratch<T>,
@@ -344,13 +345,10 @@ impl<T: RealSample> DerivationPlan<T> {
     }
 }
 
-fn put_over<T: RealSample>(flat: &FlatEnergies, bands: &[T], derived: &mut DerivedResponse<T>) {
+// Fills what follows from curves and energies.
+fn put_over<T: RealSample>(flat: &FlatEnergies, derived: &mut DerivedResponse<T>) {
     let len = derived.reflected.len();
     let factor = flat.total.recip();
-    let curves = bands.chunks_exact(len).zip(derived.curves.chunks_exact_mut(len));
-    for ((band, curve), energy) in curves.zip(&mut derived.energies) {
-        *energy = accumulate_energy(band, factor, curve);
-    }
     derived.tnce.iter_mut().zip(&derived.energies).for_each(|(tnce, energy)| *tnce = energy * factor);
     derived.total = derived.tnce.iter().sum();
     tnce_over_band(&derived.energies, &flat.bands, &mut derived.tnce_over_band);
@@ -542,12 +540,13 @@ mod tests {
             plan.derive_response(ir, foam, flat, &mut once, &mut plan.make_scratch()).expect("derived");
             let mut reflected = vec![0.0; 384];
             subtract_foam(ir, foam, &mut reflected);
-            plan.run_over(&reflected, &energies, &mut again, &mut scratch).expect("derived");
-            assert_eq!(once, again);
-            let mut energies = [f64::NAN; 5];
             let forward = f32::plan_real_forward(384);
             let mut spectrum = forward.make_output_vec();
             forward.process(&mut reflected.clone(), &mut spectrum).expect("a spectrum");
+            let transformed = TransformedResponse { samples: reflected.clone(), spectrum: spectrum.clone() };
+            plan.run_over(&transformed, &energies, &mut again, &mut scratch).expect("derived");
+            assert_eq!(once, again);
+            let mut energies = [f64::NAN; 5];
             plan.spectrum_energies(&spectrum, &mut energies);
             let total = plan.spectrum_energy(&spectrum);
             assert!((total / energy(&reflected) - 1.0).abs() < 1e-5);
@@ -556,7 +555,8 @@ mod tests {
             assert!(energies.iter().zip(&once.energies).all(alike), "{energies:?} {:?}", once.energies);
         }
         let short = FlatEnergies { bands: vec![1.0; 4], ..energies };
-        let result = plan.run_over(flat, &short, &mut plan.make_derived(), &mut scratch);
+        let flat = TransformedResponse { samples: flat.to_vec(), spectrum: vec![Complex::default(); 193] };
+        let result = plan.run_over(&flat, &short, &mut plan.make_derived(), &mut scratch);
         assert!(matches!(result, Err(Error::Length { .. })), "{result:?}");
     }
 

@@ -1,11 +1,11 @@
 //! Values computed from impulse responses: means and energies of references; responses, curves and energies of runs.
 
 use std::collections::HashMap;
+use std::ops::Range;
 
 use echolake_dsp::air::AirState;
 use echolake_dsp::air_correction::AirCorrectionFit;
 use echolake_dsp::chain::{DerivationPlan, DerivedResponse, FlatEnergies};
-use echolake_dsp::mean::SignalMean;
 use echolake_dsp::rise::CurveShape;
 use echolake_dsp::rounding::{CURVE_BITS, round_samples};
 use echolake_dsp::temperature::ReferenceAir;
@@ -23,9 +23,6 @@ pub(crate) struct MeanResponse {
     /// Mean air.
     pub air: AirState,
 }
-
-/// Values of each pair of Flat.
-pub(crate) type FlatPairs = HashMap<u32, FlatPair>;
 
 /// Values of a pair of Flat without the direct sound.
 #[derive(Debug, Clone)]
@@ -64,33 +61,31 @@ pub(crate) struct RunResponses {
     pub airs: Vec<AirState>,
 }
 
-/// Values derived from some of a run's measurements.
-#[derive(Debug, Clone, Default)]
-pub(crate) struct DerivedRows {
-    bands: usize,
+/// Values derived from a run's measurements, column by column. Those of bands are in the order of the bands, and end
+/// with their sum if there is a total.
+#[derive(Debug, Default)]
+pub(crate) struct DerivedColumns {
     pub pairs: Vec<u32>,
-    /// `[pairs x length]`.
-    reflected: Vec<f32>,
-    /// `[bands][pairs x length]`.
-    curves: Vec<Vec<f32>>,
-    /// `[pairs x bands]`.
-    energies: Vec<f64>,
-    tnce: Vec<f64>,
-    tnce_over_band: Vec<f64>,
-    /// `[pairs x bands]`: shapes of the curves.
-    shapes: Vec<Option<CurveShape>>,
-    /// `[estimates][pairs x bands]`: TNCE without Foam's reflection, by the best estimate and its variants; empty if
-    /// that is not known.
-    unbiased: Vec<Vec<f64>>,
-    /// `[pairs x (bands + 1)]`: relative errors of TNCE, the total's last; empty if they are not known.
-    errors: Vec<LevelError>,
-    /// `[pairs x (2 bands + 1)]`: standard uncertainties of levels over Flat's total, of the total, and of levels over
-    /// Flat's same band; null without energy; empty if they are not known.
-    uncertainties: Vec<Option<f64>>,
+    /// `[bands + 1][pairs]`.
+    energies: Vec<Vec<f64>>,
+    pub tnce: Vec<Vec<f64>>,
+    /// `[bands][pairs]`.
+    tnce_over_band: Vec<Vec<f64>>,
+    /// `[bands][pairs]`: shapes of the curves.
+    shapes: Vec<Vec<Option<CurveShape>>>,
+    /// `[estimates][bands + 1][pairs]`: TNCE without Foam's reflection, by the best estimate and its variants.
+    pub unbiased: Vec<Vec<Vec<f64>>>,
+    /// `[pairs x bands]`: of the energies; empty if no uncertainty will be known.
+    sensitivities: Vec<EnergySensitivity>,
+    /// `[bands + 1][pairs]`: relative errors of TNCE; without values if they are not known.
+    pub errors: Vec<Vec<LevelError>>,
+    /// `[2 bands + 1][pairs]`: standard uncertainties of levels over Flat's total, of the total, and of levels over
+    /// Flat's same band; null without energy; without values if they are not known.
+    uncertainties: Vec<Vec<Option<f32>>>,
 }
 
-/// Responses and curves of [`DerivedRows`].
-#[derive(Debug, Clone, Default)]
+/// Responses and curves of some of a run's measurements.
+#[derive(Debug)]
 pub(crate) struct DerivedLists {
     pub pairs: Vec<u32>,
     /// `[pairs x length]`.
@@ -100,95 +95,106 @@ pub(crate) struct DerivedLists {
 }
 
 impl DerivedLists {
-    /// Adds the curves of the counted pairs, `length` samples each, to the means of their bands.
-    pub fn add_curves(
-        &self,
-        length: usize,
-        counted: &[bool],
-        means: &mut [SignalMean],
-    ) -> Result<(), echolake_dsp::Error> {
-        for (mean, curves) in means.iter_mut().zip(&self.curves) {
-            let curves = curves.chunks_exact(length).zip(counted).filter(|(_, is_counted)| **is_counted);
-            curves.map(|(curve, _)| curve).try_for_each(|curve| mean.add_signal(curve))?;
-        }
-        Ok(())
+    /// Returns an empty set for up to `pairs` measurements of as many bands, each of `length` samples.
+    pub fn with_capacity(pairs: usize, bands: usize, length: usize) -> Self {
+        let samples = || Vec::with_capacity(pairs * length);
+        Self { pairs: Vec::with_capacity(pairs), reflected: samples(), curves: (0..bands).map(|_| samples()).collect() }
+    }
+
+    /// Appends the lists of one measurement.
+    pub fn push(&mut self, pair: u32, derived: &DerivedResponse<f32>) {
+        self.pairs.push(pair);
+        self.reflected.extend_from_slice(&derived.reflected);
+        let curves = derived.curves.chunks_exact(derived.reflected.len());
+        self.curves.iter_mut().zip(curves).for_each(|(all, curve)| all.extend_from_slice(curve));
     }
 }
 
-impl DerivedRows {
-    /// Returns an empty set of rows with this number of bands.
-    pub fn new(bands: usize) -> Self {
-        Self { bands, curves: vec![Vec::new(); bands], ..Self::default() }
+/// Rounds responses and curves as a lake stores them.
+pub(crate) fn round_lists(derived: &mut DerivedResponse<f32>, precision: SamplePrecision) {
+    if precision == SamplePrecision::Rounded {
+        let length = derived.reflected.len().max(1);
+        round_samples(&mut derived.reflected, CURVE_BITS);
+        derived.curves.chunks_exact_mut(length).for_each(|curve| round_samples(curve, CURVE_BITS));
+    }
+}
+
+impl DerivedColumns {
+    /// Returns empty columns of this number of bands, and of estimates of Foam's reflection.
+    pub fn new(bands: usize, estimates: usize) -> Self {
+        let with_total = vec![Vec::new(); bands + 1];
+        Self {
+            energies: with_total.clone(),
+            tnce: with_total.clone(),
+            tnce_over_band: vec![Vec::new(); bands],
+            shapes: vec![Vec::new(); bands],
+            unbiased: vec![with_total; estimates],
+            errors: vec![Vec::new(); bands + 1],
+            uncertainties: vec![Vec::new(); 2 * bands + 1],
+            ..Self::default()
+        }
     }
 
     /// Appends the values of one measurement.
     pub fn push(&mut self, pair: u32, derived: &DerivedResponse<f32>) {
         self.pairs.push(pair);
-        self.reflected.extend_from_slice(&derived.reflected);
-        let length = derived.reflected.len();
-        for (all, curve) in self.curves.iter_mut().zip(derived.curves.chunks_exact(length)) {
-            all.extend_from_slice(curve);
-        }
-        self.energies.extend_from_slice(&derived.energies);
-        self.tnce.extend_from_slice(&derived.tnce);
-        self.tnce_over_band.extend_from_slice(&derived.tnce_over_band);
-        self.shapes.extend_from_slice(&derived.shapes);
+        push_with_sum(&mut self.energies, derived.energies.iter().copied());
+        push_with_sum(&mut self.tnce, derived.tnce.iter().copied());
+        self.tnce_over_band.iter_mut().zip(&derived.tnce_over_band).for_each(|(all, value)| all.push(*value));
+        self.shapes.iter_mut().zip(&derived.shapes).for_each(|(all, shape)| all.push(*shape));
     }
 
     /// Appends the TNCE of one measurement without Foam's reflection, by the estimate of this number.
     pub fn push_unbiased(&mut self, estimate: usize, energies: &[f64], flat_total: f64) {
-        self.unbiased.resize(self.unbiased.len().max(estimate + 1), Vec::new());
-        self.unbiased[estimate].extend(energies.iter().map(|energy| energy / flat_total));
+        push_with_sum(&mut self.unbiased[estimate], energies.iter().map(|energy| energy / flat_total));
     }
 
-    /// Appends the errors of one measurement from its sensitivities and Flat's.
-    pub fn push_errors(&mut self, levels: &LevelUncertainty, of: &[EnergySensitivity], flat: &FlatPair) {
-        let (total, flat_total) =
-            (EnergySensitivity::sum_of_bands(of), EnergySensitivity::sum_of_bands(&flat.sensitivities));
-        let over_total = || of.iter().chain([&total]);
-        self.errors.extend(over_total().map(|of| levels.relative_error(of, &flat_total)));
-        self.uncertainties.extend(over_total().map(|of| levels.level_db(of, &flat_total)));
-        self.uncertainties.extend(of.iter().zip(&flat.sensitivities).map(|(of, flat)| levels.level_db(of, flat)));
+    /// Appends the sensitivities of one measurement, `[bands]`.
+    pub fn push_sensitivities(&mut self, of: &[EnergySensitivity]) {
+        self.sensitivities.extend_from_slice(of);
     }
 
-    /// Moves out the responses and curves, which are empty afterwards.
-    pub fn take_lists(&mut self, precision: SamplePrecision) -> DerivedLists {
-        let mut lists = DerivedLists {
-            pairs: self.pairs.clone(),
-            reflected: std::mem::take(&mut self.reflected),
-            curves: std::mem::take(&mut self.curves),
-        };
-        if precision == SamplePrecision::Rounded {
-            for samples in lists.curves.iter_mut().chain([&mut lists.reflected]) {
-                let length = samples.len() / self.pairs.len().max(1);
-                for one in samples.chunks_exact_mut(length.max(1)) {
-                    round_samples(one, CURVE_BITS);
-                }
+    /// Computes the errors of all measurements from their sensitivities and from Flat's, `[bands]`, of each pair.
+    pub fn fill_errors<'a>(
+        &mut self,
+        levels: &LevelUncertainty,
+        of_flat: impl Fn(u32) -> Option<&'a [EnergySensitivity]>,
+    ) {
+        let bands = self.shapes.len();
+        let pairs = self.pairs.iter().filter_map(|pair| of_flat(*pair));
+        for (of, flat) in self.sensitivities.chunks_exact(bands).zip(pairs) {
+            let total = &EnergySensitivity::sum_of_bands(of);
+            let flat_total = &EnergySensitivity::sum_of_bands(flat);
+            let over_total = of.iter().chain([total]).map(|of| (of, flat_total));
+            for (all, (of, flat)) in self.errors.iter_mut().zip(over_total.clone()) {
+                all.push(levels.relative_error(of, flat));
+            }
+            for (all, (of, flat)) in self.uncertainties.iter_mut().zip(over_total.chain(of.iter().zip(flat))) {
+                all.push(levels.level_db(of, flat).map(|u_db| u_db as f32));
             }
         }
-        lists
     }
 
-    /// Returns the values of every column from `tnce_*` to `energy_total`, by its name.
-    pub fn energy_columns(&self, bands: &[String]) -> Vec<(String, Vec<f64>)> {
-        let mut columns = vec![
-            ("tnce_total".into(), self.sum_bands(&self.tnce)),
-            ("energy_total".into(), self.sum_bands(&self.energies)),
-        ];
+    /// Returns every column from `tnce_*` to `energy_total`, by its name.
+    pub fn energy_columns(&self, bands: &[String]) -> Vec<(String, &[f64])> {
+        let total = bands.len();
+        let mut columns =
+            vec![("tnce_total".into(), &self.tnce[total][..]), ("energy_total".into(), &self.energies[total][..])];
         for (b, band) in bands.iter().enumerate() {
-            columns.push((format!("tnce_{band}"), self.band_values(&self.tnce, b)));
-            columns.push((format!("tnce_band_{band}"), self.band_values(&self.tnce_over_band, b)));
-            columns.push((format!("energy_{band}"), self.band_values(&self.energies, b)));
+            columns.push((format!("tnce_{band}"), &self.tnce[b][..]));
+            columns.push((format!("tnce_band_{band}"), &self.tnce_over_band[b][..]));
+            columns.push((format!("energy_{band}"), &self.energies[b][..]));
         }
         columns
     }
 
-    /// Returns the values of `rise_*_ms`, `centre_*_ms` and `slope_*_per_ms`, by their names; null without energy.
-    pub fn shape_columns(&self, bands: &[String], rate_hz: f64) -> Vec<(String, Vec<Option<f32>>)> {
+    /// Returns the values of `rise_*_ms`, `centre_*_ms` and `slope_*_per_ms` of some rows, by their names; null without
+    /// energy.
+    pub fn shape_columns(&self, bands: &[String], rate_hz: f64, rows: Range<usize>) -> Vec<(String, Vec<Option<f32>>)> {
         let per_ms = rate_hz / 1e3;
         let column = |band: usize, value: &dyn Fn(&CurveShape) -> f64| {
-            let shapes = self.shapes.iter().skip(band).step_by(self.bands);
-            shapes.map(|shape| shape.as_ref().map(|shape| value(shape) as f32)).collect()
+            let shapes = &self.shapes[band][rows.clone()];
+            shapes.iter().map(|shape| shape.as_ref().map(|shape| value(shape) as f32)).collect()
         };
         let named = |(b, band): (usize, &String)| {
             [
@@ -200,44 +206,25 @@ impl DerivedRows {
         bands.iter().enumerate().flat_map(named).collect()
     }
 
-    /// Returns the values of every column `*_u_db`, by its name; null if they are not known.
-    pub fn uncertainty_columns(&self, bands: &[String]) -> Vec<(String, Vec<Option<f32>>)> {
+    /// Returns the values of every column `*_u_db` of some rows, by its name; null if they are not known.
+    pub fn uncertainty_columns(&self, bands: &[String], rows: Range<usize>) -> Vec<(String, Vec<Option<f32>>)> {
         let over_total = bands.iter().map(|band| format!("tnce_{band}_u_db")).chain(["tnce_total_u_db".to_owned()]);
-        let names: Vec<_> = over_total.chain(bands.iter().map(|band| format!("tnce_band_{band}_u_db"))).collect();
-        let each = names.len();
-        let column = |at: usize| match self.uncertainties.len() {
-            0 => vec![None; self.pairs.len()],
-            _ => self.uncertainties.iter().skip(at).step_by(each).map(|u| u.map(|u| u as f32)).collect(),
+        let names = over_total.chain(bands.iter().map(|band| format!("tnce_band_{band}_u_db")));
+        let column = |values: &Vec<Option<f32>>| match values.get(rows.clone()) {
+            Some(values) => values.to_vec(),
+            None => vec![None; rows.len()],
         };
-        names.into_iter().enumerate().map(|(at, name)| (name, column(at))).collect()
+        names.zip(&self.uncertainties).map(|(name, values)| (name, column(values))).collect()
     }
+}
 
-    /// Returns the relative errors of `tnce_*` and `tnce_total`; without values if they are not known.
-    pub fn error_columns(&self) -> Vec<Vec<LevelError>> {
-        let each = self.bands + 1;
-        (0..each).map(|at| self.errors.iter().skip(at).step_by(each).copied().collect()).collect()
+// Appends a value to each column, and their sum to the last one.
+fn push_with_sum(columns: &mut [Vec<f64>], values: impl Iterator<Item = f64>) {
+    let Some((total, bands)) = columns.split_last_mut() else { return };
+    let mut sum = 0.0;
+    for (all, value) in bands.iter_mut().zip(values) {
+        all.push(value);
+        sum += value;
     }
-
-    /// Returns the values of `tnce_*` and `tnce_total`.
-    pub fn tnce_columns(&self) -> Vec<Vec<f64>> {
-        self.band_columns(&self.tnce)
-    }
-
-    /// Returns the same without Foam's reflection by each estimate; empty if that is not known.
-    pub fn unbiased_columns(&self) -> Vec<Vec<Vec<f64>>> {
-        self.unbiased.iter().map(|values| self.band_columns(values)).collect()
-    }
-
-    fn band_columns(&self, values: &[f64]) -> Vec<Vec<f64>> {
-        let bands = (0..self.bands).map(|band| self.band_values(values, band));
-        bands.chain([self.sum_bands(values)]).collect()
-    }
-
-    fn band_values(&self, values: &[f64], band: usize) -> Vec<f64> {
-        values.iter().skip(band).step_by(self.bands).copied().collect()
-    }
-
-    fn sum_bands(&self, values: &[f64]) -> Vec<f64> {
-        values.chunks_exact(self.bands).map(|row| row.iter().sum()).collect()
-    }
+    total.push(sum);
 }

@@ -40,6 +40,7 @@ mod report;
 #[cfg(test)]
 mod revision_tests;
 mod rows;
+mod run_derivation;
 
 pub use complete::{CompletedRun, CompletionReport, CompletionSummary};
 pub use echolake_recording::FileIntegrity;

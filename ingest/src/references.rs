@@ -5,26 +5,24 @@ use std::sync::Arc;
 
 use echolake_dsp::Complex;
 use echolake_dsp::air::AirState;
-use echolake_dsp::air_correction::{AirCorrection, AirScratch, PairAir};
+use echolake_dsp::air_correction::{AirCorrection, AirScratch, PairAir, TransformedResponse};
 use echolake_dsp::foam::subtract_foam;
 use echolake_dsp::foam_reflection::{FoamReflection, FoamReflectionFit, ReflectionPath};
 use echolake_dsp::geometry::{direct_mm, image_mm, incidence_deg, specular_point};
 use echolake_dsp::temperature::ReferenceAir;
-use echolake_dsp::uncertainty::{DirectSoundResidual, EnergySensitivity};
+use echolake_dsp::uncertainty::{DirectSoundResidual, DirectSoundWaveform, EnergySensitivity};
 use echolake_lake::{
     DirectSound, Lake, LakeSnapshot, ReferenceNames, SamplePrecision, SurfaceReferences, VisibleRun, verdict_mark,
 };
 use echolake_schema::annotations::RejectedMeasurements;
 use echolake_schema::{PairId, Rig, SurfaceId};
 use futures::future::try_join_all;
-use rayon::iter::{IntoParallelRefIterator as _, ParallelIterator as _};
+use rayon::iter::{IntoParallelRefMutIterator as _, ParallelIterator as _};
 use sha2::{Digest as _, Sha256};
 use tokio::sync::Mutex;
 
 use crate::CODE_VERSION;
-use crate::derived_values::{
-    FlatPair, FlatPairs, MeanResponse, MeanResponses, air_correction_fit, derivation_plan, residual_fit,
-};
+use crate::derived_values::{FlatPair, MeanResponse, MeanResponses, air_correction_fit, derivation_plan, residual_fit};
 use crate::error::{Error, Result};
 use crate::pipeline::Cores;
 use crate::read_back;
@@ -47,27 +45,33 @@ pub(crate) struct ReferenceFinder {
     /// Keyed by version: the means change with the runs, and so does the version.
     means: HashMap<String, Arc<MeanResponses>>,
     /// Keyed by Flat's version and Foam's.
-    loaded: HashMap<(String, String), LoadedReferences>,
+    loaded: HashMap<(String, String), Arc<LoadedReferences>>,
 }
 
-/// The direct sound of each pair of a surface, and Flat's values without it.
-#[derive(Clone)]
-pub(crate) struct ReferenceResponses {
-    direct: Arc<MeanResponses>,
-    flat: Arc<FlatPairs>,
+/// The references of a surface: the direct sound of each pair, and Flat's values without it.
+pub(crate) struct LoadedReferences {
+    pairs: HashMap<u32, ReferencePair>,
     /// Residual of Flat; None if it cannot be measured.
     pub flat_residual: Option<DirectSoundResidual>,
-    correction: Arc<AirCorrection<f32>>,
-}
-
-/// References as the lake subtracts them, and those without Foam's reflection.
-#[derive(Clone)]
-pub(crate) struct LoadedReferences {
-    pub chosen: ReferenceResponses,
-    /// By pair; empty if Foam's reflection cannot be estimated: few pairs, or arrivals that are not apart.
-    unbiased: Arc<HashMap<u32, Vec<UnbiasedPair>>>,
+    /// Number of estimates of Foam's reflection; 0 if it cannot be estimated: few pairs, or arrivals that are not apart.
+    pub estimate_count: usize,
     /// The surface whose only run Flat's energies are from.
     pub only_flat: Option<SurfaceId>,
+    correction: AirCorrection<f32>,
+}
+
+/// What all responses of a pair are derived with.
+pub(crate) struct ReferencePair {
+    pub paths: PairPaths,
+    pub direct: TransformedResponse<f32>,
+    /// Air of the direct sound.
+    air: AirState,
+    /// The direct sound for [`ResidualFit::add_pair`](echolake_dsp::uncertainty::ResidualFit::add_pair).
+    pub waveform: DirectSoundWaveform<f32>,
+    pub flat: FlatPair,
+    /// References without Foam's reflection by the best estimate, then by variants of it, whose differences show its
+    /// error.
+    pub unbiased: Vec<UnbiasedPair>,
 }
 
 /// A pair's references without Foam's reflection, by one estimate of it.
@@ -78,18 +82,6 @@ pub(crate) struct UnbiasedPair {
     pub flat_total: f64,
     /// Spectrum of what Flat reflects; empty in variants.
     pub flat: Vec<Complex<f32>>,
-}
-
-impl LoadedReferences {
-    /// Returns a pair's references by the best estimate, then by variants of it, whose differences show its error.
-    pub fn unbiased_pair(&self, pair: u32) -> &[UnbiasedPair] {
-        self.unbiased.get(&pair).map_or(&[], Vec::as_slice)
-    }
-
-    /// Returns the number of estimates, 0 if there is none.
-    pub fn estimate_count(&self) -> usize {
-        self.unbiased.values().next().map_or(0, Vec::len)
-    }
 }
 
 /// One finder for all workers: they share its cache.
@@ -168,7 +160,7 @@ impl ReferenceFinder {
         &mut self,
         wanted: &WantedReferences,
         cores: &Cores,
-    ) -> Result<Option<LoadedReferences>> {
+    ) -> Result<Option<Arc<LoadedReferences>>> {
         let Some(versions) = wanted.version_pair() else { return Ok(None) };
         if let Some(known) = self.loaded.get(&versions) {
             return Ok(Some(known.clone()));
@@ -179,26 +171,30 @@ impl ReferenceFinder {
         let [foam, flat_foam, flat] = named.map(|of| self.means[of.version_key()].clone());
         let lake = self.lake.clone();
         let is_foam_chosen = wanted.direct_sound == DirectSound::Foam;
-        let derive = move || {
-            let reflections = estimate_reflections(&lake, &flat, &flat_foam)?;
-            let chosen = match reflections.first() {
-                _ if is_foam_chosen => ReferenceResponses::new(&lake, foam.clone(), &flat, &flat_foam)?,
-                Some(best) => {
-                    let direct = Arc::new(remove_reflection(&lake, best, &foam, &flat)?);
-                    ReferenceResponses::new(&lake, direct, &flat, &remove_reflection(&lake, best, &flat_foam, &flat)?)?
-                }
-                None => return Ok(None),
-            };
-            let unbiased = chosen.unbiased_pairs(&lake, &reflections, [&foam, &flat_foam], &flat)?;
-            Ok::<_, Error>(Some((chosen, Arc::new(unbiased))))
-        };
-        let [foam_name, flat_name] = [&wanted.foam, &wanted.flat].map(|of| of.surface.to_string());
-        let found = cores.compute_on_core(derive).await?;
-        let (chosen, unbiased) = found.ok_or(Error::FoamReflection { foam: foam_name, flat: flat_name })?;
         let accepted = accepted_runs(&self.snapshot, &self.rejected);
         let flat_runs = accepted.filter(|run| run.surface == wanted.flat.surface).count();
         let only_flat = (flat_runs == 1).then(|| wanted.flat.surface.clone());
-        let loaded = LoadedReferences { chosen, unbiased, only_flat };
+        let derive = move || {
+            let reflections = estimate_reflections(&lake, &flat, &flat_foam)?;
+            let means = match reflections.first() {
+                _ if is_foam_chosen => [foam.clone(), flat_foam.clone()],
+                Some(best) => {
+                    let direct = Arc::new(remove_reflection(&lake, best, &foam, &flat)?);
+                    let flat_direct = match Arc::ptr_eq(&foam, &flat_foam) {
+                        true => direct.clone(),
+                        false => Arc::new(remove_reflection(&lake, best, &flat_foam, &flat)?),
+                    };
+                    [direct, flat_direct]
+                }
+                None => return Ok(None),
+            };
+            let mut references = LoadedReferences::new(&lake, &means, &flat, only_flat)?;
+            references.add_unbiased(&lake, &reflections, [&foam, &flat_foam], &flat)?;
+            Ok::<_, Error>(Some(Arc::new(references)))
+        };
+        let [foam_name, flat_name] = [&wanted.foam, &wanted.flat].map(|of| of.surface.to_string());
+        let found = cores.compute_on_core(derive).await?;
+        let loaded = found.ok_or(Error::FoamReflection { foam: foam_name, flat: flat_name })?;
         self.loaded.insert(versions, loaded.clone());
         Ok(Some(loaded))
     }
@@ -256,119 +252,132 @@ fn accepted_runs<'a>(
     snapshot.runs().filter(move |run| !rejected.is_run_rejected(run.run.as_str()))
 }
 
-impl ReferenceResponses {
-    // `direct` is subtracted from a surface's responses, `flat_direct` from Flat's.
-    fn new(lake: &Lake, direct: Arc<MeanResponses>, flat: &MeanResponses, flat_direct: &MeanResponses) -> Result<Self> {
+impl LoadedReferences {
+    // The first of `means` is subtracted from a surface's responses, the other from Flat's.
+    fn new(
+        lake: &Lake,
+        [direct, flat_direct]: &[Arc<MeanResponses>; 2],
+        flat: &MeanResponses,
+        only_flat: Option<SurfaceId>,
+    ) -> Result<Self> {
         let rig = lake.rig();
         let plan = derivation_plan(rig).map_err(kernel_error)?;
         let mut scratch = plan.make_scratch();
-        let length = rig.impulse_response.length;
         let measured: Vec<_> = sorted_means(flat)
             .into_iter()
             .filter_map(|(pair, flat)| Some((pair, flat, flat_direct.get(&pair)?, PairPaths::new(lake, pair)?)))
             .collect();
         let mut fit = air_correction_fit(rig);
-        let mut reflected = vec![0.0; length];
+        let mut without_direct = vec![0.0; rig.impulse_response.length];
         for (_, flat, direct, paths) in &measured {
-            subtract_foam(&flat.ir, &direct.ir, &mut reflected);
-            fit.add_pair(&direct.ir, &reflected, [paths.direct_m, paths.reflected_m]).map_err(kernel_error)?;
+            subtract_foam(&flat.ir, &direct.ir, &mut without_direct);
+            fit.add_pair(&direct.ir, &without_direct, [paths.direct_m, paths.reflected_m]).map_err(kernel_error)?;
         }
-        let mut references =
-            Self { direct, flat: Arc::default(), flat_residual: None, correction: Arc::new(fit.finish()) };
-        let mut air_scratch = references.make_scratch();
+        let correction = fit.finish();
+        let mut air_scratch = correction.make_scratch();
+        let mut reflected = correction.make_reflected();
         let mut residual = residual_fit(rig).map_err(kernel_error)?;
-        let mut pairs = FlatPairs::with_capacity(flat.len());
-        for (pair, flat, direct, paths) in measured {
-            references
-                .subtract_direct(&flat.ir, direct, &flat.air, &paths, &mut reflected, &mut air_scratch)
-                .map_err(kernel_error)?;
-            let energies = plan.flat_energies(&reflected, &mut scratch).map_err(kernel_error)?;
-            let mut sensitivities = vec![EnergySensitivity::default(); energies.bands.len()];
-            let per_kelvin = |bin| references.energy_per_kelvin(bin, paths.reflected_m);
-            plan.compute_sensitivities(&reflected, &direct.ir, per_kelvin, &mut sensitivities, &mut scratch)
-                .map_err(kernel_error)?;
+        let mut pairs = HashMap::with_capacity(flat.len());
+        let is_same = Arc::ptr_eq(direct, flat_direct);
+        let mut add_pair = |pair: u32, flat: &MeanResponse, flat_direct: &MeanResponse, paths: PairPaths| {
             let [direct_secs, reflected_secs] = paths.arrival_secs(rig);
-            residual.add_pair(&reflected, &direct.ir, direct_secs, reflected_secs).map_err(kernel_error)?;
-            pairs.insert(pair, FlatPair { energies, sensitivities, air: flat.air });
+            let own = correction.transform_response(flat_direct.ir.clone(), &mut air_scratch)?;
+            let own_waveform = residual.prepare_direct(&own.spectrum, direct_secs, reflected_secs)?;
+            let air = paths.in_air(&flat.air, &flat_direct.air);
+            correction.subtract_direct(&flat.ir, &own, &air, &mut reflected, &mut air_scratch)?;
+            let energies = plan.flat_energies(&reflected.samples, &mut scratch)?;
+            let mut sensitivities = vec![EnergySensitivity::default(); energies.bands.len()];
+            let per_kelvin = |bin| correction.energy_per_kelvin(bin, paths.reflected_m);
+            plan.compute_sensitivities(
+                &reflected.spectrum,
+                &own.spectrum,
+                per_kelvin,
+                &mut sensitivities,
+                &mut scratch,
+            )?;
+            residual.add_pair(&reflected.spectrum, &own_waveform)?;
+            let flat = FlatPair { energies, sensitivities, air: flat.air };
+            let (direct, waveform, air) = match direct.get(&pair) {
+                None => return Ok(()),
+                // Most often Foam is that of Flat, too.
+                Some(_) if is_same => (own, own_waveform, flat_direct.air),
+                Some(other) => {
+                    let direct = correction.transform_response(other.ir.clone(), &mut air_scratch)?;
+                    let waveform = residual.prepare_direct(&direct.spectrum, direct_secs, reflected_secs)?;
+                    (direct, waveform, other.air)
+                }
+            };
+            pairs.insert(pair, ReferencePair { paths, direct, air, waveform, flat, unbiased: Vec::new() });
+            Ok::<_, echolake_dsp::Error>(())
+        };
+        for (pair, flat, flat_direct, paths) in measured {
+            add_pair(pair, flat, flat_direct, paths).map_err(kernel_error)?;
         }
-        references.flat = Arc::new(pairs);
-        references.flat_residual = residual.finish();
-        Ok(references)
+        Ok(Self { pairs, flat_residual: residual.finish(), estimate_count: 0, only_flat, correction })
     }
 
-    /// Returns the direct sound of a pair and its values of Flat, if the references have the pair.
-    pub fn of_pair(&self, pair: u32) -> Option<(&MeanResponse, &FlatPair)> {
-        Some((self.direct.get(&pair)?, self.flat.get(&pair)?))
+    /// Returns the references of a pair, if they have it.
+    pub fn find_pair(&self, pair: u32) -> Option<&ReferencePair> {
+        self.pairs.get(&pair)
     }
 
-    /// Returns buffers for [`Self::subtract_direct`].
-    pub fn make_scratch(&self) -> AirScratch<f32> {
-        self.correction.make_scratch()
+    /// Returns the correction, for its buffers and changes of energies, and for [`ReferencePair::subtract_direct`].
+    pub fn correction(&self) -> &AirCorrection<f32> {
+        &self.correction
     }
 
-    /// Computes what a surface reflects from a response that was measured in this air.
-    pub fn subtract_direct(
-        &self,
-        ir: &[f32],
-        direct: &MeanResponse,
-        air: &AirState,
-        paths: &PairPaths,
-        reflected: &mut [f32],
-        scratch: &mut AirScratch<f32>,
-    ) -> std::result::Result<(), echolake_dsp::Error> {
-        self.correction.subtract_direct(ir, &direct.ir, &paths.in_air(air, &direct.air), reflected, scratch)
-    }
-
-    /// Computes the spectrum of what a surface reflects from the response that [`Self::subtract_direct`] took last.
-    pub fn reflected_spectrum(
-        &self,
-        direct: &[Complex<f32>],
-        reflected: &mut [Complex<f32>],
-        scratch: &AirScratch<f32>,
-    ) {
-        self.correction.reflected_spectrum(direct, reflected, scratch);
-    }
-
-    // For each pair that Flat and both Foams have, its references by each estimate.
-    fn unbiased_pairs(
-        &self,
+    // Adds the references by each estimate to each pair that Flat and both Foams have.
+    fn add_unbiased(
+        &mut self,
         lake: &Lake,
         reflections: &[FoamReflection],
-        [foam, flat_foam]: [&Arc<MeanResponses>; 2],
+        [foam, flat_foam]: [&MeanResponses; 2],
         flat: &MeanResponses,
-    ) -> Result<HashMap<u32, Vec<UnbiasedPair>>> {
+    ) -> Result<()> {
         if reflections.is_empty() {
-            return Ok(HashMap::new());
+            return Ok(());
         }
         let plan = derivation_plan(lake.rig()).map_err(kernel_error)?;
-        let of_pair = |scratch: &mut AirScratch<f32>, (pair, flat): (&u32, &MeanResponse)| {
-            let (Some(own), Some(flat_foam), Some(paths)) =
-                (foam.get(pair), flat_foam.get(pair), PairPaths::new(lake, *pair))
+        let Self { pairs, correction, .. } = self;
+        let add_to_pair = |scratch: &mut AirScratch<f32>, (number, pair): (&u32, &mut ReferencePair)| {
+            let (Some(own), Some(flat_foam), Some(flat)) = (foam.get(number), flat_foam.get(number), flat.get(number))
             else {
-                return Ok(None);
+                return Ok(());
             };
             let mut direct = vec![0.0; flat.ir.len()];
             let mut reflected = vec![Complex::default(); flat.ir.len() / 2 + 1];
-            self.correction.take_response(&flat.ir, &paths.in_air(&flat.air, &flat_foam.air), scratch)?;
-            let unbiased = reflections.iter().enumerate().map(|(number, reflection)| {
-                reflection.direct_sound(&flat_foam.ir, &flat.ir, paths.incidence_deg, &mut direct)?;
-                let of_flat = self.correction.compute_spectrum(&direct, scratch)?;
-                self.correction.reflected_spectrum(&of_flat, &mut reflected, scratch);
+            let incidence_deg = pair.paths.incidence_deg;
+            correction.take_response(&flat.ir, &pair.paths.in_air(&flat.air, &flat_foam.air), scratch)?;
+            for (number, reflection) in reflections.iter().enumerate() {
+                reflection.direct_sound(&flat_foam.ir, &flat.ir, incidence_deg, &mut direct)?;
+                let of_flat = correction.compute_spectrum(&direct, scratch)?;
+                correction.reflected_spectrum(&of_flat, &mut reflected, scratch);
                 let flat_total = plan.spectrum_energy(&reflected);
                 let of_best = if number == 0 { reflected.clone() } else { Vec::new() };
-                reflection.direct_sound(&own.ir, &flat.ir, paths.incidence_deg, &mut direct)?;
-                let direct = self.correction.compute_spectrum(&direct, scratch)?;
-                Ok(UnbiasedPair { direct, flat_total, flat: of_best })
-            });
-            Ok(Some((*pair, unbiased.collect::<std::result::Result<_, _>>()?)))
+                reflection.direct_sound(&own.ir, &flat.ir, incidence_deg, &mut direct)?;
+                let direct = correction.compute_spectrum(&direct, scratch)?;
+                pair.unbiased.push(UnbiasedPair { direct, flat_total, flat: of_best });
+            }
+            Ok::<_, echolake_dsp::Error>(())
         };
-        let pairs = flat.par_iter().map_init(|| self.make_scratch(), of_pair);
-        pairs.filter_map(std::result::Result::transpose).collect::<std::result::Result<_, _>>().map_err(kernel_error)
+        let added = pairs.par_iter_mut().map_init(|| correction.make_scratch(), add_to_pair);
+        added.collect::<std::result::Result<(), _>>().map_err(kernel_error)?;
+        self.estimate_count = if self.pairs.is_empty() { 0 } else { reflections.len() };
+        Ok(())
     }
+}
 
-    /// Returns the relative change of a bin's energy, per kelvin that the air is warmer than its sensor says.
-    pub fn energy_per_kelvin(&self, bin: usize, metres: f64) -> f64 {
-        self.correction.energy_per_kelvin(bin, metres)
+impl ReferencePair {
+    /// Computes what a surface reflects from a response that was measured in this air.
+    pub fn subtract_direct(
+        &self,
+        correction: &AirCorrection<f32>,
+        ir: &[f32],
+        air: &AirState,
+        reflected: &mut TransformedResponse<f32>,
+        scratch: &mut AirScratch<f32>,
+    ) -> std::result::Result<(), echolake_dsp::Error> {
+        correction.subtract_direct(ir, &self.direct, &self.paths.in_air(air, &self.air), reflected, scratch)
     }
 }
 

@@ -1,5 +1,8 @@
 //! Energy, its running sum along time, and both over Flat's.
 
+use realfft::num_complex::Complex;
+use wide::f64x2;
+
 use crate::RealSample;
 pub use crate::foam::subtract_foam;
 
@@ -98,6 +101,47 @@ pub(crate) fn accumulate_energy<T: RealSample>(band: &[T], factor: f64, curve: &
     sum
 }
 
+/// Running sums of squares of two bands, the real and the imaginary parts of a signal, times `factor`; returns the sums
+/// themselves.
+///
+/// coupled, first, second  `[len]`
+///
+/// Each is what [`accumulate_energy`] computes.
+pub(crate) fn accumulate_couple<T: RealSample>(
+    coupled: &[Complex<T>],
+    factor: f64,
+    first: &mut [T],
+    second: &mut [T],
+) -> [f64; 2] {
+    let square = |x: &Complex<T>| {
+        let x = f64x2::new([x.re.f64(), x.im.f64()]);
+        x * x
+    };
+    let put = |sum: f64x2, first: &mut T, second: &mut T| [*first, *second] = (sum * factor).to_array().map(T::of);
+    let mut sum = f64x2::ZERO;
+    let (blocks, rest) = coupled.as_chunks::<BLOCK>();
+    let (first_blocks, first_rest) = first.as_chunks_mut::<BLOCK>();
+    let (second_blocks, second_rest) = second.as_chunks_mut::<BLOCK>();
+    for (block, (first, second)) in blocks.iter().zip(first_blocks.iter_mut().zip(second_blocks)) {
+        let mut sums: [f64x2; BLOCK] = std::array::from_fn(|i| square(&block[i]));
+        for distance in [1, 2, 4] {
+            let before = sums;
+            for i in distance..BLOCK {
+                sums[i] = before[i] + before[i - distance];
+            }
+        }
+        for (within, (first, second)) in sums.iter().zip(first.iter_mut().zip(second)) {
+            put(sum + *within, first, second);
+        }
+        sum += sums[BLOCK - 1];
+    }
+    for (x, (first, second)) in rest.iter().zip(first_rest.iter_mut().zip(second_rest)) {
+        sum += square(x);
+        put(sum, first, second);
+    }
+    sum.to_array()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -121,6 +165,22 @@ mod tests {
         let mut over = [f64::NAN; 2];
         tnce_over_band(&[9.0, 10.0], &[18.0, 5.0], &mut over);
         assert_eq!(over, [0.5, 2.0]);
+    }
+
+    #[test]
+    fn two_bands_at_once_are_each_by_itself() {
+        for len in [0, 1, 7, 8, 30, 384] {
+            let bands = [0.7, 1.9].map(|turn| (0..len).map(|n| (n as f32 * turn).sin()).collect::<Vec<f32>>());
+            let coupled: Vec<_> = bands[0].iter().zip(&bands[1]).map(|(re, im)| Complex::new(*re, *im)).collect();
+            let mut both = [vec![f32::NAN; len], vec![f32::NAN; len]];
+            let [first, second] = &mut both;
+            let sums = accumulate_couple(&coupled, 0.3, first, second);
+            for ((band, curve), sum) in bands.iter().zip(&both).zip(sums) {
+                let mut expected = vec![f32::NAN; len];
+                assert_eq!(accumulate_energy(band, 0.3, &mut expected), sum, "{len}");
+                assert_eq!(curve, &expected, "{len}");
+            }
+        }
     }
 
     // An f32 sum of a million equal squares would stall long before; ours is exact.

@@ -8,6 +8,7 @@ use realfft::RealToComplex;
 use realfft::num_complex::Complex;
 use rustfft::{Fft, FftDirection};
 
+use crate::energy::accumulate_couple;
 use crate::error::check_len;
 use crate::uncertainty::{EnergySensitivity, bin_angle};
 use crate::{Error, RealSample};
@@ -52,6 +53,8 @@ pub struct FilterBankPlan<T: RealSample> {
     len: usize,
     bands: Vec<BandWeights>,
     couples: Vec<BandCouple<T>>,
+    /// `[len/2 + 1]`: angle of each bin per sample.
+    angles: Vec<f64>,
     forward: Arc<dyn RealToComplex<T>>,
     inverse: Arc<dyn Fft<T>>,
 }
@@ -64,8 +67,13 @@ struct BandWeights {
     weights: Vec<f64>,
 }
 
+/// Values of one bin that are summed to an [`EnergySensitivity`], in the order of its fields.
+type SensitivityTerms = [f64; 6];
+
 /// Bins that are summed side by side.
 const LANES: usize = 8;
+
+const NOT_FINITE: Error = Error::NotFinite { what: "the response" };
 
 /// Two bands that are transformed as one; the second is empty if the number of bands is odd.
 struct BandCouple<T> {
@@ -79,8 +87,8 @@ struct BandCouple<T> {
 pub struct FilterBankScratch<T> {
     signal: Vec<T>,
     spectrum: Vec<Complex<T>>,
-    /// Spectrum of the direct sound.
-    direct: Vec<Complex<T>>,
+    /// `[len/2 + 1]`.
+    terms: Vec<SensitivityTerms>,
     /// `[couples x len]`.
     coupled: Vec<Complex<T>>,
     work: Vec<Complex<T>>,
@@ -119,6 +127,7 @@ impl<T: RealSample> FilterBankPlan<T> {
             len,
             bands: bands.iter().copied().map(weights).collect(),
             couples: bands.chunks(2).map(couple).collect(),
+            angles: (0..bins).map(|bin| bin_angle(bin, len)).collect(),
             forward: T::plan_real_forward(len),
             inverse: T::plan_fft(len, FftDirection::Inverse),
         })
@@ -141,7 +150,7 @@ impl<T: RealSample> FilterBankPlan<T> {
         FilterBankScratch {
             signal: self.forward.make_input_vec(),
             spectrum: self.forward.make_output_vec(),
-            direct: self.forward.make_output_vec(),
+            terms: vec![SensitivityTerms::default(); self.angles.len()],
             coupled: vec![Complex::default(); self.couples.len() * self.len],
             work: vec![Complex::default(); work],
         }
@@ -154,17 +163,64 @@ impl<T: RealSample> FilterBankPlan<T> {
     pub fn split_bands(&self, ir: &[T], bands: &mut [T], scratch: &mut FilterBankScratch<T>) -> Result<(), Error> {
         check_len("the bands", bands.len(), self.bands.len() * self.len)?;
         self.compute_spectrum(ir, scratch)?;
-        let FilterBankScratch { spectrum, coupled, work, .. } = scratch;
-        for (couple, coupled) in self.couples.iter().zip(coupled.chunks_exact_mut(self.len)) {
-            couple.filter_spectrum(spectrum, coupled);
-        }
-        self.inverse.process_with_scratch(coupled, work);
+        let spectrum = std::mem::take(&mut scratch.spectrum);
+        let filtered = self.filter_couples(&spectrum, scratch);
+        scratch.spectrum = spectrum;
+        filtered?;
+        let coupled = &scratch.coupled;
         for (out, coupled) in bands.chunks_mut(2 * self.len).zip(coupled.chunks_exact(self.len)) {
             let (first, second) = out.split_at_mut(self.len);
             first.iter_mut().zip(coupled).for_each(|(out, c)| *out = c.re);
             second.iter_mut().zip(coupled).for_each(|(out, c)| *out = c.im);
         }
         Ok(())
+    }
+
+    /// Computes the running energy of each band of a signal times a factor, and its energy, by the signal's spectrum.
+    ///
+    /// spectrum  `[len / 2 + 1]`, curves `[bands x len]`, energies `[bands]`
+    ///
+    /// # Errors
+    /// [`Error::Length`] or [`Error::NotFinite`].
+    pub fn accumulate_bands(
+        &self,
+        spectrum: &[Complex<T>],
+        factor: f64,
+        curves: &mut [T],
+        energies: &mut [f64],
+        scratch: &mut FilterBankScratch<T>,
+    ) -> Result<(), Error> {
+        check_len("the curves", curves.len(), self.bands.len() * self.len)?;
+        check_len("the energies", energies.len(), self.bands.len())?;
+        self.filter_couples(spectrum, scratch)?;
+        let coupled = scratch.coupled.chunks_exact(self.len);
+        for ((curves, energies), coupled) in curves.chunks_mut(2 * self.len).zip(energies.chunks_mut(2)).zip(coupled) {
+            let (first, second) = curves.split_at_mut(self.len);
+            // The last couple of an odd number of bands has no second one.
+            let second = if second.is_empty() { &mut scratch.signal[..] } else { second };
+            let sums = accumulate_couple(coupled, factor, first, second);
+            energies.iter_mut().zip(sums).for_each(|(energy, sum)| *energy = sum);
+        }
+        Ok(())
+    }
+
+    /// The same for a signal of samples `[len]`.
+    ///
+    /// # Errors
+    /// [`Error::Length`] or [`Error::NotFinite`].
+    pub fn accumulate_signal(
+        &self,
+        ir: &[T],
+        factor: f64,
+        curves: &mut [T],
+        energies: &mut [f64],
+        scratch: &mut FilterBankScratch<T>,
+    ) -> Result<(), Error> {
+        self.compute_spectrum(ir, scratch)?;
+        let spectrum = std::mem::take(&mut scratch.spectrum);
+        let done = self.accumulate_bands(&spectrum, factor, curves, energies, scratch);
+        scratch.spectrum = spectrum;
+        done
     }
 
     /// Energy of a signal in each band, by Parseval: no band is computed for it.
@@ -201,38 +257,49 @@ impl<T: RealSample> FilterBankPlan<T> {
     /// Energy of a reflected response in each band, and what errors of the direct sound beneath it do to that energy,
     /// and warmer air by its relative change in each bin.
     ///
+    /// reflected, direct  `[len / 2 + 1]`: their spectra
+    ///
     /// # Errors
     /// [`Error::Length`] or [`Error::NotFinite`].
     pub fn compute_sensitivities(
         &self,
-        reflected: &[T],
-        direct: &[T],
+        reflected: &[Complex<T>],
+        direct: &[Complex<T>],
         per_kelvin: impl Fn(usize) -> f64,
         sensitivities: &mut [EnergySensitivity],
         scratch: &mut FilterBankScratch<T>,
     ) -> Result<(), Error> {
         check_len("the sensitivities", sensitivities.len(), self.bands.len())?;
-        self.compute_spectrum(direct, scratch)?;
-        std::mem::swap(&mut scratch.spectrum, &mut scratch.direct);
-        self.compute_spectrum(reflected, scratch)?;
-        for (band, sensitivity) in self.bands.iter().zip(sensitivities) {
-            let mut sum = EnergySensitivity::default();
-            let bins = scratch.spectrum.iter().zip(&scratch.direct).enumerate().skip(band.bins.start);
-            for ((bin, (x, d)), weight) in bins.zip(&band.weights) {
-                let angle = bin_angle(bin, self.len);
-                let product = x.conj() * d;
-                let power = d.norm_sqr().f64();
-                let energy = weight * x.norm_sqr().f64();
-                sum.energy += energy;
-                sum.temperature += energy * per_kelvin(bin);
-                sum.gain += 2.0 * weight * product.re.f64();
-                sum.gain_square += weight * power;
-                // A delay adds minus the first derivative, and half of its square times the second.
-                sum.delay += 2.0 * weight * angle * product.im.f64();
-                sum.delay_square += weight * angle * angle * (power - product.re.f64());
-            }
-            *sensitivity = sum;
+        self.check_spectrum(reflected)?;
+        self.check_spectrum(direct)?;
+        let spectra = reflected.iter().zip(direct).zip(&self.angles);
+        for ((bin, terms), ((x, d), angle)) in scratch.terms.iter_mut().enumerate().zip(spectra) {
+            let product = x.conj() * d;
+            let power = d.norm_sqr().f64();
+            let energy = x.norm_sqr().f64();
+            let gain = product.re.f64();
+            // A delay adds minus the first derivative, and half of its square times the second.
+            let delay = angle * product.im.f64();
+            *terms = [energy, 2.0 * gain, power, 2.0 * delay, angle * angle * (power - gain), energy * per_kelvin(bin)];
         }
+        for (band, sensitivity) in self.bands.iter().zip(sensitivities) {
+            let mut sums = SensitivityTerms::default();
+            for (terms, weight) in scratch.terms[band.bins.clone()].iter().zip(&band.weights) {
+                sums.iter_mut().zip(terms).for_each(|(sum, term)| *sum += weight * term);
+            }
+            let [energy, gain, gain_square, delay, delay_square, temperature] = sums;
+            *sensitivity = EnergySensitivity { energy, gain, gain_square, delay, delay_square, temperature };
+        }
+        Ok(())
+    }
+
+    fn filter_couples(&self, spectrum: &[Complex<T>], scratch: &mut FilterBankScratch<T>) -> Result<(), Error> {
+        self.check_spectrum(spectrum)?;
+        let FilterBankScratch { coupled, work, .. } = scratch;
+        for (couple, coupled) in self.couples.iter().zip(coupled.chunks_exact_mut(self.len)) {
+            couple.filter_spectrum(spectrum, coupled);
+        }
+        self.inverse.process_with_scratch(coupled, work);
         Ok(())
     }
 
@@ -240,12 +307,15 @@ impl<T: RealSample> FilterBankPlan<T> {
         check_len("the response", ir.len(), self.len)?;
         let FilterBankScratch { signal, spectrum, work, .. } = scratch;
         signal.copy_from_slice(ir);
-        let not_finite = Error::NotFinite { what: "the response" };
-        if self.forward.process_with_scratch(signal, spectrum, work).is_err() {
-            return Err(not_finite);
-        }
-        // The first bin is the sum of all samples, and one that is not finite spoils it.
-        if spectrum.first().is_some_and(|dc| dc.re.f64().is_finite()) { Ok(()) } else { Err(not_finite) }
+        let done = self.forward.process_with_scratch(signal, spectrum, work);
+        done.map_err(|_| NOT_FINITE)?;
+        self.check_spectrum(spectrum)
+    }
+
+    // The first bin is the sum of all samples, and one that is not finite spoils it.
+    fn check_spectrum(&self, spectrum: &[Complex<T>]) -> Result<(), Error> {
+        check_len("the spectrum", spectrum.len(), self.angles.len())?;
+        if spectrum[0].re.f64().is_finite() { Ok(()) } else { Err(NOT_FINITE) }
     }
 }
 

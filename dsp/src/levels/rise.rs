@@ -6,6 +6,9 @@ use crate::RealSample;
 /// Shares of a curve's last value between which it rises.
 const RISE_SHARES: [f64; 2] = [0.1, 0.9];
 
+/// Samples that are compared side by side.
+const BLOCK: usize = 16;
+
 /// Shape of one cumulative energy curve, in samples from its first.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CurveShape {
@@ -32,13 +35,17 @@ pub struct CurveShape {
 pub fn curve_shape<T: RealSample>(curve: &[T]) -> Option<CurveShape> {
     let last = curve.last()?.f64();
     // A sum is not finite if one of its terms is not.
-    let sum: f64 = curve.iter().map(|x| x.f64()).sum();
+    let sum = T::sum_samples(curve);
     if !(last > 0.0 && sum.is_finite()) {
         return None;
     }
+    let (blocks, _) = curve.as_chunks::<BLOCK>();
     let crossing = |share: f64| {
         let level = share * last;
-        let at = curve.iter().position(|x| x.f64() >= level)?;
+        // Whole blocks below the level are passed over without a branch for each sample.
+        let reaches = |block: &[T; BLOCK]| block.iter().fold(false, |reaches, x| reaches | (x.f64() >= level));
+        let first = BLOCK * blocks.iter().position(reaches).unwrap_or(blocks.len());
+        let at = first + curve[first..].iter().position(|x| x.f64() >= level)?;
         let (before, here) = (at.checked_sub(1).map_or(0.0, |n| curve[n].f64()), curve[at].f64());
         Some(at as f64 - (here - level) / (here - before))
     };
@@ -62,6 +69,24 @@ mod tests {
         assert!((two.centre - 3.0).abs() < 1e-9, "{two:?}");
         // An arrival in the first sample.
         assert_eq!(curve_shape(&[1.0, 1.0]).map(|shape| shape.centre), Some(0.0));
+    }
+
+    // Curves that fall, as a list of a query may, cross where they first do.
+    #[test]
+    fn the_first_crossing_counts_in_curves_of_any_length() {
+        for len in 1..70 {
+            let curve: Vec<f32> = (0..len).map(|n| (n as f32 * 0.9).sin() + n as f32 * 0.1 + 1.0).collect();
+            let last = f64::from(curve[len - 1]);
+            let crossing = |share: f64| {
+                let at = curve.iter().position(|x| f64::from(*x) >= share * last).expect("the last one");
+                let before = if at == 0 { 0.0 } else { f64::from(curve[at - 1]) };
+                at as f64 - (f64::from(curve[at]) - share * last) / (f64::from(curve[at]) - before)
+            };
+            let shape = curve_shape(&curve).expect("a shape");
+            assert_eq!(shape.rise, crossing(0.9) - crossing(0.1), "{len}");
+            let sum: f64 = curve.iter().map(|x| f64::from(*x)).sum();
+            assert!((shape.centre - (len as f64 - sum / last)).abs() < 1e-12, "{len}");
+        }
     }
 
     #[test]

@@ -7,8 +7,8 @@
 use std::f64::consts::LN_10;
 use std::sync::Arc;
 
+use realfft::ComplexToReal;
 use realfft::num_complex::Complex;
-use realfft::{ComplexToReal, RealToComplex};
 
 use crate::error::check_len;
 use crate::{Error, RealSample};
@@ -46,13 +46,17 @@ pub struct DirectSoundResidual {
 /// Measures a run's [`DirectSoundResidual`].
 ///
 /// ```
+/// use echolake_dsp::Complex;
 /// use echolake_dsp::uncertainty::ResidualFit;
 ///
 /// let mut fit = ResidualFit::<f64>::new(384, 96e3, [2e3, 40e3])?;
-/// let direct: Vec<f64> = (0..384).map(|n| (-(f64::from(n) - 80.0).powi(2) / 8.0).exp()).collect();
-/// let reflected: Vec<f64> = direct.iter().map(|x| 0.01 * x).collect();
+/// // The spectrum of a sample of 1, the 80th of 384, and of 1 % of it.
+/// let turn = std::f64::consts::TAU * 80.0 / 384.0;
+/// let direct: Vec<_> = (0..193).map(|bin| Complex::from_polar(1.0, -turn * f64::from(bin))).collect();
+/// let reflected: Vec<_> = direct.iter().map(|x| 0.01 * x).collect();
+/// let of_pair = fit.prepare_direct(&direct, 80.0 / 96e3, 200.0 / 96e3)?;
 /// for _ in 0..24 {
-///     assert!(fit.add_pair(&reflected, &direct, 80.0 / 96e3, 200.0 / 96e3)?);
+///     assert!(fit.add_pair(&reflected, &of_pair)?);
 /// }
 /// let residual = fit.finish().ok_or("24 pairs are enough")?;
 /// assert!((residual.gain.mean - 0.01).abs() < 1e-9 && residual.delay.mean.abs() < 1e-9);
@@ -61,7 +65,6 @@ pub struct DirectSoundResidual {
 pub struct ResidualFit<T: RealSample> {
     rate_hz: f64,
     len: usize,
-    forward: Arc<dyn RealToComplex<T>>,
     inverse: Arc<dyn ComplexToReal<T>>,
     /// Gain of each bin, over the number of samples: falls smoothly to nothing at the limits of the sweep's range, so
     /// that nothing rings from one arrival to the other.
@@ -71,6 +74,21 @@ pub struct ResidualFit<T: RealSample> {
     gains: ErrorSums,
     delays: ErrorSums,
     noise: (usize, f64),
+    filtered: Vec<Complex<T>>,
+    signal: Vec<T>,
+    work: Vec<Complex<T>>,
+}
+
+/// The direct sound of a pair, as [`ResidualFit`] compares responses with it: the same for all runs.
+#[derive(Debug, Clone, PartialEq)]
+pub struct DirectSoundWaveform<T> {
+    /// Samples of noise alone, before it arrives.
+    quiet: usize,
+    /// Direct sound within the sweep's range, and what a delay by a sample adds to it, both times the gate, up to its
+    /// end. Empty if the reflection arrives too soon thereafter.
+    gated: [Vec<T>; 2],
+    /// Sums of products: of the direct sound with itself, of both, and of the delay's with itself.
+    products: [f64; 3],
 }
 
 #[derive(Debug, Clone, Copy, Default)]
@@ -146,75 +164,87 @@ impl<T: RealSample> ResidualFit<T> {
             if (0.0..=1.0).contains(&share) { (std::f64::consts::PI * share).sin().powi(2) } else { 0.0 }
         };
         let smooth: Vec<f64> = (0..len / 2 + 1).map(gain).collect();
+        let inverse = T::plan_real_inverse(len);
         Ok(Self {
             rate_hz,
             len,
-            forward: T::plan_real_forward(len),
-            inverse: T::plan_real_inverse(len),
             noise_share: 2.0 * smooth.iter().map(|gain| gain * gain).sum::<f64>() / len as f64,
             bin_gains: smooth.iter().map(|gain| gain / len as f64).collect(),
             gains: ErrorSums::default(),
             delays: ErrorSums::default(),
             noise: (0, 0.0),
+            filtered: inverse.make_input_vec(),
+            signal: inverse.make_output_vec(),
+            work: inverse.make_scratch_vec(),
+            inverse,
         })
     }
 
-    /// Adds a pair: its response without the direct sound, the direct sound, and the arrivals of both in the panel's
-    /// plane, s. Returns false, and measures only the noise, if they arrive too soon after one another.
+    /// Prepares a pair's direct sound by its spectrum `[len / 2 + 1]` and the arrivals of direct and reflected sound in
+    /// the panel's plane, s. It serves every fit of the same settings.
     ///
     /// # Errors
     /// [`Error::Length`] or [`Error::NotFinite`].
-    pub fn add_pair(
+    pub fn prepare_direct(
         &mut self,
-        reflected: &[T],
-        direct: &[T],
+        spectrum: &[Complex<T>],
         direct_secs: f64,
         reflected_secs: f64,
-    ) -> Result<bool, Error> {
-        check_len("the response", reflected.len(), self.len)?;
-        check_len("the direct sound", direct.len(), self.len)?;
+    ) -> Result<DirectSoundWaveform<T>, Error> {
         let quiet = ((direct_secs - NOISE_SECS) * self.rate_hz).clamp(0.0, self.len as f64) as usize;
-        let spectrum = self.signal_spectrum(reflected)?;
-        let reflected = self.filtered_signal(&spectrum, |_| Complex::new(1.0, 0.0))?;
-        self.noise.0 += quiet;
-        self.noise.1 += reflected[..quiet].iter().map(|x| x.f64().powi(2)).sum::<f64>();
+        let mut waveform = DirectSoundWaveform { quiet, gated: [Vec::new(), Vec::new()], products: [0.0; 3] };
         if reflected_secs - direct_secs < LEAST_SEPARATION_SECS || !(direct_secs + reflected_secs).is_finite() {
-            return Ok(false);
+            return Ok(waveform);
         }
-        let spectrum = self.signal_spectrum(direct)?;
-        let direct = self.filtered_signal(&spectrum, |_| Complex::new(1.0, 0.0))?;
-        let derivative = self.filtered_signal(&spectrum, |bin| Complex::new(0.0, bin_angle(bin, self.len)))?;
-        let gate = |n: usize| {
-            let secs = n as f64 / self.rate_hz - (reflected_secs - GATE_SECS[0]);
-            let fall = secs / (GATE_SECS[0] - GATE_SECS[1]);
-            match fall {
-                ..=0.0 => 1.0,
-                0.0..1.0 => 0.5 + 0.5 * (std::f64::consts::PI * fall).cos(),
-                _ => 0.0,
-            }
-        };
-        // Least squares of gain x direct - delay x derivative.
-        let [mut dd, mut ds, mut ss, mut xd, mut xs] = [0.0; 5];
-        for (n, ((x, d), s)) in reflected.iter().zip(&direct).zip(&derivative).enumerate() {
-            let weight = gate(n);
-            let x = x.f64();
+        let gates: Vec<f64> =
+            (0..self.len).map(|n| self.gate(n, reflected_secs)).take_while(|gate| *gate > 0.0).collect();
+        let len = self.len;
+        let direct = self.filter_spectrum(spectrum, |_| Complex::new(1.0, 0.0))?.to_vec();
+        let derivative = self.filter_spectrum(spectrum, |bin| Complex::new(0.0, bin_angle(bin, len)))?;
+        let [mut dd, mut ds, mut ss] = [0.0; 3];
+        for ((gate, d), s) in gates.iter().zip(&direct).zip(derivative) {
             let d = d.f64();
             let s = -s.f64();
-            (dd, ds, ss) = (dd + weight * d * d, ds + weight * d * s, ss + weight * s * s);
-            (xd, xs) = (xd + weight * x * d, xs + weight * x * s);
+            dd += gate * d * d;
+            ds += gate * d * s;
+            ss += gate * s * s;
         }
-        let determinant = dd * ss - ds * ds;
-        // Arrivals at one another's side are not told apart.
-        if !(determinant > 1e-6 * dd * ss) {
+        // Otherwise arrivals at one another's side are not told apart.
+        if dd * ss - ds * ds > 1e-6 * dd * ss {
+            let gated = |signal: &[T], sign: f64| {
+                gates.iter().zip(signal).map(|(gate, x)| T::of(sign * gate * x.f64())).collect()
+            };
+            waveform.gated = [gated(&direct, 1.0), gated(derivative, -1.0)];
+            waveform.products = [dd, ds, ss];
+        }
+        Ok(waveform)
+    }
+
+    /// Adds a pair by the spectrum `[len / 2 + 1]` of its response without the direct sound. Returns false, and measures
+    /// only the noise, if the reflection arrives too soon after the direct sound.
+    ///
+    /// # Errors
+    /// [`Error::Length`] or [`Error::NotFinite`].
+    pub fn add_pair(&mut self, reflected: &[Complex<T>], direct: &DirectSoundWaveform<T>) -> Result<bool, Error> {
+        let reflected = self.filter_spectrum(reflected, |_| Complex::new(1.0, 0.0))?;
+        let quiet = &reflected[..direct.quiet];
+        let noise = T::dot_product(quiet, quiet);
+        // Least squares of gain x direct - delay x derivative.
+        let [xd, xs] = direct.gated.each_ref().map(|gated| T::dot_product(reflected, gated));
+        self.noise.0 += direct.quiet;
+        self.noise.1 += noise;
+        if direct.gated[0].is_empty() {
             return Ok(false);
         }
+        let [dd, ds, ss] = direct.products;
+        let determinant = dd * ss - ds * ds;
         self.gains.add_value((xd * ss - xs * ds) / determinant);
         self.delays.add_value((xs * dd - xd * ds) / determinant);
         Ok(true)
     }
 
     /// Computes the moments; None of fewer than [`LEAST_PAIRS`].
-    pub fn finish(self) -> Option<DirectSoundResidual> {
+    pub fn finish(&self) -> Option<DirectSoundResidual> {
         let (samples, squares) = self.noise;
         (self.gains.count >= LEAST_PAIRS).then(|| DirectSoundResidual {
             gain: self.gains.moments(),
@@ -223,35 +253,39 @@ impl<T: RealSample> ResidualFit<T> {
         })
     }
 
-    fn signal_spectrum(&self, signal: &[T]) -> Result<Vec<Complex<T>>, Error> {
-        let mut signal = signal.to_vec();
-        let mut spectrum = self.forward.make_output_vec();
-        let done = self.forward.process(&mut signal, &mut spectrum);
-        let finite = done.is_ok() && spectrum.first().is_some_and(|dc| dc.re.f64().is_finite());
-        finite.then_some(spectrum).ok_or(Error::NotFinite { what: "the response" })
+    // 1 before the reflection, and 0 once it may arrive.
+    fn gate(&self, sample: usize, reflected_secs: f64) -> f64 {
+        let secs = sample as f64 / self.rate_hz - (reflected_secs - GATE_SECS[0]);
+        match secs / (GATE_SECS[0] - GATE_SECS[1]) {
+            ..=0.0 => 1.0,
+            fall @ 0.0..1.0 => 0.5 + 0.5 * (std::f64::consts::PI * fall).cos(),
+            _ => 0.0,
+        }
     }
 
-    // Within the sweep's range, times a factor of each bin.
-    fn filtered_signal(
-        &self,
+    // The signal of a spectrum within the sweep's range, times a factor of each bin.
+    fn filter_spectrum(
+        &mut self,
         spectrum: &[Complex<T>],
         factor: impl Fn(usize) -> Complex<f64>,
-    ) -> Result<Vec<T>, Error> {
-        let bins = spectrum.iter().zip(&self.bin_gains).enumerate();
-        let mut filtered: Vec<_> = bins
-            .map(|(bin, (x, gain))| {
-                let value = Complex::new(x.re.f64(), x.im.f64()) * factor(bin) * gain;
-                Complex::new(T::of(value.re), T::of(value.im))
-            })
-            .collect();
-        // The ends of a real signal's spectrum are real.
-        filtered[0].im = T::default();
-        if self.len.is_multiple_of(2) {
-            filtered[self.len / 2].im = T::default();
+    ) -> Result<&[T], Error> {
+        check_len("the spectrum", spectrum.len(), self.bin_gains.len())?;
+        let not_finite = Error::NotFinite { what: "the response" };
+        if !spectrum[0].re.f64().is_finite() {
+            return Err(not_finite);
         }
-        let mut signal = self.inverse.make_output_vec();
-        let done = self.inverse.process(&mut filtered, &mut signal);
-        done.map(|()| signal).map_err(|_| Error::NotFinite { what: "the response" })
+        let bins = self.filtered.iter_mut().zip(spectrum).zip(&self.bin_gains).enumerate();
+        for (bin, ((filtered, x), gain)) in bins {
+            let value = Complex::new(x.re.f64(), x.im.f64()) * factor(bin) * gain;
+            *filtered = Complex::new(T::of(value.re), T::of(value.im));
+        }
+        // The ends of a real signal's spectrum are real.
+        self.filtered[0].im = T::default();
+        if self.len.is_multiple_of(2) {
+            self.filtered[self.len / 2].im = T::default();
+        }
+        let done = self.inverse.process_with_scratch(&mut self.filtered, &mut self.signal, &mut self.work);
+        done.map(|()| &self.signal[..]).map_err(|_| not_finite)
     }
 }
 
@@ -364,6 +398,13 @@ mod tests {
         (0..LEN).map(sample).collect()
     }
 
+    fn spectrum(signal: &[f64]) -> Vec<Complex<f64>> {
+        let forward = f64::plan_real_forward(signal.len());
+        let mut spectrum = forward.make_output_vec();
+        forward.process(&mut signal.to_vec(), &mut spectrum).expect("a spectrum");
+        spectrum
+    }
+
     fn sum(a: &[f64], factor: f64, b: &[f64]) -> Vec<f64> {
         a.iter().zip(b).map(|(a, b)| a + factor * b).collect()
     }
@@ -375,7 +416,8 @@ mod tests {
         let mut scratch = plan.make_scratch();
         let mut sensitivities = |signal: &[f64]| {
             let mut found = [EnergySensitivity::default(); 5];
-            plan.compute_sensitivities(signal, &direct, |_| 0.01, &mut found, &mut scratch).expect("sensitivities");
+            plan.compute_sensitivities(&spectrum(signal), &spectrum(&direct), |_| 0.01, &mut found, &mut scratch)
+                .expect("sensitivities");
             found
         };
         let before = sensitivities(&reflected);
@@ -407,7 +449,8 @@ mod tests {
             let left = sum(&sum(&pulse(80.0 + delay), 0.005, &direct), -1.0, &direct);
             let mut reflected = sum(&left, 0.7, &pulse(at));
             reflected.iter_mut().enumerate().for_each(|(n, x)| *x += noise(n, pair));
-            assert_eq!(fit.add_pair(&reflected, &direct, 80.0 / RATE_HZ, at / RATE_HZ), Ok(true));
+            let waveform = fit.prepare_direct(&spectrum(&direct), 80.0 / RATE_HZ, at / RATE_HZ).expect("finite");
+            assert_eq!(fit.add_pair(&spectrum(&reflected), &waveform), Ok(true));
         }
         let found = fit.finish().expect("40 pairs");
         assert!((found.delay.mean - 0.02).abs() < 0.001, "{found:?}");
@@ -419,13 +462,20 @@ mod tests {
     #[test]
     fn few_pairs_and_overlapping_arrivals_give_nothing() {
         let mut fit = ResidualFit::<f64>::new(LEN, RATE_HZ, RANGE_HZ).expect("a fit");
-        let direct = pulse(80.0);
+        let direct = spectrum(&pulse(80.0));
+        let silence = spectrum(&[0.0; LEN]);
+        let mut prepare = |signal: &[Complex<f64>], at: f64| fit.prepare_direct(signal, 80.0 / RATE_HZ, at / RATE_HZ);
+        let apart = prepare(&direct, 160.0).expect("finite");
+        let [near, silent] = [prepare(&direct, 110.0), prepare(&silence, 160.0)].map(|found| found.expect("finite"));
+        assert!(matches!(prepare(&direct[1..], 160.0), Err(Error::Length { .. })));
         for _ in 1..LEAST_PAIRS {
-            assert_eq!(fit.add_pair(&direct, &direct, 80.0 / RATE_HZ, 160.0 / RATE_HZ), Ok(true));
+            assert_eq!(fit.add_pair(&direct, &apart), Ok(true));
         }
-        assert_eq!(fit.add_pair(&direct, &direct, 80.0 / RATE_HZ, 110.0 / RATE_HZ), Ok(false));
-        assert_eq!(fit.add_pair(&[0.0; LEN], &[0.0; LEN], 80.0 / RATE_HZ, 160.0 / RATE_HZ), Ok(false));
-        assert!(matches!(fit.add_pair(&direct[1..], &direct, 0.0, 0.001), Err(Error::Length { .. })));
+        assert_eq!(fit.add_pair(&direct, &near), Ok(false));
+        assert_eq!(fit.add_pair(&silence, &silent), Ok(false));
+        assert!(matches!(fit.add_pair(&direct[1..], &apart), Err(Error::Length { .. })));
+        let broken = vec![Complex::from(f64::NAN); direct.len()];
+        assert!(matches!(fit.add_pair(&broken, &apart), Err(Error::NotFinite { .. })));
         assert!(fit.finish().is_none());
         for (len, rate_hz, range_hz) in [(0, RATE_HZ, RANGE_HZ), (9, f64::NAN, RANGE_HZ), (9, RATE_HZ, [2e3, 50e3])] {
             assert!(ResidualFit::<f32>::new(len, rate_hz, range_hz).is_err());

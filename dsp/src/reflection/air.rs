@@ -170,8 +170,12 @@ impl AirAbsorption {
 
     /// Attenuation of a pure tone, dB/m.
     pub fn db_per_m(&self, frequency_hz: f64) -> f64 {
-        let square = frequency_hz * frequency_hz;
-        let relaxation = |[hz, strength]: [f64; 2]| strength / (hz + square / hz);
+        self.db_per_m_of_square(frequency_hz * frequency_hz)
+    }
+
+    // Of the square of a frequency, Hz^2.
+    pub(crate) fn db_per_m_of_square(&self, square: f64) -> f64 {
+        let relaxation = |[hz, strength]: [f64; 2]| strength * hz / (hz * hz + square);
         8.686 * square * (self.classical + relaxation(self.oxygen) + relaxation(self.nitrogen))
     }
 }

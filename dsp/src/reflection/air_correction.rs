@@ -24,9 +24,11 @@ const NEPER_PER_DB: f64 = LN_10 / 20.0;
 /// of the simulated rig at 18 to 25 C (`tests/numbers/repeated_runs.py`) at 40 kHz; in other bands that is 0.1 to 0.3.
 pub const SLOPE_UNCERTAINTY: f64 = 0.4;
 
-/// 1 / 0! to 1 / 8!: coefficients of the exponential series.
+/// 1 / 0! to 1 / 8!: coefficients of the exponential series, and of those of sine and cosine.
 const INVERSE_FACTORIALS: [f64; 9] =
     [1.0, 1.0, 1.0 / 2.0, 1.0 / 6.0, 1.0 / 24.0, 1.0 / 120.0, 1.0 / 720.0, 1.0 / 5_040.0, 1.0 / 40_320.0];
+/// Greatest number whose exponential is computed by them, within 1.1e-11.
+const SERIES_LIMIT: f64 = 0.25;
 
 /// Half of the width that slopes are smoothed over, as a ratio of frequencies: a third of an octave in all.
 const SMOOTHED_RATIO: f64 = 1.122_462_048_309_373;
@@ -92,8 +94,11 @@ impl<T: RealSample> AirCorrectionFit<T> {
             let air = self.reference.air();
             AirEffect::new(&self.reference, &AirState { temperature_c: air.temperature_c + kelvin, ..air })
         });
+        let squares: Vec<f64> = (0..self.len / 2 + 1).map(|bin| (bin as f64 * step_hz).powi(2)).collect();
         let by_bin = |effect: &AirEffect| -> Vec<f64> {
-            (0..self.len / 2 + 1).map(|bin| effect.nepers_per_m(bin as f64 * step_hz)).collect()
+            let mut nepers = vec![0.0; squares.len()];
+            effect.fill_absorption(&squares, &mut nepers);
+            nepers
         };
         let absorption = by_bin(&own);
         let slopes = |path: &PathSum| {
@@ -106,7 +111,6 @@ impl<T: RealSample> AirCorrectionFit<T> {
         let changes = by_bin(&warmer).into_iter().zip(by_bin(&colder)).map(|(warm, cold)| 2.0 * (cold - warm));
         let ln_ratio = warmer.ln_ratio - colder.ln_ratio;
         AirCorrection {
-            rate_hz: self.rate_hz,
             len: self.len,
             reference: self.reference,
             direct_slopes: slopes(&self.direct),
@@ -114,10 +118,20 @@ impl<T: RealSample> AirCorrectionFit<T> {
             absorption_per_kelvin: changes.collect(),
             reflected_slopes,
             absorption,
+            squares,
             forward: self.forward,
             inverse: T::plan_real_inverse(self.len),
         }
     }
+}
+
+/// A response and its spectrum, of which each follows from the other.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TransformedResponse<T> {
+    /// `[len]`.
+    pub samples: Vec<T>,
+    /// `[len / 2 + 1]`.
+    pub spectrum: Vec<Complex<T>>,
 }
 
 /// The air that a pair's response and the direct sound beneath it were measured in, and the lengths of both paths.
@@ -137,12 +151,13 @@ pub struct PairAir {
 ///
 /// The direct sound is brought to the response's air first, because it is subtracted there.
 pub struct AirCorrection<T: RealSample> {
-    rate_hz: f64,
     len: usize,
     reference: ReferenceAir,
     /// `[bins]`: d ln(spectrum) / d ln(frequency) of speaker and microphone, on the direct and on the reflected path.
     direct_slopes: Vec<Complex<f64>>,
     reflected_slopes: Vec<Complex<f64>>,
+    /// `[bins]`: squares of the frequencies, Hz^2.
+    squares: Vec<f64>,
     /// `[bins]`: absorption by the reference air, neper/m.
     absorption: Vec<f64>,
     /// `[bins]`: relative change of an energy per kelvin by speaker and microphone, and by absorption per metre.
@@ -160,8 +175,11 @@ pub struct AirScratch<T> {
     /// `[bins]`: gains that bring the direct sound to the response's air, and the response to the reference air.
     to_response: Vec<Complex<T>>,
     to_reference: Vec<Complex<T>>,
-    direct: Vec<Complex<T>>,
-    reflected: Vec<Complex<T>>,
+    /// `[bins]`: absorption by the response's air and by that of the direct sound, neper/m.
+    absorbed: [Vec<f64>; 2],
+    /// `[bins]`: logarithms of gains.
+    nepers: Vec<Complex<f64>>,
+    scaled: Vec<Complex<T>>,
     work: Vec<Complex<T>>,
 }
 
@@ -178,9 +196,12 @@ impl AirEffect {
         Self { ln_ratio: ratio.ln(), ratio, absorption: AirAbsorption::new(air) }
     }
 
-    // At a frequency of the corrected response, neper/m.
-    fn nepers_per_m(&self, hz: f64) -> f64 {
-        NEPER_PER_DB * self.absorption.db_per_m(hz * self.ratio)
+    // At frequencies of the corrected response with these squares, neper/m.
+    fn fill_absorption(&self, squares: &[f64], nepers_per_m: &mut [f64]) {
+        let factor = self.ratio * self.ratio;
+        for (nepers, square) in nepers_per_m.iter_mut().zip(squares) {
+            *nepers = NEPER_PER_DB * self.absorption.db_per_m_of_square(square * factor);
+        }
     }
 }
 
@@ -194,40 +215,41 @@ impl<T: RealSample> AirCorrection<T> {
             response: spectrum.clone(),
             to_response: spectrum.clone(),
             to_reference: spectrum.clone(),
-            direct: spectrum.clone(),
-            reflected: spectrum,
+            absorbed: [self.squares.clone(), self.squares.clone()],
+            nepers: vec![Complex::default(); spectrum.len()],
+            scaled: spectrum,
             work: vec![Complex::default(); work],
         }
     }
 
-    /// Computes what a surface reflects, in the reference air, from a response and the direct sound.
-    ///
-    /// ir, direct, reflected  `[len]`
+    /// A place for [`Self::subtract_direct`], which fills it again and again.
+    pub fn make_reflected(&self) -> TransformedResponse<T> {
+        TransformedResponse { samples: self.forward.make_input_vec(), spectrum: self.forward.make_output_vec() }
+    }
+
+    /// Computes what a surface reflects, in the reference air, from a response `[len]` and the direct sound.
     ///
     /// # Errors
     /// [`Error::Length`] or [`Error::NotFinite`].
     pub fn subtract_direct(
         &self,
         ir: &[T],
-        direct: &[T],
+        direct: &TransformedResponse<T>,
         pair: &PairAir,
-        reflected: &mut [T],
+        reflected: &mut TransformedResponse<T>,
         scratch: &mut AirScratch<T>,
     ) -> Result<(), Error> {
-        check_len("the reflected response", reflected.len(), self.len)?;
+        check_len("the reflected response", reflected.samples.len(), self.len)?;
+        check_len("the direct sound", direct.samples.len(), self.len)?;
         self.take_response(ir, pair, scratch)?;
+        self.reflected_spectrum(&direct.spectrum, &mut reflected.spectrum, scratch);
         if self.reference.treatment == AirTreatment::Paper {
-            check_len("the direct sound", direct.len(), self.len)?;
-            subtract_foam(ir, direct, reflected);
+            subtract_foam(ir, &direct.samples, &mut reflected.samples);
             return Ok(());
         }
-        transform(&*self.forward, direct, &mut scratch.signal, &mut scratch.direct, &mut scratch.work)?;
-        let mut spectrum = std::mem::take(&mut scratch.reflected);
-        self.reflected_spectrum(&scratch.direct, &mut spectrum, scratch);
         let share = T::of((self.len as f64).recip());
-        spectrum.iter_mut().for_each(|x| *x = *x * share);
-        let done = self.inverse.process_with_scratch(&mut spectrum, reflected, &mut scratch.work);
-        scratch.reflected = spectrum;
+        scratch.scaled.iter_mut().zip(&reflected.spectrum).for_each(|(scaled, x)| *scaled = x * share);
+        let done = self.inverse.process_with_scratch(&mut scratch.scaled, &mut reflected.samples, &mut scratch.work);
         done.map_err(|_| Error::NotFinite { what: "the response" })
     }
 
@@ -236,7 +258,7 @@ impl<T: RealSample> AirCorrection<T> {
     /// # Errors
     /// [`Error::Length`] or [`Error::NotFinite`].
     pub fn take_response(&self, ir: &[T], pair: &PairAir, scratch: &mut AirScratch<T>) -> Result<(), Error> {
-        let AirScratch { signal, response, to_response, to_reference, work, .. } = scratch;
+        let AirScratch { signal, response, to_response, to_reference, absorbed, nepers, work, .. } = scratch;
         transform(&*self.forward, ir, signal, response, work)?;
         if self.reference.treatment == AirTreatment::Paper {
             let one = Complex::new(T::of(1.0), T::default());
@@ -246,19 +268,20 @@ impl<T: RealSample> AirCorrection<T> {
         }
         let of_response = AirEffect::new(&self.reference, &pair.response);
         let of_direct = AirEffect::new(&self.reference, &pair.direct);
-        let step_hz = self.rate_hz / self.len as f64;
-        for (bin, (to_response, to_reference)) in to_response.iter_mut().zip(to_reference).enumerate() {
-            let hz = bin as f64 * step_hz;
-            let absorbed = of_response.nepers_per_m(hz);
-            *to_response = gain_of(
-                self.direct_slopes[bin] * (of_response.ln_ratio - of_direct.ln_ratio)
-                    + (of_direct.nepers_per_m(hz) - absorbed) * pair.direct_m,
-            );
-            *to_reference = gain_of(
-                -self.reflected_slopes[bin] * of_response.ln_ratio
-                    + (absorbed - self.absorption[bin]) * pair.reflected_m,
-            );
+        let [by_response, by_direct] = absorbed;
+        of_response.fill_absorption(&self.squares, by_response);
+        of_direct.fill_absorption(&self.squares, by_direct);
+        let ln_ratio = of_response.ln_ratio - of_direct.ln_ratio;
+        let changes = by_direct.iter().zip(&*by_response).map(|(direct, response)| direct - response);
+        for ((nepers, slope), change) in nepers.iter_mut().zip(&self.direct_slopes).zip(changes) {
+            *nepers = slope * ln_ratio + change * pair.direct_m;
         }
+        fill_gains(nepers, to_response);
+        let changes = by_response.iter().zip(&self.absorption).map(|(response, reference)| response - reference);
+        for ((nepers, slope), change) in nepers.iter_mut().zip(&self.reflected_slopes).zip(changes) {
+            *nepers = slope * -of_response.ln_ratio + change * pair.reflected_m;
+        }
+        fill_gains(nepers, to_reference);
         Ok(())
     }
 
@@ -283,6 +306,19 @@ impl<T: RealSample> AirCorrection<T> {
         }
     }
 
+    /// Computes the spectrum of a response `[len]`, and keeps both.
+    ///
+    /// # Errors
+    /// [`Error::Length`] or [`Error::NotFinite`].
+    pub fn transform_response(
+        &self,
+        samples: Vec<T>,
+        scratch: &mut AirScratch<T>,
+    ) -> Result<TransformedResponse<T>, Error> {
+        let spectrum = self.compute_spectrum(&samples, scratch)?;
+        Ok(TransformedResponse { samples, spectrum })
+    }
+
     /// Computes the spectrum of a signal `[len]`.
     ///
     /// # Errors
@@ -301,17 +337,27 @@ impl<T: RealSample> AirCorrection<T> {
     }
 }
 
-fn gain_of<T: RealSample>(nepers: Complex<f64>) -> Complex<T> {
-    let gain = exponential(nepers);
-    Complex::new(T::of(gain.re), T::of(gain.im))
+fn fill_gains<T: RealSample>(nepers: &mut [Complex<f64>], gains: &mut [Complex<T>]) {
+    exponentiate(nepers);
+    gains.iter_mut().zip(nepers).for_each(|(gain, exact)| *gain = Complex::new(T::of(exact.re), T::of(exact.im)));
 }
 
-// Gains are near 1: eight terms of the series are within 1e-11 then, and take less than exp, sin, and cos.
-fn exponential(nepers: Complex<f64>) -> Complex<f64> {
-    if nepers.l1_norm() > 0.25 {
-        return nepers.exp();
+// Gains are near 1, and then all of them are computed without a branch, side by side.
+fn exponentiate(values: &mut [Complex<f64>]) {
+    match values.iter().filter(|x| !(x.l1_norm() <= SERIES_LIMIT)).count() {
+        0 => values.iter_mut().for_each(|x| *x = small_exponential(*x)),
+        _ => values.iter_mut().for_each(|x| *x = x.exp()),
     }
-    INVERSE_FACTORIALS.iter().rev().fold(Complex::default(), |sum, inverse| sum * nepers + inverse)
+}
+
+// The series of exp, sine and cosine up to the eighth power take less than the functions.
+fn small_exponential(nepers: Complex<f64>) -> Complex<f64> {
+    let [one, _, f2, f3, f4, f5, f6, f7, f8] = INVERSE_FACTORIALS;
+    let level = INVERSE_FACTORIALS.iter().rev().fold(0.0, |sum, inverse| sum * nepers.re + inverse);
+    let square = nepers.im * nepers.im;
+    let cosine = (((f8 * square - f6) * square + f4) * square - f2) * square + one;
+    let sine = (((f5 - f7 * square) * square - f3) * square + one) * nepers.im;
+    Complex::new(level * cosine, level * sine)
 }
 
 fn transform<T: RealSample>(
@@ -373,6 +419,7 @@ mod tests {
     // Both paths' sound in air, on the reference's time axis: their delays are the same in all air.
     fn response(air: &AirState, reflected: f64) -> Vec<f64> {
         let effect = AirEffect::new(&REFERENCE, air);
+        let nepers_per_m = |hz: f64| NEPER_PER_DB * effect.absorption.db_per_m(hz * effect.ratio);
         let mut spectrum: Vec<_> = (0..LEN / 2 + 1)
             .map(|bin| {
                 let hz = bin as f64 * RATE_HZ / LEN as f64;
@@ -381,7 +428,7 @@ mod tests {
                 }
                 let path = |metres: f64| {
                     let samples = metres / REFERENCE.speed_of_sound() * RATE_HZ;
-                    let level = (-metres * effect.nepers_per_m(hz)).exp();
+                    let level = (-metres * nepers_per_m(hz)).exp();
                     emitted(hz * effect.ratio)
                         * Complex::from_polar(level, -std::f64::consts::TAU * bin as f64 * samples / LEN as f64)
                 };
@@ -413,10 +460,16 @@ mod tests {
             let own = AirState { temperature_c: celsius, humidity_pct, pressure_hpa: 965.0 };
             let other = AirState { temperature_c: 22.0, humidity_pct: 40.0, pressure_hpa: 980.0 };
             let pair = PairAir { response: own, direct: other, direct_m: DIRECT_M, reflected_m: REFLECTED_M };
-            let mut reflected = vec![f64::NAN; LEN];
+            let direct = correction.transform_response(response(&other, 0.0), &mut scratch).expect("a spectrum");
+            let mut reflected = correction.make_reflected();
+            reflected.samples.fill(f64::NAN);
             correction
-                .subtract_direct(&response(&own, 0.5), &response(&other, 0.0), &pair, &mut reflected, &mut scratch)
+                .subtract_direct(&response(&own, 0.5), &direct, &pair, &mut reflected, &mut scratch)
                 .expect("a reflection");
+            let spectrum = correction.compute_spectrum(&reflected.samples, &mut scratch).expect("a spectrum");
+            let apart = spectrum.iter().zip(&reflected.spectrum).map(|(a, b)| (a - b).norm()).fold(0.0, f64::max);
+            assert!(apart < 1e-11, "{celsius} C: the spectrum is that of the samples but for {apart}");
+            let reflected = reflected.samples;
             let energy = |signal: &[f64]| signal.iter().map(|x| x * x).sum::<f64>();
             let off: Vec<f64> = reflected.iter().zip(&expected).map(|(a, b)| a - b).collect();
             let off_db = 10.0 * (energy(&off) / energy(&expected)).log10();
@@ -441,17 +494,20 @@ mod tests {
     }
 
     #[test]
-    fn the_exponential_series_is_within_rounding_of_the_function() {
+    fn gains_are_those_of_the_exponential_function() {
         for i in -60..=60 {
             for k in -60..=60 {
                 let nepers = Complex::new(f64::from(i), f64::from(k)) / 200.0;
                 // The ninth term at 0.25, and f32 keeps 6e-8.
-                let off = (exponential(nepers) - nepers.exp()).norm();
-                assert!(off < 1.1e-11, "{nepers}: {off}");
-                let divided = (1..=8).rev().fold(Complex::from(1.0), |sum, k| sum * nepers / f64::from(k) + 1.0);
-                assert!(nepers.l1_norm() > 0.25 || (exponential(nepers) - divided).norm() < 4e-16, "{nepers}");
+                let mut gains = [nepers, Complex::default()];
+                exponentiate(&mut gains);
+                let off = (gains[0] - nepers.exp()).norm();
+                assert!(off < 1.1e-11 && gains[1] == Complex::new(1.0, 0.0), "{nepers}: {off}");
             }
         }
+        let mut gains = [Complex::new(f64::NAN, 0.0)];
+        exponentiate(&mut gains);
+        assert!(gains[0].re.is_nan());
     }
 
     #[test]
@@ -460,13 +516,16 @@ mod tests {
         let mut scratch = correction.make_scratch();
         let air = REFERENCE.air();
         let pair = PairAir { response: air, direct: air, direct_m: DIRECT_M, reflected_m: REFLECTED_M };
-        let mut out = vec![0.0; LEN];
+        let mut out = correction.make_reflected();
         let zeros = [0.0; LEN];
         let mut broken = zeros;
         broken[3] = f64::NAN;
-        let found = correction.subtract_direct(&zeros[1..], &zeros, &pair, &mut out, &mut scratch);
+        let direct = correction.transform_response(zeros.to_vec(), &mut scratch).expect("a spectrum");
+        let found = correction.subtract_direct(&zeros[1..], &direct, &pair, &mut out, &mut scratch);
         assert!(matches!(found, Err(Error::Length { .. })));
-        let found = correction.subtract_direct(&zeros, &broken, &pair, &mut out, &mut scratch);
+        let found = correction.subtract_direct(&broken, &direct, &pair, &mut out, &mut scratch);
+        assert!(matches!(found, Err(Error::NotFinite { .. })));
+        let found = correction.transform_response(broken.to_vec(), &mut scratch);
         assert!(matches!(found, Err(Error::NotFinite { .. })));
     }
 }

@@ -1,13 +1,16 @@
 //! Rows of tables `nce`, `tnce` and `tnce_d4`.
 
+use std::ops::Range;
+use std::sync::Arc;
+
+use arrow::array::{Float32Array, Float64Array};
 use arrow::record_batch::RecordBatch;
-use echolake_lake::BatchBuilder;
 use echolake_schema::symmetry::MovedPair;
 use echolake_schema::tables::Table;
 use echolake_schema::{Grid, Pair, PairId, Rig, Symmetry};
 
 use super::RunKeys;
-use crate::derived_values::{DerivedLists, DerivedRows};
+use crate::derived_values::{DerivedColumns, DerivedLists};
 use crate::error::Result;
 
 /// Versions of the references that the rows used.
@@ -43,40 +46,47 @@ pub(crate) fn nce_rows(
     Ok(columns.fill_text("flat_version", of.flat).fill_text("foam_version", of.foam).finish()?)
 }
 
-/// Builds rows of `tnce`.
+/// Builds some rows of `tnce`.
 pub(crate) fn tnce_rows(
     rig: &Rig,
     grid: &Grid,
     keys: &RunKeys,
-    derived: &DerivedRows,
+    derived: &DerivedColumns,
+    range: Range<usize>,
     of: ReferenceVersions<'_>,
 ) -> Result<RecordBatch> {
-    let mut columns = keys.begin_rows(Table::Tnce, rig, derived.pairs.len());
-    columns.push_pairs("", grid_pairs(grid, derived.pairs.iter()));
-    energy_columns(&mut columns, rig, derived, 1);
-    let shapes = derived.shape_columns(&rig.band_names(), rig.sweep.rate_hz.get());
-    for (name, values) in shapes.into_iter().chain(derived.uncertainty_columns(&rig.band_names())) {
-        columns.push_floats(&name, values);
+    let pairs = &derived.pairs[range.clone()];
+    let mut columns = keys.begin_rows(Table::Tnce, rig, pairs.len());
+    columns.push_pairs("", grid_pairs(grid, pairs.iter()));
+    let bands = rig.band_names();
+    for (name, values) in derived.energy_columns(&bands) {
+        columns.push_column(&name, Arc::new(Float64Array::from(values[range.clone()].to_vec())));
+    }
+    let shapes = derived.shape_columns(&bands, rig.sweep.rate_hz.get(), range.clone());
+    for (name, values) in shapes.into_iter().chain(derived.uncertainty_columns(&bands, range)) {
+        columns.push_column(&name, Arc::new(Float32Array::from(values)));
     }
     Ok(columns.fill_text("flat_version", of.flat).fill_text("foam_version", of.foam).finish()?)
 }
 
-/// Builds rows of `tnce_d4`, grouped by pair, one per symmetry. Symmetries that the grid lacks are left out.
+/// Builds rows of `tnce_d4` of some measurements, grouped by pair, one per symmetry. Symmetries that the grid lacks are
+/// left out.
 pub(crate) fn tnce_d4(
     rig: &Rig,
     grid: &Grid,
     SymmetryPairs(moved): &SymmetryPairs,
     keys: &RunKeys,
-    derived: &DerivedRows,
+    derived: &DerivedColumns,
+    range: Range<usize>,
     of: ReferenceVersions<'_>,
 ) -> Result<RecordBatch> {
     let each = moved.len();
-    let rows: Vec<_> = derived
-        .pairs
+    let pairs = &derived.pairs[range.clone()];
+    let rows: Vec<_> = pairs
         .iter()
         .flat_map(|pair| moved.iter().map(move |(symmetry, pairs)| (*symmetry, pairs[*pair as usize])))
         .collect();
-    let measured = derived.pairs.iter().flat_map(|pair| std::iter::repeat_n(pair, each));
+    let measured = pairs.iter().flat_map(|pair| std::iter::repeat_n(pair, each));
     let moved = rows.iter().map(|(_, moved)| Some(&moved.pair));
     let mut columns = keys.begin_rows(Table::TnceD4, rig, rows.len());
     columns
@@ -85,7 +95,11 @@ pub(crate) fn tnce_d4(
         .push_flags("swapped", rows.iter().map(|(_, moved)| moved.swapped))
         .push_pairs("d4_", moved.clone())
         .push_positions(grid, moved);
-    energy_columns(&mut columns, rig, derived, each);
+    for (name, values) in derived.energy_columns(&rig.band_names()) {
+        let mut repeated = Vec::with_capacity(rows.len());
+        values[range.clone()].iter().for_each(|x| repeated.extend(std::iter::repeat_n(*x, each)));
+        columns.push_column(&name, Arc::new(Float64Array::from(repeated)));
+    }
     Ok(columns.fill_text("flat_version", of.flat).fill_text("foam_version", of.foam).finish()?)
 }
 
@@ -94,11 +108,4 @@ fn grid_pairs<'a>(
     ids: impl Iterator<Item = &'a u32> + Clone,
 ) -> impl Iterator<Item = Option<&'a Pair>> + Clone {
     ids.map(|id| grid.pair(PairId(*id)))
-}
-
-// Repeats each measurement's numbers in `each` rows.
-fn energy_columns(columns: &mut BatchBuilder, rig: &Rig, derived: &DerivedRows, each: usize) {
-    for (name, values) in derived.energy_columns(&rig.band_names()) {
-        columns.push_doubles(&name, values.into_iter().flat_map(|x| std::iter::repeat_n(x, each)));
-    }
 }
