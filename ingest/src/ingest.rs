@@ -27,6 +27,7 @@ use crate::reading::{Measurer, Response, RunContent, RunHead, check_filled};
 use crate::references::digest_parts;
 use crate::report::{FileReport, IngestOutcome, IngestedRun};
 use crate::rows::runs::RunReferences;
+use crate::rows::surfaces::FarFieldCache;
 use crate::rows::{self, RunKeys};
 
 /// Revision of the rows that follow from a run alone, responses among them: those of another one are derived again.
@@ -53,6 +54,7 @@ struct IngestWork {
     again: bool,
     context: IngestContext,
     measurer: Arc<Measurer>,
+    far_fields: Arc<FarFieldCache>,
     shared: Option<SharedWork>,
 }
 
@@ -111,6 +113,7 @@ impl<'a> LakeIngest<'a> {
         let (references, others) = self.order_sources(sources).await?;
         let cores = Cores::all()?;
         let measurer = Arc::new(Measurer::new(self.lake));
+        let far_fields = Arc::new(FarFieldCache::default());
         for sources in [lacking, references, others] {
             let mut claimed: Vec<RunSource> = Vec::new();
             let mut free = sources;
@@ -123,7 +126,9 @@ impl<'a> LakeIngest<'a> {
                 let runs = || Arc::new(context.snapshot.runs().map(|run| run.run.clone()).collect());
                 let known = known.get_or_insert_with(runs).clone();
                 let shared = self.claims.clone().map(|claims| SharedWork { claims, known });
-                let work = IngestWork { again: self.again, context, measurer: measurer.clone(), shared };
+                let measurer = measurer.clone();
+                let far_fields = far_fields.clone();
+                let work = IngestWork { again: self.again, context, measurer, far_fields, shared };
                 for source in self.ingest_group(work, free, report).await? {
                     if !claimed.contains(&source) {
                         report(FileReport::Claimed(source.clone()));
@@ -142,7 +147,7 @@ impl<'a> LakeIngest<'a> {
         let snapshot = Arc::new(self.lake.ensure_tables().await?);
         let context = IngestContext::read_from(self.lake, &Cores::all()?, snapshot).await?;
         let measurer = Arc::new(Measurer::new(self.lake));
-        let work = IngestWork { again: false, context, measurer, shared: None };
+        let work = IngestWork { again: false, context, measurer, far_fields: Arc::default(), shared: None };
         let job = work.read_and_stage(source).await?;
         self.lake.commit_staged(&job.staged).await?;
         Ok(job.report)
@@ -312,8 +317,10 @@ impl IngestWork {
         let its_lake = lake.clone();
         let for_rows = keys.clone();
         let its_content = content.clone();
+        let far_fields = self.far_fields.clone();
         let of_the_run = async {
-            let files = cores.compute_on_core(move || encode_run(&its_lake, &for_rows, &its_content)).await?;
+            let encode = move || encode_run(&its_lake, &for_rows, &its_content, &far_fields);
+            let files = cores.compute_on_core(encode).await?;
             self.context.stage_rows(&keys, &derivation, files).await
         };
         if is_current {
@@ -402,12 +409,18 @@ impl IngestWork {
 }
 
 // The rows that do not depend on references.
-fn encode_run(lake: &Lake, keys: &RunKeys, content: &RunContent) -> Result<Vec<(Table, EncodedFile)>> {
+fn encode_run(
+    lake: &Lake,
+    keys: &RunKeys,
+    content: &RunContent,
+    far_fields: &FarFieldCache,
+) -> Result<Vec<(Table, EncodedFile)>> {
     let rig = lake.rig();
     let origin = content.manifest.origin.label();
     let references = &lake.config().references;
-    let surface = rows::surfaces::surface_row(rig, keys, &content.surface, references, origin, &content.heights_mm)?;
-    let heights = rows::heightmaps::heightmap_rows(rig, keys, &content.heights_mm)?;
+    let heights_mm = &content.heights_mm;
+    let surface = rows::surfaces::surface_row(rig, keys, &content.surface, references, origin, heights_mm, far_fields)?;
+    let heights = rows::heightmaps::heightmap_rows(rig, keys, heights_mm)?;
     let mut tables = vec![
         (Table::Surfaces, vec![surface]),
         (Table::Environment, vec![rows::logs::environment_rows(rig, keys, &content.readings)?]),
@@ -436,7 +449,7 @@ impl RunContent {
     fn run_responses(&self) -> RunResponses {
         RunResponses {
             pairs: self.accepted.iter().map(|(m, _)| m.pair_id).collect(),
-            irs: self.accepted.iter().flat_map(|(_, r)| r.ir.iter().copied()).collect(),
+            irs: rows::measurements::join_responses(&self.accepted),
             airs: self.accepted.iter().map(|(m, r)| measured_air(m, r)).collect(),
         }
     }

@@ -1,9 +1,10 @@
 //! The row of table `surfaces`.
 
 use std::f64::consts::{FRAC_1_SQRT_2, SQRT_2, TAU};
+use std::sync::{Arc, Mutex, PoisonError};
 
 use arrow::record_batch::RecordBatch;
-use echolake_dsp::far_field::{FarFieldCoefficients, far_field_coefficients};
+use echolake_dsp::far_field::{FarFieldCoefficients, FarFieldPlan};
 use echolake_dsp::height_field::HeightField;
 use echolake_dsp::temperature::ReferenceAir;
 use echolake_lake::ReferenceSurfaces;
@@ -11,10 +12,25 @@ use echolake_schema::tables::Table;
 use echolake_schema::{ProjectName, Rig, SurfaceId, SurfaceRecord};
 
 use super::RunKeys;
-use crate::error::Result;
+use crate::error::{Error, Result};
 
 /// Frequencies of a band at which the far field is computed: of thirds of an octave.
 const FAR_FIELD_FREQUENCIES: usize = 3;
+
+/// Cache of the plan for far fields of the reliefs of a lake, most of which have the same size and number of cells.
+#[derive(Default)]
+pub(crate) struct FarFieldCache(Mutex<Option<Arc<FarFieldPlan>>>);
+
+impl FarFieldCache {
+    // Plans for these wave numbers of bands, unless the last relief was like this one.
+    fn find_plan(&self, relief: &HeightField, bands: &[Option<Vec<f64>>]) -> Arc<FarFieldPlan> {
+        let mut last = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        match last.as_ref().filter(|plan| plan.fits_field(relief)) {
+            Some(plan) => plan.clone(),
+            None => last.insert(Arc::new(FarFieldPlan::new(relief, bands.iter().flatten().cloned().collect()))).clone(),
+        }
+    }
+}
 
 /// Builds the row of a run's surface; references that it does not name default to the lake's.
 pub(crate) fn surface_row(
@@ -24,6 +40,7 @@ pub(crate) fn surface_row(
     references: &ReferenceSurfaces,
     origin: &str,
     heights_mm: &[f32],
+    far_fields: &FarFieldCache,
 ) -> Result<RecordBatch> {
     let mesh = surface.mesh.as_ref();
     let relief = relief_stats(heights_mm).or(mesh.map(|m| [m.relief_mm[0] as f32, m.relief_mm[1] as f32, f32::NAN]));
@@ -32,10 +49,14 @@ pub(crate) fn surface_row(
     let foam = surface.foam_reference.as_ref().unwrap_or(&references.foam);
     let heights = HeightField::from_rows(rig.panel.size_mm, heights_mm.to_vec());
     let mut row = keys.begin_rows(Table::Surfaces, rig, 1);
-    for (band, hz) in rig.band_names().iter().zip(&rig.bands.centres_hz) {
+    let far = match &heights {
+        Some(heights) => compute_far_fields(heights, rig, far_fields)
+            .map_err(|cause| Error::Kernel { file: keys.run.to_string(), cause })?,
+        None => vec![None; rig.bands.centres_hz.len()],
+    };
+    for ((band, hz), far) in rig.band_names().iter().zip(&rig.bands.centres_hz).zip(far) {
         let phase = heights.as_ref().and_then(|heights| detail_phase(heights, rig, *hz));
         row.push_floats(&format!("detail_phase_{band}"), [phase]);
-        let far = heights.as_ref().and_then(|heights| far_field(heights, rig, *hz));
         row.push_floats(&format!("diffusion_normalised_{band}"), [far.map(|far| far.diffusion_normalised as f32)]);
         row.push_floats(&format!("far_scattering_{band}"), [far.map(|far| far.scattering as f32)]);
     }
@@ -69,15 +90,26 @@ fn detail_phase(heights: &HeightField, rig: &Rig, hz: f64) -> Option<f32> {
     heights.detail_phase(wavelength_mm).map(|phase| phase as f32)
 }
 
-// Over the part of the band's octave that the sweep has.
-fn far_field(heights: &HeightField, rig: &Rig, hz: f64) -> Option<FarFieldCoefficients> {
+// The coefficients of each band; None if the sweep does not have it, or the cells cannot show its wavelengths.
+fn compute_far_fields(
+    heights: &HeightField,
+    rig: &Rig,
+    cache: &FarFieldCache,
+) -> std::result::Result<Vec<Option<FarFieldCoefficients>>, echolake_dsp::Error> {
+    let bands: Vec<_> = rig.bands.centres_hz.iter().map(|hz| far_wave_numbers(heights, rig, *hz)).collect();
+    let mut found = cache.find_plan(heights, &bands).compute_coefficients(heights)?.into_iter();
+    Ok(bands.into_iter().map(|band| band.and_then(|_| found.next())).collect())
+}
+
+// Wave numbers over the part of the band's octave that the sweep has, rad/m.
+fn far_wave_numbers(heights: &HeightField, rig: &Rig, hz: f64) -> Option<Vec<f64>> {
     let speed_m_s = ReferenceAir::from_response(&rig.impulse_response).speed_of_sound();
     let low_hz = rig.sweep.low_hz.max(hz * FRAC_1_SQRT_2);
     let high_hz = rig.sweep.high_hz.min(hz * SQRT_2);
     let at = |i: usize| low_hz * (high_hz / low_hz).powf((i as f64 + 0.5) / FAR_FIELD_FREQUENCIES as f64);
-    let wave_numbers: Vec<f64> = (0..FAR_FIELD_FREQUENCIES).map(|i| TAU * at(i) / speed_m_s).collect();
     let is_fine = 1e3 * speed_m_s / high_hz > 2.0 * heights.pitch_mm();
-    (low_hz < high_hz && is_fine).then(|| far_field_coefficients(heights, &wave_numbers))
+    let wave_numbers = || (0..FAR_FIELD_FREQUENCIES).map(|i| TAU * at(i) / speed_m_s).collect();
+    (low_hz < high_hz && is_fine).then(wave_numbers)
 }
 
 // Minimum, maximum and root mean square height about the mean.
@@ -110,7 +142,13 @@ mod tests {
         assert!((phase - 0.4 * (TAU * 10.0 / 343.2) as f32).abs() < 0.01, "{phase}");
         assert_eq!(detail_phase(&grooves(100), &rig, 40e3), None);
         assert_eq!(HeightField::from_rows(585.0, vec![0.0; 6]), None);
-        let far = |cells: usize, hz| far_field(&grooves(cells), &rig, hz);
-        assert!(far(100, 2_500.0).is_some_and(|far| far.scattering.abs() < 0.01) && far(100, 40e3).is_none());
+        let cache = FarFieldCache::default();
+        for cells in [100, 260, 100] {
+            let far = compute_far_fields(&grooves(cells), &rig, &cache).expect("coefficients");
+            assert!(far[0].is_some_and(|far| far.scattering.abs() < 0.01), "{far:?}");
+            assert_eq!(far[4].is_some(), cells == 260);
+            let again = compute_far_fields(&grooves(cells), &rig, &FarFieldCache::default()).expect("coefficients");
+            assert_eq!(far, again);
+        }
     }
 }
