@@ -53,7 +53,8 @@ pub(crate) struct LoadedReferences {
     pairs: HashMap<u32, ReferencePair>,
     /// Residual of Flat; None if it cannot be measured.
     pub flat_residual: Option<DirectSoundResidual>,
-    /// Number of estimates of Foam's reflection; 0 if it cannot be estimated: few pairs, or arrivals that are not apart.
+    /// Number of estimates of Foam's reflection; 0 if it cannot be estimated: few pairs, or arrivals that are not
+    /// apart.
     pub estimate_count: usize,
     /// The surface whose only run Flat's energies are from.
     pub only_flat: Option<SurfaceId>,

@@ -24,14 +24,14 @@ const EXPONENT_MASK: u32 = 0x7f80_0000;
 /// assert_eq!(samples, [1.0, 19_661.0 / 65_536.0, -655.0 / 65_536.0, 0.0]);
 /// ```
 pub fn round_samples(samples: &mut [f32], kept_bits: u32) {
-    let greatest = samples.iter().fold(0.0f32, |greatest, x| greatest.max(x.abs()));
-    let power = f32::from_bits(greatest.to_bits() & EXPONENT_MASK);
+    // Magnitudes are in the order of their bits, and those of samples that are not finite have the greatest exponent.
+    let greatest = samples.iter().fold(0, |greatest: i32, x| greatest.max(x.abs().to_bits().cast_signed()));
+    let power = f32::from_bits(greatest.cast_unsigned() & EXPONENT_MASK);
     // Added to a sample, it leaves no digits below the step.
     let shift = 1.5 * power * 2f32.powi(FRACTION_BITS - kept_bits as i32);
-    if !(shift.is_normal() && samples.iter().all(|x| x.is_finite())) {
-        return;
+    if shift.is_normal() {
+        samples.iter_mut().for_each(|x| *x = (*x + shift) - shift);
     }
-    samples.iter_mut().for_each(|x| *x = (*x + shift) - shift);
 }
 
 #[cfg(test)]
@@ -60,8 +60,10 @@ mod tests {
             round_samples(&mut rounded, CURVE_BITS);
             assert_eq!(rounded, samples);
         }
-        let mut rounded = [0.3, f32::NAN];
-        round_samples(&mut rounded, CURVE_BITS);
-        assert!(rounded[0] == 0.3 && rounded[1].is_nan());
+        for not_a_number in [f32::NAN, -f32::NAN] {
+            let mut rounded = [0.3, not_a_number];
+            round_samples(&mut rounded, CURVE_BITS);
+            assert!(rounded[0] == 0.3 && rounded[1].is_nan());
+        }
     }
 }

@@ -220,8 +220,8 @@ impl<T: RealSample> ResidualFit<T> {
         Ok(waveform)
     }
 
-    /// Adds a pair by the spectrum `[len / 2 + 1]` of its response without the direct sound. Returns false, and measures
-    /// only the noise, if the reflection arrives too soon after the direct sound.
+    /// Adds a pair by the spectrum `[len / 2 + 1]` of its response without the direct sound. Returns false, and
+    /// measures only the noise, if the reflection arrives too soon after the direct sound.
     ///
     /// # Errors
     /// [`Error::Length`] or [`Error::NotFinite`].

@@ -49,7 +49,14 @@ fn measurement_batch(rig: &Rig, grid: &Grid, keys: &RunKeys, rows: &[(Measuremen
         .push_floats("speaker_residual_mm", rows.iter().map(|(m, _)| known(m.speaker_residual_mm)))
         .push_texts("source", rows.iter().map(|(_, r)| r.source.label()))
         .push_longs("chunk_offset", rows.iter().map(|(_, r)| r.chunk_offset as i64))
-        .push_lists("ir", rows.iter().flat_map(|(_, r)| r.ir.iter().copied()).collect())
+        .push_lists("ir", join_responses(rows))
         .finish()?;
     Ok(batch)
+}
+
+/// Joins the samples of all responses, `[measurements x length]`.
+pub(crate) fn join_responses(measured: &[(Measurement, Response)]) -> Vec<f32> {
+    let mut samples = Vec::with_capacity(measured.iter().map(|(_, response)| response.ir.len()).sum());
+    measured.iter().for_each(|(_, response)| samples.extend_from_slice(&response.ir));
+    samples
 }
