@@ -85,7 +85,7 @@ impl DecodedChunk {
         Self::decode_into(body, Vec::new())
     }
 
-    /// Decodes into the memory of an earlier chunk ([`RecordCursor::into_memory`]), which the system need not clear.
+    /// Decodes into the memory of an earlier chunk ([`Self::into_memory`]), which the system need not clear.
     ///
     /// # Errors
     /// As [`Self::decode`].
@@ -163,6 +163,14 @@ impl DecodedChunk {
         self.records.slice_ref(part)
     }
 
+    /// Returns its memory for [`Self::decode_into`]. It is empty if others share the records or they are large.
+    pub fn into_memory(self) -> Vec<u8> {
+        let mut records = self.records.try_into_mut().unwrap_or_default();
+        records.clear();
+        let memory = Vec::from(records);
+        if memory.capacity() as u64 <= LARGE_RECORD { memory } else { Vec::new() }
+    }
+
     /// Returns a strict cursor over its records.
     pub fn into_cursor(self) -> RecordCursor {
         RecordCursor::new(self.records)
@@ -193,13 +201,9 @@ impl RecordCursor {
         Self { records, position: 0 }
     }
 
-    /// Returns the memory of the records for [`DecodedChunk::decode_into`]. It is empty if others share the records or
-    /// they are large.
+    /// Returns the memory of the records: see [`DecodedChunk::into_memory`].
     pub fn into_memory(self) -> Vec<u8> {
-        let mut records = self.records.try_into_mut().unwrap_or_default();
-        records.clear();
-        let memory = Vec::from(records);
-        if memory.capacity() as u64 <= LARGE_RECORD { memory } else { Vec::new() }
+        DecodedChunk { records: self.records, crc: 0 }.into_memory()
     }
 
     /// Returns the next record; None behind the last one.

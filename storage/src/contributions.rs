@@ -22,6 +22,7 @@ use echolake_schema::annotations::{Annotation, AnnotationKind};
 use echolake_schema::tables::{LIST_CHILD, Table};
 use echolake_schema::{RunId, SurfaceId};
 use futures::TryStreamExt as _;
+use object_store::PutPayload;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
 
@@ -122,7 +123,8 @@ impl ContributedFile {
                     rows: range.len() as u64,
                 });
             }
-            let EncodedFile { bytes, stats, .. } = encode_batches(table, &schema, &[rows])?;
+            let EncodedFile { blocks, stats, .. } = encode_batches(table, &schema, &[rows])?;
+            let bytes = PutPayload::from_iter(blocks).into();
             files.push(Self { parts, stats, bytes });
         }
         Ok(files)
@@ -182,7 +184,7 @@ impl Lake {
                 let ContributedPart { surface, run, rows } = part;
                 RunPart { surface, run, derivation: ADDED.to_owned(), rows, row_version: None, row_counts: None }
             };
-            let file = EncodedFile { bytes: contributed.bytes, stats: contributed.stats, rows };
+            let file = EncodedFile { blocks: vec![contributed.bytes], stats: contributed.stats, rows };
             let mut one = self.stage_file(table, &name, file).await?;
             one.file.parts = contributed.parts.into_iter().map(part).collect();
             staged.push(one.file);

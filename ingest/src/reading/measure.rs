@@ -43,6 +43,8 @@ pub(crate) struct Measurer {
     plans: Mutex<HashMap<usize, Arc<RecordingPlan>>>,
     correction: ResponseCorrection<f32>,
     precision: SamplePrecision,
+    /// Memory of earlier chunks, as many as were in memory at once.
+    idle_memory: Mutex<Vec<Vec<u8>>>,
 }
 
 /// Memory that the messages of one run may still take, bytes: the chunks of a hostile file can decompress to thousands
@@ -161,6 +163,19 @@ impl Measurer {
             plans: Mutex::default(),
             correction: ResponseCorrection::new(ReferenceAir::from_response(response), response.division),
             precision: lake.config().samples,
+            idle_memory: Mutex::default(),
+        }
+    }
+
+    /// Takes memory for a chunk, that of an earlier one if there is any.
+    pub fn take_memory(&self) -> Vec<u8> {
+        self.idle_memory.lock().unwrap_or_else(PoisonError::into_inner).pop().unwrap_or_default()
+    }
+
+    /// Keeps a chunk's memory for [`Self::take_memory`].
+    pub fn return_memory(&self, memory: Vec<u8>) {
+        if memory.capacity() > 0 {
+            self.idle_memory.lock().unwrap_or_else(PoisonError::into_inner).push(memory);
         }
     }
 

@@ -67,7 +67,7 @@ impl RunContent {
                     }
                     let begin = raw.offset;
                     let length = raw.body.len() as u64;
-                    match budget.take_chunk().and_then(|()| decode_chunk(&raw)) {
+                    match budget.take_chunk().and_then(|()| decode_chunk(&raw, measurer.take_memory())) {
                         Ok((offset, chunk)) if !seen.insert(chunk.identity()) => {
                             list_damage(&mut whole.damaged, || {
                                 format!("the chunk at byte {offset}: a copy of one before it")
@@ -88,7 +88,8 @@ impl RunContent {
                             let permit = raw.permit;
                             let work = move || {
                                 let measured = measurer.process_chunk(offset, &chunk, &channels, &budget);
-                                drop((chunk, permit));
+                                measurer.return_memory(chunk.into_memory());
+                                drop(permit);
                                 measured
                             };
                             // Another core would have to fetch what this one has in its cache, so it gets a chunk only
@@ -120,7 +121,7 @@ impl RunContent {
         }
         for (offset, length) in waiting {
             let raw = reader.reread_chunk(offset, length).await?;
-            let (offset, chunk) = decode_chunk(&raw).map_err(|e| Error::read_failure(name, e))?;
+            let (offset, chunk) = decode_chunk(&raw, Vec::new()).map_err(|e| Error::read_failure(name, e))?;
             let measurer = measurer.clone();
             let channels = definitions.channels.clone();
             let budget = budget.clone();
@@ -211,8 +212,8 @@ fn check_manifest(manifest: &RunManifest, name: &str) -> Result<()> {
 }
 
 // Where the walk is: it takes less than the digest of the same bytes, and to hand it to another thread as much again.
-fn decode_chunk(raw: &RawChunk) -> std::result::Result<(u64, DecodedChunk), String> {
-    let chunk = DecodedChunk::decode(&raw.body);
+fn decode_chunk(raw: &RawChunk, memory: Vec<u8>) -> std::result::Result<(u64, DecodedChunk), String> {
+    let chunk = DecodedChunk::decode_into(&raw.body, memory);
     let chunk = chunk.map_err(|reason| format!("the chunk at byte {}: {reason}", raw.offset))?;
     Ok((raw.offset, chunk))
 }

@@ -1,5 +1,6 @@
 //! Rows as a Parquet file, in the layout that the lake's readers want.
 
+use std::io::{self, Write};
 use std::sync::Arc;
 
 use arrow::array::{Array, AsArray as _};
@@ -25,6 +26,9 @@ const ROW_GROUP_BYTES: usize = 64 << 20;
 /// Of the levels of zstd, 1: samples become 1.3 to 2.2 points larger than at 3 and are written a sixth to a half
 /// faster.
 const ZSTD_LEVEL: i32 = 1;
+/// Least and greatest size of a block of a file in memory.
+const LEAST_BLOCK_BYTES: usize = 16 << 10;
+const MOST_BLOCK_BYTES: usize = 1 << 20;
 /// Rows are in its order, so that its differences are small.
 const PAIR: &str = "pair_id";
 /// Delta reads statistics of this many leading columns.
@@ -46,14 +50,14 @@ pub struct FileEncoder {
     table: Table,
     schema: SchemaRef,
     /// Made with the first batch, from whose rows the size of row groups follows.
-    writer: Option<ArrowWriter<Vec<u8>>>,
+    writer: Option<ArrowWriter<FileBlocks>>,
     stats: StatsCollector,
 }
 
-/// A file's bytes, and Delta's statistics of it as JSON.
+/// A file's bytes in blocks, and Delta's statistics of it as JSON.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct EncodedFile {
-    pub(crate) bytes: Bytes,
+    pub(crate) blocks: Vec<Bytes>,
     pub(crate) stats: String,
     pub(crate) rows: u64,
 }
@@ -82,26 +86,61 @@ impl FileEncoder {
     pub fn finish(mut self) -> Result<EncodedFile> {
         let table = self.table;
         self.ensure_writer(&RecordBatch::new_empty(self.schema.clone()))?;
-        let bytes = match self.writer {
+        let blocks = match self.writer {
             Some(writer) => writer.into_inner().map_err(|e| encode_error(table, e))?,
-            None => Vec::new(),
+            None => FileBlocks::default(),
         };
         let rows = self.stats.rows as u64;
-        Ok(EncodedFile { bytes: bytes.into(), rows, stats: self.stats.into_json().to_string() })
+        Ok(EncodedFile { blocks: blocks.into_blocks(), rows, stats: self.stats.into_json().to_string() })
     }
 
-    fn ensure_writer(&mut self, first: &RecordBatch) -> Result<&mut ArrowWriter<Vec<u8>>> {
+    fn ensure_writer(&mut self, first: &RecordBatch) -> Result<&mut ArrowWriter<FileBlocks>> {
         let table = self.table;
         let made = match self.writer.take() {
             Some(writer) => writer,
             None => {
                 let properties = writer_properties(table, &self.schema, first);
                 let options = ArrowWriterOptions::new().with_properties(properties).with_skip_arrow_metadata(true);
-                ArrowWriter::try_new_with_options(Vec::new(), self.schema.clone(), options)
+                ArrowWriter::try_new_with_options(FileBlocks::default(), self.schema.clone(), options)
                     .map_err(|e| encode_error(table, e))?
             }
         };
         Ok(self.writer.insert(made))
+    }
+}
+
+/// Bytes that are written, in blocks that never move: one vector for all would be copied as often as it grows.
+#[derive(Default)]
+struct FileBlocks {
+    full: Vec<Bytes>,
+    last: Vec<u8>,
+    /// Bytes of the full blocks.
+    full_bytes: usize,
+}
+
+impl FileBlocks {
+    fn into_blocks(mut self) -> Vec<Bytes> {
+        self.full.push(self.last.into());
+        self.full
+    }
+}
+
+impl Write for FileBlocks {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        if self.last.len() == self.last.capacity() {
+            // A file is small or large.
+            let block = Vec::with_capacity(self.full_bytes.clamp(LEAST_BLOCK_BYTES, MOST_BLOCK_BYTES));
+            let full = std::mem::replace(&mut self.last, block);
+            self.full_bytes += full.len();
+            self.full.extend((!full.is_empty()).then(|| Bytes::from(full)));
+        }
+        let fitting = bytes.len().min(self.last.capacity() - self.last.len());
+        self.last.extend_from_slice(&bytes[..fitting]);
+        Ok(fitting)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
     }
 }
 
@@ -280,6 +319,22 @@ mod tests {
     use arrow::datatypes::{Field, Schema};
 
     use super::*;
+
+    #[test]
+    fn blocks_are_the_bytes_that_were_written() {
+        for sizes in [vec![], vec![0, 3], vec![10_000; 5], vec![8_192; 500], vec![3 << 20, 1, 2 << 20]] {
+            let mut blocks = FileBlocks::default();
+            let mut expected = Vec::new();
+            for (number, size) in sizes.into_iter().enumerate() {
+                let bytes: Vec<u8> = (0..size).map(|at| (at * 31 + number) as u8).collect();
+                blocks.write_all(&bytes).expect("memory");
+                expected.extend_from_slice(&bytes);
+            }
+            let blocks = blocks.into_blocks();
+            assert!(blocks.iter().all(|block| block.len() <= MOST_BLOCK_BYTES));
+            assert_eq!(blocks.concat(), expected);
+        }
+    }
 
     #[test]
     fn statistics_span_the_batches_and_skip_nan() {

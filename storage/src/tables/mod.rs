@@ -181,10 +181,13 @@ impl Lake {
     pub async fn stage_file(&self, table: Table, name: &FileName, file: EncodedFile) -> Result<StagedFile> {
         let name = name.compose();
         let path = table_folder(table).join(name.as_str());
-        let bytes = file.bytes.len() as u64;
+        let bytes = file.blocks.iter().map(|block| block.len() as u64).sum();
         let stats = file.stats;
         let rows = file.rows;
-        self.store().put(&path, file.bytes.into()).await.map_err(|e| Error::store_failure("write", &path, e))?;
+        self.store()
+            .put(&path, file.blocks.into_iter().collect())
+            .await
+            .map_err(|e| Error::store_failure("write", &path, e))?;
         let parts = Vec::new();
         let replaces = None;
         let row_counts = None;
