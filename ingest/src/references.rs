@@ -339,6 +339,7 @@ impl LoadedReferences {
             return Ok(());
         }
         let plan = derivation_plan(lake.rig()).map_err(kernel_error)?;
+        let is_same = std::ptr::eq(foam, flat_foam);
         let Self { pairs, correction, .. } = self;
         let add_to_pair = |scratch: &mut AirScratch<f32>, (number, pair): (&u32, &mut ReferencePair)| {
             let (Some(own), Some(flat_foam), Some(flat)) = (foam.get(number), flat_foam.get(number), flat.get(number))
@@ -355,8 +356,13 @@ impl LoadedReferences {
                 correction.reflected_spectrum(&of_flat, &mut reflected, scratch);
                 let flat_total = plan.spectrum_energy(&reflected);
                 let of_best = if number == 0 { reflected.clone() } else { Vec::new() };
-                reflection.direct_sound(&own.ir, &flat.ir, incidence_deg, &mut direct)?;
-                let direct = correction.compute_spectrum(&direct, scratch)?;
+                let direct = match is_same {
+                    true => of_flat,
+                    false => {
+                        reflection.direct_sound(&own.ir, &flat.ir, incidence_deg, &mut direct)?;
+                        correction.compute_spectrum(&direct, scratch)?
+                    }
+                };
                 pair.unbiased.push(UnbiasedPair { direct, flat_total, flat: of_best });
             }
             Ok::<_, echolake_dsp::Error>(())

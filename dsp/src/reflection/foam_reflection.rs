@@ -116,10 +116,24 @@ struct NormalEquations {
     wanted: Vec<f64>,
 }
 
+/// A pair whose filters are fitted by what the gate lets through.
+struct GatedPair<'a> {
+    pair: &'a FittedPair,
+    /// `[len]`: squares of the gate.
+    gates: Vec<f64>,
+    /// The difference backwards, between zeros, so that a slice is what the taps move to a sample.
+    backwards: Vec<f64>,
+}
+
 /// Delays signals by fractions of a sample, around a circle twice as long as a response.
 struct SignalDelay {
     forward: Arc<dyn RealToComplex<f64>>,
     inverse: Arc<dyn ComplexToReal<f64>>,
+    /// Of the signal that was taken last.
+    spectrum: Vec<Complex<f64>>,
+    turned: Vec<Complex<f64>>,
+    delayed: Vec<f64>,
+    work: Vec<Complex<f64>>,
 }
 
 impl ReflectionPath {
@@ -172,27 +186,28 @@ impl FoamReflectionFit {
             return None;
         }
         let stride = self.pairs.len().div_ceil(MOST_PAIRS);
-        let mut pairs: Vec<_> = self.pairs.iter().step_by(stride).collect();
-        pairs.sort_by(|a, b| a.path.separation_secs().total_cmp(&b.path.separation_secs()));
-        let part_of = |number: usize| number * PARTS / pairs.len();
         let classes = supported_classes(&self.pairs);
         let taps = self.lead() + self.samples(FILTER_SECS[1]) + 1;
+        let mut pairs: Vec<_> = self.pairs.iter().step_by(stride).map(|pair| self.gate_pair(pair, taps)).collect();
+        pairs.sort_by(|a, b| a.pair.path.separation_secs().total_cmp(&b.pair.path.separation_secs()));
+        let part_of = |number: usize| number * PARTS / pairs.len();
         let mut parts = vec![NormalEquations::new(classes, taps); PARTS];
         for (number, pair) in pairs.iter().enumerate() {
-            let products = self.tap_products(pair, taps);
-            parts[part_of(number)].add_products(pair.path.sine_square(), &products);
+            parts[part_of(number)].add_products(pair.pair.path.sine_square(), &pair.tap_products(taps));
         }
-        let delay = SignalDelay::new(2 * self.len);
+        let mut delay = SignalDelay::new(2 * self.len);
         let mut waveform = vec![0.0; 2 * self.len];
         let mut best = None;
         for _ in 0..ROUNDS {
             if let Some(best) = &best {
-                waveform = self.direct_waveform(&pairs, best, &delay)?;
+                waveform = self.direct_waveform(&pairs, best, &mut delay)?;
             }
+            delay.take_signal(&waveform)?;
             parts.iter_mut().for_each(|equations| equations.wanted.fill(0.0));
             for (number, pair) in pairs.iter().enumerate() {
-                let correlations = self.tap_correlations(pair, &waveform, taps, &delay)?;
-                parts[part_of(number)].add_correlations(pair.path.sine_square(), &correlations);
+                let secs = pair.pair.path.direct_secs;
+                let correlations = pair.tap_correlations(taps, delay.delay_signal(secs * self.rate_hz)?);
+                parts[part_of(number)].add_correlations(pair.pair.path.sine_square(), &correlations);
             }
             best = Some(self.solve_equations(NormalEquations::sum_without(&parts, None))?);
         }
@@ -209,64 +224,31 @@ impl FoamReflectionFit {
         Some(FoamReflection { lead: self.lead(), classes, filters })
     }
 
-    // Sums of products of the gated difference, moved by each tap, with itself moved by each: the lower triangle.
-    fn tap_products(&self, pair: &FittedPair, taps: usize) -> Vec<f64> {
-        let mut products = vec![0.0; taps * taps];
-        let mut moved = vec![0.0; taps];
-        for n in 0..self.len {
-            let gate = self.gate(pair, n);
-            if gate == 0.0 {
-                continue;
-            }
-            for (tap, x) in moved.iter_mut().enumerate() {
-                *x = gate * self.moved_difference(pair, n, tap);
-            }
-            for (tap, row) in products.chunks_exact_mut(taps).enumerate() {
-                row[..=tap].iter_mut().zip(&moved).for_each(|(sum, x)| *sum += moved[tap] * x);
-            }
+    fn gate_pair<'a>(&self, pair: &'a FittedPair, taps: usize) -> GatedPair<'a> {
+        let later = std::iter::repeat_n(0.0, self.lead());
+        let earlier = std::iter::repeat_n(0.0, taps);
+        GatedPair {
+            pair,
+            gates: (0..self.len).map(|n| self.gate(pair, n).powi(2)).collect(),
+            backwards: later.chain(pair.difference.iter().rev().copied()).chain(earlier).collect(),
         }
-        products
-    }
-
-    // Sums of products of the gated difference, moved by each tap, with the gated response of Foam less the direct
-    // sound's waveform.
-    fn tap_correlations(
-        &self,
-        pair: &FittedPair,
-        waveform: &[f64],
-        taps: usize,
-        delay: &SignalDelay,
-    ) -> Option<Vec<f64>> {
-        let direct = delay.delayed_signal(waveform, pair.path.direct_secs * self.rate_hz)?;
-        let mut correlations = vec![0.0; taps];
-        for (n, (foam, direct)) in pair.foam.iter().zip(&direct).enumerate() {
-            let gate = self.gate(pair, n);
-            if gate == 0.0 {
-                continue;
-            }
-            let reflected = gate * gate * (foam - direct / pair.path.direct_secs);
-            for (tap, sum) in correlations.iter_mut().enumerate() {
-                *sum += reflected * self.moved_difference(pair, n, tap);
-            }
-        }
-        Some(correlations)
     }
 
     // The mean of all direct sounds, each from its arrival, at a distance that sound travels in a second. Times before
     // the arrival are at the end.
     fn direct_waveform(
         &self,
-        pairs: &[&FittedPair],
+        pairs: &[GatedPair<'_>],
         reflection: &FoamReflection,
-        delay: &SignalDelay,
+        delay: &mut SignalDelay,
     ) -> Option<Vec<f64>> {
         let circle = 2 * self.len;
         let mut sums = vec![(0.0, 0.0); circle];
-        for pair in pairs {
+        for GatedPair { pair, .. } in pairs {
             let arrival = pair.path.direct_secs * self.rate_hz;
-            let direct = reflection.remove_reflection(&pair.foam, &pair.difference, pair.path.sine_square());
-            let advanced = delay.delayed_signal(&direct, -arrival)?;
-            for (at, (sum, x)) in sums.iter_mut().zip(&advanced).enumerate() {
+            delay.take_signal(&reflection.remove_reflection(&pair.foam, &pair.difference, pair.path.sine_square()))?;
+            let advanced = delay.delay_signal(-arrival)?;
+            for (at, (sum, x)) in sums.iter_mut().zip(advanced).enumerate() {
                 let lag = if at < self.len { at as f64 } else { at as f64 - circle as f64 };
                 if (0.0..self.len as f64).contains(&(lag + arrival)) {
                     *sum = (sum.0 + x * pair.path.direct_secs, sum.1 + 1.0);
@@ -278,13 +260,11 @@ impl FoamReflectionFit {
 
     fn gate(&self, pair: &FittedPair, sample: usize) -> f64 {
         let secs = sample as f64 / self.rate_hz - (pair.path.reflected_secs - GATE_SECS[0]);
-        let rise = (secs / GATE_SECS[1]).clamp(0.0, 1.0);
-        0.5 - 0.5 * (std::f64::consts::PI * rise).cos()
-    }
-
-    fn moved_difference(&self, pair: &FittedPair, sample: usize, tap: usize) -> f64 {
-        let at = (sample + self.lead()).checked_sub(tap);
-        at.and_then(|at| pair.difference.get(at)).copied().unwrap_or(0.0)
+        match secs / GATE_SECS[1] {
+            ..=0.0 => 0.0,
+            rise @ 0.0..1.0 => 0.5 - 0.5 * (std::f64::consts::PI * rise).cos(),
+            _ => 1.0,
+        }
     }
 
     fn samples(&self, secs: f64) -> usize {
@@ -293,6 +273,56 @@ impl FoamReflectionFit {
 
     fn lead(&self) -> usize {
         self.samples(-FILTER_SECS[0])
+    }
+}
+
+impl GatedPair<'_> {
+    // What each tap moves to the sample before this one.
+    fn moved_before(&self, sample: usize) -> &[f64] {
+        &self.backwards[self.gates.len() - sample..]
+    }
+
+    // Sums of products of the gated difference, moved by each tap, with itself moved by each: the lower triangle.
+    //
+    // With both taps one later, a sample has the gate of the next one. So the sum changes only where the gate does,
+    // which is at its rise and at the ends of the response.
+    fn tap_products(&self, taps: usize) -> Vec<f64> {
+        let mut first = vec![0.0; taps];
+        let mut changes = vec![0.0; taps * taps];
+        let mut gate_before = 0.0;
+        for (sample, gate) in self.gates.iter().chain([&0.0]).enumerate() {
+            let moved = &self.moved_before(sample)[..taps];
+            first.iter_mut().zip(moved).for_each(|(sum, x)| *sum += gate_before * moved[0] * x);
+            let change = gate - gate_before;
+            if change != 0.0 {
+                for (tap, row) in changes.chunks_exact_mut(taps).enumerate() {
+                    let factor = change * moved[tap];
+                    row[..=tap].iter_mut().zip(moved).for_each(|(sum, x)| *sum += factor * x);
+                }
+            }
+            gate_before = *gate;
+        }
+        let mut products = vec![0.0; taps * taps];
+        for tap in 0..taps {
+            let (above, own) = products.split_at_mut(tap * taps);
+            own[0] = first[tap];
+            if let Some(before) = tap.checked_sub(1).map(|before| before * taps) {
+                let sums = above[before..].iter().zip(&changes[before..]);
+                own[1..=tap].iter_mut().zip(sums).for_each(|(sum, (above, change))| *sum = above + change);
+            }
+        }
+        products
+    }
+
+    // Sums of products of the gated difference, moved by each tap, with the gated response of Foam less the direct
+    // sound, which is given at a distance that sound travels in a second.
+    fn tap_correlations(&self, taps: usize, direct: &[f64]) -> Vec<f64> {
+        let mut correlations = vec![0.0; taps];
+        for (n, ((foam, direct), gate)) in self.pair.foam.iter().zip(direct).zip(&self.gates).enumerate() {
+            let reflected = gate * (foam - direct / self.pair.path.direct_secs);
+            correlations.iter_mut().zip(self.moved_before(n + 1)).for_each(|(sum, x)| *sum += reflected * x);
+        }
+        correlations
     }
 }
 
@@ -365,9 +395,9 @@ impl NormalEquations {
             row[i] += LOADING * trace / unknowns as f64;
             for j in 0..i {
                 let factor = &above[j * unknowns..=j * unknowns + j];
-                row[j] = (row[j] - dot_product(&row[..j], &factor[..j])) / factor[j];
+                row[j] = (row[j] - f64::dot_product(&row[..j], &factor[..j])) / factor[j];
             }
-            let square = row[i] - dot_product(&row[..i], &row[..i]);
+            let square = row[i] - f64::dot_product(&row[..i], &row[..i]);
             if !(square > 0.0) {
                 return None;
             }
@@ -376,7 +406,7 @@ impl NormalEquations {
         let mut solution = self.wanted;
         for i in 0..unknowns {
             let row = &self.matrix[i * unknowns..=i * unknowns + i];
-            solution[i] = (solution[i] - dot_product(&row[..i], &solution[..i])) / row[i];
+            solution[i] = (solution[i] - f64::dot_product(&row[..i], &solution[..i])) / row[i];
         }
         for i in (0..unknowns).rev() {
             let row = &self.matrix[i * unknowns..=i * unknowns + i];
@@ -388,30 +418,41 @@ impl NormalEquations {
     }
 }
 
-fn dot_product(a: &[f64], b: &[f64]) -> f64 {
-    a.iter().zip(b).map(|(a, b)| a * b).sum()
-}
-
 impl SignalDelay {
     fn new(circle: usize) -> Self {
-        Self { forward: f64::plan_real_forward(circle), inverse: f64::plan_real_inverse(circle) }
+        let forward = f64::plan_real_forward(circle);
+        let inverse = f64::plan_real_inverse(circle);
+        let work = forward.get_scratch_len().max(inverse.get_scratch_len());
+        Self {
+            spectrum: forward.make_output_vec(),
+            turned: forward.make_output_vec(),
+            delayed: inverse.make_output_vec(),
+            work: vec![Complex::default(); work],
+            forward,
+            inverse,
+        }
     }
 
     // None if the signal is longer than the circle.
-    fn delayed_signal(&self, signal: &[f64], samples: f64) -> Option<Vec<f64>> {
-        let circle = self.forward.len();
-        let mut delayed = vec![0.0; circle];
-        delayed.get_mut(..signal.len())?.copy_from_slice(signal);
-        let mut spectrum = self.forward.make_output_vec();
-        self.forward.process(&mut delayed, &mut spectrum).ok()?;
-        for (bin, x) in spectrum.iter_mut().enumerate() {
-            let angle = -std::f64::consts::TAU * bin as f64 * samples / circle as f64;
-            *x *= Complex::from_polar(1.0 / circle as f64, angle);
+    fn take_signal(&mut self, signal: &[f64]) -> Option<()> {
+        self.delayed.fill(0.0);
+        self.delayed.get_mut(..signal.len())?.copy_from_slice(signal);
+        self.forward.process_with_scratch(&mut self.delayed, &mut self.spectrum, &mut self.work).ok()
+    }
+
+    // Returns the signal that was taken last, delayed.
+    fn delay_signal(&mut self, samples: f64) -> Option<&[f64]> {
+        let circle = self.delayed.len() as f64;
+        let step = Complex::cis(-std::f64::consts::TAU * samples / circle);
+        let mut factor = Complex::from(circle.recip());
+        for (turned, x) in self.turned.iter_mut().zip(&self.spectrum) {
+            *turned = x * factor;
+            factor *= step;
         }
         // The end of a real signal's spectrum is real.
-        spectrum.last_mut()?.im = 0.0;
-        self.inverse.process(&mut spectrum, &mut delayed).ok()?;
-        Some(delayed)
+        self.turned.last_mut()?.im = 0.0;
+        self.inverse.process_with_scratch(&mut self.turned, &mut self.delayed, &mut self.work).ok()?;
+        Some(&self.delayed)
     }
 }
 
@@ -471,130 +512,4 @@ pub fn estimate_error(best: f64, variants: &[f64]) -> f64 {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    const LEN: usize = 384;
-    const RATE_HZ: f64 = 96e3;
-
-    // Sound of the sweep's range, about a fraction of a sample.
-    fn pulse(n: usize, at: f64) -> f64 {
-        let x = n as f64 - at;
-        let sinc = |edge_hz: f64| {
-            let turns = 2.0 * edge_hz / RATE_HZ;
-            if x.abs() < 1e-9 { turns } else { (std::f64::consts::PI * turns * x).sin() / (std::f64::consts::PI * x) }
-        };
-        (sinc(40e3) - sinc(2e3)) * (-(x / 60.0).powi(2)).exp()
-    }
-
-    // Direct sound, which goes as 1/d, and a reflection by layers, each with its delay in samples and factor.
-    fn response(direct: f64, reflected: f64, layers: &[(f64, f64)]) -> Vec<f64> {
-        let reflection = |n| layers.iter().map(|(delay, r)| 0.7 * r * pulse(n, reflected + delay)).sum::<f64>();
-        (0..LEN).map(|n| 60.0 / direct * pulse(n, direct) + reflection(n)).collect()
-    }
-
-    fn paths() -> impl Iterator<Item = ReflectionPath> {
-        (0..400).map(|i| {
-            let direct = 40.0 + 7.31 * f64::from(i % 12);
-            let reflected = direct + 16.0 + 0.23 * f64::from(i);
-            path(direct, reflected, 60.0 - 0.11 * f64::from(i) - 2.0 * f64::from(i % 7))
-        })
-    }
-
-    fn path(direct: f64, reflected: f64, incidence_deg: f64) -> ReflectionPath {
-        ReflectionPath { direct_secs: direct / RATE_HZ, reflected_secs: reflected / RATE_HZ, incidence_deg }
-    }
-
-    // A surface that reflects by the angle, and the wall behind it.
-    fn foam_layers(path: ReflectionPath) -> [(f64, f64); 2] {
-        [(0.0, 0.04 + 0.1 * path.sine_square()), (27.4 - 2.0 * path.sine_square(), 0.02)]
-    }
-
-    fn responses(path: ReflectionPath, layers: &[(f64, f64)]) -> [Vec<f64>; 2] {
-        let [direct, reflected] = [path.direct_secs, path.reflected_secs].map(|secs| secs * RATE_HZ);
-        [response(direct, reflected, layers), response(direct, reflected, &[(0.0, 0.84)])]
-    }
-
-    fn energy(a: &[f64], b: &[f64]) -> f64 {
-        a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum()
-    }
-
-    // Energies over all pairs of what Flat reflects, of Foam's error and of the estimates' by variant.
-    fn errors(layers: impl Fn(ReflectionPath) -> Vec<(f64, f64)>) -> [f64; 4] {
-        let mut fit = FoamReflectionFit::new(LEN, RATE_HZ).expect("a fit");
-        for path in paths() {
-            let [foam, flat] = responses(path, &layers(path));
-            let apart = path.separation_secs() >= LEAST_SEPARATION_SECS;
-            assert_eq!(fit.add_pair(&foam, &flat, path), Ok(apart));
-        }
-        let estimate = fit.finish().expect("an estimate");
-        let mut sums = [0.0; 4];
-        for path in paths() {
-            let [foam, flat] = responses(path, &layers(path));
-            let [truth, _] = responses(path, &[]);
-            let mut found = vec![f64::NAN; LEN];
-            estimate.best.direct_sound(&foam, &flat, path.incidence_deg, &mut found).expect("lengths");
-            let mut moved = found.clone();
-            let variant = estimate.variants.last().expect("variants");
-            variant.direct_sound(&foam, &flat, path.incidence_deg, &mut moved).expect("lengths");
-            let errors = [energy(&flat, &truth), energy(&foam, &truth), energy(&found, &truth), energy(&moved, &found)];
-            sums.iter_mut().zip(errors).for_each(|(sum, error)| *sum += error);
-        }
-        sums
-    }
-
-    #[test]
-    fn the_direct_sound_of_every_pair_is_found_though_foam_reflects_by_the_angle() {
-        let [_, before, after, moved] = errors(|path| foam_layers(path).to_vec());
-        assert!(after < 2.5e-3 * before, "{} dB of Foam's reflection is left", 10.0 * (after / before).log10());
-        assert!(moved > after && moved < 0.1 * before, "{moved} of {before}");
-    }
-
-    #[test]
-    fn of_foam_that_reflects_nothing_nothing_is_found() {
-        let [flat, before, after, _] = errors(|_| Vec::new());
-        assert!(before == 0.0 && after < 1e-6 * flat, "{} dB", 10.0 * (after / flat).log10());
-    }
-
-    #[test]
-    fn few_pairs_or_a_flat_that_is_foam_give_no_estimate() {
-        let responses = |r| response(60.0, 120.0, &[(0.0, r)]);
-        let fit = |pairs: usize, flat: f64| {
-            let mut fit = FoamReflectionFit::new(LEN, RATE_HZ).expect("a fit");
-            for _ in 0..pairs {
-                let added = fit.add_pair(&responses(0.05), &responses(flat), path(60.0, 120.0, 30.0));
-                assert_eq!(added, Ok(true));
-            }
-            fit.finish()
-        };
-        assert!(fit(LEAST_PAIRS - 1, 0.8).is_none());
-        assert!(fit(LEAST_PAIRS, 0.05).is_none());
-        assert!(fit(LEAST_PAIRS, 0.8).is_some());
-    }
-
-    #[test]
-    fn overlapping_arrivals_and_bad_responses_add_nothing() {
-        let mut fit = FoamReflectionFit::new(LEN, RATE_HZ).expect("a fit");
-        let (foam, flat) = (response(60.0, 80.0, &[(0.0, 0.1)]), response(60.0, 80.0, &[(0.0, 0.8)]));
-        for [direct, reflected, angle] in
-            [[60.0, 80.0, 30.0], [60.0, 360.0, 30.0], [f64::NAN, 120.0, 30.0], [60.0, 120.0, f64::NAN]]
-        {
-            let added = fit.add_pair(&foam, &flat, path(direct, reflected, angle));
-            assert_eq!(added, Ok(false), "{direct} {reflected} {angle}");
-        }
-        let mut broken = foam.clone();
-        broken[200] = f64::NAN;
-        let result = fit.add_pair(&broken, &flat, path(60.0, 120.0, 30.0));
-        assert!(matches!(result, Err(Error::NotFinite { .. })), "{result:?}");
-        assert!(matches!(fit.add_pair(&foam[1..], &flat, path(60.0, 120.0, 30.0)), Err(Error::Length { .. })));
-        assert!(fit.pairs.is_empty());
-        assert!(FoamReflectionFit::new(0, RATE_HZ).is_err() && FoamReflectionFit::new(9, 1e3).is_err());
-    }
-
-    // Of 1, 2, 3 and 4 the jackknife's variance is 3/4 of the sum of squares about the mean, 5.
-    #[test]
-    fn errors_of_an_estimate_are_those_of_its_variants() {
-        assert!((estimate_error(2.0, &[1.0, 2.0, 3.0, 4.0, 2.0]) - 3.75f64.sqrt()).abs() < 1e-12);
-        assert!((estimate_error(2.0, &[1.0, 1.0, 1.0, 1.0, 2.5]) - 0.5).abs() < 1e-12);
-    }
-}
+mod tests;
