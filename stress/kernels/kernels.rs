@@ -4,15 +4,19 @@
 use std::hint::black_box;
 
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
+use echolake_dsp::air_correction::{AirCorrectionFit, PairAir, TransformedResponse};
 use echolake_dsp::chain::{DerivationPlan, MeasurementParams, MeasurementPlan, raw_len};
 use echolake_dsp::deconvolution::{DeconvolutionParams, DeconvolutionPlan, SpectralDivision, TransformLength};
 use echolake_dsp::energy::{cumulative_energy, nce, tnce};
+use echolake_dsp::far_field::FarFieldPlan;
 use echolake_dsp::filter_bank::FilterBankPlan;
 use echolake_dsp::height_field::HeightField;
 use echolake_dsp::kirchhoff::{KirchhoffPlan, SoundPath, TransducerPose};
+use echolake_dsp::rounding::{CURVE_BITS, round_samples};
 use echolake_dsp::sweep::{SineSweep, SweepShape};
 use echolake_dsp::air::AirState;
 use echolake_dsp::temperature::{ReferenceAir, TemperatureCorrection};
+use echolake_dsp::uncertainty::{EnergySensitivity, ResidualFit};
 use echolake_schema::Rig;
 use echolake_dsp::{Error, RealSample as _};
 use echolake_schema::messages::SampleFormat;
@@ -36,6 +40,8 @@ criterion_group!(
     filter_bank,
     energy,
     derivation,
+    air,
+    far_field,
     reflection
 );
 criterion_main!(kernels);
@@ -211,13 +217,67 @@ fn derivation(criterion: &mut Criterion) {
     let mut scratch = plan.make_scratch();
     let mut derived = plan.make_derived();
     let energies = plan.flat_energies(&ir, &mut scratch).expect("a response");
+    let transformed = transform_response(&ir);
     let mut group = criterion.benchmark_group("derivation");
     group.throughput(Throughput::Elements(IR_LEN as u64));
     group.bench_function(BenchmarkId::new("response_to_curves", IR_LEN), |bencher| {
         bencher.iter(|| -> Result<(), Error> { plan.derive_response(black_box(&ir), &foam, &ir, &mut derived, &mut scratch) });
     });
     group.bench_function(BenchmarkId::new("with_known_flat", IR_LEN), |bencher| {
-        bencher.iter(|| plan.run_over(black_box(&ir), &energies, &mut derived, &mut scratch));
+        bencher.iter(|| plan.run_over(black_box(&transformed), &energies, &mut derived, &mut scratch));
+    });
+    let mut sensitivities = [EnergySensitivity::default(); CENTRES_HZ.len()];
+    group.bench_function(BenchmarkId::new("sensitivities", IR_LEN), |bencher| {
+        let TransformedResponse { spectrum, .. } = &transformed;
+        bencher.iter(|| {
+            plan.compute_sensitivities(black_box(spectrum), spectrum, |_| 0.01, &mut sensitivities, &mut scratch)
+        });
+    });
+    let mut residual = ResidualFit::<f32>::new(IR_LEN, RATE_HZ, [LOW_HZ, HIGH_HZ]).expect("settings of the paper");
+    let waveform = residual.prepare_direct(&transformed.spectrum, 0.5e-3, 2e-3).expect("a response");
+    group.bench_function(BenchmarkId::new("residual", IR_LEN), |bencher| {
+        bencher.iter(|| residual.add_pair(black_box(&transformed.spectrum), &waveform));
+    });
+    let mut rounded = ir.clone();
+    group.bench_function(BenchmarkId::new("rounding", IR_LEN), |bencher| {
+        bencher.iter(|| round_samples(black_box(&mut rounded), CURVE_BITS));
+    });
+}
+
+fn transform_response(samples: &[f32]) -> TransformedResponse<f32> {
+    let forward = f32::plan_real_forward(samples.len());
+    let mut spectrum = forward.make_output_vec();
+    forward.process(&mut samples.to_vec(), &mut spectrum).expect("the plan's length");
+    TransformedResponse { samples: samples.to_vec(), spectrum }
+}
+
+/// Subtraction of the direct sound in the air of a response.
+fn air(criterion: &mut Criterion) {
+    let ir = response();
+    let mut fit = AirCorrectionFit::<f32>::new(IR_LEN, RATE_HZ, [LOW_HZ, HIGH_HZ], reference_air());
+    fit.add_pair(&ir, &ir, [0.3, 0.7]).expect("a response");
+    let correction = fit.finish();
+    let [response, direct] = [21.9, 22.4].map(|celsius| AirState::with_known(celsius, None, None));
+    let pair = PairAir { response, direct, direct_m: 0.3, reflected_m: 0.7 };
+    let direct = transform_response(&ir);
+    let mut reflected = correction.make_reflected();
+    let mut scratch = correction.make_scratch();
+    let mut group = criterion.benchmark_group("air");
+    group.throughput(Throughput::Elements(IR_LEN as u64));
+    group.bench_function(BenchmarkId::new("subtract_direct", IR_LEN), |bencher| {
+        bencher.iter(|| correction.subtract_direct(black_box(&ir), &direct, &pair, &mut reflected, &mut scratch));
+    });
+}
+
+/// Far field of a relief in the bands of the paper, three frequencies each.
+fn far_field(criterion: &mut Criterion) {
+    let relief = HeightField::from_fn(585.0, 274, |x, y| 15.0 * (x / 30.0).sin() + 10.0 * (y / 25.0).cos());
+    let waves = |hz: f64| [0.84, 1.0, 1.19].map(|ratio| std::f64::consts::TAU * hz * ratio / 343.0).to_vec();
+    let plan = FarFieldPlan::new(&relief, CENTRES_HZ.map(|hz| waves(0.8 * hz)).to_vec());
+    let mut group = criterion.benchmark_group("far_field");
+    group.throughput(Throughput::Elements((relief.cells() * relief.cells()) as u64));
+    group.bench_function(BenchmarkId::new("five_bands", relief.cells()), |bencher| {
+        bencher.iter(|| plan.compute_coefficients(black_box(&relief)));
     });
 }
 
