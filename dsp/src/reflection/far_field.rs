@@ -128,29 +128,27 @@ impl FarFieldPlan {
             let actual = format!("{} cells over {} mm", relief.cells(), relief.size_mm());
             return Err(Error::Setting { what: "the relief", actual, expected: "the plan's cells and size" });
         }
-        let heights = CellHeights::new(relief);
-        Ok(self.bands.iter().map(|band| self.band_coefficients(band, &heights)).collect())
+        let wave_numbers = || self.bands.iter().flat_map(|band| &band.wave_numbers).copied();
+        let [least, greatest] = [wave_numbers().fold(f64::MAX, f64::min), wave_numbers().fold(0.0, f64::max)];
+        let table = PhaseTable::new(&CellHeights::new(relief), [least * RISES[0], greatest * RISES[1]]);
+        let mut sums = vec![0.0; 4 * self.cells];
+        Ok(self.bands.iter().map(|band| self.band_coefficients(band, &table, &mut sums)).collect())
     }
 
-    fn band_coefficients(&self, band: &BandWaves, heights: &CellHeights) -> FarFieldCoefficients {
-        let mut energies = SOURCES.map(|_| [[0.0; RECEIVERS]; VIEWS]);
-        let mut mirrored = SOURCES.map(|_| 0.0);
-        let mut sums = vec![0.0; 4 * self.cells];
-        for wave_number in &band.wave_numbers {
-            let table = PhaseTable::new(heights, RISES.map(|rise| wave_number * rise));
-            let fill = |upright: f64, sums: &mut PhaseSums| table.fill_sums(upright, sums);
-            for (number, (source_deg, _)) in SOURCES.into_iter().enumerate() {
-                let responses = self.polar_responses(*wave_number, source_deg, fill, &mut sums);
-                add_energies(&mut energies[number], &responses);
-                table.fill_sums(2.0 * wave_number * source_deg.to_radians().cos(), &mut sums);
-                let columns = sums.chunks_exact(self.cells).map(|part| part.iter().sum::<f64>());
-                let square: f64 = columns.take(2).map(|sum| sum * sum).sum();
-                mirrored[number] += square / (self.cells as f64).powi(4) / band.wave_numbers.len() as f64;
-            }
-        }
+    fn band_coefficients(&self, band: &BandWaves, table: &PhaseTable, sums: &mut PhaseSums) -> FarFieldCoefficients {
         let weights: f64 = SOURCES.iter().map(|(_, weight)| weight).sum();
         let mut coefficients = FarFieldCoefficients { diffusion_normalised: 0.0, scattering: 0.0 };
-        for (((energies, flat), mirrored), (_, weight)) in energies.iter().zip(&band.flat).zip(mirrored).zip(SOURCES) {
+        for ((source_deg, weight), flat) in SOURCES.into_iter().zip(&band.flat) {
+            let mut energies = [[0.0; RECEIVERS]; VIEWS];
+            let mut mirrored = 0.0;
+            for wave_number in &band.wave_numbers {
+                let phase_sums = |upright: f64, sums: &mut PhaseSums| table.fill_sums(upright, sums);
+                add_energies(&mut energies, &self.polar_responses(*wave_number, source_deg, phase_sums, sums));
+                table.fill_sums(2.0 * wave_number * source_deg.to_radians().cos(), sums);
+                let columns = sums.chunks_exact(self.cells).map(|part| part.iter().sum::<f64>());
+                let square: f64 = columns.take(2).map(|sum| sum * sum).sum();
+                mirrored += square / (self.cells as f64).powi(4) / band.wave_numbers.len() as f64;
+            }
             let diffusion = energies.iter().zip(flat).map(|(relief, flat)| diffusion_normalised(relief, flat));
             coefficients.diffusion_normalised += diffusion.sum::<f64>() / VIEWS as f64 * weight / weights;
             coefficients.scattering += (1.0 - mirrored) * weight / weights;
@@ -267,11 +265,12 @@ impl LinePhases {
 }
 
 impl PhaseTable {
-    // The polynomial's coefficients are Bessel functions of half the range times the height, and vanish beyond it.
+    // The polynomial's coefficients are Bessel functions of half the range times the height, and vanish beyond it: those
+    // of 1.4 times as high an order and 10 more are below 1e-8.
     fn new(heights: &CellHeights, [low, high]: [f64; 2]) -> Self {
         let middle = (low + high) / 2.0;
         let half = (high - low) / 2.0;
-        let last = 12 + (half * heights.greatest_m).ceil() as usize;
+        let last = 10 + (1.4 * half * heights.greatest_m).ceil() as usize;
         let distance = |point: usize| half * (PI * point as f64 / last as f64).cos();
         let uprights: Vec<f64> = (0..=last).map(|point| middle - distance(point)).collect();
         let width = 4 * heights.cells;
@@ -439,11 +438,11 @@ mod tests {
             });
             let wave_numbers: Vec<f64> = (0..bands).map(|band| 45.0 * f64::from(1 << band)).collect();
             let plan = FarFieldPlan::new(&relief, wave_numbers.iter().map(|wave_number| vec![*wave_number]).collect());
-            let heights = CellHeights::new(&relief);
+            let range = [wave_numbers[0] * RISES[0], wave_numbers[wave_numbers.len() - 1] * RISES[1]];
+            let table = PhaseTable::new(&CellHeights::new(&relief), range);
             let found = plan.compute_coefficients(&relief).expect("the plan's relief");
             let level = HeightField::from_fn(585.0, cells, |_, _| 0.0);
             for (wave_number, found) in wave_numbers.into_iter().zip(found) {
-                let table = PhaseTable::new(&heights, RISES.map(|rise| wave_number * rise));
                 let mut expected = FarFieldCoefficients { diffusion_normalised: 0.0, scattering: 0.0 };
                 for (source_deg, weight) in SOURCES {
                     let mut sums = vec![0.0; 4 * cells];
