@@ -277,7 +277,8 @@ async fn claim_run(context: &IngestContext, claims: &WorkClaims, run: &VisibleRu
         return Err(Error::Claimed { file });
     }
     let rows = context.lake.commit_log().list_files(Table::Runs).await?;
-    let is_there = |row: &DataFile| rows.iter().any(|there| there.logged_file() == row.logged_file());
+    let is_there =
+        |row: &DataFile| rows.iter().any(|there| there.path == row.path && there.log_version == row.log_version);
     match context.snapshot.files_of(Table::Runs, &run.run).all(is_there) {
         true => Ok(()),
         false => Err(Error::Gone { file }),

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use arrow::record_batch::RecordBatch;
-use echolake_lake::{DataFile, Error as LakeError, FileName, FolderListing, Lake, LakeSnapshot};
+use echolake_lake::{Error as LakeError, FileName, FolderListing, Lake, LakeSnapshot};
 use echolake_recording::{DecodedChunk, ResyncItem, ResyncReader};
 use echolake_schema::tables::Table;
 use object_store::path::Path;
@@ -126,7 +126,7 @@ pub async fn examine_lake(lake: &Lake, progress: &mut dyn FnMut(CheckStep<'_>)) 
         report.tables.push(TableReport {
             table: table.name(),
             files: files.len(),
-            rows: files.iter().map(DataFile::visible_rows).sum(),
+            rows: files.iter().map(|file| file.visible_rows()).sum(),
             bytes: files.iter().map(|f| f.bytes).sum(),
         });
     }

@@ -323,10 +323,11 @@ impl LakeCatalog {
         for table in Table::ALL {
             let files = snapshot.files(table);
             let is_same = |before: &&Arc<LakeTable>| before.is_of(files) && !before.is_faulty();
-            let kept = before.and_then(|b| b.tables.get(&table)).filter(is_same);
+            let known = before.and_then(|b| b.tables.get(&table));
+            let kept = known.filter(is_same);
             let provider = match kept.filter(|_| snapshot.check_table(table).is_ok()) {
                 Some(kept) => kept.clone(),
-                None => Arc::new(self.open_table(table, files)?.of_snapshot(&snapshot)),
+                None => Arc::new(self.open_table(table, files, known.map(AsRef::as_ref))?.of_snapshot(&snapshot)),
             };
             tables.insert(table, provider);
         }
@@ -381,9 +382,14 @@ impl LakeCatalog {
         }
     }
 
-    fn open_table(&self, table: Table, files: &[DataFile]) -> Result<LakeTable, Error> {
+    fn open_table(
+        &self,
+        table: Table,
+        files: &[Arc<DataFile>],
+        before: Option<&LakeTable>,
+    ) -> Result<LakeTable, Error> {
         let schema = table.schema(self.lake.rig());
-        LakeTable::new(table, schema, files.to_vec(), self.source.clone()).map_err(execution_error)
+        LakeTable::new(table, schema, files, self.source.clone(), before).map_err(execution_error)
     }
 
     async fn past_provider(
@@ -426,7 +432,7 @@ impl LakeCatalog {
     async fn table_at(&self, tables_id: &str, version: u64, table: Table) -> Result<Arc<LakeTable>, Error> {
         let read = async {
             let snapshot = self.lake.snapshot_at(version, table).await?;
-            Ok(Arc::new(self.open_table(table, snapshot.files(table))?))
+            Ok(Arc::new(self.open_table(table, snapshot.files(table), None)?))
         };
         self.past.get_or_insert_async(&(tables_id.to_owned(), version, table), read).await
     }

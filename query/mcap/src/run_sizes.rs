@@ -25,7 +25,7 @@ impl RunSizes {
 
     /// Returns the sizes that are known. A file that is missing here is asked for its size.
     pub async fn read_sizes(&self, snapshot: &LakeSnapshot) -> HashMap<Path, u64> {
-        let files: Vec<_> = snapshot.files(Table::Runs).iter().collect();
+        let files: Vec<_> = snapshot.files(Table::Runs).iter().map(|file| &**file).collect();
         if SmallTables::cached_columns(Table::Runs, &self.schema, files.iter().copied()).is_none() {
             return HashMap::new();
         }

@@ -85,7 +85,7 @@ fn seen_bytes(snapshot: &LakeSnapshot, file: &DataFile) -> u64 {
 
 // Surface and run of each run that readers see in a file.
 fn runs_of(file: &DataFile) -> Vec<(String, String)> {
-    match FileName::parse(&file.path) {
+    match &file.name {
         Some(FileName::Rows { surface, run, .. } | FileName::Pointer(VisibleRun { surface, run, .. })) => {
             vec![(surface.to_string(), run.to_string())]
         }

@@ -22,7 +22,7 @@ pub(crate) struct HeldTable {
     table: Table,
     /// The cached columns.
     schema: SchemaRef,
-    files: Vec<DataFile>,
+    files: Vec<Arc<DataFile>>,
     places: HashMap<Path, usize>,
     /// The rows of all files, if a query read them together.
     whole: OnceCell<RecordBatch>,
@@ -30,8 +30,10 @@ pub(crate) struct HeldTable {
 
 impl HeldTable {
     /// Makes a table of its files; None if it is not small.
-    pub fn from_files(table: Table, schema: &SchemaRef, files: &[DataFile]) -> Result<Option<Self>> {
-        let Some(columns) = SmallTables::cached_columns(table, schema, files.iter()) else { return Ok(None) };
+    pub fn from_files(table: Table, schema: &SchemaRef, files: &[Arc<DataFile>]) -> Result<Option<Self>> {
+        let Some(columns) = SmallTables::cached_columns(table, schema, files.iter().map(|file| &**file)) else {
+            return Ok(None);
+        };
         let schema = Arc::new(schema.project(&columns)?);
         let places = files.iter().enumerate().map(|(place, file)| (file.path.clone(), place)).collect();
         Ok(Some(Self { table, schema, files: files.to_vec(), places, whole: OnceCell::new() }))
@@ -89,7 +91,7 @@ impl HeldTable {
     }
 
     async fn read_files(&self, small: &SmallTables, places: &[usize]) -> Result<Vec<RecordBatch>> {
-        let files: Vec<_> = places.iter().filter_map(|place| self.files.get(*place)).collect();
+        let files: Vec<_> = places.iter().filter_map(|place| self.files.get(*place)).map(|file| &**file).collect();
         small.read_files(self.table, &self.schema, &files, self.files.len()).await
     }
 }

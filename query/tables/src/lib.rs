@@ -7,6 +7,7 @@ mod held_table;
 mod lake_table;
 mod local_scans;
 mod readers;
+mod scan_files;
 mod small_tables;
 
 pub use lake_table::{FileReaders, LakeTable};

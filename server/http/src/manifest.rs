@@ -130,7 +130,7 @@ pub(super) fn forwarded_prefix(headers: &HeaderMap) -> &str {
 
 impl RowsElsewhere {
     fn from_snapshot(snapshot: &LakeSnapshot, table: Table) -> Option<Self> {
-        let all: u64 = snapshot.files(table).iter().map(DataFile::visible_rows).sum();
+        let all: u64 = snapshot.files(table).iter().map(|file| file.visible_rows()).sum();
         let readable: u64 = snapshot.readable_files(table).map(DataFile::visible_rows).sum();
         (all > readable).then(|| Self { table: table.name(), rows: all - readable })
     }

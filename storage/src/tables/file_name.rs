@@ -114,11 +114,6 @@ impl FileName {
     }
 }
 
-/// Returns whether a file of this name was merged from several.
-pub(crate) fn is_merged(name: &str) -> bool {
-    matches!(FileName::parse(&Path::from(name)), Some(FileName::Merged { .. }))
-}
-
 /// Returns a table's folder in the lake.
 pub(crate) fn table_folder(table: Table) -> Path {
     Path::from(format!("tables/{}", table.name()))

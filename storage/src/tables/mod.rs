@@ -1,6 +1,7 @@
 //! A lake's tables: rows in, and a view of them.
 
 mod batch_builder;
+mod current_runs;
 mod data_file;
 mod file_name;
 mod log;
@@ -278,7 +279,7 @@ impl Lake {
         let mut count = 0;
         for table in Table::ALL {
             let gone = snapshot.superseded_files(table).iter().chain(snapshot.foreign_files(table));
-            let remove: Vec<_> = gone.map(DataFile::logged_file).collect();
+            let remove: Vec<_> = gone.map(|file| file.logged_file()).collect();
             if !remove.is_empty() {
                 count += remove.len();
                 self.commit_log().commit_change(table, &TableCommit { remove, ..TableCommit::default() }).await?;

@@ -73,8 +73,8 @@ impl SurfaceReferences {
 
 // The names in the rows of a file's surfaces, which are the same in all of them, taken from the file's statistics.
 fn names_of_file(file: &DataFile, defaults: &ReferenceNames) -> Vec<(SurfaceId, ReferenceNames)> {
-    let surfaces = match FileName::parse(&file.path) {
-        Some(FileName::Rows { surface, .. }) => vec![surface],
+    let surfaces = match &file.name {
+        Some(FileName::Rows { surface, .. }) => vec![surface.clone()],
         _ => file.visible_parts().map(|(part, _)| part.surface.clone()).collect(),
     };
     let text = |column: &str| file.stats.as_ref()?.min.get(column)?.as_str()?.parse().ok();

@@ -12,10 +12,10 @@ use crate::{DataFile, RunPart, RunRowCounts};
 const PROJECT: &str = "project";
 
 /// Returns the run of a file of one run; None for other files.
-pub(crate) fn run_of_file(file: &DataFile) -> Option<RunId> {
-    match FileName::parse(&file.path)? {
+pub(crate) fn run_of_file(file: &DataFile) -> Option<&RunId> {
+    match file.name.as_ref()? {
         FileName::Rows { run, .. } => Some(run),
-        FileName::Pointer(pointer) => Some(pointer.run),
+        FileName::Pointer(pointer) => Some(&pointer.run),
         FileName::Rig { .. } | FileName::Merged { .. } => None,
     }
 }
@@ -30,19 +30,19 @@ pub(crate) struct RunPointer<'a> {
 
 /// Lists the rows of `runs` that a file of that table shows.
 pub(crate) fn list_pointers(file: &DataFile) -> Vec<RunPointer<'_>> {
-    let run = |path: &Path| match FileName::parse(path)? {
+    let pointer = |name: FileName| match name {
         FileName::Pointer(run) => Some(run),
         _ => None,
     };
     if file.parts.is_empty() {
-        let shown = run(&file.path).filter(|run| !file.hidden.contains(&run.run));
+        let shown = file.name.clone().and_then(pointer).filter(|run| !file.hidden.contains(&run.run));
         let version = file.log_version;
         let row_counts = file.row_counts.as_ref();
         return shown.map(|run| RunPointer { run, version, row_counts }).into_iter().collect();
     }
     let parts = file.visible_parts().map(|(part, _)| part);
     let pointers = parts.filter_map(|part| {
-        let run = run(&part.file_name().into())?;
+        let run = pointer(FileName::parse(&part.file_name().into())?)?;
         let version = part.row_version?;
         Some(RunPointer { run, version, row_counts: part.row_counts.as_ref() })
     });
@@ -53,7 +53,7 @@ impl DataFile {
     /// The runs whose rows the file shows; none for rows that come from the rig.
     pub fn shown_runs(&self) -> Vec<RunId> {
         match self.parts.is_empty() {
-            true => run_of_file(self).into_iter().collect(),
+            true => run_of_file(self).cloned().into_iter().collect(),
             false => self.visible_parts().map(|(part, _)| part.run.clone()).collect(),
         }
     }
@@ -97,7 +97,7 @@ pub(crate) fn decode_parts(text: &str) -> Option<Vec<RunPart>> {
 impl RunPart {
     /// The only part of a file of one run; None if the file has another name.
     pub(crate) fn of_file(file: &DataFile) -> Option<Self> {
-        let is_pointer = matches!(FileName::parse(&file.path), Some(FileName::Pointer(_)));
+        let is_pointer = matches!(file.name, Some(FileName::Pointer(_)));
         let part = Self::from_path(&file.path, file.rows, is_pointer.then_some(file.log_version))?;
         Some(Self { row_counts: file.row_counts.clone(), ..part })
     }

@@ -3,7 +3,8 @@
 //! Delta commits one table at a time, so a run's rows are committed before its `runs` row. The file of that
 //! row carries in its name the derivations that are current; files of other derivations are not seen.
 
-use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
+use std::collections::{BTreeSet, HashMap, HashSet};
+use std::sync::{Arc, OnceLock};
 
 use echolake_schema::tables::{Source, Table};
 use echolake_schema::{ProjectName, RunId, SurfaceId};
@@ -11,20 +12,21 @@ use futures::future::{try_join, try_join_all};
 use object_store::path::Path;
 
 use crate::contributions::ShownVersions;
+use crate::tables::current_runs::{CurrentRun, CurrentRuns, NewestRuns};
 use crate::tables::file_name::{FileName, VisibleRun};
-use crate::tables::run_parts::{RunPointer, list_pointers, run_of_file};
+use crate::tables::run_parts::run_of_file;
 use crate::tables::table_fault::{LackingRows, TableFault};
 use crate::{CommitLog, DataFile, Error, Result, RunRowCounts, TableView};
 
 /// A frozen view of all tables.
 #[derive(Debug, Clone, Default)]
 pub struct LakeSnapshot {
-    files: HashMap<Table, Vec<DataFile>>,
-    runs: BTreeMap<RunId, CurrentRun>,
+    files: HashMap<Table, SeenFiles>,
+    runs: CurrentRuns,
     newest: NewestRuns,
-    hidden: HashMap<Table, Vec<DataFile>>,
-    outgrown: HashMap<Table, Vec<DataFile>>,
-    foreign: HashMap<Table, Vec<DataFile>>,
+    hidden: HashMap<Table, Vec<Arc<DataFile>>>,
+    outgrown: HashMap<Table, Vec<Arc<DataFile>>>,
+    foreign: HashMap<Table, Vec<Arc<DataFile>>>,
     lacking: HashMap<Table, Vec<LackingRows>>,
     faults: HashMap<Table, TableFault>,
     versions: HashMap<Table, u64>,
@@ -34,34 +36,37 @@ pub struct LakeSnapshot {
     is_restricted: bool,
 }
 
-/// A run's row in `runs`, and the version of `runs` that added it.
-#[derive(Debug, Clone)]
-struct CurrentRun {
-    run: VisibleRun,
-    log_version: u64,
-    project: Option<ProjectName>,
-    row_counts: Option<RunRowCounts>,
-}
-
-/// The run that describes each surface: of all its runs, and of those of a project.
+/// The files of a table that readers see.
 #[derive(Debug, Clone, Default)]
-struct NewestRuns {
-    of_surface: HashMap<SurfaceId, RunId>,
-    of_project: HashMap<(SurfaceId, ProjectName), RunId>,
+struct SeenFiles {
+    files: Vec<Arc<DataFile>>,
+    /// The places of the files that show rows of a run, once somebody asks for those of one.
+    of_run: OnceLock<HashMap<RunId, Vec<usize>>>,
 }
 
-impl NewestRuns {
-    /// Of several runs the newest counts that is not rejected as a whole; if all of them are, the newest.
-    fn from_runs<'a>(runs: impl Iterator<Item = &'a CurrentRun>, is_rejected: impl Fn(&VisibleRun) -> bool) -> Self {
-        let mut newest = Self::default();
-        let (rejected, others): (Vec<_>, Vec<_>) = runs.partition(|current| is_rejected(&current.run));
-        for CurrentRun { run, project, .. } in rejected.into_iter().chain(others) {
-            newest.of_surface.insert(run.surface.clone(), run.run.clone());
-            if let Some(project) = project {
-                newest.of_project.insert((run.surface.clone(), project.clone()), run.run.clone());
+impl SeenFiles {
+    fn files_of(&self, run: &RunId) -> impl Iterator<Item = &DataFile> {
+        let places = self.of_run.get_or_init(|| {
+            let mut places = HashMap::<RunId, Vec<usize>>::new();
+            for (place, file) in self.files.iter().enumerate() {
+                for run in file.shown_runs() {
+                    let of_run = places.entry(run).or_default();
+                    // A file of users may have several parts of a run.
+                    if of_run.last() != Some(&place) {
+                        of_run.push(place);
+                    }
+                }
             }
-        }
-        newest
+            places
+        });
+        let places = places.get(run).map_or(&[] as &[usize], Vec::as_slice);
+        places.iter().filter_map(|place| self.files.get(*place)).map(|file| &**file)
+    }
+}
+
+impl From<Vec<Arc<DataFile>>> for SeenFiles {
+    fn from(files: Vec<Arc<DataFile>>) -> Self {
+        Self { files, of_run: OnceLock::new() }
     }
 }
 
@@ -140,9 +145,9 @@ impl LakeSnapshot {
     }
 
     // Without the files of any table.
-    fn from_pointers(pointers: &[DataFile]) -> Self {
-        let runs = current_runs(pointers);
-        Self { newest: NewestRuns::from_runs(runs.values(), VisibleRun::is_rejected), runs, ..Self::default() }
+    fn from_pointers(pointers: &[Arc<DataFile>]) -> Self {
+        let runs = CurrentRuns::from_files(pointers);
+        Self { newest: NewestRuns::from_runs(runs.iter(), VisibleRun::is_rejected), runs, ..Self::default() }
     }
 
     fn take_view(&mut self, table: Table, view: TableView) {
@@ -161,7 +166,7 @@ impl LakeSnapshot {
     }
 
     /// The view of one table that a version of `runs` gives, its files as the log had them then.
-    pub(crate) fn from_table_files(pointers: &[DataFile], table: Table, files: Vec<DataFile>) -> Self {
+    pub(crate) fn from_table_files(pointers: &[Arc<DataFile>], table: Table, files: Vec<Arc<DataFile>>) -> Self {
         let mut snapshot = Self::from_pointers(pointers);
         snapshot.sort_in(table, files);
         snapshot
@@ -212,7 +217,7 @@ impl LakeSnapshot {
     }
 
     /// The files of a table that another program put into its log; empty for readers of some projects.
-    pub fn foreign_files(&self, table: Table) -> &[DataFile] {
+    pub fn foreign_files(&self, table: Table) -> &[Arc<DataFile>] {
         self.foreign.get(&table).map_or(&[], Vec::as_slice)
     }
 
@@ -243,7 +248,7 @@ impl LakeSnapshot {
     pub fn lake_version(&self) -> Option<u64> {
         match self.is_restricted {
             false => self.log_version(Table::Runs),
-            true => self.runs.values().map(|current| current.log_version).max(),
+            true => self.runs.iter().map(|current| current.log_version).max(),
         }
     }
 
@@ -269,30 +274,31 @@ impl LakeSnapshot {
     }
 
     /// The files of a table that readers see.
-    pub fn files(&self, table: Table) -> &[DataFile] {
-        self.files.get(&table).map_or(&[], Vec::as_slice)
+    pub fn files(&self, table: Table) -> &[Arc<DataFile>] {
+        self.files.get(&table).map_or(&[], |seen| seen.files.as_slice())
     }
 
     /// The files of a table that its readers may have as they are: for readers of some projects, those without hidden
     /// rows.
     pub fn readable_files(&self, table: Table) -> impl Iterator<Item = &DataFile> {
-        self.files(table).iter().filter(|file| !self.is_restricted || file.hidden.is_empty())
+        let readable = self.files(table).iter().filter(|file| !self.is_restricted || file.hidden.is_empty());
+        readable.map(|file| &**file)
     }
 
     /// The files of a table that belong to a run that readers see, but are no longer seen themselves. Excludes files
     /// whose author had seen the run's present row: that ingest may be about to replace it by one that names them.
-    pub fn superseded_files(&self, table: Table) -> &[DataFile] {
+    pub fn superseded_files(&self, table: Table) -> &[Arc<DataFile>] {
         self.hidden.get(&table).map_or(&[], Vec::as_slice)
     }
 
     /// Merged files of a table that readers see in part, and whose other parts are superseded.
-    pub(crate) fn outgrown_files(&self, table: Table) -> &[DataFile] {
+    pub(crate) fn outgrown_files(&self, table: Table) -> &[Arc<DataFile>] {
         self.outgrown.get(&table).map_or(&[], Vec::as_slice)
     }
 
     /// The runs that readers see, by name and so by time.
     pub fn runs(&self) -> impl DoubleEndedIterator<Item = &VisibleRun> {
-        self.runs.values().map(|current| &current.run)
+        self.runs.iter().map(|current| &current.run)
     }
 
     /// One run.
@@ -312,7 +318,7 @@ impl LakeSnapshot {
         is_there: impl Fn(&VisibleRun) -> bool,
         is_rejected: impl Fn(&VisibleRun) -> bool,
     ) -> BTreeSet<RunId> {
-        let there = self.runs.values().filter(|current| is_there(&current.run));
+        let there = self.runs.iter().filter(|current| is_there(&current.run));
         let NewestRuns { of_surface, of_project } = NewestRuns::from_runs(there, is_rejected);
         of_surface.into_values().chain(of_project.into_values()).collect()
     }
@@ -329,31 +335,34 @@ impl LakeSnapshot {
 
     /// The files of one run in a table, and the merged ones that show its rows.
     pub fn files_of<'a>(&'a self, table: Table, run: &'a RunId) -> impl Iterator<Item = &'a DataFile> {
-        self.files(table).iter().filter(move |file| match file.parts.is_empty() {
-            true => run_of_file(file).as_ref() == Some(run),
-            false => file.visible_parts().any(|(part, _)| part.run == *run),
-        })
+        self.files.get(&table).into_iter().flat_map(move |seen| seen.files_of(run))
     }
 
     /// The runs whose rows are in the files of a table that readers see.
     pub(crate) fn shown_runs(&self, table: Table) -> HashSet<RunId> {
-        self.files(table).iter().flat_map(DataFile::shown_runs).collect()
+        self.files(table).iter().flat_map(|file| file.shown_runs()).collect()
     }
 
-    fn sort_in(&mut self, table: Table, files: Vec<DataFile>) {
+    fn sort_in(&mut self, table: Table, files: Vec<Arc<DataFile>>) {
         if table.source() == Source::Users {
             return self.sort_in_users(table, files);
         }
         let (merged, single): (Vec<_>, Vec<_>) = files.into_iter().partition(|f| !f.parts.is_empty());
-        let mut sorted = SortedFiles::default();
+        let mut sorted = SortedFiles::with_runs(self.runs.len());
         for file in single {
             match self.file_place(table, &file) {
                 RowsPlace::Seen => {
-                    sorted.logged.extend(run_of_file(&file).map(|run| (run, file.rows)));
-                    sorted.shown.extend(run_of_file(&file));
+                    if let Some(place) = self.place_of_file(&file) {
+                        sorted.logged[place] = Some(file.rows);
+                        sorted.shown[place] = true;
+                    }
                     sorted.seen.push(file);
                 }
-                RowsPlace::OfProject => sorted.logged.extend(run_of_file(&file).map(|run| (run, file.rows))),
+                RowsPlace::OfProject => {
+                    if let Some(place) = self.place_of_file(&file) {
+                        sorted.logged[place] = Some(file.rows);
+                    }
+                }
                 RowsPlace::Superseded if self.is_superseded(table, &file) => sorted.hidden.push(file),
                 RowsPlace::Foreign => sorted.foreign.push(file),
                 RowsPlace::Superseded | RowsPlace::Unseen => {}
@@ -361,7 +370,7 @@ impl LakeSnapshot {
         }
         merged.into_iter().for_each(|file| self.sort_merged(table, file, &mut sorted));
         sorted.seen.sort_by(|a, b| a.path.cmp(&b.path));
-        let is_without_rig = table.source() == Source::Rig && sorted.seen.is_empty() && !self.runs.is_empty();
+        let is_without_rig = table.source() == Source::Rig && sorted.seen.is_empty() && self.runs.len() > 0;
         let lacking = self.compare_rows(table, &sorted.logged);
         let fault = match (lacking.is_empty(), sorted.foreign.first()) {
             (false, _) => Some(TableFault::from_lacking(table, &lacking)),
@@ -369,43 +378,47 @@ impl LakeSnapshot {
             (true, None) => is_without_rig.then(|| TableFault::without_rig(table)),
         };
         fault.into_iter().for_each(|fault| self.set_fault(fault));
-        self.files.insert(table, sorted.seen);
+        self.files.insert(table, sorted.seen.into());
         self.hidden.insert(table, sorted.hidden);
         self.outgrown.insert(table, sorted.outgrown);
         self.foreign.insert(table, sorted.foreign);
         self.lacking.insert(table, lacking);
     }
 
+    fn place_of_file(&self, file: &DataFile) -> Option<usize> {
+        self.runs.place_of(run_of_file(file)?)
+    }
+
     // Rows of users are seen with their run, predictions with any run of their surface: those of removed runs stay.
-    fn sort_in_users(&mut self, table: Table, files: Vec<DataFile>) {
+    fn sort_in_users(&mut self, table: Table, files: Vec<Arc<DataFile>>) {
         let (mut seen, foreign): (Vec<_>, Vec<_>) = files.into_iter().partition(|file| !file.parts.is_empty());
         for file in &mut seen {
             let is_seen = |surface: &SurfaceId, run: &RunId| match table {
                 Table::Predictions => self.newest.of_surface.contains_key(surface),
-                _ => self.runs.contains_key(run),
+                _ => self.runs.get(run).is_some(),
             };
             let unseen = file.parts.iter().filter(|part| !is_seen(&part.surface, &part.run));
-            let unseen: Vec<_> = unseen.map(|part| part.run.clone()).collect();
-            file.hidden.extend(unseen);
-            file.hidden.sort();
-            file.hidden.dedup();
+            let unseen = unseen.map(|part| part.run.clone());
+            let mut hidden: Vec<_> = file.hidden.iter().cloned().chain(unseen).collect();
+            hidden.sort();
+            hidden.dedup();
+            DataFile::hide_runs(file, hidden);
         }
         seen.retain(|file| file.visible_parts().next().is_some());
         foreign.first().into_iter().for_each(|file| self.set_fault(TableFault::from_foreign(table, file)));
-        self.files.insert(table, seen);
+        self.files.insert(table, seen.into());
         self.foreign.insert(table, foreign);
     }
 
     // What each run's row says that the table has of it, against what its log has.
-    fn compare_rows(&self, table: Table, logged: &HashMap<RunId, u64>) -> Vec<LackingRows> {
-        let named = self.runs.values().filter(|current| match table.source() {
+    fn compare_rows(&self, table: Table, logged: &[Option<u64>]) -> Vec<LackingRows> {
+        let named = self.runs.iter().zip(logged).filter(|(current, _)| match table.source() {
             Source::Rig | Source::Pointer | Source::Users => false,
             Source::Run => true,
             Source::References => current.run.reference_derivation.is_some(),
         });
-        let needed = named.filter(|current| self.run_place(table, current) != RowsPlace::Superseded);
-        let compared = needed.filter_map(|current| {
-            let actual = logged.get(&current.run.run).copied();
+        let needed = named.filter(|(current, _)| self.run_place(table, current) != RowsPlace::Superseded);
+        let compared = needed.filter_map(|(current, actual)| {
             let expected = current.row_counts.as_ref().and_then(|counts| counts.rows_of(table));
             let is_whole = match (expected, &current.row_counts) {
                 (Some(expected), _) => actual.unwrap_or(0) == expected,
@@ -421,26 +434,28 @@ impl LakeSnapshot {
 
     // What is merged was seen before. An ingest that did not know of the merge may have added the same rows again: its
     // file is the one that counts, because it tells what its author saw.
-    fn sort_merged(&self, table: Table, mut file: DataFile, sorted: &mut SortedFiles) {
+    fn sort_merged(&self, table: Table, mut file: Arc<DataFile>, sorted: &mut SortedFiles) {
         let mut superseded = Vec::new();
-        file.hidden.clear();
+        let mut hidden = Vec::new();
         for part in &file.parts {
             let place = self.rows_place(table, &part.run, &part.derivation);
-            if matches!(place, RowsPlace::Seen | RowsPlace::OfProject) {
-                sorted.logged.entry(part.run.clone()).or_insert(part.rows);
+            if let (RowsPlace::Seen | RowsPlace::OfProject, Some(run)) = (place, self.runs.place_of(&part.run)) {
+                sorted.logged[run].get_or_insert(part.rows);
+                if place == RowsPlace::Seen && !std::mem::replace(&mut sorted.shown[run], true) {
+                    continue;
+                }
             }
-            match place {
-                RowsPlace::Seen if sorted.shown.insert(part.run.clone()) => continue,
-                RowsPlace::Seen | RowsPlace::Superseded => superseded.push(part.run.clone()),
-                RowsPlace::OfProject | RowsPlace::Unseen | RowsPlace::Foreign => {}
+            if matches!(place, RowsPlace::Seen | RowsPlace::Superseded) {
+                superseded.push(part.run.clone());
             }
-            file.hidden.push(part.run.clone());
+            hidden.push(part.run.clone());
         }
+        DataFile::hide_runs(&mut file, hidden);
         if superseded.len() == file.parts.len() {
             sorted.hidden.push(file);
         } else {
             if !superseded.is_empty() {
-                sorted.outgrown.push(DataFile { hidden: superseded, ..file.clone() });
+                sorted.outgrown.push(Arc::new(DataFile { hidden: superseded, ..DataFile::clone(&file) }));
             }
             if file.hidden.len() < file.parts.len() {
                 sorted.seen.push(file);
@@ -449,11 +464,11 @@ impl LakeSnapshot {
     }
 
     fn file_place(&self, table: Table, file: &DataFile) -> RowsPlace {
-        match FileName::parse(&file.path) {
+        match &file.name {
             Some(FileName::Rig { .. }) if table.source() == Source::Rig => RowsPlace::Seen,
-            Some(FileName::Pointer(pointer)) if self.run(&pointer.run) == Some(&pointer) => RowsPlace::Seen,
+            Some(FileName::Pointer(pointer)) if self.run(&pointer.run) == Some(pointer) => RowsPlace::Seen,
             Some(FileName::Pointer(_)) => RowsPlace::Superseded,
-            Some(FileName::Rows { run, derivation, .. }) => self.rows_place(table, &run, &derivation),
+            Some(FileName::Rows { run, derivation, .. }) => self.rows_place(table, run, derivation),
             Some(FileName::Rig { .. } | FileName::Merged { .. }) => RowsPlace::Unseen,
             None => RowsPlace::Foreign,
         }
@@ -485,13 +500,13 @@ impl LakeSnapshot {
     // the log has it now. Rows that are named and describe no surface: an author that had seen the row of the run that
     // does describe it is about to remove or to reject that one. No clock is asked.
     fn is_superseded(&self, table: Table, file: &DataFile) -> bool {
-        let Some(FileName::Rows { run, derivation, .. }) = FileName::parse(&file.path) else {
-            let current = run_of_file(file).and_then(|run| self.runs.get(&run));
+        let Some(FileName::Rows { run, derivation, .. }) = &file.name else {
+            let current = run_of_file(file).and_then(|run| self.runs.get(run));
             return current.is_some_and(|current| file.seen_runs < current.log_version);
         };
-        let Some(current) = self.runs.get(&run) else { return false };
+        let Some(current) = self.runs.get(run) else { return false };
         let describing = self.newest.of_surface.get(&current.run.surface).and_then(|run| self.runs.get(run));
-        let other = describing.filter(|_| is_named(table, &current.run, &derivation));
+        let other = describing.filter(|_| is_named(table, &current.run, derivation));
         file.seen_runs < other.map_or(0, |other| other.log_version).max(current.log_version)
     }
 
@@ -532,28 +547,20 @@ enum RowsPlace {
 /// A table's files on their way into a snapshot.
 #[derive(Default)]
 struct SortedFiles {
-    seen: Vec<DataFile>,
-    hidden: Vec<DataFile>,
-    outgrown: Vec<DataFile>,
-    foreign: Vec<DataFile>,
-    /// The runs that a file shows already.
-    shown: HashSet<RunId>,
+    seen: Vec<Arc<DataFile>>,
+    hidden: Vec<Arc<DataFile>>,
+    outgrown: Vec<Arc<DataFile>>,
+    foreign: Vec<Arc<DataFile>>,
+    /// Whether a file shows rows of a run already, for each run.
+    shown: Vec<bool>,
     /// The rows of each run that the table's log has, of the derivation that `runs` names.
-    logged: HashMap<RunId, u64>,
+    logged: Vec<Option<u64>>,
 }
 
-// A row replaces its predecessor, in the same commit unless that one is in a merged file; of two the newer one counts.
-fn current_runs(files: &[DataFile]) -> BTreeMap<RunId, CurrentRun> {
-    let mut rows: Vec<_> =
-        files.iter().flat_map(|file| list_pointers(file).into_iter().map(move |row| (row, file))).collect();
-    rows.sort_by_key(|(row, _)| (row.version, row.run.joined_derivations()));
-    let current = |(row, file): (RunPointer<'_>, &DataFile)| CurrentRun {
-        log_version: row.version,
-        project: file.project(),
-        row_counts: row.row_counts.cloned(),
-        run: row.run,
-    };
-    rows.into_iter().map(current).map(|row| (row.run.run.clone(), row)).collect()
+impl SortedFiles {
+    fn with_runs(runs: usize) -> Self {
+        Self { shown: vec![false; runs], logged: vec![None; runs], ..Self::default() }
+    }
 }
 
 #[cfg(test)]
@@ -563,12 +570,13 @@ mod tests {
     use crate::tables::run_parts::{decode_parts, encode_parts};
 
     /// A file whose number is the version of `runs` that its author had seen; of a run's row, that added it.
-    fn file(table: Table, name: &str, version: u64) -> DataFile {
+    fn file(table: Table, name: &str, version: u64) -> Arc<DataFile> {
         let path = table_folder(table).join(name);
         let log_version = if table == Table::Runs { version } else { 0 };
         let seen_runs = version - log_version.min(1);
         let (stats, parts, hidden, row_counts) = (None, Vec::new(), Vec::new(), None);
-        DataFile { path, bytes: 1, rows: 1, log_version, seen_runs, stats, parts, hidden, row_counts }
+        let name = FileName::parse(&path);
+        Arc::new(DataFile { path, name, bytes: 1, rows: 1, log_version, seen_runs, stats, parts, hidden, row_counts })
     }
 
     fn view(files: &[(Table, &str, u64)]) -> LakeSnapshot {
@@ -578,7 +586,7 @@ mod tests {
         snapshot
     }
 
-    fn names(files: &[DataFile]) -> Vec<&str> {
+    fn names(files: &[Arc<DataFile>]) -> Vec<&str> {
         files.iter().filter_map(|f| f.path.filename()).collect()
     }
 
@@ -625,10 +633,10 @@ mod tests {
         assert_eq!(twice.files(Table::Measurements).len(), 2);
     }
 
-    fn counting(file: DataFile, counts: &[(Table, u64)]) -> DataFile {
+    fn counting(file: Arc<DataFile>, counts: &[(Table, u64)]) -> Arc<DataFile> {
         let mut rows = RunRowCounts::default();
         counts.iter().for_each(|(table, count)| rows.set_rows(*table, *count));
-        DataFile { row_counts: Some(rows), ..file }
+        Arc::new(DataFile { row_counts: Some(rows), ..DataFile::clone(&file) })
     }
 
     fn lacking(snapshot: &LakeSnapshot, table: Table) -> Vec<(String, Option<u64>, u64)> {
@@ -641,12 +649,14 @@ mod tests {
         let row = counting(file(Table::Runs, "flat.r1.ab.cd.parquet", 5), &[(Table::Nce, 4), (Table::Events, 0)]);
         let older = file(Table::Runs, "wood.r2.ab.none.parquet", 5);
         let of = |table, files| LakeSnapshot::from_table_files(&[row.clone(), older.clone()], table, files);
-        let four = DataFile { rows: 4, ..file(Table::Nce, "flat.r1.cd.parquet", 5) };
+        let with_rows =
+            |rows| Arc::new(DataFile { rows, ..DataFile::clone(&file(Table::Nce, "flat.r1.cd.parquet", 5)) });
+        let four = with_rows(4);
         assert!(
             of(Table::Nce, vec![four.clone()]).check_table(Table::Nce).is_ok(),
             "the older run waits for references"
         );
-        let three = of(Table::Nce, vec![DataFile { rows: 3, ..four.clone() }]);
+        let three = of(Table::Nce, vec![with_rows(3)]);
         assert_eq!(lacking(&three, Table::Nce), [("r1".to_owned(), Some(4), 3)]);
         let error = three.check_table(Table::Nce).expect_err("refused").to_string();
         assert!(error.contains("`nce`") && error.contains("run `r1` has 3 rows, expected 4"), "{error}");
@@ -711,11 +721,12 @@ mod tests {
         assert!(seen.check_table(Table::Measurements).is_ok() && seen.foreign_files(Table::Measurements).is_empty());
     }
 
-    fn merged(table: Table, parts: &[(&str, u64)]) -> DataFile {
+    fn merged(table: Table, parts: &[(&str, u64)]) -> Arc<DataFile> {
         let text = serde_json::to_string(parts).expect("text");
         let parts = decode_parts(&text).expect("parts");
         assert_eq!(encode_parts(&parts), text);
-        DataFile { rows: parts.iter().map(|p| p.rows).sum(), parts, ..file(table, "merged.aa.parquet", 0) }
+        let file = DataFile::clone(&file(table, "merged.aa.parquet", 0));
+        Arc::new(DataFile { rows: parts.iter().map(|p| p.rows).sum(), parts, ..file })
     }
 
     #[test]
@@ -736,12 +747,19 @@ mod tests {
         let both = runs("ef");
         assert_eq!(names(both.files(Table::Nce)), ["flat.r1.cd.parquet", "merged.aa.parquet"]);
         let partly = &both.files(Table::Nce)[1];
-        assert_eq!((partly.visible_rows(), &partly.hidden), (3, &vec![r1]), "the same rows once more");
+        assert_eq!((partly.visible_rows(), &partly.hidden), (3, &vec![r1.clone()]), "the same rows once more");
         let visible: Vec<_> = partly.visible_parts().map(|(part, rows)| (part.run.clone(), rows)).collect();
         assert_eq!(visible, [(r2.clone(), 4..7)]);
         assert!(both.superseded_files(Table::Nce).is_empty());
         assert_eq!(names(both.outgrown_files(Table::Nce)), ["merged.aa.parquet"]);
         assert_eq!(both.files_of(Table::Nce, &r2).count(), 1);
+
+        let count_of =
+            |run: &RunId| both.files(Table::Nce).iter().filter(|file| file.shown_runs().contains(run)).count();
+        for run in [&r1, &r2, &run("r3")] {
+            assert_eq!(both.files_of(Table::Nce, run).count(), count_of(run), "{run}");
+        }
+        assert_eq!(both.files_of(Table::Tnce, &r1).count(), 0);
 
         let replaced = runs("gh");
         assert_eq!(names(replaced.files(Table::Nce)), ["flat.r1.cd.parquet", "wood.r2.gh.parquet"]);

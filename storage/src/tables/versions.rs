@@ -7,6 +7,7 @@
 
 use std::collections::HashSet;
 use std::str::FromStr;
+use std::sync::Arc;
 
 use chrono::{DateTime, NaiveDate, NaiveDateTime, SecondsFormat, Utc};
 use echolake_schema::tables::{Source, Table};
@@ -136,7 +137,7 @@ impl Lake {
         let snapshot = LakeSnapshot::from_table_files(&pointers, table, files);
         let shown = snapshot.shown_runs(table);
         // Another file may have the same rows.
-        let is_missing = |file: &&DataFile| {
+        let is_missing = |file: &&Arc<DataFile>| {
             let runs = file.shown_runs();
             !there.contains(&file.path) && (runs.is_empty() || runs.iter().any(|run| !shown.contains(run)))
         };
@@ -178,7 +179,7 @@ impl Lake {
 }
 
 // Returns whether these files have the rows of all runs.
-fn shows_all(pointers: &[DataFile], table: Table, files: &[DataFile]) -> bool {
+fn shows_all(pointers: &[Arc<DataFile>], table: Table, files: &[Arc<DataFile>]) -> bool {
     let snapshot = LakeSnapshot::from_table_files(pointers, table, files.to_vec());
     snapshot.shown_runs(table).len() == snapshot.runs().count()
 }

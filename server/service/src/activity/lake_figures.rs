@@ -41,7 +41,7 @@ impl LakeFigures {
         let bytes = |table: Table| snapshot.files(table).iter().map(|file| file.bytes).sum::<u64>();
         Ok(Self {
             version: snapshot.log_version(Table::Runs).unwrap_or(0),
-            surfaces: snapshot.files(Table::Surfaces).iter().map(echolake_lake::DataFile::visible_rows).sum(),
+            surfaces: snapshot.files(Table::Surfaces).iter().map(|file| file.visible_rows()).sum(),
             runs: snapshot.runs().count() as u64,
             damaged_runs,
             table_bytes: Table::ALL.into_iter().map(bytes).sum(),

@@ -2,6 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use std::ops::Range;
+use std::sync::Arc;
 
 use async_trait::async_trait;
 use chrono::{DateTime, Utc};
@@ -13,12 +14,15 @@ use serde_json::{Map, Value};
 
 use crate::Result;
 use crate::contributions::ShownVersions;
+use crate::tables::file_name::FileName;
 
-/// A Parquet file of a table.
+/// A Parquet file of a table. Its entry in the log is decoded once, and shared by all snapshots that have it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DataFile {
     /// Path in the lake.
     pub path: Path,
+    /// Its name, parsed; None if another program gave it.
+    pub name: Option<FileName>,
     /// Size.
     pub bytes: u64,
     /// Rows.
@@ -75,6 +79,13 @@ pub struct RunPart {
 }
 
 impl DataFile {
+    /// Makes it the file whose parts of these runs are hidden, and of no others.
+    pub(crate) fn hide_runs(file: &mut Arc<Self>, hidden: Vec<RunId>) {
+        if file.hidden != hidden {
+            Arc::make_mut(file).hidden = hidden;
+        }
+    }
+
     /// The file as its log's present version has it.
     pub fn logged_file(&self) -> LoggedFile {
         LoggedFile { name: self.path.filename().unwrap_or_default().to_owned(), log_version: self.log_version }
@@ -130,7 +141,7 @@ pub struct TableView {
     /// The id that the table was given when it was made.
     pub id: String,
     /// Its files, by path.
-    pub files: Vec<DataFile>,
+    pub files: Vec<Arc<DataFile>>,
     /// Of `runs`: what the version shows of the tables of users.
     pub shown: ShownVersions,
     /// Of a table of users: the highest number of an object of the lake's earlier form that is in it.
@@ -280,7 +291,7 @@ pub trait CommitLog: Send + Sync + std::fmt::Debug {
     /// The table as of now; None if there is no table.
     async fn view_table(&self, table: Table) -> Result<Option<TableView>>;
     /// The table's files as of now; none if there is no table.
-    async fn list_files(&self, table: Table) -> Result<Vec<DataFile>> {
+    async fn list_files(&self, table: Table) -> Result<Vec<Arc<DataFile>>> {
         Ok(self.view_table(table).await?.unwrap_or_default().files)
     }
     /// The version that an earlier look found, without a look; None if there was none.
@@ -304,11 +315,11 @@ pub trait CommitLog: Send + Sync + std::fmt::Debug {
     /// The table as of a version that the log still holds, or its newest if that is older; None if there is no table.
     async fn view_at(&self, table: Table, version: u64) -> Result<Option<TableView>>;
     /// The table's files as of a version that the log still holds.
-    async fn files_at(&self, table: Table, version: u64) -> Result<Vec<DataFile>> {
+    async fn files_at(&self, table: Table, version: u64) -> Result<Vec<Arc<DataFile>>> {
         Ok(self.view_at(table, version).await?.unwrap_or_default().files)
     }
     /// The files of all versions that the log still holds; none if there is no table.
-    async fn files_of_all_versions(&self, table: Table) -> Result<Vec<DataFile>>;
+    async fn files_of_all_versions(&self, table: Table) -> Result<Vec<Arc<DataFile>>>;
     /// Returns whether a file of this name is in the log.
     async fn has_file(&self, table: Table, name: &str) -> Result<bool>;
     /// Names of the current and the removed files; None if there is no log.
@@ -338,6 +349,7 @@ mod tests {
         };
         let mut file = DataFile {
             path: "tables/nce/merged.x.parquet".into(),
+            name: Some(FileName::Merged { digest: "x".to_owned() }),
             bytes: 1,
             rows: 15,
             log_version: 1,

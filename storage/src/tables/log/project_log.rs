@@ -39,14 +39,16 @@ impl ProjectLog {
 
     // Files of the other tables are seen if a run's row names them. Predictions are of a surface, whose name other
     // projects may use, too.
-    fn keep_visible(&self, table: Table, files: &mut Vec<DataFile>) {
+    fn keep_visible(&self, table: Table, files: &mut Vec<Arc<DataFile>>) {
         files.retain_mut(|file| match table {
             Table::Runs => {
-                file.hidden = self.hidden_runs(file);
+                let hidden = self.hidden_runs(file);
+                DataFile::hide_runs(file, hidden);
                 !list_pointers(file).is_empty()
             }
             Table::Predictions => {
-                file.hidden = self.hidden_runs(file);
+                let hidden = self.hidden_runs(file);
+                DataFile::hide_runs(file, hidden);
                 file.visible_parts().next().is_some()
             }
             _ => true,
@@ -99,7 +101,8 @@ impl CommitLog for ProjectLog {
 
     // Up to the one that added the newest row that is seen: how many came after it is a matter of other projects.
     async fn list_versions(&self, table: Table) -> Result<Vec<TableVersion>> {
-        let newest = self.list_files(Table::Runs).await?.iter().flat_map(list_pointers).map(|row| row.version).max();
+        let files = self.list_files(Table::Runs).await?;
+        let newest = files.iter().flat_map(|file| list_pointers(file)).map(|row| row.version).max();
         let mut versions = self.log.list_versions(table).await?;
         if table == Table::Runs {
             versions.retain(|version| newest.is_some_and(|newest| version.version <= newest));
@@ -135,7 +138,7 @@ impl CommitLog for ProjectLog {
         Ok(view)
     }
 
-    async fn files_of_all_versions(&self, table: Table) -> Result<Vec<DataFile>> {
+    async fn files_of_all_versions(&self, table: Table) -> Result<Vec<Arc<DataFile>>> {
         let mut files = self.log.files_of_all_versions(table).await?;
         self.keep_visible(table, &mut files);
         Ok(files)

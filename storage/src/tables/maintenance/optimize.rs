@@ -6,6 +6,7 @@
 //! that whoever may see one project has whole files of it; surfaces are merged with those of the same references alone,
 //! whose names ingest takes from the files' statistics.
 
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use echolake_schema::ProjectName;
@@ -143,7 +144,8 @@ impl Lake {
         removal: Option<RemovalRecord>,
     ) -> Result<CommitOutcome> {
         let change = TableCommit { removal, ..TableCommit::default() };
-        let (outcome, _) = self.merge_files(table, std::slice::from_ref(file), change, None).await?;
+        let file = Arc::new(file.clone());
+        let (outcome, _) = self.merge_files(table, std::slice::from_ref(&file), change, None).await?;
         Ok(outcome)
     }
 
@@ -151,11 +153,11 @@ impl Lake {
     async fn merge_files(
         &self,
         table: Table,
-        files: &[DataFile],
+        files: &[Arc<DataFile>],
         change: TableCommit,
         mut lease: Option<&mut MaintenanceLease>,
     ) -> Result<(CommitOutcome, u64)> {
-        let mut slices: Vec<_> = files.iter().flat_map(run_slices).collect();
+        let mut slices: Vec<_> = files.iter().flat_map(|file| run_slices(file)).collect();
         slices.sort_by(|a, b| part_key(&a.part).cmp(&part_key(&b.part)));
         let mut encoder = FileEncoder::new(table, table.schema(self.rig()));
         for slice in &slices {
@@ -175,7 +177,7 @@ impl Lake {
         }
         let parts: Vec<_> = slices.into_iter().map(|s| s.part).collect();
         let mut staged = self.stage_file(table, &merged_name(&parts), encoder.finish()?).await?;
-        let replaced = files.iter().map(DataFile::logged_file).collect();
+        let replaced = files.iter().map(|file| file.logged_file()).collect();
         staged.file.replaces = Some(ReplacedFiles { prefix: None, files: replaced });
         staged.file.parts = parts;
         if let Some(lease) = lease {
@@ -271,11 +273,11 @@ fn plan_merges(
     readers: &FileReaders<'_>,
     table: Table,
     target_bytes: u64,
-) -> Vec<Vec<DataFile>> {
+) -> Vec<Vec<Arc<DataFile>>> {
     if table.source() == Source::Rig {
         return Vec::new();
     }
-    let is_small = |f: &&DataFile| f.bytes < target_bytes / 2 && f.hidden.is_empty();
+    let is_small = |f: &&Arc<DataFile>| f.bytes < target_bytes / 2 && f.hidden.is_empty();
     let first = |f: &DataFile| run_slices(f).first().map(|s| (s.part.surface.clone(), s.part.run.clone()));
     let mut small: Vec<_> = snapshot.files(table).iter().filter(is_small).cloned().collect();
     let place = |file: &DataFile| (readers.audience_of(table, file), surface_references(table, file));

@@ -96,7 +96,7 @@ impl Lake {
         if table == Table::Runs {
             self.delta_log().set_rebuilding(true).await?;
         }
-        let remove = view.files.iter().map(DataFile::logged_file).collect();
+        let remove = view.files.iter().map(|file| file.logged_file()).collect();
         self.commit_log().commit_change(table, &TableCommit { remove, ..TableCommit::default() }).await.map(drop)
     }
 

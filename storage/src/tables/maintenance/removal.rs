@@ -51,7 +51,9 @@ impl Lake {
             for file in files {
                 match parts_of(&file, &removal.runs) {
                     of if of.is_empty() => {}
-                    of if of.len() < file.parts.len() => shared.push(DataFile { hidden: of, ..file }),
+                    of if of.len() < file.parts.len() => {
+                        shared.push(DataFile { hidden: of, ..DataFile::clone(&file) });
+                    }
                     _ => whole.push(file.logged_file()),
                 }
             }
@@ -81,7 +83,7 @@ fn is_of_runs(table: Table) -> bool {
 // The runs among these whose rows a file has.
 fn parts_of(file: &DataFile, runs: &BTreeSet<RunId>) -> Vec<RunId> {
     let of: Vec<_> = match file.parts.is_empty() {
-        true => run_of_file(file).into_iter().collect(),
+        true => run_of_file(file).cloned().into_iter().collect(),
         false => file.parts.iter().map(|part| part.run.clone()).collect(),
     };
     of.into_iter().filter(|run| runs.contains(run)).collect()

@@ -123,7 +123,7 @@ const VERDICT: &str = "verdict";
 fn snapshot_version(snapshot: &LakeSnapshot) -> String {
     let of_runs = Table::ALL.into_iter().filter(|table| table.source() != Source::Users);
     let files = of_runs.flat_map(|table| snapshot.files(table));
-    let has_verdicts = |file: &&DataFile| {
+    let has_verdicts = |file: &&Arc<DataFile>| {
         let greatest = file.stats.as_ref().and_then(|stats| stats.max.get("kind")?.as_str());
         greatest.is_none_or(|kind| kind == VERDICT)
     };
@@ -134,7 +134,7 @@ fn users_version(snapshot: &LakeSnapshot) -> String {
     files_version(Table::OF_USERS.into_iter().flat_map(|table| snapshot.files(table)), snapshot)
 }
 
-fn files_version<'a>(files: impl Iterator<Item = &'a DataFile>, snapshot: &LakeSnapshot) -> String {
+fn files_version<'a>(files: impl Iterator<Item = &'a Arc<DataFile>>, snapshot: &LakeSnapshot) -> String {
     let mut digest = Sha256::new();
     digest.update(env!("CARGO_PKG_VERSION"));
     for file in files {

@@ -26,12 +26,12 @@ use uuid::Uuid;
 
 use self::actions::{AddFile, ApplicationTransaction, FileFormat, LogLine, TableMetadata};
 use self::log_folder::{CommitAttempt, LogFolder, own_protocol};
-use self::table_state::{COPIED, ENGINE, TableState, mark_rebuild, objects_application, shown_application};
+use self::table_state::{COPIED, ENGINE, TableFile, TableState, mark_rebuild, objects_application, shown_application};
 use crate::contribution_objects::last_object;
 use crate::error::rebuild_hint;
 use crate::location::LakeLocation;
 use crate::remote::backoff_time;
-use crate::tables::file_name::{is_merged, table_folder};
+use crate::tables::file_name::{FileName, table_folder};
 use crate::tables::run_parts::{decode_parts, encode_parts};
 use crate::{
     CommitEffect, CommitLog, CommitOutcome, DataFile, Error, FileHistory, FileStats, LoggedFile, NewFile,
@@ -368,9 +368,10 @@ impl<'a> PendingChange<'a> {
             (None, CommitEffect::Rows) => ("WRITE", json!({ "mode": "Overwrite" })),
             (None, CommitEffect::Layout) => ("OPTIMIZE", json!({ "targetSize": largest.to_string() })),
         };
-        let removed = state.files.values().filter(|f| self.remove.contains(&file_name(&f.path)));
         let removed =
-            removed.map(|f| LogLine { remove: Some(f.removed_at(now_millis, data_change)), ..LogLine::default() });
+            state.files.values().map(|file| &file.add).filter(|add| self.remove.contains(&file_name(&add.path)));
+        let removed =
+            removed.map(|add| LogLine { remove: Some(add.removed_at(now_millis, data_change)), ..LogLine::default() });
         let added = self.add.iter().map(|f| {
             let add = add_file(f, state.version + 1, now_millis, data_change);
             LogLine { add: Some(add), ..LogLine::default() }
@@ -461,7 +462,7 @@ impl CommitLog for DeltaLog {
         state.map(|state| table_view(table, &state)).transpose()
     }
 
-    async fn files_of_all_versions(&self, table: Table) -> Result<Vec<DataFile>> {
+    async fn files_of_all_versions(&self, table: Table) -> Result<Vec<Arc<DataFile>>> {
         match self.log_folder(table).load_all_versions().await? {
             Some(state) => data_files(table, &state),
             None => Ok(Vec::new()),
@@ -469,7 +470,10 @@ impl CommitLog for DeltaLog {
     }
 
     async fn has_file(&self, table: Table, name: &str) -> Result<bool> {
-        let has = |state: &TableState| state.files.keys().any(|path| decoded_name(path) == name);
+        // Names of ours are spelled in the log as they are.
+        let has = |state: &TableState| {
+            state.files.contains_key(name) || state.files.keys().any(|path| decoded_name(path) == name)
+        };
         if self.known_state(table).await.is_some_and(|state| has(&state)) {
             return Ok(true);
         }
@@ -568,14 +572,16 @@ fn table_view(table: Table, state: &TableState) -> Result<TableView> {
     Ok(TableView { version: state.version, id, files, shown, copied, is_rebuilding })
 }
 
-fn data_files(table: Table, state: &TableState) -> Result<Vec<DataFile>> {
-    let mut files = state.files.values().map(|add| data_file(table, add)).collect::<Result<Vec<_>>>()?;
+fn data_files(table: Table, state: &TableState) -> Result<Vec<Arc<DataFile>>> {
+    let decoded = |file: &Arc<TableFile>| file.decode_once(|add| data_file(table, add));
+    let mut files = state.files.values().map(decoded).collect::<Result<Vec<_>>>()?;
     files.sort_by(|a, b| a.path.cmp(&b.path));
     Ok(files)
 }
 
 fn data_file(table: Table, add: &AddFile) -> Result<DataFile> {
-    let name = file_name(&add.path);
+    let path = table_folder(table).join(file_name(&add.path));
+    let name = FileName::parse(&path);
     let stats = add.stats.as_deref().and_then(|json| serde_json::from_str::<Map<String, Value>>(json).ok());
     let rows = stats.as_ref().and_then(|stats| stats.get("numRecords")?.as_u64());
     Ok(DataFile {
@@ -585,16 +591,20 @@ fn data_file(table: Table, add: &AddFile) -> Result<DataFile> {
         seen_runs: number_tag(add, SEEN_RUNS),
         stats: stats.map(file_stats),
         row_counts: find_tag(add, ROWS).and_then(|text| serde_json::from_str(text).ok()),
-        parts: if is_merged(&name) { parts_of_file(table, add)? } else { Vec::new() },
+        parts: match name {
+            Some(FileName::Merged { .. }) => parts_of_file(table, add)?,
+            _ => Vec::new(),
+        },
         hidden: Vec::new(),
-        path: table_folder(table).join(name),
+        name,
+        path,
     })
 }
 
 fn known_files(state: &TableState) -> HashMap<String, KnownFile> {
     let known =
         |add: &AddFile| KnownFile { log_version: number_tag(add, LOG_VERSION), seen_runs: number_tag(add, SEEN_RUNS) };
-    state.files.iter().map(|(path, add)| (file_name(path), known(add))).collect()
+    state.files.iter().map(|(path, file)| (file_name(path), known(&file.add))).collect()
 }
 
 /// A file's name of its path in the log.
@@ -716,7 +726,38 @@ fn delta_type(data_type: &ArrowType) -> Value {
 
 #[cfg(test)]
 mod tests {
+    use object_store::memory::InMemory;
+
     use super::*;
+
+    /// What the log says of a file is decoded once, whatever versions come after it; a version that is read by itself
+    /// has equal files.
+    #[tokio::test]
+    async fn a_commit_decodes_its_own_files_alone() {
+        let store = Arc::new(InMemory::new());
+        let open = || DeltaLog { store: store.clone(), is_remote: false, rig: Rig::paper(), loaded: Mutex::default() };
+        let (log, reader) = (open(), open());
+        log.create_table(Table::Nce).await.expect("made");
+        let mut seen = Vec::<Arc<DataFile>>::new();
+        // A checkpoint is among these versions.
+        for number in 0..25 {
+            let stats = json!({ "numRecords": number, "minValues": { "pair_id": 1 }, "maxValues": { "pair_id": 7 } });
+            let name = format!("flat.r{number:02}.ab.parquet");
+            let new = NewFile { stats: stats.to_string(), ..file(&name, None) };
+            let commit = TableCommit { add: vec![new], ..TableCommit::default() };
+            log.commit_change(Table::Nce, &commit).await.expect("committed");
+            let view = reader.view_table(Table::Nce).await.expect("read").expect("a table");
+            let kept = seen.iter().filter(|known| view.files.iter().any(|file| Arc::ptr_eq(file, known)));
+            assert_eq!((kept.count(), view.files.len()), (number, number + 1));
+            seen = view.files;
+        }
+        let alone = log.view_at(Table::Nce, 25).await.expect("read").expect("a table").files;
+        assert_eq!(alone, seen);
+        assert!(!Arc::ptr_eq(&alone[3], &seen[3]));
+        assert_eq!((seen[3].rows, &seen[3].name), (3, &FileName::parse(&seen[3].path)));
+        assert!(log.has_file(Table::Nce, "flat.r03.ab.parquet").await.expect("looked"));
+        assert!(!log.has_file(Table::Nce, "flat.r33.ab.parquet").await.expect("looked"));
+    }
 
     fn file(name: &str, replaces: Option<(&str, &[&str])>) -> NewFile {
         let replaces = replaces.map(|(prefix, names)| ReplacedFiles {

@@ -1,13 +1,14 @@
 //! A table's state in its log up to a version: the actions, reconciled.
 
 use std::collections::BTreeMap;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 use echolake_schema::tables::Table;
 use serde_json::Value;
 
 use super::actions::{AddFile, ApplicationTransaction, LogLine, ProtocolVersions, RemoveFile, TableMetadata};
 use crate::contributions::{ShownVersion, ShownVersions};
+use crate::{DataFile, Result};
 
 /// Time for which a checkpoint keeps a removed file's tombstone: Delta's default, a week.
 const TOMBSTONE_MILLIS: i64 = 7 * 24 * 3600 * 1000;
@@ -19,11 +20,33 @@ pub(super) struct TableState {
     pub version: u64,
     pub protocol: Option<ProtocolVersions>,
     pub metadata: Option<TableMetadata>,
-    pub files: BTreeMap<String, Arc<AddFile>>,
+    pub files: BTreeMap<Arc<str>, Arc<TableFile>>,
     pub removed: BTreeMap<String, Arc<RemoveFile>>,
     transactions: BTreeMap<String, ApplicationTransaction>,
     /// Another program has added or removed files since this one last wrote the metadata.
     is_changed_by_others: bool,
+}
+
+/// A file of a table. Later states of the table share it, so that its statistics are decoded once.
+#[derive(Debug)]
+pub(super) struct TableFile {
+    pub add: AddFile,
+    decoded: OnceLock<Arc<DataFile>>,
+}
+
+impl TableFile {
+    fn new(add: AddFile) -> Self {
+        Self { add, decoded: OnceLock::new() }
+    }
+
+    /// Returns the file as readers see it, which `decode` makes of its action unless an earlier call did.
+    pub fn decode_once(&self, decode: impl FnOnce(&AddFile) -> Result<DataFile>) -> Result<Arc<DataFile>> {
+        if let Some(known) = self.decoded.get() {
+            return Ok(known.clone());
+        }
+        let decoded = Arc::new(decode(&self.add)?);
+        Ok(self.decoded.get_or_init(|| decoded).clone())
+    }
 }
 
 /// The setting of a table's metadata that says that it is being made again, or that another program changed its files.
@@ -119,10 +142,10 @@ impl TableState {
     fn apply_line(&mut self, line: LogLine) {
         if let Some(add) = line.add {
             self.removed.remove(&add.path);
-            self.files.insert(add.path.clone(), Arc::new(add));
+            self.files.insert(add.path.as_str().into(), Arc::new(TableFile::new(add)));
         }
         if let Some(remove) = line.remove {
-            self.files.remove(&remove.path);
+            self.files.remove(remove.path.as_str());
             self.removed.insert(remove.path.clone(), Arc::new(remove));
         }
         if let Some(transaction) = line.txn {
@@ -141,8 +164,8 @@ impl TableState {
         }
         let header = [LogLine { protocol: self.protocol.clone(), ..line() }, LogLine { meta_data, ..line() }];
         let transactions = self.transactions.values().map(|txn| LogLine { txn: Some(txn.clone()), ..line() });
-        let added = self.files.values().map(|add| {
-            let add = AddFile { data_change: false, ..add.as_ref().clone() };
+        let added = self.files.values().map(|file| {
+            let add = AddFile { data_change: false, ..file.add.clone() };
             LogLine { add: Some(add), ..line() }
         });
         let kept = self
@@ -226,7 +249,7 @@ mod tests {
         let again = r#"{"add":{"path":"b","partitionValues":{},"size":3,"modificationTime":2,"dataChange":true}}"#;
         state.apply_lines(2, vec![line(again)]);
         let check = |state: &TableState, removed: &[&str]| {
-            assert_eq!(state.files.values().map(|f| (f.path.as_str(), f.size)).collect::<Vec<_>>(), [("b", 3)]);
+            assert_eq!(state.files.values().map(|f| (f.add.path.as_str(), f.add.size)).collect::<Vec<_>>(), [("b", 3)]);
             assert_eq!(state.removed.keys().map(String::as_str).collect::<Vec<_>>(), removed);
             assert_eq!(state.transactions["spark"].version, 7);
             assert!(state.protocol.is_some() && state.metadata.is_some());

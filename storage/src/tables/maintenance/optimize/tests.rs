@@ -102,7 +102,7 @@ async fn put(lake: &Lake, surface: &str, run: &str, derivation: &str, value: usi
 /// The rows that readers see, sorted by surface and run.
 async fn seen(lake: &Lake) -> RecordBatch {
     let snapshot = lake.snapshot().await.expect("a view");
-    let mut slices: Vec<_> = snapshot.files(TABLE).iter().flat_map(run_slices).collect();
+    let mut slices: Vec<_> = snapshot.files(TABLE).iter().flat_map(|file| run_slices(file)).collect();
     slices.sort_by(|a, b| part_key(&a.part).cmp(&part_key(&b.part)));
     let mut batches = Vec::new();
     for slice in slices {
@@ -112,7 +112,7 @@ async fn seen(lake: &Lake) -> RecordBatch {
     concat_batches(&TABLE.schema(lake.rig()), &batches).expect("rows of one schema")
 }
 
-async fn files(lake: &Lake) -> Vec<DataFile> {
+async fn files(lake: &Lake) -> Vec<Arc<DataFile>> {
     lake.commit_log().list_files(TABLE).await.expect("a log")
 }
 
@@ -185,7 +185,7 @@ async fn a_replaced_run_is_left_out_at_once_and_written_out_by_the_clean_up() {
     put(&lake, "flat", "r1", "d2", 77).await;
     let expected = seen(&lake).await;
     assert_eq!(expected.num_rows(), 5 * ROWS);
-    let logged = |files: &[DataFile]| files.iter().map(|f| f.rows).sum::<u64>() as usize;
+    let logged = |files: &[Arc<DataFile>]| files.iter().map(|f| f.rows).sum::<u64>() as usize;
     assert_eq!(logged(&files(&lake).await), 6 * ROWS, "other Delta readers still see the old rows");
     lake.remove_superseded().await.expect("cleaned up");
     assert_eq!(logged(&files(&lake).await), 5 * ROWS);
@@ -294,7 +294,8 @@ fn reader_of(lake: &Lake, projects: &[&str]) -> Lake {
 
 async fn seen_runs(lake: &Lake) -> Vec<String> {
     let snapshot = lake.snapshot().await.expect("a view");
-    let mut rows: Vec<_> = snapshot.files(TABLE).iter().flat_map(run_slices).map(|s| s.part.run.to_string()).collect();
+    let mut rows: Vec<_> =
+        snapshot.files(TABLE).iter().flat_map(|file| run_slices(file)).map(|s| s.part.run.to_string()).collect();
     rows.sort();
     assert_eq!(rows, snapshot.runs().map(|run| run.run.to_string()).collect::<Vec<_>>());
     rows
@@ -360,14 +361,14 @@ async fn rows_of_runs(lake: &Lake) -> Vec<(String, String, u64)> {
     };
     let rows: Vec<_> = snapshot.runs().map(row).collect();
     for table in [Table::Runs, Table::Surfaces, TABLE] {
-        let mut shown: Vec<_> = snapshot.files(table).iter().flat_map(DataFile::shown_runs).collect();
+        let mut shown: Vec<_> = snapshot.files(table).iter().flat_map(|file| file.shown_runs()).collect();
         shown.sort();
         assert_eq!(shown.len(), rows.len(), "{table:?} shows {shown:?}");
     }
     rows
 }
 
-async fn only_merged(lake: &Lake, table: Table) -> DataFile {
+async fn only_merged(lake: &Lake, table: Table) -> Arc<DataFile> {
     let mut merged = lake.commit_log().list_files(table).await.expect("a log");
     merged.retain(|file| !file.parts.is_empty());
     assert_eq!(merged.len(), 1, "{table:?}");
@@ -441,7 +442,7 @@ async fn a_past_version_of_runs_is_seen_once_its_files_are_merged_and_deleted() 
     optimize(&lake).await;
     lake.vacuum(chrono::TimeDelta::zero(), crate::DeletionMode::Real, &mut |_, _| {}).await.expect("deleted");
     let then = lake.snapshot_at(version, Table::Runs).await.expect("held");
-    assert_eq!(then.files(Table::Runs).iter().map(DataFile::visible_rows).sum::<u64>() as usize, 5 * ROWS);
+    assert_eq!(then.files(Table::Runs).iter().map(|file| file.visible_rows()).sum::<u64>() as usize, 5 * ROWS);
     put(&lake, "flat", "r1", "d2", 77).await;
     optimize(&lake).await;
     lake.vacuum(chrono::TimeDelta::zero(), crate::DeletionMode::Real, &mut |_, _| {}).await.expect("deleted");
@@ -459,7 +460,7 @@ async fn a_surface_that_two_projects_measured_is_described_to_both() {
         {
             let snapshot = reader.snapshot().await.expect("a view");
             let files = snapshot.files(Table::Surfaces).iter();
-            let mut shown: Vec<_> = files.flat_map(DataFile::shown_runs).map(|run| run.to_string()).collect();
+            let mut shown: Vec<_> = files.flat_map(|file| file.shown_runs()).map(|run| run.to_string()).collect();
             shown.sort();
             assert_eq!(shown, expected);
         }
