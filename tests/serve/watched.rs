@@ -62,7 +62,7 @@ fn the_lake_and_connections_are_tables_over_postgres_too() {
     assert_eq!(client.query("select origin from system.ingests"), one("simulated"));
     let listed = "select count(*) from pg_class c join pg_namespace n on n.oid = c.relnamespace \
                   where n.nspname = 'system' and not pg_table_is_visible(c.oid) and c.relkind = 'r'";
-    assert_eq!(client.query(listed), one("6"));
+    assert_eq!(client.query(listed), one("7"));
     assert_eq!(
         client.query("select obj_description('system.queries'::regclass, 'pg_class') like 'One row per query%'"),
         one("t")

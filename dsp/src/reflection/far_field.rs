@@ -74,8 +74,8 @@ type PolarResponses = [[Complex<f64>; RECEIVERS]; VIEWS];
 /// the imaginary parts, then the same of each row along y. `[4 x cells]`.
 type PhaseSums = [f64];
 
-/// [`PhaseSums`] at Chebyshev's points of a range, between which a polynomial is through them: sums are smooth functions
-/// of the wave number, and there are fewer points than angles.
+/// [`PhaseSums`] at Chebyshev's points of a range, between which a polynomial is through them: sums are smooth
+/// functions of the wave number, and there are fewer points than angles.
 struct PhaseTable {
     uprights: Vec<f64>,
     /// `[points, up to a multiple of BLOCK][4 x cells]`.
@@ -242,8 +242,8 @@ impl LinePhases {
         Self { re, im, step: Complex::cis(turn * pitch_mm) }
     }
 
-    // Sums of phases along the line times these, and of differences of the former, over two cells, times these; then the
-    // same with the wave from the other side.
+    // Sums of phases along the line times these, and of differences of the former, over two cells, times these; then
+    // the same with the wave from the other side.
     fn transform_sums(&self, sums: &[f64]) -> [(Complex<f64>, Complex<f64>); 2] {
         let (re, im) = sums.split_at(self.re.len());
         let [rr, ii] = [f64::dot_product(re, &self.re), f64::dot_product(im, &self.im)];
@@ -265,8 +265,8 @@ impl LinePhases {
 }
 
 impl PhaseTable {
-    // The polynomial's coefficients are Bessel functions of half the range times the height, and vanish beyond it: those
-    // of 1.4 times as high an order and 10 more are below 1e-8.
+    // The polynomial's coefficients are Bessel functions of half the range times the height, and vanish beyond it:
+    // those of 1.4 times as high an order and 10 more are below 1e-8.
     fn new(heights: &CellHeights, [low, high]: [f64; 2]) -> Self {
         let middle = (low + high) / 2.0;
         let half = (high - low) / 2.0;
