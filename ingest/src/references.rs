@@ -61,7 +61,7 @@ pub(crate) struct LoadedReferences {
     correction: AirCorrection<f32>,
 }
 
-/// What all responses of a pair are derived with.
+/// Values with which all responses of a pair are derived.
 pub(crate) struct ReferencePair {
     pub paths: PairPaths,
     pub direct: TransformedResponse<f32>,

@@ -31,7 +31,7 @@ pub(crate) struct RunDerivation<'a> {
     /// Greatest coordinate of the grid along a side of the panel.
     widest_mm: f64,
     columns: DerivedColumns,
-    /// Whether the run's statistics count each pair of the columns.
+    /// True for each pair of the columns that the run's statistics count.
     counted: Vec<bool>,
     curves: Vec<SignalMean>,
     scattering: ScatteringSums,

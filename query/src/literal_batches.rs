@@ -1,8 +1,8 @@
 //! Batches of fewer rows for queries with large constants.
 //!
-//! An operator that needs a constant as a column repeats it for each row of a batch. A text of 1 MB, written out or made
-//! by `repeat` while the query was planned, is 8 GB in a batch of 8192 rows, which no memory pool counts before it is
-//! there.
+//! An operator that needs a constant as a column repeats it for each row of a batch. A text of 1 MB, written out or
+//! made by `repeat` while the query was planned, is 8 GB in a batch of 8192 rows, which no memory pool counts before it
+//! is there.
 
 use datafusion::common::tree_node::{TreeNode as _, TreeNodeRecursion};
 use datafusion::error::Result;

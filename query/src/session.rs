@@ -2,6 +2,7 @@
 
 mod answer;
 
+use std::borrow::Cow;
 use std::collections::HashSet;
 use std::sync::Arc;
 
@@ -138,7 +139,8 @@ impl Session {
         self
     }
 
-    // The tables of the schema `system` that are not the lake's; none without workers and a program around that has some.
+    // The tables of the schema `system` that are not the lake's; none without workers and a program around that has
+    // some.
     fn source_tables(&self) -> Vec<(&'static str, Arc<dyn TableProvider>)> {
         system::engine_tables(self.system.as_ref(), self.engine.cluster())
     }
@@ -401,7 +403,7 @@ impl Session {
         let planned = async move {
             set_planning(true);
             let planned = async {
-                let optimized = if is_optimized { plan.clone() } else { state.optimize(&plan)? };
+                let optimized = if is_optimized { Cow::Borrowed(&plan) } else { Cow::Owned(state.optimize(&plan)?) };
                 let state = limit_batch_rows(state, &optimized)?;
                 let physical = state.query_planner().create_physical_plan(&optimized, &*state).await?;
                 let context = session.task_context(&state, &of_query);

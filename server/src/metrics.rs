@@ -136,7 +136,7 @@ impl ServerMetrics {
         self.cache_bytes.inc_by(fetched_bytes);
     }
 
-    /// Takes what an engine has spread over workers, and what it was told by them.
+    /// Takes what an engine has spread over workers, and what they reported.
     pub fn set_workers(&self, counts: &SpreadCounts, workers: &[WorkerState]) {
         self.workers.count_spread(counts);
         self.workers.set_workers(workers);

@@ -1,5 +1,5 @@
-//! A worker: the stages of heavy queries that the engines of other servers send it, over gRPC. It is an engine of its own
-//! with a port, which the system confines to the lake's files as it does with engines.
+//! A worker: the stages of heavy queries that the engines of other servers send it, over gRPC. It is an engine of its
+//! own with a port, which the system confines to the lake's files as it does with engines.
 
 use std::convert::Infallible;
 use std::fs::File;

@@ -194,7 +194,8 @@ impl ListenAddress {
 const HTTP: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 8080);
 
 impl ServeArgs {
-    /// Gives up what a worker does not need; a server's engines do so themselves. To be called before there are threads.
+    /// Gives up what a worker does not need; a server's engines do so themselves. To be called before there are
+    /// threads.
     pub fn confine_process(&self, lake_url: &str) -> anyhow::Result<()> {
         match self.workers.worker_address() {
             Some(_) => self.workers.confine_worker(lake_url, &self.queries.cache, self.certificate_files().as_ref()),

@@ -1,5 +1,5 @@
-//! Heavy queries over workers, as processes of their own: answers, refusals, and workers that are killed. Short form of the
-//! campaign `workers`.
+//! Heavy queries over workers, as processes of their own: answers, refusals, and workers that are killed. Short form of
+//! the campaign `workers`.
 
 #[allow(dead_code, reason = "the campaign, of which this wants a part")]
 #[path = "../../stress/src/workers.rs"]

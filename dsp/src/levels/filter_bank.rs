@@ -59,7 +59,7 @@ pub struct FilterBankPlan<T: RealSample> {
     inverse: Arc<dyn Fft<T>>,
 }
 
-/// What a band takes of the power of a spectrum.
+/// Weights by which a band takes the power of a spectrum.
 struct BandWeights {
     /// Bins in which it has a gain, up to half of the rate.
     bins: Range<usize>,

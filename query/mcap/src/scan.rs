@@ -116,12 +116,12 @@ pub struct ScanPiece {
 
 impl ScanPiece {
     /// Returns the offset of its first byte in its file.
-    pub fn start(&self) -> u64 {
+    pub fn start_offset(&self) -> u64 {
         self.piece.range.start
     }
 
     /// Returns its size in bytes.
-    pub fn size(&self) -> u64 {
+    pub fn byte_count(&self) -> u64 {
         self.piece.range.end - self.piece.range.start
     }
 }
@@ -129,7 +129,7 @@ impl ScanPiece {
 impl McapExec {
     /// A plan that reads `pieces` in up to `most` partitions of about the same size.
     pub(super) fn new(scan: Scan, pieces: Vec<ScanPiece>, most: usize) -> Self {
-        let bytes: u64 = pieces.iter().map(ScanPiece::size).sum();
+        let bytes: u64 = pieces.iter().map(ScanPiece::byte_count).sum();
         let share = bytes.div_ceil(most.max(1) as u64).max(1);
         let mut partitions = vec![Vec::new()];
         let mut taken = 0;
@@ -138,7 +138,7 @@ impl McapExec {
                 partitions.push(Vec::new());
                 taken = 0;
             }
-            taken += piece.size();
+            taken += piece.byte_count();
             if let Some(pieces) = partitions.last_mut() {
                 pieces.push(piece);
             }
@@ -249,41 +249,49 @@ impl DisplayAs for McapExec {
     }
 }
 
+/// What the plans of scans of run files have in common: no inputs, no expressions, fixed properties, and metrics.
+macro_rules! leaf_plan_methods {
+    () => {
+        fn name(&self) -> &'static str {
+            "McapExec"
+        }
+
+        fn properties(&self) -> &Arc<PlanProperties> {
+            &self.properties
+        }
+
+        fn children(&self) -> Vec<&Arc<dyn ExecutionPlan>> {
+            Vec::new()
+        }
+
+        fn apply_expressions(
+            &self,
+            _: &mut dyn FnMut(&Arc<dyn PhysicalExpr>) -> Result<TreeNodeRecursion>,
+        ) -> Result<TreeNodeRecursion> {
+            Ok(TreeNodeRecursion::Continue)
+        }
+
+        fn replace_children(
+            self: Arc<Self>,
+            _: Vec<Arc<dyn ExecutionPlan>>,
+            _: ReplaceChildrenOptions,
+        ) -> Result<Arc<dyn ExecutionPlan>> {
+            Ok(self)
+        }
+
+        fn with_new_children(self: Arc<Self>, _: Vec<Arc<dyn ExecutionPlan>>) -> Result<Arc<dyn ExecutionPlan>> {
+            Ok(self)
+        }
+
+        fn metrics(&self) -> Option<MetricsSet> {
+            Some(self.metrics.clone_inner())
+        }
+    };
+}
+pub(super) use leaf_plan_methods;
+
 impl ExecutionPlan for McapExec {
-    fn name(&self) -> &'static str {
-        "McapExec"
-    }
-
-    fn properties(&self) -> &Arc<PlanProperties> {
-        &self.properties
-    }
-
-    fn children(&self) -> Vec<&Arc<dyn ExecutionPlan>> {
-        Vec::new()
-    }
-
-    fn apply_expressions(
-        &self,
-        _: &mut dyn FnMut(&Arc<dyn PhysicalExpr>) -> Result<TreeNodeRecursion>,
-    ) -> Result<TreeNodeRecursion> {
-        Ok(TreeNodeRecursion::Continue)
-    }
-
-    fn replace_children(
-        self: Arc<Self>,
-        _: Vec<Arc<dyn ExecutionPlan>>,
-        _: ReplaceChildrenOptions,
-    ) -> Result<Arc<dyn ExecutionPlan>> {
-        Ok(self)
-    }
-
-    fn with_new_children(self: Arc<Self>, _: Vec<Arc<dyn ExecutionPlan>>) -> Result<Arc<dyn ExecutionPlan>> {
-        Ok(self)
-    }
-
-    fn metrics(&self) -> Option<MetricsSet> {
-        Some(self.metrics.clone_inner())
-    }
+    leaf_plan_methods!();
 
     fn execute(&self, partition: usize, context: Arc<TaskContext>) -> Result<SendableRecordBatchStream> {
         let reads = self.partitions.get(partition).cloned().unwrap_or_default();

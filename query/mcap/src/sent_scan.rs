@@ -1,6 +1,6 @@
-//! Scans of run files as they are sent to workers: which files, which of their pieces, and what of the messages. A worker
-//! reads the summaries of the files by itself, and caches them. What comes is checked before it is used, because whoever
-//! knows the workers' token may send anything.
+//! Scans of run files as they are sent to workers: which files, which of their pieces, and what of the messages. A
+//! worker reads the summaries of the files by itself, and caches them. What comes is checked before it is used, because
+//! whoever knows the workers' token may send anything.
 
 use std::fmt;
 use std::ops::RangeInclusive;
@@ -18,11 +18,12 @@ use datafusion::physical_plan::stream::RecordBatchStreamAdapter;
 use datafusion::physical_plan::{DisplayAs, DisplayFormatType, ExecutionPlan, PlanProperties, ReplaceChildrenOptions};
 use futures::{StreamExt as _, TryStreamExt as _, stream};
 use prost::Message;
+use tokio::sync::OnceCell;
 
 use super::error::Fault;
 use super::file::McapFiles;
-use super::scan::{McapExec, Scan, ScanPiece, Source, plan_properties};
-use super::table::{decoded_table, message_table};
+use super::scan::{McapExec, Scan, ScanPiece, Source, leaf_plan_methods, plan_properties};
+use super::table::{McapTable, decoded_table, message_table};
 use super::target::{Target, parse_path};
 
 /// Files that a partition opens at once.
@@ -50,8 +51,14 @@ pub fn decode_mcap_scan(bytes: &[u8], files: &Arc<McapFiles>) -> Result<Arc<dyn 
         parse_path(&file.path)?;
     }
     let properties = plan_properties(&schema, message.partitions.len());
-    let (files, metrics) = (files.clone(), ExecutionPlanMetricsSet::new());
-    Ok(Arc::new(SentScan { message: Arc::new(message), files, schema, properties, metrics }))
+    Ok(Arc::new(SentScan {
+        message: Arc::new(message),
+        files: files.clone(),
+        table: Arc::default(),
+        schema,
+        properties,
+        metrics: ExecutionPlanMetricsSet::new(),
+    }))
 }
 
 fn not_sent(what: &str) -> DataFusionError {
@@ -139,8 +146,8 @@ impl ScanMessage {
         })
     }
 
-    // The table of the same files, and of its pieces those of a partition.
-    async fn open_partition(&self, partition: usize, files: &Arc<McapFiles>, schema: &SchemaRef) -> Result<McapExec> {
+    // The table of the same files.
+    async fn open_table(&self, files: &Arc<McapFiles>, schema: &SchemaRef) -> Result<McapTable> {
         let open = |file: &FileMessage| {
             let file = file.clone();
             async move { file.open_target(files).await }
@@ -151,11 +158,18 @@ impl ScanMessage {
             Some(topic) => decoded_table(targets, topic, files)?,
             None => message_table(targets, topic, files)?,
         };
-        let projection: Vec<_> = self.projection.iter().map(|place| *place as usize).collect();
-        let fits = table.schema.project(&projection).is_ok_and(|own| own == **schema);
-        if !fits {
-            return Err(not_sent("the files have other columns"));
+        match table.schema.project(&self.column_places()).is_ok_and(|own| own == **schema) {
+            true => Ok(table),
+            false => Err(not_sent("the files have other columns")),
         }
+    }
+
+    fn column_places(&self) -> Vec<usize> {
+        self.projection.iter().map(|place| *place as usize).collect()
+    }
+
+    // The scan of a partition's pieces.
+    fn plan_partition(&self, partition: usize, table: &McapTable, schema: &SchemaRef) -> Result<McapExec> {
         let sent = self.partitions.get(partition).map(|partition| partition.pieces.as_slice()).unwrap_or_default();
         let find = |sent: &PieceMessage| {
             let source = sent.file as usize;
@@ -172,7 +186,8 @@ impl ScanMessage {
             _ => return Err(not_sent("its times are no range")),
         };
         let limit = self.limit.map(|limit| limit as usize);
-        let scan = Scan { parts: table.parts, projection, schema: schema.clone(), times, limit };
+        let projection = self.column_places();
+        let scan = Scan { parts: table.parts.clone(), projection, schema: schema.clone(), times, limit };
         Ok(McapExec::from_partitions(Arc::new(scan), vec![pieces]))
     }
 }
@@ -202,6 +217,8 @@ impl FileMessage {
 struct SentScan {
     message: Arc<ScanMessage>,
     files: Arc<McapFiles>,
+    /// Opened by the partition that runs first.
+    table: Arc<OnceCell<McapTable>>,
     schema: SchemaRef,
     properties: Arc<PlanProperties>,
     metrics: ExecutionPlanMetricsSet,
@@ -215,47 +232,14 @@ impl DisplayAs for SentScan {
 }
 
 impl ExecutionPlan for SentScan {
-    fn name(&self) -> &'static str {
-        "McapExec"
-    }
-
-    fn properties(&self) -> &Arc<PlanProperties> {
-        &self.properties
-    }
-
-    fn children(&self) -> Vec<&Arc<dyn ExecutionPlan>> {
-        Vec::new()
-    }
-
-    fn apply_expressions(
-        &self,
-        _: &mut dyn FnMut(&Arc<dyn PhysicalExpr>) -> Result<TreeNodeRecursion>,
-    ) -> Result<TreeNodeRecursion> {
-        Ok(TreeNodeRecursion::Continue)
-    }
-
-    fn replace_children(
-        self: Arc<Self>,
-        _: Vec<Arc<dyn ExecutionPlan>>,
-        _: ReplaceChildrenOptions,
-    ) -> Result<Arc<dyn ExecutionPlan>> {
-        Ok(self)
-    }
-
-    fn with_new_children(self: Arc<Self>, _: Vec<Arc<dyn ExecutionPlan>>) -> Result<Arc<dyn ExecutionPlan>> {
-        Ok(self)
-    }
-
-    fn metrics(&self) -> Option<MetricsSet> {
-        Some(self.metrics.clone_inner())
-    }
+    leaf_plan_methods!();
 
     fn execute(&self, partition: usize, context: Arc<TaskContext>) -> Result<SendableRecordBatchStream> {
         let (message, files, schema) = (self.message.clone(), self.files.clone(), self.schema.clone());
-        let metrics = self.metrics.clone();
+        let (table, metrics) = (self.table.clone(), self.metrics.clone());
         let batches = async move {
-            let opened = message.open_partition(partition, &files, &schema).await?;
-            opened.with_metrics(metrics).execute(0, context)
+            let table = table.get_or_try_init(|| message.open_table(&files, &schema)).await?;
+            message.plan_partition(partition, table, &schema)?.with_metrics(metrics).execute(0, context)
         };
         let batches = stream::once(batches).try_flatten();
         Ok(Box::pin(RecordBatchStreamAdapter::new(self.schema.clone(), batches)))

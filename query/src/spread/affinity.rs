@@ -1,4 +1,4 @@
-//! Which worker reads which files. A file goes to the same worker in every query, by rendezvous hashing, so that what
+//! The worker that reads each file. A file goes to the same worker in every query, by rendezvous hashing, so that what
 //! workers cache adds up; large files are cut at fixed places for the same reason.
 
 use std::collections::BTreeMap;
@@ -128,11 +128,11 @@ struct McapPiece {
 impl FilePiece for McapPiece {
     // Other queries read other chunks: what is near to them belongs to the same worker.
     fn place(&self) -> (&str, u64) {
-        (&self.path, self.piece.start() / PIECE_BYTES)
+        (&self.path, self.piece.start_offset() / PIECE_BYTES)
     }
 
     fn bytes(&self) -> u64 {
-        self.piece.size()
+        self.piece.byte_count()
     }
 }
 

@@ -1,5 +1,5 @@
-//! The order in which a query is tried: on the workers, once more on those that remain, and in the engine itself. Once rows
-//! have been sent, a query is not retried.
+//! The order in which a query is tried: on the workers, once more on those that remain, and in the engine itself. Once
+//! rows have been sent, a query is not retried.
 
 use std::sync::Arc;
 

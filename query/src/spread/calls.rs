@@ -1,5 +1,5 @@
-//! Calls of a worker: let in by the token, computed on threads of their own, and each task ended with the call by which it
-//! was sent, however that ends: an engine holds it open while its query runs.
+//! Calls of a worker: let in by the token, computed on threads of their own, and each task ended with the call by which
+//! it was sent, however that ends: an engine holds it open while its query runs.
 
 use std::sync::Arc;
 
@@ -28,8 +28,8 @@ pub(super) struct WorkerCalls {
     /// The header that is expected; None if all of this machine may call.
     authorization: Option<String>,
     tasks: SpreadTasks,
-    /// The threads that compute. Those that serve connections never do, or they would not hear that a query is over. Plans
-    /// are decoded by recursion, for which these threads have the stack.
+    /// The threads that compute. Those that serve connections never do, or they would not hear that a query is over.
+    /// Plans are decoded by recursion, for which these threads have the stack.
     threads: QueryThreads,
 }
 

@@ -36,7 +36,7 @@ use crate::control::threads::QueryThreads;
 
 /// Timeout of a new connection to a worker.
 pub(super) const CONNECT_LIMIT: Duration = Duration::from_secs(2);
-/// Silence after which a worker is asked whether it is there, and the timeout of its answer.
+/// Silence after which a worker is asked for a sign of life, and the timeout of its answer.
 const KEEP_ALIVE: Duration = Duration::from_secs(10);
 const KEEP_ALIVE_LIMIT: Duration = Duration::from_secs(5);
 /// Limit of a worker's figures, bytes.

@@ -75,7 +75,7 @@ enum PlanLeaf {
     Files(u64),
     /// Rows that the plan has in itself.
     Rows,
-    /// What is not sent to workers, with the reason.
+    /// A node that is not sent to workers, with the reason.
     Refused(String),
 }
 

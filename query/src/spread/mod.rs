@@ -2,8 +2,8 @@
 //! workers: processes of the same program on the same lake. Everything else runs in the engine that was asked.
 //!
 //! A worker that is lost costs no answer as long as no row was sent: the query then runs once more on the remaining
-//! workers, and at last in the engine itself. [`attempts`] has that order, [`decision`] what is spread, [`worker`] the far
-//! end.
+//! workers, and at last in the engine itself. [`attempts`] has that order, [`decision`] what is spread, [`worker`] the
+//! far end.
 
 mod affinity;
 pub(crate) mod attempts;

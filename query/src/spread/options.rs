@@ -1,4 +1,4 @@
-//! What a task takes from the session of its query: the limit of its memory and the session's options. They cross the wire
+//! The limit of memory and the options that a task takes from the session of its query. They cross the wire
 //! as an extension of the configuration.
 
 use std::collections::BTreeMap;
@@ -17,7 +17,7 @@ const OF_EXECUTION: &str = "datafusion.execution.";
 const BATCH_ROWS_LIMIT: usize = 1 << 16;
 
 extensions_options! {
-    /// What a task takes from its query's session.
+    /// Limit and options that a task takes from its query's session.
     pub(super) struct TaskOptions {
         /// Bytes that the task's operators may hold; 0 for no limit.
         pub memory_bytes: usize, default = 0

@@ -1,6 +1,7 @@
-//! The end of a worker's tasks. A task is over when the call by which it was sent is: its engine holds that call open for
-//! as long as the query runs. The library then forgets the task's plan, at a time that is its cache's to choose; until
-//! that, operators that compute on threads of their own would go on. So the leaves and the head of each plan are guarded.
+//! The end of a worker's tasks. A task is over when the call by which it was sent is: its engine holds that call open
+//! for as long as the query runs. The library then forgets the task's plan, at a time that is its cache's to choose;
+//! until that, operators that compute on threads of their own would go on. So the leaves and the head of each plan are
+//! guarded.
 
 use std::collections::HashMap;
 use std::pin::Pin;

@@ -34,8 +34,8 @@ use crate::{Error, QueryEngine};
 
 /// A worker of the engines of other servers of the same lake.
 ///
-/// Any plan that comes with the token is run, so the token is for those servers. A plan finds a store that only reads, and
-/// nothing else.
+/// Any plan that comes with the token is run, so the token is for those servers. A plan finds a store that only reads,
+/// and nothing else.
 pub struct WorkerService {
     worker: Worker,
     calls: WorkerCalls,
@@ -120,8 +120,8 @@ impl WorkerPlanRewriteHandler for LocalScans {
     }
 }
 
-// The state of a task: functions and store of the engine's queries, with the task's configuration; its operators may hold
-// `memory` bytes.
+// The state of a task: functions and store of the engine's queries, with the task's configuration; its operators may
+// hold `memory` bytes.
 fn build_task_state(engine: &QueryEngine, config: SessionConfig, memory: Option<usize>) -> Result<SessionState> {
     let known = engine.worker_state();
     let mut runtime = known.runtime_env().as_ref().clone();
@@ -133,8 +133,8 @@ fn build_task_state(engine: &QueryEngine, config: SessionConfig, memory: Option<
         .with_config(config)
         .with_runtime_env(Arc::new(runtime))
         .build();
-    // The builder registers functions in any order, so that one may have replaced another by an alias. Twice, because this
-    // does, too.
+    // The builder registers functions in any order, so that one may have replaced another by an alias. Twice, because
+    // this does, too.
     for _ in 0..2 {
         for (name, function) in known.scalar_functions() {
             if name == function.name()

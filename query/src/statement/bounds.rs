@@ -9,6 +9,7 @@ use std::any::TypeId;
 use datafusion::sql::sqlparser::dialect::{Dialect, PostgreSqlDialect};
 use datafusion::sql::sqlparser::tokenizer::{Token, Tokenizer, Word};
 
+use super::columns::hinted_error;
 use crate::Error;
 
 /// Maximum nesting of brackets.
@@ -111,12 +112,7 @@ pub fn check_statement_bounds(sql: &str, dialect: &dyn Dialect) -> Result<(), Er
     if let Some([Token::Number(number, _), Token::Word(word)]) =
         tokens.array_windows().find(|[a, b]| matches!(a, Token::Number(..)) && matches!(b, Token::Word(_)))
     {
-        let message = format!("`{number}{word}` is no number");
-        return Err(Error::Query {
-            message,
-            place: None,
-            hint: Some("a blank between a number and a name".to_owned()),
-        });
+        return Err(hinted_error(format!("`{number}{word}` is no number"), "a blank between a number and a name"));
     }
     for token in tokens.iter().filter(|t| !matches!(t, Token::Whitespace(_))) {
         let Some(innermost) = open.last_mut() else { break };
@@ -197,11 +193,7 @@ pub fn check_statement_bounds(sql: &str, dialect: &dyn Dialect) -> Result<(), Er
 }
 
 fn refuse_excess(what: &str, most: usize, hint: &str) -> Result<(), Error> {
-    Err(Error::Query {
-        message: format!("the query has more than {most} {what}"),
-        place: None,
-        hint: Some(hint.to_owned()),
-    })
+    Err(hinted_error(format!("the query has more than {most} {what}"), hint))
 }
 
 fn is_string(token: &Token) -> bool {

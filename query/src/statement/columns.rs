@@ -56,8 +56,8 @@ pub(super) fn has_columns(select: &Select) -> bool {
 }
 
 /// Returns an error with a hint and without a place.
-pub(super) fn hinted_error(message: String, hint: String) -> Error {
-    Error::Query { message, place: None, hint: Some(hint) }
+pub(super) fn hinted_error(message: String, hint: impl Into<String>) -> Error {
+    Error::Query { message, place: None, hint: Some(hint.into()) }
 }
 
 impl ColumnsExpansion<'_> {

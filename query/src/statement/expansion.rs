@@ -6,10 +6,12 @@ use std::ops::ControlFlow;
 
 use datafusion::sql::parser::Statement;
 use datafusion::sql::sqlparser::ast::{
-    Expr, GroupByExpr, GroupByWithModifier, Ident, ObjectNamePart, Query, Select, TableFactor, Visitor,
+    Expr, GroupByExpr, GroupByWithModifier, ObjectNamePart, Query, Select, TableFactor, Visitor,
 };
 
+use super::columns::hinted_error;
 use super::syntax_walk::walk_syntax;
+use super::tree::normalized_name;
 use crate::Error;
 
 /// Maximum number of tables of a query, with those behind the names of its WITH.
@@ -24,19 +26,12 @@ const MOST_GROUPINGS: u64 = 4_096;
 pub(super) fn check_expansion(statement: &Statement) -> Result<(), Error> {
     match statement {
         Statement::Statement(parsed) => match walk_syntax(parsed.as_ref(), &mut ExpansionVisitor::default()) {
-            ControlFlow::Break(excess) => {
-                Err(Error::Query { message: excess.message, place: None, hint: Some(excess.hint.to_owned()) })
-            }
+            ControlFlow::Break(error) => Err(error),
             ControlFlow::Continue(()) => Ok(()),
         },
         Statement::Explain(explain) => check_expansion(&explain.statement),
         Statement::CreateExternalTable(_) | Statement::CopyTo(_) | Statement::Reset(_) => Ok(()),
     }
-}
-
-struct Excess {
-    message: String,
-    hint: &'static str,
 }
 
 /// Counts the tables of queries, from the inner ones to the outer ones.
@@ -57,40 +52,30 @@ struct OpenQuery {
 }
 
 impl ExpansionVisitor {
-    fn add_tables(&mut self, tables: u64) -> ControlFlow<Excess> {
+    fn add_tables(&mut self, tables: u64) -> ControlFlow<Error> {
         let Some(query) = self.open.last_mut() else { return ControlFlow::Continue(()) };
         query.tables = query.tables.saturating_add(tables);
-        match query.tables <= MOST_TABLES {
-            true => ControlFlow::Continue(()),
-            false => ControlFlow::Break(Excess {
-                message: format!(
-                    "the query has more than {MOST_TABLES} tables, once each name of a WITH is what it stands for"
-                ),
-                hint: "name it once, and join fewer of them",
-            }),
+        if query.tables <= MOST_TABLES {
+            return ControlFlow::Continue(());
         }
-    }
-}
-
-fn find_name(name: &Ident) -> String {
-    match name.quote_style {
-        Some(_) => name.value.clone(),
-        None => name.value.to_lowercase(),
+        let message =
+            format!("the query has more than {MOST_TABLES} tables, once each name of a WITH is what it stands for");
+        ControlFlow::Break(hinted_error(message, "name it once, and join fewer of them"))
     }
 }
 
 impl Visitor for ExpansionVisitor {
-    type Break = Excess;
+    type Break = Error;
 
-    fn pre_visit_query(&mut self, query: &Query) -> ControlFlow<Excess> {
+    fn pre_visit_query(&mut self, query: &Query) -> ControlFlow<Error> {
         self.open.push(OpenQuery { tables: 0, known: self.known.len() });
         for part in query.with.iter().flat_map(|with| &with.cte_tables) {
-            self.named.insert(&raw const *part.query, find_name(&part.alias.name));
+            self.named.insert(&raw const *part.query, normalized_name(&part.alias.name));
         }
         ControlFlow::Continue(())
     }
 
-    fn post_visit_query(&mut self, query: &Query) -> ControlFlow<Excess> {
+    fn post_visit_query(&mut self, query: &Query) -> ControlFlow<Error> {
         let Some(closed) = self.open.pop() else { return ControlFlow::Continue(()) };
         self.known.truncate(closed.known);
         match self.named.remove(&(&raw const *query)) {
@@ -102,11 +87,11 @@ impl Visitor for ExpansionVisitor {
         }
     }
 
-    fn pre_visit_table_factor(&mut self, factor: &TableFactor) -> ControlFlow<Excess> {
+    fn pre_visit_table_factor(&mut self, factor: &TableFactor) -> ControlFlow<Error> {
         let TableFactor::Table { name, .. } = factor else { return ControlFlow::Continue(()) };
         let known = match name.0.as_slice() {
             [ObjectNamePart::Identifier(name)] => {
-                let name = find_name(name);
+                let name = normalized_name(name);
                 self.known.iter().rev().find(|known| known.0 == name).map(|known| known.1)
             }
             _ => None,
@@ -114,13 +99,13 @@ impl Visitor for ExpansionVisitor {
         self.add_tables(known.unwrap_or(1).max(1))
     }
 
-    fn pre_visit_select(&mut self, select: &Select) -> ControlFlow<Excess> {
+    fn pre_visit_select(&mut self, select: &Select) -> ControlFlow<Error> {
         match count_groupings(&select.group_by) <= MOST_GROUPINGS {
             true => ControlFlow::Continue(()),
-            false => ControlFlow::Break(Excess {
-                message: format!("GROUP BY has more than {MOST_GROUPINGS} grouping sets"),
-                hint: "GROUPING SETS names those that are needed",
-            }),
+            false => ControlFlow::Break(hinted_error(
+                format!("GROUP BY has more than {MOST_GROUPINGS} grouping sets"),
+                "GROUPING SETS names those that are needed",
+            )),
         }
     }
 }

@@ -76,12 +76,10 @@ pub(crate) fn parse_statement(sql: &str, recursion_limit: usize) -> Result<State
     let statements = builder.build().and_then(|mut parser| parser.parse_statements());
     match <[Statement; 1]>::try_from(Vec::from(statements.map_err(|e| Error::from_planning(sql, &e))?)) {
         Ok([statement]) => Ok(statement),
-        Err(none) if none.is_empty() => {
-            Err(columns::hinted_error("no statement".into(), "select * from surfaces".into()))
-        }
+        Err(none) if none.is_empty() => Err(columns::hinted_error("no statement".into(), "select * from surfaces")),
         Err(_) => {
             let hint = "`echolake sql` takes several, each ended by ;";
-            Err(columns::hinted_error("one statement at a time".into(), hint.into()))
+            Err(columns::hinted_error("one statement at a time".into(), hint))
         }
     }
 }

@@ -3,6 +3,7 @@
 use datafusion::sql::parser::Statement;
 use datafusion::sql::sqlparser::ast::{BinaryOperator, Expr, Ident, SetExpr, Statement as Sql, UnaryOperator, Value};
 
+use super::columns::hinted_error;
 use crate::Error;
 
 /// Maximum length of a predicate of comparisons, bytes.
@@ -49,10 +50,6 @@ pub(crate) fn append_predicate(
             "what may stand behind WHERE, as `snr_db < 35 and pair_id < 100`",
         )),
     }
-}
-
-fn hinted_error(message: String, hint: &str) -> Error {
-    Error::Query { message, place: None, hint: Some(hint.to_owned()) }
 }
 
 // An allow list, so that no expression of a newer parser passes.

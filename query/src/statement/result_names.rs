@@ -55,7 +55,7 @@ pub(super) fn expand_grouping_positions(select: &mut Select) -> Result<(), Error
         }
         if matches!(group, Expr::Rollup(sets) | Expr::Cube(sets) if has_equal(sets)) {
             let hint = "FROM (SELECT a, a AS b FROM t) GROUP BY ROLLUP(a, b)";
-            return Err(hinted_error("a column is in ROLLUP or CUBE twice".into(), hint.into()));
+            return Err(hinted_error("a column is in ROLLUP or CUBE twice".into(), hint));
         }
     }
     Ok(())

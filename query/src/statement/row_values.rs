@@ -43,7 +43,7 @@ pub(super) fn rewrite_row_value(expr: &mut Expr, is_aggregate: &dyn Fn(&str) -> 
     let has_aggregate = |value| walk_syntax(value, &mut AggregateVisitor { is_aggregate, depth: 0 }).is_break();
     if row.iter().any(has_aggregate) {
         let hint = "SELECT ... FROM (SELECT x, count(*) AS n FROM t GROUP BY x) WHERE (x, n) IN (...)";
-        return Err(hinted_error("a row with an aggregate is not compared with a subquery".into(), hint.into()));
+        return Err(hinted_error("a row with an aggregate is not compared with a subquery".into(), hint));
     }
     let comparison = RowComparison { row, subquery };
     let mut value = tree::parse_expr(&format!(

@@ -71,8 +71,8 @@ impl ScanFiles {
                 }
             }
         }
-        // Statistics are merged one after the other, so that those of files that come can be added to those of all files
-        // before, if all of these stay.
+        // Statistics are merged one after the other, so that those of files that come can be added to those of all
+        // files before, if all of these stay.
         let all = match before.filter(|before| kept > 0 && kept == before.files.len()) {
             Some(before) => {
                 let added = added.iter().map(|known| &**known);
@@ -118,9 +118,9 @@ impl ScanFile {
             let part = part.with_statistics(known.clone());
             return Self { file, part, known };
         }
-        // The scan's predicate leaves out the hidden rows. Here they are not even read, so that no other predicate meets
-        // them and nothing counts them. The selection does not cross the wire. Exact statistics would be taken for
-        // those of all rows: a column with one value is not read.
+        // The scan's predicate leaves out the hidden rows. Here they are not even read, so that no other predicate
+        // meets them and nothing counts them. The selection does not cross the wire. Exact statistics would be taken
+        // for those of all rows: a column with one value is not read.
         let known = known_of_parts(&file, schema);
         let part = part.with_statistics(Arc::new(known.clone().to_inexact()));
         let part = part.with_extension(ParquetRowSelection::from(visible_selection(&file)));

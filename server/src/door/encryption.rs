@@ -40,8 +40,8 @@ pub struct CertificateFiles {
 type FileStates = Vec<Option<(SystemTime, u64)>>;
 
 impl CertificateFiles {
-    /// Returns the folders that a confined process reads to take renewed files: those of the files, and of what they link
-    /// to.
+    /// Returns the folders that a confined process reads to take renewed files: those of the files, and of what they
+    /// link to.
     pub fn folders(&self) -> Vec<PathBuf> {
         let files = [&self.certificate, &self.key];
         let targets = files.into_iter().filter_map(|path| path.canonicalize().ok());

@@ -37,9 +37,9 @@ pub fn missing_support() -> Option<&'static str> {
     )
 }
 
-/// Lets the process read `lake` and its own program, read and write `own` folders, and nothing else; connect over TCP to
-/// the ports of `workers` alone. To be called before there are threads. A kernel without Landlock leaves the process as
-/// it is.
+/// Lets the process read `lake` and its own program, read and write `own` folders, and nothing else; connect over TCP
+/// to the ports of `workers` alone. To be called before there are threads. A kernel without Landlock leaves the process
+/// as it is.
 ///
 /// # Errors
 /// The system refuses.

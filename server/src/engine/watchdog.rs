@@ -79,7 +79,7 @@ struct ReportedCluster {
 impl ReportedCluster {
     fn report_changes(&mut self, cluster: &WorkerCluster) {
         let counts = cluster.spread_counts();
-        // A spare, which has asked none, leaves the door what it was told by the engine in use.
+        // A spare, which has asked none, leaves the door what the engine in use reported.
         let workers: Vec<_> = cluster.worker_states().into_iter().filter(WorkerState::was_asked).collect();
         if counts != self.counts || workers != self.workers {
             EngineReport::Workers { counts: counts.since(&self.counts), workers: workers.clone() }.send_line();

@@ -1,9 +1,9 @@
-//! Figures of workers, as an engine was told them last, and of the queries that were spread over them.
+//! Figures of workers, as they last reported them to an engine, and of the queries that were spread over them.
 
 use echolake_query::{SpreadCounts, WorkerFigures, WorkerState};
 use prometheus::{IntCounterVec, IntGaugeVec, Opts, Registry, Result};
 
-/// A figure of each worker: its name, its meaning, and where it is.
+/// A figure of each worker: its name, its meaning, and how it is read.
 type WorkerFigure = (&'static str, &'static str, fn(&WorkerFigures) -> u64);
 
 const FIGURES: [WorkerFigure; 4] = [

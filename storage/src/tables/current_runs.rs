@@ -17,8 +17,8 @@ pub(super) struct CurrentRuns {
 }
 
 impl CurrentRuns {
-    /// Lists the runs that files of `runs` show. A row replaces its predecessor, in the same commit unless that one is in
-    /// a merged file; of two the newer one counts.
+    /// Lists the runs that files of `runs` show. A row replaces its predecessor, in the same commit unless that one is
+    /// in a merged file; of two the newer one counts.
     pub fn from_files(files: &[Arc<DataFile>]) -> Self {
         let mut rows: Vec<_> =
             files.iter().flat_map(|file| list_pointers(file).into_iter().map(move |row| (row, &**file))).collect();

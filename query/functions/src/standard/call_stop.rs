@@ -62,7 +62,8 @@ pub fn check_stop() -> Result<()> {
     }
 }
 
-/// Sets whether the statement of this thread is being planned, so that what its constant calls return stays in the plan.
+/// Sets whether the statement of this thread is being planned, so that what its constant calls return stays in the
+/// plan.
 pub fn set_planning(is_planned: bool) {
     FLAG.with_borrow(|flag| {
         if let Some(StopFlag(statement)) = flag {
