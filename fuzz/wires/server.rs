@@ -113,6 +113,7 @@ fn engine_settings(program: PathBuf, sockets: &str) -> EngineSettings {
     EngineSettings {
         program,
         memory: MEMORY,
+        column_bytes: 64 << 20,
         environment: vec![("FUZZED_ENGINE".to_owned(), sockets.to_owned())],
         temp: None,
         slow: None,

@@ -87,7 +87,7 @@ impl LakeCatalog {
     /// Creates the catalogue of a lake as its reader sees it. `source` caches nothing for another reader but what all
     /// may see.
     pub fn new(lake: &Lake, lookups: LookupFunctions, source: FileReaders) -> Self {
-        let small = source.small.clone();
+        let columns = source.columns.clone();
         Self {
             lake: lake.clone(),
             source,
@@ -96,7 +96,7 @@ impl LakeCatalog {
             current: Mutex::default(),
             taking: tokio::sync::Mutex::default(),
             past: Cache::new(PAST_TABLES),
-            runs: Arc::new(McapFiles::new(lake, &small)),
+            runs: Arc::new(McapFiles::new(lake, &columns)),
             annotations: AnnotationCache::default(),
         }
     }

@@ -60,6 +60,8 @@ pub struct EngineLimits {
     /// Niceness of the threads that plan and run statements, -20 to 19; None for that of the process. Without a system
     /// that lets threads differ, as Linux does, it is the whole process's.
     pub niceness: Option<i32>,
+    /// Bytes of decoded columns that the process keeps beside what queries hold; None for 256 MiB.
+    pub column_bytes: Option<usize>,
 }
 
 /// A function that queries may call.

@@ -29,6 +29,8 @@ use crate::signals::StopRequest;
 
 /// Memory for queries by default.
 const MEMORY_MIB: u32 = 4096;
+/// Default of `--column-memory`.
+const COLUMNS_MIB: u32 = 256;
 /// Time for which the demo's answers may go on after Ctrl-C.
 const CATALOGUE_DRAIN: Duration = Duration::from_secs(5);
 
@@ -75,6 +77,9 @@ pub(super) struct QueryArgs {
     /// Memory limit of all queries together, MiB; if it is exceeded, the largest query is ended.
     #[arg(long, value_name = "MIB", default_value_t = MEMORY_MIB, value_parser = clap::value_parser!(u32).range(64..))]
     memory: u32,
+    /// Memory for decoded columns of tables beside that of queries, MiB: that of statements; pages have a quarter of it.
+    #[arg(long, value_name = "MIB", default_value_t = COLUMNS_MIB)]
+    column_memory: u32,
     /// Log queries that take this long or longer, with their statements, as 1s or 500ms.
     #[arg(long, value_name = "TIME", value_parser = parse_duration)]
     log_slow: Option<Duration>,
@@ -97,7 +102,7 @@ impl QueryArgs {
             temp: self.temp.clone(),
             slow: self.log_slow,
             cache: self.cache.cache_folder().filter(|_| lake.is_remote()),
-            ..default_engine_settings(self.memory)?
+            ..default_engine_settings(self.memory, self.column_memory)?
         })
     }
 }
@@ -117,6 +122,9 @@ pub(crate) struct EngineArgs {
     /// Bytes that its queries may hold.
     #[arg(long)]
     memory_bytes: usize,
+    /// Bytes of decoded columns that it keeps.
+    #[arg(long)]
+    column_bytes: usize,
     /// Milliseconds from which a query is logged.
     #[arg(long)]
     log_slow_ms: Option<u64>,
@@ -158,7 +166,14 @@ pub(crate) async fn serve_engine(args: &EngineArgs, lake_url: &str) -> anyhow::R
     let lake = args.cache.open_lake(lake_url).await?;
     let slow = args.log_slow_ms.map(Duration::from_millis);
     let workers = args.read_workers()?;
-    let options = EngineOptions { role: args.role, sockets: &args.sockets, memory: args.memory_bytes, slow, workers };
+    let options = EngineOptions {
+        role: args.role,
+        sockets: &args.sockets,
+        memory: args.memory_bytes,
+        column_bytes: args.column_bytes,
+        slow,
+        workers,
+    };
     run_engine(&lake, options).await?;
     Ok(CommandOutcome::Whole)
 }
@@ -262,7 +277,7 @@ pub(crate) async fn run_serve(args: &ServeArgs, lake_url: &str) -> anyhow::Resul
 
 /// Serves the catalogue alone, at the default address or, if that is taken, on any free port.
 pub(crate) async fn serve_catalogue(lake: &Lake, stop: &StopRequest) -> anyhow::Result<CommandOutcome> {
-    let engines = default_engine_settings(MEMORY_MIB)?;
+    let engines = default_engine_settings(MEMORY_MIB, COLUMNS_MIB)?;
     let settings = |http| ServerSettings {
         http: Some(http),
         flight_sql: None,
@@ -282,7 +297,7 @@ pub(crate) async fn serve_catalogue(lake: &Lake, stop: &StopRequest) -> anyhow::
     run_server(server, stop).await
 }
 
-fn default_engine_settings(memory_mib: u32) -> anyhow::Result<EngineSettings> {
+fn default_engine_settings(memory_mib: u32, column_mib: u32) -> anyhow::Result<EngineSettings> {
     let program = std::env::current_exe().context("this program does not know its own path")?;
     let (name, value) = child_variable();
     Ok(EngineSettings {
@@ -290,6 +305,7 @@ fn default_engine_settings(memory_mib: u32) -> anyhow::Result<EngineSettings> {
         environment: vec![(name.to_owned(), value.to_owned())],
         statement_environment: Vec::new(),
         memory: (memory_mib as usize) << 20,
+        column_bytes: (column_mib as usize) << 20,
         temp: None,
         slow: None,
         cache: None,

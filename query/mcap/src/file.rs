@@ -10,7 +10,7 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use echolake_lake::{Lake, LakeSnapshot};
-use echolake_lake_tables::SmallTables;
+use echolake_lake_tables::ColumnStore;
 use echolake_recording::{
     BlockReader, ChannelDefinitions, DefinitionDigests, FRAME_BYTES, MAGIC, Record, RecordFrame, RecordSplitter,
     RunSummary, SplitRecord, describe_mcap_error, find_part, opcode, parse_record, summary_range, tail_range,
@@ -96,9 +96,9 @@ impl Weighter<FileVersion, Arc<McapFile>> for SummaryWeighter {
 }
 
 impl McapFiles {
-    /// Creates an empty cache for a lake, whose small tables are in `small`.
-    pub fn new(lake: &Lake, small: &Arc<SmallTables>) -> Self {
-        let sizes = lake.is_remote().then(|| RunSizes::new(lake, small));
+    /// Creates an empty cache for a lake, whose decoded columns are in `columns`.
+    pub fn new(lake: &Lake, columns: &Arc<ColumnStore>) -> Self {
+        let sizes = lake.is_remote().then(|| RunSizes::new(lake, columns));
         // So few items are one shard, in which a summary may take all the room.
         Self { store: lake.store(), sizes, cache: Cache::with_weighter(32, CACHED_BYTES, SummaryWeighter) }
     }

@@ -7,29 +7,25 @@ use arrow::array::AsArray as _;
 use arrow::datatypes::{Int64Type, SchemaRef};
 use arrow::record_batch::RecordBatch;
 use echolake_lake::{Lake, LakeSnapshot};
-use echolake_lake_tables::SmallTables;
+use echolake_lake_tables::ColumnStore;
 use echolake_schema::tables::Table;
 use object_store::path::Path;
 
-/// The rows of `runs`, in memory.
+/// The sizes in `runs`, in memory.
 #[derive(Debug)]
 pub(super) struct RunSizes {
-    small: Arc<SmallTables>,
+    columns: Arc<ColumnStore>,
     schema: SchemaRef,
 }
 
 impl RunSizes {
-    pub fn new(lake: &Lake, small: &Arc<SmallTables>) -> Self {
-        Self { small: small.clone(), schema: Table::Runs.schema(lake.rig()) }
+    pub fn new(lake: &Lake, columns: &Arc<ColumnStore>) -> Self {
+        Self { columns: columns.clone(), schema: Table::Runs.schema(lake.rig()) }
     }
 
     /// Returns the sizes that are known. A file that is missing here is asked for its size.
     pub async fn read_sizes(&self, snapshot: &LakeSnapshot) -> HashMap<Path, u64> {
-        let files: Vec<_> = snapshot.files(Table::Runs).iter().map(|file| &**file).collect();
-        if SmallTables::cached_columns(Table::Runs, &self.schema, files.iter().copied()).is_none() {
-            return HashMap::new();
-        }
-        let rows = self.small.read_rows(Table::Runs, &self.schema, &files).await;
+        let rows = self.columns.read_rows(&self.schema, snapshot.files(Table::Runs), &["file", "file_bytes"]).await;
         rows.ok().and_then(|rows| sizes_by_path(&rows)).unwrap_or_default()
     }
 }

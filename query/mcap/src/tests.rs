@@ -12,7 +12,7 @@ use datafusion::prelude::SessionContext;
 use datafusion::sql::parser::Statement;
 use datafusion::sql::sqlparser::ast::VisitMut as _;
 use echolake_lake::{FileName, Lake, ReferenceSurfaces, VisibleRun, encode_batches};
-use echolake_lake_tables::SmallTables;
+use echolake_lake_tables::{ColumnStore, LakeReaderFactory};
 use echolake_schema::Rig;
 use echolake_schema::tables::Table;
 use mcap::records::MessageHeader;
@@ -35,8 +35,11 @@ pub(crate) struct TestLake {
 
 pub(crate) async fn lake() -> TestLake {
     let lake = Lake::open_or_create("memory://", &Rig::paper(), &ReferenceSurfaces::default()).await.expect("a lake");
-    let files = Arc::new(McapFiles::new(&lake, &Arc::new(SmallTables::new(&lake))));
-    TestLake { lake, files, context: SessionContext::new() }
+    let context = SessionContext::new();
+    let footers = context.runtime_env().cache_manager.get_file_metadata_cache();
+    let columns = Arc::new(ColumnStore::new(Arc::new(LakeReaderFactory::new(&lake, footers)), None, 1 << 20));
+    let files = Arc::new(McapFiles::new(&lake, &columns));
+    TestLake { lake, files, context }
 }
 
 pub(crate) async fn put(lake: &TestLake, path: &str, file: Vec<u8>) {

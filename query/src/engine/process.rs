@@ -18,7 +18,7 @@ use echolake_functions::{
     whole_number_ranges, zone_time,
 };
 use echolake_lake::Lake;
-use echolake_lake_tables::{FileReaders, LakeReaderFactory, SmallTables};
+use echolake_lake_tables::{ColumnStore, FileReaders, LakeReaderFactory};
 use echolake_schema::ProjectName;
 
 use super::EngineLimits;
@@ -41,6 +41,8 @@ const BATCH_ROWS: usize = 2048;
 /// Cache size for the files' footers and page indexes, bytes. Queries read the same files again and again, and a
 /// thousand runs need more than DataFusion's default of 50 MiB.
 const METADATA_BYTES: usize = 256 << 20;
+/// Bytes of decoded columns that a process keeps by default.
+const COLUMN_BYTES: usize = 256 << 20;
 /// Bytes that are fetched of a file's end on an object store: footer and page index of nearly all files in one request.
 const REMOTE_FOOTER_BYTES: usize = 128 << 10;
 /// Disk space that sorts and aggregations of all queries may use, bytes.
@@ -59,6 +61,8 @@ pub(crate) struct EngineProcess {
     lookups: LookupFunctions,
     url: ObjectStoreUrl,
     reader: Arc<LakeReaderFactory>,
+    /// Decoded columns. A scan names the files that it reads, and leaves out rows by its filters.
+    columns: Arc<ColumnStore>,
     pub turns: Arc<TurnQueue>,
     pub seats: Arc<SeatPool>,
     pub running: RunningQueries,
@@ -82,6 +86,8 @@ impl EngineProcess {
         let runtime = build_runtime(lake, &url, limits.memory).map_err(failed)?;
         let metadata = runtime.cache_manager.get_file_metadata_cache();
         let reader = Arc::new(LakeReaderFactory::new(lake, metadata));
+        let column_bytes = limits.column_bytes.unwrap_or(COLUMN_BYTES);
+        let columns = Arc::new(ColumnStore::new(reader.clone(), footer_bytes(lake), column_bytes as u64));
         let functions = FunctionSet::all(lake.rig()).map_err(|e| Error::failed_query(&e.to_string()))?;
         let threads = |e: std::io::Error| Error::failed_query(&format!("no threads for queries: {e}"));
         let lookups = LookupFunctions::from_lake(lake, &functions)?;
@@ -91,6 +97,7 @@ impl EngineProcess {
             lookups,
             url,
             reader,
+            columns,
             turns: TurnQueue::new(limits.computing.unwrap_or_else(default_computing)),
             seats: SeatPool::new(limits.niceness),
             running: RunningQueries::default(),
@@ -113,18 +120,22 @@ impl EngineProcess {
         Ok(self.rights.get_or_insert(lake.visible_projects(), || self.open_catalog(lake)))
     }
 
-    // Rows of small tables are cached by right. Footers are cached by file: what a reader may not see of a file is not
-    // read by its footer.
+    // Footers and columns are cached by file: what a reader may not see of a file is not read by its footer, and is left
+    // out of its columns by the scan's filter.
     fn open_catalog(&self, lake: &Lake) -> LakeCatalog {
         let source = FileReaders {
             url: self.url.clone(),
             reader: self.reader.clone(),
-            footer_bytes: lake.is_remote().then_some(REMOTE_FOOTER_BYTES),
-            small: Arc::new(SmallTables::new(lake)),
+            footer_bytes: footer_bytes(lake),
+            columns: self.columns.clone(),
             is_restricted: lake.is_restricted(),
         };
         LakeCatalog::new(lake, self.lookups.clone(), source)
     }
+}
+
+fn footer_bytes(lake: &Lake) -> Option<usize> {
+    lake.is_remote().then_some(REMOTE_FOOTER_BYTES)
 }
 
 // Statements wait for the store now and then; more at once would hold memory, and not end sooner.

@@ -24,9 +24,9 @@ use echolake_schema::tables::Table;
 use super::function_tests::{SmallLake, examples};
 use super::tests::{lake, put_events};
 use super::*;
-use crate::check_transport;
 use crate::views::LakeView;
 use crate::views::tests::put;
+use crate::{EngineLimits, check_transport};
 
 /// Plans a query as a session does, without running it.
 async fn physical_plan(engine: &QueryEngine, sql: &str) -> Result<(SessionState, Arc<dyn ExecutionPlan>), Error> {
@@ -225,6 +225,75 @@ async fn a_small_table_is_not_divided() {
     let text = displayable(local.as_ref()).indent(false).to_string();
     assert!(text.contains("rows in memory"), "{text}");
     assert!(!row_texts(local, &state).await.is_empty());
+}
+
+/// Runs a query by plans of an engine, whose process keeps columns, and of one that keeps none.
+async fn check_kept(engine: &QueryEngine, without: &QueryEngine, sql: &str) {
+    let mut texts = Vec::new();
+    let mut expected: Option<Vec<String>> = None;
+    for engine in [without, engine, engine] {
+        let (state, plan) = physical_plan(engine, sql).await.unwrap_or_else(|e| panic!("{sql}: {e}"));
+        let local = engine.rewrite_local_scans(plan).expect("rewritten");
+        texts.push(displayable(local.as_ref()).indent(false).to_string());
+        let rows = row_texts(local, &state).await;
+        match &expected {
+            Some(expected) => check_same(sql, "kept", expected, &rows),
+            None => expected = Some(rows),
+        }
+    }
+    let is_held: Vec<_> = texts.iter().map(|text| text.contains("rows in memory")).collect();
+    assert_eq!(is_held, [false, true, true], "{sql}: {texts:?}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn columns_that_are_kept_give_the_rows_of_their_files() {
+    let (_folder, lake) = merged_lake(30_000).await;
+    for (run, lines) in [("r6", 9000), ("r7", 1), ("r8", 2951)] {
+        put_events(&lake, "flat", run, "old", lines).await;
+    }
+    let restricted = lake.restricted_to(["ours".parse().expect("a name")].into());
+    for lake in [&lake, &restricted] {
+        let limits = EngineLimits { column_bytes: Some(1), ..EngineLimits::default() };
+        let without = QueryEngine::with_limits(lake, limits).expect("an engine");
+        let engine = QueryEngine::new(lake, None).expect("an engine");
+        for sql in [
+            "select * from events",
+            "select message, log_time_ns from events where log_time_ns between 2000 and 2005 and surface_id <> 'foam'",
+            "select run_id, count(*), sum(log_time_ns), max(message) from events group by run_id",
+            "select log_time_ns + 1, run_id from events order by log_time_ns desc, run_id limit 7",
+            "select count(message) from (select message from events where message <> '' limit 20000)",
+            "select a.run_id, count(*) from events a join runs b on a.run_id = b.run_id where a.log_time_ns % 3 = 1 \
+             group by a.run_id",
+            "select count(*) from events where run_id = 'r2' and length(message) > 1",
+            "select surface_id, run_id from runs",
+        ] {
+            check_kept(&engine, &without, sql).await;
+        }
+    }
+}
+
+// Of a large file, a filter reads few groups of rows; what leaves out rows while the first ones are found does not count.
+#[tokio::test(flavor = "multi_thread")]
+async fn columns_of_a_large_file_are_kept_unless_a_filter_selects_rows() {
+    let (_folder, lake) = lake().await;
+    put_events(&lake, "flat", "r1", "old", 70_000).await;
+    let engine = QueryEngine::new(&lake, None).expect("an engine");
+    for (sql, is_kept) in [
+        ("select message, count(*) from events group by message", true),
+        ("select log_time_ns, message from events order by log_time_ns % 1000 desc, log_time_ns limit 3", true),
+        ("select log_time_ns from events order by log_time_ns desc limit 3", true),
+        ("select log_time_ns from events where log_time_ns > 69000 order by log_time_ns desc limit 3", false),
+        ("select count(message) from events where log_time_ns % 3 = 0", false),
+        ("select message from events limit 3", false),
+    ] {
+        let (state, plan) = physical_plan(&engine, sql).await.expect("planned");
+        let expected = row_texts(plan, &state).await;
+        let (state, plan) = physical_plan(&engine, sql).await.expect("planned");
+        let local = engine.rewrite_local_scans(plan).expect("rewritten");
+        let text = displayable(local.as_ref()).indent(false).to_string();
+        assert_eq!(text.contains("rows in memory"), is_kept, "{sql}: {text}");
+        check_same(sql, "kept", &expected, &row_texts(local, &state).await);
+    }
 }
 
 // What cannot be sent is named, and stays where it is.

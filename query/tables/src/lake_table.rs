@@ -32,12 +32,13 @@ use futures::FutureExt as _;
 use futures::future::BoxFuture;
 
 use crate::boxed_scan;
-use crate::held_table::HeldTable;
+use crate::column_store::ColumnStore;
 use crate::scan_files::{PartlyHidden, RUN, ScanFile, ScanFiles};
-use crate::small_tables::SmallTables;
 
 /// Rows per batch of a scan without lists: the engine's kernels are fastest with it.
-const NARROW_BATCH_ROWS: usize = 8192;
+pub(crate) const NARROW_BATCH_ROWS: usize = 8192;
+/// Maximum rows of a table that one partition reads.
+const SMALL_ROWS: u64 = 20_000;
 
 /// Files of one table in one snapshot.
 #[derive(Debug)]
@@ -47,8 +48,8 @@ pub struct LakeTable {
     columns: DFSchema,
     files: ScanFiles,
     source: FileReaders,
-    /// What the process holds of its rows, if the table is small.
-    held: Option<Arc<HeldTable>>,
+    /// It has few rows, and no lists but the curves of `surface_stats`.
+    is_small: bool,
     /// The snapshot, if it has a fault in this table: it is refused.
     faulty: Option<Arc<LakeSnapshot>>,
 }
@@ -62,8 +63,8 @@ pub struct FileReaders {
     pub reader: Arc<dyn ParquetFileReaderFactory>,
     /// Bytes of a file's end that the first request for a footer fetches, if a request takes long.
     pub footer_bytes: Option<usize>,
-    /// Caches the rows of small tables.
-    pub small: Arc<SmallTables>,
+    /// Columns that the process has decoded.
+    pub columns: Arc<ColumnStore>,
     /// True if files may hold rows that are none of the reader's business: plans name what it may see of such files, and
     /// neither what it may not see nor how much that is.
     pub is_restricted: bool,
@@ -94,12 +95,12 @@ impl LakeTable {
         before: Option<&Self>,
     ) -> Result<Self> {
         let columns = DFSchema::try_from(schema.clone())?;
-        let held = HeldTable::from_files(table, &schema, files)?.map(Arc::new);
-        held.iter().for_each(|held| source.small.add_table(held));
+        let is_narrow = table == Table::SurfaceStats || !schema.fields().iter().any(|f| f.data_type().is_nested());
+        let is_small = is_narrow && files.iter().map(|file| file.rows).sum::<u64>() <= SMALL_ROWS;
         let is_restricted = source.is_restricted;
         let before = before.filter(|before| before.schema == schema && before.source.is_restricted == is_restricted);
         let files = ScanFiles::new(files, &schema, is_restricted, before.map(|before| &before.files))?;
-        Ok(Self { table, schema, columns, files, source, held, faulty: None })
+        Ok(Self { table, schema, columns, files, source, is_small, faulty: None })
     }
 
     /// Makes it the table of this snapshot, which is refused if the snapshot has a fault in it.
@@ -158,7 +159,7 @@ impl LakeTable {
         }
         // More partitions than one would cost a small table more than it takes to read it. What is declared is not
         // divided by the optimizer, neither here nor for other processes.
-        let declared = self.held.is_some().then_some(Partitioning::UnknownPartitioning(1));
+        let declared = self.is_small.then_some(Partitioning::UnknownPartitioning(1));
         let groups = declared.as_ref().map_or(state.config().target_partitions(), Partitioning::partition_count);
         let config = FileScanConfigBuilder::new(self.source.url.clone(), Arc::new(source))
             .with_file_groups(file_groups(files, groups))

@@ -3,8 +3,9 @@
 //! A plan is optimised, explained and sent to other machines with DataFusion's own scans of Parquet files. Just before it
 //! runs,
 //!
-//! - a scan of a small table reads the rows that this process has of its files ([`HeldScan`]);
-//! - a scan of small files without lists reads all their rows. For each file that it opens, DataFusion's Parquet source
+//! - a scan without lists reads the columns that this process has decoded of its files, and decodes and keeps the others
+//!   ([`HeldScan`]), unless they are more than a share of what the process keeps;
+//! - such a scan of small files reads all their rows. For each file that it opens, DataFusion's Parquet source
 //!   adapts the query's filters to the file, and plans by them which row groups and pages to read: for a file of a few
 //!   thousand rows that takes longer than reading them. The filters stand above the scan, too;
 //! - other scans read through this process' cache and its footers, also those of a plan that came over the wire.
@@ -13,12 +14,13 @@
 
 use std::sync::Arc;
 
-use datafusion::common::stats::Precision;
 use datafusion::datasource::physical_plan::{FileScanConfig, FileScanConfigBuilder, FileSource, ParquetSource};
-use datafusion::datasource::source::DataSourceExec;
+use datafusion::datasource::source::{DataSource, DataSourceExec};
 use datafusion::error::Result;
 use datafusion::physical_plan::ExecutionPlan;
+use datafusion::physical_plan::aggregates::AggregateExec;
 use datafusion::physical_plan::execution_plan::{ChildrenPropertiesMode, ReplaceChildrenOptions};
+use datafusion::physical_plan::sorts::sort::SortExec;
 
 use crate::held_scan::HeldScan;
 use crate::lake_table::FileReaders;
@@ -31,14 +33,24 @@ const SMALL_FILE_ROWS: usize = 65_536;
 /// # Errors
 /// If a scan's expressions do not fit its columns.
 pub fn rewrite_local_scans(plan: Arc<dyn ExecutionPlan>, readers: &FileReaders) -> Result<Arc<dyn ExecutionPlan>> {
+    rewrite_node(plan, readers, &mut Vec::new())
+}
+
+// `bounds` are the ids of filters that nodes above give their scans while they run, see [`produced_bounds`].
+fn rewrite_node(
+    plan: Arc<dyn ExecutionPlan>,
+    readers: &FileReaders,
+    bounds: &mut Vec<u64>,
+) -> Result<Arc<dyn ExecutionPlan>> {
     if plan.children().is_empty() {
-        let scan = plan.downcast_ref::<DataSourceExec>().and_then(|scan| scan.data_source().downcast_ref());
-        return Ok(scan.map_or(Ok(None), |scan| local_scan(scan, readers))?.unwrap_or(plan));
+        let scan = plan.downcast_ref::<DataSourceExec>();
+        return Ok(scan.map_or(Ok(None), |scan| local_scan(scan.data_source(), readers, bounds))?.unwrap_or(plan));
     }
+    bounds.extend(produced_bounds(plan.as_ref()));
     let mut is_changed = false;
     let mut children = Vec::with_capacity(plan.children().len());
     for child in plan.children() {
-        let rewritten = rewrite_local_scans(child.clone(), readers)?;
+        let rewritten = rewrite_node(child.clone(), readers, bounds)?;
         is_changed |= !Arc::ptr_eq(child, &rewritten);
         children.push(rewritten);
     }
@@ -48,13 +60,26 @@ pub fn rewrite_local_scans(plan: Arc<dyn ExecutionPlan>, readers: &FileReaders) 
     }
 }
 
+// The filters by which the first rows of an order, or an extreme, leave out rows that are beyond those found so far. Those
+// of joins may leave few rows of many.
+fn produced_bounds(plan: &dyn ExecutionPlan) -> Vec<u64> {
+    let is_bounded = plan.downcast_ref::<SortExec>().is_some() || plan.downcast_ref::<AggregateExec>().is_some();
+    let produced = if is_bounded { plan.dynamic_expressions_produced() } else { Vec::new() };
+    produced.iter().filter_map(|filter| filter.expression_id()).collect()
+}
+
 // What this process reads for a scan; None if that is what the scan reads.
-fn local_scan(scan: &FileScanConfig, readers: &FileReaders) -> Result<Option<Arc<dyn ExecutionPlan>>> {
+fn local_scan(
+    data_source: &Arc<dyn DataSource>,
+    readers: &FileReaders,
+    bounds: &[u64],
+) -> Result<Option<Arc<dyn ExecutionPlan>>> {
+    let Some(scan) = data_source.downcast_ref::<FileScanConfig>() else { return Ok(None) };
     let Some(source) = scan.file_source().downcast_ref::<ParquetSource>() else { return Ok(None) };
     if scan.object_store_url != readers.url {
         return Ok(None);
     }
-    if let Some(held) = HeldScan::try_from_scan(scan, source, &readers.small)? {
+    if let Some(held) = HeldScan::try_from_scan(data_source, scan, source, readers, bounds)? {
         return Ok(Some(Arc::new(DataSourceExec::new(Arc::new(held)))));
     }
     let source: Arc<dyn FileSource> = if has_spare_filters(scan, source)? {
@@ -86,13 +111,30 @@ fn has_spare_filters(scan: &FileScanConfig, source: &ParquetSource) -> Result<bo
     if scan.projected_schema()?.fields().iter().any(|field| field.data_type().is_nested()) {
         return Ok(false);
     }
-    let mut files = 0;
-    let mut rows = 0;
-    for file in scan.file_groups.iter().flat_map(|group| group.files()) {
-        let known = file.statistics.as_ref().map_or(Precision::Absent, |known| known.num_rows);
-        let Some(known) = known.get_value() else { return Ok(false) };
-        files += 1;
-        rows += known;
+    Ok(ScanSize::from_scan(scan).is_some_and(|size| !size.has_large_files()))
+}
+
+/// What a scan reads.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct ScanSize {
+    files: usize,
+    pub rows: usize,
+}
+
+impl ScanSize {
+    /// Adds up the files of a scan, each of which is all of a file or a range of it; None if it does not know the rows
+    /// of one.
+    pub fn from_scan(scan: &FileScanConfig) -> Option<Self> {
+        let mut size = Self { files: 0, rows: 0 };
+        for file in scan.file_groups.iter().flat_map(|group| group.files()) {
+            size.files += 1;
+            size.rows += file.statistics.as_ref()?.num_rows.get_value()?;
+        }
+        Some(size)
     }
-    Ok(rows < files * SMALL_FILE_ROWS)
+
+    /// Returns whether the files are so large that it pays to plan which of their rows to read.
+    pub fn has_large_files(&self) -> bool {
+        self.rows >= self.files * SMALL_FILE_ROWS
+    }
 }

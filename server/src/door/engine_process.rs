@@ -29,6 +29,8 @@ use crate::process_memory::private_bytes;
 /// Time for which a request that lost its engine waits for the reason.
 const REASON_WAIT: Duration = Duration::from_secs(2);
 
+/// Share of the memory for decoded columns that the engine of pages has.
+const PAGES_SHARE: usize = 4;
 /// Idle connections that are kept to an engine.
 const IDLE_CONNECTIONS: usize = 32;
 
@@ -39,6 +41,8 @@ pub struct EngineSettings {
     pub program: PathBuf,
     /// Bytes of memory that queries may hold, all of them together.
     pub memory: usize,
+    /// Bytes of decoded columns that the engine of statements keeps; that of pages keeps a quarter of it.
+    pub column_bytes: usize,
     /// Variables of their environment beside the server's own.
     pub environment: Vec<(String, String)>,
     /// Variables of the engine of statements alone, such as the token of workers.
@@ -126,6 +130,14 @@ pub(crate) struct EngineStart<'a> {
     pub spills: PathBuf,
 }
 
+// Pages read few columns.
+fn column_bytes(role: EngineRole, settings: &EngineSettings) -> usize {
+    match role {
+        EngineRole::Pages => settings.column_bytes / PAGES_SHARE,
+        EngineRole::Statements => settings.column_bytes,
+    }
+}
+
 fn cache_arguments(cache: &CacheFolder) -> [OsString; 4] {
     ["--cache".into(), cache.path.clone().into(), "--cache-size".into(), cache.bytes.to_string().into()]
 }
@@ -149,6 +161,8 @@ impl EngineProcess {
             .args(start.lake_folder.iter().flat_map(|folder| [OsStr::new("--confine-to"), folder.as_os_str()]))
             .args(["--role", start.role.name(), "--memory-bytes"])
             .arg(counted_bytes(start.settings.memory).to_string())
+            .arg("--column-bytes")
+            .arg(column_bytes(start.role, start.settings).to_string())
             .args(
                 start.settings.slow.iter().flat_map(|slow| ["--log-slow-ms".to_owned(), slow.as_millis().to_string()]),
             )

@@ -102,8 +102,8 @@ pub fn lake_folders(lake: &Path) -> Vec<PathBuf> {
     [lake.to_owned()].into_iter().chain(links.map(|entry| entry.path())).collect()
 }
 
-/// Limits what the process can allocate from now on to the `memory` bytes that its queries may hold, and a little
-/// besides.
+/// Limits what the process can allocate from now on to the `memory` bytes that its queries may hold and its
+/// caches keep, and a little besides.
 ///
 /// # Errors
 /// The system does not tell what the process has, or refuses.

@@ -39,6 +39,8 @@ pub struct EngineOptions<'a> {
     pub sockets: &'a Path,
     /// Bytes that its queries may hold.
     pub memory: usize,
+    /// Bytes of decoded columns that it keeps.
+    pub column_bytes: usize,
     /// Time from which a query is logged as slow; None for never.
     pub slow: Option<Duration>,
     /// Workers over which heavy queries are spread; None for no workers.
@@ -51,7 +53,7 @@ pub struct EngineOptions<'a> {
 /// # Errors
 /// [`Error::System`], [`Error::Query`], [`Error::Transport`].
 pub async fn run_engine(lake: &Lake, options: EngineOptions<'_>) -> Result<(), Error> {
-    let EngineOptions { role, sockets, memory, slow, workers } = options;
+    let EngineOptions { role, sockets, memory, column_bytes, slow, workers } = options;
     let messages = read_messages();
     let http = EngineSocket::Http.listen_in(sockets)?;
     let flight_sql = EngineSocket::FlightSql.listen_in(sockets)?;
@@ -60,7 +62,7 @@ pub async fn run_engine(lake: &Lake, options: EngineOptions<'_>) -> Result<(), E
     let niceness = (role == EngineRole::Statements).then_some(STATEMENT_NICENESS);
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     let computing = (role == EngineRole::Pages).then_some(cores * PAGES_PER_CORE);
-    let limits = EngineLimits { memory: Some(memory), computing, niceness };
+    let limits = EngineLimits { memory: Some(memory), computing, niceness, column_bytes: Some(column_bytes) };
     let engine = QueryEngine::with_limits(lake, limits)?;
     warm_up(&engine).await?;
     if let Some(workers) = &workers {
@@ -68,8 +70,8 @@ pub async fn run_engine(lake: &Lake, options: EngineOptions<'_>) -> Result<(), E
     }
     let services = EngineServices::new(lake, engine, slow)?;
     // Behind the start of its threads, whose stacks count.
-    confinement::limit_memory(memory).map_err(Error::System)?;
-    watchdog::start_watchdog(&services, role, memory).map_err(Error::System)?;
+    confinement::limit_memory(memory + column_bytes).map_err(Error::System)?;
+    watchdog::start_watchdog(&services, role, memory, column_bytes).map_err(Error::System)?;
     EngineReport::Ready.send_line();
     #[cfg(feature = "postgres")]
     let postgres = echolake_postgres::serve_postgres_socket(services.clone(), postgres);

@@ -15,7 +15,7 @@ const INTERVAL: Duration = Duration::from_millis(50);
 const MEMORY_LOOK: Duration = Duration::from_millis(10);
 /// Time of the processors that a statement may use after it was cancelled, ran out of time, or lost its client.
 const GRACE: Duration = Duration::from_millis(250);
-/// Memory of an engine that is not of its queries: footers of files, small tables, what the allocator keeps.
+/// Memory of an engine that is not of its queries: footers of files, what the allocator keeps.
 const CACHE_BYTES: usize = 192 << 20;
 /// Part of its memory by which an engine may be over it after its largest statement was cancelled.
 const TOLERANCE: f64 = 1.2;
@@ -26,11 +26,16 @@ const RELEASE: Duration = Duration::from_millis(500);
 ///
 /// # Errors
 /// The system gives no thread, or does not tell the process's memory.
-pub(super) fn start_watchdog(services: &EngineServices, role: EngineRole, memory: usize) -> std::io::Result<()> {
+pub(super) fn start_watchdog(
+    services: &EngineServices,
+    role: EngineRole,
+    memory: usize,
+    column_bytes: usize,
+) -> std::io::Result<()> {
     let services = services.clone();
     let blocks = if services.lake().is_remote() { CACHE_MEMORY_BYTES as usize } else { 0 };
     let base = private_bytes("self").ok_or_else(|| std::io::Error::other("/proc/self/statm cannot be read"))?;
-    let limit = (memory as f64 * TOLERANCE) as usize + base + CACHE_BYTES + blocks;
+    let limit = (memory as f64 * TOLERANCE) as usize + base + CACHE_BYTES + blocks + column_bytes;
     let memory = MemoryWatch { limit, cancelled: None };
     std::thread::Builder::new().name("watchdog".to_owned()).spawn(move || watch_engine(&services, role, memory))?;
     Ok(())
