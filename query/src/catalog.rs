@@ -32,6 +32,7 @@ use quick_cache::sync::Cache;
 use crate::contributions::{AnnotationCache, KnownVerdicts, with_pending_rows, without_rejected};
 use crate::listed_verdicts::listed_rejection;
 use crate::overlay_schema::{NamedTables, OverlaySchema};
+use crate::sorted_join::AsOfFilter;
 use crate::statement::{PastTableName, checked_operators, find_past_tables, walk_statement};
 use crate::system;
 use crate::views::{LakeView, LazyView, LookupFunctions, PairJoin, SortedNulls, UnusedJoin};
@@ -46,8 +47,8 @@ const REMOTE_CHECK_LASTS: Duration = Duration::from_secs(1);
 const PAST_TABLES: usize = 32;
 
 /// Returns the optimizer rules for plans over tables and views: the same for every snapshot and every reader.
-pub(crate) fn optimizer_rules(lookups: &LookupFunctions) -> [Arc<dyn OptimizerRule + Send + Sync>; 3] {
-    [Arc::new(UnusedJoin), Arc::new(PairJoin::new(lookups)), Arc::new(SortedNulls)]
+pub(crate) fn optimizer_rules(lookups: &LookupFunctions) -> [Arc<dyn OptimizerRule + Send + Sync>; 4] {
+    [Arc::new(UnusedJoin), Arc::new(PairJoin::new(lookups)), Arc::new(SortedNulls), Arc::new(AsOfFilter)]
 }
 
 /// Registers the tables of a lake in a query's context. It is what a right has: the lake as readers with this right see

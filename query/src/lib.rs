@@ -37,6 +37,7 @@ mod overlay_schema;
 mod plan_transport;
 mod request_memory;
 mod session;
+mod sorted_join;
 mod spread;
 mod statement;
 mod system;

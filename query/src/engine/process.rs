@@ -27,8 +27,11 @@ use crate::control::RunningQueries;
 use crate::control::seats::SeatPool;
 use crate::control::threads::{QueryThreads, count_cores};
 use crate::control::turns::TurnQueue;
+use crate::sorted_join::SortedJoinPlanner;
 use crate::spread::{ReadOnlyStore, WorkerCluster};
-use crate::statement::{EndingRule, FloatForms, IntegerArithmetic, LimitedOperators, SubqueryConditions};
+use crate::statement::{
+    AsOfSidePlanner, EndingRule, FloatForms, IntegerArithmetic, LimitedOperators, SubqueryConditions,
+};
 use crate::views::LookupFunctions;
 use crate::{Error, OpaqueValue};
 
@@ -187,6 +190,8 @@ fn build_template(
         .with_analyzer_rule(Arc::new(IntegerArithmetic))
         .with_analyzer_rule(Arc::new(FloatForms))
         .with_optimizer_rules(rules.map(ending).collect())
+        .with_relation_planners(vec![Arc::new(AsOfSidePlanner)])
+        .with_query_planner(Arc::new(SortedJoinPlanner))
         .build();
     let _ = state.register_udf(Arc::new(octet_length_of_bytes()));
     for function in whole_number_ranges() {

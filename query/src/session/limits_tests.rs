@@ -16,7 +16,10 @@ const END_LIMIT: Duration = Duration::from_secs(120);
 const ENDLESS: &str = "with recursive r as (select 1 n union all select n + 1 from r) select count(*) from r";
 /// A join that runs for hours without a row.
 const BARREN: &str = "select count(*) from generate_series(1, 1000000) a(x) join generate_series(1, 1000000) b(y) \
-                      on a.x > b.y + 2000000";
+                      on a.x + b.y < 0";
+/// The same by order.
+const BARREN_ORDER: &str = "select count(*) from generate_series(1, 1000000) a(x) join generate_series(1, 1000000) b(y) \
+                            on a.x >= b.y and a.x + b.y < 0";
 
 async fn engine(memory: Option<usize>) -> (tempfile::TempDir, QueryEngine) {
     let folder = tempfile::tempdir().expect("a folder");
@@ -44,7 +47,7 @@ async fn outcome(session: &Session, sql: &str) -> Result<u64, Error> {
 #[tokio::test]
 async fn a_query_ends_when_it_is_cancelled() {
     let (_folder, engine) = engine(None).await;
-    for sql in [ENDLESS, BARREN] {
+    for sql in [ENDLESS, BARREN, BARREN_ORDER] {
         let mut answer = session(&engine, QueryQuota::default()).query(sql).await.expect("it begins");
         let handle = answer.cancel_handle();
         let reading = tokio::spawn(async move { answer.next().await.map(|_| ()) });
@@ -121,10 +124,15 @@ async fn a_request_is_limited_as_a_query() {
 async fn memory_is_limited() {
     let (_folder, engine) = engine(Some(32 << 20)).await;
     let session = session(&engine, QueryQuota::default());
-    // One list of all values, which cannot be spilled to disk.
-    let sql = "select array_agg(x || 'abcdefghijklmnopqrstuvwxyz') from generate_series(1, 10000000) t(x)";
-    let ended = outcome(&session, sql).await;
-    assert!(matches!(ended, Err(Error::MemoryLimit { .. })), "{ended:?}");
+    for sql in [
+        // One list of all values, which cannot be spilled to disk.
+        "select array_agg(x || 'abcdefghijklmnopqrstuvwxyz') from generate_series(1, 10000000) t(x)",
+        // One window of all rows.
+        "select count(*) from generate_series(1, 1000000) a(x) join generate_series(1, 5000000) b(y) on b.y >= a.x",
+    ] {
+        let ended = outcome(&session, sql).await;
+        assert!(matches!(ended, Err(Error::MemoryLimit { .. })), "{sql}: {ended:?}");
+    }
 }
 
 #[tokio::test]

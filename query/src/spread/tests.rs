@@ -223,6 +223,7 @@ async fn explain_gives_the_decision_and_its_reason() {
         ("select 1", "it reads no table file"),
         ("select count(*) from generate_series(1, 10)", "is not sent to workers"),
         ("select * from nce order by surface_id, pair_id limit 7", "asks for the first rows of an order"),
+        ("select count(*) from nce n asof join measurements m using (run_id, pair_id)", "SortedJoinExec"),
     ] {
         let text = explain(&eager, sql).await;
         assert!(text.contains("not spread over workers: ") && text.contains(reason), "{sql}: {text}");

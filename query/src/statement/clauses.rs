@@ -11,14 +11,11 @@ use datafusion::sql::sqlparser::ast::{
 };
 
 use super::syntax_walk::walk_syntax;
-use super::{hints, tree};
+use super::{as_of_join, hints, tree};
 use crate::Error;
 
 /// Aliases that are the first word of a kind of join which the parser does not know.
-const JOIN_WORDS: [&str; 2] = ["POSITIONAL", "ASOF"];
-
-/// Replacement of an ASOF JOIN.
-const NEAREST: &str = "JOIN ... ON a.t >= b.t QUALIFY row_number() over (partition by a.id order by b.t desc) = 1";
+const JOIN_WORDS: [&str; 1] = ["POSITIONAL"];
 
 /// Accepts statements all of whose clauses are planned.
 ///
@@ -119,10 +116,9 @@ impl Visitor for ClauseVisitor<'_> {
 // A join without a condition would be a cross join.
 fn check_joins(tables: &TableWithJoins) -> Outcome {
     let mut left = &tables.relation;
-    for Join { relation, join_operator, .. } in &tables.joins {
+    for Join { relation, join_operator, global } in &tables.joins {
         if let Some(word) = join_word(left) {
-            let hint = if word == "ASOF" { NEAREST } else { "JOIN ... ON row_number, or quote the alias" };
-            refuse_if(true, &format!("{word} JOIN"), hint)?;
+            refuse_if(true, &format!("{word} JOIN"), "JOIN ... ON row_number, or quote the alias")?;
         }
         let is_bare = matches!(
             join_operator,
@@ -135,7 +131,8 @@ fn check_joins(tables: &TableWithJoins) -> Outcome {
                 | JoinOperator::FullOuter(JoinConstraint::None)
         );
         let is_as_of = matches!(join_operator, JoinOperator::AsOf { .. });
-        refuse_if(is_as_of, "ASOF JOIN", NEAREST)?;
+        refuse_if(is_as_of, "MATCH_CONDITION of a join", as_of_join::FORM)?;
+        refuse_if(*global, "GLOBAL JOIN", "JOIN")?;
         refuse_if(is_bare, "JOIN without ON or USING", "CROSS JOIN if every pair of rows is meant")?;
         left = relation;
     }

@@ -27,7 +27,7 @@ const SYNTAX: [(&str, &str); 30] = [
     ("MATERIALIZED", "WITH t AS (SELECT ...)"),
     ("USING SAMPLE", "WHERE random() < 0.1 takes a tenth of the rows, ORDER BY random() LIMIT 10 takes ten"),
     ("LIMIT # %", "QUALIFY percent_rank() over (order by x) < 0.1, or LIMIT with a number of rows"),
-    ("ASOF", "JOIN ... ON a.t >= b.t QUALIFY row_number() over (partition by a.id order by b.t desc) = 1"),
+    ("ASOF", super::as_of_join::FORM),
     ("PIVOT", PIVOT),
     ("UNPIVOT", UNPIVOT),
     ("FOR VERSION", "t VERSION AS OF 12"),

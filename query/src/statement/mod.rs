@@ -3,9 +3,10 @@
 //! [`parse_statement`] checks the bounds of a text ([`bounds`]) and parses it in the [`dialect`] of HTTP, Flight SQL
 //! and the prompt; Postgres' protocol checks the same bounds and has a parser of its own. [`prepare_statement`] then
 //! takes the steps that are the same for all protocols, in this order: the one [`rewrite`] of the tree, the [`gate`]
-//! and the check of [`clauses`], the planner, and three passes over its plan. The text itself is never rewritten.
+//! and the check of [`clauses`], the planner, and four passes over its plan. The text itself is never rewritten.
 
 mod as_of;
+mod as_of_join;
 mod bounds;
 mod cast_place;
 mod clauses;
@@ -49,6 +50,7 @@ use datafusion::sql::sqlparser::ast::{DescribeAlias, Statement as Sql};
 use datafusion::sql::sqlparser::tokenizer::Tokenizer;
 
 pub(crate) use as_of::{PastTableName, find_past_tables};
+pub(crate) use as_of_join::AsOfSidePlanner;
 pub use bounds::check_statement_bounds;
 pub(crate) use cast_place::find_cast;
 pub(crate) use ending_rules::EndingRule;
@@ -72,10 +74,14 @@ pub(crate) fn parse_statement(sql: &str, recursion_limit: usize) -> Result<State
     check_statement_bounds(sql, &LakeDialect)?;
     let tokens = Tokenizer::new(&LakeDialect, sql).tokenize_with_location();
     let tokens = summarize::read_summarize(tokens.map_err(|e| Error::from_tokenizer(sql, e.into()))?);
+    let (tokens, as_of_joins) = as_of_join::read_as_of_joins(tokens);
     let builder = DFParserBuilder::new(tokens).with_dialect(&LakeDialect).with_recursion_limit(recursion_limit);
     let statements = builder.build().and_then(|mut parser| parser.parse_statements());
     match <[Statement; 1]>::try_from(Vec::from(statements.map_err(|e| Error::from_planning(sql, &e))?)) {
-        Ok([statement]) => Ok(statement),
+        Ok([mut statement]) => {
+            as_of_join::mark_as_of_joins(&mut statement, as_of_joins, sql)?;
+            Ok(statement)
+        }
         Err(none) if none.is_empty() => Err(columns::hinted_error("no statement".into(), "select * from surfaces")),
         Err(_) => {
             let hint = "`echolake sql` takes several, each ended by ;";
@@ -117,6 +123,7 @@ async fn plan_statement(sql: &str, statement: Statement, state: &SessionState) -
     let plan = state.statement_to_plan(statement).await;
     let plan = plan.and_then(placeholders::infer_types).and_then(integer_casts::round_casts);
     let plan = plan.and_then(|plan| declared_types::settle_types(plan, state.config_options()));
+    let plan = plan.and_then(as_of_join::plan_as_of_joins);
     plan.map_err(|e| Error::from_planning(sql, &e))
 }
 

@@ -13,6 +13,7 @@ use datafusion::sql::sqlparser::ast::{
     TableWithJoins, VisitorMut, WildcardAdditionalOptions,
 };
 
+use super::as_of_join::is_as_of_join;
 use super::columns::hinted_error;
 use super::syntax_walk::walk_mut;
 use super::tree::{normalized_name, parse_expr, quoted_ident};
@@ -93,7 +94,7 @@ fn refuse_repeated(joins: &[Join]) -> Result<(), Error> {
             let message = format!("`{column}` is joined by USING again after a RIGHT or FULL JOIN");
             return Err(hinted_error(message, "join by ON, after a FULL JOIN with coalesce(a.x, b.x)".to_owned()));
         }
-        if is_outer(join) && !matches!(join.join_operator, JoinOperator::Left(_) | JoinOperator::LeftOuter(_)) {
+        if is_outer(join) && !is_as_of_join(join) && !is_left(join) {
             merged.extend(columns);
         }
     }
@@ -209,8 +210,14 @@ fn constraint(join: &Join) -> Option<&JoinConstraint> {
     }
 }
 
+// The time of an as-of join differs between its sides, as columns of outer joins do.
 fn is_outer(join: &Join) -> bool {
-    constraint(join).is_some() && !matches!(join.join_operator, JoinOperator::Join(_) | JoinOperator::Inner(_))
+    let is_inner = matches!(join.join_operator, JoinOperator::Join(_) | JoinOperator::Inner(_));
+    constraint(join).is_some() && (!is_inner || is_as_of_join(join))
+}
+
+fn is_left(join: &Join) -> bool {
+    matches!(join.join_operator, JoinOperator::Left(_) | JoinOperator::LeftOuter(_))
 }
 
 fn is_outer_using(join: &Join) -> bool {

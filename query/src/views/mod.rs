@@ -35,9 +35,9 @@ use crate::system::{self, SYSTEM_SCHEMA};
 
 pub(crate) use lazy_view::LazyView;
 pub(crate) use lookup::LookupFunctions;
-pub(crate) use pair_join::PairJoin;
+pub(crate) use pair_join::{PairJoin, scanned_table};
 pub(crate) use sorted_nulls::SortedNulls;
-pub(crate) use unused_join::UnusedJoin;
+pub(crate) use unused_join::{UnusedJoin, has_table_key};
 
 /// A view.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

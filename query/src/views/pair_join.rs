@@ -97,7 +97,7 @@ fn is_measured(plan: &LogicalPlan, key: &Column) -> bool {
 }
 
 /// Returns the table whose rows the plan has, with columns under their own names: `all` of its rows, or some.
-pub(super) fn scanned_table(plan: &LogicalPlan, all: bool) -> Option<Table> {
+pub(crate) fn scanned_table(plan: &LogicalPlan, all: bool) -> Option<Table> {
     match plan {
         LogicalPlan::TableScan(scan) => {
             let provider = source_as_provider(&scan.source).ok()?;

@@ -82,7 +82,12 @@ fn changes_nothing(join: &Join, used: &HashSet<Column>) -> bool {
 }
 
 fn finds_one(right: &LogicalPlan, on: &[(Expr, Expr)]) -> bool {
-    let keys: HashSet<_> = on.iter().filter_map(|(_, key)| key.try_as_col()).map(|key| key.name.as_str()).collect();
-    let key = scanned_table(right, false).map_or(&[] as &[_], Table::key);
-    !key.is_empty() && key.iter().all(|column| keys.contains(column))
+    has_table_key(right, on.iter().filter_map(|(_, key)| key.try_as_col()).map(|key| key.name.as_str()))
+}
+
+/// Returns whether rows of a table of the lake are in a plan, each determined by the columns of these names.
+pub(crate) fn has_table_key<'a>(plan: &LogicalPlan, columns: impl Iterator<Item = &'a str>) -> bool {
+    let columns: HashSet<_> = columns.collect();
+    let key = scanned_table(plan, false).map_or(&[] as &[_], Table::key);
+    !key.is_empty() && key.iter().all(|column| columns.contains(column))
 }

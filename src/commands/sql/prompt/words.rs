@@ -7,10 +7,11 @@ use rustyline::completion::{Completer, Pair};
 use rustyline::{Context, Helper, Highlighter, Hinter, Validator};
 
 /// Words that are completed besides names.
-const KEYWORDS: [&str; 38] = [
+const KEYWORDS: [&str; 39] = [
     "and",
     "as",
     "asc",
+    "asof join",
     "between",
     "by",
     "case",
