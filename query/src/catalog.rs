@@ -35,7 +35,9 @@ use crate::overlay_schema::{NamedTables, OverlaySchema};
 use crate::sorted_join::AsOfFilter;
 use crate::statement::{PastTableName, checked_operators, find_past_tables, walk_statement};
 use crate::system;
-use crate::views::{LakeView, LazyView, LookupFunctions, PairJoin, SortedNulls, UnusedJoin};
+use crate::views::{
+    EagerAggregation, LakeView, LazyView, LookupFunctions, PairJoin, PercentileCalls, SortedNulls, UnusedJoin,
+};
 use crate::{Error, error};
 
 /// Time for which a new layout of the same rows may go undetected; vacuum keeps replaced files for an hour at least.
@@ -47,8 +49,15 @@ const REMOTE_CHECK_LASTS: Duration = Duration::from_secs(1);
 const PAST_TABLES: usize = 32;
 
 /// Returns the optimizer rules for plans over tables and views: the same for every snapshot and every reader.
-pub(crate) fn optimizer_rules(lookups: &LookupFunctions) -> [Arc<dyn OptimizerRule + Send + Sync>; 4] {
-    [Arc::new(UnusedJoin), Arc::new(PairJoin::new(lookups)), Arc::new(SortedNulls), Arc::new(AsOfFilter)]
+pub(crate) fn optimizer_rules(lookups: &LookupFunctions) -> [Arc<dyn OptimizerRule + Send + Sync>; 6] {
+    [
+        Arc::new(UnusedJoin),
+        Arc::new(PairJoin::new(lookups)),
+        Arc::new(EagerAggregation::new(lookups)),
+        Arc::new(PercentileCalls::new()),
+        Arc::new(SortedNulls),
+        Arc::new(AsOfFilter),
+    ]
 }
 
 /// Registers the tables of a lake in a query's context. It is what a right has: the lake as readers with this right see
@@ -320,15 +329,25 @@ impl LakeCatalog {
             Some(version) => self.lake.commit_log().commit_tag(Table::Runs, version).await?,
             None => None,
         };
-        let mut tables = HashMap::new();
+        let mut tables: HashMap<Table, Arc<LakeTable>> = HashMap::new();
         for table in Table::ALL {
             let files = snapshot.files(table);
-            let is_same = |before: &&Arc<LakeTable>| before.is_of(files) && !before.is_faulty();
+            let measured = tables.get(&Table::Tnce).filter(|_| table == Table::TnceD4);
+            let is_same = |before: &&Arc<LakeTable>| {
+                let has_measured = before.measured_rows().map(Arc::as_ptr) == measured.map(Arc::as_ptr);
+                before.is_of(files) && !before.is_faulty() && has_measured
+            };
             let known = before.and_then(|b| b.tables.get(&table));
             let kept = known.filter(is_same);
             let provider = match kept.filter(|_| snapshot.check_table(table).is_ok()) {
                 Some(kept) => kept.clone(),
-                None => Arc::new(self.open_table(table, files, known.map(AsRef::as_ref))?.of_snapshot(&snapshot)),
+                None => {
+                    let opened = self.open_table(table, files, known.map(AsRef::as_ref))?.of_snapshot(&snapshot);
+                    Arc::new(match measured {
+                        Some(measured) => opened.with_measured(measured),
+                        None => opened,
+                    })
+                }
             };
             tables.insert(table, provider);
         }

@@ -19,6 +19,7 @@ use datafusion::physical_expr::ScalarFunctionExpr;
 use datafusion::physical_plan::ExecutionPlan;
 use datafusion_proto::bytes::physical_plan_to_bytes_with_extension_codec;
 use datafusion_proto::physical_plan::{PhysicalExtensionCodec, PhysicalProtoConverterExtension};
+use echolake_functions::shared_percentiles;
 use echolake_mcap_tables::{McapFiles, decode_mcap_scan, encode_mcap_scan};
 
 use crate::QueryEngine;
@@ -64,6 +65,7 @@ impl QueryEngine {
             // Only a closed registry would refuse.
             let _ = state.register_udf(function);
         }
+        let _ = state.register_udaf(Arc::new(shared_percentiles()));
         state
     }
 

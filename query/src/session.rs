@@ -578,10 +578,16 @@ mod turns_tests;
 mod attempts;
 
 #[cfg(test)]
+mod eager_aggregation_tests;
+
+#[cfg(test)]
 mod escape_tests;
 
 #[cfg(test)]
 pub(crate) mod function_tests;
+
+#[cfg(test)]
+mod percentile_tests;
 
 #[cfg(test)]
 mod plan_tests;

@@ -29,6 +29,7 @@ pub use standard::exact_aggregates::exact_aggregates;
 pub use standard::list_members::{ANY_EQUAL, list_membership};
 pub use standard::number_ranges::whole_number_ranges;
 pub use standard::octet_length::octet_length_of_bytes;
+pub use standard::shared_percentiles::shared_percentiles;
 pub use standard::text_concatenation::text_concatenation;
 pub use standard::time_patterns::pattern_functions;
 pub use standard::unified_floats::{FloatForm, UnifiedFloat, unified_floats};

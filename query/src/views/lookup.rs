@@ -22,6 +22,8 @@ pub(crate) struct LookupFunctions(Vec<Arc<ScalarUDF>>);
 
 /// Prefix of the lookup functions for columns of `pairs`.
 const OF_PAIR: &str = "pair_";
+/// Prefix of the lookup functions by pair and symmetry.
+const OF_MOVED: &str = "d4_";
 /// The function of the field that views call.
 const OF_ROOMS: &str = "room_parameters";
 
@@ -56,6 +58,32 @@ impl LookupFunctions {
     /// Returns the lookup function of a column of `pairs`.
     pub fn of_pair(&self, column: &str) -> Option<&Arc<ScalarUDF>> {
         self.0.iter().find(|function| function.name().strip_prefix(OF_PAIR) == Some(column))
+    }
+
+    /// Returns the lookup function of a column of `tnce_d4` that follows from pair and symmetry.
+    pub fn of_moved_pair(&self, column: &str) -> Option<&Arc<ScalarUDF>> {
+        let is_moved = column.starts_with(OF_MOVED) || column.ends_with("_mm") || column == "swapped";
+        let column = Some(column.strip_prefix(OF_MOVED).unwrap_or(column)).filter(|_| is_moved)?;
+        self.0.iter().find(|function| function.name().strip_prefix(OF_MOVED) == Some(column))
+    }
+
+    /// Returns the symmetries under which each pair has another one, with their ids.
+    pub fn moved_symmetries(&self) -> Vec<(i32, Symmetry)> {
+        let moved = self.of_moved_pair("d4_pair_id").and_then(|moved| moved.inner().downcast_ref::<LookupFunction>());
+        let has = |id: usize| moved.is_some_and(|moved| moved.pairs > 0 && moved.values.is_valid(id * moved.pairs));
+        let all = Symmetry::ALL.into_iter().enumerate();
+        all.filter(|(id, _)| has(*id)).map(|(id, symmetry)| (id as i32, symmetry)).collect()
+    }
+
+    /// Returns whether a function looks a value up by pair, or by pair and symmetry.
+    pub fn is_lookup(&self, function: &ScalarUDF) -> bool {
+        function.inner().downcast_ref::<LookupFunction>().is_some()
+    }
+
+    /// Returns the number of the rig's pairs.
+    pub fn count_pairs(&self) -> u64 {
+        let lookup = self.0.iter().find_map(|function| function.inner().downcast_ref::<LookupFunction>());
+        lookup.map_or(0, |lookup| lookup.pairs as u64)
     }
 
     /// Returns the functions.
@@ -97,7 +125,10 @@ fn moved_lookups(grid: &Grid) -> Vec<LookupFunction> {
         let speaker = axis(|g, m| g.point(m.pair.speaker).map(|p| p.position_mm), i);
         columns.extend([(format!("microphone_{name}"), microphone), (format!("speaker_{name}"), speaker)]);
     }
-    columns.into_iter().map(|(name, values)| LookupFunction::new("d4_", &name, values, grid.pairs().len(), 2)).collect()
+    columns
+        .into_iter()
+        .map(|(name, values)| LookupFunction::new(OF_MOVED, &name, values, grid.pairs().len(), 2))
+        .collect()
 }
 
 impl LookupFunction {

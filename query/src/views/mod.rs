@@ -5,12 +5,14 @@
 
 mod augmented;
 mod catalogue;
+mod eager_aggregation;
 mod ir;
 mod lazy_view;
 mod levels;
 mod lookup;
 mod materials;
 mod pair_join;
+mod percentile_calls;
 mod room_parameters;
 mod sorted_nulls;
 mod tnce_db;
@@ -33,9 +35,11 @@ use futures::FutureExt as _;
 
 use crate::system::{self, SYSTEM_SCHEMA};
 
+pub(crate) use eager_aggregation::EagerAggregation;
 pub(crate) use lazy_view::LazyView;
 pub(crate) use lookup::LookupFunctions;
 pub(crate) use pair_join::{PairJoin, scanned_table};
+pub(crate) use percentile_calls::PercentileCalls;
 pub(crate) use sorted_nulls::SortedNulls;
 pub(crate) use unused_join::{UnusedJoin, has_table_key};
 

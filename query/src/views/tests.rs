@@ -17,7 +17,7 @@ use crate::{Error, Session};
 /// Pairs that each run of the lake measures.
 const PAIRS: usize = 3;
 /// Tables with rows in these tests.
-const TABLES: [Table; 6] =
+pub(crate) const TABLES: [Table; 6] =
     [Table::Surfaces, Table::Measurements, Table::Nce, Table::Tnce, Table::Heightmaps, Table::Runs];
 
 async fn lake() -> (tempfile::TempDir, Lake) {
@@ -58,6 +58,17 @@ fn column(table: Table, field: &Field, surface: &str, run: &str) -> ArrayRef {
 
 /// Adds a run to a lake, as ingest does.
 pub(crate) async fn put(lake: &Lake, surface: &str, run: &str) {
+    put_columns(lake, surface, run, &TABLES, &|table, field| column(table, field, surface, run)).await;
+}
+
+/// The same, with these columns of some tables, the last of which is `runs`.
+pub(crate) async fn put_columns(
+    lake: &Lake,
+    surface: &str,
+    run: &str,
+    tables: &[Table],
+    column: &dyn Fn(Table, &Field) -> ArrayRef,
+) {
     let pointer = VisibleRun {
         surface: surface.parse().expect("an id"),
         run: run.parse().expect("an id"),
@@ -67,9 +78,9 @@ pub(crate) async fn put(lake: &Lake, surface: &str, run: &str) {
     };
     let rows = FileName::Rows { surface: pointer.surface.clone(), run: pointer.run.clone(), derivation: "ab".into() };
     let mut staged = Vec::new();
-    for table in TABLES {
+    for table in tables.iter().copied() {
         let schema = table.schema(lake.rig());
-        let columns = schema.fields().iter().map(|f| column(table, f, surface, run)).collect();
+        let columns = schema.fields().iter().map(|f| column(table, f)).collect();
         let file = encode_batches(table, &schema, &[RecordBatch::try_new(schema.clone(), columns).expect("rows")]);
         let name = if table == Table::Runs { FileName::Pointer(pointer.clone()) } else { rows.clone() };
         let file = lake.stage_file(table, &name, file.expect("encoded")).await.expect("staged");

@@ -52,6 +52,26 @@ pub struct LakeTable {
     is_small: bool,
     /// The snapshot, if it has a fault in this table: it is refused.
     faulty: Option<Arc<LakeSnapshot>>,
+    /// Of `tnce_d4`: `tnce`.
+    measured: Option<Arc<LakeTable>>,
+}
+
+/// What readers see of a table.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct TableSize {
+    /// Its rows.
+    pub rows: u64,
+    /// Runs with rows in it, about.
+    pub runs: u64,
+}
+
+impl TableSize {
+    fn from_files<'a>(files: impl Iterator<Item = &'a DataFile>) -> Self {
+        files.fold(Self::default(), |size, file| Self {
+            rows: size.rows + file.visible_rows(),
+            runs: size.runs + if file.parts.is_empty() { 1 } else { file.visible_parts().count() as u64 },
+        })
+    }
 }
 
 /// Readers of data files, shared by all tables.
@@ -100,13 +120,23 @@ impl LakeTable {
         let is_restricted = source.is_restricted;
         let before = before.filter(|before| before.schema == schema && before.source.is_restricted == is_restricted);
         let files = ScanFiles::new(files, &schema, is_restricted, before.map(|before| &before.files))?;
-        Ok(Self { table, schema, columns, files, source, is_small, faulty: None })
+        Ok(Self { table, schema, columns, files, source, is_small, faulty: None, measured: None })
     }
 
     /// Makes it the table of this snapshot, which is refused if the snapshot has a fault in it.
     pub fn of_snapshot(self, snapshot: &Arc<LakeSnapshot>) -> Self {
         let faulty = snapshot.check_table(self.table).is_err().then(|| snapshot.clone());
         Self { faulty, ..self }
+    }
+
+    /// Makes it the table of the same rows moved by symmetries.
+    pub fn with_measured(self, measured: &Arc<Self>) -> Self {
+        Self { measured: Some(measured.clone()), ..self }
+    }
+
+    /// Returns the table whose rows this one has, moved by symmetries.
+    pub fn measured_rows(&self) -> Option<&Arc<Self>> {
+        self.measured.as_ref()
     }
 
     /// Returns whether queries of it are refused.
@@ -122,6 +152,11 @@ impl LakeTable {
     /// Returns which table it is.
     pub fn table(&self) -> Table {
         self.table
+    }
+
+    /// Returns how many rows and runs it has.
+    pub fn table_size(&self) -> TableSize {
+        TableSize::from_files(self.files.files.iter().map(|file| &*file.file))
     }
 
     // Prunes files by their statistics in the log. DataFusion would prune them, too, but only after opening each; a

@@ -5,11 +5,12 @@ mod boxed_scan;
 mod column_store;
 mod held_scan;
 mod lake_table;
+mod leading_filter;
 mod local_scans;
 mod readers;
 mod scan_files;
 
 pub use column_store::ColumnStore;
-pub use lake_table::{FileReaders, LakeTable};
+pub use lake_table::{FileReaders, LakeTable, TableSize};
 pub use local_scans::rewrite_local_scans;
 pub use readers::LakeReaderFactory;

@@ -8,6 +8,8 @@
 //! - such a scan of small files reads all their rows. For each file that it opens, DataFusion's Parquet source
 //!   adapts the query's filters to the file, and plans by them which row groups and pages to read: for a file of a few
 //!   thousand rows that takes longer than reading them. The filters stand above the scan, too;
+//! - another scan for the first rows of an order reads the order's first column alone of most rows ([`LeadingFilter`]). It
+//!   skips row groups by their statistics, too, but few: each has rows of many surfaces, and so nearly all values;
 //! - other scans read through this process' cache and its footers, also those of a plan that came over the wire.
 //!
 //! The plan's nodes keep their partitions, orders, statistics and rows, so that nodes above need not be planned again.
@@ -17,13 +19,19 @@ use std::sync::Arc;
 use datafusion::datasource::physical_plan::{FileScanConfig, FileScanConfigBuilder, FileSource, ParquetSource};
 use datafusion::datasource::source::{DataSource, DataSourceExec};
 use datafusion::error::Result;
+use datafusion::physical_expr::PhysicalExpr;
 use datafusion::physical_plan::ExecutionPlan;
 use datafusion::physical_plan::aggregates::AggregateExec;
 use datafusion::physical_plan::execution_plan::{ChildrenPropertiesMode, ReplaceChildrenOptions};
+use datafusion::physical_plan::filter::FilterExec;
+use datafusion::physical_plan::projection::ProjectionExec;
+use datafusion::physical_plan::repartition::RepartitionExec;
 use datafusion::physical_plan::sorts::sort::SortExec;
+use datafusion::physical_plan::union::UnionExec;
 
 use crate::held_scan::HeldScan;
 use crate::lake_table::FileReaders;
+use crate::leading_filter::LeadingFilter;
 
 /// Rows below which a file without wanted lists is read as a whole, whatever filters there are.
 const SMALL_FILE_ROWS: usize = 65_536;
@@ -33,24 +41,48 @@ const SMALL_FILE_ROWS: usize = 65_536;
 /// # Errors
 /// If a scan's expressions do not fit its columns.
 pub fn rewrite_local_scans(plan: Arc<dyn ExecutionPlan>, readers: &FileReaders) -> Result<Arc<dyn ExecutionPlan>> {
-    rewrite_node(plan, readers, &mut Vec::new())
+    rewrite_node(plan, readers, WantedRows::All, &mut Vec::new())
+}
+
+/// The rows of a node that the nodes above it want.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum WantedRows {
+    All,
+    /// The first ones of an order.
+    First,
+}
+
+impl WantedRows {
+    fn of_children(self, plan: &dyn ExecutionPlan) -> Self {
+        if let Some(sort) = plan.downcast_ref::<SortExec>() {
+            return if sort.fetch().is_some() { Self::First } else { Self::All };
+        }
+        let keeps_rows = plan.is::<FilterExec>()
+            || plan.is::<ProjectionExec>()
+            || plan.is::<RepartitionExec>()
+            || plan.is::<UnionExec>();
+        if keeps_rows { self } else { Self::All }
+    }
 }
 
 // `bounds` are the ids of filters that nodes above give their scans while they run, see [`produced_bounds`].
 fn rewrite_node(
     plan: Arc<dyn ExecutionPlan>,
     readers: &FileReaders,
+    wanted: WantedRows,
     bounds: &mut Vec<u64>,
 ) -> Result<Arc<dyn ExecutionPlan>> {
     if plan.children().is_empty() {
         let scan = plan.downcast_ref::<DataSourceExec>();
-        return Ok(scan.map_or(Ok(None), |scan| local_scan(scan.data_source(), readers, bounds))?.unwrap_or(plan));
+        let local = scan.map_or(Ok(None), |scan| local_scan(scan.data_source(), readers, wanted, bounds));
+        return Ok(local?.unwrap_or(plan));
     }
+    let wanted = wanted.of_children(plan.as_ref());
     bounds.extend(produced_bounds(plan.as_ref()));
     let mut is_changed = false;
     let mut children = Vec::with_capacity(plan.children().len());
     for child in plan.children() {
-        let rewritten = rewrite_node(child.clone(), readers, bounds)?;
+        let rewritten = rewrite_node(child.clone(), readers, wanted, bounds)?;
         is_changed |= !Arc::ptr_eq(child, &rewritten);
         children.push(rewritten);
     }
@@ -72,6 +104,7 @@ fn produced_bounds(plan: &dyn ExecutionPlan) -> Vec<u64> {
 fn local_scan(
     data_source: &Arc<dyn DataSource>,
     readers: &FileReaders,
+    wanted: WantedRows,
     bounds: &[u64],
 ) -> Result<Option<Arc<dyn ExecutionPlan>>> {
     let Some(scan) = data_source.downcast_ref::<FileScanConfig>() else { return Ok(None) };
@@ -82,6 +115,7 @@ fn local_scan(
     if let Some(held) = HeldScan::try_from_scan(data_source, scan, source, readers, bounds)? {
         return Ok(Some(Arc::new(DataSourceExec::new(Arc::new(held)))));
     }
+    let found_rows = Some(source).filter(|_| wanted == WantedRows::First).and_then(leading_predicate);
     let source: Arc<dyn FileSource> = if has_spare_filters(scan, source)? {
         let unfiltered = readers.parquet_source(scan.file_source().table_schema().clone());
         let unfiltered = unfiltered.with_table_parquet_options(source.table_parquet_options().clone());
@@ -90,10 +124,16 @@ fn local_scan(
             Some(projected) => projected,
             None => return Ok(None),
         }
-    } else if source.parquet_file_reader_factory().is_some_and(|own| Arc::ptr_eq(own, &readers.reader)) {
+    } else if found_rows.is_none()
+        && source.parquet_file_reader_factory().is_some_and(|own| Arc::ptr_eq(own, &readers.reader))
+    {
         return Ok(None);
     } else {
         let source = source.clone().with_parquet_file_reader_factory(readers.reader.clone());
+        let source = match found_rows {
+            Some(predicate) => source.with_predicate(predicate).with_pushdown_filters(true),
+            None => source,
+        };
         match readers.footer_bytes {
             Some(bytes) => Arc::new(source.with_metadata_size_hint(bytes)),
             None => Arc::new(source),
@@ -101,6 +141,13 @@ fn local_scan(
     };
     let local = FileScanConfigBuilder::from(scan.clone()).with_source(source).build();
     Ok(Some(DataSourceExec::from_data_source(local)))
+}
+
+// The predicate of a scan that becomes narrower while rows are found, so that it pays to test rows; None if it does not,
+// or if the scan tests them anyway.
+fn leading_predicate(source: &ParquetSource) -> Option<Arc<dyn PhysicalExpr>> {
+    let is_tested = source.table_parquet_options().global.pushdown_filters;
+    source.filter().filter(|_| !is_tested).and_then(|predicate| LeadingFilter::prepend_to(&predicate))
 }
 
 // Whether reading the whole files and filtering the rows above is faster.

@@ -23,6 +23,9 @@ use crate::{Error, Result};
 const PAGE_BYTES: usize = 128 * 1024;
 /// Size that a row group grows to, before encoding.
 const ROW_GROUP_BYTES: usize = 64 << 20;
+/// Rows of a row group of a table without lists, at most: about sixteen runs of the paper's grid. A reader that looks
+/// for the highest values reads few groups to their end, and of the others only the rows that it needs.
+const ROW_GROUP_ROWS: usize = 48 << 10;
 /// Of the levels of zstd, 1: samples become 1.3 to 2.2 points larger than at 3 and are written a sixth to a half
 /// faster.
 const ZSTD_LEVEL: i32 = 1;
@@ -167,7 +170,9 @@ pub fn encode_batches(table: Table, schema: &SchemaRef, batches: &[RecordBatch])
 fn writer_properties(table: Table, schema: &SchemaRef, first: &RecordBatch) -> WriterProperties {
     let rows = first.num_rows();
     let bytes = first.get_array_memory_size();
-    let rows_a_group = if rows == 0 { 1 } else { (ROW_GROUP_BYTES * rows / bytes.max(1)).max(1) };
+    let has_lists = schema.fields().iter().any(|field| field.data_type().is_nested());
+    let most_rows = if has_lists { usize::MAX } else { ROW_GROUP_ROWS };
+    let rows_a_group = if rows == 0 { 1 } else { (ROW_GROUP_BYTES * rows / bytes.max(1)).clamp(1, most_rows) };
     let mut builder = WriterProperties::builder()
         .set_compression(Compression::ZSTD(ZstdLevel::try_new(ZSTD_LEVEL).unwrap_or_default()))
         .set_created_by(concat!("echolake ", env!("CARGO_PKG_VERSION")).to_owned())

@@ -7,6 +7,7 @@ pub(crate) mod exact_aggregates;
 pub(crate) mod list_members;
 pub(crate) mod number_ranges;
 pub(crate) mod octet_length;
+pub(crate) mod shared_percentiles;
 pub(crate) mod text_concatenation;
 pub(crate) mod time_patterns;
 pub(crate) mod unified_floats;
