@@ -264,10 +264,12 @@ fn generate_query(numbers: &mut NumberStream) -> String {
 
 fn check_schema(sql: &str, expected: &SchemaRef, schema: &SchemaRef) {
     let fields = |schema: &SchemaRef| -> Vec<_> {
-        let facts = |field: &Arc<Field>| (field.name().clone(), field.data_type().clone(), field.is_nullable());
-        schema.fields().iter().map(facts).collect()
+        schema.fields().iter().map(|field| (field.name().clone(), field.data_type().clone())).collect()
     };
     assert_eq!(fields(expected), fields(schema), "{sql}");
+    // `coalesce(flag, false)` is an AND for DataFusion, which may be null for it.
+    let is_stricter = |(own, expected): (&Arc<Field>, &Arc<Field>)| expected.is_nullable() && !own.is_nullable();
+    assert!(!schema.fields().iter().zip(expected.fields()).any(is_stricter), "{sql}");
 }
 
 /// A lake with runs of different values.
@@ -345,14 +347,13 @@ async fn aggregates_stand_below_joins_where_they_split() {
          join pairs p on p.pair_id = t.pair_id group by d order by d",
         "select avg(p.incidence_deg) from tnce t join pairs p on p.pair_id = t.pair_id",
         "select symmetry, swapped, count(*), avg(microphone_x_mm * speaker_x_mm) from augmented group by 1, 2",
-        "select distinct s.typology from measurements t join surfaces s using (surface_id)",
         "select s.side, sum(t.x) from (select surface_id, temperature_c * 2 as x from measurements) t \
          left join surfaces s using (surface_id) group by 1",
     ];
     for sql in first {
         let plan = check_query(&engine, &lookups, sql).await;
         let inner = plan.lines().filter(|line| line.contains("AggregateExec")).next_back().expect("an aggregate");
-        assert!(aggregates_first(&plan) || sql.contains("distinct"), "{sql}: {plan}");
+        assert!(aggregates_first(&plan), "{sql}: {plan}");
         if plan.contains("Join") {
             let join = plan.find("Join").expect("a join");
             assert!(plan.find(inner).expect("the lowest aggregate") > join, "{sql}: {plan}");
@@ -374,9 +375,9 @@ async fn aggregates_stand_below_joins_where_they_split() {
     for sql in last {
         assert!(!aggregates_first(&check_query(&engine, &lookups, sql).await), "{sql}");
     }
-    // As it is outside of tests, few rows are joined as they are.
+    // As it is outside of tests, rows that are fewer than pairs are joined as they are.
     let context = engine.create_context();
-    let (_, plan) = plan_in(&context, &engine, first[0]).await.expect("planned");
+    let (_, plan) = plan_in(&context, &engine, first[1]).await.expect("planned");
     assert!(!aggregates_first(&displayable(plan.as_ref()).indent(false).to_string()));
 }
 

@@ -2,6 +2,7 @@
 //! and the moved pair. Aggregates over `tnce_d4` then read an eighth of the rows, and narrower ones. The stored table stays
 //! for other readers, and for all other queries.
 
+use arrow::datatypes::{Field, FieldRef};
 use datafusion::common::Column;
 use datafusion::datasource::{provider_as_source, source_as_provider};
 use datafusion::functions::core::coalesce;
@@ -49,7 +50,7 @@ impl SymmetryRows {
         let symmetries = symmetries.project(named).ok()?.alias(SYMMETRIES).ok()?;
         let measured = LogicalPlanBuilder::scan(Table::Tnce.name(), provider_as_source(measured.clone()), None).ok()?;
         let measured = measured.build().ok()?;
-        let column = |field: &arrow::datatypes::FieldRef| {
+        let column = |field: &FieldRef| {
             moved_column(field, lookups).or_else(|| {
                 let place = measured.schema().index_of_column_by_name(None, field.name())?;
                 let (relation, own) = measured.schema().qualified_field(place);
@@ -64,7 +65,7 @@ impl SymmetryRows {
 
 // A column of the symmetry, or of the pair that it moves the measured one to. The lookups' results may be null, the
 // table's columns are not.
-fn moved_column(field: &arrow::datatypes::Field, lookups: &LookupFunctions) -> Option<Expr> {
+fn moved_column(field: &Field, lookups: &LookupFunctions) -> Option<Expr> {
     let of_symmetries = |name: &str| Expr::Column(Column::new(Some(SYMMETRIES), name));
     if field.name() == SYMMETRY {
         return Some(of_symmetries(SYMMETRY));
