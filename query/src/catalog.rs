@@ -33,7 +33,7 @@ use crate::contributions::{AnnotationCache, KnownVerdicts, with_pending_rows, wi
 use crate::listed_verdicts::listed_rejection;
 use crate::overlay_schema::{NamedTables, OverlaySchema};
 use crate::sorted_join::AsOfFilter;
-use crate::statement::{PastTableName, checked_operators, find_past_tables, walk_statement};
+use crate::statement::{PastTableName, checked_operators, end_joins, find_past_tables, walk_statement};
 use crate::system;
 use crate::views::{
     EagerAggregation, LakeView, LazyView, LookupFunctions, PairJoin, PercentileCalls, SortedNulls, UnusedJoin,
@@ -128,12 +128,13 @@ impl LakeCatalog {
         &self.runs
     }
 
-    /// Replaces the scans of a plan by what this process holds of the files, just before it runs here.
+    /// Replaces the scans of a plan by what this process holds of the files, just before it runs here, and makes joins end
+    /// with their statement.
     ///
     /// # Errors
     /// If a scan does not fit its table.
     pub fn rewrite_local_scans(&self, plan: Arc<dyn ExecutionPlan>) -> Result<Arc<dyn ExecutionPlan>, DataFusionError> {
-        rewrite_local_scans(plan, &self.source)
+        rewrite_local_scans(end_joins(plan)?, &self.source)
     }
 
     /// Registers everything that `statement` may name, all of one snapshot of the lake, and the program's own tables in

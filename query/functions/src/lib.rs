@@ -26,7 +26,9 @@ use responses::{band_energy, decay, nce, octave_band, rise, room_parameters, spe
 pub use standard::call_limits::{check_fixed_type, limited_functions};
 pub use standard::call_stop::{StopFlag, check_stop, set_planning};
 pub use standard::exact_aggregates::exact_aggregates;
+pub use standard::limited_aggregates::{limited_aggregates, limited_windows};
 pub use standard::list_members::{ANY_EQUAL, list_membership};
+pub use standard::list_texts::{ending_condition, list_text};
 pub use standard::number_ranges::whole_number_ranges;
 pub use standard::octet_length::octet_length_of_bytes;
 pub use standard::shared_percentiles::shared_percentiles;

@@ -12,10 +12,12 @@ use datafusion::execution::runtime_env::{RuntimeEnv, RuntimeEnvBuilder};
 use datafusion::execution::session_state::{SessionState, SessionStateBuilder};
 use datafusion::functions_nested::min_max::array_min_udf;
 use datafusion::optimizer::{Optimizer, OptimizerRule};
+use datafusion::physical_optimizer::PhysicalOptimizerRule;
+use datafusion::physical_optimizer::optimizer::PhysicalOptimizer;
 use datafusion::prelude::SessionConfig;
 use echolake_functions::{
-    FunctionSet, exact_aggregates, limited_functions, list_membership, octet_length_of_bytes, pattern_functions,
-    whole_number_ranges, zone_time,
+    FunctionSet, exact_aggregates, limited_aggregates, limited_functions, limited_windows, list_membership,
+    octet_length_of_bytes, pattern_functions, whole_number_ranges, zone_time,
 };
 use echolake_lake::Lake;
 use echolake_lake_tables::{ColumnStore, FileReaders, LakeReaderFactory};
@@ -30,7 +32,8 @@ use crate::control::turns::TurnQueue;
 use crate::sorted_join::SortedJoinPlanner;
 use crate::spread::{ReadOnlyStore, WorkerCluster};
 use crate::statement::{
-    AsOfSidePlanner, EndingRule, FloatForms, IntegerArithmetic, LimitedOperators, SubqueryConditions,
+    AsOfSidePlanner, EndingPhysicalRule, EndingRule, FloatForms, IntegerArithmetic, LimitedOperators,
+    SubqueryConditions,
 };
 use crate::views::LookupFunctions;
 use crate::{Error, OpaqueValue};
@@ -183,6 +186,8 @@ fn build_template(
     let conditions: Arc<dyn OptimizerRule + Send + Sync> = Arc::new(SubqueryConditions);
     let rules = std::iter::once(conditions).chain(Optimizer::new().rules).chain(rules);
     let ending = |rule| -> Arc<dyn OptimizerRule + Send + Sync> { Arc::new(EndingRule(rule)) };
+    let physical = PhysicalOptimizer::new().rules.into_iter();
+    let ending_physical = |rule| -> Arc<dyn PhysicalOptimizerRule + Send + Sync> { Arc::new(EndingPhysicalRule(rule)) };
     let mut state = SessionStateBuilder::new()
         .with_config(session_config())
         .with_runtime_env(runtime)
@@ -190,6 +195,7 @@ fn build_template(
         .with_analyzer_rule(Arc::new(IntegerArithmetic))
         .with_analyzer_rule(Arc::new(FloatForms))
         .with_optimizer_rules(rules.map(ending).collect())
+        .with_physical_optimizer_rules(physical.map(ending_physical).collect())
         .with_relation_planners(vec![Arc::new(AsOfSidePlanner)])
         .with_query_planner(Arc::new(SortedJoinPlanner))
         .build();
@@ -227,6 +233,12 @@ fn limit_calls(mut state: SessionState) -> SessionState {
     let limited: Vec<_> = limited.into_iter().map(Arc::new).collect();
     for function in &limited {
         let _ = state.register_udf(function.clone());
+    }
+    for function in limited_aggregates() {
+        let _ = state.register_udaf(Arc::new(function));
+    }
+    for function in limited_windows() {
+        let _ = state.register_udwf(Arc::new(function));
     }
     let rule = LimitedOperators::new(&limited);
     SessionStateBuilder::new_from_existing(state).with_analyzer_rule(Arc::new(rule)).build()

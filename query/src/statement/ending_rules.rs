@@ -1,14 +1,21 @@
-//! Rules of the optimizer that end with their statement: planning waits for nothing, so that a large plan would be
-//! optimized to its end after its statement was cancelled.
+//! What ends with its statement, although it waits for nothing: a large plan would be optimized to its end after its
+//! statement was cancelled, and a join would look at all pairs of a batch.
 
 use std::sync::Arc;
 
 use datafusion::common::tree_node::Transformed;
+use datafusion::config::ConfigOptions;
 use datafusion::error::Result;
 use datafusion::logical_expr::LogicalPlan;
 use datafusion::optimizer::optimizer::ApplyOrder;
 use datafusion::optimizer::{OptimizerConfig, OptimizerRule};
-use echolake_functions::check_stop;
+use datafusion::physical_expr::ScalarFunctionExpr;
+use datafusion::physical_optimizer::{PhysicalOptimizerContext, PhysicalOptimizerRule};
+use datafusion::physical_plan::ExecutionPlan;
+use datafusion::physical_plan::execution_plan::{ChildrenPropertiesMode, ReplaceChildrenOptions};
+use datafusion::physical_plan::joins::utils::JoinFilter;
+use datafusion::physical_plan::joins::{NestedLoopJoinExec, NestedLoopJoinExecBuilder};
+use echolake_functions::{check_stop, ending_condition};
 
 /// A rule that is applied to no further node once its statement has ended.
 #[derive(Debug)]
@@ -27,4 +34,61 @@ impl OptimizerRule for EndingRule {
         check_stop()?;
         self.0.rewrite(plan, config)
     }
+}
+
+/// A rule of physical plans that does not begin once its statement has ended.
+#[derive(Debug)]
+pub(crate) struct EndingPhysicalRule(pub Arc<dyn PhysicalOptimizerRule + Send + Sync>);
+
+impl PhysicalOptimizerRule for EndingPhysicalRule {
+    fn name(&self) -> &str {
+        self.0.name()
+    }
+
+    fn schema_check(&self) -> bool {
+        self.0.schema_check()
+    }
+
+    fn optimize(&self, plan: Arc<dyn ExecutionPlan>, options: &ConfigOptions) -> Result<Arc<dyn ExecutionPlan>> {
+        check_stop()?;
+        self.0.optimize(plan, options)
+    }
+
+    fn optimize_with_context(
+        &self,
+        plan: Arc<dyn ExecutionPlan>,
+        context: &dyn PhysicalOptimizerContext,
+    ) -> Result<Arc<dyn ExecutionPlan>> {
+        check_stop()?;
+        self.0.optimize_with_context(plan, context)
+    }
+}
+
+/// Makes the joins of a plan that look at all pairs ask, for each row of one side, whether the statement goes on. It is
+/// called just before the plan runs: no plan crosses the wire after it.
+///
+/// # Errors
+/// None but those of DataFusion's own constructors.
+pub(crate) fn end_joins(plan: Arc<dyn ExecutionPlan>) -> Result<Arc<dyn ExecutionPlan>> {
+    let mut is_changed = false;
+    let mut children = Vec::with_capacity(plan.children().len());
+    for child in plan.children() {
+        let ended = end_joins(child.clone())?;
+        is_changed |= !Arc::ptr_eq(child, &ended);
+        children.push(ended);
+    }
+    // Nodes keep what they share with those below, as the filters of found rows.
+    let plan = match is_changed {
+        true => plan.replace_children(children, ReplaceChildrenOptions::new(ChildrenPropertiesMode::Keep))?,
+        false => plan,
+    };
+    let Some(join) = plan.downcast_ref::<NestedLoopJoinExec>() else { return Ok(plan) };
+    let Some(filter) = join.filter() else { return Ok(plan) };
+    let field = filter.expression().return_field(filter.schema())?;
+    let function = ending_condition();
+    let name = function.name().to_owned();
+    let args = vec![filter.expression().clone()];
+    let condition = ScalarFunctionExpr::new(&name, function, args, field, Arc::new(ConfigOptions::new()));
+    let filter = JoinFilter::new(Arc::new(condition), filter.column_indices().to_vec(), filter.schema().clone());
+    Ok(Arc::new(NestedLoopJoinExecBuilder::from(join).with_filter(Some(filter)).build()?))
 }

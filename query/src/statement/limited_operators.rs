@@ -1,6 +1,6 @@
 //! Operators and casts that make much of little, for processes whose memory is limited: `a || b` of texts becomes a
-//! function with a limit, and so does `a ~ b`; functions that stand for operators on lists get theirs, and no cast makes a value of a huge
-//! fixed size. See [`limited_functions`].
+//! function with a limit, and so does `a ~ b`; functions that stand for operators on lists get theirs. A cast of lists to
+//! text ends with its statement, and no cast makes a value of a huge fixed size. See [`limited_functions`].
 //!
 //! [`limited_functions`]: echolake_functions::limited_functions
 
@@ -17,7 +17,7 @@ use datafusion::logical_expr::expr_rewriter::NamePreserver;
 use datafusion::logical_expr::utils::merge_schema;
 use datafusion::logical_expr::{BinaryExpr, Expr, ExprSchemable as _, LogicalPlan, Operator, ScalarUDF};
 use datafusion::optimizer::AnalyzerRule;
-use echolake_functions::{check_fixed_type, text_concatenation};
+use echolake_functions::{check_fixed_type, list_text, text_concatenation};
 
 /// The function of the operator `~`.
 const REGEXP_LIKE: &str = "regexp_like";
@@ -26,6 +26,7 @@ const REGEXP_LIKE: &str = "regexp_like";
 #[derive(Debug)]
 pub(crate) struct LimitedOperators {
     texts: Arc<ScalarUDF>,
+    list_text: Arc<ScalarUDF>,
     /// Functions with limits by their names.
     functions: HashMap<String, Arc<ScalarUDF>>,
 }
@@ -34,7 +35,7 @@ impl LimitedOperators {
     /// Creates the rule with the functions that have limits.
     pub fn new(functions: &[Arc<ScalarUDF>]) -> Self {
         let functions = functions.iter().map(|function| (function.name().to_owned(), function.clone())).collect();
-        Self { texts: text_concatenation(), functions }
+        Self { texts: text_concatenation(), list_text: list_text(), functions }
     }
 
     // The limited form of a function that the planner has taken without its limit.
@@ -48,6 +49,7 @@ impl LimitedOperators {
                 *op == Operator::StringConcat || (*op == Operator::RegexMatch && !matches!(**right, Expr::Literal(..)))
             }
             Expr::ScalarFunction(call) => self.limited_form(call).is_some(),
+            Expr::Cast(Cast { field, .. }) | Expr::TryCast(TryCast { field, .. }) => field.data_type().is_string(),
             _ => false,
         }
     }
@@ -107,6 +109,15 @@ impl LimitedOperators {
                     None => Transformed::no(Expr::ScalarFunction(call)),
                 });
             }
+            Expr::Cast(Cast { expr, field }) if field.data_type().is_string() => {
+                let (expr, is_limited) = self.limit_text(*expr, schema)?;
+                return Ok(Transformed::new_transformed(Expr::Cast(Cast { expr: Box::new(expr), field }), is_limited));
+            }
+            Expr::TryCast(TryCast { expr, field }) if field.data_type().is_string() => {
+                let (expr, is_limited) = self.limit_text(*expr, schema)?;
+                let cast = Expr::TryCast(TryCast { expr: Box::new(expr), field });
+                return Ok(Transformed::new_transformed(cast, is_limited));
+            }
             other => return Ok(Transformed::no(other)),
         };
         let kind = self.operand_type(&left, schema)?;
@@ -116,6 +127,14 @@ impl LimitedOperators {
         }
         let call = ScalarFunction::new_udf(self.texts.clone(), vec![*left, *right]);
         Ok(Transformed::yes(Expr::ScalarFunction(call)))
+    }
+
+    // Lists and structs are written by the function, so that the cast above it is one of texts.
+    fn limit_text(&self, expr: Expr, schema: &DFSchema) -> Result<(Expr, bool)> {
+        Ok(match self.operand_type(&expr, schema)?.is_nested() {
+            true => (Expr::ScalarFunction(ScalarFunction::new_udf(self.list_text.clone(), vec![expr])), true),
+            false => (expr, false),
+        })
     }
 
     // The type of a long chain is not asked for from its beginning at each of its parts.

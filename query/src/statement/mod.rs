@@ -53,7 +53,7 @@ pub(crate) use as_of::{PastTableName, find_past_tables};
 pub(crate) use as_of_join::AsOfSidePlanner;
 pub use bounds::check_statement_bounds;
 pub(crate) use cast_place::find_cast;
-pub(crate) use ending_rules::EndingRule;
+pub(crate) use ending_rules::{EndingPhysicalRule, EndingRule, end_joins};
 pub(crate) use float_forms::FloatForms;
 pub(crate) use integer_arithmetic::{IntegerArithmetic, checked_operators};
 pub(crate) use limited_operators::LimitedOperators;

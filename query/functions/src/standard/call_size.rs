@@ -170,7 +170,7 @@ fn offset_lengths<O: OffsetSizeTrait>(offsets: &[O]) -> Vec<f64> {
 }
 
 // Bytes of an array's values, also of one that is a part of another.
-fn value_bytes(values: &ArrayRef) -> f64 {
+pub(super) fn value_bytes(values: &ArrayRef) -> f64 {
     let bytes = values.to_data().get_slice_memory_size();
     bytes.unwrap_or_else(|_| values.get_array_memory_size()) as f64
 }
