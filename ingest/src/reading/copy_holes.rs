@@ -43,10 +43,17 @@ async fn walk_file(opened: &OpenedRun) -> std::result::Result<FileIntegrity, Res
     reader.finish().await
 }
 
+// A hole may begin and end within records that tolerate zeros, as an index does that can be made again: what is lost
+// begins later then, or nothing is lost but what the CRC tells.
 async fn find_hole(opened: &OpenedRun, integrity: &FileIntegrity) -> Option<Range<u64>> {
-    let lost = integrity.lost.iter().filter(|_| integrity.has_wrong_crc);
+    if !integrity.has_wrong_crc {
+        return None;
+    }
+    let whole = [0..integrity.bytes];
+    let lost: &[Range<u64>] = if integrity.lost.is_empty() { &whole } else { integrity.lost.as_slice() };
     for range in lost {
-        if let Some(hole) = find_zeros(opened, range.clone()).await {
+        let blocks = range.start / HOLE * HOLE..range.end.next_multiple_of(HOLE).min(integrity.bytes);
+        if let Some(hole) = find_zeros(opened, blocks).await {
             return Some(hole);
         }
     }

@@ -3,7 +3,7 @@
 
 use std::sync::Arc;
 
-use datafusion::common::tree_node::Transformed;
+use datafusion::common::tree_node::{Transformed, TreeNode as _, TreeNodeRecursion};
 use datafusion::config::ConfigOptions;
 use datafusion::error::Result;
 use datafusion::logical_expr::LogicalPlan;
@@ -16,6 +16,21 @@ use datafusion::physical_plan::execution_plan::{ChildrenPropertiesMode, ReplaceC
 use datafusion::physical_plan::joins::utils::JoinFilter;
 use datafusion::physical_plan::joins::{NestedLoopJoinExec, NestedLoopJoinExecBuilder};
 use echolake_functions::{check_stop, ending_condition};
+
+/// DataFusion's rule that makes a product and a condition a join by keys.
+const CROSS_JOINS: &str = "eliminate_cross_join";
+/// Joins of a plan above which the rule is not applied: three hundred take it a minute.
+const MOST_JOINS: usize = 100;
+
+fn count_joins(plan: &LogicalPlan) -> usize {
+    let mut joins = 0;
+    // Counting fails for no plan.
+    let _ = plan.apply(|node| {
+        joins += usize::from(matches!(node, LogicalPlan::Join(_)));
+        Ok(TreeNodeRecursion::Continue)
+    });
+    joins
+}
 
 /// A rule that is applied to no further node once its statement has ended.
 #[derive(Debug)]
@@ -32,6 +47,10 @@ impl OptimizerRule for EndingRule {
 
     fn rewrite(&self, plan: LogicalPlan, config: &dyn OptimizerConfig) -> Result<Transformed<LogicalPlan>> {
         check_stop()?;
+        // It looks at all joins again for each of them.
+        if self.0.name() == CROSS_JOINS && count_joins(&plan) > MOST_JOINS {
+            return Ok(Transformed::no(plan));
+        }
         self.0.rewrite(plan, config)
     }
 }

@@ -1,12 +1,14 @@
-//! Refuses a statement of few words whose plan is huge: names of a WITH that stand for each other are planned again
-//! wherever they stand, and CUBE makes each subset of its columns a grouping set.
+//! Refuses a statement whose plan is huge, or is made in a time that grows with the square of its lists: names of a WITH
+//! that stand for each other are planned again wherever they stand, CUBE makes each subset of its columns a grouping set,
+//! and each column, window and key of an order is compared with all others.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::ops::ControlFlow;
 
 use datafusion::sql::parser::Statement;
 use datafusion::sql::sqlparser::ast::{
-    Expr, GroupByExpr, GroupByWithModifier, ObjectNamePart, Query, Select, TableFactor, Visitor,
+    Expr, GroupByExpr, GroupByWithModifier, ObjectNamePart, OrderByKind, Query, Select, TableFactor, Visitor,
+    WindowType,
 };
 
 use super::columns::hinted_error;
@@ -18,6 +20,14 @@ use crate::Error;
 const MOST_TABLES: u64 = 2_000;
 /// Maximum number of grouping sets of one SELECT.
 const MOST_GROUPINGS: u64 = 4_096;
+/// Maximum number of columns in grouping sets: DataFusion has no more, and finds that out after it has planned them.
+const MOST_GROUPED: usize = 64;
+/// Maximum number of expressions of one SELECT; four thousand take a second.
+const MOST_COLUMNS: usize = 4_096;
+/// Maximum number of keys of one ORDER BY.
+const MOST_KEYS: usize = 1_000;
+/// Maximum number of windows of one statement that are written in different ways.
+const MOST_WINDOWS: usize = 200;
 
 /// Accepts statements whose plans are not much larger than they are.
 ///
@@ -43,6 +53,8 @@ struct ExpansionVisitor {
     known: Vec<(String, u64)>,
     /// Names of queries of a WITH, by the addresses of the queries.
     named: HashMap<*const Query, String>,
+    /// How windows are written.
+    windows: HashSet<String>,
 }
 
 struct OpenQuery {
@@ -69,6 +81,11 @@ impl Visitor for ExpansionVisitor {
 
     fn pre_visit_query(&mut self, query: &Query) -> ControlFlow<Error> {
         self.open.push(OpenQuery { tables: 0, known: self.known.len() });
+        if let Some(OrderByKind::Expressions(keys)) = query.order_by.as_ref().map(|order| &order.kind)
+            && keys.len() > MOST_KEYS
+        {
+            return refuse_keys();
+        }
         for part in query.with.iter().flat_map(|with| &with.cte_tables) {
             self.named.insert(&raw const *part.query, normalized_name(&part.alias.name));
         }
@@ -100,6 +117,18 @@ impl Visitor for ExpansionVisitor {
     }
 
     fn pre_visit_select(&mut self, select: &Select) -> ControlFlow<Error> {
+        if select.projection.len() > MOST_COLUMNS {
+            return ControlFlow::Break(hinted_error(
+                format!("SELECT has more than {MOST_COLUMNS} columns"),
+                "a row for each of them, by a join with VALUES, or several queries",
+            ));
+        }
+        if count_grouped(&select.group_by) > MOST_GROUPED {
+            return ControlFlow::Break(hinted_error(
+                format!("grouping sets have more than {MOST_GROUPED} columns"),
+                "a GROUP BY for each set, and UNION ALL",
+            ));
+        }
         match count_groupings(&select.group_by) <= MOST_GROUPINGS {
             true => ControlFlow::Continue(()),
             false => ControlFlow::Break(hinted_error(
@@ -108,6 +137,51 @@ impl Visitor for ExpansionVisitor {
             )),
         }
     }
+
+    fn pre_visit_expr(&mut self, expr: &Expr) -> ControlFlow<Error> {
+        let Expr::Function(call) = expr else { return ControlFlow::Continue(()) };
+        let Some(window) = &call.over else { return ControlFlow::Continue(()) };
+        if let WindowType::WindowSpec(window) = window
+            && window.order_by.len() > MOST_KEYS
+        {
+            return refuse_keys();
+        }
+        self.windows.insert(window.to_string());
+        match self.windows.len() <= MOST_WINDOWS {
+            true => ControlFlow::Continue(()),
+            false => ControlFlow::Break(hinted_error(
+                format!("the query has more than {MOST_WINDOWS} different windows"),
+                "several queries with fewer of them",
+            )),
+        }
+    }
+}
+
+fn refuse_keys() -> ControlFlow<Error> {
+    let message = format!("ORDER BY has more than {MOST_KEYS} keys");
+    ControlFlow::Break(hinted_error(message, "an order by one expression of them"))
+}
+
+// How many expressions are in grouping sets, each once; 0 without such sets.
+fn count_grouped(group_by: &GroupByExpr) -> usize {
+    let (keys, has_modifier) = match group_by {
+        GroupByExpr::Expressions(keys, modifiers) => (keys.as_slice(), !modifiers.is_empty()),
+        GroupByExpr::All(_) => return 0,
+    };
+    let mut grouped = HashSet::new();
+    let mut has_sets = has_modifier;
+    for key in keys {
+        match key {
+            Expr::Cube(sets) | Expr::Rollup(sets) | Expr::GroupingSets(sets) => {
+                has_sets = true;
+                grouped.extend(sets.iter().flatten().map(ToString::to_string));
+            }
+            key => {
+                grouped.insert(key.to_string());
+            }
+        }
+    }
+    if has_sets { grouped.len() } else { 0 }
 }
 
 fn count_groupings(group_by: &GroupByExpr) -> u64 {
@@ -172,13 +246,41 @@ mod tests {
             (format!("cube({})", columns(13)), false),
             (format!("cube({})", columns(200)), false),
             (format!("cube({0}), cube({0})", columns(7)), false),
-            (format!("rollup({})", columns(3_000)), true),
-            (format!("rollup({0}), rollup({0})", columns(100)), false),
+            (format!("rollup({})", columns(64)), true),
+            (format!("rollup({})", columns(65)), false),
+            (format!("rollup({0}), rollup({0}), rollup({0})", columns(16)), false),
+            (format!("grouping sets (({}), (c70))", columns(64)), false),
             ("grouping sets ((c0), (c1), ())".to_owned(), true),
             (columns(3_000), true),
         ] {
             let sql = format!("select count(*) from t group by {group}");
             assert_eq!(refusal(&sql).is_none(), passes, "{sql}");
+        }
+    }
+
+    #[test]
+    fn long_lists_are_counted_where_their_square_costs() {
+        let list = |count: usize, part: &str| {
+            (0..count).map(|n| part.replace('#', &n.to_string())).collect::<Vec<_>>().join(", ")
+        };
+        for (sql, limit) in [
+            (format!("select {} from t", list(4_096, "a + # as c#")), None),
+            (format!("select {} from t", list(4_097, "a + # as c#")), Some("4096 columns")),
+            (format!("select * from (select {} from t)", list(4_097, "a")), Some("4096 columns")),
+            (format!("select a from t order by {}", list(1_000, "a + #")), None),
+            (format!("select a from t order by {}", list(1_001, "a + #")), Some("1000 keys")),
+            (format!("select sum(a) over (order by {}) from t", list(1_001, "a + #")), Some("1000 keys")),
+            (format!("select {} from t", list(200, "sum(a) over (order by b + #)")), None),
+            (format!("select {} from t", list(201, "sum(a) over (order by b + #)")), Some("200 different windows")),
+            (format!("select {} from t", list(4_000, "sum(a + #) over (order by b)")), None),
+            (format!("select a from t where a in ({})", list(100_000, "#")), None),
+        ] {
+            let refused = refusal(&sql);
+            let is_expected = match limit {
+                Some(limit) => refused.as_ref().is_some_and(|text| text.contains(limit)),
+                None => refused.is_none(),
+            };
+            assert!(is_expected, "{}: {refused:?}", &sql[..60]);
         }
     }
 }

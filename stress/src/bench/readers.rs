@@ -223,14 +223,14 @@ pub(crate) fn measure_readers(args: &ReadersArgs, report: &mut BenchReport) -> R
     // The goals are for this load.
     let is_goal = readers == 200 && args.kind == QuestionKind::All;
     if is_goal {
-        rate.goal(FigureGoal::AtLeast(1200.0));
+        rate.goal(FigureGoal::AtLeast(3000.0));
     }
     report.figure("errors", times.errors as f64, "");
     for share in [50, 95, 99] {
         let time = millis(percentile(&all, f64::from(share) / 100.0));
         let figure = report.figure(format!("answers to {readers} readers, p{share}"), time, "ms");
         if is_goal && share == 95 {
-            figure.goal(FigureGoal::AtMost(300.0));
+            figure.goal(FigureGoal::AtMost(150.0));
         }
     }
     for (what, answers) in &times.answers {

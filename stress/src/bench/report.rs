@@ -1,6 +1,7 @@
 //! Figures of benchmarks, with the peer or the limit that stands beside them and their goals: as a table, as JSON, and
 //! as a page of Markdown.
 
+use std::collections::HashMap;
 use std::fmt::Write as _;
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
@@ -14,7 +15,8 @@ pub(crate) struct ReportOutput {
     /// Print JSON instead of a table.
     #[arg(long, global = true)]
     json: bool,
-    /// Write the figures as a page of Markdown, too.
+    /// Write the figures as a page of Markdown, too, and beside it as JSON. What stands there before, if it is of a
+    /// machine of the same kind, is what the figures are compared with.
     #[arg(long, global = true, value_name = "FILE")]
     pub document: Option<PathBuf>,
 }
@@ -49,6 +51,8 @@ pub(crate) struct BenchFigure {
     /// A peer or a limit, and its value in the same unit.
     beside: Option<(String, f64)>,
     goal: Option<FigureGoal>,
+    /// Value of the last run that was written down.
+    before: Option<f64>,
 }
 
 impl FigureGoal {
@@ -90,13 +94,14 @@ impl BenchFigure {
         self.goal.is_some_and(|goal| !goal.is_met(self.value))
     }
 
-    /// Name, value, what stands beside it, the ratio of both, and the goal.
-    fn cells(&self) -> [String; 5] {
+    /// Name, value, what stands beside it, the ratio of both, the goal, and the value of the last run.
+    fn cells(&self) -> [String; 6] {
         let value = format!("{} {}", number_text(self.value), self.unit).trim_end().to_owned();
         let beside = self.beside.as_ref().map(|(name, value)| format!("{name}: {}", number_text(*value)));
         let ratio = self.beside.as_ref().map(|(_, beside)| number_text(self.value / beside));
         let goal = self.goal.map(|g| format!("{} {}", g.text(), if self.is_missed() { "MISSED" } else { "met" }));
-        [self.name.clone(), value, beside.unwrap_or_default(), ratio.unwrap_or_default(), goal.unwrap_or_default()]
+        let before = self.before.map(number_text);
+        [Some(self.name.clone()), Some(value), beside, ratio, goal, before].map(Option::unwrap_or_default)
     }
 
     fn json(&self, group: &str) -> Value {
@@ -114,7 +119,7 @@ impl BenchFigure {
 
 /// Longer names than this push their line's other cells to the right.
 const NAME_WIDTH: usize = 72;
-const HEADINGS: [&str; 5] = ["figure", "value", "beside", "ratio", "goal"];
+const HEADINGS: [&str; 6] = ["figure", "value", "beside", "ratio", "goal", "before"];
 
 impl BenchReport {
     pub fn new() -> Self {
@@ -146,7 +151,7 @@ impl BenchReport {
         eprintln!("  {name}: {} {unit}", number_text(value));
         let figures = &mut self.last_group().figures;
         let place = figures.len();
-        figures.push(BenchFigure { name, value, unit, beside: None, goal: None });
+        figures.push(BenchFigure { name, value, unit, beside: None, goal: None, before: None });
         &mut figures[place]
     }
 
@@ -169,8 +174,11 @@ impl BenchReport {
     ///
     /// # Errors
     /// Something was wrong.
-    pub fn finish(self, output: &ReportOutput) -> Result<()> {
+    pub fn finish(mut self, output: &ReportOutput) -> Result<()> {
         let machine = machine_facts();
+        if let Some(file) = &output.document {
+            self.set_before(&read_figures(&file.with_extension("json"), &machine)?);
+        }
         let mut out = std::io::stdout().lock();
         if output.json {
             writeln!(out, "{:#}", self.json(&machine))?;
@@ -179,12 +187,21 @@ impl BenchReport {
         }
         if let Some(file) = &output.document {
             std::fs::write(file, self.markdown(&machine)).with_context(|| format!("cannot write {file:?}"))?;
+            std::fs::write(file.with_extension("json"), format!("{:#}\n", self.json(&machine)))?;
             for (name, svg) in self.groups.iter().filter_map(|group| group.picture.as_ref()) {
                 std::fs::write(file.with_file_name(format!("{name}.svg")), svg)?;
             }
         }
         ensure!(self.failures.is_empty(), "{}", self.failures.join("\n"));
         Ok(())
+    }
+
+    fn set_before(&mut self, figures: &HashMap<[String; 2], f64>) {
+        for group in &mut self.groups {
+            for figure in &mut group.figures {
+                figure.before = figures.get(&[group.title.clone(), figure.name.clone()]).copied();
+            }
+        }
     }
 
     fn json(&self, machine: &[(&str, String)]) -> Value {
@@ -209,9 +226,10 @@ impl BenchReport {
             let rows: Vec<_> = group.figures.iter().map(BenchFigure::cells).collect();
             let width = |column: usize| rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
             let widths = [width(0).min(NAME_WIDTH), width(1), width(2), width(3)];
-            for [name, value, beside, ratio, goal] in &rows {
+            for [name, value, beside, ratio, goal, before] in &rows {
+                let before = if before.is_empty() { String::new() } else { format!("  before: {before}") };
                 let line = format!(
-                    "  {name:<0$}  {value:>1$}  {beside:<2$}  {ratio:>3$}  {goal}",
+                    "  {name:<0$}  {value:>1$}  {beside:<2$}  {ratio:>3$}  {goal}{before}",
                     widths[0], widths[1], widths[2], widths[3]
                 );
                 text += line.trim_end();
@@ -228,7 +246,8 @@ impl BenchReport {
         let command: Vec<_> = kept.map(|place| args[place].as_str()).collect();
         let mut text = format!(
             "# Performance\n\n`stress {}` wrote this page. All its figures were measured in one run, on one machine:\n\
-             {}. A ratio is a figure over what stands beside it.\n\n{}.\n",
+             {}. A ratio is a figure over what stands beside it; \"before\" is the value of the run that this page had \
+             before, if its machine was of the same kind.\n\n{}.\n",
             command.join(" "),
             facts_line(machine),
             self.goals_line()
@@ -247,7 +266,7 @@ impl BenchReport {
             if group.figures.is_empty() {
                 continue;
             }
-            let _ = writeln!(text, "| {} |\n| --- | ---: | --- | ---: | --- |", HEADINGS.join(" | "));
+            let _ = writeln!(text, "| {} |\n| --- | ---: | --- | ---: | --- | ---: |", HEADINGS.join(" | "));
             for figure in &group.figures {
                 let _ = writeln!(text, "| {} |", figure.cells().map(|cell| cell.replace('|', "\\|")).join(" | "));
             }
@@ -262,6 +281,20 @@ impl BenchReport {
         let list = if missed.is_empty() { String::new() } else { format!("; missed: {}", missed.join("; ")) };
         format!("{met} of {} goals are met{list}", figures.len())
     }
+}
+
+// The figures of the last run that was written down, by group and name; none if it was on another kind of machine.
+fn read_figures(file: &Path, machine: &[(&str, String)]) -> Result<HashMap<[String; 2], f64>> {
+    let Ok(text) = std::fs::read_to_string(file) else { return Ok(HashMap::new()) };
+    let last: Value = serde_json::from_str(&text).with_context(|| format!("in {file:?}"))?;
+    if !machine.iter().all(|(name, fact)| last["machine"][*name] == json!(fact)) {
+        return Ok(HashMap::new());
+    }
+    let figures = last["figures"].as_array().into_iter().flatten().filter_map(|figure| {
+        let [group, name] = ["group", "name"].map(|key| figure[key].as_str().unwrap_or_default().to_owned());
+        Some(([group, name], figure["value"].as_f64()?))
+    });
+    Ok(figures.collect())
 }
 
 /// Returns a number with three or four digits that count.

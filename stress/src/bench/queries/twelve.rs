@@ -16,6 +16,30 @@ pub(crate) struct BenchQuery {
 /// Kind of the twelve.
 pub(crate) const TWELVE: &str = "twelve";
 
+/// Kind of the joins of the air to the takes.
+pub(crate) const TIME_JOIN: &str = "joins by time";
+
+/// The air of the five seconds before each take, and the last reading before it.
+pub(crate) fn time_joins() -> [BenchQuery; 2] {
+    let query = |name: &str, join: &str| BenchQuery {
+        name: name.to_owned(),
+        kind: TIME_JOIN,
+        sql: format!(
+            "SELECT m.surface_id, count(e.temperature_c) AS readings, avg(e.temperature_c) AS mean_c FROM measurements m \
+             {join} GROUP BY m.surface_id ORDER BY m.surface_id"
+        ),
+        peer: None,
+    };
+    [
+        query(
+            "range join",
+            "JOIN environment e ON e.run_id = m.run_id \
+             AND e.log_time BETWEEN m.log_time - INTERVAL '5 seconds' AND m.log_time",
+        ),
+        query("as-of join", "ASOF LEFT JOIN environment e ON m.run_id = e.run_id AND m.log_time >= e.log_time"),
+    ]
+}
+
 /// The queries about a surface and a pair of the lake.
 pub(crate) fn bench_queries(surface: &str, pair: i64) -> Vec<BenchQuery> {
     let mut queries: Vec<BenchQuery> = Vec::new();
