@@ -2,12 +2,15 @@
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
-use anyhow::{Context as _, Result, ensure};
+use anyhow::{Context as _, Result, anyhow, ensure};
+use echolake_acquisition::run::controller::RecordingMode;
 use echolake_lake::Lake;
 
 use super::FULL_LAKE_RESPONSES;
+use super::ingest::simulated::{SimulationOrder, put_into_inbox};
 use super::ingest::{IngestBenchArgs, lake_size, responses, sweeps};
 use super::limits::measure_limits;
 use super::mcap::{McapBenchArgs, measure_mcap};
@@ -116,19 +119,42 @@ fn measure_lake_queries(args: &WholeBenchArgs, folder: &Path, report: &mut Bench
 
 fn measure_lake_readers(args: &WholeBenchArgs, folder: &Path, report: &mut BenchReport) -> Result<()> {
     let served = ServedLake::start(&echolake_path()?, folder, &[]);
+    let load = |readers, is_ingesting| ReadersArgs {
+        address: served.http.clone(),
+        readers,
+        seconds: if args.quick { 5 } else { 60 },
+        kind: QuestionKind::All,
+        certificate: None,
+        token: None,
+        pid: Some(served.id()),
+        is_ingesting,
+    };
     for readers in [10, 200] {
-        let load = ReadersArgs {
-            address: served.http.clone(),
-            readers,
-            seconds: if args.quick { 5 } else { 60 },
-            kind: QuestionKind::All,
-            certificate: None,
-            token: None,
-            pid: Some(served.id()),
-        };
-        measure_readers(&load, report)?;
+        measure_readers(&load(readers, false), report)?;
     }
-    Ok(())
+    let again = SimulationOrder {
+        count: if args.quick { 3 } else { 20 },
+        keep: RecordingMode::ResponsesOnly,
+        pairs: usize::MAX,
+        seed: args.seed,
+        folder: &folder.join("again"),
+    };
+    let files = again.make()?.files;
+    let has_ended = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        // One after the other, and each by a command of its own, as a rig's runs come.
+        let ingest = scope.spawn(|| {
+            for file in files.iter().take_while(|_| !has_ended.load(Ordering::Relaxed)) {
+                put_into_inbox(std::slice::from_ref(file), &folder.join("lake"))?;
+                run_echolake(folder, &["ingest"])?;
+            }
+            Ok(())
+        });
+        let measured = measure_readers(&load(200, true), report);
+        has_ended.store(true, Ordering::Relaxed);
+        let ingested = ingest.join().map_err(|_| anyhow!("the ingest panicked"))?;
+        measured.and(ingested)
+    })
 }
 
 fn measure_ingest_cost(args: &WholeBenchArgs, folder: &Path, report: &mut BenchReport) -> Result<()> {
