@@ -152,6 +152,11 @@ async fn large_constants_are_rows_of_small_batches() {
         let refused = answered(&limited, sql).await.expect_err(sql);
         assert!(refused.to_string().contains("more than 256 MiB of texts"), "{sql}: {refused}");
     }
+    for call in ["array_agg(v) over (order by v desc)", "string_agg(repeat(v::varchar, 9), ',') over (order by v)"] {
+        let sql = format!("select count(a) from (select {call} a from generate_series(1,100000) t(v))");
+        let refused = answered(&limited, &sql).await.expect_err(&sql);
+        assert!(refused.to_string().contains("over a window have more than 128 MiB"), "{sql}: {refused}");
+    }
     // What the plan has no room for is computed when it runs.
     let calls: Vec<_> = (0..10).map(|n| format!("length(repeat('x', 20000000 + {n})) c{n}")).collect();
     let given = answered(&limited, &format!("select {}", calls.join(", "))).await.expect("lengths");

@@ -28,6 +28,10 @@ use super::call_stop::check_stop;
 
 /// Bytes of the texts that one `string_agg` may hold.
 const MOST_TEXT_BYTES: usize = 256 << 20;
+/// Bytes from which on a result is a large one.
+const LARGE_RESULT: usize = 16 << 10;
+/// Bytes of the large results of one window, which holds them until its rows are given out.
+const MOST_RESULT_BYTES: usize = 128 << 20;
 
 /// Returns `array_agg` and `string_agg` with their limits.
 pub fn limited_aggregates() -> [AggregateUDF; 2] {
@@ -53,7 +57,7 @@ impl LimitedAggregate {
     }
 
     fn limit_accumulator(&self, inner: Box<dyn Accumulator>) -> Box<dyn Accumulator> {
-        Box::new(LimitedAccumulator { inner, limit: self.clone() })
+        Box::new(LimitedAccumulator { inner, limit: self.clone(), large_results: None })
     }
 
     fn check_values(&self, held: usize, values: &[ArrayRef]) -> Result<()> {
@@ -144,6 +148,28 @@ impl AggregateUDFImpl for LimitedAggregate {
 struct LimitedAccumulator {
     inner: Box<dyn Accumulator>,
     limit: LimitedAggregate,
+    /// Bytes of its large results; None before the first result, which is the only one outside of windows.
+    large_results: Option<usize>,
+}
+
+impl LimitedAccumulator {
+    fn count_result(&mut self, result: &ScalarValue) -> Result<()> {
+        let bytes = result.size();
+        let Some(before) = self.large_results else {
+            self.large_results = Some(0);
+            return Ok(());
+        };
+        let total = before.saturating_add(if bytes < LARGE_RESULT { 0 } else { bytes });
+        self.large_results = Some(total);
+        match total <= MOST_RESULT_BYTES {
+            true => Ok(()),
+            false => Err(DataFusionError::Execution(format!(
+                "the results of {} over a window have more than {} MiB; hint: a frame of fewer rows",
+                self.limit.own.name(),
+                MOST_RESULT_BYTES >> 20
+            ))),
+        }
+    }
 }
 
 impl Accumulator for LimitedAccumulator {
@@ -172,7 +198,9 @@ impl Accumulator for LimitedAccumulator {
 
     fn evaluate(&mut self) -> Result<ScalarValue> {
         check_stop()?;
-        self.inner.evaluate()
+        let result = self.inner.evaluate()?;
+        self.count_result(&result)?;
+        Ok(result)
     }
 
     fn size(&self) -> usize {
