@@ -273,6 +273,50 @@ async fn columns_that_are_kept_give_the_rows_of_their_files() {
     }
 }
 
+// Of lists, the pages of the pairs that a query names; all other scans of lists read files as before.
+#[tokio::test(flavor = "multi_thread")]
+async fn lists_of_named_pairs_are_those_of_their_rows() {
+    let (_folder, lake) = measured_lake().await;
+    for (surface, run) in [("0001_0", "r3"), ("theirs-wall", "r4"), ("ours-wall", "r5")] {
+        put(&lake, surface, run).await;
+    }
+    reject(&lake, "one", "r3", Some(vec![1]), "rejected").await;
+    for is_merged in [false, true] {
+        if is_merged {
+            lake.optimize(128 << 20, &AtomicBool::new(false), &mut |_| {}).await.expect("merged");
+            put(&lake, "0002_0", "r6").await;
+        }
+        let restricted = lake.restricted_to(["ours", "text"].map(|name| name.parse().expect("a name")).into());
+        for lake in [&lake, &restricted] {
+            let limits = EngineLimits { column_bytes: Some(1), ..EngineLimits::default() };
+            let without = QueryEngine::with_limits(lake, limits).expect("an engine");
+            let engine = QueryEngine::new(lake, None).expect("an engine");
+            for sql in [
+                "select ir from measurements where pair_id = 1",
+                "select run_id, ir from measurements where pair_id = 1 and surface_id = '0001_0' and run_id > 'r1'",
+                "select * from nce where pair_id in (0, 2)",
+                "select run_id, reflected_ir[1] + pair_id, list_energy(reflected_ir) from nce where pair_id = 2",
+                "select surface_id, avg_list(reflected_ir) from nce where pair_id = 1 or pair_id = 0 group by surface_id",
+                "select ir, reflected_ir from ir where pair_id = 1",
+                "select reflected_ir from nce where pair_id = 1 and microphone <> 1",
+                "select count(*) from (select ir from measurements where pair_id = 1 limit 2)",
+            ] {
+                check_kept(&engine, &without, sql).await;
+            }
+            for sql in [
+                "select ir from measurements",
+                "select ir from measurements where pair_id > 0",
+                "select ir from measurements where pair_id = 1 or microphone = 2",
+            ] {
+                let (_, plan) = physical_plan(&engine, sql).await.expect("planned");
+                let local = engine.rewrite_local_scans(plan).expect("rewritten");
+                let text = displayable(local.as_ref()).indent(false).to_string();
+                assert!(!text.contains("rows in memory"), "{sql}: {text}");
+            }
+        }
+    }
+}
+
 // Of a large file, a filter reads few groups of rows; what leaves out rows while the first ones are found does not count.
 #[tokio::test(flavor = "multi_thread")]
 async fn columns_of_a_large_file_are_kept_unless_a_filter_selects_rows() {

@@ -43,6 +43,10 @@ fn column(table: Table, field: &Field, surface: &str, run: &str) -> ArrayRef {
         ("surface_id", _) => Arc::new(StringArray::from(vec![surface; rows])),
         ("run_id", _) => Arc::new(StringArray::from(vec![run; rows])),
         ("symmetry", _) => Arc::new(StringArray::from(Symmetry::ALL.map(Symmetry::name).to_vec())),
+        // A surface's name may begin with its project's.
+        ("project", _) => {
+            Arc::new(StringArray::from(vec![surface.split_once('-').map_or("text", |(project, _)| project); rows]))
+        }
         (_, DataType::Utf8) => Arc::new(StringArray::from(vec!["text"; rows])),
         (_, DataType::Boolean) => Arc::new(arrow::array::BooleanArray::from(vec![true; rows])),
         (_, DataType::List(child)) => {

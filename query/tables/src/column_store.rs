@@ -5,6 +5,7 @@
 //! of the whole. Small files, of which some tables have one for each run, are given out joined.
 
 use std::collections::HashMap;
+use std::ops::Range;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use std::time::Duration;
@@ -136,6 +137,16 @@ impl WantedColumns {
         Ok(Self { table_schema: table_schema.clone(), schema, names })
     }
 
+    /// Makes the list of the columns of these names.
+    ///
+    /// # Errors
+    /// If the table does not have one.
+    pub fn from_names(table_schema: &SchemaRef, names: &[&str]) -> Result<Self> {
+        let places =
+            names.iter().map(|name| table_schema.index_of(name)).collect::<std::result::Result<Vec<_>, _>>()?;
+        Self::new(table_schema, &places)
+    }
+
     fn with_all_scalars(&self) -> Result<Self> {
         let fields = self.table_schema.fields();
         let scalars = (0..fields.len()).filter(|column| value_bytes(fields[*column].data_type()).is_some());
@@ -187,8 +198,7 @@ impl ColumnStore {
         files: &[Arc<DataFile>],
         columns: &[&str],
     ) -> Result<RecordBatch> {
-        let places = columns.iter().map(|name| schema.index_of(name)).collect::<std::result::Result<Vec<_>, _>>()?;
-        let wanted = WantedColumns::new(schema, &places)?;
+        let wanted = WantedColumns::from_names(schema, columns)?;
         let metrics = ExecutionPlanMetricsSet::new();
         let parts: Vec<_> = files.iter().map(|file| partitioned_file(file)).collect();
         let read = self.read_each(&parts, &wanted, ScanMetrics { metrics: &metrics, partition: 0 }).await?;
@@ -203,6 +213,70 @@ impl ColumnStore {
             );
         }
         Ok(concat_batches(wanted.schema(), &visible)?)
+    }
+
+    /// Reads wanted columns of some rows of a file, in batches. Of a large file no more is decoded than the groups of rows
+    /// that have them.
+    ///
+    /// # Errors
+    /// If the file cannot be read, or has other rows than its log says.
+    pub(crate) async fn read_range(
+        &self,
+        file: &DataFile,
+        rows: Range<u64>,
+        wanted: &WantedColumns,
+    ) -> Result<Vec<RecordBatch>> {
+        let metrics = ExecutionPlanMetricsSet::new();
+        let metrics = ScanMetrics { metrics: &metrics, partition: 0 };
+        let stored = self.stored_file(&file.path);
+        let part = partitioned_file(file);
+        let pieces = match stored.pieces.get() {
+            Some(pieces) => pieces,
+            None => {
+                let footer = self.read_footer(&part, metrics).await?;
+                stored.pieces.get_or_init(|| self.number_pieces(&footer.metadata))
+            }
+        };
+        check_rows(&file.path, file.rows, pieces.iter().map(|piece| piece.rows).sum())?;
+        let mut end = 0;
+        let has_wanted = |piece: &&RowPiece| {
+            end += piece.rows as u64;
+            end > rows.start && end - (piece.rows as u64) < rows.end
+        };
+        let groups: Vec<_> = pieces.iter().filter(has_wanted).map(|piece| piece.group_offset).collect();
+        let (Some(first), Some(last)) = (groups.first(), groups.last()) else { return Ok(Vec::new()) };
+        let part = part.with_range(*first, last + 1);
+        let (first, read) = self.read_part(&part, wanted, metrics).await?;
+        let mut start = first as u64;
+        let mut found = Vec::new();
+        for batch in read {
+            let end = start + batch.num_rows() as u64;
+            let kept = rows.start.clamp(start, end)..rows.end.clamp(start, end);
+            if !kept.is_empty() {
+                found.push(batch.slice((kept.start - start) as usize, (kept.end - kept.start) as usize));
+            }
+            start = end;
+        }
+        Ok(found)
+    }
+
+    /// Reads wanted columns of a file, or of a range of it, each of its pieces a batch; returns the place of their first
+    /// row in the file with them.
+    ///
+    /// # Errors
+    /// As [`Self::read_files`].
+    pub(crate) async fn read_part(
+        &self,
+        file: &PartitionedFile,
+        wanted: &WantedColumns,
+        metrics: ScanMetrics<'_>,
+    ) -> Result<(usize, Vec<RecordBatch>)> {
+        let stored = self.stored_file(&file.object_meta.location);
+        let read = self.read_stored(&stored, file, wanted, metrics).await?;
+        // Whoever read rows knows the pieces.
+        let pieces = stored.pieces.get().map_or(&[] as &[RowPiece], Vec::as_slice);
+        let is_before = |piece: &&RowPiece| file.range.as_ref().is_some_and(|range| piece.group_offset < range.start);
+        Ok((pieces.iter().take_while(is_before).map(|piece| piece.rows).sum(), read))
     }
 
     /// Reads wanted columns of files, each of its pieces a batch; those of several files in one batch.
@@ -257,14 +331,23 @@ impl ColumnStore {
         wanted: &WantedColumns,
         metrics: ScanMetrics<'_>,
     ) -> Result<Vec<RecordBatch>> {
-        let stored = self.stored_file(&file.object_meta.location);
-        if let Some(known) = self.known_rows(&stored, file, wanted)? {
+        self.read_stored(&self.stored_file(&file.object_meta.location), file, wanted, metrics).await
+    }
+
+    async fn read_stored(
+        &self,
+        stored: &StoredFile,
+        file: &PartitionedFile,
+        wanted: &WantedColumns,
+        metrics: ScanMetrics<'_>,
+    ) -> Result<Vec<RecordBatch>> {
+        if let Some(known) = self.known_rows(stored, file, wanted)? {
             return Ok(known);
         }
         let _reading = timeout(READING_WAIT, stored.reading.lock()).await;
-        match self.known_rows(&stored, file, wanted)? {
+        match self.known_rows(stored, file, wanted)? {
             Some(known) => Ok(known),
-            None => self.decode_file(&stored, file, wanted, metrics).await,
+            None => self.decode_file(stored, file, wanted, metrics).await,
         }
     }
 
@@ -299,17 +382,15 @@ impl ColumnStore {
         stored: &StoredFile,
         file: &PartitionedFile,
         wanted: &WantedColumns,
-        ScanMetrics { metrics, partition }: ScanMetrics<'_>,
+        metrics: ScanMetrics<'_>,
     ) -> Result<Vec<RecordBatch>> {
-        let mut reader = self.reader.create_reader(partition, file.clone(), self.footer_bytes, metrics)?;
-        let metadata = reader.get_metadata(Some(&ArrowReaderOptions::new())).await?;
-        let pieces = stored.pieces.get_or_init(|| self.number_pieces(&metadata));
+        let footer = self.read_footer(file, metrics).await?;
+        let pieces = stored.pieces.get_or_init(|| self.number_pieces(&footer.metadata));
         let rows: usize = pieces.iter().map(|piece| piece.rows).sum();
         if let Some(Precision::Exact(expected)) = file.statistics.as_ref().map(|known| known.num_rows) {
             check_rows(&file.object_meta.location, expected as u64, rows)?;
         }
         let pieces: Vec<_> = pieces_in_range(pieces, file).copied().collect();
-        let footer = ReadFooter { reader, metadata };
         // One request fetches all of a small file.
         if self.footer_bytes.is_none() || rows >= JOINED_ROWS {
             return self.complete_pieces(footer, &pieces, wanted).await;
@@ -319,6 +400,24 @@ impl ColumnStore {
         let places = places.collect::<std::result::Result<Vec<_>, _>>()?;
         let read = self.complete_pieces(footer, &pieces, &all).await?;
         Ok(read.iter().map(|rows| rows.project(&places)).collect::<std::result::Result<_, _>>()?)
+    }
+
+    /// Makes a reader of a file.
+    ///
+    /// # Errors
+    /// What the store's readers say.
+    pub(crate) fn open_file(
+        &self,
+        file: &PartitionedFile,
+        ScanMetrics { metrics, partition }: ScanMetrics<'_>,
+    ) -> Result<Box<dyn AsyncFileReader>> {
+        Ok(self.reader.create_reader(partition, file.clone(), self.footer_bytes, metrics)?)
+    }
+
+    async fn read_footer(&self, file: &PartitionedFile, metrics: ScanMetrics<'_>) -> Result<ReadFooter> {
+        let mut reader = self.open_file(file, metrics)?;
+        let metadata = reader.get_metadata(Some(&ArrowReaderOptions::new())).await?;
+        Ok(ReadFooter { reader, metadata })
     }
 
     async fn complete_pieces(
@@ -446,7 +545,11 @@ fn pieces_in_range<'a>(pieces: &'a [RowPiece], file: &'a PartitionedFile) -> imp
     pieces.iter().filter(|piece| file.range.as_ref().is_none_or(|range| range.contains(piece.group_offset)))
 }
 
-fn batch_of_rows(schema: &SchemaRef, columns: Vec<ArrayRef>, rows: usize) -> Result<RecordBatch> {
+/// Makes a batch of columns of so many rows, of which there may be none.
+///
+/// # Errors
+/// If the columns are not those of the schema.
+pub(crate) fn batch_of_rows(schema: &SchemaRef, columns: Vec<ArrayRef>, rows: usize) -> Result<RecordBatch> {
     let options = RecordBatchOptions::new().with_row_count(Some(rows));
     Ok(RecordBatch::try_new_with_options(schema.clone(), columns, &options)?)
 }

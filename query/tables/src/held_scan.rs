@@ -1,13 +1,16 @@
 //! A scan that reads columns which this process has decoded: what DataFusion's Parquet source would read of the same
-//! files.
+//! files. Lists are not kept: a scan of lists of few pairs finds its rows by the columns that are kept, and decodes their
+//! pages.
 
+use std::collections::BTreeSet;
 use std::fmt;
 use std::ops::Range;
 use std::sync::Arc;
 
-use arrow::compute::filter_record_batch;
-use arrow::datatypes::SchemaRef;
-use arrow::record_batch::{RecordBatch, RecordBatchOptions};
+use arrow::array::{ArrayRef, AsArray as _, UInt64Array};
+use arrow::compute::{concat_batches, filter_record_batch};
+use arrow::datatypes::{DataType, Field, Schema, SchemaRef, UInt64Type};
+use arrow::record_batch::RecordBatch;
 use datafusion::common::cast::as_boolean_array;
 use datafusion::common::tree_node::TreeNodeRecursion;
 use datafusion::common::{DataFusionError, Statistics};
@@ -16,6 +19,8 @@ use datafusion::datasource::physical_plan::{FileScanConfig, FileSource as _, Par
 use datafusion::datasource::source::DataSource;
 use datafusion::error::Result;
 use datafusion::execution::{SendableRecordBatchStream, TaskContext};
+use datafusion::logical_expr::Operator;
+use datafusion::physical_expr::expressions::{BinaryExpr, Column, InListExpr, Literal};
 use datafusion::physical_expr::projection::{ProjectionExprs, Projector};
 use datafusion::physical_expr::utils::{collect_columns, reassign_expr_columns};
 use datafusion::physical_expr::{EquivalenceProperties, Partitioning, PhysicalExpr, split_conjunction};
@@ -27,14 +32,19 @@ use datafusion::physical_plan::stream::RecordBatchStreamAdapter;
 use futures::stream::BoxStream;
 use futures::{FutureExt as _, StreamExt as _, TryStreamExt as _};
 
-use crate::column_store::{ColumnStore, JOINED_ROWS, ScanMetrics, WantedColumns};
+use crate::column_store::{ColumnStore, JOINED_ROWS, ScanMetrics, WantedColumns, batch_of_rows};
 use crate::lake_table::{FileReaders, NARROW_BATCH_ROWS};
 use crate::local_scans::ScanSize;
+use crate::placed_rows::read_placed_rows;
+use crate::run_rows::PAIR;
 
 /// Files, or joined files, that a partition of a scan reads at once: while one is decoded, the next one is fetched.
 const READ_AHEAD: usize = 2;
 /// The same from an object store, where a file takes several requests.
 const READ_AHEAD_REMOTE: usize = 16;
+
+/// Pairs that a filter of a scan of lists may name: each is a page of each list.
+const NAMED_PAIRS: usize = 16;
 
 /// The scan. It stands for another one, whose partitions, orders and statistics it has.
 #[derive(Debug)]
@@ -52,8 +62,13 @@ struct PartitionRows {
     /// The places of files that are read together, by partition.
     files: Vec<Vec<Range<usize>>>,
     read_ahead: usize,
-    /// The columns that the filters and the projection need.
+    /// The columns that the filters and the projection need; only those that the filters need, if there are lists beside
+    /// them.
     wanted: WantedColumns,
+    /// The others.
+    placed: Option<WantedColumns>,
+    /// All of them.
+    read_schema: SchemaRef,
     /// The filters that nobody above applies, in their order: what the first leaves out, no other one sees.
     filters: Vec<Arc<dyn PhysicalExpr>>,
     projector: Projector,
@@ -88,25 +103,42 @@ impl HeldScan {
         let is_filtered = source.table_parquet_options().global.pushdown_filters;
         let predicate = source.filter().filter(|_| is_filtered);
         let filters: Vec<_> = predicate.iter().flat_map(|predicate| split_conjunction(predicate)).cloned().collect();
-        let needed = filters.iter().cloned().chain(projection.expr_iter()).flat_map(|expr| collect_columns(&expr));
-        let mut places = needed.map(|column| schema.index_of(column.name())).collect::<Result<Vec<_>, _>>()?;
-        places.sort_unstable();
-        places.dedup();
-        let kinds = places.iter().map(|place| schema.field(*place).data_type());
+        let filtered = places_of(filters.iter().cloned(), schema)?;
+        let needed = places_of(filters.iter().cloned().chain(projection.expr_iter()), schema)?;
+        let is_list = |place: &usize| schema.field(*place).data_type().is_nested();
+        let (kept, placed) = if needed.iter().any(is_list) {
+            if filtered.iter().any(is_list) || !filters.iter().any(names_pairs) {
+                return Ok(None);
+            }
+            let placed = needed.into_iter().filter(|place| !filtered.contains(place)).collect();
+            (filtered, placed)
+        } else {
+            (needed, Vec::new())
+        };
+        let kinds = kept.iter().map(|place| schema.field(*place).data_type());
         if !readers.columns.is_kept(kinds, size.rows as u64) {
             return Ok(None);
         }
-        let wanted = WantedColumns::new(schema, &places)?;
-        let assign = |expr: Arc<dyn PhysicalExpr>| reassign_expr_columns(expr, wanted.schema());
+        let wanted = WantedColumns::new(schema, &kept)?;
+        let placed = if placed.is_empty() { None } else { Some(WantedColumns::new(schema, &placed)?) };
+        let all_fields = wanted.schema().fields().iter().chain(placed.iter().flat_map(|it| it.schema().fields()));
+        let read_schema: SchemaRef = Arc::new(Schema::new(all_fields.cloned().collect::<Vec<_>>()));
+        let assign = |expr: Arc<dyn PhysicalExpr>| reassign_expr_columns(expr, &read_schema);
+        let read_together = |files: &[PartitionedFile]| match placed {
+            Some(_) => (0..files.len()).map(|place| place..place + 1).collect(),
+            None => join_small_files(files),
+        };
         let rows = PartitionRows {
             columns: readers.columns.clone(),
-            files: scan.file_groups.iter().map(|group| join_small_files(group.files())).collect(),
+            files: scan.file_groups.iter().map(|group| read_together(group.files())).collect(),
             read_ahead: if readers.footer_bytes.is_some() { READ_AHEAD_REMOTE } else { READ_AHEAD },
             filters: filters.into_iter().map(assign).collect::<Result<_>>()?,
-            projector: projection.try_map_exprs(assign)?.make_projector(wanted.schema())?,
+            projector: projection.try_map_exprs(assign)?.make_projector(&read_schema)?,
             schema: scan.projected_schema()?,
             is_restricted: readers.is_restricted,
             wanted,
+            placed,
+            read_schema,
             scan: data_source.clone(),
             limit: scan.limit,
         };
@@ -123,6 +155,28 @@ fn selects_groups(filter: &Arc<dyn PhysicalExpr>, schema: &SchemaRef, bounds: &[
         !is_bound(part) && !collect_columns(part).iter().all(|column| is_measured(column.name()))
     };
     split_conjunction(filter).into_iter().any(selects)
+}
+
+// The places of the columns that expressions need, in order.
+fn places_of(expressions: impl Iterator<Item = Arc<dyn PhysicalExpr>>, schema: &SchemaRef) -> Result<Vec<usize>> {
+    let columns: BTreeSet<_> =
+        expressions.flat_map(|expr| collect_columns(&expr)).map(|it| it.name().to_owned()).collect();
+    let mut places = columns.iter().map(|name| schema.index_of(name)).collect::<Result<Vec<_>, _>>()?;
+    places.sort_unstable();
+    Ok(places)
+}
+
+// Whether a filter leaves one row for each pair that it names, and each run.
+fn names_pairs(filter: &Arc<dyn PhysicalExpr>) -> bool {
+    let is_pair = |expr: &Arc<dyn PhysicalExpr>| expr.downcast_ref::<Column>().is_some_and(|it| it.name() == PAIR);
+    if let Some(list) = filter.downcast_ref::<InListExpr>() {
+        return !list.negated() && is_pair(list.expr()) && list.len() <= NAMED_PAIRS;
+    }
+    filter.downcast_ref::<BinaryExpr>().is_some_and(|binary| match binary.op() {
+        Operator::Eq => is_pair(binary.left()) && binary.right().is::<Literal>(),
+        Operator::Or => names_pairs(binary.left()) && names_pairs(binary.right()),
+        _ => false,
+    })
 }
 
 // Returns the ranges of a partition's files that are read together, in order.
@@ -157,18 +211,54 @@ impl PartitionRows {
         let scan = self.scan.downcast_ref::<FileScanConfig>();
         let group = scan.and_then(|scan| scan.file_groups.get(partition)).and_then(|group| group.files().get(files));
         let files = group.ok_or_else(|| DataFusionError::Internal(format!("no files of partition {partition}")))?;
-        let read = self.columns.read_files(files, &self.wanted, ScanMetrics { metrics: &metrics, partition }).await?;
-        read.into_iter().map(|rows| self.finish_rows(rows)).collect()
+        let metrics = ScanMetrics { metrics: &metrics, partition };
+        if let (Some(placed), [file]) = (&self.placed, files) {
+            return self.read_placed(file, placed, metrics).await;
+        }
+        let read = self.columns.read_files(files, &self.wanted, metrics).await?;
+        read.into_iter().map(|rows| self.project_rows(&self.filter_rows(rows)?)).collect()
     }
 
-    fn finish_rows(&self, mut rows: RecordBatch) -> Result<RecordBatch> {
+    // Reads what the filters need of the rows of a file, and the rest of the rows that they leave.
+    async fn read_placed(
+        &self,
+        file: &PartitionedFile,
+        placed: &WantedColumns,
+        metrics: ScanMetrics<'_>,
+    ) -> Result<Vec<RecordBatch>> {
+        let (mut start, read) = self.columns.read_part(file, &self.wanted, metrics).await?;
+        let place = Arc::new(Field::new("place", DataType::UInt64, false));
+        let fields: Vec<_> = self.wanted.schema().fields().iter().cloned().chain([place]).collect();
+        let numbered_schema: SchemaRef = Arc::new(Schema::new(fields));
+        let mut left = Vec::with_capacity(read.len());
+        for rows in read {
+            let end = start + rows.num_rows();
+            let places: ArrayRef = Arc::new(UInt64Array::from_iter_values(start as u64..end as u64));
+            let columns = rows.columns().iter().cloned().chain([places]).collect();
+            left.push(self.filter_rows(RecordBatch::try_new(numbered_schema.clone(), columns)?)?);
+            start = end;
+        }
+        let left = concat_batches(&numbered_schema, &left)?;
+        let Some((places, columns)) = left.columns().split_last().filter(|_| left.num_rows() > 0) else {
+            return Ok(Vec::new());
+        };
+        let places: Vec<_> = places.as_primitive::<UInt64Type>().values().iter().map(|place| *place as usize).collect();
+        let found = read_placed_rows(self.columns.open_file(file, metrics)?, placed, &places).await?;
+        let columns = columns.iter().chain(found.columns()).cloned().collect();
+        Ok(vec![self.project_rows(&batch_of_rows(&self.read_schema, columns, left.num_rows())?)?])
+    }
+
+    fn filter_rows(&self, mut rows: RecordBatch) -> Result<RecordBatch> {
         for filter in &self.filters {
             let kept = filter.evaluate(&rows)?.into_array(rows.num_rows())?;
             rows = filter_record_batch(&rows, as_boolean_array(&kept)?)?;
         }
-        let projected = self.projector.project_batch(&rows)?;
-        let options = RecordBatchOptions::new().with_row_count(Some(rows.num_rows()));
-        Ok(RecordBatch::try_new_with_options(self.schema.clone(), projected.columns().to_vec(), &options)?)
+        Ok(rows)
+    }
+
+    fn project_rows(&self, rows: &RecordBatch) -> Result<RecordBatch> {
+        let projected = self.projector.project_batch(rows)?;
+        batch_of_rows(&self.schema, projected.columns().to_vec(), rows.num_rows())
     }
 
     fn stream_partition(
@@ -275,10 +365,8 @@ impl DataSource for HeldScan {
 
 #[cfg(test)]
 mod tests {
-    use arrow::datatypes::{DataType, Field, Schema};
     use datafusion::common::stats::Precision;
-    use datafusion::logical_expr::Operator;
-    use datafusion::physical_expr::expressions::{DynamicFilterPhysicalExpr, binary, col, lit};
+    use datafusion::physical_expr::expressions::{DynamicFilterPhysicalExpr, binary, col, in_list, lit};
 
     use super::*;
 
@@ -304,6 +392,32 @@ mod tests {
         check(&dynamic, &[], true);
         check(&with_dynamic, &[id], false);
         check(&with_dynamic, &[id + 1], true);
+    }
+
+    #[test]
+    fn filters_name_pairs_if_each_of_their_alternatives_does() {
+        let fields = [("pair_id", DataType::Int32), ("speaker", DataType::Int32)];
+        let schema: SchemaRef = Arc::new(Schema::new(fields.map(|(name, kind)| Field::new(name, kind, true)).to_vec()));
+        let column = |name: &str| col(name, &schema).expect("a column");
+        let join = |left, operator, right| binary(left, operator, right, &schema).expect("an expression");
+        let pair = |number: i32| join(column("pair_id"), Operator::Eq, lit(number));
+        let speaker = join(column("speaker"), Operator::Eq, lit(7_i32));
+        let list = |count: i32, is_negated| {
+            in_list(column("pair_id"), (0..count).map(lit).collect(), &is_negated, &schema).expect("a list")
+        };
+        for (filter, expected) in [
+            (pair(7), true),
+            (join(pair(7), Operator::Or, pair(8)), true),
+            (list(16, false), true),
+            (list(17, false), false),
+            (list(3, true), false),
+            (speaker.clone(), false),
+            (join(pair(7), Operator::Or, speaker), false),
+            (join(column("pair_id"), Operator::Gt, lit(7_i32)), false),
+            (join(column("pair_id"), Operator::Eq, column("speaker")), false),
+        ] {
+            assert_eq!(names_pairs(&filter), expected, "{filter}");
+        }
     }
 
     #[test]

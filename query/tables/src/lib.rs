@@ -7,10 +7,13 @@ mod held_scan;
 mod lake_table;
 mod leading_filter;
 mod local_scans;
+mod placed_rows;
 mod readers;
+mod run_rows;
 mod scan_files;
 
 pub use column_store::ColumnStore;
 pub use lake_table::{FileReaders, LakeTable, TableSize};
 pub use local_scans::rewrite_local_scans;
 pub use readers::LakeReaderFactory;
+pub use run_rows::RunRows;

@@ -4,7 +4,8 @@
 //! runs,
 //!
 //! - a scan without lists reads the columns that this process has decoded of its files, and decodes and keeps the others
-//!   ([`HeldScan`]), unless they are more than a share of what the process keeps;
+//!   ([`HeldScan`]), unless they are more than a share of what the process keeps; a scan of lists of few pairs does so,
+//!   and then reads the pages of the lists that have these rows;
 //! - such a scan of small files reads all their rows. For each file that it opens, DataFusion's Parquet source
 //!   adapts the query's filters to the file, and plans by them which row groups and pages to read: for a file of a few
 //!   thousand rows that takes longer than reading them. The filters stand above the scan, too;
