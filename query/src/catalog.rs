@@ -21,7 +21,7 @@ use datafusion::prelude::SessionContext;
 use datafusion::sql::parser::Statement;
 use echolake_functions::unified_floats;
 use echolake_lake::{DataFile, Error as LakeError, Lake, LakeMoment, LakeSnapshot, VisibleRun};
-use echolake_lake_tables::{FileReaders, LakeTable, rewrite_local_scans};
+use echolake_lake_tables::{FileReaders, LakeTable, RunRows, rewrite_local_scans};
 use echolake_mcap_tables::{self as mcap_tables, Contents, McapCalls, McapFiles};
 use echolake_schema::RunId;
 use echolake_schema::annotations::Annotation;
@@ -135,6 +135,14 @@ impl LakeCatalog {
     /// If a scan does not fit its table.
     pub fn rewrite_local_scans(&self, plan: Arc<dyn ExecutionPlan>) -> Result<Arc<dyn ExecutionPlan>, DataFusionError> {
         rewrite_local_scans(end_joins(plan)?, &self.source)
+    }
+
+    /// Returns a table in a snapshot that this catalogue has given, to read rows of its runs without a plan.
+    pub fn run_rows<'a>(&'a self, snapshot: &'a LakeSnapshot, table: Table) -> RunRows<'a> {
+        let known = self.known_snapshot();
+        let known = known.as_ref().and_then(|known| known.tables.get(&table)).map(|table| table.schema());
+        let schema = known.unwrap_or_else(|| table.schema(self.lake.rig()));
+        RunRows { table, schema, snapshot, readers: &self.source }
     }
 
     /// Registers everything that `statement` may name, all of one snapshot of the lake, and the program's own tables in

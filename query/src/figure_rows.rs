@@ -174,8 +174,8 @@ pub fn curves_query(rig: &Rig, surfaces: &str, filter: &str) -> String {
     )
 }
 
-/// Returns the columns of [`CurveRow`] behind its surface, aggregates over rows of `nce`.
-pub fn curve_columns(rig: &Rig) -> String {
+// The columns of `CurveRow` behind its surface, aggregates over rows of `nce`.
+fn curve_columns(rig: &Rig) -> String {
     let means: Vec<_> = rig.band_names().iter().map(|band| format!("avg_list(nce_{band})")).collect();
     format!("count(*) as pairs, make_array({}) as bands", means.join(", "))
 }

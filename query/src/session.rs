@@ -7,6 +7,7 @@ use std::collections::HashSet;
 use std::sync::Arc;
 
 use arrow::datatypes::{DataType, SchemaRef};
+use arrow::record_batch::RecordBatch;
 use bytes::Bytes;
 use datafusion::catalog::TableProvider;
 use datafusion::common::ParamValues;
@@ -22,6 +23,7 @@ use echolake_lake::{Lake, LakeSnapshot, VisibleRun};
 use echolake_mcap_tables::Contents;
 use echolake_schema::RunId;
 use echolake_schema::annotations::Annotation;
+use echolake_schema::tables::Table;
 use futures::FutureExt as _;
 use futures::future::BoxFuture;
 use tokio::sync::mpsc;
@@ -482,6 +484,46 @@ impl Session {
     /// [`Error::Lake`] if the lake cannot be read.
     pub async fn known_snapshot(&self) -> Result<Option<Arc<LakeSnapshot>>, Error> {
         self.engine.catalog().known_current_snapshot().await
+    }
+
+    /// Returns the rows that `SELECT columns FROM table WHERE run_id IN (runs) AND pair_id IN (pairs)` has of a snapshot
+    /// that the session has given, without a plan: of lists, the pages of these rows are read. The table's rows are
+    /// those of runs, and each has a pair. To be called as a part of [`Session::run_request`].
+    ///
+    /// # Errors
+    /// [`Error::Lake`] if the table has a fault or a file is damaged; [`Error::Execution`] if it cannot be read.
+    pub fn read_pair_rows<'a>(
+        &'a self,
+        snapshot: &'a LakeSnapshot,
+        table: Table,
+        runs: &'a [RunId],
+        pairs: &'a [i32],
+        columns: &'a [&'a str],
+    ) -> BoxFuture<'a, Result<RecordBatch, Error>> {
+        let read = async move {
+            let rows = self.engine.catalog().run_rows(snapshot, table).read_pairs(runs, pairs, columns).await;
+            rows.map_err(|e| Error::from_execution("", &e))
+        };
+        read.boxed()
+    }
+
+    /// Returns the rows that `SELECT columns FROM table WHERE run_id = run` has, in the same way, in batches. The
+    /// columns are no lists.
+    ///
+    /// # Errors
+    /// As [`Session::read_pair_rows`].
+    pub fn read_run_rows<'a>(
+        &'a self,
+        snapshot: &'a LakeSnapshot,
+        table: Table,
+        run: &'a RunId,
+        columns: &'a [&'a str],
+    ) -> BoxFuture<'a, Result<Vec<RecordBatch>, Error>> {
+        let read = async move {
+            let rows = self.engine.catalog().run_rows(snapshot, table).read_run(run, columns).await;
+            rows.map_err(|e| Error::from_execution("", &e))
+        };
+        read.boxed()
     }
 
     /// Makes the next query look for a newer version of the lake, however short ago the last look was.

@@ -15,7 +15,7 @@ use utoipa::{IntoParams, ToSchema};
 
 use super::super::extract::{PathParams, QueryParams, WholeNumber};
 use super::content::{AnswerContent, EndpointAnswer};
-use super::pair::{PairPath, ResponseSignal, find_geometry, read_measurement, read_reflected};
+use super::pair::{PairPath, ResponseSignal, find_geometry, read_samples};
 use super::request::CatalogueRequest;
 
 /// Samples that are analysed; what follows them is left out.
@@ -116,12 +116,8 @@ pub(super) async fn analysis(
 ) -> EndpointAnswer {
     let entry = request.find_surface(&path.surface_id).await?;
     let pair = request.parse_pair(&path.pair_id)?;
-    let found = tokio::try_join!(
-        read_measurement(&request, entry, pair),
-        read_reflected(&request, entry, pair),
-        find_geometry(&request, pair)
-    );
-    let (measurement, [own, flat], geometry) = found?;
+    let found = tokio::try_join!(read_samples(&request, entry, pair), find_geometry(&request, pair));
+    let ((measurement, [own, flat]), geometry) = found?;
     let rig = request.catalogue.lake().rig();
     let speed_mm_s = 1000.0 * ReferenceAir::from_response(&rig.impulse_response).speed_of_sound();
     let direct_s = geometry.direct_mm / speed_mm_s;

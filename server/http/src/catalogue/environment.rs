@@ -12,6 +12,7 @@ use super::request::{CatalogueRequest, RunPath, nanos_value, text_value};
 /// A reading, or the mean of some.
 #[derive(Deserialize)]
 pub(super) struct AirReading {
+    #[serde(alias = "log_time_ns")]
     ns: i64,
     temperature_c: Option<f64>,
     humidity_pct: Option<f64>,

@@ -19,6 +19,7 @@ mod measured_pairs;
 mod neighbours;
 mod packing;
 mod pair;
+mod pair_rows;
 mod relief;
 mod request;
 mod rows;

@@ -1,6 +1,5 @@
 //! `GET /api/v1/surfaces/{surface_id}/pairs/{pair_id}`: everything about one impulse response.
 
-use std::iter::repeat;
 use std::ops::RangeInclusive;
 use std::sync::Arc;
 
@@ -8,8 +7,9 @@ use arrow::array::{ArrayRef, Float64Array};
 use arrow::record_batch::RecordBatch;
 use axum::Extension;
 use echolake_dsp::room_parameters::is_long_enough;
-use echolake_query::figure_rows::{CurveRow, TOTAL_BAND, band_list, curve_columns, levels_db};
-use echolake_schema::Symmetry;
+use echolake_query::figure_rows::{CurveRow, TOTAL_BAND, band_keys, levels_db};
+use echolake_schema::symmetry::MovedPair;
+use echolake_schema::{Rig, RunId, Symmetry};
 use echolake_service::RequestFault;
 use serde::{Deserialize, Serialize};
 use utoipa::{IntoParams, ToSchema};
@@ -18,7 +18,8 @@ use super::super::extract::{BinaryContent, PathParams};
 use super::content::{AnswerContent, EndpointAnswer};
 use super::curves::CurveSet;
 use super::environment::{AirReading, AirSeries};
-use super::request::{CatalogueRequest, missing_item, nanos_value, number_value, text_value};
+use super::pair_rows::{PairEnergies, PairResponses, PairRows};
+use super::request::{CatalogueRequest, missing_item, number_value, text_value};
 use super::runs::RunLogEntry;
 use super::snapshot::summary::SurfaceEntry;
 
@@ -133,30 +134,6 @@ impl PairMeasurement {
     }
 }
 
-#[derive(Deserialize)]
-pub(super) struct ReflectedResponse {
-    surface_id: String,
-    pub reflected: Option<Vec<f32>>,
-}
-
-/// Responses and curves of a pair on one surface after Foam's response was subtracted.
-#[derive(Deserialize)]
-struct PairResponses {
-    surface_id: String,
-    reflected: Option<Vec<f32>>,
-    pairs: i64,
-    bands: Vec<Option<Vec<f32>>>,
-}
-
-#[derive(Clone, Deserialize)]
-struct PairEnergies {
-    pair_id: i32,
-    total: Vec<Option<f64>>,
-    band: Vec<Option<f64>>,
-    total_u_db: Vec<Option<f64>>,
-    band_u_db: Vec<Option<f64>>,
-}
-
 /// A pair that a symmetry of the grid makes of another.
 #[derive(Serialize, ToSchema)]
 struct SymmetricPair {
@@ -186,24 +163,14 @@ struct RoomBand {
     reason: Option<String>,
 }
 
-const MEASUREMENT: &str = "select ir, log_time_ns, run_id, log_time, attempt, verdict, reasons, temperature_c, \
-    humidity_pct, pressure_hpa, outside_level_db, snr_db, clipped_samples, arrival_error_us, microphone_residual_mm, \
-    speaker_residual_mm, source, chunk_offset from measurements \
-    where surface_id = $1 and pair_id = $2 order by run_id desc limit 1";
 const GEOMETRY: &str = "select pair_id, microphone, speaker, \
     make_array(microphone_x_mm, microphone_y_mm, microphone_z_mm) as microphone_mm, \
     make_array(speaker_x_mm, speaker_y_mm, speaker_z_mm) as speaker_mm, direct_mm, image_mm, incidence_deg, \
     make_array(specular_x_mm, specular_y_mm) as specular_mm, \
     make_array(fresnel_major_2000_mm, fresnel_minor_2000_mm) as low_mm, \
     make_array(fresnel_major_40000_mm, fresnel_minor_40000_mm) as high_mm from pairs order by pair_id";
-const REFLECTED: &str = "select surface_id, avg_list(reflected_ir) as reflected from nce \
-    where surface_id in ($1, $2) and pair_id = $3 group by surface_id";
 const ROOM: &str = "select midband_hz, edt_s, t20_s, t30_s, c50_db, c80_db, d50, ts_ms, range_db, reason \
     from room_parameters where surface_id = $1 and pair_id = $2 and run_id = $3 order by midband_hz nulls first";
-const ATTEMPTS: &str = "select log_time, level, name, message from events \
-    where run_id = $1 and message like $2 order by log_time_ns limit 200";
-const AIR: &str = "select log_time_ns as ns, temperature_c, humidity_pct, pressure_hpa, outside_level_db \
-    from environment where run_id = $1 and log_time_ns between $2 and $3 order by log_time_ns limit 2000";
 
 impl CatalogueRequest {
     /// The pair of this number.
@@ -234,33 +201,30 @@ pub(super) async fn find_geometry(request: &CatalogueRequest, pair: usize) -> Re
     found.ok_or_else(|| missing_item(format!("pair {pair}"), "ask for another one"))
 }
 
-/// The newest measurement of a pair.
-///
-/// # Errors
-/// [`RequestFault::NotFound`] if there is none.
-pub(super) async fn read_measurement(
-    request: &CatalogueRequest,
-    entry: &SurfaceEntry,
-    pair: usize,
-) -> Result<PairMeasurement, RequestFault> {
-    let id = &entry.surface.surface_id;
-    let found = request.read_rows(MEASUREMENT, vec![text_value(id), number_value(pair)]).await?.into_iter().next();
-    let what = || format!("a measurement of pair {pair} on surface `{id}`");
-    found.ok_or_else(|| missing_item(what(), "its run may be partial; another pair may be there"))
+// The fault for a pair that was not measured.
+fn missing_measurement(entry: &SurfaceEntry, pair: usize) -> RequestFault {
+    let what = format!("a measurement of pair {pair} on surface `{}`", entry.surface.surface_id);
+    missing_item(what, "its run may be partial; another pair may be there")
 }
 
-/// The responses of a surface and of its Flat after Foam's were subtracted, if they are known.
-pub(super) async fn read_reflected(
+/// The newest measurement of a pair, and the responses of its surface and of Flat after Foam's were subtracted, if they
+/// are known.
+///
+/// # Errors
+/// [`RequestFault::NotFound`] if there is no measurement.
+pub(super) async fn read_samples(
     request: &CatalogueRequest,
     entry: &SurfaceEntry,
     pair: usize,
-) -> Result<[Option<Vec<f32>>; 2], RequestFault> {
-    let id = &entry.surface.surface_id;
-    let flat = &entry.surface.flat_reference;
-    let rows: Vec<ReflectedResponse> =
-        request.read_rows(REFLECTED, vec![text_value(id), text_value(flat), number_value(pair)]).await?;
-    let of = |surface: &str| rows.iter().find(|row| row.surface_id == surface).and_then(|row| row.reflected.clone());
-    Ok([of(id), of(flat)])
+) -> Result<(PairMeasurement, [Option<Vec<f32>>; 2]), RequestFault> {
+    let read = |rows: PairRows| async move {
+        let (measurement, reflected) = tokio::join!(rows.read_measurement(), rows.read_reflected());
+        // Of a pair that was not measured, nothing else counts.
+        let Some(measurement) = measurement? else { return Ok(None) };
+        Ok::<_, RequestFault>(Some((measurement, reflected?)))
+    };
+    let found = request.read_pair(entry, pair, read).await?;
+    found.ok_or_else(|| missing_measurement(entry, pair))
 }
 
 /// A pair's response.
@@ -292,14 +256,14 @@ impl ResponseSignal {
         entry: &SurfaceEntry,
         pair: usize,
     ) -> Result<Vec<f32>, RequestFault> {
-        let measurement = read_measurement(request, entry, pair).await?;
-        let samples = match self {
-            Self::Measured => Some(measurement.ir),
-            Self::Reflected => {
-                let [own, _] = read_reflected(request, entry, pair).await?;
-                own
+        let read = move |rows: PairRows| async move {
+            match self {
+                Self::Measured => Ok::<_, RequestFault>(rows.read_measured().await?.map(Some)),
+                Self::Reflected => rows.read_own_reflected().await,
             }
         };
+        let found = request.read_pair(entry, pair, read).await?;
+        let samples = found.ok_or_else(|| missing_measurement(entry, pair))?;
         samples.ok_or_else(|| RequestFault::NoData {
             what: format!("pair {pair} of surface `{}`", entry.surface.surface_id),
             data: "reflected response",
@@ -339,48 +303,38 @@ pub(super) async fn pair(
     let entry = request.find_surface(&path.surface_id).await?;
     let pair = request.parse_pair(&path.pair_id)?;
     if request.as_arrow {
-        let found = tokio::try_join!(read_measurement(&request, entry, pair), read_reflected(&request, entry, pair));
-        let (measurement, [own, flat]) = found?;
+        let (measurement, [own, flat]) = read_samples(&request, entry, pair).await?;
         return Ok(encode_samples(&request, &measurement.ir, own.as_deref(), flat.as_deref())?);
     }
-    let (measurement, (responses, curves), geometry) = tokio::try_join!(
-        read_measurement(&request, entry, pair),
-        read_responses(&request, entry, pair),
-        find_geometry(&request, pair),
-    )?;
-    let reflected = |surface: &str| responses.iter().find(|(name, _)| name == surface)?.1.as_deref();
-    let (PairLevels { energies, symmetries }, room, attempts, air) = tokio::try_join!(
-        read_levels(&request, entry, pair, &measurement.run_id),
-        read_room(&request, entry, pair, &measurement),
-        // The controller's messages about a pair begin so.
-        request.read_rows::<RunLogEntry>(
-            ATTEMPTS,
-            vec![text_value(&measurement.run_id), text_value(&format!("pair {pair},%"))]
-        ),
-        request.read_rows::<AirReading>(
-            AIR,
-            vec![
-                text_value(&measurement.run_id),
-                nanos_value(measurement.log_time_ns.saturating_sub(AROUND_NS)),
-                nanos_value(measurement.log_time_ns.saturating_add(AROUND_NS)),
-            ],
-        ),
-    )?;
+    let (found, geometry) = tokio::try_join!(read_findings(&request, entry, pair), find_geometry(&request, pair))?;
+    let PairFindings { measurement, responses: [own, flat], energies, attempts, air } = found;
+    let room = read_room(&request, entry, pair, &measurement).await?;
+    let rig = request.catalogue.lake().rig();
+    let number = geometry.pair_id;
+    let bands = BandColumns::new(rig);
+    let surface = &entry.surface;
+    let mut curves = Vec::new();
+    let [own, flat] = [(&surface.surface_id, own), (&surface.flat_reference, flat)].map(|(name, found)| {
+        let PairResponses { reflected, pairs, bands } = found?;
+        curves.push(CurveRow { surface_id: name.clone(), pairs, bands });
+        reflected
+    });
+    let curves = CurveSet::from_rows(rig, entry, &curves, usize::MAX);
     Ok(AnswerContent::encode_json(&PairDetail {
-        surface_id: &entry.surface.surface_id,
+        surface_id: &surface.surface_id,
         pair: geometry,
         environment: AirSeries::new(air, measurement.log_time_ns, &measurement.log_time),
         measured: &measurement.ir,
         measurement: &measurement,
-        rate_hz: request.catalogue.lake().rig().sweep.rate_hz.get(),
-        reflected: reflected(&entry.surface.surface_id),
-        flat_reflected: reflected(&entry.surface.flat_reference),
-        tnce_db: levels_db(&energies.total),
-        tnce_band_db: levels_db(&energies.band),
-        tnce_u_db: energies.total_u_db,
-        tnce_band_u_db: energies.band_u_db,
+        rate_hz: rig.sweep.rate_hz.get(),
+        reflected: own.as_deref(),
+        flat_reflected: flat.as_deref(),
+        tnce_db: levels_db(&energies.find_values(number, &bands.total)?),
+        tnce_band_db: levels_db(&energies.find_values(number, &bands.band)?),
+        tnce_u_db: energies.find_values(number, &bands.total_u_db)?,
+        tnce_band_u_db: energies.find_values(number, &bands.band_u_db)?,
         curves: Some(curves).filter(CurveSet::is_there),
-        symmetries,
+        symmetries: find_symmetries(&request, pair, &energies, &bands)?,
         room,
         attempts,
     })?)
@@ -397,92 +351,99 @@ impl PairGeometry {
     }
 }
 
-/// A response after Foam's was subtracted, by the name of its surface.
-type ReflectedResponses = Vec<(String, Option<Vec<f32>>)>;
-
-// The responses and the curves of a pair on a surface and on its Flat.
-async fn read_responses(
-    request: &CatalogueRequest,
-    entry: &SurfaceEntry,
-    pair: usize,
-) -> Result<(ReflectedResponses, CurveSet), RequestFault> {
-    let rig = request.catalogue.lake().rig();
-    let sql = format!(
-        "select surface_id, avg_list(reflected_ir) as reflected, {} from nce \
-         where surface_id in ($1, $2) and pair_id = $3 group by surface_id",
-        curve_columns(rig)
-    );
-    let surface = &entry.surface;
-    let values = vec![text_value(&surface.surface_id), text_value(&surface.flat_reference), number_value(pair)];
-    let mut responses = Vec::new();
-    let mut curves = Vec::new();
-    for PairResponses { surface_id, reflected, pairs, bands } in request.read_rows(&sql, values).await? {
-        responses.push((surface_id.clone(), reflected));
-        curves.push(CurveRow { surface_id, pairs, bands });
-    }
-    Ok((responses, CurveSet::from_rows(rig, entry, &curves, usize::MAX)))
-}
-
-/// Energies of a pair, and those of the pairs that symmetries make of it.
-struct PairLevels {
+/// What tables have of a pair on a surface.
+struct PairFindings {
+    measurement: PairMeasurement,
+    /// Of the surface and of its Flat, with the curves by band.
+    responses: [Option<PairResponses>; 2],
+    /// Of the pair, and of those that symmetries make of it.
     energies: PairEnergies,
-    symmetries: Vec<SymmetricPair>,
+    attempts: Vec<RunLogEntry>,
+    air: Vec<AirReading>,
 }
 
-async fn read_levels(
+async fn read_findings(
     request: &CatalogueRequest,
     entry: &SurfaceEntry,
     pair: usize,
-    run: &str,
-) -> Result<PairLevels, RequestFault> {
-    let lake = request.catalogue.lake();
-    let rig = lake.rig();
+) -> Result<PairFindings, RequestFault> {
+    let rig = request.catalogue.lake().rig();
+    let curves: Vec<_> = rig.band_names().iter().map(|band| format!("nce_{band}")).collect();
+    let bands = BandColumns::new(rig);
+    let moved = moved_pairs(request, pair).map(|(_, moved)| moved.pair.id.0 as i32);
+    let pairs: Vec<_> = moved.chain([pair as i32]).collect();
+    let read = |rows: PairRows| async move {
+        let (measurement, responses) = tokio::join!(rows.read_measurement(), rows.read_responses(&curves));
+        let Some(measurement) = measurement? else { return Ok(None) };
+        let responses = responses?;
+        let run: RunId = measurement.run_id.parse().map_err(RequestFault::defect("a row is of no run"))?;
+        let ns = measurement.log_time_ns;
+        let columns = [&bands.total, &bands.band, &bands.total_u_db, &bands.band_u_db].map(Vec::as_slice);
+        let (energies, attempts, air) = tokio::try_join!(
+            rows.read_energies(&run, &pairs, columns),
+            rows.read_attempts(&run),
+            rows.read_air(&run, ns.saturating_sub(AROUND_NS), ns.saturating_add(AROUND_NS)),
+        )?;
+        Ok::<_, RequestFault>(Some(PairFindings { measurement, responses, energies, attempts, air }))
+    };
+    let found = request.read_pair(entry, pair, read).await?;
+    found.ok_or_else(|| missing_measurement(entry, pair))
+}
+
+/// Columns of `tnce` by band, the total last.
+struct BandColumns {
+    total: Vec<String>,
+    band: Vec<String>,
+    total_u_db: Vec<String>,
+    band_u_db: Vec<String>,
+}
+
+impl BandColumns {
+    fn new(rig: &Rig) -> Self {
+        let over_total = |band: &String| format!("tnce_{band}");
+        let over_band = |band: &String| if band == TOTAL_BAND { over_total(band) } else { format!("tnce_band_{band}") };
+        let with_u = |columns: &[String]| columns.iter().map(|column| format!("{column}_u_db")).collect();
+        let bands = band_keys(rig);
+        let total: Vec<_> = bands.iter().map(over_total).collect();
+        let band: Vec<_> = bands.iter().map(over_band).collect();
+        Self { total_u_db: with_u(&total), band_u_db: with_u(&band), total, band }
+    }
+}
+
+// The pairs that the symmetries of the grid make of a pair, by the symmetries' names.
+fn moved_pairs(request: &CatalogueRequest, pair: usize) -> impl Iterator<Item = (&'static str, MovedPair)> {
     let moved = request.view.results.moved_pairs.get_or_init(|| {
-        let images = |symmetry| Some((symmetry, lake.grid().moved_pairs(symmetry)?));
+        let images = |symmetry| Some((symmetry, request.catalogue.lake().grid().moved_pairs(symmetry)?));
         let mut all: Vec<_> = Symmetry::ALL.into_iter().filter_map(images).collect();
         all.sort_by_key(|(symmetry, _)| symmetry.name());
         all
     });
-    let moved: Vec<_> = moved.iter().map(|(symmetry, pairs)| (symmetry.name(), pairs[pair])).collect();
-    let over_total = |band: &str| format!("tnce_{band}");
-    let over_band = |band: &str| if band == TOTAL_BAND { over_total(band) } else { format!("tnce_band_{band}") };
-    let total = band_list(rig, over_total);
-    let band = band_list(rig, over_band);
-    let total_u = band_list(rig, |band| format!("{}_u_db", over_total(band)));
-    let band_u = band_list(rig, |band| format!("{}_u_db", over_band(band)));
-    // A placeholder for each symmetry, one of which leaves the pair where it is.
-    let sql = format!(
-        "select pair_id, {total} as total, {band} as band, {total_u} as total_u_db, {band_u} as band_u_db from tnce \
-         where surface_id = $1 and run_id = $2 and pair_id in ($3, $4, $5, $6, $7, $8, $9, $10)"
-    );
-    let pairs = moved.iter().map(|(_, moved)| moved.pair.id.0 as usize).chain(repeat(pair)).take(Symmetry::ALL.len());
-    let values = [text_value(&entry.surface.surface_id), text_value(run)].into_iter().chain(pairs.map(number_value));
-    let rows: Vec<PairEnergies> = request.read_rows(&sql, values.collect()).await?;
-    let find = |pair: usize| rows.iter().find(|row| usize::try_from(row.pair_id) == Ok(pair));
-    let nothing = vec![None; rig.band_names().len() + 1];
-    let energies = find(pair).cloned().unwrap_or_else(|| PairEnergies {
-        pair_id: 0,
-        total: nothing.clone(),
-        band: nothing.clone(),
-        total_u_db: nothing.clone(),
-        band_u_db: nothing,
-    });
+    moved.iter().map(move |(symmetry, pairs)| (symmetry.name(), pairs[pair]))
+}
+
+fn find_symmetries(
+    request: &CatalogueRequest,
+    pair: usize,
+    energies: &PairEnergies,
+    bands: &BandColumns,
+) -> Result<Vec<SymmetricPair>, RequestFault> {
     // A pair without energies has no row in `tnce_d4` either.
-    let measured = moved.into_iter().filter(|_| find(pair).is_some());
-    let symmetries = measured.filter_map(|(symmetry, moved)| {
-        let row = find(moved.pair.id.0 as usize)?;
+    if !energies.has_pair(pair as i32) {
+        return Ok(Vec::new());
+    }
+    let measured = moved_pairs(request, pair).filter(|(_, moved)| energies.has_pair(moved.pair.id.0 as i32));
+    let symmetries = measured.map(|(symmetry, moved)| {
         let pair = moved.pair;
-        Some(SymmetricPair {
+        Ok(SymmetricPair {
             symmetry,
             pair_id: pair.id.0.into(),
             microphone: pair.microphone.0.into(),
             speaker: pair.speaker.0.into(),
             swapped: moved.swapped,
-            tnce_db: levels_db(&row.total),
+            tnce_db: levels_db(&energies.find_values(pair.id.0 as i32, &bands.total)?),
         })
     });
-    let symmetries = symmetries.collect();
-    Ok(PairLevels { energies, symmetries })
+    symmetries.collect()
 }
 
 async fn read_room(

@@ -36,20 +36,25 @@ impl<T: DeserializeOwned + Send + 'static> AnswerEncoder for RowDecoder<T> {
         if self.bytes > MOST_BYTES {
             return Err(RequestFault::TooLarge { limit: MOST_BYTES });
         }
-        let rows = finite_batch(&batch).map_err(|e| e.to_string());
-        let rows = rows.and_then(|batch| serde_arrow::from_record_batch(&batch).map_err(|e| e.to_string()));
-        match rows {
-            Ok(rows) => Ok(vec![rows]),
-            Err(e) => {
-                tracing::error!(sql = self.sql, error = e, "the rows of a query are not as expected");
-                Err(RequestFault::Internal)
-            }
-        }
+        Ok(vec![decode_rows(&self.sql, &batch)?])
     }
 
     fn encode_end(self) -> Result<Vec<Vec<T>>, RequestFault> {
         Ok(Vec::new())
     }
+}
+
+/// Decodes a batch into structs; numbers that are not finite are null. `sql` is for the log.
+///
+/// # Errors
+/// [`RequestFault::Internal`] if the columns are not those of the structs.
+pub(super) fn decode_rows<T: DeserializeOwned>(sql: &str, batch: &RecordBatch) -> Result<Vec<T>, RequestFault> {
+    let rows = finite_batch(batch).map_err(|e| e.to_string());
+    let rows = rows.and_then(|batch| serde_arrow::from_record_batch(&batch).map_err(|e| e.to_string()));
+    rows.map_err(|e| {
+        tracing::error!(sql, error = e, "the rows of a query are not as expected");
+        RequestFault::Internal
+    })
 }
 
 // Without what a slice leaves out of its buffers.
