@@ -8,7 +8,7 @@ pub use crate::foam::subtract_foam;
 
 /// Sum of squares.
 pub fn energy<T: RealSample>(x: &[T]) -> f64 {
-    x.iter().map(|x| x.f64() * x.f64()).sum()
+    T::dot_product(x, x)
 }
 
 /// Root of the mean square; 0 of no samples.
