@@ -22,7 +22,7 @@ use realfft::num_complex::Complex;
 use realfft::{ComplexToReal, RealToComplex};
 use rustfft::{Fft, FftDirection};
 
-use crate::deconvolution::fast_length;
+use crate::deconvolution::{JointSpectrum, fast_length};
 use crate::error::check_len;
 use crate::level::power_to_db;
 use crate::oversampling::{greatest_magnitude, oversampled_peak};
@@ -32,6 +32,8 @@ use crate::{Error, RealSample};
 pub use fault::{TakeChannel, TakeFault};
 pub use harmonics::{HARMONIC_ORDERS, TakeDistortion};
 
+/// Bins side by side.
+const LANES: usize = 4;
 /// Greatest clock ratio that is searched, as a fraction: 3000 ppm.
 const MAX_CLOCK_RATIO: f64 = 3e-3;
 /// Width of the sin^4 at both limits of the sweep's range, Hz: it rings for 0.5 ms. At most a quarter of the range.
@@ -93,6 +95,8 @@ pub struct TakeAnalyzer {
     /// Gains of bins, and those bins that have one.
     taper: Vec<f32>,
     range: Range<usize>,
+    /// Squares of these bins' gains over the played sweep's powers.
+    copy_weights: Vec<f64>,
 }
 
 /// Transforms of a response's vicinity, `[len]`, with its onset in the middle.
@@ -101,12 +105,32 @@ struct ShortTransform {
     step_hz: f64,
     forward: Arc<dyn Fft<f32>>,
     inverse: Arc<dyn Fft<f32>>,
+    /// Bins in the sweep's range.
+    swept: Range<usize>,
     /// Bins whose taper is at least a half, and the weights of their phases in a clock ratio.
     core: Range<usize>,
     drift_weights: Vec<f64>,
     /// Bins of each part of the sweep, and the window before an arrival.
     parts: Vec<Range<usize>>,
     window: Vec<f32>,
+}
+
+/// Buffers of a [`TakeAnalyzer`].
+#[derive(Default)]
+pub struct TakeScratch {
+    /// Spectra of the recording and the loopback.
+    spectra: [Vec<Complex<f32>>; 2],
+    signal: Vec<f32>,
+    quotient: Vec<Complex<f32>>,
+    transform: TransformScratch,
+}
+
+/// Memory for transforms.
+#[derive(Default)]
+struct TransformScratch {
+    work: Vec<Complex<f32>>,
+    /// Samples and powers of responses that are judged.
+    judged: Vec<(Vec<Complex<f32>>, Vec<f32>)>,
 }
 
 /// A response to a sweep.
@@ -155,11 +179,14 @@ impl TakeAnalyzer {
             (0..played.len()).map(|k| taper_gain(&sweep, k as f64 * sweep.rate_hz / n as f64) as f32).collect();
         let first = taper.iter().position(|gain| *gain > 0.0).unwrap_or(0);
         let count = taper.iter().filter(|gain| **gain > 0.0).count();
+        let range = first..first + count;
+        let weight = |(gain, bin): (&f32, &Complex<f32>)| f64::from(*gain).powi(2) / widen(*bin).norm_sqr();
         Ok(Self {
             short: ShortTransform::new(&sweep, short),
             inverse: f32::plan_fft(n, FftDirection::Inverse),
             real_inverse: f32::plan_real_inverse(n),
-            range: first..first + count,
+            copy_weights: taper[range.clone()].iter().zip(&played[range.clone()]).map(weight).collect(),
+            range,
             sweep,
             recording_len,
             forward,
@@ -175,9 +202,13 @@ impl TakeAnalyzer {
     /// # Errors
     /// [`Error::Length`]; [`Error::NotFinite`].
     pub fn analyze_take(&self, recording: &[f32], loopback: Option<&[f32]>) -> Result<TakeAnalysis, Error> {
-        let recorded = self.transform_signal("the recording", recording)?;
-        let looped = loopback.map(|signal| self.transform_signal("the loopback", signal)).transpose()?;
-        Ok(self.analyze_spectra([Some(recording), loopback], &recorded, looped.as_deref()))
+        let TakeScratch { spectra: [recorded, looped], signal, transform, .. } = &mut TakeScratch::default();
+        self.transform_signal("the recording", recording, recorded, signal, transform)?;
+        if let Some(loopback) = loopback {
+            self.transform_signal("the loopback", loopback, looped, signal, transform)?;
+        }
+        let looped = loopback.is_some().then_some(looped.as_slice());
+        Ok(self.analyze_spectra([Some(recording), loopback], recorded, looped, transform))
     }
 
     /// Gains of bins for [`Self::deconvolve_take`]: 1 in the sweep's range, with half cosines of this width, Hz, at
@@ -189,7 +220,8 @@ impl TakeAnalyzer {
         (0..self.played.len()).map(gain).collect()
     }
 
-    /// Analyses a take, and divides its recording by its loopback with these gains.
+    /// Analyses a take, and divides its recording by its loopback with these gains. The spectra are taken from `joint`,
+    /// if there is a joint transform of both channels of this analyzer's length.
     ///
     /// recording, loopback `[recording_len]`, gains `[bins]`
     /// response `[recording_len]`  the whole response
@@ -198,26 +230,40 @@ impl TakeAnalyzer {
     /// [`Error::Length`]; [`Error::NotFinite`]; [`Error::NoLoopback`] if it has nothing at a frequency.
     pub fn deconvolve_take(
         &self,
-        recording: &[f32],
-        loopback: &[f32],
+        [recording, loopback]: [&[f32]; 2],
+        joint: Option<JointSpectrum<'_, f32>>,
         gains: &[f32],
         response: &mut [f32],
+        scratch: &mut TakeScratch,
     ) -> Result<TakeAnalysis, Error> {
         check_len("the response", response.len(), self.recording_len)?;
         check_len("the gains", gains.len(), self.played.len())?;
-        let recorded = self.transform_signal("the recording", recording)?;
-        let looped = self.transform_signal("the loopback", loopback)?;
+        let TakeScratch { spectra: [recorded, looped], signal, quotient, transform } = scratch;
+        match joint.filter(|joint| joint.transform_len() == self.forward.len()) {
+            Some(joint) => {
+                check_len("the recording", recording.len(), self.recording_len)?;
+                check_len("the loopback", loopback.len(), self.recording_len)?;
+                joint.split_spectra(recorded, looped);
+                check_finite("the recording", recorded)?;
+                check_finite("the loopback", looped)?;
+            }
+            None => {
+                self.transform_signal("the recording", recording, recorded, signal, transform)?;
+                self.transform_signal("the loopback", loopback, looped, signal, transform)?;
+            }
+        }
         if looped.iter().zip(gains).any(|(z, gain)| *gain > 0.0 && z.norm_sqr() == 0.0) {
             return Err(Error::NoLoopback);
         }
         let scale = 1.0 / self.forward.len() as f32;
-        let bins = recorded.iter().zip(&looped).zip(gains);
-        let mut quotient: Vec<_> = bins.map(|((of, by), gain)| divide_bin(of, by, gain * scale)).collect();
-        let mut samples = self.real_inverse.make_output_vec();
+        let bins = recorded.iter().zip(&*looped).zip(gains);
+        quotient.clear();
+        quotient.extend(bins.map(|((of, by), gain)| divide_bin(of, by, gain * scale)));
+        signal.resize(self.forward.len(), 0.0);
         // The sweep's range ends before both real bins.
-        let _ = self.real_inverse.process(&mut quotient, &mut samples);
-        response.copy_from_slice(&samples[..self.recording_len]);
-        Ok(self.analyze_spectra([Some(recording), Some(loopback)], &recorded, Some(&looped)))
+        let _ = self.real_inverse.process_with_scratch(quotient, signal, self.transform_work(transform));
+        response.copy_from_slice(&signal[..self.recording_len]);
+        Ok(self.analyze_spectra([Some(recording), Some(loopback)], recorded, Some(looped), transform))
     }
 
     fn analyze_spectra(
@@ -225,6 +271,7 @@ impl TakeAnalyzer {
         [recording, loopback]: [Option<&[f32]>; 2],
         recorded: &[Complex<f32>],
         looped: Option<&[Complex<f32>]>,
+        scratch: &mut TransformScratch,
     ) -> TakeAnalysis {
         let mut analysis = TakeAnalysis::unknown();
         for (channel, signal) in [(TakeChannel::Recording, recording), (TakeChannel::Loopback, loopback)] {
@@ -234,45 +281,58 @@ impl TakeAnalyzer {
             }
         }
         let Some(looped) = looped else {
-            self.analyze_recording(&mut analysis, &self.divide_by_sweep(recorded), 0.0, 0, true);
+            self.analyze_recording(&mut analysis, &self.divide_by_sweep(recorded, scratch), 0.0, 0, true);
             return analysis;
         };
-        let electrical = self.divide_by_sweep(looped);
-        let loopback_ratio = self.fit_clock_ratio(&electrical);
-        let aligned = self.align_clocks(&electrical, loopback_ratio);
-        let match_db = self.match_db(&electrical, &aligned, 1);
+        let electrical = self.divide_by_sweep(looped, scratch);
+        let response = self.divide_spectra(recorded, looped, self.forward.len() / 2, scratch);
+        self.analyze_channels(&mut analysis, [recorded, looped], &electrical, &response, scratch);
+        scratch.judged.extend([electrical, response].map(|judged| (judged.samples, judged.powers)));
+        analysis
+    }
+
+    // Faults of a take, from the response of its loopback to the sweep and that of its recording to the loopback.
+    fn analyze_channels(
+        &self,
+        analysis: &mut TakeAnalysis,
+        [recorded, looped]: [&[Complex<f32>]; 2],
+        electrical: &SweepResponse,
+        response: &SweepResponse,
+        scratch: &mut TransformScratch,
+    ) {
+        let loopback_ratio = self.fit_clock_ratio(electrical);
+        let aligned = self.align_clocks(electrical, loopback_ratio);
+        let match_db = self.match_db(electrical, &aligned, 1);
         analysis.loopback_match_db = match_db;
-        let response = self.divide_spectra(recorded, looped, self.forward.len() / 2);
-        let direct = self.match_db(&response, &response.vicinity, 1);
+        let direct = self.match_db(response, &response.vicinity, 1);
         if direct > SAME_SIGNAL_DB && response.peak == 0 {
             let level_db = power_to_db(response.energy) - power_to_db(self.unit_energy());
             analysis.faults.push(TakeFault::SameSignal { level_db });
         } else if match_db >= MATCH_DB {
-            if response.onset < -(self.seconds(RINGING_SECS) as i64) && self.is_played_sweep(recorded) {
+            if response.onset < -(self.seconds(RINGING_SECS) as i64) && self.is_played_sweep(recorded, scratch) {
                 analysis.faults.push(TakeFault::Swapped { early_secs: -self.secs_of(response.onset) });
             } else {
-                self.find_cut(&mut analysis, electrical.onset);
-                self.find_dropout(&mut analysis, electrical.onset, &[&aligned], TakeChannel::Loopback);
+                self.find_cut(analysis, electrical.onset);
+                self.find_dropout(analysis, electrical.onset, &[&aligned], TakeChannel::Loopback);
                 let is_copy = self.is_digital_copy(looped, electrical.peak);
-                self.analyze_recording(&mut analysis, &response, loopback_ratio, electrical.onset, is_copy);
+                self.analyze_recording(analysis, response, loopback_ratio, electrical.onset, is_copy);
             }
-        } else if self.match_db(&electrical, &electrical.vicinity, 2) > TORN_MATCH_DB
-            && self.find_dropout(&mut analysis, electrical.onset, &[&electrical.vicinity], TakeChannel::Loopback)
+        } else if self.match_db(electrical, &electrical.vicinity, 2) > TORN_MATCH_DB
+            && self.find_dropout(analysis, electrical.onset, &[&electrical.vicinity], TakeChannel::Loopback)
         {
             // Its two parts arrive at different times.
         } else {
-            let acoustical = self.divide_by_sweep(recorded);
+            let acoustical = self.divide_by_sweep(recorded, scratch);
             let aligned = self.align_clocks(&acoustical, self.fit_clock_ratio(&acoustical));
             let recording_db = self.match_db(&acoustical, &aligned, 1);
             analysis.faults.push(if recording_db >= MATCH_DB {
                 TakeFault::Swapped { early_secs: self.secs_of(electrical.onset - acoustical.onset) }
-            } else if self.causal_db(&response) > CAUSAL_DB && response.peak_db() >= PEAK_DB {
+            } else if self.causal_db(response) > CAUSAL_DB && response.peak_db() >= PEAK_DB {
                 TakeFault::UnknownSweep { match_db, least_db: MATCH_DB }
             } else {
                 TakeFault::Loopback { match_db, least_db: MATCH_DB }
             });
         }
-        analysis
     }
 
     // Faults of a recording over a loopback with the sweep in it, or over the played sweep itself; `known` is the
@@ -312,8 +372,8 @@ impl TakeAnalyzer {
     }
 
     // Whether a channel is the sweep itself, by the playing clock.
-    fn is_played_sweep(&self, spectrum: &[Complex<f32>]) -> bool {
-        let response = self.divide_by_sweep(spectrum);
+    fn is_played_sweep(&self, spectrum: &[Complex<f32>], scratch: &mut TransformScratch) -> bool {
+        let response = self.divide_by_sweep(spectrum, scratch);
         let ratio = self.fit_clock_ratio(&response);
         self.match_db(&response, &self.align_clocks(&response, ratio), 1) >= MATCH_DB
             && ratio.abs() <= self.drift_ratio(MAX_DRIFT_CYCLES)
@@ -321,18 +381,24 @@ impl TakeAnalyzer {
 
     // Whether a channel is the sweep at a delay of whole samples, without the response of any converter.
     fn is_digital_copy(&self, spectrum: &[Complex<f32>], delay: i64) -> bool {
-        let step = Complex::from_polar(1.0, TAU * delay as f64 / self.forward.len() as f64);
-        let mut turn = Complex::new(1.0, 0.0);
-        let mut product = Complex::<f64>::default();
-        let mut energies = [0.0, 0.0];
-        for k in self.range.clone() {
-            let weight = f64::from(self.taper[k]).powi(2);
-            let quotient = widen(spectrum[k]) * widen(self.played[k]).inv();
-            product += quotient * turn * weight;
-            energies[0] += weight * quotient.norm_sqr();
-            energies[1] += weight;
-            turn *= step;
+        let angle = TAU * delay as f64 / self.forward.len() as f64;
+        let turn = |bins: usize| Complex::from_polar(1.0, angle * bins as f64);
+        let step = turn(LANES);
+        let mut turns: [Complex<f64>; LANES] = std::array::from_fn(turn);
+        let mut products = [Complex::<f64>::default(); LANES];
+        let mut energies = [0.0; LANES];
+        let range = self.range.clone();
+        let bins = lane_groups(&spectrum[range.clone()]).zip(lane_groups(&self.played[range]));
+        for ((of, by), weights) in bins.zip(lane_groups(&self.copy_weights)) {
+            for lane in 0..LANES {
+                let of = widen(of[lane]);
+                products[lane] += of * widen(by[lane]).conj() * turns[lane] * weights[lane];
+                energies[lane] += of.norm_sqr() * weights[lane];
+                turns[lane] *= step;
+            }
         }
+        let product: Complex<f64> = products.iter().sum();
+        let energies = [energies.iter().sum::<f64>(), crate::energy::energy(&self.taper)];
         1.0 - product.norm_sqr() / (energies[0] * energies[1]) < DIGITAL_COPY_SHARE
     }
 
@@ -341,37 +407,58 @@ impl TakeAnalyzer {
         cycles / (self.sweep.duration_secs * self.sweep.high_hz)
     }
 
-    fn transform_signal(&self, what: &'static str, signal: &[f32]) -> Result<Vec<Complex<f32>>, Error> {
+    fn transform_signal(
+        &self,
+        what: &'static str,
+        signal: &[f32],
+        spectrum: &mut Vec<Complex<f32>>,
+        samples: &mut Vec<f32>,
+        scratch: &mut TransformScratch,
+    ) -> Result<(), Error> {
         check_len(what, signal.len(), self.recording_len)?;
-        let mut samples = signal.to_vec();
+        samples.clear();
+        samples.extend_from_slice(signal);
         samples.resize(self.forward.len(), 0.0);
-        let mut spectrum = self.forward.make_output_vec();
-        let _ = self.forward.process(&mut samples, &mut spectrum);
-        if spectrum.iter().all(|x| x.re.is_finite() && x.im.is_finite()) {
-            Ok(spectrum)
-        } else {
-            Err(Error::NotFinite { what })
-        }
+        spectrum.resize(self.played.len(), Complex::default());
+        let _ = self.forward.process_with_scratch(samples, spectrum, self.transform_work(scratch));
+        check_finite(what, spectrum)
+    }
+
+    fn transform_work<'a>(&self, scratch: &'a mut TransformScratch) -> &'a mut [Complex<f32>] {
+        let lens = [self.forward.get_scratch_len(), self.real_inverse.get_scratch_len()];
+        let len = lens.into_iter().fold(self.inverse.get_inplace_scratch_len(), usize::max);
+        scratch.work.resize(len, Complex::default());
+        &mut scratch.work
     }
 
     // A channel over the played sweep. Of the two places that a lag in a circle has, early and late, the sweep is where
     // the recording lost less of it: a sweep that is in it as a whole may begin at any sample.
-    fn divide_by_sweep(&self, of: &[Complex<f32>]) -> SweepResponse {
+    fn divide_by_sweep(&self, of: &[Complex<f32>], scratch: &mut TransformScratch) -> SweepResponse {
         let latest = (self.forward.len() + self.recording_len).saturating_sub(self.sweep.len()) / 2;
-        self.divide_spectra(of, &self.played, latest)
+        self.divide_spectra(of, &self.played, latest, scratch)
     }
 
     // Lags over `latest` are negative.
-    fn divide_spectra(&self, of: &[Complex<f32>], by: &[Complex<f32>], latest: usize) -> SweepResponse {
+    fn divide_spectra(
+        &self,
+        of: &[Complex<f32>],
+        by: &[Complex<f32>],
+        latest: usize,
+        scratch: &mut TransformScratch,
+    ) -> SweepResponse {
         let n = self.forward.len();
-        let mut samples = vec![Complex::default(); n];
+        let (mut samples, mut powers) = scratch.judged.pop().unwrap_or_default();
         let range = self.range.clone();
+        samples.resize(n, Complex::default());
+        samples[..range.start].fill(Complex::default());
+        samples[range.end..].fill(Complex::default());
         let bins = of[range.clone()].iter().zip(&by[range.clone()]).zip(&self.taper[range.clone()]);
         for (to, ((of, by), gain)) in samples[range].iter_mut().zip(bins) {
             *to = divide_bin(of, by, gain / n as f32);
         }
-        self.inverse.process(&mut samples);
-        let powers = powers_of(&samples);
+        self.inverse.process_with_scratch(&mut samples, self.transform_work(scratch));
+        powers.clear();
+        powers.extend(samples.iter().map(Complex::norm_sqr));
         let energy = sum_of(&powers);
         let peak = index_of_greatest(&powers);
         let is_early = peak > latest;
@@ -426,18 +513,17 @@ impl TakeAnalyzer {
             return Cow::Borrowed(&response.vicinity);
         }
         let mut spectrum = response.vicinity.spectrum.clone();
-        let mut last_hz = f64::NAN;
-        let mut turn = Complex::default();
-        for (k, z) in spectrum.iter_mut().enumerate() {
-            let hz = (k as f64 * self.short.step_hz).clamp(self.sweep.low_hz, self.sweep.high_hz);
-            if hz != last_hz {
-                let cycles = self.sweep.phase_cycles(hz / (1.0 + ratio)) - self.sweep.phase_cycles(hz);
-                let (sin, cos) = (TAU * cycles.fract()).sin_cos();
-                turn = Complex::new(cos as f32, sin as f32);
-                last_hz = hz;
-            }
-            *z *= turn;
+        let cycles = |hz: f64| self.sweep.phase_cycles(hz / (1.0 + ratio)) - self.sweep.phase_cycles(hz);
+        // Beyond the sweep's range bins are turned as at its limits.
+        let Range { start, end } = self.short.swept;
+        let (below, rest) = spectrum.split_at_mut(start);
+        let (swept, above) = rest.split_at_mut(end - start);
+        for (bins, hz) in [(below, self.sweep.low_hz), (above, self.sweep.high_hz)] {
+            let turn = Complex::from_polar(1.0, TAU * cycles(hz).fract());
+            let turn = Complex::new(turn.re as f32, turn.im as f32);
+            bins.iter_mut().for_each(|z| *z *= turn);
         }
+        clock::turn_bins(swept, |bin| cycles((start + bin) as f64 * self.short.step_hz));
         let scale = 1.0 / self.short.len as f32;
         let mut samples: Vec<_> = spectrum.iter().map(|z| z * scale).collect();
         self.short.inverse.process(&mut samples);
@@ -473,6 +559,7 @@ impl ShortTransform {
         Self {
             len,
             step_hz,
+            swept: swept_bins(sweep, len),
             forward: f32::plan_fft(len, FftDirection::Forward),
             inverse: f32::plan_fft(len, FftDirection::Inverse),
             drift_weights: clock::drift_weights(sweep, core.clone().map(|k| k as f64 * step_hz)),
@@ -506,6 +593,13 @@ impl SweepResponse {
     }
 }
 
+// Bins of a transform that are in the sweep's range.
+fn swept_bins(sweep: &SineSweep, len: usize) -> Range<usize> {
+    let bin = |hz: f64| hz / sweep.rate_hz * len as f64;
+    let start = (bin(sweep.low_hz).ceil() as usize).min(len);
+    start..(bin(sweep.high_hz) as usize + 1).clamp(start, len)
+}
+
 // Gain of a frequency: 1 in the sweep's range, falling to 0 at its limits.
 fn taper_gain(sweep: &SineSweep, hz: f64) -> f64 {
     sine_taper(sweep, hz, TAPER_HZ.min((sweep.high_hz - sweep.low_hz) / 4.0)).powi(4)
@@ -516,7 +610,15 @@ fn sine_taper(sweep: &SineSweep, hz: f64, width_hz: f64) -> f64 {
     (std::f64::consts::FRAC_PI_2 * inside).sin()
 }
 
+fn check_finite(what: &'static str, spectrum: &[Complex<f32>]) -> Result<(), Error> {
+    match spectrum.iter().all(|x| x.re.is_finite() && x.im.is_finite()) {
+        true => Ok(()),
+        false => Err(Error::NotFinite { what }),
+    }
+}
+
 // Silence divided by silence is silence.
+#[inline]
 fn divide_bin(of: &Complex<f32>, by: &Complex<f32>, gain: f32) -> Complex<f32> {
     of * by.conj() * (gain / by.norm_sqr().max(f32::MIN_POSITIVE))
 }
@@ -535,6 +637,14 @@ fn sum_of(powers: &[f32]) -> f64 {
     let mut sums = [0.0; 64];
     powers.chunks(64).for_each(|chunk| f32::add_to(chunk, &mut sums));
     sums.iter().sum()
+}
+
+// The last group is filled up with zeros.
+fn lane_groups<T: Copy + Default>(values: &[T]) -> impl Iterator<Item = [T; LANES]> {
+    let (groups, last) = values.as_chunks();
+    let mut filled = [T::default(); LANES];
+    filled[..last.len()].copy_from_slice(last);
+    groups.iter().copied().chain([filled])
 }
 
 fn widen(z: Complex<f32>) -> Complex<f64> {

@@ -172,12 +172,14 @@ impl WavImport<'_> {
         .map_err(planned)?;
         let mut samples = vec![0.0; plan.output_len()];
         let limits_hz = response_limits_hz([rig.sweep.low_hz, rig.sweep.high_hz], reference.time_ratio(&air));
-        plan.run_within(limits_hz, &microphone.fractions, &loopback.fractions, &mut samples, &mut plan.make_scratch())
+        let mut scratch = plan.make_scratch();
+        plan.run_within(limits_hz, &microphone.fractions, &loopback.fractions, &mut samples, &mut scratch)
             .map_err(|e| unread("loopback", e.to_string()))?;
         let clipped = microphone.clipped + loopback.clipped;
         let mut assessor = TakeAssessor::new(rig, len).map_err(planned)?;
-        let mut assessment =
-            assessor.assess_take(&microphone.fractions, &loopback.fractions, arrival, clipped).map_err(planned)?;
+        let channels: [&[f32]; 2] = [&microphone.fractions, &loopback.fractions];
+        let joint = plan.joint_spectrum(&mut scratch);
+        let mut assessment = assessor.assess_take(channels, joint, arrival, clipped).map_err(planned)?;
         check_response(assessor.response(), samples.len(), arrival, rig).map_err(|e| unread("recording", e))?;
         // The geometry of a foreign rig is known less well than its files say, and the level outside was not recorded:
         // the arrival is recorded, not judged, and so is a signal-to-noise ratio that a long response leaves no room

@@ -1,9 +1,10 @@
 //! Quality of a recording: signal-to-noise ratio, clipping, loopback, clocks, lost samples, and arrival of the direct
 //! sound.
 
+use echolake_dsp::deconvolution::JointSpectrum;
 use echolake_dsp::level::power_to_db;
 use echolake_dsp::sweep::SineSweep;
-use echolake_dsp::take_analysis::{TakeAnalysis, TakeAnalyzer, TakeFault};
+use echolake_dsp::take_analysis::{TakeAnalysis, TakeAnalyzer, TakeFault, TakeScratch};
 use echolake_dsp::temperature::ReferenceAir;
 use echolake_dsp::{Error, chain};
 use echolake_schema::Rig;
@@ -46,6 +47,7 @@ pub struct TakeAssessor {
     /// Gains of the response's bins.
     gains: Vec<f32>,
     response: Vec<f32>,
+    scratch: TakeScratch,
     signal_len: usize,
     rate_hz: f64,
 }
@@ -64,23 +66,26 @@ impl TakeAssessor {
             gains: analyzer.taper_gains(TAPER_PERIODS * rate_hz / quiet.start.max(1) as f64),
             analyzer,
             response: vec![0.0; recording_len],
+            scratch: TakeScratch::default(),
             signal_len,
             rate_hz,
         })
     }
 
-    /// Assesses one recording; samples are fractions of full scale.
+    /// Assesses one recording; samples are fractions of full scale. `joint` is the transform of both channels, if they
+    /// were deconvolved.
     ///
     /// # Errors
     /// As [`TakeAnalyzer::deconvolve_take`]: a silent loopback leaves nothing to assess.
     pub fn assess_take(
         &mut self,
-        microphone: &[f32],
-        loopback: &[f32],
+        [microphone, loopback]: [&[f32]; 2],
+        joint: Option<JointSpectrum<'_, f32>>,
         expected_arrival_secs: f64,
         clipped_samples: u32,
     ) -> Result<TakeAssessment, Error> {
-        let analysis = self.analyzer.deconvolve_take(microphone, loopback, &self.gains, &mut self.response)?;
+        let Self { analyzer, gains, response, scratch, .. } = self;
+        let analysis = analyzer.deconvolve_take([microphone, loopback], joint, gains, response, scratch)?;
         Ok(TakeAssessment {
             snr_db: self.snr_db(),
             clipped_samples,
@@ -192,7 +197,7 @@ mod tests {
             .collect();
         microphone[delay..].iter_mut().zip(&loopback).for_each(|(m, l)| *m += 0.3 * l);
         let mut assessor = TakeAssessor::new(&rig, loopback.len()).expect("a plan");
-        assessor.assess_take(&microphone, &loopback, expected / 96e3, 0).expect("assessed")
+        assessor.assess_take([&microphone, &loopback], None, expected / 96e3, 0).expect("assessed")
     }
 
     // A sweep of amplitude A, T seconds and B Hz has a power spectrum of (A rate)^2 T / 4 B within its range
@@ -223,7 +228,7 @@ mod tests {
                 let normal = std::iter::repeat_with(|| -> f64 { StandardNormal.sample(&mut rng) });
                 let mut microphone: Vec<f32> = normal.take(loopback.len()).map(|x| (sigma * x) as f32).collect();
                 microphone[60..].iter_mut().zip(&loopback).for_each(|(m, l)| *m += 0.3 * l);
-                let found = assessor.assess_take(&microphone, &loopback, 60.0 / 96e3, 0).expect("assessed");
+                let found = assessor.assess_take([&microphone, &loopback], None, 60.0 / 96e3, 0).expect("assessed");
                 assert!((found.snr_db - true_db).abs() < 1.0, "{duration_secs} s: {true_db}, {}", found.snr_db);
             }
         }

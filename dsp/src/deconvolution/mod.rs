@@ -110,6 +110,37 @@ pub struct DeconvolutionScratch<T: RealSample> {
     /// Scratch of the transforms; between them, the quotient. One buffer, as the cache has no room for two.
     work: AlignedBuffer<Complex<T>>,
     sums: Vec<Complex<T>>,
+    /// Gains of both signals in the joint transform.
+    gains: [f64; 2],
+}
+
+/// The transform of a recording and its loopback together, from which those of each follow.
+pub struct JointSpectrum<'a, T> {
+    joint: &'a [Complex<T>],
+    gains: [f64; 2],
+}
+
+impl<T: RealSample> JointSpectrum<'_, T> {
+    /// Returns the length of the transform.
+    pub fn transform_len(&self) -> usize {
+        self.joint.len() - 1
+    }
+
+    /// Replaces two spectra by those of the recording and the loopback, as transforms of real samples give them.
+    ///
+    /// recorded, looped `[transform_len / 2 + 1]`
+    pub fn split_spectra(&self, recorded: &mut Vec<Complex<T>>, looped: &mut Vec<Complex<T>>) {
+        let bins = self.transform_len() / 2 + 1;
+        let [recording_scale, loopback_scale] = self.gains.map(|gain| T::of(0.5 / gain));
+        let pairs = || self.joint[..bins].iter().zip(self.joint.iter().rev()).map(|(z, mirrored)| (z, mirrored.conj()));
+        recorded.clear();
+        recorded.extend(pairs().map(|(z, b)| (z + b) * recording_scale));
+        looped.clear();
+        looped.extend(pairs().map(|(z, b)| {
+            let d = z - b;
+            Complex::new(d.im, -d.re) * loopback_scale
+        }));
+    }
 }
 
 impl<T: RealSample> DeconvolutionPlan<T> {
@@ -163,7 +194,13 @@ impl<T: RealSample> DeconvolutionPlan<T> {
             joint: AlignedBuffer::new(self.len + 1),
             work: AlignedBuffer::new(work),
             sums: self.inverse.make_sums(),
+            gains: [f64::NAN; 2],
         }
+    }
+
+    /// Returns the spectrum of what was deconvolved last with these buffers.
+    pub fn joint_spectrum<'a>(&self, scratch: &'a mut DeconvolutionScratch<T>) -> JointSpectrum<'a, T> {
+        JointSpectrum { gains: scratch.gains, joint: scratch.joint.values() }
     }
 
     /// Samples of the response that a run gives.
@@ -200,10 +237,11 @@ impl<T: RealSample> DeconvolutionPlan<T> {
         check_len("the recording", recording.len(), self.recording_len)?;
         check_len("the loopback", loopback.len(), self.recording_len)?;
         check_len("the response", ir.len(), self.output_len)?;
-        let DeconvolutionScratch { joint, work, sums } = scratch;
+        let DeconvolutionScratch { joint, work, sums, gains } = scratch;
         let joint = joint.values();
         let work = work.values();
         let levels = SignalLevels::from_signals(recording, loopback)?;
+        *gains = levels.gains;
         self.transform_jointly(recording, loopback, levels.gains.map(T::of), joint, work);
         let (quotient, work) = work.split_at_mut(self.inverse.spectrum_len());
         self.divide_spectra(limits_hz, joint, levels.rounding, quotient)?;
@@ -390,6 +428,42 @@ mod tests {
         assert_eq!(plan.deconvolve_recording(&noise, &faint, &mut ir, &mut scratch), Err(Error::NoLoopback));
         plan.deconvolve_recording(&noise, &noise, &mut ir, &mut scratch).expect("good after bad");
         assert!((ir[0] - ir.iter().copied().fold(0.0, f32::max)).abs() < 1e-6, "{ir:?}");
+    }
+
+    // One of the signals is a million times as loud, and the length is even or odd.
+    #[test]
+    fn the_spectra_of_both_signals_follow_from_the_joint_one() {
+        for recording_len in [128, 135] {
+            let plan = DeconvolutionPlan::<f64>::new(DeconvolutionParams {
+                recording_len,
+                output_len: 10,
+                rate_hz: 96e3,
+                low_hz: 2e3,
+                high_hz: 40e3,
+                division: SpectralDivision::Tapered,
+                taper_hz: 0.0,
+                length: TransformLength::Exact,
+            })
+            .expect("a plan");
+            let noise = |seed: usize| move |n: usize| ((n * seed) % 101) as f64 - 50.0;
+            let recording: Vec<f64> = (0..recording_len).map(noise(37)).collect();
+            let loopback: Vec<f64> = (0..recording_len).map(noise(59)).map(|x| 1e-6 * x).collect();
+            let (mut ir, mut scratch) = (vec![0.0; 10], plan.make_scratch());
+            plan.deconvolve_recording(&recording, &loopback, &mut ir, &mut scratch).expect("a response");
+            let (mut recorded, mut looped) = (vec![Complex::default(); 3], Vec::new());
+            let joint = plan.joint_spectrum(&mut scratch);
+            assert_eq!(joint.transform_len(), recording_len);
+            joint.split_spectra(&mut recorded, &mut looped);
+            for (signal, spectrum, level) in [(recording, recorded, 1.0), (loopback, looped, 1e-6)] {
+                assert_eq!(spectrum.len(), recording_len / 2 + 1);
+                for (k, z) in spectrum.iter().enumerate() {
+                    let cycles = |n: usize| ((k * n) % recording_len) as f64 / recording_len as f64;
+                    let turn = |n: usize| Complex::from_polar(1.0, -std::f64::consts::TAU * cycles(n));
+                    let expected: Complex<f64> = signal.iter().enumerate().map(|(n, x)| turn(n) * x).sum();
+                    assert!((z - expected).norm() < 1e-10 * level, "{recording_len}, {k}: {z}, expected {expected}");
+                }
+            }
+        }
     }
 
     #[test]

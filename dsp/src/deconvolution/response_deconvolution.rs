@@ -1,7 +1,7 @@
 //! Deconvolution in the precision and length that its division asks for.
 
 use crate::deconvolution::{
-    DeconvolutionParams, DeconvolutionPlan, DeconvolutionScratch, SpectralDivision, TransformLength,
+    DeconvolutionParams, DeconvolutionPlan, DeconvolutionScratch, JointSpectrum, SpectralDivision, TransformLength,
 };
 use crate::{Error, RealSample};
 
@@ -57,6 +57,14 @@ impl<T: RealSample> ResponseDeconvolution<T> {
         match &self.0 {
             Precision::Same(plan) => plan.output_len(),
             Precision::Double(plan) => plan.output_len(),
+        }
+    }
+
+    /// Returns the spectrum of what was deconvolved last with these buffers; None of another precision.
+    pub fn joint_spectrum<'a>(&self, scratch: &'a mut ResponseScratch<T>) -> Option<JointSpectrum<'a, T>> {
+        match (&self.0, &mut scratch.0) {
+            (Precision::Same(plan), PrecisionScratch::Same(scratch)) => Some(plan.joint_spectrum(scratch)),
+            _ => None,
         }
     }
 

@@ -3,8 +3,9 @@
 use std::f64::consts::{PI, TAU};
 
 use realfft::num_complex::Complex;
+use wide::f64x4;
 
-use super::{MAX_CLOCK_RATIO, SweepResponse, TakeAnalyzer, index_of_greatest, powers_of, widen};
+use super::{LANES, MAX_CLOCK_RATIO, SweepResponse, TakeAnalyzer, index_of_greatest, powers_of, widen};
 use crate::sweep::SineSweep;
 
 /// Rounds of the fit: each is exact to some thousandths of the ratio that is left.
@@ -40,13 +41,22 @@ impl TakeAnalyzer {
         let mut last = 0.0;
         let mut phase = 0.0;
         let mut ratio = 0.0;
-        for (z, weight) in aligned.spectrum[self.short.core.clone()].iter().zip(&self.short.drift_weights) {
-            let angle = (widen(*z) * turned).arg();
-            let change = angle - last;
-            phase += if change.abs() > PI { change - TAU.copysign(change) } else { change };
-            last = angle;
-            ratio += phase * weight;
-            turned *= step;
+        let bins = aligned.spectrum[self.short.core.clone()].chunks(LANES);
+        for (bins, weights) in bins.zip(self.short.drift_weights.chunks(LANES)) {
+            let mut parts = [[0.0; LANES]; 2];
+            for (lane, z) in bins.iter().enumerate() {
+                let z = widen(*z) * turned;
+                parts[0][lane] = z.re;
+                parts[1][lane] = z.im;
+                turned *= step;
+            }
+            let [re, im] = parts.map(f64x4::new);
+            for (angle, weight) in im.atan2(re).to_array().into_iter().zip(weights) {
+                let change = angle - last;
+                phase += if change.abs() > PI { change - TAU.copysign(change) } else { change };
+                last = angle;
+                ratio += phase * weight;
+            }
         }
         ratio
     }
@@ -115,6 +125,17 @@ impl TakeAnalyzer {
         let products: Vec<f32> = (0..=2 * reach).map(product).collect();
         let lag = index_of_greatest(&products) as f64 - reach as f64;
         if per_ratio == 0.0 { 0.0 } else { (-lag / per_ratio).clamp(-MAX_CLOCK_RATIO, MAX_CLOCK_RATIO) }
+    }
+}
+
+/// Turns bins by these cycles at each, whose values past the last bin are not used.
+pub(super) fn turn_bins(bins: &mut [Complex<f32>], cycles_at: impl Fn(usize) -> f64) {
+    for (group, bins) in bins.chunks_mut(LANES).enumerate() {
+        let angle = |lane: usize| TAU * cycles_at(LANES * group + lane).fract();
+        let (sin, cos) = f64x4::new(std::array::from_fn(angle)).sin_cos();
+        for (z, (sin, cos)) in bins.iter_mut().zip(sin.to_array().into_iter().zip(cos.to_array())) {
+            *z *= Complex::new(cos as f32, sin as f32);
+        }
     }
 }
 

@@ -427,3 +427,19 @@ fn a_response_rings_before_its_arrival_as_its_taper_says() {
         }
     }
 }
+
+// As each bin by itself, for numbers of bins that fill groups and that do not.
+#[test]
+fn bins_are_turned_by_their_cycles() {
+    for count in [0, 1, 3, 4, 5, 64, 1_625] {
+        let cycles = |bin: usize| -9_500.3 + 7.77 * bin as f64 + 1e-4 * (bin as f64).powi(2);
+        let bins: Vec<Complex<f32>> = (0..count).map(|bin| Complex::new(bin as f32, 1.0 - bin as f32)).collect();
+        let mut turned = bins.clone();
+        clock::turn_bins(&mut turned, cycles);
+        for (bin, (before, after)) in bins.iter().zip(&turned).enumerate() {
+            let expected = widen(*before) * Complex::from_polar(1.0, TAU * cycles(bin).fract());
+            let off = (widen(*after) - expected).norm() / expected.norm();
+            assert!(off < 2e-7, "{count}, bin {bin}: {off}");
+        }
+    }
+}

@@ -176,7 +176,8 @@ impl RunController<'_> {
         let sweep = &self.rig.sweep;
         let limits_hz = response_limits_hz([sweep.low_hz, sweep.high_hz], time_ratio);
         self.deconvolution.run_within(limits_hz, &self.microphone, &self.loopback, &mut self.ir, &mut self.scratch)?;
-        self.assessor.assess_take(&self.microphone, &self.loopback, arrival_secs, clipped)
+        let joint = self.deconvolution.joint_spectrum(&mut self.scratch);
+        self.assessor.assess_take([&self.microphone, &self.loopback], joint, arrival_secs, clipped)
     }
 
     // The order within an attempt is kept for live views. In the file a verdict follows its messages because
