@@ -119,19 +119,29 @@ pub struct SoundPath<'a> {
     pub reflection: &'a [Complex<f32>],
 }
 
-/// The relief's facets, lengths in m.
+/// The relief's facets, lengths in m. What all rows or all columns share stands once: all facets are read for each
+/// response, from beyond the core's cache.
 struct ReliefFacets {
     area: f32,
+    /// Place of each row.
+    rows: Vec<f32x8>,
+    columns: Vec<FacetColumns>,
+    /// Row by row.
     groups: Vec<FacetGroup>,
 }
 
-/// Neighbours of one row, which are weighed at once. The last group of a row is filled up with facets that weigh
-/// nothing.
-struct FacetGroup {
-    place: [f32x8; 3],
-    slope: [f32x8; 2],
+/// Places in their row of neighbours that are weighed at once. The last group of a row is filled up with facets that
+/// weigh nothing.
+struct FacetColumns {
+    place: f32x8,
     /// 1 where there is a facet, else 0.
     presence: f32x8,
+}
+
+/// Heights and slopes of the facets of a group.
+struct FacetGroup {
+    height: f32x8,
+    slope: [f32x8; 2],
 }
 
 /// Gain by direction and node.
@@ -277,8 +287,8 @@ impl KirchhoffPlan {
         let ends = [ViewPoint::from_pose(path.microphone), ViewPoint::from_pose(path.speaker)];
         let last = plain.len() - 2;
         let end = f32x8::splat((last + 1) as f32);
-        for group in &self.facets.groups {
-            let weights = group.facet_weights(ends, self.scattering);
+        for (columns, y, group) in self.facets.iter_groups() {
+            let weights = group.facet_weights(columns, y, ends, self.scattering);
             let arrival = weights.path * per_metre;
             let index = arrival.fast_trunc_int();
             let after = arrival - f32x8::from_i32x8(index);
@@ -365,36 +375,53 @@ impl ReliefFacets {
     fn new(relief: &HeightField) -> Self {
         let cells = relief.cells();
         let pitch = metres_from_mm(relief.pitch_mm());
-        let firsts = (0..cells).flat_map(|iy| (0..cells).step_by(LANES).map(move |first| (first, iy)));
-        Self { area: pitch * pitch, groups: firsts.map(|(first, iy)| FacetGroup::new(relief, first, iy)).collect() }
+        let centre = |cell: usize| metres_from_mm(relief.centre_mm(cell));
+        let firsts = || (0..cells).step_by(LANES);
+        // The last facet stands in for those that are not there.
+        let lanes = |value: &dyn Fn(usize) -> f32, first: usize| {
+            f32x8::new(std::array::from_fn(|lane| value((first + lane).min(cells - 1))))
+        };
+        let presence = |first: usize| std::array::from_fn(|lane| if first + lane < cells { 1.0 } else { 0.0 });
+        let group = |(iy, first): (usize, usize)| FacetGroup {
+            height: lanes(&|ix| metres_from_mm(relief.cell_height(ix, iy).into()), first),
+            slope: [0, 1].map(|axis| lanes(&|ix| relief.gradient_at(ix, iy)[axis], first)),
+        };
+        let columns = |first| FacetColumns { place: lanes(&centre, first), presence: f32x8::new(presence(first)) };
+        Self {
+            area: pitch * pitch,
+            rows: (0..cells).map(|iy| f32x8::splat(centre(iy))).collect(),
+            columns: firsts().map(columns).collect(),
+            groups: (0..cells).flat_map(|iy| firsts().map(move |first| (iy, first))).map(group).collect(),
+        }
+    }
+
+    // Each group with its columns and the place of its row.
+    #[inline]
+    fn iter_groups(&self) -> impl Iterator<Item = (&FacetColumns, f32x8, &FacetGroup)> {
+        let rows = self.groups.chunks_exact(self.columns.len().max(1)).zip(&self.rows);
+        rows.flat_map(move |(groups, y)| {
+            self.columns.iter().zip(groups).map(move |(columns, group)| (columns, *y, group))
+        })
     }
 }
 
 impl FacetGroup {
-    fn new(relief: &HeightField, first: usize, iy: usize) -> Self {
-        let last = relief.cells() - 1;
-        let lanes =
-            |value: &dyn Fn(usize) -> f32| f32x8::new(std::array::from_fn(|lane| value((first + lane).min(last))));
-        Self {
-            place: [
-                lanes(&|ix| metres_from_mm(relief.centre_mm(ix))),
-                lanes(&|_| metres_from_mm(relief.centre_mm(iy))),
-                lanes(&|ix| metres_from_mm(relief.cell_height(ix, iy).into())),
-            ],
-            slope: [0, 1].map(|axis| lanes(&|ix| relief.gradient_at(ix, iy)[axis])),
-            presence: f32x8::new(std::array::from_fn(|lane| if first + lane <= last { 1.0 } else { 0.0 })),
-        }
-    }
-
     #[inline]
-    fn facet_weights(&self, [microphone, speaker]: [ViewPoint; 2], scattering: FacetScattering) -> FacetWeights {
-        let near = microphone.view_facets(self);
-        let far = speaker.view_facets(self);
+    fn facet_weights(
+        &self,
+        columns: &FacetColumns,
+        y: f32x8,
+        [microphone, speaker]: [ViewPoint; 2],
+        scattering: FacetScattering,
+    ) -> FacetWeights {
+        let place = [columns.place, y, self.height];
+        let near = microphone.view_facets(place, self.slope);
+        let far = speaker.view_facets(place, self.slope);
         let [derivative, plain] = match scattering {
             FacetScattering::FacingTangent => facing_tangent(&near, &far),
             FacetScattering::Blended => blended_weights(&near, &far),
         };
-        let product = near.nearness * far.nearness * self.presence;
+        let product = near.nearness * far.nearness * columns.presence;
         FacetWeights {
             path: near.distance + far.distance,
             derivative: derivative * product,
@@ -430,13 +457,11 @@ impl ViewPoint {
     }
 
     #[inline]
-    fn view_facets(&self, facets: &FacetGroup) -> FacetView {
+    fn view_facets(&self, [x, y, z]: [f32x8; 3], [slope_x, slope_y]: [f32x8; 2]) -> FacetView {
         let [px, py, pz] = self.position;
-        let [x, y, z] = facets.place;
         let dx = px - x;
         let dy = py - y;
         let dz = pz - z;
-        let [slope_x, slope_y] = facets.slope;
         let distance = (dx * dx + dy * dy + dz * dz).sqrt();
         let nearness = 1.0 / distance;
         let [ax, ay, az] = self.axis;
