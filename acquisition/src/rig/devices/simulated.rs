@@ -46,6 +46,10 @@ const MICROPHONE_GAIN: f64 = 0.037;
 const NOISE: [f64; 2] = [8e-6, 4e-6];
 /// The drives' noise in the microphone, rms re full scale: 36 dB over its own.
 const DRIVES: f64 = 5e-4;
+/// Length of the blocks in which an output goes through the room, over that of a response.
+const RESPONSES_PER_BLOCK: usize = 8;
+/// Samples whose noise is drawn at once.
+const NOISE_BLOCK: usize = 256;
 /// The converter: a pole above the audio range, and a delay that both channels share.
 const CONVERTER_POLE_HZ: f64 = 60_000.0;
 const CONVERTER_DELAY: f64 = 37.0;
@@ -347,14 +351,20 @@ struct SimulatedAudio {
     output: Option<Played>,
 }
 
-/// An output, its loopback without noise, and the transforms that take it through the room.
+/// An output, its loopback without noise, and what takes it through the room.
+///
+/// The loopback is cut into blocks that begin a response's length early: in the product of a block's spectrum and a
+/// response's, the rest of the block is what the microphone hears.
 struct Played {
     output: Vec<f32>,
     loopback: Vec<f32>,
-    spectrum: Vec<Complex<f32>>,
+    /// `[output]`: at the microphone.
+    signal: Vec<f32>,
+    blocks: Vec<Vec<Complex<f32>>>,
     forward: Arc<dyn RealToComplex<f32>>,
     inverse: Arc<dyn ComplexToReal<f32>>,
-    signal: Vec<f32>,
+    samples: Vec<f32>,
+    response: Vec<Complex<f32>>,
     product: Vec<Complex<f32>>,
     work: Vec<Complex<f32>>,
 }
@@ -377,14 +387,14 @@ impl AudioInterface for SimulatedAudio {
             None => self.room.compute_response(&inputs, &mut self.scratch).map_err(failed)?,
         };
         let played = match &mut self.output {
-            Some(played) if played.output == output => played,
+            Some(played) if is_same(&played.output, output) => played,
             other => other.insert(Played::new(output, self.rate_hz, response.len())),
         };
         played.convolve_with(&response);
         let room = if is_spoiled { SPOILED_NOISE } else { NOISE[0] };
         let noise = if world.power == DrivePower::On { room.hypot(DRIVES) } else { room };
         take.started = Some(world.now);
-        quantise_signal(&played.signal[..output.len()], MICROPHONE_GAIN, noise, &mut world, &mut take.microphone);
+        quantise_signal(&played.signal, MICROPHONE_GAIN, noise, &mut world, &mut take.microphone);
         quantise_signal(&played.loopback, 1.0, NOISE[1], &mut world, &mut take.loopback);
         if let Some(ahead) = &mut self.ahead {
             let world = world.clone();
@@ -397,58 +407,100 @@ impl AudioInterface for SimulatedAudio {
 impl Played {
     fn new(output: &[f32], rate_hz: f64, response_len: usize) -> Self {
         // Room for the response and the converter's delay behind the output, so that nothing wraps around.
-        let len = fast_length(output.len() + response_len + 2 * CONVERTER_DELAY as usize);
-        let forward = f32::plan_real_forward(len);
-        let inverse = f32::plan_real_inverse(len);
-        let mut played = Self {
+        let mut converted = convert_output(output, rate_hz, output.len() + response_len + 2 * CONVERTER_DELAY as usize);
+        let block_len = RESPONSES_PER_BLOCK * response_len;
+        let forward = f32::plan_real_forward(block_len);
+        let inverse = f32::plan_real_inverse(block_len);
+        let mut work = vec![Complex::default(); forward.get_scratch_len().max(inverse.get_scratch_len())];
+        let block = |start: usize| {
+            let scale = 1.0 / block_len as f32;
+            let early = start + converted.len() - response_len;
+            let mut samples: Vec<f32> =
+                (early..early + block_len).map(|n| converted[n % converted.len()] * scale).collect();
+            let mut spectrum = forward.make_output_vec();
+            // Lengths are the plan's own, so the transform cannot refuse.
+            let _ = forward.process_with_scratch(&mut samples, &mut spectrum, &mut work);
+            spectrum
+        };
+        let blocks = (0..output.len()).step_by(block_len - response_len).map(block).collect();
+        converted.truncate(output.len());
+        Self {
             output: output.to_vec(),
-            loopback: Vec::new(),
-            spectrum: forward.make_output_vec(),
-            signal: vec![0.0; len],
-            product: forward.make_output_vec(),
-            work: vec![Complex::default(); forward.get_scratch_len().max(inverse.get_scratch_len())],
+            loopback: converted,
+            signal: vec![0.0; output.len()],
+            blocks,
+            samples: forward.make_input_vec(),
+            response: forward.make_output_vec(),
+            product: inverse.make_input_vec(),
+            work,
             forward,
             inverse,
-        };
-        played.signal[..output.len()].copy_from_slice(output);
-        let _ = played.forward.process_with_scratch(&mut played.signal, &mut played.spectrum, &mut played.work);
-        for (k, x) in played.spectrum.iter_mut().enumerate() {
-            let hz = k as f64 * rate_hz / len as f64;
-            let pole = Complex::new(1.0, hz / CONVERTER_POLE_HZ).inv();
-            let delay = Complex::from_polar(1.0, -2.0 * PI * k as f64 * CONVERTER_DELAY / len as f64);
-            let response = pole * delay;
-            *x *= Complex::new(response.re as f32, response.im as f32);
         }
-        played.convolve_with(&[1.0]);
-        played.loopback = played.signal[..output.len()].to_vec();
-        played
     }
 
-    // `signal` becomes the output through the converter and this response.
+    // `signal` becomes the loopback through this response.
     fn convolve_with(&mut self, response: &[f32]) {
-        let len = self.signal.len();
-        self.signal.fill(0.0);
-        self.signal[..response.len()].copy_from_slice(response);
-        // Lengths are the plan's own, so the transforms cannot refuse; they ask for real ends only.
-        let _ = self.forward.process_with_scratch(&mut self.signal, &mut self.product, &mut self.work);
-        let scale = 1.0 / len as f32;
-        self.product.iter_mut().zip(&self.spectrum).for_each(|(p, s)| *p = *p * *s * scale);
-        self.product[0].im = 0.0;
-        if let Some(last) = self.product.last_mut() {
-            last.im = 0.0;
+        let Self { signal, blocks, forward, inverse, samples, response: spectrum, product, work, .. } = self;
+        samples.fill(0.0);
+        samples[..response.len()].copy_from_slice(response);
+        // Lengths are the plans' own, so the transforms cannot refuse; they ask for real ends only.
+        let _ = forward.process_with_scratch(samples, spectrum, work);
+        for (heard, block) in signal.chunks_mut(samples.len() - response.len()).zip(&*blocks) {
+            product.iter_mut().zip(block.iter().zip(&*spectrum)).for_each(|(product, (a, b))| *product = a * b);
+            product[0].im = 0.0;
+            if let Some(last) = product.last_mut() {
+                last.im = 0.0;
+            }
+            let _ = inverse.process_with_scratch(product, samples, work);
+            heard.copy_from_slice(&samples[response.len()..][..heard.len()]);
         }
-        let _ = self.inverse.process_with_scratch(&mut self.product, &mut self.signal, &mut self.work);
     }
 }
 
-// 24 bits with noise; samples over full scale are clipped.
+// Without an exit at the first difference, so that the loop is compiled into vectors.
+fn is_same(a: &[f32], b: &[f32]) -> bool {
+    a.len() == b.len() && a.iter().zip(b).fold(true, |is_same, (a, b)| is_same & (a == b))
+}
+
+// An output after the converter, with room behind it for `len` samples.
+fn convert_output(output: &[f32], rate_hz: f64, len: usize) -> Vec<f32> {
+    let len = fast_length(len);
+    let mut samples = output.to_vec();
+    samples.resize(len, 0.0);
+    let forward = f32::plan_real_forward(len);
+    let mut spectrum = forward.make_output_vec();
+    // Lengths are the plans' own, so the transforms cannot refuse; they ask for real ends only.
+    let _ = forward.process(&mut samples, &mut spectrum);
+    let last = spectrum.len() - 1;
+    for (k, x) in spectrum.iter_mut().enumerate() {
+        let hz = k as f64 * rate_hz / len as f64;
+        let pole = Complex::new(1.0, hz / CONVERTER_POLE_HZ).inv();
+        let delay = Complex::from_polar(1.0, -2.0 * PI * k as f64 * CONVERTER_DELAY / len as f64);
+        let response = pole * delay / len as f64;
+        *x *= Complex::new(response.re as f32, response.im as f32);
+        if k == 0 || k == last {
+            x.im = 0.0;
+        }
+    }
+    let _ = f32::plan_real_inverse(len).process(&mut spectrum, &mut samples);
+    samples
+}
+
+// 24 bits with noise; samples over full scale are clipped. Noise is drawn block by block: the loop behind it has then
+// no branches, and is compiled into vectors.
 fn quantise_signal(signal: &[f32], gain: f64, noise: f64, world: &mut SimulatedWorld, out: &mut Vec<i32>) {
     out.clear();
-    out.extend(signal.iter().map(|x| {
-        let value = FULL_SCALE * (f64::from(*x) * gain + noise * world.draw_normal());
-        // Rounded: the conversion cuts. `round` is a call for each sample, unless the processor is known.
-        (value + 0.5f64.copysign(value)).clamp(-FULL_SCALE, FULL_SCALE - 1.0) as i32
-    }));
+    let mut normals = [0.0; NOISE_BLOCK];
+    for block in signal.chunks(NOISE_BLOCK) {
+        if world.effects.noise_and_drift {
+            normals[..block.len()].iter_mut().for_each(|normal| *normal = StandardNormal.sample(&mut world.rng));
+        }
+        out.extend(block.iter().zip(&normals).map(|(x, normal)| {
+            let value = FULL_SCALE * (f64::from(*x) * gain + noise * normal);
+            // Rounded: the conversion cuts. `round` is a call for each sample, unless the processor is known.
+            (value + 0.5f64.copysign(value)).clamp(-FULL_SCALE, FULL_SCALE - 1.0) as i32
+        }));
+    }
 }
 
 #[cfg(test)]
@@ -526,6 +578,29 @@ mod tests {
             assert_eq!(forecast == Some(world.response_inputs()), [1, 2].contains(&turn), "{turn}");
             forecast = world.clone().forecast_inputs();
             world.read_air();
+        }
+    }
+
+    // Each sample as a sum of products, also around the ends of blocks and for outputs that are shorter than one.
+    #[test]
+    fn an_output_goes_through_the_room_in_blocks() {
+        let rate_hz = 96e3;
+        let response: Vec<f32> = (0..64).map(|n| ((n * 37) % 19) as f32 / 19.0 - 0.5).collect();
+        for len in [100, 448, 449, 1_500] {
+            let output: Vec<f32> = (0..len).map(|n| (0.002 * (n * n) as f32).sin()).collect();
+            let mut played = Played::new(&output, rate_hz, response.len());
+            let converted = convert_output(&output, rate_hz, len + 64 + 2 * CONVERTER_DELAY as usize);
+            assert_eq!(played.loopback, converted[..len]);
+            for _ in 0..2 {
+                played.convolve_with(&response);
+                assert_eq!(played.signal.len(), len);
+                for (n, heard) in played.signal.iter().enumerate() {
+                    let early = |delay: usize| f64::from(converted[(n + converted.len() - delay) % converted.len()]);
+                    let terms = response.iter().enumerate().map(|(delay, gain)| f64::from(*gain) * early(delay));
+                    let expected = terms.sum::<f64>();
+                    assert!((f64::from(*heard) - expected).abs() < 1e-5, "{len}, {n}: {heard}, expected {expected}");
+                }
+            }
         }
     }
 
