@@ -49,8 +49,8 @@ async fn find_hole(opened: &OpenedRun, integrity: &FileIntegrity) -> Option<Rang
     if !integrity.has_wrong_crc {
         return None;
     }
-    let whole = [0..integrity.bytes];
-    let lost: &[Range<u64>] = if integrity.lost.is_empty() { &whole } else { integrity.lost.as_slice() };
+    let whole = 0..integrity.bytes;
+    let lost = if integrity.lost.is_empty() { std::slice::from_ref(&whole) } else { integrity.lost.as_slice() };
     for range in lost {
         let blocks = range.start / HOLE * HOLE..range.end.next_multiple_of(HOLE).min(integrity.bytes);
         if let Some(hole) = find_zeros(opened, blocks).await {

@@ -352,7 +352,7 @@ async fn aggregates_stand_below_joins_where_they_split() {
     ];
     for sql in first {
         let plan = check_query(&engine, &lookups, sql).await;
-        let inner = plan.lines().filter(|line| line.contains("AggregateExec")).next_back().expect("an aggregate");
+        let inner = plan.lines().rfind(|line| line.contains("AggregateExec")).expect("an aggregate");
         assert!(aggregates_first(&plan), "{sql}: {plan}");
         if plan.contains("Join") {
             let join = plan.find("Join").expect("a join");

@@ -431,8 +431,8 @@ mod tests {
             assert_eq!(join_small_files(&files), expected, "{rows:?}");
         };
         check(&[], &[]);
-        check(&[5000], &[0..1]);
-        check(&[1, 1, 1], &[0..3]);
+        check(&[5000], std::slice::from_ref(&(0..1)));
+        check(&[1, 1, 1], std::slice::from_ref(&(0..3)));
         check(&[2951, 1, 1, 2951, 2951, 1], &[0..1, 1..3, 3..4, 4..5, 5..6]);
         check(&[1000; 17], &[0..8, 8..16, 16..17]);
     }

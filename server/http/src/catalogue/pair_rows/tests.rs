@@ -49,12 +49,12 @@ impl TestRun {
     // Between -1 and 1; some values are -0.
     fn number(&self, row: usize, column: usize) -> f64 {
         let mixed = (row * 7919 + column * 104_729 + self.seed * 1_299_709) % 100_003;
-        if mixed % 17 == 0 { -0.0 } else { mixed as f64 / 50_001.5 - 1.0 }
+        if mixed.is_multiple_of(17) { -0.0 } else { mixed as f64 / 50_001.5 - 1.0 }
     }
 
     fn column(&self, table: Table, place: usize, field: &Field) -> ArrayRef {
         let rows = self.row_count(table);
-        let known = |row: usize| !field.is_nullable() || row % 5 > 0;
+        let known = |row: usize| !field.is_nullable() || !row.is_multiple_of(5);
         let texts = |text: &dyn Fn(usize) -> String| -> ArrayRef {
             Arc::new((0..rows).map(|row| known(row).then(|| text(row))).collect::<StringArray>())
         };
@@ -250,7 +250,8 @@ impl TestReader {
             let bits_of = |lists: &[Option<Vec<f32>>]| -> Vec<_> {
                 lists.iter().map(|samples| samples.as_deref().map(bits)).collect()
             };
-            let expected = expected.map(|row| (bits_of(&[row.reflected.clone()]), row.pairs, bits_of(&row.bands)));
+            let expected =
+                expected.map(|row| (bits_of(std::slice::from_ref(&row.reflected)), row.pairs, bits_of(&row.bands)));
             let found = found.map(|row| (bits_of(&[row.reflected]), row.pairs, bits_of(&row.bands)));
             assert_eq!(found, expected, "{what}, {name}");
         }
