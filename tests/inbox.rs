@@ -57,7 +57,8 @@ fn a_copy_with_a_hole_waits_and_a_whole_file_replaces_a_damaged_one() {
     let summary = whole.len() - 28;
     let summary = u64::from_le_bytes(whole[summary..summary + 8].try_into().expect("eight")) as usize;
     let last = (summary - 13) / 4096 * 4096;
-    for hole in [0..4096, 4096..8192, 8192..last, last - 4096..last] {
+    // The last block may have nothing but an index, which is made again.
+    for hole in [0..4096, 4096..8192, 8192..last, last - 4 * 4096..last] {
         let mut copy = whole.clone();
         copy[hole.clone()].fill(0);
         std::fs::write(&run, &copy).expect("written");

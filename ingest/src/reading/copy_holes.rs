@@ -44,13 +44,9 @@ async fn walk_file(opened: &OpenedRun) -> std::result::Result<FileIntegrity, Res
 }
 
 // A hole may begin and end within records that tolerate zeros, as an index does that can be made again: what is lost
-// begins later then, or nothing is lost but what the CRC tells.
+// begins later and ends earlier then, so that its first and last block are looked at as a whole.
 async fn find_hole(opened: &OpenedRun, integrity: &FileIntegrity) -> Option<Range<u64>> {
-    if !integrity.has_wrong_crc {
-        return None;
-    }
-    let whole = 0..integrity.bytes;
-    let lost = if integrity.lost.is_empty() { std::slice::from_ref(&whole) } else { integrity.lost.as_slice() };
+    let lost = integrity.lost.iter().filter(|_| integrity.has_wrong_crc);
     for range in lost {
         let blocks = range.start / HOLE * HOLE..range.end.next_multiple_of(HOLE).min(integrity.bytes);
         if let Some(hole) = find_zeros(opened, blocks).await {

@@ -23,7 +23,7 @@
 //! `m.log_time >= e.log_time` both sides are sorted in descending order. [`SortedJoin`] is the logical node. The syntax
 //! of as-of joins makes one ([`as_of_join`](crate::statement)); of the optimizer's joins [`SortedJoinPlanner`] makes
 //! those by order that [`recognition`] finds. DataFusion sorts, partitions by the keys and spills what it sorts;
-//! [`SortedJoinExec`] merges, and reserves memory for the part of the window that it holds.
+//! `SortedJoinExec` ([`exec`]) merges, and reserves memory for the part of the window that it holds.
 
 mod exec;
 mod filter_rule;
