@@ -7,6 +7,7 @@ use arrow::array::{Array as _, ArrayRef, AsArray as _, BooleanArray, Float64Arra
 use arrow::compute::cast;
 use arrow::datatypes::{DataType, Field, Float32Type, Float64Type, Int64Type};
 use arrow::record_batch::RecordBatch;
+use arrow::util::display::{ArrayFormatter, FormatOptions};
 use arrow::util::pretty::pretty_format_batches;
 use bytes::Bytes;
 use echolake_functions::FunctionSet;
@@ -21,6 +22,29 @@ use crate::{Error, Session};
 
 const LEN: usize = 384;
 const BANDS: [&str; 5] = ["2500", "5000", "10000", "20000", "40000"];
+
+/// Returns the rows of a batch as texts.
+pub(crate) fn row_lines(batch: &RecordBatch, separator: &str) -> Vec<String> {
+    let options = FormatOptions::default().with_null("null");
+    let columns: Vec<_> =
+        batch.columns().iter().map(|c| ArrayFormatter::try_new(c, &options).expect("printable")).collect();
+    let line = |row| columns.iter().map(|c| c.value(row).to_string()).collect::<Vec<_>>().join(separator);
+    (0..batch.num_rows()).map(line).collect()
+}
+
+/// Returns the rows of an answer, sorted, with `|` between columns.
+///
+/// # Errors
+/// Those of the query.
+pub(crate) async fn answer_lines(session: &Session, sql: &str) -> Result<Vec<String>, Error> {
+    let mut answer = session.query(sql).await?;
+    let mut lines = Vec::new();
+    while let Some(batch) = answer.next().await? {
+        lines.extend(row_lines(&batch, "|"));
+    }
+    lines.sort();
+    Ok(lines)
+}
 
 /// A lake with two runs in it, made of the golden cases: surface `0015_0`, and its Flat.
 pub(crate) struct SmallLake {

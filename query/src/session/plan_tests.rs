@@ -4,7 +4,6 @@ use std::collections::BTreeSet;
 use std::sync::atomic::AtomicBool;
 
 use arrow::record_batch::RecordBatch;
-use arrow::util::display::{ArrayFormatter, FormatOptions};
 use datafusion::datasource::physical_plan::{FileScanConfig, ParquetSource};
 use datafusion::datasource::source::DataSourceExec;
 use datafusion::logical_expr::{ColumnarValue, Volatility, create_udf};
@@ -21,7 +20,7 @@ use echolake_lake::{ContributedFile, annotation_rows};
 use echolake_schema::annotations::{Annotation, AnnotationKind};
 use echolake_schema::tables::Table;
 
-use super::function_tests::{SmallLake, examples};
+use super::function_tests::{SmallLake, examples, row_lines};
 use super::tests::{lake, put_events};
 use super::*;
 use crate::views::LakeView;
@@ -50,16 +49,7 @@ pub(super) async fn plan_in(
 pub(super) async fn row_texts(plan: Arc<dyn ExecutionPlan>, state: &SessionState) -> Vec<String> {
     let text = displayable(plan.as_ref()).indent(false).to_string();
     let batches = collect(plan, state.task_ctx()).await.unwrap_or_else(|e| panic!("{e}: {text}"));
-    let options = FormatOptions::new().with_null("null");
-    let mut rows = Vec::new();
-    for batch in &batches {
-        let columns: Vec<_> =
-            batch.columns().iter().map(|c| ArrayFormatter::try_new(c, &options).expect("texts")).collect();
-        rows.extend(
-            (0..batch.num_rows())
-                .map(|row| columns.iter().map(|column| column.value(row).to_string()).collect::<Vec<_>>().join(" | ")),
-        );
-    }
+    let mut rows: Vec<_> = batches.iter().flat_map(|batch| row_lines(batch, " | ")).collect();
     rows.sort();
     rows
 }

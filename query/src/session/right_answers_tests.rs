@@ -1,10 +1,10 @@
 //! Statements that the library below answers wrongly or not at all: the right values, each the same in DuckDB and
 //! PostgreSQL.
 
-use arrow::util::display::{ArrayFormatter, FormatOptions};
 use echolake_lake::{Lake, ReferenceSurfaces};
 use echolake_schema::Rig;
 
+use super::function_tests::answer_lines;
 use crate::{Error, Session};
 
 async fn session() -> Session {
@@ -14,18 +14,7 @@ async fn session() -> Session {
 
 /// Returns the rows of an answer, sorted, with `|` between columns and `;` between rows.
 async fn answer(session: &Session, sql: &str) -> Result<String, Error> {
-    let mut answer = session.query(sql).await?;
-    let mut lines = Vec::new();
-    let options = FormatOptions::default().with_null("null");
-    while let Some(batch) = answer.next().await? {
-        let columns: Vec<_> =
-            batch.columns().iter().map(|c| ArrayFormatter::try_new(c, &options).expect("printable")).collect();
-        for row in 0..batch.num_rows() {
-            lines.push(columns.iter().map(|c| c.value(row).to_string()).collect::<Vec<_>>().join("|"));
-        }
-    }
-    lines.sort();
-    Ok(lines.join(";"))
+    Ok(answer_lines(session, sql).await?.join(";"))
 }
 
 async fn check(cases: &[(&str, &str)]) {

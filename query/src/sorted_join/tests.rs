@@ -6,14 +6,13 @@ use std::sync::Arc;
 
 use arrow::array::{ArrayRef, Float64Array, Int64Array, RecordBatch, StringArray, TimestampMicrosecondArray};
 use arrow::datatypes::{DataType, Field, Schema, TimeUnit};
-use arrow::util::display::{ArrayFormatter, FormatOptions};
 use arrow::util::pretty::pretty_format_batches;
 use datafusion::datasource::MemTable;
 use echolake_lake::{Lake, ReferenceSurfaces};
 use echolake_schema::Rig;
 
-use crate::session::function_tests::SmallLake;
-use crate::{Error, Session};
+use crate::Session;
+use crate::session::function_tests::{SmallLake, answer_lines};
 
 /// Conditions of range joins of `a` and `b`; `#` is a column of one of the types of positions.
 const RANGES: [&str; 16] = [
@@ -149,36 +148,20 @@ async fn open_session(lake: &Lake, random: &mut Random) -> Session {
     }))
 }
 
-async fn rows_of(session: &Session, sql: &str) -> Result<Vec<String>, Error> {
-    let mut answer = session.query(sql).await?;
-    let mut lines = Vec::new();
-    let options = FormatOptions::default().with_null("null");
-    while let Some(batch) = answer.next().await? {
-        let columns: Vec<_> =
-            batch.columns().iter().map(|c| ArrayFormatter::try_new(c, &options).expect("printable")).collect();
-        lines.extend(
-            (0..batch.num_rows())
-                .map(|row| columns.iter().map(|c| c.value(row).to_string()).collect::<Vec<_>>().join("|")),
-        );
-    }
-    lines.sort();
-    Ok(lines)
-}
-
 async fn lake() -> Lake {
     Lake::open_or_create("memory://", &Rig::paper(), &ReferenceSurfaces::default()).await.expect("a lake")
 }
 
 async fn is_sorted_join(session: &Session, sql: &str) -> bool {
-    let plan = rows_of(session, &format!("explain {sql}")).await.unwrap_or_else(|e| panic!("{sql}: {e}"));
+    let plan = answer_lines(session, &format!("explain {sql}")).await.unwrap_or_else(|e| panic!("{sql}: {e}"));
     plan.join("\n").contains("SortedJoinExec")
 }
 
 async fn compare(session: &Session, seed: u64, sql: &str, plain: &str) {
     assert!(is_sorted_join(session, sql).await, "{sql}");
     assert!(!is_sorted_join(session, plain).await, "{plain}");
-    let given = rows_of(session, sql).await.unwrap_or_else(|e| panic!("seed {seed}: {sql}: {e}"));
-    let expected = rows_of(session, plain).await.unwrap_or_else(|e| panic!("seed {seed}: {plain}: {e}"));
+    let given = answer_lines(session, sql).await.unwrap_or_else(|e| panic!("seed {seed}: {sql}: {e}"));
+    let expected = answer_lines(session, plain).await.unwrap_or_else(|e| panic!("seed {seed}: {plain}: {e}"));
     assert_eq!(given, expected, "seed {seed}: {sql}");
 }
 
@@ -280,7 +263,7 @@ async fn as_of_joins_are_read_in_all_places() {
         ("select asof.k from (select 1 as k) as asof join (values (1)) b(x) on true".to_owned(), "1"),
         ("select asof.k from (select 1 as k) as asof left join (values (1)) b(x) on x = k".to_owned(), "1"),
     ] {
-        let given = rows_of(&session, &sql).await.unwrap_or_else(|e| panic!("{sql}: {e}"));
+        let given = answer_lines(&session, &sql).await.unwrap_or_else(|e| panic!("{sql}: {e}"));
         let mut expected: Vec<_> = expected.split(';').collect();
         expected.sort_unstable();
         assert_eq!(given, expected, "{sql}");
@@ -305,7 +288,7 @@ async fn what_is_no_as_of_join_is_refused() {
         ("select 1 from a asof join b match_condition (a.t >= b.t) on a.k = b.k", "MATCH_CONDITION"),
         ("select 1 from a asof join b on a.t >= b.i", "ompar"),
     ] {
-        let error = rows_of(&session, sql).await.expect_err(sql).to_string();
+        let error = answer_lines(&session, sql).await.expect_err(sql).to_string();
         assert!(error.contains(part) && error.contains("hint: "), "{sql}: {error}");
         assert!(!error.contains("Internal") && !error.contains("AsOfSide"), "{sql}: {error}");
     }
@@ -338,7 +321,7 @@ async fn conditions_on_keys_reach_both_scans() {
     let session = open_session(&lake, &mut Random(7)).await;
     let sql = "explain select m.pair_id, e.temperature_c from measurements m asof join environment e on m.run_id = \
                e.run_id and m.log_time >= e.log_time where m.run_id = 'r' and m.pair_id = 3 and e.temperature_c > 20";
-    let plan = rows_of(&session, sql).await.expect("a plan").join("\n");
+    let plan = answer_lines(&session, sql).await.expect("a plan").join("\n");
     let logical: Vec<_> = plan.lines().filter(|line| line.contains("Filter: ")).collect();
     assert!(plan.contains("m.run_id = Utf8(\"r\")") || plan.contains("run_id = Utf8(\"r\")"), "{plan}");
     assert!(logical.iter().any(|line| line.contains("temperature_c > ")), "{plan}");

@@ -12,10 +12,10 @@ use datafusion::optimizer::{OptimizerConfig, OptimizerRule};
 use datafusion::physical_expr::ScalarFunctionExpr;
 use datafusion::physical_optimizer::{PhysicalOptimizerContext, PhysicalOptimizerRule};
 use datafusion::physical_plan::ExecutionPlan;
-use datafusion::physical_plan::execution_plan::{ChildrenPropertiesMode, ReplaceChildrenOptions};
 use datafusion::physical_plan::joins::utils::JoinFilter;
 use datafusion::physical_plan::joins::{NestedLoopJoinExec, NestedLoopJoinExecBuilder};
 use echolake_functions::{check_stop, ending_condition};
+use echolake_lake_tables::rewrite_children;
 
 /// DataFusion's rule that makes a product and a condition a join by keys.
 const CROSS_JOINS: &str = "eliminate_cross_join";
@@ -89,18 +89,7 @@ impl PhysicalOptimizerRule for EndingPhysicalRule {
 /// # Errors
 /// None but those of DataFusion's own constructors.
 pub(crate) fn end_joins(plan: Arc<dyn ExecutionPlan>) -> Result<Arc<dyn ExecutionPlan>> {
-    let mut is_changed = false;
-    let mut children = Vec::with_capacity(plan.children().len());
-    for child in plan.children() {
-        let ended = end_joins(child.clone())?;
-        is_changed |= !Arc::ptr_eq(child, &ended);
-        children.push(ended);
-    }
-    // Nodes keep what they share with those below, as the filters of found rows.
-    let plan = match is_changed {
-        true => plan.replace_children(children, ReplaceChildrenOptions::new(ChildrenPropertiesMode::Keep))?,
-        false => plan,
-    };
+    let plan = rewrite_children(plan, &mut end_joins)?;
     let Some(join) = plan.downcast_ref::<NestedLoopJoinExec>() else { return Ok(plan) };
     let Some(filter) = join.filter() else { return Ok(plan) };
     let field = filter.expression().return_field(filter.schema())?;

@@ -53,7 +53,7 @@ struct ExpansionVisitor {
     known: Vec<(String, u64)>,
     /// Names of queries of a WITH, by the addresses of the queries.
     named: HashMap<*const Query, String>,
-    /// How windows are written.
+    /// Windows as they are written.
     windows: HashSet<String>,
 }
 
@@ -162,14 +162,11 @@ fn refuse_keys() -> ControlFlow<Error> {
     ControlFlow::Break(hinted_error(message, "an order by one expression of them"))
 }
 
-// How many expressions are in grouping sets, each once; 0 without such sets.
+// Counts the expressions in grouping sets, each once; 0 without such sets.
 fn count_grouped(group_by: &GroupByExpr) -> usize {
-    let (keys, has_modifier) = match group_by {
-        GroupByExpr::Expressions(keys, modifiers) => (keys.as_slice(), !modifiers.is_empty()),
-        GroupByExpr::All(_) => return 0,
-    };
+    let (keys, modifiers) = grouping_parts(group_by);
     let mut grouped = HashSet::new();
-    let mut has_sets = has_modifier;
+    let mut has_sets = !modifiers.is_empty();
     for key in keys {
         match key {
             Expr::Cube(sets) | Expr::Rollup(sets) | Expr::GroupingSets(sets) => {
@@ -184,11 +181,15 @@ fn count_grouped(group_by: &GroupByExpr) -> usize {
     if has_sets { grouped.len() } else { 0 }
 }
 
+fn grouping_parts(group_by: &GroupByExpr) -> (&[Expr], &[GroupByWithModifier]) {
+    match group_by {
+        GroupByExpr::Expressions(keys, modifiers) => (keys, modifiers),
+        GroupByExpr::All(modifiers) => (&[], modifiers),
+    }
+}
+
 fn count_groupings(group_by: &GroupByExpr) -> u64 {
-    let (keys, modifiers) = match group_by {
-        GroupByExpr::Expressions(keys, modifiers) => (keys.as_slice(), modifiers),
-        GroupByExpr::All(modifiers) => (&[][..], modifiers),
-    };
+    let (keys, modifiers) = grouping_parts(group_by);
     let of_key = |key: &Expr| match key {
         Expr::Cube(columns) => count_subsets(columns.len()),
         Expr::Rollup(columns) => columns.len() as u64 + 1,

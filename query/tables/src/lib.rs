@@ -14,6 +14,6 @@ mod scan_files;
 
 pub use column_store::ColumnStore;
 pub use lake_table::{FileReaders, LakeTable, TableSize};
-pub use local_scans::rewrite_local_scans;
+pub use local_scans::{rewrite_children, rewrite_local_scans};
 pub use readers::LakeReaderFactory;
 pub use run_rows::RunRows;

@@ -80,10 +80,22 @@ fn rewrite_node(
     }
     let wanted = wanted.of_children(plan.as_ref());
     bounds.extend(produced_bounds(plan.as_ref()));
+    rewrite_children(plan, &mut |child| rewrite_node(child, readers, wanted, bounds))
+}
+
+/// Rewrites the inputs of a planned node. The node keeps its properties, and what it shares with nodes below, as the
+/// filters of the rows that it has found.
+///
+/// # Errors
+/// Those of `rewrite`, and of the node if its new inputs do not fit.
+pub fn rewrite_children(
+    plan: Arc<dyn ExecutionPlan>,
+    rewrite: &mut dyn FnMut(Arc<dyn ExecutionPlan>) -> Result<Arc<dyn ExecutionPlan>>,
+) -> Result<Arc<dyn ExecutionPlan>> {
     let mut is_changed = false;
     let mut children = Vec::with_capacity(plan.children().len());
     for child in plan.children() {
-        let rewritten = rewrite_node(child.clone(), readers, wanted, bounds)?;
+        let rewritten = rewrite(child.clone())?;
         is_changed |= !Arc::ptr_eq(child, &rewritten);
         children.push(rewritten);
     }

@@ -83,8 +83,8 @@ fn measure_lake_ingest(args: &WholeBenchArgs, folder: &Path, report: &mut BenchR
         None => make_runs(args, &fresh)?,
     }
     let begun = Instant::now();
-    run_echolake(folder, &["ingest"])?;
-    let counted = run_echolake(folder, &["sql", "--format", "csv", "select count(*) from measurements"])?;
+    run_echolake(&fresh, &["ingest"])?;
+    let counted = run_echolake(&fresh, &["sql", "--format", "csv", "select count(*) from measurements"])?;
     let seconds = begun.elapsed().as_secs_f64();
     let responses: f64 = counted.lines().nth(1).context("no count")?.trim().parse()?;
     report.group("From run files to a lake");
@@ -140,13 +140,14 @@ fn measure_lake_readers(args: &WholeBenchArgs, folder: &Path, report: &mut Bench
         folder: &folder.join("again"),
     };
     let files = again.make()?.files;
+    let lake = folder.join("lake");
     let has_ended = AtomicBool::new(false);
     std::thread::scope(|scope| {
         // One after the other, and each by a command of its own, as a rig's runs come.
         let ingest = scope.spawn(|| {
             for file in files.iter().take_while(|_| !has_ended.load(Ordering::Relaxed)) {
-                put_into_inbox(std::slice::from_ref(file), &folder.join("lake"))?;
-                run_echolake(folder, &["ingest"])?;
+                put_into_inbox(std::slice::from_ref(file), &lake)?;
+                run_echolake(&lake, &["ingest"])?;
             }
             Ok(())
         });
@@ -193,21 +194,13 @@ fn make_runs(args: &WholeBenchArgs, lake: &Path) -> Result<()> {
     let surfaces = args.surfaces.unwrap_or(if args.quick { 6 } else { 350 }).to_string();
     let seed = args.seed.to_string();
     let order = ["demo", "--no-serve", "--no-ingest", "--ir-only", "--surfaces", &surfaces, "--seed", &seed];
-    let status = Command::new(echolake_path()?)
-        .arg("--lake")
-        .arg(lake)
-        .args(order)
-        .env_remove("ECHOLAKE_LAKE")
-        .stdout(Stdio::null())
-        .status()?;
-    ensure!(status.success(), "`echolake demo` failed");
-    Ok(())
+    run_echolake(lake, &order).map(drop)
 }
 
-// Runs `echolake` on the lake `lake` of a folder, and returns its output.
-fn run_echolake(folder: &Path, args: &[&str]) -> Result<String> {
+// Runs `echolake` on a lake, and returns its output.
+fn run_echolake(lake: &Path, args: &[&str]) -> Result<String> {
     let mut command = Command::new(echolake_path()?);
-    command.args(["--lake", "lake"]).args(args).current_dir(folder).env_remove("ECHOLAKE_LAKE");
+    command.arg("--lake").arg(lake).args(args).env_remove("ECHOLAKE_LAKE");
     let output = command.stderr(Stdio::inherit()).output()?;
     ensure!(output.status.success(), "`echolake {}` failed", args.join(" "));
     Ok(String::from_utf8(output.stdout)?)

@@ -35,7 +35,7 @@ const MOST_RESULT_BYTES: usize = 128 << 20;
 
 /// Returns `array_agg` and `string_agg` with their limits.
 pub fn limited_aggregates() -> [AggregateUDF; 2] {
-    [(array_agg_udaf(), usize::MAX), (string_agg_udaf(), MOST_TEXT_BYTES)]
+    [(array_agg_udaf(), None), (string_agg_udaf(), Some(MOST_TEXT_BYTES))]
         .map(|(own, most_bytes)| AggregateUDF::new_from_impl(LimitedAggregate { own, most_bytes }))
 }
 
@@ -48,7 +48,8 @@ pub fn limited_windows() -> [WindowUDF; 3] {
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 struct LimitedAggregate {
     own: Arc<AggregateUDF>,
-    most_bytes: usize,
+    /// Bytes of texts that an accumulator may hold.
+    most_bytes: Option<usize>,
 }
 
 impl LimitedAggregate {
@@ -60,15 +61,17 @@ impl LimitedAggregate {
         Box::new(LimitedAccumulator { inner, limit: self.clone(), large_results: None })
     }
 
-    fn check_values(&self, held: usize, values: &[ArrayRef]) -> Result<()> {
+    // An accumulator of lists adds up its size from all of its values, so that it is not called without a maximum.
+    fn check_values(&self, held_bytes: impl FnOnce() -> usize, values: &[ArrayRef]) -> Result<()> {
         check_stop()?;
+        let Some(most_bytes) = self.most_bytes else { return Ok(()) };
         let added = values.first().map_or(0.0, value_bytes) as usize;
-        match held.saturating_add(added) <= self.most_bytes {
+        match held_bytes().saturating_add(added) <= most_bytes {
             true => Ok(()),
             false => Err(DataFusionError::Execution(format!(
                 "{} would hold more than {} MiB of texts; hint: fewer or shorter texts, or array_agg",
                 self.own.name(),
-                self.most_bytes >> 20
+                most_bytes >> 20
             ))),
         }
     }
@@ -174,12 +177,12 @@ impl LimitedAccumulator {
 
 impl Accumulator for LimitedAccumulator {
     fn update_batch(&mut self, values: &[ArrayRef]) -> Result<()> {
-        self.limit.check_values(self.inner.size(), values)?;
+        self.limit.check_values(|| self.inner.size(), values)?;
         self.inner.update_batch(values)
     }
 
     fn merge_batch(&mut self, states: &[ArrayRef]) -> Result<()> {
-        self.limit.check_values(self.inner.size(), states)?;
+        self.limit.check_values(|| self.inner.size(), states)?;
         self.inner.merge_batch(states)
     }
 
@@ -222,12 +225,12 @@ impl GroupsAccumulator for LimitedGroups {
         filter: Option<&BooleanArray>,
         group_count: usize,
     ) -> Result<()> {
-        self.limit.check_values(self.inner.size(), values)?;
+        self.limit.check_values(|| self.inner.size(), values)?;
         self.inner.update_batch(values, groups, filter, group_count)
     }
 
     fn merge_batch(&mut self, states: &[ArrayRef], groups: &[usize], group_count: usize) -> Result<()> {
-        self.limit.check_values(self.inner.size(), states)?;
+        self.limit.check_values(|| self.inner.size(), states)?;
         self.inner.merge_batch(states, groups, group_count)
     }
 
@@ -296,7 +299,7 @@ impl WindowUDFImpl for LimitedWindow {
     }
 }
 
-/// What computes a partition of a window, a row after the other.
+/// Computes a partition of a window, one row after the other.
 #[derive(Debug)]
 struct LimitedEvaluator(Box<dyn PartitionEvaluator>);
 
