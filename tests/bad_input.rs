@@ -404,7 +404,7 @@ mod slow {
                 .and_then(|n| n.parse::<u64>().ok())
         };
         let before = used().expect("a number");
-        disk.remount(&format!("size={}k", before + 700));
+        disk.remount(&format!("size={}k", before + 300));
         place.fails(1, &["ingest"], "full");
         place.fails(1, &["acquire", "--surface", "prd", "--rig", "rig.toml"], "full");
         // Readers are not disturbed.
@@ -438,7 +438,7 @@ mod slow {
         assert!(acknowledged > 200 && count("/sweep") == acknowledged, "{acknowledged}");
     }
 
-    // The system ends a process that writes larger files than it may: heights are as large, and flat ones are not.
+    // The system ends a process that writes larger files than it may: heights are as large, and rows of two flat runs are not.
     #[test]
     fn a_run_that_ends_ingest_is_passed_over_by_the_next_one() {
         let place = TestFolder::new();
@@ -447,7 +447,7 @@ mod slow {
         }
         let ingest = || {
             let mut command = Command::new("sh");
-            command.args(["-c", "ulimit -c 0; ulimit -f 250; exec \"$0\" --lake lake ingest", ECHOLAKE]);
+            command.args(["-c", "ulimit -c 0; ulimit -f 600; exec \"$0\" --lake lake ingest", ECHOLAKE]);
             run_command(command.current_dir(place.path("")).env_remove("ECHOLAKE_LAKE")).expect("the command starts")
         };
         let first = ingest();

@@ -35,9 +35,10 @@ fn parquet_file(lake: &Path, table: &str) -> PathBuf {
     let files = fs::read_dir(lake.join("tables").join(table)).expect("listed");
     let mut files: Vec<_> = files.map(|entry| entry.expect("an entry").path()).collect();
     files.retain(|path| path.extension().is_some_and(|extension| extension == "parquet"));
-    // A merged file, if there is one: those that it replaced stay for a while.
+    // The file of most runs: those that it replaced stay for a while.
     files.sort_by_key(|path| {
-        (path.file_name().is_some_and(|name| name.as_encoded_bytes().starts_with(b"merged.")), path.clone())
+        let is_shared = path.file_name().is_some_and(|name| name.as_encoded_bytes().starts_with(b"merged."));
+        (is_shared, fs::metadata(path).expect("its size").len())
     });
     files.pop().expect("a file")
 }

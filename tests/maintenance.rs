@@ -63,17 +63,23 @@ mod slow {
         for (surface, seed) in [("flat", "1"), ("foam", "2"), ("flat_b", "3"), ("wood", "4"), ("prd", "5")] {
             place.acquire(surface, &["--seed", seed, "--ir-only"]);
         }
-        // Its rows do not change when the others' Flat does, and stay in merged files of which the rest goes.
+        // Its rows do not change when the others' Flat does, and stay in merged files of which the rest goes. Flat and
+        // Foam share files, and so do the surfaces that are no references and rest on them.
         place.acquire("wavy", &["--seed", "6", "--ir-only", "--flat", "flat_b"]);
         place.ok(&["ingest"]);
         let before = tables(&place);
+        // On a busy machine a group has fewer runs.
+        let files = "select count(*) between 4 and 6 and sum(runs) = 6 and sum(rows) = 270 as is_right from system.files \
+                     where \"table\" = 'nce'";
+        assert_eq!(place.sql(files)[0]["is_right"], true);
         let ingests = place.sql("select * from system.ingests order by run_id");
         let report: serde_json::Value = serde_json::from_str(&place.ok(&["optimize", "--json"])).expect("JSON");
         let merged: Vec<_> =
             report["tables"].as_array().expect("a list").iter().map(|t| (&t["table"], &t["merged"])).collect();
         assert_eq!(merged.len(), 10, "{report}");
         // The row of `wavy` in `surfaces` has another reference.
-        assert!(merged.iter().all(|(table, count)| **count == if **table == "surfaces" { 5 } else { 6 }), "{report}");
+        let least = |table: &serde_json::Value| if table == "surfaces" { 3 } else { 4 };
+        assert!(merged.iter().all(|(table, count)| count.as_u64() >= Some(least(table))), "{report}");
         same(&tables(&place), &before, "after optimize");
         assert_eq!(place.sql("select * from system.ingests order by run_id"), ingests);
         assert_eq!(place.number("select count(*) from tnce_d4"), 6.0 * 45.0 * 8.0);

@@ -5,7 +5,10 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
-use echolake_lake::{ClaimOutcome, CommitOutcome, DataFile, LakeSnapshot, VisibleRun, WorkClaims, verdict_mark};
+use echolake_lake::{
+    ClaimOutcome, CommitOutcome, DataFile, FileGroup, LakeSnapshot, ReferenceNames, VisibleRun, WorkClaims,
+    verdict_mark,
+};
 use echolake_schema::tables::{Source, Table};
 use echolake_schema::{RunId, SurfaceId};
 use tracing::Instrument as _;
@@ -14,7 +17,7 @@ use crate::context::IngestContext;
 use crate::derive::ReferenceDerivation;
 use crate::error::{Error, Result};
 use crate::ingest::{LOOK_EVERY, LakeIngest};
-use crate::pipeline::{self, Cores, ReadyJob};
+use crate::pipeline::{self, Cores, GROUP, ReadyJob};
 use crate::read_back;
 use crate::references::WantedReferences;
 use crate::rows::runs::RunReferences;
@@ -62,6 +65,11 @@ impl LakeIngest<'_> {
         let cores = Cores::all()?;
         let (changed, unrestored, snapshot) = self.complete_in_rounds(&cores, done).await?;
         self.lake.remove_superseded_in(&snapshot).await?;
+        // The lake is whole without it, and whatever file is damaged is no file of this ingest.
+        if let Err(error) = self.lake.merge_small_groups(&snapshot, GROUP, &self.stop).await {
+            let error = &error as &dyn std::error::Error;
+            tracing::warn!(error, "files of few runs are not merged");
+        }
         let is_whole = snapshot.is_whole();
         let waiting = waiting_runs(&IngestContext::read_from(self.lake, &cores, snapshot).await?).await;
         Ok(CompletionSummary { changed, waiting, unrestored, is_whole })
@@ -233,6 +241,7 @@ async fn turn_surfaces(
         }
     }
     let mut staged = Vec::new();
+    let mut pointers = Vec::new();
     let mut completed = Vec::new();
     for job in find_jobs(&context, &BTreeSet::new()).await {
         if !job.is_turn() || blocked.contains(&job.run.surface) {
@@ -251,11 +260,17 @@ async fn turn_surfaces(
                 claimed => claimed?,
             }
         }
-        let ready = complete_run(&context, &job).await?;
+        let mut ready = complete_run(&context, &job).await?;
+        pointers.extend(ready.staged.extract_if(.., |rows| rows.table() == Table::Runs));
         staged.extend(ready.staged);
         completed.push((job.run, ready.report));
+        // Nobody sees them yet, and they wait in the store rather than in memory.
+        if completed.len().is_multiple_of(GROUP) {
+            lake.commit_rows(std::mem::take(&mut staged)).await?;
+        }
     }
-    let outcomes = lake.commit_staged(&staged).await?;
+    lake.commit_rows(staged).await?;
+    let outcomes = lake.commit_rows(pointers).await?;
     round.turned = outcomes.contains(&CommitOutcome::Now);
     round.overtaken |= outcomes.contains(&CommitOutcome::Outdated);
     for (run, report) in completed {
@@ -291,7 +306,7 @@ async fn complete_run(context: &IngestContext, job: &CompletionJob) -> Result<Re
     let keys = RunKeys { surface: run.surface.clone(), run: run.run.clone() };
     let by_verdicts = *by_verdicts;
     let mut report = CompletedRun { run: run.run.clone(), surface: run.surface.clone(), measurements: 0, by_verdicts };
-    let (files, references) = match ReferenceDerivation::new(context, &run.run, &run.run_derivation, wanted).await? {
+    let (rows, references) = match ReferenceDerivation::new(context, &run.run, &run.run_derivation, wanted).await? {
         Some(derivation) => {
             let responses = read_back::read_responses(lake, &context.snapshot, &run.run).await?;
             report.measurements = responses.pairs.len();
@@ -301,7 +316,7 @@ async fn complete_run(context: &IngestContext, job: &CompletionJob) -> Result<Re
         None if wanted.version_pair().is_none() => {
             (Vec::new(), RunReferences { missing: wanted.missing_names(), ..RunReferences::default() })
         }
-        None => return Ok(ReadyJob { staged: Vec::new(), report }),
+        None => return Ok(ReadyJob { staged: Vec::new(), report, mark: None }),
     };
     let mut row = Vec::new();
     for file in context.snapshot.files_of(Table::Runs, &run.run) {
@@ -309,7 +324,14 @@ async fn complete_run(context: &IngestContext, job: &CompletionJob) -> Result<Re
         row.push(rows::runs::with_references(lake.rig(), &keys, &before, &references)?);
     }
     let pointer = job.completed_run(references.derivation.clone());
-    let mut staged = context.stage_derived(pointer, &row, files).await?;
+    let names = ReferenceNames { flat: wanted.flat.surface.clone(), foam: wanted.foam.surface.clone() };
+    let project = context.snapshot.project_of(&run.run);
+    let group = FileGroup::new(&run.surface, project, names, &lake.config().references);
+    let mut staged = context.stage_derived(&pointer, &group, &row, rows)?;
+    if pointer == *run {
+        // Some tables lack its rows; the others keep them in the files where they are.
+        staged.retain(|rows| rows.table() == Table::Runs || !context.has_rows(rows.table(), &run.run));
+    }
     // A row of an earlier version of the program does not count the others.
     if let Some(counts) = context.snapshot.row_counts(&run.run).cloned()
         && let Some(row) = staged.pop()
@@ -317,5 +339,5 @@ async fn complete_run(context: &IngestContext, job: &CompletionJob) -> Result<Re
         let row = row.with_row_counts(counts, &staged);
         staged.push(row);
     }
-    Ok(ReadyJob { staged, report })
+    Ok(ReadyJob { staged, report, mark: None })
 }

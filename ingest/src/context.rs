@@ -1,12 +1,12 @@
-//! State shared by all workers of an ingest: one snapshot of the lake, and the staging of a run's files.
+//! State shared by all workers of an ingest: one snapshot of the lake, and the staging of a run's rows.
 
 use std::sync::Arc;
 
 use arrow::record_batch::RecordBatch;
-use echolake_lake::{EncodedFile, FileName, Lake, LakeSnapshot, StagedFile, VisibleRun, encode_batches};
+use echolake_lake::{EncodedRows, FileGroup, Lake, LakeSnapshot, StagedRows, VisibleRun, encode_run_rows};
+use echolake_schema::RunId;
 use echolake_schema::annotations::RejectedMeasurements;
 use echolake_schema::tables::Table;
-use futures::future::{join_all, try_join};
 
 use crate::error::Result;
 use crate::pipeline::Cores;
@@ -32,41 +32,43 @@ impl IngestContext {
         Ok(Self { lake: lake.clone(), cores: cores.clone(), snapshot, rejected, finder })
     }
 
-    /// Stages a run's files of one derivation.
-    pub async fn stage_rows(
+    /// Returns whether readers see all rows of a run in a table.
+    pub fn has_rows(&self, table: Table, run: &RunId) -> bool {
+        let is_lacking = self.snapshot.lacking_rows(table).iter().any(|lacking| lacking.run == *run);
+        !is_lacking && self.snapshot.files_of(table, run).next().is_some()
+    }
+
+    /// Stages a run's rows of one derivation, for files that it may share with the other runs of `group`.
+    pub fn stage_rows(
         &self,
-        keys: &RunKeys,
+        RunKeys { surface, run }: &RunKeys,
+        group: &FileGroup,
         derivation: &str,
-        files: Vec<(Table, EncodedFile)>,
-    ) -> Result<Vec<StagedFile>> {
-        let RunKeys { surface, run } = keys.clone();
-        let name = FileName::Rows { surface, run, derivation: derivation.to_owned() };
-        // In parallel, because each file waits for the disk by itself.
-        let staged = join_all(files.into_iter().map(|(table, file)| self.lake.stage_file(table, &name, file))).await;
-        let staged = staged.into_iter().map(|file| Ok(file?.made_from(&self.snapshot)));
+        rows: Vec<(Table, EncodedRows)>,
+    ) -> Vec<StagedRows> {
+        let staged = rows.into_iter().map(|(table, rows)| {
+            let keys = (surface.clone(), run.clone());
+            StagedRows::new(table, keys, derivation.to_owned(), rows, group).made_from(&self.snapshot)
+        });
         staged.collect()
     }
 
-    /// Stages the files that follow from a run's references, then in the list its row of `runs`, which replaces the
-    /// rows in the snapshot. After its commit readers see the files that the row names, and nothing else of the run.
-    pub async fn stage_derived(
+    /// Stages the rows that follow from a run's references, then in the list its row of `runs`, which replaces the
+    /// rows in the snapshot. After its commit readers see the rows that it names, and nothing else of the run.
+    pub fn stage_derived(
         &self,
-        run: VisibleRun,
+        run: &VisibleRun,
+        group: &FileGroup,
         row: &[RecordBatch],
-        files: Vec<(Table, EncodedFile)>,
-    ) -> Result<Vec<StagedFile>> {
+        rows: Vec<(Table, EncodedRows)>,
+    ) -> Result<Vec<StagedRows>> {
         let keys = RunKeys { surface: run.surface.clone(), run: run.run.clone() };
-        // Without references there are no files.
-        let derivation = run.reference_derivation.clone().unwrap_or_default();
-        let pointer = self.stage_pointer(run, row);
-        let (mut staged, pointer) = try_join(self.stage_rows(&keys, &derivation, files), pointer).await?;
-        staged.push(pointer);
+        // Without references there are no rows.
+        let derivation = run.reference_derivation.as_deref().unwrap_or_default();
+        let mut staged = self.stage_rows(&keys, group, derivation, rows);
+        let row = encode_run_rows(Table::Runs, &Table::Runs.schema(self.lake.rig()), row)?;
+        let pointer = StagedRows::of_pointer(run, row, group).made_from(&self.snapshot);
+        staged.push(pointer.with_replaced_rows(run, self.snapshot.files_of(Table::Runs, &run.run)));
         Ok(staged)
-    }
-
-    async fn stage_pointer(&self, run: VisibleRun, row: &[RecordBatch]) -> Result<StagedFile> {
-        let file = encode_batches(Table::Runs, &Table::Runs.schema(self.lake.rig()), row)?;
-        let staged = self.lake.stage_file(Table::Runs, &FileName::Pointer(run.clone()), file).await?;
-        Ok(staged.made_from(&self.snapshot).with_replaced_rows(&run, self.snapshot.files_of(Table::Runs, &run.run)))
     }
 }

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use echolake_lake::{EncodedFile, FileEncoder, Lake, encode_batches, verdict_mark};
+use echolake_lake::{EncodedRows, FileEncoder, Lake, encode_run_rows, verdict_mark};
 use echolake_schema::RunId;
 use echolake_schema::annotations::RejectedMeasurements;
 use echolake_schema::tables::Table;
@@ -50,18 +50,18 @@ impl ReferenceDerivation {
         Ok(Some(Self { name, flat_version, foam_version, references, rejected }))
     }
 
-    /// Derives every pair that both references have. Returns the files, and the run row's references.
+    /// Derives every pair that both references have. Returns the rows, and the run row's references.
     pub async fn derive_run(
         self,
         context: &IngestContext,
         keys: &RunKeys,
         responses: RunResponses,
-    ) -> Result<(Vec<(Table, EncodedFile)>, RunReferences)> {
+    ) -> Result<(Vec<(Table, EncodedRows)>, RunReferences)> {
         let this = Arc::new(self);
         let for_rows = keys.clone();
         let lake = context.lake.clone();
         let derivation = this.clone();
-        let (files, unpaired) =
+        let (rows, unpaired) =
             context.cores.compute_on_core(move || derivation.encode_tables(&lake, &for_rows, &responses)).await?;
         let references = RunReferences {
             missing: if unpaired == 0 { String::new() } else { format!("references of {unpaired} pairs") },
@@ -69,16 +69,16 @@ impl ReferenceDerivation {
             flat_version: Some(this.flat_version.clone()),
             foam_version: Some(this.foam_version.clone()),
         };
-        Ok((files, references))
+        Ok((rows, references))
     }
 
-    // Returns the files, and the number of pairs that a reference lacks.
+    // Returns the rows, and the number of pairs that a reference lacks.
     fn encode_tables(
         &self,
         lake: &Lake,
         keys: &RunKeys,
         responses: &RunResponses,
-    ) -> Result<(Vec<(Table, EncodedFile)>, usize)> {
+    ) -> Result<(Vec<(Table, EncodedRows)>, usize)> {
         let rig = lake.rig();
         let grid = lake.grid();
         let failed = |cause| Error::Kernel { file: keys.run.to_string(), cause };
@@ -122,9 +122,9 @@ impl ReferenceDerivation {
             },
         );
         first.and(second)?;
-        let mut files = Vec::with_capacity(4);
+        let mut rows = Vec::with_capacity(4);
         for (table, encoder) in [(Table::Nce, nce), (Table::Tnce, tnce), (Table::TnceD4, tnce_d4)] {
-            files.push((table, encoder.finish()?));
+            rows.push((table, encoder.finish_run()?));
         }
         // Of a rejected run there are none: they would be those of the surface's newest run.
         let mut stats = Vec::new();
@@ -132,8 +132,8 @@ impl ReferenceDerivation {
             stats.push(rows::stats::stats_rows(rig, keys, &levels, of)?);
         }
         let schema = Table::SurfaceStats.schema(rig);
-        files.push((Table::SurfaceStats, encode_batches(Table::SurfaceStats, &schema, &stats)?));
-        Ok((files, responses.pairs.len() - paired))
+        rows.push((Table::SurfaceStats, encode_run_rows(Table::SurfaceStats, &schema, &stats)?));
+        Ok((rows, responses.pairs.len() - paired))
     }
 
     // Returns whether a run's statistics count a pair.

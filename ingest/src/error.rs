@@ -3,6 +3,7 @@
 use std::ops::Range;
 
 use echolake_dsp::foam_reflection::LEAST_PAIRS;
+use echolake_lake::StoreError;
 use echolake_recording::{FILE_END_BYTES, ResyncError};
 use echolake_schema::ErrorCause;
 use echolake_schema::manifest::ManifestError;
@@ -11,7 +12,7 @@ use echolake_schema::manifest::ManifestError;
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The file cannot be read.
-    #[error("cannot read `{file}`: {source}")]
+    #[error("cannot read `{file}`: {source}{}", StoreError::cause_hint(source))]
     Read {
         /// The file.
         file: String,
@@ -237,7 +238,7 @@ pub enum Error {
 impl From<ResyncError> for Error {
     fn from(error: ResyncError) -> Self {
         match error {
-            ResyncError::Read { file, source } => Self::Read { file, source },
+            ResyncError::Read { file, source } => Self::read_failure(file, source),
             ResyncError::Gone { file } => Self::Gone { file },
             ResyncError::NotMcap { file, actual } => Self::NotMcap { file, actual },
         }
@@ -283,6 +284,27 @@ impl Error {
     }
 
     pub(crate) fn read_failure(file: impl ToString, source: impl Into<ErrorCause>) -> Self {
-        Self::Read { file: file.to_string(), source: source.into() }
+        Self::Read { file: file.to_string(), source: StoreError::plain_cause(source.into()) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io;
+
+    use super::*;
+
+    #[test]
+    fn a_file_that_its_store_does_not_give_is_refused_with_a_hint() {
+        let denied = io::Error::from(io::ErrorKind::PermissionDenied);
+        let source = object_store::Error::Generic { store: "S3", source: Box::new(denied) };
+        for error in [
+            Error::read_failure("inbox/a.mcap", object_store::Error::Generic { store: "S3", source: "odd".into() }),
+            ResyncError::Read { file: "inbox/a.mcap".into(), source: Box::new(source) }.into(),
+        ] {
+            let text = error.to_string();
+            assert!(text.starts_with("cannot read `inbox/a.mcap`: ") && !text.contains("Generic"), "{text}");
+            assert_eq!(text.contains("; hint: "), text.contains("permission denied"), "{text}");
+        }
     }
 }

@@ -7,8 +7,8 @@ use std::time::Duration;
 
 use echolake_dsp::air::AirState;
 use echolake_lake::{
-    ClaimOutcome, ClaimTimes, CommitOutcome, EncodedFile, Lake, ReferenceNames, RunRowCounts, VisibleRun, WorkClaims,
-    encode_batches, object_sha256, verdict_mark,
+    ClaimOutcome, ClaimTimes, CommitOutcome, EncodedRows, FileGroup, Lake, ReferenceNames, RunRowCounts, VisibleRun,
+    WorkClaims, encode_run_rows, object_sha256, verdict_mark,
 };
 use echolake_schema::RunId;
 use echolake_schema::messages::Measurement;
@@ -149,7 +149,7 @@ impl<'a> LakeIngest<'a> {
         let measurer = Arc::new(Measurer::new(self.lake));
         let work = IngestWork { again: false, context, measurer, far_fields: Arc::default(), shared: None };
         let job = work.read_and_stage(source).await?;
-        self.lake.commit_staged(&job.staged).await?;
+        self.lake.commit_rows(job.staged).await?;
         Ok(job.report)
     }
 
@@ -294,7 +294,9 @@ impl IngestWork {
             inbox::move_to_place(lake, source, &place, &file, known.is_some()).await?;
             Ok(next_mark.or(mark))
         };
-        let names = ReferenceNames::from_surface(&content.surface, &lake.config().references);
+        let defaults = &lake.config().references;
+        let names = ReferenceNames::from_surface(&content.surface, defaults);
+        let group = FileGroup::new(&keys.surface, content.surface.project.as_ref(), names.clone(), defaults);
         let wanted = finder.lock().await.wanted_by(names);
         let mut taken = IngestedRun {
             run: keys.run.clone(),
@@ -312,7 +314,7 @@ impl IngestWork {
         let is_current = known.is_some_and(|k| k.run_derivation == derivation);
         if !self.again && is_current && !snapshot.lacks_rows(&keys.run, Source::Run) {
             kept.await?;
-            return Ok(ReadyJob { staged: Vec::new(), report: taken });
+            return Ok(ReadyJob { staged: Vec::new(), report: taken, mark: None });
         }
         let its_lake = lake.clone();
         let for_rows = keys.clone();
@@ -320,17 +322,18 @@ impl IngestWork {
         let far_fields = self.far_fields.clone();
         let of_the_run = async {
             let encode = move || encode_run(&its_lake, &for_rows, &its_content, &far_fields);
-            let files = cores.compute_on_core(encode).await?;
-            self.context.stage_rows(&keys, &derivation, files).await
+            let rows = cores.compute_on_core(encode).await?;
+            Ok::<_, Error>(self.context.stage_rows(&keys, &group, &derivation, rows))
         };
         if is_current {
             // Its row of `runs` names the missing rows. Those that need references follow when all of these are there.
-            let (staged, _) = tokio::try_join!(of_the_run, kept)?;
+            let (mut staged, mark) = tokio::try_join!(of_the_run, kept)?;
+            staged.retain(|rows| !self.context.has_rows(rows.table(), &keys.run));
             taken.mended = true;
-            return Ok(ReadyJob { staged, report: taken });
+            return Ok(ReadyJob { staged, report: taken, mark });
         }
         let of_references = async {
-            let (files, references) =
+            let (rows, references) =
                 match ReferenceDerivation::new(&self.context, &keys.run, &derivation, &wanted).await? {
                     Some(derived) => derived.derive_run(&self.context, &keys, content.run_responses()).await?,
                     None => (Vec::new(), RunReferences { missing: wanted.missing_names(), ..RunReferences::default() }),
@@ -349,7 +352,7 @@ impl IngestWork {
                 verdicts,
             };
             let row = rows::runs::new_run_row(lake, &keys, &content, &derivation, &references)?;
-            Ok((self.context.stage_derived(run, &[row], files).await?, references))
+            Ok((self.context.stage_derived(&run, &group, &[row], rows)?, references))
         };
         // The file comes to its place meanwhile.
         let (mut staged, (derived, references), mark) = tokio::try_join!(of_the_run, of_references, kept)?;
@@ -361,9 +364,8 @@ impl IngestWork {
         }
         taken.derived = references.derivation.is_some();
         taken.missing = references.missing;
-        drop(mark);
-        tracing::debug!(files = staged.len(), missing = taken.missing, "the rows are written and not committed yet");
-        Ok(ReadyJob { staged, report: taken })
+        tracing::debug!(tables = staged.len(), missing = taken.missing, "the rows are encoded and not committed yet");
+        Ok(ReadyJob { staged, report: taken, mark })
     }
 
     // Claims a file, if several ingests share the work.
@@ -414,7 +416,7 @@ fn encode_run(
     keys: &RunKeys,
     content: &RunContent,
     far_fields: &FarFieldCache,
-) -> Result<Vec<(Table, EncodedFile)>> {
+) -> Result<Vec<(Table, EncodedRows)>> {
     let rig = lake.rig();
     let origin = content.manifest.origin.label();
     let references = &lake.config().references;
@@ -429,7 +431,7 @@ fn encode_run(
     tables.extend(heights.map(|batch| (Table::Heightmaps, vec![batch])));
     let mut encoded = Vec::with_capacity(tables.len() + 1);
     for (table, batches) in tables {
-        encoded.push((table, encode_batches(table, &table.schema(rig), &batches)?));
+        encoded.push((table, encode_run_rows(table, &table.schema(rig), &batches)?));
     }
     encoded.push((
         Table::Measurements,

@@ -1,8 +1,7 @@
 //! Runs jobs on a few workers at once, and commits their files in groups.
 //!
-//! A commit costs the same for one run as for many, and a table's log grows with every commit; so jobs that become
-//! ready within a short time are committed together. Queues are bounded: a few lists of staged files wait in memory,
-//! not rows.
+//! A commit costs the same for one run as for many, and a table's log and its files grow with every commit; so jobs that
+//! become ready within a short time are committed together. Their encoded rows wait in memory, up to a number of bytes.
 
 use std::collections::VecDeque;
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
@@ -10,21 +9,26 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-use echolake_lake::{CommitOutcome, Lake, StagedFile};
+use echolake_lake::{CommitOutcome, Lake, StagedRows};
 use rayon::{ThreadPool, ThreadPoolBuilder};
-use tokio::sync::{mpsc, oneshot};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, oneshot};
 use tokio::task::JoinSet;
 use tokio::time::{Instant, timeout_at};
 use tracing::Span;
 
 use crate::error::{Error, Result};
+use crate::inbox::ReadingMark;
 
-/// Maximum number of jobs per commit: a crash loses that much work, and nothing else.
-const GROUP: usize = 16;
+/// Maximum number of jobs per commit: a crash loses that much work, and nothing else. A file of a table has rows of so
+/// many runs.
+pub(crate) const GROUP: usize = 16;
+
+/// Memory for rows that wait for their commit, KiB; a commit takes half of it at most, unless one job is larger.
+const WAITING_KIB: u32 = 512 << 10;
 
 /// Time that a job waits for others to share its commit: every commit adds a file to each table's log, which all
-/// readers read.
-const GATHER: Duration = Duration::from_secs(2);
+/// readers read. Tests count files however busy the machine is, and groups end with the last job.
+const GATHER: Duration = Duration::from_secs(if cfg!(test) { 600 } else { 2 });
 
 /// A pool of one thread per core, shared by all computations; each thread reuses its memory. Tokio's blocking pool
 /// would spread the work, and the memory it frees, over hundreds of threads.
@@ -49,13 +53,23 @@ impl Drop for BusyCore {
 
 /// A finished job, ready for the commit.
 pub(crate) struct ReadyJob<R> {
-    /// Files in the store; the last one decides the job's outcome.
-    pub staged: Vec<StagedFile>,
+    /// Rows of tables; the last ones decide the job's outcome.
+    pub staged: Vec<StagedRows>,
     pub report: R,
+    /// It stays until the commit, which may end the process, too.
+    pub mark: Option<ReadingMark>,
 }
 
-/// A job with its result: its report, and the outcome of its last file (None if it had no files).
+/// A job with its result: its report, and the outcome of its last rows (None if it had none).
 pub(crate) type JobOutcome<J, R> = (J, Result<(R, Option<CommitOutcome>)>);
+
+/// A finished job that waits for its commit.
+struct WaitingJob<J, R> {
+    job: J,
+    done: Result<ReadyJob<R>>,
+    /// Its share of the memory for waiting rows.
+    memory: OwnedSemaphorePermit,
+}
 
 impl Cores {
     pub fn all() -> Result<Self> {
@@ -134,6 +148,7 @@ where
     let queue = Arc::new(Mutex::new(VecDeque::from(jobs)));
     let next = |queue: &Mutex<VecDeque<J>>| queue.lock().unwrap_or_else(PoisonError::into_inner).pop_front();
     let (sender, mut ready) = mpsc::channel(GROUP);
+    let memory = Arc::new(Semaphore::new(WAITING_KIB as usize));
     let mut workers = JoinSet::new();
     let halt = Arc::new(AtomicBool::new(false));
     for _ in 0..=cores.count() {
@@ -141,12 +156,15 @@ where
         let sender = sender.clone();
         let work = work.clone();
         let halt = halt.clone();
+        let memory = memory.clone();
         workers.spawn(async move {
             while !halt.load(Ordering::Relaxed)
                 && let Some(job) = next(&queue)
             {
                 let done = work(job.clone()).await;
-                if sender.send((job, done)).await.is_err() {
+                // A commit frees memory: it waits for a full group only for a time.
+                let Ok(memory) = memory.clone().acquire_many_owned(waiting_kib(&done)).await else { break };
+                if sender.send(WaitingJob { job, done, memory }).await.is_err() {
                     break;
                 }
             }
@@ -168,11 +186,18 @@ where
     if next(&queue).is_some() { Err(Error::Stopped) } else { Ok(()) }
 }
 
+fn waiting_kib<R>(done: &Result<ReadyJob<R>>) -> u32 {
+    let bytes: usize = done.iter().flat_map(|ready| &ready.staged).map(StagedRows::memory_bytes).sum();
+    u32::try_from(bytes >> 10).map_or(WAITING_KIB, |kib| kib.min(WAITING_KIB))
+}
+
 // Collects ready jobs until there are enough for a commit or the timeout is over; None once no more will come.
-async fn gather_group<T>(ready: &mut mpsc::Receiver<T>) -> Option<Vec<T>> {
+async fn gather_group<J, R>(ready: &mut mpsc::Receiver<WaitingJob<J, R>>) -> Option<Vec<WaitingJob<J, R>>> {
     let mut group = vec![ready.recv().await?];
     let deadline = Instant::now() + GATHER;
+    let kib = |group: &[WaitingJob<J, R>]| group.iter().map(|job| job.memory.num_permits()).sum::<usize>();
     while group.len() < GROUP
+        && kib(&group) < WAITING_KIB as usize / 2
         && let Ok(Some(next)) = timeout_at(deadline, ready.recv()).await
     {
         group.push(next);
@@ -182,18 +207,26 @@ async fn gather_group<T>(ready: &mut mpsc::Receiver<T>) -> Option<Vec<T>> {
 
 async fn commit_group<J, R>(
     lake: &Lake,
-    group: Vec<(J, Result<ReadyJob<R>>)>,
+    group: Vec<WaitingJob<J, R>>,
     ended: &mut (dyn FnMut(JobOutcome<J, R>) -> Result<()> + Send),
 ) -> Result<()> {
-    let staged: Vec<_> =
-        group.iter().flat_map(|(_, done)| done.iter().flat_map(|r| r.staged.iter().cloned())).collect();
-    let mut outcomes = lake.commit_staged(&staged).await?.into_iter();
-    for (job, done) in group {
-        let done = done.map(|ready| {
-            let last = outcomes.by_ref().take(ready.staged.len()).last();
-            (ready.report, last)
+    let mut staged = Vec::new();
+    let mut finished = Vec::with_capacity(group.len());
+    // Memory and marks are theirs until the end of the commit.
+    let mut held = Vec::with_capacity(group.len());
+    for waiting in group {
+        let done = waiting.done.map(|ready| {
+            let count = ready.staged.len();
+            staged.extend(ready.staged);
+            held.push((waiting.memory, ready.mark));
+            (ready.report, count)
         });
-        ended((job, done))?;
+        finished.push((waiting.job, done));
+    }
+    let mut outcomes = lake.commit_rows(staged).await?.into_iter();
+    drop(held);
+    for (job, done) in finished {
+        ended((job, done.map(|(report, count)| (report, outcomes.by_ref().take(count).last()))))?;
     }
     Ok(())
 }

@@ -401,6 +401,19 @@ fn file_hint(file: &str) -> String {
 }
 
 impl StoreError {
+    /// The same cause, with a store's error as one that says what a user can act on.
+    pub fn plain_cause(cause: ErrorCause) -> ErrorCause {
+        match cause.downcast::<object_store::Error>() {
+            Ok(error) => Box::new(Self(*error)),
+            Err(other) => other,
+        }
+    }
+
+    /// What to do about a cause that is a store's error, with `; hint: ` before it; empty if nothing is known.
+    pub fn cause_hint(cause: &ErrorCause) -> &'static str {
+        cause.downcast_ref::<Self>().map_or("", Self::hint_text)
+    }
+
     fn hint_text(&self) -> &'static str {
         let mut source: Option<&dyn std::error::Error> = Some(&self.0);
         while let Some(error) = source {

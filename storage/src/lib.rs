@@ -56,11 +56,11 @@ pub use run_digest::{digest_record, digest_record_path, file_sha256, object_sha2
 #[cfg(feature = "tables")]
 pub use tables::{
     BatchBuilder, CommitEffect, CommitLog, CommitOutcome, DataFile, DeletedFile, DeletionMode, EncodedFile,
-    FileEncoder, FileHistory, FileName, FileStats, GivenUpRows, KEEP_HOURS, LackingRows, LakeMoment, LakeSnapshot,
-    LakeTag, LoggedFile, MergeProgress, NewFile, NoMoment, OptimizeReport, ReferenceNames, RemovalRecord,
-    ReplacedFiles, RunPart, RunRowCounts, StagedFile, SurfaceReferences, TARGET_BYTES, TableChange, TableCommit,
-    TableOptimizeReport, TableVersion, TableView, TagName, VacuumReport, VisibleRun, add_missing_columns,
-    encode_batches, reader_metadata, verdict_mark, wanted_schema,
+    EncodedRows, FileEncoder, FileGroup, FileHistory, FileName, FileStats, GivenUpRows, KEEP_HOURS, LackingRows,
+    LakeMoment, LakeSnapshot, LakeTag, LoggedFile, MergeProgress, NewFile, NoMoment, OptimizeReport, ReferenceNames,
+    RemovalRecord, ReplacedFiles, RunPart, RunRowCounts, StagedFile, StagedRows, SurfaceReferences, TARGET_BYTES,
+    TableChange, TableCommit, TableOptimizeReport, TableVersion, TableView, TagName, VacuumReport, VisibleRun,
+    add_missing_columns, encode_batches, encode_run_rows, reader_metadata, verdict_mark, wanted_schema,
 };
 #[cfg(feature = "remote")]
 pub use upload::{RunUpload, UploadOutcome, UploadStep};

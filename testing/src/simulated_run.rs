@@ -19,6 +19,20 @@ pub const SMALL_RIG: &str = include_str!("../../tests/fixtures/small_rig.toml");
 /// # Panics
 /// There is no such relief, or the folder cannot be written.
 pub fn simulate_run(folder: &Path, number: usize, surface: &str, relief: &str, keep: RecordingMode) -> PathBuf {
+    simulate_project_run(folder, number, (surface, None), relief, keep)
+}
+
+/// The same of a surface that belongs to a project.
+///
+/// # Panics
+/// As [`simulate_run`], or it is no project's name.
+pub fn simulate_project_run(
+    folder: &Path,
+    number: usize,
+    (surface, project): (&str, Option<&str>),
+    relief: &str,
+    keep: RecordingMode,
+) -> PathBuf {
     let rig = Rig::from_toml(SMALL_RIG).expect("a rig");
     let specimen = PanelSpecimen::Relief(PanelRelief::by_name(relief).expect("a relief"));
     let run = RunRequest {
@@ -28,7 +42,7 @@ pub fn simulate_run(folder: &Path, number: usize, surface: &str, relief: &str, k
         flat: None,
         foam: None,
         macro_reference: None,
-        project: None,
+        project: project.map(|name| name.parse().expect("a project")),
         start: Timestamp(1_767_600_000_000_000_000).plus_secs(number as f64 * 3_600.0),
         seed: number as u64 + 1,
         tag: number as u64 + 1,

@@ -3,6 +3,7 @@
 Needs Python's standard library alone. `ceph_rgw.sh` beside it installs and starts the gateway.
 """
 import base64
+import collections
 import contextlib
 import datetime
 import hashlib
@@ -239,46 +240,53 @@ def digest_of(lines):
 
 
 def current_files(commits):
-    """Returns the names of the files that a table's commits, in their order, leave in it."""
-    there = set()
+    """Returns the files that a table's commits, in their order, leave in it: the runs' parts by the names of files."""
+    there = {}
     for commit in commits:
         for line in commit.splitlines():
             action = json.loads(line)
             if "add" in action:
-                there.add(urllib.parse.unquote(action["add"]["path"]))
+                name = urllib.parse.unquote(action["add"]["path"])
+                parts = action["add"].get("tags", {}).get("echolake.parts")
+                # A file of one run has the name of its part.
+                there[name] = [part[0] for part in json.loads(parts)] if parts else [name]
             if "remove" in action:
-                there.discard(urllib.parse.unquote(action["remove"]["path"]))
+                there.pop(urllib.parse.unquote(action["remove"]["path"]), None)
     return there
 
 
+def list_rows(files):
+    """Returns how often a table has the rows of each run and derivation: which runs share a file is left to chance."""
+    return collections.Counter(part for parts in files.values() for part in parts)
+
+
 def folder_files(lake):
-    """Returns the MD5 digests of all files of a lake's tables, and of its runs, by their paths."""
-    lake, files = pathlib.Path(lake), {}
+    """Returns the parts of a lake's tables, with their number, and the MD5 digests of its run files."""
+    lake, found = pathlib.Path(lake), {}
     for table in TABLES:
-        folder = lake / "tables" / table
-        commits = [path.read_text() for path in sorted((folder / "_delta_log").glob("*.json"))]
-        files |= {f"tables/{table}/{name}": None for name in current_files(commits)}
-    files |= {str(path.relative_to(lake)): None for path in (lake / "runs").rglob("*.mcap")}
-    return {name: hashlib.md5((lake / name).read_bytes()).hexdigest() for name in files}
+        commits = [path.read_text() for path in sorted((lake / f"tables/{table}/_delta_log").glob("*.json"))]
+        found |= {f"tables/{table}/{part}": count for part, count in list_rows(current_files(commits)).items()}
+    runs = {str(path.relative_to(lake)): path for path in (lake / "runs").rglob("*.mcap")}
+    return found | {name: hashlib.md5(path.read_bytes()).hexdigest() for name, path in runs.items()}
 
 
 def bucket_files(bucket, prefix):
-    """Returns the same of a lake in a bucket."""
+    """Returns the same of a lake in a bucket, whose logs must name files that are there."""
     there = {key.removeprefix(f"{prefix}/"): tag for key, tag in bucket.list(f"{prefix}/").items()}
-    names = [name for name in there if name.startswith("runs/") and name.endswith(".mcap")]
+    found, absent = {}, []
     for table in TABLES:
         log = f"tables/{table}/_delta_log/"
         commits = sorted(name for name in there if name.startswith(log) and name.endswith(".json"))
-        texts = [bucket.get(f"{prefix}/{name}").decode() for name in commits]
-        names += [f"tables/{table}/{name}" for name in current_files(texts)]
-    absent = [name for name in names if name not in there]
+        files = current_files([bucket.get(f"{prefix}/{name}").decode() for name in commits])
+        absent += [f"tables/{table}/{name}" for name in files if f"tables/{table}/{name}" not in there]
+        found |= {f"tables/{table}/{part}": count for part, count in list_rows(files).items()}
     require(not absent, f"the log names files that are not there: {absent[:5]}")
 
     def digest(name):
         # The ETag of an object that came in parts is no digest of its bytes.
         return hashlib.md5(bucket.get(f"{prefix}/{name}")).hexdigest() if "-" in there[name] else there[name]
 
-    return {name: digest(name) for name in names}
+    return found | {name: digest(name) for name in there if name.startswith("runs/") and name.endswith(".mcap")}
 
 
 def require_same(expected, seen, what):

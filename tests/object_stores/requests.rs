@@ -71,7 +71,7 @@ mod slow {
         assert!(page.len() <= 8, "{page:?}");
         sql(&server, "select ir from ir where surface_id = 'prd' and pair_id = 1");
         let response = take_requests(&store);
-        assert!(response.len() <= 2 && !response.is_empty(), "{response:?}");
+        assert!(response.len() <= 2, "{response:?}");
         sql(&server, "select avg(tnce_total) from tnce");
         let scan = take_requests(&store);
         assert!(scan.len() <= SURFACES.len(), "{scan:?}");

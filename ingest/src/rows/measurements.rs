@@ -1,7 +1,7 @@
 //! Rows of table `measurements`.
 
 use arrow::record_batch::RecordBatch;
-use echolake_lake::{EncodedFile, FileEncoder};
+use echolake_lake::{EncodedRows, FileEncoder};
 use echolake_schema::messages::Measurement;
 use echolake_schema::tables::Table;
 use echolake_schema::{Grid, PairId, Rig};
@@ -19,13 +19,13 @@ pub(crate) fn encode_measurements(
     grid: &Grid,
     keys: &RunKeys,
     accepted: &[(Measurement, Response)],
-) -> Result<EncodedFile> {
+) -> Result<EncodedRows> {
     let rows_a_batch = (LIST_VALUES / rig.impulse_response.length).max(1);
     let mut encoder = FileEncoder::new(Table::Measurements, Table::Measurements.schema(rig));
     for part in accepted.chunks(rows_a_batch) {
         encoder.write_batch(&measurement_batch(rig, grid, keys, part)?)?;
     }
-    Ok(encoder.finish()?)
+    Ok(encoder.finish_run()?)
 }
 
 fn measurement_batch(rig: &Rig, grid: &Grid, keys: &RunKeys, rows: &[(Measurement, Response)]) -> Result<RecordBatch> {

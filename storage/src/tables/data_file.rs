@@ -10,10 +10,13 @@ use arrow::record_batch::RecordBatch;
 use bytes::Bytes;
 use echolake_schema::tables::{LIST_CHILD, Table};
 use parquet::arrow::ArrowWriter;
-use parquet::arrow::arrow_writer::ArrowWriterOptions;
+use parquet::arrow::arrow_writer::{
+    ArrowColumnChunk, ArrowColumnWriter, ArrowRowGroupWriterFactory, ArrowWriterOptions, compute_leaves,
+};
 use parquet::basic::{Compression, Encoding, ZstdLevel};
 use parquet::errors::ParquetError;
 use parquet::file::properties::{EnabledStatistics, WriterProperties};
+use parquet::file::writer::SerializedFileWriter;
 use parquet::schema::types::ColumnPath;
 use serde_json::{Map, Value, json};
 
@@ -26,6 +29,8 @@ const ROW_GROUP_BYTES: usize = 64 << 20;
 /// Rows of a row group of a table without lists, at most: about sixteen runs of the paper's grid. A reader that looks
 /// for the highest values reads few groups to their end, and of the others only the rows that it needs.
 const ROW_GROUP_ROWS: usize = 48 << 10;
+/// Most rows of a run that wait to share a row group; the eight symmetries of the paper's pairs are more.
+const WAITING_ROWS: usize = ROW_GROUP_ROWS / 4;
 /// Of the levels of zstd, 1: samples become 1.3 to 2.2 points larger than at 3 and are written a sixth to a half
 /// faster.
 const ZSTD_LEVEL: i32 = 1;
@@ -52,8 +57,27 @@ const STATS_TEXT: usize = 64;
 pub struct FileEncoder {
     table: Table,
     schema: SchemaRef,
-    /// Made with the first batch, from whose rows the size of row groups follows.
-    writer: Option<ArrowWriter<FileBlocks>>,
+    /// Made with the first rows that are encoded, from which the size of row groups follows.
+    file: Option<OpenFile>,
+    /// The row group that grows; no writers if there is none.
+    writers: Vec<ArrowColumnWriter>,
+    group_rows: usize,
+    rows: EncodedRows,
+}
+
+/// A file without row groups, and what makes them.
+struct OpenFile {
+    writer: SerializedFileWriter<FileBlocks>,
+    groups: ArrowRowGroupWriterFactory,
+    rows_a_group: usize,
+}
+
+/// A run's rows of one table, for a file that it may share with other runs. A table with lists, or many rows of another,
+/// are row groups already. Few rows without lists wait for those of the other runs, whose row group they share.
+#[derive(Debug, Default)]
+pub struct EncodedRows {
+    groups: Vec<Vec<ArrowColumnChunk>>,
+    waiting: Vec<RecordBatch>,
     stats: StatsCollector,
 }
 
@@ -65,11 +89,35 @@ pub struct EncodedFile {
     pub(crate) rows: u64,
 }
 
+impl EncodedRows {
+    /// Number of rows.
+    pub(crate) fn row_count(&self) -> u64 {
+        self.stats.rows as u64
+    }
+
+    /// Bytes that they take in memory.
+    pub fn memory_bytes(&self) -> usize {
+        let encoded = self.groups.iter().flatten().map(|chunk| chunk.close().bytes_written as usize);
+        let waiting = self.waiting.iter().map(RecordBatch::get_array_memory_size);
+        encoded.sum::<usize>() + waiting.sum::<usize>()
+    }
+
+    /// The same rows once more, if no row group is made of them yet.
+    pub(crate) fn copy_waiting(&self) -> Option<Self> {
+        let copy = || Self { groups: Vec::new(), waiting: self.waiting.clone(), stats: self.stats.clone() };
+        self.groups.is_empty().then(copy)
+    }
+
+    fn waiting_rows(&self) -> usize {
+        self.waiting.iter().map(RecordBatch::num_rows).sum()
+    }
+}
+
 impl FileEncoder {
     /// A file of a table, whose schema is given because it depends on the lake's rig.
     pub fn new(table: Table, schema: SchemaRef) -> Self {
-        let stats = StatsCollector::new(&schema);
-        Self { table, schema, writer: None, stats }
+        let rows = EncodedRows { stats: StatsCollector::new(&schema), ..EncodedRows::default() };
+        Self { table, schema, file: None, writers: Vec::new(), group_rows: 0, rows }
     }
 
     /// Adds rows.
@@ -77,9 +125,50 @@ impl FileEncoder {
     /// # Errors
     /// [`Error::Encode`] if the batch does not have the table's schema.
     pub fn write_batch(&mut self, batch: &RecordBatch) -> Result<()> {
-        let table = self.table;
-        self.stats.add_batch(batch);
-        self.ensure_writer(batch)?.write(batch).map_err(|e| encode_error(table, e))
+        let [kinds, expected] = [batch.schema_ref(), &self.schema].map(|s| s.fields().iter().map(|f| f.data_type()));
+        if !kinds.eq(expected) {
+            let reason = "a batch has other columns than the table".to_owned();
+            return Err(Error::Encode { table: self.table.name(), reason });
+        }
+        self.rows.stats.add_batch(batch);
+        self.rows.waiting.push(batch.clone());
+        let is_begun = !self.writers.is_empty() || !self.rows.groups.is_empty();
+        match is_begun || has_lists(&self.schema) || self.rows.waiting_rows() > WAITING_ROWS {
+            true => self.encode_waiting(),
+            false => Ok(()),
+        }
+    }
+
+    /// Adds the rows of a run.
+    ///
+    /// # Errors
+    /// [`Error::Encode`] if they are not of this table.
+    pub(crate) fn append_run(&mut self, mut run: EncodedRows) -> Result<()> {
+        if !run.groups.is_empty() {
+            self.encode_waiting()?;
+            self.end_group()?;
+        }
+        self.rows.groups.append(&mut run.groups);
+        self.rows.waiting.append(&mut run.waiting);
+        self.rows.stats.add_rows(run.stats);
+        self.encode_waiting()
+    }
+
+    /// Ends the rows of a run: in a table with lists, a row group has rows of one run alone.
+    ///
+    /// # Errors
+    /// As [`Self::write_batch`].
+    pub(crate) fn end_run(&mut self) -> Result<()> {
+        if has_lists(&self.schema) { self.end_group() } else { Ok(()) }
+    }
+
+    /// The rows of one run, for a file that it may share with others.
+    ///
+    /// # Errors
+    /// As [`Self::write_batch`].
+    pub fn finish_run(mut self) -> Result<EncodedRows> {
+        self.end_group()?;
+        Ok(self.rows)
     }
 
     /// The file.
@@ -87,28 +176,76 @@ impl FileEncoder {
     /// # Errors
     /// As [`Self::write_batch`].
     pub fn finish(mut self) -> Result<EncodedFile> {
+        self.encode_waiting()?;
+        self.end_group()?;
         let table = self.table;
-        self.ensure_writer(&RecordBatch::new_empty(self.schema.clone()))?;
-        let blocks = match self.writer {
-            Some(writer) => writer.into_inner().map_err(|e| encode_error(table, e))?,
-            None => FileBlocks::default(),
+        let EncodedRows { groups, stats, .. } = std::mem::take(&mut self.rows);
+        let rows = stats.rows as u64;
+        let OpenFile { mut writer, .. } = match self.file.take() {
+            Some(file) => file,
+            None => self.open_file(&RecordBatch::new_empty(self.schema.clone()))?,
         };
-        let rows = self.stats.rows as u64;
-        Ok(EncodedFile { blocks: blocks.into_blocks(), rows, stats: self.stats.into_json().to_string() })
+        let written = groups.into_iter().try_for_each(|chunks| {
+            let mut group = writer.next_row_group()?;
+            chunks.into_iter().try_for_each(|chunk| chunk.append_to_row_group(&mut group))?;
+            group.close().map(drop)
+        });
+        let blocks = written.and_then(|()| writer.into_inner()).map_err(|e| encode_error(table, e))?;
+        Ok(EncodedFile { blocks: blocks.into_blocks(), rows, stats: stats.into_json().to_string() })
     }
 
-    fn ensure_writer(&mut self, first: &RecordBatch) -> Result<&mut ArrowWriter<FileBlocks>> {
-        let table = self.table;
-        let made = match self.writer.take() {
-            Some(writer) => writer,
-            None => {
-                let properties = writer_properties(table, &self.schema, first);
-                let options = ArrowWriterOptions::new().with_properties(properties).with_skip_arrow_metadata(true);
-                ArrowWriter::try_new_with_options(FileBlocks::default(), self.schema.clone(), options)
-                    .map_err(|e| encode_error(table, e))?
+    fn open_file(&self, first: &RecordBatch) -> Result<OpenFile> {
+        let rows_a_group = rows_a_group(first);
+        let properties = writer_properties(self.table, &self.schema);
+        let options = ArrowWriterOptions::new().with_properties(properties).with_skip_arrow_metadata(true);
+        ArrowWriter::try_new_with_options(FileBlocks::default(), self.schema.clone(), options)
+            .and_then(ArrowWriter::into_serialized_writer)
+            .map(|(writer, groups)| OpenFile { writer, groups, rows_a_group })
+            .map_err(|e| encode_error(self.table, e))
+    }
+
+    fn encode_waiting(&mut self) -> Result<()> {
+        for batch in std::mem::take(&mut self.rows.waiting) {
+            let mut from = 0;
+            while from < batch.num_rows() {
+                from += self.encode_rows(&batch, from)?;
             }
+        }
+        Ok(())
+    }
+
+    // Encodes the rows from one on that fit into the row group; returns their number.
+    fn encode_rows(&mut self, batch: &RecordBatch, from: usize) -> Result<usize> {
+        let table = self.table;
+        let failed = |e| encode_error(table, e);
+        let file = match self.file.take() {
+            Some(file) => file,
+            None => self.open_file(batch)?,
         };
-        Ok(self.writer.insert(made))
+        let OpenFile { groups, rows_a_group, .. } = self.file.insert(file);
+        if self.writers.is_empty() {
+            self.writers = groups.create_column_writers(self.rows.groups.len()).map_err(failed)?;
+        }
+        let rows = (*rows_a_group - self.group_rows).min(batch.num_rows() - from);
+        let mut writers = self.writers.iter_mut();
+        for (field, column) in self.schema.fields().iter().zip(batch.slice(from, rows).columns()) {
+            for (leaf, writer) in compute_leaves(field, column).map_err(failed)?.iter().zip(&mut writers) {
+                writer.write(leaf).map_err(failed)?;
+            }
+        }
+        self.group_rows += rows;
+        if self.group_rows == *rows_a_group {
+            self.end_group()?;
+        }
+        Ok(rows)
+    }
+
+    fn end_group(&mut self) -> Result<()> {
+        self.group_rows = 0;
+        let chunks = std::mem::take(&mut self.writers).into_iter().map(ArrowColumnWriter::close);
+        let chunks: Vec<_> = chunks.collect::<std::result::Result<_, _>>().map_err(|e| encode_error(self.table, e))?;
+        self.rows.groups.extend((!chunks.is_empty()).then_some(chunks));
+        Ok(())
     }
 }
 
@@ -156,9 +293,31 @@ fn encode_error(table: Table, error: ParquetError) -> Error {
 /// # Errors
 /// [`Error::Encode`] if the batches do not have the table's schema.
 pub fn encode_batches(table: Table, schema: &SchemaRef, batches: &[RecordBatch]) -> Result<EncodedFile> {
+    encode_all(table, schema, batches)?.finish()
+}
+
+/// Encodes the rows of a run, all of which are in memory, for a file that it may share with other runs.
+///
+/// # Errors
+/// As [`encode_batches`].
+pub fn encode_run_rows(table: Table, schema: &SchemaRef, batches: &[RecordBatch]) -> Result<EncodedRows> {
+    encode_all(table, schema, batches)?.finish_run()
+}
+
+fn encode_all(table: Table, schema: &SchemaRef, batches: &[RecordBatch]) -> Result<FileEncoder> {
     let mut encoder = FileEncoder::new(table, schema.clone());
     batches.iter().try_for_each(|batch| encoder.write_batch(batch))?;
-    encoder.finish()
+    Ok(encoder)
+}
+
+fn has_lists(schema: &SchemaRef) -> bool {
+    schema.fields().iter().any(|field| field.data_type().is_nested())
+}
+
+fn rows_a_group(first: &RecordBatch) -> usize {
+    let rows = first.num_rows();
+    let most_rows = if has_lists(first.schema_ref()) { usize::MAX } else { ROW_GROUP_ROWS };
+    (ROW_GROUP_BYTES * rows / first.get_array_memory_size().max(1)).clamp(1, most_rows)
 }
 
 // Samples do not repeat, so a dictionary only costs; their bytes by significance compress best
@@ -167,17 +326,11 @@ pub fn encode_batches(table: Table, schema: &SchemaRef, batches: &[RecordBatch])
 // Single values of measurements are not compressed (zstd makes them an eighth smaller): a reader copies them, and makes
 // no decompressor for each column of each file, which takes longer than reading three thousand of them. Numbers of
 // `tnce_d4` have a dictionary: a row has most of its numbers from the seven beside it.
-fn writer_properties(table: Table, schema: &SchemaRef, first: &RecordBatch) -> WriterProperties {
-    let rows = first.num_rows();
-    let bytes = first.get_array_memory_size();
-    let has_lists = schema.fields().iter().any(|field| field.data_type().is_nested());
-    let most_rows = if has_lists { usize::MAX } else { ROW_GROUP_ROWS };
-    let rows_a_group = if rows == 0 { 1 } else { (ROW_GROUP_BYTES * rows / bytes.max(1)).clamp(1, most_rows) };
+fn writer_properties(table: Table, schema: &SchemaRef) -> WriterProperties {
     let mut builder = WriterProperties::builder()
         .set_compression(Compression::ZSTD(ZstdLevel::try_new(ZSTD_LEVEL).unwrap_or_default()))
         .set_created_by(concat!("echolake ", env!("CARGO_PKG_VERSION")).to_owned())
         .set_data_page_size_limit(PAGE_BYTES)
-        .set_max_row_group_row_count(Some(rows_a_group))
         .set_statistics_enabled(EnabledStatistics::Page);
     let of_measurements = matches!(table, Table::Measurements | Table::Nce | Table::Tnce | Table::TnceD4);
     for field in schema.fields() {
@@ -212,11 +365,13 @@ fn writer_properties(table: Table, schema: &SchemaRef, first: &RecordBatch) -> W
 }
 
 /// Delta's statistics of a file, gathered batch by batch.
+#[derive(Debug, Clone, Default)]
 struct StatsCollector {
     rows: usize,
     columns: Vec<ColumnStats>,
 }
 
+#[derive(Debug, Clone)]
 struct ColumnStats {
     name: String,
     index: usize,
@@ -225,6 +380,15 @@ struct ColumnStats {
     extremes: Option<(Value, Value)>,
     /// A batch had no extremes that are known, so the file has none either.
     unknown: bool,
+}
+
+impl ColumnStats {
+    fn widen(&mut self, (low, high): (Value, Value)) {
+        self.extremes = Some(match self.extremes.take() {
+            Some((l, h)) => (if is_less(&low, &l) { low } else { l }, if is_less(&h, &high) { high } else { h }),
+            None => (low, high),
+        });
+    }
 }
 
 impl StatsCollector {
@@ -253,10 +417,17 @@ impl StatsCollector {
                 column.unknown = true;
                 continue;
             };
-            column.extremes = Some(match column.extremes.take() {
-                Some((l, h)) => (if is_less(&low, &l) { low } else { l }, if is_less(&h, &high) { high } else { h }),
-                None => (low, high),
-            });
+            column.widen((low, high));
+        }
+    }
+
+    /// Adds the statistics of other rows of the table.
+    fn add_rows(&mut self, other: Self) {
+        self.rows += other.rows;
+        for (column, other) in self.columns.iter_mut().zip(other.columns) {
+            column.nulls += other.nulls;
+            column.unknown |= other.unknown;
+            other.extremes.into_iter().for_each(|extremes| column.widen(extremes));
         }
     }
 

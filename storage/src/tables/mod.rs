@@ -4,6 +4,7 @@ mod batch_builder;
 mod current_runs;
 mod data_file;
 mod file_name;
+mod group_commit;
 mod log;
 mod maintenance;
 mod references;
@@ -17,8 +18,9 @@ mod verdicts;
 mod versions;
 
 pub use batch_builder::BatchBuilder;
-pub use data_file::{EncodedFile, FileEncoder, encode_batches};
+pub use data_file::{EncodedFile, EncodedRows, FileEncoder, encode_batches, encode_run_rows};
 pub use file_name::{FileName, VisibleRun};
+pub use group_commit::{FileGroup, StagedRows};
 pub use log::{
     CommitEffect, CommitLog, CommitOutcome, DataFile, FileHistory, FileStats, LoggedFile, NewFile, RemovalRecord,
     ReplacedFiles, RunPart, RunRowCounts, TableChange, TableCommit, TableVersion, TableView,
@@ -56,6 +58,21 @@ pub struct StagedFile {
 }
 
 impl StagedFile {
+    // A file that is not in the store yet.
+    fn from_name(table: Table, name: String, rows: u64) -> Self {
+        let file = NewFile {
+            name,
+            bytes: 0,
+            stats: String::new(),
+            replaces: Vec::new(),
+            parts: Vec::new(),
+            seen_runs: 0,
+            run_version: 0,
+            row_counts: None,
+        };
+        Self { table, file, rows }
+    }
+
     /// Records the view of the lake that its rows were made from. What that view did not hold, the rows do not answer
     /// to: a row of `runs` that it lacked supersedes them.
     #[must_use]
@@ -84,7 +101,7 @@ impl StagedFile {
     #[must_use]
     pub fn with_replaced_rows<'a>(mut self, run: &VisibleRun, old: impl IntoIterator<Item = &'a DataFile>) -> Self {
         let files = old.into_iter().map(DataFile::logged_file).collect();
-        self.file.replaces = Some(ReplacedFiles { prefix: Some(run.name_prefix()), files });
+        self.file.replaces = vec![ReplacedFiles { prefix: Some(run.name_prefix()), files }];
         self
     }
 }
@@ -180,20 +197,17 @@ impl Lake {
     /// # Errors
     /// What the store says.
     pub async fn stage_file(&self, table: Table, name: &FileName, file: EncodedFile) -> Result<StagedFile> {
-        let name = name.compose();
-        let path = table_folder(table).join(name.as_str());
-        let bytes = file.blocks.iter().map(|block| block.len() as u64).sum();
-        let stats = file.stats;
-        let rows = file.rows;
-        self.store()
-            .put(&path, file.blocks.into_iter().collect())
-            .await
-            .map_err(|e| Error::store_failure("write", &path, e))?;
-        let parts = Vec::new();
-        let replaces = None;
-        let row_counts = None;
-        let file = NewFile { name, bytes, stats, replaces, parts, seen_runs: 0, run_version: 0, row_counts };
-        Ok(StagedFile { table, file, rows })
+        let mut staged = StagedFile::from_name(table, name.compose(), file.rows);
+        self.store_file(&mut staged, file).await?;
+        Ok(staged)
+    }
+
+    async fn store_file(&self, staged: &mut StagedFile, file: EncodedFile) -> Result<()> {
+        let path = table_folder(staged.table).join(staged.file.name.as_str());
+        staged.file.bytes = file.blocks.iter().map(|block| block.len() as u64).sum();
+        staged.file.stats = file.stats;
+        let put = self.store().put(&path, file.blocks.into_iter().collect()).await;
+        put.map(drop).map_err(|e| Error::store_failure("write", &path, e))
     }
 
     /// Returns whether a file of this name is in the table.

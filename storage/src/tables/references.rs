@@ -9,7 +9,7 @@ use crate::tables::file_name::{FileName, VisibleRun};
 use crate::{DataFile, LakeSnapshot, ReferenceSurfaces};
 
 /// The surfaces that a surface names as its references.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub struct ReferenceNames {
     /// The surface that normalises.
     pub flat: SurfaceId,

@@ -102,6 +102,11 @@ impl RunPart {
         Some(Self { row_counts: file.row_counts.clone(), ..part })
     }
 
+    /// Returns whether it is of a run's row in `runs`, whose derivation is several.
+    pub(crate) fn is_pointer(&self) -> bool {
+        self.derivation.contains('.')
+    }
+
     fn from_path(path: &Path, rows: u64, row_version: Option<u64>) -> Option<Self> {
         match FileName::parse(path)? {
             FileName::Rows { surface, run, derivation } => {
@@ -115,6 +120,11 @@ impl RunPart {
             }
             FileName::Rig { .. } | FileName::Merged { .. } => None,
         }
+    }
+
+    /// Common beginning of the names of files with rows of this run alone.
+    pub(crate) fn place(&self) -> String {
+        format!("{}.{}.", self.surface, self.run)
     }
 
     /// The name of a file with these rows alone.

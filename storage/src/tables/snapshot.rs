@@ -3,6 +3,7 @@
 //! Delta commits one table at a time, so a run's rows are committed before its `runs` row. The file of that
 //! row carries in its name the derivations that are current; files of other derivations are not seen.
 
+use std::cmp::Reverse;
 use std::collections::{BTreeSet, HashMap, HashSet};
 use std::sync::{Arc, OnceLock};
 
@@ -16,7 +17,7 @@ use crate::tables::current_runs::{CurrentRun, CurrentRuns, NewestRuns};
 use crate::tables::file_name::{FileName, VisibleRun};
 use crate::tables::run_parts::run_of_file;
 use crate::tables::table_fault::{LackingRows, TableFault};
-use crate::{CommitLog, DataFile, Error, Result, RunRowCounts, TableView};
+use crate::{CommitLog, DataFile, Error, Result, RunPart, RunRowCounts, TableView};
 
 /// A frozen view of all tables.
 #[derive(Debug, Clone, Default)]
@@ -291,7 +292,7 @@ impl LakeSnapshot {
         self.hidden.get(&table).map_or(&[], Vec::as_slice)
     }
 
-    /// Merged files of a table that readers see in part, and whose other parts are superseded.
+    /// Files of a table that have superseded rows of some runs, and rows of others that are not.
     pub(crate) fn outgrown_files(&self, table: Table) -> &[Arc<DataFile>] {
         self.outgrown.get(&table).map_or(&[], Vec::as_slice)
     }
@@ -343,32 +344,20 @@ impl LakeSnapshot {
         self.files(table).iter().flat_map(|file| file.shown_runs()).collect()
     }
 
-    fn sort_in(&mut self, table: Table, files: Vec<Arc<DataFile>>) {
+    fn sort_in(&mut self, table: Table, mut files: Vec<Arc<DataFile>>) {
         if table.source() == Source::Users {
             return self.sort_in_users(table, files);
         }
-        let (merged, single): (Vec<_>, Vec<_>) = files.into_iter().partition(|f| !f.parts.is_empty());
         let mut sorted = SortedFiles::with_runs(self.runs.len());
-        for file in single {
-            match self.file_place(table, &file) {
-                RowsPlace::Seen => {
-                    if let Some(place) = self.place_of_file(&file) {
-                        sorted.logged[place] = Some(file.rows);
-                        sorted.shown[place] = true;
-                    }
-                    sorted.seen.push(file);
-                }
-                RowsPlace::OfProject => {
-                    if let Some(place) = self.place_of_file(&file) {
-                        sorted.logged[place] = Some(file.rows);
-                    }
-                }
-                RowsPlace::Superseded if self.is_superseded(table, &file) => sorted.hidden.push(file),
-                RowsPlace::Foreign => sorted.foreign.push(file),
-                RowsPlace::Superseded | RowsPlace::Unseen => {}
+        // An ingest that did not know of a file may have added the same rows again. Of both, the rows count whose
+        // author saw more: they are the last ones that any snapshot takes for superseded.
+        files.sort_by_key(|file| (Reverse(file.seen_runs), !file.parts.is_empty()));
+        for file in files {
+            match file.parts.is_empty() {
+                true => self.sort_single(table, file, &mut sorted),
+                false => self.sort_shared(table, file, &mut sorted),
             }
         }
-        merged.into_iter().for_each(|file| self.sort_merged(table, file, &mut sorted));
         sorted.seen.sort_by(|a, b| a.path.cmp(&b.path));
         let is_without_rig = table.source() == Source::Rig && sorted.seen.is_empty() && self.runs.len() > 0;
         let lacking = self.compare_rows(table, &sorted.logged);
@@ -385,8 +374,21 @@ impl LakeSnapshot {
         self.lacking.insert(table, lacking);
     }
 
-    fn place_of_file(&self, file: &DataFile) -> Option<usize> {
-        self.runs.place_of(run_of_file(file)?)
+    fn sort_single(&self, table: Table, file: Arc<DataFile>, sorted: &mut SortedFiles) {
+        let place = self.file_place(table, &file);
+        let run = run_of_file(&file).and_then(|run| self.runs.place_of(run));
+        if let (RowsPlace::Seen | RowsPlace::OfProject, Some(run)) = (place, run) {
+            sorted.logged[run].get_or_insert(file.rows);
+        }
+        match place {
+            RowsPlace::Seen if run.is_some_and(|run| std::mem::replace(&mut sorted.shown[run], true)) => {
+                sorted.hidden.push(file);
+            }
+            RowsPlace::Seen => sorted.seen.push(file),
+            RowsPlace::Superseded if self.is_file_superseded(table, &file) => sorted.hidden.push(file),
+            RowsPlace::Foreign => sorted.foreign.push(file),
+            RowsPlace::Superseded | RowsPlace::OfProject | RowsPlace::Unseen => {}
+        }
     }
 
     // Rows of users are seen with their run, predictions with any run of their surface: those of removed runs stay.
@@ -432,20 +434,24 @@ impl LakeSnapshot {
         compared.collect()
     }
 
-    // What is merged was seen before. An ingest that did not know of the merge may have added the same rows again: its
-    // file is the one that counts, because it tells what its author saw.
-    fn sort_merged(&self, table: Table, mut file: Arc<DataFile>, sorted: &mut SortedFiles) {
+    // Each part is placed as a file of its own would be.
+    fn sort_shared(&self, table: Table, mut file: Arc<DataFile>, sorted: &mut SortedFiles) {
         let mut superseded = Vec::new();
         let mut hidden = Vec::new();
         for part in &file.parts {
             let place = self.rows_place(table, &part.run, &part.derivation);
+            let is_superseded = match place {
+                RowsPlace::Seen => true,
+                RowsPlace::Superseded => self.are_rows_superseded(table, &part.run, &part.derivation, file.seen_runs),
+                RowsPlace::OfProject | RowsPlace::Unseen | RowsPlace::Foreign => false,
+            };
             if let (RowsPlace::Seen | RowsPlace::OfProject, Some(run)) = (place, self.runs.place_of(&part.run)) {
                 sorted.logged[run].get_or_insert(part.rows);
                 if place == RowsPlace::Seen && !std::mem::replace(&mut sorted.shown[run], true) {
                     continue;
                 }
             }
-            if matches!(place, RowsPlace::Seen | RowsPlace::Superseded) {
+            if is_superseded {
                 superseded.push(part.run.clone());
             }
             hidden.push(part.run.clone());
@@ -499,15 +505,16 @@ impl LakeSnapshot {
     // An author that had not seen the run's present row cannot replace it, so that no row will ever name its file as
     // the log has it now. Rows that are named and describe no surface: an author that had seen the row of the run that
     // does describe it is about to remove or to reject that one. No clock is asked.
-    fn is_superseded(&self, table: Table, file: &DataFile) -> bool {
-        let Some(FileName::Rows { run, derivation, .. }) = &file.name else {
-            let current = run_of_file(file).and_then(|run| self.runs.get(run));
-            return current.is_some_and(|current| file.seen_runs < current.log_version);
-        };
+    fn are_rows_superseded(&self, table: Table, run: &RunId, derivation: &str, seen_runs: u64) -> bool {
         let Some(current) = self.runs.get(run) else { return false };
         let describing = self.newest.of_surface.get(&current.run.surface).and_then(|run| self.runs.get(run));
         let other = describing.filter(|_| is_named(table, &current.run, derivation));
-        file.seen_runs < other.map_or(0, |other| other.log_version).max(current.log_version)
+        seen_runs < other.map_or(0, |other| other.log_version).max(current.log_version)
+    }
+
+    fn is_file_superseded(&self, table: Table, file: &DataFile) -> bool {
+        let part = RunPart::of_file(file);
+        part.is_some_and(|part| self.are_rows_superseded(table, &part.run, &part.derivation, file.seen_runs))
     }
 
     /// The version of `runs` that added the row of a file's run; 0 if the name is no run's rows, or the run is not

@@ -34,7 +34,7 @@ pub struct DataFile {
     pub seen_runs: u64,
     /// Least and greatest values, if the log has them.
     pub stats: Option<FileStats>,
-    /// If it was merged from files of several runs: their parts, in the order of their rows, which are contiguous.
+    /// If it has rows of several runs: their parts, in the order of their rows, which are contiguous.
     pub parts: Vec<RunPart>,
     /// The runs of parts that a snapshot does not show; empty as the log gives it.
     pub hidden: Vec<RunId>,
@@ -168,21 +168,21 @@ pub struct NewFile {
     pub bytes: u64,
     /// Delta's statistics, JSON.
     pub stats: String,
-    /// The files that it replaces, if it replaces any.
-    pub replaces: Option<ReplacedFiles>,
-    /// The parts that it was merged from, if it was merged.
+    /// The files that it replaces: those of one place, or of a place for each of its parts.
+    pub replaces: Vec<ReplacedFiles>,
+    /// The parts, if it has rows of several runs.
     pub parts: Vec<RunPart>,
     /// The version of `runs` that its author had seen.
     pub seen_runs: u64,
-    /// The version of `runs` that added the row of its run which its author had seen; 0 if there was none. If the file
-    /// is in the log already, but its author had not seen that row, it is added again.
+    /// The version of `runs` that added the row of its run which its author had seen, of several the newest; 0 if there
+    /// was none. If the file is in the log already, but its author had not seen that row, it is added again.
     pub run_version: u64,
     /// Of a run's row in `runs`: the rows that its other tables have.
     pub row_counts: Option<RunRowCounts>,
 }
 
-/// The files that a new one replaces. If other files have taken their place, the new one is not added. A merged file in
-/// a place with a beginning stays, because it has other runs' rows: the newer row of the run counts.
+/// The files that a new one replaces. If other files have taken their place, the new one is not added. A file of several
+/// runs in a place with a beginning stays, because it has other runs' rows: the newer row of the run counts.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ReplacedFiles {
     /// Beginning of the names of all files in that place; None if the names alone are the place.

@@ -1,4 +1,5 @@
-//! Merges small files of a table into large ones. Neither the rows that readers see nor their storage format changes.
+//! Merges small files of a table into large ones: all that `optimize` finds, and those of few runs at the end of an
+//! ingest. Neither the rows that readers see nor their storage format changes.
 //!
 //! A merged file's Add lists its parts, (surface, run, derivation) each with its number of rows; a snapshot decides
 //! over every part as it would over a file of its own. A part of `runs` has, in addition, the version that added it:
@@ -94,7 +95,7 @@ impl Lake {
         let readers = FileReaders::from_snapshot(self, &snapshot);
         let plans: Vec<_> = Table::ALL
             .into_iter()
-            .map(|table| (table, plan_merges(&snapshot, &readers, table, target_bytes)))
+            .map(|table| (table, plan_merges(&snapshot, &readers, table, MergeRule::Bytes(target_bytes))))
             .collect();
         let total = plans.iter().flat_map(|(_, groups)| groups).map(Vec::len).sum();
         let mut report = OptimizeReport::default();
@@ -131,6 +132,27 @@ impl Lake {
         Ok(report)
     }
 
+    /// Merges files of fewer than so many runs, wherever there are enough of them for a file of as many: a lake that
+    /// grows by a run at a time has as few files as one that grows by groups. Returns the number of files that went.
+    ///
+    /// # Errors
+    /// [`Error::DataFile`], or what the store says. What was merged before stays so.
+    pub async fn merge_small_groups(&self, snapshot: &LakeSnapshot, runs: usize, stop: &AtomicBool) -> Result<usize> {
+        let readers = FileReaders::from_snapshot(self, snapshot);
+        let of_ingest = Table::ALL.into_iter().filter(|table| table.source() != Source::Users);
+        let mut merged = 0;
+        for table in of_ingest {
+            for group in plan_merges(snapshot, &readers, table, MergeRule::Runs(runs)) {
+                if stop.load(Ordering::Relaxed) {
+                    return Ok(merged);
+                }
+                let (outcome, _) = self.merge_files(table, &group, CommitEffect::Layout.into(), None).await?;
+                merged += if outcome == CommitOutcome::Now { group.len() } else { 0 };
+            }
+        }
+        Ok(merged)
+    }
+
     /// Rewrites a merged file without its superseded rows. If another writer did so meanwhile, nothing changes.
     pub(crate) async fn rewrite_file(&self, table: Table, file: &DataFile) -> Result<CommitOutcome> {
         self.rewrite_without(table, file, None).await
@@ -159,6 +181,7 @@ impl Lake {
     ) -> Result<(CommitOutcome, u64)> {
         let mut slices: Vec<_> = files.iter().flat_map(|file| run_slices(file)).collect();
         slices.sort_by(|a, b| part_key(&a.part).cmp(&part_key(&b.part)));
+        let seen_runs = files.iter().map(|file| file.seen_runs).max().unwrap_or(0);
         let mut encoder = FileEncoder::new(table, table.schema(self.rig()));
         for slice in &slices {
             if let Some(lease) = lease.as_deref_mut() {
@@ -170,6 +193,7 @@ impl Lake {
                 rows += batch.num_rows() as u64;
                 encoder.write_batch(&batch)?;
             }
+            encoder.end_run()?;
             if rows != slice.part.rows {
                 let source = format!("{rows} rows were read of {} of run {}", slice.part.rows, slice.part.run).into();
                 return Err(Error::DataFile { file: slice.file.path.to_string(), source });
@@ -178,8 +202,10 @@ impl Lake {
         let parts: Vec<_> = slices.into_iter().map(|s| s.part).collect();
         let mut staged = self.stage_file(table, &merged_name(&parts), encoder.finish()?).await?;
         let replaced = files.iter().map(|file| file.logged_file()).collect();
-        staged.file.replaces = Some(ReplacedFiles { prefix: None, files: replaced });
+        staged.file.replaces = vec![ReplacedFiles { prefix: None, files: replaced }];
         staged.file.parts = parts;
+        // A part that `runs` does not name yet stays as new as its author made it.
+        staged.file.seen_runs = seen_runs;
         if let Some(lease) = lease {
             lease.ensure_held().await?;
         }
@@ -204,12 +230,24 @@ fn run_slices(file: &DataFile) -> Vec<RunSlice<'_>> {
     file.visible_parts().map(|(part, rows)| RunSlice { file, part: part.clone(), rows }).collect()
 }
 
-fn part_key(part: &RunPart) -> (&str, &str, Option<u64>) {
+/// The order of the parts of a file.
+pub(crate) fn part_key(part: &RunPart) -> (&str, &str, Option<u64>) {
     (part.surface.as_str(), part.run.as_str(), part.row_version)
 }
 
+/// The name of a file that is made of the rows of several runs at once: never that of one that is merged, whose bytes
+/// may be others.
+pub(crate) fn group_name(parts: &[RunPart]) -> String {
+    name_after(b"group\n", parts).compose()
+}
+
 fn merged_name(parts: &[RunPart]) -> FileName {
+    name_after(b"", parts)
+}
+
+fn name_after(kind: &[u8], parts: &[RunPart]) -> FileName {
     let mut sha = Sha256::new();
+    sha.update(kind);
     for part in parts {
         sha.update(part.file_name());
         sha.update("\n");
@@ -267,37 +305,69 @@ impl<'a> FileReaders<'a> {
     }
 }
 
+/// Which files are merged, and how far.
+#[derive(Debug, Clone, Copy)]
+enum MergeRule {
+    /// Those of less than half of these bytes, to as many bytes at most.
+    Bytes(u64),
+    /// Those of fewer than so many runs, to as many runs at least.
+    Runs(usize),
+}
+
+impl MergeRule {
+    fn is_small(self, file: &DataFile) -> bool {
+        match self {
+            Self::Bytes(target) => file.bytes < target / 2,
+            Self::Runs(runs) => run_count(file) < runs,
+        }
+    }
+
+    // Returns whether a group is full without the next file.
+    fn is_full(self, group: &[Arc<DataFile>], next: &DataFile) -> bool {
+        match self {
+            Self::Bytes(target) => group.iter().map(|file| file.bytes).sum::<u64>() + next.bytes > target,
+            Self::Runs(_) => self.is_worthwhile(group),
+        }
+    }
+
+    fn is_worthwhile(self, group: &[Arc<DataFile>]) -> bool {
+        match self {
+            Self::Bytes(_) => group.len() > 1,
+            Self::Runs(runs) => group.iter().map(|file| run_count(file)).sum::<usize>() >= runs,
+        }
+    }
+}
+
+fn run_count(file: &DataFile) -> usize {
+    file.parts.len().max(1)
+}
+
 // Neighbours by surface and run in groups of about the wanted size, so that a query for a surface opens few files.
 fn plan_merges(
     snapshot: &LakeSnapshot,
     readers: &FileReaders<'_>,
     table: Table,
-    target_bytes: u64,
+    rule: MergeRule,
 ) -> Vec<Vec<Arc<DataFile>>> {
     if table.source() == Source::Rig {
         return Vec::new();
     }
-    let is_small = |f: &&Arc<DataFile>| f.bytes < target_bytes / 2 && f.hidden.is_empty();
+    let is_small = |f: &&Arc<DataFile>| rule.is_small(f) && f.hidden.is_empty();
     let first = |f: &DataFile| run_slices(f).first().map(|s| (s.part.surface.clone(), s.part.run.clone()));
     let mut small: Vec<_> = snapshot.files(table).iter().filter(is_small).cloned().collect();
     let place = |file: &DataFile| (readers.audience_of(table, file), surface_references(table, file));
     small.sort_by_cached_key(|file| (place(file), first(file)));
-    let mut groups = vec![Vec::new()];
-    let mut bytes = 0;
+    let mut groups: Vec<Vec<Arc<DataFile>>> = Vec::new();
     let mut last = None;
     for file in small {
         let place = Some(place(&file));
-        if bytes + file.bytes > target_bytes || place != last {
-            groups.push(Vec::new());
-            bytes = 0;
+        match groups.last_mut().filter(|group| place == last && !rule.is_full(group, &file)) {
+            Some(group) => group.push(file),
+            None => groups.push(vec![file]),
         }
         last = place;
-        bytes += file.bytes;
-        if let Some(group) = groups.last_mut() {
-            group.push(file);
-        }
     }
-    groups.retain(|group| group.len() > 1);
+    groups.retain(|group| rule.is_worthwhile(group));
     groups
 }
 
@@ -308,4 +378,4 @@ fn surface_references(table: Table, file: &DataFile) -> Option<[Option<String>; 
 }
 
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;

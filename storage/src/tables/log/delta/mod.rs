@@ -43,7 +43,7 @@ const COMMIT_TRIES: usize = 50;
 /// Time for which a log on an object store is taken to hold the version that was found there. A log forgets versions
 /// after 30 days; tables that somebody deletes are missed only so much later.
 const LOG_LASTS: Duration = Duration::from_secs(600);
-/// The tag of a merged file's Add that holds its parts.
+/// The tag of the Add of a file of several runs that holds its parts.
 const PARTS: &str = "echolake.parts";
 /// The tag of an Add that holds the version of its commit: a checkpoint does not tell it.
 const LOG_VERSION: &str = "echolake.version";
@@ -314,10 +314,20 @@ impl DeltaLog {
 }
 
 /// A file that a version of a table holds.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 struct KnownFile {
     log_version: u64,
     seen_runs: u64,
+    /// Of a file of several rows of `runs`: the place of each, and the version that added it.
+    rows: Vec<(String, u64)>,
+}
+
+impl KnownFile {
+    /// The version that added the row in a place; None if it has no row there.
+    fn row_version(&self, name: &str, place: &str) -> Option<u64> {
+        let of_parts = self.rows.iter().find(|(of, _)| of == place).map(|(_, version)| *version);
+        of_parts.or_else(|| name.starts_with(place).then_some(self.log_version))
+    }
 }
 
 /// The rest of a commit that one version of a table still lacks.
@@ -344,7 +354,10 @@ impl<'a> PendingChange<'a> {
                     change.remove.insert(replaced.name.clone());
                 }
                 // Its version is not known before the commit, and no file of the same commit names it.
-                known.insert(file.name.clone(), KnownFile { log_version: u64::MAX, seen_runs: file.seen_runs });
+                let log_version = u64::MAX;
+                let rows = file.replaces.iter().filter_map(|place| Some((place.prefix.clone()?, log_version)));
+                let added = KnownFile { log_version, seen_runs: file.seen_runs, rows: rows.collect() };
+                known.insert(file.name.clone(), added);
                 change.remove.remove(&file.name);
                 change.add.push(file);
             }
@@ -381,17 +394,32 @@ impl<'a> PendingChange<'a> {
 
     // An Add whose author had not seen the row of the run that this one will replace may be cleaned up at any moment;
     // it is added again.
+    //
+    // A file of several rows of `runs` may be there with rows that others have replaced since: the places of its rows
+    // alone decide.
     fn decide_outcome(&self, file: &NewFile, known: &HashMap<String, KnownFile>) -> CommitOutcome {
-        if known.get(&file.name).is_some_and(|known| known.seen_runs >= file.run_version) {
+        let has_places = file.parts.len() > 1 && file.replaces.iter().any(|replaced| replaced.prefix.is_some());
+        if !has_places && known.get(&file.name).is_some_and(|known| known.seen_runs >= file.run_version) {
             return CommitOutcome::Before;
         }
-        let Some(replaces) = &file.replaces else { return CommitOutcome::Now };
-        let expected = replaces.files.iter().all(|file| is_known(file, known));
-        let alone = replaces.prefix.as_ref().is_none_or(|prefix| {
-            known.keys().filter(|n| n.starts_with(prefix)).count() == replaces.removed_files().count()
-        });
-        if expected && alone { CommitOutcome::Now } else { CommitOutcome::Outdated }
+        match file.replaces.iter().all(|replaced| is_in_place(replaced, known)) {
+            true => CommitOutcome::Now,
+            false => CommitOutcome::Outdated,
+        }
     }
+}
+
+// Returns whether the files that are expected in a place are there, and none with a newer row, or a row as new.
+fn is_in_place(replaced: &ReplacedFiles, known: &HashMap<String, KnownFile>) -> bool {
+    if !replaced.files.iter().all(|file| is_known(file, known)) {
+        return false;
+    }
+    let Some(place) = &replaced.prefix else { return true };
+    let is_expected = |name: &str| replaced.files.iter().any(|file| file.name == name);
+    let rows = known.iter().filter_map(|(name, file)| Some((is_expected(name), file.row_version(name, place)?)));
+    let (expected, others): (Vec<_>, Vec<_>) = rows.partition(|(is_expected, _)| *is_expected);
+    let newest = expected.into_iter().map(|(_, version)| version).max();
+    others.into_iter().all(|(_, version)| newest.is_some_and(|newest| version < newest))
 }
 
 fn is_known(file: &LoggedFile, known: &HashMap<String, KnownFile>) -> bool {
@@ -496,7 +524,7 @@ impl CommitLog for DeltaLog {
             return Ok(false);
         }
         let commit = TableCommit { add: files.to_vec(), ..TableCommit::default() };
-        let change = PendingChange::from_commit(&commit, known_files(&state));
+        let change = PendingChange::from_commit(&commit, known_files(table, &state)?);
         let now = Utc::now();
         let mut lines = change.log_lines(&state, now.timestamp_millis());
         lines.extend(copied.map(|number| transaction_line(COPIED.to_owned(), number, now.timestamp_millis())));
@@ -514,7 +542,7 @@ impl CommitLog for DeltaLog {
                 Some(state) => (state, false),
                 None => (self.require_table(table).await?, true),
             };
-            let change = PendingChange::from_commit(commit, known_files(&state));
+            let change = PendingChange::from_commit(commit, known_files(table, &state)?);
             // Only the newest version tells what is not to be written.
             if !is_newest && !change.is_all_of(commit) {
                 continue;
@@ -601,10 +629,17 @@ fn data_file(table: Table, add: &AddFile) -> Result<DataFile> {
     })
 }
 
-fn known_files(state: &TableState) -> HashMap<String, KnownFile> {
-    let known =
-        |add: &AddFile| KnownFile { log_version: number_tag(add, LOG_VERSION), seen_runs: number_tag(add, SEEN_RUNS) };
-    state.files.iter().map(|(path, file)| (file_name(path), known(&file.add))).collect()
+fn known_files(table: Table, state: &TableState) -> Result<HashMap<String, KnownFile>> {
+    let known = |(path, file): (&Arc<str>, &Arc<TableFile>)| {
+        let mut rows = Vec::new();
+        if table == Table::Runs {
+            let parts = file.decode_once(|add| data_file(table, add))?;
+            rows.extend(parts.parts.iter().filter_map(|part| Some((part.place(), part.row_version?))));
+        }
+        let (log_version, seen_runs) = (number_tag(&file.add, LOG_VERSION), number_tag(&file.add, SEEN_RUNS));
+        Ok::<_, Error>((file_name(path), KnownFile { log_version, seen_runs, rows }))
+    };
+    state.files.iter().map(known).collect()
 }
 
 /// A file's name of its path in the log.
@@ -662,7 +697,12 @@ fn removal_parameters(removal: &RemovalRecord) -> Value {
 
 // Names of ours have no character that Delta would percent-encode.
 fn add_file(file: &NewFile, log_version: u64, now_millis: i64, data_change: bool) -> AddFile {
-    let parts = (!file.parts.is_empty()).then(|| (PARTS, encode_parts(&file.parts)));
+    let mut parts = file.parts.clone();
+    // A row of `runs` that was in no file before is of this version.
+    for part in parts.iter_mut().filter(|part| part.is_pointer()) {
+        part.row_version = part.row_version.or(Some(log_version));
+    }
+    let parts = (!parts.is_empty()).then(|| (PARTS, encode_parts(&parts)));
     let seen_runs = (file.seen_runs > 0).then(|| (SEEN_RUNS, file.seen_runs.to_string()));
     let of_parts: Vec<_> = file.parts.iter().map(|part| &part.row_counts).collect();
     let rows = match &file.row_counts {
@@ -760,10 +800,11 @@ mod tests {
     }
 
     fn file(name: &str, replaces: Option<(&str, &[&str])>) -> NewFile {
-        let replaces = replaces.map(|(prefix, names)| ReplacedFiles {
+        let replaced = |(prefix, names): (&str, &[&str])| ReplacedFiles {
             prefix: Some(prefix.to_owned()).filter(|p| !p.is_empty()),
             files: names.iter().map(|name| logged(name, 3)).collect(),
-        });
+        };
+        let replaces = replaces.map(replaced).into_iter().collect();
         let (stats, parts, row_counts) = ("{}".into(), Vec::new(), None);
         NewFile { name: name.into(), bytes: 1, stats, replaces, parts, seen_runs: 0, run_version: 0, row_counts }
     }
@@ -774,7 +815,8 @@ mod tests {
 
     /// Files that version 3 of the log added, and whose authors had seen version 5 of `runs`.
     fn names(names: &[&str]) -> HashMap<String, KnownFile> {
-        names.iter().map(|n| ((*n).to_owned(), KnownFile { log_version: 3, seen_runs: 5 })).collect()
+        let known = || KnownFile { log_version: 3, seen_runs: 5, rows: Vec::new() };
+        names.iter().map(|name| ((*name).to_owned(), known())).collect()
     }
 
     #[test]
@@ -822,7 +864,7 @@ mod tests {
         assert_eq!(outcomes(vec![of_merged()], &["m", "x.3"]), (vec![CommitOutcome::Outdated], vec![]));
         assert_eq!(outcomes(vec![of_merged()], &["y.1"]), (vec![CommitOutcome::Outdated], vec![]), "merged anew");
         let mut older = new();
-        older.replaces.as_mut().expect("replaces").files[0].log_version = 2;
+        older.replaces[0].files[0].log_version = 2;
         assert_eq!(outcomes(vec![older], &["x.1"]), (vec![CommitOutcome::Outdated], vec![]), "it was added again");
         let first = |name| file(name, Some(("x.", &[])));
         assert_eq!(

@@ -23,17 +23,17 @@ use parquet::file::metadata::{PageIndexPolicy, ParquetMetaDataReader};
 use super::*;
 use crate::{ReferenceSurfaces, VisibleRun, encode_batches};
 
-const TABLE: Table = Table::Nce;
-const ROWS: usize = 20;
+pub(crate) const TABLE: Table = Table::Nce;
+pub(crate) const ROWS: usize = 20;
 
-async fn open(store: &Arc<InMemory>) -> Lake {
+pub(crate) async fn open(store: &Arc<InMemory>) -> Lake {
     let store: Arc<dyn ObjectStore> = store.clone();
     Lake::open_or_create_in(store, "a lake under test", &Rig::paper(), &ReferenceSurfaces::default())
         .await
         .expect("a lake")
 }
 
-fn column(field: &Field, surface: &str, run: &str, value: usize) -> ArrayRef {
+pub(crate) fn column(field: &Field, surface: &str, run: &str, value: usize) -> ArrayRef {
     let numbers = || (0..ROWS).map(|row| (row * 1000 + value) as f32 * 0.37);
     match (field.name().as_str(), field.data_type()) {
         ("surface_id", _) => Arc::new(StringArray::from(vec![surface; ROWS])),
@@ -61,7 +61,7 @@ fn column(field: &Field, surface: &str, run: &str, value: usize) -> ArrayRef {
     }
 }
 
-fn visible(surface: &str, run: &str, derivation: &str) -> VisibleRun {
+pub(crate) fn visible(surface: &str, run: &str, derivation: &str) -> VisibleRun {
     VisibleRun {
         surface: surface.parse().expect("an id"),
         run: run.parse().expect("an id"),
@@ -72,7 +72,7 @@ fn visible(surface: &str, run: &str, derivation: &str) -> VisibleRun {
 }
 
 /// Adds a run's derived rows, or replaces them, and its row in `runs`.
-async fn put(lake: &Lake, surface: &str, run: &str, derivation: &str, value: usize) {
+pub(crate) async fn put(lake: &Lake, surface: &str, run: &str, derivation: &str, value: usize) {
     let pointer = visible(surface, run, derivation);
     let part = FileName::Rows {
         surface: pointer.surface.clone(),
@@ -100,7 +100,7 @@ async fn put(lake: &Lake, surface: &str, run: &str, derivation: &str, value: usi
 }
 
 /// The rows that readers see, sorted by surface and run.
-async fn seen(lake: &Lake) -> RecordBatch {
+pub(crate) async fn seen(lake: &Lake) -> RecordBatch {
     let snapshot = lake.snapshot().await.expect("a view");
     let mut slices: Vec<_> = snapshot.files(TABLE).iter().flat_map(|file| run_slices(file)).collect();
     slices.sort_by(|a, b| part_key(&a.part).cmp(&part_key(&b.part)));
@@ -112,7 +112,7 @@ async fn seen(lake: &Lake) -> RecordBatch {
     concat_batches(&TABLE.schema(lake.rig()), &batches).expect("rows of one schema")
 }
 
-async fn files(lake: &Lake) -> Vec<Arc<DataFile>> {
+pub(crate) async fn files(lake: &Lake) -> Vec<Arc<DataFile>> {
     lake.commit_log().list_files(TABLE).await.expect("a log")
 }
 
