@@ -211,13 +211,25 @@ impl RecordCursor {
     /// # Errors
     /// [`RecordError`].
     pub fn next_record(&mut self) -> Result<Option<Record<'_>>, RecordError> {
-        let rest = &self.records[self.position..];
-        if rest.is_empty() {
-            return Ok(None);
+        self.next_unskipped(|_| false)
+    }
+
+    /// Returns the next record that is not a whole message of a channel that `is_skipped`; None behind the last one.
+    ///
+    /// # Errors
+    /// [`RecordError`].
+    #[inline]
+    pub fn next_unskipped(&mut self, is_skipped: impl Fn(u16) -> bool) -> Result<Option<Record<'_>>, RecordError> {
+        while self.position < self.records.len() {
+            let rest = &self.records[self.position..];
+            let (code, body, behind) = split_record(rest).ok_or(RecordError::Early)?;
+            self.position = self.records.len() - behind.len();
+            let is_message = code == op::MESSAGE && body.len() >= MESSAGE_HEADER_BYTES;
+            if !(is_message && is_skipped(u16::from_le_bytes([body[0], body[1]]))) {
+                return parse_fast(code, body).map(Some).map_err(RecordError::Content);
+            }
         }
-        let (code, body, behind) = split_record(rest).ok_or(RecordError::Early)?;
-        self.position = self.records.len() - behind.len();
-        parse_fast(code, body).map(Some).map_err(RecordError::Content)
+        Ok(None)
     }
 }
 
@@ -289,6 +301,7 @@ fn chunk_parts(body: &[u8]) -> Result<(ChunkHeader, &[u8]), ChunkError> {
     }
 }
 
+#[inline]
 fn split_record(records: &[u8]) -> Option<(u8, &[u8], &[u8])> {
     let (frame, behind) = records.split_at_checked(FRAME_BYTES)?;
     let frame = RecordFrame::from_bytes(frame);
@@ -297,6 +310,7 @@ fn split_record(records: &[u8]) -> Option<(u8, &[u8], &[u8])> {
 }
 
 // Most records are messages, which are read without the library's general parser.
+#[inline]
 fn parse_fast(code: u8, body: &[u8]) -> Result<Record<'_>, McapError> {
     match body.split_first_chunk::<MESSAGE_HEADER_BYTES>() {
         Some((h, data)) if code == op::MESSAGE => Ok(Record::Message {
@@ -379,6 +393,31 @@ mod tests {
             }
             assert_eq!(count, 4, "a channel and its messages");
         }
+    }
+
+    // Of another channel's messages only the frame is looked at; what is no whole message is refused as ever.
+    #[test]
+    fn messages_of_skipped_channels_are_passed() {
+        let record = |code: u8, body: &[u8]| [&[code][..], &(body.len() as u64).to_le_bytes(), body].concat();
+        let message = |channel: u8| record(op::MESSAGE, &[&[channel][..], &[0; MESSAGE_HEADER_BYTES]].concat());
+        let records = [message(1), message(2), record(0x80, &[1, 2]), message(1), message(2), message(3)].concat();
+        let mut cursor = RecordCursor::new(records.into());
+        let mut seen = Vec::new();
+        while let Some(record) = cursor.next_unskipped(|channel| channel == 1).expect("whole") {
+            seen.push(match record {
+                Record::Message { header, .. } => header.channel_id,
+                _ => 0,
+            });
+        }
+        assert_eq!(seen, [2, 0, 2, 3]);
+        for short in [0, 1, MESSAGE_HEADER_BYTES - 1] {
+            let damaged = [message(1), record(op::MESSAGE, &vec![1; short])].concat();
+            let mut cursor = RecordCursor::new(damaged.into());
+            assert!(matches!(cursor.next_unskipped(|_| true), Err(RecordError::Content(_))), "{short}");
+        }
+        let mut cut = [message(1), message(1)].concat();
+        cut.pop();
+        assert!(matches!(RecordCursor::new(cut.into()).next_unskipped(|_| true), Err(RecordError::Early)));
     }
 
     #[test]

@@ -73,12 +73,17 @@ impl PieceRecords {
 
     /// Returns the next record; None behind the last one. The text of an error is the damage.
     pub fn next_record(&mut self) -> Result<Option<Record<'_>>, String> {
+        self.next_unskipped(|_| false)
+    }
+
+    /// As [`Self::next_record`], past messages of channels that are `is_skipped`.
+    pub fn next_unskipped(&mut self, is_skipped: impl Fn(u16) -> bool) -> Result<Option<Record<'_>>, String> {
         if let Some(body) = self.chunk.take() {
             let room = std::mem::take(&mut self.room);
             let decoded = DecodedChunk::decode_into(&body, room).map_err(|e| format!("its chunk is damaged: {e}"))?;
             self.records = decoded.into_cursor();
         }
-        self.records.next_record().map_err(|e| e.to_string())
+        self.records.next_unskipped(is_skipped).map_err(|e| e.to_string())
     }
 
     /// Returns the memory of the records for another piece.

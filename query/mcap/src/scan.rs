@@ -63,9 +63,22 @@ pub(super) struct Source {
     pub file: Arc<McapFile>,
     /// The channels that are meant: topic, and which mapping they have.
     pub channels: BTreeMap<u16, (String, usize)>,
+    /// By channel, whether the file describes it and it is not meant.
+    skipped: Box<[bool]>,
 }
 
 impl Source {
+    /// A file of which some channels are meant.
+    pub fn new(run: Option<(String, String)>, file: Arc<McapFile>, channels: BTreeMap<u16, (String, usize)>) -> Self {
+        let mut skipped = vec![false; file.channels.keys().next_back().map_or(0, |last| usize::from(*last) + 1)];
+        file.channels.keys().for_each(|id| skipped[usize::from(*id)] = !channels.contains_key(id));
+        Self { run, file, channels, skipped: skipped.into() }
+    }
+
+    fn is_skipped(&self, channel: u16) -> bool {
+        self.skipped.get(usize::from(channel)).is_some_and(|is_skipped| *is_skipped)
+    }
+
     /// Returns the pieces that may have messages of the channels in the time.
     pub fn pieces_within<'a>(&'a self, times: Option<&'a RangeInclusive<i64>>) -> impl Iterator<Item = &'a Piece> {
         let nanos = |time: u64| i64::try_from(time).unwrap_or(i64::MAX);
@@ -451,16 +464,14 @@ impl Scanner {
         let parts = &self.scan.parts;
         let source = &parts.sources[*source];
         let path = &source.file.path;
-        while let Some(record) = records.next_record().map_err(|what| Fault::damaged(path, *offset, what))? {
+        let damaged = |what: String| Fault::damaged(path, *offset, what);
+        while let Some(record) = records.next_unskipped(|channel| source.is_skipped(channel)).map_err(damaged)? {
             let Record::Message { header, data } = &record else {
-                source.file.digests.check_definition(&record).map_err(|what| Fault::damaged(path, *offset, what))?;
+                source.file.digests.check_definition(&record).map_err(damaged)?;
                 continue;
             };
             let Some((topic, mapping)) = source.channels.get(&header.channel_id) else {
-                if source.file.channels.contains_key(&header.channel_id) {
-                    continue;
-                }
-                return Err(Fault::damaged(path, *offset, undescribed_channel(header.channel_id)).into());
+                return Err(damaged(undescribed_channel(header.channel_id)).into());
             };
             if let Some(times) = &self.scan.times
                 && !i64::try_from(header.log_time).is_ok_and(|nanos| times.contains(&nanos))

@@ -52,7 +52,7 @@ pub(super) fn decoded_table(targets: Vec<Target>, topic: &str, files: &Arc<McapF
         let mapped =
             |(id, channel): (u16, Channel)| Some((id, (topic.to_owned(), *layouts.known.get(&channel.schema)?)));
         let channels = channels_of(target).into_iter().filter_map(mapped).collect();
-        Source { run: target.run.clone(), file: target.file.clone(), channels }
+        Source::new(target.run.clone(), target.file.clone(), channels)
     };
     let sources = targets.iter().map(source).collect();
     let heads = Head::OF_COLUMNS.to_vec();
@@ -74,7 +74,7 @@ pub(super) fn message_table(
     let source = |target: Target| {
         let meant = target.file.channels.iter().filter(|(_, c)| topic.is_none_or(|topic| c.topic == topic));
         let channels = meant.map(|(id, c)| (*id, (c.topic.clone(), 0))).collect();
-        Source { run: target.run, file: target.file, channels }
+        Source::new(target.run, target.file, channels)
     };
     let heads = Head::OF_MESSAGES.to_vec();
     let schema = Arc::new(Schema::new(heads.iter().map(|h| h.column_field()).collect::<Vec<_>>()));
