@@ -3,7 +3,8 @@
 #
 # dist/ has them afterwards: a source archive that builds without Node and has the manual, wheels, Debian packages, an inventory (CycloneDX)
 # with licences, and SHA256SUMS. Needs git, Rust, Node with npm, Python 3.10 or newer with venv, and dpkg-deb.
-# $ECHOLAKE_TARGETS names the targets, by default all below whose standard library is installed (`rustup target add`).
+# $ECHOLAKE_TARGETS names the targets, by default all below whose standard library is installed (`rustup target add`). The packages
+# of a target for newer processors, TARGET/PROCESSOR, are in dist/PROCESSOR/.
 # What is compiled stays in $CARGO_TARGET_DIR, so a second try goes on where the first one stopped.
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -18,7 +19,7 @@ unset ECHOLAKE_LAKE
 work=$CARGO_TARGET_DIR/package
 source=$work/echolake-$version
 out=$work/out
-TARGETS=(x86_64-unknown-linux-gnu x86_64-unknown-linux-musl aarch64-unknown-linux-gnu)
+TARGETS=(x86_64-unknown-linux-gnu x86_64-unknown-linux-gnu/x86-64-v3 x86_64-unknown-linux-musl aarch64-unknown-linux-gnu)
 WHEEL_MB=60
 
 say() { printf '\n== %s\n' "$*" >&2; }
@@ -26,7 +27,7 @@ fail() { printf 'error: %s\n' "$*" >&2; exit 1; }
 
 make_source() {
     say "sources and pages of echolake $version ($ECHOLAKE_COMMIT)"
-    rm -rf "$source" "$work/web" "$out"
+    rm -rf "$source" "$work/web" "$work/programs" "$out"
     mkdir -p "$work" "$out"
     git archive --prefix="echolake-$version/" "$commit" | tar -x -C "$work"
     cp -r "$source/web" "$work/web"
@@ -45,10 +46,10 @@ find_targets() {
     installed=$(cd "$source" && rustc --print sysroot)/lib/rustlib
     targets=()
     for target in "${wanted[@]}"; do
-        if [ -d "$installed/$target/lib" ]; then
+        if [ -d "$installed/${target%/*}/lib" ]; then
             targets+=("$target")
         else
-            left_out+=("$target: no standard library; hint: rustup target add $target")
+            left_out+=("$target: no standard library; hint: rustup target add ${target%/*}")
         fi
     done
     for target in "${TARGETS[@]}"; do
@@ -65,12 +66,21 @@ install_tools() {
     export PATH="$work/tools/bin:$PATH"
 }
 
+# The folder under dist/ for a target's packages.
+folder_of() {
+    case $1 in
+        */*) echo "$out/${1#*/}" ;;
+        *) echo "$out" ;;
+    esac
+}
+
 make_wheel() {
-    local target=$1 tag=manylinux_2_28
+    local target=$1 tag=manylinux_2_28 flags=
     [[ $target == *-musl ]] && tag=musllinux_1_2
+    [[ $target == */* ]] && flags="-C target-cpu=${target#*/}"
     say "wheel for $target ($tag)"
-    (cd "$source/python" && maturin build --zig --target "$target" --compatibility "$tag" --auditwheel check \
-        --sbom-include pages.cdx.json --out "$out" >&2)
+    (cd "$source/python" && RUSTFLAGS=$flags maturin build --zig --target "${target%/*}" --compatibility "$tag" --auditwheel check \
+        --sbom-include pages.cdx.json --out "$(folder_of "$target")" >&2)
 }
 
 # The program as it is in the wheel: all packages ship the same bytes.
@@ -81,6 +91,15 @@ unpack_program() {
 open(sys.argv[2], "wb").write(a.read(next(n for n in a.namelist() if n.endswith(".data/scripts/echolake"))))' \
         "$wheel" "$folder/echolake"
     chmod 755 "$folder/echolake"
+}
+
+# On a processor that is too old, the program says so. QEMU has one, if it is installed.
+check_older_processor() {
+    local said
+    command -v qemu-x86_64 >/dev/null || { left_out+=("an older processor: not tried; hint: apt install qemu-user"); return 0; }
+    if said=$(qemu-x86_64 -cpu Nehalem "$1" --version 2>&1) || [[ $said != *"built for x86-64-v3"* ]]; then
+        fail "on a processor without AVX2, the program did not say what it needs: $said"
+    fi
 }
 
 check_size() {
@@ -107,37 +126,46 @@ left_out=()
 make_source
 find_targets
 install_tools
-python3 "$source/packaging/inventory.py" licences "$source" "${targets[@]}"
+python3 "$source/packaging/inventory.py" licences "$source" $(printf '%s\n' "${targets[@]%/*}" | uniq)
 say "advisories"
 # Only a release requires them.
 ECHOLAKE_ADVISORIES=${ECHOLAKE_ADVISORIES:-unchecked} \
     "$source/packaging/advisories.sh" "$source" "$out/echolake-$version.advisories.txt"
-runnable=
+runnable=()
 for target in "${targets[@]}"; do
     rm -f "$work/fresh" && touch "$work/fresh"
     make_wheel "$target"
     wheel=$(find "$out" -name '*.whl' -newer "$work/fresh")
-    unpack_program "$wheel" "$work/$target"
+    program=$work/programs/${target/\//-}
+    unpack_program "$wheel" "$program"
     check_size "$wheel" "$WHEEL_MB"
-    if [ -z "$runnable" ] && "$work/$target/echolake" --version >/dev/null 2>&1; then
-        runnable=$work/$target/echolake
-        make_documents "$runnable" "$wheel"
+    if [[ $target == */x86-64-v3 ]]; then
+        check_older_processor "$program/echolake"
+    fi
+    if "$program/echolake" --version >/dev/null 2>&1; then
+        [ "${#runnable[@]}" -gt 0 ] || make_documents "$program/echolake" "$wheel"
+        runnable+=("$target")
     fi
 done
-[ -n "$runnable" ] || fail "none of the programs runs here, so there are no man pages; hint: build for this machine, too"
-say "the end-to-end tests of the program that ships"
-(cd "$source" && ECHOLAKE_SHIPPED=$runnable cargo test --profile quick --test main --locked -- end_to_end >&2)
+[ "${#runnable[@]}" -gt 0 ] || fail "none of the programs runs here, so there are no man pages; hint: build for this machine, too"
+for target in "${runnable[@]}"; do
+    say "the end-to-end tests of the program for $target"
+    (cd "$source" && ECHOLAKE_SHIPPED=$work/programs/${target/\//-}/echolake cargo test --profile quick --test main --locked -- end_to_end >&2)
+done
 for target in "${targets[@]}"; do
     case $target in
-        x86_64-*-gnu) architecture=amd64 ;;
+        x86_64-*-gnu | x86_64-*-gnu/*) architecture=amd64 ;;
         aarch64-*-gnu) architecture=arm64 ;;
         *) continue ;;
     esac
-    say "Debian package for $architecture"
-    "$source/packaging/deb.sh" "$work/$target/echolake" "$architecture" "$version" "$work/documents" "$source" "$out" >&2
+    say "Debian package for $target"
+    "$source/packaging/deb.sh" "$work/programs/${target/\//-}/echolake" "$architecture" "$version" "$work/documents" "$source" \
+        "$(folder_of "$target")" >&2
 done
-(cd "$out" && sha256sum -- * >SHA256SUMS)
-"$source/packaging/check_wheel.sh" "$out" "$version"
+(cd "$out" && find . -type f -printf '%P\n' | sort | xargs sha256sum -- >"$work/SHA256SUMS" && mv "$work/SHA256SUMS" .)
+for target in "${runnable[@]}"; do
+    [[ $target == *-musl ]] || "$source/packaging/check_wheel.sh" "$(folder_of "$target")" "$version"
+done
 rm -rf dist && cp -r "$out" dist
 say "dist/, to be published by hand"
 (cd dist && ls -l)

@@ -169,6 +169,15 @@ pub(crate) enum LakeCommand {
 }
 
 impl CliArguments {
+    /// Starts the program again, with other settings of its allocator, if the command takes in runs. To be called before
+    /// there are threads.
+    #[cfg(feature = "lake")]
+    pub fn prepare_memory(&self) {
+        if let CliCommand::Lake(LakeCommand::Demo(_) | LakeCommand::Ingest(_) | LakeCommand::Twin(_)) = &self.command {
+            echolake_ingest::keep_freed_memory();
+        }
+    }
+
     /// Gives up what the command does not need. To be called before there are threads.
     pub fn confine_process(&self) -> anyhow::Result<()> {
         match &self.command {

@@ -7,6 +7,7 @@ mod commands;
 mod duration;
 mod error_text;
 mod logging;
+mod processor;
 mod progress;
 mod signals;
 #[cfg(feature = "otlp")]
@@ -53,8 +54,20 @@ const WRONG_USAGE: u8 = 2;
 const DONE_WITH_LOSS: u8 = 3;
 
 fn main() -> ExitCode {
+    // Nothing that is compiled here stands before it: it could use the instructions.
+    if !processor::has_instructions() {
+        let _ = std::io::Write::write_all(&mut std::io::stderr(), processor::TOO_OLD.as_bytes());
+        return ExitCode::from(FAILED);
+    }
+    run_program()
+}
+
+#[inline(never)]
+fn run_program() -> ExitCode {
     // clap itself ends with 2 on wrong usage.
     let cli = cli::CliArguments::parse();
+    #[cfg(feature = "lake")]
+    cli.prepare_memory();
     let runtime = || {
         tokio::runtime::Builder::new_multi_thread()
             .enable_all()

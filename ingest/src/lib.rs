@@ -29,6 +29,7 @@ mod derive;
 mod derived_values;
 pub mod doctor;
 mod error;
+mod freed_memory;
 mod inbox;
 mod ingest;
 mod pipeline;
@@ -45,6 +46,7 @@ mod run_derivation;
 pub use complete::{CompletedRun, CompletionReport, CompletionSummary};
 pub use echolake_recording::FileIntegrity;
 pub use error::{Error, Result};
+pub use freed_memory::keep_freed_memory;
 pub use inbox::{
     PendingFiles, RecordingState, RunSource, SuspectFile, UnfinishedRecording, find_runs, has_end, list_arrivals,
     list_pending, pending_runs, rig_of_run,

@@ -23,12 +23,12 @@ use crate::inbox::ReadingMark;
 /// many runs.
 pub(crate) const GROUP: usize = 16;
 
-/// Memory for rows that wait for their commit, KiB; a commit takes half of it at most, unless one job is larger.
-const WAITING_KIB: u32 = 512 << 10;
+/// Memory for rows that wait for their commit, KiB; a commit takes three quarters of it, or what one job has.
+const WAITING_KIB: u32 = 320 << 10;
 
 /// Time that a job waits for others to share its commit: every commit adds a file to each table's log, which all
 /// readers read. Tests count files however busy the machine is, and groups end with the last job.
-const GATHER: Duration = Duration::from_secs(if cfg!(test) { 600 } else { 2 });
+const GATHER: Duration = Duration::from_secs(if cfg!(test) { 600 } else { 20 });
 
 /// A pool of one thread per core, shared by all computations; each thread reuses its memory. Tokio's blocking pool
 /// would spread the work, and the memory it frees, over hundreds of threads.
@@ -197,7 +197,7 @@ async fn gather_group<J, R>(ready: &mut mpsc::Receiver<WaitingJob<J, R>>) -> Opt
     let deadline = Instant::now() + GATHER;
     let kib = |group: &[WaitingJob<J, R>]| group.iter().map(|job| job.memory.num_permits()).sum::<usize>();
     while group.len() < GROUP
-        && kib(&group) < WAITING_KIB as usize / 2
+        && kib(&group) < WAITING_KIB as usize * 3 / 4
         && let Ok(Some(next)) = timeout_at(deadline, ready.recv()).await
     {
         group.push(next);

@@ -97,7 +97,11 @@ enum CampaignCommand {
 }
 
 fn main() -> Result<()> {
-    match StressCli::parse().campaign {
+    let campaign = StressCli::parse().campaign;
+    if let CampaignCommand::Bench(_) = &campaign {
+        echolake_ingest::keep_freed_memory();
+    }
+    match campaign {
         CampaignCommand::Kills(args) => kill_ingest::run_kill_ingest(&args),
         CampaignCommand::HostileFiles(args) => hostile_ingest::run_hostile_ingest(&args),
         CampaignCommand::AcquireKills(args) => kill_acquire::run_kill_acquire(&args),

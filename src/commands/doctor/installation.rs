@@ -22,6 +22,7 @@ use crate::CommandOutcome;
 #[cfg(feature = "lake")]
 use crate::commands::serve::ServeArgs;
 use crate::commands::{format_size, print_line};
+use crate::processor;
 
 /// Versions of what reads and writes the lake's files, and of all else that was compiled in.
 const LOCK_FILE: &str = include_str!("../../../Cargo.lock");
@@ -183,7 +184,7 @@ fn processor_fact() -> InstallationFact {
     let model = listed.lines().find_map(|line| line.strip_prefix("model name")?.split_once(": "));
     let threads = std::thread::available_parallelism().map_or(1, usize::from);
     let model = model.map(|(_, model)| format!(", {model}")).unwrap_or_default();
-    InstallationFact::ok("processor", format!("{threads} threads{model}"))
+    InstallationFact::ok("processor", format!("{threads} threads{model}; the program is for {}", processor::BUILT_FOR))
 }
 
 fn memory_fact() -> InstallationFact {

@@ -312,7 +312,7 @@ fn facts_line(machine: &[(&str, String)]) -> String {
 }
 
 // The program and the machine that were measured.
-fn machine_facts() -> [(&'static str, String); 5] {
+fn machine_facts() -> [(&'static str, String); 6] {
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     let read_value = |file: &str, key: &str| {
         let text = std::fs::read_to_string(file).unwrap_or_default();
@@ -325,6 +325,7 @@ fn machine_facts() -> [(&'static str, String); 5] {
     [
         ("program", concat!("echolake ", env!("CARGO_PKG_VERSION")).to_owned()),
         ("profile", profile),
+        ("built for", if cfg!(target_feature = "avx2") { "x86-64-v3" } else { std::env::consts::ARCH }.to_owned()),
         ("processor", read_value("/proc/cpuinfo", "model name")),
         ("cores", cores.to_string()),
         ("memory", format!("{:.0} GiB", kib / 1024.0 / 1024.0)),
