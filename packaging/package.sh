@@ -74,6 +74,10 @@ folder_of() {
     esac
 }
 
+program_of() {
+    echo "$work/programs/${1/\//-}/echolake"
+}
+
 make_wheel() {
     local target=$1 tag=manylinux_2_28 flags=
     [[ $target == *-musl ]] && tag=musllinux_1_2
@@ -136,21 +140,21 @@ for target in "${targets[@]}"; do
     rm -f "$work/fresh" && touch "$work/fresh"
     make_wheel "$target"
     wheel=$(find "$out" -name '*.whl' -newer "$work/fresh")
-    program=$work/programs/${target/\//-}
-    unpack_program "$wheel" "$program"
+    program=$(program_of "$target")
+    unpack_program "$wheel" "$(dirname "$program")"
     check_size "$wheel" "$WHEEL_MB"
     if [[ $target == */x86-64-v3 ]]; then
-        check_older_processor "$program/echolake"
+        check_older_processor "$program"
     fi
-    if "$program/echolake" --version >/dev/null 2>&1; then
-        [ "${#runnable[@]}" -gt 0 ] || make_documents "$program/echolake" "$wheel"
+    if "$program" --version >/dev/null 2>&1; then
+        [ "${#runnable[@]}" -gt 0 ] || make_documents "$program" "$wheel"
         runnable+=("$target")
     fi
 done
 [ "${#runnable[@]}" -gt 0 ] || fail "none of the programs runs here, so there are no man pages; hint: build for this machine, too"
 for target in "${runnable[@]}"; do
     say "the end-to-end tests of the program for $target"
-    (cd "$source" && ECHOLAKE_SHIPPED=$work/programs/${target/\//-}/echolake cargo test --profile quick --test main --locked -- end_to_end >&2)
+    (cd "$source" && ECHOLAKE_SHIPPED=$(program_of "$target") cargo test --profile quick --test main --locked -- end_to_end >&2)
 done
 for target in "${targets[@]}"; do
     case $target in
@@ -159,7 +163,7 @@ for target in "${targets[@]}"; do
         *) continue ;;
     esac
     say "Debian package for $target"
-    "$source/packaging/deb.sh" "$work/programs/${target/\//-}/echolake" "$architecture" "$version" "$work/documents" "$source" \
+    "$source/packaging/deb.sh" "$(program_of "$target")" "$architecture" "$version" "$work/documents" "$source" \
         "$(folder_of "$target")" >&2
 done
 (cd "$out" && find . -type f -printf '%P\n' | sort | xargs sha256sum -- >"$work/SHA256SUMS" && mv "$work/SHA256SUMS" .)

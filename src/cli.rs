@@ -169,8 +169,8 @@ pub(crate) enum LakeCommand {
 }
 
 impl CliArguments {
-    /// Starts the program again, with other settings of its allocator, if the command takes in runs. To be called before
-    /// there are threads.
+    /// Starts the program again, with other settings of its allocator, if the command ingests runs. To be called
+    /// before there are threads.
     #[cfg(feature = "lake")]
     pub fn prepare_memory(&self) {
         if let CliCommand::Lake(LakeCommand::Demo(_) | LakeCommand::Ingest(_) | LakeCommand::Twin(_)) = &self.command {

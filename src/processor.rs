@@ -3,7 +3,7 @@
 /// Their name, as compilers and distributions know it.
 pub(crate) const BUILT_FOR: &str = if cfg!(target_feature = "avx2") { "x86-64-v3" } else { std::env::consts::ARCH };
 
-/// What a program for newer processors says on an older one.
+/// The message of a program for newer processors on an older one.
 pub(crate) const TOO_OLD: &str = "error: this program is built for x86-64-v3, processors with AVX2 (since 2013), and \
     this processor is older; hint: the other package for x86-64 runs on all of them\n";
 

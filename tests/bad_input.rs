@@ -438,7 +438,8 @@ mod slow {
         assert!(acknowledged > 200 && count("/sweep") == acknowledged, "{acknowledged}");
     }
 
-    // The system ends a process that writes larger files than it may: heights are as large, and rows of two flat runs are not.
+    // The system ends a process that writes larger files than it may: heights are as large, and rows of two flat runs
+    // are not.
     #[test]
     fn a_run_that_ends_ingest_is_passed_over_by_the_next_one() {
         let place = TestFolder::new();

@@ -69,8 +69,8 @@ mod slow {
         place.ok(&["ingest"]);
         let before = tables(&place);
         // On a busy machine a group has fewer runs.
-        let files = "select count(*) between 4 and 6 and sum(runs) = 6 and sum(rows) = 270 as is_right from system.files \
-                     where \"table\" = 'nce'";
+        let files = "select count(*) between 4 and 6 and sum(runs) = 6 and sum(rows) = 270 as is_right \
+                     from system.files where \"table\" = 'nce'";
         assert_eq!(place.sql(files)[0]["is_right"], true);
         let ingests = place.sql("select * from system.ingests order by run_id");
         let report: serde_json::Value = serde_json::from_str(&place.ok(&["optimize", "--json"])).expect("JSON");

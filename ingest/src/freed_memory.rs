@@ -10,8 +10,8 @@ const PURGE_DELAY: &str = "MIMALLOC_PURGE_DELAY";
 /// Longer than a run takes. By default it is a second.
 const KEPT_MS: &str = "10000";
 
-/// Starts this program again within its process, so that mimalloc keeps freed memory for longer: what is given back after
-/// each run, the system clears before the next one has it, which is half of an ingest where clearing is slow.
+/// Starts this program again within its process, so that mimalloc keeps freed memory for longer. The system clears what
+/// is given back after each run before the next one has it: half of an ingest where clearing is slow.
 ///
 /// It is for programs whose allocator is mimalloc, before they have threads. It does nothing if the variable is set, as
 /// it is the second time, or if the program cannot be started again.

@@ -1,7 +1,8 @@
 //! Runs jobs on a few workers at once, and commits their files in groups.
 //!
-//! A commit costs the same for one run as for many, and a table's log and its files grow with every commit; so jobs that
-//! become ready within a short time are committed together. Their encoded rows wait in memory, up to a number of bytes.
+//! A commit costs the same for one run as for many, and a table's log and its files grow with every commit; so jobs
+//! that become ready within a short time are committed together. Their encoded rows wait in memory, up to a number of
+//! bytes.
 
 use std::collections::VecDeque;
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};

@@ -55,8 +55,8 @@ pub(crate) async fn read_responses(lake: &Lake, snapshot: &LakeSnapshot, run: &R
     Ok(out)
 }
 
-/// Reads a run's rows from a file that shows them. A file of this run alone is read and checked as a whole; of a file of
-/// several runs only the run's pages are read.
+/// Reads a run's rows from a file that shows them. A file of this run alone is read and checked as a whole; of a file
+/// of several runs only the run's pages are read.
 pub(crate) async fn rows_of_run(
     lake: &Lake,
     table: Table,

@@ -409,7 +409,7 @@ impl StoreError {
         }
     }
 
-    /// What to do about a cause that is a store's error, with `; hint: ` before it; empty if nothing is known.
+    /// The advice about a cause that is a store's error, with `; hint: ` before it; empty if nothing is known.
     pub fn cause_hint(cause: &ErrorCause) -> &'static str {
         cause.downcast_ref::<Self>().map_or("", Self::hint_text)
     }

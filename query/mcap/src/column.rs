@@ -263,8 +263,8 @@ impl Column {
             Self::U16(c) => Arc::new(c.finish()),
             Self::U32(c) => Arc::new(c.finish()),
             Self::U64(c) => Arc::new(c.finish()),
-            // One NaN, as in results of queries: the sign that a file's NaN has depends on the recorder's processor. All
-            // values are written, so that the loop has no branches and is compiled into vectors.
+            // One NaN, as in results of queries: the sign that a file's NaN has depends on the recorder's processor.
+            // All values are written, so that the loop has no branches and is compiled into vectors.
             Self::F32(c) => {
                 c.values.iter_mut().for_each(|x| *x = if x.is_nan() { f32::NAN } else { *x });
                 Arc::new(c.finish())

@@ -72,8 +72,8 @@ struct OpenFile {
     rows_a_group: usize,
 }
 
-/// A run's rows of one table, for a file that it may share with other runs. A table with lists, or many rows of another,
-/// are row groups already. Few rows without lists wait for those of the other runs, whose row group they share.
+/// A run's rows of one table, for a file that it may share with other runs. Those of a table with lists, and many rows
+/// of another, are row groups already. Few rows without lists wait for those of other runs, whose row group they share.
 #[derive(Debug, Default)]
 pub struct EncodedRows {
     groups: Vec<Vec<ArrowColumnChunk>>,
@@ -95,7 +95,7 @@ impl EncodedRows {
         self.stats.rows as u64
     }
 
-    /// Bytes that they take in memory.
+    /// Their size in memory, bytes.
     pub fn memory_bytes(&self) -> usize {
         let encoded = self.groups.iter().flatten().map(|chunk| chunk.close().bytes_written as usize);
         let waiting = self.waiting.iter().map(RecordBatch::get_array_memory_size);

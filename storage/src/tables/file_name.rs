@@ -54,10 +54,15 @@ pub struct VisibleRun {
     pub verdicts: Option<String>,
 }
 
+/// Common beginning of the names of files with rows of this run alone.
+pub(crate) fn run_prefix(surface: &SurfaceId, run: &RunId) -> String {
+    format!("{surface}.{run}.")
+}
+
 impl VisibleRun {
     /// Common beginning of the names of all of the run's rows in `runs`.
     pub(crate) fn name_prefix(&self) -> String {
-        format!("{}.{}.", self.surface, self.run)
+        run_prefix(&self.surface, &self.run)
     }
 
     /// Both derivations and the mark of the verdicts, as the name of the run's row has them.

@@ -30,7 +30,7 @@ pub struct FileGroup {
 /// A run's rows of one table on their way into a file, which no reader sees before a commit.
 #[derive(Debug)]
 pub struct StagedRows {
-    /// What the log will say of them if they have a file of their own.
+    /// Their entry in the log, if they have a file of their own.
     file: StagedFile,
     part: RunPart,
     rows: EncodedRows,
@@ -104,7 +104,7 @@ impl StagedRows {
         self.file.table
     }
 
-    /// Bytes that they take in memory.
+    /// Their size in memory, bytes.
     pub fn memory_bytes(&self) -> usize {
         self.rows.memory_bytes()
     }
@@ -132,7 +132,7 @@ impl Lake {
     /// the outcome of each, in the given order. Repeating it with the same rows adds nothing, in whatever groups.
     ///
     /// # Errors
-    /// What the store says. Tables that were committed before stay so, unseen by readers; repeating the call resumes.
+    /// Errors of the store. Tables that were committed before stay so, unseen by readers; repeating the call resumes.
     pub async fn commit_rows(&self, staged: Vec<StagedRows>) -> Result<Vec<CommitOutcome>> {
         let mut outcomes = vec![CommitOutcome::Before; staged.len()];
         let numbered = staged.into_iter().enumerate();

@@ -122,11 +122,6 @@ impl RunPart {
         }
     }
 
-    /// Common beginning of the names of files with rows of this run alone.
-    pub(crate) fn place(&self) -> String {
-        format!("{}.{}.", self.surface, self.run)
-    }
-
     /// The name of a file with these rows alone.
     pub(crate) fn file_name(&self) -> String {
         format!("{}.{}.{}{EXTENSION}", self.surface, self.run, self.derivation)

@@ -7,18 +7,20 @@ use object_store::memory::InMemory;
 
 use super::*;
 use crate::encode_run_rows;
-use crate::tables::maintenance::merge_tests::{ROWS, TABLE, column, files, open, put, seen, visible};
+use crate::tables::maintenance::merge_tests::{
+    ROWS, TABLE, list_files, made_up_column, open_lake, put_run, read_seen_rows, visible_run,
+};
 
 /// The rows of a run in three tables, its row in `runs` last.
 fn stage(lake: &Lake, snapshot: &LakeSnapshot, surface: &str, run: &str, derivation: &str, value: usize) -> RowsOfRun {
-    let pointer = visible(surface, run, derivation);
+    let pointer = visible_run(surface, run, derivation);
     let project = surface.split_once('-').map(|(project, _)| project.parse().expect("a project"));
     let defaults = &lake.config().references;
     let references = ReferenceNames { flat: defaults.flat.clone(), foam: defaults.foam.clone() };
     let group = FileGroup::new(&pointer.surface, project.as_ref(), references, defaults);
     let encode = |table: Table| {
         let schema = table.schema(lake.rig());
-        let columns = schema.fields().iter().map(|field| column(field, surface, run, value)).collect();
+        let columns = schema.fields().iter().map(|field| made_up_column(field, surface, run, value)).collect();
         let rows = RecordBatch::try_new(schema.clone(), columns).expect("rows");
         encode_run_rows(table, &schema, &[rows]).expect("encoded")
     };
@@ -47,7 +49,7 @@ async fn commit(lake: &Lake, rows: impl IntoIterator<Item = StagedRows>) -> Vec<
 
 /// A lake with these runs of one group, named by their places.
 async fn lake_of(surfaces: &[&str]) -> Lake {
-    let lake = open(&Arc::new(InMemory::new())).await;
+    let lake = open_lake(&Arc::new(InMemory::new())).await;
     lake.ensure_tables().await.expect("made");
     let snapshot = snapshot_of(&lake).await;
     let rows = surfaces
@@ -81,12 +83,12 @@ const SURFACES: [&str; 5] = ["wood", "flat", "prd", "foam", "brick"];
 #[tokio::test]
 async fn a_group_shows_the_rows_of_files_of_one_run() {
     let grouped = lake_of(&SURFACES).await;
-    let single = open(&Arc::new(InMemory::new())).await;
+    let single = open_lake(&Arc::new(InMemory::new())).await;
     single.ensure_tables().await.expect("made");
     for (number, surface) in SURFACES.iter().enumerate() {
-        put(&single, surface, &format!("r{number}"), "d1", number).await;
+        put_run(&single, surface, &format!("r{number}"), "d1", number).await;
     }
-    assert!(seen(&grouped).await == seen(&single).await, "other rows");
+    assert!(read_seen_rows(&grouped).await == read_seen_rows(&single).await, "other rows");
     // References have a file of their own, because readers of all projects see them.
     let expected = lists(&[&["r1", "r3"], &["r4", "r2", "r0"]]);
     for table in [TABLE, Table::Surfaces, Table::Runs] {
@@ -110,16 +112,16 @@ async fn a_group_shows_the_rows_of_files_of_one_run() {
 /// A process ended between the commits of two tables; the next one forms other groups.
 #[tokio::test]
 async fn rows_that_the_log_has_are_not_added_again() {
-    let lake = open(&Arc::new(InMemory::new())).await;
+    let lake = open_lake(&Arc::new(InMemory::new())).await;
     lake.ensure_tables().await.expect("made");
     let view = snapshot_of(&lake).await;
     let stage_run = |number: usize| stage(&lake, &view, SURFACES[number], &format!("r{number}"), "d1", number);
     let of_nce = [0, 2, 4].into_iter().flat_map(stage_run).filter(|rows| rows.table() == TABLE);
     assert_eq!(commit(&lake, of_nce).await, [CommitOutcome::Now; 3]);
-    let named = files(&lake).await;
+    let named = list_files(&lake).await;
     assert!(snapshot_of(&lake).await.files(TABLE).is_empty(), "nobody sees them");
     lake.remove_superseded().await.expect("cleaned up");
-    assert_eq!(files(&lake).await, named, "their author may be about to name them");
+    assert_eq!(list_files(&lake).await, named, "their author may be about to name them");
     let view = snapshot_of(&lake).await;
     let stage_run = |number: usize| stage(&lake, &view, SURFACES[number], &format!("r{number}"), "d1", number);
     let (now, before) = (CommitOutcome::Now, CommitOutcome::Before);
@@ -130,14 +132,14 @@ async fn rows_that_the_log_has_are_not_added_again() {
     // Once more, as if the last answer had been lost.
     let again = commit(&lake, [2, 3, 4].into_iter().flat_map(stage_run)).await;
     assert!(again.iter().all(|outcome| *outcome == before), "{again:?}");
-    assert_eq!(seen(&lake).await.num_rows(), 5 * ROWS);
+    assert_eq!(read_seen_rows(&lake).await.num_rows(), 5 * ROWS);
 }
 
 /// Rows that replace others are in their log, and another writer cleans up and replaces one of the runs itself.
 #[tokio::test]
 async fn a_part_waits_for_its_name_and_falls_alone() {
     let lake = lake_of(&["wood", "prd", "brick"]).await;
-    let before = seen(&lake).await;
+    let before = read_seen_rows(&lake).await;
     let view = snapshot_of(&lake).await;
     let mut staged: Vec<_> = ["wood", "prd", "brick"]
         .iter()
@@ -147,12 +149,12 @@ async fn a_part_waits_for_its_name_and_falls_alone() {
     let rows: Vec<_> = staged.extract_if(.., |rows| rows.table() == TABLE).collect();
     commit(&lake, rows).await;
     lake.remove_superseded().await.expect("cleaned up");
-    assert!(seen(&lake).await == before, "nothing is named yet");
-    assert_eq!(files(&lake).await.iter().map(|file| file.parts.len()).collect::<Vec<_>>(), [3, 3]);
+    assert!(read_seen_rows(&lake).await == before, "nothing is named yet");
+    assert_eq!(list_files(&lake).await.iter().map(|file| file.parts.len()).collect::<Vec<_>>(), [3, 3]);
     // Another writer is faster with one of them.
-    put(&lake, "prd", "r1", "d3", 99).await;
+    put_run(&lake, "prd", "r1", "d3", 99).await;
     lake.remove_superseded().await.expect("cleaned up");
-    let parts: Vec<_> = files(&lake).await.iter().map(|file| file.parts.len()).collect();
+    let parts: Vec<_> = list_files(&lake).await.iter().map(|file| file.parts.len()).collect();
     assert_eq!(parts.iter().filter(|parts| **parts == 2).count(), 2, "both files lost a part: {parts:?}");
     assert_eq!(derivations(&lake).await, ["d1", "d3", "d1"]);
     // The rows of `runs` came with one file, of which a clean-up has taken a row out: all are tried again later.
@@ -167,8 +169,12 @@ async fn a_part_waits_for_its_name_and_falls_alone() {
     assert_eq!(derivations(&lake).await, ["d2", "d3", "d2"]);
     lake.remove_superseded().await.expect("cleaned up");
     assert_eq!(derivations(&lake).await, ["d2", "d3", "d2"]);
-    assert_eq!(seen(&lake).await.num_rows(), 3 * ROWS);
-    assert_eq!(files(&lake).await.iter().map(|file| file.rows).sum::<u64>() as usize, 3 * ROWS, "nothing else is left");
+    assert_eq!(read_seen_rows(&lake).await.num_rows(), 3 * ROWS);
+    assert_eq!(
+        list_files(&lake).await.iter().map(|file| file.rows).sum::<u64>() as usize,
+        3 * ROWS,
+        "nothing else is left"
+    );
 }
 
 /// Of a group of rows of `runs`, one is overtaken, and the others are not.
@@ -176,7 +182,7 @@ async fn a_part_waits_for_its_name_and_falls_alone() {
 async fn an_overtaken_row_takes_no_other_with_it() {
     let lake = lake_of(&["wood"]).await;
     let view = snapshot_of(&lake).await;
-    put(&lake, "wood", "r0", "d3", 99).await;
+    put_run(&lake, "wood", "r0", "d3", 99).await;
     let runs = [("wood", "r0"), ("prd", "r1"), ("brick", "r2")];
     let staged = runs.iter().flat_map(|(surface, run)| stage(&lake, &view, surface, run, "d2", 7));
     let outcomes: Vec<_> = commit(&lake, staged).await.chunks(3).map(|of_run| of_run[2]).collect();
@@ -187,7 +193,7 @@ async fn an_overtaken_row_takes_no_other_with_it() {
 /// A run file that came under two names, of which one was changed.
 #[tokio::test]
 async fn a_run_that_comes_twice_in_a_group_has_one_row() {
-    let lake = open(&Arc::new(InMemory::new())).await;
+    let lake = open_lake(&Arc::new(InMemory::new())).await;
     lake.ensure_tables().await.expect("made");
     let view = snapshot_of(&lake).await;
     let runs = [("wood", "d1"), ("wood", "d1"), ("wood", "d2"), ("prd", "d1")];
@@ -198,8 +204,8 @@ async fn a_run_that_comes_twice_in_a_group_has_one_row() {
     let outcomes = commit(&lake, staged).await;
     assert_eq!(outcomes, [now, now, now, before, before, before, now, before, outdated, now, now, now]);
     assert_eq!(derivations(&lake).await, ["d1", "d1"]);
-    assert_eq!(seen(&lake).await.num_rows(), 2 * ROWS);
-    assert!(files(&lake).await.iter().all(|file| {
+    assert_eq!(read_seen_rows(&lake).await.num_rows(), 2 * ROWS);
+    assert!(list_files(&lake).await.iter().all(|file| {
         let runs: BTreeSet<_> = file.parts.iter().map(|part| &part.run).collect();
         runs.len() == file.parts.len()
     }));
@@ -228,7 +234,7 @@ async fn a_row_that_returns_is_a_new_row() {
     }
     lake.remove_superseded().await.expect("cleaned up");
     assert_eq!(derivations(&lake).await, ["d5"; 3]);
-    assert_eq!(seen(&lake).await.num_rows(), 3 * ROWS);
+    assert_eq!(read_seen_rows(&lake).await.num_rows(), 3 * ROWS);
 }
 
 #[tokio::test]
@@ -252,7 +258,7 @@ fn rows_without_lists_share_a_row_group() {
         let schema = table.schema(&rig);
         let mut encoder = FileEncoder::new(table, schema.clone());
         let one = |run: &str| {
-            let columns = schema.fields().iter().map(|field| column(field, "wood", run, 1)).collect();
+            let columns = schema.fields().iter().map(|field| made_up_column(field, "wood", run, 1)).collect();
             let batch = RecordBatch::try_new(schema.clone(), columns).expect("rows");
             encode_run_rows(table, &schema, &vec![batch; rows / ROWS]).expect("encoded")
         };

@@ -181,8 +181,8 @@ pub struct NewFile {
     pub row_counts: Option<RunRowCounts>,
 }
 
-/// The files that a new one replaces. If other files have taken their place, the new one is not added. A file of several
-/// runs in a place with a beginning stays, because it has other runs' rows: the newer row of the run counts.
+/// The files that a new one replaces. If other files have taken their place, the new one is not added. A file of
+/// several runs in a place with a beginning stays, because it has other runs' rows: the newer row of the run counts.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ReplacedFiles {
     /// Beginning of the names of all files in that place; None if the names alone are the place.

@@ -305,7 +305,7 @@ impl<'a> FileReaders<'a> {
     }
 }
 
-/// Which files are merged, and how far.
+/// The choice of files that are merged, and of the size up to which they are.
 #[derive(Debug, Clone, Copy)]
 enum MergeRule {
     /// Those of less than half of these bytes, to as many bytes at most.

@@ -31,7 +31,7 @@ use crate::contribution_objects::last_object;
 use crate::error::rebuild_hint;
 use crate::location::LakeLocation;
 use crate::remote::backoff_time;
-use crate::tables::file_name::{FileName, table_folder};
+use crate::tables::file_name::{FileName, run_prefix, table_folder};
 use crate::tables::run_parts::{decode_parts, encode_parts};
 use crate::{
     CommitEffect, CommitLog, CommitOutcome, DataFile, Error, FileHistory, FileStats, LoggedFile, NewFile,
@@ -634,7 +634,9 @@ fn known_files(table: Table, state: &TableState) -> Result<HashMap<String, Known
         let mut rows = Vec::new();
         if table == Table::Runs {
             let parts = file.decode_once(|add| data_file(table, add))?;
-            rows.extend(parts.parts.iter().filter_map(|part| Some((part.place(), part.row_version?))));
+            rows.extend(
+                parts.parts.iter().filter_map(|part| Some((run_prefix(&part.surface, &part.run), part.row_version?))),
+            );
         }
         let (log_version, seen_runs) = (number_tag(&file.add, LOG_VERSION), number_tag(&file.add, SEEN_RUNS));
         Ok::<_, Error>((file_name(path), KnownFile { log_version, seen_runs, rows }))

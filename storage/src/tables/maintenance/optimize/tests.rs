@@ -26,14 +26,14 @@ use crate::{ReferenceSurfaces, VisibleRun, encode_batches};
 pub(crate) const TABLE: Table = Table::Nce;
 pub(crate) const ROWS: usize = 20;
 
-pub(crate) async fn open(store: &Arc<InMemory>) -> Lake {
+pub(crate) async fn open_lake(store: &Arc<InMemory>) -> Lake {
     let store: Arc<dyn ObjectStore> = store.clone();
     Lake::open_or_create_in(store, "a lake under test", &Rig::paper(), &ReferenceSurfaces::default())
         .await
         .expect("a lake")
 }
 
-pub(crate) fn column(field: &Field, surface: &str, run: &str, value: usize) -> ArrayRef {
+pub(crate) fn made_up_column(field: &Field, surface: &str, run: &str, value: usize) -> ArrayRef {
     let numbers = || (0..ROWS).map(|row| (row * 1000 + value) as f32 * 0.37);
     match (field.name().as_str(), field.data_type()) {
         ("surface_id", _) => Arc::new(StringArray::from(vec![surface; ROWS])),
@@ -61,7 +61,7 @@ pub(crate) fn column(field: &Field, surface: &str, run: &str, value: usize) -> A
     }
 }
 
-pub(crate) fn visible(surface: &str, run: &str, derivation: &str) -> VisibleRun {
+pub(crate) fn visible_run(surface: &str, run: &str, derivation: &str) -> VisibleRun {
     VisibleRun {
         surface: surface.parse().expect("an id"),
         run: run.parse().expect("an id"),
@@ -72,8 +72,8 @@ pub(crate) fn visible(surface: &str, run: &str, derivation: &str) -> VisibleRun 
 }
 
 /// Adds a run's derived rows, or replaces them, and its row in `runs`.
-pub(crate) async fn put(lake: &Lake, surface: &str, run: &str, derivation: &str, value: usize) {
-    let pointer = visible(surface, run, derivation);
+pub(crate) async fn put_run(lake: &Lake, surface: &str, run: &str, derivation: &str, value: usize) {
+    let pointer = visible_run(surface, run, derivation);
     let part = FileName::Rows {
         surface: pointer.surface.clone(),
         run: pointer.run.clone(),
@@ -89,7 +89,7 @@ pub(crate) async fn put(lake: &Lake, surface: &str, run: &str, derivation: &str,
     let row = FileName::Pointer(pointer.clone());
     for (table, name) in [(TABLE, part), (Table::Surfaces, described), (Table::Runs, row)] {
         let schema = table.schema(lake.rig());
-        let columns = schema.fields().iter().map(|f| column(f, surface, run, value)).collect();
+        let columns = schema.fields().iter().map(|f| made_up_column(f, surface, run, value)).collect();
         let rows = RecordBatch::try_new(schema.clone(), columns).expect("rows");
         let file = encode_batches(table, &schema, &[rows]).expect("encoded");
         staged.push(lake.stage_file(table, &name, file).await.expect("staged"));
@@ -100,7 +100,7 @@ pub(crate) async fn put(lake: &Lake, surface: &str, run: &str, derivation: &str,
 }
 
 /// The rows that readers see, sorted by surface and run.
-pub(crate) async fn seen(lake: &Lake) -> RecordBatch {
+pub(crate) async fn read_seen_rows(lake: &Lake) -> RecordBatch {
     let snapshot = lake.snapshot().await.expect("a view");
     let mut slices: Vec<_> = snapshot.files(TABLE).iter().flat_map(|file| run_slices(file)).collect();
     slices.sort_by(|a, b| part_key(&a.part).cmp(&part_key(&b.part)));
@@ -112,7 +112,7 @@ pub(crate) async fn seen(lake: &Lake) -> RecordBatch {
     concat_batches(&TABLE.schema(lake.rig()), &batches).expect("rows of one schema")
 }
 
-pub(crate) async fn files(lake: &Lake) -> Vec<Arc<DataFile>> {
+pub(crate) async fn list_files(lake: &Lake) -> Vec<Arc<DataFile>> {
     lake.commit_log().list_files(TABLE).await.expect("a log")
 }
 
@@ -123,9 +123,9 @@ async fn optimize(lake: &Lake) -> OptimizeReport {
 /// Five runs, of surfaces and in an order that are not sorted.
 async fn five() -> (Arc<InMemory>, Lake) {
     let store = Arc::new(InMemory::new());
-    let lake = open(&store).await;
+    let lake = open_lake(&store).await;
     for (number, surface) in ["wood", "flat", "prd", "foam", "brick"].iter().enumerate() {
-        put(&lake, surface, &format!("r{number}"), "d1", number).await;
+        put_run(&lake, surface, &format!("r{number}"), "d1", number).await;
     }
     (store, lake)
 }
@@ -133,15 +133,15 @@ async fn five() -> (Arc<InMemory>, Lake) {
 #[tokio::test]
 async fn readers_see_the_same_rows_in_the_same_layout() {
     let (store, lake) = five().await;
-    let (before, singles) = (seen(&lake).await, files(&lake).await);
+    let (before, singles) = (read_seen_rows(&lake).await, list_files(&lake).await);
     let report = optimize(&lake).await;
     let merged: Vec<_> = report.tables.iter().map(|table| (table.table, table.merged, table.files)).collect();
     assert_eq!(merged, [("surfaces", 5, 1), ("runs", 5, 1), ("nce", 5, 1)]);
-    let merged = files(&lake).await;
+    let merged = list_files(&lake).await;
     assert_eq!(merged.len(), 1, "nothing else is left in the log");
     let surfaces: Vec<_> = merged[0].parts.iter().map(|p| (p.surface.as_str(), p.rows)).collect();
     assert_eq!(surfaces, ["brick", "flat", "foam", "prd", "wood"].map(|s| (s, ROWS as u64)));
-    assert!(seen(&lake).await == before, "other rows");
+    assert!(read_seen_rows(&lake).await == before, "other rows");
     assert_eq!(merged[0].stats.as_ref().expect("statistics").max["surface_id"], "wood");
 
     let layout = |bytes: bytes::Bytes| {
@@ -171,46 +171,46 @@ async fn readers_see_the_same_rows_in_the_same_layout() {
 
     // What is new is merged with what is merged.
     assert!(optimize(&lake).await.tables.is_empty());
-    put(&lake, "cube", "r9", "d1", 9).await;
-    let before = seen(&lake).await;
+    put_run(&lake, "cube", "r9", "d1", 9).await;
+    let before = read_seen_rows(&lake).await;
     optimize(&lake).await;
-    assert_eq!(files(&lake).await.len(), 1);
-    assert!(seen(&lake).await == before, "other rows");
+    assert_eq!(list_files(&lake).await.len(), 1);
+    assert!(read_seen_rows(&lake).await == before, "other rows");
 }
 
 #[tokio::test]
 async fn a_replaced_run_is_left_out_at_once_and_written_out_by_the_clean_up() {
     let (_, lake) = five().await;
     optimize(&lake).await;
-    put(&lake, "flat", "r1", "d2", 77).await;
-    let expected = seen(&lake).await;
+    put_run(&lake, "flat", "r1", "d2", 77).await;
+    let expected = read_seen_rows(&lake).await;
     assert_eq!(expected.num_rows(), 5 * ROWS);
     let logged = |files: &[Arc<DataFile>]| files.iter().map(|f| f.rows).sum::<u64>() as usize;
-    assert_eq!(logged(&files(&lake).await), 6 * ROWS, "other Delta readers still see the old rows");
+    assert_eq!(logged(&list_files(&lake).await), 6 * ROWS, "other Delta readers still see the old rows");
     lake.remove_superseded().await.expect("cleaned up");
-    assert_eq!(logged(&files(&lake).await), 5 * ROWS);
-    assert!(seen(&lake).await == expected, "other rows");
+    assert_eq!(logged(&list_files(&lake).await), 5 * ROWS);
+    assert!(read_seen_rows(&lake).await == expected, "other rows");
     optimize(&lake).await;
-    assert_eq!(files(&lake).await.len(), 1);
-    assert!(seen(&lake).await == expected, "other rows");
+    assert_eq!(list_files(&lake).await.len(), 1);
+    assert!(read_seen_rows(&lake).await == expected, "other rows");
     for (number, surface) in ["wood", "flat", "prd", "foam", "brick"].iter().enumerate() {
-        put(&lake, surface, &format!("r{number}"), "d3", number).await;
+        put_run(&lake, surface, &format!("r{number}"), "d3", number).await;
     }
     lake.remove_superseded().await.expect("cleaned up");
-    assert!(files(&lake).await.iter().all(|f| f.parts.is_empty()), "all of its parts are replaced");
+    assert!(list_files(&lake).await.iter().all(|f| f.parts.is_empty()), "all of its parts are replaced");
 }
 
 #[tokio::test]
 async fn a_merge_of_what_is_replaced_meanwhile_changes_nothing() {
     let (_, lake) = five().await;
     let planned = lake.snapshot().await.expect("a view").files(TABLE).to_vec();
-    put(&lake, "flat", "r1", "d2", 77).await;
+    put_run(&lake, "flat", "r1", "d2", 77).await;
     lake.remove_superseded().await.expect("cleaned up");
-    let (before, named) = (seen(&lake).await, files(&lake).await);
+    let (before, named) = (read_seen_rows(&lake).await, list_files(&lake).await);
     let (outcome, _) = lake.merge_files(TABLE, &planned, CommitEffect::Layout.into(), None).await.expect("no error");
     assert_eq!(outcome, CommitOutcome::Outdated);
-    assert_eq!(files(&lake).await, named);
-    assert!(seen(&lake).await == before, "other rows");
+    assert_eq!(list_files(&lake).await, named);
+    assert!(read_seen_rows(&lake).await == before, "other rows");
 }
 
 // Delta itself lets both through: their Removes change no data.
@@ -218,12 +218,12 @@ async fn a_merge_of_what_is_replaced_meanwhile_changes_nothing() {
 async fn of_two_merges_at_once_one_is_made() {
     for _ in 0..10 {
         let (store, lakes) = five().await;
-        let before = seen(&lakes).await;
+        let before = read_seen_rows(&lakes).await;
         let planned = lakes.snapshot().await.expect("a view").files(TABLE).to_vec();
         let merge = |range: std::ops::Range<usize>| {
             let (store, planned) = (store.clone(), planned.clone());
             tokio::spawn(async move {
-                let lake = open(&store).await;
+                let lake = open_lake(&store).await;
                 lake.merge_files(TABLE, &planned[range], CommitEffect::Layout.into(), None).await.expect("no error").0
             })
         };
@@ -231,8 +231,8 @@ async fn of_two_merges_at_once_one_is_made() {
         let mut outcomes = [a.expect("done"), b.expect("done")].map(|o| o == CommitOutcome::Now);
         outcomes.sort();
         assert_eq!(outcomes, [false, true]);
-        assert_eq!(files(&lakes).await.iter().map(|f| f.rows).sum::<u64>() as usize, 5 * ROWS);
-        assert!(seen(&lakes).await == before, "other rows");
+        assert_eq!(list_files(&lakes).await.iter().map(|f| f.rows).sum::<u64>() as usize, 5 * ROWS);
+        assert!(read_seen_rows(&lakes).await == before, "other rows");
     }
 }
 
@@ -241,14 +241,14 @@ async fn of_two_merges_at_once_one_is_made() {
 async fn parts_outlive_a_checkpoint() {
     let (store, first) = five().await;
     optimize(&first).await;
-    let parts = files(&first).await[0].parts.clone();
+    let parts = list_files(&first).await[0].parts.clone();
     for number in 0..100 {
-        put(&first, "cube", "r9", &format!("e{number}"), 9).await;
+        put_run(&first, "cube", "r9", &format!("e{number}"), 9).await;
     }
     let checkpoint = object_store::path::Path::from("tables/nce/_delta_log/_last_checkpoint");
     object_store::ObjectStoreExt::head(store.as_ref(), &checkpoint).await.expect("a checkpoint");
-    let anew = open(&store).await;
-    let merged: Vec<_> = files(&anew).await.into_iter().filter(|f| !f.parts.is_empty()).collect();
+    let anew = open_lake(&store).await;
+    let merged: Vec<_> = list_files(&anew).await.into_iter().filter(|f| !f.parts.is_empty()).collect();
     assert_eq!(merged.len(), 1);
     assert_eq!(merged[0].parts, parts);
 }
@@ -261,7 +261,7 @@ async fn vacuum_deletes_what_is_merged_and_nothing_that_is_named() {
         singles.extend(lake.commit_log().list_files(table).await.expect("a log"));
     }
     optimize(&lake).await;
-    let before = seen(&lake).await;
+    let before = read_seen_rows(&lake).await;
     let vacuum = |hours, deletion| {
         let lake = lake.clone();
         async move { lake.vacuum(chrono::TimeDelta::hours(hours), deletion, &mut |_, _| {}).await.expect("no error") }
@@ -274,16 +274,16 @@ async fn vacuum_deletes_what_is_merged_and_nothing_that_is_named() {
     object_store::ObjectStoreExt::head(store.as_ref(), &singles[0].path).await.expect("only told");
     assert_eq!(vacuum(0, crate::DeletionMode::Real).await.files, told.files);
     object_store::ObjectStoreExt::head(store.as_ref(), &singles[0].path).await.expect_err("deleted");
-    assert!(seen(&lake).await == before, "other rows");
+    assert!(read_seen_rows(&lake).await == before, "other rows");
     assert!(vacuum(0, crate::DeletionMode::Real).await.files.is_empty());
 }
 
 /// Runs of two projects, of references and of none.
 async fn of_projects() -> Lake {
-    let lake = open(&Arc::new(InMemory::new())).await;
+    let lake = open_lake(&Arc::new(InMemory::new())).await;
     for (number, surface) in ["flat", "foam", "a-wall", "a-hall", "b-wall", "b-hall", "old", "older"].iter().enumerate()
     {
-        put(&lake, surface, &format!("r{number}"), "d1", number).await;
+        put_run(&lake, surface, &format!("r{number}"), "d1", number).await;
     }
     lake
 }
@@ -331,7 +331,7 @@ async fn projects_are_not_merged_and_readers_see_parts_of_files_that_were() {
     let lake = of_projects().await;
     let pairs = [["r0", "r1"], ["r2", "r3"], ["r4", "r5"], ["r6", "r7"]].map(|pair| pair.map(str::to_owned));
     optimize(&lake).await;
-    let merged = files(&lake).await;
+    let merged = list_files(&lake).await;
     let mut parts: Vec<_> = merged.iter().map(|f| f.parts.iter().map(|p| p.run.to_string()).collect()).collect();
     parts.iter_mut().for_each(|runs: &mut Vec<String>| runs.sort());
     parts.sort();
@@ -343,7 +343,7 @@ async fn projects_are_not_merged_and_readers_see_parts_of_files_that_were() {
     assert_eq!((seen_runs(&reader_of(&lake, &["a"])).await.len(), whole(&reader_of(&lake, &["a"])).await), (4, 2));
     // As a version without projects merged them.
     lake.merge_files(TABLE, &merged, CommitEffect::Layout.into(), None).await.expect("merged");
-    assert_eq!(files(&lake).await.len(), 1);
+    assert_eq!(list_files(&lake).await.len(), 1);
     let reader = reader_of(&lake, &["a"]);
     assert_eq!(
         (seen_runs(&reader).await, whole(&reader).await),
@@ -382,10 +382,10 @@ async fn a_merged_row_of_a_run_keeps_its_version_and_its_newer_one_counts() {
     optimize(&lake).await;
     assert_eq!(rows_of_runs(&lake).await, before);
     assert_eq!(lake.commit_log().list_files(Table::Runs).await.expect("a log").len(), 1);
-    put(&lake, "flat", "r1", "d2", 77).await;
+    put_run(&lake, "flat", "r1", "d2", 77).await;
     let then = lake.snapshot().await.expect("a view");
-    put(&lake, "wood", "r0", "d2", 78).await;
-    put(&lake, "cube", "r9", "d1", 9).await;
+    put_run(&lake, "wood", "r0", "d2", 78).await;
+    put_run(&lake, "cube", "r9", "d1", 9).await;
     let row = |run: &str, derivation: &str, version| (run.to_owned(), derivation.to_owned(), version);
     let mut expected = before.clone();
     (expected[0], expected[1]) = (row("r0", "d2", 8), row("r1", "d2", 7));
@@ -403,7 +403,7 @@ async fn a_merged_row_of_a_run_keeps_its_version_and_its_newer_one_counts() {
     assert_eq!(only_merged(&lake, Table::Runs).await.parts.len(), 6);
     assert_eq!(rows_of_runs(&lake).await, expected);
     drop(lake);
-    assert_eq!(rows_of_runs(&open(&store).await).await, expected);
+    assert_eq!(rows_of_runs(&open_lake(&store).await).await, expected);
 }
 
 #[tokio::test]
@@ -438,12 +438,12 @@ async fn a_past_version_of_runs_is_seen_once_its_files_are_merged_and_deleted() 
     let (_, lake) = five().await;
     let version = lake.snapshot().await.expect("a view").log_version(Table::Runs).expect("a log");
     optimize(&lake).await;
-    put(&lake, "cube", "r9", "d1", 9).await;
+    put_run(&lake, "cube", "r9", "d1", 9).await;
     optimize(&lake).await;
     lake.vacuum(chrono::TimeDelta::zero(), crate::DeletionMode::Real, &mut |_, _| {}).await.expect("deleted");
     let then = lake.snapshot_at(version, Table::Runs).await.expect("held");
     assert_eq!(then.files(Table::Runs).iter().map(|file| file.visible_rows()).sum::<u64>() as usize, 5 * ROWS);
-    put(&lake, "flat", "r1", "d2", 77).await;
+    put_run(&lake, "flat", "r1", "d2", 77).await;
     optimize(&lake).await;
     lake.vacuum(chrono::TimeDelta::zero(), crate::DeletionMode::Real, &mut |_, _| {}).await.expect("deleted");
     let gone = lake.snapshot_at(version, Table::Runs).await;
@@ -470,9 +470,9 @@ async fn a_surface_that_two_projects_measured_is_described_to_both() {
     optimize(&lake).await;
     check([&["r0", "r1", "r2", "r3"], &["r0", "r1", "r4", "r5"], &all]).await;
     // Project b measures one of project a's surfaces, and a row of the same merged file is superseded.
-    put(&lake, "a-wall", "r8-b", "d1", 8).await;
-    put(&lake, "a-hall", "r9", "d1", 9).await;
-    put(&lake, "a-hall", "r3", "d2", 3).await;
+    put_run(&lake, "a-wall", "r8-b", "d1", 8).await;
+    put_run(&lake, "a-hall", "r9", "d1", 9).await;
+    put_run(&lake, "a-hall", "r3", "d2", 3).await;
     let expected: [&[&str]; 3] = [
         &["r0", "r1", "r2", "r9"],
         &["r0", "r1", "r4", "r5", "r8-b"],
@@ -500,7 +500,7 @@ async fn projects_have_rows_of_runs_of_their_own() {
 async fn references_are_seen_in_a_file_that_was_merged_before_there_were_projects() {
     let (_, lake) = five().await;
     optimize(&lake).await;
-    put(&lake, "a-wall", "r5", "d1", 5).await;
+    put_run(&lake, "a-wall", "r5", "d1", 5).await;
     let reader = reader_of(&lake, &["a"]);
     let runs: Vec<_> = rows_of_runs(&reader).await.into_iter().map(|(run, _, version)| (run, version)).collect();
     assert_eq!(runs, [("r1".to_owned(), 2), ("r3".to_owned(), 4), ("r5".to_owned(), 7)]);
@@ -509,7 +509,7 @@ async fn references_are_seen_in_a_file_that_was_merged_before_there_were_project
     let snapshot = reader.snapshot().await.expect("a view");
     let partly: Vec<_> = snapshot.files(Table::Runs).iter().filter(|file| !file.hidden.is_empty()).collect();
     assert_eq!((partly.len(), partly[0].visible_parts().count(), partly[0].parts.len()), (1, 2, 5));
-    put(&lake, "cube", "r6", "d1", 6).await;
+    put_run(&lake, "cube", "r6", "d1", 6).await;
     optimize(&lake).await;
     assert_eq!((rows_of_runs(&lake).await.len(), rows_of_runs(&reader).await.len()), (7, 3));
 }
@@ -518,7 +518,7 @@ async fn references_are_seen_in_a_file_that_was_merged_before_there_were_project
 async fn whoever_looks_while_runs_come_sees_all_rows_of_each() {
     const RUNS: usize = 30;
     let store = Arc::new(InMemory::new());
-    let lake = open(&store).await;
+    let lake = open_lake(&store).await;
     // Requests that are made at once are answered in any order.
     let config = ThrottleConfig { wait_get_per_call: Duration::from_millis(1), ..ThrottleConfig::default() };
     let slow: Arc<dyn ObjectStore> = Arc::new(ThrottledStore::new(store, config));
@@ -529,7 +529,7 @@ async fn whoever_looks_while_runs_come_sees_all_rows_of_each() {
     let writing = tokio::spawn(async move {
         for number in 0..RUNS {
             let before = seen_looks.load(Ordering::SeqCst);
-            put(&lake, "wood", &format!("r{number}"), "d1", number).await;
+            put_run(&lake, "wood", &format!("r{number}"), "d1", number).await;
             // A look at a lake whose other tables lack rows is repeated while runs come.
             while seen_looks.load(Ordering::SeqCst) == before {
                 tokio::time::sleep(Duration::from_millis(1)).await;
