@@ -111,6 +111,15 @@ async fn files_of_single_runs_are_merged_once_there_are_enough() {
     let at_once = with_inbox(&runs).await;
     ingest_pending(at_once.clone()).await.expect("ingested");
     let expected = read_rows(at_once).await;
+    // The files of the references and of fourteen runs are too few to be written again.
+    let two_groups = with_inbox(&runs[..16]).await;
+    ingest_pending(two_groups.clone()).await.expect("ingested");
+    let lake = open_lake(two_groups).await.expect("a lake");
+    for table in run_tables() {
+        let files = seen_files(&lake, table).await;
+        let parts: BTreeSet<_> = files.iter().map(|file| file.parts.len()).collect();
+        assert_eq!((files.len(), parts), (2, BTreeSet::from([2, 14])), "{}", table.name());
+    }
     let grown = with_inbox(&runs[..2]).await;
     ingest_pending(grown.clone()).await.expect("ingested");
     let lake = open_lake(grown.clone()).await.expect("a lake");

@@ -24,6 +24,8 @@ use crate::{
 
 /// Default size that files are merged to: few enough for a million responses, small enough to be held in memory.
 pub const TARGET_BYTES: u64 = 128 << 20;
+/// Files that a merge by runs replaces, at least: to replace a large one and few small ones costs more than they do.
+const LEAST_MERGED_FILES: usize = 4;
 /// Hex digits that a name keeps of its digest.
 const DIGEST_DIGITS: usize = 16;
 
@@ -132,8 +134,8 @@ impl Lake {
         Ok(report)
     }
 
-    /// Merges files of fewer than so many runs, wherever there are enough of them for a file of as many: a lake that
-    /// grows by a run at a time has as few files as one that grows by groups. Returns the number of files that went.
+    /// Merges files of fewer than so many runs, wherever four or more have as many runs together: a lake that grows by
+    /// a run at a time has as few files as one that grows by groups. Returns the number of files that went.
     ///
     /// # Errors
     /// [`Error::DataFile`], or what the store says. What was merged before stays so.
@@ -326,16 +328,20 @@ impl MergeRule {
     fn is_full(self, group: &[Arc<DataFile>], next: &DataFile) -> bool {
         match self {
             Self::Bytes(target) => group.iter().map(|file| file.bytes).sum::<u64>() + next.bytes > target,
-            Self::Runs(_) => self.is_worthwhile(group),
+            Self::Runs(runs) => has_runs(group, runs),
         }
     }
 
     fn is_worthwhile(self, group: &[Arc<DataFile>]) -> bool {
         match self {
             Self::Bytes(_) => group.len() > 1,
-            Self::Runs(runs) => group.iter().map(|file| run_count(file)).sum::<usize>() >= runs,
+            Self::Runs(runs) => group.len() >= LEAST_MERGED_FILES && has_runs(group, runs),
         }
     }
+}
+
+fn has_runs(group: &[Arc<DataFile>], runs: usize) -> bool {
+    group.iter().map(|file| run_count(file)).sum::<usize>() >= runs
 }
 
 fn run_count(file: &DataFile) -> usize {
