@@ -89,6 +89,13 @@ pub struct EncodedFile {
     pub(crate) rows: u64,
 }
 
+impl EncodedFile {
+    /// Its bytes, in order.
+    pub fn blocks(&self) -> &[Bytes] {
+        &self.blocks
+    }
+}
+
 impl EncodedRows {
     /// Number of rows.
     pub(crate) fn row_count(&self) -> u64 {

@@ -10,6 +10,7 @@ mod queries;
 mod readers;
 mod report;
 mod scale;
+mod served_costs;
 mod slices;
 mod whole;
 

@@ -18,6 +18,7 @@ use super::queries::{QueryBenchArgs, measure_queries};
 use super::readers::{QuestionKind, ReadersArgs, measure_readers};
 use super::report::{BenchReport, FigureGoal};
 use super::scale::{ScaleBenchArgs, measure_scale};
+use super::served_costs::{measure_full_stores, measure_pair_pages};
 use crate::serve::server::ServedLake;
 use crate::{block_on, echolake_path};
 
@@ -113,6 +114,7 @@ fn measure_lake_queries(args: &WholeBenchArgs, folder: &Path, report: &mut Bench
         threads: std::thread::available_parallelism().map_or(1, usize::from),
         only: String::new(),
         explain: false,
+        folder: Some(folder.to_owned()),
     };
     block_on(measure_queries(&queries, report))
 }
@@ -129,9 +131,14 @@ fn measure_lake_readers(args: &WholeBenchArgs, folder: &Path, report: &mut Bench
         pid: Some(served.id()),
         is_ingesting,
     };
-    for readers in [10, 200] {
-        measure_readers(&load(readers, false), report)?;
-    }
+    block_on(async {
+        let lake = Lake::open(&folder.join("lake").display().to_string()).await?;
+        measure_pair_pages(&served, &lake, args.seed, report).await?;
+        for readers in [10, 200] {
+            measure_readers(&load(readers, false), report)?;
+        }
+        measure_full_stores(&served, &lake, report)
+    })?;
     let again = SimulationOrder {
         count: if args.quick { 3 } else { 20 },
         keep: RecordingMode::ResponsesOnly,

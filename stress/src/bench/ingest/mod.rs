@@ -53,7 +53,7 @@ impl IngestBenchArgs {
     }
 
     fn runs(&self) -> usize {
-        self.runs.unwrap_or(if self.quick { 4 } else { 6 }).max(REFERENCES + 1)
+        self.runs.unwrap_or(if self.quick { 4 } else { 12 }).max(REFERENCES + 1)
     }
 
     fn repeats(&self) -> usize {

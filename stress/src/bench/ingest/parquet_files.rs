@@ -1,10 +1,12 @@
 //! The lake's Parquet files by themselves: their rows read back, and written again by the parquet crate alone.
 
+use anyhow::ensure;
 use arrow::array::RecordBatchReader as _;
 use arrow::datatypes::SchemaRef;
 use arrow::record_batch::RecordBatch;
 use bytes::Bytes;
 use echolake_lake::{FileName, Lake, VisibleRun};
+use echolake_schema::SurfaceId;
 use echolake_schema::tables::{Source, Table};
 use object_store::ObjectStoreExt as _;
 use parquet::arrow::ArrowWriter;
@@ -24,7 +26,7 @@ const BATCH_ROWS: usize = 512;
 /// A file that ingest wrote.
 pub(crate) struct StoredTableFile {
     pub table: Table,
-    /// It is of a reference's run.
+    /// It is of references' runs.
     pub of_reference: bool,
     pub bytes: Bytes,
 }
@@ -60,12 +62,13 @@ pub(crate) async fn read_table_files(lake: &Lake) -> anyhow::Result<Vec<StoredTa
     for table in Table::ALL.into_iter().filter(|t| t.source() != Source::Rig) {
         for file in snapshot.files(table) {
             let references = &lake.config().references;
-            let of_reference = match FileName::parse(&file.path) {
-                Some(FileName::Rows { surface, .. } | FileName::Pointer(VisibleRun { surface, .. })) => {
-                    surface == references.flat || surface == references.foam
-                }
-                _ => false,
+            let surfaces = match FileName::parse(&file.path) {
+                Some(FileName::Rows { surface, .. } | FileName::Pointer(VisibleRun { surface, .. })) => vec![surface],
+                _ => file.visible_parts().map(|(part, _)| part.surface.clone()).collect(),
             };
+            let is_reference = |surface: &SurfaceId| [&references.flat, &references.foam].contains(&surface);
+            let of_reference = surfaces.iter().any(is_reference);
+            ensure!(surfaces.iter().all(is_reference) == of_reference, "`{}` has references and others", file.path);
             let bytes = lake.store().get(&file.path).await?.bytes().await?;
             found.push(StoredTableFile { table, of_reference, bytes });
         }

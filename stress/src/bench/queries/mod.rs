@@ -1,9 +1,11 @@
 //! Queries beside DuckDB on the same Parquet files in the same run, warm, the median of times in turns: twelve of the
-//! lake's readers, joins of the air to the takes by time, and generated ones.
+//! lake's readers, joins of the air to the takes by time, and generated ones. The twelve are measured once more beside
+//! DuckDB on files of one run each, as files were before runs shared them.
 //!
 //! The Python of `--python` has the packages duckdb and pyarrow. The engines take turns, so that other programs disturb
 //! both alike. Answers are compared value by value.
 
+mod run_files;
 mod twelve;
 
 use std::collections::BTreeMap;
@@ -22,6 +24,8 @@ use twelve::{BenchQuery, TIME_JOIN, TWELVE, time_joins};
 
 pub(crate) use twelve::bench_queries;
 
+/// The one of the twelve that is measured as a first query, too.
+const COLD_QUERY: &str = "by_incidence";
 /// Slow generated queries that are reported by themselves.
 const SHOWN_SLOW: usize = 8;
 
@@ -51,6 +55,9 @@ pub(crate) struct QueryBenchArgs {
     /// Shows texts and plans with their metrics instead.
     #[arg(long)]
     pub explain: bool,
+    /// Parent of the temporary folder, for copies of the lake's tables.
+    #[arg(long, value_name = "DIR")]
+    pub folder: Option<PathBuf>,
 }
 
 /// A query's times, s.
@@ -95,15 +102,14 @@ pub(crate) async fn measure_queries(args: &QueryBenchArgs, report: &mut BenchRep
         }
         None => None,
     };
-    let mut times = Vec::new();
-    for query in queries {
-        let name = format!("{}: {}", query.name, query.sql);
-        match compare_engines(&session, peer.as_mut(), query, args.runs, report).await {
-            Ok(measured) => times.push(measured),
-            Err(why) => report.fail(format!("{name}: {why:#}")),
-        }
-    }
+    let cold = match queries.iter().find(|query| query.name == COLD_QUERY) {
+        Some(query) => Some(time_cold_query(args, query, peer.as_mut()).await?),
+        None => None,
+    };
+    let of_run_files: Vec<_> = queries.iter().filter(|query| query.kind == TWELVE).cloned().collect();
+    let mut times = time_queries(&session, peer.as_mut(), queries, args.runs, report).await;
     let version = peer.as_ref().map_or(String::new(), |peer| format!("DuckDB {}", peer.version));
+    drop(peer);
     let twelve: Vec<_> = times.extract_if(.., |t| t.query.kind == TWELVE).collect();
     if !twelve.is_empty() {
         report.group("Twelve queries");
@@ -111,6 +117,21 @@ pub(crate) async fn measure_queries(args: &QueryBenchArgs, report: &mut BenchRep
         for times in &twelve {
             report_times(format!("{}, {} rows", times.query.name, times.rows), times, &version, report);
         }
+        if let Some(times) = &cold {
+            let name = format!("{COLD_QUERY} as the first query: the lake is opened, nothing is decoded or planned");
+            report_times(name, times, &version, report);
+        }
+    }
+    if let Some(python) = args.python.as_ref().filter(|_| !of_run_files.is_empty()) {
+        let folder = super::temporary_folder(args.folder.as_deref())?;
+        let files = run_files::write_run_files(&lake, folder.path()).await?;
+        let mut peer =
+            DuckdbPeer::start(python, &PeerTables { files, threads: args.threads, ..PeerTables::default() })?;
+        let times = time_queries(&session, Some(&mut peer), of_run_files, args.runs, report).await;
+        report.note("Last: the same queries, and the lake as it is, beside DuckDB on copies of one file for each run.");
+        let of_peer = geometric_mean(times.iter().filter_map(QueryTimes::ratio));
+        let name = "the twelve queries, geometric mean of DuckDB's time on one file per run";
+        report.figure(name, of_peer, "x").goal(FigureGoal::AtMost(0.3));
     }
     let joins: Vec<_> = times.extract_if(.., |t| t.query.kind == TIME_JOIN).collect();
     if !joins.is_empty() {
@@ -172,6 +193,39 @@ fn report_ratios(name: &str, times: &[QueryTimes], [mean, most]: [f64; 2], repor
 fn geometric_mean(values: impl Iterator<Item = f64>) -> f64 {
     let logs: Vec<_> = values.map(f64::ln).collect();
     (logs.iter().sum::<f64>() / logs.len() as f64).exp()
+}
+
+// Once. Files are in the system's cache, if the lake was just made.
+async fn time_cold_query(
+    args: &QueryBenchArgs,
+    query: &BenchQuery,
+    peer: Option<&mut DuckdbPeer>,
+) -> Result<QueryTimes> {
+    let start = Instant::now();
+    let session = Session::new(&Lake::open(&args.lake).await?)?;
+    let answer = collect_batches(&session, &query.sql).await?;
+    let own = start.elapsed().as_secs_f64();
+    let peer = peer.map(|peer| peer.time_query(&query.sql)).transpose()?;
+    Ok(QueryTimes { query: query.clone(), own, peer, rows: answer.iter().map(RecordBatch::num_rows).sum() })
+}
+
+// The times of those queries that both engines answered; others are failures of the report.
+async fn time_queries(
+    session: &Session,
+    mut peer: Option<&mut DuckdbPeer>,
+    queries: Vec<BenchQuery>,
+    runs: usize,
+    report: &mut BenchReport,
+) -> Vec<QueryTimes> {
+    let mut times = Vec::new();
+    for query in queries {
+        let name = format!("{}: {}", query.name, query.sql);
+        match compare_engines(session, peer.as_deref_mut(), query, runs, report).await {
+            Ok(measured) => times.push(measured),
+            Err(why) => report.fail(format!("{name}: {why:#}")),
+        }
+    }
+    times
 }
 
 // One untimed run of each, whose answers are compared, then in turns.

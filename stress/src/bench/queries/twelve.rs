@@ -2,6 +2,7 @@
 //! echolake has.
 
 /// One query of the benchmark.
+#[derive(Clone)]
 pub(crate) struct BenchQuery {
     /// Short name.
     pub name: String,
