@@ -401,6 +401,13 @@ async fn aggregates_of_moved_rows_are_those_of_measured_ones() {
         let plan = check_query(&engine, &lookups, &sql).await;
         assert!(plan.contains("/tnce/") && !plan.contains("/tnce_d4/"), "{sql}: {plan}");
     }
+    for sql in [
+        "select foam_version, swapped, count(*), max(tnce_total) from tnce_d4 where tnce_total > 0.3 group by 1, 2",
+        "select count(distinct flat_version) from tnce_d4",
+    ] {
+        let plan = check_query(&engine, &lookups, sql).await;
+        assert!(plan.contains("/tnce/") && !plan.contains("/tnce_d4/"), "{sql}: {plan}");
+    }
     // A table without some of the rows is read itself, and so is one whose rows are wanted.
     for sql in ["select symmetry, surface_id, pair_id from tnce_d4 where pair_id = 31", "select count(*) from tnce_d4"]
     {

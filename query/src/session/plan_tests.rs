@@ -135,7 +135,7 @@ async fn reject(lake: &Lake, id: &str, run: &str, pairs: Option<Vec<u32>>, value
 }
 
 /// Queries with every kind of node and function that statements of clients have.
-const QUERIES: [&str; 36] = [
+const QUERIES: [&str; 37] = [
     "select count(*) from pairs",
     "select min(pair_id), max(direct_mm), sum(pair_id), avg(direct_mm) from pairs where incidence_deg < 30",
     "select microphone, count(*) as n, sum(direct_mm) as d from pairs group by microphone having count(*) > 5",
@@ -157,6 +157,7 @@ const QUERIES: [&str; 36] = [
     "select m.pair_id, p.incidence_deg from measurements m join pairs p using (pair_id)",
     "select surface_id, pair_id, ir[1], list_energy(ir) from measurements where pair_id > 1",
     "select surface_id, avg_list(reflected_ir) from nce group by surface_id",
+    "select pair_id, sum(x * x), count(*) from (select pair_id, unnest(ir) as x from measurements) v group by pair_id",
     "select surface_id, run_id, pair_id, incidence_deg from ir where pair_id = 1",
     "select ir from ir order by surface_id, pair_id limit 1",
     "select count(*) from augmented where symmetry = 'rot90'",
@@ -201,6 +202,27 @@ async fn plans_run_on_another_engine_of_the_lake() {
     }
     let pairs = check_sent(&before, &after, "select surface_id, pair_id from ir").await;
     assert_eq!(pairs, ["0001_0 | 0", "0001_0 | 2", "flat | 0"]);
+}
+
+// Whichever partition reads them. What depends on the order of rows keeps it.
+#[tokio::test(flavor = "multi_thread")]
+async fn values_of_lists_are_aggregated_by_all_partitions() {
+    let (_folder, lake) = measured_lake().await;
+    let engine = QueryEngine::new(&lake, None).expect("an engine");
+    let shared = "UnnestExec | RepartitionExec: partitioning=RoundRobinBatch";
+    for (values, is_shared) in [("sum(x * x), count(*)", true), ("max(x)", true), ("array_agg(x)", false)] {
+        let sql = format!(
+            "select pair_id, {values} from (select pair_id, unnest(ir) as x from measurements) v group by pair_id"
+        );
+        let (_, plan) = physical_plan(&engine, &sql).await.expect("planned");
+        let node_texts = |plan: &Arc<dyn ExecutionPlan>| {
+            let text = displayable(plan.as_ref()).indent(false).to_string();
+            text.lines().map(str::trim).collect::<Vec<_>>().join(" | ")
+        };
+        assert!(!node_texts(&plan).contains(shared), "{}", node_texts(&plan));
+        let local = engine.rewrite_local_scans(plan).expect("rewritten");
+        assert_eq!(node_texts(&local).contains(shared), is_shared, "{}", node_texts(&local));
+    }
 }
 
 // However large its files are: a range of a file may be read by another process, which does not hold it.

@@ -69,7 +69,8 @@ struct PartitionRows {
     placed: Option<WantedColumns>,
     /// All of them.
     read_schema: SchemaRef,
-    /// The filters that nobody above applies, in their order: what the first leaves out, no other one sees.
+    /// The filters that nobody above applies, in their order but for comparisons of numbers, which are first: they are
+    /// fast. What the first leaves out, no other one sees.
     filters: Vec<Arc<dyn PhysicalExpr>>,
     projector: Projector,
     schema: SchemaRef,
@@ -102,7 +103,9 @@ impl HeldScan {
         };
         let is_filtered = source.table_parquet_options().global.pushdown_filters;
         let predicate = source.filter().filter(|_| is_filtered);
-        let filters: Vec<_> = predicate.iter().flat_map(|predicate| split_conjunction(predicate)).cloned().collect();
+        let mut filters: Vec<_> =
+            predicate.iter().flat_map(|predicate| split_conjunction(predicate)).cloned().collect();
+        filters.sort_by_key(|filter| !compares_numbers(filter, schema));
         let filtered = places_of(filters.iter().cloned(), schema)?;
         let needed = places_of(filters.iter().cloned().chain(projection.expr_iter()), schema)?;
         let is_list = |place: &usize| schema.field(*place).data_type().is_nested();
@@ -155,6 +158,17 @@ fn selects_groups(filter: &Arc<dyn PhysicalExpr>, schema: &SchemaRef, bounds: &[
         !is_bound(part) && !collect_columns(part).iter().all(|column| is_measured(column.name()))
     };
     split_conjunction(filter).into_iter().any(selects)
+}
+
+// Whether a filter compares a column of numbers with a number, which cannot fail.
+fn compares_numbers(filter: &Arc<dyn PhysicalExpr>, schema: &SchemaRef) -> bool {
+    filter.downcast_ref::<BinaryExpr>().is_some_and(|binary| {
+        let column = binary.left().downcast_ref::<Column>();
+        let kind = column.and_then(|column| schema.field_with_name(column.name()).ok()).map(|field| field.data_type());
+        let is_comparison =
+            matches!(binary.op(), Operator::Eq | Operator::Lt | Operator::LtEq | Operator::Gt | Operator::GtEq);
+        is_comparison && kind.is_some_and(DataType::is_numeric) && binary.right().is::<Literal>()
+    })
 }
 
 // The places of the columns that expressions need, in order.

@@ -11,7 +11,9 @@
 //!   thousand rows that takes longer than reading them. The filters stand above the scan, too;
 //! - another scan for the first rows of an order reads the order's first column alone of most rows ([`LeadingFilter`]). It
 //!   skips row groups by their statistics, too, but few: each has rows of many surfaces, and so nearly all values;
-//! - other scans read through this process' cache and its footers, also those of a plan that came over the wire.
+//! - other scans read through this process' cache and its footers, also those of a plan that came over the wire;
+//! - values of lists that are aggregated are taken from the lists by all partitions: the lists of a run are read by one of
+//!   them, and their values are some hundred times as many rows.
 //!
 //! The plan's nodes keep their partitions, orders, statistics and rows, so that nodes above need not be planned again.
 
@@ -20,8 +22,8 @@ use std::sync::Arc;
 use datafusion::datasource::physical_plan::{FileScanConfig, FileScanConfigBuilder, FileSource, ParquetSource};
 use datafusion::datasource::source::{DataSource, DataSourceExec};
 use datafusion::error::Result;
-use datafusion::physical_expr::PhysicalExpr;
-use datafusion::physical_plan::ExecutionPlan;
+use datafusion::physical_expr::aggregate::AggregateFunctionExpr;
+use datafusion::physical_expr::{Partitioning, PhysicalExpr};
 use datafusion::physical_plan::aggregates::AggregateExec;
 use datafusion::physical_plan::execution_plan::{ChildrenPropertiesMode, ReplaceChildrenOptions};
 use datafusion::physical_plan::filter::FilterExec;
@@ -29,6 +31,8 @@ use datafusion::physical_plan::projection::ProjectionExec;
 use datafusion::physical_plan::repartition::RepartitionExec;
 use datafusion::physical_plan::sorts::sort::SortExec;
 use datafusion::physical_plan::union::UnionExec;
+use datafusion::physical_plan::unnest::UnnestExec;
+use datafusion::physical_plan::{ExecutionPlan, ExecutionPlanProperties as _, InputOrderMode};
 
 use crate::held_scan::HeldScan;
 use crate::lake_table::FileReaders;
@@ -36,6 +40,9 @@ use crate::leading_filter::LeadingFilter;
 
 /// Rows below which a file without wanted lists is read as a whole, whatever filters there are.
 const SMALL_FILE_ROWS: usize = 65_536;
+
+/// Aggregate functions that give the same whatever the order of their rows, the last digits of sums apart.
+const UNORDERED: [&str; 5] = ["avg", "count", "max", "min", "sum"];
 
 /// Replaces scans of the lake's files by what this process holds of them. No plan crosses the wire after it.
 ///
@@ -49,6 +56,8 @@ pub fn rewrite_local_scans(plan: Arc<dyn ExecutionPlan>, readers: &FileReaders) 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum WantedRows {
     All,
+    /// All, in any order.
+    Unordered,
     /// The first ones of an order.
     First,
 }
@@ -57,6 +66,12 @@ impl WantedRows {
     fn of_children(self, plan: &dyn ExecutionPlan) -> Self {
         if let Some(sort) = plan.downcast_ref::<SortExec>() {
             return if sort.fetch().is_some() { Self::First } else { Self::All };
+        }
+        if let Some(aggregate) = plan.downcast_ref::<AggregateExec>() {
+            let is_insensitive = |call: &Arc<AggregateFunctionExpr>| UNORDERED.contains(&call.fun().name());
+            let is_unordered = *aggregate.input_order_mode() == InputOrderMode::Linear;
+            let keeps_all = is_unordered && aggregate.aggr_expr().iter().all(is_insensitive);
+            return if keeps_all { Self::Unordered } else { Self::All };
         }
         let keeps_rows = plan.is::<FilterExec>()
             || plan.is::<ProjectionExec>()
@@ -78,9 +93,22 @@ fn rewrite_node(
         let local = scan.map_or(Ok(None), |scan| local_scan(scan.data_source(), readers, wanted, bounds));
         return Ok(local?.unwrap_or(plan));
     }
+    let is_shared = wanted == WantedRows::Unordered && plan.is::<UnnestExec>();
     let wanted = wanted.of_children(plan.as_ref());
     bounds.extend(produced_bounds(plan.as_ref()));
-    rewrite_children(plan, &mut |child| rewrite_node(child, readers, wanted, bounds))
+    rewrite_children(plan, &mut |child| {
+        let local = rewrite_node(child, readers, wanted, bounds)?;
+        if is_shared { share_batches(local) } else { Ok(local) }
+    })
+}
+
+// Hands batches to all partitions in turn, whichever of them read them.
+fn share_batches(plan: Arc<dyn ExecutionPlan>) -> Result<Arc<dyn ExecutionPlan>> {
+    let partitions = plan.output_partitioning().partition_count();
+    if partitions < 2 || plan.output_ordering().is_some() || !plan.is::<DataSourceExec>() {
+        return Ok(plan);
+    }
+    Ok(Arc::new(RepartitionExec::try_new(plan, Partitioning::RoundRobinBatch(partitions))?))
 }
 
 /// Rewrites the inputs of a planned node. The node keeps its properties, and what it shares with nodes below, as the

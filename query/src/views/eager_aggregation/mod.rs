@@ -143,7 +143,7 @@ impl KeyDimension {
     fn from_column(name: &str) -> Option<Self> {
         const FEW: [&str; 5] = ["attempt", "level", "source", "swapped", "verdict"];
         match name {
-            "surface_id" | "run_id" => Some(Self::Run),
+            "surface_id" | "run_id" | "flat_version" | "foam_version" => Some(Self::Run),
             "pair_id" | "microphone" | "speaker" => Some(Self::Pair),
             "d4_pair_id" | "d4_microphone" | "d4_speaker" => Some(Self::MovedPair),
             "symmetry" => Some(Self::Symmetry),
