@@ -493,14 +493,23 @@ mod slow {
         };
         let first = ask("accept", "*/*");
         let etag = first.header("etag").expect("a tag").to_owned();
+        // The engine of statements describes a run, whose file it reads.
+        let run = place.sql("select run_id from runs limit 1")[0]["run_id"].as_str().expect("a run").to_owned();
+        let ask_run = |known: &str| {
+            let request = HttpRequest::get(&format!("/api/v1/runs/{run}")).with("authorization", &token);
+            request.with("if-none-match", known).send(&server)
+        };
+        let described = ask_run("\"none\"");
         server.signal_engines(Signal::STOP);
         let again = ask("accept", "*/*");
+        let described_again = ask_run("\"none\"");
         let unchanged = ask("if-none-match", &etag).status;
         let failed = ask("if-match", "\"other\"").status;
         let unknown = get(&server, "/api/v1/surfaces?limit=2").status;
         let wrong = HttpRequest::get("/api/v1/surfaces?limit=2").with("authorization", "Bearer x").send(&server).status;
         server.signal_engines(Signal::CONT);
         assert_eq!((again.status, &again.body, again.header("etag")), (200, &first.body, Some(&*etag)));
+        assert_eq!((described_again.status, &described_again.body), (200, &described.body));
         assert_eq!((unchanged, failed, unknown, wrong), (304, 412, 401, 401));
         assert_eq!(first.header("echolake-lasting-version"), None, "that is for the door");
         // The same address in another form, and what was refused, are answered by the engine.
@@ -509,6 +518,8 @@ mod slow {
         place.ok(&["ingest"]);
         let after = ask("if-none-match", &etag);
         assert_eq!((after.status, json(&after)["total"].as_u64()), (200, Some(4)));
+        let of_run = described.header("etag").expect("a tag");
+        assert_eq!(ask_run(of_run).status, 304, "another run does not change what a run is");
         std::fs::write(place.path("tokens.toml"), "").expect("written");
         crate::serve::wait_until("its token is gone", || ask("accept", "*/*").status == 401);
     }

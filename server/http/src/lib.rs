@@ -169,6 +169,14 @@ pub fn engine_role(method: &Method, path: &str) -> EngineRole {
     }
 }
 
+/// Returns whether the answer to a request, by its method and path alone, may be given to others with the same rights.
+///
+/// That is what the engine of pages answers, and the description of a run. Others are large, or statements.
+pub fn is_shared_answer(method: &Method, path: &str) -> bool {
+    engine_role(method, path) == EngineRole::Pages
+        || (*method == Method::GET && catalogue::described_run(path).is_some())
+}
+
 fn with_protocol(protocol: ServerProtocol, routes: Router) -> Router {
     routes.layer(from_fn_with_state(protocol, request_protocol::set_protocol))
 }

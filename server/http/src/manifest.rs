@@ -88,7 +88,8 @@ async fn files(
     let view = catalogue.current_view().await?;
     let origin = server_origin(&headers);
     // The answer has the tables that were asked for, and the server's address as this client knows it.
-    let etag = view.answer_etag(AnswerContents::Contributions, &format!("{origin} files {:?}", query.table));
+    let version = view.content_version(AnswerContents::Contributions);
+    let etag = view.answer_etag(&version, &format!("{origin} files {:?}", query.table));
     let validators = [
         (header::ETAG, etag.as_str()),
         (header::CACHE_CONTROL, "private, no-cache"),
@@ -107,7 +108,6 @@ async fn files(
         snapshot.readable_files(*table).filter_map(move |file| ManifestFile::from_data_file(origin, *table, file))
     });
     let rows_elsewhere = all.iter().filter_map(|table| RowsElsewhere::from_snapshot(snapshot, *table)).collect();
-    let version = view.content_version(AnswerContents::Contributions);
     let manifest = FileManifest { version: &version, files: files.collect(), rows_elsewhere };
     Ok((validators, axum::Json(manifest)).into_response())
 }

@@ -111,8 +111,12 @@ pub(super) fn file_routes() -> OpenApiRouter {
 /// Returns whether the endpoint of a path reads a run's file: its mesh, or its contents.
 pub(super) fn reads_run_file(path: &str) -> bool {
     let of_surface = path.starts_with("/api/v1/surfaces/") && path.ends_with("/mesh.glb");
-    let of_run = path.strip_prefix("/api/v1/runs/").is_some_and(|run| !run.is_empty() && !run.contains('/'));
-    of_surface || of_run
+    of_surface || described_run(path).is_some()
+}
+
+/// Returns the run that the endpoint of a path describes, if it describes one.
+pub(super) fn described_run(path: &str) -> Option<&str> {
+    path.strip_prefix("/api/v1/runs/").filter(|run| !run.is_empty() && !run.contains('/'))
 }
 
 /// State shared by the endpoints.
@@ -199,7 +203,9 @@ async fn answer_validated(
     let as_gzip = format::accepts_encoding(&headers, "gzip");
     // What the client may do is in the lake's answer.
     let may_annotate = catalogue.service().has_scope(TokenScope::Annotate);
-    let etag = view.answer_etag(contents, &format!("{address} {as_arrow} {as_gzip} {may_annotate}"));
+    let version = described_run(request.uri().path()).and_then(|run| view.run_version(run));
+    let version = version.unwrap_or_else(|| view.content_version(contents));
+    let etag = view.answer_etag(&version, &format!("{address} {as_arrow} {as_gzip} {may_annotate}"));
     let lasting = || view.lasting_version().map(|version| (LASTING_VERSION, HeaderValue::from(version)));
     let outcome = ConditionOutcome::new(&headers, &etag);
     let instead = || {

@@ -21,7 +21,9 @@ use axum::extract::{Request, State};
 use axum::http::{HeaderMap, HeaderValue, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse as _, Response};
-use echolake_http::{FORWARDED_PROTO, ProblemResponse, RequestSite, SLICED_RUNS, engine_role, request_site};
+use echolake_http::{
+    FORWARDED_PROTO, ProblemResponse, RequestSite, SLICED_RUNS, engine_role, is_shared_answer, request_site,
+};
 use echolake_service::request_span::{REQUEST_ID, begin_request};
 use echolake_service::{ClientIdentity, EngineRole, FaultCode, RequestFault, ServerProtocol};
 use hyper::body::Incoming;
@@ -155,7 +157,7 @@ impl ServerDoor {
         let path = request.uri().path().to_owned();
         let method = request.method().clone();
         let role = engine_role(&method, &path);
-        let key = AnswerKey::from_request(&client, &request).filter(|_| role == EngineRole::Pages);
+        let key = AnswerKey::from_request(&client, &request).filter(|_| is_shared_answer(&method, &path));
         let mut response = self.answer_or_forward(role, &client, request, key, &work).await?;
         let runs = response.headers_mut().remove(SLICED_RUNS);
         if !self.access().is_open() {

@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use std::time::Duration;
 
 use arrow::datatypes::DataType;
-use echolake_lake::{DataFile, LakeSnapshot};
+use echolake_lake::{DataFile, LakeSnapshot, VisibleRun};
 use echolake_query::figure_rows::CurveRow;
 use echolake_query::{EngineClient, PreparedQuery, QueryQuota, Session};
 use echolake_schema::Symmetry;
@@ -78,10 +78,19 @@ impl SnapshotView {
         }
     }
 
-    /// Returns the tag of an answer of this version: a digest of the version and of the answer's `name`, which no
-    /// other answer has.
-    pub fn answer_etag(&self, content: AnswerContents, name: &str) -> String {
-        let digest = Sha256::new().chain_update(self.content_version(content)).chain_update(name).finalize();
+    /// Returns the version of a run's description, which rests on the run's own rows; None if readers see no such run.
+    pub fn run_version(&self, run: &str) -> Option<String> {
+        let VisibleRun { surface, run, run_derivation, reference_derivation, verdicts } =
+            self.snapshot.run(&run.parse().ok()?)?;
+        let optional = [reference_derivation, verdicts].map(|mark| mark.as_deref().unwrap_or_default());
+        let program = env!("CARGO_PKG_VERSION");
+        Some(format!("{program} {surface} {run} {run_derivation} {}", optional.join(" ")))
+    }
+
+    /// Returns the tag of an answer: a digest of the version of what it rests on, and of its `name`, which no other
+    /// answer has.
+    pub fn answer_etag(&self, version: &str, name: &str) -> String {
+        let digest = Sha256::new().chain_update(version).chain_update(name).finalize();
         format!("\"{}\"", hex::encode(&digest[..VERSION_BYTES]))
     }
 
