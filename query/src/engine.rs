@@ -62,6 +62,8 @@ pub struct EngineLimits {
     pub niceness: Option<i32>,
     /// Bytes of decoded columns that the process keeps beside what queries hold; None for 256 MiB.
     pub column_bytes: Option<usize>,
+    /// Statements that have threads at a time, those whose readers fetch nothing among them; None for any number.
+    pub seats: Option<usize>,
 }
 
 /// A function that queries may call.

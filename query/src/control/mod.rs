@@ -159,11 +159,14 @@ impl QueryTicket {
         {
             return Ok(Some(threads));
         }
+        // Whoever waits for a turn may have a seat, so whoever has a turn must not wait for one.
+        let has_seat = self.lock_place().seat.is_some();
+        let seat_place = if has_seat { None } else { Some(seats.wait_for_place().await) };
         self.resume_computing(turns).await;
         let mut place = self.lock_place();
-        let seat = match &place.seat {
-            Some(seat) => seat.clone(),
-            None => Arc::new(seats.take_seat(&self.owner)?),
+        let seat = match (&place.seat, seat_place) {
+            (Some(seat), _) => seat.clone(),
+            (None, seat_place) => Arc::new(seats.take_seat(&self.owner, seat_place.unwrap_or_default())?),
         };
         place.seat = Some(seat.clone());
         Ok(seat.handle().cloned())

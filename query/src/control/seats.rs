@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use echolake_functions::StopFlag;
 use tokio::runtime::Handle;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 use super::blame::{StatementBlame, StatementOwner};
 use super::thread_clock::{ThreadClock, ThreadTimes};
@@ -49,7 +50,15 @@ impl QuerySeat {
 /// The seats of a process.
 pub(crate) struct SeatPool {
     niceness: Option<i32>,
+    /// The seats that statements may have at a time; None for any number.
+    places: Option<Arc<Semaphore>>,
     state: Mutex<PoolState>,
+}
+
+/// Right to a seat.
+#[derive(Debug, Default)]
+pub(crate) struct SeatPlace {
+    _permit: Option<OwnedSemaphorePermit>,
 }
 
 #[derive(Default)]
@@ -73,6 +82,7 @@ pub(crate) struct HeldSeat {
     pool: Arc<SeatPool>,
     owner: Arc<StatementOwner>,
     times: OnceLock<ThreadTimes>,
+    _place: SeatPlace,
 }
 
 impl HeldSeat {
@@ -111,16 +121,27 @@ impl fmt::Debug for HeldSeat {
 }
 
 impl SeatPool {
-    /// Creates a pool without seats, whose threads will have this niceness; None for that of the process.
-    pub fn new(niceness: Option<i32>) -> Arc<Self> {
-        Arc::new(Self { niceness, state: Mutex::default() })
+    /// Creates a pool without seats, whose threads will have this niceness; None for that of the process. At most
+    /// `most` statements have a seat at a time.
+    pub fn new(niceness: Option<i32>, most: Option<usize>) -> Arc<Self> {
+        Arc::new(Self { niceness, places: most.map(Semaphore::new).map(Arc::new), state: Mutex::default() })
+    }
+
+    /// Waits until a statement may have a seat.
+    pub async fn wait_for_place(&self) -> SeatPlace {
+        let permit = match self.places.clone() {
+            // Nobody closes it.
+            Some(places) => places.acquire_owned().await.ok(),
+            None => None,
+        };
+        SeatPlace { _permit: permit }
     }
 
     /// Takes an idle seat, or starts one.
     ///
     /// # Errors
     /// If the system cannot start its threads.
-    pub fn take_seat(self: &Arc<Self>, owner: &Arc<StatementOwner>) -> std::io::Result<HeldSeat> {
+    pub fn take_seat(self: &Arc<Self>, owner: &Arc<StatementOwner>, place: SeatPlace) -> std::io::Result<HeldSeat> {
         let (idle, surplus) = {
             let mut state = self.lock();
             let surplus = state.collect_drained();
@@ -132,7 +153,8 @@ impl SeatPool {
             None => QuerySeat::start(self.niceness)?,
         };
         seat.stop.set_stopped(false);
-        Ok(HeldSeat { seat: Some(seat), pool: self.clone(), owner: owner.clone(), times: OnceLock::new() })
+        let (pool, owner, times) = (self.clone(), owner.clone(), OnceLock::new());
+        Ok(HeldSeat { seat: Some(seat), pool, owner, times, _place: place })
     }
 
     /// Returns a statement that has ended and given its seat back, and on whose seat a thread has computed for more than
@@ -211,22 +233,25 @@ mod tests {
 
     #[test]
     fn a_seat_has_one_statement_and_is_reused_without_its_tasks() {
-        let pool = SeatPool::new(None);
-        let (first, second) = (pool.take_seat(&owner()).expect("threads"), pool.take_seat(&owner()).expect("threads"));
+        let pool = SeatPool::new(None, None);
+        let (first, second) = (
+            pool.take_seat(&owner(), SeatPlace::default()).expect("threads"),
+            pool.take_seat(&owner(), SeatPlace::default()).expect("threads"),
+        );
         let (first_seat, second_seat) = (address(&first), address(&second));
         assert_ne!(first_seat, second_seat);
         let (release, released) = mpsc::channel::<()>();
         let task = first.handle().expect("it runs").spawn(async move { released.recv() });
         drop(first);
         drop(second);
-        let third = pool.take_seat(&owner()).expect("threads");
+        let third = pool.take_seat(&owner(), SeatPlace::default()).expect("threads");
         assert_eq!(address(&third), second_seat, "the first is not idle");
         drop(release);
         wait_until(|| task.is_finished(), "the task ends");
         let mut reused = Vec::new();
         wait_until(
             || {
-                reused.push(pool.take_seat(&owner()).expect("threads"));
+                reused.push(pool.take_seat(&owner(), SeatPlace::default()).expect("threads"));
                 reused.last().is_some_and(|held| address(held) == first_seat)
             },
             "the seat is idle",
@@ -236,10 +261,26 @@ mod tests {
         assert!(pool.lock().idle.len() <= IDLE_SEATS);
     }
 
+    #[tokio::test]
+    async fn no_more_statements_have_a_seat_than_may() {
+        let pool = SeatPool::new(None, Some(2));
+        let mut held = Vec::new();
+        for _ in 0..2 {
+            let place = pool.wait_for_place().await;
+            held.push(pool.take_seat(&owner(), place).expect("threads"));
+        }
+        let waiting = pool.clone();
+        let third = tokio::spawn(async move { waiting.wait_for_place().await });
+        tokio::task::yield_now().await;
+        assert!(!third.is_finished(), "two have one");
+        held.pop();
+        third.await.expect("its place");
+    }
+
     #[test]
     fn threads_have_the_niceness_of_their_pool() {
-        let pool = SeatPool::new(Some(7));
-        let held = pool.take_seat(&owner()).expect("threads");
+        let pool = SeatPool::new(Some(7), None);
+        let held = pool.take_seat(&owner(), SeatPlace::default()).expect("threads");
         let threads = held.handle().expect("it runs").clone();
         let ask = |threads: &Handle| threads.block_on(async { tokio::spawn(async { own_niceness() }).await });
         assert_eq!(ask(&threads).expect("no panic"), 7);
@@ -254,10 +295,10 @@ mod tests {
 
     #[test]
     fn what_computes_after_its_statement_is_blamed_on_it_and_a_task_that_waits_is_not() {
-        let pool = SeatPool::new(None);
+        let pool = SeatPool::new(None, None);
         let grace = Duration::from_millis(50);
         let (release, released) = mpsc::channel::<()>();
-        let held = pool.take_seat(&owner()).expect("threads");
+        let held = pool.take_seat(&owner(), SeatPlace::default()).expect("threads");
         held.handle().expect("it runs").spawn(async move { released.recv() });
         drop(held);
         std::thread::sleep(grace * 2);
@@ -266,7 +307,7 @@ mod tests {
         assert_eq!(pool.find_runaway(grace), None, "it waits");
         let culprit = Arc::new(StatementOwner::new("culprit".into(), Some(7)));
         culprit.set_statement("select 1");
-        let held = pool.take_seat(&culprit).expect("threads");
+        let held = pool.take_seat(&culprit, SeatPlace::default()).expect("threads");
         let (end, ended) = mpsc::channel::<()>();
         let task = held.handle().expect("it runs").spawn(async move {
             while ended.try_recv() == Err(mpsc::TryRecvError::Empty) {

@@ -1,5 +1,6 @@
 //! Threads of their own: those that plan and run queries are separate from those that serve connections.
 
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use tokio::runtime::{Builder, Handle, Runtime};
@@ -39,7 +40,7 @@ impl QueryThreads {
     ) -> std::io::Result<Self> {
         let cores = count_cores();
         let mut builder = thread_builder(name, cores);
-        builder.max_blocking_threads((2 * cores).clamp(LEAST_BLOCKING, MOST_BLOCKING));
+        builder.max_blocking_threads(blocking_threads(cores));
         Self::build(builder.on_thread_start(begin).on_thread_stop(end))
     }
 
@@ -51,6 +52,16 @@ impl QueryThreads {
     pub fn handle(&self) -> Option<&Handle> {
         self.0.as_ref().map(Runtime::handle)
     }
+}
+
+/// Returns the address space of the stacks of the threads of so many statements, bytes.
+pub fn stack_bytes(statements: usize) -> usize {
+    let cores = count_cores();
+    statements * (cores + blocking_threads(cores)) * STACK_BYTES
+}
+
+fn blocking_threads(cores: usize) -> usize {
+    (2 * cores).clamp(LEAST_BLOCKING, MOST_BLOCKING)
 }
 
 /// Returns the number of cores that the process may use.
@@ -74,9 +85,50 @@ impl Drop for QueryThreads {
     // A runtime's own drop waits for its threads, which asynchronous code must not. `shutdown_background` detaches
     // threads that are just ending, at which glibc crashes now and then (its bug 19951).
     fn drop(&mut self) {
-        if let Some(runtime) = self.0.take() {
+        let Some(runtime) = self.0.take() else { return };
+        let kept = Arc::new(Mutex::new(Some(runtime)));
+        let dropped = kept.clone();
+        match std::thread::Builder::new().spawn(move || drop(take_runtime(&dropped))) {
             // Its handle is kept, so that it is not detached either.
-            std::mem::forget(std::thread::spawn(move || drop(runtime)));
+            Ok(thread) => std::mem::forget(thread),
+            // The system gives no more threads: better a crash now and then than one now.
+            Err(_) => take_runtime(&kept).into_iter().for_each(Runtime::shutdown_background),
         }
+    }
+}
+
+fn take_runtime(kept: &Mutex<Option<Runtime>>) -> Option<Runtime> {
+    kept.lock().unwrap_or_else(PoisonError::into_inner).take()
+}
+
+#[cfg(test)]
+mod tests {
+    use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
+
+    use super::*;
+
+    // The limit is that of the process, so the test is a process of its own: it starts this program again.
+    #[test]
+    fn without_threads_a_runtime_ends_in_the_background() {
+        const OWN_PROCESS: &str = "ECHOLAKE_TEST_WITHOUT_THREADS";
+        if std::env::var_os(OWN_PROCESS).is_none() {
+            let name = "control::threads::tests::without_threads_a_runtime_ends_in_the_background";
+            let mut command = std::process::Command::new(std::env::current_exe().expect("this program"));
+            let ended = command.args([name, "--exact"]).env(OWN_PROCESS, "1").output().expect("it runs");
+            let text = String::from_utf8_lossy(&ended.stderr).into_owned();
+            assert!(ended.status.success() && String::from_utf8_lossy(&ended.stdout).contains("1 passed"), "{text}");
+            return;
+        }
+        let outer = QueryThreads::new("outer", 1).expect("threads");
+        let threads = outer.handle().expect("it runs").clone();
+        let (left, right) = (QueryThreads::new("left", 1), QueryThreads::new("right", 1));
+        let Rlimit { maximum, .. } = getrlimit(Resource::Data);
+        setrlimit(Resource::Data, Rlimit { current: Some(0), maximum }).expect("a lower limit");
+        let ended = std::thread::Builder::new().spawn(|| ());
+        let dropped = threads.block_on(async { tokio::spawn(async move { drop(left) }).await });
+        setrlimit(Resource::Data, Rlimit { current: maximum, maximum }).expect("the limit of before");
+        assert!(ended.is_err(), "the system gives no threads");
+        dropped.expect("no panic");
+        drop(right);
     }
 }

@@ -105,7 +105,7 @@ impl EngineProcess {
             reader,
             columns,
             turns: TurnQueue::new(limits.computing.unwrap_or_else(default_computing)),
-            seats: SeatPool::new(limits.niceness),
+            seats: SeatPool::new(limits.niceness, limits.seats),
             running: RunningQueries::default(),
             memory: limits.memory,
             own: functions.names().map(str::to_owned).collect(),

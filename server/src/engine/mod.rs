@@ -12,7 +12,9 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use echolake_lake::Lake;
-use echolake_query::{ClusterSettings, EngineClient, EngineLimits, QueryEngine, QueryQuota, Session, WorkerCluster};
+use echolake_query::{
+    ClusterSettings, EngineClient, EngineLimits, QueryEngine, QueryQuota, Session, WorkerCluster, stack_bytes,
+};
 use echolake_schema::tables::Table;
 use echolake_service::{DoorMessage, EngineReport, EngineRole, EngineServices, EngineSocket, Error, LakeFigures};
 use futures::FutureExt as _;
@@ -26,6 +28,8 @@ const LAKE_LOOK: Duration = Duration::from_secs(15);
 const REMOTE_LAKE_LOOK: Duration = Duration::from_secs(60);
 /// Statements of pages that compute at once, for each core: they are short, and of one client.
 const PAGES_PER_CORE: usize = 8;
+/// Those that have threads and wait until their rows are fetched, besides.
+const PAUSED_SEATS: usize = 16;
 /// Niceness of threads that run statements from outside: a page, which is computed beside them, has the processors
 /// first.
 const STATEMENT_NICENESS: i32 = 10;
@@ -62,7 +66,9 @@ pub async fn run_engine(lake: &Lake, options: EngineOptions<'_>) -> Result<(), E
     let niceness = (role == EngineRole::Statements).then_some(STATEMENT_NICENESS);
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     let computing = (role == EngineRole::Pages).then_some(cores * PAGES_PER_CORE);
-    let limits = EngineLimits { memory: Some(memory), computing, niceness, column_bytes: Some(column_bytes) };
+    // Pages fetch the rows of their statements at once, but they may wait for a busy processor.
+    let seats = computing.map(|computing| computing + PAUSED_SEATS);
+    let limits = EngineLimits { memory: Some(memory), computing, niceness, column_bytes: Some(column_bytes), seats };
     let engine = QueryEngine::with_limits(lake, limits)?;
     warm_up(&engine).await?;
     if let Some(workers) = &workers {
@@ -70,7 +76,8 @@ pub async fn run_engine(lake: &Lake, options: EngineOptions<'_>) -> Result<(), E
     }
     let services = EngineServices::new(lake, engine, slow)?;
     // Behind the start of its threads, whose stacks count.
-    confinement::limit_memory(memory + column_bytes).map_err(Error::System)?;
+    let stacks = seats.map_or(0, stack_bytes);
+    confinement::limit_memory(memory + column_bytes + stacks).map_err(Error::System)?;
     watchdog::start_watchdog(&services, role, memory, column_bytes).map_err(Error::System)?;
     EngineReport::Ready.send_line();
     #[cfg(feature = "postgres")]
