@@ -123,7 +123,11 @@ mod tests {
         let threads = outer.handle().expect("it runs").clone();
         let (left, right) = (QueryThreads::new("left", 1), QueryThreads::new("right", 1));
         let Rlimit { maximum, .. } = getrlimit(Resource::Data);
-        setrlimit(Resource::Data, Rlimit { current: Some(0), maximum }).expect("a lower limit");
+        // Small values still find memory, the stack of a thread does not.
+        let statm = std::fs::read_to_string("/proc/self/statm").expect("what the process has");
+        let pages: u64 = statm.split(' ').nth(5).and_then(|pages| pages.parse().ok()).expect("data pages");
+        let most = pages * rustix::param::page_size() as u64 + (1 << 20);
+        setrlimit(Resource::Data, Rlimit { current: Some(most), maximum }).expect("a lower limit");
         let ended = std::thread::Builder::new().spawn(|| ());
         let dropped = threads.block_on(async { tokio::spawn(async move { drop(left) }).await });
         setrlimit(Resource::Data, Rlimit { current: maximum, maximum }).expect("the limit of before");
