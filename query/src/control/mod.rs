@@ -161,12 +161,12 @@ impl QueryTicket {
         }
         // Whoever waits for a turn may have a seat, so whoever has a turn must not wait for one.
         let has_seat = self.lock_place().seat.is_some();
-        let seat_place = if has_seat { None } else { Some(seats.wait_for_place().await) };
+        let seat_place = if has_seat { None } else { seats.wait_for_place().await };
         self.resume_computing(turns).await;
         let mut place = self.lock_place();
-        let seat = match (&place.seat, seat_place) {
-            (Some(seat), _) => seat.clone(),
-            (None, seat_place) => Arc::new(seats.take_seat(&self.owner, seat_place.unwrap_or_default())?),
+        let seat = match &place.seat {
+            Some(seat) => seat.clone(),
+            None => Arc::new(seats.take_seat(&self.owner, seat_place)?),
         };
         place.seat = Some(seat.clone());
         Ok(seat.handle().cloned())

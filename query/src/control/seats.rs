@@ -50,16 +50,13 @@ impl QuerySeat {
 /// The seats of a process.
 pub(crate) struct SeatPool {
     niceness: Option<i32>,
-    /// The seats that statements may have at a time; None for any number.
-    places: Option<Arc<Semaphore>>,
+    /// The seats that statements may have at a time.
+    places: Arc<Semaphore>,
     state: Mutex<PoolState>,
 }
 
-/// Right to a seat.
-#[derive(Debug, Default)]
-pub(crate) struct SeatPlace {
-    _permit: Option<OwnedSemaphorePermit>,
-}
+/// Right to a seat; None from a pool that is closed, which no pool is.
+pub(crate) type SeatPlace = Option<OwnedSemaphorePermit>;
 
 #[derive(Default)]
 struct PoolState {
@@ -122,19 +119,15 @@ impl fmt::Debug for HeldSeat {
 
 impl SeatPool {
     /// Creates a pool without seats, whose threads will have this niceness; None for that of the process. At most
-    /// `most` statements have a seat at a time.
+    /// `most` statements have a seat at a time; None for any number.
     pub fn new(niceness: Option<i32>, most: Option<usize>) -> Arc<Self> {
-        Arc::new(Self { niceness, places: most.map(Semaphore::new).map(Arc::new), state: Mutex::default() })
+        let places = Arc::new(Semaphore::new(most.unwrap_or(Semaphore::MAX_PERMITS)));
+        Arc::new(Self { niceness, places, state: Mutex::default() })
     }
 
     /// Waits until a statement may have a seat.
     pub async fn wait_for_place(&self) -> SeatPlace {
-        let permit = match self.places.clone() {
-            // Nobody closes it.
-            Some(places) => places.acquire_owned().await.ok(),
-            None => None,
-        };
-        SeatPlace { _permit: permit }
+        self.places.clone().acquire_owned().await.ok()
     }
 
     /// Takes an idle seat, or starts one.
@@ -234,24 +227,22 @@ mod tests {
     #[test]
     fn a_seat_has_one_statement_and_is_reused_without_its_tasks() {
         let pool = SeatPool::new(None, None);
-        let (first, second) = (
-            pool.take_seat(&owner(), SeatPlace::default()).expect("threads"),
-            pool.take_seat(&owner(), SeatPlace::default()).expect("threads"),
-        );
+        let (first, second) =
+            (pool.take_seat(&owner(), None).expect("threads"), pool.take_seat(&owner(), None).expect("threads"));
         let (first_seat, second_seat) = (address(&first), address(&second));
         assert_ne!(first_seat, second_seat);
         let (release, released) = mpsc::channel::<()>();
         let task = first.handle().expect("it runs").spawn(async move { released.recv() });
         drop(first);
         drop(second);
-        let third = pool.take_seat(&owner(), SeatPlace::default()).expect("threads");
+        let third = pool.take_seat(&owner(), None).expect("threads");
         assert_eq!(address(&third), second_seat, "the first is not idle");
         drop(release);
         wait_until(|| task.is_finished(), "the task ends");
         let mut reused = Vec::new();
         wait_until(
             || {
-                reused.push(pool.take_seat(&owner(), SeatPlace::default()).expect("threads"));
+                reused.push(pool.take_seat(&owner(), None).expect("threads"));
                 reused.last().is_some_and(|held| address(held) == first_seat)
             },
             "the seat is idle",
@@ -280,7 +271,7 @@ mod tests {
     #[test]
     fn threads_have_the_niceness_of_their_pool() {
         let pool = SeatPool::new(Some(7), None);
-        let held = pool.take_seat(&owner(), SeatPlace::default()).expect("threads");
+        let held = pool.take_seat(&owner(), None).expect("threads");
         let threads = held.handle().expect("it runs").clone();
         let ask = |threads: &Handle| threads.block_on(async { tokio::spawn(async { own_niceness() }).await });
         assert_eq!(ask(&threads).expect("no panic"), 7);
@@ -298,7 +289,7 @@ mod tests {
         let pool = SeatPool::new(None, None);
         let grace = Duration::from_millis(50);
         let (release, released) = mpsc::channel::<()>();
-        let held = pool.take_seat(&owner(), SeatPlace::default()).expect("threads");
+        let held = pool.take_seat(&owner(), None).expect("threads");
         held.handle().expect("it runs").spawn(async move { released.recv() });
         drop(held);
         std::thread::sleep(grace * 2);
@@ -307,7 +298,7 @@ mod tests {
         assert_eq!(pool.find_runaway(grace), None, "it waits");
         let culprit = Arc::new(StatementOwner::new("culprit".into(), Some(7)));
         culprit.set_statement("select 1");
-        let held = pool.take_seat(&culprit, SeatPlace::default()).expect("threads");
+        let held = pool.take_seat(&culprit, None).expect("threads");
         let (end, ended) = mpsc::channel::<()>();
         let task = held.handle().expect("it runs").spawn(async move {
             while ended.try_recv() == Err(mpsc::TryRecvError::Empty) {

@@ -91,7 +91,7 @@ pub struct EncodedFile {
 
 impl EncodedFile {
     /// Its bytes, in order.
-    pub fn blocks(&self) -> &[Bytes] {
+    pub fn byte_blocks(&self) -> &[Bytes] {
         &self.blocks
     }
 }

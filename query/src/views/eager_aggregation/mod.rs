@@ -101,8 +101,12 @@ impl EagerAggregation {
         if dimensions.contains(&KeyDimension::Pair) && dimensions.contains(&KeyDimension::Symmetry) {
             dimensions.remove(&KeyDimension::MovedPair);
         }
+        // Many runs have the same references.
+        if dimensions.contains(&KeyDimension::Run) {
+            dimensions.remove(&KeyDimension::References);
+        }
         let values = |dimension: &KeyDimension| match dimension {
-            KeyDimension::Run => flat.size.runs,
+            KeyDimension::Run | KeyDimension::References => flat.size.runs,
             KeyDimension::Pair | KeyDimension::MovedPair => self.lookups.count_pairs(),
             KeyDimension::Symmetry => Symmetry::ALL.len() as u64,
             KeyDimension::Few(_) => FEW_VALUES,
@@ -133,6 +137,7 @@ impl OptimizerRule for EagerAggregation {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 enum KeyDimension {
     Run,
+    References,
     Pair,
     MovedPair,
     Symmetry,
@@ -143,7 +148,8 @@ impl KeyDimension {
     fn from_column(name: &str) -> Option<Self> {
         const FEW: [&str; 5] = ["attempt", "level", "source", "swapped", "verdict"];
         match name {
-            "surface_id" | "run_id" | "flat_version" | "foam_version" => Some(Self::Run),
+            "surface_id" | "run_id" => Some(Self::Run),
+            "flat_version" | "foam_version" => Some(Self::References),
             "pair_id" | "microphone" | "speaker" => Some(Self::Pair),
             "d4_pair_id" | "d4_microphone" | "d4_speaker" => Some(Self::MovedPair),
             "symmetry" => Some(Self::Symmetry),

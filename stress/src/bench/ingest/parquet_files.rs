@@ -5,8 +5,8 @@ use arrow::array::RecordBatchReader as _;
 use arrow::datatypes::SchemaRef;
 use arrow::record_batch::RecordBatch;
 use bytes::Bytes;
-use echolake_lake::{FileName, Lake, VisibleRun};
-use echolake_schema::SurfaceId;
+use echolake_lake::Lake;
+use echolake_schema::RunId;
 use echolake_schema::tables::{Source, Table};
 use object_store::ObjectStoreExt as _;
 use parquet::arrow::ArrowWriter;
@@ -58,17 +58,15 @@ pub(crate) fn zstd_compression(level: i32) -> Compression {
 /// All files that ingest wrote.
 pub(crate) async fn read_table_files(lake: &Lake) -> anyhow::Result<Vec<StoredTableFile>> {
     let snapshot = lake.snapshot().await?;
+    let references = &lake.config().references;
+    let of_references = [&references.flat, &references.foam];
+    let is_reference = |run: &RunId| snapshot.run(run).is_some_and(|run| of_references.contains(&&run.surface));
     let mut found = Vec::new();
     for table in Table::ALL.into_iter().filter(|t| t.source() != Source::Rig) {
         for file in snapshot.files(table) {
-            let references = &lake.config().references;
-            let surfaces = match FileName::parse(&file.path) {
-                Some(FileName::Rows { surface, .. } | FileName::Pointer(VisibleRun { surface, .. })) => vec![surface],
-                _ => file.visible_parts().map(|(part, _)| part.surface.clone()).collect(),
-            };
-            let is_reference = |surface: &SurfaceId| [&references.flat, &references.foam].contains(&surface);
-            let of_reference = surfaces.iter().any(is_reference);
-            ensure!(surfaces.iter().all(is_reference) == of_reference, "`{}` has references and others", file.path);
+            let runs = file.shown_runs();
+            let of_reference = runs.iter().any(is_reference);
+            ensure!(runs.iter().all(is_reference) == of_reference, "`{}` has references and others", file.path);
             let bytes = lake.store().get(&file.path).await?.bytes().await?;
             found.push(StoredTableFile { table, of_reference, bytes });
         }

@@ -122,7 +122,8 @@ pub(crate) async fn measure_queries(args: &QueryBenchArgs, report: &mut BenchRep
             report_times(name, times, &version, report);
         }
     }
-    if let Some(python) = args.python.as_ref().filter(|_| !of_run_files.is_empty()) {
+    // Copies of the whole lake are too much for a query or two.
+    if let Some(python) = args.python.as_ref().filter(|_| args.only.is_empty()) {
         let folder = super::temporary_folder(args.folder.as_deref())?;
         let files = run_files::write_run_files(&lake, folder.path()).await?;
         let mut peer =

@@ -50,6 +50,6 @@ async fn write_rows(lake: Lake, table: Table, file: Arc<DataFile>, rows: Range<u
     let rows: Vec<RecordBatch> = lake.read_rows(table, &file, &[], rows).await?.try_collect().await?;
     let encoded = encode_batches(table, &table.schema(lake.rig()), &rows)?;
     let mut copy = File::create_new(&path)?;
-    encoded.blocks().iter().try_for_each(|block| copy.write_all(block))?;
+    encoded.byte_blocks().iter().try_for_each(|block| copy.write_all(block))?;
     Ok(())
 }
