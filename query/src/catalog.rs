@@ -32,6 +32,8 @@ use quick_cache::sync::Cache;
 use crate::contributions::{AnnotationCache, KnownVerdicts, with_pending_rows, without_rejected};
 use crate::listed_verdicts::listed_rejection;
 use crate::overlay_schema::{NamedTables, OverlaySchema};
+use crate::session::PreparedQuery;
+use crate::session::known_plans::KnownPlans;
 use crate::sorted_join::AsOfFilter;
 use crate::statement::{PastTableName, checked_operators, end_joins, find_past_tables, walk_statement};
 use crate::system;
@@ -88,6 +90,7 @@ struct CatalogSnapshot {
     system_tables: Arc<NamedTables>,
     rejection: ScalarUDF,
     verdicts: KnownVerdicts,
+    plans: KnownPlans,
     looked: Mutex<Instant>,
     /// The last look at the log of `runs`; None if the next query must look.
     checked: Mutex<Option<Instant>>,
@@ -186,6 +189,27 @@ impl LakeCatalog {
         let read = mcap_tables::register(context, &current.snapshot, &self.runs, calls).await;
         read.map_err(mcap_failed)?;
         Ok(current.snapshot.clone())
+    }
+
+    /// Returns the plan of a statement on the current snapshot, if it is kept.
+    ///
+    /// # Errors
+    /// [`Error::Lake`] if the lake cannot be read.
+    pub async fn find_plan(&self, sql: &str) -> Result<Option<Arc<PreparedQuery>>, Error> {
+        let Some(known) = self.known_snapshot().filter(|known| known.snapshot.is_whole()) else { return Ok(None) };
+        let Some(plan) = known.plans.find_plan(sql) else { return Ok(None) };
+        Ok(self.is_fresh(&known).await?.then_some(plan))
+    }
+
+    /// Optimizes the plan of a statement, and keeps it for later runs on its snapshot if these would plan the same.
+    ///
+    /// # Errors
+    /// As [`PreparedQuery::optimize`].
+    pub fn keep_plan(&self, query: PreparedQuery) -> Result<Arc<PreparedQuery>, Error> {
+        match self.known_snapshot().filter(|known| Arc::ptr_eq(&known.snapshot, query.snapshot())) {
+            Some(known) => known.plans.keep_plan(query, &known.public_tables),
+            None => Ok(Arc::new(query)),
+        }
     }
 
     /// Returns the current snapshot of the lake, which a query started now would see; cached until something changes.
@@ -394,6 +418,7 @@ impl LakeCatalog {
             system_tables,
             rejection,
             verdicts,
+            plans: KnownPlans::default(),
             looked,
             checked,
         })

@@ -26,6 +26,7 @@ pub struct EngineClient {
     name: Arc<str>,
     quota: QueryQuota,
     places: Option<Arc<Semaphore>>,
+    is_program: bool,
     /// Bytes that operators of its queries have reserved.
     held: Arc<HeldMemory>,
 }
@@ -34,7 +35,12 @@ impl EngineClient {
     /// Creates a client.
     pub fn new(name: impl Into<Arc<str>>, quota: QueryQuota) -> Self {
         let places = quota.concurrent.map(|places| Arc::new(Semaphore::new(places)));
-        Self { name: name.into(), quota, places, held: Arc::default() }
+        Self { name: name.into(), quota, places, is_program: false, held: Arc::default() }
+    }
+
+    /// Creates the program as a client: its threads are not as nice as those of statements from outside.
+    pub fn new_program(name: impl Into<Arc<str>>, quota: QueryQuota) -> Self {
+        Self { is_program: true, ..Self::new(name, quota) }
     }
 
     /// Returns the name for logs and error messages.
@@ -45,6 +51,11 @@ impl EngineClient {
     /// Returns the name to be shared.
     pub(crate) fn shared_name(&self) -> Arc<str> {
         self.name.clone()
+    }
+
+    /// Returns whether it is the program itself.
+    pub(crate) fn is_program(&self) -> bool {
+        self.is_program
     }
 
     /// Returns the limits on the client's queries.

@@ -57,7 +57,7 @@ pub struct EngineLimits {
     /// Statements that compute at once, while others wait; None for twice the cores, four at least. Statements whose
     /// readers fetch nothing do not count.
     pub computing: Option<usize>,
-    /// Niceness of the threads that plan and run statements, -20 to 19; None for that of the process. Without a system
+    /// Niceness of the threads that plan and run others' statements than the program's own, -20 to 19; None for that of the process. Without a system
     /// that lets threads differ, as Linux does, it is the whole process's.
     pub niceness: Option<i32>,
     /// Bytes of decoded columns that the process keeps beside what queries hold; None for 256 MiB.
@@ -142,7 +142,8 @@ impl QueryEngine {
     /// what its threads had computed. Processor time counts, so that nothing is blamed for waiting on a busy machine.
     pub fn find_runaway(&self, grace: Duration) -> Option<StatementBlame> {
         let running = self.process.running.find_runaway(grace);
-        running.or_else(|| self.process.seats.find_runaway(grace))
+        let on_seats = || self.process.seats.find_runaway(grace);
+        running.or_else(on_seats).or_else(|| self.process.program_seats.find_runaway(grace))
     }
 
     /// Stops the statement that holds the most memory, with an error that says so; returns whose it was, and None if no
@@ -228,7 +229,8 @@ impl QueryEngine {
 
     /// Waits for a turn of the ticket, and takes its seat; returns the seat's threads.
     pub(crate) async fn begin_computing(&self, ticket: &QueryTicket) -> Result<Handle, Error> {
-        let threads = ticket.begin_computing(&self.process.turns, &self.process.seats).await;
+        let seats = if ticket.is_program { &self.process.program_seats } else { &self.process.seats };
+        let threads = ticket.begin_computing(&self.process.turns, seats).await;
         let failed = |e| Error::failed_query(&format!("the system gives no threads for the query: {e}"));
         threads.map_err(failed)?.ok_or_else(ended_error)
     }

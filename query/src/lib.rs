@@ -47,6 +47,7 @@ pub use client::{EngineClient, QueryPermit, QueryQuota};
 pub use control::blame::StatementBlame;
 pub use control::continue_request;
 pub use control::threads::{QueryThreads, stack_bytes};
+pub use echolake_lake_tables::RowReading;
 pub use echolake_mcap_tables::{Attachment, Contents, Topic};
 pub use engine::{EngineLimits, QueryEngine, SqlFunction};
 pub use error::{Error, OUT_OF_RANGE, QueryPlace};

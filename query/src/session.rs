@@ -1,6 +1,7 @@
 //! A session: every query sees one snapshot of the lake and may only read.
 
 mod answer;
+pub(crate) mod known_plans;
 
 use std::borrow::Cow;
 use std::collections::HashSet;
@@ -20,6 +21,7 @@ use datafusion::prelude::SessionContext;
 use datafusion::sql::parser::Statement;
 use echolake_functions::set_planning;
 use echolake_lake::{Lake, LakeSnapshot, VisibleRun};
+use echolake_lake_tables::RowReading;
 use echolake_mcap_tables::Contents;
 use echolake_schema::RunId;
 use echolake_schema::annotations::Annotation;
@@ -81,6 +83,11 @@ impl PreparedQuery {
     /// Returns its text.
     pub fn sql(&self) -> &str {
         &self.sql
+    }
+
+    /// Returns the snapshot on which it was planned.
+    pub(crate) fn snapshot(&self) -> &Arc<LakeSnapshot> {
+        &self.snapshot
     }
 
     /// Returns the schema of its answers.
@@ -185,7 +192,15 @@ impl Session {
     pub fn query<'a>(&'a self, sql: &'a str) -> BoxFuture<'a, Result<QueryAnswer, Error>> {
         let query = async move {
             let started = self.start_query()?;
-            let prepared = self.plan_statement(sql, self.parse_sql(sql)?, &started.ticket).await?;
+            let prepared = match self.engine.catalog().find_plan(sql).await?.filter(|_| self.extend.is_none()) {
+                Some(known) => known,
+                None => {
+                    let (session, statement, sql) = (self.clone(), self.parse_sql(sql)?, sql.to_owned());
+                    started.ticket.set_statement(&sql);
+                    let plan = async move { session.keep_plan(session.plan_statement(sql, statement).await?) };
+                    self.engine.on_seat(&started.ticket, plan).await?
+                }
+            };
             self.run_plan(&prepared, prepared.state.clone(), LogicalPlan::clone(&prepared.plan), started).await
         };
         query.boxed()
@@ -225,7 +240,10 @@ impl Session {
     ) -> BoxFuture<'a, Result<PreparedQuery, Error>> {
         let prepare = async move {
             let started = self.start_query()?;
-            self.plan_statement(sql, statement, &started.ticket).await
+            let (session, sql) = (self.clone(), sql.to_owned());
+            started.ticket.set_statement(&sql);
+            let plan = async move { session.plan_statement(sql, statement).await };
+            self.engine.on_seat(&started.ticket, plan).await
         };
         prepare.boxed()
     }
@@ -358,31 +376,28 @@ impl Session {
     }
 
     fn start_ticket(&self) -> Arc<QueryTicket> {
-        let ticket = QueryTicket::new(self.client.shared_name(), self.request);
+        let ticket = QueryTicket::new(self.client.shared_name(), self.request, self.client.is_program());
         self.engine.start_ticket(ticket, self.client.quota().time)
     }
 
-    async fn plan_statement(
-        &self,
-        sql: &str,
-        mut statement: Statement,
-        ticket: &Arc<QueryTicket>,
-    ) -> Result<PreparedQuery, Error> {
-        ticket.set_statement(sql);
-        let session = self.clone();
-        let sql = sql.to_owned();
-        let plan = async move {
-            let context = session.engine.create_context();
-            let system = session.source_tables();
-            let snapshot = session.engine.catalog().register_tables(&context, system, &mut statement).await?;
-            if let Some(extend) = &session.extend {
-                extend(&context).map_err(|e| Error::from_execution("", &e))?;
-            }
-            let state = context.state();
-            let plan = OpaqueValue::new(prepare_statement(&sql, statement, &state).await?);
-            Ok(PreparedQuery { state: OpaqueValue::new(state), plan, snapshot, sql, is_optimized: false })
-        };
-        self.engine.on_seat(ticket, plan).await
+    async fn plan_statement(&self, sql: String, mut statement: Statement) -> Result<PreparedQuery, Error> {
+        let context = self.engine.create_context();
+        let system = self.source_tables();
+        let snapshot = self.engine.catalog().register_tables(&context, system, &mut statement).await?;
+        if let Some(extend) = &self.extend {
+            extend(&context).map_err(|e| Error::from_execution("", &e))?;
+        }
+        let state = context.state();
+        let plan = OpaqueValue::new(prepare_statement(&sql, statement, &state).await?);
+        Ok(PreparedQuery { state: OpaqueValue::new(state), plan, snapshot, sql, is_optimized: false })
+    }
+
+    // Those of a session with tables or settings of its own are not kept.
+    fn keep_plan(&self, planned: PreparedQuery) -> Result<Arc<PreparedQuery>, Error> {
+        match self.extend {
+            Some(_) => Ok(Arc::new(planned)),
+            None => self.engine.catalog().keep_plan(planned),
+        }
     }
 
     async fn run_plan(
@@ -487,7 +502,7 @@ impl Session {
     }
 
     /// Returns the rows that `SELECT columns FROM table WHERE run_id IN (runs) AND pair_id IN (pairs)` has of a snapshot
-    /// that the session has given, without a plan: of lists, the pages of these rows are read. The table's rows are
+    /// that the session has given, without a plan. The table's rows are
     /// those of runs, and each has a pair. To be called as a part of [`Session::run_request`].
     ///
     /// # Errors
@@ -499,9 +514,10 @@ impl Session {
         runs: &'a [RunId],
         pairs: &'a [i32],
         columns: &'a [&'a str],
+        reading: RowReading,
     ) -> BoxFuture<'a, Result<RecordBatch, Error>> {
         let read = async move {
-            let rows = self.engine.catalog().run_rows(snapshot, table).read_pairs(runs, pairs, columns).await;
+            let rows = self.engine.catalog().run_rows(snapshot, table).read_pairs(runs, pairs, columns, reading).await;
             rows.map_err(|e| Error::from_execution("", &e))
         };
         read.boxed()
@@ -609,6 +625,9 @@ pub(crate) mod tests;
 
 #[cfg(test)]
 mod call_limits_tests;
+
+#[cfg(test)]
+mod known_plans_tests;
 
 #[cfg(test)]
 mod limits_tests;

@@ -77,7 +77,7 @@ pub(super) struct QueryArgs {
     /// Memory limit of all queries together, MiB; if it is exceeded, the largest query is ended.
     #[arg(long, value_name = "MIB", default_value_t = MEMORY_MIB, value_parser = clap::value_parser!(u32).range(64..))]
     memory: u32,
-    /// Memory for decoded columns of tables beside that of queries, MiB: that of statements; pages have a quarter of it.
+    /// Memory for decoded columns of tables beside that of queries, MiB: that of statements; pages have half as much.
     #[arg(long, value_name = "MIB", default_value_t = COLUMNS_MIB)]
     column_memory: u32,
     /// Log queries that take this long or longer, with their statements, as 1s or 500ms.

@@ -59,6 +59,8 @@ pub(crate) struct QueryTicket {
     stopped: Notify,
     /// Bytes that its operators have reserved.
     held: Arc<HeldMemory>,
+    /// Its seat is one of the program's own.
+    pub is_program: bool,
     place: Mutex<ComputingPlace>,
     /// The work that waits for this query, in whose turn and on whose seat it computes.
     outer: Option<Arc<QueryTicket>>,
@@ -83,12 +85,13 @@ impl Drop for QueryTicket {
 
 impl QueryTicket {
     /// Creates the ticket of a query, which is part of the work of the current task, if that is some.
-    pub fn new(client: Arc<str>, request: Option<u64>) -> Self {
+    pub fn new(client: Arc<str>, request: Option<u64>, is_program: bool) -> Self {
         Self {
             owner: Arc::new(StatementOwner::new(client, request)),
             stop: OnceLock::new(),
             stopped: Notify::new(),
             held: Arc::default(),
+            is_program,
             place: Mutex::default(),
             outer: Self::current_work().filter(|outer| outer.seat_handle().is_some()),
             timer: OnceLock::new(),

@@ -71,6 +71,8 @@ pub(crate) struct EngineProcess {
     columns: Arc<ColumnStore>,
     pub turns: Arc<TurnQueue>,
     pub seats: Arc<SeatPool>,
+    /// Seats of the program's own statements: others if those from outside are nice.
+    pub program_seats: Arc<SeatPool>,
     pub running: RunningQueries,
     /// Bytes that queries may hold; None for no limit.
     pub memory: Option<usize>,
@@ -97,6 +99,11 @@ impl EngineProcess {
         let functions = FunctionSet::all(lake.rig()).map_err(|e| Error::failed_query(&e.to_string()))?;
         let threads = |e: std::io::Error| Error::failed_query(&format!("no threads for queries: {e}"));
         let lookups = LookupFunctions::from_lake(lake, &functions)?;
+        let seats = SeatPool::new(limits.niceness, limits.seats);
+        let program_seats = match limits.niceness {
+            Some(_) => SeatPool::new(None, limits.seats),
+            None => seats.clone(),
+        };
         Ok(Self {
             lake: lake.clone(),
             template: build_template(runtime, &functions, optimizer_rules(&lookups), limits),
@@ -105,7 +112,8 @@ impl EngineProcess {
             reader,
             columns,
             turns: TurnQueue::new(limits.computing.unwrap_or_else(default_computing)),
-            seats: SeatPool::new(limits.niceness, limits.seats),
+            seats,
+            program_seats,
             running: RunningQueries::default(),
             memory: limits.memory,
             own: functions.names().map(str::to_owned).collect(),

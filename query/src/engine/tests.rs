@@ -44,7 +44,7 @@ async fn a_timer_ends_with_its_query() {
     let engine = QueryEngine::new(&lake, None).expect("an engine");
     let tasks = engine.process.watch.handle().expect("threads").metrics();
     let before = tasks.num_alive_tasks();
-    let ticket = || engine.start_ticket(QueryTicket::new("test".into(), None), Some(Duration::from_secs(3600)));
+    let ticket = || engine.start_ticket(QueryTicket::new("test".into(), None, false), Some(Duration::from_secs(3600)));
     let tickets: Vec<_> = (0..100).map(|_| ticket()).collect();
     assert_eq!(tasks.num_alive_tasks(), before + 100);
     drop(tickets);
@@ -105,4 +105,17 @@ async fn a_right_is_opened_once_and_the_least_used_ones_go() {
     assert_eq!(catalog(&whole.of_lake(&lake).expect("an engine")), catalog(&whole));
     let (_other, another) = self::lake().await;
     assert!(matches!(whole.of_lake(&another), Err(Error::Execution { .. })));
+}
+
+#[tokio::test]
+async fn the_programs_own_statements_are_not_as_nice_as_those_from_outside() {
+    let (_folder, lake) = lake().await;
+    let limits = EngineLimits { niceness: Some(7), ..EngineLimits::default() };
+    let engine = QueryEngine::with_limits(&lake, limits).expect("an engine");
+    let niceness = async |client: EngineClient| {
+        let asked = async { Ok::<_, Error>(rustix::process::getpriority_process(None).expect("a priority")) };
+        engine.open_session(&Arc::new(client)).supervise_work(asked).await.expect("it runs")
+    };
+    assert_eq!(niceness(EngineClient::new("outside", QueryQuota::default())).await, 7);
+    assert_ne!(niceness(EngineClient::new_program("program", QueryQuota::default())).await, 7);
 }

@@ -4,7 +4,7 @@
 //! A column is kept in pieces of as many rows as a scan's batch, because operators count the memory of a slice as that
 //! of the whole. Small files, of which some tables have one for each run, are given out joined.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::ops::Range;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
@@ -20,6 +20,7 @@ use datafusion::datasource::physical_plan::ParquetFileReaderFactory;
 use datafusion::error::{DataFusionError, Result};
 use datafusion::physical_plan::metrics::ExecutionPlanMetricsSet;
 use echolake_lake::{DataFile, Error as LakeError, add_missing_columns, reader_metadata};
+use echolake_schema::RunId;
 use futures::{FutureExt as _, StreamExt as _, TryStreamExt as _};
 use object_store::path::Path;
 use parquet::arrow::arrow_reader::ArrowReaderOptions;
@@ -98,6 +99,8 @@ struct StoredFile {
     pieces: OnceLock<Vec<RowPiece>>,
     /// Held while somebody decodes columns of the file.
     reading: AsyncMutex<()>,
+    /// Runs and the rows of the file that were found to be theirs.
+    owners: Mutex<HashSet<(RunId, Range<u64>)>>,
 }
 
 /// Consecutive rows of a file.
@@ -229,6 +232,66 @@ impl ColumnStore {
         let metrics = ExecutionPlanMetricsSet::new();
         let metrics = ScanMetrics { metrics: &metrics, partition: 0 };
         let stored = self.stored_file(&file.path);
+        let Some(part) = self.find_part(&stored, file, &rows, metrics).await? else { return Ok(Vec::new()) };
+        let (first, read) = self.read_part(&part, wanted, metrics).await?;
+        let mut start = first as u64;
+        let mut found = Vec::new();
+        for batch in read {
+            let end = start + batch.num_rows() as u64;
+            let kept = rows.start.clamp(start, end)..rows.end.clamp(start, end);
+            if !kept.is_empty() {
+                found.push(batch.slice((kept.start - start) as usize, (kept.end - kept.start) as usize));
+            }
+            start = end;
+        }
+        Ok(found)
+    }
+
+    /// Returns whether these columns of some rows of a file may be kept, lists as well: no more than a share of the store.
+    ///
+    /// # Errors
+    /// As [`Self::read_range`].
+    pub(crate) async fn has_room(&self, file: &DataFile, rows: Range<u64>, wanted: &WantedColumns) -> Result<bool> {
+        let metrics = ExecutionPlanMetricsSet::new();
+        let metrics = ScanMetrics { metrics: &metrics, partition: 0 };
+        let stored = self.stored_file(&file.path);
+        let Some(part) = self.find_part(&stored, file, &rows, metrics).await? else { return Ok(true) };
+        if self.known_rows(&stored, &part, wanted)?.is_some() {
+            return Ok(true);
+        }
+        let footer = self.read_footer(&part, metrics).await?;
+        let pieces = stored.pieces.get().map_or(&[] as &[RowPiece], Vec::as_slice);
+        let mut groups: Vec<_> = pieces_in_range(pieces, &part).map(|piece| piece.group).collect();
+        groups.dedup();
+        let names: Vec<_> = wanted.names.iter().map(|name| &**name).collect();
+        let columns = groups.iter().flat_map(|group| footer.metadata.row_group(*group).columns());
+        let columns =
+            columns.filter(|column| column.column_path().parts().first().is_some_and(|n| names.contains(&&**n)));
+        let bytes: u64 = columns.map(|column| column.uncompressed_size().unsigned_abs()).sum();
+        Ok(bytes <= self.bytes / SCAN_SHARE)
+    }
+
+    /// Returns whether rows of a file were found to be those of a run.
+    pub(crate) fn is_owner_known(&self, path: &Path, run: &RunId, rows: &Range<u64>) -> bool {
+        let stored = self.stored_file(path);
+        let owners = stored.owners.lock().unwrap_or_else(PoisonError::into_inner);
+        owners.contains(&(run.clone(), rows.clone()))
+    }
+
+    /// Remembers that rows of a file are those of a run.
+    pub(crate) fn note_owner(&self, path: &Path, run: &RunId, rows: &Range<u64>) {
+        let stored = self.stored_file(path);
+        stored.owners.lock().unwrap_or_else(PoisonError::into_inner).insert((run.clone(), rows.clone()));
+    }
+
+    // The range of a file with all groups of rows that have some of these rows; None if there is none.
+    async fn find_part(
+        &self,
+        stored: &StoredFile,
+        file: &DataFile,
+        rows: &Range<u64>,
+        metrics: ScanMetrics<'_>,
+    ) -> Result<Option<PartitionedFile>> {
         let part = partitioned_file(file);
         let pieces = match stored.pieces.get() {
             Some(pieces) => pieces,
@@ -244,20 +307,8 @@ impl ColumnStore {
             end > rows.start && end - (piece.rows as u64) < rows.end
         };
         let groups: Vec<_> = pieces.iter().filter(has_wanted).map(|piece| piece.group_offset).collect();
-        let (Some(first), Some(last)) = (groups.first(), groups.last()) else { return Ok(Vec::new()) };
-        let part = part.with_range(*first, last + 1);
-        let (first, read) = self.read_part(&part, wanted, metrics).await?;
-        let mut start = first as u64;
-        let mut found = Vec::new();
-        for batch in read {
-            let end = start + batch.num_rows() as u64;
-            let kept = rows.start.clamp(start, end)..rows.end.clamp(start, end);
-            if !kept.is_empty() {
-                found.push(batch.slice((kept.start - start) as usize, (kept.end - kept.start) as usize));
-            }
-            start = end;
-        }
-        Ok(found)
+        let (Some(first), Some(last)) = (groups.first(), groups.last()) else { return Ok(None) };
+        Ok(Some(part.with_range(*first, last + 1)))
     }
 
     /// Reads wanted columns of a file, or of a range of it, each of its pieces a batch; returns the place of their first

@@ -16,4 +16,4 @@ pub use column_store::ColumnStore;
 pub use lake_table::{FileReaders, LakeTable, TableSize};
 pub use local_scans::{rewrite_children, rewrite_local_scans};
 pub use readers::LakeReaderFactory;
-pub use run_rows::RunRows;
+pub use run_rows::{RowReading, RunRows};

@@ -2,10 +2,11 @@
 
 use std::collections::BTreeMap;
 use std::ops::Range;
+use std::sync::Arc;
 
-use arrow::array::{Array as _, AsArray as _, BooleanArray};
-use arrow::compute::{concat_batches, filter_record_batch};
-use arrow::datatypes::{Int32Type, SchemaRef};
+use arrow::array::{Array as _, ArrayRef, AsArray as _, UInt32Array};
+use arrow::compute::{concat_batches, take_record_batch};
+use arrow::datatypes::{Int32Type, Schema, SchemaRef};
 use arrow::record_batch::RecordBatch;
 use datafusion::error::{DataFusionError, Result};
 use datafusion::physical_plan::metrics::ExecutionPlanMetricsSet;
@@ -25,10 +26,10 @@ pub(crate) const PAIR: &str = "pair_id";
 /// A table in one snapshot, whose rows are those of runs, as its reader sees it: they are read by their places in files.
 ///
 /// 1. The snapshot tells which files show rows of a run, and which rows of a merged file these are.
-/// 2. The pairs of these rows, and other columns without lists, are those that the process has decoded.
-/// 3. Of rows with lists, the pages that have them are decoded.
+/// 2. Which rows of these are those of a pair, is said by the pairs that the process has decoded.
+/// 3. Of other columns, the pages that have the rows are decoded; those of runs that many ask for are kept, too.
 ///
-/// Of merged files the name of the run beside each row is checked: which rows are whose is said by the log alone.
+/// Of merged files the name of the run beside each row is checked, once: which rows are whose is said by the log alone.
 pub struct RunRows<'a> {
     /// The table.
     pub table: Table,
@@ -38,6 +39,15 @@ pub struct RunRows<'a> {
     pub snapshot: &'a LakeSnapshot,
     /// Readers of its files.
     pub readers: &'a FileReaders,
+}
+
+/// How rows of pairs are read.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum RowReading {
+    /// The pages that have them are decoded each time.
+    Places,
+    /// All rows of their runs are decoded and kept, if there is room: they are a reference's, which all surfaces share.
+    Kept,
 }
 
 /// Rows of a run in a file.
@@ -55,13 +65,9 @@ impl RunRows<'_> {
         let wanted = WantedColumns::from_names(&self.schema, columns)?;
         let mut found = Vec::new();
         for (file, ranges) in self.find_ranges(std::slice::from_ref(run))? {
+            self.check_owners(file, &ranges).await?;
             for range in ranges {
-                found.extend(self.readers.columns.read_range(file, range.rows.clone(), &wanted).await?);
-                // The first one, and the last one if it is another.
-                let places = range.rows.start as usize..range.rows.end as usize;
-                let mut ends: Vec<_> = places.clone().take(1).chain(places.last()).collect();
-                ends.dedup();
-                self.check_runs(file, &ends, &[run, run]).await?;
+                found.extend(self.readers.columns.read_range(file, range.rows, &wanted).await?);
             }
         }
         Ok(found)
@@ -71,36 +77,27 @@ impl RunRows<'_> {
     ///
     /// # Errors
     /// As [`RunRows::read_run`].
-    pub async fn read_pairs(&self, runs: &[RunId], pairs: &[i32], columns: &[&str]) -> Result<RecordBatch> {
+    pub async fn read_pairs(
+        &self,
+        runs: &[RunId],
+        pairs: &[i32],
+        columns: &[&str],
+        reading: RowReading,
+    ) -> Result<RecordBatch> {
         let wanted = WantedColumns::from_names(&self.schema, columns)?;
-        let has_lists = wanted.schema().fields().iter().any(|field| field.data_type().is_nested());
-        let stored = if has_lists { &[] } else { columns };
-        let stored: Vec<_> = std::iter::once(PAIR).chain(stored.iter().copied()).collect();
-        let stored = WantedColumns::from_names(&self.schema, &stored)?;
+        let stored = PairColumns::new(&self.schema, columns, RowReading::Kept)?;
+        let placed = PairColumns::new(&self.schema, columns, RowReading::Places)?;
         let mut found = Vec::new();
         for (file, ranges) in self.find_ranges(runs)? {
-            let mut places = Vec::new();
-            let mut owners = Vec::new();
-            for RunRange { run, rows } in ranges {
-                let mut start = rows.start as usize;
-                for batch in self.readers.columns.read_range(file, rows, &stored).await? {
-                    let numbers = batch.column(0).as_primitive::<Int32Type>();
-                    let is_wanted: BooleanArray =
-                        numbers.iter().map(|pair| Some(pair.is_some_and(|pair| pairs.contains(&pair)))).collect();
-                    places.extend(is_wanted.values().set_indices().map(|row| start + row));
-                    owners.resize(places.len(), run);
-                    start += batch.num_rows();
-                    if !has_lists && is_wanted.true_count() > 0 {
-                        let kept = filter_record_batch(&batch, &is_wanted)?;
-                        let columns = kept.columns()[1..].to_vec();
-                        found.push(batch_of_rows(wanted.schema(), columns, kept.num_rows())?);
-                    }
+            self.check_owners(file, &ranges).await?;
+            for RunRange { rows, .. } in ranges {
+                let has_room = reading == RowReading::Kept
+                    && self.readers.columns.has_room(file, rows.clone(), &stored.stored).await?;
+                let columns = if has_room { &stored } else { &placed };
+                if let Some(rows) = self.read_range_pairs(file, rows, pairs, columns).await? {
+                    found.push(batch_of_rows(wanted.schema(), columns.in_order(&rows), rows.num_rows())?);
                 }
             }
-            if has_lists && !places.is_empty() {
-                found.push(self.read_places(file, &wanted, &places).await?);
-            }
-            self.check_runs(file, &places, &owners).await?;
         }
         Ok(concat_batches(wanted.schema(), &found)?)
     }
@@ -127,6 +124,37 @@ impl RunRows<'_> {
         Ok(ordered)
     }
 
+    // The stored columns of some pairs, then those of the pages that have these rows; None if there is no such row.
+    async fn read_range_pairs(
+        &self,
+        file: &DataFile,
+        rows: Range<u64>,
+        pairs: &[i32],
+        columns: &PairColumns,
+    ) -> Result<Option<RecordBatch>> {
+        let mut start = rows.start as usize;
+        let mut places = Vec::new();
+        let mut kept = Vec::new();
+        for batch in self.readers.columns.read_range(file, rows, &columns.stored).await? {
+            let numbers = batch.column(0).as_primitive::<Int32Type>();
+            let is_wanted = |row: &usize| numbers.is_valid(*row) && pairs.contains(&numbers.value(*row));
+            let rows: Vec<_> = (0..batch.num_rows()).filter(is_wanted).collect();
+            if !rows.is_empty() {
+                places.extend(rows.iter().map(|row| start + row));
+                let rows = UInt32Array::from_iter_values(rows.into_iter().map(|row| row as u32));
+                kept.push(take_record_batch(&batch, &rows)?);
+            }
+            start += batch.num_rows();
+        }
+        let Some(schema) = kept.first().map(RecordBatch::schema) else { return Ok(None) };
+        let stored = concat_batches(&schema, &kept)?;
+        let Some(placed) = &columns.placed else { return Ok(Some(stored)) };
+        let placed = self.read_places(file, placed, &places).await?;
+        let fields = [schema.fields().as_ref(), placed.schema().fields().as_ref()].concat();
+        let all = [stored.columns(), placed.columns()].concat();
+        Ok(Some(batch_of_rows(&Arc::new(Schema::new(fields)), all, places.len())?))
+    }
+
     async fn read_places(&self, file: &DataFile, wanted: &WantedColumns, places: &[usize]) -> Result<RecordBatch> {
         let metrics = ExecutionPlanMetricsSet::new();
         let metrics = ScanMetrics { metrics: &metrics, partition: 0 };
@@ -134,21 +162,54 @@ impl RunRows<'_> {
         read_placed_rows(reader, wanted, places).await
     }
 
-    // Checks that rows of a merged file are those of their owners.
-    async fn check_runs(&self, file: &DataFile, places: &[usize], owners: &[&RunId]) -> Result<()> {
-        if file.parts.is_empty() || places.is_empty() {
+    // Checks that these rows of a merged file are those of their runs, unless it was done before.
+    async fn check_owners(&self, file: &DataFile, ranges: &[RunRange<'_>]) -> Result<()> {
+        if file.parts.is_empty() {
             return Ok(());
         }
         let wanted = WantedColumns::from_names(&self.schema, &[RUN])?;
-        let named = self.read_places(file, &wanted, places).await?;
-        let names = named.column(0).as_string::<i32>();
-        for (row, (place, run)) in places.iter().zip(owners).enumerate() {
-            if names.is_null(row) || names.value(row) != run.as_str() {
-                let source = format!("row {place} is not of run `{run}`, as its log says").into();
+        for RunRange { run, rows } in ranges {
+            if self.readers.columns.is_owner_known(&file.path, run, rows) {
+                continue;
+            }
+            let places: Vec<_> = (rows.start as usize..rows.end as usize).collect();
+            let named = self.read_places(file, &wanted, &places).await?;
+            let mut names = named.column(0).as_string::<i32>().iter();
+            if let Some(row) = names.position(|name| name != Some(run.as_str())) {
+                let source = format!("row {} is not of run `{run}`, as its log says", places[row]).into();
                 let damaged = LakeError::DataFile { file: file.path.to_string(), source };
                 return Err(DataFusionError::External(damaged.into()));
             }
+            self.readers.columns.note_owner(&file.path, run, rows);
         }
         Ok(())
+    }
+}
+
+/// How wanted columns of pairs are read.
+struct PairColumns {
+    /// Columns that the process keeps: the pairs first.
+    stored: WantedColumns,
+    /// Columns whose pages are decoded.
+    placed: Option<WantedColumns>,
+    /// For each wanted column its place in those that are stored and then placed.
+    places: Vec<usize>,
+}
+
+impl PairColumns {
+    fn new(schema: &SchemaRef, columns: &[&str], reading: RowReading) -> Result<Self> {
+        let others = columns.iter().copied().filter(|name| *name != PAIR);
+        let (placed, mut stored): (Vec<_>, Vec<_>) = others.partition(|_| reading == RowReading::Places);
+        stored.insert(0, PAIR);
+        let all = [&*stored, &placed].concat();
+        Ok(Self {
+            stored: WantedColumns::from_names(schema, &stored)?,
+            placed: (!placed.is_empty()).then(|| WantedColumns::from_names(schema, &placed)).transpose()?,
+            places: columns.iter().filter_map(|name| all.iter().position(|known| known == name)).collect(),
+        })
+    }
+
+    fn in_order(&self, rows: &RecordBatch) -> Vec<ArrayRef> {
+        self.places.iter().map(|place| rows.column(*place).clone()).collect()
     }
 }

@@ -30,7 +30,7 @@ use crate::process_memory::private_bytes;
 const REASON_WAIT: Duration = Duration::from_secs(2);
 
 /// Share of the memory for decoded columns that the engine of pages has.
-const PAGES_SHARE: usize = 4;
+const PAGES_SHARE: usize = 2;
 /// Idle connections that are kept to an engine.
 const IDLE_CONNECTIONS: usize = 32;
 
@@ -41,7 +41,7 @@ pub struct EngineSettings {
     pub program: PathBuf,
     /// Bytes of memory that queries may hold, all of them together.
     pub memory: usize,
-    /// Bytes of decoded columns that the engine of statements keeps; that of pages keeps a quarter of it.
+    /// Bytes of decoded columns that the engine of statements keeps; that of pages keeps half as much.
     pub column_bytes: usize,
     /// Variables of their environment beside the server's own.
     pub environment: Vec<(String, String)>,

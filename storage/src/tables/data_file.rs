@@ -22,8 +22,10 @@ use serde_json::{Map, Value, json};
 
 use crate::{Error, Result};
 
-/// Size of a data page: a reader of one response fetches one page, which also bounds what it decodes.
+/// Size of a data page.
 const PAGE_BYTES: usize = 128 * 1024;
+/// The same of lists: a reader of one response decompresses all lists of its page.
+const LIST_PAGE_BYTES: usize = 32 * 1024;
 /// Size that a row group grows to, before encoding.
 const ROW_GROUP_BYTES: usize = 64 << 20;
 /// Rows of a row group of a table without lists, at most: about sixteen runs of the paper's grid. A reader that looks
@@ -37,8 +39,8 @@ const ZSTD_LEVEL: i32 = 1;
 /// Least and greatest size of a block of a file in memory.
 const LEAST_BLOCK_BYTES: usize = 16 << 10;
 const MOST_BLOCK_BYTES: usize = 1 << 20;
-/// Rows are in its order, so that its differences are small.
-const PAIR: &str = "pair_id";
+/// Columns in whose order rows are, so that their differences are small.
+const ASCENDING: [&str; 3] = ["pair_id", "log_time_ns", "log_time"];
 /// Delta reads statistics of this many leading columns.
 const STATS_COLUMNS: usize = 32;
 /// Longest text that statistics keep: Delta readers compare prefixes, and parameters are long.
@@ -332,7 +334,8 @@ fn rows_a_group(first: &RecordBatch) -> usize {
 //
 // Single values of measurements are not compressed (zstd makes them an eighth smaller): a reader copies them, and makes
 // no decompressor for each column of each file, which takes longer than reading three thousand of them. Numbers of
-// `tnce_d4` have a dictionary: a row has most of its numbers from the seven beside it.
+// `tnce_d4` have a dictionary: a row has most of its numbers from the seven beside it. So have maps of heights: a run's
+// eight are one map, turned and mirrored.
 fn writer_properties(table: Table, schema: &SchemaRef) -> WriterProperties {
     let mut builder = WriterProperties::builder()
         .set_compression(Compression::ZSTD(ZstdLevel::try_new(ZSTD_LEVEL).unwrap_or_default()))
@@ -346,7 +349,7 @@ fn writer_properties(table: Table, schema: &SchemaRef) -> WriterProperties {
         if kind.is_numeric() || (of_measurements && !kind.is_nested()) {
             builder = builder.set_column_compression(ColumnPath::from(name.as_str()), Compression::UNCOMPRESSED);
         }
-        if name == PAIR {
+        if ASCENDING.contains(&name.as_str()) && kind.primitive_width().is_some() {
             let column = ColumnPath::from(name.as_str());
             builder = builder
                 .set_column_dictionary_enabled(column.clone(), false)
@@ -359,11 +362,12 @@ fn writer_properties(table: Table, schema: &SchemaRef) -> WriterProperties {
             false if kind.is_floating() => ColumnPath::new(vec![name]),
             false => continue,
         };
-        if is_list || table != Table::TnceD4 {
+        if !matches!(table, Table::TnceD4 | Table::Heightmaps) {
             builder = builder.set_column_dictionary_enabled(column.clone(), false);
         }
         if is_list {
             builder = builder
+                .set_column_data_page_size_limit(column.clone(), LIST_PAGE_BYTES)
                 .set_column_encoding(column.clone(), Encoding::BYTE_STREAM_SPLIT)
                 .set_column_statistics_enabled(column, EnabledStatistics::None);
         }

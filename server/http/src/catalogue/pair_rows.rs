@@ -10,7 +10,7 @@ use arrow::datatypes::{DataType, Float32Type, Float64Type, Int32Type, Int64Type}
 use arrow::record_batch::RecordBatch;
 use echolake_dsp::mean::SignalMean;
 use echolake_lake::LakeSnapshot;
-use echolake_query::Session;
+use echolake_query::{RowReading, Session};
 use echolake_schema::RunId;
 use echolake_schema::tables::Table;
 use echolake_service::RequestFault;
@@ -237,7 +237,10 @@ impl PairRows {
     }
 
     async fn read_nce(&self, surface: &str, columns: &[&str]) -> Result<RecordBatch, RequestFault> {
-        self.read_rows(Table::Nce, &self.runs_of(surface), &[self.pair], columns).await
+        // Pages of all surfaces show Flat's rows.
+        let reading = if surface == self.flat { RowReading::Kept } else { RowReading::Places };
+        let runs = self.runs_of(surface);
+        Ok(self.session.read_pair_rows(&self.snapshot, Table::Nce, &runs, &[self.pair], columns, reading).await?)
     }
 
     async fn read_rows(
@@ -247,7 +250,8 @@ impl PairRows {
         pairs: &[i32],
         columns: &[&str],
     ) -> Result<RecordBatch, RequestFault> {
-        Ok(self.session.read_pair_rows(&self.snapshot, table, runs, pairs, columns).await?)
+        let reading = RowReading::Places;
+        Ok(self.session.read_pair_rows(&self.snapshot, table, runs, pairs, columns, reading).await?)
     }
 
     // By name and so by time.

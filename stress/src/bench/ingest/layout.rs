@@ -12,7 +12,7 @@ use parquet::file::properties::WriterPropertiesBuilder;
 use super::super::report::BenchReport;
 use super::IngestBenchArgs;
 use super::parquet_files::{
-    FileRows, LEVEL, NumberEncoding, PAGE_BYTES, StoredTableFile, builder_as, read_all, zstd_compression,
+    FileRows, LEVEL, NumberEncoding, StoredTableFile, builder_as, read_all, with_stored_pages, zstd_compression,
 };
 
 /// Page sizes that are compared.
@@ -58,7 +58,7 @@ fn compare_layouts(args: &IngestBenchArgs, file: &Bytes, rows: &FileRows, report
         layout("dictionary, zstd 1", NumberEncoding::Dictionary, zstd_compression(LEVEL)),
     ];
     for FileLayout { name, numbers, compression } in candidates {
-        let properties = builder_as(&metadata, numbers).set_data_page_size_limit(PAGE_BYTES);
+        let properties = with_stored_pages(builder_as(&metadata, numbers), &metadata);
         let properties = properties.set_compression(compression).build();
         let mut size = 0;
         let mut write = f64::INFINITY;

@@ -17,9 +17,10 @@ use parquet::errors::Result as ParquetResult;
 use parquet::file::metadata::ParquetMetaData;
 use parquet::file::properties::{EnabledStatistics, WriterProperties, WriterPropertiesBuilder};
 
-/// The lake's level of zstd and its page size, which its files do not record.
+/// The lake's level of zstd and its sizes of pages, which its files do not record.
 pub(crate) const LEVEL: i32 = 1;
-pub(crate) const PAGE_BYTES: usize = 128 * 1024;
+const PAGE_BYTES: usize = 128 * 1024;
+const LIST_PAGE_BYTES: usize = 32 * 1024;
 /// Rows in a batch, about as many as ingest encodes at a time.
 const BATCH_ROWS: usize = 512;
 
@@ -77,8 +78,8 @@ pub(crate) async fn read_table_files(lake: &Lake) -> anyhow::Result<Vec<StoredTa
 impl FileRows {
     pub fn read(StoredTableFile { bytes: file, .. }: &StoredTableFile) -> anyhow::Result<Self> {
         let builder = ParquetRecordBatchReaderBuilder::try_new(file.clone())?.with_batch_size(BATCH_ROWS);
-        let properties =
-            builder_as(builder.metadata(), NumberEncoding::AsStored).set_data_page_size_limit(PAGE_BYTES).build();
+        let properties = builder_as(builder.metadata(), NumberEncoding::AsStored);
+        let properties = with_stored_pages(properties, builder.metadata()).build();
         let raw = raw_bytes(builder.metadata());
         let reader = builder.build()?;
         let schema = reader.schema();
@@ -112,6 +113,17 @@ pub(crate) fn raw_bytes(metadata: &ParquetMetaData) -> u64 {
     raw.sum()
 }
 
+/// Adds the lake's sizes of pages.
+pub(crate) fn with_stored_pages(
+    builder: WriterPropertiesBuilder,
+    metadata: &ParquetMetaData,
+) -> WriterPropertiesBuilder {
+    let columns = metadata.file_metadata().schema_descr().columns();
+    let lists = columns.iter().filter(|column| column.max_rep_level() > 0).map(|column| column.path().clone());
+    let limit = |builder: WriterPropertiesBuilder, list| builder.set_column_data_page_size_limit(list, LIST_PAGE_BYTES);
+    lists.fold(builder.set_data_page_size_limit(PAGE_BYTES), limit)
+}
+
 /// Writer properties as a file records them, its numbers' encoding apart; compressed as the lake's files are.
 pub(crate) fn builder_as(metadata: &ParquetMetaData, numbers: NumberEncoding) -> WriterPropertiesBuilder {
     let mut builder = WriterProperties::builder()
@@ -124,11 +136,14 @@ pub(crate) fn builder_as(metadata: &ParquetMetaData, numbers: NumberEncoding) ->
         if column.compression() == Compression::UNCOMPRESSED {
             builder = builder.set_column_compression(path.clone(), Compression::UNCOMPRESSED);
         }
-        let split = column.encodings().any(|e| e == Encoding::BYTE_STREAM_SPLIT);
+        let has_encoding = |wanted| column.encodings().any(|encoding| encoding == wanted);
+        if has_encoding(Encoding::DELTA_BINARY_PACKED) {
+            builder = builder.set_column_encoding(path.clone(), Encoding::DELTA_BINARY_PACKED);
+        }
         if column.dictionary_page_offset().is_none() && numbers != NumberEncoding::Dictionary {
             builder = builder.set_column_dictionary_enabled(path.clone(), false);
         }
-        if split && numbers == NumberEncoding::AsStored {
+        if has_encoding(Encoding::BYTE_STREAM_SPLIT) && numbers == NumberEncoding::AsStored {
             builder = builder.set_column_encoding(path.clone(), Encoding::BYTE_STREAM_SPLIT);
         }
         if column.statistics().is_none() {

@@ -311,8 +311,10 @@ impl TestReader {
                 pairs.iter().map(i32::to_string).collect::<Vec<_>>().join(", ")
             );
             let expected = self.answer(&sql).await.unwrap_or_else(|e| panic!("{sql}: {e}"));
-            let found = self.session.read_pair_rows(&self.snapshot, table, &runs, &pairs, &names).await;
-            assert_eq!(sorted_lines(&[found.expect("rows")]), sorted_lines(&expected), "{sql}");
+            for reading in [RowReading::Places, RowReading::Kept] {
+                let found = self.session.read_pair_rows(&self.snapshot, table, &runs, &pairs, &names, reading).await;
+                assert_eq!(sorted_lines(&[found.expect("rows")]), sorted_lines(&expected), "{sql}, {reading:?}");
+            }
         }
     }
 

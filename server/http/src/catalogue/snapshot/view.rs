@@ -247,7 +247,7 @@ fn removed_files(before: &LakeSnapshot, after: &LakeSnapshot) -> Vec<VisibleFile
 // to these.
 fn catalogue_session(service: &QueryService) -> Arc<Session> {
     let quota = QueryQuota { time: Some(LONGEST), ..QueryQuota::default() };
-    let session = service.engine().open_session(&Arc::new(EngineClient::new("catalogue", quota)));
+    let session = service.engine().open_session(&Arc::new(EngineClient::new_program("catalogue", quota)));
     // Most of its queries read a few rows: parts that wait for each other cost more than they save.
     Arc::new(session.with_extension(Arc::new(|context| {
         context.state_ref().write().config_mut().options_mut().execution.target_partitions = 1;
