@@ -202,12 +202,13 @@ impl LakeCatalog {
     }
 
     /// Optimizes the plan of a statement, and keeps it for later runs on its snapshot if these would plan the same.
+    /// That of an engine with workers is not optimized: for them, other rules apply.
     ///
     /// # Errors
     /// As [`PreparedQuery::optimize`].
-    pub fn keep_plan(&self, query: PreparedQuery) -> Result<Arc<PreparedQuery>, Error> {
+    pub fn keep_plan(&self, query: PreparedQuery, has_workers: bool) -> Result<Arc<PreparedQuery>, Error> {
         match self.known_snapshot().filter(|known| Arc::ptr_eq(&known.snapshot, query.snapshot())) {
-            Some(known) => known.plans.keep_plan(query, &known.public_tables),
+            Some(known) => known.plans.keep_plan(query, &known.public_tables, has_workers),
             None => Ok(Arc::new(query)),
         }
     }

@@ -396,7 +396,7 @@ impl Session {
     fn keep_plan(&self, planned: PreparedQuery) -> Result<Arc<PreparedQuery>, Error> {
         match self.extend {
             Some(_) => Ok(Arc::new(planned)),
-            None => self.engine.catalog().keep_plan(planned),
+            None => self.engine.catalog().keep_plan(planned, self.engine.cluster().is_some()),
         }
     }
 

@@ -37,19 +37,30 @@ impl KnownPlans {
         self.0.get(sql)
     }
 
-    /// Optimizes the plan of a statement, and keeps it, if each later run on the snapshot would plan the same: if it reads
-    /// nothing but these tables, and calls no function such as `now()`.
+    /// Keeps the plan of a statement if each later run on the snapshot would plan the same: if it reads nothing but these
+    /// tables, and calls no function such as `now()`. It is optimized first, unless there are workers.
     ///
     /// # Errors
     /// As [`PreparedQuery::optimize`].
-    pub fn keep_plan(&self, query: PreparedQuery, tables: &NamedTables) -> Result<Arc<PreparedQuery>, Error> {
+    pub fn keep_plan(
+        &self,
+        query: PreparedQuery,
+        tables: &NamedTables,
+        has_workers: bool,
+    ) -> Result<Arc<PreparedQuery>, Error> {
         if query.sql.len() > LONGEST_TEXT || !is_repeatable(&query.plan, tables) {
             return Ok(Arc::new(query));
         }
-        set_planning(true);
-        let optimized = query.optimize();
-        set_planning(false);
-        let query = Arc::new(optimized?);
+        let query = match has_workers {
+            true => query,
+            false => {
+                set_planning(true);
+                let optimized = query.optimize();
+                set_planning(false);
+                optimized?
+            }
+        };
+        let query = Arc::new(query);
         if constant_bytes(&query.plan).is_ok_and(|bytes| bytes <= MOST_CONSTANT_BYTES) {
             self.0.insert(query.sql.clone(), query.clone());
         }

@@ -12,6 +12,7 @@ use crate::{EngineClient, Error, QueryEngine, QueryQuota, Session};
 
 async fn test_lake() -> Lake {
     let lake = Lake::open_or_create("memory://", &Rig::paper(), &ReferenceSurfaces::default()).await.expect("a lake");
+    lake.ensure_tables().await.expect("tables");
     put_events(&lake, "flat", "r0", "d", 3).await;
     lake
 }

@@ -162,6 +162,16 @@ impl WantedColumns {
     }
 }
 
+/// Room in the store that columns may take.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum StoreRoom {
+    None,
+    /// What other columns leave.
+    Free,
+    /// A share of the store, whatever it has now.
+    Share,
+}
+
 /// Who reads, for `EXPLAIN ANALYZE`.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct ScanMetrics<'a> {
@@ -247,11 +257,22 @@ impl ColumnStore {
         Ok(found)
     }
 
-    /// Returns whether these columns of some rows of a file may be kept, lists as well: no more than a share of the store.
+    /// Returns whether these columns of some rows of a file are kept, or may be kept, lists as well.
     ///
     /// # Errors
     /// As [`Self::read_range`].
-    pub(crate) async fn has_room(&self, file: &DataFile, rows: Range<u64>, wanted: &WantedColumns) -> Result<bool> {
+    pub(crate) async fn has_room(
+        &self,
+        file: &DataFile,
+        rows: Range<u64>,
+        wanted: &WantedColumns,
+        room: StoreRoom,
+    ) -> Result<bool> {
+        let most = match room {
+            StoreRoom::None => return Ok(false),
+            StoreRoom::Free => self.bytes.saturating_sub(self.columns.weight()),
+            StoreRoom::Share => self.bytes / SCAN_SHARE,
+        };
         let metrics = ExecutionPlanMetricsSet::new();
         let metrics = ScanMetrics { metrics: &metrics, partition: 0 };
         let stored = self.stored_file(&file.path);
@@ -268,7 +289,7 @@ impl ColumnStore {
         let columns =
             columns.filter(|column| column.column_path().parts().first().is_some_and(|n| names.contains(&&**n)));
         let bytes: u64 = columns.map(|column| column.uncompressed_size().unsigned_abs()).sum();
-        Ok(bytes <= self.bytes / SCAN_SHARE)
+        Ok(bytes <= most)
     }
 
     /// Returns whether rows of a file were found to be those of a run.

@@ -24,8 +24,9 @@ use parquet::file::serialized_reader::SerializedPageReader;
 
 use crate::column_store::WantedColumns;
 
-/// Rows between two wanted ones that are decoded rather than skipped by a reader of its own for each.
-const NEAR_ROWS: usize = 32;
+/// Mean distance of rows, in rows, from which on the reader skips what is between them: it decodes all of dense rows, and
+/// so needs all of their pages. It takes rows for dense below 32, counted from the group's first one.
+const SPARSE_ROWS: usize = 128;
 
 /// Reads columns of the rows at some places of a file, which are in order and differ. Of other rows, only those in the
 /// same pages are fetched.
@@ -44,23 +45,23 @@ pub(crate) async fn read_placed_rows(
     let mask = ProjectionMask::columns(described, names);
     let levels = parquet_to_arrow_field_levels(described, mask.clone(), None)?;
     let columns: Vec<_> = (0..described.num_columns()).filter(|column| mask.leaf_included(*column)).collect();
-    let clusters = cluster_places(&metadata, places)?;
-    let parts: Vec<Vec<_>> = clusters
+    let groups = group_places(&metadata, places)?;
+    let parts: Vec<Vec<_>> = groups
         .iter()
-        .map(|cluster| columns.iter().map(|column| (*column, cluster.byte_ranges(&metadata, *column))).collect())
+        .map(|rows| columns.iter().map(|column| (*column, rows.byte_ranges(&metadata, *column))).collect())
         .collect();
     let ranges = parts.iter().flatten().flat_map(|(_, ranges)| ranges.iter().cloned()).collect();
     let mut fetched = reader.get_byte_ranges(ranges).await?.into_iter();
-    let mut rows = Vec::with_capacity(clusters.len());
-    for (cluster, parts) in clusters.into_iter().zip(parts) {
+    let mut rows = Vec::with_capacity(groups.len());
+    for (wanted_rows, parts) in groups.into_iter().zip(parts) {
         let take_bytes = |(column, ranges): (usize, Vec<Range<u64>>)| {
             let starts = ranges.into_iter().map(|range| range.start);
             (column, Arc::new(FetchedColumn { parts: starts.zip(&mut fetched).collect() }))
         };
         let columns = parts.into_iter().map(take_bytes).collect();
-        let pages = FetchedPages { metadata: &metadata, group: cluster.group, columns };
-        let count = cluster.places.len();
-        let selection = Some(cluster.into_selection());
+        let pages = FetchedPages { metadata: &metadata, group: wanted_rows.group, columns };
+        let count = wanted_rows.places.len();
+        let selection = Some(wanted_rows.into_selection());
         for batch in ParquetRecordBatchReader::try_new_with_row_groups(&levels, &pages, count, selection)? {
             rows.push(add_missing_columns(&batch?, wanted.schema())?);
         }
@@ -68,33 +69,33 @@ pub(crate) async fn read_placed_rows(
     Ok(concat_batches(wanted.schema(), &rows)?)
 }
 
-/// Wanted rows of one group of rows that are near to each other.
-struct RowCluster {
+/// Wanted rows of one group of rows.
+struct GroupRows {
     group: usize,
     /// Counted from the group's first row.
     places: Vec<usize>,
 }
 
-impl RowCluster {
-    // Where the pages of a column are that have the cluster's rows, and those between; all of the column if the file has
+impl GroupRows {
+    // Where the pages of a column are that have the rows, and those between dense ones; all of the column if the file has
     // no index of its pages.
     fn byte_ranges(&self, metadata: &ParquetMetaData, column: usize) -> Vec<Range<u64>> {
         let (start, length) = metadata.row_group(self.group).column(column).byte_range();
-        let whole = start..start + length;
-        let (Some(pages), Some(first), Some(last)) =
-            (page_locations(metadata, self.group, column), self.places.first(), self.places.last())
-        else {
-            return std::iter::once(whole).collect();
+        let end = start + length;
+        let Some(pages) = page_locations(metadata, self.group, column) else {
+            return std::iter::once(start..end).collect();
         };
-        let page_of = |place: usize| {
-            let before = pages.partition_point(|page| page.first_row_index <= place as i64);
-            before.saturating_sub(1)
-        };
-        let offset_of = |page: usize| pages.get(page).map_or(whole.end, |page| page.offset as u64);
-        let wanted = offset_of(page_of(*first))..offset_of(page_of(*last) + 1);
+        let page_of = |place: &usize| pages.partition_point(|page| page.first_row_index <= *place as i64).max(1) - 1;
+        let mut wanted: Vec<_> = self.places.iter().map(page_of).collect();
+        wanted.dedup();
+        let is_sparse = self.places.last().is_some_and(|last| last / SPARSE_ROWS > self.places.len());
+        if let (false, Some(first), Some(last)) = (is_sparse, wanted.first(), wanted.last()) {
+            wanted = (*first..=*last).collect();
+        }
+        let offset_of = |page: usize| pages.get(page).map_or(end, |page| page.offset as u64);
         // The values of a dictionary are before the first page.
-        let dictionary = start..offset_of(0);
-        [dictionary, wanted].into_iter().filter(|range| !range.is_empty()).collect()
+        let dictionary = std::iter::once(start..offset_of(0)).filter(|range| !range.is_empty());
+        dictionary.chain(wanted.into_iter().map(|page| offset_of(page)..offset_of(page + 1))).collect()
     }
 
     fn into_selection(self) -> RowSelection {
@@ -108,27 +109,24 @@ impl RowCluster {
     }
 }
 
-fn cluster_places(metadata: &ParquetMetaData, places: &[usize]) -> ParquetResult<Vec<RowCluster>> {
-    let mut groups = metadata.row_groups().iter().enumerate();
-    let mut clusters: Vec<RowCluster> = Vec::new();
+fn group_places(metadata: &ParquetMetaData, places: &[usize]) -> ParquetResult<Vec<GroupRows>> {
+    let mut described = metadata.row_groups().iter().enumerate();
+    let mut groups: Vec<GroupRows> = Vec::new();
     let mut known: Range<usize> = 0..0;
-    let mut group = 0;
     for place in places {
         while *place >= known.end {
             let absent = || ParquetError::General(format!("it has no row {place}"));
-            let (number, described) = groups.next().ok_or_else(absent)?;
-            group = number;
-            known = known.end..known.end + usize::try_from(described.num_rows())?;
-        }
-        let place = place - known.start;
-        match clusters.last_mut().filter(|cluster| cluster.group == group) {
-            Some(cluster) if cluster.places.last().is_some_and(|last| place <= last + NEAR_ROWS) => {
-                cluster.places.push(place);
+            let (group, rows) = described.next().ok_or_else(absent)?;
+            known = known.end..known.end + usize::try_from(rows.num_rows())?;
+            if *place < known.end {
+                groups.push(GroupRows { group, places: Vec::new() });
             }
-            _ => clusters.push(RowCluster { group, places: vec![place] }),
+        }
+        if let Some(rows) = groups.last_mut() {
+            rows.places.push(place - known.start);
         }
     }
-    Ok(clusters)
+    Ok(groups)
 }
 
 fn page_locations(metadata: &ParquetMetaData, group: usize, column: usize) -> Option<&Vec<PageLocation>> {

@@ -15,7 +15,7 @@ use echolake_schema::RunId;
 use echolake_schema::tables::Table;
 use object_store::path::Path;
 
-use crate::column_store::{ScanMetrics, WantedColumns, batch_of_rows};
+use crate::column_store::{ScanMetrics, StoreRoom, WantedColumns, batch_of_rows};
 use crate::lake_table::FileReaders;
 use crate::placed_rows::read_placed_rows;
 use crate::scan_files::{RUN, partitioned_file};
@@ -44,7 +44,7 @@ pub struct RunRows<'a> {
 /// How rows of pairs are read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RowReading {
-    /// The pages that have them are decoded each time.
+    /// The pages that have them are decoded each time, unless all their columns are kept, or there is room to keep them.
     Places,
     /// All rows of their runs are decoded and kept, if there is room: they are a reference's, which all surfaces share.
     Kept,
@@ -87,12 +87,17 @@ impl RunRows<'_> {
         let wanted = WantedColumns::from_names(&self.schema, columns)?;
         let stored = PairColumns::new(&self.schema, columns, RowReading::Kept)?;
         let placed = PairColumns::new(&self.schema, columns, RowReading::Places)?;
+        let has_lists = wanted.schema().fields().iter().any(|field| field.data_type().is_nested());
         let mut found = Vec::new();
         for (file, ranges) in self.find_ranges(runs)? {
             self.check_owners(file, &ranges).await?;
             for RunRange { rows, .. } in ranges {
-                let has_room = reading == RowReading::Kept
-                    && self.readers.columns.has_room(file, rows.clone(), &stored.stored).await?;
+                let room = match reading {
+                    RowReading::Kept => StoreRoom::Share,
+                    RowReading::Places if has_lists => StoreRoom::None,
+                    RowReading::Places => StoreRoom::Free,
+                };
+                let has_room = self.readers.columns.has_room(file, rows.clone(), &stored.stored, room).await?;
                 let columns = if has_room { &stored } else { &placed };
                 if let Some(rows) = self.read_range_pairs(file, rows, pairs, columns).await? {
                     found.push(batch_of_rows(wanted.schema(), columns.in_order(&rows), rows.num_rows())?);

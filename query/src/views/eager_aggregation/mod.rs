@@ -44,6 +44,8 @@ use split_aggregate::SplitAggregate;
 
 /// Rows of a group from which on it is faster to make groups first: they are aggregated twice.
 const ROWS_A_GROUP: u64 = 8;
+/// Versions of a reference that a lake has, about: a rig's Flat and Foam are measured again when it has changed.
+const KNOWN_REFERENCES: u64 = 16;
 /// Values that a column has whose values are few: verdicts, attempts, flags.
 const FEW_VALUES: u64 = 4;
 
@@ -106,7 +108,8 @@ impl EagerAggregation {
             dimensions.remove(&KeyDimension::References);
         }
         let values = |dimension: &KeyDimension| match dimension {
-            KeyDimension::Run | KeyDimension::References => flat.size.runs,
+            KeyDimension::Run => flat.size.runs,
+            KeyDimension::References => flat.size.runs.min(KNOWN_REFERENCES),
             KeyDimension::Pair | KeyDimension::MovedPair => self.lookups.count_pairs(),
             KeyDimension::Symmetry => Symmetry::ALL.len() as u64,
             KeyDimension::Few(_) => FEW_VALUES,

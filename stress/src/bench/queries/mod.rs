@@ -64,6 +64,8 @@ pub(crate) struct QueryBenchArgs {
 struct QueryTimes {
     query: BenchQuery,
     own: f64,
+    /// Of a text that is new each time: its plan is not kept.
+    planned: f64,
     peer: Option<f64>,
     rows: usize,
 }
@@ -188,6 +190,12 @@ fn report_ratios(name: &str, times: &[QueryTimes], [mean, most]: [f64; 2], repor
         report.figure(format!("{name}, geometric mean {of_peer}"), value, "x").goal(FigureGoal::AtMost(mean));
         let title = format!("{name}, slowest {of_peer} ({})", slowest.query.name);
         report.figure(title, ratio, "x").goal(FigureGoal::AtMost(most));
+        let planned = geometric_mean(times.iter().filter_map(|t| Some(t.planned / t.peer?)));
+        report.figure(
+            format!("{name}, each time as a new text, whose plan is not known: mean {of_peer}"),
+            planned,
+            "x",
+        );
     }
 }
 
@@ -207,7 +215,13 @@ async fn time_cold_query(
     let answer = collect_batches(&session, &query.sql).await?;
     let own = start.elapsed().as_secs_f64();
     let peer = peer.map(|peer| peer.time_query(&query.sql)).transpose()?;
-    Ok(QueryTimes { query: query.clone(), own, peer, rows: answer.iter().map(RecordBatch::num_rows).sum() })
+    Ok(QueryTimes {
+        query: query.clone(),
+        own,
+        planned: own,
+        peer,
+        rows: answer.iter().map(RecordBatch::num_rows).sum(),
+    })
 }
 
 // The times of those queries that both engines answered; others are failures of the report.
@@ -247,8 +261,13 @@ async fn compare_engines(
     let rows = answer.iter().map(RecordBatch::num_rows).sum();
     drop(answer);
     let mut own = Vec::new();
+    let mut planned = Vec::new();
     let mut other = Vec::new();
-    for _ in 0..runs {
+    for run in 0..runs {
+        let new_text = format!("{} -- {run}", query.sql);
+        let start = Instant::now();
+        collect_batches(session, &new_text).await?;
+        planned.push(start.elapsed().as_secs_f64());
         let start = Instant::now();
         collect_batches(session, &query.sql).await?;
         own.push(start.elapsed().as_secs_f64());
@@ -256,7 +275,8 @@ async fn compare_engines(
             other.push(peer.time_query(peer_sql)?);
         }
     }
-    Ok(QueryTimes { query, own: median(own), peer: (!other.is_empty()).then(|| median(other)), rows })
+    let peer = (!other.is_empty()).then(|| median(other));
+    Ok(QueryTimes { query, own: median(own), planned: median(planned), peer, rows })
 }
 
 async fn explain_query(session: &Session, query: &BenchQuery) -> Result<()> {
