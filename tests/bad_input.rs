@@ -448,7 +448,7 @@ mod slow {
         }
         let ingest = || {
             let mut command = Command::new("sh");
-            command.args(["-c", "ulimit -c 0; ulimit -f 600; exec \"$0\" --lake lake ingest", ECHOLAKE]);
+            command.args(["-c", "ulimit -c 0; ulimit -f 300; exec \"$0\" --lake lake ingest", ECHOLAKE]);
             run_command(command.current_dir(place.path("")).env_remove("ECHOLAKE_LAKE")).expect("the command starts")
         };
         let first = ingest();
