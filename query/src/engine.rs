@@ -57,8 +57,8 @@ pub struct EngineLimits {
     /// Statements that compute at once, while others wait; None for twice the cores, four at least. Statements whose
     /// readers fetch nothing do not count.
     pub computing: Option<usize>,
-    /// Niceness of the threads that plan and run others' statements than the program's own, -20 to 19; None for that of the process. Without a system
-    /// that lets threads differ, as Linux does, it is the whole process's.
+    /// Niceness of the threads that plan and run statements other than the program's own, -20 to 19; None for that of
+    /// the process. Without a system that lets threads differ, as Linux does, it is the whole process's.
     pub niceness: Option<i32>,
     /// Bytes of decoded columns that the process keeps beside what queries hold; None for 256 MiB.
     pub column_bytes: Option<usize>,

@@ -37,8 +37,8 @@ impl KnownPlans {
         self.0.get(sql)
     }
 
-    /// Keeps the plan of a statement if each later run on the snapshot would plan the same: if it reads nothing but these
-    /// tables, and calls no function such as `now()`. It is optimized first, unless there are workers.
+    /// Keeps the plan of a statement if each later run on the snapshot would plan the same: if it reads nothing but
+    /// these tables, and calls no function such as `now()`. It is optimized first, unless there are workers.
     ///
     /// # Errors
     /// As [`PreparedQuery::optimize`].

@@ -24,8 +24,8 @@ use parquet::file::serialized_reader::SerializedPageReader;
 
 use crate::column_store::WantedColumns;
 
-/// Mean distance of rows, in rows, from which on the reader skips what is between them: it decodes all of dense rows, and
-/// so needs all of their pages. It takes rows for dense below 32, counted from the group's first one.
+/// Mean distance of rows, in rows, from which on the reader skips what is between them: it decodes all of dense rows,
+/// and so needs all of their pages. It takes rows for dense below 32, counted from the group's first one.
 const SPARSE_ROWS: usize = 128;
 
 /// Reads columns of the rows at some places of a file, which are in order and differ. Of other rows, only those in the
@@ -77,8 +77,8 @@ struct GroupRows {
 }
 
 impl GroupRows {
-    // Where the pages of a column are that have the rows, and those between dense ones; all of the column if the file has
-    // no index of its pages.
+    // Where the pages of a column are that have the rows, and those between dense ones; all of the column if the file
+    // has no index of its pages.
     fn byte_ranges(&self, metadata: &ParquetMetaData, column: usize) -> Vec<Range<u64>> {
         let (start, length) = metadata.row_group(self.group).column(column).byte_range();
         let end = start + length;

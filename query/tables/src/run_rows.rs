@@ -44,7 +44,7 @@ pub struct RunRows<'a> {
 /// How rows of pairs are read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RowReading {
-    /// The pages that have them are decoded each time, unless all their columns are kept, or there is room to keep them.
+    /// The pages that have them are decoded each time, unless all their columns are kept, or have room.
     Places,
     /// All rows of their runs are decoded and kept, if there is room: they are a reference's, which all surfaces share.
     Kept,
