@@ -207,7 +207,7 @@ impl LakeCatalog {
     /// # Errors
     /// As [`PreparedQuery::optimize`].
     pub fn keep_plan(&self, query: PreparedQuery, has_workers: bool) -> Result<Arc<PreparedQuery>, Error> {
-        match self.known_snapshot().filter(|known| Arc::ptr_eq(&known.snapshot, query.snapshot())) {
+        match self.known_snapshot().filter(|known| query.is_of_snapshot(&known.snapshot)) {
             Some(known) => known.plans.keep_plan(query, &known.public_tables, has_workers),
             None => Ok(Arc::new(query)),
         }

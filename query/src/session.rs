@@ -76,7 +76,10 @@ impl PreparedQuery {
     /// # Errors
     /// [`Error::Query`] if it cannot be planned.
     pub fn optimize(self) -> Result<Self, Error> {
-        let plan = self.state.optimize(&self.plan).map_err(|e| Error::from_optimizing(&self.sql, &e))?;
+        set_planning(true);
+        let plan = self.state.optimize(&self.plan);
+        set_planning(false);
+        let plan = plan.map_err(|e| Error::from_optimizing(&self.sql, &e))?;
         Ok(Self { plan: OpaqueValue::new(plan), is_optimized: true, ..self })
     }
 
@@ -85,9 +88,9 @@ impl PreparedQuery {
         &self.sql
     }
 
-    /// Returns the snapshot on which it was planned.
-    pub(crate) fn snapshot(&self) -> &Arc<LakeSnapshot> {
-        &self.snapshot
+    /// Returns whether it was planned on this snapshot.
+    pub(crate) fn is_of_snapshot(&self, snapshot: &Arc<LakeSnapshot>) -> bool {
+        Arc::ptr_eq(&self.snapshot, snapshot)
     }
 
     /// Returns the schema of its answers.
@@ -192,7 +195,7 @@ impl Session {
     pub fn query<'a>(&'a self, sql: &'a str) -> BoxFuture<'a, Result<QueryAnswer, Error>> {
         let query = async move {
             let started = self.start_query()?;
-            let prepared = match self.engine.catalog().find_plan(sql).await?.filter(|_| self.extend.is_none()) {
+            let prepared = match self.find_plan(sql, &started.ticket).await? {
                 Some(known) => known,
                 None => {
                     let (session, statement, sql) = (self.clone(), self.parse_sql(sql)?, sql.to_owned());
@@ -273,7 +276,7 @@ impl Session {
     /// # Errors
     /// [`Error::Lake`] if the lake cannot be read.
     pub async fn is_current(&self, prepared: &PreparedQuery) -> Result<bool, Error> {
-        Ok(Arc::ptr_eq(&self.current_snapshot().await?, &prepared.snapshot))
+        Ok(prepared.is_of_snapshot(&self.current_snapshot().await?))
     }
 
     /// Parses one statement.
@@ -392,6 +395,17 @@ impl Session {
         Ok(PreparedQuery { state: OpaqueValue::new(state), plan, snapshot, sql, is_optimized: false })
     }
 
+    // Looking may wait for the lake's store, so the ticket ends it.
+    async fn find_plan(&self, sql: &str, ticket: &QueryTicket) -> Result<Option<Arc<PreparedQuery>>, Error> {
+        if self.extend.is_some() {
+            return Ok(None);
+        }
+        tokio::select! {
+            found = self.engine.catalog().find_plan(sql) => found,
+            why = ticket.wait_for_stop() => Err(Error::from_stop(&why)),
+        }
+    }
+
     // Those of a session with tables or settings of its own are not kept.
     fn keep_plan(&self, planned: PreparedQuery) -> Result<Arc<PreparedQuery>, Error> {
         match self.extend {
@@ -501,9 +515,9 @@ impl Session {
         self.engine.catalog().known_current_snapshot().await
     }
 
-    /// Returns the rows that `SELECT columns FROM table WHERE run_id IN (runs) AND pair_id IN (pairs)` has of a snapshot
-    /// that the session has given, without a plan. The table's rows are
-    /// those of runs, and each has a pair. To be called as a part of [`Session::run_request`].
+    /// Returns the rows that `SELECT columns FROM table WHERE run_id IN (runs) AND pair_id IN (pairs)` has of a
+    /// snapshot that the session has given, without a plan. The table's rows are those of runs, and each has a pair. To
+    /// be called as a part of [`Session::run_request`].
     ///
     /// # Errors
     /// [`Error::Lake`] if the table has a fault or a file is damaged; [`Error::Execution`] if it cannot be read.

@@ -7,7 +7,6 @@ use datafusion::common::TableReference;
 use datafusion::common::tree_node::{TreeNode as _, TreeNodeRecursion};
 use datafusion::error::DataFusionError;
 use datafusion::logical_expr::{Expr, LogicalPlan, Volatility};
-use echolake_functions::set_planning;
 use quick_cache::sync::Cache;
 
 use super::PreparedQuery;
@@ -22,7 +21,7 @@ const MOST_PARTS: usize = 2000;
 /// Most bytes of constants in a plan that is kept.
 const MOST_CONSTANT_BYTES: usize = 256 << 10;
 
-/// Optimized plans by the texts of their statements.
+/// Plans by the texts of their statements.
 pub(crate) struct KnownPlans(Cache<String, Arc<PreparedQuery>>);
 
 impl Default for KnownPlans {
@@ -51,16 +50,7 @@ impl KnownPlans {
         if query.sql.len() > LONGEST_TEXT || !is_repeatable(&query.plan, tables) {
             return Ok(Arc::new(query));
         }
-        let query = match has_workers {
-            true => query,
-            false => {
-                set_planning(true);
-                let optimized = query.optimize();
-                set_planning(false);
-                optimized?
-            }
-        };
-        let query = Arc::new(query);
+        let query = Arc::new(if has_workers { query } else { query.optimize()? });
         if constant_bytes(&query.plan).is_ok_and(|bytes| bytes <= MOST_CONSTANT_BYTES) {
             self.0.insert(query.sql.clone(), query.clone());
         }

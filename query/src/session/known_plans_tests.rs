@@ -1,4 +1,4 @@
-//! Which statements have plans that are kept, and that these are their snapshot's.
+//! Plans are kept of the right statements, and are those of their snapshot.
 
 use std::sync::Arc;
 

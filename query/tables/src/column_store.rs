@@ -166,7 +166,7 @@ impl WantedColumns {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum StoreRoom {
     None,
-    /// What other columns leave.
+    /// The room that other columns leave.
     Free,
     /// A share of the store, whatever it has now.
     Share,
@@ -284,11 +284,11 @@ impl ColumnStore {
         let pieces = stored.pieces.get().map_or(&[] as &[RowPiece], Vec::as_slice);
         let mut groups: Vec<_> = pieces_in_range(pieces, &part).map(|piece| piece.group).collect();
         groups.dedup();
-        let names: Vec<_> = wanted.names.iter().map(|name| &**name).collect();
-        let columns = groups.iter().flat_map(|group| footer.metadata.row_group(*group).columns());
-        let columns =
-            columns.filter(|column| column.column_path().parts().first().is_some_and(|n| names.contains(&&**n)));
-        let bytes: u64 = columns.map(|column| column.uncompressed_size().unsigned_abs()).sum();
+        let names = wanted.names.iter().map(|name| &**name);
+        let mask = ProjectionMask::columns(footer.metadata.file_metadata().schema_descr(), names);
+        let columns = groups.iter().flat_map(|group| footer.metadata.row_group(*group).columns().iter().enumerate());
+        let columns = columns.filter(|(place, _)| mask.leaf_included(*place));
+        let bytes: u64 = columns.map(|(_, column)| column.uncompressed_size().unsigned_abs()).sum();
         Ok(bytes <= most)
     }
 

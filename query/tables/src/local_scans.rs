@@ -12,8 +12,8 @@
 //! - another scan for the first rows of an order reads the order's first column alone of most rows ([`LeadingFilter`]). It
 //!   skips row groups by their statistics, too, but few: each has rows of many surfaces, and so nearly all values;
 //! - other scans read through this process' cache and its footers, also those of a plan that came over the wire;
-//! - values of lists that are aggregated are taken from the lists by all partitions: the lists of a run are read by one,
-//!   and their values are some hundred times as many rows.
+//! - values of lists that are aggregated are taken from the lists by all partitions: one of them reads the lists of a
+//!   run, and their values are some hundred times as many rows.
 //!
 //! The plan's nodes keep their partitions, orders, statistics and rows, so that nodes above need not be planned again.
 

@@ -26,10 +26,10 @@ pub(crate) const PAIR: &str = "pair_id";
 /// A table in one snapshot, whose rows are those of runs, as its reader sees it: they are read by their places in files.
 ///
 /// 1. The snapshot tells which files show rows of a run, and which rows of a merged file these are.
-/// 2. Which rows of these are those of a pair, is said by the pairs that the process has decoded.
+/// 2. The pairs beside these rows, which the process keeps decoded, tell which rows are wanted.
 /// 3. Of other columns, the pages that have the rows are decoded; those of runs that many ask for are kept, too.
 ///
-/// Of merged files the name of the run beside each row is checked, once: which rows are whose is said by the log alone.
+/// Of merged files the name of the run beside each row is checked, once: the log alone says which rows are whose.
 pub struct RunRows<'a> {
     /// The table.
     pub table: Table,
@@ -41,7 +41,7 @@ pub struct RunRows<'a> {
     pub readers: &'a FileReaders,
 }
 
-/// How rows of pairs are read.
+/// Reading of rows of pairs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RowReading {
     /// The pages that have them are decoded each time, unless all their columns are kept, or have room.
@@ -191,7 +191,7 @@ impl RunRows<'_> {
     }
 }
 
-/// How wanted columns of pairs are read.
+/// Wanted columns of pairs, by their reading.
 struct PairColumns {
     /// Columns that the process keeps: the pairs first.
     stored: WantedColumns,
