@@ -165,6 +165,9 @@ impl MessageRelay {
             }
             let is_unread = !self.outgoing.is_empty();
             tokio::select! {
+                // In this order: the engine's answer to the end of its client comes after the end itself, and is not
+                // passed on.
+                biased;
                 () = client_end.cancelled() => return broken_relay(RequestFault::Unauthenticated),
                 () = drain.wait_until_begun(), if !is_unread && !self.awaited.is_any() => {
                     self.outgoing = fatal_message(&RequestFault::Disconnected);
