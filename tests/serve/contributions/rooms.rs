@@ -1,5 +1,7 @@
 //! What users add crosses no project, empties no cache that it does not concern, and its faults stop only its readers.
 
+use std::time::Duration;
+
 use serde_json::json;
 
 use super::super::catalogue::lake;
@@ -16,11 +18,11 @@ fn two_projects() -> TestFolder {
     for surface in ["flat", "foam"] {
         place.acquire(surface, &["--ir-only"]);
     }
-    for project in ["alpha", "beta"] {
-        place.acquire("brick_wall", &["--ir-only", "--project", project]);
-        // One after the other: of two runs of one second in one commit, chance would say which is newer.
-        place.ok(&["ingest"]);
-    }
+    place.acquire("brick_wall", &["--ir-only", "--project", "alpha"]);
+    // The name of a run has its second, then a random tag: of two runs of one second, the tag would say which is newer.
+    std::thread::sleep(Duration::from_secs(1));
+    place.acquire("brick_wall", &["--ir-only", "--project", "beta"]);
+    place.ok(&["ingest"]);
     place
 }
 
