@@ -408,6 +408,11 @@ async fn aggregates_of_moved_rows_are_those_of_measured_ones() {
         let plan = check_query(&engine, &lookups, sql).await;
         assert!(plan.contains("/tnce/") && !plan.contains("/tnce_d4/"), "{sql}: {plan}");
     }
+    // What has no nulls is counted as rows: a group for each pair is not needed.
+    let sql = "select s.typology, count(*), count(t.microphone_y_mm) from tnce_d4 t \
+               join surfaces s on s.surface_id = t.surface_id where t.run_id > 'r2' group by 1";
+    let plan = check_query(&engine, &lookups, sql).await;
+    assert!(plan.contains("/tnce/") && !plan.contains("pair_id"), "{sql}: {plan}");
     // A table without some of the rows is read itself, and so is one whose rows are wanted.
     for sql in ["select symmetry, surface_id, pair_id from tnce_d4 where pair_id = 31", "select count(*) from tnce_d4"]
     {

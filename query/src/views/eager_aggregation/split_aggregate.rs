@@ -6,7 +6,7 @@ use std::sync::Arc;
 use arrow::datatypes::DataType;
 use datafusion::common::metadata::FieldMetadata;
 use datafusion::common::tree_node::TreeNode as _;
-use datafusion::common::{Column, DFSchema};
+use datafusion::common::{Column, DFSchema, JoinType};
 use datafusion::functions::core::coalesce;
 use datafusion::functions_aggregate::count::count_udaf;
 use datafusion::logical_expr::expr::{AggregateFunction, Cast, ScalarFunction};
@@ -19,7 +19,7 @@ use super::flat_aggregate::{FlatAggregate, RowStep};
 use super::{EagerAggregation, KeyDimension};
 
 /// Scalar functions of floats that fail for no value.
-const UNFAILING: [&str; 8] = ["abs", "ceil", "floor", "log10", "nullif", "one_nan", "one_zero", "sqrt"];
+const UNFAILING: [&str; 9] = ["abs", "ceil", "coalesce", "floor", "log10", "nullif", "one_nan", "one_zero", "sqrt"];
 
 /// The halves.
 pub(super) struct SplitAggregate<'a> {
@@ -55,8 +55,11 @@ impl<'a> SplitAggregate<'a> {
         let steps = flat.steps.iter().flat_map(RowStep::exprs);
         flat.group.iter().chain(steps).for_each(|expr| split.add_keys(expr));
         let mut has_lookup = flat.group.iter().any(|expr| split.has_lookup(expr));
+        let one = lit(1_i64);
         for call in &flat.calls {
             let [value] = call.params.args.as_slice() else { return None };
+            // As moved pairs, which need no group of their own then.
+            let value = if call.func.name() == "count" && split.is_never_null(value, flat) { &one } else { value };
             let result = if split.is_of_groups(value) {
                 has_lookup |= split.has_lookup(value);
                 split.add_keys(value);
@@ -137,6 +140,14 @@ impl<'a> SplitAggregate<'a> {
         let (of_rows, joined): (Vec<_>, Vec<_>) = columns.into_iter().partition(|c| self.row_columns.contains(*c));
         (!joined.is_empty() || self.has_lookup(value))
             && of_rows.iter().all(|column| KeyDimension::from_column(&column.name).is_some())
+    }
+
+    // Whether a value has no nulls, so that counting it counts rows. Outer joins make nulls of any column.
+    fn is_never_null(&self, value: &Expr, flat: &FlatAggregate) -> bool {
+        let is_outer = |step: &RowStep| matches!(step, RowStep::Join { join, .. } if join.join_type != JoinType::Inner);
+        !flat.steps.iter().any(is_outer)
+            && self.cannot_fail(value)
+            && value.nullable(&self.scope).is_ok_and(|is_nullable| !is_nullable)
     }
 
     // Whether a value is of a row alone, and fails for no row, also not for one that the join would have left out.
