@@ -56,6 +56,7 @@ fn manifests_and_wav_files() {
     row("a,good.wav,good.wav,0/0/1,0/0/0,20", "exchanged");
     row("a,good.wav,good.wav,0/0/0,0/0/1,NaN", "`NaN` is no number");
     row("a,good.wav,good.wav,0/0/0,0/0/1,400", "temperature (C) is 400");
+    row("a,good.wav,good.wav,0/0/0,0/0/1,", "it is empty, and levels of a model are corrected by it");
     row("../a,good.wav,good.wav,0/0/0,0/0/1,20", "not a valid surface id");
     check("", "it is empty");
     check(HEADER, "no rows");

@@ -1,6 +1,7 @@
 //! Columns of the CSV files that imports read and exports write, so that what goes out comes back in.
 
-/// The manifest of WAV recordings; the first six are needed.
+/// The manifest of WAV recordings; the first five are needed, and the temperature unless
+/// the rig measures at full scale.
 pub const WAV_MANIFEST: [&str; 10] = [
     "surface",
     "recording",
@@ -13,9 +14,9 @@ pub const WAV_MANIFEST: [&str; 10] = [
     "recorded_at",
     "attempt",
 ];
-/// The manifest of responses of REW; the first six are needed.
+/// The manifest of responses of REW; the first five are needed.
 pub const REW_MANIFEST: [&str; 8] =
-    ["surface", "response", "microphone", "speaker", "temperature_c", "timing_offset_ms", "start_secs", "recorded_at"];
+    ["surface", "response", "microphone", "speaker", "timing_offset_ms", "temperature_c", "start_secs", "recorded_at"];
 /// GIR's `combinations.csv`: the order of the matrix's rows, from 1.
 pub const GIR_COMBINATIONS: [&str; 7] =
     ["combination", "mic_layer", "mic_x", "mic_y", "speaker_layer", "speaker_x", "speaker_y"];

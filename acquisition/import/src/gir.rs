@@ -98,7 +98,7 @@ impl GirImport<'_> {
         for ((row, pair), celsius) in pairs.iter().enumerate().zip(&temperatures) {
             at = at.plus_secs(TAKE_SECS);
             let samples = matrix.row(row).iter().map(|x| *x as f32).collect();
-            let response = ImportedResponse { pair: *pair, at, celsius: *celsius, samples, is_corrected: true };
+            let response = ImportedResponse { pair: *pair, at, celsius: Some(*celsius), samples, is_corrected: true };
             response.record_response(&mut recorder, self.rig, self.grid)?;
         }
         let count = pairs.len() as u64;

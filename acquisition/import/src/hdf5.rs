@@ -18,7 +18,7 @@ use crate::hdf5_mapping::{
     DatasetDimension, Hdf5Mapping, PositionMapping, RateMapping, TemperatureMapping, TemperatureUnit,
 };
 use crate::positions::{CoordinateFrame, to_nano};
-use crate::response::{ImportedResponse, least_length};
+use crate::response::{ImportedResponse, describe_unknown_air, least_length};
 use crate::{Error, ImportOptions, ImportedRun, RUN_SECS, content_error};
 
 /// Source name of the import's log entries.
@@ -64,6 +64,9 @@ pub fn check_hdf5(mapping: &Path, rig: &Rig, celsius: Option<Celsius>) -> Result
     ResponseSet::open(mapping, rig, &rig.build_grid()?, celsius).map(drop)
 }
 
+/// The pair, the temperature, if somebody told it, and the samples of a response.
+type ReadResponse = (Pair, Option<Celsius>, Vec<f32>);
+
 struct Hdf5Import<'a> {
     rig: &'a Rig,
     grid: &'a Grid,
@@ -79,7 +82,8 @@ struct ResponseSet<'g> {
     surfaces: Vec<SurfaceId>,
     microphones: Vec<&'g Point>,
     speakers: Vec<&'g Point>,
-    temperatures: AirTemperatures,
+    /// None if nobody told them.
+    temperatures: Option<AirTemperatures>,
 }
 
 /// The axis of each dimension in the responses' dataset.
@@ -132,11 +136,16 @@ impl<'g> ResponseSet<'g> {
         let surfaces = mapping.parse_surfaces(path, measurements)?;
         let counts = [microphones.len(), speakers.len(), measurements];
         let temperatures = match celsius {
-            Some(given) => AirTemperatures { celsius: vec![given], steps: [0; 3] },
-            None => mapped.temperatures(path, mapping.temperature.as_ref(), counts)?,
+            Some(given) => Some(AirTemperatures { celsius: vec![given], steps: [0; 3] }),
+            None => {
+                let mapping = mapping.temperature.as_ref();
+                mapping.map(|mapping| mapped.temperatures(path, mapping, counts)).transpose()?
+            }
         };
         let length = count(axes.sample);
-        let least = temperatures.celsius.iter().map(|c| least_length(rig, *c, false)).max().unwrap_or(0);
+        let of_air = |celsius| least_length(rig, celsius, false);
+        let told = temperatures.iter().flat_map(|told| &told.celsius).map(|celsius| of_air(Some(*celsius)));
+        let least = told.max().unwrap_or_else(|| of_air(None));
         if length < least {
             let expected = format!("{least} at least, for the lake's responses of {}", rig.impulse_response.length);
             return Err(content_error(mapped.path, name, format!("{length} samples"), expected));
@@ -159,6 +168,11 @@ impl<'g> ResponseSet<'g> {
         let start = RunStart { manifest: &manifest, rig: import.rig, surface: &record, relief: None, plan: None };
         let mut recorder = batch.create_run(&path, &start)?;
         recorder.log(started, LogLevel::Info, NAME, "times are made up: the mapping has none")?;
+        let unknown_air = if self.temperatures.is_none() { self.microphones.len() * self.speakers.len() } else { 0 };
+        let notes: Vec<_> = describe_unknown_air(unknown_air, import.rig).into_iter().collect();
+        for note in &notes {
+            recorder.log(started, LogLevel::Warning, NAME, note)?;
+        }
         let shape = &self.responses.shape;
         let block = self.block_shape();
         let mut blocks: Vec<usize> = shape.iter().zip(&block).map(|(n, b)| n.div_ceil(*b)).collect();
@@ -184,15 +198,7 @@ impl<'g> ResponseSet<'g> {
         let count = measured as u64;
         batch.seal_run(recorder, &RunEnd { ended: at, accepted: count, rejected: 0, attempts: count })?;
         let (run_id, surface) = (manifest.run_id, manifest.surface_id);
-        Ok(ImportedRun {
-            path,
-            run_id,
-            surface,
-            measurements: measured,
-            rejected: 0,
-            warnings: Vec::new(),
-            notes: Vec::new(),
-        })
+        Ok(ImportedRun { path, run_id, surface, measurements: measured, rejected: 0, warnings: Vec::new(), notes })
     }
 
     // Reads a block of the dataset, and tells its responses apart.
@@ -202,7 +208,7 @@ impl<'g> ResponseSet<'g> {
         counts: &[usize],
         measurement: usize,
         grid: &Grid,
-    ) -> Result<Vec<(Pair, Celsius, Vec<f32>)>, Error> {
+    ) -> Result<Vec<ReadResponse>, Error> {
         let (file, name) = (&self.mapping.file, &self.mapping.responses.dataset);
         let values = self.responses.read_block(starts, counts).map_err(|what| {
             content_error(
@@ -224,7 +230,7 @@ impl<'g> ResponseSet<'g> {
             for s in 0..counts[speaker] {
                 let (m_of_all, s_of_all) = (starts[microphone] + m, starts[speaker] + s);
                 let PairId(id) = grid.parse_pair(self.microphones[m_of_all], self.speakers[s_of_all])?;
-                let celsius = self.temperatures.find([m_of_all, s_of_all, measurement]);
+                let celsius = self.temperatures.as_ref().map(|told| told.find([m_of_all, s_of_all, measurement]));
                 let first = m * of_microphone + s * of_speaker;
                 let samples = (0..counts[sample]).map(|n| values[first + n * of_sample] as f32).collect();
                 responses.push((grid.pairs()[id as usize], celsius, samples));
@@ -375,18 +381,17 @@ impl MappedFile<'_> {
     fn temperatures(
         &self,
         path: &Path,
-        mapping: Option<&TemperatureMapping>,
+        mapping: &TemperatureMapping,
         [microphones, speakers, measurements]: [usize; 3],
     ) -> Result<AirTemperatures, Error> {
         let hint = "a temperature; hint: --temperature-c says what it was";
         let stored = match mapping {
-            None => return Err(content_error(path, "temperature", "it is missing", hint)),
-            Some(TemperatureMapping::Celsius(celsius)) => {
+            TemperatureMapping::Celsius(celsius) => {
                 let celsius =
                     Celsius::new(*celsius).map_err(|e| content_error(path, "temperature", e.to_string(), hint))?;
                 return Ok(AirTemperatures { celsius: vec![celsius], steps: [0; 3] });
             }
-            Some(TemperatureMapping::Stored(stored)) => stored,
+            TemperatureMapping::Stored(stored) => stored,
         };
         let found = self.variable(&stored.dataset)?;
         let (mut steps, mut expected) = ([0; 3], Vec::new());

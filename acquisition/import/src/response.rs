@@ -10,7 +10,8 @@ use echolake_schema::{Celsius, Grid, Pair, Rig, Timestamp};
 pub(crate) struct ImportedResponse {
     pub pair: Pair,
     pub at: Timestamp,
-    pub celsius: Celsius,
+    /// None if nobody told it.
+    pub celsius: Option<Celsius>,
     pub samples: Vec<f32>,
     /// True if it is on the time axis of the rig's reference temperature.
     pub is_corrected: bool,
@@ -21,7 +22,7 @@ impl ImportedResponse {
     pub fn record_response(self, recorder: &mut Recorder, rig: &Rig, grid: &Grid) -> Result<(), Error> {
         let Self { pair, at, celsius, samples, is_corrected } = self;
         let unknown = f64::NAN;
-        let celsius = celsius.get();
+        let celsius = celsius.unwrap_or(rig.impulse_response.reference_temperature_c).get();
         let [m, s] = [pair.microphone, pair.speaker].map(|id| grid.points()[id.index()].position_mm);
         recorder.poses(at, m, s)?;
         recorder.environment(
@@ -69,8 +70,21 @@ impl ImportedResponse {
     }
 }
 
+/// Describes responses whose temperature nobody told.
+pub(crate) fn describe_unknown_air(responses: usize, rig: &Rig) -> Option<String> {
+    let celsius = rig.impulse_response.reference_temperature_c.get();
+    let note = || {
+        format!(
+            "no temperature is known of {responses} responses: {celsius} C, the reference's, stands in temperature_c, \
+             and nothing is corrected"
+        )
+    };
+    (responses > 0).then(note)
+}
+
 /// Returns the samples that it takes to bring a response to the reference temperature.
-pub(crate) fn least_length(rig: &Rig, celsius: Celsius, is_corrected: bool) -> usize {
+pub(crate) fn least_length(rig: &Rig, celsius: Option<Celsius>, is_corrected: bool) -> usize {
+    let celsius = celsius.unwrap_or(rig.impulse_response.reference_temperature_c);
     let air = AirState::with_known(celsius.get(), None, None);
     let ratio = ReferenceAir::from_response(&rig.impulse_response).time_ratio(&air);
     match rig.impulse_response.length {

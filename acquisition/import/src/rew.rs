@@ -22,7 +22,7 @@ use realfft::num_complex::Complex;
 
 use self::rew_text::RewText;
 use crate::batch::ImportBatch;
-use crate::response::{ImportedResponse, least_length};
+use crate::response::{ImportedResponse, describe_unknown_air, least_length};
 use crate::wav_file::{WavChannel, split_reference};
 use crate::wav_manifest::{ManifestCells, next_record, no_rows, open_manifest};
 use crate::{Error, ImportOptions, ImportedRun};
@@ -63,6 +63,11 @@ pub fn import_rew(
         let mut recorder = batch.create_run(&path, &start)?;
         let measurements = rows.len();
         let mut warnings = Vec::new();
+        let unknown_air = rows.iter().filter(|row| row.response.celsius.is_none()).count();
+        let notes: Vec<_> = describe_unknown_air(unknown_air, rig).into_iter().collect();
+        for note in &notes {
+            recorder.log(started, LogLevel::Warning, NAME, note)?;
+        }
         for RewRow { line, response, warnings: faults, .. } in rows {
             let at = response.at;
             response.record_response(&mut recorder, rig, &grid)?;
@@ -83,7 +88,7 @@ pub fn import_rew(
             measurements,
             warnings,
             rejected: 0,
-            notes: Vec::new(),
+            notes,
         });
     }
     batch.publish_all()?;
@@ -175,8 +180,9 @@ fn parse_row(cells: &ManifestCells<'_>, rig: &Rig, grid: &Grid) -> Result<RewRow
     Ok(RewRow { line: cells.line(), recorded_at: cells.parse_time()?, response, warnings })
 }
 
-fn geometry_secs(pair: Pair, rig: &Rig, grid: &Grid, celsius: Celsius) -> f64 {
+fn geometry_secs(pair: Pair, rig: &Rig, grid: &Grid, celsius: Option<Celsius>) -> f64 {
     let [m, s] = [pair.microphone, pair.speaker].map(|id| grid.points()[id.index()].position_mm);
+    let celsius = celsius.unwrap_or(rig.impulse_response.reference_temperature_c);
     let air = AirState::with_known(celsius.get(), None, None);
     direct_mm(m, s) / 1e3 / ReferenceAir::from_response(&rig.impulse_response).speed_in(&air)
 }

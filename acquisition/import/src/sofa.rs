@@ -19,7 +19,7 @@ use echolake_schema::{Celsius, ErrorCause, Grid, Pair, PairId, Point, Rig, Surfa
 use crate::batch::ImportBatch;
 use crate::hdf5_file::{Hdf5File, Hdf5Variable, place_in_grid};
 use crate::positions::{CoordinateFrame, to_nano};
-use crate::response::{ImportedResponse, least_length};
+use crate::response::{ImportedResponse, describe_unknown_air, least_length};
 use crate::{Error, ImportOptions, ImportedRun, RUN_SECS, content_error};
 
 /// Source name of the import's log entries.
@@ -116,7 +116,8 @@ struct SofaMeasurement {
     /// Row of its response.
     row: usize,
     pair: Pair,
-    celsius: Celsius,
+    /// None if nobody told it.
+    celsius: Option<Celsius>,
     /// ns since 1970.
     time: Option<i64>,
 }
@@ -150,7 +151,7 @@ impl Sofa {
             let expected = format!("{least} at least, for the lake's responses of {}", rig.impulse_response.length);
             return Err(content_error(path, reader.data_name(), format!("{length} samples"), expected));
         }
-        let off = celsius.iter().find(|c| is_ours && (c.get() - reference).abs() > 1e-6);
+        let off = celsius.iter().flatten().find(|c| is_ours && (c.get() - reference).abs() > 1e-6);
         if let Some(off) = off {
             let actual = format!("responses at {} C", off.get());
             return Err(content_error(path, "RoomTemperature", actual, format!("those at the rig's {reference} C")));
@@ -181,7 +182,9 @@ impl Sofa {
         if self.measurements.iter().all(|m| m.time.is_none()) {
             recorder.log(started, LogLevel::Info, NAME, "times are made up: the file has none")?;
         }
-        for warning in &self.warnings {
+        let unknown_air = self.measurements.iter().filter(|m| m.celsius.is_none()).count();
+        let notes: Vec<_> = describe_unknown_air(unknown_air, import.rig).into_iter().collect();
+        for warning in self.warnings.iter().chain(&notes) {
             recorder.log(started, LogLevel::Warning, NAME, warning)?;
         }
         for (measured, at) in self.measurements.iter().zip(times) {
@@ -202,7 +205,7 @@ impl Sofa {
             measurements: count,
             warnings: self.warnings.clone(),
             rejected: 0,
-            notes: Vec::new(),
+            notes,
         })
     }
 
@@ -366,36 +369,36 @@ impl SofaReader<'_> {
     }
 
     // Of each measurement. What is given overrides what the file has.
-    fn temperatures(&mut self, count: usize, given: Option<Celsius>) -> Result<Vec<Celsius>, Error> {
+    fn temperatures(&mut self, count: usize, given: Option<Celsius>) -> Result<Vec<Option<Celsius>>, Error> {
         let Some(given) = given else { return self.temperatures_of_file(count) };
         let of_file = self.temperatures_of_file(count).unwrap_or_default();
-        if let Some(other) = of_file.iter().find(|c| (c.get() - given.get()).abs() > 1e-6) {
+        if let Some(other) = of_file.iter().flatten().find(|c| (c.get() - given.get()).abs() > 1e-6) {
             let (other, given) = (other.get(), given.get());
             self.warnings.push(format!("RoomTemperature is {other} C; taken as {given} C by --temperature-c"));
         }
-        Ok(vec![given; count])
+        Ok(vec![Some(given); count])
     }
 
-    fn temperatures_of_file(&self, count: usize) -> Result<Vec<Celsius>, Error> {
+    // None of each if the file has none.
+    fn temperatures_of_file(&self, count: usize) -> Result<Vec<Option<Celsius>>, Error> {
         let name = "RoomTemperature";
         let refused = |actual: String, expected: &str| {
             content_error(self.path, name, actual, format!("{expected}; hint: --temperature-c says what it was"))
         };
-        let found = self.variable(name)?.ok_or_else(|| refused("it is missing".into(), "temperatures"))?;
+        let Some(found) = self.variable(name)? else { return Ok(vec![None; count]) };
         let zero = match self.file.text_of(name, "Units").trim().to_ascii_lowercase().as_str() {
             "kelvin" | "k" | "" => KELVIN,
             "celsius" | "degree celsius" | "degrees celsius" | "c" => 0.0,
             other => return Err(refused(format!("units `{other}`"), "kelvin or degree celsius")),
         };
+        // Tools fill what nobody measured with 0 kelvin.
+        if zero == KELVIN && found.values.iter().all(|x| *x == 0.0) {
+            return Ok(vec![None; count]);
+        }
         let rows = self.rows(name, &found, count, 1)?;
-        let checked: Result<Vec<_>, _> = rows.into_iter().map(|row| Celsius::new(to_nano(row[0] - zero))).collect();
-        checked.map_err(|e| {
-            if found.values.iter().all(|x| *x == 0.0) {
-                refused("0 kelvin, with which tools fill what nobody measured".into(), "a temperature")
-            } else {
-                refused(e.to_string(), "a temperature")
-            }
-        })
+        let celsius = |row: &[f64]| Celsius::new(to_nano(row[0] - zero)).map(Some);
+        let checked: Result<Vec<_>, _> = rows.into_iter().map(celsius).collect();
+        checked.map_err(|e| refused(e.to_string(), "a temperature"))
     }
 
     // ns since 1970.

@@ -21,6 +21,7 @@ use echolake_schema::messages::{AmbientSample, ImpulseResponse, Measurement, Swe
 use echolake_schema::{Grid, Rig, SampleRate, SurfaceId, Timestamp};
 
 use crate::batch::ImportBatch;
+use crate::response::describe_unknown_air;
 use crate::take_summary::TakeSummary;
 use crate::wav_manifest::{self, ManifestRow};
 use crate::{Error, ImportOptions, ImportedRun, wav_search};
@@ -100,7 +101,9 @@ impl WavImport<'_> {
         }
         let count = rows.len() as u64;
         let rejected = summary.rejected();
-        let notes = summary.describe_takes();
+        let unknown_air = rows.iter().filter(|row| row.celsius.is_none()).count();
+        let notes: Vec<_> =
+            summary.describe_takes().into_iter().chain(describe_unknown_air(unknown_air, self.rig)).collect();
         let logged_at = timed.last().map_or(started, |(time, _)| *time);
         for note in &notes {
             recorder.log(logged_at, LogLevel::Info, NAME, note)?;
@@ -148,7 +151,8 @@ impl WavImport<'_> {
         summary: &mut TakeSummary,
     ) -> Result<Option<String>, Error> {
         let unread = |column, what| Error::Row { path: self.manifest.to_owned(), line: row.line, column, what };
-        let (rig, celsius) = (self.rig, row.celsius.get());
+        let rig = self.rig;
+        let celsius = row.celsius.unwrap_or(rig.impulse_response.reference_temperature_c).get();
         let planned = |cause| Error::Plan { rig: rig.name.clone(), cause };
         let reference = ReferenceAir::from_response(&rig.impulse_response);
         let air = AirState::with_known(celsius, Some(row.humidity_pct), Some(row.pressure_hpa));

@@ -41,6 +41,12 @@ impl DryWav {
         Ok(Self { channel: opened.map_err(|fault| Error::WavFile { fault })? })
     }
 
+    /// Says which of its channels is read; None if it has one.
+    pub fn describe_channel(&self) -> Option<String> {
+        let channels = self.channel.layout.channels;
+        (channels > 1).then(|| format!("{} of {channels}", self.channel.label()))
+    }
+
     /// Sampling rate.
     pub fn rate_hz(&self) -> u32 {
         self.channel.layout.rate_hz

@@ -13,7 +13,7 @@ use crate::Error;
 use crate::wav_file::{WavChannel, common_format};
 
 /// Number of required columns, which come first.
-const NEEDED: usize = 6;
+const NEEDED: usize = 5;
 
 /// A row of the manifest, checked.
 #[derive(Debug, Clone)]
@@ -25,7 +25,8 @@ pub(crate) struct ManifestRow {
     pub is_sweep: bool,
     pub format: SampleFormat,
     pub pair: Pair,
-    pub celsius: Celsius,
+    /// None if nobody told it: of a room alone.
+    pub celsius: Option<Celsius>,
     pub humidity_pct: f64,
     pub pressure_hpa: f64,
     pub recorded_at: Option<Timestamp>,
@@ -148,11 +149,21 @@ impl ManifestCells<'_> {
         self.path.parent().unwrap_or(Path::new("."))
     }
 
-    /// Returns the temperature.
-    pub fn parse_celsius(&self) -> Result<Celsius, Error> {
+    /// Returns the temperature, if there is one.
+    pub fn parse_celsius(&self) -> Result<Option<Celsius>, Error> {
         let column = "temperature_c";
-        let celsius = self.parse_number(column)?.ok_or_else(|| self.cell_error(column, "it is empty"))?;
-        Celsius::new(celsius).map_err(|e| self.cell_error(column, e.to_string()))
+        let celsius = self.parse_number(column)?.map(Celsius::new).transpose();
+        celsius.map_err(|e| self.cell_error(column, e.to_string()))
+    }
+
+    // A sweep through a model is compared with that of Flat in other air. A room is what it is.
+    fn parse_sweep_celsius(&self, rig: &Rig) -> Result<Option<Celsius>, Error> {
+        match self.parse_celsius()? {
+            None if rig.model_scale() != 1.0 => {
+                Err(self.cell_error("temperature_c", "it is empty, and levels of a model are corrected by it"))
+            }
+            known => Ok(known),
+        }
     }
 
     /// Returns the time of the recording, if there is one.
@@ -198,7 +209,7 @@ impl ManifestCells<'_> {
             line: self.line(),
             format,
             pair: self.parse_pair(grid)?,
-            celsius: self.parse_celsius()?,
+            celsius: self.parse_sweep_celsius(rig)?,
             humidity_pct: self.parse_number("humidity_pct")?.unwrap_or(f64::NAN),
             pressure_hpa: self.parse_number("pressure_hpa")?.unwrap_or(f64::NAN),
             recorded_at: self.parse_time()?,

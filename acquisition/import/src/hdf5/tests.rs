@@ -158,8 +158,11 @@ fn what_is_wrong_is_named_and_nothing_is_left() {
     let without = place.mapping(&dimensions, ("[temperature]\ndataset = \"data/kelvin\"\nunits = \"kelvin\"\n", "#"));
     let text = std::fs::read_to_string(&without).expect("read").replace("#dimensions", "# dimensions");
     std::fs::write(&without, text).expect("written");
-    let error = place.import(&without, None).expect_err("no temperature").to_string();
-    assert!(error.contains("temperature: it is missing") && error.contains("--temperature-c"), "{error}");
+    // Nothing is corrected then, and the import says so.
+    let runs = place.import(&without, None).expect("imported");
+    let [note] = runs[0].notes.as_slice() else { panic!("{:?}", runs[0].notes) };
+    assert!(note.starts_with("no temperature is known of 4 responses: 20 C, the reference's"), "{note}");
+    assert!(irs(&runs[0]).iter().all(|ir| ir.temperature_c == 20.0));
     let runs = place.import(&without, Some(19.0)).expect("imported");
     assert!(irs(&runs[0]).iter().all(|ir| ir.temperature_c == 19.0));
 }

@@ -58,7 +58,8 @@ impl RewFolder {
 
     /// Reads a manifest of one row, from the column `response` on.
     fn row(&self, response: &str, rest: &str) -> Result<RewRow, Error> {
-        let text = format!("{}\nroom,{response},0/0/0,0/1/0,20,{rest}\n", REW_MANIFEST[..7].join(","));
+        let header = "surface,response,microphone,speaker,temperature_c,timing_offset_ms,start_secs";
+        let text = format!("{header}\nroom,{response},0/0/0,0/1/0,20,{rest}\n");
         let manifest = self.write("manifest.csv", text.as_bytes());
         let rig = Rig::from_toml(RIG).expect("a rig");
         let mut surfaces = read_rows(&manifest, &rig, &rig.build_grid().expect("a grid"))?;

@@ -152,11 +152,16 @@ fn responses_of_others_come_at_their_own_temperature_and_in_the_order_of_time() 
 }
 
 #[test]
-fn what_a_file_does_not_tell_is_made_up_or_asked_for() {
+fn what_a_file_does_not_tell_is_made_up_and_said() {
     let place = SofaFolder::new();
     let silent = || SofaContent::new().without("MeasurementDate").without("RoomTemperature").without("Data.Delay");
-    let error = place.import(&[("a.sofa", silent())], None).expect_err("no temperature").to_string();
-    assert!(error.contains("RoomTemperature") && error.contains("--temperature-c"), "{error}");
+    // 0 kelvin is with what tools fill what nobody measured.
+    let zero = SofaContent::new().with("RoomTemperature", &[1], &[0.0]);
+    for run in place.import(&[("a.sofa", silent()), ("zero.sofa", zero)], None).expect("imported") {
+        let [note] = run.notes.as_slice() else { panic!("{:?}", run.notes) };
+        assert!(note.starts_with("no temperature is known of 2 responses: 20 C, the reference's"), "{note}");
+        assert!(irs(&run).iter().all(|(_, ir)| ir.temperature_c == 20.0));
+    }
     let runs = place.import(&[("b.sofa", silent())], Some(18.0)).expect("imported");
     let irs = irs(&runs[0]);
     assert!(irs[0].0 < irs[1].0 && irs[0].0 >= 1_767_700_000_000_000_000);
@@ -312,8 +317,7 @@ fn what_is_wrong_is_named_and_nothing_is_left() {
     let same = [0.0, 124f64.atan2(150.0).to_degrees(), 150f64.hypot(124.0) / 1e3];
     refused(SofaContent::new().with("SourcePosition", &[1, 3], &same), "a second response of its pair");
     refused(SofaContent::new().with("RoomTemperature", &[1], &[20.0]), "RoomTemperature");
-    refused(SofaContent::new().with("RoomTemperature", &[1], &[0.0]), "0 kelvin, with which tools");
-    refused(SofaContent::new().with("RoomTemperature", &[1], &[0.0]), "--temperature-c says");
+    refused(SofaContent::new().with("RoomTemperature", &[1], &[20.0]), "--temperature-c says");
     refused(SofaContent::new().with("MeasurementDate", &[2], &[-1.0, 1.0]), "seconds since 1970");
     let place = SofaFolder::new();
     let path = place.0.path().join("text.sofa");

@@ -41,7 +41,11 @@ impl WavFolder {
     }
 
     fn import(&self, progress: &mut dyn FnMut(usize, usize)) -> Result<Vec<ImportedRun>, Error> {
-        let rig = Rig::from_toml("sweep.duration_secs = 0.03").expect("a rig");
+        self.import_by("sweep.duration_secs = 0.03", progress)
+    }
+
+    fn import_by(&self, rig: &str, progress: &mut dyn FnMut(usize, usize)) -> Result<Vec<ImportedRun>, Error> {
+        let rig = Rig::from_toml(rig).expect("a rig");
         let inbox = self.inbox();
         let options = ImportOptions { started: Timestamp(1_767_600_000_000_000_000), folder: &inbox, project: None };
         import_wav(&self.manifest(), &rig, options, progress)
@@ -109,6 +113,20 @@ fn messages_are_in_the_order_of_time_however_the_rows_are() {
     messages.for_each(|m| times.entry(m.channel.topic.clone()).or_default().push(m.log_time));
     assert_eq!(times["/measurement"].len(), 3);
     assert!(times.values().all(|of_topic| of_topic.is_sorted()), "{times:?}");
+}
+
+// Levels of a model are compared with those of its Flat in other air. A room is what it is.
+#[test]
+fn a_room_needs_no_temperature() {
+    let place = WavFolder::new(0.5);
+    let rows = "surface,recording,loopback,microphone,speaker\na,last.wav,good.wav,0/0/0,0/0/1\n";
+    std::fs::write(place.manifest(), rows).expect("written");
+    let error = place.import(&mut |_, _| {}).expect_err("a model").to_string();
+    assert!(error.contains("line 2, column `temperature_c`: it is empty, and levels of a model"), "{error}");
+    let room = "bands.centres_hz = [2500, 5000]\nsweep = { duration_secs = 0.03, high_hz = 20000 }";
+    let runs = place.import_by(room, &mut |_, _| {}).expect("imported");
+    let said = "no temperature is known of 1 responses: 20 C, the reference's, stands in temperature_c";
+    assert!(runs[0].notes.iter().any(|note| note.starts_with(said)), "{:?}", runs[0].notes);
 }
 
 /// Samples of a recording whose direct sound is `late` samples later than geometry gives, and its sweep.
