@@ -116,6 +116,50 @@ fn commands_name_what_a_lake_of_rooms_lacks() {
     }
 }
 
+/// Parameters are those of the room as it was, whatever temperature is told of it, and without one.
+#[test]
+fn parameters_of_a_room_do_not_move_with_the_temperature() {
+    let place = TestFolder::new();
+    let sweep = sweep();
+    write_wav(&place, "sweep.wav", &sweep);
+    write_wav(&place, "room.wav", &record_room(&sweep, 0.4, 2000.0));
+    let row = |(room, celsius)| format!("{room},room.wav,sweep.wav,0 0 1000,2000 0 1000,{celsius}\n");
+    let rows = [("mild", "20"), ("hot", "35"), ("untold", "")].map(row).concat();
+    std::fs::write(place.path("manifest.csv"), format!("{HEADER}{rows}")).expect("written");
+    std::fs::write(place.path("rooms.toml"), ROOM_RIG).expect("written");
+    let import = ["import", "wav", "manifest.csv", "--rig", "rooms.toml"];
+    place.fails(0, &import, "no temperature is known of 1 responses: 20 C, the reference's");
+    place.ok(&["ingest"]);
+    assert_eq!(place.number("select count(distinct ir::varchar) from measurements"), 2.0, "the hot one is corrected");
+    let parameters = |room: &str| {
+        place.sql(&format!(
+            "select * exclude (surface_id, run_id) from room_parameters where surface_id = '{room}' order by midband_hz"
+        ))
+    };
+    let mild = parameters("mild");
+    assert_eq!((parameters("hot"), parameters("untold")), (mild.clone(), mild.clone()));
+    let known = |name: &str| mild.iter().filter(|row| row[name].is_number()).count();
+    assert!(known("c50_db") > 4 && known("t20_s") > 2, "{mild:?}");
+}
+
+/// Levels of two pairs have no uncertainty. They are shown without one.
+#[test]
+fn levels_without_an_uncertainty_are_shown() {
+    let place = lake();
+    import_rooms(&place, &[("flat", 0.3), ("foam", 0.05)]);
+    place.ok(&["ingest"]);
+    let of_hall = "from surface_stats h join surface_stats f on f.band = h.band \
+                   where h.surface_id = 'hall' and f.surface_id = 'flat' and h.band = '1000'";
+    assert_eq!(place.number(&format!("select count(*) {of_hall} and h.p90_mean_u_db is null")), 1.0);
+    let level = place.number(&format!("select h.p90_mean_db - f.p90_mean_db {of_hall}"));
+    let expected = format!("{:.2}", level.abs());
+    place.ok(&["figure", "levels", "hall", "-o", "levels.csv"]);
+    let csv = std::fs::read_to_string(place.path("levels.csv")).expect("read");
+    for text in [place.ok(&["figure", "table", "hall"]), csv] {
+        assert!(text.contains(&expected), "{expected} in {text}");
+    }
+}
+
 /// E21: `listen` takes the response from the surface's newest run, as `twin`, `replay` and `catalogue` do, also if an
 /// older run measured the pair later, or has pairs that the newest lacks.
 #[test]

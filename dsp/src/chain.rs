@@ -108,6 +108,26 @@ impl<T: RealSample> MeasurementPlan<T> {
         self.correction.correct_response(raw, air, ir);
         Ok(())
     }
+
+    /// The same response as measured, whatever the air: its time is that of the recording.
+    ///
+    /// # Errors
+    /// As [`ResponseDeconvolution::run_within`].
+    pub fn compute_measured(
+        &self,
+        recording: &[T],
+        loopback: &[T],
+        measured: &mut [T],
+        scratch: &mut MeasurementScratch<T>,
+    ) -> Result<(), Error> {
+        check_len("the response", measured.len(), self.ir_len)?;
+        let MeasurementScratch { deconvolution, raw } = scratch;
+        self.deconvolution.run_within(self.range_hz, recording, loopback, raw, deconvolution)?;
+        let kept = raw.len().min(measured.len());
+        measured[..kept].copy_from_slice(&raw[..kept]);
+        measured[kept..].fill(T::default());
+        Ok(())
+    }
 }
 
 /// Correction of responses to the reference temperature.

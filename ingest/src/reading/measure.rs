@@ -7,6 +7,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use bytes::Bytes;
 use echolake_dsp::air::AirState;
 use echolake_dsp::chain::{MeasurementParams, MeasurementPlan, MeasurementScratch, ResponseCorrection};
+use echolake_dsp::room_parameters::is_long_enough;
 use echolake_dsp::rounding::{RESPONSE_BITS, round_samples};
 use echolake_dsp::temperature::ReferenceAir;
 use echolake_lake::{Lake, SamplePrecision};
@@ -43,6 +44,8 @@ pub(crate) struct Measurer {
     plans: Mutex<HashMap<usize, Arc<RecordingPlan>>>,
     correction: ResponseCorrection<f32>,
     precision: SamplePrecision,
+    /// True if responses are long enough for parameters of rooms, which need them as measured.
+    keeps_measured: bool,
     /// Memory of earlier chunks, as many as were in memory at once.
     idle_memory: Mutex<Vec<Vec<u8>>>,
 }
@@ -113,6 +116,8 @@ pub(crate) struct Response {
     pub air: AirState,
     pub source: ResponseSource,
     pub ir: Vec<f32>,
+    /// The same without the correction of its temperature, if it is long enough for a room and known.
+    pub measured: Option<Vec<f32>>,
 }
 
 /// Origin of a response; the greater is preferred.
@@ -163,6 +168,7 @@ impl Measurer {
             plans: Mutex::default(),
             correction: ResponseCorrection::new(ReferenceAir::from_response(response), response.division),
             precision: lake.config().samples,
+            keeps_measured: is_long_enough(response.length, lake.rig().sweep.rate_hz.get()),
             idle_memory: Mutex::default(),
         }
     }
@@ -186,7 +192,8 @@ impl Measurer {
     }
 
     fn response_bytes(&self) -> u64 {
-        2 * MESSAGE_BYTES + 4 * self.rig.impulse_response.length as u64
+        let lists = if self.keeps_measured { 2 } else { 1 };
+        2 * MESSAGE_BYTES + lists * 4 * self.rig.impulse_response.length as u64
     }
 
     /// Reads all messages of a chunk, within the run's budget. A damaged message is reported and skipped.
@@ -269,21 +276,28 @@ impl Measurer {
         check_bytes(format, count, &sweep.microphone)?;
         check_bytes(format, count, &sweep.loopback)?;
         let planned = self.recording_plan(count)?;
-        let mut ir = vec![0.0; self.rig.impulse_response.length];
-        let measured = planned.with_buffers(count, |buffers| {
+        let length = self.rig.impulse_response.length;
+        let mut ir = vec![0.0; length];
+        let mut measured = self.keeps_measured.then(|| vec![0.0; length]);
+        let is_measured = planned.with_buffers(count, |buffers| {
             let MeasurementBuffers { microphone, loopback, scratch } = buffers;
             samples::decode_samples(format, &sweep.microphone, microphone).map_err(|e| e.to_string())?;
             samples::decode_samples(format, &sweep.loopback, loopback).map_err(|e| e.to_string())?;
-            match planned.plan.compute_ir(microphone, loopback, &air, &mut ir, scratch) {
+            let of_room = match &mut measured {
+                Some(samples) => planned.plan.compute_measured(microphone, loopback, samples, scratch),
+                None => Ok(()),
+            };
+            match of_room.and_then(|()| planned.plan.compute_ir(microphone, loopback, &air, &mut ir, scratch)) {
                 Ok(()) => Ok(true),
                 Err(echolake_dsp::Error::NoLoopback) => Ok(false),
                 Err(e) => Err(e.to_string()),
             }
         });
-        if !measured? {
+        if !is_measured? {
             return Ok(None);
         }
         self.round_response(&mut ir);
+        measured.iter_mut().for_each(|samples| self.round_response(samples));
         Ok(Some(Response {
             pair: sweep.pair_id,
             attempt: sweep.attempt,
@@ -292,6 +306,7 @@ impl Measurer {
             air,
             source: ResponseSource::Sweep,
             ir,
+            measured,
         }))
     }
 
@@ -311,6 +326,7 @@ impl Measurer {
         }
         let length = self.rig.impulse_response.length;
         let mut ir = vec![0.0; length];
+        let mut measured = None;
         let source = if given.temperature_corrected {
             let kept = given
                 .samples
@@ -322,9 +338,15 @@ impl Measurer {
             return Ok(None);
         } else {
             self.correction.correct_response(&given.samples, &air, &mut ir);
+            measured = self.keeps_measured.then(|| {
+                let mut samples: Vec<f32> = given.samples.iter().copied().take(length).collect();
+                samples.resize(length, 0.0);
+                samples
+            });
             ResponseSource::Ir
         };
         self.round_response(&mut ir);
+        measured.iter_mut().for_each(|samples| self.round_response(samples));
         Ok(Some(Response {
             pair: given.pair_id,
             attempt: given.attempt,
@@ -333,6 +355,7 @@ impl Measurer {
             air,
             source,
             ir,
+            measured,
         }))
     }
 

@@ -50,6 +50,7 @@ fn measurement_batch(rig: &Rig, grid: &Grid, keys: &RunKeys, rows: &[(Measuremen
         .push_texts("source", rows.iter().map(|(_, r)| r.source.label()))
         .push_longs("chunk_offset", rows.iter().map(|(_, r)| r.chunk_offset as i64))
         .push_lists("ir", join_responses(rows))
+        .push_optional_lists("measured_ir", rows.iter().map(|(_, r)| r.measured.as_deref()))
         .finish()?;
     Ok(batch)
 }

@@ -3,8 +3,8 @@
 use std::sync::Arc;
 
 use arrow::array::{
-    Array as _, ArrayRef, AsArray as _, BooleanArray, Float32Array, Float64Array, Int32Array, Int64Array, ListArray,
-    StringArray, TimestampMicrosecondArray,
+    Array as _, ArrayRef, AsArray as _, BooleanArray, Float32Array, Float32Builder, Float64Array, Int32Array,
+    Int64Array, ListArray, ListBuilder, StringArray, TimestampMicrosecondArray,
 };
 use arrow::buffer::OffsetBuffer;
 use arrow::datatypes::{DataType, Field, Float32Type, Float64Type, SchemaRef};
@@ -95,6 +95,21 @@ impl BatchBuilder {
         let child = Arc::new(Field::new(LIST_CHILD, DataType::Float32, false));
         let offsets = OffsetBuffer::from_repeated_length(each, self.rows);
         self.push_column(name, Arc::new(ListArray::new(child, offsets, Arc::new(Float32Array::from(values)), None)))
+    }
+
+    /// Adds a column of lists, nulls among them.
+    pub fn push_optional_lists<'a>(
+        &mut self,
+        name: &str,
+        lists: impl IntoIterator<Item = Option<&'a [f32]>>,
+    ) -> &mut Self {
+        let mut builder = ListBuilder::new(Float32Builder::new());
+        builder = builder.with_field(Field::new(LIST_CHILD, DataType::Float32, false));
+        for list in lists {
+            builder.values().append_slice(list.unwrap_or_default());
+            builder.append(list.is_some());
+        }
+        self.push_column(name, Arc::new(builder.finish()))
     }
 
     /// Adds three columns: `pair_id`, `microphone` and `speaker`, each after the prefix.

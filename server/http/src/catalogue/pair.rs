@@ -160,7 +160,11 @@ struct RoomBand {
     d50: Option<f64>,
     ts_ms: Option<f64>,
     range_db: Option<f64>,
+    /// By how much T30 is longer than T20.
+    curvature_percent: Option<f64>,
     reason: Option<String>,
+    /// Why the values may not be what they are taken for, as of a decay with two slopes.
+    doubt: Option<String>,
 }
 
 const GEOMETRY: &str = "select pair_id, microphone, speaker, \
@@ -169,7 +173,8 @@ const GEOMETRY: &str = "select pair_id, microphone, speaker, \
     make_array(specular_x_mm, specular_y_mm) as specular_mm, \
     make_array(fresnel_major_2000_mm, fresnel_minor_2000_mm) as low_mm, \
     make_array(fresnel_major_40000_mm, fresnel_minor_40000_mm) as high_mm from pairs order by pair_id";
-const ROOM: &str = "select midband_hz, edt_s, t20_s, t30_s, c50_db, c80_db, d50, ts_ms, range_db, reason \
+const ROOM: &str = "select midband_hz, edt_s, t20_s, t30_s, c50_db, c80_db, d50, ts_ms, range_db, \
+    curvature_percent, reason, doubt \
     from room_parameters where surface_id = $1 and pair_id = $2 and run_id = $3 order by midband_hz nulls first";
 
 impl CatalogueRequest {
