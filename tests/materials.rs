@@ -125,6 +125,14 @@ mod slow {
             assert!((difference_db - expected_db).abs() < 1e-4, "{difference_db} {expected_db}");
         }
         place.fails(1, &[&listen[..], &["-o", "sounds"]].concat(), "sounds");
+        // The same samples, said to be those of two channels in turn.
+        let mut stereo = std::fs::read(place.path("click.wav")).expect("read");
+        stereo[22] = 2;
+        stereo[28..32].copy_from_slice(&(4 * 48_000u32).to_le_bytes());
+        stereo[32] = 4;
+        std::fs::write(place.path("stereo.wav"), stereo).expect("written");
+        let said = "--dry is `stereo.wav`, channel 1 of 2; hint: `file.wav#2` names the second one";
+        place.fails(0, &["listen", "stretcher_bond", "7", "--dry", "stereo.wav", "-o", "stereo"], said);
         for (args, expected) in [
             (["marble", "7", "click.wav"], "no surface `marble`"),
             (["flat", "99999", "click.wav"], "surface `flat` has no reflected_ir of pair 99999"),

@@ -57,6 +57,9 @@ struct ResponseRow {
 pub(crate) async fn run_listen(args: &ListenArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let lake = Lake::open(lake_url).await?;
     let dry = DryWav::open(&args.dry).context("--dry")?;
+    if let Some(channel) = dry.describe_channel() {
+        eprintln!("--dry is {channel}; hint: `file.wav#2` names the second one");
+    }
     let session = Session::new(&lake)?;
     let surface = newest_response(&session, args, args.surface.as_str()).await?;
     let flat = surface.flat_reference.clone().with_context(|| format!("{} has no Flat", args.surface))?;

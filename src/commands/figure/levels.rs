@@ -110,7 +110,8 @@ impl<'a> LevelTable<'a> {
             (LevelReference::FlatBand, false) => {
                 let flat = self.stored_value(&surface.flat_reference, band)?;
                 let flat_u = if self.kind == LevelKind::Unbiased { flat.u_db } else { Some(0.0) };
-                Some(LevelValue { level_db: own.level_db - flat.level_db, u_db: Some(own.u_db?.hypot(flat_u?)) })
+                let u_db = own.u_db.zip(flat_u).map(|(own, flat)| own.hypot(flat));
+                Some(LevelValue { level_db: own.level_db - flat.level_db, u_db })
             }
         }
     }
@@ -121,7 +122,12 @@ impl<'a> LevelTable<'a> {
         let Some(base) = self.base.filter(|base| base.surface_id != surface.surface_id) else { return Some(own) };
         let other = self.level_value(base, band)?;
         let is_flat = base.surface_id == surface.flat_reference && self.kind == LevelKind::Measured;
-        let other_u = if is_flat { Some(0.0) } else { other.u_db.or(Some(0.0)) };
+        // A Flat over itself has none, and needs none.
+        let other_u = match other.u_db {
+            None if base.surface_id == base.flat_reference => Some(0.0),
+            _ if is_flat => Some(0.0),
+            known => known,
+        };
         let u_db = own.u_db.zip(other_u).map(|(own, other)| own.hypot(other));
         Some(LevelValue { level_db: own.level_db - other.level_db, u_db })
     }
