@@ -54,7 +54,8 @@ pub use levels::{
 pub use real::RealSample;
 pub use realfft::num_complex::Complex;
 pub use reflection::{
-    air, air_correction, arrival, far_field, foam, foam_reflection, fresnel, geometry, kirchhoff, scattering,
+    air, air_correction, arrival, far_field, foam, foam_reflection, fresnel, geometry, kirchhoff, periodic_profile,
+    relief_coefficients, repeating_relief, scattering,
 };
 pub use relief::{height_field, heights};
 pub use similarity::{components, correlation, self_organising_map, significance};

@@ -15,13 +15,16 @@ is columns `detail_phase_*` of table `surfaces`: the phase of its details that a
     python tests/simulation/compare_bem.py waves joint1.2  # these reliefs
     python tests/simulation/compare_bem.py --write FILE    # and puts the table between the markers in FILE
     python tests/simulation/compare_bem.py --cylinder
-    python tests/simulation/compare_bem.py --far-field --write docs/materials.md  # five minutes
+    python tests/simulation/compare_bem.py --far-field --write docs/materials.md  # ten minutes
 
 With `--far-field` the table has coefficients by band, of 3 frequencies each: diffusion by ISO 17497-2, normalised by
 the flat bar, and scattering by Mommertz's correlation with the flat bar; the program's is 1 less the share that is
-mirrored. The far field has plane waves from 0, 30 and 60 degrees to both sides, with weights for random incidence, and
-37 receivers, by the boundary-element method and as `echolake_dsp::far_field` has it. The last row is what the lake's
-function `scattering` makes of the boundary elements' pressures at the 120 pairs of the grid.
+mirrored. The far field has plane waves from 0, 30 and 60 degrees to both sides, with weights for random incidence, by
+the boundary-element method and as `echolake_dsp::far_field` has it. Diffusion has 37 receivers. Scattering has 721: 37
+stand in the middle of the mirror's narrow beam, and count it for more than it is. Beside each stands the standard
+uncertainty that `echolake_dsp::relief_coefficients` gives to Kirchhoff's approximation, from the phase of the details
+that are narrower than a wavelength; a test in that module compares the table with its constants. The last row is what
+the lake's function `scattering` makes of the boundary elements' pressures at the 120 pairs of the grid.
 """
 
 import argparse
@@ -44,6 +47,7 @@ FEW = np.polynomial.legendre.leggauss(2)
 MANY = np.polynomial.legendre.leggauss(8)
 # Receivers and sources of ISO 17497-2, and the sources' weights for random incidence.
 RECEIVER_ANGLES = np.radians(np.arange(-90, 91, 5))
+FINE_ANGLES = np.radians(np.arange(-360, 361) / 4)
 SOURCE_ANGLES = np.radians([0, -30, 30, -60, 60])
 SOURCE_WEIGHTS = np.array([1, 3, 3, 3, 3]) / 13
 # Rows of the table: energies over Flat, and root mean square differences of the pairs from the boundary-element method.
@@ -113,7 +117,7 @@ class BoundaryMesh:
         return near
 
     def all_scattered(self, k, sources, receivers):
-        """The same, and that of plane waves far away, `[37, 5]`, but for a common factor."""
+        """The same, and that of plane waves far away, `[721, 5]`, but for a common factor."""
         d = self.middle[:, None] - sources[None]
         r = np.hypot(d[..., 0], d[..., 1])
         h0, h1 = hankel(k * r)
@@ -123,7 +127,7 @@ class BoundaryMesh:
         both = np.hstack([incident, waves])
         both = solve(self.matrix(k), both, overwrite_a=True, overwrite_b=True, check_finite=False)
         pressure, of_waves = both[:, : len(sources)], both[:, len(sources) :]
-        to_receiver = np.stack([np.sin(RECEIVER_ANGLES), np.cos(RECEIVER_ANGLES)])
+        to_receiver = np.stack([np.sin(FINE_ANGLES), np.cos(FINE_ANGLES)])
         out, far = 0, 0
         for t, w in zip(*FEW, strict=True):
             d = receivers[:, None] - (self.middle + self.half * t)[None]
@@ -236,12 +240,12 @@ def cell_heights(name):
     return height, (np.arange(FACETS) + 0.5) * WIDTH / FACETS - WIDTH / 2
 
 
-def detail_phases(name):
-    """Phase by band of what is left of a relief beside its mean over a wavelength, root mean square."""
+def detail_phases(name, frequencies=CENTRES):
+    """Phase by frequency of what is left of a relief beside its mean over a wavelength, root mean square."""
     height, _ = cell_heights(name)
     sums = np.concatenate([[0.0], np.cumsum(height)])
     place, phases = np.arange(FACETS), []
-    for hz in CENTRES:
+    for hz in frequencies:
         half = round((SPEED / hz / (WIDTH / FACETS) - 1) / 2)
         low, high = np.maximum(place - half, 0), np.minimum(place + half + 1, FACETS)
         detail = height - (sums[high] - sums[low]) / (high - low)
@@ -339,8 +343,8 @@ def far_kirchhoff(name, hz):
     return out
 
 
-def far_coefficients(fields, flat):
-    """Normalised diffusion and scattering of a band, from pressures `[frequencies, 37, 5]`."""
+def far_diffusion(fields, flat):
+    """Normalised diffusion of a band, from pressures `[frequencies, 37, 5]`."""
 
     def diffusion(pressures):
         energy = (np.abs(pressures) ** 2).sum(0)
@@ -348,9 +352,13 @@ def far_coefficients(fields, flat):
         return (energy.sum(0) ** 2 - square) / (len(energy) - 1) / square
 
     d, flat_d = diffusion(fields), diffusion(flat)
+    return ((d - flat_d) / (1 - flat_d)) @ SOURCE_WEIGHTS
+
+
+def far_scattering(fields, flat):
+    """Scattering of a band, from pressures `[frequencies, 721, 5]`."""
     coherent = (np.abs((fields * flat.conj()).sum(1)) ** 2 / (np.abs(flat) ** 2).sum(1)).sum(0)
-    scattering = 1 - coherent / (np.abs(fields) ** 2).sum((0, 1))
-    return ((d - flat_d) / (1 - flat_d)) @ SOURCE_WEIGHTS, scattering @ SOURCE_WEIGHTS
+    return (1 - coherent / (np.abs(fields) ** 2).sum((0, 1))) @ SOURCE_WEIGHTS
 
 
 def mirrored_share(name, hz):
@@ -389,13 +397,17 @@ def far_table(names):
     yield "| --- | --- |" + " ---: |" * len(CENTRES)
     for name in names:
         near, far, by_kirchhoff = fields(name)
-        exact_values = np.array([far_coefficients(far[b], far_flat[b]) for b in bands]).T
-        program = np.array([far_coefficients(by_kirchhoff[b], kirchhoff_flat[b]) for b in bands]).T
+        to_37 = slice(None, None, 20)
+        phase = np.array([np.mean(detail_phases(name, frequencies[b])) for b in bands])
+        scattering = np.array([np.mean([1 - mirrored_share(name, hz) for hz in frequencies[b]]) for b in bands])
         rows = [
-            ("diffusion, boundary elements", exact_values[0]),
-            ("`diffusion_normalised_*`", program[0]),
-            ("scattering, boundary elements", exact_values[1]),
-            ("`far_scattering_*`", [np.mean([1 - mirrored_share(name, hz) for hz in frequencies[b]]) for b in bands]),
+            ("diffusion, boundary elements", [far_diffusion(far[b][:, to_37], far_flat[b][:, to_37]) for b in bands]),
+            ("diffusion, Kirchhoff", [far_diffusion(by_kirchhoff[b], kirchhoff_flat[b]) for b in bands]),
+            ("its standard uncertainty", np.hypot(0.01, 0.45 * phase)),
+            ("scattering, boundary elements", [far_scattering(far[b], far_flat[b]) for b in bands]),
+            ("scattering, Kirchhoff", scattering),
+            ("its standard uncertainty", np.hypot(0.02, 0.8 * phase * (1 - scattering))),
+            ("phase of details, rad", phase),
             ("`scattering` of the grid's pairs", [grid_scattering(near[b], near_flat[b]) for b in bands]),
         ]
         for n, (label, values) in enumerate(rows):

@@ -9,4 +9,7 @@ pub mod foam_reflection;
 pub mod fresnel;
 pub mod geometry;
 pub mod kirchhoff;
+pub mod periodic_profile;
+pub mod relief_coefficients;
+pub mod repeating_relief;
 pub mod scattering;

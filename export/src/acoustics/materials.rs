@@ -19,10 +19,13 @@ pub struct MaterialBand {
     pub scattering_reason: Option<String>,
     pub specular_loss: Option<f64>,
     pub specular_loss_u: Option<f64>,
-    /// Computed by Kirchhoff's approximation.
+    /// Computed from the relief.
     pub far_scattering: Option<f64>,
-    /// Computed by Kirchhoff's approximation.
+    pub far_scattering_u: Option<f64>,
+    /// Computed from the relief by Kirchhoff's approximation.
     pub diffusion_normalised: Option<f64>,
+    pub diffusion_normalised_u: Option<f64>,
+    pub far_field_reason: Option<String>,
     /// Origin of the surface's signals, as `measured` or `simulated`.
     pub origin: String,
 }
@@ -129,7 +132,10 @@ mod tests {
             specular_loss: Some(0.5),
             specular_loss_u: None,
             far_scattering: None,
+            far_scattering_u: None,
             diffusion_normalised: None,
+            diffusion_normalised_u: None,
+            far_field_reason: None,
             origin: "simulated".into(),
         }
     }
@@ -161,7 +167,7 @@ mod tests {
         assert_eq!(choras["origins"], json!({ "b": "simulated" }));
         let (csv, _) = format_materials(&rows, MaterialFormat::Csv).expect("materials");
         let text = String::from_utf8(csv).expect("text");
-        assert!(text.contains("\na,500.0,,,no board,0.5,0.05,,0.5,,,,simulated\n"), "{text}");
+        assert!(text.contains("\na,500.0,,,no board,0.5,0.05,,0.5,,,,,,,simulated\n"), "{text}");
         for format in [MaterialFormat::Pyroomacoustics, MaterialFormat::Csv] {
             assert!(matches!(format_materials(&[], format), Err(Error::Nothing { .. })));
         }

@@ -4,8 +4,10 @@ use std::f64::consts::{FRAC_1_SQRT_2, SQRT_2, TAU};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use arrow::record_batch::RecordBatch;
-use echolake_dsp::far_field::{FarFieldCoefficients, FarFieldPlan};
+use echolake_dsp::far_field::FarFieldPlan;
 use echolake_dsp::height_field::HeightField;
+use echolake_dsp::relief_coefficients::{ReliefCoefficients, estimate_coefficients};
+use echolake_dsp::scattering::UncertainNumber;
 use echolake_dsp::temperature::ReferenceAir;
 use echolake_lake::ReferenceSurfaces;
 use echolake_schema::tables::Table;
@@ -17,13 +19,18 @@ use crate::error::{Error, Result};
 /// Frequencies of a band at which the far field is computed: of thirds of an octave.
 const FAR_FIELD_FREQUENCIES: usize = 3;
 
+/// Wave numbers of a band, rad/m, or why it has no coefficients.
+type BandWaves = std::result::Result<Vec<f64>, &'static str>;
+/// Coefficients of a band, or why it has none.
+type BandCoefficients = std::result::Result<ReliefCoefficients, &'static str>;
+
 /// Cache of the plan for far fields of the reliefs of a lake, most of which have the same size and number of cells.
 #[derive(Default)]
 pub(crate) struct FarFieldCache(Mutex<Option<Arc<FarFieldPlan>>>);
 
 impl FarFieldCache {
     // Plans for these wave numbers of bands, unless the last relief was like this one.
-    fn find_plan(&self, relief: &HeightField, bands: &[Option<Vec<f64>>]) -> Arc<FarFieldPlan> {
+    fn find_plan(&self, relief: &HeightField, bands: &[BandWaves]) -> Arc<FarFieldPlan> {
         let mut last = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         match last.as_ref().filter(|plan| plan.fits_field(relief)) {
             Some(plan) => plan.clone(),
@@ -52,13 +59,22 @@ pub(crate) fn surface_row(
     let far = match &heights {
         Some(heights) => compute_far_fields(heights, rig, far_fields)
             .map_err(|cause| Error::Kernel { file: keys.run.to_string(), cause })?,
-        None => vec![None; rig.bands.centres_hz.len()],
+        None => vec![Err("no heights of the relief"); rig.bands.centres_hz.len()],
     };
     for ((band, hz), far) in rig.band_names().iter().zip(&rig.bands.centres_hz).zip(far) {
         let phase = heights.as_ref().and_then(|heights| detail_phase(heights, rig, *hz));
         row.push_floats(&format!("detail_phase_{band}"), [phase]);
-        row.push_floats(&format!("diffusion_normalised_{band}"), [far.map(|far| far.diffusion_normalised as f32)]);
-        row.push_floats(&format!("far_scattering_{band}"), [far.map(|far| far.scattering as f32)]);
+        let known = far.ok();
+        let numbers = [
+            ("diffusion_normalised", known.and_then(|far| far.diffusion_normalised.ok())),
+            ("far_scattering", known.and_then(|far| far.scattering.ok())),
+        ];
+        for (name, number) in numbers {
+            let uncertainty = number.and_then(|number: UncertainNumber| number.uncertainty);
+            row.push_floats(&format!("{name}_{band}"), [number.map(|number| number.value as f32)]);
+            row.push_floats(&format!("{name}_u_{band}"), [uncertainty.map(|u| u as f32)]);
+        }
+        row.fill_text(&format!("far_field_reason_{band}"), describe_gaps(&far).as_deref());
     }
     let row = row
         .fill_text("panel", keys.surface.panel())
@@ -90,26 +106,47 @@ fn detail_phase(heights: &HeightField, rig: &Rig, hz: f64) -> Option<f32> {
     heights.detail_phase(wavelength_mm).map(|phase| phase as f32)
 }
 
-// The coefficients of each band; None if the sweep does not have it, or the cells cannot show its wavelengths.
+// Why a band lacks coefficients; None if it has both.
+fn describe_gaps(far: &BandCoefficients) -> Option<String> {
+    let far = match far {
+        Ok(far) => far,
+        Err(reason) => return Some((*reason).to_owned()),
+    };
+    match (far.scattering.err(), far.diffusion_normalised.err()) {
+        (None, None) => None,
+        (Some(both), Some(other)) if both == other => Some(both.to_string()),
+        (scattering, diffusion) => {
+            let gaps = [("scattering", scattering), ("diffusion", diffusion)];
+            let gaps = gaps.into_iter().filter_map(|(name, gap)| Some(format!("{name}: {}", gap?)));
+            Some(gaps.collect::<Vec<_>>().join("; "))
+        }
+    }
+}
+
 fn compute_far_fields(
     heights: &HeightField,
     rig: &Rig,
     cache: &FarFieldCache,
-) -> std::result::Result<Vec<Option<FarFieldCoefficients>>, echolake_dsp::Error> {
+) -> std::result::Result<Vec<BandCoefficients>, echolake_dsp::Error> {
     let bands: Vec<_> = rig.bands.centres_hz.iter().map(|hz| far_wave_numbers(heights, rig, *hz)).collect();
-    let mut found = cache.find_plan(heights, &bands).compute_coefficients(heights)?.into_iter();
-    Ok(bands.into_iter().map(|band| band.and_then(|_| found.next())).collect())
+    let mut found = estimate_coefficients(heights, &cache.find_plan(heights, &bands))?.into_iter();
+    let of_band = |band: BandWaves| band.and_then(|_| found.next().ok_or("no wave numbers"));
+    Ok(bands.into_iter().map(of_band).collect())
 }
 
 // Wave numbers over the part of the band's octave that the sweep has, rad/m.
-fn far_wave_numbers(heights: &HeightField, rig: &Rig, hz: f64) -> Option<Vec<f64>> {
+fn far_wave_numbers(heights: &HeightField, rig: &Rig, hz: f64) -> BandWaves {
     let speed_m_s = ReferenceAir::from_response(&rig.impulse_response).speed_of_sound();
     let low_hz = rig.sweep.low_hz.max(hz * FRAC_1_SQRT_2);
     let high_hz = rig.sweep.high_hz.min(hz * SQRT_2);
     let at = |i: usize| low_hz * (high_hz / low_hz).powf((i as f64 + 0.5) / FAR_FIELD_FREQUENCIES as f64);
-    let is_fine = 1e3 * speed_m_s / high_hz > 2.0 * heights.pitch_mm();
-    let wave_numbers = || (0..FAR_FIELD_FREQUENCIES).map(|i| TAU * at(i) / speed_m_s).collect();
-    (low_hz < high_hz && is_fine).then(wave_numbers)
+    if low_hz >= high_hz {
+        return Err("the sweep does not have the band");
+    }
+    if 1e3 * speed_m_s / high_hz <= 2.0 * heights.pitch_mm() {
+        return Err("the cells of the heights are half a wavelength wide, or wider");
+    }
+    Ok((0..FAR_FIELD_FREQUENCIES).map(|i| TAU * at(i) / speed_m_s).collect())
 }
 
 // Minimum, maximum and root mean square height about the mean.
@@ -145,8 +182,9 @@ mod tests {
         let cache = FarFieldCache::default();
         for cells in [100, 260, 100] {
             let far = compute_far_fields(&grooves(cells), &rig, &cache).expect("coefficients");
-            assert!(far[0].is_some_and(|far| far.scattering.abs() < 0.01), "{far:?}");
-            assert_eq!(far[4].is_some(), cells == 260);
+            let lowest = far[0].expect("a band").scattering.expect("a number");
+            assert!(lowest.value.abs() < 0.01 && lowest.uncertainty.is_some_and(|u| u < 0.05), "{far:?}");
+            assert_eq!(far[4].is_ok(), cells == 260, "{:?}", far[4]);
             let again = compute_far_fields(&grooves(cells), &rig, &FarFieldCache::default()).expect("coefficients");
             assert_eq!(far, again);
         }

@@ -52,7 +52,8 @@ pub(super) fn view_sql(rig: &Rig) -> String {
          sqrt(power(t.scattering_u, 2) + {near_scattering}) AS scattering_u, \
          {of_flats_material} t.specular_loss END AS specular_loss, {of_flats_material} \
          sqrt(power(t.specular_loss_u, 2) + {near_loss}) END AS specular_loss_u, \
-         {diffusion} AS diffusion_normalised, {far} AS far_scattering \
+         {diffusion} AS diffusion_normalised, {diffusion_u} AS diffusion_normalised_u, {far} AS far_scattering, \
+         {far_u} AS far_scattering_u, {far_reason} AS far_field_reason \
          FROM surfaces s JOIN surface_stats t ON t.run_id = s.run_id \
          LEFT JOIN surfaces flat ON flat.surface_id = s.flat_reference \
          LEFT JOIN ({hard}) h ON h.flat_reference = s.flat_reference AND h.band = t.band \
@@ -60,7 +61,10 @@ pub(super) fn view_sql(rig: &Rig) -> String {
         near_scattering = near_field("t.scattering"),
         near_loss = near_field("t.specular_loss"),
         diffusion = per_band("diffusion_normalised"),
+        diffusion_u = per_band("diffusion_normalised_u"),
         far = per_band("far_scattering"),
+        far_u = per_band("far_scattering_u"),
+        far_reason = per_band("far_field_reason"),
     );
     let scale = format!("{:?}", rig.model_scale());
     let has_absorption = "NOT is_foam AND absorption >= -1.96 * absorption_u";
@@ -84,7 +88,8 @@ pub(super) fn view_sql(rig: &Rig) -> String {
          WHEN NOT {has_scattering} THEN 'parts of the panel differ by more than the method can bear' \
          WHEN abs(scattering - specular_loss) > 1.96 * sqrt(power(scattering_u, 2) + power(specular_loss_u, 2)) \
          THEN 'the methods disagree' END AS scattering_reason, \
-         specular_loss, specular_loss_u, far_scattering, diffusion_normalised, measurements, origin FROM ({found})"
+         specular_loss, specular_loss_u, far_scattering, far_scattering_u, diffusion_normalised, \
+         diffusion_normalised_u, far_field_reason, measurements, origin FROM ({found})"
     )
 }
 
@@ -135,13 +140,16 @@ pub(super) fn column_notes() -> HashMap<String, HashMap<String, String>> {
         column_note(
             "far_scattering",
             "1",
-            "Scattering coefficient for random incidence in the far field; computed by Kirchhoff's approximation",
+            "Scattering coefficient for random incidence in the far field; computed from the relief, not measured",
         ),
+        column_note("far_scattering_u", "1", "Its standard uncertainty"),
         column_note(
             "diffusion_normalised",
             "1",
-            "Normalised diffusion of ISO 17497-2; computed by Kirchhoff's approximation",
+            "Normalised diffusion of ISO 17497-2; computed from the relief by Kirchhoff's approximation",
         ),
+        column_note("diffusion_normalised_u", "1", "Its standard uncertainty"),
+        column_note("far_field_reason", "", "Why far_scattering or diffusion_normalised is missing"),
     ];
     noted.into_iter().collect()
 }

@@ -85,14 +85,23 @@ pub(super) fn surface_columns(bands: &[String]) -> Vec<Column> {
         ("far_scattering", "Scattering coefficient: share of the energy that is not mirrored"),
     ];
     for (name, coefficient) in far_field {
-        columns.extend(bands.iter().map(|band| {
+        columns.extend(bands.iter().flat_map(|band| {
             let comment = format!(
-                "{coefficient}, random incidence, far field, band at {band} Hz; computed from the relief by \
-                 Kirchhoff's approximation, not measured; null without heights, or if their cells are too wide"
+                "{coefficient}, random incidence, far field, band at {band} Hz; computed from the relief, not \
+                 measured: by Kirchhoff's approximation, or exactly if it has ridges that repeat; null if \
+                 far_field_reason_{band} says why"
             );
-            Column::float(format!("{name}_{band}"), "1", comment).or_null()
+            let uncertainty = format!("Standard uncertainty of {name}_{band}");
+            [
+                Column::float(format!("{name}_{band}"), "1", comment).or_null(),
+                Column::float(format!("{name}_u_{band}"), "1", uncertainty).or_null(),
+            ]
         }));
     }
+    columns.extend(bands.iter().map(|band| {
+        let comment = format!("Why coefficients of the far field are missing, band at {band} Hz");
+        Column::text(&format!("far_field_reason_{band}"), &comment).or_null()
+    }));
     columns.extend([Column::text("origin", ORIGINS), project_column(), code_version()]);
     columns
 }
@@ -220,6 +229,13 @@ pub(super) fn measurement_columns() -> Vec<Column> {
             "Impulse response over the loopback, at the reference temperature, cropped; direct sound still in it; \
             rounded to 2^-20 of its greatest sample, unless lake.toml says exact",
         ),
+        Column::floats(
+            "measured_ir",
+            "1",
+            "The same response as measured, at no temperature but its own, as a room's parameters need it; null of \
+            responses that are shorter than 50 ms, or were given at the reference temperature",
+        )
+        .or_null(),
         code_version(),
     ]);
     columns

@@ -1201,8 +1201,12 @@ export interface components {
             readonly absorption_u: number | null;
             /** @description Computed from the relief by Kirchhoff's approximation. */
             readonly diffusion_normalised: number | null;
-            /** @description Computed from the relief by Kirchhoff's approximation. */
+            readonly diffusion_normalised_u: number | null;
+            /** @description The reason if one of the computed coefficients is missing. */
+            readonly far_field_reason: string | null;
+            /** @description Computed from the relief. */
             readonly far_scattering: number | null;
+            readonly far_scattering_u: number | null;
             /** @description Centre of the octave, a tenth of the model's frequency. */
             readonly full_scale_hz: number;
             readonly scattering: number | null;
@@ -1429,7 +1433,11 @@ export interface components {
         readonly RoomBand: {
             readonly c50_db: number | null;
             readonly c80_db: number | null;
+            /** @description By how much T30 is longer than T20. */
+            readonly curvature_percent: number | null;
             readonly d50: number | null;
+            /** @description Why the values may not be what they are taken for, as of a decay with two slopes. */
+            readonly doubt: string | null;
             readonly edt_s: number | null;
             /** @description Of the octave; null for all frequencies. */
             readonly midband_hz: number | null;

@@ -23,15 +23,21 @@ struct MaterialBand {
     scattering_reason: Option<String>,
     specular_loss: Option<f64>,
     specular_loss_u: Option<f64>,
-    /// Computed from the relief by Kirchhoff's approximation.
+    /// Computed from the relief.
     far_scattering: Option<f64>,
+    far_scattering_u: Option<f64>,
     /// Computed from the relief by Kirchhoff's approximation.
     diffusion_normalised: Option<f64>,
+    diffusion_normalised_u: Option<f64>,
+    /// The reason if one of the computed coefficients is missing.
+    far_field_reason: Option<String>,
 }
 
 const MATERIALS: &str = "select full_scale_hz, absorption, absorption_u, absorption_reason, scattering, scattering_u, \
     scattering_reason, specular_loss, specular_loss_u, cast(far_scattering as double) as far_scattering, \
-    cast(diffusion_normalised as double) as diffusion_normalised from materials where surface_id = $1 order by band_hz";
+    cast(far_scattering_u as double) as far_scattering_u, cast(diffusion_normalised as double) as diffusion_normalised, \
+    cast(diffusion_normalised_u as double) as diffusion_normalised_u, far_field_reason \
+    from materials where surface_id = $1 order by band_hz";
 
 /// Absorption and scattering of a surface by octave at full scale, for simulations of rooms.
 #[utoipa::path(
