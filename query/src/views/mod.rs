@@ -13,6 +13,7 @@ mod lookup;
 mod materials;
 mod pair_join;
 mod percentile_calls;
+mod repeatability;
 mod room_parameters;
 mod sorted_nulls;
 mod tnce_db;
@@ -60,6 +61,8 @@ pub(crate) enum LakeView {
     RoomParameters,
     /// One row per surface and band: absorption and scattering at full scale.
     Materials,
+    /// One row per surface, band and kind of level: by how much its runs differ.
+    Repeatability,
 }
 
 /// Unit of levels over Flat's energy in all bands.
@@ -85,8 +88,16 @@ pub fn table_meaning(name: &str) -> Option<&'static str> {
 
 impl LakeView {
     /// All views.
-    pub const ALL: [Self; 7] =
-        [Self::Ir, Self::TnceDb, Self::Augmented, Self::Catalogue, Self::Levels, Self::RoomParameters, Self::Materials];
+    pub const ALL: [Self; 8] = [
+        Self::Ir,
+        Self::TnceDb,
+        Self::Augmented,
+        Self::Catalogue,
+        Self::Levels,
+        Self::RoomParameters,
+        Self::Materials,
+        Self::Repeatability,
+    ];
 
     /// Returns its name in SQL.
     pub fn name(self) -> &'static str {
@@ -98,6 +109,7 @@ impl LakeView {
             Self::Levels => "levels",
             Self::RoomParameters => "room_parameters",
             Self::Materials => "materials",
+            Self::Repeatability => "repeatability",
         }
     }
 
@@ -117,6 +129,10 @@ impl LakeView {
                 "One row per surface and band, of its newest run: absorption and scattering for simulations of rooms \
                  at full scale (1:10), with standard uncertainties, and reasons for what is missing."
             }
+            Self::Repeatability => {
+                "One row per surface, band and kind of level: repeatability and reproducibility over its runs, days \
+                 and rigs (ISO 5725-2)."
+            }
         }
     }
 
@@ -134,6 +150,7 @@ impl LakeView {
             Self::Catalogue => &[Table::Surfaces, Table::Runs, Table::SurfaceStats],
             Self::Levels | Self::Materials => &[Table::Surfaces, Table::SurfaceStats],
             Self::RoomParameters => &[Table::Measurements],
+            Self::Repeatability => &[Table::Runs, Table::SurfaceStats],
         }
     }
 
@@ -147,6 +164,7 @@ impl LakeView {
             Self::Levels => levels::view_sql(),
             Self::RoomParameters => room_parameters::view_sql(lake.rig()),
             Self::Materials => materials::view_sql(lake.rig()),
+            Self::Repeatability => repeatability::view_sql(),
         }
     }
 
@@ -162,6 +180,7 @@ impl LakeView {
             Self::Levels => levels::column_notes(),
             Self::RoomParameters => room_parameters::column_notes(),
             Self::Materials => materials::column_notes(),
+            Self::Repeatability => repeatability::column_notes(),
         }
     }
 
