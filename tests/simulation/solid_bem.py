@@ -7,7 +7,8 @@ diffusion is that of 37 receivers in the plane of incidence, 5 degrees apart, no
 17497-2). One line of JSON is printed for each case, and kept in FILE, so that a run that was stopped goes on.
 
     pip install mesh2scattering numpy scipy trimesh       # its solver is compiled by g++ and make
-    python tests/simulation/solid_bem.py --reference FILE # the sine of the scattering literature: 16 published values
+    python tests/simulation/solid_bem.py --reference FILE # a sine: 16 published values (93 minutes beside other work)
+    python tests/simulation/solid_bem.py --reference FILE --write docs/materials.md
     python tests/simulation/solid_bem.py FILE             # five reliefs of 585 mm, three incidences
 
 The reference is what the mesh in the public data of Mesh2scattering is (its example `sine`, at 1:2.5), at 1:10: a round
@@ -242,21 +243,41 @@ def solve(cases, size, is_round, speed, file):
         yield known[key]
 
 
+def reference_table(rows):
+    """Lines of the reference's table, in Markdown."""
+    yield "| source, zenith and azimuth | | " + " | ".join(f"{khz} kHz" for khz in (4, 8, 12, 16)) + " |"
+    yield "| --- | --- |" + " ---: |" * 4
+    for (zenith, azimuth), published in REFERENCE.items():
+        found = {
+            row["hz"]: row["scattering"] for row in rows if (row["zenith_deg"], row["azimuth_deg"]) == (zenith, azimuth)
+        }
+        yield f"| {zenith}, {azimuth} | published | " + " | ".join(f"{x:.3f}" for x in published) + " |"
+        yield "| | here | " + " | ".join(f"{found[khz * 1e3]:.3f}" for khz in (4, 8, 12, 16)) + " |"
+
+
 def main():
     """Solves the reference, or five reliefs."""
     parser = argparse.ArgumentParser()
     parser.add_argument("file", type=pathlib.Path, metavar="FILE")
     parser.add_argument("--reference", action="store_true")
+    parser.add_argument("--write", type=pathlib.Path, metavar="PAGE")
     args = parser.parse_args()
     if args.reference:
         cases = [("sine", SINE, hz, incidence) for hz in (4e3, 8e3, 12e3, 16e3) for incidence in REFERENCE]
-        worst = 0.0
+        worst, rows = 0.0, []
         for row in solve(cases, 0.2, True, 346.18, args.file):
             expected = REFERENCE[row["zenith_deg"], row["azimuth_deg"]][int(row["hz"] / 4e3) - 1]
             worst = max(worst, abs(row["scattering"] - expected))
+            rows.append(row)
             print(json.dumps({**row, "published": expected}), flush=True)
+        if args.write:
+            marker = "tests/simulation/solid_bem.py --reference"
+            before, rest = args.write.read_text().split(f"<!-- {marker} -->\n")
+            after = rest.split(f"<!-- end of {marker} -->\n")[1]
+            body = "\n".join(reference_table(rows))
+            args.write.write_text(f"{before}<!-- {marker} -->\n\n{body}\n\n<!-- end of {marker} -->\n{after}")
         print(f"greatest difference: {worst:.3f}", file=sys.stderr)
-        sys.exit(worst > 0.05)
+        sys.exit(int(worst > 0.05))
     incidences = [(0, 0), (30, 0), (60, 0)]
     cases = [(name, relief, hz, i) for hz in (2.5e3, 5e3, 10e3) for name, relief in RELIEFS.items() for i in incidences]
     cases += [("waves 12 mm / 250 mm", RELIEFS["waves 12 mm / 250 mm"], 20e3, i) for i in incidences]
