@@ -415,6 +415,14 @@ def far_table(names):
             yield f"| {FAR_RELIEFS[name] if n == 0 else ''} | {label} | {cells} |"
 
 
+def write_table(page, marker, lines):
+    """Puts lines between the markers in a page."""
+    before, rest = page.read_text().split(f"<!-- {marker} -->\n")
+    after = rest.split(f"<!-- end of {marker} -->\n")[1]
+    body = "\n".join(lines)
+    page.write_text(f"{before}<!-- {marker} -->\n\n{body}\n\n<!-- end of {marker} -->\n{after}")
+
+
 def main():
     """Prints the table, or checks the method."""
     parser = argparse.ArgumentParser()
@@ -432,10 +440,7 @@ def main():
         print(line, flush=True)
         lines.append(line)
     if args.write:
-        before, rest = args.write.read_text().split(f"<!-- {marker} -->\n")
-        after = rest.split(f"<!-- end of {marker} -->\n")[1]
-        body = "\n".join(lines)
-        args.write.write_text(f"{before}<!-- {marker} -->\n\n{body}\n\n<!-- end of {marker} -->\n{after}")
+        write_table(args.write, marker, lines)
 
 
 if __name__ == "__main__":

@@ -29,9 +29,9 @@ import mesh2scattering as m2s
 import numpy as np
 import pyfar as pf
 import trimesh
+from compare_bem import RECEIVER_ANGLES, write_table
 from scipy.spatial import Delaunay
 
-RECEIVER_ANGLES = np.radians(np.arange(-90, 91, 5))
 # Published scattering: zenith and azimuth of the source, deg; 4, 8, 12, 16 kHz at 1:10.
 REFERENCE = {
     (0, 0): [0.005, 0.023, 0.021, 0.214],
@@ -271,11 +271,7 @@ def main():
             rows.append(row)
             print(json.dumps({**row, "published": expected}), flush=True)
         if args.write:
-            marker = "tests/simulation/solid_bem.py --reference"
-            before, rest = args.write.read_text().split(f"<!-- {marker} -->\n")
-            after = rest.split(f"<!-- end of {marker} -->\n")[1]
-            body = "\n".join(reference_table(rows))
-            args.write.write_text(f"{before}<!-- {marker} -->\n\n{body}\n\n<!-- end of {marker} -->\n{after}")
+            write_table(args.write, "tests/simulation/solid_bem.py --reference", reference_table(rows))
         print(f"greatest difference: {worst:.3f}", file=sys.stderr)
         sys.exit(int(worst > 0.05))
     incidences = [(0, 0), (30, 0), (60, 0)]

@@ -18,7 +18,7 @@ use crate::hdf5_mapping::{
     DatasetDimension, Hdf5Mapping, PositionMapping, RateMapping, TemperatureMapping, TemperatureUnit,
 };
 use crate::positions::{CoordinateFrame, to_nano};
-use crate::response::{ImportedResponse, describe_unknown_air, least_length};
+use crate::response::{ImportedResponse, least_length, record_unknown_air};
 use crate::{Error, ImportOptions, ImportedRun, RUN_SECS, content_error};
 
 /// Source name of the import's log entries.
@@ -64,7 +64,7 @@ pub fn check_hdf5(mapping: &Path, rig: &Rig, celsius: Option<Celsius>) -> Result
     ResponseSet::open(mapping, rig, &rig.build_grid()?, celsius).map(drop)
 }
 
-/// The pair, the temperature, if somebody told it, and the samples of a response.
+/// The pair, the temperature, if it is known, and the samples of a response.
 type ReadResponse = (Pair, Option<Celsius>, Vec<f32>);
 
 struct Hdf5Import<'a> {
@@ -82,7 +82,7 @@ struct ResponseSet<'g> {
     surfaces: Vec<SurfaceId>,
     microphones: Vec<&'g Point>,
     speakers: Vec<&'g Point>,
-    /// None if nobody told them.
+    /// None if they are unknown.
     temperatures: Option<AirTemperatures>,
 }
 
@@ -144,8 +144,8 @@ impl<'g> ResponseSet<'g> {
         };
         let length = count(axes.sample);
         let of_air = |celsius| least_length(rig, celsius, false);
-        let told = temperatures.iter().flat_map(|told| &told.celsius).map(|celsius| of_air(Some(*celsius)));
-        let least = told.max().unwrap_or_else(|| of_air(None));
+        let known = temperatures.iter().flat_map(|known| &known.celsius).map(|celsius| of_air(Some(*celsius)));
+        let least = known.max().unwrap_or_else(|| of_air(None));
         if length < least {
             let expected = format!("{least} at least, for the lake's responses of {}", rig.impulse_response.length);
             return Err(content_error(mapped.path, name, format!("{length} samples"), expected));
@@ -169,10 +169,7 @@ impl<'g> ResponseSet<'g> {
         let mut recorder = batch.create_run(&path, &start)?;
         recorder.log(started, LogLevel::Info, NAME, "times are made up: the mapping has none")?;
         let unknown_air = if self.temperatures.is_none() { self.microphones.len() * self.speakers.len() } else { 0 };
-        let notes: Vec<_> = describe_unknown_air(unknown_air, import.rig).into_iter().collect();
-        for note in &notes {
-            recorder.log(started, LogLevel::Warning, NAME, note)?;
-        }
+        let notes = record_unknown_air(&mut recorder, started, NAME, unknown_air, import.rig)?;
         let shape = &self.responses.shape;
         let block = self.block_shape();
         let mut blocks: Vec<usize> = shape.iter().zip(&block).map(|(n, b)| n.div_ceil(*b)).collect();
@@ -230,7 +227,7 @@ impl<'g> ResponseSet<'g> {
             for s in 0..counts[speaker] {
                 let (m_of_all, s_of_all) = (starts[microphone] + m, starts[speaker] + s);
                 let PairId(id) = grid.parse_pair(self.microphones[m_of_all], self.speakers[s_of_all])?;
-                let celsius = self.temperatures.as_ref().map(|told| told.find([m_of_all, s_of_all, measurement]));
+                let celsius = self.temperatures.as_ref().map(|known| known.find([m_of_all, s_of_all, measurement]));
                 let first = m * of_microphone + s * of_speaker;
                 let samples = (0..counts[sample]).map(|n| values[first + n * of_sample] as f32).collect();
                 responses.push((grid.pairs()[id as usize], celsius, samples));

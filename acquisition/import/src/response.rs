@@ -1,6 +1,6 @@
 //! One imported response as a run records it: its pair, time and temperature; everything else is unknown.
 
-use echolake_acquisition::run::recorder::{Error, Recorder};
+use echolake_acquisition::run::recorder::{Error, LogLevel, Recorder};
 use echolake_dsp::air::AirState;
 use echolake_dsp::temperature::{ReferenceAir, TemperatureCorrection};
 use echolake_schema::messages::{AmbientSample, ImpulseResponse, Measurement, Verdict};
@@ -10,7 +10,7 @@ use echolake_schema::{Celsius, Grid, Pair, Rig, Timestamp};
 pub(crate) struct ImportedResponse {
     pub pair: Pair,
     pub at: Timestamp,
-    /// None if nobody told it.
+    /// None if it is unknown.
     pub celsius: Option<Celsius>,
     pub samples: Vec<f32>,
     /// True if it is on the time axis of the rig's reference temperature.
@@ -22,7 +22,7 @@ impl ImportedResponse {
     pub fn record_response(self, recorder: &mut Recorder, rig: &Rig, grid: &Grid) -> Result<(), Error> {
         let Self { pair, at, celsius, samples, is_corrected } = self;
         let unknown = f64::NAN;
-        let celsius = celsius.unwrap_or(rig.impulse_response.reference_temperature_c).get();
+        let celsius = known_celsius(celsius, rig);
         let [m, s] = [pair.microphone, pair.speaker].map(|id| grid.points()[id.index()].position_mm);
         recorder.poses(at, m, s)?;
         recorder.environment(
@@ -70,9 +70,27 @@ impl ImportedResponse {
     }
 }
 
-/// Describes responses whose temperature nobody told.
+/// Returns the temperature, C, or the reference's, to which nothing is corrected then.
+pub(crate) fn known_celsius(celsius: Option<Celsius>, rig: &Rig) -> f64 {
+    celsius.unwrap_or(rig.impulse_response.reference_temperature_c).get()
+}
+
+/// Records how many responses of a run have an unknown temperature, and returns the same as the run's notes.
+pub(crate) fn record_unknown_air(
+    recorder: &mut Recorder,
+    at: Timestamp,
+    source: &str,
+    responses: usize,
+    rig: &Rig,
+) -> Result<Vec<String>, Error> {
+    let notes: Vec<_> = describe_unknown_air(responses, rig).into_iter().collect();
+    notes.iter().try_for_each(|note| recorder.log(at, LogLevel::Warning, source, note))?;
+    Ok(notes)
+}
+
+/// Describes responses of unknown temperature.
 pub(crate) fn describe_unknown_air(responses: usize, rig: &Rig) -> Option<String> {
-    let celsius = rig.impulse_response.reference_temperature_c.get();
+    let celsius = known_celsius(None, rig);
     let note = || {
         format!(
             "no temperature is known of {responses} responses: {celsius} C, the reference's, stands in temperature_c, \
@@ -84,8 +102,7 @@ pub(crate) fn describe_unknown_air(responses: usize, rig: &Rig) -> Option<String
 
 /// Returns the samples that it takes to bring a response to the reference temperature.
 pub(crate) fn least_length(rig: &Rig, celsius: Option<Celsius>, is_corrected: bool) -> usize {
-    let celsius = celsius.unwrap_or(rig.impulse_response.reference_temperature_c);
-    let air = AirState::with_known(celsius.get(), None, None);
+    let air = AirState::with_known(known_celsius(celsius, rig), None, None);
     let ratio = ReferenceAir::from_response(&rig.impulse_response).time_ratio(&air);
     match rig.impulse_response.length {
         length if is_corrected || ratio == 1.0 => length,

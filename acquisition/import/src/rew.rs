@@ -22,7 +22,7 @@ use realfft::num_complex::Complex;
 
 use self::rew_text::RewText;
 use crate::batch::ImportBatch;
-use crate::response::{ImportedResponse, describe_unknown_air, least_length};
+use crate::response::{ImportedResponse, known_celsius, least_length, record_unknown_air};
 use crate::wav_file::{WavChannel, split_reference};
 use crate::wav_manifest::{ManifestCells, next_record, no_rows, open_manifest};
 use crate::{Error, ImportOptions, ImportedRun};
@@ -64,10 +64,7 @@ pub fn import_rew(
         let measurements = rows.len();
         let mut warnings = Vec::new();
         let unknown_air = rows.iter().filter(|row| row.response.celsius.is_none()).count();
-        let notes: Vec<_> = describe_unknown_air(unknown_air, rig).into_iter().collect();
-        for note in &notes {
-            recorder.log(started, LogLevel::Warning, NAME, note)?;
-        }
+        let notes = record_unknown_air(&mut recorder, started, NAME, unknown_air, rig)?;
         for RewRow { line, response, warnings: faults, .. } in rows {
             let at = response.at;
             response.record_response(&mut recorder, rig, &grid)?;
@@ -182,8 +179,7 @@ fn parse_row(cells: &ManifestCells<'_>, rig: &Rig, grid: &Grid) -> Result<RewRow
 
 fn geometry_secs(pair: Pair, rig: &Rig, grid: &Grid, celsius: Option<Celsius>) -> f64 {
     let [m, s] = [pair.microphone, pair.speaker].map(|id| grid.points()[id.index()].position_mm);
-    let celsius = celsius.unwrap_or(rig.impulse_response.reference_temperature_c);
-    let air = AirState::with_known(celsius.get(), None, None);
+    let air = AirState::with_known(known_celsius(celsius, rig), None, None);
     direct_mm(m, s) / 1e3 / ReferenceAir::from_response(&rig.impulse_response).speed_in(&air)
 }
 

@@ -19,7 +19,7 @@ use echolake_schema::{Celsius, ErrorCause, Grid, Pair, PairId, Point, Rig, Surfa
 use crate::batch::ImportBatch;
 use crate::hdf5_file::{Hdf5File, Hdf5Variable, place_in_grid};
 use crate::positions::{CoordinateFrame, to_nano};
-use crate::response::{ImportedResponse, describe_unknown_air, least_length};
+use crate::response::{ImportedResponse, least_length, record_unknown_air};
 use crate::{Error, ImportOptions, ImportedRun, RUN_SECS, content_error};
 
 /// Source name of the import's log entries.
@@ -116,7 +116,7 @@ struct SofaMeasurement {
     /// Row of its response.
     row: usize,
     pair: Pair,
-    /// None if nobody told it.
+    /// None if it is unknown.
     celsius: Option<Celsius>,
     /// ns since 1970.
     time: Option<i64>,
@@ -183,10 +183,10 @@ impl Sofa {
             recorder.log(started, LogLevel::Info, NAME, "times are made up: the file has none")?;
         }
         let unknown_air = self.measurements.iter().filter(|m| m.celsius.is_none()).count();
-        let notes: Vec<_> = describe_unknown_air(unknown_air, import.rig).into_iter().collect();
-        for warning in self.warnings.iter().chain(&notes) {
+        for warning in &self.warnings {
             recorder.log(started, LogLevel::Warning, NAME, warning)?;
         }
+        let notes = record_unknown_air(&mut recorder, started, NAME, unknown_air, import.rig)?;
         for (measured, at) in self.measurements.iter().zip(times) {
             let SofaResponses { length, samples, .. } = &self.responses;
             let samples = samples[measured.row * length..][..*length].to_vec();

@@ -21,7 +21,7 @@ use echolake_schema::messages::{AmbientSample, ImpulseResponse, Measurement, Swe
 use echolake_schema::{Grid, Rig, SampleRate, SurfaceId, Timestamp};
 
 use crate::batch::ImportBatch;
-use crate::response::describe_unknown_air;
+use crate::response::{describe_unknown_air, known_celsius};
 use crate::take_summary::TakeSummary;
 use crate::wav_manifest::{self, ManifestRow};
 use crate::{Error, ImportOptions, ImportedRun, wav_search};
@@ -152,7 +152,7 @@ impl WavImport<'_> {
     ) -> Result<Option<String>, Error> {
         let unread = |column, what| Error::Row { path: self.manifest.to_owned(), line: row.line, column, what };
         let rig = self.rig;
-        let celsius = row.celsius.unwrap_or(rig.impulse_response.reference_temperature_c).get();
+        let celsius = known_celsius(row.celsius, rig);
         let planned = |cause| Error::Plan { rig: rig.name.clone(), cause };
         let reference = ReferenceAir::from_response(&rig.impulse_response);
         let air = AirState::with_known(celsius, Some(row.humidity_pct), Some(row.pressure_hpa));

@@ -25,7 +25,7 @@ pub(crate) struct ManifestRow {
     pub is_sweep: bool,
     pub format: SampleFormat,
     pub pair: Pair,
-    /// None if nobody told it: of a room alone.
+    /// None if it is unknown: of a room alone.
     pub celsius: Option<Celsius>,
     pub humidity_pct: f64,
     pub pressure_hpa: f64,

@@ -77,11 +77,11 @@ pub struct RoomParameters {
     pub range_db: Option<f64>,
     /// Why values are missing; empty if none is.
     pub refusals: Vec<String>,
-    /// Why values may not mean what they are taken for; empty if nothing speaks against them.
+    /// Reasons for which values may not mean what they are taken for; empty if there are none.
     pub doubts: Vec<String>,
 }
 
-/// What was measured of a response, in all its frequencies, and the band of it that is looked at.
+/// The measured samples of a response, in all its frequencies, and the band of it that is looked at.
 struct MeasuredResponse<'a> {
     /// Without zeros at its end.
     samples: Vec<f64>,
@@ -133,8 +133,8 @@ struct FittedTime {
 ///
 /// ir  `[n]`, any unit
 ///
-/// Source: ISO 3382-1:2009, 5.3.3 and annex A; ISO 3382-2:2008, 7.1, 7.3 and annexes B and C; Guski and Vorlaender 2014,
-/// Acta Acustica united with Acustica 100:320-327, for the subtraction together with truncation and compensation.
+/// Source: ISO 3382-1:2009, 5.3.3 and annex A; ISO 3382-2:2008, 7.1, 7.3 and annexes B and C; Guski and Vorlaender
+/// 2014, Acta Acustica united with Acustica 100:320-327, for the subtraction together with truncation and compensation.
 ///
 /// ```
 /// // A decay of 60 dB a second, without noise.
@@ -374,7 +374,7 @@ impl CompensatedDecay {
         is_decay.then_some(decay)
     }
 
-    // Standard deviation of the noise's energy in so many samples, of which it has independent ones by the band's width.
+    // Standard deviation of the noise's energy in so many samples. How many are independent, the band's width says.
     fn noise_deviation(&self, samples: f64) -> f64 {
         self.crossing.noise * (samples * self.rate_hz / self.width_hz).sqrt()
     }

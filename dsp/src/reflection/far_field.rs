@@ -19,7 +19,7 @@ const RECEIVERS: usize = 37;
 /// each side.
 ///
 /// Source: ISO 17497-2:2012, clause 8.4.
-const SOURCES: [(f64, f64); 3] = [(0.0, 1.0), (30.0, 6.0), (60.0, 6.0)];
+pub(crate) const SOURCES: [(f64, f64); 3] = [(0.0, 1.0), (30.0, 6.0), (60.0, 6.0)];
 /// Least and greatest sum of the vertical parts of both ways.
 const RISES: [f64; 2] = [0.5, 2.0];
 /// Views of a relief from one zenith angle: from both sides along x, and along y.
@@ -120,7 +120,7 @@ impl FarFieldPlan {
     }
 
     /// Wave numbers of each band, rad/m.
-    pub fn bands(&self) -> impl Iterator<Item = &[f64]> {
+    pub fn band_wave_numbers(&self) -> impl Iterator<Item = &[f64]> {
         self.bands.iter().map(|band| band.wave_numbers.as_slice())
     }
 

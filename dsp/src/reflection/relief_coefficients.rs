@@ -33,7 +33,7 @@ pub struct ReliefCoefficients {
     pub diffusion_normalised: Result<UncertainNumber, CoefficientGap>,
 }
 
-/// Why a coefficient is not given.
+/// Reason for which a coefficient is not given.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum CoefficientGap {
     /// Kirchhoff's approximation does not hold, and the relief has no ridges that repeat.
@@ -62,7 +62,7 @@ pub enum CoefficientGap {
 /// ```
 pub fn estimate_coefficients(relief: &HeightField, plan: &FarFieldPlan) -> Result<Vec<ReliefCoefficients>, Error> {
     let of_kirchhoff = plan.compute_coefficients(relief)?;
-    let phases = plan.bands().map(|wave_numbers| mean_detail_phase(relief, wave_numbers));
+    let phases = plan.band_wave_numbers().map(|wave_numbers| mean_detail_phase(relief, wave_numbers));
     let bands: Vec<_> = of_kirchhoff.iter().zip(phases).map(|(far, phase)| kirchhoff_numbers(far, phase)).collect();
     let is_unsure = |[scattering, _]: &[UncertainNumber; 2]| u_of(scattering) > SMALL_U;
     let ridges = if bands.iter().any(is_unsure) { RepeatingRelief::find_ridges(relief)? } else { None };
@@ -79,7 +79,7 @@ pub fn estimate_coefficients(relief: &HeightField, plan: &FarFieldPlan) -> Resul
             diffusion_normalised: known(diffusion, CoefficientGap::NarrowDetails),
         }
     };
-    Ok(bands.into_iter().zip(plan.bands()).map(estimate).collect())
+    Ok(bands.into_iter().zip(plan.band_wave_numbers()).map(estimate).collect())
 }
 
 fn u_of(number: &UncertainNumber) -> f64 {
@@ -104,7 +104,7 @@ fn mean_detail_phase(relief: &HeightField, wave_numbers: &[f64]) -> f64 {
 // None if the waves are too short for this period, or an order is exactly horizontal.
 fn solve_ridges(ridges: &RepeatingRelief, wave_numbers: &[f64]) -> Option<UncertainNumber> {
     let shortest = wave_numbers.iter().copied().fold(0.0, f64::max);
-    let half_waves = shortest * ridges.profile().period_mm() / 1e3 / PI;
+    let half_waves = shortest * ridges.repeated_profile().period_mm() / 1e3 / PI;
     (half_waves <= MOST_HALF_WAVES).then(|| ridges.random_incidence_scattering(wave_numbers).ok()).flatten()
 }
 

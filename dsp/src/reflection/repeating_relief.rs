@@ -4,6 +4,7 @@
 use std::f64::consts::TAU;
 
 use crate::Error;
+use crate::far_field::SOURCES;
 use crate::height_field::HeightField;
 use crate::periodic_profile::{IncidentWave, PeriodicProfile};
 use crate::scattering::UncertainNumber;
@@ -21,11 +22,6 @@ const GREATEST_DISORDER: f64 = 0.03;
 /// Cells of a period of which the profile is made, at least, and for each wavelength.
 const LEAST_CELLS: f64 = 96.0;
 
-/// Zenith angles of sources, deg, and their weights in the mean for random incidence, on each side of the normal: those
-/// of the far field of other reliefs.
-///
-/// Source: ISO 17497-2:2012, clause 8.4.
-const SOURCES: [(f64, f64); 3] = [(0.0, 1.0), (30.0, 6.0), (60.0, 6.0)];
 /// Standard uncertainty of a finite sample's scattering where no order's cut-off is near.
 ///
 /// Source: with [`CUT_OFF_U`] that by which 16 values of a round sample of ten periods differ, by boundary elements
@@ -74,7 +70,7 @@ impl RepeatingRelief {
     }
 
     /// The profile that repeats.
-    pub fn profile(&self) -> &PeriodicProfile {
+    pub fn repeated_profile(&self) -> &PeriodicProfile {
         &self.profile
     }
 
@@ -201,13 +197,17 @@ mod tests {
             for is_turned in [false, true] {
                 let relief = sine(585.0, period_mm, 5.1, cells, is_turned);
                 let found = RepeatingRelief::find_ridges(&relief).expect("no error").expect("ridges");
-                let off = found.profile().period_mm() / period_mm - 1.0;
-                assert!(off.abs() < 5e-3, "{period_mm} mm of {cells} cells: {}", found.profile().period_mm());
+                let off = found.repeated_profile().period_mm() / period_mm - 1.0;
+                assert!(off.abs() < 5e-3, "{period_mm} mm of {cells} cells: {}", found.repeated_profile().period_mm());
             }
         }
         let steps = HeightField::from_fn(585.0, 274, |x, _| if (x / 24.0).rem_euclid(1.0) < 0.5 { 7.0 } else { 0.0 });
         let found = RepeatingRelief::find_ridges(&steps).expect("no error").expect("ridges");
-        assert!((found.profile().period_mm() / 24.0 - 1.0).abs() < 3e-3, "{}", found.profile().period_mm());
+        assert!(
+            (found.repeated_profile().period_mm() / 24.0 - 1.0).abs() < 3e-3,
+            "{}",
+            found.repeated_profile().period_mm()
+        );
     }
 
     #[test]
@@ -224,7 +224,7 @@ mod tests {
     }
 
     // A sine at 1:10, as a round sample of ten periods has it by boundary elements (examples/project/sine of
-    // Mesh2scattering, whose mesh has 80 mm and 23.05 mm from crest to trough at 1:2.5): 13 of 16 values are told, and
+    // Mesh2scattering, whose mesh has 80 mm and 23.05 mm from crest to trough at 1:2.5): 13 of 16 values are given, and
     // all of them are within 1.96 u.
     #[test]
     fn the_uncertainty_holds_what_a_finite_sample_does() {
@@ -236,19 +236,19 @@ mod tests {
             (60.0, 0.0, [0.015, 0.320, 0.883, 0.894]),
             (60.0, 90.0, [0.005, 0.019, 0.023, 0.034]),
         ];
-        let mut told = 0;
+        let mut given = 0;
         for (zenith_deg, azimuth_deg, expected) in published {
             for (khz, expected) in [4.0, 8.0, 12.0, 16.0].into_iter().zip(expected) {
                 let wave = IncidentWave { wave_number: TAU * khz * 1e3 / 346.18, zenith_deg, azimuth_deg };
-                let orders = ridges.profile().diffracted_orders(&wave).expect("orders");
+                let orders = ridges.repeated_profile().diffracted_orders(&wave).expect("orders");
                 let mirrored: f64 = orders.iter().filter(|order| order.order == 0).map(|order| order.energy).sum();
                 let u = ridges.finite_sample_u(&wave);
                 let off: f64 = 1.0 - mirrored - expected;
                 assert!(off.abs() <= 1.96 * u || u > 0.15, "{wave:?}: {off} beside {u}");
-                told += usize::from(u <= 0.15);
+                given += usize::from(u <= 0.15);
             }
         }
-        assert_eq!(told, 13);
+        assert_eq!(given, 13);
     }
 
     #[test]
@@ -261,7 +261,7 @@ mod tests {
             for (zenith_deg, weight) in [(0.0, 1.0), (30.0, 6.0), (60.0, 6.0)] {
                 for azimuth_deg in [0.0, 90.0, 180.0, 270.0] {
                     let wave = IncidentWave { wave_number, zenith_deg, azimuth_deg };
-                    let orders = ridges.profile().diffracted_orders(&wave).expect("orders");
+                    let orders = ridges.repeated_profile().diffracted_orders(&wave).expect("orders");
                     sum += weight * orders.iter().filter(|o| o.order != 0).map(|o| o.energy).sum::<f64>();
                     weights += weight;
                 }

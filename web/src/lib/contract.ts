@@ -1436,7 +1436,7 @@ export interface components {
             /** @description By how much T30 is longer than T20. */
             readonly curvature_percent: number | null;
             readonly d50: number | null;
-            /** @description Why the values may not be what they are taken for, as of a decay with two slopes. */
+            /** @description Reasons for which the values may not be what they are taken for, as of a decay with two slopes. */
             readonly doubt: string | null;
             readonly edt_s: number | null;
             /** @description Of the octave; null for all frequencies. */

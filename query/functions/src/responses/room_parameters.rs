@@ -42,15 +42,16 @@ static DESCRIPTION: FunctionDescription = FunctionDescription {
     name: "room_parameters",
     family: FunctionFamily::Responses,
     about: "Parameters of ISO 3382-1:2009 of a room's response, counted from its arrival: a struct of `edt_s`, \
-            `t20_s` and `t30_s` with their standard deviations by the band's width `t20_u_s` and `t30_u_s`, the decays' \
-            `t20_nonlinearity` and `t30_nonlinearity` (per mille) and `curvature_percent` of ISO 3382-2:2008, annex B, \
-            `c50_db`, `c80_db`, `d50` (0 to 1), `ts_ms` and `range_db`, the range of the decay curve from its start to \
-            where the decay meets the noise (Lundeby's method). The response ends where its last zeros begin. The \
-            noise's power is subtracted, and the energy after that point is added as the late decay's. Null where the \
-            range is too short (25 dB for EDT and the energies, 35 dB for T20, 45 dB for T30) or over 144 dB, where the \
-            response is shorter than 50 ms, and for times of less than 16 over the bandwidth, which are the filter's \
-            own; `reason` has the cause. `doubt` says that a decay is no line, or has more than one slope. Of all \
-            frequencies, or of the band of band_filter if its midband frequency is given.",
+            `t20_s` and `t30_s` with their standard deviations by the band's width `t20_u_s` and `t30_u_s`, the \
+            decays' `t20_nonlinearity` and `t30_nonlinearity` (per mille) and `curvature_percent` of ISO \
+            3382-2:2008, annex B, `c50_db`, `c80_db`, `d50` (0 to 1), `ts_ms` and `range_db`, the range of the decay \
+            curve from its start to where the decay meets the noise (Lundeby's method). The response ends where its \
+            last zeros begin. The noise's power is subtracted, and the energy after that point is added as the late \
+            decay's. Null where the range is too short (25 dB for EDT and the energies, 35 dB for T20, 45 dB for \
+            T30) or over 144 dB, where the response is shorter than 50 ms, and for times of less than 16 over the \
+            bandwidth, which are the filter's own; `reason` has the cause. `doubt` says that a decay is no line, or \
+            has more than one slope. Of all frequencies, or of the band of band_filter if its midband frequency is \
+            given.",
     parameters: &[
         FunctionParameter {
             name: "ir",

@@ -163,7 +163,7 @@ struct RoomBand {
     /// By how much T30 is longer than T20.
     curvature_percent: Option<f64>,
     reason: Option<String>,
-    /// Why the values may not be what they are taken for, as of a decay with two slopes.
+    /// Reasons for which the values may not be what they are taken for, as of a decay with two slopes.
     doubt: Option<String>,
 }
 
